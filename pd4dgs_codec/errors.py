@@ -1,0 +1,78 @@
+"""The one exception tree. No library's exception leaves the package's public functions.
+
+Every message says what was found, what was expected, and where.
+"""
+
+from __future__ import annotations
+
+
+class Pd4Error(Exception):
+    """Base of every error this package raises on purpose. The commands print it as one line and exit 1."""
+
+
+class DataError(Pd4Error):
+    """A dataset, an image, a camera or a checkpoint is missing, broken or not ours."""
+
+
+class TrainError(Pd4Error):
+    """Training cannot start or go on."""
+
+
+class RenderError(Pd4Error):
+    """The rasteriser was given input it must refuse, or an option it does not support."""
+
+
+class EncodeError(Pd4Error):
+    """A scene cannot be written as a `.pd4` file (NaN, infinity, a count over a limit, a failed verification)."""
+
+
+class DecodeError(Pd4Error):
+    """Bytes that are not a valid `.pd4` file.
+
+    offset: byte offset in the file where the fault was found, or None if unknown.
+    chunk: index of the chunk in file order, or None outside chunks.
+    clause: the clause of spec/format.md that is violated, such as "4.2".
+    """
+
+    def __init__(self, message: str, *, offset: int | None = None, chunk: int | None = None, clause: str | None = None):
+        self.message = message
+        self.offset = offset
+        self.chunk = chunk
+        self.clause = clause
+        super().__init__(message)
+
+    def __str__(self) -> str:
+        where = []
+        if self.chunk is not None:
+            where.append(f"chunk {self.chunk}")
+        if self.offset is not None:
+            where.append(f"offset {self.offset}")
+        return self.message + (f" ({', '.join(where)})" if where else "")
+
+
+class Truncated(DecodeError):
+    """The bytes end too early. Streaming waits on it; `allow_partial` turns it into the longest valid prefix."""
+
+
+class BadSignature(DecodeError):
+    """The first bytes are not those of a `.pd4` file."""
+
+
+class UnsupportedVersion(DecodeError):
+    """The major version is not one this decoder reads."""
+
+
+class UnsupportedFeature(DecodeError):
+    """A critical field or chunk this decoder does not know."""
+
+
+class ChecksumMismatch(DecodeError):
+    """A CRC-32 differs from the one stored."""
+
+
+class Malformed(DecodeError):
+    """A rule of the format is broken."""
+
+
+class LimitExceeded(DecodeError):
+    """A declared count or size is over the format's limits; nothing was allocated for it."""

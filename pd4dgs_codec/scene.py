@@ -1,0 +1,157 @@
+"""The decoded scene: numpy arrays with shape, dtype, unit and axes, and which layers are present.
+
+This is what the decoder yields and the encoder takes; it knows nothing of torch, of bytes or of files.
+
+Words: a *layer* is a transmitted increment, a *level* (0, 1, 2) is a render mode. Layer l carries the anchors that
+become active at level l, so the arrays of prefix l are the first rows of the arrays of prefix l + 1.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+
+FEATURE_DIM = 32
+SCALING_DIM = 6
+N_OFFSETS = 10
+
+#: Plane (a, b) of a HexPlane has shape [C, reso[b], reso[a]]; axes x, y, z, t = 0, 1, 2, 3.
+PLANES: tuple[tuple[str, int, int], ...] = (
+    ("xy", 0, 1),
+    ("xz", 0, 2),
+    ("xt", 0, 3),
+    ("yz", 1, 2),
+    ("yt", 1, 3),
+    ("zt", 2, 3),
+)
+
+#: A mask m is stored as a code 0..255, m = code * MASK_STEP; an anchor is active at a level iff its code is > 0.
+MASK_STEP = np.float32(1.0 / 255.0)
+MASK_THRESHOLD = 0.01
+MASK_MIN_CODE = 3
+
+#: Residual heads each deformation may have, with their output width.
+GLOBAL_HEADS: dict[str, int] = {"position": 3, "feature": FEATURE_DIM, "offset": 3 * N_OFFSETS, "scaling": SCALING_DIM}
+LOCAL_HEADS: dict[str, int] = {"mean": 3, "scale": 3, "quat": 4, "opacity": 1, "color": 3}
+
+#: The decoders of the scaffold (input [feature 32, view direction 3]) with their output width.
+SCAFFOLD_NETWORKS: dict[str, int] = {"opacity": N_OFFSETS, "covariance": 7 * N_OFFSETS, "color": 3 * N_OFFSETS}
+
+#: A network: per linear layer (weight float32 [out, in], bias float32 [out]); ReLU between layers, none at the end.
+Network = tuple[tuple[np.ndarray, np.ndarray], ...]
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera, OpenCV axes (x right, y down, z forward); pixel centres at +0.5."""
+
+    viewmat: np.ndarray  #: float32 [4, 4], world to camera, last row 0 0 0 1
+    K: np.ndarray  #: float32 [3, 3], pixels
+    width: int
+    height: int
+
+
+@dataclass(frozen=True, eq=False)
+class SceneInfo:
+    """What every layer needs and what a player needs to show the file alone. All reals are exact binary32 values."""
+
+    voxel_size: float  #: scene units; anchors are integer multiples of it
+    box: np.ndarray  #: float32 [2, 3], lower and upper corner; the HexPlanes' normalisation box, scene units
+    time_range: tuple[float, float]  #: seconds; normalised time 0 and 1
+    background: tuple[float, float, float]  #: linear RGB in 0..1 behind every Gaussian
+    near: float
+    far: float
+    up: tuple[float, float, float]  #: world direction
+    unit: float  #: metres per scene unit, 0 if unknown
+    camera: Camera | None  #: one default camera
+
+
+@dataclass(frozen=True, eq=False)
+class Deformation:
+    """A HexPlane and its residual MLP.
+
+    planes: scale -> plane name -> float32 [C, reso[b], reso[a]]; sampled bilinearly (align corners, border clamp),
+    multiplied within a scale, concatenated over scales. networks: "trunk" and the heads that are present.
+    """
+
+    planes: tuple[dict[str, np.ndarray], ...]
+    networks: dict[str, Network]
+
+
+@dataclass(frozen=True)
+class Steps:
+    """Quantisation steps Q, each a positive normal binary32: x_hat = k * Q."""
+
+    feature: float = 0.05
+    scaling_log: float = 0.02
+    offset: float = 0.05
+    planes_global: float = 0.1
+    planes_local: float = 0.1
+    weights_scaffold: float = 0.005
+    weights_global: float = 0.005
+    weights_local: float = 0.005
+
+    def scaled(self, factor: float) -> Steps:
+        """Every step times `factor`, rounded to binary32."""
+        return Steps(**{k: float(np.float32(v * factor)) for k, v in self.__dict__.items()})
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A prefix of a scene, from the layers `layers`.
+
+    layers: ascending layer numbers present, starting with 0, e.g. (0,), (0, 1), (0, 2), (0, 1, 2).
+    rows: rows[i] = number of anchors in the prefix that ends with layers[i].
+    anchor_q: int32 [N, 3] voxel indices; position = anchor_q * voxel_size, world, scene units.
+    feature: float32 [N, 32]. scaling_log: float32 [N, 6], natural log of scene units (0..2 spread of the offsets,
+    3..5 base scale). offset: float32 [N, 10, 3], in units of exp(scaling_log[:3]).
+    mask: per present layer i, uint8 [rows[i]] codes (see MASK_STEP), non-decreasing from layer to layer.
+    networks: "opacity", "covariance", "color". local_deformation belongs to layer 2, global_deformation to layer 1;
+    either may be None (left out).
+    """
+
+    info: SceneInfo
+    steps: Steps
+    layers: tuple[int, ...]
+    rows: tuple[int, ...]
+    anchor_q: np.ndarray
+    feature: np.ndarray
+    scaling_log: np.ndarray
+    offset: np.ndarray
+    mask: tuple[np.ndarray, ...]
+    networks: dict[str, Network]
+    global_deformation: Deformation | None = None
+    local_deformation: Deformation | None = None
+    left_out: tuple[dict, ...] = field(default=())  #: {what, why, bytes} rows, filled by the encoder
+
+    @property
+    def level(self) -> int:
+        """The highest level this scene can render."""
+        return self.layers[-1]
+
+    @property
+    def anchor(self) -> np.ndarray:
+        """float32 [N, 3] anchor positions, world, scene units."""
+        return (self.anchor_q.astype(np.float64) * np.float64(np.float32(self.info.voxel_size))).astype(np.float32)
+
+    def prefix(self, max_layer: int) -> Scene:
+        """The scene that a decoder yields from the layers <= max_layer; `self` if nothing is cut."""
+        n = sum(layer <= max_layer for layer in self.layers)
+        if n == len(self.layers):
+            return self
+        if n == 0:
+            raise ValueError(f"max_layer must be >= 0, found {max_layer}")
+        rows = self.rows[n - 1]
+        return replace(
+            self,
+            layers=self.layers[:n],
+            rows=self.rows[:n],
+            anchor_q=self.anchor_q[:rows],
+            feature=self.feature[:rows],
+            scaling_log=self.scaling_log[:rows],
+            offset=self.offset[:rows],
+            mask=self.mask[:n],
+            global_deformation=self.global_deformation if 1 in self.layers[:n] else None,
+            local_deformation=self.local_deformation if 2 in self.layers[:n] else None,
+        )

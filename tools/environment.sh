@@ -1,0 +1,14 @@
+# Sourced by demo.sh and test.sh: makes (or reuses) a virtual environment with this package, versions pinned.
+# usage: source tools/environment.sh FOLDER EXTRAS
+make_environment() {
+    local folder=$1 extras=$2 python=${PYTHON:-python3} stamp
+    "$python" -c 'import sys; sys.exit(sys.version_info < (3, 10))' ||
+        { echo "Python >= 3.10 is needed, found $("$python" --version)" >&2; return 1; }
+    stamp=$(cat pyproject.toml constraints.txt | cksum)-$extras
+    if [ "$(cat "$folder/.stamp" 2>/dev/null)" != "$stamp" ]; then
+        echo "Making the environment $folder (once; downloads about 300 MB of packages) ..." >&2
+        "$python" -m venv "$folder"
+        "$folder/bin/python" -m pip install --quiet --constraint constraints.txt --editable ".[$extras]"
+        echo "$stamp" > "$folder/.stamp"
+    fi
+}
