@@ -1,0 +1,153 @@
+"""Checkpoints: versioned, self-describing, and loaded with `weights_only=True`, so that a file cannot run code.
+
+A checkpoint is a dict {"format", "version", "scene": {info, steps, sizes}, "state": tensors, "training": {...}}.
+Shapes are read from the tensors; nothing needs the configuration that made the model. "training" holds what resuming
+needs and may be empty.
+"""
+
+from __future__ import annotations
+
+import os
+import pickle
+import tempfile
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.model.convert import from_scene
+from pd4dgs_codec.model.model import Model
+from pd4dgs_codec.scene import PLANES, Camera, Deformation, Network, Scene, SceneInfo, Steps
+
+FORMAT = "pd4dgs-checkpoint"
+VERSION = 1
+
+
+def save(path: str | Path, model: Model, training: dict[str, Any] | None = None) -> None:
+    """Writes the model and, for resuming, `training`; the file appears whole or not at all."""
+    content = {
+        "format": FORMAT,
+        "version": VERSION,
+        "info": _info_to_plain(model.info),
+        "steps": asdict(model.steps),
+        "deformations": {
+            name: None if field is None else field.planes.layout.reso.tolist()
+            for name, field in (("global", model.global_deformation), ("local", model.local_deformation))
+        },
+        "state": {name: tensor.detach().cpu() for name, tensor in model.state_dict().items()},
+        "training": training or {},
+    }
+    path = Path(path)
+    try:
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+    except OSError as error:
+        raise DataError(f"{path}: cannot write here: {error.strerror}") from None
+    try:
+        with os.fdopen(handle, "wb") as stream:
+            torch.save(content, stream)
+        os.replace(temporary, path)
+    except (OSError, RuntimeError) as error:
+        Path(temporary).unlink(missing_ok=True)
+        raise DataError(f"{path}: cannot write the checkpoint: {error}") from None
+    except BaseException:
+        Path(temporary).unlink(missing_ok=True)
+        raise
+
+
+def load(path: str | Path) -> tuple[Model, dict[str, Any]]:
+    """(model, training) from a checkpoint; DataError in one line for anything that is not a whole one of ours."""
+    try:
+        content = torch.load(path, map_location="cpu", weights_only=True)
+    except FileNotFoundError:
+        raise DataError(f"{path}: no such checkpoint") from None
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror}") from None
+    except pickle.UnpicklingError:
+        raise DataError(f"{path}: refused, it holds pickled code or objects; expected a {FORMAT} of tensors") from None
+    except Exception:  # torch raises many kinds for a broken zip archive
+        raise DataError(f"{path}: not a readable checkpoint; expected a {FORMAT} file") from None
+    if not isinstance(content, dict) or content.get("format") != FORMAT:
+        raise DataError(f"{path}: not a {FORMAT}; found {_describe(content)}")
+    if content.get("version") != VERSION:
+        raise DataError(f"{path}: {FORMAT} version {content.get('version')!r}, expected {VERSION}")
+    try:
+        model = _build(content)
+    except (KeyError, TypeError, ValueError, IndexError, RuntimeError, AttributeError) as error:
+        raise DataError(f"{path}: a {FORMAT} with missing or misshapen content: {error}") from None
+    for name, tensor in model.state_dict().items():
+        if tensor.is_floating_point() and not torch.isfinite(tensor).all():
+            raise DataError(f"{path}: tensor {name} holds a NaN or an infinity; expected finite numbers")
+    return model, content["training"]
+
+
+def _build(content: dict[str, Any]) -> Model:
+    """The model is first built as a scene of the same shapes, then filled, so that shapes are checked in one place."""
+    state = {name: tensor.numpy() for name, tensor in content["state"].items()}
+    n = len(state["anchor_q"])
+
+    def network(prefix: str) -> Network:
+        layers = sorted(int(k.split(".")[-2]) for k in state if k.startswith(prefix + ".linears.") and k.endswith(".weight"))
+        return tuple((state[f"{prefix}.linears.{i}.weight"], state[f"{prefix}.linears.{i}.bias"]) for i in layers)
+
+    def deformation(name: str) -> Deformation | None:
+        reso = content["deformations"][name]
+        if reso is None:
+            return None
+        prefix = f"{name}_deformation"
+        channels = state[f"{prefix}.planes.grid"].shape[1]
+        planes = tuple(
+            {plane: np.zeros((channels, r[b], r[a]), np.float32) for plane, a, b in PLANES} for r in reso
+        )
+        heads = sorted({k.split(".")[2] for k in state if k.startswith(f"{prefix}.heads.")}, key=_head_order)
+        networks = {"trunk": network(f"{prefix}.trunk")} | {h: network(f"{prefix}.heads.{h}") for h in heads}
+        return Deformation(planes, networks)
+
+    names = sorted({k.split(".")[1] for k in state if k.startswith("networks.")})
+    scene = Scene(
+        info=_info_from_plain(content["info"]),
+        steps=Steps(**content["steps"]),
+        layers=(0,),
+        rows=(n,),
+        anchor_q=state["anchor_q"],
+        feature=np.zeros((n, 32), np.float32),
+        scaling_log=np.zeros((n, 6), np.float32),
+        offset=np.zeros((n, 10, 3), np.float32),
+        mask=(np.full(n, 255, np.uint8),),
+        networks={name: network(f"networks.{name}") for name in names},
+        global_deformation=deformation("global"),
+        local_deformation=deformation("local"),
+    )
+    model = from_scene(scene)
+    model.load_state_dict(content["state"])
+    return model
+
+
+def _head_order(name: str) -> int:
+    return [*"position feature offset scaling mean scale quat opacity color".split()].index(name)
+
+
+def _info_to_plain(info: SceneInfo) -> dict[str, Any]:
+    plain = dict(info.__dict__, box=info.box.tolist())
+    if info.camera is not None:
+        camera = info.camera
+        plain["camera"] = dict(camera.__dict__, viewmat=camera.viewmat.tolist(), K=camera.K.tolist())
+    return plain
+
+
+def _info_from_plain(plain: dict[str, Any]) -> SceneInfo:
+    camera = plain["camera"]
+    if camera is not None:
+        camera = Camera(
+            **dict(camera, viewmat=np.array(camera["viewmat"], np.float32), K=np.array(camera["K"], np.float32))
+        )
+    tuples = {k: tuple(plain[k]) for k in ("time_range", "background", "up")}
+    return SceneInfo(**dict(plain, box=np.array(plain["box"], np.float32), camera=camera, **tuples))
+
+
+def _describe(content: Any) -> str:
+    if isinstance(content, dict):
+        return f"a dict with keys {sorted(map(str, content))[:4]}"
+    return f"a {type(content).__name__}"

@@ -1,0 +1,53 @@
+"""Sizes of the model, as frozen data, and the three presets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS
+
+
+@dataclass(frozen=True)
+class DeformationConfig:
+    """A HexPlane and its MLP. `resolution` holds for x, y and z and is multiplied by each of `multires`; time is not."""
+
+    resolution: int
+    time_resolution: int
+    channels: int
+    multires: tuple[int, ...]
+    width: int
+    heads: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class ModelConfig:
+    """Both deformations (None: the level adds none) and how many anchors training starts from and stays below."""
+
+    global_deformation: DeformationConfig | None
+    local_deformation: DeformationConfig | None
+    hidden: int = 32
+    initial_anchors: int = 20_000
+    max_anchors: int = 40_000
+
+
+_GLOBAL, _LOCAL = tuple(GLOBAL_HEADS), tuple(LOCAL_HEADS)
+
+PRESETS: dict[str, ModelConfig] = {
+    "tiny": ModelConfig(
+        DeformationConfig(16, 16, 8, (1, 2), 32, _GLOBAL),
+        DeformationConfig(24, 24, 8, (1, 2), 32, _LOCAL),
+        initial_anchors=5_000,
+        max_anchors=12_000,
+    ),
+    "small": ModelConfig(
+        DeformationConfig(32, 24, 16, (1, 2), 64, _GLOBAL),
+        DeformationConfig(48, 50, 16, (1, 2), 64, _LOCAL),
+    ),
+    # plane sizes of the paper's backbone: 1.496 MB and 8.007 MB of float32
+    "paper": ModelConfig(
+        DeformationConfig(32, 10, 16, (1, 2), 128, _GLOBAL),
+        DeformationConfig(64, 100, 16, (1, 2), 128, _LOCAL),
+        initial_anchors=26_000,
+        max_anchors=50_000,
+    ),
+}

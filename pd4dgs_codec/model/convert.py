@@ -1,0 +1,75 @@
+"""Model <-> Scene: torch tensors to the numpy arrays that the codec packs, and back."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+
+from pd4dgs_codec.attributes.quantise import mask_codes
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.model.deformation import DeformationField
+from pd4dgs_codec.model.layers import MLP, mask_logits
+from pd4dgs_codec.model.model import Model
+from pd4dgs_codec.scene import MASK_STEP, Scene
+
+
+def to_scene(model: Model) -> Scene:
+    """Every anchor of the model as one unplanned scene: rows (N, ...), masks of inactive anchors 0.
+
+    Raises DataError naming the tensor that holds a NaN or an infinity.
+    """
+    for name, tensor in model.state_dict().items():
+        if tensor.is_floating_point() and not torch.isfinite(tensor).all():
+            raise DataError(f"model tensor {name} holds a NaN or an infinity; expected finite numbers")
+    fields = (model.global_deformation, model.local_deformation)
+    layers = (0, *(i + 1 for i, deformation in enumerate(fields) if deformation is not None))
+    n = len(model.anchor_q)
+    with torch.no_grad():
+        masks = tuple(mask_codes(model.masks(layer).cpu().numpy()) for layer in layers)
+    global_deformation, local_deformation = (None if f is None else f.arrays() for f in fields)
+    return Scene(
+        info=model.info,
+        steps=model.steps,
+        layers=layers,
+        rows=(n,) * len(layers),
+        anchor_q=_numpy(model.anchor_q),
+        feature=_numpy(model.feature),
+        scaling_log=_numpy(model.scaling_log),
+        offset=_numpy(model.offset),
+        mask=masks,
+        networks={name: net.arrays() for name, net in model.networks.items()},
+        global_deformation=global_deformation,
+        local_deformation=local_deformation,
+    )
+
+
+def from_scene(scene: Scene) -> Model:
+    """The model that renders `scene`, anchors in the scene's order.
+
+    A level whose layer is absent looks like the level below it; masks come back to within 1e-6.
+    """
+    n = len(scene.anchor_q)
+    masks = np.zeros((n, 3), np.float64)
+    for level in range(3):
+        present = [i for i, layer in enumerate(scene.layers) if layer <= level]
+        codes = scene.mask[present[-1]]
+        masks[: len(codes), level] = codes * np.float64(MASK_STEP)
+    box = scene.info.box
+    fields = (scene.global_deformation, scene.local_deformation)
+    global_field, local_field = (None if f is None else DeformationField.from_arrays(f, box) for f in fields)
+    return Model(
+        scene.info,
+        scene.steps,
+        torch.from_numpy(scene.anchor_q.astype(np.int32)),
+        torch.from_numpy(np.array(scene.feature, np.float32)),
+        torch.from_numpy(np.array(scene.scaling_log, np.float32)),
+        torch.from_numpy(np.array(scene.offset, np.float32)),
+        torch.from_numpy(mask_logits(masks)),
+        {name: MLP.from_arrays(net) for name, net in scene.networks.items()},
+        global_field,
+        local_field,
+    )
+
+
+def _numpy(tensor: torch.Tensor) -> np.ndarray:
+    return tensor.detach().cpu().numpy().copy()

@@ -1,0 +1,195 @@
+"""The layered model: one graph for training and inference.
+
+Render_0    = R(MLP(A))
+Render_1(t) = R(MLP(A + F_global(A, t)))
+Render_2(t) = R(MLP(A + F_global(A, t)) + F_local(G, t))
+
+A: anchors (feature, log-scaling, offsets on a voxel grid); G: the Gaussians that the scaffold's networks make of them.
+The gate m^(level) multiplies each Gaussian's final opacity and scale, after the local residuals.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from pd4dgs_codec.model.deformation import DeformationField
+from pd4dgs_codec.model.layers import MLP, level_mask
+from pd4dgs_codec.scene import FEATURE_DIM, MASK_THRESHOLD, N_OFFSETS, SceneInfo, Steps
+
+#: A Gaussian fainter than this never reaches a pixel (the rasteriser's threshold), so its networks are not evaluated.
+MIN_OPACITY = 1.0 / 255.0
+#: Anchors farther outside the image than this share of its size (plus their own extent) are not evaluated.
+FRUSTUM_MARGIN = 0.15
+
+
+@dataclass(frozen=True)
+class Rounding:
+    """How a training step imitates quantisation: uniform noise on the anchors' attributes, rounding of planes, weights."""
+
+    noise: torch.Generator | None = None
+    weights: bool = False
+
+
+EXACT = Rounding()
+
+
+@dataclass
+class Gaussians:
+    """What the rasteriser takes; K Gaussians. Scales, opacities and colours are activated and gated."""
+
+    means: Tensor  #: [K, 3] world
+    quats: Tensor  #: [K, 4] wxyz, unit
+    scales: Tensor  #: [K, 3] scene units
+    opacities: Tensor  #: [K] 0..1
+    colors: Tensor  #: [K, 3] 0..1
+    slots: Tensor  #: int64 [K], anchor * 10 + offset
+    anchors: Tensor  #: int64 [n], the anchors that were evaluated
+    raw_opacity: Tensor  #: [n, 10] before the gate
+
+
+class Model(nn.Module):
+    """Anchors, networks, deformations and masks. All tensors float32 but anchor_q (int32 [N, 3])."""
+
+    anchor_q: Tensor
+
+    def __init__(
+        self,
+        info: SceneInfo,
+        steps: Steps,
+        anchor_q: Tensor,
+        feature: Tensor,
+        scaling_log: Tensor,
+        offset: Tensor,
+        mask_logits: Tensor,
+        networks: dict[str, MLP],
+        global_deformation: DeformationField | None,
+        local_deformation: DeformationField | None,
+    ):
+        super().__init__()
+        self.info, self.steps = info, steps
+        self.register_buffer("anchor_q", anchor_q)
+        self.feature = nn.Parameter(feature)
+        self.scaling_log = nn.Parameter(scaling_log)
+        self.offset = nn.Parameter(offset)
+        self.mask_logits = nn.Parameter(mask_logits)
+        self.networks = nn.ModuleDict(networks)
+        self.global_deformation = global_deformation
+        self.local_deformation = local_deformation
+
+    @property
+    def anchor(self) -> Tensor:
+        """[N, 3] anchor positions, world."""
+        return (self.anchor_q.double() * float(self.info.voxel_size)).float()
+
+    @property
+    def level(self) -> int:
+        """The highest level that differs from the one below in more than its masks."""
+        return 2 if self.local_deformation is not None else 1 if self.global_deformation is not None else 0
+
+    def masks(self, level: int) -> Tensor:
+        """m^(level) [N]."""
+        return level_mask(self.mask_logits, level)
+
+    @torch.no_grad()
+    def visible(self, level: int, viewmat: Tensor, K: Tensor, width: int, height: int) -> Tensor:
+        """int64 [n]: anchors active at `level` that may reach the image, in ascending order."""
+        position = self.anchor @ viewmat[:3, :3].T + viewmat[:3, 3]
+        extent = self.scaling_log.exp()
+        radius = 2.0 * extent[:, :3].amax(1) + 3.33 * extent[:, 3:].amax(1)
+        depth = position[:, 2]
+        z = depth.clamp(min=float(self.info.near))
+        x = K[0, 0] * position[:, 0] / z + K[0, 2]
+        y = K[1, 1] * position[:, 1] / z + K[1, 2]
+        margin = torch.maximum(K[0, 0], K[1, 1]) * radius / z + FRUSTUM_MARGIN * max(width, height)
+        inside = (x > -margin) & (x < width + margin) & (y > -margin) & (y < height + margin)
+        return (inside & (depth + radius > 0) & (self.masks(level) > MASK_THRESHOLD)).nonzero()[:, 0]
+
+    def gaussians(
+        self,
+        level: int,
+        t: float,
+        viewmat: Tensor,
+        K: Tensor,
+        width: int,
+        height: int,
+        rounding: Rounding = EXACT,
+    ) -> Gaussians:
+        """The Gaussians of `level` at normalised time t in 0..1 as the camera (viewmat [4, 4], K [3, 3]) meets them."""
+        rows = self.visible(level, viewmat, K, width, height)
+        mask = self.masks(level).index_select(0, rows)
+        position = self.anchor.index_select(0, rows)
+        feature = self._attribute(self.feature, rows, self.steps.feature, rounding)
+        scaling_log = self._attribute(self.scaling_log, rows, self.steps.scaling_log, rounding)
+        offset = self._attribute(self.offset, rows, self.steps.offset, rounding)
+        if level >= 1 and self.global_deformation is not None:
+            residual = self.global_deformation(
+                position,
+                t,
+                plane_step=self.steps.planes_global if rounding.weights else None,
+                weight_step=self.steps.weights_global if rounding.weights else None,
+            )
+            position = position + residual["position"] if "position" in residual else position
+            feature = feature + residual["feature"] if "feature" in residual else feature
+            offset = offset + residual["offset"].view_as(offset) if "offset" in residual else offset
+            scaling_log = scaling_log + residual["scaling"] if "scaling" in residual else scaling_log
+
+        weight_step = self.steps.weights_scaffold if rounding.weights else None
+        camera_centre = -viewmat[:3, :3].T @ viewmat[:3, 3]
+        direction = F.normalize(position - camera_centre, dim=1)
+        inputs = torch.cat([feature, direction], dim=1)
+        raw_opacity = torch.tanh(self.networks["opacity"](inputs, weight_step))
+        keep = (raw_opacity.detach() * mask.detach()[:, None] >= MIN_OPACITY).flatten().nonzero()[:, 0]
+        owner = torch.div(keep, N_OFFSETS, rounding_mode="floor")
+
+        scaling = scaling_log.exp()
+        covariance = self.networks["covariance"](inputs, weight_step).view(-1, 7).index_select(0, keep)
+        colors = torch.sigmoid(self.networks["color"](inputs, weight_step).view(-1, 3).index_select(0, keep))
+        opacities = raw_opacity.flatten().index_select(0, keep)
+        scaling_k = scaling.index_select(0, owner)
+        means = position.index_select(0, owner) + offset.view(-1, 3).index_select(0, keep) * scaling_k[:, :3]
+        scales = scaling_k[:, 3:] * torch.sigmoid(covariance[:, :3])
+        quats = F.normalize(covariance[:, 3:], dim=1)
+        if level >= 2 and self.local_deformation is not None:
+            residual = self.local_deformation(
+                means,
+                t,
+                plane_step=self.steps.planes_local if rounding.weights else None,
+                weight_step=self.steps.weights_local if rounding.weights else None,
+            )
+            means = means + residual["mean"] if "mean" in residual else means
+            scales = F.relu(scales + residual["scale"]) if "scale" in residual else scales
+            quats = F.normalize(quats + residual["quat"], dim=1) if "quat" in residual else quats
+            opacities = (opacities + residual["opacity"][:, 0]).clamp(0, 1) if "opacity" in residual else opacities
+            colors = (colors + residual["color"]).clamp(0, 1) if "color" in residual else colors
+        gate = mask.index_select(0, owner)
+        return Gaussians(
+            means=means,
+            quats=quats,
+            scales=scales * gate[:, None],
+            opacities=opacities * gate,
+            colors=colors,
+            slots=rows.index_select(0, owner) * N_OFFSETS + keep % N_OFFSETS,
+            anchors=rows,
+            raw_opacity=raw_opacity,
+        )
+
+    def _attribute(self, values: Tensor, rows: Tensor, step: float, rounding: Rounding) -> Tensor:
+        picked = values.index_select(0, rows)
+        if rounding.noise is None:
+            return picked
+        noise = torch.rand(picked.shape, generator=rounding.noise, device=picked.device)
+        return picked + (noise - 0.5) * step
+
+
+def fresh_networks(hidden: int) -> dict[str, MLP]:
+    """The scaffold's decoders, untrained: input [feature 32, view direction 3]."""
+    width = FEATURE_DIM + 3
+    return {
+        "opacity": MLP((width, hidden, N_OFFSETS)),
+        "covariance": MLP((width, hidden, 7 * N_OFFSETS)),
+        "color": MLP((width, hidden, 3 * N_OFFSETS)),
+    }
