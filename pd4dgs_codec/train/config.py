@@ -1,0 +1,134 @@
+"""What a training run is: frozen settings and the schedule they imply. Source of the constants: the PD-4DGS method."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from pd4dgs_codec.errors import TrainError
+from pd4dgs_codec.scene import Steps
+
+#: Iterations per preset when neither a count nor a time limit is given.
+DEFAULT_ITERATIONS = {"tiny": 3_000, "small": 10_000, "paper": 15_000}
+
+
+@dataclass(frozen=True)
+class LearningRates:
+    """(start, end) of a log-linear schedule over the run; Adam, eps 1e-15."""
+
+    feature: tuple[float, float] = (7.5e-3, 1.5e-3)
+    scaling_log: tuple[float, float] = (7e-3, 1.5e-3)
+    offset: tuple[float, float] = (1e-2, 2e-4)
+    mask_logits: tuple[float, float] = (5e-2, 2e-2)
+    opacity: tuple[float, float] = (2e-3, 1e-4)
+    covariance: tuple[float, float] = (4e-3, 4e-4)
+    color: tuple[float, float] = (8e-3, 2e-4)
+    planes: tuple[float, float] = (1e-2, 5e-4)
+    deformation: tuple[float, float] = (1e-3, 5e-5)
+
+
+@dataclass(frozen=True)
+class PlaneWeights:
+    """Weights of the plane regularisers: spatial second difference, its time twin, mean |1 - g| of the time planes."""
+
+    plane_smooth: float
+    time_smooth: float
+    time_l1: float
+
+
+@dataclass(frozen=True)
+class TrainConfig:
+    """Everything that decides a run besides the data. Each ablation of the method is one field."""
+
+    preset: str = "small"
+    iterations: int | None = None  #: None: the preset's default, or what fits `max_seconds`
+    max_seconds: float | None = None
+    seed: int = 0
+    lambdas: tuple[float, float, float] = (0.04, 0.01, 0.00025)  #: rate weight per level
+    rate_scale: float = 0.1  #: multiplies every lambda; 1 is the paper's operating point
+    rate_share: float = 0.2  #: share of the anchors on which a step estimates the rate
+    tmc: float = 0.01
+    tmc_binary: bool = True
+    tmc_smooth: bool = True
+    tmc_tau: float = 4.0  #: voxels
+    rollout: str = "adaptive"  #: "adaptive", "uniform" or "fixed"
+    ssim: float = 0.2
+    volume: float = 0.01  #: weight of the mean product of scales (Scaffold-GS)
+    noise: bool = True
+    grow_threshold: float = 2e-4
+    steps: Steps = field(default_factory=Steps)
+    rates: LearningRates = field(default_factory=LearningRates)
+    global_planes: PlaneWeights = PlaneWeights(1e-4, 5e-4, 5e-5)
+    local_planes: PlaneWeights = PlaneWeights(2e-4, 1e-3, 1e-4)
+    max_gradient_norm: float = 100.0
+
+    def __post_init__(self) -> None:
+        if self.preset not in DEFAULT_ITERATIONS:
+            raise TrainError(f"preset {self.preset!r} is unknown; expected one of {', '.join(DEFAULT_ITERATIONS)}")
+        if self.iterations is not None and self.iterations < 1:
+            raise TrainError(f"iterations must be at least 1, found {self.iterations}")
+        if self.max_seconds is not None and not self.max_seconds > 0:
+            raise TrainError(f"max-seconds must be positive, found {self.max_seconds}")
+        if self.rollout not in ("adaptive", "uniform", "fixed"):
+            raise TrainError(f"rollout {self.rollout!r} is unknown; expected adaptive, uniform or fixed")
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """The phases of a run of N iterations, as fractions of N (the paper's N is 30,000)."""
+
+    iterations: int
+
+    def _at(self, fraction: float) -> int:
+        return round(self.iterations * fraction)
+
+    @property
+    def coarse_end(self) -> int:
+        """Before it only level 0 is trained; from it on, quantisation noise is added."""
+        return self._at(1 / 10)
+
+    @property
+    def warm(self) -> int:
+        """Levels are sampled uniformly before it (T_warm)."""
+        return self._at(1 / 15)
+
+    @property
+    def progressive(self) -> int:
+        """The rate term, TMC and the average rho start here (T_progressive)."""
+        return self._at(1 / 3)
+
+    @property
+    def rho_start(self) -> int:
+        """rho's moving average starts here."""
+        return max(self.warm, self.progressive)
+
+    @property
+    def rho_every(self) -> int:
+        """Iterations between updates of rho (K)."""
+        return max(1, self._at(1 / 150))
+
+    @property
+    def grow(self) -> range:
+        """Iterations after which anchors are grown and pruned."""
+        every = max(20, self._at(1 / 100))
+        return range(self._at(1 / 60) + every, self._at(1 / 2) + 1, every)
+
+    @property
+    def rounding(self) -> int:
+        """Planes and weights are rounded straight-through from here on."""
+        return self._at(4 / 5)
+
+    def phases_not_reached(self, iteration: int) -> list[str]:
+        """Names of the phases that a run cut after `iteration` iterations never entered."""
+        starts = {
+            "levels 1 and 2": self.coarse_end,
+            "rate and mask terms": self.progressive,
+            "rounding of planes and weights": self.rounding,
+            "the end of the learning-rate schedule": self.iterations - 1,
+        }
+        return [name for name, start in starts.items() if iteration <= start]
+
+
+def learning_rate(bounds: tuple[float, float], progress: float) -> float:
+    """Log-linear between the bounds at progress 0..1."""
+    start, end = bounds
+    return start * (end / start) ** min(max(progress, 0.0), 1.0)

@@ -1,0 +1,100 @@
+"""A fresh model for a dataset: where the first anchors stand and how large they are."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pd4dgs_codec.data.dataset import Dataset
+from pd4dgs_codec.model.config import ModelConfig
+from pd4dgs_codec.model.deformation import DeformationField
+from pd4dgs_codec.model.model import Model, fresh_networks
+from pd4dgs_codec.scene import FEATURE_DIM, GLOBAL_HEADS, LOCAL_HEADS, N_OFFSETS, Camera, SceneInfo, Steps
+
+#: Voxels along the longest side of the scene's box.
+GRID = 1024
+MASK_START = 2.0
+
+
+def fresh_model(config: ModelConfig, dataset: Dataset, steps: Steps, seed: int) -> Model:
+    """An untrained model: anchors on the dataset's points (topped up near them), or spread over its box."""
+    generator = torch.Generator().manual_seed(seed)
+    torch.manual_seed(seed)  # nn.Linear and HexPlane draw their start values from the global generator
+    info = scene_info(dataset)
+    anchor_q = initial_cells(dataset, config.initial_anchors, info.voxel_size, generator)
+    n = len(anchor_q)
+    spacing = nearest_distances((anchor_q.double() * info.voxel_size).float()).clamp(min=info.voxel_size)
+    fields = []
+    for field, widths in ((config.global_deformation, GLOBAL_HEADS), (config.local_deformation, LOCAL_HEADS)):
+        fields.append(None if field is None else DeformationField.fresh(field, info.box, widths))
+    mask_logits = torch.zeros(n, 3)
+    mask_logits[:, 0] = MASK_START
+    return Model(
+        info,
+        steps,
+        anchor_q,
+        torch.zeros(n, FEATURE_DIM),
+        spacing.log()[:, None].repeat(1, 6),
+        torch.zeros(n, N_OFFSETS, 3),
+        mask_logits,
+        fresh_networks(config.hidden),
+        *fields,
+    )
+
+
+def scene_info(dataset: Dataset) -> SceneInfo:
+    """The header's facts of a dataset; the voxel is 1/1024 of the box's longest side."""
+    view = dataset.train[0]
+    box = np.asarray(dataset.box, np.float32)
+    return SceneInfo(
+        voxel_size=_binary32(float((box[1] - box[0]).max()) / GRID),
+        box=box,
+        time_range=tuple(_binary32(v) for v in dataset.time_range),  # type: ignore[arg-type]
+        background=tuple(_binary32(v) for v in dataset.background),  # type: ignore[arg-type]
+        near=_binary32(dataset.near),
+        far=_binary32(dataset.far),
+        up=tuple(_binary32(v) for v in dataset.up),  # type: ignore[arg-type]
+        unit=_binary32(dataset.unit),
+        camera=Camera(np.asarray(view.viewmat, np.float32), np.asarray(view.K, np.float32), view.width, view.height),
+    )
+
+
+def initial_cells(dataset: Dataset, count: int, voxel_size: float, generator: torch.Generator) -> Tensor:
+    """int32 [n, 3] unique voxel cells, about `count` of them."""
+    if dataset.points is None or len(dataset.points) == 0:
+        low, high = (torch.from_numpy(np.asarray(dataset.box[i], np.float32)) for i in (0, 1))
+        points = low + (high - low) * torch.rand(count, 3, generator=generator)
+        return torch.unique(torch.round(points / voxel_size).to(torch.int32), dim=0)
+    points = torch.from_numpy(np.asarray(dataset.points, np.float32))
+    low, high = (torch.from_numpy(np.asarray(dataset.box[i], np.float32)) for i in (0, 1))
+    reach = 0.5 * (high - low).max()  # a stray triangulated point must not stretch the grid
+    points = points[((points > low - reach) & (points < high + reach)).all(1)]
+    if len(points) > count:
+        points = points[torch.randperm(len(points), generator=generator)[:count]]
+    elif 0 < len(points) < count:
+        spacing = nearest_distances(points)
+        pick = torch.randint(len(points), (count - len(points),), generator=generator)
+        jitter = torch.randn(len(pick), 3, generator=generator) * spacing[pick, None]
+        points = torch.cat([points, points[pick] + jitter])
+    return torch.unique(torch.round(points / voxel_size).to(torch.int32), dim=0)
+
+
+def nearest_distances(points: Tensor, k: int = 3) -> Tensor:
+    """Root mean squared distance to the k nearest other points, [n]; exact, in blocks."""
+    n = len(points)
+    if n < 2:
+        return torch.full((n,), 1.0)
+    k = min(k, n - 1)
+    out = []
+    for block in points.split(max(1, 8_000_000 // n)):
+        nearest = torch.cdist(block, points).topk(k + 1, largest=False).values[:, 1:]
+        out.append(nearest.square().mean(1).sqrt())
+    return torch.cat(out)
+
+
+def _binary32(value: float) -> float:
+    value = float(np.float32(value))
+    return value if math.isfinite(value) else 0.0

@@ -1,0 +1,320 @@
+"""The training loop. One step: draw a view and a level, render, add the level's terms, update; now and then grow.
+
+Everything random comes from one generator whose state is saved, so a resumed run repeats the uninterrupted one bit for
+bit at a fixed number of iterations and threads.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import time
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pd4dgs_codec.data.dataset import Dataset, View
+from pd4dgs_codec.errors import TrainError
+from pd4dgs_codec.metrics.image import mpsnr
+from pd4dgs_codec.model import checkpoint
+from pd4dgs_codec.model.config import PRESETS
+from pd4dgs_codec.model.model import Model, Rounding
+from pd4dgs_codec.render.picture import Picture, render, render_image
+from pd4dgs_codec.scene import MASK_THRESHOLD
+from pd4dgs_codec.train import losses
+from pd4dgs_codec.train.config import DEFAULT_ITERATIONS, PlaneWeights, Schedule, TrainConfig
+from pd4dgs_codec.train.densify import Densifier
+from pd4dgs_codec.train.initialise import fresh_model
+from pd4dgs_codec.train.optimiser import Optimiser
+from pd4dgs_codec.train.rollout import CAPACITY_WEIGHTED, UNIFORM, rollout_probabilities, sample_level, updated_rho
+from pd4dgs_codec.train.ssim import TargetStats, image_loss
+
+#: Steps timed before a run with a time limit fixes N, and the share of the limit that N is meant to fill.
+TIMED_STEPS = 50
+TIME_SHARE = 0.95
+#: Later steps cost more than the first (more anchors, all levels); measured growth of the mean step over a run.
+GROWTH_ALLOWANCE = 1.15
+#: Held-out evaluations over a run, for the curve of quality against wall time, and views in each.
+CURVE_POINTS = 12
+CURVE_VIEWS = 6
+
+
+class Trainer:
+    """A run in progress; `run` carries it to its end."""
+
+    def __init__(self, config: TrainConfig, dataset: Dataset, device: str = "cpu"):
+        preset = PRESETS[config.preset]
+        self.config, self.dataset, self.device = config, dataset, torch.device(device)
+        self.model = fresh_model(preset, dataset, config.steps, config.seed).to(self.device)
+        self.optimiser = Optimiser(self.model, config.rates)
+        self.densifier = Densifier(self.model, config.grow_threshold, preset.max_anchors)
+        self.generator = torch.Generator().manual_seed(config.seed)
+        self.noise = torch.Generator(device=self.device).manual_seed(config.seed + 1)
+        self.iteration = 0
+        self.total = config.iterations or (0 if config.max_seconds else DEFAULT_ITERATIONS[config.preset])
+        self.rho = 0.0
+        self.skipped = 0
+        self.seconds = 0.0
+        self.curve: list[dict[str, Any]] = []
+        self.order: list[int] = []
+        self._targets = [self._target(view) for view in dataset.train]
+        self._step_seconds = 0.0
+
+    # -- the run ---------------------------------------------------------------------------------------------------
+
+    def run(self, output: Path, *, log: Path | None = None, progress: Any = None, save_every: float = 60.0) -> None:
+        """Trains to the end, to the time limit, or to KeyboardInterrupt; `output` always holds a whole checkpoint then.
+
+        progress: an object with `.update(trainer, record)` and `.close()`, or None. save_every: seconds.
+        """
+        start = time.monotonic() - self.seconds
+        saved = time.monotonic()
+        stream = open(log, "a", encoding="utf-8") if log else None  # noqa: SIM115
+        try:
+            if not self.total:
+                self._fix_iterations(start)
+            while self.iteration < self.total:
+                record = self.step()
+                self.seconds = time.monotonic() - start
+                if self._curve_due():
+                    record["held_out_psnr"] = self._evaluate()
+                    self.seconds = time.monotonic() - start
+                if stream:
+                    stream.write(json.dumps(record | {"seconds": round(self.seconds, 3)}) + "\n")
+                if progress:
+                    progress.update(self, record)
+                if time.monotonic() - saved > save_every:
+                    self.save(output)
+                    saved = time.monotonic()
+                if self.config.max_seconds and self.seconds >= self.config.max_seconds:
+                    break
+        except KeyboardInterrupt:
+            pass
+        finally:
+            if stream:
+                stream.close()
+        self.save(output)
+
+    def step(self) -> dict[str, Any]:
+        """One training step; returns its log record (every term unweighted)."""
+        schedule = Schedule(self.total or 10**9)
+        index = self._next_view()
+        level, probabilities = self._draw_level(schedule)
+        rounding = Rounding(
+            noise=self.noise if self.config.noise and self.iteration >= schedule.coarse_end else None,
+            weights=self.iteration >= schedule.rounding,
+        )
+        picture, terms, loss = self._loss(index, level, schedule, rounding)
+        record: dict[str, Any] = {"iteration": self.iteration, "level": level, "loss": float(loss.detach())}
+        record |= {name: float(value.detach()) for name, value in terms.items()}
+        loss.backward()
+        record["gradient_norm"] = norm = self.optimiser.gradient_norm()
+        if math.isfinite(norm) and math.isfinite(record["loss"]):
+            self._update(norm, schedule, picture, record)
+        else:
+            self.skipped += 1
+            record["skipped"] = self.skipped
+        self.optimiser.zero_grad()
+        if self.iteration >= schedule.rho_start and self.iteration % schedule.rho_every == 0:
+            with torch.no_grad():
+                self.rho = updated_rho(self.rho, self.model.masks(0), self.model.masks(2))
+        record |= {"rho": self.rho, "pi": probabilities, "anchors": len(self.model.anchor_q)}
+        if self.iteration % schedule.rho_every == 0:
+            record["active"] = self.active_anchors()
+        self.iteration += 1
+        return record
+
+    def active_anchors(self) -> list[int]:
+        """Anchors active per level 0, 1, 2."""
+        with torch.no_grad():
+            return [int((self.model.masks(level) > MASK_THRESHOLD).sum()) for level in range(3)]
+
+    # -- parts of a step -------------------------------------------------------------------------------------------
+
+    def _loss(self, index: int, level: int, schedule: Schedule, rounding: Rounding) -> tuple[Picture, dict, Tensor]:
+        config, view = self.config, self.dataset.train[index]
+        viewmat, K, target = self._targets[index]
+        picture = render(self.model, level, view.time, viewmat, K, view.width, view.height, rounding)
+        if picture.meta["means2d"].requires_grad:
+            picture.meta["means2d"].retain_grad()
+        l1, dissimilarity = image_loss(picture.image, target)
+        terms = {"l1": l1, "dssim": dissimilarity}
+        loss = (1 - config.ssim) * l1 + config.ssim * dissimilarity
+        if config.volume and len(picture.gaussians.scales):
+            terms["volume"] = picture.gaussians.scales.prod(dim=1).mean()
+            loss = loss + config.volume * terms["volume"]
+        fields = (
+            ("global", self.model.global_deformation, config.global_planes),
+            ("local", self.model.local_deformation, config.local_planes),
+        )
+        for name, field, weights in fields[:level]:
+            if field is not None:
+                loss = loss + self._plane_terms(name, field, weights, terms)
+        if self.iteration >= schedule.progressive:
+            loss = loss + self._level_terms(level, terms)
+        return picture, terms, loss
+
+    def _plane_terms(self, name: str, field: Any, weights: PlaneWeights, terms: dict[str, Tensor]) -> Tensor:
+        total = torch.zeros((), device=self.device)
+        for term, value in field.planes.regularisers().items():
+            terms[f"{name}_{term}"] = value
+            total = total + getattr(weights, term) * value
+        return total
+
+    def _level_terms(self, level: int, terms: dict[str, Tensor]) -> Tensor:
+        config = self.config
+        mask = self.model.masks(level)
+        terms["rate"] = losses.rate_term(self.model, mask, config.rate_share, self.generator)
+        total = config.lambdas[level] * config.rate_scale * terms["rate"]
+        if config.tmc_binary:
+            terms["tmc_binary"] = losses.binary_term(mask)
+            total = total + config.tmc * terms["tmc_binary"]
+        if config.tmc_smooth:
+            pairs, weights = losses.neighbour_pairs(self.model.anchor_q.cpu(), config.tmc_tau, self.generator)
+            terms["tmc_smooth"] = losses.smooth_term(mask, pairs.to(self.device), weights.to(self.device))
+            total = total + config.tmc * terms["tmc_smooth"]
+        return total
+
+    def _update(self, norm: float, schedule: Schedule, picture: Picture, record: dict[str, Any]) -> None:
+        if norm > self.config.max_gradient_norm:
+            for group in self.optimiser.adam.param_groups:
+                for p in group["params"]:
+                    if p.grad is not None:
+                        p.grad.mul_(self.config.max_gradient_norm / norm)
+        gradient = picture.meta["means2d"].grad
+        growing = self.total and self.iteration <= schedule.grow.stop
+        if growing and gradient is not None and len(picture.gaussians.slots):
+            drawn = (picture.meta["radii"][0] > 0).all(-1)
+            height, width = picture.alpha.shape
+            self.densifier.observe(picture.gaussians, gradient[0], drawn, width, height)
+        self.optimiser.step(self.iteration / max(1, self.total))
+        if self.total and self.iteration in schedule.grow:
+            room = len(self.model.anchor_q) < self.densifier.max_anchors
+            pruned, grown = self.densifier.adjust(self.model, self.optimiser, self.generator, grow=room)
+            record |= {"pruned": pruned, "grown": grown}
+
+    def _draw_level(self, schedule: Schedule) -> tuple[int, tuple[float, float, float]]:
+        if self.iteration < schedule.coarse_end:
+            return 0, (1.0, 0.0, 0.0)
+        if self.config.rollout == "uniform" or self.iteration < schedule.rho_start:
+            probabilities = UNIFORM
+        elif self.config.rollout == "fixed":
+            probabilities = CAPACITY_WEIGHTED
+        else:
+            probabilities = rollout_probabilities(self.rho)
+        return sample_level(probabilities, self.model.level, self.generator), probabilities
+
+    def _next_view(self) -> int:
+        if not self.order:
+            self.order = torch.randperm(len(self.dataset.train), generator=self.generator).tolist()
+        return self.order.pop()
+
+    def _target(self, view: View) -> tuple[Tensor, Tensor, TargetStats]:
+        matrices = (torch.as_tensor(np.array(m, np.float32), device=self.device) for m in (view.viewmat, view.K))
+        image = torch.as_tensor(view.image, device=self.device).float() / 255
+        mask = None if view.mask is None else torch.as_tensor(view.mask, device=self.device).float()
+        return (*matrices, TargetStats(image, mask))
+
+    # -- time limit, evaluation, checkpoints -----------------------------------------------------------------------
+
+    def _fix_iterations(self, start: float) -> None:
+        """Fixes N from the cost of a step at each level, so that the run fills TIME_SHARE of its limit."""
+        assert self.config.max_seconds
+        for _ in range(TIMED_STEPS):
+            before = time.monotonic()
+            self.step()
+            self._step_seconds = time.monotonic() - before
+            self.seconds = time.monotonic() - start
+            if self.seconds >= self.config.max_seconds:
+                break
+        costs = [self._level_cost(level) for level in range(3)]
+        schedule = Schedule(1000)
+        coarse = schedule.coarse_end / 1000
+        mean = coarse * costs[0] + (1 - coarse) * sum(costs) / 3
+        left = TIME_SHARE * self.config.max_seconds - (time.monotonic() - start)
+        left -= CURVE_POINTS * CURVE_VIEWS * sum(costs) / 3
+        self.total = self.iteration + max(1, int(left / (mean * GROWTH_ALLOWANCE)))
+        self.config = replace(self.config, iterations=self.total)
+
+    def _level_cost(self, level: int, repeats: int = 6) -> float:
+        """Median seconds of a full step at `level`, leaving the model, the optimiser and the generators as they are."""
+        states = self.generator.get_state(), self.noise.get_state()
+        rounding = Rounding(noise=self.noise)
+        seconds = []
+        for i in range(repeats):
+            before = time.monotonic()
+            _, _, loss = self._loss(i % len(self.dataset.train), level, Schedule(1), rounding)
+            loss.backward()
+            self.optimiser.gradient_norm()
+            self.optimiser.zero_grad()
+            seconds.append(time.monotonic() - before)
+        self.generator.set_state(states[0])
+        self.noise.set_state(states[1])
+        return sorted(seconds)[repeats // 2] * 1.1  # the update itself is not run here
+
+    def _curve_due(self) -> bool:
+        every = max(1, self.total // CURVE_POINTS)
+        return self.iteration % every == 0 or self.iteration == self.total
+
+    def _evaluate(self) -> list[float]:
+        """Mean held-out PSNR per level on a few views spread over the held-out set (training views if there is none)."""
+        views = self.dataset.test or self.dataset.train
+        views = views[:: max(1, len(views) // CURVE_VIEWS)][:CURVE_VIEWS]
+        psnr = []
+        for level in range(self.model.level + 1):
+            images = (render_image(self.model, level, v.time, v.viewmat, v.K, v.width, v.height) for v in views)
+            psnr.append(float(np.mean([mpsnr(i, v.image, v.mask) for i, v in zip(images, views, strict=True)])))
+        self.curve.append({"iteration": self.iteration, "seconds": self.seconds, "psnr": psnr})
+        return psnr
+
+    def save(self, path: Path) -> None:
+        """Writes the checkpoint with all that resuming needs."""
+        checkpoint.save(
+            path,
+            self.model,
+            {
+                "config": json.dumps(_plain(self.config)),
+                "source": self.dataset.name,
+                "iteration": self.iteration,
+                "total": self.total,
+                "seconds": self.seconds,
+                "rho": self.rho,
+                "skipped": self.skipped,
+                "order": self.order,
+                "curve": json.dumps(self.curve),
+                "optimiser": self.optimiser.state(),
+                "densifier": self.densifier.state(),
+                "generator": self.generator.get_state(),
+                "noise": self.noise.get_state(),
+            },
+        )
+
+    def resume(self, path: Path) -> None:
+        """Goes on from a checkpoint of the same configuration; TrainError if it holds no training state."""
+        model, training = checkpoint.load(path)
+        if "optimiser" not in training:
+            raise TrainError(f"{path}: holds no training state (a decoded or stripped checkpoint); cannot resume from it")
+        self.model = model.to(self.device)
+        self.optimiser = Optimiser(self.model, self.config.rates)
+        self.optimiser.load_state(training["optimiser"])
+        self.densifier.load_state(training["densifier"])
+        self.generator.set_state(training["generator"])
+        self.noise.set_state(training["noise"])
+        for name in ("iteration", "total", "seconds", "rho", "skipped", "order"):
+            setattr(self, name, training[name])
+        self.curve = json.loads(training["curve"])
+
+
+def _plain(config: TrainConfig) -> dict[str, Any]:
+    return json.loads(json.dumps(config, default=lambda value: value.__dict__))
+
+
+def psnr_summary(model: Model, curve: list[dict[str, Any]]) -> str:
+    """The last point of the curve as text, for progress lines."""
+    if not curve:
+        return ""
+    return "/".join(f"{value:.2f}" for value in curve[-1]["psnr"]) + " dB"

@@ -1,0 +1,72 @@
+"""The terms of the loss besides the picture: rate, temporal mask consistency, planes. Each unweighted, by name."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pd4dgs_codec.model.model import Model
+from pd4dgs_codec.model.rate import channel_moments, rate_bits
+from pd4dgs_codec.scene import MASK_THRESHOLD
+
+
+def attribute_bits(model: Model, rows: Tensor, active: Tensor) -> Tensor:
+    """R per scalar [n, 68] of the anchors `rows` (int64 [n]); priors are the moments over the anchors `active`."""
+    parts = []
+    for values, step in (
+        (model.feature, model.steps.feature),
+        (model.scaling_log, model.steps.scaling_log),
+        (model.offset.flatten(1), model.steps.offset),
+    ):
+        mu, sigma = channel_moments(values.index_select(0, active))
+        parts.append(rate_bits(values.index_select(0, rows), mu, sigma, step))
+    return torch.cat(parts, dim=1)
+
+
+def rate_term(model: Model, mask: Tensor, share: float, generator: torch.Generator) -> Tensor:
+    """R_l = 1/|V| sum_i m_i Rbar_i, Rbar_i the mean bits over the 68 scalars of anchor i, estimated on a random share
+    of the anchors; the gradient reaches masks, attributes and the priors' moments. mask: m^(l) [N]."""
+    active = (mask.detach() > MASK_THRESHOLD).nonzero()[:, 0]
+    if len(active) < 2:
+        return mask.sum() * 0.0
+    n = max(1, int(len(active) * share))
+    rows = active[torch.randperm(len(active), generator=generator)[:n]]
+    weighted = mask.index_select(0, rows) * attribute_bits(model, rows, active).mean(1)
+    return weighted.mean() * (len(active) / len(mask))
+
+
+def binary_term(mask: Tensor) -> Tensor:
+    """L_binary = -1/|V| sum (m log2 m + (1 - m) log2(1 - m)); m clamped inside the logarithms."""
+    m = mask.clamp(1e-6, 1 - 1e-6)
+    return -(m * m.log2() + (1 - m) * (1 - m).log2()).mean()
+
+
+def smooth_term(mask: Tensor, pairs: Tensor, weights: Tensor) -> Tensor:
+    """L_smooth = 1/|S| sum w_ij |m_i - m_j| over pairs int64 [2, S] with weights [S]."""
+    if pairs.shape[1] == 0:
+        return mask.sum() * 0.0
+    return (weights * (mask.index_select(0, pairs[0]) - mask.index_select(0, pairs[1])).abs()).mean()
+
+
+def neighbour_pairs(anchor_q: Tensor, tau: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+    """Random pairs of near anchors and their weights exp(-|x_i - x_j| / tau), distances in voxels.
+
+    Anchors that stand close along a space-filling (Morton) curve are near each other in space.
+    """
+    n = len(anchor_q)
+    if n < 2:
+        return torch.zeros(2, 0, dtype=torch.int64), torch.zeros(0)
+    low = anchor_q.amin(0)
+    cells = (anchor_q - low).to(torch.int64)
+    code = torch.zeros(n, dtype=torch.int64)
+    for bit in range(20):
+        for axis in range(3):
+            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+    order = torch.argsort(code)
+    gap = torch.randint(1, min(9, n), (n,), generator=generator)
+    first = torch.arange(n)
+    second = first + gap
+    inside = second < n
+    pairs = torch.stack([order[first[inside]], order[second[inside]]])
+    distance = (anchor_q[pairs[0]] - anchor_q[pairs[1]]).float().norm(dim=1)
+    return pairs, torch.exp(-distance / tau)
