@@ -86,8 +86,8 @@ class Steps:
     feature: float = 0.05
     scaling_log: float = 0.02
     offset: float = 0.05
-    planes_global: float = 0.1
-    planes_local: float = 0.1
+    planes_global: float = 0.05
+    planes_local: float = 0.05
     weights_scaffold: float = 0.005
     weights_global: float = 0.005
     weights_local: float = 0.005

@@ -20,7 +20,18 @@ import torch
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.model import Model
-from pd4dgs_codec.scene import PLANES, Camera, Deformation, Network, Scene, SceneInfo, Steps
+from pd4dgs_codec.scene import (
+    GLOBAL_HEADS,
+    LOCAL_HEADS,
+    PLANES,
+    SCAFFOLD_NETWORKS,
+    Camera,
+    Deformation,
+    Network,
+    Scene,
+    SceneInfo,
+    Steps,
+)
 
 FORMAT = "pd4dgs-checkpoint"
 VERSION = 1
@@ -101,11 +112,12 @@ def _build(content: dict[str, Any]) -> Model:
         planes = tuple(
             {plane: np.zeros((channels, r[b], r[a]), np.float32) for plane, a, b in PLANES} for r in reso
         )
-        heads = sorted({k.split(".")[2] for k in state if k.startswith(f"{prefix}.heads.")}, key=_head_order)
+        # the registry's order, not the dictionary's: optimiser states are matched to parameters by order
+        present = {k.split(".")[2] for k in state if k.startswith(f"{prefix}.heads.")}
+        heads = [head for head in (GLOBAL_HEADS | LOCAL_HEADS) if head in present]
         networks = {"trunk": network(f"{prefix}.trunk")} | {h: network(f"{prefix}.heads.{h}") for h in heads}
         return Deformation(planes, networks)
 
-    names = sorted({k.split(".")[1] for k in state if k.startswith("networks.")})
     scene = Scene(
         info=_info_from_plain(content["info"]),
         steps=Steps(**content["steps"]),
@@ -116,17 +128,13 @@ def _build(content: dict[str, Any]) -> Model:
         scaling_log=np.zeros((n, 6), np.float32),
         offset=np.zeros((n, 10, 3), np.float32),
         mask=(np.full(n, 255, np.uint8),),
-        networks={name: network(f"networks.{name}") for name in names},
+        networks={name: network(f"networks.{name}") for name in SCAFFOLD_NETWORKS},
         global_deformation=deformation("global"),
         local_deformation=deformation("local"),
     )
     model = from_scene(scene)
     model.load_state_dict(content["state"])
     return model
-
-
-def _head_order(name: str) -> int:
-    return [*"position feature offset scaling mean scale quat opacity color".split()].index(name)
 
 
 def _info_to_plain(info: SceneInfo) -> dict[str, Any]:

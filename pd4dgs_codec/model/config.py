@@ -41,12 +41,12 @@ PRESETS: dict[str, ModelConfig] = {
     ),
     "small": ModelConfig(
         DeformationConfig(32, 24, 16, (1, 2), 64, _GLOBAL),
-        DeformationConfig(48, 50, 16, (1, 2), 64, _LOCAL),
+        DeformationConfig(48, 50, 16, (1, 2), 32, _LOCAL),
     ),
     # plane sizes of the paper's backbone: 1.496 MB and 8.007 MB of float32
     "paper": ModelConfig(
-        DeformationConfig(32, 10, 16, (1, 2), 128, _GLOBAL),
-        DeformationConfig(64, 100, 16, (1, 2), 128, _LOCAL),
+        DeformationConfig(32, 10, 16, (1, 2), 64, _GLOBAL),
+        DeformationConfig(64, 100, 16, (1, 2), 64, _LOCAL),
         initial_anchors=26_000,
         max_anchors=50_000,
     ),

@@ -27,12 +27,16 @@ class MLP(nn.Module):
             nn.init.zeros_(self.linears[-1].weight)
             nn.init.zeros_(self.linears[-1].bias)
 
+    def rounded(self, step: float | None) -> list[tuple[Tensor, Tensor]]:
+        """(weight, bias) per layer; with `step`, rounded straight-through."""
+        return [
+            (round_straight_through(lin.weight, step), round_straight_through(lin.bias, step)) for lin in self.linears
+        ]
+
     def forward(self, x: Tensor, step: float | None = None) -> Tensor:
         """x [n, in] -> [n, out]; with `step`, weights and biases are rounded straight-through first."""
-        for i, linear in enumerate(self.linears):
-            if i:
-                x = F.relu(x)
-            x = F.linear(x, round_straight_through(linear.weight, step), round_straight_through(linear.bias, step))
+        for i, (weight, bias) in enumerate(self.rounded(step)):
+            x = F.linear(F.relu(x) if i else x, weight, bias)
         return x
 
     def arrays(self) -> Network:

@@ -18,7 +18,7 @@ from torch.nn import functional as F
 
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.layers import MLP, level_mask
-from pd4dgs_codec.scene import FEATURE_DIM, MASK_THRESHOLD, N_OFFSETS, SceneInfo, Steps
+from pd4dgs_codec.scene import FEATURE_DIM, MASK_THRESHOLD, N_OFFSETS, SCAFFOLD_NETWORKS, SceneInfo, Steps
 
 #: A Gaussian fainter than this never reaches a pixel (the rasteriser's threshold), so its networks are not evaluated.
 MIN_OPACITY = 1.0 / 255.0
@@ -26,11 +26,28 @@ MIN_OPACITY = 1.0 / 255.0
 FRUSTUM_MARGIN = 0.15
 
 
+class Noise:
+    """Uniform noise in -0.5..0.5, cut at random places from one long pool: drawing it afresh would cost 5 ms a step."""
+
+    def __init__(self, seed: int, device: torch.device | str = "cpu", size: int = 1 << 23):
+        generator = torch.Generator().manual_seed(seed)
+        self.pool = (torch.rand(size, generator=generator) - 0.5).to(device)
+        self.generator = generator
+
+    def draw(self, shape: torch.Size) -> Tensor:
+        """A tensor of `shape`."""
+        n = shape.numel()
+        if n > len(self.pool):
+            return torch.rand(shape, generator=self.generator).to(self.pool.device) - 0.5
+        start = int(torch.randint(len(self.pool) - n + 1, (), generator=self.generator))
+        return self.pool[start : start + n].view(shape)
+
+
 @dataclass(frozen=True)
 class Rounding:
     """How a training step imitates quantisation: uniform noise on the anchors' attributes, rounding of planes, weights."""
 
-    noise: torch.Generator | None = None
+    noise: Noise | None = None
     weights: bool = False
 
 
@@ -137,21 +154,20 @@ class Model(nn.Module):
             offset = offset + residual["offset"].view_as(offset) if "offset" in residual else offset
             scaling_log = scaling_log + residual["scaling"] if "scaling" in residual else scaling_log
 
-        weight_step = self.steps.weights_scaffold if rounding.weights else None
         camera_centre = -viewmat[:3, :3].T @ viewmat[:3, 3]
         direction = F.normalize(position - camera_centre, dim=1)
-        inputs = torch.cat([feature, direction], dim=1)
-        raw_opacity = torch.tanh(self.networks["opacity"](inputs, weight_step))
+        opacity, covariance, color = self._decode(torch.cat([feature, direction], dim=1), rounding)
+        raw_opacity = torch.tanh(opacity)
         keep = (raw_opacity.detach() * mask.detach()[:, None] >= MIN_OPACITY).flatten().nonzero()[:, 0]
         owner = torch.div(keep, N_OFFSETS, rounding_mode="floor")
 
-        scaling = scaling_log.exp()
-        covariance = self.networks["covariance"](inputs, weight_step).view(-1, 7).index_select(0, keep)
-        colors = torch.sigmoid(self.networks["color"](inputs, weight_step).view(-1, 3).index_select(0, keep))
+        covariance = covariance.view(-1, 7).index_select(0, keep)
+        colors = torch.sigmoid(color.view(-1, 3).index_select(0, keep))
         opacities = raw_opacity.flatten().index_select(0, keep)
-        scaling_k = scaling.index_select(0, owner)
-        means = position.index_select(0, owner) + offset.view(-1, 3).index_select(0, keep) * scaling_k[:, :3]
-        scales = scaling_k[:, 3:] * torch.sigmoid(covariance[:, :3])
+        per_anchor = torch.cat([position, scaling_log.exp(), mask[:, None]], dim=1)  # one gather for all of it
+        centre, spread, base, gate = per_anchor.index_select(0, owner).split([3, 3, 3, 1], dim=1)
+        means = centre + offset.view(-1, 3).index_select(0, keep) * spread
+        scales = base * torch.sigmoid(covariance[:, :3])
         quats = F.normalize(covariance[:, 3:], dim=1)
         if level >= 2 and self.local_deformation is not None:
             residual = self.local_deformation(
@@ -165,31 +181,49 @@ class Model(nn.Module):
             quats = F.normalize(quats + residual["quat"], dim=1) if "quat" in residual else quats
             opacities = (opacities + residual["opacity"][:, 0]).clamp(0, 1) if "opacity" in residual else opacities
             colors = (colors + residual["color"]).clamp(0, 1) if "color" in residual else colors
-        gate = mask.index_select(0, owner)
         return Gaussians(
             means=means,
             quats=quats,
-            scales=scales * gate[:, None],
-            opacities=opacities * gate,
+            scales=scales * gate,
+            opacities=opacities * gate[:, 0],
             colors=colors,
             slots=rows.index_select(0, owner) * N_OFFSETS + keep % N_OFFSETS,
             anchors=rows,
             raw_opacity=raw_opacity,
         )
 
+    @torch.no_grad()
+    def round_weights(self) -> None:
+        """Planes and weights in place to multiples of their steps: what `Rounding(weights=True)` imitates."""
+        steps = self.steps
+        parts: list[tuple[nn.Module, float]] = [(self.networks, steps.weights_scaffold)]
+        for field, planes, weights in (
+            (self.global_deformation, steps.planes_global, steps.weights_global),
+            (self.local_deformation, steps.planes_local, steps.weights_local),
+        ):
+            if field is not None:
+                parts += [(field.planes, planes), (field.trunk, weights), (field.heads, weights)]
+        for module, step in parts:
+            for parameter in module.parameters():
+                parameter.copy_(torch.round(parameter / step) * step)
+
+    def _decode(self, inputs: Tensor, rounding: Rounding) -> list[Tensor]:
+        """Opacity [n, 10], covariance [n, 70], colour [n, 30] before activation; first layers in one product."""
+        step = self.steps.weights_scaffold if rounding.weights else None
+        networks = [self.networks[name].rounded(step) for name in SCAFFOLD_NETWORKS]
+        if any(len(layers) != 2 for layers in networks):
+            return [self.networks[name](inputs, step) for name in SCAFFOLD_NETWORKS]
+        first = [layers[0] for layers in networks]
+        hidden = F.relu(F.linear(inputs, torch.cat([w for w, _ in first]), torch.cat([b for _, b in first])))
+        parts = hidden.split([len(b) for _, b in first], dim=1)
+        return [F.linear(part, *layers[1]) for part, layers in zip(parts, networks, strict=True)]
+
     def _attribute(self, values: Tensor, rows: Tensor, step: float, rounding: Rounding) -> Tensor:
         picked = values.index_select(0, rows)
-        if rounding.noise is None:
-            return picked
-        noise = torch.rand(picked.shape, generator=rounding.noise, device=picked.device)
-        return picked + (noise - 0.5) * step
+        return picked if rounding.noise is None else picked + rounding.noise.draw(picked.shape) * step
 
 
 def fresh_networks(hidden: int) -> dict[str, MLP]:
     """The scaffold's decoders, untrained: input [feature 32, view direction 3]."""
     width = FEATURE_DIM + 3
-    return {
-        "opacity": MLP((width, hidden, N_OFFSETS)),
-        "covariance": MLP((width, hidden, 7 * N_OFFSETS)),
-        "color": MLP((width, hidden, 3 * N_OFFSETS)),
-    }
+    return {name: MLP((width, hidden, outputs)) for name, outputs in SCAFFOLD_NETWORKS.items()}

@@ -1,0 +1,207 @@
+"""Numba kernels of HexPlane at one time for all points: sampling, forward and backward.
+
+At one time t each time plane is a single row, the blend of two of its rows, so a point costs three bilinear and three
+linear lookups per scale. Channels lie innermost and are walked `LANES` at a time. The backward pass splits scales over
+threads first and points second, each part owning its gradient buffers, which are summed in a fixed order: results are
+bitwise reproducible for a fixed number of parts, and with one part for any number of threads.
+
+Arguments everywhere, all floats of one dtype: grid [cells, C] (of which only the spatial planes are read), C a
+multiple of LANES; rows [n_rows, C], the time planes at the time wanted; reso [S, 4], start [S, 6], row_start [S, 3] of
+`hexplane.PlaneLayout`; points [N, 3] and box [2, 3] in scene units.
+"""
+
+from __future__ import annotations
+
+import numba as nb
+import numpy as np
+
+from pd4dgs_codec.model.simd import INNER, LANES, OUTER, load, splat, store, total
+
+XY, XZ, XT, YZ, YT, ZT = range(6)
+
+
+@nb.njit(**INNER)
+def _locate(p, lower, upper, n):
+    """First cell, fraction and slope d(cell coordinate)/dp of p on an axis of n cells; slope 0 where clamped."""
+    unit = (np.float64(p) - lower) / (np.float64(upper) - lower)
+    if not (unit > 0):  # NaN too
+        return 0, 0.0, 0.0
+    first = max(n - 2, 0)
+    if unit >= 1:
+        return first, float(n - 1 - first), 0.0
+    at = unit * (n - 1)
+    cell = min(int(at), first)
+    return cell, at - cell, (n - 1) / (np.float64(upper) - lower)
+
+
+@nb.njit(**INNER)
+def _linear(table, i, step, f):
+    """(sample, d sample / df) of the lanes at flat offset i and its neighbour `step` further."""
+    a = load(table, i)
+    d = load(table, i + step) - a
+    return a + d * f, d
+
+
+@nb.njit(**INNER)
+def _bilinear(table, i, step_u, step_v, fu, fv):
+    """(sample, d sample / dfu, d sample / dfv)."""
+    a, da = _linear(table, i, step_u, fu)
+    b, db = _linear(table, i + step_v, step_u, fu)
+    return a + (b - a) * fv, da + (db - da) * fv, b - a
+
+
+@nb.njit(**INNER)
+def _add_linear(table, i, step, f, g):
+    """The transpose of `_linear`: adds (1 - f) g and f g."""
+    gf = g * f
+    store(table, i, load(table, i) + (g - gf))
+    store(table, i + step, load(table, i + step) + gf)
+
+
+@nb.njit(**INNER)
+def _add_bilinear(table, i, step_u, step_v, fu, fv, g):
+    gv = g * fv
+    _add_linear(table, i, step_u, fu, g - gv)
+    _add_linear(table, i + step_v, step_u, fu, gv)
+
+
+@nb.njit(**INNER)
+def _address(s, point, reso, start, row_start, box, channels):
+    """Of one point and scale: flat offsets of its six lookups, the steps to its neighbours, fractions and slopes.
+
+    Offsets: xy, xz, yz in the grid and x, y, z in the rows. Steps: to the next cell along x, y, z (0 on an axis of one
+    cell) where it is the inner axis, then as the outer axis of xy, xz, yz.
+    """
+    nx, ny, nz = reso[s, 0], reso[s, 1], reso[s, 2]
+    x, fx, sx = _locate(point[0], box[0, 0], box[1, 0], nx)
+    y, fy, sy = _locate(point[1], box[0, 1], box[1, 1], ny)
+    z, fz, sz = _locate(point[2], box[0, 2], box[1, 2], nz)
+    xy, xz, yz = start[s, XY] + y * nx + x, start[s, XZ] + z * nx + x, start[s, YZ] + z * ny + y
+    rx, ry, rz = row_start[s, 0] + x, row_start[s, 1] + y, row_start[s, 2] + z
+    offsets = (xy * channels, xz * channels, yz * channels, rx * channels, ry * channels, rz * channels)
+    dx, dy, dz = min(nx - 1, 1) * channels, min(ny - 1, 1) * channels, min(nz - 1, 1) * channels
+    return offsets, (dx, dy, dz, dy * nx, dz * nx, dz * ny), (fx, fy, fz), (sx, sy, sz)
+
+
+@nb.njit(**OUTER)
+def sample(out, grid, rows, reso, start, row_start, points, box):
+    """out [N, S * C] = per scale the product of the six planes at `points`."""
+    channels = grid.shape[1]
+    real = grid.dtype.type
+    for n in nb.prange(len(points)):
+        for s in range(len(reso)):
+            (xy, xz, yz, rx, ry, rz), (dx, dy, dz, xy_y, xz_z, yz_z), (fx, fy, fz), _ = _address(
+                s, points[n], reso, start, row_start, box, channels
+            )
+            u, v, w = splat(real(fx)), splat(real(fy)), splat(real(fz))
+            for c in range(0, channels, LANES):
+                a = _bilinear(grid, xy + c, dx, xy_y, u, v)[0]
+                b = _bilinear(grid, xz + c, dx, xz_z, u, w)[0]
+                d = _bilinear(grid, yz + c, dy, yz_z, v, w)[0]
+                e = _linear(rows, rx + c, dx, u)[0] * _linear(rows, ry + c, dy, v)[0] * _linear(rows, rz + c, dz, w)[0]
+                store(out, n * out.shape[1] + s * channels + c, a * b * d * e)
+
+
+@nb.njit(**INNER)
+def _point_gradient(
+    grad, grad_rows, g, g_offset, grid, rows, channels, offsets, steps, fractions, slopes, out, out_offset
+):
+    """Adds one point's gradient at one scale to `grad` and `grad_rows`, and writes that of the point to flat `out`."""
+    xy, xz, yz, rx, ry, rz = offsets
+    dx, dy, dz, xy_y, xz_z, yz_z = steps
+    real = grid.dtype.type
+    u, v, w = splat(real(fractions[0])), splat(real(fractions[1])), splat(real(fractions[2]))
+    gx = gy = gz = splat(real(0))
+    for c in range(0, channels, LANES):
+        a, a_u, a_v = _bilinear(grid, xy + c, dx, xy_y, u, v)
+        b, b_u, b_w = _bilinear(grid, xz + c, dx, xz_z, u, w)
+        d, d_v, d_w = _bilinear(grid, yz + c, dy, yz_z, v, w)
+        e, e_u = _linear(rows, rx + c, dx, u)
+        f, f_v = _linear(rows, ry + c, dy, v)
+        h, h_w = _linear(rows, rz + c, dz, w)
+        # each factor's gradient is the product of the others: prefixes from the left times suffixes from the right
+        suffix_h = load(g, g_offset + c)
+        suffix_f = suffix_h * h
+        suffix_e = suffix_f * f
+        suffix_d = suffix_e * e
+        suffix_b = suffix_d * d
+        g_a, g_b = suffix_b * b, suffix_b * a
+        prefix = a * b
+        g_d = suffix_d * prefix
+        prefix = prefix * d
+        g_e = suffix_e * prefix
+        prefix = prefix * e
+        g_f = suffix_f * prefix
+        g_h = suffix_h * (prefix * f)
+        gx = gx + g_a * a_u + g_b * b_u + g_e * e_u
+        gy = gy + g_a * a_v + g_d * d_v + g_f * f_v
+        gz = gz + g_b * b_w + g_d * d_w + g_h * h_w
+        _add_bilinear(grad, xy + c, dx, xy_y, u, v, g_a)
+        _add_bilinear(grad, xz + c, dx, xz_z, u, w, g_b)
+        _add_bilinear(grad, yz + c, dy, yz_z, v, w, g_d)
+        _add_linear(grad_rows, rx + c, dx, u, g_e)
+        _add_linear(grad_rows, ry + c, dy, v, g_f)
+        _add_linear(grad_rows, rz + c, dz, w, g_h)
+    out[out_offset] = total(gx) * real(slopes[0])
+    out[out_offset + 1] = total(gy) * real(slopes[1])
+    out[out_offset + 2] = total(gz) * real(slopes[2])
+
+
+@nb.njit(**OUTER)
+def sample_backward(grad, extra, grad_rows, grad_points, g, grid, rows, reso, start, row_start, points, box):
+    """The transpose of `sample`. g: [N, S * C]. Results, to be given zeroed except grad_points:
+
+    grad [cells, C], of which the spatial planes are filled; extra [parts - 1, n_spatial, C], scratch; grad_rows
+    [parts, n_rows, C], summed into grad_rows[0]; grad_points [S, N, 3], per scale.
+    """
+    channels, parts, n_points = grid.shape[1], len(grad_rows), len(points)
+    for task in nb.prange(len(reso) * parts):
+        s, part = task // parts, task % parts
+        own = grad if part == 0 else extra[part - 1]
+        flat = grad_points[s].reshape(-1)
+        for n in range(n_points * part // parts, n_points * (part + 1) // parts):
+            offsets, steps, fractions, slopes = _address(s, points[n], reso, start, row_start, box, channels)
+            at = n * g.shape[1] + s * channels
+            _point_gradient(
+                own, grad_rows[part], g, at, grid, rows, channels, offsets, steps, fractions, slopes, flat, 3 * n
+            )
+    for part in range(1, parts):
+        grad_rows[0] += grad_rows[part]
+        for cell in nb.prange(extra.shape[1]):
+            for c in range(channels):
+                grad[cell, c] += extra[part - 1, cell, c]
+
+
+@nb.njit(error_model="numpy", cache=True)  # exact arithmetic: the rounding must be that of the codec's quantiser
+def collapse(rows, grid, reso, start, row_start, t, step):
+    """rows [n_rows, C] = the time planes of `grid` at normalised time t, rounded to multiples of `step` if step > 0."""
+    real = grid.dtype.type
+    for s in range(len(reso)):
+        first, f, _ = _locate(t, 0.0, 1.0, reso[s, 3])
+        step_t = min(reso[s, 3] - 1, 1)
+        for axis, plane in enumerate((XT, YT, ZT)):
+            n = reso[s, axis]
+            for i in range(n):
+                cell = start[s, plane] + first * n + i
+                for c in range(grid.shape[1]):
+                    a, b = grid[cell, c], grid[cell + step_t * n, c]
+                    if step > 0:
+                        a, b = np.rint(a / real(step)) * real(step), np.rint(b / real(step)) * real(step)
+                    rows[row_start[s, axis] + i, c] = a + (b - a) * real(f)
+
+
+@nb.njit(error_model="numpy", cache=True)
+def collapse_backward(grad, grad_rows, reso, start, row_start, t):
+    """The transpose of `collapse` (rounding passes the gradient): adds to the time planes of grad [cells, C]."""
+    real = grad.dtype.type
+    for s in range(len(reso)):
+        first, f, _ = _locate(t, 0.0, 1.0, reso[s, 3])
+        step_t = min(reso[s, 3] - 1, 1)
+        for axis, plane in enumerate((XT, YT, ZT)):
+            n = reso[s, axis]
+            for i in range(n):
+                cell = start[s, plane] + first * n + i
+                for c in range(grad.shape[1]):
+                    value = grad_rows[row_start[s, axis] + i, c]
+                    grad[cell, c] += value * real(1 - f)
+                    grad[cell + step_t * n, c] += value * real(f)

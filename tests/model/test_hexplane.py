@@ -1,0 +1,214 @@
+"""HexPlane: the kernels against plain torch, against the definition, and on hard input."""
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+numba = pytest.importorskip("numba")
+
+from pd4dgs_codec.errors import DataError, TrainError  # noqa: E402
+from pd4dgs_codec.model.hexplane import HexPlane, _Round, _Sample, sample_reference  # noqa: E402
+from pd4dgs_codec.model.plane_layout import PlaneLayout  # noqa: E402
+from pd4dgs_codec.model.plane_regularisers import TERMS, regularisers, regularisers_reference  # noqa: E402
+from pd4dgs_codec.scene import PLANES  # noqa: E402
+
+BOX = np.array([[-1.0, -2.0, 0.5], [1.0, 3.0, 4.5]], np.float32)
+SHAPES = [((7, 5, 9, 4), 8, (1, 2)), ((7, 1, 9, 1), 24, (1, 2, 3)), ((1, 2, 3, 2), 16, (1,))]
+
+
+def field(resolution=(7, 5, 9, 4), channels=8, multires=(1, 2), dtype=torch.float64, seed=0):
+    plane = HexPlane(BOX, resolution, channels, multires).to(dtype)
+    with torch.no_grad():
+        plane.grid.normal_(generator=torch.Generator().manual_seed(seed))
+    return plane
+
+
+def points_in(n, spread=1.3, dtype=torch.float64, seed=1):
+    """Random points, some outside the box when spread > 1."""
+    unit = torch.rand(n, 3, generator=torch.Generator().manual_seed(seed), dtype=dtype) - 0.5
+    low, high = torch.tensor(BOX, dtype=dtype)
+    return ((low + high) / 2 + unit * spread * (high - low)).requires_grad_()
+
+
+def value_and_gradients(plane, features, points):
+    weights = torch.linspace(-1, 1, features.numel(), dtype=features.dtype).view_as(features)
+    return features.detach(), *torch.autograd.grad((features * weights).sum(), [plane.grid, points])
+
+
+@pytest.mark.parametrize("t", [0.0, 0.37, 1.0, -3.0, 7.0])
+@pytest.mark.parametrize("shape", SHAPES)
+def test_kernel_equals_reference(shape, t):
+    plane, points = field(*shape), points_in(200)
+    fast = value_and_gradients(plane, plane(points, t), points)
+    slow = value_and_gradients(plane, sample_reference(plane.grid, plane.layout, plane.box, points, t), points)
+    for found, expected in zip(fast, slow, strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-12)
+    assert fast[2].abs().sum() > 0
+
+
+def test_float32_is_as_close_as_float32_allows():
+    exact, single = field(), field().float()
+    points = points_in(300)
+    narrow = points.detach().float().requires_grad_()
+    a = value_and_gradients(exact, exact(narrow.double(), 0.6), narrow)
+    b = value_and_gradients(single, single(narrow, 0.6), narrow)
+    for expected, found in zip(a, b, strict=True):
+        assert (expected - found).abs().max() < 2e-6 * expected.abs().max()
+
+
+def test_gradcheck():
+    plane = field((3, 2, 3, 3), 8, (1,))
+    points = points_in(4, spread=0.9)
+    layout, box = plane.layout, plane.box.double()
+    torch.autograd.gradcheck(lambda g, p: _Sample.apply(g, layout, box, p, 0.3, None), (plane.grid, points), eps=1e-6)
+    torch.autograd.gradcheck(lambda g, p: sample_reference(g, layout, box, p, 0.3), (plane.grid, points), eps=1e-6)
+
+
+def test_at_the_nodes_it_is_the_product_of_plane_cells():
+    """Orientation, axis order, normalisation of points and time, concatenation: from the definition alone."""
+    reso = (3, 4, 5, 6)
+    plane = field(reso, 8, (1, 2), torch.float32)
+    arrays = plane.plane_arrays()
+    for cell in [(0, 0, 0, 0), (2, 3, 4, 5), (1, 2, 3, 4), (2, 0, 1, 3)]:
+        unit = np.array(cell) / (np.array(reso) - 1)
+        point = torch.tensor(BOX[0] + unit[:3] * (BOX[1] - BOX[0]), dtype=torch.float32)[None]
+        found = plane(point, float(unit[3]))[0, :8].detach().numpy()
+        expected = np.prod([arrays[0][name][:, cell[b], cell[a]] for name, a, b in PLANES], axis=0)
+        np.testing.assert_allclose(found, expected, rtol=1e-4, atol=1e-5)
+
+
+def test_plane_arrays_round_trip():
+    plane = field(dtype=torch.float32)
+    arrays = plane.plane_arrays()
+    assert arrays[1]["xt"].shape == (8, 4, 14) and arrays[1]["xt"].dtype == np.float32
+    other = HexPlane.from_plane_arrays(BOX, arrays)
+    assert torch.equal(other.grid, plane.grid)
+    points = points_in(50, dtype=torch.float32)
+    assert torch.equal(other(points, 0.2), plane(points, 0.2))
+
+
+def test_start_values():
+    plane = HexPlane(BOX, (4, 4, 4, 3), 8, generator=torch.Generator().manual_seed(3))
+    for scale in plane.plane_arrays():
+        for name, array in scale.items():
+            assert (array == 1).all() if "t" in name else 0.1 <= array.min() < array.max() <= 0.5
+
+
+def test_one_time_per_point_and_odd_channels_use_the_reference():
+    plane, points = field(), points_in(6)
+    times = torch.linspace(-0.2, 1.2, 6, dtype=torch.float64)
+    rows = [plane(points[i : i + 1], float(times[i])) for i in range(6)]
+    torch.testing.assert_close(plane(points, times), torch.cat(rows))
+    torch.testing.assert_close(plane(points, times[2]), plane(points, float(times[2])))
+    odd = field(channels=5)
+    assert odd(points, 0.5).shape == (6, odd.out_features) == (6, 10)
+    assert set(odd.regularisers()) == set(TERMS)
+
+
+@pytest.mark.parametrize("channels", [8, 5])
+def test_rounding_is_straight_through(channels):
+    plane, points, step = field(channels=channels), points_in(100), 0.25
+    rounded = field(channels=channels)
+    with torch.no_grad():
+        rounded.grid.copy_(_Round.apply(plane.grid, step))
+    assert not torch.equal(rounded.grid, plane.grid)
+    found = value_and_gradients(plane, plane(points, 0.4, step=step), points)
+    expected = value_and_gradients(rounded, rounded(points, 0.4), points)
+    for a, b in zip(found, expected, strict=True):
+        torch.testing.assert_close(a, b, rtol=1e-10, atol=1e-12)
+
+
+@pytest.mark.parametrize("channels", [8, 5])
+def test_non_finite_points_go_to_the_border(channels):
+    plane = field(channels=channels)
+    low, high = torch.tensor(BOX, dtype=torch.float64)
+    bad = torch.tensor([[torch.nan, torch.inf, -torch.inf]], dtype=torch.float64, requires_grad=True)
+    corner = torch.stack([low[0], high[1], low[2]])[None].requires_grad_()
+    features = plane(bad, 0.5)
+    torch.testing.assert_close(features, plane(corner, 0.5))
+    assert torch.autograd.grad(features.sum(), bad)[0].eq(0).all()
+    assert torch.isfinite(plane(corner, float("nan"))).all()
+
+
+def test_no_points():
+    plane = field()
+    points = torch.zeros(0, 3, dtype=torch.float64, requires_grad=True)
+    features = plane(points, 0.5)
+    assert features.shape == (0, 16)
+    features.sum().backward()
+    assert plane.grid.grad.eq(0).all() and points.grad.shape == (0, 3)
+
+
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="needs two threads")
+@pytest.mark.parametrize("multires", [(1,), (1, 2)])
+def test_threads(multires):
+    """Bitwise repeatable; one scale on two threads is split over points, two scales are not and so equal one thread."""
+    plane, points = field(multires=multires, dtype=torch.float32), points_in(501, dtype=torch.float32)
+    before = numba.get_num_threads()
+    runs = {}
+    try:
+        for name, threads in (("one", 1), ("two", 2), ("again", 2)):
+            numba.set_num_threads(threads)
+            runs[name] = value_and_gradients(plane, plane(points, 0.3), points)
+    finally:
+        numba.set_num_threads(before)
+    for one, two, again in zip(*runs.values(), strict=True):
+        assert torch.equal(two, again)
+        assert torch.equal(one, two) if len(multires) == 2 else torch.allclose(one, two, rtol=1e-4, atol=1e-5)
+
+
+@pytest.mark.parametrize("shape", [*SHAPES, ((4, 3, 6, 3), 8, (1,))])
+def test_regularisers_equal_reference(shape):
+    plane = field(*shape)
+    results = []
+    for form in (regularisers, regularisers_reference):
+        terms = form(plane.grid, plane.layout)
+        total = sum(w * terms[name] for w, name in zip((0.3, 0.7, -0.2), TERMS, strict=True))
+        results.append((*(terms[name].detach() for name in TERMS), torch.autograd.grad(total, plane.grid)[0]))
+    for found, expected in zip(*results, strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-13)
+
+
+def test_regularisers_by_definition():
+    """A parabola a i^2 along an axis has second difference 2 a; a ramp has none; time planes at 1 are free."""
+    plane = HexPlane(BOX, (6, 5, 4, 7), 8, (1,)).double()
+    (views,) = plane.layout.views(plane.grid.detach())
+    for name in ("xy", "xz", "yz"):
+        views[name].copy_(3 * torch.arange(views[name].shape[1], dtype=torch.float64)[None, :, None])
+    assert all(abs(float(v.detach())) < 1e-20 for v in plane.regularisers().values())
+    views["xy"].copy_(0.5 * torch.arange(6, dtype=torch.float64)[None, :, None] ** 2)
+    views["yz"].copy_(1.5 * torch.arange(4, dtype=torch.float64)[:, None, None] ** 2)
+    views["xt"].copy_(torch.arange(7, dtype=torch.float64)[:, None, None] ** 2)
+    terms = {name: term.detach() for name, term in plane.regularisers().items()}
+    assert float(terms["plane_smooth"]) == pytest.approx(1.0 + 9.0)
+    assert float(terms["time_smooth"]) == pytest.approx(4.0)
+    assert float(terms["time_l1"]) == pytest.approx(np.abs(1 - np.arange(7) ** 2).mean())
+
+
+def test_layout_covers_every_cell_once():
+    layout = PlaneLayout.build([(2, 3, 4, 5), (4, 6, 8, 5)])
+    grid = torch.zeros(layout.n_cells, 1)
+    for scale in layout.views(grid):
+        for view in scale.values():
+            view += 1
+    assert grid.eq(1).all() and layout.n_spatial == 6 + 8 + 12 + 24 + 32 + 48
+
+
+def test_errors():
+    arrays = field(dtype=torch.float32).plane_arrays()
+    plane = HexPlane(BOX, (7, 5, 9, 4), 8)
+    with pytest.raises(DataError, match="1"):
+        plane.load_plane_arrays(arrays[:1])
+    wrong = ({**arrays[0], "yz": arrays[0]["yz"][:, 1:]}, arrays[1])
+    with pytest.raises(DataError, match="yz of scale 0"):
+        plane.load_plane_arrays(wrong)
+    with pytest.raises(DataError, match="yz"):
+        HexPlane.from_plane_arrays(BOX, wrong)
+    with pytest.raises(DataError, match="planes"):
+        HexPlane.from_plane_arrays(BOX, ({"xy": arrays[0]["xy"]},))
+    with pytest.raises(DataError, match="lower < upper"):
+        HexPlane(BOX[::-1], (4, 4, 4, 4))
+    with pytest.raises(TrainError, match="resolution"):
+        HexPlane(BOX, (4, 4, 0, 4))
+    with pytest.raises(TrainError, match=r"\[N, 3\]"):
+        plane(torch.zeros(4, 2), 0.5)

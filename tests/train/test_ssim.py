@@ -1,0 +1,140 @@
+"""The picture's loss: the kernels against plain torch, both against the definition."""
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+numba = pytest.importorskip("numba")
+
+from pd4dgs_codec.errors import TrainError  # noqa: E402
+from pd4dgs_codec.train.ssim import TargetStats, image_loss, image_loss_reference  # noqa: E402
+
+
+def pair(height, width, dtype=torch.float64, masked=False, seed=0):
+    """(render that wants a gradient, training image, mask or None)."""
+    generator = torch.Generator().manual_seed(seed)
+    target = torch.rand(height, width, 3, generator=generator, dtype=dtype)
+    noise = torch.randn(height, width, 3, generator=generator, dtype=dtype)
+    mask = torch.rand(height, width, generator=generator) > 0.4 if masked else None
+    if mask is not None:
+        mask[0, 0] = True
+    return (target + 0.2 * noise).requires_grad_(), target, mask
+
+
+def terms_and_gradient(terms, image, weights=(0.8, 0.2)):
+    total = sum(w * term for w, term in zip(weights, terms, strict=True))
+    return *(term.detach() for term in terms), torch.autograd.grad(total, image)[0]
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("size", [(37, 41), (1, 1), (3, 100), (24, 16)])
+def test_kernel_equals_reference(size, masked):
+    image, target, mask = pair(*size, masked=masked)
+    stats = TargetStats(target, mask)
+    for weights in ((0.8, 0.2), (0.0, 1.0)):
+        fast = terms_and_gradient(image_loss(image, stats), image, weights)
+        slow = terms_and_gradient(image_loss_reference(image, target, stats.weights), image, weights)
+        for found, expected in zip(fast, slow, strict=True):
+            torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-12)
+
+
+def test_float32():
+    image, target, mask = pair(30, 20, torch.float32, masked=True)
+    stats = TargetStats(target, mask)
+    fast = terms_and_gradient(image_loss(image, stats), image)
+    wide = image.detach().double().requires_grad_()
+    exact = terms_and_gradient(image_loss(wide, TargetStats(target.double(), mask)), wide)
+    assert fast[0].dtype == fast[2].dtype == torch.float32
+    for found, expected in zip(fast, exact, strict=True):
+        assert (found - expected).abs().max() < 1e-5 * expected.abs().max()
+
+
+def test_gradcheck():
+    image, target, mask = pair(4, 5, masked=True)
+    stats = TargetStats(target, mask)
+    torch.autograd.gradcheck(lambda x: image_loss(x, stats), (image,), eps=1e-6)
+
+
+def test_by_definition():
+    """SSIM of one pixel at a time, each window written out with its zero padding."""
+    image, target, mask = pair(9, 13, masked=True)
+    x, y = (np.pad(a.detach().numpy(), ((5, 5), (5, 5), (0, 0))) for a in (image, target))
+    taps = np.exp(-(np.arange(-5.0, 6.0) ** 2) / (2 * 1.5**2))
+    window = np.outer(taps, taps) / taps.sum() ** 2
+    l1, dissimilarity, count = 0.0, 0.0, 0
+    for j, i in zip(*np.nonzero(mask.numpy()), strict=True):
+        for c in range(3):
+            a, b = x[j : j + 11, i : i + 11, c], y[j : j + 11, i : i + 11, c]
+            ma, mb = (window * a).sum(), (window * b).sum()
+            va, vb = (window * a * a).sum() - ma**2, (window * b * b).sum() - mb**2
+            cov = (window * a * b).sum() - ma * mb
+            ssim = (2 * ma * mb + 1e-4) * (2 * cov + 9e-4) / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4))
+            l1, dissimilarity, count = l1 + abs(a[5, 5] - b[5, 5]), dissimilarity + 1 - ssim, count + 1
+    found = [float(term.detach()) for term in image_loss(image, TargetStats(target, mask))]
+    assert found == pytest.approx([l1 / count, dissimilarity / count], rel=1e-9)
+
+
+def test_equal_images_cost_nothing():
+    _, target, _ = pair(20, 30)
+    image = target.clone().requires_grad_()
+    l1, dissimilarity, gradient = terms_and_gradient(image_loss(image, TargetStats(target)), image)
+    assert float(l1) == 0 and abs(float(dissimilarity)) < 1e-12 and gradient.abs().max() < 1e-12
+
+
+def test_masked_pixels_out_of_reach_do_not_matter():
+    image, target, _ = pair(16, 40)
+    mask = torch.ones(16, 40)
+    mask[:, 20:] = 0
+    stats = TargetStats(target, mask)
+    before = terms_and_gradient(image_loss(image, stats), image)
+    changed = image.detach().clone()
+    changed[:, 25:] += 1
+    changed.requires_grad_()
+    after = terms_and_gradient(image_loss(changed, stats), changed)
+    torch.testing.assert_close(after[:2], before[:2], rtol=0, atol=1e-14)
+    assert after[2][:, 25:].eq(0).all() and not torch.equal(after[2][:, 20:25], torch.zeros(16, 5, 3))
+
+
+def test_kept_moments_change_nothing():
+    image, target, mask = pair(18, 22, masked=True)
+    kept = TargetStats(target, mask, keep=True)
+    expected = terms_and_gradient(image_loss(image, TargetStats(target, mask)), image)
+    for _ in range(2):
+        found = terms_and_gradient(image_loss(image, kept), image)
+        assert all(torch.equal(a, b) for a, b in zip(found, expected, strict=True))
+
+
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="needs two threads")
+def test_threads_change_nothing():
+    image, target, mask = pair(33, 50, torch.float32, masked=True)
+    before = numba.get_num_threads()
+    runs = []
+    try:
+        for threads in (1, 2):
+            numba.set_num_threads(threads)
+            runs.append(terms_and_gradient(image_loss(image, TargetStats(target, mask)), image))
+    finally:
+        numba.set_num_threads(before)
+    assert all(torch.equal(a, b) for a, b in zip(*runs, strict=True))
+
+
+def test_hard_input():
+    image, target, _ = pair(12, 14)
+    nothing = terms_and_gradient(image_loss(image, TargetStats(target, torch.zeros(12, 14))), image)
+    assert all(term.eq(0).all() for term in nothing)
+    with torch.no_grad():
+        image[3, 4, 1] = torch.nan
+    broken = terms_and_gradient(image_loss(image, TargetStats(target)), image)
+    assert broken[0].isnan() and broken[1].isnan() and broken[2][3, 4, 1].isnan()
+    transposed = image_loss(target.transpose(0, 1), TargetStats(target.transpose(0, 1)))
+    assert float(transposed[0]) == 0
+
+
+def test_errors():
+    _, target, _ = pair(12, 14)
+    with pytest.raises(TrainError, match=r"\(5, 14, 3\)"):
+        image_loss(target[:5], TargetStats(target))
+    with pytest.raises(TrainError, match="mask"):
+        TargetStats(target, torch.ones(14, 12))
+    with pytest.raises(TrainError, match="float"):
+        TargetStats((255 * target).to(torch.uint8))
