@@ -53,8 +53,17 @@ def render(
 
 
 @torch.no_grad()
-def render_image(model: Model, level: int, t: float, viewmat: np.ndarray, K: np.ndarray, width: int, height: int) -> np.ndarray:
+def render_image(
+    model: Model,
+    level: int,
+    t: float,
+    viewmat: np.ndarray,
+    K: np.ndarray,
+    width: int,
+    height: int,
+    rounding: Rounding = EXACT,
+) -> np.ndarray:
     """The picture as float32 [H, W, 3] in 0..1."""
     device = model.feature.device
     camera = (torch.as_tensor(np.array(m, np.float32), device=device) for m in (viewmat, K))
-    return render(model, level, t, *camera, width, height).image.clamp(0, 1).cpu().numpy()
+    return render(model, level, t, *camera, width, height, rounding).image.clamp(0, 1).cpu().numpy()

@@ -40,12 +40,15 @@ class TrainConfig:
     """Everything that decides a run besides the data. Each ablation of the method is one field."""
 
     preset: str = "small"
+    source: str = ""  #: what `data.load` was given; stored so that a resumed run meets the same data
+    downscale: int = 1
+    holdout: int = 8
     iterations: int | None = None  #: None: the preset's default, or what fits `max_seconds`
     max_seconds: float | None = None
     seed: int = 0
     lambdas: tuple[float, float, float] = (0.04, 0.01, 0.00025)  #: rate weight per level
     rate_scale: float = 0.1  #: multiplies every lambda; 1 is the paper's operating point
-    rate_share: float = 0.2  #: share of the anchors on which a step estimates the rate
+    rate_share: float = 0.05  #: share of the anchors on which a step estimates the rate
     tmc: float = 0.01
     tmc_binary: bool = True
     tmc_smooth: bool = True

@@ -18,11 +18,11 @@ import torch
 from torch import Tensor
 
 from pd4dgs_codec.data.dataset import Dataset, View
-from pd4dgs_codec.errors import TrainError
+from pd4dgs_codec.errors import RenderError, TrainError
 from pd4dgs_codec.metrics.image import mpsnr
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import PRESETS
-from pd4dgs_codec.model.model import Model, Rounding
+from pd4dgs_codec.model.model import Model, Noise, Rounding
 from pd4dgs_codec.render.picture import Picture, render, render_image
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train import losses
@@ -53,7 +53,7 @@ class Trainer:
         self.optimiser = Optimiser(self.model, config.rates)
         self.densifier = Densifier(self.model, config.grow_threshold, preset.max_anchors)
         self.generator = torch.Generator().manual_seed(config.seed)
-        self.noise = torch.Generator(device=self.device).manual_seed(config.seed + 1)
+        self.noise = Noise(config.seed + 1, self.device)
         self.iteration = 0
         self.total = config.iterations or (0 if config.max_seconds else DEFAULT_ITERATIONS[config.preset])
         self.rho = 0.0
@@ -62,7 +62,7 @@ class Trainer:
         self.curve: list[dict[str, Any]] = []
         self.order: list[int] = []
         self._targets = [self._target(view) for view in dataset.train]
-        self._step_seconds = 0.0
+        self.neighbours: losses.Neighbours | None = None  #: rebuilt when anchors come or go
 
     # -- the run ---------------------------------------------------------------------------------------------------
 
@@ -97,6 +97,8 @@ class Trainer:
         finally:
             if stream:
                 stream.close()
+        if self.iteration >= self.total:
+            self.model.round_weights()  # the file holds rounded values; so does the finished checkpoint
         self.save(output)
 
     def step(self) -> dict[str, Any]:
@@ -108,14 +110,8 @@ class Trainer:
             noise=self.noise if self.config.noise and self.iteration >= schedule.coarse_end else None,
             weights=self.iteration >= schedule.rounding,
         )
-        picture, terms, loss = self._loss(index, level, schedule, rounding)
-        record: dict[str, Any] = {"iteration": self.iteration, "level": level, "loss": float(loss.detach())}
-        record |= {name: float(value.detach()) for name, value in terms.items()}
-        loss.backward()
-        record["gradient_norm"] = norm = self.optimiser.gradient_norm()
-        if math.isfinite(norm) and math.isfinite(record["loss"]):
-            self._update(norm, schedule, picture, record)
-        else:
+        record: dict[str, Any] = {"iteration": self.iteration, "level": level}
+        if not self._learn(index, level, schedule, rounding, record):
             self.skipped += 1
             record["skipped"] = self.skipped
         self.optimiser.zero_grad()
@@ -134,6 +130,22 @@ class Trainer:
             return [int((self.model.masks(level) > MASK_THRESHOLD).sum()) for level in range(3)]
 
     # -- parts of a step -------------------------------------------------------------------------------------------
+
+    def _learn(self, index: int, level: int, schedule: Schedule, rounding: Rounding, record: dict[str, Any]) -> bool:
+        """Loss, gradient, update; False, with nothing changed, if any of it is not finite."""
+        try:
+            picture, terms, loss = self._loss(index, level, schedule, rounding)
+        except RenderError as error:  # the rasteriser refuses NaN and infinite input
+            record["refused"] = str(error)
+            return False
+        record["loss"] = float(loss.detach())
+        record |= {name: float(value.detach()) for name, value in terms.items()}
+        loss.backward()
+        record["gradient_norm"] = norm = self.optimiser.gradient_norm()
+        if not (math.isfinite(norm) and math.isfinite(record["loss"])):
+            return False
+        self._update(norm, schedule, picture, record)
+        return True
 
     def _loss(self, index: int, level: int, schedule: Schedule, rounding: Rounding) -> tuple[Picture, dict, Tensor]:
         config, view = self.config, self.dataset.train[index]
@@ -174,7 +186,9 @@ class Trainer:
             terms["tmc_binary"] = losses.binary_term(mask)
             total = total + config.tmc * terms["tmc_binary"]
         if config.tmc_smooth:
-            pairs, weights = losses.neighbour_pairs(self.model.anchor_q.cpu(), config.tmc_tau, self.generator)
+            if self.neighbours is None:
+                self.neighbours = losses.Neighbours(self.model.anchor_q)
+            pairs, weights = self.neighbours.draw(config.tmc_tau, self.generator)
             terms["tmc_smooth"] = losses.smooth_term(mask, pairs.to(self.device), weights.to(self.device))
             total = total + config.tmc * terms["tmc_smooth"]
         return total
@@ -195,6 +209,7 @@ class Trainer:
         if self.total and self.iteration in schedule.grow:
             room = len(self.model.anchor_q) < self.densifier.max_anchors
             pruned, grown = self.densifier.adjust(self.model, self.optimiser, self.generator, grow=room)
+            self.neighbours = None
             record |= {"pruned": pruned, "grown": grown}
 
     def _draw_level(self, schedule: Schedule) -> tuple[int, tuple[float, float, float]]:
@@ -225,9 +240,7 @@ class Trainer:
         """Fixes N from the cost of a step at each level, so that the run fills TIME_SHARE of its limit."""
         assert self.config.max_seconds
         for _ in range(TIMED_STEPS):
-            before = time.monotonic()
             self.step()
-            self._step_seconds = time.monotonic() - before
             self.seconds = time.monotonic() - start
             if self.seconds >= self.config.max_seconds:
                 break
@@ -242,7 +255,7 @@ class Trainer:
 
     def _level_cost(self, level: int, repeats: int = 6) -> float:
         """Median seconds of a full step at `level`, leaving the model, the optimiser and the generators as they are."""
-        states = self.generator.get_state(), self.noise.get_state()
+        states = self.generator.get_state(), self.noise.generator.get_state()
         rounding = Rounding(noise=self.noise)
         seconds = []
         for i in range(repeats):
@@ -253,7 +266,7 @@ class Trainer:
             self.optimiser.zero_grad()
             seconds.append(time.monotonic() - before)
         self.generator.set_state(states[0])
-        self.noise.set_state(states[1])
+        self.noise.generator.set_state(states[1])
         return sorted(seconds)[repeats // 2] * 1.1  # the update itself is not run here
 
     def _curve_due(self) -> bool:
@@ -265,8 +278,11 @@ class Trainer:
         views = self.dataset.test or self.dataset.train
         views = views[:: max(1, len(views) // CURVE_VIEWS)][:CURVE_VIEWS]
         psnr = []
+        rounding = Rounding(weights=self.iteration > Schedule(self.total).rounding)
         for level in range(self.model.level + 1):
-            images = (render_image(self.model, level, v.time, v.viewmat, v.K, v.width, v.height) for v in views)
+            images = (
+                render_image(self.model, level, v.time, v.viewmat, v.K, v.width, v.height, rounding) for v in views
+            )
             psnr.append(float(np.mean([mpsnr(i, v.image, v.mask) for i, v in zip(images, views, strict=True)])))
         self.curve.append({"iteration": self.iteration, "seconds": self.seconds, "psnr": psnr})
         return psnr
@@ -289,7 +305,7 @@ class Trainer:
                 "optimiser": self.optimiser.state(),
                 "densifier": self.densifier.state(),
                 "generator": self.generator.get_state(),
-                "noise": self.noise.get_state(),
+                "noise": self.noise.generator.get_state(),
             },
         )
 
@@ -303,7 +319,7 @@ class Trainer:
         self.optimiser.load_state(training["optimiser"])
         self.densifier.load_state(training["densifier"])
         self.generator.set_state(training["generator"])
-        self.noise.set_state(training["noise"])
+        self.noise.generator.set_state(training["noise"])
         for name in ("iteration", "total", "seconds", "rho", "skipped", "order"):
             setattr(self, name, training[name])
         self.curve = json.loads(training["curve"])

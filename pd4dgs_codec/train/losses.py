@@ -48,25 +48,27 @@ def smooth_term(mask: Tensor, pairs: Tensor, weights: Tensor) -> Tensor:
     return (weights * (mask.index_select(0, pairs[0]) - mask.index_select(0, pairs[1])).abs()).mean()
 
 
-def neighbour_pairs(anchor_q: Tensor, tau: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-    """Random pairs of near anchors and their weights exp(-|x_i - x_j| / tau), distances in voxels.
+class Neighbours:
+    """Draws pairs of near anchors: those that stand close along a space-filling (Morton) curve."""
 
-    Anchors that stand close along a space-filling (Morton) curve are near each other in space.
-    """
-    n = len(anchor_q)
-    if n < 2:
-        return torch.zeros(2, 0, dtype=torch.int64), torch.zeros(0)
-    low = anchor_q.amin(0)
-    cells = (anchor_q - low).to(torch.int64)
-    code = torch.zeros(n, dtype=torch.int64)
-    for bit in range(20):
-        for axis in range(3):
-            code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-    order = torch.argsort(code)
-    gap = torch.randint(1, min(9, n), (n,), generator=generator)
-    first = torch.arange(n)
-    second = first + gap
-    inside = second < n
-    pairs = torch.stack([order[first[inside]], order[second[inside]]])
-    distance = (anchor_q[pairs[0]] - anchor_q[pairs[1]]).float().norm(dim=1)
-    return pairs, torch.exp(-distance / tau)
+    def __init__(self, anchor_q: Tensor):
+        self.anchor_q = anchor_q.cpu().to(torch.int64)
+        n = len(anchor_q)
+        cells = self.anchor_q - self.anchor_q.amin(0) if n else self.anchor_q
+        code = torch.zeros(n, dtype=torch.int64)
+        for bit in range(20):
+            for axis in range(3):
+                code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+        self.order = torch.argsort(code)
+
+    def draw(self, tau: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
+        """Pairs int64 [2, S] and their weights exp(-|x_i - x_j| / tau) [S], distances in voxels."""
+        n = len(self.order)
+        if n < 2:
+            return torch.zeros(2, 0, dtype=torch.int64), torch.zeros(0)
+        gap = torch.randint(1, min(9, n), (n,), generator=generator)
+        first = torch.arange(n)
+        inside = first + gap < n
+        pairs = torch.stack([self.order[first[inside]], self.order[(first + gap)[inside]]])
+        distance = (self.anchor_q[pairs[0]] - self.anchor_q[pairs[1]]).float().norm(dim=1)
+        return pairs, torch.exp(-distance / tau)

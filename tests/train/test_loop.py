@@ -1,0 +1,127 @@
+"""The loop on a scene of a few tiny pictures: it learns, resumes bit for bit, survives bad steps, ends on time."""
+
+import dataclasses
+import json
+import math
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("numba")
+
+from pd4dgs_codec.data.dataset import Dataset, View  # noqa: E402
+from pd4dgs_codec.errors import TrainError  # noqa: E402
+from pd4dgs_codec.model import checkpoint  # noqa: E402
+from pd4dgs_codec.model.config import PRESETS, DeformationConfig, ModelConfig  # noqa: E402
+from pd4dgs_codec.train.config import Schedule, TrainConfig  # noqa: E402
+from pd4dgs_codec.train.loop import Trainer  # noqa: E402
+
+W, H = 32, 24
+
+
+def view(t: float) -> View:
+    """A bright disc that moves to the right over a grey ground; the camera sways a little."""
+    y, x = np.mgrid[0:H, 0:W] + 0.5
+    disc = (x - 8 - 16 * t) ** 2 + (y - 12) ** 2 < 16
+    image = np.full((H, W, 3), 90, np.uint8)
+    image[disc] = (230, 60, 40)
+    viewmat = np.eye(4, dtype=np.float32)
+    viewmat[0, 3], viewmat[2, 3] = 0.1 * math.sin(6 * t), 3.0
+    K = np.array([[30, 0, W / 2], [0, 30, H / 2], [0, 0, 1]], np.float32)
+    return View(viewmat=viewmat, K=K, width=W, height=H, time=t, image=image, mask=None, name=f"{t}", camera_id=0)
+
+
+@pytest.fixture
+def dataset() -> Dataset:
+    views = tuple(view(t) for t in np.linspace(0, 1, 6))
+    return Dataset(
+        name="disc", train=views, test=(view(0.5),), points=None, point_colors=None,
+        box=np.array([[-1.5, -1.2, -1], [1.5, 1.2, 1]], np.float32), near=0.1, far=10.0, background=(0.0, 0.0, 0.0),
+        time_range=(0.0, 1.0), up=(0.0, -1.0, 0.0), unit=0.0, masked=False,
+    )  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def few_anchors(monkeypatch):
+    """The tiny preset with few anchors and cells, so that a step costs milliseconds."""
+    field = DeformationConfig(4, 4, 4, (1,), 8, ("position", "feature", "offset", "scaling"))
+    local = dataclasses.replace(field, heads=("mean", "scale", "quat", "opacity", "color"))
+    monkeypatch.setitem(PRESETS, "tiny", ModelConfig(field, local, hidden=8, initial_anchors=300, max_anchors=600))
+
+
+def weights(path) -> dict:
+    return checkpoint.load(path)[0].state_dict()
+
+
+def test_it_learns_and_logs_every_term(dataset, tmp_path):
+    trainer = Trainer(TrainConfig(preset="tiny", iterations=90), dataset)
+    trainer.run(tmp_path / "m.pt", log=tmp_path / "log.jsonl")
+    records = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert [r["iteration"] for r in records] == list(range(90))
+    assert np.mean([r["l1"] for r in records[-10:]]) < 0.6 * np.mean([r["l1"] for r in records[:5]])
+    assert {"l1", "dssim", "volume", "rate", "tmc_binary", "tmc_smooth", "rho", "pi", "anchors"} <= set(records[-1])
+    assert all(r["level"] == 0 for r in records[: Schedule(90).coarse_end])
+    assert {r["level"] for r in records} == {0, 1, 2}
+    assert "rate" not in records[Schedule(90).progressive - 1] and "rate" in records[Schedule(90).progressive]
+    assert records[-1]["rho"] > 0
+    assert any("held_out_psnr" in r for r in records)
+
+
+def test_resuming_repeats_the_run_bit_for_bit(dataset, tmp_path):
+    config = TrainConfig(preset="tiny", iterations=60)
+    Trainer(config, dataset).run(tmp_path / "whole.pt")
+    for cut in (25, 41):  # inside growing, and inside the progressive phase
+        part = Trainer(config, dataset)
+        for _ in range(cut):
+            part.step()
+        part.save(tmp_path / "part.pt")
+        resumed = Trainer(config, dataset)
+        resumed.resume(tmp_path / "part.pt")
+        resumed.run(tmp_path / "resumed.pt")
+        whole, again = weights(tmp_path / "whole.pt"), weights(tmp_path / "resumed.pt")
+        assert whole.keys() == again.keys()
+        assert all(torch.equal(whole[k], again[k]) for k in whole), cut
+
+
+def test_seeds_differ_and_repeat(dataset, tmp_path):
+    for name, seed in (("a", 0), ("b", 0), ("c", 1)):
+        Trainer(TrainConfig(preset="tiny", iterations=12, seed=seed), dataset).run(tmp_path / f"{name}.pt")
+    a, b, c = (weights(tmp_path / f"{name}.pt") for name in "abc")
+    assert all(torch.equal(a[k], b[k]) for k in a)
+    assert not torch.equal(a["feature"][:10], c["feature"][:10])
+
+
+def test_a_non_finite_step_is_skipped_and_counted(dataset):
+    trainer = Trainer(TrainConfig(preset="tiny", iterations=30), dataset)
+    trainer.step()
+    with torch.no_grad():
+        trainer.model.networks["color"].linears[1].bias[0] = math.nan
+    before = trainer.model.feature.detach().clone()
+    record = trainer.step()
+    assert record["skipped"] == 1 == trainer.skipped
+    assert torch.equal(before, trainer.model.feature.detach())
+
+
+def test_a_time_limit_fixes_n_once_and_ends_in_time(dataset, tmp_path):
+    trainer = Trainer(TrainConfig(preset="tiny", max_seconds=6.0), dataset)
+    trainer.run(tmp_path / "m.pt")
+    assert trainer.total > 50 and trainer.seconds < 8.0
+    stored = checkpoint.load(tmp_path / "m.pt")[1]
+    assert stored["total"] == trainer.total
+    assert json.loads(stored["config"])["iterations"] == trainer.total
+
+
+def test_a_finished_checkpoint_holds_rounded_weights(dataset, tmp_path):
+    trainer = Trainer(TrainConfig(preset="tiny", iterations=20), dataset)
+    trainer.run(tmp_path / "m.pt")
+    model, _ = checkpoint.load(tmp_path / "m.pt")
+    ratio = model.networks["color"].linears[0].weight.detach() / model.steps.weights_scaffold
+    assert torch.allclose(ratio, ratio.round(), atol=1e-3)
+
+
+def test_resuming_from_a_model_without_training_state_is_refused(dataset, tmp_path):
+    trainer = Trainer(TrainConfig(preset="tiny", iterations=5), dataset)
+    checkpoint.save(tmp_path / "m.pt", trainer.model)
+    with pytest.raises(TrainError, match="no training state"):
+        trainer.resume(tmp_path / "m.pt")

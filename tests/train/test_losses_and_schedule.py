@@ -1,0 +1,101 @@
+"""Hand-computed cases of the mask terms, the rollout and the schedule."""
+
+import math
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from pd4dgs_codec.errors import TrainError  # noqa: E402
+from pd4dgs_codec.model.layers import level_mask, mask_logits  # noqa: E402
+from pd4dgs_codec.train import losses  # noqa: E402
+from pd4dgs_codec.train.config import Schedule, TrainConfig, learning_rate  # noqa: E402
+from pd4dgs_codec.train.rollout import rollout_probabilities, sample_level, updated_rho  # noqa: E402
+
+
+def test_masks_are_monotone_and_start_where_the_method_says():
+    logits = torch.tensor([[2.0, 0.0, 0.0], [-30.0, 5.0, -40.0], [40.0, 1.0, 1.0]])
+    masks = [level_mask(logits, level) for level in range(3)]
+    assert all((b >= a).all() for a, b in zip(masks, masks[1:], strict=False))
+    rho = float(masks[2][0] - masks[0][0])
+    assert rho == pytest.approx(1 / (1 + math.exp(-2 - 2 * math.log(2))) - 1 / (1 + math.exp(-2)))
+    assert rho == pytest.approx(0.0866, abs=5e-4)
+
+
+def test_mask_logits_invert_the_masks():
+    import numpy as np
+
+    masks = np.array([[0.0, 0.0, 1.0], [0.2, 0.2, 0.7], [1.0, 1.0, 1.0], [0.012, 0.5, 0.5]])
+    logits = torch.from_numpy(mask_logits(masks))
+    assert torch.isfinite(logits).all()
+    for level in range(3):
+        assert np.allclose(level_mask(logits, level).numpy(), masks[:, level], atol=1e-6)
+
+
+def test_binary_term_is_the_mean_entropy_in_bits():
+    assert float(losses.binary_term(torch.full((5,), 0.5))) == pytest.approx(1.0)
+    assert float(losses.binary_term(torch.tensor([0.0, 1.0]))) < 1e-4
+    quarter = -(0.25 * math.log2(0.25) + 0.75 * math.log2(0.75))
+    assert float(losses.binary_term(torch.tensor([0.25, 0.75]))) == pytest.approx(quarter, rel=1e-5)
+
+
+def test_binary_term_has_finite_gradients_at_the_ends():
+    mask = torch.tensor([0.0, 1.0, 0.5], requires_grad=True)
+    losses.binary_term(mask).backward()
+    assert torch.isfinite(mask.grad).all()
+
+
+def test_smooth_term_weighs_differences_by_distance():
+    pairs, weights = torch.tensor([[0, 1], [1, 2]]), torch.tensor([1.0, 0.5])
+    assert float(losses.smooth_term(torch.tensor([0.0, 1.0, 0.5]), pairs, weights)) == pytest.approx((1.0 + 0.25) / 2)
+
+
+def test_neighbours_are_near():
+    generator = torch.Generator().manual_seed(0)
+    grid = torch.stack(torch.meshgrid(*[torch.arange(12)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    cells = grid[torch.randperm(len(grid), generator=generator)].int()
+    pairs, weights = losses.Neighbours(cells).draw(4.0, generator)
+    assert (pairs[0] != pairs[1]).all()
+    distance = (cells[pairs[0]] - cells[pairs[1]]).float().norm(dim=1)
+    assert float(distance.mean()) < 4  # random pairs of this cube are 8 apart on average
+    assert torch.allclose(weights, torch.exp(-distance / 4.0))
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_no_pairs_without_two_anchors(count):
+    pairs, weights = losses.Neighbours(torch.zeros(count, 3, dtype=torch.int32)).draw(4.0, torch.Generator())
+    assert pairs.shape == (2, 0)
+    assert float(losses.smooth_term(torch.ones(count), pairs, weights)) == 0
+
+
+def test_rollout_probabilities():
+    assert rollout_probabilities(0.0) == pytest.approx((1 / 3,) * 3)
+    assert rollout_probabilities(1.0) == pytest.approx((0.15, 0.30, 0.55))
+    assert sum(rollout_probabilities(0.37)) == pytest.approx(1.0)
+    assert updated_rho(0.5, torch.zeros(4), torch.ones(4)) == pytest.approx(0.525)
+    assert updated_rho(0.5, torch.ones(0), torch.ones(0)) == pytest.approx(0.475)
+
+
+def test_levels_follow_their_probabilities_and_never_pass_the_highest():
+    generator = torch.Generator().manual_seed(1)
+    draws = [sample_level((0.15, 0.30, 0.55), 2, generator) for _ in range(4000)]
+    assert [draws.count(level) / 4000 for level in range(3)] == pytest.approx([0.15, 0.30, 0.55], abs=0.03)
+    assert {sample_level((0.15, 0.30, 0.55), 1, generator) for _ in range(50)} == {0, 1}
+
+
+def test_the_schedule_is_the_papers_at_its_own_length():
+    s = Schedule(30_000)
+    assert (s.progressive, s.warm, s.rho_every, s.coarse_end, s.rounding) == (10_000, 2_000, 200, 3_000, 24_000)
+    assert s.grow.start > 500 and s.grow.stop == 15_001
+    assert s.phases_not_reached(30_000) == []
+    assert s.phases_not_reached(5_000)[0] == "rate and mask terms"
+
+
+def test_learning_rates_are_log_linear():
+    assert learning_rate((1e-2, 1e-4), 0.5) == pytest.approx(1e-3)
+
+
+@pytest.mark.parametrize("bad", [{"preset": "huge"}, {"iterations": 0}, {"max_seconds": -1.0}, {"rollout": "greedy"}])
+def test_bad_configurations_are_refused(bad):
+    with pytest.raises(TrainError, match="expected|must be"):
+        TrainConfig(**bad)
