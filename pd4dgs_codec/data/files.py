@@ -1,0 +1,144 @@
+"""Reading JSON, images and points, with every failure turned into one clear DataError."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import DataError
+
+IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+WHITE = 255
+LARGEST = float(np.finfo(np.float64).max)
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """The JSON object in `path`."""
+    try:
+        value = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise DataError(f"{path}: missing, expected a JSON file") from None
+    except json.JSONDecodeError as e:
+        raise DataError(f"{path}: line {e.lineno}, column {e.colno}: broken JSON: {e.msg}") from None
+    except (OSError, ValueError, RecursionError) as e:
+        raise DataError(f"{path}: cannot be read as JSON: {e}") from None
+    if not isinstance(value, dict):
+        raise DataError(f"{path}: found a JSON {type(value).__name__}, expected an object")
+    return value
+
+
+def number(value: Any, where: str, *, positive: bool = False) -> float:
+    """`value` as a finite float (greater than zero if `positive`)."""
+    expected = "a finite number" + (" > 0" if positive else "")
+    if isinstance(value, bool) or not isinstance(value, (int, float)):
+        raise DataError(f"{where} is {value!r}, expected {expected}")
+    if not abs(value) <= LARGEST or (positive and value <= 0):  # also true of NaN and of integers beyond any float
+        raise DataError(f"{where} is {str(value)[:24]}, expected {expected}")
+    return float(value)
+
+
+def array(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
+    """`value` as a finite float64 array of the given shape."""
+    try:
+        result = np.asarray(value, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        raise DataError(f"{where} is not a numeric array, expected shape {shape}") from None
+    if result.shape != shape:
+        raise DataError(f"{where} has shape {result.shape}, expected {shape}")
+    if not np.isfinite(result).all():
+        raise DataError(f"{where} holds NaN or infinity, expected finite numbers")
+    return result
+
+
+def find_image(folder: Path, name: str) -> Path:
+    """The image file of a `file_path` written with or without its extension."""
+    for suffix in IMAGE_SUFFIXES:
+        path = folder / (name + suffix)
+        if path.is_file():
+            return path
+    raise DataError(f"{folder / name}: image is missing (tried as it is, .png, .jpg and .jpeg)")
+
+
+def _open(path: Path):
+    try:
+        from PIL import Image, UnidentifiedImageError
+    except ImportError:
+        raise DataError(f"{path}: reading images needs pillow (pip install 'pd4dgs-codec[train]')") from None
+    try:
+        return Image.open(path)
+    except FileNotFoundError:
+        raise DataError(f"{path}: image is missing") from None
+    except (UnidentifiedImageError, OSError, Image.DecompressionBombError):
+        raise DataError(f"{path}: not an image that can be read") from None
+
+
+def image_info(path: Path) -> tuple[int, int, bool]:
+    """Width, height and whether there is an alpha channel, from the file's header."""
+    with _open(path) as image:
+        return image.width, image.height, "A" in image.getbands() or "transparency" in image.info
+
+
+def _rgb(image, *, composite: bool):
+    """PIL image in mode RGB: alpha composited on white, or dropped."""
+    from PIL import Image
+
+    if composite and ("A" in image.getbands() or "transparency" in image.info):
+        image = image.convert("RGBA")
+        image = Image.alpha_composite(Image.new("RGBA", image.size, (WHITE,) * 4), image)
+    return image.convert("RGB")
+
+
+def read_image(path: Path, size: tuple[int, int], *, downscale: int = 1, composite: bool = True) -> np.ndarray:
+    """uint8 [H // downscale, W // downscale, 3], the mean of each block; the file must measure `size` = (W, H).
+
+    composite: put a transparent image on white; otherwise its alpha is dropped (photographs).
+    """
+    with _open(path) as image:
+        if image.size != tuple(size):
+            raise DataError(f"{path}: image is {image.width}x{image.height}, expected {size[0]}x{size[1]}")
+        check_downscale(size, downscale, str(path))
+        try:
+            rgb = _rgb(image, composite=composite)
+        except (OSError, SyntaxError, ValueError) as e:
+            raise DataError(f"{path}: image data is broken: {e}") from None
+        if downscale > 1:
+            w, h = size[0] // downscale, size[1] // downscale
+            rgb = rgb.reduce(downscale, box=(0, 0, w * downscale, h * downscale))
+        return np.array(rgb)
+
+
+def read_mask(path: Path, size: tuple[int, int], *, downscale: int = 1) -> np.ndarray:
+    """bool [H // downscale, W // downscale]: True where every pixel of the block is non-zero."""
+    with _open(path) as image:
+        if image.size != tuple(size):
+            raise DataError(f"{path}: mask is {image.width}x{image.height}, expected {size[0]}x{size[1]}")
+        try:
+            return shrink_mask(np.array(image.convert("L")) > 0, downscale)
+        except (OSError, SyntaxError, ValueError) as e:
+            raise DataError(f"{path}: mask data is broken: {e}") from None
+
+
+def check_downscale(size: tuple[int, int], downscale: int, where: str) -> None:
+    """Refuse a downscale that leaves no pixel."""
+    if min(size) // downscale < 1:
+        raise DataError(f"{where}: downscale {downscale} leaves nothing of {size[0]}x{size[1]} pixels")
+
+
+def _blocks(image: np.ndarray, k: int) -> np.ndarray:
+    h, w = image.shape[0] // k, image.shape[1] // k
+    return image[: h * k, : w * k].reshape(h, k, w, k, *image.shape[2:])
+
+
+def shrink_image(image: np.ndarray, k: int) -> np.ndarray:
+    """uint8 [H, W, 3] -> uint8 [H // k, W // k, 3], mean of each block, halves rounded up (as `read_image` does)."""
+    if k == 1:
+        return image
+    return (_blocks(image, k).mean(axis=(1, 3)) + 0.5).astype(np.uint8)
+
+
+def shrink_mask(mask: np.ndarray, k: int) -> np.ndarray:
+    """bool [H, W] -> bool [H // k, W // k], True where the whole block is."""
+    return mask if k == 1 else np.asarray(_blocks(mask, k).all(axis=(1, 3)))

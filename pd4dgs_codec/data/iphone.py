@@ -1,0 +1,216 @@
+"""The iPhone (DyCheck), Nerfies and HyperNeRF layout: camera/*.json, rgb/{factor}x, splits/, scene.json and so on."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import DataError
+from .cameras import (
+    Frame,
+    Lens,
+    cameras_box,
+    check_rotation,
+    depth_range,
+    mean_up,
+    normalised_times,
+    points_box,
+    read_view,
+    world_to_camera,
+)
+from .dataset import Dataset, View
+from .files import array, number, read_json, read_mask
+
+
+@dataclass(frozen=True, eq=False)
+class CameraFiles:
+    """What the files say of the cameras. Poses are centred and scaled, lenses are those of rgb/{factor}x.
+
+    A Frame's time is its time id. points: float32 [M, 3] of points.npy, centred and scaled, or None.
+    """
+
+    train: tuple[Frame, ...]
+    test: tuple[Frame, ...]
+    factor: int
+    scene: dict[str, Any]
+    extra: dict[str, Any]
+    points: np.ndarray | None
+
+
+def _pair(value: Any, where: str) -> tuple[float, float]:
+    a, b = array(value, (2,), where)
+    return float(a), float(b)
+
+
+def read_camera(path: Path, factor: int) -> tuple[Lens, np.ndarray, np.ndarray]:
+    """Lens in pixels of rgb/{factor}x, world-to-camera rotation float64 [3, 3] and camera centre [3], as stored."""
+    camera = read_json(path)
+
+    def field(key: str, default: Any = None) -> Any:
+        value = camera.get(key, default)
+        if value is None:
+            raise DataError(f"{path}: no {key}, expected it in a camera file")
+        return value
+
+    rotation = array(field("orientation"), (3, 3), f"{path}: orientation")
+    check_rotation(rotation, f"{path}: orientation")
+    center = array(field("position"), (3,), f"{path}: position")
+    focal = number(field("focal_length"), f"{path}: focal_length", positive=True)
+    aspect = number(field("pixel_aspect_ratio", 1.0), f"{path}: pixel_aspect_ratio", positive=True)
+    cx, cy = _pair(field("principal_point"), f"{path}: principal_point")
+    width, height = (int(v) // factor for v in _pair(field("image_size"), f"{path}: image_size"))
+    if min(width, height) < 2:
+        raise DataError(f"{path}: image_size {field('image_size')} over factor {factor}, expected at least 2x2")
+    k1, k2, k3 = array(field("radial_distortion", [0.0] * 3), (3,), f"{path}: radial_distortion").tolist()
+    stored = camera.get("tangential_distortion", camera.get("tangential", [0.0, 0.0]))
+    tangential = _pair(stored, f"{path}: tangential_distortion")
+    skew = number(field("skew", 0.0), f"{path}: skew") / factor
+    lens = Lens(
+        width, height, focal / factor, focal * aspect / factor, cx / factor, cy / factor, skew, (k1, k2, k3), tangential
+    )
+    return lens, rotation, center
+
+
+def _strings(value: Any, where: str) -> list[str]:
+    if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
+        raise DataError(f"{where} is not a list of frame names")
+    return value
+
+
+def _split_names(folder: Path) -> tuple[list[str], list[str]]:
+    """Train and test names: splits/*.json, else dataset.json, else HyperNeRF's rule (i % 4 == 0 and == 2)."""
+    if (folder / "splits" / "train.json").is_file():
+        paths = [folder / "splits" / f"{s}.json" for s in ("train", "val")]
+        train, test = (
+            _strings(read_json(p).get("frame_names"), f"{p}: frame_names") if p.is_file() else [] for p in paths
+        )
+        return train, test
+    path = folder / "dataset.json"
+    listed = read_json(path)
+    ids, train, test = (_strings(listed.get(k, []), f"{path}: {k}") for k in ("ids", "train_ids", "val_ids"))
+    return (train, test) if test else (ids[0::4], ids[2::4])
+
+
+def _extra(folder: Path) -> tuple[dict[str, Any], int]:
+    """extra.json and the factor whose images are the dataset's own; HyperNeRF has none and is used at 2x."""
+    path = folder / "extra.json"
+    if not path.is_file():
+        return {}, 1 if (folder / "rgb" / "1x").is_dir() and not (folder / "rgb" / "2x").is_dir() else 2
+    extra = read_json(path)
+    factor = number(extra.get("factor", 1), f"{path}: factor", positive=True)
+    if factor != int(factor):
+        raise DataError(f"{path}: factor is {factor}, expected an integer")
+    return extra, int(factor)
+
+
+def _points(folder: Path, center: np.ndarray, scale: float) -> np.ndarray | None:
+    path = folder / "points.npy"
+    if not path.is_file():
+        return None
+    try:
+        points = np.load(path, allow_pickle=False)
+    except (OSError, ValueError, EOFError):
+        raise DataError(f"{path}: not a .npy file of numbers") from None
+    if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind != "f":
+        found = f"{points.dtype} {points.shape}" if isinstance(points, np.ndarray) else "an archive"
+        raise DataError(f"{path}: found {found}, expected floats [M, 3]")
+    points = ((points.astype(np.float64) - center) * scale).astype(np.float32)
+    points = points[np.isfinite(points).all(axis=1)]
+    return points if len(points) else None
+
+
+def read_cameras(folder: str | Path) -> CameraFiles:
+    """Read every camera of both splits; images need not exist."""
+    folder = Path(folder)
+    scene, (extra, factor) = read_json(folder / "scene.json"), _extra(folder)
+    center = array(scene.get("center", [0.0] * 3), (3,), f"{folder / 'scene.json'}: center")
+    scale = number(scene.get("scale", 1.0), f"{folder / 'scene.json'}: scale", positive=True)
+    path = folder / "metadata.json"
+    metadata = read_json(path)
+
+    def frame(name: str) -> Frame:
+        entry = metadata.get(name)
+        if not isinstance(entry, dict):
+            raise DataError(f"{path}: no entry for frame {name!r}, which the split lists")
+        time = number(entry.get("warp_id", entry.get("time_id")), f"{path}: {name}: warp_id")
+        lens, rotation, position = read_camera(folder / "camera" / f"{name}.json", factor)
+        viewmat = world_to_camera(rotation, (position - center) * scale)
+        camera_id = int(number(entry.get("camera_id", 0), f"{path}: {name}: camera_id"))
+        return Frame(name, camera_id, time, viewmat, lens, folder / "rgb" / f"{factor}x" / f"{name}.png")
+
+    train, test = (tuple(frame(name) for name in names) for names in _split_names(folder))
+    if not train:
+        raise DataError(f"{folder}: the split holds 0 training frames, expected at least 1")
+    return CameraFiles(train, test, factor, scene, extra, _points(folder, center, scale))
+
+
+def _with_covisible(view: View, frame: Frame, folder: Path, factor: int, downscale: int) -> View:
+    path = folder / "covisible" / f"{factor}x" / "val" / f"{frame.name}.png"
+    if not path.is_file():
+        raise DataError(f"{path}: covisibility mask is missing, though others of its folder are there")
+    mask = read_mask(path, (frame.lens.width, frame.lens.height), downscale=downscale)
+    return replace(view, mask=mask if view.mask is None else mask & view.mask)
+
+
+def _box(files: CameraFiles, frames: list[Frame], folder: Path) -> np.ndarray:
+    if files.extra.get("bbox") is not None:
+        where = f"{folder / 'extra.json'}: bbox"
+        box = array(files.extra["bbox"], (2, 3), where).astype(np.float32)
+        if not (box[0] < box[1]).all():
+            raise DataError(f"{where} is {box.tolist()}, expected a lower and an upper corner")
+        return box
+    return cameras_box(frames) if files.points is None else points_box(files.points)
+
+
+def _near_far(files: CameraFiles, frames: list[Frame], box: np.ndarray, folder: Path) -> tuple[float, float]:
+    """scene.json's near and far: already in scene units."""
+    where = folder / "scene.json"
+    if files.scene.get("near") is None or files.scene.get("far") is None:
+        return depth_range(frames, box, files.points)
+    near, far = (number(files.scene[k], f"{where}: {k}", positive=True) for k in ("near", "far"))
+    if near >= far:
+        raise DataError(f"{where}: near {near:g} and far {far:g}, expected near < far")
+    return near, far
+
+
+def _up(files: CameraFiles, frames: list[Frame], folder: Path) -> tuple[float, float, float]:
+    if files.extra.get("up") is None:
+        return mean_up(frames)
+    up = array(files.extra["up"], (3,), f"{folder / 'extra.json'}: up")
+    x, y, z = up / max(np.linalg.norm(up), 1e-12)
+    return float(x), float(y), float(z)
+
+
+def read(folder: Path, downscale: int) -> Dataset:
+    """Read the folder at rgb/{factor}x over `downscale` (see `dataset.load`)."""
+    files = read_cameras(folder)
+    frames = [*files.train, *files.test]
+    times, start, stop = normalised_times([f.time for f in frames])
+    views = [read_view(f, t, downscale, composite=False) for f, t in zip(frames, times, strict=True)]
+    train, test = views[: len(files.train)], views[len(files.train) :]
+    masked = bool(test) and (folder / "covisible" / f"{files.factor}x" / "val").is_dir()
+    if masked:
+        test = [_with_covisible(v, f, folder, files.factor, downscale) for v, f in zip(test, files.test, strict=True)]
+    box = _box(files, frames, folder)
+    near, far = _near_far(files, frames, box, folder)
+    fps = files.extra.get("fps")
+    fps = None if fps is None else number(fps, f"{folder / 'extra.json'}: fps", positive=True)
+    r, g, b = array(files.extra.get("background", [0.0] * 3), (3,), f"{folder / 'extra.json'}: background").tolist()
+    return Dataset(
+        name=folder.resolve().name,
+        train=tuple(train),
+        test=tuple(test),
+        points=files.points,
+        point_colors=None,
+        box=box,
+        near=near,
+        far=far,
+        background=(r, g, b),
+        time_range=(start / fps, stop / fps) if fps and stop > start else (0.0, 1.0),
+        up=_up(files, frames, folder),
+        unit=0.0,
+        masked=masked,
+    )

@@ -1,0 +1,181 @@
+"""Blender, D-NeRF and nerfstudio folders: transforms*.json with OpenGL camera-to-world matrices."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..errors import DataError
+from .cameras import (
+    Frame,
+    Lens,
+    cameras_box,
+    check_rotation,
+    depth_range,
+    mean_up,
+    normalised_times,
+    points_box,
+    read_view,
+    world_to_camera,
+)
+from .dataset import Dataset, View
+from .files import array, find_image, image_info, number, read_json
+from .ply import read_ply
+
+PINHOLE_MODELS = {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
+#: OpenGL's camera looks along -z with y up; OpenCV's along +z with y down.
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0])
+#: A border is one colour if this share of it lies within this many 8-bit levels of its median.
+BORDER_SHARE, BORDER_LEVELS = 0.99, 3
+
+
+def _choose(folder: Path) -> tuple[Path, Path | None]:
+    """The file with the training frames, and the one with the test frames if the folder is split."""
+    train = folder / "transforms_train.json"
+    if train.is_file():
+        others = (folder / "transforms_test.json", folder / "transforms_val.json")
+        return train, next((p for p in others if p.is_file()), None)
+    found = sorted(folder.glob("transforms*.json"))
+    for path in found:
+        if path.name == "transforms.json" or len(found) == 1:
+            return path, None
+    names = ", ".join(p.name for p in found)
+    raise DataError(f"{folder}: found {names}; expected transforms.json, transforms_train.json or a single file")
+
+
+def _focal(get, axis: str, size: int, where: str) -> float | None:
+    if get("fl_" + axis) is not None:
+        return number(get("fl_" + axis), f"{where}: fl_{axis}", positive=True)
+    angle = get("camera_angle_" + axis)
+    if angle is None:
+        return None
+    angle = number(angle, f"{where}: camera_angle_{axis}", positive=True)
+    if angle >= np.pi:
+        raise DataError(f"{where}: camera_angle_{axis} is {angle}, expected radians below pi")
+    return float(0.5 * size / np.tan(0.5 * angle))
+
+
+def _lens(file: dict[str, Any], frame: dict[str, Any], image: Path, where: str) -> Lens:
+    """Intrinsics of one frame; its own keys go before the file's."""
+
+    def get(key: str) -> Any:
+        return frame.get(key, file.get(key))
+
+    def value(key: str, default: float = 0.0) -> float:
+        return default if get(key) is None else number(get(key), f"{where}: {key}")
+
+    if get("w") is None or get("h") is None:
+        width, height, _ = image_info(image)
+    else:
+        width, height = (int(number(get(k), f"{where}: {k}", positive=True)) for k in ("w", "h"))
+    model = get("camera_model")
+    if (model is not None and model not in PINHOLE_MODELS) or value("k4"):
+        raise DataError(f"{where}: camera_model {model!r} (k4 {value('k4'):g}) is not supported, expected a pinhole")
+    fx = _focal(get, "x", width, where)
+    fy = _focal(get, "y", height, where)
+    if fx is None and fy is None:
+        raise DataError(f"{where}: no focal length, expected fl_x or camera_angle_x")
+    fx, fy = fx or fy, fy or fx
+    assert fx is not None and fy is not None
+    cx, cy = value("cx", width / 2), value("cy", height / 2)
+    radial, tangential = (value("k1"), value("k2"), value("k3")), (value("p1"), value("p2"))
+    return Lens(width, height, fx, fy, cx, cy, 0.0, radial, tangential)
+
+
+def _viewmat(matrix: Any, where: str) -> np.ndarray:
+    """float64 [4, 4] world to camera, OpenCV, from an OpenGL camera-to-world matrix 4x4 or 3x4."""
+    rows = 3 if isinstance(matrix, list) and len(matrix) == 3 else 4
+    pose = array(matrix, (rows, 4), where)
+    check_rotation(pose[:3, :3], where)
+    return world_to_camera(OPENGL_TO_OPENCV @ pose[:3, :3].T, pose[:3, 3])
+
+
+def _frames(folder: Path, path: Path) -> tuple[list[Frame], dict[str, Any]]:
+    """The frames of one file in its order, and the whole file."""
+    file = read_json(path)
+    listed = file.get("frames")
+    if not isinstance(listed, list) or not listed:
+        raise DataError(f"{path}: found no frames, expected a list of at least 1")
+    frames = []
+    for i, frame in enumerate(listed):
+        where = f"{path}: frame {i}"
+        if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
+            raise DataError(f"{where} has no file_path, expected an object with file_path and transform_matrix")
+        viewmat = _viewmat(frame.get("transform_matrix"), f"{where}: transform_matrix")
+        image = find_image(folder, frame["file_path"])
+        time = i / max(len(listed) - 1, 1) if frame.get("time") is None else number(frame["time"], f"{where}: time")
+        frames.append(Frame(image.stem, 0, time, viewmat, _lens(file, frame, image, where), image))
+    return frames, file
+
+
+def _split(folder: Path, holdout: int) -> tuple[list[Frame], list[Frame], dict[str, Any]]:
+    """Train and test frames and the training file; split files decide, else every `holdout`-th frame is test."""
+    train_file, test_file = _choose(folder)
+    frames, file = _frames(folder, train_file)
+    if test_file is not None:
+        return frames, _frames(folder, test_file)[0], file
+    held = [holdout > 0 and i % holdout == holdout // 2 for i in range(len(frames))]
+    train = [f for f, h in zip(frames, held, strict=True) if not h]
+    return train, [f for f, h in zip(frames, held, strict=True) if h], file
+
+
+def _points(folder: Path, file: dict[str, Any]) -> tuple[np.ndarray | None, np.ndarray | None]:
+    named = file.get("ply_file_path")
+    if isinstance(named, str):
+        return read_ply(folder / named)
+    found = sorted(folder.glob("*.ply"))
+    return read_ply(found[0]) if len(found) == 1 else (None, None)
+
+
+def _stored_depth(folder: Path, file: dict[str, Any]) -> tuple[float, float] | None:
+    """(near, far) from near_far_per_frame. Half the 5th percentile of near: single frames go down to almost 0."""
+    if file.get("near_far_per_frame") is None:
+        return None
+    where = f"{folder}: near_far_per_frame"
+    rows = array(file["near_far_per_frame"], (len(file["frames"]), 2), where)
+    near, far = 0.5 * float(np.percentile(rows[:, 0], 5)), float(rows[:, 1].max())
+    if not 0 < near < far:
+        raise DataError(f"{where} spans {near:g} to {far:g}, expected 0 < near < far")
+    return near, far
+
+
+def border_color(views: Sequence[View]) -> tuple[float, float, float]:
+    """The colour behind everything: that of the images' border if it is one colour throughout, else black."""
+    edges = np.concatenate([e for v in views for e in (v.image[0], v.image[-1], v.image[:, 0], v.image[:, -1])])
+    middle = np.median(edges, axis=0)
+    same = (np.abs(edges - middle) <= BORDER_LEVELS).all(axis=1).mean() >= BORDER_SHARE
+    r, g, b = middle / 255.0 if same else np.zeros(3)
+    return float(r), float(g), float(b)
+
+
+def read(folder: Path, downscale: int, holdout: int) -> Dataset:
+    """Read a folder with transforms*.json (see `dataset.load`)."""
+    train, test, file = _split(folder, holdout)
+    frames = train + test
+    times, start, stop = normalised_times([f.time for f in frames])
+    depth = _stored_depth(folder, file)
+    points, colors = _points(folder, file)
+    if points is not None and not len(points):
+        points, colors = None, None
+    views = [read_view(f, t, downscale, composite=True) for f, t in zip(frames, times, strict=True)]
+    transparent = image_info(train[0].image)[2]
+    box = cameras_box(frames, depth) if points is None else points_box(points)
+    near, far = depth or depth_range(frames, box, points)
+    return Dataset(
+        name=folder.resolve().name,
+        train=tuple(views[: len(train)]),
+        test=tuple(views[len(train) :]),
+        points=points,
+        point_colors=colors,
+        box=box,
+        near=near,
+        far=far,
+        background=(1.0, 1.0, 1.0) if transparent else border_color(views[: len(train)]),
+        time_range=(start, stop) if stop > start else (0.0, 1.0),
+        up=mean_up(frames),
+        unit=0.0,
+        masked=False,
+    )

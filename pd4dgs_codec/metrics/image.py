@@ -1,0 +1,115 @@
+"""Masked PSNR and masked SSIM of the DyCheck protocol, in float64 numpy. Scores are per frame; average over frames.
+
+Images are brought to 8 bits first, as a written picture would be. Masks are bool [H, W], True = counts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from ..errors import DataError
+
+if TYPE_CHECKING:
+    from ..data.dataset import View
+
+TAPS, SIGMA = 11, 1.5
+C1, C2 = 0.01**2, 0.03**2
+LEAST_WEIGHT = 1e-6
+
+
+def to_uint8(image: np.ndarray) -> np.ndarray:
+    """uint8 image from reals in 0..1 (clipped, rounded to the nearest level); uint8 passes through. NaN is an error."""
+    image = np.asarray(image)
+    if image.dtype == np.uint8:
+        return image
+    if image.dtype.kind != "f":
+        raise DataError(f"image has dtype {image.dtype}, expected uint8 or floats in 0..1")
+    if np.isnan(image).any():
+        raise DataError(f"image holds NaN in {int(np.isnan(image).sum())} values, expected numbers in 0..1")
+    return np.rint(np.clip(image.astype(np.float64), 0.0, 1.0) * 255.0).astype(np.uint8)
+
+
+def _prepare(pred, target, mask) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Both images as float64 [H, W, 3] in 0..1 after 8 bits, and the mask as float64 [H, W]."""
+    a, b = np.asarray(pred), np.asarray(target)
+    if a.shape != b.shape or a.ndim != 3 or a.shape[2] != 3:
+        raise DataError(f"images have shapes {a.shape} and {b.shape}, expected the same [H, W, 3]")
+    m = np.ones(a.shape[:2]) if mask is None else np.asarray(mask).astype(np.float64)
+    if m.shape != a.shape[:2]:
+        raise DataError(f"mask has shape {m.shape}, expected {a.shape[:2]} as the images")
+    return to_uint8(a) / 255.0, to_uint8(b) / 255.0, m
+
+
+def mpsnr(pred: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """-10 log10(sum(squared error * m) / max(sum(m), 1e-6)) in dB, m over 3 channels; infinite if nothing differs.
+
+    pred, target: [H, W, 3] uint8 or floats in 0..1. mask: bool [H, W]; None = all.
+    """
+    a, b, m = _prepare(pred, target, mask)
+    mse = float((np.square(a - b) * m[..., None]).sum() / max(3.0 * m.sum(), LEAST_WEIGHT))
+    return float("inf") if mse == 0 else float(-10.0 * np.log10(mse))
+
+
+def _gaussian() -> np.ndarray:
+    x = np.arange(TAPS) - TAPS // 2
+    f = np.exp(-0.5 * (x / SIGMA) ** 2)
+    return f / f.sum()
+
+
+def _slide(z: np.ndarray, weights: np.ndarray, axis: int) -> np.ndarray:
+    """Correlation along an axis, only where all of `weights` fits."""
+    n = z.shape[axis] - len(weights) + 1
+    part = [slice(None)] * z.ndim
+    total = 0.0
+    for i, w in enumerate(weights):
+        part[axis] = slice(i, i + n)
+        total = total + w * z[tuple(part)]
+    return np.asarray(total)
+
+
+def _blur(z: np.ndarray, m: np.ndarray) -> np.ndarray:
+    """Masked separable Gaussian of z [H, W, C] with mask m [H, W, 1]: rows first, then columns.
+
+    Each pass is conv(z m, f) * taps / conv(m, 1), or 0 where no pixel counts; the mask becomes (count != 0).
+    """
+    f = _gaussian()
+    for axis in (1, 0):
+        count = _slide(m, np.ones(TAPS), axis)
+        z = np.where(count != 0, _slide(z * m, f, axis) * TAPS / np.maximum(count, 1.0), 0.0)
+        m = (count != 0).astype(np.float64)
+    return z
+
+
+def mssim(pred: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) -> float:
+    """Masked SSIM: 11-tap Gaussian, sigma 1.5, valid; variances >= 0, |covariance| <= sqrt(s0 s1); mean of the map.
+
+    pred, target: [H, W, 3] uint8 or floats in 0..1, at least 11x11. mask: bool [H, W]; None = all. The mean is not
+    weighted by the mask, as in the protocol: windows without a valid pixel count as 1.
+    """
+    a, b, m = _prepare(pred, target, mask)
+    if min(a.shape[:2]) < TAPS:
+        raise DataError(f"image is {a.shape[1]}x{a.shape[0]}, expected at least {TAPS}x{TAPS} for SSIM")
+    blurred = _blur(np.concatenate([a, b, a * a, b * b, a * b], axis=2), m[..., None])
+    mu0, mu1, aa, bb, ab = np.split(blurred, 5, axis=2)
+    var0, var1 = np.maximum(aa - mu0 * mu0, 0.0), np.maximum(bb - mu1 * mu1, 0.0)
+    cov = ab - mu0 * mu1
+    cov = np.sign(cov) * np.minimum(np.sqrt(var0 * var1), np.abs(cov))
+    numerator = (2 * mu0 * mu1 + C1) * (2 * cov + C2)
+    return float((numerator / ((mu0 * mu0 + mu1 * mu1 + C1) * (var0 + var1 + C2))).mean())
+
+
+def mean_image_baseline(train: Sequence[View], test: Sequence[View]) -> float:
+    """Mean mPSNR in dB over the test views of always predicting the mean training image: what any model must beat."""
+    if not train or not test:
+        raise DataError(f"found {len(train)} training and {len(test)} test views, expected at least 1 of each")
+    shapes = {v.image.shape for v in (*train, *test)}
+    if len(shapes) > 1:
+        raise DataError(f"images have {len(shapes)} sizes, expected one for the mean image: {sorted(shapes)}")
+    total = np.zeros(train[0].image.shape, np.float64)
+    for view in train:
+        total += view.image
+    mean = total / (255.0 * len(train))
+    return float(np.mean([mpsnr(mean, v.image, v.mask) for v in test]))

@@ -1,0 +1,84 @@
+"""The lens model and the robust geometry."""
+
+import numpy as np
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pd4dgs_codec.data.cameras import (
+    Frame,
+    Lens,
+    cameras_box,
+    distort,
+    normalised_times,
+    points_box,
+    rectify,
+    undistort,
+)
+
+small = st.floats(-0.02, 0.02)  # in this range the polynomial does not fold within the tested square
+
+
+@settings(max_examples=50, deadline=None)
+@given(small, small, small, st.floats(-0.01, 0.01), st.floats(-0.01, 0.01))
+def test_undistort_inverts_distort(k1, k2, k3, p1, p2):
+    lens = Lens(100, 100, 100, 100, 50, 50, 0.0, (k1, k2, k3), (p1, p2))
+    x, y = np.meshgrid(np.linspace(-0.7, 0.7, 9), np.linspace(-0.7, 0.7, 9))
+    xi, yi = undistort(*distort(x, y, lens)[:2], lens)
+    np.testing.assert_allclose(xi, x, atol=1e-9)
+    np.testing.assert_allclose(yi, y, atol=1e-9)
+
+
+def test_jacobian_is_the_derivative():
+    lens = Lens(100, 100, 100, 100, 50, 50, 0.0, (0.1, -0.05, 0.02), (0.01, -0.02))
+    x, y, h = np.array([0.3, -0.5]), np.array([0.2, 0.4]), 1e-6
+    _, _, xx, xy, yy = distort(x, y, lens)
+    dx = (np.array(distort(x + h, y, lens)[:2]) - distort(x - h, y, lens)[:2]) / (2 * h)
+    dy = (np.array(distort(x, y + h, lens)[:2]) - distort(x, y - h, lens)[:2]) / (2 * h)
+    np.testing.assert_allclose([xx, xy], dx, atol=1e-8)
+    np.testing.assert_allclose([xy, yy], dy, atol=1e-8)
+
+
+def test_matches_opencv_formula():
+    """One point, by hand: k1 = .1, p1 = .01, p2 = .02 at (1, 2), r² = 5."""
+    lens = Lens(10, 10, 1, 1, 0, 0, 0.0, (0.1, 0.0, 0.0), (0.01, 0.02))
+    xd, yd, *_ = distort(np.array(1.0), np.array(2.0), lens)
+    np.testing.assert_allclose([xd, yd], [1.5 + 0.04 + 0.02 * 7, 3.0 + 0.08 + 0.01 * 13])
+
+
+def test_what_folds_back_is_not_seen():
+    """With k1 = -.5 the image is folded beyond r = sqrt(2/3), where the stored picture would be shown a second time."""
+    lens = Lens(96, 64, 40.0, 40.0, 48.0, 32.0, 0.0, (-0.5, 0.0, 0.0))
+    _, seen = rectify(np.full((64, 96, 3), 200, np.uint8), lens)
+    x, y = np.meshgrid((np.arange(96) + 0.5 - 48) / 40, (np.arange(64) + 0.5 - 32) / 40)
+    np.testing.assert_array_equal(seen, np.hypot(x, y) < np.sqrt(2 / 3))
+
+
+def test_skew_moves_along_x():
+    """The sample for a pixel lies skew * y to the right in the stored image."""
+    lens = Lens(40, 20, 10.0, 10.0, 20.0, 10.0, skew=5.0)
+    ramp = np.repeat(np.tile(6 * np.arange(40, dtype=np.uint8), (20, 1))[..., None], 3, axis=2)
+    image, seen = rectify(ramp, lens)
+    assert image[14, 15, 0] == 6 * 15 + round(6 * 5.0 * 0.45) and seen[14, 15]
+    assert not seen[19, 39] and seen[0, 39]
+
+
+def test_box_ignores_strays():
+    points = np.random.default_rng(1).uniform(-1, 1, (5000, 3)).astype(np.float32)
+    points[:5] = 1000
+    box = points_box(points)
+    assert np.abs(np.abs(box) - 1.19).max() < 0.03
+
+
+def test_box_finds_the_common_point():
+    frames = []
+    for a in np.linspace(0, 2, 7):
+        R = np.array([[np.cos(a), 0, -np.sin(a)], [0, 1, 0], [np.sin(a), 0, np.cos(a)]])
+        viewmat = np.eye(4)
+        viewmat[:3, :3], viewmat[:3, 3] = R, [0, 0, 8] - R @ [1, 2, 3]
+        frames.append(Frame("", 0, 0.0, viewmat, Lens(4, 4, 4, 4, 2, 2), None))
+    np.testing.assert_allclose(cameras_box(frames), [[1 - 2.6, 2 - 2.6, 3 - 2.6], [3.6, 4.6, 5.6]], atol=1e-5)
+
+
+def test_times():
+    assert normalised_times([3.0, 5.0, 4.0]) == ([0.0, 1.0, 0.5], 3.0, 5.0)
+    assert normalised_times([3.0, 3.0])[0] == [0.0, 0.0]

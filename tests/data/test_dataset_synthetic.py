@@ -1,0 +1,175 @@
+"""The ray caster against a marching one, and the scenes' promises."""
+
+import hashlib
+
+import numpy as np
+import pytest
+
+from pd4dgs_codec.data import load
+from pd4dgs_codec.data import synthetic as syn
+from pd4dgs_codec.data.raycast import NO_BODY, Eye, enter, place
+from pd4dgs_codec.data.scenes import MOTIONS, SceneBuilder
+
+INSIDE = {
+    "sphere": lambda m: (m**2).sum(axis=0) <= 1,
+    "box": lambda m: np.abs(m).max(axis=0) <= 1,
+    "cylinder": lambda m: (m[0] ** 2 + m[1] ** 2 <= 1) & (np.abs(m[2]) <= 1),
+}
+
+
+@pytest.fixture(scope="module")
+def local():
+    return load("synthetic:local")
+
+
+@pytest.mark.parametrize("shape", INSIDE)
+def test_entry_agrees_with_marching(shape):
+    rng = np.random.default_rng(0)
+    o = np.array([2.1, -1.7, 1.9])
+    d = -o[:, None] / 3 + rng.normal(size=(3, 300)) * 0.5
+    found = enter(shape, o, list(d))
+    s = np.linspace(0, 12, 6001)
+    inside = np.stack([INSIDE[shape](o[:, None] + d[:, i : i + 1] * s) for i in range(300)])
+    marched = np.where(inside.any(axis=1), s[inside.argmax(axis=1)], np.inf)
+    both = np.isfinite(found) & np.isfinite(marched)
+    assert both.sum() > 60 and (np.isfinite(found) & ~np.isfinite(marched)).sum() <= 6  # grazing rays slip the march
+    assert not (np.isfinite(marched) & ~np.isfinite(found)).any()
+    assert (np.abs(found[both] - marched[both]) <= 0.0021).all()
+
+
+def marched_hidden(placed, origin, target, own):
+    """Does any body but `own` hold a point of the open segment?"""
+    p = origin[:, None] + (target - origin)[:, None] * np.linspace(0, 1, 3000, endpoint=False)
+    return any(INSIDE[b.body.shape](b.inverse @ (p - b.c[:, None])).any() for i, b in enumerate(placed) if i != own)
+
+
+def test_visibility_agrees_with_marching():
+    """_seen, on surface points that moved with their bodies, against sampling the segment to the camera."""
+    bodies = SceneBuilder("fast", 0).bodies()
+    surface = syn._surface(bodies, syn.fixed_viewmats()[1], 0.6)
+    rng = np.random.default_rng(1)
+    chosen = rng.choice(np.flatnonzero(surface.body > 1), 60, replace=False)  # not floor and wall: mostly visible
+    body, point = surface.body[chosen], surface.point[:, chosen]
+    verdicts = []
+    for t in (0.0, 0.37, 0.9):
+        placed = place(bodies, t)
+        eye = Eye(placed, syn._train_viewmat(t))
+        for k, seen in enumerate(syn._seen(eye, body, point)):
+            at = placed[body[k]]
+            world = at.A @ point[:, k] + at.c
+            x, y, z = eye.viewmat[:3, :3] @ (world - eye.center)
+            u, v = syn.LENS.fx * x / z + syn.LENS.cx, syn.LENS.fy * y / z + syn.LENS.cy
+            # A back is hidden by its own body: look a little before the surface.
+            near = world + 1e-3 * (eye.center - world)
+            back = INSIDE[at.body.shape]((at.inverse @ (near - at.c))[:, None])[0]
+            free = not back and not marched_hidden(placed, eye.center, world, body[k])
+            verdicts.append((seen, free and 0 <= u <= syn.LENS.width and 0 <= v <= syn.LENS.height))
+    seen, expected = np.array(verdicts).T
+    assert (seen != expected).mean() <= 0.02  # grazing cases of the sampled segment
+    assert 0.1 < seen.mean() < 0.95
+
+
+def test_first_hit_is_the_nearest_of_all_bodies():
+    placed = place(SceneBuilder("static", 3).bodies(), 0.0)
+    eye = Eye(placed, syn.fixed_viewmats()[0])
+    xs, ys = syn._grid(1)
+    depth, index = eye.first_hits(xs, ys)
+    full = np.stack([eye.enter(b, xs[None, :], ys[:, None]) for b in placed])
+    np.testing.assert_array_equal(depth, full.min(axis=0))
+    np.testing.assert_array_equal(index, np.where(np.isinf(depth), NO_BODY, full.argmin(axis=0)))
+    assert len(np.unique(index)) >= 10  # most bodies and the sky are in the picture
+
+
+def test_pictures_are_antialiased(monkeypatch):
+    """The picture is nearer to one of many rays per pixel than a picture of single rays is."""
+    bodies, pictures = SceneBuilder("static", 0).bodies(), {}
+    default = syn.SUPERSAMPLING
+    for n in (default, 1, 6):
+        monkeypatch.setattr(syn, "SUPERSAMPLING", n)
+        pictures[n] = syn._render(bodies, syn._train_viewmat(0.5), 0.5).astype(float)
+    error = {n: np.square(p - pictures[6]).mean() for n, p in pictures.items()}
+    assert error[default] < 0.6 * error[1]
+
+
+def test_shapes_and_split(local):
+    assert len(local.train) == 60 and len(local.test) == 30 and local.masked
+    v = local.train[0]
+    assert v.image.shape == (120, 160, 3) and v.image.dtype == np.uint8 and v.mask is None
+    assert {w.camera_id for w in local.test} == {1, 2} and {w.camera_id for w in local.train} == {0}
+    assert {w.time for w in local.test} <= {w.time for w in local.train}
+    assert local.train[0].time == 0 and local.train[-1].time == 1
+    assert local.points.shape == (5000, 3) and local.point_colors.dtype == np.uint8
+    assert ((local.points >= local.box[0] - 0.1) & (local.points <= local.box[1] + 0.1)).all()
+
+
+def test_camera_moves_on_an_arc(local):
+    centers = np.stack([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in local.train])
+    azimuth = np.degrees(np.arctan2(centers[:, 0] - syn.TARGET[0], syn.TARGET[1] - centers[:, 1]))
+    assert 60 <= np.ptp(azimuth) <= 90 and (np.diff(azimuth) > 0).all()
+    for v in (local.test[0], local.test[-1]):
+        c = -v.viewmat[:3, :3].T @ v.viewmat[:3, 3]
+        assert np.linalg.norm(centers - c, axis=1).min() > 0.2
+
+
+def test_masks_are_covisibility(local):
+    share = np.array([v.mask.mean() for v in local.test])
+    assert ((share > 0.8) & (share < 1)).all()
+
+
+def test_points_lie_on_what_is_seen(local):
+    """Points project onto pixels of their own colour in the first frame, where nothing hides them."""
+    v = local.train[0]
+    placed = place(SceneBuilder("local", 0).bodies(), 0.0)
+    eye = Eye(placed, v.viewmat.astype(np.float64))
+    c = v.viewmat[:3, :3] @ local.points.T + v.viewmat[:3, 3:]
+    u, w = c[0] / c[2] * syn.LENS.fx + syn.LENS.cx, c[1] / c[2] * syn.LENS.fy + syn.LENS.cy
+    ok = (c[2] > 0) & (u > 1) & (w > 1) & (u < 159) & (w < 119)
+    depth, _ = eye.first_hits(*syn._grid(1))
+    ok[ok] = np.abs(depth[w[ok].astype(int), u[ok].astype(int)] - c[2][ok]) < 0.08
+    assert ok.sum() > 1500
+    error = np.abs(v.image[w[ok].astype(int), u[ok].astype(int)].astype(float) - local.point_colors[ok])
+    assert np.median(error) < 12
+
+
+def digest(d) -> str:
+    h = hashlib.sha256(d.points.tobytes() + d.point_colors.tobytes())
+    for v in (*d.train, *d.test):
+        h.update(v.image.tobytes() + v.viewmat.tobytes() + (b"" if v.mask is None else v.mask.tobytes()))
+    return h.hexdigest()
+
+
+def test_content_depends_on_the_string_alone(local):
+    np.random.seed(5)  # noqa: NPY002 - a global seed must not matter
+    again = syn._dataset.__wrapped__("local", 0)
+    assert digest(again) == digest(local) == digest(load("synthetic:local?seed=0"))
+
+
+def test_seed_and_name_change_the_picture():
+    def first(name, seed):
+        return syn._render(SceneBuilder(name, seed).bodies(), syn._train_viewmat(0.5), 0.5)
+
+    pictures = [first("static", 0), first("static", 1), first("global", 0), first("local", 0), first("fast", 0)]
+    for i, a in enumerate(pictures):
+        for b in pictures[i + 1 :]:
+            assert (a != b).any(axis=2).mean() > 0.01
+
+
+@pytest.mark.parametrize("name", MOTIONS)
+def test_motion_is_what_the_name_says(name):
+    """From a fixed camera: static never changes; the others do, fast more per frame than global."""
+    bodies = SceneBuilder(name, 0).bodies()
+    camera = syn.fixed_viewmats()[0]
+    a, b = (syn._render(bodies, camera, t).astype(float) for t in (0.30, 0.30 + 1 / 59))
+    change = np.abs(a - b).mean()
+    assert change == 0 if name == "static" else change > (1.0 if name == "fast" else 0.05)
+
+
+def test_downscale_matches_the_full_picture(local):
+    half = load("synthetic:local", downscale=2)
+    v, w = half.train[5], local.train[5]
+    assert v.image.shape == (60, 80, 3) and (v.width, v.height) == (80, 60)
+    mean = w.image.reshape(60, 2, 80, 2, 3).mean(axis=(1, 3))
+    assert np.abs(v.image - mean).max() <= 0.5
+    np.testing.assert_allclose(v.K[:2], w.K[:2] / 2, rtol=1e-6)
+    m, n = half.test[0].mask, local.test[0].mask
+    np.testing.assert_array_equal(m, n.reshape(60, 2, 80, 2).all(axis=(1, 3)))

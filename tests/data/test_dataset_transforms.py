@@ -1,0 +1,204 @@
+"""Blender-like folders: axes, intrinsics, times, splits, background, points, box."""
+
+import json
+import struct
+import time
+
+import numpy as np
+import pytest
+from dataset_pictures import gradient, pose
+from PIL import Image
+
+from pd4dgs_codec.data import load
+from pd4dgs_codec.errors import DataError
+
+
+def test_axes_become_opencv(blender):
+    d = load(blender(), holdout=0)
+    for v in d.train:  # every camera looks at the origin from 4 away: ahead is +z, and world up (y) is image up (-y)
+        assert v.viewmat.dtype == np.float32
+        np.testing.assert_allclose(v.viewmat @ [0, 0, 0, 1], [0, 0, 4, 1], atol=1e-6)
+        np.testing.assert_allclose(v.viewmat @ [0, 1, 0, 1], [0, -1, 4, 1], atol=1e-6)
+    np.testing.assert_allclose(d.train[0].viewmat @ [1, 0, 0, 1], [1, 0, 4, 1], atol=1e-6)
+    assert d.up == pytest.approx((0, 1, 0))
+
+
+def test_focal_from_angle_and_centre(blender):
+    v = load(blender()).train[0]
+    f = 6 / np.tan(0.4)
+    np.testing.assert_allclose(v.K, [[f, 0, 6], [0, f, 4], [0, 0, 1]], rtol=1e-6)
+
+
+def test_frame_keys_go_before_file_keys(blender):
+    d = load(blender(fl_x=20, fl_y=30, cx=5, cy=3.5, frame0={"fl_x": 21, "cx": 6.25}))
+    np.testing.assert_allclose(d.train[0].K, [[21, 0, 6.25], [0, 30, 3.5], [0, 0, 1]])
+    np.testing.assert_allclose(d.train[1].K, [[20, 0, 5], [0, 30, 3.5], [0, 0, 1]])
+
+
+def test_downscale_is_the_block_mean_and_scales_k(blender):
+    folder = blender(size=(13, 8), fl_x=20, fl_y=30, cx=5, cy=3.5)
+    v = load(folder, downscale=3).train[0]
+    image = gradient(13, 8).astype(float)[:6, :12]
+    mean = image.reshape(2, 3, 4, 3, 3).mean(axis=(1, 3))
+    assert (v.width, v.height) == (4, 2) == (v.image.shape[1], v.image.shape[0])
+    assert np.abs(v.image - mean).max() <= 0.5 + 1e-6
+    np.testing.assert_allclose(v.K, np.array([[20, 0, 5], [0, 30, 3.5], [0, 0, 3]]) / 3, rtol=1e-6)
+
+
+def test_holdout_and_times(blender):
+    d = load(blender(n=14), holdout=8)
+    assert [v.name for v in d.test] == ["r_004", "r_012"]
+    assert [v.name for v in d.train[:5]] == ["r_000", "r_001", "r_002", "r_003", "r_005"]
+    assert d.test[0].time == pytest.approx(4 / 13) and d.train[-1].time == 1.0 and d.train[0].time == 0.0
+    assert d.time_range == (0.0, 1.3) and not d.masked
+    assert len(load(blender(n=14), holdout=0).test) == 0
+
+
+def test_missing_times_go_by_index(blender):
+    folder = blender(n=5)
+    file = json.loads((folder / "transforms.json").read_text())
+    for frame in file["frames"]:
+        del frame["time"]
+    (folder / "transforms.json").write_text(json.dumps(file))
+    assert [v.time for v in load(folder, holdout=0).train] == [0, 0.25, 0.5, 0.75, 1]
+
+
+def test_split_files_decide(blender):
+    folder = blender(n=9, name="transforms_train.json")
+    file = json.loads((folder / "transforms_train.json").read_text())
+    (folder / "transforms_test.json").write_text(json.dumps({**file, "frames": file["frames"][3:5]}))
+    d = load(folder)
+    assert len(d.train) == 9 and [v.name for v in d.test] == ["r_003", "r_004"]
+    assert d.test[0].time == pytest.approx(3 / 8)
+
+
+def test_alpha_goes_on_white(blender):
+    folder = blender(n=2)
+    rgba = np.zeros((8, 12, 4), np.uint8)
+    rgba[:, :6] = 200, 100, 0, 255
+    rgba[:, 6:9] = 200, 100, 0, 51
+    for i in range(2):
+        Image.fromarray(rgba).save(folder / f"r_{i:03d}.png")
+    d = load(folder, holdout=0)
+    assert d.background == (1, 1, 1)
+    image = d.train[0].image
+    assert image[0, 0].tolist() == [200, 100, 0] and image[0, 11].tolist() == [255] * 3
+    assert np.abs(image[0, 7].astype(int) - [244, 224, 204]).max() <= 1
+
+
+@pytest.mark.parametrize("color", [(255, 255, 255), (10, 200, 30)])
+def test_uniform_border_is_the_background(blender, color):
+    folder = blender(n=3)
+    for i in range(3):
+        image = np.full((8, 12, 3), color, np.uint8)
+        image[3:5, 3:9] = 77
+        Image.fromarray(image).save(folder / f"r_{i:03d}.png")
+    assert load(folder).background == pytest.approx([c / 255 for c in color])
+
+
+def test_busy_border_means_black(blender):
+    assert load(blender()).background == (0, 0, 0)
+
+
+def test_distortion_is_removed(blender):
+    """A radially distorted picture of a known pattern comes back as the pinhole picture; its unseen rim is masked."""
+    w, h, f, k1 = 96, 64, 80.0, 0.18
+    folder = blender(n=1, size=(w, h), fl_x=f, fl_y=f, k1=k1)
+    u, v = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
+
+    def pattern(x, y):
+        return np.stack([128 + 90 * np.sin(9 * x), 128 + 90 * np.cos(8 * y), 128 + 90 * np.sin(6 * x + 5 * y)], axis=2)
+
+    xd, yd = (u - w / 2) / f, (v - h / 2) / f
+    rd = np.hypot(xd, yd)
+    r = rd.copy()
+    for _ in range(60):  # plain fixed point, independent of the reader's Newton iteration
+        r = rd / (1 + k1 * r * r)
+    x, y = xd * r / rd, yd * r / rd
+    Image.fromarray(np.rint(pattern(x, y)).astype(np.uint8)).save(folder / "r_000.png")
+    view = load(folder, holdout=0).train[0]
+    expected = pattern(xd, yd)
+    assert view.mask is not None and 0.75 < view.mask.mean() < 1.0
+    assert not view.mask[0, 0] and view.mask[h // 2, w // 2]
+    assert np.abs(view.image - expected)[view.mask].max() < 3.0
+    assert (view.image[~view.mask] == 0).all()
+
+
+def test_binary_and_ascii_points_agree(blender):
+    folder = blender()
+    xyz = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
+    head = "ply\nformat {} 1.0\ncomment x\nelement vertex 50\n" + "".join(f"property float {c}\n" for c in "xyz")
+    head += "property uchar red\nproperty uchar green\nproperty uchar blue\nend_header\n"
+    rows = [(*p.tolist(), i, 2 * i, 255 - i) for i, p in enumerate(xyz)]
+    body = b"".join(struct.pack("<3f3B", *r) for r in rows)
+    (folder / "a.ply").write_bytes(head.format("binary_little_endian").encode() + body)
+    binary = load(folder)
+    (folder / "a.ply").write_text(head.format("ascii") + "".join(" ".join(map(repr, r)) + "\n" for r in rows))
+    text = load(folder)
+    for d in (binary, text):
+        np.testing.assert_array_equal(d.points, xyz)
+        np.testing.assert_array_equal(d.point_colors[7], [7, 14, 248])
+    inside = ((xyz >= binary.box[0]) & (xyz <= binary.box[1])).all(axis=1)
+    assert inside.mean() >= 0.95
+
+
+def test_named_points_go_before_the_only_one(blender):
+    folder = blender(ply_file_path="b.ply")
+    for name, x in (("a", 1.0), ("b", 2.0)):
+        head = "ply\nformat ascii 1.0\nelement vertex 1\n" + "".join(f"property float {c}\n" for c in "xyz")
+        (folder / f"{name}.ply").write_text(head + f"end_header\n{x} 0 0\n")
+    d = load(folder)
+    assert d.points.tolist() == [[2.0, 0.0, 0.0]] and d.point_colors is None
+
+
+def test_box_and_depth_without_points(blender):
+    d = load(blender())
+    np.testing.assert_allclose(d.box, [[-1.3] * 3, [1.3] * 3], atol=1e-5)
+    assert d.near < 2.7 and d.far > 5.3
+
+
+def test_stored_depth(blender):
+    d = load(blender(near_far_per_frame=[[2.0, 6.0]] * 9))
+    assert (d.near, d.far) == (1.0, 6.0)
+
+
+def test_parallel_cameras_get_a_box_ahead(blender):
+    folder = blender(n=2)
+    file = json.loads((folder / "transforms.json").read_text())
+    for i, frame in enumerate(file["frames"]):
+        frame["transform_matrix"] = np.array(pose()).tolist()
+        frame["transform_matrix"][0][3] = float(i)
+    (folder / "transforms.json").write_text(json.dumps(file))
+    d = load(folder, holdout=0)
+    assert np.isfinite(d.box).all() and (d.box[1] > d.box[0]).all() and d.box.mean(axis=0)[2] < 4
+
+
+def test_shelf_hand(shared):
+    folder, start = shared("shelf-hand"), time.process_time()
+    d = load(folder, downscale=2)
+    assert time.process_time() - start < 4
+    assert (len(d.train), len(d.test)) == (75, 11) and d.train[0].image.shape == (192, 256, 3)
+    assert d.points.shape == (12518, 3) and d.background == (0, 0, 0)
+    v = d.train[30]
+    camera = d.points @ v.viewmat[:3, :3].T + v.viewmat[:3, 3]
+    pixel = camera @ v.K.T
+    pixel = pixel[:, :2] / pixel[:, 2:]
+    inside = (camera[:, 2] > 0) & (pixel >= 0).all(axis=1) & (pixel < [v.width, v.height]).all(axis=1)
+    assert inside.mean() > 0.4
+    x, y = pixel[inside].astype(int).T
+    error = np.abs(v.image[y, x].astype(float) - d.point_colors[inside]).mean()
+    mirrored = np.abs(v.image[y, v.width - 1 - x].astype(float) - d.point_colors[inside]).mean()
+    assert error < 0.6 * mirrored  # the points' colours are found where they project
+
+
+def test_bouncing_balls(shared):
+    d = load(shared("bouncing-balls"), downscale=8)
+    assert (len(d.train), len(d.test)) == (140, 20) and d.background == (1, 1, 1)
+    np.testing.assert_allclose(d.box, [[-1.3] * 3, [1.3] * 3], atol=1e-4)
+    assert d.up == pytest.approx((0, 0, 1), abs=1e-6) and d.points is None
+    assert d.train[0].K[0, 0] == pytest.approx(1111.111 / 8, rel=1e-5)
+
+
+def test_unsupported_lens(blender):
+    with pytest.raises(DataError, match="OPENCV_FISHEYE"):
+        load(blender(camera_model="OPENCV_FISHEYE"))
