@@ -1,0 +1,1 @@
+"""Bytes <-> fields: the container's framing, canonical msgpack, and the format's limits."""

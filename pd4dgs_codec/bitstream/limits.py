@@ -1,0 +1,22 @@
+"""The format's limits, in one place. A reader holds every declared count against them before it allocates anything."""
+
+from __future__ import annotations
+
+# File structure
+MAX_HEADER = 4096  #: bytes; a header lists chunks and a few reals, and must arrive with the first packets
+MAX_CHUNKS = 64  #: three layers and ancillary chunks; bounds the walk over a hostile header
+MAX_PAYLOAD = 1 << 31  #: bytes in one chunk; fits a signed 32-bit size on every platform
+MAX_DEPTH = 4  #: nested maps and lists in canonical msgpack
+
+# Scene
+MAX_ANCHORS = 1 << 24  #: rows over all layers; 68 int32 columns of them are 4.6 GB
+MAX_SYMBOL = (1 << 24) - 1  #: |k|, so that k is exact in binary32 and k * Q in binary64
+MAX_VOXEL = 1 << 20  #: |voxel index| per axis; a Morton code of three 21-bit offsets fits 63 bits
+
+# Deformation
+MAX_PLANE_SIDE = 4096  #: cells; eight times the paper's finest plane
+MAX_PLANE_CHANNELS = 256
+MAX_PLANE_SCALES = 8
+MAX_PLANE_CELLS = 1 << 28  #: cells times channels over all planes of one chunk: 1 GiB of float32
+MAX_NETWORK_WIDTH = 4096  #: inputs or outputs of one linear layer
+MAX_NETWORK_LAYERS = 16

@@ -1,0 +1,93 @@
+"""One ANS stream: symbols and integer tables <-> bytes. constriction's AnsCoder is the reference coder.
+
+The stream is u32 words, little-endian, in the order in which the decoder consumes them. The decoder's whole arithmetic:
+
+    x = 0; while words are left and x < 2**32: x = x << 32 | next()
+    symbol: q = x & 0xFFFFFF; s with cum[s] <= q < cum[s + 1]; x = (x >> 24) * (cum[s + 1] - cum[s]) + q - cum[s]
+            if x < 2**32 and words are left: x = x << 32 | next()
+    end:    x == 0 and no words left
+
+constriction panics with a BaseException on a bad table, leaves half a channel encoded on a bad symbol, and aborts the
+process on a count it cannot allocate. So everything is checked before it sees it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import constriction
+import numpy as np
+
+from ..errors import EncodeError, LimitExceeded, Malformed
+from .tables import TOTAL
+
+MAX_COUNT = 1 << 26  #: symbols in one channel; decoding allocates four bytes for each
+_U32 = np.dtype("<u4")
+
+
+def _table_fault(cum: np.ndarray) -> str | None:
+    if cum.ndim != 1 or len(cum) < 2 or cum[0] != 0 or cum[-1] != TOTAL:
+        return f"a frequency table must run from 0 to {TOTAL}"
+    if np.any(cum[1:] <= cum[:-1]):
+        return "a frequency table has a symbol of zero frequency"
+    return None
+
+
+def _model(cum: np.ndarray) -> constriction.stream.model.Categorical:
+    # Passed like this, constriction's own rounding has scale exactly 1 and reproduces the integer table.
+    return constriction.stream.model.Categorical((np.diff(cum) - 1).astype(np.float64), perfect=False)
+
+
+def ans_encode(channels: Sequence[np.ndarray], cums: Sequence[np.ndarray]) -> bytes:
+    """Encode channels (int, 1-D, symbols 0 .. n - 1) in order, each under its own table cum [n + 1].
+
+    A channel whose table has one symbol costs nothing. Raises EncodeError for a bad table or symbol.
+    """
+    if len(channels) != len(cums):
+        raise EncodeError(f"{len(channels)} channels need as many frequency tables, found {len(cums)}")
+    coder = constriction.stream.stack.AnsCoder()
+    for index in range(len(channels) - 1, -1, -1):  # last in, first out
+        symbols, cum = np.asarray(channels[index]), np.asarray(cums[index])
+        if fault := _table_fault(cum):
+            raise EncodeError(f"channel {index}: {fault}")
+        if symbols.size == 0:
+            continue
+        if symbols.ndim != 1 or symbols.dtype.kind not in "iu":
+            raise EncodeError(f"channel {index}: expected a 1-D integer array, found {symbols.dtype} {symbols.shape}")
+        low, high = int(symbols.min()), int(symbols.max())
+        if low < 0 or high > len(cum) - 2:
+            raise EncodeError(f"channel {index}: symbols {low}..{high} outside the table's 0..{len(cum) - 2}")
+        if len(cum) > 2:
+            coder.encode_reverse(np.ascontiguousarray(symbols, dtype=np.int32), _model(cum))
+    return coder.get_compressed()[::-1].astype(_U32).tobytes()
+
+
+class AnsDecoder:
+    """Sequential decoder of one stream. `data` holds the stream's words and nothing else."""
+
+    def __init__(self, data: bytes | memoryview):
+        if len(data) % 4:
+            raise Malformed(f"an ANS stream of {len(data)} bytes, expected a multiple of 4")
+        words = np.frombuffer(data, dtype=_U32).astype(np.uint32)[::-1]
+        if len(words) and words[-1] == 0:
+            raise Malformed("an ANS stream begins with a zero word")
+        self._coder = constriction.stream.stack.AnsCoder(np.ascontiguousarray(words))
+
+    def take(self, count: int, cum: np.ndarray) -> np.ndarray:
+        """The next `count` symbols under the table, int32 [count]. Junk bytes decode to junk: see finish()."""
+        if not 0 <= count <= MAX_COUNT:
+            raise LimitExceeded(f"{count} symbols in one channel, limit {MAX_COUNT}")
+        if fault := _table_fault(cum):
+            raise Malformed(fault)
+        if count == 0 or len(cum) == 2:
+            return np.zeros(count, dtype=np.int32)
+        return np.asarray(self._coder.decode(_model(cum), count), dtype=np.int32)
+
+    def finish(self) -> None:
+        """Raise Malformed unless exactly the stream's symbols have been taken: state 0 and no words left.
+
+        This finds nearly every damaged stream, not all: state 0 is a fixed point that yields first symbols for ever, so
+        a cut stream can end in it too. The chunk's length and CRC-32 are what guarantees whole bytes.
+        """
+        if not self._coder.is_empty():
+            raise Malformed("an ANS stream does not end in state 0: corrupt bytes or wrong counts")

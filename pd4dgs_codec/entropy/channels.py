@@ -1,0 +1,200 @@
+"""The public door of entropy coding: channels of int32 symbols <-> one self-contained payload.
+
+Payload: for each non-empty channel a varint token, (family << 1 | has_exceptions), then, if the family is below 8, a
+new prior's parameters, else the prior defined (family - 8) definitions before the latest; then the channel's
+exceptions, if any: their number, and for each the gap to the previous position and the distance outside the window.
+After the last channel the ANS words: the classes of each histogram prior in order of definition, then each channel's
+symbols, those of a scaled prior as all table entries followed by all low bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..errors import EncodeError, LimitExceeded, Malformed
+from .ans import MAX_COUNT, AnsDecoder, ans_encode
+from .fitting import fit_best, histogram
+from .priors import CONST, FIRST_REUSE, K_MAX, Hist, Prior, Window, family_code, read_prior, write_prior
+from .rate import gaussian_bits
+from .sharing import plan_priors
+from .tables import uniform_table
+from .varint import ByteReader, put_varint
+
+
+@dataclass(frozen=True)
+class CodedChannels:
+    payload: bytes
+    payload_bits: int  #: 8 * len(payload): symbols, prior parameters, tables and exceptions
+    rate_bits: float  #: the sum of R(a), whatever prior was chosen
+    prior_ids: list[int]  #: one per channel; an empty channel counts as const
+
+
+@dataclass(frozen=True, eq=False)
+class _Exceptions:
+    positions: np.ndarray  #: int64 [M], ascending
+    values: np.ndarray  #: int64 [M]
+
+
+def check_channels(channels: Sequence[np.ndarray]) -> list[np.ndarray]:
+    """The channels as int32 [N]; EncodeError unless each is a 1-D integer array with |k| <= 2**24 - 1."""
+    checked = []
+    for index, channel in enumerate(channels):
+        array = np.asarray(channel)
+        if array.ndim != 1 or array.dtype.kind not in "iu" or array.size > MAX_COUNT:
+            raise EncodeError(
+                f"channel {index}: expected 1-D integers, at most {MAX_COUNT}, found {array.dtype} {array.shape}"
+            )
+        if array.size and (int(array.min()) < -K_MAX or int(array.max()) > K_MAX):
+            raise EncodeError(f"channel {index}: symbols {array.min()}..{array.max()}, limit |k| <= {K_MAX}")
+        checked.append(array.astype(np.int32))
+    return checked
+
+
+def encode_channels(channels: Sequence[np.ndarray], *, priors: str = "best", effort: int = 5) -> CodedChannels:
+    """Encode int32 channels (1-D, any lengths, |k| <= 2**24 - 1) into one payload.
+
+    priors: "gauss" allows const and gauss only, the model of R(a); "best" every prior and is never larger.
+    effort: 1..9, time spent on fitting. Raises EncodeError.
+    """
+    if priors not in ("best", "gauss") or not 1 <= effort <= 9:
+        raise EncodeError(f"expected priors best or gauss and effort 1..9, found {priors!r} and {effort}")
+    arrays = check_channels(channels)
+    histograms = [histogram(a) for a in arrays if len(a)]
+    rounds = 0 if effort < 3 else effort // 2
+    payload, prior_ids = _encode(arrays, plan_priors(histograms, lambda h: h.gauss, rounds))
+    if priors == "best":
+        other = _encode(arrays, plan_priors(histograms, lambda h: fit_best(h, effort), rounds))
+        if len(other[0]) < len(payload):
+            payload, prior_ids = other
+    return CodedChannels(payload, 8 * len(payload), sum(gaussian_bits(a) for a in arrays), prior_ids)
+
+
+def _encode(arrays: Sequence[np.ndarray], plan: Sequence[Prior]) -> tuple[bytes, list[int]]:
+    out, defined, prior_ids = bytearray(), list[Prior](), []
+    symbols, cums = list[np.ndarray](), list[np.ndarray]()
+    remaining = iter(plan)
+    for array in arrays:
+        if len(array) == 0:
+            prior_ids.append(CONST)
+            continue
+        prior = next(remaining)
+        prior_ids.append(prior.id)
+        inside, exceptions = _split(array, prior.window)
+        _write_channel(out, prior, exceptions, defined)
+        for part, cum in _parts(inside, prior):
+            symbols.append(part)
+            cums.append(cum)
+    tables = [p for p in defined if isinstance(p, Hist)]
+    words = ans_encode([*(p.class_symbols for p in tables), *symbols], [*(p.class_cum for p in tables), *cums])
+    return bytes(out) + words, prior_ids
+
+
+def _parts(inside: np.ndarray, prior: Prior) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Table entries, and the low bits of a scaled prior, each with its table."""
+    entry = inside - prior.window.kmin
+    shift = prior.window.shift
+    if not shift:
+        return [(entry, prior.cum)]
+    return [(entry >> shift, prior.cum), (entry & ((1 << shift) - 1), uniform_table(shift))]
+
+
+def _split(array: np.ndarray, window: Window) -> tuple[np.ndarray, _Exceptions]:
+    symbols = array.astype(np.int64)
+    out = (symbols < window.kmin) | (symbols >= window.end)
+    positions = np.flatnonzero(out)
+    return symbols[~out], _Exceptions(positions, symbols[positions])
+
+
+def _write_channel(out: bytearray, prior: Prior, exceptions: _Exceptions, defined: list[Prior]) -> None:
+    back = next((i for i, known in enumerate(reversed(defined)) if known is prior), None)
+    family = family_code(prior) if back is None else FIRST_REUSE + back
+    put_varint(out, 2 * family + (len(exceptions.positions) > 0))
+    if back is None:
+        write_prior(out, prior)
+        defined.append(prior)
+    if len(exceptions.positions):
+        _write_exceptions(out, exceptions, prior.window)
+
+
+def _write_exceptions(out: bytearray, exceptions: _Exceptions, window: Window) -> None:
+    put_varint(out, len(exceptions.positions) - 1)
+    gaps = np.diff(exceptions.positions, prepend=-1) - 1
+    for gap, value in zip(gaps.tolist(), exceptions.values.tolist(), strict=True):
+        put_varint(out, gap)
+        put_varint(out, 2 * (window.kmin - 1 - value) + 1 if value < window.kmin else 2 * (value - window.end))
+
+
+def _read_exceptions(reader: ByteReader, count: int, window: Window) -> _Exceptions:
+    number = 1 + reader.varint(min(count, reader.remaining // 2), "the number of exceptions")
+    positions, values, position = [], [], -1
+    for _ in range(number):
+        at = reader.offset
+        position += 1 + reader.varint(MAX_COUNT, "an exception's position")
+        code = reader.varint(4 * K_MAX + 2, "an exception's value")
+        value = window.kmin - 1 - code // 2 if code & 1 else window.end + code // 2
+        if position >= count or abs(value) > K_MAX:
+            raise Malformed(f"an exception {value} at {position} of {count} symbols", offset=at)
+        positions.append(position)
+        values.append(value)
+    return _Exceptions(np.array(positions, dtype=np.int64), np.array(values, dtype=np.int64))
+
+
+def decode_channels(payload: bytes | memoryview, counts: Sequence[int]) -> list[np.ndarray]:
+    """Inverse of encode_channels: one int32 [count] array per count.
+
+    The caller has held the counts against its limits. Raises Malformed (cut, trailing or corrupt bytes),
+    LimitExceeded, or UnsupportedFeature (a prior outside the registry).
+    """
+    for index, count in enumerate(counts):
+        if not 0 <= count <= MAX_COUNT:
+            raise LimitExceeded(f"channel {index}: {count} symbols, limit {MAX_COUNT}")
+    reader = ByteReader(payload)
+    defined: list[Prior] = []
+    heads = [_read_channel(reader, count, defined) for count in counts if count]
+    stream = AnsDecoder(reader.rest())
+    priors = [p.with_class_symbols(stream.take(p.window.n, p.class_cum)) if isinstance(p, Hist) else p for p in defined]
+    remaining = iter(heads)
+    arrays = []
+    for count in counts:
+        if count == 0:
+            arrays.append(np.zeros(0, dtype=np.int32))
+            continue
+        index, exceptions = next(remaining)
+        arrays.append(_take_channel(stream, count, priors[index], exceptions))
+    stream.finish()
+    return arrays
+
+
+def _read_channel(reader: ByteReader, count: int, defined: list[Prior]) -> tuple[int, _Exceptions | None]:
+    """One channel's head: the index of its prior among those defined so far, and its exceptions."""
+    at = reader.offset
+    token = reader.varint(2 * (FIRST_REUSE + MAX_COUNT), "a channel's prior")
+    family = token >> 1
+    if family < FIRST_REUSE:
+        defined.append(read_prior(reader, family))
+        index = len(defined) - 1
+    else:
+        index = len(defined) - 1 - (family - FIRST_REUSE)
+        if index < 0:
+            raise Malformed(f"a channel reuses a prior {-index} before the first", offset=at)
+    return index, _read_exceptions(reader, count, defined[index].window) if token & 1 else None
+
+
+def _take_channel(stream: AnsDecoder, count: int, prior: Prior, exceptions: _Exceptions | None) -> np.ndarray:
+    window, left = prior.window, count - (0 if exceptions is None else len(exceptions.positions))
+    inside = stream.take(left, prior.cum)
+    if window.shift:
+        inside = (inside << window.shift) + stream.take(left, uniform_table(window.shift))
+        if left and int(inside.max()) + window.kmin > K_MAX:
+            raise Malformed(f"symbol {int(inside.max()) + window.kmin}, limit {K_MAX}")
+    inside += np.int32(window.kmin)
+    if exceptions is None:
+        return inside
+    array = np.empty(count, dtype=np.int32)
+    listed = np.zeros(count, dtype=bool)
+    listed[exceptions.positions] = True
+    array[listed], array[~listed] = exceptions.values, inside
+    return array

@@ -1,0 +1,183 @@
+"""The same symbols under LZMA, in the layout that suits LZMA best; and float32 arrays, for comparisons.
+
+Payload: one byte of lc + 9 * (lp + 5 * pb), one byte of flags (bit 0: the bytes of wide numbers lie in separate
+planes), then for symbols, per non-empty channel, a varint of (zigzag(base) << 2 | log2(width)); then one raw LZMA2
+stream of the channels in order, each as little-endian signed integers k - base of the narrowest width, or as float32.
+"""
+
+from __future__ import annotations
+
+import itertools
+import lzma
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..errors import EncodeError, LimitExceeded, Malformed
+from .ans import MAX_COUNT
+from .channels import CodedChannels, check_channels
+from .priors import K_MAX
+from .rate import gaussian_bits
+from .varint import ByteReader, put_varint
+
+MAX_RAW = 1 << 31  #: bytes before compression, per payload
+_DICT_MAX = 1 << 26  #: a decoder never needs more memory than this plus the data
+_SAMPLE = 1 << 19  #: bytes on which the search compares settings
+_SIGNED: list[np.dtype] = [np.dtype("<i1"), np.dtype("<i2"), np.dtype("<i4")]
+_FLOAT: np.dtype = np.dtype("<f4")
+
+
+def encode_channels_lzma(channels: Sequence[np.ndarray], *, effort: int = 5) -> CodedChannels:
+    """Encode int32 channels (1-D, |k| <= 2**24 - 1) with LZMA; prior_ids is empty. effort 1..9 bounds the search."""
+    arrays = check_channels(channels)
+    head, numbers = bytearray(), list[np.ndarray]()
+    for array in arrays:
+        if len(array):
+            base, log_width = _narrowest(int(array.min()), int(array.max()))
+            put_varint(head, (2 * base if base >= 0 else -2 * base - 1) << 2 | log_width)
+            numbers.append((array - base).astype(_SIGNED[log_width]))
+    payload = _compress(bytes(head), numbers, effort)
+    return CodedChannels(payload, 8 * len(payload), sum(gaussian_bits(a) for a in arrays), [])
+
+
+def decode_channels_lzma(payload: bytes | memoryview, counts: Sequence[int]) -> list[np.ndarray]:
+    """Inverse of encode_channels_lzma: one int32 [count] array per count. Raises Malformed or LimitExceeded."""
+    _check_counts(counts)
+    reader = ByteReader(payload)
+    planar = _read_layout(reader)
+    bases, dtypes = list[int](), list[np.dtype]()
+    for count in counts:
+        code = reader.varint(8 * K_MAX + 3, "a channel's base and width") if count else 0
+        if code & 3 == 3:
+            raise Malformed("a channel of 8-byte symbols, expected 1, 2 or 4", offset=reader.offset)
+        bases.append(-((code >> 2) + 1) // 2 if code & 4 else code >> 3)
+        dtypes.append(_SIGNED[code & 3])
+    arrays = []
+    for base, numbers in zip(bases, _decompress(reader, dtypes, counts, planar), strict=True):
+        symbols = numbers.astype(np.int64) + base
+        if len(symbols) and int(np.abs(symbols).max()) > K_MAX:
+            raise Malformed(f"symbols {symbols.min()}..{symbols.max()}, limit |k| <= {K_MAX}")
+        arrays.append(symbols.astype(np.int32))
+    return arrays
+
+
+def encode_floats_lzma(arrays: Sequence[np.ndarray], *, effort: int = 5) -> bytes:
+    """Compress float32 arrays (any shape, flattened in C order). EncodeError for NaN, infinity or another dtype."""
+    for index, array in enumerate(arrays):
+        if array.dtype != np.float32 or not np.isfinite(array).all():
+            raise EncodeError(f"array {index}: expected finite float32, found {array.dtype}, NaN or infinity")
+    return _compress(b"", [np.ascontiguousarray(a, dtype=_FLOAT).ravel() for a in arrays], effort)
+
+
+def decode_floats_lzma(payload: bytes | memoryview, counts: Sequence[int]) -> list[np.ndarray]:
+    """Inverse of encode_floats_lzma: one float32 [count] array per count. Raises Malformed or LimitExceeded."""
+    _check_counts(counts)
+    reader = ByteReader(payload)
+    planar = _read_layout(reader)
+    arrays = [a.astype(np.float32) for a in _decompress(reader, [_FLOAT] * len(counts), counts, planar)]
+    if any(not np.isfinite(a).all() for a in arrays):
+        raise Malformed("a float32 array holds NaN or infinity")
+    return arrays
+
+
+def _narrowest(low: int, high: int) -> tuple[int, int]:
+    """(base, log2(width)): base 0 if it is no wider than the centred one."""
+    for log_width, limit in enumerate((1 << 7, 1 << 15, 1 << 31)):
+        if -limit <= low and high < limit:
+            return 0, log_width
+        if high - low < 2 * limit:
+            return min(low + limit, K_MAX), log_width
+    raise AssertionError("int32 always fits in four bytes")
+
+
+def _check_counts(counts: Sequence[int]) -> None:
+    for index, count in enumerate(counts):
+        if not 0 <= count <= MAX_COUNT:
+            raise LimitExceeded(f"array {index}: {count} numbers, limit {MAX_COUNT}")
+
+
+def _layout(numbers: Sequence[np.ndarray], planar: bool) -> bytes:
+    if not planar:
+        return b"".join(n.tobytes() for n in numbers)
+    return b"".join(n.view(np.uint8).reshape(-1, n.itemsize).T.tobytes() for n in numbers)
+
+
+def _filters(size: int, lc: int, lp: int, pb: int) -> list[dict[str, int]]:
+    # The dictionary's size follows from the data's, so it is not stored: the power of two that holds all of it.
+    dict_size = min(max(4096, 1 << (size - 1).bit_length() if size else 0), _DICT_MAX)
+    preset = 9 | lzma.PRESET_EXTREME
+    return [{"id": lzma.FILTER_LZMA2, "preset": preset, "dict_size": dict_size, "lc": lc, "lp": lp, "pb": pb}]
+
+
+def _packed(data: bytes, setting: tuple[int, int, int]) -> bytes:
+    return lzma.compress(data, format=lzma.FORMAT_RAW, filters=_filters(len(data), *setting))
+
+
+def _settings(effort: int) -> list[tuple[int, int, int]]:
+    """(lc, lp, pb) to try; lc + lp <= 4 is LZMA2's own limit."""
+    if effort < 4:
+        return [(3, 0, 0)]
+    if effort < 7:
+        return [(0, 0, 0), (2, 0, 0), (4, 0, 0)]
+    triples = itertools.product((0, 1, 2, 3, 4), (0, 1, 2), (0, 2))
+    return [t for t in triples if t[0] + t[1] <= 4]
+
+
+def _sample(data: bytes) -> bytes:
+    """Eight evenly spaced pieces of long data."""
+    if len(data) <= _SAMPLE:
+        return data
+    piece = _SAMPLE // 8
+    return b"".join(data[(len(data) - piece) * i // 7 & ~3 :][:piece] for i in range(8))
+
+
+def _compress(head: bytes, numbers: Sequence[np.ndarray], effort: int) -> bytes:
+    if not 1 <= effort <= 9:
+        raise EncodeError(f"effort is {effort}, expected 1..9")
+    layouts = {False: _layout(numbers, False)}
+    if len(layouts[False]) > MAX_RAW:
+        raise EncodeError(f"{len(layouts[False])} bytes before LZMA, limit {MAX_RAW}")
+    if effort >= 4 and any(n.itemsize > 1 for n in numbers):
+        layouts[True] = _layout(numbers, True)
+    trials = [(planar, setting) for planar in layouts for setting in _settings(effort)]
+    if len(trials) > 1:
+        samples = {planar: _sample(data) for planar, data in layouts.items()}
+        trials.sort(key=lambda trial: len(_packed(samples[trial[0]], trial[1])))
+    planar, (lc, lp, pb) = trials[0]
+    return bytes((lc + 9 * (lp + 5 * pb), planar)) + head + _packed(layouts[planar], (lc, lp, pb))
+
+
+def _read_layout(reader: ByteReader) -> bool:
+    """Whether bytes lie in planes. lc, lp and pb are recorded for the reader of a comparison: LZMA2 holds its own."""
+    reader.byte("lc, lp and pb", 9 * 5 * 5 - 1)
+    return bool(reader.byte("the layout's flags", 1))
+
+
+def _decompress(
+    reader: ByteReader, dtypes: Sequence[np.dtype], counts: Sequence[int], planar: bool
+) -> list[np.ndarray]:
+    size = sum(count * dtype.itemsize for count, dtype in zip(counts, dtypes, strict=True))
+    if size > MAX_RAW:
+        raise LimitExceeded(f"{size} bytes under LZMA, limit {MAX_RAW}")
+    data = _inflate(bytes(reader.rest()), size)
+    arrays, at = [], 0
+    for count, dtype in zip(counts, dtypes, strict=True):
+        part = np.frombuffer(data, dtype=np.uint8, count=count * dtype.itemsize, offset=at)
+        at += part.size
+        if planar:
+            part = np.ascontiguousarray(part.reshape(dtype.itemsize, count).T)
+        arrays.append(part.reshape(-1).view(dtype))
+    return arrays
+
+
+def _inflate(packed: bytes, size: int) -> bytes:
+    """Exactly `size` bytes: one more is asked for, so that a longer stream shows, and never more than that."""
+    decoder = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=_filters(size, 3, 0, 0))
+    try:
+        data = decoder.decompress(packed, max_length=size + 1)
+    except lzma.LZMAError as error:
+        raise Malformed(f"LZMA: {error}") from None
+    if len(data) != size or not decoder.eof or decoder.unused_data:
+        end = "ends" if decoder.eof else "goes on or is cut"
+        raise Malformed(f"the LZMA stream gives {len(data)} bytes and {end}, expected {size} and its end")
+    return data

@@ -1,0 +1,256 @@
+"""The registry of priors: parameters <-> bytes, and the integer table each one stands for.
+
+A prior covers a window of symbols kmin .. kmin + (n << shift) - 1. With shift > 0 the table codes (k - kmin) >> shift
+and the low bits follow with equal probabilities, so a wide channel needs no table of more than 2**14 entries. Symbols
+outside the window are exceptions, listed beside the prior.
+
+Adding a prior: a class with an id, `cum`, `write` and `read`, and its row in _FAMILIES.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import ClassVar
+
+import numpy as np
+
+from ..errors import Malformed, UnsupportedFeature
+from .tables import OCTAVE, SI_MAX, SI_MIN, histogram_table, mixture_table, norm_table
+from .varint import ByteReader, put_varint, put_zigzag
+
+K_MAX = (1 << 24) - 1  #: |k| of any symbol
+MAX_WINDOW = 1 << 14
+MAX_SHIFT = 12
+MU8_MAX = 1 << 31
+FLOORS = (1, 16)  #: 16 / 2**24 is the clip of R(a)
+CLASS_STEPS = (8, 16, 32, 64)  #: histogram classes per prior, in 1/64 octave
+
+CONST, GAUSS, GMM2, HIST = 0, 1, 2, 3
+SCALED = 4  #: a prefix: shift, then the family; never a prior's own id
+FIRST_REUSE = 8  #: family codes from here on name an earlier prior
+
+
+@dataclass(frozen=True)
+class Window:
+    kmin: int
+    n: int
+    shift: int = 0
+
+    @property
+    def end(self) -> int:
+        """The first symbol above the window."""
+        return self.kmin + (self.n << self.shift)
+
+    def write(self, out: bytearray) -> None:
+        put_zigzag(out, self.kmin)
+        put_varint(out, self.n - 2)
+
+    @classmethod
+    def read(cls, reader: ByteReader, shift: int) -> Window:
+        at = reader.offset
+        kmin = reader.zigzag(K_MAX, "the window's first symbol")
+        n = 2 + reader.varint(MAX_WINDOW - 2, "the window's size")
+        if kmin + ((n - 1) << shift) > K_MAX:
+            raise Malformed(f"a window of {n} << {shift} from {kmin} passes the largest symbol {K_MAX}", offset=at)
+        return cls(kmin, n, shift)
+
+
+@dataclass(frozen=True)
+class Normal:
+    """One Gaussian in a window: mean kmin + mu8 / 256 and standard deviation 2**(si / 64), in table entries."""
+
+    mu8: int
+    si: int
+
+    def write(self, out: bytearray, n: int, extra: int = 0) -> None:
+        put_zigzag(out, self.mu8 - 128 * (n - 1))  # from the window's middle: most often two bytes
+        put_varint(out, 2 * (self.si - SI_MIN) + extra)
+
+    @classmethod
+    def read(cls, reader: ByteReader, n: int) -> tuple[Normal, int]:
+        mu8 = reader.zigzag(MU8_MAX, "a Gaussian's mean") + 128 * (n - 1)
+        code = reader.varint(2 * (SI_MAX - SI_MIN) + 1, "a Gaussian's width")
+        return cls(mu8, (code >> 1) + SI_MIN), code & 1
+
+
+@dataclass(frozen=True, eq=False)
+class Const:
+    """Every symbol is kmin; costs nothing per symbol."""
+
+    id: ClassVar[int] = CONST
+    window: Window
+
+    @cached_property
+    def cum(self) -> np.ndarray:
+        return norm_table(1, 0, 0, 1)
+
+    def write(self, out: bytearray) -> None:
+        put_zigzag(out, self.window.kmin)
+
+    @classmethod
+    def read(cls, reader: ByteReader, shift: int) -> Const:
+        return cls(Window(reader.zigzag(K_MAX, "a constant"), 1))
+
+
+@dataclass(frozen=True, eq=False)
+class Gauss:
+    """A quantised Gaussian, the model of R(a)."""
+
+    id: ClassVar[int] = GAUSS
+    window: Window
+    normal: Normal
+    floor: int
+
+    @cached_property
+    def cum(self) -> np.ndarray:
+        return norm_table(self.window.n, self.normal.mu8, self.normal.si, self.floor)
+
+    def write(self, out: bytearray) -> None:
+        self.window.write(out)
+        self.normal.write(out, self.window.n, FLOORS.index(self.floor))
+
+    @classmethod
+    def read(cls, reader: ByteReader, shift: int) -> Gauss:
+        window = Window.read(reader, shift)
+        normal, floor = Normal.read(reader, window.n)
+        return cls(window, normal, FLOORS[floor])
+
+
+@dataclass(frozen=True, eq=False)
+class Mixture:
+    """Two quantised Gaussians; `weight` 1..255 is the second one's share in 1/256."""
+
+    id: ClassVar[int] = GMM2
+    window: Window
+    first: Normal
+    second: Normal
+    weight: int
+    floor: int
+
+    @cached_property
+    def cum(self) -> np.ndarray:
+        first, second = (self.first.mu8, self.first.si), (self.second.mu8, self.second.si)
+        return mixture_table(self.window.n, first, second, self.weight, self.floor)
+
+    def write(self, out: bytearray) -> None:
+        self.window.write(out)
+        self.first.write(out, self.window.n, FLOORS.index(self.floor))
+        self.second.write(out, self.window.n)
+        out.append(self.weight)
+
+    @classmethod
+    def read(cls, reader: ByteReader, shift: int) -> Mixture:
+        window = Window.read(reader, shift)
+        first, floor = Normal.read(reader, window.n)
+        second, reserved = Normal.read(reader, window.n)
+        weight = reader.byte("a mixture's weight")
+        if reserved or weight == 0:
+            raise Malformed("a mixture with a reserved bit set or a weight of 0", offset=reader.offset)
+        return cls(window, first, second, weight, FLOORS[floor])
+
+
+@dataclass(frozen=True, eq=False)
+class Hist:
+    """A histogram: frequencies rounded to `top` classes of `step` / 64 octaves, counted up to the largest; 0 is absent.
+
+    The classes (or their differences) are coded in the ANS stream, before all channels, under a Gaussian of their own.
+    """
+
+    id: ClassVar[int] = HIST
+    window: Window
+    step: int
+    top: int
+    differences: bool
+    class_si16: int  #: si = 16 * class_si16 - 160
+    class_mean16: int  #: mu8 = 16 * class_mean16; 0 and not stored for differences, whose mean is 0
+    classes: np.ndarray | None  #: int [n] in 0..top; None until the stream has given them
+
+    @cached_property
+    def class_cum(self) -> np.ndarray:
+        n, mu8 = (2 * self.top + 1, 256 * self.top) if self.differences else (self.top + 1, 16 * self.class_mean16)
+        return norm_table(n, mu8, 16 * self.class_si16 - 160, 1)
+
+    @property
+    def class_symbols(self) -> np.ndarray:
+        """The classes as symbols of class_cum, int64 [n]."""
+        classes = np.asarray(self.classes, dtype=np.int64)
+        return np.diff(classes, prepend=0) + self.top if self.differences else classes
+
+    def with_class_symbols(self, symbols: np.ndarray) -> Hist:
+        classes = np.cumsum(symbols.astype(np.int64) - self.top) if self.differences else symbols.astype(np.int64)
+        if classes.min() < 0 or classes.max() > self.top or classes.max() == 0:
+            raise Malformed(f"histogram classes {classes.min()}..{classes.max()}, expected 0..{self.top}, not all 0")
+        return replace(self, classes=classes)
+
+    @cached_property
+    def cum(self) -> np.ndarray:
+        classes = np.asarray(self.classes, dtype=np.int64)
+        below = (self.top - classes) * self.step
+        return histogram_table(np.where(classes > 0, OCTAVE[below & 63] >> (below >> 6), 0))
+
+    def write(self, out: bytearray) -> None:
+        self.window.write(out)
+        out.append(CLASS_STEPS.index(self.step) | 4 * self.differences)
+        put_varint(out, self.top)
+        out.append(self.class_si16)
+        if not self.differences:
+            put_varint(out, self.class_mean16)
+
+    @classmethod
+    def read(cls, reader: ByteReader, shift: int) -> Hist:
+        window = Window.read(reader, shift)
+        mode = reader.byte("a histogram's mode", 7)
+        step, differences = CLASS_STEPS[mode & 3], bool(mode & 4)
+        top = reader.varint(top_limit(step), "a histogram's largest class")
+        if top == 0:
+            raise Malformed("a histogram without classes", offset=reader.offset)
+        si16 = reader.byte("a histogram's class width", 63)
+        mean16 = 0 if differences else reader.varint(16 * top, "a histogram's class mean")
+        return cls(window, step, top, differences, si16, mean16, None)
+
+
+Prior = Const | Gauss | Mixture | Hist
+_FAMILIES: dict[int, type[Const] | type[Gauss] | type[Mixture] | type[Hist]] = {
+    family.id: family for family in (Const, Gauss, Mixture, Hist)
+}
+
+
+def top_limit(step: int) -> int:
+    """The largest class a histogram may have: classes reach 31 octaves below the largest frequency."""
+    return 1 + 31 * 64 // step
+
+
+def family_code(prior: Prior) -> int:
+    """What introduces a new prior in the parameter block."""
+    return SCALED if prior.window.shift else prior.id
+
+
+def write_prior(out: bytearray, prior: Prior) -> None:
+    """Append everything after the family code."""
+    if prior.window.shift:
+        out += bytes((prior.window.shift, prior.id))
+    prior.write(out)
+
+
+def read_prior(reader: ByteReader, family: int) -> Prior:
+    """Inverse of write_prior. Raises UnsupportedFeature for an id outside the registry."""
+    shift = 0
+    if family == SCALED:
+        shift = reader.byte("a prior's shift", MAX_SHIFT)
+        family = reader.byte("a prior's id")
+        if shift == 0 or family == CONST:
+            raise Malformed("a scaled prior with shift 0 or a constant", offset=reader.offset)
+    if family not in _FAMILIES:
+        raise UnsupportedFeature(f"prior {family} is not in the registry {sorted(_FAMILIES)}", offset=reader.offset)
+    return _FAMILIES[family].read(reader, shift)
+
+
+def header_bits(prior: Prior) -> float:
+    """Bits of the prior's own description: its bytes, and a histogram's classes."""
+    out = bytearray()
+    write_prior(out, prior)
+    bits = 8.0 * len(out)
+    if isinstance(prior, Hist):
+        bits += float((24 - np.log2(np.diff(prior.class_cum)))[prior.class_symbols].sum())
+    return bits

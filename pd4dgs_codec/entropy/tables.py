@@ -1,0 +1,81 @@
+"""Integer frequency tables: the only probabilities that enter the format.
+
+A table is ``cum`` int64 [n + 1], strictly increasing from 0 to 2**24; symbol q owns the interval [cum[q], cum[q + 1]).
+Every rule below uses integers below 2**53 only, so Python, C and JavaScript build the same table on every machine.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+PRECISION = 24
+TOTAL = 1 << PRECISION
+MAX_FLOOR_MASS = 1 << 23  #: n * floor may not pass it, so at least half of the mass follows the model
+SI_MIN, SI_MAX = -640, 1280  #: sigma = Q * 2 ** (si / 64)
+
+# The two constants of NormTable v1. Computing them in float64 is safe: no entry comes closer than 1e-4 to a rounding
+# boundary (a test checks that), while float64 is off by less than 1e-6 whatever the C library.
+_T = [round(2**27 * math.erf(i / (32 * math.sqrt(2)))) for i in range(257)]
+NORMAL = np.array([*_T, _T[-1]], dtype=np.int64)  #: T[i] = round(2**28 (Phi(i / 32) - 1/2)), T[257] = T[256]
+OCTAVE = np.array([round(2.0 ** (31 - j / 64)) for j in range(64)], dtype=np.int64)  #: M[j]
+
+
+def norm_cdf28(n: int, mu8: int | np.ndarray, si: int | np.ndarray) -> np.ndarray:
+    """C(k) for k = 0 .. n - 2, int64 [..., n - 1] in units of 2**-28: the Gaussian's mass up to k + 1/2.
+
+    mu8: 256 * (mean - kmin), in symbols; si: 64 * log2(sigma / Q). Arrays broadcast as leading axes.
+    """
+    mu8, si = np.asarray(mu8, dtype=np.int64)[..., None], np.asarray(si, dtype=np.int64)[..., None]
+    e, j = si >> 6, si & 63
+    nb = np.maximum(0, e - 8)
+    t = np.arange(n - 1, dtype=np.int64) * 256 + 128 - mu8
+    a = np.minimum(np.abs(t) >> nb, (1 << 21) - 1)
+    z = np.minimum((a * OCTAVE[j]) >> (23 + e - nb), 8 << 16)
+    i, f = z >> 11, z & 2047
+    v = NORMAL[i] + (((NORMAL[i + 1] - NORMAL[i]) * f) >> 11)
+    return (1 << 27) + np.where(t < 0, -v, v)
+
+
+def table_from_cdf28(cdf: np.ndarray, floor: int) -> np.ndarray:
+    """cum int64 [..., n + 1] from C int64 [..., n - 1]: each symbol gets `floor` plus its share of the rest."""
+    n = cdf.shape[-1] + 1
+    cum = np.empty((*cdf.shape[:-1], n + 1), dtype=np.int64)
+    cum[..., 0] = 0
+    cum[..., 1:-1] = ((cdf * (TOTAL - n * floor)) >> 28) + floor * np.arange(1, n)
+    cum[..., -1] = TOTAL
+    return cum
+
+
+def norm_table(n: int, mu8: int, si: int, floor: int) -> np.ndarray:
+    """NormTable v1: cum int64 [n + 1] of a quantised Gaussian over symbols 0 .. n - 1.
+
+    The first symbol carries the mass below the window, the last the mass above it. The caller has checked
+    n >= 1, SI_MIN <= si <= SI_MAX, |mu8| < 2**40 and n * floor <= MAX_FLOOR_MASS.
+    """
+    return table_from_cdf28(norm_cdf28(n, mu8, si), floor)
+
+
+def mixture_table(n: int, first: tuple[int, int], second: tuple[int, int], weight: int, floor: int) -> np.ndarray:
+    """cum int64 [n + 1] of two Gaussians (mu8, si); `weight` 0..256 is the second one's share in 1/256."""
+    c1, c2 = norm_cdf28(n, *first), norm_cdf28(n, *second)
+    return table_from_cdf28(((256 - weight) * c1 + weight * c2) >> 8, floor)
+
+
+def histogram_table(freqs: np.ndarray) -> np.ndarray:
+    """cum int64 [n + 1] from non-negative weights [n], each < 2**31, n <= 2**14, not all zero.
+
+    With W(q) the sum of the first q weights and s = max(0, bits(W(n)) - 28):
+    cum[q] = ((W(q) >> s) * (2**24 - n)) // (W(n) >> s) + q, so that an absent symbol keeps 2**-24.
+    """
+    total = np.cumsum(np.asarray(freqs, dtype=np.int64))
+    n, shift = len(total), max(0, int(total[-1]).bit_length() - 28)
+    cum = np.zeros(n + 1, dtype=np.int64)
+    cum[1:] = (total >> shift) * (TOTAL - n) // (int(total[-1]) >> shift) + np.arange(1, n + 1)
+    return cum
+
+
+def uniform_table(bits: int) -> np.ndarray:
+    """cum int64 [2**bits + 1] of equally likely symbols, 0 <= bits <= 24."""
+    return np.arange((1 << bits) + 1, dtype=np.int64) << (PRECISION - bits)

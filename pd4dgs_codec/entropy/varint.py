@@ -1,0 +1,68 @@
+"""Variable-length integers: LEB128, least significant seven bits first, always in the shortest form."""
+
+from __future__ import annotations
+
+from ..errors import LimitExceeded, Malformed
+
+_MAX_BYTES = 5
+
+
+def put_varint(out: bytearray, value: int) -> None:
+    """Append value (0 <= value < 2**35)."""
+    while value >= 0x80:
+        out.append(value & 0x7F | 0x80)
+        value >>= 7
+    out.append(value)
+
+
+def put_zigzag(out: bytearray, value: int) -> None:
+    """Append a signed value: 0, -1, 1, -2, ... become 0, 1, 2, 3, ..."""
+    put_varint(out, 2 * value if value >= 0 else -2 * value - 1)
+
+
+class ByteReader:
+    """Reads a parameter block front to back; every fault is Malformed or LimitExceeded with the byte offset in it."""
+
+    def __init__(self, data: bytes | memoryview):
+        self._data = memoryview(data)
+        self.offset = 0
+
+    @property
+    def remaining(self) -> int:
+        return len(self._data) - self.offset
+
+    def varint(self, limit: int, what: str) -> int:
+        """The next integer, at most `limit`."""
+        value, start = 0, self.offset
+        for index in range(_MAX_BYTES):
+            if self.offset >= len(self._data):
+                raise Malformed(f"the payload ends inside {what}", offset=start)
+            byte = self._data[self.offset]
+            self.offset += 1
+            value |= (byte & 0x7F) << (7 * index)
+            if byte < 0x80:
+                if index and byte == 0:
+                    raise Malformed(f"{what} is not in its shortest form", offset=start)
+                if value > limit:
+                    raise LimitExceeded(f"{what} is {value}, limit {limit}", offset=start)
+                return value
+        raise Malformed(f"{what} is longer than {_MAX_BYTES} bytes", offset=start)
+
+    def byte(self, what: str, limit: int = 255) -> int:
+        """The next byte, at most `limit`."""
+        if not self.remaining:
+            raise Malformed(f"the payload ends before {what}", offset=self.offset)
+        value = self._data[self.offset]
+        if value > limit:
+            raise Malformed(f"{what} is {value}, expected at most {limit}", offset=self.offset)
+        self.offset += 1
+        return value
+
+    def zigzag(self, limit: int, what: str) -> int:
+        """The next signed integer, at most `limit` in magnitude."""
+        code = self.varint(2 * limit, what)
+        return -(code + 1) // 2 if code & 1 else code // 2
+
+    def rest(self) -> memoryview:
+        """Everything that has not been read."""
+        return self._data[self.offset :]

@@ -1,0 +1,138 @@
+"""The ANS stream against an independent decoder, and its guards."""
+
+import struct
+from bisect import bisect_right
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pd4dgs_codec.entropy.ans import MAX_COUNT, AnsDecoder, ans_encode
+from pd4dgs_codec.entropy.tables import histogram_table, norm_table, uniform_table
+from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
+
+
+def python_decode(data: bytes, counts: list[int], cums: list[list[int]]) -> list[list[int]]:
+    """The normative arithmetic, with nothing but Python's integers."""
+    words = list(struct.unpack(f"<{len(data) // 4}I", data))[::-1]
+    x, channels = 0, []
+    while words and x < 1 << 32:
+        x = x << 32 | words.pop()
+    for count, cum in zip(counts, cums, strict=True):
+        symbols = []
+        for _ in range(count if len(cum) > 2 else 0):
+            q = x & 0xFFFFFF
+            s = bisect_right(cum, q) - 1
+            x = (x >> 24) * (cum[s + 1] - cum[s]) + q - cum[s]
+            if x < 1 << 32 and words:
+                x = x << 32 | words.pop()
+            symbols.append(s)
+        channels.append(symbols or [0] * count)
+    assert x == 0 and not words
+    return channels
+
+
+tables = st.one_of(
+    st.builds(norm_table, st.integers(1, 40), st.integers(-9, 9000), st.integers(-640, 640), st.sampled_from((1, 16))),
+    st.lists(st.integers(0, 1000), min_size=1, max_size=30).filter(any).map(lambda f: histogram_table(np.array(f))),
+    st.integers(0, 10).map(uniform_table),
+)
+
+
+@st.composite
+def coded_channels(draw):
+    cums = draw(st.lists(tables, max_size=5))
+    channels = [
+        np.array(draw(st.lists(st.integers(0, len(cum) - 2), max_size=40)), dtype=np.int32) for cum in cums
+    ]
+    return channels, cums
+
+
+@given(coded_channels())
+def test_round_trip_by_both_decoders(case):
+    channels, cums = case
+    data = ans_encode(channels, cums)
+    decoder = AnsDecoder(data)
+    for channel, cum in zip(channels, cums, strict=True):
+        taken = decoder.take(len(channel), cum)
+        assert taken.dtype == np.int32 and np.array_equal(taken, channel)
+    decoder.finish()
+    decoded = python_decode(data, [len(c) for c in channels], [c.tolist() for c in cums])
+    assert decoded == [c.tolist() for c in channels]
+
+
+def test_long_stream_costs_what_the_tables_say():
+    rng = np.random.default_rng(0)
+    cum = norm_table(41, 256 * 20, 128, 1)
+    symbols = np.clip(np.rint(rng.normal(20, 4, 30_000)), 0, 40).astype(np.int32)
+    bits = float((24 - np.log2(np.diff(cum)))[symbols].sum())
+    data = ans_encode([symbols], [cum])
+    assert bits <= 8 * len(data) + 1 and 8 * len(data) <= bits + 64
+    assert python_decode(data, [len(symbols)], [cum.tolist()]) == [symbols.tolist()]
+
+
+def test_nothing_costs_nothing():
+    const = norm_table(1, 0, 0, 1)
+    assert ans_encode([], []) == b"" == ans_encode([np.zeros(1000, np.int32)], [const])
+    decoder = AnsDecoder(b"")
+    assert np.array_equal(decoder.take(1000, const), np.zeros(1000))
+    decoder.finish()
+
+
+@pytest.mark.parametrize(
+    "symbols, cum",
+    [
+        ([3], uniform_table(1)),
+        ([-1], uniform_table(1)),
+        ([0], np.array([0, 5, 5, 2**24])),
+        ([0], np.array([1, 5, 2**24])),
+        ([0], np.array([0, 5, 2**24 - 1])),
+        ([0.5], uniform_table(1)),
+        ([[0, 1]], uniform_table(1)),
+        ([0], np.array([0])),
+    ],
+)
+def test_the_encoder_refuses_what_would_panic(symbols, cum):
+    with pytest.raises(EncodeError):
+        ans_encode([np.array(symbols)], [cum])
+
+
+def test_the_encoder_refuses_a_missing_table():
+    with pytest.raises(EncodeError):
+        ans_encode([np.array([0])], [])
+
+
+@pytest.mark.parametrize("count", [-1, MAX_COUNT + 1, 10**11])
+def test_the_decoder_refuses_counts_that_would_abort(count):
+    with pytest.raises(LimitExceeded):
+        AnsDecoder(b"\1\0\0\0").take(count, uniform_table(4))
+
+
+@pytest.mark.parametrize("data", [b"\1", b"\1\0\0", b"\0\0\0\0", b"\0\0\0\0\1\0\0\0"])
+def test_the_decoder_refuses_impossible_streams(data):
+    with pytest.raises(Malformed):
+        AnsDecoder(data)
+
+
+def test_the_decoder_refuses_a_bad_table():
+    with pytest.raises(Malformed):
+        AnsDecoder(b"\1\0\0\0").take(1, np.array([0, 7, 7, 2**24]))
+
+
+@settings(max_examples=60)
+@given(st.integers(0, 10**6), st.integers(0, 7), st.booleans())
+def test_damage_shows_in_the_final_state(at, bit, cut):
+    cum = norm_table(20, 2560, 100, 1)
+    symbols = np.random.default_rng(1).integers(0, 20, 200).astype(np.int32)
+    good = ans_encode([symbols], [cum])
+    bad = bytearray(good)
+    if cut:
+        # At least one word stays: without any the state is 0 throughout, the valid stream of 200 first symbols.
+        del bad[4 + 4 * (at % (len(good) // 4 - 1)) :]
+    else:
+        bad[at % len(good)] ^= 1 << bit
+    with pytest.raises(Malformed):
+        decoder = AnsDecoder(bytes(bad))
+        decoder.take(len(symbols), cum)
+        decoder.finish()

@@ -1,0 +1,93 @@
+"""The LZMA mode: round trips, the recorded layout, bounded and checked decompression."""
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pd4dgs_codec.entropy.lzma_mode import (
+    decode_channels_lzma,
+    decode_floats_lzma,
+    encode_channels_lzma,
+    encode_floats_lzma,
+)
+from pd4dgs_codec.entropy.priors import K_MAX
+from pd4dgs_codec.errors import DecodeError, EncodeError, LimitExceeded, Malformed
+
+bounded = st.integers(-100, 100) | st.integers(900, 1100) | st.integers(-K_MAX, K_MAX)
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.lists(bounded, max_size=30), max_size=5), st.sampled_from([1, 5, 9]))
+def test_symbols_round_trip(lists, effort):
+    channels = [np.array(values, dtype=np.int32) for values in lists]
+    coded = encode_channels_lzma(channels, effort=effort)
+    decoded = decode_channels_lzma(coded.payload, [len(c) for c in channels])
+    assert all(d.dtype == np.int32 and np.array_equal(d, c) for d, c in zip(decoded, channels, strict=True))
+    assert coded.payload_bits == 8 * len(coded.payload) and coded.prior_ids == []
+
+
+@settings(max_examples=40, deadline=None)
+@given(st.lists(st.lists(st.floats(width=32, allow_nan=False, allow_infinity=False), max_size=20), max_size=4))
+def test_floats_round_trip_bit_for_bit(lists):
+    arrays = [np.array(values, dtype=np.float32) for values in lists]
+    decoded = decode_floats_lzma(encode_floats_lzma(arrays), [a.size for a in arrays])
+    assert [d.tobytes() for d in decoded] == [a.tobytes() for a in arrays]
+
+
+def test_the_narrowest_width_is_taken_around_a_base():
+    rng = np.random.default_rng(0)
+    near = rng.integers(-120, 120, 4000).astype(np.int32)
+    far = near + 1_000_000
+    sizes = [len(encode_channels_lzma([c], effort=1).payload) for c in (near, far)]
+    assert sizes[1] <= sizes[0] + 8 and sizes[0] < 4200
+
+
+def test_more_effort_is_not_larger_here():
+    rng = np.random.default_rng(1)
+    channels = [np.rint(rng.normal(0, s, 3000)).astype(np.int32) for s in (0.5, 3, 400, 90_000)]
+    sizes = [len(encode_channels_lzma(channels, effort=e).payload) for e in (1, 5, 9)]
+    assert sizes[2] <= sizes[1] < sizes[0]
+
+
+def test_every_cut_and_many_flips_give_our_errors_only():
+    rng = np.random.default_rng(2)
+    channels = [np.rint(rng.normal(0, s, 120)).astype(np.int32) for s in (2, 500)]
+    payload, counts = encode_channels_lzma(channels).payload, [120, 120]
+    for size in range(len(payload)):
+        with pytest.raises(Malformed):
+            decode_channels_lzma(payload[:size], counts)
+    with pytest.raises(Malformed):
+        decode_channels_lzma(payload + b"\0", counts)
+    for bit in range(8 * len(payload)):
+        damaged = bytearray(payload)
+        damaged[bit // 8] ^= 1 << (bit % 8)
+        try:
+            decoded = decode_channels_lzma(bytes(damaged), counts)
+        except DecodeError:
+            continue
+        assert [len(d) for d in decoded] == counts
+
+
+def test_never_inflates_beyond_the_declared_counts():
+    bomb = encode_channels_lzma([np.zeros(4_000_000, np.int32)], effort=1).payload
+    assert len(bomb) < 2000
+    with pytest.raises(Malformed):
+        decode_channels_lzma(bomb, [100])
+    with pytest.raises(Malformed):
+        decode_channels_lzma(bomb, [4_000_001])
+    with pytest.raises(LimitExceeded):
+        decode_channels_lzma(bomb, [10**11])
+    with pytest.raises(LimitExceeded):
+        decode_floats_lzma(bomb, [1 << 26] * 9)
+
+
+def test_floats_that_are_not_numbers_are_refused_on_both_sides():
+    for bad in (np.array([np.nan], np.float32), np.array([np.inf], np.float32), np.array([1.0])):
+        with pytest.raises(EncodeError):
+            encode_floats_lzma([bad])
+    good = bytearray(encode_floats_lzma([np.array([1.5], np.float32)]))
+    at = good.index(np.float32(1.5).tobytes())  # too short to compress, so LZMA2 stores it
+    good[at : at + 4] = np.float32(np.nan).tobytes()
+    with pytest.raises(Malformed, match="NaN"):
+        decode_floats_lzma(bytes(good), [1])

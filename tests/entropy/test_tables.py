@@ -1,0 +1,125 @@
+"""NormTable v1 and the other integer tables: check vectors, extremes, and closeness to the exact Gaussian."""
+
+import math
+import zlib
+
+import mpmath
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pd4dgs_codec.entropy.tables import (
+    MAX_FLOOR_MASS,
+    NORMAL,
+    OCTAVE,
+    SI_MAX,
+    SI_MIN,
+    TOTAL,
+    histogram_table,
+    mixture_table,
+    norm_table,
+    uniform_table,
+)
+
+
+def is_table(cum: np.ndarray, n: int) -> bool:
+    return len(cum) == n + 1 and cum[0] == 0 and cum[-1] == TOTAL and bool(np.all(np.diff(cum) >= 1))
+
+
+def python_norm_table(n: int, mu8: int, si: int, fl: int) -> list[int]:
+    """The rule once more with Python's integers, one symbol at a time, checking the 2**53 bound."""
+    e, j = si >> 6, si & 63
+    nb = max(0, e - 8)
+    cum = [0]
+    for k in range(n - 1):
+        t = (2 * k + 1) * 128 - mu8
+        a = min(abs(t) >> nb, 2**21 - 1)
+        z = min((a * int(OCTAVE[j])) >> (23 + e - nb), 8 << 16)
+        i, f = z >> 11, z & 2047
+        v = int(NORMAL[i]) + (((int(NORMAL[i + 1]) - int(NORMAL[i])) * f) >> 11)
+        product = (2**27 + (-v if t < 0 else v)) * (2**24 - n * fl)
+        assert max(abs(t), a * int(OCTAVE[j]), product) < 2**53
+        cum.append((product >> 28) + fl * (k + 1))
+    return [*cum, 2**24]
+
+
+def test_check_vector():
+    expected = [0, 49993, 672082, 3802177, 10044625, 15004705, 16572122, 2**24]
+    assert norm_table(7, 832, 0, 1).tolist() == expected
+
+
+def test_constants_match_high_precision_and_stay_clear_of_rounding_boundaries():
+    with mpmath.workdps(40):
+        normal = [2**28 * (mpmath.ncdf(mpmath.mpf(i) / 32) - mpmath.mpf(1) / 2) for i in range(257)]
+        octave = [mpmath.power(2, 31 - mpmath.mpf(j) / 64) for j in range(64)]
+        assert [int(mpmath.nint(x)) for x in normal] == NORMAL[:257].tolist()
+        assert [int(mpmath.nint(x)) for x in octave] == OCTAVE.tolist()
+        margin = min(abs(x - mpmath.floor(x) - 0.5) for x in normal + octave)
+    assert margin > 1e-4 and NORMAL[257] == NORMAL[256] == 2**27
+    assert (NORMAL[1], NORMAL[32]) == (3346026, 91629033)
+
+
+@given(
+    st.integers(2, 300), st.integers(-(2**31), 2**31), st.integers(SI_MIN, SI_MAX), st.sampled_from([1, 16])
+)
+def test_equals_the_rule_in_python_integers(n, mu8, si, floor):
+    cum = norm_table(n, mu8, si, floor)
+    assert cum.tolist() == python_norm_table(n, mu8, si, floor) and is_table(cum, n)
+
+
+@pytest.mark.parametrize("si", [SI_MIN, -1, 0, 577, SI_MAX])
+@pytest.mark.parametrize("n, floor", [(2, 1), (2, 16), (1 << 14, 16)])
+def test_extreme_parameters_give_tables(n, floor, si):
+    for mu8 in (0, 128 * n, -(2**31), 2**31):
+        assert is_table(norm_table(n, mu8, si, floor), n)
+
+
+def test_the_largest_windows_give_tables():
+    for n, floor in ((1 << 19, 16), (1 << 20, 8)):
+        assert n * floor == MAX_FLOOR_MASS and is_table(norm_table(n, 128 * n, 1000, floor), n)
+
+
+@pytest.mark.parametrize("sigma", [0.05, 0.3, 1.0, 7.3, 200.0])
+def test_loses_almost_nothing_against_the_exact_gaussian(sigma):
+    si = round(64 * math.log2(sigma))
+    sigma, mean = 2 ** (si / 64), 6 * max(sigma, 1) + 0.25
+    n = int(2 * mean) + 1
+    cum = norm_table(n, round(256 * mean), si, 1)
+    scale = sigma * math.sqrt(2)
+    exact = np.array([math.erf((k + 0.5 - mean) / scale) - math.erf((k - 0.5 - mean) / scale) for k in range(n)]) / 2
+    seen = exact > 1e-12
+    loss = exact[seen] @ np.log2(exact[seen] / (np.diff(cum)[seen] / TOTAL))
+    bits = -(exact[seen] @ np.log2(exact[seen]))
+    assert 0 <= loss + 1e-9 and loss <= 7e-4 * bits + 1e-5
+
+
+@given(st.integers(2, 200), st.integers(0, 256), st.integers(SI_MIN, SI_MAX), st.integers(SI_MIN, SI_MAX))
+def test_mixture_is_a_table_between_its_parts(n, weight, si1, si2):
+    cum = mixture_table(n, (100, si1), (256 * n, si2), weight, 1)
+    ends = np.stack([norm_table(n, 100, si1, 1), norm_table(n, 256 * n, si2, 1)])
+    assert is_table(cum, n)
+    assert np.all(cum >= ends.min(axis=0) - 1) and np.all(cum <= ends.max(axis=0) + 1)
+
+
+@given(st.lists(st.integers(0, 2**31 - 1), min_size=1, max_size=60).filter(any))
+def test_histogram_table_follows_the_weights(freqs):
+    cum = histogram_table(np.array(freqs))
+    assert is_table(cum, len(freqs))
+    share = np.array(freqs) / sum(freqs)
+    assert np.all(np.abs(np.diff(cum) / TOTAL - share) < (len(freqs) + 3) / TOTAL)
+
+
+def test_histogram_table_at_its_limits():
+    assert histogram_table(np.array([0, 3, 1])).tolist() == [0, 1, 1 + (2**24 - 3) * 3 // 4 + 1, 2**24]
+    assert is_table(histogram_table(np.full(1 << 14, 2**31 - 1)), 1 << 14)
+    assert uniform_table(2).tolist() == [0, 2**22, 2**23, 3 * 2**22, 2**24]
+
+
+def test_tables_are_frozen():
+    """A checksum over many tables: a change of any entry is a change of the format."""
+    crc = 0
+    for si in range(SI_MIN, SI_MAX + 1, 37):
+        for mu8 in (-1000, 0, 4321, 10**6):
+            crc = zlib.crc32(norm_table(33, mu8, si, 1 if si % 2 else 16).astype("<i8").tobytes(), crc)
+    assert crc == 0xc5ea5b43
