@@ -1,1 +1,39 @@
+"""Progressive 4D Gaussian splatting: a layered codec, an open bitstream format and a trainer.
 
+    data = encode(scene)                    # scene.Scene -> bytes of a .pd4 file
+    scene = decode(data, max_layer=1)       # a prefix of its layers
+    stream = open_stream()                  # stream.feed(bytes) -> one Scene per completed layer
+
+Importing the package loads none of its modules; each name below loads what it needs at first use.
+"""
+
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pd4dgs_codec.codec.decoder import decode
+    from pd4dgs_codec.codec.encoder import encode
+    from pd4dgs_codec.codec.info import FORMAT_VERSION
+    from pd4dgs_codec.codec.stream import open_stream
+
+__version__ = "0.1.0"
+__all__ = ["FORMAT_VERSION", "decode", "encode", "open_stream"]
+
+_HOMES = {
+    "FORMAT_VERSION": "pd4dgs_codec.codec.info",
+    "decode": "pd4dgs_codec.codec.decoder",
+    "encode": "pd4dgs_codec.codec.encoder",
+    "open_stream": "pd4dgs_codec.codec.stream",
+}
+
+
+def __getattr__(name: str) -> object:
+    if name not in _HOMES:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(_HOMES[name]), name)
+
+
+def __dir__() -> list[str]:
+    return sorted([*globals(), *_HOMES])

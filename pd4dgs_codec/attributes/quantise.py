@@ -1,0 +1,54 @@
+"""Uniform scalar quantisation, float32 <-> int32 symbols, and mask codes."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pd4dgs_codec.errors import EncodeError
+from pd4dgs_codec.scene import MASK_MIN_CODE, MASK_THRESHOLD
+
+#: Symbols k satisfy |k| <= MAX_SYMBOL, so that binary64(k) * binary64(Q) is exact (24 + 24 bits of significand).
+MAX_SYMBOL = (1 << 24) - 1
+
+_SMALLEST_STEP = float(np.finfo(np.float32).tiny)
+_LARGEST_STEP = float(np.finfo(np.float32).max)
+
+
+def is_step(value: float) -> bool:
+    """Whether `value` may be a quantisation step or a voxel size: a positive normal binary32."""
+    return bool(_SMALLEST_STEP <= value <= _LARGEST_STEP and float(np.float32(value)) == value)
+
+
+def quantise(x: np.ndarray, step: float, name: str = "tensor") -> np.ndarray:
+    """k = round-half-to-even(binary64(x) / binary64(step)), int32 of x's shape.
+
+    x: float32 array. step: positive normal binary32. quantise(dequantise(k, step), step) == k for |k| <= 2^23; above
+    that two neighbouring k can share one binary32 value unless step is a power of two.
+    Raises EncodeError naming the tensor if a value is not finite or |k| would exceed MAX_SYMBOL.
+    """
+    if not is_step(step):
+        raise EncodeError(f"{name}: quantisation step {step!r}, expected a positive normal binary32 value")
+    if not np.isfinite(x).all():
+        raise EncodeError(f"{name}: {np.size(x) - int(np.isfinite(x).sum())} values are NaN or infinite, expected none")
+    k = np.rint(x.astype(np.float64) / np.float64(step))
+    largest = float(np.abs(k).max()) if k.size else 0.0
+    if largest > MAX_SYMBOL:
+        raise EncodeError(f"{name}: symbol of magnitude {largest:.0f} at step {step:g}, expected at most {MAX_SYMBOL}")
+    return k.astype(np.int32)
+
+
+def dequantise(k: np.ndarray, step: float) -> np.ndarray:
+    """x_hat = binary32(binary64(k) * binary64(step)), float32 of k's shape: an exact product and one rounding."""
+    with np.errstate(over="ignore"):  # an overflow to infinity is the caller's to refuse
+        return (k.astype(np.float64) * np.float64(step)).astype(np.float32)
+
+
+def mask_codes(mask: np.ndarray) -> np.ndarray:
+    """uint8 codes of masks m in [0, 1]: 0 where m <= MASK_THRESHOLD, else max(MASK_MIN_CODE, round(255 m)).
+
+    Monotone in m, so codes keep the order of the masks they come from. The inverse is m = code * MASK_STEP.
+    """
+    m = np.asarray(mask, dtype=np.float64)
+    if not ((m >= 0) & (m <= 1)).all():
+        raise EncodeError("mask: a value is outside [0, 1] or NaN")
+    return np.where(m <= MASK_THRESHOLD, 0, np.maximum(MASK_MIN_CODE, np.rint(m * 255.0))).astype(np.uint8)

@@ -1,0 +1,1 @@
+"""Whole scene <-> chunks of a `.pd4` file: layer plan, encoder, decoder, incremental stream. No torch."""

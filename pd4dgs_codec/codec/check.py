@@ -1,0 +1,113 @@
+"""Checks of a Scene before it is encoded: shapes, dtypes, finiteness, row counts. One clear line each."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import numpy as np
+
+from pd4dgs_codec.attributes.quantise import is_step
+from pd4dgs_codec.attributes.table import ATTRIBUTES
+from pd4dgs_codec.bitstream.limits import MAX_VOXEL
+from pd4dgs_codec.codec.kinds import LAYER_KINDS, SCAFFOLD_INPUT, TRUNK, LayerKind
+from pd4dgs_codec.errors import EncodeError
+from pd4dgs_codec.scene import MASK_MIN_CODE, PLANES, Deformation, Network, Scene
+
+
+def _expect(ok: bool, message: str) -> None:
+    if not ok:
+        raise EncodeError(message)
+
+
+def _expect_array(name: str, a: np.ndarray, dtype: type, shape: tuple[int | None, ...]) -> None:
+    matches = len(a.shape) == len(shape) and all(e is None or e == f for e, f in zip(shape, a.shape, strict=True))
+    _expect(a.dtype == dtype and matches, f"{name}: {a.dtype} {a.shape}, expected {np.dtype(dtype)} {shape}")
+    if a.dtype.kind == "f":
+        _expect(bool(np.isfinite(a).all()), f"{name}: a value is NaN or infinite")
+
+
+def check_scene(scene: Scene) -> None:
+    """Raise EncodeError unless `scene` has the shapes, dtypes and ranges that scene.Scene documents."""
+    layers, rows = scene.layers, scene.rows
+    _expect(layers[:1] == (0,) and set(layers) <= {0, 1, 2}, f"layers {layers}, expected 0 first and none but 0, 1, 2")
+    _expect(all(a < b for a, b in pairwise(layers)), f"layers {layers}, expected ascending numbers")
+    _expect(len(rows) == len(layers) == len(scene.mask), "rows, mask and layers differ in length")
+    _expect(all(a <= b for a, b in pairwise((0, *rows))), f"rows {rows}, expected a non-decreasing sequence")
+    n = rows[-1]
+    _expect_array("anchor_q", scene.anchor_q, np.int32, (n, 3))
+    if n:
+        reach = max(int(scene.anchor_q.max()), -int(scene.anchor_q.min()))
+        _expect(reach <= MAX_VOXEL, f"anchor_q: voxel index of magnitude {reach}, expected at most {MAX_VOXEL}")
+    for a in ATTRIBUTES:
+        _expect_array(a.name, getattr(scene, a.name), np.float32, (n, *a.shape))
+    _check_masks(scene)
+    _check_info(scene)
+    for name, step in vars(scene.steps).items():
+        _expect(is_step(step), f"step of {name}: {step!r}, expected a positive normal binary32 value")
+    _check_networks("scaffold", scene.networks, LAYER_KINDS[0], SCAFFOLD_INPUT)
+    missing = set(LAYER_KINDS[0].heads) - set(scene.networks)
+    _expect(not missing, f"scaffold networks {sorted(missing)} are missing")
+    for kind in LAYER_KINDS[1:]:
+        deformation = getattr(scene, kind.deformation or "")
+        if deformation is not None:
+            _expect(kind.layer in layers, f"{kind.deformation} is given, but layer {kind.layer} is not among {layers}")
+            _check_deformation(deformation, kind)
+
+
+def _check_masks(scene: Scene) -> None:
+    for layer, rows, codes in zip(scene.layers, scene.rows, scene.mask, strict=True):
+        _expect_array(f"mask of layer {layer}", codes, np.uint8, (rows,))
+        odd = (codes > 0) & (codes < MASK_MIN_CODE)
+        _expect(not odd.any(), f"mask of layer {layer}: a code in 1..{MASK_MIN_CODE - 1}, expected 0 or more")
+    for (low, high), layer in zip(pairwise(scene.mask), scene.layers[1:], strict=True):
+        _expect(bool((high[: low.size] >= low).all()), f"mask of layer {layer} falls below that of the layer before")
+
+
+def _check_info(scene: Scene) -> None:
+    info = scene.info
+    _expect(is_step(info.voxel_size), f"voxel_size {info.voxel_size!r}, expected a positive normal binary32 value")
+    _expect_array("box", info.box, np.float32, (2, 3))
+    _expect(bool((info.box[0] <= info.box[1]).all()), "box: a lower corner above the upper one")
+    reals = [*info.time_range, *info.background, info.near, info.far, *info.up, info.unit]
+    with np.errstate(over="ignore"):
+        _expect(bool(np.isfinite(np.array(reals, np.float32)).all()), "info: a value is NaN, infinite or over binary32")
+    if info.camera is not None:
+        _expect_array("camera.viewmat", info.camera.viewmat, np.float32, (4, 4))
+        _expect_array("camera.K", info.camera.K, np.float32, (3, 3))
+        sizes = (info.camera.width, info.camera.height)
+        _expect(all(1 <= s <= 65535 for s in sizes), f"camera of {sizes} pixels, expected 1..65535 each")
+        _expect(bool((info.camera.viewmat[3] == (0, 0, 0, 1)).all()), "camera.viewmat: last row is not 0 0 0 1")
+
+
+def _check_deformation(deformation: Deformation, kind: LayerKind) -> None:
+    name, width = kind.deformation, 0
+    _expect(len(deformation.planes) > 0, f"{name}: no planes, expected at least one scale")
+    for s, planes in enumerate(deformation.planes):
+        _expect(set(planes) == {p for p, _, _ in PLANES}, f"{name} scale {s}: planes {sorted(planes)}, expected six")
+        channels, side = planes["xy"].shape[0], plane_sides(planes)
+        _expect(min(channels, *side) >= 1, f"{name} scale {s}: an empty plane")
+        for p, a, b in PLANES:
+            _expect_array(f"{name} scale {s} plane {p}", planes[p], np.float32, (channels, side[b], side[a]))
+        width += channels
+    _expect(TRUNK in deformation.networks, f"{name}: the network 'trunk' is missing")
+    trunk_out = deformation.networks[TRUNK][-1][0].shape[0]
+    for network, layers in deformation.networks.items():
+        _check_networks(str(name), {network: layers}, kind, width if network == TRUNK else trunk_out)
+
+
+def _check_networks(owner: str, networks: dict[str, Network], kind: LayerKind, width_in: int) -> None:
+    for name, network in networks.items():
+        _expect(name in kind.network_ids, f"{owner}: network {name!r}, expected one of {list(kind.network_ids)}")
+        _expect(len(network) > 0, f"{owner} network {name}: no layers")
+        width = width_in
+        for i, (weight, bias) in enumerate(network):
+            _expect_array(f"{owner} network {name} weight {i}", weight, np.float32, (None, width))
+            width = weight.shape[0]
+            _expect_array(f"{owner} network {name} bias {i}", bias, np.float32, (width,))
+        out = kind.heads.get(name, width)
+        _expect(width == out, f"{owner} network {name}: {width} outputs, expected {out}")
+
+
+def plane_sides(planes: dict[str, np.ndarray]) -> tuple[int, int, int, int]:
+    """Resolutions along x, y, z, t of one scale's planes, read off xy and zt."""
+    return planes["xy"].shape[2], planes["xy"].shape[1], planes["zt"].shape[2], planes["zt"].shape[1]

@@ -1,0 +1,131 @@
+"""Bytes of a `.pd4` file -> Scene. Takes bytes and nothing else; needs numpy, constriction and the standard library."""
+
+from __future__ import annotations
+
+from pd4dgs_codec.bitstream.container import PREAMBLE_SIZE, read_chunk, read_preamble, scene_id_of
+from pd4dgs_codec.codec.header import Header, unpack_header
+from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
+from pd4dgs_codec.codec.layers import read_layer
+from pd4dgs_codec.codec.symbols import LayerSymbols, assemble
+from pd4dgs_codec.errors import DecodeError, Malformed, Truncated, UnsupportedFeature
+from pd4dgs_codec.scene import Scene
+
+
+class LayerReader:
+    """Walks a file's chunks in order. It holds no bytes: every call gets all of the file that has arrived."""
+
+    def __init__(self) -> None:
+        self.header: Header | None = None
+        self.layers: list[LayerSymbols] = []
+        self.offset = 0  #: of the next chunk
+        self._index = 0
+        self._scene_id: bytes | None = None
+
+    @property
+    def complete(self) -> bool:
+        """Whether every chunk that the header lists has been read."""
+        return self.header is not None and self._index == len(self.header.chunks)
+
+    def scene(self) -> Scene:
+        """The scene of the layers read so far, at least one."""
+        assert self.header is not None
+        try:
+            return assemble(self.header.info, self.header.attribute_steps, self.layers)
+        except DecodeError as error:
+            raise _located(error, self._index - 1, self.offset) from None
+
+    def next_layer(self, data: bytes | bytearray, max_layer: int | None = None) -> LayerSymbols | None:
+        """Read on to the end of one more layer <= max_layer; None if the file has no more (clause "decoding process").
+
+        Raises Truncated, with nothing consumed that a later call would miss, if `data` ends before; Malformed if
+        bytes follow the last chunk.
+        """
+        if self.header is None:
+            preamble = read_preamble(data)
+            self.header, self.offset = unpack_header(preamble.header, offset=PREAMBLE_SIZE), preamble.size
+        chunks = self.header.chunks
+        while self._index < len(chunks):
+            if max_layer is not None and not _any_layer(chunks[self._index :], max_layer):
+                return None
+            layer = self._read_chunk(data)
+            if layer is not None:
+                self.layers.append(layer)
+                return layer
+        if len(data) > self.offset:
+            raise Malformed(f"{len(data) - self.offset} bytes follow the last chunk, expected none", offset=self.offset)
+        return None
+
+    def _read_chunk(self, data: bytes | bytearray) -> LayerSymbols | None:
+        """The layer in the next chunk, or None if it is an ancillary one that is not known."""
+        assert self.header is not None
+        expected_type, length = self.header.chunks[self._index]
+        chunk = read_chunk(
+            data, self.offset, type=expected_type, length=length, scene_id=self._scene_id, index=self._index
+        )
+        kind = BY_CHUNK_TYPE.get(chunk.type)
+        if kind is None and not chunk.ancillary:
+            message = f"critical chunk of unknown type {chunk.type}"
+            raise UnsupportedFeature(message, offset=self.offset, chunk=self._index)
+        if self._scene_id is None:
+            self._scene_id = scene_id_of(chunk.payload)
+            if chunk.scene_id != self._scene_id:
+                message = f"scene id {chunk.scene_id.hex()}, expected {self._scene_id.hex()} from the layer-0 payload"
+                raise Malformed(message, offset=self.offset + 8, chunk=self._index)
+        layer = None
+        if kind is not None:
+            rows_before = sum(len(layer.anchor_q) for layer in self.layers)
+            try:
+                layer = read_layer(chunk.payload, kind, rows_before, self.header.mode, self.header.raw_deformation)
+            except DecodeError as error:
+                raise _located(error, self._index, self.offset) from None
+        self._index += 1
+        self.offset = chunk.end
+        return layer
+
+
+def _any_layer(chunks: tuple[tuple[int, int], ...], max_layer: int) -> bool:
+    return any(kind in BY_CHUNK_TYPE and BY_CHUNK_TYPE[kind].layer <= max_layer for kind, _ in chunks)
+
+
+def _located(error: DecodeError, chunk: int, offset: int) -> DecodeError:
+    """`error` from inside a payload, placed in the file. A payload is complete, so it cannot be Truncated."""
+    kind = Malformed if isinstance(error, Truncated) else type(error)
+    return kind(error.message, offset=offset, chunk=chunk, clause=error.clause)
+
+
+def decode_layers(
+    data: bytes, *, max_layer: int | None = None, allow_partial: bool = False
+) -> tuple[Header, list[LayerSymbols], bool]:
+    """(header, symbols per layer, whether nothing asked for is missing)."""
+    reader, complete = _read(data, max_layer, allow_partial)
+    assert reader.header is not None
+    return reader.header, reader.layers, complete
+
+
+def decode(data: bytes, *, max_layer: int | None = None, allow_partial: bool = False) -> Scene:
+    """The scene of a file, or of its layers <= max_layer (bytes after those are not looked at).
+
+    A cut file raises Truncated, or yields its longest valid prefix of layers if allow_partial, which still needs
+    layer 0. Other faults raise the other DecodeErrors.
+    """
+    return decode_partial(data, max_layer=max_layer, allow_partial=allow_partial)[0]
+
+
+def decode_partial(data: bytes, *, max_layer: int | None = None, allow_partial: bool = True) -> tuple[Scene, bool]:
+    """(scene, complete): as decode, and whether every layer asked for was there."""
+    reader, complete = _read(data, max_layer, allow_partial)
+    return reader.scene(), complete
+
+
+def _read(data: bytes, max_layer: int | None, allow_partial: bool) -> tuple[LayerReader, bool]:
+    if max_layer is not None and max_layer < 0:
+        raise ValueError(f"max_layer must be 0 or more, found {max_layer}")
+    reader = LayerReader()
+    try:
+        while reader.next_layer(data, max_layer) is not None:
+            pass
+    except Truncated:
+        if not (allow_partial and reader.layers):
+            raise
+        return reader, False
+    return reader, True

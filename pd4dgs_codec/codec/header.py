@@ -1,0 +1,135 @@
+"""The file header <-> canonical msgpack: chunk list, coding mode, attribute steps, and what shows the file alone."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pd4dgs_codec.attributes.quantise import is_step
+from pd4dgs_codec.attributes.table import ATTRIBUTES
+from pd4dgs_codec.bitstream import canonical
+from pd4dgs_codec.bitstream.limits import MAX_CHUNKS, MAX_PAYLOAD
+from pd4dgs_codec.codec.fields import Fields, as_integer, as_list
+from pd4dgs_codec.codec.kinds import LAYER_KINDS
+from pd4dgs_codec.errors import Malformed
+from pd4dgs_codec.scene import Camera, SceneInfo
+
+#: How symbols are coded, and how the deformations' planes and weights travel: the numbers in the header.
+MODES = {"ans": 0, "lzma": 1}
+DEFORMATIONS = {"coded": 0, "float32": 1}
+
+# Keys of the header map.
+CHUNKS, MODE, DEFORMATION, STEPS, VOXEL_SIZE, BOX, TIME_RANGE, BACKGROUND, NEAR_FAR, UP, UNIT, CAMERA = range(1, 13)
+# Keys of the camera map.
+VIEWMAT, INTRINSICS, WIDTH, HEIGHT = range(1, 5)
+
+MAX_CAMERA_SIDE = 65535
+
+
+@dataclass(frozen=True, eq=False)
+class Header:
+    """chunks: (type, payload length in bytes) in file order. attribute_steps: by name, in the table's order."""
+
+    chunks: tuple[tuple[int, int], ...]
+    mode: str
+    deformation: str
+    attribute_steps: dict[str, float]
+    info: SceneInfo
+
+    @property
+    def raw_deformation(self) -> bool:
+        """Whether planes and weights of the deformations are float32 values."""
+        return self.deformation == "float32"
+
+
+def _f32(values) -> list[float]:
+    return [float(np.float32(v)) for v in np.ravel(values)]
+
+
+def pack_header(header: Header) -> bytes:
+    """The header's bytes. Raises EncodeError (from the packer) for a value canonical msgpack cannot hold."""
+    info = header.info
+    fields: dict[int, object] = {
+        CHUNKS: [list(chunk) for chunk in header.chunks],
+        MODE: MODES[header.mode],
+        DEFORMATION: DEFORMATIONS[header.deformation],
+        STEPS: _f32([header.attribute_steps[a.name] for a in ATTRIBUTES]),
+        VOXEL_SIZE: _f32(info.voxel_size)[0],
+        BOX: _f32(info.box),
+        TIME_RANGE: _f32(info.time_range),
+        BACKGROUND: _f32(info.background),
+        NEAR_FAR: _f32([info.near, info.far]),
+        UP: _f32(info.up),
+        UNIT: _f32(info.unit)[0],
+    }
+    if info.camera is not None:
+        camera = info.camera
+        fields[CAMERA] = {
+            VIEWMAT: _f32(camera.viewmat[:3]),
+            INTRINSICS: _f32(camera.K),
+            WIDTH: int(camera.width),
+            HEIGHT: int(camera.height),
+        }
+    return canonical.pack(fields)
+
+
+def unpack_header(data: bytes, offset: int = 0) -> Header:
+    """The inverse of pack_header (clause "header"); `offset` is that of the header's first byte, for messages."""
+    fields = Fields(canonical.unpack(data, offset=offset), "header", set(range(CHUNKS, CAMERA + 1)))
+    steps = fields.reals(STEPS, len(ATTRIBUTES))
+    voxel_size = fields.real(VOXEL_SIZE)
+    for name, step in zip(["voxel_size", *(a.name for a in ATTRIBUTES)], [voxel_size, *steps], strict=True):
+        if not is_step(step):
+            raise Malformed(f"header: step {step!r} of {name}, expected a positive normal binary32 value")
+    box = np.array(fields.reals(BOX, 6), dtype=np.float32).reshape(2, 3)
+    if (box[0] > box[1]).any():
+        raise Malformed("header: a lower corner of the box lies above the upper one")
+    near, far = fields.reals(NEAR_FAR, 2)
+    info = SceneInfo(
+        voxel_size=voxel_size,
+        box=box,
+        time_range=fields.reals(TIME_RANGE, 2),  # type: ignore[arg-type]
+        background=fields.reals(BACKGROUND, 3),  # type: ignore[arg-type]
+        near=near,
+        far=far,
+        up=fields.reals(UP, 3),  # type: ignore[arg-type]
+        unit=fields.real(UNIT),
+        camera=_unpack_camera(fields.get(CAMERA)) if CAMERA in fields else None,
+    )
+    return Header(
+        chunks=_unpack_chunks(fields.sequence(CHUNKS)),
+        mode=fields.choice(MODE, MODES),
+        deformation=fields.choice(DEFORMATION, DEFORMATIONS),
+        attribute_steps={a.name: step for a, step in zip(ATTRIBUTES, steps, strict=True)},
+        info=info,
+    )
+
+
+def _unpack_chunks(rows: list) -> tuple[tuple[int, int], ...]:
+    as_integer(len(rows), MAX_CHUNKS, "header: number of chunks", low=1)
+    chunks = []
+    for i, row in enumerate(rows):
+        kind, length = as_list(row, f"header: chunk {i}", 2)
+        chunks.append(
+            (
+                as_integer(kind, 0xFFFF, f"header: type of chunk {i}"),
+                as_integer(length, MAX_PAYLOAD, f"header: length of chunk {i}"),
+            )
+        )
+    layers = [kind for kind, _ in chunks if kind < len(LAYER_KINDS)]
+    if chunks[0][0] != 0 or layers != sorted(set(layers)):
+        raise Malformed(f"header: layer chunks {layers}, expected layer 0 first and each layer once, ascending")
+    return tuple(chunks)
+
+
+def _unpack_camera(data: object) -> Camera:
+    fields = Fields(data, "header camera", {VIEWMAT, INTRINSICS, WIDTH, HEIGHT})
+    viewmat = np.eye(4, dtype=np.float32)
+    viewmat[:3] = np.array(fields.reals(VIEWMAT, 12), dtype=np.float32).reshape(3, 4)
+    return Camera(
+        viewmat=viewmat,
+        K=np.array(fields.reals(INTRINSICS, 9), dtype=np.float32).reshape(3, 3),
+        width=fields.integer(WIDTH, MAX_CAMERA_SIDE, low=1),
+        height=fields.integer(HEIGHT, MAX_CAMERA_SIDE, low=1),
+    )

@@ -1,0 +1,195 @@
+"""What only one layer needs, at the start of its payload: rows, section lengths, steps, plane sizes, network widths."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from enum import IntEnum
+
+from pd4dgs_codec.attributes.planes import PREDICTORS
+from pd4dgs_codec.attributes.quantise import is_step
+from pd4dgs_codec.attributes.table import N_CHANNELS
+from pd4dgs_codec.bitstream import canonical
+from pd4dgs_codec.bitstream.limits import (
+    MAX_ANCHORS,
+    MAX_NETWORK_LAYERS,
+    MAX_NETWORK_WIDTH,
+    MAX_PAYLOAD,
+    MAX_PLANE_CELLS,
+    MAX_PLANE_CHANNELS,
+    MAX_PLANE_SCALES,
+    MAX_PLANE_SIDE,
+)
+from pd4dgs_codec.codec.fields import Fields, as_integer, as_list
+from pd4dgs_codec.codec.kinds import SCAFFOLD_INPUT, TRUNK, LayerKind
+from pd4dgs_codec.errors import LimitExceeded, Malformed, UnsupportedFeature
+from pd4dgs_codec.scene import PLANES
+
+
+class Section(IntEnum):
+    """Parts of a payload, in order; one without symbols is absent. SYMBOLS (mode lzma) stands for 1..4 together."""
+
+    POSITIONS = 0
+    MASKS = 1
+    ATTRIBUTES = 2
+    PLANES = 3
+    WEIGHTS = 4
+    SYMBOLS = 5
+    FLOATS = 6
+
+
+# Keys of the map.
+ROWS, SECTIONS, STEPS, SCALES, NETWORKS = range(1, 6)
+
+#: A layer of S symbols has at least (S - FREE_SYMBOLS) / SYMBOLS_PER_BYTE bytes, so that a few bytes that declare
+#: constant channels cannot make a decoder allocate without end. Real scenes spend over 0.1 bit per symbol.
+FREE_SYMBOLS = 1 << 22
+SYMBOLS_PER_BYTE = 2048
+
+
+@dataclass(frozen=True)
+class ScaleMeta:
+    """One HexPlane scale: channels, resolution along x, y, z, t, and a predictor id per plane in PLANES' order."""
+
+    channels: int
+    sides: tuple[int, int, int, int]
+    predictors: tuple[int, ...]
+
+    def shapes(self) -> list[tuple[int, int, int]]:
+        """[C, H, W] of the six planes."""
+        return [(self.channels, self.sides[b], self.sides[a]) for _, a, b in PLANES]
+
+
+@dataclass(frozen=True)
+class LayerMeta:
+    """rows: the layer's own anchors. sections: length in bytes by Section. steps: by field of Steps.
+
+    networks: per name the widths of its linear layers' outputs; the first input follows from the layer (input_width).
+    """
+
+    rows: int
+    sections: dict[int, int]
+    steps: dict[str, float]
+    scales: tuple[ScaleMeta, ...]
+    networks: dict[str, tuple[int, ...]]
+
+    def input_width(self, name: str, kind: LayerKind) -> int:
+        """Inputs of network `name`: the scaffold's fixed ones, the sampled planes' or the trunk's outputs."""
+        if kind.deformation is None:
+            return SCAFFOLD_INPUT
+        return sum(s.channels for s in self.scales) if name == TRUNK else self.networks[TRUNK][-1]
+
+    def weight_shapes(self, kind: LayerKind) -> list[tuple[int, ...]]:
+        """Shapes of weight, bias, weight, bias ... of all networks in order."""
+        shapes: list[tuple[int, ...]] = []
+        for name, widths in self.networks.items():
+            inputs = (self.input_width(name, kind), *widths[:-1])
+            for wide_in, wide_out in zip(inputs, widths, strict=True):
+                shapes += [(wide_out, wide_in), (wide_out,)]
+        return shapes
+
+    def plane_shapes(self) -> list[tuple[int, int, int]]:
+        """[C, H, W] of all planes, scale by scale."""
+        return [shape for scale in self.scales for shape in scale.shapes()]
+
+
+def pack_meta(meta: LayerMeta, kind: LayerKind) -> bytes:
+    """Canonical msgpack of `meta`; what is empty is absent."""
+    fields: dict[int, object] = {ROWS: meta.rows, SECTIONS: {int(k): meta.sections[k] for k in sorted(meta.sections)}}
+    if meta.networks:
+        fields[STEPS] = [meta.steps[name] for name in step_names(kind)]
+    if meta.scales:
+        fields[SCALES] = [[s.channels, *s.sides, *s.predictors] for s in meta.scales]
+    if meta.networks:
+        fields[NETWORKS] = [[kind.network_ids[name], *widths] for name, widths in meta.networks.items()]
+    return canonical.pack(fields)
+
+
+def unpack_meta(data: bytes, kind: LayerKind, rows_before: int, raw: bool) -> LayerMeta:
+    """The inverse of pack_meta (clause "layer parameters"); every count is within its limit afterwards."""
+    where = f"layer {kind.layer}"
+    fields = Fields(canonical.unpack(data), where, set(range(ROWS, NETWORKS + 1)))
+    known_sections = {int(s) for s in Section}
+    sections = Fields(fields.get(SECTIONS), f"{where} sections", known_sections)
+    networks = _unpack_networks(fields, kind, where)
+    meta = LayerMeta(
+        rows=fields.integer(ROWS, MAX_ANCHORS - rows_before),
+        sections={s: sections.integer(s, MAX_PAYLOAD, low=1) for s in known_sections if s in sections},
+        steps=_unpack_steps(fields, kind, where) if networks else {},
+        scales=_unpack_scales(fields, raw, where) if networks and kind.deformation else (),
+        networks=networks,
+    )
+    for key, expected in ((STEPS, bool(networks)), (SCALES, bool(meta.scales))):
+        if (key in fields) != expected:
+            raise Malformed(f"{where}: key {key} is {'missing' if expected else 'there'} without reason")
+    return meta
+
+
+def check_symbol_count(meta: LayerMeta, kind: LayerKind, rows_before: int, payload_bytes: int) -> None:
+    """LimitExceeded if the layer declares more symbols than its payload could reasonably hold."""
+    cells = sum(math.prod(shape) for shape in meta.plane_shapes())
+    if cells > MAX_PLANE_CELLS:
+        raise LimitExceeded(f"layer {kind.layer}: planes of {cells} cells, limit {MAX_PLANE_CELLS}")
+    weights = sum(math.prod(shape) for shape in meta.weight_shapes(kind))
+    symbols = rows_before + meta.rows * (N_CHANNELS + 4) + cells + weights
+    limit = FREE_SYMBOLS + SYMBOLS_PER_BYTE * payload_bytes
+    if symbols > limit:
+        raise LimitExceeded(f"layer {kind.layer}: {symbols} symbols in {payload_bytes} bytes, limit {limit}")
+
+
+def step_names(kind: LayerKind) -> list[str]:
+    """Fields of Steps that a layer's chunk carries: planes (if the layer has any), then weights."""
+    return [name for name in (kind.planes_step, kind.weights_step) if name is not None]
+
+
+def _unpack_steps(fields: Fields, kind: LayerKind, where: str) -> dict[str, float]:
+    names = step_names(kind)
+    steps = dict(zip(names, fields.reals(STEPS, len(names)), strict=True))
+    for name, step in steps.items():
+        if not is_step(step):
+            raise Malformed(f"{where}: step {step!r} of {name}, expected a positive normal binary32 value")
+    return steps
+
+
+def _unpack_scales(fields: Fields, raw: bool, where: str) -> tuple[ScaleMeta, ...]:
+    rows = fields.sequence(SCALES)
+    as_integer(len(rows), MAX_PLANE_SCALES, f"{where}: number of scales", low=1)
+    scales = []
+    for i, row in enumerate(rows):
+        channels, *rest = as_list(row, f"{where} scale {i}", 5 + len(PLANES))
+        as_integer(channels, MAX_PLANE_CHANNELS, f"{where} scale {i} channels", low=1)
+        for side in rest[:4]:
+            as_integer(side, MAX_PLANE_SIDE, f"{where} scale {i} side", low=1)
+        for predictor in rest[4:]:
+            if as_integer(predictor, 0xFFFF, f"{where} scale {i} predictor") not in PREDICTORS:
+                raise UnsupportedFeature(f"{where} scale {i}: predictor {predictor}, expected {list(PREDICTORS)}")
+            if raw and predictor != 0:
+                raise Malformed(f"{where} scale {i}: predictor {predictor} on float32 planes, expected 0")
+        scales.append(ScaleMeta(channels, tuple(rest[:4]), tuple(rest[4:])))
+    return tuple(scales)
+
+
+def _unpack_networks(fields: Fields, kind: LayerKind, where: str) -> dict[str, tuple[int, ...]]:
+    rows = fields.sequence(NETWORKS) if NETWORKS in fields else []
+    names = {number: name for name, number in kind.network_ids.items()}
+    as_integer(len(rows), len(names), f"{where}: number of networks", low=0)
+    networks: dict[str, tuple[int, ...]] = {}
+    last = -1
+    for row in rows:
+        number, *widths = as_list(row, f"{where} network")
+        if as_integer(number, 0xFFFF, f"{where} network id") not in names:
+            raise UnsupportedFeature(f"{where}: network {number}, expected one of {names}")
+        if number <= last:
+            raise Malformed(f"{where}: network {number} after {last}, expected ascending ids")
+        last, name = number, names[number]
+        as_integer(len(widths), MAX_NETWORK_LAYERS, f"{where} network {name} layers", low=1)
+        for width in widths:
+            as_integer(width, MAX_NETWORK_WIDTH, f"{where} network {name} width", low=1)
+        if widths[-1] != kind.heads.get(name, widths[-1]):
+            raise Malformed(f"{where} network {name}: {widths[-1]} outputs, expected {kind.heads[name]}")
+        networks[name] = tuple(widths)
+    if kind.deformation is None and len(networks) != len(names):
+        raise Malformed(f"{where}: networks {list(networks)}, expected {list(kind.network_ids)}")
+    if networks and kind.deformation is not None and (TRUNK not in networks or len(networks) == 1):
+        raise Malformed(f"{where}: networks {list(networks)}, expected '{TRUNK}' and at least one head")
+    return networks

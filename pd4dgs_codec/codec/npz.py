@@ -1,0 +1,68 @@
+"""Scene -> a flat dict of arrays under stable names, for numpy.savez and for readers that know nothing of ours."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pd4dgs_codec.attributes.quantise import quantise
+from pd4dgs_codec.attributes.table import ATTRIBUTES
+from pd4dgs_codec.codec.kinds import LAYER_KINDS
+from pd4dgs_codec.scene import MASK_STEP, Network, Scene
+
+#: First part of the names of each layer's networks and planes.
+PREFIXES = {0: "", 1: "global", 2: "local"}
+
+
+def to_npz_dict(scene: Scene, symbols: bool = False) -> dict[str, np.ndarray]:
+    """Arrays by key: anchor, feature, scaling_log, offset (float32, one row per anchor); mask_L per layer L present
+    (float32 masks of the first rows); mlp.NAME.weight.i and .bias.i with NAME opacity, covariance, color, global.trunk,
+    global.position ... local.mean ...; planes.{global,local}.SCALE.PLANE; meta_* for the rest.
+
+    symbols: also NAME_q (int32) and NAME_step (float32) for every quantised array; anchor_step is the voxel size.
+    """
+    arrays = {"anchor": scene.anchor}
+    steps: dict[str, float] = {}
+    for a in ATTRIBUTES:
+        arrays[a.name], steps[a.name] = getattr(scene, a.name), getattr(scene.steps, a.name)
+    for kind in LAYER_KINDS:
+        owner, q_weights = PREFIXES[kind.layer], getattr(scene.steps, kind.weights_step)
+        deformation = getattr(scene, kind.deformation) if kind.deformation else None
+        networks: dict[str, Network] = deformation.networks if deformation else {} if kind.layer else scene.networks
+        for name, network in networks.items():
+            stem = f"mlp.{owner}.{name}" if owner else f"mlp.{name}"
+            for i, (weight, bias) in enumerate(network):
+                arrays[f"{stem}.weight.{i}"], arrays[f"{stem}.bias.{i}"] = weight, bias
+                steps[f"{stem}.weight.{i}"] = steps[f"{stem}.bias.{i}"] = q_weights
+        for s, planes in enumerate(deformation.planes if deformation else ()):
+            for name, plane in planes.items():
+                arrays[f"planes.{owner}.{s}.{name}"] = plane
+                steps[f"planes.{owner}.{s}.{name}"] = getattr(scene.steps, kind.planes_step or "")
+    if symbols:
+        quantised = {name: quantise(arrays[name], step, name) for name, step in steps.items()}
+        arrays |= {f"{name}_q": k for name, k in quantised.items()}
+        arrays |= {f"{name}_step": np.float32(step) for name, step in steps.items()}
+        arrays |= {"anchor_q": scene.anchor_q, "anchor_step": np.float32(scene.info.voxel_size)}
+    for layer, codes in zip(scene.layers, scene.mask, strict=True):
+        arrays[f"mask_{layer}"] = codes.astype(np.float32) * MASK_STEP
+        if symbols:
+            arrays |= {f"mask_{layer}_q": codes.astype(np.int32), f"mask_{layer}_step": MASK_STEP}
+    return {name: np.asarray(a) for name, a in (arrays | _meta(scene)).items()}
+
+
+def _meta(scene: Scene) -> dict[str, np.ndarray]:
+    info = scene.info
+    meta = {
+        "layers": np.array(scene.layers, np.int32),
+        "rows": np.array(scene.rows, np.int32),
+        "voxel_size": np.float32(info.voxel_size),
+        "box": info.box,
+        "time_range": np.array(info.time_range, np.float32),
+        "background": np.array(info.background, np.float32),
+        "near_far": np.array([info.near, info.far], np.float32),
+        "up": np.array(info.up, np.float32),
+        "unit": np.float32(info.unit),
+    }
+    if info.camera is not None:
+        meta |= {"camera_viewmat": info.camera.viewmat, "camera_K": info.camera.K}
+        meta["camera_size"] = np.array([info.camera.width, info.camera.height], np.int32)
+    return {f"meta_{name}": np.asarray(value) for name, value in meta.items()}

@@ -1,0 +1,87 @@
+"""Quantiser, masks and the attribute table."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from pd4dgs_codec.attributes.quantise import MAX_SYMBOL, dequantise, is_step, mask_codes, quantise
+from pd4dgs_codec.attributes.table import ATTRIBUTES, N_CHANNELS, dequantise_attributes, quantise_attributes
+from pd4dgs_codec.errors import EncodeError
+
+steps = st.floats(2.0**-100, 2.0**90, width=32)
+
+
+@given(st.lists(st.integers(-(1 << 23), 1 << 23), min_size=1, max_size=50), steps)
+def test_symbols_survive_their_float32_values(ks, step):
+    k = np.array(ks, np.int32)
+    np.testing.assert_array_equal(quantise(dequantise(k, step), step), k)
+
+
+@given(st.integers(-MAX_SYMBOL, MAX_SYMBOL), st.integers(-60, 60))
+def test_all_symbols_survive_a_power_of_two_step(k, exponent):
+    step = 2.0**exponent
+    assert quantise(dequantise(np.array([k]), step), step)[0] == k
+
+
+def test_a_large_symbol_can_collide_with_its_neighbour():
+    """Why the property above stops at 2^23: two symbols, one binary32."""
+    step = float(np.float32(1 + 2.0**-23))
+    pair = dequantise(np.array([MAX_SYMBOL - 1, MAX_SYMBOL]), step)
+    assert pair[0] == pair[1]
+
+
+@given(st.integers(-1000, 1000), steps)
+def test_dequantise_is_one_rounding_of_the_exact_product(k, step):
+    from fractions import Fraction
+
+    exact = Fraction(k) * Fraction(step)
+    got = dequantise(np.array([k], np.int32), step)[0]
+    neighbours = [np.nextafter(got, np.float32(s)) for s in (-np.inf, np.inf)]
+    assert all(abs(Fraction(float(got)) - exact) <= abs(Fraction(float(n)) - exact) for n in neighbours)
+
+
+def test_halves_round_to_even():
+    np.testing.assert_array_equal(quantise(np.array([0.5, 1.5, 2.5, -0.5, -1.5], np.float32), 1.0), [0, 2, 2, 0, -2])
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+def test_non_finite_values_are_refused_by_name(bad):
+    with pytest.raises(EncodeError, match="feature.*NaN or infinite"):
+        quantise(np.array([0, bad], np.float32), 0.5, "feature")
+
+
+def test_symbols_over_the_limit_are_refused():
+    assert quantise(np.array([MAX_SYMBOL], np.float32), 1.0)[0] == MAX_SYMBOL
+    with pytest.raises(EncodeError, match="offset.*16777216"):
+        quantise(np.array([MAX_SYMBOL + 1], np.float32), 1.0, "offset")
+
+
+@pytest.mark.parametrize("step", [0.0, -1.0, np.nan, np.inf, 1e-45, 0.1, 1e39])
+def test_what_is_no_step(step):
+    assert not is_step(step)
+    with pytest.raises(EncodeError):
+        quantise(np.zeros(1, np.float32), step)
+
+
+def test_mask_codes():
+    masks = np.array([0, 0.01, np.nextafter(np.float32(0.01), np.float32(1)), 0.013, 0.5, 1.0], np.float32)
+    np.testing.assert_array_equal(mask_codes(masks), [0, 0, 3, 3, 128, 255])
+    with pytest.raises(EncodeError):
+        mask_codes(np.array([np.nan]))
+
+
+@given(st.lists(st.floats(0, 1, width=32), min_size=2))
+def test_mask_codes_keep_order(values):
+    codes = mask_codes(np.sort(np.array(values, np.float32)))
+    assert (np.diff(codes.astype(int)) >= 0).all() and not ((codes > 0) & (codes < 3)).any()
+
+
+def test_the_table_is_a_bijection_on_channels():
+    k = np.arange(N_CHANNELS * 7, dtype=np.int32).reshape(N_CHANNELS, 7)
+    q = {"feature": 0.5, "scaling_log": 0.25, "offset": 2.0}
+    values = dequantise_attributes(k, q)
+    shapes = {a.name: values[a.name].shape for a in ATTRIBUTES}
+    assert shapes == {"feature": (7, 32), "scaling_log": (7, 6), "offset": (7, 10, 3)}
+    assert values["offset"][3, 1, 2] == 2.0 * k[32 + 6 + 3 * 1 + 2, 3]
+    np.testing.assert_array_equal(quantise_attributes(values, q), k)

@@ -1,0 +1,254 @@
+"""Faulty files: every one raises the package's own error, soon, and never anything else."""
+
+import struct
+import time
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import make_scene
+
+from pd4dgs_codec.bitstream import canonical
+from pd4dgs_codec.bitstream.container import (
+    FLAG_ANCILLARY,
+    read_chunk,
+    read_preamble,
+    scene_id_of,
+    write_chunk,
+    write_preamble,
+)
+from pd4dgs_codec.codec import header as header_module
+from pd4dgs_codec.codec import layer_meta
+from pd4dgs_codec.codec.decoder import decode
+from pd4dgs_codec.codec.encoder import encode
+from pd4dgs_codec.codec.header import unpack_header
+from pd4dgs_codec.errors import DecodeError, LimitExceeded, Malformed, Pd4Error, Truncated, UnsupportedFeature
+
+SMALL = encode(make_scene(1, layers=(0, 1), anchors=2, kind="constant", hidden=(), extent=1), layers=2, effort=1)
+FULL = encode(make_scene(7, anchors=20), layers=2, effort=1)
+
+
+def take_apart(data):
+    """(header map, [(type, flags, payload)])"""
+    preamble = read_preamble(data)
+    chunks, offset = [], preamble.size
+    while offset < len(data):
+        chunk = read_chunk(data, offset)
+        chunks.append((chunk.type, chunk.flags, chunk.payload))
+        offset = chunk.end
+    return canonical.unpack(preamble.header), chunks
+
+
+def put_together(header, chunks, scene_id=None):
+    """A file with right lengths, ids and CRCs, whatever its payloads say."""
+    header = {**header, header_module.CHUNKS: [[t, len(p)] for t, _, p in chunks]}
+    scene_id = scene_id or scene_id_of(chunks[0][2])
+    framed = [write_chunk(t, f, scene_id, p) for t, f, p in chunks]
+    return b"".join([write_preamble(canonical.pack(header)), *framed])
+
+
+def with_meta(payload, change):
+    """`payload` with its parameter map changed."""
+    (length,) = struct.unpack_from("<I", payload)
+    meta = canonical.unpack(payload[4 : 4 + length])
+    packed = canonical.pack(change(meta))
+    return struct.pack("<I", len(packed)) + packed + payload[4 + length :]
+
+
+def test_putting_together_what_was_taken_apart_changes_nothing():
+    assert put_together(*take_apart(FULL)) == FULL
+
+
+def test_every_single_bit_flip_is_caught():
+    for i in range(8 * len(SMALL)):
+        data = bytearray(SMALL)
+        data[i // 8] ^= 1 << i % 8
+        with pytest.raises(DecodeError):
+            decode(bytes(data))
+
+
+def test_every_cut_is_caught():
+    for size in range(len(SMALL)):
+        with pytest.raises(Truncated):
+            decode(SMALL[:size])
+
+
+@given(st.integers(0, 2), st.integers(0, 10**6), st.integers(1, 255), st.booleans())
+@settings(max_examples=150)
+def test_changed_payloads_behind_right_checksums_raise_only_our_errors(which, place, mask, cut):
+    header, chunks = take_apart(FULL)
+    kind, flags, payload = chunks[which]
+    changed = bytearray(payload)
+    place %= len(changed)
+    if cut:
+        del changed[place:]
+    else:
+        changed[place] ^= mask
+    chunks[which] = (kind, flags, bytes(changed))
+    try:
+        scene = decode(put_together(header, chunks))
+    except DecodeError as error:
+        assert not isinstance(error, Truncated), "a payload is complete: no more bytes would help"
+    else:  # some changes only change symbols
+        assert np.isfinite(scene.feature).all()
+
+
+@given(st.binary(max_size=200))
+def test_arbitrary_bytes_raise_only_our_errors(junk):
+    for data in (junk, FULL[:20] + junk, FULL[:8] + junk):
+        with pytest.raises(Pd4Error):
+            decode(data)
+
+
+def test_a_layer_of_another_scene_is_refused():
+    header, chunks = take_apart(FULL)
+    other = encode(make_scene(8, anchors=20), layers=2, effort=1)
+    mixed = [chunks[0], *take_apart(other)[1][1:]]
+    first = write_chunk(*chunks[0][:2], scene_id_of(chunks[0][2]), chunks[0][2])
+    rest = [write_chunk(t, f, scene_id_of(take_apart(other)[1][0][2]), p) for t, f, p in mixed[1:]]
+    header = {**header, header_module.CHUNKS: [[t, len(p)] for t, _, p in mixed]}
+    data = b"".join([write_preamble(canonical.pack(header)), first, *rest])
+    with pytest.raises(Malformed, match="belongs to scene"):
+        decode(data)
+    with pytest.raises(Malformed, match="layer-0 payload"):
+        decode(put_together(*take_apart(FULL), scene_id=b"12345678"))
+
+
+def test_unknown_chunks_are_refused_if_critical_and_skipped_if_ancillary():
+    header, chunks = take_apart(FULL)
+    extra = [(99, FLAG_ANCILLARY, b"preview"), (98, FLAG_ANCILLARY, b"")]
+    skipped = put_together(header, [chunks[0], extra[0], *chunks[1:], extra[1]])
+    assert decode(skipped).layers == (0, 1, 2)
+    assert decode(skipped, max_layer=0).layers == (0,)
+    critical = put_together(header, [*chunks[:2], (99, 0, b"needed"), chunks[2]])
+    with pytest.raises(UnsupportedFeature, match="type 99"):
+        decode(critical)
+    assert decode(critical, max_layer=1).layers == (0, 1)
+
+
+def test_layer_order_is_checked():
+    header, chunks = take_apart(FULL)
+    for wrong in ([chunks[1]], [chunks[0], chunks[2], chunks[1]], [chunks[0], chunks[1], chunks[1]]):
+        with pytest.raises(Malformed, match="layer 0 first"):
+            decode(put_together(header, wrong))
+
+
+def test_unknown_header_keys():
+    header, chunks = take_apart(FULL)
+    assert decode(put_together({**header, 64: "later", 1000: [1]}, chunks)).layers == (0, 1, 2)
+    with pytest.raises(UnsupportedFeature, match="key 63"):
+        decode(put_together({**header, 63: 1}, chunks))
+
+
+HEADER_FAULTS = {
+    header_module.MODE: (7, UnsupportedFeature),
+    header_module.DEFORMATION: (2, UnsupportedFeature),
+    header_module.STEPS: ([0.0, 1.0, 1.0], Malformed),
+    header_module.VOXEL_SIZE: (-1.0, Malformed),
+    header_module.BOX: ([1.0] * 5, Malformed),
+    header_module.BACKGROUND: ([1, 2, 3], Malformed),
+    header_module.NEAR_FAR: (1.0, Malformed),
+    header_module.UNIT: (True, Malformed),
+    header_module.CAMERA: ({1: [0.0] * 12}, Malformed),
+}
+
+
+@pytest.mark.parametrize("key", HEADER_FAULTS)
+def test_header_fields_are_checked(key):
+    header, chunks = take_apart(FULL)
+    value, error = HEADER_FAULTS[key]
+    with pytest.raises(error):
+        decode(put_together({**header, key: value}, chunks))
+    if key != header_module.CAMERA:
+        del header[key]
+        with pytest.raises(Malformed, match="missing"):
+            decode(put_together(header, chunks))
+
+
+def with_networks(meta, change):
+    return {**meta, layer_meta.NETWORKS: [change(network) for network in meta[layer_meta.NETWORKS]]}
+
+
+META_FAULTS = {
+    "rows": (lambda m: {**m, layer_meta.ROWS: 1 << 25}, LimitExceeded),
+    "more rows": (lambda m: {**m, layer_meta.ROWS: m[layer_meta.ROWS] + 1}, DecodeError),
+    "negative rows": (lambda m: {**m, layer_meta.ROWS: -1}, Malformed),
+    "section": (lambda m: {**m, layer_meta.SECTIONS: {**m[layer_meta.SECTIONS], 1: 5}}, Malformed),
+    "unknown section": (lambda m: {**m, layer_meta.SECTIONS: {**m[layer_meta.SECTIONS], 9: 1}}, UnsupportedFeature),
+    "step": (lambda m: {**m, layer_meta.STEPS: [0.0] * len(m[layer_meta.STEPS])}, Malformed),
+    "networks": (lambda m: {**m, layer_meta.NETWORKS: m[layer_meta.NETWORKS][::-1]}, Malformed),
+    "network": (lambda m: {**m, layer_meta.NETWORKS: [[9, 3]]}, UnsupportedFeature),
+    "width": (lambda m: with_networks(m, lambda n: [n[0], 5000, *n[1:]]), LimitExceeded),
+    "outputs": (lambda m: with_networks(m, lambda n: [n[0], n[-1] + 1]), DecodeError),
+    "unknown key": (lambda m: {**m, 9: 1}, UnsupportedFeature),
+}
+
+
+@pytest.mark.parametrize("which", [0, 2])
+@pytest.mark.parametrize("name", META_FAULTS)
+def test_layer_parameters_are_checked(name, which):
+    change, error = META_FAULTS[name]
+    header, chunks = take_apart(FULL)
+    kind, flags, payload = chunks[which]
+    chunks[which] = (kind, flags, with_meta(payload, change))
+    with pytest.raises(error) as caught:
+        decode(put_together(header, chunks))
+    assert caught.value.chunk == which
+
+
+@pytest.mark.parametrize(
+    "row", [[2, 1, 1, 1], [2, 9999, 1, 1, 1, *[0] * 6], [0, 1, 1, 1, 1, *[0] * 6], [2, 3, 2, 4, 5, *[77] * 6]]
+)
+def test_plane_parameters_are_checked(row):
+    header, chunks = take_apart(FULL)
+    chunks[1] = (1, 0, with_meta(chunks[1][2], lambda m: {**m, layer_meta.SCALES: [row]}))
+    with pytest.raises((Malformed, LimitExceeded, UnsupportedFeature)):
+        decode(put_together(header, chunks))
+
+
+def test_a_few_bytes_cannot_ask_for_gigabytes():
+    """Constant channels cost nothing to code, so the declared sizes themselves are bounded by the payload."""
+    header, chunks = take_apart(FULL)
+    bombs = (
+        lambda m: {**m, layer_meta.ROWS: (1 << 24) - 100},
+        lambda m: {**m, layer_meta.SCALES: [[256, 1000, 1000, 1, 1, *[0] * 6]]},
+    )
+    for bomb in bombs:
+        changed = [chunks[0], (1, 0, with_meta(chunks[1][2], bomb)), chunks[2]]
+        start = time.perf_counter()
+        with pytest.raises(LimitExceeded):
+            decode(put_together(header, changed))
+        assert time.perf_counter() - start < 2
+
+
+def test_values_that_overflow_float32_are_malformed():
+    header, chunks = take_apart(FULL)
+    with pytest.raises(Malformed, match="not finite"):
+        decode(put_together({**header, header_module.STEPS: [2.0**127] * 3}, chunks))
+
+
+def test_a_voxel_in_two_layers_is_malformed():
+    scene = make_scene(7, layers=(0, 1), anchors=20)
+    header, chunks = take_apart(encode(replace(scene, mask=(scene.mask[1], scene.mask[1])), layers=2, effort=1))
+    both = [chunks[0], (1, 0, _same_anchors_again(scene))]
+    with pytest.raises(Malformed, match="more than one anchor"):
+        decode(put_together(header, both))
+
+
+def _same_anchors_again(scene):
+    """A layer-1 payload whose own anchors are those of layer 0, made by the layer writer itself."""
+    from pd4dgs_codec.codec.layers import Coding, write_layer
+    from pd4dgs_codec.codec.plan import plan
+    from pd4dgs_codec.codec.symbols import layer_symbols
+
+    planned, _ = plan(replace(scene, mask=(scene.mask[1], scene.mask[1])), 2)
+    first, second = (layer_symbols(planned, i) for i in (0, 1))
+    again = replace(second, anchor_q=first.anchor_q, mask_own=first.mask_own, attributes=first.attributes)
+    return write_layer(again, Coding(effort=1))[0]
+
+
+def test_the_header_is_small():
+    assert len(read_preamble(FULL).header) < 512
+    assert unpack_header(read_preamble(FULL).header).mode == "ans"

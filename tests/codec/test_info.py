@@ -1,0 +1,84 @@
+"""info from a file's first bytes, digests of its contents, and the npz keys."""
+
+import hashlib
+
+import numpy as np
+import pytest
+from strategies import make_scene
+
+from pd4dgs_codec import FORMAT_VERSION
+from pd4dgs_codec.codec.decoder import decode
+from pd4dgs_codec.codec.encoder import encode
+from pd4dgs_codec.codec.info import hashes, info
+from pd4dgs_codec.codec.npz import to_npz_dict
+from pd4dgs_codec.errors import Truncated
+from pd4dgs_codec.scene import PLANES
+
+SCENE = make_scene(7, anchors=20)
+DATA = encode(SCENE, layers=2, effort=1)
+
+
+def test_info_needs_the_header_alone():
+    whole = info(DATA)
+    first = info(DATA[: whole["header_bytes"]])
+    with pytest.raises(Truncated):
+        info(DATA[: whole["header_bytes"] - 1])
+    assert whole["format_version"] == FORMAT_VERSION == "1.0"
+    assert whole["bytes"] == first["bytes"] == len(DATA)
+    place = ("layer", "offset", "bytes", "end")
+    assert [{k: row[k] for k in place} for row in whole["layers"]] == first["layers"]
+    ends = [whole["header_bytes"], *(row["end"] for row in whole["layers"])]
+    assert [row["offset"] for row in whole["layers"]] == ends[:-1] and ends[-1] == len(DATA)
+    decoded = decode(DATA)
+    assert [row["anchors"] for row in whole["layers"]] == np.diff([0, *decoded.rows]).tolist()
+    assert whole["anchors"] == len(decoded.anchor_q) and first["anchors"] is None
+    assert whole["steps"]["feature"] == SCENE.steps.feature
+    assert whole["layers"][2]["steps"] == {"planes_local": 0.5, "weights_local": SCENE.steps.weights_local}
+    assert whole["layers"][1]["planes"] == [[2, 3, 2, 4, 5]]
+
+
+def test_hashes_follow_the_documented_order():
+    scene, rows = decode(DATA), hashes(DATA)
+    first, last = scene.rows[0], scene.rows[1]
+    own = slice(first, last)
+    arrays = [scene.anchor[own], scene.feature[own], scene.scaling_log[own], scene.offset[own]]
+    arrays += [scene.global_deformation.planes[0][name] for name, _, _ in PLANES]
+    for name in ("trunk", "position", "feature", "offset", "scaling"):
+        arrays += [a for pair in scene.global_deformation.networks[name] for a in pair]
+    digest = hashlib.sha256(b"".join(a.astype("<f4").tobytes() for a in arrays)).hexdigest()
+    assert rows[1] == {"layer": 1, "symbols": rows[1]["symbols"], "tensors": digest}
+    steps = scene.steps
+    symbols = [scene.anchor_q[own], scene.mask[1][:first].astype(int) - scene.mask[0], scene.mask[1][own]]
+    symbols += [(scene.feature[own] / steps.feature).T, (scene.scaling_log[own] / steps.scaling_log).T]
+    symbols += [(scene.offset[own].reshape(-1, 30) / steps.offset).T]
+    symbols += [a / steps.planes_global for a in arrays[4:10]] + [a / steps.weights_global for a in arrays[10:]]
+    digest = hashlib.sha256(b"".join(np.ascontiguousarray(a).astype("<i4").tobytes() for a in symbols)).hexdigest()
+    assert rows[1]["symbols"] == digest
+
+
+def test_hashes_name_the_contents_not_the_coding():
+    lzma = encode(SCENE, layers=2, mode="lzma", effort=1)
+    assert lzma != DATA and hashes(lzma) == hashes(DATA)
+    assert hashes(encode(SCENE, layers=1, effort=1)) == hashes(DATA)[:2]
+    raw = hashes(encode(SCENE, layers=2, deformation="float32", effort=1))
+    assert [r["tensors"] for r in raw] == [r["tensors"] for r in hashes(DATA)]
+    assert raw[0] == hashes(DATA)[0] and raw[1]["symbols"] != hashes(DATA)[1]["symbols"]
+
+
+def test_npz_keys_and_symbols():
+    scene = decode(DATA)
+    arrays = to_npz_dict(scene, symbols=True)
+    plain = to_npz_dict(scene)
+    assert {"anchor", "feature", "scaling_log", "offset", "mask_0", "mask_1", "mask_2"} <= set(plain)
+    assert {"mlp.opacity.weight.0", "mlp.color.bias.1"} <= set(plain)
+    assert {"mlp.global.trunk.weight.0", "mlp.local.mean.bias.0"} <= set(plain)
+    assert {"planes.global.0.xy", "planes.local.0.zt"} <= set(plain)
+    assert not any(name.endswith(("_q", "_step")) for name in plain)
+    data = [name for name in plain if not name.startswith("meta_")]
+    for name in data:
+        k, step = arrays[f"{name}_q"], arrays[f"{name}_step"]
+        assert k.dtype == np.int32 and plain[name].dtype == np.float32 == step.dtype
+        value = (k.astype(np.float64) * np.float64(step)).astype(np.float32)
+        np.testing.assert_array_equal(value, plain[name], err_msg=name)
+    assert set(arrays) - set(plain) == {f"{name}_{end}" for name in data for end in ("q", "step")}
+    assert tuple(arrays["meta_rows"]) == scene.rows and arrays["meta_camera_K"].shape == (3, 3)

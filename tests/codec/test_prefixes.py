@@ -1,0 +1,117 @@
+"""Layer prefixes, cut files and incremental decoding."""
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import LAYER_SETS, assert_same_scene, make_scene, scenes
+
+from pd4dgs_codec import decode, encode, open_stream
+from pd4dgs_codec.codec.decoder import decode_partial
+from pd4dgs_codec.codec.info import info
+from pd4dgs_codec.errors import BadSignature, ChecksumMismatch, Malformed, Truncated
+
+FILES = {layers: encode(make_scene(7, layers=layers, anchors=20), layers=2, effort=1) for layers in LAYER_SETS}
+
+
+@given(scenes())
+@settings(max_examples=8)
+def test_each_prefix_decodes_to_what_max_layer_gives(scene):
+    data = encode(scene, layers=2, effort=1, verify=False)
+    whole = decode(data)
+    for row in info(data)["layers"]:
+        prefix = data[: row["end"]]
+        got = decode(prefix, max_layer=row["layer"])
+        assert_same_scene(got, decode(data, max_layer=row["layer"]))
+        assert_same_scene(got, whole.prefix(row["layer"]))
+        if row["end"] < len(data):
+            with pytest.raises(Truncated):
+                decode(prefix)
+        partial, complete = decode_partial(prefix)
+        assert complete == (row["end"] == len(data))
+        assert_same_scene(partial, got)
+
+
+@pytest.mark.parametrize("layers", LAYER_SETS)
+def test_every_cut_yields_the_longest_valid_prefix_or_truncated(layers):
+    data = FILES[layers]
+    ends = [row["end"] for row in info(data)["layers"]]
+    for size in [*range(0, len(data), 101), *(e + d for e in ends for d in (-1, 0, 1) if e + d < len(data))]:
+        if size < len(data):
+            with pytest.raises(Truncated):
+                decode(data[:size])
+        whole_layers = sum(end <= size for end in ends)
+        if whole_layers == 0:
+            with pytest.raises(Truncated):
+                decode(data[:size], allow_partial=True)
+        else:
+            assert decode(data[:size], allow_partial=True).layers == layers[:whole_layers]
+
+
+def test_max_layer_does_not_look_beyond_its_prefix():
+    data = FILES[(0, 1, 2)]
+    end = info(data)["layers"][0]["end"]
+    assert decode(data[:end] + b"garbage", max_layer=0).layers == (0,)
+    assert decode(data, max_layer=7).layers == (0, 1, 2)
+    assert decode(FILES[(0, 2)], max_layer=1).layers == (0,)
+    with pytest.raises(ValueError, match="max_layer"):
+        decode(data, max_layer=-1)
+
+
+def test_allow_partial_forgives_a_cut_and_nothing_else():
+    data = bytearray(FILES[(0, 1)])
+    data[-10] ^= 1
+    with pytest.raises(ChecksumMismatch):
+        decode(bytes(data), allow_partial=True)
+    with pytest.raises(Malformed, match="bytes follow"):
+        decode(FILES[(0, 1)] + b"\0", allow_partial=True)
+
+
+@given(st.sampled_from(LAYER_SETS), st.lists(st.integers(0, 4000), max_size=8))
+@settings(max_examples=15)
+def test_a_stream_does_not_depend_on_where_it_is_cut(layers, cuts):
+    data = FILES[layers]
+    places = [0, *sorted(min(c, len(data)) for c in cuts), len(data)]
+    stream, got = open_stream(), []
+    for a, b in zip(places[:-1], places[1:], strict=True):
+        got += stream.feed(data[a:b])
+        assert len(got) == sum(row["end"] <= b for row in info(data)["layers"])
+    assert stream.complete
+    stream.finish()
+    for layer, scene in zip(layers, got, strict=True):
+        assert_same_scene(scene, decode(data, max_layer=layer))
+
+
+def test_a_stream_fed_byte_by_byte():
+    data, stream, got = FILES[(0, 2)], open_stream(), []
+    for i in range(len(data)):
+        got += stream.feed(data[i : i + 1])
+    assert [scene.layers for scene in got] == [(0,), (0, 2)]
+
+
+def test_a_fault_stays_and_earlier_layers_remain():
+    data = bytearray(FILES[(0, 1, 2)])
+    rows = info(bytes(data))["layers"]
+    data[rows[1]["end"] - 9] ^= 4
+    stream = open_stream()
+    scenes_before = stream.feed(bytes(data))
+    assert [s.layers for s in scenes_before] == [(0,)]
+    for call in (lambda: stream.feed(b""), lambda: stream.feed(b"x"), stream.finish):
+        with pytest.raises(ChecksumMismatch):
+            call()
+    assert not stream.complete
+
+
+def test_a_stream_that_ends_early_says_so():
+    stream = open_stream()
+    assert stream.feed(FILES[(0, 1)][:-1])[0].layers == (0,)
+    with pytest.raises(Truncated):
+        stream.finish()
+
+
+def test_a_stream_refuses_other_data_at_once_and_extra_bytes():
+    with pytest.raises(BadSignature):
+        open_stream().feed(b"PNG")
+    stream = open_stream()
+    assert len(stream.feed(FILES[(0,)] + b"!")) == 1
+    with pytest.raises(Malformed, match="follow"):
+        stream.finish()

@@ -1,0 +1,224 @@
+"""Scene -> bytes -> Scene: every symbol, every row, every mode."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import HUGE, RANGES, assert_same_networks, assert_same_scene, make_scene, scenes
+
+from pd4dgs_codec.codec import encoder
+from pd4dgs_codec.codec.decoder import decode
+from pd4dgs_codec.codec.encoder import encode, encode_with_report
+from pd4dgs_codec.entropy.morton import morton_codes
+from pd4dgs_codec.errors import EncodeError
+from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS
+
+MODES = [("ans", "coded"), ("lzma", "coded"), ("ans", "float32"), ("lzma", "float32")]
+
+
+def rows_by_voxel(scene):
+    """voxel -> (attributes, mask code per layer, 0 where a prefix does not hold the row)."""
+    table = {}
+    for i, cell in enumerate(scene.anchor_q.tolist()):
+        attributes = [scene.feature[i], scene.scaling_log[i], scene.offset[i].ravel()]
+        codes = tuple(int(m[i]) if i < len(m) else 0 for m in scene.mask)
+        table[tuple(cell)] = (np.concatenate(attributes).tobytes(), codes)
+    return table
+
+
+@given(scenes(), st.sampled_from(MODES), st.sampled_from(("best", "gauss")))
+@settings(max_examples=20)
+def test_everything_active_comes_back_and_encodes_to_the_same_bytes(scene, mode, priors):
+    options = {"mode": mode[0], "deformation": mode[1], "priors": priors, "layers": 2, "effort": 1}
+    data = encode(scene, **options)
+    decoded = decode(data)
+    active = {cell: row for cell, row in rows_by_voxel(scene).items() if row[1][-1] > 0}
+    assert rows_by_voxel(decoded) == active
+    assert decoded.layers == scene.layers
+    assert_same_networks(decoded.networks, scene.networks)
+    for name in ("global_deformation", "local_deformation"):
+        given_one, got = getattr(scene, name), getattr(decoded, name)
+        assert (got is not None) == (given_one is not None)
+        if got is not None:
+            assert_same_networks(got.networks, given_one.networks)
+            for p, q in zip(got.planes, given_one.planes, strict=True):
+                assert all(np.array_equal(p[k], q[k]) for k in q)
+    assert encode(decoded, **options) == data
+
+
+@given(scenes())
+@settings(max_examples=8)
+def test_rows_are_sorted_by_layer_then_morton_order(scene):
+    decoded = decode(encode(scene, layers=2, effort=1, verify=False))
+    first = 0
+    for index, last in enumerate(decoded.rows):
+        own = decoded.anchor_q[first:last]
+        assert (np.diff(morton_codes(own)) > 0).all() if len(own) > 1 else True
+        assert (decoded.mask[index][first:last] >= 3).all()
+        if index:
+            earlier = decoded.mask[index - 1]
+            assert (decoded.mask[index][: len(earlier)] >= earlier).all()
+        first = last
+
+
+@pytest.mark.parametrize("mode,deformation", MODES)
+def test_unquantised_values_come_back_within_half_a_step(mode, deformation):
+    scene = make_scene(3, kind="gaussian")
+    rng = np.random.default_rng(0)
+    noisy = replace(scene, feature=scene.feature + rng.uniform(-0.49, 0.49, scene.feature.shape).astype(np.float32))
+    got = decode(encode(noisy, mode=mode, deformation=deformation, step_scale=0.5, layers=2))
+    order = {tuple(c): i for i, c in enumerate(scene.anchor_q.tolist())}
+    index = [order[tuple(c)] for c in got.anchor_q.tolist()]
+    step = scene.steps.feature * 0.5
+    assert got.steps.feature == step and len(index) > 0
+    error = np.abs(got.feature - noisy.feature[index])
+    assert error.max() <= 0.5 * step * (1 + 1e-5) and error.max() > 0.1 * step
+
+
+@pytest.mark.parametrize("mode", ["ans", "lzma"])
+def test_symbols_over_the_whole_range(mode):
+    scene = make_scene(1, layers=(0,), anchors=3, kind="huge", hidden=())
+    got = decode(encode(scene, mode=mode, priors="gauss", effort=1))
+    assert np.abs(got.feature).max() == HUGE * scene.steps.feature
+    assert_same_networks(got.networks, scene.networks)
+
+
+def test_float32_deformations_keep_every_bit():
+    scene = make_scene(1)
+    planes = tuple({k: v + np.float32(0.001) for k, v in s.items()} for s in scene.global_deformation.planes)
+    scene = replace(scene, global_deformation=replace(scene.global_deformation, planes=planes))
+    got = decode(encode(scene, deformation="float32", layers=2))
+    np.testing.assert_array_equal(got.global_deformation.planes[0]["xt"], planes[0]["xt"])
+    coded = decode(encode(scene, layers=2))
+    assert not np.array_equal(coded.global_deformation.planes[0]["xt"], planes[0]["xt"])
+
+
+def test_the_header_information_comes_back():
+    for with_camera in (True, False):
+        scene = make_scene(5, with_camera=with_camera)
+        got = decode(encode(scene, layers=2)).info
+        for name in ("voxel_size", "time_range", "background", "near", "far", "up", "unit"):
+            assert getattr(got, name) == getattr(scene.info, name), name
+        np.testing.assert_array_equal(got.box, scene.info.box)
+        assert (got.camera is not None) == with_camera
+        if with_camera:
+            np.testing.assert_array_equal(got.camera.viewmat, scene.info.camera.viewmat)
+            np.testing.assert_array_equal(got.camera.K, scene.info.camera.K)
+            assert (got.camera.width, got.camera.height) == (640, 480)
+
+
+@pytest.mark.parametrize("kind", RANGES[:3])
+def test_the_report_adds_up(kind):
+    data, report = encode_with_report(make_scene(2, anchors=40, kind=kind), layers=2, effort=1)
+    report = report.json()
+    assert report["bytes"] == len(data) and report["verified"] and report["mode"] == "ans"
+    assert sum(row["bytes"] for row in report["layers"]) < len(data)
+    for row in report["layers"]:
+        streams = {s["name"]: s for s in row["streams"]}
+        counted = [streams[name] for name in ("attributes", "planes", "weights") if name in streams]
+        assert row["payload_bits"] == sum(s["payload_bits"] for s in counted) > 0
+        assert row["rate_bits"] == pytest.approx(sum(s["rate_bits"] for s in counted))
+        assert row["symbols"] == sum(s["symbols"] for s in counted)
+        assert 8 * row["bytes"] >= row["payload_bits"] + row["position_bits"] + streams["masks"]["payload_bits"]
+
+
+def test_steps_that_are_no_binary32_values_are_rounded_once():
+    scene = make_scene(0)
+    scene = replace(scene, steps=replace(scene.steps, feature=0.05))
+    data = encode(scene, layers=2)
+    assert decode(data).steps.feature == float(np.float32(0.05))
+    assert encode(decode(data), layers=2) == data
+
+
+def broken(name, value, **more):
+    return lambda scene: replace(scene, **{name: value(getattr(scene, name))}, **more)
+
+
+def poisoned(array):
+    array = array.copy()
+    array.flat[-1] = np.nan
+    return array
+
+
+FAULTS = {
+    "feature.*NaN": broken("feature", poisoned),
+    "offset.*NaN": broken("offset", poisoned),
+    "feature: float64": broken("feature", lambda a: a.astype(np.float64)),
+    "scaling_log:.*expected": broken("scaling_log", lambda a: a[:, :5]),
+    "anchor_q: voxel index": broken("anchor_q", lambda a: a + np.int32(1 << 22)),
+    "holds more than one anchor": broken(
+        "anchor_q", lambda a: np.zeros_like(a), mask=tuple(np.full(6, 9, np.uint8) for _ in range(3))
+    ),
+    "mask of layer 1: a code in 1..2": broken("mask", lambda m: (m[0], np.full_like(m[1], 2), m[2])),
+    "mask of layer 2 falls": broken("mask", lambda m: (np.full_like(m[0], 9),) * 2 + (np.full_like(m[0], 8),)),
+    "scaffold networks .'color'. are missing": broken("networks", lambda n: {k: n[k] for k in n if k != "color"}),
+    "layers": broken("layers", lambda _: (0, 2, 1)),
+    "step of feature": broken("steps", lambda s: replace(s, feature=0.0)),
+    "global_deformation network trunk": broken(
+        "global_deformation", lambda d: replace(d, networks={**d.networks, "trunk": d.networks["position"]})
+    ),
+    "planes.*expected six": broken(
+        "local_deformation", lambda d: replace(d, planes=({k: v for k, v in d.planes[0].items() if k != "xt"},))
+    ),
+    "voxel_size": broken("info", lambda i: replace(i, voxel_size=0.0)),
+    "info: a value": broken("info", lambda i: replace(i, near=float("inf"))),
+}
+
+
+@pytest.mark.parametrize("message", FAULTS)
+def test_scenes_that_cannot_be_written_are_refused_in_one_line(message):
+    scene = make_scene(0, anchors=6, extent=60)
+    assert len(scene.anchor_q) == 6
+    with pytest.raises(EncodeError, match=message) as caught:
+        encode(FAULTS[message](scene), layers=2)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"mode": "zip"},
+        {"deformation": "x"},
+        {"priors": "x"},
+        {"layers": 3},
+        {"layers": "2"},
+        {"effort": 0},
+        {"step_scale": 0},
+    ],
+)
+def test_unknown_options_are_refused(options):
+    with pytest.raises(EncodeError, match="expected"):
+        encode(make_scene(0), **options)
+
+
+def test_sizes_over_the_format_limits_are_refused_without_verification():
+    scene = make_scene(0, channels=1, sides=(4097, 1, 1, 1))
+    with pytest.raises(EncodeError, match="limit"):
+        encode(scene, layers=2, verify=False)
+
+
+def test_verification_notices_a_changed_symbol(monkeypatch):
+    def write_wrong(symbols, coding):
+        changed = symbols.attributes.copy()
+        changed[5, 0] += 1
+        return original(replace(symbols, attributes=changed), coding)
+
+    original = encoder.write_layer
+    monkeypatch.setattr(encoder, "write_layer", write_wrong)
+    scene = make_scene(0, layers=(0,))
+    with pytest.raises(EncodeError, match="verification: layer 0"):
+        encode(scene)
+    assert encode(scene, verify=False)
+
+
+@given(st.sampled_from(sorted(GLOBAL_HEADS)), st.sampled_from(sorted(LOCAL_HEADS)))
+@settings(max_examples=3)
+def test_single_heads(global_head, local_head):
+    heads = ({global_head: GLOBAL_HEADS[global_head]}, {local_head: LOCAL_HEADS[local_head]})
+    scene = make_scene(0, heads=heads)
+    decoded = decode(encode(scene, layers=2, effort=1))
+    assert_same_scene(decoded, decode(encode(decoded, layers=2, effort=1)))
+    assert set(decoded.global_deformation.networks) == {"trunk", global_head}
+    assert set(decoded.local_deformation.networks) == {"trunk", local_head}

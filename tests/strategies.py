@@ -1,0 +1,193 @@
+"""Hypothesis generators of scenes: all layer sets, with and without heads, from no anchor to a few, all symbol ranges.
+
+Hypothesis draws the shape of a scene and a seed; numpy fills the arrays. Values are multiples of their steps unless
+said otherwise, so that a test knows every symbol that must come back.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from hypothesis import strategies as st
+
+from pd4dgs_codec.attributes.quantise import dequantise
+from pd4dgs_codec.scene import (
+    FEATURE_DIM,
+    GLOBAL_HEADS,
+    LOCAL_HEADS,
+    N_OFFSETS,
+    PLANES,
+    SCAFFOLD_NETWORKS,
+    SCALING_DIM,
+    Camera,
+    Deformation,
+    Network,
+    Scene,
+    SceneInfo,
+    Steps,
+)
+
+HUGE = (1 << 24) - 1
+LAYER_SETS = ((0,), (0, 1), (0, 2), (0, 1, 2))
+#: How symbols are drawn: all equal, a few small ones, Gaussian, or spread over the whole range the format allows.
+RANGES = ("constant", "small", "gaussian", "huge")
+
+
+def symbols(rng: np.random.Generator, shape: tuple[int, ...], kind: str) -> np.ndarray:
+    """int32 symbols of `shape` drawn as `kind` says."""
+    if kind == "constant":
+        return np.full(shape, 2, np.int32)
+    if kind == "small":
+        return rng.integers(-2, 3, shape, dtype=np.int32)
+    if kind == "gaussian":
+        return np.rint(rng.normal(size=shape) * 20).astype(np.int32)
+    return rng.choice(np.array([-HUGE, -1, 0, 1, HUGE], np.int32), shape)
+
+
+def network(rng: np.random.Generator, widths: tuple[int, ...], step: float, kind: str) -> Network:
+    """A network of the given widths (input, hidden ..., output) with quantised weights."""
+    pairs = zip(widths[:-1], widths[1:], strict=True)
+    return tuple(
+        (dequantise(symbols(rng, (b, a), kind), step), dequantise(symbols(rng, (b,), kind), step)) for a, b in pairs
+    )
+
+
+def deformation(
+    rng: np.random.Generator,
+    heads: dict[str, int],
+    steps: tuple[float, float],
+    *,
+    channels: int = 2,
+    sides: tuple[int, int, int, int] = (3, 2, 4, 5),
+    scales: int = 1,
+    width: int = 3,
+    kind: str = "small",
+) -> Deformation:
+    """A Deformation with the steps (planes, weights); the sides x, y, z double from scale to scale."""
+    planes = []
+    for s in range(scales):
+        reso = [side << s for side in sides[:3]] + [sides[3]]
+        planes.append(
+            {name: dequantise(symbols(rng, (channels, reso[b], reso[a]), kind), steps[0]) for name, a, b in PLANES}
+        )
+    networks = {"trunk": network(rng, (channels * scales, width), steps[1], kind)}
+    for name, outputs in heads.items():
+        layers = network(rng, (width, outputs), steps[1], kind)
+        layers[-1][1][0] = np.float32(steps[1])  # not all zero: such a head is not sent
+        networks[name] = layers
+    return Deformation(tuple(planes), networks)
+
+
+def info(rng: np.random.Generator, with_camera: bool = True) -> SceneInfo:
+    """Scene information with binary32 reals."""
+    camera = None
+    if with_camera:
+        viewmat = np.eye(4, dtype=np.float32)
+        viewmat[:3] = rng.normal(size=(3, 4)).astype(np.float32)
+        camera = Camera(viewmat, np.array([[500, 0, 320], [0, 501, 240], [0, 0, 1]], np.float32), 640, 480)
+    box = np.array([[-1, -2, -3], [1, 2, 3]], np.float32)
+    return SceneInfo(0.0078125, box, (0.5, 3.25), (0.0, 0.5, 1.0), 0.125, 64.0, (0.0, -1.0, 0.0), 1.5, camera)
+
+
+def make_scene(
+    seed: int = 0,
+    *,
+    layers: tuple[int, ...] = (0, 1, 2),
+    anchors: int = 6,
+    kind: str = "small",
+    heads: tuple[dict[str, int], dict[str, int]] = (GLOBAL_HEADS, LOCAL_HEADS),
+    with_camera: bool = True,
+    extent: int = 8,
+    hidden: tuple[int, ...] = (4,),
+    **deformation_options,
+) -> Scene:
+    """An unplanned scene: every anchor in every layer's prefix, in random order, some of them inactive.
+
+    Steps are powers of two, so that even the largest symbols come back from their float32 values.
+    """
+    rng = np.random.default_rng(seed)
+    steps = Steps(0.0625, 0.03125, 0.125, 0.25, 0.5, 0.0078125, 0.015625, 0.0078125)
+    cells = np.unique(rng.integers(-extent, extent + 1, (anchors, 3), dtype=np.int32), axis=0)
+    cells = rng.permutation(cells)
+    n = len(cells)
+    codes = np.sort(rng.choice(np.array([0, 0, 3, 4, 77, 255], np.uint8), (n, len(layers))), axis=1)
+    return Scene(
+        info=info(rng, with_camera),
+        steps=steps,
+        layers=layers,
+        rows=(n,) * len(layers),
+        anchor_q=cells,
+        feature=dequantise(symbols(rng, (n, FEATURE_DIM), kind), steps.feature),
+        scaling_log=dequantise(symbols(rng, (n, SCALING_DIM), kind), steps.scaling_log),
+        offset=dequantise(symbols(rng, (n, N_OFFSETS, 3), kind), steps.offset),
+        mask=tuple(codes.T.copy()),
+        networks={
+            name: network(rng, (FEATURE_DIM + 3, *hidden, outputs), steps.weights_scaffold, kind)
+            for name, outputs in SCAFFOLD_NETWORKS.items()
+        },
+        global_deformation=deformation(
+            rng, heads[0], (steps.planes_global, steps.weights_global), kind=kind, **deformation_options
+        )
+        if 1 in layers and heads[0]
+        else None,
+        local_deformation=deformation(
+            rng, heads[1], (steps.planes_local, steps.weights_local), kind=kind, **deformation_options
+        )
+        if 2 in layers and heads[1]
+        else None,
+    )
+
+
+def _subset(heads: dict[str, int]) -> st.SearchStrategy[dict[str, int]]:
+    return st.sets(st.sampled_from(sorted(heads))).map(lambda names: {k: v for k, v in heads.items() if k in names})
+
+
+@st.composite
+def scenes(draw: st.DrawFn) -> Scene:
+    """Scenes of all layer sets, ranges, head sets and small plane sizes, empty ones and planes of side 1 included.
+
+    Fitting priors to a channel over the whole range takes some 20 ms, so those scenes have at most one anchor.
+    """
+    kind = draw(st.sampled_from(RANGES))
+    return make_scene(
+        draw(st.integers(0, 2**32 - 1)),
+        layers=draw(st.sampled_from(LAYER_SETS)),
+        anchors=draw(st.sampled_from((0, 1) if kind == "huge" else (0, 1, 2, 5, 40))),
+        kind=kind,
+        heads=(draw(_subset(GLOBAL_HEADS)), draw(_subset(LOCAL_HEADS))),
+        with_camera=draw(st.booleans()),
+        extent=draw(st.sampled_from((1, 30, 1 << 19))),
+        hidden=draw(st.sampled_from(((), (1,), (5, 2)))),
+        channels=draw(st.integers(1, 3)),
+        sides=draw(st.tuples(*[st.integers(1, 4)] * 4)),
+        scales=draw(st.integers(1, 2)),
+        width=draw(st.integers(1, 4)),
+    )
+
+
+def assert_same_scene(a: Scene, b: Scene) -> None:
+    """Every array of two scenes is equal, bit for bit."""
+    assert (a.layers, a.rows) == (b.layers, b.rows)
+    for name in ("anchor_q", "feature", "scaling_log", "offset"):
+        np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
+        assert getattr(a, name).dtype == getattr(b, name).dtype
+    for x, y in zip(a.mask, b.mask, strict=True):
+        np.testing.assert_array_equal(x, y)
+    assert_same_networks(a.networks, b.networks)
+    for x, y in ((a.global_deformation, b.global_deformation), (a.local_deformation, b.local_deformation)):
+        assert (x is None) == (y is None)
+        if x is not None and y is not None:
+            assert_same_networks(x.networks, y.networks)
+            assert len(x.planes) == len(y.planes)
+            for p, q in zip(x.planes, y.planes, strict=True):
+                assert list(p) == list(q)
+                for name in p:
+                    np.testing.assert_array_equal(p[name], q[name], err_msg=name)
+
+
+def assert_same_networks(a: dict[str, Network], b: dict[str, Network]) -> None:
+    """Equal names and equal weights."""
+    assert set(a) == set(b)
+    for name in a:
+        for (wa, ba), (wb, bb) in zip(a[name], b[name], strict=True):
+            np.testing.assert_array_equal(wa, wb, err_msg=name)
+            np.testing.assert_array_equal(ba, bb, err_msg=name)
