@@ -1,0 +1,286 @@
+"""Compositing of projected and binned Gaussians: numba kernels.
+
+`composite` draws, `composite_backward` returns one gradient slot per (Gaussian, tile) pair. No atomics: every result
+is the same for any number of threads. Inside a tile the loop is Gaussian-major over the blocks of 8 pixels in a row
+that its ellipse touches and that are not finished yet: a tile has 64 blocks, so both sets are one 64-bit word, and a
+small Gaussian costs few lanes.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numba import njit, prange
+
+from pd4dgs_codec.render.projection import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    GEOM_COLUMNS,
+    INV_SA,
+    REACH_LOG2,
+    SA,
+    SB,
+    SLOT_GEOMETRY,
+    K,
+    Q,
+    X,
+    Y,
+)
+from pd4dgs_codec.render.simd import (
+    LANES,
+    exp2,
+    fma,
+    fnma,
+    iota,
+    load,
+    mask_gt,
+    prefetch,
+    select_gt,
+    splat,
+    sqrt,
+    store,
+    total,
+    totals,
+    trailing_zeros,
+)
+
+TILE_WIDTH, TILE_HEIGHT = 32, 16  #: pixels
+T_MIN = 1e-4  #: a pixel is finished when its transmittance would fall to this
+_COLUMNS = TILE_WIDTH // LANES
+_BLOCKS = _COLUMNS * TILE_HEIGHT
+_STATE = 5  #: vectors of state per block
+_AHEAD = 4  #: Gaussians by which memory is fetched early
+_F = np.float32
+_OPTIONS: dict[str, Any] = dict(cache=True, nogil=True, error_model="numpy")
+
+
+@njit(**_OPTIONS)
+def _prefetch(items, n, end, geom, colors, stride):
+    if n + _AHEAD < end:
+        ahead = np.int64(items[n + _AHEAD])
+        prefetch(geom, ahead * GEOM_COLUMNS)
+        prefetch(colors, ahead * stride)
+
+
+@njit(**_OPTIONS)
+def _coverage(geom, g, left, top):
+    """Which blocks of the tile Gaussian g (offset into flat geom) may touch: bit = column * 16 + row.
+
+    The chord of each pixel row, eight rows at a time, a little too wide where float32 rounds.
+    """
+    shear = geom[g + K]
+    dy = top + 0.5 - geom[g + Y]
+    zero, far = splat(_F(0.0)), splat(_F(1e9))
+    reach = splat(_F(geom[g + Q] + REACH_LOG2 + 1e-4))
+    width = splat(_F(min(geom[g + INV_SA], 1e30) * (1.0 + 1e-6)))
+    slack = splat(_F(1e-3 + 1e-5 * abs(shear)))
+    mask = np.uint64(0)
+    for half in range(2):
+        row = iota() + splat(_F(half * LANES))
+        r = fma(row, splat(_F(geom[g + SB])), splat(_F(geom[g + SB] * dy)))
+        rest = fnma(r, r, reach)
+        centre = fma(row, splat(_F(shear)), splat(_F(geom[g + X] - 0.5 - left + shear * dy)))
+        extent = fma(sqrt(select_gt(rest, zero, rest, zero)), width, slack)
+        begin, end = select_gt(zero, rest, far, centre - extent), centre + extent
+        for column in range(_COLUMNS):
+            x = column * LANES
+            hit = mask_gt(end, splat(_F(x))) & mask_gt(splat(_F(x + LANES - 1)), begin)
+            mask |= hit << np.uint64(column * TILE_HEIGHT + half * LANES)
+    return mask
+
+
+@njit(**_OPTIONS)
+def _steps(geom, g, left, top):
+    """Start and steps per row and per column of t at a block's first pixel, then start and step of r per row."""
+    dy = top + 0.5 - geom[g + Y]
+    sa = geom[g + SA]
+    return (
+        sa * (left + 0.5 - geom[g + X] - geom[g + K] * dy), -sa * geom[g + K], sa * LANES,
+        geom[g + SB] * dy, geom[g + SB],
+    )  # fmt: skip
+
+
+@njit(**_OPTIONS)
+def _begin(state, channel, left, top, width, height):
+    """Transmittance 1 inside the image, 0 outside; returns the blocks with a pixel inside, as bits."""
+    alive = np.uint64(0)
+    for block in range(_BLOCKS):
+        y, x = top + block % TILE_HEIGHT, left + block // TILE_HEIGHT * LANES
+        if y < height and x < width:
+            alive |= np.uint64(1) << np.uint64(block)
+        for lane in range(LANES):
+            state[(block * _STATE + channel) * LANES + lane] = _F(1.0) if y < height and x + lane < width else _F(0.0)
+    return alive
+
+
+@njit(**_OPTIONS)
+def _place(x, y):
+    """Offset in `state` of pixel (x, y) of the tile, in its block's first vector."""
+    return (x // LANES * TILE_HEIGHT + y) * _STATE * LANES + x % LANES
+
+
+@njit(**_OPTIONS)
+def _composite_tile(items, start, end, geom, colors, stride, channel, left, top, width, height, state):
+    """Blend the tile's Gaussians into `state`: per block transmittance (0 once finished), 3 colours, its last value."""
+    alive = _begin(state, 4, left, top, width, height)
+    alive = _begin(state, 0, left, top, width, height)
+    one = np.uint64(1)
+    zero, faintest = splat(_F(0.0)), splat(_F(ALPHA_MIN))
+    low, high, t_min = splat(_F(-9.0)), splat(_F(ALPHA_MAX)), splat(_F(T_MIN))
+    for n in range(start, end):
+        if not alive:
+            break
+        _prefetch(items, n, end, geom, colors, stride)
+        g = np.int64(items[n]) * GEOM_COLUMNS
+        mask = _coverage(geom, g, left, top) & alive
+        t_start, t_row, t_column, r_start, r_row = _steps(geom, g, left, top)
+        opacity, step = geom[g + Q], splat(_F(geom[g + SA]))
+        c = np.int64(items[n]) * stride + channel
+        red, green, blue = splat(colors[c]), splat(colors[c + 1]), splat(colors[c + 2])
+        while mask:
+            block = trailing_zeros(mask)
+            mask &= mask - one
+            row, column = float(block % TILE_HEIGHT), float(block // TILE_HEIGHT)
+            r = r_start + row * r_row
+            t = fma(iota(), step, splat(_F(t_start + row * t_row + column * t_column)))
+            exponent = fnma(t, t, splat(_F(opacity - r * r)))
+            alpha = exp2(select_gt(exponent, low, exponent, low))
+            alpha = select_gt(high, alpha, alpha, high)
+            alpha = select_gt(faintest, alpha, zero, alpha)
+            p = block * (_STATE * LANES)
+            before = load(state, p)
+            weight = alpha * before
+            after = before - weight
+            weight = select_gt(after, t_min, weight, zero)
+            store(state, p + 4 * LANES, select_gt(after, t_min, after, load(state, p + 4 * LANES)))
+            after = select_gt(after, t_min, after, zero)
+            store(state, p, after)
+            store(state, p + LANES, fma(weight, red, load(state, p + LANES)))
+            store(state, p + 2 * LANES, fma(weight, green, load(state, p + 2 * LANES)))
+            store(state, p + 3 * LANES, fma(weight, blue, load(state, p + 3 * LANES)))
+            if not mask_gt(after, zero):
+                alive &= ~(one << np.uint64(block))
+
+
+@njit(parallel=True, **_OPTIONS)
+def composite(items, starts, geom, colors, channel, background, out_colors, transmittance):
+    """Draw 3 channels from `channel` on. colors float32 [N, D], D a multiple of 3; background float32 [D].
+
+    out_colors [H, W, D'], D' <= D, and transmittance = 1 - alpha [H, W], float32, are filled. (1 - alpha computed from
+    alpha would lose the digits that the gradient of a nearly hidden background needs.)
+    """
+    height, width, channels = out_colors.shape
+    columns = -(-width // TILE_WIDTH)
+    stride = colors.shape[1]
+    flat_geom, flat_colors = geom.reshape(-1), colors.reshape(-1)
+    for tile in prange(starts.size - 1):
+        left, top = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
+        state = np.zeros(_BLOCKS * _STATE * LANES, np.float32)
+        _composite_tile(
+            items, starts[tile], starts[tile + 1], flat_geom, flat_colors, stride, channel, left, top, width, height,
+            state,
+        )  # fmt: skip
+        for y in range(top, min(top + TILE_HEIGHT, height)):
+            for x in range(left, min(left + TILE_WIDTH, width)):
+                p = _place(x - left, y - top)
+                behind = state[p + 4 * LANES]
+                transmittance[y, x] = behind
+                for c in range(min(3, channels - channel)):
+                    back = behind * background[channel + c]
+                    out_colors[y, x, channel + c] = state[p + (1 + c) * LANES] + back
+
+
+@njit(**_OPTIONS)
+def _composite_tile_backward(
+    items, slot_of, start, end, geom, colors, stride, channel, left, top, width, height, state, slots, slot_stride
+):  # fmt: skip
+    """Front to back again. Per block: transmittance, R (the gradient's share of what lies behind), dL/d(3 colours)."""
+    alive = _begin(state, 0, left, top, width, height)
+    one_bit = np.uint64(1)
+    scratch = np.empty(LANES, np.float32)
+    zero, one, faintest = splat(_F(0.0)), splat(_F(1.0)), splat(_F(ALPHA_MIN))
+    low, high, t_min = splat(_F(-9.0)), splat(_F(ALPHA_MAX)), splat(_F(T_MIN))
+    for n in range(start, end):
+        _prefetch(items, n, end, geom, colors, stride)
+        g = np.int64(items[n]) * GEOM_COLUMNS
+        mask = _coverage(geom, g, left, top) & alive if alive else alive
+        t_start, t_row, t_column, r_start, r_row = _steps(geom, g, left, top)
+        opacity, step = geom[g + Q], splat(_F(geom[g + SA]))
+        c = np.int64(items[n]) * stride + channel
+        red, green, blue = splat(colors[c]), splat(colors[c + 1]), splat(colors[c + 2])
+        sum_g, sum_gt, sum_gtt, sum_gr, sum_grr, sum_gtr = zero, zero, zero, zero, zero, zero
+        sum_red, sum_green, sum_blue = zero, zero, zero
+        while mask:
+            block = trailing_zeros(mask)
+            mask &= mask - one_bit
+            row, column = float(block % TILE_HEIGHT), float(block // TILE_HEIGHT)
+            r = r_start + row * r_row
+            t = fma(iota(), step, splat(_F(t_start + row * t_row + column * t_column)))
+            exponent = fnma(t, t, splat(_F(opacity - r * r)))
+            unclamped = exp2(select_gt(exponent, low, exponent, low))
+            alpha = select_gt(high, unclamped, unclamped, high)
+            alpha = select_gt(faintest, alpha, zero, alpha)
+            p = block * (_STATE * LANES)
+            before = load(state, p)
+            weight = alpha * before
+            after = before - weight
+            weight = select_gt(after, t_min, weight, zero)
+            after = select_gt(after, t_min, after, zero)
+            store(state, p, after)
+            v_red, v_green, v_blue = load(state, p + 2 * LANES), load(state, p + 3 * LANES), load(state, p + 4 * LANES)
+            v = fma(v_red, red, fma(v_green, green, v_blue * blue))
+            behind = fnma(weight, v, load(state, p + LANES))
+            store(state, p + LANES, behind)
+            gradient = alpha * (before * v - behind / (one - alpha))
+            gradient = select_gt(weight, zero, select_gt(unclamped, high, zero, gradient), zero)
+            r_vector = splat(_F(r))
+            gt, gr = gradient * t, gradient * r_vector
+            sum_g, sum_gt, sum_gr = sum_g + gradient, sum_gt + gt, sum_gr + gr
+            sum_gtt, sum_grr, sum_gtr = fma(gt, t, sum_gtt), fma(gr, r_vector, sum_grr), fma(gt, r_vector, sum_gtr)
+            sum_red, sum_green = fma(weight, v_red, sum_red), fma(weight, v_green, sum_green)
+            sum_blue = fma(weight, v_blue, sum_blue)
+            if not mask_gt(after, zero):
+                alive &= ~(one_bit << np.uint64(block))
+        sums = totals(sum_g, sum_gt, sum_gtt, sum_gr, sum_grr, sum_gtr, sum_red, sum_green)
+        slot = np.int64(slot_of[n]) * slot_stride
+        if channel == 0:
+            store(slots, slot, sums)
+        else:
+            store(scratch, 0, sums)
+            for s in range(SLOT_GEOMETRY):
+                slots[slot + s] += scratch[s]
+            slots[slot + SLOT_GEOMETRY + channel] = scratch[SLOT_GEOMETRY]
+            slots[slot + SLOT_GEOMETRY + channel + 1] = scratch[SLOT_GEOMETRY + 1]
+        slots[slot + SLOT_GEOMETRY + channel + 2] = total(sum_blue)
+
+
+@njit(parallel=True, **_OPTIONS)
+def composite_backward(
+    items, slot_of, starts, geom, colors, channel, out_colors, transmittance, g_colors, g_alphas, slots
+):  # fmt: skip
+    """slots float32 [pairs, 6 + D]: gradient sums of each pair; geometry columns are added to when channel > 0.
+
+    g_colors [H, W, D'], g_alphas [H, W]: dL/d(out_colors), dL/d(1 - transmittance), which counts in the first pass.
+    """
+    height, width, channels = out_colors.shape
+    columns = -(-width // TILE_WIDTH)
+    stride, slot_stride = colors.shape[1], slots.shape[1]
+    flat_geom, flat_colors, flat_slots = geom.reshape(-1), colors.reshape(-1), slots.reshape(-1)
+    for tile in prange(starts.size - 1):
+        left, top = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
+        state = np.zeros(_BLOCKS * _STATE * LANES, np.float32)
+        for y in range(top, min(top + TILE_HEIGHT, height)):
+            for x in range(left, min(left + TILE_WIDTH, width)):
+                p = _place(x - left, y - top)
+                # What lies behind contributes v.C and, through alpha = 1 - T, -g_alpha T.
+                behind = -transmittance[y, x] * g_alphas[y, x] if channel == 0 else _F(0.0)
+                for c in range(min(3, channels - channel)):
+                    v = g_colors[y, x, channel + c]
+                    behind += v * out_colors[y, x, channel + c]
+                    state[p + (2 + c) * LANES] = v
+                state[p + LANES] = behind
+        _composite_tile_backward(
+            items, slot_of, starts[tile], starts[tile + 1], flat_geom, flat_colors, stride, channel, left, top, width,
+            height, state, flat_slots, slot_stride,
+        )  # fmt: skip

@@ -1,0 +1,91 @@
+"""How many threads, and which threading layer. Import this before torch and numba: it imports neither.
+
+OpenMP threads that spin while they wait make a training step 5-20 times slower as soon as another process takes a
+core; `OMP_WAIT_POLICY=passive` (read when torch loads) and numba's `tbb` layer avoid that. The `tbb` package puts its
+library in the environment's lib folder, where the loader does not look, so it is loaded here by path.
+"""
+
+from __future__ import annotations
+
+import ctypes
+import os
+import sys
+from pathlib import Path
+
+from pd4dgs_codec.errors import RenderError
+
+_tbb: ctypes.CDLL | None = None
+
+
+def _tbb_candidates() -> list[str]:
+    names = ["libtbb.so.12", "libtbb.12.dylib"]
+    folders = [Path(sys.prefix) / "lib", Path(sys.base_prefix) / "lib"]
+    folders += [Path(p).parents[2] / "lib" for p in sys.path if Path(p).name == "site-packages"]
+    files = [str(folder / name) for folder in folders for name in names]
+    return [f for f in files if os.path.exists(f)] + names
+
+
+def load_tbb() -> bool:
+    """Make the tbb library findable for numba; False if it is not installed."""
+    global _tbb
+    for name in _tbb_candidates() if _tbb is None else []:
+        try:
+            _tbb = ctypes.CDLL(name, mode=ctypes.RTLD_GLOBAL)
+            break
+        except OSError:
+            continue
+    return _tbb is not None
+
+
+def choose_layer() -> None:
+    """numba's layer: tbb where it loads, else numba's own order (OpenMP, work queue). A user's choice stays."""
+    if not load_tbb() or "NUMBA_THREADING_LAYER" in os.environ:
+        return
+    os.environ["NUMBA_THREADING_LAYER"] = "tbb"
+    if "numba" in sys.modules:
+        sys.modules["numba"].config.THREADING_LAYER = "tbb"
+
+
+def available() -> int:
+    """CPUs this process may use."""
+    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+
+
+def configure(threads: int | None = None) -> int:
+    """Set the wait policy, the threading layer and the number of threads of torch and numba; returns that number.
+
+    threads: 1 .. available CPUs, or None for OMP_NUM_THREADS if set, else all. Best called before torch and numba are
+    imported; afterwards it still sets their thread counts, but the wait policy of an OpenMP already loaded stays.
+    Starting processes: spawn, never fork (OpenMP kills forked children).
+    """
+    if threads is None:
+        asked = os.environ.get("OMP_NUM_THREADS", "")
+        threads = min(int(asked), available()) if asked.isdigit() and int(asked) > 0 else available()
+    if not 1 <= threads <= available():
+        raise RenderError(f"threads is {threads}, expected 1 to {available()} (the CPUs this process may use)")
+    os.environ.setdefault("OMP_WAIT_POLICY", "passive")
+    os.environ["OMP_NUM_THREADS"] = str(threads)
+    choose_layer()
+    if "numba" not in sys.modules:
+        os.environ.setdefault("NUMBA_NUM_THREADS", str(available()))
+    if "torch" in sys.modules:
+        sys.modules["torch"].set_num_threads(threads)
+    set_kernel_threads(threads)
+    return threads
+
+
+_kernel_threads: int | None = None
+
+
+def set_kernel_threads(threads: int) -> None:
+    """Threads of the CPU kernels from the next call on."""
+    global _kernel_threads
+    _kernel_threads = threads
+
+
+def kernel_threads() -> int:
+    """Threads that the CPU kernels use: what `configure` set, else OMP_NUM_THREADS, else all available CPUs."""
+    if _kernel_threads is None:
+        configure(None)
+    assert _kernel_threads is not None
+    return _kernel_threads

@@ -1,0 +1,117 @@
+"""Threads: the same bits for any number, at once from two callers, and the layer chosen before numba starts."""
+
+import os
+import subprocess
+import sys
+import threading
+
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("numba")
+
+from raster_scenes import camera, draw_with_gradients, scene  # noqa: E402
+
+from pd4dgs_codec.errors import RenderError  # noqa: E402
+from pd4dgs_codec.render import threads  # noqa: E402
+
+needs_two = pytest.mark.skipif(threads.available() < 2, reason="needs 2 CPUs")
+
+
+@pytest.fixture(autouse=True)
+def restore_threads():
+    before, torch_before = threads.kernel_threads(), torch.get_num_threads()
+    yield
+    threads.set_kernel_threads(before)
+    torch.set_num_threads(torch_before)
+
+
+def _draw(count, seed=0):
+    threads.set_kernel_threads(count)
+    return draw_with_gradients(scene(3000, seed, scale=0.04), *camera(150, 110), 150, 110, "cpu")
+
+
+def _same(a, b):
+    return all(torch.equal(a[k], b[k]) for k in a if k != "meta")
+
+
+@needs_two
+def test_one_and_two_threads_give_the_same_bits():
+    one, two, again = _draw(1), _draw(2), _draw(2)
+    assert _same(one, two) and _same(two, again)
+    assert not _same(one, _draw(1, seed=1))
+
+
+@needs_two
+def test_two_callers_at_once():
+    expected = [_draw(2, seed) for seed in (0, 1)]
+    results = [[], []]
+
+    def work(n):
+        for _ in range(5):
+            results[n].append(_draw(2, n))
+
+    workers = [threading.Thread(target=work, args=(n,)) for n in (0, 1)]
+    for w in workers:
+        w.start()
+    for w in workers:
+        w.join(60)
+    assert all(len(r) == 5 for r in results)
+    assert all(_same(r, expected[n]) for n in (0, 1) for r in results[n])
+
+
+@pytest.mark.parametrize("count", [0, -1, 10_000])
+def test_impossible_counts_are_refused(count):
+    with pytest.raises(RenderError, match="expected 1 to"):
+        threads.configure(count)
+
+
+def test_configure_sets_torch_and_the_kernels():
+    assert threads.configure(1) == 1
+    assert threads.kernel_threads() == 1 and torch.get_num_threads() == 1
+
+
+def _run(code, **variables):
+    environment = {k: v for k, v in os.environ.items() if not k.startswith(("OMP_", "NUMBA_"))} | variables
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
+    assert done.returncode == 0, done.stderr
+    return done.stdout.split()
+
+
+_CHILD = """
+import sys
+from pd4dgs_codec.render import threads
+assert not {"torch", "numba"} & set(sys.modules)
+threads.configure(1)
+import os, torch
+from pd4dgs_codec.render.rasterization import rasterization
+g = [torch.rand(50, n) if n else torch.rand(50) for n in (3, 4, 3, 0, 3)]
+g[0][:, 2] += 2
+rasterization(*g, torch.eye(4)[None], torch.tensor([[[30.0, 0, 15], [0, 30, 15], [0, 0, 1]]]), 30, 30)
+import numba
+print(numba.threading_layer(), numba.get_num_threads(), torch.get_num_threads(), os.environ["OMP_WAIT_POLICY"])
+"""
+
+
+def test_before_torch_in_a_new_process():
+    layer, numba_threads, torch_threads, policy = _run(_CHILD)
+    assert layer == ("tbb" if threads.load_tbb() else layer)
+    assert (numba_threads, torch_threads, policy) == ("1", "1", "passive")
+
+
+def test_without_tbb_another_layer_is_used():
+    child = _CHILD.replace("threads.configure(1)", "threads.load_tbb = lambda: False\nthreads.configure(1)")
+    layer = _run(child)[0]
+    assert layer in ("tbb", "omp", "workqueue")
+
+
+def test_a_users_choice_of_layer_and_policy_stays():
+    assert _run(_CHILD, NUMBA_THREADING_LAYER="workqueue", OMP_WAIT_POLICY="active")[0::3] == ["workqueue", "active"]
+
+
+@pytest.mark.slow
+def test_first_call_of_a_warm_cache_is_quick():
+    code = _CHILD.replace("rasterization(*g", "import time; start = time.perf_counter(); rasterization(*g")
+    code += "print(time.perf_counter() - start)"
+    _run(code)
+    assert float(_run(code)[-1]) < 1.0
