@@ -1,0 +1,43 @@
+"""`python -m pd4dgs_codec VERB ...`: the same commands as the `pd4dgs-VERB` programs."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+
+VERBS = {
+    "train": "train a layered scene from posed images",
+    "encode": "pack a trained scene into a .pd4 file",
+    "decode": "unpack a .pd4 file, or the first layers of one",
+    "info": "show the header and the layers of a .pd4 file",
+    "render": "render a file to pictures or a video",
+    "eval": "measure each level of a file against a dataset",
+    "bench": "measure speed, stability and delivery",
+    "package": "prepare a .pd4 file for streaming",
+    "serve": "stream a package over HTTP at a given rate",
+}
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Runs one verb; returns its exit code."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    verb = arguments[0] if arguments else "--help"
+    if verb in ("-h", "--help"):
+        lines = ["usage: python -m pd4dgs_codec VERB ...   (VERB --help explains each)", ""]
+        lines += [f"  {name:<9}{summary}" for name, summary in VERBS.items()]
+        print("\n".join(lines), file=sys.stdout if arguments else sys.stderr)
+        return 0 if arguments else 2
+    if verb == "--version":
+        from pd4dgs_codec.cli.common import version_line
+
+        print(version_line("pd4dgs_codec"))
+        return 0
+    if verb not in VERBS:
+        print(f"pd4dgs: error: found {verb!r}, expected one of {', '.join(VERBS)}", file=sys.stderr)
+        return 2
+    return import_module(f"pd4dgs_codec.cli.{verb}").main(arguments[1:])
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,264 @@
+"""What the commands share: options, exit codes, one-line errors, and what goes to stdout or stderr.
+
+Only the standard library is imported here, so that `--help` and usage errors answer at once, and so that the number of
+threads is settled before torch and numba are loaded.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import json
+import math
+import os
+import sys
+from collections.abc import Callable, Iterable, Sequence
+from typing import Any, NoReturn
+
+from pd4dgs_codec.errors import DecodeError, EncodeError, Pd4Error
+
+OK, FAILED, USAGE, PARTIAL = 0, 1, 2, 3
+
+EXIT_CODES = (
+    "exit codes: 0 done, 1 bad data or I/O, 2 wrong usage, 3 cut input decoded as far as possible (--allow-partial)"
+)
+SOURCES = """\
+SOURCE is one of
+  a folder in the iPhone/Nerfies layout (camera/, rgb/, splits/; its split files decide what is held out)
+  a folder with transforms*.json (Blender, D-NeRF, nerfstudio)
+  synthetic:static   nothing moves
+  synthetic:global   large objects move slowly
+  synthetic:local    the same, and small parts move on their own
+  synthetic:fast     quick motion
+  (synthetic:NAME?seed=n gives another scene of that kind)"""
+
+
+class UsageError(Exception):
+    """The command line itself is wrong: exit 2."""
+
+
+class Parser(argparse.ArgumentParser):
+    """argparse with one-line usage errors, no abbreviated options, and the common options."""
+
+    def __init__(self, verb: str, usage: str, summary: str, details: str):
+        super().__init__(
+            prog=f"pd4dgs-{verb}",
+            usage=f"pd4dgs-{verb} {usage} [options]",
+            description=summary,
+            epilog=f"{details}\n\n{EXIT_CODES}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+            add_help=False,
+        )
+
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(message)
+
+    def add_common(self) -> None:
+        """The options that every command has."""
+        group = self.add_argument_group("common options")
+        group.add_argument("-h", "--help", action="help", help="show this help and exit")
+        group.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
+        group.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else there")
+        group.add_argument("-v", "--verbose", action="store_true", help="say more on stderr")
+        group.add_argument("-j", "--threads", type=positive_int, metavar="N", help="CPU threads (default: all cores)")
+        group.add_argument("-f", "--overwrite", action="store_true", help="replace an output that exists")
+
+
+class _Version(argparse.Action):
+    """Prints the release and the format version; a plain "version" action would import the codec for every --help."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
+        print(version_line(parser.prog))
+        parser.exit()
+
+
+def version_line(prog: str) -> str:
+    """The program's release and the version of the format it writes."""
+    from pd4dgs_codec import FORMAT_VERSION, __version__
+
+    return f"{prog} {__version__}, format {FORMAT_VERSION}"
+
+
+# -- option types ------------------------------------------------------------------------------------------------------
+
+
+def positive_int(text: str) -> int:
+    """An integer >= 1."""
+    return _checked(text, int, lambda value: value >= 1, "an integer >= 1")
+
+
+def count(text: str) -> int:
+    """An integer >= 0."""
+    return _checked(text, int, lambda value: value >= 0, "an integer >= 0")
+
+
+def positive_float(text: str) -> float:
+    """A finite number > 0."""
+    return _checked(text, float, lambda value: 0 < value < math.inf, "a number > 0")
+
+
+def non_negative_float(text: str) -> float:
+    """A finite number >= 0."""
+    return _checked(text, float, lambda value: 0 <= value < math.inf, "a number >= 0")
+
+
+def finite_float(text: str) -> float:
+    """A finite number."""
+    return _checked(text, float, math.isfinite, "a number")
+
+
+def _checked(text: str, kind: Callable[[str], Any], accept: Callable[[Any], bool], expected: str) -> Any:
+    with contextlib.suppress(ValueError):
+        if accept(value := kind(text)):
+            return value
+    raise argparse.ArgumentTypeError(f"found {text!r}, expected {expected}")
+
+
+def rates(text: str) -> dict[str, float]:
+    """Comma-separated link rates, bits per second with k, M or G for 1e3, 1e6, 1e9: "2M,10M" -> {"2M": 2e6, ...}."""
+    units = {"k": 1e3, "M": 1e6, "G": 1e9}
+    result = {}
+    for name in text.split(","):
+        number, unit = (name[:-1], units[name[-1]]) if name[-1:] in units else (name, 1.0)
+        try:
+            value = float(number) * unit
+        except ValueError:
+            value = math.nan
+        if not 0 < value < math.inf:
+            raise argparse.ArgumentTypeError(f"found {name!r}, expected a rate in bits per second such as 2M or 500k")
+        result[name] = value
+    return result
+
+
+# -- talking to the caller ---------------------------------------------------------------------------------------------
+
+
+class Console:
+    """Data to stdout, messages to stderr; with --json stdout holds one JSON object and nothing else."""
+
+    def __init__(self, args: argparse.Namespace):
+        self.json, self.verbose = args.json, args.verbose
+
+    def message(self, text: str) -> None:
+        """A line for the person at the terminal."""
+        print(text, file=sys.stderr, flush=True)
+
+    def detail(self, text: str) -> None:
+        """A line shown with -v only."""
+        if self.verbose:
+            self.message(text)
+
+    def result(self, data: dict[str, Any], text: str, *, on_stdout: bool) -> None:
+        """The outcome: `data` with --json, else `text`, on stdout where it is what was asked for, else on stderr."""
+        if self.json:
+            print(json.dumps(finite(data)), flush=True)
+        elif on_stdout:
+            print(text, flush=True)
+        else:
+            self.message(text)
+
+
+def finite(value: Any) -> Any:
+    """`value` with infinities and NaN as null: JSON has none of them."""
+    if isinstance(value, dict):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
+    """Rows as right-aligned columns under their heads; the first column is left-aligned."""
+    cells = [list(head), *([str(cell) for cell in row] for row in rows)]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
+    return "\n".join(
+        "  ".join(
+            cell.rjust(w) if i else cell.ljust(w) for i, (cell, w) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in cells
+    )
+
+
+def number(value: float | None, digits: int = 2) -> str:
+    """A number for a table, thousands separated; "-" for none."""
+    return "-" if value is None else f"{value:,.{digits}f}"
+
+
+# -- running -----------------------------------------------------------------------------------------------------------
+
+Action = Callable[[argparse.Namespace, Console], int]
+
+
+def run(parser: Parser, action: Action, argv: Sequence[str] | None) -> int:
+    """Parses, acts, and turns every failure into one line on stderr and an exit code."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    as_json, verbose = "--json" in arguments, not {"-v", "--verbose"}.isdisjoint(arguments)
+    name = ""
+    try:
+        args = parser.parse_args(arguments)
+        name = getattr(args, "input", "")
+        code = action(args, Console(args))
+        sys.stdout.flush()
+        return code
+    except UsageError as error:
+        return _fail(parser, error, f"{error}; see {parser.prog} --help", as_json, USAGE)
+    except BrokenPipeError:  # the reader went away, as `| head` does
+        _close_stdout()
+        return FAILED
+    except (Exception, KeyboardInterrupt) as error:
+        message = _explain(error, "stdin" if name == "-" else name)
+        if message is None:
+            if verbose:
+                raise
+            message = f"internal error, please report it: {type(error).__name__}: {error} (-v shows where)"
+        return _fail(parser, error, message, as_json)
+
+
+def _explain(error: BaseException, name: str) -> str | None:
+    """One line for an error that the caller can do something about; None for a fault of this program."""
+    if isinstance(error, (DecodeError, EncodeError)):  # the codec sees bytes and arrays, not the name of their file
+        return f"{name}: {error}"
+    if isinstance(error, Pd4Error):
+        return str(error)
+    if isinstance(error, OSError):
+        where = error.filename or ("stdout" if error.errno else "")  # only writes to a stream carry no name
+        return f"{where}: {error.strerror or error}".lstrip(": ")
+    if isinstance(error, ModuleNotFoundError) and error.name and not error.name.startswith("pd4dgs_codec"):
+        return f"needs the module {error.name}, which is not installed: pip install 'pd4dgs-codec[train]'"
+    if isinstance(error, MemoryError):
+        return "out of memory"
+    if isinstance(error, KeyboardInterrupt):
+        return "interrupted; nothing was written"
+    return None
+
+
+def _fail(parser: Parser, error: BaseException, message: str, as_json: bool, code: int = FAILED) -> int:
+    line = " ".join(message.split())
+    print(f"{parser.prog}: error: {line}", file=sys.stderr, flush=True)
+    if as_json:
+        content: dict[str, Any] = {"type": type(error).__name__, "message": line}
+        if isinstance(error, DecodeError) and error.offset is not None:
+            content["offset"] = error.offset
+        with contextlib.suppress(OSError):
+            print(json.dumps({"error": content}), flush=True)
+    try:
+        sys.stdout.flush()
+    except OSError:
+        _close_stdout()
+    return code
+
+
+def _close_stdout() -> None:
+    """Points stdout at nothing, so that the interpreter's own flush at exit cannot fail a second time."""
+    with contextlib.suppress(OSError, ValueError):
+        nothing = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(nothing, sys.stdout.fileno())
+        os.close(nothing)
+
+
+def use_threads(args: argparse.Namespace) -> None:
+    """Settles the number of threads; call it before the first import of torch or numba."""
+    from pd4dgs_codec.render.threads import configure
+
+    configure(args.threads)

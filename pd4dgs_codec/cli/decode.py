@@ -1,0 +1,149 @@
+"""`pd4dgs-decode`: `.pd4` -> arrays, a checkpoint, or a check of every byte."""
+
+from __future__ import annotations
+
+import argparse
+import io
+import os
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pd4dgs_codec.cli.common import OK, PARTIAL, Console, Parser, UsageError, number, run, table, use_threads
+from pd4dgs_codec.cli.files import STDIO, check_output, read_bytes, write_bytes
+
+if TYPE_CHECKING:
+    from pd4dgs_codec.scene import Scene
+
+DETAILS = """\
+Without -o the file is decoded and checked, and a summary printed. An .npz file holds the float32 arrays anchor,
+feature, scaling_log, offset, mask_L, mlp.*, planes.* and meta_*; a .pt file is a checkpoint that encode, render and
+eval accept.
+
+examples:
+  pd4dgs-decode scene.pd4
+  pd4dgs-decode scene.pd4 --max-layer 0 -o base.npz
+  head -c 300000 scene.pd4 | pd4dgs-decode - --allow-partial -o prefix.pt"""
+
+
+def parser() -> Parser:
+    """The options of `pd4dgs-decode`."""
+    p = Parser("decode", "[scene.pd4] [-o FILE]", "Unpack a .pd4 file, or the first layers of one.", DETAILS)
+    p.add_argument(
+        "input", nargs="?", default=STDIO, metavar="scene.pd4", help="file to read; - or nothing reads stdin"
+    )
+    p.add_argument(
+        "-o", "--output", metavar="FILE", help="FILE.npz or FILE.pt; - writes npz to stdout; without it only check"
+    )
+    p.add_argument("--max-layer", type=int, choices=(0, 1, 2), help="stop after this layer")
+    p.add_argument(
+        "--symbols", action="store_true", help="with .npz: add the integers (NAME_q) and their steps (NAME_step)"
+    )
+    p.add_argument(
+        "--allow-partial", action="store_true", help="decode as many layers of a cut file as are whole; exit 3 then"
+    )
+    p.add_common()
+    return p
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return run(parser(), _decode, argv)
+
+
+def _decode(args: argparse.Namespace, console: Console) -> int:
+    kind = _output_kind(args)
+    if args.output:
+        check_output(args.output, args.overwrite)
+    data = read_bytes(args.input)
+    from pd4dgs_codec.codec.decoder import decode_partial
+
+    start = time.perf_counter()
+    scene, complete = decode_partial(data, max_layer=args.max_layer, allow_partial=args.allow_partial)
+    seconds = time.perf_counter() - start
+    console.detail(f"steps {scene.steps}")
+    if kind == ".pt":
+        _write_checkpoint(scene, args)
+    elif kind == ".npz":
+        write_bytes(args.output, _npz(scene, args.symbols), args.overwrite)
+    if not complete:
+        console.message(f"pd4dgs-decode: the input is cut; decoded the layers {list(scene.layers)}")
+    result = _summary(scene, data, complete, seconds, args)
+    console.result(result, _text(result), on_stdout=not args.output)
+    return OK if complete else PARTIAL
+
+
+def _output_kind(args: argparse.Namespace) -> str | None:
+    """ ".npz", ".pt", or None without an output."""
+    if args.output is None:
+        if args.symbols:
+            raise UsageError("--symbols needs -o FILE.npz")
+        return None
+    if args.output == STDIO:
+        if args.json:
+            raise UsageError("-o - and --json both want stdout; name an output file")
+        return ".npz"
+    kind = Path(args.output).suffix
+    if kind not in (".npz", ".pt"):
+        raise UsageError(f"found -o {args.output}, expected a name that ends in .npz or .pt")
+    if args.symbols and kind == ".pt":
+        raise UsageError("--symbols needs -o FILE.npz; a checkpoint holds no symbols")
+    return kind
+
+
+def _npz(scene: Scene, symbols: bool) -> bytes:
+    import numpy as np
+
+    from pd4dgs_codec.codec.npz import to_npz_dict
+
+    stream = io.BytesIO()
+    np.savez(stream, **to_npz_dict(scene, symbols))  # type: ignore[arg-type]
+    return stream.getvalue()
+
+
+def _write_checkpoint(scene: Scene, args: argparse.Namespace) -> None:
+    use_threads(args)
+    from pd4dgs_codec.model import checkpoint
+    from pd4dgs_codec.model.convert import from_scene
+
+    check_output(args.output, args.overwrite)  # it may have appeared meanwhile
+    checkpoint.save(os.path.realpath(args.output), from_scene(scene))
+
+
+def _summary(scene: Scene, data: bytes, complete: bool, seconds: float, args: argparse.Namespace) -> dict[str, Any]:
+    from pd4dgs_codec.codec.info import info
+
+    described = {row["layer"]: row for row in info(data)["layers"]}
+    rows = []
+    for i, (layer, total) in enumerate(zip(scene.layers, scene.rows, strict=True)):
+        place = {key: described[layer][key] for key in ("offset", "bytes", "end")}
+        anchors = total - (scene.rows[i - 1] if i else 0)
+        rows.append({"layer": layer, **place, "anchors": anchors, "active": int((scene.mask[i] > 0).sum())})
+    return {
+        "input": args.input,
+        "output": args.output,
+        "bytes": len(data),
+        "complete": complete,
+        "seconds": round(seconds, 4),
+        "anchors": len(scene.anchor_q),
+        "global_deformation": scene.global_deformation is not None,
+        "local_deformation": scene.local_deformation is not None,
+        "layers": rows,
+    }
+
+
+def _text(result: dict[str, Any]) -> str:
+    rows = [
+        (row["layer"], *(number(row[key], 0) for key in ("bytes", "end", "anchors", "active")))
+        for row in result["layers"]
+    ]
+    state = "whole and valid" if result["complete"] else "cut; valid so far"
+    name = "stdin" if result["input"] == STDIO else result["input"]
+    lines = [
+        f"{name}: {result['bytes']:,} bytes, {state}, decoded in {result['seconds']:.3f} s",
+        table(("layer", "bytes", "prefix", "new anchors", "active"), rows),
+    ]
+    if result["output"]:
+        lines.append(f"wrote {'stdout' if result['output'] == STDIO else result['output']}")
+    return "\n".join(lines)

@@ -1,0 +1,110 @@
+"""`pd4dgs-info`: what a `.pd4` file holds."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Sequence
+from typing import Any
+
+from pd4dgs_codec.cli.common import OK, Console, Parser, number, rates, run, table
+from pd4dgs_codec.cli.files import STDIO, read_bytes
+
+DETAILS = """\
+Times to the first frame are 8 * (bytes up to the end of layer 0) / rate: the network alone, no latency.
+
+examples:
+  pd4dgs-info scene.pd4
+  pd4dgs-info scene.pd4 --check --at 500k,2M,50M --json"""
+
+#: What -v tells of each layer: quantisation steps, planes as [channels, x, y, z, t], widths of the networks' layers.
+DETAIL_KEYS = ("steps", "planes", "networks")
+
+
+def parser() -> Parser:
+    """The options of `pd4dgs-info`."""
+    p = Parser("info", "FILE", "Show the header and the layers of a .pd4 file.", DETAILS)
+    p.add_argument("input", metavar="FILE", help=".pd4 file; - reads stdin")
+    p.add_argument("--check", action="store_true", help="decode everything, so that every checksum and rule is tested")
+    p.add_argument("--hashes", action="store_true", help="SHA-256 per layer of its integers and of its float32 tensors")
+    p.add_argument(
+        "--at",
+        type=rates,
+        default="2M,10M,50M",
+        metavar="RATES",
+        help="link rates in bits per second for the first-frame times (default: 2M,10M,50M)",
+    )
+    p.add_common()
+    return p
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return run(parser(), _info, argv)
+
+
+def _info(args: argparse.Namespace, console: Console) -> int:
+    data = read_bytes(args.input)
+    from pd4dgs_codec.codec.decoder import decode
+    from pd4dgs_codec.codec.info import hashes, info
+
+    result = {"input": args.input, **info(data)}
+    end = result["layers"][0]["end"]
+    result["first_frame_seconds"] = {name: 8 * end / rate for name, rate in args.at.items()}
+    result["left_out"] = _left_out(result["layers"])
+    if args.check:
+        decode(data)
+        result["checked"] = True
+    if args.hashes:
+        result["hashes"] = hashes(data)
+    for row in result["layers"]:
+        console.detail(f"layer {row['layer']}: " + ", ".join(f"{key} {row.get(key)}" for key in DETAIL_KEYS))
+    console.result(result, _text(result), on_stdout=True)
+    return OK
+
+
+def _left_out(layers: list[dict[str, Any]]) -> list[dict[str, str]]:
+    """Layers, deformations and residual heads that the format has room for and this file does without."""
+    from pd4dgs_codec.codec.kinds import LAYER_KINDS
+
+    why = "the encoder found that it changes nothing visible, or was told to stop below"
+    rows = {row["layer"]: row for row in layers}
+    missing = []
+    for kind in LAYER_KINDS[1:]:
+        row = rows.get(kind.layer)
+        if row is None:
+            missing.append(f"layer {kind.layer}")
+        elif "networks" in row:  # known only where the file holds the whole chunk
+            gone = [head for head in kind.heads if head not in row["networks"]]
+            missing += (
+                [f"{kind.deformation}"]
+                if len(gone) == len(kind.heads)
+                else [f"{kind.deformation} head {h}" for h in gone]
+            )
+    return [{"what": what, "why": why} for what in missing]
+
+
+def _text(result: dict[str, Any]) -> str:
+    name = "stdin" if result["input"] == STDIO else result["input"]
+    cut = "" if result["available"] >= result["bytes"] else f", of which {result['available']:,} are here"
+    low, high = result["time_range"]
+    lines = [
+        f"{name}: .pd4 format {result['format_version']}, {result['bytes']:,} bytes{cut}",
+        f"mode {result['mode']}, deformation {result['deformation']}, header {result['header_bytes']} bytes, "
+        f"{number(result['anchors'], 0)} anchors on a grid of {result['voxel_size']:.6g} scene units, "
+        f"time {low:g} to {high:g} s",
+        table(
+            ("layer", "offset", "bytes", "prefix", "new anchors"),
+            [
+                (row["layer"], *(number(row.get(key), 0) for key in ("offset", "bytes", "end", "anchors")))
+                for row in result["layers"]
+            ],
+        ),
+        *(f"left out: {item['what']} ({item['why']})" for item in result["left_out"]),
+        "first frame: " + ", ".join(f"{s:.2f} s at {rate}bps" for rate, s in result["first_frame_seconds"].items()),
+    ]
+    if result.get("checked"):
+        lines.append("checked: every layer decodes")
+    for row in result.get("hashes", []):
+        lines.append(f"layer {row['layer']}: symbols {row['symbols']}")
+        lines.append(f"layer {row['layer']}: tensors {row['tensors']}")
+    return "\n".join(lines)

@@ -1,0 +1,72 @@
+"""Progress on stderr: bars on a terminal, elsewhere a plain line now and then."""
+
+from __future__ import annotations
+
+import contextlib
+import sys
+import time
+from collections.abc import Callable, Iterator
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from pd4dgs_codec.train.loop import Trainer
+
+#: Between two lines where stderr is not a terminal.
+LINE_SECONDS = 10.0
+
+
+@contextlib.contextmanager
+def progress_bar(total: int | None, unit: str, label: str) -> Iterator[Callable[[], None]]:
+    """A function to call after each item: a bar on a terminal, elsewhere a line every LINE_SECONDS."""
+    if sys.stderr.isatty():
+        from tqdm import tqdm
+
+        with tqdm(total=total, unit=unit, desc=label, leave=False, file=sys.stderr) as bar:
+
+            def advance() -> None:
+                bar.update(1)
+
+            yield advance
+        return
+    done, told = 0, time.monotonic()
+
+    def count_one() -> None:
+        nonlocal done, told
+        done += 1
+        if time.monotonic() - told > LINE_SECONDS:
+            told = time.monotonic()
+            print(f"{label}: {done}{f' of {total}' if total else ''} {unit}", file=sys.stderr, flush=True)
+
+    yield count_one
+
+
+class TrainingProgress:
+    """A bar on a terminal; elsewhere a line whenever held-out quality was measured."""
+
+    def __init__(self) -> None:
+        self.stream = sys.stderr
+        self.bar: Any = None
+
+    def update(self, trainer: Trainer, record: dict[str, Any]) -> None:
+        """Called after every step with its log record."""
+        psnr = "/".join(f"{value:.2f}" for value in trainer.curve[-1]["psnr"]) if trainer.curve else ""
+        if self.stream.isatty():
+            self._bar(trainer).set_postfix_str(f"{record['anchors']} anchors {psnr} dB" if psnr else "", refresh=False)
+            self.bar.update(1)
+        elif "held_out_psnr" in record:
+            where = f"step {trainer.iteration}/{trainer.total}, {trainer.seconds:.0f} s"
+            print(f"{where}: {psnr} dB, {record['anchors']} anchors", file=self.stream, flush=True)
+
+    def close(self) -> None:
+        """Takes the bar away."""
+        if self.bar is not None:
+            self.bar.close()
+
+    def _bar(self, trainer: Trainer) -> Any:
+        if self.bar is None:
+            from tqdm import tqdm
+
+            self.bar = tqdm(
+                total=trainer.total or None, initial=trainer.iteration - 1, unit="step", file=self.stream, leave=False
+            )
+        return self.bar

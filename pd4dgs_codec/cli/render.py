@@ -1,0 +1,201 @@
+"""`pd4dgs-render`: pictures of a `.pd4` file or a checkpoint."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import statistics
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pd4dgs_codec.cli.common import (
+    OK,
+    SOURCES,
+    Console,
+    Parser,
+    UsageError,
+    count,
+    finite_float,
+    positive_float,
+    positive_int,
+    run,
+    use_threads,
+)
+from pd4dgs_codec.cli.files import STDIO, check_output, named_input, whole_file, whole_files
+from pd4dgs_codec.cli.progress import progress_bar
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from pd4dgs_codec.report.frames import Frame
+    from pd4dgs_codec.report.levels import Level
+
+DETAILS = f"""\
+Without --data the file's own camera is used, over its whole time; with --data the views of a dataset at their times.
+
+{SOURCES}
+
+examples:
+  pd4dgs-render scene.pd4 -o scene.gif --orbit 20
+  pd4dgs-render scene.pd4 -o levels.mp4 --side-by-side --data synthetic:local
+  pd4dgs-render scene.pd4 -o out/%04d.png --max-layer 0 --data recordings/kitchen --split test --downscale 2"""
+
+VIDEOS = (".gif", ".mp4")
+
+
+def parser() -> Parser:
+    """The options of `pd4dgs-render`."""
+    p = Parser("render", "FILE -o OUT", "Render a .pd4 file or a checkpoint to pictures or a video.", DETAILS)
+    p.add_argument("input", metavar="FILE", help=".pd4 file or .pt checkpoint; - reads a .pd4 from stdin")
+    p.add_argument(
+        "-o", "--output", required=True, metavar="OUT", help="pictures such as out/%%04d.png, or a .gif or .mp4"
+    )
+    p.add_argument("--max-layer", type=int, choices=(0, 1, 2), help="render what the layers up to this one give")
+    p.add_argument("--data", metavar="SOURCE", help="take cameras, times and true images from a dataset")
+    p.add_argument("--split", choices=("test", "train"), default="test", help="which views of it (default: test)")
+    p.add_argument(
+        "--downscale", type=positive_int, default=1, metavar="K", help="pictures 1/K as wide and high (default: 1)"
+    )
+    p.add_argument("--holdout", type=count, default=8, metavar="K", help="as in pd4dgs-train (default: 8)")
+    p.add_argument(
+        "--frames",
+        type=positive_int,
+        metavar="N",
+        help="pictures over the whole time (default: 60), or of --data the first N",
+    )
+    p.add_argument(
+        "--orbit",
+        type=finite_float,
+        default=0.0,
+        metavar="DEG",
+        help="sway the file's camera through DEG degrees around what it looks at",
+    )
+    p.add_argument(
+        "--fps", type=positive_float, default=20.0, metavar="F", help="frames per second of a video (default: 20)"
+    )
+    p.add_argument(
+        "--side-by-side",
+        action="store_true",
+        help="all levels next to each other, with the true image if --data is given",
+    )
+    p.add_common()
+    return p
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return run(parser(), _render, argv)
+
+
+def _render(args: argparse.Namespace, console: Console) -> int:
+    kind = _check_usage(args)
+    if kind in VIDEOS:
+        check_output(args.output, args.overwrite)
+    use_threads(args)
+    from pd4dgs_codec.report.levels import load_levels
+
+    if kind == ".mp4":
+        from pd4dgs_codec.report.movie import check_mp4
+
+        check_mp4()
+    levels = load_levels(named_input(args.input), args.max_layer)
+    console.detail(f"{args.input}: levels " + ", ".join(f"{row.level} ({row.anchors} anchors)" for row in levels))
+    frames = _frames(args, levels[-1])
+    if not args.side_by_side:
+        levels = levels[-1:]
+    milliseconds: list[float] = []
+    with progress_bar(len(frames), "frames", "rendering") as step:
+        outputs = _write(args, kind, _pictures(frames, levels, args.side_by_side, milliseconds, step), len(frames))
+    result = {
+        "input": args.input,
+        "output": args.output,
+        "outputs": outputs,
+        "frames": len(frames),
+        "width": frames[0].camera.width,
+        "height": frames[0].camera.height,
+        "levels": [level.level for level in levels],
+        "render_ms": statistics.median(milliseconds),
+    }
+    console.result(result, _text(result), on_stdout=False)
+    return OK
+
+
+def _check_usage(args: argparse.Namespace) -> str:
+    """The kind of output: the lower-case suffix."""
+    kind = Path(args.output).suffix.lower()
+    if args.output == STDIO or kind not in (*VIDEOS, ".png", ".jpg", ".jpeg", ".webp", ".bmp"):
+        raise UsageError(f"found -o {args.output}, expected pictures such as out/%04d.png, or a .gif or .mp4")
+    if args.data and args.orbit:
+        raise UsageError("--orbit moves the file's own camera; leave out --data or --orbit")
+    if kind not in VIDEOS and "%" in args.output:
+        name = Path(args.output).name
+        if not re.fullmatch(r"[^%]*%0?\d*d[^%]*", name) or "%" in str(Path(args.output).parent):
+            raise UsageError(f"found -o {args.output}, expected one frame number such as %04d in the file name")
+    return kind
+
+
+def _frames(args: argparse.Namespace, level: Level) -> list[Frame]:
+    from pd4dgs_codec.data.dataset import load
+    from pd4dgs_codec.errors import DataError
+    from pd4dgs_codec.report.frames import dataset_frames, own_frames
+
+    if args.data is None:
+        return own_frames(level.model.info, args.frames or 60, args.orbit, args.downscale)
+    dataset = load(args.data, downscale=args.downscale, holdout=args.holdout)
+    views = dataset.test if args.split == "test" else dataset.train
+    if not views:
+        raise DataError(f"{args.data}: has no held-out views; expected --split train or another --holdout")
+    return dataset_frames(views[: args.frames])
+
+
+def _pictures(
+    frames: list[Frame], levels: list[Level], beside: bool, milliseconds: list[float], step: Callable[[], None]
+) -> Iterator[np.ndarray]:
+    """uint8 [H, W, 3] per frame: the one level, or all of them beside the true image. Times are noted per picture."""
+    from pd4dgs_codec.metrics.image import to_uint8
+    from pd4dgs_codec.render.picture import render_image
+    from pd4dgs_codec.report.panels import level_caption, side_by_side
+
+    for frame in frames:
+        camera, images, captions = frame.camera, [], []
+        for level in levels:
+            start = time.perf_counter()
+            image = render_image(
+                level.model, level.level, frame.time, camera.viewmat, camera.K, camera.width, camera.height
+            )
+            milliseconds.append(1e3 * (time.perf_counter() - start))
+            images.append(to_uint8(image))
+            captions.append(level_caption(level.level, level.cumulative_bytes))
+        if beside and frame.truth is not None:
+            images.append(frame.truth)
+            captions.append("ground truth")
+        yield side_by_side(images, captions) if beside else images[0]
+        step()
+
+
+def _write(args: argparse.Namespace, kind: str, pictures: Iterator[np.ndarray], count: int) -> int:
+    """Writes all pictures; returns the number of files."""
+    from pd4dgs_codec.report.movie import write_gif, write_mp4, write_pictures
+
+    if kind in VIDEOS:
+        with whole_file(args.output, args.overwrite) as temporary:
+            (write_gif if kind == ".gif" else write_mp4)(pictures, temporary, args.fps)
+        return 1
+    numbered = "%" in args.output
+    if count > 1 and not numbered:
+        raise UsageError(
+            f"found -o {args.output} for {count} pictures, expected a frame number in it, such as %04d, or --frames 1"
+        )
+    names = [args.output % i if numbered else args.output for i in range(count)]
+    with whole_files(args.output, names, args.overwrite) as temporaries:
+        write_pictures(pictures, temporaries)
+    return len(names)
+
+
+def _text(result: dict[str, Any]) -> str:
+    levels = ", ".join(map(str, result["levels"]))
+    size = f"{result['width']}x{result['height']}"
+    speed = f"{result['render_ms']:.1f} ms per picture"
+    return f"{result['output']}: {result['frames']} frames of {size}, level {levels}, {speed}"

@@ -1,0 +1,75 @@
+"""What a resumed training run takes from its checkpoint, and what the command line may not contradict."""
+
+from __future__ import annotations
+
+import argparse
+import json
+from dataclasses import is_dataclass, replace
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pd4dgs_codec.errors import TrainError
+
+if TYPE_CHECKING:
+    from pd4dgs_codec.train.config import TrainConfig
+    from pd4dgs_codec.train.loop import Trainer
+
+#: Options that a resumed run takes from its checkpoint: naming another value there is an error.
+FIXED = ("preset", "seed", "downscale", "holdout", "iterations", "rate_scale", "rollout")
+
+
+def stored_config(args: argparse.Namespace) -> TrainConfig:
+    """The configuration in the checkpoint args.resume, with this call's time limit if it names one.
+
+    Raises TrainError where the call asks for something else than was stored.
+    """
+    from pd4dgs_codec.model import checkpoint
+
+    _, training = checkpoint.load(args.resume)
+    if "config" not in training:
+        what = "no training state (it was decoded from a .pd4, or stripped)"
+        raise TrainError(f"{args.resume}: holds {what}; expected a checkpoint of pd4dgs-train")
+    config = parse_config(training["config"], args.resume)
+    for name in FIXED:
+        asked = getattr(args, name)
+        if asked is not None:
+            _expect_same(args.resume, f"--{name.replace('_', '-')}", getattr(config, name), asked)
+    if args.no_noise:
+        _expect_same(args.resume, "noise", config.noise, False)
+    if _same_source(args.source) != _same_source(config.source):
+        _expect_same(args.resume, "SOURCE", config.source, args.source)
+    return replace(config, max_seconds=args.max_seconds or config.max_seconds)
+
+
+def parse_config(text: str, path: str) -> TrainConfig:
+    """The inverse of the JSON in a checkpoint; fields that it lacks keep their defaults."""
+    from pd4dgs_codec.train.config import TrainConfig
+
+    try:
+        return _rebuilt(json.loads(text), TrainConfig())
+    except (ValueError, TypeError, AttributeError) as error:
+        raise TrainError(f"{path}: its stored configuration cannot be read: {error}") from None
+
+
+def _rebuilt(plain: Any, like: Any) -> Any:
+    """JSON data as a value of the same type as `like`: nested dataclasses, and tuples for lists."""
+    if is_dataclass(like) and not isinstance(like, type):
+        return type(like)(**{name: _rebuilt(value, getattr(like, name)) for name, value in plain.items()})
+    return tuple(plain) if isinstance(plain, list) else plain
+
+
+def _expect_same(path: str, what: str, stored: Any, asked: Any) -> None:
+    if stored != asked:
+        raise TrainError(f"{path}: was trained with {what} {stored}, found {asked}; expected the same to resume")
+
+
+def _same_source(source: str) -> str:
+    return source if source.startswith("synthetic:") else str(Path(source).resolve())
+
+
+def check_time_left(trainer: Trainer, path: str) -> None:
+    """TrainError if the run has used up its time limit without having finished."""
+    limit = trainer.config.max_seconds
+    if limit and trainer.iteration < trainer.total and trainer.seconds >= limit:
+        used = f"has trained {trainer.seconds:.0f} s of its limit of {limit:g} s"
+        raise TrainError(f"{path}: {used}; expected a larger --max-seconds to go on")

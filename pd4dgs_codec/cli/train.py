@@ -1,0 +1,199 @@
+"""`pd4dgs-train`: posed images -> a checkpoint with three levels."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import signal
+import sys
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pd4dgs_codec.cli.common import (
+    OK,
+    SOURCES,
+    Console,
+    Parser,
+    UsageError,
+    count,
+    non_negative_float,
+    number,
+    positive_float,
+    positive_int,
+    run,
+    table,
+    use_threads,
+)
+from pd4dgs_codec.cli.files import STDIO, check_output
+from pd4dgs_codec.cli.progress import TrainingProgress
+from pd4dgs_codec.cli.resume import FIXED, check_time_left, stored_config
+from pd4dgs_codec.errors import TrainError
+
+if TYPE_CHECKING:
+    from pd4dgs_codec.train.config import TrainConfig
+    from pd4dgs_codec.train.loop import Trainer
+
+DETAILS = f"""\
+Training ends after --iterations or --max-seconds, whichever comes first; the schedule follows from them. Ctrl-C ends
+it early with a whole checkpoint, which --resume goes on from.
+
+{SOURCES}
+
+examples:
+  pd4dgs-train synthetic:local -o local.pt --preset tiny --max-seconds 300
+  pd4dgs-train recordings/kitchen -o kitchen.pt --downscale 2 --iterations 10000
+  pd4dgs-train recordings/kitchen -o kitchen.pt --resume kitchen.pt"""
+
+
+def parser() -> Parser:
+    """The options of `pd4dgs-train`. What a checkpoint fixes has no default here, so that a conflict can be told."""
+    p = Parser("train", "SOURCE -o FILE.pt", "Train a layered dynamic Gaussian scene from posed images.", DETAILS)
+    p.add_argument("source", metavar="SOURCE", help="dataset to train on, see below")
+    p.add_argument("-o", "--output", required=True, metavar="FILE.pt", help="checkpoint to write")
+    p.add_argument("--preset", choices=("tiny", "small", "paper"), help="model size (default: small)")
+    p.add_argument(
+        "--iterations",
+        type=positive_int,
+        metavar="N",
+        help="training steps (default: by preset, or what fits --max-seconds)",
+    )
+    p.add_argument(
+        "--max-seconds", type=positive_float, metavar="S", help="time limit; on --resume earlier time counts too"
+    )
+    p.add_argument(
+        "--downscale", type=positive_int, metavar="K", help="train on images 1/K as wide and high (default: 1)"
+    )
+    p.add_argument(
+        "--holdout",
+        type=count,
+        metavar="K",
+        help="without split files, hold out frames with i %% K == K/2 (default: 8; 0: none)",
+    )
+    p.add_argument("--seed", type=count, metavar="N", help="seed of all that is random in training (default: 0)")
+    p.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to train (default: auto)")
+    p.add_argument("--resume", metavar="FILE.pt", help="go on from this checkpoint, with the settings stored in it")
+    p.add_argument("--log", metavar="FILE.jsonl", help="write one JSON object per step")
+    p.add_argument(
+        "--rate-scale",
+        type=non_negative_float,
+        metavar="X",
+        help="weight of the bit rate against quality (default: 0.1; 1: the paper's)",
+    )
+    p.add_argument("--no-noise", action="store_true", help="ablation: train without quantisation noise")
+    p.add_argument(
+        "--rollout", choices=("adaptive", "uniform", "fixed"), help="how levels are sampled (default: adaptive)"
+    )
+    p.add_common()
+    return p
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return run(parser(), _train, argv)
+
+
+def _train(args: argparse.Namespace, console: Console) -> int:
+    if STDIO in (args.output, args.resume, args.log):
+        raise UsageError("training reads and writes named files, not - (stdin, stdout)")
+    resuming_in_place = args.resume is not None and Path(args.resume).resolve() == Path(args.output).resolve()
+    check_output(args.output, args.overwrite or resuming_in_place)
+    if args.log:
+        check_output(args.log, args.overwrite or args.resume is not None)
+    use_threads(args)
+    from pd4dgs_codec.data.dataset import load
+    from pd4dgs_codec.train.loop import Trainer
+
+    config = stored_config(args) if args.resume else _fresh_config(args)
+    dataset = load(args.source, downscale=config.downscale, holdout=config.holdout)
+    trainer = Trainer(config, dataset, _device(args.device))
+    if args.resume:
+        trainer.resume(Path(args.resume))
+        check_time_left(trainer, args.resume)
+    elif args.log:
+        Path(args.log).unlink(missing_ok=True)
+    limit = f", at most {config.max_seconds:g} s" if config.max_seconds else ""
+    held_out = f"{len(dataset.test)} held out" if dataset.test else "none held out"
+    start = f", from step {trainer.iteration}" if trainer.iteration else ""
+    console.message(
+        f"training {config.preset} on {len(dataset.train)} views ({held_out}), {trainer.device}{limit}{start}"
+    )
+    console.detail(f"{config}")
+    progress = TrainingProgress()
+    try:
+        with _terminate_as_interrupt():
+            trainer.run(Path(args.output), log=Path(args.log) if args.log else None, progress=progress)
+    finally:
+        progress.close()
+    result = _summary(args, trainer)
+    console.result(result, _text(result), on_stdout=False)
+    return OK
+
+
+def _fresh_config(args: argparse.Namespace) -> TrainConfig:
+    from pd4dgs_codec.train.config import TrainConfig
+
+    named = {name: getattr(args, name) for name in (*FIXED, "max_seconds") if getattr(args, name) is not None}
+    return TrainConfig(source=args.source, noise=not args.no_noise, **named)
+
+
+def _device(name: str) -> str:
+    import torch
+
+    if name == "auto":
+        return "cuda" if torch.cuda.is_available() else "cpu"
+    if name == "cuda" and not torch.cuda.is_available():
+        raise TrainError("--device cuda: this PyTorch finds no CUDA device; expected one, or --device cpu")
+    return name
+
+
+@contextlib.contextmanager
+def _terminate_as_interrupt() -> Iterator[None]:
+    """SIGTERM (a scheduler's or timeout's polite end) acts as Ctrl-C, so that it too leaves a whole checkpoint."""
+    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)
+
+
+def _summary(args: argparse.Namespace, trainer: Trainer) -> dict[str, Any]:
+    from pd4dgs_codec.train.config import Schedule
+
+    finished = 0 < trainer.total <= trainer.iteration
+    schedule = Schedule(trainer.total or sys.maxsize)  # 0: ended before the steps that a time limit allows were known
+    psnr = trainer.curve[-1]["psnr"] if trainer.curve else []
+    return {
+        "output": args.output,
+        "source": trainer.config.source,
+        "preset": trainer.config.preset,
+        "device": str(trainer.device),
+        "iterations": trainer.iteration,
+        "total": trainer.total,
+        "finished": finished,
+        "seconds": round(trainer.seconds, 3),
+        "phases_not_reached": [] if finished else schedule.phases_not_reached(trainer.iteration),
+        "skipped": trainer.skipped,
+        "anchors": len(trainer.model.anchor_q),
+        "active_anchors": trainer.active_anchors(),
+        "split": "test" if trainer.dataset.test else "train",
+        "levels": [{"level": level, "mpsnr": value} for level, value in enumerate(psnr)],
+    }
+
+
+def _text(result: dict[str, Any]) -> str:
+    end = "" if result["finished"] or not result["total"] else f" of {result['total']}"
+    steps = f"{result['iterations']}{end} steps in {result['seconds']:.0f} s"
+    lines = [f"{result['output']}: {steps}, {result['anchors']} anchors"]
+    if result["phases_not_reached"]:
+        lines.append(f"never reached: {', '.join(result['phases_not_reached'])}")
+    if not result["finished"]:
+        lines.append(f"not finished: --resume {result['output']} goes on from here")
+    if result["skipped"]:
+        lines.append(f"{result['skipped']} steps skipped: their gradient was not finite")
+    if result["levels"]:
+        split = "held-out" if result["split"] == "test" else "training-view"
+        rows = zip(result["levels"], result["active_anchors"], strict=False)
+        cells = [(row["level"], number(row["mpsnr"]), number(active, 0)) for row, active in rows]
+        lines.append(table(("level", f"{split} PSNR dB", "active anchors"), cells))
+    return "\n".join(lines)

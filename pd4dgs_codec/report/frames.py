@@ -1,0 +1,75 @@
+"""Which pictures to take of a file: a dataset's views, or the file's own camera over time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pd4dgs_codec.data.dataset import View
+from pd4dgs_codec.errors import RenderError
+from pd4dgs_codec.scene import Camera, SceneInfo
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """One picture to take. time: 0..1. truth: uint8 [H, W, 3], the image that a dataset has there, or None."""
+
+    camera: Camera
+    time: float
+    truth: np.ndarray | None = None
+
+
+def dataset_frames(views: Sequence[View]) -> list[Frame]:
+    """The cameras, times and images of a dataset's views."""
+    return [Frame(view.camera, view.time, view.image) for view in views]
+
+
+def own_frames(info: SceneInfo, count: int, orbit: float = 0.0, downscale: int = 1) -> list[Frame]:
+    """`count` pictures over the whole time from the file's camera, which sways `orbit` degrees around what it looks at.
+
+    Raises RenderError if the file has no camera.
+    """
+    if info.camera is None:
+        raise RenderError("the file holds no camera of its own; expected --data SOURCE to take cameras from")
+    camera = shrunk(info.camera, downscale)
+    times = np.linspace(0.0, 1.0, count) if count > 1 else np.zeros(1)
+    centre = look_at_point(info)
+    # a full sine over the sequence: it starts and ends at rest in the given camera, so that a looped video has no jump
+    angles = np.radians(orbit / 2) * np.sin(2 * np.pi * times)
+    return [
+        Frame(turned(camera, centre, info.up, a) if a else camera, float(t)) for a, t in zip(angles, times, strict=True)
+    ]
+
+
+def shrunk(camera: Camera, downscale: int) -> Camera:
+    """The camera of an image 1/downscale as wide and high, the remainder cropped; pixel centres at +0.5."""
+    if downscale == 1:
+        return camera
+    K = camera.K.copy()
+    K[:2] /= downscale
+    width, height = max(1, camera.width // downscale), max(1, camera.height // downscale)
+    return replace(camera, K=K, width=width, height=height)
+
+
+def look_at_point(info: SceneInfo) -> np.ndarray:
+    """float64 [3] the point of the camera's optical axis nearest to the middle of the scene's box, world."""
+    assert info.camera is not None
+    viewmat = info.camera.viewmat.astype(np.float64)
+    eye, axis = -viewmat[:3, :3].T @ viewmat[:3, 3], viewmat[2, :3]
+    depth = float(axis @ (info.box.astype(np.float64).mean(axis=0) - eye))
+    return eye + max(depth, float(info.near), 1e-6) * axis
+
+
+def turned(camera: Camera, centre: np.ndarray, up: Sequence[float], angle: float) -> Camera:
+    """The camera carried by `angle` radians around the axis `up` through `centre`, still looking at the same point."""
+    axis = np.asarray(up, np.float64)
+    axis = axis / max(float(np.linalg.norm(axis)), 1e-12)
+    x, y, z = axis
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    rotation = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * (cross @ cross)  # Rodrigues
+    world = np.eye(4)
+    world[:3, :3], world[:3, 3] = rotation, centre - rotation @ centre
+    viewmat = camera.viewmat.astype(np.float64) @ np.linalg.inv(world)
+    return replace(camera, viewmat=viewmat.astype(np.float32))

@@ -1,0 +1,115 @@
+"""Results as Markdown tables and as a plot of quality against training time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+
+def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table; columns padded, so that it also reads as plain text."""
+    cells = [list(head), *map(list, rows)]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
+    lines = ["| " + " | ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) + " |" for row in cells]
+    lines.insert(1, "|" + "|".join("-" * (w + 2) for w in widths) + "|")
+    return "\n".join(lines)
+
+
+def quality_table(results: Sequence[dict[str, Any]]) -> str:
+    """Per scene and level: held-out quality of the `.pd4`, and the bytes, seconds and milliseconds that go with it."""
+    rows = []
+    for result in results:
+        for level in result["evaluation"]["levels"]:
+            rows.append(
+                (
+                    result["name"],
+                    str(level["level"]),
+                    f"{level['mpsnr']:.2f}",
+                    f"{level['mssim']:.4f}",
+                    f"{level['loss_db']:+.3f}",
+                    f"{level['cumulative_bytes']:,}",
+                    f"{level['first_frame_seconds']:.2f}",
+                    f"{level['decode_seconds']:.2f}",
+                    f"{level['render_ms']:.0f}",
+                    f"{level['anchors']:,}",
+                    f"{result['train_seconds'] / 60:.1f}",
+                )
+            )
+    head = (
+        "scene",
+        "level",
+        "mPSNR dB",
+        "mSSIM",
+        "lost by packing dB",
+        "bytes so far",
+        "s at 2 Mbps",
+        "decode s",
+        "render ms",
+        "anchors",
+        "training min",
+    )
+    return markdown(head, rows)
+
+
+def coding_table(results: Sequence[dict[str, Any]]) -> str:
+    """Per scene and layer: the modes' bytes, and what the coder spends against the rate model and against LZMA."""
+    rows = []
+    for result in results:
+        for row in result["coding"]:
+            draco = row.get("draco_position_bytes")
+            rows.append(
+                (
+                    result["name"],
+                    str(row["layer"]),
+                    f"{row['ans_bytes']:,}",
+                    f"{row['lzma_bytes']:,}",
+                    f"{row['lzma_float32_bytes']:,}",
+                    _ratio(row["payload_over_rate"]),
+                    _ratio(row["train_over_rate"]),
+                    _ratio(row["best_over_gauss"]),
+                    _ratio(row["ans_over_lzma"], 3),
+                    f"{row['position_bytes']:,.0f} / {'-' if draco is None else f'{draco:,.0f}'}",
+                )
+            )
+    head = (
+        "scene",
+        "layer",
+        "ans",
+        "lzma",
+        "lzma, float32 deformation",
+        "gauss payload / ΣR",
+        "trainer's ΣR / ΣR",
+        "best / gauss",
+        "ans / lzma, same symbols",
+        "positions / Draco",
+    )
+    return markdown(head, rows)
+
+
+def _ratio(value: float | None, digits: int = 4) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def time_plot(results: Sequence[dict[str, Any]], path: Path) -> None:
+    """Held-out PSNR per level against training wall time, one panel per scene, legible in black and white."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(1, len(results), figsize=(4.2 * len(results), 3.4), squeeze=False)
+    styles = ((":", "o"), ("--", "s"), ("-", "^"))
+    for axis, result in zip(axes[0], results, strict=True):
+        for level, (line, mark) in enumerate(styles):
+            points = [(p["seconds"], p["psnr"][level]) for p in result["curve"] if len(p["psnr"]) > level]
+            if points:
+                axis.plot(*zip(*points, strict=True), line + mark, color="black", ms=4, lw=1, label=f"level {level}")
+        axis.set_title(result["name"])
+        axis.set_xlabel("training wall time, s")
+        axis.grid(alpha=0.3)
+    axes[0][0].set_ylabel("held-out PSNR, dB")
+    axes[0][0].legend()
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)

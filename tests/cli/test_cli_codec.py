@@ -1,0 +1,161 @@
+"""encode, decode and info, as their users call them."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+
+ENCODE_KEYS = {"mode", "bytes", "verified", "seconds", "layers", "left_out"}
+LAYER_KEYS = {"layer", "bytes", "payload_bits", "rate_bits", "position_bits", "symbols", "anchors"}
+
+
+def test_encode_writes_what_the_codec_encodes(cli, model_pt, tmp_path):
+    from pd4dgs_codec.codec.encoder import encode
+    from pd4dgs_codec.model import checkpoint
+    from pd4dgs_codec.model.convert import to_scene
+
+    output = tmp_path / "s.pd4"
+    result = cli("encode", model_pt, "-o", output, "--effort", 1, "--json")
+    assert result.code == 0 and result.err == ""
+    assert output.read_bytes() == encode(to_scene(checkpoint.load(model_pt)[0]), effort=1)
+    report = result.json
+    assert ENCODE_KEYS <= set(report) and report["verified"] is True
+    assert report["bytes"] == output.stat().st_size
+    assert [row["layer"] for row in report["layers"]] == [0, 1, 2]
+    for row in report["layers"]:
+        assert LAYER_KEYS <= set(row)
+        assert row["ratio"] == pytest.approx(row["payload_bits"] / row["rate_bits"])
+    rate = report["train_rate_bits_layers"]
+    assert [row["layer"] for row in rate] == [0, 1, 2]
+    assert report["train_rate_bits"] == pytest.approx(sum(row["bits"] for row in rate))
+    for row, train in zip(report["layers"], rate, strict=True):  # floats against their rounded values: close, not equal
+        assert train["bits"] == pytest.approx(row["rate_bits"], rel=0.1) and train["bits"] != row["rate_bits"]
+
+
+def test_encode_options_reach_the_codec(cli, model_pt, tmp_path):
+    def size(*options) -> tuple[int, dict]:
+        report = cli("encode", model_pt, "-o", tmp_path / "s.pd4", "-f", "--effort", 1, "--json", *options).json
+        return report["bytes"], report
+
+    plain, _ = size()
+    assert size("--step-scale", 3)[0] < plain
+    assert size("--mode", "lzma")[1]["mode"] == "lzma"
+    assert size("--mode", "lzma", "--deformation", "float32")[0] > plain
+    assert [row["layer"] for row in size("--layers", 1)[1]["layers"]] == [0, 1]
+    assert size("--no-verify")[1]["verified"] is False
+
+
+def test_encode_table_goes_to_stderr(cli, model_pt, tmp_path):
+    result = cli("encode", model_pt, "-o", tmp_path / "s.pd4", "--effort", 1)
+    assert result.code == 0 and result.out == b""
+    assert "first frame after" in result.err and "payload/ΣR" in result.err
+
+
+def test_pipes_and_repacking_give_the_same_file(cli, model_pt, scene_pd4):
+    piped = cli("encode", "-", "-o", "-", "--effort", 1, stdin=model_pt.read_bytes())
+    assert piped.code == 0 and piped.out == scene_pd4.read_bytes()
+    again = cli("encode", "-", "-o", "-", "--effort", 1, stdin=piped.out)
+    assert again.code == 0 and again.out == piped.out
+    summary = cli("decode", "-", "--json", stdin=piped.out)
+    assert summary.json["complete"] is True and summary.json["bytes"] == len(piped.out)
+
+
+def test_decode_npz_holds_the_decoded_arrays(cli, scene_pd4, tmp_path):
+    from pd4dgs_codec.codec.decoder import decode
+
+    output = tmp_path / "s.npz"
+    assert cli("decode", scene_pd4, "-o", output, "--max-layer", 1, "--symbols").code == 0
+    scene, arrays = decode(scene_pd4.read_bytes(), max_layer=1), np.load(output)
+    assert np.array_equal(arrays["anchor"], scene.anchor)
+    assert np.array_equal(arrays["feature"], scene.feature)
+    assert "mask_1" in arrays and "mask_2" not in arrays
+    exact = arrays["feature_q"].astype(np.float64) * np.float64(arrays["feature_step"])
+    assert np.array_equal(exact.astype(np.float32), scene.feature)
+    piped = cli("decode", scene_pd4, "-o", "-", "--max-layer", 1, "--symbols")
+    assert piped.out == output.read_bytes()
+
+
+def test_decoded_checkpoint_encodes_to_the_same_symbols(cli, scene_pd4, tmp_path):
+    checkpoint, again = tmp_path / "d.pt", tmp_path / "again.pd4"
+    assert cli("decode", scene_pd4, "-o", checkpoint).code == 0
+    assert cli("encode", checkpoint, "-o", again, "--effort", 1).code == 0
+    first, second = (cli("info", path, "--hashes", "--json").json["hashes"] for path in (scene_pd4, again))
+    assert [row["symbols"] for row in first] == [row["symbols"] for row in second]
+
+
+def test_decode_without_output_prints_a_summary(cli, scene_pd4):
+    result = cli("decode", scene_pd4)
+    assert result.code == 0 and result.err == ""
+    assert b"whole and valid" in result.out
+
+
+def test_partial_input_exits_3_only_when_allowed(cli, scene_pd4, tmp_path):
+    data = scene_pd4.read_bytes()
+    ends = [row["end"] for row in cli("info", scene_pd4, "--json").json["layers"]]
+    cut = data[: ends[1] + 5]
+    refused = cli("decode", "-", "--json", stdin=cut)
+    assert refused.code == 1 and refused.json["error"]["type"] == "Truncated"
+    partial = cli("decode", "-", "--allow-partial", "--json", "-o", tmp_path / "p.npz", stdin=cut)
+    assert partial.code == 3 and partial.json["complete"] is False
+    assert [row["layer"] for row in partial.json["layers"]] == [0, 1]
+    assert "mask_1" in np.load(tmp_path / "p.npz")
+    assert cli("decode", "-", "--allow-partial", stdin=data).code == 0
+    assert cli("decode", "-", "--allow-partial", "--max-layer", 1, stdin=cut).code == 0
+    assert cli("decode", "-", "--allow-partial", stdin=data[: ends[0] - 1]).code == 1
+
+
+def test_info_states_layers_and_first_frame(cli, scene_pd4):
+    result = cli("info", scene_pd4, "--json", "--check", "--at", "500k,2M,1e9")
+    report, size = result.json, scene_pd4.stat().st_size
+    assert report["format_version"] == "1.0" and report["bytes"] == size and report["checked"] is True
+    assert report["layers"][-1]["end"] == size
+    end = report["layers"][0]["end"]
+    assert report["first_frame_seconds"] == {"500k": 8 * end / 5e5, "2M": 8 * end / 2e6, "1e9": 8 * end / 1e9}
+    text = cli("info", scene_pd4).out.decode()
+    assert "first frame" in text and f"{size:,} bytes" in text
+
+
+def test_info_names_what_is_left_out(cli, model_pt, tmp_path):
+    output = tmp_path / "s.pd4"
+    assert cli("encode", model_pt, "-o", output, "--layers", 1, "--effort", 1).code == 0
+    assert [row["what"] for row in cli("info", output, "--json").json["left_out"]] == ["layer 2"]
+
+
+def test_existing_output_needs_overwrite(cli, scene_pd4, tmp_path):
+    output = tmp_path / "s.npz"
+    output.write_bytes(b"precious")
+    refused = cli("decode", scene_pd4, "-o", output)
+    assert refused.code == 1 and output.read_bytes() == b"precious"
+    assert cli("decode", scene_pd4, "-o", output, "-f").code == 0
+    assert output.read_bytes() != b"precious"
+
+
+def test_output_through_a_symbolic_link_keeps_the_link(cli, scene_pd4, tmp_path):
+    real, link = tmp_path / "real.npz", tmp_path / "link.npz"
+    real.write_bytes(b"old")
+    link.symlink_to(real)
+    assert cli("decode", scene_pd4, "-o", link, "-f").code == 0
+    assert link.is_symlink() and real.read_bytes() != b"old"
+
+
+def test_a_device_is_written_to_and_not_replaced(cli, model_pt):
+    assert cli("encode", model_pt, "-o", os.devnull, "-f", "--effort", 1).code == 0
+    assert not os.path.isfile(os.devnull)
+
+
+def test_decoding_runs_where_torch_and_numba_cannot_be_imported(scene_pd4):
+    program = (
+        "import sys; sys.modules['torch'] = sys.modules['numba'] = None\n"
+        "from pd4dgs_codec.__main__ import main\n"
+        f"sys.exit(main(['decode', {str(scene_pd4)!r}, '--json']) or main(['info', {str(scene_pd4)!r}]))"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout.splitlines()[0])["complete"] is True

@@ -1,0 +1,111 @@
+"""render and eval."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+Image = pytest.importorskip("PIL.Image")
+
+WIDTH, HEIGHT = 32, 24  # of the scene's camera and of the dataset's pictures
+
+
+def test_eval_states_quality_and_bytes_per_level(cli, scene_pd4, shared_dataset):
+    result = cli("eval", scene_pd4, shared_dataset, "--json")
+    assert result.code == 0
+    report = result.json
+    assert report["masked"] is False and report["split"] == "test" and report["views"] == 1
+    assert isinstance(report["baseline_mean_image_psnr"], float)
+    ends = [row["end"] for row in cli("info", scene_pd4, "--json").json["layers"]]
+    assert [row["cumulative_bytes"] for row in report["levels"]] == ends
+    assert [row["anchors"] for row in report["levels"]] == [40, 50, 60]
+    for row in report["levels"]:
+        assert 0 < row["mpsnr"] < 60 and -1 <= row["mssim"] <= 1 and row["decode_seconds"] > 0
+
+
+def test_eval_averages_the_views_of_each_levels_own_prefix(scene_pd4, shared_dataset):
+    from pd4dgs_codec.codec.decoder import decode
+    from pd4dgs_codec.codec.info import info
+    from pd4dgs_codec.data.dataset import load
+    from pd4dgs_codec.metrics.image import mpsnr
+    from pd4dgs_codec.model.convert import from_scene
+    from pd4dgs_codec.render.picture import render_image
+    from pd4dgs_codec.report.evaluate import evaluate_file
+
+    data, dataset = scene_pd4.read_bytes(), load(str(shared_dataset), holdout=2)
+    end = info(data)["layers"][1]["end"]
+    rows = evaluate_file(data[:end], dataset, 1)["levels"]
+    model = from_scene(decode(data, max_layer=1))
+    images = [render_image(model, 1, v.time, v.viewmat, v.K, v.width, v.height) for v in dataset.test]
+    expected = np.mean([mpsnr(image, v.image, v.mask) for image, v in zip(images, dataset.test, strict=True)])
+    assert len(images) == 3 and [row["level"] for row in rows] == [0, 1]
+    assert rows[1]["mpsnr"] == pytest.approx(expected, abs=1e-9)
+
+
+def test_eval_of_checkpoint_and_pipe(cli, model_pt, scene_pd4, shared_dataset):
+    levels = cli("eval", model_pt, shared_dataset, "--json").json["levels"]
+    assert [row["cumulative_bytes"] for row in levels] == [None] * 3
+    piped = cli("eval", "-", shared_dataset, "--json", "--max-layer", 1, stdin=scene_pd4.read_bytes()).json["levels"]
+    assert [row["level"] for row in piped] == [0, 1]
+    # what quantisation may cost on this scene
+    assert piped[1]["mpsnr"] == pytest.approx(levels[1]["mpsnr"], abs=0.5)
+
+
+def test_eval_without_held_out_views_says_so(cli, scene_pd4, shared_dataset):
+    result = cli("eval", scene_pd4, shared_dataset, "--holdout", 0, "--max-layer", 0)
+    assert result.code == 0 and "training views" in result.err and b"6 training views" in result.out
+
+
+def test_render_dataset_views_as_the_renderer_sees_them(cli, scene_pd4, shared_dataset, tmp_path):
+    from pd4dgs_codec.data.dataset import load
+    from pd4dgs_codec.metrics.image import to_uint8
+    from pd4dgs_codec.render.picture import render_image
+    from pd4dgs_codec.report.levels import load_levels
+
+    options = ("--data", shared_dataset, "--split", "train", "--max-layer", 1, "--json")
+    result = cli("render", scene_pd4, "-o", tmp_path / "out" / "%02d.png", *options)
+    assert result.code == 0 and result.json["frames"] == 5 and result.json["levels"] == [1]
+    view = load(str(shared_dataset)).train[2]
+    level = load_levels(scene_pd4, 1)[-1]
+    expected = to_uint8(render_image(level.model, 1, view.time, view.viewmat, view.K, view.width, view.height))
+    assert np.array_equal(np.asarray(Image.open(tmp_path / "out" / "02.png")), expected)
+    assert len(list((tmp_path / "out").iterdir())) == 5
+
+
+def test_render_own_camera_to_gif_and_one_picture(cli, scene_pd4, tmp_path):
+    assert cli("render", scene_pd4, "-o", tmp_path / "a.gif", "--frames", 5, "--orbit", 60).code == 0
+    movie = Image.open(tmp_path / "a.gif")
+    assert movie.n_frames == 5 and movie.size == (WIDTH, HEIGHT)
+    assert cli("render", scene_pd4, "-o", tmp_path / "a.png", "--frames", 1, "--downscale", 2).code == 0
+    assert Image.open(tmp_path / "a.png").size == (WIDTH // 2, HEIGHT // 2)
+    refused = cli("render", scene_pd4, "-o", tmp_path / "b.png", "--frames", 2)
+    assert refused.code == 2 and not (tmp_path / "b.png").exists()
+
+
+def test_side_by_side_holds_all_levels_and_the_truth(cli, scene_pd4, shared_dataset, tmp_path):
+    options = ("--data", shared_dataset, "--side-by-side", "--json")
+    report = cli("render", scene_pd4, "-o", tmp_path / "%d.png", *options).json
+    assert report["levels"] == [0, 1, 2] and report["outputs"] == 1
+    sheet = np.asarray(Image.open(tmp_path / "0.png"))
+    truth = np.asarray(Image.open(shared_dataset / "004.png"))
+    assert np.array_equal(sheet[-HEIGHT:, -WIDTH:], truth)
+    assert sheet.shape[1] == 4 * WIDTH + 3 * 4
+
+
+def test_render_mp4(cli, scene_pd4, tmp_path):
+    imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+    assert cli("render", scene_pd4, "-o", tmp_path / "a.mp4", "--frames", 7, "--fps", 10).code == 0
+    frames, seconds = imageio_ffmpeg.count_frames_and_secs(str(tmp_path / "a.mp4"))
+    assert frames == 7 and seconds == pytest.approx(0.7, abs=0.11)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.mp4"]
+
+
+def test_mp4_without_ffmpeg_is_said_before_rendering(cli, scene_pd4, tmp_path, monkeypatch):
+    def absent():
+        raise RuntimeError("No ffmpeg exe could be found")
+
+    pytest.importorskip("imageio_ffmpeg")
+    monkeypatch.setattr("imageio_ffmpeg.get_ffmpeg_exe", absent)
+    result = cli("render", scene_pd4, "-o", tmp_path / "a.mp4")
+    assert result.code == 1 and "imageio-ffmpeg" in result.err and list(tmp_path.iterdir()) == []

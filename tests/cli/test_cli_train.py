@@ -1,0 +1,161 @@
+"""train: what it writes, how it ends and how it goes on."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+torch = pytest.importorskip("torch")
+
+from pd4dgs_codec.model import checkpoint  # noqa: E402
+from pd4dgs_codec.model.config import PRESETS, DeformationConfig, ModelConfig  # noqa: E402
+from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS  # noqa: E402
+
+
+@pytest.fixture(autouse=True)
+def _small_preset(monkeypatch):
+    """A preset that takes milliseconds a step."""
+    fields = (DeformationConfig(4, 4, 4, (1,), 8, tuple(heads)) for heads in (GLOBAL_HEADS, LOCAL_HEADS))
+    monkeypatch.setitem(PRESETS, "tiny", ModelConfig(*fields, hidden=8, initial_anchors=150, max_anchors=300))
+
+
+@pytest.fixture
+def train(cli, shared_dataset):
+    def call(output, *options, iterations=4):
+        limit = ("--iterations", iterations) if iterations else ()
+        return cli("train", shared_dataset, "-o", output, "--preset", "tiny", "-j", 1, *limit, *options)
+
+    return call
+
+
+def _state(path) -> dict:
+    return checkpoint.load(path)[0].state_dict()
+
+
+def _same(a: dict, b: dict) -> bool:
+    return a.keys() == b.keys() and all(torch.equal(a[k], b[k]) for k in a)
+
+
+def test_train_reports_and_logs(train, tmp_path, shared_dataset):
+    output, log = tmp_path / "m.pt", tmp_path / "run.jsonl"
+    result = train(output, "--json", "--log", log)
+    assert result.code == 0
+    report = result.json
+    assert report["iterations"] == report["total"] == 4 and report["finished"] is True
+    assert report["phases_not_reached"] == [] and [row["level"] for row in report["levels"]] == [0, 1, 2]
+    assert len([json.loads(line) for line in log.read_text().splitlines()]) == 4
+    training = checkpoint.load(output)[1]
+    config = json.loads(training["config"])
+    assert config["source"] == str(shared_dataset) and config["downscale"] == 1 and config["holdout"] == 8
+
+
+def test_options_reach_the_configuration(train, tmp_path):
+    options = ("--seed", 7, "--downscale", 2, "--holdout", 3, "--rate-scale", 0.5, "--no-noise", "--rollout", "fixed")
+    assert train(tmp_path / "m.pt", *options, iterations=1).code == 0
+    config = json.loads(checkpoint.load(tmp_path / "m.pt")[1]["config"])
+    found = [config[k] for k in ("seed", "downscale", "holdout", "rate_scale", "noise", "rollout", "preset")]
+    assert found == [7, 2, 3, 0.5, False, "fixed", "tiny"]
+
+
+def test_seed_decides_the_result(train, tmp_path):
+    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
+        assert train(tmp_path / f"{name}.pt", "--seed", seed, iterations=2).code == 0
+    a, b, c = (_state(tmp_path / f"{name}.pt") for name in "abc")
+    assert _same(a, b) and not _same(a, c)
+
+
+def test_interrupted_and_resumed_run_repeats_the_uninterrupted_one(train, tmp_path, monkeypatch):
+    from pd4dgs_codec.train.loop import Trainer
+
+    assert train(tmp_path / "whole.pt", iterations=8).code == 0
+    step = Trainer.step
+
+    def interrupted(self):
+        if self.iteration == 3:
+            raise KeyboardInterrupt
+        return step(self)
+
+    monkeypatch.setattr(Trainer, "step", interrupted)
+    cut = train(tmp_path / "cut.pt", iterations=8)
+    assert cut.code == 0 and "3 of 8 steps" in cut.err
+    assert "never reached: " in cut.err and "rounding" in cut.err and "--resume" in cut.err
+    monkeypatch.setattr(Trainer, "step", step)
+    assert train(tmp_path / "cut.pt", "--resume", tmp_path / "cut.pt", iterations=None).code == 0
+    assert _same(_state(tmp_path / "whole.pt"), _state(tmp_path / "cut.pt"))
+
+
+def test_resume_refuses_what_contradicts_the_checkpoint(cli, train, tmp_path, shared_dataset):
+    first = tmp_path / "m.pt"
+    assert train(first, iterations=2).code == 0
+    before = first.read_bytes()
+    contradictions = {
+        "--seed": ("--seed", 5),
+        "--downscale": ("--downscale", 2),
+        "--holdout": ("--holdout", 0),
+        "--iterations": ("--iterations", 9),
+        "--preset": ("--preset", "small"),
+        "noise": ("--no-noise",),
+    }
+    for what, options in contradictions.items():
+        result = cli("train", shared_dataset, "-o", first, "--resume", first, *options)
+        assert result.code == 1 and what in result.err and len(result.error_lines) == 1
+    result = cli("train", "synthetic:static", "-o", first, "--resume", first)
+    assert result.code == 1 and "synthetic:static" in result.err
+    assert first.read_bytes() == before
+
+
+def test_resume_into_another_file_needs_a_free_name(cli, train, tmp_path, shared_dataset):
+    first, second = tmp_path / "m.pt", tmp_path / "n.pt"
+    assert train(first, iterations=2).code == 0
+    second.write_bytes(b"precious")
+    assert cli("train", shared_dataset, "-o", second, "--resume", first).code == 1
+    assert second.read_bytes() == b"precious"
+
+
+def test_resume_needs_training_state(cli, model_pt, shared_dataset, tmp_path):
+    result = cli("train", shared_dataset, "-o", tmp_path / "n.pt", "--resume", model_pt)
+    assert result.code == 1 and "no training state" in result.err
+
+
+def test_time_limit_ends_cleanly_and_must_grow_on_resume(cli, train, tmp_path, shared_dataset, monkeypatch):
+    from pd4dgs_codec.train.loop import Trainer
+
+    slow = iter(range(1000))
+    step = Trainer.step
+
+    def late(self):
+        record = step(self)
+        if next(slow) == 2:
+            monkeypatch.setattr("pd4dgs_codec.train.loop.time.monotonic", lambda: 1e9)
+        return record
+
+    monkeypatch.setattr(Trainer, "step", late)
+    first = tmp_path / "m.pt"
+    result = train(first, "--max-seconds", 1000, "--json", iterations=50)
+    monkeypatch.undo()
+    report = result.json
+    assert result.code == 0 and report["iterations"] == 3 and report["finished"] is False
+    assert "rate and mask terms" in report["phases_not_reached"]
+    refused = cli("train", shared_dataset, "-o", first, "--resume", first)
+    assert refused.code == 1 and "larger --max-seconds" in refused.err
+
+
+def test_existing_log_is_kept_unless_overwritten(train, tmp_path):
+    log = tmp_path / "run.jsonl"
+    log.write_text("precious\n")
+    assert train(tmp_path / "m.pt", "--log", log).code == 1
+    assert log.read_text() == "precious\n" and not (tmp_path / "m.pt").exists()
+    assert train(tmp_path / "m.pt", "--log", log, "-f", iterations=2).code == 0
+    assert len(log.read_text().splitlines()) == 2
+
+
+def test_no_held_out_frames_is_said(train, tmp_path):
+    result = train(tmp_path / "m.pt", "--holdout", 0, iterations=2)
+    assert result.code == 0 and "none held out" in result.err and "training-view PSNR" in result.err
+
+
+def test_cuda_that_is_absent_is_refused(train, tmp_path, monkeypatch):
+    monkeypatch.setattr("torch.cuda.is_available", lambda: False)
+    result = train(tmp_path / "m.pt", "--device", "cuda")
+    assert result.code == 1 and "--device cpu" in result.err
