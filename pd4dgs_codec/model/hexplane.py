@@ -18,7 +18,7 @@ from torch.autograd.function import once_differentiable
 
 from pd4dgs_codec.errors import DataError, TrainError
 from pd4dgs_codec.model import hexplane_kernels as kernels
-from pd4dgs_codec.model.plane_layout import PlaneLayout
+from pd4dgs_codec.model.plane_layout import TIME_AXIS, PlaneLayout
 from pd4dgs_codec.model.plane_regularisers import regularisers
 from pd4dgs_codec.model.simd import LANES
 from pd4dgs_codec.scene import PLANES
@@ -96,8 +96,9 @@ class HexPlane(nn.Module):
 
     box: [2, 3] lower and upper corner, scene units; points are normalised by it and clamped to it.
     resolution: cells along x, y, z, t of the base scale, each >= 1. multires: factor on x, y, z per scale.
-    The parameter `grid` is [cells, C]; `layout` says which cells are which plane. Start values: spatial planes
-    U(0.1, 0.5), time planes 1.
+    The parameter `grid` is [cells, C]; `layout` says which cells are which plane. Start values: each channel of a
+    spatial plane one draw of U(0.1, 0.5), time planes 1. (One draw per channel, not per cell as in the public code: cells that no anchor
+    reaches keep their start value, and noise there would cost bits.)
     """
 
     def __init__(
@@ -118,7 +119,10 @@ class HexPlane(nn.Module):
         x, y, z, t = (int(r) for r in resolution)
         self._setup(box, [(x * m, y * m, z * m, t) for m in map(int, multires)], int(channels))
         with torch.no_grad():
-            self.grid[: self.layout.n_spatial].uniform_(0.1, 0.5, generator=generator)
+            for scale in self.layout.views(self.grid):
+                for name, _, b in PLANES:
+                    if b != TIME_AXIS:
+                        scale[name].copy_(torch.empty(channels).uniform_(0.1, 0.5, generator=generator))
 
     def _setup(self, box, resolutions: Sequence[Sequence[int]], channels: int) -> None:
         corners = torch.as_tensor(np.array(box, np.float32))

@@ -17,11 +17,13 @@ from torch import Tensor, nn
 from torch.nn import functional as F
 
 from pd4dgs_codec.model.deformation import DeformationField
-from pd4dgs_codec.model.layers import MLP, level_mask
+from pd4dgs_codec.model.layers import MLP, level_mask, round_straight_through
 from pd4dgs_codec.scene import FEATURE_DIM, MASK_THRESHOLD, N_OFFSETS, SCAFFOLD_NETWORKS, SceneInfo, Steps
 
 #: A Gaussian fainter than this never reaches a pixel (the rasteriser's threshold), so its networks are not evaluated.
 MIN_OPACITY = 1.0 / 255.0
+#: Every Gaussian starts about this opaque.
+START_OPACITY = 0.1
 #: Anchors farther outside the image than this share of its size (plus their own extent) are not evaluated.
 FRUSTUM_MARGIN = 0.15
 
@@ -45,9 +47,11 @@ class Noise:
 
 @dataclass(frozen=True)
 class Rounding:
-    """How a training step imitates quantisation: uniform noise on the anchors' attributes, rounding of planes, weights."""
+    """How a training step imitates quantisation: uniform noise on the anchors' attributes, or rounding of them; rounding
+    of planes and weights. Rounding is straight-through."""
 
     noise: Noise | None = None
+    attributes: bool = False
     weights: bool = False
 
 
@@ -220,10 +224,14 @@ class Model(nn.Module):
 
     def _attribute(self, values: Tensor, rows: Tensor, step: float, rounding: Rounding) -> Tensor:
         picked = values.index_select(0, rows)
+        if rounding.attributes:
+            return round_straight_through(picked, step)
         return picked if rounding.noise is None else picked + rounding.noise.draw(picked.shape) * step
 
 
 def fresh_networks(hidden: int) -> dict[str, MLP]:
     """The scaffold's decoders, untrained: input [feature 32, view direction 3]."""
     width = FEATURE_DIM + 3
-    return {name: MLP((width, hidden, outputs)) for name, outputs in SCAFFOLD_NETWORKS.items()}
+    networks = {name: MLP((width, hidden, outputs)) for name, outputs in SCAFFOLD_NETWORKS.items()}
+    nn.init.constant_(networks["opacity"].linears[-1].bias, START_OPACITY)  # else chance decides what is ever seen
+    return networks

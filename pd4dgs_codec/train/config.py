@@ -47,7 +47,7 @@ class TrainConfig:
     max_seconds: float | None = None
     seed: int = 0
     lambdas: tuple[float, float, float] = (0.04, 0.01, 0.00025)  #: rate weight per level
-    rate_scale: float = 0.1  #: multiplies every lambda; 1 is the paper's operating point
+    rate_scale: float = 0.3  #: multiplies every lambda; 1 is the paper's operating point
     rate_share: float = 0.05  #: share of the anchors on which a step estimates the rate
     tmc: float = 0.01
     tmc_binary: bool = True
@@ -60,8 +60,8 @@ class TrainConfig:
     grow_threshold: float = 2e-4
     steps: Steps = field(default_factory=Steps)
     rates: LearningRates = field(default_factory=LearningRates)
-    global_planes: PlaneWeights = PlaneWeights(1e-4, 5e-4, 5e-5)
-    local_planes: PlaneWeights = PlaneWeights(2e-4, 1e-3, 1e-4)
+    global_planes: PlaneWeights = PlaneWeights(1e-3, 5e-3, 5e-5)
+    local_planes: PlaneWeights = PlaneWeights(2e-3, 1e-2, 1e-4)
     max_gradient_norm: float = 100.0
 
     def __post_init__(self) -> None:
@@ -118,7 +118,12 @@ class Schedule:
     @property
     def rounding(self) -> int:
         """Planes and weights are rounded straight-through from here on."""
-        return self._at(4 / 5)
+        return self._at(1 / 2)
+
+    @property
+    def exact_rounding(self) -> int:
+        """The anchors' attributes are rounded straight-through from here on, where noise imitated it before."""
+        return self._at(9 / 10)
 
     def phases_not_reached(self, iteration: int) -> list[str]:
         """Names of the phases that a run cut after `iteration` iterations never entered."""

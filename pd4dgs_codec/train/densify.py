@@ -14,8 +14,11 @@ from pd4dgs_codec.train.optimiser import Optimiser
 
 #: Cell sizes of the growing levels, in voxels, coarse to fine; the gradient threshold doubles from one to the next.
 CELLS = (16, 4, 1)
-#: An anchor is pruned when its mean summed opacity per visit is below this.
+#: An anchor is pruned when its mean summed opacity per visit is below this ...
 MIN_MEAN_OPACITY = 0.005
+#: ... over at least so many visits; a Gaussian's pull is judged after at least so many.
+MIN_ANCHOR_VISITS = 40
+MIN_SLOT_VISITS = 10
 
 
 class Densifier:
@@ -23,11 +26,9 @@ class Densifier:
 
     def __init__(self, model: Model, threshold: float, max_anchors: int):
         self.threshold, self.max_anchors = threshold, max_anchors
-        self._reset(len(model.anchor_q))
-
-    def _reset(self, n: int) -> None:
-        self.pull = torch.zeros(n * N_OFFSETS)
-        self.visits = torch.zeros(n * N_OFFSETS)
+        n = len(model.anchor_q)
+        self.pull = torch.zeros(n, N_OFFSETS)
+        self.visits = torch.zeros(n, N_OFFSETS)
         self.opacity = torch.zeros(n)
         self.anchor_visits = torch.zeros(n)
 
@@ -37,17 +38,17 @@ class Densifier:
         scale = means2d_grad.new_tensor([0.5 * width, 0.5 * height])  # the threshold is in normalised image units
         pull = (means2d_grad * scale).norm(dim=1)
         slots = gaussians.slots[drawn].cpu()
-        self.pull.index_add_(0, slots, pull[drawn].cpu())
-        self.visits.index_add_(0, slots, torch.ones(len(slots)))
+        self.pull.view(-1).index_add_(0, slots, pull[drawn].cpu())
+        self.visits.view(-1).index_add_(0, slots, torch.ones(len(slots)))
         rows = gaussians.anchors.cpu()
         self.opacity.index_add_(0, rows, gaussians.raw_opacity.clamp(min=0).sum(1).cpu())
         self.anchor_visits.index_add_(0, rows, torch.ones(len(rows)))
 
     @torch.no_grad()
     def adjust(self, model: Model, optimiser: Optimiser, generator: torch.Generator, *, grow: bool) -> tuple[int, int]:
-        """Prunes and (if `grow`) grows; forgets the statistics. Returns (pruned, grown)."""
+        """Prunes and (if `grow`) grows; forgets the statistics that were judged. Returns (pruned, grown)."""
         masks = model.masks(2).cpu()
-        visited = self.anchor_visits > 4
+        visited = self.anchor_visits >= MIN_ANCHOR_VISITS
         faint = visited & (self.opacity < MIN_MEAN_OPACITY * self.anchor_visits)
         keep = (~faint & (masks > MASK_THRESHOLD)).nonzero()[:, 0]
         if len(keep) == 0:  # nothing shows yet: better a bad model than none
@@ -74,13 +75,22 @@ class Densifier:
                 "mask_logits": mask_logits.to(device),
             },
         )
-        self._reset(len(model.anchor_q))
+        self._forget_judged(visited, keep, n)
         return pruned, n
+
+    def _forget_judged(self, visited: Tensor, keep: Tensor, added: int) -> None:
+        self.opacity[visited] = 0
+        self.anchor_visits[visited] = 0
+        judged = self.visits >= MIN_SLOT_VISITS
+        self.pull[judged] = 0
+        self.visits[judged] = 0
+        for name, value in self.state().items():
+            setattr(self, name, torch.cat([value[keep], value.new_zeros(added, *value.shape[1:])]))
 
     def _new_cells(self, model: Model, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """(int64 [n, 4] voxel cell and cell size, float [n, 32] feature) of free cells that are pulled at, strongest first."""
-        mean_pull = self.pull / self.visits.clamp(min=1)
-        seen = self.visits >= 0.4 * self.visits.max().clamp(min=1)
+        mean_pull = (self.pull / self.visits.clamp(min=1)).flatten()
+        seen = self.visits.flatten() >= MIN_SLOT_VISITS
         anchor_q, scaling = model.anchor_q.cpu(), model.scaling_log.detach().cpu().exp()
         feature, offset = model.feature.detach().cpu(), model.offset.detach().cpu()
         low, high = (torch.from_numpy(model.info.box[i]).double() / model.info.voxel_size for i in (0, 1))

@@ -17,6 +17,9 @@ from pd4dgs_codec.scene import FEATURE_DIM, GLOBAL_HEADS, LOCAL_HEADS, N_OFFSETS
 #: Voxels along the longest side of the scene's box.
 GRID = 1024
 MASK_START = 2.0
+#: Random candidates per initial point, and the training views that judge them, where a dataset has no points.
+CARVE_CANDIDATES = 20
+CARVE_VIEWS = 40
 
 
 def fresh_model(config: ModelConfig, dataset: Dataset, steps: Steps, seed: int) -> Model:
@@ -65,8 +68,7 @@ def scene_info(dataset: Dataset) -> SceneInfo:
 def initial_cells(dataset: Dataset, count: int, voxel_size: float, generator: torch.Generator) -> Tensor:
     """int32 [n, 3] unique voxel cells, about `count` of them."""
     if dataset.points is None or len(dataset.points) == 0:
-        low, high = (torch.from_numpy(np.asarray(dataset.box[i], np.float32)) for i in (0, 1))
-        points = low + (high - low) * torch.rand(count, 3, generator=generator)
+        points = carved_points(dataset, count, generator)
         return torch.unique(torch.round(points / voxel_size).to(torch.int32), dim=0)
     points = torch.from_numpy(np.asarray(dataset.points, np.float32))
     low, high = (torch.from_numpy(np.asarray(dataset.box[i], np.float32)) for i in (0, 1))
@@ -80,6 +82,30 @@ def initial_cells(dataset: Dataset, count: int, voxel_size: float, generator: to
         jitter = torch.randn(len(pick), 3, generator=generator) * spacing[pick, None]
         points = torch.cat([points, points[pick] + jitter])
     return torch.unique(torch.round(points / voxel_size).to(torch.int32), dim=0)
+
+
+def carved_points(dataset: Dataset, count: int, generator: torch.Generator) -> Tensor:
+    """float32 [count, 3] random points of the box, the more likely the more training views see something there.
+
+    A view sees something where its pixel differs from the constant background; without such a background, or outside
+    every view, all points are alike.
+    """
+    low, high = (torch.from_numpy(np.asarray(dataset.box[i], np.float32)) for i in (0, 1))
+    points = low + (high - low) * torch.rand(CARVE_CANDIDATES * count, 3, generator=generator)
+    background = torch.tensor(dataset.background) * 255
+    seen, hits = torch.zeros(len(points)), torch.zeros(len(points))
+    views = dataset.train[:: max(1, len(dataset.train) // CARVE_VIEWS)]
+    for view in views:
+        viewmat, K = (torch.from_numpy(np.array(m, np.float32)) for m in (view.viewmat, view.K))
+        camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]
+        pixel = (camera[:, :2] / camera[:, 2:].clamp(min=1e-6) * K[[0, 1], [0, 1]] + K[:2, 2]).floor().long()
+        inside = (camera[:, 2] > 0) & (pixel >= 0).all(1) & (pixel[:, 0] < view.width) & (pixel[:, 1] < view.height)
+        something = (torch.from_numpy(view.image).float() - background).abs().amax(2) > 8
+        x, y = pixel[inside].T
+        seen[inside] += 1
+        hits[inside] += something[y, x].float()
+    share = (hits + 1e-3) / (seen + 1)  # few views say little
+    return points[torch.multinomial(share.square(), count, generator=generator)]
 
 
 def nearest_distances(points: Tensor, k: int = 3) -> Tensor:

@@ -106,10 +106,7 @@ class Trainer:
         schedule = Schedule(self.total or 10**9)
         index = self._next_view()
         level, probabilities = self._draw_level(schedule)
-        rounding = Rounding(
-            noise=self.noise if self.config.noise and self.iteration >= schedule.coarse_end else None,
-            weights=self.iteration >= schedule.rounding,
-        )
+        rounding = self._rounding(schedule)
         record: dict[str, Any] = {"iteration": self.iteration, "level": level}
         if not self._learn(index, level, schedule, rounding, record):
             self.skipped += 1
@@ -212,6 +209,11 @@ class Trainer:
             self.neighbours = None
             record |= {"pruned": pruned, "grown": grown}
 
+    def _rounding(self, schedule: Schedule) -> Rounding:
+        exact = self.iteration >= schedule.exact_rounding and self.config.noise
+        noisy = self.iteration >= schedule.coarse_end and self.config.noise and not exact
+        return Rounding(self.noise if noisy else None, attributes=exact, weights=self.iteration >= schedule.rounding)
+
     def _draw_level(self, schedule: Schedule) -> tuple[int, tuple[float, float, float]]:
         if self.iteration < schedule.coarse_end:
             return 0, (1.0, 0.0, 0.0)
@@ -278,7 +280,7 @@ class Trainer:
         views = self.dataset.test or self.dataset.train
         views = views[:: max(1, len(views) // CURVE_VIEWS)][:CURVE_VIEWS]
         psnr = []
-        rounding = Rounding(weights=self.iteration > Schedule(self.total).rounding)
+        rounding = replace(self._rounding(Schedule(self.total)), noise=None)
         for level in range(self.model.level + 1):
             images = (
                 render_image(self.model, level, v.time, v.viewmat, v.K, v.width, v.height, rounding) for v in views
