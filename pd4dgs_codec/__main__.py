@@ -13,9 +13,6 @@ VERBS = {
     "info": "show the header and the layers of a .pd4 file",
     "render": "render a file to pictures or a video",
     "eval": "measure each level of a file against a dataset",
-    "bench": "measure speed, stability and delivery",
-    "package": "prepare a .pd4 file for streaming",
-    "serve": "stream a package over HTTP at a given rate",
 }
 
 

@@ -83,11 +83,11 @@ class Deformation:
 class Steps:
     """Quantisation steps Q, each a positive normal binary32: x_hat = k * Q."""
 
-    feature: float = 0.05
-    scaling_log: float = 0.02
+    feature: float = 0.025
+    scaling_log: float = 0.03
     offset: float = 0.05
-    planes_global: float = 0.05
-    planes_local: float = 0.05
+    planes_global: float = 0.02
+    planes_local: float = 0.03
     weights_scaffold: float = 0.005
     weights_global: float = 0.005
     weights_local: float = 0.005

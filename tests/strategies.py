@@ -26,7 +26,7 @@ from pd4dgs_codec.scene import (
     Steps,
 )
 
-HUGE = (1 << 24) - 1
+HUGE = 1 << 23
 LAYER_SETS = ((0,), (0, 1), (0, 2), (0, 1, 2))
 #: How symbols are drawn: all equal, a few small ones, Gaussian, or spread over the whole range the format allows.
 RANGES = ("constant", "small", "gaussian", "huge")

@@ -7,8 +7,9 @@ import numpy as np
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.scene import MASK_MIN_CODE, MASK_THRESHOLD
 
-#: Symbols k satisfy |k| <= MAX_SYMBOL, so that binary64(k) * binary64(Q) is exact (24 + 24 bits of significand).
-MAX_SYMBOL = (1 << 24) - 1
+#: Symbols k satisfy |k| <= MAX_SYMBOL: binary64(k) * binary64(Q) is exact, and no two symbols of one step share a
+#: binary32 value, so that quantising what was dequantised gives the same symbol.
+MAX_SYMBOL = 1 << 23
 
 _SMALLEST_STEP = float(np.finfo(np.float32).tiny)
 _LARGEST_STEP = float(np.finfo(np.float32).max)

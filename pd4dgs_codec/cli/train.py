@@ -119,12 +119,8 @@ def _train(args: argparse.Namespace, console: Console) -> int:
         f"training {config.preset} on {len(dataset.train)} views ({held_out}), {trainer.device}{limit}{start}"
     )
     console.detail(f"{config}")
-    progress = TrainingProgress()
-    try:
-        with _terminate_as_interrupt():
-            trainer.run(Path(args.output), log=Path(args.log) if args.log else None, progress=progress)
-    finally:
-        progress.close()
+    with _terminate_as_interrupt():
+        trainer.run(Path(args.output), log=Path(args.log) if args.log else None, progress=TrainingProgress())
     result = _summary(args, trainer)
     console.result(result, _text(result), on_stdout=False)
     return OK

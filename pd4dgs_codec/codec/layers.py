@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pd4dgs_codec.attributes import planes as decorrelation
+from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
 from pd4dgs_codec.attributes.table import N_CHANNELS
 from pd4dgs_codec.bitstream.limits import MAX_VOXEL
 from pd4dgs_codec.codec.kinds import LayerKind
@@ -155,6 +156,9 @@ def read_layer(payload: bytes | memoryview, kind: LayerKind, rows_before: int, m
     _check_ranges(kind, anchor_q, increase, own)
     planes, networks = _shape_tensors(meta, tensors)
     attributes = np.stack(channels[Section.ATTRIBUTES])
+    for tensor in (attributes, *tensors):
+        if tensor.dtype.kind == "i" and tensor.size and max(int(tensor.max()), -int(tensor.min())) > MAX_SYMBOL:
+            raise Malformed(f"layer {kind.layer}: a symbol over {MAX_SYMBOL} in magnitude")
     return LayerSymbols(kind, anchor_q, increase, own, attributes, planes, networks, meta.steps, raw)
 
 

@@ -59,6 +59,9 @@ def save(path: str | Path, model: Model, training: dict[str, Any] | None = None)
     try:
         with os.fdopen(handle, "wb") as stream:
             torch.save(content, stream)
+        umask = os.umask(0)
+        os.umask(umask)
+        os.chmod(temporary, 0o666 & ~umask)  # mkstemp lets only the owner read
         os.replace(temporary, path)
     except (OSError, RuntimeError) as error:
         Path(temporary).unlink(missing_ok=True)
@@ -74,7 +77,7 @@ def load(path: str | Path) -> tuple[Model, dict[str, Any]]:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
         raise DataError(f"{path}: no such checkpoint") from None
-    except OSError as error:
+    except (IsADirectoryError, PermissionError) as error:
         raise DataError(f"{path}: cannot be read: {error.strerror}") from None
     except pickle.UnpicklingError:
         raise DataError(f"{path}: refused, it holds pickled code or objects; expected a {FORMAT} of tensors") from None

@@ -97,8 +97,10 @@ class HexPlane(nn.Module):
     box: [2, 3] lower and upper corner, scene units; points are normalised by it and clamped to it.
     resolution: cells along x, y, z, t of the base scale, each >= 1. multires: factor on x, y, z per scale.
     The parameter `grid` is [cells, C]; `layout` says which cells are which plane. Start values: each channel of a
-    spatial plane one draw of U(0.1, 0.5), time planes 1. (One draw per channel, not per cell as in the public code: cells that no anchor
-    reaches keep their start value, and noise there would cost bits.)
+    spatial plane one draw of U(0.1, 0.5), time planes 1. One draw per channel, not per cell as in the public code: cells that no anchor
+    reaches keep their start value, and noise there would cost bits. With the quantisation step `step` the draw is a
+    multiple of it and each cell is dithered within its rounding interval: free where nothing is learnt, and elsewhere
+    the rounding errors of neighbouring cells are independent, where equal ones would shift the whole scene.
     """
 
     def __init__(
@@ -108,6 +110,7 @@ class HexPlane(nn.Module):
         channels: int = 16,
         multires: Sequence[int] = (1, 2),
         generator: torch.Generator | None = None,
+        step: float | None = None,
     ):
         super().__init__()
         sizes = [*resolution, channels, *multires]
@@ -122,7 +125,12 @@ class HexPlane(nn.Module):
             for scale in self.layout.views(self.grid):
                 for name, _, b in PLANES:
                     if b != TIME_AXIS:
-                        scale[name].copy_(torch.empty(channels).uniform_(0.1, 0.5, generator=generator))
+                        start = torch.empty(channels).uniform_(0.1, 0.5, generator=generator)
+                        scale[name].copy_(start if step is None else torch.round(start / step) * step)
+            if step is not None:
+                self.grid[: self.layout.n_spatial] += step * torch.empty(self.layout.n_spatial, channels).uniform_(
+                    -0.45, 0.45, generator=generator
+                )
 
     def _setup(self, box, resolutions: Sequence[Sequence[int]], channels: int) -> None:
         corners = torch.as_tensor(np.array(box, np.float32))

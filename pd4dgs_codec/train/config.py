@@ -60,8 +60,8 @@ class TrainConfig:
     grow_threshold: float = 2e-4
     steps: Steps = field(default_factory=Steps)
     rates: LearningRates = field(default_factory=LearningRates)
-    global_planes: PlaneWeights = PlaneWeights(1e-3, 5e-3, 5e-5)
-    local_planes: PlaneWeights = PlaneWeights(2e-3, 1e-2, 1e-4)
+    global_planes: PlaneWeights = PlaneWeights(1e-4, 5e-4, 5e-5)
+    local_planes: PlaneWeights = PlaneWeights(2e-4, 1e-3, 1e-4)
     max_gradient_norm: float = 100.0
 
     def __post_init__(self) -> None:
@@ -118,7 +118,7 @@ class Schedule:
     @property
     def rounding(self) -> int:
         """Planes and weights are rounded straight-through from here on."""
-        return self._at(1 / 2)
+        return self._at(2 / 3)
 
     @property
     def exact_rounding(self) -> int:

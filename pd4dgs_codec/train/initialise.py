@@ -31,8 +31,11 @@ def fresh_model(config: ModelConfig, dataset: Dataset, steps: Steps, seed: int) 
     n = len(anchor_q)
     spacing = nearest_distances((anchor_q.double() * info.voxel_size).float()).clamp(min=info.voxel_size)
     fields = []
-    for field, widths in ((config.global_deformation, GLOBAL_HEADS), (config.local_deformation, LOCAL_HEADS)):
-        fields.append(None if field is None else DeformationField.fresh(field, info.box, widths))
+    for field, widths, step in (
+        (config.global_deformation, GLOBAL_HEADS, steps.planes_global),
+        (config.local_deformation, LOCAL_HEADS, steps.planes_local),
+    ):
+        fields.append(None if field is None else DeformationField.fresh(field, info.box, widths, step))
     mask_logits = torch.zeros(n, 3)
     mask_logits[:, 0] = MASK_START
     return Model(

@@ -97,6 +97,8 @@ class Trainer:
         finally:
             if stream:
                 stream.close()
+            if progress:
+                progress.close()
         if self.iteration >= self.total:
             self.model.round_weights()  # the file holds rounded values; so does the finished checkpoint
         self.save(output)

@@ -12,23 +12,10 @@ from pd4dgs_codec.errors import EncodeError
 steps = st.floats(2.0**-100, 2.0**90, width=32)
 
 
-@given(st.lists(st.integers(-(1 << 23), 1 << 23), min_size=1, max_size=50), steps)
+@given(st.lists(st.integers(-MAX_SYMBOL, MAX_SYMBOL), min_size=1, max_size=50), steps)
 def test_symbols_survive_their_float32_values(ks, step):
     k = np.array(ks, np.int32)
     np.testing.assert_array_equal(quantise(dequantise(k, step), step), k)
-
-
-@given(st.integers(-MAX_SYMBOL, MAX_SYMBOL), st.integers(-60, 60))
-def test_all_symbols_survive_a_power_of_two_step(k, exponent):
-    step = 2.0**exponent
-    assert quantise(dequantise(np.array([k]), step), step)[0] == k
-
-
-def test_a_large_symbol_can_collide_with_its_neighbour():
-    """Why the property above stops at 2^23: two symbols, one binary32."""
-    step = float(np.float32(1 + 2.0**-23))
-    pair = dequantise(np.array([MAX_SYMBOL - 1, MAX_SYMBOL]), step)
-    assert pair[0] == pair[1]
 
 
 @given(st.integers(-1000, 1000), steps)
@@ -53,7 +40,7 @@ def test_non_finite_values_are_refused_by_name(bad):
 
 def test_symbols_over_the_limit_are_refused():
     assert quantise(np.array([MAX_SYMBOL], np.float32), 1.0)[0] == MAX_SYMBOL
-    with pytest.raises(EncodeError, match="offset.*16777216"):
+    with pytest.raises(EncodeError, match="offset.*8388609"):
         quantise(np.array([MAX_SYMBOL + 1], np.float32), 1.0, "offset")
 
 

@@ -1,0 +1,981 @@
+#!/usr/bin/env python3
+"""The reference decoder of the `.pd4` format 1.0-draft, written from spec/format.md with the standard library alone.
+
+    python -I -S spec/refdec.py FILE
+
+prints the hashes of clause 12.4 as JSON. Faults give one line, `name: what`, and exit code 1. Above each function
+stands the clause it follows, in the specification's words. It is meant to be read, not to be fast. One file, so that
+it can be carried alone.
+"""
+# ruff: noqa: B905  (lengths agree by construction; strict= would only lengthen the lines)
+
+import hashlib
+import json
+import lzma
+import math
+import struct
+import sys
+import zlib
+from bisect import bisect_right
+
+SIGNATURE = bytes.fromhex("89504434 0D0A1A0A")
+K = (1 << 24) - 1  # clause 14: coded symbols
+MAX_SYMBOL = 1 << 23  # clause 14: symbols of attributes, plane samples and weights
+MAX_VOXEL = 1 << 20
+MAX_COUNT = 1 << 26
+TOTAL = 1 << 24
+PLANES = (("xy", 0, 1), ("xz", 0, 2), ("xt", 0, 3), ("yz", 1, 2), ("yt", 1, 3), ("zt", 2, 3))
+ATTRIBUTES = (("feature", 32), ("scaling_log", 6), ("offset", 30))
+NETWORKS = (  # clause 6.3: per layer the outputs by id, None for any
+    {0: 10, 1: 70, 2: 30},
+    {0: None, 1: 3, 2: 32, 3: 30, 4: 6},
+    {0: None, 1: 3, 2: 3, 3: 4, 4: 1, 5: 3},
+)
+POSITIONS, MASKS, ATTRIBUTE_SECTION, PLANE_SECTION, WEIGHTS, SYMBOLS, FLOATS = range(7)
+
+
+class Fault(Exception):
+    """A fault of the file; `name` is one of clause 15."""
+
+    def __init__(self, name, what):
+        super().__init__(f"{name}: {what}")
+        self.name = name
+
+
+def need(ok, what, name="Malformed"):
+    if not ok:
+        raise Fault(name, what)
+
+
+# 14 Limits: "A declared value over its limit is LimitExceeded, and nothing is allocated for it."
+def limited(value, high, what, low=0):
+    need(type(value) is int, f"{what} is no integer")
+    need(value <= high, f"{what} is {value}, limit {high}", "LimitExceeded")
+    need(value >= low, f"{what} is {value}, expected at least {low}")
+    return value
+
+
+class Reader:
+    """Takes bytes from the front; running out of them is Malformed."""
+
+    def __init__(self, data):
+        self.data, self.at = data, 0
+
+    @property
+    def left(self):
+        return len(self.data) - self.at
+
+    def take(self, count):
+        need(count <= self.left, f"{self.left} bytes, expected {count} more")
+        self.at += count
+        return self.data[self.at - count : self.at]
+
+    def number(self, form):
+        return struct.unpack(form, self.take(struct.calcsize(form)))[0]
+
+    def byte(self, high=255):
+        value = self.number("B")
+        need(value <= high, f"a byte is {value}, expected at most {high}")
+        return value
+
+    # 7.1 Variable-length integers: "A varint holds seven bits per byte, least significant first; the high bit of a
+    # byte says that another follows. It takes at most 5 bytes and MUST be in the shortest form"
+    def varint(self, high):
+        value = 0
+        for index in range(5):
+            byte = self.byte()
+            value |= (byte & 127) << 7 * index
+            if byte < 128:
+                need(byte or not index, "a varint is not in its shortest form")
+                return limited(value, high, "a varint")
+        raise Fault("Malformed", "a varint of more than 5 bytes")
+
+    # 7.1 Variable-length integers: "A zigzag integer v is the varint 2v for v ≥ 0 and −2v − 1 for v < 0."
+    def zigzag(self, high):
+        return unzigzag(self.varint(2 * high))
+
+
+def unzigzag(code):
+    return -(code >> 1) - 1 if code & 1 else code >> 1
+
+
+MSGPACK_SIZED = {  # first byte: (kind, form of the size, least size that needs this form)
+    0xC4: ("bin", "B", 0),
+    0xC5: ("bin", "H", 1 << 8),
+    0xC6: ("bin", "I", 1 << 16),
+    0xD9: ("str", "B", 32),
+    0xDA: ("str", "H", 1 << 8),
+    0xDB: ("str", "I", 1 << 16),
+    0xDC: ("list", "H", 16),
+    0xDD: ("list", "I", 1 << 16),
+    0xDE: ("map", "H", 16),
+    0xDF: ("map", "I", 1 << 16),
+}
+
+
+# 4 Canonical msgpack: "Header and layer parameters are one msgpack value each, in the one form that this clause
+# allows."
+def unpack(data):
+    reader = Reader(data)
+    value = msgpack_value(reader, 0)
+    need(not reader.left, "bytes follow a msgpack value")
+    return value
+
+
+# 4 Canonical msgpack: "nil, float 64, ext and timestamp MUST NOT occur. Lists and maps are nested at most 4 deep, the
+# outermost counted."
+def msgpack_value(reader, depth):
+    b = reader.byte()
+    if b < 0x80 or b >= 0xE0:
+        return b if b < 0x80 else b - 256
+    if b < 0xC0:
+        kind, size = ("map", b & 15) if b < 0x90 else ("list", b & 15) if b < 0xA0 else ("str", b & 31)
+        return msgpack_items(reader, kind, size, depth)
+    if b in (0xC2, 0xC3):
+        return b == 0xC3
+    if b == 0xCA:
+        return check_finite(reader.number(">f"))
+    if 0xCC <= b <= 0xCF:  # the second number: the first value that needs this form
+        form, least = (("B", 1 << 7), ("H", 1 << 8), ("I", 1 << 16), ("Q", 1 << 32))[b - 0xCC]
+        return shortest(reader.number(">" + form), least)
+    if 0xD0 <= b <= 0xD3:
+        form, least = (("b", 1 << 5), ("h", 1 << 7), ("i", 1 << 15), ("q", 1 << 31))[b - 0xD0]
+        return -1 - shortest(-1 - reader.number(">" + form), least)
+    need(b in MSGPACK_SIZED, f"msgpack byte {b:#x}")
+    kind, form, least = MSGPACK_SIZED[b]
+    return msgpack_items(reader, kind, shortest(reader.number(">" + form), least), depth)
+
+
+def shortest(value, least):
+    need(value >= least, f"msgpack {value} is not in its shortest form")
+    return value
+
+
+# 4 Canonical msgpack: "keys are integers 0..2^32 − 1, ascending, each once"
+def msgpack_items(reader, kind, size, depth):
+    if kind == "bin":
+        return bytes(reader.take(size))
+    if kind == "str":
+        try:
+            return reader.take(size).decode()
+        except UnicodeDecodeError:
+            raise Fault("Malformed", "a string is not UTF-8") from None
+    need(depth < 4, "msgpack nested deeper than 4")
+    need(size <= reader.left, f"{size} msgpack entries in {reader.left} bytes")
+    if kind == "list":
+        return [msgpack_value(reader, depth + 1) for _ in range(size)]
+    result, last = {}, -1
+    for _ in range(size):
+        key = msgpack_value(reader, depth + 1)
+        need(type(key) is int and last < key < 1 << 32, f"map key {key!r} after {last}")
+        result[key], last = msgpack_value(reader, depth + 1), key
+    return result
+
+
+def check_finite(value):
+    need(math.isfinite(value), "a value is not finite")
+    return value
+
+
+# 4 Canonical msgpack: "a key under 64 that this text does not define is an UnsupportedFeature; unknown keys from 64
+# on MUST be ignored. A missing required key is Malformed"
+def fields(value, known, required, what):
+    need(type(value) is dict, f"{what} is no map")
+    unknown = [key for key in value if key not in known and key < 64]
+    need(not unknown, f"{what}: key {unknown}", "UnsupportedFeature")
+    missing = [key for key in required if key not in value]
+    need(not missing, f"{what}: keys {missing} are missing")
+    return value
+
+
+def a_list(value, what, count=None):
+    need(type(value) is list and count in (None, len(value)), f"{what}: expected a list of {count or 'some'} entries")
+    return value
+
+
+def reals(value, what, count):
+    need(all(type(v) is float for v in a_list(value, what, count)), f"{what}: expected float 32")
+    return value
+
+
+# 5.1 Header map: "Steps and voxel size MUST be positive normal binary32 values."
+def a_step(value):
+    need(type(value) is float and value >= 2.0**-126, f"step {value!r}")
+    return value
+
+
+# 3.1 Preamble: "It checks the signature, then the major version, then H against its limit, then the CRC-32."
+def read_preamble(data):
+    need(SIGNATURE.startswith(data[:8]), "not a .pd4 file", "BadSignature")
+    need(len(data) >= 20, "the file ends in the preamble", "Truncated")
+    major, _, size, crc = struct.unpack_from("<HHII", data, 8)
+    need(major == 1, f"major version {major}", "UnsupportedVersion")
+    limited(size, 4096, "the header's length")
+    need(len(data) >= 20 + size, "the file ends in the header", "Truncated")
+    header = data[20 : 20 + size]
+    need(zlib.crc32(data[:16] + header) == crc, "CRC-32 of the header", "ChecksumMismatch")
+    return read_header(header), 20 + size
+
+
+# 5.1 Header map: "coding mode: 0 ans, 1 lzma; others UnsupportedFeature" "deformation: 0 coded as symbols, 1 float32
+# (9.2); others UnsupportedFeature"
+def read_header(data):
+    header = fields(unpack(data), range(1, 13), range(1, 12), "header")
+    for key, count in ((4, 3), (6, 6), (7, 2), (8, 3), (9, 2), (10, 3)):
+        reals(header[key], f"header key {key}", count)
+    for step in (header[5], *header[4]):
+        a_step(step)
+    need(type(header[11]) is float, "header key 11: expected float 32")
+    need(all(a <= b for a, b in zip(header[6][:3], header[6][3:])), "a lower corner of the box above the upper one")
+    if 12 in header:
+        camera = fields(header[12], range(1, 5), range(1, 5), "camera")
+        reals(camera[1], "camera matrix", 12)
+        reals(camera[2], "camera intrinsics", 9)
+        for key in (3, 4):
+            limited(camera[key], 65535, "camera size", 1)
+    read_chunk_list(a_list(header[1], "chunk list"))
+    for key in (2, 3):
+        need(limited(header[key], 1 << 32, f"header key {key}") <= 1, f"key {key}: {header[key]}", "UnsupportedFeature")
+    return header
+
+
+# 5.2 Chunk list: "The first type MUST be 0; the types of layers among all entries MUST ascend, each at most once."
+def read_chunk_list(rows):
+    limited(len(rows), 64, "the number of chunks", 1)
+    for row in rows:
+        kind, size = a_list(row, "a chunk", 2)
+        limited(kind, 65535, "a chunk type")
+        limited(size, 1 << 31, "a payload's length")
+    layers = [kind for kind, _ in rows if kind < 3]
+    need(rows[0][0] == 0 and layers == sorted(set(layers)), f"layers {layers}")
+
+
+# 3.2 Chunks: "Type and length MUST equal those in the chunk list. Checks come in this order: L against its limit, L
+# against the list, the bytes that are there, CRC-32, flags, type, scene id."
+def read_chunk(data, at, kind, size, scene_id):
+    need(len(data) >= at + 16, "the file ends in a chunk's head", "Truncated")
+    found_kind, flags, found_size, found_id = struct.unpack_from("<HHI8s", data, at)
+    limited(found_size, 1 << 31, "a payload's length")
+    need(found_size == size, f"payload of {found_size} bytes, listed {size}")
+    end = at + 16 + size
+    need(len(data) >= end + 4, "the file ends in a chunk", "Truncated")
+    crc = struct.unpack_from("<I", data, end)[0]
+    need(zlib.crc32(data[at:end]) == crc, f"CRC-32 of the chunk at {at}", "ChecksumMismatch")
+    need(flags <= 1, f"flags {flags:#x}")
+    need(found_kind == kind, f"chunk type {found_kind}, listed {kind}")
+    need(scene_id in (None, found_id), "a chunk of another scene")
+    payload = data[at + 16 : end]
+    # 3.3: the scene id is the first 8 bytes of the SHA-256 of the payload of the layer-0 chunk.
+    need(scene_id or found_id == hashlib.sha256(payload).digest()[:8], "the scene id is not that of layer 0")
+    # 3.4: the chunk types of layers are critical.
+    need(kind < 3 or flags == 1, f"critical chunk of type {kind}", "UnsupportedFeature")
+    need(kind >= 3 or flags == 0, "a layer marked as ancillary")
+    return payload, found_id, end + 4
+
+
+class Layer:
+    """What one layer says: symbols {name: [int]} in the order of clause 12.4, and what dequantisation needs."""
+
+    def __init__(self, number, rows_before, header):
+        self.number, self.rows_before, self.header = number, rows_before, header
+        self.symbols = {}
+        self.tensors = {}  # {name: [float]}, every one a binary32 value
+
+
+# 6.1 Layout: "The lengths of the sections MUST sum to the rest exactly."
+def read_layer(payload, number, rows_before, header):
+    layer = Layer(number, rows_before, header)
+    reader = Reader(payload)
+    parameters = reader.take(reader.number("<I"))
+    read_parameters(layer, unpack(parameters))
+    need(sum(layer.sections.values()) == reader.left, "the sections do not fill the payload")
+    check_sizes(layer, len(payload))
+    parts = {section: reader.take(layer.sections[section]) for section in sorted(layer.sections)}
+    read_sections(layer, parts)
+    need(not parts, f"sections {sorted(parts)} have nothing to code")
+    return layer
+
+
+# 6.2 Layer parameters: "Layer 0 has keys 3 and 5 and not 4. Layers 1 and 2 have keys 3, 4 and 5 if the layer has a
+# deformation, else none of them."
+def read_parameters(layer, value):
+    parameters = fields(value, range(1, 6), (1, 2), "layer parameters")
+    sections = fields(parameters[2], range(7), (), "sections")
+    layer.networks = read_networks(layer.number, parameters[5]) if 5 in parameters else {}
+    need(layer.networks or layer.number, "layer 0 without networks")
+    layer.raw = bool(layer.networks and layer.number and header_is_float32(layer.header))
+    layer.rows = limited(parameters[1], (1 << 24) - layer.rows_before, "own rows")
+    layer.sections = {s: limited(sections[s], 1 << 31, "a section", 1) for s in sections if s < 64}
+    has_planes = bool(layer.networks) and layer.number > 0
+    need((3 in parameters) == bool(layer.networks), "steps without networks or the reverse")
+    layer.steps = [a_step(v) for v in reals(parameters[3], "steps", 1 + has_planes)] if layer.networks else []
+    if has_planes:
+        need(4 in parameters, "a deformation without planes")
+    layer.scales = read_scales(layer, parameters[4]) if has_planes else []
+    need((4 in parameters) == has_planes, "planes without reason")
+
+
+def header_is_float32(header):
+    return header[3] == 1
+
+
+# 6.3 Planes and networks: "channels 1..256, resolutions 1..4096 along x, y, z, t, and one predictor per plane (11.3;
+# all 0 if the layer's deformation is float32)."
+def read_scales(layer, rows):
+    limited(len(a_list(rows, "scales")), 8, "the number of scales", 1)
+    for row in rows:
+        a_list(row, "a scale", 11)
+        limited(row[0], 256, "plane channels", 1)
+        for side in row[1:5]:
+            limited(side, 4096, "a plane's side", 1)
+        for predictor in row[5:]:
+            need(limited(predictor, 65535, "a predictor") <= 5, f"predictor {predictor}", "UnsupportedFeature")
+            need(predictor == 0 or not layer.raw, "a predictor on float32 planes")
+    return rows
+
+
+# 6.3 Planes and networks: "Layer 0 has all three networks. A deformation has its trunk and at least one head. Other
+# ids are UnsupportedFeature."
+def read_networks(number, rows):
+    limited(len(a_list(rows, "networks")), len(NETWORKS[number]), "the number of networks", 1)
+    networks, last = {}, -1
+    for row in rows:
+        need(a_list(row, "a network"), "an empty network")
+        key = limited(row[0], 65535, "a network's id")
+        need(key in NETWORKS[number], f"network {key}", "UnsupportedFeature")
+        need(key > last, f"network {key} after {last}")
+        limited(len(row) - 1, 16, "linear layers", 1)
+        for width in row[1:]:
+            limited(width, 4096, "a network's width", 1)
+        need(NETWORKS[number][key] in (None, row[-1]), f"network {key} with {row[-1]} outputs")
+        networks[key], last = row[1:], key
+    need(len(networks) == 3 if number == 0 else 0 in networks and len(networks) > 1, f"networks {list(networks)}")
+    return networks
+
+
+# 6.3 Planes and networks: "Plane ab is an array [C, H, W] with H the resolution along b and W that along a: its rows
+# follow b, its columns a."
+def plane_shapes(layer):
+    return [
+        (f"planes.{s}.{name}", predictor, (scale[0], scale[1 + b], scale[1 + a]))
+        for s, scale in enumerate(layer.scales)
+        for (name, a, b), predictor in zip(PLANES, scale[5:])
+    ]
+
+
+# 6.3 Planes and networks: "Linear layer i is a weight [o_i, o_{i−1}] and a bias [o_i]; o_0 is the network's input
+# width."
+def weight_shapes(layer):
+    shapes = []
+    for key, widths in layer.networks.items():
+        width = 35 if layer.number == 0 else layer.networks[0][-1] if key else sum(s[0] for s in layer.scales)
+        for i, outputs in enumerate(widths):
+            shapes += [(f"network.{key}.weight.{i}", outputs * width), (f"network.{key}.bias.{i}", outputs)]
+            width = outputs
+    return shapes
+
+
+# 6.5 Declared sizes: "c MUST NOT exceed 2^28, and E + 72·n + c + w MUST NOT exceed 2^22 + 2048·L, L being the
+# payload's length in bytes."
+def check_sizes(layer, payload_bytes):
+    cells = sum(c * h * w for _, _, (c, h, w) in plane_shapes(layer))
+    limited(cells, 1 << 28, "plane cells")
+    count = layer.rows_before + 72 * layer.rows + cells + sum(size for _, size in weight_shapes(layer))
+    limited(count, (1 << 22) + 2048 * payload_bytes, "the symbols of a layer")
+
+
+# 6.4 Sections: "A section is present if and only if it has at least one symbol or value to code. Mode ans uses 0..4,
+# mode lzma 0 and 5."
+def read_sections(layer, parts):
+    def part(section, count):
+        need((section in parts) == (count > 0), f"section {section} with {count} symbols to code")
+        return parts.pop(section, b"")
+
+    planes, weights = plane_shapes(layer), weight_shapes(layer)
+    counts = {MASKS: [layer.rows_before, layer.rows], ATTRIBUTE_SECTION: [layer.rows] * 68}
+    counts[PLANE_SECTION] = [] if layer.raw else [h * w for _, _, (c, h, w) in planes for _ in range(c)]
+    counts[WEIGHTS] = [] if layer.raw else [size for _, size in weights]
+    positions = decode_positions(part(POSITIONS, layer.rows), layer.rows)
+    channels = {}
+    if layer.header[2] == 1:
+        flat = [count for section in counts for count in counts[section]]
+        decoded = decode_lzma_symbols(part(SYMBOLS, sum(flat)), flat)
+        for section in counts:
+            channels[section], decoded = decoded[: len(counts[section])], decoded[len(counts[section]) :]
+    else:
+        for section in counts:
+            channels[section] = decode_channels(part(section, sum(counts[section])), counts[section])
+    layer.raw_values = {}
+    if layer.raw:
+        sizes = {name: c * h * w for name, _, (c, h, w) in planes} | dict(weights)
+        floats = decode_lzma_floats(part(FLOATS, 1), list(sizes.values()))
+        layer.raw_values = dict(zip(sizes, floats))
+    keep_symbols(layer, positions, channels, planes, weights)
+
+
+# 11.1 Masks: "Layer ℓ codes a rise 0..255 for each earlier row, added to that row's code in the layer before in the
+# file, and a code 3..255 for each own row."
+# 11.2 Attributes: "Symbols, here and in 11.3 and 11.4, MUST lie in −2^23..2^23, else Malformed."
+def keep_symbols(layer, positions, channels, planes, weights):
+    rise, own = channels[MASKS]
+    need(all(0 <= v <= 255 for v in rise) and all(3 <= v <= 255 for v in own), "a mask code out of range")
+    layer.symbols = {"anchor": [v for cell in positions for v in cell], "mask_rise": rise, "mask_own": own}
+    first = 0
+    for name, width in ATTRIBUTES:  # [width, n], channel by channel
+        layer.symbols[name] = [k for channel in channels[ATTRIBUTE_SECTION][first : first + width] for k in channel]
+        first += width
+    if not layer.raw:
+        residuals = iter(channels[PLANE_SECTION])
+        for name, predictor, (c, h, w) in planes:
+            layer.symbols[name] = [k for _ in range(c) for k in restore(next(residuals), predictor, h, w)]
+        layer.symbols |= {name: channel for (name, _), channel in zip(weights, channels[WEIGHTS])}
+    need(all(abs(k) <= MAX_SYMBOL for symbols in layer.symbols.values() for k in symbols), "a symbol over 2^23")
+
+
+# 11.3 Planes: "in row 0 N and NW are taken equal to W, in column 0 W and NW are taken equal to N, and at (0, 0) all
+# three are 0."
+def restore(residuals, predictor, h, w):
+    k = list(residuals)
+    for at in range(len(k)) if predictor else ():
+        i, j = divmod(at, w)
+        west, north = k[at - 1] if j else 0, k[at - w] if i else 0
+        corner = k[at - w - 1] if i and j else 0
+        if i == 0:
+            north = corner = west
+        elif j == 0:
+            west = corner = north
+        if predictor == 1:
+            k[at] += west
+        elif predictor == 2:
+            k[at] += north
+        elif predictor == 3:
+            k[at] += max(min(west, north), min(max(west, north), west + north - corner))
+        elif predictor == 4:
+            k[at] += west + north - corner
+        else:
+            k[at] += (west + north) >> 1
+    return k
+
+
+# 7.3 NormTable: "T[i] = round(2^28 (Φ(i/32) − 1/2)) for i = 0..256, T[257] = T[256] = 2^27 M[j] = round(2^(31 −
+# j/64)) for j = 0..63"
+T = [round(2**27 * math.erf(i / (32 * math.sqrt(2)))) for i in range(257)]
+T.append(T[-1])
+M = [round(2 ** (31 - j / 64)) for j in range(64)]
+
+
+# 7.3 NormTable: "C = 2^27 − v if t < 0, else 2^27 + v"
+def norm_cdf(n, mu8, si):
+    e, j = si >> 6, si & 63
+    nb = max(0, e - 8)
+    result = []
+    for k in range(n - 1):
+        t = 256 * k + 128 - mu8
+        a = min(abs(t) >> nb, (1 << 21) - 1)
+        z = min((a * M[j]) >> (23 + e - nb), 1 << 19)
+        i, f = z >> 11, z & 2047
+        v = T[i] + (((T[i + 1] - T[i]) * f) >> 11)
+        result.append((1 << 27) - v if t < 0 else (1 << 27) + v)
+    return result
+
+
+# 7.3 NormTable: "with a floor fl the table cum[q] = ((C(q−1) · (2^24 − n·fl)) >> 28) + fl·q for 0 < q < n."
+def table_of(cdf, floor):
+    n = len(cdf) + 1
+    inner = [((c * (TOTAL - n * floor)) >> 28) + floor * q for q, c in enumerate(cdf, 1)]
+    return [0, *inner, TOTAL]
+
+
+# 7.5 Histogram tables: "cum[q] = ((W(q) >> h) · (2^24 − n)) // (W(n) >> h) + q, q = 0..n"
+def histogram_table(classes, top, step):
+    sums = [0]
+    for c in classes:
+        b = (top - c) * step
+        sums.append(sums[-1] + (M[b & 63] >> (b >> 6) if c else 0))
+    h = max(0, sums[-1].bit_length() - 28)
+    return [((s >> h) * (TOTAL - len(classes))) // (sums[-1] >> h) + q for q, s in enumerate(sums)]
+
+
+# 7.7 ANS streams: "A stream is a multiple of 4 bytes: u32 words in the order in which the decoder takes them. It may
+# be empty; its first word MUST NOT be 0."
+class Ans:
+    def __init__(self, data):
+        need(len(data) % 4 == 0, "an ANS stream that is no multiple of 4 bytes")
+        self.words, self.at, self.x = struct.unpack(f"<{len(data) // 4}I", data), 0, 0
+        need(not self.words or self.words[0], "an ANS stream that begins with 0")
+        while self.x < 1 << 32 and self.at < len(self.words):
+            self.x = self.x << 32 | self.words[self.at]
+            self.at += 1
+
+    # 7.7 ANS streams: "x = (x >> 24)·(cum[s+1] − cum[s]) + q − cum[s] if x < 2^32 and words are left: x = x·2^32 +
+    # next word"
+    def take(self, count, cum):
+        if len(cum) == 2:
+            return [0] * count
+        result = []
+        for _ in range(count):
+            q = self.x & 0xFFFFFF
+            s = bisect_right(cum, q) - 1
+            self.x = (self.x >> 24) * (cum[s + 1] - cum[s]) + q - cum[s]
+            if self.x < 1 << 32 and self.at < len(self.words):
+                self.x = self.x << 32 | self.words[self.at]
+                self.at += 1
+            result.append(s)
+        return result
+
+    # 7.7 ANS streams: "x MUST be 0 and no word left, else Malformed"
+    def finish(self):
+        need(self.x == 0 and self.at == len(self.words), "an ANS stream does not end in state 0")
+
+
+class Prior:
+    """kmin, n, shift: the window of clause 8.2; cum: its table, for a hist once the classes are known."""
+
+    def __init__(self, kmin, n, shift, cum):
+        self.kmin, self.n, self.shift, self.cum = kmin, n, shift, cum
+        self.end = kmin + (n << shift)
+        self.classes = None  # of a hist: (step, top, differences, table of the classes)
+
+
+# 8.1 Parameter block: "a new prior: u8 shift 1..12, u8 family 1..3, the family's parameters"
+# 8.2 Priors: "The floor of a mixture is that of its first normal."
+def read_prior(reader, family):
+    shift = 0
+    if family == 4:
+        shift, family = reader.byte(12), reader.byte()
+        need(shift and family, "a scaled prior with shift 0 or a constant")
+    need(family <= 3, f"prior family {family}", "UnsupportedFeature")
+    kmin = reader.zigzag(K)
+    if family == 0:
+        return Prior(kmin, 1, 0, [0, TOTAL])
+    n = 2 + reader.varint((1 << 14) - 2)
+    need(kmin + ((n - 1) << shift) <= K, "a window passes the largest symbol")
+    if family == 3:
+        return read_histogram(reader, Prior(kmin, n, shift, None))
+    mu8, si, floor = read_normal(reader, n)
+    cdf = norm_cdf(n, mu8, si)
+    if family == 2:
+        mu8, si, reserved = read_normal(reader, n)
+        w = reader.byte()
+        need(w and not reserved, "a mixture with weight 0 or a reserved bit")
+        cdf = [((256 - w) * c1 + w * c2) >> 8 for c1, c2 in zip(cdf, norm_cdf(n, mu8, si))]  # clause 7.4
+    return Prior(kmin, n, shift, table_of(cdf, 16 if floor else 1))
+
+
+# 8.2 Priors: "zigzag g, |g| ≤ 2^31, mu8 = g + 128·(n − 1); varint v ≤ 3841: bit 0 the floor, 0: fl = 1, 1: fl = 16;
+# si = (v >> 1) − 640"
+def read_normal(reader, n):
+    mu8 = reader.zigzag(1 << 31) + 128 * (n - 1)
+    v = reader.varint(3841)
+    return mu8, (v >> 1) - 640, v & 1
+
+
+# 8.2 Priors: "without differences the symbols are the classes, of a table of top + 1 symbols with mu8 = 16·m; with
+# differences symbol r adds r − top to the class before (0 before the first), of a table of 2·top + 1 symbols with mu8
+# = 256·top."
+def read_histogram(reader, prior):
+    mode = reader.byte(7)
+    step, differences = 8 << (mode & 3), mode >> 2
+    top = reader.varint(1 + 1984 // step)
+    need(top, "a histogram without classes")
+    si = 16 * reader.byte(63) - 160
+    n, mu8 = (2 * top + 1, 256 * top) if differences else (top + 1, 16 * reader.varint(16 * top))
+    prior.classes = (step, top, differences, table_of(norm_cdf(n, mu8, si), 1))
+    return prior
+
+
+# 8.4 Symbols: "The ANS stream holds the classes of each hist prior in the order of definition"
+def take_classes(stream, prior):
+    step, top, differences, cum = prior.classes
+    classes, last = [], 0
+    for symbol in stream.take(prior.n, cum):
+        last = last + symbol - top if differences else symbol
+        classes.append(last)
+    need(0 <= min(classes) and 0 < max(classes) <= top, "a histogram's classes out of range")
+    prior.cum = histogram_table(classes, top, step)
+
+
+# 8.3 Exceptions: "the symbol is kmin − 1 − (c >> 1) if c is odd, else kmin + n·2^shift + (c >> 1). It MUST lie in
+# −K..K, its position within the channel."
+def read_exceptions(reader, count, prior):
+    number = 1 + reader.varint(min(count, reader.left // 2))
+    result, at = {}, -1
+    for _ in range(number):
+        at += 1 + reader.varint(MAX_COUNT)
+        c = reader.varint(4 * K + 2)
+        value = prior.kmin - 1 - (c >> 1) if c & 1 else prior.end + (c >> 1)
+        need(at < count and abs(value) <= K, f"an exception {value} at {at} of {count}")
+        result[at] = value
+    return result
+
+
+# 8.1 Parameter block: "For each non-empty channel in order: a varint token, at most 2·(2^26 + 8); the parameters of a
+# new prior (8.2), if any; its exceptions (8.3), if bit 0 of the token is set."
+def decode_channels(data, counts):
+    reader, defined, heads = Reader(data), [], []
+    for count in counts:
+        if count == 0:
+            continue
+        limited(count, MAX_COUNT, "the symbols of a channel")
+        token = reader.varint(2 * (MAX_COUNT + 8))
+        if token >> 1 < 8:
+            defined.append(read_prior(reader, token >> 1))
+        back = max(token >> 1, 8) - 8
+        need(back < len(defined), "a channel reuses a prior before the first")
+        prior = defined[-1 - back]
+        heads.append((prior, read_exceptions(reader, count, prior) if token & 1 else {}))
+    stream = Ans(reader.take(reader.left))
+    for prior in defined:
+        if prior.classes:
+            take_classes(stream, prior)
+    heads = iter(heads)
+    channels = [take_channel(stream, count, *next(heads)) if count else [] for count in counts]
+    stream.finish()
+    return channels
+
+
+# 8.4 Symbols: "for shift 0 the entries s of the prior's table; else first all entries, then all low bits r under the
+# uniform table of shift bits. The symbol is kmin + s·2^shift + r, and MUST NOT exceed K. Exceptions are then put in
+# their places."
+def take_channel(stream, count, prior, exceptions):
+    left = count - len(exceptions)
+    symbols = [prior.kmin + (s << prior.shift) for s in stream.take(left, prior.cum)]
+    if prior.shift:
+        uniform = [q << (24 - prior.shift) for q in range((1 << prior.shift) + 1)]  # clause 7.6
+        symbols = [k + r for k, r in zip(symbols, stream.take(left, uniform))]
+        need(not symbols or max(symbols) <= K, "a symbol over K")
+    if not exceptions:
+        return symbols
+    inside = iter(symbols)
+    return [exceptions[at] if at in exceptions else next(inside) for at in range(count)]
+
+
+# 9.1 Symbols: "It MUST unpack to exactly the bytes that the widths and lengths call for, at most 2^31, and end with
+# its end marker at the section's last byte. Its dictionary is the smallest power of two that holds the unpacked
+# bytes, at least 2^12 and at most 2^26."
+def unpack_lzma(data, size):
+    limited(size, 1 << 31, "bytes under LZMA")
+    dictionary = min(max(1 << 12, 1 << max(size - 1, 0).bit_length()), 1 << 26)
+    decoder = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=[{"id": lzma.FILTER_LZMA2, "dict_size": dictionary}])
+    try:
+        raw = decoder.decompress(data, max_length=size + 1)
+    except lzma.LZMAError as error:
+        raise Fault("Malformed", f"LZMA: {error}") from None
+    need(len(raw) == size and decoder.eof and not decoder.unused_data, "an LZMA stream of another length")
+    return raw
+
+
+# 9.1 Symbols: "With byte planes, each channel's data are all least significant bytes first, then the next, and so
+# on."
+def split_numbers(raw, forms, planar):
+    arrays, at = [], 0
+    for form, count in forms:
+        width = struct.calcsize(form)
+        part = raw[at : at + count * width]
+        at += len(part)
+        if planar:
+            part = bytes(part[plane * count + i] for i in range(count) for plane in range(width))
+        arrays.append(list(struct.unpack(f"<{count}{form}", part)))
+    return arrays
+
+
+# 9.1 Symbols: "the symbol is base + v, which MUST lie in −K..K."
+def decode_lzma_symbols(data, counts):
+    if not data:
+        return [[] for _ in counts]
+    reader = Reader(data)
+    _, planar = reader.byte(224), reader.byte(1)
+    bases, forms = [], []
+    for count in counts:
+        limited(count, MAX_COUNT, "the symbols of a channel")
+        code = reader.varint(8 * K + 3) if count else 0
+        need(code & 3 < 3, "a channel of 8-byte symbols")
+        bases.append(unzigzag(code >> 2))
+        forms.append(("bhi"[code & 3], count))
+    size = sum(count * struct.calcsize(form) for form, count in forms)
+    arrays = split_numbers(unpack_lzma(reader.take(reader.left), size), forms, planar)
+    channels = [[base + v for v in array] for base, array in zip(bases, arrays)]
+    need(all(abs(k) <= K for channel in channels for k in channel), "a symbol over K")
+    return channels
+
+
+# 9.2 Floats: "Section 6 is the same two bytes, no varints, and one raw LZMA2 stream of binary32 values, one array per
+# plane, weight and bias. Byte planes apply per array. Values MUST be finite."
+def decode_lzma_floats(data, counts):
+    for count in counts:
+        limited(count, MAX_COUNT, "values of an array")
+    reader = Reader(data)
+    _, planar = reader.byte(224), reader.byte(1)
+    raw = unpack_lzma(reader.take(reader.left), 4 * sum(counts))
+    arrays = split_numbers(raw, [("f", count) for count in counts], planar)
+    need(all(math.isfinite(v) for array in arrays for v in array), "a float32 value is not finite")
+    return arrays
+
+
+PULL_STEPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 512)
+AROUND = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]
+PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+
+
+# 10.3 Grids: "A grid of N cells is dense if N < 100, or if its cells have at least 5·N occupied neighbours in all,
+# out of 26 each."
+class Grid:
+    def __init__(self, nodes, level):
+        index = {node: i for i, node in enumerate(nodes)}
+        self.level = level
+        boxes = ([(x + i, y + j, z + k) for i, j, k in AROUND] for x, y, z in nodes)
+        self.near = [[index[cell] for cell in box if cell in index] for box in boxes]
+        self.dense = len(nodes) < 100 or sum(map(len, self.near)) >= 6 * len(nodes)
+        self.cell = list(range(len(nodes)))  # the cell of each node; kept while nodes split
+
+    # 10.4 Prediction: "u_i = c_i << (8 − g) if g ≤ 8, else c_i >> (g − 8)"
+    def measure(self, centres):
+        g = self.level
+        self.units = [[v << (8 - g) if g <= 8 else v >> (g - 8) for v in c] for c in centres]
+        self.sums = [[0] * 10 for _ in self.near]
+        for cell, u in zip(self.cell, self.units):
+            terms = (1, *u, *(u[i] * u[j] for i, j in PAIRS))
+            self.sums[cell] = [a + b for a, b in zip(self.sums[cell], terms)]
+        self.boxes = {}
+
+    # 10.3 Grids: "A node's box in a grid is the 3 × 3 × 3 cells around the cell in which the node lies."
+    def box(self, node):
+        cell = self.cell[node]
+        if cell not in self.boxes:
+            self.boxes[cell] = [sum(column) for column in zip(*(self.sums[c] for c in self.near[cell]))]
+        return self.boxes[cell]
+
+
+# 10.4 Prediction: "For each node before a split along axis a. l_i is the number of unknown bits of coordinate p_i:
+# level − 1 for the axes already halved at this level, else level."
+def predict(nodes, left, axis, grids):
+    """Per node: context of sequence 1, context of sequence 2, 1 if the upper half is expected."""
+    centres = [[(p << (l + 1)) + (1 << l) for p, l in zip(node, left)] for node in nodes]
+    for grid in grids:
+        grid.measure(centres)
+    result = []
+    for node in range(len(nodes)):
+        grid = next((grid for grid in reversed(grids) if grid.box(node)[0] > 7), grids[0])
+        result.append(classify(grid.box(node), grid.units[node], grid.level, left, axis))
+    return result
+
+
+# 10.4 Prediction: "m_i = ((Σ d_i) << 4) // N' C_ij = (((Σ d_i d_j) << 8) // N' − m_i m_j) >> 8, and C_ii += max(2^(2
+# s_i) >> 3, 1) with s_i = max(9 − g + l_i, 0)"
+def classify(box, u, g, left, axis):
+    total, others = box[0], max(box[0] - 1, 1)
+    m = [((box[1 + i] - total * u[i]) << 4) // others for i in range(3)]
+    C = [[0] * 3 for _ in range(3)]
+    for slot, (i, j) in enumerate(PAIRS):
+        moment = box[4 + slot] - u[i] * box[1 + j] - u[j] * box[1 + i] + total * u[i] * u[j]  # appendix C
+        C[i][j] = C[j][i] = ((moment << 8) // others - m[i] * m[j]) >> 8
+    for i in range(3):
+        C[i][i] += max((1 << 2 * max(9 - g + left[i], 0)) >> 3, 1)
+    a, b, c = axis, (axis + 1) % 3, (axis + 2) % 3
+    A = [0] * 3
+    A[a] = C[b][b] * C[c][c] - C[b][c] ** 2
+    A[b] = C[a][c] * C[b][c] - C[a][b] * C[c][c]
+    A[c] = C[a][b] * C[b][c] - C[a][c] * C[b][b]
+    D = max(sum(C[a][j] * A[j] for j in range(3)), 1)
+    P = sum(A[j] * m[j] for j in range(3))
+    return contexts(total - 1, A[a], D, P, g, left, axis)
+
+
+# 10.4 Prediction: "density = clip((3 L − 16 (3 g − l_x − l_y − l_z)) // 12 + 30, 0, 39), L = bits(min(N, 4096)^8) −
+# 1, or 0 for N = 0 scale = clip(g − l_a, 0, 4)"
+def contexts(others, A, D, P, g, left, axis):
+    h = max(8 - g + left[axis], 0)
+    pull = bisect_right(PULL_STEPS, abs(P) // max(D >> h, 1)) if others else 0
+    sharpness = min(max((A << (2 * h + 4)) // D, 0).bit_length(), 9)
+    L = (min(others, 4096) ** 8).bit_length() - 1 if others else 0
+    density = min(max((3 * L - 16 * (3 * g - sum(left))) // 12 + 30, 0), 39)
+    scale = min(max(g - left[axis], 0), 4)
+    return (density, sharpness, min(pull // 3, 4)), (pull, sharpness, scale), int(P > 0)
+
+
+# 10.5 Adaptive bits: "Each of the six families keeps a pair of counts (c0, c1) per context, 0 at the start of the
+# payload."
+class AdaptiveBits:
+    def __init__(self, families):
+        self.families = families  # context -> its keys as (grandparent, parent, context)
+        self.counts = ({}, {}, {})
+
+    # 10.5 Adaptive bits: "p = 32768; for grandparent, parent, context with w = 1, 16, 16: p = (65536 c1 + 256 w p) //
+    # (c0 + c1 + 256 w)"
+    def probability(self, context):
+        p = 32768
+        for counts, key, w in zip(self.counts, self.families(context), (1, 16, 16)):
+            c0, c1 = counts.get(key, (0, 0))
+            p = (65536 * c1 + 256 * w * p) // (c0 + c1 + 256 * w)
+        q = max(min(p, 65536 - p), 16)
+        k = q.bit_length() - 3
+        q = min(((q >> k) << k) + ((1 << k) >> 1), 32768)
+        return q if p < 32768 else 65536 - q
+
+    # 10.5 Adaptive bits: "After the pass every bit adds 256 to its count in its context, parent and grandparent; then
+    # every pair that was added to and has t = c0 + c1 > 12288 becomes (12288 c0 // t, 12288 c1 // t)."
+    def update(self, coded):
+        for family, counts in enumerate(self.counts):
+            touched = {}
+            for context, bit in coded:
+                key = self.families(context)[family]
+                touched[key] = pair = counts.setdefault(key, [0, 0])
+                pair[bit] += 256
+            for key, (c0, c1) in touched.items():
+                if c0 + c1 > 12288:
+                    counts[key] = [12288 * c0 // (c0 + c1), 12288 * c1 // (c0 + c1)]
+
+    # 10.5 Adaptive bits: "With 64 elements or more there are four, of the elements whose index modulo 16 is 0; 1, 2;
+    # 3..6; 7..15; a shorter sequence has one. All tables of a pass are those at its start. Its elements are coded by
+    # ascending P(1), then by index."
+    def decode(self, stream, sequence):
+        bits = [0] * len(sequence)
+        for low, high in ((0, 1), (1, 3), (3, 7), (7, 16)) if len(sequence) >= 64 else ((0, 16),):
+            mine = [i for i in range(len(sequence)) if low <= i % 16 < high]
+            known = {context: self.probability(context) for context in {sequence[i] for i in mine}}
+            for p, i in sorted((known[sequence[i]], i) for i in mine):
+                bits[i] = stream.take(1, (0, TOTAL - 256 * p, TOTAL))[0]
+            self.update([(sequence[i], bits[i]) for i in mine])
+        return bits
+
+
+# 10.1 Payload: "For n = 0 the section is absent. Else: 3 × i32, the minimum of the voxel indices along x, y, z; 3 ×
+# u8, the depth of each axis: bits(largest index − minimum), 0..21; then one ANS stream to the end."
+def decode_positions(data, count):
+    if count == 0:
+        return []
+    reader = Reader(data)
+    low, depths = [reader.number("<i") for _ in range(3)], [reader.byte(21) for _ in range(3)]
+    need(count <= 1 << sum(depths), f"{count} anchors in a box of 2^{sum(depths)}")
+    stream = Ans(reader.take(reader.left))
+    nodes = decode_tree(stream, depths, count)
+    stream.finish()
+    for axis in range(3):
+        coordinates = [node[axis] for node in nodes]
+        need(min(coordinates) == 0 and max(coordinates).bit_length() == depths[axis], "minimum or depth does not fit")
+    cells = [tuple(p + m for p, m in zip(node, low)) for node in nodes]
+    need(all(abs(v) <= MAX_VOXEL for cell in cells for v in cell), "a voxel index over 2^20")
+    return cells
+
+
+# 10.2 Tree: "For level = R .. 1 and, in each, axis = z, y, x, every node is halved along the axis: its coordinate p
+# becomes 2p (lower half), 2p + 1 (upper half), or both in this order. If level exceeds the depth of the axis, it
+# becomes 2p and nothing is coded."
+def decode_tree(stream, depths, count):
+    flags = AdaptiveBits(lambda c: ((c[1] // 2, c[2]), (c[0] // 2, c[1] // 2, c[2]), c))
+    sides = AdaptiveBits(lambda c: (c[0], (c[0], c[2]), c))
+    nodes, grids = [(0, 0, 0)], []
+    for level in range(max(depths), 0, -1):
+        if not grids or grids[-1].dense:
+            grids = [*grids, Grid(nodes, level)][-3:]
+        for axis in (2, 1, 0):
+            if level > depths[axis]:
+                halves = [(0,)] * len(nodes)
+            else:
+                left = [level - 1 if a > axis else level for a in range(3)]
+                halves = decode_split(stream, flags, sides, predict(nodes, left, axis, grids), count)
+            for grid in grids:
+                grid.cell = [cell for cell, own in zip(grid.cell, halves) for _ in own]
+            nodes = [
+                tuple(2 * p + half if a == axis else p for a, p in enumerate(node))
+                for node, own in zip(nodes, halves)
+                for half in own
+            ]
+    need(len(nodes) == count, f"{len(nodes)} anchors, {count} declared")
+    return nodes
+
+
+# 10.2 Tree: "per node of which one half is occupied: 1 if it is the expected one (10.4)." "More than n nodes at any
+# time are Malformed."
+def decode_split(stream, flags, sides, guesses, count):
+    """Per node the halves that are occupied: (0,), (1,) or (0, 1)."""
+    both = flags.decode(stream, [flag for flag, _, _ in guesses]) if len(guesses) < count else [0] * len(guesses)
+    need(len(guesses) + sum(both) <= count, f"more than {count} anchors")
+    hits = iter(sides.decode(stream, [side for (_, side, _), two in zip(guesses, both) if not two]))
+    return [(0, 1) if two else (upper if next(hits) else 1 - upper,) for (_, _, upper), two in zip(guesses, both)]
+
+
+# 11.5 Dequantisation: "x̂ = binary32(binary64(k) · binary64(Q)): the product is exact, and the one rounding is to
+# nearest, ties to even, with subnormal results kept."
+def dequantise(symbols, step):
+    form = f"<{len(symbols)}f"
+    try:
+        return list(struct.unpack(form, struct.pack(form, *(k * step for k in symbols))))
+    except OverflowError:
+        raise Fault("Malformed", "a reconstructed value is not finite") from None
+
+
+# 11.5 Dequantisation: "An anchor's position is dequantised from its voxel index with the voxel size as Q." "Values of
+# section 6 are taken as they are."
+def dequantise_layer(layer):
+    steps = dict(zip([name for name, _ in ATTRIBUTES], layer.header[4])) | {"anchor": layer.header[5]}
+    for name, symbols in layer.symbols.items():
+        if name in dict(ATTRIBUTES):  # [width, n] -> [n, width]
+            symbols = [k for row in range(layer.rows) for k in symbols[row :: layer.rows]]
+        if not name.startswith("mask"):
+            step = steps.get(name) or layer.steps[0 if name.startswith("planes") else -1]
+            layer.tensors[name] = dequantise(symbols, step)
+    layer.tensors |= layer.raw_values
+
+
+# 12.1 Order: "When the last layer asked for has been read: sums of masks, each voxel at most once over all layers,
+# and dequantisation."
+def finish(layers):
+    codes = []
+    for layer in layers:
+        codes = [code + rise for code, rise in zip(codes, layer.symbols["mask_rise"])] + layer.symbols["mask_own"]
+        need(not codes or max(codes) <= 255, "a mask code over 255")
+    anchors = [v for layer in layers for v in layer.symbols["anchor"]]
+    need(len(set(zip(*[iter(anchors)] * 3))) == len(anchors) // 3, "a voxel holds more than one anchor")
+    for layer in layers:
+        dequantise_layer(layer)
+
+
+# 12.1 Order: "Read preamble and header, then the chunks in order."
+# 3.2 Chunks: "Bytes after the last chunk make the file Malformed."
+def decode(data, max_layer=2):
+    """The layers <= max_layer of a file's bytes, each with `symbols` and `tensors` by name, flat and in C order."""
+    header, at = read_preamble(data)
+    layers, scene_id, rows = [], None, 0
+    wanted = [i for i, (kind, _) in enumerate(header[1]) if kind <= max_layer]
+    stop = len(header[1]) if max_layer >= 2 else wanted[-1] + 1
+    for kind, size in header[1][:stop]:
+        payload, scene_id, at = read_chunk(data, at, kind, size, scene_id)
+        if kind < 3:
+            layers.append(read_layer(payload, kind, rows, header))
+            rows += layers[-1].rows
+    need(max_layer < 2 or at == len(data), "bytes follow the last chunk")
+    finish(layers)
+    return layers
+
+
+# 12.4 Hashes: "For conformance, two SHA-256 digests per layer, printed in hexadecimal as a JSON list of {"layer",
+# "symbols", "tensors"}."
+def hashes(data):
+    rows = []
+    for layer in decode(data):
+        symbols, tensors = hashlib.sha256(), hashlib.sha256()
+        for values in layer.symbols.values():
+            symbols.update(struct.pack(f"<{len(values)}i", *values))
+        for values in layer.tensors.values():
+            tensors.update(struct.pack(f"<{len(values)}f", *values))
+        rows.append({"layer": layer.number, "symbols": symbols.hexdigest(), "tensors": tensors.hexdigest()})
+    return rows
+
+
+def main(arguments):
+    if len(arguments) != 1:
+        print("usage: refdec.py FILE", file=sys.stderr)
+        return 2
+    try:
+        with open(arguments[0], "rb") as stream:
+            data = stream.read()
+        print(json.dumps(hashes(data)))
+    except (Fault, OSError) as error:
+        print(f"refdec: {arguments[0]}: {error}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(sys.argv[1:]))

@@ -1,0 +1,228 @@
+"""Checkpoints: they come back whole, run nothing, and are refused in one line when anything about them is wrong."""
+
+from __future__ import annotations
+
+import os
+import stat
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from strategies import LAYER_SETS, make_scene
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("numba")
+
+from pd4dgs_codec.errors import DataError  # noqa: E402
+from pd4dgs_codec.model import checkpoint  # noqa: E402
+from pd4dgs_codec.model.convert import from_scene  # noqa: E402
+
+
+def model(layers=(0, 1, 2), **options):
+    scene = make_scene(3, layers=layers, anchors=7, **options)
+    return from_scene(replace(scene, mask=tuple(np.maximum(m, 3) for m in scene.mask)))
+
+
+@pytest.fixture
+def path(tmp_path) -> Path:
+    """A whole checkpoint."""
+    checkpoint.save(tmp_path / "model.pt", model(), {"iteration": 4})
+    return tmp_path / "model.pt"
+
+
+def refusal(path: Path, *says: str) -> str:
+    """The one line that `load` raises; it names the file."""
+    with pytest.raises(DataError) as caught:
+        checkpoint.load(path)
+    message = str(caught.value)
+    assert str(path) in message
+    for text in says:
+        assert text in message
+    return message
+
+
+@pytest.mark.parametrize("layers", LAYER_SETS)
+@pytest.mark.parametrize("hidden", [(), (4,), (5, 3)])
+def test_round_trip(tmp_path, layers, hidden):
+    saved = model(layers, hidden=hidden, scales=2)
+    training = {"iteration": 4, "state": {"moment": torch.arange(3.0)}, "order": [2, 0, 1]}
+    checkpoint.save(tmp_path / "m.pt", saved, training)
+    loaded, extra = checkpoint.load(tmp_path / "m.pt")
+    expected, got = saved.state_dict(), loaded.state_dict()
+    assert list(got) == list(expected)
+    assert all(torch.equal(got[k], expected[k]) and got[k].dtype == expected[k].dtype for k in expected)
+    assert (loaded.steps, loaded.level) == (saved.steps, saved.level)
+    for name in ("voxel_size", "time_range", "background", "near", "far", "up", "unit"):
+        assert getattr(loaded.info, name) == getattr(saved.info, name), name
+    np.testing.assert_array_equal(loaded.info.box, saved.info.box)
+    np.testing.assert_array_equal(loaded.info.camera.viewmat, saved.info.camera.viewmat)
+    np.testing.assert_array_equal(loaded.info.camera.K, saved.info.camera.K)
+    assert (extra["iteration"], extra["order"]) == (4, [2, 0, 1])
+    assert torch.equal(extra["state"]["moment"], torch.arange(3.0))
+
+
+def test_no_camera_and_no_anchors(tmp_path):
+    scene = make_scene(0, anchors=0, with_camera=False)
+    checkpoint.save(tmp_path / "m.pt", from_scene(scene))
+    loaded, training = checkpoint.load(tmp_path / "m.pt")
+    assert loaded.info.camera is None and len(loaded.anchor_q) == 0 and training == {}
+
+
+# -- files that are refused --------------------------------------------------------------------------------------------
+
+
+class Trap:
+    """Pickles as a call that creates a folder."""
+
+    def __init__(self, target: Path):
+        self.target = target
+
+    def __reduce__(self):
+        return os.mkdir, (str(self.target),)
+
+
+@pytest.mark.parametrize("zipped", [True, False])
+def test_a_pickle_that_wants_to_run_code_is_refused_unrun(path, tmp_path, zipped):
+    target = tmp_path / "ran"
+    content = torch.load(path, weights_only=True)
+    content["training"] = Trap(target)
+    torch.save(content, path, _use_new_zipfile_serialization=zipped)
+    message = refusal(path, "refused")
+    assert not target.exists() and "\n" not in message
+    torch.load(path, weights_only=False)  # the trap works
+    assert target.exists()
+
+
+FOREIGN = {
+    "a dictionary of weights": ({"weights": torch.zeros(3)}, "weights"),
+    "another format": ({"format": "somebody else's", "version": 1}, "format"),
+    "a tensor": (torch.zeros(3), "Tensor"),
+    "a list": ([1, 2], "list"),
+}
+
+
+@pytest.mark.parametrize("kind", FOREIGN)
+def test_checkpoints_of_other_programs(tmp_path, kind):
+    content, says = FOREIGN[kind]
+    torch.save(content, tmp_path / "m.pt")
+    assert "\n" not in refusal(tmp_path / "m.pt", "not a pd4dgs-checkpoint", says)
+
+
+@pytest.mark.parametrize("size", [0, 1, 50, 0.3, 0.9, -1])
+def test_truncated_files(path, size):
+    data = path.read_bytes()
+    path.write_bytes(data[: int(size * len(data)) if isinstance(size, float) else size])
+    assert "\n" not in refusal(path)
+
+
+def test_missing_files_and_folders(tmp_path):
+    refusal(tmp_path / "none.pt", "no such")
+    (tmp_path / "folder.pt").mkdir()
+    refusal(tmp_path / "folder.pt")
+
+
+@pytest.mark.parametrize("value", [float("nan"), float("inf")])
+@pytest.mark.parametrize("name", ["feature", "networks.color.linears.0.bias", "local_deformation.planes.grid"])
+def test_numbers_that_are_not_finite(path, name, value):
+    content = torch.load(path, weights_only=True)
+    content["state"][name].view(-1)[-1] = value
+    torch.save(content, path)
+    assert "\n" not in refusal(path, name, "finite")
+
+
+def without(name):
+    return lambda content: content["state"].pop(name)
+
+
+def reshaped(name, change):
+    return lambda content: content["state"].update({name: change(content["state"][name])})
+
+
+MISSHAPEN = {
+    "no state": lambda content: content.pop("state"),
+    "no info": lambda content: content.pop("info"),
+    "no steps": lambda content: content.pop("steps"),
+    "no deformations": lambda content: content.pop("deformations"),
+    "an unknown step": lambda content: content["steps"].update(color=1.0),
+    "an info without box": lambda content: content["info"].pop("box"),
+    "state is a list": lambda content: content.update(state=[1, 2]),
+    "no anchor_q": without("anchor_q"),
+    "no offset": without("offset"),
+    "no mask_logits": without("mask_logits"),
+    "no colour network": lambda c: [c["state"].pop(k) for k in list(c["state"]) if k.startswith("networks.color.")],
+    "no bias": without("networks.opacity.linears.0.bias"),
+    "no trunk weight": without("global_deformation.trunk.linears.0.weight"),
+    "no planes": without("local_deformation.planes.grid"),
+    "an unknown tensor": lambda content: content["state"].update(extra=torch.zeros(2)),
+    "a row too few": reshaped("feature", lambda a: a[:-1]),
+    "a column too many": reshaped("feature", lambda a: torch.cat([a, a[:, :1]], dim=1)),
+    "two offsets short": reshaped("offset", lambda a: a[:, :8]),
+    "two mask levels": reshaped("mask_logits", lambda a: a[:, :2]),
+    "planes too short": reshaped("global_deformation.planes.grid", lambda a: a[:-1]),
+    "a flat weight": reshaped("networks.color.linears.0.weight", lambda a: a.flatten()),
+    "a bias too long": reshaped("networks.color.linears.1.bias", lambda a: torch.cat([a, a])),
+    "a number for a tensor": reshaped("feature", lambda a: 3.0),
+}
+
+
+@pytest.mark.parametrize("fault", MISSHAPEN)
+def test_missing_and_misshapen_content(path, fault):
+    content = torch.load(path, weights_only=True)
+    MISSHAPEN[fault](content)
+    torch.save(content, path)
+    refusal(path, "missing or misshapen")
+
+
+@pytest.mark.parametrize("version", [0, 2, "1", None])
+def test_other_versions(path, version):
+    content = torch.load(path, weights_only=True)
+    content["version"] = version
+    torch.save(content, path)
+    assert "\n" not in refusal(path, f"version {version!r}", "expected 1")
+
+
+# -- writing -----------------------------------------------------------------------------------------------------------
+
+
+def test_a_full_disk_leaves_the_old_file_and_nothing_else(path, tmp_path, monkeypatch):
+    before = path.read_bytes()
+
+    def fail_midway(content, stream):
+        stream.write(b"half a file")
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr(torch, "save", fail_midway)
+    with pytest.raises(DataError, match="No space left") as caught:
+        checkpoint.save(path, model())
+    assert "\n" not in str(caught.value) and str(path) in str(caught.value)
+    assert path.read_bytes() == before and os.listdir(tmp_path) == ["model.pt"]
+
+
+def test_an_interrupted_write_leaves_the_old_file_and_nothing_else(path, tmp_path, monkeypatch):
+    before = path.read_bytes()
+
+    def interrupted(content, stream):
+        stream.write(b"half a file")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(torch, "save", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        checkpoint.save(path, model())
+    assert path.read_bytes() == before and os.listdir(tmp_path) == ["model.pt"]
+
+
+def test_a_folder_that_is_not_there(tmp_path):
+    with pytest.raises(DataError, match="none"):
+        checkpoint.save(tmp_path / "none" / "m.pt", model())
+
+
+@pytest.mark.skipif(os.name != "posix", reason="file modes")
+@pytest.mark.parametrize("umask", [0o022, 0o077])
+def test_the_file_is_as_readable_as_the_umask_says(tmp_path, umask):
+    previous = os.umask(umask)
+    try:
+        checkpoint.save(tmp_path / "m.pt", model())
+    finally:
+        os.umask(previous)
+    assert stat.S_IMODE((tmp_path / "m.pt").stat().st_mode) == 0o666 & ~umask

@@ -1,0 +1,338 @@
+"""The graph: levels, residuals, gate, culling; the model against numpy, against its scene and against its file."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("numba")
+
+from pd4dgs_codec import decode, encode  # noqa: E402
+from pd4dgs_codec.codec.evaluate import residuals  # noqa: E402
+from pd4dgs_codec.errors import DataError  # noqa: E402
+from pd4dgs_codec.model import model as graph  # noqa: E402
+from pd4dgs_codec.model.config import DeformationConfig  # noqa: E402
+from pd4dgs_codec.model.convert import from_scene, to_scene  # noqa: E402
+from pd4dgs_codec.model.deformation import DeformationField  # noqa: E402
+from pd4dgs_codec.model.layers import level_mask, mask_logits  # noqa: E402
+from pd4dgs_codec.model.model import Model, fresh_networks  # noqa: E402
+from pd4dgs_codec.render.picture import render_image  # noqa: E402
+from pd4dgs_codec.scene import (  # noqa: E402
+    GLOBAL_HEADS,
+    LOCAL_HEADS,
+    MASK_STEP,
+    MASK_THRESHOLD,
+    Camera,
+    SceneInfo,
+    Steps,
+)
+
+WIDTH, HEIGHT = 40, 30
+VOXEL = 2.0**-6
+BOX = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 1.5]], np.float32)
+VIEWMAT = torch.eye(4)
+VIEWMAT[2, 3] = 4.0
+K = torch.tensor([[40.0, 0, 19.5], [0, 40.0, 15.5], [0, 0, 1]])
+FLAT = (200, 200, 200)  #: one mask at all levels
+
+
+ALL_HEADS = (tuple(GLOBAL_HEADS), tuple(LOCAL_HEADS))
+
+
+def small_model(heads=ALL_HEADS, masks=FLAT, *, anchors=80, seed=0, channels=8, reach=1.0, opacity=1.0) -> Model:
+    """An untrained model with `anchors` of different looks within +-reach; masks: codes per level, for all anchors or
+    [anchors, 3]. Deformations without heads are None."""
+    torch.manual_seed(seed)
+    rng = np.random.default_rng(seed)
+    side = int(reach / VOXEL)
+    cells = np.unique(rng.integers(-side, side + 1, (2 * anchors, 3), dtype=np.int32), axis=0)
+    cells = rng.permutation(cells)[:anchors]
+    camera = Camera(VIEWMAT.numpy(), K.numpy(), WIDTH, HEIGHT)
+    info = SceneInfo(VOXEL, BOX, (0.0, 1.0), (0.25, 0.5, 0.75), 0.125, 64.0, (0.0, -1.0, 0.0), 0.0, camera)
+    networks = fresh_networks(16)
+    torch.nn.init.constant_(networks["opacity"].linears[-1].bias, opacity)
+    config = DeformationConfig(5, 4, channels, (1, 2), 8, ())
+    fields = [
+        DeformationField.fresh(replace(config, heads=names), BOX, widths, 0.02) if names else None
+        for names, widths in zip(heads, (GLOBAL_HEADS, LOCAL_HEADS), strict=True)
+    ]
+    codes = np.broadcast_to(np.asarray(masks, np.float64), (anchors, 3)) * MASK_STEP
+    values = [0.5 * rng.normal(size=shape) for shape in ((anchors, 32), (anchors, 6), (anchors, 10, 3))]
+    feature, scaling_log, offset = (torch.from_numpy(v.astype(np.float32)) for v in values)
+    logits = torch.from_numpy(mask_logits(codes))
+    steps = Steps().scaled(1.0)
+    return Model(info, steps, torch.from_numpy(cells), feature, scaling_log - 2.5, offset, logits, networks, *fields)
+
+
+@torch.no_grad()
+def stir(model: Model, amount: float, seed: int = 1) -> Model:
+    """Gives every deformation planes that vary and heads that move things by about `amount`."""
+    generator = torch.Generator().manual_seed(seed)
+    for field in (model.global_deformation, model.local_deformation):
+        if field is not None:
+            field.planes.grid.copy_(0.5 + torch.rand(field.planes.grid.shape, generator=generator))
+            for head in field.heads.values():
+                for parameter in head.parameters():
+                    parameter.copy_(amount * (torch.rand(parameter.shape, generator=generator) - 0.5))
+    return model
+
+
+@torch.no_grad()
+def gaussians(model: Model, level: int, t: float = 0.3, viewmat=VIEWMAT):
+    return model.gaussians(level, t, viewmat, K, WIDTH, HEIGHT)
+
+
+def picture(model: Model, level: int, t: float = 0.3, viewmat=VIEWMAT) -> np.ndarray:
+    image = render_image(model, level, t, viewmat.numpy(), K.numpy(), WIDTH, HEIGHT)
+    assert np.abs(image - model.info.background).max() > 0.1  # something is drawn, or the tests compare nothing
+    return image
+
+
+def set_bias(field: DeformationField, head: str) -> torch.Tensor:
+    """Makes the head answer one constant everywhere, and returns it."""
+    bias = field.heads[head].linears[0].bias
+    with torch.no_grad():
+        bias.copy_(0.1 * torch.cos(torch.arange(len(bias)) + 0.5))
+    return bias.detach().clone()
+
+
+# -- levels ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("t", [0.0, 0.37, 1.0])
+def test_a_fresh_model_looks_the_same_at_every_level(t):
+    model = small_model()
+    assert model.level == 2
+    base = picture(model, 0, t)
+    for level in (1, 2):
+        np.testing.assert_allclose(picture(model, level, t), base, atol=1e-6)
+
+
+def test_a_fresh_model_differs_between_levels_by_its_gate_alone():
+    model = small_model(masks=(100, 150, 250), opacity=2.0)  # no Gaussian so faint that a gate hides it
+    low, high = gaussians(model, 0), gaussians(model, 2)
+    assert torch.equal(low.slots, high.slots) and len(low.slots) == 800
+    for name in ("means", "quats", "colors"):
+        torch.testing.assert_close(getattr(low, name), getattr(high, name), rtol=0, atol=1e-6)
+    for name in ("opacities", "scales"):
+        torch.testing.assert_close(getattr(high, name), 2.5 * getattr(low, name), rtol=1e-4, atol=1e-7)
+
+
+@given(hnp.arrays(np.float32, (4, 3), elements=st.floats(-100, 100, width=32)))
+@settings(max_examples=40)
+def test_masks_never_fall_from_level_to_level(logits):
+    masks = torch.stack([level_mask(torch.from_numpy(logits), level) for level in range(3)])
+    assert (masks >= 0).all() and (masks <= 1).all()
+    assert (masks[1:] >= masks[:-1]).all()
+
+
+@given(hnp.arrays(np.float64, (5, 3), elements=st.floats(0, 1)))
+@settings(max_examples=40)
+def test_mask_logits_invert_level_mask(masks):
+    masks = np.sort(masks, axis=1)
+    logits = torch.from_numpy(mask_logits(masks))
+    for level in range(3):
+        np.testing.assert_allclose(level_mask(logits, level).numpy(), masks[:, level], atol=1.5e-6)
+
+
+def test_only_anchors_above_the_threshold_take_part():
+    codes = np.tile(np.array([[0, 0, 3], [0, 3, 200], [3, 3, 3], [2, 2, 2]]), (20, 1))
+    model = small_model(masks=codes)
+    for level in range(3):
+        evaluated = gaussians(model, level).anchors.tolist()
+        assert evaluated == [i for i in range(80) if codes[i, level] * MASK_STEP > MASK_THRESHOLD]
+
+
+# -- global deformation ------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("head", ["feature", "offset", "scaling"])
+def test_a_global_residual_is_added_to_its_attribute(head):
+    model, plain = small_model(), small_model()
+    bias = set_bias(model.global_deformation, head)
+    attribute = plain.scaling_log if head == "scaling" else getattr(plain, head)
+    with torch.no_grad():
+        attribute += bias.view(attribute.shape[1:])
+    got, expected = gaussians(model, 1), gaussians(plain, 0)
+    assert torch.equal(got.slots, expected.slots)
+    for name in ("means", "quats", "scales", "opacities", "colors"):
+        torch.testing.assert_close(getattr(got, name), getattr(expected, name), rtol=1e-5, atol=1e-5)
+    assert not np.allclose(picture(model, 1), picture(model, 0), atol=1e-3)
+
+
+def test_the_global_position_residual_moves_anchors_and_the_view_direction():
+    """Moving every anchor by b is moving the camera by -b, the networks' view direction included."""
+    model = small_model()
+    bias = set_bias(model.global_deformation, "position")
+    moved = gaussians(model, 1)
+    viewmat = VIEWMAT.clone()
+    viewmat[:3, 3] += viewmat[:3, :3] @ bias
+    expected = gaussians(model, 0, viewmat=viewmat)
+    assert torch.equal(moved.slots, expected.slots)
+    torch.testing.assert_close(moved.means, expected.means + bias, rtol=0, atol=1e-6)
+    for name in ("quats", "scales", "opacities", "colors"):
+        torch.testing.assert_close(getattr(moved, name), getattr(expected, name), rtol=1e-5, atol=1e-6)
+    np.testing.assert_allclose(picture(model, 1), picture(model, 0, viewmat=viewmat), atol=1e-4)
+    assert (gaussians(model, 0).colors - moved.colors).abs().max() > 1e-4
+
+
+# -- local deformation -------------------------------------------------------------------------------------------------
+
+ACTIVATIONS = {
+    "mean": ("means", lambda x: x),
+    "scale": ("scales", lambda x: x.clamp(min=0)),
+    "quat": ("quats", lambda x: x / x.norm(dim=1, keepdim=True)),
+    "opacity": ("opacities", lambda x: x.clamp(0, 1)),
+    "color": ("colors", lambda x: x.clamp(0, 1)),
+}
+
+
+@pytest.mark.parametrize("head", LOCAL_HEADS)
+@pytest.mark.parametrize("alone", [False, True])
+def test_a_local_residual_changes_its_own_quantity_before_the_gate(head, alone):
+    """After the global deformation, and with `alone` in a model that has no other local head."""
+    model = stir(small_model((tuple(GLOBAL_HEADS), (head,) if alone else tuple(LOCAL_HEADS))), 0.1)
+    with torch.no_grad():
+        for name, net in model.local_deformation.heads.items():
+            for parameter in net.parameters():
+                parameter.mul_(0 if name != head else 1)
+    assert set(model.local_deformation.heads) == ({head} if alone else set(LOCAL_HEADS))
+    before, after = gaussians(model, 1), gaussians(model, 2)
+    assert torch.equal(before.slots, after.slots)
+    gate = 200 / 255
+    with torch.no_grad():
+        residual = model.local_deformation(before.means, 0.3)[head]
+    for name, (quantity, activate) in ACTIVATIONS.items():
+        expected = getattr(before, quantity)
+        if name == head:
+            gated = gate if quantity in ("scales", "opacities") else 1.0
+            expected = activate(expected / gated + residual.view(expected.shape)) * gated
+            assert (expected - getattr(before, quantity)).abs().max() > 1e-3
+        torch.testing.assert_close(getattr(after, quantity), expected, rtol=1e-4, atol=1e-5)
+
+
+def test_the_gate_comes_after_the_local_residuals():
+    """Residuals that push opacity and scale past their bounds: the gate must still scale what the clamps leave."""
+    model = small_model(masks=(51, 51, 51))
+    with torch.no_grad():
+        model.local_deformation.heads["opacity"].linears[0].bias.fill_(5.0)
+        model.local_deformation.heads["scale"].linears[0].bias.copy_(torch.tensor([-100.0, 0.0, 3.0]))
+    got, before = gaussians(model, 2), gaussians(model, 1)
+    torch.testing.assert_close(got.opacities, torch.full_like(got.opacities, 0.2), rtol=1e-5, atol=0)
+    assert (got.scales[:, 0] == 0).all()
+    torch.testing.assert_close(got.scales[:, 1], before.scales[:, 1])
+    torch.testing.assert_close(got.scales[:, 2], before.scales[:, 2] + 0.6, rtol=1e-5, atol=1e-6)
+
+
+@pytest.mark.parametrize("head", GLOBAL_HEADS)
+def test_each_global_head_can_stand_alone(head):
+    model = stir(small_model(((head,), ())), 0.3)
+    assert set(model.global_deformation.heads) == {head} and model.level == 1
+    assert not np.allclose(picture(model, 1), picture(model, 0), atol=1e-3)
+    np.testing.assert_array_equal(picture(model, 2), picture(model, 1))
+
+
+def test_a_level_without_deformation_is_the_level_below():
+    model = stir(small_model(((), tuple(LOCAL_HEADS))), 0.1)
+    np.testing.assert_array_equal(picture(model, 1), picture(model, 0))
+    assert not np.allclose(picture(model, 2), picture(model, 1), atol=1e-3)
+    assert small_model(((), ())).level == 0
+
+
+# -- what is not evaluated ---------------------------------------------------------------------------------------------
+
+
+def everything(model, level, *_):
+    return (model.masks(level) > MASK_THRESHOLD).nonzero()[:, 0]
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_culling_changes_no_pixel(level, monkeypatch):
+    """Anchors all around the camera, some of them half in the picture."""
+    model = stir(small_model(anchors=1500, reach=3.0), 0.02)
+    viewmats = []
+    for angle in (0.3, 2.0, 4.1):
+        viewmat = torch.eye(4)
+        c, s = float(np.cos(angle)), float(np.sin(angle))
+        viewmat[:3, :3] = torch.tensor([[c, 0, -s], [0, 1, 0], [s, 0, c]])
+        viewmats.append(viewmat)
+    culled = [(picture(model, level, viewmat=v), len(gaussians(model, level, viewmat=v).anchors)) for v in viewmats]
+    monkeypatch.setattr(Model, "visible", everything)
+    for viewmat, (image, evaluated) in zip(viewmats, culled, strict=True):
+        assert 0 < evaluated < 750  # fewer than half
+        np.testing.assert_allclose(picture(model, level, viewmat=viewmat), image, atol=1e-5)
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_faint_gaussians_left_out_change_no_pixel(level, monkeypatch):
+    """At level 2 without the opacity head, which could raise them: the set is fixed before the residuals."""
+    model = stir(small_model((tuple(GLOBAL_HEADS), ("mean", "scale", "quat", "color")), opacity=0.0), 0.05)
+    with torch.no_grad():  # from clearly negative over just visible to opaque
+        model.networks["opacity"].linears[-1].bias.copy_(torch.linspace(-0.3, 0.4, 10))
+    image, kept = picture(model, level), len(gaussians(model, level).slots)
+    monkeypatch.setattr(graph, "MIN_OPACITY", -2.0)
+    assert 0.2 * 800 < kept < 0.8 * len(gaussians(model, level).slots)
+    np.testing.assert_allclose(picture(model, level), image, atol=1e-5)
+
+
+# -- the model elsewhere -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("channels", [8, 3])
+def test_the_numpy_evaluation_equals_the_torch_field(channels):
+    """Inside the box, on its corners, outside it; at and beyond both ends of time."""
+    model = stir(small_model(channels=channels), 0.7)
+    points = np.random.default_rng(4).uniform(-2, 2, (200, 3)).astype(np.float32)
+    points[:2] = BOX
+    for field in (model.global_deformation, model.local_deformation):
+        for t in (-0.5, 0.0, 0.123, 0.5, 1.0, 2.0):
+            with torch.no_grad():
+                expected = field(torch.from_numpy(points), t)
+            got = residuals(field.arrays(), BOX, points, t)
+            assert set(got) == set(expected)
+            for name in got:
+                np.testing.assert_allclose(got[name], expected[name].numpy(), rtol=0, atol=1e-5, err_msg=name)
+                assert np.abs(got[name]).max() > 0.1
+
+
+MIXED = np.sort(np.random.default_rng(9).choice(np.array([0, 3, 4, 90, 255]), (80, 3)), axis=1)
+
+
+@pytest.mark.parametrize(
+    "heads,layers",
+    [
+        ((("position",), ("mean", "color")), (0, 1, 2)),
+        (((), ("scale",)), (0, 2)),
+        ((tuple(GLOBAL_HEADS), ()), (0, 1)),
+        (((), ()), (0,)),
+    ],
+)
+def test_the_model_of_its_scene_renders_the_same(heads, layers):
+    model = stir(small_model(heads, MIXED), 0.2)
+    scene = to_scene(model)
+    assert scene.layers == layers
+    again = from_scene(scene)
+    for level in layers:
+        for t in (0.0, 0.61):
+            np.testing.assert_allclose(picture(again, level, t), picture(model, level, t), atol=1e-5)
+
+
+def test_a_decoded_file_encodes_to_the_same_bytes_also_through_the_model():
+    options = {"effort": 1, "priors": "gauss"}
+    data = encode(to_scene(stir(small_model(masks=MIXED), 0.5)), **options)
+    decoded = decode(data)
+    assert decoded.layers == (0, 1, 2)
+    assert encode(decoded, **options) == data
+    assert encode(to_scene(from_scene(decoded)), **options) == data
+
+
+def test_a_model_with_a_nan_becomes_no_scene():
+    model = small_model()
+    with torch.no_grad():
+        model.offset[3, 1, 0] = float("nan")
+    with pytest.raises(DataError, match="offset"):
+        to_scene(model)

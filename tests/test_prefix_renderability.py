@@ -1,0 +1,173 @@
+"""Every layer prefix of any file decodes to what max_layer gives and renders: a finite picture at any time.
+
+Scenes whose numbers overflow float32 on the way to a picture may instead be refused with one clear RenderError.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import LAYER_SETS, RANGES, assert_same_scene, make_scene, scenes
+
+pytest.importorskip("torch")
+pytest.importorskip("numba")
+
+from pd4dgs_codec import decode, encode  # noqa: E402
+from pd4dgs_codec.codec.decoder import decode_layers  # noqa: E402
+from pd4dgs_codec.codec.info import info  # noqa: E402
+from pd4dgs_codec.errors import RenderError  # noqa: E402
+from pd4dgs_codec.model.convert import from_scene  # noqa: E402
+from pd4dgs_codec.render.picture import render_image  # noqa: E402
+from pd4dgs_codec.scene import Camera, Scene  # noqa: E402
+
+WIDTH, HEIGHT = 24, 16
+#: Normalised times; those outside 0..1 are clamped to it.
+TIMES = (-2.5, 0.0, 0.3, 1.0, 17.0)
+
+
+def own_camera(scene: Scene) -> Camera:
+    """The file's own camera with a small picture."""
+    camera = scene.info.camera
+    assert camera is not None
+    shrink = np.array([[WIDTH / camera.width], [HEIGHT / camera.height], [1]], np.float32)
+    return Camera(camera.viewmat, camera.K * shrink, WIDTH, HEIGHT)
+
+
+def camera_near(scene: Scene, seed: int) -> Camera:
+    """Any rotation, looking at one of the anchors from nearby or from within."""
+    rng = np.random.default_rng(seed)
+    rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    rotation[0] *= np.linalg.det(rotation)
+    target = rng.permutation(scene.anchor)[0] if len(scene.anchor) else np.zeros(3)
+    viewmat = np.eye(4)
+    viewmat[:3, :3], viewmat[:3, 3] = rotation, [0, 0, rng.choice([0.01, 0.5, 4.0])] - rotation @ target
+    f = 10 ** rng.uniform(0, 3)
+    K = np.array([[f, 0, WIDTH / 2], [0, f, HEIGHT / 2], [0, 0, 1]], np.float32)
+    return Camera(viewmat.astype(np.float32), K, WIDTH, HEIGHT)
+
+
+def shoot(model, level: int, t: float, camera: Camera, may_refuse: bool = False) -> np.ndarray | None:
+    """The picture, which must be finite and in 0..1; None if the renderer refuses it in one line and may."""
+    try:
+        image = render_image(model, level, t, camera.viewmat, camera.K, camera.width, camera.height)
+    except RenderError as error:
+        assert may_refuse and "not finite" in str(error) and "\n" not in str(error)
+        return None
+    assert image.shape == (HEIGHT, WIDTH, 3) and image.dtype == np.float32
+    assert np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1
+    return image
+
+
+def prefixes(data: bytes) -> list[tuple[int, Scene]]:
+    """(layer, scene) per layer prefix of the file, from the prefix's bytes alone."""
+    return [(row["layer"], decode(data[: row["end"]], max_layer=row["layer"])) for row in info(data)["layers"]]
+
+
+def largest_value(scene: Scene) -> float:
+    """The largest magnitude of a feature, log scaling, plane cell or weight."""
+    arrays = [scene.feature, scene.scaling_log, *(a for net in scene.networks.values() for pair in net for a in pair)]
+    for field in (scene.global_deformation, scene.local_deformation):
+        if field is not None:
+            arrays += [plane for scale in field.planes for plane in scale.values()]
+            arrays += [a for net in field.networks.values() for pair in net for a in pair]
+    return max((float(np.abs(a).max()) for a in arrays if a.size), default=0.0)
+
+
+@given(scenes())
+@settings(max_examples=8)
+def test_prefixes_decode_to_the_symbols_and_floats_of_max_layer(scene):
+    data = encode(scene, layers=2, effort=1, verify=False)
+    whole = decode_layers(data)[1]
+    for i, (layer, got) in enumerate(prefixes(data)):
+        assert_same_scene(got, decode(data, max_layer=layer))
+        symbols = decode_layers(data[: info(data)["layers"][i]["end"]], max_layer=layer)[1]
+        assert [s.kind.layer for s in symbols] == list(got.layers)
+        for a, b in zip(symbols, whole[: i + 1], strict=True):
+            assert a.steps == b.steps and len(a.arrays()) == len(b.arrays())
+            assert all(x.dtype == y.dtype and np.array_equal(x, y) for x, y in zip(a.arrays(), b.arrays(), strict=True))
+
+
+@given(scenes(), st.integers(0, 2**32 - 1), st.floats(-10, 10, width=32))
+@settings(max_examples=25)
+def test_every_prefix_renders_at_any_time_from_any_camera(scene, seed, t):
+    data = encode(scene, layers=2, effort=1, verify=False)
+    for layer, prefix in prefixes(data):
+        model = from_scene(prefix)
+        may_refuse = largest_value(prefix) > 1e4
+        cameras = [camera_near(prefix, seed)] + ([own_camera(prefix)] if prefix.info.camera else [])
+        for camera in cameras:
+            pictures = [shoot(model, layer, time, camera, may_refuse) for time in (*TIMES, t)]
+            for outside, border in ((0, 1), (-2, -3)):
+                np.testing.assert_equal(pictures[outside], pictures[border])
+
+
+@pytest.mark.parametrize("channels", [2, 8])
+@pytest.mark.parametrize("layers", LAYER_SETS)
+def test_prefixes_of_a_visible_scene_show_something_at_their_level(layers, channels):
+    """8 channels go through the kernels, 2 through the reference. A level whose layer is missing looks like the one
+    below it, and a moving layer moves."""
+    scene = visible_scene(layers, channels)
+    camera = camera_at(scene)
+    data = encode(scene, layers=2, effort=1)
+    for layer, prefix in prefixes(data):
+        model = from_scene(prefix)
+        image = shoot(model, layer, 0.0, camera)
+        assert image is not None and np.abs(image - np.array(prefix.info.background, np.float32)).max() > 0.1
+        for above in range(layer + 1, 3):
+            np.testing.assert_array_equal(shoot(model, above, 0.0, camera), image)
+        moves = shoot(model, layer, 0.7, camera)
+        assert np.array_equal(moves, image) == (layer == 0)
+        np.testing.assert_array_equal(shoot(model, layer, -1.0, camera), image)
+
+
+@pytest.mark.parametrize("kind", RANGES)
+@pytest.mark.parametrize("anchors", [0, 1])
+def test_the_empty_and_the_one_anchor_file(kind, anchors):
+    data = encode(make_scene(11, kind=kind, anchors=anchors), layers=2, effort=1, verify=False)
+    for layer, prefix in prefixes(data):
+        model, camera = from_scene(prefix), own_camera(prefix)
+        for t in TIMES:
+            image = shoot(model, layer, t, camera, may_refuse=kind == "huge")
+            if len(prefix.anchor_q) == 0:
+                np.testing.assert_array_equal(image, np.broadcast_to(np.float32(prefix.info.background), image.shape))
+
+
+@given(st.integers(0, 2**32 - 1))
+@settings(max_examples=4)
+def test_log_scalings_beyond_float32_leave_pictures_finite(seed):
+    """exp overflows from 88.7 on: such a Gaussian is skipped, the rest of the picture stays."""
+    rng = np.random.default_rng(seed)
+    scene = visible_scene((0, 1, 2), 2, seed=seed % 97)
+    some = rng.random(scene.scaling_log.shape) < 0.1
+    step = scene.steps.scaling_log
+    extreme = rng.choice(np.array([-(1 << 23), -4000, 2800, 2839, 2840, 4000, 1 << 23]), scene.scaling_log.shape) * step
+    scene = replace(scene, scaling_log=np.where(some, extreme, scene.scaling_log).astype(np.float32))
+    for layer, prefix in prefixes(encode(scene, layers=2, effort=1, verify=False)):
+        model = from_scene(prefix)
+        for t in (0.0, 0.6):
+            assert shoot(model, layer, t, camera_at(scene)) is not None
+
+
+def visible_scene(layers: tuple[int, ...], channels: int, seed: int = 0) -> Scene:
+    """Forty opaque Gaussians or more near the origin, deformed gently."""
+    scene = make_scene(seed, layers=layers, anchors=40, extent=60, channels=channels, width=8, with_camera=False)
+    rng = np.random.default_rng(seed)
+    scaling_log = np.float32(-2.0) + scene.scaling_log
+    networks = dict(scene.networks)
+    weight, bias = networks["opacity"][-1]
+    networks["opacity"] = (*networks["opacity"][:-1], (weight, np.full_like(bias, 1.0)))
+    codes = np.sort(rng.choice(np.array([0, 100, 255], np.uint8), (len(scaling_log), len(layers))), axis=1)
+    codes[: len(codes) // 2] = 255
+    return replace(scene, scaling_log=scaling_log, networks=networks, mask=tuple(codes.T.copy()))
+
+
+def camera_at(scene: Scene) -> Camera:
+    """Looks at the origin from a distance of 2."""
+    viewmat = np.eye(4, dtype=np.float32)
+    viewmat[2, 3] = 2
+    K = np.array([[20, 0, WIDTH / 2], [0, 20, HEIGHT / 2], [0, 0, 1]], np.float32)
+    return Camera(viewmat, K, WIDTH, HEIGHT)

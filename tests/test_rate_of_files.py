@@ -1,0 +1,116 @@
+"""What files of Gaussian scenes cost: against the rate model, against the better priors, against LZMA, and against the
+trainer's own sum."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from strategies import make_scene
+
+from pd4dgs_codec.codec.encoder import Report, encode_with_report
+from pd4dgs_codec.scene import Deformation, Network, Scene
+
+VARIANTS = {"best": {}, "gauss": {"priors": "gauss"}, "lzma": {"mode": "lzma"}}
+#: Spread of a channel over its step, from nearly constant to seven bits a symbol.
+SPREADS = 2.0 ** np.linspace(-0.5, 5.0, 68)
+
+
+@cache
+def gaussian_scene() -> Scene:
+    """16,000 anchors, a third of them new at each level, all channels Gaussian with means and spreads of their own;
+    Gaussian weights, and planes that are Gaussian noise around 1."""
+    rng = np.random.default_rng(21)
+    scene = make_scene(21, anchors=16_000, extent=500, hidden=(32,), channels=4, sides=(12, 12, 12, 8), width=32)
+    n = len(scene.anchor_q)
+    steps = {name: getattr(scene.steps, name) for name in ("feature", "scaling_log", "offset")}
+    step = np.repeat([*steps.values()], [32, 6, 30])
+    values = step * (rng.normal(0, 20, 68) + SPREADS * rng.normal(size=(n, 68)))
+    feature, scaling_log, offset = np.split(values.astype(np.float32), [32, 38], axis=1)
+    first = rng.integers(0, 3, n)
+    own = rng.integers(40, 250, n)
+    mask = tuple(np.where(first <= level, own + level, 0).astype(np.uint8) for level in range(3))
+    return replace(
+        scene,
+        feature=feature,
+        scaling_log=scaling_log,
+        offset=offset.reshape(n, 10, 3),
+        mask=mask,
+        networks={k: _gaussian_network(rng, net, scene.steps.weights_scaffold) for k, net in scene.networks.items()},
+        global_deformation=_gaussian_deformation(rng, scene.global_deformation, scene.steps.planes_global),
+        local_deformation=_gaussian_deformation(rng, scene.local_deformation, scene.steps.planes_local),
+    )
+
+
+def _gaussian_network(rng: np.random.Generator, network: Network, step: float) -> Network:
+    return tuple(
+        (rng.normal(0, 6 * step, w.shape).astype(np.float32), rng.normal(0, 6 * step, b.shape).astype(np.float32))
+        for w, b in network
+    )
+
+
+def _gaussian_deformation(rng: np.random.Generator, field: Deformation | None, step: float) -> Deformation:
+    assert field is not None
+    planes = tuple(
+        {name: rng.normal(1, 4 * step, plane.shape).astype(np.float32) for name, plane in scale.items()}
+        for scale in field.planes
+    )
+    networks = {name: _gaussian_network(rng, network, 2.0**-6) for name, network in field.networks.items()}
+    return Deformation(planes, networks)
+
+
+@cache
+def report(variant: str) -> Report:
+    return encode_with_report(gaussian_scene(), verify=False, effort=5, **VARIANTS[variant])[1]
+
+
+def streams(variant: str, layer: int) -> dict[str, int]:
+    return {s.name: s.payload_bits for s in report(variant).layers[layer].streams}
+
+
+@pytest.mark.parametrize("layer", [0, 1, 2])
+def test_gaussian_priors_spend_what_the_rate_model_says(layer):
+    row = report("gauss").layers[layer]
+    assert row.layer == layer and row.anchors > 5000 and row.rate_bits > 1e6
+    assert 0.999 * row.rate_bits <= row.payload_bits <= 1.005 * row.rate_bits
+
+
+@pytest.mark.parametrize("layer", [0, 1, 2])
+def test_the_best_priors_never_spend_more(layer):
+    assert report("best").layers[layer].payload_bits <= report("gauss").layers[layer].payload_bits
+    best, gauss = streams("best", layer), streams("gauss", layer)
+    assert set(best) == set(gauss) and "masks" in best
+    for name in best:
+        assert best[name] <= gauss[name], name
+
+
+def test_ans_beats_lzma_on_the_same_symbols():
+    """Masks included (LZMA codes them in the same stream), positions aside."""
+    ans, lzma = (sum(sum(streams(v, layer).values()) for layer in range(3)) for v in ("best", "lzma"))
+    assert ans <= 0.97 * lzma
+    assert report("best").bytes < report("lzma").bytes
+
+
+def test_the_modes_report_the_same_symbols_and_rate():
+    """A layer's rate counts attributes, planes and weights, whatever the mode."""
+    for layer in range(3):
+        ans, lzma = report("best").layers[layer], report("lzma").layers[layer]
+        assert ans.rate_bits == pytest.approx(report("gauss").layers[layer].rate_bits)
+        assert lzma.rate_bits == pytest.approx(ans.rate_bits)
+        assert (ans.anchors, ans.position_bits) == (lzma.anchors, lzma.position_bits)
+
+
+def test_the_trainers_rate_is_the_coders_rate():
+    """On values that were never rounded, layer by layer and part by part, within 2 %."""
+    pytest.importorskip("torch")
+    from pd4dgs_codec.report.rate import train_rate_bits
+
+    for own, row in zip(train_rate_bits(gaussian_scene()), report("gauss").layers, strict=True):
+        assert own["layer"] == row.layer
+        coded = {s.name: s.rate_bits for s in row.streams}
+        parts = {"attributes"} | ({"planes", "weights"} if row.layer else {"weights"})
+        for part in parts:
+            assert own[part] == pytest.approx(coded[part], rel=0.02), (row.layer, part)
+        assert sum(own[part] for part in parts) == pytest.approx(row.rate_bits, rel=0.02)
