@@ -1,4 +1,4 @@
-"""Measures what the README's tables show, on the scenes named there; writes docs/results.md, its plot and pictures.
+"""Measures what the README's tables show; writes them there and, with plot and pictures, into docs/results.md.
 
     python tools/results.py [--only NAME ...] [--seconds 600] [--out out] [--docs docs]
 
@@ -29,6 +29,8 @@ SCENES = (
 )
 #: Bytes per layer that the PD-4DGS paper publishes (average over the seven Dycheck iPhone scenes).
 PUBLISHED = (436_000, 1_187_000, 5_275_000)
+#: The tables of README.md stand between these lines.
+MARKERS = ("<!-- results: written by tools/results.py -->", "<!-- end of results -->")
 
 
 def main(argv: list[str] | None = None) -> int:
@@ -91,8 +93,17 @@ def write(results: list[dict[str, Any]], out: Path, docs: Path, threads: int) ->
         lines += [f"- left out: {row['what']} ({row['bytes']:,} bytes): {row['why']}" for row in result["left_out"]]
         lines += [f"- {result['iterations']} iterations, rho {result['rho']:.3f}, {result['skipped_steps']} skipped steps", ""]
     (docs / "results.md").write_text("\n".join(lines))
+    if len(results) == len(SCENES):  # a partial run must not replace the whole table
+        _fill_readme(docs.parent / "README.md", [quality_table(results), coding_table(results)])
     slim = [{k: v for k, v in r.items() if k != "source"} for r in results]
     (docs / "results.json").write_text(json.dumps(slim, indent=1) + "\n")
+
+
+def _fill_readme(readme: Path, tables: list[str]) -> None:
+    """Puts the tables between the README's two result markers."""
+    before, rest = readme.read_text().split(MARKERS[0])
+    after = rest.split(MARKERS[1])[1]
+    readme.write_text(before + MARKERS[0] + "\n\n" + "\n\n".join(tables) + "\n\n" + MARKERS[1] + after)
 
 
 def _paper_lines(result: dict[str, Any], markdown: Any) -> list[str]:

@@ -22,8 +22,9 @@ from pd4dgs_codec.scene import FEATURE_DIM, MASK_THRESHOLD, N_OFFSETS, SCAFFOLD_
 
 #: A Gaussian fainter than this never reaches a pixel (the rasteriser's threshold), so its networks are not evaluated.
 MIN_OPACITY = 1.0 / 255.0
-#: Every Gaussian starts about this opaque.
-START_OPACITY = 0.1
+#: Opacities of an anchor's ten Gaussians start spread between these: some are seen everywhere, and not all are, since
+#: they start at one place.
+START_OPACITY = (-0.25, 0.15)
 #: Anchors farther outside the image than this share of its size (plus their own extent) are not evaluated.
 FRUSTUM_MARGIN = 0.15
 
@@ -233,5 +234,7 @@ def fresh_networks(hidden: int) -> dict[str, MLP]:
     """The scaffold's decoders, untrained: input [feature 32, view direction 3]."""
     width = FEATURE_DIM + 3
     networks = {name: MLP((width, hidden, outputs)) for name, outputs in SCAFFOLD_NETWORKS.items()}
-    nn.init.constant_(networks["opacity"].linears[-1].bias, START_OPACITY)  # else chance decides what is ever seen
+    with torch.no_grad():  # else chance decides what is ever seen
+        networks["opacity"].linears[-1].bias.copy_(torch.linspace(*START_OPACITY, N_OFFSETS))
+        networks["opacity"].linears[-1].weight.mul_(0.3)
     return networks

@@ -248,7 +248,7 @@ class Trainer:
             self.seconds = time.monotonic() - start
             if self.seconds >= self.config.max_seconds:
                 break
-        costs = [self._level_cost(level) for level in range(3)]
+        costs = self._level_costs()
         schedule = Schedule(1000)
         coarse = schedule.coarse_end / 1000
         mean = coarse * costs[0] + (1 - coarse) * sum(costs) / 3
@@ -257,21 +257,23 @@ class Trainer:
         self.total = self.iteration + max(1, int(left / (mean * GROWTH_ALLOWANCE)))
         self.config = replace(self.config, iterations=self.total)
 
-    def _level_cost(self, level: int, repeats: int = 6) -> float:
-        """Median seconds of a full step at `level`, leaving the model, the optimiser and the generators as they are."""
+    def _level_costs(self, repeats: int = 9) -> list[float]:
+        """Median seconds of a full step at each level, leaving model, optimiser and generators as they are.
+
+        The levels take turns, so that a moment in which something else has the machine falls on all of them.
+        """
         states = self.generator.get_state(), self.noise.generator.get_state()
-        rounding = Rounding(noise=self.noise)
-        seconds = []
-        for i in range(repeats):
+        seconds: list[list[float]] = [[], [], []]
+        for i in range(3 * repeats):
             before = time.monotonic()
-            _, _, loss = self._loss(i % len(self.dataset.train), level, Schedule(1), rounding)
+            _, _, loss = self._loss(i % len(self.dataset.train), i % 3, Schedule(1), Rounding(noise=self.noise))
             loss.backward()
             self.optimiser.gradient_norm()
             self.optimiser.zero_grad()
-            seconds.append(time.monotonic() - before)
+            seconds[i % 3].append(time.monotonic() - before)
         self.generator.set_state(states[0])
         self.noise.generator.set_state(states[1])
-        return sorted(seconds)[repeats // 2] * 1.1  # the update itself is not run here
+        return [1.1 * sorted(level)[repeats // 2] for level in seconds]  # the update itself is not run here
 
     def _curve_due(self) -> bool:
         every = max(1, self.total // CURVE_POINTS)
