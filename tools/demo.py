@@ -13,6 +13,11 @@ from pathlib import Path
 from pd4dgs_codec.render.threads import configure
 
 
+def say(line: str) -> None:
+    """Prints a stage as it begins."""
+    print(line, flush=True)
+
+
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--source", default="synthetic:local", help="dataset folder or synthetic:NAME (%(default)s)")
@@ -38,15 +43,20 @@ def main(argv: list[str] | None = None) -> int:
         max_seconds=args.max_seconds,
     )
     try:
-        result = run_job(Job("demo", config), args.out, say=lambda line: print(line, flush=True), progress=TrainingProgress())
+        result = run_job(Job("demo", config), args.out, say=say, progress=TrainingProgress())
     except Pd4Error as error:
         print(f"demo: error: {error}", file=sys.stderr)
         return 1
     folder = args.out / "demo"
     time_plot([result], folder / "quality-over-time.png")
     print(f"\n{quality_table([result])}\n\n{coding_table([result])}\n")
-    print(f"model        {folder}/model.pt\nbitstream    {folder}/scene.pd4\npictures     {folder}/levels.png, {folder}/levels.gif")
-    print(f"plot         {folder}/quality-over-time.png\nall figures  {folder}/results.json")
+    for what, names in (
+        ("model", "model.pt"),
+        ("bitstream", "scene.pd4"),
+        ("pictures", "levels.png levels.gif quality-over-time.png"),
+        ("all figures", "results.json"),
+    ):
+        print(f"{what:12} " + ", ".join(str(folder / name) for name in names.split()))
     return 0
 
 

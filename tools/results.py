@@ -33,6 +33,11 @@ PUBLISHED = (436_000, 1_187_000, 5_275_000)
 MARKERS = ("<!-- results: written by tools/results.py -->", "<!-- end of results -->")
 
 
+def say(line: str) -> None:
+    """Prints a stage as it begins."""
+    print(line, flush=True)
+
+
 def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="+", metavar="NAME", choices=[row[0] for row in SCENES])
@@ -56,7 +61,7 @@ def main(argv: list[str] | None = None) -> int:
         config = TrainConfig(
             preset=preset, source=str(source), downscale=downscale, max_seconds=args.seconds * share
         )
-        results.append(run_job(Job(name, config), args.out, say=lambda s: print(s, flush=True), progress=TrainingProgress()))
+        results.append(run_job(Job(name, config), args.out, say=say, progress=TrainingProgress()))
     write(results, args.out, args.docs, threads)
     return 0
 
@@ -91,7 +96,8 @@ def write(results: list[dict[str, Any]], out: Path, docs: Path, threads: int) ->
     for result in results:
         lines += [f"## {result['name']}", "", f"![truth and levels](img/{result['name']}.png)", ""]
         lines += [f"- left out: {row['what']} ({row['bytes']:,} bytes): {row['why']}" for row in result["left_out"]]
-        lines += [f"- {result['iterations']} iterations, rho {result['rho']:.3f}, {result['skipped_steps']} skipped steps", ""]
+        skipped = f"{result['skipped_steps']} skipped steps"
+        lines += [f"- {result['iterations']} iterations, rho {result['rho']:.3f}, {skipped}", ""]
     (docs / "results.md").write_text("\n".join(lines))
     if len(results) == len(SCENES):  # a partial run must not replace the whole table
         _fill_readme(docs.parent / "README.md", [quality_table(results), coding_table(results)])
@@ -116,13 +122,14 @@ def _paper_lines(result: dict[str, Any], markdown: Any) -> list[str]:
     deformation = sum(
         row["streams"].get(name, 0.0) for row in result["coding"][1:] for name in ("planes", "weights")
     )
+    anchors = result["evaluation"]["levels"][-1]["anchors"]
     return [
-        "The scenes differ: ours is shelf-hand, the published bytes are averages over the Dycheck iPhone scenes. The plane",
-        "sizes are the same.",
+        "The scenes differ: ours is shelf-hand, the published bytes are averages over the Dycheck iPhone scenes. The",
+        "plane sizes are the same.",
         "",
         markdown(("layer", "bytes here", "published bytes, other scenes", "ratio"), rows),
         "",
-        f"Planes and weights of both deformations: {deformation:,.0f} bytes; anchors: {result['evaluation']['levels'][-1]['anchors']:,}.",
+        f"Planes and weights of both deformations: {deformation:,.0f} bytes; anchors: {anchors:,}.",
         "",
     ]
 

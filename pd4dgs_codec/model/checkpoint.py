@@ -103,8 +103,9 @@ def _build(content: dict[str, Any]) -> Model:
     n = len(state["anchor_q"])
 
     def network(prefix: str) -> Network:
-        layers = sorted(int(k.split(".")[-2]) for k in state if k.startswith(prefix + ".linears.") and k.endswith(".weight"))
-        return tuple((state[f"{prefix}.linears.{i}.weight"], state[f"{prefix}.linears.{i}.bias"]) for i in layers)
+        count = sum(k.startswith(f"{prefix}.linears.") and k.endswith(".weight") for k in state)
+        names = [f"{prefix}.linears.{i}" for i in range(count)]
+        return tuple((state[f"{name}.weight"], state[f"{name}.bias"]) for name in names)
 
     def deformation(name: str) -> Deformation | None:
         reso = content["deformations"][name]

@@ -9,7 +9,7 @@ from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS
 
 @dataclass(frozen=True)
 class DeformationConfig:
-    """A HexPlane and its MLP. `resolution` holds for x, y and z and is multiplied by each of `multires`; time is not."""
+    """A HexPlane and its MLP. `multires` multiplies `resolution`, that of x, y and z, not time."""
 
     resolution: int
     time_resolution: int

@@ -10,7 +10,7 @@ from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.layers import MLP, mask_logits
 from pd4dgs_codec.model.model import Model
-from pd4dgs_codec.scene import MASK_STEP, Scene
+from pd4dgs_codec.scene import MASK_STEP, SCAFFOLD_NETWORKS, Scene
 
 
 def to_scene(model: Model) -> Scene:
@@ -37,7 +37,7 @@ def to_scene(model: Model) -> Scene:
         scaling_log=_numpy(model.scaling_log),
         offset=_numpy(model.offset),
         mask=masks,
-        networks={name: net.arrays() for name, net in model.networks.items()},
+        networks={name: model.network(name).arrays() for name in SCAFFOLD_NETWORKS},
         global_deformation=global_deformation,
         local_deformation=local_deformation,
     )

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -10,7 +12,7 @@ from torch.nn import functional as F
 from pd4dgs_codec import scene
 from pd4dgs_codec.model.config import DeformationConfig
 from pd4dgs_codec.model.hexplane import HexPlane
-from pd4dgs_codec.model.layers import MLP, round_straight_through
+from pd4dgs_codec.model.layers import MLP
 
 
 class DeformationField(nn.Module):
@@ -43,7 +45,7 @@ class DeformationField(nn.Module):
 
     def arrays(self) -> scene.Deformation:
         """Planes and weights as numpy arrays."""
-        networks = {"trunk": self.trunk.arrays()} | {name: head.arrays() for name, head in self.heads.items()}
+        networks = {"trunk": self.trunk.arrays()} | {name: head.arrays() for name, head in self.named_heads()}
         return scene.Deformation(self.planes.plane_arrays(), networks)
 
     def forward(
@@ -53,13 +55,13 @@ class DeformationField(nn.Module):
         if not self.heads:
             return {}
         hidden = F.relu(self.trunk(self.planes(points, t, step=plane_step), weight_step))
-        heads = list(self.heads.items())
-        if all(len(head.linears) == 1 for _, head in heads):  # one product for all heads
-            weight = torch.cat([head.linears[0].weight for _, head in heads])
-            bias = torch.cat([head.linears[0].bias for _, head in heads])
-            out = F.linear(
-                hidden, round_straight_through(weight, weight_step), round_straight_through(bias, weight_step)
-            )
-            parts = out.split([head.linears[0].out_features for _, head in heads], dim=1)
-            return {name: part for (name, _), part in zip(heads, parts, strict=True)}
-        return {name: head(hidden, weight_step) for name, head in heads}
+        layers = {name: head.rounded(weight_step) for name, head in self.named_heads()}
+        if any(len(head) > 1 for head in layers.values()):
+            return {name: head(hidden, weight_step) for name, head in self.named_heads()}
+        firsts = [head[0] for head in layers.values()]  # one product for all heads
+        out = F.linear(hidden, torch.cat([w for w, _ in firsts]), torch.cat([b for _, b in firsts]))
+        return dict(zip(layers, out.split([len(b) for _, b in firsts], dim=1), strict=True))
+
+    def named_heads(self) -> list[tuple[str, MLP]]:
+        """The heads present, in the registry's order."""
+        return [(name, cast(MLP, head)) for name, head in self.heads.items()]

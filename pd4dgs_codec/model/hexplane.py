@@ -96,8 +96,8 @@ class HexPlane(nn.Module):
 
     box: [2, 3] lower and upper corner, scene units; points are normalised by it and clamped to it.
     resolution: cells along x, y, z, t of the base scale, each >= 1. multires: factor on x, y, z per scale.
-    The parameter `grid` is [cells, C]; `layout` says which cells are which plane. Start values: each channel of a
-    spatial plane one draw of U(0.1, 0.5), time planes 1. One draw per channel, not per cell as in the public code: cells that no anchor
+    The parameter `grid` is [cells, C]; `layout` says which cells are which plane. Start values: time planes 1, each
+    channel of a spatial plane one draw of U(0.1, 0.5), not one per cell as in the public code: cells that no anchor
     reaches keep their start value, and noise there would cost bits. With the quantisation step `step` the draw is a
     multiple of it and each cell is dithered within its rounding interval: free where nothing is learnt, and elsewhere
     the rounding errors of neighbouring cells are independent, where equal ones would shift the whole scene.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -24,13 +26,18 @@ class MLP(nn.Module):
         super().__init__()
         self.linears = nn.ModuleList(nn.Linear(a, b) for a, b in zip(widths[:-1], widths[1:], strict=True))
         if zero_last:
-            nn.init.zeros_(self.linears[-1].weight)
-            nn.init.zeros_(self.linears[-1].bias)
+            nn.init.zeros_(self.layers[-1].weight)
+            nn.init.zeros_(self.layers[-1].bias)
+
+    @property
+    def layers(self) -> list[nn.Linear]:
+        """The linear layers, input side first."""
+        return [cast(nn.Linear, linear) for linear in self.linears]
 
     def rounded(self, step: float | None) -> list[tuple[Tensor, Tensor]]:
         """(weight, bias) per layer; with `step`, rounded straight-through."""
         return [
-            (round_straight_through(lin.weight, step), round_straight_through(lin.bias, step)) for lin in self.linears
+            (round_straight_through(lin.weight, step), round_straight_through(lin.bias, step)) for lin in self.layers
         ]
 
     def forward(self, x: Tensor, step: float | None = None) -> Tensor:
@@ -42,7 +49,7 @@ class MLP(nn.Module):
     def arrays(self) -> Network:
         """The weights as numpy arrays, input side first."""
         return tuple(
-            (lin.weight.detach().cpu().numpy().copy(), lin.bias.detach().cpu().numpy().copy()) for lin in self.linears
+            (lin.weight.detach().cpu().numpy().copy(), lin.bias.detach().cpu().numpy().copy()) for lin in self.layers
         )
 
     @staticmethod
@@ -50,14 +57,14 @@ class MLP(nn.Module):
         """The module that `arrays` came from."""
         mlp = MLP((network[0][0].shape[1], *(w.shape[0] for w, _ in network)))
         with torch.no_grad():
-            for linear, (w, b) in zip(mlp.linears, network, strict=True):
+            for linear, (w, b) in zip(mlp.layers, network, strict=True):
                 linear.weight.copy_(torch.from_numpy(np.array(w)))
                 linear.bias.copy_(torch.from_numpy(np.array(b)))
         return mlp
 
 
 def level_mask(logits: Tensor, level: int) -> Tensor:
-    """m^(level) [N] of logits [N, 3]: sigmoid(a0 + sum_{1<=j<=level} softplus(a_j)), monotone in level by construction."""
+    """m^(level) [N] of logits [N, 3]: sigmoid(a0 + sum_{1<=j<=level} softplus(a_j)), so never falling with level."""
     total = logits[:, 0]
     for j in range(1, level + 1):
         total = total + F.softplus(logits[:, j])

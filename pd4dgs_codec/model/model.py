@@ -11,6 +11,7 @@ The gate m^(level) multiplies each Gaussian's final opacity and scale, after the
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import cast
 
 import torch
 from torch import Tensor, nn
@@ -48,8 +49,8 @@ class Noise:
 
 @dataclass(frozen=True)
 class Rounding:
-    """How a training step imitates quantisation: uniform noise on the anchors' attributes, or rounding of them; rounding
-    of planes and weights. Rounding is straight-through."""
+    """How a training step imitates quantisation: noise on the anchors' attributes, or rounding of them; rounding of
+    planes and weights. Rounding is straight-through."""
 
     noise: Noise | None = None
     attributes: bool = False
@@ -111,6 +112,10 @@ class Model(nn.Module):
     def level(self) -> int:
         """The highest level that differs from the one below in more than its masks."""
         return 2 if self.local_deformation is not None else 1 if self.global_deformation is not None else 0
+
+    def network(self, name: str) -> MLP:
+        """One of the scaffold's decoders."""
+        return cast(MLP, self.networks[name])
 
     def masks(self, level: int) -> Tensor:
         """m^(level) [N]."""
@@ -215,9 +220,9 @@ class Model(nn.Module):
     def _decode(self, inputs: Tensor, rounding: Rounding) -> list[Tensor]:
         """Opacity [n, 10], covariance [n, 70], colour [n, 30] before activation; first layers in one product."""
         step = self.steps.weights_scaffold if rounding.weights else None
-        networks = [self.networks[name].rounded(step) for name in SCAFFOLD_NETWORKS]
+        networks = [self.network(name).rounded(step) for name in SCAFFOLD_NETWORKS]
         if any(len(layers) != 2 for layers in networks):
-            return [self.networks[name](inputs, step) for name in SCAFFOLD_NETWORKS]
+            return [self.network(name)(inputs, step) for name in SCAFFOLD_NETWORKS]
         first = [layers[0] for layers in networks]
         hidden = F.relu(F.linear(inputs, torch.cat([w for w, _ in first]), torch.cat([b for _, b in first])))
         parts = hidden.split([len(b) for _, b in first], dim=1)
@@ -235,6 +240,7 @@ def fresh_networks(hidden: int) -> dict[str, MLP]:
     width = FEATURE_DIM + 3
     networks = {name: MLP((width, hidden, outputs)) for name, outputs in SCAFFOLD_NETWORKS.items()}
     with torch.no_grad():  # else chance decides what is ever seen
-        networks["opacity"].linears[-1].bias.copy_(torch.linspace(*START_OPACITY, N_OFFSETS))
-        networks["opacity"].linears[-1].weight.mul_(0.3)
+        last = networks["opacity"].layers[-1]
+        last.bias.copy_(torch.linspace(*START_OPACITY, N_OFFSETS))
+        last.weight.mul_(0.3)
     return networks

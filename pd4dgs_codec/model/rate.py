@@ -85,7 +85,7 @@ class _LogProbability(torch.autograd.Function):
 
 
 def log_probability(a: Tensor, mu: Tensor, sigma: Tensor, q: Tensor | float) -> Tensor:
-    """ln P of the interval a +- Q/2 under N(mu, sigma), natural log, broadcast; gradients to all four, finite in the tails."""
+    """ln P of the interval a +- Q/2 under N(mu, sigma), broadcast; gradients to all four, finite in the tails."""
     return _LogProbability.apply(a, mu, sigma, torch.as_tensor(q, dtype=a.dtype, device=a.device))
 
 

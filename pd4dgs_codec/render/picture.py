@@ -65,5 +65,5 @@ def render_image(
 ) -> np.ndarray:
     """The picture as float32 [H, W, 3] in 0..1."""
     device = model.feature.device
-    camera = (torch.as_tensor(np.array(m, np.float32), device=device) for m in (viewmat, K))
-    return render(model, level, t, *camera, width, height, rounding).image.clamp(0, 1).cpu().numpy()
+    extrinsics, intrinsics = (torch.as_tensor(np.array(m, np.float32), device=device) for m in (viewmat, K))
+    return render(model, level, t, extrinsics, intrinsics, width, height, rounding).image.clamp(0, 1).cpu().numpy()

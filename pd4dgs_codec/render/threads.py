@@ -52,8 +52,10 @@ def available() -> int:
 
 
 def keep_freed_memory() -> None:
-    """Let glibc reuse large blocks instead of returning each to the system: a training step frees and takes hundreds of
-    megabytes, and the page faults of fresh blocks made element-wise operations several times slower. Elsewhere: nothing.
+    """Let glibc reuse large blocks instead of returning each to the system; elsewhere this does nothing.
+
+    A training step frees and takes hundreds of megabytes, and the page faults of fresh blocks made element-wise
+    operations several times slower.
     """
     mmap_threshold, trim_threshold = -3, -1  # glibc's M_MMAP_THRESHOLD, M_TRIM_THRESHOLD
     try:

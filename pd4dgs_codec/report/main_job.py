@@ -1,4 +1,4 @@
-"""The main job on one scene: train, pack in every mode, decode each prefix, render, measure; all figures in one dict."""
+"""The main job on one scene: train, pack in every mode, decode each prefix, render, measure; one dict holds it all."""
 
 from __future__ import annotations
 

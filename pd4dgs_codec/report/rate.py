@@ -6,8 +6,8 @@ import torch
 from torch import Tensor
 
 from pd4dgs_codec.attributes.table import ATTRIBUTES
-from pd4dgs_codec.codec.layers import channel_groups
 from pd4dgs_codec.codec.layer_meta import Section
+from pd4dgs_codec.codec.layers import channel_groups
 from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.codec.symbols import layer_symbols
 from pd4dgs_codec.model.rate import channel_moments, rate_bits

@@ -1,4 +1,4 @@
-"""Growing and pruning of anchors, after Scaffold-GS: grow where the picture pulls at Gaussians, prune what never shows."""
+"""Growing and pruning of anchors, after Scaffold-GS: grow where the loss pulls at Gaussians, prune what never shows."""
 
 from __future__ import annotations
 
@@ -88,7 +88,7 @@ class Densifier:
             setattr(self, name, torch.cat([value[keep], value.new_zeros(added, *value.shape[1:])]))
 
     def _new_cells(self, model: Model, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """(int64 [n, 4] voxel cell and cell size, float [n, 32] feature) of free cells that are pulled at, strongest first."""
+        """(int64 [n, 4] voxel cell and cell size, float [n, 32] feature) of free cells, the strongest pull first."""
         mean_pull = (self.pull / self.visits.clamp(min=1)).flatten()
         seen = self.visits.flatten() >= MIN_SLOT_VISITS
         anchor_q, scaling = model.anchor_q.cpu(), model.scaling_log.detach().cpu().exp()

@@ -233,10 +233,10 @@ class Trainer:
         return self.order.pop()
 
     def _target(self, view: View) -> tuple[Tensor, Tensor, TargetStats]:
-        matrices = (torch.as_tensor(np.array(m, np.float32), device=self.device) for m in (view.viewmat, view.K))
+        viewmat, K = (torch.as_tensor(np.array(m, np.float32), device=self.device) for m in (view.viewmat, view.K))
         image = torch.as_tensor(view.image, device=self.device).float() / 255
         mask = None if view.mask is None else torch.as_tensor(view.mask, device=self.device).float()
-        return (*matrices, TargetStats(image, mask))
+        return viewmat, K, TargetStats(image, mask)
 
     # -- time limit, evaluation, checkpoints -----------------------------------------------------------------------
 
@@ -280,7 +280,7 @@ class Trainer:
         return self.iteration % every == 0 or self.iteration == self.total
 
     def _evaluate(self) -> list[float]:
-        """Mean held-out PSNR per level on a few views spread over the held-out set (training views if there is none)."""
+        """Mean PSNR per level on a few held-out views (training views if none are held out)."""
         views = self.dataset.test or self.dataset.train
         views = views[:: max(1, len(views) // CURVE_VIEWS)][:CURVE_VIEWS]
         psnr = []
@@ -319,7 +319,7 @@ class Trainer:
         """Goes on from a checkpoint of the same configuration; TrainError if it holds no training state."""
         model, training = checkpoint.load(path)
         if "optimiser" not in training:
-            raise TrainError(f"{path}: holds no training state (a decoded or stripped checkpoint); cannot resume from it")
+            raise TrainError(f"{path}: holds no training state (it was decoded or stripped); cannot resume from it")
         self.model = model.to(self.device)
         self.optimiser = Optimiser(self.model, self.config.rates)
         self.optimiser.load_state(training["optimiser"])

@@ -30,13 +30,16 @@ def exact(a, mu, sigma, q):
         return float(mpmath.log(p)), [float(g) for g in grads]
 
 
-@pytest.mark.parametrize(("dtype", "tolerance", "gradient_tolerance"), [(torch.float64, 2e-12, 1e-9), (torch.float32, 2e-5, 1e-4)])
+@pytest.mark.parametrize(
+    ("dtype", "tolerance", "gradient_tolerance"), [(torch.float64, 2e-12, 1e-9), (torch.float32, 2e-5, 1e-4)]
+)
 def test_value_and_gradients(dtype, tolerance, gradient_tolerance):
     for ratio in RATIOS:
         for distance in DISTANCES:
             for mu in (0.0, -1.5):
                 q = 0.125
-                tensors = [torch.tensor(x, dtype=dtype, requires_grad=True) for x in (mu + distance * ratio * q, mu, ratio * q, q)]
+                values = (mu + distance * ratio * q, mu, ratio * q, q)
+                tensors = [torch.tensor(x, dtype=dtype, requires_grad=True) for x in values]
                 a, m, s, step = tensors
                 value = log_probability(a, m, s, step)
                 value.backward()
