@@ -59,7 +59,7 @@ class SceneInfo:
     voxel_size: float  #: scene units; anchors are integer multiples of it
     box: np.ndarray  #: float32 [2, 3], lower and upper corner; the HexPlanes' normalisation box, scene units
     time_range: tuple[float, float]  #: seconds; normalised time 0 and 1
-    background: tuple[float, float, float]  #: linear RGB in 0..1 behind every Gaussian
+    background: tuple[float, float, float]  #: RGB as displayed, 0..1, behind every Gaussian
     near: float
     far: float
     up: tuple[float, float, float]  #: world direction
@@ -133,7 +133,8 @@ class Scene:
     @property
     def anchor(self) -> np.ndarray:
         """float32 [N, 3] anchor positions, world, scene units."""
-        return (self.anchor_q.astype(np.float64) * np.float64(np.float32(self.info.voxel_size))).astype(np.float32)
+        with np.errstate(over="ignore"):  # an absurd voxel size gives infinities, which the decoder refuses
+            return (self.anchor_q.astype(np.float64) * np.float64(np.float32(self.info.voxel_size))).astype(np.float32)
 
     def prefix(self, max_layer: int) -> Scene:
         """The scene that a decoder yields from the layers <= max_layer; `self` if nothing is cut."""

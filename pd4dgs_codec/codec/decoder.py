@@ -66,6 +66,9 @@ class LayerReader:
         if kind is None and not chunk.ancillary:
             message = f"critical chunk of unknown type {chunk.type}"
             raise UnsupportedFeature(message, offset=self.offset, chunk=self._index)
+        if kind is not None and chunk.ancillary:
+            message = f"layer {kind.layer} is flagged ancillary, expected a critical chunk"
+            raise Malformed(message, offset=self.offset, chunk=self._index)
         if self._scene_id is None:
             self._scene_id = scene_id_of(chunk.payload)
             if chunk.scene_id != self._scene_id:

@@ -172,11 +172,14 @@ def _unpack_scales(fields: Fields, raw: bool, where: str) -> tuple[ScaleMeta, ..
 def _unpack_networks(fields: Fields, kind: LayerKind, where: str) -> dict[str, tuple[int, ...]]:
     rows = fields.sequence(NETWORKS) if NETWORKS in fields else []
     names = {number: name for name, number in kind.network_ids.items()}
-    as_integer(len(rows), len(names), f"{where}: number of networks", low=0)
+    as_integer(len(rows), len(names), f"{where}: number of networks", low=int(NETWORKS in fields))
     networks: dict[str, tuple[int, ...]] = {}
     last = -1
     for row in rows:
-        number, *widths = as_list(row, f"{where} network")
+        entry = as_list(row, f"{where} network")
+        if not entry:
+            raise Malformed(f"{where}: an empty network entry, expected an id and widths")
+        number, *widths = entry
         if as_integer(number, 0xFFFF, f"{where} network id") not in names:
             raise UnsupportedFeature(f"{where}: network {number}, expected one of {names}")
         if number <= last:

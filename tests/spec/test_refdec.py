@@ -1,0 +1,291 @@
+"""The reference decoder agrees with the package, and quotes the specification that it claims to follow."""
+
+import ast
+import importlib.util
+import json
+import random
+import re
+import struct
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import LAYER_SETS, make_scene, scenes
+
+from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
+from pd4dgs_codec.bitstream import canonical
+from pd4dgs_codec.bitstream.container import read_chunk, read_preamble, scene_id_of, write_chunk, write_preamble
+from pd4dgs_codec.codec.decoder import decode
+from pd4dgs_codec.codec.encoder import encode
+from pd4dgs_codec.codec.info import hashes
+from pd4dgs_codec.entropy.channels import encode_channels
+from pd4dgs_codec.entropy.lzma_mode import encode_channels_lzma
+from pd4dgs_codec.entropy.morton import morton_order
+from pd4dgs_codec.entropy.positions import encode_positions
+from pd4dgs_codec.entropy.priors import CONST, GAUSS, GMM2, HIST, K_MAX
+from pd4dgs_codec.entropy.tables import NORMAL, OCTAVE
+from pd4dgs_codec.errors import DecodeError
+
+SPEC = Path(__file__).parents[2] / "spec"
+TEXT = (SPEC / "format.md").read_text(encoding="utf-8")
+SOURCE = (SPEC / "refdec.py").read_text(encoding="utf-8")
+
+_module = importlib.util.spec_from_file_location("refdec", SPEC / "refdec.py")
+refdec = importlib.util.module_from_spec(_module)
+_module.loader.exec_module(refdec)
+
+CODINGS = {
+    "ans best": {},
+    "ans gauss": {"priors": "gauss"},
+    "lzma": {"mode": "lzma"},
+    "ans float32": {"deformation": "float32"},
+    "lzma float32": {"mode": "lzma", "deformation": "float32"},
+}
+SCENES = {
+    "empty": {"anchors": 0},
+    "one anchor": {"anchors": 1, "layers": (0,), "hidden": ()},
+    "whole range": {"anchors": 1, "layers": (0,), "kind": "huge", "hidden": ()},
+    "a hundred anchors": {"anchors": 100, "kind": "gaussian", "extent": 30},
+    "two scales": {"scales": 2, "sides": (1, 3, 2, 4), "channels": 1},
+    **{f"layers {layers}": {"layers": layers, "anchors": 9} for layers in LAYER_SETS},
+}
+
+
+@pytest.mark.parametrize("coding", CODINGS)
+@pytest.mark.parametrize("scene", SCENES)
+def test_hashes_are_those_of_the_package(scene, coding):
+    data = encode(make_scene(3, **SCENES[scene]), layers=2, effort=3, **CODINGS[coding])
+    assert refdec.hashes(data) == hashes(data)
+
+
+@given(scenes(), st.sampled_from(sorted(CODINGS)))
+@settings(max_examples=15)
+def test_hashes_of_any_scene_are_those_of_the_package(scene, coding):
+    data = encode(scene, layers=2, effort=1, verify=False, **CODINGS[coding])
+    assert refdec.hashes(data) == hashes(data)
+
+
+def test_tensors_by_name_and_prefixes():
+    data = encode(make_scene(7, anchors=20), layers=2, effort=1)
+    scene, layers = decode(data), refdec.decode(data)
+    assert [layer.number for layer in layers] == [0, 1, 2]
+    own = slice(scene.rows[0], scene.rows[1])
+    for name in ("anchor", "feature", "scaling_log", "offset"):
+        assert layers[1].tensors[name] == getattr(scene, name)[own].ravel().tolist(), name
+    assert layers[1].tensors["planes.0.yt"] == scene.global_deformation.planes[0]["yt"].ravel().tolist()
+    assert layers[2].tensors["network.3.bias.0"] == scene.local_deformation.networks["quat"][0][1].tolist()
+    assert layers[0].symbols["anchor"] == scene.anchor_q[: scene.rows[0]].ravel().tolist()
+    prefix = refdec.decode(data, max_layer=1)
+    assert [p.tensors for p in prefix] == [p.tensors for p in layers[:2]] and len(prefix) == 2
+
+
+def test_every_prior_family():
+    rng = np.random.default_rng(0)
+    two = np.concatenate([rng.normal(-40, 3, 4000), rng.normal(60, 9, 4000)])
+    channels = [
+        np.full(5, 7),
+        rng.normal(3, 2.5, 3000),
+        two,
+        rng.choice([-30, 0, 1, 30], 5000, p=[0.2, 0.5, 0.2, 0.1]),
+        rng.normal(0, 1e6, 400),
+        np.append(rng.normal(0, 1, 500), [90000, -K_MAX, K_MAX]),
+        np.zeros(0),
+    ]
+    channels = [np.clip(np.rint(c), -K_MAX, K_MAX).astype(np.int32) for c in channels]
+    counts = [len(c) for c in channels]
+    coded = encode_channels(channels, effort=9)
+    assert set(coded.prior_ids) == {CONST, GAUSS, GMM2, HIST}
+    assert refdec.decode_channels(coded.payload, counts) == [c.tolist() for c in channels]
+    wide = encode_channels(channels[4:5], priors="gauss").payload
+    assert wide[0] >> 1 == 4 and refdec.decode_channels(wide, [400]) == [channels[4].tolist()]
+    assert refdec.decode_lzma_symbols(encode_channels_lzma(channels).payload, counts) == [c.tolist() for c in channels]
+
+
+@pytest.mark.parametrize("depth", [7, 13, 21])
+def test_positions_on_a_surface(depth):
+    rng = np.random.default_rng(depth)
+    direction = rng.normal(size=(1200, 3)) * (1, 0.8, 0.3)
+    sphere = direction / np.linalg.norm(direction, axis=1)[:, None]
+    cells = np.unique(np.rint(sphere * (2 ** (depth - 1) - 1)).astype(np.int32), axis=0)
+    cells = cells[morton_order(cells)]
+    assert refdec.decode_positions(encode_positions(cells), len(cells)) == [tuple(c) for c in cells.tolist()]
+
+
+def take_apart(data):
+    preamble, chunks = read_preamble(data), []
+    offset = preamble.size
+    while offset < len(data):
+        chunks.append(read_chunk(data, offset))
+        offset = chunks[-1].end
+    return canonical.unpack(preamble.header), [(c.type, c.flags, c.payload) for c in chunks]
+
+
+def put_together(header, chunks):
+    """A file with right lengths, ids and CRCs, whatever its payloads say."""
+    scene_id = scene_id_of(chunks[0][2])
+    framed = [write_chunk(t, f, scene_id, p) for t, f, p in chunks]
+    return write_preamble(canonical.pack({**header, 1: [[t, len(p)] for t, _, p in chunks]})) + b"".join(framed)
+
+
+def outcome(function, data, fault):
+    try:
+        return function(data)
+    except fault as error:
+        return getattr(error, "name", type(error).__name__)
+
+
+@pytest.mark.parametrize("coding", ["ans best", "lzma float32"])
+def test_damage_behind_right_checksums_has_the_same_outcome(coding):
+    """Both accept with the same contents, or both refuse with the same error's name."""
+    header, chunks = take_apart(encode(make_scene(3, anchors=20), layers=2, effort=3, **CODINGS[coding]))
+    rng, seen = random.Random(1), set()
+    for _ in range(100):
+        damaged, which = list(chunks), rng.randrange(3)
+        kind, flags, payload = damaged[which]
+        parameters = 4 + struct.unpack_from("<I", payload)[0]
+        at = rng.choice((rng.randrange(parameters), rng.randrange(parameters, len(payload))))
+        cut = rng.randrange(4) == 0
+        changed = payload[:at] + (b"" if cut else bytes([rng.randrange(256)])) + payload[at + 1 :]
+        damaged[which] = (kind, flags, changed)
+        data = put_together(header, damaged)
+        found = outcome(refdec.hashes, data, refdec.Fault)
+        assert found == outcome(hashes, data, DecodeError), changed.hex()
+        seen.add(found if isinstance(found, str) else "fine")
+    assert {"Malformed", "fine"} <= seen
+
+
+FRAME_FAULTS = {
+    "Truncated": lambda data: data[:-1],
+    "Malformed": lambda data: data + b"\0",
+    "BadSignature": lambda data: b"\x88" + data[1:],
+    "UnsupportedVersion": lambda data: data[:8] + b"\2" + data[9:],
+    "LimitExceeded": lambda data: data[:13] + b"\x11" + data[14:],
+    "ChecksumMismatch": lambda data: data[:-30] + bytes([data[-30] ^ 1]) + data[-29:],
+}
+
+
+@pytest.mark.parametrize("name", FRAME_FAULTS)
+def test_faults_of_the_frame(name):
+    data = FRAME_FAULTS[name](encode(make_scene(3), layers=2, effort=1))
+    assert outcome(refdec.hashes, data, refdec.Fault) == outcome(hashes, data, DecodeError) == name
+
+
+def test_ancillary_and_unknown_chunks():
+    data = encode(make_scene(3), layers=2, effort=1)
+    header, chunks = take_apart(data)
+    skipped = put_together(header, [chunks[0], (40000, 1, b"x"), *chunks[1:], (9, 1, b"")])
+    assert refdec.hashes(skipped) == hashes(data)
+    for wrong, name in (((9, 0, b""), "UnsupportedFeature"), ((1, 1, chunks[1][2]), "Malformed")):
+        other = put_together(header, [chunks[0], wrong])
+        assert outcome(refdec.hashes, other, refdec.Fault) == name
+
+
+def test_an_empty_list_of_networks_is_malformed():
+    header, chunks = take_apart(encode(make_scene(3, layers=(0, 1), heads=({}, {})), layers=2, effort=1))
+    _, _, payload = chunks[1]
+    (length,) = struct.unpack_from("<I", payload)
+    meta = canonical.pack({**canonical.unpack(payload[4 : 4 + length]), 5: []})
+    chunks[1] = (1, 0, struct.pack("<I", len(meta)) + meta + payload[4 + length :])
+    assert outcome(refdec.hashes, put_together(header, chunks), refdec.Fault) == "Malformed"
+
+
+MSGPACK = [0, 127, 128, 255, 256, 65535, 65536, 2**32 - 1, 2**32, 2**64 - 1]
+MSGPACK += [-1, -32, -33, -128, -129, -32768, -32769, -(2**31), -(2**31) - 1, -(2**63)]
+MSGPACK += [True, False, 0.5, -0.0, "", "é" * 16, "x" * 31, "x" * 32, "x" * 256, b"", b"x" * 255, b"x" * 65536]
+MSGPACK += [[], [[]] * 16, [[[[]]]], {}, {0: 1, 2**32 - 1: 2}, {i: i for i in range(20)}, ["x" * 65536, [0] * 65536]]
+
+
+@pytest.mark.parametrize("value", MSGPACK, ids=range(len(MSGPACK)))
+def test_canonical_msgpack(value):
+    assert refdec.unpack(canonical.pack(value)) == value
+
+
+@pytest.mark.parametrize(
+    "data",
+    "cc7f cd00ff ce0000ffff cf00000000ffffffff d001 d0e0 d1ff80 d9 d90178 c0 cb3fe0000000000000 ca7f800000 d40000 "
+    "8201010001 82010101 81a17801 81c301 9191919190 81ff00 a1ff 0000 dc0001c2 c5000178 93 "
+    "81cf000000010000000000".split(),
+)
+def test_other_msgpack_is_malformed_to_both(data):
+    data = bytes.fromhex(data)
+    assert outcome(refdec.unpack, data, refdec.Fault) == outcome(canonical.unpack, data, DecodeError) == "Malformed"
+
+
+def test_the_command_prints_the_hashes_and_one_line_for_a_fault(tmp_path):
+    data = encode(make_scene(3), layers=2, effort=1)
+    for content, code in ((data, 0), (data[:-1], 1), (None, 1)):
+        path = tmp_path / f"{code}.pd4"
+        if content is None:
+            path.unlink()
+        else:
+            path.write_bytes(content)
+        command = [sys.executable, "-I", "-S", str(SPEC / "refdec.py"), str(path)]
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60)
+        assert done.returncode == code
+        if code:
+            assert done.stdout == "" and done.stderr.count("\n") == 1 and str(path) in done.stderr
+        else:
+            assert json.loads(done.stdout) == hashes(data) and done.stderr == ""
+
+
+def test_it_imports_the_standard_library_alone():
+    names = {a.name for n in ast.walk(ast.parse(SOURCE)) if isinstance(n, ast.Import) for a in n.names}
+    names |= {n.module for n in ast.walk(ast.parse(SOURCE)) if isinstance(n, ast.ImportFrom)}
+    assert "struct" in names and names <= set(sys.stdlib_module_names)
+
+
+def clauses():
+    """Clause number -> its text with markup and line ends removed."""
+    parts = re.split(r"^#{2,3} (\d+(?:\.\d+)?) ", TEXT, flags=re.M)
+    return {number: plain(text) for number, text in zip(parts[1::2], parts[2::2], strict=True)}
+
+
+def plain(text):
+    return re.sub(r"\s+", " ", re.sub(r"[`*|\\]", "", text)).strip()
+
+
+def test_every_quotation_is_in_its_clause():
+    texts = clauses()
+    blocks = re.findall(r"^ *# (\d+(?:\.\d+)?) ([A-Z][^:\n]*): (\".*(?:\n *# .*)*)", SOURCE, flags=re.M)
+    quoted = set()
+    for number, title, body in blocks:
+        for piece in re.split(r"\n *# (?=\d+(?:\.\d+)? [A-Z][^:\n]*: \")", body):
+            words = plain(re.sub(r"\n *# ", " ", piece))
+            head = re.match(r"(\d+(?:\.\d+)?) ([A-Z][^:]*): (.*)", words)
+            number, title, words = head.groups() if head else (number, title, words)
+            assert texts[number].startswith(title), (number, title)
+            for quotation in words.strip('"').split('" "'):
+                assert quotation in texts[number], (number, quotation)
+                quoted.add(number)
+    assert len(quoted) > 30
+
+
+def test_the_tables_and_limits_of_the_specification():
+    assert K_MAX == refdec.K and MAX_SYMBOL == refdec.MAX_SYMBOL
+    for heading, table, values in (("B.1", NORMAL, refdec.T), ("B.2", OCTAVE, refdec.M)):
+        printed = TEXT.split(f"### {heading} ")[1].split("```")[1].split()
+        assert [int(v) for v in printed] == table.tolist() == values
+    check = [int(v) for v in re.search(r"gives 0, ([\d, ]+), 2\^24", TEXT)[1].split(",")]
+    assert refdec.table_of(refdec.norm_cdf(7, 832, 0), 1) == [0, *check, 1 << 24]
+
+
+def test_the_annotated_file():
+    appendix = TEXT.split("## A An annotated file")[1].split("## B Tables")[0]
+    data = b""
+    for offset, cell in re.findall(r"^\| (\d+) \| (`[^|]*) \|", appendix, flags=re.M):
+        assert int(offset) == len(data)
+        repeated = re.fullmatch(r"`(..) × (\d+)`", cell)
+        data += (
+            bytes.fromhex(repeated[1]) * int(repeated[2]) if repeated else bytes.fromhex(re.sub("`|<br>", " ", cell))
+        )
+    assert f"{len(data)} bytes" in appendix
+    (found,) = refdec.hashes(data)
+    assert [found] == hashes(data)
+    assert found["symbols"] in appendix and found["tensors"] in appendix
+    (layer,) = refdec.decode(data)
+    assert layer.symbols["anchor"] == [-1, 0, 2] and layer.symbols["mask_own"] == [77]
+    assert set(layer.symbols["feature"] + layer.symbols["network.1.weight.0"]) == {2}
