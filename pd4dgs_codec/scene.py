@@ -35,6 +35,18 @@ MASK_MIN_CODE = 3
 GLOBAL_HEADS: dict[str, int] = {"position": 3, "feature": FEATURE_DIM, "offset": 3 * N_OFFSETS, "scaling": SCALING_DIM}
 LOCAL_HEADS: dict[str, int] = {"mean": 3, "scale": 3, "quat": 4, "opacity": 1, "color": 3}
 
+#: Heads whose output is a length, in units of `deformation_unit`; the others add to what they name as they are.
+LENGTH_HEADS = ("position", "mean", "scale")
+
+
+def deformation_unit(box: np.ndarray) -> np.float32:
+    """The unit of LENGTH_HEADS: an eighth of the longest side of the HexPlanes' box, scene units.
+
+    In scene units a rounded weight would shift a small scene by whole pixels.
+    """
+    return np.float32(0.125) * (box[1] - box[0]).astype(np.float32).max()
+
+
 #: The decoders of the scaffold (input [feature 32, view direction 3]) with their output width.
 SCAFFOLD_NETWORKS: dict[str, int] = {"opacity": N_OFFSETS, "covariance": 7 * N_OFFSETS, "color": 3 * N_OFFSETS}
 
@@ -88,9 +100,9 @@ class Steps:
     offset: float = 0.05
     planes_global: float = 0.02
     planes_local: float = 0.03
-    weights_scaffold: float = 0.005
-    weights_global: float = 0.005
-    weights_local: float = 0.005
+    weights_scaffold: float = 0.004
+    weights_global: float = 0.002
+    weights_local: float = 0.002
 
     def scaled(self, factor: float) -> Steps:
         """Every step times `factor`, rounded to binary32."""

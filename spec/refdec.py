@@ -245,7 +245,7 @@ def read_chunk_list(rows):
     for row in rows:
         kind, size = a_list(row, "a chunk", 2)
         limited(kind, 65535, "a chunk type")
-        limited(size, 1 << 31, "a payload's length")
+        limited(size, (1 << 31) - 1, "a payload's length")
     layers = [kind for kind, _ in rows if kind < 3]
     need(rows[0][0] == 0 and layers == sorted(set(layers)), f"layers {layers}")
 
@@ -255,7 +255,7 @@ def read_chunk_list(rows):
 def read_chunk(data, at, kind, size, scene_id):
     need(len(data) >= at + 16, "the file ends in a chunk's head", "Truncated")
     found_kind, flags, found_size, found_id = struct.unpack_from("<HHI8s", data, at)
-    limited(found_size, 1 << 31, "a payload's length")
+    limited(found_size, (1 << 31) - 1, "a payload's length")
     need(found_size == size, f"payload of {found_size} bytes, listed {size}")
     end = at + 16 + size
     need(len(data) >= end + 4, "the file ends in a chunk", "Truncated")
@@ -305,7 +305,7 @@ def read_parameters(layer, value):
     need(layer.networks or layer.number, "layer 0 without networks")
     layer.raw = bool(layer.networks and layer.number and header_is_float32(layer.header))
     layer.rows = limited(parameters[1], (1 << 24) - layer.rows_before, "own rows")
-    layer.sections = {s: limited(sections[s], 1 << 31, "a section", 1) for s in sections if s < 64}
+    layer.sections = {s: limited(sections[s], (1 << 31) - 1, "a section", 1) for s in sections if s < 64}
     has_planes = bool(layer.networks) and layer.number > 0
     need((3 in parameters) == bool(layer.networks), "steps without networks or the reverse")
     layer.steps = [a_step(v) for v in reals(parameters[3], "steps", 1 + has_planes)] if layer.networks else []

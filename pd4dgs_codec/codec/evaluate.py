@@ -9,7 +9,7 @@ import numpy as np
 
 from pd4dgs_codec.codec.check import plane_sides
 from pd4dgs_codec.codec.kinds import TRUNK
-from pd4dgs_codec.scene import PLANES, Deformation, Network
+from pd4dgs_codec.scene import LENGTH_HEADS, PLANES, Deformation, Network, deformation_unit
 
 
 def sample_planes(
@@ -54,7 +54,10 @@ def run_network(network: Network, x: np.ndarray) -> np.ndarray:
 
 
 def residuals(deformation: Deformation, box: np.ndarray, points: np.ndarray, t: float) -> dict[str, np.ndarray]:
-    """head -> float32 [n, width] residuals at `points` [n, 3] (scene units) and normalised time t."""
+    """head -> float32 [n, width] residuals at `points` [n, 3] (scene units) and normalised time t; lengths in scene
+    units."""
     features = sample_planes(deformation.planes, box, points, t)
     hidden = np.maximum(run_network(deformation.networks[TRUNK], features), 0)
-    return {name: run_network(network, hidden) for name, network in deformation.networks.items() if name != TRUNK}
+    outputs = {name: run_network(network, hidden) for name, network in deformation.networks.items() if name != TRUNK}
+    unit = deformation_unit(box)
+    return {name: out * unit if name in LENGTH_HEADS else out for name, out in outputs.items()}

@@ -10,14 +10,15 @@ from __future__ import annotations
 import os
 import pickle
 import tempfile
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
-from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.codec.check import check_scene
+from pd4dgs_codec.errors import DataError, Pd4Error
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.scene import (
@@ -85,16 +86,23 @@ def load(path: str | Path) -> tuple[Model, dict[str, Any]]:
         raise DataError(f"{path}: not a readable checkpoint; expected a {FORMAT} file") from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise DataError(f"{path}: not a {FORMAT}; found {_describe(content)}")
-    if content.get("version") != VERSION:
-        raise DataError(f"{path}: {FORMAT} version {content.get('version')!r}, expected {VERSION}")
+    version = content.get("version")
+    if not isinstance(version, int) or version != VERSION:
+        raise DataError(f"{path}: {FORMAT} version {version!r}, expected {VERSION}")
     try:
-        model = _build(content)
-    except (KeyError, TypeError, ValueError, IndexError, RuntimeError, AttributeError) as error:
-        raise DataError(f"{path}: a {FORMAT} with missing or misshapen content: {error}") from None
-    for name, tensor in model.state_dict().items():
-        if tensor.is_floating_point() and not torch.isfinite(tensor).all():
-            raise DataError(f"{path}: tensor {name} holds a NaN or an infinity; expected finite numbers")
-    return model, content["training"]
+        _refuse_not_finite(content["state"])
+        return _build(content), dict(content["training"])
+    except (
+        KeyError, TypeError, ValueError, IndexError, RuntimeError, AttributeError, MemoryError, Pd4Error
+    ) as error:  # fmt: skip
+        reason = " ".join(str(error).split())  # torch explains itself over several lines
+        raise DataError(f"{path}: a {FORMAT} with missing or misshapen content: {reason}") from None
+
+
+def _refuse_not_finite(state: dict[str, torch.Tensor]) -> None:
+    for name, tensor in state.items():
+        if not torch.isfinite(tensor).all():
+            raise DataError(f"tensor {name} holds a NaN or an infinity; expected finite numbers")
 
 
 def _build(content: dict[str, Any]) -> Model:
@@ -112,7 +120,10 @@ def _build(content: dict[str, Any]) -> Model:
         if reso is None:
             return None
         prefix = f"{name}_deformation"
-        channels = state[f"{prefix}.planes.grid"].shape[1]
+        n_cells, channels = state[f"{prefix}.planes.grid"].shape
+        needed = sum(r[a] * r[b] for r in reso for _, a, b in PLANES)
+        if needed != n_cells:  # before anything of that size is made
+            raise ValueError(f"{name} planes of {n_cells} cells, expected {needed} for the resolutions {reso}")
         planes = tuple(
             {plane: np.zeros((channels, r[b], r[a]), np.float32) for plane, a, b in PLANES} for r in reso
         )
@@ -125,17 +136,18 @@ def _build(content: dict[str, Any]) -> Model:
     scene = Scene(
         info=_info_from_plain(content["info"]),
         steps=Steps(**content["steps"]),
-        layers=(0,),
-        rows=(n,),
+        layers=(0, 1, 2),
+        rows=(n, n, n),
         anchor_q=state["anchor_q"],
         feature=np.zeros((n, 32), np.float32),
         scaling_log=np.zeros((n, 6), np.float32),
         offset=np.zeros((n, 10, 3), np.float32),
-        mask=(np.full(n, 255, np.uint8),),
+        mask=(np.full(n, 255, np.uint8),) * 3,
         networks={name: network(f"networks.{name}") for name in SCAFFOLD_NETWORKS},
         global_deformation=deformation("global"),
         local_deformation=deformation("local"),
     )
+    check_scene(replace(scene, steps=scene.steps.scaled(1.0)))
     model = from_scene(scene)
     model.load_state_dict(content["state"])
     return model

@@ -21,6 +21,7 @@ class DeformationField(nn.Module):
     def __init__(self, planes: HexPlane, trunk: MLP, heads: dict[str, MLP]):
         super().__init__()
         self.planes = planes
+        self.unit = float(scene.deformation_unit(planes.box.numpy()))
         self.trunk = trunk
         self.heads = nn.ModuleDict(heads)
 
@@ -51,9 +52,15 @@ class DeformationField(nn.Module):
     def forward(
         self, points: Tensor, t: float, plane_step: float | None = None, weight_step: float | None = None
     ) -> dict[str, Tensor]:
-        """points [n, 3] world, t in 0..1 -> residual [n, width] per head present."""
+        """points [n, 3] world, t in 0..1 -> residual [n, width] per head present, lengths in scene units."""
         if not self.heads:
             return {}
+        outputs = self._outputs(points, t, plane_step, weight_step)
+        return {name: out * self.unit if name in scene.LENGTH_HEADS else out for name, out in outputs.items()}
+
+    def _outputs(
+        self, points: Tensor, t: float, plane_step: float | None, weight_step: float | None
+    ) -> dict[str, Tensor]:
         hidden = F.relu(self.trunk(self.planes(points, t, step=plane_step), weight_step))
         layers = {name: head.rounded(weight_step) for name, head in self.named_heads()}
         if any(len(head) > 1 for head in layers.values()):

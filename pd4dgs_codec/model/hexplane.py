@@ -94,7 +94,8 @@ def sample_reference(grid: Tensor, layout: PlaneLayout, box: Tensor, points: Ten
 class HexPlane(nn.Module):
     """A learnable HexPlane.
 
-    box: [2, 3] lower and upper corner, scene units; points are normalised by it and clamped to it.
+    box: [2, 3] lower and upper corner, scene units; points are normalised by it and clamped to it. On an axis where
+    the corners are equal, points up to it fall on the first cell and those above it on the last.
     resolution: cells along x, y, z, t of the base scale, each >= 1. multires: factor on x, y, z per scale.
     The parameter `grid` is [cells, C]; `layout` says which cells are which plane. Start values: time planes 1, each
     channel of a spatial plane one draw of U(0.1, 0.5), not one per cell as in the public code: cells that no anchor
@@ -134,8 +135,8 @@ class HexPlane(nn.Module):
 
     def _setup(self, box, resolutions: Sequence[Sequence[int]], channels: int) -> None:
         corners = torch.as_tensor(np.array(box, np.float32))
-        if corners.shape != (2, 3) or not torch.isfinite(corners).all() or not (corners[1] > corners[0]).all():
-            raise DataError(f"HexPlane box must be [2, 3], finite, lower < upper, found {corners.tolist()}")
+        if corners.shape != (2, 3) or not torch.isfinite(corners).all() or not (corners[1] >= corners[0]).all():
+            raise DataError(f"HexPlane box must be [2, 3], finite, lower <= upper, found {corners.tolist()}")
         self.box: Tensor
         self.register_buffer("box", corners)
         self.layout = PlaneLayout.build(resolutions)

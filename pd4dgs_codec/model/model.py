@@ -25,7 +25,7 @@ from pd4dgs_codec.scene import FEATURE_DIM, MASK_THRESHOLD, N_OFFSETS, SCAFFOLD_
 MIN_OPACITY = 1.0 / 255.0
 #: Opacities of an anchor's ten Gaussians start spread between these: some are seen everywhere, and not all are, since
 #: they start at one place.
-START_OPACITY = (-0.25, 0.15)
+START_OPACITY = (-0.1, 0.2)
 #: Anchors farther outside the image than this share of its size (plus their own extent) are not evaluated.
 FRUSTUM_MARGIN = 0.15
 
@@ -240,7 +240,5 @@ def fresh_networks(hidden: int) -> dict[str, MLP]:
     width = FEATURE_DIM + 3
     networks = {name: MLP((width, hidden, outputs)) for name, outputs in SCAFFOLD_NETWORKS.items()}
     with torch.no_grad():  # else chance decides what is ever seen
-        last = networks["opacity"].layers[-1]
-        last.bias.copy_(torch.linspace(*START_OPACITY, N_OFFSETS))
-        last.weight.mul_(0.3)
+        networks["opacity"].layers[-1].bias.copy_(torch.linspace(*START_OPACITY, N_OFFSETS))
     return networks

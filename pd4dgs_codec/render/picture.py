@@ -35,13 +35,17 @@ def render(
 ) -> Picture:
     """Render_level at normalised time t in 0..1; viewmat [4, 4] world to camera, K [3, 3] pixels."""
     gaussians = model.gaussians(level, t, viewmat, K, width, height, rounding)
+    opacities, colors = gaussians.opacities, gaussians.colors
+    if not torch.is_grad_enabled():  # a colour that overflowed hides its Gaussian; training refuses the step instead
+        opacities = torch.where(colors.isfinite().all(1), opacities, 0.0)
+        colors = colors.nan_to_num()
     background = torch.tensor([model.info.background], dtype=torch.float32, device=viewmat.device)
-    colors, alphas, meta = rasterization(
+    images, alphas, meta = rasterization(
         gaussians.means,
         gaussians.quats,
         gaussians.scales,
-        gaussians.opacities,
-        gaussians.colors,
+        opacities,
+        colors,
         viewmat[None],
         K[None],
         width,
@@ -49,7 +53,7 @@ def render(
         near_plane=max(float(model.info.near), 1e-6),
         backgrounds=background,
     )
-    return Picture(colors[0], alphas[0, ..., 0], gaussians, meta)
+    return Picture(images[0], alphas[0, ..., 0], gaussians, meta)
 
 
 @torch.no_grad()

@@ -47,7 +47,7 @@ class TrainConfig:
     max_seconds: float | None = None
     seed: int = 0
     lambdas: tuple[float, float, float] = (0.04, 0.01, 0.00025)  #: rate weight per level
-    rate_scale: float = 0.3  #: multiplies every lambda; 1 is the paper's operating point
+    rate_scale: float = 0.1  #: multiplies every lambda; 1 is the paper's operating point
     rate_share: float = 0.05  #: share of the anchors on which a step estimates the rate
     tmc: float = 0.01
     tmc_binary: bool = True

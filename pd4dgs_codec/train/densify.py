@@ -45,13 +45,15 @@ class Densifier:
         self.anchor_visits.index_add_(0, rows, torch.ones(len(rows)))
 
     @torch.no_grad()
-    def adjust(self, model: Model, optimiser: Optimiser, generator: torch.Generator, *, grow: bool) -> tuple[int, int]:
-        """Prunes and (if `grow`) grows; forgets the statistics that were judged. Returns (pruned, grown)."""
+    def adjust(
+        self, model: Model, optimiser: Optimiser, generator: torch.Generator, *, grow: bool, prune: bool
+    ) -> tuple[int, int]:
+        """Prunes and grows as told; forgets the statistics that were judged. Returns (pruned, grown)."""
         masks = model.masks(2).cpu()
         visited = self.anchor_visits >= MIN_ANCHOR_VISITS
         faint = visited & (self.opacity < MIN_MEAN_OPACITY * self.anchor_visits)
         keep = (~faint & (masks > MASK_THRESHOLD)).nonzero()[:, 0]
-        if len(keep) == 0:  # nothing shows yet: better a bad model than none
+        if not prune or len(keep) == 0:  # if nothing shows: better a bad model than none
             keep = torch.arange(len(masks))
         cells, feature = self._new_cells(model, generator) if grow else (None, None)
         room = self.max_anchors - len(keep)

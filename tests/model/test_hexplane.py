@@ -206,7 +206,7 @@ def test_errors():
         HexPlane.from_plane_arrays(BOX, wrong)
     with pytest.raises(DataError, match="planes"):
         HexPlane.from_plane_arrays(BOX, ({"xy": arrays[0]["xy"]},))
-    with pytest.raises(DataError, match="lower < upper"):
+    with pytest.raises(DataError, match="lower <= upper"):
         HexPlane(BOX[::-1], (4, 4, 4, 4))
     with pytest.raises(TrainError, match="resolution"):
         HexPlane(BOX, (4, 4, 0, 4))
