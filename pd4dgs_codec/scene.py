@@ -40,11 +40,11 @@ LENGTH_HEADS = ("position", "mean", "scale")
 
 
 def deformation_unit(box: np.ndarray) -> np.float32:
-    """The unit of LENGTH_HEADS: an eighth of the longest side of the HexPlanes' box, scene units.
+    """The unit of LENGTH_HEADS: a quarter of the longest side of the HexPlanes' box, scene units.
 
     In scene units a rounded weight would shift a small scene by whole pixels.
     """
-    return np.float32(0.125) * (box[1] - box[0]).astype(np.float32).max()
+    return np.float32(0.25) * (box[1] - box[0]).astype(np.float32).max()
 
 
 #: The decoders of the scaffold (input [feature 32, view direction 3]) with their output width.
@@ -98,11 +98,11 @@ class Steps:
     feature: float = 0.025
     scaling_log: float = 0.03
     offset: float = 0.05
-    planes_global: float = 0.02
-    planes_local: float = 0.03
+    planes_global: float = 0.03
+    planes_local: float = 0.06
     weights_scaffold: float = 0.004
-    weights_global: float = 0.002
-    weights_local: float = 0.002
+    weights_global: float = 0.001
+    weights_local: float = 0.001
 
     def scaled(self, factor: float) -> Steps:
         """Every step times `factor`, rounded to binary32."""

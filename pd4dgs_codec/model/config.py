@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS
+from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS, Steps
 
 
 @dataclass(frozen=True)
@@ -28,6 +28,7 @@ class ModelConfig:
     hidden: int = 32
     initial_anchors: int = 20_000
     max_anchors: int = 40_000
+    steps: Steps = Steps()
 
 
 _GLOBAL, _LOCAL = tuple(GLOBAL_HEADS), tuple(LOCAL_HEADS)
@@ -49,5 +50,6 @@ PRESETS: dict[str, ModelConfig] = {
         DeformationConfig(64, 100, 16, (1, 2), 64, _LOCAL),
         initial_anchors=26_000,
         max_anchors=50_000,
+        steps=Steps(planes_global=0.04, planes_local=0.1),  # twice the cells: coarser, for the same bytes
     ),
 }

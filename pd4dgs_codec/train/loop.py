@@ -49,7 +49,7 @@ class Trainer:
     def __init__(self, config: TrainConfig, dataset: Dataset, device: str = "cpu"):
         preset = PRESETS[config.preset]
         self.config, self.dataset, self.device = config, dataset, torch.device(device)
-        self.model = fresh_model(preset, dataset, config.steps, config.seed).to(self.device)
+        self.model = fresh_model(preset, dataset, config.steps or preset.steps, config.seed).to(self.device)
         self.optimiser = Optimiser(self.model, config.rates)
         self.densifier = Densifier(self.model, config.grow_threshold, preset.max_anchors)
         self.generator = torch.Generator().manual_seed(config.seed)
