@@ -98,7 +98,7 @@ class Steps:
     feature: float = 0.025
     scaling_log: float = 0.03
     offset: float = 0.05
-    planes_global: float = 0.03
+    planes_global: float = 0.05
     planes_local: float = 0.06
     weights_scaffold: float = 0.004
     weights_global: float = 0.001

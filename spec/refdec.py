@@ -227,10 +227,14 @@ def read_header(data):
         a_step(step)
     need(type(header[11]) is float, "header key 11: expected float 32")
     need(all(a <= b for a, b in zip(header[6][:3], header[6][3:])), "a lower corner of the box above the upper one")
+    (start, end), (near, far) = header[7], header[9]
+    need(start <= end and all(0 <= c <= 1 for c in header[8]) and 0 <= near < far, "time, background, near or far")
+    need(header[11] >= 0, "a negative unit")
     if 12 in header:
         camera = fields(header[12], range(1, 5), range(1, 5), "camera")
         reals(camera[1], "camera matrix", 12)
-        reals(camera[2], "camera intrinsics", 9)
+        fx, fy, _, _ = reals(camera[2], "camera intrinsics", 4)
+        need(fx > 0 and fy > 0, "a focal length that is not positive")
         for key in (3, 4):
             limited(camera[key], 65535, "camera size", 1)
     read_chunk_list(a_list(header[1], "chunk list"))
@@ -326,6 +330,7 @@ def read_scales(layer, rows):
     for row in rows:
         a_list(row, "a scale", 11)
         limited(row[0], 256, "plane channels", 1)
+        need(row[0] == rows[0][0], "scales with different channels")
         for side in row[1:5]:
             limited(side, 4096, "a plane's side", 1)
         for predictor in row[5:]:

@@ -23,9 +23,9 @@ SHARED = Path(os.environ.get("PD4DGS_SHARED", Path(__file__).resolve().parents[2
 SCENES = (
     ("shelf-hand", SHARED / "shelf-hand", 2, "small", 1.0),
     ("bouncing-balls", SHARED / "bouncing-balls", 4, "small", 1.0),
-    ("synthetic-local", "synthetic:local", 1, "small", 0.5),
-    ("synthetic-fast", "synthetic:fast", 1, "small", 0.5),
-    ("shelf-hand-paper", SHARED / "shelf-hand", 2, "paper", 1.2),
+    ("synthetic-local", "synthetic:local", 1, "small", 0.4),
+    ("synthetic-fast", "synthetic:fast", 1, "small", 0.4),
+    ("shelf-hand-paper", SHARED / "shelf-hand", 2, "paper", 1.0),
 )
 #: Bytes per layer that the PD-4DGS paper publishes (average over the seven Dycheck iPhone scenes).
 PUBLISHED = (436_000, 1_187_000, 5_275_000)

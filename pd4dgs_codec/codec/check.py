@@ -77,6 +77,25 @@ def _check_info(scene: Scene) -> None:
         sizes = (info.camera.width, info.camera.height)
         _expect(all(1 <= s <= 65535 for s in sizes), f"camera of {sizes} pixels, expected 1..65535 each")
         _expect(bool((info.camera.viewmat[3] == (0, 0, 0, 1)).all()), "camera.viewmat: last row is not 0 0 0 1")
+        form = info.camera.K * ((0, 1, 0), (1, 0, 0), (1, 1, 1))
+        _expect(bool((form == ((0, 0, 0), (0, 0, 0), (0, 0, 1))).all()), "camera.K: expected fx 0 cx, 0 fy cy, 0 0 1")
+    fault = info_fault(info)
+    _expect(fault is None, str(fault))
+
+
+def info_fault(info: SceneInfo) -> str | None:
+    """What is wrong with finite header values that a player could not work with, or None; encoder and decoder agree."""
+    start, end = info.time_range
+    rules = [
+        (start <= end, f"time range {start}..{end}, expected it to ascend"),
+        (all(0 <= c <= 1 for c in info.background), f"background {info.background}, expected 0..1"),
+        (0 <= info.near < info.far, f"near {info.near} and far {info.far}, expected 0 <= near < far"),
+        (info.unit >= 0, f"unit {info.unit}, expected 0 or more"),
+    ]
+    if info.camera is not None:
+        fx, fy = float(info.camera.K[0, 0]), float(info.camera.K[1, 1])
+        rules.append((fx > 0 and fy > 0, f"camera with focal lengths {fx} and {fy}, expected both positive"))
+    return next((fault for holds, fault in rules if not holds), None)
 
 
 def _check_deformation(deformation: Deformation, kind: LayerKind) -> None:
@@ -85,6 +104,8 @@ def _check_deformation(deformation: Deformation, kind: LayerKind) -> None:
     for s, planes in enumerate(deformation.planes):
         _expect(set(planes) == {p for p, _, _ in PLANES}, f"{name} scale {s}: planes {sorted(planes)}, expected six")
         channels, side = planes["xy"].shape[0], plane_sides(planes)
+        first = deformation.planes[0]["xy"].shape[0]
+        _expect(channels == first, f"{name} scale {s}: {channels} channels, expected {first} as in scale 0")
         _expect(min(channels, *side) >= 1, f"{name} scale {s}: an empty plane")
         for p, a, b in PLANES:
             _expect_array(f"{name} scale {s} plane {p}", planes[p], np.float32, (channels, side[b], side[a]))

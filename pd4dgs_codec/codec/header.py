@@ -10,6 +10,7 @@ from pd4dgs_codec.attributes.quantise import is_step
 from pd4dgs_codec.attributes.table import ATTRIBUTES
 from pd4dgs_codec.bitstream import canonical
 from pd4dgs_codec.bitstream.limits import MAX_CHUNKS, MAX_PAYLOAD
+from pd4dgs_codec.codec.check import info_fault
 from pd4dgs_codec.codec.fields import Fields, as_integer, as_list
 from pd4dgs_codec.codec.kinds import LAYER_KINDS
 from pd4dgs_codec.errors import Malformed
@@ -67,7 +68,7 @@ def pack_header(header: Header) -> bytes:
         camera = info.camera
         fields[CAMERA] = {
             VIEWMAT: _f32(camera.viewmat[:3]),
-            INTRINSICS: _f32(camera.K),
+            INTRINSICS: _f32(camera.K[[0, 1, 0, 1], [0, 1, 2, 2]]),
             WIDTH: int(camera.width),
             HEIGHT: int(camera.height),
         }
@@ -97,6 +98,9 @@ def unpack_header(data: bytes, offset: int = 0) -> Header:
         unit=fields.real(UNIT),
         camera=_unpack_camera(fields.get(CAMERA)) if CAMERA in fields else None,
     )
+    fault = info_fault(info)
+    if fault is not None:
+        raise Malformed(f"header: {fault}")
     return Header(
         chunks=_unpack_chunks(fields.sequence(CHUNKS)),
         mode=fields.choice(MODE, MODES),
@@ -127,9 +131,10 @@ def _unpack_camera(data: object) -> Camera:
     fields = Fields(data, "header camera", {VIEWMAT, INTRINSICS, WIDTH, HEIGHT})
     viewmat = np.eye(4, dtype=np.float32)
     viewmat[:3] = np.array(fields.reals(VIEWMAT, 12), dtype=np.float32).reshape(3, 4)
+    fx, fy, cx, cy = fields.reals(INTRINSICS, 4)
     return Camera(
         viewmat=viewmat,
-        K=np.array(fields.reals(INTRINSICS, 9), dtype=np.float32).reshape(3, 3),
+        K=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float32),
         width=fields.integer(WIDTH, MAX_CAMERA_SIDE, low=1),
         height=fields.integer(HEIGHT, MAX_CAMERA_SIDE, low=1),
     )

@@ -154,10 +154,12 @@ def _unpack_steps(fields: Fields, kind: LayerKind, where: str) -> dict[str, floa
 def _unpack_scales(fields: Fields, raw: bool, where: str) -> tuple[ScaleMeta, ...]:
     rows = fields.sequence(SCALES)
     as_integer(len(rows), MAX_PLANE_SCALES, f"{where}: number of scales", low=1)
-    scales = []
+    scales: list[ScaleMeta] = []
     for i, row in enumerate(rows):
         channels, *rest = as_list(row, f"{where} scale {i}", 5 + len(PLANES))
         as_integer(channels, MAX_PLANE_CHANNELS, f"{where} scale {i} channels", low=1)
+        if scales and channels != scales[0].channels:
+            raise Malformed(f"{where} scale {i}: {channels} channels, expected {scales[0].channels} as in scale 0")
         for side in rest[:4]:
             as_integer(side, MAX_PLANE_SIDE, f"{where} scale {i} side", low=1)
         for predictor in rest[4:]:

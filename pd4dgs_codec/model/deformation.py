@@ -27,7 +27,7 @@ class DeformationField(nn.Module):
 
     @staticmethod
     def fresh(
-        config: DeformationConfig, box: np.ndarray, head_widths: dict[str, int], plane_step: float
+        config: DeformationConfig, box: np.ndarray, head_widths: dict[str, int], plane_step: float | None
     ) -> DeformationField:
         """A new field with the heads that `config` names, `head_widths` giving each one's output width."""
         resolution = (config.resolution,) * 3 + (config.time_resolution,)

@@ -97,11 +97,10 @@ class HexPlane(nn.Module):
     box: [2, 3] lower and upper corner, scene units; points are normalised by it and clamped to it. On an axis where
     the corners are equal, points up to it fall on the first cell and those above it on the last.
     resolution: cells along x, y, z, t of the base scale, each >= 1. multires: factor on x, y, z per scale.
-    The parameter `grid` is [cells, C]; `layout` says which cells are which plane. Start values: time planes 1, each
-    channel of a spatial plane one draw of U(0.1, 0.5), not one per cell as in the public code: cells that no anchor
-    reaches keep their start value, and noise there would cost bits. With the quantisation step `step` the draw is a
-    multiple of it and each cell is dithered within its rounding interval: free where nothing is learnt, and elsewhere
-    the rounding errors of neighbouring cells are independent, where equal ones would shift the whole scene.
+    The parameter `grid` is [cells, C]; `layout` says which cells are which plane. Start values: time planes 1, spatial
+    planes U(0.1, 0.5) in each cell. With the quantisation step `step`, one draw per channel instead, a multiple of it,
+    dithered within the rounding interval of each cell: cells that no anchor reaches keep their start value, and noise
+    there would cost bits; dither is free there, and elsewhere it keeps the rounding errors of neighbours independent.
     """
 
     def __init__(
@@ -123,15 +122,16 @@ class HexPlane(nn.Module):
         x, y, z, t = (int(r) for r in resolution)
         self._setup(box, [(x * m, y * m, z * m, t) for m in map(int, multires)], int(channels))
         with torch.no_grad():
+            spatial = self.grid[: self.layout.n_spatial]
+            if step is None:
+                spatial.uniform_(0.1, 0.5, generator=generator)
+                return
             for scale in self.layout.views(self.grid):
                 for name, _, b in PLANES:
                     if b != TIME_AXIS:
                         start = torch.empty(channels).uniform_(0.1, 0.5, generator=generator)
-                        scale[name].copy_(start if step is None else torch.round(start / step) * step)
-            if step is not None:
-                self.grid[: self.layout.n_spatial] += step * torch.empty(self.layout.n_spatial, channels).uniform_(
-                    -0.45, 0.45, generator=generator
-                )
+                        scale[name].copy_(torch.round(start / step) * step)
+            spatial += step * torch.empty_like(spatial).uniform_(-0.45, 0.45, generator=generator)
 
     def _setup(self, box, resolutions: Sequence[Sequence[int]], channels: int) -> None:
         corners = torch.as_tensor(np.array(box, np.float32))

@@ -23,7 +23,7 @@ class LearningRates:
     covariance: tuple[float, float] = (4e-3, 4e-4)
     color: tuple[float, float] = (8e-3, 2e-4)
     planes: tuple[float, float] = (1e-2, 5e-4)
-    deformation: tuple[float, float] = (2e-3, 1e-4)
+    deformation: tuple[float, float] = (1.5e-3, 7e-5)
 
 
 @dataclass(frozen=True)
@@ -60,8 +60,8 @@ class TrainConfig:
     grow_threshold: float = 2e-4
     steps: Steps | None = None  #: None: the preset's
     rates: LearningRates = field(default_factory=LearningRates)
-    global_planes: PlaneWeights = PlaneWeights(3e-4, 1.5e-3, 5e-5)
-    local_planes: PlaneWeights = PlaneWeights(6e-4, 3e-3, 1e-4)
+    global_planes: PlaneWeights = PlaneWeights(1e-4, 5e-4, 5e-5)
+    local_planes: PlaneWeights = PlaneWeights(2e-4, 1e-3, 1e-4)
     max_gradient_norm: float = 100.0
 
     def __post_init__(self) -> None:

@@ -32,7 +32,7 @@ def fresh_model(config: ModelConfig, dataset: Dataset, steps: Steps, seed: int) 
     spacing = nearest_distances((anchor_q.double() * info.voxel_size).float()).clamp(min=info.voxel_size)
     fields = []
     for field, widths, step in (
-        (config.global_deformation, GLOBAL_HEADS, steps.planes_global),
+        (config.global_deformation, GLOBAL_HEADS, None),  # few cells, all reached: noise tells places apart at once
         (config.local_deformation, LOCAL_HEADS, steps.planes_local),
     ):
         fields.append(None if field is None else DeformationField.fresh(field, info.box, widths, step))
