@@ -217,8 +217,9 @@ def read_preamble(data):
     return read_header(header), 20 + size
 
 
-# 5.1 Header map: "coding mode: 0 ans, 1 lzma; others UnsupportedFeature" "deformation: 0 coded as symbols, 1 float32
-# (9.2); others UnsupportedFeature"
+# 5.1 Header map: "The time at 1 MUST NOT precede the time at 0, the background MUST lie in 0..1, 0 ≤ near < far and
+# unit ≥ 0 MUST hold." "coding mode: 0 ans, 1 lzma; others UnsupportedFeature" "deformation: 0 coded as symbols, 1
+# float32 (9.2); others UnsupportedFeature"
 def read_header(data):
     header = fields(unpack(data), range(1, 13), range(1, 12), "header")
     for key, count in ((4, 3), (6, 6), (7, 2), (8, 3), (9, 2), (10, 3)):
@@ -323,8 +324,8 @@ def header_is_float32(header):
     return header[3] == 1
 
 
-# 6.3 Planes and networks: "channels 1..256, resolutions 1..4096 along x, y, z, t, and one predictor per plane (11.3;
-# all 0 if the layer's deformation is float32)."
+# 6.3 Planes and networks: "channels 1..256, the same in every scale, resolutions 1..4096 along x, y, z, t, and one
+# predictor per plane (11.3; all 0 if the layer's deformation is float32)."
 def read_scales(layer, rows):
     limited(len(a_list(rows, "scales")), 8, "the number of scales", 1)
     for row in rows:

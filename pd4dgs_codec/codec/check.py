@@ -11,7 +11,7 @@ from pd4dgs_codec.attributes.table import ATTRIBUTES
 from pd4dgs_codec.bitstream.limits import MAX_VOXEL
 from pd4dgs_codec.codec.kinds import LAYER_KINDS, SCAFFOLD_INPUT, TRUNK, LayerKind
 from pd4dgs_codec.errors import EncodeError
-from pd4dgs_codec.scene import MASK_MIN_CODE, PLANES, Deformation, Network, Scene
+from pd4dgs_codec.scene import MASK_MIN_CODE, PLANES, Deformation, Network, Scene, SceneInfo
 
 
 def _expect(ok: bool, message: str) -> None:
