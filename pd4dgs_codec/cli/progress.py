@@ -69,4 +69,7 @@ class TrainingProgress:
             self.bar = tqdm(
                 total=trainer.total or None, initial=trainer.iteration - 1, unit="step", file=self.stream, leave=False
             )
+        if self.bar.total is None and trainer.total:  # a time limit fixes the number of steps after some have passed
+            self.bar.total = trainer.total
+            self.bar.refresh()
         return self.bar

@@ -75,11 +75,11 @@ class Trainer:
         saved = time.monotonic()
         stream = open(log, "a", encoding="utf-8") if log else None  # noqa: SIM115
         try:
-            if not self.total:
-                self._fix_iterations(start)
-            while self.iteration < self.total:
+            while not self.total or self.iteration < self.total:
                 record = self.step()
                 self.seconds = time.monotonic() - start
+                if not self.total and self.iteration >= TIMED_STEPS:
+                    self._fix_iterations(start)
                 if self._curve_due():
                     record["held_out_psnr"] = self._evaluate()
                     self.seconds = time.monotonic() - start
@@ -99,7 +99,7 @@ class Trainer:
                 stream.close()
             if progress:
                 progress.close()
-        if self.iteration >= self.total:
+        if self.total and self.iteration >= self.total:
             self.model.round_weights()  # the file holds rounded values; so does the finished checkpoint
         self.save(output)
 
@@ -204,7 +204,7 @@ class Trainer:
             drawn = (picture.meta["radii"][0] > 0).all(-1)
             height, width = picture.alpha.shape
             self.densifier.observe(picture.gaussians, gradient[0], drawn, width, height)
-        self.optimiser.step(self.iteration / max(1, self.total))
+        self.optimiser.step(self.iteration / self.total if self.total else 0.0)
         if self.total and self.iteration in schedule.grow:
             room = len(self.model.anchor_q) < self.densifier.max_anchors
             pruned, grown = self.densifier.adjust(
@@ -249,11 +249,6 @@ class Trainer:
     def _fix_iterations(self, start: float) -> None:
         """Fixes N from the cost of a step at each level, so that the run fills TIME_SHARE of its limit."""
         assert self.config.max_seconds
-        for _ in range(TIMED_STEPS):
-            self.step()
-            self.seconds = time.monotonic() - start
-            if self.seconds >= self.config.max_seconds:
-                break
         costs = self._level_costs()
         schedule = Schedule(1000)
         coarse = schedule.coarse_end / 1000
@@ -282,6 +277,8 @@ class Trainer:
         return [1.1 * sorted(level)[repeats // 2] for level in seconds]  # the update itself is not run here
 
     def _curve_due(self) -> bool:
+        if not self.total:
+            return False
         every = max(1, self.total // CURVE_POINTS)
         return self.iteration % every == 0 or self.iteration == self.total
 
