@@ -410,7 +410,9 @@ def read_sections(layer, parts):
             channels[section], decoded = decoded[: len(counts[section])], decoded[len(counts[section]) :]
     else:
         for section in counts:
-            channels[section] = decode_channels(part(section, sum(counts[section])), counts[section])
+            data = part(section, sum(counts[section]))
+            attributes = section == ATTRIBUTE_SECTION and layer.rows > 0
+            channels[section] = (decode_attributes if attributes else decode_channels)(data, counts[section])
     layer.raw_values = {}
     if layer.raw:
         sizes = {name: c * h * w for name, _, (c, h, w) in planes} | dict(weights)
@@ -654,6 +656,87 @@ def take_channel(stream, count, prior, exceptions):
         return symbols
     inside = iter(symbols)
     return [exceptions[at] if at in exceptions else next(inside) for at in range(count)]
+
+
+# 8.5 The attributes section: "Section 2 is a u8, the form" "Other forms are UnsupportedFeature."
+def decode_attributes(data, counts):
+    reader = Reader(data)
+    form = reader.byte()
+    need(form <= 1, f"form {form} of the attributes", "UnsupportedFeature")
+    if form == 0:
+        return decode_channels(reader.take(reader.left), counts)
+    terms = [read_terms(reader, c) for c in range(1, 38)]
+    splits = [read_split(reader) for _ in range(10)]
+    # 8.6: "two varints, the lengths in bytes of stages 0 and 1, each at most the section's length. Their sum MUST NOT
+    # exceed the bytes that follow the block. Stage 2 is the rest, to the section's end."
+    sizes = [reader.varint(len(data)) for _ in range(2)]
+    need(sum(sizes) <= reader.left, f"stages of {sizes} bytes in the {reader.left} that are left")
+    stages = [reader.take(size) for size in sizes] + [reader.take(reader.left)]
+    return decode_stages(stages, counts[0], terms, splits)
+
+
+# 8.6 Prediction block: "a varint m ≤ c, then m times a varint g ≤ 38 and a zigzag weight w, |w| ≤ 2^15. The term
+# refers to channel j = j' + 1 + g, where j' is the channel of the term before, −1 for the first; so the j ascend. j
+# MUST be less than c, else Malformed"
+def read_terms(reader, c):
+    """[(channel, weight)] of channel c."""
+    terms, j = [], -1
+    for _ in range(reader.varint(c)):
+        j += 1 + reader.varint(38)
+        need(j < c, f"channel {c} is predicted from channel {j}")
+        terms.append((j, reader.zigzag(1 << 15)))
+    return terms
+
+
+# 8.6 Prediction block: "a varint f ≤ 3. Bit 0: y_i is split, by x_i. Bit 1: z_i is split, by x_i and y_i. If f > 0
+# follows a zigzag centre a_i of x_i; if bit 1 is set, then a zigzag centre b_i of y_i; |a_i| and |b_i| ≤ K"
+def read_split(reader):
+    """(y is split, z is split, a, b) of a Gaussian."""
+    f = reader.varint(3)
+    a = reader.zigzag(K) if f else 0
+    return f & 1, f >> 1, a, reader.zigzag(K) if f >> 1 else 0
+
+
+# 8.7 Stages: "so the lengths in stage 1 follow from stage 0, those in stage 2 from stages 0 and 1."
+def decode_stages(stages, rows, terms, splits):
+    k, whole = [None] * 68, list(range(38))
+    for x, (y_is_split, z_is_split, _, _) in zip(range(38, 68, 3), splits):
+        whole += [x] + [x + 1] * (not y_is_split) + [x + 2] * (not z_is_split)
+    for c, symbols in zip(whole, decode_channels(stages[0], [rows] * len(whole))):
+        k[c] = symbols
+    for c, own in enumerate(terms, 1):
+        k[c] = add_prediction(k[c], [(k[j], w) for j, w in own])
+    split_y = [(x, a) for x, (is_split, _, a, _) in zip(range(38, 68, 3), splits) if is_split]
+    classes = [[min(abs(v - a), 4) for v in k[x]] for x, a in split_y]
+    for (x, _), symbols in zip(split_y, decode_classes(stages[1], 5, classes)):
+        k[x + 1] = symbols
+    split_z = [(x, a, b) for x, (_, is_split, a, b) in zip(range(38, 68, 3), splits) if is_split]
+    classes = [[min(abs(v - a) + abs(w - b), 6) for v, w in zip(k[x], k[x + 1])] for x, a, b in split_z]
+    for (x, _, _), symbols in zip(split_z, decode_classes(stages[2], 7, classes)):
+        k[x + 2] = symbols
+    return k
+
+
+# 8.7 Stages: "k_c = r_c + ((Σ w·k_j + 512) >> 10)" "Every k_c MUST lie in −K..K, else Malformed"
+def add_prediction(residuals, terms):
+    sums = [512] * len(residuals)
+    for channel, w in terms:
+        sums = [s + w * k for s, k in zip(sums, channel)]
+    symbols = [r + (s >> 10) for r, s in zip(residuals, sums)]
+    need(all(abs(k) <= K for k in symbols), "a predicted symbol over K")
+    return symbols
+
+
+# 8.7 Stages: "The classes of a split channel are channels of their own: class q holds, in row order, the symbols of
+# the rows with"
+def decode_classes(data, number, classes):
+    """The split channels, given the class of each row of each."""
+    parts = map(iter, decode_channels(data, [own.count(q) for own in classes for q in range(number)]))
+    channels = []
+    for own in classes:
+        of_class = [next(parts) for _ in range(number)]
+        channels.append([next(of_class[q]) for q in own])
+    return channels
 
 
 # 9.1 Symbols: "It MUST unpack to exactly the bytes that the widths and lengths call for, at most 2^31, and end with

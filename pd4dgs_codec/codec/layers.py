@@ -19,6 +19,7 @@ from pd4dgs_codec.attributes.table import N_CHANNELS
 from pd4dgs_codec.bitstream.limits import MAX_VOXEL
 from pd4dgs_codec.codec.kinds import LayerKind
 from pd4dgs_codec.codec.layer_meta import LayerMeta, ScaleMeta, Section, check_symbol_count, pack_meta, unpack_meta
+from pd4dgs_codec.codec.prediction import read_attributes, write_attributes
 from pd4dgs_codec.codec.symbols import LayerSymbols, Planes
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
 from pd4dgs_codec.entropy.lzma_mode import (
@@ -66,16 +67,17 @@ def write_layer(symbols: LayerSymbols, coding: Coding) -> tuple[bytes, list[Stre
     for section, channels in groups.items():
         if not any(channel.size for channel in channels):
             continue
-        if coding.mode == "lzma":
+        if section == Section.ATTRIBUTES:
+            data, rate_bits = write_attributes(symbols.attributes, coding.priors, coding.effort)
+        elif coding.mode == "lzma":  # one stream for all, but a layer's rate counts no masks
             coded = encode_channels_lzma(channels, effort=coding.effort)
+            data, rate_bits = coded.payload, coded.rate_bits - sum(gaussian_bits(c) for c in channels[:2])
         else:
             coded = encode_channels(channels, priors=coding.priors, effort=coding.effort)
-        sections[section] = coded.payload
-        rate_bits = coded.rate_bits
-        if coding.mode == "lzma":  # one stream for all, but a layer's rate counts no masks
-            rate_bits -= sum(gaussian_bits(channel) for channel in channels[:2])
+            data, rate_bits = coded.payload, coded.rate_bits
+        sections[section] = data
         count = sum(channel.size for channel in channels)
-        reports.append(StreamReport(section.name.lower(), coded.payload_bits, rate_bits, count))
+        reports.append(StreamReport(section.name.lower(), 8 * len(data), rate_bits, count))
     if symbols.raw and symbols.networks:
         sections[Section.FLOATS] = encode_floats_lzma([a.ravel() for a in symbols.tensors()], effort=coding.effort)
         reports.append(StreamReport("floats", 8 * len(sections[Section.FLOATS]), 0.0, 0))
@@ -197,7 +199,12 @@ def _decode_groups(
         return channels
     for section in GROUPS:
         data = _part(parts, section, sum(counts[section]))
-        channels[section] = decode_channels(data, counts[section]) if data else _zeros(counts[section])
+        if not data:
+            channels[section] = _zeros(counts[section])
+        elif section == Section.ATTRIBUTES:
+            channels[section] = list(read_attributes(data, rows))
+        else:
+            channels[section] = decode_channels(data, counts[section])
     return channels
 
 

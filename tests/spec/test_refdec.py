@@ -8,6 +8,7 @@ import re
 import struct
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -16,18 +17,21 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import LAYER_SETS, make_scene, scenes
 
-from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
+from pd4dgs_codec.attributes.quantise import MAX_SYMBOL, dequantise
 from pd4dgs_codec.bitstream import canonical
 from pd4dgs_codec.bitstream.container import read_chunk, read_preamble, scene_id_of, write_chunk, write_preamble
 from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.encoder import encode
 from pd4dgs_codec.codec.info import hashes
+from pd4dgs_codec.codec.layer_meta import Section
+from pd4dgs_codec.codec.prediction import PLAIN, PREDICTED, read_attributes
 from pd4dgs_codec.entropy.channels import encode_channels
 from pd4dgs_codec.entropy.lzma_mode import encode_channels_lzma
 from pd4dgs_codec.entropy.morton import morton_order
 from pd4dgs_codec.entropy.positions import encode_positions
 from pd4dgs_codec.entropy.priors import CONST, GAUSS, GMM2, HIST, K_MAX
 from pd4dgs_codec.entropy.tables import NORMAL, OCTAVE
+from pd4dgs_codec.entropy.varint import put_varint, put_zigzag
 from pd4dgs_codec.errors import DecodeError
 
 SPEC = Path(__file__).parents[2] / "spec"
@@ -113,6 +117,155 @@ def test_positions_on_a_surface(depth):
     cells = np.unique(np.rint(sphere * (2 ** (depth - 1) - 1)).astype(np.int32), axis=0)
     cells = cells[morton_order(cells)]
     assert refdec.decode_positions(encode_positions(cells), len(cells)) == [tuple(c) for c in cells.tolist()]
+
+
+def correlated_scene(anchors):
+    """Features and log-scalings mixed from five sources; per Gaussian, half of the anchors have offset 0, 0, 0."""
+    scene = make_scene(5, layers=(0, 1), anchors=anchors, extent=12)
+    rng, n = np.random.default_rng(6), len(scene.anchor_q)
+    mixed = np.rint(rng.normal(size=(n, 5)) @ rng.normal(size=(5, 38)) * 6 + rng.normal(size=(n, 38)))
+    offset = np.rint((rng.random((n, 10, 1)) < 0.5) * rng.normal(size=(n, 10, 3)) * 8)
+    mixed, offset = mixed.astype(np.int32), offset.astype(np.int32)
+    return replace(
+        scene,
+        feature=dequantise(mixed[:, :32], scene.steps.feature),
+        scaling_log=dequantise(mixed[:, 32:], scene.steps.scaling_log),
+        offset=dequantise(offset, scene.steps.offset),
+    )
+
+
+def attributes_section(payload):
+    (length,) = struct.unpack_from("<I", payload)
+    meta = canonical.unpack(payload[4 : 4 + length])
+    start = 4 + length + sum(size for section, size in meta[2].items() if section < Section.ATTRIBUTES)
+    return payload[start : start + meta[2][int(Section.ATTRIBUTES)]], meta[1]
+
+
+@pytest.fixture(scope="module")
+def predicted_file():
+    return encode(correlated_scene(1000), layers=2, effort=2)
+
+
+def test_hashes_of_a_scene_whose_attributes_are_predicted(predicted_file):
+    section, rows = attributes_section(take_apart(predicted_file)[1][0][2])
+    assert section[0] == PREDICTED and rows >= 400
+    reader = refdec.Reader(section[1:])
+    assert any(refdec.read_terms(reader, c) for c in range(1, 38))
+    assert any(refdec.read_split(reader)[:2] == (1, 1) for _ in range(10))
+    assert refdec.hashes(predicted_file) == hashes(predicted_file)
+    plain = encode(correlated_scene(1000), layers=2, effort=1)
+    assert attributes_section(take_apart(plain)[1][0][2])[0][0] == PLAIN
+    assert refdec.hashes(plain) == hashes(predicted_file)
+
+
+def test_damage_to_a_predicted_scene_has_the_same_outcome(predicted_file):
+    section, rows = attributes_section(take_apart(predicted_file)[1][0][2])
+    rng, seen = random.Random(4), set()
+    for i in range(40):
+        at = rng.randrange(1, 1200 if i % 2 else len(section))
+        damaged = section[:at] + bytes([rng.randrange(256)]) + section[at + 1 :]
+        ours, theirs = both(damaged, rows)
+        assert ours == theirs, (at, damaged[at])
+        seen.add(ours if isinstance(ours, str) else "fine")
+    assert {"Malformed", "LimitExceeded"} <= seen
+
+
+ROWS = 9
+
+
+def predicted_section(terms=None, splits=None, *, form=1, lengths=None, residual=3, extra=b""):
+    """Attributes of ROWS rows in form 1, every residual and offset the same. terms: c -> (m, [(g, w)]); splits: i ->
+    (f, centres); lengths: of stages 0 and 1 from the true ones."""
+    block, splits = bytearray([form]), splits or {}
+    for c in range(1, 38):
+        number, own = (terms or {}).get(c, (0, []))
+        put_varint(block, number)
+        for gap, weight in own:
+            put_varint(block, gap)
+            put_zigzag(block, weight)
+    counts, classes = [38], [[], []]
+    for i in range(10):
+        f, centres = splits.get(i, (0, []))
+        put_varint(block, f)
+        for centre in centres:
+            put_zigzag(block, centre)
+        counts.append(3 - (f & 1) - (f >> 1 & 1))
+        for stage in (0, 1):
+            classes[stage] += [ROWS] * (f >> stage & 1)  # all rows are of one class
+    channel = np.full(ROWS, residual, np.int32)
+    stages = [encode_channels([channel] * sum(counts)).payload]
+    stages += [encode_channels([channel] * len(own)).payload for own in classes]
+    true = [len(stages[0]), len(stages[1])]
+    for length in lengths(*true) if lengths else true:
+        put_varint(block, length)
+    return bytes(block) + b"".join(stages) + extra
+
+
+def both(section, rows=ROWS):
+    """Outcome of the reference decoder and of the package: symbols or the error's name."""
+    ours = outcome(lambda d: refdec.decode_attributes(d, [rows] * 68), section, refdec.Fault)
+    return ours, outcome(lambda d: read_attributes(d, rows).tolist(), section, DecodeError)
+
+
+ONE = 1 << 10
+FINE_BLOCKS = {  # options, and symbols of some channels; channel 67 is never predicted
+    "no terms": ({}, {1: 3, 3: 3}),
+    "two terms": ({"terms": {3: (2, [(0, -ONE), (1, ONE >> 1)])}}, {1: 3, 3: 2}),  # -1.5 rounds to -1
+    "just under a half": ({"terms": {3: (2, [(0, -ONE), (1, (ONE >> 1) - 1)])}}, {3: 1}),
+    "all terms": ({"terms": {37: (37, [(0, 1 << 15)] * 37)}}, {36: 3, 37: 3 + 37 * 32 * 3}),
+    "chain of largest weights": ({"terms": {1: (1, [(0, -(1 << 15))]), 3: (1, [(1, 1 << 15)])}}, {1: -93, 3: -2973}),
+    "splits": ({"splits": {0: (1, [5]), 1: (2, [-K_MAX, K_MAX]), 9: (3, [3, 3])}}, {38: 3, 42: 3, 66: 3}),
+    "largest result": ({"terms": {3: (1, [(0, ONE)])}, "residual": K_MAX >> 1}, {3: K_MAX - 1}),
+}
+
+
+@pytest.mark.parametrize("name", FINE_BLOCKS)
+def test_prediction_blocks_at_their_limits_are_read_by_both(name):
+    options, expected = FINE_BLOCKS[name]
+    ours, theirs = both(predicted_section(**options))
+    assert ours == theirs and len(ours) == 68
+    for channel, symbol in {67: options.get("residual", 3), **expected}.items():
+        assert ours[channel] == [symbol] * ROWS, channel
+
+
+BROKEN_BLOCKS = {
+    "unknown form": ({"form": 2}, "UnsupportedFeature"),
+    "more terms than channels before": ({"terms": {2: (3, [(0, 1), (0, 1), (0, 1)])}}, "LimitExceeded"),
+    "predicted from itself": ({"terms": {2: (1, [(2, 1)])}}, "Malformed"),
+    "predicted from a later channel": ({"terms": {2: (2, [(1, 1), (30, 1)])}}, "Malformed"),
+    "gap over its limit": ({"terms": {37: (1, [(39, 1)])}}, "LimitExceeded"),
+    "weight over its limit": ({"terms": {1: (1, [(0, (1 << 15) + 1)])}}, "LimitExceeded"),
+    "weight under its limit": ({"terms": {1: (1, [(0, -(1 << 15) - 1)])}}, "LimitExceeded"),
+    "unknown split": ({"splits": {4: (4, [0])}}, "LimitExceeded"),
+    "centre of x over K": ({"splits": {4: (1, [K_MAX + 1])}}, "LimitExceeded"),
+    "centre of y under -K": ({"splits": {4: (2, [0, -K_MAX - 1])}}, "LimitExceeded"),
+    "stage longer than the section": ({"lengths": lambda a, b: (a + 9999, b)}, "LimitExceeded"),
+    "stages longer than the rest": ({"lengths": lambda a, b: (a, b + 1)}, "Malformed"),
+    "stage 0 a byte short": ({"lengths": lambda a, b: (a - 1, b + 1), "splits": {0: (3, [0, 0])}}, "Malformed"),
+    "stage 1 a byte short": ({"lengths": lambda a, b: (a, b - 1), "splits": {0: (3, [0, 0])}}, "Malformed"),
+    "bytes in a stage without symbols": ({"extra": b"\1\0\0\0"}, "Malformed"),
+    "result over K": ({"terms": {3: (1, [(0, ONE)])}, "residual": (K_MAX >> 1) + 1}, "Malformed"),
+}
+
+
+@pytest.mark.parametrize("name", BROKEN_BLOCKS)
+def test_broken_prediction_blocks_are_refused_by_both(name):
+    options, fault = BROKEN_BLOCKS[name]
+    assert both(predicted_section(**options)) == (fault, fault)
+
+
+def test_damage_to_predicted_attributes_has_the_same_outcome():
+    terms = {c: (2, [(0, 700), (c % 2, -300)]) for c in range(2, 38)}
+    section = predicted_section(terms, {i: (i % 4, [2, 4][: (0, 1, 2, 2)[i % 4]]) for i in range(10)})
+    rng, seen = random.Random(3), set()
+    for _ in range(400):
+        at = rng.randrange(len(section))
+        cut = rng.randrange(4) == 0
+        damaged = section[:at] + (b"" if cut else bytes([rng.randrange(256)])) + section[at + 1 :]
+        ours, theirs = both(damaged)
+        assert ours == theirs, damaged.hex()
+        seen.add(ours if isinstance(ours, str) else "fine")
+    assert {"Malformed", "LimitExceeded", "fine"} <= seen
 
 
 def take_apart(data):
