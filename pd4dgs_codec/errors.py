@@ -22,6 +22,10 @@ class RenderError(Pd4Error):
     """The rasteriser was given input it must refuse, or an option it does not support."""
 
 
+class NotFinite(RenderError):
+    """Colours or backgrounds to draw hold NaN or infinity: a step that diverged, where other refusals are mistakes."""
+
+
 class EncodeError(Pd4Error):
     """A scene cannot be written as a `.pd4` file (NaN, infinity, a count over a limit, a failed verification)."""
 

@@ -8,7 +8,7 @@ become active at level l, so the arrays of prefix l are the first rows of the ar
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -135,7 +135,6 @@ class Scene:
     networks: dict[str, Network]
     global_deformation: Deformation | None = None
     local_deformation: Deformation | None = None
-    left_out: tuple[dict, ...] = field(default=())  #: {what, why, bytes} rows, filled by the encoder
 
     @property
     def level(self) -> int:

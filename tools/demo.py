@@ -35,20 +35,22 @@ def main(argv: list[str] | None = None) -> int:
     from pd4dgs_codec.report.tables import coding_table, quality_table, time_plot
     from pd4dgs_codec.train.config import TrainConfig
 
-    config = TrainConfig(
-        preset=args.preset,
-        source=args.source,
-        downscale=args.downscale,
-        seed=args.seed,
-        max_seconds=args.max_seconds,
-    )
     try:
+        config = TrainConfig(
+            preset=args.preset,
+            source=args.source,
+            downscale=args.downscale,
+            seed=args.seed,
+            max_seconds=args.max_seconds,
+        )
         result = run_job(Job("demo", config), args.out, say=say, progress=TrainingProgress())
-    except Pd4Error as error:
-        print(f"demo: error: {error}", file=sys.stderr)
+    except (Pd4Error, OSError, KeyboardInterrupt) as error:
+        print(f"demo: error: {str(error) or 'interrupted'}", file=sys.stderr)
         return 1
     folder = args.out / "demo"
     time_plot([result], folder / "quality-over-time.png")
+    if result["phases_not_reached"]:
+        print(f"\nthe time limit came before: {', '.join(result['phases_not_reached'])}")
     print(f"\n{quality_table([result])}\n\n{coding_table([result])}\n")
     for what, names in (
         ("model", "model.pt"),

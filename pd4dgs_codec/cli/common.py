@@ -1,7 +1,7 @@
 """What the commands share: options, exit codes, one-line errors, and what goes to stdout or stderr.
 
-Only the standard library is imported here, so that `--help` and usage errors answer at once, and so that the number of
-threads is settled before torch and numba are loaded.
+Of libraries only the standard one is imported here, so that `--help` and usage errors answer at once, and so that the
+number of threads is settled before torch and numba are loaded.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NoReturn
 
 from pd4dgs_codec.errors import DecodeError, EncodeError, Pd4Error
+from pd4dgs_codec.jsonable import finite
 
 OK, FAILED, USAGE, PARTIAL = 0, 1, 2, 3
 
@@ -93,6 +94,11 @@ def count(text: str) -> int:
     return _checked(text, int, lambda value: value >= 0, "an integer >= 0")
 
 
+def seed(text: str) -> int:
+    """An integer that torch's generators take, as does the next one."""
+    return _checked(text, int, lambda value: 0 <= value <= 2**63 - 2, "an integer from 0 to 2^63 - 2")
+
+
 def positive_float(text: str) -> float:
     """A finite number > 0."""
     return _checked(text, float, lambda value: 0 < value < math.inf, "a number > 0")
@@ -157,15 +163,6 @@ class Console:
             print(text, flush=True)
         else:
             self.message(text)
-
-
-def finite(value: Any) -> Any:
-    """`value` with infinities and NaN as null: JSON has none of them."""
-    if isinstance(value, dict):
-        return {key: finite(item) for key, item in value.items()}
-    if isinstance(value, (list, tuple)):
-        return [finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import io
-import os
 import time
 from collections.abc import Sequence
 from pathlib import Path
@@ -108,7 +107,7 @@ def _write_checkpoint(scene: Scene, args: argparse.Namespace) -> None:
     from pd4dgs_codec.model.convert import from_scene
 
     check_output(args.output, args.overwrite)  # it may have appeared meanwhile
-    checkpoint.save(os.path.realpath(args.output), from_scene(scene))
+    checkpoint.save(args.output, from_scene(scene))
 
 
 def _summary(scene: Scene, data: bytes, complete: bool, seconds: float, args: argparse.Namespace) -> dict[str, Any]:

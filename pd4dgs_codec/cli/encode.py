@@ -94,7 +94,7 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
     result = {"input": args.input, "output": args.output, **report.json()}
     for row in result["layers"]:
         row["ratio"] = row["payload_bits"] / row["rate_bits"] if row["rate_bits"] else None
-    if trained:
+    if trained and args.json:  # shown nowhere else, and it takes its time
         result |= _train_rate(scene, layers, args.step_scale)
         bits = {row["layer"]: row["bits"] for row in result["train_rate_bits_layers"]}
         for row in result["layers"]:  # float32 deformations may keep a layer that is zero once quantised

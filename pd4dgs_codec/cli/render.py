@@ -42,6 +42,7 @@ examples:
   pd4dgs-render scene.pd4 -o levels.mp4 --side-by-side --data synthetic:local
   pd4dgs-render scene.pd4 -o out/%04d.png --max-layer 0 --data recordings/kitchen --split test --downscale 2"""
 
+PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 VIDEOS = (".gif", ".mp4")
 
 
@@ -125,7 +126,7 @@ def _render(args: argparse.Namespace, console: Console) -> int:
 def _check_usage(args: argparse.Namespace) -> str:
     """The kind of output: the lower-case suffix."""
     kind = Path(args.output).suffix.lower()
-    if args.output == STDIO or kind not in (*VIDEOS, ".png", ".jpg", ".jpeg", ".webp", ".bmp"):
+    if args.output == STDIO or kind not in (*PICTURES, *VIDEOS):
         raise UsageError(f"found -o {args.output}, expected pictures such as out/%04d.png, or a .gif or .mp4")
     if args.data and args.orbit:
         raise UsageError("--orbit moves the file's own camera; leave out --data or --orbit")

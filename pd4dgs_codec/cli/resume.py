@@ -43,10 +43,14 @@ def stored_config(args: argparse.Namespace) -> TrainConfig:
 
 def parse_config(text: str, path: str) -> TrainConfig:
     """The inverse of the JSON in a checkpoint; fields that it lacks keep their defaults."""
+    from pd4dgs_codec.scene import Steps
     from pd4dgs_codec.train.config import TrainConfig
 
     try:
-        return _rebuilt(json.loads(text), TrainConfig())
+        plain = json.loads(text)
+        if plain.get("steps") is not None:  # None by default, so that its type is not that of a default value
+            plain["steps"] = Steps(**plain["steps"])
+        return _rebuilt(plain, TrainConfig())
     except (ValueError, TypeError, AttributeError) as error:
         raise TrainError(f"{path}: its stored configuration cannot be read: {error}") from None
 
@@ -70,6 +74,7 @@ def _same_source(source: str) -> str:
 def check_time_left(trainer: Trainer, path: str) -> None:
     """TrainError if the run has used up its time limit without having finished."""
     limit = trainer.config.max_seconds
-    if limit and trainer.iteration < trainer.total and trainer.seconds >= limit:
+    unfinished = not trainer.total or trainer.iteration < trainer.total  # total 0: cut before a time limit fixed it
+    if limit and unfinished and trainer.seconds >= limit:
         used = f"has trained {trainer.seconds:.0f} s of its limit of {limit:g} s"
         raise TrainError(f"{path}: {used}; expected a larger --max-seconds to go on")

@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import argparse
-import contextlib
-import signal
+import os
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -22,21 +21,23 @@ from pd4dgs_codec.cli.common import (
     positive_float,
     positive_int,
     run,
+    seed,
     table,
     use_threads,
 )
 from pd4dgs_codec.cli.files import STDIO, check_output
 from pd4dgs_codec.cli.progress import TrainingProgress
 from pd4dgs_codec.cli.resume import FIXED, check_time_left, stored_config
-from pd4dgs_codec.errors import TrainError
+from pd4dgs_codec.errors import RenderError, TrainError
 
 if TYPE_CHECKING:
     from pd4dgs_codec.train.config import TrainConfig
     from pd4dgs_codec.train.loop import Trainer
 
 DETAILS = f"""\
-Training ends after --iterations or --max-seconds, whichever comes first; the schedule follows from them. Ctrl-C ends
-it early with a whole checkpoint, which --resume goes on from.
+Training ends after --iterations or --max-seconds, whichever comes first; the schedule follows from them. Ctrl-C (or
+SIGTERM) ends it early, after the step in hand, with a whole checkpoint, which --resume goes on from. A second Ctrl-C
+ends it at once, and what was trained since the last save (one a minute) is lost.
 
 {SOURCES}
 
@@ -70,7 +71,7 @@ def parser() -> Parser:
         metavar="K",
         help="without split files, hold out frames with i %% K == K/2 (default: 8; 0: none)",
     )
-    p.add_argument("--seed", type=count, metavar="N", help="seed of all that is random in training (default: 0)")
+    p.add_argument("--seed", type=seed, metavar="N", help="seed of all that is random in training (default: 0)")
     p.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to train (default: auto)")
     p.add_argument("--resume", metavar="FILE.pt", help="go on from this checkpoint, with the settings stored in it")
     p.add_argument("--log", metavar="FILE.jsonl", help="write one JSON object per step")
@@ -96,22 +97,27 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _train(args: argparse.Namespace, console: Console) -> int:
     if STDIO in (args.output, args.resume, args.log):
         raise UsageError("training reads and writes named files, not - (stdin, stdout)")
+    if args.log and os.path.realpath(args.log) == os.path.realpath(args.output):
+        raise UsageError(f"--log and -o both name {args.output}; expected two files")
     resuming_in_place = args.resume is not None and Path(args.resume).resolve() == Path(args.output).resolve()
     check_output(args.output, args.overwrite or resuming_in_place)
     if args.log:
         check_output(args.log, args.overwrite or args.resume is not None)
     use_threads(args)
     from pd4dgs_codec.data.dataset import load
+    from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.train.loop import Trainer
 
+    checkpoint.target(args.output)  # refuses a device now, not after the first minute
+    device = _device(args.device, console)
     config = stored_config(args) if args.resume else _fresh_config(args)
     dataset = load(args.source, downscale=config.downscale, holdout=config.holdout)
-    trainer = Trainer(config, dataset, _device(args.device))
+    trainer = Trainer(config, dataset, device)
     if args.resume:
         trainer.resume(Path(args.resume))
         check_time_left(trainer, args.resume)
-    elif args.log:
-        Path(args.log).unlink(missing_ok=True)
+    elif args.log and os.path.isfile(args.log):  # a device or a pipe has nothing to empty
+        open(args.log, "w").close()
     limit = f", at most {config.max_seconds:g} s" if config.max_seconds else ""
     held_out = f"{len(dataset.test)} held out" if dataset.test else "none held out"
     start = f", from step {trainer.iteration}" if trainer.iteration else ""
@@ -119,8 +125,10 @@ def _train(args: argparse.Namespace, console: Console) -> int:
         f"training {config.preset} on {len(dataset.train)} views ({held_out}), {trainer.device}{limit}{start}"
     )
     console.detail(f"{config}")
-    with _terminate_as_interrupt():
+    try:
         trainer.run(Path(args.output), log=Path(args.log) if args.log else None, progress=TrainingProgress())
+    except KeyboardInterrupt:
+        raise TrainError("interrupted twice; what was trained since the last save is lost") from None
     result = _summary(args, trainer)
     console.result(result, _text(result), on_stdout=False)
     return OK
@@ -133,30 +141,29 @@ def _fresh_config(args: argparse.Namespace) -> TrainConfig:
     return TrainConfig(source=args.source, noise=not args.no_noise, **named)
 
 
-def _device(name: str) -> str:
+def _device(name: str, console: Console) -> str:
+    """Where to train. auto is CUDA only where PyTorch finds a GPU and gsplat can draw on it."""
     import torch
 
-    if name == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    if name == "cuda" and not torch.cuda.is_available():
+    if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
+        return "cpu"
+    if not torch.cuda.is_available():
         raise TrainError("--device cuda: this PyTorch finds no CUDA device; expected one, or --device cpu")
-    return name
+    from pd4dgs_codec.render import gsplat_backend
 
-
-@contextlib.contextmanager
-def _terminate_as_interrupt() -> Iterator[None]:
-    """SIGTERM (a scheduler's or timeout's polite end) acts as Ctrl-C, so that it too leaves a whole checkpoint."""
-    before = signal.signal(signal.SIGTERM, signal.default_int_handler)
     try:
-        yield
-    finally:
-        signal.signal(signal.SIGTERM, before)
+        gsplat_backend.check()
+    except RenderError as error:
+        if name == "cuda":
+            raise TrainError(f"--device cuda: {error}") from None
+        console.message(f"the GPU is not used: {error}")
+        return "cpu"
+    return "cuda"
 
 
 def _summary(args: argparse.Namespace, trainer: Trainer) -> dict[str, Any]:
     from pd4dgs_codec.train.config import Schedule
 
-    finished = 0 < trainer.total <= trainer.iteration
     schedule = Schedule(trainer.total or sys.maxsize)  # 0: ended before the steps that a time limit allows were known
     psnr = trainer.curve[-1]["psnr"] if trainer.curve else []
     return {
@@ -166,9 +173,10 @@ def _summary(args: argparse.Namespace, trainer: Trainer) -> dict[str, Any]:
         "device": str(trainer.device),
         "iterations": trainer.iteration,
         "total": trainer.total,
-        "finished": finished,
+        "finished": 0 < trainer.total <= trainer.iteration,
+        "interrupted": trainer.interrupted,
         "seconds": round(trainer.seconds, 3),
-        "phases_not_reached": [] if finished else schedule.phases_not_reached(trainer.iteration),
+        "phases_not_reached": schedule.phases_not_reached(trainer.iteration),
         "skipped": trainer.skipped,
         "anchors": len(trainer.model.anchor_q),
         "active_anchors": trainer.active_anchors(),

@@ -1,11 +1,11 @@
 """The attributes section of mode ans: 68 channels as they are, or with what one channel tells of another taken out.
 
-Byte 0 is the form. Form 0: the rest is one channels payload of the 68 channels. Form 1: a block of varints, then three
-channels payloads, the *stages*, each decoded before the next. All arithmetic is on integers.
+Byte 0 is the form. Form 0: the rest is one channels payload of the 68 channels. Form 1: a block of varints, then
+three channels payloads, the *stages*, each decoded before the next. All arithmetic is on integers.
 
 *Linear prediction*, channels 1..37 (features, log-scalings): for channel c a varint m <= c, then m terms in ascending
-order of the channel j they refer to: a varint j - (previous j) - 1, starting from previous j = -1, and a zigzag weight w,
-|w| <= 2^15. Coded is the residual k_c - ((sum_j w_j k_j + 512) >> 10), the shift rounding down.
+order of the channel j they refer to: a varint j - (previous j) - 1, starting from previous j = -1, and a zigzag weight
+w, |w| <= 2^15. Coded is the residual k_c - ((sum_j w_j k_j + 512) >> 10), the shift rounding down.
 
 *Classes*, channels 38..67 (offsets x, y, z of ten Gaussians): per Gaussian a varint f in 0..3: bit 0, y is split by x;
 bit 1, z is split by x and y. If f > 0 follow a zigzag centre of x and, if bit 1 is set, one of y, each |.| <= 2^24 - 1.
@@ -244,7 +244,7 @@ def _read_split(reader: ByteReader) -> Split:
 
 
 def _read_classes(data: memoryview, symbols: np.ndarray, channels: Sequence[tuple[int, np.ndarray, int]]) -> None:
-    """Decodes a stage's classes into the rows of `symbols` they belong to; channels: (channel, class of each row, number)."""
+    """Decodes a stage's classes into their rows of `symbols`; channels: (channel, class per row, number of classes)."""
     places = [(c, np.flatnonzero(classes == k)) for c, classes, count in channels for k in range(count)]
     for (c, rows), values in zip(places, decode_channels(data, [len(rows) for _, rows in places]), strict=True):
         symbols[c, rows] = values

@@ -10,9 +10,10 @@ from __future__ import annotations
 import os
 import pickle
 import tempfile
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import numpy as np
 import torch
@@ -39,7 +40,8 @@ VERSION = 1
 
 
 def save(path: str | Path, model: Model, training: dict[str, Any] | None = None) -> None:
-    """Writes the model and, for resuming, `training`; the file appears whole or not at all."""
+    """Writes the model and, for resuming, `training`; the file appears whole or not at all. See `target`."""
+    real = target(path)
     content = {
         "format": FORMAT,
         "version": VERSION,
@@ -52,9 +54,8 @@ def save(path: str | Path, model: Model, training: dict[str, Any] | None = None)
         "state": {name: tensor.detach().cpu() for name, tensor in model.state_dict().items()},
         "training": training or {},
     }
-    path = Path(path)
     try:
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        handle, temporary = tempfile.mkstemp(dir=real.parent, prefix=f".{real.name}.")
     except OSError as error:
         raise DataError(f"{path}: cannot write here: {error.strerror}") from None
     try:
@@ -63,13 +64,21 @@ def save(path: str | Path, model: Model, training: dict[str, Any] | None = None)
         umask = os.umask(0)
         os.umask(umask)
         os.chmod(temporary, 0o666 & ~umask)  # mkstemp lets only the owner read
-        os.replace(temporary, path)
+        os.replace(temporary, real)
     except (OSError, RuntimeError) as error:
         Path(temporary).unlink(missing_ok=True)
         raise DataError(f"{path}: cannot write the checkpoint: {error}") from None
     except BaseException:
         Path(temporary).unlink(missing_ok=True)
         raise
+
+
+def target(path: str | Path) -> Path:
+    """The file that `save` replaces: a symbolic link stays one. DataError if a device, a pipe or a folder is there."""
+    real = Path(os.path.realpath(path))
+    if real.exists() and not real.is_file():
+        raise DataError(f"{path}: is not a regular file; expected the name of a checkpoint to write")
+    return real
 
 
 def load(path: str | Path) -> tuple[Model, dict[str, Any]]:
@@ -80,9 +89,10 @@ def load(path: str | Path) -> tuple[Model, dict[str, Any]]:
         raise DataError(f"{path}: no such checkpoint") from None
     except (IsADirectoryError, PermissionError) as error:
         raise DataError(f"{path}: cannot be read: {error.strerror}") from None
-    except pickle.UnpicklingError:
-        raise DataError(f"{path}: refused, it holds pickled code or objects; expected a {FORMAT} of tensors") from None
-    except Exception:  # torch raises many kinds for a broken zip archive
+    except Exception as error:  # torch raises many kinds for a broken zip archive
+        if isinstance(error, pickle.UnpicklingError) and _begins_as_torch_files(path):
+            found = "refused, it holds pickled code or objects"
+            raise DataError(f"{path}: {found}; expected a {FORMAT} of tensors") from None
         raise DataError(f"{path}: not a readable checkpoint; expected a {FORMAT} file") from None
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise DataError(f"{path}: not a {FORMAT}; found {_describe(content)}")
@@ -97,6 +107,13 @@ def load(path: str | Path) -> tuple[Model, dict[str, Any]]:
     ) as error:  # fmt: skip
         reason = " ".join(str(error).split())  # torch explains itself over several lines
         raise DataError(f"{path}: a {FORMAT} with missing or misshapen content: {reason}") from None
+
+
+def _begins_as_torch_files(path: str | Path | BinaryIO) -> bool:
+    """Whether it is a zip archive or a binary pickle; torch's refusal of pickled objects and of any text are one."""
+    with open(path, "rb") if isinstance(path, (str, Path)) else nullcontext(path) as stream:
+        stream.seek(0)
+        return stream.read(2).startswith((b"PK", b"\x80"))
 
 
 def _refuse_not_finite(state: dict[str, torch.Tensor]) -> None:

@@ -203,9 +203,12 @@ class Model(nn.Module):
         )
 
     @torch.no_grad()
-    def round_weights(self) -> None:
-        """Planes and weights in place to multiples of their steps: what `Rounding(weights=True)` imitates."""
+    def round_to_steps(self) -> None:
+        """Attributes, planes and weights in place to multiples of their steps: what `Rounding` imitates."""
         steps = self.steps
+        for name in ("feature", "scaling_log", "offset"):
+            values, step = getattr(self, name), getattr(steps, name)
+            values.copy_(torch.round(values / step) * step)
         parts: list[tuple[nn.Module, float]] = [(self.networks, steps.weights_scaffold)]
         for field, planes, weights in (
             (self.global_deformation, steps.planes_global, steps.weights_global),

@@ -20,13 +20,29 @@ def _load():
     try:
         version = importlib.metadata.version("gsplat")
         module = importlib.import_module("gsplat")
-    except ImportError as error:
+    except (ImportError, RuntimeError, OSError) as error:  # it may load or build its CUDA part at once
         raise RenderError(f"gsplat cannot be imported ({error}): install pd4dgs-codec[gpu] or use the CPU") from error
     alpha_max = ALPHA_MAX_OF_VERSION.get(".".join(version.split(".")[:2]))
     if alpha_max != ALPHA_MAX:
         found = "an unknown alpha limit" if alpha_max is None else f"alpha limit {alpha_max}"
         raise RenderError(f"gsplat {version} has {found}, expected {ALPHA_MAX} (gsplat 1.5)")
     return module
+
+
+def check() -> None:
+    """RenderError in one line unless gsplat can draw here: the right version, with its CUDA kernels.
+
+    Without a CUDA compiler gsplat imports all the same and fails at the first picture. Where it has one it may build
+    its kernels now, which takes minutes.
+    """
+    _load()
+    try:
+        from gsplat.cuda._backend import _C
+    except (ImportError, RuntimeError, OSError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise RenderError(f"gsplat's CUDA kernels do not load ({reason}): use the CPU") from error
+    if _C is None:
+        raise RenderError("gsplat has no CUDA kernels here, nor a compiler (nvcc) to build them: use the CPU")
 
 
 def _drawable(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> list[Tensor]:

@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pd4dgs_codec.errors import RenderError
+from pd4dgs_codec.errors import NotFinite, RenderError
 
 BACKENDS = ("auto", "cpu", "gsplat", "reference")
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
@@ -127,7 +127,7 @@ def rasterization(
     position) after backward (for densification; on the CPU it is a leaf, so a loss on it does not reach `means`);
     depths [C, N]; conics [C, N, 3] upper triangle of the inverse 2D covariance; opacities [C, N]; width; height.
 
-    Raises RenderError for wrong shapes, devices and unsupported options.
+    Raises RenderError for wrong shapes, devices and unsupported options; its kind NotFinite for colours.
     Formulas: Zwicker et al., "EWA splatting"; Kerbl et al., "3D Gaussian Splatting"; conventions of gsplat 1.5.3.
     """
     refused = {
@@ -157,7 +157,7 @@ def rasterization(
         raise RenderError(f"tensors are on different devices: {sorted({str(t.device) for t in tensors})}")
     for name, tensor in (("colors", colors), ("backgrounds", backgrounds)):
         if tensor is not None and not torch.isfinite(tensor.detach().float().sum()):
-            raise RenderError(f"{name} has a value that is not finite, or their sum overflows")
+            raise NotFinite(f"{name} has a value that is not finite, or their sum overflows")
     if render_mode in ("D", "ED"):
         colors, backgrounds = colors[..., :0], None
 

@@ -3,24 +3,28 @@
 from __future__ import annotations
 
 import json
+import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.codec.encoder import Report, encode_with_report
+from pd4dgs_codec.cli.files import whole_file, whole_files, write_bytes
+from pd4dgs_codec.codec.encoder import LayerReport, Report, encode_with_report
 from pd4dgs_codec.codec.plan import plan
-from pd4dgs_codec.data.dataset import load
+from pd4dgs_codec.data.dataset import Dataset, load
 from pd4dgs_codec.entropy.morton import morton_order
+from pd4dgs_codec.errors import TrainError
+from pd4dgs_codec.jsonable import finite
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.report.evaluate import evaluate_file
 from pd4dgs_codec.report.pictures import draw_levels
 from pd4dgs_codec.report.rate import train_rate_bits
 from pd4dgs_codec.scene import Scene
-from pd4dgs_codec.train.config import TrainConfig
+from pd4dgs_codec.train.config import Schedule, TrainConfig
 from pd4dgs_codec.train.loop import Trainer
 
 #: Encodings whose sizes stand side by side; "ans" is the file that is evaluated and kept.
@@ -30,6 +34,8 @@ VARIANTS: dict[str, dict[str, str]] = {
     "lzma": {"mode": "lzma"},
     "lzma_float32": {"mode": "lzma", "deformation": "float32"},
 }
+#: Pictures of the levels: stills and an animation.
+PICTURES = ("levels.png", "levels.gif")
 #: The rate of a first frame's figure, bits per second.
 LINK = 2e6
 
@@ -43,26 +49,30 @@ class Job:
 
 
 def run_job(job: Job, folder: Path, *, say: Callable[[str], None], progress: Any = None) -> dict[str, Any]:
-    """Runs `job` in folder/name, keeping a finished checkpoint of the same configuration; returns and writes
-    results.json there. say: receives one line per stage. progress: as Trainer.run takes it."""
+    """Runs `job` in folder/name and returns what it writes to results.json there.
+
+    A checkpoint of the same configuration is kept if its training ended, by itself or at the time limit, and trained to
+    that end if it was interrupted. say: receives one line per stage. progress: as Trainer.run takes it. TrainError
+    if a signal interrupts the training.
+    """
     folder = folder / job.name
     folder.mkdir(parents=True, exist_ok=True)
     config = job.config
     say(f"{job.name}: reading {config.source}")
     dataset = load(config.source, downscale=config.downscale, holdout=config.holdout)
     path = folder / "model.pt"
-    training = _finished_training(path, config)
-    if training is None:
+    stored = _stored_training(path, config)
+    if stored is not None and _ended(stored, config):
+        say(f"{job.name}: {path} is kept: {stored['iteration']} steps, the same settings")
+    else:
         say(f"{job.name}: training, preset {config.preset}, {len(dataset.train)} views")
-        log = folder / "train.jsonl"
-        log.unlink(missing_ok=True)
-        Trainer(config, dataset).run(path, log=log, progress=progress)
+        _train(config, dataset, path, stored, say=lambda text: say(f"{job.name}: {text}"), progress=progress)
     model, training = checkpoint.load(path)
     scene = to_scene(model)
     say(f"{job.name}: packing {len(scene.anchor_q)} anchors in {len(VARIANTS)} ways")
     files = {name: encode_with_report(scene, **options) for name, options in VARIANTS.items()}  # type: ignore[arg-type]
     data, report = files["ans"]
-    (folder / "scene.pd4").write_bytes(data)
+    write_bytes(str(folder / "scene.pd4"), data, overwrite=True)
     say(f"{job.name}: {len(data)} bytes; rendering the held-out views at each level")
     packed = evaluate_file(data, dataset)
     unpacked = {row["level"]: row for row in evaluate_file(path, dataset)["levels"]}
@@ -75,7 +85,9 @@ def run_job(job: Job, folder: Path, *, say: Callable[[str], None], progress: Any
         "preset": config.preset,
         "downscale": config.downscale,
         "seed": config.seed,
-        "iterations": training["total"],
+        "iterations": training["iteration"],
+        "total": training["total"],
+        "phases_not_reached": Schedule(training["total"] or sys.maxsize).phases_not_reached(training["iteration"]),
         "train_seconds": training["seconds"],
         "skipped_steps": training["skipped"],
         "rho": training["rho"],
@@ -85,9 +97,38 @@ def run_job(job: Job, folder: Path, *, say: Callable[[str], None], progress: Any
         "left_out": report.left_out,
     }
     say(f"{job.name}: drawing")
-    result["pictures"] = [path.name for path in draw_levels(data, dataset, folder)]
-    (folder / "results.json").write_text(json.dumps(result, indent=1))
+    pictures = [str(folder / name) for name in PICTURES]
+    with whole_files(pictures[0], pictures, overwrite=True) as temporaries:
+        draw_levels(data, dataset, *temporaries)
+    result["pictures"] = list(PICTURES)
+    with whole_file(str(folder / "results.json"), overwrite=True) as temporary:
+        temporary.write_text(json.dumps(finite(result), indent=1, allow_nan=False))
     return result
+
+
+def _train(
+    config: TrainConfig,
+    dataset: Dataset,
+    path: Path,
+    stored: dict[str, Any] | None,
+    *,
+    say: Callable[[str], None],
+    progress: Any,
+) -> None:
+    """Trains to `path`, from the checkpoint there if `stored` is its state; the log lies beside it."""
+    log = path.with_name("train.jsonl")
+    if stored is None:
+        log.unlink(missing_ok=True)
+        trainer = Trainer(config, dataset)
+    else:
+        if config.max_seconds and stored["total"]:  # the number of steps that the limit gave is part of the run
+            config = replace(config, iterations=stored["total"])
+        trainer = Trainer(config, dataset)
+        trainer.resume(path)
+        say(f"going on from step {trainer.iteration}")
+    trainer.run(path, log=log, progress=progress)
+    if trainer.interrupted:
+        raise TrainError(f"{path}: training was interrupted at step {trainer.iteration}; the same command goes on")
 
 
 def coding_rows(reports: dict[str, Report], scene: Scene) -> list[dict[str, Any]]:
@@ -95,36 +136,50 @@ def coding_rows(reports: dict[str, Report], scene: Scene) -> list[dict[str, Any]
 
     payload_over_rate: `--priors gauss` payload bits over the sum of R(a) on the layer's own symbols.
     train_over_rate: the trainer's sum of R(a) on the float checkpoint over the same. ans_over_lzma: all coded symbols
-    (masks included, positions aside) in mode ans over the same symbols in mode lzma.
+    (masks included, positions aside) in mode ans over the same symbols in mode lzma. None where there is nothing to
+    compare, as where an encoding drops the layer.
     """
-    trained = train_rate_bits(scene)
+    trained = {int(row["layer"]): sum(row.values()) - row["layer"] for row in train_rate_bits(scene)}
     cells = plan(scene)[0].anchor_q
-    rows = []
-    for i, best in enumerate(reports["ans"].layers):
-        layers = {name: report.layers[i] for name, report in reports.items()}
-        gauss, lzma = layers["gauss"], layers["lzma"]
-        own_rate = sum(value for name, value in trained[i].items() if name != "layer")
-        start = sum(layer.anchors for layer in reports["ans"].layers[:i])
+    variants = {name: {layer.layer: layer for layer in report.layers} for name, report in reports.items()}
+    rows, start = [], 0
+    for best in reports["ans"].layers:
+        layers = {name: by_number.get(best.layer) for name, by_number in variants.items()}
         draco = draco_position_bits(cells[start : start + best.anchors])
-        coded = {name: sum(s.payload_bits for s in layers[name].streams) for name in ("ans", "lzma")}
+        start += best.anchors
+        own_rate, rate = trained.get(best.layer), _value(layers["gauss"], "rate_bits")
+        payload = _value(layers["gauss"], "payload_bits")
+        coded = {name: _symbol_bits(layers[name]) for name in ("ans", "lzma")}
         rows.append(
             {
                 "layer": best.layer,
                 "anchors": best.anchors,
-                **{f"{name}_bytes": layer.bytes for name, layer in layers.items()},
+                **{f"{name}_bytes": _value(layer, "bytes") for name, layer in layers.items()},
                 "streams": {s.name: s.payload_bits / 8 for s in best.streams},
                 "position_bytes": best.position_bits / 8,
                 "draco_position_bytes": None if draco is None else draco / 8,
-                "rate_bits": gauss.rate_bits,
+                "rate_bits": rate,
                 "train_rate_bits": own_rate,
-                "payload_over_rate": gauss.payload_bits / gauss.rate_bits if gauss.rate_bits else None,
-                "best_over_gauss": best.payload_bits / gauss.payload_bits if gauss.payload_bits else None,
-                "train_over_rate": own_rate / gauss.rate_bits if gauss.rate_bits else None,
-                "ans_over_lzma": coded["ans"] / coded["lzma"] if coded["lzma"] else None,
-                "lzma_symbol_bytes": sum(s.payload_bits for s in lzma.streams) / 8,
+                "payload_over_rate": _over(payload, rate),
+                "best_over_gauss": _over(best.payload_bits, payload),
+                "train_over_rate": _over(own_rate, rate),
+                "ans_over_lzma": _over(coded["ans"], coded["lzma"]),
+                "lzma_symbol_bytes": _over(coded["lzma"], 8),
             }
         )
     return rows
+
+
+def _value(layer: LayerReport | None, name: str) -> Any:
+    return None if layer is None else getattr(layer, name)
+
+
+def _symbol_bits(layer: LayerReport | None) -> float | None:
+    return None if layer is None else sum(s.payload_bits for s in layer.streams)
+
+
+def _over(a: float | None, b: float | None) -> float | None:
+    return None if a is None or not b else a / b
 
 
 def draco_position_bits(cells: np.ndarray) -> int | None:
@@ -147,8 +202,8 @@ def draco_position_bits(cells: np.ndarray) -> int | None:
     return 8 * len(data)
 
 
-def _finished_training(path: Path, config: TrainConfig) -> dict[str, Any] | None:
-    """The training state of a finished run of this very configuration, else None."""
+def _stored_training(path: Path, config: TrainConfig) -> dict[str, Any] | None:
+    """The training state of a run of this very configuration, finished or not, else None."""
     if not path.exists():
         return None
     _, training = checkpoint.load(path)
@@ -156,5 +211,10 @@ def _finished_training(path: Path, config: TrainConfig) -> dict[str, Any] | None
     wanted = json.loads(json.dumps(config, default=lambda value: value.__dict__))
     if wanted["iterations"] is None:
         stored["iterations"] = None
-    return training if stored == wanted and training["iteration"] >= training["total"] else None
+    return training if stored == wanted else None
 
+
+def _ended(training: dict[str, Any], config: TrainConfig) -> bool:
+    """Whether a run came to its end, or to that of its time."""
+    finished = 0 < training["total"] <= training["iteration"]
+    return finished or bool(config.max_seconds and training["seconds"] >= config.max_seconds)

@@ -9,8 +9,6 @@ import numpy as np
 
 from pd4dgs_codec.errors import RenderError
 
-PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
-
 
 def write_pictures(frames: Iterator[np.ndarray], paths: list[Path]) -> None:
     """One uint8 [H, W, 3] frame per path."""

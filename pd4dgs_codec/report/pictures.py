@@ -15,18 +15,16 @@ from pd4dgs_codec.report.movie import write_gif
 from pd4dgs_codec.report.panels import level_caption, side_by_side
 
 
-def draw_levels(data: bytes, dataset: Dataset, folder: Path, *, stills: int = 3, frames: int = 40) -> list[Path]:
-    """Writes folder/levels.png (`stills` held-out views, one under the other) and folder/levels.gif; returns both."""
+def draw_levels(data: bytes, dataset: Dataset, still: Path, movie: Path, *, stills: int = 3, frames: int = 40) -> None:
+    """Writes `still` (`stills` held-out views, one under the other) and the GIF `movie` (about `frames` frames)."""
     from PIL import Image
 
     levels = load_levels(data)
     views = dataset.test or dataset.train
     picked = views[:: max(1, len(views) // stills)][:stills]
-    still, movie = folder / "levels.png", folder / "levels.gif"
     Image.fromarray(np.concatenate(list(_panels(levels, picked)))).save(still)
     path = dataset.train[:: max(1, len(dataset.train) // frames)]
     write_gif(_panels(levels, path), movie, fps=12)
-    return [still, movie]
 
 
 def _panels(levels: Sequence[Level], views: Sequence[View]) -> Iterator[np.ndarray]:

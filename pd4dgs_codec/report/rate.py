@@ -18,7 +18,7 @@ def train_rate_bits(scene: Scene, layers: str | int = "auto") -> list[dict[str, 
     """Per layer of the file that `scene` becomes: bits of R(a) as the trainer computes them, in float64.
 
     attributes: R of the unrounded values over the layer's anchors, priors their moments. planes, weights: R of the
-    rounded residuals and weights, which is what the last fifth of training sees.
+    rounded residuals and weights, which is what the last third of training sees.
     """
     planned, _ = plan(scene, layers)
     rows = (0, *planned.rows)

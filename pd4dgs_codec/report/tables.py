@@ -6,6 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+#: A coding row's bytes in the modes that the table shows; None where a mode drops the layer.
+BYTES = ("ans_bytes", "lzma_bytes", "lzma_float32_bytes")
+
 
 def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A Markdown table; columns padded, so that it also reads as plain text."""
@@ -62,9 +65,7 @@ def coding_table(results: Sequence[dict[str, Any]]) -> str:
                 (
                     result["name"],
                     str(row["layer"]),
-                    f"{row['ans_bytes']:,}",
-                    f"{row['lzma_bytes']:,}",
-                    f"{row['lzma_float32_bytes']:,}",
+                    *("-" if row[key] is None else f"{row[key]:,}" for key in BYTES),
                     _ratio(row["payload_over_rate"]),
                     _ratio(row["train_over_rate"]),
                     _ratio(row["best_over_gauss"]),

@@ -71,6 +71,8 @@ class TrainConfig:
             raise TrainError(f"iterations must be at least 1, found {self.iterations}")
         if self.max_seconds is not None and not self.max_seconds > 0:
             raise TrainError(f"max-seconds must be positive, found {self.max_seconds}")
+        if not 0 <= self.seed <= 2**63 - 2:  # the next one seeds the noise
+            raise TrainError(f"seed {self.seed} is out of range; expected an integer from 0 to 2^63 - 2")
         if self.rollout not in ("adaptive", "uniform", "fixed"):
             raise TrainError(f"rollout {self.rollout!r} is unknown; expected adaptive, uniform or fixed")
 
@@ -91,7 +93,8 @@ class Schedule:
 
     @property
     def warm(self) -> int:
-        """Levels are sampled uniformly before it (T_warm)."""
+        """The method samples levels uniformly before it (T_warm). Here it ends within the coarse phase, and rho_start,
+        never earlier, decides."""
         return self._at(1 / 15)
 
     @property
@@ -126,11 +129,14 @@ class Schedule:
         return self._at(9 / 10)
 
     def phases_not_reached(self, iteration: int) -> list[str]:
-        """Names of the phases that a run cut after `iteration` iterations never entered."""
+        """Names of the phases that a run cut after `iteration` iterations never entered; none for a whole run."""
+        if iteration >= self.iterations:
+            return []
         starts = {
             "levels 1 and 2": self.coarse_end,
             "rate and mask terms": self.progressive,
             "rounding of planes and weights": self.rounding,
+            "exact rounding of attributes": self.exact_rounding,
             "the end of the learning-rate schedule": self.iterations - 1,
         }
         return [name for name, start in starts.items() if iteration <= start]

@@ -70,21 +70,25 @@ def scene_info(dataset: Dataset) -> SceneInfo:
 
 def initial_cells(dataset: Dataset, count: int, voxel_size: float, generator: torch.Generator) -> Tensor:
     """int32 [n, 3] unique voxel cells, about `count` of them."""
-    if dataset.points is None or len(dataset.points) == 0:
+    points = _points_near_box(dataset)
+    if len(points) == 0:
         points = carved_points(dataset, count, generator)
-        return torch.unique(torch.round(points / voxel_size).to(torch.int32), dim=0)
-    points = torch.from_numpy(np.asarray(dataset.points, np.float32))
-    low, high = (torch.from_numpy(np.asarray(dataset.box[i], np.float32)) for i in (0, 1))
-    reach = 0.5 * (high - low).max()  # a stray triangulated point must not stretch the grid
-    points = points[((points > low - reach) & (points < high + reach)).all(1)]
-    if len(points) > count:
+    elif len(points) > count:
         points = points[torch.randperm(len(points), generator=generator)[:count]]
-    elif 0 < len(points) < count:
+    elif len(points) < count:
         spacing = nearest_distances(points)
         pick = torch.randint(len(points), (count - len(points),), generator=generator)
         jitter = torch.randn(len(pick), 3, generator=generator) * spacing[pick, None]
         points = torch.cat([points, points[pick] + jitter])
     return torch.unique(torch.round(points / voxel_size).to(torch.int32), dim=0)
+
+
+def _points_near_box(dataset: Dataset) -> Tensor:
+    """float32 [n, 3] the dataset's points, but for those so far from its box that they would stretch the grid."""
+    points = torch.from_numpy(np.array(() if dataset.points is None else dataset.points, np.float32).reshape(-1, 3))
+    low, high = (torch.from_numpy(np.asarray(dataset.box[i], np.float32)) for i in (0, 1))
+    reach = 0.5 * (high - low).max()
+    return points[((points > low - reach) & (points < high + reach)).all(1)]
 
 
 def carved_points(dataset: Dataset, count: int, generator: torch.Generator) -> Tensor:

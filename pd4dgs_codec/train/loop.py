@@ -1,28 +1,30 @@
 """The training loop. One step: draw a view and a level, render, add the level's terms, update; now and then grow.
 
-Everything random comes from one generator whose state is saved, so a resumed run repeats the uninterrupted one bit for
-bit at a fixed number of iterations and threads.
+Everything random comes from one generator whose state is saved, so on the CPU a resumed run repeats the uninterrupted
+one bit for bit at a fixed number of iterations and threads; on CUDA sums come in any order.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
 import time
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TextIO
 
 import numpy as np
 import torch
 from torch import Tensor
 
 from pd4dgs_codec.data.dataset import Dataset, View
-from pd4dgs_codec.errors import RenderError, TrainError
+from pd4dgs_codec.errors import DataError, NotFinite, TrainError
+from pd4dgs_codec.jsonable import finite
 from pd4dgs_codec.metrics.image import mpsnr
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import PRESETS
-from pd4dgs_codec.model.model import Model, Noise, Rounding
+from pd4dgs_codec.model.model import Noise, Rounding
 from pd4dgs_codec.render.picture import Picture, render, render_image
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train import losses
@@ -32,23 +34,28 @@ from pd4dgs_codec.train.initialise import fresh_model
 from pd4dgs_codec.train.optimiser import Optimiser
 from pd4dgs_codec.train.rollout import CAPACITY_WEIGHTED, UNIFORM, rollout_probabilities, sample_level, updated_rho
 from pd4dgs_codec.train.ssim import TargetStats, image_loss
+from pd4dgs_codec.train.stop import StopRequest
 
 #: Steps timed before a run with a time limit fixes N, and the share of the limit that N is meant to fill.
 TIMED_STEPS = 50
 TIME_SHARE = 0.95
 #: Mean cost of a step over a run against the one measured at its start: more anchors, fewer visible Gaussians.
 LATER_COST = 0.8
+#: N is at least so much: where a limit is nearly spent the run is cut and says so, instead of squeezing the schedule.
+LEAST_TIMED_TOTAL = 10 * TIMED_STEPS
 #: Held-out evaluations over a run, for the curve of quality against wall time, and views in each.
 CURVE_POINTS = 12
 CURVE_VIEWS = 6
 
 
 class Trainer:
-    """A run in progress; `run` carries it to its end."""
+    """A run in progress; `run` carries it to its end. interrupted: a signal ended the last `run`."""
 
     def __init__(self, config: TrainConfig, dataset: Dataset, device: str = "cpu"):
         preset = PRESETS[config.preset]
         self.config, self.dataset, self.device = config, dataset, torch.device(device)
+        if self.device.type == "cuda":  # the variances of SSIM are differences of blurred images: no ten-bit factors
+            torch.backends.cudnn.allow_tf32 = False
         self.model = fresh_model(preset, dataset, config.steps or preset.steps, config.seed).to(self.device)
         self.optimiser = Optimiser(self.model, config.rates)
         self.densifier = Densifier(self.model, config.grow_threshold, preset.max_anchors)
@@ -59,6 +66,7 @@ class Trainer:
         self.rho = 0.0
         self.skipped = 0
         self.seconds = 0.0
+        self.interrupted = False
         self.curve: list[dict[str, Any]] = []
         self.order: list[int] = []
         self._targets = [self._target(view) for view in dataset.train]
@@ -67,41 +75,55 @@ class Trainer:
     # -- the run ---------------------------------------------------------------------------------------------------
 
     def run(self, output: Path, *, log: Path | None = None, progress: Any = None, save_every: float = 60.0) -> None:
-        """Trains to the end, to the time limit, or to KeyboardInterrupt; `output` always holds a whole checkpoint then.
+        """Trains to the end, to the time limit, or to Ctrl-C or SIGTERM, which end it after the step in hand and set
+        `interrupted`; `output` holds a whole checkpoint then.
 
-        progress: an object with `.update(trainer, record)` and `.close()`, or None. save_every: seconds.
+        A second signal raises KeyboardInterrupt at once: `output` stays as last saved. progress: an object with
+        `.update(trainer, record)` and `.close()`, or None. save_every: seconds. Raises DataError for a checkpoint that
+        cannot be written, or for such a log, in which case the checkpoint is saved first.
         """
+        with StopRequest() as stop:
+            stream = _open_log(log) if log else None
+            try:
+                failure = self._steps(output, stop, stream, progress, save_every)
+            finally:
+                if stream:
+                    with contextlib.suppress(OSError):  # what a failed write left is lost; it has been told
+                        stream.close()
+                if progress:
+                    progress.close()
+            if self.total and self.iteration >= self.total:
+                self.model.round_to_steps()  # what the end of the run rendered, and what the file will hold
+            self.save(output)
+        self.interrupted = stop.requested
+        if failure:
+            raise _log_error(log, failure)
+
+    def _steps(
+        self, output: Path, stop: StopRequest, stream: TextIO | None, progress: Any, save_every: float
+    ) -> OSError | None:
+        """Steps until one of the ends of `run`; returns what kept a record from being logged, which is an end too."""
         start = time.monotonic() - self.seconds
         saved = time.monotonic()
-        stream = open(log, "a", encoding="utf-8") if log else None  # noqa: SIM115
-        try:
-            while not self.total or self.iteration < self.total:
-                record = self.step()
+        while not self.total or self.iteration < self.total:
+            record = self.step()
+            self.seconds = time.monotonic() - start
+            if not self.total and self.iteration >= TIMED_STEPS:
+                self._fix_iterations(start)
+                record["total"] = self.total
+            if self._curve_due():
+                record["held_out_psnr"] = self._evaluate()
                 self.seconds = time.monotonic() - start
-                if not self.total and self.iteration >= TIMED_STEPS:
-                    self._fix_iterations(start)
-                if self._curve_due():
-                    record["held_out_psnr"] = self._evaluate()
-                    self.seconds = time.monotonic() - start
-                if stream:
-                    stream.write(json.dumps(record | {"seconds": round(self.seconds, 3)}) + "\n")
-                if progress:
-                    progress.update(self, record)
-                if time.monotonic() - saved > save_every:
-                    self.save(output)
-                    saved = time.monotonic()
-                if self.config.max_seconds and self.seconds >= self.config.max_seconds:
-                    break
-        except KeyboardInterrupt:
-            pass
-        finally:
-            if stream:
-                stream.close()
+            if stream and (failure := _append(stream, record | {"seconds": round(self.seconds, 3)})):
+                return failure
             if progress:
-                progress.close()
-        if self.total and self.iteration >= self.total:
-            self.model.round_weights()  # the file holds rounded values; so does the finished checkpoint
-        self.save(output)
+                progress.update(self, record)
+            if time.monotonic() - saved > save_every:
+                self.save(output)
+                saved = time.monotonic()
+            if stop.requested or (self.config.max_seconds and self.seconds >= self.config.max_seconds):
+                break
+        return None
 
     def step(self) -> dict[str, Any]:
         """One training step; returns its log record (every term unweighted)."""
@@ -134,7 +156,7 @@ class Trainer:
         """Loss, gradient, update; False, with nothing changed, if any of it is not finite."""
         try:
             picture, terms, loss = self._loss(index, level, schedule, rounding)
-        except RenderError as error:  # the rasteriser refuses NaN and infinite input
+        except NotFinite as error:  # a diverged step may be passed over; any other refusal is here to stay
             record["refused"] = str(error)
             return False
         record["loss"] = float(loss.detach())
@@ -247,7 +269,8 @@ class Trainer:
     # -- time limit, evaluation, checkpoints -----------------------------------------------------------------------
 
     def _fix_iterations(self, start: float) -> None:
-        """Fixes N from the cost of a step at each level, so that the run fills TIME_SHARE of its limit."""
+        """Fixes N from the cost of a step at each level, so that the run fills TIME_SHARE of its limit; see
+        LEAST_TIMED_TOTAL."""
         assert self.config.max_seconds
         costs = self._level_costs()
         schedule = Schedule(1000)
@@ -255,7 +278,7 @@ class Trainer:
         mean = coarse * costs[0] + (1 - coarse) * sum(costs) / 3
         left = TIME_SHARE * self.config.max_seconds - (time.monotonic() - start)
         left -= CURVE_POINTS * CURVE_VIEWS * sum(costs) / 3
-        self.total = self.iteration + max(1, int(left / (mean * LATER_COST)))
+        self.total = max(LEAST_TIMED_TOTAL, self.iteration + int(left / (mean * LATER_COST)))
         self.config = replace(self.config, iterations=self.total)
 
     def _level_costs(self, repeats: int = 9) -> list[float]:
@@ -319,27 +342,54 @@ class Trainer:
         )
 
     def resume(self, path: Path) -> None:
-        """Goes on from a checkpoint of the same configuration; TrainError if it holds no training state."""
+        """Goes on from a checkpoint of the same configuration and data.
+
+        TrainError if it holds no training state, DataError if that state is broken or of other data.
+        """
         model, training = checkpoint.load(path)
         if "optimiser" not in training:
             raise TrainError(f"{path}: holds no training state (it was decoded or stripped); cannot resume from it")
         self.model = model.to(self.device)
         self.optimiser = Optimiser(self.model, self.config.rates)
+        try:
+            self._restore(training)
+        except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+            reason = " ".join(f"{type(error).__name__}: {error}".split())  # torch explains itself over several lines
+            raise DataError(f"{path}: its training state cannot be read: {reason}") from None
+        if not all(0 <= index < len(self.dataset.train) for index in self.order):
+            views = f"{len(self.dataset.train)} training views"
+            raise DataError(f"{path}: its next views are {self.order[:8]}, found {views}; expected the same data")
+
+    def _restore(self, training: dict[str, Any]) -> None:
         self.optimiser.load_state(training["optimiser"])
         self.densifier.load_state(training["densifier"])
         self.generator.set_state(training["generator"])
         self.noise.generator.set_state(training["noise"])
-        for name in ("iteration", "total", "seconds", "rho", "skipped", "order"):
-            setattr(self, name, training[name])
-        self.curve = json.loads(training["curve"])
+        self.iteration, self.total, self.skipped = (int(training[k]) for k in ("iteration", "total", "skipped"))
+        self.seconds, self.rho = float(training["seconds"]), float(training["rho"])
+        self.order = [int(index) for index in training["order"]]
+        self.curve = list(json.loads(training["curve"]))
 
 
 def _plain(config: TrainConfig) -> dict[str, Any]:
     return json.loads(json.dumps(config, default=lambda value: value.__dict__))
 
 
-def psnr_summary(model: Model, curve: list[dict[str, Any]]) -> str:
-    """The last point of the curve as text, for progress lines."""
-    if not curve:
-        return ""
-    return "/".join(f"{value:.2f}" for value in curve[-1]["psnr"]) + " dB"
+def _open_log(path: Path) -> TextIO:
+    try:
+        return open(path, "a", encoding="utf-8", buffering=1)  # by lines: a failed write shows at its step
+    except OSError as error:
+        raise _log_error(path, error) from None
+
+
+def _append(stream: TextIO, record: dict[str, Any]) -> OSError | None:
+    """Writes a record as one line of JSON; returns the error if it could not."""
+    try:
+        stream.write(json.dumps(finite(record), allow_nan=False) + "\n")
+    except OSError as error:
+        return error
+    return None
+
+
+def _log_error(path: Path | None, error: OSError) -> DataError:
+    return DataError(f"{path}: the log cannot be written: {error.strerror or error}")

@@ -12,6 +12,7 @@ import pytest
 pytest.importorskip("torch")
 
 from pd4dgs_codec import __main__ as dispatcher  # noqa: E402
+from pd4dgs_codec import jsonable  # noqa: E402
 from pd4dgs_codec.cli import common, files  # noqa: E402
 
 VERBS = ("train", "encode", "decode", "info", "render", "eval")
@@ -42,6 +43,8 @@ USAGE_ERRORS = [
     ("train", ["synthetic:local", "-o", "m.pt", "--iterations", "0"]),
     ("train", ["synthetic:local", "-o", "m.pt", "--max-seconds", "nan"]),
     ("train", ["synthetic:local", "-o", "-"]),
+    ("train", ["synthetic:local", "-o", "m.pt", "--seed", str(2**63 - 1)]),
+    ("train", ["synthetic:local", "-o", "m.pt", "--log", "m.pt"]),
     ("encode", ["m.pt"]),
     ("encode", ["m.pt", "-o", "-", "--json"]),
     ("encode", ["m.pt", "-o", "s.pd4", "--effort", "10"]),
@@ -121,7 +124,7 @@ def test_table_aligns_numbers_right():
 
 
 def test_infinite_and_nan_become_null():
-    assert common.finite({"a": [float("inf"), 1.0], "b": (float("nan"), "x")}) == {"a": [None, 1.0], "b": [None, "x"]}
+    assert jsonable.finite({"a": [float("inf"), 1.0], "b": (float("nan"), "x")}) == {"a": [None, 1.0], "b": [None, "x"]}
 
 
 def test_internal_error_is_one_line_and_verbose_shows_where(cli, scene_pd4, monkeypatch):

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
+import signal
+import sys
 
 import pytest
 
@@ -72,14 +75,14 @@ def test_interrupted_and_resumed_run_repeats_the_uninterrupted_one(train, tmp_pa
     step = Trainer.step
 
     def interrupted(self):
-        if self.iteration == 3:
-            raise KeyboardInterrupt
+        if self.iteration == 2:
+            signal.raise_signal(signal.SIGINT)
         return step(self)
 
     monkeypatch.setattr(Trainer, "step", interrupted)
     cut = train(tmp_path / "cut.pt", iterations=8)
     assert cut.code == 0 and "3 of 8 steps" in cut.err
-    assert "never reached: " in cut.err and "rounding" in cut.err and "--resume" in cut.err
+    assert "never reached: " in cut.err and "exact rounding of attributes" in cut.err and "--resume" in cut.err
     monkeypatch.setattr(Trainer, "step", step)
     assert train(tmp_path / "cut.pt", "--resume", tmp_path / "cut.pt", iterations=None).code == 0
     assert _same(_state(tmp_path / "whole.pt"), _state(tmp_path / "cut.pt"))
@@ -159,3 +162,51 @@ def test_cuda_that_is_absent_is_refused(train, tmp_path, monkeypatch):
     monkeypatch.setattr("torch.cuda.is_available", lambda: False)
     result = train(tmp_path / "m.pt", "--device", "cuda")
     assert result.code == 1 and "--device cpu" in result.err
+
+
+def test_a_gpu_that_gsplat_cannot_use_is_left_alone(monkeypatch, capsys):
+    from argparse import Namespace
+
+    from pd4dgs_codec.cli.common import Console
+    from pd4dgs_codec.cli.train import _device
+    from pd4dgs_codec.errors import TrainError
+
+    console = Console(Namespace(json=False, verbose=False))
+    monkeypatch.setattr("torch.cuda.is_available", lambda: True)
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    assert _device("auto", console) == "cpu" and "GPU is not used: gsplat" in capsys.readouterr().err
+    with pytest.raises(TrainError, match="--device cuda: gsplat"):
+        _device("cuda", console)
+    monkeypatch.setattr("pd4dgs_codec.render.gsplat_backend.check", lambda: None)
+    assert _device("auto", console) == _device("cuda", console) == "cuda"
+
+
+def test_a_second_interrupt_is_one_line(train, tmp_path, monkeypatch):
+    from pd4dgs_codec.train.loop import Trainer
+
+    monkeypatch.setattr(Trainer, "step", lambda self: [signal.raise_signal(signal.SIGINT) for _ in range(2)])
+    result = train(tmp_path / "m.pt")
+    assert result.code == 1 and "interrupted twice" in result.error_lines[-1] and not (tmp_path / "m.pt").exists()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links, pipes and /dev/null")
+def test_links_and_devices_stay_what_they_are(train, tmp_path):
+    log, output = tmp_path / "log", tmp_path / "link.pt"
+    log.symlink_to("/dev/null")
+    output.symlink_to("real.pt")
+    assert train(output, "--log", log, iterations=1).code == 0
+    assert log.is_symlink() and output.is_symlink() and (tmp_path / "real.pt").is_file()
+    os.mkfifo(tmp_path / "pipe")
+    result = train(tmp_path / "pipe", iterations=1)
+    assert result.code == 1 and "not a regular file" in result.err and (tmp_path / "pipe").is_fifo()
+
+
+def test_stored_steps_come_back_as_steps():
+    from dataclasses import replace
+
+    from pd4dgs_codec.cli.resume import parse_config
+    from pd4dgs_codec.scene import Steps
+    from pd4dgs_codec.train.config import TrainConfig
+
+    config = replace(TrainConfig(), steps=Steps(feature=0.25), iterations=7)
+    assert parse_config(json.dumps(config, default=lambda value: value.__dict__), "m.pt") == config

@@ -227,6 +227,22 @@ def test_an_interrupted_write_leaves_the_old_file_and_nothing_else(path, tmp_pat
     assert path.read_bytes() == before and os.listdir(tmp_path) == ["model.pt"]
 
 
+@pytest.mark.skipif(os.name != "posix", reason="links and pipes")
+def test_a_link_stays_one_and_a_pipe_is_refused(path, tmp_path):
+    link = tmp_path / "link.pt"
+    link.symlink_to(path)
+    checkpoint.save(link, model(), {"iteration": 9})
+    assert link.is_symlink() and checkpoint.load(path)[1]["iteration"] == 9
+    os.mkfifo(tmp_path / "pipe")
+    with pytest.raises(DataError, match="pipe: is not a regular file"):
+        checkpoint.save(tmp_path / "pipe", model())
+
+
+def test_text_is_not_called_pickled_code(tmp_path):
+    (tmp_path / "m.pt").write_text("hello")
+    assert "pickled" not in refusal(tmp_path / "m.pt", "not a readable checkpoint")
+
+
 def test_a_folder_that_is_not_there(tmp_path):
     with pytest.raises(DataError, match="none"):
         checkpoint.save(tmp_path / "none" / "m.pt", model())

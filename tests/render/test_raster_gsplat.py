@@ -44,6 +44,20 @@ def test_missing_gsplat_is_one_clear_line(monkeypatch):
         gsplat_backend.rasterize(*scene(4), *camera(8, 8), None, depth=False, **SIZES)
 
 
+@pytest.mark.parametrize("kernels, says", [(object(), None), (None, "no CUDA kernels"), ("absent", "do not load")])
+def test_check_wants_the_compiled_kernels(monkeypatch, kernels, says):
+    _install(monkeypatch, "1.5.3")
+    monkeypatch.setitem(sys.modules, "gsplat.cuda", types.SimpleNamespace())
+    backend = None if kernels == "absent" else types.SimpleNamespace(_C=kernels)
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", backend)
+    if says is None:
+        gsplat_backend.check()
+        return
+    with pytest.raises(RenderError, match=says) as caught:
+        gsplat_backend.check()
+    assert "\n" not in str(caught.value)
+
+
 @pytest.mark.parametrize("channels, depth, mode", [(3, False, "RGB"), (3, True, "RGB+D"), (0, True, "D")])
 def test_what_gsplat_is_asked(monkeypatch, channels, depth, mode):
     calls = _install(monkeypatch, "1.5.3+pt24cu124")

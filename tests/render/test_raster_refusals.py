@@ -6,7 +6,7 @@ torch = pytest.importorskip("torch")
 
 from raster_scenes import NAMES, camera, scene  # noqa: E402
 
-from pd4dgs_codec.errors import RenderError  # noqa: E402
+from pd4dgs_codec.errors import NotFinite, RenderError  # noqa: E402
 from pd4dgs_codec.render.rasterization import rasterization  # noqa: E402
 
 OPTIONS = [
@@ -53,6 +53,13 @@ def test_shapes_and_types(name):
 def test_no_channels():
     with pytest.raises(RenderError, match="0 channels"):
         rasterization(*scene(5, channels=0), *camera(8, 8), 8, 8)
+
+
+def test_colours_that_are_not_finite_have_an_error_of_their_own():
+    tensors = [t.detach() for t in scene(5)]
+    tensors[4][2, 1] = float("nan")
+    with pytest.raises(NotFinite, match="colors"):
+        rasterization(*tensors, *camera(8, 8), 8, 8)
 
 
 CAMERAS = [

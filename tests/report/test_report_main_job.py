@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import json
 import shutil
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -16,10 +17,13 @@ pytest.importorskip("numba")
 Image = pytest.importorskip("PIL.Image")
 
 from pd4dgs_codec import decode  # noqa: E402
+from pd4dgs_codec.codec.encoder import encode_with_report  # noqa: E402
 from pd4dgs_codec.codec.info import info  # noqa: E402
 from pd4dgs_codec.data.dataset import Dataset, View  # noqa: E402
+from pd4dgs_codec.errors import TrainError  # noqa: E402
 from pd4dgs_codec.model import checkpoint  # noqa: E402
 from pd4dgs_codec.model.config import PRESETS, DeformationConfig, ModelConfig  # noqa: E402
+from pd4dgs_codec.model.convert import to_scene  # noqa: E402
 from pd4dgs_codec.report import main_job, tables  # noqa: E402
 from pd4dgs_codec.report.main_job import Job, run_job  # noqa: E402
 from pd4dgs_codec.train.config import TrainConfig  # noqa: E402
@@ -142,11 +146,51 @@ def test_another_configuration_trains_anew(job, copied, no_training, change):
 
 
 def test_an_unfinished_checkpoint_is_trained_again(job, copied, no_training):
-    path = copied / "discs" / "model.pt"
+    path, log = copied / "discs" / "model.pt", copied / "discs" / "train.jsonl"
     model, training = checkpoint.load(path)
-    checkpoint.save(path, model, training | {"iteration": training["total"] - 1})
-    with pytest.raises(_Started):
-        _run(job, copied)
+    for iteration, total in ((39, 40), (0, 0)):
+        checkpoint.save(path, model, training | {"iteration": iteration, "total": total})
+        with pytest.raises(_Started):
+            _run(job, copied)
+        assert len(log.read_text().splitlines()) == 40  # it goes on, and so does its log
+
+
+@pytest.mark.parametrize(
+    ("seconds", "total", "ended"), [(1.0, 50, False), (9.0, 50, True), (1.0, 40, True), (1.0, 0, False)]
+)
+def test_a_run_ends_with_its_steps_or_its_time(seconds, total, ended):
+    config = dataclasses.replace(CONFIG, max_seconds=9.0)
+    assert main_job._ended({"iteration": 40, "total": total, "seconds": seconds}, config) is ended
+
+
+def test_an_interrupted_training_is_not_published_and_goes_on(job, finished, tmp_path, monkeypatch):
+    step = main_job.Trainer.step
+
+    def interrupted(self):
+        if self.iteration == 10:
+            signal.raise_signal(signal.SIGINT)
+        return step(self)
+
+    monkeypatch.setattr(main_job.Trainer, "step", interrupted)
+    with pytest.raises(TrainError, match="interrupted at step 11"):
+        _run(job, tmp_path)
+    assert sorted(p.name for p in (tmp_path / "discs").iterdir()) == ["model.pt", "train.jsonl"]
+    monkeypatch.setattr(main_job.Trainer, "step", step)
+    result, said = _run(job, tmp_path)
+    assert any("from step 11" in line for line in said) and result["phases_not_reached"] == []
+    assert (tmp_path / "discs" / "scene.pd4").read_bytes() == (finished[0] / "discs" / "scene.pd4").read_bytes()
+
+
+def test_a_layer_that_one_encoding_drops_is_shown_as_absent(finished):
+    scene = to_scene(checkpoint.load(finished[0] / "discs" / "model.pt")[0])
+    reports = {
+        name: encode_with_report(scene, effort=1, **options)[1] for name, options in main_job.VARIANTS.items()
+    }
+    whole = main_job.coding_rows(reports, scene)
+    reports["lzma_float32"] = dataclasses.replace(reports["lzma_float32"], layers=reports["lzma_float32"].layers[1:])
+    rows = main_job.coding_rows(reports, scene)
+    assert rows[0] == whole[0] | {"lzma_float32_bytes": None} and rows[1:] == whole[1:]
+    assert "| - " in tables.coding_table([finished[1] | {"coding": rows}])
 
 
 def test_the_results_become_markdown_tables_and_a_plot(finished, tmp_path):

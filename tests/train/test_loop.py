@@ -1,8 +1,11 @@
 """The loop on a scene of a few tiny pictures: it learns, resumes bit for bit, survives bad steps, ends on time."""
 
 import dataclasses
+import io
 import json
 import math
+import signal
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,9 +14,10 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("numba")
 
 from pd4dgs_codec.data.dataset import Dataset, View  # noqa: E402
-from pd4dgs_codec.errors import TrainError  # noqa: E402
+from pd4dgs_codec.errors import DataError, NotFinite, RenderError, TrainError  # noqa: E402
 from pd4dgs_codec.model import checkpoint  # noqa: E402
 from pd4dgs_codec.model.config import PRESETS, DeformationConfig, ModelConfig  # noqa: E402
+from pd4dgs_codec.train import loop  # noqa: E402
 from pd4dgs_codec.train.config import Schedule, TrainConfig  # noqa: E402
 from pd4dgs_codec.train.loop import Trainer  # noqa: E402
 
@@ -96,7 +100,7 @@ def test_a_non_finite_step_is_skipped_and_counted(dataset):
     trainer = Trainer(TrainConfig(preset="tiny", iterations=30), dataset)
     trainer.step()
     with torch.no_grad():
-        trainer.model.networks["color"].linears[1].bias[0] = math.nan
+        trainer.model.networks["color"].linears[1].bias[:] = math.nan
     before = trainer.model.feature.detach().clone()
     record = trainer.step()
     assert record["skipped"] == 1 == trainer.skipped
@@ -106,8 +110,10 @@ def test_a_non_finite_step_is_skipped_and_counted(dataset):
 def test_a_time_limit_fixes_n_once_and_ends_in_time(dataset, tmp_path):
     Trainer(TrainConfig(preset="tiny", iterations=12), dataset).run(tmp_path / "warm.pt")  # compiles the kernels
     trainer = Trainer(TrainConfig(preset="tiny", max_seconds=10.0), dataset)
-    trainer.run(tmp_path / "m.pt")
-    assert trainer.total > 50 and trainer.seconds < 12.0
+    trainer.run(tmp_path / "m.pt", log=tmp_path / "log.jsonl")
+    assert trainer.total >= loop.LEAST_TIMED_TOTAL and trainer.seconds < 12.0
+    totals = {r["iteration"]: r["total"] for r in map(json.loads, open(tmp_path / "log.jsonl")) if "total" in r}
+    assert totals == {loop.TIMED_STEPS - 1: trainer.total}
     stored = checkpoint.load(tmp_path / "m.pt")[1]
     assert stored["total"] == trainer.total
     assert json.loads(stored["config"])["iterations"] == trainer.total
@@ -133,3 +139,97 @@ def test_resuming_from_a_model_without_training_state_is_refused(dataset, tmp_pa
     checkpoint.save(tmp_path / "m.pt", trainer.model)
     with pytest.raises(TrainError, match="no training state"):
         trainer.resume(tmp_path / "m.pt")
+
+
+def test_a_limit_nearly_spent_gives_a_cut_run_that_says_so(dataset):
+    trainer = Trainer(TrainConfig(preset="tiny", max_seconds=1e-3), dataset)
+    trainer._fix_iterations(start=0.0)
+    assert trainer.total == loop.LEAST_TIMED_TOTAL
+    assert "levels 1 and 2" in Schedule(trainer.total).phases_not_reached(loop.TIMED_STEPS)
+
+
+@pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
+def test_the_first_signal_ends_the_run_after_a_whole_step(dataset, tmp_path, monkeypatch, number):
+    trainer = Trainer(TrainConfig(preset="tiny", iterations=8), dataset)
+    update, before = trainer._update, signal.getsignal(number)
+
+    def interrupted(*args):
+        if trainer.iteration == 2:
+            signal.raise_signal(number)  # in the middle of a step
+        update(*args)
+
+    monkeypatch.setattr(trainer, "_update", interrupted)
+    trainer.run(tmp_path / "m.pt")
+    assert trainer.interrupted and trainer.iteration == 3 == checkpoint.load(tmp_path / "m.pt")[1]["iteration"]
+    assert signal.getsignal(number) is before
+    resumed, whole = (Trainer(TrainConfig(preset="tiny", iterations=8), dataset) for _ in range(2))
+    resumed.resume(tmp_path / "m.pt")
+    resumed.run(tmp_path / "resumed.pt")
+    whole.run(tmp_path / "whole.pt")
+    again, expected = weights(tmp_path / "resumed.pt"), weights(tmp_path / "whole.pt")
+    assert not resumed.interrupted and all(torch.equal(again[k], expected[k]) for k in expected)
+
+
+def test_a_second_signal_ends_it_at_once_and_saves_nothing(dataset, tmp_path, monkeypatch):
+    trainer = Trainer(TrainConfig(preset="tiny", iterations=8), dataset)
+    before = signal.getsignal(signal.SIGINT)
+    monkeypatch.setattr(trainer, "_update", lambda *_: [signal.raise_signal(signal.SIGINT) for _ in range(2)])
+    with pytest.raises(KeyboardInterrupt):
+        trainer.run(tmp_path / "m.pt")
+    assert not (tmp_path / "m.pt").exists() and signal.getsignal(signal.SIGINT) is before
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="needs /dev/full")
+def test_a_log_that_cannot_be_written_ends_the_run_with_a_checkpoint(dataset, tmp_path):
+    trainer = Trainer(TrainConfig(preset="tiny", iterations=8), dataset)
+    with pytest.raises(DataError, match="/dev/full: .*No space left"):
+        trainer.run(tmp_path / "m.pt", log=Path("/dev/full"))
+    assert checkpoint.load(tmp_path / "m.pt")[1]["iteration"] == 1
+    with pytest.raises(DataError, match="none"):
+        trainer.run(tmp_path / "n.pt", log=tmp_path / "none" / "log.jsonl")
+
+
+def test_the_log_is_json_even_of_a_step_that_is_not_finite():
+    stream = io.StringIO()
+    assert loop._append(stream, {"loss": math.nan, "pi": (0.5, math.inf)}) is None
+    assert json.loads(stream.getvalue(), parse_constant=pytest.fail) == {"loss": None, "pi": [0.5, None]}
+
+
+def test_only_what_is_not_finite_is_skipped(dataset, monkeypatch):
+    trainer = Trainer(TrainConfig(preset="tiny", iterations=8), dataset)
+
+    def refuse(error):
+        monkeypatch.setattr(trainer, "_loss", lambda *_: (_ for _ in ()).throw(error))
+
+    refuse(NotFinite("colors"))
+    assert trainer.step()["refused"] == "colors"
+    refuse(RenderError("no gsplat"))
+    with pytest.raises(RenderError, match="no gsplat"):
+        trainer.step()
+
+
+BROKEN_STATES = {
+    "order": [0, 6],
+    "generator": torch.zeros(3),
+    "optimiser": {"state": {}},
+    "densifier": None,
+    "iteration": "many",
+    "curve": "{",
+}
+
+
+@pytest.mark.parametrize("name", BROKEN_STATES)
+def test_broken_training_state_is_refused_in_one_line(dataset, tmp_path, name):
+    trainer = Trainer(TrainConfig(preset="tiny", iterations=5), dataset)
+    trainer.save(tmp_path / "m.pt")
+    model, training = checkpoint.load(tmp_path / "m.pt")
+    for broken in (training | {name: BROKEN_STATES[name]}, {k: v for k, v in training.items() if k != name}):
+        checkpoint.save(tmp_path / "m.pt", model, broken)
+        with pytest.raises((DataError, TrainError)) as caught:
+            trainer.resume(tmp_path / "m.pt")
+        assert str(tmp_path / "m.pt") in str(caught.value) and "\n" not in str(caught.value)
+
+
+def test_points_that_all_lie_far_outside_are_as_good_as_none(dataset):
+    far = dataclasses.replace(dataset, points=np.full((20, 3), 1e4, np.float32))
+    assert len(Trainer(TrainConfig(preset="tiny", iterations=5), far).model.anchor_q) > 100

@@ -85,9 +85,10 @@ def test_levels_follow_their_probabilities_and_never_pass_the_highest():
 
 def test_the_schedule_is_the_papers_at_its_own_length():
     s = Schedule(30_000)
-    assert (s.progressive, s.warm, s.rho_every, s.coarse_end, s.rounding) == (10_000, 2_000, 200, 3_000, 24_000)
+    assert (s.progressive, s.warm, s.rho_every, s.coarse_end, s.rounding) == (10_000, 2_000, 200, 3_000, 20_000)
     assert s.grow.start > 500 and s.grow.stop == 15_001
-    assert s.phases_not_reached(30_000) == []
+    assert s.phases_not_reached(30_000) == Schedule(4).phases_not_reached(4) == []
+    assert s.phases_not_reached(27_000)[0] == "exact rounding of attributes"
     assert s.phases_not_reached(5_000)[0] == "rate and mask terms"
 
 
@@ -95,7 +96,9 @@ def test_learning_rates_are_log_linear():
     assert learning_rate((1e-2, 1e-4), 0.5) == pytest.approx(1e-3)
 
 
-@pytest.mark.parametrize("bad", [{"preset": "huge"}, {"iterations": 0}, {"max_seconds": -1.0}, {"rollout": "greedy"}])
+@pytest.mark.parametrize(
+    "bad", [{"preset": "huge"}, {"iterations": 0}, {"max_seconds": -1.0}, {"rollout": "greedy"}, {"seed": -1}]
+)
 def test_bad_configurations_are_refused(bad):
     with pytest.raises(TrainError, match="expected|must be"):
         TrainConfig(**bad)
