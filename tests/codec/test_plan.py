@@ -11,7 +11,7 @@ from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.encoder import encode, encode_with_report
 from pd4dgs_codec.codec.kinds import LAYER_KINDS
 from pd4dgs_codec.codec.plan import head_bounds, plan
-from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS, PLANES, Deformation
+from pd4dgs_codec.scene import GLOBAL_HEADS, LENGTH_HEADS, LOCAL_HEADS, PLANES, Deformation, deformation_unit
 
 VOXEL = 0.0078125
 
@@ -83,8 +83,10 @@ def test_each_head_is_judged_by_its_own_bound(layer):
     heads = GLOBAL_HEADS if layer == 1 else LOCAL_HEADS
     bounds = head_bounds(scene_with(), kind)
     assert set(bounds) == set(heads) and bounds["position" if layer == 1 else "mean"] == 1e-3 * VOXEL
+    unit = float(deformation_unit(scene_with().info.box))
+    outputs = {name: bound / (unit if name in LENGTH_HEADS else 1.0) for name, bound in bounds.items()}
     for alive in heads:
-        values = {name: (1.01 if name == alive else 0.99) * bound for name, bound in bounds.items()}
+        values = {name: (1.01 if name == alive else 0.99) * output for name, output in outputs.items()}
         scene = scene_with(**{"global_value" if layer == 1 else "local_value": values})
         planned, left_out = plan(scene, "auto", raw_deformation=True)
         networks = getattr(planned, kind.deformation).networks

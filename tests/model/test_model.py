@@ -167,7 +167,7 @@ def test_a_global_residual_is_added_to_its_attribute(head):
 def test_the_global_position_residual_moves_anchors_and_the_view_direction():
     """Moving every anchor by b is moving the camera by -b, the networks' view direction included."""
     model = small_model()
-    bias = set_bias(model.global_deformation, "position")
+    bias = set_bias(model.global_deformation, "position") * model.global_deformation.unit
     moved = gaussians(model, 1)
     viewmat = VIEWMAT.clone()
     viewmat[:3, 3] += viewmat[:3, :3] @ bias
@@ -225,7 +225,8 @@ def test_the_gate_comes_after_the_local_residuals():
     torch.testing.assert_close(got.opacities, torch.full_like(got.opacities, 0.2), rtol=1e-5, atol=0)
     assert (got.scales[:, 0] == 0).all()
     torch.testing.assert_close(got.scales[:, 1], before.scales[:, 1])
-    torch.testing.assert_close(got.scales[:, 2], before.scales[:, 2] + 0.6, rtol=1e-5, atol=1e-6)
+    grown = before.scales[:, 2] + 0.6 * model.local_deformation.unit
+    torch.testing.assert_close(got.scales[:, 2], grown, rtol=1e-5, atol=1e-6)
 
 
 @pytest.mark.parametrize("head", GLOBAL_HEADS)
