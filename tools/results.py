@@ -23,8 +23,8 @@ SHARED = Path(os.environ.get("PD4DGS_SHARED", Path(__file__).resolve().parents[2
 SCENES = (
     ("shelf-hand", SHARED / "shelf-hand", 2, "small", 4_629, 600.0),
     ("bouncing-balls", SHARED / "bouncing-balls", 4, "small", 10_000, 600.0),
-    ("synthetic-local", "synthetic:local", 1, "tiny", 2_500, 240.0),
-    ("synthetic-fast", "synthetic:fast", 1, "tiny", 2_500, 240.0),
+    ("synthetic-local", "synthetic:local", 1, "tiny", 1_500, 240.0),
+    ("synthetic-fast", "synthetic:fast", 1, "tiny", 1_500, 240.0),
     ("shelf-hand-paper", SHARED / "shelf-hand", 2, "paper", 4_600, 720.0),
 )
 #: Bytes per layer that the PD-4DGS paper publishes (average over the seven Dycheck iPhone scenes).
