@@ -17,9 +17,10 @@ from pd4dgs_codec.attributes import planes as decorrelation
 from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
 from pd4dgs_codec.attributes.table import N_CHANNELS
 from pd4dgs_codec.bitstream.limits import MAX_VOXEL
+from pd4dgs_codec.codec.attribute_section import read_attributes, write_attributes
 from pd4dgs_codec.codec.kinds import LayerKind
 from pd4dgs_codec.codec.layer_meta import LayerMeta, ScaleMeta, Section, check_symbol_count, pack_meta, unpack_meta
-from pd4dgs_codec.codec.prediction import read_attributes, write_attributes
+from pd4dgs_codec.codec.plane_section import read_planes, write_planes
 from pd4dgs_codec.codec.symbols import LayerSymbols, Planes
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
 from pd4dgs_codec.entropy.lzma_mode import (
@@ -69,6 +70,8 @@ def write_layer(symbols: LayerSymbols, coding: Coding) -> tuple[bytes, list[Stre
             continue
         if section == Section.ATTRIBUTES:
             data, rate_bits = write_attributes(symbols.attributes, coding.priors, coding.effort)
+        elif section == Section.PLANES:
+            data, rate_bits = write_planes(_by_plane(channels, symbols), coding.priors, coding.effort)
         elif coding.mode == "lzma":  # one stream for all, but a layer's rate counts no masks
             coded = encode_channels_lzma(channels, effort=coding.effort)
             data, rate_bits = coded.payload, coded.rate_bits - sum(gaussian_bits(c) for c in channels[:2])
@@ -100,6 +103,13 @@ def channel_groups(symbols: LayerSymbols) -> tuple[dict[Section, list[np.ndarray
         else:
             groups[Section.WEIGHTS].append(tensor.ravel())
     return groups, predictors
+
+
+def _by_plane(channels: list[np.ndarray], symbols: LayerSymbols) -> list[np.ndarray]:
+    """Residuals [C, H, W] per plane from one array per plane channel."""
+    rest = iter(channels)
+    shapes = [scale[name].shape for scale in symbols.planes for name, _, _ in PLANES]
+    return [np.stack([next(rest) for _ in range(shape[0])]).reshape(shape) for shape in shapes]
 
 
 def _meta(symbols: LayerSymbols, sections: dict[Section, bytes], predictors: list[int]) -> LayerMeta:
@@ -145,7 +155,7 @@ def read_layer(payload: bytes | memoryview, kind: LayerKind, rows_before: int, m
     raw = raw and bool(meta.networks) and kind.deformation is not None
     shapes = [*meta.plane_shapes(), *meta.weight_shapes(kind)]
     counts = _channel_counts(meta, kind, rows_before, raw)
-    channels = _decode_groups(parts, counts, mode)
+    channels = _decode_groups(parts, counts, meta, mode)
     if raw:
         floats = decode_floats_lzma(_part(parts, Section.FLOATS, 1), [math.prod(shape) for shape in shapes])
         tensors = [x.reshape(shape) for x, shape in zip(floats, shapes, strict=True)]
@@ -184,7 +194,7 @@ def _channel_counts(meta: LayerMeta, kind: LayerKind, rows_before: int, raw: boo
 
 
 def _decode_groups(
-    parts: dict[int, bytes], counts: dict[Section, list[int]], mode: str
+    parts: dict[int, bytes], counts: dict[Section, list[int]], meta: LayerMeta, mode: str
 ) -> dict[Section, list[np.ndarray]]:
     rows = counts[Section.MASKS][1]
     data = _part(parts, Section.POSITIONS, rows)
@@ -203,6 +213,10 @@ def _decode_groups(
             channels[section] = _zeros(counts[section])
         elif section == Section.ATTRIBUTES:
             channels[section] = list(read_attributes(data, rows))
+        elif section == Section.PLANES:
+            channels[section] = [
+                channel.ravel() for plane in read_planes(data, meta.plane_shapes()) for channel in plane
+            ]
         else:
             channels[section] = decode_channels(data, counts[section])
     return channels

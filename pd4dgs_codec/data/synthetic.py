@@ -24,7 +24,10 @@ LENS = Lens(160, 120, 150.0, 150.0, 81.5, 58.75)  #: off centre on purpose: read
 SUPERSAMPLING = 2
 TRAIN_FRAMES = 60
 TEST_INSTANTS = range(2, TRAIN_FRAMES, 4)
-FPS = 30.0
+FPS = 12.0
+#: The camera goes back and forth over its arc so many times, as a hand does: were it to pass each place once, place
+#: and instant would be one, and a static scene whose look depends on the view would explain every motion.
+SWEEPS = 2.5
 SKY = np.array([0.71, 0.80, 0.90])
 TARGET = np.array([0.0, 0.1, 0.5])
 BOX = np.array([[-2.7, -2.7, -0.1], [2.7, 2.5, 2.6]], np.float32)
@@ -52,7 +55,8 @@ def _look(azimuth: float, radius: float, height: float) -> np.ndarray:
 
 
 def _train_viewmat(t: float) -> np.ndarray:
-    return _look(np.radians(80 * (t - 0.5)), 3.9 + 0.15 * np.cos(7 * t), 1.15 + 0.2 * np.sin(9 * t))
+    azimuth = 40 * np.sin(2 * np.pi * SWEEPS * t - np.pi / 2)
+    return _look(np.radians(azimuth), 3.9 + 0.15 * np.cos(7 * t), 1.15 + 0.2 * np.sin(9 * t))
 
 
 def fixed_viewmats() -> tuple[np.ndarray, np.ndarray]:

@@ -20,11 +20,12 @@ from strategies import LAYER_SETS, make_scene, scenes
 from pd4dgs_codec.attributes.quantise import MAX_SYMBOL, dequantise
 from pd4dgs_codec.bitstream import canonical
 from pd4dgs_codec.bitstream.container import read_chunk, read_preamble, scene_id_of, write_chunk, write_preamble
+from pd4dgs_codec.codec.attribute_section import read_attributes
 from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.encoder import encode
 from pd4dgs_codec.codec.info import hashes
 from pd4dgs_codec.codec.layer_meta import Section
-from pd4dgs_codec.codec.prediction import PLAIN, PREDICTED, read_attributes
+from pd4dgs_codec.codec.stages import PLAIN, STAGED
 from pd4dgs_codec.entropy.channels import encode_channels
 from pd4dgs_codec.entropy.lzma_mode import encode_channels_lzma
 from pd4dgs_codec.entropy.morton import morton_order
@@ -148,7 +149,7 @@ def predicted_file():
 
 def test_hashes_of_a_scene_whose_attributes_are_predicted(predicted_file):
     section, rows = attributes_section(take_apart(predicted_file)[1][0][2])
-    assert section[0] == PREDICTED and rows >= 400
+    assert section[0] == STAGED and rows >= 400
     reader = refdec.Reader(section[1:])
     assert any(refdec.read_terms(reader, c) for c in range(1, 38))
     assert any(refdec.read_split(reader)[:2] == (1, 1) for _ in range(10))

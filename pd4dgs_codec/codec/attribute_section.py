@@ -1,39 +1,59 @@
 """The attributes section of mode ans: 68 channels as they are, or with what one channel tells of another taken out.
 
-Byte 0 is the form. Form 0: the rest is one channels payload of the 68 channels. Form 1: a block of varints, then
-three channels payloads, the *stages*, each decoded before the next. All arithmetic is on integers.
+Byte 0 is the form. Form 0: the rest is one channels payload of the 68 channels. Form 1: a block of varints, then eight
+channels payloads, the *stages*, each decoded before the next. All arithmetic is on integers.
 
 *Linear prediction*, channels 1..37 (features, log-scalings): for channel c a varint m <= c, then m terms in ascending
 order of the channel j they refer to: a varint j - (previous j) - 1, starting from previous j = -1, and a zigzag weight
-w, |w| <= 2^15. Coded is the residual k_c - ((sum_j w_j k_j + 512) >> 10), the shift rounding down.
+w, |w| <= 2^15. Coded is the residual e_c = k_c - ((sum_j w_j k_j + 512) >> 10), the shift rounding down.
 
-*Classes*, channels 38..67 (offsets x, y, z of ten Gaussians): per Gaussian a varint f in 0..3: bit 0, y is split by x;
-bit 1, z is split by x and y. If f > 0 follow a zigzag centre of x and, if bit 1 is set, one of y, each |.| <= 2^24 - 1.
-The symbols of a split y go, in row order, to class min(|x - centre_x|, 4), those of a split z to class
-min(|x - centre_x| + |y - centre_y|, 6).
+*Activity*. The residuals of an anchor tend to be large together. Stages 0..4 hold the residuals of channels 0..37 in
+the runs that STAGES names, stage 5 the ten offsets x. For each of stages 1..5 the block has a varint C in 1..8: each
+channel of the stage is split into C classes of rows by how large the residuals of the earlier stages are (`activity`).
 
-The block ends with the varint lengths of stages 0 and 1. Stage 0 holds the channels that are not split, in order; stage
-1 the split y, each as its 5 classes in order; stage 2 the split z, each as its 7 classes.
+*Distance*, the offsets y and z of ten Gaussians: per Gaussian a varint f in 0..3: bit 0, y is split by x; bit 1, z is
+split by x and y. If f > 0 follow a zigzag centre of x and, if bit 1 is set, one of y, each |.| <= 2^24 - 1. The symbols
+of a split y go to class min(|x - centre_x|, 4), those of a split z to class min(|x - centre_x| + |y - centre_y|, 6).
+Stage 6 holds the y, stage 7 the z.
+
+The block ends with the varint lengths of stages 0..6. In a stage, channels come in ascending order, a split one as its
+classes in order, each with its rows in order.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from pd4dgs_codec.attributes.table import N_CHANNELS
+from pd4dgs_codec.codec.stages import (
+    PLAIN,
+    PRIOR_BITS,
+    STAGED,
+    activity_classes,
+    cheapest_class_count,
+    entropy_bits,
+    places_of,
+    put_stages,
+    read_class_count,
+    read_stages,
+    relative_magnitude,
+)
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
 from pd4dgs_codec.entropy.priors import K_MAX
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
 from pd4dgs_codec.errors import Malformed, UnsupportedFeature
 from pd4dgs_codec.scene import FEATURE_DIM, N_OFFSETS, SCALING_DIM
 
-PLAIN, PREDICTED = 0, 1
 N_PREDICTED = FEATURE_DIM + SCALING_DIM
 WEIGHT_SHIFT = 10
 MAX_WEIGHT = 1 << 15
+#: First channel of each stage of residuals, and the end of the last.
+STAGES = (0, 6, 12, 20, 29, N_PREDICTED)
+#: Channels of the ten offsets x.
+X_CHANNELS = tuple(range(N_PREDICTED, N_PREDICTED + 3 * N_OFFSETS, 3))
 Y_CLASSES, Z_CLASSES = 5, 7
 SPLIT_Y, SPLIT_Z = 1, 2
 
@@ -71,8 +91,9 @@ class Split:
         return np.minimum(np.abs(x - self.centre_x) + np.abs(y - self.centre_y), Z_CLASSES - 1)
 
 
-def _x_of(gaussian: int) -> int:
-    return N_PREDICTED + 3 * gaussian
+def _stage_channels(stage: int) -> tuple[int, ...]:
+    """The channels of stages 0..5."""
+    return tuple(range(STAGES[stage], STAGES[stage + 1])) if stage < len(STAGES) - 1 else X_CHANNELS
 
 
 # -- writing -----------------------------------------------------------------------------------------------------------
@@ -86,49 +107,63 @@ def write_attributes(attributes: np.ndarray, priors: str, effort: int) -> tuple[
     plain = encode_channels(list(attributes), priors=priors, effort=effort)
     data = bytes([PLAIN]) + plain.payload
     if priors == "best" and effort > 1 and attributes.shape[1] > 1:
-        predicted = _write_predicted(attributes.astype(np.int64), effort)
+        predicted = _write_staged(attributes.astype(np.int64), effort)
         data = min(data, predicted, key=len)
     return data, plain.rate_bits
 
 
-def _write_predicted(symbols: np.ndarray, effort: int) -> bytes:
+def _write_staged(symbols: np.ndarray, effort: int) -> bytes:
     terms = [_fit_terms(symbols, c) for c in range(1, N_PREDICTED)]
-    splits = [_fit_split(*symbols[_x_of(i) : _x_of(i) + 3]) for i in range(N_OFFSETS)]
-    out = bytearray([PREDICTED])
+    splits = [_fit_split(*symbols[x : x + 3]) for x in X_CHANNELS]
+    coded = symbols.copy()
+    for c, term in enumerate(terms, start=1):
+        coded[c] = symbols[c] - term.prediction(symbols)
+    counts = [
+        cheapest_class_count([(coded[list(_stage_channels(stage))], _activity(coded, stage))])
+        for stage in range(1, len(STAGES))
+    ]
+
+    out = bytearray([STAGED])
     for term in terms:
         put_varint(out, len(term.channels))
         for gap, weight in zip(np.diff(term.channels, prepend=-1) - 1, term.weights, strict=True):
             put_varint(out, int(gap))
             put_zigzag(out, int(weight))
+    for count in counts:
+        put_varint(out, count)
     for split in splits:
         put_varint(out, split.flags)
         if split.flags:
             put_zigzag(out, split.centre_x)
         if split.flags & SPLIT_Z:
             put_zigzag(out, split.centre_y)
-    coded = symbols.copy()
-    for c, term in enumerate(terms, start=1):
-        coded[c] = symbols[c] - term.prediction(symbols)
-    stages = [encode_channels(stage, effort=effort).payload for stage in _stages(coded, splits)]
-    put_varint(out, len(stages[0]))
-    put_varint(out, len(stages[1]))
-    return bytes(out) + b"".join(stages)
+    stages = [[channel[rows] for channel, rows in places] for places in _places(coded, counts, splits)]
+    put_stages(out, stages, effort)
+    return bytes(out)
 
 
-def _stages(coded: np.ndarray, splits: Sequence[Split]) -> tuple[list[np.ndarray], list[np.ndarray], list[np.ndarray]]:
-    whole, ys, zs = list(coded[:N_PREDICTED]), [], []
-    for i, split in enumerate(splits):
-        x, y, z = coded[_x_of(i) : _x_of(i) + 3]
-        whole.append(x)
-        if split.flags & SPLIT_Y:
-            ys += [y[split.y_classes(x) == k] for k in range(Y_CLASSES)]
-        else:
-            whole.append(y)
-        if split.flags & SPLIT_Z:
-            zs += [z[split.z_classes(x, y) == k] for k in range(Z_CLASSES)]
-        else:
-            whole.append(z)
-    return whole, ys, zs
+def _places(
+    coded: np.ndarray, counts: Sequence[int], splits: Sequence[Split]
+) -> Iterator[list[tuple[np.ndarray, np.ndarray]]]:
+    """Per stage, the (channel, rows) that it codes, in order. `coded` int64 [68, n] is read only as far as the stages
+    before reach."""
+    every = np.arange(coded.shape[1])
+    for stage, count in enumerate((1, *counts)):
+        parts = places_of(activity_classes(_activity(coded, stage), count), count) if count > 1 else [every]
+        yield [(coded[c], part) for c in _stage_channels(stage) for part in parts]
+    for axis, flag, count in ((1, SPLIT_Y, Y_CLASSES), (2, SPLIT_Z, Z_CLASSES)):
+        places = []
+        for x, split in zip(X_CHANNELS, splits, strict=True):
+            parts = [every]
+            if split.flags & flag:
+                classes = split.y_classes(coded[x]) if axis == 1 else split.z_classes(coded[x], coded[x + 1])
+                parts = places_of(classes, count)
+            places += [(coded[x + axis], part) for part in parts]
+        yield places
+
+
+def _activity(coded: np.ndarray, stage: int) -> np.ndarray:
+    return relative_magnitude(coded[: STAGES[stage]])
 
 
 def _fit_terms(symbols: np.ndarray, c: int) -> Terms:
@@ -152,7 +187,7 @@ def _fit_terms(symbols: np.ndarray, c: int) -> Terms:
     residual = symbols[c] - terms.prediction(symbols)
     if not terms.channels.size or np.abs(residual).max() > K_MAX:
         return nothing
-    return terms if _entropy(residual) + TERM_BITS * len(terms.channels) < _entropy(symbols[c]) else nothing
+    return terms if entropy_bits(residual) + TERM_BITS * len(terms.channels) < entropy_bits(symbols[c]) else nothing
 
 
 def _fit_split(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Split:
@@ -163,20 +198,14 @@ def _fit_split(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Split:
 
 
 def _gains(symbols: np.ndarray, classes: np.ndarray) -> bool:
-    """Whether a prior per class pays, at about 80 bits each."""
+    """Whether a prior per class pays."""
     parts = [symbols[classes == k] for k in range(int(classes.max()) + 1)]
-    return sum(_entropy(part) + 80 for part in parts) < _entropy(symbols) + 80
+    return sum(entropy_bits(part) + PRIOR_BITS for part in parts) < entropy_bits(symbols) + PRIOR_BITS
 
 
 def _mode(symbols: np.ndarray) -> int:
     values, counts = np.unique(symbols, return_counts=True)
     return int(values[counts.argmax()])
-
-
-def _entropy(symbols: np.ndarray) -> float:
-    """Empirical order-0 entropy of all symbols, bits."""
-    counts = np.unique(symbols, return_counts=True)[1]
-    return float(counts @ np.log2(symbols.size / counts)) if symbols.size else 0.0
 
 
 # -- reading -----------------------------------------------------------------------------------------------------------
@@ -188,38 +217,15 @@ def read_attributes(data: bytes, rows: int) -> np.ndarray:
     form = reader.byte("the form of the attributes")
     if form == PLAIN:
         return np.stack(decode_channels(reader.rest(), [rows] * N_CHANNELS))
-    if form != PREDICTED:
-        raise UnsupportedFeature(f"form {form} of the attributes, expected {PLAIN} or {PREDICTED}")
+    if form != STAGED:
+        raise UnsupportedFeature(f"form {form} of the attributes, expected {PLAIN} or {STAGED}")
     terms = [_read_terms(reader, c) for c in range(1, N_PREDICTED)]
+    counts = [read_class_count(reader, stage) for stage in range(1, len(STAGES))]
     splits = [_read_split(reader) for _ in range(N_OFFSETS)]
-    lengths = [reader.varint(len(data), f"the length of stage {stage}") for stage in (0, 1)]
-    rest = reader.rest()
-    if sum(lengths) > len(rest):
-        raise Malformed(f"stages of {lengths} bytes in the {len(rest)} that are left")
-    stages = rest[: lengths[0]], rest[lengths[0] : sum(lengths)], rest[sum(lengths) :]
-
-    whole = 3 * N_OFFSETS - sum(split.flags.bit_count() for split in splits)
     symbols = np.zeros((N_CHANNELS, rows), np.int64)
-    unsplit = iter(decode_channels(stages[0], [rows] * (N_PREDICTED + whole)))
-    for c in range(N_PREDICTED):
-        symbols[c] = next(unsplit)
-    for i, split in enumerate(splits):
-        symbols[_x_of(i)] = next(unsplit)
-        for axis, flag in ((1, SPLIT_Y), (2, SPLIT_Z)):
-            if not split.flags & flag:
-                symbols[_x_of(i) + axis] = next(unsplit)
+    read_stages(reader, len(STAGES) + 2, _places(symbols, counts, splits))
     for c, term in enumerate(terms, start=1):
         symbols[c] += term.prediction(symbols)
-    split_y = [
-        (_x_of(i) + 1, s.y_classes(symbols[_x_of(i)]), Y_CLASSES) for i, s in enumerate(splits) if s.flags & SPLIT_Y
-    ]
-    _read_classes(stages[1], symbols, split_y)
-    split_z = [
-        (_x_of(i) + 2, s.z_classes(*symbols[_x_of(i) : _x_of(i) + 2]), Z_CLASSES)
-        for i, s in enumerate(splits)
-        if s.flags & SPLIT_Z
-    ]
-    _read_classes(stages[2], symbols, split_z)
     if symbols.size and max(int(symbols.max()), -int(symbols.min())) > K_MAX:
         raise Malformed(f"a predicted attribute over {K_MAX} in magnitude")
     return symbols.astype(np.int32)
@@ -241,10 +247,3 @@ def _read_split(reader: ByteReader) -> Split:
     centre_x = reader.zigzag(K_MAX, "the centre of x") if flags else 0
     centre_y = reader.zigzag(K_MAX, "the centre of y") if flags & SPLIT_Z else 0
     return Split(flags, centre_x, centre_y)
-
-
-def _read_classes(data: memoryview, symbols: np.ndarray, channels: Sequence[tuple[int, np.ndarray, int]]) -> None:
-    """Decodes a stage's classes into their rows of `symbols`; channels: (channel, class per row, number of classes)."""
-    places = [(c, np.flatnonzero(classes == k)) for c, classes, count in channels for k in range(count)]
-    for (c, rows), values in zip(places, decode_channels(data, [len(rows) for _, rows in places]), strict=True):
-        symbols[c, rows] = values

@@ -6,7 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pd4dgs_codec.attributes.table import N_CHANNELS
-from pd4dgs_codec.codec.prediction import PLAIN, PREDICTED, read_attributes, write_attributes
+from pd4dgs_codec.codec.attribute_section import read_attributes, write_attributes
+from pd4dgs_codec.codec.stages import PLAIN, STAGED
 from pd4dgs_codec.entropy.channels import encode_channels
 from pd4dgs_codec.errors import DecodeError
 
@@ -23,7 +24,7 @@ def correlated(rows: int, seed: int = 0) -> np.ndarray:
 def test_dependent_channels_are_predicted_and_come_back():
     attributes = correlated(1500)
     data, rate = write_attributes(attributes, "best", 5)
-    assert data[0] == PREDICTED
+    assert data[0] == STAGED
     plain = encode_channels(list(attributes))
     assert len(data) < 0.75 * len(plain.payload)
     assert rate == plain.rate_bits
@@ -55,7 +56,7 @@ def test_any_symbols_come_back(rows, seed, scale):
 def test_damage_raises_only_decode_errors():
     rows = 400
     data, _ = write_attributes(correlated(rows), "best", 2)
-    assert data[0] == PREDICTED
+    assert data[0] == STAGED
     rng = np.random.default_rng(2)
     for cut in rng.integers(0, len(data), 60):
         with pytest.raises(DecodeError):

@@ -1,0 +1,110 @@
+"""The planes section of mode ans: the residuals of all plane channels as they are, or split by their activity.
+
+Byte 0 is the form. Form 0: the rest is one channels payload of all channels, plane by plane. Form 1: stages. Stage 0
+holds channels 0 and 1 of every plane, stage s >= 1 channels 2^s .. 2^(s+1) - 1, as far as planes have them. A block of
+one varint C in 1..8 per stage from 1 on comes first: in that stage each channel is split into C classes of cells by the
+relative magnitudes (`stages.relative_magnitude`) of the plane's earlier channels, summed over the 3 x 3 cells around,
+the border repeated. In a stage, planes come in order, then channels, then classes, each with its cells row by row.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from pd4dgs_codec.codec.stages import (
+    PLAIN,
+    STAGED,
+    activity_classes,
+    cheapest_class_count,
+    places_of,
+    put_stages,
+    read_class_count,
+    read_stages,
+    relative_magnitude,
+)
+from pd4dgs_codec.entropy.channels import CodedChannels, decode_channels, encode_channels
+from pd4dgs_codec.entropy.varint import ByteReader, put_varint
+from pd4dgs_codec.errors import UnsupportedFeature
+
+Shape = tuple[int, int, int]  #: channels, rows, columns
+
+
+def write_planes(residuals: Sequence[np.ndarray], priors: str, effort: int) -> tuple[bytes, float]:
+    """(section bytes, sum of R(a) over all channels) of residuals int32 [C, H, W] per plane; the smaller of both forms.
+
+    With priors "gauss", the model of R(a), the form is plain.
+    """
+    plain: CodedChannels = encode_channels(
+        [channel.ravel() for plane in residuals for channel in plane], priors=priors, effort=effort
+    )
+    data = bytes([PLAIN]) + plain.payload
+    if priors == "best" and effort > 1:
+        data = min(data, _write_staged(residuals, effort), key=len)
+    return data, plain.rate_bits
+
+
+def read_planes(data: bytes, shapes: Sequence[Shape]) -> list[np.ndarray]:
+    """Residuals int32 [C, H, W] per plane; the inverse of write_planes. shapes were checked against the limits."""
+    reader = ByteReader(data)
+    form = reader.byte("the form of the planes")
+    if form == PLAIN:
+        channels = iter(decode_channels(reader.rest(), [h * w for c, h, w in shapes for _ in range(c)]))
+        return [np.stack([next(channels) for _ in range(c)]).reshape(c, h, w) for c, h, w in shapes]
+    if form != STAGED:
+        raise UnsupportedFeature(f"form {form} of the planes, expected {PLAIN} or {STAGED}")
+    number = _stage_count(shapes)
+    counts = [read_class_count(reader, stage) for stage in range(1, number)]
+    planes = [np.zeros((c, h * w), np.int64) for c, h, w in shapes]
+    read_stages(reader, number, _places(planes, shapes, counts))
+    return [plane.astype(np.int32).reshape(shape) for plane, shape in zip(planes, shapes, strict=True)]
+
+
+def _write_staged(residuals: Sequence[np.ndarray], effort: int) -> bytes:
+    shapes: list[Shape] = [plane.shape for plane in residuals]  # type: ignore[misc]
+    planes = [plane.reshape(len(plane), -1).astype(np.int64) for plane in residuals]
+    counts = []
+    for stage in range(1, _stage_count(shapes)):
+        first, end = 1 << stage, 2 << stage
+        groups = [
+            (plane[first:end], _activity(plane[:first], shape))
+            for plane, shape in zip(planes, shapes, strict=True)
+            if len(plane) > first
+        ]
+        counts.append(cheapest_class_count(groups))
+    out = bytearray([STAGED])
+    for count in counts:
+        put_varint(out, count)
+    put_stages(out, [[channel[at] for channel, at in places] for places in _places(planes, shapes, counts)], effort)
+    return bytes(out)
+
+
+def _stage_count(shapes: Sequence[Shape]) -> int:
+    return max(1, (max(c for c, _, _ in shapes) - 1).bit_length())
+
+
+def _places(
+    planes: Sequence[np.ndarray], shapes: Sequence[Shape], counts: Sequence[int]
+) -> Iterator[list[tuple[np.ndarray, np.ndarray]]]:
+    """Per stage, the (channel, cells) that it codes, in order. `planes` int64 [C, H * W] are read only as far as the
+    stages before reach."""
+    for stage, count in enumerate((1, *counts)):
+        first, end = (1 << stage if stage else 0), 2 << stage
+        places = []
+        for plane, shape in zip(planes, shapes, strict=True):
+            if len(plane) <= first:
+                continue
+            parts = [np.arange(plane.shape[1])]
+            if count > 1:
+                parts = places_of(activity_classes(_activity(plane[:first], shape), count), count)
+            places += [(channel, part) for channel in plane[first:end] for part in parts]
+        yield places
+
+
+def _activity(channels: np.ndarray, shape: Shape) -> np.ndarray:
+    """int64 [H * W]: relative magnitudes of channels int64 [m, H * W], summed over 3 x 3 cells, the border repeated."""
+    _, height, width = shape
+    padded = np.pad(relative_magnitude(channels).reshape(height, width), 1, mode="edge")
+    columns = padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]
+    return (columns[:-2] + columns[1:-1] + columns[2:]).ravel()

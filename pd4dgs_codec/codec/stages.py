@@ -1,0 +1,99 @@
+"""Stages: channels payloads decoded one after another, so that a later one may be split by what an earlier one held.
+
+What the sections of attributes and of planes share. Residuals that belong to one place (an anchor, a plane's cell)
+tend to be large together; a channel is split into classes of places by the *activity* of the channels before it, and
+each class has a prior of its own. All arithmetic is on integers.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from itertools import accumulate
+
+import numpy as np
+
+from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
+from pd4dgs_codec.entropy.varint import ByteReader, put_varint
+from pd4dgs_codec.errors import Malformed
+
+#: The two forms of a section: one payload of all its channels as they are, or a block and stages.
+PLAIN, STAGED = 0, 1
+MAX_CLASSES = 8
+#: Encoder: numbers of classes to try, and about what each further prior costs.
+CLASS_COUNTS = (1, 3, 5, 8)
+PRIOR_BITS = 40
+
+
+def relative_magnitude(residuals: np.ndarray) -> np.ndarray:
+    """int64 [n]: sum over channels of the magnitudes of residuals int64 [m, n] relative to their channel's mean, in
+    units of 1/256. Below 2^8 m n."""
+    magnitude = np.abs(residuals)
+    places = magnitude.shape[1]
+    return (magnitude * (places << 8) // (magnitude.sum(axis=1, keepdims=True) + 1)).sum(axis=0)
+
+
+def activity_classes(activity: np.ndarray, count: int) -> np.ndarray:
+    """int64 [n] in 0..count-1: places by their activity int64 [n], in classes of about equal size."""
+    bounds = np.sort(activity)[[i * len(activity) // count for i in range(1, count)]]
+    return np.searchsorted(bounds, activity, side="right")
+
+
+def places_of(classes: np.ndarray, count: int) -> list[np.ndarray]:
+    """The places of each class, ascending."""
+    return [np.flatnonzero(classes == k) for k in range(count)]
+
+
+def cheapest_class_count(groups: Sequence[tuple[np.ndarray, np.ndarray]]) -> int:
+    """Encoder: how many classes cost the (residuals int64 [m, n], activity int64 [n]) of a stage least."""
+    costs = []
+    for count in CLASS_COUNTS:
+        bits = 0.0
+        for residuals, activity in groups:
+            for places in places_of(activity_classes(activity, count), count):
+                bits += sum(entropy_bits(channel[places]) + PRIOR_BITS for channel in residuals)
+        costs.append((bits, count))
+    return min(costs)[1]
+
+
+def entropy_bits(symbols: np.ndarray) -> float:
+    """Empirical order-0 entropy of all symbols together."""
+    if not symbols.size:
+        return 0.0
+    low, high = int(symbols.min()), int(symbols.max())
+    if high - low > 4 * symbols.size + 1024:
+        counts = np.unique(symbols, return_counts=True)[1]
+    else:
+        counts = np.bincount(symbols - low)
+        counts = counts[counts > 0]
+    return float(counts @ np.log2(symbols.size / counts))
+
+
+def put_stages(out: bytearray, stages: Sequence[Sequence[np.ndarray]], effort: int) -> None:
+    """Appends the lengths of all stages but the last, then their payloads."""
+    payloads = [encode_channels(stage, effort=effort).payload for stage in stages]
+    for payload in payloads[:-1]:
+        put_varint(out, len(payload))
+    out += b"".join(payloads)
+
+
+def read_class_count(reader: ByteReader, stage: int) -> int:
+    """A number of classes, 1..MAX_CLASSES."""
+    count = reader.varint(MAX_CLASSES, f"the number of classes of stage {stage}")
+    if not count:
+        raise Malformed(f"stage {stage} has 0 classes, expected 1..{MAX_CLASSES}")
+    return count
+
+
+def read_stages(reader: ByteReader, number: int, places: Iterator[list[tuple[np.ndarray, np.ndarray]]]) -> None:
+    """Decodes `number` stages. `places` yields per stage, after those before are decoded, its channels: (int64 [n] to
+    decode into, the places int64 [k] there)."""
+    lengths = [reader.varint(reader.remaining, f"the length of stage {stage}") for stage in range(number - 1)]
+    rest = reader.rest()
+    if sum(lengths) > len(rest):
+        raise Malformed(f"stages of {sum(lengths)} bytes and more in the {len(rest)} that are left")
+    bounds = [0, *accumulate(lengths), len(rest)]
+    for stage, targets in enumerate(places):
+        payload = rest[bounds[stage] : bounds[stage + 1]]
+        decoded = decode_channels(payload, [len(at) for _, at in targets])
+        for (channel, at), values in zip(targets, decoded, strict=True):
+            channel[at] = values
