@@ -27,11 +27,12 @@ class DeformationField(nn.Module):
 
     @staticmethod
     def fresh(
-        config: DeformationConfig, box: np.ndarray, head_widths: dict[str, int], plane_step: float | None
+        config: DeformationConfig, box: np.ndarray, head_widths: dict[str, int], spacing: int | None, plane_step: float
     ) -> DeformationField:
-        """A new field with the heads that `config` names, `head_widths` giving each one's output width."""
+        """A new field with the heads that `config` names, `head_widths` giving each one's output width. spacing: of the
+        planes' start values, see HexPlane."""
         resolution = (config.resolution,) * 3 + (config.time_resolution,)
-        planes = HexPlane(box, resolution, config.channels, config.multires, step=plane_step)
+        planes = HexPlane(box, resolution, config.channels, config.multires, spacing=spacing, step=plane_step)
         trunk = MLP((config.channels * len(config.multires), config.width, config.width))
         return DeformationField(
             planes, trunk, {name: MLP((config.width, head_widths[name]), zero_last=True) for name in config.heads}

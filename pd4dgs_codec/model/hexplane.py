@@ -91,16 +91,36 @@ def sample_reference(grid: Tensor, layout: PlaneLayout, box: Tensor, points: Ten
     return torch.cat(features, 1)
 
 
+#: Between these a spatial plane's start values are drawn.
+START = (0.5, 1.5)
+
+
+def _start(shape: Sequence[int], spacing: int | None, step: float, generator: torch.Generator | None) -> Tensor:
+    """Start values [H, W, C] of a spatial plane, see HexPlane."""
+    height, width, channels = shape
+    if spacing is None:
+        draw = torch.empty(channels).uniform_(*START, generator=generator)
+        dither = torch.empty(height, width, channels).uniform_(-0.45, 0.45, generator=generator)
+        return (torch.round(draw / step) + dither) * step
+    draws = torch.empty(1, channels, -(-height // spacing), -(-width // spacing)).uniform_(*START, generator=generator)
+    field = F.interpolate(draws, size=(height, width), mode="bilinear", align_corners=True)
+    return field[0].permute(1, 2, 0)
+
+
 class HexPlane(nn.Module):
     """A learnable HexPlane.
 
     box: [2, 3] lower and upper corner, scene units; points are normalised by it and clamped to it. On an axis where
     the corners are equal, points up to it fall on the first cell and those above it on the last.
     resolution: cells along x, y, z, t of the base scale, each >= 1. multires: factor on x, y, z per scale.
-    The parameter `grid` is [cells, C]; `layout` says which cells are which plane. Start values: time planes 1, spatial
-    planes U(0.1, 0.5) in each cell. With the quantisation step `step`, one draw per channel instead, a multiple of it,
-    dithered within the rounding interval of each cell: cells that no anchor reaches keep their start value, and noise
-    there would cost bits; dither is free there, and elsewhere it keeps the rounding errors of neighbours independent.
+    The parameter `grid` is [cells, C]; `layout` says which cells are which plane.
+
+    Start values: time planes 1, spatial planes random in START. Their products are then of the size of 1, and so are
+    the steps that the optimiser takes in them; from 0.1..0.5, as public code starts, features of some 0.03 told places
+    and times apart so slowly that some runs never began to move. Draws are independent every `spacing` cells and
+    linear in between, so that cells that no anchor reaches cost few bits. With spacing None a plane has one draw per
+    channel, a multiple of the quantisation step `step`, dithered within the rounding interval of each cell: dither is
+    free where no anchor comes, and elsewhere keeps the rounding errors of neighbours independent.
     """
 
     def __init__(
@@ -110,7 +130,8 @@ class HexPlane(nn.Module):
         channels: int = 16,
         multires: Sequence[int] = (1, 2),
         generator: torch.Generator | None = None,
-        step: float | None = None,
+        spacing: int | None = 1,
+        step: float = 1.0,
     ):
         super().__init__()
         sizes = [*resolution, channels, *multires]
@@ -122,16 +143,10 @@ class HexPlane(nn.Module):
         x, y, z, t = (int(r) for r in resolution)
         self._setup(box, [(x * m, y * m, z * m, t) for m in map(int, multires)], int(channels))
         with torch.no_grad():
-            spatial = self.grid[: self.layout.n_spatial]
-            if step is None:
-                spatial.uniform_(0.1, 0.5, generator=generator)
-                return
             for scale in self.layout.views(self.grid):
                 for name, _, b in PLANES:
                     if b != TIME_AXIS:
-                        start = torch.empty(channels).uniform_(0.1, 0.5, generator=generator)
-                        scale[name].copy_(torch.round(start / step) * step)
-            spatial += step * torch.empty_like(spatial).uniform_(-0.45, 0.45, generator=generator)
+                        scale[name].copy_(_start(scale[name].shape, spacing, step, generator))
 
     def _setup(self, box, resolutions: Sequence[Sequence[int]], channels: int) -> None:
         corners = torch.as_tensor(np.array(box, np.float32))

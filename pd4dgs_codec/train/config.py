@@ -22,7 +22,7 @@ class LearningRates:
     opacity: tuple[float, float] = (2e-3, 1e-4)
     covariance: tuple[float, float] = (4e-3, 4e-4)
     color: tuple[float, float] = (8e-3, 2e-4)
-    planes: tuple[float, float] = (1e-2, 5e-4)
+    planes: tuple[float, float] = (3e-2, 1e-3)
     deformation: tuple[float, float] = (1.5e-3, 7e-5)
 
 

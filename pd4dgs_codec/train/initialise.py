@@ -31,11 +31,11 @@ def fresh_model(config: ModelConfig, dataset: Dataset, steps: Steps, seed: int) 
     n = len(anchor_q)
     spacing = nearest_distances((anchor_q.double() * info.voxel_size).float()).clamp(min=info.voxel_size)
     fields = []
-    for field, widths, step in (
-        (config.global_deformation, GLOBAL_HEADS, None),  # few cells, all reached: noise tells places apart at once
-        (config.local_deformation, LOCAL_HEADS, steps.planes_local),
+    for field, widths, start_spacing, step in (
+        (config.global_deformation, GLOBAL_HEADS, 4, steps.planes_global),  # few cells: places differ from the start
+        (config.local_deformation, LOCAL_HEADS, None, steps.planes_local),
     ):
-        fields.append(None if field is None else DeformationField.fresh(field, info.box, widths, step))
+        fields.append(None if field is None else DeformationField.fresh(field, info.box, widths, start_spacing, step))
     mask_logits = torch.zeros(n, 3)
     mask_logits[:, 0] = MASK_START
     return Model(

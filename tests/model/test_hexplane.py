@@ -87,11 +87,24 @@ def test_plane_arrays_round_trip():
     assert torch.equal(other(points, 0.2), plane(points, 0.2))
 
 
-def test_start_values():
-    plane = HexPlane(BOX, (4, 4, 4, 3), 8, generator=torch.Generator().manual_seed(3))
+@pytest.mark.parametrize("spacing", [1, 3, None])
+def test_start_values(spacing):
+    step, generator = 1 / 16, torch.Generator().manual_seed(3)
+    plane = HexPlane(BOX, (5, 4, 6, 3), 8, generator=generator, spacing=spacing, step=step)
     for scale in plane.plane_arrays():
         for name, array in scale.items():
-            assert (array == 1).all() if "t" in name else 0.1 <= array.min() < array.max() <= 0.5
+            if "t" in name:
+                assert (array == 1).all()
+                continue
+            assert 0.5 - step / 2 <= array.min() < array.max() <= 1.5 + step / 2
+            whole = np.round(array / step)
+            if spacing is None:  # cells that nothing reaches cost no bits, and round independently
+                assert (whole == whole[:, :1, :1]).all() and len(np.unique(array)) > 0.9 * array.size
+            else:
+                assert len(np.unique(whole)) > 8
+            if spacing == 3:  # linear between draws, up to the ends
+                ratio = np.abs(np.diff(array, 2, axis=1)).mean() / np.abs(np.diff(array, axis=1)).mean()
+                assert ratio < 0.6
 
 
 def test_one_time_per_point_and_odd_channels_use_the_reference():
