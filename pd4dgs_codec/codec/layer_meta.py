@@ -125,14 +125,19 @@ def unpack_meta(data: bytes, kind: LayerKind, rows_before: int, raw: bool) -> La
     return meta
 
 
+def declared_symbols(meta: LayerMeta, kind: LayerKind, rows_before: int) -> int:
+    """Symbols (or float32 values) that the parameters say the layer has, voxel indices and masks included."""
+    cells = sum(math.prod(shape) for shape in meta.plane_shapes())
+    weights = sum(math.prod(shape) for shape in meta.weight_shapes(kind))
+    return rows_before + meta.rows * (N_CHANNELS + 4) + cells + weights
+
+
 def check_symbol_count(meta: LayerMeta, kind: LayerKind, rows_before: int, payload_bytes: int) -> None:
     """LimitExceeded if the layer declares more symbols than its payload could reasonably hold."""
     cells = sum(math.prod(shape) for shape in meta.plane_shapes())
     if cells > MAX_PLANE_CELLS:
         raise LimitExceeded(f"layer {kind.layer}: planes of {cells} cells, limit {MAX_PLANE_CELLS}")
-    weights = sum(math.prod(shape) for shape in meta.weight_shapes(kind))
-    symbols = rows_before + meta.rows * (N_CHANNELS + 4) + cells + weights
-    limit = FREE_SYMBOLS + SYMBOLS_PER_BYTE * payload_bytes
+    symbols, limit = declared_symbols(meta, kind, rows_before), FREE_SYMBOLS + SYMBOLS_PER_BYTE * payload_bytes
     if symbols > limit:
         raise LimitExceeded(f"layer {kind.layer}: {symbols} symbols in {payload_bytes} bytes, limit {limit}")
 
