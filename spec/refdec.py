@@ -291,7 +291,7 @@ class Layer:
 def read_layer(payload, number, rows_before, header):
     layer = Layer(number, rows_before, header)
     reader = Reader(payload)
-    parameters = reader.take(reader.number("<I"))
+    parameters = reader.take(limited(reader.number("<I"), 4096, "the parameters' length"))
     read_parameters(layer, unpack(parameters))
     need(sum(layer.sections.values()) == reader.left, "the sections do not fill the payload")
     check_sizes(layer, len(payload))

@@ -223,6 +223,14 @@ def test_a_few_bytes_cannot_ask_for_gigabytes():
         assert time.perf_counter() - start < 2
 
 
+def test_parameters_are_small():
+    """msgpack takes up to 130 times its bytes in memory."""
+    header, chunks = take_apart(FULL)
+    changed = [(0, 0, with_meta(chunks[0][2], lambda m: {**m, 64: [[]] * 4000})), *chunks[1:]]
+    with pytest.raises(LimitExceeded, match="parameters of 4"):
+        decode(put_together(header, changed))
+
+
 def test_values_that_overflow_float32_are_malformed():
     header, chunks = take_apart(FULL)
     with pytest.raises(Malformed, match="not finite"):
