@@ -23,6 +23,7 @@ K = (1 << 24) - 1  # clause 14: coded symbols
 MAX_SYMBOL = 1 << 23  # clause 14: symbols of attributes, plane samples and weights
 MAX_VOXEL = 1 << 20
 MAX_COUNT = 1 << 26
+MAX_ENTRIES = 1 << 21
 TOTAL = 1 << 24
 PLANES = (("xy", 0, 1), ("xz", 0, 2), ("xt", 0, 3), ("yz", 1, 2), ("yt", 1, 3), ("zt", 2, 3))
 ATTRIBUTES = (("feature", 32), ("scaling_log", 6), ("offset", 30))
@@ -620,7 +621,7 @@ def read_exceptions(reader, count, prior):
 # 8.1 Parameter block: "For each non-empty channel in order: a varint token, at most 2·(2^26 + 8); the parameters of a
 # new prior (8.2), if any; its exceptions (8.3), if bit 0 of the token is set."
 def decode_channels(data, counts):
-    reader, defined, heads = Reader(data), [], []
+    reader, defined, heads, entries = Reader(data), [], [], 0
     for count in counts:
         if count == 0:
             continue
@@ -628,6 +629,7 @@ def decode_channels(data, counts):
         token = reader.varint(2 * (MAX_COUNT + 8))
         if token >> 1 < 8:
             defined.append(read_prior(reader, token >> 1))
+            entries = limited(entries + defined[-1].n, MAX_ENTRIES, "the entries of a section's tables")
         back = max(token >> 1, 8) - 8
         need(back < len(defined), "a channel reuses a prior before the first")
         prior = defined[-1 - back]

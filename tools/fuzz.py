@@ -24,8 +24,8 @@ import subprocess
 import sys
 import time
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from dataclasses import asdict, dataclass, field
+from collections.abc import Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -94,7 +94,8 @@ class Figures:
     def json(self) -> dict[str, Any]:
         """The figures as plain values, with the shares worked out."""
         past = {name: self.past(k) / max(self.inputs, 1) for k, name in enumerate(DEPTHS) if k}
-        return {**asdict(self), "past": past, "inputs_per_second": self.inputs / max(self.seconds, 1e-9)}
+        rate = self.inputs / max(self.seconds, 1e-9)
+        return {**vars(self), "past": past, "inputs_per_second": rate}
 
 
 # -- one process -------------------------------------------------------------------------------------------------------

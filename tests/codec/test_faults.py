@@ -226,7 +226,7 @@ def test_a_few_bytes_cannot_ask_for_gigabytes():
 def test_parameters_are_small():
     """msgpack takes up to 130 times its bytes in memory."""
     header, chunks = take_apart(FULL)
-    changed = [(0, 0, with_meta(chunks[0][2], lambda m: {**m, 64: [[]] * 4000})), *chunks[1:]]
+    changed = [(0, 0, with_meta(chunks[0][2], lambda m: {**m, 64: [[]] * 4096})), *chunks[1:]]
     with pytest.raises(LimitExceeded, match="parameters of 4"):
         decode(put_together(header, changed))
 

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
-from pd4dgs_codec.entropy.priors import CONST, GAUSS, GMM2, HIST, K_MAX
+from pd4dgs_codec.entropy.priors import CONST, GAUSS, GMM2, HIST, K_MAX, MAX_ENTRIES, MAX_WINDOW
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
 from pd4dgs_codec.errors import DecodeError, EncodeError, LimitExceeded, Malformed, UnsupportedFeature
 
@@ -236,6 +236,24 @@ def test_bad_parameters_are_named(payload, error):
 def test_counts_are_bounded(count):
     with pytest.raises(LimitExceeded):
         decode_channels(b"\0\0", [count])
+
+
+def test_tables_of_a_section_are_bounded():
+    """Eight bytes define a table of 128 KiB: 86 kB of them took 1.6 GB."""
+    wide = payload_of(2, 0, MAX_WINDOW - 2, 0, 1280)
+    most = MAX_ENTRIES // MAX_WINDOW
+    assert len(decode_channels(wide * most, [1] * most)) == most
+    with pytest.raises(LimitExceeded, match="entries"):
+        decode_channels(wide * (most + 1), [1] * (most + 1))
+
+
+def test_wide_channels_share_a_table_rather_than_pass_the_limit():
+    rng = np.random.default_rng(6)
+    centres = rng.integers(-(2**23), 2**23, MAX_ENTRIES // MAX_WINDOW + 20)
+    narrow = np.array([0, 1, 1, 2, 5], np.int32)
+    channels = [narrow, *((c + rng.integers(-8000, 8000, 40)).astype(np.int32) for c in centres)]
+    coded = encode_channels(channels, effort=1)
+    assert_same(decode_channels(coded.payload, [len(c) for c in channels]), channels)
 
 
 @given(st.integers(-(2**31), 2**31), st.integers(0, 2**33))

@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fuzzing.files import Chunk, Parts, Seed, take_apart, try_put_together
-from pd4dgs_codec.bitstream.container import write_preamble
+from pd4dgs_codec.bitstream.container import SIGNATURE, write_preamble
 from pd4dgs_codec.entropy.varint import put_varint
 
 _POWERS = (7, 8, 12, 14, 15, 16, 20, 21, 22, 23, 24, 26, 28, 31, 32)
@@ -39,8 +39,9 @@ Change = Callable[[random.Random, bytearray, bytes], None]
 
 
 def _place(rng: random.Random, data: bytearray) -> int:
-    """An offset, in half of the cases near the beginning, where parameters lie."""
-    return rng.randrange(min(len(data), 40) if rng.random() < 0.5 else len(data)) if data else 0
+    """An offset. In a section, half of them are near the beginning, where parameters lie."""
+    near = len(data) if data[:4] == SIGNATURE[:4] or rng.random() < 0.5 else min(len(data), 40)
+    return rng.randrange(near) if near else 0
 
 
 def flip(rng: random.Random, data: bytearray, other: bytes) -> None:
