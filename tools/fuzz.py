@@ -22,7 +22,9 @@ import re
 import resource
 import subprocess
 import sys
+import tempfile
 import time
+import warnings
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -32,7 +34,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tools"), str(ROOT / "tests")]
 
-from fuzzing.check import DECODED, Finding, check_memory, examine  # noqa: E402
+from fuzzing.check import Finding, check_memory, examine  # noqa: E402
 from fuzzing.files import Seed, built_seeds, given_seeds, known_prefixes  # noqa: E402
 from fuzzing.mutate import Case, make_case  # noqa: E402
 
@@ -43,7 +45,7 @@ SAMPLE = 25  #: every so many inputs the peak memory is traced, which takes twic
 STUCK_SECONDS = 20.0  #: of wall time on one input, then its process is ended
 SPARE_MEMORY = 4 << 30  #: address space a child may take beyond what it begins with
 SEEN_MEMORY = 24 << 10  #: KiB: an input that grows the process by so much is traced as well
-DEPTHS = ("inputs", "header's checksum", "first chunk's", "second chunk's", "third chunk's")
+CHECKSUMS = ("header's checksum", "first chunk's", "second chunk's", "third chunk's")
 
 
 @dataclass
@@ -71,13 +73,14 @@ class Figures:
         self.traced += other.traced
         self.seconds += other.seconds
 
-    def past(self, checksums: int) -> int:
-        """Inputs in which at least so many checksums hold."""
-        return sum(count for depth, count in self.checksums.items() if depth >= checksums)
+    def shares(self) -> dict[str, float]:
+        """Per checksum the share of the inputs in which it holds, and all before it."""
+        past = [sum(n for depth, n in self.checksums.items() if depth >= k) for k in range(1, 1 + len(CHECKSUMS))]
+        return {name: count / max(self.inputs, 1) for name, count in zip(CHECKSUMS, past, strict=True)}
 
     def markdown(self) -> str:
         """The figures as tables."""
-        share = [f"| past the {name} | {self.past(k) / max(self.inputs, 1):.1%} |" for k, name in enumerate(DEPTHS) if k]
+        share = [f"| past the {name} | {share:.1%} |" for name, share in self.shares().items()]
         outcomes = [f"| ends in {name} | {count:,} |" for name, count in self.outcomes.most_common()]
         rows = [
             f"| inputs | {self.inputs:,} |",
@@ -93,9 +96,8 @@ class Figures:
 
     def json(self) -> dict[str, Any]:
         """The figures as plain values, with the shares worked out."""
-        past = {name: self.past(k) / max(self.inputs, 1) for k, name in enumerate(DEPTHS) if k}
         rate = self.inputs / max(self.seconds, 1e-9)
-        return {**vars(self), "past": past, "inputs_per_second": rate}
+        return {**vars(self), "past": self.shares(), "inputs_per_second": rate}
 
 
 # -- one process -------------------------------------------------------------------------------------------------------
@@ -242,40 +244,36 @@ def save_findings(seeds: Sequence[Seed], run: int, figures: Figures, folder: Pat
 # -- coverage ----------------------------------------------------------------------------------------------------------
 
 
-def reach(run: int, inputs: int, paths: Sequence[Path]) -> dict[str, float]:
-    """Per package the share of lines and branches of the decoder and encoder that the inputs reach, in per cent.
-
-    Runs in a process of its own, so that imports count and seed files, which the encoder writes, do not.
+def reach(seeds: Sequence[Seed], run: int, inputs: int) -> dict[str, Any]:
+    """What the inputs reach of the functions they enter: per package the lines and branches, in per cent, and per
+    function the lines that no input reached. Functions never entered are the encoder's.
     """
-    code = (
-        "import sys, json, coverage; sys.argv = ['fuzz']; sys.path[:0] = {paths!r}\n"
-        "cov = coverage.Coverage(branch=True, data_file=None, source={source!r}); cov.start()\n"
-        "import fuzz; from pathlib import Path; cov.stop()\n"
-        "seeds = fuzz.all_seeds([Path(p) for p in {given!r}]); cov.start()\n"
-        "fuzz.run_inputs(seeds, {run}, 0, {inputs}); cov.stop()\n"
-        "import io; out = {{}}\n"
-        "for name in {packages!r}:\n"
-        "    out[name] = cov.report(include=['*/pd4dgs_codec/' + name + '/*'], file=io.StringIO())\n"
-        "files = ['*/pd4dgs_codec/' + f for f in {decoder!r}]\n"
-        "out['decoder'] = cov.report(include=files, file=io.StringIO())\n"
-        "print(json.dumps(out))\n"
-    ).format(
-        paths=sys.path[:3],
-        source=[str(ROOT / "pd4dgs_codec" / name) for name in PACKAGES],
-        given=[str(p) for p in paths],
-        run=run,
-        inputs=inputs,
-        packages=PACKAGES,
-        decoder=DECODER_FILES,
-    )
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
-    if done.returncode:
-        raise SystemExit(done.stderr)
-    return json.loads(done.stdout.splitlines()[-1])
+    import coverage
 
-
-#: Modules in which no line belongs to the encoder alone.
-DECODER_FILES = ("codec/decoder.py", "codec/stream.py", "codec/fields.py", "codec/info.py", "entropy/morton.py")
+    sources = [str(ROOT / "pd4dgs_codec" / name) for name in PACKAGES]
+    measured = coverage.Coverage(branch=True, data_file=None, source=sources, messages=False)
+    measured.start()
+    run_inputs(seeds, run, 0, inputs)
+    measured.stop()
+    with tempfile.NamedTemporaryFile(suffix=".json") as file, warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # modules were imported before: only functions count here
+        measured.json_report(outfile=file.name)
+        files = json.loads(Path(file.name).read_text())["files"]
+    shares, missed = {}, {}
+    for package in PACKAGES:
+        total = reached = 0
+        for path, row in files.items():
+            if f"pd4dgs_codec/{package}/" not in path:
+                continue
+            for name, function in row["functions"].items():
+                counts = function["summary"]
+                if name and counts["covered_lines"]:
+                    total += counts["num_statements"] + counts["num_branches"]
+                    reached += counts["covered_lines"] + counts["covered_branches"]
+                    if counts["missing_lines"]:
+                        missed[f"{package}/{Path(path).name} {name}"] = function["missing_lines"]
+        shares[package] = 100 * reached / max(total, 1)
+    return {"inputs": inputs, "reached": shares, "missed": missed}
 
 
 # -- atheris -----------------------------------------------------------------------------------------------------------
@@ -284,7 +282,7 @@ _LAST = re.compile(r"#(\d+)\s+\w+\s+cov: (\d+) ft: (\d+) corp: (\d+)/")
 
 
 def guided(seconds: int, run: int, folder: Path, paths: Sequence[Path]) -> dict[str, Any]:
-    """A coverage-guided run of libFuzzer through atheris, in a process of its own: {inputs, edges, corpus, findings}."""
+    """A coverage-guided run of libFuzzer through atheris, in a process of its own; what it printed last."""
     corpus = folder / "corpus"
     corpus.mkdir(parents=True, exist_ok=True)
     command = [sys.executable, str(Path(__file__).with_name("fuzz_atheris.py")), str(corpus)]
@@ -335,8 +333,10 @@ def main(argv: Sequence[str] | None = None) -> int:
         found = result["findings"]
         text = "\n".join(["| figure | value |", "|---|---|", *(f"| {k} | {v} |" for k, v in result.items())])
     elif args.coverage is not None:
-        result, found = reach(args.seed, args.coverage, args.files), []
-        text = "\n".join(["| package | reached |", "|---|---|", *(f"| {k} | {v:.1f} % |" for k, v in result.items())])
+        result, found = reach(all_seeds(args.files), args.seed, args.coverage), []
+        rows = [f"| {k} | {v:.1f} % |" for k, v in result["reached"].items()]
+        missed = [f"{function}: lines {lines}" for function, lines in result["missed"].items()]
+        text = "\n".join(["| package | reached |", "|---|---|", *rows, "", *missed])
     else:
         seeds = all_seeds(args.files)
         if args.input is not None:

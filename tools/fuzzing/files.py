@@ -1,4 +1,4 @@
-"""Files to mutate: small ones that together use every mode, layer set, prior and predictor; taking apart, putting together.
+"""Files to mutate: small ones that use every mode, layer set, prior and form; taking apart, putting together.
 
 What is put together has right lengths, chunk list, scene ids and checksums, whatever its payloads say.
 """
@@ -86,7 +86,7 @@ def put_together(parts: Parts, header: bytes | None = None) -> bytes:
 
 @dataclass(frozen=True)
 class Seed:
-    """A valid file. digests: one for the header and one per layer, of everything decoded; weight: how often to take it."""
+    """A valid file. digests: of the header and of each layer, all that is decoded. weight: how often to take it."""
 
     name: str
     data: bytes
@@ -109,7 +109,7 @@ def digests(data: bytes, **options: Any) -> tuple[bytes, ...]:
 
 
 def as_seed(name: str, data: bytes) -> Seed:
-    """A seed of a valid file. Small files come more often, and those whose positions need no tree: they decode faster."""
+    """A seed of a valid file. Those that decode faster come more often: small ones, those without a tree of cells."""
     rows = sum(len(layer.anchor_q) for layer in decode_layers(data)[1])
     return Seed(name, data, digests(data), 1.0 / (len(data) + (3000 if rows > 1 else 0)))
 
@@ -154,7 +154,7 @@ def _correlated(anchors: int) -> Scene:
 
 
 def _all_priors() -> Scene:
-    """No anchors, and weights that are spiky, heavy-tailed, wide, or bells with outliers: one kind of prior for each."""
+    """No anchors, and weights that are spiky, heavy-tailed, or wide with outliers: a kind of prior for each."""
     rng = np.random.default_rng(0)
     scene = make_scene(5, layers=(0,), anchors=0, hidden=())
 

@@ -19,7 +19,7 @@ from pd4dgs_codec.entropy.varint import put_varint
 _POWERS = (7, 8, 12, 14, 15, 16, 20, 21, 22, 23, 24, 26, 28, 31, 32)
 #: Around every limit of the format and every width of an integer.
 INTEGERS = (0, 1, 2, 3, 4, 5, 10, 30, 68, 70, *(v for p in _POWERS for v in ((1 << p) - 1, 1 << p, (1 << p) + 1)))
-REALS = (0.0, -0.0, 1.0, -1.0, 0.5, 2.0**-149, 2.0**-126, 2.0**-20, 2.0**20, 2.0**127, -(2.0**127), 3.4028234663852886e38)
+REALS = (0.0, -0.0, 1.0, -1.0, 0.5, 2.0**-149, 2.0**-126, 2.0**-20, 2.0**20, 2.0**127, -(2.0**127))
 LONGEST_BURST = 64
 REPAIRED_SHARE = 0.6  #: of the inputs
 
@@ -145,7 +145,8 @@ def _other_value(rng: random.Random, value: Any) -> Any:
     if isinstance(value, float):
         return rng.choice(REALS) if rng.random() < 0.7 else -value
     if isinstance(value, int):
-        return rng.choice((rng.choice(INTEGERS), value + 1, value - 1, 2 * value, value ^ 1 << rng.randrange(12), -value))
+        near = (value + 1, value - 1, 2 * value, -value, value ^ 1 << rng.randrange(12))
+        return rng.choice((rng.choice(INTEGERS), *near))
     return rng.choice(INTEGERS)
 
 
@@ -273,4 +274,3 @@ def make_case(seeds: Sequence[Seed], seed: int, index: int) -> Case:
         data = change_bytes(rng, chosen.data, donor.data, names)
         return Case(data, False, f"{chosen.name}: {', '.join(names)}")
     return Case(data, True, f"{chosen.name}, repaired: {', '.join(names)}")
-
