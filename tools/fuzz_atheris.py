@@ -18,7 +18,7 @@ import atheris  # noqa: E402
 with atheris.instrument_imports(include=[f"pd4dgs_codec.{p}" for p in ("bitstream", "entropy", "attributes", "codec")]):
     from fuzzing.check import examine
 
-from fuzzing.files import take_apart, try_put_together  # noqa: E402
+from fuzzing.files import put_together, take_apart  # noqa: E402
 from fuzzing.mutate import Case  # noqa: E402
 
 from pd4dgs_codec.bitstream import canonical  # noqa: E402
@@ -50,7 +50,7 @@ def mutate(data: bytes, max_size: int, seed: int) -> bytes:
         chunk.meta = _mutated_map(chunk.meta)
     else:
         chunk.payload = atheris.Mutate(chunk.payload, len(chunk.payload) + 16)
-    return try_put_together(parts, data)[:max_size]
+    return put_together(parts)[:max_size]
 
 
 def _mutated_map(value: dict) -> dict:

@@ -24,7 +24,7 @@ from pd4dgs_codec.codec import header as header_module
 from pd4dgs_codec.codec import layer_meta
 from pd4dgs_codec.codec.decoder import decode_layers
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
-from pd4dgs_codec.errors import EncodeError
+from pd4dgs_codec.errors import DecodeError
 from pd4dgs_codec.scene import Scene
 
 
@@ -125,7 +125,7 @@ def built_seeds() -> list[Seed]:
         files[f"tiny-{i}-{mode}-{deformation}"] = encode(scene, layers=2, effort=3, **options)
     files["no-anchor"] = encode(make_scene(1, anchors=0, with_camera=False), layers=2, effort=1)
     files["all-heads"] = encode(make_scene(2, anchors=6, scales=2), layers=2, effort=5)
-    files["predicted"] = encode(_correlated(30), layers=0, effort=5)
+    files["predicted"] = encode(_correlated(60), layers=0, effort=5)
     for mode in ("ans", "lzma"):
         files[f"priors-{mode}"] = encode(_all_priors(), layers=0, effort=5, mode=mode)
     flat = make_scene(3, layers=(0, 1), anchors=0, kind="constant", **{**tiny, "sides": (90, 3, 40, 2), "scales": 2})
@@ -141,9 +141,9 @@ def _correlated(anchors: int) -> Scene:
     rng = np.random.default_rng(0)
     scene = make_scene(4, layers=(0,), anchors=anchors, extent=3, hidden=())
     n, steps = len(scene.anchor_q), scene.steps
-    base = np.rint(rng.normal(0, 60, (n, 1)))
-    feature = base * rng.integers(1, 3, 32) + rng.integers(-1, 2, (n, 32))
-    offset = np.rint(rng.normal(0, 1, (n, 10, 3)) ** 3)
+    feature = np.rint(rng.normal(0, 900, (n, 1))) * rng.choice([1, 2], 32) + rng.integers(-1, 2, (n, 32))
+    still = rng.random((n, 10, 1)) < 0.6
+    offset = np.where(still, 0, np.rint(rng.normal(0, 40, (n, 10, 3))))
     codes = np.full(n, 255, np.uint8)
     return replace(
         scene,
@@ -172,8 +172,6 @@ def _all_priors() -> Scene:
 
 def given_seeds(paths: Iterable[Path]) -> list[Seed]:
     """Seeds of `.pd4` files and of those in folders; files that do not decode are left out (vectors may be faulty)."""
-    from pd4dgs_codec.errors import DecodeError
-
     seeds = []
     for path in paths:
         for file in sorted(path.rglob("*.pd4")) if path.is_dir() else [path]:
@@ -182,14 +180,6 @@ def given_seeds(paths: Iterable[Path]) -> list[Seed]:
             except DecodeError:
                 continue
     return seeds
-
-
-def try_put_together(parts: Parts, fallback: bytes) -> bytes:
-    """put_together, or `fallback` where the parts have no canonical form or pass a limit of the writer."""
-    try:
-        return put_together(parts)
-    except EncodeError:
-        return fallback
 
 
 def known_prefixes(seeds: Sequence[Seed]) -> frozenset[tuple[bytes, ...]]:

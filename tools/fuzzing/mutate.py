@@ -8,13 +8,15 @@ from __future__ import annotations
 import copy
 import random
 import struct
+import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from fuzzing.files import Chunk, Parts, Seed, take_apart, try_put_together
-from pd4dgs_codec.bitstream.container import SIGNATURE, write_preamble
+from fuzzing.files import Chunk, Parts, Seed, put_together, take_apart
+from pd4dgs_codec.bitstream.container import CHUNK_HEAD_SIZE, SIGNATURE, read_chunk, read_preamble, write_preamble
 from pd4dgs_codec.entropy.varint import put_varint
+from pd4dgs_codec.errors import EncodeError
 
 _POWERS = (7, 8, 12, 14, 15, 16, 20, 21, 22, 23, 24, 26, 28, 31, 32)
 #: Around every limit of the format and every width of an integer.
@@ -247,9 +249,12 @@ PART_WEIGHTS = (40, 12, 20, 8, 15, 5)
 def change_parts(rng: random.Random, data: bytes, other: bytes, names: list[str]) -> bytes:
     """A file whose parts were changed, with lengths, chunk list, scene ids and checksums right again."""
     parts, donor = take_apart(data), take_apart(other)
-    for change in rng.choices(PART_CHANGES, PART_WEIGHTS, k=rng.choice((1, 1, 1, 2))):
-        change(rng, parts, donor, names)
-    return try_put_together(parts, data)
+    try:
+        for change in rng.choices(PART_CHANGES, PART_WEIGHTS, k=rng.choice((1, 1, 1, 2))):
+            change(rng, parts, donor, names)
+        return put_together(parts)
+    except EncodeError:  # a value that has no canonical form, such as one nested too deep
+        return data
 
 
 def change_header_bytes(rng: random.Random, data: bytes, other: bytes, names: list[str]) -> bytes:
@@ -260,6 +265,22 @@ def change_header_bytes(rng: random.Random, data: bytes, other: bytes, names: li
     return write_preamble(header) + data[20 + size :]
 
 
+def change_frame(rng: random.Random, data: bytes, other: bytes, names: list[str]) -> bytes:
+    """A field of a chunk's frame changed, with the checksum right again: type, flags, length or scene id that lie."""
+    frames, offset = [], read_preamble(data).size
+    while offset < len(data):
+        end = read_chunk(data, offset).end
+        frames.append((offset, end))
+        offset = end
+    offset, end = rng.choice(frames)
+    head = bytearray(data[offset : offset + CHUNK_HEAD_SIZE])
+    at = rng.randrange(len(head))
+    head[at] ^= 1 << rng.randrange(8)
+    names.append(f"byte {at} of a frame")
+    body = bytes(head) + data[offset + CHUNK_HEAD_SIZE : end - 4]
+    return data[:offset] + body + struct.pack("<I", zlib.crc32(body)) + data[end:]
+
+
 def make_case(seeds: Sequence[Seed], seed: int, index: int) -> Case:
     """Input number `index` of the run `seed` over these files."""
     rng = random.Random(seed << 40 | index)
@@ -268,6 +289,8 @@ def make_case(seeds: Sequence[Seed], seed: int, index: int) -> Case:
     act = rng.random()
     if act < 0.04:
         data = change_header_bytes(rng, chosen.data, donor.data, names)
+    elif act < 0.06:
+        data = change_frame(rng, chosen.data, donor.data, names)
     elif act < REPAIRED_SHARE:
         data = change_parts(rng, chosen.data, donor.data, names)
     else:
