@@ -5,6 +5,7 @@
     python tools/fuzz.py --input 4711                     # one input again, with its recipe
     python tools/fuzz.py --atheris 300                    # coverage-guided, 300 s; needs `pip install atheris`
     python tools/fuzz.py --coverage 20000                 # which branches those inputs alone reach; needs `coverage`
+    python tools/fuzz.py --damage 100000 a.pd4 b.pd4      # flips, bursts, swaps, splices and cuts of files of any size
 
 Inputs are numbered: input i of run S over the same seed files is the same on every machine, whatever --jobs is. Each is
 decoded in a child process by every entry point; a crash, a hang and anything but the package's own DecodeErrors is a
@@ -35,6 +36,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tools"), str(ROOT / "tests")]
 
 from fuzzing.check import Finding, check_memory, examine  # noqa: E402
+from fuzzing.damage import damage  # noqa: E402
 from fuzzing.files import Seed, built_seeds, given_seeds, known_prefixes  # noqa: E402
 from fuzzing.mutate import Case, make_case  # noqa: E402
 
@@ -321,6 +323,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
     p.add_argument("--input", type=int, metavar="I", help="examine input I alone, in this process")
     p.add_argument("--atheris", type=int, metavar="S", help="a coverage-guided run of S seconds instead")
+    p.add_argument("--damage", type=int, metavar="N", help="N changes of the given files, checksums left as they are")
     p.add_argument("--coverage", type=int, metavar="N", help="measure what N inputs reach instead")
     return p
 
@@ -332,6 +335,14 @@ def main(argv: Sequence[str] | None = None) -> int:
         result = guided(args.atheris, args.seed, args.out, args.files)
         found = result["findings"]
         text = "\n".join(["| figure | value |", "|---|---|", *(f"| {k} | {v} |" for k, v in result.items())])
+    elif args.damage is not None:
+        data = [seed.data for seed in given_seeds(args.files)]
+        if not data:
+            raise SystemExit("fuzz.py: --damage needs .pd4 files, found none")
+        outcomes, found = damage(data, args.seed, args.damage)
+        result = {"files": len(data), "outcomes": outcomes, "findings": found}
+        rows = [f"| ends in {name} | {count:,} |" for name, count in outcomes.most_common()]
+        text = "\n".join(["| figure | value |", "|---|---|", *rows, f"| findings | {len(found)} |", *found[:20]])
     elif args.coverage is not None:
         result, found = reach(all_seeds(args.files), args.seed, args.coverage), []
         rows = [f"| {k} | {v:.1f} % |" for k, v in result["reached"].items()]

@@ -9,6 +9,7 @@ from __future__ import annotations
 import random
 import time
 import tracemalloc
+import warnings
 from dataclasses import dataclass
 
 from fuzzing.files import digests
@@ -131,6 +132,12 @@ def examine(case: Case, known: frozenset[tuple[bytes, ...]], rng: random.Random)
 
     known: digests of what the seeds' prefixes decode to; an input whose checksums were not repaired may give no other.
     """
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")  # a warning is a line on somebody's terminal that says nothing
+        return _examine(case, known, rng)
+
+
+def _examine(case: Case, known: frozenset[tuple[bytes, ...]], rng: random.Random) -> Outcome:
     data = case.data
     start = time.process_time()
     name, result = _end(decode, data)

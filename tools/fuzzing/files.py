@@ -125,7 +125,7 @@ def built_seeds() -> list[Seed]:
         files[f"tiny-{i}-{mode}-{deformation}"] = encode(scene, layers=2, effort=3, **options)
     files["no-anchor"] = encode(make_scene(1, anchors=0, with_camera=False), layers=2, effort=1)
     files["all-heads"] = encode(make_scene(2, anchors=6, scales=2), layers=2, effort=5)
-    files["predicted"] = encode(_correlated(60), layers=0, effort=5)
+    files["predicted"] = encode(_correlated(60), layers=0, effort=2)
     for mode in ("ans", "lzma"):
         files[f"priors-{mode}"] = encode(_all_priors(), layers=0, effort=5, mode=mode)
     flat = make_scene(3, layers=(0, 1), anchors=0, kind="constant", **{**tiny, "sides": (90, 3, 40, 2), "scales": 2})
