@@ -7,8 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pd4dgs_codec.entropy.ans import ans_encode
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
 from pd4dgs_codec.entropy.priors import CONST, GAUSS, GMM2, HIST, K_MAX, MAX_ENTRIES, MAX_WINDOW
+from pd4dgs_codec.entropy.tables import norm_table, uniform_table
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
 from pd4dgs_codec.errors import DecodeError, EncodeError, LimitExceeded, Malformed, UnsupportedFeature
 
@@ -263,3 +265,15 @@ def test_varints_round_trip(signed, unsigned):
     put_varint(out, unsigned)
     reader = ByteReader(bytes(out))
     assert (reader.zigzag(2**31, "x"), reader.varint(2**33, "y"), reader.remaining) == (signed, unsigned, 0)
+
+
+def test_low_bits_past_the_last_symbol_are_malformed():
+    """A window may end above the largest symbol; what is coded there may not."""
+    top = K_MAX - 1
+    head = payload_of(2 * 4) + bytes((2, 1)) + payload_of(2 * (top - 4), 0, 0, 1280)
+    symbols = [np.array([1]), np.array([3])]
+    words = ans_encode(symbols, [norm_table(2, 128, 0, 1), uniform_table(2)])
+    with pytest.raises(Malformed, match=f"symbol {K_MAX + 2}, limit {K_MAX}"):
+        decode_channels(head + words, [1])
+    words = ans_encode([symbols[0], np.array([1])], [norm_table(2, 128, 0, 1), uniform_table(2)])
+    assert decode_channels(head + words, [1])[0].tolist() == [K_MAX]

@@ -237,7 +237,7 @@ def test_the_command_prints_a_table_and_writes_figures(monkeypatch, tmp_path, ca
 
 def trained_like():
     """At most 4 kB with three layers, every head, masks that rise, and weights and planes that are not constant."""
-    data = encode(make_scene(11, anchors=12, kind="gaussian", extent=4, hidden=(), heads=SMALL_HEADS), layers=2)
+    data = encode(make_scene(11, anchors=12, kind="gaussian", extent=4, hidden=(4,), heads=SMALL_HEADS), layers=2)
     assert 2000 < len(data) <= 4096
     return data
 
