@@ -35,7 +35,7 @@ from typing import Any
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tools"), str(ROOT / "tests")]
 
-from fuzzing.check import Finding, check_memory, examine  # noqa: E402
+from fuzzing.check import Finding, check_memory, compare_reference, examine  # noqa: E402
 from fuzzing.damage import damage  # noqa: E402
 from fuzzing.files import Seed, built_seeds, given_seeds, known_prefixes  # noqa: E402
 from fuzzing.mutate import Case, make_case  # noqa: E402
@@ -62,6 +62,7 @@ class Figures:
     slowest: tuple[float, int] = (0.0, -1)  #: seconds of processor time of decode, input
     memory: tuple[float, int] = (0.0, -1)  #: share of the bound, input
     traced: int = 0
+    compared: int = 0  #: with the reference decoder
     seconds: float = 0.0  #: of processor time, all checks included
 
     def add(self, other: Figures) -> None:
@@ -73,6 +74,7 @@ class Figures:
         self.findings += other.findings
         self.slowest, self.memory = max(self.slowest, other.slowest), max(self.memory, other.memory)
         self.traced += other.traced
+        self.compared += other.compared
         self.seconds += other.seconds
 
     def shares(self) -> dict[str, float]:
@@ -92,6 +94,7 @@ class Figures:
             f"| inputs per second and core | {self.inputs / max(self.seconds, 1e-9):,.0f} |",
             f"| slowest decode | {self.slowest[0]:.3f} s (input {self.slowest[1]}) |",
             f"| highest memory, of its bound | {self.memory[0]:.1%} (input {self.memory[1]}; {self.traced:,} traced) |",
+            f"| compared with the reference decoder | {self.compared:,} |",
             f"| findings | {len(self.findings)} |",
         ]
         return "\n".join(["| figure | value |", "|---|---|", *rows])
@@ -123,8 +126,13 @@ def forget_peak() -> None:
         pass
 
 
-def run_inputs(seeds: Sequence[Seed], run: int, first: int, end: int, place: Any = None, stop: Any = None) -> Figures:
-    """Examine the inputs first .. end - 1. place.value: the one at work; stop.value: end early."""
+def run_inputs(
+    seeds: Sequence[Seed], run: int, first: int, end: int, place: Any = None, stop: Any = None, reference: int = 0
+) -> Figures:
+    """Examine the inputs first .. end - 1. place.value: the one at work; stop.value: end early.
+
+    reference: every so many inputs are decoded by the specification's reference decoder as well, 0 for none.
+    """
     figures, known = Figures(), known_prefixes(seeds)
     started = time.process_time()
     forget_peak()
@@ -142,6 +150,8 @@ def run_inputs(seeds: Sequence[Seed], run: int, first: int, end: int, place: Any
             figures.outcomes[outcome.name] += 1
             figures.checksums[outcome.checksums] += 1
             figures.slowest = max(figures.slowest, (outcome.seconds, index))
+            if reference and index % reference == 0:
+                figures.compared += compare_reference(case.data)
             grown = peak_kib() > usual + SEEN_MEMORY
             if index % SAMPLE == 0 or grown:
                 figures.traced += 1
@@ -173,13 +183,13 @@ class _Child:
     since: float = 0.0
 
 
-def _child_main(writer: Any, seeds: Sequence[Seed], run: int, first: int, end: int, place: Any, stop: Any) -> None:
+def _child_main(writer: Any, *args: Any) -> None:
     taken = int(Path("/proc/self/statm").read_text().split()[0]) * resource.getpagesize()
     resource.setrlimit(resource.RLIMIT_AS, (taken + SPARE_MEMORY,) * 2)
-    writer.send(run_inputs(seeds, run, first, end, place, stop))
+    writer.send(run_inputs(*args))
 
 
-def run_many(seeds: Sequence[Seed], run: int, inputs: int, seconds: float, jobs: int) -> Figures:
+def run_many(seeds: Sequence[Seed], run: int, inputs: int, seconds: float, jobs: int, reference: int = 0) -> Figures:
     """The inputs 0 .. inputs - 1 in child processes, or as many as `seconds` of wall time allow."""
     context = multiprocessing.get_context("fork")  # the seeds are built once
     stop, figures = context.RawValue("b", 0), Figures()
@@ -193,7 +203,7 @@ def run_many(seeds: Sequence[Seed], run: int, inputs: int, seconds: float, jobs:
             first, end = waiting.pop()
             reader, writer = context.Pipe(duplex=False)
             place = context.RawValue("q", first)
-            process = context.Process(target=_child_main, args=(writer, seeds, run, first, end, place, stop))
+            process = context.Process(target=_child_main, args=(writer, seeds, run, first, end, place, stop, reference))
             process.start()
             writer.close()
             children.append(_Child(process, reader, place, first, end))
@@ -318,6 +328,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--inputs", type=int, default=20_000, help="how many (default: 20000)")
     p.add_argument("--seed", type=int, default=0, help="number of the run (default: 0)")
     p.add_argument("--seconds", type=float, default=float("inf"), help="stop after this wall time")
+    p.add_argument("--reference", type=int, default=50, metavar="K", help="compare every Kth input with spec/refdec.py")
     p.add_argument("--jobs", type=int, default=1, help="processes at once (default: 1)")
     p.add_argument("--out", type=Path, default=ROOT / "out" / "fuzz", help="folder for findings (default: out/fuzz)")
     p.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
@@ -352,9 +363,9 @@ def main(argv: Sequence[str] | None = None) -> int:
         seeds = all_seeds(args.files)
         if args.input is not None:
             print(make_case(seeds, args.seed, args.input).recipe)
-            figures = run_inputs(seeds, args.seed, args.input, args.input + 1)
+            figures = run_inputs(seeds, args.seed, args.input, args.input + 1, reference=1)
         else:
-            figures = run_many(seeds, args.seed, args.inputs, args.seconds, args.jobs)
+            figures = run_many(seeds, args.seed, args.inputs, args.seconds, args.jobs, args.reference)
         save_findings(seeds, args.seed, figures, args.out)
         result, found, text = figures.json(), figures.findings, figures.markdown()
         text += "".join(f"\n{row['input']} {row['kind']}: {row['message']} ({row['recipe']})" for row in found[:20])

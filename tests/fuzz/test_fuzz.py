@@ -33,8 +33,9 @@ def names(figures):
 
 
 def test_a_short_run_finds_nothing():
-    figures = fuzz.run_inputs(SEEDS, 20, 0, 4000)
+    figures = fuzz.run_inputs(SEEDS, 20, 0, 4000, reference=20)
     assert not figures.findings
+    assert figures.compared > 150
     assert figures.inputs == 4000 == sum(figures.outcomes.values())
     assert figures.repaired >= figures.inputs / 2
     shares = figures.shares()
@@ -186,6 +187,21 @@ def test_damage_that_decodes_is_a_finding(monkeypatch):
 def test_doors_that_disagree_are_a_finding(monkeypatch):
     monkeypatch.setattr(check, "_streamed", lambda data, rng: [(0,)])
     assert "disagreement" in names(fuzz.run_inputs(SEEDS, 0, 0, 40))
+
+
+@pytest.mark.parametrize("change", [lambda rows: rows[:1], raising(KeyError("x"))])
+def test_a_reference_decoder_that_differs_is_a_finding(monkeypatch, change):
+    reference = check._reference()
+    true = reference.hashes
+    monkeypatch.setattr(reference, "hashes", lambda data: change(true(data)))
+    assert "reference" in names(fuzz.run_inputs(SEEDS, 1, 0, 30, reference=1))
+
+
+def test_a_file_that_only_we_decode_is_a_finding(monkeypatch):
+    reference = check._reference()
+    monkeypatch.setattr(reference, "hashes", raising(reference.Fault("Malformed", "x")))
+    with pytest.raises(check.Finding, match="refuses"):
+        check.compare_reference(BY_NAME["no-anchor"].data)
 
 
 def test_too_much_memory_is_a_finding(monkeypatch):

@@ -6,11 +6,15 @@ decoded to other symbols; time and memory stay within bounds.
 
 from __future__ import annotations
 
+import importlib.util
 import random
 import time
 import tracemalloc
 import warnings
 from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from types import ModuleType
 
 from fuzzing.files import digests
 from fuzzing.mutate import Case
@@ -27,6 +31,9 @@ from pd4dgs_codec.errors import DecodeError, Truncated
 MAX_SECONDS = 2.0  #: of processor time, per input
 #: Peak memory of decoding is at most these times the symbols declared, the bytes given, and a constant (clause 15).
 BYTES_PER_SYMBOL, BYTES_PER_BYTE, BYTES_ALWAYS = 48, 48, 64 << 20
+
+REFERENCE = Path(__file__).resolve().parents[2] / "spec" / "refdec.py"
+REFERENCE_SYMBOLS = 20_000
 
 DECODED = "decoded"
 
@@ -174,3 +181,34 @@ def _check_partial(case: Case, known: frozenset[tuple[bytes, ...]], name: str) -
             raise Finding("disagreement", f"decode ends in {name}, with allow_partial complete is {result[1]}")  # type: ignore[index]
         if not case.repaired and digests(case.data, allow_partial=True) not in known:
             raise Finding("silent", "with allow_partial decoded to what no prefix of a seed holds")
+
+
+@cache
+def _reference() -> ModuleType:
+    spec = importlib.util.spec_from_file_location("refdec", REFERENCE)
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def compare_reference(data: bytes) -> bool:
+    """Whether the specification's reference decoder was asked; Finding if it yields or refuses otherwise than ours.
+
+    It is plain Python: an input that declares more than REFERENCE_SYMBOLS is left out.
+    """
+    if declared(data) > REFERENCE_SYMBOLS:
+        return False
+    name, ours = _end(hashes, data)
+    reference = _reference()
+    try:
+        theirs = reference.hashes(data)
+    except reference.Fault as fault:
+        if name == DECODED:
+            raise Finding("reference", f"decoded, but the reference decoder refuses: {fault}") from None
+        return True
+    except Exception as error:
+        raise Finding("reference", f"the reference decoder raised {type(error).__name__}: {error}") from error
+    if name != DECODED or ours != theirs:
+        raise Finding("reference", f"ends in {name}, but the reference decoder yields {theirs}: {ours}")
+    return True
