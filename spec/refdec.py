@@ -382,12 +382,12 @@ def weight_shapes(layer):
     return shapes
 
 
-# 6.5 Declared sizes: "c MUST NOT exceed 2^28, n MUST NOT exceed 2^14 + 2·L, and E + 72·n + c + w MUST NOT exceed 2^22 +
+# 6.5 Declared sizes: "c MUST NOT exceed 2^28, n MUST NOT exceed 2^13 + 2·L, and E + 72·n + c + w MUST NOT exceed 2^22 +
 # 2048·L, L being the payload's length in bytes."
 def check_sizes(layer, payload_bytes):
     cells = sum(c * h * w for _, _, (c, h, w) in plane_shapes(layer))
     limited(cells, 1 << 28, "plane cells")
-    limited(layer.rows, (1 << 14) + 2 * payload_bytes, "own rows")
+    limited(layer.rows, (1 << 13) + 2 * payload_bytes, "own rows")
     count = layer.rows_before + 72 * layer.rows + cells + sum(size for _, size in weight_shapes(layer))
     limited(count, (1 << 22) + 2048 * payload_bytes, "the symbols of a layer")
 

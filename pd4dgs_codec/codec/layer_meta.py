@@ -46,7 +46,7 @@ ROWS, SECTIONS, STEPS, SCALES, NETWORKS = range(1, 6)
 FREE_SYMBOLS = 1 << 22
 SYMBOLS_PER_BYTE = 2048
 #: An anchor's position takes some 25 us to decode and may cost next to nothing; real anchors take tens of bytes.
-FREE_ROWS = 1 << 14
+FREE_ROWS = 1 << 13
 ROWS_PER_BYTE = 2
 
 

@@ -354,7 +354,7 @@ def test_a_few_bytes_cannot_ask_for_gigabytes():
     header, chunks = take_apart(FULL)
     bombs = (
         lambda m: {**m, layer_meta.ROWS: (1 << 24) - 100},
-        lambda m: {**m, layer_meta.ROWS: (1 << 14) + 2 * len(chunks[1][2]) + 40},
+        lambda m: {**m, layer_meta.ROWS: (1 << 13) + 2 * len(chunks[1][2]) + 40},
         lambda m: {**m, layer_meta.SCALES: [[256, 1000, 1000, 1, 1, *[0] * 6]]},
     )
     for bomb in bombs:
