@@ -29,7 +29,7 @@ Layers = Sequence[LayerSymbols]
 
 
 @contextmanager
-def _whole_payloads_known(files: Sequence[bytes]) -> Iterator[Mapping[bytes, Layers]]:
+def whole_payloads_known(files: Sequence[bytes]) -> Iterator[Mapping[bytes, Layers]]:
     """The layers of each file; while this holds, the decoder takes those of an unchanged payload from here."""
     known: dict[Any, LayerSymbols] = {}
     read_layer = decoder.read_layer
@@ -46,7 +46,7 @@ def _whole_payloads_known(files: Sequence[bytes]) -> Iterator[Mapping[bytes, Lay
         yield layers
 
 
-def _ends(data: bytes) -> list[tuple[int, bool]]:
+def chunk_ends(data: bytes) -> list[tuple[int, bool]]:
     """(offset of the first byte after it, whether it is a layer) of header and chunks."""
     preamble = read_preamble(data)
     ends = [(preamble.size, False)]
@@ -55,7 +55,7 @@ def _ends(data: bytes) -> list[tuple[int, bool]]:
     return ends
 
 
-def _check_change(data: bytes, originals: Mapping[bytes, Layers]) -> str:
+def check_change(data: bytes, originals: Mapping[bytes, Layers]) -> str:
     """What a damaged file ends in; Finding if it decodes and is none of the originals."""
     try:
         decoder.decode_layers(data)
@@ -66,7 +66,7 @@ def _check_change(data: bytes, originals: Mapping[bytes, Layers]) -> str:
     return DECODED
 
 
-def _check_cut(data: bytes, size: int, layers: Layers, ends: Sequence[tuple[int, bool]]) -> str:
+def check_cut(data: bytes, size: int, layers: Layers, ends: Sequence[tuple[int, bool]]) -> str:
     """A cut file is Truncated, and with allow_partial its whole layers and no others come back, flagged."""
     whole = sum(end <= size for end, is_layer in ends if is_layer)
     cut = data[:size]
@@ -93,7 +93,7 @@ def damage(files: Sequence[bytes], run: int, changes: int) -> tuple[Counter[str]
     findings: list[str] = []
     kinds = [change for change in CHANGES if change is not truncate]
     rng = random.Random(run)
-    with _whole_payloads_known(files) as originals:
+    with whole_payloads_known(files) as originals:
 
         def examine(what: str, check: Any, *args: Any) -> None:
             try:
@@ -105,15 +105,15 @@ def damage(files: Sequence[bytes], run: int, changes: int) -> tuple[Counter[str]
             data = bytearray(files[index % len(files)])
             change = rng.choice(kinds)
             change(rng, data, rng.choice(files))
-            examine(f"change {index}, {change.__name__}", _check_change, bytes(data), originals)
+            examine(f"change {index}, {change.__name__}", check_change, bytes(data), originals)
         for number, data in enumerate(files):
-            ends = _ends(data)
+            ends = chunk_ends(data)
             near = [e + d for e, _ in ends for d in range(-BOUNDARY, BOUNDARY + 1) if 0 <= e + d < len(data)]
             cuts = int(changes * CUTS_PER_CHANGE / len(files))
             for size in [*near, *(rng.randrange(len(data)) for _ in range(cuts))]:
-                examine(f"file {number} cut at {size}", _check_cut, data, size, originals[data], ends)
+                examine(f"file {number} cut at {size}", check_cut, data, size, originals[data], ends)
             for bit in [8 * place + b for place in near for b in range(8)]:
                 flipped = bytearray(data)
                 flipped[bit // 8] ^= 1 << bit % 8
-                examine(f"file {number}, bit {bit}", _check_change, bytes(flipped), originals)
+                examine(f"file {number}, bit {bit}", check_change, bytes(flipped), originals)
     return outcomes, findings
