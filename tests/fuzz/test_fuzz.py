@@ -326,9 +326,9 @@ def test_checks_take_a_twentieth_of_decoding(monkeypatch):
     for module, name in checks:
         monkeypatch.setattr(module, name, timed(getattr(module, name)))
     shares = []
-    for _ in range(5):
+    for _ in range(9):
         spent[0], start = 0.0, time.perf_counter()
         decode(data)
         shares.append(spent[0] / (time.perf_counter() - start))
     print(f"checks take {min(shares):.1%} to {max(shares):.1%} of decoding {len(data)} bytes")
-    assert sorted(shares)[2] <= 0.05
+    assert sorted(shares)[4] <= 0.05
