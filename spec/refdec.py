@@ -23,6 +23,7 @@ K = (1 << 24) - 1  # clause 14: coded symbols
 MAX_SYMBOL = 1 << 23  # clause 14: symbols of attributes, plane samples and weights
 MAX_VOXEL = 1 << 20
 MAX_COUNT = 1 << 26
+MAX_ENTRIES = 1 << 21
 TOTAL = 1 << 24
 PLANES = (("xy", 0, 1), ("xz", 0, 2), ("xt", 0, 3), ("yz", 1, 2), ("yt", 1, 3), ("zt", 2, 3))
 ATTRIBUTES = (("feature", 32), ("scaling_log", 6), ("offset", 30))
@@ -291,7 +292,7 @@ class Layer:
 def read_layer(payload, number, rows_before, header):
     layer = Layer(number, rows_before, header)
     reader = Reader(payload)
-    parameters = reader.take(reader.number("<I"))
+    parameters = reader.take(limited(reader.number("<I"), 4096, "the parameters' length"))
     read_parameters(layer, unpack(parameters))
     need(sum(layer.sections.values()) == reader.left, "the sections do not fill the payload")
     check_sizes(layer, len(payload))
@@ -381,11 +382,12 @@ def weight_shapes(layer):
     return shapes
 
 
-# 6.5 Declared sizes: "c MUST NOT exceed 2^28, and E + 72·n + c + w MUST NOT exceed 2^22 + 2048·L, L being the
-# payload's length in bytes."
+# 6.5 Declared sizes: "c MUST NOT exceed 2^28, n MUST NOT exceed 2^13 + 2·L, and E + 72·n + c + w MUST NOT exceed 2^22 +
+# 2048·L, L being the payload's length in bytes."
 def check_sizes(layer, payload_bytes):
     cells = sum(c * h * w for _, _, (c, h, w) in plane_shapes(layer))
     limited(cells, 1 << 28, "plane cells")
+    limited(layer.rows, (1 << 13) + 2 * payload_bytes, "own rows")
     count = layer.rows_before + 72 * layer.rows + cells + sum(size for _, size in weight_shapes(layer))
     limited(count, (1 << 22) + 2048 * payload_bytes, "the symbols of a layer")
 
@@ -620,7 +622,7 @@ def read_exceptions(reader, count, prior):
 # 8.1 Parameter block: "For each non-empty channel in order: a varint token, at most 2·(2^26 + 8); the parameters of a
 # new prior (8.2), if any; its exceptions (8.3), if bit 0 of the token is set."
 def decode_channels(data, counts):
-    reader, defined, heads = Reader(data), [], []
+    reader, defined, heads, entries = Reader(data), [], [], 0
     for count in counts:
         if count == 0:
             continue
@@ -628,6 +630,7 @@ def decode_channels(data, counts):
         token = reader.varint(2 * (MAX_COUNT + 8))
         if token >> 1 < 8:
             defined.append(read_prior(reader, token >> 1))
+            entries = limited(entries + defined[-1].n, MAX_ENTRIES, "the entries of a section's tables")
         back = max(token >> 1, 8) - 8
         need(back < len(defined), "a channel reuses a prior before the first")
         prior = defined[-1 - back]

@@ -45,6 +45,9 @@ ROWS, SECTIONS, STEPS, SCALES, NETWORKS = range(1, 6)
 #: constant channels cannot make a decoder allocate without end. Real scenes spend over 0.1 bit per symbol.
 FREE_SYMBOLS = 1 << 22
 SYMBOLS_PER_BYTE = 2048
+#: An anchor's position takes some 25 us to decode and may cost next to nothing; real anchors take tens of bytes.
+FREE_ROWS = 1 << 13
+ROWS_PER_BYTE = 2
 
 
 @dataclass(frozen=True)
@@ -125,14 +128,22 @@ def unpack_meta(data: bytes, kind: LayerKind, rows_before: int, raw: bool) -> La
     return meta
 
 
+def declared_symbols(meta: LayerMeta, kind: LayerKind, rows_before: int) -> int:
+    """Symbols (or float32 values) that the parameters say the layer has, voxel indices and masks included."""
+    cells = sum(math.prod(shape) for shape in meta.plane_shapes())
+    weights = sum(math.prod(shape) for shape in meta.weight_shapes(kind))
+    return rows_before + meta.rows * (N_CHANNELS + 4) + cells + weights
+
+
 def check_symbol_count(meta: LayerMeta, kind: LayerKind, rows_before: int, payload_bytes: int) -> None:
-    """LimitExceeded if the layer declares more symbols than its payload could reasonably hold."""
+    """LimitExceeded if the layer declares more anchors or symbols than its payload could reasonably hold."""
     cells = sum(math.prod(shape) for shape in meta.plane_shapes())
     if cells > MAX_PLANE_CELLS:
         raise LimitExceeded(f"layer {kind.layer}: planes of {cells} cells, limit {MAX_PLANE_CELLS}")
-    weights = sum(math.prod(shape) for shape in meta.weight_shapes(kind))
-    symbols = rows_before + meta.rows * (N_CHANNELS + 4) + cells + weights
-    limit = FREE_SYMBOLS + SYMBOLS_PER_BYTE * payload_bytes
+    most = FREE_ROWS + ROWS_PER_BYTE * payload_bytes
+    if meta.rows > most:
+        raise LimitExceeded(f"layer {kind.layer}: {meta.rows} anchors in {payload_bytes} bytes, limit {most}")
+    symbols, limit = declared_symbols(meta, kind, rows_before), FREE_SYMBOLS + SYMBOLS_PER_BYTE * payload_bytes
     if symbols > limit:
         raise LimitExceeded(f"layer {kind.layer}: {symbols} symbols in {payload_bytes} bytes, limit {limit}")
 

@@ -16,7 +16,7 @@ import numpy as np
 from pd4dgs_codec.attributes import planes as decorrelation
 from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
 from pd4dgs_codec.attributes.table import N_CHANNELS
-from pd4dgs_codec.bitstream.limits import MAX_VOXEL
+from pd4dgs_codec.bitstream.limits import MAX_PARAMETERS, MAX_VOXEL
 from pd4dgs_codec.codec.attribute_section import read_attributes, write_attributes
 from pd4dgs_codec.codec.kinds import LayerKind
 from pd4dgs_codec.codec.layer_meta import LayerMeta, ScaleMeta, Section, check_symbol_count, pack_meta, unpack_meta
@@ -31,7 +31,7 @@ from pd4dgs_codec.entropy.lzma_mode import (
 )
 from pd4dgs_codec.entropy.positions import decode_positions, encode_positions
 from pd4dgs_codec.entropy.rate import gaussian_bits
-from pd4dgs_codec.errors import Malformed
+from pd4dgs_codec.errors import LimitExceeded, Malformed
 from pd4dgs_codec.scene import MASK_MIN_CODE, PLANES, Network
 
 #: The groups of channels, by section, in coding order; FLOATS and POSITIONS are not channels.
@@ -132,6 +132,8 @@ def read_meta(payload: bytes | memoryview, kind: LayerKind, rows_before: int, ra
     if len(payload) < 4:
         raise Malformed(f"layer {kind.layer}: payload of {len(payload)} bytes, expected at least 4")
     (length,) = struct.unpack_from("<I", payload)
+    if length > MAX_PARAMETERS:
+        raise LimitExceeded(f"layer {kind.layer}: parameters of {length} bytes, limit {MAX_PARAMETERS}")
     if length > len(payload) - 4:
         raise Malformed(f"layer {kind.layer}: parameters of {length} bytes in a payload of {len(payload)}")
     meta = unpack_meta(bytes(payload[4 : 4 + length]), kind, rows_before, raw)

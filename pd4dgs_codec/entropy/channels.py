@@ -17,7 +17,7 @@ import numpy as np
 from ..errors import EncodeError, LimitExceeded, Malformed
 from .ans import MAX_COUNT, AnsDecoder, ans_encode
 from .fitting import fit_best, histogram
-from .priors import CONST, FIRST_REUSE, K_MAX, Hist, Prior, Window, family_code, read_prior, write_prior
+from .priors import CONST, FIRST_REUSE, K_MAX, MAX_ENTRIES, Hist, Prior, Window, family_code, read_prior, write_prior
 from .rate import gaussian_bits
 from .sharing import plan_priors
 from .tables import uniform_table
@@ -153,7 +153,14 @@ def decode_channels(payload: bytes | memoryview, counts: Sequence[int]) -> list[
             raise LimitExceeded(f"channel {index}: {count} symbols, limit {MAX_COUNT}")
     reader = ByteReader(payload)
     defined: list[Prior] = []
-    heads = [_read_channel(reader, count, defined) for count in counts if count]
+    heads, entries = [], 0
+    for count in counts:
+        if count:
+            known = len(defined)
+            heads.append(_read_channel(reader, count, defined))
+            entries += sum(prior.window.n for prior in defined[known:])
+            if entries > MAX_ENTRIES:
+                raise LimitExceeded(f"tables of {entries} entries in one section, limit {MAX_ENTRIES}")
     stream = AnsDecoder(reader.rest())
     priors = [p.with_class_symbols(stream.take(p.window.n, p.class_cum)) if isinstance(p, Hist) else p for p in defined]
     remaining = iter(heads)

@@ -21,6 +21,7 @@ from .varint import ByteReader, put_varint, put_zigzag
 
 K_MAX = (1 << 24) - 1  #: |k| of any symbol
 MAX_WINDOW = 1 << 14
+MAX_ENTRIES = 1 << 21  #: of all tables of one section: eight bytes can define a table of 2**14 entries, 128 KiB
 MAX_SHIFT = 12
 MU8_MAX = 1 << 31
 FLOORS = (1, 16)  #: 16 / 2**24 is the clip of R(a)

@@ -11,7 +11,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from .fitting import Histogram, exception_bits, pool, symbol_costs
-from .priors import Prior, header_bits
+from .priors import MAX_ENTRIES, MAX_WINDOW, Prior, header_bits
 
 BLOCK = 256  #: channels planned together; keeps the cost matrix small
 WIDE = 1024  #: a channel with more distinct symbols spends too much on each for its prior's few bytes to matter
@@ -28,7 +28,19 @@ def plan_priors(histograms: Sequence[Histogram], fit: Fit, rounds: int) -> list[
         shared = _plan_block([histograms[c] for c in block], [plan[c] for c in block], fit, rounds)
         for c, prior in zip(block, shared, strict=True):
             plan[c] = prior
-    return plan
+    return _within_limit(histograms, plan, fit)
+
+
+def _within_limit(histograms: Sequence[Histogram], plan: list[Prior], fit: Fit) -> list[Prior]:
+    """The plan, its widest priors replaced by one for all their channels where the tables would pass MAX_ENTRIES."""
+    distinct = sorted({id(p): p for p in plan}.values(), key=lambda p: p.window.n)
+    ends = np.cumsum([p.window.n for p in distinct])
+    if not distinct or ends[-1] <= MAX_ENTRIES:
+        return plan
+    kept = {id(p) for p, end in zip(distinct, ends, strict=True) if end <= MAX_ENTRIES - MAX_WINDOW}
+    rest = [c for c, p in enumerate(plan) if id(p) not in kept]
+    common = fit(pool([histograms[c] for c in rest]))
+    return [p if id(p) in kept else common for p in plan]
 
 
 def _plan_block(histograms: Sequence[Histogram], plan: list[Prior], fit: Fit, rounds: int) -> list[Prior]:

@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pd4dgs_codec.bitstream import container
 from pd4dgs_codec.bitstream.canonical import pack, unpack
 from pd4dgs_codec.bitstream.container import (
     CHUNK_OVERHEAD,
@@ -136,3 +137,10 @@ def test_junk_gives_our_errors_only(data, offset):
             read_preamble(start + data)
     with pytest.raises(DecodeError):
         read_chunk(data, offset)
+
+
+def test_the_writer_refuses_a_payload_over_the_limit(monkeypatch):
+    monkeypatch.setattr(container, "MAX_PAYLOAD", 10)
+    assert len(write_chunk(1, 0, bytes(8), bytes(10))) == 30
+    with pytest.raises(EncodeError, match="payload of 11 bytes, limit 10"):
+        write_chunk(1, 0, bytes(8), bytes(11))

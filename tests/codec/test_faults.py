@@ -3,6 +3,7 @@
 import struct
 import time
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -21,9 +22,10 @@ from pd4dgs_codec.bitstream.container import (
 )
 from pd4dgs_codec.codec import header as header_module
 from pd4dgs_codec.codec import layer_meta
-from pd4dgs_codec.codec.decoder import decode
+from pd4dgs_codec.codec.decoder import decode, decode_layers
 from pd4dgs_codec.codec.encoder import encode
 from pd4dgs_codec.codec.header import unpack_header
+from pd4dgs_codec.codec.layers import Coding, write_layer
 from pd4dgs_codec.errors import DecodeError, LimitExceeded, Malformed, Pd4Error, Truncated, UnsupportedFeature
 
 SMALL = encode(make_scene(1, layers=(0, 1), anchors=2, kind="constant", hidden=(), extent=1), layers=2, effort=1)
@@ -128,6 +130,13 @@ def test_unknown_chunks_are_refused_if_critical_and_skipped_if_ancillary():
     assert decode(critical, max_layer=1).layers == (0, 1)
 
 
+def test_a_layer_is_critical_even_if_it_says_otherwise():
+    header, chunks = take_apart(FULL)
+    flagged = [chunks[0], (1, FLAG_ANCILLARY, chunks[1][2]), chunks[2]]
+    with pytest.raises(Malformed, match="layer 1 is flagged ancillary"):
+        decode(put_together(header, flagged))
+
+
 def test_layer_order_is_checked():
     header, chunks = take_apart(FULL)
     for wrong in ([chunks[1]], [chunks[0], chunks[2], chunks[1]], [chunks[0], chunks[1], chunks[1]]):
@@ -140,6 +149,33 @@ def test_unknown_header_keys():
     assert decode(put_together({**header, 64: "later", 1000: [1]}, chunks)).layers == (0, 1, 2)
     with pytest.raises(UnsupportedFeature, match="key 63"):
         decode(put_together({**header, 63: 1}, chunks))
+
+
+def test_the_header_is_a_map():
+    _, chunks = take_apart(FULL)
+    framed = write_chunk(0, 0, scene_id_of(chunks[0][2]), chunks[0][2])
+    with pytest.raises(Malformed, match="header: list, expected a map"):
+        decode(write_preamble(canonical.pack([1, 2])) + framed)
+
+
+CAMERA = {1: [1.0] * 12, 2: [500.0, 0.0, 320.0, 240.0], 3: 640, 4: 480}  # a focal length of 0
+
+
+@pytest.mark.parametrize(
+    "key, value, message",
+    [
+        (header_module.BOX, [0.0, 0.0, 1.0, 1.0, 1.0, 0.5], "lower corner"),
+        (header_module.TIME_RANGE, [2.0, 1.0], "time range 2.0..1.0"),
+        (header_module.BACKGROUND, [0.0, 1.5, 0.0], "expected 0..1"),
+        (header_module.NEAR_FAR, [4.0, 4.0], "near 4.0 and far 4.0"),
+        (header_module.UNIT, -1.0, "unit -1.0"),
+        (header_module.CAMERA, CAMERA, "focal lengths"),
+    ],
+)
+def test_values_that_no_player_could_use_are_malformed(key, value, message):
+    header, chunks = take_apart(FULL)
+    with pytest.raises(Malformed, match=message):
+        decode(put_together({**header, key: value}, chunks))
 
 
 HEADER_FAULTS = {
@@ -198,6 +234,111 @@ def test_layer_parameters_are_checked(name, which):
     assert caught.value.chunk == which
 
 
+def without(meta, key):
+    return {k: v for k, v in meta.items() if k != key}
+
+
+DEFORMATION_FAULTS = {
+    "missing without reason": (lambda m: without(m, layer_meta.NETWORKS), "key 3 is there without reason"),
+    "no scales": (lambda m: without(m, layer_meta.SCALES), "key 4 is missing"),
+    "other channels": (lambda m: {**m, layer_meta.SCALES: [[2, *[1] * 4, *[0] * 6], [3, *[1] * 4, *[0] * 6]]}, "3 cha"),
+    "empty network": (lambda m: {**m, layer_meta.NETWORKS: [[0, 3], []]}, "an empty network entry"),
+    "no head": (lambda m: {**m, layer_meta.NETWORKS: m[layer_meta.NETWORKS][:1]}, "at least one head"),
+    "outputs of a head": (lambda m: {**m, layer_meta.NETWORKS: [[0, 3], [1, 4]]}, "4 outputs, expected 3"),
+}
+
+
+@pytest.mark.parametrize("name", DEFORMATION_FAULTS)
+def test_deformations_are_whole(name):
+    change, message = DEFORMATION_FAULTS[name]
+    header, chunks = take_apart(FULL)
+    chunks[1] = (1, 0, with_meta(chunks[1][2], change))
+    with pytest.raises(Malformed, match=message):
+        decode(put_together(header, chunks))
+
+
+def test_scaffold_networks_are_all_there():
+    header, chunks = take_apart(FULL)
+    changed = with_meta(chunks[0][2], lambda m: {**m, layer_meta.NETWORKS: m[layer_meta.NETWORKS][:2]})
+    with pytest.raises(Malformed, match="expected .'opacity', 'covariance', 'color'"):
+        decode(put_together(header, [(0, 0, changed), *chunks[1:]]))
+
+
+def test_float32_planes_have_no_predictor():
+    header, chunks = take_apart(encode(make_scene(7, anchors=3), layers=2, effort=1, deformation="float32"))
+    rows = [[2, 3, 2, 4, 5, 0, 0, 1, 0, 0, 0]]
+    chunks[1] = (1, 0, with_meta(chunks[1][2], lambda m: {**m, layer_meta.SCALES: rows}))
+    with pytest.raises(Malformed, match="predictor 1 on float32 planes"):
+        decode(put_together(header, chunks))
+
+
+def test_planes_are_bounded_however_long_the_payload(monkeypatch):
+    monkeypatch.setattr(layer_meta, "MAX_PLANE_CELLS", 100)
+    with pytest.raises(LimitExceeded, match="planes of 142 cells, limit 100"):
+        decode(FULL)
+
+
+@pytest.mark.parametrize(
+    "payload, message",
+    [
+        (b"\0\0\0", "payload of 3 bytes, expected at least 4"),
+        (b"\5\0\0\0\x80", "parameters of 5 bytes in a payload of 5"),
+    ],
+)
+def test_a_payload_holds_its_parameters(payload, message):
+    header, chunks = take_apart(FULL)
+    with pytest.raises(Malformed, match=message):
+        decode(put_together(header, [(0, 0, payload), *chunks[1:]]))
+
+
+def test_sections_fill_the_payload_and_belong_to_the_mode():
+    header, chunks = take_apart(FULL)
+    longer = [(0, 0, chunks[0][2] + b"?"), *chunks[1:]]
+    with pytest.raises(Malformed, match="sections of"):
+        decode(put_together(header, longer))
+    section = {int(layer_meta.Section.FLOATS): 1}
+    change = partial(with_meta, change=lambda m: {**m, 2: {**m[2], **section}})
+    with pytest.raises(Malformed, match="section 6 is there, but nothing is left"):
+        decode(put_together(header, [(0, 0, change(chunks[0][2]) + b"?"), *chunks[1:]]))
+    with pytest.raises(Malformed, match="section symbols is missing"):
+        decode(put_together({**header, header_module.MODE: header_module.MODES["lzma"]}, chunks))
+
+
+def written(which, **changes):
+    """FULL with arrays of one layer replaced before they are coded, by the layer writer itself."""
+    header, layers, _ = decode_layers(FULL)
+    fields, chunks = take_apart(FULL)
+    changed = replace(layers[which], **{name: change(getattr(layers[which], name)) for name, change in changes.items()})
+    chunks[which] = (which, 0, write_layer(changed, Coding(effort=1))[0])
+    return put_together(fields, chunks)
+
+
+def with_first(value):
+    def change(array):
+        array = array.copy()
+        array.flat[0] = value
+        return array
+
+    return change
+
+
+SYMBOL_FAULTS = {
+    "a voxel index over 1048576": (0, {"anchor_q": lambda a: (a + (1 << 20)).astype(np.int32)}),
+    "rise of a mask code in -1": (1, {"mask_increase": with_first(-1)}),
+    "layer 0: mask code in 2": (0, {"mask_own": with_first(2)}),
+    "layer 1: mask code in .*256, expected 3..255": (1, {"mask_own": with_first(256)}),
+    "layer 2: mask code .*, expected at most 255": (2, {"mask_increase": lambda a: np.full_like(a, 255)}),
+    "a symbol over 8388608 in magnitude": (0, {"attributes": with_first((1 << 23) + 1)}),
+}
+
+
+@pytest.mark.parametrize("message", SYMBOL_FAULTS)
+def test_symbols_out_of_range_are_malformed(message):
+    which, changes = SYMBOL_FAULTS[message]
+    with pytest.raises(Malformed, match=message):
+        decode(written(which, **changes))
+
+
 @pytest.mark.parametrize(
     "row", [[2, 1, 1, 1], [2, 9999, 1, 1, 1, *[0] * 6], [0, 1, 1, 1, 1, *[0] * 6], [2, 3, 2, 4, 5, *[77] * 6]]
 )
@@ -213,6 +354,7 @@ def test_a_few_bytes_cannot_ask_for_gigabytes():
     header, chunks = take_apart(FULL)
     bombs = (
         lambda m: {**m, layer_meta.ROWS: (1 << 24) - 100},
+        lambda m: {**m, layer_meta.ROWS: (1 << 13) + 2 * len(chunks[1][2]) + 40},
         lambda m: {**m, layer_meta.SCALES: [[256, 1000, 1000, 1, 1, *[0] * 6]]},
     )
     for bomb in bombs:
@@ -221,6 +363,14 @@ def test_a_few_bytes_cannot_ask_for_gigabytes():
         with pytest.raises(LimitExceeded):
             decode(put_together(header, changed))
         assert time.perf_counter() - start < 2
+
+
+def test_parameters_are_small():
+    """msgpack takes up to 130 times its bytes in memory."""
+    header, chunks = take_apart(FULL)
+    changed = [(0, 0, with_meta(chunks[0][2], lambda m: {**m, 64: [[]] * 4096})), *chunks[1:]]
+    with pytest.raises(LimitExceeded, match="parameters of 4"):
+        decode(put_together(header, changed))
 
 
 def test_values_that_overflow_float32_are_malformed():

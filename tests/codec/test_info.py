@@ -7,6 +7,8 @@ import pytest
 from strategies import make_scene
 
 from pd4dgs_codec import FORMAT_VERSION
+from pd4dgs_codec.bitstream import canonical
+from pd4dgs_codec.bitstream.container import FLAG_ANCILLARY, read_chunk, read_preamble, write_chunk, write_preamble
 from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.encoder import encode
 from pd4dgs_codec.codec.info import hashes, info
@@ -82,3 +84,19 @@ def test_npz_keys_and_symbols():
         np.testing.assert_array_equal(value, plain[name], err_msg=name)
     assert set(arrays) - set(plain) == {f"{name}_{end}" for name in data for end in ("q", "step")}
     assert tuple(arrays["meta_rows"]) == scene.rows and arrays["meta_camera_K"].shape == (3, 3)
+
+
+def test_info_names_chunks_it_does_not_know():
+    preamble = read_preamble(DATA)
+    fields, extra = canonical.unpack(preamble.header), b"a preview"
+    fields[1].append([99, len(extra)])
+    chunk = write_chunk(99, FLAG_ANCILLARY, read_chunk(DATA, preamble.size).scene_id, extra)
+    front = write_preamble(canonical.pack(fields))
+    data = front + DATA[preamble.size :] + chunk
+    assert info(data)["chunks"] == [{"type": 99, "offset": len(data) - 29, "bytes": 29, "end": len(data)}]
+    assert [row["layer"] for row in info(data)["layers"]] == [0, 1, 2] and hashes(data) == hashes(DATA)
+
+
+def test_a_scene_without_a_camera_has_no_camera_keys():
+    scene = decode(encode(make_scene(7, anchors=2, with_camera=False), layers=2, effort=1))
+    assert not any("camera" in name for name in to_npz_dict(scene))

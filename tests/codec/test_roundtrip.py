@@ -213,6 +213,36 @@ def test_verification_notices_a_changed_symbol(monkeypatch):
     assert encode(scene, verify=False)
 
 
+def test_verification_notices_a_file_that_does_not_decode(monkeypatch):
+    monkeypatch.setattr(encoder, "scene_id_of", lambda payload: bytes(8))
+    with pytest.raises(EncodeError, match="verification: the file does not decode"):
+        encode(make_scene(0, layers=(0,)))
+
+
+def test_verification_notices_lost_rows_and_wrong_values(monkeypatch):
+    """What the decoder hands out is compared, not only what it reads."""
+    scene = make_scene(0, layers=(0,))
+
+    def first_changed(change):
+        """assemble, with the scene of its first call changed: that of the file, before the one that was meant."""
+        calls = []
+
+        def changed(*args):
+            calls.append(args)
+            return change(assemble(*args)) if len(calls) == 1 else assemble(*args)
+
+        return changed
+
+    assemble = encoder.assemble
+    for message, change in (
+        ("layers and rows", lambda s: replace(s, rows=(s.rows[0] + 1,))),
+        ("layer 0 decodes to other values", lambda s: replace(s, feature=s.feature + np.float32(1))),
+    ):
+        monkeypatch.setattr(encoder, "assemble", first_changed(change))
+        with pytest.raises(EncodeError, match=f"verification: .*{message}"):
+            encode(scene)
+
+
 @given(st.sampled_from(sorted(GLOBAL_HEADS)), st.sampled_from(sorted(LOCAL_HEADS)))
 @settings(max_examples=3)
 def test_single_heads(global_head, local_head):

@@ -7,8 +7,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pd4dgs_codec.entropy.ans import ans_encode
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
-from pd4dgs_codec.entropy.priors import CONST, GAUSS, GMM2, HIST, K_MAX
+from pd4dgs_codec.entropy.priors import CONST, GAUSS, GMM2, HIST, K_MAX, MAX_ENTRIES, MAX_WINDOW
+from pd4dgs_codec.entropy.tables import norm_table, uniform_table
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
 from pd4dgs_codec.errors import DecodeError, EncodeError, LimitExceeded, Malformed, UnsupportedFeature
 
@@ -238,6 +240,24 @@ def test_counts_are_bounded(count):
         decode_channels(b"\0\0", [count])
 
 
+def test_tables_of_a_section_are_bounded():
+    """Eight bytes define a table of 128 KiB: 86 kB of them took 1.6 GB."""
+    wide = payload_of(2, 0, MAX_WINDOW - 2, 0, 1280)
+    most = MAX_ENTRIES // MAX_WINDOW
+    assert len(decode_channels(wide * most, [1] * most)) == most
+    with pytest.raises(LimitExceeded, match="entries"):
+        decode_channels(wide * (most + 1), [1] * (most + 1))
+
+
+def test_wide_channels_share_a_table_rather_than_pass_the_limit():
+    rng = np.random.default_rng(6)
+    centres = rng.integers(-(2**23), 2**23, MAX_ENTRIES // MAX_WINDOW + 20)
+    narrow = np.array([0, 1, 1, 2, 5], np.int32)
+    channels = [narrow, *((c + rng.integers(-8000, 8000, 40)).astype(np.int32) for c in centres)]
+    coded = encode_channels(channels, effort=1)
+    assert_same(decode_channels(coded.payload, [len(c) for c in channels]), channels)
+
+
 @given(st.integers(-(2**31), 2**31), st.integers(0, 2**33))
 def test_varints_round_trip(signed, unsigned):
     out = bytearray()
@@ -245,3 +265,15 @@ def test_varints_round_trip(signed, unsigned):
     put_varint(out, unsigned)
     reader = ByteReader(bytes(out))
     assert (reader.zigzag(2**31, "x"), reader.varint(2**33, "y"), reader.remaining) == (signed, unsigned, 0)
+
+
+def test_low_bits_past_the_last_symbol_are_malformed():
+    """A window may end above the largest symbol; what is coded there may not."""
+    top = K_MAX - 1
+    head = payload_of(2 * 4) + bytes((2, 1)) + payload_of(2 * (top - 4), 0, 0, 1280)
+    symbols = [np.array([1]), np.array([3])]
+    words = ans_encode(symbols, [norm_table(2, 128, 0, 1), uniform_table(2)])
+    with pytest.raises(Malformed, match=f"symbol {K_MAX + 2}, limit {K_MAX}"):
+        decode_channels(head + words, [1])
+    words = ans_encode([symbols[0], np.array([1])], [norm_table(2, 128, 0, 1), uniform_table(2)])
+    assert decode_channels(head + words, [1])[0].tolist() == [K_MAX]

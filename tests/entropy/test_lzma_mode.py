@@ -1,10 +1,13 @@
 """The LZMA mode: round trips, the recorded layout, bounded and checked decompression."""
 
+import lzma
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pd4dgs_codec.entropy import lzma_mode
 from pd4dgs_codec.entropy.lzma_mode import (
     decode_channels_lzma,
     decode_floats_lzma,
@@ -12,6 +15,7 @@ from pd4dgs_codec.entropy.lzma_mode import (
     encode_floats_lzma,
 )
 from pd4dgs_codec.entropy.priors import K_MAX
+from pd4dgs_codec.entropy.varint import put_varint
 from pd4dgs_codec.errors import DecodeError, EncodeError, LimitExceeded, Malformed
 
 bounded = st.integers(-100, 100) | st.integers(900, 1100) | st.integers(-K_MAX, K_MAX)
@@ -91,3 +95,45 @@ def test_floats_that_are_not_numbers_are_refused_on_both_sides():
     good[at : at + 4] = np.float32(np.nan).tobytes()
     with pytest.raises(Malformed, match="NaN"):
         decode_floats_lzma(bytes(good), [1])
+
+
+def test_bytes_that_say_what_does_not_exist_are_refused():
+    payload = bytearray(encode_channels_lzma([np.array([5, 6, 7], np.int32)]).payload)
+    payload[2] |= 3
+    with pytest.raises(Malformed, match="8-byte symbols"):
+        decode_channels_lzma(bytes(payload), [3])
+    over = bytes(payload[:2]) + bytes([0]) + b"\0"
+    with pytest.raises(Malformed, match="expected 3 and its end"):
+        decode_channels_lzma(over, [3])
+
+
+def test_a_base_that_carries_symbols_past_the_limit_is_malformed():
+    payload = encode_channels_lzma([np.array([K_MAX, K_MAX - 9], np.int32)], effort=1).payload
+    head = bytearray()
+    put_varint(head, 8 * K_MAX)  # base K, integers of one byte
+    at = 2 + len(head)
+    assert payload[2:at] == bytes(head), "the encoder's own choice for symbols this high"
+    wrong = lzma_of(np.array([1, 0], np.int8))
+    with pytest.raises(Malformed, match="limit .k. <= 16777215"):
+        decode_channels_lzma(payload[:at] + wrong, [2])
+
+
+def lzma_of(numbers):
+    filters = [{"id": lzma.FILTER_LZMA2, "dict_size": 4096}]
+    return lzma.compress(numbers.tobytes(), format=lzma.FORMAT_RAW, filters=filters)
+
+
+def test_long_data_is_sampled_to_choose_a_layout():
+    rng = np.random.default_rng(3)
+    channel = np.rint(rng.normal(0, 3000, 300_000)).astype(np.int32)
+    coded = encode_channels_lzma([channel], effort=4)
+    np.testing.assert_array_equal(decode_channels_lzma(coded.payload, [channel.size])[0], channel)
+    assert coded.payload[1] == 1, "bytes of wide numbers lie in planes, which the sample must show"
+
+
+def test_the_encoder_refuses_what_it_cannot_write(monkeypatch):
+    with pytest.raises(EncodeError, match="effort is 10"):
+        encode_floats_lzma([], effort=10)
+    monkeypatch.setattr(lzma_mode, "MAX_RAW", 11)
+    with pytest.raises(EncodeError, match="12 bytes before LZMA, limit 11"):
+        encode_floats_lzma([np.zeros(3, np.float32)])

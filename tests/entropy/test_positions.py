@@ -138,6 +138,8 @@ def test_wrong_counts_and_headers_are_refused():
         decode_positions(payload[:12] + b"\x16" + payload[13:], len(cells))
     with pytest.raises(Malformed):
         decode_positions(payload + bytes(4), len(cells))
+    with pytest.raises(Malformed, match="the minimum or the depths do not fit"):
+        decode_positions(bytes(12) + b"\1\0\0", 1)  # one cell in the upper half, so the minimum is another
     with pytest.raises(Malformed, match="outside int32"):
         decode_positions(b"\xff\xff\xff\x7f" + payload[4:], len(cells))
 

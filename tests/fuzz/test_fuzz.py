@@ -1,0 +1,334 @@
+"""Hostile input: a short run of the fuzzer, files that once broke a promise, and the fuzzer's own eyes."""
+
+import os
+import random
+import time
+from functools import partial
+from pathlib import Path
+
+import fuzz
+import numpy as np
+import pytest
+from fuzzing import check, damage, files, mutate
+from strategies import make_scene
+
+from pd4dgs_codec import decode, encode
+from pd4dgs_codec.codec import layer_meta
+from pd4dgs_codec.codec.decoder import decode_layers
+from pd4dgs_codec.entropy.priors import MAX_ENTRIES, MAX_WINDOW
+from pd4dgs_codec.entropy.varint import put_varint
+from pd4dgs_codec.errors import DecodeError
+
+SEEDS = files.built_seeds()
+BY_NAME = {seed.name: seed for seed in SEEDS}
+KNOWN = files.known_prefixes(SEEDS)
+CASES = sorted((Path(__file__).parent / "cases").glob("*.pd4"))
+
+
+def names(figures):
+    return {row["kind"] for row in figures.findings}
+
+
+# -- the decoder -------------------------------------------------------------------------------------------------------
+
+
+def test_a_short_run_finds_nothing():
+    figures = fuzz.run_inputs(SEEDS, 20, 0, 4000, reference=20)
+    assert not figures.findings
+    assert figures.compared > 150
+    assert figures.inputs == 4000 == sum(figures.outcomes.values())
+    assert figures.repaired >= figures.inputs / 2
+    shares = figures.shares()
+    assert shares["header's checksum"] > 0.7 and shares["first chunk's"] > 0.5
+    assert {"Malformed", "LimitExceeded", "UnsupportedFeature", "ChecksumMismatch", "Truncated"} <= {*figures.outcomes}
+
+
+@pytest.mark.parametrize("path", CASES, ids=lambda path: path.stem)
+def test_a_file_that_once_broke_a_promise(path):
+    data = path.read_bytes()
+    for door in range(8):
+        check.examine(mutate.Case(data, True, path.stem), KNOWN, random.Random(door))
+    check.check_memory(data)
+
+
+def with_section(name, chunk, number, data, **meta):
+    """A seed with one section replaced and layer parameters changed, everything else right."""
+    parts = files.take_apart(BY_NAME[name].data)
+    parts.chunks[chunk].sections[number] = bytes(data)
+    parts.chunks[chunk].meta |= {getattr(layer_meta, key): value for key, value in meta.items()}
+    return files.put_together(parts)
+
+
+def varints(*numbers):
+    out = bytearray()
+    for number in numbers:
+        put_varint(out, number)
+    return out
+
+
+def constant_planes(predictor):
+    """535 bytes that declare 3.6 million plane cells, all of them one symbol."""
+    scales = [[1, 4096, 40 - i, 40 - i, 40 - i, *[predictor] * 6] for i in range(8)]
+    return with_section("wide-planes", 1, 3, varints(0, 2, *[16] * 47), SCALES=scales)
+
+
+def many_exceptions():
+    """Weights each of which is an exception: two bytes for two 64-bit integers."""
+    count = 35 * 3000
+    networks = [[0, 3000, 10], [1, 70], [2, 30]]
+    exceptions = varints(1, 0, count - 1) + bytes(2 * count)
+    return with_section("wide-planes", 0, 4, exceptions + varints(*[16] * 7), NETWORKS=networks)
+
+
+def wide_tables():
+    """As many tables of full width as a section may have, for one symbol each."""
+    out, channels = bytearray(), MAX_ENTRIES // MAX_WINDOW
+    for _ in range(channels):
+        out += varints(2, 0, MAX_WINDOW - 2, 0, 1280)
+    out += varints(*[16] * (6 * 64 - channels))
+    return with_section("wide-planes", 1, 3, out, SCALES=[[64, 1, 1, 1, 1, *[0] * 6]])
+
+
+def many_anchors(mode):
+    scene = make_scene(1, layers=(0, 1), anchors=12_000, extent=40, kind="gaussian")
+    return encode(scene, layers=2, effort=1, mode=mode, verify=False)
+
+
+BIG = {
+    "planes by the median": partial(constant_planes, 3),
+    "planes by sums": partial(constant_planes, 4),
+    "exceptions": many_exceptions,
+    "tables": wide_tables,
+    "anchors": partial(many_anchors, "ans"),
+    "anchors, lzma": partial(many_anchors, "lzma"),
+}
+
+
+@pytest.mark.parametrize("name", BIG)
+def test_memory_stays_within_its_bound(name):
+    data = BIG[name]()
+    decode(data)  # the file is valid: all of what it declares is decoded
+    assert 0.02 < check.check_memory(data) <= 1
+
+
+def test_sections_that_no_limit_covered_are_refused():
+    out = bytearray()
+    for _ in range(6 * 256):
+        out += varints(2, 0, MAX_WINDOW - 2, 0, 1280)
+    data = with_section("wide-planes", 1, 3, out, SCALES=[[256, 1, 1, 1, 1, *[0] * 6]])
+    with pytest.raises(DecodeError, match="entries"):
+        decode(data)
+    check.check_memory(data)
+
+
+def test_damage_and_cuts_of_a_file_are_noticed():
+    data = [BY_NAME["all-heads"].data, encode(make_scene(9, anchors=200, extent=9), layers=2, effort=1)]
+    outcomes, findings = damage.damage(data, 0, 3000)
+    assert not findings
+    assert {"ChecksumMismatch", "Truncated", "Malformed"} <= set(outcomes)
+
+
+# -- the fuzzer sees what it is to see ---------------------------------------------------------------------------------
+
+
+def test_inputs_are_named_by_their_numbers():
+    cases = [mutate.make_case(SEEDS, 3, index) for index in range(300)]
+    assert cases == [mutate.make_case(SEEDS, 3, index) for index in range(300)]
+    assert len({case.data for case in cases}) > 280
+    assert cases != [mutate.make_case(SEEDS, 4, index) for index in range(300)]
+
+
+def test_taking_apart_and_putting_together_changes_nothing():
+    for seed in SEEDS:
+        assert files.put_together(files.take_apart(seed.data)) == seed.data
+
+
+def raising(error):
+    def raise_it(*args, **options):
+        raise error
+
+    return raise_it
+
+
+class Panic(BaseException):
+    """What the coder library raises."""
+
+
+@pytest.mark.parametrize("error", [ValueError("x"), MemoryError(), RecursionError(), Panic("x")])
+def test_another_exception_is_a_finding(monkeypatch, error):
+    monkeypatch.setattr(check, "decode", raising(error))
+    figures = fuzz.run_inputs(SEEDS, 0, 0, 3)
+    assert names(figures) == {"exception"} and len(figures.findings) == 3
+
+
+def test_two_lines_are_a_finding(monkeypatch):
+    monkeypatch.setattr(check, "decode", raising(DecodeError("one\ntwo")))
+    assert names(fuzz.run_inputs(SEEDS, 0, 0, 3)) == {"message"}
+
+
+def test_a_silent_wrong_decode_is_a_finding():
+    parts = files.take_apart(BY_NAME["no-anchor"].data)
+    parts.header[files.header_module.VOXEL_SIZE] *= 2
+    wrong = mutate.Case(files.put_together(parts), False, "as if a checksum had let it pass")
+    with pytest.raises(check.Finding, match="no seed") as caught:
+        check.examine(wrong, KNOWN, random.Random(0))
+    assert caught.value.kind == "silent"
+
+
+def test_damage_that_decodes_is_a_finding(monkeypatch):
+    whole = BY_NAME["all-heads"].data
+    layers = decode_layers(whole)
+    monkeypatch.setattr(damage.decoder, "decode_layers", lambda *args, **options: layers)
+    _, findings = damage.damage([whole], 0, 100)
+    assert any("damaged file decodes" in line for line in findings)
+    assert any("bytes decode as a whole file" in line for line in findings)
+
+
+def test_doors_that_disagree_are_a_finding(monkeypatch):
+    monkeypatch.setattr(check, "_streamed", lambda data, rng: [(0,)])
+    assert "disagreement" in names(fuzz.run_inputs(SEEDS, 0, 0, 40))
+
+
+@pytest.mark.parametrize("change", [lambda rows: rows[:1], raising(KeyError("x"))])
+def test_a_reference_decoder_that_differs_is_a_finding(monkeypatch, change):
+    reference = check._reference()
+    true = reference.hashes
+    monkeypatch.setattr(reference, "hashes", lambda data: change(true(data)))
+    assert "reference" in names(fuzz.run_inputs(SEEDS, 1, 0, 30, reference=1))
+
+
+def test_a_file_that_only_we_decode_is_a_finding(monkeypatch):
+    reference = check._reference()
+    monkeypatch.setattr(reference, "hashes", raising(reference.Fault("Malformed", "x")))
+    with pytest.raises(check.Finding, match="refuses"):
+        check.compare_reference(BY_NAME["no-anchor"].data)
+
+
+def test_too_much_memory_is_a_finding(monkeypatch):
+    def greedy(data, **options):
+        np.zeros(100 << 20, np.uint8)
+        return decode(data, **options)
+
+    monkeypatch.setattr(check, "decode", greedy)
+    with pytest.raises(check.Finding, match="bytes at once"):
+        check.check_memory(BY_NAME["no-anchor"].data)
+
+
+def test_a_slow_decode_is_a_finding(monkeypatch):
+    monkeypatch.setattr(check, "MAX_SECONDS", 0.0)
+    assert "hang" in names(fuzz.run_inputs(SEEDS, 0, 0, 20))
+
+
+@pytest.mark.parametrize("kind, act", [("crash", partial(os._exit, 134)), ("hang", partial(time.sleep, 60))])
+def test_a_process_that_ends_or_sticks_is_a_finding_and_the_run_goes_on(monkeypatch, tmp_path, kind, act):
+    def examine(case, known, rng):
+        if case.data == bad.data:
+            act()
+        return check.Outcome("decoded", 0.0, 1)
+
+    bad = mutate.make_case(SEEDS, 5, 13)
+    monkeypatch.setattr(fuzz, "examine", examine)
+    monkeypatch.setattr(fuzz, "check_memory", lambda data: 0.0)
+    monkeypatch.setattr(fuzz, "STUCK_SECONDS", 1.5)
+    monkeypatch.setattr(fuzz, "BATCH", 20)
+    figures = fuzz.run_many(SEEDS, 5, 50, 30.0, 2)
+    assert [(row["input"], row["kind"]) for row in figures.findings] == [(13, kind)]
+    assert figures.inputs == 50 and figures.outcomes["decoded"] == 49
+    fuzz.save_findings(SEEDS, 5, figures, tmp_path)
+    assert (tmp_path / f"5-13-{kind}.pd4").read_bytes() == bad.data
+
+
+def test_the_command_prints_a_table_and_writes_figures(monkeypatch, tmp_path, capsys):
+    monkeypatch.setattr(fuzz, "all_seeds", lambda paths: SEEDS)
+    target = tmp_path / "figures.json"
+    assert fuzz.main(["--inputs", "60", "--seed", "2", "--json", str(target), "--out", str(tmp_path)]) == 0
+    assert "| inputs | 60 |" in capsys.readouterr().out
+    assert '"inputs": 60' in target.read_text()
+    assert fuzz.main(["--input", "7", "--out", str(tmp_path)]) == 0
+    assert mutate.make_case(SEEDS, 0, 7).recipe in capsys.readouterr().out
+
+
+# -- long --------------------------------------------------------------------------------------------------------------
+
+
+def trained_like():
+    """At most 4 kB with three layers, every head, masks that rise, and weights and planes that are not constant."""
+    data = encode(make_scene(11, anchors=12, kind="gaussian", extent=4, hidden=(4,), heads=SMALL_HEADS), layers=2)
+    assert 2000 < len(data) <= 4096
+    return data
+
+
+SMALL_HEADS = ({"position": 3, "scaling": 6}, {"mean": 3, "opacity": 1})
+
+
+@pytest.mark.slow
+def test_every_flip_and_every_cut_of_a_small_file_is_caught():
+    data = trained_like()
+    for bit in range(8 * len(data)):
+        flipped = bytearray(data)
+        flipped[bit // 8] ^= 1 << bit % 8
+        with pytest.raises(DecodeError):
+            decode(bytes(flipped))
+    ends = damage.chunk_ends(data)
+    with damage.whole_payloads_known([data]) as originals:
+        for size in range(len(data)):
+            damage.check_cut(data, size, originals[data], ends)
+
+
+def real_files():
+    given = os.environ.get("PD4DGS_FILES")
+    paths = given.split(os.pathsep) if given else [fuzz.ROOT / "out"]
+    return [seed.data for seed in files.given_seeds(Path(p) for p in paths if Path(p).exists())]
+
+
+@pytest.mark.slow
+def test_a_hundred_thousand_damages_of_real_files_are_caught():
+    data = real_files()
+    if not data:
+        pytest.skip("no trained files: name some in PD4DGS_FILES, or make out/ with tools/demo.sh")
+    outcomes, findings = damage.damage(data, 0, 100_000)
+    assert not findings
+    assert sum(outcomes.values()) >= 102_000
+
+
+@pytest.mark.slow
+def test_checks_take_a_twentieth_of_decoding(monkeypatch):
+    """Checksums, scene id, header, parameters, tables, ranges, duplicates, finiteness, timed where they are called."""
+    from pd4dgs_codec.bitstream import container
+    from pd4dgs_codec.codec import decoder, layers, symbols
+    from pd4dgs_codec.entropy import ans
+
+    options = {"channels": 16, "sides": (64, 64, 64, 40), "hidden": (32,), "width": 32}
+    data = encode(make_scene(1, anchors=20_000, extent=60, kind="gaussian", **options), layers=2, effort=1)
+    spent = [0.0]
+
+    def timed(function):
+        def run(*args, **kwargs):
+            start = time.perf_counter()
+            try:
+                return function(*args, **kwargs)
+            finally:
+                spent[0] += time.perf_counter() - start
+
+        return run
+
+    checks = [
+        (container, "read_preamble"),
+        (container.zlib, "crc32"),
+        (decoder, "scene_id_of"),
+        (decoder, "unpack_header"),
+        (layers, "read_meta"),
+        (layers, "_check_ranges"),
+        (symbols, "_check_scene"),
+        (ans, "_frequencies"),
+    ]
+    decode(data)
+    for module, name in checks:
+        monkeypatch.setattr(module, name, timed(getattr(module, name)))
+    shares = []
+    for _ in range(9):
+        spent[0], start = 0.0, time.perf_counter()
+        decode(data)
+        shares.append(spent[0] / (time.perf_counter() - start))
+    print(f"checks take {min(shares):.1%} to {max(shares):.1%} of decoding {len(data)} bytes")
+    assert sorted(shares)[4] <= 0.05
