@@ -95,11 +95,11 @@ class Deformation:
 class Steps:
     """Quantisation steps Q, each a positive normal binary32: x_hat = k * Q."""
 
-    feature: float = 0.025
-    scaling_log: float = 0.03
+    feature: float = 0.035
+    scaling_log: float = 0.04
     offset: float = 0.05
-    planes_global: float = 0.05
-    planes_local: float = 0.06
+    planes_global: float = 0.1
+    planes_local: float = 0.12
     weights_scaffold: float = 0.004
     weights_global: float = 0.001
     weights_local: float = 0.001

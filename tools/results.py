@@ -21,11 +21,11 @@ from pd4dgs_codec.render.threads import configure
 SHARED = Path(os.environ.get("PD4DGS_SHARED", Path(__file__).resolve().parents[2] / "shared" / "data"))
 #: name, source, downscale, preset, iterations, time limit in seconds
 SCENES = (
-    ("shelf-hand", SHARED / "shelf-hand", 2, "small", 4_629, 600.0),
-    ("bouncing-balls", SHARED / "bouncing-balls", 4, "small", 10_000, 600.0),
-    ("synthetic-local", "synthetic:local", 1, "tiny", 1_500, 240.0),
-    ("synthetic-fast", "synthetic:fast", 1, "tiny", 1_500, 240.0),
-    ("shelf-hand-paper", SHARED / "shelf-hand", 2, "paper", 4_600, 720.0),
+    ("shelf-hand", SHARED / "shelf-hand", 2, "small", 4_600, 600.0),
+    ("bouncing-balls", SHARED / "bouncing-balls", 4, "small", 9_000, 600.0),
+    ("synthetic-local", "synthetic:local", 1, "tiny", 2_000, 300.0),
+    ("synthetic-fast", "synthetic:fast", 1, "tiny", 2_000, 300.0),
+    ("shelf-hand-paper", SHARED / "shelf-hand", 2, "paper", 4_600, 1_500.0),
 )
 #: Bytes per layer that the PD-4DGS paper publishes (average over the seven Dycheck iPhone scenes).
 PUBLISHED = (436_000, 1_187_000, 5_275_000)

@@ -56,10 +56,11 @@ def quality_table(results: Sequence[dict[str, Any]]) -> str:
 
 
 def coding_table(results: Sequence[dict[str, Any]]) -> str:
-    """Per scene and layer: the modes' bytes, and what the coder spends against the rate model and against LZMA."""
+    """Per scene and layer, and for all layers of a scene together: the modes' bytes, and what the coder spends against
+    the rate model and against LZMA."""
     rows = []
     for result in results:
-        for row in result["coding"]:
+        for row in (*result["coding"], all_layers(result["coding"])):
             draco = row.get("draco_position_bytes")
             rows.append(
                 (
@@ -86,6 +87,28 @@ def coding_table(results: Sequence[dict[str, Any]]) -> str:
         "positions / Draco",
     )
     return markdown(head, rows)
+
+
+def all_layers(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """One row for the layers of a file together: sums, and ratios of sums; None where a layer has no figure."""
+    sums: dict[str, Any] = {"layer": "all"}
+    for key in (*BYTES, "position_bytes", "draco_position_bytes"):
+        values = [row.get(key) for row in rows]
+        sums[key] = None if None in values else sum(values)  # type: ignore[arg-type]
+    weights = {
+        "payload_over_rate": [row.get("rate_bits") for row in rows],
+        "train_over_rate": [row.get("rate_bits") for row in rows],
+        "best_over_gauss": [_product(row.get("rate_bits"), row.get("payload_over_rate")) for row in rows],
+        "ans_over_lzma": [row.get("lzma_symbol_bytes") for row in rows],
+    }
+    for key, weight in weights.items():
+        parts = [_product(row.get(key), w) for row, w in zip(rows, weight, strict=True)]
+        sums[key] = None if None in parts or not parts else sum(parts) / sum(weight)  # type: ignore[arg-type]
+    return sums
+
+
+def _product(a: float | None, b: float | None) -> float | None:
+    return None if a is None or b is None else a * b
 
 
 def _ratio(value: float | None, digits: int = 4) -> str:

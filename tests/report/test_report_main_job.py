@@ -195,19 +195,36 @@ def test_a_layer_that_one_encoding_drops_is_shown_as_absent(finished):
 
 def test_the_results_become_markdown_tables_and_a_plot(finished, tmp_path):
     result = finished[1]
-    for table in (tables.quality_table([result, result]), tables.coding_table([result, result])):
+    levels = [str(row["level"]) for row in result["evaluation"]["levels"]]
+    for table, numbers in (
+        (tables.quality_table([result, result]), levels),
+        (tables.coding_table([result, result]), [*levels, "all"]),
+    ):
         rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
         assert len({len(line) for line in table.splitlines()}) == 1  # columns line up
         assert len({len(row) for row in rows}) == 1 and set("".join(rows[1])) == {"-"}
-        assert len(rows) == 2 + 2 * len(result["evaluation"]["levels"])
         assert all(row[0] == "discs" for row in rows[2:])
-        assert [row[1] for row in rows[2:]] == 2 * [str(r["level"]) for r in result["evaluation"]["levels"]]
+        assert [row[1] for row in rows[2:]] == 2 * numbers
         assert all(cell for row in rows for cell in row)
     assert f"{result['evaluation']['levels'][-1]['cumulative_bytes']:,}" in tables.quality_table([result])
     assert f"{result['coding'][0]['lzma_bytes']:,}" in tables.coding_table([result])
     pytest.importorskip("matplotlib")
     tables.time_plot([result], tmp_path / "plot.png")
     assert Image.open(tmp_path / "plot.png").width > 300
+
+
+def test_the_row_of_all_layers_holds_sums_and_ratios_of_sums():
+    row = {"ans_bytes": 10, "lzma_bytes": 20, "lzma_float32_bytes": 30, "position_bytes": 1.0}
+    row |= {"draco_position_bytes": 2.0, "rate_bits": 100.0, "payload_over_rate": 1.0, "train_over_rate": 1.0}
+    row |= {"best_over_gauss": 0.5, "ans_over_lzma": 0.5, "lzma_symbol_bytes": 10.0}
+    other = row | {"rate_bits": 300.0, "payload_over_rate": 2.0, "best_over_gauss": 1.0, "lzma_symbol_bytes": 30.0}
+    total = tables.all_layers([row, other | {"ans_over_lzma": 0.9}])
+    assert (total["ans_bytes"], total["lzma_float32_bytes"], total["draco_position_bytes"]) == (20, 60, 4.0)
+    assert total["payload_over_rate"] == (100 + 600) / 400
+    assert total["best_over_gauss"] == (50 + 600) / 700
+    assert total["ans_over_lzma"] == pytest.approx((5 + 27) / 40)
+    missing = tables.all_layers([row, other | {"lzma_bytes": None, "ans_over_lzma": None}])
+    assert missing["lzma_bytes"] is None and missing["ans_over_lzma"] is None and missing["ans_bytes"] == 20
 
 
 def test_draco_positions_cost_some_bits_and_no_origin():
