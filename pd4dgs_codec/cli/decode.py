@@ -124,6 +124,7 @@ def _summary(scene: Scene, data: bytes, complete: bool, seconds: float, args: ar
         "output": args.output,
         "bytes": len(data),
         "complete": complete,
+        "max_layer": args.max_layer,
         "seconds": round(seconds, 4),
         "anchors": len(scene.anchor_q),
         "global_deformation": scene.global_deformation is not None,
@@ -137,7 +138,12 @@ def _text(result: dict[str, Any]) -> str:
         (row["layer"], *(number(row[key], 0) for key in ("bytes", "end", "anchors", "active")))
         for row in result["layers"]
     ]
-    state = "whole and valid" if result["complete"] else "cut; valid so far"
+    if not result["complete"]:
+        state = "cut; valid so far"
+    elif result["max_layer"] is not None:  # what follows the prefix was not looked at
+        state = f"layers {', '.join(str(row['layer']) for row in result['layers'])} whole and valid"
+    else:
+        state = "whole and valid"
     name = "stdin" if result["input"] == STDIO else result["input"]
     lines = [
         f"{name}: {result['bytes']:,} bytes, {state}, decoded in {result['seconds']:.3f} s",
