@@ -18,22 +18,11 @@ from torch.autograd.function import once_differentiable
 
 from pd4dgs_codec.errors import DataError, TrainError
 from pd4dgs_codec.model import hexplane_kernels as kernels
+from pd4dgs_codec.model.layers import round_straight_through
 from pd4dgs_codec.model.plane_layout import TIME_AXIS, PlaneLayout
 from pd4dgs_codec.model.plane_regularisers import regularisers
 from pd4dgs_codec.model.simd import LANES
 from pd4dgs_codec.scene import PLANES
-
-
-class _Round(torch.autograd.Function):
-    """round(x / step) * step; the gradient passes unchanged (straight-through)."""
-
-    @staticmethod
-    def forward(ctx, x: Tensor, step: float) -> Tensor:
-        return torch.div(x, step).round_().mul_(step)
-
-    @staticmethod
-    def backward(ctx, g: Tensor):
-        return g, None
 
 
 class _Sample(torch.autograd.Function):
@@ -178,8 +167,7 @@ class HexPlane(nn.Module):
         if one_time and self.grid.device.type == "cpu" and self.grid.shape[1] % LANES == 0:
             box = self.box.to(self.grid.dtype)
             return _Sample.apply(self.grid, self.layout, box, points.contiguous(), float(t), step)
-        grid = self.grid if step is None else _Round.apply(self.grid, step)
-        return sample_reference(grid, self.layout, self.box, points, t)
+        return sample_reference(round_straight_through(self.grid, step), self.layout, self.box, points, t)
 
     def regularisers(self) -> dict[str, Tensor]:
         """Unweighted plane_smooth, time_smooth, time_l1: see `plane_regularisers`."""

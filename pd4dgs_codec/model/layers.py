@@ -12,11 +12,19 @@ from torch.nn import functional as F
 from pd4dgs_codec.scene import Network
 
 
+class _Round(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx, x: Tensor, step: float) -> Tensor:
+        return torch.div(x, step).round_().mul_(step)
+
+    @staticmethod
+    def backward(ctx, g: Tensor):
+        return g, None
+
+
 def round_straight_through(x: Tensor, step: float | None) -> Tensor:
     """round(x / step) * step with the identity's gradient; x itself if step is None."""
-    if step is None:
-        return x
-    return x + (torch.round(x.detach() / step) * step - x.detach())
+    return x if step is None else _Round.apply(x, step)
 
 
 class MLP(nn.Module):

@@ -7,7 +7,8 @@ torch = pytest.importorskip("torch")
 numba = pytest.importorskip("numba")
 
 from pd4dgs_codec.errors import DataError, TrainError  # noqa: E402
-from pd4dgs_codec.model.hexplane import HexPlane, _Round, _Sample, sample_reference  # noqa: E402
+from pd4dgs_codec.model.hexplane import HexPlane, _Sample, sample_reference  # noqa: E402
+from pd4dgs_codec.model.layers import round_straight_through  # noqa: E402
 from pd4dgs_codec.model.plane_layout import PlaneLayout  # noqa: E402
 from pd4dgs_codec.model.plane_regularisers import TERMS, regularisers, regularisers_reference  # noqa: E402
 from pd4dgs_codec.scene import PLANES  # noqa: E402
@@ -123,7 +124,7 @@ def test_rounding_is_straight_through(channels):
     plane, points, step = field(channels=channels), points_in(100), 0.25
     rounded = field(channels=channels)
     with torch.no_grad():
-        rounded.grid.copy_(_Round.apply(plane.grid, step))
+        rounded.grid.copy_(round_straight_through(plane.grid, step))
     assert not torch.equal(rounded.grid, plane.grid)
     found = value_and_gradients(plane, plane(points, 0.4, step=step), points)
     expected = value_and_gradients(rounded, rounded(points, 0.4), points)

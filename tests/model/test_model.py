@@ -57,7 +57,7 @@ def small_model(heads=ALL_HEADS, masks=FLAT, *, anchors=80, seed=0, channels=8, 
     torch.nn.init.constant_(networks["opacity"].linears[-1].bias, opacity)
     config = DeformationConfig(5, 4, channels, (1, 2), 8, ())
     fields = [
-        DeformationField.fresh(replace(config, heads=names), BOX, widths, 0.02) if names else None
+        DeformationField.fresh(replace(config, heads=names), BOX, widths, None, 0.02) if names else None
         for names, widths in zip(heads, (GLOBAL_HEADS, LOCAL_HEADS), strict=True)
     ]
     codes = np.broadcast_to(np.asarray(masks, np.float64), (anchors, 3)) * MASK_STEP
