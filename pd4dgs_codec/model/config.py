@@ -50,6 +50,6 @@ PRESETS: dict[str, ModelConfig] = {
         DeformationConfig(64, 100, 16, (1, 2), 64, _LOCAL),
         initial_anchors=26_000,
         max_anchors=50_000,
-        steps=Steps(planes_local=0.2),  # twice the cells: coarser, for the same bytes
+        steps=Steps(planes_local=0.3),  # twice the cells: coarser, for the same bytes
     ),
 }
