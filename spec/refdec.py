@@ -23,6 +23,7 @@ K = (1 << 24) - 1  # clause 14: coded symbols
 MAX_SYMBOL = 1 << 23  # clause 14: symbols of attributes, plane samples and weights
 MAX_VOXEL = 1 << 20
 MAX_COUNT = 1 << 26
+VARINT_MAX = (1 << 35) - 1  # clause 7.1: five bytes of seven bits
 TOTAL = 1 << 24
 PLANES = (("xy", 0, 1), ("xz", 0, 2), ("xt", 0, 3), ("yz", 1, 2), ("yt", 1, 3), ("zt", 2, 3))
 ATTRIBUTES = (("feature", 32), ("scaling_log", 6), ("offset", 30))
@@ -74,8 +75,12 @@ class Reader:
         return struct.unpack(form, self.take(struct.calcsize(form)))[0]
 
     def byte(self, high=255):
-        value = self.number("B")
-        need(value <= high, f"a byte is {value}, expected at most {high}")
+        return limited(self.number("B"), high, "a byte")
+
+    # 2.3 Reserved and unused: "A reserved bit or value MUST be zero or absent in a 1.0 file"
+    def bits(self, used):
+        value = self.byte()
+        need(value >> used == 0, f"a byte is {value:#x}, expected {used} bits")
         return value
 
     # 7.1 Variable-length integers: "A varint holds seven bits per byte, least significant first; the high bit of a
@@ -582,7 +587,7 @@ def read_normal(reader, n):
 # differences symbol r adds r − top to the class before (0 before the first), of a table of 2·top + 1 symbols with mu8
 # = 256·top."
 def read_histogram(reader, prior):
-    mode = reader.byte(7)
+    mode = reader.bits(3)
     step, differences = 8 << (mode & 3), mode >> 2
     top = reader.varint(1 + 1984 // step)
     need(top, "a histogram without classes")
@@ -606,10 +611,11 @@ def take_classes(stream, prior):
 # 8.3 Exceptions: "the symbol is kmin − 1 − (c >> 1) if c is odd, else kmin + n·2^shift + (c >> 1). It MUST lie in
 # −K..K, its position within the channel."
 def read_exceptions(reader, count, prior):
-    number = 1 + reader.varint(min(count, reader.left // 2))
+    number = 1 + reader.varint(VARINT_MAX)
+    need(number <= min(count, reader.left // 2), f"{number} exceptions among {count} symbols")
     result, at = {}, -1
     for _ in range(number):
-        at += 1 + reader.varint(MAX_COUNT)
+        at += 1 + reader.varint(VARINT_MAX)
         c = reader.varint(4 * K + 2)
         value = prior.kmin - 1 - (c >> 1) if c & 1 else prior.end + (c >> 1)
         need(at < count and abs(value) <= K, f"an exception {value} at {at} of {count}")
@@ -773,7 +779,7 @@ def decode_lzma_symbols(data, counts):
     if not data:
         return [[] for _ in counts]
     reader = Reader(data)
-    _, planar = reader.byte(224), reader.byte(1)
+    _, planar = reader.byte(224), reader.bits(1)
     bases, forms = [], []
     for count in counts:
         limited(count, MAX_COUNT, "the symbols of a channel")
@@ -794,7 +800,7 @@ def decode_lzma_floats(data, counts):
     for count in counts:
         limited(count, MAX_COUNT, "values of an array")
     reader = Reader(data)
-    _, planar = reader.byte(224), reader.byte(1)
+    _, planar = reader.byte(224), reader.bits(1)
     raw = unpack_lzma(reader.take(reader.left), 4 * sum(counts))
     arrays = split_numbers(raw, [("f", count) for count in counts], planar)
     need(all(math.isfinite(v) for array in arrays for v in array), "a float32 value is not finite")
