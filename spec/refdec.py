@@ -1026,29 +1026,32 @@ def finish(layers):
         dequantise_layer(layer)
 
 
-# 12.1 Order: "Read preamble and header, then the chunks in order."
+# 12.1 Order: "Read preamble and header, then the chunks in order." "A decoder of prefix ℓ stops after the last layer ≤
+# ℓ in the list and does not look at what follows."
 # 3.2 Chunks: "Bytes after the last chunk make the file Malformed."
-def decode(data, max_layer=2):
-    """The layers <= max_layer of a file's bytes, each with `symbols` and `tensors` by name, flat and in C order."""
+def decode(data, max_layer=None):
+    """The layers of a file's bytes, or of prefix max_layer, each with `symbols` and `tensors` by name, flat and in C
+    order."""
     header, at = read_preamble(data)
     layers, scene_id, rows = [], None, 0
-    wanted = [i for i, (kind, _) in enumerate(header[1]) if kind <= max_layer]
-    stop = len(header[1]) if max_layer >= 2 else wanted[-1] + 1
+    stop = len(header[1])
+    if max_layer is not None:
+        stop = 1 + max(i for i, (kind, _) in enumerate(header[1]) if kind <= min(max_layer, 2))
     for kind, size in header[1][:stop]:
         payload, scene_id, at = read_chunk(data, at, kind, size, scene_id)
         if kind < 3:
             layers.append(read_layer(payload, kind, rows, header))
             rows += layers[-1].rows
-    need(max_layer < 2 or at == len(data), "bytes follow the last chunk")
+    need(max_layer is not None or at == len(data), "bytes follow the last chunk")
     finish(layers)
     return layers
 
 
 # 12.4 Hashes: "For conformance, two SHA-256 digests per layer, printed in hexadecimal as a JSON list of {"layer",
 # "symbols", "tensors"}."
-def hashes(data):
+def hashes(data, max_layer=None):
     rows = []
-    for layer in decode(data):
+    for layer in decode(data, max_layer):
         symbols, tensors = hashlib.sha256(), hashlib.sha256()
         for values in layer.symbols.values():
             symbols.update(struct.pack(f"<{len(values)}i", *values))
