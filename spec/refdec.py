@@ -56,6 +56,14 @@ def limited(value, high, what, low=0):
     return value
 
 
+# 15 Errors and security: "a mode, deformation, form of the attributes, predictor, network, prior family, section number
+# or key under 64 that is not registered"
+def registered(value, known, what):
+    need(type(value) is int, f"{what} is no integer")
+    need(value in known, f"{what} is {value}", "UnsupportedFeature")
+    return value
+
+
 class Reader:
     """Takes bytes from the front; running out of them is Malformed."""
 
@@ -245,7 +253,7 @@ def read_header(data):
             limited(camera[key], 65535, "camera size", 1)
     read_chunk_list(a_list(header[1], "chunk list"))
     for key in (2, 3):
-        need(limited(header[key], 1 << 32, f"header key {key}") <= 1, f"key {key}: {header[key]}", "UnsupportedFeature")
+        registered(header[key], (0, 1), f"header key {key}")
     return header
 
 
@@ -340,7 +348,7 @@ def read_scales(layer, rows):
         for side in row[1:5]:
             limited(side, 4096, "a plane's side", 1)
         for predictor in row[5:]:
-            need(limited(predictor, 65535, "a predictor") <= 5, f"predictor {predictor}", "UnsupportedFeature")
+            registered(predictor, range(6), "a predictor")
             need(predictor == 0 or not layer.raw, "a predictor on float32 planes")
     return rows
 
@@ -348,12 +356,11 @@ def read_scales(layer, rows):
 # 6.3 Planes and networks: "Layer 0 has all three networks. A deformation has its trunk and at least one head. Other
 # ids are UnsupportedFeature."
 def read_networks(number, rows):
-    limited(len(a_list(rows, "networks")), len(NETWORKS[number]), "the number of networks", 1)
+    need(a_list(rows, "networks"), "an empty list of networks")
     networks, last = {}, -1
     for row in rows:
         need(a_list(row, "a network"), "an empty network")
-        key = limited(row[0], 65535, "a network's id")
-        need(key in NETWORKS[number], f"network {key}", "UnsupportedFeature")
+        key = registered(row[0], NETWORKS[number], "a network's id")
         need(key > last, f"network {key} after {last}")
         limited(len(row) - 1, 16, "linear layers", 1)
         for width in row[1:]:
