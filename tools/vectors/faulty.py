@@ -35,14 +35,16 @@ from pd4dgs_codec.entropy.priors import (
     MU8_MAX,
     SCALED,
     Hist,
+    Prior,
     Window,
     top_limit,
     write_prior,
 )
-from pd4dgs_codec.entropy.tables import TOTAL, uniform_table
+from pd4dgs_codec.entropy.tables import TOTAL
 
 from . import lzma2
 from .blocks import (
+    ANS,
     ATTRIBUTE,
     CAMERA,
     FLOAT32,
@@ -390,14 +392,14 @@ def _header() -> Iterator[Vector]:
         yield bad(f"header-key-{key:02}-unknown", what, "4 17.2", FEATURE, plain.with_header({key: 1}))
     values: list[tuple[str, int, object, str]] = [
         ("mode-unknown", 2, 2, FEATURE),
-        ("mode-largest", 2, 2**32 - 1, FEATURE),
+        ("mode-largest", 2, 2**64 - 1, FEATURE),
         ("mode-real", 2, 0.0, MALFORMED),
         ("mode-boolean", 2, False, MALFORMED),
-        ("mode-negative", 2, -1, MALFORMED),
+        ("mode-negative", 2, -1, FEATURE),
         ("mode-list", 2, [0], MALFORMED),
         ("deformation-unknown", 3, 2, FEATURE),
         ("deformation-text", 3, "coded", MALFORMED),
-        ("deformation-negative", 3, -5, MALFORMED),
+        ("deformation-negative", 3, -5, FEATURE),
         ("steps-two", 4, [1.0] * 2, MALFORMED),
         ("steps-four", 4, [1.0] * 4, MALFORMED),
         ("steps-integer", 4, [1, 1.0, 1.0], MALFORMED),
@@ -597,6 +599,8 @@ def _parameters() -> Iterator[Vector]:
     ]
     for name, change, error, what in zero:
         yield _in_layer(0, f"layer-0-{name}", what, "6.2", error, layer.payload(change), plain)  # type: ignore[arg-type]
+    bare_0 = replace(layer, meta={1: 1}).with_sections({WEIGHTS: None}).payload()
+    yield _in_layer(0, "layer-0-bare", "Layer 0 without steps, networks and weights.", "6.2", MALFORMED, bare_0, plain)
     one: list[tuple[str, Layer, object, str, str]] = [
         ("rows-over-limit", deformed, put(1, MAX_ANCHORS - 2), LIMIT, "More than 2^24 anchors with those of layer 0."),
         ("steps-missing", deformed, without(3), MALFORMED, "A deformation without steps."),
@@ -622,16 +626,18 @@ def _scales() -> Iterator[Vector]:
         ("entry-long", [[*plain, 0]], MALFORMED, "A scale of twelve numbers."),
         ("channels-zero", [[0, *plain[1:]]], MALFORMED, "No channels."),
         ("channels-over-limit", [[MAX_PLANE_CHANNELS + 1, *plain[1:]]], LIMIT, "257 channels."),
-        ("channels-differ", [plain, [1, *plain[1:]]], MALFORMED, "Scales of two and one channels."),
         ("side-zero", [[*plain[:3], 0, *plain[4:]]], MALFORMED, "A side of 0."),
         ("side-over-limit", [[*plain[:4], MAX_PLANE_SIDE + 1, *plain[5:]]], LIMIT, "A side of 4097."),
         ("side-real", [[2, 3.0, *plain[2:]]], MALFORMED, "A side that is a real."),
         ("predictor-unknown", [[*plain[:-1], 6]], FEATURE, "Predictor 6."),
-        ("predictor-over-limit", [[*plain[:-1], 65535]], FEATURE, "Predictor 65535."),
-        ("predictor-negative", [[*plain[:-1], -1]], MALFORMED, "Predictor −1."),
+        ("predictor-largest", [[*plain[:-1], 2**64 - 1]], FEATURE, "Predictor 2^64 − 1."),
+        ("predictor-negative", [[*plain[:-1], -1]], FEATURE, "Predictor −1."),
+        ("predictor-boolean", [[*plain[:-1], False]], MALFORMED, "A predictor that is a boolean."),
     ]
     for name, value, error, what in values:
         yield _in_layer(1, f"scales-{name}", what, "6.3", error, layer.payload(lambda m, value=value: {**m, 4: value}))
+    differ = make_file(make_layer(), make_layer(1, (), before=1, scales=[Scale(2), Scale(1)]))
+    yield bad("scales-channels-differ", "Scales of two and one channels.", "6.3", MALFORMED, differ, chunk=1)
 
 
 def _networks() -> Iterator[Vector]:
@@ -644,7 +650,10 @@ def _networks() -> Iterator[Vector]:
         ("entry-integer", [0, *good[1:]], MALFORMED, "An entry that is an integer."),
         ("without-layers", [[0], *good[1:]], MALFORMED, "A network without linear layers."),
         ("id-unknown", [*good[:2], [3, 30]], FEATURE, "Network 3 in layer 0."),
-        ("id-negative", [[-1, 10], *good[1:]], MALFORMED, "Network −1."),
+        ("id-negative", [[-1, 10], *good[1:]], FEATURE, "Network −1."),
+        ("id-largest", [*good[:2], [2**64 - 1, 30]], FEATURE, "Network 2^64 − 1."),
+        ("id-real", [[0.0, 10], *good[1:]], MALFORMED, "An id that is a real."),
+        ("four", [*good, [3, 1]], FEATURE, "Network 3 beside the others."),
         ("descend", good[::-1], MALFORMED, "Networks in descending order."),
         ("twice", [good[0], good[0], good[2]], MALFORMED, "A network twice."),
         ("two", good[:2], MALFORMED, "Layer 0 without its color network."),
@@ -774,11 +783,35 @@ def _new(family: int, *parameters: bytes) -> bytes:
     return varint(2 * family) + b"".join(parameters)
 
 
+def _below(kmin: int) -> bytes:
+    """CODES as exceptions of a window that begins at kmin."""
+    return varint(len(CODES) - 1) + b"".join(varint(0) + varint(2 * (kmin - 1 - code) + 1) for code in CODES)
+
+
+def _steep_plane(mode: int = ANS) -> Layer:
+    """Layer 1 with a plane whose samples are within 2^23, while its second residual is K + 1."""
+    samples = np.array([-MAX_SYMBOL, MAX_SYMBOL], np.int32)
+    scale = Scale(1, (2, 1, 1, 1), (1, 0, 0, 0, 0, 0), lambda name, shape: np.resize(samples * (name == "xy"), shape))
+    return make_layer(1, (), before=1, scales=[scale], mode=mode)
+
+
+def _steep(name: str, what: str, clauses: str, prior: Prior) -> Vector:
+    """The residuals of `_steep_plane` under this prior."""
+    layer = _steep_plane()
+    residuals = [[-MAX_SYMBOL, 2 * MAX_SYMBOL], [0] * 2, [0] * 2, [0], [0], [0]]
+    written = layer.with_sections({PLANE: coded(residuals, {0: prior})})
+    return bad(name, what, clauses, MALFORMED, make_file(make_layer(), written), chunk=1)
+
+
 def _priors() -> Iterator[Vector]:
     window = zigzag(3) + varint(8)  # ten entries from 3
     normal = zigzag(0) + varint(2 * 700)
     stream = coded([CODES], {0: gauss(3, 10, si=60)})[-4:]
     top, reserved = MAX_WINDOW - 2, varint(2 * 700 + 1)
+    # All three symbols as exceptions below the window, so that nothing but its end is wrong.
+    last, entry = K_MAX, K_MAX - 4095
+    past = varint(2 * 1 + 1) + zigzag(last) + varint(0) + normal + _below(last)
+    past_scaled = varint(2 * SCALED + 1) + b"\x0c\1" + zigzag(entry) + varint(0) + normal + _below(entry)
     for name, section, error, what in (
         ("token-over-limit", varint(2 * (FIRST_REUSE + MAX_COUNT) + 1), LIMIT, "A token over its limit."),
         ("family-5", _new(5, window), FEATURE, "Prior family 5."),
@@ -801,13 +834,8 @@ def _priors() -> Iterator[Vector]:
             LIMIT,
             "A window of 2^14 + 1 entries.",
         ),
-        ("window-past-k", _new(1, zigzag(K_MAX), varint(0), normal, stream), MALFORMED, "A window that ends at 2^24."),
-        (
-            "window-past-k-scaled",
-            _new(SCALED, b"\x0c\1", zigzag(K_MAX - 4095), varint(0), normal),
-            MALFORMED,
-            "A scaled window that passes K.",
-        ),
+        ("window-past-k", past, MALFORMED, "A window that ends at 2^24."),
+        ("window-past-k-scaled", past_scaled, MALFORMED, "A scaled window whose last entry begins at 2^24."),
         (
             "mean-over-limit",
             _new(1, window, zigzag(MU8_MAX + 1), varint(1400), stream),
@@ -844,12 +872,7 @@ def _priors() -> Iterator[Vector]:
     yield _attributed("channel-missing", "67 channels of attributes.", "8.1", MALFORMED, one)
     yield _attributed("channel-too-many", "69 channels of attributes.", "8.1", MALFORMED, b"\0" + coded([[2] * 3] * 69))
     wide = gauss(K_MAX - 2 * 4095, 2, shift=12)
-    block = bytearray(b"\0" + varint(2 * SCALED))
-    write_prior(block, wide)
-    block += varint(2 * FIRST_REUSE) * 67
-    parts = [(np.ones(3, int), wide.cum), (np.full(3, 4095), uniform_table(12))] * 68
-    section = bytes(block) + ans_encode([k for k, _ in parts], [cum for _, cum in parts])
-    yield _attributed("symbol-over-k", "Scaled symbols of K + 1.", "8.4", MALFORMED, section)
+    yield _steep("symbol-over-k", "A scaled symbol of K + 1.", "8.4", wide)
 
 
 def _histograms() -> Iterator[Vector]:
@@ -866,11 +889,9 @@ def _histograms() -> Iterator[Vector]:
     plain = Hist(Window(3, n), 8, 5, False, 30, 8, np.array([5] * n))
     signed = Hist(Window(3, n), 8, 5, True, 30, 0, np.array([5] * n))
     head = varint(2 * plain.id) + window
-    for bit in range(3, 8, 4):
+    for bit in range(3, 8):
         what = f"Bit {bit} of the mode, which is reserved."
-        yield masked(
-            f"mode-bit-{bit}", what, MALFORMED, plain, head + bytes([1 << bit]) + varint(5) + b"\x1e" + varint(8)
-        )
+        yield masked(f"mode-bit-{bit}", what, MALFORMED, signed, head + bytes([4 | 1 << bit]) + varint(5) + b"\x1e")
     yield masked("top-0", "No classes.", MALFORMED, plain, head + b"\0" + varint(0) + b"\x1e" + varint(0))
     for i, d in enumerate((8, 64)):
         what = f"More classes than a step of {d} allows."
@@ -919,6 +940,7 @@ def _exceptions() -> Iterator[Vector]:
     def listed(*numbers: int) -> bytes:
         return varint(1) + zigzag(9) + b"".join(map(varint, numbers))
 
+    yield _steep("exceptions-above-k", "An exception of K + 1.", "8.3", SMALL)
     for name, section, error, what in (
         ("beyond-channel", listed(0, 3, 0), MALFORMED, "An exception at place 3 of three symbols."),
         ("second-beyond-channel", listed(1, 1, 0, 1, 0), MALFORMED, "A second exception at place 3 of three symbols."),
@@ -926,7 +948,6 @@ def _exceptions() -> Iterator[Vector]:
         ("counts-that-lie", listed(MAX_COUNT - 1, 0, 0), MALFORMED, "2^26 exceptions in four bytes."),
         ("cut", listed(1, 0, 0, 0), MALFORMED, "The section ends inside an exception."),
         ("code-over-limit", listed(0, 0, 4 * K_MAX + 3), LIMIT, "A code over 4·K + 2."),
-        ("above-k", listed(0, 0, 2 * (K_MAX - 9)), MALFORMED, "An exception of K + 1."),
         ("below-k", listed(0, 0, 2 * (K_MAX + 9) + 1), MALFORMED, "An exception of −K − 1."),
     ):
         yield _masked(f"exceptions-{name}", what, "8.3", error, section)
@@ -938,31 +959,42 @@ def _prediction() -> Iterator[Vector]:
     def block(terms=None, splits=None, counts=None) -> bytes:
         return b"\1" + prediction_block(terms or {}, splits or {}, counts or {})
 
+    def whole(terms, splits=None) -> bytes:
+        """With stages as without terms and splits."""
+        stage = coded(k)
+        return block(terms, splits) + varint(len(stage)) + varint(0) + stage
+
+    def said(*lengths: int) -> bytes:
+        """Other lengths of the stages, of as many bytes as the right ones."""
+        return predicted_attributes(k, {}, both, lengths=lambda a, b: lengths)
+
     both = {0: (3, 3, 3)}
+    size = len(said(1, 1))
     for name, section, error, what in (
         ("form-2", b"\2" + coded(k), FEATURE, "Form 2 of the attributes."),
         ("form-255", b"\xff" + coded(k), FEATURE, "Form 255 of the attributes."),
         ("form-alone", b"\1", MALFORMED, "The section ends after its form."),
         ("block-cut", block()[:30], MALFORMED, "The section ends inside the prediction block."),
         ("terms-over-limit", block({2: [(0, 1)] * 3}), LIMIT, "Three terms for channel 2."),
-        ("term-of-itself", block({2: [(2, 1)]}), MALFORMED, "Channel 2 is predicted from itself."),
-        ("term-of-later-channel", block({2: [(1, 1), (30, 1)]}), MALFORMED, "Channel 2 is predicted from channel 32."),
+        ("term-of-itself", whole({2: [(2, 1)]}), MALFORMED, "Channel 2 is predicted from itself."),
+        ("term-of-later-channel", whole({2: [(1, 1), (30, 1)]}), MALFORMED, "Channel 2 is predicted from channel 32."),
         ("term-gap-over-limit", block({37: [(39, 1)]}), LIMIT, "A gap of 39 channels."),
-        ("weight-over-limit", block({1: [(0, (1 << 15) + 1)]}), LIMIT, "A weight of 2^15 + 1."),
-        ("weight-under-limit", block({1: [(0, -(1 << 15) - 1)]}), LIMIT, "A weight of −2^15 − 1."),
-        ("term-missing", block(counts={37: 1})[: -11 + 1], MALFORMED, "The section ends before a term."),
+        ("weight-over-limit", whole({1: [(0, (1 << 15) + 1)]}), LIMIT, "A weight of 2^15 + 1."),
+        ("weight-under-limit", whole({1: [(0, -(1 << 15) - 1)]}), LIMIT, "A weight of −2^15 − 1."),
+        ("term-missing", block(counts={37: 1})[:-10], MALFORMED, "The section ends before a term."),
         ("split-unknown", block(splits={9: (4, 0, 0)}), LIMIT, "Split 4."),
         ("split-x-over-limit", block(splits={4: (1, K_MAX + 1, 0)}), LIMIT, "A centre of x of K + 1."),
         ("split-y-under-limit", block(splits={4: (2, 0, -K_MAX - 1)}), LIMIT, "A centre of y of −K − 1."),
         (
             "stage-over-section",
-            predicted_attributes(k, {}, both, lengths=lambda a, b: (a + 9999, b)),
+            said(size + 1, 0),
             LIMIT,
-            "A stage longer than the section.",
+            "A stage a byte longer than the section.",
         ),
+        ("stage-of-section", said(size, 0), MALFORMED, "A stage as long as the section."),
         (
             "stages-over-rest",
-            predicted_attributes(k, {}, both, lengths=lambda a, b: (a, b + 99)),
+            predicted_attributes(k, {}, both, lengths=lambda a, b: (a, b + 5)),
             MALFORMED,
             "Stages longer than what follows the block.",
         ),
@@ -1024,7 +1056,8 @@ def _lzma() -> Iterator[Vector]:
     yield of("head-cut", "The section ends among the channels' bases.", MALFORMED, right[:20])
     yield of("eight-bytes", "A channel of integers of 8 bytes.", MALFORMED, first(3))
     yield of("base-over-limit", "A base of −K − 1.", LIMIT, first(4 * (2 * K_MAX + 1)))
-    yield of("symbol-over-k", "A symbol of K + 77.", MALFORMED, first(8 * K_MAX))
+    steep = make_file(make_layer(mode=LZMA), _steep_plane(LZMA), header={2: LZMA})
+    yield bad("lzma-symbol-over-k", "A symbol of K + 1.", "9.1", MALFORMED, steep, chunk=1)
     yield of("nothing-packed", "No stream.", MALFORMED, right[:2] + head)
     yield of("end-alone", "A stream of an end marker.", MALFORMED, right[:2] + head + b"\0")
     yield of("byte-short", "The stream unpacks to a byte less.", MALFORMED, how(lambda d: packed(d[:-1])))
@@ -1082,7 +1115,7 @@ def _floats() -> Iterator[Vector]:
     yield of("value-missing", "A value less.", MALFORMED, lzma_floats([*arrays[:-1], arrays[-1][:-1]]))
     yield of("value-more", "A value more.", MALFORMED, lzma_floats([*arrays, np.zeros(1, np.float32)]))
     right = lzma_floats(arrays)
-    yield of("note-over-limit", "The first byte is 255.", LIMIT, b"\xff" + right[1:])
+    yield of("note-over-limit", "The first byte is 225.", LIMIT, b"\xe1" + right[1:])
     yield of("flags-reserved", "A reserved bit of the second byte.", MALFORMED, right[:1] + b"\2" + right[2:])
     yield of("end-missing", "No end marker.", MALFORMED, right[:-1])
     yield of("one-byte", "The section ends after one byte.", MALFORMED, right[:1])

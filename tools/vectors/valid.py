@@ -87,12 +87,22 @@ Case = tuple[str, str, str, File]
 
 
 def _scenes() -> Iterator[Case]:
-    yield "one-anchor", "One anchor in layer 0; every channel is constant.", "3.1 3.2 3.3 5.1 6.1 6.2 6.3 6.4 8.1", make_file(make_layer())
+    yield (
+        "one-anchor",
+        "One anchor in layer 0; every channel is constant.",
+        "3.1 3.2 3.3 5.1 6.1 6.2 6.3 6.4 8.1",
+        make_file(make_layer()),
+    )
     yield "camera", "A default camera.", "5.3", make_file(make_layer(), header={12: CAMERA})
     yield "empty-scene", "No anchor at all: networks alone.", "6.2 6.4", make_file(make_layer(cells=()))
     empty = [make_layer(number, ()) for number in (0, 1, 2)]
     yield "empty-layers", "Layers 1 and 2 with neither anchors nor deformation.", "6.2 6.4", make_file(*empty)
-    yield "layers-0-1-2", "Anchors, rises of masks and a deformation in every layer.", "6.1 11.1 12.1 12.2 12.4", three_layers()
+    yield (
+        "layers-0-1-2",
+        "Anchors, rises of masks and a deformation in every layer.",
+        "6.1 11.1 12.1 12.2 12.4",
+        three_layers(),
+    )
     base, deformed = make_layer(0, line(2)), dict(before=2, scales=[Scale()])
     yield "layers-0-1", "Layer 2 is not there.", "5.2 12.2", make_file(base, make_layer(1, [[0, 0, 1]], **deformed))
     yield "layers-0-2", "Layer 1 is not there.", "5.2 12.2", make_file(base, make_layer(2, [[0, 0, 1]], **deformed))
@@ -135,6 +145,7 @@ def _priors() -> Iterator[Case]:
     different = {c: gauss(-3 - c % 5, 7 + c % 11, si=16 * c - 160, offset=37 * c - 900) for c in range(0, 68, 2)}
     yield "prior-gauss", "Gaussian priors of many windows, means and widths.", "7.3 8.2", _with_priors(different)
     extremes = {c: gauss(-3, 7, si=si) for c, si in enumerate((SI_MIN, SI_MIN + 1, -1, 0, 511, 512, SI_MAX))}
+    extremes[9] = gauss(-3, 7, si=SI_MAX, floor=16)
     extremes |= {7 + i: gauss(-3, 7, offset=g) for i, g in enumerate((-MU8_MAX, MU8_MAX))}
     yield "prior-gauss-extremes", "The least and largest widths and means.", "7.3 8.2", _with_priors(extremes)
     floors = {c: gauss(-20 - c % 2, 60, si=0, floor=(1, 16)[c // 2 % 2]) for c in range(16)}
@@ -504,10 +515,11 @@ def _floats() -> Iterator[Case]:
     for scale in layer.meant.planes:
         for plane in scale.values():
             plane.reshape(-1)[:] = np.resize(odd, plane.size)
-    planar = layer.with_sections({FLOATS: lzma_floats(list(layer.meant.tensors()), planar=True, stream=lzma2.packed)})
+    floats = lzma_floats(list(layer.meant.tensors()), planar=True, stream=lzma2.packed)
+    planar = layer.with_sections({FLOATS: b"\xe0" + floats[1:]})
     yield (
         "float32-extremes",
-        "Signed zeros, subnormals and the largest values; byte planes.",
+        "Signed zeros, subnormals and the largest values; byte planes; the largest first byte.",
         "9.2",
         make_file(make_layer(), planar, header=raw),
     )
