@@ -215,7 +215,7 @@ def _chunks() -> Iterator[Vector]:
     )
     for name, c in (("between-layers", 2), ("last", 3)):
         chunks = list(file.chunks)
-        chunks.insert(c, replace(ancillary(9, b"needed"), flags=0))
+        chunks.insert(c, replace(ancillary(3 * (c - 1), b"needed"), flags=0))
         what = f"A critical chunk of unknown type is chunk {c}."
         yield bad(
             f"critical-unknown-{name}", what, "3.4", FEATURE, replace(file, chunks=tuple(chunks)), chunk=c, at=TYPE

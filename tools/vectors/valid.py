@@ -248,6 +248,14 @@ def _histograms() -> Iterator[Case]:
         "8.2",
         _with_priors(extremes, k),
     )
+    many = np.full(MAX_WINDOW, 9)
+    many[::37], many[5::1001] = 12, 1
+    wide: dict[int, Prior] = {
+        0: Hist(Window(-500, 1000), 8, 40, False, 30, 300, pattern(1000, low=0, high=40)),
+        1: Hist(Window(-8000, MAX_WINDOW), 32, 12, True, 4, 0, many),
+    }
+    k = _of_widths(490, 8000)
+    yield "prior-histogram-widest", "Histograms of 1000 and of 2^14 entries.", "7.5 8.2", _with_priors(wide, k)
     below = {0: Hist(Window(-3, 7), 8, 9, False, 20, 40, np.array([2, 3, 0, 1, 4, 0, 2]))}
     yield "prior-histogram-below-top", "No entry has the largest class.", "7.5 8.2", _with_priors(below)
     scaled: dict[int, Prior] = {0: Hist(Window(-5000, 40, 8), 16, 9, True, 20, 0, _classes(9, 40))}
@@ -448,6 +456,16 @@ def _positions() -> Iterator[Case]:
     yield "positions-scattered", "Scattered voxels: grids that are not dense.", "10.3 10.4", at(scattered)
     slope = [[i * 16 + i // 3, j * 16, (3 * i + 5 * j) * 4 + 7] for i in range(14) for j in range(14)]
     yield "positions-plane", "A tilted plane with unknown low bits.", "10.4 10.5", at(slope)
+    around = range(-12, 13)
+    bowl = [[i * 9, j * 9, (i * i + j * j) // 2] for i in around for j in around]
+    yield "positions-bowl", "A paraboloid: strong pulls.", "10.4", at(bowl)
+    curve = [[i * i // 8, i * 37, i * i * i // 4096] for i in range(400)]
+    yield "positions-curve", "A curve: few neighbours, coarse grids.", "10.3 10.4", at(curve)
+    for name, a, b in (("slope", 33, 2), ("slab", 33, 8), ("flat", 17, 150)):
+        sheet = [[i * a, j * a, (i + j) // b] for i in range(18) for j in range(18)]
+        above = [[a * k * 3, a * k * 2, b * 7 + k] for k in range(6)]
+        what = "A thin sheet and a few voxels off it: the strongest pulls."
+        yield f"positions-{name}", what, "10.4", at(sheet + above)
     second = make_layer(1, ordered([[i, 1, 0] for i in range(5)]), before=5)
     yield (
         "positions-two-layers",
@@ -495,9 +513,16 @@ def _lzma() -> Iterator[Case]:
         "6.4 9.1",
         make_file(empty, make_layer(1, (), mode=LZMA), header=mode),
     )
-    long = make_layer(0, line(1100), mode=LZMA)
+    far = np.full((68, 1100), 2, np.int32)
+    far[0] = far[67] = pattern(1100)
+    long = make_layer(0, line(1100), mode=LZMA, attributes=far)
     stream = [long.with_sections({SYMBOLS: lzma_symbols(long.channels, width=0, stream=lzma2.packed)})]
-    yield "lzma-dictionary", "More than 2^16 bytes, so a larger dictionary.", "9.1", make_file(*stream, header=mode)
+    yield (
+        "lzma-dictionary",
+        "More than 2^16 bytes, of which the last repeat the first.",
+        "9.1",
+        make_file(*stream, header=mode),
+    )
     note = layers[0].sections[SYMBOLS]
     noted = layers[0].with_sections({SYMBOLS: b"\xe0" + note[1:]})
     yield "lzma-note", "The unused first byte at its largest value.", "9.1", make_file(noted, header=mode)
