@@ -504,6 +504,7 @@ def _camera() -> Iterator[Vector]:
         ("intrinsics-three", 2, [500.0, 320.0, 240.0], MALFORMED),
         ("fx-zero", 2, [0.0, 500.0, 320.0, 240.0], MALFORMED),
         ("fy-negative", 2, [500.0, -500.0, 320.0, 240.0], MALFORMED),
+        ("fy-zero", 2, [500.0, 0.0, 320.0, 240.0], MALFORMED),
         ("width-zero", 3, 0, MALFORMED),
         ("width-over-limit", 3, 65536, LIMIT),
         ("width-real", 3, 640.0, MALFORMED),

@@ -33,12 +33,14 @@ from .blocks import (
     FLOAT32,
     FLOATS,
     LZMA,
+    PLANE,
     SMALL,
     SYMBOLS,
     File,
     Layer,
     Scale,
     Vector,
+    coded,
     gauss,
     good,
     lzma_floats,
@@ -285,6 +287,15 @@ def _exceptions() -> Iterator[Case]:
         "8.3 8.4",
         _with_priors({0: gauss(-600, 76, shift=4)}, wide),
     )
+    ends = np.array([MAX_SYMBOL, 1 - MAX_SYMBOL], np.int32)  # residuals of the left predictor: 2^23 and -K, and back
+    scale = Scale(
+        1, (2, 1, 1, 1), (1, 1, 0, 0, 0, 0), lambda name, shape: np.resize(ends[:: -1 if name == "xz" else 1], shape)
+    )
+    plane = make_layer(1, (), before=1, scales=[scale])
+    residuals = [[MAX_SYMBOL, -K_MAX], [1 - MAX_SYMBOL, K_MAX], ends, [MAX_SYMBOL], [MAX_SYMBOL], [MAX_SYMBOL]]
+    section = coded(residuals, dict.fromkeys(range(6), SMALL))
+    largest = make_file(make_layer(), plane.with_sections({PLANE: section}))
+    yield "exceptions-extremes", "Exceptions of K and -K.", "8.3 14", largest
     reuse = pattern(68, ROWS)
     reuse[:, 5] = 50
     yield (
@@ -466,6 +477,16 @@ def _positions() -> Iterator[Case]:
         above = [[a * k * 3, a * k * 2, b * 7 + k] for k in range(6)]
         what = "A thin sheet and a few voxels off it: the strongest pulls."
         yield f"positions-{name}", what, "10.4", at(sheet + above)
+    for n, what in ((99, "The most voxels that are dense whatever lies around them."), (100, "One voxel more.")):
+        yield f"positions-{n}", what, "10.3", at(pattern(n, 3, low=0, high=4095, seed=n).tolist())
+    # Blocks of 8 cells with 7 neighbours each and squares of 4 with 3 each: 560 neighbours of 112 cells of side 8.
+    places = [[4 * (i % 3), 4 * (i // 3 % 3), 4 * (i // 9)] for i in range(21)]
+    corners = [itertools.product(range(2), range(2), range(2 if i < 7 else 1)) for i in range(21)]
+    cells = [
+        [p + d for p, d in zip(place, own, strict=True)] for place, c in zip(places, corners, strict=True) for own in c
+    ]
+    inside = pattern(len(cells), 3, low=0, high=7)
+    yield "positions-just-dense", "A grid of exactly five neighbours a cell.", "10.3", at(8 * np.array(cells) + inside)
     second = make_layer(1, ordered([[i, 1, 0] for i in range(5)]), before=5)
     yield (
         "positions-two-layers",
