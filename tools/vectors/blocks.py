@@ -188,6 +188,11 @@ def plain_attributes(k: np.ndarray, priors: Mapping[int, Prior] | None = None) -
     return b"\0" + coded(k, priors)
 
 
+def plain_planes(residuals: Iterable[Iterable[int]], priors: Mapping[int, Prior] | None = None) -> bytes:
+    """Section PLANES of the channels of all planes."""
+    return coded(residuals, priors)
+
+
 Terms = Mapping[int, Sequence[tuple[int, int]]]
 Splits = Mapping[int, tuple[int, int, int]]
 
@@ -426,7 +431,7 @@ def _sections(meant: LayerSymbols, predictors: Sequence[int], mode: int) -> dict
         if n:
             sections[ATTRIBUTE] = plain_attributes(meant.attributes)
         if flat:
-            sections[PLANE] = coded(flat)
+            sections[PLANE] = plain_planes(flat)
         if weights:
             sections[WEIGHTS] = coded(weights)
     if meant.raw:

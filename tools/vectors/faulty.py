@@ -72,6 +72,7 @@ from .blocks import (
     make_layer,
     pattern,
     plain_attributes,
+    plain_planes,
     predicted_attributes,
     prediction_block,
     varint,
@@ -687,7 +688,9 @@ def _sections() -> Iterator[Vector]:
         )
     empty = make_layer(1, (), before=0)
     base = make_file(make_layer(cells=()), empty)
-    fill = {POSITIONS: bytes(15), MASKS: b"\0\4", ATTRIBUTE: b"\0", PLANE: b"\0\4", WEIGHTS: b"\0\4"}
+    one = [[2]]
+    fill = {POSITIONS: bytes(15), MASKS: coded(one), PLANE: plain_planes(one), WEIGHTS: coded(one)}
+    fill[ATTRIBUTE] = plain_attributes(np.zeros((68, 0), np.int32))
     for section, name in enumerate(names):
         what = f"Section {name} has nothing to code."
         payload = empty.with_sections({section: fill[section]}).payload()
@@ -800,7 +803,7 @@ def _steep(name: str, what: str, clauses: str, prior: Prior) -> Vector:
     """The residuals of `_steep_plane` under this prior."""
     layer = _steep_plane()
     residuals = [[-MAX_SYMBOL, 2 * MAX_SYMBOL], [0] * 2, [0] * 2, [0], [0], [0]]
-    written = layer.with_sections({PLANE: coded(residuals, {0: prior})})
+    written = layer.with_sections({PLANE: plain_planes(residuals, {0: prior})})
     return bad(name, what, clauses, MALFORMED, make_file(make_layer(), written), chunk=1)
 
 

@@ -40,7 +40,6 @@ from .blocks import (
     Layer,
     Scale,
     Vector,
-    coded,
     gauss,
     good,
     lzma_floats,
@@ -49,6 +48,7 @@ from .blocks import (
     make_layer,
     pattern,
     plain_attributes,
+    plain_planes,
     predicted_attributes,
 )
 
@@ -293,7 +293,7 @@ def _exceptions() -> Iterator[Case]:
     )
     plane = make_layer(1, (), before=1, scales=[scale])
     residuals = [[MAX_SYMBOL, -K_MAX], [1 - MAX_SYMBOL, K_MAX], ends, [MAX_SYMBOL], [MAX_SYMBOL], [MAX_SYMBOL]]
-    section = coded(residuals, dict.fromkeys(range(6), SMALL))
+    section = plain_planes(residuals, dict.fromkeys(range(6), SMALL))
     largest = make_file(make_layer(), plane.with_sections({PLANE: section}))
     yield "exceptions-extremes", "Exceptions of K and -K.", "8.3 14", largest
     reuse = pattern(68, ROWS)
