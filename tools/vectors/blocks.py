@@ -424,7 +424,7 @@ def _sections(meant: LayerSymbols, predictors: Sequence[int], mode: int) -> dict
     if mode == LZMA:
         channels = [*masks, *meant.attributes, *flat, *weights]
         if any(c.size for c in channels):
-            sections[SYMBOLS] = lzma_symbols(channels)
+            sections[SYMBOLS] = lzma_symbols(channels, stream=lzma2.packed)
     else:
         if meant.mask_increase.size or n:
             sections[MASKS] = coded(masks)
