@@ -24,6 +24,7 @@ MAX_SYMBOL = 1 << 23  # clause 14: symbols of attributes, plane samples and weig
 MAX_VOXEL = 1 << 20
 MAX_COUNT = 1 << 26
 MAX_ENTRIES = 1 << 21
+VARINT_MAX = (1 << 35) - 1  # clause 7.1: five bytes of seven bits
 TOTAL = 1 << 24
 PLANES = (("xy", 0, 1), ("xz", 0, 2), ("xt", 0, 3), ("yz", 1, 2), ("yt", 1, 3), ("zt", 2, 3))
 ATTRIBUTES = (("feature", 32), ("scaling_log", 6), ("offset", 30))
@@ -56,6 +57,14 @@ def limited(value, high, what, low=0):
     return value
 
 
+# 15 Errors and security: "a mode, deformation, form of the attributes, predictor, network, prior family, section number
+# or key under 64 that is not registered"
+def registered(value, known, what):
+    need(type(value) is int, f"{what} is no integer")
+    need(value in known, f"{what} is {value}", "UnsupportedFeature")
+    return value
+
+
 class Reader:
     """Takes bytes from the front; running out of them is Malformed."""
 
@@ -75,8 +84,12 @@ class Reader:
         return struct.unpack(form, self.take(struct.calcsize(form)))[0]
 
     def byte(self, high=255):
-        value = self.number("B")
-        need(value <= high, f"a byte is {value}, expected at most {high}")
+        return limited(self.number("B"), high, "a byte")
+
+    # 2.3 Reserved and unused: "A reserved bit or value MUST be zero or absent in a 1.0 file"
+    def bits(self, used):
+        value = self.byte()
+        need(value >> used == 0, f"a byte is {value:#x}, expected {used} bits")
         return value
 
     # 7.1 Variable-length integers: "A varint holds seven bits per byte, least significant first; the high bit of a
@@ -241,7 +254,7 @@ def read_header(data):
             limited(camera[key], 65535, "camera size", 1)
     read_chunk_list(a_list(header[1], "chunk list"))
     for key in (2, 3):
-        need(limited(header[key], 1 << 32, f"header key {key}") <= 1, f"key {key}: {header[key]}", "UnsupportedFeature")
+        registered(header[key], (0, 1), f"header key {key}")
     return header
 
 
@@ -336,7 +349,7 @@ def read_scales(layer, rows):
         for side in row[1:5]:
             limited(side, 4096, "a plane's side", 1)
         for predictor in row[5:]:
-            need(limited(predictor, 65535, "a predictor") <= 5, f"predictor {predictor}", "UnsupportedFeature")
+            registered(predictor, range(6), "a predictor")
             need(predictor == 0 or not layer.raw, "a predictor on float32 planes")
     return rows
 
@@ -344,12 +357,11 @@ def read_scales(layer, rows):
 # 6.3 Planes and networks: "Layer 0 has all three networks. A deformation has its trunk and at least one head. Other
 # ids are UnsupportedFeature."
 def read_networks(number, rows):
-    limited(len(a_list(rows, "networks")), len(NETWORKS[number]), "the number of networks", 1)
+    need(a_list(rows, "networks"), "an empty list of networks")
     networks, last = {}, -1
     for row in rows:
         need(a_list(row, "a network"), "an empty network")
-        key = limited(row[0], 65535, "a network's id")
-        need(key in NETWORKS[number], f"network {key}", "UnsupportedFeature")
+        key = registered(row[0], NETWORKS[number], "a network's id")
         need(key > last, f"network {key} after {last}")
         limited(len(row) - 1, 16, "linear layers", 1)
         for width in row[1:]:
@@ -584,7 +596,7 @@ def read_normal(reader, n):
 # differences symbol r adds r − top to the class before (0 before the first), of a table of 2·top + 1 symbols with mu8
 # = 256·top."
 def read_histogram(reader, prior):
-    mode = reader.byte(7)
+    mode = reader.bits(3)
     step, differences = 8 << (mode & 3), mode >> 2
     top = reader.varint(1 + 1984 // step)
     need(top, "a histogram without classes")
@@ -608,10 +620,11 @@ def take_classes(stream, prior):
 # 8.3 Exceptions: "the symbol is kmin − 1 − (c >> 1) if c is odd, else kmin + n·2^shift + (c >> 1). It MUST lie in
 # −K..K, its position within the channel."
 def read_exceptions(reader, count, prior):
-    number = 1 + reader.varint(min(count, reader.left // 2))
+    number = 1 + reader.varint(VARINT_MAX)
+    need(number <= min(count, reader.left // 2), f"{number} exceptions among {count} symbols")
     result, at = {}, -1
     for _ in range(number):
-        at += 1 + reader.varint(MAX_COUNT)
+        at += 1 + reader.varint(VARINT_MAX)
         c = reader.varint(4 * K + 2)
         value = prior.kmin - 1 - (c >> 1) if c & 1 else prior.end + (c >> 1)
         need(at < count and abs(value) <= K, f"an exception {value} at {at} of {count}")
@@ -776,7 +789,7 @@ def decode_lzma_symbols(data, counts):
     if not data:
         return [[] for _ in counts]
     reader = Reader(data)
-    _, planar = reader.byte(224), reader.byte(1)
+    _, planar = reader.byte(224), reader.bits(1)
     bases, forms = [], []
     for count in counts:
         limited(count, MAX_COUNT, "the symbols of a channel")
@@ -797,7 +810,7 @@ def decode_lzma_floats(data, counts):
     for count in counts:
         limited(count, MAX_COUNT, "values of an array")
     reader = Reader(data)
-    _, planar = reader.byte(224), reader.byte(1)
+    _, planar = reader.byte(224), reader.bits(1)
     raw = unpack_lzma(reader.take(reader.left), 4 * sum(counts))
     arrays = split_numbers(raw, [("f", count) for count in counts], planar)
     need(all(math.isfinite(v) for array in arrays for v in array), "a float32 value is not finite")
@@ -1023,29 +1036,32 @@ def finish(layers):
         dequantise_layer(layer)
 
 
-# 12.1 Order: "Read preamble and header, then the chunks in order."
+# 12.1 Order: "Read preamble and header, then the chunks in order." "A decoder of prefix ℓ stops after the last layer ≤
+# ℓ in the list and does not look at what follows."
 # 3.2 Chunks: "Bytes after the last chunk make the file Malformed."
-def decode(data, max_layer=2):
-    """The layers <= max_layer of a file's bytes, each with `symbols` and `tensors` by name, flat and in C order."""
+def decode(data, max_layer=None):
+    """The layers of a file's bytes, or of prefix max_layer, each with `symbols` and `tensors` by name, flat and in C
+    order."""
     header, at = read_preamble(data)
     layers, scene_id, rows = [], None, 0
-    wanted = [i for i, (kind, _) in enumerate(header[1]) if kind <= max_layer]
-    stop = len(header[1]) if max_layer >= 2 else wanted[-1] + 1
+    stop = len(header[1])
+    if max_layer is not None:
+        stop = 1 + max(i for i, (kind, _) in enumerate(header[1]) if kind <= min(max_layer, 2))
     for kind, size in header[1][:stop]:
         payload, scene_id, at = read_chunk(data, at, kind, size, scene_id)
         if kind < 3:
             layers.append(read_layer(payload, kind, rows, header))
             rows += layers[-1].rows
-    need(max_layer < 2 or at == len(data), "bytes follow the last chunk")
+    need(max_layer is not None or at == len(data), "bytes follow the last chunk")
     finish(layers)
     return layers
 
 
 # 12.4 Hashes: "For conformance, two SHA-256 digests per layer, printed in hexadecimal as a JSON list of {"layer",
 # "symbols", "tensors"}."
-def hashes(data):
+def hashes(data, max_layer=None):
     rows = []
-    for layer in decode(data):
+    for layer in decode(data, max_layer):
         symbols, tensors = hashlib.sha256(), hashlib.sha256()
         for values in layer.symbols.values():
             symbols.update(struct.pack(f"<{len(values)}i", *values))

@@ -38,7 +38,7 @@ class LayerReader:
         """Read on to the end of one more layer <= max_layer; None if the file has no more (clause "decoding process").
 
         Raises Truncated, with nothing consumed that a later call would miss, if `data` ends before; Malformed if
-        bytes follow the last chunk.
+        bytes follow the last chunk of a file that is read whole (max_layer None).
         """
         if self.header is None:
             preamble = read_preamble(data)
@@ -51,7 +51,7 @@ class LayerReader:
             if layer is not None:
                 self.layers.append(layer)
                 return layer
-        if len(data) > self.offset:
+        if max_layer is None and len(data) > self.offset:
             raise Malformed(f"{len(data) - self.offset} bytes follow the last chunk, expected none", offset=self.offset)
         return None
 
