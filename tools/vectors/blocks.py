@@ -189,22 +189,72 @@ def plain_attributes(k: np.ndarray, priors: Mapping[int, Prior] | None = None) -
 
 
 def plain_planes(residuals: Iterable[Iterable[int]], priors: Mapping[int, Prior] | None = None) -> bytes:
-    """Section PLANES of the channels of all planes."""
-    return coded(residuals, priors)
+    """Section PLANES of the channels of all planes, form 0 (clause 8.8)."""
+    return b"\0" + coded(residuals, priors)
+
+
+def relative_magnitude(e: np.ndarray) -> np.ndarray:
+    """int64 [n] of residuals int64 [m, n] (clause 8.9)."""
+    return sum((abs(c) * 256 * len(c) // (1 + abs(c).sum()) for c in e), np.zeros(e.shape[1], np.int64))
+
+
+def split_by_activity(channel: np.ndarray, activity: np.ndarray, count: int) -> list[np.ndarray]:
+    """The symbols of each of `count` classes (clause 8.9)."""
+    ascending, n = sorted(activity.tolist()), len(activity)
+    bounds = [ascending[i * n // count] for i in range(1, count)]
+    classes = np.array([sum(b <= a for b in bounds) for a in activity.tolist()])
+    return [channel[classes == q] for q in range(count)]
+
+
+Lengths = Callable[[list[int]], list[int]]
+
+
+def staged(stages: Iterable[Iterable[np.ndarray]], lengths: Lengths = lambda sizes: sizes, tail: bytes = b"") -> bytes:
+    """The lengths of all stages but the last, then the stages. lengths: what is said, from the true lengths."""
+    payloads = [coded(stage) for stage in stages]
+    said = lengths([len(p) for p in payloads[:-1]])
+    return b"".join(map(varint, said)) + b"".join(payloads) + tail
+
+
+def staged_planes(
+    planes: Sequence[np.ndarray], counts: Sequence[int], lengths: Lengths = lambda sizes: sizes, tail: bytes = b""
+) -> bytes:
+    """Section PLANES of residuals int32 [C, H, W] per plane, form 1 (clause 8.8). counts: classes of stages 1 on."""
+    stages = []
+    for stage in range(max(1, (len(planes[0]) - 1).bit_length())):
+        first, end = (1 << stage if stage else 0), 2 << stage
+        channels: list[np.ndarray] = []
+        for plane in planes:
+            e = plane.reshape(len(plane), -1).astype(np.int64)
+            if stage == 0:
+                channels += list(e[:end])
+                continue
+            _, height, width = plane.shape
+            size = relative_magnitude(e[:first]).reshape(height, width)
+            i, j = np.indices((height, width))
+            near = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)]
+            around = sum(size[np.clip(i + a, 0, height - 1), np.clip(j + b, 0, width - 1)] for a, b in near)
+            for channel in e[first:end]:
+                channels += split_by_activity(channel, np.ravel(around), counts[stage - 1])
+        stages.append(channels)
+    return b"\1" + b"".join(map(varint, counts)) + staged(stages, lengths, tail)
 
 
 Terms = Mapping[int, Sequence[tuple[int, int]]]
 Splits = Mapping[int, tuple[int, int, int]]
+ONE_CLASS = (1,) * 5  # in each of the stages 1 to 5
+RESIDUAL_STAGES = (0, 6, 12, 20, 29, 38)
 
 
 def prediction_block(
-    terms: Mapping[int, Sequence[tuple[int, int]]], splits: Splits, counts: Mapping[int, int]
+    terms: Terms, splits: Splits, counts: Mapping[int, int], classes: Sequence[int] = ONE_CLASS
 ) -> bytes:
-    """Items 1 and 2 of clause 8.6. terms: channel -> (g, w) as they are stored; counts: other numbers of terms."""
+    """Items 1 to 3 of clause 8.6. terms: channel -> (g, w) as they are stored; counts: other numbers of terms."""
     out = b""
     for c in range(1, 38):
         own = terms.get(c, ())
         out += varint(counts.get(c, len(own))) + b"".join(varint(g) + zigzag(w) for g, w in own)
+    out += b"".join(map(varint, classes))
     for i in range(10):
         flags, a, b = splits.get(i, (0, 0, 0))
         out += varint(flags) + (zigzag(a) if flags else b"") + (zigzag(b) if flags & 2 else b"")
@@ -216,37 +266,45 @@ def gaps(terms: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
     return [(j - last - 1, w) for last, (j, w) in zip([-1, *(j for j, _ in terms)], terms, strict=False)]
 
 
+def attribute_stages(e: np.ndarray, splits: Splits, classes: Sequence[int]) -> list[list[np.ndarray]]:
+    """The channels of the eight stages of clause 8.7, of residuals and offsets int64 [68, n]."""
+    stages = [list(e[:6])]
+    for stage, count in enumerate(classes, 1):
+        first = RESIDUAL_STAGES[stage]
+        channels = e[first : RESIDUAL_STAGES[stage + 1]] if stage < 5 else e[38:68:3]
+        activity = relative_magnitude(e[:first])
+        stages.append([part for channel in channels for part in split_by_activity(channel, activity, count)])
+    ys, zs = list[np.ndarray](), list[np.ndarray]()
+    for i in range(10):
+        x, y, z = e[38 + 3 * i : 41 + 3 * i]
+        flags, a, b = splits.get(i, (0, 0, 0))
+        near_x, near_xy = np.minimum(abs(x - a), CLASSES_Y - 1), np.minimum(abs(x - a) + abs(y - b), CLASSES_Z - 1)
+        ys += [y[near_x == q] for q in range(CLASSES_Y)] if flags & 1 else [y]
+        zs += [z[near_xy == q] for q in range(CLASSES_Z)] if flags & 2 else [z]
+    return [*stages, ys, zs]
+
+
 def predicted_attributes(
     k: np.ndarray,
     terms: Terms,
     splits: Splits,
+    classes: Sequence[int] = ONE_CLASS,
     *,
-    lengths: Callable[[int, int], tuple[int, int]] = lambda a, b: (a, b),
+    lengths: Lengths = lambda sizes: sizes,
     tail: bytes = b"",
 ) -> bytes:
-    """Section ATTRIBUTES of int32 [68, n], form 1 (clauses 8.5 to 8.7). terms: channel -> (channel, weight) ascending.
+    """Section ATTRIBUTES of int32 [68, n], form 1 (clauses 8.5 to 8.9). terms: channel -> (channel, weight) ascending.
 
-    lengths: what the block says of stages 0 and 1, from the true lengths. tail: after the last stage.
+    classes: of stages 1 to 5. lengths: what the block says of stages 0 to 6, from the true lengths. tail: after the
+    last stage.
     """
     k = k.astype(np.int64)
-    whole = [k[0]]
+    e = k.copy()
     for c in range(1, 38):
         total = sum((w * k[j] for j, w in terms.get(c, ())), np.zeros_like(k[c]))
-        whole.append(k[c] - (total + 512 >> WEIGHT_SHIFT))
-    y_classes, z_classes = [], []
-    for i in range(10):
-        x, y, z = k[38 + 3 * i : 41 + 3 * i]
-        flags, a, b = splits.get(i, (0, 0, 0))
-        near_x, near_xy = abs(x - a), abs(x - a) + abs(y - b)
-        whole += [x] + [y] * (not flags & 1) + [z] * (not flags & 2)
-        if flags & 1:
-            y_classes += [y[np.minimum(near_x, CLASSES_Y - 1) == q] for q in range(CLASSES_Y)]
-        if flags & 2:
-            z_classes += [z[np.minimum(near_xy, CLASSES_Z - 1) == q] for q in range(CLASSES_Z)]
-    stages = [coded(whole), coded(y_classes), coded(z_classes)]
-    block = prediction_block({c: gaps(own) for c, own in terms.items()}, splits, {})
-    said = b"".join(map(varint, lengths(len(stages[0]), len(stages[1]))))
-    return b"\1" + block + said + b"".join(stages) + tail
+        e[c] -= total + 512 >> WEIGHT_SHIFT
+    block = prediction_block({c: gaps(own) for c, own in terms.items()}, splits, {}, classes)
+    return b"\1" + block + staged(attribute_stages(e, splits, classes), lengths, tail)
 
 
 # -- LZMA sections (clause 9) ------------------------------------------------------------------------------------------

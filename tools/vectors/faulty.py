@@ -52,6 +52,7 @@ from .blocks import (
     HEADER,
     LZMA,
     MASKS,
+    ONE_CLASS,
     PLANE,
     POSITIONS,
     SMALL,
@@ -62,6 +63,7 @@ from .blocks import (
     Scale,
     Vector,
     ancillary,
+    attribute_stages,
     bad,
     coded,
     constant_networks,
@@ -75,6 +77,8 @@ from .blocks import (
     plain_planes,
     predicted_attributes,
     prediction_block,
+    staged,
+    staged_planes,
     varint,
     words,
     zigzag,
@@ -104,7 +108,7 @@ def cases() -> Iterator[Vector]:
     )
     for part in (*parts, _sections, _sizes, _varints, _priors, _histograms, _streams, _exceptions, _prediction):
         yield from part()
-    for part in (_lzma, _floats, _positions, _ranges):
+    for part in (_staged_planes, _lzma, _floats, _positions, _ranges):
         yield from part()
 
 
@@ -963,17 +967,18 @@ def _prediction() -> Iterator[Vector]:
     def block(terms=None, splits=None, counts=None) -> bytes:
         return b"\1" + prediction_block(terms or {}, splits or {}, counts or {})
 
-    def whole(terms, splits=None) -> bytes:
-        """With stages as without terms and splits."""
-        stage = coded(k)
-        return block(terms, splits) + varint(len(stage)) + varint(0) + stage
+    def whole(terms) -> bytes:
+        """With stages as without terms."""
+        return block(terms) + predicted_attributes(k, {}, {})[len(block()) :]
 
-    def said(*lengths: int) -> bytes:
-        """Other lengths of the stages, of as many bytes as the right ones."""
-        return predicted_attributes(k, {}, both, lengths=lambda a, b: lengths)
+    def said(change) -> bytes:
+        """Other lengths of the stages."""
+        return predicted_attributes(k, {}, both, lengths=change)
+
+    def classed(count: int) -> bytes:
+        return b"\1" + prediction_block({}, {}, {}, (1, 1, count, 1, 1))
 
     both = {0: (3, 3, 3)}
-    size = len(said(1, 1))
     for name, section, error, what in (
         ("form-2", b"\2" + coded(k), FEATURE, "Form 2 of the attributes."),
         ("form-255", b"\xff" + coded(k), FEATURE, "Form 255 of the attributes."),
@@ -985,51 +990,71 @@ def _prediction() -> Iterator[Vector]:
         ("term-gap-over-limit", block({37: [(39, 1)]}), LIMIT, "A gap of 39 channels."),
         ("weight-over-limit", whole({1: [(0, (1 << 15) + 1)]}), LIMIT, "A weight of 2^15 + 1."),
         ("weight-under-limit", whole({1: [(0, -(1 << 15) - 1)]}), LIMIT, "A weight of −2^15 − 1."),
-        ("term-missing", block(counts={37: 1})[:-10], MALFORMED, "The section ends before a term."),
+        ("term-missing", block(counts={37: 1})[:-15], MALFORMED, "The section ends before a term."),
         ("split-unknown", block(splits={9: (4, 0, 0)}), LIMIT, "Split 4."),
         ("split-x-over-limit", block(splits={4: (1, K_MAX + 1, 0)}), LIMIT, "A centre of x of K + 1."),
         ("split-y-under-limit", block(splits={4: (2, 0, -K_MAX - 1)}), LIMIT, "A centre of y of −K − 1."),
-        (
-            "stage-over-section",
-            said(size + 1, 0),
-            LIMIT,
-            "A stage a byte longer than the section.",
-        ),
-        ("stage-of-section", said(size, 0), MALFORMED, "A stage as long as the section."),
+        ("classes-0", classed(0), MALFORMED, "No class in stage 3."),
+        ("classes-9", classed(9), LIMIT, "Nine classes in stage 3."),
+        ("classes-cut", classed(1)[:-13], MALFORMED, "The section ends after two class counts."),
+        ("stage-over-rest", said(lambda sizes: [999, *sizes[1:]]), LIMIT, "A stage longer than the section."),
         (
             "stages-over-rest",
-            predicted_attributes(k, {}, both, lengths=lambda a, b: (a, b + 5)),
+            said(lambda sizes: [*sizes[:-1], sizes[-1] + 40]),
             MALFORMED,
-            "Stages longer than what follows the block.",
+            "Stages longer than what is left.",
         ),
-        (
-            "stage-0-short",
-            predicted_attributes(k, {}, both, lengths=lambda a, b: (a - 1, b)),
-            MALFORMED,
-            "Stage 0 is a byte short.",
-        ),
-        (
-            "stage-1-short",
-            predicted_attributes(k, {}, both, lengths=lambda a, b: (a, b - 1)),
-            MALFORMED,
-            "Stage 1 is a byte short.",
-        ),
-        (
-            "stage-without-symbols",
-            predicted_attributes(k, {}, {}, tail=words(1)),
-            MALFORMED,
-            "Bytes in a stage without symbols.",
-        ),
+        ("stage-0-short", said(lambda sizes: [sizes[0] - 1, *sizes[1:]]), MALFORMED, "Stage 0 is a byte short."),
+        ("stage-6-short", said(lambda sizes: [*sizes[:-1], sizes[-1] - 1]), MALFORMED, "Stage 6 is a byte short."),
+        ("stage-left", predicted_attributes(k, {}, {}, tail=words(1)), MALFORMED, "A word behind the last stage."),
         ("result-over-k", _over_k(), MALFORMED, "A predicted symbol of K + 1."),
     ):
         yield _attributed(f"predicted-{name}", what, "8.5 8.6 8.7", error, section)
 
 
 def _over_k() -> bytes:
-    """Form 1 with every residual of stage 0 just over K / 2, and channel 3 predicted as channel 0."""
-    residuals = np.full((68, 3), (K_MAX >> 1) + 1)
-    stage = coded(residuals)
-    return b"\1" + prediction_block({3: [(0, 1 << 10)]}, {}, {}) + varint(len(stage)) + varint(0) + stage
+    """Form 1 with every residual just over K / 2, and channel 3 predicted as channel 0."""
+    e = np.full((68, 3), (K_MAX >> 1) + 1)
+    stages = staged(attribute_stages(e, {}, ONE_CLASS))
+    return b"\1" + prediction_block({3: [(0, 1 << 10)]}, {}, {}) + stages
+
+
+def _staged_planes() -> Iterator[Vector]:
+    layer = make_layer(1, (), before=1, scales=[Scale(5)])
+    file, planes = make_file(make_layer(), layer), list(layer.meant.planes[0].values())
+    plain = layer.sections[PLANE]
+    for name, section, error, what in (
+        ("form-2", b"\2" + plain[1:], FEATURE, "Form 2 of the planes."),
+        ("form-alone", b"\1", MALFORMED, "The section ends after its form."),
+        (
+            "classes-0",
+            staged_planes(planes, (1, 1)).replace(b"\1\1\1", b"\1\1\0", 1),
+            MALFORMED,
+            "No class in stage 2.",
+        ),
+        ("classes-9", staged_planes(planes, (9, 1)), LIMIT, "Nine classes in stage 1."),
+        (
+            "stage-over-rest",
+            staged_planes(planes, (3, 2), lambda sizes: [9999, sizes[1]]),
+            LIMIT,
+            "A stage longer than the section.",
+        ),
+        (
+            "stages-over-rest",
+            staged_planes(planes, (3, 2), lambda sizes: [sizes[0] + 60, sizes[1] + 60]),
+            MALFORMED,
+            "Stages longer than what is left.",
+        ),
+        (
+            "stage-0-short",
+            staged_planes(planes, (3, 2), lambda sizes: [sizes[0] - 1, sizes[1]]),
+            MALFORMED,
+            "Stage 0 is a byte short.",
+        ),
+        ("stage-left", staged_planes(planes, (3, 2), tail=words(7)), MALFORMED, "A word behind the last stage."),
+    ):
+        payload = layer.with_sections({PLANE: section}).payload()
+        yield _in_layer(1, f"planes-{name}", what, "8.8 8.9", error, payload, file)
 
 
 # -- clause 9 ----------------------------------------------------------------------------------------------------------

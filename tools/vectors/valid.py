@@ -33,6 +33,7 @@ from .blocks import (
     FLOAT32,
     FLOATS,
     LZMA,
+    ONE_CLASS,
     PLANE,
     SMALL,
     SYMBOLS,
@@ -50,6 +51,7 @@ from .blocks import (
     plain_attributes,
     plain_planes,
     predicted_attributes,
+    staged_planes,
 )
 
 GLOBAL_HEADS = {0: (4, 3), 1: (3,), 2: (5, 32), 3: (30,), 4: (6,)}
@@ -312,9 +314,9 @@ def _exceptions() -> Iterator[Case]:
 def _attributes() -> Iterator[Case]:
     k = pattern(68, ROWS)
 
-    def predicted(terms, splits, k=k) -> File:
+    def predicted(terms, splits, k=k, classes=ONE_CLASS) -> File:
         layer = make_layer(0, line(len(k[0])), attributes=k)
-        return make_file(layer.with_sections({ATTRIBUTE: predicted_attributes(k, terms, splits)}))
+        return make_file(layer.with_sections({ATTRIBUTE: predicted_attributes(k, terms, splits, classes)}))
 
     yield "predicted-nothing", "Form 1 without terms or splits.", "8.5 8.6", predicted({}, {})
     ladder = {c: [(j, 97 * c - 1800 + 31 * j) for j in range(c % 7, c, 5)] for c in range(1, 38)}
@@ -351,6 +353,18 @@ def _attributes() -> Iterator[Case]:
     yield "predicted-both", "Terms and splits together.", "8.6 8.7", predicted(ladder, flags)
     spread = pattern(68, 2, low=-40, high=40)
     yield "predicted-two-anchors", "More classes than symbols.", "8.7", predicted(ladder, flags, spread)
+    lively = pattern(68, ROWS) * (np.arange(ROWS) % 5)  # rows of different activity
+    yield "staged-classes", "Channels split by activity.", "8.7 8.9", predicted({}, {}, lively, (3, 5, 8, 2, 7))
+    yield "staged-all", "Terms, splits and classes.", "8.6 8.7 8.9", predicted(ladder, flags, lively, (8, 3, 1, 6, 4))
+    few = predicted(ladder, flags, spread, (8,) * 5)
+    yield "staged-two-anchors", "More classes than anchors.", "8.9", few
+    still = np.full((68, ROWS), 0, np.int32)
+    yield (
+        "staged-no-activity",
+        "Every activity is 0: all rows are of the last class.",
+        "8.9",
+        predicted({}, {}, still, (8,) * 5),
+    )
     full = np.full((68, 2), MAX_SYMBOL, np.int32)
     full[::2] *= -1
     yield (
@@ -389,6 +403,14 @@ def _planes() -> Iterator[Case]:
 
     edge = Scale(1, (2, 2, 2, 2), (1, 2, 1, 2, 1, 2), steep)
     yield "planes-extremes", "The largest samples, with residuals of the largest symbols.", "11.3 14", deformed([edge])
+    for channels, counts in ((1, ()), (2, ()), (3, (3,)), (5, (8, 2)), (9, (1, 5, 8))):
+        uneven = Scale(
+            channels, (5, 4, 1, 3), (0,) * 6, lambda name, s: pattern(*s) * (np.arange(np.prod(s)).reshape(s) % 4)
+        )
+        layer = make_layer(1, (), before=1, scales=[uneven])
+        section = staged_planes([p for p in layer.meant.planes[0].values()], counts)
+        file = make_file(make_layer(), layer.with_sections({PLANE: section}))
+        yield f"planes-staged-{channels}", f"{channels} plane channels in stages.", "8.8 8.9", file
     flat = Scale(1, (MAX_PLANE_SIDE, 1, 1, 2), (0,) * 6, lambda name, shape: np.full(shape, 1, np.int32))
     yield "planes-longest", "A side of 4096 cells.", "6.3 14", deformed([flat])
     many = Scale(MAX_PLANE_CHANNELS, (1, 1, 1, 1), (0,) * 6)
