@@ -790,9 +790,9 @@ def read_class_count(reader):
     return count
 
 
-# 8.9 Classes by activity: "Lengths are varints, the bytes of a stage each, at most the bytes left in the section;
-# their sum MUST NOT exceed the bytes that follow the last of them. The last stage takes the rest, to the section's
-# end."
+# 8.9 Classes by activity: "Lengths are varints, the bytes of a stage each, at most the bytes left in the section, the
+# varint's own included; their sum MUST NOT exceed the bytes that follow the last of them, else Malformed. The last
+# stage takes the rest, to the section's end."
 def take_stages(reader, number):
     sizes = [reader.varint(reader.left) for _ in range(number - 1)]
     need(sum(sizes) <= reader.left, f"stages of {sizes} bytes in the {reader.left} that are left")
