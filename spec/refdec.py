@@ -423,10 +423,14 @@ def read_sections(layer, parts):
         for section in counts:
             channels[section], decoded = decoded[: len(counts[section])], decoded[len(counts[section]) :]
     else:
-        for section in counts:
-            data = part(section, sum(counts[section]))
-            attributes = section == ATTRIBUTE_SECTION and layer.rows > 0
-            channels[section] = (decode_attributes if attributes else decode_channels)(data, counts[section])
+        for section, sizes in counts.items():
+            data = part(section, sum(sizes))
+            if section == ATTRIBUTE_SECTION and sum(sizes):
+                channels[section] = decode_attributes(data, layer.rows)
+            elif section == PLANE_SECTION and sizes:
+                channels[section] = decode_planes(data, [shape for _, _, shape in planes])
+            else:
+                channels[section] = decode_channels(data, sizes)
     layer.raw_values = {}
     if layer.raw:
         sizes = {name: c * h * w for name, _, (c, h, w) in planes} | dict(weights)
@@ -674,21 +678,34 @@ def take_channel(stream, count, prior, exceptions):
     return [exceptions[at] if at in exceptions else next(inside) for at in range(count)]
 
 
-# 8.5 The attributes section: "Section 2 is a u8, the form" "Other forms are UnsupportedFeature."
-def decode_attributes(data, counts):
+# 8.5 The attributes section: "Section 2 is a u8, the form" "the prediction block (8.6), then eight sections of coded
+# channels, the stages 0..7 (8.7)"
+# 8.7 Stages of the attributes: "The activity of a row is the relative magnitude (8.9) of the residuals named, the
+# places being the n rows."
+def decode_attributes(data, n):
     reader = Reader(data)
-    form = reader.byte()
-    need(form <= 1, f"form {form} of the attributes", "UnsupportedFeature")
-    if form == 0:
-        return decode_channels(reader.take(reader.left), counts)
+    if read_form(reader) == 0:
+        return decode_channels(reader.take(reader.left), [n] * 68)
     terms = [read_terms(reader, c) for c in range(1, 38)]
+    class_counts = [read_class_count(reader) for _ in range(5)]
     splits = [read_split(reader) for _ in range(10)]
-    # 8.6: "two varints, the lengths in bytes of stages 0 and 1, each at most the section's length. Their sum MUST NOT
-    # exceed the bytes that follow the block. Stage 2 is the rest, to the section's end."
-    sizes = [reader.varint(len(data)) for _ in range(2)]
-    need(sum(sizes) <= reader.left, f"stages of {sizes} bytes in the {reader.left} that are left")
-    stages = [reader.take(size) for size in sizes] + [reader.take(reader.left)]
-    return decode_stages(stages, counts[0], terms, splits)
+    *stages, stage_y, stage_z = take_stages(reader, 8)
+    k = []  # r_0 .. r_37, then x_0 .. x_9
+    for stage, end, class_count in zip(stages, (6, 12, 20, 29, 38, 48), [1, *class_counts]):
+        classes = classes_by_activity(relative_magnitude(k, n), class_count)
+        k += decode_classes(stage, [classes] * (end - len(k)), class_count)
+    residuals, x = k[:38], k[38:]
+    y = decode_classes(stage_y, [y_classes(split, *own) for split, *own in zip(splits, x)], 5)
+    z = decode_classes(stage_z, [z_classes(split, *own) for split, *own in zip(splits, x, y)], 7)
+    return add_predictions(residuals, terms) + [channel for offset in zip(x, y, z) for channel in offset]
+
+
+# 8.5 The attributes section: "Other forms are UnsupportedFeature."
+# 8.8 The planes section: "Other forms are UnsupportedFeature."
+def read_form(reader):
+    form = reader.byte()
+    need(form <= 1, f"form {form} of a section", "UnsupportedFeature")
+    return form
 
 
 # 8.6 Prediction block: "a varint m ≤ c, then m times a varint g ≤ 38 and a zigzag weight w, |w| ≤ 2^15. The term
@@ -713,46 +730,107 @@ def read_split(reader):
     return f & 1, f >> 1, a, reader.zigzag(K) if f >> 1 else 0
 
 
-# 8.7 Stages: "so the lengths in stage 1 follow from stage 0, those in stage 2 from stages 0 and 1."
-def decode_stages(stages, rows, terms, splits):
-    k, whole = [None] * 68, list(range(38))
-    for x, (y_is_split, z_is_split, _, _) in zip(range(38, 68, 3), splits):
-        whole += [x] + [x + 1] * (not y_is_split) + [x + 2] * (not z_is_split)
-    for c, symbols in zip(whole, decode_channels(stages[0], [rows] * len(whole))):
-        k[c] = symbols
-    for c, own in enumerate(terms, 1):
-        k[c] = add_prediction(k[c], [(k[j], w) for j, w in own])
-    split_y = [(x, a) for x, (is_split, _, a, _) in zip(range(38, 68, 3), splits) if is_split]
-    classes = [[min(abs(v - a), 4) for v in k[x]] for x, a in split_y]
-    for (x, _), symbols in zip(split_y, decode_classes(stages[1], 5, classes)):
-        k[x + 1] = symbols
-    split_z = [(x, a, b) for x, (_, is_split, a, b) in zip(range(38, 68, 3), splits) if is_split]
-    classes = [[min(abs(v - a) + abs(w - b), 6) for v, w in zip(k[x], k[x + 1])] for x, a, b in split_z]
-    for (x, _, _), symbols in zip(split_z, decode_classes(stages[2], 7, classes)):
-        k[x + 2] = symbols
+# 8.7 Stages of the attributes: "min(|x_i − a_i|, 4) for y_i, classes 0..4"
+def y_classes(split, x):
+    """The class of each row; 0 if y is not split."""
+    is_split, _, a, _ = split
+    return [is_split * min(abs(v - a), 4) for v in x]
+
+
+# 8.7 Stages of the attributes: "min(|x_i − a_i| + |y_i − b_i|, 6) for z_i, classes 0..6"
+def z_classes(split, x, y):
+    _, is_split, a, b = split
+    return [is_split * min(abs(v - a) + abs(w - b), 6) for v, w in zip(x, y)]
+
+
+# 8.7 Stages of the attributes: "A channel that is split stands in its stage as its classes 0, 1, .. in order, each a
+# channel of its own that holds, in row order, the symbols of the rows of that class"
+# 8 Coded channels: "Channels of length 0 leave no trace."
+def decode_classes(data, classes, class_count):
+    """The channels of a stage, given the class of each place of each; a channel that is not split is all class 0."""
+    parts = map(iter, decode_channels(data, [own.count(q) for own in classes for q in range(class_count)]))
+    channels = []
+    for own in classes:
+        of_class = [next(parts) for _ in range(class_count)]
+        channels.append([next(of_class[q]) for q in own])
+    return channels
+
+
+# 8.7 Stages of the attributes: "k_c = r_c + ((Σ w·k_j + 512) >> 10)" "Every k_c MUST lie in −K..K, else Malformed"
+def add_predictions(residuals, terms):
+    k = residuals[:1]
+    for own, r in zip(terms, residuals[1:]):
+        sums = [512] * len(r)
+        for j, w in own:
+            sums = [s + w * v for s, v in zip(sums, k[j])]
+        k.append([v + (s >> 10) for v, s in zip(r, sums)])
+        need(all(abs(v) <= K for v in k[-1]), "a predicted symbol over K")
     return k
 
 
-# 8.7 Stages: "k_c = r_c + ((Σ w·k_j + 512) >> 10)" "Every k_c MUST lie in −K..K, else Malformed"
-def add_prediction(residuals, terms):
-    sums = [512] * len(residuals)
-    for channel, w in terms:
-        sums = [s + w * k for s, k in zip(sums, channel)]
-    symbols = [r + (s >> 10) for r, s in zip(residuals, sums)]
-    need(all(abs(k) <= K for k in symbols), "a predicted symbol over K")
-    return symbols
+# 8.8 The planes section: "Stage 0 holds the plane channels 0 and 1, stage s ≥ 1 the plane channels 2^s .. 2^(s+1) − 1,
+# as far as there are such. Within a stage come the planes in the order of the plain form, in each its plane channels,
+# ascending, in each its classes."
+def decode_planes(data, shapes):
+    """The residuals, channel by channel in the order of the plain form; shapes: (channels, height, width) of each."""
+    reader, channels = Reader(data), shapes[0][0]
+    if read_form(reader) == 0:
+        return decode_channels(reader.take(reader.left), [h * w for c, h, w in shapes for _ in range(c)])
+    number = max(1, (channels - 1).bit_length())
+    class_counts = [read_class_count(reader) for _ in range(number - 1)]
+    planes = [[] for _ in shapes]
+    for s, (stage, class_count) in enumerate(zip(take_stages(reader, number), [1, *class_counts])):
+        first, end = len(planes[0]), min(2 << s, channels)
+        classes = [classes_by_activity(cell_activity(e, h, w), class_count) for e, (_, h, w) in zip(planes, shapes)]
+        decoded = decode_classes(stage, [own for own in classes for _ in range(first, end)], class_count)
+        for e in planes:
+            e += decoded[: end - first]
+            del decoded[: end - first]
+    return [channel for e in planes for channel in e]
 
 
-# 8.7 Stages: "The classes of a split channel are channels of their own: class q holds, in row order, the symbols of
-# the rows with"
-def decode_classes(data, number, classes):
-    """The split channels, given the class of each row of each."""
-    parts = map(iter, decode_channels(data, [own.count(q) for own in classes for q in range(number)]))
-    channels = []
-    for own in classes:
-        of_class = [next(parts) for _ in range(number)]
-        channels.append([next(of_class[q]) for q in own])
-    return channels
+# 8.8 The planes section: "The activity of cell (i, j) is the sum, over the nine cells (clip(i + a, 0, H − 1), clip(j +
+# b, 0, W − 1)) with a and b in −1..1, of their relative magnitudes (8.9) in the residuals of the plane's channels in
+# the stages before, the places being the plane's cells."
+def cell_activity(channels, h, w):
+    magnitude = relative_magnitude(channels, h * w)
+    rows = [[min(max(i + a, 0), h - 1) for a in (-1, 0, 1)] for i in range(h)]
+    columns = [[min(max(j + b, 0), w - 1) for b in (-1, 0, 1)] for j in range(w)]
+    return [sum(magnitude[i * w + j] for i in near_i for j in near_j) for near_i in rows for near_j in columns]
+
+
+# 8.9 Classes by activity: "A class count is a varint 1..8 (0 is Malformed)."
+def read_class_count(reader):
+    count = reader.varint(8)
+    need(count, "a class count of 0")
+    return count
+
+
+# 8.9 Classes by activity: "Lengths are varints, the bytes of a stage each, at most the bytes left in the section, the
+# varint's own included; their sum MUST NOT exceed the bytes that follow the last of them, else Malformed. The last
+# stage takes the rest, to the section's end."
+def take_stages(reader, number):
+    sizes = [reader.varint(reader.left) for _ in range(number - 1)]
+    need(sum(sizes) <= reader.left, f"stages of {sizes} bytes in the {reader.left} that are left")
+    return [reader.take(size) for size in sizes] + [reader.take(reader.left)]
+
+
+# 8.9 Classes by activity: "Σ over channels c of (|e_c[p]| · 256·N) // (1 + Σ over places q of |e_c[q]|)"
+def relative_magnitude(channels, n):
+    """Of each of the n places."""
+    magnitude = [0] * n
+    for e in channels:
+        total = 1 + sum(abs(v) for v in e)
+        magnitude = [m + abs(v) * 256 * n // total for m, v in zip(magnitude, e)]
+    return magnitude
+
+
+# 8.9 Classes by activity: "let A be the activities in ascending order. The class of a place is the number of i in 1 ..
+# C − 1 with A[(i·N) // C] at most its activity."
+def classes_by_activity(activity, class_count):
+    ascending = sorted(activity)
+    bounds = [ascending[i * len(ascending) // class_count] for i in range(1, class_count)]
+    return [bisect_right(bounds, value) for value in activity]
 
 
 # 9.1 Symbols: "It MUST unpack to exactly the bytes that the widths and lengths call for, at most 2^31, and end with
