@@ -49,7 +49,7 @@ def need(ok, what, name="Malformed"):
         raise Fault(name, what)
 
 
-# 14 Limits: "A declared value over its limit is LimitExceeded, and nothing is allocated for it."
+# 14 Limits: "A declared value over its limit is LimitExceeded, and nothing is allocated for it"
 def limited(value, high, what, low=0):
     need(type(value) is int, f"{what} is no integer")
     need(value <= high, f"{what} is {value}, limit {high}", "LimitExceeded")
@@ -57,8 +57,8 @@ def limited(value, high, what, low=0):
     return value
 
 
-# 15 Errors and security: "a mode, deformation, form of the attributes, predictor, network, prior family, section number
-# or key under 64 that is not registered"
+# 15 Errors and security: "a mode, deformation, form of a section, predictor, network, prior family, section number or
+# key under 64 that is not registered"
 def registered(value, known, what):
     need(type(value) is int, f"{what} is no integer")
     need(value in known, f"{what} is {value}", "UnsupportedFeature")
@@ -621,8 +621,8 @@ def take_classes(stream, prior):
     prior.cum = histogram_table(classes, top, step)
 
 
-# 8.3 Exceptions: "the symbol is kmin − 1 − (c >> 1) if c is odd, else kmin + n·2^shift + (c >> 1). It MUST lie in
-# −K..K, its position within the channel."
+# 8.3 Exceptions: "the symbol is kmin − 1 − (c >> 1) if c is odd, else kmin + n·2^shift + (c >> 1)." "There MUST NOT be
+# more exceptions than symbols, the symbol MUST lie in −K..K and its position within the channel, else Malformed."
 def read_exceptions(reader, count, prior):
     number = 1 + reader.varint(VARINT_MAX)
     need(number <= min(count, reader.left // 2), f"{number} exceptions among {count} symbols")
@@ -663,8 +663,8 @@ def decode_channels(data, counts):
 
 
 # 8.4 Symbols: "for shift 0 the entries s of the prior's table; else first all entries, then all low bits r under the
-# uniform table of shift bits. The symbol is kmin + s·2^shift + r, and MUST NOT exceed K. Exceptions are then put in
-# their places."
+# uniform table of shift bits. The symbol is kmin + s·2^shift + r, and MUST NOT exceed K, else Malformed. Exceptions
+# are then put in their places."
 def take_channel(stream, count, prior, exceptions):
     left = count - len(exceptions)
     symbols = [prior.kmin + (s << prior.shift) for s in stream.take(left, prior.cum)]

@@ -209,15 +209,25 @@ def split_by_activity(channel: np.ndarray, activity: np.ndarray, count: int) -> 
 Lengths = Callable[[list[int]], list[int]]
 
 
-def staged(stages: Iterable[Iterable[np.ndarray]], lengths: Lengths = lambda sizes: sizes, tail: bytes = b"") -> bytes:
-    """The lengths of all stages but the last, then the stages. lengths: what is said, from the true lengths."""
-    payloads = [coded(stage) for stage in stages]
+def staged(
+    stages: Iterable[Iterable[np.ndarray]],
+    lengths: Lengths = lambda sizes: sizes,
+    tail: bytes = b"",
+    priors: Mapping[int, Mapping[int, Prior]] | None = None,
+) -> bytes:
+    """The lengths of all stages but the last, then the stages. lengths: what is said, from the true lengths. priors: by
+    stage, then by channel of the stage."""
+    payloads = [coded(stage, (priors or {}).get(number)) for number, stage in enumerate(stages)]
     said = lengths([len(p) for p in payloads[:-1]])
     return b"".join(map(varint, said)) + b"".join(payloads) + tail
 
 
 def staged_planes(
-    planes: Sequence[np.ndarray], counts: Sequence[int], lengths: Lengths = lambda sizes: sizes, tail: bytes = b""
+    planes: Sequence[np.ndarray],
+    counts: Sequence[int],
+    lengths: Lengths = lambda sizes: sizes,
+    tail: bytes = b"",
+    priors: Mapping[int, Mapping[int, Prior]] | None = None,
 ) -> bytes:
     """Section PLANES of residuals int32 [C, H, W] per plane, form 1 (clause 8.8). counts: classes of stages 1 on."""
     stages = []
@@ -237,7 +247,7 @@ def staged_planes(
             for channel in e[first:end]:
                 channels += split_by_activity(channel, np.ravel(around), counts[stage - 1])
         stages.append(channels)
-    return b"\1" + b"".join(map(varint, counts)) + staged(stages, lengths, tail)
+    return b"\1" + b"".join(map(varint, counts)) + staged(stages, lengths, tail, priors)
 
 
 Terms = Mapping[int, Sequence[tuple[int, int]]]
@@ -366,6 +376,16 @@ class Layer:
         packed = pack(meta({**self.meta, 2: lengths}))
         body = b"".join(self.sections[s] for s in sorted(self.sections))
         return struct.pack("<I", len(packed)) + packed + body
+
+    def padded(self, parameters: int) -> bytes:
+        """Its bytes, an ignored key among the parameters filling them up to so many bytes."""
+        bare = struct.unpack_from("<I", self.payload())[0]
+        form, size = next(
+            (form, parameters - bare - 1 - form)
+            for form in (2, 3)
+            if parameters - bare - 1 - form < 1 << 8 * (form - 1)
+        )
+        return self.payload(lambda m: {**m, 64: bytes(size)})
 
     def with_sections(self, sections: Mapping[int, bytes | None]) -> Layer:
         """With other bytes in some sections; None takes one out."""

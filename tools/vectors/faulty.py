@@ -19,6 +19,7 @@ from pd4dgs_codec.bitstream.limits import (
     MAX_HEADER,
     MAX_NETWORK_LAYERS,
     MAX_NETWORK_WIDTH,
+    MAX_PARAMETERS,
     MAX_PAYLOAD,
     MAX_PLANE_CHANNELS,
     MAX_PLANE_SCALES,
@@ -41,6 +42,7 @@ from pd4dgs_codec.entropy.priors import (
     write_prior,
 )
 from pd4dgs_codec.entropy.tables import TOTAL
+from pd4dgs_codec.entropy.varint import VARINT_MAX
 
 from . import lzma2
 from .blocks import (
@@ -83,7 +85,7 @@ from .blocks import (
     words,
     zigzag,
 )
-from .valid import LARGEST, LEAST_NORMAL, line, ordered, symbols_at_limit, three_layers
+from .valid import LARGEST, LEAST_NORMAL, line, ordered, rows_at_limit, symbols_at_limit, tables_at_limit, three_layers
 
 MALFORMED, LIMIT, FEATURE = "Malformed", "LimitExceeded", "UnsupportedFeature"
 SIGNATURE, VERSION, HEADER_LENGTH, HEADER_CRC, HEADER_START = 0, 8, 12, 16, 20  # offsets in the preamble
@@ -547,7 +549,6 @@ def _layout() -> Iterator[Vector]:
             struct.pack("<I", len(payload) - 3) + payload[4:],
             "Parameters a byte longer than the payload.",
         ),
-        ("parameters-largest", struct.pack("<I", 2**32 - 1) + payload[4:], "Parameters of 2^32 − 1 bytes."),
         (
             "parameters-short",
             struct.pack("<I", size - 1) + payload[4:],
@@ -558,6 +559,11 @@ def _layout() -> Iterator[Vector]:
         ("sections-cut", payload[: 4 + size], "No byte of any section."),
     ):
         yield _in_layer(0, f"payload-{name}", what, "6.1", MALFORMED, bytes_, plain)
+    for name, bytes_, what in (
+        ("largest", struct.pack("<I", 2**32 - 1) + payload[4:], "Parameters of 2^32 − 1 bytes."),
+        ("over-limit", make_layer().padded(MAX_PARAMETERS + 1), "Parameters of 4097 bytes."),
+    ):
+        yield _in_layer(0, f"payload-parameters-{name}", what, "6.1 14", LIMIT, bytes_, plain)
 
 
 def _parameters() -> Iterator[Vector]:
@@ -735,6 +741,8 @@ def _sections() -> Iterator[Vector]:
 def _sizes() -> Iterator[Vector]:
     over = symbols_at_limit(over=1)
     yield bad("symbols-over-limit", "One symbol more than the payload may declare.", "6.5", LIMIT, over, chunk=1)
+    crowd = rows_at_limit(over=1)
+    yield bad("rows-over-limit", "One anchor more than the payload may declare.", "6.5 14", LIMIT, crowd, chunk=0)
     layer, file = make_layer(), _plain()
     for name, rows in (("rows", 1 << 20), ("most-rows", MAX_ANCHORS)):
         payload = layer.payload(lambda m, rows=rows: {**m, 1: rows})
@@ -879,6 +887,8 @@ def _priors() -> Iterator[Vector]:
     one = b"\0" + coded([[2] * 3] * 67)
     yield _attributed("channel-missing", "67 channels of attributes.", "8.1", MALFORMED, one)
     yield _attributed("channel-too-many", "69 channels of attributes.", "8.1", MALFORMED, b"\0" + coded([[2] * 3] * 69))
+    over = tables_at_limit(more=True)
+    yield bad("prior-tables-over-limit", "Tables of 2^21 + 1 entries in a section.", "8.2 14", LIMIT, over, chunk=1)
     wide = gauss(K_MAX - 2 * 4095, 2, shift=12)
     yield _steep("symbol-over-k", "A scaled symbol of K + 1.", "8.4", wide)
 
@@ -953,6 +963,8 @@ def _exceptions() -> Iterator[Vector]:
         ("beyond-channel", listed(0, 3, 0), MALFORMED, "An exception at place 3 of three symbols."),
         ("second-beyond-channel", listed(1, 1, 0, 1, 0), MALFORMED, "A second exception at place 3 of three symbols."),
         ("more-than-symbols", listed(3, *[0, 0] * 4), MALFORMED, "Four exceptions among three symbols."),
+        ("number-largest", listed(VARINT_MAX, 0, 0), MALFORMED, "2^35 exceptions, the most a varint can say."),
+        ("place-largest", listed(0, VARINT_MAX, 0), MALFORMED, "An exception at place 2^35 − 1 of three symbols."),
         ("counts-that-lie", listed(MAX_COUNT - 1, 0, 0), MALFORMED, "2^26 exceptions in four bytes."),
         ("cut", listed(1, 0, 0, 0), MALFORMED, "The section ends inside an exception."),
         ("code-over-limit", listed(0, 0, 4 * K_MAX + 3), LIMIT, "A code over 4·K + 2."),
@@ -979,6 +991,9 @@ def _prediction() -> Iterator[Vector]:
         return b"\1" + prediction_block({}, {}, {}, (1, 1, count, 1, 1))
 
     both = {0: (3, 3, 3)}
+    stages = [coded(stage) for stage in attribute_stages(k, {}, ONE_CLASS)]
+    stages[1] = varint(2 * FIRST_REUSE) * 6
+    reused = block() + b"".join([*(varint(len(stage)) for stage in stages[:-1]), *stages])
     for name, section, error, what in (
         ("form-2", b"\2" + coded(k), FEATURE, "Form 2 of the attributes."),
         ("form-255", b"\xff" + coded(k), FEATURE, "Form 255 of the attributes."),
@@ -1006,6 +1021,7 @@ def _prediction() -> Iterator[Vector]:
         ),
         ("stage-0-short", said(lambda sizes: [sizes[0] - 1, *sizes[1:]]), MALFORMED, "Stage 0 is a byte short."),
         ("stage-6-short", said(lambda sizes: [*sizes[:-1], sizes[-1] - 1]), MALFORMED, "Stage 6 is a byte short."),
+        ("prior-of-earlier-stage", reused, MALFORMED, "Stage 1 refers to a prior of stage 0."),
         ("stage-left", predicted_attributes(k, {}, {}, tail=words(1)), MALFORMED, "A word behind the last stage."),
         ("result-over-k", _over_k(), MALFORMED, "A predicted symbol of K + 1."),
     ):
@@ -1023,6 +1039,15 @@ def _staged_planes() -> Iterator[Vector]:
     layer = make_layer(1, (), before=1, scales=[Scale(5)])
     file, planes = make_file(make_layer(), layer), list(layer.meant.planes[0].values())
     plain = layer.sections[PLANE]
+
+    def of_the_rest(more: int) -> bytes:
+        """Stage 0 as long as what is left of the section where its length begins, or longer."""
+        said = 0
+        for _ in range(3):  # the length's own bytes count
+            section = staged_planes(planes, (3, 2), lambda sizes, said=said: [said + more, sizes[1]])  # type: ignore[misc]
+            said = len(section) - len(b"\1\3\2")
+        return section
+
     for name, section, error, what in (
         ("form-2", b"\2" + plain[1:], FEATURE, "Form 2 of the planes."),
         ("form-alone", b"\1", MALFORMED, "The section ends after its form."),
@@ -1051,10 +1076,20 @@ def _staged_planes() -> Iterator[Vector]:
             MALFORMED,
             "Stage 0 is a byte short.",
         ),
+        ("stage-of-rest", of_the_rest(0), MALFORMED, "A stage as long as all that its length and the rest take."),
+        ("stage-over-rest-by-1", of_the_rest(1), LIMIT, "A stage of a byte more than its length and the rest take."),
         ("stage-left", staged_planes(planes, (3, 2), tail=words(7)), MALFORMED, "A word behind the last stage."),
     ):
         payload = layer.with_sections({PLANE: section}).payload()
         yield _in_layer(1, f"planes-{name}", what, "8.8 8.9", error, payload, file)
+    same = make_layer(1, (), before=1, scales=[Scale(3, (1, 1, 1, 1), fill=lambda name, shape: np.full(shape, 4))])
+    first, again = coded([[4]] * 12), varint(2 * FIRST_REUSE)
+    section = b"\1\1" + varint(len(first)) + first + again * 6
+    payload = same.with_sections({PLANE: section}).payload()
+    what = "A stage refers to a prior of the stage before."
+    yield _in_layer(
+        1, "planes-prior-of-earlier-stage", what, "8 8.1 8.8", MALFORMED, payload, make_file(make_layer(), same)
+    )
 
 
 # -- clause 9 ----------------------------------------------------------------------------------------------------------

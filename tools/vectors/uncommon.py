@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-from pd4dgs_codec.bitstream.limits import MAX_CHUNKS, MAX_HEADER
+from pd4dgs_codec.bitstream.limits import MAX_CHUNKS, MAX_HEADER, MAX_PARAMETERS
 
 from .blocks import (
     CAMERA,
@@ -19,7 +19,7 @@ from .blocks import (
     make_layer,
     varint,
 )
-from .valid import three_layers
+from .valid import rows_at_limit, three_layers
 
 FIRST_PRIVATE = 1 << 15
 #: A value of every form that canonical msgpack has, nested as deep as a value in the header may be.
@@ -90,6 +90,9 @@ def _cases() -> Iterator[tuple[str, str, str, File]]:
     layer = layers.layer(1)
     extended = layer.payload(lambda m: {**m, 64: [1, 2], 70000: {5: "x"}})
     yield "layer-unknown-keys", "Keys from 64 on in the layer parameters.", "4 6.2", layers.with_payload(1, extended)
+    longest = layers.with_payload(1, layer.padded(MAX_PARAMETERS))
+    yield "layer-parameters-longest", "Layer parameters of 4096 bytes.", "6.1 14", longest
+    yield "rows-at-limit", "As many anchors as the payload may declare.", "6.5 14", rows_at_limit()
     noted = layer.payload(lambda m: {**m, 2: {**m[2], 64: 7, 65: "no length", 2**32 - 1: -1}})
     yield (
         "layer-unknown-sections",

@@ -3,17 +3,19 @@
 from __future__ import annotations
 
 import itertools
+import struct
 from collections.abc import Iterator
 
 import numpy as np
 
 from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
 from pd4dgs_codec.bitstream.limits import MAX_NETWORK_LAYERS, MAX_NETWORK_WIDTH, MAX_PLANE_CHANNELS, MAX_PLANE_SIDE
-from pd4dgs_codec.codec.layer_meta import FREE_SYMBOLS, SYMBOLS_PER_BYTE
+from pd4dgs_codec.codec.layer_meta import FREE_ROWS, FREE_SYMBOLS, ROWS_PER_BYTE, SYMBOLS_PER_BYTE
 from pd4dgs_codec.entropy.morton import morton_order
 from pd4dgs_codec.entropy.priors import (
     CLASS_STEPS,
     K_MAX,
+    MAX_ENTRIES,
     MAX_WINDOW,
     MU8_MAX,
     Const,
@@ -50,6 +52,7 @@ from .blocks import (
     pattern,
     plain_attributes,
     plain_planes,
+    plane_channels,
     predicted_attributes,
     staged_planes,
 )
@@ -182,6 +185,18 @@ def _priors() -> Iterator[Case]:
     k = _of_widths(0, 8000, 8000)
     k[0] = pattern(ROWS, low=0, high=1)
     yield "prior-windows", "Windows of 2 and of 2^14 entries.", "7.2 8.2 14", _with_priors(windows, k)
+    wide_tables = [gauss(-(MAX_WINDOW >> 1), MAX_WINDOW, si=200 + c) for c in range(96)]
+    yield "prior-tables-at-limit", "Tables of 2^21 entries in one section.", "8.2 14", tables_at_limit()
+    many = Scale(32, (1, 1, 1, 1))
+    deformed = make_layer(1, (), before=1, scales=[many])
+    own = {3: dict(enumerate(wide_tables[:40])), 4: dict(enumerate(wide_tables))}
+    section = staged_planes(list(deformed.meant.planes[0].values()), (1,) * 4, priors=own)
+    yield (
+        "prior-tables-per-stage",
+        "Tables of more than 2^21 entries in all stages, not in any of them.",
+        "8 8.8 14",
+        make_file(make_layer(), deformed.with_sections({PLANE: section})),
+    )
     yield "prior-constants", "A constant of its own per channel, to the largest symbols.", "8.1 8.2", _constants()
     four = [SMALL, gauss(-3, 7, si=10), gauss(-3, 7, si=20), Const(Window(1, 1))]
     k = pattern(68, ROWS)
@@ -209,6 +224,20 @@ def _priors() -> Iterator[Case]:
         "8 8.1",
         make_file(layer.with_sections({ATTRIBUTE: section})),
     )
+
+
+def tables_at_limit(more: bool = False) -> File:
+    """A section of 128 windows of 2^14 entries, 2^21 in all, and one of a single entry if there are to be more."""
+    layer = make_layer(1, (), before=1, scales=[Scale(32, (1, 1, 1, 1))])
+    channels = [c for plane in layer.meant.planes[0].values() for c in plane_channels(plane)]
+    different: list[Prior] = [
+        gauss(-(MAX_WINDOW >> 1), MAX_WINDOW, si=200 + c) for c in range(MAX_ENTRIES // MAX_WINDOW)
+    ]
+    priors = {c: different[c % len(different)] for c in range(len(channels))}
+    if more:
+        last = len(channels) - 1
+        priors[last] = Const(Window(int(channels[last][0]), 1))
+    return make_file(make_layer(), layer.with_sections({PLANE: plain_planes(channels, priors)}))
 
 
 def _constants() -> File:
@@ -358,6 +387,14 @@ def _attributes() -> Iterator[Case]:
     yield "staged-all", "Terms, splits and classes.", "8.6 8.7 8.9", predicted(ladder, flags, lively, (8, 3, 1, 6, 4))
     few = predicted(ladder, flags, spread, (8,) * 5)
     yield "staged-two-anchors", "More classes than anchors.", "8.9", few
+    large = pattern(68, 12)
+    large[:6] = pattern(6, 12, low=-MAX_SYMBOL, high=MAX_SYMBOL)
+    yield (
+        "staged-extremes",
+        "Activities of the largest symbols.",
+        "8.9 14",
+        predicted({}, {}, large, (8, 3, 5, 2, 4)),
+    )
     still = np.full((68, ROWS), 0, np.int32)
     yield (
         "staged-no-activity",
@@ -451,6 +488,15 @@ def symbols_at_limit(over: int = 0) -> File:
         if rest == 0 and second >= 256:
             return make_file(make_layer(cells=()), layer(first, second, hidden))
     raise AssertionError("no widths reach the limit")
+
+
+def rows_at_limit(over: int = 0) -> File:
+    """As many anchors as clause 6.5 allows a payload of 600 bytes, or `over` more."""
+    size = 600
+    layer = make_layer(0, line(FREE_ROWS + ROWS_PER_BYTE * size + over))
+    bare = layer.payload()
+    payload = layer.padded(struct.unpack_from("<I", bare)[0] + size - len(bare))
+    return make_file(layer).with_payload(0, payload)
 
 
 # -- positions ---------------------------------------------------------------------------------------------------------
