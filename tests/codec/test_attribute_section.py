@@ -151,13 +151,13 @@ def test_a_faulty_block_is_refused(options, error, message):
         read_attributes(block(**options), 3)
 
 
-def test_a_predicted_symbol_over_the_limit_is_refused():
-    payload = encode_channels([np.full(3, K_MAX, np.int32)] * 10).payload
-    stages = [encode_channels([np.full(3, K_MAX, np.int32)] * number).payload for number in (6, 6, 8, 9, 9, 10, 10)]
-    lengths = [len(stage) for stage in stages]
-    fine = block(lengths=lengths) + b"".join(stages) + payload
-    assert (read_attributes(fine, 3) == K_MAX).all()
-    for sign in (1, -1):
-        over = block(terms={1: (1, [(0, sign << 15)])}, lengths=lengths) + b"".join(stages) + payload
+@pytest.mark.parametrize("symbol", [K_MAX >> 1, -(K_MAX >> 1), (K_MAX >> 1) + 1, -(K_MAX >> 1) - 1])
+def test_a_predicted_symbol_over_the_limit_is_refused(symbol):
+    """Channel 1 is predicted as channel 0 is, and its residual doubles it."""
+    stages = [encode_channels([np.full(3, symbol)] * number).payload for number in (6, 6, 8, 9, 9, 10, 10, 10)]
+    data = block(terms={1: (1, [(0, 1 << 10)])}, lengths=[len(s) for s in stages[:-1]]) + b"".join(stages)
+    if abs(2 * symbol) <= K_MAX:
+        assert read_attributes(data, 3)[:3, 0].tolist() == [symbol, 2 * symbol, symbol]
+    else:
         with pytest.raises(Malformed, match=f"a predicted attribute over {K_MAX}"):
-            read_attributes(over, 3)
+            read_attributes(data, 3)
