@@ -269,9 +269,18 @@ def read_chunk_list(rows):
     need(rows[0][0] == 0 and layers == sorted(set(layers)), f"layers {layers}")
 
 
+# 3.3 Scene identity: "the header from the end of its chunk list (the value of key 1, its first entry) to its own end"
+def behind_chunk_list(header):
+    reader = Reader(header)
+    reader.take(3 if reader.data[0] == 0xDE else 1)  # the head of the map
+    for _ in ("key 1", "the chunk list"):
+        msgpack_value(reader, 1)
+    return reader.take(reader.left)
+
+
 # 3.2 Chunks: "Type and length MUST equal those in the chunk list. Checks come in this order: L against its limit, L
 # against the list, the bytes that are there, CRC-32, flags, type, scene id."
-def read_chunk(data, at, kind, size, scene_id):
+def read_chunk(data, at, kind, size, scene_id, described):
     need(len(data) >= at + 16, "the file ends in a chunk's head", "Truncated")
     found_kind, flags, found_size, found_id = struct.unpack_from("<HHI8s", data, at)
     limited(found_size, (1 << 31) - 1, "a payload's length")
@@ -282,10 +291,10 @@ def read_chunk(data, at, kind, size, scene_id):
     need(zlib.crc32(data[at:end]) == crc, f"CRC-32 of the chunk at {at}", "ChecksumMismatch")
     need(flags <= 1, f"flags {flags:#x}")
     need(found_kind == kind, f"chunk type {found_kind}, listed {kind}")
-    need(scene_id in (None, found_id), "a chunk of another scene")
     payload = data[at + 16 : end]
-    # 3.3: the scene id is the first 8 bytes of the SHA-256 of the payload of the layer-0 chunk.
-    need(scene_id or found_id == hashlib.sha256(payload).digest()[:8], "the scene id is not that of layer 0")
+    # 3.3: the first 8 bytes of the SHA-256 of what the header says besides the chunk list, then the layer-0 payload.
+    expected = scene_id or hashlib.sha256(described + payload).digest()[:8]
+    need(found_id == expected, "the scene id is not that of the header and layer 0")
     # 3.4: the chunk types of layers are critical.
     need(kind < 3 or flags == 1, f"critical chunk of type {kind}", "UnsupportedFeature")
     need(kind >= 3 or flags == 0, "a layer marked as ancillary")
@@ -1121,12 +1130,13 @@ def decode(data, max_layer=None):
     """The layers of a file's bytes, or of prefix max_layer, each with `symbols` and `tensors` by name, flat and in C
     order."""
     header, at = read_preamble(data)
+    described = behind_chunk_list(data[20:at])
     layers, scene_id, rows = [], None, 0
     stop = len(header[1])
     if max_layer is not None:
         stop = 1 + max(i for i, (kind, _) in enumerate(header[1]) if kind <= min(max_layer, 2))
     for kind, size in header[1][:stop]:
-        payload, scene_id, at = read_chunk(data, at, kind, size, scene_id)
+        payload, scene_id, at = read_chunk(data, at, kind, size, scene_id, described)
         if kind < 3:
             layers.append(read_layer(payload, kind, rows, header))
             rows += layers[-1].rows

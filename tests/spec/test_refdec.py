@@ -19,10 +19,11 @@ from strategies import LAYER_SETS, make_scene, scenes
 
 from pd4dgs_codec.attributes.quantise import MAX_SYMBOL, dequantise
 from pd4dgs_codec.bitstream import canonical
-from pd4dgs_codec.bitstream.container import read_chunk, read_preamble, scene_id_of, write_chunk, write_preamble
+from pd4dgs_codec.bitstream.container import read_chunk, read_preamble, write_chunk, write_preamble
 from pd4dgs_codec.codec.attribute_section import read_attributes
 from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.encoder import encode
+from pd4dgs_codec.codec.header import scene_id_of
 from pd4dgs_codec.codec.info import hashes
 from pd4dgs_codec.codec.layer_meta import Section
 from pd4dgs_codec.codec.plane_section import read_planes
@@ -430,9 +431,9 @@ def take_apart(data):
 
 def put_together(header, chunks):
     """A file with right lengths, ids and CRCs, whatever its payloads say."""
-    scene_id = scene_id_of(chunks[0][2])
-    framed = [write_chunk(t, f, scene_id, p) for t, f, p in chunks]
-    return write_preamble(canonical.pack({**header, 1: [[t, len(p)] for t, _, p in chunks]})) + b"".join(framed)
+    packed = canonical.pack({**header, 1: [[t, len(p)] for t, _, p in chunks]})
+    scene_id = scene_id_of(packed, chunks[0][2])
+    return write_preamble(packed) + b"".join(write_chunk(t, f, scene_id, p) for t, f, p in chunks)
 
 
 def outcome(function, data, fault):

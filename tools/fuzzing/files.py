@@ -20,7 +20,7 @@ from vectors import blocks
 from pd4dgs_codec import encode
 from pd4dgs_codec.attributes.quantise import dequantise
 from pd4dgs_codec.bitstream import canonical
-from pd4dgs_codec.bitstream.container import read_chunk, read_preamble, scene_id_of, write_chunk, write_preamble
+from pd4dgs_codec.bitstream.container import read_chunk, read_preamble, write_chunk, write_preamble
 from pd4dgs_codec.codec import attribute_section, layer_meta, stages
 from pd4dgs_codec.codec import header as header_module
 from pd4dgs_codec.codec.decoder import decode_layers
@@ -83,12 +83,16 @@ def take_apart(data: bytes) -> Parts:
 
 
 def put_together(parts: Parts, header: bytes | None = None) -> bytes:
-    """The file of `parts`, or with other bytes for a header. EncodeError if a value has no canonical form."""
+    """The file of `parts`, or with other bytes for a header, which may be none. EncodeError if a value has no canonical
+    form."""
     payloads = [chunk.packed() for chunk in parts.chunks]
     if header is None:
         rows = [[chunk.type, len(payload)] for chunk, payload in zip(parts.chunks, payloads, strict=True)]
         header = canonical.pack({**parts.header, header_module.CHUNKS: rows})
-    scene_id = scene_id_of(payloads[0]) if payloads else bytes(8)
+    try:
+        scene_id = header_module.scene_id_of(header, payloads[0])
+    except (DecodeError, LookupError, TypeError):  # no header, or no chunk
+        scene_id = bytes(8)
     framed = [write_chunk(c.type, c.flags & 1, scene_id, p) for c, p in zip(parts.chunks, payloads, strict=True)]
     return b"".join([write_preamble(header), *framed])
 

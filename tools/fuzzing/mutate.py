@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from typing import Any
 
 from fuzzing.files import Chunk, Parts, Seed, put_together, take_apart, take_stages
-from pd4dgs_codec.bitstream.container import CHUNK_HEAD_SIZE, SIGNATURE, read_chunk, read_preamble, write_preamble
+from pd4dgs_codec.bitstream.container import CHUNK_HEAD_SIZE, SIGNATURE, read_chunk, read_preamble
 from pd4dgs_codec.entropy.varint import put_varint
 from pd4dgs_codec.errors import EncodeError
 
@@ -275,11 +275,11 @@ def change_parts(rng: random.Random, data: bytes, other: bytes, names: list[str]
 
 
 def change_header_bytes(rng: random.Random, data: bytes, other: bytes, names: list[str]) -> bytes:
-    """The header's bytes changed as they lie, with the checksum right again: msgpack in forms that nobody writes."""
+    """The header's bytes changed as they lie, ids and checksums right again: msgpack in forms that nobody writes."""
     (size,) = struct.unpack_from("<I", data, 12)
     header = change_bytes(rng, data[20 : 20 + size], other[20:200], names)[:4096]
     names.append("in the header")
-    return write_preamble(header) + data[20 + size :]
+    return put_together(take_apart(data), header)
 
 
 def change_frame(rng: random.Random, data: bytes, other: bytes, names: list[str]) -> bytes:

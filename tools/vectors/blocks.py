@@ -19,7 +19,8 @@ from pd4dgs_codec.attributes.planes import residual
 from pd4dgs_codec.attributes.quantise import dequantise
 from pd4dgs_codec.attributes.table import ATTRIBUTES, N_CHANNELS, dequantise_attributes
 from pd4dgs_codec.bitstream import canonical
-from pd4dgs_codec.bitstream.container import MAJOR, SIGNATURE, scene_id_of
+from pd4dgs_codec.bitstream.container import MAJOR, SIGNATURE
+from pd4dgs_codec.codec.header import scene_id_of
 from pd4dgs_codec.codec.kinds import LAYER_KINDS, SCAFFOLD_INPUT
 from pd4dgs_codec.codec.layer_meta import Section, step_names
 from pd4dgs_codec.codec.symbols import LayerSymbols
@@ -575,14 +576,18 @@ class File:
         """Offset of a chunk; that of the file's end for the number of chunks."""
         return 20 + len(self.header_bytes()) + sum(20 + len(c.payload) for c in self.chunks[:index])
 
+    @property
+    def scene_id(self) -> bytes:
+        """Clause 3.3, of the canonical header."""
+        return scene_id_of(canonical.pack(self.fields()), self.chunks[0].payload)
+
     def data(self) -> bytes:
         """Its bytes."""
         header = self.header_bytes()
         declared = len(header) if self.declared is None else self.declared
         front = struct.pack("<8sHHI", self.signature, self.major, self.minor, declared)
         crc = zlib.crc32(header, zlib.crc32(front)) ^ self.crc
-        scene_id = scene_id_of(self.chunks[0].payload)
-        frames = b"".join(c.frame(scene_id) for c in self.chunks)
+        frames = b"".join(c.frame(self.scene_id) for c in self.chunks)
         return front + struct.pack("<I", crc) + header + frames + self.tail
 
     def with_header(self, fields: Mapping[int, object]) -> File:

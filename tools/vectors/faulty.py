@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import itertools
 import math
 import struct
@@ -12,7 +13,6 @@ import numpy as np
 
 from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
 from pd4dgs_codec.bitstream import canonical
-from pd4dgs_codec.bitstream.container import scene_id_of
 from pd4dgs_codec.bitstream.limits import (
     MAX_ANCHORS,
     MAX_CHUNKS,
@@ -195,14 +195,24 @@ def _chunks() -> Iterator[Vector]:
     )
 
     alien = replace(file, chunks=(file.chunks[0],)).with_chunk(0, scene_id=b"12345678")
-    yield bad(
-        "scene-id-layer-0", "The scene id is not that of the payload.", "3.3", MALFORMED, alien, chunk=0, at=SCENE_ID
-    )
+    yield bad("scene-id-layer-0", "The scene id is another one.", "3.3", MALFORMED, alien, chunk=0, at=SCENE_ID)
     same = file
     for c in range(3):
         same = same.with_chunk(c, scene_id=b"12345678")
     yield bad("scene-id-all", "All chunks agree on a wrong scene id.", "3.3", MALFORMED, same, chunk=0, at=SCENE_ID)
-    donor = scene_id_of(make_layer().payload())
+    own_payload = hashlib.sha256(file.chunks[0].payload).digest()[:8]
+    alone = replace(file, chunks=tuple(replace(c, scene_id=own_payload) for c in file.chunks))
+    what = "A scene id of the payload of layer 0 without the header."
+    yield bad("scene-id-without-header", what, "3.3", MALFORMED, alone, chunk=0, at=SCENE_ID)
+    for name, fields, what in (
+        ("steps", {4: [0.5, 0.5, 0.5]}, "The header of another scene, with other steps."),
+        ("ignored-key", {64: 1}, "A key that is ignored was put into the header."),
+        ("camera", {12: CAMERA}, "A default camera was put into the header."),
+    ):
+        other = file.with_header(fields)
+        spliced = replace(other, chunks=tuple(replace(c, scene_id=file.scene_id) for c in file.chunks))
+        yield bad(f"splice-header-{name}", what, "3.3", MALFORMED, spliced, chunk=0, at=SCENE_ID)
+    donor = make_file(make_layer()).scene_id
     spliced = file.with_chunk(2, scene_id=donor)
     yield bad("splice-layer-2", "Layer 2 is from another scene.", "3.3", MALFORMED, spliced, chunk=2, at=SCENE_ID)
     extra = replace(file, chunks=(file.chunks[0], ancillary(9, b"x", scene_id=donor), *file.chunks[1:]))
