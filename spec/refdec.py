@@ -24,6 +24,7 @@ MAX_SYMBOL = 1 << 23  # clause 14: symbols of attributes, plane samples and weig
 MAX_VOXEL = 1 << 20
 MAX_COUNT = 1 << 26
 MAX_ENTRIES = 1 << 21
+VARINT_MAX = (1 << 35) - 1  # clause 7.1: five bytes of seven bits
 TOTAL = 1 << 24
 PLANES = (("xy", 0, 1), ("xz", 0, 2), ("xt", 0, 3), ("yz", 1, 2), ("yt", 1, 3), ("zt", 2, 3))
 ATTRIBUTES = (("feature", 32), ("scaling_log", 6), ("offset", 30))
@@ -48,11 +49,19 @@ def need(ok, what, name="Malformed"):
         raise Fault(name, what)
 
 
-# 14 Limits: "A declared value over its limit is LimitExceeded, and nothing is allocated for it."
+# 14 Limits: "A declared value over its limit is LimitExceeded, and nothing is allocated for it"
 def limited(value, high, what, low=0):
     need(type(value) is int, f"{what} is no integer")
     need(value <= high, f"{what} is {value}, limit {high}", "LimitExceeded")
     need(value >= low, f"{what} is {value}, expected at least {low}")
+    return value
+
+
+# 15 Errors and security: "a mode, deformation, form of a section, predictor, network, prior family, section number or
+# key under 64 that is not registered"
+def registered(value, known, what):
+    need(type(value) is int, f"{what} is no integer")
+    need(value in known, f"{what} is {value}", "UnsupportedFeature")
     return value
 
 
@@ -75,8 +84,12 @@ class Reader:
         return struct.unpack(form, self.take(struct.calcsize(form)))[0]
 
     def byte(self, high=255):
-        value = self.number("B")
-        need(value <= high, f"a byte is {value}, expected at most {high}")
+        return limited(self.number("B"), high, "a byte")
+
+    # 2.3 Reserved and unused: "A reserved bit or value MUST be zero or absent in a 1.0 file"
+    def bits(self, used):
+        value = self.byte()
+        need(value >> used == 0, f"a byte is {value:#x}, expected {used} bits")
         return value
 
     # 7.1 Variable-length integers: "A varint holds seven bits per byte, least significant first; the high bit of a
@@ -241,7 +254,7 @@ def read_header(data):
             limited(camera[key], 65535, "camera size", 1)
     read_chunk_list(a_list(header[1], "chunk list"))
     for key in (2, 3):
-        need(limited(header[key], 1 << 32, f"header key {key}") <= 1, f"key {key}: {header[key]}", "UnsupportedFeature")
+        registered(header[key], (0, 1), f"header key {key}")
     return header
 
 
@@ -256,9 +269,18 @@ def read_chunk_list(rows):
     need(rows[0][0] == 0 and layers == sorted(set(layers)), f"layers {layers}")
 
 
+# 3.3 Scene identity: "the header from the end of its chunk list (the value of key 1, its first entry) to its own end"
+def behind_chunk_list(header):
+    reader = Reader(header)
+    reader.take(3 if reader.data[0] == 0xDE else 1)  # the head of the map
+    for _ in ("key 1", "the chunk list"):
+        msgpack_value(reader, 1)
+    return reader.take(reader.left)
+
+
 # 3.2 Chunks: "Type and length MUST equal those in the chunk list. Checks come in this order: L against its limit, L
 # against the list, the bytes that are there, CRC-32, flags, type, scene id."
-def read_chunk(data, at, kind, size, scene_id):
+def read_chunk(data, at, kind, size, scene_id, described):
     need(len(data) >= at + 16, "the file ends in a chunk's head", "Truncated")
     found_kind, flags, found_size, found_id = struct.unpack_from("<HHI8s", data, at)
     limited(found_size, (1 << 31) - 1, "a payload's length")
@@ -269,10 +291,10 @@ def read_chunk(data, at, kind, size, scene_id):
     need(zlib.crc32(data[at:end]) == crc, f"CRC-32 of the chunk at {at}", "ChecksumMismatch")
     need(flags <= 1, f"flags {flags:#x}")
     need(found_kind == kind, f"chunk type {found_kind}, listed {kind}")
-    need(scene_id in (None, found_id), "a chunk of another scene")
     payload = data[at + 16 : end]
-    # 3.3: the scene id is the first 8 bytes of the SHA-256 of the payload of the layer-0 chunk.
-    need(scene_id or found_id == hashlib.sha256(payload).digest()[:8], "the scene id is not that of layer 0")
+    # 3.3: the first 8 bytes of the SHA-256 of what the header says besides the chunk list, then the layer-0 payload.
+    expected = scene_id or hashlib.sha256(described + payload).digest()[:8]
+    need(found_id == expected, "the scene id is not that of the header and layer 0")
     # 3.4: the chunk types of layers are critical.
     need(kind < 3 or flags == 1, f"critical chunk of type {kind}", "UnsupportedFeature")
     need(kind >= 3 or flags == 0, "a layer marked as ancillary")
@@ -336,7 +358,7 @@ def read_scales(layer, rows):
         for side in row[1:5]:
             limited(side, 4096, "a plane's side", 1)
         for predictor in row[5:]:
-            need(limited(predictor, 65535, "a predictor") <= 5, f"predictor {predictor}", "UnsupportedFeature")
+            registered(predictor, range(6), "a predictor")
             need(predictor == 0 or not layer.raw, "a predictor on float32 planes")
     return rows
 
@@ -344,12 +366,11 @@ def read_scales(layer, rows):
 # 6.3 Planes and networks: "Layer 0 has all three networks. A deformation has its trunk and at least one head. Other
 # ids are UnsupportedFeature."
 def read_networks(number, rows):
-    limited(len(a_list(rows, "networks")), len(NETWORKS[number]), "the number of networks", 1)
+    need(a_list(rows, "networks"), "an empty list of networks")
     networks, last = {}, -1
     for row in rows:
         need(a_list(row, "a network"), "an empty network")
-        key = limited(row[0], 65535, "a network's id")
-        need(key in NETWORKS[number], f"network {key}", "UnsupportedFeature")
+        key = registered(row[0], NETWORKS[number], "a network's id")
         need(key > last, f"network {key} after {last}")
         limited(len(row) - 1, 16, "linear layers", 1)
         for width in row[1:]:
@@ -411,10 +432,14 @@ def read_sections(layer, parts):
         for section in counts:
             channels[section], decoded = decoded[: len(counts[section])], decoded[len(counts[section]) :]
     else:
-        for section in counts:
-            data = part(section, sum(counts[section]))
-            attributes = section == ATTRIBUTE_SECTION and layer.rows > 0
-            channels[section] = (decode_attributes if attributes else decode_channels)(data, counts[section])
+        for section, sizes in counts.items():
+            data = part(section, sum(sizes))
+            if section == ATTRIBUTE_SECTION and sum(sizes):
+                channels[section] = decode_attributes(data, layer.rows)
+            elif section == PLANE_SECTION and sizes:
+                channels[section] = decode_planes(data, [shape for _, _, shape in planes])
+            else:
+                channels[section] = decode_channels(data, sizes)
     layer.raw_values = {}
     if layer.raw:
         sizes = {name: c * h * w for name, _, (c, h, w) in planes} | dict(weights)
@@ -584,7 +609,7 @@ def read_normal(reader, n):
 # differences symbol r adds r − top to the class before (0 before the first), of a table of 2·top + 1 symbols with mu8
 # = 256·top."
 def read_histogram(reader, prior):
-    mode = reader.byte(7)
+    mode = reader.bits(3)
     step, differences = 8 << (mode & 3), mode >> 2
     top = reader.varint(1 + 1984 // step)
     need(top, "a histogram without classes")
@@ -605,13 +630,14 @@ def take_classes(stream, prior):
     prior.cum = histogram_table(classes, top, step)
 
 
-# 8.3 Exceptions: "the symbol is kmin − 1 − (c >> 1) if c is odd, else kmin + n·2^shift + (c >> 1). It MUST lie in
-# −K..K, its position within the channel."
+# 8.3 Exceptions: "the symbol is kmin − 1 − (c >> 1) if c is odd, else kmin + n·2^shift + (c >> 1)." "There MUST NOT be
+# more exceptions than symbols, the symbol MUST lie in −K..K and its position within the channel, else Malformed."
 def read_exceptions(reader, count, prior):
-    number = 1 + reader.varint(min(count, reader.left // 2))
+    number = 1 + reader.varint(VARINT_MAX)
+    need(number <= min(count, reader.left // 2), f"{number} exceptions among {count} symbols")
     result, at = {}, -1
     for _ in range(number):
-        at += 1 + reader.varint(MAX_COUNT)
+        at += 1 + reader.varint(VARINT_MAX)
         c = reader.varint(4 * K + 2)
         value = prior.kmin - 1 - (c >> 1) if c & 1 else prior.end + (c >> 1)
         need(at < count and abs(value) <= K, f"an exception {value} at {at} of {count}")
@@ -646,8 +672,8 @@ def decode_channels(data, counts):
 
 
 # 8.4 Symbols: "for shift 0 the entries s of the prior's table; else first all entries, then all low bits r under the
-# uniform table of shift bits. The symbol is kmin + s·2^shift + r, and MUST NOT exceed K. Exceptions are then put in
-# their places."
+# uniform table of shift bits. The symbol is kmin + s·2^shift + r, and MUST NOT exceed K, else Malformed. Exceptions
+# are then put in their places."
 def take_channel(stream, count, prior, exceptions):
     left = count - len(exceptions)
     symbols = [prior.kmin + (s << prior.shift) for s in stream.take(left, prior.cum)]
@@ -661,21 +687,34 @@ def take_channel(stream, count, prior, exceptions):
     return [exceptions[at] if at in exceptions else next(inside) for at in range(count)]
 
 
-# 8.5 The attributes section: "Section 2 is a u8, the form" "Other forms are UnsupportedFeature."
-def decode_attributes(data, counts):
+# 8.5 The attributes section: "Section 2 is a u8, the form" "the prediction block (8.6), then eight sections of coded
+# channels, the stages 0..7 (8.7)"
+# 8.7 Stages of the attributes: "The activity of a row is the relative magnitude (8.9) of the residuals named, the
+# places being the n rows."
+def decode_attributes(data, n):
     reader = Reader(data)
-    form = reader.byte()
-    need(form <= 1, f"form {form} of the attributes", "UnsupportedFeature")
-    if form == 0:
-        return decode_channels(reader.take(reader.left), counts)
+    if read_form(reader) == 0:
+        return decode_channels(reader.take(reader.left), [n] * 68)
     terms = [read_terms(reader, c) for c in range(1, 38)]
+    class_counts = [read_class_count(reader) for _ in range(5)]
     splits = [read_split(reader) for _ in range(10)]
-    # 8.6: "two varints, the lengths in bytes of stages 0 and 1, each at most the section's length. Their sum MUST NOT
-    # exceed the bytes that follow the block. Stage 2 is the rest, to the section's end."
-    sizes = [reader.varint(len(data)) for _ in range(2)]
-    need(sum(sizes) <= reader.left, f"stages of {sizes} bytes in the {reader.left} that are left")
-    stages = [reader.take(size) for size in sizes] + [reader.take(reader.left)]
-    return decode_stages(stages, counts[0], terms, splits)
+    *stages, stage_y, stage_z = take_stages(reader, 8)
+    k = []  # r_0 .. r_37, then x_0 .. x_9
+    for stage, end, class_count in zip(stages, (6, 12, 20, 29, 38, 48), [1, *class_counts]):
+        classes = classes_by_activity(relative_magnitude(k, n), class_count)
+        k += decode_classes(stage, [classes] * (end - len(k)), class_count)
+    residuals, x = k[:38], k[38:]
+    y = decode_classes(stage_y, [y_classes(split, *own) for split, *own in zip(splits, x)], 5)
+    z = decode_classes(stage_z, [z_classes(split, *own) for split, *own in zip(splits, x, y)], 7)
+    return add_predictions(residuals, terms) + [channel for offset in zip(x, y, z) for channel in offset]
+
+
+# 8.5 The attributes section: "Other forms are UnsupportedFeature."
+# 8.8 The planes section: "Other forms are UnsupportedFeature."
+def read_form(reader):
+    form = reader.byte()
+    need(form <= 1, f"form {form} of a section", "UnsupportedFeature")
+    return form
 
 
 # 8.6 Prediction block: "a varint m ≤ c, then m times a varint g ≤ 38 and a zigzag weight w, |w| ≤ 2^15. The term
@@ -700,46 +739,107 @@ def read_split(reader):
     return f & 1, f >> 1, a, reader.zigzag(K) if f >> 1 else 0
 
 
-# 8.7 Stages: "so the lengths in stage 1 follow from stage 0, those in stage 2 from stages 0 and 1."
-def decode_stages(stages, rows, terms, splits):
-    k, whole = [None] * 68, list(range(38))
-    for x, (y_is_split, z_is_split, _, _) in zip(range(38, 68, 3), splits):
-        whole += [x] + [x + 1] * (not y_is_split) + [x + 2] * (not z_is_split)
-    for c, symbols in zip(whole, decode_channels(stages[0], [rows] * len(whole))):
-        k[c] = symbols
-    for c, own in enumerate(terms, 1):
-        k[c] = add_prediction(k[c], [(k[j], w) for j, w in own])
-    split_y = [(x, a) for x, (is_split, _, a, _) in zip(range(38, 68, 3), splits) if is_split]
-    classes = [[min(abs(v - a), 4) for v in k[x]] for x, a in split_y]
-    for (x, _), symbols in zip(split_y, decode_classes(stages[1], 5, classes)):
-        k[x + 1] = symbols
-    split_z = [(x, a, b) for x, (_, is_split, a, b) in zip(range(38, 68, 3), splits) if is_split]
-    classes = [[min(abs(v - a) + abs(w - b), 6) for v, w in zip(k[x], k[x + 1])] for x, a, b in split_z]
-    for (x, _, _), symbols in zip(split_z, decode_classes(stages[2], 7, classes)):
-        k[x + 2] = symbols
+# 8.7 Stages of the attributes: "min(|x_i − a_i|, 4) for y_i, classes 0..4"
+def y_classes(split, x):
+    """The class of each row; 0 if y is not split."""
+    is_split, _, a, _ = split
+    return [is_split * min(abs(v - a), 4) for v in x]
+
+
+# 8.7 Stages of the attributes: "min(|x_i − a_i| + |y_i − b_i|, 6) for z_i, classes 0..6"
+def z_classes(split, x, y):
+    _, is_split, a, b = split
+    return [is_split * min(abs(v - a) + abs(w - b), 6) for v, w in zip(x, y)]
+
+
+# 8.7 Stages of the attributes: "A channel that is split stands in its stage as its classes 0, 1, .. in order, each a
+# channel of its own that holds, in row order, the symbols of the rows of that class"
+# 8 Coded channels: "Channels of length 0 leave no trace."
+def decode_classes(data, classes, class_count):
+    """The channels of a stage, given the class of each place of each; a channel that is not split is all class 0."""
+    parts = map(iter, decode_channels(data, [own.count(q) for own in classes for q in range(class_count)]))
+    channels = []
+    for own in classes:
+        of_class = [next(parts) for _ in range(class_count)]
+        channels.append([next(of_class[q]) for q in own])
+    return channels
+
+
+# 8.7 Stages of the attributes: "k_c = r_c + ((Σ w·k_j + 512) >> 10)" "Every k_c MUST lie in −K..K, else Malformed"
+def add_predictions(residuals, terms):
+    k = residuals[:1]
+    for own, r in zip(terms, residuals[1:]):
+        sums = [512] * len(r)
+        for j, w in own:
+            sums = [s + w * v for s, v in zip(sums, k[j])]
+        k.append([v + (s >> 10) for v, s in zip(r, sums)])
+        need(all(abs(v) <= K for v in k[-1]), "a predicted symbol over K")
     return k
 
 
-# 8.7 Stages: "k_c = r_c + ((Σ w·k_j + 512) >> 10)" "Every k_c MUST lie in −K..K, else Malformed"
-def add_prediction(residuals, terms):
-    sums = [512] * len(residuals)
-    for channel, w in terms:
-        sums = [s + w * k for s, k in zip(sums, channel)]
-    symbols = [r + (s >> 10) for r, s in zip(residuals, sums)]
-    need(all(abs(k) <= K for k in symbols), "a predicted symbol over K")
-    return symbols
+# 8.8 The planes section: "Stage 0 holds the plane channels 0 and 1, stage s ≥ 1 the plane channels 2^s .. 2^(s+1) − 1,
+# as far as there are such. Within a stage come the planes in the order of the plain form, in each its plane channels,
+# ascending, in each its classes."
+def decode_planes(data, shapes):
+    """The residuals, channel by channel in the order of the plain form; shapes: (channels, height, width) of each."""
+    reader, channels = Reader(data), shapes[0][0]
+    if read_form(reader) == 0:
+        return decode_channels(reader.take(reader.left), [h * w for c, h, w in shapes for _ in range(c)])
+    number = max(1, (channels - 1).bit_length())
+    class_counts = [read_class_count(reader) for _ in range(number - 1)]
+    planes = [[] for _ in shapes]
+    for s, (stage, class_count) in enumerate(zip(take_stages(reader, number), [1, *class_counts])):
+        first, end = len(planes[0]), min(2 << s, channels)
+        classes = [classes_by_activity(cell_activity(e, h, w), class_count) for e, (_, h, w) in zip(planes, shapes)]
+        decoded = decode_classes(stage, [own for own in classes for _ in range(first, end)], class_count)
+        for e in planes:
+            e += decoded[: end - first]
+            del decoded[: end - first]
+    return [channel for e in planes for channel in e]
 
 
-# 8.7 Stages: "The classes of a split channel are channels of their own: class q holds, in row order, the symbols of
-# the rows with"
-def decode_classes(data, number, classes):
-    """The split channels, given the class of each row of each."""
-    parts = map(iter, decode_channels(data, [own.count(q) for own in classes for q in range(number)]))
-    channels = []
-    for own in classes:
-        of_class = [next(parts) for _ in range(number)]
-        channels.append([next(of_class[q]) for q in own])
-    return channels
+# 8.8 The planes section: "The activity of cell (i, j) is the sum, over the nine cells (clip(i + a, 0, H − 1), clip(j +
+# b, 0, W − 1)) with a and b in −1..1, of their relative magnitudes (8.9) in the residuals of the plane's channels in
+# the stages before, the places being the plane's cells."
+def cell_activity(channels, h, w):
+    magnitude = relative_magnitude(channels, h * w)
+    rows = [[min(max(i + a, 0), h - 1) for a in (-1, 0, 1)] for i in range(h)]
+    columns = [[min(max(j + b, 0), w - 1) for b in (-1, 0, 1)] for j in range(w)]
+    return [sum(magnitude[i * w + j] for i in near_i for j in near_j) for near_i in rows for near_j in columns]
+
+
+# 8.9 Classes by activity: "A class count is a varint 1..8 (0 is Malformed)."
+def read_class_count(reader):
+    count = reader.varint(8)
+    need(count, "a class count of 0")
+    return count
+
+
+# 8.9 Classes by activity: "Lengths are varints, the bytes of a stage each, at most the bytes left in the section, the
+# varint's own included; their sum MUST NOT exceed the bytes that follow the last of them, else Malformed. The last
+# stage takes the rest, to the section's end."
+def take_stages(reader, number):
+    sizes = [reader.varint(reader.left) for _ in range(number - 1)]
+    need(sum(sizes) <= reader.left, f"stages of {sizes} bytes in the {reader.left} that are left")
+    return [reader.take(size) for size in sizes] + [reader.take(reader.left)]
+
+
+# 8.9 Classes by activity: "Σ over channels c of (|e_c[p]| · 256·N) // (1 + Σ over places q of |e_c[q]|)"
+def relative_magnitude(channels, n):
+    """Of each of the n places."""
+    magnitude = [0] * n
+    for e in channels:
+        total = 1 + sum(abs(v) for v in e)
+        magnitude = [m + abs(v) * 256 * n // total for m, v in zip(magnitude, e)]
+    return magnitude
+
+
+# 8.9 Classes by activity: "let A be the activities in ascending order. The class of a place is the number of i in 1 ..
+# C − 1 with A[(i·N) // C] at most its activity."
+def classes_by_activity(activity, class_count):
+    ascending = sorted(activity)
+    bounds = [ascending[i * len(ascending) // class_count] for i in range(1, class_count)]
+    return [bisect_right(bounds, value) for value in activity]
 
 
 # 9.1 Symbols: "It MUST unpack to exactly the bytes that the widths and lengths call for, at most 2^31, and end with
@@ -776,7 +876,7 @@ def decode_lzma_symbols(data, counts):
     if not data:
         return [[] for _ in counts]
     reader = Reader(data)
-    _, planar = reader.byte(224), reader.byte(1)
+    _, planar = reader.byte(224), reader.bits(1)
     bases, forms = [], []
     for count in counts:
         limited(count, MAX_COUNT, "the symbols of a channel")
@@ -797,7 +897,7 @@ def decode_lzma_floats(data, counts):
     for count in counts:
         limited(count, MAX_COUNT, "values of an array")
     reader = Reader(data)
-    _, planar = reader.byte(224), reader.byte(1)
+    _, planar = reader.byte(224), reader.bits(1)
     raw = unpack_lzma(reader.take(reader.left), 4 * sum(counts))
     arrays = split_numbers(raw, [("f", count) for count in counts], planar)
     need(all(math.isfinite(v) for array in arrays for v in array), "a float32 value is not finite")
@@ -1023,29 +1123,33 @@ def finish(layers):
         dequantise_layer(layer)
 
 
-# 12.1 Order: "Read preamble and header, then the chunks in order."
+# 12.1 Order: "Read preamble and header, then the chunks in order." "A decoder of prefix ℓ stops after the last layer ≤
+# ℓ in the list and does not look at what follows."
 # 3.2 Chunks: "Bytes after the last chunk make the file Malformed."
-def decode(data, max_layer=2):
-    """The layers <= max_layer of a file's bytes, each with `symbols` and `tensors` by name, flat and in C order."""
+def decode(data, max_layer=None):
+    """The layers of a file's bytes, or of prefix max_layer, each with `symbols` and `tensors` by name, flat and in C
+    order."""
     header, at = read_preamble(data)
+    described = behind_chunk_list(data[20:at])
     layers, scene_id, rows = [], None, 0
-    wanted = [i for i, (kind, _) in enumerate(header[1]) if kind <= max_layer]
-    stop = len(header[1]) if max_layer >= 2 else wanted[-1] + 1
+    stop = len(header[1])
+    if max_layer is not None:
+        stop = 1 + max(i for i, (kind, _) in enumerate(header[1]) if kind <= min(max_layer, 2))
     for kind, size in header[1][:stop]:
-        payload, scene_id, at = read_chunk(data, at, kind, size, scene_id)
+        payload, scene_id, at = read_chunk(data, at, kind, size, scene_id, described)
         if kind < 3:
             layers.append(read_layer(payload, kind, rows, header))
             rows += layers[-1].rows
-    need(max_layer < 2 or at == len(data), "bytes follow the last chunk")
+    need(max_layer is not None or at == len(data), "bytes follow the last chunk")
     finish(layers)
     return layers
 
 
 # 12.4 Hashes: "For conformance, two SHA-256 digests per layer, printed in hexadecimal as a JSON list of {"layer",
 # "symbols", "tensors"}."
-def hashes(data):
+def hashes(data, max_layer=None):
     rows = []
-    for layer in decode(data):
+    for layer in decode(data, max_layer):
         symbols, tensors = hashlib.sha256(), hashlib.sha256()
         for values in layer.symbols.values():
             symbols.update(struct.pack(f"<{len(values)}i", *values))

@@ -8,7 +8,6 @@ The preamble's CRC covers its first 16 bytes and the header; a chunk's CRC cover
 
 from __future__ import annotations
 
-import hashlib
 import struct
 import zlib
 from dataclasses import dataclass
@@ -59,11 +58,6 @@ class Chunk:
     @property
     def ancillary(self) -> bool:
         return bool(self.flags & FLAG_ANCILLARY)
-
-
-def scene_id_of(payload: Buffer) -> bytes:
-    """The scene id that a layer-0 payload gives every chunk of its file: the first 8 bytes of its SHA-256."""
-    return hashlib.sha256(payload).digest()[:SCENE_ID_SIZE]
 
 
 def write_preamble(header: bytes) -> bytes:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from pd4dgs_codec.bitstream.container import PREAMBLE_SIZE, read_chunk, read_preamble, scene_id_of
-from pd4dgs_codec.codec.header import Header, unpack_header
+from pd4dgs_codec.bitstream.container import PREAMBLE_SIZE, read_chunk, read_preamble
+from pd4dgs_codec.codec.header import Header, scene_id_of, unpack_header
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
 from pd4dgs_codec.codec.layers import read_layer
 from pd4dgs_codec.codec.symbols import LayerSymbols, assemble
@@ -12,13 +12,14 @@ from pd4dgs_codec.scene import Scene
 
 
 class LayerReader:
-    """Walks a file's chunks in order. It holds no bytes: every call gets all of the file that has arrived."""
+    """Walks a file's chunks in order. It holds no bytes but the header's: every call gets all that has arrived."""
 
     def __init__(self) -> None:
         self.header: Header | None = None
         self.layers: list[LayerSymbols] = []
         self.offset = 0  #: of the next chunk
         self._index = 0
+        self._packed_header = b""
         self._scene_id: bytes | None = None
 
     @property
@@ -38,11 +39,12 @@ class LayerReader:
         """Read on to the end of one more layer <= max_layer; None if the file has no more (clause "decoding process").
 
         Raises Truncated, with nothing consumed that a later call would miss, if `data` ends before; Malformed if
-        bytes follow the last chunk.
+        bytes follow the last chunk of a file that is read whole (max_layer None).
         """
         if self.header is None:
             preamble = read_preamble(data)
             self.header, self.offset = unpack_header(preamble.header, offset=PREAMBLE_SIZE), preamble.size
+            self._packed_header = preamble.header
         chunks = self.header.chunks
         while self._index < len(chunks):
             if max_layer is not None and not _any_layer(chunks[self._index :], max_layer):
@@ -51,7 +53,7 @@ class LayerReader:
             if layer is not None:
                 self.layers.append(layer)
                 return layer
-        if len(data) > self.offset:
+        if max_layer is None and len(data) > self.offset:
             raise Malformed(f"{len(data) - self.offset} bytes follow the last chunk, expected none", offset=self.offset)
         return None
 
@@ -70,9 +72,10 @@ class LayerReader:
             message = f"layer {kind.layer} is flagged ancillary, expected a critical chunk"
             raise Malformed(message, offset=self.offset, chunk=self._index)
         if self._scene_id is None:
-            self._scene_id = scene_id_of(chunk.payload)
+            self._scene_id = scene_id_of(self._packed_header, chunk.payload)
             if chunk.scene_id != self._scene_id:
-                message = f"scene id {chunk.scene_id.hex()}, expected {self._scene_id.hex()} from the layer-0 payload"
+                expected = f"{self._scene_id.hex()} from the header and the layer-0 payload"
+                message = f"scene id {chunk.scene_id.hex()}, expected {expected}"
                 raise Malformed(message, offset=self.offset + 8, chunk=self._index)
         layer = None
         if kind is not None:

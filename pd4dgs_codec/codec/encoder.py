@@ -8,10 +8,10 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from pd4dgs_codec.attributes.table import ATTRIBUTES
-from pd4dgs_codec.bitstream.container import scene_id_of, write_chunk, write_preamble
+from pd4dgs_codec.bitstream.container import write_chunk, write_preamble
 from pd4dgs_codec.codec.check import check_scene
 from pd4dgs_codec.codec.decoder import decode_layers
-from pd4dgs_codec.codec.header import DEFORMATIONS, MODES, Header, pack_header
+from pd4dgs_codec.codec.header import DEFORMATIONS, MODES, Header, pack_header, scene_id_of
 from pd4dgs_codec.codec.layers import Coding, StreamReport, read_meta, write_layer
 from pd4dgs_codec.codec.plan import LeftOut, plan
 from pd4dgs_codec.codec.symbols import (
@@ -135,9 +135,10 @@ def _container(scene: Scene, mode: str, deformation: str, symbols: list[LayerSym
         attribute_steps={a.name: getattr(scene.steps, a.name) for a in ATTRIBUTES},
         info=scene.info,
     )
-    scene_id = scene_id_of(payloads[0])
+    packed = pack_header(header)
+    scene_id = scene_id_of(packed, payloads[0])
     chunks = [write_chunk(t, 0, scene_id, payload) for t, payload in zip(types, payloads, strict=True)]
-    return b"".join([write_preamble(pack_header(header)), *chunks])
+    return b"".join([write_preamble(packed), *chunks])
 
 
 def _verify(data: bytes, planned: Scene, meant: list[LayerSymbols]) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+
 from pd4dgs_codec.errors import LimitExceeded, Malformed, UnsupportedFeature
 
 #: Unknown keys from here on may be ignored; unknown ones below change what the file means.
@@ -35,11 +37,8 @@ class Fields:
 
     def choice(self, key: int, table: dict[str, int]) -> str:
         """The name of an enumerated value; a number outside the table is a feature this decoder does not know."""
-        value = as_integer(self.get(key), 0xFFFFFFFF, f"{self._where} key {key}")
-        for name, number in table.items():
-            if number == value:
-                return name
-        raise UnsupportedFeature(f"{self._where} key {key}: {value}, expected one of {table}")
+        names = {number: name for name, number in table.items()}
+        return names[as_registered(self.get(key), names, f"{self._where} key {key}")]
 
     def sequence(self, key: int, count: int | None = None) -> list:
         """A list, of `count` entries if given."""
@@ -68,6 +67,15 @@ def as_integer(value: object, high: int, where: str, low: int = 0) -> int:
         raise LimitExceeded(f"{where}: {value}, expected at most {high}")
     if value < low:
         raise Malformed(f"{where}: {value}, expected at least {low}")
+    return value
+
+
+def as_registered(value: object, known: Mapping[int, object], where: str) -> int:
+    """`value` as one of the `known` numbers of a registry; another integer is a feature this decoder does not know."""
+    if not isinstance(value, int) or isinstance(value, bool):
+        raise Malformed(f"{where}: {type(value).__name__}, expected an integer")
+    if value not in known:
+        raise UnsupportedFeature(f"{where}: {value}, expected one of {list(known)}")
     return value
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,7 @@ import numpy as np
 from pd4dgs_codec.attributes.quantise import is_step
 from pd4dgs_codec.attributes.table import ATTRIBUTES
 from pd4dgs_codec.bitstream import canonical
+from pd4dgs_codec.bitstream.container import SCENE_ID_SIZE
 from pd4dgs_codec.bitstream.limits import MAX_CHUNKS, MAX_PAYLOAD
 from pd4dgs_codec.codec.check import info_fault
 from pd4dgs_codec.codec.fields import Fields, as_integer, as_list
@@ -108,6 +110,18 @@ def unpack_header(data: bytes, offset: int = 0) -> Header:
         attribute_steps={a.name: step for a, step in zip(ATTRIBUTES, steps, strict=True)},
         info=info,
     )
+
+
+def scene_id_of(header: bytes, payload: bytes) -> bytes:
+    """The scene id of every chunk of a file: the first 8 bytes of the SHA-256 of the header's bytes behind its chunk
+    list, then of the layer-0 payload. Chunks may come and go without another id; whatever decodes them may not.
+
+    header: canonical, with a chunk list.
+    """
+    fields = canonical.unpack(header)
+    map_head = 1 if len(fields) < 16 else 3
+    chunk_list = len(canonical.pack(CHUNKS)) + len(canonical.pack(fields[CHUNKS]))
+    return hashlib.sha256(header[map_head + chunk_list :] + payload).digest()[:SCENE_ID_SIZE]
 
 
 def _unpack_chunks(rows: list) -> tuple[tuple[int, int], ...]:

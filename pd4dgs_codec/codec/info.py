@@ -59,8 +59,9 @@ def info(data: bytes) -> dict:
     }
 
 
-def hashes(data: bytes) -> list[dict]:
-    """Per layer {layer, symbols, tensors}: SHA-256 in hex of a complete file's integers and float32 values.
+def hashes(data: bytes, max_layer: int | None = None) -> list[dict]:
+    """Per layer {layer, symbols, tensors}: SHA-256 in hex of a complete file's integers and float32 values, or of
+    those of its layers <= max_layer alone (bytes after those are not looked at).
 
     symbols: int32 little-endian, C order, of anchor_q [n, 3], the rise of earlier rows' mask codes, the codes of own
     rows, attributes [68, n], then planes [C, H, W] scale by scale in the order xy xz xt yz yt zt, then weight [out, in]
@@ -69,7 +70,7 @@ def hashes(data: bytes) -> list[dict]:
     then planes and networks as above.
     """
     reader = LayerReader()
-    while reader.next_layer(data) is not None:
+    while reader.next_layer(data, max_layer) is not None:
         pass
     scene = reader.scene()
     rows = []

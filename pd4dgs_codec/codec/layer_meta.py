@@ -20,9 +20,9 @@ from pd4dgs_codec.bitstream.limits import (
     MAX_PLANE_SCALES,
     MAX_PLANE_SIDE,
 )
-from pd4dgs_codec.codec.fields import Fields, as_integer, as_list
+from pd4dgs_codec.codec.fields import Fields, as_integer, as_list, as_registered
 from pd4dgs_codec.codec.kinds import SCAFFOLD_INPUT, TRUNK, LayerKind
-from pd4dgs_codec.errors import LimitExceeded, Malformed, UnsupportedFeature
+from pd4dgs_codec.errors import LimitExceeded, Malformed
 from pd4dgs_codec.scene import PLANES
 
 
@@ -174,9 +174,7 @@ def _unpack_scales(fields: Fields, raw: bool, where: str) -> tuple[ScaleMeta, ..
         for side in rest[:4]:
             as_integer(side, MAX_PLANE_SIDE, f"{where} scale {i} side", low=1)
         for predictor in rest[4:]:
-            if as_integer(predictor, 0xFFFF, f"{where} scale {i} predictor") not in PREDICTORS:
-                raise UnsupportedFeature(f"{where} scale {i}: predictor {predictor}, expected {list(PREDICTORS)}")
-            if raw and predictor != 0:
+            if as_registered(predictor, PREDICTORS, f"{where} scale {i} predictor") != 0 and raw:
                 raise Malformed(f"{where} scale {i}: predictor {predictor} on float32 planes, expected 0")
         scales.append(ScaleMeta(channels, tuple(rest[:4]), tuple(rest[4:])))
     return tuple(scales)
@@ -185,7 +183,8 @@ def _unpack_scales(fields: Fields, raw: bool, where: str) -> tuple[ScaleMeta, ..
 def _unpack_networks(fields: Fields, kind: LayerKind, where: str) -> dict[str, tuple[int, ...]]:
     rows = fields.sequence(NETWORKS) if NETWORKS in fields else []
     names = {number: name for name, number in kind.network_ids.items()}
-    as_integer(len(rows), len(names), f"{where}: number of networks", low=int(NETWORKS in fields))
+    if NETWORKS in fields and not rows:
+        raise Malformed(f"{where}: an empty list of networks, expected some or no list")
     networks: dict[str, tuple[int, ...]] = {}
     last = -1
     for row in rows:
@@ -193,9 +192,7 @@ def _unpack_networks(fields: Fields, kind: LayerKind, where: str) -> dict[str, t
         if not entry:
             raise Malformed(f"{where}: an empty network entry, expected an id and widths")
         number, *widths = entry
-        if as_integer(number, 0xFFFF, f"{where} network id") not in names:
-            raise UnsupportedFeature(f"{where}: network {number}, expected one of {names}")
-        if number <= last:
+        if as_registered(number, names, f"{where} network id") <= last:
             raise Malformed(f"{where}: network {number} after {last}, expected ascending ids")
         last, name = number, names[number]
         as_integer(len(widths), MAX_NETWORK_LAYERS, f"{where} network {name} layers", low=1)

@@ -1,7 +1,7 @@
 """The planes section of mode ans: the residuals of all plane channels as they are, or split by their activity.
 
 Byte 0 is the form. Form 0: the rest is one channels payload of all channels, plane by plane. Form 1: stages. Stage 0
-holds channels 0 and 1 of every plane, stage s >= 1 channels 2^s .. 2^(s+1) - 1, as far as planes have them. A block of
+holds channels 0 and 1 of every plane, stage s >= 1 channels 2^s .. 2^(s+1) - 1, as far as there are such. A block of
 one varint C in 1..8 per stage from 1 on comes first: in that stage each channel is split into C classes of cells by the
 relative magnitudes (`stages.relative_magnitude`) of the plane's earlier channels, summed over the 3 x 3 cells around,
 the border repeated. In a stage, planes come in order, then channels, then classes, each with its cells row by row.
@@ -67,11 +67,7 @@ def _write_staged(residuals: Sequence[np.ndarray], effort: int) -> bytes:
     counts = []
     for stage in range(1, _stage_count(shapes)):
         first, end = 1 << stage, 2 << stage
-        groups = [
-            (plane[first:end], _activity(plane[:first], shape))
-            for plane, shape in zip(planes, shapes, strict=True)
-            if len(plane) > first
-        ]
+        groups = [(p[first:end], _activity(p[:first], shape)) for p, shape in zip(planes, shapes, strict=True)]
         counts.append(cheapest_class_count(groups))
     out = bytearray([STAGED])
     for count in counts:
@@ -81,7 +77,8 @@ def _write_staged(residuals: Sequence[np.ndarray], effort: int) -> bytes:
 
 
 def _stage_count(shapes: Sequence[Shape]) -> int:
-    return max(1, (max(c for c, _, _ in shapes) - 1).bit_length())
+    """All planes of a layer have the same number of channels."""
+    return max(1, (shapes[0][0] - 1).bit_length())
 
 
 def _places(
@@ -93,8 +90,6 @@ def _places(
         first, end = (1 << stage if stage else 0), 2 << stage
         places = []
         for plane, shape in zip(planes, shapes, strict=True):
-            if len(plane) <= first:
-                continue
             parts = [np.arange(plane.shape[1])]
             if count > 1:
                 parts = places_of(activity_classes(_activity(plane[:first], shape), count), count)

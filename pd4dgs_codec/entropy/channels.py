@@ -21,7 +21,7 @@ from .priors import CONST, FIRST_REUSE, K_MAX, MAX_ENTRIES, Hist, Prior, Window,
 from .rate import gaussian_bits
 from .sharing import plan_priors
 from .tables import uniform_table
-from .varint import ByteReader, put_varint
+from .varint import VARINT_MAX, ByteReader, put_varint
 
 
 @dataclass(frozen=True)
@@ -128,11 +128,14 @@ def _write_exceptions(out: bytearray, exceptions: _Exceptions, window: Window) -
 
 
 def _read_exceptions(reader: ByteReader, count: int, window: Window) -> _Exceptions:
-    number = 1 + reader.varint(min(count, reader.remaining // 2), "the number of exceptions")
+    at = reader.offset
+    number = 1 + reader.varint(VARINT_MAX, "the number of exceptions")
+    if number > min(count, reader.remaining // 2):
+        raise Malformed(f"{number} exceptions among {count} symbols, in {reader.remaining} bytes", offset=at)
     positions, values, position = [], [], -1
     for _ in range(number):
         at = reader.offset
-        position += 1 + reader.varint(MAX_COUNT, "an exception's position")
+        position += 1 + reader.varint(VARINT_MAX, "an exception's position")
         code = reader.varint(4 * K_MAX + 2, "an exception's value")
         value = window.kmin - 1 - code // 2 if code & 1 else window.end + code // 2
         if position >= count or abs(value) > K_MAX:

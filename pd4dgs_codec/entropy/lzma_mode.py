@@ -150,7 +150,7 @@ def _compress(head: bytes, numbers: Sequence[np.ndarray], effort: int) -> bytes:
 def _read_layout(reader: ByteReader) -> bool:
     """Whether bytes lie in planes. lc, lp and pb are recorded for the reader of a comparison: LZMA2 holds its own."""
     reader.byte("lc, lp and pb", 9 * 5 * 5 - 1)
-    return bool(reader.byte("the layout's flags", 1))
+    return bool(reader.bits("the layout's flags", 1))
 
 
 def _decompress(

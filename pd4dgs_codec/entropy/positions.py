@@ -57,7 +57,7 @@ import struct
 
 import numpy as np
 
-from ..errors import EncodeError, Malformed, Truncated
+from ..errors import EncodeError, LimitExceeded, Malformed, Truncated
 from .ans import AnsDecoder, ans_encode
 from .morton import AXIS_BITS, morton_codes
 from .position_model import AdaptiveBits, Grid, contexts, flag_model, side_model
@@ -185,7 +185,7 @@ def encode_positions(cells: np.ndarray) -> bytes:
 def decode_positions(payload: bytes | memoryview, count: int) -> np.ndarray:
     """The cells int32 [count, 3] of a payload, in Morton order. Memory is O(count), whatever the bytes say.
 
-    Raises Truncated or Malformed if the payload is not one that encode_positions makes for `count` cells.
+    Raises Truncated, Malformed or LimitExceeded if the payload is not one that encode_positions makes for them.
     """
     if count <= 0:
         if count or len(payload):
@@ -196,7 +196,7 @@ def decode_positions(payload: bytes | memoryview, count: int) -> np.ndarray:
     *low, dx, dy, dz = _HEADER.unpack_from(payload)
     depths = [dx, dy, dz]
     if max(depths) > AXIS_BITS:
-        raise Malformed(f"positions: depths {depths}, limit {AXIS_BITS}")
+        raise LimitExceeded(f"positions: depths {depths}, limit {AXIS_BITS}")
     if sum(depths) < 63 and count > 1 << sum(depths):
         raise Malformed(f"positions: {count} cells in a box of 2**{sum(depths)}")
     decoder = AnsDecoder(payload[_HEADER.size :])

@@ -201,7 +201,7 @@ class Hist:
     @classmethod
     def read(cls, reader: ByteReader, shift: int) -> Hist:
         window = Window.read(reader, shift)
-        mode = reader.byte("a histogram's mode", 7)
+        mode = reader.bits("a histogram's mode", 3)
         step, differences = CLASS_STEPS[mode & 3], bool(mode & 4)
         top = reader.varint(top_limit(step), "a histogram's largest class")
         if top == 0:

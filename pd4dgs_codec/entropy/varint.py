@@ -5,6 +5,7 @@ from __future__ import annotations
 from ..errors import LimitExceeded, Malformed
 
 _MAX_BYTES = 5
+VARINT_MAX = (1 << 7 * _MAX_BYTES) - 1
 
 
 def put_varint(out: bytearray, value: int) -> None:
@@ -54,8 +55,15 @@ class ByteReader:
             raise Malformed(f"the payload ends before {what}", offset=self.offset)
         value = self._data[self.offset]
         if value > limit:
-            raise Malformed(f"{what} is {value}, expected at most {limit}", offset=self.offset)
+            raise LimitExceeded(f"{what} is {value}, limit {limit}", offset=self.offset)
         self.offset += 1
+        return value
+
+    def bits(self, what: str, used: int) -> int:
+        """The next byte, whose bits from `used` on are reserved."""
+        value = self.byte(what)
+        if value >> used:
+            raise Malformed(f"{what} is {value:#04x}, bits {used}..7 are reserved", offset=self.offset - 1)
         return value
 
     def zigzag(self, limit: int, what: str) -> int:

@@ -15,7 +15,6 @@ from pd4dgs_codec.bitstream.container import (
     SIGNATURE,
     read_chunk,
     read_preamble,
-    scene_id_of,
     write_chunk,
     write_preamble,
 )
@@ -37,8 +36,7 @@ FLAGS = [0, FLAG_ANCILLARY, 0]
 
 def small_file() -> bytes:
     header = pack({1: [[i, len(p)] for i, p in enumerate(PAYLOADS)]})
-    scene_id = scene_id_of(PAYLOADS[0])
-    chunks = [write_chunk(i, f, scene_id, p) for i, (f, p) in enumerate(zip(FLAGS, PAYLOADS, strict=True))]
+    chunks = [write_chunk(i, f, b"scene id", p) for i, (f, p) in enumerate(zip(FLAGS, PAYLOADS, strict=True))]
     return write_preamble(header) + b"".join(chunks)
 
 
@@ -47,8 +45,6 @@ def read_file(data: bytes) -> list[bytes]:
     offset, scene_id, payloads = preamble.size, None, []
     for index, (kind, length) in enumerate(unpack(preamble.header, offset=20)[1]):
         chunk = read_chunk(data, offset, type=kind, length=length, scene_id=scene_id, index=index)
-        if index == 0 and chunk.scene_id != scene_id_of(chunk.payload):
-            raise Malformed("scene id")
         scene_id, offset = chunk.scene_id, chunk.end
         payloads.append(chunk.payload)
     if offset != len(data):

@@ -1,15 +1,21 @@
 """The attributes section: both forms give back the symbols; prediction pays where channels depend on each other."""
 
+from unittest.mock import patch
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
 from pd4dgs_codec.attributes.table import N_CHANNELS
-from pd4dgs_codec.codec.attribute_section import read_attributes, write_attributes
+from pd4dgs_codec.codec import attribute_section
+from pd4dgs_codec.codec.attribute_section import MAX_WEIGHT, read_attributes, write_attributes
 from pd4dgs_codec.codec.stages import PLAIN, STAGED
 from pd4dgs_codec.entropy.channels import encode_channels
-from pd4dgs_codec.errors import DecodeError
+from pd4dgs_codec.entropy.priors import K_MAX
+from pd4dgs_codec.entropy.varint import put_varint, put_zigzag
+from pd4dgs_codec.errors import DecodeError, LimitExceeded, Malformed
 
 
 def correlated(rows: int, seed: int = 0) -> np.ndarray:
@@ -43,14 +49,44 @@ def test_independent_channels_stay_plain():
     np.testing.assert_array_equal(read_attributes(data, 300), attributes)
 
 
-@settings(max_examples=15)
-@given(st.integers(1, 60), st.integers(0, 1000), st.sampled_from((1, 50, 1 << 23)))
-def test_any_symbols_come_back(rows, seed, scale):
+def written_in_stages(attributes, class_count=None):
+    """The section in form 1, even where form 0 is shorter; class_count, if any, instead of the best."""
+    choose = attribute_section.cheapest_class_count if class_count is None else lambda _: class_count
+    with patch.object(attribute_section, "cheapest_class_count", choose):
+        return attribute_section._write_staged(attributes.astype(np.int64), 1)
+
+
+@settings(max_examples=10)
+@given(st.integers(1, 60), st.integers(0, 1000), st.integers(1, 8), st.sampled_from((1, 50, 1 << 23)))
+def test_any_symbols_come_back(rows, seed, class_count, scale):
+    """Few channels have the whole scale: fitting priors to wide ones takes time."""
     rng = np.random.default_rng(seed)
-    attributes = np.clip(np.rint(rng.standard_t(2, (N_CHANNELS, rows)) * scale), -(1 << 23), 1 << 23).astype(np.int32)
+    scales = np.where(rng.random((N_CHANNELS, 1)) < 0.1, scale, min(scale, 3))
+    attributes = np.clip(np.rint(rng.standard_t(2, (N_CHANNELS, rows)) * scales), -MAX_SYMBOL, MAX_SYMBOL)
+    attributes = attributes.astype(np.int32)
     attributes[rng.random(N_CHANNELS) < 0.3] = int(rng.integers(-5, 5))
-    data, _ = write_attributes(attributes, "best", 2)
-    np.testing.assert_array_equal(read_attributes(data, rows), attributes)
+    for data in (written_in_stages(attributes, class_count), write_attributes(attributes, "best", 1)[0]):
+        np.testing.assert_array_equal(read_attributes(data, rows), attributes)
+
+
+def test_the_largest_symbols_come_back():
+    rng, rows = np.random.default_rng(4), 200
+    attributes = np.ones((N_CHANNELS, rows), np.int32)
+    wide = [0, 6, 7, 29, 38, 39, 40]
+    attributes[wide] = rng.choice([-MAX_SYMBOL, -1, 0, MAX_SYMBOL], (len(wide), rows))
+    np.testing.assert_array_equal(read_attributes(written_in_stages(attributes, 3), rows), attributes)
+
+
+def test_terms_that_would_break_a_limit_are_left_out():
+    """A weight of 40, and one that predicts 2^23 where -2^23 stands."""
+    source = np.resize(np.array([1, -1, 0, 2], np.int32), 4200)
+    attributes = np.zeros((N_CHANNELS, 4200), np.int32)
+    attributes[0], attributes[1] = source * 100, source * 4000
+    attributes[2] = np.where(source > 0, MAX_SYMBOL, -MAX_SYMBOL)
+    attributes[3] = attributes[2]
+    attributes[3, 0] = -MAX_SYMBOL
+    assert abs(attributes[1]).max() > abs(attributes[0]).max() * MAX_WEIGHT >> 10
+    np.testing.assert_array_equal(read_attributes(written_in_stages(attributes), 4200), attributes)
 
 
 def test_damage_raises_only_decode_errors():
@@ -73,3 +109,55 @@ def test_damage_raises_only_decode_errors():
 def test_an_unknown_form_is_refused():
     with pytest.raises(DecodeError, match="form 2"):
         read_attributes(b"\x02", 3)
+
+
+def block(*, terms=None, counts=(1, 1, 1, 1, 1), split=(0,), lengths=(0,) * 7):
+    """A prediction block and no stages. terms: c -> (m, [(g, w)]); split: f and centres of Gaussian 0."""
+    out = bytearray([STAGED])
+    for c in range(1, 38):
+        number, own = (terms or {}).get(c, (0, []))
+        put_varint(out, number)
+        for gap, weight in own:
+            put_varint(out, gap)
+            put_zigzag(out, weight)
+    out += bytes(counts)
+    put_varint(out, split[0])
+    for centre in split[1:]:
+        put_zigzag(out, centre)
+    out += bytes(9)
+    for length in lengths:
+        put_varint(out, length)
+    return bytes(out)
+
+
+@pytest.mark.parametrize(
+    ("options", "error", "message"),
+    [
+        ({"terms": {2: (3, [])}}, LimitExceeded, "number of terms of channel 2 is 3, limit 2"),
+        ({"terms": {5: (1, [(5, 1)])}}, Malformed, "channel 5 is predicted from channel 5"),
+        ({"terms": {5: (1, [(0, MAX_WEIGHT + 1)])}}, LimitExceeded, "a weight of channel 5"),
+        ({"counts": (1, 0, 1, 1, 1)}, Malformed, "stage 2 has 0 classes"),
+        ({"counts": (1, 1, 1, 1, 9)}, LimitExceeded, "classes of stage 5 is 9"),
+        ({"split": (4,)}, LimitExceeded, "the split of a Gaussian is 4"),
+        ({"split": (1, K_MAX + 1)}, LimitExceeded, "the centre of x"),
+        ({"split": (2, 0, -K_MAX - 1)}, LimitExceeded, "the centre of y"),
+        ({"lengths": (8, 0, 0, 0, 0, 0, 0)}, LimitExceeded, "the length of stage 0 is 8, limit 7"),
+        ({"lengths": (0, 0, 0, 0, 0, 0, 1)}, Malformed, "stages of 1 bytes and more in the 0 that are left"),
+        ({}, Malformed, "ends"),
+    ],
+)
+def test_a_faulty_block_is_refused(options, error, message):
+    with pytest.raises(error, match=message):
+        read_attributes(block(**options), 3)
+
+
+@pytest.mark.parametrize("symbol", [K_MAX >> 1, -(K_MAX >> 1), (K_MAX >> 1) + 1, -(K_MAX >> 1) - 1])
+def test_a_predicted_symbol_over_the_limit_is_refused(symbol):
+    """Channel 1 is predicted as channel 0 is, and its residual doubles it."""
+    stages = [encode_channels([np.full(3, symbol)] * number).payload for number in (6, 6, 8, 9, 9, 10, 10, 10)]
+    data = block(terms={1: (1, [(0, 1 << 10)])}, lengths=[len(s) for s in stages[:-1]]) + b"".join(stages)
+    if abs(2 * symbol) <= K_MAX:
+        assert read_attributes(data, 3)[:3, 0].tolist() == [symbol, 2 * symbol, symbol]
+    else:
+        with pytest.raises(Malformed, match=f"a predicted attribute over {K_MAX}"):
+            read_attributes(data, 3)

@@ -16,7 +16,6 @@ from pd4dgs_codec.bitstream.container import (
     FLAG_ANCILLARY,
     read_chunk,
     read_preamble,
-    scene_id_of,
     write_chunk,
     write_preamble,
 )
@@ -24,7 +23,7 @@ from pd4dgs_codec.codec import header as header_module
 from pd4dgs_codec.codec import layer_meta
 from pd4dgs_codec.codec.decoder import decode, decode_layers
 from pd4dgs_codec.codec.encoder import encode
-from pd4dgs_codec.codec.header import unpack_header
+from pd4dgs_codec.codec.header import scene_id_of, unpack_header
 from pd4dgs_codec.codec.layers import Coding, write_layer
 from pd4dgs_codec.errors import DecodeError, LimitExceeded, Malformed, Pd4Error, Truncated, UnsupportedFeature
 
@@ -46,9 +45,10 @@ def take_apart(data):
 def put_together(header, chunks, scene_id=None):
     """A file with right lengths, ids and CRCs, whatever its payloads say."""
     header = {**header, header_module.CHUNKS: [[t, len(p)] for t, _, p in chunks]}
-    scene_id = scene_id or scene_id_of(chunks[0][2])
+    packed = canonical.pack(header)
+    scene_id = scene_id or scene_id_of(packed, chunks[0][2])
     framed = [write_chunk(t, f, scene_id, p) for t, f, p in chunks]
-    return b"".join([write_preamble(canonical.pack(header)), *framed])
+    return b"".join([write_preamble(packed), *framed])
 
 
 def with_meta(payload, change):
@@ -108,14 +108,34 @@ def test_a_layer_of_another_scene_is_refused():
     header, chunks = take_apart(FULL)
     other = encode(make_scene(8, anchors=20), layers=2, effort=1)
     mixed = [chunks[0], *take_apart(other)[1][1:]]
-    first = write_chunk(*chunks[0][:2], scene_id_of(chunks[0][2]), chunks[0][2])
-    rest = [write_chunk(t, f, scene_id_of(take_apart(other)[1][0][2]), p) for t, f, p in mixed[1:]]
     header = {**header, header_module.CHUNKS: [[t, len(p)] for t, _, p in mixed]}
-    data = b"".join([write_preamble(canonical.pack(header)), first, *rest])
+    first, *rest = (read_chunk(data, read_preamble(data).size) for data in (FULL, other))
+    framed = [write_chunk(t, f, (first, *rest)[i > 0].scene_id, p) for i, (t, f, p) in enumerate(mixed)]
     with pytest.raises(Malformed, match="belongs to scene"):
-        decode(data)
+        decode(b"".join([write_preamble(canonical.pack(header)), *framed]))
     with pytest.raises(Malformed, match="layer-0 payload"):
         decode(put_together(*take_apart(FULL), scene_id=b"12345678"))
+
+
+def test_a_header_of_another_scene_is_refused():
+    """Even one whose chunks have the same types and lengths, with a right CRC-32."""
+    header, chunks = take_apart(FULL)
+    for key, value in ((header_module.VOXEL_SIZE, 0.5), (64, "a key that decoders ignore")):
+        front = write_preamble(canonical.pack({**header, key: value}))
+        with pytest.raises(Malformed, match="from the header and the layer-0 payload"):
+            decode(front + FULL[read_preamble(FULL).size :])
+
+
+def test_a_scene_keeps_its_id_when_chunks_come_and_go():
+    header, chunks = take_apart(FULL)
+    extra = [(99, FLAG_ANCILLARY, b"x")] * 20  # a chunk list in its longer form
+    ids = {
+        read_chunk(data, read_preamble(data).size).scene_id
+        for data in (FULL, put_together(header, chunks[:2]), put_together(header, [*chunks, *extra]))
+    }
+    assert len(ids) == 1
+    many = {**header, **{64 + i: i for i in range(10)}}  # a map in its longer form
+    assert decode(put_together(many, chunks)).layers == (0, 1, 2)
 
 
 def test_unknown_chunks_are_refused_if_critical_and_skipped_if_ancillary():
@@ -153,7 +173,7 @@ def test_unknown_header_keys():
 
 def test_the_header_is_a_map():
     _, chunks = take_apart(FULL)
-    framed = write_chunk(0, 0, scene_id_of(chunks[0][2]), chunks[0][2])
+    framed = write_chunk(0, 0, bytes(8), chunks[0][2])
     with pytest.raises(Malformed, match="header: list, expected a map"):
         decode(write_preamble(canonical.pack([1, 2])) + framed)
 

@@ -216,13 +216,13 @@ def payload_of(*numbers: int) -> bytes:
         (payload_of(2 * 8), Malformed),  # reuse before the first prior
         (payload_of(2 * 4, 0, 1), Malformed),  # scaled by nothing
         (payload_of(2 * 4, 1, 0), Malformed),  # a scaled constant
-        (payload_of(2 * 4, 13, 1), Malformed),  # too large a shift
+        (payload_of(2 * 4, 13, 1), LimitExceeded),  # too large a shift
         (payload_of(2, 2 * K_MAX, 0, 0, 0), Malformed),  # a window past the last symbol
         (payload_of(2, 0, (1 << 14) - 1, 0, 0), LimitExceeded),  # a window too wide
         (payload_of(2, 0, 0, 0, 3842), LimitExceeded),  # sigma out of range
         (payload_of(2 * 2, 0, 0, 0, 0, 0, 0, 0), Malformed),  # a mixture without its second part
         (payload_of(2 * 3, 0, 0, 0, 0), Malformed),  # a histogram without classes
-        (payload_of(1, 0, 9, 0, 0), LimitExceeded),  # more exceptions than symbols
+        (payload_of(1, 0, 9, 0, 0), Malformed),  # more exceptions than symbols
         (payload_of(1, 0, 0, 7, 0), Malformed),  # an exception after the last symbol
         (payload_of(1, 0, 0, 0, 2 * K_MAX), Malformed),  # an exception past the last symbol value
         (b"\x80\x00\x00", Malformed),  # a varint that is not in its shortest form

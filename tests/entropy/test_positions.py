@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 
 from pd4dgs_codec.entropy.morton import morton_codes, morton_order
 from pd4dgs_codec.entropy.positions import decode_positions, encode_positions
-from pd4dgs_codec.errors import DecodeError, EncodeError, Malformed, Truncated
+from pd4dgs_codec.errors import DecodeError, EncodeError, LimitExceeded, Malformed, Truncated
 
 _spec = importlib.util.spec_from_file_location(
     "bench_positions", Path(__file__).resolve().parents[2] / "tools" / "bench_positions.py"
@@ -134,7 +134,7 @@ def test_wrong_counts_and_headers_are_refused():
             decode_positions(payload, count)
     with pytest.raises(Truncated):
         decode_positions(payload[:14], len(cells))
-    with pytest.raises(Malformed, match="depths"):
+    with pytest.raises(LimitExceeded, match="depths"):
         decode_positions(payload[:12] + b"\x16" + payload[13:], len(cells))
     with pytest.raises(Malformed):
         decode_positions(payload + bytes(4), len(cells))

@@ -1,7 +1,9 @@
 """Hostile input: a short run of the fuzzer, files that once broke a promise, and the fuzzer's own eyes."""
 
+import copy
 import os
 import random
+import struct
 import time
 from functools import partial
 from pathlib import Path
@@ -13,16 +15,16 @@ from fuzzing import check, damage, files, mutate
 from strategies import make_scene
 
 from pd4dgs_codec import decode, encode
-from pd4dgs_codec.codec import layer_meta
 from pd4dgs_codec.codec.decoder import decode_layers
-from pd4dgs_codec.entropy.priors import MAX_ENTRIES, MAX_WINDOW
+from pd4dgs_codec.codec.layer_meta import NETWORKS, ROWS, SCALES, Section
+from pd4dgs_codec.codec.stages import PLAIN, STAGED
+from pd4dgs_codec.entropy.priors import FIRST_REUSE, GAUSS, MAX_ENTRIES, MAX_WINDOW
 from pd4dgs_codec.entropy.varint import put_varint
-from pd4dgs_codec.errors import DecodeError
+from pd4dgs_codec.errors import DecodeError, LimitExceeded
 
 SEEDS = files.built_seeds()
 BY_NAME = {seed.name: seed for seed in SEEDS}
 KNOWN = files.known_prefixes(SEEDS)
-CASES = sorted((Path(__file__).parent / "cases").glob("*.pd4"))
 
 
 def names(figures):
@@ -43,19 +45,11 @@ def test_a_short_run_finds_nothing():
     assert {"Malformed", "LimitExceeded", "UnsupportedFeature", "ChecksumMismatch", "Truncated"} <= {*figures.outcomes}
 
 
-@pytest.mark.parametrize("path", CASES, ids=lambda path: path.stem)
-def test_a_file_that_once_broke_a_promise(path):
-    data = path.read_bytes()
-    for door in range(8):
-        check.examine(mutate.Case(data, True, path.stem), KNOWN, random.Random(door))
-    check.check_memory(data)
-
-
-def with_section(name, chunk, number, data, **meta):
-    """A seed with one section replaced and layer parameters changed, everything else right."""
+def crafted(name, chunk, sections, meta=None):
+    """A seed with other sections and layer parameters, everything else right."""
     parts = files.take_apart(BY_NAME[name].data)
-    parts.chunks[chunk].sections[number] = bytes(data)
-    parts.chunks[chunk].meta |= {getattr(layer_meta, key): value for key, value in meta.items()}
+    parts.chunks[chunk].sections |= {int(number): bytes(data) for number, data in sections.items()}
+    parts.chunks[chunk].meta |= meta or {}
     return files.put_together(parts)
 
 
@@ -66,10 +60,31 @@ def varints(*numbers):
     return out
 
 
+def equal_channels(count):
+    """A section of that many channels, all of them the symbol 1 alone."""
+    return varints(0, 2, *[2 * FIRST_REUSE] * (count - 1))
+
+
+def wide_tables(tables, channels):
+    """The form of plain planes and a section of that many channels of one symbol, the first with wide tables."""
+    return varints(PLAIN, *[2 * GAUSS, 0, MAX_WINDOW - 2, 0, 1280] * tables, *[2 * FIRST_REUSE] * (channels - tables))
+
+
+def planes_of_one_cell(channels):
+    return {SCALES: [[channels, 1, 1, 1, 1, *[0] * 6]]}
+
+
 def constant_planes(predictor):
     """535 bytes that declare 3.6 million plane cells, all of them one symbol."""
     scales = [[1, 4096, 40 - i, 40 - i, 40 - i, *[predictor] * 6] for i in range(8)]
-    return with_section("wide-planes", 1, 3, varints(0, 2, *[16] * 47), SCALES=scales)
+    return crafted("wide-planes", 1, {Section.PLANES: varints(PLAIN) + equal_channels(48)}, {SCALES: scales})
+
+
+def constant_stages():
+    """400 bytes that declare 3.9 million plane cells, those of stage 1 in eight classes."""
+    stages = [equal_channels(12), equal_channels(6)]
+    section = varints(STAGED, 8, len(stages[0])) + stages[0] + stages[1]
+    return crafted("wide-planes", 1, {Section.PLANES: section}, {SCALES: [[3, 1000, 1000, 80, 80, *[0] * 6]]})
 
 
 def many_exceptions():
@@ -77,16 +92,14 @@ def many_exceptions():
     count = 35 * 3000
     networks = [[0, 3000, 10], [1, 70], [2, 30]]
     exceptions = varints(1, 0, count - 1) + bytes(2 * count)
-    return with_section("wide-planes", 0, 4, exceptions + varints(*[16] * 7), NETWORKS=networks)
+    weights = exceptions + varints(*[2 * FIRST_REUSE] * 7)
+    return crafted("wide-planes", 0, {Section.WEIGHTS: weights}, {NETWORKS: networks})
 
 
-def wide_tables():
+def most_wide_tables():
     """As many tables of full width as a section may have, for one symbol each."""
-    out, channels = bytearray(), MAX_ENTRIES // MAX_WINDOW
-    for _ in range(channels):
-        out += varints(2, 0, MAX_WINDOW - 2, 0, 1280)
-    out += varints(*[16] * (6 * 64 - channels))
-    return with_section("wide-planes", 1, 3, out, SCALES=[[64, 1, 1, 1, 1, *[0] * 6]])
+    section = wide_tables(MAX_ENTRIES // MAX_WINDOW, 6 * 64)
+    return crafted("wide-planes", 1, {Section.PLANES: section}, planes_of_one_cell(64))
 
 
 def many_anchors(mode):
@@ -97,8 +110,9 @@ def many_anchors(mode):
 BIG = {
     "planes by the median": partial(constant_planes, 3),
     "planes by sums": partial(constant_planes, 4),
+    "planes in stages": constant_stages,
     "exceptions": many_exceptions,
-    "tables": wide_tables,
+    "tables": most_wide_tables,
     "anchors": partial(many_anchors, "ans"),
     "anchors, lzma": partial(many_anchors, "lzma"),
 }
@@ -111,13 +125,34 @@ def test_memory_stays_within_its_bound(name):
     assert 0.02 < check.check_memory(data) <= 1
 
 
-def test_sections_that_no_limit_covered_are_refused():
-    out = bytearray()
-    for _ in range(6 * 256):
-        out += varints(2, 0, MAX_WINDOW - 2, 0, 1280)
-    data = with_section("wide-planes", 1, 3, out, SCALES=[[256, 1, 1, 1, 1, *[0] * 6]])
-    with pytest.raises(DecodeError, match="entries"):
+def tables_of_200_mb():
+    section = wide_tables(6 * 256, 6 * 256)
+    return crafted("wide-planes", 1, {Section.PLANES: section}, planes_of_one_cell(256))
+
+
+def parameters_of_many_lists():
+    return crafted("no-anchor", 0, {}, {64: [[[]] * 16] * 2000})
+
+
+def anchors_of_3_seconds():
+    box = struct.pack("<3i3B", 0, 0, 0, 21, 21, 21)
+    return crafted("tiny-0-ans-coded", 0, {Section.POSITIONS: box + b"\1" * 4000}, {ROWS: 1 << 17})
+
+
+ONCE_BROKE_A_PROMISE = {
+    "entries": tables_of_200_mb,
+    "parameters": parameters_of_many_lists,
+    "anchors": anchors_of_3_seconds,
+}
+
+
+@pytest.mark.parametrize("limit", ONCE_BROKE_A_PROMISE)
+def test_a_file_that_once_broke_a_promise(limit):
+    data = ONCE_BROKE_A_PROMISE[limit]()
+    with pytest.raises(LimitExceeded, match=limit):
         decode(data)
+    for door in range(8):
+        check.examine(mutate.Case(data, True, limit), KNOWN, random.Random(door))
     check.check_memory(data)
 
 
@@ -138,9 +173,41 @@ def test_inputs_are_named_by_their_numbers():
     assert cases != [mutate.make_case(SEEDS, 4, index) for index in range(300)]
 
 
+UNKNOWN = (("header", "keys"), ("camera", "keys"), ("layer", "keys"), ("layer", "sections"))
+
+
 def test_taking_apart_and_putting_together_changes_nothing():
-    for seed in SEEDS:
+    uncommon = [fuzz.VECTORS / "uncommon" / f"{name}-unknown-{what}.pd4" for name, what in UNKNOWN]
+    for seed in [*SEEDS, *files.given_seeds(uncommon)]:
         assert files.put_together(files.take_apart(seed.data)) == seed.data
+
+
+def test_seeds_use_both_forms_of_both_sections_and_stages_come_apart():
+    chunks = [chunk for seed in SEEDS for chunk in files.take_apart(seed.data).chunks if chunk.sections]
+    for number, count in ((Section.ATTRIBUTES, 8), (Section.PLANES, 3)):
+        sections = {
+            chunk.sections[number]: files.take_stages(chunk, number) for chunk in chunks if number in chunk.sections
+        }
+        staged = {data: taken for data, taken in sections.items() if data[0] == STAGED}
+        assert staged and any(data[0] == PLAIN for data in sections)
+        for data, taken in staged.items():
+            assert taken.packed() == data and len(taken.stages) == count
+        assert all(taken is None for data, taken in sections.items() if data not in staged)
+
+
+def test_a_change_in_a_stage_leaves_the_other_stages_as_they_were():
+    parts = files.take_apart(BY_NAME["staged-attributes"].data)
+    before, seen = files.take_stages(parts.chunks[0], Section.ATTRIBUTES), set()
+    for i in range(60):
+        changed, names = copy.deepcopy(parts), []
+        mutate.stage_bytes(random.Random(i), changed, parts, names)
+        place = names[-1].rpartition(" ")[2]
+        seen.add(place)
+        if place != "block":
+            after = files.take_stages(changed.chunks[0], Section.ATTRIBUTES)
+            same = [a == b for a, b in zip(before.stages, after.stages, strict=True)]
+            assert same[: int(place)] + same[int(place) + 1 :] == [True] * 7 and after.block == before.block
+    assert seen == {"block", *"01234567"}
 
 
 def raising(error):

@@ -19,12 +19,14 @@ from strategies import LAYER_SETS, make_scene, scenes
 
 from pd4dgs_codec.attributes.quantise import MAX_SYMBOL, dequantise
 from pd4dgs_codec.bitstream import canonical
-from pd4dgs_codec.bitstream.container import read_chunk, read_preamble, scene_id_of, write_chunk, write_preamble
+from pd4dgs_codec.bitstream.container import read_chunk, read_preamble, write_chunk, write_preamble
 from pd4dgs_codec.codec.attribute_section import read_attributes
 from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.encoder import encode
+from pd4dgs_codec.codec.header import scene_id_of
 from pd4dgs_codec.codec.info import hashes
 from pd4dgs_codec.codec.layer_meta import Section
+from pd4dgs_codec.codec.plane_section import read_planes
 from pd4dgs_codec.codec.stages import PLAIN, STAGED
 from pd4dgs_codec.entropy.channels import encode_channels
 from pd4dgs_codec.entropy.lzma_mode import encode_channels_lzma
@@ -121,111 +123,190 @@ def test_positions_on_a_surface(depth):
 
 
 def correlated_scene(anchors):
-    """Features and log-scalings mixed from five sources; per Gaussian, half of the anchors have offset 0, 0, 0."""
-    scene = make_scene(5, layers=(0, 1), anchors=anchors, extent=12)
+    """Features and log-scalings mixed from five sources and noise, louder for some anchors; per Gaussian, half of the
+    anchors have offset 0, 0, 0; samples of planes are large in some blocks, in all channels."""
+    scene = make_scene(5, layers=(0, 1), anchors=anchors, extent=12, channels=5, sides=(20, 25, 22, 4))
     rng, n = np.random.default_rng(6), len(scene.anchor_q)
-    mixed = np.rint(rng.normal(size=(n, 5)) @ rng.normal(size=(5, 38)) * 6 + rng.normal(size=(n, 38)))
+    alone = rng.normal(size=(n, 38)) * np.exp(rng.normal(size=(n, 1)) * 1.5)
+    mixed = np.rint(rng.normal(size=(n, 5)) @ rng.normal(size=(5, 38)) * 6 + alone)
     offset = np.rint((rng.random((n, 10, 1)) < 0.5) * rng.normal(size=(n, 10, 3)) * 8)
     mixed, offset = mixed.astype(np.int32), offset.astype(np.int32)
+    planes = {
+        name: dequantise(busy(rng, plane.shape), scene.steps.planes_global)
+        for name, plane in scene.global_deformation.planes[0].items()
+    }
     return replace(
         scene,
         feature=dequantise(mixed[:, :32], scene.steps.feature),
         scaling_log=dequantise(mixed[:, 32:], scene.steps.scaling_log),
         offset=dequantise(offset, scene.steps.offset),
+        global_deformation=replace(scene.global_deformation, planes=(planes,)),
     )
 
 
-def attributes_section(payload):
+def busy(rng, shape, spread=2.0):
+    """Symbols [C, H, W] that are large in some blocks of 4 by 4 places, in all channels."""
+    _, h, w = shape
+    places = np.kron(np.exp(rng.normal(size=(h // 4 + 1, w // 4 + 1)) * spread), np.ones((4, 4)))[:h, :w]
+    return np.clip(np.rint(rng.normal(size=shape) * places), -K_MAX, K_MAX).astype(np.int32)
+
+
+def section_of(payload, section):
+    """(bytes, own rows) of a section."""
     (length,) = struct.unpack_from("<I", payload)
     meta = canonical.unpack(payload[4 : 4 + length])
-    start = 4 + length + sum(size for section, size in meta[2].items() if section < Section.ATTRIBUTES)
-    return payload[start : start + meta[2][int(Section.ATTRIBUTES)]], meta[1]
+    start = 4 + length + sum(size for other, size in meta[2].items() if other < section)
+    return payload[start : start + meta[2][int(section)]], meta[1]
 
 
 @pytest.fixture(scope="module")
-def predicted_file():
+def staged_file():
     return encode(correlated_scene(1000), layers=2, effort=2)
 
 
-def test_hashes_of_a_scene_whose_attributes_are_predicted(predicted_file):
-    section, rows = attributes_section(take_apart(predicted_file)[1][0][2])
+def test_hashes_of_a_scene_in_stages(staged_file):
+    chunks = take_apart(staged_file)[1]
+    section, rows = section_of(chunks[0][2], Section.ATTRIBUTES)
     assert section[0] == STAGED and rows >= 400
     reader = refdec.Reader(section[1:])
-    assert any(refdec.read_terms(reader, c) for c in range(1, 38))
-    assert any(refdec.read_split(reader)[:2] == (1, 1) for _ in range(10))
-    assert refdec.hashes(predicted_file) == hashes(predicted_file)
+    assert any([refdec.read_terms(reader, c) for c in range(1, 38)])
+    assert max([refdec.read_class_count(reader) for _ in range(5)]) > 1
+    assert (1, 1) in [refdec.read_split(reader)[:2] for _ in range(10)]
+    section, _ = section_of(chunks[1][2], Section.PLANES)
+    assert section[0] == STAGED and max(section[1:3]) > 1
+    assert refdec.hashes(staged_file) == hashes(staged_file)
     plain = encode(correlated_scene(1000), layers=2, effort=1)
-    assert attributes_section(take_apart(plain)[1][0][2])[0][0] == PLAIN
-    assert refdec.hashes(plain) == hashes(predicted_file)
+    for (_, _, payload), number in zip(take_apart(plain)[1], (Section.ATTRIBUTES, Section.PLANES), strict=True):
+        assert section_of(payload, number)[0][0] == PLAIN
+    assert refdec.hashes(plain) == hashes(staged_file)
 
 
-def test_damage_to_a_predicted_scene_has_the_same_outcome(predicted_file):
-    section, rows = attributes_section(take_apart(predicted_file)[1][0][2])
+def test_damage_to_a_scene_in_stages_has_the_same_outcome(staged_file):
+    section, rows = section_of(take_apart(staged_file)[1][0][2], Section.ATTRIBUTES)
+    assert_same_outcomes(section, lambda d: both(d, rows), 40, 1200)
+
+
+def assert_same_outcomes(section, decode_both, number, begin):
+    """`decode_both` agrees on copies of a section that differ in one byte, half of them in the first `begin` bytes."""
     rng, seen = random.Random(4), set()
-    for i in range(40):
-        at = rng.randrange(1, 1200 if i % 2 else len(section))
-        damaged = section[:at] + bytes([rng.randrange(256)]) + section[at + 1 :]
-        ours, theirs = both(damaged, rows)
-        assert ours == theirs, (at, damaged[at])
+    for i in range(number):
+        at = rng.randrange(min(begin, len(section)) if i % 2 else len(section))
+        cut = rng.randrange(4) == 0
+        damaged = section[:at] + (b"" if cut else bytes([rng.randrange(256)])) + section[at + 1 :]
+        ours, theirs = decode_both(damaged)
+        assert ours == theirs, (at, damaged[at : at + 1])
         seen.add(ours if isinstance(ours, str) else "fine")
     assert {"Malformed", "LimitExceeded"} <= seen
+    return seen
 
 
 ROWS = 9
+STAGE_BOUNDS = (0, 6, 12, 20, 29, 38)
 
 
-def predicted_section(terms=None, splits=None, *, form=1, lengths=None, residual=3, extra=b""):
-    """Attributes of ROWS rows in form 1, every residual and offset the same. terms: c -> (m, [(g, w)]); splits: i ->
-    (f, centres); lengths: of stages 0 and 1 from the true ones."""
-    block, splits = bytearray([form]), splits or {}
+def same(symbol):
+    """Channels [68, ROWS] of one symbol."""
+    return np.full((68, ROWS), symbol, np.int32)
+
+
+def staged_attributes(coded, *, terms=None, counts=(1,) * 5, splits=None, form=STAGED, lengths=None, extra=b""):
+    """A section of residuals and offsets int32 [68, n]. terms: c -> (m, [(g, w)]); splits: i -> (f, centres); lengths:
+    those of stages 0..6 from the true ones of 0..7."""
+    block, splits, n = bytearray([form]), splits or {}, coded.shape[1]
     for c in range(1, 38):
         number, own = (terms or {}).get(c, (0, []))
         put_varint(block, number)
         for gap, weight in own:
             put_varint(block, gap)
             put_zigzag(block, weight)
-    counts, classes = [38], [[], []]
+    for count in counts:
+        put_varint(block, count)
+    k = coded.tolist()
+    stages = []
+    for stage, count in enumerate((1, *counts)):
+        classes = refdec.classes_by_activity(refdec.relative_magnitude(k[: STAGE_BOUNDS[stage]], n), count)
+        channels = range(*STAGE_BOUNDS[stage : stage + 2]) if stage < 5 else range(38, 68, 3)
+        stages.append([part for c in channels for part in parted(coded[c], classes, count)])
+    stages += [[], []]
     for i in range(10):
         f, centres = splits.get(i, (0, []))
         put_varint(block, f)
         for centre in centres:
             put_zigzag(block, centre)
-        counts.append(3 - (f & 1) - (f >> 1 & 1))
-        for stage in (0, 1):
-            classes[stage] += [ROWS] * (f >> stage & 1)  # all rows are of one class
-    channel = np.full(ROWS, residual, np.int32)
-    stages = [encode_channels([channel] * sum(counts)).payload]
-    stages += [encode_channels([channel] * len(own)).payload for own in classes]
-    true = [len(stages[0]), len(stages[1])]
-    for length in lengths(*true) if lengths else true:
-        put_varint(block, length)
-    return bytes(block) + b"".join(stages) + extra
+        split = (f & 1, f >> 1 & 1, *centres, 0, 0)[:4]
+        x, y, z = range(38 + 3 * i, 41 + 3 * i)
+        stages[6] += parted(coded[y], refdec.y_classes(split, k[x]), 5)
+        stages[7] += parted(coded[z], refdec.z_classes(split, k[x], k[y]), 7)
+    return bytes(block) + staged(stages, lengths) + extra
+
+
+def staged_planes(planes, *, counts=(), form=STAGED, lengths=None, extra=b""):
+    """A section of residuals int32 [C, H, W] per plane. lengths: of all stages but the last, from the true ones."""
+    block = bytearray([form])
+    for count in counts:
+        put_varint(block, count)
+    stages = []
+    for stage, count in enumerate((1, *counts)):
+        stages.append([])
+        for plane in planes:
+            first = 1 << stage if stage else 0
+            channels = plane.reshape(len(plane), -1)
+            classes = refdec.classes_by_activity(
+                refdec.cell_activity(channels[:first].tolist(), *plane.shape[1:]), count
+            )
+            stages[-1] += [p for channel in channels[first : 2 << stage] for p in parted(channel, classes, count)]
+    return bytes(block) + staged(stages, lengths) + extra
+
+
+def parted(channel, classes, count):
+    """The symbols of each class."""
+    return [channel[np.array(classes) == q] for q in range(count)]
+
+
+def staged(stages, lengths=None):
+    """The lengths of all stages but the last, and the stages."""
+    payloads, out = [encode_channels(stage, effort=1).payload for stage in stages], bytearray()
+    true = [len(payload) for payload in payloads]
+    for length in lengths(*true) if lengths else true[:-1]:
+        put_varint(out, length)
+    return bytes(out) + b"".join(payloads)
 
 
 def both(section, rows=ROWS):
     """Outcome of the reference decoder and of the package: symbols or the error's name."""
-    ours = outcome(lambda d: refdec.decode_attributes(d, [rows] * 68), section, refdec.Fault)
+    ours = outcome(lambda d: refdec.decode_attributes(d, rows), section, refdec.Fault)
     return ours, outcome(lambda d: read_attributes(d, rows).tolist(), section, DecodeError)
 
 
+def both_planes(section, shapes):
+    ours = outcome(lambda d: refdec.decode_planes(d, shapes), section, refdec.Fault)
+
+    def theirs(data):
+        return [channel.ravel().tolist() for plane in read_planes(data, shapes) for channel in plane]
+
+    return ours, outcome(theirs, section, DecodeError)
+
+
 ONE = 1 << 10
-FINE_BLOCKS = {  # options, and symbols of some channels; channel 67 is never predicted
-    "no terms": ({}, {1: 3, 3: 3}),
-    "two terms": ({"terms": {3: (2, [(0, -ONE), (1, ONE >> 1)])}}, {1: 3, 3: 2}),  # -1.5 rounds to -1
-    "just under a half": ({"terms": {3: (2, [(0, -ONE), (1, (ONE >> 1) - 1)])}}, {3: 1}),
-    "all terms": ({"terms": {37: (37, [(0, 1 << 15)] * 37)}}, {36: 3, 37: 3 + 37 * 32 * 3}),
-    "chain of largest weights": ({"terms": {1: (1, [(0, -(1 << 15))]), 3: (1, [(1, 1 << 15)])}}, {1: -93, 3: -2973}),
-    "splits": ({"splits": {0: (1, [5]), 1: (2, [-K_MAX, K_MAX]), 9: (3, [3, 3])}}, {38: 3, 42: 3, 66: 3}),
-    "largest result": ({"terms": {3: (1, [(0, ONE)])}, "residual": K_MAX >> 1}, {3: K_MAX - 1}),
+FINE_BLOCKS = {  # residual, options, and symbols of some channels; channel 67 is never predicted
+    "no terms": (3, {}, {1: 3, 3: 3}),
+    "two terms": (3, {"terms": {3: (2, [(0, -ONE), (1, ONE >> 1)])}}, {1: 3, 3: 2}),  # -1.5 rounds to -1
+    "just under a half": (3, {"terms": {3: (2, [(0, -ONE), (1, (ONE >> 1) - 1)])}}, {3: 1}),
+    "all terms": (3, {"terms": {37: (37, [(0, 1 << 15)] * 37)}}, {36: 3, 37: 3 + 37 * 32 * 3}),
+    "largest weights": (3, {"terms": {1: (1, [(0, -(1 << 15))]), 3: (1, [(1, 1 << 15)])}}, {1: -93, 3: -2973}),
+    "splits": (3, {"splits": {0: (1, [5]), 1: (2, [-K_MAX, K_MAX]), 9: (3, [3, 3])}}, {38: 3, 42: 3, 66: 3}),
+    "class counts": (3, {"counts": (8, 1, 2, 7, 8)}, {37: 3}),
+    "largest symbols": (-K_MAX, {"counts": (8,) * 5, "splits": {0: (3, [K_MAX, K_MAX])}}, {39: -K_MAX}),
+    "largest result": (K_MAX >> 1, {"terms": {3: (1, [(0, ONE)])}}, {3: K_MAX - 1}),
 }
 
 
 @pytest.mark.parametrize("name", FINE_BLOCKS)
 def test_prediction_blocks_at_their_limits_are_read_by_both(name):
-    options, expected = FINE_BLOCKS[name]
-    ours, theirs = both(predicted_section(**options))
+    residual, options, expected = FINE_BLOCKS[name]
+    ours, theirs = both(staged_attributes(same(residual), **options))
     assert ours == theirs and len(ours) == 68
-    for channel, symbol in {67: options.get("residual", 3), **expected}.items():
+    for channel, symbol in {67: residual, **expected}.items():
         assert ours[channel] == [symbol] * ROWS, channel
 
 
@@ -237,36 +318,106 @@ BROKEN_BLOCKS = {
     "gap over its limit": ({"terms": {37: (1, [(39, 1)])}}, "LimitExceeded"),
     "weight over its limit": ({"terms": {1: (1, [(0, (1 << 15) + 1)])}}, "LimitExceeded"),
     "weight under its limit": ({"terms": {1: (1, [(0, -(1 << 15) - 1)])}}, "LimitExceeded"),
+    "class count 0": ({"counts": (1, 1, 1, 1, 0)}, "Malformed"),
+    "class count 9": ({"counts": (9, 1, 1, 1, 1)}, "LimitExceeded"),
     "unknown split": ({"splits": {4: (4, [0])}}, "LimitExceeded"),
     "centre of x over K": ({"splits": {4: (1, [K_MAX + 1])}}, "LimitExceeded"),
     "centre of y under -K": ({"splits": {4: (2, [0, -K_MAX - 1])}}, "LimitExceeded"),
-    "stage longer than the section": ({"lengths": lambda a, b: (a + 9999, b)}, "LimitExceeded"),
-    "stages longer than the rest": ({"lengths": lambda a, b: (a, b + 1)}, "Malformed"),
-    "stage 0 a byte short": ({"lengths": lambda a, b: (a - 1, b + 1), "splits": {0: (3, [0, 0])}}, "Malformed"),
-    "stage 1 a byte short": ({"lengths": lambda a, b: (a, b - 1), "splits": {0: (3, [0, 0])}}, "Malformed"),
-    "bytes in a stage without symbols": ({"extra": b"\1\0\0\0"}, "Malformed"),
-    "result over K": ({"terms": {3: (1, [(0, ONE)])}, "residual": (K_MAX >> 1) + 1}, "Malformed"),
+    "length over what is left": ({"lengths": lambda *n: (*n[:6], sum(n) + 3)}, "LimitExceeded"),  # takes two bytes
+    "length of all that is left": ({"lengths": lambda *n: (*n[:6], sum(n) + 2)}, "Malformed"),
+    "stages a byte longer than the rest": ({"lengths": lambda *n: (*n[:6], n[6] + n[7] + 1)}, "Malformed"),
+    "stage 0 a byte short": ({"lengths": lambda a, b, *n: (a - 1, b + 1, *n[:5])}, "Malformed"),
+    "stage 6 a byte short": ({"lengths": lambda *n: (*n[:6], n[6] - 1)}, "Malformed"),
+    "bytes after the last stage": ({"extra": b"\1\0\0\0"}, "Malformed"),
 }
 
 
 @pytest.mark.parametrize("name", BROKEN_BLOCKS)
 def test_broken_prediction_blocks_are_refused_by_both(name):
     options, fault = BROKEN_BLOCKS[name]
-    assert both(predicted_section(**options)) == (fault, fault)
+    assert both(staged_attributes(same(3), **options)) == (fault, fault)
 
 
-def test_damage_to_predicted_attributes_has_the_same_outcome():
+def test_a_predicted_symbol_over_its_limit_is_refused_by_both():
+    section = staged_attributes(same((K_MAX >> 1) + 1), terms={3: (1, [(0, ONE)])})
+    assert both(section) == ("Malformed", "Malformed")
+
+
+def any_terms(rng):
+    """Terms of a few channels, weak enough that no symbol passes its limit."""
+    terms = {}
+    for c in rng.choice(np.arange(1, 38), 5, replace=False).tolist():
+        channels = np.sort(rng.choice(c, min(c, 3), replace=False))
+        gaps = (np.diff(channels, prepend=-1) - 1).tolist()
+        terms[c] = (len(gaps), [(gap, int(rng.integers(-ONE, ONE))) for gap in gaps])
+    return terms
+
+
+@given(st.integers(1, 30), st.integers(0, 2**32 - 1), st.lists(st.integers(1, 8), min_size=5, max_size=5))
+@settings(max_examples=8)
+def test_any_attributes_in_stages_are_read_alike(rows, seed, counts):
+    rng = np.random.default_rng(seed)
+    coded = busy(rng, (68, 1, rows)).reshape(68, rows)
+    splits = {i: (f, rng.integers(-3, 4, (0, 1, 2, 2)[f]).tolist()) for i, f in enumerate(rng.integers(0, 4, 10))}
+    section = staged_attributes(coded, terms=any_terms(rng), counts=counts, splits=splits)
+    ours, theirs = both(section, rows)
+    assert ours == theirs and ours[0] == coded[0].tolist() and ours[38:] == coded[38:].tolist()
+
+
+@pytest.mark.parametrize("rows", [2, 300])
+def test_classes_of_the_largest_attributes_are_the_same(rows):
+    coded = np.ones((68, rows), np.int32)
+    wide = [0, 6, 12, 20, 29, 38, 39, 40]
+    coded[wide] = np.random.default_rng(rows).choice([-K_MAX, -1, 0, 1, K_MAX], (len(wide), rows))
+    ours, theirs = both(staged_attributes(coded, counts=(3, 4, 5, 7, 8), splits={0: (3, [K_MAX, -K_MAX])}), rows)
+    assert ours == theirs == coded.tolist()
+
+
+def test_damage_to_attributes_in_stages_has_the_same_outcome():
     terms = {c: (2, [(0, 700), (c % 2, -300)]) for c in range(2, 38)}
-    section = predicted_section(terms, {i: (i % 4, [2, 4][: (0, 1, 2, 2)[i % 4]]) for i in range(10)})
-    rng, seen = random.Random(3), set()
-    for _ in range(400):
-        at = rng.randrange(len(section))
-        cut = rng.randrange(4) == 0
-        damaged = section[:at] + (b"" if cut else bytes([rng.randrange(256)])) + section[at + 1 :]
-        ours, theirs = both(damaged)
-        assert ours == theirs, damaged.hex()
-        seen.add(ours if isinstance(ours, str) else "fine")
-    assert {"Malformed", "LimitExceeded", "fine"} <= seen
+    splits = {i: (i % 4, [2, 4][: (0, 1, 2, 2)[i % 4]]) for i in range(10)}
+    coded = busy(np.random.default_rng(3), (68, 1, ROWS), spread=0.5).reshape(68, ROWS)
+    section = staged_attributes(coded, terms=terms, counts=(2, 3, 1, 8, 2), splits=splits)
+    assert "fine" in assert_same_outcomes(section, both, 400, 300)
+
+
+@given(st.integers(1, 9), st.lists(st.tuples(st.integers(1, 7), st.integers(1, 7)), min_size=1, max_size=7), st.data())
+@settings(max_examples=15)
+def test_any_planes_in_stages_are_read_alike(channels, sides, data):
+    rng = np.random.default_rng(data.draw(st.integers(0, 2**32 - 1)))
+    spread = data.draw(st.sampled_from((1, 16)))
+    number = max(1, (channels - 1).bit_length()) - 1
+    counts = data.draw(st.lists(st.integers(1, 8), min_size=number, max_size=number))
+    planes = [busy(rng, (channels, h, w), spread) for h, w in sides]
+    ours, theirs = both_planes(staged_planes(planes, counts=counts), [plane.shape for plane in planes])
+    assert ours == theirs == [channel.ravel().tolist() for plane in planes for channel in plane]
+
+
+BROKEN_PLANES = {
+    "unknown form": ({"form": 2}, "UnsupportedFeature"),
+    "class count 0": ({"counts": (1, 0)}, "Malformed"),
+    "class count 9": ({"counts": (9, 1)}, "LimitExceeded"),
+    "length over what is left": ({"lengths": lambda *n: (n[0], sum(n) + 2)}, "LimitExceeded"),
+    "length of all that is left": ({"lengths": lambda *n: (n[0], sum(n) + 1)}, "Malformed"),
+    "stages a byte longer than the rest": ({"lengths": lambda *n: (n[0], n[1] + n[2] + 1)}, "Malformed"),
+    "stage 0 a byte short": ({"lengths": lambda a, b, c: (a - 1, b + 1)}, "Malformed"),
+    "stage 1 a byte short": ({"lengths": lambda a, b, c: (a, b - 1)}, "Malformed"),
+    "bytes after the last stage": ({"extra": b"\1\0\0\0"}, "Malformed"),
+}
+SHAPES = [(5, 3, 4), (5, 1, 7), (5, 1, 1)]
+
+
+@pytest.mark.parametrize("name", BROKEN_PLANES)
+def test_broken_planes_are_refused_by_both(name):
+    options, fault = BROKEN_PLANES[name]
+    section = staged_planes([np.full(shape, 3, np.int32) for shape in SHAPES], **{"counts": (1, 1), **options})
+    assert both_planes(section, SHAPES) == (fault, fault)
+
+
+def test_damage_to_planes_in_stages_has_the_same_outcome():
+    rng = np.random.default_rng(5)
+    section = staged_planes([busy(rng, shape, spread=1) for shape in SHAPES], counts=(3, 2))
+    assert "fine" in assert_same_outcomes(section, lambda d: both_planes(d, SHAPES), 400, 12)
 
 
 def take_apart(data):
@@ -280,9 +431,9 @@ def take_apart(data):
 
 def put_together(header, chunks):
     """A file with right lengths, ids and CRCs, whatever its payloads say."""
-    scene_id = scene_id_of(chunks[0][2])
-    framed = [write_chunk(t, f, scene_id, p) for t, f, p in chunks]
-    return write_preamble(canonical.pack({**header, 1: [[t, len(p)] for t, _, p in chunks]})) + b"".join(framed)
+    packed = canonical.pack({**header, 1: [[t, len(p)] for t, _, p in chunks]})
+    scene_id = scene_id_of(packed, chunks[0][2])
+    return write_preamble(packed) + b"".join(write_chunk(t, f, scene_id, p) for t, f, p in chunks)
 
 
 def outcome(function, data, fault):
@@ -425,6 +576,14 @@ def test_the_tables_and_limits_of_the_specification():
         assert [int(v) for v in printed] == table.tolist() == values
     check = [int(v) for v in re.search(r"gives 0, ([\d, ]+), 2\^24", TEXT)[1].split(",")]
     assert refdec.table_of(refdec.norm_cdf(7, 832, 0), 1) == [0, *check, 1 << 24]
+    activity, classes = re.search(r"activities ([\d, ]+) and C = 3 .* and classes ([\d, ]+)\.", TEXT).groups()
+    found = refdec.classes_by_activity([int(v) for v in activity.split(",")], 3)
+    assert found == [int(v) for v in classes.split(",")]
+    residuals, magnitudes = re.search(
+        r"residuals ([\d, −]+) of one channel\s+have\s+the\s+relative\s+magnitudes\s+([\d, ]+)\.", TEXT
+    ).groups()
+    found = refdec.relative_magnitude([[int(v.replace("−", "-")) for v in residuals.split(",")]], 4)
+    assert found == [int(v) for v in magnitudes.split(",")]
 
 
 def test_the_annotated_file():

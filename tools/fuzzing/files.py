@@ -15,22 +15,27 @@ from typing import Any
 
 import numpy as np
 from strategies import LAYER_SETS, RANGES, make_scene
+from vectors import blocks
 
 from pd4dgs_codec import encode
 from pd4dgs_codec.attributes.quantise import dequantise
 from pd4dgs_codec.bitstream import canonical
-from pd4dgs_codec.bitstream.container import read_chunk, read_preamble, scene_id_of, write_chunk, write_preamble
+from pd4dgs_codec.bitstream.container import read_chunk, read_preamble, write_chunk, write_preamble
+from pd4dgs_codec.codec import attribute_section, layer_meta, stages
 from pd4dgs_codec.codec import header as header_module
-from pd4dgs_codec.codec import layer_meta
 from pd4dgs_codec.codec.decoder import decode_layers
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
+from pd4dgs_codec.codec.layer_meta import Section
+from pd4dgs_codec.entropy.varint import ByteReader, put_varint
 from pd4dgs_codec.errors import DecodeError
-from pd4dgs_codec.scene import Scene
+from pd4dgs_codec.scene import N_OFFSETS, Scene
 
 
 @dataclass
 class Chunk:
-    """One chunk. meta and sections are the parameters and sections of a layer's payload, None for other chunks."""
+    """One chunk. meta and sections are the parameters and sections of a layer's payload, None for other chunks.
+
+    The section map in meta holds only what stands for no bytes."""
 
     type: int
     flags: int
@@ -43,7 +48,9 @@ class Chunk:
         if self.meta is None or self.sections is None:
             return self.payload
         lengths = {number: len(data) for number, data in sorted(self.sections.items()) if data}
-        meta = canonical.pack({**self.meta, layer_meta.SECTIONS: lengths})
+        others = self.meta.get(layer_meta.SECTIONS)
+        both = {**(others if isinstance(others, dict) else {}), **lengths}
+        meta = canonical.pack({**self.meta, layer_meta.SECTIONS: both})
         return b"".join([struct.pack("<I", len(meta)), meta, *(self.sections[number] for number in lengths)])
 
 
@@ -66,7 +73,9 @@ def take_apart(data: bytes) -> Parts:
             (length,) = struct.unpack_from("<I", chunk.payload)
             part.meta, at = canonical.unpack(chunk.payload[4 : 4 + length]), 4 + length
             part.sections = {}
-            for number, size in sorted(part.meta[layer_meta.SECTIONS].items()):
+            lengths = part.meta[layer_meta.SECTIONS]
+            for number in sorted(int(section) for section in Section if section in lengths):
+                size = lengths.pop(number)
                 part.sections[number], at = chunk.payload[at : at + size], at + size
         chunks.append(part)
         offset = chunk.end
@@ -74,14 +83,68 @@ def take_apart(data: bytes) -> Parts:
 
 
 def put_together(parts: Parts, header: bytes | None = None) -> bytes:
-    """The file of `parts`, or with other bytes for a header. EncodeError if a value has no canonical form."""
+    """The file of `parts`, or with other bytes for a header, which may be none. EncodeError if a value has no canonical
+    form."""
     payloads = [chunk.packed() for chunk in parts.chunks]
     if header is None:
         rows = [[chunk.type, len(payload)] for chunk, payload in zip(parts.chunks, payloads, strict=True)]
         header = canonical.pack({**parts.header, header_module.CHUNKS: rows})
-    scene_id = scene_id_of(payloads[0]) if payloads else bytes(8)
+    try:
+        scene_id = header_module.scene_id_of(header, payloads[0])
+    except (DecodeError, LookupError, TypeError):  # no header, or no chunk
+        scene_id = bytes(8)
     framed = [write_chunk(c.type, c.flags & 1, scene_id, p) for c, p in zip(parts.chunks, payloads, strict=True)]
     return b"".join([write_preamble(header), *framed])
+
+
+@dataclass
+class Staged:
+    """A section of form 1 taken apart. block: all before the lengths, the form included."""
+
+    block: bytes
+    stages: list[bytes]
+
+    def packed(self) -> bytes:
+        """The section, with the lengths of these stages."""
+        lengths = bytearray()
+        for stage in self.stages[:-1]:
+            put_varint(lengths, len(stage))
+        return b"".join([self.block, lengths, *self.stages])
+
+
+def take_stages(chunk: Chunk, number: int) -> Staged | None:
+    """The stages of a section; None if it has none or is not valid."""
+    data = (chunk.sections or {}).get(number, b"")
+    if number not in (Section.ATTRIBUTES, Section.PLANES) or data[:1] != bytes([stages.STAGED]):
+        return None
+    try:
+        reader = ByteReader(data)
+        reader.byte("the form")
+        count = _pass_block(reader, chunk, number)
+        block = data[: reader.offset]
+        lengths = [reader.varint(len(data), "the length of a stage") for _ in range(count - 1)]
+    except (DecodeError, LookupError, TypeError):  # the section, or the parameters, were changed before
+        return None
+    bounds = [*itertools.accumulate(lengths, initial=reader.offset), len(data)]
+    return Staged(block, [data[start:end] for start, end in itertools.pairwise(bounds)])
+
+
+def _pass_block(reader: ByteReader, chunk: Chunk, number: int) -> int:
+    """Reads on to the lengths of the stages and returns how many stages there are."""
+    assert chunk.meta is not None
+    if number == Section.ATTRIBUTES:
+        for channel in range(1, attribute_section.N_PREDICTED):
+            attribute_section._read_terms(reader, channel)
+        counts = len(attribute_section.STAGES) - 1
+    else:
+        counts = max(1, (chunk.meta[layer_meta.SCALES][0][0] - 1).bit_length()) - 1
+    for stage in range(counts):
+        stages.read_class_count(reader, stage)
+    if number == Section.PLANES:
+        return counts + 1
+    for _ in range(N_OFFSETS):
+        attribute_section._read_split(reader)
+    return counts + 3
 
 
 @dataclass(frozen=True)
@@ -126,6 +189,7 @@ def built_seeds() -> list[Seed]:
     files["no-anchor"] = encode(make_scene(1, anchors=0, with_camera=False), layers=2, effort=1)
     files["all-heads"] = encode(make_scene(2, anchors=6, scales=2), layers=2, effort=5)
     files["predicted"] = encode(_correlated(60), layers=0, effort=2)
+    files |= _staged()
     for mode in ("ans", "lzma"):
         files[f"priors-{mode}"] = encode(_all_priors(), layers=0, effort=5, mode=mode)
     flat = make_scene(3, layers=(0, 1), anchors=0, kind="constant", **{**tiny, "sides": (90, 3, 40, 2), "scales": 2})
@@ -151,6 +215,23 @@ def _correlated(anchors: int) -> Scene:
         feature=dequantise(feature.astype(np.int32), steps.feature),
         offset=dequantise(offset.astype(np.int32), steps.offset),
     )
+
+
+def _staged() -> dict[str, bytes]:
+    """Attributes and planes in stages with classes, terms and splits, whether an encoder would choose them or not."""
+    k = blocks.pattern(68, 12) * (np.arange(12, dtype=np.int32) % 4)
+    terms = {c: [(c // 2, 300 - 20 * c)] for c in range(1, 38, 3)}
+    splits = {i: (i % 4, i - 4, 5 - i) for i in range(10)}
+    layer = blocks.make_layer(0, [[i, 0, 0] for i in range(12)], attributes=k)
+    section = blocks.predicted_attributes(k, terms, splits, (3, 1, 8, 2, 5))
+    attributes = blocks.make_file(layer.with_sections({Section.ATTRIBUTES: section}))
+    layer = blocks.make_layer(1, (), before=1, scales=[blocks.Scale(5), blocks.Scale(5, (2, 1, 3, 4))])
+    planes = [plane for scale in layer.meant.planes for plane in scale.values()]
+    layer = layer.with_sections({Section.PLANES: blocks.staged_planes(planes, (3, 8))})
+    return {
+        "staged-attributes": attributes.data(),
+        "staged-planes": blocks.make_file(blocks.make_layer(), layer).data(),
+    }
 
 
 def _all_priors() -> Scene:

@@ -13,8 +13,8 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from fuzzing.files import Chunk, Parts, Seed, put_together, take_apart
-from pd4dgs_codec.bitstream.container import CHUNK_HEAD_SIZE, SIGNATURE, read_chunk, read_preamble, write_preamble
+from fuzzing.files import Chunk, Parts, Seed, put_together, take_apart, take_stages
+from pd4dgs_codec.bitstream.container import CHUNK_HEAD_SIZE, SIGNATURE, read_chunk, read_preamble
 from pd4dgs_codec.entropy.varint import put_varint
 from pd4dgs_codec.errors import EncodeError
 
@@ -189,6 +189,23 @@ def section_bytes(rng: random.Random, parts: Parts, other: Parts, names: list[st
     names.append(f"in section {number}")
 
 
+def stage_bytes(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:
+    """Bytes of one stage of a section in stages, or of the block before them; the stages' lengths follow."""
+    places = [(chunk, number) for chunk in parts.chunks for number in chunk.sections or ()]
+    found = [(c, number, staged) for c, number in places if (staged := take_stages(c, number)) is not None]
+    if not found:
+        return section_bytes(rng, parts, other, names)
+    chunk, number, staged = rng.choice(found)
+    at = rng.randrange(-1, len(staged.stages))
+    if at < 0:
+        staged.block = staged.block[:1] + change_bytes(rng, staged.block[1:], staged.block, names)
+    else:
+        staged.stages[at] = change_bytes(rng, staged.stages[at], rng.choice(staged.stages), names)
+    assert chunk.sections is not None
+    chunk.sections[number] = staged.packed()
+    names.append(f"in section {number}, {f'stage {at}' if at >= 0 else 'the block'}")
+
+
 def section_swap(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:
     """A section comes from another layer or file, or is dropped, random, or of zeros."""
     chunk, donor = _layer(rng, parts), _layer(rng, other if rng.random() < 0.6 else parts)
@@ -242,8 +259,8 @@ def chunks(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> 
     names.append("chunks")
 
 
-PART_CHANGES = (section_bytes, section_swap, parameters, header_value, payload_bytes, chunks)
-PART_WEIGHTS = (40, 12, 20, 8, 15, 5)
+PART_CHANGES = (section_bytes, stage_bytes, section_swap, parameters, header_value, payload_bytes, chunks)
+PART_WEIGHTS = (30, 15, 10, 20, 8, 12, 5)
 
 
 def change_parts(rng: random.Random, data: bytes, other: bytes, names: list[str]) -> bytes:
@@ -258,11 +275,11 @@ def change_parts(rng: random.Random, data: bytes, other: bytes, names: list[str]
 
 
 def change_header_bytes(rng: random.Random, data: bytes, other: bytes, names: list[str]) -> bytes:
-    """The header's bytes changed as they lie, with the checksum right again: msgpack in forms that nobody writes."""
+    """The header's bytes changed as they lie, ids and checksums right again: msgpack in forms that nobody writes."""
     (size,) = struct.unpack_from("<I", data, 12)
     header = change_bytes(rng, data[20 : 20 + size], other[20:200], names)[:4096]
     names.append("in the header")
-    return write_preamble(header) + data[20 + size :]
+    return put_together(take_apart(data), header)
 
 
 def change_frame(rng: random.Random, data: bytes, other: bytes, names: list[str]) -> bytes:
