@@ -41,7 +41,6 @@ class Stream:
                 raise
         return scenes
 
-
     def finish(self) -> None:
         """Say that no bytes follow: raises the pending fault, or Truncated if a layer is missing."""
         if self._error is not None:
