@@ -95,7 +95,7 @@ class Deformation:
 class Steps:
     """Quantisation steps Q, each a positive normal binary32: x_hat = k * Q."""
 
-    feature: float = 0.035
+    feature: float = 0.04
     scaling_log: float = 0.04
     offset: float = 0.05
     planes_global: float = 0.1
