@@ -21,10 +21,10 @@ from pd4dgs_codec.render.threads import configure
 SHARED = Path(os.environ.get("PD4DGS_SHARED", Path(__file__).resolve().parents[2] / "shared" / "data"))
 #: name, source, downscale, preset, iterations, time limit in seconds
 SCENES = (
-    ("shelf-hand", SHARED / "shelf-hand", 2, "small", 6_500, 600.0),
-    ("bouncing-balls", SHARED / "bouncing-balls", 4, "small", 9_000, 600.0),
-    ("synthetic-local", "synthetic:local", 1, "tiny", 2_000, 300.0),
-    ("synthetic-fast", "synthetic:fast", 1, "tiny", 2_000, 300.0),
+    ("shelf-hand", SHARED / "shelf-hand", 2, "small", 5_000, 600.0),
+    ("bouncing-balls", SHARED / "bouncing-balls", 4, "small", 7_000, 600.0),
+    ("synthetic-local", "synthetic:local", 1, "small", 1_500, 600.0),
+    ("synthetic-fast", "synthetic:fast", 1, "small", 1_500, 600.0),
     ("shelf-hand-paper", SHARED / "shelf-hand", 2, "paper", 4_600, 1_500.0),
 )
 #: Bytes per layer that the PD-4DGS paper publishes (average over the seven Dycheck iPhone scenes).
