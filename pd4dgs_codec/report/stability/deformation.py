@@ -277,7 +277,7 @@ def _residual_error(make: Callable[[], Deformation], times: Sequence[float]) -> 
 
 
 def _file_pictures(make: Callable[[], Deformation], times: Sequence[float], options: dict) -> tuple[str, float]:
-    data = encoder.encode(small_scene(make()), **options)
+    data = encoder.encode(small_scene(make()), effort=1, **options)
     model = from_scene(decoder.decode(data))
     error = _largest([picture_error(model, 1, t) for t in times])
     return f"{len(data):,} bytes, {len(times)} pictures", error
@@ -389,7 +389,7 @@ def _drawn_against_sent() -> tuple[str, float]:
 
 def _picture_of_mask(mask: int) -> tuple[str, float]:
     scene = small_scene(mask=mask)
-    decoded = decoder.decode(encoder.encode(scene))
+    decoded = decoder.decode(encoder.encode(scene, effort=1))
     model = from_scene(decoded)
     error = picture_error(model, 0, 0.0)
     if not mask:
