@@ -106,7 +106,8 @@ class Steps:
 
     def scaled(self, factor: float) -> Steps:
         """Every step times `factor`, rounded to binary32."""
-        return Steps(**{k: float(np.float32(v * factor)) for k, v in self.__dict__.items()})
+        with np.errstate(over="ignore"):  # an infinite step is the encoder's to refuse
+            return Steps(**{k: float(np.float32(v * factor)) for k, v in self.__dict__.items()})
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,6 +13,7 @@ MAX_SYMBOL = 1 << 23
 
 _SMALLEST_STEP = float(np.finfo(np.float32).tiny)
 _LARGEST_STEP = float(np.finfo(np.float32).max)
+_TO_INFINITY = 2.0**128 - 2.0**103  #: from here on binary64 rounds to an infinite binary32
 
 
 def is_step(value: float) -> bool:
@@ -25,7 +26,7 @@ def quantise(x: np.ndarray, step: float, name: str = "tensor") -> np.ndarray:
 
     x: float32 array. step: positive normal binary32. quantise(dequantise(k, step), step) == k for |k| <= 2^23; above
     that two neighbouring k can share one binary32 value unless step is a power of two.
-    Raises EncodeError naming the tensor if a value is not finite or |k| would exceed MAX_SYMBOL.
+    Raises EncodeError naming the tensor if a value is not finite, |k| would exceed MAX_SYMBOL, or x_hat be infinite.
     """
     if not is_step(step):
         raise EncodeError(f"{name}: quantisation step {step!r}, expected a positive normal binary32 value")
@@ -35,6 +36,8 @@ def quantise(x: np.ndarray, step: float, name: str = "tensor") -> np.ndarray:
     largest = float(np.abs(k).max()) if k.size else 0.0
     if largest > MAX_SYMBOL:
         raise EncodeError(f"{name}: symbol of magnitude {largest:.0f} at step {step:g}, expected at most {MAX_SYMBOL}")
+    if largest * step >= _TO_INFINITY:
+        raise EncodeError(f"{name}: a value that comes back as infinity at step {step:g}, expected a finite one")
     return k.astype(np.int32)
 
 

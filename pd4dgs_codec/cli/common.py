@@ -55,12 +55,17 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         raise UsageError(message)
 
-    def add_common(self) -> None:
-        """The options that every command has."""
+    def add_common(self, *, json_file: bool = False) -> None:
+        """The options that every command has. json_file: --json may name a file; args.json is then its name, or "-"."""
         group = self.add_argument_group("common options")
         group.add_argument("-h", "--help", action="help", help="show this help and exit")
         group.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
-        group.add_argument("--json", action="store_true", help="print one JSON object on stdout and nothing else there")
+        if json_file:
+            what = "write one JSON object to FILE; without FILE, to stdout and nothing else there"
+            group.add_argument("--json", nargs="?", const="-", metavar="FILE", help=what)
+        else:
+            what = "print one JSON object on stdout and nothing else there"
+            group.add_argument("--json", action="store_true", help=what)
         group.add_argument("-v", "--verbose", action="store_true", help="say more on stderr")
         group.add_argument("-j", "--threads", type=positive_int, metavar="N", help="CPU threads (default: all cores)")
         group.add_argument("-f", "--overwrite", action="store_true", help="replace an output that exists")

@@ -9,6 +9,7 @@ import numpy as np
 
 from pd4dgs_codec.attributes.table import ATTRIBUTES
 from pd4dgs_codec.bitstream.container import write_chunk, write_preamble
+from pd4dgs_codec.codec.bounds import ErrorBound, error_bounds
 from pd4dgs_codec.codec.check import check_scene
 from pd4dgs_codec.codec.decoder import decode_layers
 from pd4dgs_codec.codec.header import DEFORMATIONS, MODES, Header, pack_header, scene_id_of
@@ -45,7 +46,8 @@ class LayerReport:
 
 @dataclass(frozen=True)
 class Report:
-    """What encode did. left_out rows hold what, why and bytes: what it would have cost, by the same coder."""
+    """What encode did. left_out rows hold what, why and bytes: what it would have cost, by the same coder. errors: how
+    far decoded values may lie from those given and how far they do, empty if not verified."""
 
     mode: str
     bytes: int
@@ -53,6 +55,7 @@ class Report:
     seconds: float
     layers: list[LayerReport]
     left_out: list[dict]
+    errors: list[ErrorBound]
 
     def json(self) -> dict:
         """The report as plain dicts, lists, strings and numbers."""
@@ -79,8 +82,8 @@ def encode_with_report(
 
     mode: "ans", or "lzma" for the same symbols under LZMA2. deformation: "coded" or "float32". priors: "best" or
     "gauss". step_scale multiplies every quantisation step. layers: "auto" leaves out deformations that do nothing,
-    0, 1 or 2 keeps the layers up to that number. effort: 1..9. verify: decode the result and compare every symbol and
-    every float. Raises EncodeError.
+    0, 1 or 2 keeps the layers up to that number. effort: 1..9. verify: decode the result, compare every symbol and
+    every float, and hold every float against its error bound. Raises EncodeError.
     """
     started = time.perf_counter()
     _check_options(mode, deformation, priors, step_scale, layers, effort)
@@ -92,12 +95,11 @@ def encode_with_report(
     written = [write_layer(layer, coding) for layer in symbols]
     _check_limits(symbols, [payload for payload, _ in written])
     data = _container(planned, mode, deformation, symbols, [payload for payload, _ in written])
-    if verify:
-        _verify(data, planned, symbols)
+    errors = _verify(data, planned, symbols, deformation == "float32") if verify else []
     reports = [_layer_report(layer, payload, r) for layer, (payload, r) in zip(symbols, written, strict=True)]
     rows = [_left_out_row(item, scene, coding, deformation, reports) for item in left_out]
     seconds = round(time.perf_counter() - started, 4)
-    return data, Report(mode, len(data), verify, seconds, reports, rows)
+    return data, Report(mode, len(data), verify, seconds, reports, rows, errors)
 
 
 def _check_options(mode: str, deformation: str, priors: str, scale: float, layers: str | int, effort: int) -> None:
@@ -141,8 +143,9 @@ def _container(scene: Scene, mode: str, deformation: str, symbols: list[LayerSym
     return b"".join([write_preamble(packed), *chunks])
 
 
-def _verify(data: bytes, planned: Scene, meant: list[LayerSymbols]) -> None:
-    """Decode `data` and compare all integers with those meant, and all floats with those the integers stand for."""
+def _verify(data: bytes, planned: Scene, meant: list[LayerSymbols], raw_deformation: bool) -> list[ErrorBound]:
+    """Decode `data`, compare all integers with those meant, all floats with those the integers stand for, and these
+    with the ones given."""
     try:
         header, decoded, _ = decode_layers(data)
         scene = assemble(header.info, header.attribute_steps, decoded)
@@ -157,6 +160,7 @@ def _verify(data: bytes, planned: Scene, meant: list[LayerSymbols]) -> None:
             raise EncodeError(f"verification: layer {want.kind.layer} decodes to other symbols")
         if not _same(float_tensors(scene, index), float_tensors(expected, index)):
             raise EncodeError(f"verification: layer {want.kind.layer} decodes to other values")
+    return error_bounds(planned, scene, raw_deformation)
 
 
 def _same(a: list[np.ndarray], b: list[np.ndarray]) -> bool:

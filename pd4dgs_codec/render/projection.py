@@ -41,6 +41,7 @@ def _saturate(value):
 @njit(**_OPTIONS)
 def _rotation(w, x, y, z):
     """Unit quaternion (w, x, y, z), 1/norm and the 9 entries of R; a zero quaternion is the identity with 1/norm 0."""
+    w, x, y, z = np.float64(w), np.float64(x), np.float64(y), np.float64(z)  # float() of a float32 stays one in numba
     norm = math.sqrt(w * w + x * x + y * y + z * z)
     if norm == 0.0:
         w, inverse = 1.0, 0.0
@@ -58,7 +59,7 @@ def _rotation(w, x, y, z):
 @njit(**_OPTIONS)
 def _to_camera(means, i, camera):
     """Point i in camera axes. camera: float64 [20] = R (9, row-major), t (3), fx, fy, cx, cy, then the limits of J."""
-    a, b, c = float(means[i, 0]), float(means[i, 1]), float(means[i, 2])
+    a, b, c = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
     return (
         camera[0] * a + camera[1] * b + camera[2] * c + camera[9],
         camera[3] * a + camera[4] * b + camera[5] * c + camera[10],
@@ -118,14 +119,14 @@ def project(
         means2d[i, :] = 0.0
         depths[i] = 0.0
         conics[i, :] = 0.0
-        opacity = float(opacities[i])
+        opacity = np.float64(opacities[i])
         x, y, z = _to_camera(means, i, camera)
         if not (z > near and z <= far and opacity > ALPHA_MIN and opacity <= _F32_MAX):
             continue
-        _, _, rotation = _rotation(float(quats[i, 0]), float(quats[i, 1]), float(quats[i, 2]), float(quats[i, 3]))
+        _, _, rotation = _rotation(quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3])
         iz, _, _, jw = _jacobian(x, y, z, camera)
         u = _matmul23(jw, rotation)
-        s0, s1, s2 = float(scales[i, 0]), float(scales[i, 1]), float(scales[i, 2])
+        s0, s1, s2 = np.float64(scales[i, 0]), np.float64(scales[i, 1]), np.float64(scales[i, 2])
         u0, u1, u2, v0, v1, v2 = u[0] * s0, u[1] * s1, u[2] * s2, u[3] * s0, u[4] * s1, u[5] * s2
         p, q, r = u0 * u0 + u1 * u1 + u2 * u2, u0 * v0 + u1 * v1 + u2 * v2, v0 * v0 + v1 * v1 + v2 * v2
         c0, c1, c2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
@@ -224,7 +225,7 @@ def project_backward(
             continue
         for c in range(channels):
             g_colors[i, c] += _saturate(_sum_slots(slots, begin, end, SLOT_GEOMETRY + c))
-        g_opacities[i] += _saturate(_sum_slots(slots, begin, end, G) / float(opacities[i]))
+        g_opacities[i] += _saturate(_sum_slots(slots, begin, end, G) / np.float64(opacities[i]))
         gx, gy, mxx, mxy, myy = _image_gradient(
             _sum_slots(slots, begin, end, GT),
             _sum_slots(slots, begin, end, GTT),
@@ -238,11 +239,9 @@ def project_backward(
 
         x, y, z = _to_camera(means, i, camera)
         iz, a, b, jw = _jacobian(x, y, z, camera)
-        unit, inverse_norm, rotation = _rotation(
-            float(quats[i, 0]), float(quats[i, 1]), float(quats[i, 2]), float(quats[i, 3])
-        )
+        unit, inverse_norm, rotation = _rotation(quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3])
         m = _matmul23(jw, rotation)
-        s0, s1, s2 = float(scales[i, 0]), float(scales[i, 1]), float(scales[i, 2])
+        s0, s1, s2 = np.float64(scales[i, 0]), np.float64(scales[i, 1]), np.float64(scales[i, 2])
         # dL/dU = 2 M U with U = m diag(s); dL/dm = dL/dU diag(s).
         d0 = 2.0 * (mxx * m[0] + mxy * m[3]), 2.0 * (mxx * m[1] + mxy * m[4]), 2.0 * (mxx * m[2] + mxy * m[5])
         d1 = 2.0 * (mxy * m[0] + myy * m[3]), 2.0 * (mxy * m[1] + myy * m[4]), 2.0 * (mxy * m[2] + myy * m[5])

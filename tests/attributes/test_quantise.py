@@ -44,6 +44,16 @@ def test_symbols_over_the_limit_are_refused():
         quantise(np.array([MAX_SYMBOL + 1], np.float32), 1.0, "offset")
 
 
+def test_values_that_would_come_back_infinite_are_refused():
+    """The largest float32 is 2^22 steps of 2^106 less a quarter; 2^22 of them are 2^128."""
+    step = 2.0**106
+    for largest in (np.finfo(np.float32).max, np.finfo(np.float32).min):
+        with pytest.raises(EncodeError, match="scaling_log.*infinity"):
+            quantise(np.array([0, largest], np.float32), step, "scaling_log")
+    near = np.array([3.3e38], np.float32)
+    assert np.isfinite(dequantise(quantise(near, step), step)).all()
+
+
 @pytest.mark.parametrize("step", [0.0, -1.0, np.nan, np.inf, 1e-45, 0.1, 1e39])
 def test_what_is_no_step(step):
     assert not is_step(step)

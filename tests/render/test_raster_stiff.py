@@ -70,8 +70,9 @@ def test_bad_colours_and_backgrounds_are_refused(value):
 @pytest.mark.parametrize(
     "name, value",
     [
-        ("quats", (0.0,) * 4), ("quats", (1e-20,) * 4), ("scales", (0.0,) * 3), ("scales", (5.0, 1e-6, 1e-6)),
-        ("scales", (-0.1,) * 3), ("scales", (1e6,) * 3), ("opacities", 1.0), ("opacities", 1.5), ("opacities", 0.0),
+        ("quats", (0.0,) * 4), ("quats", (1e-20,) * 4), ("quats", (1e20,) * 4), ("quats", (3e38,) * 4),
+        ("scales", (0.0,) * 3), ("scales", (5.0, 1e-6, 1e-6)), ("scales", (-0.1,) * 3),
+        ("scales", (1e6,) * 3), ("opacities", 1.0), ("opacities", 1.5), ("opacities", 0.0),
         ("means", (0.1, 0.0, 1e9)), ("means", (0.05, 0.0, 0.02)),
     ],
 )  # fmt: skip
