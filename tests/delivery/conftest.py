@@ -13,13 +13,13 @@ from pd4dgs_codec.delivery.server import Server
 
 @pytest.fixture(scope="session")
 def scene_bytes() -> bytes:
-    return encode(make_scene(7, anchors=40), layers=2, effort=1)
+    return encode(make_scene(7, anchors=250, kind="gaussian", extent=20), layers=2, effort=1)
 
 
 @pytest.fixture(scope="session")
 def other_bytes() -> bytes:
     """Another scene in a file of another length."""
-    return encode(make_scene(8, anchors=30), layers=2, effort=1)
+    return encode(make_scene(8, anchors=120, kind="gaussian", extent=20), layers=2, effort=1)
 
 
 @pytest.fixture
