@@ -13,6 +13,7 @@ VERBS = {
     "info": "show the header and the layers of a .pd4 file",
     "render": "render a file to pictures or a video",
     "eval": "measure each level of a file against a dataset",
+    "package": "lay out a file for DASH, HLS and plain HTTP",
     "serve": "serve a folder over HTTP, at the rate of a slow link if wanted",
 }
 
