@@ -23,15 +23,17 @@ In production any server of static files will do. nginx:
     include mime.types;
     types { application/octet-stream pd4; application/dash+xml mpd; }
     gzip off;
-    add_header Access-Control-Allow-Origin * always;
-    add_header Access-Control-Expose-Headers "Accept-Ranges, Content-Length, Content-Range, ETag" always;
-    if ($request_method = OPTIONS) {
-      add_header Access-Control-Allow-Origin *;
-      add_header Access-Control-Allow-Headers "Range, If-Range";
-      return 204;
+    location / {
+      add_header Access-Control-Allow-Origin * always;
+      add_header Access-Control-Expose-Headers "Accept-Ranges, Content-Length, Content-Range, ETag" always;
+      if ($request_method = OPTIONS) {
+        add_header Access-Control-Allow-Origin *;
+        add_header Access-Control-Allow-Headers "Range, If-Range";
+        return 204;
+      }
     }
   }
-Caddy:
+Caddy (written from its documentation, not tried):
   :80
   root * /srv/scenes
   header Access-Control-Allow-Origin *
