@@ -89,7 +89,8 @@ class SceneClient:
 
     The first request is one open-ended GET, read as it arrives; after a cut, and for layers taken later, Range with
     If-Range fetches what is missing and nothing twice. If the file is another one then, everything begins anew with its
-    layer 0. A damaged layer is fetched once more and never shown. transfer: bytes and counts, see Transfer.
+    layer 0. A damaged layer is fetched once more and never shown. Stopping leaves what is on its way, at most what the
+    sockets' buffers hold. transfer: bytes and counts, see Transfer.
     """
 
     def __init__(self, url: str, *, stall: float = 10.0, attempts: int = 5):
@@ -117,7 +118,8 @@ class SceneClient:
         until = time.monotonic() + budget.seconds
         self._meter.start(time.monotonic())
         while True:
-            yield from self._ready(budget)
+            while ready := self._ready(budget):  # until empty: a fault behind a layer shows at the next feed
+                yield from ready
             left = until - time.monotonic()
             end: int | None = LONGEST_HEADER
             reach = None

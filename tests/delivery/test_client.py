@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 import random
+import shutil
+import ssl
+import subprocess
 import time
 
 import pytest
 from faulty import Fault, FaultyServer
-from strategies import assert_same_scene
+from strategies import assert_same_scene, make_scene
 
-from pd4dgs_codec import decode
+from pd4dgs_codec import decode, encode
 from pd4dgs_codec.delivery.client import Budget, RateMeter, SceneClient, next_end
 from pd4dgs_codec.delivery.link import Link
 from pd4dgs_codec.delivery.prefix import layer_ends
@@ -126,6 +129,20 @@ def test_a_damaged_layer_is_fetched_again_and_never_shown(scene_bytes, levels):
             assert len(server.requests) == 2
 
 
+def test_a_damaged_layer_within_the_first_block():
+    data = encode(make_scene(7, anchors=6), layers=2, effort=1)
+    ends = [end for _, end in layer_ends(data)]
+    assert ends[-1] < 4000
+    damaged = bytearray(data)
+    damaged[ends[1] - 30] ^= 1
+    same = {"ETag": '"same"'}
+    faults = [Fault(headers=same, then=lambda server: setattr(server, "content", data)), Fault(headers=same)]
+    with FaultyServer(bytes(damaged), faults) as server, SceneClient(server.url) as client:
+        server.heeds_if_range = False
+        check(list(client.scenes()), [decode(data, max_layer=layer) for layer in range(3)])
+    assert server.requests[1]["range"] == f"bytes={ends[0]}-{ends[2] - 1}"
+
+
 @pytest.mark.parametrize("status", [500, 502, 503, 504, 429, 408])
 def test_passing_errors_are_asked_again(scene_bytes, levels, status):
     with FaultyServer(scene_bytes, [Fault(status=status)]) as server, SceneClient(server.url) as client:
@@ -216,6 +233,29 @@ def test_nobody_there_is_one_clear_line():
         with pytest.raises(DeliveryError) as told:
             list(SceneClient(name, attempts=2).scenes())
         assert str(told.value).startswith(name) and "\n" not in str(told.value)
+
+
+def test_https_with_certificates_checked(folder, tmp_path, monkeypatch, levels):
+    openssl = shutil.which("openssl")
+    if openssl is None:
+        pytest.skip("no openssl to make a certificate with")
+    key, certificate = tmp_path / "key.pem", tmp_path / "certificate.pem"
+    subject = ["-subj", "/CN=localhost", "-addext", "subjectAltName=IP:127.0.0.1"]
+    kind = ["-newkey", "ec", "-pkeyopt", "ec_paramgen_curve:prime256v1", "-nodes", "-days", "2"]
+    command = [openssl, "req", "-x509", *kind, *subject, "-keyout", str(key), "-out", str(certificate)]
+    subprocess.run(command, check=True, capture_output=True)
+    context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
+    context.load_cert_chain(certificate, key)
+    server = Server(folder)
+    server.socket = context.wrap_socket(server.socket, server_side=True)
+    with server, server.running():
+        url = server.url_of("scene.pd4").replace("http:", "https:")
+        with SceneClient(url) as client, pytest.raises(DeliveryError, match="certificate verify failed"):
+            list(client.scenes())
+        assert client.transfer.cuts == 1  # nothing that asking again would change
+        monkeypatch.setenv("SSL_CERT_FILE", str(certificate))
+        with SceneClient(url) as client:
+            check(list(client.scenes(Budget(max_layer=0))) + list(client.scenes()), levels)
 
 
 @pytest.mark.parametrize("url", ["ftp://host/x", "http://", "http:///x", "http://user@host/x", "http://h:99999/x", "x"])
