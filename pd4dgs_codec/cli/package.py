@@ -75,8 +75,9 @@ def _video(data: bytes, args: argparse.Namespace) -> tuple[Video | None, str | N
     """(video, None), or (None, why there is none)."""
     from pd4dgs_codec.errors import RenderError
 
+    use_threads(args)  # a wrong --threads is an error, not a reason to do without
     try:
-        return _render(data, args), None
+        return _render(data, args.fps), None
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("pd4dgs_codec"):
             raise
@@ -85,8 +86,7 @@ def _video(data: bytes, args: argparse.Namespace) -> tuple[Video | None, str | N
         return None, str(error)
 
 
-def _render(data: bytes, args: argparse.Namespace) -> Video:
-    use_threads(args)
+def _render(data: bytes, fps: float) -> Video:
     import tempfile
 
     from pd4dgs_codec.delivery.package import Video
@@ -98,7 +98,7 @@ def _render(data: bytes, args: argparse.Namespace) -> Video:
     check_mp4()
     level = load_levels(data)[-1]
     low, high = level.model.info.time_range
-    count = max(2, round((high - low) * args.fps)) if high > low else STILL_FRAMES
+    count = max(2, round((high - low) * fps)) if high > low else STILL_FRAMES
     if count > MAX_FRAMES:
         raise RenderError(f"it would have {count:,} frames, expected at most {MAX_FRAMES:,}; choose a lower --fps")
     frames = own_frames(level.model.info, count)
@@ -107,8 +107,8 @@ def _render(data: bytes, args: argparse.Namespace) -> Video:
         raise RenderError(f"the file's camera has {camera.width}x{camera.height} pixels, a video takes 2x2 or more")
     with tempfile.TemporaryDirectory(prefix="pd4dgs-") as folder, progress_bar(len(frames), "frames", "video") as step:
         path = Path(folder) / "video.mp4"
-        write_mp4(_pictures(frames, level, step), path, args.fps, fragment=max(1, round(FRAGMENT_SECONDS * args.fps)))
-        return Video(path.read_bytes(), camera.width // 2 * 2, camera.height // 2 * 2, args.fps)
+        write_mp4(_pictures(frames, level, step), path, fps, fragment=max(1, round(FRAGMENT_SECONDS * fps)))
+        return Video(path.read_bytes(), camera.width // 2 * 2, camera.height // 2 * 2, fps)
 
 
 def _pictures(frames: list[Any], level: Any, step: Callable[[], None]) -> Iterator[np.ndarray]:

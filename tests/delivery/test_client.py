@@ -269,7 +269,7 @@ def test_stop_when_the_seconds_are_over_and_go_on_later(scene_bytes, levels):
     with FaultyServer(scene_bytes, [Fault(ends[0] + 20, "stall")]) as server, SceneClient(server.url) as client:
         start = time.monotonic()
         check(list(client.scenes(Budget(seconds=0.3))), levels[:1])
-        assert 0.25 < time.monotonic() - start < 0.6
+        assert 0.25 < time.monotonic() - start < 1.0
         assert len(client.transfer.data) == ends[0] + 20
         check(list(client.scenes()), levels[1:])
     assert server.requests[1]["range"] == f"bytes={ends[0] + 20}-{ends[2] - 1}"

@@ -24,7 +24,7 @@ def test_a_file_takes_8S_over_B(folder, rate, size):
     (folder / "long.bin").write_bytes(bytes(size))
     with Server(folder, link=Link(rate)) as server, server.running():
         ask(server, "/bytes.bin")
-        took = statistics.median(_seconds(server, "/long.bin") for _ in range(3))
+        took = statistics.median(_seconds(server, "/long.bin") for _ in range(5))
     expected = 8 * size / rate
     assert abs(took - expected) <= max(0.03 * expected, 0.01), f"{took:.4f} s, expected {expected:.4f}"
 
@@ -78,4 +78,4 @@ def test_no_rate_is_no_limit():
 
 def test_latency_is_paid_by_the_connection_and_by_each_request(folder):
     with Server(folder, latency=0.05) as server, server.running():
-        assert 0.1 <= _seconds(server, "/bytes.bin") < 0.18
+        assert 0.1 <= _seconds(server, "/bytes.bin") < 0.3

@@ -207,6 +207,21 @@ def test_without_a_renderer_there_is_a_clear_word(call, folder, tmp_path, monkey
     monkeypatch.setattr("pd4dgs_codec.cli.package._render", gone)
     code, _, err = call(folder / "scene.pd4", "-o", tmp_path / "out")
     assert code == 0 and "no 2D video: needs the module torch" in err
+    code, _, err = call(folder / "scene.pd4", "-o", tmp_path / "other", "-j", 100_000)
+    assert code == 1 and "threads is 100000" in err and not (tmp_path / "other").exists()
+
+
+@pytest.mark.parametrize(
+    ("time_range", "camera", "says"), [((0.0, 2.0), False, "no camera"), ((0.0, 1e5), True, "2,000,000 frames")]
+)
+def test_scenes_that_make_no_video(call, tmp_path, time_range, camera, says):
+    pytest.importorskip("torch")
+    scene = make_scene(7, layers=(0,), anchors=3, with_camera=camera)
+    (tmp_path / "s.pd4").write_bytes(encode(replace(scene, info=replace(scene.info, time_range=time_range)), effort=1))
+    code, out, err = call(tmp_path / "s.pd4", "-o", tmp_path / "out", "--json")
+    told = json.loads(out)
+    assert code == 0 and told["video"] is False and says in told["why_no_video"] and says in err
+    assert not (tmp_path / "out" / "fallback.mp4").exists()
 
 
 def test_a_rendered_video_is_packaged(call, folder, tmp_path, monkeypatch):
