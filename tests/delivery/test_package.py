@@ -130,14 +130,14 @@ def test_the_playlist_names_the_index(packaged):
 
 
 def test_ancillary_chunks_travel_along(scene_bytes):
-    from pd4dgs_codec.bitstream.container import read_preamble, scene_id_of, write_preamble
+    from pd4dgs_codec.bitstream.container import read_preamble, write_preamble
     from pd4dgs_codec.codec.header import pack_header, unpack_header
     from pd4dgs_codec.codec.info import info
 
     preamble = read_preamble(scene_bytes)
     header = unpack_header(preamble.header)
     first = info(scene_bytes)["layers"][0]
-    scene_id = scene_id_of(scene_bytes[first["offset"] + 16 : first["end"] - 4])
+    scene_id = scene_bytes[first["offset"] + 8 : first["offset"] + 16]  # chunks behind layer 0 do not change it
     extra = write_chunk(40000, 1, scene_id, b"notes")
     chunks = (header.chunks[0], (40000, 5), *header.chunks[1:], (40000, 5))
     head = write_preamble(pack_header(replace(header, chunks=chunks)))
