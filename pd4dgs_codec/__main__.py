@@ -14,6 +14,8 @@ VERBS = {
     "render": "render a file to pictures or a video",
     "eval": "measure each level of a file against a dataset",
     "bench": "measure what the codec, the renderer and the trainer promise",
+    "package": "lay out a file for DASH, HLS and plain HTTP",
+    "serve": "serve a folder over HTTP, at the rate of a slow link if wanted",
 }
 
 

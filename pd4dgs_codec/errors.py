@@ -26,6 +26,10 @@ class NotFinite(RenderError):
     """Colours or backgrounds to draw hold NaN or infinity: a step that diverged, where other refusals are mistakes."""
 
 
+class DeliveryError(Pd4Error):
+    """A file cannot be fetched over the network, served or packaged."""
+
+
 class EncodeError(Pd4Error):
     """A scene cannot be written as a `.pd4` file (NaN, infinity, a count over a limit, a failed verification)."""
 

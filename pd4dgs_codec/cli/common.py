@@ -126,20 +126,29 @@ def _checked(text: str, kind: Callable[[str], Any], accept: Callable[[Any], bool
     raise argparse.ArgumentTypeError(f"found {text!r}, expected {expected}")
 
 
+def rate(text: str) -> float:
+    """A link rate in bits per second with k, M or G for 1e3, 1e6, 1e9: "2M" -> 2e6."""
+    return _scaled(text, {"k": 1e3, "M": 1e6, "G": 1e9}, "a rate in bits per second such as 2M or 500k")
+
+
 def rates(text: str) -> dict[str, float]:
-    """Comma-separated link rates, bits per second with k, M or G for 1e3, 1e6, 1e9: "2M,10M" -> {"2M": 2e6, ...}."""
-    units = {"k": 1e3, "M": 1e6, "G": 1e9}
-    result = {}
-    for name in text.split(","):
-        number, unit = (name[:-1], units[name[-1]]) if name[-1:] in units else (name, 1.0)
-        try:
-            value = float(number) * unit
-        except ValueError:
-            value = math.nan
-        if not 0 < value < math.inf:
-            raise argparse.ArgumentTypeError(f"found {name!r}, expected a rate in bits per second such as 2M or 500k")
-        result[name] = value
-    return result
+    """Comma-separated link rates: "2M,10M" -> {"2M": 2e6, "10M": 1e7}."""
+    return {name: rate(name) for name in text.split(",")}
+
+
+def duration(text: str) -> float:
+    """Seconds: "50ms", "1.5s" or "1.5"."""
+    return _scaled(text, {"ms": 1e-3, "s": 1.0}, "a time such as 50ms or 1.5s", low=0.0)
+
+
+def _scaled(text: str, units: dict[str, float], expected: str, low: float = math.ulp(0.0)) -> float:
+    """A finite number >= low times its unit."""
+    unit = next((unit for unit in units if text.endswith(unit)), "")
+    with contextlib.suppress(ValueError):
+        value = float(text.removesuffix(unit)) * units.get(unit, 1.0)
+        if low <= value < math.inf:
+            return value
+    raise argparse.ArgumentTypeError(f"found {text!r}, expected {expected}")
 
 
 # -- talking to the caller ---------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.cli.common import OK, PARTIAL, Console, Parser, UsageError, number, run, table, use_threads
 from pd4dgs_codec.cli.files import STDIO, check_output, read_bytes, write_bytes
+from pd4dgs_codec.errors import DeliveryError
 
 if TYPE_CHECKING:
     from pd4dgs_codec.scene import Scene
@@ -18,10 +19,11 @@ if TYPE_CHECKING:
 DETAILS = """\
 Without -o the file is decoded and checked, and a summary printed. An .npz file holds the float32 arrays anchor,
 feature, scaling_log, offset, mask_L, mlp.*, planes.* and meta_*; a .pt file is a checkpoint that encode, render and
-eval accept.
+eval accept. Of a URL (http, https) only the layers asked for are fetched; cut connections are taken up again.
 
 examples:
   pd4dgs-decode scene.pd4
+  pd4dgs-decode http://127.0.0.1:8000/scene.pd4 --max-layer 1 -o prefix.npz
   pd4dgs-decode scene.pd4 --max-layer 0 -o base.npz
   head -c 300000 scene.pd4 | pd4dgs-decode - --allow-partial -o prefix.pt"""
 
@@ -30,7 +32,7 @@ def parser() -> Parser:
     """The options of `pd4dgs-decode`."""
     p = Parser("decode", "[scene.pd4] [-o FILE]", "Unpack a .pd4 file, or the first layers of one.", DETAILS)
     p.add_argument(
-        "input", nargs="?", default=STDIO, metavar="scene.pd4", help="file to read; - or nothing reads stdin"
+        "input", nargs="?", default=STDIO, metavar="scene.pd4", help="file or URL to read; - or nothing reads stdin"
     )
     p.add_argument(
         "-o", "--output", metavar="FILE", help="FILE.npz or FILE.pt; - writes npz to stdout; without it only check"
@@ -55,7 +57,7 @@ def _decode(args: argparse.Namespace, console: Console) -> int:
     kind = _output_kind(args)
     if args.output:
         check_output(args.output, args.overwrite)
-    data = read_bytes(args.input)
+    data = _input(args, console)
     from pd4dgs_codec.codec.decoder import decode_partial
 
     start = time.perf_counter()
@@ -71,6 +73,28 @@ def _decode(args: argparse.Namespace, console: Console) -> int:
     result = _summary(scene, data, complete, seconds, args)
     console.result(result, _text(result), on_stdout=not args.output)
     return OK if complete else PARTIAL
+
+
+def _input(args: argparse.Namespace, console: Console) -> bytes:
+    """The file's bytes; of a URL only those that --max-layer needs."""
+    from pd4dgs_codec.delivery.transfer import Transfer, is_url
+
+    if not is_url(args.input):
+        return read_bytes(args.input)
+    from pd4dgs_codec.delivery.prefix import fetch
+
+    transfer = Transfer(args.input)
+    try:
+        data = fetch(transfer, args.max_layer)
+    except DeliveryError as error:
+        if not (args.allow_partial and transfer.data):
+            raise
+        console.message(f"pd4dgs-decode: {error}")
+        data = bytes(transfer.data)
+    finally:
+        transfer.close()
+    console.detail(f"{len(transfer.data):,} bytes in {transfer.requests} requests, {transfer.cuts} cuts")
+    return data
 
 
 def _output_kind(args: argparse.Namespace) -> str | None:

@@ -94,7 +94,7 @@ def whole_files(pattern: str, names: list[str], overwrite: bool) -> Iterator[lis
             raise DataError(f"{name}: exists already; --overwrite replaces it")
     existing = next(p for p in (parent, *parent.parents) if p.exists())
     if not existing.is_dir():
-        raise DataError(f"{existing}: is a file, expected a folder for the pictures")
+        raise DataError(f"{existing}: is a file, expected a folder to write into")
     folder = _temporary_folder(existing, str(parent))
     try:
         temporaries = [Path(folder) / Path(name).name for name in names]

@@ -11,10 +11,12 @@ from pd4dgs_codec.cli.files import STDIO, read_bytes
 
 DETAILS = """\
 Times to the first frame are 8 * (bytes up to the end of layer 0) / rate: the network alone, no latency.
+Of a URL (http, https) only the header is fetched, unless --check or --hashes need everything.
 
 examples:
   pd4dgs-info scene.pd4
-  pd4dgs-info scene.pd4 --check --at 500k,2M,50M --json"""
+  pd4dgs-info scene.pd4 --check --at 500k,2M,50M --json
+  pd4dgs-info http://127.0.0.1:8000/scene.pd4"""
 
 #: What -v tells of each layer: quantisation steps, planes as [channels, x, y, z, t], widths of the networks' layers.
 DETAIL_KEYS = ("steps", "planes", "networks")
@@ -23,7 +25,7 @@ DETAIL_KEYS = ("steps", "planes", "networks")
 def parser() -> Parser:
     """The options of `pd4dgs-info`."""
     p = Parser("info", "FILE", "Show the header and the layers of a .pd4 file.", DETAILS)
-    p.add_argument("input", metavar="FILE", help=".pd4 file; - reads stdin")
+    p.add_argument("input", metavar="FILE", help=".pd4 file or its URL; - reads stdin")
     p.add_argument("--check", action="store_true", help="decode everything, so that every checksum and rule is tested")
     p.add_argument("--hashes", action="store_true", help="SHA-256 per layer of its integers and of its float32 tensors")
     p.add_argument(
@@ -43,11 +45,11 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _info(args: argparse.Namespace, console: Console) -> int:
-    data = read_bytes(args.input)
+    data, total = _input(args, console)
     from pd4dgs_codec.codec.decoder import decode
     from pd4dgs_codec.codec.info import hashes, info
 
-    result = {"input": args.input, **info(data)}
+    result = {"input": args.input, **info(data), "available": total}
     end = result["layers"][0]["end"]
     result["first_frame_seconds"] = {name: 8 * end / rate for name, rate in args.at.items()}
     result["left_out"] = _left_out(result["layers"])
@@ -60,6 +62,24 @@ def _info(args: argparse.Namespace, console: Console) -> int:
         console.detail(f"layer {row['layer']}: " + ", ".join(f"{key} {row.get(key)}" for key in DETAIL_KEYS))
     console.result(result, _text(result), on_stdout=True)
     return OK
+
+
+def _input(args: argparse.Namespace, console: Console) -> tuple[bytes, int]:
+    """(bytes, length of the file): all of it, or of a URL the header alone where that suffices."""
+    from pd4dgs_codec.delivery.transfer import Transfer, is_url
+
+    if not is_url(args.input):
+        data = read_bytes(args.input)
+        return data, len(data)
+    from pd4dgs_codec.delivery.prefix import fetch, fetch_header
+
+    transfer = Transfer(args.input)
+    try:
+        data = fetch(transfer) if args.check or args.hashes else fetch_header(transfer)
+    finally:
+        transfer.close()
+    console.detail(f"fetched {len(transfer.data):,} bytes in {transfer.requests} requests")
+    return data, len(data) if transfer.total is None else transfer.total
 
 
 def _left_out(layers: list[dict[str, Any]]) -> list[dict[str, str]]:

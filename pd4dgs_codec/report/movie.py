@@ -30,19 +30,30 @@ def write_gif(frames: Iterator[np.ndarray], path: Path, fps: float) -> None:
     )
 
 
-def write_mp4(frames: Iterator[np.ndarray], path: Path, fps: float) -> None:
-    """H.264 in 4:2:0, which every browser plays; an odd row or column is cropped. RenderError without ffmpeg."""
+def write_mp4(frames: Iterator[np.ndarray], path: Path, fps: float, *, fragment: int | None = None) -> None:
+    """H.264 in 4:2:0, which every browser plays; an odd row or column is cropped. RenderError without ffmpeg.
+
+    fragment: frames per fragment that starts with a key frame, as streaming wants them; None for a plain file.
+    """
     check_mp4()
     import imageio_ffmpeg
 
     writer = None
+    movflags = "+frag_keyframe+empty_moov+default_base_moof"
+    options = ["-g", str(fragment), "-sc_threshold", "0", "-bf", "0", "-movflags", movflags] if fragment else []
     try:
         for frame in frames:
             even = np.ascontiguousarray(frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2])
             if writer is None:
                 size = (even.shape[1], even.shape[0])
                 writer = imageio_ffmpeg.write_frames(
-                    str(path), size, fps=fps, quality=8, macro_block_size=2, ffmpeg_log_level="error"
+                    str(path),
+                    size,
+                    fps=fps,
+                    quality=8,
+                    macro_block_size=2,
+                    ffmpeg_log_level="error",
+                    output_params=options,
                 )
                 writer.send(None)
             writer.send(even)

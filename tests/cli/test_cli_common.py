@@ -15,7 +15,7 @@ from pd4dgs_codec import __main__ as dispatcher  # noqa: E402
 from pd4dgs_codec import jsonable  # noqa: E402
 from pd4dgs_codec.cli import common, files  # noqa: E402
 
-VERBS = ("train", "encode", "decode", "info", "render", "eval", "bench")
+VERBS = ("train", "encode", "decode", "info", "render", "eval", "bench", "package", "serve")
 
 
 @pytest.mark.parametrize("verb", VERBS)

@@ -1,0 +1,128 @@
+"""`pd4dgs-package`: a `.pd4` file as a folder for DASH, HLS and plain HTTP."""
+
+from __future__ import annotations
+
+import argparse
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pd4dgs_codec.cli.common import OK, Console, Parser, number, positive_float, run, table, use_threads
+from pd4dgs_codec.cli.files import read_bytes, whole_files
+from pd4dgs_codec.cli.progress import progress_bar
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from pd4dgs_codec.delivery.package import Video
+
+DETAILS = """\
+DIR then holds scene.pd4, index.json (byte ranges and SHA-256 of the layers), scene.mp4 and scene.mpd (DASH: each
+layer a fragment and an AdaptationSet of its own, with dependencyId) and scene.m3u8 (HLS, whose session data names
+index.json).
+
+DASH clients that follow dependencyId deliver the layers; showing them takes a .pd4 decoder. Stock DASH and HLS players
+play the 2D video: fallback.mp4, rendered from the scene with its own camera over its whole time. It needs torch, numba
+and ffmpeg (the extra [train]) and a file with a camera; else the folder is made without it, and stock players find
+nothing to play.
+
+examples:
+  pd4dgs-package scene.pd4 -o out/scene
+  pd4dgs-package scene.pd4 -o out/scene --no-video --json"""
+
+STILL_FRAMES = 60  #: for a scene whose time stands still
+MAX_FRAMES = 3000
+FRAGMENT_SECONDS = 2
+
+
+def parser() -> Parser:
+    """The options of `pd4dgs-package`."""
+    p = Parser("package", "scene.pd4 -o DIR", "Lay out a .pd4 file for DASH, HLS and plain HTTP.", DETAILS)
+    p.add_argument("input", metavar="scene.pd4", help="file to package; - reads stdin")
+    p.add_argument("-o", "--output", required=True, metavar="DIR", help="folder to write, made if missing")
+    p.add_argument("--no-video", action="store_true", help="do without the 2D video")
+    p.add_argument("--fps", type=positive_float, default=20.0, metavar="F", help="of the 2D video (default: 20)")
+    p.add_common()
+    return p
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return run(parser(), _package, argv)
+
+
+def _package(args: argparse.Namespace, console: Console) -> int:
+    data = read_bytes(args.input)
+    from pd4dgs_codec.codec.decoder import decode
+    from pd4dgs_codec.delivery.package import package
+
+    decode(data)  # before any rendering
+    video, why_not = (None, "--no-video") if args.no_video else _video(data, args)
+    if why_not and not args.no_video:
+        console.message(f"pd4dgs-package: no 2D video: {why_not}")
+    files = package(data, video)
+    names = [str(Path(args.output) / name) for name in files]
+    with whole_files(names[0], names, args.overwrite) as temporaries:
+        for temporary, content in zip(temporaries, files.values(), strict=True):
+            temporary.write_bytes(content)
+    rows = [{"name": name, "bytes": len(content)} for name, content in files.items()]
+    result = {"input": args.input, "output": args.output, "files": rows, "video": video is not None}
+    console.result(result | {"why_no_video": why_not}, _text(result), on_stdout=False)
+    return OK
+
+
+def _video(data: bytes, args: argparse.Namespace) -> tuple[Video | None, str | None]:
+    """(video, None), or (None, why there is none)."""
+    from pd4dgs_codec.errors import RenderError
+
+    use_threads(args)  # a wrong --threads is an error, not a reason to do without
+    try:
+        return _render(data, args.fps), None
+    except ModuleNotFoundError as error:
+        if (error.name or "").startswith("pd4dgs_codec"):
+            raise
+        return None, f"needs the module {error.name}, which is not installed"
+    except RenderError as error:
+        return None, str(error)
+
+
+def _render(data: bytes, fps: float) -> Video:
+    import tempfile
+
+    from pd4dgs_codec.delivery.package import Video
+    from pd4dgs_codec.errors import RenderError
+    from pd4dgs_codec.report.frames import own_frames
+    from pd4dgs_codec.report.levels import load_levels
+    from pd4dgs_codec.report.movie import check_mp4, write_mp4
+
+    check_mp4()
+    level = load_levels(data)[-1]
+    low, high = level.model.info.time_range
+    count = max(2, round((high - low) * fps)) if high > low else STILL_FRAMES
+    if count > MAX_FRAMES:
+        raise RenderError(f"it would have {count:,} frames, expected at most {MAX_FRAMES:,}; choose a lower --fps")
+    frames = own_frames(level.model.info, count)
+    camera = frames[0].camera
+    if min(camera.width, camera.height) < 2:
+        raise RenderError(f"the file's camera has {camera.width}x{camera.height} pixels, a video takes 2x2 or more")
+    with tempfile.TemporaryDirectory(prefix="pd4dgs-") as folder, progress_bar(len(frames), "frames", "video") as step:
+        path = Path(folder) / "video.mp4"
+        write_mp4(_pictures(frames, level, step), path, fps, fragment=max(1, round(FRAGMENT_SECONDS * fps)))
+        return Video(path.read_bytes(), camera.width // 2 * 2, camera.height // 2 * 2, fps)
+
+
+def _pictures(frames: list[Any], level: Any, step: Callable[[], None]) -> Iterator[np.ndarray]:
+    from pd4dgs_codec.metrics.image import to_uint8
+    from pd4dgs_codec.render.picture import render_image
+
+    for frame in frames:
+        camera = frame.camera
+        yield to_uint8(
+            render_image(level.model, level.level, frame.time, camera.viewmat, camera.K, camera.width, camera.height)
+        )
+        step()
+
+
+def _text(result: dict[str, Any]) -> str:
+    rows = [(row["name"], number(row["bytes"], 0)) for row in result["files"]]
+    return f"{result['output']}: {len(rows)} files\n{table(('file', 'bytes'), rows)}"

@@ -1,0 +1,88 @@
+"""`pd4dgs-serve`: a folder over HTTP, on a slow link if wanted."""
+
+from __future__ import annotations
+
+import argparse
+import signal
+import threading
+from collections.abc import Sequence
+
+from pd4dgs_codec.cli.common import OK, Console, Parser, duration, rate, run
+
+DETAILS = """\
+GET and HEAD with ranges, If-Range, ETag and CORS. Nothing outside DIR is served, nor names that begin with a dot.
+The first line on stdout is the URL, printed when the server listens; it ends on Ctrl-C or SIGTERM.
+
+--rate is one link that all clients share; it carries bodies, headers cross for free. --latency is a round trip: a new
+connection waits for one, each request for another.
+
+In production any server of static files will do. nginx:
+  server {
+    listen 80;
+    root /srv/scenes;
+    include mime.types;
+    types { application/octet-stream pd4; application/dash+xml mpd; }
+    gzip off;
+    location / {
+      add_header Access-Control-Allow-Origin * always;
+      add_header Access-Control-Expose-Headers "Accept-Ranges, Content-Length, Content-Range, ETag" always;
+      if ($request_method = OPTIONS) {
+        add_header Access-Control-Allow-Origin *;
+        add_header Access-Control-Allow-Headers "Range, If-Range";
+        return 204;
+      }
+    }
+  }
+Caddy (written from its documentation, not tried):
+  :80
+  root * /srv/scenes
+  header Access-Control-Allow-Origin *
+  header Access-Control-Allow-Headers "Range, If-Range"
+  header Access-Control-Expose-Headers "Accept-Ranges, Content-Length, Content-Range, ETag"
+  @preflight method OPTIONS
+  respond @preflight 204
+  file_server
+
+examples:
+  pd4dgs-serve out/scene
+  pd4dgs-serve out/scene --port 0 --rate 2M --latency 50ms"""
+
+
+def parser() -> Parser:
+    """The options of `pd4dgs-serve`."""
+    p = Parser("serve", "DIR", "Serve a folder over HTTP, at the rate of a slow link if wanted.", DETAILS)
+    p.add_argument("input", metavar="DIR", help="folder to serve")
+    p.add_argument("--host", default="127.0.0.1", metavar="H", help="address to listen on (default: 127.0.0.1)")
+    p.add_argument("--port", type=_port, default=8000, metavar="N", help="port, 0 for any free one (default: 8000)")
+    p.add_argument("--rate", type=rate, metavar="BPS", help="rate of the link in bits per second, such as 2M")
+    p.add_argument("--latency", type=duration, default=0.0, metavar="T", help="round trip, such as 50ms (default: 0)")
+    p.add_common()
+    return p
+
+
+def _port(text: str) -> int:
+    if text.isascii() and text.isdigit() and len(text) < 6 and int(text) < 65536:
+        return int(text)
+    raise argparse.ArgumentTypeError(f"found {text!r}, expected 0 to 65535")
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return run(parser(), _serve, argv)
+
+
+def _serve(args: argparse.Namespace, console: Console) -> int:
+    from pd4dgs_codec.delivery.link import Link
+    from pd4dgs_codec.delivery.server import Server
+
+    log = console.message if console.verbose else None
+    with Server(args.input, args.host, args.port, link=Link(args.rate), latency=args.latency, log=log) as server:
+        stop = threading.Event()
+        if threading.current_thread() is threading.main_thread():
+            for number in (signal.SIGINT, signal.SIGTERM):
+                signal.signal(number, lambda *_: stop.set())
+        with server.running():
+            result = {"url": server.url, "folder": str(server.root), "rate": args.rate, "latency": args.latency}
+            console.result(result, server.url, on_stdout=True)
+            stop.wait()
+    return OK

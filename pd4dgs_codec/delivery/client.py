@@ -1,0 +1,173 @@
+"""A viewer's side of a `.pd4` file on a web server: layers as they arrive, upgrades later, cuts survived.
+
+Which layer next, and when to stop. Layers build on each other, so the next one is always the next in the file, and the
+only question is whether to take it. `next_end` answers after every layer:
+
+1. no layer beyond `max_layer`, and none that ends beyond `bytes`;
+2. the first layer always, as long as `seconds` last: without it there is no picture;
+3. a further layer only if the rest of it would arrive within `seconds` at the rate of the last second of transfer.
+
+What arrives of a layer before the seconds are over is kept, and a later call goes on from there.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from pd4dgs_codec.codec.stream import open_stream
+from pd4dgs_codec.delivery.prefix import LONGEST_HEADER, layer_ends
+from pd4dgs_codec.delivery.transfer import Changed, OutOfTime, Transfer
+from pd4dgs_codec.errors import BadSignature, DecodeError, UnsupportedVersion
+from pd4dgs_codec.scene import Scene
+
+RATE_SECONDS = 1.0
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a viewer will spend: layers, bytes of the file counted from its first, seconds counted from the call."""
+
+    max_layer: int | None = None
+    bytes: int | None = None
+    seconds: float = math.inf
+
+
+def next_end(
+    layers: list[tuple[int, int]], have: int, budget: Budget, seconds_left: float, rate: float | None
+) -> int | None:
+    """Where the next layer to fetch ends, in bytes of the file, or None to stop.
+
+    layers: (layer, end) in file order. have: bytes here. rate: bytes per second lately, None if not known yet.
+    """
+    wanted = within(layers, budget)
+    end = next((end for _, end in wanted if end > have), None)
+    if end is None or seconds_left <= 0:
+        return None
+    first = end == layers[0][1]
+    in_time = rate is None or seconds_left == math.inf or end - have <= rate * seconds_left
+    return end if first or in_time else None
+
+
+def within(layers: list[tuple[int, int]], budget: Budget) -> list[tuple[int, int]]:
+    """The layers that the budget's `max_layer` and `bytes` allow."""
+    return [
+        (layer, end)
+        for layer, end in layers
+        if (budget.max_layer is None or layer <= budget.max_layer) and (budget.bytes is None or end <= budget.bytes)
+    ]
+
+
+class RateMeter:
+    """Bytes per second over the last RATE_SECONDS of a transfer."""
+
+    def __init__(self) -> None:
+        self._marks: deque[tuple[float, int]] = deque()  # (when, bytes until then)
+
+    def start(self, now: float) -> None:
+        """A request begins; what was measured before a rest does not count."""
+        self._marks = deque([(now, 0)])
+
+    def note(self, now: float, size: int) -> None:
+        """`size` bytes arrived."""
+        self._marks.append((now, self._marks[-1][1] + size))
+        while len(self._marks) > 2 and now - self._marks[1][0] >= RATE_SECONDS:
+            self._marks.popleft()
+
+    @property
+    def rate(self) -> float | None:
+        """None before anything arrived."""
+        (start, before), (end, after) = self._marks[0], self._marks[-1]
+        return (after - before) / max(end - start, 1e-6) if after > before else None
+
+
+class SceneClient:
+    """Scenes of one URL, best first picture first. Use it in a `with` block, or close it.
+
+    The first request is one open-ended GET, read as it arrives; after a cut, and for layers taken later, Range with
+    If-Range fetches what is missing and nothing twice. If the file is another one then, everything begins anew with its
+    layer 0. A damaged layer is fetched once more and never shown. Stopping leaves what is on its way, at most what the
+    sockets' buffers hold. transfer: bytes and counts, see Transfer.
+    """
+
+    def __init__(self, url: str, *, stall: float = 10.0, attempts: int = 5):
+        self.transfer = Transfer(url, stall=stall, attempts=attempts)
+        self._meter = RateMeter()
+        self._repaired_at = -1
+        self._begin()
+
+    def __enter__(self) -> SceneClient:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Ends the connection; `scenes` may still be called and opens another."""
+        self.transfer.close()
+
+    def scenes(self, budget: Budget = Budget()) -> Iterator[Scene]:
+        """One scene per layer that completes, each holding all layers so far; ends where the budget says.
+
+        Called again, it goes on after the last layer given. Raises DeliveryError if the file cannot be had, DecodeError
+        if it is not a valid one; scenes given before stay valid.
+        """
+        until = time.monotonic() + budget.seconds
+        self._meter.start(time.monotonic())
+        while True:
+            while ready := self._ready(budget):  # until empty: a fault behind a layer shows at the next feed
+                yield from ready
+            left = until - time.monotonic()
+            end: int | None = LONGEST_HEADER
+            reach = None
+            if self._layers:
+                end = next_end(self._layers, len(self.transfer.data), budget, left, self._meter.rate)
+                reach = within(self._layers, budget)[-1][1] if end is not None else None
+            if end is None:
+                break
+            try:
+                block = self.transfer.read(end, reach=reach, seconds=left)
+            except Changed:
+                self._repaired_at = -1
+                self._begin()
+                continue
+            except OutOfTime:
+                break
+            if not block:
+                self._stream.finish()  # the file ends within this layer: Truncated
+            self._meter.note(time.monotonic(), len(block))
+        self.close()
+
+    def _begin(self) -> None:
+        self._stream, self._fed, self._done = open_stream(), 0, 0
+        self._layers: list[tuple[int, int]] = []
+
+    def _ready(self, budget: Budget) -> list[Scene]:
+        """Feeds what is new to the decoder; a fault sends the transfer back to the end of the last good layer."""
+        try:
+            return self._feed(budget)
+        except (BadSignature, UnsupportedVersion):
+            raise  # not what damage on the way looks like
+        except DecodeError:
+            good = self._layers[self._done - 1][1] if self._done else 0
+            if self._repaired_at == good:
+                raise
+            self._repaired_at = good
+            self.transfer.rewind(good)
+            self._begin()
+            self._feed(Budget())  # the good layers once more; they were given already
+            return []
+
+    def _feed(self, budget: Budget) -> list[Scene]:
+        data, end = self.transfer.data, len(self.transfer.data)
+        if not self._layers:
+            self._layers = layer_ends(data)
+        if self._layers:  # the first bytes of a small file may hold more than was asked for
+            end = min(end, max((end for _, end in within(self._layers, budget)), default=0))
+        block, self._fed = bytes(data[self._fed : end]), max(self._fed, end)
+        scenes = self._stream.feed(block)
+        self._done += len(scenes)
+        return scenes

@@ -1,0 +1,225 @@
+"""A `.pd4` file as a folder that web players know what to do with: DASH, HLS and a JSON index beside it.
+
+DASH carries the layers themselves: `scene.mp4` holds each in a fragment of its own, and the manifest names the
+fragments with their dependencies. Concatenated, the samples are the `.pd4` file again. HLS has no layers that depend on
+each other: its playlist shows the 2D video and points to the index, which says where the layers lie in `scene.pd4`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import xml.etree.ElementTree as ElementTree
+from dataclasses import dataclass
+from typing import Any
+
+from pd4dgs_codec.codec.decoder import decode
+from pd4dgs_codec.codec.info import info
+from pd4dgs_codec.delivery import mp4
+from pd4dgs_codec.errors import DeliveryError
+
+SCENE, SEGMENTS, MPD, PLAYLIST, INDEX = "scene.pd4", "scene.mp4", "scene.mpd", "scene.m3u8", "index.json"
+VIDEO, VIDEO_PLAYLIST = "fallback.mp4", "fallback.m3u8"
+LAYER_SCHEME = "urn:pd4dgs:layer:2026"
+SESSION_DATA_ID = "org.pd4dgs.layers"
+MIN_BUFFER_SECONDS = 1  #: the time that the manifest's bandwidths are for
+STILL_SECONDS = 1.0  #: shown for a scene whose time stands still
+MAX_SECONDS = ((1 << 32) - 1) // mp4.TIMESCALE  #: a sample's duration has 32 bits
+
+
+@dataclass(frozen=True)
+class Video:
+    """A 2D rendition of the scene: fragmented MP4 of H.264. width, height: pixels. fps: frames per second."""
+
+    data: bytes
+    width: int
+    height: int
+    fps: float
+
+
+@dataclass(frozen=True)
+class Part:
+    """A layer's share of the file: start..end, bytes of the `.pd4`; segment: its bytes in scene.mp4, end exclusive."""
+
+    layer: int
+    start: int
+    end: int
+    segment: tuple[int, int]
+
+
+def package(data: bytes, video: Video | None = None) -> dict[str, bytes]:
+    """Name -> content of every file of the folder.
+
+    Raises DecodeError unless `data` is a whole, valid `.pd4` file, DeliveryError for one too long or large to wrap.
+    """
+    decode(data)
+    low, high = info(data)["time_range"]
+    seconds = high - low if high > low else STILL_SECONDS
+    if seconds > MAX_SECONDS:
+        raise DeliveryError(f"the scene lasts {seconds:g} s, DASH takes at most {MAX_SECONDS:,}")
+    segments, init, parts = _segments(data, seconds)
+    files = {SCENE: data, SEGMENTS: segments}
+    files[MPD] = _manifest(init, parts, seconds, video)
+    if video is not None:
+        files |= {VIDEO: video.data, VIDEO_PLAYLIST: _video_playlist(video)}
+    files[PLAYLIST] = _playlist(video)
+    files[INDEX] = _index(data, init, parts, seconds, video)
+    return files
+
+
+def _segments(data: bytes, seconds: float) -> tuple[bytes, int, list[Part]]:
+    """(scene.mp4, bytes of its initialisation, parts). What stands between layers travels with the layer after it."""
+    rows = info(data)["layers"]
+    ticks = max(1, round(seconds * mp4.TIMESCALE))
+    content = mp4.initialisation(len(rows), ticks)
+    init, start, parts = len(content), 0, []
+    for number, row in enumerate(rows, 1):
+        end = len(data) if number == len(rows) else row["end"]
+        piece = mp4.fragment(number, number, data[start:end], ticks)
+        parts.append(Part(row["layer"], start, end, (len(content), len(content) + len(piece))))
+        content += piece
+        start = end
+    return content, init, parts
+
+
+# -- DASH --------------------------------------------------------------------------------------------------------------
+
+
+def _manifest(init: int, parts: list[Part], seconds: float, video: Video | None) -> bytes:
+    root = ElementTree.Element(
+        "MPD",
+        {
+            "xmlns": "urn:mpeg:dash:schema:mpd:2011",
+            "profiles": "urn:mpeg:dash:profile:full:2011",
+            "type": "static",
+            "mediaPresentationDuration": _duration(seconds),
+            "minBufferTime": _duration(MIN_BUFFER_SECONDS),
+        },
+    )
+    period = ElementTree.SubElement(root, "Period", id="0", start="PT0S")
+    if video is not None:
+        _video_set(period, video)
+    for i, part in enumerate(parts):
+        group = ElementTree.SubElement(
+            period, "AdaptationSet", contentType="application", mimeType="application/mp4", codecs="mett"
+        )
+        ElementTree.SubElement(group, "SupplementalProperty", schemeIdUri=LAYER_SCHEME, value=str(part.layer))
+        bandwidth = math.ceil(8 * part.segment[1] / MIN_BUFFER_SECONDS)
+        representation = ElementTree.SubElement(
+            group, "Representation", id=f"L{part.layer}", bandwidth=str(min(bandwidth, (1 << 32) - 1))
+        )
+        if i:
+            representation.set("dependencyId", " ".join(f"L{before.layer}" for before in parts[:i]))
+        whole = max(1, round(seconds * mp4.TIMESCALE))
+        _segment_list(representation, SEGMENTS, init, mp4.TIMESCALE, whole, [part.segment])
+    ElementTree.indent(root)
+    return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n"
+
+
+def _video_set(period: ElementTree.Element, video: Video) -> None:
+    init, pieces = mp4.fragments(video.data)
+    group = ElementTree.SubElement(
+        period, "AdaptationSet", contentType="video", mimeType="video/mp4", segmentAlignment="true", startWithSAP="1"
+    )
+    representation = ElementTree.SubElement(
+        group,
+        "Representation",
+        id="video",
+        bandwidth=str(_peak_rate(video)),
+        codecs=_codec(video.data[:init]),
+        width=str(video.width),
+        height=str(video.height),
+        frameRate=f"{round(video.fps * 1000)}/1000",
+    )
+    ticks = round(1000 * max(piece.samples for piece in pieces) / video.fps)
+    _segment_list(representation, VIDEO, init, 1000, ticks, [(piece.start, piece.end) for piece in pieces])
+
+
+def _segment_list(
+    parent: ElementTree.Element, url: str, init: int, timescale: int, ticks: int, ranges: list[tuple[int, int]]
+) -> None:
+    ElementTree.SubElement(parent, "BaseURL").text = url
+    segments = ElementTree.SubElement(parent, "SegmentList", timescale=str(timescale), duration=str(ticks))
+    ElementTree.SubElement(segments, "Initialization", range=f"0-{init - 1}")
+    for start, end in ranges:
+        ElementTree.SubElement(segments, "SegmentURL", mediaRange=f"{start}-{end - 1}")
+
+
+def _duration(seconds: float) -> str:
+    return f"PT{seconds:.3f}".rstrip("0").rstrip(".") + "S"
+
+
+# -- HLS ---------------------------------------------------------------------------------------------------------------
+
+
+def _playlist(video: Video | None) -> bytes:
+    lines = ["#EXTM3U", "#EXT-X-VERSION:7"]
+    lines.append(f'#EXT-X-SESSION-DATA:DATA-ID="{SESSION_DATA_ID}",URI="{INDEX}"')
+    if video is not None:
+        init, _ = mp4.fragments(video.data)
+        lines.append("#EXT-X-INDEPENDENT-SEGMENTS")
+        lines.append(
+            f'#EXT-X-STREAM-INF:BANDWIDTH={_peak_rate(video)},CODECS="{_codec(video.data[:init])}",'
+            f"RESOLUTION={video.width}x{video.height},FRAME-RATE={video.fps:.3f}"
+        )
+        lines.append(VIDEO_PLAYLIST)
+    return ("\n".join(lines) + "\n").encode()
+
+
+def _video_playlist(video: Video) -> bytes:
+    init, pieces = mp4.fragments(video.data)
+    seconds = [piece.samples / video.fps for piece in pieces]
+    lines = ["#EXTM3U", "#EXT-X-VERSION:7", "#EXT-X-PLAYLIST-TYPE:VOD", "#EXT-X-INDEPENDENT-SEGMENTS"]
+    lines.append(f"#EXT-X-TARGETDURATION:{max(1, math.ceil(max(seconds)))}")
+    lines.append(f'#EXT-X-MAP:URI="{VIDEO}",BYTERANGE="{init}@0"')
+    for piece, length in zip(pieces, seconds, strict=True):
+        lines += [f"#EXTINF:{length:.6f},", f"#EXT-X-BYTERANGE:{piece.end - piece.start}@{piece.start}", VIDEO]
+    return ("\n".join([*lines, "#EXT-X-ENDLIST"]) + "\n").encode()
+
+
+def _peak_rate(video: Video) -> int:
+    """Bits per second of the video's dearest fragment."""
+    _, pieces = mp4.fragments(video.data)
+    return math.ceil(max(8 * (piece.end - piece.start) * video.fps / piece.samples for piece in pieces))
+
+
+def _codec(init: bytes) -> str:
+    """`avc1.PPCCLL`: profile, constraints and level as the AVC configuration box has them."""
+    at = init.find(b"avcC")
+    if at < 0 or at + 8 > len(init):
+        raise DeliveryError("the 2D video is not H.264, expected an avcC box")
+    return f"avc1.{init[at + 5 : at + 8].hex()}"
+
+
+# -- the index ---------------------------------------------------------------------------------------------------------
+
+
+def _index(data: bytes, init: int, parts: list[Part], seconds: float, video: Video | None) -> bytes:
+    """Where everything is. Byte ranges are [first, one past the last]; sha256 are of the `.pd4` file's bytes."""
+    about = info(data)
+    layers = [
+        {
+            "layer": part.layer,
+            "range": [part.start, part.end],
+            "sha256": hashlib.sha256(data[part.start : part.end]).hexdigest(),
+            "depends_on": [before.layer for before in parts[:i]],
+            "dash": {"file": SEGMENTS, "init": [0, init], "range": list(part.segment)},
+        }
+        for i, part in enumerate(parts)
+    ]
+    content: dict[str, Any] = {
+        "file": SCENE,
+        "format_version": about["format_version"],
+        "bytes": len(data),
+        "sha256": hashlib.sha256(data).hexdigest(),
+        "time_range": about["time_range"],
+        "seconds": seconds,
+        "layers": layers,
+        "dash": MPD,
+        "hls": PLAYLIST,
+        "video": None,
+    }
+    if video is not None:
+        content["video"] = {"file": VIDEO, "width": video.width, "height": video.height, "fps": video.fps}
+    return (json.dumps(content, indent=1) + "\n").encode()

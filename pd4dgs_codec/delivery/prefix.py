@@ -1,0 +1,73 @@
+"""Parts of a remote `.pd4` file, and no byte more than a round trip is worth."""
+
+from __future__ import annotations
+
+from pd4dgs_codec.bitstream.container import PREAMBLE_SIZE, read_preamble
+from pd4dgs_codec.bitstream.limits import MAX_HEADER
+from pd4dgs_codec.codec.info import info
+from pd4dgs_codec.delivery.transfer import Changed, Transfer
+from pd4dgs_codec.errors import Truncated
+
+#: Headers of today have some 250 bytes; a longer one costs a second request.
+HEADER_GUESS = 512
+LONGEST_HEADER = PREAMBLE_SIZE + MAX_HEADER
+
+
+def header_size(data: bytes | bytearray) -> int | None:
+    """Bytes of preamble and header, or None if `data`, the first bytes of a file, does not hold them all."""
+    try:
+        return read_preamble(data).size
+    except Truncated:
+        return None
+
+
+def layer_ends(data: bytes | bytearray) -> list[tuple[int, int]]:
+    """(layer, end of its chunk in the file) from a file's first bytes; empty if its header is not whole yet."""
+    size = header_size(data)
+    return [] if size is None else [(row["layer"], row["end"]) for row in info(bytes(data[:size]))["layers"]]
+
+
+def fetch_header(transfer: Transfer) -> bytes:
+    """Preamble and header alone; fewer bytes where the remote file ends within them. Raises as Transfer.read does."""
+    while True:
+        try:
+            for end in (HEADER_GUESS, LONGEST_HEADER):
+                _fill(transfer, end, end)
+                size = header_size(transfer.data)
+                if size is not None:
+                    return bytes(transfer.data[:size])
+            return bytes(transfer.data)
+        except Changed:
+            continue
+
+
+def fetch(transfer: Transfer, max_layer: int | None = None) -> bytes:
+    """The file, or its prefix of layers <= max_layer; fewer bytes where the remote file ends early.
+
+    The prefix takes two requests of exactly those bytes, the whole file one. Of bytes after the last chunk one is
+    fetched, so that the decoder sees them. Raises as Transfer.read does, and DecodeError for a bad header.
+    """
+    while True:
+        try:
+            if max_layer is None:
+                return _fetch_whole(transfer)
+            header = fetch_header(transfer)
+            end = max((end for layer, end in layer_ends(header) if layer <= max_layer), default=len(header))
+            _fill(transfer, end, end)
+            return bytes(transfer.data[:end])
+        except Changed:
+            continue
+
+
+def _fetch_whole(transfer: Transfer) -> bytes:
+    size = None
+    while size is None and transfer.read(LONGEST_HEADER):
+        size = header_size(transfer.data)
+    if size is not None:
+        _fill(transfer, info(bytes(transfer.data[:size]))["bytes"] + 1, None)
+    return bytes(transfer.data)
+
+
+def _fill(transfer: Transfer, end: int, reach: int | None) -> None:
+    while transfer.read(end, reach=reach):
+        pass

@@ -1,0 +1,223 @@
+"""The range server as HTTP clients see it."""
+
+from __future__ import annotations
+
+import http.client
+import os
+import socket
+import threading
+import time
+from email.utils import formatdate
+
+import pytest
+from asking import ask
+
+from pd4dgs_codec.delivery.server import Server
+from pd4dgs_codec.errors import DeliveryError
+
+CONTENT = bytes(i % 251 for i in range(1000))
+
+
+def test_the_whole_file_with_its_validators(server):
+    answer = ask(server, "/bytes.bin")
+    assert answer.status == 200 and answer.body == CONTENT
+    assert answer.headers["Content-Length"] == "1000" and answer.headers["Accept-Ranges"] == "bytes"
+    assert answer.headers["ETag"].startswith('"') and answer.headers["Last-Modified"].endswith("GMT")
+    assert ask(server, "/scene.pd4").headers["Content-Type"] == "application/octet-stream"
+
+
+@pytest.mark.parametrize(
+    ("header", "start", "end"),
+    [
+        ("bytes=0-0", 0, 1),
+        ("bytes=10-19", 10, 20),
+        ("bytes=990-", 990, 1000),
+        ("bytes=990-5000", 990, 1000),
+        ("bytes=-7", 993, 1000),
+        ("bytes=-5000", 0, 1000),
+        ("Bytes=3-4", 3, 5),
+    ],
+)
+def test_one_range(server, header, start, end):
+    answer = ask(server, "/bytes.bin", Range=header)
+    assert answer.status == 206 and answer.body == CONTENT[start:end]
+    assert answer.headers["Content-Range"] == f"bytes {start}-{end - 1}/1000"
+    assert answer.headers["Content-Length"] == str(end - start)
+
+
+@pytest.mark.parametrize("header", ["bytes=1000-", "bytes=5000-6000", "bytes=-0"])
+def test_ranges_without_a_byte_are_416(server, header):
+    answer = ask(server, "/bytes.bin", Range=header)
+    assert answer.status == 416 and answer.headers["Content-Range"] == "bytes */1000"
+
+
+@pytest.mark.parametrize(
+    "header", ["bytes=5-4", "bytes=a-b", "bytes=", "bytes=-", "lines=0-4", "bytes=0-1,5-6", "bytes=" + "9" * 5000 + "-"]
+)
+def test_what_is_no_single_range_gets_the_whole_file(server, header):
+    assert ask(server, "/bytes.bin", Range=header).status == 200
+
+
+def test_head_sends_no_body_and_ignores_ranges(server):
+    answer = ask(server, "/bytes.bin", "HEAD", Range="bytes=0-9")
+    assert answer.status == 200 and answer.body == b"" and answer.headers["Content-Length"] == "1000"
+
+
+def test_if_range_holds_for_the_same_file_only(server, folder):
+    etag = ask(server, "/bytes.bin", "HEAD").headers["ETag"]
+    assert ask(server, "/bytes.bin", Range="bytes=5-", If_Range=etag).status == 206
+    assert ask(server, "/bytes.bin", Range="bytes=5-", If_Range="W/" + etag).status == 200
+    (folder / "bytes.bin").write_bytes(CONTENT[::-1])  # the same length
+    changed = ask(server, "/bytes.bin", Range="bytes=5-", If_Range=etag)
+    assert changed.status == 200 and changed.body == CONTENT[::-1] and changed.headers["ETag"] != etag
+
+
+def test_if_range_with_a_date_needs_an_old_enough_file(server, folder):
+    old = time.time() - 100
+    os.utime(folder / "bytes.bin", (old, old))
+    assert ask(server, "/bytes.bin", Range="bytes=5-", If_Range=formatdate(old, usegmt=True)).status == 206
+    assert ask(server, "/bytes.bin", Range="bytes=5-", If_Range=formatdate(old - 1, usegmt=True)).status == 200
+    now = time.time()
+    os.utime(folder / "bytes.bin", (now, now))  # could change again within this second
+    assert ask(server, "/bytes.bin", Range="bytes=5-", If_Range=formatdate(now, usegmt=True)).status == 200
+
+
+def test_not_modified(server):
+    first = ask(server, "/bytes.bin").headers
+    for header in (first["ETag"], f'"x", W/{first["ETag"]}', "*"):
+        answer = ask(server, "/bytes.bin", If_None_Match=header)
+        assert answer.status == 304 and answer.body == b"" and answer.headers["ETag"] == first["ETag"]
+    assert ask(server, "/bytes.bin", If_None_Match='"x"', If_Modified_Since=first["Last-Modified"]).status == 200
+    assert ask(server, "/bytes.bin", If_Modified_Since=first["Last-Modified"]).status == 304
+    assert ask(server, "/bytes.bin", If_Modified_Since=formatdate(0, usegmt=True)).status == 200
+    assert ask(server, "/bytes.bin", If_Modified_Since="yesterday").status == 200
+
+
+def test_pages_of_other_sites_may_read_and_resume(server):
+    assert ask(server, "/bytes.bin").headers["Access-Control-Allow-Origin"] == "*"
+    assert "Content-Range" in ask(server, "/nothing").headers["Access-Control-Expose-Headers"]
+    preflight = ask(server, "/bytes.bin", "OPTIONS", Origin="http://example.org", Access_Control_Request_Method="GET")
+    assert preflight.status == 204 and preflight.body == b""
+    assert {"Range", "If-Range"} <= set(preflight.headers["Access-Control-Allow-Headers"].split(", "))
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH"])
+def test_other_methods_are_refused(server, method):
+    answer = ask(server, "/bytes.bin", method)
+    assert answer.status == 405 and "GET" in answer.headers["Allow"]
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        "/../secret.txt",
+        "/%2e%2e/secret.txt",
+        "/..%2fsecret.txt",
+        "/%2E%2E%2Fsecret.txt",
+        "/sub/../../secret.txt",
+        "/sub/%2e%2e/%2e%2e/secret.txt",
+        "/..\\secret.txt",
+        "//secret.txt",
+        "/%00",
+        "/bytes.bin%00.txt",
+        "/%ff",
+        "/out.txt",
+        "/outside/secret.txt",
+        "/loop",
+        "/.hidden",
+        "/pipe",
+        "/sub",
+        "/",
+        "/bytes.bin/",
+        "/%5b",
+        "http://[/bytes.bin",
+        "*",
+    ],
+)
+def test_only_files_of_the_folder(server, folder, target):
+    (folder.parent / "secret.txt").write_text("secret")
+    (folder / ".hidden").write_text("secret")
+    (folder / "sub").mkdir()
+    (folder / "out.txt").symlink_to(folder.parent / "secret.txt")
+    (folder / "outside").symlink_to(folder.parent)
+    (folder / "loop").symlink_to(folder / "loop")
+    os.mkfifo(folder / "pipe")
+    answer = ask(server, target)
+    assert answer.status == 404 and b"secret" not in answer.body
+
+
+def test_links_and_odd_names_inside_the_folder_are_served(server, folder):
+    (folder / "a b%ü.txt").write_text("here")
+    (folder / "link.txt").symlink_to("a b%ü.txt")
+    assert ask(server, server.url_of("a b%ü.txt").removeprefix(server.url.rstrip("/"))).body == b"here"
+    assert ask(server, "/link.txt?query#fragment").body == b"here"
+
+
+def test_a_connection_serves_several_requests(server):
+    connection = http.client.HTTPConnection(*server.server_address[:2], timeout=10)
+    for i in range(5):
+        connection.request("GET", "/bytes.bin", headers={"Range": f"bytes={i}-{i}"})
+        assert connection.getresponse().read() == CONTENT[i : i + 1]
+    connection.close()
+
+
+def test_a_body_on_get_is_not_the_next_request(server):
+    with socket.create_connection(server.server_address[:2], timeout=10) as raw:
+        smuggled = b"GET /scene.pd4 HTTP/1.1\r\nHost: x\r\n\r\n"
+        head = f"GET /bytes.bin HTTP/1.1\r\nHost: x\r\nContent-Length: {len(smuggled)}\r\n\r\n".encode()
+        raw.sendall(head + smuggled)
+        received = b""
+        while block := raw.recv(65536):
+            received += block
+    assert received.count(b"HTTP/1.1 ") == 1 and received.endswith(CONTENT)
+
+
+def test_a_file_that_shrinks_while_it_is_sent_cuts_the_answer(folder):
+    from pd4dgs_codec.delivery.link import Link
+
+    (folder / "long.bin").write_bytes(bytes(40_000))
+    with Server(folder, link=Link(1e6)) as server, server.running():
+        connection = http.client.HTTPConnection(*server.server_address[:2], timeout=10)
+        connection.request("GET", "/long.bin")
+        response = connection.getresponse()
+        response.read(1000)
+        (folder / "long.bin").write_bytes(b"new")
+        with pytest.raises(http.client.IncompleteRead):
+            response.read()
+        connection.close()
+
+
+def test_64_clients_at_once_get_every_byte(folder):
+    content = os.urandom(200_000)
+    (folder / "long.bin").write_bytes(content)
+    results: list[bytes] = []
+    with Server(folder) as server, server.running():
+        barrier = threading.Barrier(64)
+
+        def client():
+            barrier.wait()
+            results.append(ask(server, "/long.bin").body)
+
+        threads = [threading.Thread(target=client) for _ in range(64)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert len(results) == 64 and all(result == content for result in results)
+
+
+def test_the_folder_and_the_address_must_be_usable(folder, server):
+    with pytest.raises(DeliveryError, match="no folder"):
+        Server(folder / "bytes.bin")
+    for host, port in (server.server_address[:2], ("203.0.113.77", 0), ("no such host", 0)):
+        with pytest.raises(DeliveryError, match="cannot listen"):
+            Server(folder, host, port)
+
+
+def test_request_lines_cannot_act_on_the_terminal(folder):
+    lines: list[str] = []
+    with Server(folder, log=lines.append) as server, server.running():
+        with socket.create_connection(server.server_address[:2], timeout=10) as raw:
+            raw.sendall(b"GET /\x1b[31m\x9b HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
+            raw.recv(65536)
+    assert len(lines) == 1 and lines[0].isprintable() and "404" in lines[0]
