@@ -1,7 +1,7 @@
 """`synthetic:static|global|local|fast[?seed=n]`: dynamic scenes ray-cast on reading, with exact covisibility masks.
 
-One camera moves to and fro along an arc (60 training frames); two fixed cameras that it never meets give the test views. The four
-scenes share their objects; only the motion differs. What is made depends on the source string alone.
+One camera moves to and fro along an arc (60 training frames); two fixed cameras that it never meets give the test
+views. The four scenes share their objects; only the motion differs. What is made depends on the source string alone.
 """
 
 from __future__ import annotations
