@@ -40,8 +40,9 @@ from pd4dgs_codec.codec.stages import (
     read_class_count,
     read_stages,
     relative_magnitude,
+    smaller_form,
 )
-from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
+from pd4dgs_codec.entropy.channels import decode_channels
 from pd4dgs_codec.entropy.priors import K_MAX
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
 from pd4dgs_codec.errors import Malformed, UnsupportedFeature
@@ -100,16 +101,10 @@ def _stage_channels(stage: int) -> tuple[int, ...]:
 
 
 def write_attributes(attributes: np.ndarray, priors: str, effort: int) -> tuple[bytes, float]:
-    """(section bytes, sum of R(a) over the 68 channels) of attributes int32 [68, n]; the smaller of both forms.
-
-    With priors "gauss", the model of R(a), the form is plain.
-    """
-    plain = encode_channels(list(attributes), priors=priors, effort=effort)
-    data = bytes([PLAIN]) + plain.payload
-    if priors == "best" and effort > 1 and attributes.shape[1] > 1:
-        predicted = _write_staged(attributes.astype(np.int64), effort)
-        data = min(data, predicted, key=len)
-    return data, plain.rate_bits
+    """(section bytes, sum of R(a) over the 68 channels) of attributes int32 [68, n], in the smaller form."""
+    one_row = attributes.shape[1] < 2  # has no spread to predict
+    staged = None if one_row else lambda: _write_staged(attributes.astype(np.int64), effort)
+    return smaller_form(list(attributes), staged, priors, effort)
 
 
 def _write_staged(symbols: np.ndarray, effort: int) -> bytes:

@@ -23,8 +23,9 @@ from pd4dgs_codec.codec.stages import (
     read_class_count,
     read_stages,
     relative_magnitude,
+    smaller_form,
 )
-from pd4dgs_codec.entropy.channels import CodedChannels, decode_channels, encode_channels
+from pd4dgs_codec.entropy.channels import decode_channels
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint
 from pd4dgs_codec.errors import UnsupportedFeature
 
@@ -32,17 +33,9 @@ Shape = tuple[int, int, int]  #: channels, rows, columns
 
 
 def write_planes(residuals: Sequence[np.ndarray], priors: str, effort: int) -> tuple[bytes, float]:
-    """(section bytes, sum of R(a) over all channels) of residuals int32 [C, H, W] per plane; the smaller of both forms.
-
-    With priors "gauss", the model of R(a), the form is plain.
-    """
-    plain: CodedChannels = encode_channels(
-        [channel.ravel() for plane in residuals for channel in plane], priors=priors, effort=effort
-    )
-    data = bytes([PLAIN]) + plain.payload
-    if priors == "best" and effort > 1:
-        data = min(data, _write_staged(residuals, effort), key=len)
-    return data, plain.rate_bits
+    """(section bytes, sum of R(a) over all channels) of residuals int32 [C, H, W] per plane, in the smaller form."""
+    channels = [channel.ravel() for plane in residuals for channel in plane]
+    return smaller_form(channels, lambda: _write_staged(residuals, effort), priors, effort)
 
 
 def read_planes(data: bytes, shapes: Sequence[Shape]) -> list[np.ndarray]:

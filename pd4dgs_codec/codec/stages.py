@@ -7,7 +7,7 @@ each class has a prior of its own. All arithmetic is on integers.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from itertools import accumulate
 
 import numpy as np
@@ -66,6 +66,20 @@ def entropy_bits(symbols: np.ndarray) -> float:
         counts = np.bincount(symbols - low)
         counts = counts[counts > 0]
     return float(counts @ np.log2(symbols.size / counts))
+
+
+def smaller_form(
+    channels: Sequence[np.ndarray], staged: Callable[[], bytes] | None, priors: str, effort: int
+) -> tuple[bytes, float]:
+    """(section bytes, sum of R(a) over all channels) of channels int32: plain, or what `staged` makes if it is shorter.
+
+    The form is plain with priors "gauss", the model of R(a), at effort 1, and without `staged`.
+    """
+    plain = encode_channels(channels, priors=priors, effort=effort)
+    data = bytes([PLAIN]) + plain.payload
+    if staged is not None and priors == "best" and effort > 1:
+        data = min(data, staged(), key=len)
+    return data, plain.rate_bits
 
 
 def put_stages(out: bytearray, stages: Sequence[Sequence[np.ndarray]], effort: int) -> None:
