@@ -113,13 +113,9 @@ def _render(data: bytes, fps: float) -> Video:
 
 def _pictures(frames: list[Any], level: Any, step: Callable[[], None]) -> Iterator[np.ndarray]:
     from pd4dgs_codec.metrics.image import to_uint8
-    from pd4dgs_codec.render.picture import render_image
 
     for frame in frames:
-        camera = frame.camera
-        yield to_uint8(
-            render_image(level.model, level.level, frame.time, camera.viewmat, camera.K, camera.width, camera.height)
-        )
+        yield to_uint8(level.picture(frame.camera, frame.time))
         step()
 
 

@@ -156,16 +156,13 @@ def _pictures(
 ) -> Iterator[np.ndarray]:
     """uint8 [H, W, 3] per frame: the one level, or all of them beside the true image. Times are noted per picture."""
     from pd4dgs_codec.metrics.image import to_uint8
-    from pd4dgs_codec.render.picture import render_image
     from pd4dgs_codec.report.panels import level_caption, side_by_side
 
     for frame in frames:
-        camera, images, captions = frame.camera, [], []
+        images, captions = [], []
         for level in levels:
             start = time.perf_counter()
-            image = render_image(
-                level.model, level.level, frame.time, camera.viewmat, camera.K, camera.width, camera.height
-            )
+            image = level.picture(frame.camera, frame.time)
             milliseconds.append(1e3 * (time.perf_counter() - start))
             images.append(to_uint8(image))
             captions.append(level_caption(level.level, level.cumulative_bytes))

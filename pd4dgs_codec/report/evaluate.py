@@ -10,7 +10,6 @@ from typing import Any
 
 from pd4dgs_codec.data.dataset import Dataset, View
 from pd4dgs_codec.metrics.image import mean_image_baseline, mpsnr, mssim
-from pd4dgs_codec.render.picture import render_image
 from pd4dgs_codec.report.levels import Level, load_levels
 
 
@@ -46,9 +45,9 @@ def evaluate_level(level: Level, views: tuple[View, ...], step: Callable[[], Non
     scores, milliseconds = [], []
     for i, view in enumerate(views):
         if i == 0:  # compilation and caches are not the renderer's speed
-            _render(level, view)
+            level.picture(view.camera, view.time)
         start = time.perf_counter()
-        image = _render(level, view)
+        image = level.picture(view.camera, view.time)
         milliseconds.append(1e3 * (time.perf_counter() - start))
         scores.append((mpsnr(image, view.image, view.mask), mssim(image, view.image, view.mask)))
         if step:
@@ -63,10 +62,6 @@ def evaluate_level(level: Level, views: tuple[View, ...], step: Callable[[], Non
         "decode_seconds": level.decode_seconds,
         "render_ms": statistics.median(milliseconds),
     }
-
-
-def _render(level: Level, view: View) -> Any:
-    return render_image(level.model, level.level, view.time, view.viewmat, view.K, view.width, view.height)
 
 
 def _baseline(dataset: Dataset, views: tuple[View, ...]) -> float | None:

@@ -6,6 +6,7 @@ import time
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import torch
 
 from pd4dgs_codec.bitstream.container import SIGNATURE
@@ -15,7 +16,8 @@ from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.model import Model
-from pd4dgs_codec.scene import MASK_THRESHOLD
+from pd4dgs_codec.render.picture import render_image
+from pd4dgs_codec.scene import MASK_THRESHOLD, Camera
 
 
 @dataclass(frozen=True)
@@ -27,6 +29,10 @@ class Level:
     anchors: int
     cumulative_bytes: int | None = None
     decode_seconds: float | None = None
+
+    def picture(self, camera: Camera, time: float) -> np.ndarray:
+        """float32 [H, W, 3] in 0..1 at normalised time 0..1."""
+        return render_image(self.model, self.level, time, camera.viewmat, camera.K, camera.width, camera.height)
 
 
 def load_levels(file: str | Path | bytes, max_layer: int | None = None, device: str = "cpu") -> list[Level]:

@@ -9,7 +9,6 @@ import numpy as np
 
 from pd4dgs_codec.data.dataset import Dataset, View
 from pd4dgs_codec.metrics.image import to_uint8
-from pd4dgs_codec.render.picture import render_image
 from pd4dgs_codec.report.levels import Level, load_levels
 from pd4dgs_codec.report.movie import write_gif
 from pd4dgs_codec.report.panels import level_caption, side_by_side
@@ -32,6 +31,5 @@ def _panels(levels: Sequence[Level], views: Sequence[View]) -> Iterator[np.ndarr
     for view in views:
         pictures = [view.image]
         for level in levels:
-            image = render_image(level.model, level.level, view.time, view.viewmat, view.K, view.width, view.height)
-            pictures.append(to_uint8(image))
+            pictures.append(to_uint8(level.picture(view.camera, view.time)))
         yield side_by_side(pictures, captions)
