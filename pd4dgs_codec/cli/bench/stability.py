@@ -1,29 +1,17 @@
-"""`pd4dgs-bench`: reports on the codec, the renderer and the trainer themselves."""
+"""`pd4dgs-bench stability`: stiff and extreme cases, each against its bound."""
 
 from __future__ import annotations
 
 import argparse
 import json
-import sys
-from collections.abc import Sequence
 from dataclasses import asdict
 
-from pd4dgs_codec.cli.common import FAILED, OK, Console, Parser, UsageError, run, use_threads
+from pd4dgs_codec.cli.common import FAILED, OK, Console, Parser, UsageError, use_threads
 from pd4dgs_codec.cli.files import STDIO, check_output, write_bytes
 from pd4dgs_codec.cli.progress import progress_bar
 from pd4dgs_codec.jsonable import finite
 
-STABILITY = "stability"
-
 DETAILS = """\
-REPORT is one of
-  stability   stiff and extreme cases: what was fed, promised and came out, against high-precision references
-
-examples:
-  pd4dgs-bench stability
-  pd4dgs-bench stability --help"""
-
-STABILITY_DETAILS = """\
 A row passes if its error is within its bound, or if input that has no answer was refused in one line. References are
 computed by mpmath or in float64. The exit code is 1 if any row fails.
 
@@ -38,35 +26,16 @@ examples:
 
 
 def parser() -> Parser:
-    """The options of `pd4dgs-bench` without a report."""
-    p = Parser("bench", "REPORT", "Measure what the codec, the renderer and the trainer promise.", DETAILS)
-    p.add_argument("report", metavar="REPORT", choices=(STABILITY,), help="what to measure, see below")
-    p.add_common()
-    return p
-
-
-def stability_parser() -> Parser:
-    """The options of `pd4dgs-bench stability`."""
+    """The options of the report."""
     summary = "Feed stiff and extreme cases, and print a Markdown table of what became of each."
-    p = Parser(f"bench {STABILITY}", "", summary, STABILITY_DETAILS)
+    p = Parser("bench stability", "", summary, DETAILS)
     p.add_argument("--only", metavar="NAME", help="the group NAME, or the cases with NAME in their name")
     p.add_common(json_file=True)
     return p
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    arguments = list(sys.argv[1:] if argv is None else argv)
-    if arguments[:1] == [STABILITY]:
-        return run(stability_parser(), _stability, arguments[1:])
-    return run(parser(), _misplaced, arguments)
-
-
-def _misplaced(args: argparse.Namespace, console: Console) -> int:
-    raise UsageError(f"found options before {args.report!r}, expected the report first")
-
-
-def _stability(args: argparse.Namespace, console: Console) -> int:
+def execute(args: argparse.Namespace, console: Console) -> int:
+    """Runs the chosen cases; FAILED if any row fails."""
     to_file = args.json not in (None, STDIO)
     console.json = args.json == STDIO
     if to_file:
