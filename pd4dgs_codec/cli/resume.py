@@ -9,13 +9,14 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.errors import TrainError
+from pd4dgs_codec.train.config import ABLATIONS
 
 if TYPE_CHECKING:
     from pd4dgs_codec.train.config import TrainConfig
     from pd4dgs_codec.train.loop import Trainer
 
 #: Options that a resumed run takes from its checkpoint: naming another value there is an error.
-FIXED = ("preset", "seed", "downscale", "holdout", "iterations", "rate_scale", "rollout")
+FIXED = ("preset", "seed", "downscale", "holdout", "iterations", "rate_scale", "rollout", "max_layer")
 
 
 def stored_config(args: argparse.Namespace) -> TrainConfig:
@@ -34,11 +35,16 @@ def stored_config(args: argparse.Namespace) -> TrainConfig:
         asked = getattr(args, name)
         if asked is not None:
             _expect_same(args.resume, f"--{name.replace('_', '-')}", getattr(config, name), asked)
-    if args.no_noise:
-        _expect_same(args.resume, "noise", config.noise, False)
+    for name, value in ablated(args).items():
+        _expect_same(args.resume, name, getattr(config, name), value)
     if _same_source(args.source) != _same_source(config.source):
         _expect_same(args.resume, "SOURCE", config.source, args.source)
     return replace(config, max_seconds=args.max_seconds or config.max_seconds)
+
+
+def ablated(args: argparse.Namespace) -> dict[str, Any]:
+    """The fields of TrainConfig that --without sets."""
+    return {name: value for part in args.without for name, value in ABLATIONS[part].items()}
 
 
 def parse_config(text: str, path: str) -> TrainConfig:

@@ -27,8 +27,9 @@ from pd4dgs_codec.cli.common import (
 )
 from pd4dgs_codec.cli.files import STDIO, check_output
 from pd4dgs_codec.cli.progress import TrainingProgress
-from pd4dgs_codec.cli.resume import FIXED, check_time_left, stored_config
+from pd4dgs_codec.cli.resume import FIXED, ablated, check_time_left, stored_config
 from pd4dgs_codec.errors import RenderError, TrainError
+from pd4dgs_codec.train.config import ABLATIONS, ROLLOUTS
 
 if TYPE_CHECKING:
     from pd4dgs_codec.train.config import TrainConfig
@@ -81,9 +82,19 @@ def parser() -> Parser:
         metavar="X",
         help="weight of the bit rate against quality (default: 0.1; 1: the paper's)",
     )
-    p.add_argument("--no-noise", action="store_true", help="ablation: train without quantisation noise")
+    p.add_argument("--max-layer", type=int, choices=(0, 1, 2), help="train without the layers above this one")
     p.add_argument(
-        "--rollout", choices=("adaptive", "uniform", "fixed"), help="how levels are sampled (default: adaptive)"
+        "--rollout",
+        choices=ROLLOUTS,
+        help="how levels are sampled (default: adaptive; top: the highest level alone)",
+    )
+    p.add_argument(
+        "--without",
+        action="append",
+        choices=tuple(ABLATIONS),
+        metavar="PART",
+        default=[],
+        help=f"ablation: leave out a part of the method ({', '.join(ABLATIONS)}); may be given several times",
     )
     p.add_common()
     return p
@@ -138,7 +149,7 @@ def _fresh_config(args: argparse.Namespace) -> TrainConfig:
     from pd4dgs_codec.train.config import TrainConfig
 
     named = {name: getattr(args, name) for name in (*FIXED, "max_seconds") if getattr(args, name) is not None}
-    return TrainConfig(source=args.source, noise=not args.no_noise, **named)
+    return TrainConfig(source=args.source, **named | ablated(args))
 
 
 def _device(name: str, console: Console) -> str:

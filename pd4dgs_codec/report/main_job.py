@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -14,18 +14,16 @@ import numpy as np
 from pd4dgs_codec.cli.files import whole_file, whole_files, write_bytes
 from pd4dgs_codec.codec.encoder import LayerReport, Report, encode_with_report
 from pd4dgs_codec.codec.plan import plan
-from pd4dgs_codec.data.dataset import Dataset, load
+from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.entropy.morton import morton_order
-from pd4dgs_codec.errors import TrainError
 from pd4dgs_codec.jsonable import finite
-from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.report.evaluate import evaluate_file
 from pd4dgs_codec.report.pictures import draw_levels
 from pd4dgs_codec.report.rate import train_rate_bits
+from pd4dgs_codec.report.trainings import ensure_trained
 from pd4dgs_codec.scene import Scene
 from pd4dgs_codec.train.config import Schedule, TrainConfig
-from pd4dgs_codec.train.loop import Trainer
 
 #: Encodings whose sizes stand side by side; "ans" is the file that is evaluated and kept.
 VARIANTS: dict[str, dict[str, str]] = {
@@ -61,13 +59,9 @@ def run_job(job: Job, folder: Path, *, say: Callable[[str], None], progress: Any
     say(f"{job.name}: reading {config.source}")
     dataset = load(config.source, downscale=config.downscale, holdout=config.holdout)
     path = folder / "model.pt"
-    stored = _stored_training(path, config)
-    if stored is not None and _ended(stored, config):
-        say(f"{job.name}: {path} is kept: {stored['iteration']} steps, the same settings")
-    else:
-        say(f"{job.name}: training, preset {config.preset}, {len(dataset.train)} views")
-        _train(config, dataset, path, stored, say=lambda text: say(f"{job.name}: {text}"), progress=progress)
-    model, training = checkpoint.load(path)
+    model, training = ensure_trained(
+        config, dataset, path, say=lambda text: say(f"{job.name}: {text}"), progress=progress
+    )
     scene = to_scene(model)
     say(f"{job.name}: packing {len(scene.anchor_q)} anchors in {len(VARIANTS)} ways")
     files = {name: encode_with_report(scene, **options) for name, options in VARIANTS.items()}  # type: ignore[arg-type]
@@ -104,31 +98,6 @@ def run_job(job: Job, folder: Path, *, say: Callable[[str], None], progress: Any
     with whole_file(str(folder / "results.json"), overwrite=True) as temporary:
         temporary.write_text(json.dumps(finite(result), indent=1, allow_nan=False))
     return result
-
-
-def _train(
-    config: TrainConfig,
-    dataset: Dataset,
-    path: Path,
-    stored: dict[str, Any] | None,
-    *,
-    say: Callable[[str], None],
-    progress: Any,
-) -> None:
-    """Trains to `path`, from the checkpoint there if `stored` is its state; the log lies beside it."""
-    log = path.with_name("train.jsonl")
-    if stored is None:
-        log.unlink(missing_ok=True)
-        trainer = Trainer(config, dataset)
-    else:
-        if config.max_seconds and stored["total"]:  # the number of steps that the limit gave is part of the run
-            config = replace(config, iterations=stored["total"])
-        trainer = Trainer(config, dataset)
-        trainer.resume(path)
-        say(f"going on from step {trainer.iteration}")
-    trainer.run(path, log=log, progress=progress)
-    if trainer.interrupted:
-        raise TrainError(f"{path}: training was interrupted at step {trainer.iteration}; the same command goes on")
 
 
 def coding_rows(reports: dict[str, Report], scene: Scene) -> list[dict[str, Any]]:
@@ -200,21 +169,3 @@ def draco_position_bits(cells: np.ndarray) -> int | None:
         quantization_origin=[0.0, 0.0, 0.0],
     )
     return 8 * len(data)
-
-
-def _stored_training(path: Path, config: TrainConfig) -> dict[str, Any] | None:
-    """The training state of a run of this very configuration, finished or not, else None."""
-    if not path.exists():
-        return None
-    _, training = checkpoint.load(path)
-    stored = json.loads(training.get("config", "{}"))
-    wanted = json.loads(json.dumps(config, default=lambda value: value.__dict__))
-    if wanted["iterations"] is None:
-        stored["iterations"] = None
-    return training if stored == wanted else None
-
-
-def _ended(training: dict[str, Any], config: TrainConfig) -> bool:
-    """Whether a run came to its end, or to that of its time."""
-    finished = 0 < training["total"] <= training["iteration"]
-    return finished or bool(config.max_seconds and training["seconds"] >= config.max_seconds)

@@ -3,12 +3,25 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from pd4dgs_codec.errors import TrainError
 from pd4dgs_codec.scene import Steps
 
 #: Iterations per preset when neither a count nor a time limit is given.
 DEFAULT_ITERATIONS = {"tiny": 3_000, "small": 10_000, "paper": 15_000}
+
+#: How levels are sampled after the coarse phase. "top" trains the highest level alone, as a monolithic model is.
+ROLLOUTS = ("adaptive", "uniform", "fixed", "top")
+
+#: Parts of the method that an ablation takes out, as the fields of `TrainConfig` that do so.
+ABLATIONS: dict[str, dict[str, Any]] = {
+    "rate": {"rate_scale": 0.0},
+    "binary": {"tmc_binary": False},
+    "smooth": {"tmc_smooth": False},
+    "tmc": {"tmc_binary": False, "tmc_smooth": False},
+    "noise": {"noise": False},
+}
 
 
 @dataclass(frozen=True)
@@ -53,7 +66,10 @@ class TrainConfig:
     tmc_binary: bool = True
     tmc_smooth: bool = True
     tmc_tau: float = 4.0  #: voxels
-    rollout: str = "adaptive"  #: "adaptive", "uniform" or "fixed"
+    rollout: str = "adaptive"  #: one of ROLLOUTS
+    max_layer: int = (
+        2  #: layers above it are not there: 0 is a static scaffold, 1 a scaffold and its global deformation
+    )
     ssim: float = 0.2
     volume: float = 0.01  #: weight of the mean product of scales (Scaffold-GS)
     noise: bool = True
@@ -73,8 +89,10 @@ class TrainConfig:
             raise TrainError(f"max-seconds must be positive, found {self.max_seconds}")
         if not 0 <= self.seed <= 2**63 - 2:  # the next one seeds the noise
             raise TrainError(f"seed {self.seed} is out of range; expected an integer from 0 to 2^63 - 2")
-        if self.rollout not in ("adaptive", "uniform", "fixed"):
-            raise TrainError(f"rollout {self.rollout!r} is unknown; expected adaptive, uniform or fixed")
+        if self.rollout not in ROLLOUTS:
+            raise TrainError(f"rollout {self.rollout!r} is unknown; expected one of {', '.join(ROLLOUTS)}")
+        if self.max_layer not in (0, 1, 2):
+            raise TrainError(f"max-layer must be 0, 1 or 2, found {self.max_layer}")
 
 
 @dataclass(frozen=True)

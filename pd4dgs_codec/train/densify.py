@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pd4dgs_codec.model.model import Gaussians, Model
 from pd4dgs_codec.scene import MASK_THRESHOLD, N_OFFSETS
-from pd4dgs_codec.train.initialise import MASK_START
+from pd4dgs_codec.train.initialise import fresh_mask_logits
 from pd4dgs_codec.train.optimiser import Optimiser
 
 #: Cell sizes of the growing levels, in voxels, coarse to fine; the gradient threshold doubles from one to the next.
@@ -64,8 +64,6 @@ class Densifier:
         device = model.feature.device
         n = len(cells)
         size = (cells[:, 3].double() * model.info.voxel_size).float()
-        mask_logits = torch.zeros(n, 3)
-        mask_logits[:, 0] = MASK_START
         pruned = len(masks) - len(keep)
         optimiser.replace_anchors(
             keep.to(device),
@@ -74,7 +72,7 @@ class Densifier:
                 "feature": feature.to(device),
                 "scaling_log": size.log()[:, None].repeat(1, 6).to(device),
                 "offset": torch.zeros(n, N_OFFSETS, 3, device=device),
-                "mask_logits": mask_logits.to(device),
+                "mask_logits": fresh_mask_logits(n, model.level).to(device),
             },
         )
         self._forget_judged(visited, keep, n)

@@ -17,6 +17,8 @@ from pd4dgs_codec.scene import FEATURE_DIM, GLOBAL_HEADS, LOCAL_HEADS, N_OFFSETS
 #: Voxels along the longest side of the scene's box.
 GRID = 1024
 MASK_START = 2.0
+#: a_j of levels that a model does not have: softplus of it is 2e-9, so their masks are those of its highest level.
+TIED = -20.0
 #: Random candidates per initial point, and the training views that judge them, where a dataset has no points.
 CARVE_CANDIDATES = 20
 CARVE_VIEWS = 40
@@ -36,8 +38,6 @@ def fresh_model(config: ModelConfig, dataset: Dataset, steps: Steps, seed: int) 
         (config.local_deformation, LOCAL_HEADS, None, steps.planes_local),
     ):
         fields.append(None if field is None else DeformationField.fresh(field, info.box, widths, start_spacing, step))
-    mask_logits = torch.zeros(n, 3)
-    mask_logits[:, 0] = MASK_START
     return Model(
         info,
         steps,
@@ -45,10 +45,18 @@ def fresh_model(config: ModelConfig, dataset: Dataset, steps: Steps, seed: int) 
         torch.zeros(n, FEATURE_DIM),
         spacing.log()[:, None].repeat(1, 6),
         torch.zeros(n, N_OFFSETS, 3),
-        mask_logits,
+        fresh_mask_logits(n, config.level),
         fresh_networks(config.hidden),
         *fields,
     )
+
+
+def fresh_mask_logits(n: int, level: int) -> Tensor:
+    """float32 [n, 3]: a_0 = MASK_START, a_j = 0 up to the model's highest level, TIED above."""
+    logits = torch.zeros(n, 3)
+    logits[:, 0] = MASK_START
+    logits[:, level + 1 :] = TIED
+    return logits
 
 
 def scene_info(dataset: Dataset) -> SceneInfo:

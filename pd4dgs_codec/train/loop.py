@@ -32,7 +32,7 @@ from pd4dgs_codec.train.config import DEFAULT_ITERATIONS, PlaneWeights, Schedule
 from pd4dgs_codec.train.densify import Densifier
 from pd4dgs_codec.train.initialise import fresh_model
 from pd4dgs_codec.train.optimiser import Optimiser
-from pd4dgs_codec.train.rollout import CAPACITY_WEIGHTED, UNIFORM, rollout_probabilities, sample_level, updated_rho
+from pd4dgs_codec.train.rollout import CAPACITY_WEIGHTED, TOP, UNIFORM, rollout_probabilities, sample_level, updated_rho
 from pd4dgs_codec.train.ssim import TargetStats, image_loss
 from pd4dgs_codec.train.stop import StopRequest
 
@@ -53,7 +53,7 @@ class Trainer:
     """A run in progress; `run` carries it to its end. interrupted: a signal ended the last `run`."""
 
     def __init__(self, config: TrainConfig, dataset: Dataset, device: str = "cpu"):
-        preset = PRESETS[config.preset]
+        preset = PRESETS[config.preset].up_to(config.max_layer)
         self.config, self.dataset, self.device = config, dataset, torch.device(device)
         if self.device.type == "cuda":  # the variances of SSIM are differences of blurred images: no ten-bit factors
             torch.backends.cudnn.allow_tf32 = False
@@ -202,8 +202,10 @@ class Trainer:
     def _level_terms(self, level: int, terms: dict[str, Tensor]) -> Tensor:
         config = self.config
         mask = self.model.masks(level)
-        terms["rate"] = losses.rate_term(self.model, mask, config.rate_share, self.generator)
-        total = config.lambdas[level] * config.rate_scale * terms["rate"]
+        total = torch.zeros((), device=self.device)
+        if config.rate_scale:
+            terms["rate"] = losses.rate_term(self.model, mask, config.rate_share, self.generator)
+            total = total + config.lambdas[level] * config.rate_scale * terms["rate"]
         if config.tmc_binary:
             terms["tmc_binary"] = losses.binary_term(mask)
             total = total + config.tmc * terms["tmc_binary"]
@@ -248,7 +250,9 @@ class Trainer:
     def _draw_level(self, schedule: Schedule) -> tuple[int, tuple[float, float, float]]:
         if self.iteration < schedule.coarse_end:
             return 0, (1.0, 0.0, 0.0)
-        if self.config.rollout == "uniform" or self.iteration < schedule.rho_start:
+        if self.config.rollout == "top":
+            probabilities = TOP
+        elif self.config.rollout == "uniform" or self.iteration < schedule.rho_start:
             probabilities = UNIFORM
         elif self.config.rollout == "fixed":
             probabilities = CAPACITY_WEIGHTED

@@ -6,6 +6,7 @@ import torch
 
 UNIFORM = (1 / 3, 1 / 3, 1 / 3)
 CAPACITY_WEIGHTED = (0.15, 0.30, 0.55)
+TOP = (0.0, 0.0, 1.0)
 RHO_DECAY = 0.95
 
 

@@ -54,11 +54,13 @@ def test_train_reports_and_logs(train, tmp_path, shared_dataset):
 
 
 def test_options_reach_the_configuration(train, tmp_path):
-    options = ("--seed", 7, "--downscale", 2, "--holdout", 3, "--rate-scale", 0.5, "--no-noise", "--rollout", "fixed")
+    options = ("--seed", 7, "--downscale", 2, "--holdout", 3, "--rate-scale", 0.5, "--rollout", "fixed")
+    options += ("--without", "noise", "--without", "tmc", "--max-layer", 1)
     assert train(tmp_path / "m.pt", *options, iterations=1).code == 0
     config = json.loads(checkpoint.load(tmp_path / "m.pt")[1]["config"])
-    found = [config[k] for k in ("seed", "downscale", "holdout", "rate_scale", "noise", "rollout", "preset")]
-    assert found == [7, 2, 3, 0.5, False, "fixed", "tiny"]
+    found = [config[k] for k in ("seed", "downscale", "holdout", "rate_scale", "rollout", "preset", "max_layer")]
+    assert found == [7, 2, 3, 0.5, "fixed", "tiny", 1]
+    assert not (config["noise"] or config["tmc_binary"] or config["tmc_smooth"])
 
 
 def test_seed_decides_the_result(train, tmp_path):
@@ -98,7 +100,8 @@ def test_resume_refuses_what_contradicts_the_checkpoint(cli, train, tmp_path, sh
         "--holdout": ("--holdout", 0),
         "--iterations": ("--iterations", 9),
         "--preset": ("--preset", "small"),
-        "noise": ("--no-noise",),
+        "noise": ("--without", "noise"),
+        "--max-layer": ("--max-layer", 1),
     }
     for what, options in contradictions.items():
         result = cli("train", shared_dataset, "-o", first, "--resume", first, *options)

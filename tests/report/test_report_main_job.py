@@ -24,7 +24,7 @@ from pd4dgs_codec.errors import TrainError  # noqa: E402
 from pd4dgs_codec.model import checkpoint  # noqa: E402
 from pd4dgs_codec.model.config import PRESETS, DeformationConfig, ModelConfig  # noqa: E402
 from pd4dgs_codec.model.convert import to_scene  # noqa: E402
-from pd4dgs_codec.report import main_job, tables  # noqa: E402
+from pd4dgs_codec.report import main_job, tables, trainings  # noqa: E402
 from pd4dgs_codec.report.main_job import Job, run_job  # noqa: E402
 from pd4dgs_codec.train.config import TrainConfig  # noqa: E402
 
@@ -91,7 +91,7 @@ def no_training(monkeypatch) -> None:
     def run(self, *_, **__):
         raise _Started
 
-    monkeypatch.setattr(main_job.Trainer, "run", run)
+    monkeypatch.setattr(trainings.Trainer, "run", run)
 
 
 def _run(job: Job, folder) -> tuple[dict, list[str]]:
@@ -160,22 +160,22 @@ def test_an_unfinished_checkpoint_is_trained_again(job, copied, no_training):
 )
 def test_a_run_ends_with_its_steps_or_its_time(seconds, total, ended):
     config = dataclasses.replace(CONFIG, max_seconds=9.0)
-    assert main_job._ended({"iteration": 40, "total": total, "seconds": seconds}, config) is ended
+    assert trainings._ended({"iteration": 40, "total": total, "seconds": seconds}, config) is ended
 
 
 def test_an_interrupted_training_is_not_published_and_goes_on(job, finished, tmp_path, monkeypatch):
-    step = main_job.Trainer.step
+    step = trainings.Trainer.step
 
     def interrupted(self):
         if self.iteration == 10:
             signal.raise_signal(signal.SIGINT)
         return step(self)
 
-    monkeypatch.setattr(main_job.Trainer, "step", interrupted)
+    monkeypatch.setattr(trainings.Trainer, "step", interrupted)
     with pytest.raises(TrainError, match="interrupted at step 11"):
         _run(job, tmp_path)
     assert sorted(p.name for p in (tmp_path / "discs").iterdir()) == ["model.pt", "train.jsonl"]
-    monkeypatch.setattr(main_job.Trainer, "step", step)
+    monkeypatch.setattr(trainings.Trainer, "step", step)
     result, said = _run(job, tmp_path)
     assert any("from step 11" in line for line in said) and result["phases_not_reached"] == []
     assert (tmp_path / "discs" / "scene.pd4").read_bytes() == (finished[0] / "discs" / "scene.pd4").read_bytes()

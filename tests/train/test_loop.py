@@ -10,6 +10,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pd4dgs_codec import decode, encode
+
 torch = pytest.importorskip("torch")
 pytest.importorskip("numba")
 
@@ -17,8 +19,9 @@ from pd4dgs_codec.data.dataset import Dataset, View  # noqa: E402
 from pd4dgs_codec.errors import DataError, NotFinite, RenderError, TrainError  # noqa: E402
 from pd4dgs_codec.model import checkpoint  # noqa: E402
 from pd4dgs_codec.model.config import PRESETS, DeformationConfig, ModelConfig  # noqa: E402
+from pd4dgs_codec.model.convert import to_scene  # noqa: E402
 from pd4dgs_codec.train import loop  # noqa: E402
-from pd4dgs_codec.train.config import Schedule, TrainConfig  # noqa: E402
+from pd4dgs_codec.train.config import ABLATIONS, Schedule, TrainConfig  # noqa: E402
 from pd4dgs_codec.train.loop import Trainer  # noqa: E402
 
 W, H = 32, 24
@@ -86,6 +89,37 @@ def test_resuming_repeats_the_run_bit_for_bit(dataset, tmp_path):
         whole, again = weights(tmp_path / "whole.pt"), weights(tmp_path / "resumed.pt")
         assert whole.keys() == again.keys()
         assert all(torch.equal(whole[k], again[k]) for k in whole), cut
+
+
+@pytest.mark.parametrize("max_layer", [0, 1])
+def test_a_model_without_upper_layers_is_packed_as_it_was_trained(dataset, tmp_path, max_layer):
+    config = TrainConfig(preset="tiny", iterations=40, max_layer=max_layer)
+    Trainer(config, dataset).run(tmp_path / "m.pt")
+    model = checkpoint.load(tmp_path / "m.pt")[0]
+    assert model.level == max_layer
+    assert torch.equal(model.masks(max_layer), model.masks(2)), "absent levels have masks of their own"
+    assert (max_layer == 1) == (not torch.equal(model.masks(0), model.masks(1)))
+    scene = decode(encode(to_scene(model)))
+    assert scene.level <= max_layer
+
+
+def test_the_top_rollout_trains_the_highest_level_alone(dataset, tmp_path):
+    config = TrainConfig(preset="tiny", iterations=40, rollout="top")
+    Trainer(config, dataset).run(tmp_path / "m.pt", log=tmp_path / "log.jsonl")
+    records = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    assert {r["level"] for r in records if r["iteration"] < 4} == {0}
+    assert {r["level"] for r in records if r["iteration"] >= 4} == {2}
+
+
+@pytest.mark.parametrize(
+    "part, gone",
+    [("rate", {"rate"}), ("binary", {"tmc_binary"}), ("smooth", {"tmc_smooth"}), ("tmc", {"tmc_binary", "tmc_smooth"})],
+)
+def test_an_ablation_takes_out_its_terms_alone(dataset, part, gone):
+    terms = {"rate", "tmc_binary", "tmc_smooth"}
+    trainer = Trainer(TrainConfig(preset="tiny", iterations=3, **ABLATIONS[part]), dataset)
+    records = [trainer.step() for _ in range(3)]
+    assert terms & set(records[-1]) == terms - gone
 
 
 def test_seeds_differ_and_repeat(dataset, tmp_path):

@@ -97,7 +97,15 @@ def test_learning_rates_are_log_linear():
 
 
 @pytest.mark.parametrize(
-    "bad", [{"preset": "huge"}, {"iterations": 0}, {"max_seconds": -1.0}, {"rollout": "greedy"}, {"seed": -1}]
+    "bad",
+    [
+        {"preset": "huge"},
+        {"iterations": 0},
+        {"max_seconds": -1.0},
+        {"rollout": "greedy"},
+        {"seed": -1},
+        {"max_layer": 3},
+    ],
 )
 def test_bad_configurations_are_refused(bad):
     with pytest.raises(TrainError, match="expected|must be"):

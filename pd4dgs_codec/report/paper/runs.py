@@ -1,0 +1,136 @@
+"""One run of one variant on one scene: trained if it is missing, packed, measured; all of it kept by its settings."""
+
+from __future__ import annotations
+
+import json
+import lzma
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+from pd4dgs_codec.cli.files import whole_file, write_bytes
+from pd4dgs_codec.codec.encoder import encode_with_report
+from pd4dgs_codec.data.dataset import Dataset
+from pd4dgs_codec.jsonable import finite
+from pd4dgs_codec.model.convert import to_scene
+from pd4dgs_codec.model.model import Model
+from pd4dgs_codec.report.evaluate import evaluate_file
+from pd4dgs_codec.report.trainings import ensure_trained
+from pd4dgs_codec.scene import MASK_THRESHOLD
+from pd4dgs_codec.train.config import ABLATIONS, TrainConfig
+
+
+@dataclass(frozen=True)
+class Variant:
+    """A way to train, as changes of TrainConfig. monolithic: shipped in one piece, all tensors float32 under LZMA."""
+
+    name: str
+    changes: dict[str, Any] = field(default_factory=dict)
+    monolithic: bool = False
+
+
+FULL = Variant("full")
+SCAFFOLD = Variant("static scaffold alone", {"max_layer": 0})
+TWO_LAYER = Variant("two layers", {"max_layer": 1})
+#: Every step trains all layers together, and nothing is spent on bytes, levels or quantisation.
+MONOLITHIC = Variant(
+    "monolithic", {"rollout": "top", **ABLATIONS["rate"], **ABLATIONS["tmc"], **ABLATIONS["noise"]}, monolithic=True
+)
+UNIFORM = Variant("uniform", {"rollout": "uniform"})
+FIXED = Variant("fixed", {"rollout": "fixed"})
+WITHOUT = tuple(Variant(f"without {part}", ABLATIONS[part]) for part in ("rate", "binary", "smooth", "tmc"))
+
+
+def at_rate(scale: float) -> Variant:
+    """The full method at another rate weight; `full` itself at the default one."""
+    return FULL if scale == TrainConfig().rate_scale else Variant(f"rate scale {scale:g}", {"rate_scale": scale})
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A scene of a table and how its runs are trained, but for variant and seed."""
+
+    name: str
+    config: TrainConfig
+    seeds: int  #: at most so many runs of each variant
+
+
+@dataclass(frozen=True)
+class Run:
+    """One training of a table."""
+
+    scene: Scene
+    variant: Variant
+    seed: int
+
+    @property
+    def config(self) -> TrainConfig:
+        """What it is trained with."""
+        return replace(self.scene.config, seed=self.seed, **self.variant.changes)
+
+    def folder(self, out: Path) -> Path:
+        """Where it lies below `out`."""
+        config = self.config
+        budget = f"{config.preset}-{config.iterations}"
+        return out / self.scene.name / budget / f"{self.variant.name.replace(' ', '-')}-{self.seed}"
+
+
+def measure(
+    run: Run, dataset: Callable[[], Dataset], out: Path, *, say: Callable[[str], None], progress: Any = None
+) -> dict[str, Any]:
+    """The result of `run`, from its result.json if there is one of the same settings, else made now.
+
+    {"scene", "variant", "seed", "config", "iterations", "seconds", "anchors", "rho", "active": anchors per level, "pi":
+    what `course` reads, "levels": rows of pd4dgs-eval}; the one level of a monolithic variant is its highest, its bytes
+    those of `monolithic_bytes`. dataset: loads the scene when needed.
+    """
+    folder = run.folder(out)
+    wanted = json.loads(json.dumps(run.config, default=lambda value: value.__dict__))
+    file = folder / "result.json"
+    if file.exists():
+        stored = json.loads(file.read_text())
+        if stored["config"] == wanted:
+            return stored
+    data = dataset()
+    path = folder / "model.pt"
+    model, training = ensure_trained(run.config, data, path, say=say, progress=progress)
+    if run.variant.monolithic:
+        levels = evaluate_file(path, data)["levels"][-1:]
+        levels[0]["cumulative_bytes"] = monolithic_bytes(model)
+    else:
+        packed, _ = encode_with_report(to_scene(model))
+        write_bytes(str(folder / "scene.pd4"), packed, overwrite=True)
+        levels = evaluate_file(packed, data)["levels"]
+    result = {
+        "scene": run.scene.name,
+        "variant": run.variant.name,
+        "seed": run.seed,
+        "config": wanted,
+        "iterations": training["iteration"],
+        "seconds": training["seconds"],
+        "anchors": len(model.anchor_q),
+        "rho": training["rho"],
+        "active": [int((model.masks(level) > MASK_THRESHOLD).sum()) for level in range(3)],
+        "pi": course(path.with_name("train.jsonl")),
+        "levels": levels,
+    }
+    with whole_file(str(file), overwrite=True) as temporary:
+        temporary.write_text(json.dumps(finite(result), indent=1, allow_nan=False))
+    return json.loads(file.read_text())
+
+
+def course(log: Path) -> list[dict[str, Any]]:
+    """iteration, rho and pi over a run, from its log: the steps after which rho is updated."""
+    keys = ("iteration", "rho", "pi")
+    records = map(json.loads, log.read_text().splitlines())
+    return [{key: record[key] for key in keys} for record in records if "active" in record]
+
+
+def monolithic_bytes(model: Model) -> int:
+    """Bytes of all layers in one piece, as the paper ships deformations: every tensor as float32 (anchors as positions,
+    no masks: each anchor is always there), one after another, under LZMA at its highest preset."""
+    tensors = {"anchor": model.anchor} | {
+        name: tensor for name, tensor in model.state_dict().items() if name not in ("anchor_q", "mask_logits")
+    }
+    return len(lzma.compress(b"".join(t.float().cpu().numpy().tobytes() for t in tensors.values()), preset=9))

@@ -1,0 +1,285 @@
+"""The tables themselves: which runs each needs, and its Markdown from their results."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from pd4dgs_codec.report.paper import plots, published
+from pd4dgs_codec.report.paper.runs import (
+    FIXED,
+    FULL,
+    MONOLITHIC,
+    SCAFFOLD,
+    TWO_LAYER,
+    UNIFORM,
+    WITHOUT,
+    Variant,
+    at_rate,
+)
+from pd4dgs_codec.report.paper.statistics import Figure, Result, at_level, figure, gain, monotone, top
+from pd4dgs_codec.report.tables import markdown
+
+#: Rate weights of the curve of quality over bytes.
+RATE_SCALES = (0.03, 0.1, 0.3, 1.0, 3.0)
+#: What the comparison promises: dB that a level may lose against the model trained for it alone, share of bytes.
+LOWER_LEVEL_LOSS, TOP_LEVEL_LOSS, TOP_SHARE, BASE_SHARE = 0.3, 0.1, 0.25, 0.10
+
+
+@dataclass(frozen=True)
+class Table:
+    """One table. scenes, seeds: what it is made from unless told otherwise; text: results -> Markdown lines; plot:
+    draws results to a path."""
+
+    name: str
+    title: str
+    variants: tuple[Variant, ...]
+    scenes: tuple[str, ...]
+    seeds: int
+    text: Callable[[Sequence[Result]], list[str]]
+    plot: Callable[[Sequence[Result], Any], None]
+
+
+def of(results: Sequence[Result], variant: Variant, scene: str | None = None) -> list[Result]:
+    """The results of one variant, on one scene or on all."""
+    return [r for r in results if r["variant"] == variant.name and scene in (None, r["scene"])]
+
+
+def scenes_of(results: Sequence[Result]) -> list[str]:
+    """Names of the scenes, in the order they came."""
+    return list(dict.fromkeys(r["scene"] for r in results))
+
+
+def comparison(results: Sequence[Result]) -> list[str]:
+    """Our levels beside models trained for one purpose, scene by scene."""
+    rows, promises = [], []
+    for scene in scenes_of(results):
+        alone = {v: of(results, v, scene) for v in (SCAFFOLD, TWO_LAYER, MONOLITHIC)}
+        full = of(results, FULL, scene)
+        for level, variant in enumerate(alone):
+            rows.append((scene, variant.name, *_cells(alone[variant], 2)))
+            rows.append((scene, f"ours, level {level}", *_cells(full, level)))
+        promises += _promises(scene, full, *alone.values())
+    theirs = [
+        (
+            "other scenes",
+            f"{row.method}, published",
+            f"{row.mpsnr:.2f}",
+            f"{row.mssim:.3f}",
+            f"{row.megabytes * 1e6:,.0f}",
+        )
+        for row in published.COMPARISON
+    ]
+    head = ("scene", "promise", "found", "allowed", "")
+    return [
+        markdown(("scene", "model", "mPSNR dB", "mSSIM", "bytes"), rows + theirs),
+        "",
+        "Each row is a training of its own but for our levels, which are three prefixes of one file. The monolithic",
+        "model trains all layers together in every step, without rate, mask terms and noise, and is shipped in one piece,",
+        "float32 under LZMA.",
+        "",
+        markdown(head, promises),
+    ]
+
+
+def _cells(results: Sequence[Result], level: int) -> tuple[str, str, str]:
+    return (
+        figure(results, at_level(level, "mpsnr")).text(2),
+        figure(results, at_level(level, "mssim")).text(4),
+        f"{figure(results, at_level(level, 'cumulative_bytes')).mean:,.0f}",
+    )
+
+
+def _promises(
+    scene: str, full: list[Result], scaffold: list[Result], two: list[Result], mono: list[Result]
+) -> list[tuple[str, ...]]:
+    def value(results: list[Result], level: int, key: str) -> float:
+        return figure(results, at_level(level, key)).mean
+
+    def row(what: str, found: float, allowed: float, unit: str, at_least: bool) -> tuple[str, ...]:
+        digits = 2 if unit == "dB" else 3
+        held = found >= allowed if at_least else found <= allowed
+        bound = f"{'≥' if at_least else '≤'} {allowed:.{digits}f} {unit}".rstrip()
+        return (
+            scene,
+            what,
+            f"{found:+.{digits}f}" if at_least else f"{found:.{digits}f}",
+            bound,
+            "yes" if held else "NO",
+        )
+
+    def lead(level: int, other: list[Result]) -> float:
+        return value(full, level, "mpsnr") - value(other, 2, "mpsnr")
+
+    size = value(mono, 2, "cumulative_bytes")
+    first = value(full, 0, "cumulative_bytes")
+    return [
+        row("level 0 against the scaffold alone", lead(0, scaffold), -LOWER_LEVEL_LOSS, "dB", True),
+        row("its bytes / the scaffold's", first / value(scaffold, 0, "cumulative_bytes"), 1.0, "", False),
+        row("level 1 against two layers", lead(1, two), -LOWER_LEVEL_LOSS, "dB", True),
+        row("level 2 against the monolithic", lead(2, mono), -TOP_LEVEL_LOSS, "dB", True),
+        row("its bytes / the monolithic's", value(full, 2, "cumulative_bytes") / size, TOP_SHARE, "", False),
+        row("layer 0 / the monolithic", first / size, BASE_SHARE, "", False),
+    ]
+
+
+def _against(head_what: str, variants: Sequence[Variant], results: Sequence[Result]) -> str:
+    """Highest levels of `variants`, each beside the full method."""
+    full = {key: figure(of(results, FULL), top(key)) for key in ("mpsnr", "mssim", "cumulative_bytes")}
+    rows = []
+    for variant in variants:
+        mine = {key: figure(of(results, variant), top(key)) for key in full}
+        base = figure(of(results, variant), lambda r: r["levels"][0]["cumulative_bytes"])
+        rows.append(
+            (
+                variant.name,
+                mine["mpsnr"].text(2),
+                mine["mssim"].text(4),
+                mine["cumulative_bytes"].text(0),
+                base.text(0),
+                figure(of(results, variant), lambda r: r["rho"]).text(3),
+                *(
+                    ("", "")
+                    if variant is FULL
+                    else (_gain(full, mine, "mpsnr", 2), _gain(full, mine, "cumulative_bytes", 0))
+                ),
+            )
+        )
+    head = (head_what, "mPSNR dB", "mSSIM", "bytes", "layer 0 bytes", "rho", "full gains dB", "full spends bytes")
+    return markdown(head, rows)
+
+
+def _gain(full: dict[str, Figure], mine: dict[str, Figure], key: str, digits: int) -> str:
+    difference = gain(full[key], mine[key])
+    return "none" if difference is None else f"{difference:+,.{digits}f}"
+
+
+def sampling(results: Sequence[Result]) -> list[str]:
+    """How levels are sampled."""
+    theirs = [(f"{r.method}, published", f"{r.mpsnr:.2f}", f"{r.megabytes:.2f} MB") for r in published.SAMPLING]
+    return [
+        _against("rollout", (UNIFORM, FIXED, FULL), results),
+        "",
+        *_spread_words("adaptive sampling (the full method)"),
+        "",
+        markdown(("other scenes", "mPSNR dB", "all layers"), theirs),
+    ]
+
+
+def components(results: Sequence[Result]) -> list[str]:
+    """The method with one of its parts taken out."""
+    theirs = [
+        (f"{r.method}, published", f"{r.mpsnr:.2f}", f"{r.mssim:.3f}", f"{r.megabytes:.2f} MB", f"{r.tlpips:.4f}")
+        for r in published.COMPONENTS
+    ]
+    return [
+        _against("method", (*WITHOUT, FULL), results),
+        "",
+        *_spread_words("the full method"),
+        "",
+        markdown(("other scenes", "mPSNR dB", "mSSIM", "all layers", "t-LPIPS"), theirs),
+    ]
+
+
+def _spread_words(what: str) -> list[str]:
+    return [
+        "Highest level; mean over scenes, then over seeds, ± half the distance between the best and the worst seed. Gains",
+        f"of {what} that are smaller than that distance, in either row, are called none.",
+    ]
+
+
+def levels(results: Sequence[Result]) -> list[str]:
+    """Each level of each run, and whether the next is always better."""
+    rows = []
+    for scene in scenes_of(results):
+        runs = of(results, FULL, scene)
+        held = sum(monotone(r) for r in runs)
+        for level in range(len(runs[0]["levels"])):
+            rows.append((scene, str(level), *_cells(runs, level), f"{held} of {len(runs)}" if level == 0 else ""))
+    theirs = [
+        ("other scenes, published", str(r.level), f"{r.mpsnr:.3f}", f"{r.mssim:.3f}", f"{r.megabytes * 1e6:,.0f}", "")
+        for r in published.LEVELS
+    ]
+    head = ("scene", "level", "mPSNR dB", "mSSIM", "bytes so far", "runs whose every level gains")
+    return [markdown(head, rows + theirs)]
+
+
+def latency(results: Sequence[Result]) -> list[str]:
+    """8 S / B until each level is there."""
+    rows = []
+    for scene in scenes_of(results):
+        full = of(results, FULL, scene)
+        for row in full[0]["levels"]:
+            size = figure(full, at_level(row["level"], "cumulative_bytes")).mean
+            rows.append((scene, f"ours, level {row['level']}", *_seconds(size), f"{size:,.0f}"))
+        mono = of(results, MONOLITHIC, scene)
+        if mono:
+            size = figure(mono, top("cumulative_bytes")).mean
+            rows.append((scene, "monolithic", *_seconds(size), f"{size:,.0f}"))
+    theirs = [
+        ("other scenes", f"{r.method}, published", *(f"{s:.2f}" for s in r.seconds), f"{r.megabytes * 1e6:,.0f}")
+        for r in published.FIRST_FRAME
+    ]
+    return [
+        markdown(("scene", "what", "s at 2 Mbps", "s at 10 Mbps", "s at 50 Mbps", "bytes"), rows + theirs),
+        "",
+        "Computed as 8 S / B; `pd4dgs-bench latency` measures them over a paced link.",
+    ]
+
+
+def _seconds(size: float) -> tuple[str, ...]:
+    return tuple(f"{8 * size / rate:.2f}" for rate in plots.LINKS)
+
+
+def rates(results: Sequence[Result]) -> list[str]:
+    """Layer sizes and levels as the rate weight moves."""
+    rows = []
+    for scene in scenes_of(results):
+        for scale in RATE_SCALES:
+            runs = of(results, at_rate(scale), scene)
+            for row in runs[0]["levels"] if runs else ():
+                level = row["level"]
+                active = figure(runs, at_level(level, "anchors")).mean
+                weight = (f"{scale:g}", f"{figure(runs, lambda r: r['rho']).mean:.3f}") if level == 0 else ("", "")
+                rows.append((scene, *weight, str(level), *_cells(runs, level), f"{active:,.0f}"))
+    head = ("scene", "rate scale", "rho", "level", "mPSNR dB", "mSSIM", "bytes so far", "anchors")
+    return [markdown(head, rows), "", "Rate scale 1 is the paper's weight; 0.1 is our default."]
+
+
+def rho(results: Sequence[Result]) -> list[str]:
+    """rho and pi at the end of each run."""
+    rows = []
+    for scene in scenes_of(results):
+        for scale in (0.1, 1.0):
+            runs = of(results, at_rate(scale), scene)
+            if runs:
+                last = runs[0]["pi"][-1]
+                cells = (f"{last['rho']:.3f}", " / ".join(f"{p:.3f}" for p in last["pi"]))
+                active = " / ".join(f"{n:,}" for n in runs[0]["active"])
+                rows.append((scene, f"{scale:g}", *cells, active))
+    return [markdown(("scene", "rate scale", "rho", "pi of levels 0 / 1 / 2", "active anchors per level"), rows)]
+
+
+SYNTHETIC = ("global", "local", "fast")
+REAL = ("shelf-hand", "bouncing-balls")
+TABLES = {
+    t.name: t
+    for t in (
+        Table(
+            "comparison",
+            "Comparison with models trained for one purpose",
+            (SCAFFOLD, TWO_LAYER, MONOLITHIC, FULL),
+            (*SYNTHETIC, *REAL),
+            1,
+            comparison,
+            plots.comparison,
+        ),
+        Table("sampling", "Sampling of levels", (UNIFORM, FIXED, FULL), SYNTHETIC, 3, sampling, plots.seeds),
+        Table("components", "Components", (*WITHOUT, FULL), SYNTHETIC, 3, components, plots.seeds),
+        Table("levels", "Levels", (FULL,), (*SYNTHETIC, *REAL), 3, levels, plots.levels),
+        Table("latency", "First frame", (FULL, MONOLITHIC), REAL, 1, latency, plots.latency),
+        Table("rates", "Quality over bytes", tuple(map(at_rate, RATE_SCALES)), REAL[:1], 1, rates, plots.rates),
+        Table("rho", "rho over training", (at_rate(0.1), at_rate(1.0)), ("static", "fast"), 1, rho, plots.rho),
+    )
+}

@@ -1,0 +1,131 @@
+"""The tables of the PD-4DGS paper from our own trainings, each beside the published figures.
+
+    python tools/paper.py comparison                         # or sampling, components, levels, latency, rates, rho
+    python tools/paper.py all
+    python tools/paper.py components --scenes fast local --seeds 5 --iterations 3000
+    python tools/paper.py levels --scenes recordings/kitchen@2
+
+Trains what is missing below --out (a stopped run goes on where it was, a finished one is kept by its settings), packs,
+measures on held-out views, and writes docs/paper/NAME.md, .json and .png. A scene is global, local, fast, static (the
+synthetic ones), shelf-hand or bouncing-balls (in the folder PD4DGS_SHARED names, default ../shared/data beside the
+repository), or any SOURCE that pd4dgs-train takes, with @K behind it to train on images 1/K as wide and high.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import json
+import os
+import sys
+from pathlib import Path
+from typing import Any
+
+from pd4dgs_codec.render.threads import configure
+
+SHARED = Path(os.environ.get("PD4DGS_SHARED", Path(__file__).resolve().parents[2] / "shared" / "data"))
+#: name: source, downscale, preset, iterations, seeds at most. Equal iterations for all variants of a scene.
+SYNTHETIC = ("tiny", 800, 3)
+SCENES: dict[str, tuple[str, int, str, int, int]] = {
+    **{name: (f"synthetic:{name}", 1, *SYNTHETIC) for name in ("static", "global", "local", "fast")},
+    "shelf-hand": (str(SHARED / "shelf-hand"), 2, "small", 2_000, 1),
+    "bouncing-balls": (str(SHARED / "bouncing-balls"), 4, "small", 3_000, 1),
+}
+#: Preset and iterations of a scene given by its source.
+OTHERS = ("small", 2_000, 1)
+
+
+def main(argv: list[str] | None = None) -> int:
+    threads = configure()
+    from pd4dgs_codec.cli.progress import TrainingProgress
+    from pd4dgs_codec.errors import Pd4Error
+    from pd4dgs_codec.report.paper.tables import TABLES
+
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("table", choices=(*TABLES, "all"))
+    parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="instead of the table's own")
+    parser.add_argument("--seeds", type=int, metavar="N", help="seeds 0 to N-1 (default: the table's own)")
+    parser.add_argument("--iterations", type=int, metavar="N", help="of each run (default: the scene's own)")
+    parser.add_argument("--out", type=Path, default=Path("out/paper"))
+    parser.add_argument("--docs", type=Path, default=Path("docs/paper"))
+    args = parser.parse_args(argv)
+    tables = list(TABLES.values()) if args.table == "all" else [TABLES[args.table]]
+    try:
+        for table in tables:
+            make(table, args, threads, TrainingProgress)
+    except (Pd4Error, OSError, KeyboardInterrupt) as error:
+        print(f"paper: error: {str(error) or 'interrupted; the same command goes on'}", file=sys.stderr)
+        return 1
+    return 0
+
+
+def make(table: Any, args: argparse.Namespace, threads: int, progress: Any) -> None:
+    """Runs what the table lacks and writes its three files."""
+    from pd4dgs_codec.data.dataset import load
+    from pd4dgs_codec.report.paper.runs import Run, measure
+
+    scenes = [scene(name, args) for name in args.scenes or table.scenes]
+    absent = [s.name for s in scenes if s.config.source.startswith(str(SHARED)) and not Path(s.config.source).is_dir()]
+    for name in absent:
+        print(f"{table.name}: {name} is not in {SHARED}, left out")
+    results = []
+    for one in scenes:
+        if one.name in absent:
+            continue
+        dataset = functools.cache(
+            lambda config=one.config: load(config.source, downscale=config.downscale, holdout=config.holdout)
+        )
+        for seed in range(min(args.seeds or table.seeds, one.seeds if args.seeds is None else args.seeds)):
+            for variant in table.variants:
+                run = Run(one, variant, seed)
+                label = f"{table.name}: {one.name}, {variant.name}, seed {seed}"
+                print(label, flush=True)
+                results.append(
+                    measure(
+                        run,
+                        dataset,
+                        args.out,
+                        say=lambda text, label=label: print(f"{label}: {text}", flush=True),
+                        progress=progress(),
+                    )
+                )
+    if results:
+        write(table, results, args.docs, threads)
+
+
+def scene(name: str, args: argparse.Namespace) -> Any:
+    """A scene by its name, or by SOURCE[@K]."""
+    from pd4dgs_codec.report.paper.runs import Scene
+    from pd4dgs_codec.train.config import TrainConfig
+
+    source, _, downscale = name.partition("@")
+    row = SCENES.get(name, (source, int(downscale or 1), *OTHERS))
+    config = TrainConfig(preset=row[2], source=row[0], downscale=row[1], iterations=args.iterations or row[3])
+    return Scene(name if name in SCENES else Path(source).name.replace(":", "-"), config, row[4])
+
+
+def write(table: Any, results: list[dict[str, Any]], docs: Path, threads: int) -> None:
+    """docs/NAME.md, NAME.json, NAME.png."""
+    docs.mkdir(parents=True, exist_ok=True)
+    table.plot(results, docs / f"{table.name}.png")
+    budgets = {r["scene"]: f"{r['scene']}: {r['config']['preset']}, {r['iterations']:,} iterations" for r in results}
+    minutes = sum(r["seconds"] for r in results) / 60
+    lines = [
+        f"# {table.title}",
+        "",
+        f"`python tools/paper.py {table.name}`: {len(results)} trainings, {minutes:.0f} minutes in all on {threads} threads",
+        f"of a shared machine. {'; '.join(budgets.values())}. Equal iterations for every row of a scene; held-out views.",
+        "Published figures are those of the paper, on other scenes.",
+        "",
+        *table.text(results),
+        "",
+        f"![{table.title}]({table.name}.png)",
+        "",
+    ]
+    (docs / f"{table.name}.md").write_text("\n".join(lines))
+    slim = [r | {"config": {k: v for k, v in r["config"].items() if k != "source"}} for r in results]
+    (docs / f"{table.name}.json").write_text(json.dumps(slim, indent=1) + "\n")
+
+
+if __name__ == "__main__":
+    sys.exit(main())
