@@ -106,6 +106,8 @@ def scene(name: str, args: argparse.Namespace) -> Any:
 
 def write(table: Any, results: list[dict[str, Any]], docs: Path, threads: int) -> None:
     """docs/NAME.md, NAME.json, NAME.png."""
+    from pd4dgs_codec.report.tables import paragraph
+
     docs.mkdir(parents=True, exist_ok=True)
     table.plot(results, docs / f"{table.name}.png")
     budgets = {r["scene"]: f"{r['scene']}: {r['config']['preset']}, {r['iterations']:,} iterations" for r in results}
@@ -113,9 +115,11 @@ def write(table: Any, results: list[dict[str, Any]], docs: Path, threads: int) -
     lines = [
         f"# {table.title}",
         "",
-        f"`python tools/paper.py {table.name}`: {len(results)} trainings, {minutes:.0f} minutes in all on {threads} threads",
-        f"of a shared machine. {'; '.join(budgets.values())}. Equal iterations for every row of a scene; held-out views.",
-        "Published figures are those of the paper, on other scenes.",
+        *paragraph(
+            f"`python tools/paper.py {table.name}`: {len(results)} trainings, {minutes:.0f} minutes on {threads} "
+            f"threads of a shared machine ({'; '.join(budgets.values())}). Equal iterations for every row of a scene; "
+            "held-out views. Published figures are those of the paper, on other scenes."
+        ),
         "",
         *table.text(results),
         "",

@@ -17,8 +17,8 @@ from pd4dgs_codec.scene import FEATURE_DIM, GLOBAL_HEADS, LOCAL_HEADS, N_OFFSETS
 #: Voxels along the longest side of the scene's box.
 GRID = 1024
 MASK_START = 2.0
-#: a_j of levels that a model does not have: softplus of it is 2e-9, so their masks are those of its highest level.
-TIED = -20.0
+#: a_j of levels that a model does not have: softplus of it is 4e-18, so their masks are those of its highest level.
+TIED = -40.0
 #: Random candidates per initial point, and the training views that judge them, where a dataset has no points.
 CARVE_CANDIDATES = 20
 CARVE_VIEWS = 40

@@ -97,8 +97,8 @@ def test_a_model_without_upper_layers_is_packed_as_it_was_trained(dataset, tmp_p
     Trainer(config, dataset).run(tmp_path / "m.pt")
     model = checkpoint.load(tmp_path / "m.pt")[0]
     assert model.level == max_layer
-    assert torch.equal(model.masks(max_layer), model.masks(2)), "absent levels have masks of their own"
-    assert (max_layer == 1) == (not torch.equal(model.masks(0), model.masks(1)))
+    own = [float((model.masks(level) - model.masks(level - 1)).max()) > 1e-6 for level in (1, 2)]
+    assert own == [max_layer >= 1, False], "absent levels have masks of their own"
     scene = decode(encode(to_scene(model)))
     assert scene.level <= max_layer
 

@@ -19,7 +19,7 @@ from pd4dgs_codec.report.paper.runs import (
     at_rate,
 )
 from pd4dgs_codec.report.paper.statistics import Figure, Result, at_level, figure, gain, monotone, top
-from pd4dgs_codec.report.tables import markdown
+from pd4dgs_codec.report.tables import markdown, paragraph
 
 #: Rate weights of the curve of quality over bytes.
 RATE_SCALES = (0.03, 0.1, 0.3, 1.0, 3.0)
@@ -75,9 +75,11 @@ def comparison(results: Sequence[Result]) -> list[str]:
     return [
         markdown(("scene", "model", "mPSNR dB", "mSSIM", "bytes"), rows + theirs),
         "",
-        "Each row is a training of its own but for our levels, which are three prefixes of one file. The monolithic",
-        "model trains all layers together in every step, without rate, mask terms and noise, and is shipped in one piece,",
-        "float32 under LZMA.",
+        *paragraph(
+            "Each row is a training of its own but for our levels, which are three prefixes of one file. The "
+            "monolithic model trains all layers together in every step, without rate, mask terms and noise, and is "
+            "shipped in one piece, float32 under LZMA."
+        ),
         "",
         markdown(head, promises),
     ]
@@ -183,10 +185,10 @@ def components(results: Sequence[Result]) -> list[str]:
 
 
 def _spread_words(what: str) -> list[str]:
-    return [
-        "Highest level; mean over scenes, then over seeds, ± half the distance between the best and the worst seed. Gains",
-        f"of {what} that are smaller than that distance, in either row, are called none.",
-    ]
+    return paragraph(
+        "Highest level; mean over scenes, then over seeds, ± half the distance between the best and the worst seed. "
+        f"Gains of {what} that are smaller than that distance, in either row, are called none."
+    )
 
 
 def levels(results: Sequence[Result]) -> list[str]:
