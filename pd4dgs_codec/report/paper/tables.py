@@ -55,12 +55,12 @@ def comparison(results: Sequence[Result]) -> list[str]:
     """Our levels beside models trained for one purpose, scene by scene."""
     rows, promises = [], []
     for scene in scenes_of(results):
-        alone = {v: of(results, v, scene) for v in (SCAFFOLD, TWO_LAYER, MONOLITHIC)}
+        alone = [of(results, variant, scene) for variant in (SCAFFOLD, TWO_LAYER, MONOLITHIC)]
         full = of(results, FULL, scene)
-        for level, variant in enumerate(alone):
-            rows.append((scene, variant.name, *_cells(alone[variant], 2)))
+        for level, runs in enumerate(alone):
+            rows.append((scene, runs[0]["variant"], *_cells(runs, 2)))
             rows.append((scene, f"ours, level {level}", *_cells(full, level)))
-        promises += _promises(scene, full, *alone.values())
+        promises += _promises(scene, full, *alone)
     theirs = [
         (
             "other scenes",
