@@ -19,7 +19,7 @@ from pd4dgs_codec.scene import Camera
 
 #: Pictures of the fixed camera over t = 0..1 that the temporal distances compare.
 TEMPORAL_FRAMES = 30
-NONE: Mapping[str, Distance] = MappingProxyType({})
+NO_DISTANCES: Mapping[str, Distance] = MappingProxyType({})
 
 
 def evaluate_file(
@@ -39,7 +39,7 @@ def evaluate_file(
     """
     views, split = (dataset.test, "test") if dataset.test else (dataset.train, "train")
     levels = load_levels(path_or_bytes, max_layer, device)
-    distances = perceptual.distances if perceptual else NONE
+    distances = perceptual.distances if perceptual else NO_DISTANCES
     result: dict[str, Any] = {
         "source": dataset.name,
         "split": split,
@@ -74,7 +74,7 @@ def metric_columns(result: dict[str, Any]) -> list[tuple[str, str, int]]:
 def evaluate_level(
     level: Level,
     views: tuple[View, ...],
-    distances: Mapping[str, Distance] = NONE,
+    distances: Mapping[str, Distance] = NO_DISTANCES,
     step: Callable[[], None] | None = None,
 ) -> dict[str, Any]:
     """The row of one level. render_ms: median milliseconds per picture, the networks included.
