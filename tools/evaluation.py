@@ -41,15 +41,18 @@ def main(argv: list[str] | None = None) -> int:
 
     page, store = args.docs / "evaluation.md", args.docs / "evaluation.json"
     perceptual = load_perceptual()
+    for name, why in perceptual.absent.items():
+        say(f"no {name}: {why}")
     try:
         around_table(page)
         results: dict[str, Any] = json.loads(store.read_text()) if store.is_file() else {}
         for name, source, downscale, *_ in SCENES:
             if name in args.only:
-                say(f"{name}: {', '.join(('mPSNR', 'mSSIM', *(d.title for d in perceptual.distances.values())))}")
+                say(f"{name}: measuring")
                 file = args.out / name / "scene.pd4"
                 result = evaluate_file(file, load(source, downscale=downscale), perceptual=perceptual)
                 levels = [{key: row[key] for key in row if key not in TIMES} for row in result["levels"]]
+                del result["perceptual"]["absent"]  # of this machine, with paths of its own
                 results[name] = finite(result | {"levels": levels})
     except (Pd4Error, OSError, ValueError) as error:
         print(f"evaluation: error: {error}", file=sys.stderr)

@@ -75,7 +75,7 @@ def _evaluate(args: argparse.Namespace, console: Console) -> int:
     perceptual = load_perceptual() if args.perceptual else None
     for name, why in (perceptual.absent if perceptual else {}).items():
         console.message(f"no {name}: {why}")
-    with progress_bar(None, "views", "evaluating") as step:
+    with progress_bar(None, "pictures", "evaluating") as step:
         result = evaluate_file(file, dataset, args.max_layer, perceptual=perceptual, step=step)
     result = {"input": args.input, "downscale": args.downscale, "holdout": args.holdout, **result}
     console.result(result, _text(result), on_stdout=True)
