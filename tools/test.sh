@@ -3,7 +3,7 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 source tools/environment.sh
-make_environment .venv-test train,test
+make_environment .venv-test train,eval,test
 .venv-test/bin/ruff check pd4dgs_codec tests tools
 .venv-test/bin/mypy
 exec .venv-test/bin/python -m pytest "$@"

@@ -24,11 +24,14 @@ from pd4dgs_codec.cli.progress import progress_bar
 DETAILS = f"""\
 Each level of a .pd4 file is decoded from its own prefix and compared with the views that training never saw.
 mPSNR in dB and mSSIM as in the DyCheck protocol: 8-bit pictures, masked where the data has masks.
+--perceptual adds LPIPS, ST-LPIPS and FLIP, those that are installed, masked too, and t-LPIPS and its like: the mean
+distance between successive pictures of a camera that stands still. docs/evaluation.md defines them all.
 
 {SOURCES}
 
 examples:
   pd4dgs-eval scene.pd4 synthetic:local
+  pd4dgs-eval scene.pd4 synthetic:local --perceptual
   pd4dgs-eval model.pt recordings/kitchen --downscale 2 --json"""
 
 
@@ -48,6 +51,7 @@ def parser() -> Parser:
         metavar="K",
         help="without split files, frames with i %% K == K/2 are held out (default: 8; 0: none)",
     )
+    p.add_argument("--perceptual", action="store_true", help="add perceptual distances, which take longer")
     p.add_common()
     return p
 
@@ -60,6 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _evaluate(args: argparse.Namespace, console: Console) -> int:
     use_threads(args)
     from pd4dgs_codec.data.dataset import load
+    from pd4dgs_codec.metrics.perceptual import load_perceptual
     from pd4dgs_codec.report.evaluate import evaluate_file
 
     file = named_input(args.input)
@@ -67,32 +72,42 @@ def _evaluate(args: argparse.Namespace, console: Console) -> int:
     console.detail(f"{args.source}: {len(dataset.train)} training views, {len(dataset.test)} held out")
     if not dataset.test:
         console.message("no views are held out: measuring on the training views")
-    with progress_bar(None, "views", "evaluating") as step:
-        result = evaluate_file(file, dataset, args.max_layer, step=step)
+    perceptual = load_perceptual() if args.perceptual else None
+    for name, why in (perceptual.absent if perceptual else {}).items():
+        console.message(f"no {name}: {why}")
+    with progress_bar(None, "pictures", "evaluating") as step:
+        result = evaluate_file(file, dataset, args.max_layer, perceptual=perceptual, step=step)
     result = {"input": args.input, "downscale": args.downscale, "holdout": args.holdout, **result}
     console.result(result, _text(result), on_stdout=True)
     return OK
 
 
 def _text(result: dict[str, Any]) -> str:
-    head = ("level", "mPSNR dB", "mSSIM", "bytes so far", "anchors", "decode s", "render ms")
-    rows = [
-        (
-            row["level"],
-            number(row["mpsnr"]),
-            number(row["mssim"], 4),
-            number(row["cumulative_bytes"], 0),
-            number(row["anchors"], 0),
-            number(row["decode_seconds"], 3),
-            number(row["render_ms"], 1),
-        )
-        for row in result["levels"]
+    from pd4dgs_codec.report.evaluate import metric_columns
+
+    columns = [
+        *metric_columns(result),
+        ("bytes so far", "cumulative_bytes", 0),
+        ("anchors", "anchors", 0),
+        ("decode s", "decode_seconds", 3),
+        ("render ms", "render_ms", 1),
     ]
+    head = ("level", *(title for title, _, _ in columns))
+    rows = [(row["level"], *(number(row[key], digits) for _, key, digits in columns)) for row in result["levels"]]
     what = "held-out" if result["split"] == "test" else "training"
     masked = "covisibility masks" if result["masked"] else "no covisibility masks"
     lines = [
         f"{result['source']}: {result['views']} {what} views, {result['width']}x{result['height']}, {masked}",
         table(head, rows),
+        *_distance_lines(result.get("perceptual")),
         f"always showing the mean training image: {number(result['baseline_mean_image_psnr'])} dB",
     ]
     return "\n".join(lines)
+
+
+def _distance_lines(perceptual: dict[str, Any] | None) -> list[str]:
+    if not perceptual or not perceptual["distances"]:
+        return []
+    sources = "; ".join(f"{d['title']}: {d['source']}" for d in perceptual["distances"].values())
+    camera, frames = perceptual["temporal_camera"], perceptual["temporal_frames"]
+    return [sources, f"t-: between successive pictures of {frames} from the camera of view {camera}"]

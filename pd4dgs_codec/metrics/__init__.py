@@ -1,5 +1,6 @@
 """Picture quality."""
 
 from .image import mean_image_baseline, mpsnr, mssim, to_uint8
+from .perceptual import Distance, Perceptual, load_perceptual
 
-__all__ = ["mean_image_baseline", "mpsnr", "mssim", "to_uint8"]
+__all__ = ["Distance", "Perceptual", "load_perceptual", "mean_image_baseline", "mpsnr", "mssim", "to_uint8"]

@@ -32,7 +32,7 @@ def to_uint8(image: np.ndarray) -> np.ndarray:
     return np.rint(np.clip(image.astype(np.float64), 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
-def _prepare(pred, target, mask) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def prepare(pred, target, mask) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Both images as float64 [H, W, 3] in 0..1 after 8 bits, and the mask as float64 [H, W]."""
     a, b = np.asarray(pred), np.asarray(target)
     if a.shape != b.shape or a.ndim != 3 or a.shape[2] != 3:
@@ -48,7 +48,7 @@ def mpsnr(pred: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) 
 
     pred, target: [H, W, 3] uint8 or floats in 0..1. mask: bool [H, W]; None = all.
     """
-    a, b, m = _prepare(pred, target, mask)
+    a, b, m = prepare(pred, target, mask)
     mse = float((np.square(a - b) * m[..., None]).sum() / max(3.0 * m.sum(), LEAST_WEIGHT))
     return float("inf") if mse == 0 else float(-10.0 * np.log10(mse))
 
@@ -89,7 +89,7 @@ def mssim(pred: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) 
     pred, target: [H, W, 3] uint8 or floats in 0..1, at least 11x11. mask: bool [H, W]; None = all. The mean is not
     weighted by the mask, as in the protocol: windows without a valid pixel count as 1.
     """
-    a, b, m = _prepare(pred, target, mask)
+    a, b, m = prepare(pred, target, mask)
     if min(a.shape[:2]) < TAPS:
         raise DataError(f"image is {a.shape[1]}x{a.shape[0]}, expected at least {TAPS}x{TAPS} for SSIM")
     blurred = _blur(np.concatenate([a, b, a * a, b * b, a * b], axis=2), m[..., None])

@@ -57,6 +57,33 @@ def test_eval_without_held_out_views_says_so(cli, scene_pd4, shared_dataset):
     assert result.code == 0 and "training views" in result.err and b"6 training views" in result.out
 
 
+def test_eval_adds_perceptual_distances_and_names_the_absent(cli, scene_pd4, shared_dataset, monkeypatch):
+    from pd4dgs_codec.data.dataset import load
+    from pd4dgs_codec.metrics.perceptual import Distance, Perceptual
+    from pd4dgs_codec.report.evaluate import TEMPORAL_FRAMES
+    from pd4dgs_codec.report.levels import load_levels
+
+    distance = Distance("MAE", "by hand", lambda a, b: np.abs(a - b).mean(axis=2))
+    loaded = Perceptual({"mae": distance}, {"lpips": "it is not here"})
+    monkeypatch.setattr("pd4dgs_codec.metrics.perceptual.load_perceptual", lambda: loaded)
+    command = ("eval", scene_pd4, shared_dataset, "--max-layer", 1)
+    result = cli(*command, "--perceptual", "--json")
+    assert result.error_lines == ["no lpips: it is not here"]
+    assert result.json["perceptual"]["absent"] == loaded.absent
+    (view,), level = load(str(shared_dataset)).test, load_levels(scene_pd4, 1)[-1]
+    row = result.json["levels"][1]
+    assert row["mmae"] == distance(level.picture(view.camera, view.time), view.image, view.mask)
+    frames = [level.picture(view.camera, t) for t in np.linspace(0, 1, TEMPORAL_FRAMES)]
+    assert row["t_mae"] == pytest.approx(distance.temporal(frames)) and row["t_mae"] > 0
+    assert result.json["levels"][0]["t_mae"] == 0  # level 0 stands still
+    assert not any("lpips" in key for key in row)
+
+    lines = cli(*command, "--perceptual").out.decode().splitlines()
+    assert "mMAE" in lines[1] and "t-MAE" in lines[1] and f"{row['t_mae']:.5f}" in lines[3].split()
+    plain = cli(*command, "--json").json
+    assert "perceptual" not in plain and set(row) - set(plain["levels"][1]) == {"mmae", "t_mae"}
+
+
 def test_render_dataset_views_as_the_renderer_sees_them(cli, scene_pd4, shared_dataset, tmp_path):
     from pd4dgs_codec.data.dataset import load
     from pd4dgs_codec.metrics.image import to_uint8

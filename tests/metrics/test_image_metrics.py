@@ -75,6 +75,15 @@ def test_mssim_by_hand():
     assert mssim(a, a) == pytest.approx(1.0)
 
 
+def test_without_a_mask_they_are_scikit_image_s():
+    metrics = pytest.importorskip("skimage.metrics")
+    a, b = random_pair(40, 50)
+    options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "channel_axis": 2}
+    _, ssim = metrics.structural_similarity(a / 255, b / 255, data_range=1.0, full=True, **options)
+    assert mssim(a, b) == pytest.approx(ssim[5:-5, 5:-5].mean(), abs=1e-9)
+    assert mpsnr(a, b) == pytest.approx(metrics.peak_signal_noise_ratio(a, b), abs=1e-9)
+
+
 def test_mpsnr_by_hand():
     a, b = np.zeros((2, 2, 3), np.uint8), np.zeros((2, 2, 3), np.uint8)
     b[0, 0] = 51  # error .2 in one of four pixels
