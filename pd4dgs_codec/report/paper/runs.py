@@ -13,6 +13,7 @@ from pd4dgs_codec.cli.files import whole_file, write_bytes
 from pd4dgs_codec.codec.encoder import encode_with_report
 from pd4dgs_codec.data.dataset import Dataset
 from pd4dgs_codec.jsonable import finite
+from pd4dgs_codec.metrics.perceptual import load_perceptual
 from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.report.evaluate import evaluate_file
@@ -82,8 +83,8 @@ def measure(
     """The result of `run`, from its result.json if there is one of the same settings, else made now.
 
     {"scene", "variant", "seed", "config", "iterations", "seconds", "anchors", "rho", "active": anchors per level, "pi":
-    what `course` reads, "levels": rows of pd4dgs-eval}; the one level of a monolithic variant is its highest, its bytes
-    those of `monolithic_bytes`. dataset: loads the scene when needed.
+    what `course` reads, "levels": rows of pd4dgs-eval --perceptual}. The one level of a monolithic variant is its
+    highest, its bytes those of `monolithic_bytes`. dataset: loads the scene when needed.
     """
     folder = run.folder(out)
     wanted = json.loads(json.dumps(run.config, default=lambda value: value.__dict__))
@@ -95,13 +96,14 @@ def measure(
     data = dataset()
     path = folder / "model.pt"
     model, training = ensure_trained(run.config, data, path, say=say, progress=progress)
+    perceptual = load_perceptual()
     if run.variant.monolithic:
-        levels = evaluate_file(path, data)["levels"][-1:]
+        levels = evaluate_file(path, data, perceptual=perceptual)["levels"][-1:]
         levels[0]["cumulative_bytes"] = monolithic_bytes(model)
     else:
         packed, _ = encode_with_report(to_scene(model))
         write_bytes(str(folder / "scene.pd4"), packed, overwrite=True)
-        levels = evaluate_file(packed, data)["levels"]
+        levels = evaluate_file(packed, data, perceptual=perceptual)["levels"]
     result = {
         "scene": run.scene.name,
         "variant": run.variant.name,

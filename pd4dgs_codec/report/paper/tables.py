@@ -58,8 +58,11 @@ def comparison(results: Sequence[Result]) -> list[str]:
         alone = [of(results, variant, scene) for variant in (SCAFFOLD, TWO_LAYER, MONOLITHIC)]
         full = of(results, FULL, scene)
         for level, runs in enumerate(alone):
-            rows.append((scene, runs[0]["variant"], *_cells(runs, 2)))
-            rows.append((scene, f"ours, level {level}", *_cells(full, level)))
+            for what, cells in (
+                (runs[0]["variant"], _cells(results, runs, 2)),
+                (f"ours, level {level}", _cells(results, full, level)),
+            ):
+                rows.append((scene, what, *cells))
         promises += _promises(scene, full, *alone)
     theirs = [
         (
@@ -67,13 +70,14 @@ def comparison(results: Sequence[Result]) -> list[str]:
             f"{row.method}, published",
             f"{row.mpsnr:.2f}",
             f"{row.mssim:.3f}",
+            *_blanks(results),
             f"{row.megabytes * 1e6:,.0f}",
         )
         for row in published.COMPARISON
     ]
     head = ("scene", "promise", "found", "allowed", "")
     return [
-        markdown(("scene", "model", "mPSNR dB", "mSSIM", "bytes"), rows + theirs),
+        markdown(("scene", "model", *_heads(results), "bytes"), rows + theirs),
         "",
         *paragraph(
             "Each row is a training of its own but for our levels, which are three prefixes of one file. The "
@@ -85,12 +89,26 @@ def comparison(results: Sequence[Result]) -> list[str]:
     ]
 
 
-def _cells(results: Sequence[Result], level: int) -> tuple[str, str, str]:
-    return (
-        figure(results, at_level(level, "mpsnr")).text(2),
-        figure(results, at_level(level, "mssim")).text(4),
-        f"{figure(results, at_level(level, 'cumulative_bytes')).mean:,.0f}",
-    )
+def _metrics(results: Sequence[Result]) -> list[tuple[str, str, int]]:
+    """Heading, key and decimals of the metrics that all results hold; the perceptual ones need their packages."""
+    optional = [("mST-LPIPS", "mstlpips", 4), ("t-ST-LPIPS", "t_stlpips", 5)]
+    held = [row for row in optional if all(row[1] in level for r in results for level in r["levels"])]
+    return [("mPSNR dB", "mpsnr", 2), ("mSSIM", "mssim", 4), *held]
+
+
+def _heads(results: Sequence[Result]) -> list[str]:
+    return [title for title, _, _ in _metrics(results)]
+
+
+def _blanks(results: Sequence[Result]) -> list[str]:
+    """Cells for the metrics that the published rows do not have under these names."""
+    return [""] * (len(_metrics(results)) - 2)
+
+
+def _cells(results: Sequence[Result], runs: Sequence[Result], level: int) -> list[str]:
+    """The metrics and the bytes of `runs` at a level; `results` are those of the whole table."""
+    metrics = [figure(runs, at_level(level, key)).text(digits) for _, key, digits in _metrics(results)]
+    return [*metrics, f"{figure(runs, at_level(level, 'cumulative_bytes')).mean:,.0f}"]
 
 
 def _promises(
@@ -128,7 +146,8 @@ def _promises(
 
 def _against(head_what: str, variants: Sequence[Variant], results: Sequence[Result]) -> str:
     """Highest levels of `variants`, each beside the full method."""
-    full = {key: figure(of(results, FULL), top(key)) for key in ("mpsnr", "mssim", "cumulative_bytes")}
+    metrics = _metrics(results)
+    full = {key: figure(of(results, FULL), top(key)) for _, key, _ in (*metrics, ("", "cumulative_bytes", 0))}
     rows = []
     for variant in variants:
         mine = {key: figure(of(results, variant), top(key)) for key in full}
@@ -136,8 +155,7 @@ def _against(head_what: str, variants: Sequence[Variant], results: Sequence[Resu
         rows.append(
             (
                 variant.name,
-                mine["mpsnr"].text(2),
-                mine["mssim"].text(4),
+                *(mine[key].text(digits) for _, key, digits in metrics),
                 mine["cumulative_bytes"].text(0),
                 base.text(0),
                 figure(of(results, variant), lambda r: r["rho"]).text(3),
@@ -148,7 +166,7 @@ def _against(head_what: str, variants: Sequence[Variant], results: Sequence[Resu
                 ),
             )
         )
-    head = (head_what, "mPSNR dB", "mSSIM", "bytes", "layer 0 bytes", "rho", "full gains dB", "full spends bytes")
+    head = (head_what, *_heads(results), "bytes", "layer 0 bytes", "rho", "full gains dB", "full spends bytes")
     return markdown(head, rows)
 
 
@@ -198,12 +216,21 @@ def levels(results: Sequence[Result]) -> list[str]:
         runs = of(results, FULL, scene)
         held = sum(monotone(r) for r in runs)
         for level in range(len(runs[0]["levels"])):
-            rows.append((scene, str(level), *_cells(runs, level), f"{held} of {len(runs)}" if level == 0 else ""))
+            held_by = f"{held} of {len(runs)}" if level == 0 else ""
+            rows.append((scene, str(level), *_cells(results, runs, level), held_by))
     theirs = [
-        ("other scenes, published", str(r.level), f"{r.mpsnr:.3f}", f"{r.mssim:.3f}", f"{r.megabytes * 1e6:,.0f}", "")
+        (
+            "other scenes, published",
+            str(r.level),
+            f"{r.mpsnr:.3f}",
+            f"{r.mssim:.3f}",
+            *_blanks(results),
+            f"{r.megabytes * 1e6:,.0f}",
+            "",
+        )
         for r in published.LEVELS
     ]
-    head = ("scene", "level", "mPSNR dB", "mSSIM", "bytes so far", "runs whose every level gains")
+    head = ("scene", "level", *_heads(results), "bytes so far", "runs whose every level gains")
     return [markdown(head, rows + theirs)]
 
 
@@ -244,8 +271,8 @@ def rates(results: Sequence[Result]) -> list[str]:
                 level = row["level"]
                 active = figure(runs, at_level(level, "anchors")).mean
                 weight = (f"{scale:g}", f"{figure(runs, lambda r: r['rho']).mean:.3f}") if level == 0 else ("", "")
-                rows.append((scene, *weight, str(level), *_cells(runs, level), f"{active:,.0f}"))
-    head = ("scene", "rate scale", "rho", "level", "mPSNR dB", "mSSIM", "bytes so far", "anchors")
+                rows.append((scene, *weight, str(level), *_cells(results, runs, level), f"{active:,.0f}"))
+    head = ("scene", "rate scale", "rho", "level", *_heads(results), "bytes so far", "anchors")
     return [markdown(head, rows), "", "Rate scale 1 is the paper's weight; 0.1 is our default."]
 
 
