@@ -11,8 +11,9 @@ from pd4dgs_codec.scene import Steps
 #: Iterations per preset when neither a count nor a time limit is given.
 DEFAULT_ITERATIONS = {"tiny": 3_000, "small": 10_000, "paper": 15_000}
 
-#: How levels are sampled after the coarse phase. "top" trains the highest level alone, as a monolithic model is.
-ROLLOUTS = ("adaptive", "uniform", "fixed", "top")
+#: Which levels a step trains after the coarse phase: one drawn from pi(rho), from the uniform or from the paper's fixed
+#: distribution; the highest alone, as a monolithic model is trained; or each of them, at thrice the cost.
+ROLLOUTS = ("adaptive", "uniform", "fixed", "top", "all")
 
 #: Parts of the method that an ablation takes out, as the fields of `TrainConfig` that do so.
 ABLATIONS: dict[str, dict[str, Any]] = {
@@ -64,6 +65,9 @@ class TrainConfig:
     rate_share: float = 0.05  #: share of the anchors on which a step estimates the rate
     tmc: float = 0.01
     tmc_binary: bool = True
+    #: the binary term's weight grows to so many times its start, so that masks end near 0 or 1: an anchor that stays
+    #: half visible at a level is paid for in full there
+    tmc_binary_growth: float = 20.0
     tmc_smooth: bool = True
     tmc_tau: float = 4.0  #: voxels
     rollout: str = "adaptive"  #: one of ROLLOUTS
@@ -72,7 +76,7 @@ class TrainConfig:
     )
     ssim: float = 0.2
     volume: float = 0.01  #: weight of the mean product of scales (Scaffold-GS)
-    noise: bool = True
+    noise: bool = True  #: imitate quantisation: noise on attributes, rounding of planes and weights, at last of all
     grow_threshold: float = 2e-4
     steps: Steps | None = None  #: None: the preset's
     rates: LearningRates = field(default_factory=LearningRates)
@@ -145,6 +149,11 @@ class Schedule:
     def exact_rounding(self) -> int:
         """The anchors' attributes are rounded straight-through from here on, where noise imitated it before."""
         return self._at(9 / 10)
+
+    def separation(self, iteration: int) -> float:
+        """How far the masks' separation has gone, 0..1: it begins with the mask terms and ends with exact rounding."""
+        begin, end = self.progressive, self.exact_rounding
+        return min(max((iteration - begin) / max(1, end - begin), 0.0), 1.0)
 
     def phases_not_reached(self, iteration: int) -> list[str]:
         """Names of the phases that a run cut after `iteration` iterations never entered; none for a whole run."""

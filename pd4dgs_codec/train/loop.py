@@ -24,7 +24,7 @@ from pd4dgs_codec.jsonable import finite
 from pd4dgs_codec.metrics.image import mpsnr
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import PRESETS
-from pd4dgs_codec.model.model import Noise, Rounding
+from pd4dgs_codec.model.model import EXACT, Noise, Rounding
 from pd4dgs_codec.render.picture import Picture, render, render_image
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train import losses
@@ -93,7 +93,7 @@ class Trainer:
                         stream.close()
                 if progress:
                     progress.close()
-            if self.total and self.iteration >= self.total:
+            if self.config.noise and self.total and self.iteration >= self.total:
                 self.model.round_to_steps()  # what the end of the run rendered, and what the file will hold
             self.save(output)
         self.interrupted = stop.requested
@@ -130,10 +130,10 @@ class Trainer:
         """One training step; returns its log record (every term unweighted)."""
         schedule = Schedule(self.total or 10**9)
         index = self._next_view()
-        level, probabilities = self._draw_level(schedule)
+        levels, probabilities = self._draw_levels(schedule)
         rounding = self._rounding(schedule)
-        record: dict[str, Any] = {"iteration": self.iteration, "level": level}
-        if not self._learn(index, level, schedule, rounding, record):
+        record: dict[str, Any] = {"iteration": self.iteration, "level": levels[-1]}
+        if not self._learn(index, levels, schedule, rounding, record):
             self.skipped += 1
             record["skipped"] = self.skipped
         self.optimiser.zero_grad()
@@ -153,20 +153,28 @@ class Trainer:
 
     # -- parts of a step -------------------------------------------------------------------------------------------
 
-    def _learn(self, index: int, level: int, schedule: Schedule, rounding: Rounding, record: dict[str, Any]) -> bool:
-        """Loss, gradient, update; False, with nothing changed, if any of it is not finite."""
-        try:
-            picture, terms, loss = self._loss(index, level, schedule, rounding)
-        except NotFinite as error:  # a diverged step may be passed over; any other refusal is here to stay
-            record["refused"] = str(error)
-            return False
-        record["loss"] = float(loss.detach())
-        record |= {name: float(value.detach()) for name, value in terms.items()}
-        loss.backward()
+    def _learn(
+        self, index: int, levels: tuple[int, ...], schedule: Schedule, rounding: Rounding, record: dict[str, Any]
+    ) -> bool:
+        """Losses, gradients, update; False, with nothing changed, if any of it is not finite. The record is that of the
+        last of the levels."""
+        pictures = []
+        for level in levels:
+            try:
+                picture, terms, loss = self._loss(index, level, schedule, rounding)
+            except NotFinite as error:  # a diverged step may be passed over; any other refusal is here to stay
+                record["refused"] = str(error)
+                return False
+            record["loss"] = float(loss.detach())
+            record |= {name: float(value.detach()) for name, value in terms.items()}
+            loss.backward()
+            pictures.append(picture)
+            if not math.isfinite(record["loss"]):
+                return False
         record["gradient_norm"] = norm = self.optimiser.gradient_norm()
-        if not (math.isfinite(norm) and math.isfinite(record["loss"])):
+        if not math.isfinite(norm):
             return False
-        self._update(norm, schedule, picture, record)
+        self._update(norm, schedule, pictures, record)
         return True
 
     def _loss(self, index: int, level: int, schedule: Schedule, rounding: Rounding) -> tuple[Picture, dict, Tensor]:
@@ -208,7 +216,8 @@ class Trainer:
             total = total + config.lambdas[level] * config.rate_scale * terms["rate"]
         if config.tmc_binary:
             terms["tmc_binary"] = losses.binary_term(mask)
-            total = total + config.tmc * terms["tmc_binary"]
+            weight = config.tmc * config.tmc_binary_growth ** Schedule(self.total).separation(self.iteration)
+            total = total + weight * terms["tmc_binary"]
         if config.tmc_smooth:
             if self.neighbours is None:
                 self.neighbours = losses.Neighbours(self.model.anchor_q)
@@ -217,18 +226,15 @@ class Trainer:
             total = total + config.tmc * terms["tmc_smooth"]
         return total
 
-    def _update(self, norm: float, schedule: Schedule, picture: Picture, record: dict[str, Any]) -> None:
+    def _update(self, norm: float, schedule: Schedule, pictures: list[Picture], record: dict[str, Any]) -> None:
         if norm > self.config.max_gradient_norm:
             for group in self.optimiser.adam.param_groups:
                 for p in group["params"]:
                     if p.grad is not None:
                         p.grad.mul_(self.config.max_gradient_norm / norm)
-        gradient = picture.meta["means2d"].grad
-        growing = self.total and self.iteration <= schedule.grow.stop
-        if growing and gradient is not None and len(picture.gaussians.slots):
-            drawn = (picture.meta["radii"][0] > 0).all(-1)
-            height, width = picture.alpha.shape
-            self.densifier.observe(picture.gaussians, gradient[0], drawn, width, height)
+        if self.total and self.iteration <= schedule.grow.stop:
+            for picture in pictures:
+                self._observe(picture)
         self.optimiser.step(self.iteration / self.total if self.total else 0.0)
         if self.total and self.iteration in schedule.grow:
             room = len(self.model.anchor_q) < self.densifier.max_anchors
@@ -242,14 +248,26 @@ class Trainer:
             self.neighbours = None
             record |= {"pruned": pruned, "grown": grown}
 
+    def _observe(self, picture: Picture) -> None:
+        gradient = picture.meta["means2d"].grad
+        if gradient is not None and len(picture.gaussians.slots):
+            drawn = (picture.meta["radii"][0] > 0).all(-1)
+            height, width = picture.alpha.shape
+            self.densifier.observe(picture.gaussians, gradient[0], drawn, width, height)
+
     def _rounding(self, schedule: Schedule) -> Rounding:
-        exact = self.iteration >= schedule.exact_rounding and self.config.noise
-        noisy = self.iteration >= schedule.coarse_end and self.config.noise and not exact
+        if not self.config.noise:
+            return EXACT
+        exact = self.iteration >= schedule.exact_rounding
+        noisy = self.iteration >= schedule.coarse_end and not exact
         return Rounding(self.noise if noisy else None, attributes=exact, weights=self.iteration >= schedule.rounding)
 
-    def _draw_level(self, schedule: Schedule) -> tuple[int, tuple[float, float, float]]:
+    def _draw_levels(self, schedule: Schedule) -> tuple[tuple[int, ...], tuple[float, float, float]]:
+        """The levels of this step, ascending, and the probabilities that they were drawn with."""
         if self.iteration < schedule.coarse_end:
-            return 0, (1.0, 0.0, 0.0)
+            return (0,), (1.0, 0.0, 0.0)
+        if self.config.rollout == "all":
+            return tuple(range(self.model.level + 1)), (1.0, 1.0, 1.0)
         if self.config.rollout == "top":
             probabilities = TOP
         elif self.config.rollout == "uniform" or self.iteration < schedule.rho_start:
@@ -258,7 +276,7 @@ class Trainer:
             probabilities = CAPACITY_WEIGHTED
         else:
             probabilities = rollout_probabilities(self.rho)
-        return sample_level(probabilities, self.model.level, self.generator), probabilities
+        return (sample_level(probabilities, self.model.level, self.generator),), probabilities
 
     def _next_view(self) -> int:
         if not self.order:

@@ -14,7 +14,7 @@ from pd4dgs_codec.data.dataset import Dataset, load  # noqa: E402
 from pd4dgs_codec.model import checkpoint  # noqa: E402
 from pd4dgs_codec.model.config import PRESETS, DeformationConfig, ModelConfig  # noqa: E402
 from pd4dgs_codec.report.paper import statistics, tables  # noqa: E402
-from pd4dgs_codec.report.paper.runs import FULL, MONOLITHIC, SCAFFOLD, Run, Scene, at_rate, measure  # noqa: E402
+from pd4dgs_codec.report.paper.runs import EVERY_LEVEL, FULL, MONOLITHIC, SCAFFOLD, Run, Scene, at_rate, measure  # noqa: E402
 from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS  # noqa: E402
 from pd4dgs_codec.train.config import TrainConfig  # noqa: E402
 
@@ -72,14 +72,14 @@ def test_the_comparison_tells_which_promise_is_broken():
         result(),
     ]
     rows[2]["levels"][0]["level"] = 2
-    lines = {line.split("|")[2].strip(): line for line in tables.comparison(rows)[-1].splitlines() if "|" in line}
-    assert (
-        "-0.20" in lines["level 0 against the scaffold alone"] and "yes" in lines["level 0 against the scaffold alone"]
-    )
-    assert "-0.50" in lines["level 1 against two layers"] and "NO" in lines["level 1 against two layers"]
-    assert "yes" in lines["level 2 against the monolithic"]
-    assert "0.273" in lines["its bytes / the monolithic's"] and "NO" in lines["its bytes / the monolithic's"]
-    assert "yes" in lines["layer 0 / the monolithic"]
+    table = [[cell.strip() for cell in line.split("|")[2:5]] for line in tables.comparison(rows)[-1].splitlines()]
+    found = {what: (allowed, told) for what, allowed, told in table}
+    assert found["level 0 against the scaffold alone"] == ("≥ -0.30 dB", "-0.20")
+    assert found["its bytes / the scaffold's"] == ("≤ 1.000", "0.909")
+    assert found["level 1 against two layers"] == ("≥ -0.30 dB", "-0.50, NOT HELD")
+    assert found["level 2 against the monolithic"] == ("≥ -0.10 dB", "-0.05")
+    assert found["its bytes / the monolithic's"] == ("≤ 0.250", "0.273, NOT HELD")
+    assert found["layer 0 / the monolithic"] == ("≤ 0.100", "0.091")
 
 
 @pytest.mark.parametrize("name", list(tables.TABLES))
@@ -101,7 +101,7 @@ def test_every_table_names_what_it_compares_and_draws_it(name, tmp_path):
     for scene in table.scenes if name not in ("sampling", "components") else ():
         assert scene in text
     if name in ("comparison", "sampling", "components"):
-        assert all(v.name in text for v in table.variants if v is not FULL)
+        assert all(v.name in text for v in table.variants if v not in (FULL, EVERY_LEVEL))
     table.plot(rows, tmp_path / "plot.png")
     assert (tmp_path / "plot.png").stat().st_size > 5_000
 

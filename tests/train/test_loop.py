@@ -97,7 +97,7 @@ def test_a_model_without_upper_layers_is_packed_as_it_was_trained(dataset, tmp_p
     Trainer(config, dataset).run(tmp_path / "m.pt")
     model = checkpoint.load(tmp_path / "m.pt")[0]
     assert model.level == max_layer
-    own = [float((model.masks(level) - model.masks(level - 1)).max()) > 1e-6 for level in (1, 2)]
+    own = [float((model.masks(level) - model.masks(level - 1)).detach().max()) > 1e-6 for level in (1, 2)]
     assert own == [max_layer >= 1, False], "absent levels have masks of their own"
     scene = decode(encode(to_scene(model)))
     assert scene.level <= max_layer
@@ -109,6 +109,25 @@ def test_the_top_rollout_trains_the_highest_level_alone(dataset, tmp_path):
     records = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
     assert {r["level"] for r in records if r["iteration"] < 4} == {0}
     assert {r["level"] for r in records if r["iteration"] >= 4} == {2}
+
+
+def test_every_level_is_trained_in_every_step_if_asked(dataset):
+    trainer = Trainer(TrainConfig(preset="tiny", iterations=40, rollout="all"), dataset)
+    for _ in range(5):
+        record = trainer.step()
+    assert record["level"] == 2 and record["pi"] == (1.0, 1.0, 1.0)
+    seen = []
+    trainer._loss, loss = (lambda *a: seen.append(a[1]) or loss(*a)), trainer._loss
+    trainer.step()
+    assert seen == [0, 1, 2]
+
+
+def test_without_quantisation_nothing_is_rounded(dataset, tmp_path):
+    config = TrainConfig(preset="tiny", iterations=40, **ABLATIONS["noise"])
+    Trainer(config, dataset).run(tmp_path / "m.pt")
+    model = checkpoint.load(tmp_path / "m.pt")[0]
+    rest = (model.feature / model.steps.feature).frac().abs()
+    assert float(((rest > 0.05) & (rest < 0.95)).float().mean()) > 0.5
 
 
 @pytest.mark.parametrize(

@@ -92,6 +92,11 @@ def test_the_schedule_is_the_papers_at_its_own_length():
     assert s.phases_not_reached(5_000)[0] == "rate and mask terms"
 
 
+def test_masks_separate_between_the_rate_terms_and_exact_rounding():
+    s = Schedule(3_000)
+    assert [s.separation(i) for i in (0, 1_000, 1_850, 2_700, 2_999)] == pytest.approx([0, 0, 0.5, 1, 1])
+
+
 def test_learning_rates_are_log_linear():
     assert learning_rate((1e-2, 1e-4), 0.5) == pytest.approx(1e-3)
 

@@ -34,6 +34,8 @@ class Variant:
 FULL = Variant("full")
 SCAFFOLD = Variant("static scaffold alone", {"max_layer": 0})
 TWO_LAYER = Variant("two layers", {"max_layer": 1})
+#: The full method, but each step trains every level: as many steps of each as the three models above it have together.
+EVERY_LEVEL = Variant("every level in every step", {"rollout": "all"})
 #: Every step trains all layers together, and nothing is spent on bytes, levels or quantisation.
 MONOLITHIC = Variant(
     "monolithic", {"rollout": "top", **ABLATIONS["rate"], **ABLATIONS["tmc"], **ABLATIONS["noise"]}, monolithic=True
