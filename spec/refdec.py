@@ -1110,17 +1110,16 @@ def dequantise_layer(layer):
     layer.tensors |= layer.raw_values
 
 
-# 12.1 Order: "When the last layer asked for has been read: sums of masks, each voxel at most once over all layers,
-# and dequantisation."
-def finish(layers):
+# 12.1 Order: "For each layer chunk, before the next chunk is looked at: parameters and their limits, sections, the
+# ranges of 11.1 and 11.2, sums of masks, each voxel at most once over the layers so far, and dequantisation."
+def finish_last(layers):
     codes = []
     for layer in layers:
         codes = [code + rise for code, rise in zip(codes, layer.symbols["mask_rise"])] + layer.symbols["mask_own"]
         need(not codes or max(codes) <= 255, "a mask code over 255")
     anchors = [v for layer in layers for v in layer.symbols["anchor"]]
     need(len(set(zip(*[iter(anchors)] * 3))) == len(anchors) // 3, "a voxel holds more than one anchor")
-    for layer in layers:
-        dequantise_layer(layer)
+    dequantise_layer(layers[-1])
 
 
 # 12.1 Order: "Read preamble and header, then the chunks in order." "A decoder of prefix ℓ stops after the last layer ≤
@@ -1139,9 +1138,9 @@ def decode(data, max_layer=None):
         payload, scene_id, at = read_chunk(data, at, kind, size, scene_id, described)
         if kind < 3:
             layers.append(read_layer(payload, kind, rows, header))
+            finish_last(layers)
             rows += layers[-1].rows
     need(max_layer is not None or at == len(data), "bytes follow the last chunk")
-    finish(layers)
     return layers
 
 
