@@ -80,6 +80,7 @@ class LayerReader:
             try:
                 layer = read_layer(chunk.payload, kind, rows_before, self.header.mode, self.header.raw_deformation)
                 check_last_layer([*self.layers, layer], self.header.info.voxel_size, self.header.attribute_steps)
+                _check_bounded(layer, self.header)
             except DecodeError as error:
                 raise _located(error, self._index, self.offset) from None
         self._index += 1
@@ -89,6 +90,13 @@ class LayerReader:
 
 def _any_layer(chunks: tuple[tuple[int, int], ...], max_layer: int) -> bool:
     return any(kind in BY_CHUNK_TYPE and BY_CHUNK_TYPE[kind].layer <= max_layer for kind, _ in chunks)
+
+
+def _check_bounded(layer: LayerSymbols, header: Header) -> None:
+    """Raise Malformed unless the header has an error bound for every class of tensors in `layer`."""
+    missing = [name for name in layer.steps if name not in header.error_bounds]
+    if missing:
+        raise Malformed(f"layer {layer.kind.layer}: no error bound of {missing[0]} in the header, expected one")
 
 
 def _located(error: DecodeError, chunk: int, offset: int) -> DecodeError:

@@ -223,13 +223,13 @@ def test_verification_notices_lost_rows_and_wrong_values(monkeypatch):
     """What the decoder hands out is compared, not only what it reads."""
     scene = make_scene(0, layers=(0,))
 
-    def first_changed(change):
-        """assemble, with the scene of its first call changed: that of the file, before the one that was meant."""
+    def last_changed(change):
+        """assemble, with the scene of its second call changed: that of the file, after the one that was meant."""
         calls = []
 
         def changed(*args):
             calls.append(args)
-            return change(assemble(*args)) if len(calls) == 1 else assemble(*args)
+            return change(assemble(*args)) if len(calls) == 2 else assemble(*args)
 
         return changed
 
@@ -238,7 +238,7 @@ def test_verification_notices_lost_rows_and_wrong_values(monkeypatch):
         ("layers and rows", lambda s: replace(s, rows=(s.rows[0] + 1,))),
         ("layer 0 decodes to other values", lambda s: replace(s, feature=s.feature + np.float32(1))),
     ):
-        monkeypatch.setattr(encoder, "assemble", first_changed(change))
+        monkeypatch.setattr(encoder, "assemble", last_changed(change))
         with pytest.raises(EncodeError, match=f"verification: .*{message}"):
             encode(scene)
 
