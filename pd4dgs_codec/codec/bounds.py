@@ -34,8 +34,8 @@ class ErrorBound:
 
 
 def rounding_bounds(decoded: Scene, raw_deformation: bool) -> dict[str, float]:
-    """By field of Steps that the scene's tensors use: the least binary32 value that bounds the error of them all if each
-    value was rounded to the nearest symbol."""
+    """By field of Steps that the scene's tensors use: what bounds the error of them all if each value was rounded to
+    the nearest symbol, rounded up to binary32."""
     bounds: dict[str, float] = {}
     for what, step, restored in _tensors(decoded, raw_deformation):
         largest = np.abs(restored).max(initial=np.float32(0))
@@ -58,7 +58,7 @@ def verify_errors(
         bounds = np.minimum(_bounds(np.abs(restored), step), declared[what])
         if not (errors <= bounds).all():
             place = np.unravel_index(int((errors - bounds).argmax()), errors.shape)
-            row = f"{what}: {x[place]!r} comes back as {restored[place]!r} at step {step:g}"
+            row = f"{what}: {x[place]} comes back as {restored[place]} at step {step:g}"
             raise EncodeError(f"verification: {row}, expected at most {bounds[place]:.9g} between them")
         steps[what], largest[what] = step, max(largest[what], float(errors.max(initial=0.0)))
     return [ErrorBound(what, steps[what], bound, largest[what]) for what, bound in declared.items()]

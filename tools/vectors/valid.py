@@ -680,7 +680,12 @@ def _ranges() -> Iterator[Case]:
     yield "bounds-zero", "Error bounds of 0.", "5.4", three_layers(header={13: zero})
     yield "bounds-negative-zero", "Error bounds of −0.", "5.4", three_layers(header={13: dict.fromkeys(zero, -0.0)})
     yield "bounds-largest", "The largest error bounds.", "5.4", three_layers(header={13: largest})
-    yield "bounds-of-layer-0", "No error bounds but those of layer 0.", "5.4", make_file(make_layer(), header={13: base})
+    yield (
+        "bounds-of-layer-0",
+        "No error bounds but those of layer 0.",
+        "5.4",
+        make_file(make_layer(), header={13: base}),
+    )
     flat = make_file(make_layer(0, line(2)), make_layer(1, (), before=2), make_layer(2, [[0, 0, 1]], before=2))
     yield (
         "bounds-without-deformations",
