@@ -173,7 +173,7 @@ def test_inputs_are_named_by_their_numbers():
     assert cases != [mutate.make_case(SEEDS, 4, index) for index in range(300)]
 
 
-UNKNOWN = (("header", "keys"), ("camera", "keys"), ("layer", "keys"), ("layer", "sections"))
+UNKNOWN = (("header", "keys"), ("camera", "keys"), ("bounds", "keys"), ("layer", "keys"), ("layer", "sections"))
 
 
 def test_taking_apart_and_putting_together_changes_nothing():
