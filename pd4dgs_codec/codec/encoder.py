@@ -19,6 +19,7 @@ from pd4dgs_codec.codec.plan import LeftOut, plan
 from pd4dgs_codec.codec.symbols import (
     LayerSymbols,
     assemble,
+    check_last_layer,
     float_tensors,
     layer_symbols,
     quantise_deformation,
@@ -94,7 +95,7 @@ def encode_with_report(
     planned, left_out = plan(scene, layers, deformation == "float32")
     symbols = [layer_symbols(planned, i, deformation == "float32") for i in range(len(planned.layers))]
     written = [write_layer(layer, coding) for layer in symbols]
-    _check_limits(symbols, [payload for payload, _ in written])
+    _check_limits(planned, symbols, [payload for payload, _ in written])
     meant = assemble(planned.info, _attribute_steps(planned), symbols)
     data = _container(meant, mode, deformation, [payload for payload, _ in written])
     errors = _verify(data, planned, symbols, meant) if verify else []
@@ -119,12 +120,13 @@ def _check_options(mode: str, deformation: str, priors: str, scale: float, layer
         raise EncodeError(f"step_scale {scale!r}, expected a positive number")
 
 
-def _check_limits(symbols: list[LayerSymbols], payloads: list[bytes]) -> None:
-    """Hold every declared size against the format's limits as a decoder will, verified or not."""
+def _check_limits(scene: Scene, symbols: list[LayerSymbols], payloads: list[bytes]) -> None:
+    """Hold declared sizes and ranges of values against the format's limits as a decoder will, verified or not."""
     rows = 0
-    for layer, payload in zip(symbols, payloads, strict=True):
+    for index, (layer, payload) in enumerate(zip(symbols, payloads, strict=True)):
         try:
             read_meta(payload, layer.kind, rows, layer.raw)
+            check_last_layer(symbols[: index + 1], scene.info.voxel_size, _attribute_steps(scene))
         except DecodeError as error:
             raise EncodeError(f"the scene is over a limit of the format: {error}") from None
         rows += len(layer.anchor_q)

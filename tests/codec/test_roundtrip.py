@@ -243,6 +243,13 @@ def test_verification_notices_lost_rows_and_wrong_values(monkeypatch):
             encode(scene)
 
 
+@pytest.mark.parametrize("verify", [True, False])
+def test_positions_that_overflow_are_refused_verified_or_not(verify):
+    scene = make_scene(7, layers=(0,), anchors=20)
+    with pytest.raises(EncodeError, match="limit of the format: layer 0: a reconstructed value is not finite"):
+        encode(replace(scene, info=replace(scene.info, voxel_size=2.0**127)), effort=1, verify=verify)
+
+
 @given(st.sampled_from(sorted(GLOBAL_HEADS)), st.sampled_from(sorted(LOCAL_HEADS)))
 @settings(max_examples=3)
 def test_single_heads(global_head, local_head):
