@@ -235,7 +235,7 @@ def read_preamble(data):
 # unit ≥ 0 MUST hold." "coding mode: 0 ans, 1 lzma; others UnsupportedFeature" "deformation: 0 coded as symbols, 1
 # float32 (9.2); others UnsupportedFeature"
 def read_header(data):
-    header = fields(unpack(data), range(1, 13), range(1, 12), "header")
+    header = fields(unpack(data), range(1, 14), (*range(1, 12), 13), "header")
     for key, count in ((4, 3), (6, 6), (7, 2), (8, 3), (9, 2), (10, 3)):
         reals(header[key], f"header key {key}", count)
     for step in (header[5], *header[4]):
@@ -252,10 +252,18 @@ def read_header(data):
         need(fx > 0 and fy > 0, "a focal length that is not positive")
         for key in (3, 4):
             limited(camera[key], 65535, "camera size", 1)
+    read_error_bounds(header[13])
     read_chunk_list(a_list(header[1], "chunk list"))
     for key in (2, 3):
         registered(header[key], (0, 1), f"header key {key}")
     return header
+
+
+# 5.4 Error bounds: "Each value is a real B ≥ 0 in the unit of the tensors." "Keys 0..3 are required in the map"
+def read_error_bounds(value):
+    bounds = fields(value, range(8), range(4), "error bounds")
+    for key in set(bounds) & set(range(8)):
+        need(type(bounds[key]) is float and bounds[key] >= 0, f"error bound {bounds[key]!r}")
 
 
 # 5.2 Chunk list: "The first type MUST be 0; the types of layers among all entries MUST ascend, each at most once."
@@ -331,6 +339,9 @@ def read_parameters(layer, value):
     sections = fields(parameters[2], range(7), (), "sections")
     layer.networks = read_networks(layer.number, parameters[5]) if 5 in parameters else {}
     need(layer.networks or layer.number, "layer 0 without networks")
+    # 5.4: the classes 4 and 5 if layer 1 has a deformation, 6 and 7 if layer 2 has one.
+    classes = {2 + 2 * layer.number, 3 + 2 * layer.number} if layer.networks and layer.number else set()
+    need(classes <= set(layer.header[13]), "no error bound for a deformation")
     layer.raw = bool(layer.networks and layer.number and header_is_float32(layer.header))
     layer.rows = limited(parameters[1], (1 << 24) - layer.rows_before, "own rows")
     layer.sections = {s: limited(sections[s], (1 << 31) - 1, "a section", 1) for s in sections if s < 64}
@@ -1110,17 +1121,16 @@ def dequantise_layer(layer):
     layer.tensors |= layer.raw_values
 
 
-# 12.1 Order: "When the last layer asked for has been read: sums of masks, each voxel at most once over all layers,
-# and dequantisation."
-def finish(layers):
+# 12.1 Order: "For each layer chunk, before the next chunk is looked at: parameters and their limits, sections, the
+# ranges of 11.1 and 11.2, sums of masks, each voxel at most once over the layers so far, and dequantisation."
+def finish_last(layers):
     codes = []
     for layer in layers:
         codes = [code + rise for code, rise in zip(codes, layer.symbols["mask_rise"])] + layer.symbols["mask_own"]
         need(not codes or max(codes) <= 255, "a mask code over 255")
     anchors = [v for layer in layers for v in layer.symbols["anchor"]]
     need(len(set(zip(*[iter(anchors)] * 3))) == len(anchors) // 3, "a voxel holds more than one anchor")
-    for layer in layers:
-        dequantise_layer(layer)
+    dequantise_layer(layers[-1])
 
 
 # 12.1 Order: "Read preamble and header, then the chunks in order." "A decoder of prefix ℓ stops after the last layer ≤
@@ -1139,9 +1149,9 @@ def decode(data, max_layer=None):
         payload, scene_id, at = read_chunk(data, at, kind, size, scene_id, described)
         if kind < 3:
             layers.append(read_layer(payload, kind, rows, header))
+            finish_last(layers)
             rows += layers[-1].rows
     need(max_layer is not None or at == len(data), "bytes follow the last chunk")
-    finish(layers)
     return layers
 
 

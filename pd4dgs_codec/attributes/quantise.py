@@ -36,14 +36,21 @@ def quantise(x: np.ndarray, step: float, name: str = "tensor") -> np.ndarray:
     largest = float(np.abs(k).max()) if k.size else 0.0
     if largest > MAX_SYMBOL:
         raise EncodeError(f"{name}: symbol of magnitude {largest:.0f} at step {step:g}, expected at most {MAX_SYMBOL}")
-    if largest * step >= _TO_INFINITY:
+    if not all_finite(k, step):
         raise EncodeError(f"{name}: a value that comes back as infinity at step {step:g}, expected a finite one")
     return k.astype(np.int32)
 
 
+def all_finite(k: np.ndarray, step: float) -> bool:
+    """Whether dequantise(k, step) holds no infinity; |k| <= MAX_SYMBOL."""
+    if MAX_SYMBOL * step < _TO_INFINITY:
+        return True
+    return not k.size or max(int(k.max()), -int(k.min())) * step < _TO_INFINITY
+
+
 def dequantise(k: np.ndarray, step: float) -> np.ndarray:
     """x_hat = binary32(binary64(k) * binary64(step)), float32 of k's shape: an exact product and one rounding."""
-    with np.errstate(over="ignore"):  # an overflow to infinity is the caller's to refuse
+    with np.errstate(over="ignore"):  # an overflow to infinity is the caller's to refuse, see all_finite
         return (k.astype(np.float64) * np.float64(step)).astype(np.float32)
 
 

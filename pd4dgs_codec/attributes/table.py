@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -34,6 +35,14 @@ ATTRIBUTES: tuple[Attribute, ...] = (
 N_CHANNELS = sum(a.width for a in ATTRIBUTES)
 
 
+def attribute_rows(symbols: np.ndarray) -> Iterator[tuple[Attribute, np.ndarray]]:
+    """(attribute, its rows [width, n]) of channel-major symbols [N_CHANNELS, n]."""
+    first = 0
+    for a in ATTRIBUTES:
+        yield a, symbols[first : first + a.width]
+        first += a.width
+
+
 def quantise_attributes(values: dict[str, np.ndarray], steps: dict[str, float]) -> np.ndarray:
     """int32 [N_CHANNELS, n] symbols, channel-major, of float32 [n, *shape] per attribute name."""
     columns = [quantise(values[a.name].reshape(-1, a.width), steps[a.name], a.name).T for a in ATTRIBUTES]
@@ -42,9 +51,7 @@ def quantise_attributes(values: dict[str, np.ndarray], steps: dict[str, float]) 
 
 def dequantise_attributes(symbols: np.ndarray, steps: dict[str, float]) -> dict[str, np.ndarray]:
     """The inverse of quantise_attributes: float32 [n, *shape] per attribute name, C-contiguous."""
-    values, first = {}, 0
-    for a in ATTRIBUTES:
-        rows = np.ascontiguousarray(symbols[first : first + a.width].T)
-        values[a.name] = dequantise(rows, steps[a.name]).reshape(-1, *a.shape)
-        first += a.width
-    return values
+    return {
+        a.name: dequantise(np.ascontiguousarray(rows.T), steps[a.name]).reshape(-1, *a.shape)
+        for a, rows in attribute_rows(symbols)
+    }

@@ -12,6 +12,8 @@ from pd4dgs_codec.cli.files import STDIO, read_bytes
 DETAILS = """\
 Times to the first frame are 8 * (bytes up to the end of layer 0) / rate: the network alone, no latency.
 Of a URL (http, https) only the header is fetched, unless --check or --hashes need everything.
+Error bounds are the encoder's word on how far a decoded value lies at most from the one given to it. What they would
+be after rounding to the nearest symbol follows from the file, and --check compares: the errors themselves do not.
 
 examples:
   pd4dgs-info scene.pd4
@@ -46,15 +48,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _info(args: argparse.Namespace, console: Console) -> int:
     data, total = _input(args, console)
-    from pd4dgs_codec.codec.decoder import decode
-    from pd4dgs_codec.codec.info import hashes, info
+    from pd4dgs_codec.codec.info import hashes, info, nearest_bounds
 
     result = {"input": args.input, **info(data), "available": total}
     end = result["layers"][0]["end"]
     result["first_frame_seconds"] = {name: 8 * end / rate for name, rate in args.at.items()}
     result["left_out"] = _left_out(result["layers"])
     if args.check:
-        decode(data)
+        result["nearest_bounds"] = nearest_bounds(data)
         result["checked"] = True
     if args.hashes:
         result["hashes"] = hashes(data)
@@ -103,6 +104,16 @@ def _left_out(layers: list[dict[str, Any]]) -> list[dict[str, str]]:
     return [{"what": what, "why": why} for what in missing]
 
 
+def _bound_lines(declared: dict[str, float], nearest: dict[str, float]) -> list[str]:
+    other = [what for what, bound in nearest.items() if declared[what] != bound]
+    if not other:
+        return ["checked: error bounds are those of rounding to the nearest symbol"]
+    return [
+        f"error bound of {what}: {declared[what]:.9g} declared, {nearest[what]:.9g} by rounding to the nearest symbol"
+        for what in other
+    ]
+
+
 def _text(result: dict[str, Any]) -> str:
     name = "stdin" if result["input"] == STDIO else result["input"]
     cut = "" if result["available"] >= result["bytes"] else f", of which {result['available']:,} are here"
@@ -120,10 +131,12 @@ def _text(result: dict[str, Any]) -> str:
             ],
         ),
         *(f"left out: {item['what']} ({item['why']})" for item in result["left_out"]),
+        "errors at most: " + ", ".join(f"{what} {bound:.4g}" for what, bound in result["error_bounds"].items()),
         "first frame: " + ", ".join(f"{s:.2f} s at {rate}bps" for rate, s in result["first_frame_seconds"].items()),
     ]
     if result.get("checked"):
         lines.append("checked: every layer decodes")
+        lines += _bound_lines(result["error_bounds"], result["nearest_bounds"])
     for row in result.get("hashes", []):
         lines.append(f"layer {row['layer']}: symbols {row['symbols']}")
         lines.append(f"layer {row['layer']}: tensors {row['tensors']}")

@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from pd4dgs_codec.delivery.package import Video
+    from pd4dgs_codec.scene import Scene
 
 DETAILS = """\
 DIR then holds scene.pd4, index.json (byte ranges and SHA-256 of the layers), scene.mp4 and scene.mpd (DASH: each
@@ -53,31 +54,35 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _package(args: argparse.Namespace, console: Console) -> int:
     data = read_bytes(args.input)
-    from pd4dgs_codec.codec.decoder import decode
     from pd4dgs_codec.delivery.package import package
 
-    decode(data)  # before any rendering
-    video, why_not = (None, "--no-video") if args.no_video else _video(data, args)
-    if why_not and not args.no_video:
-        console.message(f"pd4dgs-package: no 2D video: {why_not}")
-    files = package(data, video)
+    why_not: str | None = "--no-video"
+
+    def render(scene: Scene) -> Video | None:
+        nonlocal why_not
+        video, why_not = _video(scene, args)
+        if why_not:
+            console.message(f"pd4dgs-package: no 2D video: {why_not}")
+        return video
+
+    files = package(data, None if args.no_video else render)
     names = [str(Path(args.output) / name) for name in files]
     with whole_files(names[0], names, args.overwrite) as temporaries:
         for temporary, content in zip(temporaries, files.values(), strict=True):
             temporary.write_bytes(content)
     rows = [{"name": name, "bytes": len(content)} for name, content in files.items()]
-    result = {"input": args.input, "output": args.output, "files": rows, "video": video is not None}
+    result = {"input": args.input, "output": args.output, "files": rows, "video": why_not is None}
     console.result(result | {"why_no_video": why_not}, _text(result), on_stdout=False)
     return OK
 
 
-def _video(data: bytes, args: argparse.Namespace) -> tuple[Video | None, str | None]:
+def _video(scene: Scene, args: argparse.Namespace) -> tuple[Video | None, str | None]:
     """(video, None), or (None, why there is none)."""
     from pd4dgs_codec.errors import RenderError
 
     use_threads(args)  # a wrong --threads is an error, not a reason to do without
     try:
-        return _render(data, args.fps), None
+        return _render(scene, args.fps), None
     except ModuleNotFoundError as error:
         if (error.name or "").startswith("pd4dgs_codec"):
             raise
@@ -86,28 +91,27 @@ def _video(data: bytes, args: argparse.Namespace) -> tuple[Video | None, str | N
         return None, str(error)
 
 
-def _render(data: bytes, fps: float) -> Video:
+def _render(scene: Scene, fps: float) -> Video:
     import tempfile
 
     from pd4dgs_codec.delivery.package import Video
     from pd4dgs_codec.errors import RenderError
     from pd4dgs_codec.report.frames import own_frames
-    from pd4dgs_codec.report.levels import load_levels
+    from pd4dgs_codec.report.levels import level_of
     from pd4dgs_codec.report.movie import check_mp4, write_mp4
 
     check_mp4()
-    level = load_levels(data)[-1]
-    low, high = level.model.info.time_range
+    low, high = scene.info.time_range
     count = max(2, round((high - low) * fps)) if high > low else STILL_FRAMES
     if count > MAX_FRAMES:
         raise RenderError(f"it would have {count:,} frames, expected at most {MAX_FRAMES:,}; choose a lower --fps")
-    frames = own_frames(level.model.info, count)
+    frames = own_frames(scene.info, count)
     camera = frames[0].camera
     if min(camera.width, camera.height) < 2:
         raise RenderError(f"the file's camera has {camera.width}x{camera.height} pixels, a video takes 2x2 or more")
     with tempfile.TemporaryDirectory(prefix="pd4dgs-") as folder, progress_bar(len(frames), "frames", "video") as step:
         path = Path(folder) / "video.mp4"
-        write_mp4(_pictures(frames, level, step), path, fps, fragment=max(1, round(FRAGMENT_SECONDS * fps)))
+        write_mp4(_pictures(frames, level_of(scene), step), path, fps, fragment=max(1, round(FRAGMENT_SECONDS * fps)))
         return Video(path.read_bytes(), camera.width // 2 * 2, camera.height // 2 * 2, fps)
 
 

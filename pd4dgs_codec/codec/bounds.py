@@ -2,11 +2,13 @@
 
 By clause 11.5 and half-to-even rounding |x - x_hat| <= Q/2, plus half a unit in the last place of x_hat: the product
 k Q is rounded to binary32 once. Voxel indices and mask codes are integers and come back as they are.
+
+The header declares one bound per class of tensors (clause "error bounds"), the classes being the fields of Steps.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,8 +25,7 @@ _TIES = 2.0**-29
 @dataclass(frozen=True)
 class ErrorBound:
     """Of all tensors that share a step. what: that field of Steps. step: Q, 0 where values are stored as they are.
-    bound: the largest error allowed to the largest of the values; largest: the largest error there is. In the unit of
-    the values."""
+    bound: the error that the header declares; largest: the largest error there is. In the unit of the values."""
 
     what: str
     step: float
@@ -32,38 +33,61 @@ class ErrorBound:
     largest: float
 
 
-def error_bounds(given: Scene, decoded: Scene, raw_deformation: bool) -> list[ErrorBound]:
-    """One per field of Steps that the scenes' tensors use, in the order of Steps.
+def rounding_bounds(decoded: Scene, raw_deformation: bool) -> dict[str, float]:
+    """By field of Steps that the scene's tensors use: what bounds the error of them all if each value was rounded to
+    the nearest symbol, rounded up to binary32."""
+    bounds: dict[str, float] = {}
+    for what, step, restored in _tensors(decoded, raw_deformation):
+        largest = np.abs(restored).max(initial=np.float32(0))
+        bounds[what] = max(bounds.get(what, 0.0), float(_bounds(largest, step)))
+    return {what: _rounded_up(bound) for what, bound in bounds.items()}
+
+
+def verify_errors(
+    given: Scene, decoded: Scene, declared: Mapping[str, float], raw_deformation: bool
+) -> list[ErrorBound]:
+    """One row per entry of `declared`, the bounds in the header of the file.
 
     given: the planned scene, its steps those of the file; decoded: what the file holds, of the same rows and shapes.
-    Raises EncodeError naming the field if any value lies farther off than its own bound.
+    Raises EncodeError naming the field if any value lies farther off than declared, or than rounding takes it.
     """
-    found: dict[str, ErrorBound] = {}
-    for (what, raw, x), (_, _, restored) in zip(_tensors(given), _tensors(decoded), strict=True):
-        step = 0.0 if raw and raw_deformation else getattr(given.steps, what)
+    steps, largest = dict.fromkeys(declared, 0.0), dict.fromkeys(declared, 0.0)
+    pairs = zip(_tensors(given, raw_deformation), _tensors(decoded, raw_deformation), strict=True)
+    for (what, step, x), (_, _, restored) in pairs:
         errors = np.abs(x.astype(np.float64) - restored)
-        units = np.spacing(np.abs(restored)).astype(np.float64) if step else np.zeros(1)
-        bounds = (0.5 + _TIES) * step + 0.5 * units
+        bounds = np.minimum(_bounds(np.abs(restored), step), declared[what])
         if not (errors <= bounds).all():
             place = np.unravel_index(int((errors - bounds).argmax()), errors.shape)
-            row = f"{what}: {x[place]!r} comes back as {restored[place]!r} at step {step:g}"
-            raise EncodeError(f"verification: {row}, expected at most half a step between them")
-        before = found.get(what, ErrorBound(what, step, 0.0, 0.0))
-        bound, largest = float(bounds.max(initial=before.bound)), float(errors.max(initial=before.largest))
-        found[what] = ErrorBound(what, step, bound, largest)
-    return [found[what] for what in vars(given.steps) if what in found]
+            row = f"{what}: {x[place]} comes back as {restored[place]} at step {step:g}"
+            raise EncodeError(f"verification: {row}, expected at most {bounds[place]:.9g} between them")
+        steps[what], largest[what] = step, max(largest[what], float(errors.max(initial=0.0)))
+    return [ErrorBound(what, steps[what], bound, largest[what]) for what, bound in declared.items()]
 
 
-def _tensors(scene: Scene) -> Iterator[tuple[str, bool, np.ndarray]]:
-    """(field of Steps, whether it belongs to a deformation, float32 values)."""
+def _bounds(magnitude: np.ndarray, step: float) -> np.ndarray:
+    """float64 error bounds of decoded values of that float32 magnitude; step 0: stored as they are."""
+    return (0.5 + _TIES) * step + 0.5 * np.spacing(magnitude).astype(np.float64) * (step > 0)
+
+
+def _rounded_up(value: float) -> float:
+    """The least binary32 value that is not below."""
+    nearest = np.float32(value)
+    return float(nearest if nearest >= value else np.nextafter(nearest, np.float32(np.inf)))
+
+
+def _tensors(scene: Scene, raw_deformation: bool) -> Iterator[tuple[str, float, np.ndarray]]:
+    """(field of Steps, step or 0 for values that are stored as they are, float32 values)."""
     for attribute in ATTRIBUTES:
-        yield attribute.name, False, getattr(scene, attribute.name)
+        yield attribute.name, getattr(scene.steps, attribute.name), getattr(scene, attribute.name)
     for kind in LAYER_KINDS:
         deformation = getattr(scene, kind.deformation) if kind.deformation else None
         networks = scene.networks if kind.deformation is None else deformation.networks if deformation else {}
+        raw = raw_deformation and kind.deformation is not None
         if deformation and kind.planes_step:
+            step = 0.0 if raw else getattr(scene.steps, kind.planes_step)
             for scale in deformation.planes:
-                yield from ((kind.planes_step, True, scale[name]) for name, _, _ in PLANES)
+                yield from ((kind.planes_step, step, scale[name]) for name, _, _ in PLANES)
+        step = 0.0 if raw else getattr(scene.steps, kind.weights_step)
         for name in kind.network_ids:
             for pair in networks.get(name, ()):
-                yield from ((kind.weights_step, kind.deformation is not None, array) for array in pair)
+                yield from ((kind.weights_step, step, array) for array in pair)

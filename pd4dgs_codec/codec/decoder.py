@@ -6,7 +6,7 @@ from pd4dgs_codec.bitstream.container import PREAMBLE_SIZE, read_chunk, read_pre
 from pd4dgs_codec.codec.header import Header, scene_id_of, unpack_header
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
 from pd4dgs_codec.codec.layers import read_layer
-from pd4dgs_codec.codec.symbols import LayerSymbols, assemble
+from pd4dgs_codec.codec.symbols import LayerSymbols, assemble, check_last_layer
 from pd4dgs_codec.errors import DecodeError, Malformed, Truncated, UnsupportedFeature
 from pd4dgs_codec.scene import Scene
 
@@ -30,10 +30,7 @@ class LayerReader:
     def scene(self) -> Scene:
         """The scene of the layers read so far, at least one."""
         assert self.header is not None
-        try:
-            return assemble(self.header.info, self.header.attribute_steps, self.layers)
-        except DecodeError as error:
-            raise _located(error, self._index - 1, self.offset) from None
+        return assemble(self.header.info, self.header.attribute_steps, self.layers)
 
     def next_layer(self, data: bytes | bytearray, max_layer: int | None = None) -> LayerSymbols | None:
         """Read on to the end of one more layer <= max_layer; None if the file has no more (clause "decoding process").
@@ -82,6 +79,8 @@ class LayerReader:
             rows_before = sum(len(layer.anchor_q) for layer in self.layers)
             try:
                 layer = read_layer(chunk.payload, kind, rows_before, self.header.mode, self.header.raw_deformation)
+                check_last_layer([*self.layers, layer], self.header.info.voxel_size, self.header.attribute_steps)
+                _check_bounded(layer, self.header)
             except DecodeError as error:
                 raise _located(error, self._index, self.offset) from None
         self._index += 1
@@ -91,6 +90,13 @@ class LayerReader:
 
 def _any_layer(chunks: tuple[tuple[int, int], ...], max_layer: int) -> bool:
     return any(kind in BY_CHUNK_TYPE and BY_CHUNK_TYPE[kind].layer <= max_layer for kind, _ in chunks)
+
+
+def _check_bounded(layer: LayerSymbols, header: Header) -> None:
+    """Raise Malformed unless the header has an error bound for every class of tensors in `layer`."""
+    missing = [name for name in layer.steps if name not in header.error_bounds]
+    if missing:
+        raise Malformed(f"layer {layer.kind.layer}: no error bound of {missing[0]} in the header, expected one")
 
 
 def _located(error: DecodeError, chunk: int, offset: int) -> DecodeError:

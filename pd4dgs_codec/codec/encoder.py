@@ -9,15 +9,17 @@ import numpy as np
 
 from pd4dgs_codec.attributes.table import ATTRIBUTES
 from pd4dgs_codec.bitstream.container import write_chunk, write_preamble
-from pd4dgs_codec.codec.bounds import ErrorBound, error_bounds
+from pd4dgs_codec.codec.bounds import ErrorBound, rounding_bounds, verify_errors
 from pd4dgs_codec.codec.check import check_scene
 from pd4dgs_codec.codec.decoder import decode_layers
 from pd4dgs_codec.codec.header import DEFORMATIONS, MODES, Header, pack_header, scene_id_of
+from pd4dgs_codec.codec.kinds import LAYER_KINDS
 from pd4dgs_codec.codec.layers import Coding, StreamReport, read_meta, write_layer
 from pd4dgs_codec.codec.plan import LeftOut, plan
 from pd4dgs_codec.codec.symbols import (
     LayerSymbols,
     assemble,
+    check_last_layer,
     float_tensors,
     layer_symbols,
     quantise_deformation,
@@ -47,7 +49,7 @@ class LayerReport:
 @dataclass(frozen=True)
 class Report:
     """What encode did. left_out rows hold what, why and bytes: what it would have cost, by the same coder. errors: how
-    far decoded values may lie from those given and how far they do, empty if not verified."""
+    far by the header decoded values may lie from those given and how far they do, empty if not verified."""
 
     mode: str
     bytes: int
@@ -83,7 +85,7 @@ def encode_with_report(
     mode: "ans", or "lzma" for the same symbols under LZMA2. deformation: "coded" or "float32". priors: "best" or
     "gauss". step_scale multiplies every quantisation step. layers: "auto" leaves out deformations that do nothing,
     0, 1 or 2 keeps the layers up to that number. effort: 1..9. verify: decode the result, compare every symbol and
-    every float, and hold every float against its error bound. Raises EncodeError.
+    every float, and hold every float against the error bound in the header. Raises EncodeError.
     """
     started = time.perf_counter()
     _check_options(mode, deformation, priors, step_scale, layers, effort)
@@ -93,9 +95,10 @@ def encode_with_report(
     planned, left_out = plan(scene, layers, deformation == "float32")
     symbols = [layer_symbols(planned, i, deformation == "float32") for i in range(len(planned.layers))]
     written = [write_layer(layer, coding) for layer in symbols]
-    _check_limits(symbols, [payload for payload, _ in written])
-    data = _container(planned, mode, deformation, symbols, [payload for payload, _ in written])
-    errors = _verify(data, planned, symbols, deformation == "float32") if verify else []
+    _check_limits(planned, symbols, [payload for payload, _ in written])
+    meant = assemble(planned.info, _attribute_steps(planned), symbols)
+    data = _container(meant, mode, deformation, [payload for payload, _ in written])
+    errors = _verify(data, planned, symbols, meant) if verify else []
     reports = [_layer_report(layer, payload, r) for layer, (payload, r) in zip(symbols, written, strict=True)]
     rows = [_left_out_row(item, scene, coding, deformation, reports) for item in left_out]
     seconds = round(time.perf_counter() - started, 4)
@@ -117,25 +120,32 @@ def _check_options(mode: str, deformation: str, priors: str, scale: float, layer
         raise EncodeError(f"step_scale {scale!r}, expected a positive number")
 
 
-def _check_limits(symbols: list[LayerSymbols], payloads: list[bytes]) -> None:
-    """Hold every declared size against the format's limits as a decoder will, verified or not."""
+def _check_limits(scene: Scene, symbols: list[LayerSymbols], payloads: list[bytes]) -> None:
+    """Hold declared sizes and ranges of values against the format's limits as a decoder will, verified or not."""
     rows = 0
-    for layer, payload in zip(symbols, payloads, strict=True):
+    for index, (layer, payload) in enumerate(zip(symbols, payloads, strict=True)):
         try:
             read_meta(payload, layer.kind, rows, layer.raw)
+            check_last_layer(symbols[: index + 1], scene.info.voxel_size, _attribute_steps(scene))
         except DecodeError as error:
             raise EncodeError(f"the scene is over a limit of the format: {error}") from None
         rows += len(layer.anchor_q)
 
 
-def _container(scene: Scene, mode: str, deformation: str, symbols: list[LayerSymbols], payloads: list[bytes]) -> bytes:
-    types = [layer.kind.chunk_type for layer in symbols]
+def _attribute_steps(scene: Scene) -> dict[str, float]:
+    return {a.name: getattr(scene.steps, a.name) for a in ATTRIBUTES}
+
+
+def _container(meant: Scene, mode: str, deformation: str, payloads: list[bytes]) -> bytes:
+    """The file of a scene as it will be decoded, from the payloads of its layers."""
+    types = [LAYER_KINDS[layer].chunk_type for layer in meant.layers]
     header = Header(
         chunks=tuple(zip(types, map(len, payloads), strict=True)),
         mode=mode,
         deformation=deformation,
-        attribute_steps={a.name: getattr(scene.steps, a.name) for a in ATTRIBUTES},
-        info=scene.info,
+        attribute_steps=_attribute_steps(meant),
+        info=meant.info,
+        error_bounds=rounding_bounds(meant, deformation == "float32"),
     )
     packed = pack_header(header)
     scene_id = scene_id_of(packed, payloads[0])
@@ -143,24 +153,23 @@ def _container(scene: Scene, mode: str, deformation: str, symbols: list[LayerSym
     return b"".join([write_preamble(packed), *chunks])
 
 
-def _verify(data: bytes, planned: Scene, meant: list[LayerSymbols], raw_deformation: bool) -> list[ErrorBound]:
-    """Decode `data`, compare all integers with those meant, all floats with those the integers stand for, and these
-    with the ones given."""
+def _verify(data: bytes, planned: Scene, symbols: list[LayerSymbols], meant: Scene) -> list[ErrorBound]:
+    """Decode `data`, compare all integers with `symbols`, all floats with those `meant`, which the integers stand for,
+    and these with the ones given, those of `planned`."""
     try:
         header, decoded, _ = decode_layers(data)
         scene = assemble(header.info, header.attribute_steps, decoded)
-        expected = assemble(planned.info, header.attribute_steps, meant)
     except DecodeError as error:
         raise EncodeError(f"verification: the file does not decode: {error}") from error
     if scene.layers != planned.layers or scene.rows != planned.rows:
         meant_rows = f"{planned.layers}, {planned.rows}"
         raise EncodeError(f"verification: layers and rows {scene.layers}, {scene.rows}; meant {meant_rows}")
-    for index, (got, want) in enumerate(zip(decoded, meant, strict=True)):
+    for index, (got, want) in enumerate(zip(decoded, symbols, strict=True)):
         if got.steps != want.steps or not _same(got.arrays(), want.arrays()):
             raise EncodeError(f"verification: layer {want.kind.layer} decodes to other symbols")
-        if not _same(float_tensors(scene, index), float_tensors(expected, index)):
+        if not _same(float_tensors(scene, index), float_tensors(meant, index)):
             raise EncodeError(f"verification: layer {want.kind.layer} decodes to other values")
-    return error_bounds(planned, scene, raw_deformation)
+    return verify_errors(planned, scene, header.error_bounds, header.raw_deformation)
 
 
 def _same(a: list[np.ndarray], b: list[np.ndarray]) -> bool:

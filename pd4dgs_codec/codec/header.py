@@ -23,22 +23,42 @@ MODES = {"ans": 0, "lzma": 1}
 DEFORMATIONS = {"coded": 0, "float32": 1}
 
 # Keys of the header map.
-CHUNKS, MODE, DEFORMATION, STEPS, VOXEL_SIZE, BOX, TIME_RANGE, BACKGROUND, NEAR_FAR, UP, UNIT, CAMERA = range(1, 13)
+CHUNKS, MODE, DEFORMATION, STEPS, VOXEL_SIZE, BOX, TIME_RANGE, BACKGROUND, NEAR_FAR, UP, UNIT = range(1, 12)
+CAMERA, ERROR_BOUNDS = 12, 13
 # Keys of the camera map.
 VIEWMAT, INTRINSICS, WIDTH, HEIGHT = range(1, 5)
+
+#: Keys of the map of error bounds, by field of Steps.
+TENSOR_CLASSES = {
+    "feature": 0,
+    "scaling_log": 1,
+    "offset": 2,
+    "weights_scaffold": 3,
+    "planes_global": 4,
+    "weights_global": 5,
+    "planes_local": 6,
+    "weights_local": 7,
+}
+#: What every layer 0 has; the other classes belong to layers that a file may do without.
+ALWAYS_BOUNDED = (*(a.name for a in ATTRIBUTES), LAYER_KINDS[0].weights_step)
 
 MAX_CAMERA_SIDE = 65535
 
 
 @dataclass(frozen=True, eq=False)
 class Header:
-    """chunks: (type, payload length in bytes) in file order. attribute_steps: by name, in the table's order."""
+    """chunks: (type, payload length in bytes) in file order. attribute_steps: by name, in the table's order.
+
+    error_bounds: by field of Steps, how far a decoded value may lie from the one that the encoder was given, in the
+    unit of the values; a binary32 value >= 0.
+    """
 
     chunks: tuple[tuple[int, int], ...]
     mode: str
     deformation: str
     attribute_steps: dict[str, float]
     info: SceneInfo
+    error_bounds: dict[str, float]
 
     @property
     def raw_deformation(self) -> bool:
@@ -74,12 +94,14 @@ def pack_header(header: Header) -> bytes:
             WIDTH: int(camera.width),
             HEIGHT: int(camera.height),
         }
+    bounds = header.error_bounds
+    fields[ERROR_BOUNDS] = {number: bounds[name] for name, number in TENSOR_CLASSES.items() if name in bounds}
     return canonical.pack(fields)
 
 
 def unpack_header(data: bytes, offset: int = 0) -> Header:
     """The inverse of pack_header (clause "header"); `offset` is that of the header's first byte, for messages."""
-    fields = Fields(canonical.unpack(data, offset=offset), "header", set(range(CHUNKS, CAMERA + 1)))
+    fields = Fields(canonical.unpack(data, offset=offset), "header", set(range(CHUNKS, ERROR_BOUNDS + 1)))
     steps = fields.reals(STEPS, len(ATTRIBUTES))
     voxel_size = fields.real(VOXEL_SIZE)
     for name, step in zip(["voxel_size", *(a.name for a in ATTRIBUTES)], [voxel_size, *steps], strict=True):
@@ -109,6 +131,7 @@ def unpack_header(data: bytes, offset: int = 0) -> Header:
         deformation=fields.choice(DEFORMATION, DEFORMATIONS),
         attribute_steps={a.name: step for a, step in zip(ATTRIBUTES, steps, strict=True)},
         info=info,
+        error_bounds=_unpack_error_bounds(fields.get(ERROR_BOUNDS)),
     )
 
 
@@ -139,6 +162,19 @@ def _unpack_chunks(rows: list) -> tuple[tuple[int, int], ...]:
     if chunks[0][0] != 0 or layers != sorted(set(layers)):
         raise Malformed(f"header: layer chunks {layers}, expected layer 0 first and each layer once, ascending")
     return tuple(chunks)
+
+
+def _unpack_error_bounds(data: object) -> dict[str, float]:
+    fields = Fields(data, "header error bounds", set(TENSOR_CLASSES.values()))
+    bounds = {
+        name: fields.real(number)
+        for name, number in TENSOR_CLASSES.items()
+        if number in fields or name in ALWAYS_BOUNDED
+    }
+    for name, bound in bounds.items():
+        if bound < 0:
+            raise Malformed(f"header: error bound {bound!r} of {name}, expected 0 or more")
+    return bounds
 
 
 def _unpack_camera(data: object) -> Camera:

@@ -7,6 +7,7 @@ import hashlib
 import numpy as np
 
 from pd4dgs_codec.bitstream.container import CHUNK_OVERHEAD, MAJOR, MINOR, PREAMBLE_SIZE, read_chunk, read_preamble
+from pd4dgs_codec.codec.bounds import rounding_bounds
 from pd4dgs_codec.codec.decoder import LayerReader
 from pd4dgs_codec.codec.header import unpack_header
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
@@ -51,12 +52,25 @@ def info(data: bytes) -> dict:
         "deformation": header.deformation,
         "voxel_size": header.info.voxel_size,
         "steps": header.attribute_steps,
+        "error_bounds": header.error_bounds,
         "anchors": rows if all("anchors" in row for row in layers) else None,
         "time_range": list(header.info.time_range),
         "camera": header.info.camera is not None,
         "layers": layers,
         "chunks": others,
     }
+
+
+def nearest_bounds(data: bytes) -> dict[str, float]:
+    """By field of Steps the error bounds that a complete file would have if its encoder rounded to the nearest symbol.
+
+    Decodes all of it. They can be held against the declared ones, where the errors themselves take the scene encoded.
+    """
+    reader = LayerReader()
+    while reader.next_layer(data) is not None:
+        pass
+    assert reader.header is not None
+    return rounding_bounds(reader.scene(), reader.header.raw_deformation)
 
 
 def hashes(data: bytes, max_layer: int | None = None) -> list[dict]:

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pd4dgs_codec.attributes.quantise import dequantise, quantise
-from pd4dgs_codec.attributes.table import ATTRIBUTES, dequantise_attributes, quantise_attributes
+from pd4dgs_codec.attributes.quantise import all_finite, dequantise, quantise
+from pd4dgs_codec.attributes.table import ATTRIBUTES, attribute_rows, dequantise_attributes, quantise_attributes
 from pd4dgs_codec.codec.kinds import LAYER_KINDS, LayerKind
 from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.scene import PLANES, Deformation, Network, Scene, SceneInfo, Steps
@@ -23,7 +23,8 @@ class LayerSymbols:
     anchor_q: int32 [n, 3] voxel indices of the layer's own anchors. mask_increase: int32 [rows before] rise of the
     earlier anchors' mask codes, mask_own: int32 [n] codes of its own. attributes: int32 [68, n].
     planes, networks: int32 symbols, or float32 values if `raw`; networks in the order of their registry ids.
-    steps: quantisation steps of this layer's planes and weights, by field of Steps; empty if it has no networks.
+    steps: quantisation steps of this layer's planes (if it has any), then weights, by field of Steps; empty if it has
+    no networks.
     """
 
     kind: LayerKind
@@ -123,21 +124,16 @@ def _network_symbols(
 
 
 def assemble(info: SceneInfo, attribute_steps: dict[str, float], layers: Sequence[LayerSymbols]) -> Scene:
-    """The decoded scene of a prefix of layers (clause "dequantisation"). Steps of absent tensors keep Steps' defaults.
+    """The decoded scene of a prefix of layers (clause "dequantisation"), each of which check_last_layer let pass.
 
-    Raises Malformed if a mask code leaves 0..255, a voxel occurs twice, or a reconstructed value is not finite.
+    Steps of absent tensors keep Steps' defaults.
     """
     steps = Steps(**attribute_steps, **{k: v for layer in layers for k, v in layer.steps.items()})
     attributes = np.concatenate([layer.attributes for layer in layers], axis=1)
     values = dequantise_attributes(attributes, attribute_steps)
-    masks: list[np.ndarray] = []
-    for layer in layers:
-        raised = masks[-1] + layer.mask_increase if masks else layer.mask_increase
-        masks.append(np.concatenate([raised, layer.mask_own]))
-        if masks[-1].size and masks[-1].max() > 255:
-            raise Malformed(f"layer {layer.kind.layer}: mask code {int(masks[-1].max())}, expected at most 255")
+    masks = _mask_codes(layers)
     tensors = {layer.kind.layer: _dequantised_networks(layer, steps) for layer in layers}
-    scene = Scene(
+    return Scene(
         info=info,
         steps=steps,
         layers=tuple(layer.kind.layer for layer in layers),
@@ -151,8 +147,43 @@ def assemble(info: SceneInfo, attribute_steps: dict[str, float], layers: Sequenc
         global_deformation=tensors.get(1) if 1 in tensors and tensors[1].networks else None,
         local_deformation=tensors.get(2) if 2 in tensors and tensors[2].networks else None,
     )
-    _check_scene(scene)
-    return scene
+
+
+def _mask_codes(layers: Sequence[LayerSymbols]) -> list[np.ndarray]:
+    """int32 codes of all rows so far, per layer: sums of the rises (clause "masks")."""
+    masks: list[np.ndarray] = []
+    for layer in layers:
+        raised = masks[-1] + layer.mask_increase if masks else layer.mask_increase
+        masks.append(np.concatenate([raised, layer.mask_own]))
+    return masks
+
+
+def check_last_layer(layers: Sequence[LayerSymbols], voxel_size: float, attribute_steps: dict[str, float]) -> None:
+    """The rules for a layer that its payload alone cannot show broken, given the header and the layers before it.
+
+    Raises Malformed if a mask code is above 255, a voxel is taken, or a reconstructed value would not be finite.
+    """
+    layer, *before = layers[-1], *layers[:-1]
+    codes = _mask_codes(layers)[-1]
+    if codes.size and codes.max() > 255:
+        raise Malformed(f"layer {layer.kind.layer}: mask code {int(codes.max())}, expected at most 255")
+    if len(layer.anchor_q) and any(len(other.anchor_q) for other in before):  # within a layer voxels differ anyway
+        row = first_duplicate(np.concatenate([other.anchor_q for other in layers]))
+        if row is not None:
+            raise Malformed(f"voxel {row.tolist()} holds more than one anchor, expected one")
+    if not all(all_finite(k, step) for k, step in _with_steps(layer, voxel_size, attribute_steps)):
+        raise Malformed(f"layer {layer.kind.layer}: a reconstructed value is not finite")
+
+
+def _with_steps(
+    layer: LayerSymbols, voxel_size: float, attribute_steps: dict[str, float]
+) -> Iterator[tuple[np.ndarray, float]]:
+    """(symbols, their step) of everything in `layer` that is dequantised."""
+    yield layer.anchor_q, voxel_size
+    yield from ((rows, attribute_steps[a.name]) for a, rows in attribute_rows(layer.attributes))
+    if not layer.raw:
+        planes, steps = len(PLANES) * len(layer.planes), list(layer.steps.values())
+        yield from ((k, steps[0 if i < planes else -1]) for i, k in enumerate(layer.tensors()))
 
 
 def _dequantised_networks(layer: LayerSymbols, steps: Steps) -> Deformation:
@@ -186,12 +217,3 @@ def first_duplicate(anchor_q: np.ndarray) -> np.ndarray | None:
     ordered = anchor_q[np.lexsort(anchor_q.T)]
     same = np.flatnonzero((ordered[1:] == ordered[:-1]).all(axis=1))
     return ordered[same[0]] if same.size else None
-
-
-def _check_scene(scene: Scene) -> None:
-    row = first_duplicate(scene.anchor_q)
-    if row is not None:
-        raise Malformed(f"voxel {row.tolist()} holds more than one anchor, expected one")
-    for index, layer in enumerate(scene.layers):
-        if not all(np.isfinite(a).all() for a in float_tensors(scene, index)):
-            raise Malformed(f"layer {layer}: a reconstructed value is not finite")

@@ -11,6 +11,7 @@ import hashlib
 import json
 import math
 import xml.etree.ElementTree as ElementTree
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,6 +19,7 @@ from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.info import info
 from pd4dgs_codec.delivery import mp4
 from pd4dgs_codec.errors import DeliveryError
+from pd4dgs_codec.scene import Scene
 
 SCENE, SEGMENTS, MPD, PLAYLIST, INDEX = "scene.pd4", "scene.mp4", "scene.mpd", "scene.m3u8", "index.json"
 VIDEO, VIDEO_PLAYLIST = "fallback.mp4", "fallback.m3u8"
@@ -48,17 +50,19 @@ class Part:
     segment: tuple[int, int]
 
 
-def package(data: bytes, video: Video | None = None) -> dict[str, bytes]:
+def package(data: bytes, render: Callable[[Scene], Video | None] | None = None) -> dict[str, bytes]:
     """Name -> content of every file of the folder.
 
-    Raises DecodeError unless `data` is a whole, valid `.pd4` file, DeliveryError for one too long or large to wrap.
+    render: makes the 2D rendition of the decoded scene, if it can. Raises DecodeError unless `data` is a whole, valid
+    `.pd4` file, DeliveryError for one too long or large to wrap, both before anything is rendered.
     """
-    decode(data)
+    scene = decode(data)
     low, high = info(data)["time_range"]
     seconds = high - low if high > low else STILL_SECONDS
     if seconds > MAX_SECONDS:
         raise DeliveryError(f"the scene lasts {seconds:g} s, DASH takes at most {MAX_SECONDS:,}")
     segments, init, parts = _segments(data, seconds)
+    video = render(scene) if render is not None else None
     files = {SCENE: data, SEGMENTS: segments}
     files[MPD] = _manifest(init, parts, seconds, video)
     if video is not None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,7 @@ from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.render.picture import render_image
-from pd4dgs_codec.scene import MASK_THRESHOLD, Camera
+from pd4dgs_codec.scene import MASK_THRESHOLD, Camera, Scene
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,11 @@ class Level:
     def picture(self, camera: Camera, time: float) -> np.ndarray:
         """float32 [H, W, 3] in 0..1 at normalised time 0..1."""
         return render_image(self.model, self.level, time, camera.viewmat, camera.K, camera.width, camera.height)
+
+
+def level_of(scene: Scene, device: str = "cpu") -> Level:
+    """The highest level of a decoded scene."""
+    return Level(scene.level, from_scene(scene).to(device), int((scene.mask[-1] > 0).sum()))
 
 
 def load_levels(file: str | Path | bytes, max_layer: int | None = None, device: str = "cpu") -> list[Level]:
@@ -61,8 +66,7 @@ def _of_bytes(data: bytes, max_layer: int | None, device: str) -> list[Level]:
         start = time.perf_counter()
         scene = decode(data[: row["end"]], max_layer=row["layer"])
         seconds = time.perf_counter() - start
-        anchors = int((scene.mask[-1] > 0).sum())
-        levels.append(Level(row["layer"], from_scene(scene).to(device), anchors, row["end"], seconds))
+        levels.append(replace(level_of(scene, device), cumulative_bytes=row["end"], decode_seconds=seconds))
     return levels
 
 

@@ -122,6 +122,23 @@ def test_info_states_layers_and_first_frame(cli, scene_pd4):
     assert "first frame" in text and f"{size:,} bytes" in text
 
 
+def test_info_compares_the_error_bounds_with_those_of_rounding(cli, scene_pd4, tmp_path, monkeypatch):
+    from pd4dgs_codec.codec import encoder
+
+    report = cli("info", scene_pd4, "--json", "--check").json
+    assert report["nearest_bounds"] == report["error_bounds"] and report["error_bounds"]["feature"] > 0
+    assert "nearest_bounds" not in cli("info", scene_pd4, "--json").json
+    text = cli("info", scene_pd4, "--check").out.decode()
+    assert "errors at most: feature 0.0" in text and "error bounds are those of rounding" in text
+    bounds = encoder.rounding_bounds
+    monkeypatch.setattr(encoder, "rounding_bounds", lambda *args: {**bounds(*args), "offset": 0.75})
+    other = tmp_path / "other.pd4"
+    assert cli("encode", scene_pd4, "-o", other, "--effort", 1).code == 0
+    lines = cli("info", other, "--check").out.decode().splitlines()
+    assert [line for line in lines if "by rounding" in line] == [lines[-1]]
+    assert lines[-1].startswith("error bound of offset: 0.75 declared, 0.0")
+
+
 def test_info_names_what_is_left_out(cli, model_pt, tmp_path):
     output = tmp_path / "s.pd4"
     assert cli("encode", model_pt, "-o", output, "--layers", 1, "--effort", 1).code == 0

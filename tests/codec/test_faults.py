@@ -190,6 +190,7 @@ CAMERA = {1: [1.0] * 12, 2: [500.0, 0.0, 320.0, 240.0], 3: 640, 4: 480}  # a foc
         (header_module.NEAR_FAR, [4.0, 4.0], "near 4.0 and far 4.0"),
         (header_module.UNIT, -1.0, "unit -1.0"),
         (header_module.CAMERA, CAMERA, "focal lengths"),
+        (header_module.ERROR_BOUNDS, dict.fromkeys(range(8), -0.5), "error bound -0.5 of feature"),
     ],
 )
 def test_values_that_no_player_could_use_are_malformed(key, value, message):
@@ -208,6 +209,7 @@ HEADER_FAULTS = {
     header_module.NEAR_FAR: (1.0, Malformed),
     header_module.UNIT: (True, Malformed),
     header_module.CAMERA: ({1: [0.0] * 12}, Malformed),
+    header_module.ERROR_BOUNDS: ({0: 0.5, 1: 0.5, 2: 0.5}, Malformed),
 }
 
 

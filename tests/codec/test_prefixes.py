@@ -1,14 +1,20 @@
 """Layer prefixes, cut files and incremental decoding."""
 
+from dataclasses import replace
+
+import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import LAYER_SETS, assert_same_scene, make_scene, scenes
 
 from pd4dgs_codec import decode, encode, open_stream
-from pd4dgs_codec.codec.decoder import decode_partial
-from pd4dgs_codec.codec.info import info
-from pd4dgs_codec.errors import BadSignature, ChecksumMismatch, Malformed, Truncated
+from pd4dgs_codec.bitstream.container import write_chunk, write_preamble
+from pd4dgs_codec.codec.decoder import decode_layers, decode_partial
+from pd4dgs_codec.codec.header import pack_header, scene_id_of
+from pd4dgs_codec.codec.info import hashes, info
+from pd4dgs_codec.codec.layers import Coding, write_layer
+from pd4dgs_codec.errors import BadSignature, ChecksumMismatch, DecodeError, Malformed, Truncated
 
 FILES = {layers: encode(make_scene(7, layers=layers, anchors=20), layers=2, effort=1) for layers in LAYER_SETS}
 
@@ -99,6 +105,59 @@ def test_a_fault_stays_and_earlier_layers_remain():
         with pytest.raises(ChecksumMismatch):
             call()
     assert not stream.complete
+
+
+def faults_by_every_door(data):
+    """(class, message, chunk, offset) of what each entry point raises."""
+
+    def streamed():
+        stream = open_stream()
+        stream.feed(data)
+        stream.finish()
+
+    doors = (
+        streamed,
+        lambda: decode(data),
+        lambda: decode(data, allow_partial=True),
+        lambda: decode_layers(data),
+        lambda: hashes(data),
+    )
+    for door in doors:
+        with pytest.raises(DecodeError) as caught:
+            door()
+        yield type(caught.value), str(caught.value), caught.value.chunk, caught.value.offset
+
+
+@pytest.mark.parametrize("later", ["damaged", "cut", "whole"])
+@pytest.mark.parametrize("first", ["value", "mask code", "voxel"])
+def test_of_two_faults_every_door_names_that_of_the_earlier_layer(first, later):
+    """Values that are not finite, sums of masks and voxels taken twice, which a payload alone does not show."""
+    header, layers, _ = decode_layers(FILES[(0, 1, 2)])
+    payloads = [write_layer(layer, Coding(effort=1))[0] for layer in layers]
+    steps, which = header.attribute_steps, 1
+    if first == "value":
+        steps, which = {**steps, "offset": 2.0**127}, 0
+    elif first == "mask code":
+        full = replace(layers[1], mask_increase=np.full_like(layers[1].mask_increase, 255))
+        payloads[1] = write_layer(full, Coding(effort=1))[0]
+    else:
+        taken = replace(layers[1], anchor_q=layers[0].anchor_q[: len(layers[1].anchor_q)])
+        payloads[1] = write_layer(taken, Coding(effort=1))[0]
+    chunks = tuple((i, len(payload)) for i, payload in enumerate(payloads))
+    packed = pack_header(replace(header, attribute_steps=steps, chunks=chunks))
+    scene_id = scene_id_of(packed, payloads[0])
+    framed = [write_chunk(i, 0, scene_id, payload) for i, payload in enumerate(payloads)]
+    front = write_preamble(packed)
+    data = bytearray(b"".join([front, *framed]))
+    if later == "damaged":
+        data[-9] ^= 1
+    elif later == "cut":
+        del data[-9:]
+    found = set(faults_by_every_door(bytes(data)))
+    assert len(found) == 1
+    error, _, chunk, offset = found.pop()
+    assert (error, chunk) == (Malformed, which)
+    assert offset == info(front)["layers"][which]["offset"]
 
 
 def test_a_stream_that_ends_early_says_so():

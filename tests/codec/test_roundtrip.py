@@ -223,13 +223,13 @@ def test_verification_notices_lost_rows_and_wrong_values(monkeypatch):
     """What the decoder hands out is compared, not only what it reads."""
     scene = make_scene(0, layers=(0,))
 
-    def first_changed(change):
-        """assemble, with the scene of its first call changed: that of the file, before the one that was meant."""
+    def last_changed(change):
+        """assemble, with the scene of its second call changed: that of the file, after the one that was meant."""
         calls = []
 
         def changed(*args):
             calls.append(args)
-            return change(assemble(*args)) if len(calls) == 1 else assemble(*args)
+            return change(assemble(*args)) if len(calls) == 2 else assemble(*args)
 
         return changed
 
@@ -238,9 +238,16 @@ def test_verification_notices_lost_rows_and_wrong_values(monkeypatch):
         ("layers and rows", lambda s: replace(s, rows=(s.rows[0] + 1,))),
         ("layer 0 decodes to other values", lambda s: replace(s, feature=s.feature + np.float32(1))),
     ):
-        monkeypatch.setattr(encoder, "assemble", first_changed(change))
+        monkeypatch.setattr(encoder, "assemble", last_changed(change))
         with pytest.raises(EncodeError, match=f"verification: .*{message}"):
             encode(scene)
+
+
+@pytest.mark.parametrize("verify", [True, False])
+def test_positions_that_overflow_are_refused_verified_or_not(verify):
+    scene = make_scene(7, layers=(0,), anchors=20)
+    with pytest.raises(EncodeError, match="limit of the format: layer 0: a reconstructed value is not finite"):
+        encode(replace(scene, info=replace(scene.info, voxel_size=2.0**127)), effort=1, verify=verify)
 
 
 @given(st.sampled_from(sorted(GLOBAL_HEADS)), st.sampled_from(sorted(LOCAL_HEADS)))

@@ -17,6 +17,7 @@ from strategies import LAYER_SETS, make_scene
 
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.bitstream.container import write_chunk
+from pd4dgs_codec.codec import decoder
 from pd4dgs_codec.delivery import mp4
 from pd4dgs_codec.delivery.package import MPD, PLAYLIST, Video, package
 from pd4dgs_codec.errors import DeliveryError, Malformed, Truncated
@@ -37,7 +38,7 @@ def fake_video(fps: float = 20.0, samples: tuple[int, ...] = (40, 40, 7)) -> Vid
 
 @pytest.fixture(scope="module", params=[False, True], ids=["layers only", "with video"])
 def packaged(request, scene_bytes) -> dict[str, bytes]:
-    return package(scene_bytes, fake_video() if request.param else None)
+    return package(scene_bytes, lambda scene: fake_video() if request.param else None)
 
 
 def _sets(files: dict[str, bytes]) -> list[ElementTree.Element]:
@@ -100,7 +101,7 @@ def test_the_manifest_is_valid(layers, video):
     etree = pytest.importorskip("lxml.etree")
     schema = etree.XMLSchema(etree.parse(str(SCHEMA)))
     data = encode(make_scene(3, layers=layers, anchors=3), layers=2, effort=1)
-    document = etree.fromstring(package(data, video)[MPD])
+    document = etree.fromstring(package(data, lambda scene: video)[MPD])
     schema.assertValid(document)
     document[0][-1][-1].set("codecs", "application/x-pd4")  # the check can fail
     assert not schema.validate(document)
@@ -108,7 +109,7 @@ def test_the_manifest_is_valid(layers, video):
 
 def test_the_video_is_listed_fragment_by_fragment(scene_bytes):
     video = fake_video()
-    files = package(scene_bytes, video)
+    files = package(scene_bytes, lambda scene: video)
     init, pieces = mp4.fragments(video.data)
     assert [piece.samples for piece in pieces] == [40, 40, 7]
     playlist = files["fallback.m3u8"].decode().splitlines()
@@ -235,8 +236,11 @@ def test_a_rendered_video_is_packaged(call, folder, tmp_path, monkeypatch):
     K = camera.K * [[0.1], [0.1], [1]]
     small = replace(camera, width=65, height=48, K=K.astype("float32"))
     (folder / "small.pd4").write_bytes(encode(replace(scene, info=replace(scene.info, camera=small)), effort=1))
+    read_layer, read = decoder.read_layer, []
+    monkeypatch.setattr(decoder, "read_layer", lambda *args: read.append(args[1].layer) or read_layer(*args))
     code, out, err = call(folder / "small.pd4", "-o", tmp_path / "out", "--fps", 10, "--json")
     assert code == 0 and json.loads(out)["video"] is True, err
+    assert read == [0, 1, 2]  # each layer is decoded once, for the check and for the video
     init, pieces = mp4.fragments((tmp_path / "out" / "fallback.mp4").read_bytes())
     low, high = scene.info.time_range
     assert sum(piece.samples for piece in pieces) == round((high - low) * 10) and len(pieces) == 2

@@ -173,7 +173,7 @@ def test_inputs_are_named_by_their_numbers():
     assert cases != [mutate.make_case(SEEDS, 4, index) for index in range(300)]
 
 
-UNKNOWN = (("header", "keys"), ("camera", "keys"), ("layer", "keys"), ("layer", "sections"))
+UNKNOWN = (("header", "keys"), ("camera", "keys"), ("bounds", "keys"), ("layer", "keys"), ("layer", "sections"))
 
 
 def test_taking_apart_and_putting_together_changes_nothing():
@@ -362,7 +362,7 @@ def test_a_hundred_thousand_damages_of_real_files_are_caught():
 def test_checks_take_a_twentieth_of_decoding(monkeypatch):
     """Checksums, scene id, header, parameters, tables, ranges, duplicates, finiteness, timed where they are called."""
     from pd4dgs_codec.bitstream import container
-    from pd4dgs_codec.codec import decoder, layers, symbols
+    from pd4dgs_codec.codec import decoder, layers
     from pd4dgs_codec.entropy import ans
 
     options = {"channels": 16, "sides": (64, 64, 64, 40), "hidden": (32,), "width": 32}
@@ -386,7 +386,7 @@ def test_checks_take_a_twentieth_of_decoding(monkeypatch):
         (decoder, "unpack_header"),
         (layers, "read_meta"),
         (layers, "_check_ranges"),
-        (symbols, "_check_scene"),
+        (decoder, "check_last_layer"),
         (ans, "_frequencies"),
     ]
     decode(data)

@@ -70,6 +70,11 @@ def _end(function, *args, **options) -> tuple[str, object]:
         raise Finding("exception", f"{name} raised {type(error).__name__}: {str(error)[:200]}") from error
 
 
+def _place(result: object) -> tuple[int | None, int | None] | None:
+    """Where an error says it lies; None for what is decoded."""
+    return (result.chunk, result.offset) if isinstance(result, DecodeError) else None
+
+
 def _streamed(data: bytes, rng: random.Random) -> list[tuple[int, ...]]:
     """The layers of each scene that a stream yields for `data` in pieces; DecodeError at its end as decode would."""
     stream, layers = open_stream(), []
@@ -156,16 +161,20 @@ def _examine(case: Case, known: frozenset[tuple[bytes, ...]], rng: random.Random
         other, layers = _end(_streamed, data, rng)
         if other != name or (name == DECODED and layers[-1] != result.layers):  # type: ignore[index, attr-defined]
             raise Finding("disagreement", f"decode ends in {name}, a stream in {other}")
+        if _place(layers) != _place(result):
+            raise Finding("disagreement", f"decode finds {name} at {_place(result)}, a stream at {_place(layers)}")
     elif door == 1:
         _check_partial(case, known, name)
     elif door == 2:
         first, _ = _end(decode, data, max_layer=0)
-        if name == DECODED and first != DECODED:
+        if first not in (DECODED, name):
             raise Finding("disagreement", f"decode ends in {name}, with max_layer=0 in {first}")
     elif door == 3:
         _end(info, data)
-    elif name == DECODED:
-        _end(hashes, data)
+    else:
+        other, _ = _end(hashes, data)
+        if other != name:
+            raise Finding("disagreement", f"decode ends in {name}, hashes in {other}")
     if seconds > MAX_SECONDS:
         raise Finding("hang", f"{seconds:.2f} s of processor time, limit {MAX_SECONDS} s")
     return Outcome(name, seconds, count_checksums(data))

@@ -15,6 +15,7 @@ from typing import Any
 
 from fuzzing.files import Chunk, Parts, Seed, put_together, take_apart, take_stages
 from pd4dgs_codec.bitstream.container import CHUNK_HEAD_SIZE, SIGNATURE, read_chunk, read_preamble
+from pd4dgs_codec.codec.header import STEPS, VOXEL_SIZE
 from pd4dgs_codec.entropy.varint import put_varint
 from pd4dgs_codec.errors import EncodeError
 
@@ -22,6 +23,7 @@ _POWERS = (7, 8, 12, 14, 15, 16, 20, 21, 22, 23, 24, 26, 28, 31, 32)
 #: Around every limit of the format and every width of an integer.
 INTEGERS = (0, 1, 2, 3, 4, 5, 10, 30, 68, 70, *(v for p in _POWERS for v in ((1 << p) - 1, 1 << p, (1 << p) + 1)))
 REALS = (0.0, -0.0, 1.0, -1.0, 0.5, 2.0**-149, 2.0**-126, 2.0**-20, 2.0**20, 2.0**127, -(2.0**127))
+OVERFLOWING = 2.0**127  #: a step of which two are not finite
 LONGEST_BURST = 64
 REPAIRED_SHARE = 0.6  #: of the inputs
 
@@ -232,6 +234,14 @@ def header_value(rng: random.Random, parts: Parts, other: Parts, names: list[str
     names.append("a header value")
 
 
+def overflow(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:
+    """Values that are not finite, which no payload shows, and a layer parameter: of two faults one is to be named."""
+    key, value = rng.choice(((STEPS, [OVERFLOWING] * 3), (VOXEL_SIZE, OVERFLOWING)))
+    parts.header[key] = value
+    names.append("values that overflow")
+    parameters(rng, parts, other, names)
+
+
 def payload_bytes(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:
     """Bytes of a whole payload, its parameters included."""
     chunk = rng.choice(parts.chunks)
@@ -259,8 +269,8 @@ def chunks(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> 
     names.append("chunks")
 
 
-PART_CHANGES = (section_bytes, stage_bytes, section_swap, parameters, header_value, payload_bytes, chunks)
-PART_WEIGHTS = (30, 15, 10, 20, 8, 12, 5)
+PART_CHANGES = (section_bytes, stage_bytes, section_swap, parameters, header_value, overflow, payload_bytes, chunks)
+PART_WEIGHTS = (30, 15, 10, 20, 8, 3, 12, 5)
 
 
 def change_parts(rng: random.Random, data: bytes, other: bytes, names: list[str]) -> bytes:

@@ -48,6 +48,17 @@ ANS, LZMA = 0, 1
 CODED, FLOAT32 = 0, 1
 WEIGHT_SHIFT, CLASSES_Y, CLASSES_Z = 10, 5, 7  # clause 8.7
 
+#: Clause 5.4, of all classes: a file may declare bounds of what it does not hold.
+ERROR_BOUNDS: dict[int, object] = {
+    0: 0.03125,
+    1: 0.015625,
+    2: 0.0625,
+    3: 2.0**-8,
+    4: 0.25,
+    5: 2.0**-9,
+    6: 0.5,
+    7: 2.0**-10,
+}
 HEADER: dict[int, object] = {
     2: ANS,
     3: CODED,
@@ -59,6 +70,7 @@ HEADER: dict[int, object] = {
     9: [0.125, 64.0],
     10: [0.0, -1.0, 0.0],
     11: 1.5,
+    13: ERROR_BOUNDS,
 }
 CAMERA: dict[int, object] = {
     1: [1.0, 0.0, 0.0, 0.25, 0.0, 0.0, -1.0, 0.5, 0.0, 1.0, 0.0, 4.0],

@@ -49,6 +49,7 @@ from .blocks import (
     ANS,
     ATTRIBUTE,
     CAMERA,
+    ERROR_BOUNDS,
     FLOAT32,
     FLOATS,
     HEADER,
@@ -103,6 +104,7 @@ def cases() -> Iterator[Vector]:
         _header,
         _chunk_list,
         _camera,
+        _error_bounds,
         _layout,
         _parameters,
         _scales,
@@ -208,6 +210,7 @@ def _chunks() -> Iterator[Vector]:
         ("steps", {4: [0.5, 0.5, 0.5]}, "The header of another scene, with other steps."),
         ("ignored-key", {64: 1}, "A key that is ignored was put into the header."),
         ("camera", {12: CAMERA}, "A default camera was put into the header."),
+        ("error-bounds", {13: dict.fromkeys(range(8), 0.0)}, "The header of another scene, with other error bounds."),
     ):
         other = file.with_header(fields)
         spliced = replace(other, chunks=tuple(replace(c, scene_id=file.scene_id) for c in file.chunks))
@@ -352,7 +355,7 @@ def _msgpack() -> Iterator[Vector]:
         header = _with_entry(packed, "40", value)
         yield bad(f"msgpack-{name}", f"In an ignored key: {what}", "4", MALFORMED, replace(plain, packed=header))
     entries = {
-        "key-twice": (_with_entry(packed, "0b", "ca3fc00000"), "A key of the header twice."),
+        "key-twice": (_with_entry(packed, "0d", canonical.pack(HEADER[13]).hex()), "A key of the header twice."),
         "keys-descend": (_with_entry(_with_entry(packed, "41", "00"), "40", "00"), "Keys of the header out of order."),
         "key-not-shortest": (_with_entry(packed, "cc40", "00"), "A key of the header as uint 8."),
         "map16": (b"\xde\0" + bytes([packed[0] & 15]) + packed[1:], "The header as map 16."),
@@ -366,14 +369,14 @@ def _msgpack() -> Iterator[Vector]:
         "entry-missing": (bytes([packed[0] + 1]) + packed[1:], "The header's map lacks its last entry."),
         "entry-uncounted": (bytes([packed[0] - 1]) + packed[1:], "The header's map has an entry more than it says."),
     }
-    unit = packed[-5:]  # key 11, the last: CA and a binary32
+    unit = canonical.pack(11) + canonical.pack(HEADER[11])
     for name, value, what in (
         ("unit-nan", "ca7fc00000", "The unit is NaN."),
         ("unit-infinity", "ca7f800000", "The unit is infinite."),
         ("unit-float64", "cb3ff8000000000000", "The unit is a float 64."),
         ("unit-nil", "c0", "The unit is nil."),
     ):
-        entries[name] = (packed[: -len(unit)] + bytes.fromhex(value), what)
+        entries[name] = (packed.replace(unit, canonical.pack(11) + bytes.fromhex(value)), what)
     for name, (header, what) in entries.items():
         yield bad(f"header-{name}", what, "4 5.1", MALFORMED, replace(plain, packed=header))
     layer = make_layer()
@@ -399,12 +402,12 @@ def _msgpack() -> Iterator[Vector]:
 
 def _header() -> Iterator[Vector]:
     plain = _plain()
-    for key in range(2, 12):
+    for key in (*range(2, 12), 13):
         what = f"Key {key} is missing."
         yield bad(f"header-key-{key:02}-missing", what, "4 5.1", MALFORMED, plain.with_header({key: None}))
     without = canonical.pack({k: v for k, v in plain.fields().items() if k != 1})
     yield bad("header-key-01-missing", "Key 1 is missing.", "4 5.1", MALFORMED, replace(plain, packed=without))
-    for key in (0, 13, 63):
+    for key in (0, 14, 63):
         what = f"Unknown key {key}."
         yield bad(f"header-key-{key:02}-unknown", what, "4 17.2", FEATURE, plain.with_header({key: 1}))
     values: list[tuple[str, int, object, str]] = [
@@ -534,6 +537,32 @@ def _camera() -> Iterator[Vector]:
         what = f"Camera key {key} is {value!r}."
         yield bad(f"camera-{name}", what, "5.3", error, plain.with_header({12: {**CAMERA, key: value}}))
     yield bad("camera-list", "The camera is a list.", "5.3", MALFORMED, plain.with_header({12: [1.0]}))
+
+
+def _error_bounds() -> Iterator[Vector]:
+    plain, file = _plain(), three_layers()
+    for key in range(8):
+        bounds = {k: v for k, v in ERROR_BOUNDS.items() if k != key}
+        layer = None if key < 4 else 1 if key < 6 else 2
+        what = f"No error bound of class {key}" + (f", which layer {layer} has." if layer else ".")
+        yield bad(f"bound-{key}-missing", what, "5.4", MALFORMED, file.with_header({13: bounds}), chunk=layer)
+    values: list[tuple[str, int, object, str]] = [
+        ("negative", 0, -(2.0**-149), MALFORMED),
+        ("integer", 3, 0, MALFORMED),
+        ("boolean", 2, True, MALFORMED),
+        ("list", 1, [0.5], MALFORMED),
+        ("unused-negative", 7, -1.0, MALFORMED),
+        ("unused-integer", 4, 1, MALFORMED),
+        ("class-8-unknown", 8, 0.5, FEATURE),
+        ("class-63-unknown", 63, 0.5, FEATURE),
+    ]
+    for name, key, value, error in values:
+        what = f"The error bound of class {key} is {value!r}."
+        changed = plain.with_header({13: dict(sorted({**ERROR_BOUNDS, key: value}.items()))})
+        yield bad(f"bound-{name}", what, "5.4", error, changed)
+    listed = plain.with_header({13: list(ERROR_BOUNDS.values())})
+    yield bad("bounds-list", "The error bounds are a list.", "5.4", MALFORMED, listed)
+    yield bad("bounds-real", "The error bounds are a real.", "5.4", MALFORMED, plain.with_header({13: 0.5}))
 
 
 # -- clause 6 ----------------------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from pd4dgs_codec.bitstream.limits import MAX_CHUNKS, MAX_HEADER, MAX_PARAMETERS
 
 from .blocks import (
     CAMERA,
+    ERROR_BOUNDS,
     Chunk,
     File,
     Scale,
@@ -87,6 +88,8 @@ def _cases() -> Iterator[tuple[str, str, str, File]]:
     yield "header-longest", "A header of 4096 bytes.", "3.1 14", plain.with_header({64: b"\0" * (300 + rest)})
     camera = {12: {**CAMERA, 64: "lens", 1000: [1.0]}}
     yield "camera-unknown-keys", "Keys from 64 on in the camera.", "4 5.3", plain.with_header(camera)
+    bounds = {13: {**ERROR_BOUNDS, 64: "a class to come", 1000: 1}}
+    yield "bounds-unknown-keys", "Keys from 64 on in the error bounds.", "4 5.4", plain.with_header(bounds)
     layer = layers.layer(1)
     extended = layer.payload(lambda m: {**m, 64: [1, 2], 70000: {5: "x"}})
     yield "layer-unknown-keys", "Keys from 64 on in the layer parameters.", "4 6.2", layers.with_payload(1, extended)

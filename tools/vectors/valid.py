@@ -675,6 +675,24 @@ def _ranges() -> Iterator[Case]:
         11: LARGEST,
     }
     yield "header-largest-reals", "The largest reals in the header.", "4 5.1", make_file(make_layer(), header=far)
+    zero, largest = dict.fromkeys(range(8), 0.0), dict.fromkeys(range(8), LARGEST)
+    base = {key: bound for key, bound in zero.items() if key < 4}
+    yield "bounds-zero", "Error bounds of 0.", "5.4", three_layers(header={13: zero})
+    yield "bounds-negative-zero", "Error bounds of −0.", "5.4", three_layers(header={13: dict.fromkeys(zero, -0.0)})
+    yield "bounds-largest", "The largest error bounds.", "5.4", three_layers(header={13: largest})
+    yield (
+        "bounds-of-layer-0",
+        "No error bounds but those of layer 0.",
+        "5.4",
+        make_file(make_layer(), header={13: base}),
+    )
+    flat = make_file(make_layer(0, line(2)), make_layer(1, (), before=2), make_layer(2, [[0, 0, 1]], before=2))
+    yield (
+        "bounds-without-deformations",
+        "No error bounds but those of layer 0, as neither layer 1 nor layer 2 has a deformation.",
+        "5.4",
+        flat.with_header({13: base}),
+    )
     negative = {6: [-0.0] * 6, 7: [-0.0, 0.0], 8: [-0.0] * 3, 9: [-0.0, 1.0], 11: -0.0}
     yield "header-negative-zeros", "Negative zeros in the header.", "4 5.1", make_file(make_layer(), header=negative)
     edge = {1: [-LARGEST] * 12, 2: [LEAST_NORMAL, LARGEST, -1.0, 0.0], 3: 65535, 4: 1}
