@@ -10,7 +10,7 @@ import subprocess
 import time
 
 import pytest
-from faulty import Fault, FaultyServer
+from pd4dgs_codec.delivery.faulty import Fault, FaultyServer
 from strategies import assert_same_scene, make_scene
 
 from pd4dgs_codec import decode, encode
