@@ -4,8 +4,19 @@ from __future__ import annotations
 
 import numpy as np
 
-from pd4dgs_codec.scene import FEATURE_DIM, N_OFFSETS, PLANES, SCAFFOLD_NETWORKS, SCALING_DIM, Camera, Deformation
-from pd4dgs_codec.scene import Network, Scene, SceneInfo, Steps
+from pd4dgs_codec.scene import (
+    FEATURE_DIM,
+    N_OFFSETS,
+    PLANES,
+    SCAFFOLD_NETWORKS,
+    SCALING_DIM,
+    Camera,
+    Deformation,
+    Network,
+    Scene,
+    SceneInfo,
+    Steps,
+)
 
 SIDE = 16  #: pixels of the picture drawn and thrown away
 CHANNELS = 8  #: of its planes, as many as take the kernel's path

@@ -16,7 +16,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from pd4dgs_codec.delivery.client import Budget, SceneClient
+from pd4dgs_codec.delivery.client import SceneClient
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.render import threads
 from pd4dgs_codec.render.warm import warm_up
@@ -32,14 +32,12 @@ class Shown:
     after_last_byte: float
 
 
-def pictures(
-    url: str, size: tuple[int, int], budget: Budget = Budget(), ready: Callable[[], object] = lambda: None
-) -> Iterator[Shown]:
+def pictures(url: str, size: tuple[int, int], ready: Callable[[], object] = lambda: None) -> Iterator[Shown]:
     """Draws each level at normalised time 0 as soon as it is decoded. size: width, height in pixels. ready: called
     before the first is drawn. Raises what SceneClient.scenes raises, and DataError for a file without a camera."""
     start = time.monotonic()
     with SceneClient(url) as client:
-        for scene in client.scenes(budget):
+        for scene in client.scenes():
             last_byte = client.arrived_at
             camera = own_camera(scene.info, size)
             ready()
