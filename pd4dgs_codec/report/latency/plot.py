@@ -15,9 +15,8 @@ MOST_FAULTS = len(STYLES)
 
 
 def draw(file: FileReport, faults: Sequence[Row], path: Path) -> None:
-    """Writes a picture of one file: per rate when each level's picture is there (warm process; a cross marks when the
-    whole file is), and beside it, if there are `faults`, when its levels are decoded under them. Legible in black and
-    white. y: mPSNR in dB, or the level without a dataset."""
+    """Writes a picture of one file: per rate when each level's picture is there (warm process), and
+    beside it, if there are `faults`, when its levels are decoded under them. Legible in black and white. y: mPSNR in dB, or the level without a dataset."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -32,7 +31,6 @@ def draw(file: FileReport, faults: Sequence[Row], path: Path) -> None:
     for rate in dict.fromkeys(row.rate for row in file.times):
         rows = [row for row in file.times if row.rate == rate]
         series[f"{rate / 1e6:g} Mbps"] = [(row.picture, heights[row.level]) for row in rows]
-        left.plot(rows[-1].expected, heights[rows[-1].level], "x", color="black", ms=8)
     _steps(left, series)
     left.set_title(file.name, fontsize=10)
     left.set_xscale("log")
@@ -43,8 +41,10 @@ def draw(file: FileReport, faults: Sequence[Row], path: Path) -> None:
     for axis in axes[0]:
         axis.set_xlabel("seconds since the request")
         axis.grid(alpha=0.3)
-        axis.legend(fontsize=7, loc="lower right")
-    axes[0][0].set_ylabel("level" if file.quality is None else "held-out mPSNR, dB")
+        axis.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
+    if file.quality is None:
+        left.set_yticks(levels)
+    left.set_ylabel("level" if file.quality is None else "held-out mPSNR, dB")
     figure.tight_layout()
     figure.savefig(path, dpi=110)
     pyplot.close(figure)

@@ -120,8 +120,8 @@ def _faults(rows: Sequence[Row]) -> str:
         cells.append((row.name, shown or "nothing", end, did, f"{row.sent:,}", "yes" if row.kept else "NO"))
     said = (
         f"At {_rate(RATE)}; silence counts as a cut after {STALL_SECONDS:g} s here (10 by default). Shown: levels as "
-        "they are decoded, those of the file that took the place of the first one called new. Right: each equals, array by "
-        "array, that of an uninterrupted decode, and the transfer ended as it had to."
+        "they are decoded, those of the file that took the place of the first one called new. Right: each equals, "
+        "array by array, that of an uninterrupted decode, and the transfer ended as it had to."
     )
     return f"## Faults\n\n{said}\n\n{markdown(head, cells)}"
 
