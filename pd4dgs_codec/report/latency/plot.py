@@ -15,8 +15,9 @@ MOST_FAULTS = len(STYLES)
 
 
 def draw(file: FileReport, faults: Sequence[Row], path: Path) -> None:
-    """Writes a picture of one file: per rate when each level's picture is there (warm process), and
-    beside it, if there are `faults`, when its levels are decoded under them. Legible in black and white. y: mPSNR in dB, or the level without a dataset."""
+    """Writes a picture of one file: per rate when each level's picture is there (warm process), and beside it, if there
+    are `faults`, when its levels are decoded under them. Legible in black and white. y: mPSNR in dB, or the level
+    without a dataset."""
     import matplotlib
 
     matplotlib.use("Agg")
