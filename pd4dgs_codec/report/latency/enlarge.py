@@ -12,6 +12,7 @@ from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.scene import Scene
 
 REACH = 3  #: voxels; copies lie this far from their original at most, along each axis
+EFFORT = 3  #: of the encoder; more gains little here
 MOST = 20  #: times as many anchors; more would hardly find free voxels
 
 
@@ -20,7 +21,7 @@ def with_anchors(data: bytes, count: int, seed: int = 5) -> bytes:
     each moved to a free voxel nearby. Raises DataError if the scene has more
     already, or far too few."""
     scene = decode(data)
-    return encode(_enlarged(scene, count, np.random.default_rng(seed)), effort=3)
+    return encode(_enlarged(scene, count, np.random.default_rng(seed)), effort=EFFORT)
 
 
 def _enlarged(scene: Scene, count: int, rng: np.random.Generator) -> Scene:
