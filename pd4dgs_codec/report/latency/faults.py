@@ -32,6 +32,7 @@ STALL_SECONDS = 1.0  #: after which the client of the table takes silence for a 
 SLUMP = 0.1  #: share of the rate that a collapsed link still carries
 SLUMP_SECONDS = 1.0
 CUTS_PER_TRANSFER = 10
+CRC_BYTES = 4  #: behind a chunk's payload
 SAME_TAG: dict[str, str | None] = {"ETag": '"same"'}
 
 
@@ -72,9 +73,9 @@ class File:
         return ((self.ends[index - 1] if index else 0) + self.ends[index]) // 2
 
     def damaged(self, index: int) -> bytes:
-        """The file with one bit of that layer changed."""
+        """The file with one bit of that layer's payload changed."""
         data = bytearray(self.data)
-        data[self.middle(index)] ^= 1
+        data[self.ends[index] - CRC_BYTES - 1] ^= 1
         return bytes(data)
 
 
