@@ -107,7 +107,7 @@ def test_times_of_a_link_that_is_much_slower_than_everything_else(data):
     size = measure.layer_rows(data)[0][1]
     (base, *_, last) = measure.times(data, [8 * size / 0.5], 1, SIZE)
     assert base.bytes == size and base.expected == pytest.approx(0.5)
-    assert 0.5 <= base.network < 0.9 and last.network > base.network
+    assert 0.5 <= base.network < 1.5 and last.network > base.network
     assert base.picture >= base.network - 0.05 and 0 < base.after_last_byte < base.picture
     assert base.cold > base.picture
 
@@ -156,7 +156,8 @@ def run(capsys, *argv):
 
 
 def test_the_command_writes_markdown_json_and_a_picture(tmp_path, capsys, data, monkeypatch):
-    monkeypatch.setattr(measure, "first_start", lambda data, rate, size: 12.3)  # compiling takes that long
+    monkeypatch.setattr(measure, "first_start", lambda data, rate, size: 12.3)  # both would take seconds
+    monkeypatch.setattr(measure, "cold_start", lambda url, size: [4.0, 5.0, 6.0])
     (tmp_path / "a.pd4").write_bytes(data)
     plot, report = tmp_path / "p.png", tmp_path / "r.json"
     options = ("--rates", "50M", "--runs", 1, "--size", "24x16", "--only", "times", "--plot", plot, "--json", report)
