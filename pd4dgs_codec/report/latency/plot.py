@@ -34,15 +34,15 @@ def draw(file: FileReport, faults: Sequence[Row], path: Path) -> None:
         series[f"{rate / 1e6:g} Mbps"] = [(row.picture, heights[row.level]) for row in rows]
     _steps(left, series)
     left.set_title(file.name, fontsize=10)
-    left.set_xscale("log")
     if faults:
         shown = {row.name: [(at, heights[n]) for of, n, at in row.shown if of == "old"] for row in faults[:MOST_FAULTS]}
         _steps(axes[0][1], shown)
         axes[0][1].set_title(f"under faults, {RATE / 1e6:g} Mbps", fontsize=10)
     for axis in axes[0]:
         axis.set_xlabel("seconds since the request")
+        axis.set_xlim(left=0)
         axis.grid(alpha=0.3)
-        axis.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.16), ncols=2)
+        axis.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2)
     if file.quality is None:
         left.set_yticks(levels)
     left.set_ylabel("level" if file.quality is None else "held-out mPSNR, dB")
