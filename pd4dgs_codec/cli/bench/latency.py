@@ -38,7 +38,7 @@ own camera; beside the published sizes of monolithic models. The section faults,
 on links and servers that fail, random cuts, and 64 clients at once.
 
 The exit code is 1 if a picture under faults is not the right one; times never fail. They need a quiet machine.
-A file takes about (8S/B + 2 s) x 3 x runs at each rate, the faults a minute.
+A file takes about (8S/B + 2 s) x 3 x runs at each rate, the faults two to three minutes.
 
 {SOURCES}
 
