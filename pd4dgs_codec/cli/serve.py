@@ -33,7 +33,7 @@ In production any server of static files will do. nginx:
       }
     }
   }
-Caddy (written from its documentation, not tried):
+Caddy:
   :80
   root * /srv/scenes
   header Access-Control-Allow-Origin *
@@ -41,6 +41,10 @@ Caddy (written from its documentation, not tried):
   header Access-Control-Expose-Headers "Accept-Ranges, Content-Length, Content-Range, ETag"
   @preflight method OPTIONS
   respond @preflight 204
+  @pd4 path *.pd4
+  header @pd4 Content-Type application/octet-stream
+  @mpd path *.mpd
+  header @mpd Content-Type application/dash+xml
   file_server
 
 examples:

@@ -78,6 +78,11 @@ class RateMeter:
             self._marks.popleft()
 
     @property
+    def latest(self) -> float:
+        """When the latest bytes arrived, or the request began."""
+        return self._marks[-1][0]
+
+    @property
     def rate(self) -> float | None:
         """None before anything arrived."""
         (start, before), (end, after) = self._marks[0], self._marks[-1]
@@ -104,6 +109,11 @@ class SceneClient:
 
     def __exit__(self, *_: object) -> None:
         self.close()
+
+    @property
+    def arrived_at(self) -> float:
+        """time.monotonic() of the latest bytes: when a scene is given, that of its layer's last one."""
+        return self._meter.latest
 
     def close(self) -> None:
         """Ends the connection; `scenes` may still be called and opens another."""

@@ -183,9 +183,7 @@ def test_an_interrupted_training_is_not_published_and_goes_on(job, finished, tmp
 
 def test_a_layer_that_one_encoding_drops_is_shown_as_absent(finished):
     scene = to_scene(checkpoint.load(finished[0] / "discs" / "model.pt")[0])
-    reports = {
-        name: encode_with_report(scene, effort=1, **options)[1] for name, options in main_job.VARIANTS.items()
-    }
+    reports = {name: encode_with_report(scene, effort=1, **options)[1] for name, options in main_job.VARIANTS.items()}
     whole = main_job.coding_rows(reports, scene)
     reports["lzma_float32"] = dataclasses.replace(reports["lzma_float32"], layers=reports["lzma_float32"].layers[1:])
     rows = main_job.coding_rows(reports, scene)

@@ -11,6 +11,7 @@ from pd4dgs_codec.cli.common import Console, Parser, UsageError, run
 
 #: Report: what it is. The module of that name holds its `parser()` and `execute(args, console)`.
 REPORTS = {
+    "latency": "seconds from the request to bytes and pictures over a slow link, and what the client does under faults",
     "stability": "stiff and extreme cases: what was fed, promised and came out, against high-precision references",
 }
 

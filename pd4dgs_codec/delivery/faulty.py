@@ -1,4 +1,7 @@
-"""A web server that misbehaves as told: it cuts, resets, stalls, lies, or changes its file between requests."""
+"""A web server that misbehaves as told: it cuts, resets, stalls, lies, or changes its file between requests.
+
+For tests and for the table of faults; `server` is the one that behaves.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from socketserver import StreamRequestHandler, ThreadingTCPServer
 
+from pd4dgs_codec.delivery.link import Link
 from pd4dgs_codec.delivery.ranges import Unsatisfiable, requested_range
 
 
@@ -31,12 +35,26 @@ class Fault:
 
 
 class FaultyServer(ThreadingTCPServer):
+    """Serves `content` at `url` on loopback inside a `with` block, one of `faults` per request, then without.
+
+    etag, ranges: whether it sends the one and heeds the other. link: what all bodies cross.
+    """
+
     daemon_threads = True
     allow_reuse_address = True
 
-    def __init__(self, content: bytes, faults: list[Fault] | None = None, *, etag: bool = True, ranges: bool = True):
+    def __init__(
+        self,
+        content: bytes,
+        faults: list[Fault] | None = None,
+        *,
+        etag: bool = True,
+        ranges: bool = True,
+        link: Link | None = None,
+    ):
         super().__init__(("127.0.0.1", 0), _Handler)
         self.content, self.faults, self.etag, self.ranges = content, list(faults or []), etag, ranges
+        self.link = link or Link()
         self.heeds_if_range = True
         self.requests: list[dict[str, str]] = []  # their headers, names in lower case
         self.sent = 0  # bytes of bodies
@@ -44,6 +62,7 @@ class FaultyServer(ThreadingTCPServer):
 
     @property
     def url(self) -> str:
+        """Of the one file."""
         return f"http://127.0.0.1:{self.server_address[1]}/scene.pd4"
 
     def __enter__(self) -> FaultyServer:
@@ -58,11 +77,12 @@ class FaultyServer(ThreadingTCPServer):
         self._thread.join()
 
     def handle_error(self, *_: object) -> None:
-        pass  # clients that go away
+        """Clients that go away are what it is for."""
 
 
 class _Handler(StreamRequestHandler):
     server: FaultyServer
+    disable_nagle_algorithm = True
 
     def handle(self) -> None:
         while self._request():
@@ -99,7 +119,7 @@ class _Handler(StreamRequestHandler):
         self.wfile.write("\r\n".join([f"HTTP/1.1 {status} X", *lines, "", ""]).encode())
         sent = body[: fault.after]
         server.sent += len(sent)
-        self.wfile.write(sent)
+        self._cross(sent)
         fault.then(server)
         if fault.after is None:
             return fault.headers.get("Connection") != "close"
@@ -110,3 +130,11 @@ class _Handler(StreamRequestHandler):
                 self.request.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
                 self.request.close()
         return False
+
+    def _cross(self, body: bytes) -> None:
+        link = self.server.link
+        with link.transfer():
+            for start in range(0, len(body), link.block):
+                block = body[start : start + link.block]
+                link.cross(len(block))
+                self.wfile.write(block)

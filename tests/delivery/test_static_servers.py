@@ -1,8 +1,9 @@
-"""The nginx configuration that `pd4dgs-serve --help` gives, run by a real nginx where there is one."""
+"""The configurations that `pd4dgs-serve --help` gives, run by a real nginx and a real Caddy where there are any."""
 
 from __future__ import annotations
 
 import http.client
+import os
 import shutil
 import socket
 import subprocess
@@ -16,9 +17,7 @@ from pd4dgs_codec import decode
 from pd4dgs_codec.cli.serve import DETAILS
 from pd4dgs_codec.delivery.client import Budget, SceneClient
 
-NGINX = shutil.which("nginx") or shutil.which("nginx", path="/usr/sbin")
-
-pytestmark = pytest.mark.skipif(NGINX is None, reason="no nginx on this machine")
+PROGRAMS = {name: shutil.which(name) or shutil.which(name, path="/usr/sbin") for name in ("nginx", "caddy")}
 
 
 def _free_port() -> int:
@@ -27,14 +26,19 @@ def _free_port() -> int:
         return probe.getsockname()[1]
 
 
-@pytest.fixture
-def port(folder, tmp_path):
-    number = _free_port()
-    block = DETAILS[DETAILS.index("  server {") : DETAILS.index("Caddy")]
-    for given, here in (("listen 80", f"listen 127.0.0.1:{number}"), ("/srv/scenes", str(folder))):
+def _configuration(begin: str, end: str, changes: dict[str, str]) -> str:
+    """The part of the help between two lines, with an address and a folder of this test."""
+    block = DETAILS[DETAILS.index(begin) : DETAILS.index(end)]
+    for given, here in changes.items():
         assert given in block
         block = block.replace(given, here)
-    shutil.copy(Path(str(NGINX)).resolve().parents[2] / "etc/nginx/mime.types", tmp_path / "mime.types")
+    return block
+
+
+def _nginx(program: str, number: int, folder: Path, tmp_path: Path) -> list[str]:
+    changes = {"listen 80": f"listen 127.0.0.1:{number}", "/srv/scenes": str(folder)}
+    block = _configuration("  server {", "Caddy", changes)
+    shutil.copy(Path(program).resolve().parents[2] / "etc/nginx/mime.types", tmp_path / "mime.types")
     (tmp_path / "tmp").mkdir()
     temporary = "".join(
         f"{kind}_temp_path {tmp_path}/tmp/{kind};\n" for kind in ("client_body", "proxy", "fastcgi", "uwsgi", "scgi")
@@ -43,8 +47,24 @@ def port(folder, tmp_path):
         f"daemon off; master_process off; pid {tmp_path}/pid; error_log stderr;\nevents {{}}\n"
         f"http {{\naccess_log off;\n{temporary}{block}}}\n"
     )
-    command = [str(NGINX), "-p", str(tmp_path), "-c", str(tmp_path / "nginx.conf"), "-e", "stderr"]
-    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True)
+    return [program, "-p", str(tmp_path), "-c", str(tmp_path / "nginx.conf"), "-e", "stderr"]
+
+
+def _caddy(program: str, number: int, folder: Path, tmp_path: Path) -> list[str]:
+    block = _configuration("  :80", "examples:", {":80": f"http://127.0.0.1:{number}", "/srv/scenes": str(folder)})
+    (tmp_path / "Caddyfile").write_text(f"{{\n  admin off\n}}\n{block}")
+    return [program, "run", "--config", str(tmp_path / "Caddyfile"), "--adapter", "caddyfile"]
+
+
+@pytest.fixture(params=["nginx", "caddy"])
+def port(request, folder, tmp_path):
+    program = PROGRAMS[request.param]
+    if program is None:
+        pytest.skip(f"no {request.param} on this machine")
+    number = _free_port()
+    command = {"nginx": _nginx, "caddy": _caddy}[request.param](program, number, folder, tmp_path)
+    environment = {**os.environ, "XDG_DATA_HOME": str(tmp_path), "XDG_CONFIG_HOME": str(tmp_path)}
+    process = subprocess.Popen(command, stderr=subprocess.PIPE, text=True, env=environment)
     try:
         for _ in range(200):
             try:
@@ -52,20 +72,22 @@ def port(folder, tmp_path):
                 break
             except OSError:
                 assert process.poll() is None, process.communicate()[1]
-                time.sleep(0.02)
+                time.sleep(0.05)
         yield number
     finally:
         process.terminate()
         process.communicate(timeout=10)
 
 
-def ask(port: int, method: str = "GET", **headers: str) -> http.client.HTTPResponse:
+def ask(port: int, method: str = "GET", target: str = "/scene.pd4", **headers: str) -> http.client.HTTPResponse:
     connection = http.client.HTTPConnection("127.0.0.1", port, timeout=10)
-    connection.request(method, "/scene.pd4", headers={k.replace("_", "-"): v for k, v in headers.items()})
+    connection.request(method, target, headers={k.replace("_", "-"): v for k, v in headers.items()})
     return connection.getresponse()
 
 
-def test_a_page_of_another_site_may_fetch_and_resume(port, scene_bytes):
+def test_a_page_of_another_site_may_fetch_and_resume(port, folder, scene_bytes):
+    (folder / "scene.mpd").write_text("<MPD/>")
+    assert ask(port, target="/scene.mpd").headers["Content-Type"] == "application/dash+xml"
     whole = ask(port)
     assert whole.read() == scene_bytes and whole.headers["Content-Type"] == "application/octet-stream"
     assert whole.headers["Access-Control-Allow-Origin"] == "*"
