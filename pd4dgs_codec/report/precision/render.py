@@ -1,0 +1,190 @@
+"""The rasteriser's error against milliseconds: precision, tile sizes and thresholds, each against the float64 oracle.
+
+All draw the same Gaussians through the same cameras. The error is the RMSE of the picture, 0..1, against the oracle with
+the thresholds of the format: alpha below 1/255 is skipped, and a pixel is finished at a transmittance of 1e-4.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import subprocess
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pd4dgs_codec.errors import RenderError
+from pd4dgs_codec.report.frames import Frame
+from pd4dgs_codec.report.levels import Level
+from pd4dgs_codec.report.precision.peers import bake
+from pd4dgs_codec.report.precision.plot import Panel, Series, pareto_front
+from pd4dgs_codec.report.precision.raster_variant import draw_all
+from pd4dgs_codec.report.precision.timing import Timing, summary
+from pd4dgs_codec.report.tables import markdown
+
+#: The float64 oracle, against which all others are held; the same formulas in float32; the kernels as they are.
+ORACLE, TEXTBOOK, KERNELS, GSPLAT = "oracle, float64", "textbook, float32", "kernels", "gsplat"
+#: Kernels compiled with other constants. Tiles are 16 rows high by construction, and at most 64 blocks of 8 pixels large;
+#: below 1/511 alphas would be clamped.
+VARIANTS: dict[str, dict[str, float]] = {
+    "tile 16x16": {"tile_width": 16},
+    "tile 8x16": {"tile_width": 8},
+    "alpha >= 1/500": {"alpha_min": 1 / 500},
+    "alpha >= 1/128": {"alpha_min": 1 / 128},
+    "alpha >= 1/64": {"alpha_min": 1 / 64},
+    "T > 1e-5": {"t_min": 1e-5},
+    "T > 1e-3": {"t_min": 1e-3},
+    "T > 1e-2": {"t_min": 1e-2},
+}
+NAMES = (ORACLE, TEXTBOOK, KERNELS, GSPLAT, *VARIANTS)
+
+
+@dataclass(frozen=True)
+class RenderPoint:
+    """One way to draw. milliseconds per picture, over all pictures and repeats; rmse and largest error over all pixels
+    of all pictures. missing: why there are no figures."""
+
+    name: str
+    milliseconds: Timing | None = None
+    rmse: float | None = None
+    largest: float | None = None
+    missing: str | None = None
+
+
+def views_of(level: Level, frames: Sequence[Frame]) -> list[dict[str, Any]]:
+    """What the frames' cameras meet of the level: the keyword arguments of oracle.picture as numpy arrays."""
+    info, views = level.model.info, []
+    for frame in frames:
+        camera = frame.camera
+        views.append(
+            {
+                **vars(bake(level, frame)),
+                "viewmat": np.array(camera.viewmat, np.float32),
+                "K": np.array(camera.K, np.float32),
+                "width": camera.width,
+                "height": camera.height,
+                "near": max(float(info.near), 1e-6),
+                "background": np.array(info.background, np.float32),
+            }
+        )
+    return views
+
+
+def sweep(
+    views: Sequence[dict[str, Any]],
+    names: Sequence[str],
+    repeats: int,
+    cache: Path,
+    step: Callable[[], None] = lambda: None,
+) -> list[RenderPoint]:
+    """A point per name of NAMES; the oracle always runs, since the others are measured against it.
+
+    cache: a folder where compiled variants are kept, each for its own; `step` is called after each point.
+    """
+    want, seconds = _textbook(views, 1, "float64")
+    points = [RenderPoint(ORACLE, summary([1e3 * s for s in seconds]), 0.0, 0.0)] if ORACLE in names else []
+    step()
+    for name in names:
+        if name == ORACLE:
+            continue
+        points.append(_point(name, views, want, repeats, cache))
+        step()
+    return points
+
+
+def _point(
+    name: str, views: Sequence[dict[str, Any]], want: Sequence[np.ndarray], repeats: int, cache: Path
+) -> RenderPoint:
+    try:
+        if name == TEXTBOOK:
+            pictures, flat = _textbook(views, 1, "float32")
+        else:
+            if name in VARIANTS:
+                pictures, seconds = _variant(name, views, repeats, cache)
+            else:
+                pictures, seconds = draw_all(views, repeats, "cpu" if name == KERNELS else "gsplat")
+            flat = [s for one in seconds for s in one]
+    except (RenderError, RuntimeError) as error:  # torch raises RuntimeError where there is no CUDA
+        if name != GSPLAT:
+            raise
+        return RenderPoint(name, missing=(str(error).splitlines() or ["cannot draw here"])[0])
+    errors = [got.astype(np.float64) - w for got, w in zip(pictures, want, strict=True)]
+    rmse = math.sqrt(sum(float(np.square(e).mean()) for e in errors) / len(errors))
+    return RenderPoint(name, summary([1e3 * s for s in flat]), rmse, max(float(np.abs(e).max()) for e in errors))
+
+
+def _textbook(views: Sequence[dict[str, Any]], repeats: int, dtype: str) -> tuple[list[np.ndarray], list[float]]:
+    import torch
+
+    from pd4dgs_codec.report.precision.oracle import picture
+    from pd4dgs_codec.report.precision.timing import clock
+
+    pictures, seconds = [], []
+    for view in views:
+        given = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in view.items()}
+        image, times = clock(lambda given=given: picture(**given, dtype=getattr(torch, dtype)), repeats)
+        pictures.append(image.numpy())
+        seconds += times
+    return pictures, seconds
+
+
+def _variant(
+    name: str, views: Sequence[dict[str, Any]], repeats: int, cache: Path
+) -> tuple[list[np.ndarray], list[list[float]]]:
+    own = cache / "".join(c if c.isalnum() else "-" for c in name)
+    environment = {**os.environ, "NUMBA_CACHE_DIR": str(own)}
+    with tempfile.TemporaryDirectory() as folder:
+        source, target = Path(folder) / "views.npz", Path(folder) / "pictures.npz"
+        arrays = {f"{i}.{k}": v for i, view in enumerate(views) for k, v in view.items()}
+        np.savez(source, count=len(views), **arrays)
+        command = [sys.executable, "-m", "pd4dgs_codec.report.precision.raster_variant", str(source), str(target)]
+        command += [json.dumps(VARIANTS[name]), str(repeats)]
+        done = subprocess.run(command, capture_output=True, text=True, env=environment)
+        if done.returncode:
+            raise RenderError(f"{name}: {(done.stderr.strip().splitlines() or ['failed'])[-1]}")
+        with np.load(target) as stored:
+            return [stored[f"picture{i}"] for i in range(len(views))], stored["seconds"].tolist()
+
+
+# -- as tables and plots -----------------------------------------------------------------------------------------------
+
+
+def front(points: Sequence[RenderPoint]) -> list[bool]:
+    """Per point whether it lies on the Pareto front of error against milliseconds."""
+    pairs = [(p.milliseconds.median, p.rmse) if p.milliseconds else None for p in points]
+    best = pareto_front([(ms, e) for pair in pairs if pair for ms, e in [pair] if e is not None])
+    return [pair in best for pair in pairs]
+
+
+def table(points: Sequence[RenderPoint]) -> str:
+    """A row per way to draw; times beside those of the kernels as they are."""
+    base = next((p.milliseconds.median for p in points if p.name == KERNELS and p.milliseconds), None)
+    head = ("drawn by", "ms per picture", "/ kernels", "RMSE", "PSNR dB", "largest error", "on the front")
+    rows = []
+    for p, on in zip(points, front(points), strict=True):
+        if p.milliseconds is None or p.rmse is None:
+            rows.append((p.name, f"none: {p.missing}", *["-"] * 5))
+            continue
+        ratio = "-" if base is None else f"{p.milliseconds.median / base:.3g}"
+        psnr = "-" if p.rmse == 0 else f"{-20 * math.log10(p.rmse):.1f}"
+        rows.append((p.name, p.milliseconds.text(), ratio, f"{p.rmse:.2g}", psnr, f"{p.largest:.2g}", "yes" if on else "-"))
+    return markdown(head, rows)
+
+
+def panels(points: Sequence[RenderPoint]) -> list[Panel]:
+    """One panel, a series per way to draw."""
+    series = [
+        Series(p.name, ((p.milliseconds.median, p.rmse),)) for p in points if p.milliseconds and p.rmse is not None
+    ]
+    return [Panel("error against rasterising time", "ms per picture", tuple(series))]
+
+
+def as_json(points: Sequence[RenderPoint]) -> list[dict[str, Any]]:
+    """The points as plain dicts."""
+    return [{**asdict(p), "front": on} for p, on in zip(points, front(points), strict=True)]
