@@ -29,9 +29,12 @@ from pd4dgs_codec.entropy.positions import decode_positions, encode_positions
 from pd4dgs_codec.entropy.rate import gaussian_bits
 from pd4dgs_codec.report.frames import Frame
 from pd4dgs_codec.report.levels import Level
+from pd4dgs_codec.report.precision.splats import Splats, bake, draw, view
 from pd4dgs_codec.report.precision.timing import Timing, measure
 from pd4dgs_codec.report.tables import markdown
 
+#: What peers are made of.
+PACKAGES = ("zstandard", "torchac", "DracoPy", "gaussforge", "fourdgs")
 #: Bytes that a Gaussian peer needs per channel for what its decoder must know: mean, deviation, least, largest symbol.
 GAUSS_PARAMETERS = 16
 #: The least standard deviation, in steps, as in R(a).
@@ -165,7 +168,9 @@ def _zstd_peer() -> Coder:
     return Coder(
         "zstd -19, narrowest integers",
         lambda symbols: [
-            zstandard.ZstdCompressor(level=19).compress(b"".join(c.astype(width(c)).tobytes() for c in symbols.channels))
+            zstandard.ZstdCompressor(level=19).compress(
+                b"".join(c.astype(width(c)).tobytes() for c in symbols.channels)
+            )
         ],
         decode,
         lambda symbols: len(symbols.channels),
@@ -251,17 +256,20 @@ def _torchac_peer() -> Coder:
 
 def coder_rows(symbols: Symbols, repeats: int, effort: int = 5) -> list[Row]:
     """This package's coder first, then the peers, all on the same channels."""
-    makers: dict[str, Callable[[], Coder]] = {
-        "this codec": lambda: Coder("this codec", _encode_own("best", effort), _decode_own),
-        "this codec, Gaussian priors": lambda: Coder(
-            "this codec, Gaussian priors", _encode_own("gauss", effort), _decode_own
-        ),
+    own = (
+        Coder("this codec", _encode_own("best", effort), _decode_own),
+        Coder("this codec, Gaussian priors", _encode_own("gauss", effort), _decode_own),
+    )
+    peers = {
         "constriction QuantizedGaussian": _quantized_gaussian_peer,
         "torchac": _torchac_peer,
         "LZMA": _lzma_peer,
         "zstd": _zstd_peer,
     }
-    return [_row("symbols", name, lambda make=make: _coder_row(make(), symbols, repeats)) for name, make in makers.items()]
+    rows = [_coder_row(coder, symbols, repeats) for coder in own]
+    for name, make in peers.items():
+        rows.append(_peer_row("symbols", name, lambda make=make: _coder_row(make(), symbols, repeats)))  # type: ignore
+    return rows
 
 
 def _coder_row(coder: Coder, symbols: Symbols, repeats: int) -> Row:
@@ -299,7 +307,7 @@ def position_rows(layers: Sequence[LayerSymbols], repeats: int) -> list[Row]:
                 raise Lossy("its cells came back as others")
         return Row("positions", "Draco, kd-tree, level 10", sum(map(len, payloads)), encode, decode, 0.0)
 
-    return [_row("positions", "this codec", own), _row("positions", "Draco", draco)]
+    return [own(), _peer_row("positions", "Draco", draco)]
 
 
 def draco_encode(cells: np.ndarray) -> bytes:
@@ -320,32 +328,10 @@ def draco_encode(cells: np.ndarray) -> bytes:
 # -- splats ------------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class Splats:
-    """Gaussians as static formats know them, float32: means [N, 3], scales [N, 3] (standard deviations), quats [N, 4]
-    wxyz, opacities [N] and colors [N, 3] in 0..1."""
-
-    means: np.ndarray
-    scales: np.ndarray
-    quats: np.ndarray
-    opacities: np.ndarray
-    colors: np.ndarray
-
-
-def bake(level: Level, frame: Frame) -> Splats:
-    """The Gaussians that the frame's camera meets at its time, with the colours that it sees."""
-    import torch
-
-    K, viewmat = (torch.from_numpy(np.array(m, np.float32)) for m in (frame.camera.K, frame.camera.viewmat))
-    with torch.no_grad():
-        g = level.model.gaussians(level.level, frame.time, viewmat, K, frame.camera.width, frame.camera.height)
-    return Splats(*(a.detach().numpy() for a in (g.means, g.scales, g.quats, g.opacities, g.colors)))
-
-
 def splat_rows(level: Level, frame: Frame, file_bytes: int, repeats: int) -> list[Row]:
     """The whole file first, which holds every instant and every view, then static formats on one instant of it."""
     splats = bake(level, frame)
-    picture = draw(level, splats, frame)
+    picture = draw(view(level, splats, frame)).numpy()
     count = f"{len(splats.means):,} splats at t = {frame.time:.2f}"
 
     def peer(name: str, encode: Callable[[Splats], bytes], decode: Callable[[bytes], Splats]) -> Callable[[], Row]:
@@ -353,7 +339,9 @@ def splat_rows(level: Level, frame: Frame, file_bytes: int, repeats: int) -> lis
             with quiet():
                 data, encoding = measure(lambda: encode(splats), repeats)
                 back, decoding = measure(lambda: decode(data), repeats)
-            error = math.sqrt(float(np.square(draw(level, back, frame).astype(np.float64) - picture).mean()))
+            error = math.sqrt(
+                float(np.square(draw(view(level, back, frame)).numpy().astype(np.float64) - picture).mean())
+            )
             return Row(count, name, len(data), encoding, decoding, error)
 
         return row
@@ -361,27 +349,10 @@ def splat_rows(level: Level, frame: Frame, file_bytes: int, repeats: int) -> lis
     ply = peer("PLY, float32", to_ply, from_ply)
     return [
         Row("all times and views", "this file", file_bytes),
-        _row(count, "PLY", ply),
-        _row(count, "SPZ", lambda: peer("SPZ 4, by gaussforge", *_spz_peer(splats))()),
-        _row(count, "fourdgs", lambda: peer("fourdgs, default profile", *_fourdgs_peer())()),
+        ply(),
+        _peer_row(count, "SPZ", lambda: peer("SPZ 4, by gaussforge", *_spz_peer(splats))()),
+        _peer_row(count, "fourdgs", lambda: peer("fourdgs, default profile", *_fourdgs_peer())()),
     ]
-
-
-def draw(level: Level, splats: Splats, frame: Frame) -> np.ndarray:
-    """float32 [H, W, 3]: the splats through the frame's camera before the scene's background, clipped to 0..1."""
-    import torch
-
-    from pd4dgs_codec.render.rasterization import rasterization
-
-    camera, info = frame.camera, level.model.info
-    arrays = (splats.means, splats.quats, splats.scales, splats.opacities, splats.colors, camera.viewmat[None], camera.K[None])
-    tensors = [torch.from_numpy(np.ascontiguousarray(a, np.float32)) for a in arrays]
-    background = torch.tensor([info.background], dtype=torch.float32)
-    with torch.no_grad():
-        image, _, _ = rasterization(
-            *tensors, camera.width, camera.height, near_plane=max(float(info.near), 1e-6), backgrounds=background
-        )  # fmt: skip
-    return image[0].clamp(0, 1).numpy()
 
 
 _PLY = ("x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity", "scale_0", "scale_1", "scale_2", "rot_0", "rot_1",
@@ -475,7 +446,7 @@ def _fourdgs_peer() -> tuple[Callable[[Splats], bytes], Callable[[bytes], Splats
 # -- rows --------------------------------------------------------------------------------------------------------------
 
 
-def _row(what: str, coder: str, make: Callable[[], Row]) -> Row:
+def _peer_row(what: str, coder: str, make: Callable[[], Row]) -> Row:
     """The row, or one that says why there is none: a peer's failure is no failure of the report."""
     try:
         return make()

@@ -7,9 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 #: Marker and line style per series; colours are not needed to tell them apart.
-STYLES = tuple(
-    (marker, line) for line in ("-", "--", ":", "-.") for marker in ("o", "s", "^", "D", "v", "x", "P", "*")
-)
+STYLES = tuple((marker, line) for line in ("-", "--", ":", "-.") for marker in ("o", "s", "^", "D", "v", "x", "P", "*"))
 #: Points with an error of 0 are drawn this factor below the smallest other error.
 ZERO_BELOW = 3.0
 
@@ -79,8 +77,7 @@ def draw(panels: Sequence[Panel], ylabel: str, path: Path) -> None:
     zero = "" if len(positive) == len(errors) else "\n(lowest marks: 0)"
     axes[0][0].set_ylabel(ylabel + zero)
     handles = [
-        Line2D([], [], marker=style[n][0], ls=style[n][1], color="black", mfc="white", lw=1, label=n)
-        for n in names
+        Line2D([], [], marker=style[n][0], ls=style[n][1], color="black", mfc="white", lw=1, label=n) for n in names
     ]
     handles.append(Line2D([], [], marker="o", color="0.75", mec="black", mfc="none", ms=11, lw=4, label="front"))
     figure.tight_layout(rect=(0, legend / size[1], 1, 1))

@@ -1,7 +1,7 @@
 """The rasteriser's error against milliseconds: precision, tile sizes and thresholds, each against the float64 oracle.
 
-All draw the same Gaussians through the same cameras. The error is the RMSE of the picture, 0..1, against the oracle with
-the thresholds of the format: alpha below 1/255 is skipped, and a pixel is finished at a transmittance of 1e-4.
+All draw the same Gaussians through the same cameras. The error is the RMSE of the picture, 0..1, against the
+oracle's with the thresholds of the format: alpha below 1/255 is skipped, a pixel is finished at a transmittance of 1e-4.
 """
 
 from __future__ import annotations
@@ -22,15 +22,14 @@ import numpy as np
 from pd4dgs_codec.errors import RenderError
 from pd4dgs_codec.report.frames import Frame
 from pd4dgs_codec.report.levels import Level
-from pd4dgs_codec.report.precision.peers import bake
 from pd4dgs_codec.report.precision.plot import Panel, Series, pareto_front
-from pd4dgs_codec.report.precision.raster_variant import draw_all
-from pd4dgs_codec.report.precision.timing import Timing, summary
+from pd4dgs_codec.report.precision.splats import View, bake, draw_all, view
+from pd4dgs_codec.report.precision.timing import Timing, clock, summary
 from pd4dgs_codec.report.tables import markdown
 
 #: The float64 oracle, against which all others are held; the same formulas in float32; the kernels as they are.
-ORACLE, TEXTBOOK, KERNELS, GSPLAT = "oracle, float64", "textbook, float32", "kernels", "gsplat"
-#: Kernels compiled with other constants. Tiles are 16 rows high by construction, and at most 64 blocks of 8 pixels large;
+ORACLE, TEXTBOOK, KERNELS, GSPLAT = "oracle float64", "textbook float32", "kernels", "gsplat"
+#: Kernels compiled with other constants. Tiles are 16 rows high by construction, and hold at most 64 blocks of 8 pixels;
 #: below 1/511 alphas would be clamped.
 VARIANTS: dict[str, dict[str, float]] = {
     "tile 16x16": {"tile_width": 16},
@@ -57,27 +56,13 @@ class RenderPoint:
     missing: str | None = None
 
 
-def views_of(level: Level, frames: Sequence[Frame]) -> list[dict[str, Any]]:
-    """What the frames' cameras meet of the level: the keyword arguments of oracle.picture as numpy arrays."""
-    info, views = level.model.info, []
-    for frame in frames:
-        camera = frame.camera
-        views.append(
-            {
-                **vars(bake(level, frame)),
-                "viewmat": np.array(camera.viewmat, np.float32),
-                "K": np.array(camera.K, np.float32),
-                "width": camera.width,
-                "height": camera.height,
-                "near": max(float(info.near), 1e-6),
-                "background": np.array(info.background, np.float32),
-            }
-        )
-    return views
+def views_of(level: Level, frames: Sequence[Frame]) -> list[View]:
+    """What the frames' cameras meet of the level."""
+    return [view(level, bake(level, frame), frame) for frame in frames]
 
 
 def sweep(
-    views: Sequence[dict[str, Any]],
+    views: Sequence[View],
     names: Sequence[str],
     repeats: int,
     cache: Path,
@@ -98,50 +83,56 @@ def sweep(
     return points
 
 
-def _point(
-    name: str, views: Sequence[dict[str, Any]], want: Sequence[np.ndarray], repeats: int, cache: Path
-) -> RenderPoint:
-    try:
-        if name == TEXTBOOK:
-            pictures, flat = _textbook(views, 1, "float32")
-        else:
-            if name in VARIANTS:
-                pictures, seconds = _variant(name, views, repeats, cache)
-            else:
-                pictures, seconds = draw_all(views, repeats, "cpu" if name == KERNELS else "gsplat")
-            flat = [s for one in seconds for s in one]
-    except (RenderError, RuntimeError) as error:  # torch raises RuntimeError where there is no CUDA
-        if name != GSPLAT:
-            raise
-        return RenderPoint(name, missing=(str(error).splitlines() or ["cannot draw here"])[0])
+def _point(name: str, views: Sequence[View], want: Sequence[np.ndarray], repeats: int, cache: Path) -> RenderPoint:
+    if name == GSPLAT and (reason := _without_gsplat()):
+        return RenderPoint(name, missing=reason)
+    if name == TEXTBOOK:
+        pictures, seconds = _textbook(views, 1, "float32")
+    elif name in VARIANTS:
+        pictures, seconds = _variant(name, views, repeats, cache)
+    else:
+        pictures, seconds = draw_all(views, repeats, "cpu" if name == KERNELS else "gsplat")
     errors = [got.astype(np.float64) - w for got, w in zip(pictures, want, strict=True)]
     rmse = math.sqrt(sum(float(np.square(e).mean()) for e in errors) / len(errors))
-    return RenderPoint(name, summary([1e3 * s for s in flat]), rmse, max(float(np.abs(e).max()) for e in errors))
+    return RenderPoint(name, summary([1e3 * s for s in seconds]), rmse, max(float(np.abs(e).max()) for e in errors))
 
 
-def _textbook(views: Sequence[dict[str, Any]], repeats: int, dtype: str) -> tuple[list[np.ndarray], list[float]]:
+def _without_gsplat() -> str | None:
+    """Why gsplat cannot draw here, in one line; None if it can."""
+    import torch
+
+    from pd4dgs_codec.render import gsplat_backend
+
+    if not torch.cuda.is_available():
+        return "there is no CUDA device"
+    try:
+        gsplat_backend.check()
+    except RenderError as error:
+        return str(error)
+    return None
+
+
+def _textbook(views: Sequence[View], repeats: int, dtype: str) -> tuple[list[np.ndarray], list[float]]:
     import torch
 
     from pd4dgs_codec.report.precision.oracle import picture
-    from pd4dgs_codec.report.precision.timing import clock
 
     pictures, seconds = [], []
     for view in views:
-        given = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in view.items()}
-        image, times = clock(lambda given=given: picture(**given, dtype=getattr(torch, dtype)), repeats)
+        given: dict[str, Any] = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in view.items()}
+        given["dtype"] = getattr(torch, dtype)
+        image, own = clock(lambda given=given: picture(**given), repeats)  # type: ignore[misc]
         pictures.append(image.numpy())
-        seconds += times
+        seconds += own
     return pictures, seconds
 
 
-def _variant(
-    name: str, views: Sequence[dict[str, Any]], repeats: int, cache: Path
-) -> tuple[list[np.ndarray], list[list[float]]]:
+def _variant(name: str, views: Sequence[View], repeats: int, cache: Path) -> tuple[list[np.ndarray], list[float]]:
     own = cache / "".join(c if c.isalnum() else "-" for c in name)
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(own)}
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "views.npz", Path(folder) / "pictures.npz"
-        arrays = {f"{i}.{k}": v for i, view in enumerate(views) for k, v in view.items()}
+        arrays: dict[str, Any] = {f"{i}.{k}": v for i, view in enumerate(views) for k, v in view.items()}
         np.savez(source, count=len(views), **arrays)
         command = [sys.executable, "-m", "pd4dgs_codec.report.precision.raster_variant", str(source), str(target)]
         command += [json.dumps(VARIANTS[name]), str(repeats)]
@@ -173,7 +164,9 @@ def table(points: Sequence[RenderPoint]) -> str:
             continue
         ratio = "-" if base is None else f"{p.milliseconds.median / base:.3g}"
         psnr = "-" if p.rmse == 0 else f"{-20 * math.log10(p.rmse):.1f}"
-        rows.append((p.name, p.milliseconds.text(), ratio, f"{p.rmse:.2g}", psnr, f"{p.largest:.2g}", "yes" if on else "-"))
+        rows.append(
+            (p.name, p.milliseconds.text(), ratio, f"{p.rmse:.2g}", psnr, f"{p.largest:.2g}", "yes" if on else "-")
+        )
     return markdown(head, rows)
 
 

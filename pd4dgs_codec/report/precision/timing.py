@@ -44,7 +44,7 @@ class Timing:
     repeats: int
 
     def text(self) -> str:
-        """"0.123 (0.120..0.130)", or the median alone where there was one run."""
+        """ "0.123 (0.120..0.130)", or the median alone where there was one run."""
         spread = f" ({self.low:.3g}..{self.high:.3g})" if self.repeats > 1 else ""
         return f"{self.median:.3g}{spread}"
 

@@ -1,0 +1,107 @@
+"""`pd4dgs-bench codec`: the codec's error against bytes and seconds, beside other coders."""
+
+from __future__ import annotations
+
+import argparse
+from typing import Any
+
+from pd4dgs_codec.cli.bench.output import add_output, add_views, finish, listed, one_of, prepare
+from pd4dgs_codec.cli.common import OK, Console, Parser, count, positive_float, positive_int, use_threads
+from pd4dgs_codec.cli.files import is_pd4, read_bytes
+from pd4dgs_codec.cli.progress import progress_bar
+
+DETAILS = """\
+A checkpoint is packed at every combination of step scale, mode and effort. Each file's error is measured on its values,
+and on pictures against those of the checkpoint; a file without its checkpoint has bytes and times alone. Times: warm,
+the median and quartiles of the repeats in one process (none begun after 10 s); cold, whole fresh processes, with the
+largest memory they held. Peers code the same symbols, the same anchors, and the splats of one instant.
+
+examples:
+  pd4dgs-bench codec model.pt --data recordings/kitchen --downscale 2 --plot codec.png > codec.md
+  pd4dgs-bench codec model.pt --quick
+  pd4dgs-bench codec scene.pd4 --json"""
+
+#: What --quick runs, where no option says otherwise.
+QUICK: dict[str, Any] = {"step_scales": (1.0, 2.0), "modes": ("ans", "lzma"), "efforts": (1,), "repeats": 1, "cold": 0}
+#: Effort and pictures where no option says otherwise.
+PEER_EFFORT, VIEWS, QUICK_VIEWS = 5, 6, 2
+
+
+def parser() -> Parser:
+    """The options of the report."""
+    summary = "Measure what the codec's error costs in bytes and seconds, and what other coders make of the same data."
+    p = Parser("bench codec", "model.pt|FILE.pd4", summary, DETAILS)
+    p.add_argument("input", metavar="FILE", help="checkpoint of pd4dgs-train, or a .pd4 file")
+    p.add_argument(
+        "--step-scales", type=listed(positive_float), metavar="X,...", help="step scales (default: 0.5,1,2,4)"
+    )
+    p.add_argument("--modes", type=listed(one_of(("ans", "lzma"))), metavar="M,...", help="modes (default: ans,lzma)")
+    p.add_argument("--efforts", type=listed(_effort), metavar="N,...", help="efforts 1..9 (default: 1,5,9)")
+    p.add_argument("--repeats", type=positive_int, metavar="N", help="runs per warm time (default: 5)")
+    p.add_argument("--cold", type=count, metavar="N", help="fresh processes per cold time; 0: none (default: 1)")
+    p.add_argument("--no-peers", action="store_true", help="leave out the other coders")
+    p.add_argument("--quick", action="store_true", help="few points, one run each, no fresh processes")
+    add_views(p)
+    add_output(p)
+    return p
+
+
+def execute(args: argparse.Namespace, console: Console) -> int:
+    """Runs the sweep, or measures the one file."""
+    prepare(args, console)
+    data = read_bytes(args.input)
+    use_threads(args)
+    from pd4dgs_codec.codec.decoder import decode_layers
+    from pd4dgs_codec.codec.encoder import encode
+    from pd4dgs_codec.report.levels import load_levels
+    from pd4dgs_codec.report.precision import codec, peers, views
+    from pd4dgs_codec.report.precision.machine import describe, sentence
+
+    machine = describe(peers.PACKAGES)
+    what = codec.Sweep(**_options(args))
+    n_views = args.views or (QUICK_VIEWS if args.quick else VIEWS)
+    masks = None
+    if is_pd4(data):
+        points = [codec.file_point(data, what.repeats, what.cold)]
+        info = load_levels(data, 0)[0].model.info
+        frames = views.frames(info, args.data, n_views, args.downscale, args.holdout)
+    else:
+        from pd4dgs_codec.model import checkpoint
+        from pd4dgs_codec.model.convert import to_scene
+
+        model, _ = checkpoint.load(args.input)
+        scene = to_scene(model)
+        frames = views.frames(scene.info, args.data, n_views, args.downscale, args.holdout)
+        masks = codec.mask_error([model.masks(i).detach().numpy() for i in scene.layers], scene.mask)
+        with progress_bar(len(what), "files", "codec") as step:
+            points = codec.sweep(args.input, scene, frames, what, step)
+        data = encode(scene, effort=PEER_EFFORT, verify=False) if not args.no_peers else b""
+    result: dict[str, Any] = {"input": args.input, "machine": machine, "views": len(frames)}
+    result |= {"points": codec.as_json(points), "masks": None if masks is None else vars(masks)}
+    parts = [codec.points_table(points)]
+    if any(p.values for p in points):
+        parts.append(codec.values_table(points, masks))
+    if not args.no_peers:
+        layers = decode_layers(data)[1]
+        symbols = peers.symbols_of(layers)
+        console.message("other coders on the same data")
+        rows = peers.coder_rows(symbols, what.repeats, PEER_EFFORT) + peers.position_rows(layers, what.repeats)
+        rows += peers.splat_rows(load_levels(data)[-1], frames[len(frames) // 2], len(data), what.repeats)
+        result |= {"peers": peers.as_json(rows), "peers_rate_bits": symbols.rate_bits}
+        parts.append(peers.table(rows, symbols.rate_bits))
+    text = "\n\n".join([*parts, sentence(machine)])
+    finish(args, console, result, text, codec.panels(points), "RMSE of pictures")
+    return OK
+
+
+def _effort(text: str) -> int:
+    value = positive_int(text)
+    if value > 9:
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected an integer from 1 to 9")
+    return value
+
+
+def _options(args: argparse.Namespace) -> dict[str, Any]:
+    names = ("step_scales", "modes", "efforts", "repeats", "cold")
+    given = {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+    return (QUICK if args.quick else {}) | given
