@@ -13,8 +13,8 @@ from pd4dgs_codec.cli.progress import progress_bar
 DETAILS = """\
 A checkpoint is packed at every combination of step scale, mode and effort. Each file's error is measured on its values,
 and on pictures against those of the checkpoint; a file without its checkpoint has bytes and times alone. Times: warm,
-the median and quartiles of the repeats in one process (none begun after 10 s); cold, whole fresh processes, with the
-largest memory they held. Peers code the same symbols, the same anchors, and the splats of one instant.
+the median and quartiles of the repeats in one process (none begun after 5 s); cold, whole fresh processes, with the
+largest memory they held, at the step scale nearest to 1. Peers code the same symbols, the same anchors, and the splats of one instant.
 
 examples:
   pd4dgs-bench codec model.pt --data recordings/kitchen --downscale 2 --plot codec.png > codec.md
@@ -75,7 +75,7 @@ def execute(args: argparse.Namespace, console: Console) -> int:
         masks = codec.mask_error([model.masks(i).detach().numpy() for i in scene.layers], scene.mask)
         with progress_bar(len(what), "files", "codec") as step:
             points = codec.sweep(args.input, scene, frames, what, step)
-        data = encode(scene, effort=PEER_EFFORT, verify=False) if not args.no_peers else b""
+        data = encode(scene, effort=1, verify=False)  # every effort codes the same symbols
     result: dict[str, Any] = {"input": args.input, "machine": machine, "views": len(frames)}
     result |= {"points": codec.as_json(points), "masks": None if masks is None else vars(masks)}
     parts = [codec.points_table(points)]
@@ -86,7 +86,8 @@ def execute(args: argparse.Namespace, console: Console) -> int:
         symbols = peers.symbols_of(layers)
         console.message("other coders on the same data")
         rows = peers.coder_rows(symbols, what.repeats, PEER_EFFORT) + peers.position_rows(layers, what.repeats)
-        rows += peers.splat_rows(load_levels(data)[-1], frames[len(frames) // 2], len(data), what.repeats)
+        own_bytes = codec.usual(points).bytes
+        rows += peers.splat_rows(load_levels(data)[-1], frames[len(frames) // 2], own_bytes, what.repeats)
         result |= {"peers": peers.as_json(rows), "peers_rate_bits": symbols.rate_bits}
         parts.append(peers.table(rows, symbols.rate_bits))
     text = "\n\n".join([*parts, sentence(machine)])

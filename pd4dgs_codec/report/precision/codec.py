@@ -36,7 +36,8 @@ UNITS = {"scaling_log": "ln(scene unit)", "offset": "exp(scaling_log)", "mask": 
 
 @dataclass(frozen=True)
 class Sweep:
-    """What to run: every step scale with every mode and effort. repeats: of warm work; cold: fresh processes each."""
+    """What to run: every step scale with every mode and effort. repeats: of warm work. cold: fresh processes, at the
+    step scale nearest to 1 alone: what they add to warm work does not depend on the step."""
 
     step_scales: tuple[float, ...] = (0.5, 1.0, 2.0, 4.0)
     modes: tuple[str, ...] = ("ans", "lzma")
@@ -121,18 +122,17 @@ def sweep(
 
 def _point(model: str, scene: Scene, options: dict[str, Any], what: Sweep) -> tuple[Point, bytes]:
     (data, report), seconds = measure(lambda: encode_with_report(scene, verify=False, **options), what.repeats)
-    point = replace(file_point(data, what.repeats, what.cold, report), encode=seconds, **_named(options))
-    if not what.cold:
+    scale = options["step_scale"]
+    fresh = what.cold if abs(math.log(scale)) == min(abs(math.log(s)) for s in what.step_scales) else 0
+    point = file_point(data, what.repeats, fresh, report)
+    point = replace(point, encode=seconds, step_scale=scale, effort=options["effort"])
+    if not fresh:
         return point, data
     with tempfile.TemporaryDirectory() as folder:
         output = str(Path(folder) / "scene.pd4")
         flags = ["--mode", options["mode"], "--effort", str(options["effort"])]
-        flags += ["--step-scale", repr(options["step_scale"]), "--no-verify", "--overwrite"]
-        return replace(point, encode_cold=cold("encode", [model, "-o", output, *flags], what.cold)), data
-
-
-def _named(options: dict[str, Any]) -> dict[str, Any]:
-    return {"step_scale": options["step_scale"], "effort": options["effort"]}
+        flags += ["--step-scale", repr(scale), "--no-verify", "--overwrite"]
+        return replace(point, encode_cold=cold("encode", [model, "-o", output, *flags], fresh)), data
 
 
 def file_point(data: bytes, repeats: int, cold_repeats: int, report: Report | None = None) -> Point:
@@ -205,6 +205,11 @@ def picture_errors(
         psnr = math.inf if rmse == 0 else -20 * math.log10(rmse)
         errors.append(PictureError(level.level, rmse, psnr, ssim / len(frames)))
     return tuple(errors)
+
+
+def usual(points: Sequence[Point]) -> Point:
+    """The point nearest to what pd4dgs-encode writes: the step scale nearest to 1, mode ans, the highest effort."""
+    return min(points, key=lambda p: (abs(math.log(p.step_scale or 1.0)), p.mode != "ans", -(p.effort or 0)))
 
 
 # -- as tables and plots -----------------------------------------------------------------------------------------------

@@ -1,7 +1,8 @@
 """The rasteriser's error against milliseconds: precision, tile sizes and thresholds, each against the float64 oracle.
 
 All draw the same Gaussians through the same cameras. The error is the RMSE of the picture, 0..1, against the
-oracle's with the thresholds of the format: alpha below 1/255 is skipped, a pixel is finished at a transmittance of 1e-4.
+oracle's, which has the thresholds of the format: alpha below 1/255 is skipped, and a pixel is finished at a
+transmittance of 1e-4.
 """
 
 from __future__ import annotations
@@ -29,8 +30,8 @@ from pd4dgs_codec.report.tables import markdown
 
 #: The float64 oracle, against which all others are held; the same formulas in float32; the kernels as they are.
 ORACLE, TEXTBOOK, KERNELS, GSPLAT = "oracle float64", "textbook float32", "kernels", "gsplat"
-#: Kernels compiled with other constants. Tiles are 16 rows high by construction, and hold at most 64 blocks of 8 pixels;
-#: below 1/511 alphas would be clamped.
+#: Kernels compiled with other constants. Tiles are 16 rows high by construction and hold at most 64 blocks of
+#: 8 pixels; below 1/511 alphas would be clamped.
 VARIANTS: dict[str, dict[str, float]] = {
     "tile 16x16": {"tile_width": 16},
     "tile 8x16": {"tile_width": 8},
@@ -118,8 +119,8 @@ def _textbook(views: Sequence[View], repeats: int, dtype: str) -> tuple[list[np.
     from pd4dgs_codec.report.precision.oracle import picture
 
     pictures, seconds = [], []
-    for view in views:
-        given: dict[str, Any] = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in view.items()}
+    for one in views:
+        given: dict[str, Any] = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in one.items()}
         given["dtype"] = getattr(torch, dtype)
         image, own = clock(lambda given=given: picture(**given), repeats)  # type: ignore[misc]
         pictures.append(image.numpy())
@@ -132,7 +133,7 @@ def _variant(name: str, views: Sequence[View], repeats: int, cache: Path) -> tup
     environment = {**os.environ, "NUMBA_CACHE_DIR": str(own)}
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "views.npz", Path(folder) / "pictures.npz"
-        arrays: dict[str, Any] = {f"{i}.{k}": v for i, view in enumerate(views) for k, v in view.items()}
+        arrays: dict[str, Any] = {f"{i}.{k}": v for i, one in enumerate(views) for k, v in one.items()}
         np.savez(source, count=len(views), **arrays)
         command = [sys.executable, "-m", "pd4dgs_codec.report.precision.raster_variant", str(source), str(target)]
         command += [json.dumps(VARIANTS[name]), str(repeats)]

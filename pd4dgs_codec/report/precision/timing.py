@@ -16,7 +16,7 @@ from pd4dgs_codec.errors import Pd4Error
 T = TypeVar("T")
 
 #: Seconds after which nothing is repeated any more: a long piece of work is timed once or twice.
-BUDGET = 10.0
+BUDGET = 5.0
 
 #: Runs a command, then prints the largest resident memory of its own. The peak that getrusage gives is no use: a child
 #: inherits its parent's.
