@@ -13,8 +13,9 @@ from pd4dgs_codec.cli.progress import progress_bar
 DETAILS = """\
 A checkpoint is packed at every combination of step scale, mode and effort. Each file's error is measured on its values,
 and on pictures against those of the checkpoint; a file without its checkpoint has bytes and times alone. Times: warm,
-the median and quartiles of the repeats in one process (none begun after 5 s); cold, whole fresh processes, with the
-largest memory they held, at the step scale nearest to 1. Peers code the same symbols, the same anchors, and the splats of one instant.
+the median and quartiles of the repeats in one process (none begun after 5 s); cold, at the step scale nearest to 1,
+whole fresh processes, with the largest memory they held. Peers code the same symbols, the same anchors, and the splats
+of one instant.
 
 examples:
   pd4dgs-bench codec model.pt --data recordings/kitchen --downscale 2 --plot codec.png > codec.md

@@ -193,17 +193,19 @@ def mask_error(masks: Sequence[np.ndarray], codes: Sequence[np.ndarray]) -> Valu
 def picture_errors(
     levels: Sequence[Level], frames: Sequence[Frame], reference: Sequence[Sequence[np.ndarray]]
 ) -> tuple[PictureError, ...]:
-    """One per level of a file. reference: the pictures of each level 0, 1, 2 that the checkpoint has."""
+    """One per level of the checkpoint, whose pictures are `reference`. A level whose layer the file leaves out looks
+    like the level below it, and is held against the checkpoint's own all the same."""
     errors = []
-    for level in levels:
+    for number, wanted in enumerate(reference):
+        level = [level for level in levels if level.level <= number][-1]
         square, ssim = 0.0, 0.0
-        for frame, want in zip(frames, reference[level.level], strict=True):
+        for frame, want in zip(frames, wanted, strict=True):
             got = level.picture(frame.camera, frame.time)
             square += float(np.square(got.astype(np.float64) - want).mean())
             ssim += mssim(got, want)
         rmse = math.sqrt(square / len(frames))
         psnr = math.inf if rmse == 0 else -20 * math.log10(rmse)
-        errors.append(PictureError(level.level, rmse, psnr, ssim / len(frames)))
+        errors.append(PictureError(number, rmse, psnr, ssim / len(frames)))
     return tuple(errors)
 
 

@@ -5,9 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 #: Marker and line style per series; colours are not needed to tell them apart.
-STYLES = tuple((marker, line) for line in ("-", "--", ":", "-.") for marker in ("o", "s", "^", "D", "v", "x", "P", "*"))
+STYLES = tuple(zip("os^Dvx*P", ("-", "--", ":", "-.") * 2, strict=True))
+#: A cost axis spans this factor at least, so that small differences look small.
+LEAST_SPAN = 4.0
 #: Points with an error of 0 are drawn this factor below the smallest other error.
 ZERO_BELOW = 3.0
 
@@ -71,6 +74,8 @@ def draw(panels: Sequence[Panel], ylabel: str, path: Path) -> None:
                 )
         axis.set_xscale("log")
         axis.set_yscale("log")
+        if shown:
+            _limit(axis, [cost for cost, _ in shown])
         axis.set_title(panel.title)
         axis.set_xlabel(panel.xlabel)
         axis.grid(alpha=0.3, which="both")
@@ -84,3 +89,15 @@ def draw(panels: Sequence[Panel], ylabel: str, path: Path) -> None:
     figure.legend(handles=handles, loc="lower center", ncol=columns + 1, frameon=False, fontsize=9)
     figure.savefig(path, dpi=110, format="png")
     pyplot.close(figure)
+
+
+def _limit(axis: Any, costs: Sequence[float]) -> None:
+    """A cost axis around its points, with few and plain numbers."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    low, high = min(costs) / 1.2, max(costs) * 1.2
+    margin = max(1.0, LEAST_SPAN * low / high) ** 0.5
+    axis.set_xlim(low / margin, high * margin)
+    axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high / low < 300 else (1.0,), numticks=12))
+    axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}"))
+    axis.xaxis.set_minor_formatter(NullFormatter())
