@@ -134,10 +134,12 @@ def test_picture_errors_by_hand():
             return np.full((16, 16, 3), 0.25 + time / 4, np.float32)
 
     frames = [views.Frame(None, 0.0), views.Frame(None, 1.0)]
-    (found,) = codec.picture_errors([Fake()], frames, [[np.full((16, 16, 3), 0.25, np.float32)] * 2])
+    (found,) = codec.picture_errors([Fake()], frames, {0: [np.full((16, 16, 3), 0.25, np.float32)] * 2})
     assert found.rmse == pytest.approx(0.25 / math.sqrt(2)) and found.psnr == pytest.approx(15.0515, abs=1e-4)
-    (same,) = codec.picture_errors([Fake()], frames[:1], [[np.full((16, 16, 3), 0.25, np.float32)]])
+    want = [np.full((16, 16, 3), 0.25, np.float32)]
+    same, above = codec.picture_errors([Fake()], frames[:1], {0: want, 2: [want[0] + 0.5]})
     assert same.rmse == 0 and same.psnr == math.inf and same.ssim == 1
+    assert (above.level, above.rmse) == (2, 0.5)  # the file has no level 2: its picture is that of level 0
 
 
 def test_a_sweep_of_a_checkpoint(model_pt, tmp_path, capsys, monkeypatch):
@@ -171,7 +173,8 @@ def test_a_sweep_of_a_checkpoint(model_pt, tmp_path, capsys, monkeypatch):
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_file_alone_has_bytes_and_times_and_peers(scene, tmp_path, capfd):
+def test_a_file_alone_has_bytes_and_times_and_peers(scene, tmp_path, capfd, monkeypatch):
+    monkeypatch.setitem(sys.modules, "torchac", None)
     path = tmp_path / "scene.pd4"
     path.write_bytes(encode(scene, effort=1))
     assert bench.main(["codec", str(path), "--quick", "--json"]) == 0
@@ -322,8 +325,20 @@ def test_a_run_without_evaluations_or_records_is_refused(tmp_path):
         train.of_file(str(log))
 
 
+def write_views(folder: Path) -> Path:
+    """Four grey pictures from cameras side by side."""
+    frames = []
+    for i in range(4):
+        Image.fromarray(np.full((16, 24, 3), 40 * i, np.uint8)).save(folder / f"{i}.png")
+        pose = [[1, 0, 0, 0.1 * i], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]
+        frames.append({"file_path": f"{i}.png", "time": i / 3, "transform_matrix": pose})
+    content = {"fl_x": 30.0, "fl_y": 30.0, "cx": 12, "cy": 8, "w": 24, "h": 16, "frames": frames}
+    (folder / "transforms.json").write_text(json.dumps(content))
+    return folder
+
+
 def test_presets_are_trained_and_compared(tmp_path, capsys):
-    argv = ["train", "synthetic:static", "--downscale", "8", "--presets", "tiny", "--iterations", "12"]
+    argv = ["train", str(write_views(tmp_path)), "--holdout", "2", "--presets", "tiny", "--iterations", "4"]
     assert bench.main([*argv, "--plot", str(tmp_path / "t.png"), "--json"]) == 0
     (run,) = json.loads(capsys.readouterr().out)["runs"]
     assert run["name"] == "tiny" and run["anchors"] > 0 and len(run["curve"]) >= 2

@@ -8,7 +8,7 @@ from __future__ import annotations
 import json
 import math
 import tempfile
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -101,7 +101,7 @@ def sweep(
 ) -> list[Point]:
     """A point per step scale, mode and effort of the checkpoint `model`, whose scene is `scene`; `step` is called after
     each. Encoding is timed without verification, which costs one decoding more. Raises EncodeError, Pd4Error."""
-    reference = [[level.picture(f.camera, f.time) for f in frames] for level in load_levels(model)]
+    reference = {level.level: [level.picture(f.camera, f.time) for f in frames] for level in load_levels(model)}
     encode_with_report(scene, effort=1, verify=False)  # the first use of a library pays for its loading
     pictures: dict[str, tuple[PictureError, ...]] = {}
     points = []
@@ -191,12 +191,12 @@ def mask_error(masks: Sequence[np.ndarray], codes: Sequence[np.ndarray]) -> Valu
 
 
 def picture_errors(
-    levels: Sequence[Level], frames: Sequence[Frame], reference: Sequence[Sequence[np.ndarray]]
+    levels: Sequence[Level], frames: Sequence[Frame], reference: Mapping[int, Sequence[np.ndarray]]
 ) -> tuple[PictureError, ...]:
     """One per level of the checkpoint, whose pictures are `reference`. A level whose layer the file leaves out looks
     like the level below it, and is held against the checkpoint's own all the same."""
     errors = []
-    for number, wanted in enumerate(reference):
+    for number, wanted in reference.items():
         level = [level for level in levels if level.level <= number][-1]
         square, ssim = 0.0, 0.0
         for frame, want in zip(frames, wanted, strict=True):
