@@ -38,7 +38,7 @@ RENDER = ("--views", "1", "--only", "oracle float64,textbook float32,kernels,gsp
 INTRODUCTION = """\
 # Error against run time
 
-Made by `python tools/precision.py` from trained models; one report by itself: `pd4dgs-bench codec`, `render` or `train`.
+Made by `python tools/precision.py` from trained models; a single report: `pd4dgs-bench codec`, `render` or `train`.
 Times are medians with quartiles of repeated warm work; long work is repeated less, or not at all. Cold times are whole
 fresh processes, imports and reading included, with the largest memory that they held. Rings and the grey steps in the
 plots mark the Pareto front: nothing is better in one way without being worse in the other.
@@ -50,15 +50,15 @@ that vanishes; it is held against the checkpoint's highest level all the same. E
 
 **Other coders** get the same data in the same run, decode what they wrote, and are compared with it:
 
-- *symbols*: masks, attributes, residuals of planes, and weights, as this codec codes them; positions aside. LZMA has the
-  layout that suits it best, zstd the narrowest integers channel by channel. constriction's QuantizedGaussian and torchac
-  code under a Gaussian per channel, with 16 bytes per channel for its moments and range. torchac's tables have 16 bits.
+- *symbols*: masks, attributes, residuals of planes, and weights, as this codec codes them; positions aside. LZMA has
+  the layout that suits it best, zstd the narrowest integers channel by channel. constriction's QuantizedGaussian and
+  torchac (whose tables have 16 bits) code under a Gaussian per channel, with 16 bytes each for its moments and range.
 - *positions*: anchors of each layer; Draco with its kd-tree at level 10, in an order of its own.
 - *splats*: the Gaussians that one camera meets at one instant, with the colours that it sees, in formats that hold
-  static splats. The file beside them holds all instants and all views, so that their bytes answer another question: what
-  one frame costs where there is no model. SPZ (version 4) is written by gaussforge, from PLY and back to PLY, which its
-  times include; coordinates are scaled by a power of two to use its fixed point. PyPI's `spz` has no wheel, and its
-  source wants a Rust build. fourdgs uses its default profile without its own verification.
+  static splats. The file beside them holds all instants and all views, so that their bytes answer another question:
+  what one frame costs where there is no model. SPZ (version 4) is written by gaussforge, from PLY and back to PLY,
+  which its times include; coordinates are scaled by a power of two to use its fixed point. PyPI's `spz` has no wheel,
+  and its source wants a Rust build. fourdgs uses its default profile without its own verification.
 
 **Rasteriser.** Each way to draw gets the same Gaussians; the error is against a float64 oracle. Tiles change no pixel.
 Thresholds looser than the format's buy time with error.

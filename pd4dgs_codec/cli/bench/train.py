@@ -67,10 +67,10 @@ def execute(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.report.precision import train
     from pd4dgs_codec.report.precision.machine import describe, sentence
 
-    machine = describe()
+    machine = None if args.runs else describe()  # where the runs that exist were made is not known
     runs = [train.of_file(path) for path in args.runs] if args.runs else _trained(args, console)
     result: dict[str, Any] = {"source": args.source, "machine": machine, "runs": train.as_json(runs)}
-    text = "\n\n".join([train.table(runs), sentence(machine)])
+    text = "\n\n".join([train.table(runs), *([sentence(machine)] if machine else [])])
     finish(args, console, result, text, train.panels(runs), "held-out RMSE of the highest level")
     return OK
 

@@ -55,9 +55,10 @@ def draw(panels: Sequence[Panel], ylabel: str, path: Path) -> None:
     floor = min(positive, default=1.0) / ZERO_BELOW
     names = list(dict.fromkeys(series.name for panel in panels for series in panel.series))
     style = {name: STYLES[i % len(STYLES)] for i, name in enumerate(names)}
-    columns = min(4, len(names))
-    legend = 0.25 * -(-len(names) // columns) + 0.25
-    size = (4.4 * len(panels) + 0.4, 3.6 + legend)
+    width = 4.4 * len(panels) + 0.4
+    columns = max(1, int(width / (0.08 * max(map(len, names), default=0) + 0.7)))
+    legend = 0.22 * -(-(len(names) + 1) // columns) + 0.2
+    size = (width, 3.6 + legend)
     figure, axes = pyplot.subplots(1, len(panels), figsize=size, sharey=True, squeeze=False)
     for axis, panel in zip(axes[0], panels, strict=True):
         shown = [(cost, max(error, floor)) for series in panel.series for cost, error in series.points]
@@ -76,9 +77,12 @@ def draw(panels: Sequence[Panel], ylabel: str, path: Path) -> None:
         axis.set_yscale("log")
         if shown:
             _limit(axis, [cost for cost, _ in shown])
+            _number(axis.xaxis, *axis.get_xlim())
         axis.set_title(panel.title)
         axis.set_xlabel(panel.xlabel)
         axis.grid(alpha=0.3, which="both")
+    if errors:
+        _number(axes[0][0].yaxis, *axes[0][0].get_ylim())
     zero = "" if len(positive) == len(errors) else "\n(lowest marks: 0)"
     axes[0][0].set_ylabel(ylabel + zero)
     handles = [
@@ -86,18 +90,23 @@ def draw(panels: Sequence[Panel], ylabel: str, path: Path) -> None:
     ]
     handles.append(Line2D([], [], marker="o", color="0.75", mec="black", mfc="none", ms=11, lw=4, label="front"))
     figure.tight_layout(rect=(0, legend / size[1], 1, 1))
-    figure.legend(handles=handles, loc="lower center", ncol=columns + 1, frameon=False, fontsize=9)
+    figure.legend(handles=handles, loc="lower center", ncol=columns, frameon=False, fontsize=9)
     figure.savefig(path, dpi=110, format="png")
     pyplot.close(figure)
 
 
 def _limit(axis: Any, costs: Sequence[float]) -> None:
-    """A cost axis around its points, with few and plain numbers."""
-    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
-
+    """The cost axis around its points."""
     low, high = min(costs) / 1.2, max(costs) * 1.2
     margin = max(1.0, LEAST_SPAN * low / high) ** 0.5
     axis.set_xlim(low / margin, high * margin)
-    axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0) if high / low < 300 else (1.0,), numticks=12))
-    axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}"))
-    axis.xaxis.set_minor_formatter(NullFormatter())
+
+
+def _number(axis: Any, low: float, high: float) -> None:
+    """Few and plain numbers on a logarithmic axis."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    subs = (1.0, 1.5, 2.0, 3.0, 5.0, 7.0) if high / low < 10 else (1.0, 2.0, 5.0) if high / low < 300 else (1.0,)
+    axis.set_major_locator(LogLocator(subs=subs, numticks=12))
+    axis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.10g}"))
+    axis.set_minor_formatter(NullFormatter())
