@@ -23,15 +23,20 @@ from pd4dgs_codec.cli import bench
 from pd4dgs_codec.render.threads import configure
 
 SHARED = Path(os.environ.get("PD4DGS_SHARED", Path(__file__).resolve().parents[2] / "shared" / "data"))
-#: name, cameras, downscale, step scales, models whose training is drawn together
-SCENES = (
-    ("shelf-hand", SHARED / "shelf-hand", 2, "1,2,4", ("shelf-hand", "shelf-hand-paper")),
-    ("bouncing-balls", SHARED / "bouncing-balls", 4, "1,2,4", ("bouncing-balls",)),
-    *((f"synthetic-{kind}", f"synthetic:{kind}", 1, "1,4", (f"synthetic-{kind}",))
-      for kind in ("static", "global", "local", "fast")),
-)  # fmt: skip
-CODEC = ("--modes", "ans,lzma", "--efforts", "1,5", "--repeats", "3", "--cold", "1", "--views", "4")
-#: Variants that need kernels of their own are drawn for the first scene alone.
+FULL = ("--step-scales", "1,2,4", "--efforts", "1,5", "--cold", "1")
+#: Without the efforts that take minutes, and, but for the static scene, without other coders.
+SHORT = ("--step-scales", "1,4", "--efforts", "1", "--cold", "1")
+#: name, cameras, downscale, codec options, models whose training is drawn together
+SCENES: tuple[tuple[str, Path | str, int, tuple[str, ...], tuple[str, ...]], ...] = (
+    ("shelf-hand", SHARED / "shelf-hand", 2, FULL, ("shelf-hand", "shelf-hand-paper")),
+    ("bouncing-balls", SHARED / "bouncing-balls", 4, FULL, ("bouncing-balls",)),
+    ("synthetic-static", "synthetic:static", 1, SHORT, ("synthetic-static",)),
+    ("synthetic-global", "synthetic:global", 1, (*SHORT, "--no-peers"), ("synthetic-global",)),
+    ("synthetic-local", "synthetic:local", 1, (*SHORT, "--no-peers"), ("synthetic-local",)),
+    ("synthetic-fast", "synthetic:fast", 1, (*SHORT, "--no-peers"), ("synthetic-fast",)),
+)
+CODEC = ("--modes", "ans,lzma", "--repeats", "3", "--views", "4")
+#: Kernels with other constants are compiled and drawn for the first scene alone.
 RENDER_ALL = ("--views", "1")
 RENDER = ("--views", "1", "--only", "oracle float64,textbook float32,kernels,gsplat")
 
@@ -76,7 +81,7 @@ def main(argv: list[str] | None = None) -> int:
     configure()
     (args.docs / "img").mkdir(parents=True, exist_ok=True)
     lines, results = [INTRODUCTION], {}
-    for name, cameras, downscale, scales, trained in SCENES:
+    for name, cameras, downscale, options, trained in SCENES:
         if args.only and name not in args.only:
             continue
         model = args.out / name / "model.pt"
@@ -87,7 +92,7 @@ def main(argv: list[str] | None = None) -> int:
         data = ["--data", str(cameras), "--downscale", str(downscale)]
         runs = [str(p) for p in (args.out / n / "model.pt" for n in trained) if p.exists()]
         reports = {
-            "codec": ["codec", str(model), *data, "--step-scales", scales, *CODEC],
+            "codec": ["codec", str(model), *data, *CODEC, *options],
             "render": ["render", str(model), *data, *(RENDER if results else RENDER_ALL)],
             "train": ["train", "--from", *runs],
         }

@@ -56,7 +56,7 @@ def draw(panels: Sequence[Panel], ylabel: str, path: Path) -> None:
     names = list(dict.fromkeys(series.name for panel in panels for series in panel.series))
     style = {name: STYLES[i % len(STYLES)] for i, name in enumerate(names)}
     width = 4.4 * len(panels) + 0.4
-    columns = max(1, int(width / (0.08 * max(map(len, names), default=0) + 0.7)))
+    columns = max(1, int(width / (0.075 * max(map(len, names), default=0) + 1.0)))
     legend = 0.22 * -(-(len(names) + 1) // columns) + 0.2
     size = (width, 3.6 + legend)
     figure, axes = pyplot.subplots(1, len(panels), figsize=size, sharey=True, squeeze=False)
