@@ -108,25 +108,26 @@ def test_plots_take_zeros_and_many_series(tmp_path):
     with Image.open(tmp_path / "p.png") as image:
         assert image.width > 800
         pixels = np.asarray(image.convert("RGB")).astype(int)
+    assert len(set(plot.STYLES)) == len(plot.STYLES)
     assert np.ptp(pixels, axis=2).max() == 0  # black and white, nothing told by colour
 
 
 # -- codec -------------------------------------------------------------------------------------------------------------
 
 
-def test_value_errors_by_hand(scene):
+def test_deviations_by_hand(scene):
     from dataclasses import replace
 
     planned, _ = plan(scene, 2)
     moved = planned.feature.copy()
     moved[0, 0] += 0.5
-    found = {v.what: v for v in codec.value_errors(planned, replace(planned, feature=moved))}
+    found = {v.what: v for v in codec.deviations(planned, replace(planned, feature=moved))}
     assert found["feature"].largest == 0.5 and found["feature"].step == planned.steps.feature
     assert found["feature"].rms == pytest.approx(0.5 / math.sqrt(moved.size))
     assert list(found) == list(vars(planned.steps)) and found["weights_local"].largest == 0
 
 
-def test_picture_errors_by_hand():
+def test_picture_deviations_by_hand():
     class Fake:
         level = 0
 
@@ -134,10 +135,10 @@ def test_picture_errors_by_hand():
             return np.full((16, 16, 3), 0.25 + time / 4, np.float32)
 
     frames = [views.Frame(None, 0.0), views.Frame(None, 1.0)]
-    (found,) = codec.picture_errors([Fake()], frames, {0: [np.full((16, 16, 3), 0.25, np.float32)] * 2})
+    (found,) = codec.picture_deviations([Fake()], frames, {0: [np.full((16, 16, 3), 0.25, np.float32)] * 2})
     assert found.rmse == pytest.approx(0.25 / math.sqrt(2)) and found.psnr == pytest.approx(15.0515, abs=1e-4)
     want = [np.full((16, 16, 3), 0.25, np.float32)]
-    same, above = codec.picture_errors([Fake()], frames[:1], {0: want, 2: [want[0] + 0.5]})
+    same, above = codec.picture_deviations([Fake()], frames[:1], {0: want, 2: [want[0] + 0.5]})
     assert same.rmse == 0 and same.psnr == math.inf and same.ssim == 1
     assert (above.level, above.rmse) == (2, 0.5)  # the file has no level 2: its picture is that of level 0
 

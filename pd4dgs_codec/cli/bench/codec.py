@@ -3,19 +3,26 @@
 from __future__ import annotations
 
 import argparse
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.cli.bench.output import add_output, add_views, finish, listed, one_of, prepare
 from pd4dgs_codec.cli.common import OK, Console, Parser, count, positive_float, positive_int, use_threads
 from pd4dgs_codec.cli.files import is_pd4, read_bytes
 from pd4dgs_codec.cli.progress import progress_bar
 
+if TYPE_CHECKING:
+    from pd4dgs_codec.report.frames import Frame
+    from pd4dgs_codec.report.precision.codec import Deviation, Point, Sweep
+    from pd4dgs_codec.report.precision.peers import Row
+    from pd4dgs_codec.scene import SceneInfo
+
 DETAILS = """\
 A checkpoint is packed at every combination of step scale, mode and effort. Each file's error is measured on its values,
 and on pictures against those of the checkpoint; a file without its checkpoint has bytes and times alone. Times: warm,
 the median and quartiles of the repeats in one process (none begun after 5 s); cold, at the step scale nearest to 1,
 whole fresh processes, with the largest memory they held. Peers code the same symbols, the same anchors, and the splats
-of one instant.
+of one instant: LZMA, zstd and constriction are always there, Draco, SPZ and fourdgs come with the extra "bench", torchac
+is used where it is installed.
 
 examples:
   pd4dgs-bench codec model.pt --data recordings/kitchen --downscale 2 --plot codec.png > codec.md
@@ -32,7 +39,9 @@ def parser() -> Parser:
     """The options of the report."""
     summary = "Measure what the codec's error costs in bytes and seconds, and what other coders make of the same data."
     p = Parser("bench codec", "model.pt|FILE.pd4", summary, DETAILS)
-    p.add_argument("input", metavar="FILE", help="checkpoint of pd4dgs-train, or a .pd4 file")
+    p.add_argument(
+        "input", metavar="FILE", help="checkpoint of pd4dgs-train, or a .pd4 file; - reads a .pd4 from stdin"
+    )
     p.add_argument(
         "--step-scales", type=listed(positive_float), metavar="X,...", help="step scales (default: 0.5,1,2,4)"
     )
@@ -52,48 +61,65 @@ def execute(args: argparse.Namespace, console: Console) -> int:
     prepare(args, console)
     data = read_bytes(args.input)
     use_threads(args)
-    from pd4dgs_codec.codec.decoder import decode_layers
-    from pd4dgs_codec.codec.encoder import encode
-    from pd4dgs_codec.report.levels import load_levels
-    from pd4dgs_codec.report.precision import codec, peers, views
+    from pd4dgs_codec.report.precision import codec, peers
     from pd4dgs_codec.report.precision.machine import describe, sentence
 
     machine = describe(peers.PACKAGES)
     what = codec.Sweep(**_options(args))
-    n_views = args.views or (QUICK_VIEWS if args.quick else VIEWS)
     masks = None
     if is_pd4(data):
         points = [codec.file_point(data, what.repeats, what.cold)]
-        info = load_levels(data, 0)[0].model.info
-        frames = views.frames(info, args.data, n_views, args.downscale, args.holdout)
     else:
-        from pd4dgs_codec.model import checkpoint
-        from pd4dgs_codec.model.convert import to_scene
-
-        model, _ = checkpoint.load(args.input)
-        scene = to_scene(model)
-        frames = views.frames(scene.info, args.data, n_views, args.downscale, args.holdout)
-        masks = codec.mask_error([model.masks(i).detach().numpy() for i in scene.layers], scene.mask)
-        with progress_bar(len(what), "files", "codec") as step:
-            points = codec.sweep(args.input, scene, frames, what, step)
-        data = encode(scene, effort=1, verify=False)  # every effort codes the same symbols
-    result: dict[str, Any] = {"input": args.input, "machine": machine, "views": len(frames)}
+        points, masks, data = _swept(args, what)
+    result: dict[str, Any] = {"input": args.input, "machine": machine}
     result |= {"points": codec.as_json(points), "masks": None if masks is None else vars(masks)}
     parts = [codec.points_table(points)]
-    if any(p.values for p in points):
+    if masks is not None:
         parts.append(codec.values_table(points, masks))
     if not args.no_peers:
-        layers = decode_layers(data)[1]
-        symbols = peers.symbols_of(layers)
         console.message("other coders on the same data")
-        rows = peers.coder_rows(symbols, what.repeats, PEER_EFFORT) + peers.position_rows(layers, what.repeats)
-        own_bytes = codec.usual(points).bytes
-        rows += peers.splat_rows(load_levels(data)[-1], frames[len(frames) // 2], own_bytes, what.repeats)
-        result |= {"peers": peers.as_json(rows), "peers_rate_bits": symbols.rate_bits}
-        parts.append(peers.table(rows, symbols.rate_bits))
+        rows, rate_bits = _beside(args, data, codec.usual(points).bytes, what.repeats)
+        result |= {"peers": peers.as_json(rows), "peers_rate_bits": rate_bits}
+        parts.append(peers.table(rows, rate_bits))
     text = "\n\n".join([*parts, sentence(machine)])
     finish(args, console, result, text, codec.panels(points), "RMSE of pictures")
     return OK
+
+
+def _swept(args: argparse.Namespace, what: Sweep) -> tuple[list[Point], Deviation, bytes]:
+    """(points of a checkpoint, what its mask codes lose, a file of its symbols, which no effort changes)."""
+    from pd4dgs_codec.codec.encoder import encode
+    from pd4dgs_codec.model import checkpoint
+    from pd4dgs_codec.model.convert import to_scene
+    from pd4dgs_codec.report.precision import codec
+
+    model, _ = checkpoint.load(args.input)
+    scene = to_scene(model)
+    masks = codec.mask_deviation([model.masks(i).detach().numpy() for i in scene.layers], scene.mask)
+    pictures = _frames(args, scene.info)
+    with progress_bar(len(what), "files", "codec") as step:
+        points = codec.sweep(args.input, scene, pictures, what, step)
+    return points, masks, encode(scene, effort=1, verify=False)
+
+
+def _beside(args: argparse.Namespace, data: bytes, own_bytes: int, repeats: int) -> tuple[list[Row], float]:
+    """(rows of all coders on the file's symbols, anchors and splats, the symbols' sum of R(a) in bits)."""
+    from pd4dgs_codec.codec.decoder import decode_layers
+    from pd4dgs_codec.report.levels import load_levels
+    from pd4dgs_codec.report.precision import peers
+
+    layers = decode_layers(data)[1]
+    symbols, level = peers.symbols_of(layers), load_levels(data)[-1]
+    pictures = _frames(args, level.model.info)
+    rows = peers.coder_rows(symbols, repeats, PEER_EFFORT) + peers.position_rows(layers, repeats)
+    rows += peers.splat_rows(level, pictures[len(pictures) // 2], own_bytes, repeats)
+    return rows, symbols.rate_bits
+
+
+def _frames(args: argparse.Namespace, info: SceneInfo) -> list[Frame]:
+    from pd4dgs_codec.report.precision.views import frames
+
+    return frames(info, args.data, args.views or (QUICK_VIEWS if args.quick else VIEWS), args.downscale, args.holdout)
 
 
 def _effort(text: str) -> int:

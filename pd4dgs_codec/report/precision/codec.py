@@ -50,7 +50,7 @@ class Sweep:
 
 
 @dataclass(frozen=True)
-class ValuesError:
+class Deviation:
     """Of all tensors that share a step. what: that field of Steps, or mask. In the unit of the values."""
 
     what: str
@@ -61,7 +61,7 @@ class ValuesError:
 
 
 @dataclass(frozen=True)
-class PictureError:
+class PictureDeviation:
     """One level's pictures against the checkpoint's own. rmse: over all pixels of all pictures, 0..1, not rounded to 8
     bits; psnr in dB, infinite for equal pictures; ssim: mean over the pictures, which are rounded to 8 bits for it."""
 
@@ -87,8 +87,8 @@ class Point:
     encode: Timing | None = None
     decode_cold: Cold | None = None
     encode_cold: Cold | None = None
-    values: tuple[ValuesError, ...] = ()
-    pictures: tuple[PictureError, ...] = ()
+    values: tuple[Deviation, ...] = ()
+    pictures: tuple[PictureDeviation, ...] = ()
 
     @property
     def error(self) -> float | None:
@@ -103,7 +103,7 @@ def sweep(
     each. Encoding is timed without verification, which costs one decoding more. Raises EncodeError, Pd4Error."""
     reference = {level.level: [level.picture(f.camera, f.time) for f in frames] for level in load_levels(model)}
     encode_with_report(scene, effort=1, verify=False)  # the first use of a library pays for its loading
-    pictures: dict[str, tuple[PictureError, ...]] = {}
+    pictures: dict[str, tuple[PictureDeviation, ...]] = {}
     points = []
     for scale in what.step_scales:
         planned, _ = plan(replace(scene, steps=scene.steps.scaled(scale)))
@@ -113,8 +113,8 @@ def sweep(
                 point, data = _point(model, scene, options, what)
                 key = json.dumps(hashes(data))  # modes and efforts change no value: their pictures are the same
                 if key not in pictures:
-                    pictures[key] = picture_errors(load_levels(data), frames, reference)
-                values = tuple(value_errors(planned, decode(data)))
+                    pictures[key] = picture_deviations(load_levels(data), frames, reference)
+                values = tuple(deviations(planned, decode(data)))
                 points.append(replace(point, values=values, pictures=pictures[key]))
                 step()
     return points
@@ -157,7 +157,7 @@ def file_point(data: bytes, repeats: int, cold_repeats: int, report: Report | No
     )
 
 
-def value_errors(given: Scene, decoded: Scene) -> list[ValuesError]:
+def deviations(given: Scene, decoded: Scene) -> list[Deviation]:
     """One per step that the scenes' tensors use, in the order of Steps. given: planned, its steps those of the file."""
     squares: dict[str, list[float]] = {}
     for index, layer in enumerate(given.layers):
@@ -174,25 +174,25 @@ def value_errors(given: Scene, decoded: Scene) -> list[ValuesError]:
                              count + error.size]  # fmt: skip
     steps = vars(given.steps)
     return [
-        ValuesError(name, UNITS.get(name, ""), steps[name], largest, math.sqrt(total / max(count, 1)))
+        Deviation(name, UNITS.get(name, ""), steps[name], largest, math.sqrt(total / max(count, 1)))
         for name in steps
         if name in squares
         for largest, total, count in [squares[name]]
     ]
 
 
-def mask_error(masks: Sequence[np.ndarray], codes: Sequence[np.ndarray]) -> ValuesError:
+def mask_deviation(masks: Sequence[np.ndarray], codes: Sequence[np.ndarray]) -> Deviation:
     """Masks in 0..1 of each level against those that their codes (uint8, same shapes) stand for."""
     errors = np.concatenate(
         [np.abs(m.astype(np.float64) - c * np.float64(MASK_STEP)) for m, c in zip(masks, codes, strict=True)]
     )
     rms = math.sqrt(float((errors**2).mean())) if errors.size else 0.0
-    return ValuesError("mask", UNITS["mask"], float(MASK_STEP), float(errors.max(initial=0.0)), rms)
+    return Deviation("mask", UNITS["mask"], float(MASK_STEP), float(errors.max(initial=0.0)), rms)
 
 
-def picture_errors(
+def picture_deviations(
     levels: Sequence[Level], frames: Sequence[Frame], reference: Mapping[int, Sequence[np.ndarray]]
-) -> tuple[PictureError, ...]:
+) -> tuple[PictureDeviation, ...]:
     """One per level of the checkpoint, whose pictures are `reference`. A level whose layer the file leaves out looks
     like the level below it, and is held against the checkpoint's own all the same."""
     errors = []
@@ -205,7 +205,7 @@ def picture_errors(
             ssim += mssim(got, want)
         rmse = math.sqrt(square / len(frames))
         psnr = math.inf if rmse == 0 else -20 * math.log10(rmse)
-        errors.append(PictureError(number, rmse, psnr, ssim / len(frames)))
+        errors.append(PictureDeviation(number, rmse, psnr, ssim / len(frames)))
     return tuple(errors)
 
 
@@ -257,7 +257,7 @@ def points_table(points: Sequence[Point]) -> str:
     return markdown(head, rows)
 
 
-def values_table(points: Sequence[Point], masks: ValuesError | None = None) -> str:
+def values_table(points: Sequence[Point], masks: Deviation | None = None) -> str:
     """A row per step scale and tensor group: the largest error and the root of the mean square."""
     head = ("steps x", "what", "unit", "step Q", "largest error", "RMS error", "largest / Q")
     rows, seen = [], set()
@@ -291,7 +291,7 @@ def as_json(points: Sequence[Point]) -> list[dict[str, Any]]:
     return [{**asdict(p), "error": p.error, "fronts": on} for p, on in zip(points, fronts(points), strict=True)]
 
 
-def _value_cells(v: ValuesError) -> tuple[str, ...]:
+def _value_cells(v: Deviation) -> tuple[str, ...]:
     return v.what, v.unit or "1", f"{v.step:.4g}", f"{v.largest:.3g}", f"{v.rms:.3g}", f"{v.largest / v.step:.3f}"
 
 

@@ -43,8 +43,8 @@ LEAST_SIGMA = 2.0**-10
 TORCHAC_ENTRIES = 1 << 24
 #: Degree-0 spherical harmonic, by which PLY files of splats store colour.
 _SH0 = 0.28209479177387814
-#: SPZ keeps 12 fractional bits and 11 before the point: coordinates are scaled by a power of two to use them.
-_SPZ_EXTENT = 1024.0
+#: What SPZ can hold, in its units: coordinates have 11 bits before the point and 12 behind, scales end at exp(5.9).
+_SPZ_EXTENT, _SPZ_SCALE = 1024.0, 256.0
 
 
 @dataclass(frozen=True)
@@ -398,8 +398,11 @@ def _spz_peer(splats: Splats) -> tuple[Callable[[Splats], bytes], Callable[[byte
     import gaussforge
 
     converter = gaussforge.GaussForge()
-    largest = max(float(np.abs(splats.means).max(initial=0.0)), 1e-9)
-    factor = np.float32(2.0 ** math.floor(math.log2(_SPZ_EXTENT / largest)))
+    room = min(
+        limit / max(float(np.abs(values).max(initial=0.0)), 1e-9)
+        for limit, values in ((_SPZ_EXTENT, splats.means), (_SPZ_SCALE, splats.scales))
+    )
+    factor = np.float32(2.0 ** math.floor(math.log2(room)))
 
     def scaled(s: Splats, by: np.float32) -> Splats:
         return Splats(s.means * by, s.scales * by, s.quats, s.opacities, s.colors)

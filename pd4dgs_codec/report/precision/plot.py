@@ -8,7 +8,8 @@ from pathlib import Path
 from typing import Any
 
 #: Marker and line style per series; colours are not needed to tell them apart.
-STYLES = tuple(zip("os^Dvx*P", ("-", "--", ":", "-.") * 2, strict=True))
+MARKERS, LINES = "os^Dvx*P<>p+", ("-", "--", ":", "-.")
+STYLES = tuple((MARKERS[i % 12], LINES[(i + i // 12) % 4]) for i in range(48))
 #: A cost axis spans this factor at least, so that small differences look small.
 LEAST_SPAN = 4.0
 #: Points with an error of 0 are drawn this factor below the smallest other error.
