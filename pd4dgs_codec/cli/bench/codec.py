@@ -21,8 +21,8 @@ A checkpoint is packed at every combination of step scale, mode and effort. Each
 and on pictures against those of the checkpoint; a file without its checkpoint has bytes and times alone. Times: warm,
 the median and quartiles of the repeats in one process (none begun after 5 s); cold, at the step scale nearest to 1,
 whole fresh processes, with the largest memory they held. Peers code the same symbols, the same anchors, and the splats
-of one instant: LZMA, zstd and constriction are always there, Draco, SPZ and fourdgs come with the extra "bench", torchac
-is used where it is installed.
+of one instant: LZMA, zstd and constriction are always there, Draco, SPZ and fourdgs with the extra "bench", and torchac
+where it where it is installed.
 
 examples:
   pd4dgs-bench codec model.pt --data recordings/kitchen --downscale 2 --plot codec.png > codec.md
