@@ -5,7 +5,9 @@ from __future__ import annotations
 import importlib
 import json
 import math
+import platform
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +21,7 @@ Image = pytest.importorskip("PIL.Image")
 from strategies import make_scene  # noqa: E402
 
 from pd4dgs_codec.cli import bench  # noqa: E402
-from pd4dgs_codec.codec.decoder import decode, decode_layers  # noqa: E402
+from pd4dgs_codec.codec.decoder import decode_layers  # noqa: E402
 from pd4dgs_codec.codec.encoder import encode  # noqa: E402
 from pd4dgs_codec.codec.plan import plan  # noqa: E402
 from pd4dgs_codec.errors import DataError, Pd4Error  # noqa: E402
@@ -42,8 +44,6 @@ def _one_thread(monkeypatch):
 @pytest.fixture(scope="module")
 def scene():
     """40 anchors in front of a small camera, three layers."""
-    from dataclasses import replace
-
     made = make_scene(8, anchors=40)
     viewmat = np.eye(4, dtype=np.float32)
     viewmat[2, 3] = 2.0
@@ -96,8 +96,6 @@ def test_the_machine_is_described_without_names_or_paths():
     about = machine.describe(("numpy", "no-such-package"))
     assert about["cpus"] >= 1 and about["versions"]["numpy"] == np.__version__
     assert about["versions"]["no-such-package"] is None
-    import platform
-
     text = machine.sentence(about)
     assert "Python" in text and "/" not in text.replace("n/a", "") and platform.node() not in text
 
@@ -116,8 +114,6 @@ def test_plots_take_zeros_and_many_series(tmp_path):
 
 
 def test_deviations_by_hand(scene):
-    from dataclasses import replace
-
     planned, _ = plan(scene, 2)
     moved = planned.feature.copy()
     moved[0, 0] += 0.5
@@ -383,16 +379,18 @@ def test_outputs_that_exist_are_refused_before_any_work(tmp_path, capsys):
     assert "exists already" in capsys.readouterr().err and (tmp_path / "p.png").read_bytes() == b"kept"
 
 
+def test_a_file_alone_has_nothing_to_plot(tmp_path, capsys, scene):
+    (tmp_path / "scene.pd4").write_bytes(encode(scene, effort=1))
+    assert bench.main(["codec", str(tmp_path / "scene.pd4"), "--plot", str(tmp_path / "p.png")]) == 2
+    assert "no error to plot" in capsys.readouterr().err
+
+
 def test_spread_takes_the_middle_of_each_share():
     assert views.spread(range(10), 2) == [2, 7] and views.spread([1, 2], 5) == [1, 2]
 
 
 def test_usual_is_what_the_encoder_writes(scene):
-    data = encode(scene, effort=1)
-    decode(data)
-    point = codec.file_point(data, 1, 0)
-    from dataclasses import replace
-
+    point = codec.file_point(encode(scene, effort=1), 1, 0)
     others = [
         replace(point, step_scale=s, mode=m, effort=e) for s in (0.5, 1.0) for m in ("lzma", "ans") for e in (1, 5)
     ]

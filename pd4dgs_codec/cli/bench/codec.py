@@ -6,7 +6,7 @@ import argparse
 from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.cli.bench.output import add_output, add_views, finish, listed, one_of, prepare
-from pd4dgs_codec.cli.common import OK, Console, Parser, count, positive_float, positive_int, use_threads
+from pd4dgs_codec.cli.common import OK, Console, Parser, UsageError, count, positive_float, positive_int, use_threads
 from pd4dgs_codec.cli.files import is_pd4, read_bytes
 from pd4dgs_codec.cli.progress import progress_bar
 
@@ -22,7 +22,7 @@ and on pictures against those of the checkpoint; a file without its checkpoint h
 the median and quartiles of the repeats in one process (none begun after 5 s); cold, at the step scale nearest to 1,
 whole fresh processes, with the largest memory they held. Peers code the same symbols, the same anchors, and the splats
 of one instant: LZMA, zstd and constriction are always there, Draco, SPZ and fourdgs with the extra "bench", and torchac
-where it where it is installed.
+where it is installed.
 
 examples:
   pd4dgs-bench codec model.pt --data recordings/kitchen --downscale 2 --plot codec.png > codec.md
@@ -68,6 +68,8 @@ def execute(args: argparse.Namespace, console: Console) -> int:
     what = codec.Sweep(**_options(args))
     masks = None
     if is_pd4(data):
+        if args.plot is not None:
+            raise UsageError("--plot: a file without its checkpoint has no error to plot; expected a checkpoint")
         points = [codec.file_point(data, what.repeats, what.cold)]
     else:
         points, masks, data = _swept(args, what)
