@@ -50,9 +50,10 @@ plots mark the Pareto front: nothing is better in one way without being worse in
 
 **Codec.** Each step scale multiplies all quantisation steps of the model. Pictures are compared with the checkpoint's
 own at the highest level, unrounded for PSNR. A finished run's tensors lie on its steps, so that at scale 1 the values
-come back exactly, and the pictures differ by the codes of the masks alone. A coarser file may leave out a deformation
-that vanishes; it is held against the checkpoint's highest level all the same. Encoding is timed without verification.
-The synthetic scenes are packed at effort 1 alone, and only the static one has the other coders beside it.
+come back exactly, and the pictures differ by the codes of the masks alone. Anchors are integers and exact at any
+scale. A coarser file may leave out a deformation that vanishes; it is held against the checkpoint's highest level all
+the same. Encoding is timed without verification. The synthetic scenes are packed at effort 1 alone, and only the
+static one has the other coders beside it.
 
 **Other coders** get the same data in the same run, decode what they wrote, and are compared with it:
 

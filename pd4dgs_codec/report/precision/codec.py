@@ -102,7 +102,7 @@ def sweep(
     """A point per step scale, mode and effort of the checkpoint `model`, whose scene is `scene`; `step` is called after
     each. Encoding is timed without verification, which costs one decoding more. Raises EncodeError, Pd4Error."""
     reference = {level.level: [level.picture(f.camera, f.time) for f in frames] for level in load_levels(model)}
-    encode_with_report(scene, effort=1, verify=False)  # the first use of a library pays for its loading
+    encode_with_report(scene, effort=1, verify=False)  # as in file_point
     pictures: dict[str, tuple[PictureDeviation, ...]] = {}
     points = []
     for scale in what.step_scales:
@@ -137,6 +137,7 @@ def _point(model: str, scene: Scene, options: dict[str, Any], what: Sweep) -> tu
 
 def file_point(data: bytes, repeats: int, cold_repeats: int, report: Report | None = None) -> Point:
     """The point of a file's bytes alone; its decoding is timed. report: of its encoding, if that is known."""
+    decode(data)  # the first time pays for loading libraries
     _, seconds = measure(lambda: decode(data), repeats)
     about, fresh = info(data), None
     if cold_repeats:

@@ -27,6 +27,7 @@ from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
 from pd4dgs_codec.entropy.lzma_mode import decode_channels_lzma, encode_channels_lzma
 from pd4dgs_codec.entropy.positions import decode_positions, encode_positions
 from pd4dgs_codec.entropy.rate import gaussian_bits
+from pd4dgs_codec.errors import Pd4Error
 from pd4dgs_codec.report.frames import Frame
 from pd4dgs_codec.report.levels import Level
 from pd4dgs_codec.report.precision.splats import Splats, bake, draw, view
@@ -59,10 +60,6 @@ class Row:
     decode: Timing | None = None
     error: float | None = None
     missing: str | None = None
-
-
-class Lossy(Exception):
-    """A coder that must be lossless gave back something else."""
 
 
 # -- symbols -----------------------------------------------------------------------------------------------------------
@@ -276,7 +273,7 @@ def _coder_row(coder: Coder, symbols: Symbols, repeats: int) -> Row:
     payloads, encode = measure(lambda: coder.encode(symbols), repeats)
     channels, decode = measure(lambda: coder.decode(payloads, symbols), repeats)
     if not all(np.array_equal(a, b) for a, b in zip(channels, symbols.channels, strict=True)):
-        raise Lossy("its symbols came back as others")
+        raise Pd4Error("its symbols came back as others")
     return Row("symbols", coder.name, sum(map(len, payloads)) + coder.overhead(symbols), encode, decode, 0.0)
 
 
@@ -293,7 +290,7 @@ def position_rows(layers: Sequence[LayerSymbols], repeats: int) -> list[Row]:
             lambda: [decode_positions(p, len(c)) for p, c in zip(payloads, cells, strict=True)], repeats
         )
         if not all(np.array_equal(a, b) for a, b in zip(back, cells, strict=True)):
-            raise Lossy("its cells came back as others")
+            raise Pd4Error("its cells came back as others")
         return Row("positions", "this codec", sum(map(len, payloads)), encode, decode, 0.0)
 
     def draco() -> Row:
@@ -304,7 +301,7 @@ def position_rows(layers: Sequence[LayerSymbols], repeats: int) -> list[Row]:
         for points, c in zip(back, cells, strict=True):
             found = np.rint(np.asarray(points)).astype(np.int64) + c.min(axis=0)
             if not np.array_equal(np.unique(found, axis=0), np.unique(c, axis=0)):
-                raise Lossy("its cells came back as others")
+                raise Pd4Error("its cells came back as others")
         return Row("positions", "Draco, kd-tree, level 10", sum(map(len, payloads)), encode, decode, 0.0)
 
     return [own(), _peer_row("positions", "Draco", draco)]
