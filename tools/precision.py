@@ -55,7 +55,8 @@ scale. A coarser file may leave out a deformation that vanishes; it is held agai
 the same. Encoding is timed without verification. The synthetic scenes are packed at effort 1 alone, and only the
 static one has the other coders beside it.
 
-**Other coders** get the same data in the same run, decode what they wrote, and are compared with it:
+**Other coders** get the same data in the same run, decode what they wrote, and are compared with it. They come with
+`pip install -c constraints.txt '.[train,bench]'`, torchac by hand: it is GPL-3 and compiled at its first import.
 
 - *symbols*: masks, attributes, residuals of planes, and weights, as this codec codes them; positions aside. LZMA has
   the layout that suits it best, zstd the narrowest integers channel by channel. constriction's QuantizedGaussian and
