@@ -273,8 +273,11 @@ def values_table(points: Sequence[Point], masks: Deviation | None = None) -> str
 
 def panels(points: Sequence[Point]) -> list[Panel]:
     """Picture error against bytes, encoding and decoding seconds; a series per mode and effort."""
-    labels = {"bytes": "bytes", "encode": "encoding, s (warm)", "decode": "decoding, s (warm)"}
-    return [Panel(f"error against {name}", labels[name], tuple(_series(points, cost))) for name, cost in COSTS.items()]
+    labels = {"bytes": ("size", "bytes"), "encode": ("encoding", "s, warm"), "decode": ("decoding", "s, warm")}
+    return [
+        Panel(f"error against {labels[name][0]}", labels[name][1], tuple(_series(points, cost)))
+        for name, cost in COSTS.items()
+    ]
 
 
 def _series(points: Sequence[Point], cost: Callable[[Point], float | None]) -> list[Series]:
