@@ -11,6 +11,9 @@ from pd4dgs_codec.cli.common import Console, Parser, UsageError, run
 
 #: Report: what it is. The module of that name holds its `parser()` and `execute(args, console)`.
 REPORTS = {
+    "codec": "error against bytes and seconds per step, mode and effort; other coders on the same data",
+    "render": "the rasteriser's error against milliseconds: precision, tiles, thresholds",
+    "train": "held-out quality against wall time per preset",
     "latency": "seconds from the request to bytes and pictures over a slow link, and what the client does under faults",
     "stability": "stiff and extreme cases: what was fed, promised and came out, against high-precision references",
 }
