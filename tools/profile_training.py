@@ -1,17 +1,16 @@
 """Where the time of a training step goes: milliseconds per part and level, as a Markdown table.
 
-    python tools/profile_training.py out/shelf-hand/model.pt [--steps 20] [--at 0.55] [--threads 1]
+    python tools/profile_training.py out/*/model.pt [--steps 20] [--at 0.55] [--threads 1] [--write docs/training.md]
 
-Goes on from a checkpoint of `pd4dgs-train`, on the data it was trained on, as if it stood at the share `--at` of its
-run, with the levels in turn; nothing is written. Each part is timed by wrapping the functions that do it, and what a
-wrapped function spends in another one counts for the other alone. Columns are medians over the steps; a part's work in
-the backward pass that is not a kernel of its own is in "backward, the rest".
+Goes on from checkpoints of `pd4dgs-train`, on the data they were trained on, as if they stood at the share `--at` of
+their runs, with the levels in turn; the checkpoints stay as they are. Each part is timed by wrapping the functions that
+do it, and what a wrapped function spends in another one counts for the other alone. Columns are medians over the steps;
+a part's work in the backward pass that is not a kernel of its own is in "backward, the rest".
 """
 
 from __future__ import annotations
 
 import argparse
-import json
 import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable
@@ -19,6 +18,8 @@ from pathlib import Path
 from typing import Any
 
 LEVELS = (0, 1, 2)
+#: Lines of a page between which `--write` puts the tables.
+BEGIN, END = "<!-- profile: written by tools/profile_training.py -->", "<!-- end of profile -->"
 
 
 class Stopwatch:
@@ -27,12 +28,20 @@ class Stopwatch:
     def __init__(self) -> None:
         self.seconds: dict[str, float] = defaultdict(float)
         self._open: list[float] = []  #: per part being timed, the seconds that parts within it took
+        self._wrapped: list[tuple[Any, str, Any]] = []
 
     def wrap(self, owner: Any, name: str, part: str) -> None:
         """Times every call of owner.name (a function, method or static method) as `part`."""
-        found = owner.__dict__.get(name)
+        found = vars(owner).get(name)
         timed = self.timed(getattr(owner, name), part)
         setattr(owner, name, staticmethod(timed) if isinstance(found, staticmethod) else timed)
+        self._wrapped.append((owner, name, found))
+
+    def unwrap(self) -> None:
+        """Gives back what `wrap` replaced."""
+        for owner, name, found in reversed(self._wrapped):
+            delattr(owner, name) if found is None else setattr(owner, name, found)
+        self._wrapped.clear()
 
     def timed(self, function: Callable, part: str) -> Callable:
         """`function`, timed as `part`."""
@@ -95,8 +104,8 @@ def watch(trainer: Any, stopwatch: Stopwatch) -> None:
         stopwatch.wrap(owner, name, part)
     for field, name in ((trainer.model.global_deformation, "global"), (trainer.model.local_deformation, "local")):
         if field is not None:
-            field.forward = stopwatch.timed(field.forward, f"{name} deformation networks")
-    trainer.step = stopwatch.timed(trainer.step, "all else")
+            stopwatch.wrap(field, "forward", f"{name} deformation networks")
+    stopwatch.wrap(trainer, "step", "all else")
 
 
 def measure(trainer: Any, steps: int, at: float) -> list[list[dict[str, float]]]:
@@ -113,7 +122,10 @@ def measure(trainer: Any, steps: int, at: float) -> list[list[dict[str, float]]]
     for level in LEVELS:  # compiles the kernels and fills the caches
         step(level)
     watch(trainer, stopwatch)
-    turns = [[step(level) for level in LEVELS] for _ in range(steps)]
+    try:
+        turns = [[step(level) for level in LEVELS] for _ in range(steps)]
+    finally:
+        stopwatch.unwrap()
     return [list(level) for level in zip(*turns, strict=True)]
 
 
@@ -130,38 +142,51 @@ def _median(values: Iterable[float]) -> float:
     return ordered[len(ordered) // 2]
 
 
-def main() -> None:
-    """Entry point."""
-    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    p.add_argument("checkpoint", type=Path, help="a checkpoint of pd4dgs-train")
-    p.add_argument("--source", help="the data, where the checkpoint's own path does not lead to it")
-    p.add_argument("--steps", type=int, default=20, help="steps timed per level (default: 20)")
-    p.add_argument("--at", type=float, default=0.55, help="share of the run at which to stand (default: 0.55)")
-    p.add_argument("--threads", type=int, help="threads (default: OMP_NUM_THREADS, else all cores)")
-    args = p.parse_args()
-
-    from pd4dgs_codec.render.threads import configure
-
-    threads = configure(args.threads)
+def profile(path: Path, source: str | None, steps: int, at: float, threads: int) -> str:
+    """The table of one checkpoint under a line that says what was measured."""
     from pd4dgs_codec.cli.resume import parse_config
     from pd4dgs_codec.data.dataset import load
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.train.loop import Trainer
 
-    config = parse_config(checkpoint.load(args.checkpoint)[1]["config"], str(args.checkpoint))
-    dataset = load(args.source or config.source, downscale=config.downscale, holdout=config.holdout)
+    config = parse_config(checkpoint.load(path)[1]["config"], str(path))
+    dataset = load(source or config.source, downscale=config.downscale, holdout=config.holdout)
     trainer = Trainer(config, dataset)
-    trainer.resume(args.checkpoint)
-    table = rows(measure(trainer, args.steps, args.at))
-    view = dataset.train[0]
-    print(
-        f"{dataset.name} {view.width}x{view.height}, {config.preset}, {len(trainer.model.anchor_q):,} anchors, "
-        f"{threads} thread(s), at {args.at:g} of the run: milliseconds per step\n"
-    )
-    print("| part | level 0 | level 1 | level 2 |\n|---|---|---|---|")
-    for part, times in table:
-        print(f"| {part} | {' | '.join(f'{t:.1f}' for t in times)} |")
-    print(f"\n{json.dumps({part: [round(t, 3) for t in times] for part, times in table})}")
+    trainer.resume(path)
+    size = f"{dataset.train[0].width}x{dataset.train[0].height}"
+    lines = [
+        f"{dataset.name} {size}, {config.preset}, {len(trainer.model.anchor_q):,} anchors, {threads} thread(s), at "
+        f"{at:g} of the run, milliseconds:",
+        "",
+        "| part | level 0 | level 1 | level 2 |",
+        "|---|---|---|---|",
+    ]
+    for part, times in rows(measure(trainer, steps, at)):
+        lines.append(f"| {part} | {' | '.join(f'{t:.1f}' for t in times)} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Entry point."""
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("checkpoints", nargs="+", type=Path, help="checkpoints of pd4dgs-train")
+    p.add_argument("--source", help="the data, where a checkpoint's own path does not lead to it")
+    p.add_argument("--steps", type=int, default=20, help="steps timed per level (default: 20)")
+    p.add_argument("--at", type=float, default=0.55, help="share of the run at which to stand (default: 0.55)")
+    p.add_argument("--threads", type=int, help="threads (default: OMP_NUM_THREADS, else all cores)")
+    p.add_argument("--write", type=Path, metavar="PAGE.md", help="put the tables into this page, between its marks")
+    args = p.parse_args()
+
+    from pd4dgs_codec.render.threads import configure
+
+    threads = configure(args.threads)
+    tables = [profile(path, args.source, args.steps, args.at, threads) for path in args.checkpoints]
+    text = "\n\n".join(tables)
+    print(text)
+    if args.write:
+        page = args.write.read_text()
+        before, after = page[: page.index(BEGIN)], page[page.index(END) :]
+        args.write.write_text(f"{before}{BEGIN}\n\n{text}\n\n{after}")
 
 
 if __name__ == "__main__":
