@@ -97,3 +97,21 @@ def test_moments_and_their_gradient_are_those_of_the_plain_form(rows):
         results.append((moments, leaf.grad))
     for found, expected in zip(*results, strict=True):
         torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 2e-11), (torch.float32, 2e-4)])
+def test_the_kernels_give_the_plain_forms_rate_and_gradients(dtype, bound):
+    """Widths from a thousandth of a step to a thousand steps, distances up to 60 sigma and both sides of Q/2."""
+    sigma = torch.logspace(-3, 3, 25, dtype=torch.float64)
+    z = torch.cat([torch.linspace(-60, 60, 41, dtype=torch.float64), torch.logspace(-6, 0, 7, dtype=torch.float64)])
+    a = torch.cat([z[:, None] * sigma, z[:, None].clamp(-1, 1) * sigma + 0.5]).to(dtype)
+    sigma, mu, weights = sigma.to(dtype), torch.zeros(25, dtype=dtype), torch.rand(a.shape, dtype=dtype) + 0.5
+    results = []
+    for form in (lambda x: x, lambda x: x[None]):  # the plain form takes what has another number of axes
+        leaves = [x.clone().requires_grad_() for x in (a, mu, sigma)]
+        bits = log_probability(*map(form, leaves), 1.0)
+        (bits * weights).sum().backward()
+        results.append([bits.detach().reshape(a.shape), *(x.grad for x in leaves)])
+    for found, expected in zip(*results, strict=True):
+        scale = expected.abs().clamp(min=1.0)
+        assert float(((found - expected).abs() / scale).max()) < bound
