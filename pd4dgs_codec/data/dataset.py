@@ -81,7 +81,8 @@ class Dataset:
         remarks = []
         if self.left_out:
             names = ", ".join(self.left_out[:REMARKED]) + (", ..." if len(self.left_out) > REMARKED else "")
-            remarks.append(f"{len(self.left_out)} views left out, their masks hold no valid pixel: {names}")
+            count = f"{len(self.left_out)} of {len(self.train) + len(self.test) + len(self.left_out)} views"
+            remarks.append(f"{count} left out, no valid pixel in the mask: {names}")
         if len({view.time for view in self.train}) == 1:
             remarks.append("all training views are of one instant: levels 1 and 2 can learn no motion")
         first = self.train[0].viewmat

@@ -63,7 +63,8 @@ def _log_probability(z: Tensor, h: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor
     """(ln P, ln(phi(u) / P)); kernels (`rate_kernels.py`) for [n, c] on the CPU, else the plain torch form."""
     if z.device.type == "cpu" and z.dim() == 2:
         results = torch.empty_like(z), torch.empty_like(z)
-        kernels.log_probability(*(x.numpy() for x in (*results, z, h, u, v)), NARROW[z.dtype])
+        arrays = [x.numpy() for x in (*results, z, h, u, v)]
+        kernels.log_probability(*arrays, NARROW[z.dtype])
         return results
     ratio = _log_ratio(z, h, u, v)
     return -0.5 * u * u - _HALF_LN_2PI - ratio, ratio
