@@ -8,6 +8,7 @@ from dataclasses import is_dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pd4dgs_codec.cli.files import write_bytes
 from pd4dgs_codec.errors import TrainError
 from pd4dgs_codec.train.config import ABLATIONS
 
@@ -75,6 +76,24 @@ def _expect_same(path: str, what: str, stored: Any, asked: Any) -> None:
 
 def _same_source(source: str) -> str:
     return source if source.startswith("synthetic:") else str(Path(source).resolve())
+
+
+def cut_log(path: str, iteration: int) -> None:
+    """Takes from a log the records of steps from `iteration` on: those that a killed run had written after its last
+    save, which come again, and a line cut in its middle. Lines that are no records stay. Whole or not at all."""
+    with open(path, "rb") as stream:
+        lines = stream.read().splitlines(keepends=True)
+    kept = b"".join(line for line in lines if line.endswith(b"\n") and not _is_step_from(line, iteration))
+    if len(kept) < sum(map(len, lines)):
+        write_bytes(path, kept, overwrite=True)
+
+
+def _is_step_from(line: bytes, iteration: int) -> bool:
+    try:
+        record = json.loads(line)
+    except ValueError:
+        return False
+    return isinstance(record, dict) and isinstance(n := record.get("iteration"), int) and n >= iteration
 
 
 def check_time_left(trainer: Trainer, path: str) -> None:

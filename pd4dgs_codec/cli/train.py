@@ -27,7 +27,7 @@ from pd4dgs_codec.cli.common import (
 )
 from pd4dgs_codec.cli.files import STDIO, check_output
 from pd4dgs_codec.cli.progress import TrainingProgress
-from pd4dgs_codec.cli.resume import FIXED, ablated, check_time_left, stored_config
+from pd4dgs_codec.cli.resume import FIXED, ablated, check_time_left, cut_log, stored_config
 from pd4dgs_codec.errors import RenderError, TrainError
 from pd4dgs_codec.train.config import ABLATIONS, ROLLOUTS
 
@@ -127,14 +127,20 @@ def _train(args: argparse.Namespace, console: Console) -> int:
     if args.resume:
         trainer.resume(Path(args.resume))
         check_time_left(trainer, args.resume)
-    elif args.log and os.path.isfile(args.log):  # a device or a pipe has nothing to empty
-        open(args.log, "w").close()
+    if args.log and os.path.isfile(args.log):  # a device or a pipe has nothing to take back
+        if args.resume:
+            cut_log(args.log, trainer.iteration)
+        else:
+            open(args.log, "w").close()
+    checkpoint.remove_leftovers(args.output)
     limit = f", at most {config.max_seconds:g} s" if config.max_seconds else ""
     held_out = f"{len(dataset.test)} held out" if dataset.test else "none held out"
     start = f", from step {trainer.iteration}" if trainer.iteration else ""
     console.message(
         f"training {config.preset} on {len(dataset.train)} views ({held_out}), {trainer.device}{limit}{start}"
     )
+    for remark in dataset.remarks():
+        console.message(f"note: {remark}")
     console.detail(f"{config}")
     try:
         trainer.run(Path(args.output), log=Path(args.log) if args.log else None, progress=TrainingProgress())

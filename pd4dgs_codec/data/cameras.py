@@ -15,6 +15,8 @@ from .files import check_downscale, read_image, shrink_image, shrink_mask
 
 #: Largest |R Rᵀ - I| of a pose that still counts as a rotation (files round to 3 or more decimals).
 ROTATION_TOLERANCE = 1e-3
+#: Of binary32, in which files hold the first and the last time; and by what share of itself a span may change there.
+LARGEST_TIME, SPAN_TOLERANCE = float(np.finfo(np.float32).max), 1e-3
 #: Half side of D-NeRF's box of initial points (1.3) over the distance of its cameras (4).
 BOX_OVER_DISTANCE = 1.3 / 4.0
 
@@ -158,10 +160,25 @@ def mean_up(frames: Sequence[Frame]) -> tuple[float, float, float]:
     return float(x), float(y), float(z)
 
 
-def normalised_times(raw: Sequence[float]) -> tuple[list[float], float, float]:
+def normalised_times(raw: Sequence[float], where: str) -> tuple[list[float], float, float]:
     """Times mapped to 0..1 by their least and greatest (all 0 if equal), and those two."""
     low, high = min(raw), max(raw)
+    if not max(abs(low), abs(high)) <= LARGEST_TIME:
+        raise DataError(f"{where}: times from {low:g} to {high:g}, expected at most {LARGEST_TIME:.2g} in magnitude")
     return [(t - low) / (high - low) if high > low else 0.0 for t in raw], low, high
+
+
+def seconds_range(start: float, stop: float) -> tuple[float, float]:
+    """Seconds at normalised time 0 and 1 of a scene that spans start..stop; (0, 1) if it spans none.
+
+    A span that binary32, as files hold it, would lose behind a large start (the time of day, say) begins at 0 instead.
+    """
+    span = stop - start
+    with np.errstate(over="ignore"):
+        if not np.float32(span) > 0:
+            return 0.0, 1.0
+        kept = float(np.float32(stop)) - float(np.float32(start))
+    return (start, stop) if abs(kept - span) <= SPAN_TOLERANCE * span else (0.0, span)
 
 
 def points_box(points: np.ndarray) -> np.ndarray:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,8 @@ from ..errors import DataError
 from ..scene import Camera
 
 SYNTHETIC_PREFIX = "synthetic:"
+#: Names of left-out views that a remark lists.
+REMARKED = 4
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,7 +52,8 @@ class Dataset:
         volume of random initial points.
     near, far: scene units along the optical axis. background: 0..1 per channel. time_range: seconds at normalised
         time 0 and 1, (0, 1) if unknown. up: unit vector, world. unit: metres per scene unit, 0 if unknown.
-    masked: True where the test masks are covisibility masks.
+    masked: True where the test masks are covisibility masks. left_out: names of views that are in neither split because
+        their masks hold no valid pixel.
     """
 
     name: str
@@ -66,11 +69,26 @@ class Dataset:
     up: tuple[float, float, float]
     unit: float
     masked: bool
+    left_out: tuple[str, ...] = ()
 
     @property
     def camera(self) -> Camera:
         """The default camera: that of the first training view."""
         return self.train[0].camera
+
+    def remarks(self) -> list[str]:
+        """What this data cannot teach or score, a line each, for whoever starts a training on it."""
+        remarks = []
+        if self.left_out:
+            names = ", ".join(self.left_out[:REMARKED]) + (", ..." if len(self.left_out) > REMARKED else "")
+            count = f"{len(self.left_out)} of {len(self.train) + len(self.test) + len(self.left_out)} views"
+            remarks.append(f"{count} left out, no valid pixel in the mask: {names}")
+        if len({view.time for view in self.train}) == 1:
+            remarks.append("all training views are of one instant: levels 1 and 2 can learn no motion")
+        first = self.train[0].viewmat
+        if all(np.array_equal(view.viewmat, first) for view in self.train):
+            remarks.append("all training views are from one place: depth stays a guess, other viewpoints look wrong")
+        return remarks
 
 
 def load(source: str | Path, *, downscale: int = 1, holdout: int = 8) -> Dataset:
@@ -79,8 +97,27 @@ def load(source: str | Path, *, downscale: int = 1, holdout: int = 8) -> Dataset
     source: `synthetic:NAME[?seed=n]`, a folder in the iPhone/Nerfies layout, or a folder with transforms*.json.
     downscale: images are averaged over downscale x downscale blocks (the remainder is cropped), intrinsics follow.
     holdout: without split files, frames with i % holdout == holdout // 2 are the test frames; 0 = none.
+    Views whose masks hold no valid pixel are left out, see `Dataset.left_out`.
     Raises DataError, one line, for anything missing or broken.
     """
+    return _without_blind_views(_read(source, downscale, holdout), source)
+
+
+def _without_blind_views(dataset: Dataset, source: str | Path) -> Dataset:
+    """Nothing can be learnt from a view without a valid pixel, and any picture would match it without error."""
+
+    def sees(view: View) -> bool:
+        return view.mask is None or bool(view.mask.any())
+
+    train, test = (tuple(filter(sees, views)) for views in (dataset.train, dataset.test))
+    left_out = tuple(view.name for view in (*dataset.train, *dataset.test) if not sees(view))
+    if not train:
+        count = len(dataset.train)
+        raise DataError(f"{source}: the masks of all {count} training views hold no valid pixel, expected one at least")
+    return replace(dataset, train=train, test=test, left_out=left_out) if left_out else dataset
+
+
+def _read(source: str | Path, downscale: int, holdout: int) -> Dataset:
     from . import iphone, synthetic, transforms
 
     if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:

@@ -19,6 +19,7 @@ from .cameras import (
     normalised_times,
     points_box,
     read_view,
+    seconds_range,
     world_to_camera,
 )
 from .dataset import Dataset, View
@@ -188,7 +189,7 @@ def read(folder: Path, downscale: int) -> Dataset:
     """Read the folder at rgb/{factor}x over `downscale` (see `dataset.load`)."""
     files = read_cameras(folder)
     frames = [*files.train, *files.test]
-    times, start, stop = normalised_times([f.time for f in frames])
+    times, start, stop = normalised_times([f.time for f in frames], str(folder))
     views = [read_view(f, t, downscale, composite=False) for f, t in zip(frames, times, strict=True)]
     train, test = views[: len(files.train)], views[len(files.train) :]
     masked = bool(test) and (folder / "covisible" / f"{files.factor}x" / "val").is_dir()
@@ -209,7 +210,7 @@ def read(folder: Path, downscale: int) -> Dataset:
         near=near,
         far=far,
         background=(r, g, b),
-        time_range=(start / fps, stop / fps) if fps and stop > start else (0.0, 1.0),
+        time_range=seconds_range(start / fps, stop / fps) if fps else (0.0, 1.0),
         up=_up(files, frames, folder),
         unit=0.0,
         masked=masked,

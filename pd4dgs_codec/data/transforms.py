@@ -19,6 +19,7 @@ from .cameras import (
     normalised_times,
     points_box,
     read_view,
+    seconds_range,
     world_to_camera,
 )
 from .dataset import Dataset, View
@@ -155,7 +156,7 @@ def read(folder: Path, downscale: int, holdout: int) -> Dataset:
     """Read a folder with transforms*.json (see `dataset.load`)."""
     train, test, file = _split(folder, holdout)
     frames = train + test
-    times, start, stop = normalised_times([f.time for f in frames])
+    times, start, stop = normalised_times([f.time for f in frames], str(folder))
     depth = _stored_depth(folder, file)
     points, colors = _points(folder, file)
     if points is not None and not len(points):
@@ -174,7 +175,7 @@ def read(folder: Path, downscale: int, holdout: int) -> Dataset:
         near=near,
         far=far,
         background=(1.0, 1.0, 1.0) if transparent else border_color(views[: len(train)]),
-        time_range=(start, stop) if stop > start else (0.0, 1.0),
+        time_range=seconds_range(start, stop),
         up=mean_up(frames),
         unit=0.0,
         masked=False,

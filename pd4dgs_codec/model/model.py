@@ -19,6 +19,7 @@ from torch.nn import functional as F
 
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.layers import MLP, level_mask, round_straight_through
+from pd4dgs_codec.model.slots import assemble, slot_linear
 from pd4dgs_codec.scene import FEATURE_DIM, MASK_THRESHOLD, N_OFFSETS, SCAFFOLD_NETWORKS, SceneInfo, Steps
 
 #: A Gaussian fainter than this never reaches a pixel (the rasteriser's threshold), so its networks are not evaluated.
@@ -166,19 +167,14 @@ class Model(nn.Module):
 
         camera_centre = -viewmat[:3, :3].T @ viewmat[:3, 3]
         direction = F.normalize(position - camera_centre, dim=1)
-        opacity, covariance, color = self._decode(torch.cat([feature, direction], dim=1), rounding)
-        raw_opacity = torch.tanh(opacity)
+        opacity, covariance, color = self._last_layers(torch.cat([feature, direction], dim=1), rounding)
+        raw_opacity = torch.tanh(F.linear(*opacity))
         keep = (raw_opacity.detach() * mask.detach()[:, None] >= MIN_OPACITY).flatten().nonzero()[:, 0]
-        owner = torch.div(keep, N_OFFSETS, rounding_mode="floor")
-
-        covariance = covariance.view(-1, 7).index_select(0, keep)
-        colors = torch.sigmoid(color.view(-1, 3).index_select(0, keep))
-        opacities = raw_opacity.flatten().index_select(0, keep)
-        per_anchor = torch.cat([position, scaling_log.exp(), mask[:, None]], dim=1)  # one gather for all of it
-        centre, spread, base, gate = per_anchor.index_select(0, owner).split([3, 3, 3, 1], dim=1)
-        means = centre + offset.view(-1, 3).index_select(0, keep) * spread
-        scales = base * torch.sigmoid(covariance[:, :3])
-        quats = F.normalize(covariance[:, 3:], dim=1)
+        shape = slot_linear(*covariance, keep)
+        colors = torch.sigmoid(slot_linear(*color, keep))
+        means, scales, quats, opacities, gate = assemble(
+            position, scaling_log.exp(), offset, raw_opacity, mask, shape, keep
+        )
         if level >= 2 and self.local_deformation is not None:
             residual = self.local_deformation(
                 means,
@@ -194,10 +190,11 @@ class Model(nn.Module):
         return Gaussians(
             means=means,
             quats=quats,
-            scales=scales * gate,
-            opacities=opacities * gate[:, 0],
+            scales=scales * gate[:, None],
+            opacities=opacities * gate,
             colors=colors,
-            slots=rows.index_select(0, owner) * N_OFFSETS + keep % N_OFFSETS,
+            slots=rows.index_select(0, torch.div(keep, N_OFFSETS, rounding_mode="floor")) * N_OFFSETS
+            + keep % N_OFFSETS,
             anchors=rows,
             raw_opacity=raw_opacity,
         )
@@ -220,22 +217,29 @@ class Model(nn.Module):
             for parameter in module.parameters():
                 parameter.copy_(torch.round(parameter / step) * step)
 
-    def _decode(self, inputs: Tensor, rounding: Rounding) -> list[Tensor]:
-        """Opacity [n, 10], covariance [n, 70], colour [n, 30] before activation; first layers in one product."""
+    def _last_layers(self, inputs: Tensor, rounding: Rounding) -> list[tuple[Tensor, Tensor, Tensor]]:
+        """Per decoder what its last layer takes, its weight and its bias; first layers of two in one product."""
         step = self.steps.weights_scaffold if rounding.weights else None
         networks = [self.network(name).rounded(step) for name in SCAFFOLD_NETWORKS]
         if any(len(layers) != 2 for layers in networks):
-            return [self.network(name)(inputs, step) for name in SCAFFOLD_NETWORKS]
+            return [(_before_last(layers, inputs), *layers[-1]) for layers in networks]
         first = [layers[0] for layers in networks]
         hidden = F.relu(F.linear(inputs, torch.cat([w for w, _ in first]), torch.cat([b for _, b in first])))
         parts = hidden.split([len(b) for _, b in first], dim=1)
-        return [F.linear(part, *layers[1]) for part, layers in zip(parts, networks, strict=True)]
+        return [(part, *layers[1]) for part, layers in zip(parts, networks, strict=True)]
 
     def _attribute(self, values: Tensor, rows: Tensor, step: float, rounding: Rounding) -> Tensor:
         picked = values.index_select(0, rows)
         if rounding.attributes:
             return round_straight_through(picked, step)
         return picked if rounding.noise is None else picked + rounding.noise.draw(picked.shape) * step
+
+
+def _before_last(layers: list[tuple[Tensor, Tensor]], x: Tensor) -> Tensor:
+    """What the last of the layers takes: the hidden layers applied to x [n, in]."""
+    for weight, bias in layers[:-1]:
+        x = F.relu(F.linear(x, weight, bias))
+    return x
 
 
 def fresh_networks(hidden: int) -> dict[str, MLP]:

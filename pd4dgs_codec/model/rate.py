@@ -15,11 +15,18 @@ import math
 
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from pd4dgs_codec.model import rate_kernels as kernels
 
 #: The clip of the training rate: no scalar costs more than log2(1e6) = 19.93 bits.
 MIN_PROBABILITY = 1e-6
 #: sigma is kept at or above Q * MIN_SIGMA_RATIO.
 MIN_SIGMA_RATIO = 2.0**-10
+#: h max(z, 1) below which P is taken as narrow.
+NARROW = {torch.float64: 0.03, torch.float32: 0.2}
+#: Added to a channel's variance, so that the gradient of its root is finite where all values are one.
+MIN_VARIANCE = 1e-20
 
 _LN2 = math.log(2.0)
 _HALF_LN_2PI = 0.5 * math.log(2.0 * math.pi)
@@ -30,7 +37,7 @@ _SQRT_HALF = math.sqrt(0.5)
 def _log_ratio(z: Tensor, h: Tensor, u: Tensor, v: Tensor) -> Tensor:
     """ln(phi(u) / P): what the gradients need, and ln P = ln phi(u) - it. In the tails both grow like z^2 and their
     difference does not, so this one is computed and the other derived."""
-    narrow = h * z.clamp(min=1.0) < (0.03 if z.dtype == torch.float64 else 0.2)
+    narrow = h * z.clamp(min=1.0) < NARROW[z.dtype]
     tail = ~narrow & (u >= 0)
     centre = ~(narrow | tail)
     out = torch.empty_like(z)
@@ -52,6 +59,17 @@ def _log_ratio(z: Tensor, h: Tensor, u: Tensor, v: Tensor) -> Tensor:
     return out
 
 
+def _log_probability(z: Tensor, h: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
+    """(ln P, ln(phi(u) / P)); kernels (`rate_kernels.py`) for [n, c] on the CPU, else the plain torch form."""
+    if z.device.type == "cpu" and z.dim() == 2:
+        results = torch.empty_like(z), torch.empty_like(z)
+        arrays = [x.numpy() for x in (*results, z, h, u, v)]
+        kernels.log_probability(*arrays, NARROW[z.dtype])
+        return results
+    ratio = _log_ratio(z, h, u, v)
+    return -0.5 * u * u - _HALF_LN_2PI - ratio, ratio
+
+
 class _LogProbability(torch.autograd.Function):
     @staticmethod
     def forward(ctx, a: Tensor, mu: Tensor, sigma: Tensor, q: Tensor) -> Tensor:  # type: ignore[override]
@@ -62,20 +80,25 @@ class _LogProbability(torch.autograd.Function):
         signed = a - mu
         d = signed.abs()
         z, h, u, v = d / sigma, 0.5 * q / sigma, (d - 0.5 * q) / sigma, (d + 0.5 * q) / sigma
-        log_ratio = _log_ratio(z, h, u, v)
+        log_p, log_ratio = _log_probability(z, h, u, v)
         ctx.save_for_backward(signed, sigma, q, z, h, v, log_ratio)
         ctx.shapes, ctx.dtype = shapes, dtype
-        return (-0.5 * u * u - _HALF_LN_2PI - log_ratio).to(dtype)
+        return log_p.to(dtype)
 
     @staticmethod
     def backward(ctx, grad: Tensor):  # type: ignore[override]
         signed, sigma, q, z, h, v, log_ratio = ctx.saved_tensors
-        grad = grad.to(log_ratio.dtype)
-        ratio = torch.exp(log_ratio)
-        m = torch.expm1(-2 * z * h)
-        grad_a = grad * torch.sign(signed) * ratio * m / sigma
-        grad_sigma = -grad * ratio * (2 * h + v * m) / sigma
-        grad_q = grad * ratio * h * (2 + m) / q
+        grad, grad_q = grad.to(log_ratio.dtype), grad
+        if z.device.type == "cpu" and z.dim() == 2 and not ctx.needs_input_grad[3]:
+            grad_a, grad_sigma = torch.empty_like(z), torch.empty_like(z)
+            inputs = (grad_a, grad_sigma, grad.contiguous(), signed, sigma, z, h, v, log_ratio)
+            kernels.gradients(*(x.numpy() for x in inputs))
+        else:
+            ratio = torch.exp(log_ratio)
+            m = torch.expm1(-2 * z * h)
+            grad_a = grad * torch.sign(signed) * ratio * m / sigma
+            grad_sigma = -grad * ratio * (2 * h + v * m) / sigma
+            grad_q = grad * ratio * h * (2 + m) / q
         grads = (grad_a, -grad_a, grad_sigma, grad_q)
         reduced = [
             g.sum_to_size(shape).to(ctx.dtype) if need else None
@@ -108,7 +131,31 @@ def rate_bits(a: Tensor, mu: Tensor, sigma: Tensor, q: Tensor | float) -> Tensor
     return _ClipValue.apply(-log_probability(a, mu, sigma, q) / _LN2)
 
 
+class _ChannelMoments(torch.autograd.Function):
+    """`channel_moments_reference` with its gradient written out: two passes over x [n, c] less in each direction."""
+
+    @staticmethod
+    def forward(ctx, x: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+        mu = x.mean(0)
+        centred = x - mu
+        sigma = (centred.square().mean(0) + MIN_VARIANCE).sqrt()
+        ctx.save_for_backward(centred, sigma)
+        return mu, sigma
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx, g_mu: Tensor, g_sigma: Tensor):  # type: ignore[override]
+        centred, sigma = ctx.saved_tensors
+        n = len(centred)
+        return torch.addcmul(g_mu / n, centred, g_sigma / (n * sigma))
+
+
 def channel_moments(x: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation per column of x [n, c]; gradient through both; n >= 1."""
+    return _ChannelMoments.apply(x)
+
+
+def channel_moments_reference(x: Tensor) -> tuple[Tensor, Tensor]:
+    """The plain torch form of `channel_moments`."""
     mu = x.mean(0)
-    return mu, ((x - mu).square().mean(0) + 1e-20).sqrt()
+    return mu, ((x - mu).square().mean(0) + MIN_VARIANCE).sqrt()

@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import os
 import signal
+import subprocess
 import sys
 
 import pytest
@@ -213,3 +215,66 @@ def test_stored_steps_come_back_as_steps():
 
     config = replace(TrainConfig(), steps=Steps(feature=0.25), iterations=7)
     assert parse_config(json.dumps(config, default=lambda value: value.__dict__), "m.pt") == config
+
+
+KILLED = """
+import os, signal, sys
+from pd4dgs_codec.model.config import PRESETS, DeformationConfig, ModelConfig
+from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS
+from pd4dgs_codec.train.loop import Trainer
+from pd4dgs_codec.cli.train import main
+
+fields = [DeformationConfig(4, 4, 4, (1,), 8, tuple(heads)) for heads in (GLOBAL_HEADS, LOCAL_HEADS)]
+PRESETS["tiny"] = ModelConfig(*fields, hidden=8, initial_anchors=150, max_anchors=300)
+run, replace, saves = Trainer.run, os.replace, []
+
+def replace_or_die(*paths):
+    saves.append(paths)
+    if len(saves) == 20:
+        os.kill(os.getpid(), signal.SIGKILL)
+    replace(*paths)
+
+os.replace = replace_or_die
+Trainer.run = lambda self, *args, **options: run(self, *args, **options, save_every=0.0)  # a save after each step
+sys.exit(main(sys.argv[1:]))
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
+def test_a_run_killed_while_it_saves_goes_on_as_if_nothing_had_happened(train, cli, tmp_path, shared_dataset):
+    whole, killed, log = tmp_path / "whole.pt", tmp_path / "killed.pt", tmp_path / "log.jsonl"
+    argv = [shared_dataset, "-o", killed, "--preset", "tiny", "-j", 1, "--iterations", 40, "--log", log]
+    done = subprocess.run([sys.executable, "-c", KILLED, *map(str, argv)], stderr=subprocess.DEVNULL, timeout=120)
+    assert done.returncode == -signal.SIGKILL
+    assert checkpoint.load(killed)[1]["iteration"] == 19 and len(log.read_text().splitlines()) == 20
+    assert len(list(tmp_path.glob(".killed.pt.*"))) == 1  # what it was writing
+    with log.open("a") as stream:
+        stream.write('{"iteration": 2')  # a line cut in its middle
+    assert cli("train", shared_dataset, "-o", killed, "--resume", killed, "--log", log, "-j", 1).code == 0
+    assert train(whole, iterations=40).code == 0
+    assert _same(_state(whole), _state(killed))
+    assert [json.loads(line)["iteration"] for line in log.read_text().splitlines()] == list(range(40))
+    assert not list(tmp_path.glob(".killed.pt.*"))
+
+
+def test_scarce_data_is_said_to_be_so(cli, dataset, tmp_path):
+    path = dataset / "transforms.json"
+    content = json.loads(path.read_text())
+    content["frames"] = content["frames"][:1]
+    path.write_text(json.dumps(content))
+    result = cli("train", dataset, "-o", tmp_path / "m.pt", "--preset", "tiny", "--iterations", 2, "-j", 1)
+    assert result.code == 0
+    notes = [line for line in result.error_lines if line.startswith("note: ")]
+    assert len(notes) == 2 and "one instant" in notes[0] and "one place" in notes[1]
+
+
+def test_a_full_disk_in_training_leaves_the_last_save(train, tmp_path, monkeypatch):
+    output = tmp_path / "m.pt"
+    assert train(output, iterations=2).code == 0
+    before = output.read_bytes()
+    monkeypatch.setattr("os.fsync", lambda _: (_ for _ in ()).throw(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))))
+    result = train(output, "-f", iterations=3)
+    assert result.code == 1 and result.error_lines[-1].endswith(
+        "m.pt: cannot write the checkpoint: No space left on device"
+    )
+    assert output.read_bytes() == before and os.listdir(tmp_path) == ["m.pt"]

@@ -1,6 +1,7 @@
 """The lens model and the robust geometry."""
 
 import numpy as np
+import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -12,8 +13,10 @@ from pd4dgs_codec.data.cameras import (
     normalised_times,
     points_box,
     rectify,
+    seconds_range,
     undistort,
 )
+from pd4dgs_codec.errors import DataError
 
 small = st.floats(-0.02, 0.02)  # in this range the polynomial does not fold within the tested square
 
@@ -80,5 +83,26 @@ def test_box_finds_the_common_point():
 
 
 def test_times():
-    assert normalised_times([3.0, 5.0, 4.0]) == ([0.0, 1.0, 0.5], 3.0, 5.0)
-    assert normalised_times([3.0, 3.0])[0] == [0.0, 0.0]
+    assert normalised_times([3.0, 5.0, 4.0], "x") == ([0.0, 1.0, 0.5], 3.0, 5.0)
+    assert normalised_times([3.0, 3.0], "x")[0] == [0.0, 0.0]
+
+
+@pytest.mark.parametrize(
+    ("span", "expected"),
+    [
+        ((0.0, 2.5), (0.0, 2.5)),
+        ((100.0, 105.0), (100.0, 105.0)),
+        ((-5.0, 0.0), (-5.0, 0.0)),
+        ((1.7e9, 1.7e9 + 4), (0.0, 4.0)),  # binary32 steps by 128 there
+        ((3.0, 3.0), (0.0, 1.0)),
+        ((0.0, 5e-324), (0.0, 1.0)),
+        ((-3e38, 3e38), (-3e38, 3e38)),
+    ],
+)
+def test_the_range_in_seconds_outlives_binary32(span, expected):
+    assert seconds_range(*span) == expected
+
+
+def test_times_beyond_binary32_are_refused():
+    with pytest.raises(DataError, match=r"x: times from -1e\+300 to 5, expected at most 3.4e\+38"):
+        normalised_times([5.0, -1e300], "x")

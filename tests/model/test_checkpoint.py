@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
 from dataclasses import replace
@@ -203,11 +204,10 @@ def test_other_versions(path, version):
 def test_a_full_disk_leaves_the_old_file_and_nothing_else(path, tmp_path, monkeypatch):
     before = path.read_bytes()
 
-    def fail_midway(content, stream):
-        stream.write(b"half a file")
-        raise OSError(28, "No space left on device")
+    def full(descriptor):
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))  # as a disk that allocates late does
 
-    monkeypatch.setattr(torch, "save", fail_midway)
+    monkeypatch.setattr(os, "fsync", full)
     with pytest.raises(DataError, match="No space left") as caught:
         checkpoint.save(path, model())
     assert "\n" not in str(caught.value) and str(path) in str(caught.value)
@@ -257,3 +257,25 @@ def test_the_file_is_as_readable_as_the_umask_says(tmp_path, umask):
     finally:
         os.umask(previous)
     assert stat.S_IMODE((tmp_path / "m.pt").stat().st_mode) == 0o666 & ~umask
+
+
+def test_a_file_that_may_not_grow_ends_in_the_systems_own_words(path, tmp_path):
+    """A real write that stops half-way, where the test above has an injected one."""
+    resource = pytest.importorskip("resource")
+    before, limits = path.read_bytes(), resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (len(before) // 2, limits[1]))  # Python ignores SIGXFSZ
+    try:
+        with pytest.raises(DataError, match=f"cannot write the checkpoint: {os.strerror(errno.EFBIG)}"):
+            checkpoint.save(path, model())
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    assert path.read_bytes() == before and os.listdir(tmp_path) == ["model.pt"]
+
+
+def test_leftovers_of_a_killed_save_are_found_by_name(path, tmp_path):
+    mine = tmp_path / f".{path.name}.ab_3xyz9"
+    others = [tmp_path / name for name in (".other.pt.ab_3xyz9", f".{path.name}.backup", f".{path.name}.notes-12")]
+    for file in (mine, *others):
+        file.write_bytes(b"x")
+    checkpoint.remove_leftovers(path)
+    assert not mine.exists() and path.exists() and all(file.exists() for file in others)

@@ -7,7 +7,12 @@ import pytest
 torch = pytest.importorskip("torch")
 mpmath = pytest.importorskip("mpmath")
 
-from pd4dgs_codec.model.rate import channel_moments, log_probability, rate_bits  # noqa: E402
+from pd4dgs_codec.model.rate import (  # noqa: E402
+    channel_moments,
+    channel_moments_reference,
+    log_probability,
+    rate_bits,
+)
 
 RATIOS = [1e-3, 0.01, 0.1, 0.3, 0.5, 1.0, 2.0, 7.0, 50.0, 1e3, 1e6]
 DISTANCES = [0.0, 1e-6, 0.3, 0.5, 1.0, 2.7, 4.9, 6.0, 20.0, 300.0]
@@ -76,3 +81,37 @@ def test_gradient_through_the_moments_matches_finite_differences():
         return -log_probability(values, mu, sigma, 0.3)
 
     assert torch.autograd.gradcheck(total, (x,), atol=1e-7)
+
+
+@pytest.mark.parametrize("rows", [1, 2, 500])
+def test_moments_and_their_gradient_are_those_of_the_plain_form(rows):
+    x = torch.randn(rows, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(rows)) * 3 + 7
+    x[:, 1] = 4.0  # a channel without spread
+    weights = torch.randn(2, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    weights[1, 1] = 0.0  # the rate holds such a sigma at its floor, so that no gradient comes back
+    results = []
+    for function in (channel_moments, channel_moments_reference):
+        leaf = x.clone().requires_grad_()
+        moments = torch.stack(function(leaf))
+        (moments * weights).sum().backward()
+        results.append((moments, leaf.grad))
+    for found, expected in zip(*results, strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 2e-11), (torch.float32, 2e-4)])
+def test_the_kernels_give_the_plain_forms_rate_and_gradients(dtype, bound):
+    """Widths from a thousandth of a step to a thousand steps, distances up to 60 sigma and both sides of Q/2."""
+    sigma = torch.logspace(-3, 3, 25, dtype=torch.float64)
+    z = torch.cat([torch.linspace(-60, 60, 41, dtype=torch.float64), torch.logspace(-6, 0, 7, dtype=torch.float64)])
+    a = torch.cat([z[:, None] * sigma, z[:, None].clamp(-1, 1) * sigma + 0.5]).to(dtype)
+    sigma, mu, weights = sigma.to(dtype), torch.zeros(25, dtype=dtype), torch.rand(a.shape, dtype=dtype) + 0.5
+    results = []
+    for form in (lambda x: x, lambda x: x[None]):  # the plain form takes what has another number of axes
+        leaves = [x.clone().requires_grad_() for x in (a, mu, sigma)]
+        bits = log_probability(*map(form, leaves), 1.0)
+        (bits * weights).sum().backward()
+        results.append([bits.detach().reshape(a.shape), *(x.grad for x in leaves)])
+    for found, expected in zip(*results, strict=True):
+        scale = expected.abs().clamp(min=1.0)
+        assert float(((found - expected).abs() / scale).max()) < bound

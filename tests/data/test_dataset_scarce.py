@@ -1,0 +1,98 @@
+"""Data that is whole but teaches little: one frame, one place, one instant, views without a valid pixel."""
+
+import json
+
+import numpy as np
+import pytest
+from dataset_pictures import pose
+from PIL import Image
+
+from pd4dgs_codec.data import load
+from pd4dgs_codec.errors import DataError
+
+#: A lens that sees nothing: its picture lies thousands of pixels off the axis.
+BLIND = {"cx": 4000, "k1": 0.5}
+
+
+def change(folder, frame) -> None:
+    """Every frame of transforms.json updated by frame(i)."""
+    path = folder / "transforms.json"
+    content = json.loads(path.read_text())
+    for i, entry in enumerate(content["frames"]):
+        entry.update(frame(i))
+    path.write_text(json.dumps(content))
+
+
+def test_ordinary_data_has_no_remarks(blender):
+    dataset = load(blender())
+    assert dataset.left_out == () and dataset.remarks() == []
+
+
+def test_one_frame(blender):
+    dataset = load(blender(n=1))
+    assert len(dataset.train) == 1 and dataset.train[0].time == 0.0 and dataset.time_range == (0.0, 1.0)
+    assert [remark.split(":")[0] for remark in dataset.remarks()] == [
+        "all training views are of one instant",
+        "all training views are from one place",
+    ]
+
+
+def test_one_place_and_one_instant_are_said(blender):
+    folder = blender()
+    change(folder, lambda i: {"transform_matrix": pose(0.3)})
+    assert ["one place" in r for r in load(folder).remarks()] == [True]
+    change(folder, lambda i: {"transform_matrix": pose(0.2 * i), "time": 7.5})
+    dataset = load(folder)
+    assert ["one instant" in r for r in dataset.remarks()] == [True] and dataset.time_range == (0.0, 1.0)
+
+
+@pytest.mark.parametrize("start", [0.0, -5.0, 100.0, 1.7e9])
+def test_times_may_start_anywhere_repeat_and_come_in_any_order(blender, start):
+    folder = blender(n=5)
+    times = [3.0, 0.0, 3.0, 4.0, 1.0]
+    change(folder, lambda i: {"time": start + times[i]})
+    dataset = load(folder, holdout=0)
+    assert [view.time for view in dataset.train] == pytest.approx([t / 4 for t in times])
+    assert np.diff(np.float32(dataset.time_range)) == 4
+
+
+def test_views_without_a_valid_pixel_are_left_out(blender):
+    folder = blender(n=9)
+    change(folder, lambda i: BLIND if i in (1, 4) else {})
+    dataset = load(folder)
+    assert dataset.left_out == ("r_001", "r_004") and [len(dataset.train), len(dataset.test)] == [7, 0]
+    assert dataset.remarks() == ["2 of 9 views left out, no valid pixel in the mask: r_001, r_004"]
+    assert dataset.train[1].time == pytest.approx(2 / 8)  # the others keep their instants
+
+
+def test_no_valid_pixel_in_any_training_view_is_refused(blender):
+    folder = blender(n=3, **BLIND)
+    with pytest.raises(DataError, match="masks of all 3 training views hold no valid pixel") as caught:
+        load(folder)
+    assert str(folder) in str(caught.value)
+
+
+def test_test_views_that_were_never_covisible_do_not_count(tmp_path):
+    names = ["0_00000", "1_00000", "1_00001"]
+    files = {
+        "metadata.json": {name: {"warp_id": i, "camera_id": 0} for i, name in enumerate(names)},
+        "scene.json": {"near": 1, "far": 2},
+        "extra.json": {"factor": 1, "fps": 30, "bbox": [[0, 0, 0], [1, 1, 1]]},
+        "splits/train.json": {"frame_names": names[:1]},
+        "splits/val.json": {"frame_names": names[1:]},
+    }
+    eye = np.eye(3).tolist()
+    camera = dict(orientation=eye, position=[0, 0, 0], focal_length=10, principal_point=[6, 4], image_size=[12, 8])
+    files |= {f"camera/{name}.json": camera for name in names}
+    for name, value in files.items():
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_text(json.dumps(value))
+    for name in names:
+        for path, value in ((f"rgb/1x/{name}.png", 9), (f"covisible/1x/val/{name}.png", 255 * (name == "1_00001"))):
+            (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+            Image.fromarray(np.full((8, 12), value, np.uint8)).convert("L" if "cov" in path else "RGB").save(
+                tmp_path / path
+            )
+    dataset = load(tmp_path)
+    assert [view.name for view in dataset.test] == ["1_00001"] and dataset.left_out == ("1_00000",)
+    assert dataset.masked

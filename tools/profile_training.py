@@ -1,0 +1,193 @@
+"""Where the time of a training step goes: milliseconds per part and level, as a Markdown table.
+
+    python tools/profile_training.py out/*/model.pt [--steps 20] [--at 0.55] [--threads 1] [--write docs/training.md]
+
+Goes on from checkpoints of `pd4dgs-train`, on the data they were trained on, as if they stood at the share `--at` of
+their runs, with the levels in turn; the checkpoints stay as they are. Each part is timed by wrapping the functions that
+do it, and what a wrapped function spends in another one counts for the other alone. Columns are medians over the steps;
+a part's work in the backward pass that is not a kernel of its own is in "backward, the rest".
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import defaultdict
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+LEVELS = (0, 1, 2)
+#: Lines of a page between which `--write` puts the tables.
+BEGIN, END = "<!-- profile: written by tools/profile_training.py -->", "<!-- end of profile -->"
+
+
+class Stopwatch:
+    """Seconds per part, without what the parts called from within it took."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = defaultdict(float)
+        self._open: list[float] = []  #: per part being timed, the seconds that parts within it took
+        self._wrapped: list[tuple[Any, str, Any]] = []
+
+    def wrap(self, owner: Any, name: str, part: str) -> None:
+        """Times every call of owner.name (a function, method or static method) as `part`."""
+        found = vars(owner).get(name)
+        timed = self.timed(getattr(owner, name), part)
+        setattr(owner, name, staticmethod(timed) if isinstance(found, staticmethod) else timed)
+        self._wrapped.append((owner, name, found))
+
+    def unwrap(self) -> None:
+        """Gives back what `wrap` replaced."""
+        for owner, name, found in reversed(self._wrapped):
+            delattr(owner, name) if found is None else setattr(owner, name, found)
+        self._wrapped.clear()
+
+    def timed(self, function: Callable, part: str) -> Callable:
+        """`function`, timed as `part`."""
+
+        def call(*args: Any, **kwargs: Any) -> Any:
+            start = time.perf_counter()
+            self._open.append(0.0)
+            try:
+                return function(*args, **kwargs)
+            finally:
+                spent = time.perf_counter() - start
+                self.seconds[part] += spent - self._open.pop()
+                if self._open:
+                    self._open[-1] += spent
+
+        return call
+
+    def take(self) -> dict[str, float]:
+        """The seconds since the last call of it."""
+        taken, self.seconds = dict(self.seconds), defaultdict(float)
+        return taken
+
+
+def watch(trainer: Any, stopwatch: Stopwatch) -> None:
+    """Wraps the parts of a step."""
+    import torch
+
+    from pd4dgs_codec.model import hexplane, plane_regularisers, slots
+    from pd4dgs_codec.model.model import Model
+    from pd4dgs_codec.render import cpu
+    from pd4dgs_codec.train import loop, losses, ssim
+
+    for owner, name, part in (
+        (Model, "visible", "choosing anchors"),
+        (Model, "gaussians", "anchors to Gaussians, the rest"),
+        (Model, "_attribute", "picking attributes, noise"),
+        (Model, "_last_layers", "scaffold networks"),
+        (slots._SlotLinear, "forward", "scaffold networks"),
+        (slots._SlotLinear, "backward", "kept Gaussians, backward"),
+        (slots._Assemble, "forward", "anchors to Gaussians, the rest"),
+        (slots._Assemble, "backward", "kept Gaussians, backward"),
+        (hexplane._Sample, "forward", "HexPlane kernels"),
+        (hexplane._Sample, "backward", "HexPlane kernels, backward"),
+        (cpu._Rasterize, "forward", "rasteriser kernels"),
+        (cpu._Rasterize, "backward", "rasteriser kernels, backward"),
+        (ssim._ImageLoss, "forward", "image loss"),
+        (ssim._ImageLoss, "backward", "image loss, backward"),
+        (plane_regularisers._Regularisers, "forward", "plane regularisers"),
+        (plane_regularisers._Regularisers, "backward", "plane regularisers, backward"),
+        (loop, "image_loss", "image loss"),
+        (losses, "rate_term", "rate term"),
+        (losses, "binary_term", "mask terms"),
+        (losses, "smooth_term", "mask terms"),
+        (losses.Neighbours, "draw", "mask terms"),
+        (torch.Tensor, "backward", "backward, the rest"),
+        (trainer.densifier, "observe", "growing: statistics"),
+        (trainer.optimiser, "gradient_norm", "gradient norm"),
+        (trainer.optimiser, "step", "Adam"),
+    ):
+        stopwatch.wrap(owner, name, part)
+    for field, name in ((trainer.model.global_deformation, "global"), (trainer.model.local_deformation, "local")):
+        if field is not None:
+            stopwatch.wrap(field, "forward", f"{name} deformation networks")
+    stopwatch.wrap(trainer, "step", "all else")
+
+
+def measure(trainer: Any, steps: int, at: float) -> list[list[dict[str, float]]]:
+    """Per level, one dictionary of seconds per part for each of `steps` steps."""
+    stopwatch = Stopwatch()
+    before = round(trainer.total * at)
+
+    def step(level: int) -> dict[str, float]:
+        trainer.iteration = before
+        trainer._draw_level = lambda schedule: (level, (1 / 3,) * 3)
+        trainer.step()
+        return stopwatch.take()
+
+    for level in LEVELS:  # compiles the kernels and fills the caches
+        step(level)
+    watch(trainer, stopwatch)
+    try:
+        turns = [[step(level) for level in LEVELS] for _ in range(steps)]
+    finally:
+        stopwatch.unwrap()
+    return [list(level) for level in zip(*turns, strict=True)]
+
+
+def rows(found: list[list[dict[str, float]]]) -> list[tuple[str, list[float]]]:
+    """(part, milliseconds per level), the costliest part first, then the median of whole steps."""
+    parts = {part for level in found for step in level for part in step}
+    medians = {part: [1e3 * _median(step.get(part, 0.0) for step in level) for level in found] for part in parts}
+    ordered = sorted(medians.items(), key=lambda row: -sum(row[1]))
+    return [*ordered, ("whole step", [1e3 * _median(sum(step.values()) for step in level) for level in found])]
+
+
+def _median(values: Iterable[float]) -> float:
+    ordered = sorted(values)
+    return ordered[len(ordered) // 2]
+
+
+def profile(path: Path, source: str | None, steps: int, at: float, threads: int) -> str:
+    """The table of one checkpoint under a line that says what was measured."""
+    from pd4dgs_codec.cli.resume import parse_config
+    from pd4dgs_codec.data.dataset import load
+    from pd4dgs_codec.model import checkpoint
+    from pd4dgs_codec.train.loop import Trainer
+
+    config = parse_config(checkpoint.load(path)[1]["config"], str(path))
+    dataset = load(source or config.source, downscale=config.downscale, holdout=config.holdout)
+    trainer = Trainer(config, dataset)
+    trainer.resume(path)
+    size = f"{dataset.train[0].width}x{dataset.train[0].height}"
+    lines = [
+        f"{dataset.name} {size}, {config.preset}, {len(trainer.model.anchor_q):,} anchors, {threads} thread(s), at "
+        f"{at:g} of the run, milliseconds:",
+        "",
+        "| part | level 0 | level 1 | level 2 |",
+        "|---|---|---|---|",
+    ]
+    for part, times in rows(measure(trainer, steps, at)):
+        lines.append(f"| {part} | {' | '.join(f'{t:.1f}' for t in times)} |")
+    return "\n".join(lines)
+
+
+def main() -> None:
+    """Entry point."""
+    p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    p.add_argument("checkpoints", nargs="+", type=Path, help="checkpoints of pd4dgs-train")
+    p.add_argument("--source", help="the data, where a checkpoint's own path does not lead to it")
+    p.add_argument("--steps", type=int, default=20, help="steps timed per level (default: 20)")
+    p.add_argument("--at", type=float, default=0.55, help="share of the run at which to stand (default: 0.55)")
+    p.add_argument("--threads", type=int, help="threads (default: OMP_NUM_THREADS, else all cores)")
+    p.add_argument("--write", type=Path, metavar="PAGE.md", help="put the tables into this page, between its marks")
+    args = p.parse_args()
+
+    from pd4dgs_codec.render.threads import configure
+
+    threads = configure(args.threads)
+    tables = [profile(path, args.source, args.steps, args.at, threads) for path in args.checkpoints]
+    text = "\n\n".join(tables)
+    print(text)
+    if args.write:
+        page = args.write.read_text()
+        before, after = page[: page.index(BEGIN)], page[page.index(END) :]
+        args.write.write_text(f"{before}{BEGIN}\n\n{text}\n\n{after}")
+
+
+if __name__ == "__main__":
+    main()
