@@ -84,8 +84,9 @@ def encode_with_report(
 
     mode: "ans", or "lzma" for the same symbols under LZMA2. deformation: "coded" or "float32". priors: "best" or
     "gauss". step_scale multiplies every quantisation step. layers: "auto" leaves out deformations that do nothing,
-    0, 1 or 2 keeps the layers up to that number. effort: 1..9. omit: "bounded", "lossless" or "nothing", see plan. verify: decode the result, compare every symbol and
-    every float, and hold every float against its error bound. Raises EncodeError.
+    0, 1 or 2 keeps the layers up to that number. effort: 1..9. omit: "bounded", "lossless" or
+    "nothing", see plan. verify: decode the result, compare every symbol and every float, and hold every float against
+    its error bound. Raises EncodeError.
     """
     started = time.perf_counter()
     _check_options(mode, deformation, priors, step_scale, layers, effort, omit)

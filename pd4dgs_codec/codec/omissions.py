@@ -1,14 +1,14 @@
 """What a file does without, and the omissions that change no picture.
 
 `leave_out` works on the values that the file will hold, so that what it proves holds for them: cells that no
-renderer reads take the cheapest values, offsets of Gaussians that no view shows the commonest ones, inputs that
-nothing reads become 0, units that are silent or unread and heads that only yield 0 go. The terms that sums lose
-are exact zeros.
+renderer reads take the cheapest values, offsets of Gaussians that no view shows the commonest ones, and inputs that
+nothing reads and the weights of units that are silent or unread become 0. No array changes its shape, and all terms
+that sums lose were zeros: the same arithmetic gives the same bits.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -45,7 +45,6 @@ def leave_out(scene: Scene, raw_deformation: bool) -> tuple[Scene, list[LeftOut]
     omissions = _Omissions(scene, raw_deformation)
     while omissions.simplify_networks():
         pass
-    omissions.drop_silent_heads()
     omissions.free_offsets_and_cells()
     return omissions.scene, omissions.found
 
@@ -68,7 +67,7 @@ class _Omissions:
             if self._networks(kind):
                 self._zero_unread_channels(kind)
         for kind in LAYER_KINDS:
-            self._remove_units(kind)
+            self._zero_dead_units(kind)
         return len(self.found) > before
 
     def _networks(self, kind: LayerKind) -> dict[str, Network]:
@@ -128,45 +127,36 @@ class _Omissions:
         )
         self._set_deformation(kind, Deformation(planes, given.networks))
 
-    def _remove_units(self, kind: LayerKind) -> None:
-        """Hidden units whose input weights are all 0 and whose bias is not positive, or whose output nothing reads."""
+    def _zero_dead_units(self, kind: LayerKind) -> None:
+        """Hidden units whose input weights are all 0 and whose bias is not positive, or whose output nothing reads.
+
+        Their weights become 0 and stay where they are: smaller matrices would cost less, but BLAS sums those in another
+        order, and pictures would change in their last bits.
+        """
         for name in list(self._networks(kind)):
             network = self._networks(kind)[name]
             for i in range(len(network) - (name != TRUNK)):
                 networks = self._networks(kind)
                 weight, bias = networks[name][i]
-                last = i == len(networks[name]) - 1
+                last = i == len(network) - 1
                 readers = [(h, 0) for h in networks if h != TRUNK] if last else [(name, i + 1)]
                 read = np.any([networks[h][j][0].any(axis=0) for h, j in readers], axis=0)
-                keep = read & (weight.any(axis=1) | (bias > 0))
-                if not keep.any():
-                    keep[0] = True  # the format has no layer without outputs
-                if keep.all():
-                    continue
-                gone = int((~keep).sum())
-                bits = self._weight_bits(kind, name, i, lambda w, b: (w[~keep], b[~keep]))
-                bits += sum(self._weight_bits(kind, h, j, lambda w, b: (w[:, ~keep], b[:0])) for h, j in readers)
-                where = f"{kind.deformation or 'scaffold'} {name}"
-                self._note(f"{where}: {gone} units of layer {i + 1}", "always 0, or read by nothing", bits)
-                self._replace_layer(kind, name, i, lambda w, b: (w[keep], b[keep]))
-                for h, j in readers:
-                    self._replace_layer(kind, h, j, lambda w, b: (w[:, keep], b))
+                dead = ~(read & (weight.any(axis=1) | (bias > 0)))
+                stale = dead & (read | weight.any(axis=1) | (bias != 0))
+                if stale.any():
+                    self._zero_units(kind, name, i, stale, readers)
 
-    def drop_silent_heads(self) -> None:
-        """Heads whose last layer is all 0, as long as one is left."""
-        for kind in LAYER_KINDS[1:]:
-            networks = self._networks(kind)
-            heads = {name: network for name, network in networks.items() if name != TRUNK}
-            silent = [name for name, network in heads.items() if not any(a.any() for a in network[-1])]
-            if not silent or len(silent) == len(heads):
-                continue
-            given: Deformation = getattr(self.scene, kind.deformation or "")
-            for name in silent:
-                tensors = Deformation((), {name: given.networks[name]})
-                what = f"{kind.deformation} head {name}"
-                self.found.append(LeftOut(what, "all its outputs are 0", kind, tensors, lossless=True))
-            rest = {name: network for name, network in given.networks.items() if name not in silent}
-            self._set_deformation(kind, Deformation(given.planes, rest))
+    def _zero_units(
+        self, kind: LayerKind, name: str, index: int, dead: np.ndarray, readers: list[tuple[str, int]]
+    ) -> None:
+        """Zeroes the outputs `dead` (bool) of a linear layer, and those inputs of the linear layers that read it."""
+        bits = self._cost(kind, [(name, index), *readers])
+        self._replace_layer(kind, name, index, lambda w, b: _zero(w, b, rows=dead))
+        for reader, j in readers:
+            self._replace_layer(kind, reader, j, lambda w, b: _zero(w, b, columns=dead))
+        where = f"{kind.deformation or 'scaffold'} {name}"
+        bits -= self._cost(kind, [(name, index), *readers])
+        self._note(f"{where}: {int(dead.sum())} units of layer {index + 1}", "always 0, or read by nothing", bits)
 
     # -- offsets and cells -------------------------------------------------------------------------------------------
 
@@ -239,9 +229,9 @@ class _Omissions:
 
     def _edit_layer(self, kind: LayerKind, name: str, index: int, edit: Callable, of: str) -> None:
         where = f"{kind.deformation or 'scaffold'} {name}"
-        before = self._weight_bits(kind, name, index, lambda w, b: (w, b))
+        before = self._cost(kind, [(name, index)])
         self._replace_layer(kind, name, index, edit)
-        saved = before - self._weight_bits(kind, name, index, lambda w, b: (w, b))
+        saved = before - self._cost(kind, [(name, index)])
         self._note(f"{where}: {of} of weights", "read by nothing, or always times 0", saved)
 
     def _replace_layer(self, kind: LayerKind, name: str, index: int, edit: Callable) -> None:
@@ -255,15 +245,13 @@ class _Omissions:
         else:
             self._set_deformation(kind, Deformation(getattr(self.scene, kind.deformation).planes, networks))
 
-    def _weight_bits(self, kind: LayerKind, name: str, index: int, pick: Callable) -> float:
-        """What the symbols of pick(weight, bias) cost in the company of all weights of their layer."""
-        weight, bias = self._networks(kind)[name][index]
+    def _cost(self, kind: LayerKind, layers: list[tuple[str, int]]) -> float:
+        """Order-0 entropy of the weights and biases of linear layers (network, index); 0 if they are float32 values."""
         if self.raw and kind.deformation is not None:
-            return 32.0 * sum(a.size for a in pick(weight, bias))
+            return 0.0
         step = getattr(self.scene.steps, kind.weights_step)
-        symbols = [quantise(a, step, name) for a in (weight, bias)]
-        each = entropy_bits(symbols[0].ravel()) / max(1, symbols[0].size)
-        return each * sum(a.size for a in pick(weight, bias))
+        arrays = [a for name, index in layers for a in self._networks(kind)[name][index]]
+        return _bits([quantise(a, step, "weight").ravel() for a in arrays])
 
     def _plane_symbols(self, kind: LayerKind, plane: np.ndarray) -> np.ndarray:
         """int32 symbols, or of float32 values their bits."""
@@ -298,8 +286,8 @@ def _zero(weight: np.ndarray, bias: np.ndarray, rows=None, columns=None) -> tupl
     return weight, bias
 
 
-def _bits(channels: np.ndarray) -> float:
-    """Order-0 entropy of channels [m, n], each under a distribution of its own."""
+def _bits(channels: Iterable[np.ndarray]) -> float:
+    """Order-0 entropy of channels, each under a distribution of its own."""
     return sum(entropy_bits(channel) for channel in channels)
 
 

@@ -18,6 +18,8 @@ from pd4dgs_codec.scene import FEATURE_DIM, N_OFFSETS, PLANES, Network, Scene
 
 Reached = tuple[dict[str, np.ndarray], ...]  #: per scale, plane name -> bool [H, W]
 
+Cells = tuple[np.ndarray, np.ndarray]  #: (first, last) cell on an axis, int [n]
+
 #: Cells by which a position may be off: another renderer rounds its coordinates otherwise.
 CELL_SLACK = 0.02
 #: Share by which an opacity may be off, for the same reason.
@@ -45,14 +47,14 @@ class _Marks:
                 marks[name] |= _rectangles(rows, ranges[a], marks[name].shape)
 
 
-def _cells(low: np.ndarray, high: np.ndarray, side: int) -> tuple[np.ndarray, np.ndarray]:
+def _cells(low: np.ndarray, high: np.ndarray, side: int) -> Cells:
     """(first, last) cell that a sample between low and high, 0..1, reads on an axis of `side` cells."""
     last = side - 1
     first = np.clip(np.floor(low * last - CELL_SLACK), 0, max(last - 1, 0)).astype(np.intp)
     return first, np.clip(np.floor(high * last + CELL_SLACK) + 1, 0, last).astype(np.intp)
 
 
-def _rectangles(rows, columns, shape: tuple[int, int]) -> np.ndarray:
+def _rectangles(rows: Cells, columns: Cells, shape: tuple[int, ...]) -> np.ndarray:
     """bool [H, W]: the union of the rectangles rows x columns, each (first, last) with both ends in it."""
     height, width = shape
     (top, bottom), (left, right) = rows, columns
@@ -85,8 +87,8 @@ def reach(scene: Scene) -> tuple[Reached, Reached, np.ndarray]:
         if local is None:
             continue
         for start, end, ranges in stretches:
-            boxes = np.stack(_mean_ranges(scene, rows, ranges))[:, shown[rows]]
-            local_cells.read(*boxes, start, end)
+            low, high = (x[shown[rows]] for x in _mean_ranges(scene, anchor[rows], rows, ranges))
+            local_cells.read(low, high, start, end)
     return cells.reached, local_cells.reached, shown
 
 
@@ -95,14 +97,15 @@ def _stretches(scene: Scene) -> Iterator[tuple[slice, list[tuple[float, float, R
     field, anchor = scene.global_deformation, scene.anchor
     chunks = [slice(i, min(i + CHUNK, len(anchor))) for i in range(0, len(anchor), CHUNK)]
     if field is None:
-        yield from ((rows, [(0.0, 1.0, {})]) for rows in chunks)
+        for rows in chunks:
+            yield rows, [(0.0, 1.0, {})]
         return
     grid = time_grid(field).tolist()
     for rows, found in zip(chunks, residual_ranges(field, scene.info.box, anchor), strict=True):
         yield rows, list(zip(grid[:-1], grid[1:], found, strict=True))
 
 
-def _mean_ranges(scene: Scene, rows: slice, ranges: Ranges) -> tuple[np.ndarray, np.ndarray]:
+def _mean_ranges(scene: Scene, anchor: np.ndarray, rows: slice, ranges: Ranges) -> tuple[np.ndarray, np.ndarray]:
     """(low, high) float32 [n, 10, 3] of the Gaussians' means (13.4, step 3) before the local deformation."""
     zero = (np.float32(0), np.float32(0))
     position, scaling = ranges.get("position", zero), ranges.get("scaling", zero)
@@ -111,7 +114,7 @@ def _mean_ranges(scene: Scene, rows: slice, ranges: Ranges) -> tuple[np.ndarray,
         spread = [np.exp(scene.scaling_log[rows] + s)[:, None, :3] for s in scaling]
         corners = [(scene.offset[rows] + o) * s for o in offset for s in spread]
         low, high = np.min(corners, axis=0), np.max(corners, axis=0)  # NaN, of 0 times infinity, is kept
-        centre = [np.broadcast_to(scene.anchor[rows] + p, scene.anchor[rows].shape)[:, None] for p in position]
+        centre = [(anchor + p)[:, None] for p in position]
         return low + centre[0], high + centre[1]
 
 
