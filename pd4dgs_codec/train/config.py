@@ -54,6 +54,7 @@ class TrainConfig:
     tmc_smooth: bool = True
     tmc_tau: float = 4.0  #: voxels
     rollout: str = "adaptive"  #: "adaptive", "uniform" or "fixed"
+    judge: bool = True  #: leave out levels that gain nothing on training views not seen yet, see `judge`
     ssim: float = 0.2
     volume: float = 0.01  #: weight of the mean product of scales (Scaffold-GS)
     noise: bool = True

@@ -1,0 +1,41 @@
+"""Levels that do not pay: judged on views that training has not seen yet, and left out of the rest of the run.
+
+On the views it learns from every level gains: 1.5 dB on a scene where nothing moves, of which other views show -0.4.
+"""
+
+from __future__ import annotations
+
+from pd4dgs_codec.model.model import Model
+from pd4dgs_codec.train.optimiser import Optimiser
+
+#: Every eighth training view waits until the levels are judged, if these are enough and the run is long enough.
+EVERY = 8
+MIN_VIEWS = 4
+MIN_ITERATIONS = 500
+
+
+def waiting_views(count: int, iterations: int) -> set[int]:
+    """Indices of the training views (of `count`) that a run of `iterations` steps judges by; none if it judges not."""
+    views = set(range(EVERY // 2, count, EVERY))
+    return views if len(views) >= MIN_VIEWS and iterations >= MIN_ITERATIONS else set()
+
+
+def levels_without_gain(psnr: list[float]) -> list[tuple[int, float]]:
+    """(level, gain in dB over the level below) from the top down, as far as the gain is not positive. psnr: per level,
+    over views that training has not seen."""
+    found = []
+    for level in range(len(psnr) - 1, 0, -1):
+        gain = psnr[level] - psnr[level - 1]
+        if gain > 0:
+            break
+        found.append((level, gain))
+    return found
+
+
+def leave_out(model: Model, optimiser: Optimiser, level: int) -> None:
+    """Takes the deformation of `level` out of the model and its optimiser."""
+    name = {1: "global_deformation", 2: "local_deformation"}[level]
+    field = getattr(model, name)
+    if field is not None:
+        optimiser.forget(field)
+        setattr(model, name, None)
