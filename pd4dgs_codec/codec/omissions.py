@@ -22,6 +22,9 @@ from pd4dgs_codec.codec.stages import entropy_bits
 from pd4dgs_codec.codec.symbols import dequantise_deformation, map_networks, quantise_deformation
 from pd4dgs_codec.scene import FEATURE_DIM, N_OFFSETS, PLANES, Deformation, Network, Scene
 
+#: Networks whose values may exceed this are left as they are; binary32 overflows at 3.4e38.
+LARGEST = 1e30
+
 
 @dataclass(frozen=True, eq=False)
 class LeftOut:
@@ -43,7 +46,7 @@ def leave_out(scene: Scene, raw_deformation: bool) -> tuple[Scene, list[LeftOut]
     Where nothing is left out the values stay those given; what takes another value takes one that has a symbol.
     """
     omissions = _Omissions(scene, raw_deformation)
-    while omissions.simplify_networks():
+    while omissions.within_range() and omissions.simplify_networks():
         pass
     omissions.free_offsets_and_cells()
     return omissions.scene, omissions.found
@@ -58,6 +61,22 @@ class _Omissions:
         self.decoded = _as_decoded(scene, raw)
 
     # -- networks ----------------------------------------------------------------------------------------------------
+
+    def within_range(self) -> bool:
+        """Whether no network can overflow: a term that is 0 times infinity is not nothing."""
+        sizes: dict[str, np.ndarray] = {}
+        with np.errstate(all="ignore"):
+            for kind in LAYER_KINDS[1:]:
+                networks = self._networks(kind)
+                if networks:
+                    planes = getattr(self.decoded, kind.deformation or "").planes
+                    largest = [np.prod([np.abs(s[n]).max((1, 2)) for n, _, _ in PLANES], axis=0) for s in planes]
+                    hidden = _largest(networks[TRUNK], np.concatenate(largest))
+                    sizes |= {name: _largest(net, hidden) for name, net in networks.items() if name != TRUNK}
+            feature = np.abs(self.decoded.feature).max(axis=0, initial=0.0) + sizes.get("feature", 0.0)
+            inputs = np.concatenate([feature, np.ones(3)])
+            sizes |= {name: _largest(network, inputs) for name, network in self.decoded.networks.items()}
+        return all((size < LARGEST).all() for size in sizes.values())
 
     def simplify_networks(self) -> bool:
         """One pass over all networks and their inputs; whether anything went."""
@@ -275,6 +294,17 @@ def _as_decoded(scene: Scene, raw: bool) -> Scene:
             symbols = quantise_deformation(deformation, kind, steps)
             fields[kind.deformation or ""] = dequantise_deformation(symbols, kind, steps)
     return replace(scene, **fields)
+
+
+def _largest(network: Network, inputs: np.ndarray) -> np.ndarray:
+    """float64 [outputs], no less than the magnitude of any output or of anything on the way, inputs being up to
+    `inputs` in magnitude."""
+    size = np.asarray(inputs, np.float64)
+    for weight, bias in network:
+        size = np.abs(weight.astype(np.float64)) @ size + np.abs(bias)
+        if not (size < LARGEST).all():
+            return np.full(len(network[-1][1]), np.inf)
+    return size
 
 
 def _zero(weight: np.ndarray, bias: np.ndarray, rows=None, columns=None) -> tuple[np.ndarray, np.ndarray]:

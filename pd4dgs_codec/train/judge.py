@@ -11,6 +11,8 @@ from pd4dgs_codec.train.optimiser import Optimiser
 #: Every eighth training view waits until the levels are judged, if these are enough and the run is long enough.
 EVERY = 8
 MIN_VIEWS = 4
+#: dB that a level must gain over the one below. Views kept back lie between those learnt from, and flatter a level.
+MIN_GAIN = 0.1
 MIN_ITERATIONS = 500
 
 
@@ -21,12 +23,12 @@ def waiting_views(count: int, iterations: int) -> set[int]:
 
 
 def levels_without_gain(psnr: list[float]) -> list[tuple[int, float]]:
-    """(level, gain in dB over the level below) from the top down, as far as the gain is not positive. psnr: per level,
-    over views that training has not seen."""
+    """(level, gain in dB over the level below) from the top down, as far as the gain is under MIN_GAIN. psnr: per
+    level, over views that training has not seen."""
     found = []
     for level in range(len(psnr) - 1, 0, -1):
         gain = psnr[level] - psnr[level - 1]
-        if gain > 0:
+        if gain >= MIN_GAIN:
             break
         found.append((level, gain))
     return found

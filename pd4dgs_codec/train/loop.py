@@ -131,13 +131,13 @@ class Trainer:
     def step(self) -> dict[str, Any]:
         """One training step; returns its log record (every term unweighted)."""
         schedule = Schedule(self.total or 10**9)
-        left_out = self._leave_out_levels(schedule)
+        judged = self._judge_levels(schedule)
         index = self._next_view(schedule)
         level, probabilities = self._draw_level(schedule)
         rounding = self._rounding(schedule)
         record: dict[str, Any] = {"iteration": self.iteration, "level": level}
-        if left_out:
-            record["left_out"] = left_out
+        if judged:
+            record |= {"judged_psnr": judged, "left_out": self.left_out}
         if not self._learn(index, level, schedule, rounding, record):
             self.skipped += 1
             record["skipped"] = self.skipped
@@ -272,8 +272,8 @@ class Trainer:
         """Training views that wait until the levels are judged; none where N is not known yet."""
         return judge.waiting_views(len(self.dataset.train), self.total) if self.config.judge else set()
 
-    def _leave_out_levels(self, schedule: Schedule) -> list[dict[str, Any]]:
-        """Where the last third begins: judges the levels and leaves out those that do not pay."""
+    def _judge_levels(self, schedule: Schedule) -> list[float]:
+        """Where the last third begins: leaves out the levels that do not pay. Returns the PSNR per level judged by."""
         waiting = sorted(self._waiting_views()) if self.iteration == schedule.rounding else []
         if not waiting:
             return []
@@ -282,7 +282,7 @@ class Trainer:
         for level, _ in found:
             judge.leave_out(self.model, self.optimiser, level)
         self.left_out = [{"level": level, "gain": gain, "views": len(waiting)} for level, gain in found]
-        return self.left_out
+        return psnr
 
     def _target(self, view: View) -> tuple[Tensor, Tensor, TargetStats]:
         viewmat, K = (torch.as_tensor(np.array(m, np.float32), device=self.device) for m in (view.viewmat, view.K))
