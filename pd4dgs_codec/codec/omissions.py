@@ -64,7 +64,7 @@ class _Omissions:
 
     def within_range(self) -> bool:
         """Whether no network can overflow: a term that is 0 times infinity is not nothing."""
-        sizes: dict[str, np.ndarray] = {}
+        sizes: dict[str, np.ndarray] = {}  # the scaffold's networks and the heads share some names
         with np.errstate(all="ignore"):
             for kind in LAYER_KINDS[1:]:
                 networks = self._networks(kind)
@@ -72,8 +72,8 @@ class _Omissions:
                     planes = getattr(self.decoded, kind.deformation or "").planes
                     largest = [np.prod([np.abs(s[n]).max((1, 2)) for n, _, _ in PLANES], axis=0) for s in planes]
                     hidden = _largest(networks[TRUNK], np.concatenate(largest))
-                    sizes |= {name: _largest(net, hidden) for name, net in networks.items() if name != TRUNK}
-            feature = np.abs(self.decoded.feature).max(axis=0, initial=0.0) + sizes.get("feature", 0.0)
+                    sizes |= {f"{kind.layer} {n}": _largest(net, hidden) for n, net in networks.items() if n != TRUNK}
+            feature = np.abs(self.decoded.feature).max(axis=0, initial=0.0) + sizes.get("1 feature", 0.0)
             inputs = np.concatenate([feature, np.ones(3)])
             sizes |= {name: _largest(network, inputs) for name, network in self.decoded.networks.items()}
         return all((size < LARGEST).all() for size in sizes.values())
