@@ -111,6 +111,42 @@ def _scan(r: Array, predictor: Predictor) -> Array:
     return square.copy()
 
 
+def fill(k: Array, given: Array) -> Array:
+    """int32 [C, H, W] samples like `k` where `given` bool [H, W], and free to take any value elsewhere, such that they
+    cost little: under the predictor that then codes them cheapest the residuals of all free samples are 0."""
+    best: tuple[float, Array] | None = None
+    for predictor in PREDICTORS:
+        filled = _fill(k, given, PREDICTORS[predictor])
+        if max(int(filled.max()), -int(filled.min())) > MAX_SYMBOL:
+            continue
+        r = residual(predictor, filled)
+        if max(int(r.max()), -int(r.min())) > MAX_SYMBOL:
+            continue
+        bits = sum(_estimated_bits(channel) for channel in r.reshape(r.shape[0], -1))
+        if best is None or bits < best[0]:
+            best = (bits, filled)
+    assert best is not None  # "none" always fits: free samples are 0
+    return best[1]
+
+
+def _fill(k: Array, given: Array, predictor: Predictor) -> Array:
+    """`k` with the predictions of the samples before in the places that are not given, by anti-diagonals."""
+    _, h, w = k.shape
+    x = k.astype(np.int64)
+    for d in range(h + w - 1):
+        i = np.arange(max(0, d - w + 1), min(h, d + 1))
+        i = i[~given[i, d - i]]
+        if not i.size:
+            continue
+        j = d - i
+        left, up = x[:, i, np.maximum(j - 1, 0)], x[:, np.maximum(i - 1, 0), j]
+        corner = x[:, np.maximum(i - 1, 0), np.maximum(j - 1, 0)]
+        west, north = np.where(j > 0, left, up), np.where(i > 0, up, left)
+        northwest = np.where((i > 0) & (j > 0), corner, np.where(i > 0, up, left))
+        x[:, i, j] = predictor.predict(west, north, northwest) if d else 0
+    return np.clip(x, -1 - MAX_SYMBOL, 1 + MAX_SYMBOL).astype(np.int32)
+
+
 def choose_predictor(k: Array) -> tuple[int, Array]:
     """(id, int32 residuals) of the predictor with the smallest estimated cost among those within MAX_SYMBOL."""
     best: tuple[float, int, Array] | None = None

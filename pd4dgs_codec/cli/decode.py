@@ -143,6 +143,7 @@ def _summary(scene: Scene, data: bytes, complete: bool, seconds: float, args: ar
         place = {key: described[layer][key] for key in ("offset", "bytes", "end")}
         anchors = total - (scene.rows[i - 1] if i else 0)
         rows.append({"layer": layer, **place, "anchors": anchors, "active": int((scene.mask[i] > 0).sum())})
+    wanted = range(3 if args.max_layer is None else args.max_layer + 1)
     return {
         "input": args.input,
         "output": args.output,
@@ -154,6 +155,7 @@ def _summary(scene: Scene, data: bytes, complete: bool, seconds: float, args: ar
         "global_deformation": scene.global_deformation is not None,
         "local_deformation": scene.local_deformation is not None,
         "layers": rows,
+        "absent": [layer for layer in wanted if layer not in described],
     }
 
 
@@ -172,6 +174,10 @@ def _text(result: dict[str, Any]) -> str:
     lines = [
         f"{name}: {result['bytes']:,} bytes, {state}, decoded in {result['seconds']:.3f} s",
         table(("layer", "bytes", "prefix", "new anchors", "active"), rows),
+    ]
+    lines += [
+        f"absent: layer {layer}, which this file does without; its level looks like the one below"
+        for layer in result["absent"]
     ]
     if result["output"]:
         lines.append(f"wrote {'stdout' if result['output'] == STDIO else result['output']}")

@@ -62,6 +62,13 @@ def parser() -> Parser:
     p.add_argument(
         "--effort", type=int, choices=range(1, 10), default=5, metavar="1-9", help="1 fast, 9 small (default: 5)"
     )
+    p.add_argument(
+        "--omit",
+        choices=("bounded", "lossless", "nothing"),
+        default="bounded",
+        help="leave out what changes no picture and residuals too small to see, the former alone, or nothing "
+        "(default: bounded)",
+    )
     p.add_argument("--no-verify", action="store_true", help="skip decoding the result and comparing every symbol")
     p.add_common()
     return p
@@ -89,6 +96,7 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
         step_scale=args.step_scale,
         layers=layers,
         effort=args.effort,
+        omit=args.omit,
         verify=not args.no_verify,
     )
     result = {"input": args.input, "output": args.output, **report.json()}
@@ -162,7 +170,9 @@ def _text(result: dict[str, Any], first_frame: float) -> str:
         for row, streams in zip(result["layers"], spent, strict=True)
     ]
     lines = [table(("layer", "bytes", "anchors", "positions", *shown, "payload/ΣR"), rows)]
-    lines += [f"left out: {item['what']} ({item['bytes']:,} bytes): {item['why']}" for item in result["left_out"]]
+    for item in result["left_out"]:
+        exactly = ", changes no picture" if item["lossless"] else ""
+        lines.append(f"left out: {item['what']} ({item['bytes']:,} bytes{exactly}): {item['why']}")
     verified = "verified" if result["verified"] else "not verified"
     name = "stdout" if result["output"] == STDIO else result["output"]
     lines.append(f"{name}: {result['bytes']:,} bytes, {verified}, {result['seconds']:.2f} s")

@@ -195,6 +195,7 @@ def _summary(args: argparse.Namespace, trainer: Trainer) -> dict[str, Any]:
         "seconds": round(trainer.seconds, 3),
         "phases_not_reached": schedule.phases_not_reached(trainer.iteration),
         "skipped": trainer.skipped,
+        "left_out": trainer.left_out,
         "anchors": len(trainer.model.anchor_q),
         "active_anchors": trainer.active_anchors(),
         "split": "test" if trainer.dataset.test else "train",
@@ -212,6 +213,9 @@ def _text(result: dict[str, Any]) -> str:
         lines.append(f"not finished: --resume {result['output']} goes on from here")
     if result["skipped"]:
         lines.append(f"{result['skipped']} steps skipped: their gradient was not finite")
+    for row in result["left_out"]:
+        gain = f"{row['gain']:+.2f} dB over level {row['level'] - 1} on {row['views']} views kept back"
+        lines.append(f"level {row['level']} left out: {gain}")
     if result["levels"]:
         split = "held-out" if result["split"] == "test" else "training-view"
         rows = zip(result["levels"], result["active_anchors"], strict=False)

@@ -15,7 +15,8 @@ from pd4dgs_codec.codec.decoder import decode_layers
 from pd4dgs_codec.codec.header import DEFORMATIONS, MODES, Header, pack_header, scene_id_of
 from pd4dgs_codec.codec.kinds import LAYER_KINDS
 from pd4dgs_codec.codec.layers import Coding, StreamReport, read_meta, write_layer
-from pd4dgs_codec.codec.plan import LeftOut, plan
+from pd4dgs_codec.codec.omissions import LeftOut
+from pd4dgs_codec.codec.plan import OMIT, plan
 from pd4dgs_codec.codec.symbols import (
     LayerSymbols,
     assemble,
@@ -48,7 +49,7 @@ class LayerReport:
 
 @dataclass(frozen=True)
 class Report:
-    """What encode did. left_out rows hold what, why and bytes: what it would have cost, by the same coder. errors: how
+    """What encode did. left_out rows hold what, why, lossless and bytes: about what it would have cost. errors: how
     far by the header decoded values may lie from those given and how far they do, empty if not verified."""
 
     mode: str
@@ -78,21 +79,23 @@ def encode_with_report(
     step_scale: float = 1.0,
     layers: str | int = "auto",
     effort: int = 5,
+    omit: str = "bounded",
     verify: bool = True,
 ) -> tuple[bytes, Report]:
     """(file, report) of a scene.
 
     mode: "ans", or "lzma" for the same symbols under LZMA2. deformation: "coded" or "float32". priors: "best" or
     "gauss". step_scale multiplies every quantisation step. layers: "auto" leaves out deformations that do nothing,
-    0, 1 or 2 keeps the layers up to that number. effort: 1..9. verify: decode the result, compare every symbol and
-    every float, and hold every float against the error bound in the header. Raises EncodeError.
+    0, 1 or 2 keeps the layers up to that number. effort: 1..9. omit: "bounded", "lossless" or "nothing", see plan.
+    verify: decode the result, compare every symbol and every float, and hold every float against the error bound in the
+    header. Raises EncodeError.
     """
     started = time.perf_counter()
-    _check_options(mode, deformation, priors, step_scale, layers, effort)
+    _check_options(mode, deformation, priors, step_scale, layers, effort, omit)
     scene = replace(scene, steps=scene.steps.scaled(step_scale))
     check_scene(scene)
     coding = Coding(mode, priors, effort)
-    planned, left_out = plan(scene, layers, deformation == "float32")
+    planned, left_out = plan(scene, layers, deformation == "float32", omit)
     symbols = [layer_symbols(planned, i, deformation == "float32") for i in range(len(planned.layers))]
     written = [write_layer(layer, coding) for layer in symbols]
     _check_limits(planned, symbols, [payload for payload, _ in written])
@@ -105,13 +108,16 @@ def encode_with_report(
     return data, Report(mode, len(data), verify, seconds, reports, rows, errors)
 
 
-def _check_options(mode: str, deformation: str, priors: str, scale: float, layers: str | int, effort: int) -> None:
+def _check_options(
+    mode: str, deformation: str, priors: str, scale: float, layers: str | int, effort: int, omit: str
+) -> None:
     choices = (
         ("mode", mode, tuple(MODES)),
         ("deformation", deformation, tuple(DEFORMATIONS)),
         ("priors", priors, ("best", "gauss")),
         ("layers", layers, LAYER_CHOICES),
         ("effort", effort, tuple(range(1, 10))),
+        ("omit", omit, OMIT),
     )
     for name, value, allowed in choices:
         if value not in allowed:
@@ -192,11 +198,14 @@ def _layer_report(layer: LayerSymbols, payload: bytes, reports: list[StreamRepor
 
 
 def _left_out_row(item: LeftOut, scene: Scene, coding: Coding, deformation: str, reports: list[LayerReport]) -> dict:
-    """{what, why, bytes}: tensors are coded to see what they cost; anchors cost what the kept ones do on average."""
-    if item.tensors is None or item.kind is None:
+    """{what, why, lossless, bytes}: see LeftOut; anchors cost what the kept ones do on average."""
+    row = {"what": item.what, "why": item.why, "lossless": item.lossless}
+    if item.anchors:
         kept = sum(r.anchors for r in reports)
         spent = sum(r.position_bits + s.payload_bits for r in reports for s in r.streams if s.name == "attributes")
-        return {"what": item.what, "why": item.why, "bytes": round(item.anchors * spent / 8 / kept) if kept else 0}
+        return row | {"bytes": round(item.anchors * spent / 8 / kept) if kept else 0}
+    if item.tensors is None or item.kind is None:
+        return row | {"bytes": round(item.bits / 8)}
     raw = deformation == "float32"
     tensors = item.tensors if raw else quantise_deformation(item.tensors, item.kind, scene.steps)
     empty = np.zeros(0, np.int32)
@@ -212,4 +221,4 @@ def _left_out_row(item: LeftOut, scene: Scene, coding: Coding, deformation: str,
         steps=steps,
         raw=raw,
     )
-    return {"what": item.what, "why": item.why, "bytes": len(write_layer(alone, coding)[0])}
+    return row | {"bytes": len(write_layer(alone, coding)[0])}

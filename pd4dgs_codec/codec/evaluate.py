@@ -29,12 +29,12 @@ def sample_planes(
         position = unit * (np.array(plane_sides(scale), dtype=np.float32) - 1)
         product: np.ndarray | float = 1.0
         for name, a, b in PLANES:
-            product = product * _bilinear(scale[name], position[:, a], position[:, b])
+            product = product * bilinear(scale[name], position[:, a], position[:, b])
         features.append(product)
     return np.concatenate(features, axis=1) if features else np.zeros((len(points), 0), np.float32)
 
 
-def _bilinear(plane: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+def bilinear(plane: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     """[n, C] samples of plane [C, H, W] at column u in 0..W-1 and row v in 0..H-1."""
     _, h, w = plane.shape
     rows_last = np.ascontiguousarray(plane.transpose(1, 2, 0))

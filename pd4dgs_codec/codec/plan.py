@@ -7,12 +7,13 @@ highest level's picture stays what it was, within the bounds below.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
 from pd4dgs_codec.codec.evaluate import residuals
 from pd4dgs_codec.codec.kinds import LAYER_KINDS, TRUNK, LayerKind
+from pd4dgs_codec.codec.omissions import LeftOut, leave_out
 from pd4dgs_codec.codec.symbols import dequantise_deformation, first_duplicate, quantise_deformation
 from pd4dgs_codec.entropy.morton import morton_order
 from pd4dgs_codec.errors import EncodeError
@@ -26,28 +27,24 @@ NEGLIGIBLE_COLOR = 0.5 / 255
 #: ... and no quaternion component (before normalisation) by more than this.
 NEGLIGIBLE_QUAT = 1e-3
 
+#: What `plan` leaves out: all it may, what changes no picture, or no more than it must.
+OMIT = ("bounded", "lossless", "nothing")
+
 #: A quick look that usually finds a head at work, and the most samples (points x times) before one is left out.
 QUICK_SAMPLES = 1 << 12
 FULL_SAMPLES = 1 << 18
 MIN_TIMES = 17
 
 
-@dataclass(frozen=True, eq=False)
-class LeftOut:
-    """Something that was not written. `tensors`: what its cost can be measured on, None if it is `anchors` anchors."""
-
-    what: str
-    why: str
-    kind: LayerKind | None = None
-    tensors: Deformation | None = None
-    anchors: int = 0
-
-
-def plan(scene: Scene, layers: str | int = "auto", raw_deformation: bool = False) -> tuple[Scene, list[LeftOut]]:
+def plan(
+    scene: Scene, layers: str | int = "auto", raw_deformation: bool = False, omit: str = "bounded"
+) -> tuple[Scene, list[LeftOut]]:
     """(the scene that the file will hold, what it leaves out). Rows come out sorted by (layer, Morton order).
 
     layers "auto" leaves out every head that is zero after quantisation or below the bounds, then every layer without
     one; 0, 1 or 2 keeps the layers up to that number and only drops heads that are exactly zero.
+    omit, one of OMIT: "bounded" leaves out what the bounds allow and what changes no picture, "lossless" only the
+    latter, "nothing" only heads that are exactly zero and anchors below the mask threshold.
     """
     left_out: list[LeftOut] = []
     scene = replace(scene, steps=scene.steps.scaled(1.0))  # binary32, as the file will hold them
@@ -56,7 +53,7 @@ def plan(scene: Scene, layers: str | int = "auto", raw_deformation: bool = False
     kept = [0]
     for layer in scene.layers[1:]:
         kind = LAYER_KINDS[layer]
-        scene, dropped = _drop_heads(scene, kind, layers == "auto", raw_deformation)
+        scene, dropped = _drop_heads(scene, kind, layers == "auto" and omit == "bounded", raw_deformation)
         left_out += dropped
         if layers != "auto" or getattr(scene, kind.deformation or "") is not None:
             kept.append(layer)
@@ -64,6 +61,9 @@ def plan(scene: Scene, layers: str | int = "auto", raw_deformation: bool = False
     if inactive:
         why = f"mask at or below the threshold at level {scene.level}"
         left_out.append(LeftOut(f"{inactive} anchors", why, anchors=inactive))
+    if omit != "nothing":
+        arranged, lossless = leave_out(arranged, raw_deformation)
+        left_out += lossless
     return arranged, left_out
 
 

@@ -22,6 +22,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "smooth": {"tmc_smooth": False},
     "tmc": {"tmc_binary": False, "tmc_smooth": False},
     "noise": {"noise": False},
+    "judge": {"judge": False},
 }
 
 
@@ -71,9 +72,9 @@ class TrainConfig:
     tmc_smooth: bool = True
     tmc_tau: float = 4.0  #: voxels
     rollout: str = "adaptive"  #: one of ROLLOUTS
-    max_layer: int = (
-        2  #: layers above it are not there: 0 is a static scaffold, 1 a scaffold and its global deformation
-    )
+    #: layers above it are not there: 0 is a static scaffold, 1 a scaffold and its global deformation
+    max_layer: int = 2
+    judge: bool = True  #: leave out levels that gain nothing on training views not seen yet, see `judge`
     ssim: float = 0.2
     volume: float = 0.01  #: weight of the mean product of scales (Scaffold-GS)
     noise: bool = True  #: imitate quantisation: noise on attributes, rounding of planes and weights, at last of all

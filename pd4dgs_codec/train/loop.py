@@ -10,6 +10,7 @@ import contextlib
 import json
 import math
 import time
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, TextIO
@@ -27,7 +28,7 @@ from pd4dgs_codec.model.config import PRESETS
 from pd4dgs_codec.model.model import EXACT, Noise, Rounding
 from pd4dgs_codec.render.picture import Picture, render, render_image
 from pd4dgs_codec.scene import MASK_THRESHOLD
-from pd4dgs_codec.train import losses
+from pd4dgs_codec.train import judge, losses
 from pd4dgs_codec.train.config import DEFAULT_ITERATIONS, PlaneWeights, Schedule, TrainConfig
 from pd4dgs_codec.train.densify import Densifier
 from pd4dgs_codec.train.initialise import fresh_model
@@ -70,6 +71,7 @@ class Trainer:
         self.interrupted = False
         self.curve: list[dict[str, Any]] = []
         self.order: list[int] = []
+        self.left_out: list[dict[str, Any]] = []  #: levels judged not to pay, with their gain in dB
         self._targets = [self._target(view) for view in dataset.train]
         self.neighbours: losses.Neighbours | None = None  #: rebuilt when anchors come or go
 
@@ -129,10 +131,13 @@ class Trainer:
     def step(self) -> dict[str, Any]:
         """One training step; returns its log record (every term unweighted)."""
         schedule = Schedule(self.total or 10**9)
-        index = self._next_view()
+        judged = self._judge_levels(schedule)
+        index = self._next_view(schedule)
         levels, probabilities = self._draw_levels(schedule)
         rounding = self._rounding(schedule)
         record: dict[str, Any] = {"iteration": self.iteration, "level": levels[-1]}
+        if judged:
+            record |= {"judged_psnr": judged, "left_out": self.left_out}
         if not self._learn(index, levels, schedule, rounding, record):
             self.skipped += 1
             record["skipped"] = self.skipped
@@ -278,10 +283,28 @@ class Trainer:
             probabilities = rollout_probabilities(self.rho)
         return (sample_level(probabilities, self.model.level, self.generator),), probabilities
 
-    def _next_view(self) -> int:
+    def _next_view(self, schedule: Schedule) -> int:
         if not self.order:
-            self.order = torch.randperm(len(self.dataset.train), generator=self.generator).tolist()
+            waiting = self._waiting_views() if self.iteration < schedule.rounding else set()
+            drawn = torch.randperm(len(self.dataset.train), generator=self.generator).tolist()
+            self.order = [index for index in drawn if index not in waiting]
         return self.order.pop()
+
+    def _waiting_views(self) -> set[int]:
+        """Training views that wait until the levels are judged; none where N is not known yet."""
+        return judge.waiting_views(len(self.dataset.train), self.total) if self.config.judge else set()
+
+    def _judge_levels(self, schedule: Schedule) -> list[float]:
+        """Where the last third begins: leaves out the levels that do not pay. Returns the PSNR per level judged by."""
+        waiting = sorted(self._waiting_views()) if self.iteration == schedule.rounding else []
+        if not waiting:
+            return []
+        psnr = self._level_psnr([self.dataset.train[index] for index in waiting])
+        found = judge.levels_without_gain(psnr)
+        for level, _ in found:
+            judge.leave_out(self.model, self.optimiser, level)
+        self.left_out = [{"level": level, "gain": gain, "views": len(waiting)} for level, gain in found]
+        return psnr
 
     def _target(self, view: View) -> tuple[Tensor, Tensor, TargetStats]:
         viewmat, K = (torch.as_tensor(np.array(m, np.float32), device=self.device) for m in (view.viewmat, view.K))
@@ -331,7 +354,12 @@ class Trainer:
     def _evaluate(self) -> list[float]:
         """Mean PSNR per level on a few held-out views (training views if none are held out)."""
         views = self.dataset.test or self.dataset.train
-        views = views[:: max(1, len(views) // CURVE_VIEWS)][:CURVE_VIEWS]
+        psnr = self._level_psnr(views[:: max(1, len(views) // CURVE_VIEWS)][:CURVE_VIEWS])
+        self.curve.append({"iteration": self.iteration, "seconds": self.seconds, "psnr": psnr})
+        return psnr
+
+    def _level_psnr(self, views: Sequence[View]) -> list[float]:
+        """Mean PSNR per level over `views`."""
         psnr = []
         rounding = replace(self._rounding(Schedule(self.total)), noise=None)
         for level in range(self.model.level + 1):
@@ -339,7 +367,6 @@ class Trainer:
                 render_image(self.model, level, v.time, v.viewmat, v.K, v.width, v.height, rounding) for v in views
             )
             psnr.append(float(np.mean([mpsnr(i, v.image, v.mask) for i, v in zip(images, views, strict=True)])))
-        self.curve.append({"iteration": self.iteration, "seconds": self.seconds, "psnr": psnr})
         return psnr
 
     def save(self, path: Path) -> None:
@@ -357,6 +384,7 @@ class Trainer:
                 "skipped": self.skipped,
                 "order": self.order,
                 "curve": json.dumps(self.curve),
+                "left_out": json.dumps(self.left_out),
                 "optimiser": self.optimiser.state(),
                 "densifier": self.densifier.state(),
                 "generator": self.generator.get_state(),
@@ -392,6 +420,7 @@ class Trainer:
         self.seconds, self.rho = float(training["seconds"]), float(training["rho"])
         self.order = [int(index) for index in training["order"]]
         self.curve = list(json.loads(training["curve"]))
+        self.left_out = list(json.loads(training.get("left_out", "[]")))
 
 
 def _plain(config: TrainConfig) -> dict[str, Any]:

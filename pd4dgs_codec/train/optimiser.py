@@ -64,6 +64,16 @@ class Optimiser:
             setattr(self.model, name, new)
         self.model.anchor_q = torch.cat([self.model.anchor_q[keep], added["anchor_q"]])
 
+    def forget(self, module: nn.Module) -> None:
+        """Takes the parameters of `module` out, and groups that hold no others."""
+        gone = {id(p) for p in module.parameters()}
+        for group in self.adam.param_groups:
+            for p in group["params"]:
+                if id(p) in gone:
+                    self.adam.state.pop(p, None)
+            group["params"] = [p for p in group["params"] if id(p) not in gone]
+        self.adam.param_groups = [group for group in self.adam.param_groups if group["params"]]
+
     def state(self) -> dict[str, Any]:
         """What resuming needs."""
         return self.adam.state_dict()

@@ -143,6 +143,9 @@ def test_info_names_what_is_left_out(cli, model_pt, tmp_path):
     output = tmp_path / "s.pd4"
     assert cli("encode", model_pt, "-o", output, "--layers", 1, "--effort", 1).code == 0
     assert [row["what"] for row in cli("info", output, "--json").json["left_out"]] == ["layer 2"]
+    decoded = cli("decode", output, "--max-layer", 2)
+    assert decoded.code == 0 and b"absent: layer 2" in decoded.out
+    assert cli("decode", output, "--max-layer", 1, "--json").json["absent"] == []
 
 
 def test_existing_output_needs_overwrite(cli, scene_pd4, tmp_path):

@@ -73,7 +73,7 @@ def test_inactive_anchors_are_dropped_and_reported():
     inactive = int((scene.mask[0] == 0).sum())
     data, report = encode_with_report(scene)
     assert 0 < inactive < 30 and len(decode(data).anchor_q) == len(scene.anchor_q) - inactive
-    (row,) = report.left_out
+    (row,) = [row for row in report.left_out if not row["lossless"]]
     assert row["what"] == f"{inactive} anchors" and row["bytes"] > 0
 
 

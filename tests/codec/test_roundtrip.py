@@ -31,7 +31,7 @@ def rows_by_voxel(scene):
 @given(scenes(), st.sampled_from(MODES), st.sampled_from(("best", "gauss")))
 @settings(max_examples=20)
 def test_everything_active_comes_back_and_encodes_to_the_same_bytes(scene, mode, priors):
-    options = {"mode": mode[0], "deformation": mode[1], "priors": priors, "layers": 2, "effort": 1}
+    options = {"mode": mode[0], "deformation": mode[1], "priors": priors, "layers": 2, "effort": 1, "omit": "nothing"}
     data = encode(scene, **options)
     decoded = decode(data)
     active = {cell: row for cell, row in rows_by_voxel(scene).items() if row[1][-1] > 0}
@@ -80,7 +80,7 @@ def test_unquantised_values_come_back_within_half_a_step(mode, deformation):
 @pytest.mark.parametrize("mode", ["ans", "lzma"])
 def test_symbols_over_the_whole_range(mode):
     scene = make_scene(1, layers=(0,), anchors=3, kind="huge", hidden=())
-    got = decode(encode(scene, mode=mode, priors="gauss", effort=1))
+    got = decode(encode(scene, mode=mode, priors="gauss", effort=1, omit="nothing"))
     assert np.abs(got.feature).max() == HUGE * scene.steps.feature
     assert_same_networks(got.networks, scene.networks)
 

@@ -1,0 +1,181 @@
+"""What changes no picture is left out, all of it, and no picture changes."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from strategies import make_scene
+
+from pd4dgs_codec.attributes import planes as decorrelation
+from pd4dgs_codec.codec.decoder import decode
+from pd4dgs_codec.codec.enclosure import residual_ranges, time_grid
+from pd4dgs_codec.codec.encoder import encode, encode_with_report
+from pd4dgs_codec.codec.evaluate import residuals
+from pd4dgs_codec.codec.plan import plan
+from pd4dgs_codec.codec.reach import reach
+from pd4dgs_codec.errors import EncodeError
+from pd4dgs_codec.scene import PLANES, Deformation, Scene
+
+SIDES = (6, 5, 7, 5)
+
+
+def lively_scene() -> Scene:
+    """A scene in which every value matters, but for the cells that nothing reaches."""
+    scene = make_scene(
+        5, anchors=60, kind="gaussian", hidden=(12,), channels=8, sides=SIDES, scales=2, width=8, extent=30
+    )
+    scaling_log = scene.scaling_log.copy()
+    scaling_log[:, :3] = -4  # Gaussians stay near their anchors
+    field = scene.global_deformation
+    ((weight, bias),) = field.networks["position"]
+    heads = {**field.networks, "position": ((weight * np.float32(0.05), bias * np.float32(0.05)),)}
+    near_one = tuple({name: 1 + np.clip(plane, -0.25, 0.25) for name, plane in s.items()} for s in field.planes)
+    masks = tuple(np.maximum(codes, 77) for codes in scene.mask)
+    return replace(scene, mask=masks, scaling_log=scaling_log, global_deformation=Deformation(near_one, heads))
+
+
+def edited(network, layer, **places):
+    """`network` with 0 in rows (of the weight; the bias becomes `bias` there) and columns of one of its layers."""
+    layers = [(w.copy(), b.copy()) for w, b in network]
+    weight, bias = layers[layer]
+    weight[places.get("rows", [])] = 0
+    bias[places.get("rows", [])] = places.get("bias", 0)
+    weight[:, places.get("columns", [])] = 0
+    return tuple(layers)
+
+
+def dead_scene() -> Scene:
+    """lively_scene with dead channels, units and a dead head, and a Gaussian of each anchor that never shows."""
+    scene = lively_scene()
+    networks = {name: edited(network, 0, columns=[7]) for name, network in scene.networks.items()}  # feature 7: unread
+    networks["opacity"] = edited(networks["opacity"], 0, rows=[3], bias=-1)  # a silent unit
+    networks["opacity"] = edited(networks["opacity"], 1, columns=[5])  # an unread one
+    networks["opacity"] = edited(networks["opacity"], 1, rows=[6], bias=-1)  # a Gaussian that never shows
+    feature = scene.feature.copy()
+    feature[:, 9] = 0
+    field, local = scene.global_deformation, scene.local_deformation
+    planes = tuple({name: plane.copy() for name, plane in scale.items()} for scale in field.planes)
+    planes[1]["yz"][1] = 0  # channel 1 of scale 1 is a product with 0
+    heads = dict(field.networks)
+    heads["feature"] = edited(heads["feature"], 0, rows=[9])
+    heads["scaling"] = edited(heads["scaling"], 0, rows=list(range(6)))
+    heads["trunk"] = edited(heads["trunk"], 0, rows=[2], columns=[4])  # a silent unit; channel 4 of scale 0 is unread
+    local_heads = {n: net if n == "trunk" else edited(net, 0, columns=[0]) for n, net in local.networks.items()}
+    return replace(
+        scene,
+        networks=networks,
+        feature=feature,
+        global_deformation=Deformation(planes, heads),
+        local_deformation=Deformation(local.planes, local_heads),
+    )
+
+
+def test_every_dead_part_is_found_and_costs_less():
+    scene = dead_scene()
+    whole, _ = encode_with_report(scene, layers=2, effort=1, omit="nothing")
+    data, report = encode_with_report(scene, layers=2, effort=1)
+    found = {row["what"]: row["bytes"] for row in report.left_out}
+    expected = [
+        "global_deformation head scaling",
+        "1 feature channels",
+        "global_deformation feature: rows of weights",
+        *(f"scaffold {name}: columns of weights" for name in scene.networks),
+        "global_deformation trunk: columns of weights",
+        "global_deformation: 2 plane channels",
+        "scaffold opacity: 2 units of layer 1",
+        "global_deformation trunk: 1 units of layer 1",
+        "local_deformation trunk: 1 units of layer 1",
+    ]
+    assert set(expected) <= set(found)
+    (hidden,) = [int(what.split()[2]) for what in found if what.startswith("offsets of")]
+    assert hidden >= len(scene.anchor_q)  # the one in ten that was made so
+    assert [what.split(":")[0] for what in found if "cells" in what] == ["global_deformation", "local_deformation"]
+    assert sum(found.values()) > 1000 < len(whole) - len(data) + 500
+    got = decode(data)
+    assert not got.networks["opacity"][0][0][[3, 5]].any() and not got.networks["opacity"][1][0][:, [3, 5]].any()
+    assert not got.feature[:, 7].any() and not got.global_deformation.planes[0]["xy"][4].any()
+    assert set(got.global_deformation.networks) == {"trunk", "position", "feature", "offset"}
+    assert encode(got, layers=2, effort=1) == data
+
+
+def test_no_pixel_changes():
+    pytest.importorskip("torch")
+    pytest.importorskip("numba")
+    from pd4dgs_codec.model.convert import from_scene
+    from pd4dgs_codec.render.picture import render_image
+
+    whole, less = (
+        from_scene(decode(encode(dead_scene(), layers=2, effort=1, omit=o))) for o in ("nothing", "lossless")
+    )
+    K = np.array([[40, 0, 24], [0, 40, 18], [0, 0, 1]], np.float32)
+    rng = np.random.default_rng(3)
+    seen = 0.0
+    for level in (0, 1, 2):
+        for _ in range(4):
+            rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+            viewmat = np.eye(4, dtype=np.float32)
+            viewmat[:3, :3] = rotation * np.sign(np.linalg.det(rotation))
+            viewmat[2, 3] = 8
+            t = float(rng.random())
+            a, b = (render_image(model, level, t, viewmat, K, 48, 36) for model in (whole, less))
+            np.testing.assert_array_equal(a, b)
+            seen += float(np.ptp(a))
+    assert seen > 1, "the pictures show something"
+
+
+def test_nothing_that_matters_goes():
+    """Of a scene without dead parts only cells that nothing reaches go, and what is kept stays as given."""
+    scene = lively_scene()
+    planned = decode(encode(scene, layers=2, effort=1))
+    _, left_out = plan(scene, 2)
+    assert all("cells" in item.what or "offsets" in item.what for item in left_out)
+    untouched = decode(encode(scene, layers=2, effort=1, omit="nothing"))
+    read = reach(untouched)
+    for kind, cells in (("global_deformation", read[0]), ("local_deformation", read[1])):
+        for marks, given, got in zip(
+            cells, getattr(untouched, kind).planes, getattr(planned, kind).planes, strict=True
+        ):
+            for name, _, _ in PLANES:
+                assert np.array_equal(given[name][:, marks[name]], got[name][:, marks[name]])
+
+
+def test_cells_that_any_instant_reads_are_marked():
+    """Against sampling: residuals lie in their ranges, and every cell that a sampled Gaussian reads is reached."""
+    scene, _ = plan(lively_scene(), 2, omit="nothing")
+    field, box = scene.global_deformation, scene.info.box
+    (stretches,) = residual_ranges(field, box, scene.anchor)
+    grid = time_grid(field)
+    assert len(stretches) == len(grid) - 1 and grid[0] == 0 and grid[-1] == 1
+    _, reached, shown = reach(scene)
+    rng = np.random.default_rng(1)
+    for ranges, start, end in zip(stretches, grid[:-1], grid[1:], strict=True):
+        for t in rng.uniform(start, end, 3):
+            moved = residuals(field, box, scene.anchor, float(t))
+            for name, (low, high) in ranges.items():
+                assert (low <= moved[name]).all() and (moved[name] <= high).all(), name
+            spread = np.exp(scene.scaling_log + moved["scaling"])[:, None, :3]
+            means = (scene.anchor + moved["position"])[:, None]
+            means = (means + (scene.offset + moved["offset"].reshape(-1, 10, 3)) * spread)[shown]
+            unit = np.clip((means - box[0]) / (box[1] - box[0]), 0, 1)
+            for scale, marks in enumerate(reached):
+                at = unit * (np.array([side << scale for side in SIDES[:3]]) - 1)
+                for name, a, b in PLANES[:2]:
+                    assert marks[name][np.floor(at[:, b]).astype(int), np.floor(at[:, a]).astype(int)].all()
+
+
+def test_a_filled_plane_keeps_what_is_given_and_costs_less():
+    rng = np.random.default_rng(2)
+    plane = rng.integers(-9, 10, (3, 12, 10), dtype=np.int32)
+    given = rng.random((12, 10)) < 0.5
+    filled = decorrelation.fill(plane, given)
+    assert np.array_equal(filled[:, given], plane[:, given])
+    assert np.array_equal(decorrelation.fill(filled, given), filled)
+    zeros = [(decorrelation.residual(p, filled)[:, ~given] == 0).all() for p in decorrelation.PREDICTORS]
+    assert any(zeros)
+    assert np.array_equal(decorrelation.fill(plane, np.ones_like(given)), plane)
+    assert not decorrelation.fill(plane, np.zeros_like(given)).any()
+
+
+def test_an_unknown_wish_is_refused():
+    with pytest.raises(EncodeError, match="omit 'much', expected one of"):
+        encode(lively_scene(), omit="much")
