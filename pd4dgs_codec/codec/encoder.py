@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -13,6 +14,7 @@ from pd4dgs_codec.codec.bounds import ErrorBound, error_bounds
 from pd4dgs_codec.codec.check import check_scene
 from pd4dgs_codec.codec.decoder import decode_layers
 from pd4dgs_codec.codec.header import DEFORMATIONS, MODES, Header, pack_header, scene_id_of
+from pd4dgs_codec.codec.kinds import LayerKind
 from pd4dgs_codec.codec.layers import Coding, StreamReport, read_meta, write_layer
 from pd4dgs_codec.codec.plan import LeftOut, plan
 from pd4dgs_codec.codec.symbols import (
@@ -23,7 +25,7 @@ from pd4dgs_codec.codec.symbols import (
     quantise_deformation,
 )
 from pd4dgs_codec.errors import DecodeError, EncodeError
-from pd4dgs_codec.scene import Scene
+from pd4dgs_codec.scene import Deformation, Scene, Steps
 
 LAYER_CHOICES = ("auto", 0, 1, 2)
 
@@ -77,27 +79,29 @@ def encode_with_report(
     layers: str | int = "auto",
     effort: int = 5,
     verify: bool = True,
+    left_out: Sequence[LeftOut] = (),
 ) -> tuple[bytes, Report]:
     """(file, report) of a scene.
 
     mode: "ans", or "lzma" for the same symbols under LZMA2. deformation: "coded" or "float32". priors: "best" or
     "gauss". step_scale multiplies every quantisation step. layers: "auto" leaves out deformations that do nothing,
     0, 1 or 2 keeps the layers up to that number. effort: 1..9. verify: decode the result, compare every symbol and
-    every float, and hold every float against its error bound. Raises EncodeError.
+    every float, and hold every float against its error bound. left_out: what the caller has taken out of the scene, to
+    be reported with the rest. Raises EncodeError.
     """
     started = time.perf_counter()
     _check_options(mode, deformation, priors, step_scale, layers, effort)
     scene = replace(scene, steps=scene.steps.scaled(step_scale))
     check_scene(scene)
     coding = Coding(mode, priors, effort)
-    planned, left_out = plan(scene, layers, deformation == "float32")
+    planned, omitted = plan(scene, layers, deformation == "float32")
     symbols = [layer_symbols(planned, i, deformation == "float32") for i in range(len(planned.layers))]
     written = [write_layer(layer, coding) for layer in symbols]
     _check_limits(symbols, [payload for payload, _ in written])
     data = _container(planned, mode, deformation, symbols, [payload for payload, _ in written])
     errors = _verify(data, planned, symbols, deformation == "float32") if verify else []
     reports = [_layer_report(layer, payload, r) for layer, (payload, r) in zip(symbols, written, strict=True)]
-    rows = [_left_out_row(item, scene, coding, deformation, reports) for item in left_out]
+    rows = [_left_out_row(item, scene, coding, deformation, reports) for item in (*left_out, *omitted)]
     seconds = round(time.perf_counter() - started, 4)
     return data, Report(mode, len(data), verify, seconds, reports, rows, errors)
 
@@ -188,19 +192,23 @@ def _left_out_row(item: LeftOut, scene: Scene, coding: Coding, deformation: str,
         kept = sum(r.anchors for r in reports)
         spent = sum(r.position_bits + s.payload_bits for r in reports for s in r.streams if s.name == "attributes")
         return {"what": item.what, "why": item.why, "bytes": round(item.anchors * spent / 8 / kept) if kept else 0}
-    raw = deformation == "float32"
-    tensors = item.tensors if raw else quantise_deformation(item.tensors, item.kind, scene.steps)
+    size = deformation_bytes(item.tensors, item.kind, scene.steps, coding, deformation == "float32")
+    return {"what": item.what, "why": item.why, "bytes": size}
+
+
+def deformation_bytes(deformation: Deformation, kind: LayerKind, steps: Steps, coding: Coding, raw: bool) -> int:
+    """What planes and networks alone would take as the layer of `kind`."""
+    tensors = deformation if raw else quantise_deformation(deformation, kind, steps)
     empty = np.zeros(0, np.int32)
-    steps = {name: getattr(scene.steps, name) for name in (item.kind.planes_step, item.kind.weights_step) if name}
     alone = LayerSymbols(
-        kind=item.kind,
+        kind=kind,
         anchor_q=np.zeros((0, 3), np.int32),
         mask_increase=empty,
         mask_own=empty,
         attributes=np.zeros((0, 0), np.int32),
         planes=tensors.planes,
         networks=tensors.networks,
-        steps=steps,
+        steps={name: getattr(steps, name) for name in (kind.planes_step, kind.weights_step) if name},
         raw=raw,
     )
-    return {"what": item.what, "why": item.why, "bytes": len(write_layer(alone, coding)[0])}
+    return len(write_layer(alone, coding)[0])
