@@ -1,10 +1,11 @@
 """Meeting a size per layer with the least loss: which quantisation steps grow, and which anchors leave the layer.
 
 Each of a layer's knobs (its steps, the share of its anchors that leave) is tried alone at a few values. The lower
-convex hull of what a value saves and what it loses gives the knob's segments; the segments of all knobs in the order of loss
-per byte are one path from "as given" to "as small as can be" (the allocation of Shoham and Gersho, Efficient bit
-allocation for an arbitrary set of quantizers, 1988), and bisection along it over real encodes finds the size. That
-takes losses and savings for additive; a second round measures them again around what the first one found.
+convex hull of what a value saves and what it loses gives the knob's segments; the segments of all knobs in the order
+of loss per byte are one path from "as given" to "as small as can be" (the allocation of Shoham and Gersho, Efficient
+bit allocation for an arbitrary set of quantizers, 1988), and bisection along it over real encodes finds the size. That
+takes losses and savings for additive, which they nearly are: measuring them again around what was found, and walking
+once more, found nothing better on trained scenes.
 
 Loss and harm are functions given by the caller, so that nothing here needs a renderer.
 """
@@ -12,7 +13,7 @@ Loss and harm are functions given by the caller, so that nothing here needs a re
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -69,7 +70,6 @@ def least_loss(
     loss: Callable[[Setting], float],
     final_size: Callable[[Setting], int],
     target: int,
-    rounds: int = 2,
 ) -> dict[str, float]:
     """The setting with final_size <= target, not less than SLACK below it if there is such a one, of least loss found.
 
@@ -79,35 +79,25 @@ def least_loss(
     start = {knob: grid[0] for knob, grid in grids.items()}
     if final_size(start) <= target:
         return start
-    found: list[dict[str, float]] = []
-    base = start
-    for _ in range(rounds):
-        path = list(_path(grids, size, loss, base))
-        base = _walk(path, start, size, final_size, target)
-        if base in found:
-            break
-        found.append(base)
-    return min(found, key=loss)
+    return _walk(_path(grids, size, loss), start, size, final_size, target)
 
 
 def _path(
-    grids: Mapping[str, Sequence[float]],
-    size: Callable[[Setting], int],
-    loss: Callable[[Setting], float],
-    base: Setting,
-) -> Iterator[Segment]:
-    """All knobs' segments by slope, each knob measured with the others as in `base`."""
+    grids: Mapping[str, Sequence[float]], size: Callable[[Setting], int], loss: Callable[[Setting], float]
+) -> list[Segment]:
+    """All knobs' segments by slope, each knob measured with the others as given."""
+    start = {knob: grid[0] for knob, grid in grids.items()}
     segments = []
     for knob, grid in grids.items():
         points = []
         for value in grid:
-            setting = {**base, knob: value}
+            setting = {**start, knob: value}
             points.append((value, float(size(setting)), loss(setting)))
         _, full, least = points[0]
         vertices = convex_hull([(value, full - bytes_, lost - least) for value, bytes_, lost in points])
         for (a, saved_a, loss_a), (b, saved_b, loss_b) in zip(vertices[:-1], vertices[1:], strict=True):
             segments.append(Segment(knob, a, b, (loss_b - loss_a) / (saved_b - saved_a)))
-    yield from sorted(segments, key=lambda s: s.slope)
+    return sorted(segments, key=lambda s: s.slope)
 
 
 def convex_hull(points: Sequence[tuple[float, float, float]]) -> list[tuple[float, float, float]]:
@@ -210,9 +200,9 @@ def fit(
     """(scene whose file keeps the targets, anchors that it drops, how) of a planned scene.
 
     targets: most bytes by layer; a layer that the scene lacks meets any. loss: of a decoded scene, to be kept low.
-    harm: float64 [N], what is lost if an anchor of the scene is missing at a level: those of least harm leave first, for the
-    next layer or, from the highest, for good. The other options as in encoder.encode_with_report, for the file that is
-    to be written. Raises EncodeError naming the layer and what it could reach.
+    harm: float64 [N], what is lost if an anchor of the scene is missing at a level: those of least harm leave first,
+    for the next layer or, from the highest, for good. The other options as in encoder.encode_with_report, for the file
+    that is to be written. Raises EncodeError naming the layer and what it could reach.
     """
     options = {"mode": mode, "deformation": deformation, "priors": priors}
     fits, dropped = [], 0
@@ -226,7 +216,8 @@ def fit(
         except Unreachable as error:
             raise EncodeError(
                 f"target size: layer {layer} takes at least {error.smallest:,} bytes "
-                f"(steps up to x{2 ** OCTAVES[-1]:g}, {SHARES[-1]:.0%} of its anchors out of it), expected at most {targets[layer]:,}"
+                f"(steps up to x{2 ** OCTAVES[-1]:g}, {SHARES[-1]:.0%} of its anchors out of it), "
+                f"expected at most {targets[layer]:,}"
             ) from None
         row = fitted.describe(found, targets[layer])
         if row.to_layer is None:

@@ -141,9 +141,7 @@ def _build(content: dict[str, Any]) -> Model:
         needed = sum(r[a] * r[b] for r in reso for _, a, b in PLANES)
         if needed != n_cells:  # before anything of that size is made
             raise ValueError(f"{name} planes of {n_cells} cells, expected {needed} for the resolutions {reso}")
-        planes = tuple(
-            {plane: np.zeros((channels, r[b], r[a]), np.float32) for plane, a, b in PLANES} for r in reso
-        )
+        planes = tuple({plane: np.zeros((channels, r[b], r[a]), np.float32) for plane, a, b in PLANES} for r in reso)
         # the registry's order, not the dictionary's: optimiser states are matched to parameters by order
         present = {k.split(".")[2] for k in state if k.startswith(f"{prefix}.heads.")}
         heads = [head for head in (GLOBAL_HEADS | LOCAL_HEADS) if head in present]

@@ -28,8 +28,8 @@ def leave_out_unpaid(
 
     From the highest layer down, the scene is quantised with and without the layer's deformation; a layer's gain is the
     largest, over the levels from its own one up, of the mean mPSNR over `views` that it adds. The deformation's
-    bytes are those that it takes alone; its anchors pass to a lower layer and are not counted. The plan drops a layer without a
-    deformation. mPSNR is of the views' true images.
+    bytes are those that it takes alone; its anchors pass to a lower layer and are not counted. The plan drops a layer
+    without a deformation. mPSNR is of the views' true images.
     """
     left_out: list[LeftOut] = []
     with_all = None
@@ -52,7 +52,7 @@ def leave_out_unpaid(
         if gain * 1e6 < min_gain * size:
             why = (
                 f"level {kind.layer} gains {gain:.3f} dB for {size:,} bytes on {len(views)} views: "
-                f"{gain * 1e6 / size:.2f} dB per MB, expected at least {min_gain:g}"
+                f"{gain * 1e6 / size:.2f} dB per MB, expected at least {min_gain:,g}"
             )
             left_out.append(LeftOut(str(kind.deformation), why, kind, deformation))
             scene, with_all = without, remaining
