@@ -159,6 +159,9 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
     data, report = encode_with_report(scene, verify=not args.no_verify, left_out=left_out, **options)
     result = {"input": args.input, "output": args.output, **report.json()}
     if target is not None:
+        added = _added_bytes(data)
+        for row in target["layers"]:
+            row["bytes"] = added.get(row["layer"], 0)
         result["target"] = target
     for row in result["layers"]:
         row["ratio"] = row["payload_bits"] / row["rate_bits"] if row["rate_bits"] else None
@@ -273,6 +276,15 @@ def _train_rate(scene: Scene, layers: str | int) -> dict[str, Any]:
         for row in rows
     ]
     return {"train_rate_bits": sum(row["bits"] for row in per_layer), "train_rate_bits_layers": per_layer}
+
+
+def _added_bytes(data: bytes) -> dict[int, int]:
+    """By layer what it adds to the file, the header counted with layer 0."""
+    from pd4dgs_codec.codec.info import info
+
+    rows = info(data)["layers"]
+    ends = [0, *(row["end"] for row in rows)]
+    return {row["layer"]: row["end"] - before for row, before in zip(rows, ends, strict=False)}
 
 
 def _first_frame_seconds(data: bytes) -> float:
