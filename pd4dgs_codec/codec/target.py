@@ -172,10 +172,12 @@ def _first(holds: Callable[[float], bool], low: float, high: float) -> float:
 
 @dataclass(frozen=True)
 class Fit:
-    """How a layer met its target. bytes: what it adds to the file, with layer 0 the header and a
-    margin of HEADER_MARGIN. factors: on the
-    steps, by field of Steps. moved: anchors that left it, to_layer where they went, None if they were dropped; harm:
-    that of the most harmful of them, in the unit of the harm given, None if there is none."""
+    """How a layer met its target.
+
+    bytes: what it adds to the file, with layer 0 the header and HEADER_MARGIN. factors: on the steps, by field of
+    Steps. moved: anchors that left it, to_layer where they went, None if they were dropped; harm: that of the most
+    harmful of them, in the unit of the harm given, None if there is none.
+    """
 
     layer: int
     target: int
