@@ -32,6 +32,7 @@ def leave_out_unpaid(
     without a deformation. mPSNR is of the views' true images.
     """
     left_out: list[LeftOut] = []
+    scene = replace(scene, steps=scene.steps.scaled(1.0))  # binary32, as the file will hold them
     with_all = None
     for kind in reversed(LAYER_KINDS[1:]):
         deformation = getattr(scene, kind.deformation or "")
