@@ -102,9 +102,10 @@ def parser() -> Parser:
     )
     views = p.add_argument_group("judging by pictures")
     views.add_argument(
-        "--data", metavar="SOURCE", help="a dataset's views, see above; they also decide which layers pay"
+        "--data",
+        metavar="SOURCE",
+        help="a dataset, see above: sizes are fitted on its training views, layers must pay on those held out",
     )
-    views.add_argument("--split", choices=("train", "test"), default="train", help="which views of it (default: train)")
     views.add_argument(
         "--downscale", type=positive_int, default=1, metavar="K", help="pictures 1/K as wide and high (default: 1)"
     )
@@ -148,13 +149,13 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
         "layers": layers,
         "effort": args.effort,
     }
-    views = _views(args, console)
+    views, held_out = _views(args, console)
     left_out: list[LeftOut] = []
-    if views and layers == "auto" and args.min_gain:
-        scene, left_out = _leave_out_unpaid(args, scene, views)
+    if held_out and layers == "auto" and args.min_gain:
+        scene, left_out = _leave_out_unpaid(args, scene, held_out)
     target = None
     if args.target_size:
-        scene, more, target = _fit(args, scene, views, options)
+        scene, more, target = _fit(args, scene, views, held_out, options)
         left_out += more
     data, report = encode_with_report(scene, verify=not args.no_verify, left_out=left_out, **options)
     result = {"input": args.input, "output": args.output, **report.json()}
@@ -190,21 +191,24 @@ def _load(args: argparse.Namespace) -> tuple[Scene, bool]:
     return to_scene(model), True
 
 
-def _views(args: argparse.Namespace, console: Console) -> list[View]:
-    """About --views views of --data, evenly spread over the split."""
+def _views(args: argparse.Namespace, console: Console) -> tuple[list[View], list[View]]:
+    """About --views of --data's training views and as many held out (training views if none are), evenly spread.
+
+    A layer is judged by what it was not fitted to: on training views a useless one may still gain a lot.
+    """
     if args.data is None:
-        return []
+        return [], []
     use_threads(args)
     from pd4dgs_codec.data.dataset import load
-    from pd4dgs_codec.errors import DataError
 
     dataset = load(args.data, downscale=args.downscale, holdout=args.holdout)
-    views = dataset.test if args.split == "test" else dataset.train
-    if not views:
-        raise DataError(f"{args.data}: has no {args.split} views; expected another --split or --holdout")
-    chosen = list(views[:: -(-len(views) // args.views)])
-    console.detail(f"{args.data}: {len(chosen)} of {len(views)} {args.split} views")
-    return chosen
+    train, test = (
+        list(views[:: -(-len(views) // args.views)]) for views in (dataset.train, dataset.test or dataset.train)
+    )
+    console.detail(f"{args.data}: {len(train)} training views, {len(test)} to judge by")
+    if not dataset.test:
+        console.message("no views are held out: layers are judged on training views")
+    return train, test
 
 
 def _leave_out_unpaid(args: argparse.Namespace, scene: Scene, views: list[View]) -> tuple[Scene, list[LeftOut]]:
@@ -225,7 +229,7 @@ def _leave_out_unpaid(args: argparse.Namespace, scene: Scene, views: list[View])
 
 
 def _fit(
-    args: argparse.Namespace, scene: Scene, views: list[View], options: dict[str, Any]
+    args: argparse.Namespace, scene: Scene, views: list[View], held_out: list[View], options: dict[str, Any]
 ) -> tuple[Scene, list[LeftOut], dict[str, Any]]:
     """(scene whose layers meet --target-size, what that leaves out, the "target" of the report)."""
     use_threads(args)
@@ -245,13 +249,13 @@ def _fit(
         fitted, dropped, fits = fit(scene, args.target_size, loss.mean_mse, loss.harm, **options)
         packed = rounded(plan(fitted, options["layers"], raw)[0], raw)
         errors = loss.mse(packed)
-        before, after = (true_psnr(s, views, step) if views else {} for s in (scene, packed))
+        before, after = (true_psnr(s, held_out, step) if views else {} for s in (scene, packed))
     levels = []
     for level, mse in errors.items():
         lost = {"lost_db": before[level] - after[level]} if views else {}
         levels.append({"level": level, "error_psnr": psnr_of(mse), **lost})
     report = {
-        "cameras": f"{args.data}, {args.split}" if views else "the file's own",
+        "cameras": f"training views of {args.data}" if views else "the file's own camera",
         "pictures": len(frames),
         "layers": [{**asdict(row), "steps": {k: getattr(fitted.steps, k) for k in row.factors}} for row in fits],
         "levels": levels,
@@ -329,6 +333,6 @@ def _target_lines(target: dict[str, Any]) -> list[str]:
         lines.append(f"layer {row['layer']}: {row['bytes']:,} bytes, at most {row['target']:,} wanted: {how}")
     for row in target["levels"]:
         error = "none" if row["error_psnr"] == math.inf else f"{row['error_psnr']:.2f} dB PSNR"
-        truth = f", {row['lost_db']:+.3f} dB of quality lost" if "lost_db" in row else ""
+        truth = f", {row['lost_db']:+.3f} dB lost on held-out views" if "lost_db" in row else ""
         lines.append(f"level {row['level']}: error against the unquantised scene {error}{truth}")
-    return lines + [f"pictures: {target['pictures']} from {target['cameras']}"]
+    return lines + [f"fitted on {target['pictures']} pictures: {target['cameras']}"]

@@ -38,7 +38,7 @@ def test_a_target_is_met_with_less_loss_than_one_factor_on_all_steps_makes(cli, 
     target = result.json["target"]
     (row,) = target["layers"]
     assert row["bytes"] == first_layer(cli, output) and row["target"] == most
-    assert target["cameras"] == "the file's own" and [level["level"] for level in target["levels"]] == [0, 1, 2]
+    assert target["cameras"] == "the file's own camera" and [level["level"] for level in target["levels"]] == [0, 1, 2]
     error = np.mean([10 ** (-0.1 * level["error_psnr"]) for level in target["levels"]])
     scaled = next(x for x in np.geomspace(1, 40, 16) if scaled_size(model_pt, x) <= most)
     assert 0 < error < scaled_error(model_pt, scaled)
@@ -86,7 +86,7 @@ def test_sizes_that_are_none_are_wrong_usage(cli, model_pt, tmp_path, text):
 
 
 def test_layers_that_do_not_pay_are_left_out_with_their_figures(cli, model_pt, shared_dataset, tmp_path):
-    judged = ("encode", model_pt, "-o", tmp_path / "s.pd4", "--data", shared_dataset, "--views", 2, *FAST)
+    judged = ("encode", model_pt, "-o", tmp_path / "s.pd4", "--data", shared_dataset, "--holdout", 3, *FAST)
     dear = cli(*judged, "--min-gain", 1e5).json
     assert [row["layer"] for row in dear["layers"]] == [0]
     assert dear["layers"][0]["anchors"] == 60, "the anchors of layers left out stay"
