@@ -34,6 +34,10 @@ SOURCE is one of
   (synthetic:NAME?seed=n gives another scene of that kind)"""
 
 
+#: How sizes of layers are named.
+LAYER_NAMES = {"L0": 0, "L1": 1, "L2": 2}
+
+
 class UsageError(Exception):
     """The command line itself is wrong: exit 2."""
 
@@ -139,6 +143,18 @@ def rates(text: str) -> dict[str, float]:
 def duration(text: str) -> float:
     """Seconds: "50ms", "1.5s" or "1.5"."""
     return _scaled(text, {"ms": 1e-3, "s": 1.0}, "a time such as 50ms or 1.5s", low=0.0)
+
+
+def layer_sizes(text: str) -> dict[int, int]:
+    """Bytes by layer with k, M for 1e3, 1e6: "L0=425k,L1=80000" -> {0: 425000, 1: 80000}."""
+    expected = "sizes in bytes such as L0=425k,L1=120000"
+    sizes: dict[int, int] = {}
+    for part in text.split(","):
+        name, _, size = part.partition("=")
+        if name not in LAYER_NAMES or LAYER_NAMES[name] in sizes:
+            raise argparse.ArgumentTypeError(f"found {text!r}, expected {expected}, each layer once")
+        sizes[LAYER_NAMES[name]] = int(_scaled(size, {"k": 1e3, "M": 1e6}, expected, low=1.0))
+    return sizes
 
 
 def _scaled(text: str, units: dict[str, float], expected: str, low: float = math.ulp(0.0)) -> float:

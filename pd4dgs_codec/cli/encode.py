@@ -4,24 +4,54 @@ from __future__ import annotations
 
 import argparse
 import io
+import math
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.cli.common import OK, Console, Parser, UsageError, number, positive_float, run, table, use_threads
+from pd4dgs_codec.cli.common import (
+    OK,
+    SOURCES,
+    Console,
+    Parser,
+    UsageError,
+    count,
+    layer_sizes,
+    non_negative_float,
+    number,
+    positive_float,
+    positive_int,
+    run,
+    table,
+    use_threads,
+)
 from pd4dgs_codec.cli.files import STDIO, check_output, is_pd4, read_bytes, write_bytes
+from pd4dgs_codec.cli.progress import progress_bar
 
 if TYPE_CHECKING:
+    from pd4dgs_codec.codec.omissions import LeftOut
+    from pd4dgs_codec.data.dataset import View
     from pd4dgs_codec.scene import Scene
 
-DETAILS = """\
+DETAILS = f"""\
 A .pd4 file holds layer 0 (static scene), layer 1 (global motion) and layer 2 (local motion) one after the other; every
 prefix that ends with a layer can be shown. What has no visible effect is left out, and the report says what and why.
+
+--target-size makes layers small enough for a link with the least loss in the pictures: 425k for layer 0 is 1.7 s at
+2 Mbps. It takes a minute or more. Give --data, or only what the file's own camera shows is judged.
+
+{SOURCES}
 
 examples:
   pd4dgs-encode model.pt -o scene.pd4
   pd4dgs-encode model.pt -o small.pd4 --step-scale 2
+  pd4dgs-encode model.pt -o fast.pd4 --target-size L0=350k --data recordings/kitchen --downscale 2
   pd4dgs-encode model.pt -o - | pd4dgs-decode -"""
 
+#: Below this gain of a level a layer is left out, dB per megabyte (1e6 bytes). About 0.5 dB is what viewers begin to
+#: notice, and a megabyte takes 4 s at 2 Mbps, longer than all of such a scene should.
+MIN_GAIN = 0.5
+#: Pictures of the file's own camera, and how many degrees it sways, where there is no dataset.
+OWN_PICTURES, OWN_ORBIT = 16, 20.0
 #: Link rate at which the report states the time to the first frame, in bits per second.
 FIRST_FRAME_RATE = 2e6
 
@@ -70,6 +100,34 @@ def parser() -> Parser:
         "(default: bounded)",
     )
     p.add_argument("--no-verify", action="store_true", help="skip decoding the result and comparing every symbol")
+    p.add_argument(
+        "--target-size",
+        type=layer_sizes,
+        default={},
+        metavar="L0=425k,...",
+        help="most bytes that each layer may add to the file (layer 0 with the header): coarser steps, fewer anchors",
+    )
+    views = p.add_argument_group("judging by pictures")
+    views.add_argument(
+        "--data",
+        metavar="SOURCE",
+        help="a dataset, see above: sizes are fitted on its training views, layers must pay on those held out",
+    )
+    views.add_argument(
+        "--downscale", type=positive_int, default=1, metavar="K", help="pictures 1/K as wide and high (default: 1)"
+    )
+    views.add_argument("--holdout", type=count, default=8, metavar="K", help="as in pd4dgs-train (default: 8)")
+    views.add_argument(
+        "--views", type=positive_int, default=16, metavar="N", help="use about N of them, evenly spread (default: 16)"
+    )
+    views.add_argument(
+        "--min-gain",
+        type=non_negative_float,
+        default=MIN_GAIN,
+        metavar="DB",
+        help="with --data, leave out layers whose level gains less than DB dB mPSNR per megabyte "
+        f"(default: {MIN_GAIN:g}; 0: keep all)",
+    )
     p.add_common()
     return p
 
@@ -85,25 +143,38 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
     check_output(args.output, args.overwrite)
     scene, trained = _load(args)
     console.detail(f"{args.input}: {len(scene.anchor_q)} anchors, layers {list(scene.layers)}, steps {scene.steps}")
+    from dataclasses import replace
+
     from pd4dgs_codec.codec.encoder import encode_with_report
 
+    scene = replace(scene, steps=scene.steps.scaled(args.step_scale))
     layers = args.layers if args.layers == "auto" else int(args.layers)
-    data, report = encode_with_report(
-        scene,
-        mode=args.mode,
-        deformation=args.deformation,
-        priors=args.priors,
-        step_scale=args.step_scale,
-        layers=layers,
-        effort=args.effort,
-        omit=args.omit,
-        verify=not args.no_verify,
-    )
+    options = {
+        "mode": args.mode,
+        "deformation": args.deformation,
+        "priors": args.priors,
+        "layers": layers,
+        "effort": args.effort,
+    }
+    views, held_out = _views(args, console)
+    left_out: list[LeftOut] = []
+    if held_out and layers == "auto" and args.min_gain:
+        scene, left_out = _leave_out_unpaid(args, scene, held_out)
+    target = None
+    if args.target_size:
+        scene, more, target = _fit(args, scene, views, held_out, options)
+        left_out += more
+    data, report = encode_with_report(scene, omit=args.omit, verify=not args.no_verify, left_out=left_out, **options)
     result = {"input": args.input, "output": args.output, **report.json()}
+    if target is not None:
+        added = _added_bytes(data)
+        for row in target["layers"]:
+            row["bytes"] = added.get(row["layer"], 0)
+        result["target"] = target
     for row in result["layers"]:
         row["ratio"] = row["payload_bits"] / row["rate_bits"] if row["rate_bits"] else None
     if trained and args.json:  # shown nowhere else, and it takes its time
-        result |= _train_rate(scene, layers, args.step_scale)
+        result |= _train_rate(scene, layers)
         bits = {row["layer"]: row["bits"] for row in result["train_rate_bits_layers"]}
         for row in result["layers"]:  # float32 deformations may keep a layer that is zero once quantised
             row["train_rate_bits"] = bits.get(row["layer"])
@@ -127,6 +198,78 @@ def _load(args: argparse.Namespace) -> tuple[Scene, bool]:
     return to_scene(model), True
 
 
+def _views(args: argparse.Namespace, console: Console) -> tuple[list[View], list[View]]:
+    """About --views of --data's training views and as many held out (training views if none are), evenly spread.
+
+    A layer is judged by what it was not fitted to: on training views a useless one may still gain a lot.
+    """
+    if args.data is None:
+        return [], []
+    use_threads(args)
+    from pd4dgs_codec.data.dataset import load
+
+    dataset = load(args.data, downscale=args.downscale, holdout=args.holdout)
+    train, test = (
+        list(views[:: -(-len(views) // args.views)]) for views in (dataset.train, dataset.test or dataset.train)
+    )
+    console.detail(f"{args.data}: {len(train)} training views, {len(test)} to judge by")
+    if not dataset.test:
+        console.message("no views are held out: layers are judged on training views")
+    return train, test
+
+
+def _leave_out_unpaid(args: argparse.Namespace, scene: Scene, views: list[View]) -> tuple[Scene, list[LeftOut]]:
+    """The scene without the layers whose level does not pay, and what went."""
+    from pd4dgs_codec.codec.layers import Coding
+    from pd4dgs_codec.report.worth import leave_out_unpaid
+
+    coding = Coding(args.mode, args.priors, args.effort)
+    with progress_bar(None, "pictures", "judging layers") as step:
+        return leave_out_unpaid(
+            scene,
+            views,
+            min_gain=args.min_gain,
+            coding=coding,
+            raw_deformation=args.deformation == "float32",
+            step=step,
+        )
+
+
+def _fit(
+    args: argparse.Namespace, scene: Scene, views: list[View], held_out: list[View], options: dict[str, Any]
+) -> tuple[Scene, list[LeftOut], dict[str, Any]]:
+    """(scene whose layers meet --target-size, what that leaves out, the "target" of the report)."""
+    use_threads(args)
+    from dataclasses import asdict
+
+    from pd4dgs_codec.codec.plan import plan
+    from pd4dgs_codec.codec.symbols import rounded
+    from pd4dgs_codec.codec.target import fit
+    from pd4dgs_codec.report.frames import dataset_frames, own_frames
+    from pd4dgs_codec.report.rendered import RenderedLoss, psnr_of, true_psnr
+
+    raw = args.deformation == "float32"
+    scene, left_out = plan(scene, options["layers"], raw, args.omit)
+    frames = dataset_frames(views) if views else own_frames(scene.info, OWN_PICTURES, OWN_ORBIT, args.downscale)
+    with progress_bar(None, "pictures", "fitting sizes") as step:
+        loss = RenderedLoss(scene, frames, step)
+        fitted, dropped, fits = fit(scene, args.target_size, loss.mean_mse, loss.harm, **options)
+        packed = rounded(plan(fitted, options["layers"], raw, "nothing")[0], raw)
+        errors = loss.mse(packed)
+        before, after = (true_psnr(s, held_out, step) if views else {} for s in (scene, packed))
+    levels = []
+    for level, mse in errors.items():
+        lost = {"lost_db": before[level] - after[level]} if views else {}
+        levels.append({"level": level, "error_psnr": psnr_of(mse), **lost})
+    report = {
+        "cameras": f"training views of {args.data}" if views else "the file's own camera",
+        "pictures": len(frames),
+        "layers": [{**asdict(row), "steps": {k: getattr(fitted.steps, k) for k in row.factors}} for row in fits],
+        "levels": levels,
+    }
+    return fitted, left_out + dropped, report
+
+
 class _Stdin(io.BytesIO):
     """Bytes that call themselves stdin in a message."""
 
@@ -134,18 +277,25 @@ class _Stdin(io.BytesIO):
         return "stdin"
 
 
-def _train_rate(scene: Scene, layers: str | int, step_scale: float) -> dict[str, Any]:
+def _train_rate(scene: Scene, layers: str | int) -> dict[str, Any]:
     """The trainer's own sum of R over the float values, at the steps and for the layers of this file."""
-    from dataclasses import replace
-
     from pd4dgs_codec.report.rate import train_rate_bits
 
-    rows = train_rate_bits(replace(scene, steps=scene.steps.scaled(step_scale)), layers)
+    rows = train_rate_bits(scene, layers)
     per_layer = [
         {**row, "layer": int(row["layer"]), "bits": sum(bits for name, bits in row.items() if name != "layer")}
         for row in rows
     ]
     return {"train_rate_bits": sum(row["bits"] for row in per_layer), "train_rate_bits_layers": per_layer}
+
+
+def _added_bytes(data: bytes) -> dict[int, int]:
+    """By layer what it adds to the file, the header counted with layer 0."""
+    from pd4dgs_codec.codec.info import info
+
+    rows = info(data)["layers"]
+    ends = [0, *(row["end"] for row in rows)]
+    return {row["layer"]: row["end"] - before for row, before in zip(rows, ends, strict=False)}
 
 
 def _first_frame_seconds(data: bytes) -> float:
@@ -173,8 +323,25 @@ def _text(result: dict[str, Any], first_frame: float) -> str:
     for item in result["left_out"]:
         exactly = ", changes no picture" if item["lossless"] else ""
         lines.append(f"left out: {item['what']} ({item['bytes']:,} bytes{exactly}): {item['why']}")
+    if "target" in result:
+        lines += _target_lines(result["target"])
     verified = "verified" if result["verified"] else "not verified"
     name = "stdout" if result["output"] == STDIO else result["output"]
     lines.append(f"{name}: {result['bytes']:,} bytes, {verified}, {result['seconds']:.2f} s")
     lines.append(f"first frame after {first_frame:.2f} s at {FIRST_FRAME_RATE / 1e6:g} Mbps")
     return "\n".join(lines)
+
+
+def _target_lines(target: dict[str, Any]) -> list[str]:
+    lines = []
+    for row in target["layers"]:
+        coarser = [f"{name} x{factor:.2f}" for name, factor in row["factors"].items() if factor != 1]
+        where = "left out" if row["to_layer"] is None else f"moved to layer {row['to_layer']}"
+        moved = [f"{row['moved']:,} anchors {where}"] if row["moved"] else []
+        how = "; ".join([", ".join(coarser), *moved] if coarser else moved) or "as it was"
+        lines.append(f"layer {row['layer']}: {row['bytes']:,} bytes, at most {row['target']:,} wanted: {how}")
+    for row in target["levels"]:
+        error = "none" if row["error_psnr"] == math.inf else f"{row['error_psnr']:.2f} dB PSNR"
+        truth = f", {row['lost_db']:+.3f} dB lost on held-out views" if "lost_db" in row else ""
+        lines.append(f"level {row['level']}: error against the unquantised scene {error}{truth}")
+    return lines + [f"fitted on {target['pictures']} pictures: {target['cameras']}"]

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from pd4dgs_codec.codec.bounds import ErrorBound, rounding_bounds, verify_errors
 from pd4dgs_codec.codec.check import check_scene
 from pd4dgs_codec.codec.decoder import decode_layers
 from pd4dgs_codec.codec.header import DEFORMATIONS, MODES, Header, pack_header, scene_id_of
-from pd4dgs_codec.codec.kinds import LAYER_KINDS
+from pd4dgs_codec.codec.kinds import LAYER_KINDS, LayerKind
 from pd4dgs_codec.codec.layers import Coding, StreamReport, read_meta, write_layer
 from pd4dgs_codec.codec.omissions import LeftOut
 from pd4dgs_codec.codec.plan import OMIT, plan
@@ -26,7 +27,7 @@ from pd4dgs_codec.codec.symbols import (
     quantise_deformation,
 )
 from pd4dgs_codec.errors import DecodeError, EncodeError
-from pd4dgs_codec.scene import Scene
+from pd4dgs_codec.scene import Deformation, Scene, Steps
 
 LAYER_CHOICES = ("auto", 0, 1, 2)
 
@@ -81,6 +82,7 @@ def encode_with_report(
     effort: int = 5,
     omit: str = "bounded",
     verify: bool = True,
+    left_out: Sequence[LeftOut] = (),
 ) -> tuple[bytes, Report]:
     """(file, report) of a scene.
 
@@ -88,14 +90,14 @@ def encode_with_report(
     "gauss". step_scale multiplies every quantisation step. layers: "auto" leaves out deformations that do nothing,
     0, 1 or 2 keeps the layers up to that number. effort: 1..9. omit: "bounded", "lossless" or "nothing", see plan.
     verify: decode the result, compare every symbol and every float, and hold every float against the error bound in the
-    header. Raises EncodeError.
+    header. left_out: what the caller has taken out of the scene, to be reported with the rest. Raises EncodeError.
     """
     started = time.perf_counter()
     _check_options(mode, deformation, priors, step_scale, layers, effort, omit)
     scene = replace(scene, steps=scene.steps.scaled(step_scale))
     check_scene(scene)
     coding = Coding(mode, priors, effort)
-    planned, left_out = plan(scene, layers, deformation == "float32", omit)
+    planned, omitted = plan(scene, layers, deformation == "float32", omit)
     symbols = [layer_symbols(planned, i, deformation == "float32") for i in range(len(planned.layers))]
     written = [write_layer(layer, coding) for layer in symbols]
     _check_limits(planned, symbols, [payload for payload, _ in written])
@@ -103,7 +105,7 @@ def encode_with_report(
     data = _container(meant, mode, deformation, [payload for payload, _ in written])
     errors = _verify(data, planned, symbols, meant) if verify else []
     reports = [_layer_report(layer, payload, r) for layer, (payload, r) in zip(symbols, written, strict=True)]
-    rows = [_left_out_row(item, scene, coding, deformation, reports) for item in left_out]
+    rows = [_left_out_row(item, scene, coding, deformation, reports) for item in (*left_out, *omitted)]
     seconds = round(time.perf_counter() - started, 4)
     return data, Report(mode, len(data), verify, seconds, reports, rows, errors)
 
@@ -206,19 +208,22 @@ def _left_out_row(item: LeftOut, scene: Scene, coding: Coding, deformation: str,
         return row | {"bytes": round(item.anchors * spent / 8 / kept) if kept else 0}
     if item.tensors is None or item.kind is None:
         return row | {"bytes": round(item.bits / 8)}
-    raw = deformation == "float32"
-    tensors = item.tensors if raw else quantise_deformation(item.tensors, item.kind, scene.steps)
+    return row | {"bytes": deformation_bytes(item.tensors, item.kind, scene.steps, coding, deformation == "float32")}
+
+
+def deformation_bytes(deformation: Deformation, kind: LayerKind, steps: Steps, coding: Coding, raw: bool) -> int:
+    """What planes and networks alone would take as the layer of `kind`."""
+    tensors = deformation if raw else quantise_deformation(deformation, kind, steps)
     empty = np.zeros(0, np.int32)
-    steps = {name: getattr(scene.steps, name) for name in (item.kind.planes_step, item.kind.weights_step) if name}
     alone = LayerSymbols(
-        kind=item.kind,
+        kind=kind,
         anchor_q=np.zeros((0, 3), np.int32),
         mask_increase=empty,
         mask_own=empty,
         attributes=np.zeros((0, 0), np.int32),
         planes=tensors.planes,
         networks=tensors.networks,
-        steps=steps,
+        steps={name: getattr(steps, name) for name in (kind.planes_step, kind.weights_step) if name},
         raw=raw,
     )
-    return row | {"bytes": len(write_layer(alone, coding)[0])}
+    return len(write_layer(alone, coding)[0])

@@ -75,7 +75,7 @@ def _cut(scene: Scene, highest: int) -> tuple[Scene, list[LeftOut]]:
         if layer > highest:
             tensors = getattr(scene, kind.deformation or "")
             left_out.append(LeftOut(f"layer {layer}", f"layers up to {highest} were asked for", kind, tensors))
-    codes = _full_masks(scene)
+    codes = full_masks(scene)
     kept = sum(layer <= highest for layer in scene.layers)
     n = scene.rows[-1]
     cut = replace(scene.prefix(highest), anchor_q=scene.anchor_q, feature=scene.feature)
@@ -154,7 +154,7 @@ def _largest_residuals(
 ) -> dict[str, float]:
     """Per head the largest |residual| (NaN counts as infinite) over times and evenly chosen anchors or Gaussians."""
     per_time = max(1, samples // n_times)
-    rows = np.flatnonzero(_full_masks(scene)[-1] > 0)
+    rows = np.flatnonzero(full_masks(scene)[-1] > 0)
     rows = rows[:: max(1, -(-rows.size // per_time))]
     largest = {name: 0.0 for name in deformation.networks if name != TRUNK}
     for t in np.linspace(0.0, 1.0, n_times):
@@ -181,14 +181,14 @@ def _deformed_means(scene: Scene, rows: np.ndarray, t: float, most: int) -> np.n
     return np.nan_to_num(means.reshape(-1, 3), posinf=0.0, neginf=0.0)
 
 
-def _full_masks(scene: Scene) -> list[np.ndarray]:
+def full_masks(scene: Scene) -> list[np.ndarray]:
     """uint8 [N] codes per layer present: an anchor that a layer's prefix does not hold is inactive there."""
     return [np.concatenate([codes, np.zeros(scene.rows[-1] - codes.size, np.uint8)]) for codes in scene.mask]
 
 
 def _arrange(scene: Scene, kept: tuple[int, ...]) -> tuple[Scene, int]:
     """(scene with rows sorted by (layer, Morton) and the layers `kept`, number of anchors dropped)."""
-    codes = _full_masks(scene)
+    codes = full_masks(scene)
     by_layer = dict(zip(scene.layers, codes, strict=True))
     masks = np.stack([*(by_layer[layer] for layer in kept[:-1]), codes[-1]])
     first = np.where(masks[-1] > 0, (masks > 0).argmax(axis=0), len(kept))

@@ -186,6 +186,12 @@ def _with_steps(
         yield from ((k, steps[0 if i < planes else -1]) for i, k in enumerate(layer.tensors()))
 
 
+def rounded(scene: Scene, raw_deformation: bool = False) -> Scene:
+    """The scene that the file of a planned scene decodes to. Raises EncodeError for a value that has no symbol."""
+    layers = [layer_symbols(scene, i, raw_deformation) for i in range(len(scene.layers))]
+    return assemble(scene.info, {a.name: getattr(scene.steps, a.name) for a in ATTRIBUTES}, layers)
+
+
 def _dequantised_networks(layer: LayerSymbols, steps: Steps) -> Deformation:
     stored = Deformation(layer.planes, layer.networks)
     if layer.raw or not layer.networks:

@@ -62,9 +62,12 @@ def run_job(job: Job, folder: Path, *, say: Callable[[str], None], progress: Any
     model, training = ensure_trained(
         config, dataset, path, say=lambda text: say(f"{job.name}: {text}"), progress=progress
     )
-    scene = to_scene(model)
-    say(f"{job.name}: packing {len(scene.anchor_q)} anchors in {len(VARIANTS)} ways")
-    files = {name: encode_with_report(scene, **options) for name, options in VARIANTS.items()}  # type: ignore[arg-type]
+    say(f"{job.name}: packing {len(model.anchor_q)} anchors in {len(VARIANTS)} ways")
+    planned, left_out = plan(to_scene(model))
+    files = {
+        name: encode_with_report(planned, omit="nothing", left_out=left_out, **options)  # type: ignore[arg-type]
+        for name, options in VARIANTS.items()
+    }
     data, report = files["ans"]
     write_bytes(str(folder / "scene.pd4"), data, overwrite=True)
     say(f"{job.name}: {len(data)} bytes; rendering the held-out views at each level")
@@ -87,7 +90,7 @@ def run_job(job: Job, folder: Path, *, say: Callable[[str], None], progress: Any
         "rho": training["rho"],
         "curve": json.loads(training["curve"]),
         "evaluation": packed,
-        "coding": coding_rows({name: rep for name, (_, rep) in files.items()}, scene),
+        "coding": coding_rows({name: rep for name, (_, rep) in files.items()}, planned),
         "left_out": report.left_out,
     }
     say(f"{job.name}: drawing")
@@ -100,16 +103,16 @@ def run_job(job: Job, folder: Path, *, say: Callable[[str], None], progress: Any
     return result
 
 
-def coding_rows(reports: dict[str, Report], scene: Scene) -> list[dict[str, Any]]:
-    """One row per layer: its bytes under every variant, payload against rate, positions against Draco's.
+def coding_rows(reports: dict[str, Report], planned: Scene) -> list[dict[str, Any]]:
+    """One row per layer of `planned`, see `plan`: its bytes under every variant, payload against rate, positions against Draco's.
 
     payload_over_rate: `--priors gauss` payload bits over the sum of R(a) on the layer's own symbols.
     train_over_rate: the trainer's sum of R(a) on the float checkpoint over the same. ans_over_lzma: all coded symbols
     (masks included, positions aside) in mode ans over the same symbols in mode lzma. None where there is nothing to
     compare, as where an encoding drops the layer.
     """
-    trained = {int(row["layer"]): sum(row.values()) - row["layer"] for row in train_rate_bits(scene)}
-    cells = plan(scene)[0].anchor_q
+    trained = {int(row["layer"]): sum(row.values()) - row["layer"] for row in train_rate_bits(planned, omit="nothing")}
+    cells = planned.anchor_q
     variants = {name: {layer.layer: layer for layer in report.layers} for name, report in reports.items()}
     rows, start = [], 0
     for best in reports["ans"].layers:

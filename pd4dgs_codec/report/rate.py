@@ -14,13 +14,13 @@ from pd4dgs_codec.model.rate import channel_moments, rate_bits
 from pd4dgs_codec.scene import Scene
 
 
-def train_rate_bits(scene: Scene, layers: str | int = "auto") -> list[dict[str, float]]:
+def train_rate_bits(scene: Scene, layers: str | int = "auto", omit: str = "bounded") -> list[dict[str, float]]:
     """Per layer of the file that `scene` becomes: bits of R(a) as the trainer computes them, in float64.
 
     attributes: R of the unrounded values over the layer's anchors, priors their moments. planes, weights: R of the
     rounded residuals and weights, which is what the last third of training sees.
     """
-    planned, _ = plan(scene, layers)
+    planned, _ = plan(scene, layers, omit=omit)
     rows = (0, *planned.rows)
     result = []
     for i, layer in enumerate(planned.layers):

@@ -73,5 +73,6 @@ def test_a_level_that_goes_stays_away(dataset, tmp_path, monkeypatch):  # noqa: 
 
 def test_with_judging_off_all_views_are_learnt_and_all_levels_stay(dataset, monkeypatch):  # noqa: F811
     monkeypatch.setattr(judge, "MIN_ITERATIONS", 10)
-    trainer = Trainer(TrainConfig(preset="tiny", iterations=30, judge=False), replace(dataset, train=dataset.train * 12))
+    views = replace(dataset, train=dataset.train * 12)
+    trainer = Trainer(TrainConfig(preset="tiny", iterations=30, judge=False), views)
     assert not trainer._waiting_views()

@@ -1,0 +1,142 @@
+"""encode by pictures: layers made to fit, layers that do not pay, and how much each anchor shows."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+pytest.importorskip("torch")
+
+#: Fitting the priors of mode ans takes ten times as long.
+FAST = ("--mode", "lzma", "--effort", 1, "--json", "-f")
+
+
+@pytest.fixture(autouse=True)
+def _few_values(monkeypatch):
+    """Each value costs an encode and its pictures: a few do here."""
+    from pd4dgs_codec.cli import encode
+    from pd4dgs_codec.codec import target
+
+    monkeypatch.setattr(target, "OCTAVES", (0.0, 1.5, 3.0))
+    monkeypatch.setattr(target, "SHARES", (0.0, 0.1, 0.5))
+    monkeypatch.setattr(encode, "OWN_PICTURES", 2)
+
+
+def first_layer(cli, path) -> int:
+    return cli("info", path, "--json").json["layers"][0]["end"]
+
+
+def test_a_target_is_met_with_less_loss_than_one_factor_on_all_steps_makes(cli, model_pt, tmp_path):
+    output = tmp_path / "s.pd4"
+    cli("encode", model_pt, "-o", output, *FAST)
+    whole = first_layer(cli, output)
+    most = int(0.75 * whole)
+    result = cli("encode", model_pt, "-o", output, "--target-size", f"L0={most}", *FAST)
+    assert result.code == 0 and 0.97 * most <= first_layer(cli, output) <= most
+    target = result.json["target"]
+    (row,) = target["layers"]
+    assert row["bytes"] == first_layer(cli, output) and row["target"] == most
+    assert target["cameras"] == "the file's own camera" and [level["level"] for level in target["levels"]] == [0, 1, 2]
+    error = np.mean([10 ** (-0.1 * level["error_psnr"]) for level in target["levels"]])
+    scaled = next(x for x in np.geomspace(1, 40, 16) if scaled_size(model_pt, x) <= most)
+    assert 0 < error < scaled_error(model_pt, scaled)
+
+
+def unquantised(model_pt):
+    from pd4dgs_codec.codec.plan import plan
+    from pd4dgs_codec.model import checkpoint
+    from pd4dgs_codec.model.convert import to_scene
+
+    return plan(to_scene(checkpoint.load(model_pt)[0]))[0]
+
+
+def scaled_size(model_pt, scale: float) -> int:
+    from pd4dgs_codec.codec.encoder import encode
+    from pd4dgs_codec.codec.info import info
+
+    data = encode(unquantised(model_pt), step_scale=scale, mode="lzma", effort=1, verify=False)
+    return info(data)["layers"][0]["end"]
+
+
+def scaled_error(model_pt, scale: float) -> float:
+    from pd4dgs_codec.codec.plan import plan
+    from pd4dgs_codec.codec.symbols import rounded
+    from pd4dgs_codec.report.frames import own_frames
+    from pd4dgs_codec.report.rendered import RenderedLoss
+
+    scene = unquantised(model_pt)
+    coarse = replace(scene, steps=scene.steps.scaled(scale))
+    return RenderedLoss(scene, own_frames(scene.info, 2, 20.0)).mean_mse(rounded(plan(coarse)[0]))
+
+
+def test_a_target_out_of_reach_writes_nothing(cli, model_pt, tmp_path):
+    output = tmp_path / "s.pd4"
+    result = cli("encode", model_pt, "-o", output, "--mode", "lzma", "--target-size", "L2=10")
+    assert result.code == 1 and not output.exists()
+    (line,) = [line for line in result.error_lines if "error" in line]
+    assert "layer 2 takes at least" in line and "expected at most 10" in line
+
+
+@pytest.mark.parametrize("text", ["425k", "L3=1k", "L0=1k,L0=2k", "L0=", "L0=-5", "L0=0.5", "L0=1k,"])
+def test_sizes_that_are_none_are_wrong_usage(cli, model_pt, tmp_path, text):
+    result = cli("encode", model_pt, "-o", tmp_path / "s.pd4", f"--target-size={text}")
+    assert result.code == 2 and "expected sizes in bytes such as L0=425k" in result.err
+
+
+def test_layers_that_do_not_pay_are_left_out_with_their_figures(cli, model_pt, shared_dataset, tmp_path):
+    judged = ("encode", model_pt, "-o", tmp_path / "s.pd4", "--data", shared_dataset, "--holdout", 3, *FAST)
+    dear = cli(*judged, "--min-gain", 1e5).json
+    assert [row["layer"] for row in dear["layers"]] == [0]
+    assert dear["layers"][0]["anchors"] == 60, "the anchors of layers left out stay"
+    gone = {row["what"]: row for row in dear["left_out"]}
+    for layer, what in ((1, "global_deformation"), (2, "local_deformation")):
+        assert (
+            f"level {layer} gains" in gone[what]["why"] and "dB per MB, expected at least 100,000" in gone[what]["why"]
+        )
+        assert f"for {gone[what]['bytes']:,} bytes on 2 views" in gone[what]["why"]
+    kept = cli(*judged, "--min-gain", 0).json
+    assert [row["layer"] for row in kept["layers"]] == [0, 1, 2]
+
+
+def test_a_layer_that_explains_the_pictures_is_kept(scene):
+    from pd4dgs_codec.codec.layers import Coding
+    from pd4dgs_codec.codec.plan import plan
+    from pd4dgs_codec.codec.symbols import rounded
+    from pd4dgs_codec.data.dataset import View
+    from pd4dgs_codec.metrics.image import to_uint8
+    from pd4dgs_codec.model.convert import from_scene
+    from pd4dgs_codec.render.picture import render_image
+    from pd4dgs_codec.report.worth import leave_out_unpaid
+
+    camera, model = scene.info.camera, from_scene(rounded(plan(scene)[0]))
+    views = []
+    for time in (0.2, 0.9):
+        picture = render_image(model, 1, time, camera.viewmat, camera.K, camera.width, camera.height)
+        views.append(View(camera.viewmat, camera.K, camera.width, camera.height, time, to_uint8(picture), None, "", 0))
+    kept, (gone,) = leave_out_unpaid(scene, views, min_gain=0.5, coding=Coding("lzma", effort=1))
+    assert gone.what == "local_deformation" and kept.global_deformation is not None
+
+
+def test_harm_is_about_the_error_that_leaving_an_anchor_out_makes(scene, monkeypatch):
+    from pd4dgs_codec.codec.plan import full_masks, plan
+    from pd4dgs_codec.report import rendered
+    from pd4dgs_codec.report.frames import own_frames
+    from pd4dgs_codec.report.rendered import RenderedLoss
+
+    monkeypatch.setattr(rendered, "PROBES", 64)  # the anchors differ less here than in a trained scene
+    planned = plan(scene)[0]
+    loss = RenderedLoss(planned, own_frames(planned.info, 2, 20.0))
+    harm = loss.harm(planned, 0)
+    anchors = range(planned.rows[0])
+    measured = []
+    for anchor in anchors:
+        masks = full_masks(planned)
+        masks[0][anchor] = 0
+        measured.append(loss.mse(replace(planned, mask=tuple(masks), rows=(len(harm),) * 3))[0])
+    scalars = 3 * len(loss.frames) * planned.info.camera.width * planned.info.camera.height
+    harm, measured = harm[: len(anchors)], scalars * np.array(measured)
+    assert np.isfinite(harm).all() and 0.5 < np.median(harm / measured) < 2
+    ranks = np.corrcoef(harm.argsort().argsort(), measured.argsort().argsort())[0, 1]
+    assert ranks > 0.7
