@@ -104,7 +104,8 @@ def run_job(job: Job, folder: Path, *, say: Callable[[str], None], progress: Any
 
 
 def coding_rows(reports: dict[str, Report], planned: Scene) -> list[dict[str, Any]]:
-    """One row per layer of `planned`, see `plan`: its bytes under every variant, payload against rate, positions against Draco's.
+    """One row per layer of `planned` (see `plan`): its bytes under every variant, payload against rate, positions
+    against Draco's.
 
     payload_over_rate: `--priors gauss` payload bits over the sum of R(a) on the layer's own symbols.
     train_over_rate: the trainer's sum of R(a) on the float checkpoint over the same. ans_over_lzma: all coded symbols
