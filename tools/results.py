@@ -23,6 +23,8 @@ SHARED = Path(os.environ.get("PD4DGS_SHARED", Path(__file__).resolve().parents[2
 SCENES = (
     ("shelf-hand", SHARED / "shelf-hand", 2, "small", 5_000, 600.0),
     ("bouncing-balls", SHARED / "bouncing-balls", 4, "small", 7_000, 600.0),
+    ("synthetic-static", "synthetic:static", 1, "small", 1_500, 600.0),
+    ("synthetic-global", "synthetic:global", 1, "small", 1_500, 600.0),
     ("synthetic-local", "synthetic:local", 1, "small", 1_500, 600.0),
     ("synthetic-fast", "synthetic:fast", 1, "small", 1_500, 600.0),
     ("shelf-hand-paper", SHARED / "shelf-hand", 2, "paper", 4_600, 1_500.0),
