@@ -25,11 +25,11 @@ from pd4dgs_codec.render.threads import configure
 
 SHARED = Path(os.environ.get("PD4DGS_SHARED", Path(__file__).resolve().parents[2] / "shared" / "data"))
 #: name: source, downscale, preset, iterations, seeds at most. Equal iterations for all variants of a scene.
-SYNTHETIC = ("tiny", 800, 3)
+SYNTHETIC = ("tiny", 400, 3)
 SCENES: dict[str, tuple[str, int, str, int, int]] = {
     **{name: (f"synthetic:{name}", 1, *SYNTHETIC) for name in ("static", "global", "local", "fast")},
-    "shelf-hand": (str(SHARED / "shelf-hand"), 2, "small", 2_000, 1),
-    "bouncing-balls": (str(SHARED / "bouncing-balls"), 4, "small", 3_000, 1),
+    "shelf-hand": (str(SHARED / "shelf-hand"), 2, "small", 1_000, 1),
+    "bouncing-balls": (str(SHARED / "bouncing-balls"), 4, "small", 1_500, 1),
 }
 #: Preset and iterations of a scene given by its source.
 OTHERS = ("small", 2_000, 1)
