@@ -18,6 +18,7 @@ import numpy as np
 
 from pd4dgs_codec.entropy.morton import morton_codes, morton_order
 from pd4dgs_codec.entropy.positions import decode_positions, encode_positions
+from pd4dgs_codec.report.draco import draco_encode
 
 SURFACES = ("sphere", "torus", "plane", "cylinder", "gyroid")
 _SHELF = Path("shelf-hand") / "points_triangulated.ply"
@@ -101,16 +102,7 @@ def draco_bytes(cells: np.ndarray) -> int:
     """Size of Draco's kd-tree encoding at level 10, checked to be lossless."""
     import DracoPy
 
-    offsets = cells - cells.min(axis=0)
-    bits = max(int(offsets.max()).bit_length(), 1)
-    blob = DracoPy.encode(
-        offsets.astype(np.float32),
-        quantization_bits=bits,
-        quantization_range=float(2**bits - 1),
-        quantization_origin=[0.0, 0.0, 0.0],
-        compression_level=10,
-        preserve_order=False,
-    )
+    blob, offsets = draco_encode(cells), cells - cells.min(axis=0)
     back = np.round(np.asarray(DracoPy.decode(blob).points)).astype(np.int64)
     if not np.array_equal(np.unique(back, axis=0), np.unique(offsets, axis=0)):
         raise SystemExit("Draco did not keep the integers")

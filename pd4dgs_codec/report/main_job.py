@@ -15,9 +15,9 @@ from pd4dgs_codec.cli.files import whole_file, whole_files, write_bytes
 from pd4dgs_codec.codec.encoder import LayerReport, Report, encode_with_report
 from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.data.dataset import load
-from pd4dgs_codec.entropy.morton import morton_order
 from pd4dgs_codec.jsonable import finite
 from pd4dgs_codec.model.convert import to_scene
+from pd4dgs_codec.report.draco import draco_encode
 from pd4dgs_codec.report.evaluate import evaluate_file
 from pd4dgs_codec.report.pictures import draw_levels
 from pd4dgs_codec.report.rate import train_rate_bits
@@ -160,16 +160,7 @@ def draco_position_bits(cells: np.ndarray) -> int | None:
     if len(cells) == 0:
         return 0
     try:
-        import DracoPy
+        data = draco_encode(cells)
     except ImportError:
         return None
-    cells = cells[morton_order(cells)] - cells.min(0)
-    bits = max(1, int(cells.max()).bit_length())
-    data = DracoPy.encode(
-        cells.astype(np.float32),
-        quantization_bits=bits,
-        compression_level=10,
-        quantization_range=float((1 << bits) - 1),
-        quantization_origin=[0.0, 0.0, 0.0],
-    )
     return 8 * len(data)

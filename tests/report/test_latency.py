@@ -191,8 +191,3 @@ def test_bad_usage_is_one_line(tmp_path, capsys, data, options, code, message):
     (tmp_path / "a.pd4").write_bytes(data)
     found, out, err = run(capsys, tmp_path / "a.pd4", *options)
     assert found == code and message in err and err.count("\n") == 1 and not out
-
-
-def test_published_sizes_are_those_of_the_paper():
-    assert table.PUBLISHED["SC-GS"] * 8 / 2 == pytest.approx(929.6)
-    assert table.PUBLISHED["PD-4DGS, layer 0"] * 8 / 2 == pytest.approx(1.744)

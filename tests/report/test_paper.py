@@ -13,7 +13,7 @@ pytest.importorskip("numba")
 from pd4dgs_codec.data.dataset import Dataset, load  # noqa: E402
 from pd4dgs_codec.model import checkpoint  # noqa: E402
 from pd4dgs_codec.model.config import PRESETS, DeformationConfig, ModelConfig  # noqa: E402
-from pd4dgs_codec.report.paper import statistics, tables  # noqa: E402
+from pd4dgs_codec.report.paper import plots, published, statistics, tables  # noqa: E402
 from pd4dgs_codec.report.paper.runs import EVERY_LEVEL, FULL, MONOLITHIC, SCAFFOLD, Run, Scene, at_rate, measure  # noqa: E402
 from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS  # noqa: E402
 from pd4dgs_codec.train.config import TrainConfig  # noqa: E402
@@ -104,6 +104,12 @@ def test_every_table_names_what_it_compares_and_draws_it(name, tmp_path):
         assert all(v.name in text for v in table.variants if v not in (FULL, EVERY_LEVEL))
     table.plot(rows, tmp_path / "plot.png")
     assert (tmp_path / "plot.png").stat().st_size > 5_000
+
+
+def test_published_seconds_are_those_of_the_published_sizes():
+    for row in published.FIRST_FRAME:
+        for seconds, rate in zip(row.seconds, plots.LINKS, strict=True):
+            assert seconds == pytest.approx(8e6 * row.megabytes / rate, rel=0.01), row
 
 
 @pytest.fixture(scope="module")

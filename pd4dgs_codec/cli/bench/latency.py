@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import json
 import re
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING
 
+from pd4dgs_codec.cli.bench.output import prepare, publish
 from pd4dgs_codec.cli.common import (
     FAILED,
     OK,
@@ -22,9 +22,9 @@ from pd4dgs_codec.cli.common import (
     rates,
     use_threads,
 )
-from pd4dgs_codec.cli.files import STDIO, check_output, whole_file, write_bytes
+from pd4dgs_codec.cli.files import whole_file
 from pd4dgs_codec.cli.progress import progress_bar
-from pd4dgs_codec.jsonable import finite
+from pd4dgs_codec.report.paper.published import FIRST_FRAME
 
 if TYPE_CHECKING:
     from pd4dgs_codec.report.latency.faults import Cuts, File, Row
@@ -89,8 +89,8 @@ def _size(text: str) -> tuple[int, int]:
 
 def execute(args: argparse.Namespace, console: Console) -> int:
     """Runs the sections; FAILED if the client showed something wrong under faults."""
-    to_file = _check_usage(args)
-    console.json = args.json == STDIO
+    _check_usage(args)
+    prepare(args, console)
     use_threads(args)
     from pd4dgs_codec.render.warm import warm_up
     from pd4dgs_codec.report.latency import faults, measure, plot, table
@@ -115,14 +115,12 @@ def execute(args: argparse.Namespace, console: Console) -> int:
         "runs": args.runs,
         "rates": args.rates,
         "files": [asdict(r) | {"times": [asdict(t) | {"within": t.within} for t in r.times]} for r in reports],
-        "published_megabytes": table.PUBLISHED,
+        "published_megabytes": {row.method: row.megabytes for row in FIRST_FRAME},
         "faults": [asdict(row) for row in rows],
         "random_cuts": cuts and asdict(cuts),
         "crowd": crowd and asdict(crowd),
     }
-    if to_file:
-        write_bytes(args.json, (json.dumps(finite(result), indent=1) + "\n").encode(), args.overwrite)
-    console.result(result, table.text(reports, args.runs, rows, cuts, crowd), on_stdout=True)
+    publish(args, console, result, table.text(reports, args.runs, rows, cuts, crowd))
     wrong = [row.name for row in rows if not row.kept]
     wrong += ["random cuts"] if cuts and cuts.wrong else []
     wrong += [f"{crowd.clients} clients at once"] if crowd and crowd.errors else []
@@ -131,16 +129,11 @@ def execute(args: argparse.Namespace, console: Console) -> int:
     return FAILED if wrong else OK
 
 
-def _check_usage(args: argparse.Namespace) -> bool:
-    """Whether --json names a file."""
+def _check_usage(args: argparse.Namespace) -> None:
     if args.data and len(args.data) != len(args.inputs):
         raise UsageError(f"found {len(args.data)} --data for {len(args.inputs)} files, expected one each or none")
     if args.plot and (Path(args.plot).suffix.lower() != ".png" or args.only == "faults"):
         raise UsageError(f"found --plot {args.plot}, expected a name that ends in .png, and no --only faults")
-    to_file = args.json not in (None, STDIO)
-    for output in [args.plot] * bool(args.plot) + [args.json] * to_file:
-        check_output(output, args.overwrite)
-    return to_file
 
 
 def _content(name: str, args: argparse.Namespace) -> bytes:

@@ -1,4 +1,4 @@
-"""What the precision reports share: which pictures to take, and JSON, a Markdown table and a plot as their outcome."""
+"""What the reports share: which pictures to take, and JSON, a Markdown table and a plot as their outcome."""
 
 from __future__ import annotations
 
@@ -36,9 +36,9 @@ def add_output(p: Parser) -> None:
 
 
 def prepare(args: argparse.Namespace, console: Console) -> None:
-    """Refuses outputs that cannot be written, before any work."""
+    """Refuses outputs that cannot be written, before any work; args.plot need not be there."""
     console.json = args.json == STDIO
-    for path in (args.plot, None if args.json == STDIO else args.json):
+    for path in (getattr(args, "plot", None), None if args.json == STDIO else args.json):
         if path is not None:
             check_output(path, args.overwrite)
 
@@ -51,12 +51,17 @@ def finish(
     panels: Sequence[Panel],
     ylabel: str,
 ) -> None:
-    """Writes the plot and the JSON file, and prints the text, or the JSON where that was asked for."""
+    """Draws the plot, if it was asked for, and publishes the rest."""
     if args.plot is not None:
         from pd4dgs_codec.report.precision.plot import draw
 
         with whole_file(args.plot, args.overwrite) as temporary:
             draw(panels, ylabel, temporary)
+    publish(args, console, result, text)
+
+
+def publish(args: argparse.Namespace, console: Console, result: dict[str, Any], text: str) -> None:
+    """Writes the JSON file, and prints the text, or the JSON where that was asked for."""
     if args.json not in (None, STDIO):
         write_bytes(args.json, (json.dumps(finite(result), indent=1) + "\n").encode(), args.overwrite)
     console.result(result, text, on_stdout=True)

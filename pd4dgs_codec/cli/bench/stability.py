@@ -3,13 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import json
 from dataclasses import asdict
 
+from pd4dgs_codec.cli.bench.output import prepare, publish
 from pd4dgs_codec.cli.common import FAILED, OK, Console, Parser, UsageError, use_threads
-from pd4dgs_codec.cli.files import STDIO, check_output, write_bytes
 from pd4dgs_codec.cli.progress import progress_bar
-from pd4dgs_codec.jsonable import finite
 
 DETAILS = """\
 A row passes if its error is within its bound, or if input that has no answer was refused in one line. References are
@@ -36,10 +34,7 @@ def parser() -> Parser:
 
 def execute(args: argparse.Namespace, console: Console) -> int:
     """Runs the chosen cases; FAILED if any row fails."""
-    to_file = args.json not in (None, STDIO)
-    console.json = args.json == STDIO
-    if to_file:
-        check_output(args.json, args.overwrite)
+    prepare(args, console)
     use_threads(args)
     from pd4dgs_codec.report.stability import rows as kinds
     from pd4dgs_codec.report.stability import table
@@ -54,7 +49,5 @@ def execute(args: argparse.Namespace, console: Console) -> int:
         if row.status == kinds.FAIL:
             console.message(f"fail: {row.group}: {row.case}: {row.got}, error {row.error}, bound {row.bound}")
     result = {"rows": [asdict(row) for row in rows], "counts": table.counts(rows)}
-    if to_file:
-        write_bytes(args.json, (json.dumps(finite(result), indent=1) + "\n").encode(), args.overwrite)
-    console.result(result, table.text(rows), on_stdout=True)
+    publish(args, console, result, table.text(rows))
     return FAILED if any(row.status == kinds.FAIL for row in rows) else OK

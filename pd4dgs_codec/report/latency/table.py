@@ -7,18 +7,8 @@ from dataclasses import dataclass
 
 from pd4dgs_codec.report.latency.faults import RATE, STALL_SECONDS, Cuts, Row
 from pd4dgs_codec.report.latency.measure import TOLERANCE, TOLERANCE_SECONDS, Crowd, Times
+from pd4dgs_codec.report.paper.published import FIRST_FRAME
 from pd4dgs_codec.report.tables import markdown
-
-#: Megabytes (1e6) before the first picture, as the PD-4DGS paper gives them: averages over seven scenes of the Dycheck
-#: iPhone captures. A monolith shows nothing before its last byte.
-PUBLISHED = {
-    "SC-GS": 232.4,
-    "Deformable 3DGS": 109.4,
-    "4DGS": 78.5,
-    "MoDec-GS": 18.37,
-    "PD-4DGS, all layers": 6.88,
-    "PD-4DGS, layer 0": 0.436,
-}
 
 
 @dataclass(frozen=True)
@@ -93,8 +83,8 @@ def _place(file: FileReport, row: Times) -> int:
 def _beside_monoliths(files: Sequence[FileReport]) -> str:
     rates = sorted({row.rate for row in files[0].times})
     rows = [
-        (f"{name}, published", f"{1e6 * megabytes:,.0f}", *(f"{8e6 * megabytes / rate:,.2f}" for rate in rates))
-        for name, megabytes in PUBLISHED.items()
+        (f"{row.method}, published", f"{1e6 * row.megabytes:,.0f}", *(f"{8e6 * row.megabytes / r:,.2f}" for r in rates))
+        for row in FIRST_FRAME
     ]
     for file in files:
         levels = {row.level: row.bytes for row in file.times}

@@ -28,6 +28,7 @@ from pd4dgs_codec.entropy.lzma_mode import decode_channels_lzma, encode_channels
 from pd4dgs_codec.entropy.positions import decode_positions, encode_positions
 from pd4dgs_codec.entropy.rate import gaussian_bits
 from pd4dgs_codec.errors import Pd4Error
+from pd4dgs_codec.report.draco import draco_encode
 from pd4dgs_codec.report.frames import Frame
 from pd4dgs_codec.report.levels import Level
 from pd4dgs_codec.report.precision.splats import Splats, bake, draw, view
@@ -305,21 +306,6 @@ def position_rows(layers: Sequence[LayerSymbols], repeats: int) -> list[Row]:
         return Row("positions", "Draco, kd-tree, level 10", sum(map(len, payloads)), encode, decode, 0.0)
 
     return [own(), _peer_row("positions", "Draco", draco)]
-
-
-def draco_encode(cells: np.ndarray) -> bytes:
-    """Draco's kd-tree coder on distinct cells int32 [N, 3], N >= 1: lossless (in its own order), best effort."""
-    import DracoPy
-
-    offsets = cells - cells.min(axis=0)
-    bits = max(1, int(offsets.max()).bit_length())
-    return DracoPy.encode(
-        offsets.astype(np.float32),
-        quantization_bits=bits,
-        compression_level=10,
-        quantization_range=float((1 << bits) - 1),
-        quantization_origin=[0.0, 0.0, 0.0],
-    )
 
 
 # -- splats ------------------------------------------------------------------------------------------------------------
