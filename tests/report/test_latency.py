@@ -17,7 +17,7 @@ from pd4dgs_codec.cli import bench  # noqa: E402
 from pd4dgs_codec.delivery.faulty import Fault, FaultyServer  # noqa: E402
 from pd4dgs_codec.errors import DataError  # noqa: E402
 from pd4dgs_codec.render.warm import warm_up  # noqa: E402
-from pd4dgs_codec.report.latency import enlarge, faults, measure, table, viewer  # noqa: E402
+from pd4dgs_codec.report.latency import enlarge, faults, measure, viewer  # noqa: E402
 from pd4dgs_codec.scene import Camera  # noqa: E402
 
 SIZE = (24, 16)
