@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS, Steps
 
@@ -34,14 +34,6 @@ class ModelConfig:
     def level(self) -> int:
         """The highest level that a model of this kind renders."""
         return 2 if self.local_deformation is not None else 1 if self.global_deformation is not None else 0
-
-    def up_to(self, max_layer: int) -> ModelConfig:
-        """The same without the deformations of the layers above max_layer."""
-        return replace(
-            self,
-            global_deformation=self.global_deformation if max_layer >= 1 else None,
-            local_deformation=self.local_deformation if max_layer >= 2 else None,
-        )
 
 
 _GLOBAL, _LOCAL = tuple(GLOBAL_HEADS), tuple(LOCAL_HEADS)

@@ -24,8 +24,9 @@ CARVE_CANDIDATES = 20
 CARVE_VIEWS = 40
 
 
-def fresh_model(config: ModelConfig, dataset: Dataset, steps: Steps, seed: int) -> Model:
-    """An untrained model: anchors on the dataset's points (topped up near them), or spread over its box."""
+def fresh_model(config: ModelConfig, dataset: Dataset, steps: Steps, seed: int, max_layer: int = 2) -> Model:
+    """An untrained model without the deformations of the layers above max_layer: anchors on the dataset's points
+    (topped up near them), or spread over its box. What it has starts the same whatever max_layer is."""
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)  # nn.Linear and HexPlane draw their start values from the global generator
     info = scene_info(dataset)
@@ -38,17 +39,22 @@ def fresh_model(config: ModelConfig, dataset: Dataset, steps: Steps, seed: int) 
         (config.local_deformation, LOCAL_HEADS, None, steps.planes_local),
     ):
         fields.append(None if field is None else DeformationField.fresh(field, info.box, widths, start_spacing, step))
-    return Model(
+    model = Model(
         info,
         steps,
         anchor_q,
         torch.zeros(n, FEATURE_DIM),
         spacing.log()[:, None].repeat(1, 6),
         torch.zeros(n, N_OFFSETS, 3),
-        fresh_mask_logits(n, config.level),
+        fresh_mask_logits(n, min(config.level, max_layer)),
         fresh_networks(config.hidden),
         *fields,
     )
+    if max_layer < 2:
+        model.local_deformation = None
+    if max_layer < 1:
+        model.global_deformation = None
+    return model
 
 
 def fresh_mask_logits(n: int, level: int) -> Tensor:

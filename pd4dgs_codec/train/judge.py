@@ -27,8 +27,8 @@ def waiting_views(count: int, iterations: int) -> set[int]:
 
 
 def levels_without_gain(psnr: list[float]) -> list[tuple[int, float]]:
-    """(level, gain in dB over the level below) from the top down, as far as the gain is under that of MIN_GAIN. psnr: per
-    level, over views that training has not seen."""
+    """(level, gain in dB over the level below) from the top down, as far as the gain is under that of MIN_GAIN.
+    psnr: per level, over views that training has not seen."""
     found = []
     for level in range(len(psnr) - 1, 0, -1):
         gain = psnr[level] - psnr[level - 1]

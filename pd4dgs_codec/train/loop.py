@@ -54,11 +54,12 @@ class Trainer:
     """A run in progress; `run` carries it to its end. interrupted: a signal ended the last `run`."""
 
     def __init__(self, config: TrainConfig, dataset: Dataset, device: str = "cpu"):
-        preset = PRESETS[config.preset].up_to(config.max_layer)
+        preset = PRESETS[config.preset]
         self.config, self.dataset, self.device = config, dataset, torch.device(device)
         if self.device.type == "cuda":  # the variances of SSIM are differences of blurred images: no ten-bit factors
             torch.backends.cudnn.allow_tf32 = False
-        self.model = fresh_model(preset, dataset, config.steps or preset.steps, config.seed).to(self.device)
+        self.model = fresh_model(preset, dataset, config.steps or preset.steps, config.seed, config.max_layer)
+        self.model.to(self.device)
         self.optimiser = Optimiser(self.model, config.rates)
         self.densifier = Densifier(self.model, config.grow_threshold, preset.max_anchors)
         self.generator = torch.Generator().manual_seed(config.seed)
