@@ -36,8 +36,9 @@ def stored_config(args: argparse.Namespace) -> TrainConfig:
         asked = getattr(args, name)
         if asked is not None:
             _expect_same(args.resume, f"--{name.replace('_', '-')}", getattr(config, name), asked)
-    for name, value in ablated(args).items():
-        _expect_same(args.resume, name, getattr(config, name), value)
+    for part in args.without:
+        if any(getattr(config, name) != value for name, value in ABLATIONS[part].items()):
+            raise TrainError(f"{args.resume}: was not trained --without {part}; expected the same to resume")
     if _same_source(args.source) != _same_source(config.source):
         _expect_same(args.resume, "SOURCE", config.source, args.source)
     return replace(config, max_seconds=args.max_seconds or config.max_seconds)

@@ -102,7 +102,7 @@ def test_resume_refuses_what_contradicts_the_checkpoint(cli, train, tmp_path, sh
         "--holdout": ("--holdout", 0),
         "--iterations": ("--iterations", 9),
         "--preset": ("--preset", "small"),
-        "noise": ("--without", "noise"),
+        "--without noise": ("--without", "noise"),
         "--max-layer": ("--max-layer", 1),
     }
     for what, options in contradictions.items():
