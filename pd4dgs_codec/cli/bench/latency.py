@@ -55,7 +55,9 @@ def parser() -> Parser:
     p.add_argument(
         "--rates", type=rates, default="2M,10M,50M", metavar="R", help="rates of the link (default: 2M,10M,50M)"
     )
-    p.add_argument("--runs", type=positive_int, default=9, metavar="N", help="of which medians are taken (default: 9)")
+    p.add_argument(
+        "--runs", type=positive_int, default=9, metavar="N", help="runs that medians are taken of (default: 9)"
+    )
     p.add_argument("--only", choices=SECTIONS, help="leave out the other section")
     p.add_argument("--size", type=_size, metavar="WxH", help="of the pictures (default: that of the file's camera)")
     p.add_argument(
@@ -64,7 +66,9 @@ def parser() -> Parser:
         metavar="N",
         help="measure a scene of N anchors in layer 0: those of FILE, and copies moved by up to 3 voxels",
     )
-    p.add_argument("--cuts", type=count, default=1000, metavar="N", help="random cuts to survive (default: 1000)")
+    p.add_argument(
+        "--cuts", type=count, default=1000, metavar="N", help="random cuts to survive, 0: none (default: 1000)"
+    )
     p.add_argument(
         "--data", action="append", default=[], metavar="SOURCE", help="dataset to take quality from, one per FILE"
     )

@@ -17,16 +17,14 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
-def add_views(p: Parser) -> None:
-    """The options that say which pictures to take."""
+def add_views(p: Parser, views: str) -> None:
+    """The options that say which pictures to take; views: how many are taken without --views, in words."""
     group = p.add_argument_group("pictures")
     what = "dataset whose held-out views give the cameras (default: the file's own camera over time)"
     group.add_argument("--data", metavar="SOURCE", help=what)
     group.add_argument("--downscale", type=positive_int, metavar="K", help="pictures 1/K as wide and high (default: 1)")
-    group.add_argument(
-        "--holdout", type=count, metavar="K", help="without split files, frames with i %% K == K/2 are held out"
-    )
-    group.add_argument("--views", type=positive_int, metavar="N", help="how many pictures")
+    group.add_argument("--holdout", type=count, metavar="K", help="as in pd4dgs-train (default: 8)")
+    group.add_argument("--views", type=positive_int, metavar="N", help=f"how many pictures (default: {views})")
 
 
 def add_output(p: Parser) -> None:
