@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.cli.files import write_bytes
 from pd4dgs_codec.errors import TrainError
-from pd4dgs_codec.train.config import ABLATIONS
+from pd4dgs_codec.train.config import ABLATIONS, BEFORE
 
 if TYPE_CHECKING:
     from pd4dgs_codec.train.config import TrainConfig
@@ -50,12 +50,12 @@ def ablated(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def parse_config(text: str, path: str) -> TrainConfig:
-    """The inverse of the JSON in a checkpoint; fields that it lacks keep their defaults."""
+    """The inverse of the JSON in a checkpoint; fields that it lacks have the values of BEFORE, else their defaults."""
     from pd4dgs_codec.scene import Steps
     from pd4dgs_codec.train.config import TrainConfig
 
     try:
-        plain = json.loads(text)
+        plain = {**BEFORE, **json.loads(text)}
         if plain.get("steps") is not None:  # None by default, so that its type is not that of a default value
             plain["steps"] = Steps(**plain["steps"])
         return _rebuilt(plain, TrainConfig())

@@ -217,6 +217,13 @@ def test_stored_steps_come_back_as_steps():
     assert parse_config(json.dumps(config, default=lambda value: value.__dict__), "m.pt") == config
 
 
+def test_a_run_from_before_a_part_of_the_method_goes_on_without_it():
+    from pd4dgs_codec.cli.resume import parse_config
+
+    config = parse_config('{"preset": "tiny"}', "m.pt")
+    assert (config.preset, config.judge, config.tmc_binary_growth, config.noise) == ("tiny", False, 1.0, True)
+
+
 KILLED = """
 import os, signal, sys
 from pd4dgs_codec.model.config import PRESETS, DeformationConfig, ModelConfig
