@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from pd4dgs_codec.cli.common import Console, Parser, count, positive_int
+from pd4dgs_codec.cli.common import Console, Parser, UsageError, count, positive_int
 from pd4dgs_codec.cli.files import STDIO, check_output, whole_file, write_bytes
 from pd4dgs_codec.jsonable import finite
 
@@ -36,7 +37,10 @@ def add_output(p: Parser) -> None:
 def prepare(args: argparse.Namespace, console: Console) -> None:
     """Refuses outputs that cannot be written, before any work; args.plot need not be there."""
     console.json = args.json == STDIO
-    for path in (getattr(args, "plot", None), None if args.json == STDIO else args.json):
+    plot = getattr(args, "plot", None)
+    if plot is not None and Path(plot).suffix.lower() != ".png":
+        raise UsageError(f"found --plot {plot}, expected a name that ends in .png")
+    for path in (plot, None if args.json == STDIO else args.json):
         if path is not None:
             check_output(path, args.overwrite)
 
