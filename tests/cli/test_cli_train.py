@@ -65,6 +65,11 @@ def test_options_reach_the_configuration(train, tmp_path):
     assert not (config["noise"] or config["tmc_binary"] or config["tmc_smooth"])
 
 
+def test_a_rate_weight_for_a_run_without_rate_is_wrong_usage(train, tmp_path):
+    result = train(tmp_path / "m.pt", "--without", "rate", "--rate-scale", 0.5)
+    assert result.code == 2 and "--without rate" in result.err and not (tmp_path / "m.pt").exists()
+
+
 def test_seed_decides_the_result(train, tmp_path):
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
         assert train(tmp_path / f"{name}.pt", "--seed", seed, iterations=2).code == 0
