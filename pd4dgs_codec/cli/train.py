@@ -44,7 +44,7 @@ ends it at once, and what was trained since the last save (one a minute) is lost
 draws them with chances of .15, .30, .55; top trains the highest level alone; all trains every level in every step, at
 about thrice the cost. Before a tenth of the run it is level 0 in any case.
 --without: rate, the bit-rate term; binary and smooth, the two mask terms; tmc, both of them; noise, the imitation of
-quantisation; judge, which leaves out levels that gain less than 0.1 dB on training views kept back until then.
+quantisation; judge, which leaves out levels that gain too little on training views kept back until then.
 
 {SOURCES}
 
