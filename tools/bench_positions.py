@@ -123,10 +123,11 @@ def octree_bits(cells: np.ndarray) -> float:
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--count", type=int, default=26000)
+    parser.add_argument("--count", type=int, default=26000, help="points per surface (default: 26000)")
+    count = parser.parse_args().count
     print(f"{'case':16} {'points':>7} {'ours':>7} {'Draco':>7} {'octree':>7} {'/Draco':>7}  encode  decode")
     ours, draco = [], []
-    for name, cells in cases(parser.parse_args().count).items():
+    for name, cells in cases(count).items():
         t0 = time.perf_counter()
         payload = encode_positions(cells)
         t1 = time.perf_counter()

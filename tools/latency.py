@@ -39,6 +39,9 @@ def main() -> None:
     parser.add_argument("--runs", type=int, default=9)
     args = parser.parse_args()
     page, docs = args.docs / "latency.md", args.docs.absolute()
+    for path in (page, *(args.trained / name for name in FILES)):
+        if not path.is_file():
+            sys.exit(f"latency: error: {path} is not there")
     text = page.read_text().split(MARKER)[0]
     source = ["--data", DATA.absolute()] * len(FILES) + ["--downscale", 2] if DATA.exists() else []
     outputs = ["--plot", docs / "img" / "latency.png", "--json", docs / "latency.json", "--overwrite"]

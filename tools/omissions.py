@@ -109,6 +109,8 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--write", type=Path, metavar="FILE", help="write the page here (default: print it)")
     args = parser.parse_args(argv)
     pairs = [scene.partition("=") for scene in args.scenes]
+    if wrong := [scene for scene, pair in zip(args.scenes, pairs, strict=True) if not all(pair)]:
+        parser.error(f"found {wrong[0]!r}, expected NAME=CHECKPOINT")
     results = [measure(name, path, args.pictures, args.effort) for name, _, path in pairs]
     text = page(results)
     if args.write:

@@ -24,19 +24,21 @@ from typing import Any
 from pd4dgs_codec.render.threads import configure
 
 SHARED = Path(os.environ.get("PD4DGS_SHARED", Path(__file__).resolve().parents[2] / "shared" / "data"))
-#: name: source, downscale, preset, iterations, seeds at most. Equal iterations for all variants of a scene.
+#: Preset, iterations and seeds at most of the synthetic scenes.
 SYNTHETIC = ("tiny", 400, 3)
+#: name: source, downscale, preset, iterations, seeds at most. Equal iterations for all variants of a scene.
 SCENES: dict[str, tuple[str, int, str, int, int]] = {
     **{name: (f"synthetic:{name}", 1, *SYNTHETIC) for name in ("static", "global", "local", "fast")},
     "shelf-hand": (str(SHARED / "shelf-hand"), 2, "small", 1_000, 1),
     "bouncing-balls": (str(SHARED / "bouncing-balls"), 4, "small", 1_500, 1),
 }
-#: Preset and iterations of a scene given by its source.
+#: The same of a scene given by its source.
 OTHERS = ("small", 2_000, 1)
 
 
 def main(argv: list[str] | None = None) -> int:
     threads = configure()
+    from pd4dgs_codec.cli.common import positive_int
     from pd4dgs_codec.cli.progress import TrainingProgress
     from pd4dgs_codec.errors import Pd4Error
     from pd4dgs_codec.report.paper.tables import TABLES
@@ -44,8 +46,8 @@ def main(argv: list[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("table", choices=(*TABLES, "all"))
     parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="instead of the table's own")
-    parser.add_argument("--seeds", type=int, metavar="N", help="seeds 0 to N-1 (default: the table's own)")
-    parser.add_argument("--iterations", type=int, metavar="N", help="of each run (default: the scene's own)")
+    parser.add_argument("--seeds", type=positive_int, metavar="N", help="seeds 0 to N-1 (default: the table's own)")
+    parser.add_argument("--iterations", type=positive_int, metavar="N", help="of each run (default: the scene's own)")
     parser.add_argument("--out", type=Path, default=Path("out/paper"))
     parser.add_argument("--docs", type=Path, default=Path("docs/paper"))
     args = parser.parse_args(argv)
@@ -75,7 +77,7 @@ def make(table: Any, args: argparse.Namespace, threads: int, progress: Any) -> N
         dataset = functools.cache(
             lambda config=one.config: load(config.source, downscale=config.downscale, holdout=config.holdout)
         )
-        for seed in range(min(args.seeds or table.seeds, one.seeds if args.seeds is None else args.seeds)):
+        for seed in range(args.seeds or min(table.seeds, one.seeds)):
             for variant in table.variants:
                 run = Run(one, variant, seed)
                 label = f"{table.name}: {one.name}, {variant.name}, seed {seed}"
@@ -95,10 +97,13 @@ def make(table: Any, args: argparse.Namespace, threads: int, progress: Any) -> N
 
 def scene(name: str, args: argparse.Namespace) -> Any:
     """A scene by its name, or by SOURCE[@K]."""
+    from pd4dgs_codec.errors import DataError
     from pd4dgs_codec.report.paper.runs import Scene
     from pd4dgs_codec.train.config import TrainConfig
 
-    source, _, downscale = name.partition("@")
+    source, at, downscale = name.partition("@")
+    if at and not (downscale.isdecimal() and int(downscale)):
+        raise DataError(f"{name}: found {downscale!r} behind @, expected an integer >= 1")
     row = SCENES.get(name, (source, int(downscale or 1), *OTHERS))
     config = TrainConfig(preset=row[2], source=row[0], downscale=row[1], iterations=args.iterations or row[3])
     return Scene(name if name in SCENES else Path(source).name.replace(":", "-"), config, row[4])

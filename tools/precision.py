@@ -3,7 +3,8 @@
     python tools/precision.py [--only NAME ...] [--out out] [--docs docs]
 
 Models are read from --out (NAME/model.pt), the cameras of real scenes from the folder in PD4DGS_SHARED (default
-../shared/data beside the repository); scenes not there are named and left out.
+../shared/data beside the repository); scenes not there are named and left out. With --only the page holds those
+scenes alone.
 """
 
 from __future__ import annotations

@@ -3,7 +3,8 @@
     python tools/results.py [--only NAME ...] [--out out] [--docs docs]
 
 Finished trainings in --out are kept, so a stopped run goes on where it was. Real scenes are read from the folder in
-PD4DGS_SHARED (default ../shared/data beside the repository); those not there are named and left out.
+PD4DGS_SHARED (default ../shared/data beside the repository); those not there are named and left out. With
+--only, docs/results.md holds those scenes alone, and the README stays.
 """
 
 from __future__ import annotations
@@ -136,9 +137,7 @@ def _paper_lines(result: dict[str, Any], markdown: Any) -> list[str]:
     ]
     total = sum(row["ans_bytes"] for row in result["coding"])
     rows.append(("all", f"{total:,}", f"{sum(PUBLISHED):,}", f"{sum(PUBLISHED) / total:.1f}"))
-    deformation = sum(
-        row["streams"].get(name, 0.0) for row in result["coding"][1:] for name in ("planes", "weights")
-    )
+    deformation = sum(row["streams"].get(name, 0.0) for row in result["coding"][1:] for name in ("planes", "weights"))
     anchors = result["evaluation"]["levels"][-1]["anchors"]
     return [
         "The scenes differ: ours is shelf-hand, the published bytes are averages over the Dycheck iPhone scenes. The",

@@ -76,7 +76,7 @@ def read_preamble(data: Buffer) -> Preamble:
     view = memoryview(data)
     start = bytes(view[: len(SIGNATURE)])
     if not SIGNATURE.startswith(start):
-        raise BadSignature(f"the file begins with {start.hex(' ')}, expected {SIGNATURE.hex(' ')}", offset=0)
+        raise BadSignature(f"not a .pd4 file: it begins with {start.hex(' ')}, expected {SIGNATURE.hex(' ')}", offset=0)
     _need(view, PREAMBLE_SIZE, "the preamble")
     _, major, minor, length = _PREAMBLE.unpack_from(view)
     if major != MAJOR:

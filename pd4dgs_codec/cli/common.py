@@ -48,7 +48,7 @@ class Parser(argparse.ArgumentParser):
     def __init__(self, verb: str, usage: str, summary: str, details: str):
         super().__init__(
             prog=f"pd4dgs-{verb}",
-            usage=f"pd4dgs-{verb} {usage} [options]",
+            usage=" ".join(part for part in (f"pd4dgs-{verb}", usage, "[options]") if part),
             description=summary,
             epilog=f"{details}\n\n{EXIT_CODES}",
             formatter_class=argparse.RawDescriptionHelpFormatter,

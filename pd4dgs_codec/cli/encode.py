@@ -118,12 +118,15 @@ def parser() -> Parser:
     )
     views.add_argument("--holdout", type=count, default=8, metavar="K", help="as in pd4dgs-train (default: 8)")
     views.add_argument(
-        "--views", type=positive_int, default=16, metavar="N", help="use about N of them, evenly spread (default: 16)"
+        "--views",
+        type=positive_int,
+        default=16,
+        metavar="N",
+        help="use about N of its views of either kind, evenly spread (default: 16)",
     )
     views.add_argument(
         "--min-gain",
         type=non_negative_float,
-        default=MIN_GAIN,
         metavar="DB",
         help="with --data, leave out layers whose level gains less than DB dB mPSNR per megabyte "
         f"(default: {MIN_GAIN:g}; 0: keep all)",
@@ -140,6 +143,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _encode(args: argparse.Namespace, console: Console) -> int:
     if args.output == STDIO and args.json:
         raise UsageError("-o - and --json both want stdout; name an output file")
+    if args.min_gain is not None and args.data is None:
+        raise UsageError("--min-gain needs --data SOURCE: a gain is measured on its views")
     check_output(args.output, args.overwrite)
     scene, trained = _load(args)
     console.detail(f"{args.input}: {len(scene.anchor_q)} anchors, layers {list(scene.layers)}, steps {scene.steps}")
@@ -158,8 +163,9 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
     }
     views, held_out = _views(args, console)
     left_out: list[LeftOut] = []
-    if held_out and layers == "auto" and args.min_gain:
-        scene, left_out = _leave_out_unpaid(args, scene, held_out)
+    min_gain = MIN_GAIN if args.min_gain is None else args.min_gain
+    if held_out and layers == "auto" and min_gain:
+        scene, left_out = _leave_out_unpaid(args, scene, held_out, min_gain)
     target = None
     if args.target_size:
         scene, more, target = _fit(args, scene, views, held_out, options)
@@ -218,7 +224,9 @@ def _views(args: argparse.Namespace, console: Console) -> tuple[list[View], list
     return train, test
 
 
-def _leave_out_unpaid(args: argparse.Namespace, scene: Scene, views: list[View]) -> tuple[Scene, list[LeftOut]]:
+def _leave_out_unpaid(
+    args: argparse.Namespace, scene: Scene, views: list[View], min_gain: float
+) -> tuple[Scene, list[LeftOut]]:
     """The scene without the layers whose level does not pay, and what went."""
     from pd4dgs_codec.codec.layers import Coding
     from pd4dgs_codec.report.worth import leave_out_unpaid
@@ -228,7 +236,7 @@ def _leave_out_unpaid(args: argparse.Namespace, scene: Scene, views: list[View])
         return leave_out_unpaid(
             scene,
             views,
-            min_gain=args.min_gain,
+            min_gain=min_gain,
             coding=coding,
             raw_deformation=args.deformation == "float32",
             step=step,

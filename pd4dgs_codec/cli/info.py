@@ -97,11 +97,15 @@ def _left_out(layers: list[dict[str, Any]]) -> list[dict[str, str]]:
         elif "networks" in row:  # known only where the file holds the whole chunk
             gone = [head for head in kind.heads if head not in row["networks"]]
             missing += (
-                [f"{kind.deformation}"]
+                [str(kind.deformation)]
                 if len(gone) == len(kind.heads)
                 else [f"{kind.deformation} head {h}" for h in gone]
             )
     return [{"what": what, "why": why} for what in missing]
+
+
+def _left_out_line(left_out: list[dict[str, str]]) -> list[str]:
+    return [f"left out: {', '.join(row['what'] for row in left_out)} ({left_out[0]['why']})"] if left_out else []
 
 
 def _bound_lines(declared: dict[str, float], nearest: dict[str, float]) -> list[str]:
@@ -130,7 +134,7 @@ def _text(result: dict[str, Any]) -> str:
                 for row in result["layers"]
             ],
         ),
-        *(f"left out: {item['what']} ({item['why']})" for item in result["left_out"]),
+        *_left_out_line(result["left_out"]),
         "errors at most: " + ", ".join(f"{what} {bound:.4g}" for what, bound in result["error_bounds"].items()),
         "first frame: " + ", ".join(f"{s:.2f} s at {rate}bps" for rate, s in result["first_frame_seconds"].items()),
     ]

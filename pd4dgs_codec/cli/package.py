@@ -101,6 +101,8 @@ def _render(scene: Scene, fps: float) -> Video:
     from pd4dgs_codec.report.movie import check_mp4, write_mp4
 
     check_mp4()
+    if scene.info.camera is None:  # said here, since no option can name another one
+        raise RenderError("the file holds no camera of its own")
     low, high = scene.info.time_range
     count = max(2, round((high - low) * fps)) if high > low else STILL_FRAMES
     if count > MAX_FRAMES:

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.cli.files import write_bytes
 from pd4dgs_codec.errors import TrainError
-from pd4dgs_codec.train.config import ABLATIONS
+from pd4dgs_codec.train.config import ABLATIONS, BEFORE
 
 if TYPE_CHECKING:
     from pd4dgs_codec.train.config import TrainConfig
@@ -36,8 +36,9 @@ def stored_config(args: argparse.Namespace) -> TrainConfig:
         asked = getattr(args, name)
         if asked is not None:
             _expect_same(args.resume, f"--{name.replace('_', '-')}", getattr(config, name), asked)
-    for name, value in ablated(args).items():
-        _expect_same(args.resume, name, getattr(config, name), value)
+    for part in args.without:
+        if any(getattr(config, name) != value for name, value in ABLATIONS[part].items()):
+            raise TrainError(f"{args.resume}: was not trained --without {part}; expected the same to resume")
     if _same_source(args.source) != _same_source(config.source):
         _expect_same(args.resume, "SOURCE", config.source, args.source)
     return replace(config, max_seconds=args.max_seconds or config.max_seconds)
@@ -49,12 +50,12 @@ def ablated(args: argparse.Namespace) -> dict[str, Any]:
 
 
 def parse_config(text: str, path: str) -> TrainConfig:
-    """The inverse of the JSON in a checkpoint; fields that it lacks keep their defaults."""
+    """The inverse of the JSON in a checkpoint; fields that it lacks have the values of BEFORE, else their defaults."""
     from pd4dgs_codec.scene import Steps
     from pd4dgs_codec.train.config import TrainConfig
 
     try:
-        plain = json.loads(text)
+        plain = {**BEFORE, **json.loads(text)}
         if plain.get("steps") is not None:  # None by default, so that its type is not that of a default value
             plain["steps"] = Steps(**plain["steps"])
         return _rebuilt(plain, TrainConfig())

@@ -40,6 +40,12 @@ Training ends after --iterations or --max-seconds, whichever comes first; the sc
 SIGTERM) ends it early, after the step in hand, with a whole checkpoint, which --resume goes on from. A second Ctrl-C
 ends it at once, and what was trained since the last save (one a minute) is lost.
 
+--rollout: adaptive draws a level, the higher ones more often the more the layers differ; uniform draws all alike; fixed
+draws them with chances of .15, .30, .55; top trains the highest level alone; all trains every level in every step, at
+about thrice the cost. Before a tenth of the run it is level 0 in any case.
+--without: rate, the bit-rate term; binary and smooth, the two mask terms; tmc, both of them; noise, the imitation of
+quantisation; judge, which leaves out levels that gain too little on training views kept back until then.
+
 {SOURCES}
 
 examples:
@@ -86,7 +92,7 @@ def parser() -> Parser:
     p.add_argument(
         "--rollout",
         choices=ROLLOUTS,
-        help="how levels are sampled (default: adaptive; top: the highest level alone)",
+        help="which level each step trains, see below (default: adaptive)",
     )
     p.add_argument(
         "--without",
@@ -94,7 +100,8 @@ def parser() -> Parser:
         choices=tuple(ABLATIONS),
         metavar="PART",
         default=[],
-        help=f"ablation: leave out a part of the method ({', '.join(ABLATIONS)}); may be given several times",
+        help=f"leave out a part of the method, to see what it is worth: {', '.join(ABLATIONS)}, see below; may be "
+        "given several times",
     )
     p.add_common()
     return p
@@ -108,6 +115,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 def _train(args: argparse.Namespace, console: Console) -> int:
     if STDIO in (args.output, args.resume, args.log):
         raise UsageError("training reads and writes named files, not - (stdin, stdout)")
+    if args.rate_scale and "rate" in args.without:
+        raise UsageError(f"found --rate-scale {args.rate_scale:g} and --without rate, expected one of them")
     if args.log and os.path.realpath(args.log) == os.path.realpath(args.output):
         raise UsageError(f"--log and -o both name {args.output}; expected two files")
     resuming_in_place = args.resume is not None and Path(args.resume).resolve() == Path(args.output).resolve()

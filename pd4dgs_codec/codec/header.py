@@ -131,7 +131,7 @@ def unpack_header(data: bytes, offset: int = 0) -> Header:
         deformation=fields.choice(DEFORMATION, DEFORMATIONS),
         attribute_steps={a.name: step for a, step in zip(ATTRIBUTES, steps, strict=True)},
         info=info,
-        error_bounds=_unpack_error_bounds(fields.get(ERROR_BOUNDS)),
+        error_bounds=_unpack_error_bounds(fields),
     )
 
 
@@ -164,8 +164,10 @@ def _unpack_chunks(rows: list) -> tuple[tuple[int, int], ...]:
     return tuple(chunks)
 
 
-def _unpack_error_bounds(data: object) -> dict[str, float]:
-    fields = Fields(data, "header error bounds", set(TENSOR_CLASSES.values()))
+def _unpack_error_bounds(header: Fields) -> dict[str, float]:
+    if ERROR_BOUNDS not in header:
+        raise Malformed(f"header: key {ERROR_BOUNDS}, error bounds, is missing, as in files of earlier drafts")
+    fields = Fields(header.get(ERROR_BOUNDS), "header error bounds", set(TENSOR_CLASSES.values()))
     bounds = {
         name: fields.real(number)
         for name, number in TENSOR_CLASSES.items()

@@ -12,6 +12,7 @@ import struct
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from http import HTTPStatus
 from socketserver import StreamRequestHandler, ThreadingTCPServer
 
 from pd4dgs_codec.delivery.link import Link
@@ -116,7 +117,7 @@ class _Handler(StreamRequestHandler):
         if part:
             headers["Content-Range"] = f"bytes {start}-{end - 1}/{len(content)}"
         lines = [f"{name}: {value}" for name, value in {**headers, **fault.headers}.items() if value is not None]
-        self.wfile.write("\r\n".join([f"HTTP/1.1 {status} X", *lines, "", ""]).encode())
+        self.wfile.write("\r\n".join([f"HTTP/1.1 {status} {HTTPStatus(status).phrase}", *lines, "", ""]).encode())
         sent = body[: fault.after]
         server.sent += len(sent)
         self._cross(sent)

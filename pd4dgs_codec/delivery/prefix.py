@@ -8,7 +8,7 @@ from pd4dgs_codec.codec.info import info
 from pd4dgs_codec.delivery.transfer import Changed, Transfer
 from pd4dgs_codec.errors import Truncated
 
-#: Headers of today have some 250 bytes; a longer one costs a second request.
+#: Headers of today have some 300 bytes; a longer one costs a second request.
 HEADER_GUESS = 512
 LONGEST_HEADER = PREAMBLE_SIZE + MAX_HEADER
 

@@ -128,9 +128,13 @@ def time_plot(results: Sequence[dict[str, Any]], path: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    figure, axes = pyplot.subplots(1, len(results), figsize=(4.2 * len(results), 3.4), squeeze=False)
+    columns = min(len(results), 4)
+    lines = -(-len(results) // columns)
+    figure, axes = pyplot.subplots(lines, columns, figsize=(4.2 * columns, 3.4 * lines), squeeze=False)
     styles = ((":", "o"), ("--", "s"), ("-", "^"))
-    for axis, result in zip(axes[0], results, strict=True):
+    for axis in axes.flat[len(results) :]:
+        axis.remove()
+    for axis, result in zip(axes.flat, results, strict=False):
         for level, (line, mark) in enumerate(styles):
             points = [(p["seconds"], p["psnr"][level]) for p in result["curve"] if len(p["psnr"]) > level]
             if points:
@@ -138,7 +142,8 @@ def time_plot(results: Sequence[dict[str, Any]], path: Path) -> None:
         axis.set_title(result["name"])
         axis.set_xlabel("training wall time, s")
         axis.grid(alpha=0.3)
-    axes[0][0].set_ylabel("held-out PSNR, dB")
+    for first in axes[:, 0]:
+        first.set_ylabel("held-out PSNR, dB")
     axes[0][0].legend()
     figure.tight_layout()
     figure.savefig(path, dpi=110)

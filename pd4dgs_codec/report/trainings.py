@@ -12,7 +12,7 @@ from pd4dgs_codec.data.dataset import Dataset
 from pd4dgs_codec.errors import TrainError
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.model import Model
-from pd4dgs_codec.train.config import TrainConfig
+from pd4dgs_codec.train.config import BEFORE, TrainConfig
 from pd4dgs_codec.train.loop import Trainer
 
 
@@ -52,9 +52,9 @@ def _stored(path: Path, config: TrainConfig) -> dict[str, Any] | None:
     if not path.exists():
         return None
     _, training = checkpoint.load(path)
-    # fields that are newer than the checkpoint had the values that are their defaults now
+    # fields that are newer than the checkpoint had the values that are their defaults now, but for BEFORE
     stored = json.loads(json.dumps(TrainConfig().__dict__, default=lambda value: value.__dict__))
-    stored |= json.loads(training.get("config", "{}"))
+    stored |= BEFORE | json.loads(training.get("config", "{}"))
     wanted = json.loads(json.dumps(config, default=lambda value: value.__dict__))
     if wanted["iterations"] is None:
         stored["iterations"] = None

@@ -25,6 +25,9 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "judge": {"judge": False},
 }
 
+#: What checkpoints that lack these fields were trained with, where it is not what has become their default.
+BEFORE: dict[str, Any] = {"judge": False, "tmc_binary_growth": 1.0}
+
 
 @dataclass(frozen=True)
 class LearningRates:

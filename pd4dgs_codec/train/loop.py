@@ -322,7 +322,9 @@ class Trainer:
         costs = self._level_costs()
         schedule = Schedule(1000)
         coarse = schedule.coarse_end / 1000
-        mean = coarse * costs[0] + (1 - coarse) * sum(costs) / 3
+        highest = self.model.level
+        later = {"all": sum(costs[: highest + 1]), "top": costs[highest]}.get(self.config.rollout, sum(costs) / 3)
+        mean = coarse * costs[0] + (1 - coarse) * later
         left = TIME_SHARE * self.config.max_seconds - (time.monotonic() - start)
         left -= CURVE_POINTS * CURVE_VIEWS * sum(costs) / 3
         self.total = max(LEAST_TIMED_TOTAL, self.iteration + int(left / (mean * LATER_COST)))

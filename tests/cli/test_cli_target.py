@@ -85,6 +85,11 @@ def test_sizes_that_are_none_are_wrong_usage(cli, model_pt, tmp_path, text):
     assert result.code == 2 and "expected sizes in bytes such as L0=425k" in result.err
 
 
+def test_a_least_gain_without_views_to_measure_it_on_is_wrong_usage(cli, model_pt, tmp_path):
+    result = cli("encode", model_pt, "-o", tmp_path / "s.pd4", "--min-gain", 1)
+    assert result.code == 2 and "--min-gain needs --data" in result.err and not (tmp_path / "s.pd4").exists()
+
+
 def test_layers_that_do_not_pay_are_left_out_with_their_figures(cli, model_pt, shared_dataset, tmp_path):
     judged = ("encode", model_pt, "-o", tmp_path / "s.pd4", "--data", shared_dataset, "--holdout", 3, *FAST)
     dear = cli(*judged, "--min-gain", 1e5).json

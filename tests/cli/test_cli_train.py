@@ -65,6 +65,11 @@ def test_options_reach_the_configuration(train, tmp_path):
     assert not (config["noise"] or config["tmc_binary"] or config["tmc_smooth"])
 
 
+def test_a_rate_weight_for_a_run_without_rate_is_wrong_usage(train, tmp_path):
+    result = train(tmp_path / "m.pt", "--without", "rate", "--rate-scale", 0.5)
+    assert result.code == 2 and "--without rate" in result.err and not (tmp_path / "m.pt").exists()
+
+
 def test_seed_decides_the_result(train, tmp_path):
     for name, seed in (("a", 1), ("b", 1), ("c", 2)):
         assert train(tmp_path / f"{name}.pt", "--seed", seed, iterations=2).code == 0
@@ -102,7 +107,7 @@ def test_resume_refuses_what_contradicts_the_checkpoint(cli, train, tmp_path, sh
         "--holdout": ("--holdout", 0),
         "--iterations": ("--iterations", 9),
         "--preset": ("--preset", "small"),
-        "noise": ("--without", "noise"),
+        "--without noise": ("--without", "noise"),
         "--max-layer": ("--max-layer", 1),
     }
     for what, options in contradictions.items():
@@ -215,6 +220,13 @@ def test_stored_steps_come_back_as_steps():
 
     config = replace(TrainConfig(), steps=Steps(feature=0.25), iterations=7)
     assert parse_config(json.dumps(config, default=lambda value: value.__dict__), "m.pt") == config
+
+
+def test_a_run_from_before_a_part_of_the_method_goes_on_without_it():
+    from pd4dgs_codec.cli.resume import parse_config
+
+    config = parse_config('{"preset": "tiny"}', "m.pt")
+    assert (config.preset, config.judge, config.tmc_binary_growth, config.noise) == ("tiny", False, 1.0, True)
 
 
 KILLED = """

@@ -92,14 +92,14 @@ def test_partial_files_and_failing_links(call, scene_bytes, monkeypatch):
     for options, expected in (([], 1), (["--allow-partial"], 3)):
         with FaultyServer(scene_bytes, [Fault(cut), *[Fault(status=503)] * 9]) as server:
             code, out, err = call("decode", server.url, *options)
-        assert code == expected and f"answers 503 X ({cut:,} bytes are here)" in err
+        assert code == expected and f"answers 503 Service Unavailable ({cut:,} bytes are here)" in err
 
 
 @pytest.mark.parametrize("verb", ["info", "decode"])
 def test_bad_urls_and_missing_files_are_one_line(call, scene_bytes, verb):
     with FaultyServer(scene_bytes, [Fault(status=404)]) as server:
         code, out, err = call(verb, server.url)
-    assert (code, out) == (1, b"") and err == f"pd4dgs-{verb}: error: {server.url}: the server answers 404 X\n"
+    assert (code, out) == (1, b"") and err == f"pd4dgs-{verb}: error: {server.url}: the server answers 404 Not Found\n"
     code, out, err = call(verb, "http://")
     assert (code, out) == (1, b"") and len(err.splitlines()) == 1
     with FaultyServer(b"<html>") as server:

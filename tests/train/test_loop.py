@@ -201,6 +201,18 @@ def test_a_limit_nearly_spent_gives_a_cut_run_that_says_so(dataset):
     assert "levels 1 and 2" in Schedule(trainer.total).phases_not_reached(loop.TIMED_STEPS)
 
 
+def test_a_time_limit_allows_for_what_a_step_of_the_rollout_costs(dataset, monkeypatch):
+    totals = {}
+    monkeypatch.setattr(Trainer, "_level_costs", lambda self: [1e-3, 2e-3, 3e-3])
+    for rollout in ("uniform", "top", "all"):
+        trainer = Trainer(TrainConfig(preset="tiny", max_seconds=1e3, rollout=rollout), dataset)
+        trainer._fix_iterations(start=loop.time.monotonic())
+        totals[rollout] = trainer.total
+    tenth, rest = 0.1, 0.9  # the coarse phase is of level 0 alone
+    assert totals["uniform"] / totals["top"] == pytest.approx((tenth * 1 + rest * 3) / (tenth * 1 + rest * 2), rel=1e-2)
+    assert totals["uniform"] / totals["all"] == pytest.approx((tenth * 1 + rest * 6) / (tenth * 1 + rest * 2), rel=1e-2)
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_the_first_signal_ends_the_run_after_a_whole_step(dataset, tmp_path, monkeypatch, number):
     trainer = Trainer(TrainConfig(preset="tiny", iterations=8), dataset)

@@ -617,10 +617,6 @@ class File:
         """With another payload in one chunk."""
         return self.with_chunk(index, payload=payload)
 
-    def with_layer(self, index: int, layer: Layer) -> File:
-        """With another layer in one chunk."""
-        return self.with_chunk(index, payload=layer.payload(), layer=layer)
-
     def layer(self, index: int) -> Layer:
         """What the payload of a layer's chunk means."""
         layer = self.chunks[index].layer

@@ -43,15 +43,20 @@ def parser() -> Parser:
         "input", metavar="FILE", help="checkpoint of pd4dgs-train, or a .pd4 file; - reads a .pd4 from stdin"
     )
     p.add_argument(
-        "--step-scales", type=listed(positive_float), metavar="X,...", help="step scales (default: 0.5,1,2,4)"
+        "--step-scales",
+        type=listed(positive_float),
+        metavar="X,...",
+        help="factors on every quantisation step (default: 0.5,1,2,4)",
     )
-    p.add_argument("--modes", type=listed(one_of(("ans", "lzma"))), metavar="M,...", help="modes (default: ans,lzma)")
-    p.add_argument("--efforts", type=listed(_effort), metavar="N,...", help="efforts 1..9 (default: 1,5,9)")
+    p.add_argument(
+        "--modes", type=listed(one_of(("ans", "lzma"))), metavar="M,...", help="entropy coders (default: ans,lzma)"
+    )
+    p.add_argument("--efforts", type=listed(_effort), metavar="N,...", help="1 fast to 9 small (default: 1,5,9)")
     p.add_argument("--repeats", type=positive_int, metavar="N", help="runs per warm time (default: 5)")
     p.add_argument("--cold", type=count, metavar="N", help="fresh processes per cold time; 0: none (default: 1)")
     p.add_argument("--no-peers", action="store_true", help="leave out the other coders")
     p.add_argument("--quick", action="store_true", help="few points, one run each, no fresh processes")
-    add_views(p)
+    add_views(p, f"{VIEWS}; with --quick {QUICK_VIEWS}")
     add_output(p)
     return p
 

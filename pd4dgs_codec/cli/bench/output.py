@@ -5,9 +5,10 @@ from __future__ import annotations
 import argparse
 import json
 from collections.abc import Callable, Sequence
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
-from pd4dgs_codec.cli.common import Console, Parser, count, positive_int
+from pd4dgs_codec.cli.common import Console, Parser, UsageError, count, positive_int
 from pd4dgs_codec.cli.files import STDIO, check_output, whole_file, write_bytes
 from pd4dgs_codec.jsonable import finite
 
@@ -17,16 +18,14 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 
-def add_views(p: Parser) -> None:
-    """The options that say which pictures to take."""
+def add_views(p: Parser, views: str) -> None:
+    """The options that say which pictures to take; views: how many are taken without --views, in words."""
     group = p.add_argument_group("pictures")
     what = "dataset whose held-out views give the cameras (default: the file's own camera over time)"
     group.add_argument("--data", metavar="SOURCE", help=what)
     group.add_argument("--downscale", type=positive_int, metavar="K", help="pictures 1/K as wide and high (default: 1)")
-    group.add_argument(
-        "--holdout", type=count, metavar="K", help="without split files, frames with i %% K == K/2 are held out"
-    )
-    group.add_argument("--views", type=positive_int, metavar="N", help="how many pictures")
+    group.add_argument("--holdout", type=count, metavar="K", help="as in pd4dgs-train (default: 8)")
+    group.add_argument("--views", type=positive_int, metavar="N", help=f"how many pictures (default: {views})")
 
 
 def add_output(p: Parser) -> None:
@@ -38,7 +37,10 @@ def add_output(p: Parser) -> None:
 def prepare(args: argparse.Namespace, console: Console) -> None:
     """Refuses outputs that cannot be written, before any work; args.plot need not be there."""
     console.json = args.json == STDIO
-    for path in (getattr(args, "plot", None), None if args.json == STDIO else args.json):
+    plot = getattr(args, "plot", None)
+    if plot is not None and Path(plot).suffix.lower() != ".png":
+        raise UsageError(f"found --plot {plot}, expected a name that ends in .png")
+    for path in (plot, None if args.json == STDIO else args.json):
         if path is not None:
             check_output(path, args.overwrite)
 

@@ -36,7 +36,7 @@ def parser() -> Parser:
         "--repeats", type=positive_int, default=REPEATS, metavar="N", help=f"drawings per picture (default: {REPEATS})"
     )
     p.add_argument("--cache", metavar="FOLDER", help="where to keep compiled kernels (default: nowhere)")
-    add_views(p)
+    add_views(p, str(VIEWS))
     add_output(p)
     return p
 

@@ -40,7 +40,7 @@ examples:
 
 def parser() -> Parser:
     """The options of the report."""
-    p = Parser("bench train", "SOURCE", "Measure held-out quality against training wall time.", DETAILS)
+    p = Parser("bench train", "[SOURCE]", "Measure held-out quality against training wall time.", DETAILS)
     p.add_argument("source", nargs="?", metavar="SOURCE", help="dataset to train on, see below")
     p.add_argument("--presets", nargs="+", choices=PRESETS, metavar="PRESET", help="model sizes (default: tiny small)")
     p.add_argument("--seconds", type=positive_float, metavar="S", help="time limit per preset (default: 120)")
@@ -48,7 +48,7 @@ def parser() -> Parser:
     p.add_argument("--downscale", type=positive_int, metavar="K", help="images 1/K as wide and high (default: 1)")
     p.add_argument("--holdout", type=count, metavar="K", help="as in pd4dgs-train (default: 8)")
     p.add_argument("--seed", type=seed, metavar="N", help="seed of each run (default: 0)")
-    p.add_argument("--from", dest="runs", nargs="+", metavar="FILE", help="checkpoints or .jsonl logs of earlier runs")
+    p.add_argument("--from", dest="runs", nargs="+", metavar="FILE", help="instead of training: checkpoints or logs")
     add_output(p)
     return p
 

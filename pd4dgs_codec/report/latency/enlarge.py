@@ -18,8 +18,7 @@ MOST = 20  #: times as many anchors; more would hardly find free voxels
 
 def with_anchors(data: bytes, count: int, seed: int = 5) -> bytes:
     """The file of a scene whose layer 0 shows `count` anchors: those of `data`, and copies of random ones among them,
-    each moved to a free voxel nearby. Raises DataError if the scene has more
-    already, or far too few."""
+    each moved to a free voxel nearby. Raises DataError if the scene has more already, or far too few."""
     scene = decode(data)
     return encode(_enlarged(scene, count, np.random.default_rng(seed)), effort=EFFORT)
 

@@ -218,7 +218,7 @@ def levels(results: Sequence[Result]) -> list[str]:
     for scene in scenes_of(results):
         runs = of(results, FULL, scene)
         held = sum(monotone(r) for r in runs)
-        for level in range(len(runs[0]["levels"])):
+        for level in sorted({row["level"] for run in runs for row in run["levels"]}):
             held_by = f"{held} of {len(runs)}" if level == 0 else ""
             rows.append((scene, str(level), *_cells(results, runs, level), held_by))
     theirs = [

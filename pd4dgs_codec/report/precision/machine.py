@@ -37,7 +37,7 @@ def sentence(machine: dict[str, Any]) -> str:
     versions = ", ".join(f"{name} {version}" for name, version in machine["versions"].items() if version)
     memory = f", {machine['memory_bytes'] / 2**30:.0f} GiB" if machine["memory_bytes"] else ""
     load = "" if machine["load_average"] is None else f", load {machine['load_average']:.2f} before the run"
-    cpus = f"{machine['cpus']} CPUs, {machine['threads']} threads used"
+    cpus = f"{machine['cpus']} CPUs, threads used: {machine['threads']}"
     return f"{machine['cpu']}, {cpus}{memory}{load}; {machine['system']}, Python {machine['python']}, {versions}"
 
 
