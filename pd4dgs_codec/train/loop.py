@@ -292,8 +292,9 @@ class Trainer:
         return self.order.pop()
 
     def _waiting_views(self) -> set[int]:
-        """Training views that wait until the levels are judged; none where N is not known yet."""
-        return judge.waiting_views(len(self.dataset.train), self.total) if self.config.judge else set()
+        """Training views that wait until the levels are judged; none where N is not known yet, or nothing to judge."""
+        judged = self.config.judge and self.config.max_layer > 0 and self.config.rollout != "top"
+        return judge.waiting_views(len(self.dataset.train), self.total) if judged else set()
 
     def _judge_levels(self, schedule: Schedule) -> list[float]:
         """Where the last third begins: leaves out the levels that do not pay. Returns the PSNR per level judged by."""

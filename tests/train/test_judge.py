@@ -75,5 +75,6 @@ def test_a_level_that_goes_stays_away(dataset, tmp_path, monkeypatch):  # noqa: 
 def test_with_judging_off_all_views_are_learnt_and_all_levels_stay(dataset, monkeypatch):  # noqa: F811
     monkeypatch.setattr(judge, "MIN_ITERATIONS", 10)
     views = replace(dataset, train=dataset.train * 12)
-    trainer = Trainer(TrainConfig(preset="tiny", iterations=30, judge=False), views)
-    assert not trainer._waiting_views()
+    assert Trainer(TrainConfig(preset="tiny", iterations=30), views)._waiting_views()
+    for nothing in ({"judge": False}, {"max_layer": 0}, {"rollout": "top"}):
+        assert not Trainer(TrainConfig(preset="tiny", iterations=30, **nothing), views)._waiting_views()
