@@ -311,7 +311,7 @@ TABLES = {
         Table("components", "Components", (*WITHOUT, FULL), SYNTHETIC, 3, components, plots.seeds),
         Table("levels", "Levels", (FULL,), (*SYNTHETIC, *REAL), 3, levels, plots.levels),
         Table("latency", "First frame", (FULL, MONOLITHIC), REAL, 1, latency, plots.latency),
-        Table("rates", "Quality over bytes", tuple(map(at_rate, RATE_SCALES)), REAL[:1], 1, rates, plots.rates),
+        Table("rates", "Quality over bytes", tuple(map(at_rate, RATE_SCALES)), ("local",), 1, rates, plots.rates),
         Table("rho", "rho over training", (at_rate(0.1), at_rate(1.0)), ("static", "fast"), 1, rho, plots.rho),
     )
 }
