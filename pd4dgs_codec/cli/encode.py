@@ -49,7 +49,7 @@ examples:
 
 #: Below this gain of a level a layer is left out, dB per megabyte (1e6 bytes). About 0.5 dB is what viewers begin to
 #: notice, and a megabyte takes 4 s at 2 Mbps, longer than all of such a scene should.
-MIN_GAIN = 0.5
+MIN_GAIN = 1.0
 #: Pictures of the file's own camera, and how many degrees it sways, where there is no dataset.
 OWN_PICTURES, OWN_ORBIT = 16, 20.0
 #: Link rate at which the report states the time to the first frame, in bits per second.
