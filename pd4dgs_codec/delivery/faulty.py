@@ -24,8 +24,8 @@ class Fault:
     """What one request meets: after `after` bytes of the body the connection ends as `how` says.
 
     how: "close", "reset" or "stall" (silence until the server stops). status: answer this instead of the file.
-    then: called at the end, to change the server for the next request. headers: replace or (None) remove those of the
-    answer.
+    then: called before the body crosses, to change the server for the next request. headers: replace or (None)
+    remove those of the answer.
     """
 
     after: int | None = None
@@ -120,8 +120,8 @@ class _Handler(StreamRequestHandler):
         self.wfile.write("\r\n".join([f"HTTP/1.1 {status} {HTTPStatus(status).phrase}", *lines, "", ""]).encode())
         sent = body[: fault.after]
         server.sent += len(sent)
+        fault.then(server)  # not after the body: the client may ask again before it is through
         self._cross(sent)
-        fault.then(server)
         if fault.after is None:
             return fault.headers.get("Connection") != "close"
         if fault.how == "stall":
