@@ -25,12 +25,12 @@ from pd4dgs_codec.render.threads import configure
 
 SHARED = Path(os.environ.get("PD4DGS_SHARED", Path(__file__).resolve().parents[2] / "shared" / "data"))
 FULL = ("--step-scales", "1,2,4", "--efforts", "1,5", "--cold", "1")
-#: Without the efforts that take minutes, and, but for the static scene, without other coders.
+#: Without the efforts that take minutes, and, but for bouncing-balls and the static scene, without other coders.
 SHORT = ("--step-scales", "1,4", "--efforts", "1", "--cold", "1")
 #: name, cameras, downscale, codec options, models whose training is drawn together
 SCENES: tuple[tuple[str, Path | str, int, tuple[str, ...], tuple[str, ...]], ...] = (
     ("shelf-hand", SHARED / "shelf-hand", 2, FULL, ("shelf-hand", "shelf-hand-paper")),
-    ("bouncing-balls", SHARED / "bouncing-balls", 4, FULL, ("bouncing-balls",)),
+    ("bouncing-balls", SHARED / "bouncing-balls", 4, SHORT, ("bouncing-balls",)),
     ("synthetic-static", "synthetic:static", 1, SHORT, ("synthetic-static",)),
     ("synthetic-global", "synthetic:global", 1, (*SHORT, "--no-peers"), ("synthetic-global",)),
     ("synthetic-local", "synthetic:local", 1, (*SHORT, "--no-peers"), ("synthetic-local",)),
@@ -54,8 +54,8 @@ plots mark the Pareto front: nothing is better in one way without being worse in
 own at the highest level, unrounded for PSNR. A finished run's tensors lie on its steps, so that at scale 1 the values
 come back exactly, and the pictures differ by the codes of the masks alone. Anchors are integers and exact at any
 scale. A coarser file may leave out a deformation that vanishes; it is held against the checkpoint's highest level all
-the same. Encoding is timed without verification. The synthetic scenes are packed at effort 1 alone, and only the
-static one has the other coders beside it.
+the same. Encoding is timed without verification. All scenes but shelf-hand are packed at effort 1 alone, and of the
+synthetic ones only the static one has the other coders beside it.
 
 **Other coders** get the same data in the same run, decode what they wrote, and are compared with it. They come with
 `pip install -c constraints.txt '.[train,bench]'`, torchac by hand: it is GPL-3 and compiled at its first import.
