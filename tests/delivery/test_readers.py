@@ -39,7 +39,7 @@ def test_pymp4_finds_the_layers(scene_bytes):
 @pytest.mark.skipif(not (MODULES / "dashjs").is_dir(), reason=f"no dashjs in {MODULES} (PD4DGS_NODE_MODULES)")
 @pytest.mark.parametrize("video", [False, True], ids=["layers only", "with video"])
 def test_javascript_players_parse_the_manifests_and_the_payload_comes_back(tmp_path, scene_bytes, video):
-    files = package(scene_bytes, fake_video() if video else None)
+    files = package(scene_bytes, (lambda scene: fake_video()) if video else None)
     for name, content in files.items():
         (tmp_path / name).write_bytes(content)
     with Server(tmp_path) as server, server.running():
