@@ -38,10 +38,11 @@ def figure(results: Sequence[Result], value: Any) -> Figure:
 
 
 def gain(ours: Figure, other: Figure) -> float | None:
-    """ours - other, or None where that is smaller than the spread over seeds of either, so that it says nothing."""
-    difference = ours.mean - other.mean
-    spread = max(ours.spread or 0.0, other.spread or 0.0)
-    return None if abs(difference) < spread else difference
+    """Mean over the seeds of ours - other at the same seed, or None where that is smaller than what these differences
+    spread (largest minus smallest), so that it says nothing."""
+    differences = [a - b for a, b in zip(ours.seeds, other.seeds, strict=True)]
+    mean = sum(differences) / len(differences)
+    return None if abs(mean) < max(differences) - min(differences) else mean
 
 
 def top(key: str) -> Any:

@@ -208,7 +208,8 @@ def components(results: Sequence[Result]) -> list[str]:
 def _spread_words(what: str) -> list[str]:
     return paragraph(
         "Highest level; mean over scenes, then over seeds, ± half the distance between the best and the worst seed. "
-        f"Gains of {what} that are smaller than that distance, in either row, are called none."
+        f"Gains are those of {what}: differences at the same seed, and their mean; where that is smaller than what the "
+        "differences spread, there is none."
     )
 
 
