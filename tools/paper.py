@@ -37,7 +37,7 @@ OTHERS = ("small", 2_000, 1)
 
 
 def main(argv: list[str] | None = None) -> int:
-    threads = configure()
+    configure()
     from pd4dgs_codec.cli.common import positive_int
     from pd4dgs_codec.cli.progress import TrainingProgress
     from pd4dgs_codec.errors import Pd4Error
@@ -54,14 +54,14 @@ def main(argv: list[str] | None = None) -> int:
     tables = list(TABLES.values()) if args.table == "all" else [TABLES[args.table]]
     try:
         for table in tables:
-            make(table, args, threads, TrainingProgress)
+            make(table, args, TrainingProgress)
     except (Pd4Error, OSError, KeyboardInterrupt) as error:
         print(f"paper: error: {str(error) or 'interrupted; the same command goes on'}", file=sys.stderr)
         return 1
     return 0
 
 
-def make(table: Any, args: argparse.Namespace, threads: int, progress: Any) -> None:
+def make(table: Any, args: argparse.Namespace, progress: Any) -> None:
     """Runs what the table lacks and writes its three files."""
     from pd4dgs_codec.data.dataset import load
     from pd4dgs_codec.report.paper.runs import Run, measure
@@ -92,7 +92,7 @@ def make(table: Any, args: argparse.Namespace, threads: int, progress: Any) -> N
                     )
                 )
     if results:
-        write(table, results, args.docs, threads)
+        write(table, results, args.docs)
 
 
 def scene(name: str, args: argparse.Namespace) -> Any:
@@ -109,20 +109,19 @@ def scene(name: str, args: argparse.Namespace) -> Any:
     return Scene(name if name in SCENES else Path(source).name.replace(":", "-"), config, row[4])
 
 
-def write(table: Any, results: list[dict[str, Any]], docs: Path, threads: int) -> None:
+def write(table: Any, results: list[dict[str, Any]], docs: Path) -> None:
     """docs/NAME.md, NAME.json, NAME.png."""
     from pd4dgs_codec.report.tables import paragraph
 
     docs.mkdir(parents=True, exist_ok=True)
     table.plot(results, docs / f"{table.name}.png")
     budgets = {r["scene"]: f"{r['scene']}: {r['config']['preset']}, {r['iterations']:,} iterations" for r in results}
-    minutes = sum(r["seconds"] for r in results) / 60
     lines = [
         f"# {table.title}",
         "",
         *paragraph(
-            f"`python tools/paper.py {table.name}`: {len(results)} trainings, {minutes:.0f} minutes on {threads} "
-            f"threads of a shared machine ({'; '.join(budgets.values())}). Equal iterations for every row of a scene; "
+            f"`python tools/paper.py {table.name}`: {len(results)} trainings "
+            f"({'; '.join(budgets.values())}). Equal iterations for every row of a scene; "
             "held-out views. Published figures are those of the paper, on other scenes."
         ),
         "",

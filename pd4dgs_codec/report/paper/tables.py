@@ -59,10 +59,8 @@ def comparison(results: Sequence[Result]) -> list[str]:
         alone = [of(results, variant, scene) for variant in (SCAFFOLD, TWO_LAYER, MONOLITHIC)]
         ours = [("ours", of(results, FULL, scene)), ("every level", of(results, EVERY_LEVEL, scene))]
         for level, runs in enumerate(alone):
-            rows.append((scene, runs[0]["variant"], *_cells(results, runs, 2), _minutes(runs)))
-            rows += [
-                (scene, f"{what}, level {level}", *_cells(results, r, level), _minutes(r)) for what, r in ours if r
-            ]
+            rows.append((scene, runs[0]["variant"], *_cells(results, runs, 2)))
+            rows += [(scene, f"{what}, level {level}", *_cells(results, r, level)) for what, r in ours if r]
         promises.append([_promises(scene, runs, *alone) for _, runs in ours if runs])
     theirs = [
         (
@@ -72,14 +70,13 @@ def comparison(results: Sequence[Result]) -> list[str]:
             f"{row.mssim:.3f}",
             *_blanks(results),
             f"{row.megabytes * 1e6:,.0f}",
-            "",
         )
         for row in published.COMPARISON
     ]
     head = ("scene", "promise", "allowed", "ours", "every level")
     held = [(*row[0][:3], *(cells[3] for cells in row)) for scene in promises for row in zip(*scene, strict=True)]
     return [
-        markdown(("scene", "model", *_heads(results), "bytes", "training min"), rows + theirs),
+        markdown(("scene", "model", *_heads(results), "bytes"), rows + theirs),
         "",
         *paragraph(
             "Each row is a training of its own but for our levels, which are three prefixes of one file. The "
@@ -91,10 +88,6 @@ def comparison(results: Sequence[Result]) -> list[str]:
         "",
         markdown(head[: 3 + len(promises[0])], held),
     ]
-
-
-def _minutes(runs: Sequence[Result]) -> str:
-    return f"{sum(r['seconds'] for r in runs) / len(runs) / 60:.1f}"
 
 
 def _metrics(results: Sequence[Result]) -> list[tuple[str, str, int]]:
