@@ -46,25 +46,36 @@ def _by(results: Sequence[Result], key: str) -> dict[str, list[Result]]:
 
 def _quality_over_bytes(axis: Any, results: Sequence[Result], line: str, marker: str, label: str) -> None:
     for i, result in enumerate(results):
-        points = [(row["cumulative_bytes"], row["mpsnr"]) for row in result["levels"]]
+        points = [(row["cumulative_bytes"] / 1e3, row["mpsnr"]) for row in result["levels"]]
         style = line + marker if len(points) > 1 else marker
         axis.plot(*zip(*points, strict=True), style, color="black", mfc="white", ms=6, lw=1, label=None if i else label)
-    axis.set_xscale("log")
-    axis.set_xlabel("bytes")
+    axis.set_xlabel("kB")
+
+
+def _kilobytes(axes: Any) -> None:
+    """A logarithmic x axis in kB with plain numbers at 1, 2 and 5; after all of a panel is drawn."""
+    from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
+    for axis in axes:
+        axis.set_xscale("log")
+        axis.xaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axis.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:,.0f}"))
+        axis.xaxis.set_minor_formatter(NullFormatter())
 
 
 def comparison(results: Sequence[Result], path: Path) -> None:
-    """Quality over bytes; our three levels joined by a line."""
+    """Quality over bytes; the levels of one file joined by a line."""
     scenes = _by(results, "scene")
     figure_, axes = _panels(len(scenes))
     for axis, (scene, rows) in zip(axes, scenes.items(), strict=True):
         for marker, (variant, runs) in zip(MARKERS, _by(rows, "variant").items(), strict=False):
-            alone = variant != "full"
-            shown = [r | {"levels": r["levels"][-1:]} for r in runs] if alone else runs
-            _quality_over_bytes(axis, shown, "-", marker, variant if alone else "ours, levels 0 to 2")
+            ours = {"full": "ours, its levels", "every level in every step": "every level, its levels"}
+            shown = runs if variant in ours else [r | {"levels": r["levels"][-1:]} for r in runs]
+            _quality_over_bytes(axis, shown, "-", marker, ours.get(variant, variant))
         axis.set_title(scene)
     axes[0].set_ylabel("held-out mPSNR, dB")
     axes[0].legend(fontsize=8)
+    _kilobytes(axes)
     _save(figure_, path)
 
 
@@ -79,6 +90,7 @@ def seeds(results: Sequence[Result], path: Path) -> None:
             axis.plot(value.seeds, [y] * len(value.seeds), "o", color="black", mfc="white", ms=7)
             axis.plot(value.mean, y, "|", color="black", ms=18)
         axis.set_yticks(range(len(groups)), list(groups))
+        axis.locator_params(axis="x", nbins=5)
         axis.set_xlabel(label)
     _save(figure_, path)
 
@@ -93,6 +105,7 @@ def levels(results: Sequence[Result], path: Path) -> None:
         axis.set_title(scene)
     axes[0].set_ylabel("held-out mPSNR, dB")
     axes[0].legend(fontsize=8)
+    _kilobytes(axes)
     _save(figure_, path)
 
 

@@ -284,7 +284,14 @@ def rho(results: Sequence[Result]) -> list[str]:
                 cells = (f"{last['rho']:.3f}", " / ".join(f"{p:.3f}" for p in last["pi"]))
                 active = " / ".join(f"{n:,}" for n in runs[0]["active"])
                 rows.append((scene, f"{scale:g}", *cells, active))
-    return [markdown(("scene", "rate scale", "rho", "pi of levels 0 / 1 / 2", "active anchors per level"), rows)]
+    return [
+        markdown(("scene", "rate scale", "rho", "pi of levels 0 / 1 / 2", "active anchors per level"), rows),
+        "",
+        *paragraph(
+            "The method expects a larger rho where more moves. Where rows of one rate scale do not differ, it is the rate "
+            "that moves the masks, not the motion. rho falls towards the end because the binary term then grows."
+        ),
+    ]
 
 
 SYNTHETIC = ("global", "local", "fast")
