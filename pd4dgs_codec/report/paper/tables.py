@@ -288,8 +288,8 @@ def rho(results: Sequence[Result]) -> list[str]:
         markdown(("scene", "rate scale", "rho", "pi of levels 0 / 1 / 2", "active anchors per level"), rows),
         "",
         *paragraph(
-            "The method expects a larger rho where more moves. Where rows of one rate scale do not differ, it is the rate "
-            "that moves the masks, not the motion. rho falls towards the end because the binary term then grows."
+            "The method expects a larger rho where more moves. Where rows of one rate scale do not differ, it is the "
+            "rate that moves the masks, not the motion. rho falls towards the end because the binary term then grows."
         ),
     ]
 
