@@ -126,6 +126,8 @@ def latency(results: Sequence[Result], path: Path) -> None:
             axis.plot(rates, theirs.seconds, marker, color="grey", ms=7, label=f"{theirs.method}, published")
         axis.set_xscale("log")
         axis.set_yscale("log")
+        axis.set_xticks(rates, [f"{rate:g}" for rate in rates])
+        axis.set_xticks([], minor=True)
         axis.set_xlabel("link, Mbps")
         axis.set_title(scene)
     axes[0].set_ylabel("seconds, 8 S / B")
