@@ -133,13 +133,13 @@ class Trainer:
         """One training step; returns its log record (every term unweighted)."""
         schedule = Schedule(self.total or 10**9)
         judged = self._judge_levels(schedule)
-        index = self._next_view(schedule)
         levels, probabilities = self._draw_levels(schedule)
+        drawn = [(self._next_view(schedule), level) for level in levels]
         rounding = self._rounding(schedule)
         record: dict[str, Any] = {"iteration": self.iteration, "level": levels[-1]}
         if judged:
             record |= {"judged_psnr": judged, "left_out": self.left_out}
-        if not self._learn(index, levels, schedule, rounding, record):
+        if not self._learn(drawn, schedule, rounding, record):
             self.skipped += 1
             record["skipped"] = self.skipped
         self.optimiser.zero_grad()
@@ -160,12 +160,12 @@ class Trainer:
     # -- parts of a step -------------------------------------------------------------------------------------------
 
     def _learn(
-        self, index: int, levels: tuple[int, ...], schedule: Schedule, rounding: Rounding, record: dict[str, Any]
+        self, drawn: list[tuple[int, int]], schedule: Schedule, rounding: Rounding, record: dict[str, Any]
     ) -> bool:
-        """Losses, gradients, update; False, with nothing changed, if any of it is not finite. The record is that of the
-        last of the levels."""
+        """Losses of (view, level) pairs, gradients, update; False, with nothing changed, if any of it is not finite. The
+        record is that of the last pair."""
         pictures = []
-        for level in levels:
+        for index, level in drawn:
             try:
                 picture, terms, loss = self._loss(index, level, schedule, rounding)
             except NotFinite as error:  # a diverged step may be passed over; any other refusal is here to stay
