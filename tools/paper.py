@@ -47,7 +47,7 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("table", choices=(*TABLES, "all"))
     parser.add_argument("--scenes", nargs="+", metavar="SCENE", help="instead of the table's own")
     parser.add_argument("--seeds", type=positive_int, metavar="N", help="seeds 0 to N-1 (default: the table's own)")
-    parser.add_argument("--iterations", type=positive_int, metavar="N", help="of each run (default: the scene's own)")
+    parser.add_argument("--iterations", type=positive_int, metavar="N", help="of each run (default: the table's own)")
     parser.add_argument("--out", type=Path, default=Path("out/paper"))
     parser.add_argument("--docs", type=Path, default=Path("docs/paper"))
     args = parser.parse_args(argv)
@@ -64,9 +64,10 @@ def main(argv: list[str] | None = None) -> int:
 def make(table: Any, args: argparse.Namespace, progress: Any) -> None:
     """Runs what the table lacks and writes its three files."""
     from pd4dgs_codec.data.dataset import load
-    from pd4dgs_codec.report.paper.runs import Run, measure
+    from pd4dgs_codec.report.paper.runs import Run, held_to, measure
 
-    scenes = [scene(name, args) for name in args.scenes or table.scenes]
+    iterations = args.iterations or table.iterations
+    scenes = [scene(name, iterations) for name in args.scenes or table.scenes]
     absent = [s.name for s in scenes if s.config.source.startswith(str(SHARED)) and not Path(s.config.source).is_dir()]
     for name in absent:
         print(f"{table.name}: {name} is not in {SHARED}, left out")
@@ -78,25 +79,28 @@ def make(table: Any, args: argparse.Namespace, progress: Any) -> None:
             lambda config=one.config: load(config.source, downscale=config.downscale, holdout=config.holdout)
         )
         for seed in range(args.seeds or min(table.seeds, one.seeds)):
+            found: dict[Any, Any] = {}
             for variant in table.variants:
                 run = Run(one, variant, seed)
                 label = f"{table.name}: {one.name}, {variant.name}, seed {seed}"
                 print(label, flush=True)
-                results.append(
-                    measure(
-                        run,
-                        dataset,
-                        args.out,
-                        say=lambda text, label=label: print(f"{label}: {text}", flush=True),
-                        progress=progress(),
-                    )
-                )
+                say = functools.partial(_say, label)
+                result = measure(run, dataset, args.out, say=say, progress=progress())
+                if variant in table.sized:
+                    limit = found[table.reference.name]["levels"][0]["cumulative_bytes"]
+                    result = held_to(result, run, limit, dataset, args.out, say=say)
+                found[variant.name] = result
+            results += found.values()
     if results:
         write(table, results, args.docs)
 
 
-def scene(name: str, args: argparse.Namespace) -> Any:
-    """A scene by its name, or by SOURCE[@K]."""
+def _say(label: str, text: str) -> None:
+    print(f"{label}: {text}", flush=True)
+
+
+def scene(name: str, iterations: int | None) -> Any:
+    """A scene by its name, or by SOURCE[@K]. iterations: instead of its own."""
     from pd4dgs_codec.errors import DataError
     from pd4dgs_codec.report.paper.runs import Scene
     from pd4dgs_codec.train.config import TrainConfig
@@ -105,7 +109,7 @@ def scene(name: str, args: argparse.Namespace) -> Any:
     if at and not (downscale.isdecimal() and int(downscale)):
         raise DataError(f"{name}: found {downscale!r} behind @, expected an integer >= 1")
     row = SCENES.get(name, (source, int(downscale or 1), *OTHERS))
-    config = TrainConfig(preset=row[2], source=row[0], downscale=row[1], iterations=args.iterations or row[3])
+    config = TrainConfig(preset=row[2], source=row[0], downscale=row[1], iterations=iterations or row[3])
     return Scene(name if name in SCENES else Path(source).name.replace(":", "-"), config, row[4])
 
 

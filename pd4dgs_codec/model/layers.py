@@ -74,8 +74,8 @@ class MLP(nn.Module):
 def level_mask(logits: Tensor, level: int) -> Tensor:
     """m^(level) [N] of logits [N, 3]: sigmoid(a0 + sum_{1<=j<=level} softplus(a_j)), so never falling with level.
 
-    The gradient reaches a_level alone. Were it to reach the logits below as well, whatever a higher level needs would be
-    held in layer 0 too, and the levels' masks would stay together.
+    The gradient reaches a_level alone. Were it to reach the logits below as well, whatever a higher level needs would
+    be held in layer 0 too, and the levels' masks would stay together.
     """
     total = logits[:, 0]
     for j in range(1, level + 1):

@@ -12,8 +12,8 @@ from pd4dgs_codec.scene import Steps
 DEFAULT_ITERATIONS = {"tiny": 3_000, "small": 10_000, "paper": 15_000}
 
 #: Which levels a step trains after the coarse phase: one drawn from pi(rho), from the uniform or from the paper's fixed
-#: distribution; the highest alone, as a monolithic model is trained; or each of them, on a view of its own, at thrice the
-#: cost.
+#: distribution; the highest alone, as a monolithic model is trained; or each of them, with a view of its own, at thrice
+#: the cost.
 ROLLOUTS = ("adaptive", "uniform", "fixed", "top", "all")
 
 #: Parts of the method that an ablation takes out, as the fields of `TrainConfig` that do so.

@@ -162,8 +162,8 @@ class Trainer:
     def _learn(
         self, drawn: list[tuple[int, int]], schedule: Schedule, rounding: Rounding, record: dict[str, Any]
     ) -> bool:
-        """Losses of (view, level) pairs, gradients, update; False, with nothing changed, if any of it is not finite. The
-        record is that of the last pair."""
+        """Losses of (view, level) pairs, gradients, update; False, with nothing changed, if any of it is not finite.
+        The record is that of the last pair."""
         pictures = []
         for index, level in drawn:
             try:

@@ -14,7 +14,17 @@ from pd4dgs_codec.data.dataset import Dataset, load  # noqa: E402
 from pd4dgs_codec.model import checkpoint  # noqa: E402
 from pd4dgs_codec.model.config import PRESETS, DeformationConfig, ModelConfig  # noqa: E402
 from pd4dgs_codec.report.paper import plots, published, statistics, tables  # noqa: E402
-from pd4dgs_codec.report.paper.runs import EVERY_LEVEL, FULL, MONOLITHIC, SCAFFOLD, Run, Scene, at_rate, measure  # noqa: E402
+from pd4dgs_codec.report.paper.runs import (  # noqa: E402
+    EVERY_LEVEL,
+    FULL,
+    MONOLITHIC,
+    SCAFFOLD,
+    Run,
+    Scene,
+    at_rate,
+    held_to,
+    measure,
+)
 from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS  # noqa: E402
 from pd4dgs_codec.train.config import TrainConfig  # noqa: E402
 
@@ -150,6 +160,20 @@ def test_runs_are_made_once_and_again_when_settings_change(small, tmp_path, data
     assert made(FULL, volume=0.02)["config"]["volume"] == 0.02 and len(said) > begun
     model = Run(scene, FULL, 0).folder(tmp_path) / "model.pt"
     assert json.loads(checkpoint.load(model)[1]["config"])["volume"] == 0.02
+
+
+def test_a_file_is_packed_again_if_its_layer_0_is_too_large_and_that_is_kept(small, tmp_path, dataset):
+    run = Run(Scene("static", TrainConfig(preset="tiny", source=STATIC, iterations=12), 1), FULL, 0)
+    said: list[str] = []
+    full = measure(run, lambda: dataset, tmp_path, say=said.append)
+    size = full["levels"][0]["cumulative_bytes"]
+    assert held_to(full, run, size, lambda: dataset, tmp_path, say=said.append) is full
+    begun = len(said)
+    held = held_to(full, run, size - 200, lambda: dataset, tmp_path, say=said.append)
+    assert 0.5 * size < held["levels"][0]["cumulative_bytes"] <= size - 200 and len(said) == begun + 1
+    assert held_to(full, run, size - 200, lambda: dataset, tmp_path, say=said.append) == held
+    assert len(said) == begun + 1, "a kept file was made again"
+    assert measure(run, lambda: dataset, tmp_path, say=said.append) == full
 
 
 def test_the_default_rate_is_the_full_method():

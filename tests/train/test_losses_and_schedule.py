@@ -22,6 +22,15 @@ def test_masks_are_monotone_and_start_where_the_method_says():
     assert rho == pytest.approx(0.0866, abs=5e-4)
 
 
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_a_level_moves_its_own_masks_and_no_other_level_s(level):
+    logits = torch.tensor([[2.0, 0.0, 0.0], [-3.0, 1.0, 2.0]], requires_grad=True)
+    level_mask(logits, level).sum().backward()
+    assert logits.grad is not None
+    moved = (logits.grad != 0).all(0)
+    assert moved.tolist() == [j == level for j in range(3)]
+
+
 def test_mask_logits_invert_the_masks():
     import numpy as np
 

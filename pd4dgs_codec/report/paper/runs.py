@@ -11,15 +11,23 @@ from typing import Any
 
 from pd4dgs_codec.cli.files import whole_file, write_bytes
 from pd4dgs_codec.codec.encoder import encode_with_report
+from pd4dgs_codec.codec.plan import plan
+from pd4dgs_codec.codec.target import fit
 from pd4dgs_codec.data.dataset import Dataset
 from pd4dgs_codec.jsonable import finite
 from pd4dgs_codec.metrics.perceptual import load_perceptual
+from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.report.evaluate import evaluate_file
+from pd4dgs_codec.report.frames import dataset_frames
+from pd4dgs_codec.report.rendered import RenderedLoss
 from pd4dgs_codec.report.trainings import ensure_trained
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train.config import ABLATIONS, TrainConfig
+
+#: Training views whose pictures say what a smaller layer 0 costs.
+FITTING_VIEWS = 16
 
 
 @dataclass(frozen=True)
@@ -34,7 +42,8 @@ class Variant:
 FULL = Variant("full")
 SCAFFOLD = Variant("static scaffold alone", {"max_layer": 0})
 TWO_LAYER = Variant("two layers", {"max_layer": 1})
-#: The full method, but each step trains every level: as many steps of each as the three models above it have together.
+#: The full method, but each step trains every level, with a view of its own: as many steps of each as the models made
+#: for one purpose have.
 EVERY_LEVEL = Variant("every level in every step", {"rollout": "all"})
 #: Every step trains all layers together, and nothing is spent on bytes, levels or quantisation.
 MONOLITHIC = Variant(
@@ -122,6 +131,37 @@ def measure(
     with whole_file(str(file), overwrite=True) as temporary:
         temporary.write_text(json.dumps(finite(result), indent=1, allow_nan=False))
     return json.loads(file.read_text())
+
+
+def held_to(
+    result: dict[str, Any],
+    run: Run,
+    limit: int,
+    dataset: Callable[[], Dataset],
+    out: Path,
+    *,
+    say: Callable[[str], None],
+) -> dict[str, Any]:
+    """The result of `run`, its file packed so that header and layer 0 have at most `limit` bytes, as
+    `pd4dgs-encode --target-size` does with the training views; `result` as it is if they have. Kept as held.json."""
+    if result["levels"][0]["cumulative_bytes"] <= limit:
+        return result
+    file = run.folder(out) / "held.json"
+    stored = json.loads(file.read_text()) if file.exists() else {}
+    if (stored.get("config"), stored.get("limit")) == (result["config"], limit):
+        return result | {"levels": stored["levels"]}
+    say(f"layer 0 is held to {limit:,} bytes")
+    data = dataset()
+    model, _ = checkpoint.load(run.folder(out) / "model.pt")
+    scene, _ = plan(to_scene(model), "auto", False, "bounded")
+    loss = RenderedLoss(scene, dataset_frames(data.train[:: -(-len(data.train) // FITTING_VIEWS)]))
+    fitted, _, _ = fit(scene, {0: limit}, loss.mean_mse, loss.harm)
+    packed, _ = encode_with_report(fitted)
+    levels = evaluate_file(packed, data, perceptual=load_perceptual())["levels"]
+    held = finite({"config": result["config"], "limit": limit, "levels": levels})
+    with whole_file(str(file), overwrite=True) as temporary:
+        temporary.write_text(json.dumps(held, indent=1, allow_nan=False))
+    return result | {"levels": json.loads(file.read_text())["levels"]}
 
 
 def course(log: Path) -> list[dict[str, Any]]:
