@@ -245,9 +245,7 @@ def _before_last(layers: list[tuple[Tensor, Tensor]], x: Tensor) -> Tensor:
 def fresh_networks(hidden: int) -> dict[str, MLP]:
     """The scaffold's decoders, untrained: input [feature 32, view direction 3]."""
     width = FEATURE_DIM + 3
-    networks = {  # no opacity depends on the input at first: else chance decides what is ever seen, and half is pruned
-        name: MLP((width, hidden, outputs), zero_last=name == "opacity") for name, outputs in SCAFFOLD_NETWORKS.items()
-    }
-    with torch.no_grad():
+    networks = {name: MLP((width, hidden, outputs)) for name, outputs in SCAFFOLD_NETWORKS.items()}
+    with torch.no_grad():  # else chance decides what is ever seen
         networks["opacity"].layers[-1].bias.copy_(torch.linspace(*START_OPACITY, N_OFFSETS))
     return networks

@@ -19,7 +19,7 @@ from pd4dgs_codec.model.config import DeformationConfig  # noqa: E402
 from pd4dgs_codec.model.convert import from_scene, to_scene  # noqa: E402
 from pd4dgs_codec.model.deformation import DeformationField  # noqa: E402
 from pd4dgs_codec.model.layers import level_mask, mask_logits  # noqa: E402
-from pd4dgs_codec.model.model import MIN_OPACITY, Model, fresh_networks  # noqa: E402
+from pd4dgs_codec.model.model import Model, fresh_networks  # noqa: E402
 from pd4dgs_codec.render.picture import render_image  # noqa: E402
 from pd4dgs_codec.scene import (  # noqa: E402
     GLOBAL_HEADS,
@@ -98,17 +98,6 @@ def set_bias(field: DeformationField, head: str) -> torch.Tensor:
     with torch.no_grad():
         bias.copy_(0.1 * torch.cos(torch.arange(len(bias)) + 0.5))
     return bias.detach().clone()
-
-
-# -- the start ---------------------------------------------------------------------------------------------------------
-
-
-def test_at_the_start_every_anchor_shows_from_every_side():
-    """A network with random last weights makes half of all views see nothing of an anchor, which is then pruned."""
-    generator = torch.Generator().manual_seed(0)
-    opacity = torch.tanh(fresh_networks(16)["opacity"](torch.randn(50, 35, generator=generator)))
-    assert (opacity == opacity[0]).all()
-    assert (opacity[0] > MIN_OPACITY).any() and (opacity[0] < 0).any()
 
 
 # -- levels ------------------------------------------------------------------------------------------------------------

@@ -285,9 +285,10 @@ def rho(results: Sequence[Result]) -> list[str]:
     """rho and pi at the end of each run."""
     rows = []
     for scene in scenes_of(results):
-        for scale in (0.1, 1.0):
-            runs = of(results, at_rate(scale), scene)
+        for variant in (FULL, at_rate(1.0)):
+            runs = of(results, variant, scene)
             if runs:
+                scale = runs[0]["config"]["rate_scale"]
                 last = runs[0]["pi"][-1]
                 cells = (f"{last['rho']:.3f}", " / ".join(f"{p:.3f}" for p in last["pi"]))
                 active = " / ".join(f"{n:,}" for n in runs[0]["active"])
@@ -335,7 +336,7 @@ TABLES = {
         Table(
             "rho",
             "rho over training",
-            (at_rate(0.1), at_rate(1.0)),
+            (FULL, at_rate(1.0)),
             ("static", "fast"),
             1,
             rho,
