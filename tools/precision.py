@@ -3,8 +3,8 @@
     python tools/precision.py [--only NAME ...] [--out out] [--docs docs]
 
 Models are read from --out (NAME/model.pt), the cameras of real scenes from the folder in PD4DGS_SHARED (default
-../shared/data beside the repository); scenes not there are named and left out. With --only the page holds those
-scenes alone.
+../shared/data beside the repository); scenes not there are named and left out. The page is written after each scene;
+with --only it keeps what it says of the others.
 """
 
 from __future__ import annotations
@@ -85,7 +85,10 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     configure()
     (args.docs / "img").mkdir(parents=True, exist_ok=True)
-    lines, results = [INTRODUCTION], {}
+    page, figures = args.docs / "precision.md", args.docs / "precision.json"
+    sections = _sections(page.read_text()) if args.only and page.exists() else {}
+    results = json.loads(figures.read_text()) if args.only and figures.exists() else {}
+    measured = 0
     for name, cameras, downscale, options, trained in SCENES:
         if args.only and name not in args.only:
             continue
@@ -98,10 +101,10 @@ def main(argv: list[str] | None = None) -> int:
         runs = [str(p) for p in (args.out / n / "model.pt" for n in trained) if p.exists()]
         reports = {
             "codec": ["codec", str(model), *data, *CODEC, *options],
-            "render": ["render", str(model), *data, *(RENDER if results else RENDER_ALL)],
+            "render": ["render", str(model), *data, *(RENDER_ALL if name == SCENES[0][0] else RENDER)],
             "train": ["train", "--from", *runs],
         }
-        lines.append(f"## {name}\n")
+        lines = []
         for report, command in reports.items():
             start = time.monotonic()
             image = args.docs / "img" / f"precision-{name}-{report}.png"
@@ -112,12 +115,21 @@ def main(argv: list[str] | None = None) -> int:
             results.setdefault(name, {})[report] = result
             lines += [f"### {name}: {report}\n", f"![{report} of {name}](img/{image.name})\n", table]
             print(f"{name}: {report} in {time.monotonic() - start:.0f} s", flush=True)
-    if not results:
+        sections[name] = "\n".join(lines).rstrip("\n") + "\n"
+        measured += 1
+        ordered = [row[0] for row in SCENES if row[0] in sections]
+        page.write_text("\n".join([INTRODUCTION, *(f"## {name}\n\n{sections[name]}" for name in ordered)]))
+        figures.write_text(json.dumps({name: results[name] for name in ordered}, indent=1) + "\n")
+    if not measured:
         print(f"precision: error: none of the models is there; expected {args.out}/NAME/model.pt", file=sys.stderr)
         return 1
-    (args.docs / "precision.md").write_text("\n".join(lines))
-    (args.docs / "precision.json").write_text(json.dumps(results, indent=1) + "\n")
     return 0
+
+
+def _sections(page: str) -> dict[str, str]:
+    """What the page says of each scene, by name."""
+    parts = [part.partition("\n") for part in page.split("\n## ")[1:]]
+    return {name: text.strip("\n") + "\n" for name, _, text in parts}
 
 
 def run(command: list[str], image: Path) -> tuple[dict[str, Any] | None, str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import importlib
+import importlib.util
 import json
 import math
 import platform
@@ -396,3 +396,23 @@ def test_usual_is_what_the_encoder_writes(scene):
     ]
     best = codec.usual(others)
     assert (best.step_scale, best.mode, best.effort) == (1.0, "ans", 5)
+
+
+def test_the_page_keeps_other_scenes_when_one_is_measured_again(tmp_path, monkeypatch):
+    path = Path(__file__).resolve().parents[2] / "tools" / "precision.py"
+    spec = importlib.util.spec_from_file_location("precision_tool", path)
+    tool = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(tool)
+    monkeypatch.setattr(tool, "SCENES", tuple((name, f"synthetic:{name}", 1, (), (name,)) for name in "abc"))
+    told = iter(range(100))
+    monkeypatch.setattr(tool, "run", lambda command, image: ({"n": 1}, f"| table {next(told)} |\n"))
+    for name in "abc":
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "model.pt").write_bytes(b"")
+    where = ["--out", str(tmp_path), "--docs", str(tmp_path)]
+    assert tool.main(where) == 0
+    first = (tmp_path / "precision.md").read_text()
+    assert tool.main(["--only", "b", *where]) == 0
+    again = (tmp_path / "precision.md").read_text()
+    assert again == first.replace("table 3", "table 9").replace("table 4", "table 10").replace("table 5", "table 11")
+    assert list(json.loads((tmp_path / "precision.json").read_text())) == ["a", "b", "c"]
