@@ -88,7 +88,7 @@ def write(results: list[dict[str, Any]], out: Path, docs: Path, threads: int) ->
     lines = [
         "# Results",
         "",
-        f"Made by `python tools/results.py` on {threads} threads of a shared machine; times are single runs, sizes and",
+        f"Made by `python tools/results.py` on {threads} thread{"s" * (threads > 1)} of a shared machine; times are single runs, sizes and",
         "qualities repeat. Quality is that of the `.pd4` prefix whose bytes stand in the same row, on held-out views.",
         "",
         quality_table(results),
