@@ -297,8 +297,9 @@ def rho(results: Sequence[Result]) -> list[str]:
         markdown(("scene", "rate scale", "rho", "pi of levels 0 / 1 / 2", "active anchors per level"), rows),
         "",
         *paragraph(
-            "The method expects a larger rho where more moves. Where rows of one rate scale do not differ, it is the "
-            "rate that moves the masks, not the motion. rho falls towards the end because the binary term then grows."
+            "The method expects a larger rho where more moves. Where rows of one rate scale differ little, it is the "
+            "rate that moves the masks, not the motion. rho falls when a level is left out, whose masks are then those "
+            "of the level below, and towards the end, when the binary term has grown."
         ),
     ]
 
@@ -327,7 +328,7 @@ TABLES = {
             "rates",
             "Quality over bytes",
             tuple(map(at_rate, RATE_SCALES)),
-            ("local", "shelf-hand"),
+            ("local",),
             1,
             rates,
             plots.rates,
