@@ -13,14 +13,18 @@ import sys
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
+from pd4dgs_codec.render.threads import configure
 
-from pd4dgs_codec.codec.decoder import decode
-from pd4dgs_codec.codec.encoder import encode_with_report
-from pd4dgs_codec.model import checkpoint
-from pd4dgs_codec.model.convert import from_scene, to_scene
-from pd4dgs_codec.render.picture import render_image
-from pd4dgs_codec.scene import Scene
+configure(1)  # with more, the first picture of a process may differ from itself drawn again by 3e-8
+
+import numpy as np  # noqa: E402
+
+from pd4dgs_codec.codec.decoder import decode  # noqa: E402
+from pd4dgs_codec.codec.encoder import encode_with_report  # noqa: E402
+from pd4dgs_codec.model import checkpoint  # noqa: E402
+from pd4dgs_codec.model.convert import from_scene, to_scene  # noqa: E402
+from pd4dgs_codec.render.picture import render_image  # noqa: E402
+from pd4dgs_codec.scene import Scene  # noqa: E402
 
 SIDE = 64  #: of the pictures, pixels
 
