@@ -85,10 +85,11 @@ def write(results: list[dict[str, Any]], out: Path, docs: Path, threads: int) ->
     time_plot(results, images / "quality-over-time.png")
     for result in results:
         shutil.copy(out / result["name"] / "levels.png", images / f"{result['name']}.png")
+    count = "one thread" if threads == 1 else f"{threads} threads"
     lines = [
         "# Results",
         "",
-        f"Made by `python tools/results.py` on {threads} thread{"s" * (threads > 1)} of a shared machine; times are single runs, sizes and",
+        f"Made by `python tools/results.py` on {count} of a shared machine; times are single runs, sizes and",
         "qualities repeat. Quality is that of the `.pd4` prefix whose bytes stand in the same row, on held-out views.",
         "",
         quality_table(results),
