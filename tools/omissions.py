@@ -35,7 +35,8 @@ HEAD = """\
 meets at any time, offsets of Gaussians that no view shows, channels and weights that nothing reads or that are always
 multiplied by zero. How this is proven is in [design.md](design.md#left-out). Below, each checkpoint packed without
 (`--omit nothing`) and with it (`--omit lossless`), and the number of pictures, at random times, levels and cameras
-around the scene, that are the same bit for bit.
+around the scene, that are the same bit for bit: `python tools/omissions.py NAME=out/NAME/model.pt ...`, after
+`python tools/results.py`.
 
 | scene | everything, bytes | left out, bytes | share | pictures the same |
 |-------|-------------------|-----------------|-------|-------------------|

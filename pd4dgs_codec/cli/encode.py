@@ -48,7 +48,7 @@ examples:
   pd4dgs-encode model.pt -o - | pd4dgs-decode -"""
 
 #: Below this gain of a level a layer is left out, dB per megabyte (1e6 bytes). About 0.5 dB is what viewers begin to
-#: notice, and a megabyte takes 4 s at 2 Mbps, longer than all of such a scene should.
+#: notice, and half a megabyte takes 2 s at 2 Mbps, as long as all of such a scene should.
 MIN_GAIN = 1.0
 #: Pictures of the file's own camera, and how many degrees it sways, where there is no dataset.
 OWN_PICTURES, OWN_ORBIT = 16, 20.0

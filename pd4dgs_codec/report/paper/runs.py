@@ -128,9 +128,7 @@ def measure(
         "pi": course(path.with_name("train.jsonl")),
         "levels": levels,
     }
-    with whole_file(str(file), overwrite=True) as temporary:
-        temporary.write_text(json.dumps(finite(result), indent=1, allow_nan=False))
-    return json.loads(file.read_text())
+    return _keep(file, result)
 
 
 def held_to(
@@ -158,10 +156,15 @@ def held_to(
     fitted, _, _ = fit(scene, {0: limit}, loss.mean_mse, loss.harm)
     packed, _ = encode_with_report(fitted)
     levels = evaluate_file(packed, data, perceptual=load_perceptual())["levels"]
-    held = finite({"config": result["config"], "limit": limit, "levels": levels})
+    held = _keep(file, {"config": result["config"], "limit": limit, "levels": levels})
+    return result | {"levels": held["levels"]}
+
+
+def _keep(file: Path, value: dict[str, Any]) -> dict[str, Any]:
+    """Writes `value` as JSON and returns what the file then says, which is what a later run will read."""
     with whole_file(str(file), overwrite=True) as temporary:
-        temporary.write_text(json.dumps(held, indent=1, allow_nan=False))
-    return result | {"levels": json.loads(file.read_text())["levels"]}
+        temporary.write_text(json.dumps(finite(value), indent=1, allow_nan=False))
+    return json.loads(file.read_text())
 
 
 def course(log: Path) -> list[dict[str, Any]]:
