@@ -66,8 +66,8 @@ def make(table: Any, args: argparse.Namespace, progress: Any) -> None:
     from pd4dgs_codec.data.dataset import load
     from pd4dgs_codec.report.paper.runs import Run, held_to, measure
 
-    iterations = args.iterations or table.iterations
-    scenes = [scene(name, iterations) for name in args.scenes or table.scenes]
+    preset, iterations = table.budget or (None, None)
+    scenes = [scene(name, preset, args.iterations or iterations) for name in args.scenes or table.scenes]
     absent = [s.name for s in scenes if s.config.source.startswith(str(SHARED)) and not Path(s.config.source).is_dir()]
     for name in absent:
         print(f"{table.name}: {name} is not in {SHARED}, left out")
@@ -99,8 +99,8 @@ def _say(label: str, text: str) -> None:
     print(f"{label}: {text}", flush=True)
 
 
-def scene(name: str, iterations: int | None) -> Any:
-    """A scene by its name, or by SOURCE[@K]. iterations: instead of its own."""
+def scene(name: str, preset: str | None, iterations: int | None) -> Any:
+    """A scene by its name, or by SOURCE[@K]. preset, iterations: instead of its own."""
     from pd4dgs_codec.errors import DataError
     from pd4dgs_codec.report.paper.runs import Scene
     from pd4dgs_codec.train.config import TrainConfig
@@ -109,7 +109,7 @@ def scene(name: str, iterations: int | None) -> Any:
     if at and not (downscale.isdecimal() and int(downscale)):
         raise DataError(f"{name}: found {downscale!r} behind @, expected an integer >= 1")
     row = SCENES.get(name, (source, int(downscale or 1), *OTHERS))
-    config = TrainConfig(preset=row[2], source=row[0], downscale=row[1], iterations=iterations or row[3])
+    config = TrainConfig(preset=preset or row[2], source=row[0], downscale=row[1], iterations=iterations or row[3])
     return Scene(name if name in SCENES else Path(source).name.replace(":", "-"), config, row[4])
 
 

@@ -41,7 +41,8 @@ def result(scene="local", variant="full", seed=0, psnr=(20.0, 22.0, 23.0), sizes
     pi = [{"iteration": i, "rho": 0.1 * i, "pi": [0.3, 0.3, 0.4]} for i in range(3)]
     whole = {
         "scene": scene, "variant": variant, "seed": seed, "iterations": 9, "seconds": 1.0, "rho": 0.2, "anchors": 12,
-        "active": [10, 11, 12], "pi": pi, "levels": levels, "config": {"preset": "tiny", "rate_scale": 0.1},
+        "active": [10, 11, 12], "pi": pi, "levels": levels,
+        "gap_by_motion": [0.01, 0.2], "config": {"preset": "tiny", "rate_scale": 0.1},
     }  # fmt: skip
     return whole | changes
 
@@ -154,6 +155,7 @@ def test_runs_are_made_once_and_again_when_settings_change(small, tmp_path, data
     assert [row["level"] for row in scaffold["levels"]] == [0]
     assert [row["level"] for row in mono["levels"]] == [2]
     assert mono["levels"][0]["cumulative_bytes"] > full["levels"][-1]["cumulative_bytes"]
+    assert scaffold["gap_by_motion"] is None and len(full["gap_by_motion"]) == 2
     assert len(full["pi"]) and full["config"]["rollout"] == "adaptive" and mono["config"]["rollout"] == "top"
     begun = len(said)
     assert made(FULL) == full and len(said) == begun, "a kept result was made again"

@@ -162,15 +162,18 @@ def rates(results: Sequence[Result], path: Path) -> None:
 
 
 def rho(results: Sequence[Result], path: Path) -> None:
-    """rho, and pi of the highest level, over training."""
+    """rho, and pi of the highest level, over training; scenes by marker, rate weights by line."""
     figure_, axes = _panels(2, width=5.2)
-    for marker, run in zip(MARKERS, results, strict=False):
-        iterations = [p["iteration"] for p in run["pi"]]
-        label = f"{run['scene']}, rate scale {run['config']['rate_scale']:g}"
-        style = {"color": "black", "mfc": "white", "ms": 5, "lw": 1, "markevery": 12, "label": label}
-        line = "-" if run["scene"] == results[0]["scene"] else "--"
-        axes[0].plot(iterations, [p["rho"] for p in run["pi"]], line + marker, **style)
-        axes[1].plot(iterations, [p["pi"][2] for p in run["pi"]], line + marker, **style)
+    scales = sorted({run["config"]["rate_scale"] for run in results})
+    for marker, (scene, runs) in zip(MARKERS, _by(results, "scene").items(), strict=False):
+        for run in runs:
+            scale = run["config"]["rate_scale"]
+            line = ("-", "--")[scales.index(scale) > 0]
+            label = f"{scene}, rate scale {scale:g}"
+            style = {"color": "black", "mfc": "white", "ms": 5, "lw": 1, "markevery": 3, "label": label}
+            iterations = [p["iteration"] for p in run["pi"]]
+            axes[0].plot(iterations, [p["rho"] for p in run["pi"]], line + marker, **style)
+            axes[1].plot(iterations, [p["pi"][2] for p in run["pi"]], line + marker, **style)
     axes[0].set_ylabel("rho")
     axes[1].set_ylabel("pi of level 2")
     for axis in axes:

@@ -9,6 +9,8 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from pd4dgs_codec.cli.files import whole_file, write_bytes
 from pd4dgs_codec.codec.encoder import encode_with_report
 from pd4dgs_codec.codec.plan import plan
@@ -28,6 +30,12 @@ from pd4dgs_codec.train.config import ABLATIONS, TrainConfig
 
 #: Training views whose pictures say what a smaller layer 0 costs.
 FITTING_VIEWS = 16
+#: Updates of rho (150 a run) from one that is kept to the next.
+COURSE_EVERY = 5
+#: Shares of the anchors, those first that move least, whose masks are looked at: the still half, the moving tenth.
+MOTION_SHARES = ((0.0, 0.5), (0.9, 1.0))
+#: Instants at which it is looked where level 1 takes an anchor.
+MOTION_INSTANTS = 13
 
 
 @dataclass(frozen=True)
@@ -93,9 +101,9 @@ def measure(
 ) -> dict[str, Any]:
     """The result of `run`, from its result.json if there is one of the same settings, else made now.
 
-    {"scene", "variant", "seed", "config", "iterations", "seconds", "anchors", "rho", "active": anchors per level, "pi":
-    what `course` reads, "levels": rows of pd4dgs-eval --perceptual}. The one level of a monolithic variant is its
-    highest, its bytes those of `monolithic_bytes`. dataset: loads the scene when needed.
+    {"scene", "variant", "seed", "config", "iterations", "seconds", "anchors", "rho", "active": anchors per level,
+    "gap_by_motion": see there, "pi": what `course` reads, "levels": rows of pd4dgs-eval --perceptual}. The one level
+    of a monolithic variant is its highest, its bytes those of `monolithic_bytes`. dataset: loads the scene when needed.
     """
     folder = run.folder(out)
     wanted = json.loads(json.dumps(run.config, default=lambda value: value.__dict__))
@@ -125,6 +133,7 @@ def measure(
         "anchors": len(model.anchor_q),
         "rho": training["rho"],
         "active": [int((model.masks(level) > MASK_THRESHOLD).sum()) for level in range(3)],
+        "gap_by_motion": gap_by_motion(model),
         "pi": course(path.with_name("train.jsonl")),
         "levels": levels,
     }
@@ -168,10 +177,27 @@ def _keep(file: Path, value: dict[str, Any]) -> dict[str, Any]:
 
 
 def course(log: Path) -> list[dict[str, Any]]:
-    """iteration, rho and pi over a run, from its log: the steps after which rho is updated."""
+    """iteration, rho and pi over a run, from its log: every COURSE_EVERY-th step after which rho is updated, and the
+    last such step."""
     keys = ("iteration", "rho", "pi")
-    records = map(json.loads, log.read_text().splitlines())
-    return [{key: record[key] for key in keys} for record in records if "active" in record]
+    records = [record for record in map(json.loads, log.read_text().splitlines()) if "active" in record]
+    kept = records[::-COURSE_EVERY][::-1]
+    return [{key: record[key] for key in keys} for record in kept]
+
+
+@torch.no_grad()
+def gap_by_motion(model: Model) -> list[float] | None:
+    """Mean m^(2) - m^(0) of the anchors in each of MOTION_SHARES, ordered by the diagonal of the box in which level 1
+    moves them; None without level 1. Over all anchors this mean is what rho follows."""
+    if model.global_deformation is None:
+        return None
+    position = model.anchor
+    instants = torch.linspace(0, 1, MOTION_INSTANTS).tolist()
+    moved = torch.stack([model.global_deformation(position, t)["position"] for t in instants])
+    order = (moved.amax(0) - moved.amin(0)).norm(dim=1).argsort()
+    gap = (model.masks(2) - model.masks(0))[order]
+    n = len(gap)
+    return [float(gap[int(low * n) : max(int(high * n), 1)].mean()) for low, high in MOTION_SHARES]
 
 
 def monolithic_bytes(model: Model) -> int:
