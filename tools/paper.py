@@ -119,14 +119,16 @@ def write(table: Any, results: list[dict[str, Any]], docs: Path) -> None:
 
     docs.mkdir(parents=True, exist_ok=True)
     table.plot(results, docs / f"{table.name}.png")
-    budgets = {r["scene"]: f"{r['scene']}: {r['config']['preset']}, {r['iterations']:,} iterations" for r in results}
+    budgets: dict[str, str] = {}
+    for r in results:
+        budgets.setdefault(r["scene"], f"{r['scene']}: {r['config']['preset']}, {r['iterations']:,} iterations")
     lines = [
         f"# {table.title}",
         "",
         *paragraph(
             f"`python tools/paper.py {table.name}`: {len(results)} trainings "
-            f"({'; '.join(budgets.values())}). Equal iterations for every row of a scene; "
-            "held-out views. Published figures are those of the paper, on other scenes."
+            f"({'; '.join(budgets.values())}). Equal iterations for every row of a scene that does not "
+            "name its own; held-out views. Published figures are those of the paper, on other scenes."
         ),
         "",
         *table.text(results),

@@ -69,7 +69,11 @@ def comparison(results: Sequence[Result], path: Path) -> None:
     figure_, axes = _panels(len(scenes))
     for axis, (scene, rows) in zip(axes, scenes.items(), strict=True):
         for marker, (variant, runs) in zip(MARKERS, _by(rows, "variant").items(), strict=False):
-            ours = {"full": "ours, its levels", "every level in every step": "every level, its levels"}
+            ours = {
+                "full": "ours, its levels",
+                "three times the steps": "thrice, its levels",
+                "every level in every step": "every level, its levels",
+            }
             shown = runs if variant in ours else [r | {"levels": r["levels"][-1:]} for r in runs]
             _quality_over_bytes(axis, shown, "-", marker, ours.get(variant, variant))
         axis.set_title(scene)

@@ -40,11 +40,13 @@ MOTION_INSTANTS = 13
 
 @dataclass(frozen=True)
 class Variant:
-    """A way to train, as changes of TrainConfig. monolithic: shipped in one piece, all tensors float32 under LZMA."""
+    """A way to train, as changes of TrainConfig. monolithic: shipped in one piece, all tensors float32 under LZMA.
+    longer: times the iterations of its scene."""
 
     name: str
     changes: dict[str, Any] = field(default_factory=dict)
     monolithic: bool = False
+    longer: int = 1
 
 
 FULL = Variant("full")
@@ -53,6 +55,8 @@ TWO_LAYER = Variant("two layers", {"max_layer": 1})
 #: The full method, but each step trains every level, with a view of its own: as many steps of each as the models made
 #: for one purpose have.
 EVERY_LEVEL = Variant("every level in every step", {"rollout": "all"})
+#: The full method, as many steps of each level by drawing levels three times as often.
+THRICE = Variant("three times the steps", longer=3)
 #: Every step trains all layers together, and nothing is spent on bytes, levels or quantisation.
 MONOLITHIC = Variant(
     "monolithic", {"rollout": "top", **ABLATIONS["rate"], **ABLATIONS["tmc"], **ABLATIONS["noise"]}, monolithic=True
@@ -87,11 +91,13 @@ class Run:
     @property
     def config(self) -> TrainConfig:
         """What it is trained with."""
-        return replace(self.scene.config, seed=self.seed, **self.variant.changes)
+        base = self.scene.config
+        iterations = base.iterations and base.iterations * self.variant.longer
+        return replace(base, seed=self.seed, iterations=iterations, **self.variant.changes)
 
     def folder(self, out: Path) -> Path:
         """Where it lies below `out`."""
-        config = self.config
+        config = self.scene.config
         budget = f"{config.preset}-{config.iterations}"
         return out / self.scene.name / budget / f"{self.variant.name.replace(' ', '-')}-{self.seed}"
 
