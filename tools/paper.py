@@ -25,7 +25,7 @@ from pd4dgs_codec.render.threads import configure
 
 SHARED = Path(os.environ.get("PD4DGS_SHARED", Path(__file__).resolve().parents[2] / "shared" / "data"))
 #: Preset, iterations and seeds at most of the synthetic scenes.
-SYNTHETIC = ("tiny", 400, 3)
+SYNTHETIC = ("tiny", 1_000, 3)
 #: name: source, downscale, preset, iterations, seeds at most. Equal iterations for all variants of a scene.
 SCENES: dict[str, tuple[str, int, str, int, int]] = {
     **{name: (f"synthetic:{name}", 1, *SYNTHETIC) for name in ("static", "global", "local", "fast")},
