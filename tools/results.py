@@ -1,4 +1,4 @@
-"""Measures what the README's tables show; writes them there and, with plot and pictures, into docs/results.md.
+"""Measures what the README's table shows; writes it there and, with coding, plot and pictures, into docs/results.md.
 
     python tools/results.py [--only NAME ...] [--out out] [--docs docs]
 
@@ -32,7 +32,7 @@ SCENES = (
 )
 #: Bytes per layer that the PD-4DGS paper publishes (average over the seven Dycheck iPhone scenes).
 PUBLISHED = (436_000, 1_187_000, 5_275_000)
-#: The tables of README.md stand between these lines.
+#: The table of README.md stands between these lines.
 MARKERS = ("<!-- results: written by tools/results.py -->", "<!-- end of results -->")
 
 
@@ -115,20 +115,20 @@ def write(results: list[dict[str, Any]], out: Path, docs: Path, threads: int) ->
         lines += [""]
     (docs / "results.md").write_text("\n".join(lines))
     if len(results) == len(SCENES):  # a partial run must not replace the whole table
-        _fill_readme(docs.parent / "README.md", [quality_table(results), coding_table(results)])
+        _fill_readme(docs.parent / "README.md", quality_table(results))
     slim = [{k: v for k, v in r.items() if k != "source"} for r in results]
     (docs / "results.json").write_text(json.dumps(slim, indent=1) + "\n")
 
 
-def _fill_readme(readme: Path, tables: list[str]) -> None:
-    """Puts the tables between the README's two result markers, if it is there and has them."""
+def _fill_readme(readme: Path, table: str) -> None:
+    """Puts the table between the README's two result markers, if it is there and has them."""
     text = readme.read_text() if readme.is_file() else ""
     if not all(text.count(marker) == 1 for marker in MARKERS):
-        say(f"{readme}: no README with result markers is there, tables not written into it")
+        say(f"{readme}: no README with result markers is there, table not written into it")
         return
     before, rest = text.split(MARKERS[0])
     after = rest.split(MARKERS[1])[1]
-    readme.write_text(before + MARKERS[0] + "\n\n" + "\n\n".join(tables) + "\n\n" + MARKERS[1] + after)
+    readme.write_text(f"{before}{MARKERS[0]}\n\n{table}\n\n{MARKERS[1]}{after}")
 
 
 def _paper_lines(result: dict[str, Any], markdown: Any) -> list[str]:
