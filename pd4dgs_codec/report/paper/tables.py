@@ -30,6 +30,8 @@ OURS = (("ours", FULL), ("thrice", THRICE), ("every level", EVERY_LEVEL))
 #: Preset and steps where masks are looked at: 0.02 to 0.05 a step, they need hundreds to go from visible to absent, and
 #: part still from moving anchors only once the deformations tell these apart.
 MASK_BUDGET = ("small", 1_500)
+#: Of the ablations, whose runs are many.
+ABLATION_BUDGET = ("tiny", 400)
 #: What the comparison promises: dB that a level may lose against the model trained for it alone, share of bytes.
 LOWER_LEVEL_LOSS, TOP_LEVEL_LOSS, TOP_SHARE, BASE_SHARE = 0.3, 0.1, 0.25, 0.10
 
@@ -335,8 +337,17 @@ TABLES = {
             sized=tuple(variant for _, variant in OURS),
             reference=SCAFFOLD,
         ),
-        Table("sampling", "Sampling of levels", (UNIFORM, FIXED, FULL), SYNTHETIC, 3, sampling, plots.seeds),
-        Table("components", "Components", (*WITHOUT, FULL), SYNTHETIC, 3, components, plots.seeds),
+        Table(
+            "sampling",
+            "Sampling of levels",
+            (UNIFORM, FIXED, FULL),
+            SYNTHETIC,
+            3,
+            sampling,
+            plots.seeds,
+            ABLATION_BUDGET,
+        ),
+        Table("components", "Components", (*WITHOUT, FULL), SYNTHETIC, 3, components, plots.seeds, ABLATION_BUDGET),
         Table("levels", "Levels", (FULL,), (*SYNTHETIC, *REAL), 3, levels, plots.levels),
         Table("latency", "First frame", (FULL, MONOLITHIC), REAL, 1, latency, plots.latency),
         Table(
