@@ -6,9 +6,10 @@
     python tools/paper.py levels --scenes recordings/kitchen@2
 
 Trains what is missing below --out (a stopped run goes on where it was, a finished one is kept by its settings), packs,
-measures on held-out views, and writes docs/paper/NAME.md, .json and .png. A scene is global, local, fast, static (the
-synthetic ones), shelf-hand or bouncing-balls (in the folder PD4DGS_SHARED names, default ../shared/data beside the
-repository), or any SOURCE that pd4dgs-train takes, with @K behind it to train on images 1/K as wide and high.
+measures on held-out views, and writes docs/paper/NAME.md, .json and .png. The method is the paper's, without --prune.
+A scene is global, local, fast, static (the synthetic ones), shelf-hand or bouncing-balls (in the folder PD4DGS_SHARED
+names, default ../shared/data beside the repository), or any SOURCE that pd4dgs-train takes, with @K behind it to train
+on images 1/K as wide and high.
 """
 
 from __future__ import annotations
@@ -25,7 +26,7 @@ from pd4dgs_codec.render.threads import configure
 
 SHARED = Path(os.environ.get("PD4DGS_SHARED", Path(__file__).resolve().parents[2] / "shared" / "data"))
 #: Preset, iterations and seeds at most of the synthetic scenes.
-SYNTHETIC = ("tiny", 1_000, 3)
+SYNTHETIC = ("tiny", 400, 3)
 #: name: source, downscale, preset, iterations, seeds at most. Equal iterations for all variants of a scene.
 SCENES: dict[str, tuple[str, int, str, int, int]] = {
     **{name: (f"synthetic:{name}", 1, *SYNTHETIC) for name in ("static", "global", "local", "fast")},
@@ -66,8 +67,7 @@ def make(table: Any, args: argparse.Namespace, progress: Any) -> None:
     from pd4dgs_codec.data.dataset import load
     from pd4dgs_codec.report.paper.runs import Run, held_to, measure
 
-    preset, iterations = table.budget or (None, None)
-    scenes = [scene(name, preset, args.iterations or iterations) for name in args.scenes or table.scenes]
+    scenes = [scene(name, table.budget, args.iterations) for name in args.scenes or table.scenes]
     absent = [s.name for s in scenes if s.config.source.startswith(str(SHARED)) and not Path(s.config.source).is_dir()]
     for name in absent:
         print(f"{table.name}: {name} is not in {SHARED}, left out")
@@ -99,8 +99,9 @@ def _say(label: str, text: str) -> None:
     print(f"{label}: {text}", flush=True)
 
 
-def scene(name: str, preset: str | None, iterations: int | None) -> Any:
-    """A scene by its name, or by SOURCE[@K]. preset, iterations: instead of its own."""
+def scene(name: str, synthetic: tuple[str, int] | None, iterations: int | None) -> Any:
+    """A scene by its name, or by SOURCE[@K]. synthetic: preset and iterations of a synthetic scene, iterations: of any
+    scene, instead of its own."""
     from pd4dgs_codec.errors import DataError
     from pd4dgs_codec.report.paper.runs import Scene
     from pd4dgs_codec.train.config import TrainConfig
@@ -108,9 +109,11 @@ def scene(name: str, preset: str | None, iterations: int | None) -> Any:
     source, at, downscale = name.partition("@")
     if at and not (downscale.isdecimal() and int(downscale)):
         raise DataError(f"{name}: found {downscale!r} behind @, expected an integer >= 1")
-    row = SCENES.get(name, (source, int(downscale or 1), *OTHERS))
-    config = TrainConfig(preset=preset or row[2], source=row[0], downscale=row[1], iterations=iterations or row[3])
-    return Scene(name if name in SCENES else Path(source).name.replace(":", "-"), config, row[4])
+    source, factor, preset, steps, seeds = SCENES.get(name, (source, int(downscale or 1), *OTHERS))
+    if synthetic and source.startswith("synthetic:"):
+        preset, steps = synthetic
+    config = TrainConfig(preset=preset, source=source, downscale=factor, iterations=iterations or steps, prune=0.0)
+    return Scene(name if name in SCENES else Path(source).name.replace(":", "-"), config, seeds)
 
 
 def write(table: Any, results: list[dict[str, Any]], docs: Path) -> None:

@@ -88,6 +88,13 @@ def parser() -> Parser:
         metavar="X",
         help="weight of the bit rate against quality (default: 0.1; 1: the paper's)",
     )
+    p.add_argument(
+        "--prune",
+        type=non_negative_float,
+        metavar="X",
+        help="half way, take out anchors whose absence adds at most this share to the squared error (default: 0.02; 0: "
+        "none)",
+    )
     p.add_argument("--max-layer", type=int, choices=(0, 1, 2), help="train without the layers above this one")
     p.add_argument(
         "--rollout",

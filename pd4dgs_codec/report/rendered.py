@@ -11,13 +11,10 @@ import torch
 from pd4dgs_codec.data.dataset import View
 from pd4dgs_codec.metrics.image import mpsnr
 from pd4dgs_codec.model.convert import from_scene
+from pd4dgs_codec.render.harm import anchor_harm
 from pd4dgs_codec.render.picture import render_image
-from pd4dgs_codec.render.rasterization import rasterization
 from pd4dgs_codec.report.frames import Frame
-from pd4dgs_codec.scene import N_OFFSETS, Camera, Scene
-
-#: Random pictures of signs per view from which an anchor's weight is estimated.
-PROBES = 2
+from pd4dgs_codec.scene import Camera, Scene
 
 
 class RenderedLoss:
@@ -43,41 +40,16 @@ class RenderedLoss:
         return float(np.mean(list(self.mse(scene).values())))
 
     def harm(self, scene: Scene, level: int) -> np.ndarray:
-        """float64 [N]: the squared error, summed over pictures and colours, of leaving out an anchor at `level`, about.
-
-        The squared norm of the picture's derivative by a gate g on the anchor's opacities and scales, times its change
-        from 1 to 0: ||dI/dg||^2, the diagonal of the Gauss-Newton matrix, from products with random signs (Bekas,
-        Kokiopoulou and Saad, An estimator for the diagonal of a matrix, 2007). Infinite where no picture comes near the
-        anchor, so that nothing is known of it.
-        """
+        """float64 [N]: the squared error, summed over pictures and colours, of leaving out an anchor at `level`, about;
+        see `anchor_harm`. Infinite where no picture comes near the anchor, so that nothing is known of it."""
         model = from_scene(scene)
         total, met = np.zeros(len(scene.anchor_q)), np.zeros(len(scene.anchor_q), bool)
         generator = torch.Generator().manual_seed(0)
         for frame in self.frames:
             viewmat, K, camera = *_tensors(frame.camera), frame.camera
-            with torch.no_grad():
-                g = model.gaussians(level, frame.time, viewmat, K, camera.width, camera.height)
-            met[g.anchors.numpy()] = True
-            owner = g.slots // N_OFFSETS
-            gate = torch.ones(len(total), requires_grad=True)
-            shown = gate[owner]
-            images, _, _ = rasterization(
-                g.means,
-                g.quats,
-                g.scales * shown[:, None],
-                g.opacities * shown,
-                g.colors,
-                viewmat[None],
-                K[None],
-                camera.width,
-                camera.height,
-                near_plane=max(float(model.info.near), 1e-6),
-                backgrounds=torch.tensor([model.info.background], dtype=torch.float32),
-            )
-            for _ in range(PROBES):
-                signs = torch.randint(0, 2, images.shape, generator=generator).float() * 2 - 1
-                (slope,) = torch.autograd.grad((images * signs).sum(), gate, retain_graph=True)
-                total += slope.double().square().numpy() / PROBES
+            harm, near, _ = anchor_harm(model, level, frame.time, viewmat, K, camera.width, camera.height, generator)
+            total += harm.numpy()
+            met |= near.numpy()
             self.step()
         return np.where(met, total, np.inf)
 

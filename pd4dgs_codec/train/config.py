@@ -16,6 +16,9 @@ DEFAULT_ITERATIONS = {"tiny": 3_000, "small": 10_000, "paper": 15_000}
 #: the cost.
 ROLLOUTS = ("adaptive", "uniform", "fixed", "top", "all")
 
+#: Rounds in which anchors that the pictures hardly need are taken out; each anchor may leave in one of them.
+PRUNING_ROUNDS = 4
+
 #: Parts of the method that an ablation takes out, as the fields of `TrainConfig` that do so.
 ABLATIONS: dict[str, dict[str, Any]] = {
     "rate": {"rate_scale": 0.0},
@@ -27,7 +30,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
 }
 
 #: What checkpoints that lack these fields were trained with, where it is not what has become their default.
-BEFORE: dict[str, Any] = {"judge": False, "tmc_binary_growth": 1.0}
+BEFORE: dict[str, Any] = {"judge": False, "tmc_binary_growth": 1.0, "prune": 0.0}
 
 
 @dataclass(frozen=True)
@@ -79,6 +82,8 @@ class TrainConfig:
     #: layers above it are not there: 0 is a static scaffold, 1 a scaffold and its global deformation
     max_layer: int = 2
     judge: bool = True  #: leave out levels that gain nothing on training views not seen yet, see `judge`
+    #: where growing ends, anchors leave whose absence adds this share at most to the squared error; see `pruning`
+    prune: float = 0.02
     ssim: float = 0.2
     volume: float = 0.01  #: weight of the mean product of scales (Scaffold-GS)
     noise: bool = True  #: imitate quantisation: noise on attributes, rounding of planes and weights, at last of all
@@ -98,6 +103,8 @@ class TrainConfig:
             raise TrainError(f"max-seconds must be positive, found {self.max_seconds}")
         if not 0 <= self.seed <= 2**63 - 2:  # the next one seeds the noise
             raise TrainError(f"seed {self.seed} is out of range; expected an integer from 0 to 2^63 - 2")
+        if not 0 <= self.prune <= 1:
+            raise TrainError(f"prune must be from 0 to 1, found {self.prune}")
         if self.rollout not in ROLLOUTS:
             raise TrainError(f"rollout {self.rollout!r} is unknown; expected one of {', '.join(ROLLOUTS)}")
         if self.max_layer not in (0, 1, 2):
@@ -144,6 +151,12 @@ class Schedule:
         """Iterations after which anchors are grown and pruned."""
         every = max(20, self._at(1 / 100))
         return range(self._at(1 / 60) + every, self._at(1 / 2) + 1, every)
+
+    @property
+    def prune(self) -> range:
+        """Iterations before which anchors that the pictures hardly need are taken out: growing has ended."""
+        every = max(1, self._at(1 / 50))
+        return range(self.grow.stop, self.grow.stop + PRUNING_ROUNDS * every, every)
 
     @property
     def rounding(self) -> int:

@@ -87,6 +87,11 @@ class Densifier:
         for name, value in self.state().items():
             setattr(self, name, torch.cat([value[keep], value.new_zeros(added, *value.shape[1:])]))
 
+    def keep(self, rows: Tensor) -> None:
+        """The anchors `rows` (int64) stay, the others have gone."""
+        for name, value in self.state().items():
+            setattr(self, name, value[rows.cpu()])
+
     def _new_cells(self, model: Model, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """(int64 [n, 4] voxel cell and cell size, float [n, 32] feature) of free cells, the strongest pull first."""
         mean_pull = (self.pull / self.visits.clamp(min=1)).flatten()

@@ -28,7 +28,7 @@ from pd4dgs_codec.model.config import PRESETS
 from pd4dgs_codec.model.model import EXACT, Noise, Rounding
 from pd4dgs_codec.render.picture import Picture, render, render_image
 from pd4dgs_codec.scene import MASK_THRESHOLD
-from pd4dgs_codec.train import judge, losses
+from pd4dgs_codec.train import judge, losses, pruning
 from pd4dgs_codec.train.config import DEFAULT_ITERATIONS, PlaneWeights, Schedule, TrainConfig
 from pd4dgs_codec.train.densify import Densifier
 from pd4dgs_codec.train.initialise import fresh_model
@@ -133,12 +133,15 @@ class Trainer:
         """One training step; returns its log record (every term unweighted)."""
         schedule = Schedule(self.total or 10**9)
         judged = self._judge_levels(schedule)
+        left = self._prune(schedule)
         levels, probabilities = self._draw_levels(schedule)
         drawn = [(self._next_view(schedule), level) for level in levels]
         rounding = self._rounding(schedule)
         record: dict[str, Any] = {"iteration": self.iteration, "level": levels[-1]}
         if judged:
             record |= {"judged_psnr": judged, "left_out": self.left_out}
+        if left:
+            record["left_model"], record["left_level_0"] = left
         if not self._learn(drawn, schedule, rounding, record):
             self.skipped += 1
             record["skipped"] = self.skipped
@@ -307,6 +310,25 @@ class Trainer:
             judge.leave_out(self.model, self.optimiser, level)
         self.left_out = [{"level": level, "gain": gain, "views": len(waiting)} for level, gain in found]
         return psnr
+
+    def _prune(self, schedule: Schedule) -> list[int]:
+        """Where growing has ended: takes out what the pictures hardly need, in a few rounds. Returns how many anchors
+        left the model and how many left layer 0."""
+        due = self.total >= pruning.MIN_ITERATIONS and self.iteration in schedule.prune
+        if not (self.config.prune and due):
+            return []
+        turn = schedule.prune.index(self.iteration)
+        waiting, views = self._waiting_views(), self.dataset.train
+        indices = [i for i in range(len(views)) if i not in waiting]
+        stride = -(-len(indices) // pruning.VIEWS)
+        shots = [(views[i], *self._targets[i]) for i in indices[turn % stride :: stride]]
+        levels = range(self.model.level if self.config.rollout == "top" else 0, self.model.level + 1)
+        before, share = len(self.model.anchor_q), self.config.prune / len(schedule.prune)
+        rounding = self._rounding(schedule)
+        keep, later = pruning.prune(self.model, self.optimiser, shots, levels, share, turn, rounding)
+        self.densifier.keep(keep)
+        self.neighbours = None
+        return [before - len(keep), later]
 
     def _target(self, view: View) -> tuple[Tensor, Tensor, TargetStats]:
         viewmat, K = (torch.as_tensor(np.array(m, np.float32), device=self.device) for m in (view.viewmat, view.K))

@@ -64,6 +64,11 @@ class Optimiser:
             setattr(self.model, name, new)
         self.model.anchor_q = torch.cat([self.model.anchor_q[keep], added["anchor_q"]])
 
+    def keep_anchors(self, keep: Tensor) -> None:
+        """Keeps the anchors `keep` (int64) alone."""
+        names = (*PER_ANCHOR, "anchor_q")
+        self.replace_anchors(keep, {name: getattr(self.model, name).detach()[:0] for name in names})
+
     def forget(self, module: nn.Module) -> None:
         """Takes the parameters of `module` out, and groups that hold no others."""
         gone = {id(p) for p in module.parameters()}

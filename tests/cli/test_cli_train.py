@@ -57,11 +57,13 @@ def test_train_reports_and_logs(train, tmp_path, shared_dataset):
 
 def test_options_reach_the_configuration(train, tmp_path):
     options = ("--seed", 7, "--downscale", 2, "--holdout", 3, "--rate-scale", 0.5, "--rollout", "fixed")
-    options += ("--without", "noise", "--without", "tmc", "--max-layer", 1)
+    options += ("--without", "noise", "--without", "tmc", "--max-layer", 1, "--prune", 0.1)
     assert train(tmp_path / "m.pt", *options, iterations=1).code == 0
     config = json.loads(checkpoint.load(tmp_path / "m.pt")[1]["config"])
-    found = [config[k] for k in ("seed", "downscale", "holdout", "rate_scale", "rollout", "preset", "max_layer")]
-    assert found == [7, 2, 3, 0.5, "fixed", "tiny", 1]
+    found = [
+        config[k] for k in ("seed", "downscale", "holdout", "rate_scale", "rollout", "preset", "max_layer", "prune")
+    ]
+    assert found == [7, 2, 3, 0.5, "fixed", "tiny", 1, 0.1]
     assert not (config["noise"] or config["tmc_binary"] or config["tmc_smooth"])
 
 

@@ -1,0 +1,98 @@
+"""Anchors that the pictures hardly need: once growing has ended they leave the model, or layer 0.
+
+Growing makes more anchors than a scene can use, and the masks do not tell which: the rate presses on all alike, and a
+small mask is not a small loss. So what an anchor is worth is measured, by the harm of its absence in training views.
+Where many share a place each is needless, but not all of them: in each of several rounds only a part of the anchors,
+scattered over the scene, may leave, and what is left is measured anew.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+from pd4dgs_codec.data.dataset import View
+from pd4dgs_codec.model.layers import mask_logits
+from pd4dgs_codec.model.model import Model, Rounding
+from pd4dgs_codec.render.harm import anchor_harm
+from pd4dgs_codec.train.config import PRUNING_ROUNDS
+from pd4dgs_codec.train.optimiser import Optimiser
+from pd4dgs_codec.train.ssim import TargetStats
+
+#: Training views in which it is measured, in each round others.
+VIEWS = 24
+#: Shorter runs have not learnt half way what they will need.
+MIN_ITERATIONS = 500
+#: Mask of an anchor at a level that it has left: under the threshold, so that it is neither drawn there nor sent.
+GONE = 1e-3
+
+Shot = tuple[View, Tensor, Tensor, TargetStats]  #: a view, its viewmat and K as tensors, its image
+
+
+def prune(
+    model: Model,
+    optimiser: Optimiser,
+    shots: Sequence[Shot],
+    levels: Sequence[int],
+    share: float,
+    turn: int,
+    rounding: Rounding,
+) -> tuple[Tensor, int]:
+    """Takes out the anchors whose absence together adds `share` at most to the squared error of any of `levels`, then
+    out of level 0 those that add as much there and are needed above it; only anchors whose `turns` is `turn`.
+
+    Returns int64 [n], the anchors that stayed, and how many of them left level 0. Anchors that no shot comes near stay.
+    """
+    harms = torch.stack([relative_harm(model, level, shots, rounding) for level in levels])
+    harms[:, turns(model.anchor_q) != turn] = torch.inf
+    keep = (~least(harms.amax(0), share)).nonzero()[:, 0]
+    optimiser.keep_anchors(keep)
+    if levels[0] > 0 or model.level == 0:
+        return keep, 0
+    later = least(harms[0, keep], share)
+    _leave_level_0(model, later)
+    return keep, int(later.sum())
+
+
+def relative_harm(model: Model, level: int, shots: Sequence[Shot], rounding: Rounding) -> Tensor:
+    """float64 [N]: the squared error that the absence of each anchor at `level` would add, about, over what there is.
+    Infinite where no shot comes near it."""
+    n, device = len(model.anchor_q), model.feature.device
+    total = torch.zeros(n, dtype=torch.float64, device=device)
+    met = torch.zeros(n, dtype=torch.bool, device=device)
+    rounding, error = replace(rounding, noise=None), 0.0
+    generator = torch.Generator().manual_seed(0)
+    for view, viewmat, K, target in shots:
+        place = (level, view.time, viewmat, K, view.width, view.height)
+        harm, near, image = anchor_harm(model, *place, generator, weights=target.weights, rounding=rounding)
+        total += harm
+        met |= near
+        error += float(((image - target.image).square().sum(-1) * target.weights).sum())
+    return torch.where(met, total / max(error, 1e-12), torch.inf)
+
+
+def turns(anchor_q: Tensor) -> Tensor:
+    """int64 [N], 0 .. PRUNING_ROUNDS - 1: the round in which each anchor may leave. A hash of its voxel, so that it is
+    the same in every round (Teschner et al., Optimized spatial hashing for collision detection, 2003)."""
+    x, y, z = anchor_q.to(torch.int64).unbind(1)
+    return (((x * 73856093) ^ (y * 19349663) ^ (z * 83492791)) >> 8) % PRUNING_ROUNDS
+
+
+def least(harm: Tensor, share: float) -> Tensor:
+    """bool [N]: the anchors of least harm, `share` at most together. harm: float64 [N] >= 0, may be infinite."""
+    order = harm.argsort(stable=True)
+    found = torch.zeros(len(harm), dtype=torch.bool, device=harm.device)
+    found[order[harm[order].cumsum(0) <= share]] = True
+    return found
+
+
+@torch.no_grad()
+def _leave_level_0(model: Model, rows: Tensor) -> None:
+    """The anchors `rows` (bool [N]) are there from level 1 on only; their masks at levels 1 and 2 stay."""
+    masks = torch.stack([model.masks(level) for level in range(3)], dim=1)[rows]
+    masks[:, 0] = GONE
+    logits = torch.from_numpy(mask_logits(masks.cpu().numpy()))
+    model.mask_logits[rows] = logits.to(model.mask_logits)
