@@ -126,11 +126,11 @@ def test_a_layer_that_explains_the_pictures_is_kept(scene):
 
 def test_harm_is_about_the_error_that_leaving_an_anchor_out_makes(scene, monkeypatch):
     from pd4dgs_codec.codec.plan import full_masks, plan
-    from pd4dgs_codec.report import rendered
+    from pd4dgs_codec.render import harm as harm_of
     from pd4dgs_codec.report.frames import own_frames
     from pd4dgs_codec.report.rendered import RenderedLoss
 
-    monkeypatch.setattr(rendered, "PROBES", 64)  # the anchors differ less here than in a trained scene
+    monkeypatch.setattr(harm_of, "PROBES", 64)  # the anchors differ less here than in a trained scene
     planned = plan(scene)[0]
     loss = RenderedLoss(planned, own_frames(planned.info, 2, 20.0))
     harm = loss.harm(planned, 0)
