@@ -92,7 +92,7 @@ def parser() -> Parser:
         "--prune",
         type=non_negative_float,
         metavar="X",
-        help="half way, take out anchors whose absence adds at most this share to the squared error (default: 0.02; 0: "
+        help="half way, take out anchors whose absence adds at most this share to the squared error (default: 0.01; 0: "
         "none)",
     )
     p.add_argument("--max-layer", type=int, choices=(0, 1, 2), help="train without the layers above this one")

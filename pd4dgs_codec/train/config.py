@@ -83,7 +83,7 @@ class TrainConfig:
     max_layer: int = 2
     judge: bool = True  #: leave out levels that gain nothing on training views not seen yet, see `judge`
     #: where growing ends, anchors leave whose absence adds this share at most to the squared error; see `pruning`
-    prune: float = 0.02
+    prune: float = 0.01
     ssim: float = 0.2
     volume: float = 0.01  #: weight of the mean product of scales (Scaffold-GS)
     noise: bool = True  #: imitate quantisation: noise on attributes, rounding of planes and weights, at last of all
