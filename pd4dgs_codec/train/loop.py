@@ -325,7 +325,10 @@ class Trainer:
         levels = range(self.model.level if self.config.rollout == "top" else 0, self.model.level + 1)
         before, share = len(self.model.anchor_q), self.config.prune / len(schedule.prune)
         rounding = self._rounding(schedule)
-        keep, later = pruning.prune(self.model, self.optimiser, shots, levels, share, turn, rounding)
+        try:
+            keep, later = pruning.prune(self.model, self.optimiser, shots, levels, share, turn, rounding)
+        except NotFinite:  # as a step that diverged: passed over, with nothing changed
+            return []
         self.densifier.keep(keep)
         self.neighbours = None
         return [before - len(keep), later]

@@ -10,6 +10,7 @@ pytest.importorskip("numba")
 
 from test_loop import dataset, few_anchors  # noqa: E402, F401 - fixtures
 
+from pd4dgs_codec.errors import NotFinite  # noqa: E402
 from pd4dgs_codec.model import checkpoint  # noqa: E402
 from pd4dgs_codec.model.model import EXACT  # noqa: E402
 from pd4dgs_codec.render.picture import render_image  # noqa: E402
@@ -113,6 +114,17 @@ def test_a_run_prunes_half_way_and_resumes_with_the_same_bits(dataset, tmp_path,
         rest.run(tmp_path / "rest.pt")
         a, b = (checkpoint.load(tmp_path / f"{name}.pt")[0].state_dict() for name in ("whole", "rest"))
         assert all(torch.equal(a[k], b[k]) for k in a)
+
+
+def test_a_round_that_meets_infinity_is_passed_over(dataset, tmp_path, monkeypatch):  # noqa: F811
+    def diverged(*_, **__):
+        raise NotFinite("colors: found inf")
+
+    monkeypatch.setattr(pruning, "MIN_ITERATIONS", 10)
+    monkeypatch.setattr(pruning, "anchor_harm", diverged)
+    trainer = Trainer(TrainConfig(preset="tiny", iterations=30, prune=0.5), dataset)
+    trainer.run(tmp_path / "m.pt", log=tmp_path / "log.jsonl")
+    assert trainer.iteration == 30 and "left_model" not in (tmp_path / "log.jsonl").read_text()
 
 
 def test_short_runs_are_not_pruned(dataset, tmp_path):  # noqa: F811
