@@ -6,10 +6,10 @@
     python tools/paper.py levels --scenes recordings/kitchen@2
 
 Trains what is missing below --out (a stopped run goes on where it was, a finished one is kept by its settings), packs,
-measures on held-out views, and writes docs/paper/NAME.md, .json and .png. The method is the paper's, without --prune.
-A scene is global, local, fast, static (the synthetic ones), shelf-hand or bouncing-balls (in the folder PD4DGS_SHARED
-names, default ../shared/data beside the repository), or any SOURCE that pd4dgs-train takes, with @K behind it to train
-on images 1/K as wide and high.
+measures on held-out views, and writes docs/paper/NAME.md, .json and .png. The method is the paper's: no anchor is pruned
+by its harm, and learning rates do not cool down. A scene is global, local, fast, static (the
+synthetic ones), shelf-hand or bouncing-balls (in the folder PD4DGS_SHARED names, default ../shared/data beside the
+repository), or any SOURCE that pd4dgs-train takes, with @K behind it to train on images 1/K as wide and high.
 """
 
 from __future__ import annotations
@@ -112,7 +112,8 @@ def scene(name: str, synthetic: tuple[str, int] | None, iterations: int | None) 
     source, factor, preset, steps, seeds = SCENES.get(name, (source, int(downscale or 1), *OTHERS))
     if synthetic and source.startswith("synthetic:"):
         preset, steps = synthetic
-    config = TrainConfig(preset=preset, source=source, downscale=factor, iterations=iterations or steps, prune=0.0)
+    method = {"prune": 0.0, "cooldown": 0.0}  # the paper's does neither
+    config = TrainConfig(preset=preset, source=source, downscale=factor, iterations=iterations or steps, **method)
     return Scene(name if name in SCENES else Path(source).name.replace(":", "-"), config, seeds)
 
 

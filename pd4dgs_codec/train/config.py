@@ -30,7 +30,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
 }
 
 #: What checkpoints that lack these fields were trained with, where it is not what has become their default.
-BEFORE: dict[str, Any] = {"judge": False, "tmc_binary_growth": 1.0, "prune": 0.0}
+BEFORE: dict[str, Any] = {"judge": False, "tmc_binary_growth": 1.0, "prune": 0.0, "cooldown": 0.0}
 
 
 @dataclass(frozen=True)
@@ -84,6 +84,9 @@ class TrainConfig:
     judge: bool = True  #: leave out levels that gain nothing on training views not seen yet, see `judge`
     #: where growing ends, anchors leave whose absence adds this share at most to the squared error; see `pruning`
     prune: float = 0.01
+    #: share of the run, at its end, over which all learning rates fall to 0 besides: else the last steps carry weights
+    #: over the edges of their rounding intervals, and pictures change by tenths of a dB from one step to the next
+    cooldown: float = 0.1
     ssim: float = 0.2
     volume: float = 0.01  #: weight of the mean product of scales (Scaffold-GS)
     noise: bool = True  #: imitate quantisation: noise on attributes, rounding of planes and weights, at last of all
@@ -103,8 +106,9 @@ class TrainConfig:
             raise TrainError(f"max-seconds must be positive, found {self.max_seconds}")
         if not 0 <= self.seed <= 2**63 - 2:  # the next one seeds the noise
             raise TrainError(f"seed {self.seed} is out of range; expected an integer from 0 to 2^63 - 2")
-        if not 0 <= self.prune <= 1:
-            raise TrainError(f"prune must be from 0 to 1, found {self.prune}")
+        for name in ("prune", "cooldown"):
+            if not 0 <= getattr(self, name) <= 1:
+                raise TrainError(f"{name} must be from 0 to 1, found {getattr(self, name)}")
         if self.rollout not in ROLLOUTS:
             raise TrainError(f"rollout {self.rollout!r} is unknown; expected one of {', '.join(ROLLOUTS)}")
         if self.max_layer not in (0, 1, 2):
@@ -187,7 +191,9 @@ class Schedule:
         return [name for name, start in starts.items() if iteration <= start]
 
 
-def learning_rate(bounds: tuple[float, float], progress: float) -> float:
-    """Log-linear between the bounds at progress 0..1."""
+def learning_rate(bounds: tuple[float, float], progress: float, cooldown: float = 0.0) -> float:
+    """Log-linear between the bounds at progress 0..1; over the last `cooldown` of it, times what falls from 1 to 0."""
     start, end = bounds
-    return start * (end / start) ** min(max(progress, 0.0), 1.0)
+    progress = min(max(progress, 0.0), 1.0)
+    left = min((1 - progress) / cooldown, 1.0) if cooldown else 1.0
+    return start * (end / start) ** progress * left

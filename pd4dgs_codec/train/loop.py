@@ -60,7 +60,7 @@ class Trainer:
             torch.backends.cudnn.allow_tf32 = False
         self.model = fresh_model(preset, dataset, config.steps or preset.steps, config.seed, config.max_layer)
         self.model.to(self.device)
-        self.optimiser = Optimiser(self.model, config.rates)
+        self.optimiser = Optimiser(self.model, config.rates, config.cooldown)
         self.densifier = Densifier(self.model, config.grow_threshold, preset.max_anchors)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.noise = Noise(config.seed + 1, self.device)
@@ -430,7 +430,7 @@ class Trainer:
         if "optimiser" not in training:
             raise TrainError(f"{path}: holds no training state (it was decoded or stripped); cannot resume from it")
         self.model = model.to(self.device)
-        self.optimiser = Optimiser(self.model, self.config.rates)
+        self.optimiser = Optimiser(self.model, self.config.rates, self.config.cooldown)
         try:
             self._restore(training)
         except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:

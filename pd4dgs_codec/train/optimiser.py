@@ -17,8 +17,8 @@ PER_ANCHOR = ("feature", "scaling_log", "offset", "mask_logits")
 class Optimiser:
     """One Adam with a group per learning-rate schedule; groups are named after the fields of LearningRates."""
 
-    def __init__(self, model: Model, rates: LearningRates):
-        self.model, self.rates = model, rates
+    def __init__(self, model: Model, rates: LearningRates, cooldown: float = 0.0):
+        self.model, self.rates, self.cooldown = model, rates, cooldown
         groups: dict[str, list[nn.Parameter]] = {name: [getattr(model, name)] for name in PER_ANCHOR}
         groups |= {name: list(net.parameters()) for name, net in model.networks.items()}
         fields = [f for f in (model.global_deformation, model.local_deformation) if f is not None]
@@ -35,7 +35,7 @@ class Optimiser:
     def step(self, progress: float) -> None:
         """One update at progress 0..1 of the schedule."""
         for group in self.adam.param_groups:
-            group["lr"] = learning_rate(getattr(self.rates, group["name"]), progress)
+            group["lr"] = learning_rate(getattr(self.rates, group["name"]), progress, self.cooldown)
         self.adam.step()
 
     def gradient_norm(self) -> float:

@@ -108,6 +108,8 @@ def test_masks_separate_between_the_rate_terms_and_exact_rounding():
 
 def test_learning_rates_are_log_linear():
     assert learning_rate((1e-2, 1e-4), 0.5) == pytest.approx(1e-3)
+    assert learning_rate((1e-2, 1e-4), 0.5, 0.1) == pytest.approx(1e-3)
+    assert learning_rate((1e-2, 1e-2), 0.95, 0.1) == pytest.approx(5e-3) and learning_rate((1, 1), 1.0, 0.1) == 0
 
 
 @pytest.mark.parametrize(
