@@ -6,10 +6,12 @@
     python tools/paper.py levels --scenes recordings/kitchen@2
 
 Trains what is missing below --out (a stopped run goes on where it was, a finished one is kept by its settings), packs,
-measures on held-out views, and writes docs/paper/NAME.md, .json and .png. The method is the paper's: no anchor is pruned
-by its harm, and learning rates do not cool down. A scene is global, local, fast, static (the
-synthetic ones), shelf-hand or bouncing-balls (in the folder PD4DGS_SHARED names, default ../shared/data beside the
-repository), or any SOURCE that pd4dgs-train takes, with @K behind it to train on images 1/K as wide and high.
+measures on held-out views, and writes docs/paper/NAME.md, .json and .png. The method is the paper's: no anchor is
+pruned by its harm, and learning rates do not cool down.
+
+A scene is global, local, fast, static (the synthetic ones), shelf-hand or bouncing-balls (in the folder PD4DGS_SHARED
+names, default ../shared/data beside the repository), or any SOURCE that pd4dgs-train takes, with @K behind it to train
+on images 1/K as wide and high.
 """
 
 from __future__ import annotations
