@@ -15,8 +15,9 @@ from pd4dgs_codec.train.optimiser import Optimiser
 EVERY = 16
 MIN_VIEWS = 4
 #: dB that levels 1 and 2 must gain over the one below. Views kept back lie between those learnt from, and flatter a
-#: level: on a scene where nothing moves by 0.4 dB, which cameras off the path do not confirm.
-MIN_GAIN = {1: 0.5, 2: 0.1}
+#: level: on a scene where nothing moves by 0.5 to 0.7 dB, which cameras off the path do not confirm. Where things move
+#: level 1 gains 1.4 dB and more.
+MIN_GAIN = {1: 0.9, 2: 0.1}
 MIN_ITERATIONS = 500
 
 
