@@ -18,6 +18,7 @@ from pd4dgs_codec.data.dataset import View
 from pd4dgs_codec.model.layers import mask_logits
 from pd4dgs_codec.model.model import Model, Rounding
 from pd4dgs_codec.render.harm import anchor_harm
+from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train.config import PRUNING_ROUNDS
 from pd4dgs_codec.train.optimiser import Optimiser
 from pd4dgs_codec.train.ssim import TargetStats
@@ -44,15 +45,18 @@ def prune(
     """Takes out the anchors whose absence together adds `share` at most to the squared error of any of `levels`, then
     out of level 0 those that add as much there and are needed above it; only anchors whose `turns` is `turn`.
 
-    Returns int64 [n], the anchors that stayed, and how many of them left level 0. Anchors that no shot comes near stay.
+    Returns int64 [n], the anchors that stayed, and how many of them left level 0. Anchors that no shot comes near stay,
+    and all do where none would be left: better a needless model than none.
     """
     harms = torch.stack([relative_harm(model, level, shots, rounding) for level in levels])
     harms[:, turns(model.anchor_q) != turn] = torch.inf
-    keep = (~least(harms.amax(0), share)).nonzero()[:, 0]
+    needless = least(harms.amax(0), share)
+    keep = (~needless | needless.all()).nonzero()[:, 0]
     optimiser.keep_anchors(keep)
-    if levels[0] > 0 or model.level == 0:
-        return keep, 0
     later = least(harms[0, keep], share)
+    stays = (model.masks(0) > MASK_THRESHOLD) & ~later
+    if levels[0] > 0 or model.level == 0 or not stays.any():
+        return keep, 0
     _leave_level_0(model, later)
     return keep, int(later.sum())
 

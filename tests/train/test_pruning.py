@@ -127,6 +127,14 @@ def test_a_round_that_meets_infinity_is_passed_over(dataset, tmp_path, monkeypat
     assert trainer.iteration == 30 and "left_model" not in (tmp_path / "log.jsonl").read_text()
 
 
+def test_a_scene_that_needs_no_anchor_keeps_some(dataset, tmp_path, monkeypatch):  # noqa: F811
+    monkeypatch.setattr(pruning, "MIN_ITERATIONS", 10)
+    monkeypatch.setattr(pruning, "relative_harm", lambda model, *_: torch.zeros(len(model.anchor_q)).double())
+    trainer = Trainer(TrainConfig(preset="tiny", iterations=40), dataset)
+    trainer.run(tmp_path / "m.pt")
+    assert 0 < trainer.active_anchors()[0] <= len(trainer.model.anchor_q) < 300
+
+
 def test_short_runs_are_not_pruned(dataset, tmp_path):  # noqa: F811
     trainer = Trainer(TrainConfig(preset="tiny", iterations=60, prune=0.5), dataset)
     trainer.run(tmp_path / "m.pt", log=tmp_path / "log.jsonl")
