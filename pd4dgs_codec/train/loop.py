@@ -29,7 +29,7 @@ from pd4dgs_codec.model.model import EXACT, Noise, Rounding
 from pd4dgs_codec.render.picture import Picture, render, render_image
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train import judge, losses, pruning
-from pd4dgs_codec.train.config import DEFAULT_ITERATIONS, PlaneWeights, Schedule, TrainConfig
+from pd4dgs_codec.train.config import DEFAULT_ITERATIONS, PRUNING_ROUNDS, PlaneWeights, Schedule, TrainConfig
 from pd4dgs_codec.train.densify import Densifier
 from pd4dgs_codec.train.initialise import fresh_model
 from pd4dgs_codec.train.optimiser import Optimiser
@@ -353,6 +353,8 @@ class Trainer:
         mean = coarse * costs[0] + (1 - coarse) * later
         left = TIME_SHARE * self.config.max_seconds - (time.monotonic() - start)
         left -= CURVE_POINTS * CURVE_VIEWS * sum(costs) / 3
+        if self.config.prune:  # to measure a harm takes about a quarter of a step
+            left -= PRUNING_ROUNDS * pruning.VIEWS * sum(costs) / 4
         self.total = max(LEAST_TIMED_TOTAL, self.iteration + int(left / (mean * LATER_COST)))
         self.config = replace(self.config, iterations=self.total)
 
