@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import torch
 from torch import Tensor
 
 from pd4dgs_codec.model.model import EXACT, Model, Rounding
-from pd4dgs_codec.render.rasterization import rasterization
+from pd4dgs_codec.render.picture import draw
 from pd4dgs_codec.scene import N_OFFSETS
 
 #: Random pictures of signs per view from which an anchor's weight is estimated.
@@ -42,23 +44,12 @@ def anchor_harm(
     met[g.anchors] = True
     gate = torch.ones(n, device=device, requires_grad=True)
     shown = gate[torch.div(g.slots, N_OFFSETS, rounding_mode="floor")]
-    images, _, _ = rasterization(
-        g.means,
-        g.quats,
-        g.scales * shown[:, None],
-        g.opacities * shown,
-        g.colors,
-        viewmat[None],
-        K[None],
-        width,
-        height,
-        near_plane=max(float(model.info.near), 1e-6),
-        backgrounds=torch.tensor([model.info.background], dtype=torch.float32, device=device),
-    )
+    gated = replace(g, scales=g.scales * shown[:, None], opacities=g.opacities * shown)
+    image = draw(model.info, gated, viewmat, K, width, height).image
     for _ in range(PROBES):
-        signs = (torch.randint(0, 2, images.shape, generator=generator).float() * 2 - 1).to(device)
+        signs = (torch.randint(0, 2, image.shape, generator=generator).float() * 2 - 1).to(device)
         if weights is not None:
-            signs = signs * weights.sqrt()[None, :, :, None]
-        (slope,) = torch.autograd.grad((images * signs).sum(), gate, retain_graph=True)
+            signs = signs * weights.sqrt()[:, :, None]
+        (slope,) = torch.autograd.grad((image * signs).sum(), gate, retain_graph=True)
         total += slope.double().square() / PROBES
-    return total, met, images[0].detach()
+    return total, met, image.detach()

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -11,6 +11,7 @@ from torch import Tensor
 
 from pd4dgs_codec.model.model import EXACT, Gaussians, Model, Rounding
 from pd4dgs_codec.render.rasterization import rasterization
+from pd4dgs_codec.scene import SceneInfo
 
 
 @dataclass
@@ -35,22 +36,28 @@ def render(
 ) -> Picture:
     """Render_level at normalised time t in 0..1; viewmat [4, 4] world to camera, K [3, 3] pixels."""
     gaussians = model.gaussians(level, t, viewmat, K, width, height, rounding)
-    opacities, colors = gaussians.opacities, gaussians.colors
-    if not torch.is_grad_enabled():  # a colour that overflowed hides its Gaussian; training refuses the step instead
-        opacities = torch.where(colors.isfinite().all(1), opacities, 0.0)
-        colors = colors.nan_to_num()
-    background = torch.tensor([model.info.background], dtype=torch.float32, device=viewmat.device)
+    if torch.is_grad_enabled():
+        return draw(model.info, gaussians, viewmat, K, width, height)
+    # a colour that overflowed hides its Gaussian; training refuses the step instead
+    opacities = torch.where(gaussians.colors.isfinite().all(1), gaussians.opacities, 0.0)
+    shown = replace(gaussians, opacities=opacities, colors=gaussians.colors.nan_to_num())
+    return replace(draw(model.info, shown, viewmat, K, width, height), gaussians=gaussians)
+
+
+def draw(info: SceneInfo, gaussians: Gaussians, viewmat: Tensor, K: Tensor, width: int, height: int) -> Picture:
+    """The picture of `gaussians` over the scene's background; camera as for `render`."""
+    background = torch.tensor([info.background], dtype=torch.float32, device=viewmat.device)
     images, alphas, meta = rasterization(
         gaussians.means,
         gaussians.quats,
         gaussians.scales,
-        opacities,
-        colors,
+        gaussians.opacities,
+        gaussians.colors,
         viewmat[None],
         K[None],
         width,
         height,
-        near_plane=max(float(model.info.near), 1e-6),
+        near_plane=max(float(info.near), 1e-6),
         backgrounds=background,
     )
     return Picture(images[0], alphas[0, ..., 0], gaussians, meta)

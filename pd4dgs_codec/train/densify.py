@@ -84,13 +84,12 @@ class Densifier:
         judged = self.visits >= MIN_SLOT_VISITS
         self.pull[judged] = 0
         self.visits[judged] = 0
-        for name, value in self.state().items():
-            setattr(self, name, torch.cat([value[keep], value.new_zeros(added, *value.shape[1:])]))
+        self.keep(keep, added)
 
-    def keep(self, rows: Tensor) -> None:
-        """The anchors `rows` (int64) stay, the others have gone."""
+    def keep(self, rows: Tensor, added: int = 0) -> None:
+        """The anchors `rows` (int64) stay, the others have gone; `added` new ones follow."""
         for name, value in self.state().items():
-            setattr(self, name, value[rows.cpu()])
+            setattr(self, name, torch.cat([value[rows.cpu()], value.new_zeros(added, *value.shape[1:])]))
 
     def _new_cells(self, model: Model, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """(int64 [n, 4] voxel cell and cell size, float [n, 32] feature) of free cells, the strongest pull first."""

@@ -75,20 +75,26 @@ def test_it_learns_and_logs_every_term(dataset, tmp_path):
     assert any("held_out_psnr" in r for r in records)
 
 
-def test_resuming_repeats_the_run_bit_for_bit(dataset, tmp_path):
-    config = TrainConfig(preset="tiny", iterations=60)
-    Trainer(config, dataset).run(tmp_path / "whole.pt")
-    for cut in (25, 41):  # inside growing, and inside the progressive phase
+def assert_resumes_bit_for_bit(config, dataset, folder, cuts):
+    """Runs cut before each of the steps `cuts` and resumed end as the one in folder/whole.pt."""
+    for cut in cuts:
         part = Trainer(config, dataset)
         for _ in range(cut):
             part.step()
-        part.save(tmp_path / "part.pt")
+        part.save(folder / "part.pt")
         resumed = Trainer(config, dataset)
-        resumed.resume(tmp_path / "part.pt")
-        resumed.run(tmp_path / "resumed.pt")
-        whole, again = weights(tmp_path / "whole.pt"), weights(tmp_path / "resumed.pt")
+        resumed.resume(folder / "part.pt")
+        resumed.run(folder / "resumed.pt")
+        whole, again = weights(folder / "whole.pt"), weights(folder / "resumed.pt")
         assert whole.keys() == again.keys()
         assert all(torch.equal(whole[k], again[k]) for k in whole), cut
+
+
+def test_resuming_repeats_the_run_bit_for_bit(dataset, tmp_path):
+    config = TrainConfig(preset="tiny", iterations=60)
+    Trainer(config, dataset).run(tmp_path / "whole.pt")
+    # inside growing, and inside the progressive phase
+    assert_resumes_bit_for_bit(config, dataset, tmp_path, (25, 41))
 
 
 @pytest.mark.parametrize("max_layer", [0, 1])

@@ -8,10 +8,9 @@ import pytest
 torch = pytest.importorskip("torch")
 pytest.importorskip("numba")
 
-from test_loop import dataset, few_anchors  # noqa: E402, F401 - fixtures
+from test_loop import assert_resumes_bit_for_bit, dataset, few_anchors  # noqa: E402, F401 - fixtures
 
 from pd4dgs_codec.errors import NotFinite  # noqa: E402
-from pd4dgs_codec.model import checkpoint  # noqa: E402
 from pd4dgs_codec.model.model import EXACT  # noqa: E402
 from pd4dgs_codec.render.picture import render_image  # noqa: E402
 from pd4dgs_codec.scene import MASK_THRESHOLD  # noqa: E402
@@ -35,17 +34,26 @@ def trained(dataset, tmp_path):  # noqa: F811
     return trainer, [(dataset.train[i], *trainer._targets[i]) for i in range(len(dataset.train))]
 
 
+def _pictures(trainer, level: int) -> list[np.ndarray]:
+    """Of the training views."""
+    return [
+        render_image(trainer.model, level, v.time, v.viewmat, v.K, v.width, v.height) for v in trainer.dataset.train
+    ]
+
+
+def _difference(pictures, others) -> float:
+    return float(np.mean([np.square(a - b).mean() for a, b in zip(pictures, others, strict=True)]))
+
+
 def _error(trainer, level: int) -> float:
     """Mean squared error over the training views."""
-    pictures = [(render_image(trainer.model, level, v.time, v.viewmat, v.K, v.width, v.height), v.image)
-                for v in trainer.dataset.train]  # fmt: skip
-    return float(np.mean([np.square(picture - image / 255).mean() for picture, image in pictures]))
+    return _difference(_pictures(trainer, level), [v.image / 255 for v in trainer.dataset.train])
 
 
 def test_harm_is_the_error_that_an_absence_adds_about(trained):
     trainer, shots = trained
     harm = pruning.relative_harm(trainer.model, 1, shots, EXACT).numpy()
-    pictures = [render_image(trainer.model, 1, v.time, v.viewmat, v.K, v.width, v.height) for v, *_ in shots]
+    pictures = _pictures(trainer, 1)
     near = np.flatnonzero(np.isfinite(harm) & (harm > 0))
     chosen = near[np.argsort(harm[near])][:: max(1, len(near) // 12)]
     logits = trainer.model.mask_logits.detach().clone()
@@ -53,8 +61,7 @@ def test_harm_is_the_error_that_an_absence_adds_about(trained):
     for row in chosen:
         with torch.no_grad():
             trainer.model.mask_logits[row] = -30.0
-        without = [render_image(trainer.model, 1, v.time, v.viewmat, v.K, v.width, v.height) for v, *_ in shots]
-        added.append(np.mean([np.square(a - b).mean() for a, b in zip(without, pictures, strict=True)]))
+        added.append(_difference(_pictures(trainer, 1), pictures))
         with torch.no_grad():
             trainer.model.mask_logits.copy_(logits)
     expected = harm[chosen] * _error(trainer, 1)
@@ -104,16 +111,7 @@ def test_a_run_prunes_half_way_and_resumes_with_the_same_bits(dataset, tmp_path,
     rounds = list(Schedule(60).prune)
     assert [r["iteration"] for r in pruned] == rounds and sum(r["left_model"] for r in pruned) > 0
     assert records[rounds[0] - 1]["anchors"] - pruned[-1]["anchors"] == sum(r["left_model"] for r in pruned)
-    for cut in rounds[1:3]:
-        part = Trainer(config, dataset)
-        for _ in range(cut):
-            part.step()
-        part.save(tmp_path / "part.pt")
-        rest = Trainer(config, dataset)
-        rest.resume(tmp_path / "part.pt")
-        rest.run(tmp_path / "rest.pt")
-        a, b = (checkpoint.load(tmp_path / f"{name}.pt")[0].state_dict() for name in ("whole", "rest"))
-        assert all(torch.equal(a[k], b[k]) for k in a)
+    assert_resumes_bit_for_bit(config, dataset, tmp_path, rounds[1:3])
 
 
 def test_a_round_that_meets_infinity_is_passed_over(dataset, tmp_path, monkeypatch):  # noqa: F811

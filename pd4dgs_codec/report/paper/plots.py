@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from pd4dgs_codec.report.paper import published
+from pd4dgs_codec.report.paper.runs import OURS
 from pd4dgs_codec.report.paper.statistics import Result, figure, top
 
 MARKERS = "os^DvPX*<>"
@@ -66,14 +67,10 @@ def _kilobytes(axes: Any) -> None:
 def comparison(results: Sequence[Result], path: Path) -> None:
     """Quality over bytes; the levels of one file joined by a line."""
     scenes = _by(results, "scene")
+    ours = {variant.name: f"{what}, its levels" for what, variant in OURS}
     figure_, axes = _panels(len(scenes))
     for axis, (scene, rows) in zip(axes, scenes.items(), strict=True):
         for marker, (variant, runs) in zip(MARKERS, _by(rows, "variant").items(), strict=False):
-            ours = {
-                "full": "ours, its levels",
-                "three times the steps": "thrice, its levels",
-                "every level in every step": "every level, its levels",
-            }
             shown = runs if variant in ours else [r | {"levels": r["levels"][-1:]} for r in runs]
             _quality_over_bytes(axis, shown, "-", marker, ours.get(variant, variant))
         axis.set_title(scene)

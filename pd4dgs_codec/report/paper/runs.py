@@ -57,6 +57,8 @@ TWO_LAYER = Variant("two layers", {"max_layer": 1})
 EVERY_LEVEL = Variant("every level in every step", {"rollout": "all"})
 #: The full method, as many steps of each level by drawing levels three times as often.
 THRICE = Variant("three times the steps", longer=3)
+#: What the comparison calls them.
+OURS = (("ours", FULL), ("thrice", THRICE), ("every level", EVERY_LEVEL))
 #: Every step trains all layers together, and nothing is spent on bytes, levels or quantisation.
 MONOLITHIC = Variant(
     "monolithic", {"rollout": "top", **ABLATIONS["rate"], **ABLATIONS["tmc"], **ABLATIONS["noise"]}, monolithic=True

@@ -8,12 +8,11 @@ from typing import Any
 
 from pd4dgs_codec.report.paper import plots, published
 from pd4dgs_codec.report.paper.runs import (
-    EVERY_LEVEL,
     FIXED,
     FULL,
     MONOLITHIC,
+    OURS,
     SCAFFOLD,
-    THRICE,
     TWO_LAYER,
     UNIFORM,
     WITHOUT,
@@ -25,8 +24,6 @@ from pd4dgs_codec.report.tables import markdown, paragraph
 
 #: Rate weights of the curve of quality over bytes.
 RATE_SCALES = (0.03, 0.1, 0.3, 1.0, 3.0)
-#: Our rows of the comparison.
-OURS = (("ours", FULL), ("thrice", THRICE), ("every level", EVERY_LEVEL))
 #: Preset and steps where masks are looked at: 0.02 to 0.05 a step, they need hundreds to go from visible to absent, and
 #: part still from moving anchors only once the deformations tell these apart.
 MASK_BUDGET = ("small", 1_500)
@@ -294,8 +291,7 @@ def rho(results: Sequence[Result]) -> list[str]:
     for scene in scenes_of(results):
         for variant in (FULL, at_rate(1.0)):
             for run in of(results, variant, scene):
-                course = run["pi"]
-                half, last = (course[-1 if i == 1 else len(course) // 2] for i in range(2))
+                half, last = run["pi"][len(run["pi"]) // 2], run["pi"][-1]
                 gaps = run["gap_by_motion"]
                 rows.append(
                     (
@@ -303,8 +299,7 @@ def rho(results: Sequence[Result]) -> list[str]:
                         f"{run['config']['rate_scale']:g}",
                         f"{half['rho']:.3f}",
                         f"{last['rho']:.3f}",
-                        *(f"{gap:.3f}" for gap in gaps or ()),
-                        *(() if gaps else ("", "")),
+                        *([f"{gap:.3f}" for gap in gaps] if gaps else ("", "")),
                         " / ".join(f"{p:.3f}" for p in last["pi"]),
                         " / ".join(f"{n:,}" for n in run["active"]),
                     )
