@@ -50,6 +50,9 @@ def deformation_unit(box: np.ndarray) -> np.float32:
 #: The decoders of the scaffold (input [feature 32, view direction 3]) with their output width.
 SCAFFOLD_NETWORKS: dict[str, int] = {"opacity": N_OFFSETS, "covariance": 7 * N_OFFSETS, "color": 3 * N_OFFSETS}
 
+#: Name of the network, in each deformation, that turns plane features into what the heads read.
+TRUNK = "trunk"
+
 #: A network: per linear layer (weight float32 [out, in], bias float32 [out]); ReLU between layers, none at the end.
 Network = tuple[tuple[np.ndarray, np.ndarray], ...]
 
@@ -89,6 +92,11 @@ class Deformation:
 
     planes: tuple[dict[str, np.ndarray], ...]
     networks: dict[str, Network]
+
+
+def plane_sides(planes: dict[str, np.ndarray]) -> tuple[int, int, int, int]:
+    """Resolutions along x, y, z, t of one scale's planes, read off xy and zt."""
+    return planes["xy"].shape[2], planes["xy"].shape[1], planes["zt"].shape[2], planes["zt"].shape[1]
 
 
 @dataclass(frozen=True)

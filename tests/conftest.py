@@ -4,10 +4,13 @@ The shell of a background job ignores SIGINT, and its children with it; tests th
 """
 
 import signal
+import sys
+from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
 
+sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))  # no package: its commands put it on the path too
 settings.register_profile("pd4dgs", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("pd4dgs")
 

@@ -20,13 +20,14 @@ ALLOWED = {
     "bitstream": set(),
     "entropy": set(),
     "attributes": set(),
-    "codec": {"bitstream", "entropy", "attributes"},
+    "evaluate": set(),
+    "codec": {"bitstream", "entropy", "attributes", "evaluate"},
     "delivery": {"bitstream", "entropy", "attributes", "codec"},
     "interchange": {"bitstream", "entropy", "attributes", "codec"},
 }
 #: Outside packages that these parts may use.
 LIBRARIES = {"numpy", "constriction", "msgpack"}
-WITHOUT_TORCH = ["errors", "scene", "bitstream", "entropy", "attributes", "codec", "delivery"]
+WITHOUT_TORCH = ["errors", "scene", "bitstream", "entropy", "attributes", "evaluate", "codec", "delivery"]
 
 
 def modules(part):

@@ -17,7 +17,7 @@ from pd4dgs_codec import decode, encode  # noqa: E402
 from pd4dgs_codec.codec.decoder import decode_layers  # noqa: E402
 from pd4dgs_codec.codec.info import info  # noqa: E402
 from pd4dgs_codec.model.convert import from_scene  # noqa: E402
-from pd4dgs_codec.render.picture import render_image  # noqa: E402
+from pd4dgs_codec.model.picture import render_image  # noqa: E402
 from pd4dgs_codec.scene import Camera, Deformation, Scene  # noqa: E402
 
 WIDTH, HEIGHT = 24, 16

@@ -1,7 +1,7 @@
 """The main job, to watch: train a dynamic scene, pack it, unpack every prefix, render each level, measure.
 
-    bash tools/demo.sh                       # the synthetic scene, CPU, under five minutes
-    bash tools/demo.sh --source FOLDER --preset small --max-seconds 600 --downscale 2
+bash tools/demo.sh                       # the synthetic scene, CPU, under five minutes
+bash tools/demo.sh --source FOLDER --preset small --max-seconds 600 --downscale 2
 """
 
 from __future__ import annotations
@@ -29,10 +29,11 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     configure()
 
+    from pages.main_job import Job, run_job
+    from pages.tables import coding_table, quality_table, time_plot
+
     from pd4dgs_codec.cli.progress import TrainingProgress
     from pd4dgs_codec.errors import Pd4Error
-    from pd4dgs_codec.report.main_job import Job, run_job
-    from pd4dgs_codec.report.tables import coding_table, quality_table, time_plot
     from pd4dgs_codec.train.config import TrainConfig
 
     try:

@@ -37,7 +37,7 @@ def main(argv: list[str] | None = None) -> int:
     from pd4dgs_codec.errors import Pd4Error
     from pd4dgs_codec.jsonable import finite
     from pd4dgs_codec.metrics import load_perceptual
-    from pd4dgs_codec.report.evaluate import evaluate_file
+    from pd4dgs_codec.view.evaluate import evaluate_file
 
     page, store = args.docs / "evaluation.md", args.docs / "evaluation.json"
     perceptual = load_perceptual()
@@ -77,8 +77,8 @@ def around_table(page: Path) -> tuple[str, str]:
 
 def table(results: dict[str, dict[str, Any]]) -> str:
     """Markdown: scenes and levels by metrics; a metric that no file was measured with has no column."""
-    from pd4dgs_codec.report.evaluate import metric_columns
-    from pd4dgs_codec.report.tables import markdown
+    from pd4dgs_codec.bench.markdown import markdown
+    from pd4dgs_codec.view.evaluate import metric_columns
 
     columns = list(dict.fromkeys(column for result in results.values() for column in metric_columns(result)))
     rows = []

@@ -23,7 +23,7 @@ from pd4dgs_codec.codec.decoder import decode  # noqa: E402
 from pd4dgs_codec.codec.encoder import encode_with_report  # noqa: E402
 from pd4dgs_codec.model import checkpoint  # noqa: E402
 from pd4dgs_codec.model.convert import from_scene, to_scene  # noqa: E402
-from pd4dgs_codec.render.picture import render_image  # noqa: E402
+from pd4dgs_codec.model.picture import render_image  # noqa: E402
 from pd4dgs_codec.scene import Scene  # noqa: E402
 
 SIDE = 64  #: of the pictures, pixels

@@ -41,10 +41,11 @@ OTHERS = ("small", 2_000, 1)
 
 def main(argv: list[str] | None = None) -> int:
     configure()
+    from pages.paper.tables import TABLES
+
     from pd4dgs_codec.cli.common import positive_int
     from pd4dgs_codec.cli.progress import TrainingProgress
     from pd4dgs_codec.errors import Pd4Error
-    from pd4dgs_codec.report.paper.tables import TABLES
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("table", choices=(*TABLES, "all"))
@@ -66,8 +67,9 @@ def main(argv: list[str] | None = None) -> int:
 
 def make(table: Any, args: argparse.Namespace, progress: Any) -> None:
     """Runs what the table lacks and writes its three files."""
+    from pages.paper.runs import Run, held_to, measure
+
     from pd4dgs_codec.data.dataset import load
-    from pd4dgs_codec.report.paper.runs import Run, held_to, measure
 
     scenes = [scene(name, table.budget, args.iterations) for name in args.scenes or table.scenes]
     absent = [s.name for s in scenes if s.config.source.startswith(str(SHARED)) and not Path(s.config.source).is_dir()]
@@ -104,8 +106,9 @@ def _say(label: str, text: str) -> None:
 def scene(name: str, synthetic: tuple[str, int] | None, iterations: int | None) -> Any:
     """A scene by its name, or by SOURCE[@K]. synthetic: preset and iterations of a synthetic scene, iterations: of any
     scene, instead of its own."""
+    from pages.paper.runs import Scene
+
     from pd4dgs_codec.errors import DataError
-    from pd4dgs_codec.report.paper.runs import Scene
     from pd4dgs_codec.train.config import TrainConfig
 
     source, at, downscale = name.partition("@")
@@ -121,7 +124,7 @@ def scene(name: str, synthetic: tuple[str, int] | None, iterations: int | None) 
 
 def write(table: Any, results: list[dict[str, Any]], docs: Path) -> None:
     """docs/NAME.md, NAME.json, NAME.png."""
-    from pd4dgs_codec.report.tables import paragraph
+    from pd4dgs_codec.bench.markdown import paragraph
 
     docs.mkdir(parents=True, exist_ok=True)
     table.plot(results, docs / f"{table.name}.png")

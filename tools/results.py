@@ -49,9 +49,10 @@ def main(argv: list[str] | None = None) -> int:
     args = parser.parse_args(argv)
     threads = configure()
 
+    from pages.main_job import Job, run_job
+
     from pd4dgs_codec.cli.progress import TrainingProgress
     from pd4dgs_codec.errors import Pd4Error
-    from pd4dgs_codec.report.main_job import Job, run_job
     from pd4dgs_codec.train.config import TrainConfig
 
     results = []
@@ -78,7 +79,9 @@ def main(argv: list[str] | None = None) -> int:
 
 def write(results: list[dict[str, Any]], out: Path, docs: Path, threads: int) -> None:
     """docs/results.md with its tables, docs/results.json, docs/img/*."""
-    from pd4dgs_codec.report.tables import coding_table, markdown, quality_table, time_plot
+    from pages.tables import coding_table, quality_table, time_plot
+
+    from pd4dgs_codec.bench.markdown import markdown
 
     images = docs / "img"
     images.mkdir(parents=True, exist_ok=True)

@@ -229,7 +229,7 @@ def _leave_out_unpaid(
 ) -> tuple[Scene, list[LeftOut]]:
     """The scene without the layers whose level does not pay, and what went."""
     from pd4dgs_codec.codec.layers import Coding
-    from pd4dgs_codec.report.worth import leave_out_unpaid
+    from pd4dgs_codec.pack.worth import leave_out_unpaid
 
     coding = Coding(args.mode, args.priors, args.effort)
     with progress_bar(None, "pictures", "judging layers") as step:
@@ -252,9 +252,9 @@ def _fit(
 
     from pd4dgs_codec.codec.plan import plan
     from pd4dgs_codec.codec.symbols import rounded
-    from pd4dgs_codec.codec.target import fit
-    from pd4dgs_codec.report.frames import dataset_frames, own_frames
-    from pd4dgs_codec.report.rendered import RenderedLoss, psnr_of, true_psnr
+    from pd4dgs_codec.pack.rendered import RenderedLoss, psnr_of, true_psnr
+    from pd4dgs_codec.pack.target import fit
+    from pd4dgs_codec.view.frames import dataset_frames, own_frames
 
     raw = args.deformation == "float32"
     scene, left_out = plan(scene, options["layers"], raw, args.omit)
@@ -287,7 +287,7 @@ class _Stdin(io.BytesIO):
 
 def _train_rate(scene: Scene, layers: str | int) -> dict[str, Any]:
     """The trainer's own sum of R over the float values, at the steps and for the layers of this file."""
-    from pd4dgs_codec.report.rate import train_rate_bits
+    from pd4dgs_codec.pack.train_rate import train_rate_bits
 
     rows = train_rate_bits(scene, layers)
     per_layer = [

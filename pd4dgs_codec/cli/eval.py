@@ -65,7 +65,7 @@ def _evaluate(args: argparse.Namespace, console: Console) -> int:
     use_threads(args)
     from pd4dgs_codec.data.dataset import load
     from pd4dgs_codec.metrics.perceptual import load_perceptual
-    from pd4dgs_codec.report.evaluate import evaluate_file
+    from pd4dgs_codec.view.evaluate import evaluate_file
 
     file = named_input(args.input)
     dataset = load(args.source, downscale=args.downscale, holdout=args.holdout)
@@ -83,7 +83,7 @@ def _evaluate(args: argparse.Namespace, console: Console) -> int:
 
 
 def _text(result: dict[str, Any]) -> str:
-    from pd4dgs_codec.report.evaluate import metric_columns
+    from pd4dgs_codec.view.evaluate import metric_columns
 
     columns = [
         *metric_columns(result),

@@ -96,9 +96,9 @@ def _render(scene: Scene, fps: float) -> Video:
 
     from pd4dgs_codec.delivery.package import Video
     from pd4dgs_codec.errors import RenderError
-    from pd4dgs_codec.report.frames import own_frames
-    from pd4dgs_codec.report.levels import level_of
-    from pd4dgs_codec.report.movie import check_mp4, write_mp4
+    from pd4dgs_codec.view.frames import own_frames
+    from pd4dgs_codec.view.levels import level_of
+    from pd4dgs_codec.view.movie import check_mp4, write_mp4
 
     check_mp4()
     if scene.info.camera is None:  # said here, since no option can name another one

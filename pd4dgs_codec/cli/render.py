@@ -29,8 +29,8 @@ from pd4dgs_codec.cli.progress import progress_bar
 if TYPE_CHECKING:
     import numpy as np
 
-    from pd4dgs_codec.report.frames import Frame
-    from pd4dgs_codec.report.levels import Level
+    from pd4dgs_codec.view.frames import Frame
+    from pd4dgs_codec.view.levels import Level
 
 DETAILS = f"""\
 Without --data the file's own camera is used, over its whole time; with --data the views of a dataset at their times.
@@ -95,10 +95,10 @@ def _render(args: argparse.Namespace, console: Console) -> int:
     if kind in VIDEOS:
         check_output(args.output, args.overwrite)
     use_threads(args)
-    from pd4dgs_codec.report.levels import load_levels
+    from pd4dgs_codec.view.levels import load_levels
 
     if kind == ".mp4":
-        from pd4dgs_codec.report.movie import check_mp4
+        from pd4dgs_codec.view.movie import check_mp4
 
         check_mp4()
     levels = load_levels(named_input(args.input), args.max_layer)
@@ -140,7 +140,7 @@ def _check_usage(args: argparse.Namespace) -> str:
 def _frames(args: argparse.Namespace, level: Level) -> list[Frame]:
     from pd4dgs_codec.data.dataset import load
     from pd4dgs_codec.errors import DataError
-    from pd4dgs_codec.report.frames import dataset_frames, own_frames
+    from pd4dgs_codec.view.frames import dataset_frames, own_frames
 
     if args.data is None:
         return own_frames(level.model.info, args.frames or 60, args.orbit, args.downscale)
@@ -156,7 +156,7 @@ def _pictures(
 ) -> Iterator[np.ndarray]:
     """uint8 [H, W, 3] per frame: the one level, or all of them beside the true image. Times are noted per picture."""
     from pd4dgs_codec.metrics.image import to_uint8
-    from pd4dgs_codec.report.panels import level_caption, side_by_side
+    from pd4dgs_codec.view.panels import level_caption, side_by_side
 
     for frame in frames:
         images, captions = [], []
@@ -175,7 +175,7 @@ def _pictures(
 
 def _write(args: argparse.Namespace, kind: str, pictures: Iterator[np.ndarray], count: int) -> int:
     """Writes all pictures; returns the number of files."""
-    from pd4dgs_codec.report.movie import write_gif, write_mp4, write_pictures
+    from pd4dgs_codec.view.movie import write_gif, write_mp4, write_pictures
 
     if kind in VIDEOS:
         with whole_file(args.output, args.overwrite) as temporary:

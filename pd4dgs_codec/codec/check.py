@@ -9,9 +9,9 @@ import numpy as np
 from pd4dgs_codec.attributes.quantise import is_step
 from pd4dgs_codec.attributes.table import ATTRIBUTES
 from pd4dgs_codec.bitstream.limits import MAX_VOXEL
-from pd4dgs_codec.codec.kinds import LAYER_KINDS, SCAFFOLD_INPUT, TRUNK, LayerKind
+from pd4dgs_codec.codec.kinds import LAYER_KINDS, SCAFFOLD_INPUT, LayerKind
 from pd4dgs_codec.errors import EncodeError
-from pd4dgs_codec.scene import MASK_MIN_CODE, PLANES, Deformation, Network, Scene, SceneInfo
+from pd4dgs_codec.scene import MASK_MIN_CODE, PLANES, TRUNK, Deformation, Network, Scene, SceneInfo, plane_sides
 
 
 def _expect(ok: bool, message: str) -> None:
@@ -127,8 +127,3 @@ def _check_networks(owner: str, networks: dict[str, Network], kind: LayerKind, w
             _expect_array(f"{owner} network {name} bias {i}", bias, np.float32, (width,))
         out = kind.heads.get(name, width)
         _expect(width == out, f"{owner} network {name}: {width} outputs, expected {out}")
-
-
-def plane_sides(planes: dict[str, np.ndarray]) -> tuple[int, int, int, int]:
-    """Resolutions along x, y, z, t of one scale's planes, read off xy and zt."""
-    return planes["xy"].shape[2], planes["xy"].shape[1], planes["zt"].shape[2], planes["zt"].shape[1]

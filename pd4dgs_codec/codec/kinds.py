@@ -7,11 +7,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from pd4dgs_codec.scene import FEATURE_DIM, GLOBAL_HEADS, LOCAL_HEADS, SCAFFOLD_NETWORKS
+from pd4dgs_codec.scene import FEATURE_DIM, GLOBAL_HEADS, LOCAL_HEADS, SCAFFOLD_NETWORKS, TRUNK
 
 #: Input of the scaffold's networks: feature and view direction.
 SCAFFOLD_INPUT = FEATURE_DIM + 3
-TRUNK = "trunk"
 
 
 @dataclass(frozen=True)

@@ -21,9 +21,9 @@ from pd4dgs_codec.bitstream.limits import (
     MAX_PLANE_SIDE,
 )
 from pd4dgs_codec.codec.fields import Fields, as_integer, as_list, as_registered
-from pd4dgs_codec.codec.kinds import SCAFFOLD_INPUT, TRUNK, LayerKind
+from pd4dgs_codec.codec.kinds import SCAFFOLD_INPUT, LayerKind
 from pd4dgs_codec.errors import LimitExceeded, Malformed
-from pd4dgs_codec.scene import PLANES
+from pd4dgs_codec.scene import PLANES, TRUNK
 
 
 class Section(IntEnum):

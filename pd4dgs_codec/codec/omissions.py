@@ -16,11 +16,11 @@ import numpy as np
 from pd4dgs_codec.attributes import planes as decorrelation
 from pd4dgs_codec.attributes.quantise import dequantise, quantise
 from pd4dgs_codec.attributes.table import ATTRIBUTES
-from pd4dgs_codec.codec.kinds import LAYER_KINDS, TRUNK, LayerKind
-from pd4dgs_codec.codec.reach import reach
+from pd4dgs_codec.codec.kinds import LAYER_KINDS, LayerKind
 from pd4dgs_codec.codec.stages import entropy_bits
 from pd4dgs_codec.codec.symbols import dequantise_deformation, map_networks, quantise_deformation
-from pd4dgs_codec.scene import FEATURE_DIM, N_OFFSETS, PLANES, Deformation, Network, Scene
+from pd4dgs_codec.evaluate.reach import reach
+from pd4dgs_codec.scene import FEATURE_DIM, N_OFFSETS, PLANES, TRUNK, Deformation, Network, Scene
 
 #: Networks whose values may exceed this are left as they are; binary32 overflows at 3.4e38.
 LARGEST = 1e30

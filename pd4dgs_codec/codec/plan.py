@@ -11,13 +11,13 @@ from dataclasses import replace
 
 import numpy as np
 
-from pd4dgs_codec.codec.evaluate import residuals
-from pd4dgs_codec.codec.kinds import LAYER_KINDS, TRUNK, LayerKind
+from pd4dgs_codec.codec.kinds import LAYER_KINDS, LayerKind
 from pd4dgs_codec.codec.omissions import LeftOut, leave_out
 from pd4dgs_codec.codec.symbols import dequantise_deformation, first_duplicate, quantise_deformation
 from pd4dgs_codec.entropy.morton import morton_order
 from pd4dgs_codec.errors import EncodeError
-from pd4dgs_codec.scene import Deformation, Scene
+from pd4dgs_codec.evaluate.residuals import residuals
+from pd4dgs_codec.scene import TRUNK, Deformation, Scene
 
 #: A deformation is left out if it moves no position (or local scale) by more than this many voxels ...
 NEGLIGIBLE_VOXELS = 1e-3

@@ -26,7 +26,7 @@ from pd4dgs_codec.metrics.image import mpsnr
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import PRESETS
 from pd4dgs_codec.model.model import EXACT, Noise, Rounding
-from pd4dgs_codec.render.picture import Picture, render, render_image
+from pd4dgs_codec.model.picture import Picture, render, render_image
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train import judge, losses, pruning
 from pd4dgs_codec.train.config import DEFAULT_ITERATIONS, PRUNING_ROUNDS, PlaneWeights, Schedule, TrainConfig

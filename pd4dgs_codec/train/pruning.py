@@ -15,9 +15,9 @@ import torch
 from torch import Tensor
 
 from pd4dgs_codec.data.dataset import View
+from pd4dgs_codec.model.harm import anchor_harm
 from pd4dgs_codec.model.layers import mask_logits
 from pd4dgs_codec.model.model import Model, Rounding
-from pd4dgs_codec.render.harm import anchor_harm
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train.config import PRUNING_ROUNDS
 from pd4dgs_codec.train.optimiser import Optimiser

@@ -17,7 +17,7 @@ FAST = ("--mode", "lzma", "--effort", 1, "--json", "-f")
 def _few_values(monkeypatch):
     """Each value costs an encode and its pictures: a few do here."""
     from pd4dgs_codec.cli import encode
-    from pd4dgs_codec.codec import target
+    from pd4dgs_codec.pack import target
 
     monkeypatch.setattr(target, "OCTAVES", (0.0, 1.5, 3.0))
     monkeypatch.setattr(target, "SHARES", (0.0, 0.1, 0.5))
@@ -63,8 +63,8 @@ def scaled_size(model_pt, scale: float) -> int:
 def scaled_error(model_pt, scale: float) -> float:
     from pd4dgs_codec.codec.plan import plan
     from pd4dgs_codec.codec.symbols import rounded
-    from pd4dgs_codec.report.frames import own_frames
-    from pd4dgs_codec.report.rendered import RenderedLoss
+    from pd4dgs_codec.pack.rendered import RenderedLoss
+    from pd4dgs_codec.view.frames import own_frames
 
     scene = unquantised(model_pt)
     coarse = replace(scene, steps=scene.steps.scaled(scale))
@@ -112,8 +112,8 @@ def test_a_layer_that_explains_the_pictures_is_kept(scene):
     from pd4dgs_codec.data.dataset import View
     from pd4dgs_codec.metrics.image import to_uint8
     from pd4dgs_codec.model.convert import from_scene
-    from pd4dgs_codec.render.picture import render_image
-    from pd4dgs_codec.report.worth import leave_out_unpaid
+    from pd4dgs_codec.model.picture import render_image
+    from pd4dgs_codec.pack.worth import leave_out_unpaid
 
     camera, model = scene.info.camera, from_scene(rounded(plan(scene)[0]))
     views = []
@@ -126,9 +126,9 @@ def test_a_layer_that_explains_the_pictures_is_kept(scene):
 
 def test_harm_is_about_the_error_that_leaving_an_anchor_out_makes(scene, monkeypatch):
     from pd4dgs_codec.codec.plan import full_masks, plan
-    from pd4dgs_codec.render import harm as harm_of
-    from pd4dgs_codec.report.frames import own_frames
-    from pd4dgs_codec.report.rendered import RenderedLoss
+    from pd4dgs_codec.model import harm as harm_of
+    from pd4dgs_codec.pack.rendered import RenderedLoss
+    from pd4dgs_codec.view.frames import own_frames
 
     monkeypatch.setattr(harm_of, "PROBES", 64)  # the anchors differ less here than in a trained scene
     planned = plan(scene)[0]

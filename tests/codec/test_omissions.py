@@ -8,12 +8,12 @@ from strategies import make_scene
 
 from pd4dgs_codec.attributes import planes as decorrelation
 from pd4dgs_codec.codec.decoder import decode
-from pd4dgs_codec.codec.enclosure import residual_ranges, time_grid
 from pd4dgs_codec.codec.encoder import encode, encode_with_report
-from pd4dgs_codec.codec.evaluate import residuals
 from pd4dgs_codec.codec.plan import plan
-from pd4dgs_codec.codec.reach import reach
 from pd4dgs_codec.errors import EncodeError
+from pd4dgs_codec.evaluate.enclosure import residual_ranges, time_grid
+from pd4dgs_codec.evaluate.reach import reach
+from pd4dgs_codec.evaluate.residuals import residuals
 from pd4dgs_codec.scene import PLANES, Deformation, Scene
 
 SIDES = (6, 5, 7, 5)
@@ -102,7 +102,7 @@ def test_no_pixel_changes():
     pytest.importorskip("torch")
     pytest.importorskip("numba")
     from pd4dgs_codec.model.convert import from_scene
-    from pd4dgs_codec.render.picture import render_image
+    from pd4dgs_codec.model.picture import render_image
 
     whole, less = (
         from_scene(decode(encode(dead_scene(), layers=2, effort=1, omit=o))) for o in ("nothing", "lossless")

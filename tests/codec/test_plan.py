@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from strategies import make_scene
 
-from pd4dgs_codec.codec import evaluate
 from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.encoder import encode, encode_with_report
 from pd4dgs_codec.codec.kinds import LAYER_KINDS
 from pd4dgs_codec.codec.plan import head_bounds, plan
+from pd4dgs_codec.evaluate import residuals as evaluate
 from pd4dgs_codec.scene import GLOBAL_HEADS, LENGTH_HEADS, LOCAL_HEADS, PLANES, Deformation, deformation_unit
 
 VOXEL = 0.0078125

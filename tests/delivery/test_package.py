@@ -229,7 +229,7 @@ def test_a_rendered_video_is_packaged(call, folder, tmp_path, monkeypatch):
     pytest.importorskip("torch")
     pytest.importorskip("imageio_ffmpeg")
     grey = np.full((48, 65, 3), 0.5, np.float32)  # in place of seconds of compiling kernels
-    monkeypatch.setattr("pd4dgs_codec.render.picture.render_image", lambda *_: grey)
+    monkeypatch.setattr("pd4dgs_codec.model.picture.render_image", lambda *_: grey)
     scene = make_scene(7, layers=(0, 1, 2), anchors=40)
     camera = scene.info.camera
     assert camera is not None

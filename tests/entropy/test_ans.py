@@ -43,9 +43,7 @@ tables = st.one_of(
 @st.composite
 def coded_channels(draw):
     cums = draw(st.lists(tables, max_size=5))
-    channels = [
-        np.array(draw(st.lists(st.integers(0, len(cum) - 2), max_size=40)), dtype=np.int32) for cum in cums
-    ]
+    channels = [np.array(draw(st.lists(st.integers(0, len(cum) - 2), max_size=40)), dtype=np.int32) for cum in cums]
     return channels, cums
 
 

@@ -60,9 +60,7 @@ def test_constants_match_high_precision_and_stay_clear_of_rounding_boundaries():
     assert (NORMAL[1], NORMAL[32]) == (3346026, 91629033)
 
 
-@given(
-    st.integers(2, 300), st.integers(-(2**31), 2**31), st.integers(SI_MIN, SI_MAX), st.sampled_from([1, 16])
-)
+@given(st.integers(2, 300), st.integers(-(2**31), 2**31), st.integers(SI_MIN, SI_MAX), st.sampled_from([1, 16]))
 def test_equals_the_rule_in_python_integers(n, mu8, si, floor):
     cum = norm_table(n, mu8, si, floor)
     assert cum.tolist() == python_norm_table(n, mu8, si, floor) and is_table(cum, n)
@@ -122,4 +120,4 @@ def test_tables_are_frozen():
     for si in range(SI_MIN, SI_MAX + 1, 37):
         for mu8 in (-1000, 0, 4321, 10**6):
             crc = zlib.crc32(norm_table(33, mu8, si, 1 if si % 2 else 16).astype("<i8").tobytes(), crc)
-    assert crc == 0xc5ea5b43
+    assert crc == 0xC5EA5B43

@@ -12,7 +12,7 @@ from test_loop import assert_resumes_bit_for_bit, dataset, few_anchors  # noqa: 
 
 from pd4dgs_codec.errors import NotFinite  # noqa: E402
 from pd4dgs_codec.model.model import EXACT  # noqa: E402
-from pd4dgs_codec.render.picture import render_image  # noqa: E402
+from pd4dgs_codec.model.picture import render_image  # noqa: E402
 from pd4dgs_codec.scene import MASK_THRESHOLD  # noqa: E402
 from pd4dgs_codec.train import pruning  # noqa: E402
 from pd4dgs_codec.train.config import PRUNING_ROUNDS, Schedule, TrainConfig  # noqa: E402

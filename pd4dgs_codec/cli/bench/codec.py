@@ -11,10 +11,10 @@ from pd4dgs_codec.cli.files import is_pd4, read_bytes
 from pd4dgs_codec.cli.progress import progress_bar
 
 if TYPE_CHECKING:
-    from pd4dgs_codec.report.frames import Frame
-    from pd4dgs_codec.report.precision.codec import Deviation, Point, Sweep
-    from pd4dgs_codec.report.precision.peers import Row
+    from pd4dgs_codec.bench.codec import Deviation, Point, Sweep
+    from pd4dgs_codec.bench.peers import Row
     from pd4dgs_codec.scene import SceneInfo
+    from pd4dgs_codec.view.frames import Frame
 
 DETAILS = """\
 A checkpoint is packed at every combination of step scale, mode and effort. Each file's error is measured on its values,
@@ -66,8 +66,8 @@ def execute(args: argparse.Namespace, console: Console) -> int:
     prepare(args, console)
     data = read_bytes(args.input)
     use_threads(args)
-    from pd4dgs_codec.report.precision import codec, peers
-    from pd4dgs_codec.report.precision.machine import describe, sentence
+    from pd4dgs_codec.bench import codec, peers
+    from pd4dgs_codec.bench.machine import describe, sentence
 
     machine = describe(peers.PACKAGES)
     what = codec.Sweep(**_options(args))
@@ -95,10 +95,10 @@ def execute(args: argparse.Namespace, console: Console) -> int:
 
 def _swept(args: argparse.Namespace, what: Sweep) -> tuple[list[Point], Deviation, bytes]:
     """(points of a checkpoint, what its mask codes lose, a file of its symbols, which no effort changes)."""
+    from pd4dgs_codec.bench import codec
     from pd4dgs_codec.codec.encoder import encode
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.model.convert import to_scene
-    from pd4dgs_codec.report.precision import codec
 
     model, _ = checkpoint.load(args.input)
     scene = to_scene(model)
@@ -111,9 +111,9 @@ def _swept(args: argparse.Namespace, what: Sweep) -> tuple[list[Point], Deviatio
 
 def _beside(args: argparse.Namespace, data: bytes, own_bytes: int, repeats: int) -> tuple[list[Row], float]:
     """(rows of all coders on the file's symbols, anchors and splats, the symbols' sum of R(a) in bits)."""
+    from pd4dgs_codec.bench import peers
     from pd4dgs_codec.codec.decoder import decode_layers
-    from pd4dgs_codec.report.levels import load_levels
-    from pd4dgs_codec.report.precision import peers
+    from pd4dgs_codec.view.levels import load_levels
 
     layers = decode_layers(data)[1]
     symbols, level = peers.symbols_of(layers), load_levels(data)[-1]
@@ -124,7 +124,7 @@ def _beside(args: argparse.Namespace, data: bytes, own_bytes: int, repeats: int)
 
 
 def _frames(args: argparse.Namespace, info: SceneInfo) -> list[Frame]:
-    from pd4dgs_codec.report.precision.views import frames
+    from pd4dgs_codec.bench.views import frames
 
     return frames(info, args.data, args.views or (QUICK_VIEWS if args.quick else VIEWS), args.downscale, args.holdout)
 

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
+from pd4dgs_codec.bench.latency.published import FIRST_FRAME
 from pd4dgs_codec.cli.bench.output import prepare, publish
 from pd4dgs_codec.cli.common import (
     FAILED,
@@ -23,11 +24,10 @@ from pd4dgs_codec.cli.common import (
 )
 from pd4dgs_codec.cli.files import whole_file
 from pd4dgs_codec.cli.progress import progress_bar
-from pd4dgs_codec.report.paper.published import FIRST_FRAME
 
 if TYPE_CHECKING:
-    from pd4dgs_codec.report.latency.faults import Cuts, File, Row
-    from pd4dgs_codec.report.latency.table import FileReport
+    from pd4dgs_codec.bench.latency.faults import Cuts, File, Row
+    from pd4dgs_codec.bench.latency.table import FileReport
 
 SECTIONS = ("times", "faults")
 DETAILS = f"""\
@@ -95,8 +95,8 @@ def execute(args: argparse.Namespace, console: Console) -> int:
     _check_usage(args)
     prepare(args, console)
     use_threads(args)
-    from pd4dgs_codec.render.warm import warm_up
-    from pd4dgs_codec.report.latency import faults, measure, plot, table
+    from pd4dgs_codec.bench.latency import faults, measure, plot, table
+    from pd4dgs_codec.model.warm import warm_up
 
     contents = [_content(name, args) for name in args.inputs]
     reports: list[FileReport] = []
@@ -141,10 +141,10 @@ def _check_usage(args: argparse.Namespace) -> None:
 
 def _content(name: str, args: argparse.Namespace) -> bytes:
     """The bytes of a valid file with a camera, enlarged if asked for."""
+    from pd4dgs_codec.bench.latency.enlarge import with_anchors
     from pd4dgs_codec.cli.files import read_bytes
     from pd4dgs_codec.codec.decoder import decode
     from pd4dgs_codec.errors import DataError, DecodeError
-    from pd4dgs_codec.report.latency.enlarge import with_anchors
 
     data = read_bytes(name)
     try:
@@ -159,11 +159,11 @@ def _content(name: str, args: argparse.Namespace) -> bytes:
 def _report(
     name: str, data: bytes, source: str | None, args: argparse.Namespace, step: Callable[[], None]
 ) -> FileReport:
+    from pd4dgs_codec.bench.latency import measure
+    from pd4dgs_codec.bench.latency.table import FileReport
     from pd4dgs_codec.codec.decoder import decode
     from pd4dgs_codec.data.dataset import load
-    from pd4dgs_codec.report.evaluate import evaluate_file
-    from pd4dgs_codec.report.latency import measure
-    from pd4dgs_codec.report.latency.table import FileReport
+    from pd4dgs_codec.view.evaluate import evaluate_file
 
     base = decode(data, max_layer=0)
     assert base.info.camera is not None
@@ -184,7 +184,7 @@ def _report(
 
 
 def _faults(file: File, cuts: int) -> tuple[list[Row], Cuts | None]:
-    from pd4dgs_codec.report.latency import faults
+    from pd4dgs_codec.bench.latency import faults
 
     chosen = faults.scenarios(file)
     with progress_bar(len(chosen), "faults", "faults") as step:

@@ -13,7 +13,7 @@ from pd4dgs_codec.cli.files import STDIO, check_output, whole_file, write_bytes
 from pd4dgs_codec.jsonable import finite
 
 if TYPE_CHECKING:
-    from pd4dgs_codec.report.precision.plot import Panel
+    from pd4dgs_codec.bench.plot import Panel
 
 T = TypeVar("T")
 
@@ -55,7 +55,7 @@ def finish(
 ) -> None:
     """Draws the plot, if it was asked for, and publishes the rest."""
     if args.plot is not None:
-        from pd4dgs_codec.report.precision.plot import draw
+        from pd4dgs_codec.bench.plot import draw
 
         with whole_file(args.plot, args.overwrite) as temporary:
             draw(panels, ylabel, temporary)

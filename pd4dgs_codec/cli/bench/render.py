@@ -45,9 +45,9 @@ def execute(args: argparse.Namespace, console: Console) -> int:
     """Draws every way."""
     prepare(args, console)
     use_threads(args)
-    from pd4dgs_codec.report.levels import load_levels
-    from pd4dgs_codec.report.precision import render, views
-    from pd4dgs_codec.report.precision.machine import describe, sentence
+    from pd4dgs_codec.bench import render, views
+    from pd4dgs_codec.bench.machine import describe, sentence
+    from pd4dgs_codec.view.levels import load_levels
 
     names = args.only or render.NAMES
     if unknown := [name for name in names if name not in render.NAMES]:

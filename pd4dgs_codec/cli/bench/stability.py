@@ -36,8 +36,8 @@ def execute(args: argparse.Namespace, console: Console) -> int:
     """Runs the chosen cases; FAILED if any row fails."""
     prepare(args, console)
     use_threads(args)
-    from pd4dgs_codec.report.stability import rows as kinds
-    from pd4dgs_codec.report.stability import table
+    from pd4dgs_codec.bench.stability import rows as kinds
+    from pd4dgs_codec.bench.stability import table
 
     kinds.mpmath()
     cases = table.chosen(table.all_cases(), args.only)

@@ -24,7 +24,7 @@ from pd4dgs_codec.cli.progress import TrainingProgress
 from pd4dgs_codec.errors import TrainError
 
 if TYPE_CHECKING:
-    from pd4dgs_codec.report.precision.train import Run
+    from pd4dgs_codec.bench.train import Run
 
 PRESETS = ("tiny", "small", "paper")
 DETAILS = f"""\
@@ -64,8 +64,8 @@ def execute(args: argparse.Namespace, console: Console) -> int:
         raise UsageError("found --seconds and --iterations, expected one of them")
     prepare(args, console)
     use_threads(args)
-    from pd4dgs_codec.report.precision import train
-    from pd4dgs_codec.report.precision.machine import describe, sentence
+    from pd4dgs_codec.bench import train
+    from pd4dgs_codec.bench.machine import describe, sentence
 
     machine = None if args.runs else describe()  # where the runs that exist were made is not known
     runs = [train.of_file(path) for path in args.runs] if args.runs else _trained(args, console)
@@ -76,8 +76,8 @@ def execute(args: argparse.Namespace, console: Console) -> int:
 
 
 def _trained(args: argparse.Namespace, console: Console) -> list[Run]:
+    from pd4dgs_codec.bench import train
     from pd4dgs_codec.data.dataset import load
-    from pd4dgs_codec.report.precision import train
     from pd4dgs_codec.train.config import TrainConfig
     from pd4dgs_codec.train.loop import Trainer
 

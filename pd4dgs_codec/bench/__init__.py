@@ -1,0 +1,1 @@
+"""What `pd4dgs-bench` measures: codec, renderer, trainer, latency, stability."""

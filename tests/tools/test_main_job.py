@@ -1,0 +1,235 @@
+"""The main job on a few tiny pictures: everything is written, a finished run is used again, the tables read well."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import shutil
+import signal
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+torch = pytest.importorskip("torch")
+pytest.importorskip("numba")
+Image = pytest.importorskip("PIL.Image")
+
+from pages import main_job, tables, trainings  # noqa: E402
+from pages.main_job import Job, run_job  # noqa: E402
+
+from pd4dgs_codec import decode  # noqa: E402
+from pd4dgs_codec.codec.encoder import encode_with_report  # noqa: E402
+from pd4dgs_codec.codec.info import info  # noqa: E402
+from pd4dgs_codec.data.dataset import Dataset, View  # noqa: E402
+from pd4dgs_codec.errors import TrainError  # noqa: E402
+from pd4dgs_codec.model import checkpoint  # noqa: E402
+from pd4dgs_codec.model.config import PRESETS, DeformationConfig, ModelConfig  # noqa: E402
+from pd4dgs_codec.model.convert import to_scene  # noqa: E402
+from pd4dgs_codec.train.config import TrainConfig  # noqa: E402
+
+WIDTH, HEIGHT, FRAMES = 48, 36, 6
+CONFIG = TrainConfig(preset="tiny", source="two-discs", iterations=40)
+
+
+def _view(t: float, camera_id: int = 0) -> View:
+    """Two discs, one of which moves, on grey."""
+    y, x = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
+    image = np.full((HEIGHT, WIDTH, 3), 100, np.uint8)
+    image[(x - 12 - 20 * t) ** 2 + (y - 18) ** 2 < 36] = (220, 60, 40)
+    image[(x - 36) ** 2 + (y - 9) ** 2 < 16] = (30, 200, 90)
+    viewmat = np.eye(4, dtype=np.float32)
+    viewmat[2, 3] = 3.0
+    K = np.array([[40, 0, WIDTH / 2], [0, 40, HEIGHT / 2], [0, 0, 1]], np.float32)
+    return View(viewmat, K, WIDTH, HEIGHT, t, image, None, f"{t:.2f}", camera_id)
+
+
+@pytest.fixture(scope="module")
+def job() -> Iterator[Job]:
+    """A tiny job whose dataset comes from here and whose model has few anchors."""
+    box = np.array([[-1.8, -1.4, -0.5], [1.8, 1.4, 0.5]], np.float32)
+    dataset = Dataset(
+        name="two-discs", train=tuple(_view(t) for t in np.linspace(0, 1, FRAMES)), test=(_view(0.3), _view(0.7)),
+        points=None, point_colors=None, box=box, near=0.1, far=10.0, background=(0.0, 0.0, 0.0), time_range=(0.0, 1.0),
+        up=(0.0, -1.0, 0.0), unit=0.0, masked=False,
+    )  # fmt: skip
+
+    def load(source, *, downscale, holdout):
+        assert source == "two-discs" and (downscale, holdout) == (CONFIG.downscale, CONFIG.holdout)
+        return dataset
+
+    field = DeformationConfig(4, 4, 8, (1, 2), 8, ("position", "feature", "offset", "scaling"))
+    local = dataclasses.replace(field, heads=("mean", "scale", "quat", "opacity", "color"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(main_job, "load", load)
+        patch.setitem(PRESETS, "tiny", ModelConfig(field, local, hidden=8, initial_anchors=250, max_anchors=300))
+        yield Job("discs", CONFIG)
+
+
+@pytest.fixture(scope="module")
+def finished(job, tmp_path_factory) -> tuple[Path, dict, list[str]]:
+    """(folder, result, lines said) of one run; tests read it and never write there."""
+    folder = tmp_path_factory.mktemp("finished")
+    return folder, *_run(job, folder)
+
+
+@pytest.fixture
+def copied(finished, tmp_path) -> Path:
+    """A copy of the run's folder that a test may change."""
+    shutil.copytree(finished[0], tmp_path, dirs_exist_ok=True)
+    return tmp_path
+
+
+class _Started(Exception):
+    pass
+
+
+@pytest.fixture
+def no_training(monkeypatch) -> None:
+    """Raises _Started where training would start."""
+
+    def run(self, *_, **__):
+        raise _Started
+
+    monkeypatch.setattr(trainings.Trainer, "run", run)
+
+
+def _run(job: Job, folder) -> tuple[dict, list[str]]:
+    said: list[str] = []
+    return run_job(job, folder, say=said.append), said
+
+
+def test_it_writes_figures_file_and_pictures(finished):
+    folder, result, said = finished[0] / "discs", *finished[1:]
+    assert json.loads((folder / "results.json").read_text()) == result
+    assert all(line.startswith("discs: ") for line in said) and any("training" in line for line in said)
+    assert (result["iterations"], result["skipped_steps"]) == (40, 0) and result["train_seconds"] > 0
+    assert len((folder / "train.jsonl").read_text().splitlines()) == 40
+
+    data = (folder / "scene.pd4").read_bytes()
+    layers = [row["layer"] for row in info(data)["layers"]]
+    assert decode(data).layers == tuple(layers) and layers[0] == 0
+    levels = result["evaluation"]["levels"]
+    assert [row["level"] for row in levels] == layers == [row["layer"] for row in result["coding"]]
+    assert levels[-1]["cumulative_bytes"] == len(data)
+    for row in levels:
+        assert row["first_frame_seconds"] == pytest.approx(row["cumulative_bytes"] * 8 / 2e6)
+        assert 5 < row["mpsnr"] < 60 and abs(row["loss_db"]) < 3
+    for row in result["coding"]:
+        assert row["best_over_gauss"] <= 1 and row["position_bytes"] > 0 or row["anchors"] == 0
+        assert row["lzma_float32_bytes"] > 0 and row["rate_bits"] > 0
+
+    assert result["pictures"] == ["levels.png", "levels.gif"]
+    panels = 1 + len(layers)
+    still = Image.open(folder / "levels.png")
+    assert still.width >= panels * WIDTH and still.height >= 2 * HEIGHT
+    movie = Image.open(folder / "levels.gif")
+    assert movie.n_frames == FRAMES and movie.width == still.width
+
+
+def test_a_finished_checkpoint_is_used_again(job, finished, copied, no_training):
+    first, path = finished[1], copied / "discs" / "model.pt"
+    before, when = path.read_bytes(), path.stat().st_mtime_ns
+    second, said = _run(job, copied)
+    assert said and not any("training" in line for line in said)
+    assert path.read_bytes() == before and path.stat().st_mtime_ns == when
+    for name in ("train_seconds", "curve", "coding", "left_out", "pictures"):
+        assert second[name] == first[name], name
+    assert [r["mpsnr"] for r in second["evaluation"]["levels"]] == [r["mpsnr"] for r in first["evaluation"]["levels"]]
+
+
+@pytest.mark.parametrize("change", [{"seed": 1}, {"iterations": 41}, {"ssim": 0.3}])
+def test_another_configuration_trains_anew(job, copied, no_training, change):
+    with pytest.raises(_Started):
+        _run(dataclasses.replace(job, config=dataclasses.replace(CONFIG, **change)), copied)
+    assert not (copied / "discs" / "train.jsonl").exists()  # the new run's log will hold that run alone
+
+
+def test_an_unfinished_checkpoint_is_trained_again(job, copied, no_training):
+    path, log = copied / "discs" / "model.pt", copied / "discs" / "train.jsonl"
+    model, training = checkpoint.load(path)
+    for iteration, total in ((39, 40), (0, 0)):
+        checkpoint.save(path, model, training | {"iteration": iteration, "total": total})
+        with pytest.raises(_Started):
+            _run(job, copied)
+        assert len(log.read_text().splitlines()) == 40  # it goes on, and so does its log
+
+
+@pytest.mark.parametrize(
+    ("seconds", "total", "ended"), [(1.0, 50, False), (9.0, 50, True), (1.0, 40, True), (1.0, 0, False)]
+)
+def test_a_run_ends_with_its_steps_or_its_time(seconds, total, ended):
+    config = dataclasses.replace(CONFIG, max_seconds=9.0)
+    assert trainings._ended({"iteration": 40, "total": total, "seconds": seconds}, config) is ended
+
+
+def test_an_interrupted_training_is_not_published_and_goes_on(job, finished, tmp_path, monkeypatch):
+    step = trainings.Trainer.step
+
+    def interrupted(self):
+        if self.iteration == 10:
+            signal.raise_signal(signal.SIGINT)
+        return step(self)
+
+    monkeypatch.setattr(trainings.Trainer, "step", interrupted)
+    with pytest.raises(TrainError, match="interrupted at step 11"):
+        _run(job, tmp_path)
+    assert sorted(p.name for p in (tmp_path / "discs").iterdir()) == ["model.pt", "train.jsonl"]
+    monkeypatch.setattr(trainings.Trainer, "step", step)
+    result, said = _run(job, tmp_path)
+    assert any("from step 11" in line for line in said) and result["phases_not_reached"] == []
+    assert (tmp_path / "discs" / "scene.pd4").read_bytes() == (finished[0] / "discs" / "scene.pd4").read_bytes()
+
+
+def test_a_layer_that_one_encoding_drops_is_shown_as_absent(finished):
+    scene = to_scene(checkpoint.load(finished[0] / "discs" / "model.pt")[0])
+    reports = {name: encode_with_report(scene, effort=1, **options)[1] for name, options in main_job.VARIANTS.items()}
+    whole = main_job.coding_rows(reports, scene)
+    reports["lzma_float32"] = dataclasses.replace(reports["lzma_float32"], layers=reports["lzma_float32"].layers[1:])
+    rows = main_job.coding_rows(reports, scene)
+    assert rows[0] == whole[0] | {"lzma_float32_bytes": None} and rows[1:] == whole[1:]
+    assert "| - " in tables.coding_table([finished[1] | {"coding": rows}])
+
+
+def test_the_results_become_markdown_tables_and_a_plot(finished, tmp_path):
+    result = finished[1]
+    levels = [str(row["level"]) for row in result["evaluation"]["levels"]]
+    for table, numbers in (
+        (tables.quality_table([result, result]), levels),
+        (tables.coding_table([result, result]), [*levels, "all"]),
+    ):
+        rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
+        assert len({len(line) for line in table.splitlines()}) == 1  # columns line up
+        assert len({len(row) for row in rows}) == 1 and set("".join(rows[1])) == {"-"}
+        assert all(row[0] == "discs" for row in rows[2:])
+        assert [row[1] for row in rows[2:]] == 2 * numbers
+        assert all(cell for row in rows for cell in row)
+    assert f"{result['evaluation']['levels'][-1]['cumulative_bytes']:,}" in tables.quality_table([result])
+    assert f"{result['coding'][0]['lzma_bytes']:,}" in tables.coding_table([result])
+    pytest.importorskip("matplotlib")
+    tables.time_plot([result], tmp_path / "plot.png")
+    assert Image.open(tmp_path / "plot.png").width > 300
+
+
+def test_the_row_of_all_layers_holds_sums_and_ratios_of_sums():
+    row = {"ans_bytes": 10, "lzma_bytes": 20, "lzma_float32_bytes": 30, "position_bytes": 1.0}
+    row |= {"draco_position_bytes": 2.0, "rate_bits": 100.0, "payload_over_rate": 1.0, "train_over_rate": 1.0}
+    row |= {"best_over_gauss": 0.5, "ans_over_lzma": 0.5, "lzma_symbol_bytes": 10.0}
+    other = row | {"rate_bits": 300.0, "payload_over_rate": 2.0, "best_over_gauss": 1.0, "lzma_symbol_bytes": 30.0}
+    total = tables.all_layers([row, other | {"ans_over_lzma": 0.9}])
+    assert (total["ans_bytes"], total["lzma_float32_bytes"], total["draco_position_bytes"]) == (20, 60, 4.0)
+    assert total["payload_over_rate"] == (100 + 600) / 400
+    assert total["best_over_gauss"] == (50 + 600) / 700
+    assert total["ans_over_lzma"] == pytest.approx((5 + 27) / 40)
+    missing = tables.all_layers([row, other | {"lzma_bytes": None, "ans_over_lzma": None}])
+    assert missing["lzma_bytes"] is None and missing["ans_over_lzma"] is None and missing["ans_bytes"] == 20
+
+
+def test_draco_positions_cost_some_bits_and_no_origin():
+    pytest.importorskip("DracoPy")
+    cells = np.unique(np.random.default_rng(0).integers(-50, 50, (3000, 3), dtype=np.int32), axis=0)
+    bits = main_job.draco_position_bits(cells)
+    assert 2 * len(cells) < bits < 21 * len(cells)
+    assert main_job.draco_position_bits(cells + np.int32(70_000)) == pytest.approx(bits, rel=0.02)
+    assert main_job.draco_position_bits(cells[:0]) == 0

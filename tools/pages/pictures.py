@@ -1,0 +1,35 @@
+"""Pictures of a packed scene: truth and every level side by side, as stills and as an animation."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pd4dgs_codec.data.dataset import Dataset, View
+from pd4dgs_codec.metrics.image import to_uint8
+from pd4dgs_codec.view.levels import Level, load_levels
+from pd4dgs_codec.view.movie import write_gif
+from pd4dgs_codec.view.panels import level_caption, side_by_side
+
+
+def draw_levels(data: bytes, dataset: Dataset, still: Path, movie: Path, *, stills: int = 3, frames: int = 40) -> None:
+    """Writes `still` (`stills` held-out views, one under the other) and the GIF `movie` (about `frames` frames)."""
+    from PIL import Image
+
+    levels = load_levels(data)
+    views = dataset.test or dataset.train
+    picked = views[:: max(1, len(views) // stills)][:stills]
+    Image.fromarray(np.concatenate(list(_panels(levels, picked)))).save(still)
+    path = dataset.train[:: max(1, len(dataset.train) // frames)]
+    write_gif(_panels(levels, path), movie, fps=12)
+
+
+def _panels(levels: Sequence[Level], views: Sequence[View]) -> Iterator[np.ndarray]:
+    captions = ["truth", *(level_caption(level.level, level.cumulative_bytes) for level in levels)]
+    for view in views:
+        pictures = [view.image]
+        for level in levels:
+            pictures.append(to_uint8(level.picture(view.camera, view.time)))
+        yield side_by_side(pictures, captions)

@@ -1,0 +1,137 @@
+"""Results as Markdown tables and as a plot of quality against training time."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pd4dgs_codec.bench.markdown import markdown
+
+#: A coding row's bytes in the modes that the table shows; None where a mode drops the layer.
+BYTES = ("ans_bytes", "lzma_bytes", "lzma_float32_bytes")
+
+
+def quality_table(results: Sequence[dict[str, Any]]) -> str:
+    """Per scene and level: held-out quality of the `.pd4`, and the bytes, seconds and milliseconds that go with it."""
+    rows = []
+    for result in results:
+        for level in result["evaluation"]["levels"]:
+            rows.append(
+                (
+                    result["name"],
+                    str(level["level"]),
+                    f"{level['mpsnr']:.2f}",
+                    f"{level['mssim']:.4f}",
+                    f"{level['loss_db']:+.3f}",
+                    f"{level['cumulative_bytes']:,}",
+                    f"{level['first_frame_seconds']:.2f}",
+                    f"{level['decode_seconds']:.2f}",
+                    f"{level['render_ms']:.0f}",
+                    f"{level['anchors']:,}",
+                    f"{result['train_seconds'] / 60:.1f}",
+                )
+            )
+    head = (
+        "scene",
+        "level",
+        "mPSNR dB",
+        "mSSIM",
+        "lost by packing dB",
+        "bytes so far",
+        "s at 2 Mbps",
+        "decode s",
+        "render ms",
+        "anchors",
+        "training min",
+    )
+    return markdown(head, rows)
+
+
+def coding_table(results: Sequence[dict[str, Any]]) -> str:
+    """Per scene and layer, and for all layers of a scene together: the modes' bytes, and what the coder spends against
+    the rate model and against LZMA."""
+    rows = []
+    for result in results:
+        for row in (*result["coding"], all_layers(result["coding"])):
+            draco = row.get("draco_position_bytes")
+            rows.append(
+                (
+                    result["name"],
+                    str(row["layer"]),
+                    *("-" if row[key] is None else f"{row[key]:,}" for key in BYTES),
+                    _ratio(row["payload_over_rate"]),
+                    _ratio(row["train_over_rate"]),
+                    _ratio(row["best_over_gauss"]),
+                    _ratio(row["ans_over_lzma"], 3),
+                    f"{row['position_bytes']:,.0f} / {'-' if draco is None else f'{draco:,.0f}'}",
+                )
+            )
+    head = (
+        "scene",
+        "layer",
+        "ans",
+        "lzma",
+        "lzma, float32 deformation",
+        "gauss payload / ΣR",
+        "trainer's ΣR / ΣR",
+        "best / gauss",
+        "ans / lzma, same symbols",
+        "positions / Draco",
+    )
+    return markdown(head, rows)
+
+
+def all_layers(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """One row for the layers of a file together: sums, and ratios of sums; None where a layer has no figure."""
+    sums: dict[str, Any] = {"layer": "all"}
+    for key in (*BYTES, "position_bytes", "draco_position_bytes"):
+        values = [row.get(key) for row in rows]
+        sums[key] = None if None in values else sum(values)  # type: ignore[arg-type]
+    weights = {
+        "payload_over_rate": [row.get("rate_bits") for row in rows],
+        "train_over_rate": [row.get("rate_bits") for row in rows],
+        "best_over_gauss": [_product(row.get("rate_bits"), row.get("payload_over_rate")) for row in rows],
+        "ans_over_lzma": [row.get("lzma_symbol_bytes") for row in rows],
+    }
+    for key, weight in weights.items():
+        parts = [_product(row.get(key), w) for row, w in zip(rows, weight, strict=True)]
+        sums[key] = None if None in parts or not parts else sum(parts) / sum(weight)  # type: ignore[arg-type]
+    return sums
+
+
+def _product(a: float | None, b: float | None) -> float | None:
+    return None if a is None or b is None else a * b
+
+
+def _ratio(value: float | None, digits: int = 4) -> str:
+    return "-" if value is None else f"{value:.{digits}f}"
+
+
+def time_plot(results: Sequence[dict[str, Any]], path: Path) -> None:
+    """Held-out PSNR per level against training wall time, one panel per scene, legible in black and white."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    columns = min(len(results), 4)
+    lines = -(-len(results) // columns)
+    figure, axes = pyplot.subplots(lines, columns, figsize=(4.2 * columns, 3.4 * lines), squeeze=False)
+    styles = ((":", "o"), ("--", "s"), ("-", "^"))
+    for axis in axes.flat[len(results) :]:
+        axis.remove()
+    for axis, result in zip(axes.flat, results, strict=False):
+        for level, (line, mark) in enumerate(styles):
+            points = [(p["seconds"], p["psnr"][level]) for p in result["curve"] if len(p["psnr"]) > level]
+            if points:
+                axis.plot(*zip(*points, strict=True), line + mark, color="black", ms=4, lw=1, label=f"level {level}")
+        axis.set_title(result["name"])
+        axis.set_xlabel("training wall time, s")
+        axis.grid(alpha=0.3)
+    for first in axes[:, 0]:
+        first.set_ylabel("held-out PSNR, dB")
+    axes[0][0].legend()
+    figure.tight_layout()
+    figure.savefig(path, dpi=110)
+    pyplot.close(figure)
