@@ -7,7 +7,6 @@ directive in README.md.
 
 from __future__ import annotations
 
-import ast
 import re
 import sys
 from pathlib import Path
@@ -32,7 +31,7 @@ myst_enable_extensions = ["strikethrough"]
 # The site needs neither torch nor numba: what is not installed is a stand-in while docstrings are read.
 autodoc_mock_imports = ["torch", "numba", "PIL", "imageio_ffmpeg", "matplotlib", "tqdm", "gsplat", "llvmlite"]
 autodoc_member_order = "bysource"
-autodoc_default_options = {"members": True, "show-inheritance": True, "ignore-module-all": True}
+autodoc_default_options = {"members": True, "ignore-module-all": True}
 autodoc_preserve_defaults = True
 autodoc_typehints = "signature"
 default_role = "code"
@@ -41,7 +40,8 @@ toc_object_entries = False
 
 html_theme = "furo"
 html_title = "pd4dgs-codec"
-html_static_path: list[str] = []
+html_static_path = ["static"]
+html_css_files = ["site.css"]
 html_copy_source = False
 html_show_sourcelink = False
 html_extra_path = ["index.html"]
@@ -82,19 +82,16 @@ def add_contents(app: Any, docname: str, source: list[str]) -> None:
 
 
 def heading(text: str, line: str) -> list[str]:
+    """A title underlined with `line`."""
     return [text, line * len(text), ""]
 
 
 def automodule(path: Path) -> list[str]:
-    """The section of one module; none for a package file that says nothing but its name."""
-    parts = path.relative_to(ROOT).with_suffix("").parts
+    """The section of one module, headed by its name inside the package."""
+    parts = path.relative_to(PACKAGE).with_suffix("").parts
     name = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
-    return [*heading(name, "-"), f".. automodule:: {name}", ""]
-
-
-def first_line(path: Path) -> str:
-    """The first line of a module's docstring, escaped."""
-    return escaped((ast.get_docstring(ast.parse(path.read_text())) or "").partition("\n")[0])
+    options = ["   :show-inheritance:"] if name == "errors" else []
+    return [*heading(name, "-"), f".. automodule:: pd4dgs_codec.{name}", *options, ""]
 
 
 def write_api(app: Any) -> None:
@@ -105,10 +102,12 @@ def write_api(app: Any) -> None:
             continue
         if path.suffix == ".py":
             rooms[path.stem] = [path]
-        elif (path / "__init__.py").exists():
-            rooms[path.name] = sorted(path.rglob("*.py"))
-    pages = {name: [*heading(name, "="), *(line for path in paths for line in automodule(path))]
-             for name, paths in rooms.items()}
+        elif modules := sorted(path.rglob("*.py")):
+            rooms[path.name] = modules
+    pages = {
+        name: [*heading(f"pd4dgs_codec.{name}", "="), *(line for path in paths for line in automodule(path))]
+        for name, paths in rooms.items()
+    }
     index = [*heading("API", "="), INDEX, ".. toctree::", "   :maxdepth: 1", ""]
     pages["index"] = [*index, *(f"   {name} <{name}>" for name in rooms), ""]
     API.mkdir(exist_ok=True)
@@ -130,29 +129,39 @@ What most programs need can be imported from the package itself:
 """
 
 
+#: What stays markup in a docstring: `a literal`, and *a word* or a few.
+MARKUP = re.compile(r"(`[^`\n]+`|(?<![\w*])\*[A-Za-z][\w ]*\*(?![\w*]))")
+#: A line that begins with names and a colon, as docstrings list arguments and fields.
+NAMED = re.compile(r"\w+(, \w+)*: ")
+
+
 def escaped(text: str) -> str:
-    """Plain text as reStructuredText; `x` becomes a literal."""
-    parts = re.split(r"(`[^`\n]+`)", text)
+    """One line of plain text as reStructuredText."""
+    parts = MARKUP.split(text)
     for i, part in enumerate(parts):
-        parts[i] = f"``{part[1:-1]}``" if i % 2 else re.sub(r"([\\*|_`<>])", r"\\\1", part)
+        if i % 2 == 0:
+            parts[i] = re.sub(r"([\\*|_`<>])", r"\\\1", part)
+        elif part[0] == "`":
+            parts[i] = f"``{part[1:-1]}``"
     return "".join(parts)
 
 
 def from_plain_text(app: Any, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
     """Event autodoc-process-docstring: docstrings here are plain text.
 
-    Paragraphs stay paragraphs, indented lines are shown as they are, and a line `name: ...` begins a line of its own.
+    Paragraphs stay paragraphs, indented ones are shown as they are, and a line `name: ...` begins a line of its own.
     """
     out: list[str] = []
     for block in re.split(r"\n\s*\n", "\n".join(lines).strip("\n")):
         rows = block.split("\n")
         if all(row.startswith("    ") for row in rows):
-            out += ["::", "", *rows, ""]
-        elif any(re.match(r"[\w, *]+: ", row) for row in rows[1:]):
-            out += [f"| {escaped(row)}" if re.match(r"[\w, *]+: ", row) or i == 0 else f"  {escaped(row.strip())}"
-                    for i, row in enumerate(rows)] + [""]
+            out += ["::", "", *rows]
+        elif any(NAMED.match(row) for row in rows[1:]):
+            starts = [i == 0 or NAMED.match(row) for i, row in enumerate(rows)]
+            out += [("| " if start else "  ") + escaped(row.strip()) for start, row in zip(starts, rows, strict=True)]
         else:
-            out += [escaped(row.strip()) for row in rows] + [""]
+            out += [escaped(row.strip()) for row in rows]
+        out.append("")
     lines[:] = out
 
 
