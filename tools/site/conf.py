@@ -19,7 +19,7 @@ sys.path.insert(0, str(ROOT))
 
 project = "pd4dgs-codec"
 author = copyright = "the pd4dgs-codec authors"
-extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.viewcode"]
+extensions = ["myst_parser", "sphinx.ext.autodoc"]
 root_doc = "README"
 include_patterns = ["*.md", "docs/**", "spec/*.md", "spec/vectors/README.md"]
 exclude_patterns = [".*", "out", "build", "dist", "tests", "tools", "pd4dgs_codec", "*.egg-info"]
@@ -63,8 +63,8 @@ CONTENTS = {
 }
 PAPER = ["comparison", "sampling", "components", "levels", "latency", "rates", "rho"]
 
-#: Rooms whose reader is a terminal.
-LEFT_OUT = {"cli"}
+#: Rooms that are used as commands, not as a library.
+LEFT_OUT = {"cli", "bench", "report"}
 
 
 def toctree(pages: list[str], caption: str = "") -> str:
@@ -108,7 +108,7 @@ def write_api(app: Any) -> None:
         name: [*heading(f"pd4dgs_codec.{name}", "="), *(line for path in paths for line in automodule(path))]
         for name, paths in rooms.items()
     }
-    index = [*heading("API", "="), INDEX, ".. toctree::", "   :maxdepth: 1", ""]
+    index = [*heading("API", "="), INDEX, "", ".. toctree::", "   :maxdepth: 1", ""]
     pages["index"] = [*index, *(f"   {name} <{name}>" for name in rooms), ""]
     API.mkdir(exist_ok=True)
     for name, lines in pages.items():
@@ -121,13 +121,16 @@ def write_api(app: Any) -> None:
 
 
 INDEX = """\
-What most programs need can be imported from the package itself:
+What most programs need can be imported from the package itself. A decoded file is a
+:class:`~pd4dgs_codec.scene.Scene`, a refused one a :exc:`~pd4dgs_codec.errors.DecodeError`. Scenes from a web server
+come from a :class:`~pd4dgs_codec.delivery.client.SceneClient`.
 
 .. autofunction:: pd4dgs_codec.decode
 .. autofunction:: pd4dgs_codec.open_stream
 .. autofunction:: pd4dgs_codec.encode
-"""
 
+The rooms of the package:
+"""
 
 #: What stays markup in a docstring: `a literal`, and *a word* or a few.
 MARKUP = re.compile(r"(`[^`\n]+`|(?<![\w*])\*[A-Za-z][\w ]*\*(?![\w*]))")
