@@ -6,7 +6,7 @@ make_environment() {
         { echo "Python >= 3.10 is needed, found $("$python" --version)" >&2; return 1; }
     stamp=$(cat pyproject.toml constraints.txt | cksum)-$extras
     if [ "$(cat "$folder/.stamp" 2>/dev/null)" != "$stamp" ]; then
-        echo "Making the environment $folder (once; downloads 300 to 450 MB of packages) ..." >&2
+        echo "Making the environment $folder (once; the packages of training are 300 to 450 MB) ..." >&2
         "$python" -m venv "$folder"
         "$folder/bin/python" -m pip install --quiet --constraint constraints.txt --editable ".[$extras]"
         echo "$stamp" > "$folder/.stamp"
