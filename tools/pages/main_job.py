@@ -13,8 +13,8 @@ import numpy as np
 
 from pages.pictures import draw_levels
 from pages.trainings import ensure_trained
+from pd4dgs_codec.atomic import whole_file, whole_files, write_bytes
 from pd4dgs_codec.bench.draco import draco_encode
-from pd4dgs_codec.cli.files import whole_file, whole_files, write_bytes
 from pd4dgs_codec.codec.encoder import LayerReport, Report, encode_with_report
 from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.data.dataset import load
@@ -69,7 +69,7 @@ def run_job(job: Job, folder: Path, *, say: Callable[[str], None], progress: Any
         for name, options in VARIANTS.items()
     }
     data, report = files["ans"]
-    write_bytes(str(folder / "scene.pd4"), data, overwrite=True)
+    write_bytes(folder / "scene.pd4", data, overwrite=True)
     say(f"{job.name}: {len(data)} bytes; rendering the held-out views at each level")
     packed = evaluate_file(data, dataset)
     unpacked = {row["level"]: row for row in evaluate_file(path, dataset)["levels"]}
@@ -98,7 +98,7 @@ def run_job(job: Job, folder: Path, *, say: Callable[[str], None], progress: Any
     with whole_files(pictures[0], pictures, overwrite=True) as temporaries:
         draw_levels(data, dataset, *temporaries)
     result["pictures"] = list(PICTURES)
-    with whole_file(str(folder / "results.json"), overwrite=True) as temporary:
+    with whole_file(folder / "results.json", overwrite=True) as temporary:
         temporary.write_text(json.dumps(finite(result), indent=1, allow_nan=False))
     return result
 

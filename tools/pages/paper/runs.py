@@ -12,7 +12,7 @@ from typing import Any
 import torch
 
 from pages.trainings import ensure_trained
-from pd4dgs_codec.cli.files import whole_file, write_bytes
+from pd4dgs_codec.atomic import whole_file, write_bytes
 from pd4dgs_codec.codec.encoder import encode_with_report
 from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.data.dataset import Dataset
@@ -129,7 +129,7 @@ def measure(
         levels[0]["cumulative_bytes"] = monolithic_bytes(model)
     else:
         packed, _ = encode_with_report(to_scene(model))
-        write_bytes(str(folder / "scene.pd4"), packed, overwrite=True)
+        write_bytes(folder / "scene.pd4", packed, overwrite=True)
         levels = evaluate_file(packed, data, perceptual=perceptual)["levels"]
     result = {
         "scene": run.scene.name,
@@ -179,7 +179,7 @@ def held_to(
 
 def _keep(file: Path, value: dict[str, Any]) -> dict[str, Any]:
     """Writes `value` as JSON and returns what the file then says, which is what a later run will read."""
-    with whole_file(str(file), overwrite=True) as temporary:
+    with whole_file(file, overwrite=True) as temporary:
         temporary.write_text(json.dumps(finite(value), indent=1, allow_nan=False))
     return json.loads(file.read_text())
 
