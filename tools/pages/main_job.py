@@ -16,6 +16,7 @@ from pages.trainings import ensure_trained
 from pd4dgs_codec.atomic import whole_file, whole_files, write_bytes
 from pd4dgs_codec.bench.draco import draco_encode
 from pd4dgs_codec.codec.encoder import LayerReport, Report, encode_with_report
+from pd4dgs_codec.codec.options import EncodeOptions
 from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.jsonable import finite
@@ -112,7 +113,8 @@ def coding_rows(reports: dict[str, Report], planned: Scene) -> list[dict[str, An
     (masks included, positions aside) in mode ans over the same symbols in mode lzma. None where there is nothing to
     compare, as where an encoding drops the layer.
     """
-    trained = {int(row["layer"]): sum(row.values()) - row["layer"] for row in train_rate_bits(planned, omit="nothing")}
+    rates = train_rate_bits(planned, EncodeOptions(omit="nothing"))
+    trained = {int(row["layer"]): sum(row.values()) - row["layer"] for row in rates}
     cells = planned.anchor_q
     variants = {name: {layer.layer: layer for layer in report.layers} for name, report in reports.items()}
     rows, start = [], 0
