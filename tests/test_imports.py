@@ -16,6 +16,7 @@ ROOT = Path(pd4dgs_codec.__file__).parent
 #: Part of the package -> the parts it may import; errors and scene are free to all.
 ALLOWED = {
     "errors": set(),
+    "atomic": set(),
     "scene": set(),
     "bitstream": set(),
     "entropy": set(),
@@ -27,7 +28,7 @@ ALLOWED = {
 }
 #: Outside packages that these parts may use.
 LIBRARIES = {"numpy", "constriction", "msgpack"}
-WITHOUT_TORCH = ["errors", "scene", "bitstream", "entropy", "attributes", "evaluate", "codec", "delivery"]
+WITHOUT_TORCH = ["errors", "atomic", "scene", "bitstream", "entropy", "attributes", "evaluate", "codec", "delivery"]
 
 
 def modules(part):

@@ -164,9 +164,8 @@ def deviations(given: Scene, decoded: Scene) -> list[Deviation]:
     for index, layer in enumerate(given.layers):
         kind = LAYER_KINDS[layer]
         before, after = float_tensors(given, index), float_tensors(decoded, index)
-        deformation = getattr(given, kind.deformation) if kind.deformation else None
         names = ["anchor", *(a.name for a in ATTRIBUTES)]
-        names += [kind.planes_step or ""] * (len(PLANES) * len(deformation.planes) if deformation else 0)
+        names += [str(kind.planes_step)] * (len(PLANES) * len(given.tensors(layer).planes))
         names += [kind.weights_step] * (len(before) - len(names))
         for name, x, y in zip(names, before, after, strict=True):
             error = np.abs(x.astype(np.float64) - y)

@@ -24,7 +24,7 @@ from pd4dgs_codec.bench.splats import Splats, bake, draw, view
 from pd4dgs_codec.bench.timing import Timing, measure
 from pd4dgs_codec.codec.attribute_section import read_attributes, write_attributes
 from pd4dgs_codec.codec.layer_meta import Section
-from pd4dgs_codec.codec.layers import GROUPS, channel_groups
+from pd4dgs_codec.codec.payload import GROUPS, channel_groups
 from pd4dgs_codec.codec.plane_section import read_planes, write_planes
 from pd4dgs_codec.codec.symbols import LayerSymbols
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels

@@ -10,6 +10,7 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pd4dgs_codec.atomic import whole_file, whole_files
 from pd4dgs_codec.cli.common import (
     OK,
     SOURCES,
@@ -23,7 +24,7 @@ from pd4dgs_codec.cli.common import (
     run,
     use_threads,
 )
-from pd4dgs_codec.cli.files import STDIO, check_output, named_input, whole_file, whole_files
+from pd4dgs_codec.cli.files import STDIO, check_output, named_input
 from pd4dgs_codec.cli.progress import progress_bar
 
 if TYPE_CHECKING:

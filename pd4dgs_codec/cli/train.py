@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pd4dgs_codec.atomic import remove_leftovers
 from pd4dgs_codec.cli.common import (
     OK,
     SOURCES,
@@ -148,7 +149,7 @@ def _train(args: argparse.Namespace, console: Console) -> int:
             cut_log(args.log, trainer.iteration)
         else:
             open(args.log, "w").close()
-    checkpoint.remove_leftovers(args.output)
+    remove_leftovers(args.output)
     limit = f", at most {config.max_seconds:g} s" if config.max_seconds else ""
     held_out = f"{len(dataset.test)} held out" if dataset.test else "none held out"
     start = f", from step {trainer.iteration}" if trainer.iteration else ""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pd4dgs_codec.bitstream.container import PREAMBLE_SIZE, read_chunk, read_preamble
 from pd4dgs_codec.codec.header import Header, scene_id_of, unpack_header
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
-from pd4dgs_codec.codec.layers import read_layer
+from pd4dgs_codec.codec.payload import read_layer
 from pd4dgs_codec.codec.symbols import LayerSymbols, assemble, check_last_layer
 from pd4dgs_codec.errors import DecodeError, Malformed, Truncated, UnsupportedFeature
 from pd4dgs_codec.scene import Scene

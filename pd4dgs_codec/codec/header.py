@@ -15,12 +15,9 @@ from pd4dgs_codec.bitstream.limits import MAX_CHUNKS, MAX_PAYLOAD
 from pd4dgs_codec.codec.check import info_fault
 from pd4dgs_codec.codec.fields import Fields, as_integer, as_list
 from pd4dgs_codec.codec.kinds import LAYER_KINDS
+from pd4dgs_codec.codec.options import DEFORMATIONS, MODES, RAW_DEFORMATION
 from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.scene import Camera, SceneInfo
-
-#: How symbols are coded, and how the deformations' planes and weights travel: the numbers in the header.
-MODES = {"ans": 0, "lzma": 1}
-DEFORMATIONS = {"coded": 0, "float32": 1}
 
 # Keys of the header map.
 CHUNKS, MODE, DEFORMATION, STEPS, VOXEL_SIZE, BOX, TIME_RANGE, BACKGROUND, NEAR_FAR, UP, UNIT = range(1, 12)
@@ -62,8 +59,8 @@ class Header:
 
     @property
     def raw_deformation(self) -> bool:
-        """Whether planes and weights of the deformations are float32 values."""
-        return self.deformation == "float32"
+        """Whether planes and networks of layers 1 and 2 are stored as float32 values."""
+        return self.deformation == RAW_DEFORMATION
 
 
 def _f32(values) -> list[float]:

@@ -11,7 +11,7 @@ from pd4dgs_codec.codec.bounds import rounding_bounds
 from pd4dgs_codec.codec.decoder import LayerReader
 from pd4dgs_codec.codec.header import unpack_header
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
-from pd4dgs_codec.codec.layers import read_meta
+from pd4dgs_codec.codec.payload import read_meta
 from pd4dgs_codec.codec.symbols import float_tensors
 
 FORMAT_VERSION = f"{MAJOR}.{MINOR}"

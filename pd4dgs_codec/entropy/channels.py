@@ -14,6 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pd4dgs_codec.entropy import EFFORTS, PRIORS
+
 from ..errors import EncodeError, LimitExceeded, Malformed
 from .ans import MAX_COUNT, AnsDecoder, ans_encode
 from .fitting import fit_best, histogram
@@ -59,7 +61,7 @@ def encode_channels(channels: Sequence[np.ndarray], *, priors: str = "best", eff
     priors: "gauss" allows const and gauss only, the model of R(a); "best" every prior and is never larger.
     effort: 1..9, time spent on fitting. Raises EncodeError.
     """
-    if priors not in ("best", "gauss") or not 1 <= effort <= 9:
+    if priors not in PRIORS or effort not in EFFORTS:
         raise EncodeError(f"expected priors best or gauss and effort 1..9, found {priors!r} and {effort}")
     arrays = check_channels(channels)
     histograms = [histogram(a) for a in arrays if len(a)]

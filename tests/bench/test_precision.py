@@ -25,6 +25,7 @@ from pd4dgs_codec.bench.splats import Splats  # noqa: E402
 from pd4dgs_codec.cli import bench  # noqa: E402
 from pd4dgs_codec.codec.decoder import decode_layers  # noqa: E402
 from pd4dgs_codec.codec.encoder import encode  # noqa: E402
+from pd4dgs_codec.codec.options import EncodeOptions  # noqa: E402
 from pd4dgs_codec.codec.plan import plan  # noqa: E402
 from pd4dgs_codec.errors import DataError, Pd4Error  # noqa: E402
 from pd4dgs_codec.model import checkpoint  # noqa: E402
@@ -114,7 +115,7 @@ def test_plots_take_zeros_and_many_series(tmp_path):
 
 
 def test_deviations_by_hand(scene):
-    planned, _ = plan(scene, 2)
+    planned, _ = plan(scene, EncodeOptions(layers=2))
     moved = planned.feature.copy()
     moved[0, 0] += 0.5
     found = {v.what: v for v in codec.deviations(planned, replace(planned, feature=moved))}

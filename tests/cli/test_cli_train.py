@@ -262,14 +262,14 @@ def test_a_run_killed_while_it_saves_goes_on_as_if_nothing_had_happened(train, c
     done = subprocess.run([sys.executable, "-c", KILLED, *map(str, argv)], stderr=subprocess.DEVNULL, timeout=300)
     assert done.returncode == -signal.SIGKILL
     assert checkpoint.load(killed)[1]["iteration"] == 19 and len(log.read_text().splitlines()) == 20
-    assert len(list(tmp_path.glob(".killed.pt.*"))) == 1  # what it was writing
+    assert len(list(tmp_path.glob(".pd4dgs-*/killed.pt"))) == 1  # what it was writing
     with log.open("a") as stream:
         stream.write('{"iteration": 2')  # a line cut in its middle
     assert cli("train", shared_dataset, "-o", killed, "--resume", killed, "--log", log, "-j", 1).code == 0
     assert train(whole, iterations=40).code == 0
     assert _same(_state(whole), _state(killed))
     assert [json.loads(line)["iteration"] for line in log.read_text().splitlines()] == list(range(40))
-    assert not list(tmp_path.glob(".killed.pt.*"))
+    assert not list(tmp_path.glob(".pd4dgs-*/killed.pt"))
 
 
 def test_scarce_data_is_said_to_be_so(cli, dataset, tmp_path):

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import asdict
 from typing import TYPE_CHECKING
 
+from pd4dgs_codec.atomic import whole_file
 from pd4dgs_codec.bench.latency.published import FIRST_FRAME
 from pd4dgs_codec.cli.bench.output import prepare, publish
 from pd4dgs_codec.cli.common import (
@@ -22,7 +23,6 @@ from pd4dgs_codec.cli.common import (
     rates,
     use_threads,
 )
-from pd4dgs_codec.cli.files import whole_file
 from pd4dgs_codec.cli.progress import progress_bar
 
 if TYPE_CHECKING:

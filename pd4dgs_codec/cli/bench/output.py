@@ -8,8 +8,9 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
+from pd4dgs_codec.atomic import whole_file
 from pd4dgs_codec.cli.common import Console, Parser, UsageError, count, positive_int
-from pd4dgs_codec.cli.files import STDIO, check_output, whole_file, write_bytes
+from pd4dgs_codec.cli.files import STDIO, check_output, write_bytes
 from pd4dgs_codec.jsonable import finite
 
 if TYPE_CHECKING:

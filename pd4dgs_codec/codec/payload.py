@@ -20,8 +20,9 @@ from pd4dgs_codec.bitstream.limits import MAX_PARAMETERS, MAX_VOXEL
 from pd4dgs_codec.codec.attribute_section import read_attributes, write_attributes
 from pd4dgs_codec.codec.kinds import LayerKind
 from pd4dgs_codec.codec.layer_meta import LayerMeta, ScaleMeta, Section, check_symbol_count, pack_meta, unpack_meta
+from pd4dgs_codec.codec.options import EncodeOptions
 from pd4dgs_codec.codec.plane_section import read_planes, write_planes
-from pd4dgs_codec.codec.symbols import LayerSymbols, Planes
+from pd4dgs_codec.codec.symbols import LayerSymbols
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
 from pd4dgs_codec.entropy.lzma_mode import (
     decode_channels_lzma,
@@ -32,19 +33,10 @@ from pd4dgs_codec.entropy.lzma_mode import (
 from pd4dgs_codec.entropy.positions import decode_positions, encode_positions
 from pd4dgs_codec.entropy.rate import gaussian_bits
 from pd4dgs_codec.errors import LimitExceeded, Malformed
-from pd4dgs_codec.scene import MASK_MIN_CODE, PLANES, Network
+from pd4dgs_codec.scene import MASK_MIN_CODE, PLANES, Network, Planes
 
 #: The groups of channels, by section, in coding order; FLOATS and POSITIONS are not channels.
 GROUPS = (Section.MASKS, Section.ATTRIBUTES, Section.PLANES, Section.WEIGHTS)
-
-
-@dataclass(frozen=True)
-class Coding:
-    """How to write symbols: mode "ans" or "lzma"; priors "best" or "gauss"; effort 1 (fast) .. 9 (small)."""
-
-    mode: str = "ans"
-    priors: str = "best"
-    effort: int = 5
 
 
 @dataclass(frozen=True)
@@ -57,32 +49,32 @@ class StreamReport:
     symbols: int
 
 
-def write_layer(symbols: LayerSymbols, coding: Coding) -> tuple[bytes, list[StreamReport]]:
+def write_layer(symbols: LayerSymbols, options: EncodeOptions) -> tuple[bytes, list[StreamReport]]:
     """(payload, what each section took; the first report is the positions'). Inverse: read_layer."""
     groups, predictors = channel_groups(symbols)
     positions = encode_positions(symbols.anchor_q) if len(symbols.anchor_q) else b""
     sections = {Section.POSITIONS: positions}
     reports = [StreamReport("positions", 8 * len(positions), 0.0, symbols.anchor_q.size)]
-    if coding.mode == "lzma":
+    if options.mode == "lzma":
         groups = {Section.SYMBOLS: [channel for section in GROUPS for channel in groups[section]]}
     for section, channels in groups.items():
         if not any(channel.size for channel in channels):
             continue
         if section == Section.ATTRIBUTES:
-            data, rate_bits = write_attributes(symbols.attributes, coding.priors, coding.effort)
+            data, rate_bits = write_attributes(symbols.attributes, options.priors, options.effort)
         elif section == Section.PLANES:
-            data, rate_bits = write_planes(_by_plane(channels, symbols), coding.priors, coding.effort)
-        elif coding.mode == "lzma":  # one stream for all, but a layer's rate counts no masks
-            coded = encode_channels_lzma(channels, effort=coding.effort)
+            data, rate_bits = write_planes(_by_plane(channels, symbols), options.priors, options.effort)
+        elif options.mode == "lzma":  # one stream for all, but a layer's rate counts no masks
+            coded = encode_channels_lzma(channels, effort=options.effort)
             data, rate_bits = coded.payload, coded.rate_bits - sum(gaussian_bits(c) for c in channels[:2])
         else:
-            coded = encode_channels(channels, priors=coding.priors, effort=coding.effort)
+            coded = encode_channels(channels, priors=options.priors, effort=options.effort)
             data, rate_bits = coded.payload, coded.rate_bits
         sections[section] = data
         count = sum(channel.size for channel in channels)
         reports.append(StreamReport(section.name.lower(), 8 * len(data), rate_bits, count))
-    if symbols.raw and symbols.networks:
-        sections[Section.FLOATS] = encode_floats_lzma([a.ravel() for a in symbols.tensors()], effort=coding.effort)
+    if symbols.raw_deformation and symbols.networks:
+        sections[Section.FLOATS] = encode_floats_lzma([a.ravel() for a in symbols.tensors()], effort=options.effort)
         reports.append(StreamReport("floats", 8 * len(sections[Section.FLOATS]), 0.0, 0))
     meta = pack_meta(_meta(symbols, sections, predictors), symbols.kind)
     return b"".join([struct.pack("<I", len(meta)), meta, *sections.values()]), reports
@@ -93,7 +85,7 @@ def channel_groups(symbols: LayerSymbols) -> tuple[dict[Section, list[np.ndarray
     groups: dict[Section, list[np.ndarray]] = {section: [] for section in GROUPS}
     groups[Section.MASKS] = [symbols.mask_increase, symbols.mask_own]
     groups[Section.ATTRIBUTES] = list(symbols.attributes)
-    tensors = [] if symbols.raw else list(symbols.tensors())
+    tensors = [] if symbols.raw_deformation else list(symbols.tensors())
     n_planes = len(PLANES) * len(symbols.planes)
     predictors = [0] * n_planes
     for i, tensor in enumerate(tensors):
@@ -127,7 +119,9 @@ def _meta(symbols: LayerSymbols, sections: dict[Section, bytes], predictors: lis
     )
 
 
-def read_meta(payload: bytes | memoryview, kind: LayerKind, rows_before: int, raw: bool) -> tuple[LayerMeta, int]:
+def read_meta(
+    payload: bytes | memoryview, kind: LayerKind, rows_before: int, raw_deformation: bool
+) -> tuple[LayerMeta, int]:
     """(parameters, offset of the first section) of a payload, all lengths checked against the bytes there are."""
     if len(payload) < 4:
         raise Malformed(f"layer {kind.layer}: payload of {len(payload)} bytes, expected at least 4")
@@ -136,7 +130,7 @@ def read_meta(payload: bytes | memoryview, kind: LayerKind, rows_before: int, ra
         raise LimitExceeded(f"layer {kind.layer}: parameters of {length} bytes, limit {MAX_PARAMETERS}")
     if length > len(payload) - 4:
         raise Malformed(f"layer {kind.layer}: parameters of {length} bytes in a payload of {len(payload)}")
-    meta = unpack_meta(bytes(payload[4 : 4 + length]), kind, rows_before, raw)
+    meta = unpack_meta(bytes(payload[4 : 4 + length]), kind, rows_before, raw_deformation)
     start, declared = 4 + length, sum(meta.sections.values())
     if start + declared != len(payload):
         raise Malformed(f"layer {kind.layer}: sections of {declared} bytes, expected {len(payload) - start}")
@@ -144,21 +138,23 @@ def read_meta(payload: bytes | memoryview, kind: LayerKind, rows_before: int, ra
     return meta, start
 
 
-def read_layer(payload: bytes | memoryview, kind: LayerKind, rows_before: int, mode: str, raw: bool) -> LayerSymbols:
+def read_layer(
+    payload: bytes | memoryview, kind: LayerKind, rows_before: int, mode: str, raw_deformation: bool
+) -> LayerSymbols:
     """The symbols of a payload (clause "layer payload"). rows_before: anchors in the layers before this one.
 
     Raises DecodeError's subclasses; nothing is allocated for a count that the limits or the payload do not cover.
     """
-    meta, start = read_meta(payload, kind, rows_before, raw)
+    meta, start = read_meta(payload, kind, rows_before, raw_deformation)
     parts: dict[int, bytes] = {}
     for section, length in sorted(meta.sections.items()):
         parts[section] = bytes(payload[start : start + length])
         start += length
-    raw = raw and bool(meta.networks) and kind.deformation is not None
+    raw_deformation = raw_deformation and bool(meta.networks) and kind.layer > 0
     shapes = [*meta.plane_shapes(), *meta.weight_shapes(kind)]
-    counts = _channel_counts(meta, kind, rows_before, raw)
+    counts = _channel_counts(meta, kind, rows_before, raw_deformation)
     channels = _decode_groups(parts, counts, meta, mode)
-    if raw:
+    if raw_deformation:
         floats = decode_floats_lzma(_part(parts, Section.FLOATS, 1), [math.prod(shape) for shape in shapes])
         tensors = [x.reshape(shape) for x, shape in zip(floats, shapes, strict=True)]
     else:
@@ -173,7 +169,7 @@ def read_layer(payload: bytes | memoryview, kind: LayerKind, rows_before: int, m
     for tensor in (attributes, *tensors):
         if tensor.dtype.kind == "i" and tensor.size and max(int(tensor.max()), -int(tensor.min())) > MAX_SYMBOL:
             raise Malformed(f"layer {kind.layer}: a symbol over {MAX_SYMBOL} in magnitude")
-    return LayerSymbols(kind, anchor_q, increase, own, attributes, planes, networks, meta.steps, raw)
+    return LayerSymbols(kind, anchor_q, increase, own, attributes, planes, networks, meta.steps, raw_deformation)
 
 
 def _part(parts: dict[int, bytes], section: Section, symbols: int) -> bytes:
@@ -184,9 +180,11 @@ def _part(parts: dict[int, bytes], section: Section, symbols: int) -> bytes:
     return parts.pop(section, b"")
 
 
-def _channel_counts(meta: LayerMeta, kind: LayerKind, rows_before: int, raw: bool) -> dict[Section, list[int]]:
-    planes = [] if raw else [h * w for c, h, w in meta.plane_shapes() for _ in range(c)]
-    weights = [] if raw else [math.prod(shape) for shape in meta.weight_shapes(kind)]
+def _channel_counts(
+    meta: LayerMeta, kind: LayerKind, rows_before: int, raw_deformation: bool
+) -> dict[Section, list[int]]:
+    planes = [] if raw_deformation else [h * w for c, h, w in meta.plane_shapes() for _ in range(c)]
+    weights = [] if raw_deformation else [math.prod(shape) for shape in meta.weight_shapes(kind)]
     return {
         Section.MASKS: [rows_before, meta.rows],
         Section.ATTRIBUTES: [meta.rows] * N_CHANNELS,
