@@ -29,7 +29,7 @@ from pd4dgs_codec.cli.progress import progress_bar
 
 if TYPE_CHECKING:
     from pd4dgs_codec.codec.omissions import LeftOut
-    from pd4dgs_codec.data.dataset import View
+    from pd4dgs_codec.data.view import View
     from pd4dgs_codec.scene import Scene
 
 DETAILS = f"""\

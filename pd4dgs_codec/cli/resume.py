@@ -76,7 +76,9 @@ def _expect_same(path: str, what: str, stored: Any, asked: Any) -> None:
 
 
 def _same_source(source: str) -> str:
-    return source if source.startswith("synthetic:") else str(Path(source).resolve())
+    from pd4dgs_codec.data.synthetic import PREFIX
+
+    return source if source.startswith(PREFIX) else str(Path(source).resolve())
 
 
 def cut_log(path: str, iteration: int) -> None:

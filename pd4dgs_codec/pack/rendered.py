@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
-from pd4dgs_codec.data.dataset import View
+from pd4dgs_codec.data.view import View
 from pd4dgs_codec.metrics.image import mpsnr
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.harm import anchor_harm

@@ -11,7 +11,7 @@ from pd4dgs_codec.codec.layers import Coding
 from pd4dgs_codec.codec.omissions import LeftOut
 from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.codec.symbols import rounded
-from pd4dgs_codec.data.dataset import View
+from pd4dgs_codec.data.view import View
 from pd4dgs_codec.pack.rendered import true_psnr
 from pd4dgs_codec.scene import Scene
 

@@ -19,7 +19,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pd4dgs_codec.data.dataset import Dataset, View
+from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DataError, NotFinite, TrainError
 from pd4dgs_codec.jsonable import finite
 from pd4dgs_codec.metrics.image import mpsnr

@@ -14,7 +14,7 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from pd4dgs_codec.data.dataset import View
+from pd4dgs_codec.data.view import View
 from pd4dgs_codec.model.harm import anchor_harm
 from pd4dgs_codec.model.layers import mask_logits
 from pd4dgs_codec.model.model import Model, Rounding

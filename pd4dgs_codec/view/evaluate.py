@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.data.dataset import Dataset, View
+from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.metrics.image import mean_image_baseline, mpsnr, mssim, to_uint8
 from pd4dgs_codec.metrics.perceptual import Distance, Perceptual
 from pd4dgs_codec.scene import Camera

@@ -15,7 +15,7 @@ from pd4dgs_codec import decode, encode
 torch = pytest.importorskip("torch")
 pytest.importorskip("numba")
 
-from pd4dgs_codec.data.dataset import Dataset, View  # noqa: E402
+from pd4dgs_codec.data.view import Dataset, View  # noqa: E402
 from pd4dgs_codec.errors import DataError, NotFinite, RenderError, TrainError  # noqa: E402
 from pd4dgs_codec.model import checkpoint  # noqa: E402
 from pd4dgs_codec.model.config import PRESETS, DeformationConfig, ModelConfig  # noqa: E402

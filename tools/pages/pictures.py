@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pd4dgs_codec.data.dataset import Dataset, View
+from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.metrics.image import to_uint8
 from pd4dgs_codec.view.levels import Level, load_levels
 from pd4dgs_codec.view.movie import write_gif

@@ -15,7 +15,7 @@ import torch
 from pd4dgs_codec.bench.stability.rows import Case
 from pd4dgs_codec.bench.stability.scenes import picture_error
 from pd4dgs_codec.codec import decoder, encoder
-from pd4dgs_codec.data.dataset import Dataset, View
+from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import DeformationConfig, ModelConfig
 from pd4dgs_codec.model.convert import from_scene, to_scene

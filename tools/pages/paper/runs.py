@@ -15,7 +15,7 @@ from pages.trainings import ensure_trained
 from pd4dgs_codec.cli.files import whole_file, write_bytes
 from pd4dgs_codec.codec.encoder import encode_with_report
 from pd4dgs_codec.codec.plan import plan
-from pd4dgs_codec.data.dataset import Dataset
+from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.jsonable import finite
 from pd4dgs_codec.metrics.perceptual import load_perceptual
 from pd4dgs_codec.model import checkpoint
