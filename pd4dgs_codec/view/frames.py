@@ -59,7 +59,7 @@ def look_at_point(info: SceneInfo) -> np.ndarray:
     viewmat = info.camera.viewmat.astype(np.float64)
     eye, axis = -viewmat[:3, :3].T @ viewmat[:3, 3], viewmat[2, :3]
     depth = float(axis @ (info.box.astype(np.float64).mean(axis=0) - eye))
-    return eye + max(depth, float(info.near), 1e-6) * axis
+    return np.asarray(eye + max(depth, float(info.near), 1e-6) * axis)
 
 
 def turned(camera: Camera, centre: np.ndarray, up: Sequence[float], angle: float) -> Camera:
