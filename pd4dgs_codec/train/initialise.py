@@ -94,7 +94,8 @@ def initial_cells(dataset: Dataset, count: int, voxel_size: float, generator: to
         pick = torch.randint(len(points), (count - len(points),), generator=generator)
         jitter = torch.randn(len(pick), 3, generator=generator) * spacing[pick, None]
         points = torch.cat([points, points[pick] + jitter])
-    return torch.unique(torch.round(points / voxel_size).to(torch.int32), dim=0)
+    cells: Tensor = torch.unique(torch.round(points / voxel_size).to(torch.int32), dim=0)
+    return cells
 
 
 def _points_near_box(dataset: Dataset) -> Tensor:
@@ -136,7 +137,7 @@ def nearest_distances(points: Tensor, k: int = 3) -> Tensor:
         return torch.full((n,), 1.0)
     k = min(k, n - 1)
     out = []
-    for block in points.split(max(1, 8_000_000 // n)):
+    for block in torch.split(points, max(1, 8_000_000 // n)):
         nearest = torch.cdist(block, points).topk(k + 1, largest=False).values[:, 1:]
         out.append(nearest.square().mean(1).sqrt())
     return torch.cat(out)
