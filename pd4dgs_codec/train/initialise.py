@@ -12,7 +12,7 @@ from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.model.config import ModelConfig
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model, fresh_networks
-from pd4dgs_codec.scene import FEATURE_DIM, GLOBAL_HEADS, LOCAL_HEADS, N_OFFSETS, Camera, SceneInfo, Steps
+from pd4dgs_codec.scene import FEATURE_DIM, GLOBAL_HEADS, LOCAL_HEADS, N_OFFSETS, SceneInfo, Steps
 
 #: Voxels along the longest side of the scene's box.
 GRID = 1024
@@ -67,7 +67,6 @@ def fresh_mask_logits(n: int, level: int) -> Tensor:
 
 def scene_info(dataset: Dataset) -> SceneInfo:
     """The header's facts of a dataset; the voxel is 1/1024 of the box's longest side."""
-    view = dataset.train[0]
     box = np.asarray(dataset.box, np.float32)
     return SceneInfo(
         voxel_size=_binary32(float((box[1] - box[0]).max()) / GRID),
@@ -78,7 +77,7 @@ def scene_info(dataset: Dataset) -> SceneInfo:
         far=_binary32(dataset.far),
         up=tuple(_binary32(v) for v in dataset.up),  # type: ignore[arg-type]
         unit=_binary32(dataset.unit),
-        camera=Camera(np.asarray(view.viewmat, np.float32), np.asarray(view.K, np.float32), view.width, view.height),
+        camera=dataset.camera,
     )
 
 

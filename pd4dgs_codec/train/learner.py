@@ -278,7 +278,7 @@ class Learner:
         psnr = self.level_psnr([self.dataset.train[index] for index in waiting])
         found = judge.levels_without_gain(psnr)
         for level, _ in found:
-            judge.leave_out(self.model, self.optimiser, level)
+            judge.drop_level(self.model, self.optimiser, level)
         self.left_out = [{"level": level, "gain": gain, "views": len(waiting)} for level, gain in found]
         return psnr
 

@@ -20,7 +20,7 @@ from pd4dgs_codec.train.loop import Trainer
     [
         ([30, 31, 32], []),
         ([30, 31, 30.9], [2]),
-        ([30, 31, 31 + 0.9 * judge.MIN_GAIN[2]], [2]),
+        ([30, 31, 31 + 0.9 * judge.MIN_GAIN_DB[2]], [2]),
         ([30, 29, 29], [2, 1]),
         ([30, 30.38, 30.4], [2, 1]),  # a scene where nothing moves
         ([30, 29, 29.5], []),  # level 2 gains, and rests on level 1
