@@ -14,7 +14,7 @@ from pd4dgs_codec.codec.symbols import rounded
 from pd4dgs_codec.scene import Scene
 
 if TYPE_CHECKING:
-    from pd4dgs_codec.data.dataset import View
+    from pd4dgs_codec.data.view import View
 
 
 def leave_out_unpaid(

@@ -16,7 +16,7 @@ from pd4dgs_codec.pack import MIN_GAIN_PER_MEGABYTE
 from pd4dgs_codec.scene import Scene
 
 if TYPE_CHECKING:
-    from pd4dgs_codec.data.dataset import Dataset, View
+    from pd4dgs_codec.data.view import Dataset, View
     from pd4dgs_codec.model.model import Model
 
 #: Pictures of the file's own camera, and how many degrees it sways, where there are no views.

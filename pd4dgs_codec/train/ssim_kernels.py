@@ -9,6 +9,8 @@ Padded images: [H + 10, stride], pixel (j, i) channel c at [j + 5, 15 + 3 i + c]
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba as nb
 import numpy as np
 
@@ -35,7 +37,7 @@ def pad(image: np.ndarray) -> np.ndarray:
 
 
 @nb.njit(**INNER)
-def _across(row, k, taps):
+def _across(row: np.ndarray, k: int, taps: np.ndarray) -> Any:
     """The horizontal window at lane k of an image row, from a flat padded row (offset included in k)."""
     value = load(row, k) * splat(taps[0])
     for o in range(1, len(taps)):
@@ -44,7 +46,7 @@ def _across(row, k, taps):
 
 
 @nb.njit(**OUTER)
-def target_moments(mean, variance, image, taps):
+def target_moments(mean: np.ndarray, variance: np.ndarray, image: np.ndarray, taps: np.ndarray) -> None:
     """mean, variance [H, lanes] of a padded image under the window."""
     height, stride = len(mean), image.shape[1]
     zero = splat(image.dtype.type(0))
@@ -66,7 +68,7 @@ def target_moments(mean, variance, image, taps):
 
 
 @nb.njit(**INNER)
-def _down(rows, x, y, j, taps):
+def _down(rows: np.ndarray, x: np.ndarray, y: np.ndarray, j: int, taps: np.ndarray) -> None:
     """rows [3, stride] = the vertical window of x, x^2 and x y at image row j."""
     stride = x.shape[1]
     zero = splat(x.dtype.type(0))
@@ -84,7 +86,16 @@ def _down(rows, x, y, j, taps):
 
 
 @nb.njit(**OUTER)
-def loss(slopes, sums, x, y, mean_y, var_y, weights, taps):
+def loss(
+    slopes: np.ndarray,
+    sums: np.ndarray,
+    x: np.ndarray,
+    y: np.ndarray,
+    mean_y: np.ndarray,
+    var_y: np.ndarray,
+    weights: np.ndarray,
+    taps: np.ndarray,
+) -> None:
     """sums [H, 2] = per row the weighted sums of |x - y| and of 1 - SSIM.
 
     slopes [3, H + 10, stride], given zeroed = the weighted derivatives of SSIM by the windowed x, x^2 and x y, in the
@@ -125,7 +136,15 @@ def loss(slopes, sums, x, y, mean_y, var_y, weights, taps):
 
 
 @nb.njit(**OUTER)
-def loss_backward(grad, x, y, weights, slopes, factors, taps):
+def loss_backward(
+    grad: np.ndarray,
+    x: np.ndarray,
+    y: np.ndarray,
+    weights: np.ndarray,
+    slopes: np.ndarray,
+    factors: np.ndarray,
+    taps: np.ndarray,
+) -> None:
     """grad [H, W, 3] = d(factors[0] * L1 + factors[1] * (1 - SSIM)) / dx; the window is its own transpose."""
     height, width = weights.shape
     stride = x.shape[1]

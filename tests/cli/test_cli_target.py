@@ -108,7 +108,7 @@ def test_a_layer_that_explains_the_pictures_is_kept(scene):
     from pd4dgs_codec.codec.options import EncodeOptions
     from pd4dgs_codec.codec.plan import plan
     from pd4dgs_codec.codec.symbols import rounded
-    from pd4dgs_codec.data.dataset import View
+    from pd4dgs_codec.data.view import View
     from pd4dgs_codec.metrics.image import to_uint8
     from pd4dgs_codec.model.convert import from_scene
     from pd4dgs_codec.model.picture import render_image

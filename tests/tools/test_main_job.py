@@ -22,7 +22,7 @@ from pages.main_job import Job, run_job  # noqa: E402
 from pd4dgs_codec import decode  # noqa: E402
 from pd4dgs_codec.codec.encoder import encode_with_report  # noqa: E402
 from pd4dgs_codec.codec.info import info  # noqa: E402
-from pd4dgs_codec.data.dataset import Dataset, View  # noqa: E402
+from pd4dgs_codec.data.view import Dataset, View  # noqa: E402
 from pd4dgs_codec.errors import TrainError  # noqa: E402
 from pd4dgs_codec.model import checkpoint  # noqa: E402
 from pd4dgs_codec.model.config import PRESETS, DeformationConfig, ModelConfig  # noqa: E402

@@ -23,7 +23,8 @@ from pages.paper.runs import (  # noqa: E402
 )
 
 from pd4dgs_codec.bench.latency.published import FIRST_FRAME  # noqa: E402
-from pd4dgs_codec.data.dataset import Dataset, load  # noqa: E402
+from pd4dgs_codec.data.dataset import load  # noqa: E402
+from pd4dgs_codec.data.view import Dataset  # noqa: E402
 from pd4dgs_codec.model import checkpoint  # noqa: E402
 from pd4dgs_codec.model.config import PRESETS, DeformationConfig, ModelConfig  # noqa: E402
 from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS  # noqa: E402

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -85,7 +84,7 @@ def run_job(job: Job, folder: Path, *, say: Callable[[str], None], progress: Any
         "seed": config.seed,
         "iterations": training["iteration"],
         "total": training["total"],
-        "phases_not_reached": Schedule(training["total"] or sys.maxsize).phases_not_reached(training["iteration"]),
+        "phases_not_reached": Schedule(training["total"] or None).phases_not_reached(training["iteration"]),
         "train_seconds": training["seconds"],
         "skipped_steps": training["skipped"],
         "rho": training["rho"],

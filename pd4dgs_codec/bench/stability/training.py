@@ -15,16 +15,13 @@ import torch
 from pd4dgs_codec.bench.stability.rows import Case
 from pd4dgs_codec.bench.stability.scenes import picture_error
 from pd4dgs_codec.codec import decoder, encoder
-from pd4dgs_codec.data.dataset import Dataset, View
+from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import DeformationConfig, ModelConfig
 from pd4dgs_codec.model.convert import from_scene, to_scene
 from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS
 from pd4dgs_codec.train.config import LearningRates, TrainConfig
-from pd4dgs_codec.train.densify import Densifier
-from pd4dgs_codec.train.initialise import fresh_model
 from pd4dgs_codec.train.loop import Trainer
-from pd4dgs_codec.train.optimiser import Optimiser
 
 GROUP = "training"
 ITERATIONS = 60
@@ -125,11 +122,7 @@ def _trainer(make: Callable[[], Dataset], config: ModelConfig = SMALLEST, factor
     """factor: on all learning rates."""
     data = make()
     rates = LearningRates(**{k: (factor * a, factor * b) for k, (a, b) in asdict(LearningRates()).items()})
-    trainer = Trainer(TrainConfig(preset="tiny", iterations=ITERATIONS, rates=rates), data)
-    trainer.model = fresh_model(config, data, config.steps, seed=0)
-    trainer.optimiser = Optimiser(trainer.model, rates)
-    trainer.densifier = Densifier(trainer.model, trainer.config.grow_threshold, config.max_anchors)
-    return trainer
+    return Trainer(TrainConfig(preset="tiny", iterations=ITERATIONS, rates=rates, cooldown=0.0), data, size=config)
 
 
 def _single() -> Trainer:
@@ -160,11 +153,11 @@ def _passing_nan() -> tuple[str, float]:
     with torch.no_grad():
         bias.fill_(np.nan)
     for _ in range(2):
-        trainer.step()
+        trainer.learner.step()
     with torch.no_grad():
         bias.copy_(kept)
     got, error = _finish(trainer)
-    return got, error if trainer.skipped == 2 else np.nan
+    return got, error if trainer.learner.skipped == 2 else np.nan
 
 
 def _finish(trainer: Trainer) -> tuple[str, float]:
@@ -177,5 +170,5 @@ def _finish(trainer: Trainer) -> tuple[str, float]:
     decoded = from_scene(scene)
     view = trainer.dataset.train[-1]
     errors = [picture_error(decoded, level, view.time, view.camera) for level in (0, 1, 2)]
-    skipped = f"{trainer.skipped} of {trainer.iteration} steps skipped"
+    skipped = f"{trainer.learner.skipped} of {trainer.iteration} steps skipped"
     return f"{skipped}, {len(scene.anchor_q):,} anchors, {len(data):,} bytes", float(np.max(errors))

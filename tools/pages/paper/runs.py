@@ -14,7 +14,7 @@ import torch
 from pages.trainings import ensure_trained
 from pd4dgs_codec.atomic import whole_file, write_bytes
 from pd4dgs_codec.codec.encoder import encode_with_report
-from pd4dgs_codec.data.dataset import Dataset
+from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.jsonable import finite
 from pd4dgs_codec.metrics.perceptual import load_perceptual
 from pd4dgs_codec.model import checkpoint

@@ -1,4 +1,4 @@
-"""Write any dataset in the iPhone layout, so that other code can be run on the same scene."""
+"""Writes a dataset in the iPhone layout: what the tests of its reader read back and break."""
 
 from __future__ import annotations
 
@@ -10,9 +10,8 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import DataError
-from .dataset import Dataset, View, load
-from .files import shrink_image, shrink_mask
+from pd4dgs_codec.data import Dataset, View
+from pd4dgs_codec.data.files import shrink_image, shrink_mask
 
 MAX_TIME_ID = 99_999  #: names have five digits
 FACTORS = (1, 2)  #: resolutions written; extra.json names the first as the dataset's own
@@ -125,26 +124,18 @@ def _write_tables(folder: Path, dataset: Dataset, train: list[_Entry], test: lis
     _write_json(folder / "extra.json", extra)
 
 
-def export_iphone(source: Dataset | str | Path, folder: str | Path) -> None:
-    """Write `source` (a Dataset, or anything `load` takes) to the new or empty `folder`.
+def export_iphone(dataset: Dataset, folder: Path) -> None:
+    """Writes `dataset` to the new `folder`.
 
     Full-size images are rgb/1x with factor 1; rgb/2x holds their 2x2 means for code that expects it. Reading the folder
     gives the same cameras, times, images, test masks, points, box, near and far. Colours of the points, masks of
     training views and a start of the time range other than 0 have no place in the layout and are lost.
     """
-    dataset = source if isinstance(source, Dataset) else load(source)
-    folder = Path(folder)
-    if folder.exists() and (not folder.is_dir() or any(folder.iterdir())):
-        raise DataError(f"{folder}: exists and is not an empty folder, expected a new one to export to")
     train, test = _entries(dataset)
-    try:
-        for entry in [*train, *test]:
-            _write_json(folder / "camera" / f"{entry.name}.json", _camera(entry.view))
-        with_masks = dataset.masked or any(v.mask is not None for v in dataset.test)
-        _write_pixels(folder, train, False)
-        _write_pixels(folder, test, with_masks)
-        _write_tables(folder, dataset, train, test)
-        if dataset.points is not None:
-            np.save(folder / "points.npy", dataset.points)
-    except OSError as e:
-        raise DataError(f"{e.filename or folder}: cannot be written: {e.strerror}") from None
+    for entry in [*train, *test]:
+        _write_json(folder / "camera" / f"{entry.name}.json", _camera(entry.view))
+    _write_pixels(folder, train, False)
+    _write_pixels(folder, test, dataset.masked or any(v.mask is not None for v in dataset.test))
+    _write_tables(folder, dataset, train, test)
+    if dataset.points is not None:
+        np.save(folder / "points.npy", dataset.points)
