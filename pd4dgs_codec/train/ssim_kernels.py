@@ -12,7 +12,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from pd4dgs_codec.model.simd import INNER, LANES, OUTER, load, splat, store
+from pd4dgs_codec.simd import LANES, kernel, load, splat, store
 
 C1, C2 = 0.01**2, 0.03**2
 TAPS = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
@@ -34,7 +34,7 @@ def pad(image: np.ndarray) -> np.ndarray:
     return out
 
 
-@nb.njit(**INNER)
+@kernel(fast=True, inline=True)
 def _across(row, k, taps):
     """The horizontal window at lane k of an image row, from a flat padded row (offset included in k)."""
     value = load(row, k) * splat(taps[0])
@@ -43,7 +43,7 @@ def _across(row, k, taps):
     return value
 
 
-@nb.njit(**OUTER)
+@kernel(fast=True, parallel=True)
 def target_moments(mean, variance, image, taps):
     """mean, variance [H, lanes] of a padded image under the window."""
     height, stride = len(mean), image.shape[1]
@@ -65,7 +65,7 @@ def target_moments(mean, variance, image, taps):
             store(variance, j * mean.shape[1] + k, _across(rows, stride + k, taps) - m * m)
 
 
-@nb.njit(**INNER)
+@kernel(fast=True, inline=True)
 def _down(rows, x, y, j, taps):
     """rows [3, stride] = the vertical window of x, x^2 and x y at image row j."""
     stride = x.shape[1]
@@ -83,7 +83,7 @@ def _down(rows, x, y, j, taps):
         store(rows, 2 * stride + k, cross)
 
 
-@nb.njit(**OUTER)
+@kernel(fast=True, parallel=True)
 def loss(slopes, sums, x, y, mean_y, var_y, weights, taps):
     """sums [H, 2] = per row the weighted sums of |x - y| and of 1 - SSIM.
 
@@ -124,7 +124,7 @@ def loss(slopes, sums, x, y, mean_y, var_y, weights, taps):
         sums[j, 0], sums[j, 1] = absolute, dissimilarity
 
 
-@nb.njit(**OUTER)
+@kernel(fast=True, parallel=True)
 def loss_backward(grad, x, y, weights, slopes, factors, taps):
     """grad [H, W, 3] = d(factors[0] * L1 + factors[1] * (1 - SSIM)) / dx; the window is its own transpose."""
     height, width = weights.shape
