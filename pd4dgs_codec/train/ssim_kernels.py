@@ -14,7 +14,7 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from pd4dgs_codec.model.simd import INNER, LANES, OUTER, load, splat, store
+from pd4dgs_codec.simd import LANES, kernel, load, splat, store
 
 C1, C2 = 0.01**2, 0.03**2
 TAPS = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
@@ -36,7 +36,7 @@ def pad(image: np.ndarray) -> np.ndarray:
     return out
 
 
-@nb.njit(**INNER)
+@kernel(fast=True, inline=True)
 def _across(row: np.ndarray, k: int, taps: np.ndarray) -> Any:
     """The horizontal window at lane k of an image row, from a flat padded row (offset included in k)."""
     value = load(row, k) * splat(taps[0])
@@ -45,7 +45,7 @@ def _across(row: np.ndarray, k: int, taps: np.ndarray) -> Any:
     return value
 
 
-@nb.njit(**OUTER)
+@kernel(fast=True, parallel=True)
 def target_moments(mean: np.ndarray, variance: np.ndarray, image: np.ndarray, taps: np.ndarray) -> None:
     """mean, variance [H, lanes] of a padded image under the window."""
     height, stride = len(mean), image.shape[1]
@@ -67,7 +67,7 @@ def target_moments(mean: np.ndarray, variance: np.ndarray, image: np.ndarray, ta
             store(variance, j * mean.shape[1] + k, _across(rows, stride + k, taps) - m * m)
 
 
-@nb.njit(**INNER)
+@kernel(fast=True, inline=True)
 def _down(rows: np.ndarray, x: np.ndarray, y: np.ndarray, j: int, taps: np.ndarray) -> None:
     """rows [3, stride] = the vertical window of x, x^2 and x y at image row j."""
     stride = x.shape[1]
@@ -85,7 +85,7 @@ def _down(rows: np.ndarray, x: np.ndarray, y: np.ndarray, j: int, taps: np.ndarr
         store(rows, 2 * stride + k, cross)
 
 
-@nb.njit(**OUTER)
+@kernel(fast=True, parallel=True)
 def loss(
     slopes: np.ndarray,
     sums: np.ndarray,
@@ -135,7 +135,7 @@ def loss(
         sums[j, 0], sums[j, 1] = absolute, dissimilarity
 
 
-@nb.njit(**OUTER)
+@kernel(fast=True, parallel=True)
 def loss_backward(
     grad: np.ndarray,
     x: np.ndarray,
