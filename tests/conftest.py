@@ -1,8 +1,11 @@
-"""What all tests share: a Hypothesis profile without deadlines, and interrupts that arrive.
+"""What all tests share: one thread each, a Hypothesis profile without deadlines, and interrupts that arrive.
 
-The shell of a background job ignores SIGINT, and its children with it; tests that send it need it heeded.
+Workers of pytest-xdist take all cores, so that more threads would only wait for each other; tests of several threads
+ask for them by number. The shell of a background job ignores SIGINT, and its children with it; tests that send it need
+it heeded.
 """
 
+import os
 import signal
 import sys
 from collections.abc import Iterator
@@ -11,6 +14,8 @@ from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
+
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # read by numpy, torch and ours when they load
 
 ROOT = Path(__file__).parents[1]
 #: Neither is a package: `refdec` is one file that can be carried alone, and the tools put their folder on the path too.
