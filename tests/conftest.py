@@ -1,22 +1,36 @@
-"""What all tests share: a Hypothesis profile without deadlines, and interrupts that arrive.
+"""What all tests share: one thread each, a Hypothesis profile without deadlines, and interrupts that arrive.
 
-The shell of a background job ignores SIGINT, and its children with it; tests that send it need it heeded.
+Workers of pytest-xdist take all cores, so that more threads would only wait for each other; tests of several threads
+ask for them by number. The shell of a background job ignores SIGINT, and its children with it; tests that send it need
+it heeded.
 """
 
+import os
 import signal
 import sys
+from collections.abc import Iterator
+from importlib.util import find_spec
 from pathlib import Path
 
 import pytest
 from hypothesis import HealthCheck, settings
 
-sys.path.insert(0, str(Path(__file__).parents[1] / "tools"))  # no package: its commands put it on the path too
+os.environ.setdefault("OMP_NUM_THREADS", "1")  # read by numpy, torch and ours when they load
+
+ROOT = Path(__file__).parents[1]
+#: Neither is a package: `refdec` is one file that can be carried alone, and the tools put their folder on the path too.
+sys.path[:0] = [str(ROOT / "tools"), str(ROOT / "spec")]
+
+#: Rooms that need the extra `train`; without it their tests are not even collected.
+NEED_TORCH = ("bench", "cli", "model", "render", "tools", "train", "view")
+collect_ignore = [] if find_spec("torch") and find_spec("numba") else list(NEED_TORCH)
+
 settings.register_profile("pd4dgs", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("pd4dgs")
 
 
 @pytest.fixture(autouse=True, scope="session")
-def _heed_interrupts():
+def _heed_interrupts() -> Iterator[None]:
     before = signal.getsignal(signal.SIGINT)
     if before is signal.SIG_IGN:
         signal.signal(signal.SIGINT, signal.default_int_handler)

@@ -25,6 +25,7 @@ def nested(depth: int) -> st.SearchStrategy:
     return leaf | st.lists(inner, max_size=4) | st.dictionaries(st.integers(0, 2**32 - 1), inner, max_size=4)
 
 
+@settings(max_examples=40)
 @given(nested(4))
 def test_round_trip(value):
     assert unpack(pack(value)) == value

@@ -12,6 +12,7 @@ from email.utils import formatdate
 import pytest
 from asking import ask
 
+from pd4dgs_codec.delivery.link import Link
 from pd4dgs_codec.delivery.server import Server
 from pd4dgs_codec.errors import DeliveryError
 
@@ -77,9 +78,9 @@ def test_if_range_with_a_date_needs_an_old_enough_file(server, folder):
     os.utime(folder / "bytes.bin", (old, old))
     assert ask(server, "/bytes.bin", Range="bytes=5-", If_Range=formatdate(old, usegmt=True)).status == 206
     assert ask(server, "/bytes.bin", Range="bytes=5-", If_Range=formatdate(old - 1, usegmt=True)).status == 200
-    now = time.time()
-    os.utime(folder / "bytes.bin", (now, now))  # could change again within this second
-    assert ask(server, "/bytes.bin", Range="bytes=5-", If_Range=formatdate(now, usegmt=True)).status == 200
+    soon = time.time() + 100
+    os.utime(folder / "bytes.bin", (soon, soon))  # could change again within that second
+    assert ask(server, "/bytes.bin", Range="bytes=5-", If_Range=formatdate(soon, usegmt=True)).status == 200
 
 
 def test_not_modified(server):
@@ -172,16 +173,22 @@ def test_a_body_on_get_is_not_the_next_request(server):
     assert received.count(b"HTTP/1.1 ") == 1 and received.endswith(CONTENT)
 
 
-def test_a_file_that_shrinks_while_it_is_sent_cuts_the_answer(folder):
-    from pd4dgs_codec.delivery.link import Link
+def test_a_file_that_shrinks_while_it_is_sent_cuts_the_answer(folder, monkeypatch):
+    link, changed, blocks = Link(1e6), threading.Event(), []
 
+    def cross(size):
+        blocks.append(size)
+        assert len(blocks) < 3 or changed.wait(10)
+
+    monkeypatch.setattr(link, "cross", cross)
     (folder / "long.bin").write_bytes(bytes(40_000))
-    with Server(folder, link=Link(1e6)) as server, server.running():
+    with Server(folder, link=link) as server, server.running():
         connection = http.client.HTTPConnection(*server.server_address[:2], timeout=10)
         connection.request("GET", "/long.bin")
         response = connection.getresponse()
         response.read(1000)
         (folder / "long.bin").write_bytes(b"new")
+        changed.set()
         with pytest.raises(http.client.IncompleteRead):
             response.read()
         connection.close()

@@ -37,7 +37,7 @@ def assert_same(decoded, channels):
         assert a.dtype == np.int32 and np.array_equal(a, b)
 
 
-@settings(max_examples=50, deadline=None)
+@settings(max_examples=25)
 @given(st.lists(channel(), max_size=5), st.sampled_from([1, 4, 9]))
 def test_round_trip_and_best_is_never_larger(channels, effort):
     counts, sizes = [len(c) for c in channels], []
@@ -192,7 +192,7 @@ def test_every_cut_and_every_flip_gives_our_errors_only():
     assert unchanged <= 4  # such as the class step of a histogram whose classes are all 0 or 1
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=300)
 @given(st.binary(max_size=60), st.lists(st.integers(0, 50), max_size=4))
 def test_junk_gives_our_errors_only(payload, counts):
     try:

@@ -24,7 +24,7 @@ def exact_bits(symbols: list[int]) -> float:
         return float(bits)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.lists(st.integers(-200, 200) | st.integers(-(2**24) + 1, 2**24 - 1), min_size=1, max_size=30))
 def test_agrees_with_mpmath(symbols):
     assert gaussian_bits(np.array(symbols, dtype=np.int32)) == pytest.approx(exact_bits(symbols), rel=1e-8, abs=1e-8)

@@ -21,7 +21,7 @@ from pd4dgs_codec.errors import DecodeError, EncodeError, LimitExceeded, Malform
 bounded = st.integers(-100, 100) | st.integers(900, 1100) | st.integers(-K_MAX, K_MAX)
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.lists(st.lists(bounded, max_size=30), max_size=5), st.sampled_from([1, 5, 9]))
 def test_symbols_round_trip(lists, effort):
     channels = [np.array(values, dtype=np.int32) for values in lists]
@@ -31,7 +31,7 @@ def test_symbols_round_trip(lists, effort):
     assert coded.payload_bits == 8 * len(coded.payload) and coded.prior_ids == []
 
 
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=40)
 @given(st.lists(st.lists(st.floats(width=32, allow_nan=False, allow_infinity=False), max_size=20), max_size=4))
 def test_floats_round_trip_bit_for_bit(lists):
     arrays = [np.array(values, dtype=np.float32) for values in lists]

@@ -6,6 +6,7 @@ import zlib
 import mpmath
 import numpy as np
 import pytest
+import refdec
 from hypothesis import given
 from hypothesis import strategies as st
 
@@ -27,23 +28,6 @@ def is_table(cum: np.ndarray, n: int) -> bool:
     return len(cum) == n + 1 and cum[0] == 0 and cum[-1] == TOTAL and bool(np.all(np.diff(cum) >= 1))
 
 
-def python_norm_table(n: int, mu8: int, si: int, fl: int) -> list[int]:
-    """The rule once more with Python's integers, one symbol at a time, checking the 2**53 bound."""
-    e, j = si >> 6, si & 63
-    nb = max(0, e - 8)
-    cum = [0]
-    for k in range(n - 1):
-        t = (2 * k + 1) * 128 - mu8
-        a = min(abs(t) >> nb, 2**21 - 1)
-        z = min((a * int(OCTAVE[j])) >> (23 + e - nb), 8 << 16)
-        i, f = z >> 11, z & 2047
-        v = int(NORMAL[i]) + (((int(NORMAL[i + 1]) - int(NORMAL[i])) * f) >> 11)
-        product = (2**27 + (-v if t < 0 else v)) * (2**24 - n * fl)
-        assert max(abs(t), a * int(OCTAVE[j]), product) < 2**53
-        cum.append((product >> 28) + fl * (k + 1))
-    return [*cum, 2**24]
-
-
 def test_check_vector():
     expected = [0, 49993, 672082, 3802177, 10044625, 15004705, 16572122, 2**24]
     assert norm_table(7, 832, 0, 1).tolist() == expected
@@ -58,12 +42,13 @@ def test_constants_match_high_precision_and_stay_clear_of_rounding_boundaries():
         margin = min(abs(x - mpmath.floor(x) - 0.5) for x in normal + octave)
     assert margin > 1e-4 and NORMAL[257] == NORMAL[256] == 2**27
     assert (NORMAL[1], NORMAL[32]) == (3346026, 91629033)
+    assert (2**21 - 1) * int(OCTAVE.max()) < 2**53, "the largest product of the rule fits a double"
 
 
 @given(st.integers(2, 300), st.integers(-(2**31), 2**31), st.integers(SI_MIN, SI_MAX), st.sampled_from([1, 16]))
 def test_equals_the_rule_in_python_integers(n, mu8, si, floor):
     cum = norm_table(n, mu8, si, floor)
-    assert cum.tolist() == python_norm_table(n, mu8, si, floor) and is_table(cum, n)
+    assert cum.tolist() == refdec.table_of(refdec.norm_cdf(n, mu8, si), floor) and is_table(cum, n)
 
 
 @pytest.mark.parametrize("si", [SI_MIN, -1, 0, 577, SI_MAX])
