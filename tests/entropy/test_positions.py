@@ -10,9 +10,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pd4dgs_codec.entropy.morton import morton_codes, morton_order
 from pd4dgs_codec.entropy.positions import decode_positions, encode_positions
 from pd4dgs_codec.errors import DecodeError, EncodeError, LimitExceeded, Malformed, Truncated
+from pd4dgs_codec.morton import morton_codes, morton_order
 
 _spec = importlib.util.spec_from_file_location(
     "bench_positions", Path(__file__).resolve().parents[2] / "tools" / "bench_positions.py"
