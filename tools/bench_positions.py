@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from pd4dgs_codec.bench.draco import draco_encode
-from pd4dgs_codec.entropy.morton import morton_codes, morton_order
 from pd4dgs_codec.entropy.positions import decode_positions, encode_positions
+from pd4dgs_codec.morton import morton_codes, morton_order
 
 SURFACES = ("sphere", "torus", "plane", "cylinder", "gyroid")
 _SHELF = Path("shelf-hand") / "points_triangulated.ply"

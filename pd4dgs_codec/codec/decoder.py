@@ -102,7 +102,7 @@ def _check_bounded(layer: LayerSymbols, header: Header) -> None:
 def _located(error: DecodeError, chunk: int, offset: int) -> DecodeError:
     """`error` from inside a payload, placed in the file. A payload is complete, so it cannot be Truncated."""
     kind = Malformed if isinstance(error, Truncated) else type(error)
-    return kind(error.message, offset=offset, chunk=chunk, clause=error.clause)
+    return kind(error.message, offset=offset, chunk=chunk)
 
 
 def decode_layers(

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pd4dgs_codec.attributes.quantise import is_step
 from pd4dgs_codec.attributes.table import ATTRIBUTES
@@ -63,7 +65,7 @@ class Header:
         return self.deformation == RAW_DEFORMATION
 
 
-def _f32(values) -> list[float]:
+def _f32(values: ArrayLike) -> list[float]:
     return [float(np.float32(v)) for v in np.ravel(values)]
 
 
@@ -144,7 +146,7 @@ def scene_id_of(header: bytes, payload: bytes) -> bytes:
     return hashlib.sha256(header[map_head + chunk_list :] + payload).digest()[:SCENE_ID_SIZE]
 
 
-def _unpack_chunks(rows: list) -> tuple[tuple[int, int], ...]:
+def _unpack_chunks(rows: list[Any]) -> tuple[tuple[int, int], ...]:
     as_integer(len(rows), MAX_CHUNKS, "header: number of chunks", low=1)
     chunks = []
     for i, row in enumerate(rows):

@@ -13,12 +13,12 @@ from dataclasses import replace
 
 import numpy as np
 
-from pd4dgs_codec.attributes import planes as decorrelation
 from pd4dgs_codec.attributes.quantise import dequantise, quantise
 from pd4dgs_codec.codec.kinds import LAYER_KINDS, LayerKind
 from pd4dgs_codec.codec.left_out import LeftOut
-from pd4dgs_codec.codec.stages import entropy_bits
+from pd4dgs_codec.codec.plane_choice import choose_predictor, fill_plane
 from pd4dgs_codec.codec.symbols import rounded
+from pd4dgs_codec.entropy.bits import entropy_bits
 from pd4dgs_codec.evaluate.reach import reach
 from pd4dgs_codec.scene import FEATURE_DIM, N_OFFSETS, PLANES, TRUNK, Deformation, Network, Planes, Scene
 
@@ -210,7 +210,7 @@ class _Omissions:
                     saved += 32.0 * len(scale[name]) * int((~read).sum())
                 else:
                     symbols = self._plane_symbols(kind, scale[name])
-                    fill = decorrelation.fill(symbols, read)
+                    fill = fill_plane(symbols, read)
                     saved += _plane_bits(symbols) - _plane_bits(fill)
                     free[-1][name] = dequantise(fill, self.scene.steps.planes(kind.layer))
 
@@ -309,5 +309,5 @@ def _bits(channels: Iterable[np.ndarray]) -> float:
 
 def _plane_bits(symbols: np.ndarray) -> float:
     """Order-0 entropy of the residuals of a plane [C, H, W]."""
-    residual = decorrelation.choose_predictor(symbols)[1]
+    residual = choose_predictor(symbols)[1]
     return _bits(residual.reshape(len(residual), -1))

@@ -21,8 +21,10 @@ from pd4dgs_codec.codec.attribute_section import read_attributes, write_attribut
 from pd4dgs_codec.codec.kinds import LayerKind
 from pd4dgs_codec.codec.layer_meta import LayerMeta, ScaleMeta, Section, check_symbol_count, pack_meta, unpack_meta
 from pd4dgs_codec.codec.options import EncodeOptions
+from pd4dgs_codec.codec.plane_choice import choose_predictor
 from pd4dgs_codec.codec.plane_section import read_planes, write_planes
 from pd4dgs_codec.codec.symbols import LayerSymbols
+from pd4dgs_codec.entropy.bits import gaussian_bits
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
 from pd4dgs_codec.entropy.lzma_mode import (
     decode_channels_lzma,
@@ -31,7 +33,6 @@ from pd4dgs_codec.entropy.lzma_mode import (
     encode_floats_lzma,
 )
 from pd4dgs_codec.entropy.positions import decode_positions, encode_positions
-from pd4dgs_codec.entropy.rate import gaussian_bits
 from pd4dgs_codec.errors import LimitExceeded, Malformed
 from pd4dgs_codec.scene import MASK_MIN_CODE, PLANES, Network, Planes
 
@@ -90,7 +91,7 @@ def channel_groups(symbols: LayerSymbols) -> tuple[dict[Section, list[np.ndarray
     predictors = [0] * n_planes
     for i, tensor in enumerate(tensors):
         if i < n_planes:
-            predictors[i], residual = decorrelation.choose_predictor(tensor)
+            predictors[i], residual = choose_predictor(tensor)
             groups[Section.PLANES] += list(residual.reshape(residual.shape[0], -1))
         else:
             groups[Section.WEIGHTS].append(tensor.ravel())

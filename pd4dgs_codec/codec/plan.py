@@ -17,8 +17,8 @@ from pd4dgs_codec.codec.left_out import LeftOut
 from pd4dgs_codec.codec.omissions import leave_out_unseen
 from pd4dgs_codec.codec.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.codec.symbols import first_duplicate
-from pd4dgs_codec.entropy.morton import morton_order
 from pd4dgs_codec.errors import EncodeError
+from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import Scene
 
 

@@ -15,15 +15,25 @@ from dataclasses import dataclass
 import numpy as np
 
 from pd4dgs_codec.entropy import EFFORTS, PRIORS
-
-from ..errors import EncodeError, LimitExceeded, Malformed
-from .ans import MAX_COUNT, AnsDecoder, ans_encode
-from .fitting import fit_best, histogram
-from .priors import CONST, FIRST_REUSE, K_MAX, MAX_ENTRIES, Hist, Prior, Window, family_code, read_prior, write_prior
-from .rate import gaussian_bits
-from .sharing import plan_priors
-from .tables import uniform_table
-from .varint import VARINT_MAX, ByteReader, put_varint
+from pd4dgs_codec.entropy.ans import MAX_COUNT, AnsDecoder, ans_encode
+from pd4dgs_codec.entropy.bits import gaussian_bits
+from pd4dgs_codec.entropy.fitting import fit_best, histogram
+from pd4dgs_codec.entropy.priors import (
+    CONST,
+    FIRST_REUSE,
+    K_MAX,
+    MAX_ENTRIES,
+    Hist,
+    Prior,
+    Window,
+    family_code,
+    read_prior,
+    write_prior,
+)
+from pd4dgs_codec.entropy.sharing import plan_priors
+from pd4dgs_codec.entropy.tables import uniform_table
+from pd4dgs_codec.entropy.varint import VARINT_MAX, ByteReader, put_varint
+from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
 
 
 @dataclass(frozen=True)

@@ -11,6 +11,7 @@ from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.encoder import encode, encode_with_report
 from pd4dgs_codec.codec.options import EncodeOptions
 from pd4dgs_codec.codec.plan import plan
+from pd4dgs_codec.codec.plane_choice import fill_plane
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.evaluate.enclosure import residual_ranges, time_grid
 from pd4dgs_codec.evaluate.reach import reach
@@ -168,13 +169,13 @@ def test_a_filled_plane_keeps_what_is_given_and_costs_less():
     rng = np.random.default_rng(2)
     plane = rng.integers(-9, 10, (3, 12, 10), dtype=np.int32)
     given = rng.random((12, 10)) < 0.5
-    filled = decorrelation.fill(plane, given)
+    filled = fill_plane(plane, given)
     assert np.array_equal(filled[:, given], plane[:, given])
-    assert np.array_equal(decorrelation.fill(filled, given), filled)
+    assert np.array_equal(fill_plane(filled, given), filled)
     zeros = [(decorrelation.residual(p, filled)[:, ~given] == 0).all() for p in decorrelation.PREDICTORS]
     assert any(zeros)
-    assert np.array_equal(decorrelation.fill(plane, np.ones_like(given)), plane)
-    assert not decorrelation.fill(plane, np.zeros_like(given)).any()
+    assert np.array_equal(fill_plane(plane, np.ones_like(given)), plane)
+    assert not fill_plane(plane, np.zeros_like(given)).any()
 
 
 def test_an_unknown_wish_is_refused():

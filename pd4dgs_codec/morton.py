@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from ..errors import EncodeError
+from pd4dgs_codec.errors import EncodeError
 
 AXIS_BITS = 21  #: bits per axis; three of them fit in one int64
 
@@ -36,7 +36,8 @@ def morton_codes(cells: np.ndarray) -> np.ndarray:
     if int(offsets.max()) >> AXIS_BITS:
         raise EncodeError(f"positions span {int(offsets.max()) + 1} voxels on one axis, limit {1 << AXIS_BITS}")
     x, y, z = (spread_bits(offsets[:, axis]) for axis in range(3))
-    return x | (y << 1) | (z << 2)
+    codes: np.ndarray = x | (y << 1) | (z << 2)
+    return codes
 
 
 def morton_order(cells: np.ndarray) -> np.ndarray:
