@@ -1,6 +1,6 @@
 """A viewer without a window: a picture of every level as its layer arrives. As a program it is the cold process.
 
-    python -m pd4dgs_codec.bench.latency.viewer URL WIDTH HEIGHT
+    python -m pd4dgs_codec.bench.viewer URL WIDTH HEIGHT
 
 draws with the file's own camera and prints one JSON line per picture, the moment it is there.
 """
@@ -41,10 +41,9 @@ def pictures(url: str, size: tuple[int, int], ready: Callable[[], object] = lamb
             last_byte = client.arrived_at
             camera = own_camera(scene.info, size)
             ready()
-            from pd4dgs_codec.model.convert import from_scene
-            from pd4dgs_codec.model.picture import render_image
+            from pd4dgs_codec.view.levels import level_of
 
-            render_image(from_scene(scene), scene.level, 0.0, camera.viewmat, camera.K, camera.width, camera.height)
+            level_of(scene).picture(camera, 0.0)
             now = time.monotonic()
             yield Shown(scene.level, now - start, now - last_byte)
 
@@ -62,9 +61,8 @@ def own_camera(info: SceneInfo, size: tuple[int, int]) -> Camera:
     return replace(info.camera, K=K.astype(np.float32), width=width, height=height)
 
 
-def main() -> None:
+def main(url: str, width: str, height: str) -> None:
     """Imports and kernels load in a thread while the bytes arrive."""
-    url, width, height = sys.argv[1:]
     threads.configure()
     warming = threading.Thread(target=warm_up)
     warming.start()
@@ -73,4 +71,4 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    main()
+    main(*sys.argv[1:])

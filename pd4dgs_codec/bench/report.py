@@ -1,4 +1,4 @@
-"""Error on one axis, time or bytes on the other: log-log scatter plots with the Pareto front marked."""
+"""Markdown tables, Pareto fronts, and log-log plots of error over time or bytes."""
 
 from __future__ import annotations
 
@@ -15,25 +15,29 @@ LEAST_SPAN = 4.0
 #: Points with an error of 0 are drawn this factor below the smallest other error.
 ZERO_BELOW = 3.0
 
-
-@dataclass(frozen=True)
-class Series:
-    """Points (cost, error) that belong together, in the order in which a line joins them."""
-
-    name: str
-    points: tuple[tuple[float, float], ...]
+#: Points (cost > 0, error >= 0) in the order in which a line joins them.
+Points = Sequence[tuple[float, float]]
 
 
 @dataclass(frozen=True)
 class Panel:
-    """One plot. title and xlabel in words; costs > 0, errors >= 0."""
+    """One plot. title and xlabel in words; series: (name, points)."""
 
     title: str
     xlabel: str
-    series: tuple[Series, ...]
+    series: Sequence[tuple[str, Points]]
 
 
-def pareto_front(points: Sequence[tuple[float, float]]) -> list[tuple[float, float]]:
+def markdown(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table; columns padded, so that it also reads as plain text."""
+    cells = [list(head), *map(list, rows)]
+    widths = [max(len(row[i]) for row in cells) for i in range(len(head))]
+    lines = ["| " + " | ".join(c.ljust(w) for c, w in zip(row, widths, strict=True)) + " |" for row in cells]
+    lines.insert(1, "|" + "|".join("-" * (w + 2) for w in widths) + "|")
+    return "\n".join(lines)
+
+
+def pareto_front(points: Points) -> list[tuple[float, float]]:
     """The distinct points (cost, error) that no other beats in one without losing in the other, by ascending cost."""
     front: list[tuple[float, float]] = []
     for point in sorted(set(points)):
@@ -51,10 +55,10 @@ def draw(panels: Sequence[Panel], ylabel: str, path: Path) -> None:
     from matplotlib import pyplot
     from matplotlib.lines import Line2D
 
-    errors = [error for panel in panels for series in panel.series for _, error in series.points]
+    errors = [error for panel in panels for _, points in panel.series for _, error in points]
     positive = [error for error in errors if error > 0]
     floor = min(positive, default=1.0) / ZERO_BELOW
-    names = list(dict.fromkeys(series.name for panel in panels for series in panel.series))
+    names = list(dict.fromkeys(name for panel in panels for name, _ in panel.series))
     style = {name: STYLES[i % len(STYLES)] for i, name in enumerate(names)}
     width = 4.4 * len(panels) + 0.4
     columns = max(1, int(width / (0.075 * max(map(len, names), default=0) + 1.0)))
@@ -62,18 +66,15 @@ def draw(panels: Sequence[Panel], ylabel: str, path: Path) -> None:
     size = (width, 3.6 + legend)
     figure, axes = pyplot.subplots(1, len(panels), figsize=size, sharey=True, squeeze=False)
     for axis, panel in zip(axes[0], panels, strict=True):
-        shown = [(cost, max(error, floor)) for series in panel.series for cost, error in series.points]
-        front = pareto_front(shown)
-        if front:
+        series = [(name, [(cost, max(error, floor)) for cost, error in points]) for name, points in panel.series]
+        shown = [point for _, points in series for point in points]
+        if front := pareto_front(shown):
             axis.step(*zip(*front, strict=True), where="post", color="0.75", lw=4, zorder=1)
             axis.plot(*zip(*front, strict=True), "o", color="black", mfc="none", ms=13, lw=0, zorder=2)
-        for series in panel.series:
-            marker, line = style[series.name]
-            points = [(cost, max(error, floor)) for cost, error in series.points]
+        for name, points in series:
             if points:
-                axis.plot(
-                    *zip(*points, strict=True), marker=marker, ls=line, color="black", mfc="white", ms=6, lw=1, zorder=3
-                )
+                look: dict[str, Any] = {"marker": style[name][0], "ls": style[name][1], "lw": 1, "ms": 6, "zorder": 3}
+                axis.plot(*zip(*points, strict=True), color="black", mfc="white", **look)
         axis.set_xscale("log")
         axis.set_yscale("log")
         if shown:
@@ -84,12 +85,13 @@ def draw(panels: Sequence[Panel], ylabel: str, path: Path) -> None:
         axis.grid(alpha=0.3, which="both")
     if errors:
         _number(axes[0][0].yaxis, *axes[0][0].get_ylim())
-    zero = "" if len(positive) == len(errors) else "\n(lowest marks: 0)"
-    axes[0][0].set_ylabel(ylabel + zero)
+    axes[0][0].set_ylabel(ylabel if len(positive) == len(errors) else f"{ylabel}\n(lowest marks: 0)")
+    marks = [(*style[name], "black", "white", 6, 1, name) for name in names]
+    marks.append(("o", "-", "0.75", "none", 11, 4, "front"))
     handles = [
-        Line2D([], [], marker=style[n][0], ls=style[n][1], color="black", mfc="white", lw=1, label=n) for n in names
+        Line2D([], [], marker=mark, ls=line, color=color, mec="black", mfc=fill, ms=ms, lw=lw, label=label)
+        for mark, line, color, fill, ms, lw, label in marks
     ]
-    handles.append(Line2D([], [], marker="o", color="0.75", mec="black", mfc="none", ms=11, lw=4, label="front"))
     figure.tight_layout(rect=(0, legend / size[1], 1, 1))
     figure.legend(handles=handles, loc="lower center", ncol=columns, frameon=False, fontsize=9)
     figure.savefig(path, dpi=110, format="png")

@@ -1,14 +1,12 @@
-"""The precision reports: fronts and tables by hand, the oracle in blocks, and a tiny model end to end."""
+"""The reports codec, render and train: fronts and tables by hand, the oracle in blocks, and a tiny model end to end."""
 
 from __future__ import annotations
 
-import importlib.util
+import importlib
 import json
 import math
 import platform
-import sys
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -18,55 +16,25 @@ pytest.importorskip("numba")
 pytest.importorskip("matplotlib")
 Image = pytest.importorskip("PIL.Image")
 
-from strategies import make_scene  # noqa: E402
+from scenes import write_views  # noqa: E402
 
-from pd4dgs_codec.bench import codec, machine, oracle, peers, plot, render, timing, train, views  # noqa: E402
-from pd4dgs_codec.bench.splats import Splats  # noqa: E402
+from pd4dgs_codec.bench import codec, pictures, render, report, timing, train  # noqa: E402
 from pd4dgs_codec.cli import bench  # noqa: E402
-from pd4dgs_codec.codec.decoder import decode_layers  # noqa: E402
 from pd4dgs_codec.codec.encoder import encode  # noqa: E402
 from pd4dgs_codec.codec.plan import plan  # noqa: E402
 from pd4dgs_codec.errors import DataError, Pd4Error  # noqa: E402
-from pd4dgs_codec.model import checkpoint  # noqa: E402
-from pd4dgs_codec.model.convert import from_scene  # noqa: E402
 from pd4dgs_codec.render.rasterization import rasterization  # noqa: E402
-from pd4dgs_codec.scene import Camera  # noqa: E402
+from pd4dgs_codec.view.frames import Frame  # noqa: E402
 
 RNG = np.random.default_rng(4)
-
-
-@pytest.fixture(autouse=True)
-def _one_thread(monkeypatch):
-    """Several would only get in the way of other tests: everything here is small."""
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
-
-
-@pytest.fixture(scope="module")
-def scene():
-    """40 anchors in front of a small camera, three layers."""
-    made = make_scene(8, anchors=40)
-    viewmat = np.eye(4, dtype=np.float32)
-    viewmat[2, 3] = 2.0
-    K = np.array([[30, 0, 16], [0, 30, 12], [0, 0, 1]], np.float32)
-    return replace(made, info=replace(made.info, camera=Camera(viewmat, K, 32, 24)))
-
-
-@pytest.fixture(scope="module")
-def model_pt(scene, tmp_path_factory) -> Path:
-    path = tmp_path_factory.mktemp("model") / "model.pt"
-    checkpoint.save(path, from_scene(scene), {"curve": json.dumps(CURVE), "config": json.dumps({"preset": "tiny"})})
-    return path
-
-
-CURVE = [{"seconds": 2.0, "psnr": [10.0, 20.0]}, {"seconds": 4.0, "psnr": [12.0, 40.0]}]
 
 # -- fronts, times, plots ----------------------------------------------------------------------------------------------
 
 
 def test_pareto_front_by_hand():
     points = [(1.0, 9.0), (2.0, 5.0), (3.0, 5.0), (2.5, 7.0), (4.0, 1.0), (4.0, 2.0), (1.0, 9.0)]
-    assert plot.pareto_front(points) == [(1.0, 9.0), (2.0, 5.0), (4.0, 1.0)]
-    assert plot.pareto_front([]) == []
+    assert report.pareto_front(points) == [(1.0, 9.0), (2.0, 5.0), (4.0, 1.0)]
+    assert report.pareto_front([]) == []
 
 
 def test_median_and_quartiles():
@@ -93,20 +61,21 @@ def test_a_cold_run_reports_its_own_memory(tmp_path, scene):
 
 
 def test_the_machine_is_described_without_names_or_paths():
-    about = machine.describe(("numpy", "no-such-package"))
+    about = timing.machine("numpy", "no-such-package")
     assert about["cpus"] >= 1 and about["versions"]["numpy"] == np.__version__
     assert about["versions"]["no-such-package"] is None
-    text = machine.sentence(about)
+    text = timing.machine_line(about)
     assert "Python" in text and "/" not in text.replace("n/a", "") and platform.node() not in text
 
 
 def test_plots_take_zeros_and_many_series(tmp_path):
-    series = tuple(plot.Series(f"s{i}", ((1.0 + i, 0.1 / (i + 1)), (2.0 + i, 0.0))) for i in range(9))
-    plot.draw([plot.Panel("a", "x", series), plot.Panel("b", "y", series[:1])], "error", tmp_path / "p.png")
+    series = [(f"s{i}", [(1.0 + i, 0.1 / (i + 1)), (2.0 + i, 0.0)]) for i in range(9)]
+    panels = [report.Panel("a", "x", series), report.Panel("b", "y", series[:1])]
+    report.draw(panels, "error", tmp_path / "p.png")
     with Image.open(tmp_path / "p.png") as image:
         assert image.width > 800
         pixels = np.asarray(image.convert("RGB")).astype(int)
-    assert len(set(plot.STYLES)) == len(plot.STYLES)
+    assert len(set(report.STYLES)) == len(report.STYLES)
     assert np.ptp(pixels, axis=2).max() == 0  # black and white, nothing told by colour
 
 
@@ -130,7 +99,7 @@ def test_picture_deviations_by_hand():
         def picture(self, camera, time):
             return np.full((16, 16, 3), 0.25 + time / 4, np.float32)
 
-    frames = [views.Frame(None, 0.0), views.Frame(None, 1.0)]
+    frames = [Frame(None, 0.0), Frame(None, 1.0)]
     (found,) = codec.picture_deviations([Fake()], frames, {0: [np.full((16, 16, 3), 0.25, np.float32)] * 2})
     assert found.rmse == pytest.approx(0.25 / math.sqrt(2)) and found.psnr == pytest.approx(15.0515, abs=1e-4)
     want = [np.full((16, 16, 3), 0.25, np.float32)]
@@ -148,7 +117,7 @@ def test_a_sweep_of_a_checkpoint(model_pt, tmp_path, capsys, monkeypatch):
         return timing.Cold(timing.summary([1.0] * repeats), 1 << 20)
 
     monkeypatch.setattr(codec, "cold", cold)
-    options = ["--step-scales", "1,4", "--efforts", "1", "--repeats", "2", "--cold", "1", "--views", "2", "--no-peers"]
+    options = ["--step-scales", "1,4", "--efforts", "1", "--repeats", "2", "--cold", "1", "--views", "2"]
     files = ["--json", str(tmp_path / "a.json"), "--plot", str(tmp_path / "a.png")]
     assert bench.main(["codec", str(model_pt), *options, *files]) == 0
     result = json.loads((tmp_path / "a.json").read_text())
@@ -170,78 +139,12 @@ def test_a_sweep_of_a_checkpoint(model_pt, tmp_path, capsys, monkeypatch):
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
 
 
-def test_a_file_alone_has_bytes_and_times_and_peers(scene, tmp_path, capfd, monkeypatch):
-    monkeypatch.setitem(sys.modules, "torchac", None)
+def test_a_file_alone_has_bytes_and_times(data, tmp_path, capsys):
     path = tmp_path / "scene.pd4"
-    path.write_bytes(encode(scene, effort=1))
+    path.write_bytes(data)
     assert bench.main(["codec", str(path), "--quick", "--json"]) == 0
-    result = json.loads(capfd.readouterr().out)
-    (point,) = result["points"]
-    assert point["bytes"] == path.stat().st_size and point["values"] == [] and point["error"] is None
-    found = {row["coder"]: row for row in result["peers"]}
-    assert found["this codec"]["error"] == 0 and found["constriction QuantizedGaussian"]["bytes"] > 0
-
-
-# -- peers -------------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture(scope="module")
-def layers(scene):
-    return decode_layers(encode(scene, layers=2, effort=1))[1]
-
-
-def test_coders_are_lossless_and_agree_on_what_they_code(layers, monkeypatch):
-    monkeypatch.setitem(sys.modules, "torchac", None)  # builds for minutes where it was never used
-    symbols = peers.symbols_of(layers)
-    assert sum(c.size for c in symbols.channels) > 40 * 68
-    rows = peers.coder_rows(symbols, 1, effort=1)
-    assert [row.coder for row in rows if row.missing] == ["torchac"]
-    assert all(row.bytes and row.error == 0 for row in rows if not row.missing)
-    least = symbols.rate_bits / 8
-    assert all(row.bytes > 0.3 * least for row in rows if row.bytes)
-
-
-def test_a_peer_that_loses_a_symbol_gets_no_figure(layers, monkeypatch):
-    decoding = peers.decode_channels_lzma
-    monkeypatch.setattr(peers, "decode_channels_lzma", lambda *a: [c + 1 for c in decoding(*a)])
-    monkeypatch.setitem(sys.modules, "torchac", None)
-    (row,) = [r for r in peers.coder_rows(peers.symbols_of(layers), 1, effort=1) if "LZMA" in r.coder]
-    assert row.bytes is None and "came back" in (row.missing or "")
-
-
-def test_positions_beside_draco(layers):
-    pytest.importorskip("DracoPy")
-    own, draco = peers.position_rows(layers, 1)
-    assert own.error == draco.error == 0 and own.bytes and draco.bytes
-
-
-def test_ply_of_splats_by_hand():
-    given = Splats(
-        means=RNG.normal(size=(5, 3)).astype(np.float32),
-        scales=RNG.uniform(0.1, 1, (5, 3)).astype(np.float32),
-        quats=RNG.normal(size=(5, 4)).astype(np.float32),
-        opacities=np.array([0.1, 0.5, 0.9, 0.999, 0.004], np.float32),
-        colors=RNG.uniform(0, 1, (5, 3)).astype(np.float32),
-    )
-    data = peers.to_ply(given)
-    assert data.startswith(b"ply\nformat binary_little_endian 1.0\nelement vertex 5\nproperty float x\n")
-    back = peers.from_ply(data)
-    for name, want in vars(given).items():
-        np.testing.assert_allclose(getattr(back, name), want, rtol=1e-5, atol=1e-6, err_msg=name)
-
-
-def test_ratios_are_to_the_first_row_of_a_kind():
-    one, two = timing.Timing(1.0, 1.0, 1.0, 1), timing.Timing(2.0, 2.0, 2.0, 1)
-    rows = [
-        peers.Row("symbols", "this codec", 100, one, two, 0.0),
-        peers.Row("symbols", "other", 150, two, one, 0.0),
-        peers.Row("positions", "this codec", 10, two, two, 0.0),
-        peers.Row("positions", "other", missing="not installed"),
-    ]
-    cells = [[c.strip() for c in line.split("|")[1:-1]] for line in peers.table(rows, 1600.0).splitlines()]
-    assert cells[3][2:7] == ["150", "1.500", "0.7500", "2", "0.5"]
-    assert cells[4][3:7] == ["1.000", "-", "1", "1"]
-    assert cells[5][2] == "none: not installed"
+    (point,) = json.loads(capsys.readouterr().out)["points"]
+    assert point["bytes"] == len(data) and point["values"] == [] and point["error"] is None
 
 
 # -- render ------------------------------------------------------------------------------------------------------------
@@ -274,7 +177,7 @@ def test_the_oracle_in_blocks_is_the_dense_oracle():
         *(given[name] for name in names), given["viewmat"][None], given["K"][None], view["width"], view["height"],
         near_plane=0.1, backgrounds=given["background"][None], backend="reference",
     )[0][0]  # fmt: skip
-    torch.testing.assert_close(oracle.picture(**given), dense, rtol=0, atol=1e-12)
+    np.testing.assert_allclose(pictures.oracle(view), dense.numpy(), rtol=0, atol=1e-12)
 
 
 def test_ways_to_draw_against_the_oracle(tmp_path):
@@ -320,18 +223,6 @@ def test_a_run_without_evaluations_or_records_is_refused(tmp_path):
     log.write_text('{"seconds": 1.0}\nnothing\n')
     with pytest.raises(DataError, match="line 2"):
         train.of_file(str(log))
-
-
-def write_views(folder: Path) -> Path:
-    """Four grey pictures from cameras side by side."""
-    frames = []
-    for i in range(4):
-        Image.fromarray(np.full((16, 24, 3), 40 * i, np.uint8)).save(folder / f"{i}.png")
-        pose = [[1, 0, 0, 0.1 * i], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]]
-        frames.append({"file_path": f"{i}.png", "time": i / 3, "transform_matrix": pose})
-    content = {"fl_x": 30.0, "fl_y": 30.0, "cx": 12, "cy": 8, "w": 24, "h": 16, "frames": frames}
-    (folder / "transforms.json").write_text(json.dumps(content))
-    return folder
 
 
 def test_presets_are_trained_and_compared(tmp_path, capsys):
@@ -386,33 +277,4 @@ def test_a_file_alone_has_nothing_to_plot(tmp_path, capsys, scene):
 
 
 def test_spread_takes_the_middle_of_each_share():
-    assert views.spread(range(10), 2) == [2, 7] and views.spread([1, 2], 5) == [1, 2]
-
-
-def test_usual_is_what_the_encoder_writes(scene):
-    point = codec.file_point(encode(scene, effort=1), 1, 0)
-    others = [
-        replace(point, step_scale=s, mode=m, effort=e) for s in (0.5, 1.0) for m in ("lzma", "ans") for e in (1, 5)
-    ]
-    best = codec.usual(others)
-    assert (best.step_scale, best.mode, best.effort) == (1.0, "ans", 5)
-
-
-def test_the_page_keeps_other_scenes_when_one_is_measured_again(tmp_path, monkeypatch):
-    path = Path(__file__).resolve().parents[2] / "tools" / "precision.py"
-    spec = importlib.util.spec_from_file_location("precision_tool", path)
-    tool = importlib.util.module_from_spec(spec)
-    spec.loader.exec_module(tool)
-    monkeypatch.setattr(tool, "SCENES", tuple((name, f"synthetic:{name}", 1, (), (name,)) for name in "abc"))
-    told = iter(range(100))
-    monkeypatch.setattr(tool, "run", lambda command, image: ({"n": 1}, f"| table {next(told)} |\n"))
-    for name in "abc":
-        (tmp_path / name).mkdir()
-        (tmp_path / name / "model.pt").write_bytes(b"")
-    where = ["--out", str(tmp_path), "--docs", str(tmp_path)]
-    assert tool.main(where) == 0
-    first = (tmp_path / "precision.md").read_text()
-    assert tool.main(["--only", "b", *where]) == 0
-    again = (tmp_path / "precision.md").read_text()
-    assert again == first.replace("table 3", "table 9").replace("table 4", "table 10").replace("table 5", "table 11")
-    assert list(json.loads((tmp_path / "precision.json").read_text())) == ["a", "b", "c"]
+    assert pictures.spread(range(10), 2) == [2, 7] and pictures.spread([1, 2], 5) == [1, 2]

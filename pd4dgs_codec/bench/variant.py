@@ -1,6 +1,6 @@
-"""Draws saved Gaussians with kernels whose constants were changed before numba compiled them: one process per variant.
+"""Draws saved views with kernels whose constants were changed before numba compiled them: one process per variant.
 
-    python -m pd4dgs_codec.bench.raster_variant INPUT.npz OUTPUT.npz CONSTANTS REPEATS
+    python -m pd4dgs_codec.bench.variant INPUT.npz OUTPUT.npz CONSTANTS REPEATS
 
 CONSTANTS: a JSON object with any of tile_width, alpha_min, t_min. NUMBA_CACHE_DIR must be the variant's own, since
 numba's cache does not know of constants.
@@ -11,7 +11,6 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -35,19 +34,18 @@ def apply(constants: dict[str, float]) -> None:
     kernels._BLOCKS = kernels._COLUMNS * kernels.TILE_HEIGHT
 
 
-def main(argv: Sequence[str]) -> int:
-    source, target, constants, repeats = argv
+def main(source: str, target: str, constants: str, repeats: str) -> None:
+    """Writes picture0, picture1, ... and seconds, those of `draw_all`."""
     apply(json.loads(constants))
     with np.load(source) as stored:
         count = int(stored["count"])
         views = [{k.split(".", 1)[1]: stored[k] for k in stored.files if k.startswith(f"{i}.")} for i in range(count)]
-    from pd4dgs_codec.bench.splats import draw_all
+    from pd4dgs_codec.bench.pictures import draw_all
 
     pictures, seconds = draw_all(views, int(repeats))
-    arrays: dict[str, Any] = {f"picture{i}": p for i, p in enumerate(pictures)}
+    arrays: dict[str, Any] = {f"picture{i}": picture for i, picture in enumerate(pictures)}
     np.savez(target, seconds=np.array(seconds), **arrays)
-    return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    main(*sys.argv[1:])

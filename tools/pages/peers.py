@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 
+from pages.draco import draco_encode
 from pd4dgs_codec.attributes.planes import choose_predictor
-from pd4dgs_codec.bench.draco import draco_encode
-from pd4dgs_codec.bench.markdown import markdown
-from pd4dgs_codec.bench.splats import Splats, bake, draw, view
+from pd4dgs_codec.bench.pictures import draw_all, view
+from pd4dgs_codec.bench.report import markdown
 from pd4dgs_codec.bench.timing import Timing, measure
 from pd4dgs_codec.codec.attribute_section import read_attributes, write_attributes
 from pd4dgs_codec.codec.layer_meta import Section
@@ -311,10 +311,23 @@ def position_rows(layers: Sequence[LayerSymbols], repeats: int) -> list[Row]:
 # -- splats ------------------------------------------------------------------------------------------------------------
 
 
+@dataclass(frozen=True, eq=False)
+class Splats:
+    """Gaussians as static formats know them, float32: means [N, 3], scales [N, 3] (standard deviations), quats [N, 4]
+    wxyz, opacities [N] and colors [N, 3] in 0..1."""
+
+    means: np.ndarray
+    scales: np.ndarray
+    quats: np.ndarray
+    opacities: np.ndarray
+    colors: np.ndarray
+
+
 def splat_rows(level: Level, frame: Frame, file_bytes: int, repeats: int) -> list[Row]:
     """The whole file first, which holds every instant and every view, then static formats on one instant of it."""
-    splats = bake(level, frame)
-    picture = draw(view(level, splats, frame)).numpy()
+    seen = view(level, frame)
+    splats = Splats(*(seen[name] for name in ("means", "scales", "quats", "opacities", "colors")))
+    picture = draw_all([seen], 1)[0][0]
     count = f"{len(splats.means):,} splats at t = {frame.time:.2f}"
 
     def peer(name: str, encode: Callable[[Splats], bytes], decode: Callable[[bytes], Splats]) -> Callable[[], Row]:
@@ -322,9 +335,8 @@ def splat_rows(level: Level, frame: Frame, file_bytes: int, repeats: int) -> lis
             with quiet():
                 data, encoding = measure(lambda: encode(splats), repeats)
                 back, decoding = measure(lambda: decode(data), repeats)
-            error = math.sqrt(
-                float(np.square(draw(view(level, back, frame)).numpy().astype(np.float64) - picture).mean())
-            )
+            drawn = draw_all([seen | vars(back)], 1)[0][0].astype(np.float64)
+            error = math.sqrt(float(np.square(drawn - picture).mean()))
             return Row(count, name, len(data), encoding, decoding, error)
 
         return row

@@ -7,89 +7,84 @@ import math
 from collections.abc import Callable, Iterator, Sequence
 from fractions import Fraction
 from functools import partial
+from typing import Any
 
 import numpy as np
 import torch
 
 from pd4dgs_codec.attributes import quantise
-from pd4dgs_codec.bench.stability.rows import Case, mpmath, refusal
-from pd4dgs_codec.bench.stability.scenes import BOX, CAMERA, HEIGHT, WIDTH, picture_error, small_scene
+from pd4dgs_codec.bench.stability import cases as shared
+from pd4dgs_codec.bench.stability.cases import BOX, CAMERA, Case, Found, largest, picture_error, refusal, small_scene
 from pd4dgs_codec.codec import decoder, encoder
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.evaluate import residuals
 from pd4dgs_codec.model import hexplane, layers
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.deformation import DeformationField
-from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.scene import MASK_THRESHOLD, PLANES, Deformation, Network, deformation_unit
+from pd4dgs_codec.view.levels import level_of
 
-HEXPLANE, DEFORMATION, MASKS = "hexplane", "deformation", "masks"
 FLOAT32 = 1e-5  #: of the largest value: what float32 loses in six lookups, their product and two layers
 RESOLUTION = (7, 5, 9, 4)
 Planes = tuple[dict[str, np.ndarray], ...]
 
 
 def cases() -> Iterator[Case]:
-    """Of the three groups in turn."""
-    yield from _hexplane_cases()
-    yield from _deformation_cases()
-    yield from _mask_cases()
+    """Groups hexplane, deformation and masks."""
+    yield from _hexplane()
+    yield from _deformation()
+    yield from _masks()
 
 
-# -- HexPlane ----------------------------------------------------------------------------------------------------------
+# -- hexplane ----------------------------------------------------------------------------------------------------------
 
 
-def _hexplane_cases() -> Iterator[Case]:
-    inside = _points(60, 0.9)
-    exact = "the float64 value of the definition, by kernel, torch and encoder alike"
-
-    def row(name: str, fed: str, points: np.ndarray, times: Sequence[float], **options) -> Case:
-        return Case(HEXPLANE, name, fed, exact, FLOAT32, partial(_sampling_error, points, times, **options))
-
+def _hexplane() -> Iterator[Case]:
+    """Times, points, resolutions and boxes, then what is not a number, then gradients."""
+    row, inside = partial(Case, "hexplane"), _points(60, 0.9)
     rows = [i / 3 for i in range(4)]
     around = [float(np.nextafter(np.float32(r), np.float32(s))) for r in rows for s in (-9, 9)]
     low, high = BOX.astype(np.float64)
     corners = np.array(list(itertools.product(*zip(low, high, strict=True))), np.float32)
-    yield row("time before the range", "t = -1e-7, -3, -1e30, -inf", inside, (-1e-7, -3.0, -1e30, -math.inf))
-    yield row("time after the range", "t = 1 + 1e-7, 7, 1e30, inf", inside, (1 + 1e-7, 7.0, 1e30, math.inf))
-    yield row("time on the rows", "t on each of 4 time rows, and one float32 beside", inside, rows + around)
-    yield row("points on the border", "the corners of the box", corners, (0.0, 0.4, 1.0))
-    yield row("points outside", "corners times 2 and 1e30", np.concatenate([corners * 2, corners * 1e30]), (0.4,))
-    yield row("one cell in all", "resolution 1, 1, 1, 1", inside, (0.0, 0.4, 1.0), resolution=(1, 1, 1, 1))
-    yield row("one cell along x and t", "resolution 1, 5, 9, 1", inside, (0.0, 0.4, 1.0), resolution=(1, 5, 9, 1))
+    far = np.concatenate([corners * 2, corners * 1e30])
     flat = BOX.copy()
     flat[:, 0] = 0.25
-    yield row("a flat box", "a box without extent along x; points on both sides", inside, (0.4,), box=flat)
-    for scale in (1e-30, 1e30):
-        name, fed = f"a box {scale:.0e} wide", "points inside, outside and on the border"
-        yield row(name, fed, inside * np.float32(scale), (0.4,), box=BOX * np.float32(scale))
-    yield Case(
-        HEXPLANE, "time not a number", "t = NaN", "as t = 0", 0.0, partial(_nan_time_error, inside)
-    )  # fmt: skip
-    yield Case(
-        HEXPLANE, "points not finite", "NaN, inf, -inf in each coordinate",
-        "as at the lower, upper, lower border; no gradient to the point", 0.0, _bad_points_error,
-    )  # fmt: skip
-    stiff = np.concatenate([corners, corners * 2, inside])
-    yield Case(
-        HEXPLANE, "gradients at borders and outside", "corners, points outside, points inside; t = -1, 0, 0.4, 1, 2",
-        "the float64 gradients, of planes and points", FLOAT32, partial(_gradient_error, stiff),
-    )  # fmt: skip
+    sampled: list[tuple[Any, ...]] = [
+        ("time before the range", "t = -1e-7, -3, -1e30, -inf", inside, (-1e-7, -3.0, -1e30, -math.inf)),
+        ("time after the range", "t = 1 + 1e-7, 7, 1e30, inf", inside, (1 + 1e-7, 7.0, 1e30, math.inf)),
+        ("time on the rows", "t on each of 4 time rows, and one float32 beside", inside, rows + around),
+        ("points on the border", "the corners of the box", corners, (0.0, 0.4, 1.0)),
+        ("points outside", "corners times 2 and 1e30", far, (0.4,)),
+        ("one cell in all", "resolution 1, 1, 1, 1", inside, (0.0, 0.4, 1.0), (1, 1, 1, 1)),
+        ("one cell along x and t", "resolution 1, 5, 9, 1", inside, (0.0, 0.4, 1.0), (1, 5, 9, 1)),
+        ("a flat box", "a box without extent along x; points on both sides", inside, (0.4,), RESOLUTION, flat),
+        *(
+            (f"a box {s:.0e} wide", "points inside, outside and on the border", inside * s, (0.4,), RESOLUTION, BOX * s)
+            for s in (np.float32(1e-30), np.float32(1e30))
+        ),
+    ]
+    exact = "the float64 value of the definition, by kernel, torch and encoder alike"
+    for name, fed, *given in sampled:
+        yield row(name, fed, exact, FLOAT32, partial(_sampling_error, *given))
+    yield row("time not a number", "t = NaN", "as t = 0", 0.0, partial(_nan_time_error, inside))
+    border = "as at the lower, upper, lower border; no gradient to the point"
+    yield row("points not finite", "NaN, inf, -inf in each coordinate", border, 0.0, _bad_points_error)
+    measure = partial(_gradient_error, np.concatenate([corners, corners * 2, inside]))
+    fed, promised = "corners, points outside, points inside", "the float64 gradients, of planes and points"
+    yield row("gradients at borders and outside", f"{fed}; t = -1, 0, 0.4, 1, 2", promised, FLOAT32, measure)
 
 
 def _points(n: int, spread: float) -> np.ndarray:
+    """float32 [n, 3], random in -spread..spread."""
     return np.random.default_rng(1).uniform(-spread, spread, (n, 3)).astype(np.float32)
 
 
-def _planes(resolution: Sequence[int], channels: int, seed: int = 0) -> Planes:
-    rng = np.random.default_rng(seed)
+def _planes(resolution: Sequence[int], channels: int) -> Planes:
+    rng = np.random.default_rng(0)
     return tuple(
-        {
-            name: rng.normal(1, 0.7, (channels, reso[b], reso[a])).astype(np.float32)
-            for name, a, b in PLANES
-        }
+        {name: rng.normal(1, 0.7, (channels, reso[b], reso[a])).astype(np.float32) for name, a, b in PLANES}
         for reso in (tuple(resolution), (*(2 * r for r in resolution[:3]), resolution[3]))
-    )  # fmt: skip
+    )
 
 
 def exact_samples(planes: Planes, box: np.ndarray, points: np.ndarray, t: float) -> np.ndarray:
@@ -120,7 +115,7 @@ def exact_samples(planes: Planes, box: np.ndarray, points: np.ndarray, t: float)
 
 def _sampling_error(
     points: np.ndarray, times: Sequence[float], resolution: Sequence[int] = RESOLUTION, box: np.ndarray = BOX
-) -> tuple[str, float]:
+) -> Found:
     worst = {"kernel": 0.0, "torch": 0.0, "encoder": 0.0}
     for t in times:
         for name, channels in (("kernel", 8), ("torch", 5), ("encoder", 5)):  # the kernel takes multiples of eight
@@ -131,14 +126,8 @@ def _sampling_error(
                 module = hexplane.HexPlane.from_plane_arrays(box, planes)
                 found = module(torch.from_numpy(points), t).detach().numpy()
             expected = exact_samples(planes, box, points, t)
-            error = float(np.abs(found - expected).max() / np.abs(expected).max())
-            worst[name] = error if not error <= worst[name] else worst[name]
-    return ", ".join(f"{name} {error:.1e}" for name, error in worst.items()), _largest(worst.values())
-
-
-def _largest(errors: object) -> float:
-    """The largest of some numbers, NaN if one is."""
-    return float(np.max(np.array(list(errors))))  # type: ignore[call-overload]
+            worst[name] = largest([worst[name], float(np.abs(found - expected).max() / np.abs(expected).max())])
+    return ", ".join(f"{name} {error:.1e}" for name, error in worst.items()), largest(worst.values())
 
 
 def _modules() -> list[hexplane.HexPlane]:
@@ -146,13 +135,13 @@ def _modules() -> list[hexplane.HexPlane]:
     return [hexplane.HexPlane.from_plane_arrays(BOX, _planes(RESOLUTION, channels)) for channels in (8, 5)]
 
 
-def _nan_time_error(points: np.ndarray) -> tuple[str, float]:
+def _nan_time_error(points: np.ndarray) -> Found:
     x = torch.from_numpy(points)
     errors = [float((m(x, math.nan) - m(x, 0.0)).detach().abs().max()) for m in _modules()]
-    return f"kernel and torch differ from t = 0 by {errors[0]:g} and {errors[1]:g}", _largest(errors)
+    return f"kernel and torch differ from t = 0 by {errors[0]:g} and {errors[1]:g}", largest(errors)
 
 
-def _bad_points_error() -> tuple[str, float]:
+def _bad_points_error() -> Found:
     low, high = BOX
     bad = np.array(list(itertools.product((math.nan, math.inf, -math.inf, 0.3), repeat=3)), np.float32)
     border = np.where(np.isnan(bad) | np.isneginf(bad), low, np.where(np.isposinf(bad), high, bad)).astype(np.float32)
@@ -164,19 +153,16 @@ def _bad_points_error() -> tuple[str, float]:
         (slope,) = torch.autograd.grad(found.sum(), x)
         stray = slope[~torch.isfinite(x)]
         errors += [float((found - expected).detach().abs().max()), float(stray.abs().max())]
-    return f"{len(bad)} points, values and gradients", _largest(errors)
+    return f"{len(bad)} points, values and gradients", largest(errors)
 
 
-def _gradient_error(points: np.ndarray) -> tuple[str, float]:
+def _gradient_error(points: np.ndarray) -> Found:
     errors = []
     for module, t in itertools.product(_modules(), (-1.0, 0.0, 0.4, 1.0, 2.0)):
-        found, expected = (_gradients(m, points, t) for m in (module, _doubled(module)))
+        doubled = hexplane.HexPlane.from_plane_arrays(BOX, module.plane_arrays()).double()
+        found, expected = (_gradients(m, points, t) for m in (module, doubled))
         errors += [float((f - e).abs().max() / e.abs().max()) for f, e in zip(found, expected, strict=True)]
-    return f"{len(points)} points at 5 times, kernel and torch", _largest(errors)
-
-
-def _doubled(module: hexplane.HexPlane) -> hexplane.HexPlane:
-    return hexplane.HexPlane.from_plane_arrays(BOX, module.plane_arrays()).double()
+    return f"{len(points)} points at 5 times, kernel and torch", largest(errors)
 
 
 def _gradients(module: hexplane.HexPlane, points: np.ndarray, t: float) -> list[torch.Tensor]:
@@ -189,32 +175,30 @@ def _gradients(module: hexplane.HexPlane, points: np.ndarray, t: float) -> list[
 # -- deformation -------------------------------------------------------------------------------------------------------
 
 
-def _deformation_cases() -> Iterator[Case]:
-    kinds: list[tuple[str, str, Callable[[], Deformation], Sequence[float]]] = [
-        ("tears", "neighbouring cells of xy at -3 and 3 scene units", _tearing, (0.0, 0.5, 1.0)),
+def _deformation() -> Iterator[Case]:
+    """Each field's residuals and the pictures of its file, then what overflows."""
+    row = partial(Case, "deformation")
+    swing, still = np.linspace(0, 1, 31).tolist(), [0.0, 0.5, 1.0]
+    exact, finite = "the residuals of float64, by model and encoder", "finite pictures"
+    fields: list[tuple[str, str, Callable[[], Deformation], Sequence[float]]] = [
+        ("tears", "neighbouring cells of xy at -3 and 3 scene units", _tearing, still),
         ("teleports", "0 up to a time row, 3 scene units from the next on", _teleporting, _around(11, 5, 6)),
         ("oscillates faster than the time grid", "+-2 scene units in alternate time rows, and between them", _swinging,
-         np.linspace(0, 1, 31).tolist()),
+         swing),
         ("moves everything by 5e5", "every anchor leaves the view by 5e5 scene units", partial(_moved, 5e5), (0.5,)),
     ]  # fmt: skip
-    for name, fed, make, times in kinds:
-        yield Case(
-            DEFORMATION, name, f"{fed}; {len(times)} instants", "the residuals of float64, by model and encoder",
-            FLOAT32, partial(_residual_error, make, times),
-        )  # fmt: skip
-        yield Case(
-            DEFORMATION, f"{name}: pictures of its file", f"{fed}; packed, unpacked and drawn",
-            "finite pictures, within 1/255 of the float64 oracle's", 1 / 255, partial(_file_pictures, make, times, {}),
-        )  # fmt: skip
-    yield Case(
-        DEFORMATION, "overflows: pictures of its file", "planes of 1e20, whose product is beyond float32, as float32",
-        "finite pictures; what is not finite is not drawn", 1 / 255,
-        partial(_file_pictures, partial(_moved, 1e20), (0.5,), {"deformation": "float32"}),
-    )  # fmt: skip
-    yield refusal(
-        DEFORMATION, "overflows: as symbols", "planes of 1e20 at a step of 0.1: over 2^23 steps", EncodeError,
-        lambda: encoder.encode(small_scene(_moved(1e20))),
-    )  # fmt: skip
+    for name, fed, make, times in fields:
+        yield row(name, f"{fed}; {len(times)} instants", exact, FLOAT32, partial(_residual_error, make, times))
+        close = f"{finite}, within 1/255 of the float64 oracle's"
+        measure = partial(_file_pictures, make, times)
+        yield row(f"{name}: pictures of its file", f"{fed}; packed, unpacked and drawn", close, 1 / 255, measure)
+    fed = "planes of 1e20, whose product is beyond float32, as float32"
+    measure = partial(_file_pictures, partial(_moved, 1e20), (0.5,), deformation="float32")
+    hidden = f"{finite}; what is not finite is not drawn"
+    yield row("overflows: pictures of its file", fed, hidden, 1 / 255, measure)
+    fed = "planes of 1e20 at a step of 0.1: over 2^23 steps"
+    act = lambda: encoder.encode(small_scene(_moved(1e20)))  # noqa: E731
+    yield refusal("deformation", "overflows: as symbols", fed, EncodeError, act)
 
 
 def _field(**values: np.ndarray) -> Deformation:
@@ -228,11 +212,8 @@ def _field(**values: np.ndarray) -> Deformation:
     both[0, 0] = both[1, 1] = 1
     both[2, 0] = both[3, 1] = -1
     head = np.array([[1, 0, -1, 0], [0, 1, 0, -1], [0, 0, 0, 0]], np.float32) / deformation_unit(BOX)
-    networks: dict[str, Network] = {
-        "trunk": ((both, np.zeros(4, np.float32)),),
-        "position": ((head, np.zeros(3, np.float32)),),
-    }
-    return Deformation((planes,), networks)
+    trunk: Network = ((both, np.zeros(4, np.float32)),)
+    return Deformation((planes,), {"trunk": trunk, "position": ((head, np.zeros(3, np.float32)),)})
 
 
 def _tearing() -> Deformation:
@@ -257,31 +238,29 @@ def _around(intervals: int, *rows: int) -> list[float]:
     return sorted([0.0, 1.0, *on, *(x + d for x in on for d in (-1e-6, 1e-6)), float(np.mean(on))])
 
 
-def _residual_error(make: Callable[[], Deformation], times: Sequence[float]) -> tuple[str, float]:
-    deformation, points = make(), _points(60, 1.2)
+def _residual_error(make: Callable[[], Deformation], times: Sequence[float]) -> Found:
+    deformation, places = make(), _points(60, 1.2)
     module = DeformationField.from_arrays(deformation, BOX)
     worst = {"model": 0.0, "encoder": 0.0}
     ((head, _),) = deformation.networks["position"]
     ((trunk, _),) = deformation.networks["trunk"]
-    unit = float(deformation_unit(BOX))
+    scale = max(float(np.abs(plane).max()) for plane in deformation.planes[0].values())
     for t in times:
-        hidden = np.maximum(exact_samples(deformation.planes, BOX, points, t) @ trunk.T.astype(np.float64), 0)
-        expected = hidden @ head.T.astype(np.float64) * unit
+        hidden = np.maximum(exact_samples(deformation.planes, BOX, places, t) @ trunk.T.astype(np.float64), 0)
+        expected = hidden @ head.T.astype(np.float64) * float(deformation_unit(BOX))
         found = {
-            "model": module(torch.from_numpy(points), t)["position"].detach().numpy(),
-            "encoder": residuals.residuals(deformation, BOX, points, t)["position"],
+            "model": module(torch.from_numpy(places), t)["position"].detach().numpy(),
+            "encoder": residuals.residuals(deformation, BOX, places, t)["position"],
         }
-        scale = max(float(np.abs(plane).max()) for plane in deformation.planes[0].values())
         for name, value in found.items():
-            worst[name] = _largest([worst[name], float(np.abs(value - expected).max()) / scale])
-    return ", ".join(f"{name} {error:.1e}" for name, error in worst.items()), _largest(worst.values())
+            worst[name] = largest([worst[name], float(np.abs(value - expected).max()) / scale])
+    return ", ".join(f"{name} {error:.1e}" for name, error in worst.items()), largest(worst.values())
 
 
-def _file_pictures(make: Callable[[], Deformation], times: Sequence[float], options: dict) -> tuple[str, float]:
-    data = encoder.encode(small_scene(make()), effort=1, **options)
+def _file_pictures(make: Callable[[], Deformation], times: Sequence[float], deformation: str = "coded") -> Found:
+    data = encoder.encode(small_scene(make()), effort=1, deformation=deformation)
     model = from_scene(decoder.decode(data))
-    error = _largest([picture_error(model, 1, t) for t in times])
-    return f"{len(data):,} bytes, {len(times)} pictures", error
+    return f"{len(data):,} bytes, {len(times)} pictures", largest(picture_error(model, 1, t) for t in times)
 
 
 # -- masks -------------------------------------------------------------------------------------------------------------
@@ -290,48 +269,37 @@ LOGITS = (-100.0, -10.0, -4.59512, 0.0, 4.0, 10.0, 100.0)
 FAR = (-1e4, *LOGITS, 1e4)  #: float32 sums of these lose up to 5e-4
 
 
-def _mask_cases() -> Iterator[Case]:
+def _masks() -> Iterator[Case]:
+    """Values, gradients, codes, what is sent and drawn, refusals."""
+    row = partial(Case, "masks")
     for logits, bound in ((LOGITS, 1e-5), (FAR, 2e-4)):
-        fed = f"logits {logits[0]:g}..{logits[-1]:g}"
-        yield Case(
-            MASKS, f"masks of {fed}", f"{fed} at all three levels",
-            f"the exact masks within {bound:g}, never falling with the level", bound,
-            partial(_level_mask_error, logits),
-        )  # fmt: skip
-    yield Case(
-        MASKS, "gradients of masks at 0 and 1", "logits -1e4..1e4 at all three levels", "all finite", 0.0,
-        _mask_gradients,
-    )  # fmt: skip
-    yield Case(
-        MASKS, "codes at 0, 1 and the threshold", "0, -0, 0.01, its float32 neighbours, 1, halves of a code",
-        "0 up to 0.01, else at least 3, ties to even", 0.0, _code_errors,
-    )  # fmt: skip
-    yield Case(
-        MASKS, "every code there and back", "codes 0 and 3..255 as masks of a model, and as codes again", "unchanged",
-        0.0, _codes_changed,
-    )  # fmt: skip
-    yield Case(
-        MASKS, "drawn where sent", "anchors with masks around the threshold", "drawn if and only if in the file", 0.0,
-        _drawn_against_sent,
-    )  # fmt: skip
+        name, promised = f"logits {logits[0]:g}..{logits[-1]:g}", f"the exact masks within {bound:g}"
+        rising, measure = f"{promised}, never falling with the level", partial(_level_mask_error, logits)
+        yield row(f"masks of {name}", f"{name} at all three levels", rising, bound, measure)
+    for name, fed, promised, count in (
+        ("gradients of masks at 0 and 1", "logits -1e4..1e4 at all three levels", "all finite", _mask_gradients),
+        ("codes at 0, 1 and the threshold", "0, -0, 0.01, its float32 neighbours, 1, halves of a code",
+         "0 up to 0.01, else at least 3, ties to even", _code_errors),
+        ("every code there and back", "codes 0 and 3..255 as masks of a model, and as codes again", "unchanged",
+         _codes_changed),
+        ("drawn where sent", "anchors with masks around the threshold", "drawn if and only if in the file",
+         _drawn_against_sent),
+    ):  # fmt: skip
+        yield row(name, fed, promised, 0.0, count)
     for mask, what in ((0, "no anchor is in the file, the picture is the background"), (255, "the oracle's picture")):
-        yield Case(
-            MASKS, f"all masks {mask // 255}", f"40 anchors of mask {mask // 255}; packed, unpacked and drawn", what,
-            1e-5, partial(_picture_of_mask, mask),
-        )  # fmt: skip
+        fed = f"40 anchors of mask {mask // 255}; packed, unpacked and drawn"
+        yield row(f"all masks {mask // 255}", fed, what, 1e-5, partial(_picture_of_mask, mask))
     for value in (-0.001, 1.001, math.nan, math.inf):
-        yield refusal(
-            MASKS, f"mask {value:g}", "a mask outside 0..1", EncodeError,
-            partial(quantise.mask_codes, np.array([value])),
-        )  # fmt: skip
+        act = partial(quantise.mask_codes, np.array([value]))
+        yield refusal("masks", f"mask {value:g}", "a mask outside 0..1", EncodeError, act)
 
 
 def _triples(logits: Sequence[float]) -> torch.Tensor:
     return torch.tensor(list(itertools.product(logits, repeat=3)))
 
 
-def _level_mask_error(values: Sequence[float]) -> tuple[str, float]:
-    mp = mpmath()
+def _level_mask_error(values: Sequence[float]) -> Found:
+    mp = shared.mpmath()
     logits = _triples(values)
     masks = [layers.level_mask(logits, level) for level in range(3)]
     worst = 0.0
@@ -340,12 +308,12 @@ def _level_mask_error(values: Sequence[float]) -> tuple[str, float]:
             total = mp.mpf(a)
             for level, rise in enumerate((None, b, c)):
                 total += 0 if rise is None else max(mp.mpf(rise), 0) + mp.log1p(mp.exp(-abs(mp.mpf(rise))))
-                worst = _largest([worst, abs(float(masks[level][i]) - float(1 / (1 + mp.exp(-total))))])
+                worst = largest([worst, abs(float(masks[level][i]) - float(1 / (1 + mp.exp(-total))))])
     falls = max(float((low - high).max()) for low, high in itertools.pairwise(masks))
     return f"{len(logits)} triples, largest fall {max(falls, 0.0):g}", worst if falls <= 0 else math.nan
 
 
-def _mask_gradients() -> tuple[str, float]:
+def _mask_gradients() -> Found:
     bad = 0
     for level in range(3):
         logits = _triples(FAR).requires_grad_()
@@ -359,7 +327,7 @@ def _threshold_neighbours() -> list[float]:
     return [float(x) for x in (np.nextafter(at, np.float32(0)), at, np.nextafter(at, np.float32(1)))]
 
 
-def _code_errors() -> tuple[str, float]:
+def _code_errors() -> Found:
     masks = [0.0, -0.0, 1e-30, MASK_THRESHOLD, *_threshold_neighbours(), 0.0118, 1.0, float(np.float32(1 - 2**-24))]
     masks += [float(np.float32((c + 0.5) / 255)) for c in range(3, 254)]
     expected = [0 if m <= MASK_THRESHOLD else max(3, round(Fraction(m) * 255)) for m in masks]
@@ -367,35 +335,32 @@ def _code_errors() -> tuple[str, float]:
     return f"{wrong} of {len(masks)} codes wrong", float(wrong)
 
 
-def _codes_changed() -> tuple[str, float]:
+def _codes_changed() -> Found:
     codes = np.array([0, *range(3, 256)], np.uint8)
     logits = torch.from_numpy(layers.mask_logits(np.repeat(codes[:, None] / 255, 3, axis=1)))
-    wrong = sum(
-        int((quantise.mask_codes(layers.level_mask(logits, level).numpy()) != codes).sum()) for level in range(3)
-    )
+    again = [quantise.mask_codes(layers.level_mask(logits, level).numpy()) for level in range(3)]
+    wrong = sum(int((found != codes).sum()) for found in again)
     return f"{wrong} of {3 * codes.size} codes changed", float(wrong)
 
 
-def _drawn_against_sent() -> tuple[str, float]:
+def _drawn_against_sent() -> Found:
     masks = [*_threshold_neighbours(), 0.0, 0.0099, 0.0101, 0.5, 1.0]
     model = from_scene(small_scene(anchors=len(masks)))
     logit = np.log(np.clip(masks, 1e-7, 1 - 1e-7)) - np.log1p(-np.clip(masks, 1e-7, 1 - 1e-7))
     with torch.no_grad():
         model.mask_logits[:, 0] = torch.from_numpy(logit).float()
-    camera = torch.from_numpy(CAMERA.viewmat), torch.from_numpy(CAMERA.K), WIDTH, HEIGHT
+    camera = torch.from_numpy(CAMERA.viewmat), torch.from_numpy(CAMERA.K), CAMERA.width, CAMERA.height
     drawn = set(model.visible(0, *camera).tolist())
     sent = set(np.flatnonzero(quantise.mask_codes(model.masks(0).detach().numpy())).tolist())
     return f"{len(drawn)} drawn, {len(sent)} sent", float(len(drawn ^ sent))
 
 
-def _picture_of_mask(mask: int) -> tuple[str, float]:
-    scene = small_scene(mask=mask)
-    decoded = decoder.decode(encoder.encode(scene, effort=1))
-    model = from_scene(decoded)
-    error = picture_error(model, 0, 0.0)
+def _picture_of_mask(mask: int) -> Found:
+    decoded = decoder.decode(encoder.encode(small_scene(mask=mask), effort=1))
+    level = level_of(decoded)
+    error = picture_error(level.model, 0, 0.0)
     if not mask:
-        picture = render_image(model, 0, 0.0, CAMERA.viewmat, CAMERA.K, WIDTH, HEIGHT)
-        background = np.array(scene.info.background, np.float32)
-        error = _largest([error, float(np.abs(picture - background).max())])
+        background = np.array(decoded.info.background, np.float32)
+        error = largest([error, float(np.abs(level.picture(CAMERA, 0.0) - background).max())])
     kept = len(decoded.anchor_q)
     return f"{kept} anchors in the file", error if kept == (40 if mask else 0) else math.nan

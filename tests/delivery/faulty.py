@@ -1,6 +1,6 @@
 """A web server that misbehaves as told: it cuts, resets, stalls, lies, or changes its file between requests.
 
-For tests and for the table of faults; `server` is the one that behaves.
+The one that behaves is pd4dgs_codec.delivery.server.
 """
 
 from __future__ import annotations

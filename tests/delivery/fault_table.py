@@ -1,5 +1,5 @@
-"""The table of faults: what the streaming client does when the link or the server fails, and whether all it shows is
-right.
+"""What the streaming client does when the link or the server fails, and whether all it shows is right; also the table
+of faults in docs/latency.md.
 
 Every row runs the client against a server on loopback behind a paced link. A picture counts as right if every array of
 its scene equals that of an uninterrupted decode of the same prefix.
@@ -12,18 +12,19 @@ import math
 import random
 import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cached_property
 
-from pd4dgs_codec.bench.latency.measure import layer_rows
+from faulty import Fault, FaultyServer
+
+from pd4dgs_codec.bench.latency import layer_rows, served
 from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.encoder import encode
 from pd4dgs_codec.codec.npz import to_npz_dict
 from pd4dgs_codec.delivery.client import SceneClient
-from pd4dgs_codec.delivery.faulty import Fault, FaultyServer
 from pd4dgs_codec.delivery.link import Link
-from pd4dgs_codec.delivery.transfer import MAX_CHANGES
+from pd4dgs_codec.delivery.transfer import MAX_CHANGES, Transfer
 from pd4dgs_codec.errors import ChecksumMismatch, DeliveryError, Pd4Error, Truncated
 from pd4dgs_codec.scene import Scene
 
@@ -203,17 +204,6 @@ def run(file: File, scenario: Scenario, rate: float = RATE) -> Row:
     )
 
 
-def run_all(
-    file: File, chosen: Sequence[Scenario], step: Callable[[], None] = lambda: None, rate: float = RATE
-) -> list[Row]:
-    """A row per scenario; `step` is called after each."""
-    rows = []
-    for scenario in chosen:
-        rows.append(run(file, scenario, rate))
-        step()
-    return rows
-
-
 @dataclass(frozen=True)
 class Cuts:
     """Random cuts and resumes. wrong: transfers whose pictures were not those of one without cuts."""
@@ -224,9 +214,8 @@ class Cuts:
     seconds: float
 
 
-def random_cuts(file: File, cuts: int, seed: int = 4, step: Callable[[], None] = lambda: None) -> Cuts:
-    """At least `cuts` closed or reset connections at random bytes, ten per transfer; `step` is called after each
-    transfer."""
+def random_cuts(file: File, cuts: int, seed: int = 4) -> Cuts:
+    """At least `cuts` closed or reset connections at random bytes, ten per transfer."""
     rng, made, wrong, transfers, start = random.Random(seed), 0, 0, 0, time.monotonic()
     while made < cuts:
         piece = len(file.data) // (CUTS_PER_TRANSFER + 1)
@@ -236,5 +225,46 @@ def random_cuts(file: File, cuts: int, seed: int = 4, step: Callable[[], None] =
         wrong += shown != file.levels()
         made += client.transfer.cuts
         transfers += 1
-        step()
     return Cuts(made, transfers, wrong, time.monotonic() - start)
+
+
+@dataclass(frozen=True)
+class Crowd:
+    """Clients at once over one link. seconds: until the last one has its last byte. errors: in words."""
+
+    clients: int
+    rate: float
+    bytes: int
+    expected: float
+    seconds: float
+    errors: list[str]
+
+
+def crowd(data: bytes, clients: int = 64, rate: float = 200e6) -> Crowd:
+    """Fetches the file by many clients at once; a byte that differs is an error too."""
+    errors: list[str] = []
+    with served(data, rate) as url:
+        barrier = threading.Barrier(clients + 1)
+
+        def client() -> None:
+            transfer = Transfer(url)
+            barrier.wait()
+            try:
+                while transfer.read():
+                    pass
+                if transfer.data != data or transfer.cuts:
+                    errors.append(f"{transfer.cuts} cuts, {len(transfer.data):,} bytes, expected {len(data):,}")
+            except Exception as error:
+                errors.append(f"{type(error).__name__}: {error}")
+            finally:
+                transfer.close()
+
+        threads = [threading.Thread(target=client) for _ in range(clients)]
+        for thread in threads:
+            thread.start()
+        barrier.wait()
+        start = time.perf_counter()
+        for thread in threads:
+            thread.join()
+        seconds = time.perf_counter() - start
+    return Crowd(clients, rate, len(data), 8 * clients * len(data) / rate, seconds, errors)
