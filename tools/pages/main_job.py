@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from pages.draco import draco_encode
 from pages.pictures import draw_levels
 from pages.trainings import ensure_trained
 from pd4dgs_codec.atomic import whole_file, whole_files, write_bytes
-from pd4dgs_codec.bench.draco import draco_encode
 from pd4dgs_codec.codec.encoder import LayerReport, Report, encode_with_report
 from pd4dgs_codec.codec.options import EncodeOptions
 from pd4dgs_codec.codec.plan import plan

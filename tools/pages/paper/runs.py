@@ -11,6 +11,7 @@ from typing import Any
 
 import torch
 
+from pages.page import commit
 from pages.trainings import ensure_trained
 from pd4dgs_codec.atomic import whole_file, write_bytes
 from pd4dgs_codec.codec.encoder import encode_with_report
@@ -106,9 +107,10 @@ def measure(
 ) -> dict[str, Any]:
     """The result of `run`, from its result.json if there is one of the same settings, else made now.
 
-    {"scene", "variant", "seed", "config", "iterations", "seconds", "anchors", "rho", "active": anchors per level,
-    "gap_by_motion": see there, "pi": what `course` reads, "levels": rows of pd4dgs-eval --perceptual}. The one level
-    of a monolithic variant is its highest, its bytes those of `monolithic_bytes`. dataset: loads the scene when needed.
+    {"scene", "variant", "seed", "commit", "config", "iterations", "seconds", "anchors", "rho", "active": anchors per
+    level, "gap_by_motion": see there, "pi": what `course` reads, "levels": rows of pd4dgs-eval --perceptual}. The one
+    level of a monolithic variant is its highest, its bytes those of `monolithic_bytes`. dataset: loads the scene when
+    needed.
     """
     folder = run.folder(out)
     wanted = json.loads(json.dumps(run.config, default=lambda value: value.__dict__))
@@ -116,7 +118,7 @@ def measure(
     if file.exists():
         stored = json.loads(file.read_text())
         if stored["config"] == wanted:
-            return stored
+            return {"commit": "unknown"} | stored
     data = dataset()
     path = folder / "model.pt"
     model, training = ensure_trained(run.config, data, path, say=say, progress=progress)
@@ -132,6 +134,7 @@ def measure(
         "scene": run.scene.name,
         "variant": run.variant.name,
         "seed": run.seed,
+        "commit": commit(),
         "config": wanted,
         "iterations": training["iteration"],
         "seconds": training["seconds"],
