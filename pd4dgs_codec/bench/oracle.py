@@ -8,8 +8,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from pd4dgs_codec.render.autograd.reference import composite, project
 from pd4dgs_codec.render.projection import ALPHA_MIN
-from pd4dgs_codec.render.reference import composite, project
 
 #: Pixels of a block's side: small blocks meet few Gaussians, large ones cost fewer calls.
 BLOCK = 16

@@ -102,7 +102,7 @@ def _without_gsplat() -> str | None:
     """Why gsplat cannot draw here, in one line; None if it can."""
     import torch
 
-    from pd4dgs_codec.render import gsplat_backend
+    from pd4dgs_codec.render.autograd import gsplat_backend
 
     if not torch.cuda.is_available():
         return "there is no CUDA device"

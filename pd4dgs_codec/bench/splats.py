@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from pd4dgs_codec.bench.timing import clock
-from pd4dgs_codec.render.rasterization import rasterization
+from pd4dgs_codec.render.autograd.rasterization import rasterization
 from pd4dgs_codec.view.frames import Frame
 from pd4dgs_codec.view.levels import Level
 

@@ -29,7 +29,7 @@ from pd4dgs_codec.codec.plan import plan  # noqa: E402
 from pd4dgs_codec.errors import DataError, Pd4Error  # noqa: E402
 from pd4dgs_codec.model import checkpoint  # noqa: E402
 from pd4dgs_codec.model.convert import from_scene  # noqa: E402
-from pd4dgs_codec.render.rasterization import rasterization  # noqa: E402
+from pd4dgs_codec.render.autograd.rasterization import rasterization  # noqa: E402
 from pd4dgs_codec.scene import Camera  # noqa: E402
 
 RNG = np.random.default_rng(4)

@@ -7,7 +7,7 @@ import torch
 
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.picture import render
-from pd4dgs_codec.render.rasterization import rasterization
+from pd4dgs_codec.render.autograd.rasterization import rasterization
 from pd4dgs_codec.scene import SCAFFOLD_NETWORKS, Camera, Deformation, Network, Scene, SceneInfo, Steps
 
 WIDTH, HEIGHT = 40, 30
