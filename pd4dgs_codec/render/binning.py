@@ -9,7 +9,7 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from pd4dgs_codec.simd import kernel
+from pd4dgs_codec.render.simd import kernel
 
 
 @kernel()

@@ -27,7 +27,7 @@ from pd4dgs_codec.render.projection import (
     X,
     Y,
 )
-from pd4dgs_codec.simd import (
+from pd4dgs_codec.render.simd import (
     LANES,
     exp2,
     fma,

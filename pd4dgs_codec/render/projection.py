@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numba import prange
 
-from pd4dgs_codec.simd import kernel
+from pd4dgs_codec.render.simd import kernel
 
 ALPHA_MAX = 0.999  #: alpha is clamped to this (gsplat 1.5.3)
 ALPHA_MIN = 1.0 / 255.0  #: fainter contributions are skipped

@@ -9,8 +9,12 @@ import numba  # noqa: E402
 from hypothesis import given, settings  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 
-from pd4dgs_codec import simd  # noqa: E402
-from pd4dgs_codec.render import binning, kernels, rasteriser  # noqa: E402
+from pd4dgs_codec.render import (  # noqa: E402
+    binning,
+    kernels,
+    rasteriser,
+    simd,  # noqa: E402
+)
 from pd4dgs_codec.scene import Camera  # noqa: E402
 
 
