@@ -64,8 +64,9 @@ def registered(value, known, what):
     return value
 
 
+# 15 Errors and security: "Inside a payload, bytes that end early are Malformed"
 class Reader:
-    """Takes bytes from the front; running out of them is Malformed."""
+    """Takes bytes from the front."""
 
     def __init__(self, data):
         self.data, self.at = data, 0
@@ -187,11 +188,11 @@ def msgpack_items(reader, kind, size, depth):
     need(depth < 4, "msgpack nested deeper than 4")
     if kind == "list":
         return [msgpack_value(reader, depth + 1) for _ in range(size)]
-    result, last = {}, -1
+    result, last = {}, None
     for _ in range(size):
         key = msgpack_value(reader, depth + 1)
         need(type(key) is int and 0 <= key < 1 << 32, f"map key {key!r}")
-        need(key > last, f"map key {key} after {last}")
+        need(last is None or key > last, f"map key {key} after {last}")
         result[key], last = msgpack_value(reader, depth + 1), key
     return result
 
@@ -459,8 +460,8 @@ def check_sizes(layer, payload_bytes):
 # mode lzma 0 and 5."
 def read_sections(layer, parts):
     def part(section, count):
-        need((section in parts) == (count > 0), f"section {section} with {count} symbols to code")
-        return parts.pop(section, b"")
+        need(section in parts or not count, f"section {section} is missing")
+        return parts.pop(section, b"") if count else b""
 
     planes, weights = plane_shapes(layer), weight_shapes(layer)
     counts = {MASKS: [layer.rows_before, layer.rows], ATTRIBUTE_SECTION: [layer.rows] * 68}
@@ -666,6 +667,7 @@ def read_histogram(reader, prior):
     return prior
 
 
+# 8.2 Priors: "A class outside 0..top, or all classes 0, is Malformed."
 # 8.4 Symbols: "The ANS stream holds the classes of each hist prior in the order of definition"
 def take_classes(stream, prior):
     step, top, differences, cum = prior.classes
@@ -701,7 +703,7 @@ def decode_channels(data, counts):
     for count in counts:
         if count == 0:
             continue
-        limited(count, MAX_COUNT, "the symbols of a channel")
+        need(count <= MAX_COUNT, f"a channel of {count} symbols", "LimitExceeded")
         token = reader.varint(2 * (MAX_COUNT + 8))
         if token >> 1 < 8:
             defined.append(read_prior(reader, token >> 1))
@@ -899,20 +901,20 @@ def unpack_lzma(data, size):
         if control == 1 or control >= 0xE0:
             start, lzma = len(out), None
         need(start is not None, "the first LZMA2 chunk does not reset the dictionary")
-        if control <= 2:
-            out += reader.take(1 + reader.number(">H"))
-        else:
-            end = len(out) + 1 + ((control & 31) << 16 | reader.number(">H"))
-            length = 1 + reader.number(">H")
-            if control >= 0xC0:
-                lzma = Lzma(reader.byte())
-            need(lzma, "an LZMA2 chunk without properties")
-            if control >= 0xA0:
-                lzma.reset()
-            need(end <= size, f"an LZMA stream of more than {size} bytes")
-            lzma.unpack(reader.take(length), out, start, end)
-        need(len(out) <= size, f"an LZMA stream of more than {size} bytes")
-    need(len(out) == size, f"an LZMA stream of {len(out)} bytes, expected {size}")
+        stored = control < 0x80
+        end = len(out) + 1 + (reader.number(">H") | (0 if stored else control & 31) << 16)
+        need(end <= size, f"an LZMA stream of more than {size} bytes")
+        if stored:
+            out += reader.take(end - len(out))
+            continue
+        length = 1 + reader.number(">H")
+        if control >= 0xC0:
+            lzma = Lzma(reader.byte())
+        need(lzma, "an LZMA2 chunk without properties")
+        if control >= 0xA0:
+            lzma.reset()
+        lzma.unpack(reader.take(length), out, start, end)
+    need(len(out) >= size, f"an LZMA stream of {len(out)} bytes, expected {size}")
     need(not reader.left, "bytes behind the end of an LZMA stream")
     return bytes(out)
 
@@ -1058,7 +1060,7 @@ def decode_lzma_symbols(data, counts):
     _, planar = reader.byte(224), reader.bits(1)
     bases, forms = [], []
     for count in counts:
-        limited(count, MAX_COUNT, "the symbols of a channel")
+        need(count <= MAX_COUNT, f"a channel of {count} symbols", "LimitExceeded")
         code = reader.varint(8 * K + 3) if count else 0
         need(code & 3 < 3, "a channel of 8-byte symbols")
         bases.append(unzigzag(code >> 2))
@@ -1074,7 +1076,7 @@ def decode_lzma_symbols(data, counts):
 # plane, weight and bias. Byte planes apply per array. Values MUST be finite."
 def decode_lzma_floats(data, counts):
     for count in counts:
-        limited(count, MAX_COUNT, "values of an array")
+        need(count <= MAX_COUNT, f"an array of {count} values", "LimitExceeded")
     reader = Reader(data)
     _, planar = reader.byte(224), reader.bits(1)
     raw = unpack_lzma(reader.take(reader.left), 4 * sum(counts))
@@ -1290,6 +1292,7 @@ def dequantise_layer(layer):
 
 # 12.1 Order: "For each layer chunk, before the next chunk is looked at: parameters and their limits, sections, the
 # ranges of 11.1 and 11.2, sums of masks, each voxel at most once over the layers so far, and dequantisation."
+# 11.1 Masks: "No sum may exceed 255."
 def finish_last(layers):
     codes = []
     for layer in layers:

@@ -1,7 +1,7 @@
 """The main job, to watch: train a dynamic scene, pack it, unpack every prefix, render each level, measure.
 
-    bash tools/demo.sh                       # the synthetic scene, CPU, under five minutes
-    bash tools/demo.sh --source FOLDER --preset small --max-seconds 600 --downscale 2
+bash tools/demo.sh                       # the synthetic scene, CPU, under five minutes
+bash tools/demo.sh --source FOLDER --preset small --max-seconds 600 --downscale 2
 """
 
 from __future__ import annotations
