@@ -36,7 +36,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     if verb not in VERBS:
         print(f"pd4dgs: error: found {verb!r}, expected one of {', '.join(VERBS)}", file=sys.stderr)
         return 2
-    return import_module(f"pd4dgs_codec.cli.{verb}").main(arguments[1:])
+    code: int = import_module(f"pd4dgs_codec.cli.{verb}").main(arguments[1:])
+    return code
 
 
 if __name__ == "__main__":

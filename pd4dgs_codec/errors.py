@@ -39,14 +39,12 @@ class DecodeError(Pd4Error):
 
     offset: byte offset in the file where the fault was found, or None if unknown.
     chunk: index of the chunk in file order, or None outside chunks.
-    clause: the clause of spec/format.md that is violated, such as "4.2".
     """
 
-    def __init__(self, message: str, *, offset: int | None = None, chunk: int | None = None, clause: str | None = None):
+    def __init__(self, message: str, *, offset: int | None = None, chunk: int | None = None):
         self.message = message
         self.offset = offset
         self.chunk = chunk
-        self.clause = clause
         super().__init__(message)
 
     def __str__(self) -> str:

@@ -44,7 +44,8 @@ def deformation_unit(box: np.ndarray) -> np.float32:
 
     In scene units a rounded weight would shift a small scene by whole pixels.
     """
-    return np.float32(0.25) * (box[1] - box[0]).astype(np.float32).max()
+    longest: np.float32 = (box[1] - box[0]).astype(np.float32).max()
+    return np.float32(0.25) * longest
 
 
 #: The decoders of the scaffold (input [feature 32, view direction 3]) with their output width.
@@ -55,6 +56,8 @@ TRUNK = "trunk"
 
 #: A network: per linear layer (weight float32 [out, in], bias float32 [out]); ReLU between layers, none at the end.
 Network = tuple[tuple[np.ndarray, np.ndarray], ...]
+#: Planes of a HexPlane: scale -> plane name -> array [C, reso[b], reso[a]].
+Planes = tuple[dict[str, np.ndarray], ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -86,11 +89,11 @@ class SceneInfo:
 class Deformation:
     """A HexPlane and its residual MLP.
 
-    planes: scale -> plane name -> float32 [C, reso[b], reso[a]]; sampled bilinearly (align corners, border clamp),
-    multiplied within a scale, concatenated over scales. networks: "trunk" and the heads that are present.
+    planes: float32, sampled bilinearly (align corners, border clamp), multiplied within a scale, concatenated over
+    scales. networks: "trunk" and the heads that are present.
     """
 
-    planes: tuple[dict[str, np.ndarray], ...]
+    planes: Planes
     networks: dict[str, Network]
 
 
@@ -111,6 +114,19 @@ class Steps:
     weights_scaffold: float = 0.004
     weights_global: float = 0.001
     weights_local: float = 0.001
+
+    @property
+    def attributes(self) -> dict[str, float]:
+        """By name of the attribute."""
+        return {"feature": self.feature, "scaling_log": self.scaling_log, "offset": self.offset}
+
+    def planes(self, layer: int) -> float:
+        """Of the planes of layer 1 or 2."""
+        return {1: self.planes_global, 2: self.planes_local}[layer]
+
+    def weights(self, layer: int) -> float:
+        """Of the networks of layer 0, 1 or 2."""
+        return (self.weights_scaffold, self.weights_global, self.weights_local)[layer]
 
     def scaled(self, factor: float) -> Steps:
         """Every step times `factor`, rounded to binary32."""
@@ -153,8 +169,38 @@ class Scene:
     @property
     def anchor(self) -> np.ndarray:
         """float32 [N, 3] anchor positions, world, scene units."""
+        voxel = np.float64(np.float32(self.info.voxel_size))
         with np.errstate(over="ignore"):  # an absurd voxel size gives infinities, which the decoder refuses
-            return (self.anchor_q.astype(np.float64) * np.float64(np.float32(self.info.voxel_size))).astype(np.float32)
+            position: np.ndarray = (self.anchor_q.astype(np.float64) * voxel).astype(np.float32)
+        return position
+
+    @property
+    def attributes(self) -> dict[str, np.ndarray]:
+        """float32 [N, ...] by name of the attribute."""
+        return {"feature": self.feature, "scaling_log": self.scaling_log, "offset": self.offset}
+
+    def deformation(self, layer: int) -> Deformation | None:
+        """That of layer 1 or 2; None if it is left out, and for layer 0, which has none."""
+        return (None, self.global_deformation, self.local_deformation)[layer]
+
+    def full_masks(self) -> list[np.ndarray]:
+        """uint8 [N] codes per layer present: an anchor that a layer's prefix does not hold is inactive there."""
+        return [np.concatenate([codes, np.zeros(self.rows[-1] - codes.size, np.uint8)]) for codes in self.mask]
+
+    def tensors(self, layer: int) -> Deformation:
+        """Planes and networks of layer 0, 1 or 2: layer 0 has its decoders and no planes, a layer left out neither."""
+        if layer == 0:
+            return Deformation((), self.networks)
+        return self.deformation(layer) or Deformation((), {})
+
+    def with_tensors(self, layer: int, tensors: Deformation | None) -> Scene:
+        """The scene with others in their place; None leaves the deformation of layer 1 or 2 out."""
+        if layer == 1:
+            return replace(self, global_deformation=tensors)
+        if layer == 2:
+            return replace(self, local_deformation=tensors)
+        assert tensors is not None and not tensors.planes
+        return replace(self, networks=tensors.networks)
 
     def prefix(self, max_layer: int) -> Scene:
         """The scene that a decoder yields from the layers <= max_layer; `self` if nothing is cut."""

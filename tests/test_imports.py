@@ -1,6 +1,7 @@
 """Who may import whom, read from the source; and decoding where torch cannot be imported."""
 
 import ast
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -13,9 +14,11 @@ from pd4dgs_codec.codec.encoder import encode
 
 ROOT = Path(pd4dgs_codec.__file__).parent
 
-#: Part of the package -> the parts it may import; errors and scene are free to all.
+#: Part of the package -> the parts it may import; errors, scene and morton are free to all.
 ALLOWED = {
     "errors": set(),
+    "atomic": set(),
+    "morton": set(),
     "scene": set(),
     "bitstream": set(),
     "entropy": set(),
@@ -23,11 +26,11 @@ ALLOWED = {
     "evaluate": set(),
     "codec": {"bitstream", "entropy", "attributes", "evaluate"},
     "delivery": {"bitstream", "entropy", "attributes", "codec"},
-    "interchange": {"bitstream", "entropy", "attributes", "codec"},
 }
 #: Outside packages that these parts may use.
-LIBRARIES = {"numpy", "constriction", "msgpack"}
-WITHOUT_TORCH = ["errors", "scene", "bitstream", "entropy", "attributes", "evaluate", "codec", "delivery"]
+LIBRARIES = {"numpy", "constriction", "msgpack", "zstandard"}
+WITHOUT_TORCH = ["errors", "atomic", "morton", "scene"]
+WITHOUT_TORCH += ["bitstream", "entropy", "attributes", "evaluate", "codec", "delivery"]
 
 
 def modules(part):
@@ -58,7 +61,7 @@ def test_parts_import_only_what_lies_before_them(part):
         for name in imported(path):
             if name.startswith("pd4dgs_codec."):
                 target = name.split(".")[1]
-                assert target in ALLOWED[part] | {part, "errors", "scene"}, f"{path.name} imports {name}"
+                assert target in ALLOWED[part] | {part, "errors", "scene", "morton"}, f"{path.name} imports {name}"
 
 
 @pytest.mark.parametrize("part", [p for p in WITHOUT_TORCH if modules(p)])
@@ -69,9 +72,15 @@ def test_the_decoder_side_uses_numpy_constriction_msgpack_and_the_standard_libra
             assert top in sys.stdlib_module_names | LIBRARIES | {"pd4dgs_codec", "__future__"}, f"{path.name}: {name}"
 
 
+def test_every_mandatory_dependency_is_imported():
+    (line,) = re.findall(r"^dependencies = (.*)$", (ROOT.parent / "pyproject.toml").read_text(), re.MULTILINE)
+    found = {name.split(".")[0] for path in ROOT.rglob("*.py") for name in imported(path)}
+    assert set(ast.literal_eval(line)) <= found
+
+
 SCRIPT = """
 import sys
-for name in ("torch", "numba", "scipy", "PIL"):
+for name in ("torch", "numba", "scipy", "PIL", "zstandard"):
     sys.modules[name] = None
 import pd4dgs_codec
 assert not [m for m in sys.modules if m.startswith("pd4dgs_codec.")], "importing the package loads its modules"
@@ -80,7 +89,7 @@ print(scene.layers, len(scene.anchor_q), pd4dgs_codec.FORMAT_VERSION)
 """
 
 
-def test_decoding_needs_no_torch():
+def test_decoding_needs_no_torch_and_no_zstandard():
     scene = make_scene(3, anchors=12)
     data = encode(scene, layers=2, effort=1)
     done = subprocess.run([sys.executable, "-c", SCRIPT], input=data, capture_output=True, cwd=ROOT.parent)

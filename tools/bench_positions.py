@@ -10,18 +10,16 @@ Captured points are taken from PD4DGS_SHARED (default ../shared/data beside the 
 from __future__ import annotations
 
 import argparse
-import os
 import time
-from pathlib import Path
 
 import numpy as np
+from pages.draco import draco_encode
+from pages.scenes import SHARED
 
-from pd4dgs_codec.bench.draco import draco_encode
-from pd4dgs_codec.entropy.morton import morton_codes, morton_order
 from pd4dgs_codec.entropy.positions import decode_positions, encode_positions
+from pd4dgs_codec.morton import morton_codes, morton_order
 
 SURFACES = ("sphere", "torus", "plane", "cylinder", "gyroid")
-_SHELF = Path("shelf-hand") / "points_triangulated.ply"
 
 
 def surface(name: str, count: int, side: int = 1024, seed: int = 0) -> np.ndarray:
@@ -71,8 +69,7 @@ _SAMPLERS = {"sphere": _sphere, "torus": _torus, "plane": _plane, "cylinder": _c
 
 def captured_points() -> np.ndarray | None:
     """Triangulated points float64 [N, 3] of a phone video, or None if the data are not there."""
-    root = os.environ.get("PD4DGS_SHARED") or Path(__file__).resolve().parents[2] / "shared" / "data"
-    path = Path(root) / _SHELF
+    path = SHARED / "shelf-hand" / "points_triangulated.ply"
     if not path.exists():
         return None
     head, body = path.read_bytes().split(b"end_header\n", 1)

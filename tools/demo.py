@@ -30,7 +30,7 @@ def main(argv: list[str] | None = None) -> int:
     configure()
 
     from pages.main_job import Job, run_job
-    from pages.tables import coding_table, quality_table, time_plot
+    from pages.tables import coding_table, figures, quality_table, time_plot
 
     from pd4dgs_codec.cli.progress import TrainingProgress
     from pd4dgs_codec.errors import Pd4Error
@@ -49,10 +49,11 @@ def main(argv: list[str] | None = None) -> int:
         print(f"demo: error: {str(error) or 'interrupted'}", file=sys.stderr)
         return 1
     folder = args.out / "demo"
-    time_plot([result], folder / "quality-over-time.png")
+    shown = [{"name": "demo", **figures(result)}]
+    time_plot(shown, folder / "quality-over-time.png")
     if result["phases_not_reached"]:
         print(f"\nthe time limit came before: {', '.join(result['phases_not_reached'])}")
-    print(f"\n{quality_table([result])}\n\n{coding_table([result])}\n")
+    print(f"\n{quality_table(shown)}\n\n{coding_table(shown)}\n")
     for what, names in (
         ("model", "model.pt"),
         ("bitstream", "scene.pd4"),

@@ -6,8 +6,8 @@
     python tools/paper.py levels --scenes recordings/kitchen@2
 
 Trains what is missing below --out (a stopped run goes on where it was, a finished one is kept by its settings), packs,
-measures on held-out views, and writes docs/paper/NAME.md, .json and .png. The method is the paper's: no anchor is
-pruned by its harm, and learning rates do not cool down.
+measures on held-out views, and writes docs/paper/NAME.md, its figures and its picture. The method is the paper's: no
+anchor is pruned by its harm, and learning rates do not cool down. With --render pages are made from their figures.
 
 A scene is global, local, fast, static (the synthetic ones), shelf-hand or bouncing-balls (in the folder PD4DGS_SHARED
 names, default ../shared/data beside the repository), or any SOURCE that pd4dgs-train takes, with @K behind it to train
@@ -18,22 +18,21 @@ from __future__ import annotations
 
 import argparse
 import functools
-import json
-import os
 import sys
 from pathlib import Path
 from typing import Any
 
+from pages.scenes import SCENES, SHARED, Scene
+
 from pd4dgs_codec.render.threads import configure
 
-SHARED = Path(os.environ.get("PD4DGS_SHARED", Path(__file__).resolve().parents[2] / "shared" / "data"))
-#: Preset, iterations and seeds at most of the synthetic scenes.
+#: Iterations and seeds at most of the synthetic scenes, in the preset tiny.
 SYNTHETIC = ("tiny", 400, 3)
-#: name: source, downscale, preset, iterations, seeds at most. Equal iterations for all variants of a scene.
-SCENES: dict[str, tuple[str, int, str, int, int]] = {
-    **{name: (f"synthetic:{name}", 1, *SYNTHETIC) for name in ("static", "global", "local", "fast")},
-    "shelf-hand": (str(SHARED / "shelf-hand"), 2, "small", 1_000, 1),
-    "bouncing-balls": (str(SHARED / "bouncing-balls"), 4, "small", 1_500, 1),
+#: name: scene, preset, iterations, seeds at most. Equal iterations for all variants of a scene.
+BUDGETS: dict[str, tuple[Scene, str, int, int]] = {
+    **{name: (SCENES[f"synthetic-{name}"], *SYNTHETIC) for name in ("static", "global", "local", "fast")},
+    "shelf-hand": (SCENES["shelf-hand"], "small", 1_000, 1),
+    "bouncing-balls": (SCENES["bouncing-balls"], "small", 1_500, 1),
 }
 #: The same of a scene given by its source.
 OTHERS = ("small", 2_000, 1)
@@ -53,12 +52,16 @@ def main(argv: list[str] | None = None) -> int:
     parser.add_argument("--seeds", type=positive_int, metavar="N", help="seeds 0 to N-1 (default: the table's own)")
     parser.add_argument("--iterations", type=positive_int, metavar="N", help="of each run (default: the table's own)")
     parser.add_argument("--out", type=Path, default=Path("out/paper"))
-    parser.add_argument("--docs", type=Path, default=Path("docs/paper"))
+    parser.add_argument("--docs", type=Path, default=Path("docs"))
+    parser.add_argument("--render", action="store_true", help="make the pages from their figures, train nothing")
     args = parser.parse_args(argv)
     tables = list(TABLES.values()) if args.table == "all" else [TABLES[args.table]]
     try:
         for table in tables:
-            make(table, args, TrainingProgress)
+            if args.render:
+                table.page.write(args.docs, table.page.read(args.docs))
+            else:
+                make(table, args, TrainingProgress)
     except (Pd4Error, OSError, KeyboardInterrupt) as error:
         print(f"paper: error: {str(error) or 'interrupted; the same command goes on'}", file=sys.stderr)
         return 1
@@ -68,16 +71,14 @@ def main(argv: list[str] | None = None) -> int:
 def make(table: Any, args: argparse.Namespace, progress: Any) -> None:
     """Runs what the table lacks and writes its three files."""
     from pages.paper.runs import Run, held_to, measure
+    from pages.paper.tables import figures
 
     from pd4dgs_codec.data.dataset import load
 
-    scenes = [scene(name, table.budget, args.iterations) for name in args.scenes or table.scenes]
-    absent = [s.name for s in scenes if s.config.source.startswith(str(SHARED)) and not Path(s.config.source).is_dir()]
-    for name in absent:
-        print(f"{table.name}: {name} is not in {SHARED}, left out")
     results = []
-    for one in scenes:
-        if one.name in absent:
+    for one in [scene(name, table.budget, args.iterations) for name in args.scenes or table.scenes]:
+        if one.config.source.startswith(str(SHARED)) and not Path(one.config.source).is_dir():
+            print(f"{table.name}: {one.name} is not in {SHARED}, left out")
             continue
         dataset = functools.cache(
             lambda config=one.config: load(config.source, downscale=config.downscale, holdout=config.holdout)
@@ -96,7 +97,8 @@ def make(table: Any, args: argparse.Namespace, progress: Any) -> None:
                 found[variant.name] = result
             results += found.values()
     if results:
-        write(table, results, args.docs)
+        table.page.write(args.docs, [figures(result, table.name) for result in results])
+        table.plot(results, args.docs / "paper" / f"{table.name}.png")
 
 
 def _say(label: str, text: str) -> None:
@@ -106,7 +108,7 @@ def _say(label: str, text: str) -> None:
 def scene(name: str, synthetic: tuple[str, int] | None, iterations: int | None) -> Any:
     """A scene by its name, or by SOURCE[@K]. synthetic: preset and iterations of a synthetic scene, iterations: of any
     scene, instead of its own."""
-    from pages.paper.runs import Scene
+    from pages.paper import runs
 
     from pd4dgs_codec.errors import DataError
     from pd4dgs_codec.train.config import TrainConfig
@@ -114,40 +116,19 @@ def scene(name: str, synthetic: tuple[str, int] | None, iterations: int | None) 
     source, at, downscale = name.partition("@")
     if at and not (downscale.isdecimal() and int(downscale)):
         raise DataError(f"{name}: found {downscale!r} behind @, expected an integer >= 1")
-    source, factor, preset, steps, seeds = SCENES.get(name, (source, int(downscale or 1), *OTHERS))
-    if synthetic and source.startswith("synthetic:"):
+    given = Scene(Path(source).name.replace(":", "-"), source, int(downscale or 1))
+    known, preset, steps, seeds = BUDGETS.get(name, (given, *OTHERS))
+    if synthetic and known.source.startswith("synthetic:"):
         preset, steps = synthetic
-    method = {"prune": 0.0, "cooldown": 0.0}  # the paper's does neither
-    config = TrainConfig(preset=preset, source=source, downscale=factor, iterations=iterations or steps, **method)
-    return Scene(name if name in SCENES else Path(source).name.replace(":", "-"), config, seeds)
-
-
-def write(table: Any, results: list[dict[str, Any]], docs: Path) -> None:
-    """docs/NAME.md, NAME.json, NAME.png."""
-    from pd4dgs_codec.bench.markdown import paragraph
-
-    docs.mkdir(parents=True, exist_ok=True)
-    table.plot(results, docs / f"{table.name}.png")
-    budgets: dict[str, str] = {}
-    for r in results:
-        budgets.setdefault(r["scene"], f"{r['scene']}: {r['config']['preset']}, {r['iterations']:,} iterations")
-    lines = [
-        f"# {table.title}",
-        "",
-        *paragraph(
-            f"`python tools/paper.py {table.name}`: {len(results)} trainings "
-            f"({'; '.join(budgets.values())}). Equal iterations for every row of a scene that does not "
-            "name its own; held-out views. Published figures are those of the paper, on other scenes."
-        ),
-        "",
-        *table.text(results),
-        "",
-        f"![{table.title}]({table.name}.png)",
-        "",
-    ]
-    (docs / f"{table.name}.md").write_text("\n".join(lines))
-    slim = [r | {"config": {k: v for k, v in r["config"].items() if k != "source"}} for r in results]
-    (docs / f"{table.name}.json").write_text(json.dumps(slim, indent=1) + "\n")
+    config = TrainConfig(
+        preset=preset,
+        source=known.source,
+        downscale=known.downscale,
+        iterations=iterations or steps,
+        prune=0.0,  # the paper's method does neither
+        cooldown=0.0,
+    )
+    return runs.Scene(name if name in BUDGETS else given.name, config, seeds)
 
 
 if __name__ == "__main__":

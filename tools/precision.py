@@ -1,146 +1,213 @@
-"""Measures docs/precision.md: the reports `pd4dgs-bench codec`, `render` and `train` of each scene, with their plots.
+"""Measures docs/precision.md: the reports `pd4dgs-bench codec`, `render` and `train` of each scene, with their plots,
+and what other coders make of the same data.
 
-    python tools/precision.py [--only NAME ...] [--out out] [--docs docs]
+    python tools/precision.py [--only NAME ...] [--out out] [--docs docs] [--render]
 
 Models are read from --out (NAME/model.pt), the cameras of real scenes from the folder in PD4DGS_SHARED (default
 ../shared/data beside the repository); scenes not there are named and left out. The page is written after each scene;
-with --only it keeps what it says of the others.
+with --only it keeps what it says of the others. The other coders come with the extra "bench"; torchac is GPL-3 and
+compiled at its first import, so it takes part only where it was installed by hand.
 """
 
 from __future__ import annotations
 
-import argparse
-import contextlib
-import io
 import json
-import os
+import math
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pd4dgs_codec.cli import bench
+from pages.page import Page, Row, keep, make, options, say, unpadded
+from pages.scenes import SCENES, Scene, present
+
 from pd4dgs_codec.render.threads import configure
 
-SHARED = Path(os.environ.get("PD4DGS_SHARED", Path(__file__).resolve().parents[2] / "shared" / "data"))
 FULL = ("--step-scales", "1,2,4", "--efforts", "1,5", "--cold", "1")
-#: Without the efforts that take minutes, and, but for bouncing-balls and the static scene, without other coders.
+#: Without the efforts that take minutes.
 SHORT = ("--step-scales", "1,4", "--efforts", "1", "--cold", "1")
-#: name, cameras, downscale, codec options, models whose training is drawn together
-SCENES: tuple[tuple[str, Path | str, int, tuple[str, ...], tuple[str, ...]], ...] = (
-    ("shelf-hand", SHARED / "shelf-hand", 2, FULL, ("shelf-hand", "shelf-hand-paper")),
-    ("bouncing-balls", SHARED / "bouncing-balls", 4, SHORT, ("bouncing-balls",)),
-    ("synthetic-static", "synthetic:static", 1, SHORT, ("synthetic-static",)),
-    ("synthetic-global", "synthetic:global", 1, (*SHORT, "--no-peers"), ("synthetic-global",)),
-    ("synthetic-local", "synthetic:local", 1, (*SHORT, "--no-peers"), ("synthetic-local",)),
-    ("synthetic-fast", "synthetic:fast", 1, (*SHORT, "--no-peers"), ("synthetic-fast",)),
-)
 CODEC = ("--modes", "ans,lzma", "--repeats", "3", "--views", "4")
+#: Scenes whose symbols, anchors and splats other coders get too.
+PEERS = ("shelf-hand", "bouncing-balls", "synthetic-static")
 #: Kernels with other constants are compiled, which takes its time, and drawn for the first scene alone.
 WAYS = "oracle float64,textbook float32,kernels,gsplat"
-RENDER = ("--views", "1", "--only", WAYS)
-RENDER_ALL = ("--views", "1", "--only", f"{WAYS},tile 16x16,tile 8x16,alpha >= 1/64,T > 1e-3,T > 1e-2")
+WAYS_ALL = f"{WAYS},tile 16x16,tile 8x16,alpha >= 1/64,T > 1e-3,T > 1e-2"
+#: Models whose training is drawn together.
+TRAINED = {"shelf-hand": ("shelf-hand", "shelf-hand-paper")}
+NAMES = tuple(name for name in SCENES if name != "shelf-hand-paper")
 
-INTRODUCTION = """\
-# Error against run time
 
-Made by `python tools/precision.py` from trained models; a single report: `pd4dgs-bench codec`, `render` or `train`.
-Times are medians with quartiles of repeated warm work; long work is repeated less, or not at all. Cold times are whole
-fresh processes, imports and reading included, with the largest memory that they held. Rings and the grey steps in the
-plots mark the Pareto front: nothing is better in one way without being worse in the other.
+def measure(scene: Scene, out: Path, docs: Path) -> Row:
+    """The row of one scene, whose model is there."""
+    from pages import peers
 
-**Codec.** Each step scale multiplies all quantisation steps of the model. Pictures are compared with the checkpoint's
-own at the highest level, unrounded for PSNR. A finished run's tensors lie on its steps, so that at scale 1 the values
-come back exactly, and the pictures differ by the codes of the masks alone. Anchors are integers and exact at any
-scale. A coarser file may leave out a deformation that vanishes; it is held against the checkpoint's highest level all
-the same. Encoding is timed without verification. All scenes but shelf-hand are packed at effort 1 alone, and of the
-synthetic ones only the static one has the other coders beside it.
+    from pd4dgs_codec.bench import timing
 
-**Other coders** get the same data in the same run, decode what they wrote, and are compared with it. They come with
-`pip install -c constraints.txt '.[train,bench]'`, torchac by hand: it is GPL-3 and compiled at its first import.
+    model, first = out / scene.name / "model.pt", scene.name == NAMES[0]
+    data = ["--data", scene.source, "--downscale", str(scene.downscale)]
+    runs = [str(p) for n in TRAINED.get(scene.name, (scene.name,)) if (p := out / n / "model.pt").exists()]
+    commands = {
+        "codec": ["codec", str(model), *data, *CODEC, *(FULL if first else SHORT)],
+        "render": ["render", str(model), *data, "--views", "1", "--only", WAYS_ALL if first else WAYS],
+        "train": ["train", "--from", *runs],
+    }
+    row: Row = {}
+    for report, command in commands.items():
+        start = time.monotonic()
+        row[report] = run(command, docs / "img" / f"precision-{scene.name}-{report}.png")
+        if report == "codec" and scene.name in PEERS:
+            say(f"{scene.name}: other coders on the same data")
+            row[report] |= beside(model, scene, row[report]["points"])
+            row[report]["machine"]["versions"] |= timing.machine(*peers.PACKAGES)["versions"]
+        keep(out / "precision", f"{scene.name}-{report}", row[report])
+        say(f"{scene.name}: {report} in {time.monotonic() - start:.0f} s")
+    return figures(row)
 
-- *symbols*: masks, attributes, residuals of planes, and weights, as this codec codes them; positions aside. LZMA has
-  the layout that suits it best, zstd the narrowest integers channel by channel. constriction's QuantizedGaussian and
-  torchac (whose tables have 16 bits) code under a Gaussian per channel, with 16 bytes each for its moments and range.
-- *positions*: anchors of each layer; Draco with its kd-tree at level 10, in an order of its own.
-- *splats*: the Gaussians that one camera meets at one instant, with the colours that it sees, in formats that hold
-  static splats. The file beside them holds all instants and all views, so that their bytes answer another question:
-  what one frame costs where there is no model. SPZ (version 4) is written by gaussforge, from PLY and back to PLY,
-  which its times include; coordinates are scaled by a power of two to use its fixed point. PyPI's `spz` has no wheel,
-  and its source wants a Rust build. fourdgs uses its default profile without its own verification.
 
-**Rasteriser.** Each way to draw gets the same Gaussians; the error is against a float64 oracle. Tiles change no pixel.
-Thresholds looser than the format's buy time with error.
+def run(command: list[str], image: Path) -> dict[str, Any]:
+    """What a report's JSON holds but for the names of its inputs. Raises Pd4Error if it failed."""
+    from pd4dgs_codec.cli import bench
+    from pd4dgs_codec.errors import Pd4Error
 
-**Trainer.** Held-out error along the runs that made the models, on six views.
-"""
+    image.parent.mkdir(parents=True, exist_ok=True)
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "report.json"
+        if bench.main([*command, "--json", str(path), "--plot", str(image), "--overwrite"]) != 0:
+            raise Pd4Error(f"pd4dgs-bench {command[0]} failed, see above")
+        result: dict[str, Any] = json.loads(path.read_text())
+    return {key: value for key, value in result.items() if key not in ("input", "source")}
+
+
+def beside(model: Path, scene: Scene, points: Sequence[dict[str, Any]]) -> dict[str, Any]:
+    """The rows of all coders on the model's symbols, anchors and splats, and the symbols' sum of R(a) in bits."""
+    from pages import peers
+
+    from pd4dgs_codec.bench.pictures import frames
+    from pd4dgs_codec.codec.decoder import decode_layers
+    from pd4dgs_codec.codec.encoder import encode
+    from pd4dgs_codec.model import checkpoint
+    from pd4dgs_codec.model.convert import to_scene
+    from pd4dgs_codec.view.levels import load_levels
+
+    # nearest to what pd4dgs-encode writes: the step scale nearest to 1, mode ans, the highest effort
+    usual = min(points, key=lambda p: (abs(math.log(p["step_scale"])), p["mode"] != "ans", -p["effort"]))
+    data = encode(to_scene(checkpoint.load(model)[0]), effort=1, verify=False)
+    layers, level = decode_layers(data)[1], load_levels(data)[-1]
+    symbols = peers.symbols_of(layers)
+    pictures = frames(level.model.info, scene.source, 4, scene.downscale)
+    rows = peers.coder_rows(symbols, 3) + peers.position_rows(layers, 3)
+    rows += peers.splat_rows(level, pictures[len(pictures) // 2], usual["bytes"], 3)
+    return {"peers": peers.as_json(rows), "peers_rate_bits": symbols.rate_bits}
+
+
+def figures(row: Row) -> Row:
+    """What the page shows: of each point the highest level's pictures, and the values once per step scale. Times and
+    deviations are lists of their fields."""
+    from pd4dgs_codec.bench.timing import machine_line
+
+    codec, render, seen = row["codec"], row["render"], set()
+    points = []
+    for point in codec["points"]:
+        values = [] if point["step_scale"] in seen else _listed(point["values"])
+        seen.add(point["step_scale"])
+        kept = {key: value for key, value in point.items() if key not in ("error", "fronts")}
+        kept |= {name: _listed(point[name]) for name in ("encode", "decode", "encode_cold", "decode_cold")}
+        points.append(kept | {"values": values, "pictures": _listed(point["pictures"][-1:])})
+    coders = {"peers": _listed(codec["peers"])} if "peers" in codec else {}
+    machines = [{"machine": machine_line(report["machine"])} for report in (codec, render)]
+    drawn = [{key: value for key, value in point.items() if key != "front"} for point in render["points"]]
+    runs = [
+        run | {"curve": [{name: p[name] for name in ("seconds", "psnr")} for p in run["curve"]]}
+        for run in row["train"]["runs"]
+    ]
+    return row | {
+        "codec": codec | machines[0] | coders | {"points": points, "masks": _listed(codec["masks"])},
+        "render": render | machines[1] | {"points": _listed(drawn)},
+        "train": {"runs": runs},
+    }
+
+
+def _listed(value: Any) -> Any:
+    """Dataclasses that became dicts as lists of their fields, in any depth."""
+    if isinstance(value, dict):
+        return [_listed(item) for item in value.values()]
+    return [_listed(item) for item in value] if isinstance(value, list) else value
+
+
+# -- the page ----------------------------------------------------------------------------------------------------------
+
+
+def render(rows: Sequence[Row]) -> str:
+    """Three sections per scene."""
+    lines = []
+    for row in rows:
+        lines += [f"## {row['name']}", ""]
+        for report, text in (("codec", _codec), ("render", _render), ("train", _train)):
+            image = f"![{report} of {row['name']}](img/precision-{row['name']}-{report}.png)"
+            lines += [f"### {row['name']}: {report}", "", image, "", unpadded(text(row[report])), ""]
+    return "\n".join(lines).rstrip("\n")
+
+
+def _timing(value: list[Any] | None) -> Any:
+    from pd4dgs_codec.bench.timing import Timing
+
+    return value and Timing(*value)
+
+
+def _cold(value: list[Any] | None) -> Any:
+    from pd4dgs_codec.bench.timing import Cold
+
+    return value and Cold(_timing(value[0]), value[1])
+
+
+def _codec(report: dict[str, Any]) -> str:
+    from pages import peers
+
+    from pd4dgs_codec.bench.codec import Deviation, PictureDeviation, Point, points_table, values_table
+
+    points = []
+    for p in report["points"]:
+        times = {name: _timing(p[name]) for name in ("encode", "decode")}
+        times |= {name: _cold(p[name]) for name in ("encode_cold", "decode_cold")}
+        pictures = [PictureDeviation(n, e, math.inf if psnr is None else psnr, x) for n, e, psnr, x in p["pictures"]]
+        deviations = {"values": tuple(Deviation(*v) for v in p["values"]), "pictures": tuple(pictures)}
+        points.append(Point(**p | times | deviations))
+    parts = [points_table(points), values_table(points, Deviation(*report["masks"]))]
+    if "peers" in report:
+        coders = [peers.Row(w, c, n, _timing(e), _timing(d), *rest) for w, c, n, e, d, *rest in report["peers"]]
+        parts.append(peers.table(coders, report["peers_rate_bits"]))
+    return "\n\n".join([*parts, report["machine"]])
+
+
+def _render(report: dict[str, Any]) -> str:
+    from pd4dgs_codec.bench.render import RenderPoint, table
+
+    points = [RenderPoint(name, _timing(milliseconds), *rest) for name, milliseconds, *rest in report["points"]]
+    sizes = (f"{v['width']}x{v['height']}, {v['gaussians']:,} Gaussians" for v in report["pictures"])
+    return "\n\n".join([table(points), f"Pictures: {'; '.join(sizes)}.", report["machine"]])
+
+
+def _train(report: dict[str, Any]) -> str:
+    from pd4dgs_codec.bench.train import of_curve, table
+
+    return table([of_curve(run["name"], run["curve"], run["anchors"]) for run in report["runs"]])
+
+
+PAGE = Page("precision", "precision.py", render)
 
 
 def main(argv: list[str] | None = None) -> int:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("--only", nargs="+", metavar="NAME", choices=[row[0] for row in SCENES])
-    parser.add_argument("--out", type=Path, default=Path("out"))
-    parser.add_argument("--docs", type=Path, default=Path("docs"))
-    args = parser.parse_args(argv)
+    """Entry point; returns the exit code."""
+    args = options(__doc__, NAMES).parse_args(argv)
     configure()
-    (args.docs / "img").mkdir(parents=True, exist_ok=True)
-    page, figures = args.docs / "precision.md", args.docs / "precision.json"
-    sections = _sections(page.read_text()) if args.only and page.exists() else {}
-    results = json.loads(figures.read_text()) if args.only and figures.exists() else {}
-    measured = 0
-    for name, cameras, downscale, options, trained in SCENES:
-        if args.only and name not in args.only:
-            continue
-        model = args.out / name / "model.pt"
-        missing = [p for p in (model, cameras) if isinstance(p, Path) and not p.exists()]
-        if missing:
-            print(f"{name}: {missing[0]} is not there, left out")
-            continue
-        data = ["--data", str(cameras), "--downscale", str(downscale)]
-        runs = [str(p) for p in (args.out / n / "model.pt" for n in trained) if p.exists()]
-        reports = {
-            "codec": ["codec", str(model), *data, *CODEC, *options],
-            "render": ["render", str(model), *data, *(RENDER_ALL if name == SCENES[0][0] else RENDER)],
-            "train": ["train", "--from", *runs],
-        }
-        lines = []
-        for report, command in reports.items():
-            start = time.monotonic()
-            image = args.docs / "img" / f"precision-{name}-{report}.png"
-            result, table = run(command, image)
-            if result is None:
-                print(f"precision: error: {name}: {report} failed, see above", file=sys.stderr)
-                return 1
-            results.setdefault(name, {})[report] = result
-            lines += [f"### {name}: {report}\n", f"![{report} of {name}](img/{image.name})\n", table]
-            print(f"{name}: {report} in {time.monotonic() - start:.0f} s", flush=True)
-        sections[name] = "\n".join(lines).rstrip("\n") + "\n"
-        measured += 1
-        ordered = [row[0] for row in SCENES if row[0] in sections]
-        page.write_text("\n".join([INTRODUCTION, *(f"## {name}\n\n{sections[name]}" for name in ordered)]))
-        figures.write_text(json.dumps({name: results[name] for name in ordered}, indent=1) + "\n")
-    if not measured:
-        print(f"precision: error: none of the models is there; expected {args.out}/NAME/model.pt", file=sys.stderr)
-        return 1
-    return 0
-
-
-def _sections(page: str) -> dict[str, str]:
-    """What the page says of each scene, by name."""
-    parts = [part.partition("\n") for part in page.split("\n## ")[1:]]
-    return {name: text.strip("\n") + "\n" for name, _, text in parts}
-
-
-def run(command: list[str], image: Path) -> tuple[dict[str, Any] | None, str]:
-    """(what a report's JSON holds but for the names of its inputs, its Markdown); None if it failed."""
-    out = io.StringIO()
-    with tempfile.TemporaryDirectory() as folder, contextlib.redirect_stdout(out):
-        path = Path(folder) / "report.json"
-        if bench.main([*command, "--json", str(path), "--plot", str(image), "--overwrite"]) != 0:
-            return None, ""
-        result = json.loads(path.read_text())
-    return {key: value for key, value in result.items() if key not in ("input", "source")}, out.getvalue()
+    scenes = present(args, NAMES)
+    for scene in scenes:
+        if not (args.out / scene.name / "model.pt").exists():
+            say(f"{scene.name}: {args.out / scene.name / 'model.pt'} is not there, left out")
+    todo = [scene.name for scene in scenes if (args.out / scene.name / "model.pt").exists()]
+    return make(PAGE, NAMES, todo, args, lambda name: measure(SCENES[name], args.out, args.docs))
 
 
 if __name__ == "__main__":

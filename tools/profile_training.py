@@ -15,9 +15,11 @@ import time
 from collections import defaultdict
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-LEVELS = (0, 1, 2)
+if TYPE_CHECKING:
+    from pd4dgs_codec.train.learner import Learner
+
 #: Lines of a page between which `--write` puts the tables.
 BEGIN, END = "<!-- profile: written by tools/profile_training.py -->", "<!-- end of profile -->"
 
@@ -65,14 +67,15 @@ class Stopwatch:
         return taken
 
 
-def watch(trainer: Any, stopwatch: Stopwatch) -> None:
-    """Wraps the parts of a step."""
+def watch(learner: Learner, stopwatch: Stopwatch) -> None:
+    """Wraps the parts of a step, and the step itself as what is none of them."""
     import torch
 
     from pd4dgs_codec.model import hexplane, plane_regularisers, slots
     from pd4dgs_codec.model.model import Model
     from pd4dgs_codec.render import cpu
-    from pd4dgs_codec.train import loop, losses, ssim
+    from pd4dgs_codec.train import learner as steps
+    from pd4dgs_codec.train import losses, ssim
 
     for owner, name, part in (
         (Model, "visible", "choosing anchors"),
@@ -91,39 +94,38 @@ def watch(trainer: Any, stopwatch: Stopwatch) -> None:
         (ssim._ImageLoss, "backward", "image loss, backward"),
         (plane_regularisers._Regularisers, "forward", "plane regularisers"),
         (plane_regularisers._Regularisers, "backward", "plane regularisers, backward"),
-        (loop, "image_loss", "image loss"),
+        (steps, "image_loss", "image loss"),
         (losses, "rate_term", "rate term"),
         (losses, "binary_term", "mask terms"),
         (losses, "smooth_term", "mask terms"),
         (losses.Neighbours, "draw", "mask terms"),
-        (torch.Tensor, "backward", "backward, the rest"),
-        (trainer.densifier, "observe", "growing: statistics"),
-        (trainer.optimiser, "gradient_norm", "gradient norm"),
-        (trainer.optimiser, "step", "Adam"),
+        (torch.autograd, "backward", "backward, the rest"),
+        (learner.densifier, "observe", "growing: statistics"),
+        (learner.optimiser, "gradient_norm", "gradient norm"),
+        (learner.optimiser, "step", "Adam"),
     ):
         stopwatch.wrap(owner, name, part)
-    for field, name in ((trainer.model.global_deformation, "global"), (trainer.model.local_deformation, "local")):
+    for field, name in ((learner.model.global_deformation, "global"), (learner.model.local_deformation, "local")):
         if field is not None:
             stopwatch.wrap(field, "forward", f"{name} deformation networks")
-    stopwatch.wrap(trainer, "step", "all else")
+    stopwatch.wrap(learner, "step", "all else")
 
 
-def measure(trainer: Any, steps: int, at: float) -> list[list[dict[str, float]]]:
-    """Per level, one dictionary of seconds per part for each of `steps` steps."""
-    stopwatch = Stopwatch()
-    before = round(trainer.total * at)
+def measure(learner: Learner, steps: int, iteration: int) -> list[list[dict[str, float]]]:
+    """Per level of the model, one dictionary of seconds per part for each of `steps` steps, all of them as if they were
+    the run's step `iteration`."""
+    stopwatch, levels = Stopwatch(), range(learner.model.level + 1)
 
     def step(level: int) -> dict[str, float]:
-        trainer.iteration = before
-        trainer._draw_level = lambda schedule: (level, (1 / 3,) * 3)
-        trainer.step()
+        learner.iteration = iteration
+        learner.step((level,))
         return stopwatch.take()
 
-    for level in LEVELS:  # compiles the kernels and fills the caches
+    for level in levels:  # compiles the kernels and fills the caches
         step(level)
-    watch(trainer, stopwatch)
+    watch(learner, stopwatch)
     try:
-        turns = [[step(level) for level in LEVELS] for _ in range(steps)]
+        turns = [[step(level) for level in levels] for _ in range(steps)]
     finally:
         stopwatch.unwrap()
     return [list(level) for level in zip(*turns, strict=True)]
@@ -153,15 +155,18 @@ def profile(path: Path, source: str | None, steps: int, at: float, threads: int)
     dataset = load(source or config.source, downscale=config.downscale, holdout=config.holdout)
     trainer = Trainer(config, dataset)
     trainer.resume(path)
+    if trainer.total is None:
+        raise SystemExit(f"{path}: was cut before its time limit fixed the length of its run; expected a longer run")
+    found = measure(trainer.learner, steps, round(trainer.total * at))
     size = f"{dataset.train[0].width}x{dataset.train[0].height}"
     lines = [
         f"{dataset.name} {size}, {config.preset}, {len(trainer.model.anchor_q):,} anchors, {threads} thread(s), at "
         f"{at:g} of the run, milliseconds:",
         "",
-        "| part | level 0 | level 1 | level 2 |",
-        "|---|---|---|---|",
+        "".join(["| part |", *(f" level {level} |" for level in range(len(found)))]),
+        "|---" * (len(found) + 1) + "|",
     ]
-    for part, times in rows(measure(trainer, steps, at)):
+    for part, times in rows(found):
         lines.append(f"| {part} | {' | '.join(f'{t:.1f}' for t in times)} |")
     return "\n".join(lines)
 

@@ -38,7 +38,8 @@ def quantise(x: np.ndarray, step: float, name: str = "tensor") -> np.ndarray:
         raise EncodeError(f"{name}: symbol of magnitude {largest:.0f} at step {step:g}, expected at most {MAX_SYMBOL}")
     if not all_finite(k, step):
         raise EncodeError(f"{name}: a value that comes back as infinity at step {step:g}, expected a finite one")
-    return k.astype(np.int32)
+    symbols: np.ndarray = k.astype(np.int32)
+    return symbols
 
 
 def all_finite(k: np.ndarray, step: float) -> bool:
@@ -51,7 +52,8 @@ def all_finite(k: np.ndarray, step: float) -> bool:
 def dequantise(k: np.ndarray, step: float) -> np.ndarray:
     """x_hat = binary32(binary64(k) * binary64(step)), float32 of k's shape: an exact product and one rounding."""
     with np.errstate(over="ignore"):  # an overflow to infinity is the caller's to refuse, see all_finite
-        return (k.astype(np.float64) * np.float64(step)).astype(np.float32)
+        values: np.ndarray = (k.astype(np.float64) * np.float64(step)).astype(np.float32)
+    return values
 
 
 def mask_codes(mask: np.ndarray) -> np.ndarray:

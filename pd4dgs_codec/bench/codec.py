@@ -16,8 +16,7 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.attributes.table import ATTRIBUTES
-from pd4dgs_codec.bench.markdown import markdown
-from pd4dgs_codec.bench.plot import Panel, Series, pareto_front
+from pd4dgs_codec.bench.report import Panel, markdown, pareto_front
 from pd4dgs_codec.bench.timing import Cold, Timing, cold, measure
 from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.encoder import Report, encode_with_report
@@ -26,7 +25,7 @@ from pd4dgs_codec.codec.kinds import LAYER_KINDS
 from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.codec.symbols import float_tensors
 from pd4dgs_codec.metrics.image import mssim
-from pd4dgs_codec.scene import MASK_STEP, PLANES, Scene
+from pd4dgs_codec.scene import MASK_STEP, Scene
 from pd4dgs_codec.view.frames import Frame
 from pd4dgs_codec.view.levels import Level, load_levels
 
@@ -103,14 +102,15 @@ def sweep(
     each. Encoding is timed without verification, which costs one decoding more. Raises EncodeError, Pd4Error."""
     reference = {level.level: [level.picture(f.camera, f.time) for f in frames] for level in load_levels(model)}
     encode_with_report(scene, effort=1, verify=False)  # as in file_point
+    nearest = min(abs(math.log(scale)) for scale in what.step_scales)
     pictures: dict[str, tuple[PictureDeviation, ...]] = {}
     points = []
     for scale in what.step_scales:
         planned, _ = plan(replace(scene, steps=scene.steps.scaled(scale)))
+        fresh = what.cold if abs(math.log(scale)) == nearest else 0
         for mode in what.modes:
             for effort in what.efforts:
-                options: dict[str, Any] = {"mode": mode, "effort": effort, "step_scale": scale}
-                point, data = _point(model, scene, options, what)
+                point, data = _point(model, scene, scale, mode, effort, what.repeats, fresh)
                 key = json.dumps(hashes(data))  # modes and efforts change no value: their pictures are the same
                 if key not in pictures:
                     pictures[key] = picture_deviations(load_levels(data), frames, reference)
@@ -120,31 +120,31 @@ def sweep(
     return points
 
 
-def _point(model: str, scene: Scene, options: dict[str, Any], what: Sweep) -> tuple[Point, bytes]:
-    (data, report), seconds = measure(lambda: encode_with_report(scene, verify=False, **options), what.repeats)
-    scale = options["step_scale"]
-    fresh = what.cold if abs(math.log(scale)) == min(abs(math.log(s)) for s in what.step_scales) else 0
-    point = file_point(data, what.repeats, fresh, report)
-    point = replace(point, encode=seconds, step_scale=scale, effort=options["effort"])
+def _point(
+    model: str, scene: Scene, scale: float, mode: str, effort: int, repeats: int, fresh: int
+) -> tuple[Point, bytes]:
+    options: dict[str, Any] = {"mode": mode, "effort": effort, "step_scale": scale, "verify": False}
+    (data, report), seconds = measure(lambda: encode_with_report(scene, **options), repeats)
+    point = replace(file_point(data, repeats, fresh, report), encode=seconds, step_scale=scale, effort=effort)
     if not fresh:
         return point, data
+    flags = ["--mode", mode, "--effort", str(effort), "--step-scale", repr(scale), "--no-verify", "--overwrite"]
     with tempfile.TemporaryDirectory() as folder:
         output = str(Path(folder) / "scene.pd4")
-        flags = ["--mode", options["mode"], "--effort", str(options["effort"])]
-        flags += ["--step-scale", repr(scale), "--no-verify", "--overwrite"]
         return replace(point, encode_cold=cold("encode", [model, "-o", output, *flags], fresh)), data
 
 
-def file_point(data: bytes, repeats: int, cold_repeats: int, report: Report | None = None) -> Point:
-    """The point of a file's bytes alone; its decoding is timed. report: of its encoding, if that is known."""
+def file_point(data: bytes, repeats: int, fresh: int, report: Report | None = None) -> Point:
+    """The point of a file's bytes alone; its decoding is timed, `fresh` times in fresh processes. report: of its
+    encoding, if that is known."""
     decode(data)  # the first time pays for loading libraries
     _, seconds = measure(lambda: decode(data), repeats)
-    about, fresh = info(data), None
-    if cold_repeats:
+    about, own = info(data), None
+    if fresh:
         with tempfile.TemporaryDirectory() as folder:
             path = Path(folder) / "scene.pd4"
             path.write_bytes(data)
-            fresh = cold("decode", [str(path)], cold_repeats)
+            own = cold("decode", [str(path)], fresh)
     return Point(
         step_scale=None,
         mode=about["mode"],
@@ -154,41 +154,34 @@ def file_point(data: bytes, repeats: int, cold_repeats: int, report: Report | No
         coded_bits=None if report is None else sum(layer.payload_bits for layer in report.layers),
         rate_bits=None if report is None else sum(layer.rate_bits for layer in report.layers),
         decode=seconds,
-        decode_cold=fresh,
+        decode_cold=own,
     )
 
 
 def deviations(given: Scene, decoded: Scene) -> list[Deviation]:
     """One per step that the scenes' tensors use, in the order of Steps. given: planned, its steps those of the file."""
-    squares: dict[str, list[float]] = {}
+    errors: dict[str, list[np.ndarray]] = {}
     for index, layer in enumerate(given.layers):
         kind = LAYER_KINDS[layer]
         before, after = float_tensors(given, index), float_tensors(decoded, index)
-        deformation = getattr(given, kind.deformation) if kind.deformation else None
         names = ["anchor", *(a.name for a in ATTRIBUTES)]
-        names += [kind.planes_step or ""] * (len(PLANES) * len(deformation.planes) if deformation else 0)
-        names += [kind.weights_step] * (len(before) - len(names))
+        names += [str(kind.planes_step) if x.ndim == 3 else kind.weights_step for x in before[len(names) :]]
         for name, x, y in zip(names, before, after, strict=True):
-            error = np.abs(x.astype(np.float64) - y)
-            largest, total, count = squares.setdefault(name, [0.0, 0.0, 0])
-            squares[name] = [max(largest, float(error.max(initial=0.0))), total + float((error**2).sum()),
-                             count + error.size]  # fmt: skip
-    steps = vars(given.steps)
-    return [
-        Deviation(name, UNITS.get(name, ""), steps[name], largest, math.sqrt(total / max(count, 1)))
-        for name in steps
-        if name in squares
-        for largest, total, count in [squares[name]]
-    ]
+            errors.setdefault(name, []).append(np.abs(x.astype(np.float64) - y))
+    return [_deviation(name, step, errors[name]) for name, step in vars(given.steps).items() if name in errors]
 
 
 def mask_deviation(masks: Sequence[np.ndarray], codes: Sequence[np.ndarray]) -> Deviation:
     """Masks in 0..1 of each level against those that their codes (uint8, same shapes) stand for."""
-    errors = np.concatenate(
-        [np.abs(m.astype(np.float64) - c * np.float64(MASK_STEP)) for m, c in zip(masks, codes, strict=True)]
-    )
-    rms = math.sqrt(float((errors**2).mean())) if errors.size else 0.0
-    return Deviation("mask", UNITS["mask"], float(MASK_STEP), float(errors.max(initial=0.0)), rms)
+    step = np.float64(MASK_STEP)
+    errors = [np.abs(m.astype(np.float64) - c * step) for m, c in zip(masks, codes, strict=True)]
+    return _deviation("mask", float(step), [np.concatenate(errors)])
+
+
+def _deviation(what: str, step: float, errors: Sequence[np.ndarray]) -> Deviation:
+    square, count = sum(float(np.square(e).sum()) for e in errors), sum(e.size for e in errors)
+    largest = max(float(e.max(initial=0.0)) for e in errors)
+    return Deviation(what, UNITS.get(what, ""), step, largest, math.sqrt(square / max(count, 1)))
 
 
 def picture_deviations(
@@ -210,31 +203,25 @@ def picture_deviations(
     return tuple(errors)
 
 
-def usual(points: Sequence[Point]) -> Point:
-    """The point nearest to what pd4dgs-encode writes: the step scale nearest to 1, mode ans, the highest effort."""
-    return min(points, key=lambda p: (abs(math.log(p.step_scale or 1.0)), p.mode != "ans", -(p.effort or 0)))
-
-
 # -- as tables and plots -----------------------------------------------------------------------------------------------
 
-#: Cost of a point, by the name that the table and the plots give it.
-COSTS: dict[str, Callable[[Point], float | None]] = {
-    "bytes": lambda p: p.bytes,
-    "encode": lambda p: p.encode.median if p.encode else None,
-    "decode": lambda p: p.decode.median,
+#: Cost of a point, by the name that the table gives it: its title and axis in the plots, and the cost itself.
+COSTS: dict[str, tuple[str, str, Callable[[Point], float | None]]] = {
+    "bytes": ("size", "bytes", lambda p: p.bytes),
+    "encode": ("encoding", "s, warm", lambda p: p.encode.median if p.encode else None),
+    "decode": ("decoding", "s, warm", lambda p: p.decode.median),
 }
+
+
+def _pairs(points: Sequence[Point], cost: Callable[[Point], float | None]) -> list[tuple[float, float]]:
+    """(cost, error) of the points that have both."""
+    return [(c, p.error) for p in points for c in [cost(p)] if c is not None and p.error is not None]
 
 
 def fronts(points: Sequence[Point]) -> list[list[str]]:
     """Per point the costs against which it lies on the Pareto front of picture errors."""
-    on: list[list[str]] = [[] for _ in points]
-    for name, cost in COSTS.items():
-        pairs = [(cost(p), p.error) for p in points]
-        front = pareto_front([(c, e) for c, e in pairs if c is not None and e is not None])
-        for row, pair in zip(on, pairs, strict=True):
-            if pair in front:
-                row.append(name)
-    return on
+    best = {name: pareto_front(_pairs(points, cost)) for name, (_, _, cost) in COSTS.items()}
+    return [[name for name, (_, _, cost) in COSTS.items() if (cost(p), p.error) in best[name]] for p in points]
 
 
 def points_table(points: Sequence[Point]) -> str:
@@ -244,59 +231,52 @@ def points_table(points: Sequence[Point]) -> str:
     rows = []
     for p, on in zip(points, fronts(points), strict=True):
         picture = p.pictures[-1] if p.pictures else None
-        rows.append(
-            (
-                _or_dash(p.step_scale, "g"), p.mode, _or_dash(p.effort, "d"), f"{p.bytes:,}",
-                " + ".join(f"{n:,}" for n in p.layer_bytes),
-                _or_dash(p.coded_bits / p.rate_bits if p.rate_bits and p.coded_bits else None, ".4f"),
-                _or_dash(picture and picture.psnr, ".2f"), _or_dash(picture and picture.ssim, ".5f"),
-                p.encode.text() if p.encode else "-", p.decode.text(),
-                *_cold_cells(p.encode_cold), *_cold_cells(p.decode_cold),
-                ", ".join(on) or "-",
-            )
-        )  # fmt: skip
+        layers = " + ".join(f"{n:,}" for n in p.layer_bytes)
+        coded = _or_dash(p.coded_bits / p.rate_bits if p.rate_bits and p.coded_bits else None, ".4f")
+        error = (_or_dash(picture and picture.psnr, ".2f"), _or_dash(picture and picture.ssim, ".5f"))
+        seconds = (p.encode.text() if p.encode else "-", p.decode.text())
+        fresh = (*_cold_cells(p.encode_cold), *_cold_cells(p.decode_cold))
+        what = (_or_dash(p.step_scale, "g"), p.mode, _or_dash(p.effort, "d"), f"{p.bytes:,}", layers, coded)
+        rows.append((*what, *error, *seconds, *fresh, ", ".join(on) or "-"))
     return markdown(head, rows)
 
 
 def values_table(points: Sequence[Point], masks: Deviation | None = None) -> str:
     """A row per step scale and tensor group: the largest error and the root of the mean square."""
     head = ("steps x", "what", "unit", "step Q", "largest error", "RMS error", "largest / Q")
-    rows, seen = [], set()
-    for point in points:
-        if point.values and point.step_scale not in seen:
-            seen.add(point.step_scale)
-            rows += [(f"{point.step_scale:g}", *_value_cells(v)) for v in point.values]
-    if masks:
-        rows.append(("any", *_value_cells(masks)))
-    return markdown(head, rows)
+    by_scale = {p.step_scale: p.values for p in reversed(points) if p.values}
+    rows = [(f"{scale:g}", v) for scale, values in reversed(by_scale.items()) for v in values]
+    rows += [("any", masks)] if masks else []
+    return markdown(
+        head,
+        [
+            (
+                scale,
+                v.what,
+                v.unit or "1",
+                f"{v.step:.4g}",
+                f"{v.largest:.3g}",
+                f"{v.rms:.3g}",
+                f"{v.largest / v.step:.3f}",
+            )
+            for scale, v in rows
+        ],
+    )
 
 
 def panels(points: Sequence[Point]) -> list[Panel]:
     """Picture error against bytes, encoding and decoding seconds; a series per mode and effort."""
-    labels = {"bytes": ("size", "bytes"), "encode": ("encoding", "s, warm"), "decode": ("decoding", "s, warm")}
+    kinds = dict.fromkeys((p.mode, p.effort) for p in points)
+    own = {kind: [p for p in points if (p.mode, p.effort) == kind] for kind in kinds}
     return [
-        Panel(f"error against {labels[name][0]}", labels[name][1], tuple(_series(points, cost)))
-        for name, cost in COSTS.items()
+        Panel(f"error against {title}", axis, [(f"{m}, effort {e}", _pairs(own[m, e], cost)) for m, e in kinds])
+        for title, axis, cost in COSTS.values()
     ]
-
-
-def _series(points: Sequence[Point], cost: Callable[[Point], float | None]) -> list[Series]:
-    names = list(dict.fromkeys((p.mode, p.effort) for p in points))
-    found = []
-    for mode, effort in names:
-        own = [(cost(p), p.error) for p in points if (p.mode, p.effort) == (mode, effort)]
-        pairs = tuple((c, e) for c, e in own if c is not None and e is not None)
-        found.append(Series(f"{mode}, effort {effort}", pairs))
-    return found
 
 
 def as_json(points: Sequence[Point]) -> list[dict[str, Any]]:
     """The points as plain dicts, each with the costs on whose front it lies."""
     return [{**asdict(p), "error": p.error, "fronts": on} for p, on in zip(points, fronts(points), strict=True)]
-
-
-def _value_cells(v: Deviation) -> tuple[str, ...]:
-    return v.what, v.unit or "1", f"{v.step:.4g}", f"{v.largest:.3g}", f"{v.rms:.3g}", f"{v.largest / v.step:.3f}"
 
 
 def _cold_cells(fresh: Cold | None) -> tuple[str, str]:

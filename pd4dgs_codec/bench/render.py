@@ -19,14 +19,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 
-from pd4dgs_codec.bench.markdown import markdown
-from pd4dgs_codec.bench.plot import Panel, Series, pareto_front
-from pd4dgs_codec.bench.splats import View, bake, draw_all, view
+from pd4dgs_codec.bench.pictures import View, draw_all, oracle
+from pd4dgs_codec.bench.report import Panel, markdown, pareto_front
 from pd4dgs_codec.bench.timing import Timing, clock, summary
 from pd4dgs_codec.errors import RenderError
-from pd4dgs_codec.view.frames import Frame
-from pd4dgs_codec.view.levels import Level
 
 #: The float64 oracle, against which all others are held; the same formulas in float32; the kernels as they are.
 ORACLE, TEXTBOOK, KERNELS, GSPLAT = "oracle float64", "textbook float32", "kernels", "gsplat"
@@ -43,6 +41,7 @@ VARIANTS: dict[str, dict[str, float]] = {
     "T > 1e-2": {"t_min": 1e-2},
 }
 NAMES = (ORACLE, TEXTBOOK, KERNELS, GSPLAT, *VARIANTS)
+Drawn = tuple[list[np.ndarray], list[float]]  #: pictures, and the seconds of each drawing
 
 
 @dataclass(frozen=True)
@@ -57,51 +56,38 @@ class RenderPoint:
     missing: str | None = None
 
 
-def views_of(level: Level, frames: Sequence[Frame]) -> list[View]:
-    """What the frames' cameras meet of the level."""
-    return [view(level, bake(level, frame), frame) for frame in frames]
-
-
 def sweep(
-    views: Sequence[View],
-    names: Sequence[str],
-    repeats: int,
-    cache: Path,
-    step: Callable[[], None] = lambda: None,
+    views: Sequence[View], names: Sequence[str], repeats: int, cache: Path, step: Callable[[], None] = lambda: None
 ) -> list[RenderPoint]:
     """A point per name of NAMES; the oracle always runs, since the others are measured against it.
 
     cache: a folder where compiled variants are kept, each for its own; `step` is called after each point.
     """
-    want, seconds = _textbook(views, 1, "float64")
+    exact = _textbook(views, torch.float64)
     points = []
     for name in names:
-        if name == ORACLE:
-            points.append(RenderPoint(ORACLE, summary([1e3 * s for s in seconds]), 0.0, 0.0))
+        if name == GSPLAT and (reason := _without_gsplat()):
+            points.append(RenderPoint(name, missing=reason))
         else:
-            points.append(_point(name, views, want, repeats, cache))
+            pictures, seconds = exact if name == ORACLE else _drawn(name, views, repeats, cache)
+            errors = [got.astype(np.float64) - want for got, want in zip(pictures, exact[0], strict=True)]
+            rmse = math.sqrt(sum(float(np.square(e).mean()) for e in errors) / len(errors))
+            largest = max(float(np.abs(e).max()) for e in errors)
+            points.append(RenderPoint(name, summary([1e3 * s for s in seconds]), rmse, largest))
         step()
     return points
 
 
-def _point(name: str, views: Sequence[View], want: Sequence[np.ndarray], repeats: int, cache: Path) -> RenderPoint:
-    if name == GSPLAT and (reason := _without_gsplat()):
-        return RenderPoint(name, missing=reason)
+def _drawn(name: str, views: Sequence[View], repeats: int, cache: Path) -> Drawn:
     if name == TEXTBOOK:
-        pictures, seconds = _textbook(views, 1, "float32")
-    elif name in VARIANTS:
-        pictures, seconds = _variant(name, views, repeats, cache)
-    else:
-        pictures, seconds = draw_all(views, repeats, "cpu" if name == KERNELS else "gsplat")
-    errors = [got.astype(np.float64) - w for got, w in zip(pictures, want, strict=True)]
-    rmse = math.sqrt(sum(float(np.square(e).mean()) for e in errors) / len(errors))
-    return RenderPoint(name, summary([1e3 * s for s in seconds]), rmse, max(float(np.abs(e).max()) for e in errors))
+        return _textbook(views, torch.float32)
+    if name in VARIANTS:
+        return _variant(name, views, repeats, cache)
+    return draw_all(views, repeats, "cpu" if name == KERNELS else "gsplat")
 
 
 def _without_gsplat() -> str | None:
     """Why gsplat cannot draw here, in one line; None if it can."""
-    import torch
-
     from pd4dgs_codec.render import gsplat_backend
 
     if not torch.cuda.is_available():
@@ -113,30 +99,20 @@ def _without_gsplat() -> str | None:
     return None
 
 
-def _textbook(views: Sequence[View], repeats: int, dtype: str) -> tuple[list[np.ndarray], list[float]]:
-    import torch
-
-    from pd4dgs_codec.bench.oracle import picture
-
-    pictures, seconds = [], []
-    for one in views:
-        given: dict[str, Any] = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in one.items()}
-        given["dtype"] = getattr(torch, dtype)
-        image, own = clock(lambda given=given: picture(**given), repeats)  # type: ignore[misc]
-        pictures.append(image.numpy())
-        seconds += own
-    return pictures, seconds
+def _textbook(views: Sequence[View], dtype: torch.dtype) -> Drawn:
+    drawn = [clock(lambda one=one: oracle(one, dtype), 1) for one in views]  # type: ignore[misc]
+    return [image for image, _ in drawn], [seconds for _, own in drawn for seconds in own]
 
 
-def _variant(name: str, views: Sequence[View], repeats: int, cache: Path) -> tuple[list[np.ndarray], list[float]]:
+def _variant(name: str, views: Sequence[View], repeats: int, cache: Path) -> Drawn:
     own = cache / "".join(c if c.isalnum() else "-" for c in name)
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(own)}
     with tempfile.TemporaryDirectory() as folder:
         source, target = Path(folder) / "views.npz", Path(folder) / "pictures.npz"
         arrays: dict[str, Any] = {f"{i}.{k}": v for i, one in enumerate(views) for k, v in one.items()}
         np.savez(source, count=len(views), **arrays)
-        command = [sys.executable, "-m", "pd4dgs_codec.bench.raster_variant", str(source), str(target)]
+        command = [sys.executable, "-m", "pd4dgs_codec.bench.variant", str(source), str(target)]
         command += [json.dumps(VARIANTS[name]), str(repeats)]
+        environment = {**os.environ, "NUMBA_CACHE_DIR": str(own)}
         done = subprocess.run(command, capture_output=True, text=True, env=environment)
         if done.returncode:
             raise RenderError(f"{name}: {(done.stderr.strip().splitlines() or ['failed'])[-1]}")
@@ -144,39 +120,36 @@ def _variant(name: str, views: Sequence[View], repeats: int, cache: Path) -> tup
             return [stored[f"picture{i}"] for i in range(len(views))], stored["seconds"].tolist()
 
 
-# -- as tables and plots -----------------------------------------------------------------------------------------------
+def _series(points: Sequence[RenderPoint]) -> dict[str, list[tuple[float, float]]]:
+    return {p.name: [(p.milliseconds.median, p.rmse)] for p in points if p.milliseconds and p.rmse is not None}
 
 
 def front(points: Sequence[RenderPoint]) -> list[bool]:
     """Per point whether it lies on the Pareto front of error against milliseconds."""
-    pairs = [(p.milliseconds.median, p.rmse) if p.milliseconds else None for p in points]
-    best = pareto_front([(ms, e) for pair in pairs if pair for ms, e in [pair] if e is not None])
-    return [pair in best for pair in pairs]
+    series = _series(points)
+    best = pareto_front([pair for pairs in series.values() for pair in pairs])
+    return [p.name in series and series[p.name][0] in best for p in points]
 
 
 def table(points: Sequence[RenderPoint]) -> str:
     """A row per way to draw; times beside those of the kernels as they are."""
     base = next((p.milliseconds.median for p in points if p.name == KERNELS and p.milliseconds), None)
     head = ("drawn by", "ms per picture", "/ kernels", "RMSE", "PSNR dB", "largest error", "on the front")
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for p, on in zip(points, front(points), strict=True):
         if p.milliseconds is None or p.rmse is None:
             rows.append((p.name, f"none: {p.missing}", *["-"] * 5))
             continue
         ratio = "-" if base is None else f"{p.milliseconds.median / base:.3g}"
         psnr = "-" if p.rmse == 0 else f"{-20 * math.log10(p.rmse):.1f}"
-        rows.append(
-            (p.name, p.milliseconds.text(), ratio, f"{p.rmse:.2g}", psnr, f"{p.largest:.2g}", "yes" if on else "-")
-        )
+        error, largest = f"{p.rmse:.2g}", f"{p.largest:.2g}"
+        rows.append((p.name, p.milliseconds.text(), ratio, error, psnr, largest, "yes" if on else "-"))
     return markdown(head, rows)
 
 
 def panels(points: Sequence[RenderPoint]) -> list[Panel]:
     """One panel, a series per way to draw."""
-    series = [
-        Series(p.name, ((p.milliseconds.median, p.rmse),)) for p in points if p.milliseconds and p.rmse is not None
-    ]
-    return [Panel("error against rasterising time", "ms per picture", tuple(series))]
+    return [Panel("error against rasterising time", "ms per picture", list(_series(points).items()))]
 
 
 def as_json(points: Sequence[RenderPoint]) -> list[dict[str, Any]]:

@@ -1,22 +1,29 @@
-"""Seconds of a piece of work: warm, repeated in this process, and cold, each time in a process of its own."""
+"""Seconds of a piece of work, warm in this process and cold in processes of its own, and the machine they hold for."""
 
 from __future__ import annotations
 
+import importlib.metadata
 import json
+import os
+import platform
 import statistics
 import subprocess
 import sys
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import TypeVar
+from pathlib import Path
+from typing import Any, TypeVar
 
 from pd4dgs_codec.errors import Pd4Error
+from pd4dgs_codec.render import threads
 
 T = TypeVar("T")
 
 #: Seconds after which nothing is repeated any more: a long piece of work is timed once or twice.
 BUDGET = 5.0
+#: Packages whose versions decide about times.
+PACKAGES = ("pd4dgs-codec", "numpy", "constriction", "torch", "numba")
 
 #: Runs a command, then prints the largest resident memory of its own. The peak that getrusage gives is no use: a child
 #: inherits its parent's.
@@ -96,3 +103,49 @@ def cold(verb: str, arguments: Sequence[str], repeats: int) -> Cold:
             raise Pd4Error((done.stderr.strip().splitlines() or [f"pd4dgs-{verb} failed"])[-1])
         peaks.append(int(json.loads(done.stdout.splitlines()[-1])))
     return Cold(summary(seconds), max(peaks))
+
+
+def machine(*others: str) -> dict[str, Any]:
+    """What makes times comparable, without a name or a path: CPU model, CPUs this process may use, threads in use,
+    memory in bytes, load before the run, versions. others: further packages; None for one that is not installed."""
+    return {
+        "cpu": _cpu_model(),
+        "cpus": threads.available(),
+        "threads": threads.kernel_threads(),
+        "memory_bytes": _memory_bytes(),
+        "load_average": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
+        "system": f"{platform.system()} {platform.machine()}",
+        "python": platform.python_version(),
+        "versions": {name: _version(name) for name in (*PACKAGES, *others)},
+    }
+
+
+def machine_line(about: dict[str, Any]) -> str:
+    """`machine` in one line, for a table's foot."""
+    versions = ", ".join(f"{name} {version}" for name, version in about["versions"].items() if version)
+    memory = f", {about['memory_bytes'] / 2**30:.0f} GiB" if about["memory_bytes"] else ""
+    load = "" if about["load_average"] is None else f", load {about['load_average']:.2f} before the run"
+    cpus = f"{about['cpus']} CPUs, threads used: {about['threads']}"
+    return f"{about['cpu']}, {cpus}{memory}{load}; {about['system']}, Python {about['python']}, {versions}"
+
+
+def _cpu_model() -> str:
+    try:
+        lines = Path("/proc/cpuinfo").read_text().splitlines()
+    except OSError:
+        return platform.processor() or platform.machine()
+    return next((line.split(":", 1)[1].strip() for line in lines if line.startswith("model name")), platform.machine())
+
+
+def _memory_bytes() -> int | None:
+    try:
+        return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    except (AttributeError, OSError, ValueError):
+        return None
+
+
+def _version(name: str) -> str | None:
+    try:
+        return importlib.metadata.version(name)
+    except importlib.metadata.PackageNotFoundError:
+        return None

@@ -4,40 +4,21 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from pd4dgs_codec.bench.markdown import markdown
-from pd4dgs_codec.bench.plot import Panel, Series, pareto_front
+from pd4dgs_codec.bench.report import Panel, Points, markdown, pareto_front
 from pd4dgs_codec.errors import DataError
 
-
-@dataclass(frozen=True)
-class CurvePoint:
-    """Held-out quality at one moment. seconds: wall time of the run so far; psnr: dB per level."""
-
-    seconds: float
-    psnr: tuple[float, ...]
-
-    @property
-    def rmse(self) -> float:
-        """Of the highest level: 10^(-PSNR / 20), 0..1."""
-        return 10 ** (-self.psnr[-1] / 20)
-
-
-@dataclass(frozen=True)
-class Run:
-    """One training. anchors: at its end, None if the log does not say."""
-
-    name: str
-    curve: tuple[CurvePoint, ...]
-    anchors: int | None
+#: One training: name; curve: evaluations, each with seconds of wall time so far, psnr in dB per level and rmse 0..1 of
+#: the highest level; anchors at its end, None if the log does not say.
+Run = dict[str, Any]
 
 
 def of_curve(name: str, curve: Sequence[dict[str, Any]], anchors: int | None) -> Run:
     """The run of a trainer's or a checkpoint's curve: dicts with seconds and psnr."""
-    return Run(name, tuple(CurvePoint(p["seconds"], tuple(p["psnr"])) for p in curve), anchors)
+    points = [{"seconds": p["seconds"], "psnr": tuple(p["psnr"]), "rmse": 10 ** (-p["psnr"][-1] / 20)} for p in curve]
+    return {"name": name, "curve": points, "anchors": anchors}
 
 
 def of_file(path: str) -> Run:
@@ -52,7 +33,7 @@ def of_file(path: str) -> Run:
         preset = json.loads(training.get("config", "{}")).get("preset", "")
         curve = json.loads(training.get("curve", "[]"))
         run = of_curve(f"{name} ({preset})" if preset else name, curve, len(model.anchor_q))
-    if not run.curve:
+    if not run["curve"]:
         raise DataError(f"{path}: found no held-out quality, expected a run that was evaluated at least once")
     return run
 
@@ -74,38 +55,27 @@ def _of_log(path: str, name: str) -> Run:
     return of_curve(name, curve, anchors)
 
 
-def front(runs: Sequence[Run]) -> list[tuple[float, float]]:
-    """The Pareto front of (seconds, RMSE) over all runs."""
-    return pareto_front([(p.seconds, p.rmse) for run in runs for p in run.curve])
+def _pairs(runs: Sequence[Run]) -> list[tuple[str, Points]]:
+    return [(run["name"], [(p["seconds"], p["rmse"]) for p in run["curve"]]) for run in runs]
 
 
 def table(runs: Sequence[Run]) -> str:
     """A row per evaluation of each run."""
-    best = front(runs)
-    levels = max((len(p.psnr) for run in runs for p in run.curve), default=0)
-    head = ("run", "seconds", *(f"level {i} PSNR dB" for i in range(levels)), "RMSE", "on the front")
+    levels = range(max((len(p["psnr"]) for run in runs for p in run["curve"]), default=0))
     rows = []
-    for run in runs:
-        for p in run.curve:
-            cells = [f"{p.psnr[i]:.2f}" if i < len(p.psnr) else "-" for i in range(levels)]
-            on = "yes" if (p.seconds, p.rmse) in best else "-"
-            rows.append((run.name, f"{p.seconds:.1f}", *cells, f"{p.rmse:.4f}", on))
-    return markdown(head, rows)
+    for run in as_json(runs):
+        for p in run["curve"]:
+            cells = [f"{p['psnr'][i]:.2f}" if i < len(p["psnr"]) else "-" for i in levels]
+            rows.append((run["name"], f"{p['seconds']:.1f}", *cells, f"{p['rmse']:.4f}", "yes" if p["front"] else "-"))
+    return markdown(("run", "seconds", *(f"level {i} PSNR dB" for i in levels), "RMSE", "on the front"), rows)
 
 
 def panels(runs: Sequence[Run]) -> list[Panel]:
     """One panel, a series per run."""
-    series = [Series(run.name, tuple((p.seconds, p.rmse) for p in run.curve)) for run in runs]
-    return [Panel("held-out error against training time", "training wall time, s", tuple(series))]
+    return [Panel("held-out error against training time", "training wall time, s", _pairs(runs))]
 
 
-def as_json(runs: Sequence[Run]) -> list[dict[str, Any]]:
-    """The runs as plain dicts, each evaluation with its RMSE and whether it lies on the front."""
-    best = front(runs)
-    return [
-        {
-            **asdict(run),
-            "curve": [{**asdict(p), "rmse": p.rmse, "front": (p.seconds, p.rmse) in best} for p in run.curve],
-        }
-        for run in runs
-    ]
+def as_json(runs: Sequence[Run]) -> list[Run]:
+    """The runs, each evaluation with whether it lies on the Pareto front of (seconds, RMSE) over all of them."""
+    best = pareto_front([pair for _, pairs in _pairs(runs) for pair in pairs])
+    return [run | {"curve": [p | {"front": (p["seconds"], p["rmse"]) in best} for p in run["curve"]]} for run in runs]

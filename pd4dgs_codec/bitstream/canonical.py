@@ -13,8 +13,8 @@ from typing import Any
 
 import msgpack
 
-from ..errors import EncodeError, Malformed
-from .limits import MAX_DEPTH
+from pd4dgs_codec.bitstream.limits import MAX_DEPTH
+from pd4dgs_codec.errors import EncodeError, Malformed
 
 _SINGLE_MAX = (2.0 - 2.0**-23) * 2.0**127
 
@@ -22,9 +22,10 @@ _SINGLE_MAX = (2.0 - 2.0**-23) * 2.0**127
 def pack(obj: Any) -> bytes:
     """Canonical bytes of a value. Raises EncodeError for what the format has no form for."""
     try:
-        return msgpack.packb(_canonical(obj), use_single_float=True)
+        data: bytes = msgpack.packb(_canonical(obj), use_single_float=True)
     except ValueError as error:
         raise EncodeError(f"cannot be written as canonical msgpack: {error}") from None
+    return data
 
 
 def unpack(data: bytes | memoryview, *, offset: int = 0) -> Any:

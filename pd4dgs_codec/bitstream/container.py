@@ -12,7 +12,8 @@ import struct
 import zlib
 from dataclasses import dataclass
 
-from ..errors import (
+from pd4dgs_codec.bitstream.limits import MAX_HEADER, MAX_PAYLOAD
+from pd4dgs_codec.errors import (
     BadSignature,
     ChecksumMismatch,
     EncodeError,
@@ -21,7 +22,6 @@ from ..errors import (
     Truncated,
     UnsupportedVersion,
 )
-from .limits import MAX_HEADER, MAX_PAYLOAD
 
 # As in PNG: a high bit and both line ends, so that a text-mode transfer breaks it, and 0x1A to stop a DOS listing.
 SIGNATURE = bytes.fromhex("89504434 0D0A1A0A")

@@ -13,10 +13,12 @@ import math
 import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NoReturn
+from typing import Any, NoReturn, TypeVar
 
 from pd4dgs_codec.errors import DecodeError, EncodeError, Pd4Error
 from pd4dgs_codec.jsonable import finite
+
+T = TypeVar("T")
 
 OK, FAILED, USAGE, PARTIAL = 0, 1, 2, 3
 
@@ -123,7 +125,7 @@ def finite_float(text: str) -> float:
     return _checked(text, float, math.isfinite, "a number")
 
 
-def _checked(text: str, kind: Callable[[str], Any], accept: Callable[[Any], bool], expected: str) -> Any:
+def _checked(text: str, kind: Callable[[str], T], accept: Callable[[T], bool], expected: str) -> T:
     with contextlib.suppress(ValueError):
         if accept(value := kind(text)):
             return value

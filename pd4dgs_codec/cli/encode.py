@@ -26,10 +26,11 @@ from pd4dgs_codec.cli.common import (
 )
 from pd4dgs_codec.cli.files import STDIO, check_output, is_pd4, read_bytes, write_bytes
 from pd4dgs_codec.cli.progress import progress_bar
+from pd4dgs_codec.codec.options import CHOICES, DEFAULTS, EncodeOptions
+from pd4dgs_codec.pack import MIN_GAIN_PER_MEGABYTE
 
 if TYPE_CHECKING:
-    from pd4dgs_codec.codec.omissions import LeftOut
-    from pd4dgs_codec.data.dataset import View
+    from pd4dgs_codec.pack.packing import Packed, Views
     from pd4dgs_codec.scene import Scene
 
 DETAILS = f"""\
@@ -47,11 +48,6 @@ examples:
   pd4dgs-encode model.pt -o fast.pd4 --target-size L0=350k --data recordings/kitchen --downscale 2
   pd4dgs-encode model.pt -o - | pd4dgs-decode -"""
 
-#: Below this gain of a level a layer is left out, dB per megabyte (1e6 bytes). About 0.5 dB is what viewers begin to
-#: notice, and half a megabyte takes 2 s at 2 Mbps, as long as all of such a scene should.
-MIN_GAIN = 1.0
-#: Pictures of the file's own camera, and how many degrees it sways, where there is no dataset.
-OWN_PICTURES, OWN_ORBIT = 16, 20.0
 #: Link rate at which the report states the time to the first frame, in bits per second.
 FIRST_FRAME_RATE = 2e6
 
@@ -63,41 +59,21 @@ def parser() -> Parser:
         "input", metavar="model.pt", help="checkpoint of pd4dgs-train, or a .pd4 file to pack again; - reads stdin"
     )
     p.add_argument("-o", "--output", required=True, metavar="FILE.pd4", help="file to write; - writes stdout")
-    p.add_argument("--mode", choices=("ans", "lzma"), default="ans", help="entropy coder (default: ans)")
-    p.add_argument(
-        "--deformation",
-        choices=("coded", "float32"),
-        default="coded",
-        help="planes and networks of layers 1 and 2: coded integers, or float32 under LZMA (default: coded)",
-    )
-    p.add_argument(
-        "--priors",
-        choices=("best", "gauss"),
-        default="best",
-        help="distributions to choose from per channel (default: best)",
-    )
+    _add_choice(p, "mode", "entropy coder")
+    _add_choice(p, "deformation", "planes and networks of layers 1 and 2: coded integers, or float32 under LZMA")
+    _add_choice(p, "priors", "distributions to choose from per channel")
     p.add_argument(
         "--step-scale",
         type=positive_float,
-        default=1.0,
+        default=DEFAULTS.step_scale,
         metavar="X",
-        help="multiply every quantisation step: above 1 smaller and coarser (default: 1)",
+        help="multiply every quantisation step: above 1 smaller and coarser (default: %(default)g)",
     )
-    p.add_argument(
-        "--layers",
-        choices=("auto", "0", "1", "2"),
-        default="auto",
-        help="auto leaves out layers without effect; a number keeps the layers up to it (default: auto)",
-    )
-    p.add_argument(
-        "--effort", type=int, choices=range(1, 10), default=5, metavar="1-9", help="1 fast, 9 small (default: 5)"
-    )
-    p.add_argument(
-        "--omit",
-        choices=("bounded", "lossless", "nothing"),
-        default="bounded",
-        help="leave out what changes no picture and residuals too small to see, the former alone, or nothing "
-        "(default: bounded)",
+    _add_choice(p, "layers", "auto leaves out layers without effect; a number keeps the layers up to it")
+    efforts = CHOICES["effort"]
+    _add_choice(p, "effort", f"{efforts[0]} fast, {efforts[-1]} small", type=int, metavar=f"{efforts[0]}-{efforts[-1]}")
+    _add_choice(
+        p, "omit", "leave out what changes no picture and residuals too small to see, the former alone, or nothing"
     )
     p.add_argument("--no-verify", action="store_true", help="skip decoding the result and comparing every symbol")
     p.add_argument(
@@ -129,10 +105,17 @@ def parser() -> Parser:
         type=non_negative_float,
         metavar="DB",
         help="with --data, leave out layers whose level gains less than DB dB mPSNR per megabyte "
-        f"(default: {MIN_GAIN:g}; 0: keep all)",
+        f"(default: {MIN_GAIN_PER_MEGABYTE:g}; 0: keep all)",
     )
     p.add_common()
     return p
+
+
+def _add_choice(p: Parser, name: str, what: str, **settings: Any) -> None:
+    """--NAME with the choices and the default of that field of EncodeOptions."""
+    default = vars(DEFAULTS)[name]
+    choices = tuple(CHOICES[name]) if "type" in settings else tuple(map(str, CHOICES[name]))
+    p.add_argument(f"--{name}", choices=choices, default=default, help=f"{what} (default: {default})", **settings)
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -146,47 +129,41 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
     if args.min_gain is not None and args.data is None:
         raise UsageError("--min-gain needs --data SOURCE: a gain is measured on its views")
     check_output(args.output, args.overwrite)
+    options = _options(args)
     scene, trained = _load(args)
     console.detail(f"{args.input}: {len(scene.anchor_q)} anchors, layers {list(scene.layers)}, steps {scene.steps}")
-    from dataclasses import replace
+    if args.data is not None or args.target_size:
+        use_threads(args)
+    from pd4dgs_codec.pack.packing import pack
 
-    from pd4dgs_codec.codec.encoder import encode_with_report
-
-    scene = replace(scene, steps=scene.steps.scaled(args.step_scale))
-    layers = args.layers if args.layers == "auto" else int(args.layers)
-    options = {
-        "mode": args.mode,
-        "deformation": args.deformation,
-        "priors": args.priors,
-        "layers": layers,
-        "effort": args.effort,
-    }
-    views, held_out = _views(args, console)
-    left_out: list[LeftOut] = []
-    min_gain = MIN_GAIN if args.min_gain is None else args.min_gain
-    if held_out and layers == "auto" and min_gain:
-        scene, left_out = _leave_out_unpaid(args, scene, held_out, min_gain)
-    target = None
-    if args.target_size:
-        scene, more, target = _fit(args, scene, views, held_out, options)
-        left_out += more
-    data, report = encode_with_report(scene, omit=args.omit, verify=not args.no_verify, left_out=left_out, **options)
-    result = {"input": args.input, "output": args.output, **report.json()}
-    if target is not None:
-        added = _added_bytes(data)
-        for row in target["layers"]:
-            row["bytes"] = added.get(row["layer"], 0)
-        result["target"] = target
-    for row in result["layers"]:
-        row["ratio"] = row["payload_bits"] / row["rate_bits"] if row["rate_bits"] else None
+    packed = pack(
+        scene,
+        options,
+        target_sizes=args.target_size,
+        views=_views(args, console),
+        min_gain=MIN_GAIN_PER_MEGABYTE if args.min_gain is None else args.min_gain,
+        downscale=args.downscale,
+        progress=lambda what: progress_bar(None, "pictures", what),
+    )
+    result = {"input": args.input, "output": args.output, **packed.json()}
     if trained and args.json:  # shown nowhere else, and it takes its time
-        result |= _train_rate(scene, layers)
-        bits = {row["layer"]: row["bits"] for row in result["train_rate_bits_layers"]}
-        for row in result["layers"]:  # float32 deformations may keep a layer that is zero once quantised
-            row["train_rate_bits"] = bits.get(row["layer"])
-    write_bytes(args.output, data, args.overwrite)
-    console.result(result, _text(result, _first_frame_seconds(data)), on_stdout=False)
+        _add_train_rate(result, packed, options)
+    write_bytes(args.output, packed.data, args.overwrite)
+    console.result(result, _text(result, 8 * packed.report.added_bytes()[0] / FIRST_FRAME_RATE), on_stdout=False)
     return OK
+
+
+def _options(args: argparse.Namespace) -> EncodeOptions:
+    return EncodeOptions(
+        mode=args.mode,
+        deformation=args.deformation,
+        priors=args.priors,
+        layers=args.layers if args.layers == "auto" else int(args.layers),
+        effort=args.effort,
+        omit=args.omit,
+        step_scale=args.step_scale,
+        verify=not args.no_verify,
+    )
 
 
 def _load(args: argparse.Namespace) -> tuple[Scene, bool]:
@@ -204,78 +181,18 @@ def _load(args: argparse.Namespace) -> tuple[Scene, bool]:
     return to_scene(model), True
 
 
-def _views(args: argparse.Namespace, console: Console) -> tuple[list[View], list[View]]:
-    """About --views of --data's training views and as many held out (training views if none are), evenly spread.
-
-    A layer is judged by what it was not fitted to: on training views a useless one may still gain a lot.
-    """
+def _views(args: argparse.Namespace, console: Console) -> Views | None:
     if args.data is None:
-        return [], []
-    use_threads(args)
+        return None
     from pd4dgs_codec.data.dataset import load
+    from pd4dgs_codec.pack.packing import Views
 
     dataset = load(args.data, downscale=args.downscale, holdout=args.holdout)
-    train, test = (
-        list(views[:: -(-len(views) // args.views)]) for views in (dataset.train, dataset.test or dataset.train)
-    )
-    console.detail(f"{args.data}: {len(train)} training views, {len(test)} to judge by")
+    views = Views.of(dataset, args.data, args.views)
+    console.detail(f"{args.data}: {len(views.fitting)} training views, {len(views.held_out)} to judge by")
     if not dataset.test:
         console.message("no views are held out: layers are judged on training views")
-    return train, test
-
-
-def _leave_out_unpaid(
-    args: argparse.Namespace, scene: Scene, views: list[View], min_gain: float
-) -> tuple[Scene, list[LeftOut]]:
-    """The scene without the layers whose level does not pay, and what went."""
-    from pd4dgs_codec.codec.layers import Coding
-    from pd4dgs_codec.pack.worth import leave_out_unpaid
-
-    coding = Coding(args.mode, args.priors, args.effort)
-    with progress_bar(None, "pictures", "judging layers") as step:
-        return leave_out_unpaid(
-            scene,
-            views,
-            min_gain=min_gain,
-            coding=coding,
-            raw_deformation=args.deformation == "float32",
-            step=step,
-        )
-
-
-def _fit(
-    args: argparse.Namespace, scene: Scene, views: list[View], held_out: list[View], options: dict[str, Any]
-) -> tuple[Scene, list[LeftOut], dict[str, Any]]:
-    """(scene whose layers meet --target-size, what that leaves out, the "target" of the report)."""
-    use_threads(args)
-    from dataclasses import asdict
-
-    from pd4dgs_codec.codec.plan import plan
-    from pd4dgs_codec.codec.symbols import rounded
-    from pd4dgs_codec.pack.rendered import RenderedLoss, psnr_of, true_psnr
-    from pd4dgs_codec.pack.target import fit
-    from pd4dgs_codec.view.frames import dataset_frames, own_frames
-
-    raw = args.deformation == "float32"
-    scene, left_out = plan(scene, options["layers"], raw, args.omit)
-    frames = dataset_frames(views) if views else own_frames(scene.info, OWN_PICTURES, OWN_ORBIT, args.downscale)
-    with progress_bar(None, "pictures", "fitting sizes") as step:
-        loss = RenderedLoss(scene, frames, step)
-        fitted, dropped, fits = fit(scene, args.target_size, loss.mean_mse, loss.harm, **options)
-        packed = rounded(plan(fitted, options["layers"], raw, "nothing")[0], raw)
-        errors = loss.mse(packed)
-        before, after = (true_psnr(s, held_out, step) if views else {} for s in (scene, packed))
-    levels = []
-    for level, mse in errors.items():
-        lost = {"lost_db": before[level] - after[level]} if views else {}
-        levels.append({"level": level, "error_psnr": psnr_of(mse), **lost})
-    report = {
-        "cameras": f"training views of {args.data}" if views else "the file's own camera",
-        "pictures": len(frames),
-        "layers": [{**asdict(row), "steps": {k: getattr(fitted.steps, k) for k in row.factors}} for row in fits],
-        "levels": levels,
-    }
-    return fitted, left_out + dropped, report
+    return views
 
 
 class _Stdin(io.BytesIO):
@@ -285,31 +202,19 @@ class _Stdin(io.BytesIO):
         return "stdin"
 
 
-def _train_rate(scene: Scene, layers: str | int) -> dict[str, Any]:
+def _add_train_rate(result: dict[str, Any], packed: Packed, options: EncodeOptions) -> None:
     """The trainer's own sum of R over the float values, at the steps and for the layers of this file."""
     from pd4dgs_codec.pack.train_rate import train_rate_bits
 
-    rows = train_rate_bits(scene, layers)
+    rows = train_rate_bits(packed.scene, EncodeOptions(layers=options.layers))
     per_layer = [
         {**row, "layer": int(row["layer"]), "bits": sum(bits for name, bits in row.items() if name != "layer")}
         for row in rows
     ]
-    return {"train_rate_bits": sum(row["bits"] for row in per_layer), "train_rate_bits_layers": per_layer}
-
-
-def _added_bytes(data: bytes) -> dict[int, int]:
-    """By layer what it adds to the file, the header counted with layer 0."""
-    from pd4dgs_codec.codec.info import info
-
-    rows = info(data)["layers"]
-    ends = [0, *(row["end"] for row in rows)]
-    return {row["layer"]: row["end"] - before for row, before in zip(rows, ends, strict=False)}
-
-
-def _first_frame_seconds(data: bytes) -> float:
-    from pd4dgs_codec.codec.info import info
-
-    return 8 * info(data)["layers"][0]["end"] / FIRST_FRAME_RATE
+    bits = {row["layer"]: row["bits"] for row in per_layer}
+    result |= {"train_rate_bits": sum(bits.values()), "train_rate_bits_layers": per_layer}
+    for row in result["layers"]:  # float32 deformations may keep a layer that is zero once quantised
+        row["train_rate_bits"] = bits.get(row["layer"])
 
 
 def _text(result: dict[str, Any], first_frame: float) -> str:

@@ -96,11 +96,7 @@ def _left_out(layers: list[dict[str, Any]]) -> list[dict[str, str]]:
             missing.append(f"layer {kind.layer}")
         elif "networks" in row:  # known only where the file holds the whole chunk
             gone = [head for head in kind.heads if head not in row["networks"]]
-            missing += (
-                [str(kind.deformation)]
-                if len(gone) == len(kind.heads)
-                else [f"{kind.deformation} head {h}" for h in gone]
-            )
+            missing += [kind.name] if len(gone) == len(kind.heads) else [f"{kind.name} head {h}" for h in gone]
     return [{"what": what, "why": why} for what in missing]
 
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import argparse
 import re
 import statistics
-import time
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pd4dgs_codec.atomic import whole_file, whole_files
 from pd4dgs_codec.cli.common import (
     OK,
     SOURCES,
@@ -23,7 +23,7 @@ from pd4dgs_codec.cli.common import (
     run,
     use_threads,
 )
-from pd4dgs_codec.cli.files import STDIO, check_output, named_input, whole_file, whole_files
+from pd4dgs_codec.cli.files import STDIO, check_output, named_input
 from pd4dgs_codec.cli.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -155,21 +155,14 @@ def _pictures(
     frames: list[Frame], levels: list[Level], beside: bool, milliseconds: list[float], step: Callable[[], None]
 ) -> Iterator[np.ndarray]:
     """uint8 [H, W, 3] per frame: the one level, or all of them beside the true image. Times are noted per picture."""
-    from pd4dgs_codec.metrics.image import to_uint8
-    from pd4dgs_codec.view.panels import level_caption, side_by_side
+    from pd4dgs_codec.view.panels import Panel, level_panels, side_by_side
 
     for frame in frames:
-        images, captions = [], []
-        for level in levels:
-            start = time.perf_counter()
-            image = level.picture(frame.camera, frame.time)
-            milliseconds.append(1e3 * (time.perf_counter() - start))
-            images.append(to_uint8(image))
-            captions.append(level_caption(level.level, level.cumulative_bytes))
-        if beside and frame.truth is not None:
-            images.append(frame.truth)
-            captions.append("ground truth")
-        yield side_by_side(images, captions) if beside else images[0]
+        panels = level_panels(levels, frame)
+        milliseconds += [panel.milliseconds for panel in panels]
+        if frame.truth is not None:
+            panels.append(Panel(frame.truth, "ground truth"))
+        yield side_by_side(panels) if beside else panels[0].picture
         step()
 
 

@@ -58,7 +58,8 @@ def parse_config(text: str, path: str) -> TrainConfig:
         plain = {**BEFORE, **json.loads(text)}
         if plain.get("steps") is not None:  # None by default, so that its type is not that of a default value
             plain["steps"] = Steps(**plain["steps"])
-        return _rebuilt(plain, TrainConfig())
+        config: TrainConfig = _rebuilt(plain, TrainConfig())
+        return config
     except (ValueError, TypeError, AttributeError) as error:
         raise TrainError(f"{path}: its stored configuration cannot be read: {error}") from None
 
@@ -76,7 +77,9 @@ def _expect_same(path: str, what: str, stored: Any, asked: Any) -> None:
 
 
 def _same_source(source: str) -> str:
-    return source if source.startswith("synthetic:") else str(Path(source).resolve())
+    from pd4dgs_codec.data.synthetic import PREFIX
+
+    return source if source.startswith(PREFIX) else str(Path(source).resolve())
 
 
 def cut_log(path: str, iteration: int) -> None:
@@ -100,7 +103,6 @@ def _is_step_from(line: bytes, iteration: int) -> bool:
 def check_time_left(trainer: Trainer, path: str) -> None:
     """TrainError if the run has used up its time limit without having finished."""
     limit = trainer.config.max_seconds
-    unfinished = not trainer.total or trainer.iteration < trainer.total  # total 0: cut before a time limit fixed it
-    if limit and unfinished and trainer.seconds >= limit:
+    if limit and not trainer.finished and trainer.seconds >= limit:
         used = f"has trained {trainer.seconds:.0f} s of its limit of {limit:g} s"
         raise TrainError(f"{path}: {used}; expected a larger --max-seconds to go on")

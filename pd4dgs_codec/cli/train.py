@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import argparse
 import os
-import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pd4dgs_codec.atomic import remove_leftovers
 from pd4dgs_codec.cli.common import (
     OK,
     SOURCES,
@@ -148,12 +148,12 @@ def _train(args: argparse.Namespace, console: Console) -> int:
             cut_log(args.log, trainer.iteration)
         else:
             open(args.log, "w").close()
-    checkpoint.remove_leftovers(args.output)
+    remove_leftovers(args.output)
     limit = f", at most {config.max_seconds:g} s" if config.max_seconds else ""
     held_out = f"{len(dataset.test)} held out" if dataset.test else "none held out"
     start = f", from step {trainer.iteration}" if trainer.iteration else ""
     console.message(
-        f"training {config.preset} on {len(dataset.train)} views ({held_out}), {trainer.device}{limit}{start}"
+        f"training {config.preset} on {len(dataset.train)} views ({held_out}), {trainer.learner.device}{limit}{start}"
     )
     for remark in dataset.remarks():
         console.message(f"note: {remark}")
@@ -195,25 +195,23 @@ def _device(name: str, console: Console) -> str:
 
 
 def _summary(args: argparse.Namespace, trainer: Trainer) -> dict[str, Any]:
-    from pd4dgs_codec.train.config import Schedule
-
-    schedule = Schedule(trainer.total or sys.maxsize)  # 0: ended before the steps that a time limit allows were known
+    learner = trainer.learner
     psnr = trainer.curve[-1]["psnr"] if trainer.curve else []
     return {
         "output": args.output,
         "source": trainer.config.source,
         "preset": trainer.config.preset,
-        "device": str(trainer.device),
+        "device": str(learner.device),
         "iterations": trainer.iteration,
-        "total": trainer.total,
-        "finished": 0 < trainer.total <= trainer.iteration,
+        "total": trainer.total or 0,  # 0: ended before the steps that a time limit allows were known
+        "finished": trainer.finished,
         "interrupted": trainer.interrupted,
         "seconds": round(trainer.seconds, 3),
-        "phases_not_reached": schedule.phases_not_reached(trainer.iteration),
-        "skipped": trainer.skipped,
-        "left_out": trainer.left_out,
+        "phases_not_reached": learner.schedule.phases_not_reached(trainer.iteration),
+        "skipped": learner.skipped,
+        "left_out": learner.left_out,
         "anchors": len(trainer.model.anchor_q),
-        "active_anchors": trainer.active_anchors(),
+        "active_anchors": learner.active_anchors(),
         "split": "test" if trainer.dataset.test else "train",
         "levels": [{"level": level, "mpsnr": value} for level, value in enumerate(psnr)],
     }

@@ -34,7 +34,6 @@ from pd4dgs_codec.codec.stages import (
     STAGED,
     activity_classes,
     cheapest_class_count,
-    entropy_bits,
     places_of,
     put_stages,
     read_class_count,
@@ -42,6 +41,7 @@ from pd4dgs_codec.codec.stages import (
     relative_magnitude,
     smaller_form,
 )
+from pd4dgs_codec.entropy.bits import entropy_bits
 from pd4dgs_codec.entropy.channels import decode_channels
 from pd4dgs_codec.entropy.priors import K_MAX
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
@@ -61,6 +61,9 @@ SPLIT_Y, SPLIT_Z = 1, 2
 #: Encoder: a term must explain this share of its channel's spread; a term costs about so many bits.
 MIN_SHARE = 0.03
 TERM_BITS = 24
+#: Encoder: added to each channel's variance when terms are fitted, about the 1/12 that rounding to integers puts there.
+#: It keeps the equations solvable where channels are constant or alike. Another value means other files.
+ROUNDING_VARIANCE = 0.08
 
 
 @dataclass(frozen=True)
@@ -72,7 +75,8 @@ class Terms:
 
     def prediction(self, symbols: np.ndarray) -> np.ndarray:
         """int64 [n] from symbols int64 [>= max channel + 1, n]."""
-        return (self.weights @ symbols[self.channels] + (1 << WEIGHT_SHIFT >> 1)) >> WEIGHT_SHIFT
+        predicted: np.ndarray = (self.weights @ symbols[self.channels] + (1 << WEIGHT_SHIFT >> 1)) >> WEIGHT_SHIFT
+        return predicted
 
 
 @dataclass(frozen=True)
@@ -85,11 +89,13 @@ class Split:
 
     def y_classes(self, x: np.ndarray) -> np.ndarray:
         """int64 [n] in 0..4."""
-        return np.minimum(np.abs(x - self.centre_x), Y_CLASSES - 1)
+        distance: np.ndarray = np.abs(x - self.centre_x)
+        return np.minimum(distance, Y_CLASSES - 1)
 
     def z_classes(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """int64 [n] in 0..6."""
-        return np.minimum(np.abs(x - self.centre_x) + np.abs(y - self.centre_y), Z_CLASSES - 1)
+        distance: np.ndarray = np.abs(x - self.centre_x) + np.abs(y - self.centre_y)
+        return np.minimum(distance, Z_CLASSES - 1)
 
 
 def _stage_channels(stage: int) -> tuple[int, ...]:
@@ -165,7 +171,7 @@ def _fit_terms(symbols: np.ndarray, c: int) -> Terms:
     """Least squares of channel c on those before it, weak terms dropped; no terms unless the entropy gains by them."""
     nothing = Terms(np.zeros(0, np.int64), np.zeros(0, np.int64))
     centred = (symbols[: c + 1] - symbols[: c + 1].mean(axis=1, keepdims=True)).astype(np.float64)
-    covariance = centred @ centred.T / symbols.shape[1] + 0.08 * np.eye(c + 1)  # 1/12: the symbols' own rounding
+    covariance = centred @ centred.T / symbols.shape[1] + ROUNDING_VARIANCE * np.eye(c + 1)
     spread = np.sqrt(np.diag(covariance))
     chosen = np.arange(c)
     for _ in range(2):

@@ -13,7 +13,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pd4dgs_codec.attributes.table import ATTRIBUTES
 from pd4dgs_codec.codec.kinds import LAYER_KINDS
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.scene import PLANES, Scene
@@ -66,7 +65,8 @@ def verify_errors(
 
 def _bounds(magnitude: np.ndarray, step: float) -> np.ndarray:
     """float64 error bounds of decoded values of that float32 magnitude; step 0: stored as they are."""
-    return (0.5 + _TIES) * step + 0.5 * np.spacing(magnitude).astype(np.float64) * (step > 0)
+    last_place: np.ndarray = np.spacing(magnitude).astype(np.float64)
+    return (0.5 + _TIES) * step + 0.5 * last_place * (step > 0)
 
 
 def _rounded_up(value: float) -> float:
@@ -77,17 +77,14 @@ def _rounded_up(value: float) -> float:
 
 def _tensors(scene: Scene, raw_deformation: bool) -> Iterator[tuple[str, float, np.ndarray]]:
     """(field of Steps, step or 0 for values that are stored as they are, float32 values)."""
-    for attribute in ATTRIBUTES:
-        yield attribute.name, getattr(scene.steps, attribute.name), getattr(scene, attribute.name)
+    for name, values in scene.attributes.items():
+        yield name, scene.steps.attributes[name], values
     for kind in LAYER_KINDS:
-        deformation = getattr(scene, kind.deformation) if kind.deformation else None
-        networks = scene.networks if kind.deformation is None else deformation.networks if deformation else {}
-        raw = raw_deformation and kind.deformation is not None
-        if deformation and kind.planes_step:
-            step = 0.0 if raw else getattr(scene.steps, kind.planes_step)
-            for scale in deformation.planes:
-                yield from ((kind.planes_step, step, scale[name]) for name, _, _ in PLANES)
-        step = 0.0 if raw else getattr(scene.steps, kind.weights_step)
+        tensors, stored = scene.tensors(kind.layer), raw_deformation and kind.layer > 0
+        for scale in tensors.planes:
+            step = 0.0 if stored else scene.steps.planes(kind.layer)
+            yield from ((str(kind.planes_step), step, scale[name]) for name, _, _ in PLANES)
+        step = 0.0 if stored else scene.steps.weights(kind.layer)
         for name in kind.network_ids:
-            for pair in networks.get(name, ()):
+            for pair in tensors.networks.get(name, ()):
                 yield from ((kind.weights_step, step, array) for array in pair)

@@ -39,18 +39,18 @@ def check_scene(scene: Scene) -> None:
         reach = max(int(scene.anchor_q.max()), -int(scene.anchor_q.min()))
         _expect(reach <= MAX_VOXEL, f"anchor_q: voxel index of magnitude {reach}, expected at most {MAX_VOXEL}")
     for a in ATTRIBUTES:
-        _expect_array(a.name, getattr(scene, a.name), np.float32, (n, *a.shape))
+        _expect_array(a.name, scene.attributes[a.name], np.float32, (n, *a.shape))
     _check_masks(scene)
     _check_info(scene)
     for name, step in vars(scene.steps).items():
         _expect(is_step(step), f"step of {name}: {step!r}, expected a positive normal binary32 value")
-    _check_networks("scaffold", scene.networks, LAYER_KINDS[0], SCAFFOLD_INPUT)
+    _check_networks(LAYER_KINDS[0].name, scene.networks, LAYER_KINDS[0], SCAFFOLD_INPUT)
     missing = set(LAYER_KINDS[0].heads) - set(scene.networks)
     _expect(not missing, f"scaffold networks {sorted(missing)} are missing")
     for kind in LAYER_KINDS[1:]:
-        deformation = getattr(scene, kind.deformation or "")
+        deformation = scene.deformation(kind.layer)
         if deformation is not None:
-            _expect(kind.layer in layers, f"{kind.deformation} is given, but layer {kind.layer} is not among {layers}")
+            _expect(kind.layer in layers, f"{kind.name} is given, but layer {kind.layer} is not among {layers}")
             _check_deformation(deformation, kind)
 
 
@@ -99,7 +99,7 @@ def info_fault(info: SceneInfo) -> str | None:
 
 
 def _check_deformation(deformation: Deformation, kind: LayerKind) -> None:
-    name, width = kind.deformation, 0
+    name, width = kind.name, 0
     _expect(len(deformation.planes) > 0, f"{name}: no planes, expected at least one scale")
     for s, planes in enumerate(deformation.planes):
         _expect(set(planes) == {p for p, _, _ in PLANES}, f"{name} scale {s}: planes {sorted(planes)}, expected six")
@@ -113,7 +113,7 @@ def _check_deformation(deformation: Deformation, kind: LayerKind) -> None:
     _expect(TRUNK in deformation.networks, f"{name}: the network 'trunk' is missing")
     trunk_out = deformation.networks[TRUNK][-1][0].shape[0]
     for network, layers in deformation.networks.items():
-        _check_networks(str(name), {network: layers}, kind, width if network == TRUNK else trunk_out)
+        _check_networks(name, {network: layers}, kind, width if network == TRUNK else trunk_out)
 
 
 def _check_networks(owner: str, networks: dict[str, Network], kind: LayerKind, width_in: int) -> None:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pd4dgs_codec.bitstream.container import PREAMBLE_SIZE, read_chunk, read_preamble
 from pd4dgs_codec.codec.header import Header, scene_id_of, unpack_header
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
-from pd4dgs_codec.codec.layers import read_layer
+from pd4dgs_codec.codec.payload import read_layer
 from pd4dgs_codec.codec.symbols import LayerSymbols, assemble, check_last_layer
 from pd4dgs_codec.errors import DecodeError, Malformed, Truncated, UnsupportedFeature
 from pd4dgs_codec.scene import Scene
@@ -102,7 +102,7 @@ def _check_bounded(layer: LayerSymbols, header: Header) -> None:
 def _located(error: DecodeError, chunk: int, offset: int) -> DecodeError:
     """`error` from inside a payload, placed in the file. A payload is complete, so it cannot be Truncated."""
     kind = Malformed if isinstance(error, Truncated) else type(error)
-    return kind(error.message, offset=offset, chunk=chunk, clause=error.clause)
+    return kind(error.message, offset=offset, chunk=chunk)
 
 
 def decode_layers(

@@ -5,31 +5,23 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
+from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.attributes.table import ATTRIBUTES
 from pd4dgs_codec.bitstream.container import write_chunk, write_preamble
 from pd4dgs_codec.codec.bounds import ErrorBound, rounding_bounds, verify_errors
 from pd4dgs_codec.codec.check import check_scene
 from pd4dgs_codec.codec.decoder import decode_layers
-from pd4dgs_codec.codec.header import DEFORMATIONS, MODES, Header, pack_header, scene_id_of
-from pd4dgs_codec.codec.kinds import LAYER_KINDS, LayerKind
-from pd4dgs_codec.codec.layers import Coding, StreamReport, read_meta, write_layer
-from pd4dgs_codec.codec.omissions import LeftOut
-from pd4dgs_codec.codec.plan import OMIT, plan
-from pd4dgs_codec.codec.symbols import (
-    LayerSymbols,
-    assemble,
-    check_last_layer,
-    float_tensors,
-    layer_symbols,
-    quantise_deformation,
-)
+from pd4dgs_codec.codec.header import Header, pack_header, scene_id_of
+from pd4dgs_codec.codec.kinds import LAYER_KINDS
+from pd4dgs_codec.codec.left_out import LeftOut
+from pd4dgs_codec.codec.options import DEFAULTS, EncodeOptions
+from pd4dgs_codec.codec.payload import StreamReport, read_meta, write_layer
+from pd4dgs_codec.codec.plan import plan
+from pd4dgs_codec.codec.symbols import LayerSymbols, assemble, check_last_layer, float_tensors, layer_symbols
 from pd4dgs_codec.errors import DecodeError, EncodeError
-from pd4dgs_codec.scene import Deformation, Scene, Steps
-
-LAYER_CHOICES = ("auto", 0, 1, 2)
+from pd4dgs_codec.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -58,74 +50,48 @@ class Report:
     verified: bool
     seconds: float
     layers: list[LayerReport]
-    left_out: list[dict]
+    left_out: list[dict[str, Any]]
     errors: list[ErrorBound]
 
-    def json(self) -> dict:
+    def added_bytes(self) -> dict[int, int]:
+        """By layer what it adds to the file, the header counted with layer 0."""
+        header = self.bytes - sum(row.bytes for row in self.layers)
+        return {row.layer: row.bytes + (header if row.layer == 0 else 0) for row in self.layers}
+
+    def json(self) -> dict[str, Any]:
         """The report as plain dicts, lists, strings and numbers."""
         return asdict(self)
 
 
-def encode(scene: Scene, **options) -> bytes:
-    """The bytes of a `.pd4` file; `options` as in encode_with_report."""
-    return encode_with_report(scene, **options)[0]
+def encode(scene: Scene, options: EncodeOptions = DEFAULTS, **changes: Any) -> bytes:
+    """The bytes of a `.pd4` file; options and changes as in encode_with_report."""
+    return encode_with_report(scene, options, **changes)[0]
 
 
 def encode_with_report(
-    scene: Scene,
-    *,
-    mode: str = "ans",
-    deformation: str = "coded",
-    priors: str = "best",
-    step_scale: float = 1.0,
-    layers: str | int = "auto",
-    effort: int = 5,
-    omit: str = "bounded",
-    verify: bool = True,
-    left_out: Sequence[LeftOut] = (),
+    scene: Scene, options: EncodeOptions = DEFAULTS, *, left_out: Sequence[LeftOut] = (), **changes: Any
 ) -> tuple[bytes, Report]:
     """(file, report) of a scene.
 
-    mode: "ans", or "lzma" for the same symbols under LZMA2. deformation: "coded" or "float32". priors: "best" or
-    "gauss". step_scale multiplies every quantisation step. layers: "auto" leaves out deformations that do nothing,
-    0, 1 or 2 keeps the layers up to that number. effort: 1..9. omit: "bounded", "lossless" or "nothing", see plan.
-    verify: decode the result, compare every symbol and every float, and hold every float against the error bound in the
-    header. left_out: what the caller has taken out of the scene, to be reported with the rest. Raises EncodeError.
+    changes: fields of EncodeOptions by name, in place of those of `options`. left_out: what the caller has taken out of
+    the scene, to be reported with the rest. Raises EncodeError.
     """
     started = time.perf_counter()
-    _check_options(mode, deformation, priors, step_scale, layers, effort, omit)
-    scene = replace(scene, steps=scene.steps.scaled(step_scale))
+    scene, options = replace(options, **changes).apply_scale(scene)
     check_scene(scene)
-    coding = Coding(mode, priors, effort)
-    planned, omitted = plan(scene, layers, deformation == "float32", omit)
-    symbols = [layer_symbols(planned, i, deformation == "float32") for i in range(len(planned.layers))]
-    written = [write_layer(layer, coding) for layer in symbols]
+    planned, omitted = plan(scene, options)
+    symbols = [layer_symbols(planned, i, options.raw_deformation) for i in range(len(planned.layers))]
+    written = [write_layer(layer, options) for layer in symbols]
     _check_limits(planned, symbols, [payload for payload, _ in written])
-    meant = assemble(planned.info, _attribute_steps(planned), symbols)
-    data = _container(meant, mode, deformation, [payload for payload, _ in written])
-    errors = _verify(data, planned, symbols, meant) if verify else []
+    meant = assemble(planned.info, planned.steps.attributes, symbols)
+    data = _container(meant, options, [payload for payload, _ in written])
+    errors = _verify(data, planned, symbols, meant) if options.verify else []
     reports = [_layer_report(layer, payload, r) for layer, (payload, r) in zip(symbols, written, strict=True)]
-    rows = [_left_out_row(item, scene, coding, deformation, reports) for item in (*left_out, *omitted)]
+    kept = sum(r.anchors for r in reports)
+    kept_bits = sum(r.position_bits + s.payload_bits for r in reports for s in r.streams if s.name == "attributes")
+    rows = [item.row(scene.steps, options, kept, kept_bits) for item in (*left_out, *omitted)]
     seconds = round(time.perf_counter() - started, 4)
-    return data, Report(mode, len(data), verify, seconds, reports, rows, errors)
-
-
-def _check_options(
-    mode: str, deformation: str, priors: str, scale: float, layers: str | int, effort: int, omit: str
-) -> None:
-    choices = (
-        ("mode", mode, tuple(MODES)),
-        ("deformation", deformation, tuple(DEFORMATIONS)),
-        ("priors", priors, ("best", "gauss")),
-        ("layers", layers, LAYER_CHOICES),
-        ("effort", effort, tuple(range(1, 10))),
-        ("omit", omit, OMIT),
-    )
-    for name, value, allowed in choices:
-        if value not in allowed:
-            raise EncodeError(f"{name} {value!r}, expected one of {list(allowed)}")
-    if not (np.isfinite(scale) and scale > 0):
-        raise EncodeError(f"step_scale {scale!r}, expected a positive number")
+    return data, Report(options.mode, len(data), options.verify, seconds, reports, rows, errors)
 
 
 def _check_limits(scene: Scene, symbols: list[LayerSymbols], payloads: list[bytes]) -> None:
@@ -133,27 +99,23 @@ def _check_limits(scene: Scene, symbols: list[LayerSymbols], payloads: list[byte
     rows = 0
     for index, (layer, payload) in enumerate(zip(symbols, payloads, strict=True)):
         try:
-            read_meta(payload, layer.kind, rows, layer.raw)
-            check_last_layer(symbols[: index + 1], scene.info.voxel_size, _attribute_steps(scene))
+            read_meta(payload, layer.kind, rows, layer.raw_deformation)
+            check_last_layer(symbols[: index + 1], scene.info.voxel_size, scene.steps.attributes)
         except DecodeError as error:
             raise EncodeError(f"the scene is over a limit of the format: {error}") from None
         rows += len(layer.anchor_q)
 
 
-def _attribute_steps(scene: Scene) -> dict[str, float]:
-    return {a.name: getattr(scene.steps, a.name) for a in ATTRIBUTES}
-
-
-def _container(meant: Scene, mode: str, deformation: str, payloads: list[bytes]) -> bytes:
+def _container(meant: Scene, options: EncodeOptions, payloads: list[bytes]) -> bytes:
     """The file of a scene as it will be decoded, from the payloads of its layers."""
     types = [LAYER_KINDS[layer].chunk_type for layer in meant.layers]
     header = Header(
         chunks=tuple(zip(types, map(len, payloads), strict=True)),
-        mode=mode,
-        deformation=deformation,
-        attribute_steps=_attribute_steps(meant),
+        mode=options.mode,
+        deformation=options.deformation,
+        attribute_steps=meant.steps.attributes,
         info=meant.info,
-        error_bounds=rounding_bounds(meant, deformation == "float32"),
+        error_bounds=rounding_bounds(meant, options.raw_deformation),
     )
     packed = pack_header(header)
     scene_id = scene_id_of(packed, payloads[0])
@@ -197,33 +159,3 @@ def _layer_report(layer: LayerSymbols, payload: bytes, reports: list[StreamRepor
         anchors=len(layer.anchor_q),
         streams=streams,
     )
-
-
-def _left_out_row(item: LeftOut, scene: Scene, coding: Coding, deformation: str, reports: list[LayerReport]) -> dict:
-    """{what, why, lossless, bytes}: see LeftOut; anchors cost what the kept ones do on average."""
-    row = {"what": item.what, "why": item.why, "lossless": item.lossless}
-    if item.anchors:
-        kept = sum(r.anchors for r in reports)
-        spent = sum(r.position_bits + s.payload_bits for r in reports for s in r.streams if s.name == "attributes")
-        return row | {"bytes": round(item.anchors * spent / 8 / kept) if kept else 0}
-    if item.tensors is None or item.kind is None:
-        return row | {"bytes": round(item.bits / 8)}
-    return row | {"bytes": deformation_bytes(item.tensors, item.kind, scene.steps, coding, deformation == "float32")}
-
-
-def deformation_bytes(deformation: Deformation, kind: LayerKind, steps: Steps, coding: Coding, raw: bool) -> int:
-    """What planes and networks alone would take as the layer of `kind`."""
-    tensors = deformation if raw else quantise_deformation(deformation, kind, steps)
-    empty = np.zeros(0, np.int32)
-    alone = LayerSymbols(
-        kind=kind,
-        anchor_q=np.zeros((0, 3), np.int32),
-        mask_increase=empty,
-        mask_own=empty,
-        attributes=np.zeros((0, 0), np.int32),
-        planes=tensors.planes,
-        networks=tensors.networks,
-        steps={name: getattr(steps, name) for name in (kind.planes_step, kind.weights_step) if name},
-        raw=raw,
-    )
-    return len(write_layer(alone, coding)[0])

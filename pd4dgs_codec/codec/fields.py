@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from typing import Any
 
 from pd4dgs_codec.errors import LimitExceeded, Malformed, UnsupportedFeature
 
@@ -40,7 +41,7 @@ class Fields:
         names = {number: name for name, number in table.items()}
         return names[as_registered(self.get(key), names, f"{self._where} key {key}")]
 
-    def sequence(self, key: int, count: int | None = None) -> list:
+    def sequence(self, key: int, count: int | None = None) -> list[Any]:
         """A list, of `count` entries if given."""
         return as_list(self.get(key), f"{self._where} key {key}", count)
 
@@ -79,7 +80,7 @@ def as_registered(value: object, known: Mapping[int, object], where: str) -> int
     return value
 
 
-def as_list(value: object, where: str, count: int | None = None) -> list:
+def as_list(value: object, where: str, count: int | None = None) -> list[Any]:
     """`value` as a list, of `count` entries if given."""
     if not isinstance(value, list):
         raise Malformed(f"{where}: {type(value).__name__}, expected a list")

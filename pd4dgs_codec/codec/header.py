@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from pd4dgs_codec.attributes.quantise import is_step
 from pd4dgs_codec.attributes.table import ATTRIBUTES
@@ -15,12 +17,9 @@ from pd4dgs_codec.bitstream.limits import MAX_CHUNKS, MAX_PAYLOAD
 from pd4dgs_codec.codec.check import info_fault
 from pd4dgs_codec.codec.fields import Fields, as_integer, as_list
 from pd4dgs_codec.codec.kinds import LAYER_KINDS
+from pd4dgs_codec.codec.options import DEFORMATIONS, MODES, RAW_DEFORMATION
 from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.scene import Camera, SceneInfo
-
-#: How symbols are coded, and how the deformations' planes and weights travel: the numbers in the header.
-MODES = {"ans": 0, "lzma": 1}
-DEFORMATIONS = {"coded": 0, "float32": 1}
 
 # Keys of the header map.
 CHUNKS, MODE, DEFORMATION, STEPS, VOXEL_SIZE, BOX, TIME_RANGE, BACKGROUND, NEAR_FAR, UP, UNIT = range(1, 12)
@@ -62,11 +61,11 @@ class Header:
 
     @property
     def raw_deformation(self) -> bool:
-        """Whether planes and weights of the deformations are float32 values."""
-        return self.deformation == "float32"
+        """Whether planes and networks of layers 1 and 2 are stored as float32 values."""
+        return self.deformation == RAW_DEFORMATION
 
 
-def _f32(values) -> list[float]:
+def _f32(values: ArrayLike) -> list[float]:
     return [float(np.float32(v)) for v in np.ravel(values)]
 
 
@@ -147,7 +146,7 @@ def scene_id_of(header: bytes, payload: bytes) -> bytes:
     return hashlib.sha256(header[map_head + chunk_list :] + payload).digest()[:SCENE_ID_SIZE]
 
 
-def _unpack_chunks(rows: list) -> tuple[tuple[int, int], ...]:
+def _unpack_chunks(rows: list[Any]) -> tuple[tuple[int, int], ...]:
     as_integer(len(rows), MAX_CHUNKS, "header: number of chunks", low=1)
     chunks = []
     for i, row in enumerate(rows):

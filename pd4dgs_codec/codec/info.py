@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from typing import Any
 
 import numpy as np
 
@@ -11,13 +12,13 @@ from pd4dgs_codec.codec.bounds import rounding_bounds
 from pd4dgs_codec.codec.decoder import LayerReader
 from pd4dgs_codec.codec.header import unpack_header
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
-from pd4dgs_codec.codec.layers import read_meta
+from pd4dgs_codec.codec.payload import read_meta
 from pd4dgs_codec.codec.symbols import float_tensors
 
 FORMAT_VERSION = f"{MAJOR}.{MINOR}"
 
 
-def info(data: bytes) -> dict:
+def info(data: bytes) -> dict[str, Any]:
     """Header and layers of a file, or of its first bytes: only the preamble and header must be there.
 
     layers: {layer, offset, bytes, end} (whole chunks; end = length of the prefix that holds layers 0 .. this one) and,
@@ -33,7 +34,7 @@ def info(data: bytes) -> dict:
         if kind is None:
             others.append({"type": chunk_type, **place})
         else:
-            row: dict = {"layer": kind.layer, **place}
+            row: dict[str, Any] = {"layer": kind.layer, **place}
             if offset + size <= len(data):
                 payload = read_chunk(data, offset, type=chunk_type, length=length).payload
                 meta, _ = read_meta(payload, kind, rows, header.raw_deformation)
@@ -73,7 +74,7 @@ def nearest_bounds(data: bytes) -> dict[str, float]:
     return rounding_bounds(reader.scene(), reader.header.raw_deformation)
 
 
-def hashes(data: bytes, max_layer: int | None = None) -> list[dict]:
+def hashes(data: bytes, max_layer: int | None = None) -> list[dict[str, Any]]:
     """Per layer {layer, symbols, tensors}: SHA-256 in hex of a complete file's integers and float32 values, or of
     those of its layers <= max_layer alone (bytes after those are not looked at).
 

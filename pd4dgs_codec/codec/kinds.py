@@ -1,4 +1,4 @@
-"""One row per layer: its chunk type, the networks it may carry and where its tensors live in Scene and Steps.
+"""One row per layer: its chunk type, the networks it may carry and the names of its steps.
 
 All numbers here are those of the bitstream.
 """
@@ -17,34 +17,38 @@ SCAFFOLD_INPUT = FEATURE_DIM + 3
 class LayerKind:
     """A layer of the format.
 
-    deformation: field of Scene with this layer's Deformation, None for the scaffold. heads: output width per network
-    (the trunk's is free). network_ids: registry numbers in the layer's chunk, ascending in this order.
-    weights_step, planes_step: fields of Steps.
+    name: of its planes and networks, for messages and reports. heads: output width per network (the trunk's is free).
+    network_ids: registry numbers in the layer's chunk, ascending in this order. planes_step, weights_step: names of the
+    classes of tensors that share a step; None if the layer has no planes.
     """
 
     layer: int
     chunk_type: int
-    deformation: str | None
+    name: str
     heads: dict[str, int]
     network_ids: dict[str, int]
     weights_step: str
-    planes_step: str | None
+    planes_step: str | None = None
+
+    @property
+    def step_names(self) -> tuple[str, ...]:
+        """Of the steps in the layer's chunk, in their order there."""
+        return (self.weights_step,) if self.planes_step is None else (self.planes_step, self.weights_step)
 
 
 LAYER_KINDS: tuple[LayerKind, ...] = (
     LayerKind(
         layer=0,
         chunk_type=0,
-        deformation=None,
+        name="scaffold",
         heads=SCAFFOLD_NETWORKS,
         network_ids={"opacity": 0, "covariance": 1, "color": 2},
         weights_step="weights_scaffold",
-        planes_step=None,
     ),
     LayerKind(
         layer=1,
         chunk_type=1,
-        deformation="global_deformation",
+        name="global_deformation",
         heads=GLOBAL_HEADS,
         network_ids={TRUNK: 0, "position": 1, "feature": 2, "offset": 3, "scaling": 4},
         weights_step="weights_global",
@@ -53,7 +57,7 @@ LAYER_KINDS: tuple[LayerKind, ...] = (
     LayerKind(
         layer=2,
         chunk_type=2,
-        deformation="local_deformation",
+        name="local_deformation",
         heads=LOCAL_HEADS,
         network_ids={TRUNK: 0, "mean": 1, "scale": 2, "quat": 3, "opacity": 4, "color": 5},
         weights_step="weights_local",

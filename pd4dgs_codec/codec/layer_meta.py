@@ -78,7 +78,7 @@ class LayerMeta:
 
     def input_width(self, name: str, kind: LayerKind) -> int:
         """Inputs of network `name`: the scaffold's fixed ones, the sampled planes' or the trunk's outputs."""
-        if kind.deformation is None:
+        if kind.layer == 0:
             return SCAFFOLD_INPUT
         return sum(s.channels for s in self.scales) if name == TRUNK else self.networks[TRUNK][-1]
 
@@ -100,7 +100,7 @@ def pack_meta(meta: LayerMeta, kind: LayerKind) -> bytes:
     """Canonical msgpack of `meta`; what is empty is absent."""
     fields: dict[int, object] = {ROWS: meta.rows, SECTIONS: {int(k): meta.sections[k] for k in sorted(meta.sections)}}
     if meta.networks:
-        fields[STEPS] = [meta.steps[name] for name in step_names(kind)]
+        fields[STEPS] = [meta.steps[name] for name in kind.step_names]
     if meta.scales:
         fields[SCALES] = [[s.channels, *s.sides, *s.predictors] for s in meta.scales]
     if meta.networks:
@@ -108,7 +108,7 @@ def pack_meta(meta: LayerMeta, kind: LayerKind) -> bytes:
     return canonical.pack(fields)
 
 
-def unpack_meta(data: bytes, kind: LayerKind, rows_before: int, raw: bool) -> LayerMeta:
+def unpack_meta(data: bytes, kind: LayerKind, rows_before: int, raw_deformation: bool) -> LayerMeta:
     """The inverse of pack_meta (clause "layer parameters"); every count is within its limit afterwards."""
     where = f"layer {kind.layer}"
     fields = Fields(canonical.unpack(data), where, set(range(ROWS, NETWORKS + 1)))
@@ -119,7 +119,7 @@ def unpack_meta(data: bytes, kind: LayerKind, rows_before: int, raw: bool) -> La
         rows=fields.integer(ROWS, MAX_ANCHORS - rows_before),
         sections={s: sections.integer(s, MAX_PAYLOAD, low=1) for s in known_sections if s in sections},
         steps=_unpack_steps(fields, kind, where) if networks else {},
-        scales=_unpack_scales(fields, raw, where) if networks and kind.deformation else (),
+        scales=_unpack_scales(fields, raw_deformation, where) if networks and kind.layer > 0 else (),
         networks=networks,
     )
     for key, expected in ((STEPS, bool(networks)), (SCALES, bool(meta.scales))):
@@ -148,21 +148,15 @@ def check_symbol_count(meta: LayerMeta, kind: LayerKind, rows_before: int, paylo
         raise LimitExceeded(f"layer {kind.layer}: {symbols} symbols in {payload_bytes} bytes, limit {limit}")
 
 
-def step_names(kind: LayerKind) -> list[str]:
-    """Fields of Steps that a layer's chunk carries: planes (if the layer has any), then weights."""
-    return [name for name in (kind.planes_step, kind.weights_step) if name is not None]
-
-
 def _unpack_steps(fields: Fields, kind: LayerKind, where: str) -> dict[str, float]:
-    names = step_names(kind)
-    steps = dict(zip(names, fields.reals(STEPS, len(names)), strict=True))
+    steps = dict(zip(kind.step_names, fields.reals(STEPS, len(kind.step_names)), strict=True))
     for name, step in steps.items():
         if not is_step(step):
             raise Malformed(f"{where}: step {step!r} of {name}, expected a positive normal binary32 value")
     return steps
 
 
-def _unpack_scales(fields: Fields, raw: bool, where: str) -> tuple[ScaleMeta, ...]:
+def _unpack_scales(fields: Fields, raw_deformation: bool, where: str) -> tuple[ScaleMeta, ...]:
     rows = fields.sequence(SCALES)
     as_integer(len(rows), MAX_PLANE_SCALES, f"{where}: number of scales", low=1)
     scales: list[ScaleMeta] = []
@@ -174,7 +168,7 @@ def _unpack_scales(fields: Fields, raw: bool, where: str) -> tuple[ScaleMeta, ..
         for side in rest[:4]:
             as_integer(side, MAX_PLANE_SIDE, f"{where} scale {i} side", low=1)
         for predictor in rest[4:]:
-            if as_registered(predictor, PREDICTORS, f"{where} scale {i} predictor") != 0 and raw:
+            if as_registered(predictor, PREDICTORS, f"{where} scale {i} predictor") != 0 and raw_deformation:
                 raise Malformed(f"{where} scale {i}: predictor {predictor} on float32 planes, expected 0")
         scales.append(ScaleMeta(channels, tuple(rest[:4]), tuple(rest[4:])))
     return tuple(scales)
@@ -201,8 +195,8 @@ def _unpack_networks(fields: Fields, kind: LayerKind, where: str) -> dict[str, t
         if widths[-1] != kind.heads.get(name, widths[-1]):
             raise Malformed(f"{where} network {name}: {widths[-1]} outputs, expected {kind.heads[name]}")
         networks[name] = tuple(widths)
-    if kind.deformation is None and len(networks) != len(names):
+    if kind.layer == 0 and len(networks) != len(names):
         raise Malformed(f"{where}: networks {list(networks)}, expected {list(kind.network_ids)}")
-    if networks and kind.deformation is not None and (TRUNK not in networks or len(networks) == 1):
+    if networks and kind.layer > 0 and (TRUNK not in networks or len(networks) == 1):
         raise Malformed(f"{where}: networks {list(networks)}, expected '{TRUNK}' and at least one head")
     return networks

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pd4dgs_codec.attributes.quantise import quantise
-from pd4dgs_codec.attributes.table import ATTRIBUTES
-from pd4dgs_codec.codec.kinds import LAYER_KINDS
-from pd4dgs_codec.scene import MASK_STEP, Network, Scene
+from pd4dgs_codec.scene import MASK_STEP, Scene
 
 #: First part of the names of each layer's networks and planes.
 PREFIXES = {0: "", 1: "global", 2: "local"}
@@ -20,23 +18,19 @@ def to_npz_dict(scene: Scene, symbols: bool = False) -> dict[str, np.ndarray]:
 
     symbols: also NAME_q (int32) and NAME_step (float32) for every quantised array; anchor_step is the voxel size.
     """
-    arrays = {"anchor": scene.anchor}
-    steps: dict[str, float] = {}
-    for a in ATTRIBUTES:
-        arrays[a.name], steps[a.name] = getattr(scene, a.name), getattr(scene.steps, a.name)
-    for kind in LAYER_KINDS:
-        owner, q_weights = PREFIXES[kind.layer], getattr(scene.steps, kind.weights_step)
-        deformation = getattr(scene, kind.deformation) if kind.deformation else None
-        networks: dict[str, Network] = deformation.networks if deformation else {} if kind.layer else scene.networks
-        for name, network in networks.items():
+    arrays = {"anchor": scene.anchor, **scene.attributes}
+    steps = scene.steps.attributes
+    for layer, owner in PREFIXES.items():
+        tensors = scene.tensors(layer)
+        for name, network in tensors.networks.items():
             stem = f"mlp.{owner}.{name}" if owner else f"mlp.{name}"
             for i, (weight, bias) in enumerate(network):
                 arrays[f"{stem}.weight.{i}"], arrays[f"{stem}.bias.{i}"] = weight, bias
-                steps[f"{stem}.weight.{i}"] = steps[f"{stem}.bias.{i}"] = q_weights
-        for s, planes in enumerate(deformation.planes if deformation else ()):
+                steps[f"{stem}.weight.{i}"] = steps[f"{stem}.bias.{i}"] = scene.steps.weights(layer)
+        for s, planes in enumerate(tensors.planes):
             for name, plane in planes.items():
                 arrays[f"planes.{owner}.{s}.{name}"] = plane
-                steps[f"planes.{owner}.{s}.{name}"] = getattr(scene.steps, kind.planes_step or "")
+                steps[f"planes.{owner}.{s}.{name}"] = scene.steps.planes(layer)
     if symbols:
         quantised = {name: quantise(arrays[name], step, name) for name, step in steps.items()}
         arrays |= {f"{name}_q": k for name, k in quantised.items()}

@@ -1,6 +1,6 @@
-"""What a file does without, and the omissions that change no picture.
+"""The omissions that change no picture.
 
-`leave_out` works on the values that the file will hold, so that what it proves holds for them: cells that no
+`leave_out_unseen` works on the values that the file will hold, so that what it proves holds for them: cells that no
 renderer reads take the cheapest values, offsets of Gaussians that no view shows the commonest ones, and inputs that
 nothing reads and the weights of units that are silent or unread become 0. No array changes its shape, and all terms
 that sums lose were zeros: the same arithmetic gives the same bits.
@@ -9,38 +9,24 @@ that sums lose were zeros: the same arithmetic gives the same bits.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 
-from pd4dgs_codec.attributes import planes as decorrelation
 from pd4dgs_codec.attributes.quantise import dequantise, quantise
-from pd4dgs_codec.attributes.table import ATTRIBUTES
 from pd4dgs_codec.codec.kinds import LAYER_KINDS, LayerKind
-from pd4dgs_codec.codec.stages import entropy_bits
-from pd4dgs_codec.codec.symbols import dequantise_deformation, map_networks, quantise_deformation
+from pd4dgs_codec.codec.left_out import LeftOut
+from pd4dgs_codec.codec.plane_choice import choose_predictor, fill_plane
+from pd4dgs_codec.codec.symbols import rounded
+from pd4dgs_codec.entropy.bits import entropy_bits
 from pd4dgs_codec.evaluate.reach import reach
-from pd4dgs_codec.scene import FEATURE_DIM, N_OFFSETS, PLANES, TRUNK, Deformation, Network, Scene
+from pd4dgs_codec.scene import FEATURE_DIM, N_OFFSETS, PLANES, TRUNK, Deformation, Network, Planes, Scene
 
 #: Networks whose values may exceed this are left as they are; binary32 overflows at 3.4e38.
 LARGEST = 1e30
 
 
-@dataclass(frozen=True, eq=False)
-class LeftOut:
-    """Something that was not written. What it would have cost: `tensors` is coded to see; else that of `anchors`
-    average anchors; else `bits`, the order-0 entropy that went. lossless: no picture changes."""
-
-    what: str
-    why: str
-    kind: LayerKind | None = None
-    tensors: Deformation | None = None
-    anchors: int = 0
-    bits: float = 0.0
-    lossless: bool = False
-
-
-def leave_out(scene: Scene, raw_deformation: bool) -> tuple[Scene, list[LeftOut]]:
+def leave_out_unseen(scene: Scene, raw_deformation: bool) -> tuple[Scene, list[LeftOut]]:
     """(`scene` without what no picture needs, what went). scene: as planned, all its rows active at its highest level.
 
     Where nothing is left out the values stay those given; what takes another value takes one that has a symbol.
@@ -52,13 +38,17 @@ def leave_out(scene: Scene, raw_deformation: bool) -> tuple[Scene, list[LeftOut]
     return omissions.scene, omissions.found
 
 
+#: (weight, bias) of a linear layer -> what takes its place.
+LinearEdit = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
 class _Omissions:
     """scene: as given, less what went so far. decoded: the same as a decoder will see it."""
 
-    def __init__(self, scene: Scene, raw: bool):
-        self.scene, self.raw = scene, raw
+    def __init__(self, scene: Scene, raw_deformation: bool):
+        self.scene, self.raw_deformation = scene, raw_deformation
         self.found: list[LeftOut] = []
-        self.decoded = _as_decoded(scene, raw)
+        self.decoded = rounded(scene, raw_deformation)
 
     # -- networks ----------------------------------------------------------------------------------------------------
 
@@ -69,7 +59,7 @@ class _Omissions:
             for kind in LAYER_KINDS[1:]:
                 networks = self._networks(kind)
                 if networks:
-                    planes = getattr(self.decoded, kind.deformation or "").planes
+                    planes = self.decoded.tensors(kind.layer).planes
                     largest = [np.prod([np.abs(s[n]).max((1, 2)) for n, _, _ in PLANES], axis=0) for s in planes]
                     hidden = _largest(networks[TRUNK], np.concatenate(largest))
                     sizes |= {f"{kind.layer} {n}": _largest(net, hidden) for n, net in networks.items() if n != TRUNK}
@@ -91,10 +81,7 @@ class _Omissions:
 
     def _networks(self, kind: LayerKind) -> dict[str, Network]:
         """The decoded networks of a layer, none if it has none."""
-        if kind.deformation is None:
-            return self.decoded.networks
-        deformation = getattr(self.decoded, kind.deformation)
-        return {} if deformation is None else deformation.networks
+        return self.decoded.tensors(kind.layer).networks
 
     def _zero_unread_features(self) -> None:
         """Feature channels that no network reads: 0 in all anchors, and no residual; and the reverse, weights of
@@ -106,26 +93,25 @@ class _Omissions:
         zero = ~self.decoded.feature.any(axis=0)
         stale = unread & ~zero
         if stale.any():
-            feature = np.where(unread, np.float32(0), self.scene.feature)
             symbols = quantise(self.decoded.feature[:, stale], self.scene.steps.feature, "feature")
             self._note(f"{int(stale.sum())} feature channels", "no network reads them", _bits(symbols.T))
-            self._set(feature=feature)
+            self._edit(lambda scene: replace(scene, feature=np.where(unread, np.float32(0), scene.feature)))
         if (unread & moved).any():
-            self._edit_layer(LAYER_KINDS[1], "feature", -1, lambda w, b: _zero(w, b, rows=unread), "rows")
+            self._zero_weights(LAYER_KINDS[1], "feature", -1, lambda w, b: _zero(w, b, rows=unread), "rows")
         idle = np.concatenate([zero & ~moved, np.zeros(3, bool)])
         for name, weight in firsts.items():
             if weight[:, idle].any():
-                self._edit_layer(LAYER_KINDS[0], name, 0, lambda w, b: _zero(w, b, columns=idle), "columns")
+                self._zero_weights(LAYER_KINDS[0], name, 0, lambda w, b: _zero(w, b, columns=idle), "columns")
 
     def _zero_unread_channels(self, kind: LayerKind) -> None:
         """Plane channels that the trunk does not read, or whose product is 0 because one plane is 0."""
-        deformation: Deformation = getattr(self.decoded, kind.deformation or "")
+        deformation = self.decoded.tensors(kind.layer)
         alive = [np.all([scale[n].any(axis=(1, 2)) for n, _, _ in PLANES], axis=0) for scale in deformation.planes]
         silent = ~np.concatenate(alive)
         weight = deformation.networks[TRUNK][0][0]
         if weight[:, silent].any():
-            self._edit_layer(kind, TRUNK, 0, lambda w, b: _zero(w, b, columns=silent), "columns")
-            weight = getattr(self.decoded, kind.deformation or "").networks[TRUNK][0][0]
+            self._zero_weights(kind, TRUNK, 0, lambda w, b: _zero(w, b, columns=silent), "columns")
+            weight = self._networks(kind)[TRUNK][0][0]
         unread = np.split(~weight.any(axis=0), len(deformation.planes))
         stale = [
             [n for n, _, _ in PLANES if s[n][dead].any()] for s, dead in zip(deformation.planes, unread, strict=True)
@@ -138,13 +124,14 @@ class _Omissions:
             for n in names
         )
         count = sum(int(dead.sum()) for dead, names in zip(unread, stale, strict=True) if names)
-        self._note(f"{kind.deformation}: {count} plane channels", "the trunk does not read them", bits)
-        given = getattr(self.scene, kind.deformation or "")
-        planes = tuple(
-            {n: np.where(dead[:, None, None], np.float32(0), scale[n]) for n, _, _ in PLANES}
-            for scale, dead in zip(given.planes, unread, strict=True)
+        self._note(f"{kind.name}: {count} plane channels", "the trunk does not read them", bits)
+        self._edit_planes(
+            kind,
+            lambda planes: tuple(
+                {n: np.where(dead[:, None, None], np.float32(0), scale[n]) for n, _, _ in PLANES}
+                for scale, dead in zip(planes, unread, strict=True)
+            ),
         )
-        self._set_deformation(kind, Deformation(planes, given.networks))
 
     def _zero_dead_units(self, kind: LayerKind) -> None:
         """Hidden units whose input weights are all 0 and whose bias is not positive, or whose output nothing reads.
@@ -170,12 +157,12 @@ class _Omissions:
     ) -> None:
         """Zeroes the outputs `dead` (bool) of a linear layer, and those inputs of the linear layers that read it."""
         bits = self._cost(kind, [(name, index), *readers])
-        self._replace_layer(kind, name, index, lambda w, b: _zero(w, b, rows=dead))
+        self._edit_linear(kind, name, index, lambda w, b: _zero(w, b, rows=dead))
         for reader, j in readers:
-            self._replace_layer(kind, reader, j, lambda w, b: _zero(w, b, columns=dead))
-        where = f"{kind.deformation or 'scaffold'} {name}"
+            self._edit_linear(kind, reader, j, lambda w, b: _zero(w, b, columns=dead))
         bits -= self._cost(kind, [(name, index), *readers])
-        self._note(f"{where}: {int(dead.sum())} units of layer {index + 1}", "always 0, or read by nothing", bits)
+        what = f"{kind.name} {name}: {int(dead.sum())} units of layer {index + 1}"
+        self._note(what, "always 0, or read by nothing", bits)
 
     # -- offsets and cells -------------------------------------------------------------------------------------------
 
@@ -204,96 +191,93 @@ class _Omissions:
         bits = _bits(symbols.T) - _bits(freed.T)
         self._note(f"offsets of {int((~shown).sum())} Gaussians", "no view shows them at any time", bits)
         values = dequantise(freed, step).reshape(-1, N_OFFSETS, 3)
-        self._set(offset=np.where(shown[..., None], self.scene.offset, values))
+        self._edit(lambda scene: replace(scene, offset=np.where(shown[..., None], scene.offset, values)))
 
     def _free_cells(self, kind: LayerKind, reached: tuple[dict[str, np.ndarray], ...]) -> None:
-        given: Deformation = getattr(self.scene, kind.deformation or "")
-        decoded: Deformation = getattr(self.decoded, kind.deformation or "")
-        planes, saved, count, cells = [], 0.0, 0, 0
-        for scale, values, marks in zip(given.planes, decoded.planes, reached, strict=True):
-            filled = dict(scale)
+        decoded = self.decoded.tensors(kind.layer).planes
+        free: list[dict[str, np.ndarray]] = []  # what unread cells take, by name of the planes that have some
+        saved, count, cells = 0.0, 0, 0
+        for scale, marks in zip(decoded, reached, strict=True):
+            free.append({})
             for name, _, _ in PLANES:
                 read = marks[name]
                 cells += read.size
                 if read.all():
                     continue
                 count += int((~read).sum())
-                symbols = self._plane_symbols(kind, values[name])
-                if self.raw:
-                    free = np.zeros_like(scale[name])
-                    saved += 32.0 * len(free) * int((~read).sum())
+                if self.raw_deformation:
+                    free[-1][name] = np.zeros_like(scale[name])
+                    saved += 32.0 * len(scale[name]) * int((~read).sum())
                 else:
-                    fill = decorrelation.fill(symbols, read)
+                    symbols = self._plane_symbols(kind, scale[name])
+                    fill = fill_plane(symbols, read)
                     saved += _plane_bits(symbols) - _plane_bits(fill)
-                    free = dequantise(fill, getattr(self.scene.steps, kind.planes_step or ""))
-                filled[name] = np.where(read, scale[name], free)
-            planes.append(filled)
-        changed = any((p[n] != s[n]).any() for p, s in zip(planes, decoded.planes, strict=True) for n in p)
-        if changed:
+                    free[-1][name] = dequantise(fill, self.scene.steps.planes(kind.layer))
+
+        def filled(planes: Planes) -> Planes:
+            return tuple(
+                scale | {name: np.where(marks[name], scale[name], values[name]) for name in values}
+                for scale, marks, values in zip(planes, reached, free, strict=True)
+            )
+
+        if any(
+            (p[n] != s[n]).any()
+            for p, s in zip(filled(self.scene.tensors(kind.layer).planes), decoded, strict=True)
+            for n in p
+        ):
             why = "no anchor is ever there" if kind.layer == 1 else "no Gaussian shown is ever there"
-            self._note(f"{kind.deformation}: {count:,} of {cells:,} plane cells", why, saved)
-            self._set_deformation(kind, Deformation(tuple(planes), given.networks))
+            self._note(f"{kind.name}: {count:,} of {cells:,} plane cells", why, saved)
+            self._edit_planes(kind, filled)
 
     # -- bookkeeping -------------------------------------------------------------------------------------------------
 
     def _note(self, what: str, why: str, bits: float) -> None:
         self.found.append(LeftOut(what, why, bits=max(bits, 0.0), lossless=True))
 
-    def _set(self, **fields) -> None:
-        self.scene = replace(self.scene, **fields)
-        self.decoded = _as_decoded(self.scene, self.raw)
+    def _edit(self, edit: Callable[[Scene], Scene]) -> None:
+        """Every edit puts in values that come back as they are: what holds for the scene holds for the decoded one."""
+        self.scene, self.decoded = edit(self.scene), edit(self.decoded)
 
-    def _set_deformation(self, kind: LayerKind, deformation: Deformation) -> None:
-        self._set(**{kind.deformation or "": deformation})
+    def _edit_planes(self, kind: LayerKind, edit: Callable[[Planes], Planes]) -> None:
+        def edited(scene: Scene) -> Scene:
+            tensors = scene.tensors(kind.layer)
+            return scene.with_tensors(kind.layer, Deformation(edit(tensors.planes), tensors.networks))
 
-    def _edit_layer(self, kind: LayerKind, name: str, index: int, edit: Callable, of: str) -> None:
-        where = f"{kind.deformation or 'scaffold'} {name}"
+        self._edit(edited)
+
+    def _edit_linear(self, kind: LayerKind, name: str, index: int, edit: LinearEdit) -> None:
+        """Puts edit(weight, bias) in place of one linear layer of the network `name`."""
+
+        def edited(scene: Scene) -> Scene:
+            tensors = scene.tensors(kind.layer)
+            layers = list(tensors.networks[name])
+            weight, bias = edit(*layers[index])
+            layers[index] = np.ascontiguousarray(weight), np.ascontiguousarray(bias)
+            return scene.with_tensors(
+                kind.layer, Deformation(tensors.planes, {**tensors.networks, name: tuple(layers)})
+            )
+
+        self._edit(edited)
+
+    def _zero_weights(self, kind: LayerKind, name: str, index: int, edit: LinearEdit, of: str) -> None:
         before = self._cost(kind, [(name, index)])
-        self._replace_layer(kind, name, index, edit)
+        self._edit_linear(kind, name, index, edit)
         saved = before - self._cost(kind, [(name, index)])
-        self._note(f"{where}: {of} of weights", "read by nothing, or always times 0", saved)
-
-    def _replace_layer(self, kind: LayerKind, name: str, index: int, edit: Callable) -> None:
-        """Puts edit(weight, bias) in place of one linear layer of the scene's network `name`."""
-        given = self.scene.networks if kind.deformation is None else getattr(self.scene, kind.deformation).networks
-        layers = list(given[name])
-        layers[index] = tuple(np.ascontiguousarray(a) for a in edit(*layers[index]))
-        networks = {**given, name: tuple(layers)}
-        if kind.deformation is None:
-            self._set(networks=networks)
-        else:
-            self._set_deformation(kind, Deformation(getattr(self.scene, kind.deformation).planes, networks))
+        self._note(f"{kind.name} {name}: {of} of weights", "read by nothing, or always times 0", saved)
 
     def _cost(self, kind: LayerKind, layers: list[tuple[str, int]]) -> float:
         """Order-0 entropy of the weights and biases of linear layers (network, index); 0 if they are float32 values."""
-        if self.raw and kind.deformation is not None:
+        if self.raw_deformation and kind.layer > 0:
             return 0.0
-        step = getattr(self.scene.steps, kind.weights_step)
+        step = self.scene.steps.weights(kind.layer)
         arrays = [a for name, index in layers for a in self._networks(kind)[name][index]]
         return _bits([quantise(a, step, "weight").ravel() for a in arrays])
 
     def _plane_symbols(self, kind: LayerKind, plane: np.ndarray) -> np.ndarray:
         """int32 symbols, or of float32 values their bits."""
-        if self.raw:
+        if self.raw_deformation:
             return np.ascontiguousarray(plane).view(np.int32)
-        return quantise(plane, getattr(self.scene.steps, kind.planes_step or ""), "plane")
-
-
-def _as_decoded(scene: Scene, raw: bool) -> Scene:
-    """`scene` with the values that the file will hold."""
-    steps = scene.steps
-    fields: dict = {
-        a.name: dequantise(quantise(getattr(scene, a.name), getattr(steps, a.name), a.name), getattr(steps, a.name))
-        for a in ATTRIBUTES
-    }
-    step = steps.weights_scaffold
-    fields["networks"] = map_networks(scene.networks, lambda name, x: dequantise(quantise(x, step, name), step))
-    for kind in LAYER_KINDS[1:]:
-        deformation = getattr(scene, kind.deformation or "")
-        if deformation is not None and not raw:
-            symbols = quantise_deformation(deformation, kind, steps)
-            fields[kind.deformation or ""] = dequantise_deformation(symbols, kind, steps)
-    return replace(scene, **fields)
+        return quantise(plane, self.scene.steps.planes(kind.layer), "plane")
 
 
 def _largest(network: Network, inputs: np.ndarray) -> np.ndarray:
@@ -307,7 +291,9 @@ def _largest(network: Network, inputs: np.ndarray) -> np.ndarray:
     return size
 
 
-def _zero(weight: np.ndarray, bias: np.ndarray, rows=None, columns=None) -> tuple[np.ndarray, np.ndarray]:
+def _zero(
+    weight: np.ndarray, bias: np.ndarray, rows: np.ndarray | None = None, columns: np.ndarray | None = None
+) -> tuple[np.ndarray, np.ndarray]:
     """The layer with its rows (outputs) or columns (inputs) `rows`, `columns` bool set to 0."""
     if columns is not None:
         weight = np.where(columns[None, :], np.float32(0), weight)
@@ -323,5 +309,5 @@ def _bits(channels: Iterable[np.ndarray]) -> float:
 
 def _plane_bits(symbols: np.ndarray) -> float:
     """Order-0 entropy of the residuals of a plane [C, H, W]."""
-    residual = decorrelation.choose_predictor(symbols)[1]
+    residual = choose_predictor(symbols)[1]
     return _bits(residual.reshape(len(residual), -1))

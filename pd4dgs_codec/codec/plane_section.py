@@ -55,7 +55,7 @@ def read_planes(data: bytes, shapes: Sequence[Shape]) -> list[np.ndarray]:
 
 
 def _write_staged(residuals: Sequence[np.ndarray], effort: int) -> bytes:
-    shapes: list[Shape] = [plane.shape for plane in residuals]  # type: ignore[misc]
+    shapes: list[Shape] = [plane.shape for plane in residuals]
     planes = [plane.reshape(len(plane), -1).astype(np.int64) for plane in residuals]
     counts = []
     for stage in range(1, _stage_count(shapes)):
@@ -94,5 +94,5 @@ def _activity(channels: np.ndarray, shape: Shape) -> np.ndarray:
     """int64 [H * W]: relative magnitudes of channels int64 [m, H * W], summed over 3 x 3 cells, the border repeated."""
     _, height, width = shape
     padded = np.pad(relative_magnitude(channels).reshape(height, width), 1, mode="edge")
-    columns = padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]
+    columns: np.ndarray = padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]
     return (columns[:-2] + columns[1:-1] + columns[2:]).ravel()

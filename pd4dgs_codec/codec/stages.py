@@ -12,6 +12,7 @@ from itertools import accumulate
 
 import numpy as np
 
+from pd4dgs_codec.entropy.bits import entropy_bits
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint
 from pd4dgs_codec.errors import Malformed
@@ -28,8 +29,8 @@ def relative_magnitude(residuals: np.ndarray) -> np.ndarray:
     """int64 [n]: sum over channels of the magnitudes of residuals int64 [m, n] relative to their channel's mean, in
     units of 1/256. Below 2^8 m n."""
     magnitude = np.abs(residuals)
-    places = magnitude.shape[1]
-    return (magnitude * (places << 8) // (magnitude.sum(axis=1, keepdims=True) + 1)).sum(axis=0)
+    relative: np.ndarray = magnitude * (magnitude.shape[1] << 8) // (magnitude.sum(axis=1, keepdims=True) + 1)
+    return relative.sum(axis=0)
 
 
 def activity_classes(activity: np.ndarray, count: int) -> np.ndarray:
@@ -53,19 +54,6 @@ def cheapest_class_count(groups: Sequence[tuple[np.ndarray, np.ndarray]]) -> int
                 bits += sum(entropy_bits(channel[places]) + PRIOR_BITS for channel in residuals)
         costs.append((bits, count))
     return min(costs)[1]
-
-
-def entropy_bits(symbols: np.ndarray) -> float:
-    """Empirical order-0 entropy of all symbols together."""
-    if not symbols.size:
-        return 0.0
-    low, high = int(symbols.min()), int(symbols.max())
-    if high - low > 4 * symbols.size + 1024:
-        counts = np.unique(symbols, return_counts=True)[1]
-    else:
-        counts = np.bincount(symbols - low)
-        counts = counts[counts > 0]
-    return float(counts @ np.log2(symbols.size / counts))
 
 
 def smaller_form(

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from pd4dgs_codec.attributes.quantise import all_finite, dequantise, quantise
-from pd4dgs_codec.attributes.table import ATTRIBUTES, attribute_rows, dequantise_attributes, quantise_attributes
+from pd4dgs_codec.attributes.table import attribute_rows, dequantise_attributes, quantise_attributes
 from pd4dgs_codec.codec.kinds import LAYER_KINDS, LayerKind
 from pd4dgs_codec.errors import Malformed
-from pd4dgs_codec.scene import PLANES, Deformation, Network, Scene, SceneInfo, Steps
+from pd4dgs_codec.scene import PLANES, Deformation, Network, Planes, Scene, SceneInfo, Steps
 
-Planes = tuple[dict[str, np.ndarray], ...]
+#: (name for messages, array) -> array of the same shape.
+ArrayMap = Callable[[str, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,9 +23,8 @@ class LayerSymbols:
 
     anchor_q: int32 [n, 3] voxel indices of the layer's own anchors. mask_increase: int32 [rows before] rise of the
     earlier anchors' mask codes, mask_own: int32 [n] codes of its own. attributes: int32 [68, n].
-    planes, networks: int32 symbols, or float32 values if `raw`; networks in the order of their registry ids.
-    steps: quantisation steps of this layer's planes (if it has any), then weights, by field of Steps; empty if it has
-    no networks.
+    planes, networks: int32 symbols, or float32 values if raw_deformation; networks in the order of their registry ids.
+    steps: quantisation steps of this layer by name, as in LayerKind.step_names; empty if it has no networks.
     """
 
     kind: LayerKind
@@ -35,7 +35,7 @@ class LayerSymbols:
     planes: Planes
     networks: dict[str, Network]
     steps: dict[str, float]
-    raw: bool = False
+    raw_deformation: bool = False
 
     def tensors(self) -> Iterator[np.ndarray]:
         """The planes (scale by scale, in PLANES' order), then weight and bias of each linear layer of each network."""
@@ -51,13 +51,13 @@ class LayerSymbols:
         return [self.anchor_q, self.mask_increase, self.mask_own, self.attributes, *self.tensors()]
 
 
-def map_deformation(deformation: Deformation, of_planes, of_weights) -> Deformation:
+def map_deformation(deformation: Deformation, of_planes: ArrayMap, of_weights: ArrayMap) -> Deformation:
     """`deformation` with of_planes(name, array) and of_weights(name, array) applied to its arrays."""
     planes = tuple({p: of_planes(f"plane {p}", scale[p]) for p, _, _ in PLANES} for scale in deformation.planes)
     return Deformation(planes, map_networks(deformation.networks, of_weights))
 
 
-def map_networks(networks: dict[str, Network], function) -> dict[str, Network]:
+def map_networks(networks: dict[str, Network], function: ArrayMap) -> dict[str, Network]:
     """`networks` with function(name, array) applied to every weight and bias."""
     return {
         name: tuple((function(f"{name} weight", w), function(f"{name} bias", b)) for w, b in network)
@@ -65,24 +65,33 @@ def map_networks(networks: dict[str, Network], function) -> dict[str, Network]:
     }
 
 
-def quantise_deformation(deformation: Deformation, kind: LayerKind, steps: Steps) -> Deformation:
-    """int32 symbols of a deformation's planes and networks under the steps of its layer."""
-    assert kind.planes_step is not None
-    q_planes, q_weights = getattr(steps, kind.planes_step), getattr(steps, kind.weights_step)
+def quantise_tensors(tensors: Deformation, kind: LayerKind, steps: Steps) -> Deformation:
+    """int32 symbols of a layer's planes and networks."""
     return map_deformation(
-        deformation,
-        lambda name, x: quantise(x, q_planes, f"{kind.deformation} {name}"),
-        lambda name, x: quantise(x, q_weights, f"{kind.deformation} {name}"),
+        tensors,
+        lambda name, x: quantise(x, steps.planes(kind.layer), f"{kind.name} {name}"),
+        lambda name, x: quantise(x, steps.weights(kind.layer), f"{kind.name} {name}"),
     )
 
 
-def dequantise_deformation(deformation: Deformation, kind: LayerKind, steps: Steps) -> Deformation:
-    """The float32 deformation of those symbols."""
-    assert kind.planes_step is not None
-    q_planes, q_weights = getattr(steps, kind.planes_step), getattr(steps, kind.weights_step)
+def dequantise_tensors(tensors: Deformation, kind: LayerKind, steps: Steps) -> Deformation:
+    """The float32 planes and networks of those symbols."""
     return map_deformation(
-        deformation, lambda name, k: dequantise(k, q_planes), lambda name, k: dequantise(k, q_weights)
+        tensors,
+        lambda _, k: dequantise(k, steps.planes(kind.layer)),
+        lambda _, k: dequantise(k, steps.weights(kind.layer)),
     )
+
+
+def round_tensors(tensors: Deformation, kind: LayerKind, steps: Steps) -> Deformation:
+    """A layer's planes and networks with the values that come back. Raises EncodeError for one that has no symbol."""
+    return dequantise_tensors(quantise_tensors(tensors, kind, steps), kind, steps)
+
+
+def layer_steps(steps: Steps, kind: LayerKind) -> dict[str, float]:
+    """The steps in the chunk of a layer by name, as in LayerKind.step_names."""
+    planes = {} if kind.planes_step is None else {kind.planes_step: steps.planes(kind.layer)}
+    return planes | {kind.weights_step: steps.weights(kind.layer)}
 
 
 def layer_symbols(scene: Scene, index: int, raw_deformation: bool = False) -> LayerSymbols:
@@ -91,36 +100,21 @@ def layer_symbols(scene: Scene, index: int, raw_deformation: bool = False) -> La
     first, last = (scene.rows[index - 1] if index else 0), scene.rows[index]
     codes = scene.mask[index].astype(np.int32)
     before = scene.mask[index - 1].astype(np.int32) if index else codes[:0]
-    values = {a.name: getattr(scene, a.name)[first:last] for a in ATTRIBUTES}
-    planes, networks, fields, raw = _network_symbols(scene, kind, raw_deformation)
+    tensors = scene.tensors(kind.layer)
+    raw_deformation = raw_deformation and kind.layer > 0 and bool(tensors.networks)
+    if not raw_deformation:
+        tensors = quantise_tensors(tensors, kind, scene.steps)
     return LayerSymbols(
         kind=kind,
         anchor_q=scene.anchor_q[first:last],
         mask_increase=codes[:first] - before,
         mask_own=codes[first:],
-        attributes=quantise_attributes(values, vars(scene.steps)),
-        planes=planes,
-        networks={name: networks[name] for name in kind.network_ids if name in networks},
-        steps={name: getattr(scene.steps, name) for name in fields},
-        raw=raw,
+        attributes=quantise_attributes({k: v[first:last] for k, v in scene.attributes.items()}, scene.steps.attributes),
+        planes=tensors.planes,
+        networks={name: tensors.networks[name] for name in kind.network_ids if name in tensors.networks},
+        steps=layer_steps(scene.steps, kind) if tensors.networks else {},
+        raw_deformation=raw_deformation,
     )
-
-
-def _network_symbols(
-    scene: Scene, kind: LayerKind, raw: bool
-) -> tuple[Planes, dict[str, Network], tuple[str, ...], bool]:
-    """(planes, networks, fields of Steps they use, whether they are float32 values) of one layer."""
-    if kind.deformation is None:
-        step = getattr(scene.steps, kind.weights_step)
-        networks = map_networks(scene.networks, lambda name, x: quantise(x, step, f"scaffold {name}"))
-        return (), networks, (kind.weights_step,), False
-    deformation = getattr(scene, kind.deformation)
-    if deformation is None:
-        return (), {}, (), False
-    if not raw:
-        deformation = quantise_deformation(deformation, kind, scene.steps)
-    assert kind.planes_step is not None
-    return deformation.planes, deformation.networks, (kind.planes_step, kind.weights_step), raw
 
 
 def assemble(info: SceneInfo, attribute_steps: dict[str, float], layers: Sequence[LayerSymbols]) -> Scene:
@@ -132,7 +126,7 @@ def assemble(info: SceneInfo, attribute_steps: dict[str, float], layers: Sequenc
     attributes = np.concatenate([layer.attributes for layer in layers], axis=1)
     values = dequantise_attributes(attributes, attribute_steps)
     masks = _mask_codes(layers)
-    tensors = {layer.kind.layer: _dequantised_networks(layer, steps) for layer in layers}
+    tensors = {layer.kind.layer: _decoded_tensors(layer, steps) for layer in layers}
     return Scene(
         info=info,
         steps=steps,
@@ -144,8 +138,8 @@ def assemble(info: SceneInfo, attribute_steps: dict[str, float], layers: Sequenc
         offset=values["offset"],
         mask=tuple(m.astype(np.uint8) for m in masks),
         networks=tensors[0].networks,
-        global_deformation=tensors.get(1) if 1 in tensors and tensors[1].networks else None,
-        local_deformation=tensors.get(2) if 2 in tensors and tensors[2].networks else None,
+        global_deformation=tensors[1] if 1 in tensors and tensors[1].networks else None,
+        local_deformation=tensors[2] if 2 in tensors and tensors[2].networks else None,
     )
 
 
@@ -181,41 +175,44 @@ def _with_steps(
     """(symbols, their step) of everything in `layer` that is dequantised."""
     yield layer.anchor_q, voxel_size
     yield from ((rows, attribute_steps[a.name]) for a, rows in attribute_rows(layer.attributes))
-    if not layer.raw:
+    if not layer.raw_deformation:
         planes, steps = len(PLANES) * len(layer.planes), list(layer.steps.values())
         yield from ((k, steps[0 if i < planes else -1]) for i, k in enumerate(layer.tensors()))
 
 
-def rounded(scene: Scene, raw_deformation: bool = False) -> Scene:
-    """The scene that the file of a planned scene decodes to. Raises EncodeError for a value that has no symbol."""
-    layers = [layer_symbols(scene, i, raw_deformation) for i in range(len(scene.layers))]
-    return assemble(scene.info, {a.name: getattr(scene.steps, a.name) for a in ATTRIBUTES}, layers)
-
-
-def _dequantised_networks(layer: LayerSymbols, steps: Steps) -> Deformation:
+def _decoded_tensors(layer: LayerSymbols, steps: Steps) -> Deformation:
     stored = Deformation(layer.planes, layer.networks)
-    if layer.raw or not layer.networks:
-        return stored
-    if layer.kind.deformation is None:
-        step = getattr(steps, layer.kind.weights_step)
-        return Deformation((), map_networks(layer.networks, lambda name, k: dequantise(k, step)))
-    return dequantise_deformation(stored, layer.kind, steps)
+    return stored if layer.raw_deformation else dequantise_tensors(stored, layer.kind, steps)
+
+
+def rounded(scene: Scene, raw_deformation: bool = False) -> Scene:
+    """`scene` with the values that come back from its file. Raises EncodeError for one that has no symbol."""
+    steps = scene.steps
+    attributes = {
+        name: dequantise(quantise(x, steps.attributes[name], name), steps.attributes[name])
+        for name, x in scene.attributes.items()
+    }
+    result = replace(
+        scene, feature=attributes["feature"], scaling_log=attributes["scaling_log"], offset=attributes["offset"]
+    )
+    for kind in LAYER_KINDS[:1] if raw_deformation else LAYER_KINDS:
+        if kind.layer == 0 or scene.deformation(kind.layer) is not None:
+            result = result.with_tensors(kind.layer, round_tensors(scene.tensors(kind.layer), kind, steps))
+    return result
 
 
 def float_tensors(scene: Scene, index: int) -> list[np.ndarray]:
     """The float32 arrays of scene.layers[index] alone: anchor, attributes in the table's order, planes, networks."""
     kind = LAYER_KINDS[scene.layers[index]]
     own = slice(scene.rows[index - 1] if index else 0, scene.rows[index])
-    if kind.deformation is None:
-        deformation: Deformation | None = Deformation((), scene.networks)
-    else:
-        deformation = getattr(scene, kind.deformation)
-    arrays = [scene.anchor[own], *(getattr(scene, a.name)[own] for a in ATTRIBUTES)]
-    if deformation is not None:
-        arrays += [scale[name] for scale in deformation.planes for name, _, _ in PLANES]
-        ordered = [deformation.networks[name] for name in kind.network_ids if name in deformation.networks]
-        arrays += [a for network in ordered for pair in network for a in pair]
-    return arrays
+    tensors = scene.tensors(kind.layer)
+    ordered = [tensors.networks[name] for name in kind.network_ids if name in tensors.networks]
+    return [
+        scene.anchor[own],
+        *(values[own] for values in scene.attributes.values()),
+        *(scale[name] for scale in tensors.planes for name, _, _ in PLANES),
+        *(array for network in ordered for pair in network for array in pair),
+    ]
 
 
 def first_duplicate(anchor_q: np.ndarray) -> np.ndarray | None:

@@ -1,5 +1,6 @@
-"""Dataset readers, the synthetic scenes, and the exporter to the iPhone layout."""
+"""Dataset readers and the synthetic scenes."""
 
-from .dataset import Dataset, View, load
+from pd4dgs_codec.data.dataset import load
+from pd4dgs_codec.data.view import Dataset, View
 
 __all__ = ["Dataset", "View", "load"]

@@ -9,9 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..errors import DataError
-from .dataset import View
-from .files import check_downscale, read_image, shrink_image, shrink_mask
+from pd4dgs_codec.data.files import check_downscale, read_image, shrink_image, shrink_mask
+from pd4dgs_codec.data.view import View
+from pd4dgs_codec.errors import DataError
 
 #: Largest |R Rᵀ - I| of a pose that still counts as a rotation (files round to 3 or more decimals).
 ROTATION_TOLERANCE = 1e-3
@@ -47,8 +47,8 @@ class Lens:
 
 
 @dataclass(frozen=True, eq=False)
-class Frame:
-    """One frame before its pixels are read. viewmat: float64 [4, 4] world to camera; time: as stored."""
+class UnreadView:
+    """A frame of a dataset before its pixels are read. viewmat: float64 [4, 4] world to camera; time: as stored."""
 
     name: str
     camera_id: int
@@ -132,7 +132,7 @@ def rectify(image: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     return np.where(seen[..., None], top * (1 - b) + bottom * b + 0.5, 0).astype(np.uint8), seen
 
 
-def read_view(frame: Frame, time: float, downscale: int, *, composite: bool) -> View:
+def read_view(frame: UnreadView, time: float, downscale: int, *, composite: bool) -> View:
     """Read the frame's pixels and make it a View at normalised time `time`."""
     lens, size = frame.lens, (frame.lens.width, frame.lens.height)
     mask = None
@@ -147,12 +147,12 @@ def read_view(frame: Frame, time: float, downscale: int, *, composite: bool) -> 
     return View(viewmat, lens.matrix(downscale), width, height, time, image, mask, frame.name, frame.camera_id)
 
 
-def centers(frames: Sequence[Frame]) -> np.ndarray:
+def centers(frames: Sequence[UnreadView]) -> np.ndarray:
     """Camera centres float64 [n, 3], world."""
     return np.stack([-f.viewmat[:3, :3].T @ f.viewmat[:3, 3] for f in frames])
 
 
-def mean_up(frames: Sequence[Frame]) -> tuple[float, float, float]:
+def mean_up(frames: Sequence[UnreadView]) -> tuple[float, float, float]:
     """Unit mean of the cameras' up directions (minus OpenCV's y axis)."""
     up = -np.mean([f.viewmat[1, :3] for f in frames], axis=0)
     norm = np.linalg.norm(up)
@@ -191,7 +191,7 @@ def points_box(points: np.ndarray) -> np.ndarray:
     return np.stack([low - pad, high + pad]).astype(np.float32)
 
 
-def cameras_box(frames: Sequence[Frame], depth: tuple[float, float] | None = None) -> np.ndarray:
+def cameras_box(frames: Sequence[UnreadView], depth: tuple[float, float] | None = None) -> np.ndarray:
     """float32 [2, 3]: a cube around the point nearest to all optical axes, in the proportion of D-NeRF's.
 
     Its half side is 1.3/4 of the median distance, or half of far - near if `depth` is known. Nearly parallel axes have
@@ -210,7 +210,7 @@ def cameras_box(frames: Sequence[Frame], depth: tuple[float, float] | None = Non
     return np.stack([middle - half, middle + half]).astype(np.float32)
 
 
-def depth_range(frames: Sequence[Frame], box: np.ndarray, points: np.ndarray | None) -> tuple[float, float]:
+def depth_range(frames: Sequence[UnreadView], box: np.ndarray, points: np.ndarray | None) -> tuple[float, float]:
     """(near, far): half the nearest and 1.5 times the farthest depth of the points, else of the box's corners."""
     if points is None or not len(points):
         points = np.stack(np.meshgrid(*box.T.astype(np.float64)), axis=-1).reshape(-1, 3)

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ..errors import DataError
+from pd4dgs_codec.errors import DataError
+
+if TYPE_CHECKING:
+    from PIL.Image import Image as Picture
 
 IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 WHITE = 255
@@ -62,30 +65,39 @@ def find_image(folder: Path, name: str) -> Path:
     raise DataError(f"{folder / name}: image is missing (tried as it is, .png, .jpg and .jpeg)")
 
 
-def _open(path: Path):
+def _open(path: Path, what: str = "image", size: tuple[int, int] | None = None) -> Picture:
+    """The file's picture, its pixels not read yet; `size` = (W, H) is what it must measure."""
     try:
         from PIL import Image, UnidentifiedImageError
     except ImportError:
         raise DataError(f"{path}: reading images needs pillow (pip install 'pd4dgs-codec[train]')") from None
     try:
-        return Image.open(path)
+        picture = Image.open(path)
     except FileNotFoundError:
         raise DataError(f"{path}: image is missing") from None
     except (UnidentifiedImageError, OSError, Image.DecompressionBombError):
         raise DataError(f"{path}: not an image that can be read") from None
+    if size is not None and picture.size != tuple(size):
+        picture.close()
+        raise DataError(f"{path}: {what} is {picture.width}x{picture.height}, expected {size[0]}x{size[1]}")
+    return picture
 
 
 def image_info(path: Path) -> tuple[int, int, bool]:
     """Width, height and whether there is an alpha channel, from the file's header."""
     with _open(path) as image:
-        return image.width, image.height, "A" in image.getbands() or "transparency" in image.info
+        return image.width, image.height, _has_alpha(image)
 
 
-def _rgb(image, *, composite: bool):
-    """PIL image in mode RGB: alpha composited on white, or dropped."""
+def _has_alpha(image: Picture) -> bool:
+    return "A" in image.getbands() or "transparency" in image.info
+
+
+def _rgb(image: Picture, *, composite: bool) -> Picture:
+    """The picture in mode RGB: alpha composited on white, or dropped."""
     from PIL import Image
 
-    if composite and ("A" in image.getbands() or "transparency" in image.info):
+    if composite and _has_alpha(image):
         image = image.convert("RGBA")
         image = Image.alpha_composite(Image.new("RGBA", image.size, (WHITE,) * 4), image)
     return image.convert("RGB")
@@ -96,9 +108,7 @@ def read_image(path: Path, size: tuple[int, int], *, downscale: int = 1, composi
 
     composite: put a transparent image on white; otherwise its alpha is dropped (photographs).
     """
-    with _open(path) as image:
-        if image.size != tuple(size):
-            raise DataError(f"{path}: image is {image.width}x{image.height}, expected {size[0]}x{size[1]}")
+    with _open(path, "image", size) as image:
         check_downscale(size, downscale, str(path))
         try:
             rgb = _rgb(image, composite=composite)
@@ -112,9 +122,7 @@ def read_image(path: Path, size: tuple[int, int], *, downscale: int = 1, composi
 
 def read_mask(path: Path, size: tuple[int, int], *, downscale: int = 1) -> np.ndarray:
     """bool [H // downscale, W // downscale]: True where every pixel of the block is non-zero."""
-    with _open(path) as image:
-        if image.size != tuple(size):
-            raise DataError(f"{path}: mask is {image.width}x{image.height}, expected {size[0]}x{size[1]}")
+    with _open(path, "mask", size) as image:
         try:
             return shrink_mask(np.array(image.convert("L")) > 0, downscale)
         except (OSError, SyntaxError, ValueError) as e:
@@ -136,7 +144,7 @@ def shrink_image(image: np.ndarray, k: int) -> np.ndarray:
     """uint8 [H, W, 3] -> uint8 [H // k, W // k, 3], mean of each block, halves rounded up (as `read_image` does)."""
     if k == 1:
         return image
-    return (_blocks(image, k).mean(axis=(1, 3)) + 0.5).astype(np.uint8)
+    return np.asarray(_blocks(image, k).mean(axis=(1, 3)) + 0.5).astype(np.uint8)
 
 
 def shrink_mask(mask: np.ndarray, k: int) -> np.ndarray:

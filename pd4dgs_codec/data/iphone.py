@@ -8,10 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from ..errors import DataError
-from .cameras import (
-    Frame,
+from pd4dgs_codec.data.cameras import (
     Lens,
+    UnreadView,
     cameras_box,
     check_rotation,
     depth_range,
@@ -22,19 +21,20 @@ from .cameras import (
     seconds_range,
     world_to_camera,
 )
-from .dataset import Dataset, View
-from .files import array, number, read_json, read_mask
+from pd4dgs_codec.data.files import array, number, read_json, read_mask
+from pd4dgs_codec.data.view import Dataset, View
+from pd4dgs_codec.errors import DataError
 
 
 @dataclass(frozen=True, eq=False)
 class CameraFiles:
     """What the files say of the cameras. Poses are centred and scaled, lenses are those of rgb/{factor}x.
 
-    A Frame's time is its time id. points: float32 [M, 3] of points.npy, centred and scaled, or None.
+    A UnreadView's time is its time id. points: float32 [M, 3] of points.npy, centred and scaled, or None.
     """
 
-    train: tuple[Frame, ...]
-    test: tuple[Frame, ...]
+    train: tuple[UnreadView, ...]
+    test: tuple[UnreadView, ...]
     factor: int
     scene: dict[str, Any]
     extra: dict[str, Any]
@@ -132,7 +132,7 @@ def read_cameras(folder: str | Path) -> CameraFiles:
     path = folder / "metadata.json"
     metadata = read_json(path)
 
-    def frame(name: str) -> Frame:
+    def frame(name: str) -> UnreadView:
         entry = metadata.get(name)
         if not isinstance(entry, dict):
             raise DataError(f"{path}: no entry for frame {name!r}, which the split lists")
@@ -140,7 +140,7 @@ def read_cameras(folder: str | Path) -> CameraFiles:
         lens, rotation, position = read_camera(folder / "camera" / f"{name}.json", factor)
         viewmat = world_to_camera(rotation, (position - center) * scale)
         camera_id = int(number(entry.get("camera_id", 0), f"{path}: {name}: camera_id"))
-        return Frame(name, camera_id, time, viewmat, lens, folder / "rgb" / f"{factor}x" / f"{name}.png")
+        return UnreadView(name, camera_id, time, viewmat, lens, folder / "rgb" / f"{factor}x" / f"{name}.png")
 
     train, test = (tuple(frame(name) for name in names) for names in _split_names(folder))
     if not train:
@@ -148,7 +148,7 @@ def read_cameras(folder: str | Path) -> CameraFiles:
     return CameraFiles(train, test, factor, scene, extra, _points(folder, center, scale))
 
 
-def _with_covisible(view: View, frame: Frame, folder: Path, factor: int, downscale: int) -> View:
+def _with_covisible(view: View, frame: UnreadView, folder: Path, factor: int, downscale: int) -> View:
     path = folder / "covisible" / f"{factor}x" / "val" / f"{frame.name}.png"
     if not path.is_file():
         raise DataError(f"{path}: covisibility mask is missing, though others of its folder are there")
@@ -156,7 +156,7 @@ def _with_covisible(view: View, frame: Frame, folder: Path, factor: int, downsca
     return replace(view, mask=mask if view.mask is None else mask & view.mask)
 
 
-def _box(files: CameraFiles, frames: list[Frame], folder: Path) -> np.ndarray:
+def _box(files: CameraFiles, frames: list[UnreadView], folder: Path) -> np.ndarray:
     if files.extra.get("bbox") is not None:
         where = f"{folder / 'extra.json'}: bbox"
         box = array(files.extra["bbox"], (2, 3), where).astype(np.float32)
@@ -166,7 +166,7 @@ def _box(files: CameraFiles, frames: list[Frame], folder: Path) -> np.ndarray:
     return cameras_box(frames) if files.points is None else points_box(files.points)
 
 
-def _near_far(files: CameraFiles, frames: list[Frame], box: np.ndarray, folder: Path) -> tuple[float, float]:
+def _near_far(files: CameraFiles, frames: list[UnreadView], box: np.ndarray, folder: Path) -> tuple[float, float]:
     """scene.json's near and far: already in scene units."""
     where = folder / "scene.json"
     if files.scene.get("near") is None or files.scene.get("far") is None:
@@ -177,7 +177,7 @@ def _near_far(files: CameraFiles, frames: list[Frame], box: np.ndarray, folder: 
     return near, far
 
 
-def _up(files: CameraFiles, frames: list[Frame], folder: Path) -> tuple[float, float, float]:
+def _up(files: CameraFiles, frames: list[UnreadView], folder: Path) -> tuple[float, float, float]:
     if files.extra.get("up") is None:
         return mean_up(frames)
     up = array(files.extra["up"], (3,), f"{folder / 'extra.json'}: up")
@@ -185,7 +185,7 @@ def _up(files: CameraFiles, frames: list[Frame], folder: Path) -> tuple[float, f
     return float(x), float(y), float(z)
 
 
-def read(folder: Path, downscale: int) -> Dataset:
+def read_iphone(folder: Path, downscale: int) -> Dataset:
     """Read the folder at rgb/{factor}x over `downscale` (see `dataset.load`)."""
     files = read_cameras(folder)
     frames = [*files.train, *files.test]

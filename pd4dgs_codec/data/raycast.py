@@ -43,12 +43,12 @@ class Paint:
 
         def sines(rows: np.ndarray) -> np.ndarray:
             vectors = (rows[:, :3] * self.size).astype(m.dtype)
-            return np.sin(vectors @ m + rows[:, 3:].astype(m.dtype)).sum(axis=0)
+            return np.asarray(np.sin(vectors @ m + rows[:, 3:].astype(m.dtype)).sum(axis=0))
 
         mix = 0.5 + 0.5 * np.tanh(2.5 * sines(self.waves))
         color = self.low[:, None] + (self.high - self.low)[:, None] * mix
         color = color * (1.0 + 0.07 * sines(self.detail))
-        return color * self.tint(t)[:, None] if self.tint else color
+        return np.asarray(color * self.tint(t)[:, None] if self.tint else color)
 
 
 @dataclass(frozen=True, eq=False)
@@ -170,12 +170,13 @@ class Eye:
     def world(self, x: np.ndarray, y: np.ndarray, depth: np.ndarray) -> np.ndarray:
         """World points [3, n] on the rays (x, y) at the given depths."""
         rotation = self.viewmat[:3, :3].T.astype(x.dtype)
-        return rotation @ np.stack([x * depth, y * depth, depth]) + self.center.astype(x.dtype)[:, None]
+        along = rotation @ np.stack([x * depth, y * depth, depth])
+        return np.asarray(along + self.center.astype(x.dtype)[:, None])
 
 
 def material(body: Placed, world: np.ndarray) -> np.ndarray:
     """Material coordinates [3, n] of world points [3, n]."""
-    return body.inverse.astype(world.dtype) @ (world - body.c.astype(world.dtype)[:, None])
+    return np.asarray(body.inverse.astype(world.dtype) @ (world - body.c.astype(world.dtype)[:, None]))
 
 
 def light_reaching(placed: Sequence[Placed], own: int, world: np.ndarray) -> np.ndarray:
@@ -205,4 +206,4 @@ def shade(placed: Sequence[Placed], own: int, world: np.ndarray, t: float) -> np
     n = n / np.maximum(np.linalg.norm(n, axis=0), 1e-12)
     lambert = np.maximum(LIGHT.astype(world.dtype) @ n, 0) * light_reaching(placed, own, world)
     strength = AMBIENT * (0.85 + 0.15 * n[2]) + DIFFUSE * lambert
-    return np.clip(body.body.paint.albedo(m, t) * strength, 0, 1)
+    return np.asarray(np.clip(body.body.paint.albedo(m, t) * strength, 0, 1))

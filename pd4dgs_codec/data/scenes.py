@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from .raycast import Body, Paint, Pose
+from pd4dgs_codec.data.raycast import Body, Paint, Pose
 
 
 @dataclass(frozen=True)
@@ -23,6 +24,9 @@ class Motion:
     hops: float = 0.0  #: bounces of the two balls
     orbit: float = 0.0  #: turns of the runner around the platform
 
+
+#: At an instant, on top of a body's place: rotation [3, 3], shift [3] and stretch per axis [3].
+Local = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 MOTIONS = {
     "static": Motion(),
@@ -48,7 +52,9 @@ class SceneBuilder:
         self.motion, self.rng = MOTIONS[name], np.random.default_rng(seed)
         self.hue = self.rng.uniform()
 
-    def paint(self, hue: float, size, wave: float, *, axes=(0, 2), strength: float = 0.45) -> Paint:
+    def paint(
+        self, hue: float, size: Sequence[float], wave: float, axes: tuple[int, int] = (0, 2), strength: float = 0.45
+    ) -> Paint:
         """Two shades of a hue in checks along two axes, `wave` radians per unit."""
         rng = self.rng
         angle = 2 * np.pi * (hue + self.hue + np.array([0, 1 / 3, 2 / 3]))
@@ -67,26 +73,46 @@ class SceneBuilder:
         angle = m.sway * np.sin(2 * np.pi * 0.75 * t)
         return _turn(2, angle), np.array([0, 0, m.heave * np.sin(np.pi * t) ** 2])
 
-    def fixed(self, shape: str, size, at, hue: float, wave: float, **paint) -> Body:
+    def fixed(
+        self,
+        shape: str,
+        size: Sequence[float],
+        at: Sequence[float],
+        hue: float,
+        wave: float,
+        *,
+        axes: tuple[int, int] = (0, 2),
+        strength: float = 0.45,
+        casts: bool = False,
+    ) -> Body:
         """A body that never moves and throws no shadow (floor, wall) or stands beside the platform."""
-        casts = paint.pop("casts", False)
         A, c = np.diag(np.asarray(size, float)), np.asarray(at, float)
-        return Body(shape, lambda t: (A, c), self.paint(hue, size, wave, **paint), casts)
+        return Body(shape, lambda t: (A, c), self.paint(hue, size, wave, axes, strength), casts)
 
-    def riding(self, shape: str, size, at, hue: float, wave: float, local=None, **paint) -> Body:
-        """A body on the platform; `local(t)` gives (rotation, shift, stretch [3]) on top of its place."""
-        size = np.asarray(size, float)
+    def riding(
+        self,
+        shape: str,
+        size: Sequence[float],
+        at: Sequence[float],
+        hue: float,
+        wave: float,
+        local: Callable[[float], Local] | None = None,
+        *,
+        axes: tuple[int, int] = (0, 2),
+    ) -> Body:
+        """A body on the platform, which moves there as `local` says."""
+        half = np.asarray(size, float)
         yaw = _turn(2, self.rng.uniform(-0.4, 0.4))
-        at = np.asarray(at, float) + np.array([*self.rng.uniform(-0.05, 0.05, 2), 0])
+        place = np.asarray(at, float) + np.array([*self.rng.uniform(-0.05, 0.05, 2), 0])
 
         def pose(t: float) -> Pose:
             R, p = self.group(t)
             turn, shift, stretch = local(t) if local else (np.eye(3), np.zeros(3), np.ones(3))
-            return R @ turn @ yaw @ np.diag(size * stretch), R @ (at + shift) + p
+            return R @ turn @ yaw @ np.diag(half * stretch), R @ (place + shift) + p
 
-        return Body(shape, pose, self.paint(hue, size, wave, **paint))
+        return Body(shape, pose, self.paint(hue, size, wave, axes))
 
-    def hop(self, phase: float, height: float):
+    def hop(self, phase: float, height: float) -> Callable[[float], np.ndarray]:
         """Bouncing on the spot."""
         rate = self.motion.hops
         return lambda t: np.array([0, 0, height * abs(np.sin(np.pi * (rate * t + phase)))]) if rate else np.zeros(3)
@@ -96,7 +122,7 @@ class SceneBuilder:
         m, pivot, reach = self.motion, np.array([0.15, 0.35, 1.17]), 0.36
         rest = self.rng.uniform(0.4, 0.9)
 
-        def part(size, along: float):
+        def part(size: Sequence[float], along: float) -> Callable[[float], Pose]:
             def pose(t: float) -> Pose:
                 R, p = self.group(t)
                 turn = R @ _turn(1, rest + m.swing * np.sin(2 * np.pi * m.swing_rate * t))
@@ -116,11 +142,11 @@ class SceneBuilder:
         one, still = np.ones(3), np.eye(3)
         ball_hop, small_hop = self.hop(0.0, 0.55), self.hop(0.4, 0.8)
 
-        def ball(t: float):
+        def ball(t: float) -> Local:
             s = m.pulse * np.sin(2 * np.pi * 3 * t)
             return still, ball_hop(t) + [0, 0, 0.3 * s], np.array([1 - 0.5 * s, 1 - 0.5 * s, 1 + s])
 
-        def runner(t: float):
+        def runner(t: float) -> Local:
             angle = 2 * np.pi * m.orbit * t
             return still, 1.5 * np.array([np.cos(angle) - 1, np.sin(angle), 0]), one
 

@@ -11,15 +11,16 @@ from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
+from numpy.typing import DTypeLike
 
-from ..errors import DataError
-from . import raycast
-from .cameras import Lens, world_to_camera
-from .dataset import SYNTHETIC_PREFIX, Dataset, View
-from .files import check_downscale, shrink_image, shrink_mask
-from .raycast import NO_BODY, Body, Eye, place
-from .scenes import MOTIONS, SceneBuilder
+from pd4dgs_codec.data.cameras import Lens, world_to_camera
+from pd4dgs_codec.data.files import check_downscale, shrink_image, shrink_mask
+from pd4dgs_codec.data.raycast import NO_BODY, Body, Eye, material, normal, place, shade
+from pd4dgs_codec.data.scenes import MOTIONS, SceneBuilder
+from pd4dgs_codec.data.view import Dataset, View
+from pd4dgs_codec.errors import DataError
 
+PREFIX = "synthetic:"
 LENS = Lens(160, 120, 150.0, 150.0, 81.5, 58.75)  #: off centre on purpose: readers must honour cx, cy
 SUPERSAMPLING = 2
 TRAIN_FRAMES = 60
@@ -38,10 +39,10 @@ COVISIBLE_SHARE = 0.05  #: a test pixel counts if this share of the training fra
 
 def parse(source: str) -> tuple[str, int]:
     """Name and seed of a `synthetic:` source."""
-    match = re.fullmatch(r"([a-z]*)(?:\?seed=(\d{1,9}))?", source.removeprefix(SYNTHETIC_PREFIX))
+    match = re.fullmatch(r"([a-z]*)(?:\?seed=(\d{1,9}))?", source.removeprefix(PREFIX))
     if match is None or match[1] not in MOTIONS:
         names = "|".join(MOTIONS)
-        raise DataError(f"{source}: unknown synthetic scene, expected {SYNTHETIC_PREFIX}{names}[?seed=n]")
+        raise DataError(f"{source}: unknown synthetic scene, expected {PREFIX}{names}[?seed=n]")
     return match[1], int(match[2] or 0)
 
 
@@ -64,7 +65,7 @@ def fixed_viewmats() -> tuple[np.ndarray, np.ndarray]:
     return _look(np.radians(-19), 3.5, 0.75), _look(np.radians(23), 3.75, 1.75)
 
 
-def _grid(scale: int, dtype=np.float64) -> tuple[np.ndarray, np.ndarray]:
+def _grid(scale: int, dtype: DTypeLike = np.float64) -> tuple[np.ndarray, np.ndarray]:
     """x [scale * W] and y [scale * H] at depth 1 of the pixel centres of an image `scale` times as fine."""
     x = ((np.arange(LENS.width * scale) + 0.5) / scale - LENS.cx) / LENS.fx
     return x.astype(dtype), (((np.arange(LENS.height * scale) + 0.5) / scale - LENS.cy) / LENS.fy).astype(dtype)
@@ -80,10 +81,10 @@ def _render(bodies: list[Body], viewmat: np.ndarray, t: float) -> np.ndarray:
     for i in range(len(placed)):
         row, col = np.nonzero(index == i)
         if len(row):
-            color[:, row, col] = raycast.shade(placed, i, eye.world(xs[col], ys[row], depth[row, col]), t)
+            color[:, row, col] = shade(placed, i, eye.world(xs[col], ys[row], depth[row, col]), t)
     s = SUPERSAMPLING
     mean = color.reshape(3, LENS.height, s, LENS.width, s).mean(axis=(2, 4))
-    return (mean.transpose(1, 2, 0) * 255 + 0.5).astype(np.uint8)
+    return np.asarray(mean.transpose(1, 2, 0) * 255 + 0.5).astype(np.uint8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,7 +104,7 @@ def _surface(bodies: list[Body], viewmat: np.ndarray, t: float) -> _Surface:
     point = viewmat[:3, :3].T @ np.stack([x, y, np.ones_like(x)])
     for i, body in enumerate(placed):
         mine = index == i
-        point[:, mine] = raycast.material(body, eye.world(x[mine], y[mine], depth[mine]))
+        point[:, mine] = material(body, eye.world(x[mine], y[mine], depth[mine]))
     return _Surface(index, point)
 
 
@@ -116,13 +117,13 @@ def _seen(eye: Eye, body: np.ndarray, point: np.ndarray) -> np.ndarray:
         if len(mine):
             camera[:, mine] = rotation @ (placed.A @ point[:, mine] + (placed.c - eye.center)[:, None])
             origin = placed.inverse @ (eye.center - placed.c)
-            n = raycast.normal(placed.body.shape, point[:, mine])
+            n = normal(placed.body.shape, point[:, mine])
             facing[mine] = (n * (origin[:, None] - point[:, mine])).sum(axis=0) > 0
     z = camera[2]
     with np.errstate(divide="ignore", invalid="ignore"):
         x, y = camera[0] / z, camera[1] / z
     u, v = LENS.fx * x + LENS.cx, LENS.fy * y + LENS.cy
-    seen = facing & (z > 0) & (u >= 0) & (u <= LENS.width) & (v >= 0) & (v <= LENS.height)
+    seen = np.asarray(facing & (z > 0) & (u >= 0) & (u <= LENS.width) & (v >= 0) & (v <= LENS.height))
     some = np.flatnonzero(seen)
     depth = np.where(body[some] == NO_BODY, np.inf, z[some])
     seen[some] = ~eye.hidden(x[some], y[some], depth, body[some])
@@ -143,7 +144,9 @@ def _covisible(bodies: list[Body], eyes: list[Eye], viewmat: np.ndarray, t: floa
     return (count >= needed).reshape(LENS.height, LENS.width)
 
 
-def _initial_points(bodies: list[Body], viewmats: list[np.ndarray], rng) -> tuple[np.ndarray, np.ndarray]:
+def _initial_points(
+    bodies: list[Body], viewmats: list[np.ndarray], rng: np.random.Generator
+) -> tuple[np.ndarray, np.ndarray]:
     """What structure from motion would give of the first instant: visible surface points, noisy, 2 % of them stray."""
     placed = place(bodies, 0.0)
     per_view = -(-POINTS // len(viewmats)) * 5 // 4  # some rays meet only the sky
@@ -157,7 +160,7 @@ def _initial_points(bodies: list[Body], viewmats: list[np.ndarray], rng) -> tupl
             mine = index[row, col] == i
             r, c = row[mine], col[mine]
             world = eye.world(xs[c], ys[r], depth[r, c])
-            colors.append(raycast.shade(placed, i, world, 0.0).T)
+            colors.append(shade(placed, i, world, 0.0).T)
             points.append(world.T + rng.normal(size=(len(r), 3)) * 0.004 * depth[r, c][:, None])
     chosen = rng.permutation(sum(map(len, points)))[:POINTS]
     xyz, rgb = np.concatenate(points)[chosen], np.concatenate(colors)[chosen]
@@ -200,7 +203,7 @@ def _shrink(view: View, k: int) -> View:
     return replace(view, K=LENS.matrix(k), width=image.shape[1], height=image.shape[0], image=image, mask=mask)
 
 
-def load(source: str, downscale: int = 1) -> Dataset:
+def read_synthetic(source: str, downscale: int = 1) -> Dataset:
     """The scene named by `source`; rendered once per process and kept in memory."""
     name, seed = parse(source)
     check_downscale((LENS.width, LENS.height), downscale, source)

@@ -2,16 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..errors import DataError
-from .cameras import (
-    Frame,
+from pd4dgs_codec.data.cameras import (
     Lens,
+    UnreadView,
     cameras_box,
     check_rotation,
     depth_range,
@@ -22,9 +21,10 @@ from .cameras import (
     seconds_range,
     world_to_camera,
 )
-from .dataset import Dataset, View
-from .files import array, find_image, image_info, number, read_json
-from .ply import read_ply
+from pd4dgs_codec.data.files import array, find_image, image_info, number, read_json
+from pd4dgs_codec.data.ply import read_ply
+from pd4dgs_codec.data.view import Dataset, View
+from pd4dgs_codec.errors import DataError
 
 PINHOLE_MODELS = {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
 #: OpenGL's camera looks along -z with y up; OpenCV's along +z with y down.
@@ -47,7 +47,7 @@ def _choose(folder: Path) -> tuple[Path, Path | None]:
     raise DataError(f"{folder}: found {names}; expected transforms.json, transforms_train.json or a single file")
 
 
-def _focal(get, axis: str, size: int, where: str) -> float | None:
+def _focal(get: Callable[[str], Any], axis: str, size: int, where: str) -> float | None:
     if get("fl_" + axis) is not None:
         return number(get("fl_" + axis), f"{where}: fl_{axis}", positive=True)
     angle = get("camera_angle_" + axis)
@@ -94,7 +94,7 @@ def _viewmat(matrix: Any, where: str) -> np.ndarray:
     return world_to_camera(OPENGL_TO_OPENCV @ pose[:3, :3].T, pose[:3, 3])
 
 
-def _frames(folder: Path, path: Path) -> tuple[list[Frame], dict[str, Any]]:
+def _frames(folder: Path, path: Path) -> tuple[list[UnreadView], dict[str, Any]]:
     """The frames of one file in its order, and the whole file."""
     file = read_json(path)
     listed = file.get("frames")
@@ -108,11 +108,11 @@ def _frames(folder: Path, path: Path) -> tuple[list[Frame], dict[str, Any]]:
         viewmat = _viewmat(frame.get("transform_matrix"), f"{where}: transform_matrix")
         image = find_image(folder, frame["file_path"])
         time = i / max(len(listed) - 1, 1) if frame.get("time") is None else number(frame["time"], f"{where}: time")
-        frames.append(Frame(image.stem, 0, time, viewmat, _lens(file, frame, image, where), image))
+        frames.append(UnreadView(image.stem, 0, time, viewmat, _lens(file, frame, image, where), image))
     return frames, file
 
 
-def _split(folder: Path, holdout: int) -> tuple[list[Frame], list[Frame], dict[str, Any]]:
+def _split(folder: Path, holdout: int) -> tuple[list[UnreadView], list[UnreadView], dict[str, Any]]:
     """Train and test frames and the training file; split files decide, else every `holdout`-th frame is test."""
     train_file, test_file = _choose(folder)
     frames, file = _frames(folder, train_file)
@@ -152,7 +152,7 @@ def border_color(views: Sequence[View]) -> tuple[float, float, float]:
     return float(r), float(g), float(b)
 
 
-def read(folder: Path, downscale: int, holdout: int) -> Dataset:
+def read_transforms(folder: Path, downscale: int, holdout: int) -> Dataset:
     """Read a folder with transforms*.json (see `dataset.load`)."""
     train, test, file = _split(folder, holdout)
     frames = train + test

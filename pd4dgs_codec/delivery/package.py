@@ -118,7 +118,8 @@ def _manifest(init: int, parts: list[Part], seconds: float, video: Video | None)
         whole = max(1, round(seconds * mp4.TIMESCALE))
         _segment_list(representation, SEGMENTS, init, mp4.TIMESCALE, whole, [part.segment])
     ElementTree.indent(root)
-    return ElementTree.tostring(root, encoding="utf-8", xml_declaration=True) + b"\n"
+    text: bytes = ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
+    return text + b"\n"
 
 
 def _video_set(period: ElementTree.Element, video: Video) -> None:

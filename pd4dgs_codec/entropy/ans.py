@@ -18,8 +18,8 @@ from collections.abc import Sequence
 import constriction
 import numpy as np
 
-from ..errors import EncodeError, LimitExceeded, Malformed, Pd4Error
-from .tables import TOTAL
+from pd4dgs_codec.entropy.tables import TOTAL
+from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed, Pd4Error
 
 MAX_COUNT = 1 << 26  #: symbols in one channel; decoding allocates four bytes for each
 _U32 = np.dtype("<u4")
@@ -29,7 +29,7 @@ def _frequencies(cum: np.ndarray, error: type[Pd4Error], where: str = "") -> np.
     """int64 [n] of a table int64 [n + 1] that constriction can take; raises `error` for any other."""
     if cum.ndim != 1 or len(cum) < 2 or cum[0] != 0 or cum[-1] != TOTAL:
         raise error(f"{where}a frequency table must run from 0 to {TOTAL}")
-    frequencies = cum[1:] - cum[:-1]
+    frequencies: np.ndarray = cum[1:] - cum[:-1]
     if frequencies[frequencies.argmin()] < 1:  # a tenth of the time that min() takes on the short tables of positions
         raise error(f"{where}a frequency table has a symbol of zero frequency")
     return frequencies
@@ -60,7 +60,8 @@ def ans_encode(channels: Sequence[np.ndarray], cums: Sequence[np.ndarray]) -> by
             raise EncodeError(f"channel {index}: symbols {low}..{high} outside the table's 0..{len(cum) - 2}")
         if len(cum) > 2:
             coder.encode_reverse(np.ascontiguousarray(symbols, dtype=np.int32), _model(frequencies))
-    return coder.get_compressed()[::-1].astype(_U32).tobytes()
+    words: np.ndarray = coder.get_compressed()
+    return words[::-1].astype(_U32).tobytes()
 
 
 class AnsDecoder:

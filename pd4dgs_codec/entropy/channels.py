@@ -14,14 +14,26 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from ..errors import EncodeError, LimitExceeded, Malformed
-from .ans import MAX_COUNT, AnsDecoder, ans_encode
-from .fitting import fit_best, histogram
-from .priors import CONST, FIRST_REUSE, K_MAX, MAX_ENTRIES, Hist, Prior, Window, family_code, read_prior, write_prior
-from .rate import gaussian_bits
-from .sharing import plan_priors
-from .tables import uniform_table
-from .varint import VARINT_MAX, ByteReader, put_varint
+from pd4dgs_codec.entropy import EFFORTS, PRIORS
+from pd4dgs_codec.entropy.ans import MAX_COUNT, AnsDecoder, ans_encode
+from pd4dgs_codec.entropy.bits import gaussian_bits
+from pd4dgs_codec.entropy.fitting import fit_best, histogram
+from pd4dgs_codec.entropy.priors import (
+    CONST,
+    FIRST_REUSE,
+    K_MAX,
+    MAX_ENTRIES,
+    Hist,
+    Prior,
+    Window,
+    family_code,
+    read_prior,
+    write_prior,
+)
+from pd4dgs_codec.entropy.sharing import plan_priors
+from pd4dgs_codec.entropy.tables import uniform_table
+from pd4dgs_codec.entropy.varint import VARINT_MAX, ByteReader, put_varint
+from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
 
 
 @dataclass(frozen=True)
@@ -59,7 +71,7 @@ def encode_channels(channels: Sequence[np.ndarray], *, priors: str = "best", eff
     priors: "gauss" allows const and gauss only, the model of R(a); "best" every prior and is never larger.
     effort: 1..9, time spent on fitting. Raises EncodeError.
     """
-    if priors not in ("best", "gauss") or not 1 <= effort <= 9:
+    if priors not in PRIORS or effort not in EFFORTS:
         raise EncodeError(f"expected priors best or gauss and effort 1..9, found {priors!r} and {effort}")
     arrays = check_channels(channels)
     histograms = [histogram(a) for a in arrays if len(a)]

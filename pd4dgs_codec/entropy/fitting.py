@@ -12,7 +12,8 @@ from functools import cached_property
 
 import numpy as np
 
-from .priors import (
+from pd4dgs_codec.entropy.bits import order0_bits, symbol_counts
+from pd4dgs_codec.entropy.priors import (
     CLASS_STEPS,
     FLOORS,
     K_MAX,
@@ -27,7 +28,7 @@ from .priors import (
     header_bits,
     top_limit,
 )
-from .tables import SI_MAX, SI_MIN, norm_cdf28, table_from_cdf28
+from pd4dgs_codec.entropy.tables import SI_MAX, SI_MIN, norm_cdf28, table_from_cdf28
 
 Cost = Callable[[np.ndarray], np.ndarray]  #: int64 [K, D] parameters -> float64 [K] bits
 
@@ -48,14 +49,8 @@ class Histogram:
 
 
 def histogram(symbols: np.ndarray) -> Histogram:
-    """Of a non-empty channel. Counting beats sorting wherever the range is not far wider than the channel."""
-    low, high = int(symbols.min()), int(symbols.max())
-    if high - low > 4 * len(symbols) + 1024:
-        values, counts = np.unique(symbols, return_counts=True)
-        return Histogram(values.astype(np.int64), counts.astype(np.int64))
-    counts = np.bincount(symbols.astype(np.int64) - low)
-    present = np.flatnonzero(counts)
-    return Histogram(present + low, counts[present])
+    """Of a non-empty channel."""
+    return Histogram(*symbol_counts(symbols))
 
 
 def pool(histograms: Sequence[Histogram]) -> Histogram:
@@ -118,7 +113,7 @@ def _richer_priors(h: Histogram, found: Prior, effort: int) -> list[Prior]:
         return []
     counts = _dense(h, found.window)
     seen = counts[counts > 0]
-    entropy = float(seen @ np.log2(seen.sum() / seen)) + found.window.shift * float(seen.sum())
+    entropy = order0_bits(seen) + found.window.shift * float(seen.sum())
     spare = prior_bits(found, h) - entropy
     priors: list[Prior] = []
     if spare > 40 + 0.72 * len(seen):  # a mixture's five more bytes; the entropy of a sample is low by log2(e) / 2 each
@@ -181,7 +176,8 @@ def _finer(mu8: int, si: int, shift: int) -> Normal:
 
 def _table_bits(cdf28: np.ndarray, counts: np.ndarray) -> np.ndarray:
     cum = table_from_cdf28(cdf28, FLOORS[-1])  # the higher floor keeps outliers from steering the fit
-    return (24 - np.log2(np.diff(cum))) @ counts
+    bits: np.ndarray = (24 - np.log2(np.diff(cum))) @ counts
+    return bits
 
 
 def _refine(

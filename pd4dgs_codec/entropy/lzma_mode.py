@@ -13,12 +13,12 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..errors import EncodeError, LimitExceeded, Malformed
-from .ans import MAX_COUNT
-from .channels import CodedChannels, check_channels
-from .priors import K_MAX
-from .rate import gaussian_bits
-from .varint import ByteReader, put_varint
+from pd4dgs_codec.entropy.ans import MAX_COUNT
+from pd4dgs_codec.entropy.bits import gaussian_bits
+from pd4dgs_codec.entropy.channels import CodedChannels, check_channels
+from pd4dgs_codec.entropy.priors import K_MAX
+from pd4dgs_codec.entropy.varint import ByteReader, put_varint
+from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
 
 MAX_RAW = 1 << 31  #: bytes before compression, per payload
 _DICT_MAX = 1 << 26  #: a decoder never needs more memory than this plus the data

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from .morton import spread_bits
+from pd4dgs_codec.morton import spread_bits
 
 MIN_NEIGHBOURS = 7  #: a grid serves a node if its 27 cells hold that many other nodes
 DENSE_NEIGHBOURS = 5  #: finer grids are built while a node has that many occupied neighbour cells on average
@@ -69,7 +69,7 @@ class Grid:
         terms[:, 9] = units[:, 1] * units[:, 2]
         if len(units) > len(self._rank):
             terms = np.add.reduceat(terms, np.flatnonzero(np.diff(self.cell, prepend=-1)), axis=0)
-        sums = terms.take(self._slots[0], axis=0)
+        sums: np.ndarray = terms.take(self._slots[0], axis=0)
         for slot in self._slots[1:]:
             sums[: len(slot)] += terms.take(slot, axis=0)
         return sums.take(self._rank, axis=0)

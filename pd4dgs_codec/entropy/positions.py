@@ -57,10 +57,10 @@ import struct
 
 import numpy as np
 
-from ..errors import EncodeError, LimitExceeded, Malformed, Truncated
-from .ans import AnsDecoder, ans_encode
-from .morton import AXIS_BITS, morton_codes
-from .position_model import AdaptiveBits, Grid, contexts, flag_model, side_model
+from pd4dgs_codec.entropy.ans import AnsDecoder, ans_encode
+from pd4dgs_codec.entropy.position_model import AdaptiveBits, Grid, contexts, flag_model, side_model
+from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed, Truncated
+from pd4dgs_codec.morton import AXIS_BITS, morton_codes
 
 _HEADER = struct.Struct("<3i3B")
 _TOTAL = 1 << 24

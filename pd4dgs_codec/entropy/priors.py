@@ -15,9 +15,9 @@ from typing import ClassVar
 
 import numpy as np
 
-from ..errors import Malformed, UnsupportedFeature
-from .tables import OCTAVE, SI_MAX, SI_MIN, histogram_table, mixture_table, norm_table
-from .varint import ByteReader, put_varint, put_zigzag
+from pd4dgs_codec.entropy.tables import OCTAVE, SI_MAX, SI_MIN, histogram_table, mixture_table, norm_table
+from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
+from pd4dgs_codec.errors import Malformed, UnsupportedFeature
 
 K_MAX = (1 << 24) - 1  #: |k| of any symbol
 MAX_WINDOW = 1 << 14

@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from .fitting import Histogram, exception_bits, pool, symbol_costs
-from .priors import MAX_ENTRIES, MAX_WINDOW, Prior, header_bits
+from pd4dgs_codec.entropy.fitting import Histogram, exception_bits, pool, symbol_costs
+from pd4dgs_codec.entropy.priors import MAX_ENTRIES, MAX_WINDOW, Prior, header_bits
 
 BLOCK = 256  #: channels planned together; keeps the cost matrix small
 WIDE = 1024  #: a channel with more distinct symbols spends too much on each for its prior's few bytes to matter

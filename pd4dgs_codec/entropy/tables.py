@@ -35,7 +35,8 @@ def norm_cdf28(n: int, mu8: int | np.ndarray, si: int | np.ndarray) -> np.ndarra
     z = np.minimum((a * OCTAVE[j]) >> (23 + e - nb), 8 << 16)
     i, f = z >> 11, z & 2047
     v = NORMAL[i] + (((NORMAL[i + 1] - NORMAL[i]) * f) >> 11)
-    return (1 << 27) + np.where(t < 0, -v, v)
+    mass: np.ndarray = (1 << 27) + np.where(t < 0, -v, v)
+    return mass
 
 
 def table_from_cdf28(cdf: np.ndarray, floor: int) -> np.ndarray:

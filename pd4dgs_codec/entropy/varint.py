@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from ..errors import LimitExceeded, Malformed
+from pd4dgs_codec.errors import LimitExceeded, Malformed
 
 _MAX_BYTES = 5
 VARINT_MAX = (1 << 7 * _MAX_BYTES) - 1

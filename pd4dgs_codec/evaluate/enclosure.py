@@ -41,7 +41,8 @@ class Stretch:
     @property
     def reach(self) -> np.ndarray:
         """How far the quantity may move from its middle value."""
-        return np.abs(self.slope) + self.radius
+        reach: np.ndarray = np.abs(self.slope) + self.radius
+        return reach
 
     def linear(self, weight: np.ndarray, bias: np.ndarray) -> Stretch:
         """After y = weight x + bias."""
@@ -61,7 +62,8 @@ def time_grid(deformation: Deformation) -> np.ndarray:
     in t on each stretch."""
     instants = [np.linspace(0.0, 1.0, s["zt"].shape[1]) if s["zt"].shape[1] > 1 else [0.0] for s in deformation.planes]
     whole = np.unique(np.concatenate([[0.0, 1.0], *instants]))
-    return np.interp(np.arange(PARTS * (len(whole) - 1) + 1) / PARTS, np.arange(len(whole)), whole)
+    grid: np.ndarray = np.interp(np.arange(PARTS * (len(whole) - 1) + 1) / PARTS, np.arange(len(whole)), whole)
+    return grid
 
 
 def residual_ranges(deformation: Deformation, box: np.ndarray, points: np.ndarray) -> Iterator[list[Ranges]]:
@@ -120,7 +122,8 @@ def _columns(plane: np.ndarray, u: np.ndarray) -> np.ndarray:
     rows = np.ascontiguousarray(plane.transpose(1, 2, 0))
     j = np.minimum(u.astype(np.intp), max(plane.shape[2] - 2, 0))
     f = (u - j)[:, None]
-    return rows[:, j] * (1 - f) + rows[:, np.minimum(j + 1, plane.shape[2] - 1)] * f
+    columns: np.ndarray = rows[:, j] * (1 - f) + rows[:, np.minimum(j + 1, plane.shape[2] - 1)] * f
+    return columns
 
 
 def _at_times(rows: np.ndarray, start: float, end: float) -> tuple[np.ndarray, np.ndarray]:

@@ -8,12 +8,12 @@ the box may read counts. A Gaussian whose opacity stays under the threshold for 
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 
 from pd4dgs_codec.evaluate.enclosure import CHUNK, Ranges, residual_ranges, time_grid
-from pd4dgs_codec.scene import FEATURE_DIM, N_OFFSETS, PLANES, Network, Scene, plane_sides
+from pd4dgs_codec.scene import FEATURE_DIM, N_OFFSETS, PLANES, Scene, plane_sides
 
 Reached = tuple[dict[str, np.ndarray], ...]  #: per scale, plane name -> bool [H, W]
 
@@ -129,10 +129,13 @@ def _may_show(scene: Scene, rows: slice, ranges: Ranges) -> np.ndarray:
         low, high = _through(rest, low, high)
         code = scene.mask[-1][rows].astype(np.float32)[:, None]
         slack = OPACITY_SLACK * (1 + np.abs(low) + np.abs(high))
-        return ~((np.tanh(high + slack) * code) < 1.0)  # NaN may show
+        shown: np.ndarray = ~((np.tanh(high + slack) * code) < 1.0)  # NaN may show
+    return shown
 
 
-def _through(network: Network | list, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _through(
+    network: Sequence[tuple[np.ndarray, np.ndarray]], low: np.ndarray, high: np.ndarray
+) -> tuple[np.ndarray, np.ndarray]:
     """Ranges after ReLU and a linear layer, for each layer of `network`."""
     for weight, bias in network:
         low, high = np.maximum(low, 0), np.maximum(high, 0)

@@ -41,7 +41,8 @@ def bilinear(plane: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
     fu, fv = (u - j)[:, None], (v - i)[:, None]
     top = rows_last[i, j] * (1 - fu) + rows_last[i, j1] * fu
     bottom = rows_last[i1, j] * (1 - fu) + rows_last[i1, j1] * fu
-    return top * (1 - fv) + bottom * fv
+    samples: np.ndarray = top * (1 - fv) + bottom * fv
+    return samples
 
 
 def run_network(network: Network, x: np.ndarray) -> np.ndarray:

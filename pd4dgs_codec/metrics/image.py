@@ -13,7 +13,7 @@ import numpy as np
 from ..errors import DataError
 
 if TYPE_CHECKING:
-    from ..data.dataset import View
+    from pd4dgs_codec.data.view import View
 
 TAPS, SIGMA = 11, 1.5
 C1, C2 = 0.01**2, 0.03**2

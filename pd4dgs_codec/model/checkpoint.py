@@ -7,13 +7,10 @@ needs and may be empty.
 
 from __future__ import annotations
 
-import glob
 import io
 import os
 import pickle
-import re
-import tempfile
-from contextlib import nullcontext, suppress
+from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -21,6 +18,7 @@ from typing import Any, BinaryIO
 import numpy as np
 import torch
 
+from pd4dgs_codec.atomic import write_bytes
 from pd4dgs_codec.codec.check import check_scene
 from pd4dgs_codec.errors import DataError, Pd4Error
 from pd4dgs_codec.model.convert import from_scene
@@ -57,36 +55,12 @@ def save(path: str | Path, model: Model, training: dict[str, Any] | None = None)
         "state": {name: tensor.detach().cpu() for name, tensor in model.state_dict().items()},
         "training": training or {},
     }
+    buffer = io.BytesIO()  # of a disk that fills, torch would say "unexpected pos" and nothing more
     try:
-        handle, temporary = tempfile.mkstemp(dir=real.parent, prefix=f".{real.name}.")
+        torch.save(content, buffer)
+        write_bytes(real, buffer.getbuffer(), overwrite=True)
     except OSError as error:
-        raise DataError(f"{path}: cannot write here: {error.strerror}") from None
-    try:
-        with os.fdopen(handle, "wb") as stream:
-            buffer = io.BytesIO()  # of a disk that fills, torch would say "unexpected pos" and nothing more
-            torch.save(content, buffer)
-            stream.write(buffer.getbuffer())
-            stream.flush()
-            os.fsync(stream.fileno())  # else the rename may outlive the bytes when the power fails
-        umask = os.umask(0)
-        os.umask(umask)
-        os.chmod(temporary, 0o666 & ~umask)  # mkstemp lets only the owner read
-        os.replace(temporary, real)
-    except OSError as error:
-        Path(temporary).unlink(missing_ok=True)
         raise DataError(f"{path}: cannot write the checkpoint: {error.strerror or error}") from None
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
-
-
-def remove_leftovers(path: str | Path) -> None:
-    """Removes what a `save` to `path` left beside it when its process was killed. Nothing may be saving there now."""
-    real = Path(os.path.realpath(path))
-    for file in real.parent.glob(f".{glob.escape(real.name)}.*"):
-        if re.fullmatch(r"\w{8}", file.name[len(real.name) + 2 :]) and file.is_file():
-            with suppress(OSError):
-                file.unlink()
 
 
 def target(path: str | Path) -> Path:

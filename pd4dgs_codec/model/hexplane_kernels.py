@@ -15,12 +15,12 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from pd4dgs_codec.model.simd import INNER, LANES, OUTER, load, splat, store, total
+from pd4dgs_codec.simd import LANES, kernel, load, splat, store, total
 
 XY, XZ, XT, YZ, YT, ZT = range(6)
 
 
-@nb.njit(**INNER)
+@kernel(fast=True, inline=True)
 def _locate(p, lower, upper, n):
     """First cell, fraction and slope d(cell coordinate)/dp of p on an axis of n cells; slope 0 where clamped."""
     unit = (np.float64(p) - lower) / (np.float64(upper) - lower)
@@ -34,7 +34,7 @@ def _locate(p, lower, upper, n):
     return cell, at - cell, (n - 1) / (np.float64(upper) - lower)
 
 
-@nb.njit(**INNER)
+@kernel(fast=True, inline=True)
 def _linear(table, i, step, f):
     """(sample, d sample / df) of the lanes at flat offset i and its neighbour `step` further."""
     a = load(table, i)
@@ -42,7 +42,7 @@ def _linear(table, i, step, f):
     return a + d * f, d
 
 
-@nb.njit(**INNER)
+@kernel(fast=True, inline=True)
 def _bilinear(table, i, step_u, step_v, fu, fv):
     """(sample, d sample / dfu, d sample / dfv)."""
     a, da = _linear(table, i, step_u, fu)
@@ -50,7 +50,7 @@ def _bilinear(table, i, step_u, step_v, fu, fv):
     return a + (b - a) * fv, da + (db - da) * fv, b - a
 
 
-@nb.njit(**INNER)
+@kernel(fast=True, inline=True)
 def _add_linear(table, i, step, f, g):
     """The transpose of `_linear`: adds (1 - f) g and f g."""
     gf = g * f
@@ -58,14 +58,14 @@ def _add_linear(table, i, step, f, g):
     store(table, i + step, load(table, i + step) + gf)
 
 
-@nb.njit(**INNER)
+@kernel(fast=True, inline=True)
 def _add_bilinear(table, i, step_u, step_v, fu, fv, g):
     gv = g * fv
     _add_linear(table, i, step_u, fu, g - gv)
     _add_linear(table, i + step_v, step_u, fu, gv)
 
 
-@nb.njit(**INNER)
+@kernel(fast=True, inline=True)
 def _address(s, point, reso, start, row_start, box, channels):
     """Of one point and scale: flat offsets of its six lookups, the steps to its neighbours, fractions and slopes.
 
@@ -83,7 +83,7 @@ def _address(s, point, reso, start, row_start, box, channels):
     return offsets, (dx, dy, dz, dy * nx, dz * nx, dz * ny), (fx, fy, fz), (sx, sy, sz)
 
 
-@nb.njit(**OUTER)
+@kernel(fast=True, parallel=True)
 def sample(out, grid, rows, reso, start, row_start, points, box):
     """out [N, S * C] = per scale the product of the six planes at `points`."""
     channels = grid.shape[1]
@@ -102,7 +102,7 @@ def sample(out, grid, rows, reso, start, row_start, points, box):
                 store(out, n * out.shape[1] + s * channels + c, a * b * d * e)
 
 
-@nb.njit(**INNER)
+@kernel(fast=True, inline=True)
 def _point_gradient(
     grad, grad_rows, g, g_offset, grid, rows, channels, offsets, steps, fractions, slopes, out, out_offset
 ):
@@ -147,7 +147,7 @@ def _point_gradient(
     out[out_offset + 2] = total(gz) * real(slopes[2])
 
 
-@nb.njit(**OUTER)
+@kernel(fast=True, parallel=True)
 def sample_backward(grad, extra, grad_rows, grad_points, g, grid, rows, reso, start, row_start, points, box):
     """The transpose of `sample`. g: [N, S * C]. Results, to be given zeroed except grad_points:
 
@@ -172,7 +172,7 @@ def sample_backward(grad, extra, grad_rows, grad_points, g, grid, rows, reso, st
                 grad[cell, c] += extra[part - 1, cell, c]
 
 
-@nb.njit(error_model="numpy", cache=True)  # exact arithmetic: the rounding must be that of the codec's quantiser
+@kernel()  # exact arithmetic: the rounding must be that of the codec's quantiser
 def collapse(rows, grid, reso, start, row_start, t, step):
     """rows [n_rows, C] = the time planes of `grid` at normalised time t, rounded to multiples of `step` if step > 0."""
     real = grid.dtype.type
@@ -190,7 +190,7 @@ def collapse(rows, grid, reso, start, row_start, t, step):
                     rows[row_start[s, axis] + i, c] = a + (b - a) * real(f)
 
 
-@nb.njit(error_model="numpy", cache=True)
+@kernel()
 def collapse_backward(grad, grad_rows, reso, start, row_start, t):
     """The transpose of `collapse` (rounding passes the gradient): adds to the time planes of grad [cells, C]."""
     real = grad.dtype.type

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pd4dgs_codec.model.plane_layout import SPATIAL, TEMPORAL, PlaneLayout
-from pd4dgs_codec.model.simd import INNER, LANES, OUTER, load, splat, store, total
+from pd4dgs_codec.simd import LANES, kernel, load, splat, store, total
 
 TERMS = ("plane_smooth", "time_smooth", "time_l1")
 
@@ -22,7 +22,7 @@ TERMS = ("plane_smooth", "time_smooth", "time_l1")
 # width, row, 1 if spatial. Sums are kept per line: results do not depend on the number of threads.
 
 
-@nb.njit(**INNER)
+@kernel(fast=True, inline=True)
 def _squares(grid, start, stop, step):
     """Sum of the squared second differences, over `step`, of the flat range start..stop."""
     two = splat(grid.dtype.type(2))
@@ -33,7 +33,7 @@ def _squares(grid, start, stop, step):
     return np.float64(total(value))
 
 
-@nb.njit(**OUTER)
+@kernel(fast=True, parallel=True)
 def _values(sums, grid, lines):
     """sums [R, 3] = each line's part of the three terms."""
     channels = grid.shape[1]
@@ -54,7 +54,7 @@ def _values(sums, grid, lines):
         sums[r, 2] = distance / (height * step)
 
 
-@nb.njit(**INNER)
+@kernel(fast=True, inline=True)
 def _band(i, n):
     """Row i, from column i - 2, of D^T D, where D takes the n - 2 second differences of n values."""
     if 2 <= i < n - 2:
@@ -65,7 +65,7 @@ def _band(i, n):
     return before, -2 * (before + here), before + 4 * here + after, -2 * (here + after), after
 
 
-@nb.njit(**INNER)
+@kernel(fast=True, inline=True)
 def _curve(grid, k, i, n, step, band, weight):
     """weight times the band's row applied around flat offset k, which is value i of n."""
     real = grid.dtype.type
@@ -76,7 +76,7 @@ def _curve(grid, k, i, n, step, band, weight):
     return value + load(grid, k + min(n - 1 - i, 2) * step) * splat(real(weight * band[4]))
 
 
-@nb.njit(**OUTER)
+@kernel(fast=True, parallel=True)
 def _gradient(grad, grid, lines, factors):
     """grad [cells, C] = that of sum(factors * terms)."""
     channels = grid.shape[1]

@@ -6,12 +6,12 @@ Arrays are [n, c] of one float type, computed in float64 whatever that is; broad
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numba as nb
 import numpy as np
 
-_OPTIONS: dict[str, Any] = {"error_model": "numpy", "cache": True}
+from pd4dgs_codec.simd import kernel
+
 _SQRT_HALF = math.sqrt(0.5)
 _HALF_LN_2PI = 0.5 * math.log(2.0 * math.pi)
 _SQRT_HALF_PI = math.sqrt(0.5 * math.pi)
@@ -20,7 +20,7 @@ _INVERSE_SQRT_PI = 1.0 / math.sqrt(math.pi)
 _FAR = 20.0
 
 
-@nb.njit(**_OPTIONS)
+@kernel()
 def _erfcx(x):
     """exp(x^2) erfc(x) for x >= 0."""
     if x < _FAR:
@@ -29,7 +29,7 @@ def _erfcx(x):
     return _INVERSE_SQRT_PI / x * (1.0 - y * (1.0 - 3.0 * y * (1.0 - 5.0 * y * (1.0 - 7.0 * y))))
 
 
-@nb.njit(parallel=True, **_OPTIONS)
+@kernel(parallel=True)
 def log_probability(out, log_ratio, z, h, u, v, narrow_below):
     """out = ln P and log_ratio = ln(phi(u) / P) in the forms of `rate.py`; narrow_below: h max(z, 1) below which P is
     taken as narrow."""
@@ -53,7 +53,7 @@ def log_probability(out, log_ratio, z, h, u, v, narrow_below):
             out[i, j] = log_phi - ratio
 
 
-@nb.njit(parallel=True, **_OPTIONS)
+@kernel(parallel=True)
 def gradients(grad_a, grad_sigma, grad, signed, sigma, z, h, v, log_ratio):
     """The gradients by a and sigma; grad: that of ln P; signed: a - mu; log_ratio: from `log_probability`."""
     for i in nb.prange(z.shape[0]):

@@ -13,14 +13,14 @@ import math
 
 import numba as nb
 
-from pd4dgs_codec.model.simd import INNER, LANES, OUTER, load, splat, store, total
 from pd4dgs_codec.scene import N_OFFSETS
+from pd4dgs_codec.simd import LANES, kernel, load, splat, store, total
 
 #: Below this a quaternion is divided by it instead of by its norm, as `torch.nn.functional.normalize` does.
 MIN_NORM = 1e-12
 
 
-@nb.njit(**INNER)
+@kernel(fast=True, inline=True)
 def _part(keep, part, parts):
     """The range of `keep` that is part's own: no anchor is in two parts."""
     begin, end = len(keep) * part // parts, len(keep) * (part + 1) // parts
@@ -31,7 +31,7 @@ def _part(keep, part, parts):
     return begin, end
 
 
-@nb.njit(**OUTER)
+@kernel(fast=True, parallel=True)
 def linear(out, keep, hidden, weight, bias):
     """out [K, w] = the outputs of a linear layer (weight [10 w, H], bias [10 w]) that belong to the kept slots."""
     width, inputs = out.shape[1], hidden.shape[1]
@@ -46,7 +46,7 @@ def linear(out, keep, hidden, weight, bias):
             out[k, o] = total(value) + bias[first + o]
 
 
-@nb.njit(**OUTER)
+@kernel(fast=True, parallel=True)
 def linear_backward(grad_hidden, grad_weight, grad_bias, keep, g, hidden, weight):
     """The transpose of `linear`. Results, given zeroed: grad_hidden [n, H], grad_weight [parts, 10 w, H] and grad_bias
     [parts, 10 w], summed into their first part."""
@@ -72,7 +72,7 @@ def linear_backward(grad_hidden, grad_weight, grad_bias, keep, g, hidden, weight
         grad_bias[0] += grad_bias[part]
 
 
-@nb.njit(**OUTER)
+@kernel(fast=True, parallel=True)
 def assemble(means, scales, quats, opacities, gates, keep, position, scaling, offset, opacity, mask, shape, relative):
     """What the kept Gaussians are made of.
 
@@ -93,14 +93,14 @@ def assemble(means, scales, quats, opacities, gates, keep, position, scaling, of
         gates[k] = mask[n]
 
 
-@nb.njit(**INNER)
+@kernel(fast=True, inline=True)
 def _norm(shape, k):
     square = shape[k, 3] * shape[k, 3] + shape[k, 4] * shape[k, 4]
     square += shape[k, 5] * shape[k, 5] + shape[k, 6] * shape[k, 6]
     return max(math.sqrt(square), shape.dtype.type(MIN_NORM))
 
 
-@nb.njit(**OUTER)
+@kernel(fast=True, parallel=True)
 def assemble_backward(
     g_position, g_scaling, g_offset, g_opacity, g_mask, g_shape,
     keep, scaling, offset, shape, relative, quats, g_means, g_scales, g_quats, g_opacities, g_gates, parts,

@@ -8,8 +8,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 import torch
 
-from pd4dgs_codec.data.dataset import View
-from pd4dgs_codec.metrics.image import mpsnr
+from pd4dgs_codec.data.view import View
+from pd4dgs_codec.metrics.levels import level_psnr
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.harm import anchor_harm
 from pd4dgs_codec.model.picture import render_image
@@ -73,15 +73,11 @@ def psnr_of(mse: float) -> float:
 def true_psnr(scene: Scene, views: Sequence[View], step: Callable[[], None] = lambda: None) -> dict[int, float]:
     """Per level of a decoded scene the mean mPSNR over views, dB."""
     model = from_scene(scene)
-    scores: dict[int, float] = {}
-    for level in scene.layers:
-        found = []
-        for view in views:
-            image = render_image(model, level, view.time, view.viewmat, view.K, view.width, view.height)
-            found.append(mpsnr(image, view.image, view.mask))
-            step()
-        scores[level] = float(np.mean(found))
-    return scores
+
+    def draw(level: int, view: View) -> np.ndarray:
+        return render_image(model, level, view.time, view.viewmat, view.K, view.width, view.height)
+
+    return level_psnr(draw, scene.layers, views, step)
 
 
 def _tensors(camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:

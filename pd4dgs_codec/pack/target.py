@@ -18,14 +18,14 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pd4dgs_codec.attributes.table import ATTRIBUTES
 from pd4dgs_codec.bitstream.container import write_chunk
 from pd4dgs_codec.codec.encoder import encode
 from pd4dgs_codec.codec.info import info
 from pd4dgs_codec.codec.kinds import LAYER_KINDS
-from pd4dgs_codec.codec.layers import Coding, write_layer
-from pd4dgs_codec.codec.omissions import LeftOut
-from pd4dgs_codec.codec.plan import full_masks, plan
+from pd4dgs_codec.codec.left_out import LeftOut
+from pd4dgs_codec.codec.options import DEFAULTS, EncodeOptions
+from pd4dgs_codec.codec.payload import write_layer
+from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.codec.symbols import layer_symbols, rounded
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.scene import Scene
@@ -176,8 +176,8 @@ class Fit:
     """How a layer met its target.
 
     bytes: what it adds to the file, with layer 0 the header and HEADER_MARGIN. factors: on the steps, by field of
-    Steps. moved: anchors that left it, to_layer where they went, None if they were dropped; harm: that of the most
-    harmful of them, in the unit of the harm given, None if there is none.
+    Steps; steps: what became of them. moved: anchors that left it, to_layer where they went, None if they were dropped;
+    harm: that of the most harmful of them, in the unit of the harm given, None if there is none.
     """
 
     layer: int
@@ -187,6 +187,7 @@ class Fit:
     moved: int
     to_layer: int | None
     harm: float | None
+    steps: dict[str, float]
 
 
 def fit(
@@ -194,27 +195,21 @@ def fit(
     targets: Mapping[int, int],
     loss: Callable[[Scene], float],
     harm: Callable[[Scene, int], np.ndarray],
-    *,
-    layers: str | int = "auto",
-    mode: str = "ans",
-    deformation: str = "coded",
-    priors: str = "best",
-    effort: int = 5,
+    options: EncodeOptions = DEFAULTS,
 ) -> tuple[Scene, list[LeftOut], list[Fit]]:
     """(scene whose file keeps the targets, anchors that it drops, how) of a planned scene.
 
     targets: most bytes by layer; a layer that the scene lacks meets any. loss: of a decoded scene, to be kept low.
     harm: float64 [N], what is lost if an anchor of the scene is missing at a level: those of least harm leave first,
-    for the next layer or, from the highest, for good. The other options as in encoder.encode_with_report, for the file
-    that is to be written. Raises EncodeError naming the layer and what it could reach.
+    for the next layer or, from the highest, for good. options: of the file that is to be written. Raises EncodeError
+    naming the layer and what it could reach.
     """
-    options = {"mode": mode, "deformation": deformation, "priors": priors}
     fits, dropped = [], 0
     for layer in sorted(targets):
         if layer not in scene.layers:
-            fits.append(Fit(layer, targets[layer], 0, {}, 0, None, None))
+            fits.append(Fit(layer, targets[layer], 0, {}, 0, None, None, {}))
             continue
-        fitted = _Layer(scene, layer, loss, harm, layers, Coding(mode, priors, effort), options)
+        fitted = _Layer(scene, layer, loss, harm, options)
         try:
             found = least_loss(fitted.grids, fitted.size, fitted.loss, fitted.final_size, targets[layer])
         except Unreachable as error:
@@ -241,18 +236,15 @@ class _Layer:
         layer: int,
         loss: Callable[[Scene], float],
         harm: Callable[[Scene, int], np.ndarray],
-        layers: str | int,
-        coding: Coding,
-        options: dict[str, str],
+        options: EncodeOptions,
     ):
         self.scene, self.layer, self.index = scene, layer, scene.layers.index(layer)
-        self.of_scene, self.layers, self.coding = loss, layers, coding
-        self.raw = options["deformation"] == "float32"
-        kind = LAYER_KINDS[layer]
-        steps = [a.name for a in ATTRIBUTES] if layer == 0 else []
-        if layer == 0 or (not self.raw and kind.deformation and getattr(scene, kind.deformation) is not None):
-            steps += [field for field in (kind.planes_step, kind.weights_step) if field]
-        self.masks = full_masks(scene)
+        self.of_scene = loss
+        self.options = replace(options, omit="nothing")  # what no picture needs went before
+        steps = list(scene.attributes) if layer == 0 else []
+        if layer == 0 or (not options.raw_deformation and scene.deformation(layer) is not None):
+            steps += LAYER_KINDS[layer].step_names
+        self.masks = scene.full_masks()
         active = self.masks[self.index] > 0
         if self.index:
             active &= self.masks[self.index - 1] == 0
@@ -263,15 +255,15 @@ class _Layer:
         self.grids = {**{step: OCTAVES for step in steps}, **({ANCHORS: SHARES} if len(own) else {})}
         self.header = 0
         if layer == 0:
-            first = encode(scene, layers=layers, effort=SEARCH_EFFORT, verify=False, **options)
+            first = encode(scene, self.options, effort=SEARCH_EFFORT, verify=False)
             self.header = info(first)["layers"][0]["offset"] + HEADER_MARGIN
-        self._sizes: dict[tuple, int] = {}
-        self._losses: dict[tuple, float] = {}
+        self._sizes: dict[tuple[int, frozenset[tuple[str, float]]], int] = {}
+        self._losses: dict[frozenset[tuple[str, float]], float] = {}
 
     def apply(self, setting: Setting) -> Scene:
-        """The scene at a setting, not planned."""
-        factors = {k: getattr(self.scene.steps, k) * 2.0**v for k, v in setting.items() if k != ANCHORS}
-        steps = replace(self.scene.steps, **factors).scaled(1.0)
+        """The scene at a setting, not planned: steps not rounded, rows with those that went."""
+        given = vars(self.scene.steps)
+        steps = replace(self.scene.steps, **{k: given[k] * 2.0**v for k, v in setting.items() if k != ANCHORS})
         masks = [codes.copy() for codes in self.masks]
         masks[self.index][self.order[: self._moved(setting)]] = 0
         rows = (len(self.scene.anchor_q),) * len(masks)
@@ -283,26 +275,27 @@ class _Layer:
 
     def final_size(self, setting: Setting) -> int:
         """Bytes at the effort wanted."""
-        return self._size(setting, self.coding.effort)
+        return self._size(setting, self.options.effort)
 
     def loss(self, setting: Setting) -> float:
         """What the given loss says of the decoded scene."""
-        key = tuple(sorted(setting.items()))
+        key = frozenset(setting.items())
         if key not in self._losses:
-            self._losses[key] = self.of_scene(rounded(self._planned(setting), self.raw))
+            self._losses[key] = self.of_scene(rounded(self._planned(setting), self.options.raw_deformation))
         return self._losses[key]
 
     def _planned(self, setting: Setting) -> Scene:
-        return plan(self.apply(setting), self.layers, self.raw, "nothing")[0]  # what no picture needs went before
+        return plan(self.apply(setting), self.options)[0]
 
     def _size(self, setting: Setting, effort: int) -> int:
         """Bytes that the layer adds to the file; none if the plan leaves it out."""
-        key = (effort, *sorted(setting.items()))
+        key = effort, frozenset(setting.items())
         if key not in self._sizes:
             planned, size = self._planned(setting), 0
             if self.layer in planned.layers:
-                symbols = layer_symbols(planned, planned.layers.index(self.layer), self.raw)
-                payload, _ = write_layer(symbols, replace(self.coding, effort=effort))
+                index = planned.layers.index(self.layer)
+                symbols = layer_symbols(planned, index, self.options.raw_deformation)
+                payload, _ = write_layer(symbols, replace(self.options, effort=effort))
                 size = self.header + len(write_chunk(symbols.kind.chunk_type, 0, bytes(8), payload))
             self._sizes[key] = size
         return self._sizes[key]
@@ -314,12 +307,15 @@ class _Layer:
         """The report of the setting that was taken."""
         moved = self._moved(setting)
         above = self.scene.layers[self.index + 1 :]
+        factors = {k: 2.0**v for k, v in setting.items() if k != ANCHORS}
+        steps = self._planned(setting).steps
         return Fit(
             layer=self.layer,
             target=target,
             bytes=self.final_size(setting),
-            factors={k: 2.0**v for k, v in setting.items() if k != ANCHORS},
+            factors=factors,
             moved=moved,
             to_layer=above[0] if above else None,
             harm=float(self.harms[moved - 1]) if moved else None,
+            steps={k: vars(steps)[k] for k in factors},
         )

@@ -5,30 +5,30 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pd4dgs_codec.attributes.table import ATTRIBUTES
 from pd4dgs_codec.codec.layer_meta import Section
-from pd4dgs_codec.codec.layers import channel_groups
+from pd4dgs_codec.codec.options import DEFAULTS, EncodeOptions
+from pd4dgs_codec.codec.payload import channel_groups
 from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.codec.symbols import layer_symbols
 from pd4dgs_codec.model.rate import channel_moments, rate_bits
 from pd4dgs_codec.scene import Scene
 
 
-def train_rate_bits(scene: Scene, layers: str | int = "auto", omit: str = "bounded") -> list[dict[str, float]]:
+def train_rate_bits(scene: Scene, options: EncodeOptions = DEFAULTS) -> list[dict[str, float]]:
     """Per layer of the file that `scene` becomes: bits of R(a) as the trainer computes them, in float64.
 
     attributes: R of the unrounded values over the layer's anchors, priors their moments. planes, weights: R of the
     rounded residuals and weights, which is what the last third of training sees.
     """
-    planned, _ = plan(scene, layers, omit=omit)
+    planned, _ = plan(scene, options)
     rows = (0, *planned.rows)
     result = []
     for i, layer in enumerate(planned.layers):
         own = slice(rows[i], rows[i + 1])
         attributes = 0.0
-        for attribute in ATTRIBUTES:
-            values = torch.from_numpy(getattr(planned, attribute.name)[own]).double().flatten(1)
-            attributes += _bits(values, getattr(planned.steps, attribute.name)) if len(values) else 0.0
+        for name, rows_of in planned.attributes.items():
+            values = torch.from_numpy(rows_of[own]).double().flatten(1)
+            attributes += _bits(values, planned.steps.attributes[name]) if len(values) else 0.0
         groups, _ = channel_groups(layer_symbols(planned, i))
         row = {"layer": float(layer), "attributes": attributes}
         for section in (Section.PLANES, Section.WEIGHTS):

@@ -6,15 +6,13 @@ result does not depend on the number of chunks or threads.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
-_OPTIONS: dict[str, Any] = dict(cache=True, nogil=True, error_model="numpy")
+from pd4dgs_codec.simd import kernel
 
 
-@njit(**_OPTIONS)
+@kernel()
 def sort(visible, depths):
     """Indices int64 of the visible Gaussians, front to back; equal float32 depths in index order.
 
@@ -45,7 +43,7 @@ def sort(visible, depths):
     return order
 
 
-@njit(parallel=True, **_OPTIONS)
+@kernel(parallel=True)
 def count_tiles(order, rects, columns, counts):
     """counts int64 [chunks, tiles]: how many Gaussians of each equal chunk of `order` touch each tile."""
     chunks = counts.shape[0]
@@ -58,7 +56,7 @@ def count_tiles(order, rects, columns, counts):
                     counts[chunk, row * columns + column] += 1
 
 
-@njit(**_OPTIONS)
+@kernel()
 def offsets(rects, counts, starts, first):
     """Exclusive prefix sums, filled: starts [tiles + 1] into items, first [N + 1] into the slots.
 
@@ -79,7 +77,7 @@ def offsets(rects, counts, starts, first):
     first[rects.shape[0]] = position
 
 
-@njit(parallel=True, **_OPTIONS)
+@kernel(parallel=True)
 def fill_tiles(order, rects, columns, positions, first, items, slot_of):
     """items int32 [pairs]: the Gaussians of each tile, front to back; slot_of int32 [pairs]: the pair's gradient slot.
 

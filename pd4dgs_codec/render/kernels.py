@@ -8,10 +8,8 @@ small Gaussian costs few lanes.
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
-from numba import njit, prange
+from numba import prange
 
 from pd4dgs_codec.render.projection import (
     ALPHA_MAX,
@@ -27,12 +25,13 @@ from pd4dgs_codec.render.projection import (
     X,
     Y,
 )
-from pd4dgs_codec.render.simd import (
+from pd4dgs_codec.simd import (
     LANES,
     exp2,
     fma,
     fnma,
     iota,
+    kernel,
     load,
     mask_gt,
     prefetch,
@@ -52,10 +51,9 @@ _BLOCKS = _COLUMNS * TILE_HEIGHT
 _STATE = 5  #: vectors of state per block
 _AHEAD = 4  #: Gaussians by which memory is fetched early
 _F = np.float32
-_OPTIONS: dict[str, Any] = dict(cache=True, nogil=True, error_model="numpy")
 
 
-@njit(**_OPTIONS)
+@kernel()
 def _prefetch(items, n, end, geom, colors, stride):
     if n + _AHEAD < end:
         ahead = np.int64(items[n + _AHEAD])
@@ -63,7 +61,7 @@ def _prefetch(items, n, end, geom, colors, stride):
         prefetch(colors, ahead * stride)
 
 
-@njit(**_OPTIONS)
+@kernel()
 def _coverage(geom, g, left, top):
     """Which blocks of the tile Gaussian g (offset into flat geom) may touch: bit = column * 16 + row.
 
@@ -90,7 +88,7 @@ def _coverage(geom, g, left, top):
     return mask
 
 
-@njit(**_OPTIONS)
+@kernel()
 def _steps(geom, g, left, top):
     """Start and steps per row and per column of t at a block's first pixel, then start and step of r per row."""
     dy = top + 0.5 - geom[g + Y]
@@ -101,7 +99,7 @@ def _steps(geom, g, left, top):
     )  # fmt: skip
 
 
-@njit(**_OPTIONS)
+@kernel()
 def _begin(state, channel, left, top, width, height):
     """Transmittance 1 inside the image, 0 outside; returns the blocks with a pixel inside, as bits."""
     alive = np.uint64(0)
@@ -114,13 +112,13 @@ def _begin(state, channel, left, top, width, height):
     return alive
 
 
-@njit(**_OPTIONS)
+@kernel()
 def _place(x, y):
     """Offset in `state` of pixel (x, y) of the tile, in its block's first vector."""
     return (x // LANES * TILE_HEIGHT + y) * _STATE * LANES + x % LANES
 
 
-@njit(**_OPTIONS)
+@kernel()
 def _composite_tile(items, start, end, geom, colors, stride, channel, left, top, width, height, state):
     """Blend the tile's Gaussians into `state`: per block transmittance (0 once finished), 3 colours, its last value."""
     alive = _begin(state, 4, left, top, width, height)
@@ -163,7 +161,7 @@ def _composite_tile(items, start, end, geom, colors, stride, channel, left, top,
                 alive &= ~(one << np.uint64(block))
 
 
-@njit(parallel=True, **_OPTIONS)
+@kernel(parallel=True)
 def composite(items, starts, geom, colors, channel, background, out_colors, transmittance):
     """Draw 3 channels from `channel` on. colors float32 [N, D], D a multiple of 3; background float32 [D].
 
@@ -191,7 +189,7 @@ def composite(items, starts, geom, colors, channel, background, out_colors, tran
                     out_colors[y, x, channel + c] = state[p + (1 + c) * LANES] + back
 
 
-@njit(**_OPTIONS)
+@kernel()
 def _composite_tile_backward(
     items, slot_of, start, end, geom, colors, stride, channel, left, top, width, height, state, slots, slot_stride
 ):  # fmt: skip
@@ -255,7 +253,7 @@ def _composite_tile_backward(
         slots[slot + SLOT_GEOMETRY + channel + 2] = total(sum_blue)
 
 
-@njit(parallel=True, **_OPTIONS)
+@kernel(parallel=True)
 def composite_backward(
     items, slot_of, starts, geom, colors, channel, out_colors, transmittance, g_colors, g_alphas, slots
 ):  # fmt: skip

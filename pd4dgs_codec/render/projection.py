@@ -10,17 +10,17 @@ completed square, so that a long thin Gaussian loses no digits in float32 and |t
 from __future__ import annotations
 
 import math
-from typing import Any
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
+
+from pd4dgs_codec.simd import kernel
 
 ALPHA_MAX = 0.999  #: alpha is clamped to this (gsplat 1.5.3)
 ALPHA_MIN = 1.0 / 255.0  #: fainter contributions are skipped
 REACH_LOG2 = math.log2(255.0)  #: a Gaussian is drawn where log2(opacity) - t^2 - r^2 >= -REACH_LOG2
 _F32_MAX = float(np.finfo(np.float32).max)
 _LN2 = math.log(2.0)
-_OPTIONS: dict[str, Any] = dict(cache=True, nogil=True, error_model="numpy")
 
 #: Columns of `geom`, float64 [N, 8]: centre (pixels), shear k, scales of t and r, log2 opacity, 1/sa; one is unused, so
 #: that a row is a cache line.
@@ -32,13 +32,13 @@ G, GT, GTT, GR, GRR, GTR = range(6)
 SLOT_GEOMETRY = 6
 
 
-@njit(**_OPTIONS)
+@kernel()
 def _saturate(value):
     """float32 of `value`, at most float32's largest magnitude; NaN passes."""
     return np.float32(min(max(value, -_F32_MAX), _F32_MAX)) if value == value else np.float32(value)
 
 
-@njit(**_OPTIONS)
+@kernel()
 def _rotation(w, x, y, z):
     """Unit quaternion (w, x, y, z), 1/norm and the 9 entries of R; a zero quaternion is the identity with 1/norm 0."""
     w, x, y, z = np.float64(w), np.float64(x), np.float64(y), np.float64(z)  # float() of a float32 stays one in numba
@@ -56,7 +56,7 @@ def _rotation(w, x, y, z):
     return (w, x, y, z), inverse, matrix
 
 
-@njit(**_OPTIONS)
+@kernel()
 def _to_camera(means, i, camera):
     """Point i in camera axes. camera: float64 [20] = R (9, row-major), t (3), fx, fy, cx, cy, then the limits of J."""
     a, b, c = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
@@ -67,7 +67,7 @@ def _to_camera(means, i, camera):
     )
 
 
-@njit(**_OPTIONS)
+@kernel()
 def _jacobian(x, y, z, camera):
     """1/z, the ratios x/z and y/z clamped to 1.3 x the field of view (as gsplat), and M = J W, 2x3 row-major."""
     iz = 1.0 / z
@@ -81,7 +81,7 @@ def _jacobian(x, y, z, camera):
     return iz, a, b, matrix
 
 
-@njit(**_OPTIONS)
+@kernel()
 def _matmul23(m, r):
     """(2x3) (3x3), both row-major tuples."""
     return (
@@ -94,13 +94,13 @@ def _matmul23(m, r):
     )
 
 
-@njit(**_OPTIONS)
+@kernel()
 def _clip_index(value, limit):
     """int of `value` clamped to 0 .. limit in floating point first, so that huge values convert safely."""
     return int(min(max(value, 0.0), float(limit)))
 
 
-@njit(parallel=True, **_OPTIONS)
+@kernel(parallel=True)
 def project(
     means, quats, scales, opacities, camera, size, limits, tile, visible, geom, rects, radii, means2d, depths, conics
 ):  # fmt: skip
@@ -166,7 +166,7 @@ def project(
         visible[i] = True
 
 
-@njit(**_OPTIONS)
+@kernel()
 def _rotation_gradient(unit, inverse_norm, g):
     """d/d(unnormalised quaternion) from g = d/dR (9, row-major)."""
     w, x, y, z = unit
@@ -183,7 +183,7 @@ def _rotation_gradient(unit, inverse_norm, g):
     )
 
 
-@njit(**_OPTIONS)
+@kernel()
 def _sum_slots(slots, begin, end, column):
     """Sum of one slot column over a Gaussian's tiles, float64."""
     result = 0.0
@@ -192,7 +192,7 @@ def _sum_slots(slots, begin, end, column):
     return result
 
 
-@njit(**_OPTIONS)
+@kernel()
 def _image_gradient(sum_t, sum_tt, sum_r, sum_rr, sum_tr, k, sa, sb):
     """d/d(mean2d) and the symmetric M = d/d(Sigma2) = 1/2 sum g n n^T, from the slot sums.
 
@@ -208,7 +208,7 @@ def _image_gradient(sum_t, sum_tt, sum_r, sum_rr, sum_tr, k, sa, sb):
     return gx, gy, mxx, mxy, myy
 
 
-@njit(parallel=True, **_OPTIONS)
+@kernel(parallel=True)
 def project_backward(
     means, quats, scales, opacities, camera, geom, first, slots, depth_channel,
     g_means, g_quats, g_scales, g_opacities, g_colors, g_means2d,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -15,6 +16,9 @@ DEFAULT_ITERATIONS = {"tiny": 3_000, "small": 10_000, "paper": 15_000}
 #: distribution; the highest alone, as a monolithic model is trained; or each of them, with a view of its own, at thrice
 #: the cost.
 ROLLOUTS = ("adaptive", "uniform", "fixed", "top", "all")
+
+#: Share of a run in which level 0 alone is trained.
+COARSE_SHARE = 1 / 10
 
 #: Rounds in which anchors that the pictures hardly need are taken out; each anchor may leave in one of them.
 PRUNING_ROUNDS = 4
@@ -117,76 +121,90 @@ class TrainConfig:
 
 @dataclass(frozen=True)
 class Schedule:
-    """The phases of a run of N iterations, as fractions of N (the paper's N is 30,000)."""
+    """The phases of a run of N iterations, as fractions of N (the paper's N is 30,000).
 
-    iterations: int
+    iterations: N; None where a time limit fixes it, but has not yet. Such a run stays in its coarse phase: every later
+    one begins at infinity, and nothing is grown or pruned. Whole numbers otherwise.
+    """
 
-    def _at(self, fraction: float) -> int:
-        return round(self.iterations * fraction)
+    iterations: int | None
+
+    def _at(self, fraction: float) -> float:
+        return math.inf if self.iterations is None else round(self.iterations * fraction)
+
+    def progress(self, iteration: int) -> float:
+        """The share of the run, 0..1, that lies before `iteration`; 0 while N is not known."""
+        return iteration / self.iterations if self.iterations else 0.0
 
     @property
-    def coarse_end(self) -> int:
+    def coarse_end(self) -> float:
         """Before it only level 0 is trained; from it on, quantisation noise is added."""
-        return self._at(1 / 10)
+        return self._at(COARSE_SHARE)
 
     @property
-    def warm(self) -> int:
+    def warm(self) -> float:
         """The method samples levels uniformly before it (T_warm). Here it ends within the coarse phase, and rho_start,
         never earlier, decides."""
         return self._at(1 / 15)
 
     @property
-    def progressive(self) -> int:
+    def progressive(self) -> float:
         """The rate term, TMC and the average rho start here (T_progressive)."""
         return self._at(1 / 3)
 
     @property
-    def rho_start(self) -> int:
+    def rho_start(self) -> float:
         """rho's moving average starts here."""
         return max(self.warm, self.progressive)
 
     @property
-    def rho_every(self) -> int:
+    def rho_every(self) -> float:
         """Iterations between updates of rho (K)."""
         return max(1, self._at(1 / 150))
 
     @property
     def grow(self) -> range:
         """Iterations after which anchors are grown and pruned."""
-        every = max(20, self._at(1 / 100))
-        return range(self._at(1 / 60) + every, self._at(1 / 2) + 1, every)
+        if self.iterations is None:
+            return range(0)
+        every = max(20, round(self.iterations * (1 / 100)))
+        return range(round(self.iterations * (1 / 60)) + every, round(self.iterations * (1 / 2)) + 1, every)
 
     @property
     def prune(self) -> range:
         """Iterations before which anchors that the pictures hardly need are taken out: growing has ended."""
-        every = max(1, self._at(1 / 50))
+        if self.iterations is None:
+            return range(0)
+        every = max(1, round(self.iterations * (1 / 50)))
         return range(self.grow.stop, self.grow.stop + PRUNING_ROUNDS * every, every)
 
     @property
-    def rounding(self) -> int:
+    def rounding(self) -> float:
         """Planes and weights are rounded straight-through from here on."""
         return self._at(2 / 3)
 
     @property
-    def exact_rounding(self) -> int:
+    def exact_rounding(self) -> float:
         """The anchors' attributes are rounded straight-through from here on, where noise imitated it before."""
         return self._at(9 / 10)
 
     def separation(self, iteration: int) -> float:
         """How far the masks' separation has gone, 0..1: it begins with the mask terms and ends with exact rounding."""
+        if self.iterations is None:
+            return 0.0
         begin, end = self.progressive, self.exact_rounding
         return min(max((iteration - begin) / max(1, end - begin), 0.0), 1.0)
 
     def phases_not_reached(self, iteration: int) -> list[str]:
         """Names of the phases that a run cut after `iteration` iterations never entered; none for a whole run."""
-        if iteration >= self.iterations:
+        if self.iterations is not None and iteration >= self.iterations:
             return []
         starts = {
             "levels 1 and 2": self.coarse_end,
             "rate and mask terms": self.progressive,
             "rounding of planes and weights": self.rounding,
             "exact rounding of attributes": self.exact_rounding,
-            "the end of the learning-rate schedule": self.iterations - 1,
+            "the end of the learning-rate schedule": self._at(1) - 1,
         }
         return [name for name, start in starts.items() if iteration <= start]
 
@@ -196,4 +214,4 @@ def learning_rate(bounds: tuple[float, float], progress: float, cooldown: float 
     start, end = bounds
     progress = min(max(progress, 0.0), 1.0)
     left = min((1 - progress) / cooldown, 1.0) if cooldown else 1.0
-    return start * (end / start) ** progress * left
+    return start * math.pow(end / start, progress) * left

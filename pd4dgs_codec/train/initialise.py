@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pd4dgs_codec.data.dataset import Dataset
+from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.model.config import ModelConfig
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model, fresh_networks
-from pd4dgs_codec.scene import FEATURE_DIM, GLOBAL_HEADS, LOCAL_HEADS, N_OFFSETS, Camera, SceneInfo, Steps
+from pd4dgs_codec.scene import FEATURE_DIM, GLOBAL_HEADS, LOCAL_HEADS, N_OFFSETS, SceneInfo, Steps
 
 #: Voxels along the longest side of the scene's box.
 GRID = 1024
@@ -67,7 +67,6 @@ def fresh_mask_logits(n: int, level: int) -> Tensor:
 
 def scene_info(dataset: Dataset) -> SceneInfo:
     """The header's facts of a dataset; the voxel is 1/1024 of the box's longest side."""
-    view = dataset.train[0]
     box = np.asarray(dataset.box, np.float32)
     return SceneInfo(
         voxel_size=_binary32(float((box[1] - box[0]).max()) / GRID),
@@ -78,7 +77,7 @@ def scene_info(dataset: Dataset) -> SceneInfo:
         far=_binary32(dataset.far),
         up=tuple(_binary32(v) for v in dataset.up),  # type: ignore[arg-type]
         unit=_binary32(dataset.unit),
-        camera=Camera(np.asarray(view.viewmat, np.float32), np.asarray(view.K, np.float32), view.width, view.height),
+        camera=dataset.camera,
     )
 
 
@@ -94,7 +93,8 @@ def initial_cells(dataset: Dataset, count: int, voxel_size: float, generator: to
         pick = torch.randint(len(points), (count - len(points),), generator=generator)
         jitter = torch.randn(len(pick), 3, generator=generator) * spacing[pick, None]
         points = torch.cat([points, points[pick] + jitter])
-    return torch.unique(torch.round(points / voxel_size).to(torch.int32), dim=0)
+    cells: Tensor = torch.unique(torch.round(points / voxel_size).to(torch.int32), dim=0)
+    return cells
 
 
 def _points_near_box(dataset: Dataset) -> Tensor:
@@ -136,7 +136,7 @@ def nearest_distances(points: Tensor, k: int = 3) -> Tensor:
         return torch.full((n,), 1.0)
     k = min(k, n - 1)
     out = []
-    for block in points.split(max(1, 8_000_000 // n)):
+    for block in torch.split(points, max(1, 8_000_000 // n)):
         nearest = torch.cdist(block, points).topk(k + 1, largest=False).values[:, 1:]
         out.append(nearest.square().mean(1).sqrt())
     return torch.cat(out)

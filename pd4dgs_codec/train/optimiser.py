@@ -43,6 +43,13 @@ class Optimiser:
         norms = [p.grad.norm() for group in self.adam.param_groups for p in group["params"] if p.grad is not None]
         return float(torch.stack(norms).norm()) if norms else 0.0
 
+    def scale_gradients(self, factor: float) -> None:
+        """All gradients times `factor`."""
+        for group in self.adam.param_groups:
+            for p in group["params"]:
+                if p.grad is not None:
+                    p.grad.mul_(factor)
+
     def zero_grad(self) -> None:
         """Forgets all gradients."""
         self.adam.zero_grad(set_to_none=True)

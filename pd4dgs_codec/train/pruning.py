@@ -14,14 +14,13 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from pd4dgs_codec.data.dataset import View
 from pd4dgs_codec.model.harm import anchor_harm
 from pd4dgs_codec.model.layers import mask_logits
 from pd4dgs_codec.model.model import Model, Rounding
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train.config import PRUNING_ROUNDS
 from pd4dgs_codec.train.optimiser import Optimiser
-from pd4dgs_codec.train.ssim import TargetStats
+from pd4dgs_codec.train.shot import Shot
 
 #: Training views in which it is measured, in each round others.
 VIEWS = 24
@@ -29,8 +28,6 @@ VIEWS = 24
 MIN_ITERATIONS = 500
 #: Mask of an anchor at a level that it has left: under the threshold, so that it is neither drawn there nor sent.
 GONE = 1e-3
-
-Shot = tuple[View, Tensor, Tensor, TargetStats]  #: a view, its viewmat and K as tensors, its image
 
 
 def prune(
@@ -69,12 +66,13 @@ def relative_harm(model: Model, level: int, shots: Sequence[Shot], rounding: Rou
     met = torch.zeros(n, dtype=torch.bool, device=device)
     rounding, error = replace(rounding, noise=None), 0.0
     generator = torch.Generator().manual_seed(0)
-    for view, viewmat, K, target in shots:
-        place = (level, view.time, viewmat, K, view.width, view.height)
-        harm, near, image = anchor_harm(model, *place, generator, weights=target.weights, rounding=rounding)
+    for shot in shots:
+        place = (level, shot.view.time, shot.viewmat, shot.K, shot.view.width, shot.view.height)
+        weights = shot.target.weights
+        harm, near, image = anchor_harm(model, *place, generator, weights=weights, rounding=rounding)
         total += harm
         met |= near
-        error += float(((image - target.image).square().sum(-1) * target.weights).sum())
+        error += float(((image - shot.target.image).square().sum(-1) * weights).sum())
     return torch.where(met, total / max(error, 1e-12), torch.inf)
 
 

@@ -7,6 +7,8 @@ still sees the masked pixels next to it. On CPU numba kernels do it (`ssim_kerne
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -20,12 +22,11 @@ from pd4dgs_codec.train import ssim_kernels as kernels
 class TargetStats:
     """A training image and what SSIM needs of it alone.
 
-    image: [H, W, 3] float, 0..1. mask: [H, W] weights >= 0 (bool or float), None for all ones.
-    keep: hold the blurred statistics (8 bytes per value of the image) rather than compute them anew each call, which
-    takes a fifth of its time.
+    image: [H, W, 3] float, 0..1. mask: [H, W] weights >= 0 (bool or float), None for all ones. The image's blurred
+    statistics are computed anew for each loss, a fifth of its time: kept, they were 8 bytes per value.
     """
 
-    def __init__(self, image: Tensor, mask: Tensor | None = None, keep: bool = False):
+    def __init__(self, image: Tensor, mask: Tensor | None = None):
         if image.dim() != 3 or image.shape[2] != 3 or not image.is_floating_point() or not image.numel():
             raise TrainError(f"training image must be float [H, W, 3], found {image.dtype} {tuple(image.shape)}")
         if mask is not None and mask.shape != image.shape[:2]:
@@ -35,36 +36,26 @@ class TargetStats:
         total = 3 * weights.sum(dtype=torch.float64)
         #: [H, W], sums to 1 over the pixels and channels; all zero if the mask is.
         self.weights = (weights / total.clamp_min(1e-6)).to(image.dtype).contiguous()
-        self._keep = keep
-        self._moments: tuple[np.ndarray, np.ndarray] | None = None
-
-    def moments(self, padded: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Blurred image and blurred variance, each [H, lanes >= 3 W]; padded: the image, padded by the kernels."""
-        if self._moments is not None:
-            return self._moments
-        height, width = self.weights.shape
-        mean, variance = (np.empty((height, kernels.lanes(width)), padded.dtype) for _ in range(2))
-        kernels.target_moments(mean, variance, padded, kernels.TAPS.astype(padded.dtype))
-        if self._keep:
-            self._moments = mean, variance
-        return mean, variance
 
 
 class _ImageLoss(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, image: Tensor, target: TargetStats):
+    def forward(ctx: Any, image: Tensor, target: TargetStats) -> tuple[Tensor, Tensor]:
         x, y = kernels.pad(image.numpy()), kernels.pad(target.image.numpy())
-        weights = target.weights.numpy()
+        weights, taps = target.weights.numpy(), kernels.TAPS.astype(x.dtype)
+        height, width = weights.shape
+        mean, variance = (np.empty((height, kernels.lanes(width)), y.dtype) for _ in range(2))
+        kernels.target_moments(mean, variance, y, taps)
         slopes = np.zeros((3, *x.shape), x.dtype)
-        sums = np.empty((len(weights), 2))
-        kernels.loss(slopes, sums, x, y, *target.moments(y), weights, kernels.TAPS.astype(x.dtype))
+        sums = np.empty((height, 2))
+        kernels.loss(slopes, sums, x, y, mean, variance, weights, taps)
         ctx.saved = x, y, weights, slopes
         l1, dissimilarity = sums.sum(0)
         return image.new_tensor(l1), image.new_tensor(dissimilarity)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, g_l1: Tensor, g_dissimilarity: Tensor):
+    def backward(ctx: Any, g_l1: Tensor, g_dissimilarity: Tensor) -> tuple[Tensor, None]:
         x, y, weights, slopes = ctx.saved
         grad = np.empty((*weights.shape, 3), x.dtype)
         factors = np.array([g_l1.item(), g_dissimilarity.item()], x.dtype)
@@ -78,7 +69,8 @@ def image_loss(image: Tensor, target: TargetStats) -> tuple[Tensor, Tensor]:
         raise TrainError(f"render is {tuple(image.shape)}, its training image {tuple(target.image.shape)}")
     image = image.to(target.image.dtype)
     if image.device.type == "cpu":
-        return _ImageLoss.apply(image.contiguous(), target)
+        l1, dissimilarity = _ImageLoss.apply(image.contiguous(), target)  # type: ignore[no-untyped-call]
+        return l1, dissimilarity
     return image_loss_reference(image, target.image, target.weights)
 
 

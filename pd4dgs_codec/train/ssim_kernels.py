@@ -9,10 +9,12 @@ Padded images: [H + 10, stride], pixel (j, i) channel c at [j + 5, 15 + 3 i + c]
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba as nb
 import numpy as np
 
-from pd4dgs_codec.model.simd import INNER, LANES, OUTER, load, splat, store
+from pd4dgs_codec.simd import LANES, kernel, load, splat, store
 
 C1, C2 = 0.01**2, 0.03**2
 TAPS = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
@@ -34,8 +36,8 @@ def pad(image: np.ndarray) -> np.ndarray:
     return out
 
 
-@nb.njit(**INNER)
-def _across(row, k, taps):
+@kernel(fast=True, inline=True)
+def _across(row: np.ndarray, k: int, taps: np.ndarray) -> Any:
     """The horizontal window at lane k of an image row, from a flat padded row (offset included in k)."""
     value = load(row, k) * splat(taps[0])
     for o in range(1, len(taps)):
@@ -43,8 +45,8 @@ def _across(row, k, taps):
     return value
 
 
-@nb.njit(**OUTER)
-def target_moments(mean, variance, image, taps):
+@kernel(fast=True, parallel=True)
+def target_moments(mean: np.ndarray, variance: np.ndarray, image: np.ndarray, taps: np.ndarray) -> None:
     """mean, variance [H, lanes] of a padded image under the window."""
     height, stride = len(mean), image.shape[1]
     zero = splat(image.dtype.type(0))
@@ -65,8 +67,8 @@ def target_moments(mean, variance, image, taps):
             store(variance, j * mean.shape[1] + k, _across(rows, stride + k, taps) - m * m)
 
 
-@nb.njit(**INNER)
-def _down(rows, x, y, j, taps):
+@kernel(fast=True, inline=True)
+def _down(rows: np.ndarray, x: np.ndarray, y: np.ndarray, j: int, taps: np.ndarray) -> None:
     """rows [3, stride] = the vertical window of x, x^2 and x y at image row j."""
     stride = x.shape[1]
     zero = splat(x.dtype.type(0))
@@ -83,8 +85,17 @@ def _down(rows, x, y, j, taps):
         store(rows, 2 * stride + k, cross)
 
 
-@nb.njit(**OUTER)
-def loss(slopes, sums, x, y, mean_y, var_y, weights, taps):
+@kernel(fast=True, parallel=True)
+def loss(
+    slopes: np.ndarray,
+    sums: np.ndarray,
+    x: np.ndarray,
+    y: np.ndarray,
+    mean_y: np.ndarray,
+    var_y: np.ndarray,
+    weights: np.ndarray,
+    taps: np.ndarray,
+) -> None:
     """sums [H, 2] = per row the weighted sums of |x - y| and of 1 - SSIM.
 
     slopes [3, H + 10, stride], given zeroed = the weighted derivatives of SSIM by the windowed x, x^2 and x y, in the
@@ -124,8 +135,16 @@ def loss(slopes, sums, x, y, mean_y, var_y, weights, taps):
         sums[j, 0], sums[j, 1] = absolute, dissimilarity
 
 
-@nb.njit(**OUTER)
-def loss_backward(grad, x, y, weights, slopes, factors, taps):
+@kernel(fast=True, parallel=True)
+def loss_backward(
+    grad: np.ndarray,
+    x: np.ndarray,
+    y: np.ndarray,
+    weights: np.ndarray,
+    slopes: np.ndarray,
+    factors: np.ndarray,
+    taps: np.ndarray,
+) -> None:
     """grad [H, W, 3] = d(factors[0] * L1 + factors[1] * (1 - SSIM)) / dx; the window is its own transpose."""
     height, width = weights.shape
     stride = x.shape[1]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import statistics
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from types import MappingProxyType
@@ -11,8 +10,9 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.data.dataset import Dataset, View
+from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.metrics.image import mean_image_baseline, mpsnr, mssim, to_uint8
+from pd4dgs_codec.metrics.levels import Metric, mean_scores
 from pd4dgs_codec.metrics.perceptual import Distance, Perceptual
 from pd4dgs_codec.scene import Camera
 from pd4dgs_codec.view.levels import Level, load_levels
@@ -29,7 +29,7 @@ def evaluate_file(
     *,
     device: str = "cpu",
     perceptual: Perceptual | None = None,
-    step: Callable[[], None] | None = None,
+    step: Callable[[], None] = lambda: None,
 ) -> dict[str, Any]:
     """What `pd4dgs-eval --json` prints: metrics are means over the views of the per-view values.
 
@@ -75,30 +75,26 @@ def evaluate_level(
     level: Level,
     views: tuple[View, ...],
     distances: Mapping[str, Distance] = NO_DISTANCES,
-    step: Callable[[], None] | None = None,
+    step: Callable[[], None] = lambda: None,
 ) -> dict[str, Any]:
     """The row of one level. render_ms: median milliseconds per picture, the networks included.
 
     distances: name -> distance; adds m<name>, the mean over the views, and t_<name>, the mean between successive
     pictures of the first view's camera at TEMPORAL_FRAMES equidistant times from 0 to 1.
     """
-    metrics: dict[str, Callable[..., float]] = {"mpsnr": mpsnr, "mssim": mssim}
+    metrics: dict[str, Metric] = {"mpsnr": mpsnr, "mssim": mssim}
     metrics |= {f"m{name}": distance for name, distance in distances.items()}
-    scores: dict[str, list[float]] = {name: [] for name in metrics}
     milliseconds = []
-    for i, view in enumerate(views):
-        if i == 0:  # compilation and caches are not the renderer's speed
-            level.picture(view.camera, view.time)
-        start = time.perf_counter()
-        image = level.picture(view.camera, view.time)
-        milliseconds.append(1e3 * (time.perf_counter() - start))
-        for name, metric in metrics.items():
-            scores[name].append(metric(image, view.image, view.mask))
-        if step:
-            step()
+
+    def draw(view: View) -> np.ndarray:
+        image, took = level.timed_picture(view.camera, view.time)
+        milliseconds.append(took)
+        return image
+
+    level.picture(views[0].camera, views[0].time)  # compilation and caches are not the renderer's speed
     return {
         "level": level.level,
-        **{name: sum(values) / len(values) for name, values in scores.items()},
+        **mean_scores(draw, views, metrics, step),
         **_temporal(level, views[0].camera, distances, step),
         "cumulative_bytes": level.cumulative_bytes,
         "anchors": level.anchors,
@@ -108,15 +104,14 @@ def evaluate_level(
 
 
 def _temporal(
-    level: Level, camera: Camera, distances: Mapping[str, Distance], step: Callable[[], None] | None
+    level: Level, camera: Camera, distances: Mapping[str, Distance], step: Callable[[], None]
 ) -> dict[str, float]:
     if not distances:
         return {}
     frames = []
     for t in np.linspace(0.0, 1.0, TEMPORAL_FRAMES):
         frames.append(to_uint8(level.picture(camera, float(t))))
-        if step:
-            step()
+        step()
     return {f"t_{name}": distance.temporal(frames) for name, distance in distances.items()}
 
 

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pd4dgs_codec.data.dataset import View
+from pd4dgs_codec.data.view import View
 from pd4dgs_codec.errors import RenderError
 from pd4dgs_codec.scene import Camera, SceneInfo
 
@@ -59,7 +59,7 @@ def look_at_point(info: SceneInfo) -> np.ndarray:
     viewmat = info.camera.viewmat.astype(np.float64)
     eye, axis = -viewmat[:3, :3].T @ viewmat[:3, 3], viewmat[2, :3]
     depth = float(axis @ (info.box.astype(np.float64).mean(axis=0) - eye))
-    return eye + max(depth, float(info.near), 1e-6) * axis
+    return np.asarray(eye + max(depth, float(info.near), 1e-6) * axis)
 
 
 def turned(camera: Camera, centre: np.ndarray, up: Sequence[float], angle: float) -> Camera:

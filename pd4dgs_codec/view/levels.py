@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass, replace
 from pathlib import Path
+from time import perf_counter
 
 import numpy as np
 import torch
@@ -22,7 +22,8 @@ from pd4dgs_codec.scene import MASK_THRESHOLD, Camera, Scene
 
 @dataclass(frozen=True)
 class Level:
-    """One level of a file. anchors: active at it. cumulative_bytes: its prefix; None for a checkpoint."""
+    """One level of a file, drawn by `model`. anchors: active at it. cumulative_bytes: of its prefix, and decode_seconds
+    of decoding that; both None for a checkpoint."""
 
     level: int
     model: Model
@@ -33,6 +34,12 @@ class Level:
     def picture(self, camera: Camera, time: float) -> np.ndarray:
         """float32 [H, W, 3] in 0..1 at normalised time 0..1."""
         return render_image(self.model, self.level, time, camera.viewmat, camera.K, camera.width, camera.height)
+
+    def timed_picture(self, camera: Camera, time: float) -> tuple[np.ndarray, float]:
+        """`picture`, and the milliseconds that it took, the networks included."""
+        start = perf_counter()
+        image = self.picture(camera, time)
+        return image, 1e3 * (perf_counter() - start)
 
 
 def level_of(scene: Scene, device: str = "cpu") -> Level:
@@ -63,9 +70,9 @@ def _of_bytes(data: bytes, max_layer: int | None, device: str) -> list[Level]:
     for row in info(data)["layers"]:
         if max_layer is not None and row["layer"] > max_layer:
             continue
-        start = time.perf_counter()
+        start = perf_counter()
         scene = decode(data[: row["end"]], max_layer=row["layer"])
-        seconds = time.perf_counter() - start
+        seconds = perf_counter() - start
         levels.append(replace(level_of(scene, device), cumulative_bytes=row["end"], decode_seconds=seconds))
     return levels
 

@@ -5,8 +5,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pd4dgs_codec.attributes.planes import PREDICTORS, choose_predictor, residual, restore
+from pd4dgs_codec.attributes.planes import PREDICTORS, residual, restore
 from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
+from pd4dgs_codec.codec.plane_choice import choose_predictor
 from pd4dgs_codec.errors import Malformed
 
 shapes = st.tuples(st.integers(1, 3), st.integers(1, 9), st.integers(1, 9))

@@ -13,7 +13,7 @@ pytest.importorskip("numba")
 pytest.importorskip("mpmath")
 
 from pd4dgs_codec.attributes import quantise  # noqa: E402
-from pd4dgs_codec.bench.stability import rasteriser, rows, table, training  # noqa: E402
+from pd4dgs_codec.bench.stability import cases, rasteriser, training  # noqa: E402
 from pd4dgs_codec.cli import bench  # noqa: E402
 from pd4dgs_codec.entropy import channels  # noqa: E402
 from pd4dgs_codec.errors import DataError, EncodeError  # noqa: E402
@@ -27,9 +27,7 @@ QUICK = ("rate", "fitting", "quantiser", "hexplane", "deformation", "masks", "ra
 
 
 @pytest.fixture(autouse=True)
-def _one_thread(monkeypatch):
-    """Several would only get in the way of other tests: everything here is small."""
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+def _one_torch_thread():
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield
@@ -37,40 +35,40 @@ def _one_thread(monkeypatch):
 
 
 def rows_of(name):
-    return table.run(table.chosen(table.all_cases(), name))
+    return [cases.judge(case) for case in cases.chosen(name)]
 
 
 # -- the table ---------------------------------------------------------------------------------------------------------
 
 
 def test_the_table_has_its_rows_and_no_two_of_one_name():
-    cases = table.all_cases()
-    names = [(c.group, c.case) for c in cases]
-    assert len(cases) >= 60 and len(set(names)) == len(names)
-    assert set(QUICK) | {"training"} == {c.group for c in cases}
-    assert all(c.fed and c.promised for c in cases)
+    every = cases.chosen(None)
+    names = [(c.group, c.case) for c in every]
+    assert len(every) >= 214 and len(set(names)) == len(names)
+    assert set(QUICK) | {"training"} == {c.group for c in every}
+    assert all(c.fed and c.promised for c in every)
 
 
 def test_the_documented_table_is_of_these_cases():
     lines = [line.split(" | ")[0][2:].strip() for line in DOCS.read_text().splitlines() if line.startswith("| ")]
-    assert {c.case for c in table.all_cases()} <= set(lines)
+    assert {c.case for c in cases.chosen(None)} <= set(lines)
 
 
 @pytest.mark.parametrize("group", QUICK)
 def test_every_row_holds(group):
-    failed = [row for row in rows_of(group) if row.status == rows.FAIL]
+    failed = [row for row in rows_of(group) if row.status == cases.FAIL]
     assert failed == []
 
 
 @pytest.mark.parametrize("case", ["learning rates times 100", "a single Gaussian", "a weight that is not a number"])
 def test_runs_that_ought_to_fail_do_not(case):
     (row,) = rows_of(case)
-    assert row.status == rows.PASS, row
+    assert row.status == cases.PASS, row
 
 
 @pytest.mark.slow
 def test_every_run_holds():
-    assert [row for row in rows_of("training") if row.status == rows.FAIL] == []
+    assert [row for row in rows_of("training") if row.status == cases.FAIL] == []
 
 
 # -- rows can fail -----------------------------------------------------------------------------------------------------
@@ -78,7 +76,7 @@ def test_every_run_holds():
 
 def broken_rows(name):
     """Names of the failed rows; a row that cannot fail would not be among them."""
-    return {row.case for row in rows_of(name) if row.status == rows.FAIL}
+    return {row.case for row in rows_of(name) if row.status == cases.FAIL}
 
 
 def naive(a, mu, sigma, q):
@@ -157,7 +155,7 @@ def test_a_picture_with_a_nan_fails(monkeypatch):
 
 
 def case_of(measure, refuses=None):
-    return rows.Case("group", "name", "fed", "promised", 1.0, measure, refuses)
+    return cases.Case("group", "name", "fed", "promised", 1.0, measure, refuses)
 
 
 def refuse(message):
@@ -179,7 +177,7 @@ def refuse(message):
     ],
 )
 def test_judgement(case, status):
-    assert rows.judge(case).status == status
+    assert cases.judge(case).status == status
 
 
 # -- the command -------------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ pytest.importorskip("torch")
 
 from pd4dgs_codec import __main__ as dispatcher  # noqa: E402
 from pd4dgs_codec import jsonable  # noqa: E402
-from pd4dgs_codec.cli import common, files  # noqa: E402
+from pd4dgs_codec.cli import common  # noqa: E402
 
 VERBS = ("train", "encode", "decode", "info", "render", "eval", "bench", "package", "serve")
 
@@ -146,23 +146,3 @@ def test_missing_module_is_named(cli, model_pt, tmp_path, monkeypatch):
     result = cli("encode", model_pt, "-o", tmp_path / "s.pd4")
     assert result.code == 1 and "torch" in result.err and "pip install" in result.err
     assert list(tmp_path.iterdir()) == []
-
-
-def test_files_that_appear_meanwhile_are_not_replaced(tmp_path):
-    target = tmp_path / "x.bin"
-    with pytest.raises(files.DataError), files.whole_file(str(target), False) as temporary:
-        temporary.write_bytes(b"new")
-        target.write_bytes(b"other")
-    assert target.read_bytes() == b"other" and [p.name for p in tmp_path.iterdir()] == ["x.bin"]
-
-
-def test_pictures_appear_together_or_not_at_all(tmp_path):
-    names = [str(tmp_path / "out" / f"{i}.png") for i in range(3)]
-    with pytest.raises(RuntimeError), files.whole_files(names[0], names, False) as temporaries:
-        temporaries[0].write_bytes(b"1")
-        raise RuntimeError("in the middle")
-    assert list(tmp_path.iterdir()) == []
-    with files.whole_files(names[0], names, False) as temporaries:
-        for temporary in temporaries:
-            temporary.write_bytes(b"1")
-    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["0.png", "1.png", "2.png"]

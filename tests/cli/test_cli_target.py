@@ -16,12 +16,11 @@ FAST = ("--mode", "lzma", "--effort", 1, "--json", "-f")
 @pytest.fixture(autouse=True)
 def _few_values(monkeypatch):
     """Each value costs an encode and its pictures: a few do here."""
-    from pd4dgs_codec.cli import encode
-    from pd4dgs_codec.pack import target
+    from pd4dgs_codec.pack import packing, target
 
     monkeypatch.setattr(target, "OCTAVES", (0.0, 1.5, 3.0))
     monkeypatch.setattr(target, "SHARES", (0.0, 0.1, 0.5))
-    monkeypatch.setattr(encode, "OWN_PICTURES", 2)
+    monkeypatch.setattr(packing, "OWN_PICTURES", 2)
 
 
 def first_layer(cli, path) -> int:
@@ -106,26 +105,26 @@ def test_layers_that_do_not_pay_are_left_out_with_their_figures(cli, model_pt, s
 
 
 def test_a_layer_that_explains_the_pictures_is_kept(scene):
-    from pd4dgs_codec.codec.layers import Coding
+    from pd4dgs_codec.codec.options import EncodeOptions
     from pd4dgs_codec.codec.plan import plan
     from pd4dgs_codec.codec.symbols import rounded
-    from pd4dgs_codec.data.dataset import View
+    from pd4dgs_codec.data.view import View
     from pd4dgs_codec.metrics.image import to_uint8
     from pd4dgs_codec.model.convert import from_scene
     from pd4dgs_codec.model.picture import render_image
-    from pd4dgs_codec.pack.worth import leave_out_unpaid
+    from pd4dgs_codec.pack.gains import leave_out_unpaid
 
     camera, model = scene.info.camera, from_scene(rounded(plan(scene)[0]))
     views = []
     for time in (0.2, 0.9):
         picture = render_image(model, 1, time, camera.viewmat, camera.K, camera.width, camera.height)
         views.append(View(camera.viewmat, camera.K, camera.width, camera.height, time, to_uint8(picture), None, "", 0))
-    kept, (gone,) = leave_out_unpaid(scene, views, min_gain=0.5, coding=Coding("lzma", effort=1))
+    kept, (gone,) = leave_out_unpaid(scene, views, min_gain=0.5, options=EncodeOptions(mode="lzma", effort=1))
     assert gone.what == "local_deformation" and kept.global_deformation is not None
 
 
 def test_harm_is_about_the_error_that_leaving_an_anchor_out_makes(scene, monkeypatch):
-    from pd4dgs_codec.codec.plan import full_masks, plan
+    from pd4dgs_codec.codec.plan import plan
     from pd4dgs_codec.model import harm as harm_of
     from pd4dgs_codec.pack.rendered import RenderedLoss
     from pd4dgs_codec.view.frames import own_frames
@@ -137,7 +136,7 @@ def test_harm_is_about_the_error_that_leaving_an_anchor_out_makes(scene, monkeyp
     anchors = range(planned.rows[0])
     measured = []
     for anchor in anchors:
-        masks = full_masks(planned)
+        masks = planned.full_masks()
         masks[0][anchor] = 0
         measured.append(loss.mse(replace(planned, mask=tuple(masks), rows=(len(harm),) * 3))[0])
     scalars = 3 * len(loss.frames) * planned.info.camera.width * planned.info.camera.height

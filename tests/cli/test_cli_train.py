@@ -13,16 +13,16 @@ import pytest
 
 torch = pytest.importorskip("torch")
 
+from tiny import TINY  # noqa: E402
+
 from pd4dgs_codec.model import checkpoint  # noqa: E402
-from pd4dgs_codec.model.config import PRESETS, DeformationConfig, ModelConfig  # noqa: E402
-from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS  # noqa: E402
+from pd4dgs_codec.model.config import PRESETS  # noqa: E402
 
 
 @pytest.fixture(autouse=True)
 def _small_preset(monkeypatch):
     """A preset that takes milliseconds a step."""
-    fields = (DeformationConfig(4, 4, 4, (1,), 8, tuple(heads)) for heads in (GLOBAL_HEADS, LOCAL_HEADS))
-    monkeypatch.setitem(PRESETS, "tiny", ModelConfig(*fields, hidden=8, initial_anchors=150, max_anchors=300))
+    monkeypatch.setitem(PRESETS, "tiny", TINY)
 
 
 @pytest.fixture
@@ -80,21 +80,21 @@ def test_seed_decides_the_result(train, tmp_path):
 
 
 def test_interrupted_and_resumed_run_repeats_the_uninterrupted_one(train, tmp_path, monkeypatch):
-    from pd4dgs_codec.train.loop import Trainer
+    from pd4dgs_codec.train.learner import Learner
 
     assert train(tmp_path / "whole.pt", iterations=8).code == 0
-    step = Trainer.step
+    step = Learner.step
 
     def interrupted(self):
         if self.iteration == 2:
             signal.raise_signal(signal.SIGINT)
         return step(self)
 
-    monkeypatch.setattr(Trainer, "step", interrupted)
+    monkeypatch.setattr(Learner, "step", interrupted)
     cut = train(tmp_path / "cut.pt", iterations=8)
     assert cut.code == 0 and "3 of 8 steps" in cut.err
     assert "never reached: " in cut.err and "exact rounding of attributes" in cut.err and "--resume" in cut.err
-    monkeypatch.setattr(Trainer, "step", step)
+    monkeypatch.setattr(Learner, "step", step)
     assert train(tmp_path / "cut.pt", "--resume", tmp_path / "cut.pt", iterations=None).code == 0
     assert _same(_state(tmp_path / "whole.pt"), _state(tmp_path / "cut.pt"))
 
@@ -134,10 +134,10 @@ def test_resume_needs_training_state(cli, model_pt, shared_dataset, tmp_path):
 
 
 def test_time_limit_ends_cleanly_and_must_grow_on_resume(cli, train, tmp_path, shared_dataset, monkeypatch):
-    from pd4dgs_codec.train.loop import Trainer
+    from pd4dgs_codec.train.learner import Learner
 
     slow = iter(range(1000))
-    step = Trainer.step
+    step = Learner.step
 
     def late(self):
         record = step(self)
@@ -145,7 +145,7 @@ def test_time_limit_ends_cleanly_and_must_grow_on_resume(cli, train, tmp_path, s
             monkeypatch.setattr("pd4dgs_codec.train.loop.time.monotonic", lambda: 1e9)
         return record
 
-    monkeypatch.setattr(Trainer, "step", late)
+    monkeypatch.setattr(Learner, "step", late)
     first = tmp_path / "m.pt"
     result = train(first, "--max-seconds", 1000, "--json", iterations=50)
     monkeypatch.undo()
@@ -194,9 +194,9 @@ def test_a_gpu_that_gsplat_cannot_use_is_left_alone(monkeypatch, capsys):
 
 
 def test_a_second_interrupt_is_one_line(train, tmp_path, monkeypatch):
-    from pd4dgs_codec.train.loop import Trainer
+    from pd4dgs_codec.train.learner import Learner
 
-    monkeypatch.setattr(Trainer, "step", lambda self: [signal.raise_signal(signal.SIGINT) for _ in range(2)])
+    monkeypatch.setattr(Learner, "step", lambda self: [signal.raise_signal(signal.SIGINT) for _ in range(2)])
     result = train(tmp_path / "m.pt")
     assert result.code == 1 and "interrupted twice" in result.error_lines[-1] and not (tmp_path / "m.pt").exists()
 
@@ -233,13 +233,12 @@ def test_a_run_from_before_a_part_of_the_method_goes_on_without_it():
 
 KILLED = """
 import os, signal, sys
-from pd4dgs_codec.model.config import PRESETS, DeformationConfig, ModelConfig
-from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS
+from tiny import TINY
+from pd4dgs_codec.model.config import PRESETS
 from pd4dgs_codec.train.loop import Trainer
 from pd4dgs_codec.cli.train import main
 
-fields = [DeformationConfig(4, 4, 4, (1,), 8, tuple(heads)) for heads in (GLOBAL_HEADS, LOCAL_HEADS)]
-PRESETS["tiny"] = ModelConfig(*fields, hidden=8, initial_anchors=150, max_anchors=300)
+PRESETS["tiny"] = TINY
 run, replace, saves = Trainer.run, os.replace, []
 
 def replace_or_die(*paths):
@@ -259,17 +258,21 @@ sys.exit(main(sys.argv[1:]))
 def test_a_run_killed_while_it_saves_goes_on_as_if_nothing_had_happened(train, cli, tmp_path, shared_dataset):
     whole, killed, log = tmp_path / "whole.pt", tmp_path / "killed.pt", tmp_path / "log.jsonl"
     argv = [shared_dataset, "-o", killed, "--preset", "tiny", "-j", 1, "--iterations", 40, "--log", log]
-    done = subprocess.run([sys.executable, "-c", KILLED, *map(str, argv)], stderr=subprocess.DEVNULL, timeout=300)
+    command, env = (
+        [sys.executable, "-c", KILLED, *map(str, argv)],
+        os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
+    )
+    done = subprocess.run(command, stderr=subprocess.DEVNULL, timeout=300, env=env)
     assert done.returncode == -signal.SIGKILL
     assert checkpoint.load(killed)[1]["iteration"] == 19 and len(log.read_text().splitlines()) == 20
-    assert len(list(tmp_path.glob(".killed.pt.*"))) == 1  # what it was writing
+    assert len(list(tmp_path.glob(".pd4dgs-*/killed.pt"))) == 1  # what it was writing
     with log.open("a") as stream:
         stream.write('{"iteration": 2')  # a line cut in its middle
     assert cli("train", shared_dataset, "-o", killed, "--resume", killed, "--log", log, "-j", 1).code == 0
     assert train(whole, iterations=40).code == 0
     assert _same(_state(whole), _state(killed))
     assert [json.loads(line)["iteration"] for line in log.read_text().splitlines()] == list(range(40))
-    assert not list(tmp_path.glob(".killed.pt.*"))
+    assert not list(tmp_path.glob(".pd4dgs-*/killed.pt"))
 
 
 def test_scarce_data_is_said_to_be_so(cli, dataset, tmp_path):

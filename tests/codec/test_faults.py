@@ -24,7 +24,8 @@ from pd4dgs_codec.codec import layer_meta
 from pd4dgs_codec.codec.decoder import decode, decode_layers
 from pd4dgs_codec.codec.encoder import encode
 from pd4dgs_codec.codec.header import scene_id_of, unpack_header
-from pd4dgs_codec.codec.layers import Coding, write_layer
+from pd4dgs_codec.codec.options import EncodeOptions
+from pd4dgs_codec.codec.payload import write_layer
 from pd4dgs_codec.errors import DecodeError, LimitExceeded, Malformed, Pd4Error, Truncated, UnsupportedFeature
 
 
@@ -333,7 +334,7 @@ def written(which, **changes):
     header, layers, _ = decode_layers(small_file())
     fields, chunks = take_apart(small_file())
     changed = replace(layers[which], **{name: change(getattr(layers[which], name)) for name, change in changes.items()})
-    chunks[which] = (which, 0, write_layer(changed, Coding(effort=1))[0])
+    chunks[which] = (which, 0, write_layer(changed, EncodeOptions(effort=1))[0])
     return put_together(fields, chunks)
 
 
@@ -416,14 +417,13 @@ def test_a_voxel_in_two_layers_is_malformed():
 
 def _same_anchors_again(scene):
     """A layer-1 payload whose own anchors are those of layer 0, made by the layer writer itself."""
-    from pd4dgs_codec.codec.layers import Coding, write_layer
     from pd4dgs_codec.codec.plan import plan
     from pd4dgs_codec.codec.symbols import layer_symbols
 
-    planned, _ = plan(replace(scene, mask=(scene.mask[1], scene.mask[1])), 2)
+    planned, _ = plan(replace(scene, mask=(scene.mask[1], scene.mask[1])), EncodeOptions(layers=2))
     first, second = (layer_symbols(planned, i) for i in (0, 1))
     again = replace(second, anchor_q=first.anchor_q, mask_own=first.mask_own, attributes=first.attributes)
-    return write_layer(again, Coding(effort=1))[0]
+    return write_layer(again, EncodeOptions(effort=1))[0]
 
 
 def test_the_header_is_small():

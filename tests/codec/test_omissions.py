@@ -9,7 +9,9 @@ from strategies import make_scene
 from pd4dgs_codec.attributes import planes as decorrelation
 from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.encoder import encode, encode_with_report
+from pd4dgs_codec.codec.options import EncodeOptions
 from pd4dgs_codec.codec.plan import plan
+from pd4dgs_codec.codec.plane_choice import fill_plane
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.evaluate.enclosure import residual_ranges, time_grid
 from pd4dgs_codec.evaluate.reach import reach
@@ -127,7 +129,7 @@ def test_nothing_that_matters_goes():
     """Of a scene without dead parts only cells that nothing reaches go, and what is kept stays as given."""
     scene = lively_scene()
     planned = decode(encode(scene, layers=2, effort=1))
-    _, left_out = plan(scene, 2)
+    _, left_out = plan(scene, EncodeOptions(layers=2))
     assert all("cells" in item.what or "offsets" in item.what for item in left_out)
     untouched = decode(encode(scene, layers=2, effort=1, omit="nothing"))
     read = reach(untouched)
@@ -141,7 +143,7 @@ def test_nothing_that_matters_goes():
 
 def test_cells_that_any_instant_reads_are_marked():
     """Against sampling: residuals lie in their ranges, and every cell that a sampled Gaussian reads is reached."""
-    scene, _ = plan(lively_scene(), 2, omit="nothing")
+    scene, _ = plan(lively_scene(), EncodeOptions(layers=2, omit="nothing"))
     field, box = scene.global_deformation, scene.info.box
     (stretches,) = residual_ranges(field, box, scene.anchor)
     grid = time_grid(field)
@@ -167,13 +169,13 @@ def test_a_filled_plane_keeps_what_is_given_and_costs_less():
     rng = np.random.default_rng(2)
     plane = rng.integers(-9, 10, (3, 12, 10), dtype=np.int32)
     given = rng.random((12, 10)) < 0.5
-    filled = decorrelation.fill(plane, given)
+    filled = fill_plane(plane, given)
     assert np.array_equal(filled[:, given], plane[:, given])
-    assert np.array_equal(decorrelation.fill(filled, given), filled)
+    assert np.array_equal(fill_plane(filled, given), filled)
     zeros = [(decorrelation.residual(p, filled)[:, ~given] == 0).all() for p in decorrelation.PREDICTORS]
     assert any(zeros)
-    assert np.array_equal(decorrelation.fill(plane, np.ones_like(given)), plane)
-    assert not decorrelation.fill(plane, np.zeros_like(given)).any()
+    assert np.array_equal(fill_plane(plane, np.ones_like(given)), plane)
+    assert not fill_plane(plane, np.zeros_like(given)).any()
 
 
 def test_an_unknown_wish_is_refused():

@@ -9,13 +9,16 @@ from strategies import make_scene
 
 from pd4dgs_codec.codec import encoder
 from pd4dgs_codec.codec.decoder import decode
+from pd4dgs_codec.codec.heads import head_bounds
 from pd4dgs_codec.codec.kinds import LAYER_KINDS
-from pd4dgs_codec.codec.plan import head_bounds, plan
+from pd4dgs_codec.codec.options import EncodeOptions
+from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.evaluate import residuals as evaluate
 from pd4dgs_codec.scene import GLOBAL_HEADS, LENGTH_HEADS, LOCAL_HEADS, PLANES, Deformation, deformation_unit
 
 VOXEL = 0.0078125
 encode, encode_with_report = (partial(f, effort=1) for f in (encoder.encode, encoder.encode_with_report))
+RAW = EncodeOptions(deformation="float32")
 
 
 def constant_deformation(heads, value, time_of=None):
@@ -64,7 +67,7 @@ def test_layers_go_with_their_deformation_and_the_highest_masks_stay(given_value
         assert active_codes(got, index) == active_codes(scene, layer)
     gone = {row["what"]: row for row in report.left_out}
     for layer, value in ((1, given_values[0]), (2, given_values[1])):
-        name = LAYER_KINDS[layer].deformation
+        name = LAYER_KINDS[layer].name
         assert (name in gone) == (value == 1e-7)
         if name in gone:
             assert gone[name]["bytes"] > 50 and "negligible" in gone[name]["why"]
@@ -90,17 +93,17 @@ def test_each_head_is_judged_by_its_own_bound(layer):
     for alive in heads:
         values = {name: (1.01 if name == alive else 0.99) * output for name, output in outputs.items()}
         scene = scene_with(**{"global_value" if layer == 1 else "local_value": values})
-        planned, left_out = plan(scene, "auto", raw_deformation=True)
-        networks = getattr(planned, kind.deformation).networks
+        planned, left_out = plan(scene, RAW)
+        networks = planned.tensors(layer).networks
         assert set(networks) == {"trunk", alive}
         gone = {item.what for item in left_out if item.kind}
-        assert gone == {f"{kind.deformation} head {h}" for h in heads if h != alive}
+        assert gone == {f"{kind.name} head {h}" for h in heads if h != alive}
 
 
 def test_a_short_event_is_seen():
     """A motion that lives in one of many time rows is found wherever it is."""
     for row in range(5):
-        planned, _ = plan(scene_with(global_value=1.0, time_of=row), "auto", raw_deformation=True)
+        planned, _ = plan(scene_with(global_value=1.0, time_of=row), RAW)
         assert planned.layers == (0, 1)
 
 
@@ -138,7 +141,7 @@ def test_numbers_that_overflow_are_not_called_negligible():
     trunk = ((np.full((1, 1), 3e38, np.float32), np.zeros(1, np.float32)),)
     networks = {**scene.global_deformation.networks, "trunk": trunk}
     scene = replace(scene, global_deformation=replace(scene.global_deformation, networks=networks))
-    assert plan(scene, "auto", raw_deformation=True)[0].layers == (0, 1)
+    assert plan(scene, RAW)[0].layers == (0, 1)
 
 
 def test_plane_sampling_agrees_with_grid_sample():

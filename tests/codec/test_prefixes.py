@@ -13,7 +13,8 @@ from pd4dgs_codec.bitstream.container import write_chunk, write_preamble
 from pd4dgs_codec.codec.decoder import decode_layers, decode_partial
 from pd4dgs_codec.codec.header import pack_header, scene_id_of
 from pd4dgs_codec.codec.info import hashes, info
-from pd4dgs_codec.codec.layers import Coding, write_layer
+from pd4dgs_codec.codec.options import EncodeOptions
+from pd4dgs_codec.codec.payload import write_layer
 from pd4dgs_codec.errors import BadSignature, ChecksumMismatch, DecodeError, Malformed, Truncated
 
 
@@ -131,16 +132,16 @@ def faults_by_every_door(data):
 def test_of_two_faults_every_door_names_that_of_the_earlier_layer(first, later):
     """Values that are not finite, sums of masks and voxels taken twice, which a payload alone does not show."""
     header, layers, _ = decode_layers(small_file())
-    payloads = [write_layer(layer, Coding(effort=1))[0] for layer in layers]
+    payloads = [write_layer(layer, EncodeOptions(effort=1))[0] for layer in layers]
     steps, which = header.attribute_steps, 1
     if first == "value":
         steps, which = {**steps, "offset": 2.0**127}, 0
     elif first == "mask code":
         full = replace(layers[1], mask_increase=np.full_like(layers[1].mask_increase, 255))
-        payloads[1] = write_layer(full, Coding(effort=1))[0]
+        payloads[1] = write_layer(full, EncodeOptions(effort=1))[0]
     else:
         taken = replace(layers[1], anchor_q=layers[0].anchor_q[: len(layers[1].anchor_q)])
-        payloads[1] = write_layer(taken, Coding(effort=1))[0]
+        payloads[1] = write_layer(taken, EncodeOptions(effort=1))[0]
     chunks = tuple((i, len(payload)) for i, payload in enumerate(payloads))
     packed = pack_header(replace(header, attribute_steps=steps, chunks=chunks))
     scene_id = scene_id_of(packed, payloads[0])

@@ -11,8 +11,8 @@ from strategies import HUGE, RANGES, assert_same_networks, assert_same_scene, ma
 
 from pd4dgs_codec.codec import encoder
 from pd4dgs_codec.codec.decoder import decode
-from pd4dgs_codec.entropy.morton import morton_codes
 from pd4dgs_codec.errors import EncodeError
+from pd4dgs_codec.morton import morton_codes
 from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS
 
 encode, encode_with_report = (partial(f, effort=1) for f in (encoder.encode, encoder.encode_with_report))

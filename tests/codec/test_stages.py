@@ -10,13 +10,13 @@ from pd4dgs_codec.codec.stages import (
     MAX_CLASSES,
     activity_classes,
     cheapest_class_count,
-    entropy_bits,
     places_of,
     put_stages,
     read_class_count,
     read_stages,
     relative_magnitude,
 )
+from pd4dgs_codec.entropy.bits import entropy_bits
 from pd4dgs_codec.entropy.priors import K_MAX
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint
 from pd4dgs_codec.errors import DecodeError, LimitExceeded, Malformed

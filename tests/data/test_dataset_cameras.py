@@ -6,8 +6,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pd4dgs_codec.data.cameras import (
-    Frame,
     Lens,
+    UnreadView,
     cameras_box,
     distort,
     normalised_times,
@@ -78,7 +78,7 @@ def test_box_finds_the_common_point():
         R = np.array([[np.cos(a), 0, -np.sin(a)], [0, 1, 0], [np.sin(a), 0, np.cos(a)]])
         viewmat = np.eye(4)
         viewmat[:3, :3], viewmat[:3, 3] = R, [0, 0, 8] - R @ [1, 2, 3]
-        frames.append(Frame("", 0, 0.0, viewmat, Lens(4, 4, 4, 4, 2, 2), None))
+        frames.append(UnreadView("", 0, 0.0, viewmat, Lens(4, 4, 4, 4, 2, 2), None))
     np.testing.assert_allclose(cameras_box(frames), [[1 - 2.6, 2 - 2.6, 3 - 2.6], [3.6, 4.6, 5.6]], atol=1e-5)
 
 

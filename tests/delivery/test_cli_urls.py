@@ -6,8 +6,8 @@ import json
 from importlib import import_module
 
 import pytest
+from faulty import Fault, FaultyServer
 
-from pd4dgs_codec.delivery.faulty import Fault, FaultyServer
 from pd4dgs_codec.delivery.prefix import HEADER_GUESS, header_size, layer_ends
 
 

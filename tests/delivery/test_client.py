@@ -11,12 +11,12 @@ import time
 from types import SimpleNamespace
 
 import pytest
+from faulty import Fault, FaultyServer
 from strategies import assert_same_scene, make_scene
 
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.delivery import client as client_module
 from pd4dgs_codec.delivery.client import Budget, RateMeter, SceneClient, next_end
-from pd4dgs_codec.delivery.faulty import Fault, FaultyServer
 from pd4dgs_codec.delivery.link import Link
 from pd4dgs_codec.delivery.prefix import layer_ends
 from pd4dgs_codec.delivery.server import Server

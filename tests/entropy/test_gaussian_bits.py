@@ -8,7 +8,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pd4dgs_codec.entropy.rate import gaussian_bits
+from pd4dgs_codec.entropy.bits import gaussian_bits
 
 
 def exact_bits(symbols: list[int]) -> float:

@@ -9,9 +9,9 @@ import refdec
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pd4dgs_codec.entropy.morton import morton_codes, morton_order
 from pd4dgs_codec.entropy.positions import decode_positions, encode_positions
 from pd4dgs_codec.errors import DecodeError, EncodeError, LimitExceeded, Malformed, Truncated
+from pd4dgs_codec.morton import morton_codes, morton_order
 
 
 def ordered(cells):

@@ -13,12 +13,12 @@ from pd4dgs_codec.scene import Steps
 def data(tmp_path_factory):
     """At most 4 kB with three layers."""
     from pd4dgs_codec.data.dataset import load
-    from pd4dgs_codec.model.config import PRESETS, DeformationConfig, ModelConfig
+    from pd4dgs_codec.model.config import DeformationConfig, ModelConfig
     from pd4dgs_codec.model.convert import to_scene
     from pd4dgs_codec.train.config import TrainConfig
     from pd4dgs_codec.train.loop import Trainer
 
-    preset = ModelConfig(
+    size = ModelConfig(
         DeformationConfig(3, 3, 2, (1,), 4, ("position", "feature")),
         DeformationConfig(3, 4, 2, (1,), 4, ("mean", "color")),
         hidden=4,
@@ -27,9 +27,8 @@ def data(tmp_path_factory):
         steps=Steps(weights_scaffold=0.01, weights_global=0.004, weights_local=0.004),
     )
     source = "synthetic:local"
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setitem(PRESETS, "tiny", preset)
-        trainer = Trainer(TrainConfig(preset="tiny", source=source, iterations=120), load(source, downscale=4))
+    config = TrainConfig(preset="tiny", source=source, iterations=120)
+    trainer = Trainer(config, load(source, downscale=4), size=size)
     trainer.run(tmp_path_factory.mktemp("trained") / "model.pt")
     data = encode(to_scene(trainer.model), layers=2)
     assert 1500 < len(data) <= 4096

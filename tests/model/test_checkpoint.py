@@ -270,12 +270,3 @@ def test_a_file_that_may_not_grow_ends_in_the_systems_own_words(path, tmp_path):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
     assert path.read_bytes() == before and os.listdir(tmp_path) == ["model.pt"]
-
-
-def test_leftovers_of_a_killed_save_are_found_by_name(path, tmp_path):
-    mine = tmp_path / f".{path.name}.ab_3xyz9"
-    others = [tmp_path / name for name in (".other.pt.ab_3xyz9", f".{path.name}.backup", f".{path.name}.notes-12")]
-    for file in (mine, *others):
-        file.write_bytes(b"x")
-    checkpoint.remove_leftovers(path)
-    assert not mine.exists() and path.exists() and all(file.exists() for file in others)

@@ -11,6 +11,7 @@ from strategies import make_scene
 from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.encoder import encode, encode_with_report
 from pd4dgs_codec.codec.info import info
+from pd4dgs_codec.codec.options import EncodeOptions
 from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.pack import target
@@ -132,7 +133,7 @@ def test_layers_meet_their_targets_and_the_loss_grows_as_they_shrink(scene):
     loss, whole, losses = coarseness(scene), added(encode(scene, **FAST)), []
     for share in (1.01, 0.95, 0.8):
         targets = {layer: round(share * whole[layer]) for layer in (0, 2)}
-        fitted, left_out, fits = fit(scene, targets, loss, harm, **FAST)
+        fitted, left_out, fits = fit(scene, targets, loss, harm, EncodeOptions(**FAST))
         data, report = encode_with_report(fitted, **FAST, left_out=left_out)
         sizes = added(data)
         for row in fits:
@@ -146,14 +147,14 @@ def test_layers_meet_their_targets_and_the_loss_grows_as_they_shrink(scene):
 def test_anchors_of_least_harm_move_to_the_next_layer_and_out_of_the_highest(scene, monkeypatch):
     monkeypatch.setattr(target, "OCTAVES", (0.0,))
     whole = added(encode(scene, **FAST))
-    fitted, left_out, (row,) = fit(scene, {0: round(0.8 * whole[0])}, lambda decoded: 0.0, harm, **FAST)
+    fitted, left_out, (row,) = fit(scene, {0: round(0.8 * whole[0])}, lambda decoded: 0.0, harm, EncodeOptions(**FAST))
     moved, own = fitted.mask[0] == 0, np.arange(scene.rows[-1]) < scene.rows[0]
     assert row.moved == (moved & own).sum() > 0 and row.to_layer == 1 and not left_out
     assert harm(scene, 0)[moved & own].max() == row.harm < harm(scene, 0)[~moved & own].min()
     assert (fitted.mask[1] > 0).all(), "they are shown from there on"
 
-    alone, _ = plan(scene, 0)
-    fitted, left_out, (row,) = fit(alone, {0: round(0.8 * whole[0])}, lambda decoded: 0.0, harm, **FAST)
+    alone, _ = plan(scene, EncodeOptions(layers=0))
+    fitted, left_out, (row,) = fit(alone, {0: round(0.8 * whole[0])}, lambda decoded: 0.0, harm, EncodeOptions(**FAST))
     assert row.to_layer is None and row.moved and (fitted.mask[0] == 0).sum() == row.moved
     report = encode_with_report(fitted, **FAST, left_out=left_out)[1]
     assert "target size" in report.left_out[0]["why"] and report.left_out[0]["what"] == f"{row.moved} anchors"
@@ -163,12 +164,12 @@ def test_a_target_out_of_reach_says_what_could_be_reached(scene):
     with pytest.raises(
         EncodeError, match=r"layer 2 takes at least [\d,]+ bytes \(steps up to x16.*expected at most 100$"
     ):
-        fit(scene, {2: 100}, coarseness(scene), harm, **FAST)
+        fit(scene, {2: 100}, coarseness(scene), harm, EncodeOptions(**FAST))
 
 
 def test_a_layer_that_is_not_there_meets_any_target(scene):
-    alone, _ = plan(scene, 0)
-    fitted, left_out, (row,) = fit(alone, {2: 1}, coarseness(alone), harm, **FAST)
+    alone, _ = plan(scene, EncodeOptions(layers=0))
+    fitted, left_out, (row,) = fit(alone, {2: 1}, coarseness(alone), harm, EncodeOptions(**FAST))
     assert fitted is alone and not left_out and (row.bytes, row.moved, row.factors) == (0, 0, {})
 
 
@@ -176,4 +177,4 @@ def test_float32_deformations_have_no_steps_to_move(scene):
     options = FAST | {"deformation": "float32"}
     most = round(0.9 * added(encode(scene, **options))[2])
     with pytest.raises(EncodeError, match="layer 2 takes at least"):
-        fit(scene, {2: most}, coarseness(scene), harm, **options)
+        fit(scene, {2: most}, coarseness(scene), harm, EncodeOptions(**options))

@@ -10,7 +10,8 @@ import numba  # noqa: E402
 from hypothesis import given, settings  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 
-from pd4dgs_codec.render import binning, cpu, kernels, simd  # noqa: E402,I001
+from pd4dgs_codec import simd  # noqa: E402
+from pd4dgs_codec.render import binning, cpu, kernels  # noqa: E402
 
 
 @numba.njit

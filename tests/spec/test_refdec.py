@@ -30,12 +30,12 @@ from pd4dgs_codec.codec.plane_section import read_planes
 from pd4dgs_codec.codec.stages import PLAIN, STAGED
 from pd4dgs_codec.entropy.channels import encode_channels
 from pd4dgs_codec.entropy.lzma_mode import encode_channels_lzma
-from pd4dgs_codec.entropy.morton import morton_order
 from pd4dgs_codec.entropy.positions import encode_positions
 from pd4dgs_codec.entropy.priors import CONST, GAUSS, GMM2, HIST, K_MAX
 from pd4dgs_codec.entropy.tables import NORMAL, OCTAVE
 from pd4dgs_codec.entropy.varint import put_varint, put_zigzag
 from pd4dgs_codec.errors import DecodeError
+from pd4dgs_codec.morton import morton_order
 
 SPEC = Path(__file__).parents[2] / "spec"
 TEXT = (SPEC / "format.md").read_text(encoding="utf-8")

@@ -18,14 +18,15 @@ Image = pytest.importorskip("PIL.Image")
 
 from pages import main_job, tables, trainings  # noqa: E402
 from pages.main_job import Job, run_job  # noqa: E402
+from scenes import SMALLEST  # noqa: E402
 
 from pd4dgs_codec import decode  # noqa: E402
 from pd4dgs_codec.codec.encoder import encode_with_report  # noqa: E402
 from pd4dgs_codec.codec.info import info  # noqa: E402
-from pd4dgs_codec.data.dataset import Dataset, View  # noqa: E402
+from pd4dgs_codec.data.view import Dataset, View  # noqa: E402
 from pd4dgs_codec.errors import TrainError  # noqa: E402
 from pd4dgs_codec.model import checkpoint  # noqa: E402
-from pd4dgs_codec.model.config import PRESETS, DeformationConfig, ModelConfig  # noqa: E402
+from pd4dgs_codec.model.config import PRESETS  # noqa: E402
 from pd4dgs_codec.model.convert import to_scene  # noqa: E402
 from pd4dgs_codec.train.config import TrainConfig  # noqa: E402
 
@@ -59,11 +60,9 @@ def job() -> Iterator[Job]:
         assert source == "two-discs" and (downscale, holdout) == (CONFIG.downscale, CONFIG.holdout)
         return dataset
 
-    field = DeformationConfig(4, 4, 8, (1, 2), 8, ("position", "feature", "offset", "scaling"))
-    local = dataclasses.replace(field, heads=("mean", "scale", "quat", "opacity", "color"))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(main_job, "load", load)
-        patch.setitem(PRESETS, "tiny", ModelConfig(field, local, hidden=8, initial_anchors=250, max_anchors=300))
+        patch.setitem(PRESETS, "tiny", SMALLEST)
         yield Job("discs", CONFIG)
 
 
@@ -182,6 +181,11 @@ def test_an_interrupted_training_is_not_published_and_goes_on(job, finished, tmp
     assert (tmp_path / "discs" / "scene.pd4").read_bytes() == (finished[0] / "discs" / "scene.pd4").read_bytes()
 
 
+def shown(result: dict) -> dict:
+    """The figures that tables show of a result."""
+    return {"name": result["name"], **tables.figures(result)}
+
+
 def test_a_layer_that_one_encoding_drops_is_shown_as_absent(finished):
     scene = to_scene(checkpoint.load(finished[0] / "discs" / "model.pt")[0])
     reports = {name: encode_with_report(scene, effort=1, **options)[1] for name, options in main_job.VARIANTS.items()}
@@ -189,15 +193,15 @@ def test_a_layer_that_one_encoding_drops_is_shown_as_absent(finished):
     reports["lzma_float32"] = dataclasses.replace(reports["lzma_float32"], layers=reports["lzma_float32"].layers[1:])
     rows = main_job.coding_rows(reports, scene)
     assert rows[0] == whole[0] | {"lzma_float32_bytes": None} and rows[1:] == whole[1:]
-    assert "| - " in tables.coding_table([finished[1] | {"coding": rows}])
+    assert "| - " in tables.coding_table([shown(finished[1] | {"coding": rows})])
 
 
 def test_the_results_become_markdown_tables_and_a_plot(finished, tmp_path):
     result = finished[1]
     levels = [str(row["level"]) for row in result["evaluation"]["levels"]]
     for table, numbers in (
-        (tables.quality_table([result, result]), levels),
-        (tables.coding_table([result, result]), [*levels, "all"]),
+        (tables.quality_table([shown(result)] * 2), levels),
+        (tables.coding_table([shown(result)] * 2), [*levels, "all"]),
     ):
         rows = [[cell.strip() for cell in line.strip("|").split("|")] for line in table.splitlines()]
         assert len({len(line) for line in table.splitlines()}) == 1  # columns line up
@@ -205,10 +209,10 @@ def test_the_results_become_markdown_tables_and_a_plot(finished, tmp_path):
         assert all(row[0] == "discs" for row in rows[2:])
         assert [row[1] for row in rows[2:]] == 2 * numbers
         assert all(cell for row in rows for cell in row)
-    assert f"{result['evaluation']['levels'][-1]['cumulative_bytes']:,}" in tables.quality_table([result])
-    assert f"{result['coding'][0]['lzma_bytes']:,}" in tables.coding_table([result])
+    assert f"{result['evaluation']['levels'][-1]['cumulative_bytes']:,}" in tables.quality_table([shown(result)])
+    assert f"{result['coding'][0]['lzma_bytes']:,}" in tables.coding_table([shown(result)])
     pytest.importorskip("matplotlib")
-    tables.time_plot([result], tmp_path / "plot.png")
+    tables.time_plot([shown(result)], tmp_path / "plot.png")
     assert Image.open(tmp_path / "plot.png").width > 300
 
 

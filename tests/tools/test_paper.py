@@ -11,6 +11,7 @@ torch = pytest.importorskip("torch")
 pytest.importorskip("numba")
 
 from pages.paper import plots, statistics, tables  # noqa: E402
+from pages.paper.published import FIRST_FRAME  # noqa: E402
 from pages.paper.runs import (  # noqa: E402
     FULL,
     MONOLITHIC,
@@ -21,12 +22,12 @@ from pages.paper.runs import (  # noqa: E402
     held_to,
     measure,
 )
+from scenes import SMALLEST  # noqa: E402
 
-from pd4dgs_codec.bench.latency.published import FIRST_FRAME  # noqa: E402
-from pd4dgs_codec.data.dataset import Dataset, load  # noqa: E402
+from pd4dgs_codec.data.dataset import load  # noqa: E402
+from pd4dgs_codec.data.view import Dataset  # noqa: E402
 from pd4dgs_codec.model import checkpoint  # noqa: E402
-from pd4dgs_codec.model.config import PRESETS, DeformationConfig, ModelConfig  # noqa: E402
-from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS  # noqa: E402
+from pd4dgs_codec.model.config import PRESETS  # noqa: E402
 from pd4dgs_codec.train.config import TrainConfig  # noqa: E402
 
 STATIC = "synthetic:static"
@@ -133,15 +134,7 @@ def dataset() -> Dataset:
 @pytest.fixture
 def small(monkeypatch):
     """The tiny preset, tinier."""
-    monkeypatch.setitem(
-        PRESETS,
-        "tiny",
-        ModelConfig(
-            DeformationConfig(4, 4, 4, (1,), 8, tuple(GLOBAL_HEADS)),
-            DeformationConfig(4, 4, 4, (1,), 8, tuple(LOCAL_HEADS)),
-            hidden=8, initial_anchors=200, max_anchors=300,
-        ),
-    )  # fmt: skip
+    monkeypatch.setitem(PRESETS, "tiny", SMALLEST)
 
 
 def test_runs_are_made_once_and_again_when_settings_change(small, tmp_path, dataset):
@@ -188,10 +181,13 @@ def test_the_tool_trains_and_writes_a_table(small, tmp_path, capsys):
     tool = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(tool)
     tool.OTHERS = ("tiny", 12, 1)
-    where = ("--out", str(tmp_path / "out"), "--docs", str(tmp_path / "docs"))
+    docs = tmp_path / "docs"
+    where = ("--out", str(tmp_path / "out"), "--docs", str(docs))
     assert tool.main(["levels", "--scenes", f"{STATIC}@4", "--iterations", "12", *where]) == 0
-    assert "| level |" in (tmp_path / "docs" / "levels.md").read_text()
-    assert json.loads((tmp_path / "docs" / "levels.json").read_text())[0]["variant"] == "full"
+    page = (docs / "paper" / "levels.md").read_text()
+    assert "| level |" in page and (docs / "paper" / "levels.png").exists()
+    assert json.loads((docs / "figures" / "paper" / "levels.json").read_text())[0]["variant"] == "full"
+    assert tool.main(["levels", "--render", *where]) == 0 and (docs / "paper" / "levels.md").read_text() == page
     capsys.readouterr()
     assert tool.main(["levels", "--scenes", str(tmp_path / "nowhere"), *where]) == 1
     assert capsys.readouterr().err.count("\n") == 1

@@ -4,19 +4,15 @@ import json
 from dataclasses import replace
 
 import pytest
+from runs import assert_same_weights, read_log
 
-torch = pytest.importorskip("torch")
-pytest.importorskip("numba")
-
-from test_loop import dataset, few_anchors  # noqa: E402, F401 - fixtures
-
-from pd4dgs_codec.codec.decoder import decode  # noqa: E402
-from pd4dgs_codec.codec.encoder import encode  # noqa: E402
-from pd4dgs_codec.model import checkpoint  # noqa: E402
-from pd4dgs_codec.model.convert import to_scene  # noqa: E402
-from pd4dgs_codec.train import judge  # noqa: E402
-from pd4dgs_codec.train.config import Schedule, TrainConfig  # noqa: E402
-from pd4dgs_codec.train.loop import Trainer  # noqa: E402
+from pd4dgs_codec.codec.decoder import decode
+from pd4dgs_codec.codec.encoder import encode
+from pd4dgs_codec.model import checkpoint
+from pd4dgs_codec.model.convert import to_scene
+from pd4dgs_codec.train import judge
+from pd4dgs_codec.train.config import Schedule, TrainConfig
+from pd4dgs_codec.train.loop import Trainer
 
 
 @pytest.mark.parametrize(
@@ -24,7 +20,7 @@ from pd4dgs_codec.train.loop import Trainer  # noqa: E402
     [
         ([30, 31, 32], []),
         ([30, 31, 30.9], [2]),
-        ([30, 31, 31 + 0.9 * judge.MIN_GAIN[2]], [2]),
+        ([30, 31, 31 + 0.9 * judge.MIN_GAIN_DB[2]], [2]),
         ([30, 29, 29], [2, 1]),
         ([30, 30.38, 30.4], [2, 1]),  # a scene where nothing moves
         ([30, 29, 29.5], []),  # level 2 gains, and rests on level 1
@@ -40,41 +36,40 @@ def test_short_runs_and_few_views_are_not_judged():
     assert not judge.waiting_views(60, judge.MIN_ITERATIONS - 1) and not judge.waiting_views(50, 1000)
 
 
-def test_a_level_that_goes_stays_away(dataset, tmp_path, monkeypatch):  # noqa: F811
+def test_a_level_that_goes_stays_away(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(judge, "MIN_ITERATIONS", 10)
     monkeypatch.setattr(judge, "levels_without_gain", lambda psnr: [(2, psnr[2] - psnr[1])])
     views = replace(dataset, train=dataset.train * 12)
     config = TrainConfig(preset="tiny", iterations=30)
     trainer = Trainer(config, views)
     seen = []
-    original = trainer._next_view
-    monkeypatch.setattr(trainer, "_next_view", lambda schedule: seen.append(original(schedule)) or seen[-1])
+    original = trainer.learner._next_view
+    monkeypatch.setattr(trainer.learner, "_next_view", lambda: seen.append(original()) or seen[-1])
     trainer.run(tmp_path / "m.pt", log=tmp_path / "log.jsonl")
     start = Schedule(30).rounding
     assert not set(seen[:start]) & judge.waiting_views(72, 30) and len(judge.waiting_views(72, 30)) == 4
-    records = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    records = read_log(tmp_path / "log.jsonl")
     assert [r["iteration"] for r in records if "left_out" in r] == [start]
     assert records[start]["left_out"][0]["level"] == 2 and max(r["level"] for r in records[start:]) == 1
     model, training = checkpoint.load(tmp_path / "m.pt")
     assert model.local_deformation is None and model.global_deformation is not None
-    assert json.loads(training["left_out"]) == trainer.left_out
+    assert json.loads(training["left_out"]) == trainer.learner.left_out
     assert decode(encode(to_scene(model), effort=1)).layers == (0, 1)
 
     part = Trainer(config, views)
     for _ in range(25):
-        part.step()
+        part.learner.step()
     part.save(tmp_path / "part.pt")
     resumed = Trainer(config, views)
     resumed.resume(tmp_path / "part.pt")
     resumed.run(tmp_path / "resumed.pt")
-    again = checkpoint.load(tmp_path / "resumed.pt")[0].state_dict()
-    assert all(torch.equal(tensor, again[name]) for name, tensor in model.state_dict().items())
-    assert resumed.left_out == trainer.left_out
+    assert_same_weights(tmp_path / "m.pt", tmp_path / "resumed.pt")
+    assert resumed.learner.left_out == trainer.learner.left_out
 
 
-def test_with_judging_off_all_views_are_learnt_and_all_levels_stay(dataset, monkeypatch):  # noqa: F811
+def test_with_judging_off_all_views_are_learnt_and_all_levels_stay(dataset, monkeypatch):
     monkeypatch.setattr(judge, "MIN_ITERATIONS", 10)
     views = replace(dataset, train=dataset.train * 12)
-    assert Trainer(TrainConfig(preset="tiny", iterations=30), views)._waiting_views()
+    assert Trainer(TrainConfig(preset="tiny", iterations=30), views).learner.waiting_views()
     for nothing in ({"judge": False}, {"max_layer": 0}, {"rollout": "top"}):
-        assert not Trainer(TrainConfig(preset="tiny", iterations=30, **nothing), views)._waiting_views()
+        assert not Trainer(TrainConfig(preset="tiny", iterations=30, **nothing), views).learner.waiting_views()

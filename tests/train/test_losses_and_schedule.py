@@ -3,14 +3,13 @@
 import math
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from pd4dgs_codec.errors import TrainError  # noqa: E402
-from pd4dgs_codec.model.layers import level_mask, mask_logits  # noqa: E402
-from pd4dgs_codec.train import losses  # noqa: E402
-from pd4dgs_codec.train.config import Schedule, TrainConfig, learning_rate  # noqa: E402
-from pd4dgs_codec.train.rollout import rollout_probabilities, sample_level, updated_rho  # noqa: E402
+from pd4dgs_codec.errors import TrainError
+from pd4dgs_codec.model.layers import level_mask, mask_logits
+from pd4dgs_codec.train import losses
+from pd4dgs_codec.train.config import Schedule, TrainConfig, learning_rate
+from pd4dgs_codec.train.rollout import rollout_probabilities, sample_level, updated_rho
 
 
 def test_masks_are_monotone_and_start_where_the_method_says():
@@ -99,6 +98,14 @@ def test_the_schedule_is_the_papers_at_its_own_length():
     assert s.phases_not_reached(30_000) == Schedule(4).phases_not_reached(4) == []
     assert s.phases_not_reached(27_000)[0] == "exact rounding of attributes"
     assert s.phases_not_reached(5_000)[0] == "rate and mask terms"
+
+
+def test_while_n_is_not_known_no_phase_but_the_first_is_in_sight():
+    s = Schedule(None)
+    assert min(s.coarse_end, s.warm, s.progressive, s.rho_start, s.rounding, s.exact_rounding) == math.inf
+    assert not s.grow and not s.prune and s.separation(7) == s.progress(7) == 0.0
+    assert s.phases_not_reached(10**9) == Schedule(3_000).phases_not_reached(0)
+    assert [i for i in range(500) if i % s.rho_every == 0] == [0]
 
 
 def test_masks_separate_between_the_rate_terms_and_exact_rounding():

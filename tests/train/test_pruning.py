@@ -1,22 +1,17 @@
 """What the pictures hardly need leaves: the least harmful anchors, as many as the share allows, and no more."""
 
-import json
-
 import numpy as np
 import pytest
+import torch
+from runs import assert_resumes_bit_for_bit, read_log
 
-torch = pytest.importorskip("torch")
-pytest.importorskip("numba")
-
-from test_loop import assert_resumes_bit_for_bit, dataset, few_anchors  # noqa: E402, F401 - fixtures
-
-from pd4dgs_codec.errors import NotFinite  # noqa: E402
-from pd4dgs_codec.model.model import EXACT  # noqa: E402
-from pd4dgs_codec.model.picture import render_image  # noqa: E402
-from pd4dgs_codec.scene import MASK_THRESHOLD  # noqa: E402
-from pd4dgs_codec.train import pruning  # noqa: E402
-from pd4dgs_codec.train.config import PRUNING_ROUNDS, Schedule, TrainConfig  # noqa: E402
-from pd4dgs_codec.train.loop import Trainer  # noqa: E402
+from pd4dgs_codec.errors import NotFinite
+from pd4dgs_codec.model.model import EXACT
+from pd4dgs_codec.model.picture import render_image
+from pd4dgs_codec.scene import MASK_THRESHOLD
+from pd4dgs_codec.train import pruning
+from pd4dgs_codec.train.config import PRUNING_ROUNDS, Schedule, TrainConfig
+from pd4dgs_codec.train.loop import Trainer
 
 
 def test_the_least_go_up_to_the_share():
@@ -27,11 +22,11 @@ def test_the_least_go_up_to_the_share():
 
 
 @pytest.fixture
-def trained(dataset, tmp_path):  # noqa: F811
+def trained(dataset, tmp_path):
     """A trainer after a short run without pruning, and its shots."""
     trainer = Trainer(TrainConfig(preset="tiny", iterations=120, prune=0.0, noise=False), dataset)
     trainer.run(tmp_path / "m.pt")
-    return trainer, [(dataset.train[i], *trainer._targets[i]) for i in range(len(dataset.train))]
+    return trainer, trainer.learner.shots
 
 
 def _pictures(trainer, level: int) -> list[np.ndarray]:
@@ -76,7 +71,9 @@ def test_pruning_costs_what_it_says_and_keeps_the_masks_above(trained):
     before = [_error(trainer, level) for level in range(3)]
     for turn in range(PRUNING_ROUNDS):
         turns, masks = pruning.turns(model.anchor_q), [model.masks(level).detach() for level in range(3)]
-        keep, later = pruning.prune(model, trainer.optimiser, shots, range(3), share / PRUNING_ROUNDS, turn, EXACT)
+        keep, later = pruning.prune(
+            model, trainer.learner.optimiser, shots, range(3), share / PRUNING_ROUNDS, turn, EXACT
+        )
         assert 0 < len(model.anchor_q) == len(keep) < len(turns)
         assert torch.isin((turns != turn).nonzero()[:, 0], keep).all()
         for level in (1, 2):
@@ -91,7 +88,7 @@ def test_pruning_costs_what_it_says_and_keeps_the_masks_above(trained):
 
 def test_a_level_that_is_not_trained_has_no_say(trained):
     trainer, shots = trained
-    keep, later = pruning.prune(trainer.model, trainer.optimiser, shots, range(2, 3), 0.05, 0, EXACT)
+    keep, later = pruning.prune(trainer.model, trainer.learner.optimiser, shots, range(2, 3), 0.05, 0, EXACT)
     assert later == 0 and 0 < len(keep)
 
 
@@ -101,12 +98,12 @@ def test_every_anchor_has_its_turn():
     assert len(shares) == PRUNING_ROUNDS and (shares - 1 / PRUNING_ROUNDS).abs().max() < 0.05
 
 
-def test_a_run_prunes_half_way_and_resumes_with_the_same_bits(dataset, tmp_path, monkeypatch):  # noqa: F811
+def test_a_run_prunes_half_way_and_resumes_with_the_same_bits(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(pruning, "MIN_ITERATIONS", 10)
     config = TrainConfig(preset="tiny", iterations=60, prune=0.05)
     whole = Trainer(config, dataset)
     whole.run(tmp_path / "whole.pt", log=tmp_path / "log.jsonl")
-    records = [json.loads(line) for line in (tmp_path / "log.jsonl").read_text().splitlines()]
+    records = read_log(tmp_path / "log.jsonl")
     pruned = [r for r in records if "left_model" in r]
     rounds = list(Schedule(60).prune)
     assert [r["iteration"] for r in pruned] == rounds and sum(r["left_model"] for r in pruned) > 0
@@ -114,7 +111,7 @@ def test_a_run_prunes_half_way_and_resumes_with_the_same_bits(dataset, tmp_path,
     assert_resumes_bit_for_bit(config, dataset, tmp_path, rounds[1:3])
 
 
-def test_a_round_that_meets_infinity_is_passed_over(dataset, tmp_path, monkeypatch):  # noqa: F811
+def test_a_round_that_meets_infinity_is_passed_over(dataset, tmp_path, monkeypatch):
     def diverged(*_, **__):
         raise NotFinite("colors: found inf")
 
@@ -125,15 +122,15 @@ def test_a_round_that_meets_infinity_is_passed_over(dataset, tmp_path, monkeypat
     assert trainer.iteration == 30 and "left_model" not in (tmp_path / "log.jsonl").read_text()
 
 
-def test_a_scene_that_needs_no_anchor_keeps_some(dataset, tmp_path, monkeypatch):  # noqa: F811
+def test_a_scene_that_needs_no_anchor_keeps_some(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(pruning, "MIN_ITERATIONS", 10)
     monkeypatch.setattr(pruning, "relative_harm", lambda model, *_: torch.zeros(len(model.anchor_q)).double())
     trainer = Trainer(TrainConfig(preset="tiny", iterations=40), dataset)
     trainer.run(tmp_path / "m.pt")
-    assert 0 < trainer.active_anchors()[0] <= len(trainer.model.anchor_q) < 300
+    assert 0 < trainer.learner.active_anchors()[0] <= len(trainer.model.anchor_q) < 300
 
 
-def test_short_runs_are_not_pruned(dataset, tmp_path):  # noqa: F811
+def test_short_runs_are_not_pruned(dataset, tmp_path):
     trainer = Trainer(TrainConfig(preset="tiny", iterations=60, prune=0.5), dataset)
     trainer.run(tmp_path / "m.pt", log=tmp_path / "log.jsonl")
     assert "left_model" not in (tmp_path / "log.jsonl").read_text()

@@ -67,7 +67,8 @@ def test_shrunk_camera_sees_the_same_rays():
 
 def test_panels_paste_images_unchanged_below_captions():
     a, b = np.full((40, 60, 3), 10, np.uint8), np.full((40, 30, 3), 200, np.uint8)
-    sheet = panels.side_by_side([a, b], ["level 0, 12 kB", "a caption far too long for its image"])
+    captioned = (panels.Panel(a, "level 0, 12 kB"), panels.Panel(b, "a caption far too long for its image"))
+    sheet = panels.side_by_side(captioned)
     assert sheet.shape == (40 + 16, 60 + 30 + panels.GAP, 3)
     assert np.array_equal(sheet[-40:, :60], a) and np.array_equal(sheet[-40:, -30:], b)
     band = sheet[:-40]

@@ -25,7 +25,7 @@ from pd4dgs_codec.codec.header import unpack_header
 from pd4dgs_codec.codec.info import hashes, info
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
 from pd4dgs_codec.codec.layer_meta import declared_symbols
-from pd4dgs_codec.codec.layers import read_meta
+from pd4dgs_codec.codec.payload import read_meta
 from pd4dgs_codec.errors import DecodeError, Truncated
 
 MAX_SECONDS = 2.0  #: of processor time, per input

@@ -1,1 +1,1 @@
-"""What only the pages under docs/ need: the main job on whole scenes, the paper's tables."""
+"""What the tools that write pages of the docs share: scenes, trainings, figures and how a page is made from them."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,11 +10,12 @@ from typing import Any
 
 import numpy as np
 
+from pages.draco import draco_encode
 from pages.pictures import draw_levels
 from pages.trainings import ensure_trained
-from pd4dgs_codec.bench.draco import draco_encode
-from pd4dgs_codec.cli.files import whole_file, whole_files, write_bytes
+from pd4dgs_codec.atomic import whole_file, whole_files, write_bytes
 from pd4dgs_codec.codec.encoder import LayerReport, Report, encode_with_report
+from pd4dgs_codec.codec.options import EncodeOptions
 from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.jsonable import finite
@@ -69,7 +69,7 @@ def run_job(job: Job, folder: Path, *, say: Callable[[str], None], progress: Any
         for name, options in VARIANTS.items()
     }
     data, report = files["ans"]
-    write_bytes(str(folder / "scene.pd4"), data, overwrite=True)
+    write_bytes(folder / "scene.pd4", data, overwrite=True)
     say(f"{job.name}: {len(data)} bytes; rendering the held-out views at each level")
     packed = evaluate_file(data, dataset)
     unpacked = {row["level"]: row for row in evaluate_file(path, dataset)["levels"]}
@@ -84,7 +84,7 @@ def run_job(job: Job, folder: Path, *, say: Callable[[str], None], progress: Any
         "seed": config.seed,
         "iterations": training["iteration"],
         "total": training["total"],
-        "phases_not_reached": Schedule(training["total"] or sys.maxsize).phases_not_reached(training["iteration"]),
+        "phases_not_reached": Schedule(training["total"] or None).phases_not_reached(training["iteration"]),
         "train_seconds": training["seconds"],
         "skipped_steps": training["skipped"],
         "rho": training["rho"],
@@ -98,7 +98,7 @@ def run_job(job: Job, folder: Path, *, say: Callable[[str], None], progress: Any
     with whole_files(pictures[0], pictures, overwrite=True) as temporaries:
         draw_levels(data, dataset, *temporaries)
     result["pictures"] = list(PICTURES)
-    with whole_file(str(folder / "results.json"), overwrite=True) as temporary:
+    with whole_file(folder / "results.json", overwrite=True) as temporary:
         temporary.write_text(json.dumps(finite(result), indent=1, allow_nan=False))
     return result
 
@@ -112,7 +112,8 @@ def coding_rows(reports: dict[str, Report], planned: Scene) -> list[dict[str, An
     (masks included, positions aside) in mode ans over the same symbols in mode lzma. None where there is nothing to
     compare, as where an encoding drops the layer.
     """
-    trained = {int(row["layer"]): sum(row.values()) - row["layer"] for row in train_rate_bits(planned, omit="nothing")}
+    rates = train_rate_bits(planned, EncodeOptions(omit="nothing"))
+    trained = {int(row["layer"]): sum(row.values()) - row["layer"] for row in rates}
     cells = planned.anchor_q
     variants = {name: {layer.layer: layer for layer in report.layers} for name, report in reports.items()}
     rows, start = [], 0

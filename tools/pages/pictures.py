@@ -7,11 +7,11 @@ from pathlib import Path
 
 import numpy as np
 
-from pd4dgs_codec.data.dataset import Dataset, View
-from pd4dgs_codec.metrics.image import to_uint8
+from pd4dgs_codec.data.view import Dataset, View
+from pd4dgs_codec.view.frames import dataset_frames
 from pd4dgs_codec.view.levels import Level, load_levels
 from pd4dgs_codec.view.movie import write_gif
-from pd4dgs_codec.view.panels import level_caption, side_by_side
+from pd4dgs_codec.view.panels import Panel, level_panels, side_by_side
 
 
 def draw_levels(data: bytes, dataset: Dataset, still: Path, movie: Path, *, stills: int = 3, frames: int = 40) -> None:
@@ -27,9 +27,5 @@ def draw_levels(data: bytes, dataset: Dataset, still: Path, movie: Path, *, stil
 
 
 def _panels(levels: Sequence[Level], views: Sequence[View]) -> Iterator[np.ndarray]:
-    captions = ["truth", *(level_caption(level.level, level.cumulative_bytes) for level in levels)]
-    for view in views:
-        pictures = [view.image]
-        for level in levels:
-            pictures.append(to_uint8(level.picture(view.camera, view.time)))
-        yield side_by_side(pictures, captions)
+    for view, frame in zip(views, dataset_frames(views), strict=True):
+        yield side_by_side([Panel(view.image, "truth"), *level_panels(levels, frame)])

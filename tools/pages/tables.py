@@ -6,17 +6,40 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from pd4dgs_codec.bench.markdown import markdown
+from pd4dgs_codec.bench.report import markdown
 
 #: A coding row's bytes in the modes that the table shows; None where a mode drops the layer.
 BYTES = ("ans_bytes", "lzma_bytes", "lzma_float32_bytes")
 
 
+#: What the page shows of a level and of a coded layer.
+LEVEL = ("level", "mpsnr", "mssim", "loss_db", "cumulative_bytes", "first_frame_seconds", "decode_seconds", "render_ms",
+         "anchors")  # fmt: skip
+LAYER = ("layer", "ans_bytes", "lzma_bytes", "lzma_float32_bytes", "position_bytes", "draco_position_bytes",
+         "rate_bits", "payload_over_rate", "train_over_rate", "best_over_gauss", "ans_over_lzma",
+         "lzma_symbol_bytes")  # fmt: skip
+
+
+def figures(result: dict[str, Any]) -> dict[str, Any]:
+    """What the tables and the plot show of what `run_job` returns, but for its name."""
+    names = ("preset", "iterations", "total", "phases_not_reached", "train_seconds", "skipped_steps", "rho")
+    streams = [layer["streams"].get(name, 0.0) for layer in result["coding"][1:] for name in ("planes", "weights")]
+    return {
+        **{name: result[name] for name in names},
+        "deformation_bytes": sum(streams),
+        "levels": [{name: level[name] for name in LEVEL} for level in result["evaluation"]["levels"]],
+        "coding": [{name: layer[name] for name in LAYER} for layer in result["coding"]],
+        "left_out": [{name: row[name] for name in ("what", "why", "bytes")} for row in result["left_out"]],
+        "curve": [{name: point[name] for name in ("seconds", "psnr")} for point in result["curve"]],
+    }
+
+
 def quality_table(results: Sequence[dict[str, Any]]) -> str:
-    """Per scene and level: held-out quality of the `.pd4`, and the bytes, seconds and milliseconds that go with it."""
+    """Per scene and level of `figures`: held-out quality of the `.pd4`, and the bytes, seconds and milliseconds that go
+    with it."""
     rows = []
     for result in results:
-        for level in result["evaluation"]["levels"]:
+        for level in result["levels"]:
             rows.append(
                 (
                     result["name"],
@@ -46,6 +69,19 @@ def quality_table(results: Sequence[dict[str, Any]]) -> str:
         "training min",
     )
     return markdown(head, rows)
+
+
+def short_table(results: Sequence[dict[str, Any]], shown: dict[str, tuple[int, ...]]) -> str:
+    """The levels `shown` of each scene: what has arrived, and how good the picture is then."""
+    rows = []
+    for result in results:
+        layers: list[str] = []
+        for level in result["levels"]:
+            layers.append(str(level["level"]))
+            if level["level"] in shown[result["name"]]:
+                size, seconds = f"{level['cumulative_bytes']:,}", f"{level['first_frame_seconds']:.2f}"
+                rows.append((result["name"], ", ".join(layers), size, seconds, f"{level['mpsnr']:.2f}"))
+    return markdown(("scene", "layers read", "bytes so far", "seconds at 2 Mbps", "PSNR dB"), rows)
 
 
 def coding_table(results: Sequence[dict[str, Any]]) -> str:

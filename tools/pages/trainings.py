@@ -8,7 +8,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
-from pd4dgs_codec.data.dataset import Dataset
+from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.errors import TrainError
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.model import Model

@@ -12,21 +12,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from pd4dgs_codec.bench.stability.rows import Case
-from pd4dgs_codec.bench.stability.scenes import picture_error
+from pd4dgs_codec.bench.stability.cases import Case, Found, picture_error
 from pd4dgs_codec.codec import decoder, encoder
-from pd4dgs_codec.data.dataset import Dataset, View
+from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import DeformationConfig, ModelConfig
 from pd4dgs_codec.model.convert import from_scene, to_scene
 from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS
 from pd4dgs_codec.train.config import LearningRates, TrainConfig
-from pd4dgs_codec.train.densify import Densifier
-from pd4dgs_codec.train.initialise import fresh_model
 from pd4dgs_codec.train.loop import Trainer
-from pd4dgs_codec.train.optimiser import Optimiser
 
-GROUP = "training"
 ITERATIONS = 60
 WIDTH, HEIGHT = 32, 24
 PROMISED = "finite checkpoint, a file that decodes, pictures of all levels within 1/255 of the float64 oracle's"
@@ -40,29 +35,33 @@ SMALLEST = ModelConfig(
 
 def cases() -> Iterator[Case]:
     """Each a run on six small pictures."""
+    blind, still, flat = np.zeros((HEIGHT, WIDTH), bool), {"time_range": (2.0, 2.0)}, {"points": None, "box": _box(0)}
     runs: list[tuple[str, str, Callable[[], Trainer]]] = [
-        ("as it should be", "a disc that moves over a grey ground", partial(_trainer, _disc)),
-        ("learning rates times 100", "every learning rate times 100", partial(_trainer, _disc, factor=100.0)),
-        ("learning rates times 1e4", "every learning rate times 10,000", partial(_trainer, _disc, factor=1e4)),
+        ("as it should be", "a disc that moves over a grey ground", _trainer),
+        ("learning rates times 100", "every learning rate times 100", partial(_trainer, factor=100.0)),
+        ("learning rates times 1e4", "every learning rate times 10,000", partial(_trainer, factor=1e4)),
         ("a single Gaussian", "one anchor, of whose Gaussians one is seen", _single),
         ("10^6 between scales", "Gaussians and offsets of 1 and of 1e-6 scene units", _two_scales),
-        ("one instant", "six views with one time stamp, time range 0", partial(_trainer, _one_instant)),
-        ("repeated time stamps", "three instants, two views each", partial(_trainer, _repeated)),
-        ("the same view six times", "one picture, one camera, one instant", partial(_trainer, _same_view)),
-        ("black pictures", "all pixels 0", partial(_trainer, partial(_painted, 0))),
-        ("white pictures", "all pixels 255 over black", partial(_trainer, partial(_painted, 255))),
-        ("nothing valid", "masks that hide every pixel", partial(_trainer, _masked)),
-        ("a flat box", "a box without depth", partial(_trainer, _flat)),
+        ("one instant", "six views with one time stamp, time range 0", _on(lambda v, i: replace(v, time=0.0), **still)),
+        ("repeated time stamps", "three instants, two views each", _on(lambda v, i: replace(v, time=(i // 2) / 2))),
+        ("the same view six times", "one picture, one camera, one instant", _on(lambda v, i: _view(0.0))),
+        ("black pictures", "all pixels 0", _on(partial(_painted, value=0))),
+        ("white pictures", "all pixels 255 over black", _on(partial(_painted, value=255))),
+        ("nothing valid", "masks that hide every pixel", _on(lambda v, i: replace(v, mask=blind))),
+        ("a flat box", "a box without depth", _on(lambda v, i: v, **flat)),
     ]
+    row = partial(Case, "training")
     for name, fed, make in runs:
-        yield Case(GROUP, name, f"{fed}; {ITERATIONS} steps", PROMISED, BOUND, partial(_run, make))
-    yield Case(
-        GROUP, "a weight that is not a number", "NaN in a network for two steps, then the weight it had",
-        f"both steps are skipped and counted; {PROMISED}", BOUND, _passing_nan,
-    )  # fmt: skip
+        yield row(name, f"{fed}; {ITERATIONS} steps", PROMISED, BOUND, partial(_run, make))
+    fed, counted = "NaN in a network for two steps, then the weight it had", "both steps are skipped and counted"
+    yield row("a weight that is not a number", fed, f"{counted}; {PROMISED}", BOUND, _passing_nan)
 
 
 # -- data --------------------------------------------------------------------------------------------------------------
+
+
+def _box(depth: float) -> np.ndarray:
+    return np.array([[-1.5, -1.2, -depth], [1.5, 1.2, depth]], np.float32)
 
 
 def _view(t: float) -> View:
@@ -76,99 +75,69 @@ def _view(t: float) -> View:
     return View(viewmat, K, WIDTH, HEIGHT, t, image, None, f"{t:.2f}", 0)
 
 
-def _disc(**changes: Any) -> Dataset:
+def _painted(view: View, index: int, value: int) -> View:
+    return replace(view, image=np.full_like(view.image, value))
+
+
+def _disc(change: Callable[[View, int], View] = lambda view, i: view, **changes: Any) -> Dataset:
+    """Six views, each changed, and other fields instead of these."""
     points = np.random.default_rng(0).uniform(-1, 1, (200, 3)).astype(np.float32)
     fields: dict[str, Any] = dict(
-        name="disc", train=tuple(_view(t) for t in np.linspace(0, 1, 6)), test=(_view(0.5),),
-        points=points, point_colors=None, box=np.array([[-1.5, -1.2, -1], [1.5, 1.2, 1]], np.float32),
-        near=0.1, far=10.0, background=(0.0, 0.0, 0.0), time_range=(0.0, 1.0), up=(0.0, -1.0, 0.0), unit=0.0,
-        masked=False,
+        name="disc", train=tuple(change(_view(t), i) for i, t in enumerate(np.linspace(0, 1, 6))), test=(_view(0.5),),
+        points=points, point_colors=None, box=_box(1), near=0.1, far=10.0, background=(0.0, 0.0, 0.0),
+        time_range=(0.0, 1.0), up=(0.0, -1.0, 0.0), unit=0.0, masked=False,
     )  # fmt: skip
     return Dataset(**(fields | changes))
-
-
-def _each(change: Callable[[View, int], View], **changes: Any) -> Dataset:
-    data = _disc(**changes)
-    return replace(data, train=tuple(change(view, i) for i, view in enumerate(data.train)))
-
-
-def _one_instant() -> Dataset:
-    return _each(lambda view, i: replace(view, time=0.0), time_range=(2.0, 2.0))
-
-
-def _repeated() -> Dataset:
-    return _each(lambda view, i: replace(view, time=(i // 2) / 2))
-
-
-def _same_view() -> Dataset:
-    first = _view(0.0)
-    return _each(lambda view, i: first)
-
-
-def _painted(value: int) -> Dataset:
-    return _each(lambda view, i: replace(view, image=np.full_like(view.image, value)))
-
-
-def _masked() -> Dataset:
-    return _each(lambda view, i: replace(view, mask=np.zeros((HEIGHT, WIDTH), bool)))
-
-
-def _flat() -> Dataset:
-    box = np.array([[-1.5, -1.2, 0], [1.5, 1.2, 0]], np.float32)
-    return _disc(box=box, points=None)
 
 
 # -- runs --------------------------------------------------------------------------------------------------------------
 
 
-def _trainer(make: Callable[[], Dataset], config: ModelConfig = SMALLEST, factor: float = 1.0) -> Trainer:
+def _on(change: Callable[[View, int], View], **changes: Any) -> Callable[[], Trainer]:
+    """A run on the changed data."""
+    return lambda: _trainer(_disc(change, **changes))
+
+
+def _trainer(data: Dataset | None = None, config: ModelConfig = SMALLEST, factor: float = 1.0) -> Trainer:
     """factor: on all learning rates."""
-    data = make()
+    data = data or _disc()
     rates = LearningRates(**{k: (factor * a, factor * b) for k, (a, b) in asdict(LearningRates()).items()})
-    trainer = Trainer(TrainConfig(preset="tiny", iterations=ITERATIONS, rates=rates), data)
-    trainer.model = fresh_model(config, data, config.steps, seed=0)
-    trainer.optimiser = Optimiser(trainer.model, rates)
-    trainer.densifier = Densifier(trainer.model, trainer.config.grow_threshold, config.max_anchors)
-    return trainer
+    return Trainer(TrainConfig(preset="tiny", iterations=ITERATIONS, rates=rates, cooldown=0.0), data, size=config)
 
 
+@torch.no_grad()
 def _single() -> Trainer:
-    trainer = _trainer(
-        partial(_disc, points=np.zeros((1, 3), np.float32)), replace(SMALLEST, initial_anchors=1, max_anchors=1)
-    )
-    with torch.no_grad():
-        trainer.model.network("opacity").layers[-1].bias[1:] = -3.0
+    one = replace(SMALLEST, initial_anchors=1, max_anchors=1)
+    trainer = _trainer(_disc(points=np.zeros((1, 3), np.float32)), one)
+    trainer.model.network("opacity").layers[-1].bias[1:] = -3.0
     return trainer
 
 
+@torch.no_grad()
 def _two_scales() -> Trainer:
-    trainer = _trainer(_disc)
-    with torch.no_grad():
-        trainer.model.scaling_log[::2] = 0.0
-        trainer.model.scaling_log[1::2] = np.log(1e-6)
+    trainer = _trainer()
+    trainer.model.scaling_log[::2] = 0.0
+    trainer.model.scaling_log[1::2] = np.log(1e-6)
     return trainer
 
 
-def _run(make: Callable[[], Trainer]) -> tuple[str, float]:
-    return _finish(make())
-
-
-def _passing_nan() -> tuple[str, float]:
-    trainer = _trainer(_disc)
+def _passing_nan() -> Found:
+    trainer = _trainer()
     bias = trainer.model.network("color").layers[-1].bias
     kept = bias.detach().clone()
     with torch.no_grad():
         bias.fill_(np.nan)
     for _ in range(2):
-        trainer.step()
+        trainer.learner.step()
     with torch.no_grad():
         bias.copy_(kept)
-    got, error = _finish(trainer)
-    return got, error if trainer.skipped == 2 else np.nan
+    got, error = _run(lambda: trainer)
+    return got, error if trainer.learner.skipped == 2 else np.nan
 
 
-def _finish(trainer: Trainer) -> tuple[str, float]:
+def _run(make: Callable[[], Trainer]) -> Found:
     """Runs to the end, writes, packs, unpacks and draws. (in words, the pictures' error)"""
+    trainer = make()
     with tempfile.TemporaryDirectory() as folder:
         trainer.run(Path(folder) / "model.pt")
         model, _ = checkpoint.load(Path(folder) / "model.pt")
@@ -177,5 +146,5 @@ def _finish(trainer: Trainer) -> tuple[str, float]:
     decoded = from_scene(scene)
     view = trainer.dataset.train[-1]
     errors = [picture_error(decoded, level, view.time, view.camera) for level in (0, 1, 2)]
-    skipped = f"{trainer.skipped} of {trainer.iteration} steps skipped"
+    skipped = f"{trainer.learner.skipped} of {trainer.iteration} steps skipped"
     return f"{skipped}, {len(scene.anchor_q):,} anchors, {len(data):,} bytes", float(np.max(errors))

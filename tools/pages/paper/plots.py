@@ -6,9 +6,9 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from pages.paper.published import FIRST_FRAME
 from pages.paper.runs import OURS
 from pages.paper.statistics import Result, figure, top
-from pd4dgs_codec.bench.latency.published import FIRST_FRAME
 
 MARKERS = "os^DvPX*<>"
 LEVEL_STYLES = ((":", "o"), ("--", "s"), ("-", "^"))

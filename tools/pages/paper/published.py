@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+from pd4dgs_codec.bench.latency import PUBLISHED_MEGABYTES
+
 
 class Comparison(NamedTuple):
     """Averages over seven scenes."""
@@ -44,6 +46,26 @@ class Level(NamedTuple):
     megabytes: float
 
 
+class FirstFrame(NamedTuple):
+    """Seconds until the first frame at 2, 10 and 50 Mbps."""
+
+    method: str
+    seconds: tuple[float, float, float]
+
+    @property
+    def megabytes(self) -> float:
+        """What must arrive before it."""
+        return PUBLISHED_MEGABYTES[self.method]
+
+
+FIRST_FRAME = (
+    FirstFrame("SC-GS", (929.6, 185.9, 37.2)),
+    FirstFrame("Deformable 3DGS", (437.6, 87.5, 17.5)),
+    FirstFrame("4DGS", (314.0, 62.8, 12.6)),
+    FirstFrame("MoDec-GS", (73.5, 14.7, 2.94)),
+    FirstFrame("PD-4DGS, all layers", (27.5, 5.5, 1.10)),
+    FirstFrame("PD-4DGS, layer 0", (1.74, 0.35, 0.07)),
+)
 COMPARISON = (
     Comparison("SC-GS", 13.90, 0.464, 0.479, 232.4),
     Comparison("Deformable 3DGS", 13.72, 0.461, 0.430, 109.4),

@@ -11,22 +11,20 @@ from typing import Any
 
 import torch
 
+from pages.page import commit
 from pages.trainings import ensure_trained
-from pd4dgs_codec.cli.files import whole_file, write_bytes
+from pd4dgs_codec.atomic import whole_file, write_bytes
 from pd4dgs_codec.codec.encoder import encode_with_report
-from pd4dgs_codec.codec.plan import plan
-from pd4dgs_codec.data.dataset import Dataset
+from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.jsonable import finite
 from pd4dgs_codec.metrics.perceptual import load_perceptual
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.model.model import Model
-from pd4dgs_codec.pack.rendered import RenderedLoss
-from pd4dgs_codec.pack.target import fit
+from pd4dgs_codec.pack.packing import Views, pack
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train.config import ABLATIONS, TrainConfig
 from pd4dgs_codec.view.evaluate import evaluate_file
-from pd4dgs_codec.view.frames import dataset_frames
 
 #: Training views whose pictures say what a smaller layer 0 costs.
 FITTING_VIEWS = 16
@@ -109,9 +107,10 @@ def measure(
 ) -> dict[str, Any]:
     """The result of `run`, from its result.json if there is one of the same settings, else made now.
 
-    {"scene", "variant", "seed", "config", "iterations", "seconds", "anchors", "rho", "active": anchors per level,
-    "gap_by_motion": see there, "pi": what `course` reads, "levels": rows of pd4dgs-eval --perceptual}. The one level
-    of a monolithic variant is its highest, its bytes those of `monolithic_bytes`. dataset: loads the scene when needed.
+    {"scene", "variant", "seed", "commit", "config", "iterations", "seconds", "anchors", "rho", "active": anchors per
+    level, "gap_by_motion": see there, "pi": what `course` reads, "levels": rows of pd4dgs-eval --perceptual}. The one
+    level of a monolithic variant is its highest, its bytes those of `monolithic_bytes`. dataset: loads the scene when
+    needed.
     """
     folder = run.folder(out)
     wanted = json.loads(json.dumps(run.config, default=lambda value: value.__dict__))
@@ -119,7 +118,7 @@ def measure(
     if file.exists():
         stored = json.loads(file.read_text())
         if stored["config"] == wanted:
-            return stored
+            return {"commit": "unknown"} | stored
     data = dataset()
     path = folder / "model.pt"
     model, training = ensure_trained(run.config, data, path, say=say, progress=progress)
@@ -129,12 +128,13 @@ def measure(
         levels[0]["cumulative_bytes"] = monolithic_bytes(model)
     else:
         packed, _ = encode_with_report(to_scene(model))
-        write_bytes(str(folder / "scene.pd4"), packed, overwrite=True)
+        write_bytes(folder / "scene.pd4", packed, overwrite=True)
         levels = evaluate_file(packed, data, perceptual=perceptual)["levels"]
     result = {
         "scene": run.scene.name,
         "variant": run.variant.name,
         "seed": run.seed,
+        "commit": commit(),
         "config": wanted,
         "iterations": training["iteration"],
         "seconds": training["seconds"],
@@ -168,18 +168,16 @@ def held_to(
     say(f"layer 0 is held to {limit:,} bytes")
     data = dataset()
     model, _ = checkpoint.load(run.folder(out) / "model.pt")
-    scene, _ = plan(to_scene(model), "auto", False, "bounded")
-    loss = RenderedLoss(scene, dataset_frames(data.train[:: -(-len(data.train) // FITTING_VIEWS)]))
-    fitted, _, _ = fit(scene, {0: limit}, loss.mean_mse, loss.harm)
-    packed, _ = encode_with_report(fitted)
-    levels = evaluate_file(packed, data, perceptual=load_perceptual())["levels"]
+    fitting = Views.of(data, run.config.source, FITTING_VIEWS).fitting
+    packed = pack(model, target_sizes={0: limit}, views=Views(run.config.source, fitting))
+    levels = evaluate_file(packed.data, data, perceptual=load_perceptual())["levels"]
     held = _keep(file, {"config": result["config"], "limit": limit, "levels": levels})
     return result | {"levels": held["levels"]}
 
 
 def _keep(file: Path, value: dict[str, Any]) -> dict[str, Any]:
     """Writes `value` as JSON and returns what the file then says, which is what a later run will read."""
-    with whole_file(str(file), overwrite=True) as temporary:
+    with whole_file(file, overwrite=True) as temporary:
         temporary.write_text(json.dumps(finite(value), indent=1, allow_nan=False))
     return json.loads(file.read_text())
 

@@ -6,6 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from pages.page import Page, Row, paragraph
 from pages.paper import plots, published
 from pages.paper.runs import (
     FIXED,
@@ -20,8 +21,7 @@ from pages.paper.runs import (
     at_rate,
 )
 from pages.paper.statistics import Figure, Result, at_level, figure, gain, monotone, top
-from pd4dgs_codec.bench.latency.published import FIRST_FRAME
-from pd4dgs_codec.bench.markdown import markdown, paragraph
+from pd4dgs_codec.bench.report import markdown
 
 #: Rate weights of the curve of quality over bytes.
 RATE_SCALES = (0.03, 0.1, 0.3, 1.0, 3.0)
@@ -50,6 +50,34 @@ class Table:
     budget: tuple[str, int] | None = None
     sized: tuple[Variant, ...] = ()
     reference: Variant | None = None
+
+    @property
+    def page(self) -> Page:
+        """docs/paper/NAME.md and its figures."""
+        return Page(f"paper/{self.name}", f"paper.py {self.name}", self._markdown, self.title)
+
+    def _markdown(self, rows: Sequence[Row]) -> str:
+        budgets: dict[str, str] = {}
+        for r in rows:
+            budgets.setdefault(r["scene"], f"{r['scene']}: {r['config']['preset']}, {r['iterations']:,} iterations")
+        said = (
+            f"{len(rows)} trainings ({'; '.join(budgets.values())}). Equal iterations for every row of a scene that "
+            "does not name its own; held-out views. Published figures are those of the paper, on other scenes."
+        )
+        return "\n".join([*paragraph(said), "", *self.text(rows), "", f"![{self.title}]({self.name}.png)"])
+
+
+#: What a page shows of a level.
+LEVEL = ("level", "mpsnr", "mssim", "mstlpips", "t_stlpips", "cumulative_bytes", "anchors")
+
+
+def figures(result: Result, table: str) -> Row:
+    """What the page of `table` shows of a run, or of all runs of a row."""
+    row = {name: result[name] for name in ("commit", "scene", "variant", "seed", "iterations", "rho")}
+    config = {name: result["config"][name] for name in ("preset", "rate_scale")}
+    levels = [{name: level[name] for name in LEVEL if name in level} for level in result["levels"]]
+    row |= {"name": result["scene"], "config": config, "levels": levels}
+    return row | {name: result[name] for name in ("pi", "active", "gap_by_motion") if table == "rho"}
 
 
 def of(results: Sequence[Result], variant: Variant, scene: str | None = None) -> list[Result]:
@@ -258,7 +286,7 @@ def latency(results: Sequence[Result]) -> list[str]:
             rows.append((scene, "monolithic", *_seconds(size), f"{size:,.0f}"))
     theirs = [
         ("other scenes", f"{r.method}, published", *(f"{s:.2f}" for s in r.seconds), f"{r.megabytes * 1e6:,.0f}")
-        for r in FIRST_FRAME
+        for r in published.FIRST_FRAME
     ]
     return [
         markdown(("scene", "what", "s at 2 Mbps", "s at 10 Mbps", "s at 50 Mbps", "bytes"), rows + theirs),

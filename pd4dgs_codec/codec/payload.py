@@ -1,0 +1,254 @@
+"""A layer's symbols <-> its chunk's payload.
+
+Payload: u32 length of the parameters, the parameters (layer_meta), then the sections in the order of Section.
+Mode ans codes each group of channels as one section; mode lzma codes all of them as one LZMA2 stream. A channel is one
+attribute scalar over the layer's anchors, one plane channel (its residuals, row by row), or one weight matrix or bias.
+"""
+
+from __future__ import annotations
+
+import math
+import struct
+from dataclasses import dataclass
+
+import numpy as np
+
+from pd4dgs_codec.attributes import planes as decorrelation
+from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
+from pd4dgs_codec.attributes.table import N_CHANNELS
+from pd4dgs_codec.bitstream.limits import MAX_PARAMETERS, MAX_VOXEL
+from pd4dgs_codec.codec.attribute_section import read_attributes, write_attributes
+from pd4dgs_codec.codec.kinds import LayerKind
+from pd4dgs_codec.codec.layer_meta import LayerMeta, ScaleMeta, Section, check_symbol_count, pack_meta, unpack_meta
+from pd4dgs_codec.codec.options import EncodeOptions
+from pd4dgs_codec.codec.plane_choice import choose_predictor
+from pd4dgs_codec.codec.plane_section import read_planes, write_planes
+from pd4dgs_codec.codec.symbols import LayerSymbols
+from pd4dgs_codec.entropy.bits import gaussian_bits
+from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
+from pd4dgs_codec.entropy.lzma_mode import (
+    decode_channels_lzma,
+    decode_floats_lzma,
+    encode_channels_lzma,
+    encode_floats_lzma,
+)
+from pd4dgs_codec.entropy.positions import decode_positions, encode_positions
+from pd4dgs_codec.errors import LimitExceeded, Malformed
+from pd4dgs_codec.scene import MASK_MIN_CODE, PLANES, Network, Planes
+
+#: The groups of channels, by section, in coding order; FLOATS and POSITIONS are not channels.
+GROUPS = (Section.MASKS, Section.ATTRIBUTES, Section.PLANES, Section.WEIGHTS)
+
+
+@dataclass(frozen=True)
+class StreamReport:
+    """One coded section. rate_bits: sum of R(a) of its channels, what the trainer's rate model would charge."""
+
+    name: str
+    payload_bits: int
+    rate_bits: float
+    symbols: int
+
+
+def write_layer(symbols: LayerSymbols, options: EncodeOptions) -> tuple[bytes, list[StreamReport]]:
+    """(payload, what each section took; the first report is the positions'). Inverse: read_layer."""
+    groups, predictors = channel_groups(symbols)
+    positions = encode_positions(symbols.anchor_q) if len(symbols.anchor_q) else b""
+    sections = {Section.POSITIONS: positions}
+    reports = [StreamReport("positions", 8 * len(positions), 0.0, symbols.anchor_q.size)]
+    if options.mode == "lzma":
+        groups = {Section.SYMBOLS: [channel for section in GROUPS for channel in groups[section]]}
+    for section, channels in groups.items():
+        if not any(channel.size for channel in channels):
+            continue
+        if section == Section.ATTRIBUTES:
+            data, rate_bits = write_attributes(symbols.attributes, options.priors, options.effort)
+        elif section == Section.PLANES:
+            data, rate_bits = write_planes(_by_plane(channels, symbols), options.priors, options.effort)
+        elif options.mode == "lzma":  # one stream for all, but a layer's rate counts no masks
+            coded = encode_channels_lzma(channels, effort=options.effort)
+            data, rate_bits = coded.payload, coded.rate_bits - sum(gaussian_bits(c) for c in channels[:2])
+        else:
+            coded = encode_channels(channels, priors=options.priors, effort=options.effort)
+            data, rate_bits = coded.payload, coded.rate_bits
+        sections[section] = data
+        count = sum(channel.size for channel in channels)
+        reports.append(StreamReport(section.name.lower(), 8 * len(data), rate_bits, count))
+    if symbols.raw_deformation and symbols.networks:
+        sections[Section.FLOATS] = encode_floats_lzma([a.ravel() for a in symbols.tensors()], effort=options.effort)
+        reports.append(StreamReport("floats", 8 * len(sections[Section.FLOATS]), 0.0, 0))
+    meta = pack_meta(_meta(symbols, sections, predictors), symbols.kind)
+    return b"".join([struct.pack("<I", len(meta)), meta, *sections.values()]), reports
+
+
+def channel_groups(symbols: LayerSymbols) -> tuple[dict[Section, list[np.ndarray]], list[int]]:
+    """(1-D int32 channels per group, predictor per plane)."""
+    groups: dict[Section, list[np.ndarray]] = {section: [] for section in GROUPS}
+    groups[Section.MASKS] = [symbols.mask_increase, symbols.mask_own]
+    groups[Section.ATTRIBUTES] = list(symbols.attributes)
+    tensors = [] if symbols.raw_deformation else list(symbols.tensors())
+    n_planes = len(PLANES) * len(symbols.planes)
+    predictors = [0] * n_planes
+    for i, tensor in enumerate(tensors):
+        if i < n_planes:
+            predictors[i], residual = choose_predictor(tensor)
+            groups[Section.PLANES] += list(residual.reshape(residual.shape[0], -1))
+        else:
+            groups[Section.WEIGHTS].append(tensor.ravel())
+    return groups, predictors
+
+
+def _by_plane(channels: list[np.ndarray], symbols: LayerSymbols) -> list[np.ndarray]:
+    """Residuals [C, H, W] per plane from one array per plane channel."""
+    rest = iter(channels)
+    shapes = [scale[name].shape for scale in symbols.planes for name, _, _ in PLANES]
+    return [np.stack([next(rest) for _ in range(shape[0])]).reshape(shape) for shape in shapes]
+
+
+def _meta(symbols: LayerSymbols, sections: dict[Section, bytes], predictors: list[int]) -> LayerMeta:
+    scales = []
+    for i, scale in enumerate(symbols.planes):
+        (channels, y, x), (_, t, z) = scale["xy"].shape, scale["zt"].shape
+        own = predictors[len(PLANES) * i : len(PLANES) * (i + 1)]
+        scales.append(ScaleMeta(channels, (x, y, z, t), tuple(own)))
+    return LayerMeta(
+        rows=len(symbols.anchor_q),
+        sections={int(section): len(data) for section, data in sections.items() if data},
+        steps=symbols.steps,
+        scales=tuple(scales),
+        networks={name: tuple(w.shape[0] for w, _ in network) for name, network in symbols.networks.items()},
+    )
+
+
+def read_meta(
+    payload: bytes | memoryview, kind: LayerKind, rows_before: int, raw_deformation: bool
+) -> tuple[LayerMeta, int]:
+    """(parameters, offset of the first section) of a payload, all lengths checked against the bytes there are."""
+    if len(payload) < 4:
+        raise Malformed(f"layer {kind.layer}: payload of {len(payload)} bytes, expected at least 4")
+    (length,) = struct.unpack_from("<I", payload)
+    if length > MAX_PARAMETERS:
+        raise LimitExceeded(f"layer {kind.layer}: parameters of {length} bytes, limit {MAX_PARAMETERS}")
+    if length > len(payload) - 4:
+        raise Malformed(f"layer {kind.layer}: parameters of {length} bytes in a payload of {len(payload)}")
+    meta = unpack_meta(bytes(payload[4 : 4 + length]), kind, rows_before, raw_deformation)
+    start, declared = 4 + length, sum(meta.sections.values())
+    if start + declared != len(payload):
+        raise Malformed(f"layer {kind.layer}: sections of {declared} bytes, expected {len(payload) - start}")
+    check_symbol_count(meta, kind, rows_before, len(payload))
+    return meta, start
+
+
+def read_layer(
+    payload: bytes | memoryview, kind: LayerKind, rows_before: int, mode: str, raw_deformation: bool
+) -> LayerSymbols:
+    """The symbols of a payload (clause "layer payload"). rows_before: anchors in the layers before this one.
+
+    Raises DecodeError's subclasses; nothing is allocated for a count that the limits or the payload do not cover.
+    """
+    meta, start = read_meta(payload, kind, rows_before, raw_deformation)
+    parts: dict[int, bytes] = {}
+    for section, length in sorted(meta.sections.items()):
+        parts[section] = bytes(payload[start : start + length])
+        start += length
+    raw_deformation = raw_deformation and bool(meta.networks) and kind.layer > 0
+    shapes = [*meta.plane_shapes(), *meta.weight_shapes(kind)]
+    counts = _channel_counts(meta, kind, rows_before, raw_deformation)
+    channels = _decode_groups(parts, counts, meta, mode)
+    if raw_deformation:
+        floats = decode_floats_lzma(_part(parts, Section.FLOATS, 1), [math.prod(shape) for shape in shapes])
+        tensors = [x.reshape(shape) for x, shape in zip(floats, shapes, strict=True)]
+    else:
+        tensors = _integer_tensors(meta, kind, channels)
+    if parts:
+        raise Malformed(f"layer {kind.layer}: section {min(parts)} is there, but nothing is left for it to code")
+    anchor_q = channels[Section.POSITIONS][0]
+    increase, own = channels[Section.MASKS]
+    _check_ranges(kind, anchor_q, increase, own)
+    planes, networks = _shape_tensors(meta, tensors)
+    attributes = np.stack(channels[Section.ATTRIBUTES])
+    for tensor in (attributes, *tensors):
+        if tensor.dtype.kind == "i" and tensor.size and max(int(tensor.max()), -int(tensor.min())) > MAX_SYMBOL:
+            raise Malformed(f"layer {kind.layer}: a symbol over {MAX_SYMBOL} in magnitude")
+    return LayerSymbols(kind, anchor_q, increase, own, attributes, planes, networks, meta.steps, raw_deformation)
+
+
+def _part(parts: dict[int, bytes], section: Section, symbols: int) -> bytes:
+    """Take a section's bytes; it is there exactly if it has symbols to code."""
+    if (section in parts) != (symbols > 0):
+        found = "there" if section in parts else "missing"
+        raise Malformed(f"section {section.name.lower()} is {found}, with {symbols} symbols to code")
+    return parts.pop(section, b"")
+
+
+def _channel_counts(
+    meta: LayerMeta, kind: LayerKind, rows_before: int, raw_deformation: bool
+) -> dict[Section, list[int]]:
+    planes = [] if raw_deformation else [h * w for c, h, w in meta.plane_shapes() for _ in range(c)]
+    weights = [] if raw_deformation else [math.prod(shape) for shape in meta.weight_shapes(kind)]
+    return {
+        Section.MASKS: [rows_before, meta.rows],
+        Section.ATTRIBUTES: [meta.rows] * N_CHANNELS,
+        Section.PLANES: planes,
+        Section.WEIGHTS: weights,
+    }
+
+
+def _decode_groups(
+    parts: dict[int, bytes], counts: dict[Section, list[int]], meta: LayerMeta, mode: str
+) -> dict[Section, list[np.ndarray]]:
+    rows = counts[Section.MASKS][1]
+    data = _part(parts, Section.POSITIONS, rows)
+    empty = np.zeros((0, 3), np.int32)
+    channels: dict[Section, list[np.ndarray]] = {Section.POSITIONS: [decode_positions(data, rows) if rows else empty]}
+    if mode == "lzma":
+        flat = [count for section in GROUPS for count in counts[section]]
+        data = _part(parts, Section.SYMBOLS, sum(flat))
+        decoded = decode_channels_lzma(data, flat) if data else _zeros(flat)
+        for section in GROUPS:
+            channels[section], decoded = decoded[: len(counts[section])], decoded[len(counts[section]) :]
+        return channels
+    for section in GROUPS:
+        data = _part(parts, section, sum(counts[section]))
+        if not data:
+            channels[section] = _zeros(counts[section])
+        elif section == Section.ATTRIBUTES:
+            channels[section] = list(read_attributes(data, rows))
+        elif section == Section.PLANES:
+            channels[section] = [
+                channel.ravel() for plane in read_planes(data, meta.plane_shapes()) for channel in plane
+            ]
+        else:
+            channels[section] = decode_channels(data, counts[section])
+    return channels
+
+
+def _zeros(counts: list[int]) -> list[np.ndarray]:
+    return [np.zeros(count, np.int32) for count in counts]
+
+
+def _integer_tensors(meta: LayerMeta, kind: LayerKind, channels: dict[Section, list[np.ndarray]]) -> list[np.ndarray]:
+    residuals, first = [], 0
+    predictors = [p for scale in meta.scales for p in scale.predictors]
+    for predictor, shape in zip(predictors, meta.plane_shapes(), strict=True):
+        plane = np.concatenate(channels[Section.PLANES][first : first + shape[0]]).reshape(shape)
+        residuals.append((predictor, plane))
+        first += shape[0]
+    weights = zip(channels[Section.WEIGHTS], meta.weight_shapes(kind), strict=True)
+    return decorrelation.restore(residuals) + [channel.reshape(shape) for channel, shape in weights]
+
+
+def _shape_tensors(meta: LayerMeta, tensors: list[np.ndarray]) -> tuple[Planes, dict[str, Network]]:
+    rest = iter(tensors)
+    planes = tuple({name: next(rest) for name, _, _ in PLANES} for _ in meta.scales)
+    networks = {name: tuple((next(rest), next(rest)) for _ in widths) for name, widths in meta.networks.items()}
+    return planes, networks
+
+
+def _check_ranges(kind: LayerKind, anchor_q: np.ndarray, increase: np.ndarray, own: np.ndarray) -> None:
+    if anchor_q.size and max(int(anchor_q.max()), -int(anchor_q.min())) > MAX_VOXEL:
+        raise Malformed(f"layer {kind.layer}: a voxel index over {MAX_VOXEL} in magnitude")
+    for name, codes, low in (("rise of a mask code", increase, 0), ("mask code", own, MASK_MIN_CODE)):
+        if codes.size and not (low <= codes.min() and codes.max() <= 255):
+            found = f"{int(codes.min())}..{int(codes.max())}"
+            raise Malformed(f"layer {kind.layer}: {name} in {found}, expected {low}..255")

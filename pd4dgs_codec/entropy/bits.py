@@ -1,0 +1,54 @@
+"""What a channel of symbols costs under two simple models: its own frequencies (order-0 entropy), and R(a)."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+P_MIN = 1e-6  #: the clip of R(a)
+SIGMA_MIN = 2.0**-10  #: in units of Q
+
+
+def symbol_counts(symbols: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(values int64 [U], ascending, counts int64 [U]) of integer symbols, at least one."""
+    low, high = int(symbols.min()), int(symbols.max())
+    if high - low > 4 * symbols.size + 1024:
+        values, counts = np.unique(symbols, return_counts=True)
+        return values.astype(np.int64), counts.astype(np.int64)
+    counts = np.bincount(symbols.astype(np.int64) - low)  # beats sorting unless the range is far wider than the channel
+    present = np.flatnonzero(counts)
+    return present + low, counts[present]
+
+
+def order0_bits(counts: np.ndarray) -> float:
+    """Order-0 entropy of symbols that occur counts [U] times, all positive, in bits for all of them together."""
+    each = counts.astype(np.float64)
+    total = each.sum()
+    return float(total * np.log2(total) - (each * np.log2(each)).sum())
+
+
+def entropy_bits(symbols: np.ndarray) -> float:
+    """Order-0 entropy of integer symbols, in bits for all of them together."""
+    return order0_bits(symbol_counts(symbols)[1]) if symbols.size else 0.0
+
+
+def gaussian_bits(symbols: np.ndarray) -> float:
+    """Sum of R(a) = -log2(Phi((k + 1/2 - mu) / sigma) - Phi((k - 1/2 - mu) / sigma)) over integer symbols k, in bits.
+
+    mu and sigma are the symbols' mean and standard deviation (units of Q, sigma >= 2**-10), each probability is
+    clipped at 1e-6. Written with the upper tail of |k - mu|, so nothing above the clip loses more than 1e-9 of itself.
+    """
+    symbols = np.asarray(symbols)
+    if symbols.size == 0:
+        return 0.0
+    values, counts = symbol_counts(symbols)
+    weights = counts / symbols.size
+    mu = float(values @ weights)
+    sigma = max(math.sqrt(float((values - mu) ** 2 @ weights)), SIGMA_MIN)
+    scale = 1.0 / (sigma * math.sqrt(2.0))
+    bits = 0.0
+    for distance, count in zip(np.abs(values - mu).tolist(), counts.tolist(), strict=True):
+        p = 0.5 * (math.erfc((distance - 0.5) * scale) - math.erfc((distance + 0.5) * scale))
+        bits -= count * math.log2(max(p, P_MIN))
+    return bits

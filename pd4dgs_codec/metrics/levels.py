@@ -1,0 +1,56 @@
+"""Scores of a renderer over a dataset's views: per-view metrics, averaged."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Protocol, TypeVar
+
+import numpy as np
+
+from pd4dgs_codec.metrics.image import mpsnr
+
+#: (picture, true image, mask) -> score
+Metric = Callable[[np.ndarray, np.ndarray, np.ndarray | None], float]
+
+
+class TrueView(Protocol):
+    """What a picture is scored against. image: uint8 [H, W, 3]; mask: bool [H, W], True = counts, or None for all."""
+
+    @property
+    def image(self) -> np.ndarray: ...
+
+    @property
+    def mask(self) -> np.ndarray | None: ...
+
+
+V = TypeVar("V", bound=TrueView)
+
+
+def mean_scores(
+    draw: Callable[[V], np.ndarray],
+    views: Sequence[V],
+    metrics: Mapping[str, Metric],
+    step: Callable[[], None] = lambda: None,
+) -> dict[str, float]:
+    """Each metric's mean over `views` of its score of draw(view), [H, W, 3] in 0..1. step: called after each view."""
+    scores: dict[str, list[float]] = {name: [] for name in metrics}
+    for view in views:
+        picture = draw(view)
+        for name, metric in metrics.items():
+            scores[name].append(metric(picture, view.image, view.mask))
+        step()
+    return {name: float(np.mean(values)) for name, values in scores.items()}
+
+
+def level_psnr(
+    draw: Callable[[int, V], np.ndarray],
+    levels: Iterable[int],
+    views: Sequence[V],
+    step: Callable[[], None] = lambda: None,
+) -> dict[int, float]:
+    """Per level the mean over `views` of the mPSNR of draw(level, view), dB; infinite where nothing differs."""
+
+    def of_level(level: int) -> float:
+        return mean_scores(lambda view: draw(level, view), views, {"mpsnr": mpsnr}, step)["mpsnr"]
+
+    return {level: of_level(level) for level in levels}

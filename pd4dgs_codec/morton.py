@@ -1,0 +1,45 @@
+"""Morton (Z-order) codes of voxel cells: bit 3i is bit i of x, 3i + 1 of y, 3i + 2 of z, relative to the minimum."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pd4dgs_codec.errors import EncodeError
+
+AXIS_BITS = 21  #: bits per axis; three of them fit in one int64
+
+
+def spread_bits(values: np.ndarray) -> np.ndarray:
+    """Bit i of each value to bit 3i. values: int, 0 <= v < 2**21; returns int64 of the same shape."""
+    v = values.astype(np.int64)
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        v = (v | (v << shift)) & mask
+    return v
+
+
+def morton_codes(cells: np.ndarray) -> np.ndarray:
+    """Codes int64 [N] of cells int [N, 3], relative to their minimum.
+
+    Raises EncodeError if the shape is wrong or an axis spans more than 2**21 cells.
+    """
+    if cells.ndim != 2 or cells.shape[1] != 3 or cells.dtype.kind not in "iu":
+        raise EncodeError(f"positions: expected an integer array [N, 3], found {cells.dtype} {list(cells.shape)}")
+    if len(cells) == 0:
+        return np.zeros(0, dtype=np.int64)
+    offsets = cells.astype(np.int64) - cells.min(axis=0).astype(np.int64)
+    if int(offsets.max()) >> AXIS_BITS:
+        raise EncodeError(f"positions span {int(offsets.max()) + 1} voxels on one axis, limit {1 << AXIS_BITS}")
+    x, y, z = (spread_bits(offsets[:, axis]) for axis in range(3))
+    codes: np.ndarray = x | (y << 1) | (z << 2)
+    return codes
+
+
+def morton_order(cells: np.ndarray) -> np.ndarray:
+    """The permutation int64 [N] that sorts cells int [N, 3] by Morton code; equal cells keep their order."""
+    return np.argsort(morton_codes(cells), kind="stable").astype(np.int64)

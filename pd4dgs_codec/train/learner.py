@@ -1,0 +1,344 @@
+"""The step: draw a level and a view, render, add the level's terms, update; now and then judge, prune and grow.
+
+Everything random comes from two generators whose states are saved, so on the CPU a resumed run repeats the
+uninterrupted one bit for bit at a fixed number of iterations and threads; on CUDA sums come in any order.
+"""
+
+from __future__ import annotations
+
+import json
+import math
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pd4dgs_codec.data.view import Dataset, View
+from pd4dgs_codec.errors import NotFinite
+from pd4dgs_codec.metrics.levels import level_psnr
+from pd4dgs_codec.model.config import PRESETS, ModelConfig
+from pd4dgs_codec.model.deformation import DeformationField
+from pd4dgs_codec.model.model import EXACT, Model, Noise, Rounding
+from pd4dgs_codec.model.picture import Picture, render, render_image
+from pd4dgs_codec.scene import MASK_THRESHOLD
+from pd4dgs_codec.train import judge, losses, pruning
+from pd4dgs_codec.train.config import PlaneWeights, Schedule, TrainConfig
+from pd4dgs_codec.train.densify import Densifier
+from pd4dgs_codec.train.initialise import fresh_model
+from pd4dgs_codec.train.optimiser import Optimiser
+from pd4dgs_codec.train.rollout import CAPACITY_WEIGHTED, TOP, UNIFORM, rollout_probabilities, sample_level, updated_rho
+from pd4dgs_codec.train.shot import Shot
+from pd4dgs_codec.train.ssim import image_loss
+
+Probabilities = tuple[float, float, float]  #: of levels 0, 1, 2
+
+
+class Learner:
+    """A model in training, with all that its steps change.
+
+    schedule: where the steps stand in the run; replaced once where a time limit fixes N after some steps.
+    iteration: steps done, those that were skipped included. skipped: those whose loss or gradient was not finite.
+    left_out: levels judged not to pay, as the log and the report have them: level, gain in dB, number of views.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        dataset: Dataset,
+        schedule: Schedule,
+        device: torch.device,
+        size: ModelConfig | None = None,
+    ):
+        """A fresh model for `dataset`, of the preset's size if no other is given."""
+        size = size or PRESETS[config.preset]
+        self.config, self.dataset, self.schedule, self.device = config, dataset, schedule, device
+        if device.type == "cuda":  # the variances of SSIM are differences of blurred images: no ten-bit factors
+            torch.backends.cudnn.allow_tf32 = False
+        self.model = fresh_model(size, dataset, config.steps or size.steps, config.seed, config.max_layer).to(device)
+        self.optimiser = Optimiser(self.model, config.rates, config.cooldown)
+        self.densifier = Densifier(self.model, config.grow_threshold, size.max_anchors)
+        self.generator = torch.Generator().manual_seed(config.seed)
+        self.noise = Noise(config.seed + 1, device)
+        self.shots = [Shot.of(view, device) for view in dataset.train]
+        self.iteration = 0
+        self.rho = 0.0
+        self.skipped = 0
+        self.order: list[int] = []  #: training views drawn and not yet learnt from, the next one last
+        self.left_out: list[dict[str, Any]] = []
+        self._neighbours: losses.Neighbours | None = None  #: rebuilt when anchors come or go
+
+    def step(self, levels: Sequence[int] | None = None) -> dict[str, Any]:
+        """One training step; returns its log record (every term unweighted). levels: those to train, ascending, each on
+        a view of its own; None draws what the rollout says."""
+        judged = self._judge_levels()
+        left = self._prune()
+        chosen, probabilities = self._draw_levels() if levels is None else _given(levels)
+        drawn = [(self._next_view(), level) for level in chosen]
+        record: dict[str, Any] = {"iteration": self.iteration, "level": chosen[-1]}
+        if judged:
+            record |= {"judged_psnr": judged, "left_out": self.left_out}
+        if left:
+            record["left_model"], record["left_level_0"] = left
+        if not self._learn(drawn, record):
+            self.skipped += 1
+            record["skipped"] = self.skipped
+        self.optimiser.zero_grad()
+        if self.iteration >= self.schedule.rho_start and self.iteration % self.schedule.rho_every == 0:
+            with torch.no_grad():
+                self.rho = updated_rho(self.rho, self.model.masks(0), self.model.masks(2))
+        record |= {"rho": self.rho, "pi": probabilities, "anchors": len(self.model.anchor_q)}
+        if self.iteration % self.schedule.rho_every == 0:
+            record["active"] = self.active_anchors()
+        self.iteration += 1
+        return record
+
+    def rehearse(self, index: int, level: int) -> None:
+        """What a step at `level` on training view `index` costs, all its terms included, but for the update; leaves
+        model, optimiser and generators as they are."""
+        states = self.generator.get_state(), self.noise.generator.get_state()
+        _, _, loss = self.loss(index, level, Rounding(noise=self.noise), mask_terms=True)
+        torch.autograd.backward(loss)
+        self.optimiser.gradient_norm()
+        self.optimiser.zero_grad()
+        self.generator.set_state(states[0])
+        self.noise.generator.set_state(states[1])
+
+    def active_anchors(self) -> list[int]:
+        """Anchors active per level 0, 1, 2."""
+        with torch.no_grad():
+            return [int((self.model.masks(level) > MASK_THRESHOLD).sum()) for level in range(3)]
+
+    def level_psnr(self, views: Sequence[View]) -> list[float]:
+        """Per level of the model the mean mPSNR over `views`, dB, rounded as the steps round by now, without noise."""
+        rounding = replace(self._rounding(), noise=None)
+
+        def draw(level: int, view: View) -> np.ndarray:
+            return render_image(self.model, level, view.time, view.viewmat, view.K, view.width, view.height, rounding)
+
+        return list(level_psnr(draw, range(self.model.level + 1), views).values())
+
+    # -- draws -----------------------------------------------------------------------------------------------------
+
+    def _draw_levels(self) -> tuple[tuple[int, ...], Probabilities]:
+        """The levels of this step, ascending, and the probabilities that they were drawn with."""
+        if self.iteration < self.schedule.coarse_end:
+            return _given((0,))
+        if self.config.rollout == "all":
+            return tuple(range(self.model.level + 1)), (1.0, 1.0, 1.0)
+        if self.config.rollout == "top":
+            probabilities = TOP
+        elif self.config.rollout == "uniform" or self.iteration < self.schedule.rho_start:
+            probabilities = UNIFORM
+        elif self.config.rollout == "fixed":
+            probabilities = CAPACITY_WEIGHTED
+        else:
+            probabilities = rollout_probabilities(self.rho)
+        return (sample_level(probabilities, self.model.level, self.generator),), probabilities
+
+    def _next_view(self) -> int:
+        if not self.order:
+            waiting = self.waiting_views() if self.iteration < self.schedule.rounding else set()
+            drawn = torch.randperm(len(self.shots), generator=self.generator).tolist()
+            self.order = [index for index in drawn if index not in waiting]
+        return self.order.pop()
+
+    def _rounding(self) -> Rounding:
+        if not self.config.noise:
+            return EXACT
+        exact = self.iteration >= self.schedule.exact_rounding
+        noisy = self.iteration >= self.schedule.coarse_end and not exact
+        weights = self.iteration >= self.schedule.rounding
+        return Rounding(self.noise if noisy else None, attributes=exact, weights=weights)
+
+    # -- loss and update -------------------------------------------------------------------------------------------
+
+    def _learn(self, drawn: list[tuple[int, int]], record: dict[str, Any]) -> bool:
+        """Losses of (view, level) pairs, gradients, update; False, with nothing changed, if any of it is not finite.
+        The record is that of the last pair."""
+        rounding, mask_terms = self._rounding(), self.iteration >= self.schedule.progressive
+        pictures = []
+        for index, level in drawn:
+            try:
+                picture, terms, loss = self.loss(index, level, rounding, mask_terms)
+            except NotFinite as error:  # a diverged step may be passed over; any other refusal is here to stay
+                record["refused"] = str(error)
+                return False
+            record["loss"] = float(loss.detach())
+            record |= {name: float(value.detach()) for name, value in terms.items()}
+            torch.autograd.backward(loss)
+            pictures.append(picture)
+            if not math.isfinite(record["loss"]):
+                return False
+        record["gradient_norm"] = norm = self.optimiser.gradient_norm()
+        if not math.isfinite(norm):
+            return False
+        if norm > self.config.max_gradient_norm:
+            self.optimiser.scale_gradients(self.config.max_gradient_norm / norm)
+        self._update(pictures, record)
+        return True
+
+    def loss(
+        self, index: int, level: int, rounding: Rounding, mask_terms: bool
+    ) -> tuple[Picture, dict[str, Tensor], Tensor]:
+        """(picture of training view `index` at `level`, terms unweighted and by name, their weighted sum).
+
+        mask_terms: whether rate and mask terms belong to it yet. Raises NotFinite where the model has diverged.
+        """
+        config, shot = self.config, self.shots[index]
+        view = shot.view
+        picture = render(self.model, level, view.time, shot.viewmat, shot.K, view.width, view.height, rounding)
+        if picture.meta["means2d"].requires_grad:
+            picture.meta["means2d"].retain_grad()
+        l1, dissimilarity = image_loss(picture.image, shot.target)
+        terms = {"l1": l1, "dssim": dissimilarity}
+        loss = (1 - config.ssim) * l1 + config.ssim * dissimilarity
+        if config.volume and len(picture.gaussians.scales):
+            terms["volume"] = picture.gaussians.scales.prod(dim=1).mean()
+            loss = loss + config.volume * terms["volume"]
+        fields = (
+            ("global", self.model.global_deformation, config.global_planes),
+            ("local", self.model.local_deformation, config.local_planes),
+        )
+        for name, field, weights in fields[:level]:
+            if field is not None:
+                loss = loss + self._plane_terms(name, field, weights, terms)
+        if mask_terms:
+            loss = loss + self._mask_terms(level, terms)
+        return picture, terms, loss
+
+    def _plane_terms(
+        self, name: str, field: DeformationField, weights: PlaneWeights, terms: dict[str, Tensor]
+    ) -> Tensor:
+        total = torch.zeros((), device=self.device)
+        for term, value in field.planes.regularisers().items():
+            terms[f"{name}_{term}"] = value
+            total = total + getattr(weights, term) * value
+        return total
+
+    def _mask_terms(self, level: int, terms: dict[str, Tensor]) -> Tensor:
+        """The rate and the two terms of temporal mask consistency."""
+        config = self.config
+        mask = self.model.masks(level)
+        total = torch.zeros((), device=self.device)
+        if config.rate_scale:
+            terms["rate"] = losses.rate_term(self.model, mask, config.rate_share, self.generator)
+            total = total + config.lambdas[level] * config.rate_scale * terms["rate"]
+        if config.tmc_binary:
+            terms["tmc_binary"] = losses.binary_term(mask)
+            weight = config.tmc * config.tmc_binary_growth ** self.schedule.separation(self.iteration)
+            total = total + weight * terms["tmc_binary"]
+        if config.tmc_smooth:
+            if self._neighbours is None:
+                self._neighbours = losses.Neighbours(self.model.anchor_q)
+            pairs, weights = self._neighbours.draw(config.tmc_tau, self.generator)
+            terms["tmc_smooth"] = losses.smooth_term(mask, pairs.to(self.device), weights.to(self.device))
+            total = total + config.tmc * terms["tmc_smooth"]
+        return total
+
+    def _update(self, pictures: list[Picture], record: dict[str, Any]) -> None:
+        """Adam; and while anchors grow, what growing goes by and the growing itself."""
+        growing, known = self.schedule.grow, self.schedule.iterations is not None
+        if known and self.iteration <= growing.stop:
+            for picture in pictures:
+                self._observe(picture)
+        self.optimiser.step(self.schedule.progress(self.iteration))
+        if self.iteration in growing:
+            pruned, grown = self.densifier.adjust(
+                self.model,
+                self.optimiser,
+                self.generator,
+                grow=len(self.model.anchor_q) < self.densifier.max_anchors,
+                prune=self.iteration >= self.schedule.coarse_end,  # before, colours are random and opacities fall
+            )
+            self._neighbours = None
+            record |= {"pruned": pruned, "grown": grown}
+
+    def _observe(self, picture: Picture) -> None:
+        gradient = picture.meta["means2d"].grad
+        if gradient is not None and len(picture.gaussians.slots):
+            drawn = (picture.meta["radii"][0] > 0).all(-1)
+            height, width = picture.alpha.shape
+            self.densifier.observe(picture.gaussians, gradient[0], drawn, width, height)
+
+    # -- what happens once or a few times in a run -------------------------------------------------------------------
+
+    def waiting_views(self) -> set[int]:
+        """Training views that wait until the levels are judged; none where N is not known yet, or nothing to judge."""
+        judged = self.config.judge and self.config.max_layer > 0 and self.config.rollout != "top"
+        return judge.waiting_views(len(self.shots), self.schedule.iterations or 0) if judged else set()
+
+    def _judge_levels(self) -> list[float]:
+        """Where the last third begins: leaves out the levels that do not pay. Returns the PSNR per level judged by."""
+        waiting = sorted(self.waiting_views()) if self.iteration == self.schedule.rounding else []
+        if not waiting:
+            return []
+        psnr = self.level_psnr([self.dataset.train[index] for index in waiting])
+        found = judge.levels_without_gain(psnr)
+        for level, _ in found:
+            judge.drop_level(self.model, self.optimiser, level)
+        self.left_out = [{"level": level, "gain": gain, "views": len(waiting)} for level, gain in found]
+        return psnr
+
+    def _prune(self) -> list[int]:
+        """Where growing has ended: takes out what the pictures hardly need, in a few rounds. Returns how many anchors
+        left the model and how many left layer 0."""
+        rounds = self.schedule.prune
+        due = (self.schedule.iterations or 0) >= pruning.MIN_ITERATIONS and self.iteration in rounds
+        if not (self.config.prune and due):
+            return []
+        turn = rounds.index(self.iteration)
+        waiting = self.waiting_views()
+        shots = [shot for i, shot in enumerate(self.shots) if i not in waiting]
+        stride = -(-len(shots) // pruning.VIEWS)
+        levels = range(self.model.level if self.config.rollout == "top" else 0, self.model.level + 1)
+        before, share = len(self.model.anchor_q), self.config.prune / len(rounds)
+        try:
+            keep, later = pruning.prune(
+                self.model, self.optimiser, shots[turn % stride :: stride], levels, share, turn, self._rounding()
+            )
+        except NotFinite:  # as a step that diverged: passed over, with nothing changed
+            return []
+        self.densifier.keep(keep)
+        self._neighbours = None
+        return [before - len(keep), later]
+
+    # -- checkpoints -----------------------------------------------------------------------------------------------
+
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint holds besides the model, so that the steps after it are the same."""
+        return {
+            "iteration": self.iteration,
+            "total": self.schedule.iterations or 0,
+            "rho": self.rho,
+            "skipped": self.skipped,
+            "order": self.order,
+            "left_out": json.dumps(self.left_out),
+            "optimiser": self.optimiser.state(),
+            "densifier": self.densifier.state(),
+            "generator": self.generator.get_state(),
+            "noise": self.noise.generator.get_state(),
+        }
+
+    def restore(self, model: Model, state: dict[str, Any]) -> None:
+        """Goes on with `model` from what `state` returned. A broken state raises whatever its first fault does."""
+        self.model = model.to(self.device)
+        self._neighbours = None
+        self.optimiser = Optimiser(self.model, self.config.rates, self.config.cooldown)
+        self.optimiser.load_state(state["optimiser"])
+        self.densifier.load_state(state["densifier"])
+        self.generator.set_state(state["generator"])
+        self.noise.generator.set_state(state["noise"])
+        self.iteration, self.skipped = int(state["iteration"]), int(state["skipped"])
+        self.schedule = Schedule(int(state["total"]) or None)
+        self.rho = float(state["rho"])
+        self.order = [int(index) for index in state["order"]]
+        self.left_out = list(json.loads(state.get("left_out", "[]")))
+
+
+def _given(levels: Sequence[int]) -> tuple[tuple[int, ...], Probabilities]:
+    """Levels that are not left to chance, and the probabilities that say so."""
+    first, second, third = (float(level in levels) for level in range(3))
+    return tuple(levels), (first, second, third)

@@ -1,0 +1,34 @@
+"""A small scene with a camera as scene, bytes and checkpoint; one thread, since everything here is small."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+pytest.importorskip("torch")
+
+from scenes import checkpoint_of, filmed_scene  # noqa: E402
+
+from pd4dgs_codec import encode  # noqa: E402
+from pd4dgs_codec.scene import Scene  # noqa: E402
+
+
+@pytest.fixture(autouse=True)
+def _one_thread(monkeypatch):
+    monkeypatch.setenv("OMP_NUM_THREADS", "1")
+
+
+@pytest.fixture(scope="session")
+def scene() -> Scene:
+    return filmed_scene()
+
+
+@pytest.fixture(scope="session")
+def data(scene) -> bytes:
+    return encode(scene, layers=2, effort=1)
+
+
+@pytest.fixture(scope="session")
+def model_pt(scene, tmp_path_factory) -> Path:
+    return checkpoint_of(scene, tmp_path_factory.mktemp("model") / "model.pt")

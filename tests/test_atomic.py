@@ -1,0 +1,59 @@
+"""Outputs appear whole or not at all, flushed to the disk before they take their name."""
+
+import os
+
+import pytest
+
+from pd4dgs_codec import atomic
+from pd4dgs_codec.errors import DataError
+
+
+def test_a_file_that_appears_meanwhile_is_not_replaced(tmp_path):
+    target = tmp_path / "x.bin"
+    with pytest.raises(DataError, match="exists already"), atomic.whole_file(target, False) as temporary:
+        temporary.write_bytes(b"new")
+        target.write_bytes(b"other")
+    assert target.read_bytes() == b"other" and os.listdir(tmp_path) == ["x.bin"]
+
+
+def test_files_appear_together_or_not_at_all(tmp_path):
+    names = [str(tmp_path / "out" / f"{i}.png") for i in range(3)]
+    with pytest.raises(RuntimeError), atomic.whole_files(names[0], names, False) as temporaries:
+        temporaries[0].write_bytes(b"1")
+        raise RuntimeError("in the middle")
+    assert list(tmp_path.iterdir()) == []
+    with atomic.whole_files(names[0], names, False) as temporaries:
+        for temporary in temporaries:
+            temporary.write_bytes(b"1")
+    assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["0.png", "1.png", "2.png"]
+
+
+def test_bytes_reach_the_disk_before_the_name(tmp_path, monkeypatch):
+    events = []
+    fsync, replace = os.fsync, os.replace
+    monkeypatch.setattr(
+        os, "fsync", lambda descriptor: (events.append(os.fstat(descriptor).st_size), fsync(descriptor))
+    )
+    monkeypatch.setattr(os, "replace", lambda *paths: (events.append(paths[1].name), replace(*paths)))
+    atomic.write_bytes(tmp_path / "x.bin", b"12345", overwrite=False)
+    assert events == [5, "x.bin"] and (tmp_path / "x.bin").read_bytes() == b"12345"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="links and devices")
+def test_a_link_stays_one_and_a_device_is_written_to(tmp_path):
+    (tmp_path / "x.bin").write_bytes(b"old")
+    (tmp_path / "link").symlink_to("x.bin")
+    atomic.write_bytes(tmp_path / "link", b"new", overwrite=True)
+    assert (tmp_path / "link").is_symlink() and (tmp_path / "x.bin").read_bytes() == b"new"
+    atomic.write_bytes("/dev/null", b"gone", overwrite=False)
+    assert not os.path.isfile("/dev/null")
+
+
+def test_leftovers_of_a_killed_process_are_found_by_the_file_they_hold(tmp_path):
+    mine = tmp_path / ".pd4dgs-ab_3xyz9" / "m.pt"
+    others = [tmp_path / name for name in ("m.pt", ".pd4dgs-cd_3xyz9/other.pt", "folder/m.pt")]
+    for file in (mine, *others):
+        file.parent.mkdir(exist_ok=True)
+        file.write_bytes(b"x")
+    atomic.remove_leftovers(tmp_path / "m.pt")
+    assert not mine.parent.exists() and all(file.exists() for file in others)

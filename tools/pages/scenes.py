@@ -1,0 +1,59 @@
+"""The scenes that the pages are made from, and where the real ones are read."""
+
+from __future__ import annotations
+
+import argparse
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from pd4dgs_codec.data.view import Dataset
+
+#: The folder of the real scenes, which are not part of the repository.
+SHARED = Path(os.environ.get("PD4DGS_SHARED") or Path(__file__).resolve().parents[3] / "shared" / "data")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """One scene and how tools/results.py trains it. name: its folder in out/ and its rows. seconds: time limit."""
+
+    name: str
+    source: str
+    downscale: int = 1
+    preset: str = "small"
+    iterations: int = 1_500
+    seconds: float = 600.0
+
+    @property
+    def there(self) -> bool:
+        """Whether its data are on this machine."""
+        return self.source.startswith("synthetic:") or Path(self.source).is_dir()
+
+    def load(self) -> Dataset:
+        """Its views. Raises DataError."""
+        from pd4dgs_codec.data.dataset import load
+
+        return load(self.source, downscale=self.downscale)
+
+
+SCENES = {
+    scene.name: scene
+    for scene in (
+        Scene("shelf-hand", str(SHARED / "shelf-hand"), 2, iterations=5_000),
+        Scene("bouncing-balls", str(SHARED / "bouncing-balls"), 4, iterations=7_000),
+        *(Scene(f"synthetic-{name}", f"synthetic:{name}") for name in ("static", "global", "local", "fast")),
+        Scene("shelf-hand-paper", str(SHARED / "shelf-hand"), 2, "paper", 4_600, 1_500.0),
+    )
+}
+
+
+def present(args: argparse.Namespace, names: Sequence[str] = tuple(SCENES)) -> list[Scene]:
+    """Those of `names` that --only asks for, else all, whose data are there; says which are not. None for --render."""
+    asked = [] if args.render else [SCENES[name] for name in names if not args.only or name in args.only]
+    for scene in asked:
+        if not scene.there:
+            print(f"{scene.name}: {scene.source} is not there, left out", flush=True)
+    return [scene for scene in asked if scene.there]
