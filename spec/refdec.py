@@ -11,7 +11,6 @@ it can be carried alone.
 
 import hashlib
 import json
-import lzma
 import math
 import struct
 import sys
@@ -57,16 +56,17 @@ def limited(value, high, what, low=0):
     return value
 
 
-# 15 Errors and security: "a mode, deformation, form of a section, predictor, network, prior family, section number or
-# key under 64 that is not registered"
+# 15 Errors and security: "UnsupportedFeature is an integer of whatever size and sign that is not a registered mode,
+# deformation, form of a section, predictor, network or prior family"
 def registered(value, known, what):
     need(type(value) is int, f"{what} is no integer")
     need(value in known, f"{what} is {value}", "UnsupportedFeature")
     return value
 
 
+# 15 Errors and security: "Inside a payload, bytes that end early are Malformed"
 class Reader:
-    """Takes bytes from the front; running out of them is Malformed."""
+    """Takes bytes from the front."""
 
     def __init__(self, data):
         self.data, self.at = data, 0
@@ -76,9 +76,10 @@ class Reader:
         return len(self.data) - self.at
 
     def take(self, count):
-        need(count <= self.left, f"{self.left} bytes, expected {count} more")
-        self.at += count
-        return self.data[self.at - count : self.at]
+        part = self.data[self.at : self.at + count]
+        need(len(part) == count, f"{len(part)} bytes, expected {count} more")
+        self.at += len(part)
+        return part
 
     def number(self, form):
         return struct.unpack(form, self.take(struct.calcsize(form)))[0]
@@ -95,14 +96,15 @@ class Reader:
     # 7.1 Variable-length integers: "A varint holds seven bits per byte, least significant first; the high bit of a
     # byte says that another follows. It takes at most 5 bytes and MUST be in the shortest form"
     def varint(self, high):
-        value = 0
-        for index in range(5):
+        value = shift = 0
+        while True:
             byte = self.byte()
-            value |= (byte & 127) << 7 * index
+            value |= (byte & 127) << shift
             if byte < 128:
-                need(byte or not index, "a varint is not in its shortest form")
+                need(byte or not shift, "a varint is not in its shortest form")
                 return limited(value, high, "a varint")
-        raise Fault("Malformed", "a varint of more than 5 bytes")
+            shift += 7
+            need(shift < 35, "a varint of more than 5 bytes")
 
     # 7.1 Variable-length integers: "A zigzag integer v is the varint 2v for v ≥ 0 and −2v − 1 for v < 0."
     def zigzag(self, high):
@@ -139,25 +141,34 @@ def unpack(data):
 # 4 Canonical msgpack: "nil, float 64, ext and timestamp MUST NOT occur. Lists and maps are nested at most 4 deep, the
 # outermost counted."
 def msgpack_value(reader, depth):
+    kind, value = msgpack_head(reader)
+    if kind == "number":
+        return value
+    return msgpack_items(reader, kind, value, depth)
+
+
+# 4 Canonical msgpack: "the shortest of positive fixint, uint 8, 16, 32, 64" "the shortest of negative fixint, int 8,
+# 16, 32, 64" "float 32, finite."
+def msgpack_head(reader):
+    """(kind, number of bytes or entries that follow), or ("number", value)."""
     b = reader.byte()
     if b < 0x80 or b >= 0xE0:
-        return b if b < 0x80 else b - 256
+        return "number", b if b < 0x80 else b - 256
     if b < 0xC0:
-        kind, size = ("map", b & 15) if b < 0x90 else ("list", b & 15) if b < 0xA0 else ("str", b & 31)
-        return msgpack_items(reader, kind, size, depth)
+        return ("map", b & 15) if b < 0x90 else ("list", b & 15) if b < 0xA0 else ("str", b & 31)
     if b in (0xC2, 0xC3):
-        return b == 0xC3
+        return "number", b == 0xC3
     if b == 0xCA:
-        return check_finite(reader.number(">f"))
+        return "number", check_finite(reader.number(">f"))
     if 0xCC <= b <= 0xCF:  # the second number: the first value that needs this form
         form, least = (("B", 1 << 7), ("H", 1 << 8), ("I", 1 << 16), ("Q", 1 << 32))[b - 0xCC]
-        return shortest(reader.number(">" + form), least)
+        return "number", shortest(reader.number(">" + form), least)
     if 0xD0 <= b <= 0xD3:
         form, least = (("b", 1 << 5), ("h", 1 << 7), ("i", 1 << 15), ("q", 1 << 31))[b - 0xD0]
-        return -1 - shortest(-1 - reader.number(">" + form), least)
+        return "number", -1 - shortest(-1 - reader.number(">" + form), least)
     need(b in MSGPACK_SIZED, f"msgpack byte {b:#x}")
     kind, form, least = MSGPACK_SIZED[b]
-    return msgpack_items(reader, kind, shortest(reader.number(">" + form), least), depth)
+    return kind, shortest(reader.number(">" + form), least)
 
 
 def shortest(value, least):
@@ -165,23 +176,23 @@ def shortest(value, least):
     return value
 
 
-# 4 Canonical msgpack: "keys are integers 0..2^32 − 1, ascending, each once"
+# 4 Canonical msgpack: "(well-formed UTF-8)" "keys are integers 0..2^32 − 1, ascending, each once"
 def msgpack_items(reader, kind, size, depth):
     if kind == "bin":
         return bytes(reader.take(size))
     if kind == "str":
-        try:
-            return reader.take(size).decode()
-        except UnicodeDecodeError:
-            raise Fault("Malformed", "a string is not UTF-8") from None
+        data = reader.take(size)
+        text = data.decode(errors="replace")
+        need(text.encode() == data, "a string is not UTF-8")
+        return text
     need(depth < 4, "msgpack nested deeper than 4")
-    need(size <= reader.left, f"{size} msgpack entries in {reader.left} bytes")
     if kind == "list":
         return [msgpack_value(reader, depth + 1) for _ in range(size)]
-    result, last = {}, -1
+    result, last = {}, None
     for _ in range(size):
         key = msgpack_value(reader, depth + 1)
-        need(type(key) is int and last < key < 1 << 32, f"map key {key!r} after {last}")
+        need(type(key) is int and 0 <= key < 1 << 32, f"map key {key!r}")
+        need(last is None or key > last, f"map key {key} after {last}")
         result[key], last = msgpack_value(reader, depth + 1), key
     return result
 
@@ -208,13 +219,17 @@ def a_list(value, what, count=None):
 
 
 def reals(value, what, count):
-    need(all(type(v) is float for v in a_list(value, what, count)), f"{what}: expected float 32")
+    return [real(v, what) for v in a_list(value, what, count)]
+
+
+def real(value, what):
+    need(type(value) is float, f"{what}: expected float 32")
     return value
 
 
 # 5.1 Header map: "Steps and voxel size MUST be positive normal binary32 values."
 def a_step(value):
-    need(type(value) is float and value >= 2.0**-126, f"step {value!r}")
+    need(value >= 2.0**-126, f"step {value!r}")
     return value
 
 
@@ -236,58 +251,67 @@ def read_preamble(data):
 # float32 (9.2); others UnsupportedFeature"
 def read_header(data):
     header = fields(unpack(data), range(1, 14), (*range(1, 12), 13), "header")
-    for key, count in ((4, 3), (6, 6), (7, 2), (8, 3), (9, 2), (10, 3)):
+    steps, box, (start, end), background, (near, far), _ = (
         reals(header[key], f"header key {key}", count)
-    for step in (header[5], *header[4]):
+        for key, count in ((4, 3), (6, 6), (7, 2), (8, 3), (9, 2), (10, 3))
+    )
+    voxel_size, unit = (real(header[key], f"header key {key}") for key in (5, 11))
+    for step in (*steps, voxel_size):
         a_step(step)
-    need(type(header[11]) is float, "header key 11: expected float 32")
-    need(all(a <= b for a, b in zip(header[6][:3], header[6][3:])), "a lower corner of the box above the upper one")
-    (start, end), (near, far) = header[7], header[9]
-    need(start <= end and all(0 <= c <= 1 for c in header[8]) and 0 <= near < far, "time, background, near or far")
-    need(header[11] >= 0, "a negative unit")
+    need(all(a <= b for a, b in zip(box[:3], box[3:])), "a lower corner of the box above the upper one")
+    need(start <= end, f"time from {start} to {end}")
+    need(all(0 <= c <= 1 for c in background), f"background {background}")
+    need(0 <= near < far, f"near {near}, far {far}")
+    need(unit >= 0, f"unit {unit}")
     if 12 in header:
-        camera = fields(header[12], range(1, 5), range(1, 5), "camera")
-        reals(camera[1], "camera matrix", 12)
-        fx, fy, _, _ = reals(camera[2], "camera intrinsics", 4)
-        need(fx > 0 and fy > 0, "a focal length that is not positive")
-        for key in (3, 4):
-            limited(camera[key], 65535, "camera size", 1)
+        read_camera(header[12])
     read_error_bounds(header[13])
-    read_chunk_list(a_list(header[1], "chunk list"))
+    read_chunk_list(header[1])
     for key in (2, 3):
         registered(header[key], (0, 1), f"header key {key}")
     return header
+
+
+# 5.3 Camera map: "fx and fy MUST be positive" "All four are required."
+def read_camera(value):
+    camera = fields(value, range(1, 5), range(1, 5), "camera")
+    reals(camera[1], "camera matrix", 12)
+    fx, fy, _, _ = reals(camera[2], "camera intrinsics", 4)
+    need(fx > 0 and fy > 0, f"focal lengths {fx} and {fy}")
+    for key in (3, 4):
+        limited(camera[key], 65535, "camera size", 1)
 
 
 # 5.4 Error bounds: "Each value is a real B ≥ 0 in the unit of the tensors." "Keys 0..3 are required in the map"
 def read_error_bounds(value):
     bounds = fields(value, range(8), range(4), "error bounds")
     for key in set(bounds) & set(range(8)):
-        need(type(bounds[key]) is float and bounds[key] >= 0, f"error bound {bounds[key]!r}")
+        need(real(bounds[key], f"error bound {key}") >= 0, f"error bound {key} is {bounds[key]}")
 
 
 # 5.2 Chunk list: "The first type MUST be 0; the types of layers among all entries MUST ascend, each at most once."
 def read_chunk_list(rows):
-    limited(len(rows), 64, "the number of chunks", 1)
+    limited(len(a_list(rows, "chunk list")), 64, "the number of chunks", 1)
     for row in rows:
         kind, size = a_list(row, "a chunk", 2)
         limited(kind, 65535, "a chunk type")
         limited(size, (1 << 31) - 1, "a payload's length")
-    layers = [kind for kind, _ in rows if kind < 3]
-    need(rows[0][0] == 0 and layers == sorted(set(layers)), f"layers {layers}")
+    layers = [kind for kind, _ in rows if kind in range(3)]
+    need(rows[0][0] == 0, f"the first chunk is of type {rows[0][0]}")
+    need(layers == sorted(set(layers)), f"layers {layers}")
 
 
 # 3.3 Scene identity: "the header from the end of its chunk list (the value of key 1, its first entry) to its own end"
 def behind_chunk_list(header):
     reader = Reader(header)
-    reader.take(3 if reader.data[0] == 0xDE else 1)  # the head of the map
+    msgpack_head(reader)
     for _ in ("key 1", "the chunk list"):
         msgpack_value(reader, 1)
     return reader.take(reader.left)
 
 
 # 3.2 Chunks: "Type and length MUST equal those in the chunk list. Checks come in this order: L against its limit, L
-# against the list, the bytes that are there, CRC-32, flags, type, scene id."
+# against the list, the bytes that are there, CRC-32, reserved flags, type, scene id, flag bit 0 against the type"
 def read_chunk(data, at, kind, size, scene_id, described):
     need(len(data) >= at + 16, "the file ends in a chunk's head", "Truncated")
     found_kind, flags, found_size, found_id = struct.unpack_from("<HHI8s", data, at)
@@ -297,16 +321,24 @@ def read_chunk(data, at, kind, size, scene_id, described):
     need(len(data) >= end + 4, "the file ends in a chunk", "Truncated")
     crc = struct.unpack_from("<I", data, end)[0]
     need(zlib.crc32(data[at:end]) == crc, f"CRC-32 of the chunk at {at}", "ChecksumMismatch")
-    need(flags <= 1, f"flags {flags:#x}")
+    need(flags >> 1 == 0, f"flags {flags:#x}")
     need(found_kind == kind, f"chunk type {found_kind}, listed {kind}")
     payload = data[at + 16 : end]
-    # 3.3: the first 8 bytes of the SHA-256 of what the header says besides the chunk list, then the layer-0 payload.
-    expected = scene_id or hashlib.sha256(described + payload).digest()[:8]
-    need(found_id == expected, "the scene id is not that of the header and layer 0")
-    # 3.4: the chunk types of layers are critical.
-    need(kind < 3 or flags == 1, f"critical chunk of type {kind}", "UnsupportedFeature")
-    need(kind >= 3 or flags == 0, "a layer marked as ancillary")
+    check_scene_id(found_id, scene_id or hashlib.sha256(described + payload).digest()[:8])
+    check_critical(kind, flags & 1)
     return payload, found_id, end + 4
+
+
+# 3.3 Scene identity: "Every chunk of a file, ancillary ones included, MUST carry it"
+def check_scene_id(found, expected):
+    need(found == expected, "the scene id is not that of the header and layer 0")
+
+
+# 3.4 Critical and ancillary chunks: "The chunk types of layers are critical: flag bit 0 MUST be zero there." "A
+# critical chunk of unknown type is an UnsupportedFeature when a decoder reaches it"
+def check_critical(kind, ancillary):
+    need(kind < 3 or ancillary, f"critical chunk of type {kind}", "UnsupportedFeature")
+    need(kind >= 3 or not ancillary, "a layer marked as ancillary")
 
 
 class Layer:
@@ -324,11 +356,10 @@ def read_layer(payload, number, rows_before, header):
     reader = Reader(payload)
     parameters = reader.take(limited(reader.number("<I"), 4096, "the parameters' length"))
     read_parameters(layer, unpack(parameters))
-    need(sum(layer.sections.values()) == reader.left, "the sections do not fill the payload")
-    check_sizes(layer, len(payload))
     parts = {section: reader.take(layer.sections[section]) for section in sorted(layer.sections)}
+    need(not reader.left, f"{reader.left} bytes behind the sections")
+    check_sizes(layer, len(payload))
     read_sections(layer, parts)
-    need(not parts, f"sections {sorted(parts)} have nothing to code")
     return layer
 
 
@@ -336,26 +367,24 @@ def read_layer(payload, number, rows_before, header):
 # deformation, else none of them."
 def read_parameters(layer, value):
     parameters = fields(value, range(1, 6), (1, 2), "layer parameters")
-    sections = fields(parameters[2], range(7), (), "sections")
-    layer.networks = read_networks(layer.number, parameters[5]) if 5 in parameters else {}
-    need(layer.networks or layer.number, "layer 0 without networks")
-    # 5.4: the classes 4 and 5 if layer 1 has a deformation, 6 and 7 if layer 2 has one.
-    classes = {2 + 2 * layer.number, 3 + 2 * layer.number} if layer.networks and layer.number else set()
-    need(classes <= set(layer.header[13]), "no error bound for a deformation")
-    layer.raw = bool(layer.networks and layer.number and header_is_float32(layer.header))
     layer.rows = limited(parameters[1], (1 << 24) - layer.rows_before, "own rows")
+    sections = fields(parameters[2], range(7), (), "sections")
     layer.sections = {s: limited(sections[s], (1 << 31) - 1, "a section", 1) for s in sections if s < 64}
-    has_planes = bool(layer.networks) and layer.number > 0
-    need((3 in parameters) == bool(layer.networks), "steps without networks or the reverse")
-    layer.steps = [a_step(v) for v in reals(parameters[3], "steps", 1 + has_planes)] if layer.networks else []
-    if has_planes:
-        need(4 in parameters, "a deformation without planes")
-    layer.scales = read_scales(layer, parameters[4]) if has_planes else []
-    need((4 in parameters) == has_planes, "planes without reason")
+    found = {3, 4, 5} & set(parameters)
+    need(found in ([{3, 4, 5}, set()] if layer.number else [{3, 5}]), f"layer {layer.number} with keys {found}")
+    layer.networks = read_networks(layer.number, parameters[5]) if 5 in parameters else {}
+    layer.deformed = bool(layer.networks) and layer.number > 0
+    layer.raw = layer.deformed and layer.header[3] == 1
+    steps = reals(parameters[3], "steps", 1 + layer.deformed) if layer.networks else []
+    layer.steps = [a_step(step) for step in steps]
+    layer.scales = read_scales(layer, parameters[4]) if layer.deformed else []
+    check_bounded(layer)
 
 
-def header_is_float32(header):
-    return header[3] == 1
+# 5.4 Error bounds: "4 and 5 if layer 1 has a deformation, 6 and 7 if layer 2 has one, else the layer is Malformed."
+def check_bounded(layer):
+    classes = {2 + 2 * layer.number, 3 + 2 * layer.number} if layer.deformed else set()
+    need(classes <= set(layer.header[13]), "no error bound for a deformation")
 
 
 # 6.3 Planes and networks: "channels 1..256, the same in every scale, resolutions 1..4096 along x, y, z, t, and one
@@ -374,12 +403,11 @@ def read_scales(layer, rows):
     return rows
 
 
-# 6.3 Planes and networks: "Layer 0 has all three networks. A deformation has its trunk and at least one head. Other
-# ids are UnsupportedFeature."
+# 6.3 Planes and networks: "Ids ascend." "The last width MUST be the number of outputs in this table." "Layer 0 has all
+# three networks. A deformation has its trunk and at least one head."
 def read_networks(number, rows):
-    need(a_list(rows, "networks"), "an empty list of networks")
     networks, last = {}, -1
-    for row in rows:
+    for row in a_list(rows, "networks"):
         need(a_list(row, "a network"), "an empty network")
         key = registered(row[0], NETWORKS[number], "a network's id")
         need(key > last, f"network {key} after {last}")
@@ -388,7 +416,11 @@ def read_networks(number, rows):
             limited(width, 4096, "a network's width", 1)
         need(NETWORKS[number][key] in (None, row[-1]), f"network {key} with {row[-1]} outputs")
         networks[key], last = row[1:], key
-    need(len(networks) == 3 if number == 0 else 0 in networks and len(networks) > 1, f"networks {list(networks)}")
+    if number == 0:
+        need(len(networks) == 3, f"networks {list(networks)} in layer 0")
+    else:
+        need(0 in networks, "a deformation without a trunk")
+        need(len(networks) > 1, "a deformation without a head")
     return networks
 
 
@@ -417,19 +449,19 @@ def weight_shapes(layer):
 # 6.5 Declared sizes: "c MUST NOT exceed 2^28, n MUST NOT exceed 2^13 + 2·L, and E + 72·n + c + w MUST NOT exceed 2^22 +
 # 2048·L, L being the payload's length in bytes."
 def check_sizes(layer, payload_bytes):
-    cells = sum(c * h * w for _, _, (c, h, w) in plane_shapes(layer))
-    limited(cells, 1 << 28, "plane cells")
-    limited(layer.rows, (1 << 13) + 2 * payload_bytes, "own rows")
-    count = layer.rows_before + 72 * layer.rows + cells + sum(size for _, size in weight_shapes(layer))
-    limited(count, (1 << 22) + 2048 * payload_bytes, "the symbols of a layer")
+    samples = sum(c * h * w for _, _, (c, h, w) in plane_shapes(layer))
+    need(samples <= 1 << 28, f"{samples} plane samples", "LimitExceeded")
+    need(layer.rows <= (1 << 13) + 2 * payload_bytes, f"{layer.rows} own rows", "LimitExceeded")
+    symbols = layer.rows_before + 72 * layer.rows + samples + sum(size for _, size in weight_shapes(layer))
+    need(symbols <= (1 << 22) + 2048 * payload_bytes, f"{symbols} symbols", "LimitExceeded")
 
 
 # 6.4 Sections: "A section is present if and only if it has at least one symbol or value to code. Mode ans uses 0..4,
 # mode lzma 0 and 5."
 def read_sections(layer, parts):
     def part(section, count):
-        need((section in parts) == (count > 0), f"section {section} with {count} symbols to code")
-        return parts.pop(section, b"")
+        need(section in parts or not count, f"section {section} is missing")
+        return parts.pop(section, b"") if count else b""
 
     planes, weights = plane_shapes(layer), weight_shapes(layer)
     counts = {MASKS: [layer.rows_before, layer.rows], ATTRIBUTE_SECTION: [layer.rows] * 68}
@@ -456,6 +488,7 @@ def read_sections(layer, parts):
         sizes = {name: c * h * w for name, _, (c, h, w) in planes} | dict(weights)
         floats = decode_lzma_floats(part(FLOATS, 1), list(sizes.values()))
         layer.raw_values = dict(zip(sizes, floats))
+    need(not parts, f"sections {sorted(parts)} have nothing to code")
     keep_symbols(layer, positions, channels, planes, weights)
 
 
@@ -464,7 +497,8 @@ def read_sections(layer, parts):
 # 11.2 Attributes: "Symbols, here and in 11.3 and 11.4, MUST lie in −2^23..2^23, else Malformed."
 def keep_symbols(layer, positions, channels, planes, weights):
     rise, own = channels[MASKS]
-    need(all(0 <= v <= 255 for v in rise) and all(3 <= v <= 255 for v in own), "a mask code out of range")
+    need(all(v >= 0 for v in rise), "a mask code that falls")  # that neither is over 255 follows in finish_last
+    need(all(v >= 3 for v in own), "a mask code under 3")
     layer.symbols = {"anchor": [v for cell in positions for v in cell], "mask_rise": rise, "mask_own": own}
     first = 0
     for name, width in ATTRIBUTES:  # [width, n], channel by channel
@@ -475,7 +509,8 @@ def keep_symbols(layer, positions, channels, planes, weights):
         for name, predictor, (c, h, w) in planes:
             layer.symbols[name] = [k for _ in range(c) for k in restore(next(residuals), predictor, h, w)]
         layer.symbols |= {name: channel for (name, _), channel in zip(weights, channels[WEIGHTS])}
-    need(all(abs(k) <= MAX_SYMBOL for symbols in layer.symbols.values() for k in symbols), "a symbol over 2^23")
+    valued = [name for name in layer.symbols if name not in ("anchor", "mask_rise", "mask_own")]
+    need(all(abs(k) <= MAX_SYMBOL for name in valued for k in layer.symbols[name]), "a symbol over 2^23")
 
 
 # 11.3 Planes: "in row 0 N and NW are taken equal to W, in column 0 W and NW are taken equal to N, and at (0, 0) all
@@ -537,7 +572,7 @@ def histogram_table(classes, top, step):
     sums = [0]
     for c in classes:
         b = (top - c) * step
-        sums.append(sums[-1] + (M[b & 63] >> (b >> 6) if c else 0))
+        sums.append(sums[-1] + (M[b & 63] >> (b >> 6) if c > 0 else 0))
     h = max(0, sums[-1].bit_length() - 28)
     return [((s >> h) * (TOTAL - len(classes))) // (sums[-1] >> h) + q for q, s in enumerate(sums)]
 
@@ -584,12 +619,13 @@ class Prior:
 
 
 # 8.1 Parameter block: "a new prior: u8 shift 1..12, u8 family 1..3, the family's parameters"
-# 8.2 Priors: "The floor of a mixture is that of its first normal."
+# 8.2 Priors: "The floor of a mixture is that of its first normal; the bit is reserved in the second."
 def read_prior(reader, family):
     shift = 0
     if family == 4:
         shift, family = reader.byte(12), reader.byte()
-        need(shift and family, "a scaled prior with shift 0 or a constant")
+        need(shift, "a scaled prior of shift 0")
+        need(family, "a scaled constant")
     need(family <= 3, f"prior family {family}", "UnsupportedFeature")
     kmin = reader.zigzag(K)
     if family == 0:
@@ -603,13 +639,14 @@ def read_prior(reader, family):
     if family == 2:
         mu8, si, reserved = read_normal(reader, n)
         w = reader.byte()
-        need(w and not reserved, "a mixture with weight 0 or a reserved bit")
+        need(w, "a mixture of weight 0")
+        need(not reserved, "a mixture with a reserved bit")
         cdf = [((256 - w) * c1 + w * c2) >> 8 for c1, c2 in zip(cdf, norm_cdf(n, mu8, si))]  # clause 7.4
     return Prior(kmin, n, shift, table_of(cdf, 16 if floor else 1))
 
 
-# 8.2 Priors: "zigzag g, |g| ≤ 2^31, mu8 = g + 128·(n − 1); varint v ≤ 3841: bit 0 the floor, 0: fl = 1, 1: fl = 16;
-# si = (v >> 1) − 640"
+# 8.2 Priors: "Of a normal, mu8 = g + 128·(n − 1) and si = (v >> 1) − 640. Bit 0 of v is the floor: fl = 1 if it is 0,
+# else 16."
 def read_normal(reader, n):
     mu8 = reader.zigzag(1 << 31) + 128 * (n - 1)
     v = reader.varint(3841)
@@ -630,6 +667,7 @@ def read_histogram(reader, prior):
     return prior
 
 
+# 8.2 Priors: "A class outside 0..top, or all classes 0, is Malformed."
 # 8.4 Symbols: "The ANS stream holds the classes of each hist prior in the order of definition"
 def take_classes(stream, prior):
     step, top, differences, cum = prior.classes
@@ -637,7 +675,8 @@ def take_classes(stream, prior):
     for symbol in stream.take(prior.n, cum):
         last = last + symbol - top if differences else symbol
         classes.append(last)
-    need(0 <= min(classes) and 0 < max(classes) <= top, "a histogram's classes out of range")
+    need(0 <= min(classes) and max(classes) <= top, "a histogram's class out of range")
+    need(any(classes), "a histogram of classes 0 alone")
     prior.cum = histogram_table(classes, top, step)
 
 
@@ -651,7 +690,8 @@ def read_exceptions(reader, count, prior):
         at += 1 + reader.varint(VARINT_MAX)
         c = reader.varint(4 * K + 2)
         value = prior.kmin - 1 - (c >> 1) if c & 1 else prior.end + (c >> 1)
-        need(at < count and abs(value) <= K, f"an exception {value} at {at} of {count}")
+        need(at < count, f"an exception at {at} of {count}")
+        need(abs(value) <= K, f"an exception {value}")
         result[at] = value
     return result
 
@@ -663,7 +703,7 @@ def decode_channels(data, counts):
     for count in counts:
         if count == 0:
             continue
-        limited(count, MAX_COUNT, "the symbols of a channel")
+        need(count <= MAX_COUNT, f"a channel of {count} symbols", "LimitExceeded")
         token = reader.varint(2 * (MAX_COUNT + 8))
         if token >> 1 < 8:
             defined.append(read_prior(reader, token >> 1))
@@ -831,7 +871,6 @@ def read_class_count(reader):
 # stage takes the rest, to the section's end."
 def take_stages(reader, number):
     sizes = [reader.varint(reader.left) for _ in range(number - 1)]
-    need(sum(sizes) <= reader.left, f"stages of {sizes} bytes in the {reader.left} that are left")
     return [reader.take(size) for size in sizes] + [reader.take(reader.left)]
 
 
@@ -853,19 +892,150 @@ def classes_by_activity(activity, class_count):
     return [bisect_right(bounds, value) for value in activity]
 
 
-# 9.1 Symbols: "It MUST unpack to exactly the bytes that the widths and lengths call for, at most 2^31, and end with
-# its end marker at the section's last byte. Its dictionary is the smallest power of two that holds the unpacked
-# bytes, at least 2^12 and at most 2^26."
+# 9.3 LZMA2: "A stream is a list of chunks, each behind its control byte, and ends with the control byte 0."
 def unpack_lzma(data, size):
-    limited(size, 1 << 31, "bytes under LZMA")
-    dictionary = min(max(1 << 12, 1 << max(size - 1, 0).bit_length()), 1 << 26)
-    decoder = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=[{"id": lzma.FILTER_LZMA2, "dict_size": dictionary}])
-    try:
-        raw = decoder.decompress(data, max_length=size + 1)
-    except lzma.LZMAError as error:
-        raise Fault("Malformed", f"LZMA: {error}") from None
-    need(len(raw) == size and decoder.eof and not decoder.unused_data, "an LZMA stream of another length")
-    return raw
+    need(size <= 1 << 31, f"{size} bytes under LZMA", "LimitExceeded")
+    reader, out, start, lzma = Reader(data), bytearray(), None, None
+    while control := reader.byte():
+        need(control <= 2 or control >= 0x80, f"LZMA2 control byte {control:#x}")
+        if control == 1 or control >= 0xE0:
+            start, lzma = len(out), None
+        need(start is not None, "the first LZMA2 chunk does not reset the dictionary")
+        stored = control < 0x80
+        end = len(out) + 1 + (reader.number(">H") | (0 if stored else control & 31) << 16)
+        need(end <= size, f"an LZMA stream of more than {size} bytes")
+        if stored:
+            out += reader.take(end - len(out))
+            continue
+        length = 1 + reader.number(">H")
+        if control >= 0xC0:
+            lzma = Lzma(reader.byte())
+        need(lzma, "an LZMA2 chunk without properties")
+        if control >= 0xA0:
+            lzma.reset()
+        lzma.unpack(reader.take(length), out, start, end)
+    need(len(out) >= size, f"an LZMA stream of {len(out)} bytes, expected {size}")
+    need(not reader.left, "bytes behind the end of an LZMA stream")
+    return bytes(out)
+
+
+# 9.3 LZMA2: "Symbols, contexts and the range decoder are those of the LZMA specification"
+class Lzma:
+    def __init__(self, properties):
+        need(properties <= 224, f"LZMA properties {properties}")
+        self.lc, self.lp, self.pb = properties % 9, properties // 9 % 5, properties // 45
+        need(self.lc + self.lp <= 4, f"LZMA properties lc {self.lc}, lp {self.lp}")
+
+    def reset(self):
+        self.probabilities, self.state, self.distances = {}, 0, [1] * 4
+
+    # 9.3 LZMA2: "A match MUST NOT reach back over the dictionary's reset nor beyond its chunk." "Its first byte MUST be
+    # 0. After its last symbol and the normalisation that follows, the code MUST be 0 and no byte of the chunk left."
+    def unpack(self, data, out, start, end):
+        """Appends the bytes of a chunk to `out`, up to `end`; the dictionary begins at `start`."""
+        self.reader = Reader(data)
+        need(self.reader.byte() == 0, "an LZMA2 chunk does not begin with 0")
+        self.code, self.range = self.reader.number(">I"), 0xFFFFFFFF
+        while len(out) < end:
+            place = len(out) - start
+            length = self.take_symbol(out, place)
+            need(len(out) + length <= end, "a match beyond its chunk")
+            need(not length or self.distances[0] <= place, "a match before the dictionary")
+            for _ in range(length):
+                out.append(out[-self.distances[0]])
+        need(self.code == 0, "an LZMA2 chunk does not end in code 0")
+        need(not self.reader.left, "bytes left in an LZMA2 chunk")
+
+    def take_symbol(self, out, place):
+        """Length of the next match, whose distance is the first of `distances`, or 0 after a literal."""
+        state, low = self.state, place & (1 << self.pb) - 1
+        if not self.bit("match", state, low):
+            self.take_literal(out, place)
+            self.state = 0 if state < 4 else state - (3 if state < 10 else 6)
+            return 0
+        if not self.bit("repeated", state):
+            self.state = 7 if state < 7 else 10
+            length = self.take_length("new", low)
+            self.distances = [self.take_distance(min(length - 2, 3)), *self.distances[:3]]
+            return length
+        if not self.bit("other", state):
+            if not self.bit("long", state, low):
+                self.state = 9 if state < 7 else 11
+                return 1
+        else:
+            which = 1 if not self.bit("not 1", state) else 2 if not self.bit("not 2", state) else 3
+            self.distances.insert(0, self.distances.pop(which))
+        self.state = 8 if state < 7 else 11
+        return self.take_length("repeated", low)
+
+    def take_literal(self, out, place):
+        before = out[-1] if place else 0
+        context = (place & (1 << self.lp) - 1) << self.lc | before >> 8 - self.lc
+        expected = out[-self.distances[0]] if self.state >= 7 else None
+        symbol = 1
+        while symbol < 256:
+            if expected is None:
+                bit = self.bit("literal", context, symbol)
+            else:  # behind a match: given the byte that would have gone on with it, as long as it is that
+                guess = expected >> 8 - symbol.bit_length() & 1
+                bit = self.bit("literal", context, guess, symbol)
+                expected = expected if bit == guess else None
+            symbol = symbol << 1 | bit
+        out.append(symbol & 255)
+
+    def take_length(self, kind, low):
+        if not self.bit(kind, "choice", 0):
+            return 2 + self.take_tree(3, kind, 0, low)
+        if not self.bit(kind, "choice", 1):
+            return 10 + self.take_tree(3, kind, 1, low)
+        return 18 + self.take_tree(8, kind, 2)
+
+    def take_distance(self, length):
+        slot = self.take_tree(6, "slot", length)
+        if slot < 4:
+            return 1 + slot
+        bits, distance = (slot >> 1) - 1, 2 | slot & 1
+        if slot < 14:
+            return 1 + (distance << bits) + self.take_reverse(bits, "distance", slot)
+        for _ in range(bits - 4):
+            distance = distance << 1 | self.take_even_bit()
+        return 1 + (distance << 4) + self.take_reverse(4, "align")
+
+    def take_tree(self, bits, *context):
+        symbol = 1
+        for _ in range(bits):
+            symbol = symbol << 1 | self.bit(*context, symbol)
+        return symbol - (1 << bits)
+
+    def take_reverse(self, bits, *context):
+        symbol, value = 1, 0
+        for place in range(bits):
+            bit = self.bit(*context, symbol)
+            symbol, value = symbol << 1 | bit, value | bit << place
+        return value
+
+    def bit(self, *context):
+        p = self.probabilities.get(context, 1 << 10)
+        bound = (self.range >> 11) * p
+        if self.code < bound:
+            self.range, bit = bound, 0
+            self.probabilities[context] = p + ((1 << 11) - p >> 5)
+        else:
+            self.code, self.range, bit = self.code - bound, self.range - bound, 1
+            self.probabilities[context] = p - (p >> 5)
+        self.normalise()
+        return bit
+
+    def take_even_bit(self):
+        self.range >>= 1
+        bit = int(self.code >= self.range)
+        self.code -= bit * self.range
+        self.normalise()
+        return bit
+
+    def normalise(self):
+        if self.range < 1 << 24:
+            self.range, self.code = self.range << 8, self.code << 8 | self.reader.byte()
 
 
 # 9.1 Symbols: "With byte planes, each channel's data are all least significant bytes first, then the next, and so
@@ -890,7 +1060,7 @@ def decode_lzma_symbols(data, counts):
     _, planar = reader.byte(224), reader.bits(1)
     bases, forms = [], []
     for count in counts:
-        limited(count, MAX_COUNT, "the symbols of a channel")
+        need(count <= MAX_COUNT, f"a channel of {count} symbols", "LimitExceeded")
         code = reader.varint(8 * K + 3) if count else 0
         need(code & 3 < 3, "a channel of 8-byte symbols")
         bases.append(unzigzag(code >> 2))
@@ -902,11 +1072,11 @@ def decode_lzma_symbols(data, counts):
     return channels
 
 
-# 9.2 Floats: "Section 6 is the same two bytes, no varints, and one raw LZMA2 stream of binary32 values, one array per
+# 9.2 Floats: "Section 6 is the same two bytes, no varints, and one LZMA2 stream of binary32 values, one array per
 # plane, weight and bias. Byte planes apply per array. Values MUST be finite."
 def decode_lzma_floats(data, counts):
     for count in counts:
-        limited(count, MAX_COUNT, "values of an array")
+        need(count <= MAX_COUNT, f"an array of {count} values", "LimitExceeded")
     reader = Reader(data)
     _, planar = reader.byte(224), reader.bits(1)
     raw = unpack_lzma(reader.take(reader.left), 4 * sum(counts))
@@ -1049,13 +1219,13 @@ def decode_positions(data, count):
         return []
     reader = Reader(data)
     low, depths = [reader.number("<i") for _ in range(3)], [reader.byte(21) for _ in range(3)]
-    need(count <= 1 << sum(depths), f"{count} anchors in a box of 2^{sum(depths)}")
     stream = Ans(reader.take(reader.left))
     nodes = decode_tree(stream, depths, count)
     stream.finish()
     for axis in range(3):
         coordinates = [node[axis] for node in nodes]
-        need(min(coordinates) == 0 and max(coordinates).bit_length() == depths[axis], "minimum or depth does not fit")
+        need(min(coordinates) == 0, "no anchor at the minimum")
+        need(max(coordinates).bit_length() == depths[axis], "a depth does not fit")
     cells = [tuple(p + m for p, m in zip(node, low)) for node in nodes]
     need(all(abs(v) <= MAX_VOXEL for cell in cells for v in cell), "a voxel index over 2^20")
     return cells
@@ -1101,11 +1271,10 @@ def decode_split(stream, flags, sides, guesses, count):
 # 11.5 Dequantisation: "x̂ = binary32(binary64(k) · binary64(Q)): the product is exact, and the one rounding is to
 # nearest, ties to even, with subnormal results kept."
 def dequantise(symbols, step):
-    form = f"<{len(symbols)}f"
-    try:
-        return list(struct.unpack(form, struct.pack(form, *(k * step for k in symbols))))
-    except OverflowError:
-        raise Fault("Malformed", "a reconstructed value is not finite") from None
+    products, form = [k * step for k in symbols], f"<{len(symbols)}f"
+    # From half a unit in the last place above the largest finite binary32 on, the rounding gives infinity.
+    need(all(abs(v) < 2.0**128 - 2.0**103 for v in products), "a reconstructed value is not finite")
+    return list(struct.unpack(form, struct.pack(form, *products)))
 
 
 # 11.5 Dequantisation: "An anchor's position is dequantised from its voxel index with the voxel size as Q." "Values of
@@ -1123,6 +1292,7 @@ def dequantise_layer(layer):
 
 # 12.1 Order: "For each layer chunk, before the next chunk is looked at: parameters and their limits, sections, the
 # ranges of 11.1 and 11.2, sums of masks, each voxel at most once over the layers so far, and dequantisation."
+# 11.1 Masks: "No sum may exceed 255."
 def finish_last(layers):
     codes = []
     for layer in layers:

@@ -18,8 +18,10 @@ from pathlib import Path
 from vectors import faulty, uncommon, valid
 from vectors.blocks import Vector
 
+from pd4dgs_codec.bitstream.container import read_preamble
+from pd4dgs_codec.codec.header import unpack_header
 from pd4dgs_codec.codec.info import hashes
-from pd4dgs_codec.errors import DecodeError
+from pd4dgs_codec.errors import DecodeError, UnsupportedFeature
 
 VECTORS = Path(__file__).resolve().parents[1] / "spec" / "vectors"
 MANIFEST = "manifest.json"
@@ -46,11 +48,22 @@ def entry(vector: Vector) -> dict:
         "sha256": hashlib.sha256(vector.data).hexdigest(),
     }
     if vector.error is not None:
-        row["error"] = vector.error
+        row["error"], row["clause"] = vector.error, vector.clauses[0]
         row |= {key: value for key, value in (("chunk", vector.chunk), ("offset", vector.offset)) if value is not None}
         row["prefix"] = vector.layers[-1]["layer"] if vector.layers else None
+    row["ans_only"] = "same" if _for_all(vector.data) else UnsupportedFeature.__name__
     row["layers"] = vector.layers
     return row
+
+
+def _for_all(data: bytes) -> bool:
+    """Whether a decoder of mode ans only gives the answer of any other: mode and deformation are those that it knows,
+    or it gets no further than the header."""
+    try:
+        header = unpack_header(read_preamble(data).header)
+    except DecodeError:
+        return True
+    return header.mode == "ans" and not header.raw_deformation
 
 
 def files(found: list[Vector]) -> dict[str, bytes]:

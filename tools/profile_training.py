@@ -73,7 +73,7 @@ def watch(learner: Learner, stopwatch: Stopwatch) -> None:
 
     from pd4dgs_codec.model import hexplane, plane_regularisers, slots
     from pd4dgs_codec.model.model import Model
-    from pd4dgs_codec.render import cpu
+    from pd4dgs_codec.render.autograd import cpu
     from pd4dgs_codec.train import learner as steps
     from pd4dgs_codec.train import losses, ssim
 
@@ -88,8 +88,8 @@ def watch(learner: Learner, stopwatch: Stopwatch) -> None:
         (slots._Assemble, "backward", "kept Gaussians, backward"),
         (hexplane._Sample, "forward", "HexPlane kernels"),
         (hexplane._Sample, "backward", "HexPlane kernels, backward"),
-        (cpu._Rasterize, "forward", "rasteriser kernels"),
-        (cpu._Rasterize, "backward", "rasteriser kernels, backward"),
+        (cpu, "rasterize", "rasteriser kernels"),
+        (cpu._Composite, "backward", "rasteriser kernels, backward"),
         (ssim._ImageLoss, "forward", "image loss"),
         (ssim._ImageLoss, "backward", "image loss, backward"),
         (plane_regularisers._Regularisers, "forward", "plane regularisers"),

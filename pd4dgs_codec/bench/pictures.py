@@ -10,9 +10,9 @@ import torch
 from torch import Tensor
 
 from pd4dgs_codec.bench.timing import clock
+from pd4dgs_codec.render.autograd.rasterization import rasterization
+from pd4dgs_codec.render.autograd.reference import composite, project
 from pd4dgs_codec.render.projection import ALPHA_MIN
-from pd4dgs_codec.render.rasterization import rasterization
-from pd4dgs_codec.render.reference import composite, project
 from pd4dgs_codec.scene import SceneInfo
 from pd4dgs_codec.view.frames import Frame, dataset_frames, own_frames
 from pd4dgs_codec.view.levels import Level

@@ -26,8 +26,7 @@ def apply(constants: dict[str, float]) -> None:
     if "alpha_min" in constants:
         projection.ALPHA_MIN = constants["alpha_min"]
         projection.REACH_LOG2 = -math.log2(constants["alpha_min"])
-    from pd4dgs_codec import simd
-    from pd4dgs_codec.render import kernels
+    from pd4dgs_codec.render import kernels, simd
 
     kernels.T_MIN = constants.get("t_min", kernels.T_MIN)
     kernels.TILE_WIDTH = int(constants.get("tile_width", kernels.TILE_WIDTH))

@@ -21,8 +21,8 @@ from pd4dgs_codec.model import hexplane_kernels as kernels
 from pd4dgs_codec.model.layers import round_straight_through
 from pd4dgs_codec.model.plane_layout import TIME_AXIS, PlaneLayout
 from pd4dgs_codec.model.plane_regularisers import regularisers
+from pd4dgs_codec.render.simd import LANES
 from pd4dgs_codec.scene import PLANES
-from pd4dgs_codec.simd import LANES
 
 
 class _Sample(torch.autograd.Function):

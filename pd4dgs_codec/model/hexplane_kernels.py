@@ -15,7 +15,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from pd4dgs_codec.simd import LANES, kernel, load, splat, store, total
+from pd4dgs_codec.render.simd import LANES, kernel, load, splat, store, total
 
 XY, XZ, XT, YZ, YT, ZT = range(6)
 

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pd4dgs_codec.model.model import EXACT, Gaussians, Model, Rounding
-from pd4dgs_codec.render.rasterization import rasterization
+from pd4dgs_codec.render.autograd.rasterization import rasterization
 from pd4dgs_codec.scene import SceneInfo
 
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pd4dgs_codec.model.plane_layout import SPATIAL, TEMPORAL, PlaneLayout
-from pd4dgs_codec.simd import LANES, kernel, load, splat, store, total
+from pd4dgs_codec.render.simd import LANES, kernel, load, splat, store, total
 
 TERMS = ("plane_smooth", "time_smooth", "time_l1")
 

@@ -10,7 +10,7 @@ import math
 import numba as nb
 import numpy as np
 
-from pd4dgs_codec.simd import kernel
+from pd4dgs_codec.render.simd import kernel
 
 _SQRT_HALF = math.sqrt(0.5)
 _HALF_LN_2PI = 0.5 * math.log(2.0 * math.pi)

@@ -13,8 +13,8 @@ import math
 
 import numba as nb
 
+from pd4dgs_codec.render.simd import LANES, kernel, load, splat, store, total
 from pd4dgs_codec.scene import N_OFFSETS
-from pd4dgs_codec.simd import LANES, kernel, load, splat, store, total
 
 #: Below this a quaternion is divided by it instead of by its norm, as `torch.nn.functional.normalize` does.
 MIN_NORM = 1e-12

@@ -14,8 +14,8 @@ from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from pd4dgs_codec.model import slot_kernels as kernels
+from pd4dgs_codec.render.simd import LANES
 from pd4dgs_codec.scene import N_OFFSETS
-from pd4dgs_codec.simd import LANES
 
 #: means [K, 3], scales [K, 3], quats [K, 4] unit, opacities [K], gates [K].
 Parts = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]

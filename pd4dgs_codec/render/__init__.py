@@ -1,4 +1,5 @@
-"""Cameras to pictures: one `rasterization` signature, numba kernels on the CPU, gsplat on CUDA.
+"""Cameras to pictures, without torch: Gaussians as numpy arrays in, a picture out (`rasteriser.draw`).
 
-Import `pd4dgs_codec.render.threads` first where the number of threads matters; `rasterization` needs torch and numba.
+`autograd` is the same with gradients, for torch tensors, and alone imports torch. Import `threads` first where the
+number of threads matters.
 """

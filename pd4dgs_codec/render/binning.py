@@ -9,11 +9,11 @@ from __future__ import annotations
 import numpy as np
 from numba import prange
 
-from pd4dgs_codec.simd import kernel
+from pd4dgs_codec.render.simd import kernel
 
 
 @kernel()
-def sort(visible, depths):
+def sort(visible: np.ndarray, depths: np.ndarray) -> np.ndarray:
     """Indices int64 of the visible Gaussians, front to back; equal float32 depths in index order.
 
     A stable radix sort of the depths' bits above the smallest, 12 bits a pass: twice or thrice through the list.
@@ -44,7 +44,7 @@ def sort(visible, depths):
 
 
 @kernel(parallel=True)
-def count_tiles(order, rects, columns, counts):
+def count_tiles(order: np.ndarray, rects: np.ndarray, columns: int, counts: np.ndarray) -> None:
     """counts int64 [chunks, tiles]: how many Gaussians of each equal chunk of `order` touch each tile."""
     chunks = counts.shape[0]
     for chunk in prange(chunks):
@@ -57,7 +57,7 @@ def count_tiles(order, rects, columns, counts):
 
 
 @kernel()
-def offsets(rects, counts, starts, first):
+def offsets(rects: np.ndarray, counts: np.ndarray, starts: np.ndarray, first: np.ndarray) -> None:
     """Exclusive prefix sums, filled: starts [tiles + 1] into items, first [N + 1] into the slots.
 
     counts becomes the write positions of fill_tiles.
@@ -78,7 +78,15 @@ def offsets(rects, counts, starts, first):
 
 
 @kernel(parallel=True)
-def fill_tiles(order, rects, columns, positions, first, items, slot_of):
+def fill_tiles(
+    order: np.ndarray,
+    rects: np.ndarray,
+    columns: int,
+    positions: np.ndarray,
+    first: np.ndarray,
+    items: np.ndarray,
+    slot_of: np.ndarray,
+) -> None:
     """items int32 [pairs]: the Gaussians of each tile, front to back; slot_of int32 [pairs]: the pair's gradient slot.
 
     Gaussian i has the slots first[i] .. first[i + 1] - 1, so summing them later reads memory in order."""

@@ -8,6 +8,8 @@ small Gaussian costs few lanes.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numba import prange
 
@@ -25,7 +27,7 @@ from pd4dgs_codec.render.projection import (
     X,
     Y,
 )
-from pd4dgs_codec.simd import (
+from pd4dgs_codec.render.simd import (
     LANES,
     exp2,
     fma,
@@ -52,9 +54,11 @@ _STATE = 5  #: vectors of state per block
 _AHEAD = 4  #: Gaussians by which memory is fetched early
 _F = np.float32
 
+Bits = Any  #: a uint64 that has a bit for each block of a tile, column * TILE_HEIGHT + row
+
 
 @kernel()
-def _prefetch(items, n, end, geom, colors, stride):
+def _prefetch(items: np.ndarray, n: int, end: int, geom: np.ndarray, colors: np.ndarray, stride: int) -> None:
     if n + _AHEAD < end:
         ahead = np.int64(items[n + _AHEAD])
         prefetch(geom, ahead * GEOM_COLUMNS)
@@ -62,8 +66,8 @@ def _prefetch(items, n, end, geom, colors, stride):
 
 
 @kernel()
-def _coverage(geom, g, left, top):
-    """Which blocks of the tile Gaussian g (offset into flat geom) may touch: bit = column * 16 + row.
+def _coverage(geom: np.ndarray, g: int, left: int, top: int) -> Bits:
+    """Which blocks of the tile Gaussian g (offset into flat geom) may touch.
 
     The chord of each pixel row, eight rows at a time, a little too wide where float32 rounds.
     """
@@ -89,7 +93,7 @@ def _coverage(geom, g, left, top):
 
 
 @kernel()
-def _steps(geom, g, left, top):
+def _steps(geom: np.ndarray, g: int, left: int, top: int) -> tuple[float, float, float, float, float]:
     """Start and steps per row and per column of t at a block's first pixel, then start and step of r per row."""
     dy = top + 0.5 - geom[g + Y]
     sa = geom[g + SA]
@@ -100,7 +104,7 @@ def _steps(geom, g, left, top):
 
 
 @kernel()
-def _begin(state, channel, left, top, width, height):
+def _begin(state: np.ndarray, channel: int, left: int, top: int, width: int, height: int) -> Bits:
     """Transmittance 1 inside the image, 0 outside; returns the blocks with a pixel inside, as bits."""
     alive = np.uint64(0)
     for block in range(_BLOCKS):
@@ -113,13 +117,26 @@ def _begin(state, channel, left, top, width, height):
 
 
 @kernel()
-def _place(x, y):
+def _place(x: int, y: int) -> int:
     """Offset in `state` of pixel (x, y) of the tile, in its block's first vector."""
     return (x // LANES * TILE_HEIGHT + y) * _STATE * LANES + x % LANES
 
 
 @kernel()
-def _composite_tile(items, start, end, geom, colors, stride, channel, left, top, width, height, state):
+def _composite_tile(
+    items: np.ndarray,
+    start: int,
+    end: int,
+    geom: np.ndarray,
+    colors: np.ndarray,
+    stride: int,
+    channel: int,
+    left: int,
+    top: int,
+    width: int,
+    height: int,
+    state: np.ndarray,
+) -> None:
     """Blend the tile's Gaussians into `state`: per block transmittance (0 once finished), 3 colours, its last value."""
     alive = _begin(state, 4, left, top, width, height)
     alive = _begin(state, 0, left, top, width, height)
@@ -162,7 +179,16 @@ def _composite_tile(items, start, end, geom, colors, stride, channel, left, top,
 
 
 @kernel(parallel=True)
-def composite(items, starts, geom, colors, channel, background, out_colors, transmittance):
+def composite(
+    items: np.ndarray,
+    starts: np.ndarray,
+    geom: np.ndarray,
+    colors: np.ndarray,
+    channel: int,
+    background: np.ndarray,
+    out_colors: np.ndarray,
+    transmittance: np.ndarray,
+) -> None:
     """Draw 3 channels from `channel` on. colors float32 [N, D], D a multiple of 3; background float32 [D].
 
     out_colors [H, W, D'], D' <= D, and transmittance = 1 - alpha [H, W], float32, are filled. (1 - alpha computed from
@@ -191,8 +217,22 @@ def composite(items, starts, geom, colors, channel, background, out_colors, tran
 
 @kernel()
 def _composite_tile_backward(
-    items, slot_of, start, end, geom, colors, stride, channel, left, top, width, height, state, slots, slot_stride
-):  # fmt: skip
+    items: np.ndarray,
+    slot_of: np.ndarray,
+    start: int,
+    end: int,
+    geom: np.ndarray,
+    colors: np.ndarray,
+    stride: int,
+    channel: int,
+    left: int,
+    top: int,
+    width: int,
+    height: int,
+    state: np.ndarray,
+    slots: np.ndarray,
+    slot_stride: int,
+) -> None:
     """Front to back again. Per block: transmittance, R (the gradient's share of what lies behind), dL/d(3 colours)."""
     alive = _begin(state, 0, left, top, width, height)
     one_bit = np.uint64(1)
@@ -255,8 +295,18 @@ def _composite_tile_backward(
 
 @kernel(parallel=True)
 def composite_backward(
-    items, slot_of, starts, geom, colors, channel, out_colors, transmittance, g_colors, g_alphas, slots
-):  # fmt: skip
+    items: np.ndarray,
+    slot_of: np.ndarray,
+    starts: np.ndarray,
+    geom: np.ndarray,
+    colors: np.ndarray,
+    channel: int,
+    out_colors: np.ndarray,
+    transmittance: np.ndarray,
+    g_colors: np.ndarray,
+    g_alphas: np.ndarray,
+    slots: np.ndarray,
+) -> None:
     """slots float32 [pairs, 6 + D]: gradient sums of each pair; geometry columns are added to when channel > 0.
 
     g_colors [H, W, D'], g_alphas [H, W]: dL/d(out_colors), dL/d(1 - transmittance), which counts in the first pass.

@@ -10,17 +10,22 @@ completed square, so that a long thin Gaussian loses no digits in float32 and |t
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numpy as np
 from numba import prange
 
-from pd4dgs_codec.simd import kernel
+from pd4dgs_codec.render.simd import kernel
 
 ALPHA_MAX = 0.999  #: alpha is clamped to this (gsplat 1.5.3)
 ALPHA_MIN = 1.0 / 255.0  #: fainter contributions are skipped
 REACH_LOG2 = math.log2(255.0)  #: a Gaussian is drawn where log2(opacity) - t^2 - r^2 >= -REACH_LOG2
 _F32_MAX = float(np.finfo(np.float32).max)
 _LN2 = math.log(2.0)
+
+Quaternion = tuple[float, float, float, float]  #: w, x, y, z
+Matrix3 = tuple[float, float, float, float, float, float, float, float, float]  #: 3x3, row-major
+Matrix23 = tuple[float, float, float, float, float, float]  #: 2x3, row-major
 
 #: Columns of `geom`, float64 [N, 8]: centre (pixels), shear k, scales of t and r, log2 opacity, 1/sa; one is unused, so
 #: that a row is a cache line.
@@ -33,13 +38,13 @@ SLOT_GEOMETRY = 6
 
 
 @kernel()
-def _saturate(value):
+def _saturate(value: float) -> Any:
     """float32 of `value`, at most float32's largest magnitude; NaN passes."""
     return np.float32(min(max(value, -_F32_MAX), _F32_MAX)) if value == value else np.float32(value)
 
 
 @kernel()
-def _rotation(w, x, y, z):
+def _rotation(w: float, x: float, y: float, z: float) -> tuple[Quaternion, float, Matrix3]:
     """Unit quaternion (w, x, y, z), 1/norm and the 9 entries of R; a zero quaternion is the identity with 1/norm 0."""
     w, x, y, z = np.float64(w), np.float64(x), np.float64(y), np.float64(z)  # float() of a float32 stays one in numba
     norm = math.sqrt(w * w + x * x + y * y + z * z)
@@ -57,7 +62,7 @@ def _rotation(w, x, y, z):
 
 
 @kernel()
-def _to_camera(means, i, camera):
+def _to_camera(means: np.ndarray, i: int, camera: np.ndarray) -> tuple[float, float, float]:
     """Point i in camera axes. camera: float64 [20] = R (9, row-major), t (3), fx, fy, cx, cy, then the limits of J."""
     a, b, c = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
     return (
@@ -68,7 +73,7 @@ def _to_camera(means, i, camera):
 
 
 @kernel()
-def _jacobian(x, y, z, camera):
+def _jacobian(x: float, y: float, z: float, camera: np.ndarray) -> tuple[float, float, float, Matrix23]:
     """1/z, the ratios x/z and y/z clamped to 1.3 x the field of view (as gsplat), and M = J W, 2x3 row-major."""
     iz = 1.0 / z
     a = min(max(x * iz, camera[16]), camera[17])
@@ -82,7 +87,7 @@ def _jacobian(x, y, z, camera):
 
 
 @kernel()
-def _matmul23(m, r):
+def _matmul23(m: Matrix23, r: Matrix3) -> Matrix23:
     """(2x3) (3x3), both row-major tuples."""
     return (
         m[0] * r[0] + m[1] * r[3] + m[2] * r[6],
@@ -95,20 +100,34 @@ def _matmul23(m, r):
 
 
 @kernel()
-def _clip_index(value, limit):
+def _clip_index(value: float, limit: int) -> int:
     """int of `value` clamped to 0 .. limit in floating point first, so that huge values convert safely."""
     return int(min(max(value, 0.0), float(limit)))
 
 
 @kernel(parallel=True)
 def project(
-    means, quats, scales, opacities, camera, size, limits, tile, visible, geom, rects, radii, means2d, depths, conics
-):  # fmt: skip
+    means: np.ndarray,
+    quats: np.ndarray,
+    scales: np.ndarray,
+    opacities: np.ndarray,
+    camera: np.ndarray,
+    size: tuple[int, int],
+    limits: tuple[float, float, float, float],
+    tile: tuple[int, int],
+    visible: np.ndarray,
+    geom: np.ndarray,
+    rects: np.ndarray,
+    radii: np.ndarray,
+    means2d: np.ndarray,
+    depths: np.ndarray,
+    conics: np.ndarray,
+) -> None:
     """Fill the per-Gaussian outputs; a culled Gaussian has visible = False and zeros elsewhere, but in geom.
 
-    size: (width, height); limits: (near, far, eps2d, radius_clip); tile: (width, height) of a tile, pixels.
-    rects int32 [N, 4] = tile columns x0, x1 and rows y0, y1, half
-    open. Comparisons are written so that NaN culls.
+    size: (width, height); limits: (near, far, eps2d, radius_clip); tile: (width, height) of a tile, pixels. visible
+    bool [N]; geom [N, GEOM_COLUMNS]; rects int32 [N, 4] = tile columns x0, x1 and rows y0, y1, half open; the rest as
+    `rasteriser.Projected` has it for one camera. Comparisons are written so that NaN culls.
     """
     width, height = size
     near, far, eps, clip = limits
@@ -167,7 +186,7 @@ def project(
 
 
 @kernel()
-def _rotation_gradient(unit, inverse_norm, g):
+def _rotation_gradient(unit: Quaternion, inverse_norm: float, g: Matrix3) -> Quaternion:
     """d/d(unnormalised quaternion) from g = d/dR (9, row-major)."""
     w, x, y, z = unit
     gw = 2.0 * (x * (g[7] - g[5]) + y * (g[2] - g[6]) + z * (g[3] - g[1]))
@@ -184,7 +203,7 @@ def _rotation_gradient(unit, inverse_norm, g):
 
 
 @kernel()
-def _sum_slots(slots, begin, end, column):
+def _sum_slots(slots: np.ndarray, begin: int, end: int, column: int) -> float:
     """Sum of one slot column over a Gaussian's tiles, float64."""
     result = 0.0
     for n in range(begin, end):
@@ -193,7 +212,9 @@ def _sum_slots(slots, begin, end, column):
 
 
 @kernel()
-def _image_gradient(sum_t, sum_tt, sum_r, sum_rr, sum_tr, k, sa, sb):
+def _image_gradient(
+    sum_t: float, sum_tt: float, sum_r: float, sum_rr: float, sum_tr: float, k: float, sa: float, sb: float
+) -> tuple[float, float, float, float, float]:
     """d/d(mean2d) and the symmetric M = d/d(Sigma2) = 1/2 sum g n n^T, from the slot sums.
 
     n = Sigma2^-1 delta = 2 ln2 (sa t, sb r - k sa t).
@@ -210,9 +231,22 @@ def _image_gradient(sum_t, sum_tt, sum_r, sum_rr, sum_tr, k, sa, sb):
 
 @kernel(parallel=True)
 def project_backward(
-    means, quats, scales, opacities, camera, geom, first, slots, depth_channel,
-    g_means, g_quats, g_scales, g_opacities, g_colors, g_means2d,
-):  # fmt: skip
+    means: np.ndarray,
+    quats: np.ndarray,
+    scales: np.ndarray,
+    opacities: np.ndarray,
+    camera: np.ndarray,
+    geom: np.ndarray,
+    first: np.ndarray,
+    slots: np.ndarray,
+    depth_channel: int,
+    g_means: np.ndarray,
+    g_quats: np.ndarray,
+    g_scales: np.ndarray,
+    g_opacities: np.ndarray,
+    g_colors: np.ndarray,
+    g_means2d: np.ndarray,
+) -> None:
     """Sum each Gaussian's slots in float64, in a fixed order, and carry the gradient to the inputs (added to g_*).
 
     slots[first[i] : first[i + 1]] belong to Gaussian i. g_colors [N, D]: slot columns 6 .. 6 + D - 1.

@@ -1,4 +1,8 @@
-"""How many threads, and which threading layer. Import this before torch and numba: it imports neither.
+"""The one policy of threads: how many, and how they wait. Import this before numpy, torch and numba; it imports none.
+
+`configure` governs torch's operations and numba's kernels at any time, and what reads the environment when it loads:
+OpenMP's wait policy, numba's threading layer, and numpy's OpenBLAS, which takes OMP_NUM_THREADS if it loads afterwards.
+A BLAS that is loaded already keeps its threads.
 
 OpenMP threads that spin while they wait make a training step 5-20 times slower as soon as another process takes a
 core; `OMP_WAIT_POLICY=passive` (read when torch loads) and numba's `tbb` layer avoid that. The `tbb` package puts its
@@ -67,10 +71,11 @@ def keep_freed_memory() -> None:
 
 
 def configure(threads: int | None = None) -> int:
-    """Set the wait policy, the threading layer and the number of threads of torch and numba; returns that number.
+    """Set the wait policy, the threading layer and the number of threads; returns that number.
 
-    threads: 1 .. available CPUs, or None for OMP_NUM_THREADS if set, else all. Best called before torch and numba are
-    imported; afterwards it still sets their thread counts, but the wait policy of an OpenMP already loaded stays.
+    threads: 1 .. available CPUs, or None for OMP_NUM_THREADS if set, else all. Best called before numpy, torch and
+    numba are imported; afterwards it still sets the threads of torch and numba, but an OpenMP or a BLAS that is loaded
+    already stays as it is.
     Starting processes: spawn, never fork (OpenMP kills forked children).
     """
     if threads is None:
@@ -84,8 +89,8 @@ def configure(threads: int | None = None) -> int:
     keep_freed_memory()
     if "numba" not in sys.modules:
         os.environ.setdefault("NUMBA_NUM_THREADS", str(available()))
-    if "torch" in sys.modules:
-        sys.modules["torch"].set_num_threads(threads)
+    if torch := sys.modules.get("torch"):
+        torch.set_num_threads(threads)
     set_kernel_threads(threads)
     return threads
 
@@ -97,6 +102,13 @@ def set_kernel_threads(threads: int) -> None:
     """Threads of the CPU kernels from the next call on."""
     global _kernel_threads
     _kernel_threads = threads
+
+
+def limit_numba() -> None:
+    """Gives numba's parallel kernels, in the calling thread, the number of threads that this module settled."""
+    import numba
+
+    numba.set_num_threads(min(kernel_threads(), numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
 
 
 def kernel_threads() -> int:

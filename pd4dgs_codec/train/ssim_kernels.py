@@ -14,7 +14,7 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from pd4dgs_codec.simd import LANES, kernel, load, splat, store
+from pd4dgs_codec.render.simd import LANES, kernel, load, splat, store
 
 C1, C2 = 0.01**2, 0.03**2
 TAPS = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)

@@ -24,7 +24,7 @@ from pd4dgs_codec.codec.encoder import encode  # noqa: E402
 from pd4dgs_codec.codec.options import EncodeOptions  # noqa: E402
 from pd4dgs_codec.codec.plan import plan  # noqa: E402
 from pd4dgs_codec.errors import DataError, Pd4Error  # noqa: E402
-from pd4dgs_codec.render.rasterization import rasterization  # noqa: E402
+from pd4dgs_codec.render.autograd.rasterization import rasterization  # noqa: E402
 from pd4dgs_codec.view.frames import Frame  # noqa: E402
 
 RNG = np.random.default_rng(4)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from pd4dgs_codec.render.rasterization import rasterization
+from pd4dgs_codec.render.autograd.rasterization import rasterization
 
 NAMES = ("means", "quats", "scales", "opacities", "colors")
 

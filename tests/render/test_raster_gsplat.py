@@ -11,10 +11,13 @@ torch = pytest.importorskip("torch")
 from raster_scenes import camera, draw_with_gradients, relative_errors, scene  # noqa: E402
 
 from pd4dgs_codec.errors import RenderError  # noqa: E402
-from pd4dgs_codec.render import gsplat_backend  # noqa: E402
-from pd4dgs_codec.render.rasterization import rasterization  # noqa: E402
+from pd4dgs_codec.render.autograd import gsplat_backend  # noqa: E402
+from pd4dgs_codec.render.autograd.rasterization import rasterization  # noqa: E402
+from pd4dgs_codec.render.rasteriser import Settings  # noqa: E402
 
-SIZES = dict(width=8, height=8, near=0.01, far=1e10, eps2d=0.3, radius_clip=0.0)
+
+def _rasterize(tensors, depth=False):
+    return gsplat_backend.rasterize(*tensors, *camera(8, 8), None, 8, 8, Settings(depth=depth))
 
 
 def _install(monkeypatch, version):
@@ -34,14 +37,14 @@ def _install(monkeypatch, version):
 def test_other_versions_are_refused(monkeypatch, version):
     _install(monkeypatch, version)
     with pytest.raises(RenderError, match=version):
-        gsplat_backend.rasterize(*scene(4), *camera(8, 8), None, depth=False, **SIZES)
+        _rasterize(scene(4))
 
 
 def test_missing_gsplat_is_one_clear_line(monkeypatch):
     monkeypatch.setitem(sys.modules, "gsplat", None)
     monkeypatch.setattr(importlib.metadata, "version", lambda name: "1.5.3")
     with pytest.raises(RenderError, match="install"):
-        gsplat_backend.rasterize(*scene(4), *camera(8, 8), None, depth=False, **SIZES)
+        _rasterize(scene(4))
 
 
 @pytest.mark.parametrize("kernels, says", [(object(), None), (None, "no CUDA kernels"), ("absent", "do not load")])
@@ -65,7 +68,7 @@ def test_what_gsplat_is_asked(monkeypatch, channels, depth, mode):
     with torch.no_grad():
         tensors[0][0, 0], tensors[3][1] = float("nan"), float("inf")
         tensors[1][2] = 0.0
-    _, _, meta = gsplat_backend.rasterize(*tensors, *camera(8, 8), None, depth=depth, **SIZES)
+    _, _, meta = _rasterize(tensors, depth)
     means, quats, scales, opacities, colors, options = calls[0]
     assert options["packed"] is False and options["render_mode"] == mode and options["rasterize_mode"] == "classic"
     assert options["eps2d"] == 0.3 and options["near_plane"] == 0.01 and options["far_plane"] == 1e10

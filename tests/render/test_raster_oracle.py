@@ -8,8 +8,8 @@ torch = pytest.importorskip("torch")
 
 from raster_scenes import camera, draw_with_gradients, relative_errors, scene, turned_camera  # noqa: E402
 
-from pd4dgs_codec.render import reference  # noqa: E402
-from pd4dgs_codec.render.rasterization import rasterization  # noqa: E402
+from pd4dgs_codec.render.autograd import reference  # noqa: E402
+from pd4dgs_codec.render.autograd.rasterization import rasterization  # noqa: E402
 
 LIMIT = 1e-5
 

@@ -7,7 +7,7 @@ torch = pytest.importorskip("torch")
 from raster_scenes import NAMES, camera, scene  # noqa: E402
 
 from pd4dgs_codec.errors import NotFinite, RenderError  # noqa: E402
-from pd4dgs_codec.render.rasterization import rasterization  # noqa: E402
+from pd4dgs_codec.render.autograd.rasterization import rasterization  # noqa: E402
 
 OPTIONS = [
     ({"rasterize_mode": "antialiased"}, "rasterize_mode"),

@@ -9,8 +9,9 @@ pytest.importorskip("numba")
 
 from raster_scenes import camera, scene  # noqa: E402
 
-from pd4dgs_codec.render import reference, threads  # noqa: E402
-from pd4dgs_codec.render.rasterization import rasterization  # noqa: E402
+from pd4dgs_codec.render import threads  # noqa: E402
+from pd4dgs_codec.render.autograd import reference  # noqa: E402
+from pd4dgs_codec.render.autograd.rasterization import rasterization  # noqa: E402
 
 pytestmark = pytest.mark.slow
 TILE = 16

@@ -3,15 +3,19 @@
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
 pytest.importorskip("numba")
 
 import numba  # noqa: E402
 from hypothesis import given, settings  # noqa: E402
 from hypothesis import strategies as st  # noqa: E402
 
-from pd4dgs_codec import simd  # noqa: E402
-from pd4dgs_codec.render import binning, cpu, kernels  # noqa: E402
+from pd4dgs_codec.render import (  # noqa: E402
+    binning,
+    kernels,
+    rasteriser,
+    simd,  # noqa: E402
+)
+from pd4dgs_codec.scene import Camera  # noqa: E402
 
 
 @numba.njit
@@ -108,23 +112,22 @@ def test_bins_list_each_tile_front_to_back(chunks):
     assert (owner == items).all() and first[-1] == starts[-1]
 
 
-def _view(width, height, n=300):
-    """A prepared view with its Gaussians' reach in pixels, by brute force from the geom records."""
-    import torch
-    from raster_scenes import camera, scene
-
-    arrays = [t.detach().numpy() for t in scene(n, 21, scale=0.05)[:4]]
-    viewmats, Ks = (t[0].double().numpy() for t in camera(width, height))
-    s = cpu.Settings(width, height, 0.01, 1e10, 0.3, 0.0, False)
-    meta = [np.empty((n, 2), np.int32), *(np.empty((n, *d), np.float32) for d in ((2,), (), (3,)))]
-    torch.manual_seed(0)
-    return cpu._prepare(arrays, cpu._pack_camera(viewmats, Ks, s), meta, s), arrays
+def _random_view(width, height, n=300):
+    """A view, prepared for compositing, of n Gaussians drawn at random."""
+    rng = np.random.default_rng(21)
+    z = rng.uniform(2, 6, n)
+    means = np.stack([*(rng.uniform(-0.5, 0.5, (2, n)) / 1.2 * z), z], 1)
+    scales, opacities = 0.05 * np.exp(0.6 * rng.normal(size=(n, 3))), rng.uniform(0.05, 0.95, n)
+    arrays = (a.astype(np.float32) for a in (means, rng.normal(size=(n, 4)), scales, opacities))
+    K = np.array([[1.2 * width, 0, width / 2], [0, 1.32 * width, height / 2], [0, 0, 1]])
+    camera = Camera(np.eye(4), K, width, height)
+    return rasteriser.project(rasteriser.Geometry(*arrays), [camera], rasteriser.Settings()).views[0]
 
 
 @pytest.mark.parametrize("size", [(100, 70), (32, 16), (31, 17)])
 def test_every_pixel_above_the_alpha_limit_is_in_a_tile_and_block(size):
     width, height = size
-    view, arrays = _view(width, height)
+    view = _random_view(width, height)
     ys, xs = np.mgrid[:height, :width] + 0.5
     columns = -(-width // kernels.TILE_WIDTH)
     covered = np.zeros((300, height, width), bool)

@@ -7,7 +7,7 @@ torch = pytest.importorskip("torch")
 from raster_scenes import NAMES, camera, draw_with_gradients, relative_errors, scene  # noqa: E402
 
 from pd4dgs_codec.errors import RenderError  # noqa: E402
-from pd4dgs_codec.render.rasterization import rasterization  # noqa: E402
+from pd4dgs_codec.render.autograd.rasterization import rasterization  # noqa: E402
 
 NAN, INF = float("nan"), float("inf")
 NEAR = 0.01

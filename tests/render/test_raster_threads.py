@@ -84,7 +84,7 @@ from pd4dgs_codec.render import threads
 assert not {"torch", "numba"} & set(sys.modules)
 threads.configure(1)
 import os, torch
-from pd4dgs_codec.render.rasterization import rasterization
+from pd4dgs_codec.render.autograd.rasterization import rasterization
 g = [torch.rand(50, n) if n else torch.rand(50) for n in (3, 4, 3, 0, 3)]
 g[0][:, 2] += 2
 rasterization(*g, torch.eye(4)[None], torch.tensor([[[30.0, 0, 15], [0, 30, 15], [0, 0, 1]]]), 30, 30)
@@ -97,6 +97,13 @@ def test_before_torch_in_a_new_process():
     layer, numba_threads, torch_threads, policy = _run(_CHILD)
     assert layer == ("tbb" if threads.load_tbb() else layer)
     assert (numba_threads, torch_threads, policy) == ("1", "1", "passive")
+
+
+@pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="needs Linux to count threads")
+def test_numpy_imported_afterwards_starts_no_threads_of_its_own():
+    code = "from pd4dgs_codec.render import threads; threads.configure(1); import numpy, os; "
+    code += "a = numpy.ones((900, 900)); a @ a; print(len(os.listdir('/proc/self/task')))"
+    assert _run(code) == ["1"]
 
 
 def test_without_tbb_another_layer_is_used():

@@ -29,6 +29,7 @@ from pd4dgs_codec.model import checkpoint  # noqa: E402
 from pd4dgs_codec.model.config import PRESETS  # noqa: E402
 from pd4dgs_codec.model.convert import to_scene  # noqa: E402
 from pd4dgs_codec.train.config import TrainConfig  # noqa: E402
+from pd4dgs_codec.train.learner import Learner  # noqa: E402
 
 WIDTH, HEIGHT, FRAMES = 48, 36, 6
 CONFIG = TrainConfig(preset="tiny", source="two-discs", iterations=40)
@@ -164,18 +165,18 @@ def test_a_run_ends_with_its_steps_or_its_time(seconds, total, ended):
 
 
 def test_an_interrupted_training_is_not_published_and_goes_on(job, finished, tmp_path, monkeypatch):
-    step = trainings.Trainer.step
+    step = Learner.step
 
     def interrupted(self):
         if self.iteration == 10:
             signal.raise_signal(signal.SIGINT)
         return step(self)
 
-    monkeypatch.setattr(trainings.Trainer, "step", interrupted)
+    monkeypatch.setattr(Learner, "step", interrupted)
     with pytest.raises(TrainError, match="interrupted at step 11"):
         _run(job, tmp_path)
     assert sorted(p.name for p in (tmp_path / "discs").iterdir()) == ["model.pt", "train.jsonl"]
-    monkeypatch.setattr(trainings.Trainer, "step", step)
+    monkeypatch.setattr(Learner, "step", step)
     result, said = _run(job, tmp_path)
     assert any("from step 11" in line for line in said) and result["phases_not_reached"] == []
     assert (tmp_path / "discs" / "scene.pd4").read_bytes() == (finished[0] / "discs" / "scene.pd4").read_bytes()

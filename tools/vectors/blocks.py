@@ -19,8 +19,7 @@ from pd4dgs_codec.attributes.planes import residual
 from pd4dgs_codec.attributes.quantise import dequantise
 from pd4dgs_codec.attributes.table import ATTRIBUTES, N_CHANNELS, dequantise_attributes
 from pd4dgs_codec.bitstream import canonical
-from pd4dgs_codec.bitstream.container import MAJOR, SIGNATURE
-from pd4dgs_codec.codec.header import scene_id_of
+from pd4dgs_codec.bitstream.container import MAJOR, SCENE_ID_SIZE, SIGNATURE
 from pd4dgs_codec.codec.kinds import LAYER_KINDS, SCAFFOLD_INPUT
 from pd4dgs_codec.codec.layer_meta import Section, step_names
 from pd4dgs_codec.codec.symbols import LayerSymbols
@@ -345,15 +344,17 @@ def lzma_layout(numbers: Sequence[np.ndarray], planar: bool) -> bytes:
 def lzma_symbols(
     channels: Sequence[np.ndarray],
     *,
-    base: int = 0,
+    base: int | None = 0,
     width: int | None = None,
     planar: bool = False,
     stream: Stream = lzma2.stored,
 ) -> bytes:
-    """Section SYMBOLS. base: of all channels. width: log2 of the bytes of every number; None takes the narrowest."""
-    out, numbers = bytes([lzma2.PROPERTIES, planar]), []
+    """Section SYMBOLS. base: of all channels; None takes each channel's first symbol. width: log2 of the bytes of every
+    number; None takes the narrowest."""
+    out, numbers, common = bytes([lzma2.PROPERTIES, planar]), [], base
     for channel in channels:
         if channel.size:
+            base = int(channel[0]) if common is None else common
             v = channel.astype(np.int64) - base
             reach = max(int(v.max()) + 1, -int(v.min()))
             w = (
@@ -415,7 +416,7 @@ class Layer:
 
 def plane_channels(tensor: np.ndarray) -> list[np.ndarray]:
     """Channels of a plane [C, H, W]; a weight or bias is one."""
-    return list(tensor.reshape(tensor.shape[0], -1)) if tensor.ndim == 3 else [tensor.ravel()]
+    return [channel.ravel() for channel in tensor] if tensor.ndim == 3 else [tensor.ravel()]
 
 
 def constant_networks(number: int, widths: Mapping[int, Sequence[int]], inputs: int) -> dict:
@@ -508,7 +509,7 @@ def _sections(meant: LayerSymbols, predictors: Sequence[int], mode: int) -> dict
     n = len(meant.anchor_q)
     sections = {POSITIONS: encode_positions(meant.anchor_q)} if n else {}
     tensors = [] if meant.raw else list(meant.tensors())
-    planes = [residual(p, k) for p, k in zip(predictors, tensors, strict=False)]
+    planes = [residual(p, k) if k.size else k for p, k in zip(predictors, tensors, strict=False)]
     weights = [k.ravel() for k in tensors[len(planes) :]]
     flat = [row for r in planes for row in plane_channels(r)]
     masks = [meant.mask_increase, meant.mask_own]
@@ -590,8 +591,10 @@ class File:
 
     @property
     def scene_id(self) -> bytes:
-        """Clause 3.3, of the canonical header."""
-        return scene_id_of(canonical.pack(self.fields()), self.chunks[0].payload)
+        """Clause 3.3, of the header as it is written; a header without its chunk list counts as a whole."""
+        header, chunk_list = self.header_bytes(), canonical.pack(1) + canonical.pack(self.fields()[1])
+        described = header[header.find(chunk_list) + len(chunk_list) :] if chunk_list in header else header
+        return hashlib.sha256(described + self.chunks[0].payload).digest()[:SCENE_ID_SIZE]
 
     def data(self) -> bytes:
         """Its bytes."""
@@ -698,3 +701,11 @@ def bad(
     offset = size if at is None else at + (0 if chunk is None else file.start(chunk))
     layers = file.hashes(None if whole else chunk or 0)
     return Vector("faulty/" + name, sentence, tuple(clauses.split()), data, layers, error, chunk, offset)
+
+
+MALFORMED, LIMIT, FEATURE = "Malformed", "LimitExceeded", "UnsupportedFeature"
+
+
+def in_layer(layer: int, name: str, what: str, clauses: str, error: str, payload: bytes, file: File) -> Vector:
+    """A vector whose fault lies in the payload of one layer of `file`."""
+    return bad(name, what, clauses, error, file.with_payload(layer, payload), chunk=layer)

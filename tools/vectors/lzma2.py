@@ -2,102 +2,189 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
 STORED_MAX = 1 << 16  #: bytes in one stored chunk
 PACKED_MAX = 1 << 21  #: bytes that one compressed chunk may unpack to
 MATCH_MAX = 273
-_LC = 3  # bits of the byte before that choose a literal's probabilities; lp = pb = 0
-PROPERTIES = _LC
 _KEY = 4  # bytes of the shortest match with a distance of its own
+#: Control bytes (clause 9.3); a compressed chunk's has the upper bits of its size added.
+STORED_RESET, STORED, KEPT, STATE, PROPERTIES_READ, ALL_RESET = 1, 2, 0x80, 0xA0, 0xC0, 0xE0
+
+
+@dataclass(frozen=True)
+class Properties:
+    """lc: bits of the byte before that choose a literal's probabilities. lp, pb: bits of the position that choose those
+    of literals and of matches."""
+
+    lc: int = 3
+    lp: int = 0
+    pb: int = 0
+
+    @property
+    def code(self) -> int:
+        """As they stand in one byte."""
+        return self.lc + 9 * (self.lp + 5 * self.pb)
+
+
+PROPERTIES = Properties().code
 
 
 def stored(data: bytes) -> bytes:
     """A stream of stored chunks, the first of which resets the dictionary."""
-    out = bytearray()
-    for start in range(0, len(data), STORED_MAX):
-        part = data[start : start + STORED_MAX]
-        out += bytes([2 if start else 1]) + (len(part) - 1).to_bytes(2, "big") + part
+    sizes = [min(STORED_MAX, len(data) - start) for start in range(0, len(data), STORED_MAX)]
+    return chunks(data, [(STORED if i else STORED_RESET, size) for i, size in enumerate(sizes)])
+
+
+def packed(data: bytes, lc: int = 3, lp: int = 0, pb: int = 0, **how: Any) -> bytes:
+    """A stream of one compressed chunk: literals and matches. how: see chunks."""
+    return chunks(data, [(ALL_RESET, len(data))], [Properties(lc, lp, pb)], **how)
+
+
+def chunks(
+    data: bytes,
+    plan: Sequence[tuple[int, int]],
+    properties: Sequence[Properties] = (),
+    *,
+    every_repeat: bool = False,
+    remember: bool = False,
+    body: Callable[[bytes], bytes] = lambda packed: packed,
+) -> bytes:
+    """A stream of `data` in chunks. plan: control byte and unpacked size of each. properties: of those chunks that hold
+    them, in order. every_repeat: use all four last distances, and matches of one byte. remember: match what lies before
+    a reset of the dictionary, which is wrong. body: changes the packed bytes of each compressed chunk."""
+    out, encoder, start, given = bytearray(), _Encoder(data, every_repeat), 0, iter(properties)
+    for control, size in plan:
+        head = (size - 1 & 0xFFFF).to_bytes(2, "big")
+        if control in (STORED_RESET, ALL_RESET):
+            encoder.origin = start
+            encoder.reach = 0 if remember else start
+        if control < KEPT:
+            assert 0 < size <= STORED_MAX
+            out += bytes([control]) + head + data[start : start + size]
+        else:
+            assert 0 < size <= PACKED_MAX
+            if control >= PROPERTIES_READ:
+                encoder.properties = next(given)
+            if control >= STATE:
+                encoder.reset()
+            written = body(encoder.encode(start, start + size))
+            out += bytes([control | size - 1 >> 16]) + head + (len(written) - 1).to_bytes(2, "big")
+            out += (bytes([encoder.properties.code]) if control >= PROPERTIES_READ else b"") + written
+        start += size
     return bytes(out) + b"\0"
-
-
-def packed(data: bytes) -> bytes:
-    """A stream of one compressed chunk: literals and matches."""
-    assert 0 < len(data) <= PACKED_MAX
-    body = _Encoder(data).encode()
-    size = len(data) - 1
-    head = bytes([0xE0 | size >> 16]) + (size & 0xFFFF).to_bytes(2, "big") + (len(body) - 1).to_bytes(2, "big")
-    return head + bytes([PROPERTIES]) + body + b"\0"
 
 
 class _Encoder:
     """LZMA's range coder with adaptive bits, as the public LZMA specification has it, and a greedy choice of matches.
 
     A match is the longest of those at the distance of the match before, at distance 1 and at the latest place of the
-    same bytes.
+    same bytes; with every_repeat also of those at the three distances before.
     """
 
-    def __init__(self, data: bytes) -> None:
-        self._data = data
+    def __init__(self, data: bytes, every_repeat: bool) -> None:
+        self._data, self._every_repeat = data, every_repeat
+        self._latest: dict[bytes, int] = {}
+        self.origin, self.reach, self.properties = 0, 0, Properties()
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the state."""
+        self._probabilities: dict[tuple, int] = {}
+        self._state, self._distances = 0, [1] * 4
+
+    def encode(self, start: int, end: int) -> bytes:
+        """The packed bytes of data[start:end]."""
         self._low, self._range, self._out = 0, 0xFFFFFFFF, bytearray()
         self._cache, self._pending = 0, 1
-        self._probabilities: dict[tuple, int] = {}
-
-    def encode(self) -> bytes:
-        data, latest, state, repeated, at = self._data, dict[bytes, int](), 0, 1, 0
-        while at < len(data):
+        data, at = self._data, start
+        while at < end:
             key = data[at : at + _KEY]
-            lengths = {d: self._matching(at, d) for d in (repeated, 1, at - latest.get(key, at))}
+            repeats = self._distances if self._every_repeat else self._distances[:1]
+            lengths = {d: self._matching(at, d, end) for d in (*repeats, 1, at - self._latest.get(key, at))}
             distance = max(lengths, key=lambda d: lengths[d])
             size = lengths[distance]
-            is_match = size >= (2 if distance == repeated else _KEY)
-            self._bit(("match", state), is_match)
-            if not is_match:
+            which = repeats.index(distance) if distance in repeats else None
+            if size >= (_KEY if which is None else 2):
+                self._match(at, distance, which, size)
+            elif self._every_repeat and lengths[repeats[0]]:
                 size = 1
-                self._literal(at, repeated if state >= 7 else 0)
-                state = 0 if state < 4 else state - (3 if state < 10 else 6)
-            elif distance == repeated:
-                for name, value in (("rep", 1), ("rep0", 0), ("rep0 long", 1)):
-                    self._bit((name, state), value)
-                self._length("rep", size - 2)
-                state = 8 if state < 7 else 11
+                self._match(at, repeats[0], 0, 1)
             else:
-                self._bit(("rep", state), 0)
-                self._length("match", size - 2)
-                self._distance(distance - 1, min(size - 2, 3))
-                state, repeated = 7 if state < 7 else 10, distance
+                size = 1
+                self._put_literal(at)
             for place in range(at, at + size):
-                latest[data[place : place + _KEY]] = place
+                self._latest[data[place : place + _KEY]] = place
             at += size
         for _ in range(5):
             self._shift()
         return bytes(self._out)
 
-    def _matching(self, at: int, distance: int) -> int:
+    def _matching(self, at: int, distance: int, end: int) -> int:
         """How many bytes at `at` are those `distance` before them."""
         data, size = self._data, 0
-        if 0 < distance <= at:
-            while size < MATCH_MAX and at + size < len(data) and data[at + size] == data[at + size - distance]:
+        if 0 < distance <= at - self.reach:
+            while size < MATCH_MAX and at + size < end and data[at + size] == data[at + size - distance]:
                 size += 1
         return size
 
+    def _low_bits(self, at: int) -> int:
+        """Those of the position that choose the probabilities of a match."""
+        return at - self.origin & (1 << self.properties.pb) - 1
+
+    def _match(self, at: int, distance: int, which: int | None, size: int) -> None:
+        """A match; which: of the last distances, None for a distance of its own."""
+        state, low = self._state, self._low_bits(at)
+        self._bit(("match", state, low), 1)
+        self._bit(("rep", state), which is not None)
+        if which is None:
+            self._length("match", size - 2, low)
+            self._distance(distance - 1, min(size - 2, 3))
+            self._distances = [distance, *self._distances[:3]]
+            self._state = 7 if state < 7 else 10
+            return
+        self._bit(("rep0", state), which > 0)
+        if which == 0:
+            self._bit(("rep0 long", state, low), size > 1)
+        else:
+            self._bit(("rep1", state), which > 1)
+            if which > 1:
+                self._bit(("rep2", state), which > 2)
+            self._distances.insert(0, self._distances.pop(which))
+        if size == 1:
+            self._state = 9 if state < 7 else 11
+            return
+        self._length("rep", size - 2, low)
+        self._state = 8 if state < 7 else 11
+
+    def _put_literal(self, at: int) -> None:
+        state = self._state
+        self._bit(("match", state, self._low_bits(at)), 0)
+        self._literal(at, self._distances[0] if state >= 7 else 0)
+        self._state = 0 if state < 4 else state - (3 if state < 10 else 6)
+
     def _literal(self, at: int, distance: int) -> None:
         """The byte at `at`; behind a match, given the byte that would have gone on with it."""
-        byte, before = self._data[at], self._data[at - 1] if at else 0
+        lc, lp, place = self.properties.lc, self.properties.lp, at - self.origin
+        byte, before = self._data[at], self._data[at - 1] if place else 0
         expected = self._data[at - distance]
         symbol, offset = 1, 0x100 if distance else 0
         for shift in range(7, -1, -1):
             bit, match = byte >> shift & 1, expected >> shift & 1
             branch = offset + (offset if match else 0)
-            self._bit(("literal", before >> 8 - _LC, branch + symbol), bit)
+            self._bit(("literal", place & (1 << lp) - 1, before >> 8 - lc, branch + symbol), bit)
             symbol = symbol << 1 | bit
             offset = offset if match == bit else 0
 
-    def _length(self, kind: str, code: int) -> None:
+    def _length(self, kind: str, code: int, low: int) -> None:
         """Length - 2 in 0..271."""
         group = 0 if code < 8 else 1 if code < 16 else 2
         self._bit((kind, "choice", 0), group > 0)
         if group:
             self._bit((kind, "choice", 1), group > 1)
-        self._tree((kind, group), code - 8 * group, 8 if group == 2 else 3)
+        self._tree((kind, group, 0 if group == 2 else low), code - 8 * group, 8 if group == 2 else 3)
 
     def _distance(self, code: int, length_state: int) -> None:
         """Distance - 1."""

@@ -16,7 +16,7 @@ from pd4dgs_codec.bench.report import markdown
 from pd4dgs_codec.errors import DataError, Pd4Error
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.picture import render
-from pd4dgs_codec.render.rasterization import rasterization
+from pd4dgs_codec.render.autograd.rasterization import rasterization
 from pd4dgs_codec.scene import SCAFFOLD_NETWORKS, Camera, Deformation, Network, Scene, SceneInfo, Steps
 
 PASS, REFUSED, FAIL = "pass", "refused", "fail"

@@ -17,7 +17,7 @@ import numpy as np
 from pd4dgs_codec.attributes import quantise as q
 from pd4dgs_codec.bench.stability.cases import Case, Found, mpmath, refusal, small_scene
 from pd4dgs_codec.codec import decoder, encoder
-from pd4dgs_codec.entropy import channels, rate
+from pd4dgs_codec.entropy import bits, channels
 from pd4dgs_codec.entropy.priors import K_MAX
 from pd4dgs_codec.errors import EncodeError
 
@@ -105,13 +105,13 @@ def _rate_error(symbols: np.ndarray) -> Found:
         pairs = [(mp.mpf(v), mp.mpf(c)) for v, c in zip(values.tolist(), counts.tolist(), strict=True)]
         n = mp.mpf(symbols.size)
         mu = sum(v * c for v, c in pairs) / n
-        sigma = max(mp.sqrt(sum((v - mu) ** 2 * c for v, c in pairs) / n), mp.mpf(rate.SIGMA_MIN))
+        sigma = max(mp.sqrt(sum((v - mu) ** 2 * c for v, c in pairs) / n), mp.mpf(bits.SIGMA_MIN))
         scale, expected = 1 / (sigma * mp.sqrt(2)), mp.mpf(0)
         for v, c in pairs:
             d = abs(v - mu)
             p = (mp.erfc((d - 0.5) * scale) - mp.erfc((d + 0.5) * scale)) / 2
-            expected -= c * mp.log(max(p, mp.mpf(rate.P_MIN)), 2)
-        found = rate.gaussian_bits(symbols)
+            expected -= c * mp.log(max(p, mp.mpf(bits.P_MIN)), 2)
+        found = bits.gaussian_bits(symbols)
         return f"{found:,.3f} bits", float(abs(mp.mpf(found) - expected) / max(expected, mp.mpf(1)))
 
 

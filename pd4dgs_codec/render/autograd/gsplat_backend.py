@@ -4,18 +4,20 @@ from __future__ import annotations
 
 import importlib
 import importlib.metadata
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from pd4dgs_codec.errors import RenderError
 from pd4dgs_codec.render.projection import ALPHA_MAX
+from pd4dgs_codec.render.rasteriser import Settings
 
 #: The clamp on alpha is compiled into gsplat and changed between versions; only what equals ours is accepted.
 ALPHA_MAX_OF_VERSION = {"1.5": 0.999, "1.6": 0.99}
 
 
-def _load():
+def _load() -> Any:
     """The gsplat module, if its version draws what the CPU backend draws."""
     try:
         version = importlib.metadata.version("gsplat")
@@ -58,21 +60,33 @@ def _drawable(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -
     ]
 
 
-def rasterize(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, **options):
-    """gsplat behind `rasterization`, which checks the arguments; options as in cpu.Settings. float32, dense layout."""
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    backgrounds: Tensor | None,
+    width: int,
+    height: int,
+    settings: Settings,
+) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    """gsplat behind `rasterization`, which checks the arguments. float32, dense layout."""
     tensors = [t.to(torch.float32) for t in (means, quats, scales, opacities)]
-    mode = "RGB" if not options["depth"] else "RGB+D" if colors.shape[-1] else "D"
+    mode = "RGB" if not settings.depth else "RGB+D" if colors.shape[-1] else "D"
     out, alphas, meta = _load().rasterization(
         *_drawable(*tensors),
         colors.to(torch.float32) if colors.shape[-1] else means.new_zeros((means.shape[0], 1), dtype=torch.float32),
         viewmats.to(torch.float32).contiguous(),
         Ks.to(torch.float32).contiguous(),
-        options["width"],
-        options["height"],
-        near_plane=options["near"],
-        far_plane=options["far"],
-        eps2d=options["eps2d"],
-        radius_clip=options["radius_clip"],
+        width,
+        height,
+        near_plane=settings.near,
+        far_plane=settings.far,
+        eps2d=settings.eps2d,
+        radius_clip=settings.radius_clip,
         backgrounds=None if backgrounds is None else backgrounds.to(torch.float32),
         render_mode=mode,
         rasterize_mode="classic",

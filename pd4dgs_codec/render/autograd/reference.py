@@ -6,10 +6,13 @@ kernels but the thresholds, so that a common mistake is unlikely.
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
 from pd4dgs_codec.render.projection import ALPHA_MAX, ALPHA_MIN
+from pd4dgs_codec.render.rasteriser import Settings
 
 T_MIN = 1e-4
 
@@ -28,7 +31,9 @@ def _rotations(quats: Tensor) -> Tensor:
     return torch.stack([torch.stack(row, -1) for row in rows], -2)
 
 
-def project(means, quats, scales, viewmat, K, width, height, eps2d):
+def project(
+    means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int, eps2d: float
+) -> tuple[Tensor, Tensor, Tensor]:
     """Pixel means [N, 2], covariances [N, 2, 2] (eps2d included) and depths [N]; the caller keeps z > 0."""
     x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(-1)
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -44,10 +49,12 @@ def project(means, quats, scales, viewmat, K, width, height, eps2d):
     return torch.stack([fx * x / z + cx, fy * y / z + cy], -1), covariance, z
 
 
-def composite(means2d, conics, opacities, colors, width, height):
+def composite(
+    means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, width: int, height: int
+) -> tuple[Tensor, Tensor]:
     """Blend Gaussians that are already sorted front to back. Returns (colors [H, W, D], alphas [H, W, 1])."""
-    grid = dict(dtype=means2d.dtype, device=means2d.device)
-    ys, xs = torch.meshgrid(torch.arange(height, **grid) + 0.5, torch.arange(width, **grid) + 0.5, indexing="ij")
+    ys, xs = (torch.arange(n, dtype=means2d.dtype, device=means2d.device) + 0.5 for n in (height, width))
+    ys, xs = torch.meshgrid(ys, xs, indexing="ij")
     dx, dy = xs[..., None] - means2d[:, 0], ys[..., None] - means2d[:, 1]
     sigma = 0.5 * (conics[:, 0] * dx * dx + conics[:, 2] * dy * dy) + conics[:, 1] * dx * dy
     alpha = torch.clamp(opacities * torch.exp(-sigma), max=ALPHA_MAX)
@@ -60,54 +67,76 @@ def composite(means2d, conics, opacities, colors, width, height):
     return weights @ colors, weights.sum(-1, keepdim=True)
 
 
-def _draw_view(means, quats, scales, opacities, colors, viewmat, K, options):
-    """One camera: (colors, alphas, radii, full-size means2d leaf or value, depths, conics)."""
-    width, height = options["width"], options["height"]
+def _draw_view(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmat: Tensor,
+    K: Tensor,
+    width: int,
+    height: int,
+    settings: Settings,
+) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    """One camera: (colors [H, W, D], alphas [H, W, 1], meta)."""
     with torch.no_grad():
         z = means @ viewmat[2, :3] + viewmat[2, 3]
-        keep = (z > options["near"]) & (z <= options["far"]) & (opacities > ALPHA_MIN) & torch.isfinite(opacities)
+        keep = (z > settings.near) & (z <= settings.far) & (opacities > ALPHA_MIN) & torch.isfinite(opacities)
         keep &= torch.isfinite(means).all(-1) & torch.isfinite(quats).all(-1) & torch.isfinite(scales).all(-1)
         index = torch.nonzero(keep)[:, 0]
         index = index[torch.sort(z[index].to(torch.float32), stable=True).indices]
-    picked = [a[index] for a in (means, quats, scales, opacities, colors)]
-    means2d, covariance, depths = project(*picked[:3], viewmat, K, width, height, options["eps2d"])
+        n = len(means)
+    means, quats, scales, opacities, colors = (a[index] for a in (means, quats, scales, opacities, colors))
+    means2d, covariance, depths = project(means, quats, scales, viewmat, K, width, height, settings.eps2d)
     p, q, r = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     det = p * r - q * q
-    extent = torch.sqrt(2 * torch.log(255.0 * picked[3].detach()))
+    extent = torch.sqrt(2 * torch.log(255.0 * opacities.detach()))
     radii = torch.ceil(extent[:, None] * torch.sqrt(torch.stack([p, r], -1).detach()))
     seen = ((means2d + radii > 0) & (means2d - radii < means2d.new_tensor([width, height]))).all(-1)
-    seen &= (radii > options["radius_clip"]).any(-1) & (det > 0)
+    seen &= (radii > settings.radius_clip).any(-1) & (det > 0)
     conics = torch.stack([r, -q, p], -1)[seen] / det[seen, None]
     index, means2d, depths = index[seen], means2d[seen], depths[seen]
-    seen_colors = torch.cat([picked[4][seen], depths[:, None]], -1) if options["depth"] else picked[4][seen]
+    seen_colors = torch.cat([colors[seen], depths[:, None]], -1) if settings.depth else colors[seen]
     if means2d.requires_grad:
         means2d.retain_grad()
-    out, alphas = composite(means2d, conics, picked[3][seen], seen_colors, width, height)
+    out, alphas = composite(means2d, conics, opacities[seen], seen_colors, width, height)
 
-    def spread(values):
-        full = values.new_zeros((means.shape[0], *values.shape[1:]))
-        return full.index_copy(0, index, values)
+    def spread(values: Tensor) -> Tensor:
+        return values.new_zeros((n, *values.shape[1:])).index_copy(0, index, values)
 
     meta = {"radii": spread(radii[seen]).to(torch.int32), "depths": spread(depths.detach())}
     return out, alphas, meta | {"conics": spread(conics.detach()), "means2d": means2d, "index": index}
 
 
-def rasterize(means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, **options):
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    viewmats: Tensor,
+    Ks: Tensor,
+    backgrounds: Tensor | None,
+    width: int,
+    height: int,
+    settings: Settings,
+) -> tuple[Tensor, Tensor, dict[str, Any]]:
     """The oracle behind `rasterization(backend="reference")`. Float64 results.
 
     meta["means2d"] is a list, one [M, 2] tensor per camera with retained gradient, beside meta["index"], a list of the
     [M] Gaussians it holds, in depth order.
     """
-    tensors = [t.double() for t in (means, quats, scales, opacities, colors, viewmats, Ks)]
+    means, quats, scales, opacities, colors = (t.double() for t in (means, quats, scales, opacities, colors))
     views = []
-    for c in range(viewmats.shape[0]):
-        source = tensors[4] if colors.dim() == 2 else tensors[4][c]
-        views.append(_draw_view(*tensors[:4], source, tensors[5][c], tensors[6][c], options))
+    for c, (viewmat, K) in enumerate(zip(viewmats.double(), Ks.double(), strict=True)):
+        source = colors if colors.dim() == 2 else colors[c]
+        views.append(_draw_view(means, quats, scales, opacities, source, viewmat, K, width, height, settings))
     out, alphas = torch.stack([v[0] for v in views]), torch.stack([v[1] for v in views])
     if backgrounds is not None:
         back = backgrounds.double()
-        if options["depth"]:
+        if settings.depth:
             back = torch.cat([back, torch.zeros_like(back[:, :1])], -1)
         out = out + (1.0 - alphas) * back[:, None, None]
-    meta = {k: torch.stack([v[2][k] for v in views]) for k in ("radii", "depths", "conics")}
+    meta: dict[str, Any] = {k: torch.stack([v[2][k] for v in views]) for k in ("radii", "depths", "conics")}
     return out, alphas, meta | {k: [v[2][k] for v in views] for k in ("means2d", "index")}

@@ -1,81 +1,50 @@
-"""The one door to rendering: gsplat's signature, checked, then the backend.
+"""The one door to rendering with gradients: gsplat's signature, checked, then the backend.
 
-`cpu` is numba (pd4dgs_codec.render.cpu), `gsplat` is CUDA, `reference` is a dense float64 torch oracle for tests.
+`cpu` is numba (`pd4dgs_codec.render.rasteriser`), `gsplat` is CUDA, `reference` is a dense float64 torch oracle for
+tests.
 """
 
 from __future__ import annotations
 
-import math
+from collections.abc import Callable
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from pd4dgs_codec.errors import NotFinite, RenderError
+from pd4dgs_codec.errors import RenderError
+from pd4dgs_codec.render.checks import check_camera, check_colours, check_limits, check_shape
+from pd4dgs_codec.render.rasteriser import Settings
 
 BACKENDS = ("auto", "cpu", "gsplat", "reference")
 RENDER_MODES = ("RGB", "D", "ED", "RGB+D", "RGB+ED")
 
 
-def _expect(name: str, tensor: Any, *shapes: tuple) -> None:
+def _expect(name: str, tensor: Any, *shapes: tuple[int | None, ...]) -> None:
     """A floating tensor whose shape is one of `shapes`; None in a shape is any size."""
     if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
         found = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
         raise RenderError(f"{name} is {found}, expected a floating-point tensor")
-    for shape in shapes:
-        if tensor.dim() == len(shape) and all(b is None or a == b for a, b in zip(tensor.shape, shape, strict=True)):
-            return
-    expected = " or ".join("[" + ", ".join("*" if b is None else str(b) for b in shape) + "]" for shape in shapes)
-    raise RenderError(f"{name} has shape {list(tensor.shape)}, expected {expected}")
+    check_shape(name, tensor.shape, *shapes)
 
 
-def _check_cameras(viewmats: Tensor, Ks: Tensor) -> None:
-    if viewmats.requires_grad or Ks.requires_grad:
-        raise RenderError("gradients to viewmats and Ks are not supported: pass them detached")
-    for viewmat, K in zip(viewmats.tolist(), Ks.tolist(), strict=True):
-        if not all(math.isfinite(v) for row in viewmat + K for v in row):
-            raise RenderError("viewmats or Ks has a value that is not finite")
-        if viewmat[3] != [0.0, 0.0, 0.0, 1.0]:
-            raise RenderError(f"the last row of a viewmat is {viewmat[3]}, expected [0, 0, 0, 1]")
-        if [K[0][1], K[1][0], *K[2]] != [0.0, 0.0, 0.0, 0.0, 1.0]:
-            raise RenderError(f"a matrix in Ks is {K}, expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] (no skew)")
-        if not (K[0][0] > 0 and K[1][1] > 0):
-            raise RenderError(f"focal lengths {K[0][0]} and {K[1][1]} in Ks, expected both positive")
-
-
-def _check_options(width, height, near_plane, far_plane, eps2d, radius_clip, render_mode, backend, refused) -> None:
-    for name, (value, supported) in refused.items():
-        if value != supported:
-            raise RenderError(f"{name}={value!r} is not supported, expected {supported!r}")
-    for name, value, known in (("render_mode", render_mode, RENDER_MODES), ("backend", backend, BACKENDS)):
-        if value not in known:
-            raise RenderError(f"{name} is {value!r}, expected one of {', '.join(known)}")
-    for name, value in (("width", width), ("height", height)):
-        if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= 65535:
-            raise RenderError(f"{name} is {value!r}, expected an integer from 1 to 65535")
-    if not 0 <= near_plane < far_plane:
-        raise RenderError(f"near_plane {near_plane} and far_plane {far_plane}: expected 0 <= near < far")
-    if not (0 <= eps2d < float("inf") and 0 <= radius_clip < float("inf")):
-        raise RenderError(f"eps2d {eps2d} and radius_clip {radius_clip}: expected finite and not negative")
-
-
-def _choose(backend: str, device: torch.device):
-    """The function (means, ..., settings) -> (colors, alphas, meta) of a backend for tensors on `device`."""
+def _choose(backend: str, device: torch.device) -> Callable[..., tuple[Tensor, Tensor, dict[str, Any]]]:
+    """The function (means, ..., width, height, settings) -> (colors, alphas, meta) of a backend for `device`."""
     if backend == "auto":
         backend = "gsplat" if device.type == "cuda" else "cpu"
     if (backend == "gsplat") != (device.type == "cuda") and backend != "reference":
         raise RenderError(f"backend {backend!r} cannot draw tensors on {device.type}")
     if backend == "gsplat":
-        from pd4dgs_codec.render import gsplat_backend
+        from pd4dgs_codec.render.autograd import gsplat_backend
 
         return gsplat_backend.rasterize
     if device.type not in ("cpu", "cuda"):
         raise RenderError(f"tensors are on {device.type}, expected cpu or cuda")
     if backend == "reference":
-        from pd4dgs_codec.render import reference
+        from pd4dgs_codec.render.autograd import reference
 
         return reference.rasterize
-    from pd4dgs_codec.render import cpu
+    from pd4dgs_codec.render.autograd import cpu
 
     return cpu.rasterize
 
@@ -130,18 +99,25 @@ def rasterization(
     Raises RenderError for wrong shapes, devices and unsupported options; its kind NotFinite for colours.
     Formulas: Zwicker et al., "EWA splatting"; Kerbl et al., "3D Gaussian Splatting"; conventions of gsplat 1.5.3.
     """
-    refused = {
-        "rasterize_mode": (rasterize_mode, "classic"),
-        "sh_degree": (sh_degree, None),
-        "absgrad": (absgrad, False),
-    }
     if covars is not None:
         raise RenderError("covars is not supported: pass quats and scales")
-    _check_options(width, height, near_plane, far_plane, eps2d, radius_clip, render_mode, backend, refused)
+    for name, value, supported in (
+        ("rasterize_mode", rasterize_mode, "classic"),
+        ("sh_degree", sh_degree, None),
+        ("absgrad", absgrad, False),
+    ):
+        if value != supported:
+            raise RenderError(f"{name}={value!r} is not supported, expected {supported!r}")
+    for name, choice, known in (("render_mode", render_mode, RENDER_MODES), ("backend", backend, BACKENDS)):
+        if choice not in known:
+            raise RenderError(f"{name} is {choice!r}, expected one of {', '.join(known)}")
+    check_limits(near_plane, far_plane, eps2d, radius_clip)
     _expect("means", means, (None, 3))
     n = means.shape[0]
     _expect("viewmats", viewmats, (None, 4, 4))
     count = viewmats.shape[0]
+    if count < 1:
+        raise RenderError("viewmats has 0 cameras, expected at least 1")
     _expect("Ks", Ks, (count, 3, 3))
     _expect("quats", quats, (n, 4))
     _expect("scales", scales, (n, 3))
@@ -151,22 +127,24 @@ def rasterization(
         raise RenderError("colors has 0 channels, expected at least 1")
     if backgrounds is not None:
         _expect("backgrounds", backgrounds, (count, colors.shape[-1]))
-    _check_cameras(viewmats, Ks)
+    if viewmats.requires_grad or Ks.requires_grad:
+        raise RenderError("gradients to viewmats and Ks are not supported: pass them detached")
+    for viewmat, K in zip(viewmats.tolist(), Ks.tolist(), strict=True):
+        check_camera(viewmat, K, width, height)
     tensors = [means, quats, scales, opacities, colors, viewmats, Ks] + ([] if backgrounds is None else [backgrounds])
     if any(t.device != means.device for t in tensors):
         raise RenderError(f"tensors are on different devices: {sorted({str(t.device) for t in tensors})}")
     for name, tensor in (("colors", colors), ("backgrounds", backgrounds)):
-        if tensor is not None and not torch.isfinite(tensor.detach().float().sum()):
-            raise NotFinite(f"{name} has a value that is not finite, or their sum overflows")
+        if tensor is not None:
+            check_colours(name, float(tensor.detach().float().sum()))
     if render_mode in ("D", "ED"):
         colors, backgrounds = colors[..., :0], None
 
+    settings = Settings(float(near_plane), float(far_plane), float(eps2d), float(radius_clip), render_mode != "RGB")
     draw = _choose(backend, means.device)
     out, alphas, meta = draw(
-        means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, width=width, height=height,
-        near=float(near_plane), far=float(far_plane), eps2d=float(eps2d), radius_clip=float(radius_clip),
-        depth=render_mode != "RGB",
-    )  # fmt: skip
+        means, quats, scales, opacities, colors, viewmats, Ks, backgrounds, width, height, settings
+    )
     if render_mode.endswith("ED"):
         out = torch.cat([out[..., :-1], out[..., -1:] / alphas.clamp(min=1e-10)], dim=-1)
     meta["opacities"] = opacities.detach().expand(count, n)
