@@ -6,9 +6,12 @@ said otherwise, so that a test knows every symbol that must come back.
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 from hypothesis import strategies as st
 
+from pd4dgs_codec import encode
 from pd4dgs_codec.attributes.quantise import dequantise
 from pd4dgs_codec.scene import (
     FEATURE_DIM,
@@ -135,6 +138,13 @@ def make_scene(
         if 2 in layers and heads[1]
         else None,
     )
+
+
+@cache
+def small_file(layers: tuple[int, ...] = (0, 1, 2), **options: object) -> bytes:
+    """make_scene(7) with twenty anchors as a file, encoded by the first test that asks and not while tests are
+    collected."""
+    return encode(make_scene(7, layers=layers, anchors=20), **{"layers": 2, "effort": 1, **options})
 
 
 def _subset(heads: dict[str, int]) -> st.SearchStrategy[dict[str, int]]:

@@ -4,7 +4,7 @@ import hashlib
 
 import numpy as np
 import pytest
-from strategies import make_scene
+from strategies import make_scene, small_file
 
 from pd4dgs_codec import FORMAT_VERSION
 from pd4dgs_codec.bitstream import canonical
@@ -17,21 +17,21 @@ from pd4dgs_codec.errors import Truncated
 from pd4dgs_codec.scene import PLANES
 
 SCENE = make_scene(7, anchors=20)
-DATA = encode(SCENE, layers=2, effort=1, omit="nothing")
 
 
 def test_info_needs_the_header_alone():
-    whole = info(DATA)
-    first = info(DATA[: whole["header_bytes"]])
+    data = small_file(omit="nothing")
+    whole = info(data)
+    first = info(data[: whole["header_bytes"]])
     with pytest.raises(Truncated):
-        info(DATA[: whole["header_bytes"] - 1])
+        info(data[: whole["header_bytes"] - 1])
     assert whole["format_version"] == FORMAT_VERSION == "1.0"
-    assert whole["bytes"] == first["bytes"] == len(DATA)
+    assert whole["bytes"] == first["bytes"] == len(data)
     place = ("layer", "offset", "bytes", "end")
     assert [{k: row[k] for k in place} for row in whole["layers"]] == first["layers"]
     ends = [whole["header_bytes"], *(row["end"] for row in whole["layers"])]
-    assert [row["offset"] for row in whole["layers"]] == ends[:-1] and ends[-1] == len(DATA)
-    decoded = decode(DATA)
+    assert [row["offset"] for row in whole["layers"]] == ends[:-1] and ends[-1] == len(data)
+    decoded = decode(data)
     assert [row["anchors"] for row in whole["layers"]] == np.diff([0, *decoded.rows]).tolist()
     assert whole["anchors"] == len(decoded.anchor_q) and first["anchors"] is None
     assert whole["steps"]["feature"] == SCENE.steps.feature
@@ -40,7 +40,8 @@ def test_info_needs_the_header_alone():
 
 
 def test_hashes_follow_the_documented_order():
-    scene, rows = decode(DATA), hashes(DATA)
+    data = small_file(omit="nothing")
+    scene, rows = decode(data), hashes(data)
     first, last = scene.rows[0], scene.rows[1]
     own = slice(first, last)
     arrays = [scene.anchor[own], scene.feature[own], scene.scaling_log[own], scene.offset[own]]
@@ -59,16 +60,18 @@ def test_hashes_follow_the_documented_order():
 
 
 def test_hashes_name_the_contents_not_the_coding():
+    data = small_file(omit="nothing")
     lzma = encode(SCENE, layers=2, mode="lzma", effort=1, omit="nothing")
-    assert lzma != DATA and hashes(lzma) == hashes(DATA)
-    assert hashes(encode(SCENE, layers=1, effort=1, omit="nothing")) == hashes(DATA)[:2]
+    assert lzma != data and hashes(lzma) == hashes(data)
+    assert hashes(encode(SCENE, layers=1, effort=1, omit="nothing")) == hashes(data)[:2]
     raw = hashes(encode(SCENE, layers=2, deformation="float32", effort=1, omit="nothing"))
-    assert [r["tensors"] for r in raw] == [r["tensors"] for r in hashes(DATA)]
-    assert raw[0] == hashes(DATA)[0] and raw[1]["symbols"] != hashes(DATA)[1]["symbols"]
+    assert [r["tensors"] for r in raw] == [r["tensors"] for r in hashes(data)]
+    assert raw[0] == hashes(data)[0] and raw[1]["symbols"] != hashes(data)[1]["symbols"]
 
 
 def test_npz_keys_and_symbols():
-    scene = decode(DATA)
+    data = small_file(omit="nothing")
+    scene = decode(data)
     arrays = to_npz_dict(scene, symbols=True)
     plain = to_npz_dict(scene)
     assert {"anchor", "feature", "scaling_log", "offset", "mask_0", "mask_1", "mask_2"} <= set(plain)
@@ -87,14 +90,15 @@ def test_npz_keys_and_symbols():
 
 
 def test_info_names_chunks_it_does_not_know():
-    preamble = read_preamble(DATA)
+    data = small_file(omit="nothing")
+    preamble = read_preamble(data)
     fields, extra = canonical.unpack(preamble.header), b"a preview"
     fields[1].append([99, len(extra)])
-    chunk = write_chunk(99, FLAG_ANCILLARY, read_chunk(DATA, preamble.size).scene_id, extra)
+    chunk = write_chunk(99, FLAG_ANCILLARY, read_chunk(data, preamble.size).scene_id, extra)
     front = write_preamble(canonical.pack(fields))
-    data = front + DATA[preamble.size :] + chunk
-    assert info(data)["chunks"] == [{"type": 99, "offset": len(data) - 29, "bytes": 29, "end": len(data)}]
-    assert [row["layer"] for row in info(data)["layers"]] == [0, 1, 2] and hashes(data) == hashes(DATA)
+    longer = front + data[preamble.size :] + chunk
+    assert info(longer)["chunks"] == [{"type": 99, "offset": len(longer) - 29, "bytes": 29, "end": len(longer)}]
+    assert [row["layer"] for row in info(longer)["layers"]] == [0, 1, 2] and hashes(longer) == hashes(data)
 
 
 def test_a_scene_without_a_camera_has_no_camera_keys():

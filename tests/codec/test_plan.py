@@ -1,13 +1,14 @@
 """What a file leaves out, and where the anchors of a layer that goes end up."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from strategies import make_scene
 
+from pd4dgs_codec.codec import encoder
 from pd4dgs_codec.codec.decoder import decode
-from pd4dgs_codec.codec.encoder import encode, encode_with_report
 from pd4dgs_codec.codec.heads import head_bounds
 from pd4dgs_codec.codec.kinds import LAYER_KINDS
 from pd4dgs_codec.codec.options import EncodeOptions
@@ -16,6 +17,7 @@ from pd4dgs_codec.evaluate import residuals as evaluate
 from pd4dgs_codec.scene import GLOBAL_HEADS, LENGTH_HEADS, LOCAL_HEADS, PLANES, Deformation, deformation_unit
 
 VOXEL = 0.0078125
+encode, encode_with_report = (partial(f, effort=1) for f in (encoder.encode, encoder.encode_with_report))
 RAW = EncodeOptions(deformation="float32")
 
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import LAYER_SETS, assert_same_scene, make_scene, scenes
+from strategies import LAYER_SETS, assert_same_scene, scenes, small_file
 
 from pd4dgs_codec import decode, encode, open_stream
 from pd4dgs_codec.bitstream.container import write_chunk, write_preamble
@@ -16,8 +16,6 @@ from pd4dgs_codec.codec.info import hashes, info
 from pd4dgs_codec.codec.options import EncodeOptions
 from pd4dgs_codec.codec.payload import write_layer
 from pd4dgs_codec.errors import BadSignature, ChecksumMismatch, DecodeError, Malformed, Truncated
-
-FILES = {layers: encode(make_scene(7, layers=layers, anchors=20), layers=2, effort=1) for layers in LAYER_SETS}
 
 
 @given(scenes())
@@ -40,7 +38,7 @@ def test_each_prefix_decodes_to_what_max_layer_gives(scene):
 
 @pytest.mark.parametrize("layers", LAYER_SETS)
 def test_every_cut_yields_the_longest_valid_prefix_or_truncated(layers):
-    data = FILES[layers]
+    data = small_file(layers)
     ends = [row["end"] for row in info(data)["layers"]]
     for size in [*range(0, len(data), 101), *(e + d for e in ends for d in (-1, 0, 1) if e + d < len(data))]:
         if size < len(data):
@@ -55,28 +53,28 @@ def test_every_cut_yields_the_longest_valid_prefix_or_truncated(layers):
 
 
 def test_max_layer_does_not_look_beyond_its_prefix():
-    data = FILES[(0, 1, 2)]
+    data = small_file()
     end = info(data)["layers"][0]["end"]
     assert decode(data[:end] + b"garbage", max_layer=0).layers == (0,)
     assert decode(data, max_layer=7).layers == (0, 1, 2)
-    assert decode(FILES[(0, 2)], max_layer=1).layers == (0,)
+    assert decode(small_file((0, 2)), max_layer=1).layers == (0,)
     with pytest.raises(ValueError, match="max_layer"):
         decode(data, max_layer=-1)
 
 
 def test_allow_partial_forgives_a_cut_and_nothing_else():
-    data = bytearray(FILES[(0, 1)])
+    data = bytearray(small_file((0, 1)))
     data[-10] ^= 1
     with pytest.raises(ChecksumMismatch):
         decode(bytes(data), allow_partial=True)
     with pytest.raises(Malformed, match="bytes follow"):
-        decode(FILES[(0, 1)] + b"\0", allow_partial=True)
+        decode(small_file((0, 1)) + b"\0", allow_partial=True)
 
 
 @given(st.sampled_from(LAYER_SETS), st.lists(st.integers(0, 4000), max_size=8))
 @settings(max_examples=15)
 def test_a_stream_does_not_depend_on_where_it_is_cut(layers, cuts):
-    data = FILES[layers]
+    data = small_file(layers)
     places = [0, *sorted(min(c, len(data)) for c in cuts), len(data)]
     stream, got = open_stream(), []
     for a, b in zip(places[:-1], places[1:], strict=True):
@@ -89,14 +87,14 @@ def test_a_stream_does_not_depend_on_where_it_is_cut(layers, cuts):
 
 
 def test_a_stream_fed_byte_by_byte():
-    data, stream, got = FILES[(0, 2)], open_stream(), []
+    data, stream, got = small_file((0, 2)), open_stream(), []
     for i in range(len(data)):
         got += stream.feed(data[i : i + 1])
     assert [scene.layers for scene in got] == [(0,), (0, 2)]
 
 
 def test_a_fault_stays_and_earlier_layers_remain():
-    data = bytearray(FILES[(0, 1, 2)])
+    data = bytearray(small_file())
     rows = info(bytes(data))["layers"]
     data[rows[1]["end"] - 9] ^= 4
     stream = open_stream()
@@ -133,7 +131,7 @@ def faults_by_every_door(data):
 @pytest.mark.parametrize("first", ["value", "mask code", "voxel"])
 def test_of_two_faults_every_door_names_that_of_the_earlier_layer(first, later):
     """Values that are not finite, sums of masks and voxels taken twice, which a payload alone does not show."""
-    header, layers, _ = decode_layers(FILES[(0, 1, 2)])
+    header, layers, _ = decode_layers(small_file())
     payloads = [write_layer(layer, EncodeOptions(effort=1))[0] for layer in layers]
     steps, which = header.attribute_steps, 1
     if first == "value":
@@ -163,7 +161,7 @@ def test_of_two_faults_every_door_names_that_of_the_earlier_layer(first, later):
 
 def test_a_stream_that_ends_early_says_so():
     stream = open_stream()
-    assert stream.feed(FILES[(0, 1)][:-1])[0].layers == (0,)
+    assert stream.feed(small_file((0, 1))[:-1])[0].layers == (0,)
     with pytest.raises(Truncated):
         stream.finish()
 
@@ -172,6 +170,6 @@ def test_a_stream_refuses_other_data_at_once_and_extra_bytes():
     with pytest.raises(BadSignature):
         open_stream().feed(b"PNG")
     stream = open_stream()
-    assert len(stream.feed(FILES[(0,)] + b"!")) == 1
+    assert len(stream.feed(small_file((0,)) + b"!")) == 1
     with pytest.raises(Malformed, match="follow"):
         stream.finish()

@@ -1,6 +1,7 @@
 """Scene -> bytes -> Scene: every symbol, every row, every mode."""
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,11 +11,11 @@ from strategies import HUGE, RANGES, assert_same_networks, assert_same_scene, ma
 
 from pd4dgs_codec.codec import encoder
 from pd4dgs_codec.codec.decoder import decode
-from pd4dgs_codec.codec.encoder import encode, encode_with_report
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.morton import morton_codes
 from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS
 
+encode, encode_with_report = (partial(f, effort=1) for f in (encoder.encode, encoder.encode_with_report))
 MODES = [("ans", "coded"), ("lzma", "coded"), ("ans", "float32"), ("lzma", "float32")]
 
 
@@ -31,7 +32,7 @@ def rows_by_voxel(scene):
 @given(scenes(), st.sampled_from(MODES), st.sampled_from(("best", "gauss")))
 @settings(max_examples=20)
 def test_everything_active_comes_back_and_encodes_to_the_same_bytes(scene, mode, priors):
-    options = {"mode": mode[0], "deformation": mode[1], "priors": priors, "layers": 2, "effort": 1, "omit": "nothing"}
+    options = {"mode": mode[0], "deformation": mode[1], "priors": priors, "layers": 2, "omit": "nothing"}
     data = encode(scene, **options)
     decoded = decode(data)
     active = {cell: row for cell, row in rows_by_voxel(scene).items() if row[1][-1] > 0}
@@ -51,7 +52,7 @@ def test_everything_active_comes_back_and_encodes_to_the_same_bytes(scene, mode,
 @given(scenes())
 @settings(max_examples=8)
 def test_rows_are_sorted_by_layer_then_morton_order(scene):
-    decoded = decode(encode(scene, layers=2, effort=1, verify=False))
+    decoded = decode(encode(scene, layers=2, verify=False))
     first = 0
     for index, last in enumerate(decoded.rows):
         own = decoded.anchor_q[first:last]
@@ -80,7 +81,7 @@ def test_unquantised_values_come_back_within_half_a_step(mode, deformation):
 @pytest.mark.parametrize("mode", ["ans", "lzma"])
 def test_symbols_over_the_whole_range(mode):
     scene = make_scene(1, layers=(0,), anchors=3, kind="huge", hidden=())
-    got = decode(encode(scene, mode=mode, priors="gauss", effort=1, omit="nothing"))
+    got = decode(encode(scene, mode=mode, priors="gauss", omit="nothing"))
     assert np.abs(got.feature).max() == HUGE * scene.steps.feature
     assert_same_networks(got.networks, scene.networks)
 
@@ -111,7 +112,7 @@ def test_the_header_information_comes_back():
 
 @pytest.mark.parametrize("kind", RANGES[:3])
 def test_the_report_adds_up(kind):
-    data, report = encode_with_report(make_scene(2, anchors=40, kind=kind), layers=2, effort=1)
+    data, report = encode_with_report(make_scene(2, anchors=40, kind=kind), layers=2)
     report = report.json()
     assert report["bytes"] == len(data) and report["verified"] and report["mode"] == "ans"
     assert sum(row["bytes"] for row in report["layers"]) < len(data)
@@ -247,7 +248,7 @@ def test_verification_notices_lost_rows_and_wrong_values(monkeypatch):
 def test_positions_that_overflow_are_refused_verified_or_not(verify):
     scene = make_scene(7, layers=(0,), anchors=20)
     with pytest.raises(EncodeError, match="limit of the format: layer 0: a reconstructed value is not finite"):
-        encode(replace(scene, info=replace(scene.info, voxel_size=2.0**127)), effort=1, verify=verify)
+        encode(replace(scene, info=replace(scene.info, voxel_size=2.0**127)), verify=verify)
 
 
 @given(st.sampled_from(sorted(GLOBAL_HEADS)), st.sampled_from(sorted(LOCAL_HEADS)))
@@ -255,7 +256,7 @@ def test_positions_that_overflow_are_refused_verified_or_not(verify):
 def test_single_heads(global_head, local_head):
     heads = ({global_head: GLOBAL_HEADS[global_head]}, {local_head: LOCAL_HEADS[local_head]})
     scene = make_scene(0, heads=heads)
-    decoded = decode(encode(scene, layers=2, effort=1))
-    assert_same_scene(decoded, decode(encode(decoded, layers=2, effort=1)))
+    decoded = decode(encode(scene, layers=2))
+    assert_same_scene(decoded, decode(encode(decoded, layers=2)))
     assert set(decoded.global_deformation.networks) == {"trunk", global_head}
     assert set(decoded.local_deformation.networks) == {"trunk", local_head}
