@@ -22,7 +22,7 @@ from pd4dgs_codec.bitstream import canonical
 from pd4dgs_codec.bitstream.container import MAJOR, SIGNATURE
 from pd4dgs_codec.codec.header import scene_id_of
 from pd4dgs_codec.codec.kinds import LAYER_KINDS, SCAFFOLD_INPUT
-from pd4dgs_codec.codec.layer_meta import Section, step_names
+from pd4dgs_codec.codec.layer_meta import Section
 from pd4dgs_codec.codec.symbols import LayerSymbols
 from pd4dgs_codec.entropy.ans import ans_encode
 from pd4dgs_codec.entropy.positions import encode_positions
@@ -490,8 +490,8 @@ def make_layer(
         attributes=np.full((N_CHANNELS, n), 2, np.int32) if attributes is None else attributes,
         planes=planes,
         networks=networks,
-        steps=dict(zip(step_names(kind), steps, strict=True)) if networks else {},
-        raw=raw,
+        steps=dict(zip(kind.step_names, steps, strict=True)) if networks else {},
+        raw_deformation=raw,
     )
     meta: dict[int, object] = {1: n}
     if networks:

@@ -9,7 +9,8 @@ from functools import partial
 import numpy as np
 
 from pd4dgs_codec.bench.stability.rows import Case, mpmath, refusal
-from pd4dgs_codec.entropy import channels, rate
+from pd4dgs_codec.entropy import channels
+from pd4dgs_codec.entropy.bits import P_MIN, SIGMA_MIN, gaussian_bits
 from pd4dgs_codec.entropy.priors import K_MAX
 from pd4dgs_codec.errors import EncodeError
 
@@ -98,13 +99,13 @@ def _rate_error(symbols: np.ndarray) -> tuple[str, float]:
         pairs = [(mp.mpf(v), mp.mpf(c)) for v, c in zip(values.tolist(), counts.tolist(), strict=True)]
         n = mp.mpf(symbols.size)
         mu = sum(v * c for v, c in pairs) / n
-        sigma = max(mp.sqrt(sum((v - mu) ** 2 * c for v, c in pairs) / n), mp.mpf(rate.SIGMA_MIN))
+        sigma = max(mp.sqrt(sum((v - mu) ** 2 * c for v, c in pairs) / n), mp.mpf(SIGMA_MIN))
         scale = 1 / (sigma * mp.sqrt(2))
         expected = mp.mpf(0)
         for v, c in pairs:
             d = abs(v - mu)
             p = (mp.erfc((d - 0.5) * scale) - mp.erfc((d + 0.5) * scale)) / 2
-            expected -= c * mp.log(max(p, mp.mpf(rate.P_MIN)), 2)
-        found = rate.gaussian_bits(symbols)
+            expected -= c * mp.log(max(p, mp.mpf(P_MIN)), 2)
+        found = gaussian_bits(symbols)
         error = float(abs(mp.mpf(found) - expected) / max(expected, mp.mpf(1)))
     return f"{found:,.3f} bits", error
