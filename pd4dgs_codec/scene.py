@@ -44,8 +44,8 @@ def deformation_unit(box: np.ndarray) -> np.float32:
 
     In scene units a rounded weight would shift a small scene by whole pixels.
     """
-    longest: np.float32 = (box[1] - box[0]).astype(np.float32).max()
-    return np.float32(0.25) * longest
+    unit: np.float32 = np.float32(0.25) * (box[1] - box[0]).astype(np.float32).max()
+    return unit
 
 
 #: The decoders of the scaffold (input [feature 32, view direction 3]) with their output width.

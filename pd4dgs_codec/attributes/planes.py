@@ -32,7 +32,8 @@ class Predictor:
 def _median(w: Array, n: Array, nw: Array) -> Array:
     """The median of W, N and W + N - NW: the LOCO-I predictor (Weinberger, Seroussi, Sapiro 2000)."""
     low, high = np.minimum(w, n), np.maximum(w, n)
-    return np.maximum(low, np.minimum(high, low + high - nw))
+    median: Array = np.maximum(low, np.minimum(high, low + high - nw))
+    return median
 
 
 def _restore_left(r: Array) -> Array:
@@ -62,7 +63,8 @@ def residual(predictor: int, k: Array) -> Array:
     w[:, :, 1:], n[:, 1:, :], nw[:, 1:, 1:] = k[:, :, :-1], k[:, :-1, :], k[:, :-1, :-1]
     n[:, 0, :] = nw[:, 0, :] = w[:, 0, :]
     w[:, 1:, 0] = nw[:, 1:, 0] = n[:, 1:, 0]
-    return k - PREDICTORS[predictor].predict(w, n, nw)
+    r: Array = k - PREDICTORS[predictor].predict(w, n, nw)
+    return r
 
 
 def restore(planes: Sequence[tuple[int, Array]]) -> list[Array]:
@@ -108,4 +110,5 @@ def _scan(r: Array, predictor: Predictor) -> Array:
         a, b = max(1, d - w + 1), min(h - 1, d - 1) + 1
         x[d, a:b] += predictor.predict(x[d - 1, a:b], x[d - 1, a - 1 : b - 1], x[d - 2, a - 1 : b - 1])
     sheared[...] = x.transpose(2, 1, 0)
-    return square.copy()
+    restored: Array = square.copy()
+    return restored

@@ -89,13 +89,14 @@ class Split:
 
     def y_classes(self, x: np.ndarray) -> np.ndarray:
         """int64 [n] in 0..4."""
-        distance: np.ndarray = np.abs(x - self.centre_x)
-        return np.minimum(distance, Y_CLASSES - 1)
+        classes: np.ndarray = np.minimum(np.abs(x - self.centre_x), Y_CLASSES - 1)
+        return classes
 
     def z_classes(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
         """int64 [n] in 0..6."""
-        distance: np.ndarray = np.abs(x - self.centre_x) + np.abs(y - self.centre_y)
-        return np.minimum(distance, Z_CLASSES - 1)
+        distance = np.abs(x - self.centre_x) + np.abs(y - self.centre_y)
+        classes: np.ndarray = np.minimum(distance, Z_CLASSES - 1)
+        return classes
 
 
 def _stage_channels(stage: int) -> tuple[int, ...]:

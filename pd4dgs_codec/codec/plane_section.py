@@ -94,5 +94,6 @@ def _activity(channels: np.ndarray, shape: Shape) -> np.ndarray:
     """int64 [H * W]: relative magnitudes of channels int64 [m, H * W], summed over 3 x 3 cells, the border repeated."""
     _, height, width = shape
     padded = np.pad(relative_magnitude(channels).reshape(height, width), 1, mode="edge")
-    columns: np.ndarray = padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]
-    return (columns[:-2] + columns[1:-1] + columns[2:]).ravel()
+    columns = padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]
+    around: np.ndarray = columns[:-2] + columns[1:-1] + columns[2:]
+    return around.ravel()

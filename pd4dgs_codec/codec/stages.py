@@ -29,8 +29,9 @@ def relative_magnitude(residuals: np.ndarray) -> np.ndarray:
     """int64 [n]: sum over channels of the magnitudes of residuals int64 [m, n] relative to their channel's mean, in
     units of 1/256. Below 2^8 m n."""
     magnitude = np.abs(residuals)
-    relative: np.ndarray = magnitude * (magnitude.shape[1] << 8) // (magnitude.sum(axis=1, keepdims=True) + 1)
-    return relative.sum(axis=0)
+    relative = magnitude * (magnitude.shape[1] << 8) // (magnitude.sum(axis=1, keepdims=True) + 1)
+    total: np.ndarray = relative.sum(axis=0)
+    return total
 
 
 def activity_classes(activity: np.ndarray, count: int) -> np.ndarray:

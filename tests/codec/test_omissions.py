@@ -4,14 +4,16 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from strategies import make_scene
+from strategies import assert_same_scene, make_scene
 
 from pd4dgs_codec.attributes import planes as decorrelation
 from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.encoder import encode, encode_with_report
+from pd4dgs_codec.codec.omissions import _Omissions
 from pd4dgs_codec.codec.options import EncodeOptions
 from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.codec.plane_choice import fill_plane
+from pd4dgs_codec.codec.symbols import rounded
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.evaluate.enclosure import residual_ranges, time_grid
 from pd4dgs_codec.evaluate.reach import reach
@@ -70,6 +72,17 @@ def dead_scene() -> Scene:
         global_deformation=Deformation(planes, heads),
         local_deformation=Deformation(local.planes, local_heads),
     )
+
+
+@pytest.mark.parametrize("raw_deformation", [False, True])
+def test_edits_of_the_scene_and_of_its_decoded_twin_are_alike(raw_deformation):
+    planned, _ = plan(dead_scene(), EncodeOptions(layers=2, omit="nothing"))
+    omissions = _Omissions(planned, raw_deformation)
+    while omissions.simplify_networks():
+        pass
+    omissions.free_offsets_and_cells()
+    assert len(omissions.found) > 8
+    assert_same_scene(omissions.decoded, rounded(omissions.scene, raw_deformation))
 
 
 def test_every_dead_part_is_found_and_costs_less():

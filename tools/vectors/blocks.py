@@ -21,7 +21,7 @@ from pd4dgs_codec.attributes.table import ATTRIBUTES, N_CHANNELS, dequantise_att
 from pd4dgs_codec.bitstream import canonical
 from pd4dgs_codec.bitstream.container import MAJOR, SCENE_ID_SIZE, SIGNATURE
 from pd4dgs_codec.codec.kinds import LAYER_KINDS, SCAFFOLD_INPUT
-from pd4dgs_codec.codec.layer_meta import Section, step_names
+from pd4dgs_codec.codec.layer_meta import Section
 from pd4dgs_codec.codec.symbols import LayerSymbols
 from pd4dgs_codec.entropy.ans import ans_encode
 from pd4dgs_codec.entropy.positions import encode_positions
@@ -410,7 +410,7 @@ class Layer:
     def channels(self) -> list[np.ndarray]:
         """The channels of sections 1 to 4 in their order, planes under predictor 0."""
         m = self.meant
-        tensors = [] if m.raw else list(m.tensors())
+        tensors = [] if m.raw_deformation else list(m.tensors())
         return [m.mask_increase, m.mask_own, *m.attributes, *(row for t in tensors for row in plane_channels(t))]
 
 
@@ -491,8 +491,8 @@ def make_layer(
         attributes=np.full((N_CHANNELS, n), 2, np.int32) if attributes is None else attributes,
         planes=planes,
         networks=networks,
-        steps=dict(zip(step_names(kind), steps, strict=True)) if networks else {},
-        raw=raw,
+        steps=dict(zip(kind.step_names, steps, strict=True)) if networks else {},
+        raw_deformation=raw,
     )
     meta: dict[int, object] = {1: n}
     if networks:
@@ -508,7 +508,7 @@ def make_layer(
 def _sections(meant: LayerSymbols, predictors: Sequence[int], mode: int) -> dict[int, bytes]:
     n = len(meant.anchor_q)
     sections = {POSITIONS: encode_positions(meant.anchor_q)} if n else {}
-    tensors = [] if meant.raw else list(meant.tensors())
+    tensors = [] if meant.raw_deformation else list(meant.tensors())
     planes = [residual(p, k) if k.size else k for p, k in zip(predictors, tensors, strict=False)]
     weights = [k.ravel() for k in tensors[len(planes) :]]
     flat = [row for r in planes for row in plane_channels(r)]
@@ -526,7 +526,7 @@ def _sections(meant: LayerSymbols, predictors: Sequence[int], mode: int) -> dict
             sections[PLANE] = plain_planes(flat)
         if weights:
             sections[WEIGHTS] = coded(weights)
-    if meant.raw:
+    if meant.raw_deformation:
         sections[FLOATS] = lzma_floats(list(meant.tensors()))
     return sections
 
@@ -644,7 +644,7 @@ def _hashes(layer: Layer, header: Mapping[int, object]) -> dict:
     tensors = [dequantise(m.anchor_q, header[5]), *(values[a.name] for a in ATTRIBUTES)]  # type: ignore[arg-type]
     own = list(m.tensors())
     count = len(PLANES) * len(m.planes)
-    if m.raw:
+    if m.raw_deformation:
         tensors += own
     elif own:
         of_steps = list(m.steps.values())
