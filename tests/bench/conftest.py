@@ -5,13 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
+from scenes import checkpoint_of, filmed_scene
 
-pytest.importorskip("torch")
-
-from scenes import checkpoint_of, filmed_scene  # noqa: E402
-
-from pd4dgs_codec import encode  # noqa: E402
-from pd4dgs_codec.scene import Scene  # noqa: E402
+from pd4dgs_codec import encode
+from pd4dgs_codec.scene import Scene
 
 
 @pytest.fixture(autouse=True)

@@ -10,15 +10,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
-pytest.importorskip("numba")
-
-from pd4dgs_codec import decode, encode  # noqa: E402
-from pd4dgs_codec.bench import latency, viewer  # noqa: E402
-from pd4dgs_codec.cli import bench  # noqa: E402
-from pd4dgs_codec.delivery.server import Server  # noqa: E402
-from pd4dgs_codec.errors import DataError  # noqa: E402
-from pd4dgs_codec.model.warm import warm_up  # noqa: E402
+from pd4dgs_codec import decode, encode
+from pd4dgs_codec.bench import latency, viewer
+from pd4dgs_codec.cli import bench
+from pd4dgs_codec.delivery.server import Server
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.model.warm import warm_up
 
 SIZE = (24, 16)
 

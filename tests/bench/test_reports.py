@@ -10,22 +10,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
+from PIL import Image
+from scenes import write_views
 
-torch = pytest.importorskip("torch")
-pytest.importorskip("numba")
-pytest.importorskip("matplotlib")
-Image = pytest.importorskip("PIL.Image")
-
-from scenes import write_views  # noqa: E402
-
-from pd4dgs_codec.bench import codec, pictures, render, report, timing, train  # noqa: E402
-from pd4dgs_codec.cli import bench  # noqa: E402
-from pd4dgs_codec.codec.encoder import encode  # noqa: E402
-from pd4dgs_codec.codec.options import EncodeOptions  # noqa: E402
-from pd4dgs_codec.codec.plan import plan  # noqa: E402
-from pd4dgs_codec.errors import DataError, Pd4Error  # noqa: E402
-from pd4dgs_codec.render.autograd.rasterization import rasterization  # noqa: E402
-from pd4dgs_codec.view.frames import Frame  # noqa: E402
+from pd4dgs_codec.bench import codec, pictures, render, report, timing, train
+from pd4dgs_codec.cli import bench
+from pd4dgs_codec.codec.encoder import encode
+from pd4dgs_codec.codec.options import EncodeOptions
+from pd4dgs_codec.codec.plan import plan
+from pd4dgs_codec.errors import DataError, Pd4Error
+from pd4dgs_codec.render.autograd.rasterization import rasterization
+from pd4dgs_codec.view.frames import Frame
 
 RNG = np.random.default_rng(4)
 

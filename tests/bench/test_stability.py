@@ -7,19 +7,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-pytest.importorskip("numba")
-pytest.importorskip("mpmath")
-
-from pd4dgs_codec.attributes import quantise  # noqa: E402
-from pd4dgs_codec.bench.stability import cases, rasteriser, training  # noqa: E402
-from pd4dgs_codec.cli import bench  # noqa: E402
-from pd4dgs_codec.entropy import channels  # noqa: E402
-from pd4dgs_codec.errors import DataError, EncodeError  # noqa: E402
-from pd4dgs_codec.evaluate import residuals as evaluate  # noqa: E402
-from pd4dgs_codec.model import layers, rate  # noqa: E402
-from pd4dgs_codec.render import projection  # noqa: E402
+from pd4dgs_codec.attributes import quantise
+from pd4dgs_codec.bench.stability import cases, rasteriser, training
+from pd4dgs_codec.cli import bench
+from pd4dgs_codec.entropy import channels
+from pd4dgs_codec.errors import DataError, EncodeError
+from pd4dgs_codec.evaluate import residuals as evaluate
+from pd4dgs_codec.model import layers, rate
+from pd4dgs_codec.render import projection
 
 DOCS = Path(__file__).parents[2] / "docs" / "stability.md"
 KEYS = {"case", "group", "fed", "promised", "got", "error", "bound", "status"}

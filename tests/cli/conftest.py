@@ -12,8 +12,6 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
-
 FRAMES, WIDTH, HEIGHT = 6, 32, 24
 
 

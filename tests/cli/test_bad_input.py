@@ -11,10 +11,9 @@ import sys
 from pathlib import Path
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-
-from pd4dgs_codec.cli import progress  # noqa: E402
+from pd4dgs_codec.cli import progress
 
 
 def _listing(folder: Path) -> dict[str, int]:

@@ -10,8 +10,6 @@ import sys
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
-
 ENCODE_KEYS = {"mode", "bytes", "verified", "seconds", "layers", "left_out"}
 LAYER_KEYS = {"layer", "bytes", "payload_bits", "rate_bits", "position_bits", "symbols", "anchors"}
 

@@ -9,11 +9,9 @@ from importlib import import_module
 
 import pytest
 
-pytest.importorskip("torch")
-
-from pd4dgs_codec import __main__ as dispatcher  # noqa: E402
-from pd4dgs_codec import jsonable  # noqa: E402
-from pd4dgs_codec.cli import common  # noqa: E402
+from pd4dgs_codec import __main__ as dispatcher
+from pd4dgs_codec import jsonable
+from pd4dgs_codec.cli import common
 
 VERBS = ("train", "encode", "decode", "info", "render", "eval", "bench", "package", "serve")
 

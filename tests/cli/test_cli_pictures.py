@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-
-pytest.importorskip("torch")
-Image = pytest.importorskip("PIL.Image")
+from PIL import Image
 
 WIDTH, HEIGHT = 32, 24  # of the scene's camera and of the dataset's pictures
 

@@ -7,8 +7,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-pytest.importorskip("torch")
-
 #: Fitting the priors of mode ans takes ten times as long.
 FAST = ("--mode", "lzma", "--effort", 1, "--json", "-f")
 

@@ -10,13 +10,11 @@ import subprocess
 import sys
 
 import pytest
+import torch
+from tiny import TINY
 
-torch = pytest.importorskip("torch")
-
-from tiny import TINY  # noqa: E402
-
-from pd4dgs_codec.model import checkpoint  # noqa: E402
-from pd4dgs_codec.model.config import PRESETS  # noqa: E402
+from pd4dgs_codec.model import checkpoint
+from pd4dgs_codec.model.config import PRESETS
 
 
 @pytest.fixture(autouse=True)

@@ -5,8 +5,6 @@ from types import ModuleType, SimpleNamespace
 
 import numpy as np
 import pytest
-
-pytest.importorskip("torch")
 import torch
 import torch.nn.functional as F
 

@@ -10,14 +10,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
 from strategies import LAYER_SETS, make_scene
 
-torch = pytest.importorskip("torch")
-pytest.importorskip("numba")
-
-from pd4dgs_codec.errors import DataError  # noqa: E402
-from pd4dgs_codec.model import checkpoint  # noqa: E402
-from pd4dgs_codec.model.convert import from_scene  # noqa: E402
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.model import checkpoint
+from pd4dgs_codec.model.convert import from_scene
 
 
 def model(layers=(0, 1, 2), **options):

@@ -1,17 +1,16 @@
 """HexPlane: the kernels against plain torch, against the definition, and on hard input."""
 
+import numba
 import numpy as np
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-numba = pytest.importorskip("numba")
-
-from pd4dgs_codec.errors import DataError, TrainError  # noqa: E402
-from pd4dgs_codec.model.hexplane import HexPlane, _Sample, sample_reference  # noqa: E402
-from pd4dgs_codec.model.layers import round_straight_through  # noqa: E402
-from pd4dgs_codec.model.plane_layout import PlaneLayout  # noqa: E402
-from pd4dgs_codec.model.plane_regularisers import TERMS, regularisers, regularisers_reference  # noqa: E402
-from pd4dgs_codec.scene import PLANES  # noqa: E402
+from pd4dgs_codec.errors import DataError, TrainError
+from pd4dgs_codec.model.hexplane import HexPlane, _Sample, sample_reference
+from pd4dgs_codec.model.layers import round_straight_through
+from pd4dgs_codec.model.plane_layout import PlaneLayout
+from pd4dgs_codec.model.plane_regularisers import TERMS, regularisers, regularisers_reference
+from pd4dgs_codec.scene import PLANES
 
 BOX = np.array([[-1.0, -2.0, 0.5], [1.0, 3.0, 4.5]], np.float32)
 SHAPES = [((7, 5, 9, 4), 8, (1, 2)), ((7, 1, 9, 1), 24, (1, 2, 3)), ((1, 2, 3, 2), 16, (1,))]

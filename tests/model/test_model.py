@@ -4,24 +4,22 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-torch = pytest.importorskip("torch")
-pytest.importorskip("numba")
-
-from pd4dgs_codec import decode, encode  # noqa: E402
-from pd4dgs_codec.errors import DataError  # noqa: E402
-from pd4dgs_codec.evaluate.residuals import residuals  # noqa: E402
-from pd4dgs_codec.model import model as graph  # noqa: E402
-from pd4dgs_codec.model.config import DeformationConfig  # noqa: E402
-from pd4dgs_codec.model.convert import from_scene, to_scene  # noqa: E402
-from pd4dgs_codec.model.deformation import DeformationField  # noqa: E402
-from pd4dgs_codec.model.layers import level_mask, mask_logits  # noqa: E402
-from pd4dgs_codec.model.model import Model, fresh_networks  # noqa: E402
-from pd4dgs_codec.model.picture import render_image  # noqa: E402
-from pd4dgs_codec.scene import (  # noqa: E402
+from pd4dgs_codec import decode, encode
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.evaluate.residuals import residuals
+from pd4dgs_codec.model import model as graph
+from pd4dgs_codec.model.config import DeformationConfig
+from pd4dgs_codec.model.convert import from_scene, to_scene
+from pd4dgs_codec.model.deformation import DeformationField
+from pd4dgs_codec.model.layers import level_mask, mask_logits
+from pd4dgs_codec.model.model import Model, fresh_networks
+from pd4dgs_codec.model.picture import render_image
+from pd4dgs_codec.scene import (
     GLOBAL_HEADS,
     LOCAL_HEADS,
     MASK_STEP,

@@ -2,12 +2,11 @@
 
 import math
 
+import mpmath
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-mpmath = pytest.importorskip("mpmath")
-
-from pd4dgs_codec.model.rate import (  # noqa: E402
+from pd4dgs_codec.model.rate import (
     channel_moments,
     channel_moments_reference,
     log_probability,

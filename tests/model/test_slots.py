@@ -1,12 +1,10 @@
 """The kernels for kept Gaussians against their plain torch forms, values and gradients."""
 
 import pytest
+import torch
 
-torch = pytest.importorskip("torch")
-pytest.importorskip("numba")
-
-from pd4dgs_codec.model import slots  # noqa: E402
-from pd4dgs_codec.render import threads  # noqa: E402
+from pd4dgs_codec.model import slots
+from pd4dgs_codec.render import threads
 
 N = 40
 

@@ -5,15 +5,13 @@ import sys
 import types
 
 import pytest
+import torch
+from raster_scenes import camera, draw_with_gradients, relative_errors, scene
 
-torch = pytest.importorskip("torch")
-
-from raster_scenes import camera, draw_with_gradients, relative_errors, scene  # noqa: E402
-
-from pd4dgs_codec.errors import RenderError  # noqa: E402
-from pd4dgs_codec.render.autograd import gsplat_backend  # noqa: E402
-from pd4dgs_codec.render.autograd.rasterization import rasterization  # noqa: E402
-from pd4dgs_codec.render.rasteriser import Settings  # noqa: E402
+from pd4dgs_codec.errors import RenderError
+from pd4dgs_codec.render.autograd import gsplat_backend
+from pd4dgs_codec.render.autograd.rasterization import rasterization
+from pd4dgs_codec.render.rasteriser import Settings
 
 
 def _rasterize(tensors, depth=False):

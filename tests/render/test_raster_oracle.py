@@ -3,13 +3,11 @@
 import math
 
 import pytest
+import torch
+from raster_scenes import camera, draw_with_gradients, relative_errors, scene, turned_camera
 
-torch = pytest.importorskip("torch")
-
-from raster_scenes import camera, draw_with_gradients, relative_errors, scene, turned_camera  # noqa: E402
-
-from pd4dgs_codec.render.autograd import reference  # noqa: E402
-from pd4dgs_codec.render.autograd.rasterization import rasterization  # noqa: E402
+from pd4dgs_codec.render.autograd import reference
+from pd4dgs_codec.render.autograd.rasterization import rasterization
 
 LIMIT = 1e-5
 

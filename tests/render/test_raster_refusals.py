@@ -1,13 +1,11 @@
 """What `rasterization` refuses, with one clear line."""
 
 import pytest
+import torch
+from raster_scenes import NAMES, camera, scene
 
-torch = pytest.importorskip("torch")
-
-from raster_scenes import NAMES, camera, scene  # noqa: E402
-
-from pd4dgs_codec.errors import NotFinite, RenderError  # noqa: E402
-from pd4dgs_codec.render.autograd.rasterization import rasterization  # noqa: E402
+from pd4dgs_codec.errors import NotFinite, RenderError
+from pd4dgs_codec.render.autograd.rasterization import rasterization
 
 OPTIONS = [
     ({"rasterize_mode": "antialiased"}, "rasterize_mode"),

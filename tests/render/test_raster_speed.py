@@ -3,15 +3,12 @@
 import time
 
 import pytest
+import torch
+from raster_scenes import camera, scene
 
-torch = pytest.importorskip("torch")
-pytest.importorskip("numba")
-
-from raster_scenes import camera, scene  # noqa: E402
-
-from pd4dgs_codec.render import threads  # noqa: E402
-from pd4dgs_codec.render.autograd import reference  # noqa: E402
-from pd4dgs_codec.render.autograd.rasterization import rasterization  # noqa: E402
+from pd4dgs_codec.render import threads
+from pd4dgs_codec.render.autograd import reference
+from pd4dgs_codec.render.autograd.rasterization import rasterization
 
 pytestmark = pytest.mark.slow
 TILE = 16

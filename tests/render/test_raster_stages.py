@@ -1,21 +1,18 @@
 """Projection, sorting, binning and the vector type, each alone."""
 
+import numba
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
-pytest.importorskip("numba")
-
-import numba  # noqa: E402
-from hypothesis import given, settings  # noqa: E402
-from hypothesis import strategies as st  # noqa: E402
-
-from pd4dgs_codec.render import (  # noqa: E402
+from pd4dgs_codec.render import (
     binning,
     kernels,
     rasteriser,
-    simd,  # noqa: E402
+    simd,
 )
-from pd4dgs_codec.scene import Camera  # noqa: E402
+from pd4dgs_codec.scene import Camera
 
 
 @numba.njit

@@ -1,13 +1,11 @@
 """Degenerate and extreme input: finite pictures and gradients, or a RenderError; never NaN, a hang or a crash."""
 
 import pytest
+import torch
+from raster_scenes import NAMES, camera, draw_with_gradients, relative_errors, scene
 
-torch = pytest.importorskip("torch")
-
-from raster_scenes import NAMES, camera, draw_with_gradients, relative_errors, scene  # noqa: E402
-
-from pd4dgs_codec.errors import RenderError  # noqa: E402
-from pd4dgs_codec.render.autograd.rasterization import rasterization  # noqa: E402
+from pd4dgs_codec.errors import RenderError
+from pd4dgs_codec.render.autograd.rasterization import rasterization
 
 NAN, INF = float("nan"), float("inf")
 NEAR = 0.01

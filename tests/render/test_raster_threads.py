@@ -6,14 +6,11 @@ import sys
 import threading
 
 import pytest
+import torch
+from raster_scenes import camera, draw_with_gradients, scene
 
-torch = pytest.importorskip("torch")
-pytest.importorskip("numba")
-
-from raster_scenes import camera, draw_with_gradients, scene  # noqa: E402
-
-from pd4dgs_codec.errors import RenderError  # noqa: E402
-from pd4dgs_codec.render import threads  # noqa: E402
+from pd4dgs_codec.errors import RenderError
+from pd4dgs_codec.render import threads
 
 needs_two = pytest.mark.skipif(threads.available() < 2, reason="needs 2 CPUs")
 

@@ -8,12 +8,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-pytest.importorskip("numba")
-
-import pd4dgs_codec  # noqa: E402
-from pd4dgs_codec.errors import NotFinite, RenderError  # noqa: E402
-from pd4dgs_codec.render import rasteriser  # noqa: E402
-from pd4dgs_codec.scene import Camera  # noqa: E402
+import pd4dgs_codec
+from pd4dgs_codec.errors import NotFinite, RenderError
+from pd4dgs_codec.render import rasteriser
+from pd4dgs_codec.scene import Camera
 
 CAMERA = Camera(np.eye(4, dtype=np.float32), np.array([[60, 0, 25], [0, 66, 20], [0, 0, 1]], np.float32), 50, 40)
 

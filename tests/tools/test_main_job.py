@@ -11,25 +11,21 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pages import main_job, tables, trainings
+from pages.main_job import Job, run_job
+from PIL import Image
+from scenes import SMALLEST
 
-torch = pytest.importorskip("torch")
-pytest.importorskip("numba")
-Image = pytest.importorskip("PIL.Image")
-
-from pages import main_job, tables, trainings  # noqa: E402
-from pages.main_job import Job, run_job  # noqa: E402
-from scenes import SMALLEST  # noqa: E402
-
-from pd4dgs_codec import decode  # noqa: E402
-from pd4dgs_codec.codec.encoder import encode_with_report  # noqa: E402
-from pd4dgs_codec.codec.info import info  # noqa: E402
-from pd4dgs_codec.data.view import Dataset, View  # noqa: E402
-from pd4dgs_codec.errors import TrainError  # noqa: E402
-from pd4dgs_codec.model import checkpoint  # noqa: E402
-from pd4dgs_codec.model.config import PRESETS  # noqa: E402
-from pd4dgs_codec.model.convert import to_scene  # noqa: E402
-from pd4dgs_codec.train.config import TrainConfig  # noqa: E402
-from pd4dgs_codec.train.learner import Learner  # noqa: E402
+from pd4dgs_codec import decode
+from pd4dgs_codec.codec.encoder import encode_with_report
+from pd4dgs_codec.codec.info import info
+from pd4dgs_codec.data.view import Dataset, View
+from pd4dgs_codec.errors import TrainError
+from pd4dgs_codec.model import checkpoint
+from pd4dgs_codec.model.config import PRESETS
+from pd4dgs_codec.model.convert import to_scene
+from pd4dgs_codec.train.config import TrainConfig
+from pd4dgs_codec.train.learner import Learner
 
 WIDTH, HEIGHT, FRAMES = 48, 36, 6
 CONFIG = TrainConfig(preset="tiny", source="two-discs", iterations=40)

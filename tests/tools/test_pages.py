@@ -7,23 +7,19 @@ import math
 import re
 import sys
 
+import evaluation
+import latency
+import omissions
+import precision
 import pytest
+import results
+from pages import page, tables
+from pages import scenes as places
+from pages.page import Page
+from pages.paper.tables import TABLES
+from scenes import checkpoint_of, filmed_scene, write_views
 
-pytest.importorskip("torch")
-pytest.importorskip("numba")
-
-import evaluation  # noqa: E402
-import latency  # noqa: E402
-import omissions  # noqa: E402
-import precision  # noqa: E402
-import results  # noqa: E402
-from pages import page, tables  # noqa: E402
-from pages import scenes as places  # noqa: E402
-from pages.page import Page  # noqa: E402
-from pages.paper.tables import TABLES  # noqa: E402
-from scenes import checkpoint_of, filmed_scene, write_views  # noqa: E402
-
-from pd4dgs_codec.errors import DataError  # noqa: E402
+from pd4dgs_codec.errors import DataError
 
 ROOT = page.ROOT
 DOCS = ROOT / "docs"

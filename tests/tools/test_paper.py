@@ -6,13 +6,9 @@ import json
 from pathlib import Path
 
 import pytest
-
-torch = pytest.importorskip("torch")
-pytest.importorskip("numba")
-
-from pages.paper import plots, statistics, tables  # noqa: E402
-from pages.paper.published import FIRST_FRAME  # noqa: E402
-from pages.paper.runs import (  # noqa: E402
+from pages.paper import plots, statistics, tables
+from pages.paper.published import FIRST_FRAME
+from pages.paper.runs import (
     FULL,
     MONOLITHIC,
     SCAFFOLD,
@@ -22,13 +18,13 @@ from pages.paper.runs import (  # noqa: E402
     held_to,
     measure,
 )
-from scenes import SMALLEST  # noqa: E402
+from scenes import SMALLEST
 
-from pd4dgs_codec.data.dataset import load  # noqa: E402
-from pd4dgs_codec.data.view import Dataset  # noqa: E402
-from pd4dgs_codec.model import checkpoint  # noqa: E402
-from pd4dgs_codec.model.config import PRESETS  # noqa: E402
-from pd4dgs_codec.train.config import TrainConfig  # noqa: E402
+from pd4dgs_codec.data.dataset import load
+from pd4dgs_codec.data.view import Dataset
+from pd4dgs_codec.model import checkpoint
+from pd4dgs_codec.model.config import PRESETS
+from pd4dgs_codec.train.config import TrainConfig
 
 STATIC = "synthetic:static"
 TOOL = Path(__file__).resolve().parents[2] / "tools" / "paper.py"

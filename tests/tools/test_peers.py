@@ -6,16 +6,12 @@ import sys
 
 import numpy as np
 import pytest
+from pages import peers
 from strategies import make_scene
 
-pytest.importorskip("torch")
-pytest.importorskip("numba")
-
-from pages import peers  # noqa: E402
-
-from pd4dgs_codec.bench import timing  # noqa: E402
-from pd4dgs_codec.codec.decoder import decode_layers  # noqa: E402
-from pd4dgs_codec.codec.encoder import encode  # noqa: E402
+from pd4dgs_codec.bench import timing
+from pd4dgs_codec.codec.decoder import decode_layers
+from pd4dgs_codec.codec.encoder import encode
 
 RNG = np.random.default_rng(4)
 

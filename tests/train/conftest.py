@@ -1,14 +1,10 @@
 """The disc's dataset, and the preset `tiny` so small that a step costs milliseconds."""
 
-from importlib.util import find_spec
-
 import pytest
 from tiny import TINY, disc
 
 from pd4dgs_codec.data import Dataset
 from pd4dgs_codec.model.config import PRESETS
-
-collect_ignore_glob = [] if find_spec("torch") and find_spec("numba") else ["test_*.py"]
 
 
 @pytest.fixture

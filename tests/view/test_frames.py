@@ -4,11 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from PIL import Image
 
-Image = pytest.importorskip("PIL.Image")
-
-from pd4dgs_codec.scene import Camera, SceneInfo  # noqa: E402
-from pd4dgs_codec.view import frames, movie, panels  # noqa: E402
+from pd4dgs_codec.scene import Camera, SceneInfo
+from pd4dgs_codec.view import frames, movie, panels
 
 
 def _info() -> SceneInfo:

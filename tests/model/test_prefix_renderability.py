@@ -10,15 +10,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import LAYER_SETS, RANGES, assert_same_scene, make_scene, scenes
 
-pytest.importorskip("torch")
-pytest.importorskip("numba")
-
-from pd4dgs_codec import decode, encode  # noqa: E402
-from pd4dgs_codec.codec.decoder import decode_layers  # noqa: E402
-from pd4dgs_codec.codec.info import info  # noqa: E402
-from pd4dgs_codec.model.convert import from_scene  # noqa: E402
-from pd4dgs_codec.model.picture import render_image  # noqa: E402
-from pd4dgs_codec.scene import Camera, Deformation, Scene  # noqa: E402
+from pd4dgs_codec import decode, encode
+from pd4dgs_codec.codec.decoder import decode_layers
+from pd4dgs_codec.codec.info import info
+from pd4dgs_codec.model.convert import from_scene
+from pd4dgs_codec.model.picture import render_image
+from pd4dgs_codec.scene import Camera, Deformation, Scene
 
 WIDTH, HEIGHT = 24, 16
 #: Normalised times; those outside 0..1 are clamped to it.
