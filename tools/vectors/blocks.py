@@ -409,7 +409,7 @@ class Layer:
     def channels(self) -> list[np.ndarray]:
         """The channels of sections 1 to 4 in their order, planes under predictor 0."""
         m = self.meant
-        tensors = [] if m.raw else list(m.tensors())
+        tensors = [] if m.raw_deformation else list(m.tensors())
         return [m.mask_increase, m.mask_own, *m.attributes, *(row for t in tensors for row in plane_channels(t))]
 
 
@@ -507,7 +507,7 @@ def make_layer(
 def _sections(meant: LayerSymbols, predictors: Sequence[int], mode: int) -> dict[int, bytes]:
     n = len(meant.anchor_q)
     sections = {POSITIONS: encode_positions(meant.anchor_q)} if n else {}
-    tensors = [] if meant.raw else list(meant.tensors())
+    tensors = [] if meant.raw_deformation else list(meant.tensors())
     planes = [residual(p, k) for p, k in zip(predictors, tensors, strict=False)]
     weights = [k.ravel() for k in tensors[len(planes) :]]
     flat = [row for r in planes for row in plane_channels(r)]
@@ -525,7 +525,7 @@ def _sections(meant: LayerSymbols, predictors: Sequence[int], mode: int) -> dict
             sections[PLANE] = plain_planes(flat)
         if weights:
             sections[WEIGHTS] = coded(weights)
-    if meant.raw:
+    if meant.raw_deformation:
         sections[FLOATS] = lzma_floats(list(meant.tensors()))
     return sections
 
@@ -641,7 +641,7 @@ def _hashes(layer: Layer, header: Mapping[int, object]) -> dict:
     tensors = [dequantise(m.anchor_q, header[5]), *(values[a.name] for a in ATTRIBUTES)]  # type: ignore[arg-type]
     own = list(m.tensors())
     count = len(PLANES) * len(m.planes)
-    if m.raw:
+    if m.raw_deformation:
         tensors += own
     elif own:
         of_steps = list(m.steps.values())
