@@ -105,11 +105,26 @@ def _located(error: DecodeError, chunk: int, offset: int) -> DecodeError:
     return kind(error.message, offset=offset, chunk=chunk)
 
 
+def read_layers(data: bytes, *, max_layer: int | None = None, allow_partial: bool = False) -> tuple[LayerReader, bool]:
+    """(reader that holds the layers asked for, whether none of them is missing); arguments as in `decode`."""
+    if max_layer is not None and max_layer < 0:
+        raise ValueError(f"max_layer must be 0 or more, found {max_layer}")
+    reader = LayerReader()
+    try:
+        while reader.next_layer(data, max_layer) is not None:
+            pass
+    except Truncated:
+        if not (allow_partial and reader.layers):
+            raise
+        return reader, False
+    return reader, True
+
+
 def decode_layers(
     data: bytes, *, max_layer: int | None = None, allow_partial: bool = False
 ) -> tuple[Header, list[LayerSymbols], bool]:
     """(header, symbols per layer, whether nothing asked for is missing)."""
-    reader, complete = _read(data, max_layer, allow_partial)
+    reader, complete = read_layers(data, max_layer=max_layer, allow_partial=allow_partial)
     assert reader.header is not None
     return reader.header, reader.layers, complete
 
@@ -125,19 +140,5 @@ def decode(data: bytes, *, max_layer: int | None = None, allow_partial: bool = F
 
 def decode_partial(data: bytes, *, max_layer: int | None = None, allow_partial: bool = True) -> tuple[Scene, bool]:
     """(scene, complete): as decode, and whether every layer asked for was there."""
-    reader, complete = _read(data, max_layer, allow_partial)
+    reader, complete = read_layers(data, max_layer=max_layer, allow_partial=allow_partial)
     return reader.scene(), complete
-
-
-def _read(data: bytes, max_layer: int | None, allow_partial: bool) -> tuple[LayerReader, bool]:
-    if max_layer is not None and max_layer < 0:
-        raise ValueError(f"max_layer must be 0 or more, found {max_layer}")
-    reader = LayerReader()
-    try:
-        while reader.next_layer(data, max_layer) is not None:
-            pass
-    except Truncated:
-        if not (allow_partial and reader.layers):
-            raise
-        return reader, False
-    return reader, True

@@ -9,7 +9,7 @@ import numpy as np
 
 from pd4dgs_codec.bitstream.container import CHUNK_OVERHEAD, MAJOR, MINOR, PREAMBLE_SIZE, read_chunk, read_preamble
 from pd4dgs_codec.codec.bounds import rounding_bounds
-from pd4dgs_codec.codec.decoder import LayerReader
+from pd4dgs_codec.codec.decoder import read_layers
 from pd4dgs_codec.codec.header import unpack_header
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
 from pd4dgs_codec.codec.payload import read_meta
@@ -67,9 +67,7 @@ def nearest_bounds(data: bytes) -> dict[str, float]:
 
     Decodes all of it. They can be held against the declared ones, where the errors themselves take the scene encoded.
     """
-    reader = LayerReader()
-    while reader.next_layer(data) is not None:
-        pass
+    reader, _ = read_layers(data)
     assert reader.header is not None
     return rounding_bounds(reader.scene(), reader.header.raw_deformation)
 
@@ -84,9 +82,7 @@ def hashes(data: bytes, max_layer: int | None = None) -> list[dict[str, Any]]:
     tensors: float32 little-endian of anchor [n, 3], feature [n, 32], scaling_log [n, 6], offset [n, 10, 3] of own rows,
     then planes and networks as above.
     """
-    reader = LayerReader()
-    while reader.next_layer(data, max_layer) is not None:
-        pass
+    reader, _ = read_layers(data, max_layer=max_layer)
     scene = reader.scene()
     rows = []
     for index, layer in enumerate(reader.layers):

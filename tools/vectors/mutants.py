@@ -1,8 +1,8 @@
 """Mistakes that an implementer could make, each built into the reference decoder: the vectors must notice them all.
 
-A mutant is a substitution in the source of `spec/refdec.py`. Those of mutants.txt are written by hand: another rounding,
-order, width, limit or branch. `slips` makes more from the source itself: each limit of a check off by one, and each part
-of a check left out.
+A mutant is a substitution in the source of `spec/refdec.py`. Those of mutants.txt are written by hand: another
+rounding, order, width, limit or branch. `slips` makes more from the source itself: each limit of a check off by one,
+and each part of a check left out.
 """
 
 from __future__ import annotations
