@@ -1,6 +1,7 @@
 """Who may import whom, read from the source of every room; and decoding where torch cannot be imported."""
 
 import ast
+import re
 import subprocess
 import sys
 from graphlib import CycleError, TopologicalSorter
@@ -22,27 +23,17 @@ ROOT = PACKAGE.parent
 
 #: What every room may import.
 EVERYWHERE = {"errors", "scene"}
-#: Room -> the other rooms that it may import. CONTRIBUTING.md draws the same picture.
-ALLOWED: dict[str, set[str]] = {
-    "errors": set(),
-    "scene": set(),
-    "atomic": set(),
-    "jsonable": set(),
-    "morton": set(),
-    "bitstream": set(),
-    "entropy": {"morton"},
-    "attributes": set(),
-    "evaluate": set(),
-    "codec": {"attributes", "bitstream", "entropy", "evaluate", "morton"},
-    "delivery": {"bitstream", "codec"},
-    "render": set(),
-    "data": set(),
-    "metrics": {"data"},
-    "model": {"atomic", "attributes", "codec", "evaluate", "render"},
-    "train": {"atomic", "data", "jsonable", "metrics", "model", "morton", "render"},
-    "view": {"bitstream", "codec", "data", "metrics", "model", "render"},
-    "pack": {"attributes", "bitstream", "codec", "data", "entropy", "metrics", "model", "view"},
-}
+
+
+def read_map() -> dict[str, set[str]]:
+    """Room -> the other rooms that it may import, from the table in CONTRIBUTING.md."""
+    text = (ROOT / "CONTRIBUTING.md").read_text()
+    table = text[text.index("<!-- map:") : text.index("<!-- end of map -->")]
+    rows = re.findall(r"^\| `(\w+)` \| [^|]+ \| ?([^|]*?) ?\|$", table, flags=re.MULTILINE)
+    return {room: {name for name in names.split(", ") if name} for room, names in rows if not names.startswith("every")}
+
+
+ALLOWED = read_map()
 #: These may import every room but `cli`: what the package measures of itself, its commands, its entry points.
 ABOVE_ALL = {"bench", "cli", "__init__", "__main__"}
 #: Rooms that a decoder is made of, and the libraries that they may use.
@@ -85,6 +76,11 @@ ROOMS = sorted({room_of(name) for name in MODULES})
 
 def test_the_reader_of_imports_reads_relative_ones():
     assert {"pd4dgs_codec.errors", "numpy", "constriction"} <= IMPORTS["pd4dgs_codec.entropy.ans"]
+
+
+def test_every_folder_with_modules_is_a_package():
+    folders = {path.parent for path in PACKAGE.rglob("*.py")}  # a folder without __init__.py is missing in the wheel
+    assert [folder for folder in folders if not (folder / "__init__.py").exists()] == []
 
 
 def test_every_room_has_its_rule_and_every_rule_its_room():

@@ -5,6 +5,7 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 source tools/environment.sh
 make_environment .venv-test train,eval,test
-.venv-test/bin/ruff check pd4dgs_codec tests tools
+.venv-test/bin/ruff check pd4dgs_codec spec tests tools
+.venv-test/bin/ruff format --check --quiet pd4dgs_codec spec tests tools
 .venv-test/bin/mypy
 exec .venv-test/bin/python -m pytest -n auto --maxprocesses 4 --dist worksteal "$@"

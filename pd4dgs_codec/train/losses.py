@@ -7,6 +7,7 @@ from torch import Tensor
 
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.rate import channel_moments, rate_bits
+from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import MASK_THRESHOLD
 
 
@@ -53,13 +54,7 @@ class Neighbours:
 
     def __init__(self, anchor_q: Tensor):
         self.anchor_q = anchor_q.cpu().to(torch.int64)
-        n = len(anchor_q)
-        cells = self.anchor_q - self.anchor_q.amin(0) if n else self.anchor_q
-        code = torch.zeros(n, dtype=torch.int64)
-        for bit in range(20):
-            for axis in range(3):
-                code |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
-        self.order = torch.argsort(code)
+        self.order = torch.from_numpy(morton_order(self.anchor_q.numpy()))
 
     def draw(self, tau: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Pairs int64 [2, S] and their weights exp(-|x_i - x_j| / tau) [S], distances in voxels."""

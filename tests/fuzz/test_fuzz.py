@@ -357,7 +357,7 @@ def test_a_hundred_thousand_damages_of_real_files_are_caught():
 def test_checks_take_a_twentieth_of_decoding(monkeypatch):
     """Checksums, scene id, header, parameters, tables, ranges, duplicates, finiteness, timed where they are called."""
     from pd4dgs_codec.bitstream import container
-    from pd4dgs_codec.codec import decoder, layers
+    from pd4dgs_codec.codec import decoder, payload
     from pd4dgs_codec.entropy import ans
 
     options = {"channels": 16, "sides": (64, 64, 64, 40), "hidden": (32,), "width": 32}
@@ -379,8 +379,8 @@ def test_checks_take_a_twentieth_of_decoding(monkeypatch):
         (container.zlib, "crc32"),
         (decoder, "scene_id_of"),
         (decoder, "unpack_header"),
-        (layers, "read_meta"),
-        (layers, "_check_ranges"),
+        (payload, "read_meta"),
+        (payload, "_check_ranges"),
         (decoder, "check_last_layer"),
         (ans, "_frequencies"),
     ]

@@ -12,7 +12,7 @@ import re
 import resource
 import signal
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -27,7 +27,7 @@ READER = "Reader."
 #: Bytes that end early are one rule (clause 15), wherever they are missed.
 TAKE = "Reader.take"
 
-SECONDS = 20  #: of processor time for one file; the slowest of the vectors takes a tenth
+SECONDS = 60  #: of processor time for one file; the slowest of the vectors takes a third
 MEMORY = 3 << 30  #: bytes of address space
 
 
@@ -163,7 +163,7 @@ def limit_memory() -> None:
     resource.setrlimit(resource.RLIMIT_AS, (MEMORY if hard == resource.RLIM_INFINITY else min(MEMORY, hard), hard))
 
 
-def in_processes(function: Callable[[Any], Any], items: list, jobs: int) -> Iterator[Any]:
+def in_processes(function: Callable[[Any], Any], items: Sequence[Any], jobs: int) -> Iterator[Any]:
     """function(item) of each item in order, in `jobs` processes of limited memory."""
     import multiprocessing
 

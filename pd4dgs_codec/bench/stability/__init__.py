@@ -1,0 +1,1 @@
+"""Stiff and extreme cases, each with what was fed, promised and found."""

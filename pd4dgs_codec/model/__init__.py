@@ -1,0 +1,1 @@
+"""The torch model: scaffold, HexPlanes, deformations, masks, rate; checkpoints; pictures of a model."""

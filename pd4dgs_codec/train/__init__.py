@@ -1,0 +1,1 @@
+"""Training: losses, rollout over levels, growing and pruning, the step and the run."""
