@@ -5,12 +5,19 @@ ask for them by number. The shell of a background job ignores SIGINT, and its ch
 it heeded.
 """
 
+import io
+import json
+import math
 import os
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from importlib import import_module
 from importlib.util import find_spec
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from hypothesis import HealthCheck, settings
@@ -37,3 +44,37 @@ def _heed_interrupts() -> Iterator[None]:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a command did."""
+
+    code: int
+    out: bytes
+    err: str
+
+    @property
+    def json(self) -> Any:
+        return json.loads(self.out)
+
+    @property
+    def error_lines(self) -> list[str]:
+        return self.err.splitlines()
+
+
+@pytest.fixture
+def cli(capfdbinary, monkeypatch) -> Callable[..., Result]:
+    """cli("info", path, "--json", stdin=b"...") -> Result. No command is so slow here that it tells of its progress."""
+    monkeypatch.setattr("pd4dgs_codec.cli.progress.LINE_SECONDS", math.inf)
+
+    def call(verb: str, *argv: object, stdin: bytes | None = None) -> Result:
+        if stdin is not None:
+            stream = SimpleNamespace(buffer=io.BytesIO(stdin), isatty=lambda: False)
+            monkeypatch.setattr("sys.stdin", stream)
+        capfdbinary.readouterr()
+        code = import_module(f"pd4dgs_codec.cli.{verb}").main([str(a) for a in argv])
+        out, err = capfdbinary.readouterr()
+        return Result(code, out, err.decode())
+
+    return call

@@ -1,19 +1,14 @@
-"""A small scene with a camera as scene, bytes and checkpoint; one thread, since everything here is small."""
+"""A small scene with a camera as scene, bytes and checkpoint."""
 
 from __future__ import annotations
 
 from pathlib import Path
 
 import pytest
-from scenes import checkpoint_of, filmed_scene
+from tiny import checkpoint_of, filmed_scene
 
 from pd4dgs_codec import encode
 from pd4dgs_codec.scene import Scene
-
-
-@pytest.fixture(autouse=True)
-def _one_thread(monkeypatch):
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
 
 
 @pytest.fixture(scope="session")

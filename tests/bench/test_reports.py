@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from scenes import write_views
+from tiny import write_views
 
 from pd4dgs_codec.bench import codec, pictures, render, report, timing, train
 from pd4dgs_codec.cli import bench
@@ -41,7 +41,7 @@ def test_median_and_quartiles():
 
 def test_work_is_repeated_until_the_budget_is_spent():
     calls = []
-    _, found = timing.measure(lambda: calls.append(1), 4)
+    _, found = timing.measure(lambda: calls.append(1), 4, budget=math.inf)
     assert found.repeats == len(calls) == 4
     assert timing.measure(lambda: None, 4, budget=0.0)[1].repeats == 1
 
@@ -51,7 +51,7 @@ def test_a_cold_run_reports_its_own_memory(tmp_path, scene):
     path.write_bytes(encode(scene, effort=1))
     ballast = np.ones(200 << 20, np.uint8)  # a child must not be charged for its parent's memory
     found = timing.cold("decode", [str(path)], 1)
-    assert found.seconds.median > 0.05 and 10 << 20 < found.peak_bytes < ballast.nbytes
+    assert found.seconds.median > 0 and 10 << 20 < found.peak_bytes < ballast.nbytes
     path.write_bytes(b"nothing")
     with pytest.raises(Pd4Error, match=r"^pd4dgs-decode: error: .*scene.pd4"):
         timing.cold("decode", [str(path)], 1)

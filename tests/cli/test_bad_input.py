@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import errno
 import json
-import math
 import os
 import subprocess
 import sys
@@ -13,17 +12,14 @@ from pathlib import Path
 import pytest
 import torch
 
-from pd4dgs_codec.cli import progress
-
 
 def _listing(folder: Path) -> dict[str, int]:
     return {str(p.relative_to(folder)): p.stat().st_size for p in sorted(folder.rglob("*"))}
 
 
 @pytest.fixture
-def fails(cli, tmp_path, monkeypatch):
+def fails(cli, tmp_path):
     """fails(verb, *argv, says=...): the command must fail cleanly, with and without --json."""
-    monkeypatch.setattr(progress, "LINE_SECONDS", math.inf)  # kernels may have to be compiled: no line of progress
 
     def check(verb: str, *argv: object, says: str = "", stdin: bytes | None = None):
         before = _listing(tmp_path)

@@ -29,7 +29,7 @@ from pd4dgs_codec.errors import ChecksumMismatch, DeliveryError, Pd4Error, Trunc
 from pd4dgs_codec.scene import Scene
 
 RATE = 10e6
-STALL_SECONDS = 1.0  #: after which the client of the table takes silence for a cut; its default is 10
+STALL_SECONDS = 1.0  #: after which the client takes silence for a cut in rows that have some; its default is 10
 SLUMP = 0.1  #: share of the rate that a collapsed link still carries
 SLUMP_SECONDS = 1.0
 CUTS_PER_TRANSFER = 10
@@ -172,12 +172,14 @@ def run(file: File, scenario: Scenario, rate: float = RATE) -> Row:
     scenes: list[tuple[Scene, float]] = []
     error: Pd4Error | None = None
     timers = scenario.weather(link)
+    silent = any(fault.how == "stall" for fault in scenario.faults)
+    patience = {"stall": STALL_SECONDS} if silent else {}
     with FaultyServer(content, list(scenario.faults), ranges=scenario.ranges, link=link) as server:
         server.heeds_if_range = scenario.heeds_if_range
         for timer in timers:
             timer.start()
         start = time.monotonic()
-        with SceneClient(server.url, stall=STALL_SECONDS) as client:
+        with SceneClient(server.url, **patience) as client:
             try:
                 for scene in client.scenes():
                     scenes.append((scene, time.monotonic() - start))

@@ -8,7 +8,6 @@ import os
 import struct
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
-from importlib import import_module
 from pathlib import Path
 
 import numpy as np
@@ -177,55 +176,45 @@ def test_large_boxes_are_read():
 # -- the command -------------------------------------------------------------------------------------------------------
 
 
-@pytest.fixture
-def call(capfdbinary):
-    def run(*argv: object) -> tuple[int, bytes, str]:
-        code = import_module("pd4dgs_codec.cli.package").main([str(a) for a in argv])
-        out, err = capfdbinary.readouterr()
-        return code, out, err.decode()
-
-    return run
-
-
-def test_the_command_writes_the_folder_whole_or_not_at_all(call, folder, tmp_path, scene_bytes):
+def test_the_command_writes_the_folder_whole_or_not_at_all(cli, folder, tmp_path, scene_bytes):
     output = tmp_path / "deep" / "out"
-    code, out, err = call(folder / "scene.pd4", "-o", output, "--no-video", "--json")
-    assert code == 0 and err == ""
-    told = json.loads(out)
+    done = cli("package", folder / "scene.pd4", "-o", output, "--no-video", "--json")
+    assert done.code == 0 and done.err == ""
+    told = done.json
     assert {row["name"]: row["bytes"] for row in told["files"]} == {p.name: p.stat().st_size for p in output.iterdir()}
     assert (output / "scene.pd4").read_bytes() == scene_bytes and told["video"] is False
-    assert call(folder / "scene.pd4", "-o", output, "--no-video")[0] == 1
-    assert call(folder / "scene.pd4", "-o", output, "--no-video", "-f")[0] == 0
+    assert cli("package", folder / "scene.pd4", "-o", output, "--no-video").code == 1
+    assert cli("package", folder / "scene.pd4", "-o", output, "--no-video", "-f").code == 0
     (folder / "cut.pd4").write_bytes(scene_bytes[:-1])
-    code, out, err = call(folder / "cut.pd4", "-o", tmp_path / "other")
-    assert code == 1 and len(err.splitlines()) == 1 and not (tmp_path / "other").exists()
+    done = cli("package", folder / "cut.pd4", "-o", tmp_path / "other")
+    assert done.code == 1 and len(done.err.splitlines()) == 1 and not (tmp_path / "other").exists()
 
 
-def test_without_a_renderer_there_is_a_clear_word(call, folder, tmp_path, monkeypatch):
+def test_without_a_renderer_there_is_a_clear_word(cli, folder, tmp_path, monkeypatch):
     def gone(*_):
         raise ModuleNotFoundError("No module named 'torch'", name="torch")
 
     monkeypatch.setattr("pd4dgs_codec.cli.package._render", gone)
-    code, _, err = call(folder / "scene.pd4", "-o", tmp_path / "out")
-    assert code == 0 and "no 2D video: needs the module torch" in err
-    code, _, err = call(folder / "scene.pd4", "-o", tmp_path / "other", "-j", 100_000)
-    assert code == 1 and "threads is 100000" in err and not (tmp_path / "other").exists()
+    done = cli("package", folder / "scene.pd4", "-o", tmp_path / "out")
+    assert done.code == 0 and "no 2D video: needs the module torch" in done.err
+    done = cli("package", folder / "scene.pd4", "-o", tmp_path / "other", "-j", 100_000)
+    assert done.code == 1 and "threads is 100000" in done.err and not (tmp_path / "other").exists()
 
 
 @pytest.mark.parametrize(
     ("time_range", "camera", "says"), [((0.0, 2.0), False, "no camera"), ((0.0, 1e5), True, "2,000,000 frames")]
 )
-def test_scenes_that_make_no_video(call, tmp_path, time_range, camera, says):
+def test_scenes_that_make_no_video(cli, tmp_path, time_range, camera, says):
     pytest.importorskip("torch")
     scene = make_scene(7, layers=(0,), anchors=3, with_camera=camera)
     (tmp_path / "s.pd4").write_bytes(encode(replace(scene, info=replace(scene.info, time_range=time_range)), effort=1))
-    code, out, err = call(tmp_path / "s.pd4", "-o", tmp_path / "out", "--json")
-    told = json.loads(out)
-    assert code == 0 and told["video"] is False and says in told["why_no_video"] and says in err
+    done = cli("package", tmp_path / "s.pd4", "-o", tmp_path / "out", "--json")
+    told = done.json
+    assert done.code == 0 and told["video"] is False and says in told["why_no_video"] and says in done.err
     assert not (tmp_path / "out" / "fallback.mp4").exists()
 
 
-def test_a_rendered_video_is_packaged(call, folder, tmp_path, monkeypatch):
+def test_a_rendered_video_is_packaged(cli, folder, tmp_path, monkeypatch):
     pytest.importorskip("torch")
     pytest.importorskip("imageio_ffmpeg")
     grey = np.full((48, 65, 3), 0.5, np.float32)  # in place of seconds of compiling kernels
@@ -238,8 +227,8 @@ def test_a_rendered_video_is_packaged(call, folder, tmp_path, monkeypatch):
     (folder / "small.pd4").write_bytes(encode(replace(scene, info=replace(scene.info, camera=small)), effort=1))
     read_layer, read = decoder.read_layer, []
     monkeypatch.setattr(decoder, "read_layer", lambda *args: read.append(args[1].layer) or read_layer(*args))
-    code, out, err = call(folder / "small.pd4", "-o", tmp_path / "out", "--fps", 10, "--json")
-    assert code == 0 and json.loads(out)["video"] is True, err
+    done = cli("package", folder / "small.pd4", "-o", tmp_path / "out", "--fps", 10, "--json")
+    assert done.code == 0 and done.json["video"] is True, done.err
     assert read == [0, 1, 2]  # each layer is decoded once, for the check and for the video
     init, pieces = mp4.fragments((tmp_path / "out" / "fallback.mp4").read_bytes())
     low, high = scene.info.time_range

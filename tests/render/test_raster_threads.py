@@ -4,6 +4,7 @@ import os
 import subprocess
 import sys
 import threading
+from ctypes.util import find_library
 
 import pytest
 import torch
@@ -92,7 +93,7 @@ print(numba.threading_layer(), numba.get_num_threads(), torch.get_num_threads(),
 
 def test_before_torch_in_a_new_process():
     layer, numba_threads, torch_threads, policy = _run(_CHILD)
-    assert layer == ("tbb" if threads.load_tbb() else layer)
+    assert (layer == "tbb") == threads.load_tbb()
     assert (numba_threads, torch_threads, policy) == ("1", "1", "passive")
 
 
@@ -105,8 +106,7 @@ def test_numpy_imported_afterwards_starts_no_threads_of_its_own():
 
 def test_without_tbb_another_layer_is_used():
     child = _CHILD.replace("threads.configure(1)", "threads.load_tbb = lambda: False\nthreads.configure(1)")
-    layer = _run(child)[0]
-    assert layer in ("tbb", "omp", "workqueue")
+    assert _run(child)[0] in ("omp", "workqueue") or find_library("tbb") is not None
 
 
 def test_a_users_choice_of_layer_and_policy_stays():

@@ -14,12 +14,11 @@ import pytest
 from pages import main_job, tables, trainings
 from pages.main_job import Job, run_job
 from PIL import Image
-from scenes import SMALLEST
+from tiny import HEIGHT, TINY, WIDTH, disc
 
 from pd4dgs_codec import decode
 from pd4dgs_codec.codec.encoder import encode_with_report
 from pd4dgs_codec.codec.info import info
-from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import TrainError
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import PRESETS
@@ -27,39 +26,22 @@ from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.learner import Learner
 
-WIDTH, HEIGHT, FRAMES = 48, 36, 6
-CONFIG = TrainConfig(preset="tiny", source="two-discs", iterations=40)
-
-
-def _view(t: float, camera_id: int = 0) -> View:
-    """Two discs, one of which moves, on grey."""
-    y, x = np.mgrid[0:HEIGHT, 0:WIDTH] + 0.5
-    image = np.full((HEIGHT, WIDTH, 3), 100, np.uint8)
-    image[(x - 12 - 20 * t) ** 2 + (y - 18) ** 2 < 36] = (220, 60, 40)
-    image[(x - 36) ** 2 + (y - 9) ** 2 < 16] = (30, 200, 90)
-    viewmat = np.eye(4, dtype=np.float32)
-    viewmat[2, 3] = 3.0
-    K = np.array([[40, 0, WIDTH / 2], [0, 40, HEIGHT / 2], [0, 0, 1]], np.float32)
-    return View(viewmat, K, WIDTH, HEIGHT, t, image, None, f"{t:.2f}", camera_id)
+FRAMES = 6
+CONFIG = TrainConfig(preset="tiny", source="disc", iterations=40)
 
 
 @pytest.fixture(scope="module")
 def job() -> Iterator[Job]:
     """A tiny job whose dataset comes from here and whose model has few anchors."""
-    box = np.array([[-1.8, -1.4, -0.5], [1.8, 1.4, 0.5]], np.float32)
-    dataset = Dataset(
-        name="two-discs", train=tuple(_view(t) for t in np.linspace(0, 1, FRAMES)), test=(_view(0.3), _view(0.7)),
-        points=None, point_colors=None, box=box, near=0.1, far=10.0, background=(0.0, 0.0, 0.0), time_range=(0.0, 1.0),
-        up=(0.0, -1.0, 0.0), unit=0.0, masked=False,
-    )  # fmt: skip
+    dataset = disc(held_out=(0.3, 0.7))
 
     def load(source, *, downscale, holdout):
-        assert source == "two-discs" and (downscale, holdout) == (CONFIG.downscale, CONFIG.holdout)
+        assert source == "disc" and (downscale, holdout) == (CONFIG.downscale, CONFIG.holdout)
         return dataset
 
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(main_job, "load", load)
-        patch.setitem(PRESETS, "tiny", SMALLEST)
+        patch.setitem(PRESETS, "tiny", TINY)
         yield Job("discs", CONFIG)
 
 

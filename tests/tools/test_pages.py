@@ -17,7 +17,7 @@ from pages import page, tables
 from pages import scenes as places
 from pages.page import Page
 from pages.paper.tables import TABLES
-from scenes import checkpoint_of, filmed_scene, write_views
+from tiny import checkpoint_of, filmed_scene, write_views
 
 from pd4dgs_codec.errors import DataError
 
@@ -131,7 +131,6 @@ def test_scenes_that_are_not_there_are_named(tmp_path, capsys, monkeypatch):
 
 
 def test_the_reports_printed_are_those_of_the_page(tmp_path, capsys, monkeypatch):
-    monkeypatch.setenv("OMP_NUM_THREADS", "1")
     monkeypatch.setitem(sys.modules, "torchac", None)  # builds for minutes where it was never used
     monkeypatch.setattr(precision, "CODEC", ("--modes", "ans,lzma", "--repeats", "2", "--views", "1"))
     monkeypatch.setattr(precision, "FULL", ("--step-scales", "1,4", "--efforts", "1", "--cold", "0"))

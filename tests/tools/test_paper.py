@@ -18,7 +18,7 @@ from pages.paper.runs import (
     held_to,
     measure,
 )
-from scenes import SMALLEST
+from tiny import TINY
 
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.data.view import Dataset
@@ -130,7 +130,7 @@ def dataset() -> Dataset:
 @pytest.fixture
 def small(monkeypatch):
     """The tiny preset, tinier."""
-    monkeypatch.setitem(PRESETS, "tiny", SMALLEST)
+    monkeypatch.setitem(PRESETS, "tiny", TINY)
 
 
 def test_runs_are_made_once_and_again_when_settings_change(small, tmp_path, dataset):
