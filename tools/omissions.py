@@ -24,7 +24,7 @@ from pd4dgs_codec.codec.encoder import encode_with_report  # noqa: E402
 from pd4dgs_codec.model import checkpoint  # noqa: E402
 from pd4dgs_codec.model.convert import from_scene, to_scene  # noqa: E402
 from pd4dgs_codec.model.picture import render_image  # noqa: E402
-from pd4dgs_codec.scene import Scene  # noqa: E402
+from pd4dgs_codec.scene import Camera, Scene  # noqa: E402
 
 SIDE = 64  #: of the pictures, pixels
 
@@ -71,15 +71,15 @@ def compare(a: Scene, b: Scene, pictures: int) -> int:
     models = from_scene(a), from_scene(b)
     same = 0
     for i in range(pictures):
-        viewmat, K = random_camera(a, rng)
+        camera = random_camera(a, rng)
         t = float(rng.random())
-        one, other = (render_image(model, i % 3, t, viewmat, K, SIDE, SIDE) for model in models)
+        one, other = (render_image(model, i % 3, t, camera) for model in models)
         same += int(np.array_equal(one, other))
     return same
 
 
-def random_camera(scene: Scene, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray]:
-    """(viewmat [4, 4], K [3, 3]) that looks at a random anchor from a random side, from 0.1 to 2 box sizes away."""
+def random_camera(scene: Scene, rng: np.random.Generator) -> Camera:
+    """A camera that looks at a random anchor from a random side, from 0.1 to 2 box sizes away."""
     target = scene.anchor[rng.integers(len(scene.anchor))]
     distance = float(np.linalg.norm(scene.info.box[1] - scene.info.box[0])) * 10 ** rng.uniform(-1, 0.3)
     rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
@@ -89,7 +89,8 @@ def random_camera(scene: Scene, rng: np.random.Generator) -> tuple[np.ndarray, n
     viewmat[:3, 3] = -rotation @ target
     viewmat[2, 3] += distance
     focal = SIDE * rng.uniform(0.5, 2)
-    return viewmat, np.array([[focal, 0, SIDE / 2], [0, focal, SIDE / 2], [0, 0, 1]], np.float32)
+    K = np.array([[focal, 0, SIDE / 2], [0, focal, SIDE / 2], [0, 0, 1]], np.float32)
+    return Camera(viewmat, K, SIDE, SIDE)
 
 
 def page(results: list[Result]) -> str:

@@ -33,9 +33,8 @@ class Splats:
 
 def bake(level: Level, frame: Frame) -> Splats:
     """The Gaussians that the frame's camera meets at its time, with the colours that it sees."""
-    viewmat, K = (torch.from_numpy(np.array(m, np.float32)) for m in (frame.camera.viewmat, frame.camera.K))
     with torch.no_grad():
-        g = level.model.gaussians(level.level, frame.time, viewmat, K, frame.camera.width, frame.camera.height)
+        g = level.model.gaussians(level.level, frame.time, frame.camera)
     return Splats(*(a.numpy() for a in (g.means, g.scales, g.quats, g.opacities, g.colors)))
 
 

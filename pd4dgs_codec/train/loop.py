@@ -25,8 +25,8 @@ from pd4dgs_codec.jsonable import finite
 from pd4dgs_codec.metrics.image import mpsnr
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import PRESETS
-from pd4dgs_codec.model.model import EXACT, Noise, Rounding
 from pd4dgs_codec.model.picture import Picture, render, render_image
+from pd4dgs_codec.model.rounding import EXACT, Noise, Rounding
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train import judge, losses, pruning
 from pd4dgs_codec.train.config import DEFAULT_ITERATIONS, PRUNING_ROUNDS, PlaneWeights, Schedule, TrainConfig
@@ -188,11 +188,10 @@ class Trainer:
 
     def _loss(self, index: int, level: int, schedule: Schedule, rounding: Rounding) -> tuple[Picture, dict, Tensor]:
         config, view = self.config, self.dataset.train[index]
-        viewmat, K, target = self._targets[index]
-        picture = render(self.model, level, view.time, viewmat, K, view.width, view.height, rounding)
+        picture = render(self.model, level, view.time, view.camera, rounding)
         if picture.meta["means2d"].requires_grad:
             picture.meta["means2d"].retain_grad()
-        l1, dissimilarity = image_loss(picture.image, target)
+        l1, dissimilarity = image_loss(picture.image, self._targets[index])
         terms = {"l1": l1, "dssim": dissimilarity}
         loss = (1 - config.ssim) * l1 + config.ssim * dissimilarity
         if config.volume and len(picture.gaussians.scales):
@@ -321,7 +320,7 @@ class Trainer:
         waiting, views = self._waiting_views(), self.dataset.train
         indices = [i for i in range(len(views)) if i not in waiting]
         stride = -(-len(indices) // pruning.VIEWS)
-        shots = [(views[i], *self._targets[i]) for i in indices[turn % stride :: stride]]
+        shots = [(views[i], self._targets[i]) for i in indices[turn % stride :: stride]]
         levels = range(self.model.level if self.config.rollout == "top" else 0, self.model.level + 1)
         before, share = len(self.model.anchor_q), self.config.prune / len(schedule.prune)
         rounding = self._rounding(schedule)
@@ -333,11 +332,10 @@ class Trainer:
         self.neighbours = None
         return [before - len(keep), later]
 
-    def _target(self, view: View) -> tuple[Tensor, Tensor, TargetStats]:
-        viewmat, K = (torch.as_tensor(np.array(m, np.float32), device=self.device) for m in (view.viewmat, view.K))
+    def _target(self, view: View) -> TargetStats:
         image = torch.as_tensor(view.image, device=self.device).float() / 255
         mask = None if view.mask is None else torch.as_tensor(view.mask, device=self.device).float()
-        return viewmat, K, TargetStats(image, mask)
+        return TargetStats(image, mask)
 
     # -- time limit, evaluation, checkpoints -----------------------------------------------------------------------
 
@@ -394,9 +392,7 @@ class Trainer:
         psnr = []
         rounding = replace(self._rounding(Schedule(self.total)), noise=None)
         for level in range(self.model.level + 1):
-            images = (
-                render_image(self.model, level, v.time, v.viewmat, v.K, v.width, v.height, rounding) for v in views
-            )
+            images = (render_image(self.model, level, v.time, v.camera, rounding) for v in views)
             psnr.append(float(np.mean([mpsnr(i, v.image, v.mask) for i, v in zip(images, views, strict=True)])))
         return psnr
 

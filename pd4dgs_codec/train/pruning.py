@@ -16,8 +16,9 @@ from torch import Tensor
 
 from pd4dgs_codec.data.dataset import View
 from pd4dgs_codec.model.harm import anchor_harm
-from pd4dgs_codec.model.layers import mask_logits
-from pd4dgs_codec.model.model import Model, Rounding
+from pd4dgs_codec.model.masks import mask_logits
+from pd4dgs_codec.model.model import Model
+from pd4dgs_codec.model.rounding import Rounding
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train.config import PRUNING_ROUNDS
 from pd4dgs_codec.train.optimiser import Optimiser
@@ -30,7 +31,7 @@ MIN_ITERATIONS = 500
 #: Mask of an anchor at a level that it has left: under the threshold, so that it is neither drawn there nor sent.
 GONE = 1e-3
 
-Shot = tuple[View, Tensor, Tensor, TargetStats]  #: a view, its viewmat and K as tensors, its image
+Shot = tuple[View, TargetStats]  #: a view and its image
 
 
 def prune(
@@ -69,8 +70,8 @@ def relative_harm(model: Model, level: int, shots: Sequence[Shot], rounding: Rou
     met = torch.zeros(n, dtype=torch.bool, device=device)
     rounding, error = replace(rounding, noise=None), 0.0
     generator = torch.Generator().manual_seed(0)
-    for view, viewmat, K, target in shots:
-        place = (level, view.time, viewmat, K, view.width, view.height)
+    for view, target in shots:
+        place = (level, view.time, view.camera)
         harm, near, image = anchor_harm(model, *place, generator, weights=target.weights, rounding=rounding)
         total += harm
         met |= near

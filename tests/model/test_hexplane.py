@@ -8,9 +8,9 @@ numba = pytest.importorskip("numba")
 
 from pd4dgs_codec.errors import DataError, TrainError  # noqa: E402
 from pd4dgs_codec.model.hexplane import HexPlane, _Sample, sample_reference  # noqa: E402
-from pd4dgs_codec.model.layers import round_straight_through  # noqa: E402
 from pd4dgs_codec.model.plane_layout import PlaneLayout  # noqa: E402
 from pd4dgs_codec.model.plane_regularisers import TERMS, regularisers, regularisers_reference  # noqa: E402
+from pd4dgs_codec.model.rounding import round_straight_through  # noqa: E402
 from pd4dgs_codec.scene import PLANES  # noqa: E402
 
 BOX = np.array([[-1.0, -2.0, 0.5], [1.0, 3.0, 4.5]], np.float32)

@@ -7,7 +7,7 @@ import pytest
 torch = pytest.importorskip("torch")
 
 from pd4dgs_codec.errors import TrainError  # noqa: E402
-from pd4dgs_codec.model.layers import level_mask, mask_logits  # noqa: E402
+from pd4dgs_codec.model.masks import level_mask, mask_logits  # noqa: E402
 from pd4dgs_codec.train import losses  # noqa: E402
 from pd4dgs_codec.train.config import Schedule, TrainConfig, learning_rate  # noqa: E402
 from pd4dgs_codec.train.rollout import rollout_probabilities, sample_level, updated_rho  # noqa: E402

@@ -11,8 +11,8 @@ pytest.importorskip("numba")
 from test_loop import assert_resumes_bit_for_bit, dataset, few_anchors  # noqa: E402, F401 - fixtures
 
 from pd4dgs_codec.errors import NotFinite  # noqa: E402
-from pd4dgs_codec.model.model import EXACT  # noqa: E402
 from pd4dgs_codec.model.picture import render_image  # noqa: E402
+from pd4dgs_codec.model.rounding import EXACT  # noqa: E402
 from pd4dgs_codec.scene import MASK_THRESHOLD  # noqa: E402
 from pd4dgs_codec.train import pruning  # noqa: E402
 from pd4dgs_codec.train.config import PRUNING_ROUNDS, Schedule, TrainConfig  # noqa: E402
@@ -31,14 +31,12 @@ def trained(dataset, tmp_path):  # noqa: F811
     """A trainer after a short run without pruning, and its shots."""
     trainer = Trainer(TrainConfig(preset="tiny", iterations=120, prune=0.0, noise=False), dataset)
     trainer.run(tmp_path / "m.pt")
-    return trainer, [(dataset.train[i], *trainer._targets[i]) for i in range(len(dataset.train))]
+    return trainer, list(zip(dataset.train, trainer._targets, strict=True))
 
 
 def _pictures(trainer, level: int) -> list[np.ndarray]:
     """Of the training views."""
-    return [
-        render_image(trainer.model, level, v.time, v.viewmat, v.K, v.width, v.height) for v in trainer.dataset.train
-    ]
+    return [render_image(trainer.model, level, v.time, v.camera) for v in trainer.dataset.train]
 
 
 def _difference(pictures, others) -> float:

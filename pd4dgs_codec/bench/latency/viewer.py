@@ -44,7 +44,7 @@ def pictures(url: str, size: tuple[int, int], ready: Callable[[], object] = lamb
             from pd4dgs_codec.model.convert import from_scene
             from pd4dgs_codec.model.picture import render_image
 
-            render_image(from_scene(scene), scene.level, 0.0, camera.viewmat, camera.K, camera.width, camera.height)
+            render_image(from_scene(scene), scene.level, 0.0, camera)
             now = time.monotonic()
             yield Shown(scene.level, now - start, now - last_byte)
 

@@ -13,11 +13,11 @@ import torch
 
 from pd4dgs_codec.attributes import quantise
 from pd4dgs_codec.bench.stability.rows import Case, mpmath, refusal
-from pd4dgs_codec.bench.stability.scenes import BOX, CAMERA, HEIGHT, WIDTH, picture_error, small_scene
+from pd4dgs_codec.bench.stability.scenes import BOX, CAMERA, picture_error, small_scene
 from pd4dgs_codec.codec import decoder, encoder
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.evaluate import residuals
-from pd4dgs_codec.model import hexplane, layers
+from pd4dgs_codec.model import hexplane, masks
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.picture import render_image
@@ -333,7 +333,7 @@ def _triples(logits: Sequence[float]) -> torch.Tensor:
 def _level_mask_error(values: Sequence[float]) -> tuple[str, float]:
     mp = mpmath()
     logits = _triples(values)
-    masks = [layers.level_mask(logits, level) for level in range(3)]
+    masks = [masks.level_mask(logits, level) for level in range(3)]
     worst = 0.0
     with mp.workdps(40):
         for i, (a, b, c) in enumerate(logits.tolist()):
@@ -349,7 +349,7 @@ def _mask_gradients() -> tuple[str, float]:
     bad = 0
     for level in range(3):
         logits = _triples(FAR).requires_grad_()
-        (slope,) = torch.autograd.grad(layers.level_mask(logits, level).sum(), logits)
+        (slope,) = torch.autograd.grad(masks.level_mask(logits, level).sum(), logits)
         bad += int((~torch.isfinite(slope)).sum())
     return f"{bad} of {9 * len(FAR) ** 3} gradients not finite", float(bad)
 
@@ -369,9 +369,9 @@ def _code_errors() -> tuple[str, float]:
 
 def _codes_changed() -> tuple[str, float]:
     codes = np.array([0, *range(3, 256)], np.uint8)
-    logits = torch.from_numpy(layers.mask_logits(np.repeat(codes[:, None] / 255, 3, axis=1)))
+    logits = torch.from_numpy(masks.mask_logits(np.repeat(codes[:, None] / 255, 3, axis=1)))
     wrong = sum(
-        int((quantise.mask_codes(layers.level_mask(logits, level).numpy()) != codes).sum()) for level in range(3)
+        int((quantise.mask_codes(masks.level_mask(logits, level).numpy()) != codes).sum()) for level in range(3)
     )
     return f"{wrong} of {3 * codes.size} codes changed", float(wrong)
 
@@ -382,8 +382,7 @@ def _drawn_against_sent() -> tuple[str, float]:
     logit = np.log(np.clip(masks, 1e-7, 1 - 1e-7)) - np.log1p(-np.clip(masks, 1e-7, 1 - 1e-7))
     with torch.no_grad():
         model.mask_logits[:, 0] = torch.from_numpy(logit).float()
-    camera = torch.from_numpy(CAMERA.viewmat), torch.from_numpy(CAMERA.K), WIDTH, HEIGHT
-    drawn = set(model.visible(0, *camera).tolist())
+    drawn = set(model.visible(0, CAMERA).tolist())
     sent = set(np.flatnonzero(quantise.mask_codes(model.masks(0).detach().numpy())).tolist())
     return f"{len(drawn)} drawn, {len(sent)} sent", float(len(drawn ^ sent))
 
@@ -394,7 +393,7 @@ def _picture_of_mask(mask: int) -> tuple[str, float]:
     model = from_scene(decoded)
     error = picture_error(model, 0, 0.0)
     if not mask:
-        picture = render_image(model, 0, 0.0, CAMERA.viewmat, CAMERA.K, WIDTH, HEIGHT)
+        picture = render_image(model, 0, 0.0, CAMERA)
         background = np.array(scene.info.background, np.float32)
         error = _largest([error, float(np.abs(picture - background).max())])
     kept = len(decoded.anchor_q)

@@ -51,7 +51,7 @@ def picture_error(model: Model, level: int, t: float, camera: Camera = CAMERA) -
     """Largest difference of a channel of a pixel between the float32 picture and the float64 oracle's picture of the
     same Gaussians; NaN where the former is not finite."""
     viewmat, K = torch.from_numpy(camera.viewmat), torch.from_numpy(camera.K)
-    picture = render(model, level, t, viewmat, K, camera.width, camera.height)
+    picture = render(model, level, t, camera)
     g = picture.gaussians
     drawn = g.colors.isfinite().all(1)
     expected, _, _ = rasterization(
