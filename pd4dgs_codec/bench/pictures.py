@@ -49,9 +49,8 @@ def view(level: Level, frame: Frame) -> View:
     """The Gaussians that the frame's camera meets at its time, with the colours that it sees."""
     info, camera = level.model.info, frame.camera
     viewmat, K = np.array(camera.viewmat, np.float32), np.array(camera.K, np.float32)
-    extrinsics, intrinsics = torch.from_numpy(viewmat), torch.from_numpy(K)
     with torch.no_grad():
-        g = level.model.gaussians(level.level, frame.time, extrinsics, intrinsics, camera.width, camera.height)
+        g = level.model.gaussians(level.level, frame.time, camera)
     return {
         **{name: getattr(g, name).numpy() for name in SPLATS},
         "viewmat": viewmat,

@@ -6,14 +6,11 @@ Images are brought to 8 bits first, as a written picture would be. Masks are boo
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import TYPE_CHECKING
+from typing import Protocol
 
 import numpy as np
 
-from ..errors import DataError
-
-if TYPE_CHECKING:
-    from pd4dgs_codec.data.view import View
+from pd4dgs_codec.errors import DataError
 
 TAPS, SIGMA = 11, 1.5
 C1, C2 = 0.01**2, 0.03**2
@@ -32,7 +29,7 @@ def to_uint8(image: np.ndarray) -> np.ndarray:
     return np.rint(np.clip(image.astype(np.float64), 0.0, 1.0) * 255.0).astype(np.uint8)
 
 
-def prepare(pred, target, mask) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def prepare(pred: np.ndarray, target: np.ndarray, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Both images as float64 [H, W, 3] in 0..1 after 8 bits, and the mask as float64 [H, W]."""
     a, b = np.asarray(pred), np.asarray(target)
     if a.shape != b.shape or a.ndim != 3 or a.shape[2] != 3:
@@ -55,8 +52,9 @@ def mpsnr(pred: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) 
 
 def _gaussian() -> np.ndarray:
     x = np.arange(TAPS) - TAPS // 2
-    f = np.exp(-0.5 * (x / SIGMA) ** 2)
-    return f / f.sum()
+    f: np.ndarray = np.exp(-0.5 * (x / SIGMA) ** 2)
+    f /= f.sum()
+    return f
 
 
 def _slide(z: np.ndarray, weights: np.ndarray, axis: int) -> np.ndarray:
@@ -101,7 +99,17 @@ def mssim(pred: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) 
     return float((numerator / ((mu0 * mu0 + mu1 * mu1 + C1) * (var0 + var1 + C2))).mean())
 
 
-def mean_image_baseline(train: Sequence[View], test: Sequence[View]) -> float:
+class Photograph(Protocol):
+    """A picture of a dataset: uint8 [H, W, 3], and bool [H, W] or None for all, the pixels that count."""
+
+    @property
+    def image(self) -> np.ndarray: ...
+
+    @property
+    def mask(self) -> np.ndarray | None: ...
+
+
+def mean_image_baseline(train: Sequence[Photograph], test: Sequence[Photograph]) -> float:
     """Mean mPSNR in dB over the test views of always predicting the mean training image: what any model must beat."""
     if not train or not test:
         raise DataError(f"found {len(train)} training and {len(test)} test views, expected at least 1 of each")

@@ -19,8 +19,8 @@ from unittest import mock
 
 import numpy as np
 
-from ..errors import DataError
-from .image import LEAST_WEIGHT, prepare
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.metrics.image import LEAST_WEIGHT, prepare
 
 #: What FLIP assumes of the viewer, its package's default: metres from the screen, its width in pixels and in metres.
 VIEWING = (0.7, 3840, 0.7)
@@ -131,7 +131,8 @@ def _of_network(network: Any) -> ErrorMap:
     @torch.inference_mode()
     def error_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
         x, y = (torch.from_numpy(z).permute(2, 0, 1)[None] * 2 - 1 for z in (a, b))
-        return network(x, y)[0, 0].numpy()
+        distances: np.ndarray = network(x, y)[0, 0].numpy()
+        return distances
 
     return error_map
 
@@ -148,6 +149,7 @@ def _flip() -> Distance:
     )
 
     def error_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return evaluate(b, a)[0][..., 0]
+        distances: np.ndarray = evaluate(b, a)[0][..., 0]
+        return distances
 
     return Distance("FLIP", f"flip-evaluator {metadata.version('flip-evaluator')}", error_map)

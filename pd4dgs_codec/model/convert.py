@@ -8,7 +8,8 @@ import torch
 from pd4dgs_codec.attributes.quantise import mask_codes
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.model.deformation import DeformationField
-from pd4dgs_codec.model.layers import MLP, mask_logits
+from pd4dgs_codec.model.masks import mask_logits
+from pd4dgs_codec.model.mlp import MLP
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.scene import MASK_STEP, SCAFFOLD_NETWORKS, Scene
 
@@ -72,4 +73,5 @@ def from_scene(scene: Scene) -> Model:
 
 
 def _numpy(tensor: torch.Tensor) -> np.ndarray:
-    return tensor.detach().cpu().numpy().copy()
+    array: np.ndarray = tensor.detach().cpu().numpy().copy()
+    return array

@@ -12,7 +12,7 @@ from torch.nn import functional as F
 from pd4dgs_codec import scene
 from pd4dgs_codec.model.config import DeformationConfig
 from pd4dgs_codec.model.hexplane import HexPlane
-from pd4dgs_codec.model.layers import MLP
+from pd4dgs_codec.model.mlp import MLP
 
 
 class DeformationField(nn.Module):
@@ -68,7 +68,7 @@ class DeformationField(nn.Module):
             return {name: head(hidden, weight_step) for name, head in self.named_heads()}
         firsts = [head[0] for head in layers.values()]  # one product for all heads
         out = F.linear(hidden, torch.cat([w for w, _ in firsts]), torch.cat([b for _, b in firsts]))
-        return dict(zip(layers, out.split([len(b) for _, b in firsts], dim=1), strict=True))
+        return dict(zip(layers, torch.split(out, [len(b) for _, b in firsts], dim=1), strict=True))
 
     def named_heads(self) -> list[tuple[str, MLP]]:
         """The heads present, in the registry's order."""

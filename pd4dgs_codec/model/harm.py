@@ -7,9 +7,10 @@ from dataclasses import replace
 import torch
 from torch import Tensor
 
-from pd4dgs_codec.model.model import EXACT, Model, Rounding
+from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.picture import draw
-from pd4dgs_codec.scene import N_OFFSETS
+from pd4dgs_codec.model.rounding import EXACT, Rounding
+from pd4dgs_codec.scene import N_OFFSETS, Camera
 
 #: Random pictures of signs per view from which an anchor's weight is estimated.
 PROBES = 2
@@ -19,10 +20,7 @@ def anchor_harm(
     model: Model,
     level: int,
     t: float,
-    viewmat: Tensor,
-    K: Tensor,
-    width: int,
-    height: int,
+    camera: Camera,
     generator: torch.Generator,
     *,
     weights: Tensor | None = None,
@@ -37,15 +35,15 @@ def anchor_harm(
     and Saad, An estimator for the diagonal of a matrix, 2007).
     """
     with torch.no_grad():
-        g = model.gaussians(level, t, viewmat, K, width, height, rounding)
-    n, device = len(model.anchor_q), viewmat.device
+        g = model.gaussians(level, t, camera, rounding)
+    n, device = len(model.anchor_q), g.means.device
     total = torch.zeros(n, dtype=torch.float64, device=device)
     met = torch.zeros(n, dtype=torch.bool, device=device)
     met[g.anchors] = True
     gate = torch.ones(n, device=device, requires_grad=True)
     shown = gate[torch.div(g.slots, N_OFFSETS, rounding_mode="floor")]
     gated = replace(g, scales=g.scales * shown[:, None], opacities=g.opacities * shown)
-    image = draw(model.info, gated, viewmat, K, width, height).image
+    image = draw(model.info, gated, camera).image
     for _ in range(PROBES):
         signs = (torch.randint(0, 2, image.shape, generator=generator).float() * 2 - 1).to(device)
         if weights is not None:

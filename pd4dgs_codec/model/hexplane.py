@@ -8,6 +8,7 @@ a fused numba kernel does it (`hexplane_kernels.py`); otherwise `sample_referenc
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import Any
 
 import numba
 import numpy as np
@@ -18,18 +19,22 @@ from torch.autograd.function import once_differentiable
 
 from pd4dgs_codec.errors import DataError, TrainError
 from pd4dgs_codec.model import hexplane_kernels as kernels
-from pd4dgs_codec.model.layers import round_straight_through
 from pd4dgs_codec.model.plane_layout import TIME_AXIS, PlaneLayout
 from pd4dgs_codec.model.plane_regularisers import regularisers
+from pd4dgs_codec.model.rounding import round_straight_through
 from pd4dgs_codec.render.simd import LANES
 from pd4dgs_codec.scene import PLANES
+
+Corners = np.ndarray | Sequence[Sequence[float]]  #: [2, 3], lower and upper corner of a box, scene units
 
 
 class _Sample(torch.autograd.Function):
     """`sample_reference` at one time with rounding folded in, by the kernels; CPU, channels a multiple of LANES."""
 
     @staticmethod
-    def forward(ctx, grid: Tensor, layout: PlaneLayout, box: Tensor, points: Tensor, t: float, step: float | None):
+    def forward(
+        ctx: Any, grid: Tensor, layout: PlaneLayout, box: Tensor, points: Tensor, t: float, step: float | None
+    ) -> Tensor:
         tables = (layout.reso, layout.start, layout.rows)
         spatial = grid[: layout.n_spatial]
         if step is not None:
@@ -44,7 +49,7 @@ class _Sample(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, g: Tensor):
+    def backward(ctx: Any, g: Tensor) -> tuple[Tensor | None, ...]:
         spatial, rows, box, points = ctx.saved_tensors
         layout, channels = ctx.layout, spatial.shape[1]
         tables = (layout.reso, layout.start, layout.rows)
@@ -56,8 +61,8 @@ class _Sample(torch.autograd.Function):
         grad_points = g.new_empty(len(layout.reso), len(points), 3)
         results = [x.numpy() for x in (grad, extra, grad_rows, grad_points)]
         inputs = [x.numpy() for x in (g.contiguous(), spatial, rows)]
-        kernels.sample_backward(*results, *inputs, *tables, points.numpy(), box.numpy())
-        kernels.collapse_backward(results[0], results[2][0], *tables, ctx.t)
+        kernels.sample_backward(*[*results, *inputs, *tables, points.numpy(), box.numpy()])
+        kernels.collapse_backward(grad.numpy(), grad_rows[0].numpy(), *tables, ctx.t)
         return grad, None, None, grad_points.sum(0) if ctx.needs_input_grad[3] else None, None, None
 
 
@@ -114,7 +119,7 @@ class HexPlane(nn.Module):
 
     def __init__(
         self,
-        box: np.ndarray | Tensor | Sequence,
+        box: Corners,
         resolution: Sequence[int],
         channels: int = 16,
         multires: Sequence[int] = (1, 2),
@@ -137,7 +142,7 @@ class HexPlane(nn.Module):
                     if b != TIME_AXIS:
                         scale[name].copy_(_start(scale[name].shape, spacing, step, generator))
 
-    def _setup(self, box, resolutions: Sequence[Sequence[int]], channels: int) -> None:
+    def _setup(self, box: Corners, resolutions: Sequence[Sequence[int]], channels: int) -> None:
         corners = torch.as_tensor(np.array(box, np.float32))
         if corners.shape != (2, 3) or not torch.isfinite(corners).all() or not (corners[1] >= corners[0]).all():
             raise DataError(f"HexPlane box must be [2, 3], finite, lower <= upper, found {corners.tolist()}")
@@ -166,7 +171,9 @@ class HexPlane(nn.Module):
         one_time = not isinstance(t, Tensor)
         if one_time and self.grid.device.type == "cpu" and self.grid.shape[1] % LANES == 0:
             box = self.box.to(self.grid.dtype)
-            return _Sample.apply(self.grid, self.layout, box, points.contiguous(), float(t), step)
+            arguments = (self.grid, self.layout, box, points.contiguous(), float(t), step)
+            features: Tensor = _Sample.apply(*arguments)  # type: ignore[no-untyped-call]
+            return features
         return sample_reference(round_straight_through(self.grid, step), self.layout, self.box, points, t)
 
     def regularisers(self) -> dict[str, Tensor]:

@@ -15,13 +15,16 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from pd4dgs_codec.render.simd import LANES, kernel, load, splat, store, total
+from pd4dgs_codec.render.simd import LANES, Vector, kernel, load, splat, store, total
 
 XY, XZ, XT, YZ, YT, ZT = range(6)
 
+Six = tuple[int, int, int, int, int, int]
+Three = tuple[float, float, float]
+
 
 @kernel(fast=True, inline=True)
-def _locate(p, lower, upper, n):
+def _locate(p: float, lower: float, upper: float, n: int) -> tuple[int, float, float]:
     """First cell, fraction and slope d(cell coordinate)/dp of p on an axis of n cells; slope 0 where clamped."""
     unit = (np.float64(p) - lower) / (np.float64(upper) - lower)
     if not (unit > 0):  # NaN too
@@ -35,7 +38,7 @@ def _locate(p, lower, upper, n):
 
 
 @kernel(fast=True, inline=True)
-def _linear(table, i, step, f):
+def _linear(table: np.ndarray, i: int, step: int, f: Vector) -> tuple[Vector, Vector]:
     """(sample, d sample / df) of the lanes at flat offset i and its neighbour `step` further."""
     a = load(table, i)
     d = load(table, i + step) - a
@@ -43,7 +46,14 @@ def _linear(table, i, step, f):
 
 
 @kernel(fast=True, inline=True)
-def _bilinear(table, i, step_u, step_v, fu, fv):
+def _bilinear(
+    table: np.ndarray,
+    i: int,
+    step_u: int,
+    step_v: int,
+    fu: Vector,
+    fv: Vector,
+) -> tuple[Vector, Vector, Vector]:
     """(sample, d sample / dfu, d sample / dfv)."""
     a, da = _linear(table, i, step_u, fu)
     b, db = _linear(table, i + step_v, step_u, fu)
@@ -51,7 +61,7 @@ def _bilinear(table, i, step_u, step_v, fu, fv):
 
 
 @kernel(fast=True, inline=True)
-def _add_linear(table, i, step, f, g):
+def _add_linear(table: np.ndarray, i: int, step: int, f: Vector, g: Vector) -> None:
     """The transpose of `_linear`: adds (1 - f) g and f g."""
     gf = g * f
     store(table, i, load(table, i) + (g - gf))
@@ -59,14 +69,22 @@ def _add_linear(table, i, step, f, g):
 
 
 @kernel(fast=True, inline=True)
-def _add_bilinear(table, i, step_u, step_v, fu, fv, g):
+def _add_bilinear(table: np.ndarray, i: int, step_u: int, step_v: int, fu: Vector, fv: Vector, g: Vector) -> None:
     gv = g * fv
     _add_linear(table, i, step_u, fu, g - gv)
     _add_linear(table, i + step_v, step_u, fu, gv)
 
 
 @kernel(fast=True, inline=True)
-def _address(s, point, reso, start, row_start, box, channels):
+def _address(
+    s: int,
+    point: np.ndarray,
+    reso: np.ndarray,
+    start: np.ndarray,
+    row_start: np.ndarray,
+    box: np.ndarray,
+    channels: int,
+) -> tuple[Six, Six, Three, Three]:
     """Of one point and scale: flat offsets of its six lookups, the steps to its neighbours, fractions and slopes.
 
     Offsets: xy, xz, yz in the grid and x, y, z in the rows. Steps: to the next cell along x, y, z (0 on an axis of one
@@ -84,7 +102,16 @@ def _address(s, point, reso, start, row_start, box, channels):
 
 
 @kernel(fast=True, parallel=True)
-def sample(out, grid, rows, reso, start, row_start, points, box):
+def sample(
+    out: np.ndarray,
+    grid: np.ndarray,
+    rows: np.ndarray,
+    reso: np.ndarray,
+    start: np.ndarray,
+    row_start: np.ndarray,
+    points: np.ndarray,
+    box: np.ndarray,
+) -> None:
     """out [N, S * C] = per scale the product of the six planes at `points`."""
     channels = grid.shape[1]
     real = grid.dtype.type
@@ -104,8 +131,20 @@ def sample(out, grid, rows, reso, start, row_start, points, box):
 
 @kernel(fast=True, inline=True)
 def _point_gradient(
-    grad, grad_rows, g, g_offset, grid, rows, channels, offsets, steps, fractions, slopes, out, out_offset
-):
+    grad: np.ndarray,
+    grad_rows: np.ndarray,
+    g: np.ndarray,
+    g_offset: int,
+    grid: np.ndarray,
+    rows: np.ndarray,
+    channels: int,
+    offsets: Six,
+    steps: Six,
+    fractions: Three,
+    slopes: Three,
+    out: np.ndarray,
+    out_offset: int,
+) -> None:
     """Adds one point's gradient at one scale to `grad` and `grad_rows`, and writes that of the point to flat `out`."""
     xy, xz, yz, rx, ry, rz = offsets
     dx, dy, dz, xy_y, xz_z, yz_z = steps
@@ -148,7 +187,20 @@ def _point_gradient(
 
 
 @kernel(fast=True, parallel=True)
-def sample_backward(grad, extra, grad_rows, grad_points, g, grid, rows, reso, start, row_start, points, box):
+def sample_backward(
+    grad: np.ndarray,
+    extra: np.ndarray,
+    grad_rows: np.ndarray,
+    grad_points: np.ndarray,
+    g: np.ndarray,
+    grid: np.ndarray,
+    rows: np.ndarray,
+    reso: np.ndarray,
+    start: np.ndarray,
+    row_start: np.ndarray,
+    points: np.ndarray,
+    box: np.ndarray,
+) -> None:
     """The transpose of `sample`. g: [N, S * C]. Results, to be given zeroed except grad_points:
 
     grad [cells, C], of which the spatial planes are filled; extra [parts - 1, n_spatial, C], scratch; grad_rows
@@ -173,7 +225,15 @@ def sample_backward(grad, extra, grad_rows, grad_points, g, grid, rows, reso, st
 
 
 @kernel()  # exact arithmetic: the rounding must be that of the codec's quantiser
-def collapse(rows, grid, reso, start, row_start, t, step):
+def collapse(
+    rows: np.ndarray,
+    grid: np.ndarray,
+    reso: np.ndarray,
+    start: np.ndarray,
+    row_start: np.ndarray,
+    t: float,
+    step: float,
+) -> None:
     """rows [n_rows, C] = the time planes of `grid` at normalised time t, rounded to multiples of `step` if step > 0."""
     real = grid.dtype.type
     for s in range(len(reso)):
@@ -191,7 +251,14 @@ def collapse(rows, grid, reso, start, row_start, t, step):
 
 
 @kernel()
-def collapse_backward(grad, grad_rows, reso, start, row_start, t):
+def collapse_backward(
+    grad: np.ndarray,
+    grad_rows: np.ndarray,
+    reso: np.ndarray,
+    start: np.ndarray,
+    row_start: np.ndarray,
+    t: float,
+) -> None:
     """The transpose of `collapse` (rounding passes the gradient): adds to the time planes of grad [cells, C]."""
     real = grad.dtype.type
     for s in range(len(reso)):

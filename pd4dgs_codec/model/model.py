@@ -13,52 +13,32 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import cast
 
+import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
 from pd4dgs_codec.model.deformation import DeformationField
-from pd4dgs_codec.model.layers import MLP, level_mask, round_straight_through
+from pd4dgs_codec.model.masks import level_mask
+from pd4dgs_codec.model.mlp import MLP
+from pd4dgs_codec.model.rounding import EXACT, Rounding, round_straight_through
 from pd4dgs_codec.model.slots import assemble, slot_linear
-from pd4dgs_codec.scene import FEATURE_DIM, MASK_THRESHOLD, N_OFFSETS, SCAFFOLD_NETWORKS, SceneInfo, Steps
+from pd4dgs_codec.render.projection import ALPHA_MIN
+from pd4dgs_codec.scene import FEATURE_DIM, MASK_THRESHOLD, N_OFFSETS, SCAFFOLD_NETWORKS, Camera, SceneInfo, Steps
 
-#: A Gaussian fainter than this never reaches a pixel (the rasteriser's threshold), so its networks are not evaluated.
-MIN_OPACITY = 1.0 / 255.0
+#: A Gaussian fainter than the rasteriser's threshold never reaches a pixel, so its networks are not evaluated.
+MIN_OPACITY = ALPHA_MIN
 #: Opacities of an anchor's ten Gaussians start spread between these: some are seen everywhere, and not all are, since
 #: they start at one place.
 START_OPACITY = (-0.1, 0.2)
-#: Anchors farther outside the image than this share of its size (plus their own extent) are not evaluated.
+#: How far an anchor's Gaussians are taken to lie from it, in its largest extent: in trained scenes one anchor in 7,000
+#: has one farther away.
+OFFSET_REACH = 2.0
+#: How far a Gaussian of opacity 1 reaches, in its largest standard deviation: to where alpha is ALPHA_MIN, at
+#: sqrt(2 ln 255) = 3.3290.
+SIGMA_REACH = 3.33
+#: Anchors farther outside the image than this share of its size (plus what their Gaussians reach) are not evaluated.
 FRUSTUM_MARGIN = 0.15
-
-
-class Noise:
-    """Uniform noise in -0.5..0.5, cut at random places from one long pool: drawing it afresh would cost 5 ms a step."""
-
-    def __init__(self, seed: int, device: torch.device | str = "cpu", size: int = 1 << 23):
-        generator = torch.Generator().manual_seed(seed)
-        self.pool = (torch.rand(size, generator=generator) - 0.5).to(device)
-        self.generator = generator
-
-    def draw(self, shape: torch.Size) -> Tensor:
-        """A tensor of `shape`."""
-        n = shape.numel()
-        if n > len(self.pool):
-            return torch.rand(shape, generator=self.generator).to(self.pool.device) - 0.5
-        start = int(torch.randint(len(self.pool) - n + 1, (), generator=self.generator))
-        return self.pool[start : start + n].view(shape)
-
-
-@dataclass(frozen=True)
-class Rounding:
-    """How a training step imitates quantisation: noise on the anchors' attributes, or rounding of them; rounding of
-    planes and weights. Rounding is straight-through."""
-
-    noise: Noise | None = None
-    attributes: bool = False
-    weights: bool = False
-
-
-EXACT = Rounding()
 
 
 @dataclass
@@ -73,6 +53,12 @@ class Gaussians:
     slots: Tensor  #: int64 [K], anchor * 10 + offset
     anchors: Tensor  #: int64 [n], the anchors that were evaluated
     raw_opacity: Tensor  #: [n, 10] before the gate
+
+
+def camera_tensors(camera: Camera, device: torch.device) -> tuple[Tensor, Tensor]:
+    """(viewmat [4, 4] world to camera, K [3, 3] pixels) as float32 tensors."""
+    viewmat, K = (torch.as_tensor(np.array(m, np.float32), device=device) for m in (camera.viewmat, camera.K))
+    return viewmat, K
 
 
 class Model(nn.Module):
@@ -123,48 +109,39 @@ class Model(nn.Module):
         return level_mask(self.mask_logits, level)
 
     @torch.no_grad()
-    def visible(self, level: int, viewmat: Tensor, K: Tensor, width: int, height: int) -> Tensor:
+    def visible(self, level: int, camera: Camera) -> Tensor:
         """int64 [n]: anchors active at `level` that may reach the image, in ascending order."""
+        viewmat, K = camera_tensors(camera, self.feature.device)
         position = self.anchor @ viewmat[:3, :3].T + viewmat[:3, 3]
         extent = self.scaling_log.exp()
-        radius = 2.0 * extent[:, :3].amax(1) + 3.33 * extent[:, 3:].amax(1)
+        radius = OFFSET_REACH * extent[:, :3].amax(1) + SIGMA_REACH * extent[:, 3:].amax(1)
         depth = position[:, 2]
         z = depth.clamp(min=float(self.info.near))
         x = K[0, 0] * position[:, 0] / z + K[0, 2]
         y = K[1, 1] * position[:, 1] / z + K[1, 2]
+        width, height = camera.width, camera.height
         margin = torch.maximum(K[0, 0], K[1, 1]) * radius / z + FRUSTUM_MARGIN * max(width, height)
         inside = (x > -margin) & (x < width + margin) & (y > -margin) & (y < height + margin)
         return (inside & (depth + radius > 0) & (self.masks(level) > MASK_THRESHOLD)).nonzero()[:, 0]
 
-    def gaussians(
-        self,
-        level: int,
-        t: float,
-        viewmat: Tensor,
-        K: Tensor,
-        width: int,
-        height: int,
-        rounding: Rounding = EXACT,
-    ) -> Gaussians:
-        """The Gaussians of `level` at normalised time t in 0..1 as the camera (viewmat [4, 4], K [3, 3]) meets them."""
-        rows = self.visible(level, viewmat, K, width, height)
+    def gaussians(self, level: int, t: float, camera: Camera, rounding: Rounding = EXACT) -> Gaussians:
+        """The Gaussians of `level` at normalised time t in 0..1 as the camera meets them."""
+        steps = self.steps
+        rows = self.visible(level, camera)
         mask = self.masks(level).index_select(0, rows)
         position = self.anchor.index_select(0, rows)
-        feature = self._attribute(self.feature, rows, self.steps.feature, rounding)
-        scaling_log = self._attribute(self.scaling_log, rows, self.steps.scaling_log, rounding)
-        offset = self._attribute(self.offset, rows, self.steps.offset, rounding)
+        feature = self._attribute(self.feature, rows, steps.feature, rounding)
+        scaling_log = self._attribute(self.scaling_log, rows, steps.scaling_log, rounding)
+        offset = self._attribute(self.offset, rows, steps.offset, rounding)
         if level >= 1 and self.global_deformation is not None:
-            residual = self.global_deformation(
-                position,
-                t,
-                plane_step=self.steps.planes_global if rounding.weights else None,
-                weight_step=self.steps.weights_global if rounding.weights else None,
-            )
-            position = position + residual["position"] if "position" in residual else position
-            feature = feature + residual["feature"] if "feature" in residual else feature
-            offset = offset + residual["offset"].view_as(offset) if "offset" in residual else offset
-            scaling_log = scaling_log + residual["scaling"] if "scaling" in residual else scaling_log
+            rounded = (steps.planes_global, steps.weights_global) if rounding.weights else (None, None)
+            residuals = self.global_deformation(position, t, *rounded)
+            position = _moved(position, residuals, "position")
+            feature = _moved(feature, residuals, "feature")
+            offset = _moved(offset, residuals, "offset")
+            scaling_log = _moved(scaling_log, residuals, "scaling")
 
+        viewmat, _ = camera_tensors(camera, self.feature.device)
         camera_centre = -viewmat[:3, :3].T @ viewmat[:3, 3]
         direction = F.normalize(position - camera_centre, dim=1)
         opacity, covariance, color = self._last_layers(torch.cat([feature, direction], dim=1), rounding)
@@ -176,25 +153,21 @@ class Model(nn.Module):
             position, scaling_log.exp(), offset, raw_opacity, mask, shape, keep
         )
         if level >= 2 and self.local_deformation is not None:
-            residual = self.local_deformation(
-                means,
-                t,
-                plane_step=self.steps.planes_local if rounding.weights else None,
-                weight_step=self.steps.weights_local if rounding.weights else None,
-            )
-            means = means + residual["mean"] if "mean" in residual else means
-            scales = F.relu(scales + residual["scale"]) if "scale" in residual else scales
-            quats = F.normalize(quats + residual["quat"], dim=1) if "quat" in residual else quats
-            opacities = (opacities + residual["opacity"][:, 0]).clamp(0, 1) if "opacity" in residual else opacities
-            colors = (colors + residual["color"]).clamp(0, 1) if "color" in residual else colors
+            rounded = (steps.planes_local, steps.weights_local) if rounding.weights else (None, None)
+            residuals = self.local_deformation(means, t, *rounded)
+            means = _moved(means, residuals, "mean")
+            scales = F.relu(_moved(scales, residuals, "scale")) if "scale" in residuals else scales
+            quats = F.normalize(_moved(quats, residuals, "quat"), dim=1) if "quat" in residuals else quats
+            opacities = _moved(opacities, residuals, "opacity").clamp(0, 1) if "opacity" in residuals else opacities
+            colors = _moved(colors, residuals, "color").clamp(0, 1) if "color" in residuals else colors
+        anchors = rows.index_select(0, torch.div(keep, N_OFFSETS, rounding_mode="floor"))
         return Gaussians(
             means=means,
             quats=quats,
             scales=scales * gate[:, None],
             opacities=opacities * gate,
             colors=colors,
-            slots=rows.index_select(0, torch.div(keep, N_OFFSETS, rounding_mode="floor")) * N_OFFSETS
-            + keep % N_OFFSETS,
+            slots=anchors * N_OFFSETS + keep % N_OFFSETS,
             anchors=rows,
             raw_opacity=raw_opacity,
         )
@@ -225,7 +198,7 @@ class Model(nn.Module):
             return [(_before_last(layers, inputs), *layers[-1]) for layers in networks]
         first = [layers[0] for layers in networks]
         hidden = F.relu(F.linear(inputs, torch.cat([w for w, _ in first]), torch.cat([b for _, b in first])))
-        parts = hidden.split([len(b) for _, b in first], dim=1)
+        parts = torch.split(hidden, [len(b) for _, b in first], dim=1)
         return [(part, *layers[1]) for part, layers in zip(parts, networks, strict=True)]
 
     def _attribute(self, values: Tensor, rows: Tensor, step: float, rounding: Rounding) -> Tensor:
@@ -233,6 +206,11 @@ class Model(nn.Module):
         if rounding.attributes:
             return round_straight_through(picked, step)
         return picked if rounding.noise is None else picked + rounding.noise.draw(picked.shape) * step
+
+
+def _moved(values: Tensor, residuals: dict[str, Tensor], head: str) -> Tensor:
+    """values plus what the head answers, if there is such a head."""
+    return values + residuals[head].view_as(values) if head in residuals else values
 
 
 def _before_last(layers: list[tuple[Tensor, Tensor]], x: Tensor) -> Tensor:

@@ -9,9 +9,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pd4dgs_codec.model.model import EXACT, Gaussians, Model, Rounding
+from pd4dgs_codec.model.model import Gaussians, Model, camera_tensors
+from pd4dgs_codec.model.rounding import EXACT, Rounding
 from pd4dgs_codec.render.autograd.rasterization import rasterization
-from pd4dgs_codec.scene import SceneInfo
+from pd4dgs_codec.scene import Camera, SceneInfo
+
+#: Nearer than this nothing is drawn, whatever a scene says, scene units: the rasteriser divides by depths.
+LEAST_NEAR = 1e-6
 
 
 @dataclass
@@ -24,29 +28,21 @@ class Picture:
     meta: dict[str, Any]
 
 
-def render(
-    model: Model,
-    level: int,
-    t: float,
-    viewmat: Tensor,
-    K: Tensor,
-    width: int,
-    height: int,
-    rounding: Rounding = EXACT,
-) -> Picture:
-    """Render_level at normalised time t in 0..1; viewmat [4, 4] world to camera, K [3, 3] pixels."""
-    gaussians = model.gaussians(level, t, viewmat, K, width, height, rounding)
+def render(model: Model, level: int, t: float, camera: Camera, rounding: Rounding = EXACT) -> Picture:
+    """Render_level at normalised time t in 0..1."""
+    gaussians = model.gaussians(level, t, camera, rounding)
     if torch.is_grad_enabled():
-        return draw(model.info, gaussians, viewmat, K, width, height)
+        return draw(model.info, gaussians, camera)
     # a colour that overflowed hides its Gaussian; training refuses the step instead
     opacities = torch.where(gaussians.colors.isfinite().all(1), gaussians.opacities, 0.0)
     shown = replace(gaussians, opacities=opacities, colors=gaussians.colors.nan_to_num())
-    return replace(draw(model.info, shown, viewmat, K, width, height), gaussians=gaussians)
+    return replace(draw(model.info, shown, camera), gaussians=gaussians)
 
 
-def draw(info: SceneInfo, gaussians: Gaussians, viewmat: Tensor, K: Tensor, width: int, height: int) -> Picture:
-    """The picture of `gaussians` over the scene's background; camera as for `render`."""
-    background = torch.tensor([info.background], dtype=torch.float32, device=viewmat.device)
+def draw(info: SceneInfo, gaussians: Gaussians, camera: Camera) -> Picture:
+    """The picture of `gaussians` over the scene's background."""
+    device = gaussians.means.device
+    viewmat, K = camera_tensors(camera, device)
     images, alphas, meta = rasterization(
         gaussians.means,
         gaussians.quats,
@@ -55,26 +51,16 @@ def draw(info: SceneInfo, gaussians: Gaussians, viewmat: Tensor, K: Tensor, widt
         gaussians.colors,
         viewmat[None],
         K[None],
-        width,
-        height,
-        near_plane=max(float(info.near), 1e-6),
-        backgrounds=background,
+        camera.width,
+        camera.height,
+        near_plane=max(float(info.near), LEAST_NEAR),
+        backgrounds=torch.tensor([info.background], dtype=torch.float32, device=device),
     )
     return Picture(images[0], alphas[0, ..., 0], gaussians, meta)
 
 
 @torch.no_grad()
-def render_image(
-    model: Model,
-    level: int,
-    t: float,
-    viewmat: np.ndarray,
-    K: np.ndarray,
-    width: int,
-    height: int,
-    rounding: Rounding = EXACT,
-) -> np.ndarray:
-    """The picture as float32 [H, W, 3] in 0..1."""
-    device = model.feature.device
-    extrinsics, intrinsics = (torch.as_tensor(np.array(m, np.float32), device=device) for m in (viewmat, K))
-    return render(model, level, t, extrinsics, intrinsics, width, height, rounding).image.clamp(0, 1).cpu().numpy()
+def render_image(model: Model, level: int, t: float, camera: Camera, rounding: Rounding = EXACT) -> np.ndarray:
+    """Render_level at normalised time t in 0..1 as float32 [H, W, 3] in 0..1."""
+    image: np.ndarray = render(model, level, t, camera, rounding).image.clamp(0, 1).cpu().numpy()
+    return image

@@ -7,6 +7,8 @@ the spatial planes along one axis only.) Two numba passes over the planes, one f
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba as nb
 import numpy as np
 import torch
@@ -14,16 +16,18 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pd4dgs_codec.model.plane_layout import SPATIAL, TEMPORAL, PlaneLayout
-from pd4dgs_codec.render.simd import LANES, kernel, load, splat, store, total
+from pd4dgs_codec.render.simd import LANES, Vector, kernel, load, splat, store, total
 
 TERMS = ("plane_smooth", "time_smooth", "time_l1")
+
+Band = tuple[float, float, float, float, float]  #: five numbers in the middle of a row of a matrix
 
 # The kernels walk lines, the rows of all planes: `PlaneLayout.lines`, int64 [R, 5] of first cell of the plane, height,
 # width, row, 1 if spatial. Sums are kept per line: results do not depend on the number of threads.
 
 
 @kernel(fast=True, inline=True)
-def _squares(grid, start, stop, step):
+def _squares(grid: np.ndarray, start: int, stop: int, step: int) -> Any:
     """Sum of the squared second differences, over `step`, of the flat range start..stop."""
     two = splat(grid.dtype.type(2))
     value = splat(grid.dtype.type(0))
@@ -34,7 +38,7 @@ def _squares(grid, start, stop, step):
 
 
 @kernel(fast=True, parallel=True)
-def _values(sums, grid, lines):
+def _values(sums: np.ndarray, grid: np.ndarray, lines: np.ndarray) -> None:
     """sums [R, 3] = each line's part of the three terms."""
     channels = grid.shape[1]
     flat = grid.reshape(-1)
@@ -55,7 +59,7 @@ def _values(sums, grid, lines):
 
 
 @kernel(fast=True, inline=True)
-def _band(i, n):
+def _band(i: int, n: int) -> Band:
     """Row i, from column i - 2, of D^T D, where D takes the n - 2 second differences of n values."""
     if 2 <= i < n - 2:
         return 1.0, -4.0, 6.0, -4.0, 1.0
@@ -66,7 +70,7 @@ def _band(i, n):
 
 
 @kernel(fast=True, inline=True)
-def _curve(grid, k, i, n, step, band, weight):
+def _curve(grid: np.ndarray, k: int, i: int, n: int, step: int, band: Band, weight: float) -> Vector:
     """weight times the band's row applied around flat offset k, which is value i of n."""
     real = grid.dtype.type
     value = load(grid, k) * splat(real(weight * band[2]))
@@ -77,7 +81,7 @@ def _curve(grid, k, i, n, step, band, weight):
 
 
 @kernel(fast=True, parallel=True)
-def _gradient(grad, grid, lines, factors):
+def _gradient(grad: np.ndarray, grid: np.ndarray, lines: np.ndarray, factors: np.ndarray) -> None:
     """grad [cells, C] = that of sum(factors * terms)."""
     channels = grid.shape[1]
     flat, flat_grad = grid.reshape(-1), grad.reshape(-1)
@@ -103,7 +107,7 @@ def _gradient(grad, grid, lines, factors):
 
 class _Regularisers(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, grid: Tensor, lines: np.ndarray):
+    def forward(ctx: Any, grid: Tensor, lines: np.ndarray) -> tuple[Tensor, ...]:
         sums = np.empty((len(lines), len(TERMS)))
         _values(sums, grid.numpy(), lines)
         ctx.lines = lines
@@ -112,7 +116,7 @@ class _Regularisers(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, *factors: Tensor):
+    def backward(ctx: Any, *factors: Tensor) -> tuple[Tensor, None]:
         (grid,) = ctx.saved_tensors
         grad = torch.empty_like(grid)
         _gradient(grad.numpy(), grid.detach().numpy(), ctx.lines, np.array([f.item() for f in factors]))
@@ -122,7 +126,8 @@ class _Regularisers(torch.autograd.Function):
 def regularisers(grid: Tensor, layout: PlaneLayout) -> dict[str, Tensor]:
     """The three terms of the planes in grid [cells, C], by name."""
     if grid.device.type == "cpu" and grid.shape[1] % LANES == 0:
-        return dict(zip(TERMS, _Regularisers.apply(grid, layout.lines), strict=True))
+        values = _Regularisers.apply(grid, layout.lines)  # type: ignore[no-untyped-call]
+        return dict(zip(TERMS, values, strict=True))
     return regularisers_reference(grid, layout)
 
 

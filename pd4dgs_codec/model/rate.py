@@ -12,6 +12,7 @@ With d = |a - mu|, z = d/sigma, h = Q/(2 sigma), u = (d - Q/2)/sigma, v = (d + Q
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -63,8 +64,8 @@ def _log_probability(z: Tensor, h: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor
     """(ln P, ln(phi(u) / P)); kernels (`rate_kernels.py`) for [n, c] on the CPU, else the plain torch form."""
     if z.device.type == "cpu" and z.dim() == 2:
         results = torch.empty_like(z), torch.empty_like(z)
-        arrays = [x.numpy() for x in (*results, z, h, u, v)]
-        kernels.log_probability(*arrays, NARROW[z.dtype])
+        log_p, log_ratio = (x.numpy() for x in results)
+        kernels.log_probability(log_p, log_ratio, z.numpy(), h.numpy(), u.numpy(), v.numpy(), NARROW[z.dtype])
         return results
     ratio = _log_ratio(z, h, u, v)
     return -0.5 * u * u - _HALF_LN_2PI - ratio, ratio
@@ -72,11 +73,12 @@ def _log_probability(z: Tensor, h: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor
 
 class _LogProbability(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, a: Tensor, mu: Tensor, sigma: Tensor, q: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, a: Tensor, mu: Tensor, sigma: Tensor, q: Tensor) -> Tensor:
         shapes, dtype = (a.shape, mu.shape, sigma.shape, q.shape), a.dtype
         # float32 loses the small difference of nearly equal arguments when sigma << Q
         wide = torch.float64 if dtype == torch.float64 or bool((sigma < q * 2.0**-7).any()) else torch.float32
-        a, mu, sigma, q = torch.broadcast_tensors(a.to(wide), mu.to(wide), sigma.to(wide), q.to(wide))
+        wider = (x.to(wide) for x in (a, mu, sigma, q))
+        a, mu, sigma, q = torch.broadcast_tensors(*wider)  # type: ignore[no-untyped-call]
         signed = a - mu
         d = signed.abs()
         z, h, u, v = d / sigma, 0.5 * q / sigma, (d - 0.5 * q) / sigma, (d + 0.5 * q) / sigma
@@ -86,7 +88,7 @@ class _LogProbability(torch.autograd.Function):
         return log_p.to(dtype)
 
     @staticmethod
-    def backward(ctx, grad: Tensor):  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         signed, sigma, q, z, h, v, log_ratio = ctx.saved_tensors
         grad, grad_q = grad.to(log_ratio.dtype), grad
         if z.device.type == "cpu" and z.dim() == 2 and not ctx.needs_input_grad[3]:
@@ -109,18 +111,20 @@ class _LogProbability(torch.autograd.Function):
 
 def log_probability(a: Tensor, mu: Tensor, sigma: Tensor, q: Tensor | float) -> Tensor:
     """ln P of the interval a +- Q/2 under N(mu, sigma), broadcast; gradients to all four, finite in the tails."""
-    return _LogProbability.apply(a, mu, sigma, torch.as_tensor(q, dtype=a.dtype, device=a.device))
+    q = torch.as_tensor(q, dtype=a.dtype, device=a.device)
+    log_p: Tensor = _LogProbability.apply(a, mu, sigma, q)  # type: ignore[no-untyped-call]
+    return log_p
 
 
 class _ClipValue(torch.autograd.Function):
     """The clipped bits forward; the unclipped log's gradient backward, so that outliers still feel the rate."""
 
     @staticmethod
-    def forward(ctx, bits: Tensor) -> Tensor:  # type: ignore[override]
+    def forward(ctx: Any, bits: Tensor) -> Tensor:
         return bits.clamp(max=-math.log2(MIN_PROBABILITY))
 
     @staticmethod
-    def backward(ctx, grad: Tensor):  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> Tensor:
         return grad
 
 
@@ -128,14 +132,15 @@ def rate_bits(a: Tensor, mu: Tensor, sigma: Tensor, q: Tensor | float) -> Tensor
     """R(a) in bits, the probability clipped at 1e-6, same shape as the broadcast inputs."""
     q = torch.as_tensor(q, dtype=a.dtype, device=a.device)
     sigma = torch.maximum(sigma, q * MIN_SIGMA_RATIO)
-    return _ClipValue.apply(-log_probability(a, mu, sigma, q) / _LN2)
+    bits: Tensor = _ClipValue.apply(-log_probability(a, mu, sigma, q) / _LN2)  # type: ignore[no-untyped-call]
+    return bits
 
 
 class _ChannelMoments(torch.autograd.Function):
     """`channel_moments_reference` with its gradient written out: two passes over x [n, c] less in each direction."""
 
     @staticmethod
-    def forward(ctx, x: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
+    def forward(ctx: Any, x: Tensor) -> tuple[Tensor, Tensor]:
         mu = x.mean(0)
         centred = x - mu
         sigma = (centred.square().mean(0) + MIN_VARIANCE).sqrt()
@@ -144,7 +149,7 @@ class _ChannelMoments(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, g_mu: Tensor, g_sigma: Tensor):  # type: ignore[override]
+    def backward(ctx: Any, g_mu: Tensor, g_sigma: Tensor) -> Tensor:
         centred, sigma = ctx.saved_tensors
         n = len(centred)
         return torch.addcmul(g_mu / n, centred, g_sigma / (n * sigma))
@@ -152,7 +157,8 @@ class _ChannelMoments(torch.autograd.Function):
 
 def channel_moments(x: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation per column of x [n, c]; gradient through both; n >= 1."""
-    return _ChannelMoments.apply(x)
+    moments: tuple[Tensor, Tensor] = _ChannelMoments.apply(x)  # type: ignore[no-untyped-call]
+    return moments
 
 
 def channel_moments_reference(x: Tensor) -> tuple[Tensor, Tensor]:

@@ -21,7 +21,7 @@ _FAR = 20.0
 
 
 @kernel()
-def _erfcx(x):
+def _erfcx(x: float) -> float:
     """exp(x^2) erfc(x) for x >= 0."""
     if x < _FAR:
         return math.exp(x * x) * math.erfc(x)
@@ -30,7 +30,15 @@ def _erfcx(x):
 
 
 @kernel(parallel=True)
-def log_probability(out, log_ratio, z, h, u, v, narrow_below):
+def log_probability(
+    out: np.ndarray,
+    log_ratio: np.ndarray,
+    z: np.ndarray,
+    h: np.ndarray,
+    u: np.ndarray,
+    v: np.ndarray,
+    narrow_below: float,
+) -> None:
     """out = ln P and log_ratio = ln(phi(u) / P) in the forms of `rate.py`; narrow_below: h max(z, 1) below which P is
     taken as narrow."""
     for i in nb.prange(z.shape[0]):
@@ -54,7 +62,17 @@ def log_probability(out, log_ratio, z, h, u, v, narrow_below):
 
 
 @kernel(parallel=True)
-def gradients(grad_a, grad_sigma, grad, signed, sigma, z, h, v, log_ratio):
+def gradients(
+    grad_a: np.ndarray,
+    grad_sigma: np.ndarray,
+    grad: np.ndarray,
+    signed: np.ndarray,
+    sigma: np.ndarray,
+    z: np.ndarray,
+    h: np.ndarray,
+    v: np.ndarray,
+    log_ratio: np.ndarray,
+) -> None:
     """The gradients by a and sigma; grad: that of ln P; signed: a - mu; log_ratio: from `log_probability`."""
     for i in nb.prange(z.shape[0]):
         for j in range(z.shape[1]):

@@ -10,8 +10,10 @@ reproducible for a fixed number of parts.
 from __future__ import annotations
 
 import math
+from typing import Any
 
 import numba as nb
+import numpy as np
 
 from pd4dgs_codec.render.simd import LANES, kernel, load, splat, store, total
 from pd4dgs_codec.scene import N_OFFSETS
@@ -21,7 +23,7 @@ MIN_NORM = 1e-12
 
 
 @kernel(fast=True, inline=True)
-def _part(keep, part, parts):
+def _part(keep: np.ndarray, part: int, parts: int) -> tuple[int, int]:
     """The range of `keep` that is part's own: no anchor is in two parts."""
     begin, end = len(keep) * part // parts, len(keep) * (part + 1) // parts
     while 0 < begin < len(keep) and keep[begin] // N_OFFSETS == keep[begin - 1] // N_OFFSETS:
@@ -32,7 +34,7 @@ def _part(keep, part, parts):
 
 
 @kernel(fast=True, parallel=True)
-def linear(out, keep, hidden, weight, bias):
+def linear(out: np.ndarray, keep: np.ndarray, hidden: np.ndarray, weight: np.ndarray, bias: np.ndarray) -> None:
     """out [K, w] = the outputs of a linear layer (weight [10 w, H], bias [10 w]) that belong to the kept slots."""
     width, inputs = out.shape[1], hidden.shape[1]
     zero = splat(hidden.dtype.type(0))
@@ -47,7 +49,15 @@ def linear(out, keep, hidden, weight, bias):
 
 
 @kernel(fast=True, parallel=True)
-def linear_backward(grad_hidden, grad_weight, grad_bias, keep, g, hidden, weight):
+def linear_backward(
+    grad_hidden: np.ndarray,
+    grad_weight: np.ndarray,
+    grad_bias: np.ndarray,
+    keep: np.ndarray,
+    g: np.ndarray,
+    hidden: np.ndarray,
+    weight: np.ndarray,
+) -> None:
     """The transpose of `linear`. Results, given zeroed: grad_hidden [n, H], grad_weight [parts, 10 w, H] and grad_bias
     [parts, 10 w], summed into their first part."""
     width, inputs, parts = g.shape[1], hidden.shape[1], len(grad_weight)
@@ -73,7 +83,21 @@ def linear_backward(grad_hidden, grad_weight, grad_bias, keep, g, hidden, weight
 
 
 @kernel(fast=True, parallel=True)
-def assemble(means, scales, quats, opacities, gates, keep, position, scaling, offset, opacity, mask, shape, relative):
+def assemble(
+    means: np.ndarray,
+    scales: np.ndarray,
+    quats: np.ndarray,
+    opacities: np.ndarray,
+    gates: np.ndarray,
+    keep: np.ndarray,
+    position: np.ndarray,
+    scaling: np.ndarray,
+    offset: np.ndarray,
+    opacity: np.ndarray,
+    mask: np.ndarray,
+    shape: np.ndarray,
+    relative: np.ndarray,
+) -> None:
     """What the kept Gaussians are made of.
 
     position [n, 3], scaling [n, 6] (extents: of the offsets, then of the Gaussians), offset and opacity of all slots
@@ -94,7 +118,7 @@ def assemble(means, scales, quats, opacities, gates, keep, position, scaling, of
 
 
 @kernel(fast=True, inline=True)
-def _norm(shape, k):
+def _norm(shape: np.ndarray, k: int) -> Any:
     square = shape[k, 3] * shape[k, 3] + shape[k, 4] * shape[k, 4]
     square += shape[k, 5] * shape[k, 5] + shape[k, 6] * shape[k, 6]
     return max(math.sqrt(square), shape.dtype.type(MIN_NORM))
@@ -102,9 +126,25 @@ def _norm(shape, k):
 
 @kernel(fast=True, parallel=True)
 def assemble_backward(
-    g_position, g_scaling, g_offset, g_opacity, g_mask, g_shape,
-    keep, scaling, offset, shape, relative, quats, g_means, g_scales, g_quats, g_opacities, g_gates, parts,
-):  # fmt: skip
+    g_position: np.ndarray,
+    g_scaling: np.ndarray,
+    g_offset: np.ndarray,
+    g_opacity: np.ndarray,
+    g_mask: np.ndarray,
+    g_shape: np.ndarray,
+    keep: np.ndarray,
+    scaling: np.ndarray,
+    offset: np.ndarray,
+    shape: np.ndarray,
+    relative: np.ndarray,
+    quats: np.ndarray,
+    g_means: np.ndarray,
+    g_scales: np.ndarray,
+    g_quats: np.ndarray,
+    g_opacities: np.ndarray,
+    g_gates: np.ndarray,
+    parts: int,
+) -> None:
     """The transpose of `assemble`. Results, given zeroed but g_shape [K, 7], whose first three are the gradients before
     the sigmoid that gave `relative`."""
     for part in nb.prange(parts):

@@ -7,6 +7,8 @@ offset, anchors counted within the arguments.
 
 from __future__ import annotations
 
+from typing import Any
+
 import numba
 import torch
 from torch import Tensor
@@ -25,7 +27,8 @@ def slot_linear(hidden: Tensor, weight: Tensor, bias: Tensor, keep: Tensor) -> T
     """[K, w]: the outputs of a linear layer that belong to the kept slots. hidden [n, H], weight [10 w, H], bias
     [10 w], the w outputs of a slot side by side."""
     if hidden.device.type == "cpu" and hidden.shape[1] % LANES == 0:
-        return _SlotLinear.apply(hidden, weight, bias, keep)
+        out: Tensor = _SlotLinear.apply(hidden, weight, bias, keep)  # type: ignore[no-untyped-call]
+        return out
     return slot_linear_reference(hidden, weight, bias, keep)
 
 
@@ -43,7 +46,10 @@ def assemble(
     [n, 10, 3]; opacity [n, 10]; mask [n]; shape [K, 7]: logits of the scales relative to the extents, quaternion.
     """
     if position.device.type == "cpu":
-        return _Assemble.apply(position, scaling, offset, opacity, mask, shape, keep)
+        parts: Parts = _Assemble.apply(  # type: ignore[no-untyped-call]
+            position, scaling, offset, opacity, mask, shape, keep
+        )
+        return parts
     return assemble_reference(position, scaling, offset, opacity, mask, shape, keep)
 
 
@@ -53,7 +59,7 @@ def assemble_reference(
     """The plain torch form of `assemble`."""
     owner = torch.div(keep, N_OFFSETS, rounding_mode="floor")
     per_anchor = torch.cat([position, scaling, mask[:, None]], dim=1)  # one gather for all of it
-    centre, spread, base, gate = per_anchor.index_select(0, owner).split([3, 3, 3, 1], dim=1)
+    centre, spread, base, gate = torch.split(per_anchor.index_select(0, owner), [3, 3, 3, 1], dim=1)
     means = centre + offset.view(-1, 3).index_select(0, keep) * spread
     scales = base * torch.sigmoid(shape[:, :3])
     quats = F.normalize(shape[:, 3:], dim=1)
@@ -62,7 +68,7 @@ def assemble_reference(
 
 class _SlotLinear(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, hidden: Tensor, weight: Tensor, bias: Tensor, keep: Tensor):
+    def forward(ctx: Any, hidden: Tensor, weight: Tensor, bias: Tensor, keep: Tensor) -> Tensor:
         hidden, weight = hidden.contiguous(), weight.contiguous()
         out = hidden.new_empty(len(keep), len(bias) // N_OFFSETS)
         kernels.linear(*(x.numpy() for x in (out, keep, hidden, weight, bias)))
@@ -71,7 +77,7 @@ class _SlotLinear(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, g: Tensor):
+    def backward(ctx: Any, g: Tensor) -> tuple[Tensor, Tensor, Tensor, None]:
         hidden, weight, keep = ctx.saved_tensors
         parts = numba.get_num_threads()
         results = torch.zeros_like(hidden), weight.new_zeros(parts, *weight.shape), weight.new_zeros(parts, len(weight))
@@ -81,7 +87,16 @@ class _SlotLinear(torch.autograd.Function):
 
 class _Assemble(torch.autograd.Function):
     @staticmethod
-    def forward(ctx, position, scaling, offset, opacity, mask, shape, keep):
+    def forward(
+        ctx: Any,
+        position: Tensor,
+        scaling: Tensor,
+        offset: Tensor,
+        opacity: Tensor,
+        mask: Tensor,
+        shape: Tensor,
+        keep: Tensor,
+    ) -> tuple[Tensor, ...]:
         n = len(keep)
         relative = torch.sigmoid(shape[:, :3])
         inputs = [x.contiguous() for x in (position, scaling, offset.view(-1, 3), opacity.flatten(), mask, shape)]
@@ -93,12 +108,12 @@ class _Assemble(torch.autograd.Function):
 
     @staticmethod
     @once_differentiable
-    def backward(ctx, *gradients: Tensor):
+    def backward(ctx: Any, *gradients: Tensor) -> tuple[Tensor | None, ...]:
         keep, scaling, offset, shape, relative, quats = ctx.saved_tensors
         position, _, _, _, mask = ctx.shapes
         results = [scaling.new_zeros(s) for s in (position, scaling.shape, offset.shape, (len(offset),), mask)]
         results.append(torch.empty_like(shape))
         given = [g.contiguous() for g in gradients]
-        arrays = [x.numpy() for x in (*results, keep, scaling, offset, shape, relative, quats, *given)]
-        kernels.assemble_backward(*arrays, numba.get_num_threads())
+        arrays: list[Any] = [x.numpy() for x in (*results, keep, scaling, offset, shape, relative, quats, *given)]
+        kernels.assemble_backward(*[*arrays, numba.get_num_threads()])
         return *(r.view(s) for r, s in zip(results, ctx.shapes, strict=False)), results[5], None

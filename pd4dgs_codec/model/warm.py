@@ -31,7 +31,7 @@ def warm_up() -> None:
     scene = _one_anchor()
     camera = scene.info.camera
     assert camera is not None
-    render_image(from_scene(scene), 2, 0.5, camera.viewmat, camera.K, SIDE, SIDE)
+    render_image(from_scene(scene), 2, 0.5, camera)
 
 
 def _one_anchor() -> Scene:

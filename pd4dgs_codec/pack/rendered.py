@@ -13,7 +13,7 @@ from pd4dgs_codec.metrics.levels import level_psnr
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.harm import anchor_harm
 from pd4dgs_codec.model.picture import render_image
-from pd4dgs_codec.scene import Camera, Scene
+from pd4dgs_codec.scene import Scene
 from pd4dgs_codec.view.frames import Frame
 
 
@@ -46,8 +46,7 @@ class RenderedLoss:
         total, met = np.zeros(len(scene.anchor_q)), np.zeros(len(scene.anchor_q), bool)
         generator = torch.Generator().manual_seed(0)
         for frame in self.frames:
-            viewmat, K, camera = *_tensors(frame.camera), frame.camera
-            harm, near, _ = anchor_harm(model, level, frame.time, viewmat, K, camera.width, camera.height, generator)
+            harm, near, _ = anchor_harm(model, level, frame.time, frame.camera, generator)
             total += harm.numpy()
             met |= near.numpy()
             self.step()
@@ -59,8 +58,7 @@ class RenderedLoss:
         for level in self.levels:
             pictures[level] = []
             for frame in self.frames:
-                c = frame.camera
-                pictures[level].append(render_image(model, level, frame.time, c.viewmat, c.K, c.width, c.height))
+                pictures[level].append(render_image(model, level, frame.time, frame.camera))
                 self.step()
         return pictures
 
@@ -75,10 +73,6 @@ def true_psnr(scene: Scene, views: Sequence[View], step: Callable[[], None] = la
     model = from_scene(scene)
 
     def draw(level: int, view: View) -> np.ndarray:
-        return render_image(model, level, view.time, view.viewmat, view.K, view.width, view.height)
+        return render_image(model, level, view.time, view.camera)
 
     return level_psnr(draw, scene.layers, views, step)
-
-
-def _tensors(camera: Camera) -> tuple[torch.Tensor, torch.Tensor]:
-    return tuple(torch.from_numpy(np.array(m, np.float32)) for m in (camera.viewmat, camera.K))  # type: ignore[return-value]

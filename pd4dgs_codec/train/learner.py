@@ -21,8 +21,9 @@ from pd4dgs_codec.errors import NotFinite
 from pd4dgs_codec.metrics.levels import level_psnr
 from pd4dgs_codec.model.config import PRESETS, ModelConfig
 from pd4dgs_codec.model.deformation import DeformationField
-from pd4dgs_codec.model.model import EXACT, Model, Noise, Rounding
+from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.picture import Picture, render, render_image
+from pd4dgs_codec.model.rounding import EXACT, Noise, Rounding
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train import judge, losses, pruning
 from pd4dgs_codec.train.config import PlaneWeights, Schedule, TrainConfig
@@ -116,7 +117,7 @@ class Learner:
         rounding = replace(self._rounding(), noise=None)
 
         def draw(level: int, view: View) -> np.ndarray:
-            return render_image(self.model, level, view.time, view.viewmat, view.K, view.width, view.height, rounding)
+            return render_image(self.model, level, view.time, view.camera, rounding)
 
         return list(level_psnr(draw, range(self.model.level + 1), views).values())
 
@@ -189,7 +190,7 @@ class Learner:
         """
         config, shot = self.config, self.shots[index]
         view = shot.view
-        picture = render(self.model, level, view.time, shot.viewmat, shot.K, view.width, view.height, rounding)
+        picture = render(self.model, level, view.time, view.camera, rounding)
         if picture.meta["means2d"].requires_grad:
             picture.meta["means2d"].retain_grad()
         l1, dissimilarity = image_loss(picture.image, shot.target)

@@ -15,8 +15,9 @@ import torch
 from torch import Tensor
 
 from pd4dgs_codec.model.harm import anchor_harm
-from pd4dgs_codec.model.layers import mask_logits
-from pd4dgs_codec.model.model import Model, Rounding
+from pd4dgs_codec.model.masks import mask_logits
+from pd4dgs_codec.model.model import Model
+from pd4dgs_codec.model.rounding import Rounding
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train.config import PRUNING_ROUNDS
 from pd4dgs_codec.train.optimiser import Optimiser
@@ -67,8 +68,8 @@ def relative_harm(model: Model, level: int, shots: Sequence[Shot], rounding: Rou
     rounding, error = replace(rounding, noise=None), 0.0
     generator = torch.Generator().manual_seed(0)
     for shot in shots:
-        place = (level, shot.view.time, shot.viewmat, shot.K, shot.view.width, shot.view.height)
         weights = shot.target.weights
+        place = (level, shot.view.time, shot.view.camera)
         harm, near, image = anchor_harm(model, *place, generator, weights=weights, rounding=rounding)
         total += harm
         met |= near

@@ -33,7 +33,7 @@ class Level:
 
     def picture(self, camera: Camera, time: float) -> np.ndarray:
         """float32 [H, W, 3] in 0..1 at normalised time 0..1."""
-        return render_image(self.model, self.level, time, camera.viewmat, camera.K, camera.width, camera.height)
+        return render_image(self.model, self.level, time, camera)
 
     def timed_picture(self, camera: Camera, time: float) -> tuple[np.ndarray, float]:
         """`picture`, and the milliseconds that it took, the networks included."""

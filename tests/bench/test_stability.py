@@ -15,7 +15,7 @@ from pd4dgs_codec.cli import bench
 from pd4dgs_codec.entropy import channels
 from pd4dgs_codec.errors import DataError, EncodeError
 from pd4dgs_codec.evaluate import residuals as evaluate
-from pd4dgs_codec.model import layers, rate
+from pd4dgs_codec.model import masks, rate
 from pd4dgs_codec.render import projection
 
 DOCS = Path(__file__).parents[2] / "docs" / "stability.md"
@@ -126,8 +126,8 @@ def test_time_that_is_not_clamped_fails(monkeypatch):
 
 
 def test_masks_that_fall_or_a_threshold_that_moves_fail(monkeypatch):
-    mask = layers.level_mask
-    monkeypatch.setattr(layers, "level_mask", lambda logits, level: mask(logits, level) * (1 - 1e-6 * level))
+    mask = masks.level_mask
+    monkeypatch.setattr(masks, "level_mask", lambda logits, level: mask(logits, level) * (1 - 1e-6 * level))
     monkeypatch.setattr(quantise, "MASK_THRESHOLD", 0.0118)
     assert {"masks of logits -100..100", "codes at 0, 1 and the threshold"} <= broken_rows("masks")
 

@@ -35,7 +35,7 @@ def test_eval_averages_the_views_of_each_levels_own_prefix(scene_pd4, shared_dat
     end = info(data)["layers"][1]["end"]
     rows = evaluate_file(data[:end], dataset, 1)["levels"]
     model = from_scene(decode(data, max_layer=1))
-    images = [render_image(model, 1, v.time, v.viewmat, v.K, v.width, v.height) for v in dataset.test]
+    images = [render_image(model, 1, v.time, v.camera) for v in dataset.test]
     expected = np.mean([mpsnr(image, v.image, v.mask) for image, v in zip(images, dataset.test, strict=True)])
     assert len(images) == 3 and [row["level"] for row in rows] == [0, 1]
     assert rows[1]["mpsnr"] == pytest.approx(expected, abs=1e-9)
@@ -93,7 +93,7 @@ def test_render_dataset_views_as_the_renderer_sees_them(cli, scene_pd4, shared_d
     assert result.code == 0 and result.json["frames"] == 5 and result.json["levels"] == [1]
     view = load(str(shared_dataset)).train[2]
     level = load_levels(scene_pd4, 1)[-1]
-    expected = to_uint8(render_image(level.model, 1, view.time, view.viewmat, view.K, view.width, view.height))
+    expected = to_uint8(render_image(level.model, 1, view.time, view.camera))
     assert np.array_equal(np.asarray(Image.open(tmp_path / "out" / "02.png")), expected)
     assert len(list((tmp_path / "out").iterdir())) == 5
 

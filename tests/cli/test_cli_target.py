@@ -115,7 +115,7 @@ def test_a_layer_that_explains_the_pictures_is_kept(scene):
     camera, model = scene.info.camera, from_scene(rounded(plan(scene)[0]))
     views = []
     for time in (0.2, 0.9):
-        picture = render_image(model, 1, time, camera.viewmat, camera.K, camera.width, camera.height)
+        picture = render_image(model, 1, time, camera)
         views.append(View(camera.viewmat, camera.K, camera.width, camera.height, time, to_uint8(picture), None, "", 0))
     kept, (gone,) = leave_out_unpaid(scene, views, min_gain=0.5, options=EncodeOptions(mode="lzma", effort=1))
     assert gone.what == "local_deformation" and kept.global_deformation is not None

@@ -18,7 +18,7 @@ from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.evaluate.enclosure import residual_ranges, time_grid
 from pd4dgs_codec.evaluate.reach import reach
 from pd4dgs_codec.evaluate.residuals import residuals
-from pd4dgs_codec.scene import PLANES, Deformation, Scene
+from pd4dgs_codec.scene import PLANES, Camera, Deformation, Scene
 
 SIDES = (6, 5, 7, 5)
 
@@ -132,7 +132,7 @@ def test_no_pixel_changes():
             viewmat[:3, :3] = rotation * np.sign(np.linalg.det(rotation))
             viewmat[2, 3] = 8
             t = float(rng.random())
-            a, b = (render_image(model, level, t, viewmat, K, 48, 36) for model in (whole, less))
+            a, b = (render_image(model, level, t, Camera(viewmat, K, 48, 36)) for model in (whole, less))
             np.testing.assert_array_equal(a, b)
             seen += float(np.ptp(a))
     assert seen > 1, "the pictures show something"

@@ -7,9 +7,9 @@ import torch
 
 from pd4dgs_codec.errors import DataError, TrainError
 from pd4dgs_codec.model.hexplane import HexPlane, _Sample, sample_reference
-from pd4dgs_codec.model.layers import round_straight_through
 from pd4dgs_codec.model.plane_layout import PlaneLayout
 from pd4dgs_codec.model.plane_regularisers import TERMS, regularisers, regularisers_reference
+from pd4dgs_codec.model.rounding import round_straight_through
 from pd4dgs_codec.scene import PLANES
 
 BOX = np.array([[-1.0, -2.0, 0.5], [1.0, 3.0, 4.5]], np.float32)

@@ -16,7 +16,7 @@ from pd4dgs_codec.model import model as graph
 from pd4dgs_codec.model.config import DeformationConfig
 from pd4dgs_codec.model.convert import from_scene, to_scene
 from pd4dgs_codec.model.deformation import DeformationField
-from pd4dgs_codec.model.layers import level_mask, mask_logits
+from pd4dgs_codec.model.masks import level_mask, mask_logits
 from pd4dgs_codec.model.model import Model, fresh_networks
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.scene import (
@@ -32,9 +32,9 @@ from pd4dgs_codec.scene import (
 WIDTH, HEIGHT = 40, 30
 VOXEL = 2.0**-6
 BOX = np.array([[-1.5, -1.5, -1.5], [1.5, 1.5, 1.5]], np.float32)
-VIEWMAT = torch.eye(4)
+VIEWMAT = np.eye(4, dtype=np.float32)
 VIEWMAT[2, 3] = 4.0
-K = torch.tensor([[40.0, 0, 19.5], [0, 40.0, 15.5], [0, 0, 1]])
+CAMERA = Camera(VIEWMAT, np.array([[40.0, 0, 19.5], [0, 40.0, 15.5], [0, 0, 1]], np.float32), WIDTH, HEIGHT)
 FLAT = (200, 200, 200)  #: one mask at all levels
 
 
@@ -49,8 +49,7 @@ def small_model(heads=ALL_HEADS, masks=FLAT, *, anchors=80, seed=0, channels=8, 
     side = int(reach / VOXEL)
     cells = np.unique(rng.integers(-side, side + 1, (2 * anchors, 3), dtype=np.int32), axis=0)
     cells = rng.permutation(cells)[:anchors]
-    camera = Camera(VIEWMAT.numpy(), K.numpy(), WIDTH, HEIGHT)
-    info = SceneInfo(VOXEL, BOX, (0.0, 1.0), (0.25, 0.5, 0.75), 0.125, 64.0, (0.0, -1.0, 0.0), 0.0, camera)
+    info = SceneInfo(VOXEL, BOX, (0.0, 1.0), (0.25, 0.5, 0.75), 0.125, 64.0, (0.0, -1.0, 0.0), 0.0, CAMERA)
     networks = fresh_networks(16)
     torch.nn.init.constant_(networks["opacity"].linears[-1].bias, opacity)
     config = DeformationConfig(5, 4, channels, (1, 2), 8, ())
@@ -80,12 +79,12 @@ def stir(model: Model, amount: float, seed: int = 1) -> Model:
 
 
 @torch.no_grad()
-def gaussians(model: Model, level: int, t: float = 0.3, viewmat=VIEWMAT):
-    return model.gaussians(level, t, viewmat, K, WIDTH, HEIGHT)
+def gaussians(model: Model, level: int, t: float = 0.3, camera=CAMERA):
+    return model.gaussians(level, t, camera)
 
 
-def picture(model: Model, level: int, t: float = 0.3, viewmat=VIEWMAT) -> np.ndarray:
-    image = render_image(model, level, t, viewmat.numpy(), K.numpy(), WIDTH, HEIGHT)
+def picture(model: Model, level: int, t: float = 0.3, camera=CAMERA) -> np.ndarray:
+    image = render_image(model, level, t, camera)
     assert np.abs(image - model.info.background).max() > 0.1  # something is drawn, or the tests compare nothing
     return image
 
@@ -167,14 +166,15 @@ def test_the_global_position_residual_moves_anchors_and_the_view_direction():
     model = small_model()
     bias = set_bias(model.global_deformation, "position") * model.global_deformation.unit
     moved = gaussians(model, 1)
-    viewmat = VIEWMAT.clone()
-    viewmat[:3, 3] += viewmat[:3, :3] @ bias
-    expected = gaussians(model, 0, viewmat=viewmat)
+    viewmat = VIEWMAT.copy()
+    viewmat[:3, 3] += viewmat[:3, :3] @ bias.numpy()
+    camera = replace(CAMERA, viewmat=viewmat)
+    expected = gaussians(model, 0, camera=camera)
     assert torch.equal(moved.slots, expected.slots)
     torch.testing.assert_close(moved.means, expected.means + bias, rtol=0, atol=1e-6)
     for name in ("quats", "scales", "opacities", "colors"):
         torch.testing.assert_close(getattr(moved, name), getattr(expected, name), rtol=1e-5, atol=1e-6)
-    np.testing.assert_allclose(picture(model, 1), picture(model, 0, viewmat=viewmat), atol=1e-4)
+    np.testing.assert_allclose(picture(model, 1), picture(model, 0, camera=camera), atol=1e-4)
     assert (gaussians(model, 0).colors - moved.colors).abs().max() > 1e-4
 
 
@@ -253,17 +253,17 @@ def everything(model, level, *_):
 def test_culling_changes_no_pixel(level, monkeypatch):
     """Anchors all around the camera, some of them half in the picture."""
     model = stir(small_model(anchors=1500, reach=3.0), 0.02)
-    viewmats = []
+    cameras = []
     for angle in (0.3, 2.0, 4.1):
-        viewmat = torch.eye(4)
-        c, s = float(np.cos(angle)), float(np.sin(angle))
-        viewmat[:3, :3] = torch.tensor([[c, 0, -s], [0, 1, 0], [s, 0, c]])
-        viewmats.append(viewmat)
-    culled = [(picture(model, level, viewmat=v), len(gaussians(model, level, viewmat=v).anchors)) for v in viewmats]
+        viewmat = np.eye(4, dtype=np.float32)
+        c, s = np.cos(angle), np.sin(angle)
+        viewmat[:3, :3] = [[c, 0, -s], [0, 1, 0], [s, 0, c]]
+        cameras.append(replace(CAMERA, viewmat=viewmat))
+    culled = [(picture(model, level, camera=c), len(gaussians(model, level, camera=c).anchors)) for c in cameras]
     monkeypatch.setattr(Model, "visible", everything)
-    for viewmat, (image, evaluated) in zip(viewmats, culled, strict=True):
+    for camera, (image, evaluated) in zip(cameras, culled, strict=True):
         assert 0 < evaluated < 750  # fewer than half
-        np.testing.assert_allclose(picture(model, level, viewmat=viewmat), image, atol=1e-5)
+        np.testing.assert_allclose(picture(model, level, camera=camera), image, atol=1e-5)
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])

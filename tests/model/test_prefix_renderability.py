@@ -45,7 +45,7 @@ def camera_near(scene: Scene, seed: int) -> Camera:
 
 def shoot(model, level: int, t: float, camera: Camera) -> np.ndarray:
     """The picture, which must be finite and in 0..1."""
-    image = render_image(model, level, t, camera.viewmat, camera.K, camera.width, camera.height)
+    image = render_image(model, level, t, camera)
     assert image.shape == (HEIGHT, WIDTH, 3) and image.dtype == np.float32
     assert np.isfinite(image).all() and image.min() >= 0 and image.max() <= 1
     return image

@@ -6,7 +6,7 @@ import pytest
 import torch
 
 from pd4dgs_codec.errors import TrainError
-from pd4dgs_codec.model.layers import level_mask, mask_logits
+from pd4dgs_codec.model.masks import level_mask, mask_logits
 from pd4dgs_codec.train import losses
 from pd4dgs_codec.train.config import Schedule, TrainConfig, learning_rate
 from pd4dgs_codec.train.rollout import rollout_probabilities, sample_level, updated_rho

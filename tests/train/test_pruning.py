@@ -6,8 +6,8 @@ import torch
 from runs import assert_resumes_bit_for_bit, read_log
 
 from pd4dgs_codec.errors import NotFinite
-from pd4dgs_codec.model.model import EXACT
 from pd4dgs_codec.model.picture import render_image
+from pd4dgs_codec.model.rounding import EXACT
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train import pruning
 from pd4dgs_codec.train.config import PRUNING_ROUNDS, Schedule, TrainConfig
@@ -31,9 +31,7 @@ def trained(dataset, tmp_path):
 
 def _pictures(trainer, level: int) -> list[np.ndarray]:
     """Of the training views."""
-    return [
-        render_image(trainer.model, level, v.time, v.viewmat, v.K, v.width, v.height) for v in trainer.dataset.train
-    ]
+    return [render_image(trainer.model, level, v.time, v.camera) for v in trainer.dataset.train]
 
 
 def _difference(pictures, others) -> float:

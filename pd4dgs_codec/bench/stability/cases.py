@@ -164,7 +164,7 @@ def picture_error(model: Model, level: int, t: float, camera: Camera = CAMERA) -
     """Largest difference of a channel of a pixel between the float32 picture and the float64 oracle's picture of the
     same Gaussians; NaN where the former is not finite."""
     viewmat, K = torch.from_numpy(camera.viewmat), torch.from_numpy(camera.K)
-    picture = render(model, level, t, viewmat, K, camera.width, camera.height)
+    picture = render(model, level, t, camera)
     g, near = picture.gaussians, max(float(model.info.near), 1e-6)
     drawn, background = g.colors.isfinite().all(1), torch.tensor([model.info.background])
     means, quats, scales, opacities, colors = (a[drawn] for a in (g.means, g.quats, g.scales, g.opacities, g.colors))

@@ -18,7 +18,7 @@ from pd4dgs_codec.bench.stability.cases import BOX, CAMERA, Case, Found, largest
 from pd4dgs_codec.codec import decoder, encoder
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.evaluate import residuals
-from pd4dgs_codec.model import hexplane, layers
+from pd4dgs_codec.model import hexplane, masks
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.scene import MASK_THRESHOLD, PLANES, Deformation, Network, deformation_unit
@@ -301,15 +301,15 @@ def _triples(logits: Sequence[float]) -> torch.Tensor:
 def _level_mask_error(values: Sequence[float]) -> Found:
     mp = shared.mpmath()
     logits = _triples(values)
-    masks = [layers.level_mask(logits, level) for level in range(3)]
+    masks_of = [masks.level_mask(logits, level) for level in range(3)]
     worst = 0.0
     with mp.workdps(40):
         for i, (a, b, c) in enumerate(logits.tolist()):
             total = mp.mpf(a)
             for level, rise in enumerate((None, b, c)):
                 total += 0 if rise is None else max(mp.mpf(rise), 0) + mp.log1p(mp.exp(-abs(mp.mpf(rise))))
-                worst = largest([worst, abs(float(masks[level][i]) - float(1 / (1 + mp.exp(-total))))])
-    falls = max(float((low - high).max()) for low, high in itertools.pairwise(masks))
+                worst = largest([worst, abs(float(masks_of[level][i]) - float(1 / (1 + mp.exp(-total))))])
+    falls = max(float((low - high).max()) for low, high in itertools.pairwise(masks_of))
     return f"{len(logits)} triples, largest fall {max(falls, 0.0):g}", worst if falls <= 0 else math.nan
 
 
@@ -317,7 +317,7 @@ def _mask_gradients() -> Found:
     bad = 0
     for level in range(3):
         logits = _triples(FAR).requires_grad_()
-        (slope,) = torch.autograd.grad(layers.level_mask(logits, level).sum(), logits)
+        (slope,) = torch.autograd.grad(masks.level_mask(logits, level).sum(), logits)
         bad += int((~torch.isfinite(slope)).sum())
     return f"{bad} of {9 * len(FAR) ** 3} gradients not finite", float(bad)
 
@@ -337,8 +337,8 @@ def _code_errors() -> Found:
 
 def _codes_changed() -> Found:
     codes = np.array([0, *range(3, 256)], np.uint8)
-    logits = torch.from_numpy(layers.mask_logits(np.repeat(codes[:, None] / 255, 3, axis=1)))
-    again = [quantise.mask_codes(layers.level_mask(logits, level).numpy()) for level in range(3)]
+    logits = torch.from_numpy(masks.mask_logits(np.repeat(codes[:, None] / 255, 3, axis=1)))
+    again = [quantise.mask_codes(masks.level_mask(logits, level).numpy()) for level in range(3)]
     wrong = sum(int((found != codes).sum()) for found in again)
     return f"{wrong} of {3 * codes.size} codes changed", float(wrong)
 
@@ -349,8 +349,7 @@ def _drawn_against_sent() -> Found:
     logit = np.log(np.clip(masks, 1e-7, 1 - 1e-7)) - np.log1p(-np.clip(masks, 1e-7, 1 - 1e-7))
     with torch.no_grad():
         model.mask_logits[:, 0] = torch.from_numpy(logit).float()
-    camera = torch.from_numpy(CAMERA.viewmat), torch.from_numpy(CAMERA.K), CAMERA.width, CAMERA.height
-    drawn = set(model.visible(0, *camera).tolist())
+    drawn = set(model.visible(0, CAMERA).tolist())
     sent = set(np.flatnonzero(quantise.mask_codes(model.masks(0).detach().numpy())).tolist())
     return f"{len(drawn)} drawn, {len(sent)} sent", float(len(drawn ^ sent))
 

@@ -1,4 +1,4 @@
-"""Small building blocks: straight-through rounding, multi-layer perceptrons, level masks."""
+"""Multi-layer perceptrons whose weights can be rounded as the codec rounds them."""
 
 from __future__ import annotations
 
@@ -9,22 +9,8 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from pd4dgs_codec.model.rounding import round_straight_through
 from pd4dgs_codec.scene import Network
-
-
-class _Round(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx, x: Tensor, step: float) -> Tensor:
-        return torch.div(x, step).round_().mul_(step)
-
-    @staticmethod
-    def backward(ctx, g: Tensor):
-        return g, None
-
-
-def round_straight_through(x: Tensor, step: float | None) -> Tensor:
-    """round(x / step) * step with the identity's gradient; x itself if step is None."""
-    return x if step is None else _Round.apply(x, step)
 
 
 class MLP(nn.Module):
@@ -69,24 +55,3 @@ class MLP(nn.Module):
                 linear.weight.copy_(torch.from_numpy(np.array(w)))
                 linear.bias.copy_(torch.from_numpy(np.array(b)))
         return mlp
-
-
-def level_mask(logits: Tensor, level: int) -> Tensor:
-    """m^(level) [N] of logits [N, 3]: sigmoid(a0 + sum_{1<=j<=level} softplus(a_j)), so never falling with level.
-
-    The gradient reaches a_level alone. Were it to reach the logits below as well, whatever a higher level needs would
-    be held in layer 0 too, and the levels' masks would stay together.
-    """
-    total = logits[:, 0]
-    for j in range(1, level + 1):
-        total = total.detach() + F.softplus(logits[:, j])
-    return torch.sigmoid(total)
-
-
-def mask_logits(masks: np.ndarray) -> np.ndarray:
-    """Logits float32 [N, 3] whose level masks are `masks` [N, 3], non-decreasing along axis 1, to within 1e-6."""
-    m = np.clip(masks.astype(np.float64), 1e-7, 1 - 1e-7)
-    total = np.log(m) - np.log1p(-m)
-    rise = np.maximum(np.diff(total, axis=1), 1e-13)
-    steps = np.where(rise > 30, rise, np.log(np.expm1(np.minimum(rise, 30.0))))
-    return np.concatenate([total[:, :1], steps], axis=1).astype(np.float32)
