@@ -34,18 +34,19 @@ def surface(name: str, count: int, side: int = 1024, seed: int = 0) -> np.ndarra
 
 def _sphere(rng: np.random.Generator, n: int) -> np.ndarray:
     p = rng.normal(size=(n, 3))
-    return 0.48 * p / np.linalg.norm(p, axis=1, keepdims=True)
+    return np.asarray(0.48 * p / np.linalg.norm(p, axis=1, keepdims=True))
 
 
 def _torus(rng: np.random.Generator, n: int) -> np.ndarray:
     ring, tube = 0.34, 0.14
     u, v, keep = rng.random((3, n)) * [[2 * np.pi], [2 * np.pi], [1]]
     around = ring + tube * np.cos(v)
-    return np.stack([around * np.cos(u), around * np.sin(u), tube * np.sin(v)], 1)[keep < around / (ring + tube)]
+    points = np.stack([around * np.cos(u), around * np.sin(u), tube * np.sin(v)], 1)
+    return np.asarray(points[keep < around / (ring + tube)])
 
 
 def _plane(rng: np.random.Generator, n: int) -> np.ndarray:
-    return (rng.random((n, 2)) - 0.5) @ np.array([[0.8, 0.1, 0.25], [-0.15, 0.7, 0.3]])
+    return np.asarray((rng.random((n, 2)) - 0.5) @ np.array([[0.8, 0.1, 0.25], [-0.15, 0.7, 0.3]]))
 
 
 def _cylinder(rng: np.random.Generator, n: int) -> np.ndarray:
@@ -61,7 +62,7 @@ def _gyroid(rng: np.random.Generator, n: int) -> np.ndarray:
         value = (s * np.roll(c, -1, axis=1)).sum(axis=1, keepdims=True)
         slope = w * (c * np.roll(c, -1, axis=1) - s * np.roll(s, 1, axis=1))
         p = p - value * slope / np.maximum((slope**2).sum(axis=1, keepdims=True), 1e-9)
-    return p[(np.abs(p) < 0.48).all(axis=1) & (np.abs(value[:, 0]) < 1e-3)]
+    return np.asarray(p[(np.abs(p) < 0.48).all(axis=1) & (np.abs(value[:, 0]) < 1e-3)])
 
 
 _SAMPLERS = {"sphere": _sphere, "torus": _torus, "plane": _plane, "cylinder": _cylinder, "gyroid": _gyroid}

@@ -9,6 +9,7 @@ from __future__ import annotations
 import random
 import sys
 from pathlib import Path
+from typing import Any
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tests")]
@@ -36,9 +37,9 @@ def mutate(data: bytes, max_size: int, seed: int) -> bytes:
     try:
         parts = take_apart(data)
     except (Pd4Error, LookupError, ValueError, AttributeError):  # not a file that has all its parts
-        return atheris.Mutate(data, len(data))
+        return bytes(atheris.Mutate(data, len(data)))
     if rng.random() < 0.1:
-        return atheris.Mutate(data, len(data))
+        return bytes(atheris.Mutate(data, len(data)))
     chunk = rng.choice(parts.chunks)
     if rng.random() < 0.15:
         parts.header = _mutated_map(parts.header)
@@ -53,7 +54,7 @@ def mutate(data: bytes, max_size: int, seed: int) -> bytes:
     return put_together(parts)[:max_size]
 
 
-def _mutated_map(value: dict) -> dict:
+def _mutated_map(value: dict[Any, Any]) -> dict[Any, Any]:
     """A changed map, or the same where the changed bytes are no map."""
     packed = canonical.pack(value)
     try:

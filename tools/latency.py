@@ -37,24 +37,6 @@ def fault_table() -> Any:
     return table
 
 
-def timed(name: str, data: bytes, rates: Sequence[float], runs: int, size: tuple[int, int] | None) -> dict[str, Any]:
-    """A FileReport as a dict. size: of the pictures; for None that of the file's camera, and quality is measured."""
-    from pd4dgs_codec.bench import latency
-    from pd4dgs_codec.codec.decoder import decode
-    from pd4dgs_codec.view.evaluate import evaluate_file
-
-    scene = decode(data, max_layer=0)
-    assert scene.info.camera is not None
-    quality = None
-    if size is None and SCENES[name].there:
-        quality = [row["mpsnr"] for row in evaluate_file(data, SCENES[name].load())["levels"]]
-    size = size or (scene.info.camera.width, scene.info.camera.height)
-    say(f"{name}: {runs} runs at {len(rates)} rates")
-    times = latency.times(data, rates, runs, size)
-    start, anchors = latency.first_start(data, max(rates), size), int((scene.mask[0] > 0).sum())
-    return asdict(latency.FileReport(f"{name}/scene.pd4", len(data), anchors, size, times, quality, start))
-
-
 def measure(out: Path, docs: Path, runs: int) -> Row:
     """All that the page shows, from the files of NAMES in `out`."""
     from pd4dgs_codec.bench import latency
@@ -62,18 +44,24 @@ def measure(out: Path, docs: Path, runs: int) -> Row:
 
     contents = {name: (out / name / "scene.pd4").read_bytes() for name in NAMES}
     warm_up()
-    files = [timed(name, data, RATES, runs, None) for name, data in contents.items()]
-    larger = timed(NAMES[1], latency.with_anchors(contents[NAMES[1]], ANCHORS), (RATE,), runs, SIZE)
+    files = []
+    for name, data in contents.items():
+        say(f"{name}: {runs} runs at {len(RATES)} rates")
+        dataset = SCENES[name].load() if SCENES[name].there else None
+        files.append(latency.report(f"{name}/scene.pd4", data, RATES, runs, dataset=dataset))
+    say(f"{NAMES[1]}: with {ANCHORS:,} anchors")
+    larger = latency.with_anchors(contents[NAMES[1]], ANCHORS)
+    reports = [*files, latency.report(f"{NAMES[1]}/scene.pd4", larger, (RATE,), runs, SIZE)]
     table = fault_table()
     file = table.File(contents[NAMES[0]])
     say(f"{NAMES[0]}: faults, {CUTS:,} cuts, a crowd")
     faults = [asdict(table.run(file, scenario)) for scenario in table.scenarios(file)]
     cuts, crowd = asdict(table.random_cuts(file, CUTS)), asdict(table.crowd(file.data))
-    row: Row = {"runs": runs, "files": files, "larger": larger, "faults": faults, "cuts": cuts, "crowd": crowd}
+    *shown, large = [asdict(report) for report in reports]
+    row: Row = {"runs": runs, "files": shown, "larger": large, "faults": faults, "cuts": cuts, "crowd": crowd}
     keep(out, "latency", row)
-    shown = {f["name"]: [(at, level) for of, level, at in f["shown"] if of == "old"] for f in faults[:MOST_FAULTS]}
-    beside = (f"under faults, {table.RATE / 1e6:g} Mbps", shown)
-    latency.draw(_report(files[0]), docs / "img" / "latency.png", beside)
+    lines = {f["name"]: [(at, level) for of, level, at in f["shown"] if of == "old"] for f in faults[:MOST_FAULTS]}
+    latency.draw(files[0], docs / "img" / "latency.png", (f"under faults, {table.RATE / 1e6:g} Mbps", lines))
     return row
 
 

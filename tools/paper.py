@@ -75,7 +75,7 @@ def make(table: Any, args: argparse.Namespace, progress: Any) -> None:
 
     from pd4dgs_codec.data.dataset import load
 
-    results = []
+    results: list[dict[str, Any]] = []
     for one in [scene(name, table.budget, args.iterations) for name in args.scenes or table.scenes]:
         if one.config.source.startswith(str(SHARED)) and not Path(one.config.source).is_dir():
             print(f"{table.name}: {one.name} is not in {SHARED}, left out")

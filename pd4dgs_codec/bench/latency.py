@@ -23,8 +23,10 @@ from pd4dgs_codec.bench.viewer import pictures
 from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.encoder import encode
 from pd4dgs_codec.codec.info import info
+from pd4dgs_codec.data.dataset import Dataset
 from pd4dgs_codec.delivery.transfer import Transfer
 from pd4dgs_codec.errors import DataError, DeliveryError
+from pd4dgs_codec.view.evaluate import evaluate_file
 
 #: What the median over the paced link may be off from 8S/B: the larger of a share and of seconds.
 TOLERANCE, TOLERANCE_SECONDS = 0.03, 0.010
@@ -154,19 +156,11 @@ def times(
                 step()
                 cold.append(cold_start(url, size))
                 step()
+        shown = [[picture.seconds for picture in run] for run in warm]
+        after = [[picture.after_last_byte for picture in run] for run in warm]
         for i, (layer, end) in enumerate(layer_rows(data)):
-            rows.append(
-                Times(
-                    rate=rate,
-                    level=layer,
-                    bytes=end,
-                    expected=8 * end / rate,
-                    network=statistics.median(run[i] for run in network),
-                    picture=statistics.median(run[i].seconds for run in warm),
-                    after_last_byte=statistics.median(run[i].after_last_byte for run in warm),
-                    cold=statistics.median(run[i] for run in cold),
-                )
-            )
+            medians = [statistics.median(run[i] for run in kind) for kind in (network, shown, after, cold)]
+            rows.append(Times(rate, layer, end, 8 * end / rate, *medians))
     return rows
 
 
@@ -174,6 +168,24 @@ def first_start(data: bytes, rate: float, size: tuple[int, int]) -> float:
     """Seconds to the first picture of a process that finds no compiled kernels, as after installation."""
     with tempfile.TemporaryDirectory(prefix="pd4dgs-") as cache, served(data, rate) as url:
         return cold_start(url, size, NUMBA_CACHE_DIR=cache)[0]
+
+
+def report(
+    name: str,
+    data: bytes,
+    rates: Sequence[float],
+    runs: int,
+    size: tuple[int, int] | None = None,
+    dataset: Dataset | None = None,
+    step: Callable[[], None] = lambda: None,
+) -> FileReport:
+    """What the tables tell of a file that holds a camera. size: of the pictures, the camera's for None."""
+    base = decode(data, max_layer=0)
+    assert base.info.camera is not None
+    size = size or (base.info.camera.width, base.info.camera.height)
+    quality = None if dataset is None else [row["mpsnr"] for row in evaluate_file(data, dataset)["levels"]]
+    measured, start = times(data, rates, runs, size, step), first_start(data, max(rates), size)
+    return FileReport(name, len(data), int((base.mask[0] > 0).sum()), size, measured, quality, start)
 
 
 def with_anchors(data: bytes, count: int, seed: int = 5) -> bytes:

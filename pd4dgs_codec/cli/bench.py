@@ -23,7 +23,6 @@ from pd4dgs_codec.jsonable import finite
 
 if TYPE_CHECKING:
     from pd4dgs_codec.bench.codec import Deviation, Point, Sweep
-    from pd4dgs_codec.bench.latency import FileReport
     from pd4dgs_codec.bench.train import Run
     from pd4dgs_codec.scene import SceneInfo
     from pd4dgs_codec.view.frames import Frame
@@ -198,13 +197,16 @@ def _latency(args: argparse.Namespace, console: Console) -> Outcome:
     if args.data and len(args.data) != len(args.inputs):
         raise UsageError(f"found {len(args.data)} --data for {len(args.inputs)} files, expected one each or none")
     from pd4dgs_codec.bench import latency
+    from pd4dgs_codec.data.dataset import load
     from pd4dgs_codec.model.warm import warm_up
 
     contents = [_with_camera(name, args.anchors) for name in args.inputs]
-    sources = args.data or [None] * len(contents)
+    sets = [load(source, downscale=args.downscale) for source in args.data] or [None] * len(contents)
+    speeds, files = list(args.rates.values()), []
     warm_up()
-    with progress_bar(3 * args.runs * len(args.rates) * len(contents), "runs", "times") as step:
-        files = [_timed(*one, args, step) for one in zip(args.inputs, contents, sources, strict=True)]
+    with progress_bar(3 * args.runs * len(speeds) * len(contents), "runs", "times") as step:
+        for name, data, dataset in zip(args.inputs, contents, sets, strict=True):
+            files.append(latency.report(name, data, speeds, args.runs, args.size, dataset, step))
     result = {
         "runs": args.runs,
         "rates": args.rates,
@@ -226,29 +228,6 @@ def _with_camera(name: str, anchors: int | None) -> bytes:
         return data if anchors is None else with_anchors(data, anchors)
     except (DecodeError, DataError) as error:
         raise DataError(f"{name}: {error}") from None
-
-
-def _timed(
-    name: str, data: bytes, source: str | None, args: argparse.Namespace, step: Callable[[], None]
-) -> FileReport:
-    from pd4dgs_codec.bench import latency
-    from pd4dgs_codec.codec.decoder import decode
-    from pd4dgs_codec.data.dataset import load
-    from pd4dgs_codec.view.evaluate import evaluate_file
-
-    base = decode(data, max_layer=0)
-    assert base.info.camera is not None
-    size = args.size or (base.info.camera.width, base.info.camera.height)
-    levels = evaluate_file(data, load(source, downscale=args.downscale))["levels"] if source else []
-    return latency.FileReport(
-        name=name,
-        bytes=len(data),
-        anchors=int((base.mask[0] > 0).sum()),
-        size=size,
-        times=latency.times(data, list(args.rates.values()), args.runs, size, step),
-        quality=[row["mpsnr"] for row in levels] or None,
-        first_start=latency.first_start(data, max(args.rates.values()), size),
-    )
 
 
 # -- stability ---------------------------------------------------------------------------------------------------------

@@ -11,10 +11,12 @@ import random
 import time
 import tracemalloc
 import warnings
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from fuzzing.files import digests
 from fuzzing.mutate import Case
@@ -55,7 +57,7 @@ class Outcome:
     checksums: int
 
 
-def _end(function, *args, **options) -> tuple[str, object]:
+def _end(function: Callable[..., Any], *args: Any, **options: Any) -> tuple[str, object]:
     """(DECODED or the error's class name, the result or the error). Finding for anything else that is raised."""
     try:
         return DECODED, function(*args, **options)

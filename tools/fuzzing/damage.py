@@ -32,7 +32,7 @@ Layers = Sequence[LayerSymbols]
 def whole_payloads_known(files: Sequence[bytes]) -> Iterator[Mapping[bytes, Layers]]:
     """The layers of each file; while this holds, the decoder takes those of an unchanged payload from here."""
     known: dict[Any, LayerSymbols] = {}
-    read_layer = decoder.read_layer
+    read_layer = decoder.read_layer  # type: ignore[attr-defined]
 
     def remember(payload: bytes, kind: Any, *rest: Any) -> LayerSymbols:
         return known.setdefault((payload, kind.layer, *rest), read_layer(payload, kind, *rest))
@@ -102,10 +102,10 @@ def damage(files: Sequence[bytes], run: int, changes: int) -> tuple[Counter[str]
                 findings.append(f"{what}: {finding}")
 
         for index in range(changes):
-            data = bytearray(files[index % len(files)])
+            changed = bytearray(files[index % len(files)])
             change = rng.choice(kinds)
-            change(rng, data, rng.choice(files))
-            examine(f"change {index}, {change.__name__}", check_change, bytes(data), originals)
+            change(rng, changed, rng.choice(files))
+            examine(f"change {index}, {change.__name__}", check_change, bytes(changed), originals)
         for number, data in enumerate(files):
             ends = chunk_ends(data)
             near = [e + d for e, _ in ends for d in range(-BOUNDARY, BOUNDARY + 1) if 0 <= e + d < len(data)]

@@ -203,7 +203,7 @@ def built_seeds() -> list[Seed]:
 def _correlated(anchors: int) -> Scene:
     """Attributes that predict one another, so that the encoder takes form 1 of the attributes."""
     rng = np.random.default_rng(0)
-    scene = make_scene(4, layers=(0,), anchors=anchors, extent=3, hidden=())
+    scene: Scene = make_scene(4, layers=(0,), anchors=anchors, extent=3, hidden=())
     n, steps = len(scene.anchor_q), scene.steps
     feature = np.rint(rng.normal(0, 900, (n, 1))) * rng.choice([1, 2], 32) + rng.integers(-1, 2, (n, 32))
     still = rng.random((n, 10, 1)) < 0.6
@@ -237,7 +237,7 @@ def _staged() -> dict[str, bytes]:
 def _all_priors() -> Scene:
     """No anchors, and weights that are spiky, heavy-tailed, or wide with outliers: a kind of prior for each."""
     rng = np.random.default_rng(0)
-    scene = make_scene(5, layers=(0,), anchors=0, hidden=())
+    scene: Scene = make_scene(5, layers=(0,), anchors=0, hidden=())
 
     def with_weight(name: str, symbols: np.ndarray) -> Any:
         ((weight, bias),) = scene.networks[name]

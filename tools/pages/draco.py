@@ -14,7 +14,7 @@ def draco_encode(cells: np.ndarray) -> bytes:
 
     offsets = cells - cells.min(axis=0)
     bits = max(1, int(offsets.max()).bit_length())
-    return DracoPy.encode(
+    data = DracoPy.encode(
         offsets.astype(np.float32),
         quantization_bits=bits,
         compression_level=10,
@@ -22,3 +22,4 @@ def draco_encode(cells: np.ndarray) -> bytes:
         quantization_origin=[0.0, 0.0, 0.0],
         preserve_order=False,
     )
+    return bytes(data)

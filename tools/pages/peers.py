@@ -134,7 +134,7 @@ def _decode_own(payloads: list[bytes], symbols: Symbols) -> list[np.ndarray]:
                 channels += list(read_attributes(data, layer.attributes.shape[1]))
             elif section == Section.PLANES:
                 shapes = [plane.shape for plane in planes]
-                channels += [c.ravel() for plane in read_planes(data, shapes) for c in plane]  # type: ignore[arg-type]
+                channels += [c.ravel() for plane in read_planes(data, shapes) for c in plane]
             else:
                 channels += [c for c in decode_channels(data, [c.size for c in groups[section]]) if c.size]
     return channels
@@ -233,7 +233,7 @@ def _torchac_peer() -> Coder:
                 continue
             table, low, rows = pieces(channel)
             values = torch.from_numpy((channel - low).astype(np.int16))
-            for part in values.split(rows):
+            for part in values.split(rows):  # type: ignore[no-untyped-call]
                 payloads.append(torchac.encode_int16_normalized_cdf(table.repeat(len(part), 1), part))
         return payloads
 
@@ -406,7 +406,7 @@ def _spz_peer(splats: Splats) -> tuple[Callable[[Splats], bytes], Callable[[byte
         result = converter.convert(data, source, target, spz_version=4)
         if "error" in result:
             raise ValueError(f"gaussforge: {result['error']}")
-        return result["data"]
+        return bytes(result["data"])
 
     return (
         lambda s: convert(to_ply(scaled(s, factor)), "ply", "spz"),

@@ -123,7 +123,7 @@ def all_layers(rows: Sequence[dict[str, Any]]) -> dict[str, Any]:
     sums: dict[str, Any] = {"layer": "all"}
     for key in (*BYTES, "position_bytes", "draco_position_bytes"):
         values = [row.get(key) for row in rows]
-        sums[key] = None if None in values else sum(values)  # type: ignore[arg-type]
+        sums[key] = None if None in values else sum(value for value in values if value is not None)
     weights = {
         "payload_over_rate": [row.get("rate_bits") for row in rows],
         "train_over_rate": [row.get("rate_bits") for row in rows],

@@ -116,7 +116,7 @@ def measure(
     wanted = json.loads(json.dumps(run.config, default=lambda value: value.__dict__))
     file = folder / "result.json"
     if file.exists():
-        stored = json.loads(file.read_text())
+        stored: dict[str, Any] = json.loads(file.read_text())
         if stored["config"] == wanted:
             return {"commit": "unknown"} | stored
     data = dataset()
@@ -179,7 +179,8 @@ def _keep(file: Path, value: dict[str, Any]) -> dict[str, Any]:
     """Writes `value` as JSON and returns what the file then says, which is what a later run will read."""
     with whole_file(file, overwrite=True) as temporary:
         temporary.write_text(json.dumps(finite(value), indent=1, allow_nan=False))
-    return json.loads(file.read_text())
+    kept: dict[str, Any] = json.loads(file.read_text())
+    return kept
 
 
 def course(log: Path) -> list[dict[str, Any]]:
