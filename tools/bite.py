@@ -2,31 +2,52 @@
 
     python tools/bite.py proof             # every faulty vector fails for its own reason and no other
     python tools/bite.py mutants           # every mistake that is built into the reference decoder is noticed
-    python tools/bite.py mutants NAME ...  # only these, and which vector notices each
+    python tools/bite.py mutants WORD ...  # those with one of these words in their names, and what notices each
 
-One line per finding and exit code 1 if there is any. --jobs sets the number of processes, 2 unless it is given.
+One line per finding and exit code 1 if there is any. --jobs sets the number of processes.
 """
 
 from __future__ import annotations
 
 import argparse
 import sys
-import time
+from collections.abc import Iterator
 
-from make_vectors import vectors
-from vectors import proof
+from make_vectors import VECTORS, vectors
+from vectors import mutants, proof
+
+
+def prove(jobs: int) -> Iterator[str]:
+    """One line per vector that proves nothing."""
+    yield from proof.prove(vectors(), jobs)
+
+
+def hunt(words: list[str], jobs: int) -> Iterator[str]:
+    """One line per mutant that no vector notices, or that one notices though it is said to be equivalent."""
+    chosen = [m for m in mutants.written() if not words or any(word in m.name for word in words)]
+    found = 0
+    for mutant, name in mutants.verdicts(chosen, mutants.stored(VECTORS), jobs):
+        found += name is not None
+        if words:
+            print(f"{mutant.clause} {mutant.name}: {name or 'not noticed'}")
+        if name is None and not mutant.equivalent:
+            yield f"{mutant.clause} {mutant.name}: no vector notices it"
+        if name is not None and mutant.equivalent:
+            yield f"{mutant.clause} {mutant.name}: said to be equivalent ({mutant.equivalent}), but {name} notices it"
+    print(f"{len(chosen)} mutants, {found} noticed, {sum(bool(m.equivalent) for m in chosen)} equivalent")
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(description="Test the conformance vectors.")
-    parser.add_argument("what", choices=("proof",))
+    parser.add_argument("what", choices=("proof", "mutants"))
+    parser.add_argument("words", nargs="*", help="of mutants: words of their names")
     parser.add_argument("--jobs", type=int, default=2, metavar="N", help="processes (default 2)")
     arguments = parser.parse_args()
-    start, found = time.monotonic(), 0
-    for line in proof.prove(vectors(), arguments.jobs):
-        print(line, file=sys.stderr)
+    found = 0
+    for line in prove(arguments.jobs) if arguments.what == "proof" else hunt(arguments.words, arguments.jobs):
+        print(line, file=sys.stderr, flush=True)
         found += 1
-    print(f"{found} findings, {time.monotonic() - start:.0f} s")
+    print(f"{found} findings")
     return int(found > 0)
 
 

@@ -210,12 +210,32 @@ def relative_magnitude(e: np.ndarray) -> np.ndarray:
     return sum((abs(c) * 256 * len(c) // (1 + abs(c).sum()) for c in e), np.zeros(e.shape[1], np.int64))
 
 
+def classes_by_activity(activity: np.ndarray, count: int) -> np.ndarray:
+    """The class of each place, 0 .. count − 1 (clause 8.9)."""
+    n = len(activity)
+    return np.searchsorted(np.sort(activity)[[i * n // count for i in range(1, count)]], activity, side="right")
+
+
 def split_by_activity(channel: np.ndarray, activity: np.ndarray, count: int) -> list[np.ndarray]:
     """The symbols of each of `count` classes (clause 8.9)."""
-    ascending, n = sorted(activity.tolist()), len(activity)
-    bounds = [ascending[i * n // count] for i in range(1, count)]
-    classes = np.array([sum(b <= a for b in bounds) for a in activity.tolist()])
+    classes = classes_by_activity(activity, count)
     return [channel[classes == q] for q in range(count)]
+
+
+def plane_activity(e: np.ndarray) -> np.ndarray:
+    """int64 [H, W] from residuals int64 [m, H, W] of the stages before (clause 8.8)."""
+    _, height, width = e.shape
+    size = relative_magnitude(e.reshape(len(e), -1)).reshape(height, width)
+    i, j = np.indices((height, width))
+    near = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)]
+    return sum(
+        (size[np.clip(i + a, 0, height - 1), np.clip(j + b, 0, width - 1)] for a, b in near), np.zeros_like(size)
+    )
+
+
+def classes_of_plane(e: np.ndarray, count: int) -> np.ndarray:
+    """The class [H, W] of each cell, given the residuals int64 [m, H, W] of the stages before."""
+    return classes_by_activity(plane_activity(e).ravel(), count).reshape(e.shape[1:])
 
 
 Lengths = Callable[[list[int]], list[int]]
@@ -247,17 +267,13 @@ def staged_planes(
         first, end = (1 << stage if stage else 0), 2 << stage
         channels: list[np.ndarray] = []
         for plane in planes:
-            e = plane.reshape(len(plane), -1).astype(np.int64)
+            e = plane.astype(np.int64)
             if stage == 0:
-                channels += list(e[:end])
+                channels += [channel.ravel() for channel in e[:end]]
                 continue
-            _, height, width = plane.shape
-            size = relative_magnitude(e[:first]).reshape(height, width)
-            i, j = np.indices((height, width))
-            near = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)]
-            around = sum(size[np.clip(i + a, 0, height - 1), np.clip(j + b, 0, width - 1)] for a, b in near)
+            activity = plane_activity(e[:first]).ravel()
             for channel in e[first:end]:
-                channels += split_by_activity(channel, np.ravel(around), counts[stage - 1])
+                channels += split_by_activity(channel.ravel(), activity, counts[stage - 1])
         stages.append(channels)
     return b"\1" + b"".join(map(varint, counts)) + staged(stages, lengths, tail, priors)
 

@@ -102,6 +102,8 @@ def _preamble() -> Iterator[Vector]:
         ("zeros", bytes(8), "Zeros."),
     ):
         yield bad(f"signature-{name}", what, "3.1", "BadSignature", replace(plain, signature=signature), at=SIGNATURE)
+    short = replace(plain, signature=b"GIF89a")
+    yield bad("signature-short", "A short file of another kind.", "3.1", "BadSignature", short, at=SIGNATURE, size=6)
     for major in (0, 2, 65535):
         what = f"Major version {major}."
         yield bad(f"version-major-{major}", what, "3.1", "UnsupportedVersion", replace(plain, major=major), at=VERSION)
@@ -782,6 +784,8 @@ def _sections() -> Iterator[Vector]:
 def _sizes() -> Iterator[Vector]:
     over = symbols_at_limit(over=1)
     yield bad("symbols-over-limit", "One symbol more than the payload may declare.", "6.5", LIMIT, over, chunk=1)
+    over, what = symbols_at_limit(over=1, rows=2), "One symbol more, those of own and of earlier rows counted."
+    yield bad("symbols-of-rows-over-limit", what, "6.5", LIMIT, over, chunk=1)
     crowd = rows_at_limit(over=1)
     yield bad("rows-over-limit", "One anchor more than the payload may declare.", "6.5 14", LIMIT, crowd, chunk=0)
     layer, file = make_layer(), _plain()

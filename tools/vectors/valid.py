@@ -8,6 +8,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
+from pd4dgs_codec.attributes.planes import restore
 from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
 from pd4dgs_codec.bitstream.limits import MAX_NETWORK_LAYERS, MAX_NETWORK_WIDTH, MAX_PLANE_CHANNELS, MAX_PLANE_SIDE
 from pd4dgs_codec.codec.layer_meta import FREE_ROWS, FREE_SYMBOLS, ROWS_PER_BYTE, SYMBOLS_PER_BYTE
@@ -43,6 +44,7 @@ from .blocks import (
     Layer,
     Scale,
     Vector,
+    classes_of_plane,
     gauss,
     good,
     lzma_floats,
@@ -387,6 +389,13 @@ def _attributes() -> Iterator[Case]:
     yield "staged-all", "Terms, splits and classes.", "8.6 8.7 8.9", predicted(ladder, flags, lively, (8, 3, 1, 6, 4))
     few = predicted(ladder, flags, spread, (8,) * 5)
     yield "staged-two-anchors", "More classes than anchors.", "8.9", few
+    fractions = pattern(68, ROWS, seed=1)
+    yield (
+        "staged-fractions",
+        "Classes that hang on the floor of each quotient, not on that of their sum.",
+        "8.9",
+        predicted({}, {}, fractions, (8,) * 5),
+    )
     large = pattern(68, 12)
     large[:6] = pattern(6, 12, low=-MAX_SYMBOL, high=MAX_SYMBOL)
     yield (
@@ -448,6 +457,12 @@ def _planes() -> Iterator[Case]:
         section = staged_planes([p for p in layer.meant.planes[0].values()], counts)
         file = make_file(make_layer(), layer.with_sections({PLANE: section}))
         yield f"planes-staged-{channels}", f"{channels} plane channels in stages.", "8.8 8.9", file
+    yield (
+        "planes-products-over-2-53",
+        "A relative magnitude whose product is over 2^53 and whose quotient lies just below an integer.",
+        "8.9",
+        _large_products(),
+    )
     flat = Scale(1, (MAX_PLANE_SIDE, 1, 1, 2), (0,) * 6, lambda name, shape: np.full(shape, 1, np.int32))
     yield "planes-longest", "A side of 4096 cells.", "6.3 14", deformed([flat])
     many = Scale(MAX_PLANE_CHANNELS, (1, 1, 1, 1), (0,) * 6)
@@ -464,6 +479,39 @@ def _planes() -> Iterator[Case]:
     yield "symbols-at-limit", "As many constant symbols as the payload may declare.", "6.5", symbols_at_limit()
 
 
+def _large_products() -> File:
+    """Plane xy of 4096 by 521 cells, N in all. In channel 0 the sum of all magnitudes is M − 1, and 256·N·E + 1 is a
+    multiple of M: the quotient of E is its integer less 1 / M, which binary64 cannot tell from the integer. Magnitudes
+    of E + 1 make up more than an eighth of the cells around them, so they are of the last class, and E is not."""
+    height, width, total, e = 521, MAX_PLANE_SIDE, 549756251549, 16669554
+    product = 256 * height * width * e
+    assert product % total == total - 1 and int(product / total) == product // total + 1
+    residuals = np.zeros((3, height, width), np.int64)
+    residuals[0, 0, 0] = -MAX_SYMBOL  # from here every other magnitude leads up, and the next one down
+    left = total - 1 - MAX_SYMBOL
+    places = itertools.product(range(3, height - 1, 3), range(20, 20 * 204 + 1, 20))
+    pairs = zip(*[iter(places)] * 2, strict=False)
+    for (i, j), (same, k) in pairs:
+        size = e if i == 252 and j == 20 * 51 else e + 1
+        if i != same or left < 2 * size:
+            continue
+        residuals[0, i, [j, k]] = size, -size
+        left -= 2 * size
+    for i in (1, 2):  # the rest, where nothing follows in its row
+        residuals[0, height - i, width - 1] = min(left, e)
+        left -= min(left, e)
+    assert left == 0
+    residuals[2] = classes_of_plane(residuals[:2], 8) == 7
+    samples = restore([(1, residuals.astype(np.int32))])[0]
+    zeros = np.zeros((3, 1, 1), np.int32)
+    sides, predictors = (width, height, 1, 1), (1, *[0] * 5)
+    scale = Scale(3, sides, predictors, lambda name, shape: samples if name == "xy" else np.broadcast_to(zeros, shape))
+    layer = make_layer(1, (), scales=[scale])
+    others = list(layer.meant.planes[0].values())[1:]
+    section = staged_planes([residuals, *others], (8,), priors={0: {0: Const(Window(0, 1))}})
+    return make_file(make_layer(cells=()), layer.with_sections({PLANE: section}))
+
+
 def _with_weights() -> Layer:
     networks = {}
     for name, outputs in (("opacity", 10), ("covariance", 70), ("color", 30)):
@@ -473,20 +521,21 @@ def _with_weights() -> Layer:
     return make_layer(networks=networks)
 
 
-def symbols_at_limit(over: int = 0) -> File:
-    """Constant channels whose number is at the limit of clause 6.5, or `over` above it."""
+def symbols_at_limit(over: int = 0, rows: int = 0) -> File:
+    """As many constant channels as clause 6.5 allows, or `over` more, and `rows` anchors in either layer."""
     plane = Scale(1, (2048, 2048, 1, 1), (0,) * 6, lambda name, shape: np.full(shape, 1, np.int32))
 
     def layer(first: int, second: int, hidden: int) -> Layer:
-        return make_layer(1, (), scales=[plane], networks={0: (first, second), 1: (hidden, 3)})
+        networks = {0: (first, second), 1: (hidden, 3)}
+        return make_layer(1, line(rows, z=5), before=rows, scales=[plane], networks=networks)
 
     size = len(layer(300, 300, 1).payload())  # the same while no width takes more bytes
-    weights = FREE_SYMBOLS + SYMBOLS_PER_BYTE * size + over - (2048 * 2048 + 4 * 2048 + 1)
+    weights = FREE_SYMBOLS + SYMBOLS_PER_BYTE * size + over - (2048 * 2048 + 4 * 2048 + 1) - 73 * rows
     for first, hidden in itertools.product(range(256, 400), range(1, 100)):
         # weights = (1 + 1) first + (first + 1) second + (second + 1) hidden + (hidden + 1) 3
         second, rest = divmod(weights - 3 - 2 * first - 4 * hidden, first + 1 + hidden)
         if rest == 0 and second >= 256:
-            return make_file(make_layer(cells=()), layer(first, second, hidden))
+            return make_file(make_layer(cells=line(rows)), layer(first, second, hidden))
     raise AssertionError("no widths reach the limit")
 
 
@@ -556,12 +605,61 @@ def _positions() -> Iterator[Case]:
     inside = pattern(len(cells), 3, low=0, high=7)
     yield "positions-just-dense", "A grid of exactly five neighbours a cell.", "10.3", at(8 * np.array(cells) + inside)
     second = make_layer(1, ordered([[i, 1, 0] for i in range(5)]), before=5)
+    sheets = "Lone voxels far above thin sheets: determinants under 1, the sharpest predictions."
+    yield "positions-sheets", sheets, "10.4", at(_sheets())
+    diagonal = "Clusters at the ends of diagonal sheets: the determinant takes more than 53 bits on the way."
+    yield "positions-diagonal", diagonal, "10.4", at(_diagonal_sheets())
+    close = pattern(110, 3, low=0, high=(1 << 16) - 1, seed=1).tolist()
+    close += [[x ^ 1, y, z] for x, y, z in close[:12]] + [[x, y ^ 3, z] for x, y, z in close[12:24]]
+    yield "positions-sparse", "Scattered pairs of voxels: densities under 0.", "10.4", at(close)
+    yield "positions-crowd", "More than 4096 nodes in one box.", "10.4", at(_crowd())
     yield (
         "positions-two-layers",
         "Neighbouring voxels in two layers.",
         "10.1 12.1",
         make_file(make_layer(0, line(5)), second),
     )
+
+
+def _draws(count: int, seed: int) -> Iterator[int]:
+    return iter(pattern(count, low=0, high=(1 << 20) - 1, seed=seed).tolist())
+
+
+def _sheets() -> list[list[int]]:
+    """60 flat sheets of up to 12 voxels, one voxel of each a little higher, each with a lone voxel far above it."""
+    side, cells, draw = 512, list[list[int]](), _draws(6000, 1)
+    for s in range(60):
+        corner = [side * (4 * v + 2) for v in (s % 4, s // 4 % 4, s // 16)]
+        count = 8 + next(draw) % 5
+        offsets = [[next(draw) % side, next(draw) % side, 0 if i else next(draw) % 64] for i in range(count)]
+        offsets.append([next(draw) % side, next(draw) % side, 2 * side - 1 - next(draw) % 128])
+        cells += [[c + o for c, o in zip(corner, offset, strict=True)] for offset in offsets]
+    return cells
+
+
+def _diagonal_sheets() -> list[list[int]]:
+    """22 sheets x = y, each with a voxel at the ends of a box of three cells and a few in the middle, some off it."""
+    side, cells, draw = 1 << 11, list[list[int]](), _draws(900, 2)
+    for s in range(22):
+        corner = [side * (8 * v + 3) for v in (s % 4, s // 4 % 4, s // 16)]
+        offsets = [[x, x, z] for x in (-side, 2 * side - 1) for z in (-side, 2 * side - 1)]
+        for _ in range(4):
+            x = next(draw) % side
+            offsets.append([x, x, next(draw) % side])
+        for _ in range(2):
+            x = next(draw) % (side - 3) + 1
+            offsets.append([x, x + next(draw) % 4 - 1, next(draw) % side])
+        cells += [[c + o for c, o in zip(corner, offset, strict=True)] for offset in offsets]
+    return cells
+
+
+def _crowd() -> list[list[int]]:
+    """17^3 voxels at every other place, one beside the first, and 110 more far from each other, some in pairs."""
+    side, draw = 64, _draws(330, 3)
+    crowd = [[9 * side + 2 * c for c in cell] for cell in itertools.product(range(17), repeat=3)]
+    alone = [[4 * side * v + next(draw) % side for v in (q % 5, q // 5 % 5, q // 25)] for q in range(110)]
+    x, y, z = crowd[0]
+    return [*crowd, [x ^ 1, y, z], *alone, *([x, y, z ^ 1] for x, y, z in alone[-4:])]
 
 
 # -- LZMA --------------------------------------------------------------------------------------------------------------
@@ -612,9 +710,32 @@ def _lzma() -> Iterator[Case]:
         "9.1",
         make_file(*stream, header=mode),
     )
+    phrases = [pattern(9, low=0, high=9, seed=s).tolist() for s in range(6)]
+    text = [n for s in pattern(400, low=0, high=5, seed=8) for n in [*phrases[s][: 4 + s], int(s)]]
+    told = make_layer(0, line(40), mode=LZMA, attributes=np.resize(text, (68, 40)).astype(np.int32))
+    yield (
+        "lzma-chunks",
+        "LZMA2 chunks of every control byte, other properties, all repeated distances.",
+        "9.3 9.1",
+        make_file(
+            told.with_sections({SYMBOLS: lzma_symbols(told.channels, width=0, stream=_every_chunk)}), header=mode
+        ),
+    )
     note = layers[0].sections[SYMBOLS]
     noted = layers[0].with_sections({SYMBOLS: b"\xe0" + note[1:]})
     yield "lzma-note", "The unused first byte at its largest value.", "9.1", make_file(noted, header=mode)
+
+
+def _every_chunk(data: bytes) -> bytes:
+    properties = [lzma2.Properties(*p) for p in ((3, 0, 2), (0, 4, 0), (2, 1, 3), (1, 3, 1))]
+    controls = [
+        *(lzma2.ALL_RESET, lzma2.KEPT, lzma2.STORED, lzma2.KEPT, lzma2.STATE, lzma2.PROPERTIES_READ, lzma2.STORED),
+        *(lzma2.STORED, lzma2.STATE, lzma2.ALL_RESET, lzma2.KEPT, lzma2.STORED_RESET, lzma2.STORED),
+        *(lzma2.PROPERTIES_READ, lzma2.KEPT),
+    ]
+    sizes = [211 + 7 * i for i in range(len(controls) - 1)]
+    plan = list(zip(controls, [*sizes, len(data) - sum(sizes)], strict=True))
+    return lzma2.chunks(data, plan, properties, every_repeat=True)
 
 
 def _floats() -> Iterator[Case]:
