@@ -23,7 +23,7 @@ from pd4dgs_codec.bench.viewer import pictures
 from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.encoder import encode
 from pd4dgs_codec.codec.info import info
-from pd4dgs_codec.data.dataset import Dataset
+from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.delivery.transfer import Transfer
 from pd4dgs_codec.errors import DataError, DeliveryError
 from pd4dgs_codec.view.evaluate import evaluate_file

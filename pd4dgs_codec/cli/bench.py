@@ -24,6 +24,7 @@ from pd4dgs_codec.jsonable import finite
 if TYPE_CHECKING:
     from pd4dgs_codec.bench.codec import Deviation, Point, Sweep
     from pd4dgs_codec.bench.train import Run
+    from pd4dgs_codec.data.view import Dataset
     from pd4dgs_codec.scene import SceneInfo
     from pd4dgs_codec.view.frames import Frame
 
@@ -201,7 +202,8 @@ def _latency(args: argparse.Namespace, console: Console) -> Outcome:
     from pd4dgs_codec.model.warm import warm_up
 
     contents = [_with_camera(name, args.anchors) for name in args.inputs]
-    sets = [load(source, downscale=args.downscale) for source in args.data] or [None] * len(contents)
+    sets: list[Dataset | None] = [load(source, downscale=args.downscale) for source in args.data]
+    sets = sets or [None] * len(contents)
     speeds, files = list(args.rates.values()), []
     warm_up()
     with progress_bar(3 * args.runs * len(speeds) * len(contents), "runs", "times") as step:
