@@ -10,12 +10,12 @@ import json
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cache, partial
+from functools import partial
 from itertools import groupby
 from pathlib import Path
 from typing import Any
 
-from .reference import PATH, Outcome, Reference, in_processes
+from .reference import Outcome, Reference, in_processes, reference_source
 
 LIST = Path(__file__).with_name("mutants.txt")
 CHEAP_SECONDS = 0.3  #: of processor time; all but a dozen vectors take less
@@ -109,14 +109,9 @@ def wrong_answer(reference: Reference, vector: Stored) -> Outcome | None:
 
 def noticed(mutant: Mutant, vectors: Sequence[Stored], cost: dict[str, float] | None = None) -> str | None:
     """The name of a vector that notices a mutant."""
-    reference = Reference(mutant.applied(_source()))
+    reference = Reference(mutant.applied(reference_source()))
     order = in_likely_order(mutant, vectors, cost)
     return next((vector.name for vector in order if wrong_answer(reference, vector)), None)
-
-
-@cache
-def _source() -> str:
-    return PATH.read_text(encoding="utf-8")
 
 
 def seconds(vector: Stored) -> float:

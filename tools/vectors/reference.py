@@ -15,7 +15,7 @@ import sys
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cache, cached_property
 from pathlib import Path
 from types import CodeType, FrameType, ModuleType
 from typing import Any
@@ -64,11 +64,17 @@ class RunsAway(BaseException):
     """A file takes more processor time than SECONDS."""
 
 
+@cache
+def reference_source() -> str:
+    """The text of spec/refdec.py."""
+    return PATH.read_text(encoding="utf-8")
+
+
 class Reference:
     """The decoder that a source text of refdec.py makes."""
 
     def __init__(self, source: str | None = None):
-        self.source = PATH.read_text(encoding="utf-8") if source is None else source
+        self.source = source or reference_source()
         self.module = ModuleType("refdec")
         exec(compile(self.source, PATH.name, "exec"), self.module.__dict__)
 
