@@ -1,6 +1,6 @@
 """Decode times of the player's decoder, in Node, beside the package's, in one run and in turn.
 
-    python tools/player_speed.py a.pd4 b.pd4               # median of 9 decodes each, after 3 that do not count
+    python tools/player_speed.py a.pd4 b.pd4               # median of 9 decodes each, after 8 that do not count
     python tools/player_speed.py a.pd4 --runs 25 --json times.json
 
 Both decode whole files from memory, warm, in processes of their own that stay. What counts is processor time, so that a
@@ -26,7 +26,7 @@ sys.path.insert(0, str(ROOT))
 from pd4dgs_codec import decode  # noqa: E402
 
 LOOP = ROOT / "player" / "test" / "decoder_loop.mjs"
-WARM_UP = 3
+WARM_UP = 8
 
 
 @dataclass(frozen=True)

@@ -75,7 +75,8 @@ function walk(stream, depths, rows) {
   const places = new Int32Array(rows + 1);
   for (let level = Math.max(...depths); level > 0; level--) {
     if (!grids.length || grids[grids.length - 1].dense) {
-      grids = [...grids.slice(1 - USED_GRIDS), new Grid(nodes, count, level, grids[grids.length - 1])];
+      const around = grids.length ? grids[grids.length - 1].start : Int32Array.of(0, count);
+      grids = [...grids.slice(1 - USED_GRIDS), new Grid(nodes, count, level, around)];
     }
     for (let axis = 2; axis >= 0; axis--) {
       const along = nodes[axis];
@@ -91,16 +92,24 @@ function walk(stream, depths, rows) {
       for (let i = 0; i < count; i++) if (!both[i]) found.sides[singles++] = found.sides[i];
       if (2 * count - singles > rows) throw malformed(`more than the ${rows} voxels declared`);
       sides.decode(stream, found.sides, singles, hits);
+      const [x, y, z] = nodes;
+      const [x2, y2, z2] = halves;
+      const along2 = halves[axis];
       let at = 0;
       for (let i = 0, single = 0; i < count; i++, at++) {
         places[i] = at;
-        for (let a = 0; a < 3; a++) halves[a][at] = nodes[a][i];
-        halves[axis][at] = 2 * along[i];
+        x2[at] = x[i];
+        y2[at] = y[i];
+        z2[at] = z[i];
+        const p = 2 * along[i];
+        along2[at] = p;
         if (both[i]) {
           at++;
-          for (let a = 0; a < 3; a++) halves[a][at] = nodes[a][i];
-          halves[axis][at] = 2 * along[i] + 1;
-        } else if (hits[single++] === found.upper[i]) halves[axis][at]++;
+          x2[at] = x[i];
+          y2[at] = y[i];
+          z2[at] = z[i];
+          along2[at] = p + 1;
+        } else if (hits[single++] === found.upper[i]) along2[at] = p + 1;
       }
       places[count] = at;
       for (const grid of grids) grid.move(places);
@@ -126,16 +135,17 @@ const STEP_Z = Float64Array.from({ length: 27 }, (_, s) => CELL * (Math.floor(s 
  * yy yz zz, of the centres in units of 1/512 of a cell, relative to the cell's lower corner. They stay below 2^46.
  */
 class Grid {
-  /** @param {Int32Array[]} nodes @param {number} count @param {number} level @param {Grid | undefined} coarser */
+  /** @param {Int32Array[]} nodes @param {number} count @param {number} level
+   * @param {Int32Array} coarser `start` of the coarser grid; there is one cell if there is none */
   constructor(nodes, count, level, coarser) {
     this.level = level;
     this.cells = count;
-    /** Of each cell its first node; one more for the end. @type {Int32Array} */
-    this.start = Int32Array.from({ length: count + 1 }, (_, i) => i);
+    /** Of each cell its first node; one more for the end. */
+    this.start = new Int32Array(count + 1);
+    for (let c = 0; c <= count; c++) this.start[c] = c;
     /** Of each cell the cell of the coarser grid around it. */
     this.parent = new Int32Array(count);
-    const around = coarser ? coarser.start : Int32Array.of(0, count);
-    for (let c = 0; c + 1 < around.length; c++) this.parent.fill(c, around[c], around[c + 1]);
+    for (let c = 0; c + 1 < coarser.length; c++) this.parent.fill(c, coarser[c], coarser[c + 1]);
     /** Of cell c the cells around it that have nodes, itself included, are around[first[c] .. first[c + 1] - 1]. */
     this.first = new Int32Array(count + 1);
     this.around = new Int32Array(0);
@@ -481,8 +491,10 @@ function family(contexts, ancestors) {
   return { parents, grands };
 }
 
-/** The pass of an element of a long sequence, by its index modulo 16. */
-const PASS = Uint8Array.of(0, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3, 3, 3, 3, 3, 3);
+/** A long sequence's passes: of each 16 elements the first of a pass, one more for the end; a short one has one pass. */
+const PASSES = [0, 1, 3, 7, 16];
+const PERIOD = 16;
+const ONE_PASS = [0, PERIOD];
 const LONG = 64;
 const MOST = 12288;
 /** Probabilities are one of these many; in their order they stand for P(1) ascending. */
@@ -523,40 +535,45 @@ class AdaptiveBits {
    */
   decode(stream, contexts, count, out) {
     if (this._order.length < count) this._order = new Int32Array(Math.max(count, 2 * this._order.length));
-    if (count < LONG) this._decodePass(stream, contexts, count, -1, out);
-    else for (let pass = 0; pass < 4; pass++) this._decodePass(stream, contexts, count, pass, out);
+    const passes = count < LONG ? ONE_PASS : PASSES;
+    for (let k = 0; k + 1 < passes.length; k++) {
+      this._decodePass(stream, contexts, count, passes[k], passes[k + 1], out);
+    }
   }
 
-  /** @param {AnsDecoder} stream @param {Uint16Array} contexts @param {number} count @param {number} pass -1 for all
-   * @param {Uint8Array} out */
-  _decodePass(stream, contexts, count, pass, out) {
+  /** The elements whose index modulo 16 is in begin..end - 1. @param {AnsDecoder} stream @param {Uint16Array} contexts
+   * @param {number} count @param {number} begin @param {number} end @param {Uint8Array} out */
+  _decodePass(stream, contexts, count, begin, end, out) {
     const levels = this._level;
     const order = this._order;
     const stamp = ++this._passes;
     let touched = 0;
     const next = new Int32Array(LEVELS + 1);
-    for (let i = 0; i < count; i++) {
-      if (pass >= 0 && PASS[i & 15] !== pass) continue;
-      const context = contexts[i];
-      if (this._pass[context] !== stamp) {
-        this._pass[context] = stamp;
-        levels[context] = this._levelOf(context);
-        this._touched[touched++] = context;
+    for (let block = 0; block < count; block += PERIOD) {
+      const stop = Math.min(block + end, count);
+      for (let i = block + begin; i < stop; i++) {
+        const context = contexts[i];
+        if (this._pass[context] !== stamp) {
+          this._pass[context] = stamp;
+          levels[context] = this._levelOf(context);
+          this._touched[touched++] = context;
+        }
+        next[levels[context] + 1]++;
       }
-      next[levels[context] + 1]++;
     }
     for (let level = 0; level < LEVELS; level++) next[level + 1] += next[level];
-    const end = next[LEVELS];
-    for (let i = 0; i < count; i++) {
-      if (pass >= 0 && PASS[i & 15] !== pass) continue;
-      order[next[levels[contexts[i]]]++] = i;
+    for (let block = 0; block < count; block += PERIOD) {
+      const stop = Math.min(block + end, count);
+      for (let i = block + begin; i < stop; i++) order[next[levels[contexts[i]]]++] = i;
+    }
+    for (let level = 0, from = 0; level < LEVELS; level++) { // next[level] has moved to the level's end
+      if (next[level] > from) stream.bits(ZEROS[level], order, from, next[level], out);
+      from = next[level];
     }
     const own = this._own, parents = this._ofParents, grands = this._ofGrands;
-    for (let k = 0; k < end; k++) {
-      const i = order[k];
-      const context = contexts[i];
-      const bit = stream.bit(ZEROS[levels[context]]);
-      out[i] = bit;
+    for (let k = 0; k < next[LEVELS]; k++) {
+      const context = contexts[order[k]];
+      const bit = out[order[k]];
       own[2 * context + bit] += 256;
       parents[2 * this._parents[context] + bit] += 256;
       grands[2 * this._grands[context] + bit] += 256;

@@ -7,7 +7,7 @@ const SEEDS = Int32Array.from({ length: 3 }, () => (Math.random() * 2 ** 32) | 1
 export class VoxelTable {
   /** @param {number} capacity rows that may be added */
   constructor(capacity) {
-    const size = 2 ** Math.max(4, 33 - Math.clz32(capacity));
+    const size = 2 ** Math.max(4, 34 - Math.clz32(capacity)); // mostly empty: most look-ups find nothing
     this._rows = new Int32Array(size).fill(-1);
     this._mask = size - 1;
   }
