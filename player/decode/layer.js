@@ -89,13 +89,19 @@ export function dequantise(symbols, step) {
   return transposed(symbols, symbols.length, 1, step);
 }
 
+/** Rows that are transposed at a time, so few that they stay in the cache. */
+const BLOCK = 128;
+
 /** As dequantise, of [columns, rows] symbols to [rows, columns] values. @param {Int32Array} symbols @param {number} rows
  * @param {number} columns @param {number} step */
 export function transposed(symbols, rows, columns, step) {
   const values = new Float32Array(symbols.length);
-  // The product is exact: 24 bits by 24 bits.
-  for (let c = 0, from = 0; c < columns; c++) {
-    for (let to = c, r = 0; r < rows; r++, to += columns) values[to] = symbols[from++] * step;
+  for (let first = 0; first < rows; first += BLOCK) {
+    const end = Math.min(first + BLOCK, rows);
+    for (let c = 0; c < columns; c++) {
+      // The product is exact: 24 bits by 24 bits.
+      for (let r = first; r < end; r++) values[r * columns + c] = symbols[c * rows + r] * step;
+    }
   }
   // Rounding is monotone, so that where the largest symbol stays finite all do.
   if (!Number.isFinite(Math.fround(MAX_SYMBOL * step))) {

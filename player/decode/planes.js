@@ -98,37 +98,53 @@ function sumOfNine(values, height, width) {
   return sums;
 }
 
-/** 11.3, in place: residuals become samples, each checked as it comes so that sums stay small.
- * @param {Int32Array} plane @param {PlaneShape} shape */
+/** 11.3, in place: residuals become samples. @param {Int32Array} plane @param {PlaneShape} shape */
 function restore(plane, { channels, height, width, predictor }) {
-  for (let c = 0, at = 0; c < channels; c++) {
-    for (let i = 0; i < height; i++) {
-      for (let j = 0; j < width; j++, at++) {
-        let k = plane[at];
-        if (predictor && (i || j)) {
-          const w = j ? plane[at - 1] : plane[at - width];
-          const n = i ? plane[at - width] : w;
-          k += predict(predictor, w, n, i && j ? plane[at - width - 1] : i ? n : w);
-        }
-        if (k > MAX_SYMBOL || k < -MAX_SYMBOL) throw malformed(`a plane sample of ${k}, limit ${MAX_SYMBOL} in magnitude`);
-        plane[at] = k;
-      }
+  const cells = height * width;
+  for (let from = 0; from < channels * cells; from += cells) {
+    if (predictor) restoreChannel(plane, from, from + cells, width, predictor);
+    else for (let at = from; at < from + cells; at++) check(plane[at]);
+  }
+}
+
+/** Each sample is checked before others are predicted from it, so that a sum stays small. @param {Int32Array} plane
+ * @param {number} from @param {number} end @param {number} width @param {number} predictor 1..5 */
+function restoreChannel(plane, from, end, width, predictor) {
+  check(plane[from]);
+  // Whatever the predictor, in row 0 it gives W and in column 0 N.
+  for (let at = from + 1; at < from + width; at++) check((plane[at] += plane[at - 1]));
+  for (let row = from + width; row < end; row += width) {
+    check((plane[row] += plane[row - width]));
+    let w = plane[row];
+    let nw = plane[row - width];
+    for (let at = row + 1; at < row + width; at++) {
+      const n = plane[at - width];
+      let k = plane[at];
+      if (predictor === 1) k += w;
+      else if (predictor === 2) k += n;
+      else if (predictor === 3) k += median(w, n, w + n - nw);
+      else if (predictor === 4) k += w + n - nw;
+      else k += (w + n) >> 1;
+      check(k);
+      plane[at] = w = k;
+      nw = n;
     }
   }
 }
 
-/** @param {number} predictor 1..5 @param {number} w @param {number} n @param {number} nw */
-function predict(predictor, w, n, nw) {
-  switch (predictor) {
-    case 1:
-      return w;
-    case 2:
-      return n;
-    case 3:
-      return Math.max(Math.min(w, n), Math.min(Math.max(w, n), w + n - nw));
-    case 4:
-      return w + n - nw;
-    default:
-      return (w + n) >> 1;
-  }
+/** The middle one of three numbers below 2^30 in magnitude, without branches: which one it is cannot be foreseen.
+ * @param {number} a @param {number} b @param {number} c */
+function median(a, b, c) {
+  let step = (a - b) & ((a - b) >> 31);
+  const least = b + step;
+  const most = a - step;
+  step = most - c;
+  const below = most - (step & ~(step >> 31));
+  step = below - least;
+  return least + (step & ~(step >> 31));
+}
+
+/** @param {number} k */
+function check(k) {
+  if ((k + MAX_SYMBOL) >>> 0 > 2 * MAX_SYMBOL) throw malformed(`a plane sample of ${k}, limit ${MAX_SYMBOL} in magnitude`);
 }

@@ -121,13 +121,14 @@ function walk(stream, depths, rows) {
   return nodes;
 }
 
-/** Steps to 13 of the 26 cells around a cell; the others are their opposites. */
-const HALF_STEPS = Array.from({ length: 13 }, (_, s) => [(s % 3) - 1, (Math.floor(s / 3) % 3) - 1, Math.floor(s / 9) - 1]);
-
-/** By the way from a cell to one around it, (dx + 1) + 3 (dy + 1) + 9 (dz + 1): how far its corner lies, 1/512 of a cell. */
-const STEP_X = Float64Array.from({ length: 27 }, (_, s) => CELL * ((s % 3) - 1));
-const STEP_Y = Float64Array.from({ length: 27 }, (_, s) => CELL * ((Math.floor(s / 3) % 3) - 1));
-const STEP_Z = Float64Array.from({ length: 27 }, (_, s) => CELL * (Math.floor(s / 9) - 1));
+/** By the way from a cell to one around it, (dx + 1) + 3 (dy + 1) + 9 (dz + 1); ways s and 26 - s are opposite. */
+const STEP_X = Int8Array.from({ length: 27 }, (_, s) => (s % 3) - 1);
+const STEP_Y = Int8Array.from({ length: 27 }, (_, s) => (Math.floor(s / 3) % 3) - 1);
+const STEP_Z = Int8Array.from({ length: 27 }, (_, s) => Math.floor(s / 9) - 1);
+/** The same in the units of 10.4. */
+const FAR_X = Float64Array.from(STEP_X, (step) => CELL * step);
+const FAR_Y = Float64Array.from(STEP_Y, (step) => CELL * step);
+const FAR_Z = Float64Array.from(STEP_Z, (step) => CELL * step);
 
 /**
  * The nodes of one level as the cells of a grid (10.3), with the run of nodes of now that lie in each, and the sums of
@@ -174,13 +175,13 @@ class Grid {
   _connect(nodes) {
     const [x, y, z] = nodes;
     const { cells, first } = this;
-    const table = new VoxelTable(cells);
-    for (let c = 0; c < cells; c++) table.add(c, x[c], y[c], z[c]);
+    const table = new VoxelTable(cells, nodes);
+    for (let c = 0; c < cells; c++) table.add(c);
     const others = new Int32Array(13 * cells);
     for (let c = 0, at = 0; c < cells; c++) {
       first[c + 1]++;
-      for (const [dx, dy, dz] of HALF_STEPS) {
-        const other = table.find(nodes, x[c] + dx, y[c] + dy, z[c] + dz);
+      for (let step = 0; step < 13; step++) {
+        const other = table.find(x[c] + STEP_X[step], y[c] + STEP_Y[step], z[c] + STEP_Z[step]);
         others[at++] = other;
         if (other < 0) continue;
         first[c + 1]++;
@@ -295,7 +296,7 @@ class Grid {
       const other = around[k];
       const step = steps[k];
       const n = start[other + 1] - start[other];
-      const dx = STEP_X[step], dy = STEP_Y[step], dz = STEP_Z[step];
+      const dx = FAR_X[step], dy = FAR_Y[step], dz = FAR_Z[step];
       const at = 9 * other;
       const x0 = own[at], y0 = own[at + 1], z0 = own[at + 2];
       const x1 = x0 + n * dx, y1 = y0 + n * dy, z1 = z0 + n * dz;

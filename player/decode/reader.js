@@ -162,16 +162,16 @@ export class LayerReader {
     if (parts.length < 2 || !voxels.length) return;
     const count = parts.reduce((sum, part) => sum + part.length, 0) / 3;
     const axes = [0, 1, 2].map(() => new Int32Array(count));
-    const table = new VoxelTable(count);
+    const table = new VoxelTable(count, axes);
     let row = 0;
     for (const part of parts) {
       for (let i = 0; i < part.length; i += 3, row++) {
         const x = part[i], y = part[i + 1], z = part[i + 2];
-        if (table.find(axes, x, y, z) >= 0) throw malformed(`voxel ${x} ${y} ${z} holds more than one anchor`);
+        if (table.find(x, y, z) >= 0) throw malformed(`voxel ${x} ${y} ${z} holds more than one anchor`);
         axes[0][row] = x;
         axes[1][row] = y;
         axes[2][row] = z;
-        table.add(row, x, y, z);
+        table.add(row);
       }
     }
   }
