@@ -2,6 +2,7 @@
 
     python tools/player_speed.py a.pd4 b.pd4               # median of 9 decodes each, after 8 that do not count
     python tools/player_speed.py a.pd4 --runs 25 --json times.json
+    python tools/player_speed.py a.pd4 --grow 100000 big.pd4  # writes copies of a.pd4's anchors side by side
 
 Both decode whole files from memory, warm, in processes of their own that stay. What counts is processor time, so that a
 busy machine changes less; wall time stands beside it. Both slow down alike when other work shares the cores, and as they
@@ -16,16 +17,20 @@ import subprocess
 import sys
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from statistics import median
+
+import numpy as np
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
-from pd4dgs_codec import decode  # noqa: E402
+from pd4dgs_codec import decode, encode  # noqa: E402
+from pd4dgs_codec.entropy.morton import morton_order  # noqa: E402
+from pd4dgs_codec.scene import Scene  # noqa: E402
 
-LOOP = ROOT / "player" / "test" / "decoder_loop.mjs"
+LOOP = ROOT / "player" / "testing" / "decoder_loop.mjs"
 WARM_UP = 8
 
 
@@ -72,6 +77,31 @@ class NodeDecoder:
         return float(str(answer["cpu"])), float(str(answer["wall"]))
 
 
+def grown(scene: Scene, anchors: int) -> Scene:
+    """At least so many anchors: copies of the scene's side by side along x, networks and planes as they are."""
+    copies = -(-anchors // scene.rows[-1])
+    shift = int(np.ptp(scene.anchor_q[:, 0])) + 1
+    rows, voxels, first = list[np.ndarray](), list[np.ndarray](), 0
+    for last in scene.rows:
+        own = np.tile(np.arange(first, last), copies)
+        moved = scene.anchor_q[own]
+        moved[:, 0] += np.repeat(np.arange(copies), last - first).astype(np.int32) * shift
+        order = morton_order(moved)
+        rows.append(own[order])
+        voxels.append(moved[order])
+        first = last
+    index = np.concatenate(rows)
+    return replace(
+        scene,
+        rows=tuple(copies * n for n in scene.rows),
+        anchor_q=np.concatenate(voxels),
+        feature=scene.feature[index],
+        scaling_log=scene.scaling_log[index],
+        offset=scene.offset[index],
+        mask=tuple(codes[index[: copies * len(codes)]] for codes in scene.mask),
+    )
+
+
 def python_seconds(data: bytes) -> tuple[float, float]:
     """(processor, wall) time of decoding a file once with the package."""
     cpu, wall = time.process_time(), time.perf_counter()
@@ -110,8 +140,13 @@ def main(argv: Sequence[str] | None = None) -> int:
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("files", nargs="+", type=Path)
     p.add_argument("--runs", type=int, default=9, help="decodes that count (default: 9)")
+    p.add_argument("--grow", nargs=2, metavar=("N", "FILE"), help="write a file of N anchors instead, from the first file")
     p.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
     args = p.parse_args(argv)
+    if args.grow:
+        count, path = args.grow
+        Path(path).write_bytes(encode(grown(decode(args.files[0].read_bytes()), int(count)), effort=1))
+        return 0
     with NodeDecoder() as node:
         rows = [row(path, *compare(path, args.runs, node)) for path in args.files]
     print("| file | anchors | Node CPU s | Python CPU s | Node/Python CPU | Node wall s | Python wall s | wall |")

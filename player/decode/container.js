@@ -18,6 +18,9 @@ const ANCILLARY = 1;
 /** @param {Uint8Array} bytes */
 const viewOf = (bytes) => new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
 
+/** H, unchecked. @param {Uint8Array} preamble all of it */
+export const headerLength = (preamble) => viewOf(preamble).getUint32(12, true);
+
 /**
  * The header's bytes out of a file's first bytes; what follows them is not looked at.
  *
@@ -40,7 +43,7 @@ export function readPreamble(bytes) {
     const message = `format version ${major}.${view.getUint16(10, true)}, this decoder reads ${MAJOR}.x`;
     throw new DecodeError("UnsupportedVersion", message, { offset: 8 });
   }
-  const length = view.getUint32(12, true);
+  const length = headerLength(bytes);
   if (length > MAX_FIELDS) {
     throw new DecodeError("LimitExceeded", `a header of ${length} bytes, limit ${MAX_FIELDS}`, { offset: 12 });
   }

@@ -106,9 +106,6 @@ export class LayerReader {
     const chunk = readChunk(bytes, { listed, sceneId: this._sceneId, offset, index });
     /** @param {DecodeError} error @param {number} at */
     const located = (error, at) => new DecodeError(error.kind, error.reason, { offset: offset + at, chunk: index });
-    const isLayer = listed.type < LAYER_TYPES;
-    if (!isLayer && !chunk.ancillary) throw located(unsupported(`critical chunk of unknown type ${listed.type}`), 0);
-    if (isLayer && chunk.ancillary) throw located(malformed(`layer ${listed.type} is flagged ancillary`), 0);
     if (this._sceneId === null) {
       const expected = sceneIdOf(header.described, chunk.payload);
       if (chunk.sceneId !== expected) {
@@ -117,6 +114,9 @@ export class LayerReader {
       }
       this._sceneId = expected;
     }
+    const isLayer = listed.type < LAYER_TYPES;
+    if (!isLayer && !chunk.ancillary) throw located(unsupported(`critical chunk of unknown type ${listed.type}`), 0);
+    if (isLayer && chunk.ancillary) throw located(malformed(`layer ${listed.type} is flagged ancillary`), 0);
     let layer = null;
     if (isLayer) {
       try {

@@ -85,6 +85,13 @@ export class Stream {
     if (!this._done) this._next();
   }
 
+  /** Forgets a fault and the bytes that are not decoded yet: the next ones fed are those of the file from `consumed` on. */
+  rewind() {
+    this._error = null;
+    this._filled = 0;
+    this._buffer = new Uint8Array(0);
+  }
+
   /** Whether one more layer was read. */
   _next() {
     const before = this._reader.offset;
