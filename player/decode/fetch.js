@@ -59,6 +59,8 @@ const MOST_CHANGES = 4;
 
 /** A cut connection, or an answer that makes no sense: asking again may help. */
 class Cut extends Error {}
+/** The file is another one now: nothing of it is here yet. */
+class Changed extends Error {}
 /** The seconds of the budget are over. */
 class OutOfTime extends Error {}
 
@@ -126,7 +128,13 @@ export class SceneSource {
         }
         const end = ends.length ? this._nextEnd(wanted, until) : this._headerEnd();
         if (end === null) return;
-        const block = await this._read(end, until);
+        let block;
+        try {
+          block = await this._read(end, until);
+        } catch (error) {
+          if (error instanceof Changed) continue;
+          throw error;
+        }
         if (block === null) {
           await this._decoder.finish(); // the file ends within this layer: Truncated
           return;
@@ -182,7 +190,8 @@ export class SceneSource {
   }
 
   /**
-   * The next bytes to arrive, none beyond `end`; null if the file ends.
+   * The next bytes to arrive, none beyond `end`; null if the file ends. Raises Changed, OutOfTime, FetchError or the
+   * signal's reason.
    *
    * @param {number} end @param {number} until
    * @returns {Promise<Uint8Array | null>}
@@ -193,7 +202,9 @@ export class SceneSource {
       if (now() >= until) throw new OutOfTime();
       if (this.total !== null && this.received >= this.total) return null;
       try {
+        const { changes } = this;
         this._answer ??= await this._request(until);
+        if (this.changes !== changes) throw new Changed();
         const block = await this._answer.take(end - this.received, this._waiting(until));
         if (block === null) {
           const { total } = this;
@@ -206,14 +217,17 @@ export class SceneSource {
           return block;
         }
       } catch (error) {
+        if (error instanceof Changed) throw error;
         this.close();
         this._signal?.throwIfAborted();
         if (now() >= until) throw new OutOfTime();
-        if (error instanceof FetchError || error instanceof DecodeError) throw error;
+        // fetch raises TypeError where there is no connection, or it ends
+        if (!(error instanceof Cut || error instanceof TypeError || error instanceof DOMException)) throw error;
         this.cuts++;
         failures++;
-        const reason = error instanceof Error ? error.message : String(error);
-        if (failures >= this._attempts) throw new FetchError(`${this.url}: ${reason} (${this.received} bytes are here)`);
+        if (failures >= this._attempts) {
+          throw new FetchError(`${this.url}: ${error.message} (${this.received} bytes are here)`);
+        }
         if (failures > 1) await sleep(Math.min(this._pause * 2 ** (failures - 2), until - now()), this._signal);
       }
     }
@@ -252,7 +266,7 @@ export class SceneSource {
       // What is fetched anew, after a cut or damage, does not come out of a cache.
       const asked = this._fetch(this.url, { headers, signal: controller.signal, cache: start ? "no-store" : "default" });
       const response = await within(asked, this._waiting(until));
-      const skip = await this._accept(response, start, resumes);
+      const skip = this._accept(response, start, resumes);
       return new Answer(response, controller, skip, () => this._signal?.removeEventListener("abort", onAbort));
     } catch (error) {
       controller.abort();
@@ -266,11 +280,11 @@ export class SceneSource {
    *
    * @param {Response} response @param {number} start @param {boolean} resumes
    */
-  async _accept(response, start, resumes) {
+  _accept(response, start, resumes) {
     const { status, headers } = response;
     if (status === 416 && resumes) {
-      await this._restart(); // the file has become shorter
-      throw new Cut("the file changed");
+      this._restart();
+      throw new Changed("the file has become shorter");
     }
     if (status !== 200 && status !== 206) {
       const said = `the server answers ${status} ${response.statusText}`.trimEnd();
@@ -285,14 +299,14 @@ export class SceneSource {
       const known = this.total;
       if (!resumes || !part || Number(part[1]) !== start) throw new Cut("an answer of another part than was asked for");
       if ((validator !== null && validator !== this._validator) || (known !== null && Number(part[3]) !== known)) {
-        await this._restart();
-        throw new Cut("the file changed");
+        this._restart();
+        throw new Changed("an answer about another file");
       }
       this.total = Number(part[3]);
       return 0;
     }
     const same = strong !== null && strong === this._validator;
-    if (start && !same) await this._restart();
+    if (start && !same) this._restart();
     // Of a compressed answer the length is not that of the file.
     const length = headers.get("Content-Encoding") ? null : headers.get("Content-Length");
     this.total = length !== null && /^\d{1,15}$/.test(length) ? Number(length) : null;
@@ -301,7 +315,7 @@ export class SceneSource {
   }
 
   /** The file is another one than before. */
-  async _restart() {
+  _restart() {
     this.changes++;
     if (this.changes > MOST_CHANGES) throw new FetchError(`${this.url}: changed ${this.changes} times while it was fetched`);
     const { _decoder: old } = this;
