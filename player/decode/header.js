@@ -36,11 +36,8 @@ export function readHeader(bytes) {
   const { value, firstEntryEnd } = unpack(bytes, "header");
   const fields = new Fields(value, "header", 1, 13);
   const chunks = readChunkList(fields);
-  // An ans-only decoder (clause 16).
-  if (asRegistered(fields.get(2), 2, "header: mode") === 1) throw unsupported("header: mode lzma, expected mode ans");
-  if (asRegistered(fields.get(3), 2, "header: deformation") === 1) {
-    throw unsupported("header: a deformation of float32 values, expected one of symbols");
-  }
+  const mode = asRegistered(fields.get(2), 2, "header: mode");
+  const deformation = asRegistered(fields.get(3), 2, "header: deformation");
   const [feature, scalingLog, offset] = fields.reals(4, 3, "steps").map((step) => checkStep(step, "header: step"));
   const voxelSize = checkStep(fields.real(5, "voxel size"), "header: voxel size");
   const [x0, y0, z0, x1, y1, z1] = fields.reals(6, 6, "box");
@@ -56,6 +53,11 @@ export function readHeader(bytes) {
   const [upX, upY, upZ] = fields.reals(10, 3, "up");
   const unit = fields.real(11, "unit");
   if (unit < 0) throw malformed(`header: unit ${unit}, expected 0 or more`);
+  const camera = fields.has(12) ? readCamera(fields.get(12)) : null;
+  const bounds = readBounds(fields.get(13));
+  // An ans-only decoder (clause 16).
+  if (mode === 1) throw unsupported("header: mode lzma, expected mode ans");
+  if (deformation === 1) throw unsupported("header: a deformation of float32 values, expected one of symbols");
   return {
     size: bytes.length,
     chunks,
@@ -72,9 +74,9 @@ export function readHeader(bytes) {
       far,
       up: [upX, upY, upZ],
       unit,
-      camera: fields.has(12) ? readCamera(fields.get(12)) : null,
+      camera,
     },
-    bounds: readBounds(fields.get(13)),
+    bounds,
     described: bytes.slice(firstEntryEnd),
   };
 }
