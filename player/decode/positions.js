@@ -4,7 +4,6 @@ import { AnsDecoder } from "./ans.js";
 import { ByteReader } from "./bytes.js";
 import { limitExceeded, malformed } from "./errors.js";
 import { MAX_VOXEL } from "./limits.js";
-import { VoxelTable } from "./voxels.js";
 
 const MAX_DEPTH = 21;
 const USED_GRIDS = 3;
@@ -75,8 +74,7 @@ function walk(stream, depths, rows) {
   const places = new Int32Array(rows + 1);
   for (let level = Math.max(...depths); level > 0; level--) {
     if (!grids.length || grids[grids.length - 1].dense) {
-      const around = grids.length ? grids[grids.length - 1].start : Int32Array.of(0, count);
-      grids = [...grids.slice(1 - USED_GRIDS), new Grid(nodes, count, level, around)];
+      grids = [...grids.slice(1 - USED_GRIDS), new Grid(nodes, count, level, grids[grids.length - 1] ?? null)];
     }
     for (let axis = 2; axis >= 0; axis--) {
       const along = nodes[axis];
@@ -121,49 +119,64 @@ function walk(stream, depths, rows) {
   return nodes;
 }
 
-/** By the way from a cell to one around it, (dx + 1) + 3 (dy + 1) + 9 (dz + 1); ways s and 26 - s are opposite. */
-const STEP_X = Int8Array.from({ length: 27 }, (_, s) => (s % 3) - 1);
-const STEP_Y = Int8Array.from({ length: 27 }, (_, s) => (Math.floor(s / 3) % 3) - 1);
-const STEP_Z = Int8Array.from({ length: 27 }, (_, s) => Math.floor(s / 9) - 1);
-/** The same in the units of 10.4. */
-const FAR_X = Float64Array.from(STEP_X, (step) => CELL * step);
-const FAR_Y = Float64Array.from(STEP_Y, (step) => CELL * step);
-const FAR_Z = Float64Array.from(STEP_Z, (step) => CELL * step);
+/** By the way from a cell to one around it, (dx + 1) + 3 (dy + 1) + 9 (dz + 1), how far its corner lies, 1/512 of a cell. */
+const WAYS = 27;
+const FAR_X = Float64Array.from({ length: WAYS }, (_, way) => CELL * ((way % 3) - 1));
+const FAR_Y = Float64Array.from({ length: WAYS }, (_, way) => CELL * ((Math.floor(way / 3) % 3) - 1));
+const FAR_Z = Float64Array.from({ length: WAYS }, (_, way) => CELL * (Math.floor(way / 9) - 1));
+
+/** A way out of child x + 2 y + 4 z of a cell, at 27 child + way: the way out of that cell, and the child there. */
+const OUTER_WAY = new Uint8Array(8 * WAYS);
+const OUTER_CHILD = new Uint8Array(8 * WAYS);
+for (let child = 0, at = 0; child < 8; child++) {
+  for (let way = 0; way < WAYS; way++, at++) {
+    for (let axis = 0, three = 1; axis < 3; axis++, three *= 3) {
+      const place = ((child >> axis) & 1) + (Math.floor(way / three) % 3) - 1;
+      OUTER_WAY[at] += three * ((place >> 1) + 1);
+      OUTER_CHILD[at] += (place & 1) << axis;
+    }
+  }
+}
+
+/** How many bits are set. */
+const ONES = Uint8Array.from({ length: 256 }, (_, byte) => byte.toString(2).replaceAll("0", "").length);
 
 /**
  * The nodes of one level as the cells of a grid (10.3), with the run of nodes of now that lie in each, and the sums of
- * 10.4 over a cell's nodes and over those in its box of 27 cells: first and second moments, in the order x y z xx xy xz
- * yy yz zz, of the centres in units of 1/512 of a cell, relative to the cell's lower corner. They stay below 2^46.
+ * 10.4 over those in a cell's box of 27 cells: first and second moments, in the order x y z xx xy xz yy yz zz, of the
+ * centres in units of 1/512 of a cell, relative to the cell's lower corner. They stay below 2^46.
  */
 class Grid {
   /** @param {Int32Array[]} nodes @param {number} count @param {number} level
-   * @param {Int32Array} coarser `start` of the coarser grid; there is one cell if there is none */
+   * @param {Grid | null} coarser the grid of the level before, as there are no gaps; null for the root alone */
   constructor(nodes, count, level, coarser) {
     this.level = level;
     this.cells = count;
-    /** Of each cell its first node; one more for the end. */
+    /** Of each cell its first node; one more for the end. @type {Int32Array} */
     this.start = new Int32Array(count + 1);
     for (let c = 0; c <= count; c++) this.start[c] = c;
-    /** Of each cell the cell of the coarser grid around it. */
+    /** Of each cell the cell of the coarser grid around it. @type {Int32Array} */
     this.parent = new Int32Array(count);
-    for (let c = 0; c + 1 < coarser.length; c++) this.parent.fill(c, coarser[c], coarser[c + 1]);
-    /** Of cell c the cells around it that have nodes, itself included, are around[first[c] .. first[c + 1] - 1]. */
+    /** Of cell c the cells around it that have nodes, itself included, are around[first[c] .. first[c + 1] - 1].
+     * @type {Int32Array} */
     this.first = new Int32Array(count + 1);
-    this.around = new Int32Array(0);
-    /** The way there. */
-    this.steps = new Uint8Array(0);
-    this._connect(nodes);
-    this.dense = count < 100 || this.around.length - count >= 5 * count;
-    this.boxSums = new Float64Array(9 * count);
-    this._cellSums = new Float64Array(9 * count);
-    /** The split for which a cell's box was summed up; that is done when it is needed. */
-    this._boxSplit = new Int32Array(count);
-    this._split = 0;
+    /** @type {Int32Array} */
+    this.around = new Int32Array(1);
+    /** The ways there. @type {Uint8Array} */
+    this.ways = Uint8Array.of(Math.floor(WAYS / 2));
+    this.first[count] = 1;
+    if (coarser) this._connect(nodes, coarser);
+    this.dense = count < 100 || this.first[count] - count >= 5 * count;
+    /** The sums over the box of the cell asked for last. Cells are asked for in order, each a few times on end. */
+    this.sums = new Float64Array(9);
+    this._summed = -1;
+    this._counted = -1;
+    this._count = 0;
     this._ready = false;
     this._nodes = nodes;
     this._unknown = [0, 0, 0];
     /** The places of the nodes' centres in their cells, 0..511, [node][axis]. */
-    this.places = new Int16Array(0);
+    this.places = new Float64Array(0);
     /** Of this split: what is added to C_ii, h, the density without neighbours, and the scale (10.4). */
     this.priors = [0, 0, 0];
     this.h = 0;
@@ -171,41 +184,44 @@ class Grid {
     this.scale = 0;
   }
 
-  /** @param {Int32Array[]} nodes */
-  _connect(nodes) {
-    const [x, y, z] = nodes;
-    const { cells, first } = this;
-    const table = new VoxelTable(cells, nodes);
-    for (let c = 0; c < cells; c++) table.add(c);
-    const others = new Int32Array(13 * cells);
-    for (let c = 0, at = 0; c < cells; c++) {
-      first[c + 1]++;
-      for (let step = 0; step < 13; step++) {
-        const other = table.find(x[c] + STEP_X[step], y[c] + STEP_Y[step], z[c] + STEP_Z[step]);
-        others[at++] = other;
-        if (other < 0) continue;
-        first[c + 1]++;
-        first[other + 1]++;
+  /** Finds the cells around each cell among the children of those around its parent. @param {Int32Array[]} nodes
+   * @param {Grid} coarser */
+  _connect([x, y, z], coarser) {
+    const { cells, parent, first } = this;
+    const { start } = coarser;
+    /** Of each coarser cell, which children it has: they stand in this order. */
+    const children = new Uint8Array(coarser.cells);
+    for (let p = 0; p < coarser.cells; p++) {
+      for (let c = start[p]; c < start[p + 1]; c++) {
+        parent[c] = p;
+        children[p] |= 1 << ((x[c] & 1) + 2 * (y[c] & 1) + 4 * (z[c] & 1));
       }
     }
-    for (let c = 0; c < cells; c++) first[c + 1] += first[c];
-    const next = first.slice();
-    this.around = new Int32Array(first[cells]);
-    this.steps = new Uint8Array(first[cells]);
-    /** @param {number} from @param {number} to @param {number} step */
-    const link = (from, to, step) => {
-      this.around[next[from]] = to;
-      this.steps[next[from]++] = step;
-    };
-    for (let c = 0, at = 0; c < cells; c++) {
-      link(c, c, 13);
-      for (let step = 0; step < 13; step++) {
-        const other = others[at++];
-        if (other < 0) continue;
-        link(c, other, step);
-        link(other, c, 26 - step);
+    let around = new Int32Array(8 * cells + WAYS);
+    let ways = new Uint8Array(8 * cells + WAYS);
+    const near = new Int32Array(WAYS);
+    let at = 0;
+    for (let p = 0; p < coarser.cells; p++) {
+      near.fill(-1);
+      for (let k = coarser.first[p]; k < coarser.first[p + 1]; k++) near[coarser.ways[k]] = coarser.around[k];
+      for (let c = start[p]; c < start[p + 1]; c++) {
+        if (at + WAYS > around.length) {
+          [around, ways] = [grown(around), grown(ways)];
+        }
+        const from = WAYS * ((x[c] & 1) + 2 * (y[c] & 1) + 4 * (z[c] & 1));
+        for (let way = 0; way < WAYS; way++) {
+          const other = near[OUTER_WAY[from + way]];
+          if (other < 0) continue;
+          const child = 1 << OUTER_CHILD[from + way];
+          if (!(children[other] & child)) continue;
+          around[at] = start[other] + ONES[children[other] & (child - 1)];
+          ways[at++] = way;
+        }
+        first[c + 1] = at;
       }
     }
+    this.around = around;
+    this.ways = ways;
   }
 
   /** After a split: node i has become node places[i], and the next one if it was halved. @param {Int32Array} places */
@@ -218,7 +234,7 @@ class Grid {
    * @param {Int32Array[]} nodes @param {number[]} unknown @param {number} axis */
   begin(nodes, unknown, axis) {
     const { level } = this;
-    this._split++;
+    this._summed = this._counted = -1;
     this._ready = false;
     this._nodes = nodes;
     this._unknown = unknown;
@@ -230,22 +246,25 @@ class Grid {
 
   /** The number of nodes in a cell's box. @param {number} cell */
   count(cell) {
+    if (this._counted === cell) return this._count;
     const { start, around } = this;
     let n = 0;
     for (let k = this.first[cell], end = this.first[cell + 1]; k < end; k++) {
       const other = around[k];
       n += start[other + 1] - start[other];
     }
+    this._counted = cell;
+    this._count = n;
     return n;
   }
 
-  /** Forms `places` and the sums over each cell, if they are not those of this split. */
+  /** Finds `places`, if they are not those of this split. */
   _prepare() {
     if (this._ready) return;
     this._ready = true;
-    const { start, cells, level } = this;
-    const count = start[cells];
-    if (this.places.length < 3 * count) this.places = new Int16Array(3 * Math.max(count, cells));
+    const { level } = this;
+    const count = this.start[this.cells];
+    if (this.places.length < 3 * count) this.places = new Float64Array(3 * Math.min(2 * count, this._nodes[0].length));
     const places = this.places;
     const mask = (2 << level) - 1;
     const up = Math.max(8 - level, 0), down = Math.max(level - 8, 0);
@@ -257,11 +276,21 @@ class Grid {
         places[at] = ((((nodes[i] << shift) + half) & mask) << up) >> down;
       }
     }
-    const sums = this._cellSums;
-    for (let cell = 0, at = 0, i = 0; cell < cells; cell++, at += 9) {
-      let x = 0, y = 0, z = 0, xx = 0, xy = 0, xz = 0, yy = 0, yz = 0, zz = 0;
-      for (const end = 3 * start[cell + 1]; i < end; i += 3) {
-        const a = places[i], b = places[i + 1], c = places[i + 2];
+  }
+
+  /** Forms `sums` of a cell. @param {number} cell */
+  sum(cell) {
+    if (this._summed === cell) return;
+    this._summed = cell;
+    this._prepare();
+    const { start, around, ways, places } = this;
+    let x = 0, y = 0, z = 0, xx = 0, xy = 0, xz = 0, yy = 0, yz = 0, zz = 0;
+    for (let k = this.first[cell], last = this.first[cell + 1]; k < last; k++) {
+      const other = around[k];
+      const way = ways[k];
+      const dx = FAR_X[way], dy = FAR_Y[way], dz = FAR_Z[way];
+      for (let i = 3 * start[other], end = 3 * start[other + 1]; i < end; i += 3) {
+        const a = places[i] + dx, b = places[i + 1] + dy, c = places[i + 2] + dz;
         x += a;
         y += b;
         z += c;
@@ -272,56 +301,25 @@ class Grid {
         yz += b * c;
         zz += c * c;
       }
-      sums[at] = x;
-      sums[at + 1] = y;
-      sums[at + 2] = z;
-      sums[at + 3] = xx;
-      sums[at + 4] = xy;
-      sums[at + 5] = xz;
-      sums[at + 6] = yy;
-      sums[at + 7] = yz;
-      sums[at + 8] = zz;
     }
+    const { sums } = this;
+    sums[0] = x;
+    sums[1] = y;
+    sums[2] = z;
+    sums[3] = xx;
+    sums[4] = xy;
+    sums[5] = xz;
+    sums[6] = yy;
+    sums[7] = yz;
+    sums[8] = zz;
   }
+}
 
-  /** Forms boxSums of a cell, if they are not those of this split. @param {number} cell */
-  sum(cell) {
-    if (this._boxSplit[cell] === this._split) return;
-    this._boxSplit[cell] = this._split;
-    this._prepare();
-    const { start, around, steps } = this;
-    const own = this._cellSums;
-    let x = 0, y = 0, z = 0, xx = 0, xy = 0, xz = 0, yy = 0, yz = 0, zz = 0;
-    for (let k = this.first[cell], end = this.first[cell + 1]; k < end; k++) {
-      const other = around[k];
-      const step = steps[k];
-      const n = start[other + 1] - start[other];
-      const dx = FAR_X[step], dy = FAR_Y[step], dz = FAR_Z[step];
-      const at = 9 * other;
-      const x0 = own[at], y0 = own[at + 1], z0 = own[at + 2];
-      const x1 = x0 + n * dx, y1 = y0 + n * dy, z1 = z0 + n * dz;
-      x += x1;
-      y += y1;
-      z += z1;
-      xx += own[at + 3] + dx * (x0 + x1);
-      xy += own[at + 4] + dx * y1 + dy * x0;
-      xz += own[at + 5] + dx * z1 + dz * x0;
-      yy += own[at + 6] + dy * (y0 + y1);
-      yz += own[at + 7] + dy * z1 + dz * y0;
-      zz += own[at + 8] + dz * (z0 + z1);
-    }
-    const sums = this.boxSums;
-    const at = 9 * cell;
-    sums[at] = x;
-    sums[at + 1] = y;
-    sums[at + 2] = z;
-    sums[at + 3] = xx;
-    sums[at + 4] = xy;
-    sums[at + 5] = xz;
-    sums[at + 6] = yy;
-    sums[at + 7] = yz;
-    sums[at + 8] = zz;
-  }
+/** Twice as long. @template {Int32Array | Uint8Array} A @param {A} array @returns {A} */
+function grown(array) {
+  const longer = /** @type {A} */ (array instanceof Int32Array ? new Int32Array(2 * array.length) : new Uint8Array(2 * array.length));
+  longer.set(array);
+  return longer;
 }
 
 /** Of a quotient up to 512, how many of the steps of `pull` are at most as large. */
@@ -384,11 +382,10 @@ function findContexts(grids, nodes, unknown, axis, out) {
     const fullness = 3 * EIGHTHS[Math.min(n - 1, 4096)] - grid.emptiness;
     const density = clip(Math.floor(fullness / 12) + 30, 0, DENSITIES - 1);
     const priorA = grid.priors[axis], priorB = grid.priors[b], priorC = grid.priors[c];
-    const at = 9 * cell;
-    const sums = grid.boxSums;
-    const sa = sums[at + axis], sb = sums[at + b], sc = sums[at + c];
-    const saa = sums[at + atAA], sab = sums[at + atAB], sac = sums[at + atAC];
-    const sbb = sums[at + atBB], sbc = sums[at + atBC], scc = sums[at + atCC];
+    const { sums } = grid;
+    const sa = sums[axis], sb = sums[b], sc = sums[c];
+    const saa = sums[atAA], sab = sums[atAB], sac = sums[atAC];
+    const sbb = sums[atBB], sbc = sums[atBC], scc = sums[atCC];
     for (let i = finest.start[first]; i < finest.start[first + 1]; i++) {
       const ra = places[3 * i + axis], rb = places[3 * i + b], rc = places[3 * i + c];
       const da = sa - n * ra, db = sb - n * rb, dc = sc - n * rc;

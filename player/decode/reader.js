@@ -1,7 +1,7 @@
 // Clause 12: a file's chunks in order, layer by layer, to scenes.
 
 import { CHUNK_OVERHEAD, PREAMBLE_SIZE, readChunk, readPreamble, sceneIdOf } from "./container.js";
-import { DecodeError, malformed, unsupported } from "./errors.js";
+import { DecodeError, limitExceeded, malformed, unsupported } from "./errors.js";
 import { LAYER_TYPES, readHeader } from "./header.js";
 import { MOST_CODE, decodeLayer, dequantise, transposed } from "./layer.js";
 import { LAYER_KINDS } from "./parameters.js";
@@ -123,7 +123,10 @@ export class LayerReader {
         const symbols = decodeLayer(chunk.payload, LAYER_KINDS[listed.type], this.rows);
         layer = { symbols, tensors: this._accept(symbols) };
       } catch (error) {
-        throw error instanceof DecodeError ? located(error, 0) : error;
+        // What an engine says where it cannot allocate an array.
+        const full = error instanceof RangeError && /allocation|array length|buffer length/i.test(error.message);
+        const fault = full ? limitExceeded(`layer ${listed.type} takes more memory than there is`) : error;
+        throw fault instanceof DecodeError ? located(fault, 0) : fault;
       }
     }
     this._index++;
