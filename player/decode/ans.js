@@ -1,0 +1,152 @@
+// Clause 7.7: ANS streams.
+
+import { malformed } from "./errors.js";
+import { INDEX_SHIFT } from "./tables.js";
+
+const LOW = 0xffffff;
+
+/**
+ * Decodes one stream, symbol by symbol.
+ *
+ * The state x < 2^64 is held as th·2^48 + tl·2^24 + q with th < 2^16 and tl, q < 2^24, so that every product with a
+ * frequency, at most 2^24, is exact in binary64 and its lowest 24 bits follow from 32-bit products.
+ */
+export class AnsDecoder {
+  /** @param {Uint8Array} bytes */
+  constructor(bytes) {
+    if (bytes.length % 4) throw malformed(`an ANS stream of ${bytes.length} bytes, expected a multiple of 4`);
+    const count = bytes.length / 4;
+    const view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
+    this._words = new Uint32Array(count);
+    for (let i = 0; i < count; i++) this._words[i] = view.getUint32(4 * i, true);
+    if (count && this._words[0] === 0) throw malformed("an ANS stream that begins with a word of 0");
+    this._at = 0;
+    this._th = 0;
+    this._tl = 0;
+    this._q = 0;
+    if (count) {
+      this._q = this._words[0] & LOW;
+      this._tl = this._words[0] >>> 24;
+      this._at = 1;
+      this._refill();
+    }
+  }
+
+  /** Takes one word if there is one and the state is below 2^32. */
+  _refill() {
+    if (this._th === 0 && this._tl < 256 && this._at < this._words.length) {
+      const word = this._words[this._at++];
+      this._th = (this._tl << 8) | (this._q >>> 16);
+      this._tl = ((this._q << 8) | (word >>> 24)) & LOW;
+      this._q = word & LOW;
+    }
+  }
+
+  /**
+   * Writes the next `count` symbols under a table to out[start ..].
+   *
+   * @param {import("./tables.js").Table} table @param {Int32Array} out @param {number} start @param {number} count
+   */
+  symbols({ cum, index }, out, start, count) {
+    if (cum.length === 2) {
+      out.fill(0, start, start + count); // a table of one symbol does not change the state
+      return;
+    }
+    const words = this._words;
+    const available = words.length;
+    let at = this._at;
+    let th = this._th;
+    let tl = this._tl;
+    let q = this._q;
+    for (let i = start; i < start + count; i++) {
+      const bucket = q >>> INDEX_SHIFT;
+      let s = index[bucket];
+      let last = index[bucket + 1];
+      while (last - s > 8) {
+        const middle = (s + last + 1) >> 1;
+        if (cum[middle] <= q) s = middle;
+        else last = middle - 1;
+      }
+      while (cum[s + 1] <= q) s++;
+      out[i] = s;
+      const f = cum[s + 1] - cum[s];
+      const r = q - cum[s];
+      q = (Math.imul(tl, f) + r) & LOW;
+      const carry = (tl * f + r - q) / 16777216;
+      const low = (Math.imul(th, f) + carry) & LOW;
+      th = (th * f + carry - low) / 16777216;
+      tl = low;
+      if (th === 0 && tl < 256 && at < available) {
+        const word = words[at++];
+        th = (tl << 8) | (q >>> 16);
+        tl = ((q << 8) | (word >>> 24)) & LOW;
+        q = word & LOW;
+      }
+    }
+    this._at = at;
+    this._th = th;
+    this._tl = tl;
+    this._q = q;
+  }
+
+  /**
+   * Writes the next bits, each 0 with probability zero / 2^24, to out[order[k]] for k = from .. end - 1.
+   *
+   * @param {number} zero 1..2^24 - 1 @param {Int32Array} order @param {number} from @param {number} end
+   * @param {Uint8Array} out
+   */
+  bits(zero, order, from, end, out) {
+    const words = this._words;
+    const available = words.length;
+    let at = this._at;
+    let th = this._th;
+    let tl = this._tl;
+    let q = this._q;
+    for (let k = from; k < end; k++) {
+      const bit = q < zero ? 0 : 1;
+      out[order[k]] = bit;
+      const f = bit ? 16777216 - zero : zero;
+      const r = bit ? q - zero : q;
+      q = (Math.imul(tl, f) + r) & LOW;
+      const carry = (tl * f + r - q) / 16777216;
+      const low = (Math.imul(th, f) + carry) & LOW;
+      th = (th * f + carry - low) / 16777216;
+      tl = low;
+      if (th === 0 && tl < 256 && at < available) {
+        const word = words[at++];
+        th = (tl << 8) | (q >>> 16);
+        tl = ((q << 8) | (word >>> 24)) & LOW;
+        q = word & LOW;
+      }
+    }
+    this._at = at;
+    this._th = th;
+    this._tl = tl;
+    this._q = q;
+  }
+
+  /** Adds the next `count` numbers of `bits` uniform bits (7.6) to out[start ..]. @param {number} bits
+   * @param {Int32Array} out @param {number} start @param {number} count */
+  addUniform(bits, out, start, count) {
+    const shift = 24 - bits;
+    const f = 1 << shift;
+    for (let i = start; i < start + count; i++) {
+      const r = this._q & (f - 1);
+      out[i] += this._q >>> shift;
+      const low = (Math.imul(this._tl, f) + r) & LOW;
+      const carry = (this._tl * f + r - low) / 16777216;
+      const middle = (Math.imul(this._th, f) + carry) & LOW;
+      this._th = (this._th * f + carry - middle) / 16777216;
+      this._tl = middle;
+      this._q = low;
+      this._refill();
+    }
+  }
+
+  /** The stream's end: Malformed unless the state is 0 and no word is left. */
+  finish() {
+    if (this._th || this._tl || this._q) throw malformed("an ANS stream that ends in another state than 0");
+    const left = this._words.length - this._at;
+    if (left) throw malformed(`${left} words behind the end of an ANS stream`);
+  }
+}

@@ -1,0 +1,129 @@
+// Clauses 8.5 to 8.7: the attributes section. Its result is the 68 channels of 11.2, still unchecked against 11.2.
+
+import { ByteReader } from "./bytes.js";
+import { decodeChannels } from "./channels.js";
+import { malformed, unsupported } from "./errors.js";
+import { MAX_CODED } from "./limits.js";
+import {
+  addRelativeMagnitudes,
+  classesByActivity,
+  decodeStage,
+  groupByClass,
+  readClassCount,
+  readStages,
+} from "./stages.js";
+
+export const CHANNELS = 68;
+/** Features and log-scalings, the channels that are predicted from each other. */
+const PREDICTED = 38;
+const GAUSSIANS = 10;
+/** The channels of stages 0..4 are those from one bound to the next; stage 5 is split by the activity of all of them. */
+const STAGE_BOUNDS = [0, 6, 12, 20, 29, PREDICTED];
+const X_STAGE = 5;
+const STAGES = 8;
+/** Classes by distance of a Gaussian's second and third coordinate. */
+const DISTANCES = [5, 7];
+
+/** terms: channel and weight. @typedef {{channel: number, weight: number}[]} Terms */
+/** split: bit 0 for y, bit 1 for z. @typedef {{split: number, a: number, b: number}} Split */
+
+/**
+ * @param {Uint8Array} bytes the section @param {number} rows at least 1
+ * @returns {Int32Array} [68, rows]
+ */
+export function decodeAttributes(bytes, rows) {
+  const reader = new ByteReader(bytes);
+  const form = reader.byte("the form of the attributes");
+  const out = new Int32Array(CHANNELS * rows);
+  if (form === 0) decodeChannels(reader.rest(), new Array(CHANNELS).fill(rows), out);
+  else if (form === 1) decodeStaged(reader, rows, out);
+  else throw unsupported(`form ${form} of the attributes`);
+  return out;
+}
+
+/** @param {ByteReader} reader @param {number} rows @param {Int32Array} out */
+function decodeStaged(reader, rows, out) {
+  /** @type {Terms[]} */
+  const terms = [[]];
+  for (let c = 1; c < PREDICTED; c++) terms.push(readTerms(reader, c));
+  const classCounts = [1];
+  for (let stage = 1; stage <= X_STAGE; stage++) classCounts.push(readClassCount(reader));
+  const splits = Array.from({ length: GAUSSIANS }, () => readSplit(reader));
+  const stages = readStages(reader, STAGES);
+  /** @param {number} c */
+  const channel = (c) => out.subarray(c * rows, (c + 1) * rows);
+
+  const activity = new Float64Array(rows);
+  for (let stage = 0; stage <= X_STAGE; stage++) {
+    const count = classCounts[stage];
+    const classes = classesByActivity(activity, count);
+    const groups = count > 1 ? groupByClass(classes, count) : null;
+    const channels = [];
+    if (stage === X_STAGE) for (let i = 0; i < GAUSSIANS; i++) channels.push(PREDICTED + 3 * i);
+    else for (let c = STAGE_BOUNDS[stage]; c < STAGE_BOUNDS[stage + 1]; c++) channels.push(c);
+    decodeStage(stages[stage], channels.map(channel), channels.map(() => groups));
+    if (stage < X_STAGE && classCounts.slice(stage + 1).some((later) => later > 1)) {
+      for (const c of channels) addRelativeMagnitudes(channel(c), activity);
+    }
+  }
+  for (let coordinate = 1; coordinate <= 2; coordinate++) {
+    const targets = splits.map((_, i) => channel(PREDICTED + 3 * i + coordinate));
+    const groups = splits.map(({ split, a, b }, i) => {
+      if (!(split & coordinate)) return null;
+      const x = channel(PREDICTED + 3 * i);
+      const y = coordinate === 2 ? channel(PREDICTED + 3 * i + 1) : null;
+      return groupByClass(classesByDistance(x, a, y, b), DISTANCES[coordinate - 1]);
+    });
+    decodeStage(stages[X_STAGE + coordinate], targets, groups);
+  }
+  for (let c = 1; c < PREDICTED; c++) predict(channel(c), terms[c], channel);
+}
+
+/** Item 1 of 8.6. @param {ByteReader} reader @param {number} c @returns {Terms} */
+function readTerms(reader, c) {
+  /** @type {Terms} */
+  const terms = [];
+  let channel = -1;
+  for (let left = reader.varint(c, "a number of terms"); left > 0; left--) {
+    channel += 1 + reader.varint(PREDICTED, "a term's channel");
+    const weight = reader.zigzag(2 ** 15, "a term's weight");
+    if (channel >= c) throw malformed(`channel ${c} is predicted from channel ${channel}, expected one below it`);
+    terms.push({ channel, weight });
+  }
+  return terms;
+}
+
+/** Item 3 of 8.6. @param {ByteReader} reader @returns {Split} */
+function readSplit(reader) {
+  const split = reader.varint(3, "a split");
+  const a = split ? reader.zigzag(MAX_CODED, "the centre of x") : 0;
+  const b = split & 2 ? reader.zigzag(MAX_CODED, "the centre of y") : 0;
+  return { split, a, b };
+}
+
+/** @param {Int32Array} x @param {number} a @param {Int32Array | null} y @param {number} b */
+function classesByDistance(x, a, y, b) {
+  const classes = new Uint8Array(x.length);
+  const last = (y ? DISTANCES[1] : DISTANCES[0]) - 1;
+  for (let p = 0; p < x.length; p++) {
+    const distance = Math.abs(x[p] - a) + (y ? Math.abs(y[p] - b) : 0);
+    classes[p] = Math.min(distance, last);
+  }
+  return classes;
+}
+
+/** The sum of 8.7, in place: residuals become symbols. @param {Int32Array} symbols @param {Terms} terms
+ * @param {(c: number) => Int32Array} channel */
+function predict(symbols, terms, channel) {
+  if (!terms.length) return;
+  const sums = new Float64Array(symbols.length).fill(512);
+  for (const { channel: c, weight } of terms) {
+    const known = channel(c);
+    for (let p = 0; p < sums.length; p++) sums[p] += weight * known[p];
+  }
+  for (let p = 0; p < sums.length; p++) {
+    const k = symbols[p] + Math.floor(sums[p] / 1024);
+    if (k > MAX_CODED || k < -MAX_CODED) throw malformed(`a predicted symbol of ${k}, limit ${MAX_CODED}`);
+    symbols[p] = k;
+  }
+}

@@ -1,0 +1,194 @@
+// Clauses 8.1 to 8.4: a section of coded channels.
+
+import { AnsDecoder } from "./ans.js";
+import { ByteReader, MAX_VARINT } from "./bytes.js";
+import { limitExceeded, malformed, unsupported } from "./errors.js";
+import { MAX_CODED, MAX_COUNT, MAX_ENTRIES, MAX_WINDOW } from "./limits.js";
+import { Table, histogramTable, mixtureTable, normTable } from "./tables.js";
+
+const CONST = 0;
+const GAUSS = 1;
+const HISTOGRAM = 3;
+const SCALED = 4;
+const FIRST_REUSE = 8;
+
+/** The symbols kmin .. kmin + n·2^shift - 1. @typedef {{kmin: number, n: number, shift: number}} Window */
+
+/**
+ * table: made by makeTable when it is first used. readClasses: takes a histogram's classes out of the stream.
+ *
+ * @typedef {object} Prior
+ * @property {Window} window
+ * @property {Table | null} table
+ * @property {() => Int32Array} makeTable
+ * @property {((stream: AnsDecoder) => void) | null} readClasses
+ */
+
+/** positions ascend. @typedef {{positions: number[], values: number[]}} Exceptions */
+
+/**
+ * Decodes a section of coded channels of these lengths, one behind the other into `out`, which they fill.
+ *
+ * @param {Uint8Array} bytes @param {ArrayLike<number>} counts @param {Int32Array} out
+ */
+export function decodeChannels(bytes, counts, out) {
+  const reader = new ByteReader(bytes);
+  /** @type {Prior[]} */
+  const priors = [];
+  /** @type {{count: number, prior: Prior, exceptions: Exceptions | null}[]} */
+  const channels = [];
+  let entries = 0;
+  for (let i = 0; i < counts.length; i++) {
+    const count = counts[i];
+    if (!count) continue;
+    const token = reader.varint(2 * (MAX_COUNT + FIRST_REUSE), "a channel's prior");
+    const family = token >> 1;
+    let prior;
+    if (family < FIRST_REUSE) {
+      prior = readPrior(reader, family);
+      priors.push(prior);
+      entries += prior.window.n;
+      if (entries > MAX_ENTRIES) {
+        throw limitExceeded(`tables of ${entries} entries in one section, limit ${MAX_ENTRIES}`);
+      }
+    } else {
+      prior = priors[priors.length - 1 - (family - FIRST_REUSE)];
+      if (!prior) throw malformed("a channel refers to a prior before the first");
+    }
+    channels.push({ count, prior, exceptions: token & 1 ? readExceptions(reader, count, prior.window) : null });
+  }
+  const stream = new AnsDecoder(reader.rest());
+  for (const prior of priors) prior.readClasses?.(stream);
+  let at = 0;
+  for (const { count, prior, exceptions } of channels) {
+    takeChannel(stream, prior, exceptions, out, at, count);
+    at += count;
+  }
+  stream.finish();
+}
+
+/** @param {AnsDecoder} stream @param {Prior} prior @param {Exceptions | null} exceptions @param {Int32Array} out
+ * @param {number} at @param {number} count */
+function takeChannel(stream, prior, exceptions, out, at, count) {
+  const { kmin, shift } = prior.window;
+  const coded = exceptions ? count - exceptions.positions.length : count;
+  prior.table ??= new Table(prior.makeTable());
+  stream.symbols(prior.table, out, at, coded);
+  if (shift) {
+    for (let i = at; i < at + coded; i++) out[i] <<= shift;
+    stream.addUniform(shift, out, at, coded);
+    for (let i = at; i < at + coded; i++) {
+      if (out[i] + kmin > MAX_CODED) throw malformed(`a symbol of ${out[i] + kmin}, limit ${MAX_CODED}`);
+    }
+  }
+  if (kmin) for (let i = at; i < at + coded; i++) out[i] += kmin;
+  if (!exceptions) return;
+  // From the back on, the symbols move up to make room for the exceptions.
+  const { positions, values } = exceptions;
+  let from = at + coded;
+  let to = at + count;
+  for (let i = positions.length - 1; i >= 0; i--) {
+    const place = at + positions[i];
+    while (to > place + 1) out[--to] = out[--from];
+    out[--to] = values[i];
+  }
+}
+
+/** 8.3. @param {ByteReader} reader @param {number} count @param {Window} window @returns {Exceptions} */
+function readExceptions(reader, count, window) {
+  const number = 1 + reader.varint(MAX_VARINT, "the number of exceptions");
+  if (number > count) throw malformed(`${number} exceptions among ${count} symbols`);
+  const end = window.kmin + window.n * 2 ** window.shift;
+  const positions = [];
+  const values = [];
+  let position = -1;
+  for (let i = 0; i < number; i++) {
+    position += 1 + reader.varint(MAX_VARINT, "an exception's place");
+    const code = reader.varint(4 * MAX_CODED + 2, "an exception's value");
+    const value = code & 1 ? window.kmin - 1 - (code >> 1) : end + (code >> 1);
+    if (position >= count || value > MAX_CODED || value < -MAX_CODED) {
+      throw malformed(`an exception of ${value} at ${position} of ${count} symbols`);
+    }
+    positions.push(position);
+    values.push(value);
+  }
+  return { positions, values };
+}
+
+/** 8.1 and 8.2. @param {ByteReader} reader @param {number} family @returns {Prior} */
+function readPrior(reader, family) {
+  if (family === CONST) {
+    const kmin = reader.zigzag(MAX_CODED, "a constant");
+    return { window: { kmin, n: 1, shift: 0 }, table: Table.CONSTANT, makeTable: () => Table.CONSTANT.cum, readClasses: null };
+  }
+  let shift = 0;
+  if (family === SCALED) {
+    shift = reader.byte("the shift of a prior");
+    if (shift > 12) throw limitExceeded(`a prior of shift ${shift}, limit 12`);
+    if (shift < 1) throw malformed("a scaled prior of shift 0");
+    family = reader.byte("the family of a scaled prior");
+    if (family < GAUSS) throw malformed("a scaled constant");
+    if (family > HISTOGRAM) throw unsupported(`a scaled prior of family ${family}`);
+  }
+  if (family > HISTOGRAM) throw unsupported(`a prior of family ${family}`);
+  const window = readWindow(reader, shift);
+  if (family === HISTOGRAM) return readHistogram(reader, window);
+  const first = readNormal(reader, window.n);
+  if (family === GAUSS) {
+    const makeTable = () => normTable(window.n, first.mu8, first.si, first.floor);
+    return { window, table: null, makeTable, readClasses: null };
+  }
+  const second = readNormal(reader, window.n);
+  if (second.floor !== 1) throw malformed("the second normal of a mixture has a floor bit, which is reserved");
+  const weight = reader.byte("the weight of a mixture");
+  if (!weight) throw malformed("a mixture of weight 0");
+  return { window, table: null, makeTable: () => mixtureTable(window.n, first, second, weight), readClasses: null };
+}
+
+/** @param {ByteReader} reader @param {number} shift @returns {Window} */
+function readWindow(reader, shift) {
+  const kmin = reader.zigzag(MAX_CODED, "the start of a window");
+  const n = 2 + reader.varint(MAX_WINDOW - 2, "the length of a window");
+  const last = kmin + (n - 1) * 2 ** shift;
+  if (last > MAX_CODED) throw malformed(`a window whose last entry is ${last}, limit ${MAX_CODED}`);
+  return { kmin, n, shift };
+}
+
+/** @param {ByteReader} reader @param {number} n */
+function readNormal(reader, n) {
+  const mean = reader.zigzag(2 ** 31, "the mean of a prior");
+  const width = reader.varint(3841, "the width of a prior");
+  return { mu8: mean + 128 * (n - 1), si: (width >> 1) - 640, floor: width & 1 ? 16 : 1 };
+}
+
+/** @param {ByteReader} reader @param {Window} window @returns {Prior} */
+function readHistogram(reader, window) {
+  const mode = reader.byte("the mode of a histogram");
+  if (mode > 7) throw malformed(`mode ${mode} of a histogram, whose bits from 3 on are reserved`);
+  const step = 8 << (mode & 3);
+  const differences = (mode & 4) !== 0;
+  const top = reader.varint(1 + Math.floor(1984 / step), "the largest class of a histogram");
+  if (!top) throw malformed("a histogram without classes");
+  const width = reader.byte("the width of a histogram's classes");
+  if (width > 63) throw limitExceeded(`a class width of ${width}, limit 63`);
+  const mu8 = differences ? 256 * top : 16 * reader.varint(16 * top, "the mean of a histogram's classes");
+  const { n } = window;
+  const classes = new Int32Array(n);
+  return {
+    window,
+    table: null,
+    makeTable: () => histogramTable(classes, top, step),
+    readClasses(stream) {
+      const table = normTable((differences ? 2 * top : top) + 1, mu8, 16 * width - 160, 1);
+      stream.symbols(new Table(table), classes, 0, n);
+      let any = 0;
+      for (let s = 0, before = 0; s < n; s++) {
+        if (differences) classes[s] += before - top;
+        before = classes[s];
+        if (before < 0 || before > top) throw malformed(`a class of ${before} in a histogram, expected 0..${top}`);
+        any |= before;
+      }
+      if (!any) throw malformed("a histogram whose classes are all 0");
+    },
+  };
+}

@@ -1,0 +1,145 @@
+// Clause 2.1: CRC-32 of zlib, and SHA-256 of FIPS 180-4, both over bytes that may come in several runs.
+
+/** Eight tables of 256: table t, entry b is the CRC-32 of byte b followed by t zero bytes, without the complements. */
+const CRC_TABLES = /* @__PURE__ */ (() => {
+  const tables = new Uint32Array(8 * 256);
+  for (let b = 0; b < 256; b++) {
+    let c = b;
+    for (let i = 0; i < 8; i++) c = c & 1 ? (c >>> 1) ^ 0xedb88320 : c >>> 1;
+    tables[b] = c;
+  }
+  for (let i = 256; i < tables.length; i++) tables[i] = (tables[i - 256] >>> 8) ^ tables[tables[i - 256] & 255];
+  return tables;
+})();
+
+/**
+ * CRC-32 of `bytes`, or of what `before` is the CRC-32 of followed by `bytes`.
+ *
+ * @param {Uint8Array} bytes @param {number} [before]
+ * @returns {number} 0..2^32 - 1
+ */
+export function crc32(bytes, before = 0) {
+  const t = CRC_TABLES;
+  const n = bytes.length;
+  let c = ~before;
+  let i = 0;
+  for (; i + 8 <= n; i += 8) {
+    c ^= bytes[i] | (bytes[i + 1] << 8) | (bytes[i + 2] << 16) | (bytes[i + 3] << 24);
+    c =
+      t[1792 + (c & 255)] ^ t[1536 + ((c >>> 8) & 255)] ^ t[1280 + ((c >>> 16) & 255)] ^ t[1024 + (c >>> 24)] ^
+      t[768 + bytes[i + 4]] ^ t[512 + bytes[i + 5]] ^ t[256 + bytes[i + 6]] ^ t[bytes[i + 7]];
+  }
+  for (; i < n; i++) c = (c >>> 8) ^ t[(c ^ bytes[i]) & 255];
+  return ~c >>> 0;
+}
+
+/** The first 32 bits of the fractional part of the root of order `power` of each of the first `count` primes. */
+function primeRoots(/** @type {number} */ count, /** @type {number} */ power) {
+  const roots = new Int32Array(count);
+  for (let n = 2, i = 0; i < count; n++) {
+    let prime = true;
+    for (let d = 2; d * d <= n; d++) if (n % d === 0) prime = false;
+    if (!prime) continue;
+    // floor(2^32 root): the largest integer whose power is at most n 2^(32 power); found exactly, bit by bit.
+    const bound = BigInt(n) << BigInt(32 * power);
+    let root = 0n;
+    for (let bit = 1n << 40n; bit; bit >>= 1n) if ((root + bit) ** BigInt(power) <= bound) root += bit;
+    roots[i++] = Number(BigInt.asIntN(32, root));
+  }
+  return roots;
+}
+
+const ROUND_CONSTANTS = /* @__PURE__ */ primeRoots(64, 3);
+const START = /* @__PURE__ */ primeRoots(8, 2);
+
+/** A SHA-256 that takes its bytes piece by piece. */
+export class Sha256 {
+  constructor() {
+    this._state = START.slice();
+    this._words = new Int32Array(64);
+    this._block = new Uint8Array(64);
+    this._filled = 0;
+    this._length = 0;
+  }
+
+  /** @param {Uint8Array} bytes @returns {this} */
+  update(bytes) {
+    this._length += bytes.length;
+    let at = 0;
+    if (this._filled) {
+      at = Math.min(64 - this._filled, bytes.length);
+      this._block.set(bytes.subarray(0, at), this._filled);
+      this._filled += at;
+      if (this._filled < 64) return this;
+      this._compress(this._block, 0, 1);
+    }
+    const blocks = (bytes.length - at) >>> 6;
+    this._compress(bytes, at, blocks);
+    at += 64 * blocks;
+    this._filled = bytes.length - at;
+    this._block.set(bytes.subarray(at));
+    return this;
+  }
+
+  /** The 32 bytes; nothing may be added afterwards. */
+  digest() {
+    const end = new Uint8Array(this._filled < 56 ? 64 - this._filled : 128 - this._filled);
+    const view = new DataView(end.buffer);
+    end[0] = 128;
+    view.setUint32(end.length - 8, Math.floor(this._length / 2 ** 29));
+    view.setUint32(end.length - 4, this._length << 3);
+    this.update(end);
+    const out = new Uint8Array(32);
+    const words = new DataView(out.buffer);
+    for (let i = 0; i < 8; i++) words.setInt32(4 * i, this._state[i]);
+    return out;
+  }
+
+  /** @param {Uint8Array} bytes @param {number} at @param {number} blocks */
+  _compress(bytes, at, blocks) {
+    const w = this._words;
+    const k = ROUND_CONSTANTS;
+    const state = this._state;
+    for (; blocks > 0; blocks--) {
+      for (let i = 0; i < 16; i++, at += 4) {
+        w[i] = (bytes[at] << 24) | (bytes[at + 1] << 16) | (bytes[at + 2] << 8) | bytes[at + 3];
+      }
+      for (let i = 16; i < 64; i++) {
+        const x = w[i - 15];
+        const y = w[i - 2];
+        const s0 = ((x >>> 7) | (x << 25)) ^ ((x >>> 18) | (x << 14)) ^ (x >>> 3);
+        const s1 = ((y >>> 17) | (y << 15)) ^ ((y >>> 19) | (y << 13)) ^ (y >>> 10);
+        w[i] = (w[i - 16] + s0 + w[i - 7] + s1) | 0;
+      }
+      let a = state[0], b = state[1], c = state[2], d = state[3];
+      let e = state[4], f = state[5], g = state[6], h = state[7];
+      for (let i = 0; i < 64; i++) {
+        const s1 = ((e >>> 6) | (e << 26)) ^ ((e >>> 11) | (e << 21)) ^ ((e >>> 25) | (e << 7));
+        const t1 = (h + s1 + (g ^ (e & (f ^ g))) + k[i] + w[i]) | 0;
+        const s0 = ((a >>> 2) | (a << 30)) ^ ((a >>> 13) | (a << 19)) ^ ((a >>> 22) | (a << 10));
+        const t2 = (s0 + ((a & b) | (c & (a | b)))) | 0;
+        h = g;
+        g = f;
+        f = e;
+        e = (d + t1) | 0;
+        d = c;
+        c = b;
+        b = a;
+        a = (t1 + t2) | 0;
+      }
+      state[0] += a;
+      state[1] += b;
+      state[2] += c;
+      state[3] += d;
+      state[4] += e;
+      state[5] += f;
+      state[6] += g;
+      state[7] += h;
+    }
+  }
+}
+
+/** @param {Uint8Array} bytes @returns {string} lower-case hexadecimal */
+export function hex(bytes) {
+  return Array.from(bytes, (b) => b.toString(16).padStart(2, "0")).join("");
+}

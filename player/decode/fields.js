@@ -1,0 +1,106 @@
+// Typed, bounded access to what msgpack held. Every getter checks type and range (clauses 4 and 15).
+
+import { limitExceeded, malformed, unsupported } from "./errors.js";
+import { Real } from "./msgpack.js";
+
+/** @typedef {import("./msgpack.js").Value} Value */
+
+/** Unknown keys from here on are ignored; unknown ones below change what the file means. */
+const FIRST_IGNORED_KEY = 64;
+const SMALLEST_NORMAL = 2 ** -126;
+
+/**
+ * An integer in least..limit.
+ *
+ * @param {Value | undefined} value @param {number} least @param {number} limit @param {string} where
+ */
+export function asInteger(value, least, limit, where) {
+  if (typeof value !== "number") throw malformed(`${where}: ${nameOf(value)}, expected an integer`);
+  if (value > limit) throw limitExceeded(`${where}: ${value}, limit ${limit}`);
+  if (value < least) throw malformed(`${where}: ${value}, expected at least ${least}`);
+  return value;
+}
+
+/**
+ * An integer out of a registry that has 0..count - 1.
+ *
+ * @param {Value | undefined} value @param {number} count @param {string} where
+ */
+export function asRegistered(value, count, where) {
+  if (typeof value !== "number") throw malformed(`${where}: ${nameOf(value)}, expected an integer`);
+  if (value < 0 || value >= count) throw unsupported(`${where}: ${value}, expected 0..${count - 1}`);
+  return value;
+}
+
+/**
+ * A list, of `length` items if given.
+ *
+ * @param {Value | undefined} value @param {string} where @param {number} [length]
+ * @returns {Value[]}
+ */
+export function asList(value, where, length) {
+  if (!Array.isArray(value)) throw malformed(`${where}: ${nameOf(value)}, expected a list`);
+  if (length !== undefined && value.length !== length) {
+    throw malformed(`${where}: a list of ${value.length}, expected ${length}`);
+  }
+  return value;
+}
+
+/** @param {Value | undefined} value @param {string} where @returns {number} an exact binary32 value */
+export function asReal(value, where) {
+  if (!(value instanceof Real)) throw malformed(`${where}: ${nameOf(value)}, expected a real`);
+  return value.value;
+}
+
+/** @param {number} step @param {string} where */
+export function checkStep(step, where) {
+  if (!(step >= SMALLEST_NORMAL)) throw malformed(`${where}: ${step}, expected a positive normal binary32 value`);
+  return step;
+}
+
+/** @param {Value | undefined} value */
+function nameOf(value) {
+  if (value === undefined) return "nothing";
+  if (value instanceof Real) return "a real";
+  if (value instanceof Uint8Array) return "bytes";
+  if (value instanceof Map) return "a map";
+  if (Array.isArray(value)) return "a list";
+  return typeof value === "number" ? "an integer" : `a ${typeof value}`;
+}
+
+/** A map of registered keys, with a name for messages. */
+export class Fields {
+  /** @param {Value | undefined} value @param {string} where @param {number} first @param {number} last known keys */
+  constructor(value, where, first, last) {
+    if (!(value instanceof Map)) throw malformed(`${where}: ${nameOf(value)}, expected a map`);
+    for (const key of value.keys()) {
+      if (key < FIRST_IGNORED_KEY && (key < first || key > last)) throw unsupported(`${where}: unknown key ${key}`);
+    }
+    this.where = where;
+    /** @type {Map<number, Value>} */
+    this.map = value;
+  }
+
+  /** @param {number} key */
+  has(key) {
+    return this.map.has(key);
+  }
+
+  /** The value of a key that must be there. @param {number} key @returns {Value} */
+  get(key) {
+    const value = this.map.get(key);
+    if (value === undefined) throw malformed(`${this.where}: key ${key} is missing`);
+    return value;
+  }
+
+  /** @param {number} key @param {string} what */
+  real(key, what) {
+    return asReal(this.get(key), `${this.where}: ${what}`);
+  }
+
+  /** @param {number} key @param {number} length @param {string} what */
+  reals(key, length, what) {
+    const where = `${this.where}: ${what}`;
+    return asList(this.get(key), where, length).map((item) => asReal(item, where));
+  }
+}

@@ -1,0 +1,57 @@
+/**
+ * A decoder of `.pd4` files: bytes in, typed arrays out. It follows the specification clause by clause and trusts no
+ * byte; every fault is a DecodeError with the name that clause 15 gives it. It decodes mode ans with coded deformations
+ * and answers UnsupportedFeature to mode lzma and to deformations as float32 values (clause 16).
+ *
+ * @module
+ */
+
+import { DecodeError } from "./errors.js";
+import { LayerReader } from "./reader.js";
+import { Stream, checkMaxLayer } from "./stream.js";
+
+export { DecodeError } from "./errors.js";
+export { hashes } from "./hashes.js";
+export { Stream } from "./stream.js";
+
+/** @typedef {import("./scene.js").Scene} Scene */
+/** @typedef {import("./scene.js").Info} Info */
+/** @typedef {import("./scene.js").Camera} Camera */
+/** @typedef {import("./scene.js").Steps} Steps */
+/** @typedef {import("./scene.js").Network} Network */
+/** @typedef {import("./scene.js").Deformation} Deformation */
+/** @typedef {import("./scene.js").Plane} Plane */
+/** @typedef {import("./errors.js").ErrorKind} ErrorKind */
+
+/**
+ * The scene of a file, or of its layers up to maxLayer (bytes behind them are not looked at).
+ *
+ * A cut file raises Truncated, or yields its longest prefix of complete layers if allowPartial, which still needs layer
+ * 0; `scene.layers` then ends early. Other faults raise the other kinds of DecodeError.
+ *
+ * @param {Uint8Array | ArrayBuffer} bytes
+ * @param {{maxLayer?: number | null, allowPartial?: boolean}} [options]
+ * @returns {Scene}
+ */
+export function decode(bytes, { maxLayer = null, allowPartial = false } = {}) {
+  const data = bytes instanceof Uint8Array ? bytes : new Uint8Array(bytes);
+  const limit = checkMaxLayer(maxLayer);
+  const reader = new LayerReader();
+  try {
+    while (reader.next(data.subarray(reader.offset), limit));
+  } catch (error) {
+    const cut = error instanceof DecodeError && error.kind === "Truncated";
+    if (!cut || !allowPartial || !reader.count) throw error;
+  }
+  return reader.scene();
+}
+
+/**
+ * A decoder that takes a file in pieces: `feed(bytes)` gives one scene per layer that they complete.
+ *
+ * @param {{maxLayer?: number | null}} [options]
+ * @returns {Stream}
+ */
+export function openStream(options) {
+  return new Stream(options);
+}

@@ -1,0 +1,111 @@
+// Clauses 6.4, 11 and 12.1: one layer's payload to symbols, and symbols to float32 values.
+
+import { decodeAttributes } from "./attributes.js";
+import { decodeChannels } from "./channels.js";
+import { malformed } from "./errors.js";
+import { MAX_SYMBOL } from "./limits.js";
+import { ATTRIBUTES, MASKS, PLANE_SECTION, POSITIONS, WEIGHTS, readParameters } from "./parameters.js";
+import { decodePlanes } from "./planes.js";
+import { decodePositions } from "./positions.js";
+
+/** @typedef {import("./parameters.js").Parameters} Parameters */
+
+/**
+ * What one layer with n own rows carries. voxels: [n, 3]. rises: of the earlier rows' mask codes. codes: of the own
+ * rows. attributes: [68, n]. planes: per scale six [C, H, W]. weights: weight, bias, weight, bias and so on, network by
+ * network.
+ *
+ * @typedef {object} LayerSymbols
+ * @property {import("./parameters.js").LayerKind} kind
+ * @property {Parameters} parameters
+ * @property {Int32Array} voxels
+ * @property {Int32Array} rises
+ * @property {Int32Array} codes
+ * @property {Int32Array} attributes
+ * @property {Int32Array[]} planes
+ * @property {Int32Array[]} weights
+ */
+
+const LEAST_OWN_CODE = 3;
+export const MOST_CODE = 255;
+
+/**
+ * The symbols of a layer's payload, each in the range that 11.1 and 11.2 allow.
+ *
+ * @param {Uint8Array} payload @param {import("./parameters.js").LayerKind} kind @param {number} earlierRows
+ * @returns {LayerSymbols}
+ */
+export function decodeLayer(payload, kind, earlierRows) {
+  const parameters = readParameters(payload, kind, earlierRows);
+  const { rows, sections, planes: shapes, networks } = parameters;
+  const positions = sections[POSITIONS];
+  const masks = sections[MASKS];
+  const attributes = sections[ATTRIBUTES];
+  const planes = sections[PLANE_SECTION];
+  const weights = sections[WEIGHTS];
+  const voxels = positions ? decodePositions(positions, rows) : new Int32Array(0);
+  const codes = new Int32Array(earlierRows + rows);
+  if (masks) decodeChannels(masks, [earlierRows, rows], codes);
+  checkRange(codes.subarray(0, earlierRows), 0, MOST_CODE, "a rise of a mask code");
+  checkRange(codes.subarray(earlierRows), LEAST_OWN_CODE, MOST_CODE, "a mask code");
+  const decoded = attributes ? decodeAttributes(attributes, rows) : new Int32Array(0);
+  checkRange(decoded, -MAX_SYMBOL, MAX_SYMBOL, "a symbol of an attribute");
+  return {
+    kind,
+    parameters,
+    voxels,
+    rises: codes.subarray(0, earlierRows),
+    codes: codes.subarray(earlierRows),
+    attributes: decoded,
+    planes: planes ? decodePlanes(planes, shapes) : [],
+    weights: weights ? decodeWeights(weights, networks) : [],
+  };
+}
+
+/** @param {Uint8Array} bytes @param {import("./parameters.js").NetworkShape[]} networks */
+function decodeWeights(bytes, networks) {
+  const counts = networks.flatMap(({ layers }) => layers.flatMap(({ inputs, outputs }) => [inputs * outputs, outputs]));
+  const all = new Int32Array(counts.reduce((sum, count) => sum + count, 0));
+  decodeChannels(bytes, counts, all);
+  checkRange(all, -MAX_SYMBOL, MAX_SYMBOL, "a symbol of a weight");
+  let at = 0;
+  return counts.map((count) => all.subarray(at, (at += count)));
+}
+
+/** @param {Int32Array} symbols @param {number} least @param {number} most @param {string} what */
+function checkRange(symbols, least, most, what) {
+  for (let i = 0; i < symbols.length; i++) {
+    if (symbols[i] < least || symbols[i] > most) throw malformed(`${what}: ${symbols[i]}, expected ${least}..${most}`);
+  }
+}
+
+/**
+ * 11.5: symbols times their step, rounded to binary32. Malformed if a result is not finite.
+ *
+ * @param {Int32Array} symbols @param {number} step
+ * @returns {Float32Array}
+ */
+export function dequantise(symbols, step) {
+  return transposed(symbols, symbols.length, 1, step);
+}
+
+/** Rows that are transposed at a time, so few that they stay in the cache. */
+const BLOCK = 128;
+
+/** As dequantise, of [columns, rows] symbols to [rows, columns] values. @param {Int32Array} symbols @param {number} rows
+ * @param {number} columns @param {number} step */
+export function transposed(symbols, rows, columns, step) {
+  const values = new Float32Array(symbols.length);
+  for (let first = 0; first < rows; first += BLOCK) {
+    const end = Math.min(first + BLOCK, rows);
+    for (let c = 0; c < columns; c++) {
+      // The product is exact: 24 bits by 24 bits.
+      for (let r = first; r < end; r++) values[r * columns + c] = symbols[c * rows + r] * step;
+    }
+  }
+  // Rounding is monotone, so that where the largest symbol stays finite all do.
+  if (!Number.isFinite(Math.fround(MAX_SYMBOL * step))) {
+    for (const value of values) if (!Number.isFinite(value)) throw malformed("a reconstructed value is not finite");
+  }
+  return values;
+}

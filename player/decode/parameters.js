@@ -1,0 +1,216 @@
+// Clause 6: the parameters of a layer and the sections behind them.
+
+import { limitExceeded, malformed } from "./errors.js";
+import { Fields, asInteger, asList, asRegistered, checkStep } from "./fields.js";
+import {
+  MAX_CHANNELS,
+  MAX_FIELDS,
+  MAX_LINEAR_LAYERS,
+  MAX_PAYLOAD,
+  MAX_PLANE_CELLS,
+  MAX_ROWS,
+  MAX_SCALES,
+  MAX_SIDE,
+  MAX_WIDTH,
+} from "./limits.js";
+import { unpack } from "./msgpack.js";
+import { PREDICTORS } from "./planes.js";
+import { PLANES } from "./scene.js";
+
+/**
+ * What a layer's number decides. networks: name and outputs by id, null for any number of outputs. classes: of the error
+ * bounds of its steps, in their order (5.4).
+ *
+ * @typedef {{layer: number, networks: [string, number | null][], classes: number[]}} LayerKind
+ */
+
+/** @type {LayerKind[]} */
+export const LAYER_KINDS = [
+  {
+    layer: 0,
+    networks: [
+      ["opacity", 10],
+      ["covariance", 70],
+      ["color", 30],
+    ],
+    classes: [3],
+  },
+  {
+    layer: 1,
+    networks: [
+      ["trunk", null],
+      ["position", 3],
+      ["feature", 32],
+      ["offset", 30],
+      ["scaling", 6],
+    ],
+    classes: [4, 5],
+  },
+  {
+    layer: 2,
+    networks: [
+      ["trunk", null],
+      ["mean", 3],
+      ["scale", 3],
+      ["quat", 4],
+      ["opacity", 1],
+      ["color", 3],
+    ],
+    classes: [6, 7],
+  },
+];
+
+/** Feature and view direction, what layer 0's networks take. */
+const SCAFFOLD_INPUTS = 32 + 3;
+const ATTRIBUTE_CHANNELS = 68;
+
+/** Section numbers of mode ans (6.4). */
+export const POSITIONS = 0;
+export const MASKS = 1;
+export const ATTRIBUTES = 2;
+export const PLANE_SECTION = 3;
+export const WEIGHTS = 4;
+const SECTIONS = ["positions", "masks", "attributes", "planes", "weights", "symbols", "floats"];
+
+/** One plane of a scale. @typedef {{channels: number, height: number, width: number, predictor: number}} PlaneShape */
+/** Linear layers from the input side. @typedef {{name: string, layers: {inputs: number, outputs: number}[]}} NetworkShape */
+
+/**
+ * planes: six per scale. steps: of the weights in layer 0, else of planes and weights, empty without a deformation.
+ * sections: by number.
+ *
+ * @typedef {object} Parameters
+ * @property {number} rows
+ * @property {number[]} steps
+ * @property {PlaneShape[]} planes
+ * @property {NetworkShape[]} networks
+ * @property {(Uint8Array | null)[]} sections
+ */
+
+/**
+ * The parameters of a layer's payload, with its sections; all counts are held against the limits and the payload.
+ *
+ * @param {Uint8Array} payload @param {LayerKind} kind @param {number} earlierRows
+ * @returns {Parameters}
+ */
+export function readParameters(payload, kind, earlierRows) {
+  const where = `layer ${kind.layer}`;
+  if (payload.length < 4) throw malformed(`${where}: a payload of ${payload.length} bytes, expected at least 4`);
+  const length = new DataView(payload.buffer, payload.byteOffset).getUint32(0, true);
+  if (length > MAX_FIELDS) throw limitExceeded(`${where}: parameters of ${length} bytes, limit ${MAX_FIELDS}`);
+  if (length > payload.length - 4) {
+    throw malformed(`${where}: parameters of ${length} bytes in a payload of ${payload.length}`);
+  }
+  const fields = new Fields(unpack(payload.subarray(4, 4 + length), where).value, where, 1, 5);
+  const rows = asInteger(fields.get(1), 0, MAX_ROWS - earlierRows, `${where}: own rows`);
+  const lengths = new Fields(fields.get(2), `${where}: sections`, 0, SECTIONS.length - 1);
+  const scales = readScales(fields, kind, where);
+  const networks = readNetworks(fields, kind, where, scales);
+  const steps = readSteps(fields, kind, where, networks.length > 0);
+  const planes = scales.flat();
+  const sections = cutSections(payload, 4 + length, lengths, where);
+  const cells = planes.reduce((sum, { channels, height, width }) => sum + channels * height * width, 0);
+  const weights = networks.reduce(
+    (sum, { layers }) => layers.reduce((all, { inputs, outputs }) => all + (inputs + 1) * outputs, sum),
+    0,
+  );
+  checkDeclared(where, payload.length, earlierRows, rows, cells, weights);
+  const counts = [rows, earlierRows + rows, rows * ATTRIBUTE_CHANNELS, cells, weights, 0, 0];
+  counts.forEach((count, section) => {
+    if ((sections[section] !== null) !== count > 0) {
+      const found = sections[section] === null ? "missing" : "there";
+      throw malformed(`${where}: section ${SECTIONS[section]} is ${found}, with ${count} symbols to code`);
+    }
+  });
+  return { rows, steps, planes, networks, sections };
+}
+
+/** Clause 6.5. @param {string} where @param {number} bytes of the payload @param {number} earlierRows @param {number} rows
+ * @param {number} cells @param {number} weights */
+function checkDeclared(where, bytes, earlierRows, rows, cells, weights) {
+  if (cells > MAX_PLANE_CELLS) throw limitExceeded(`${where}: ${cells} plane cells, limit ${MAX_PLANE_CELLS}`);
+  const mostRows = 2 ** 13 + 2 * bytes;
+  if (rows > mostRows) throw limitExceeded(`${where}: ${rows} own rows in ${bytes} bytes, limit ${mostRows}`);
+  const symbols = earlierRows + 72 * rows + cells + weights;
+  const mostSymbols = 2 ** 22 + 2048 * bytes;
+  if (symbols > mostSymbols) throw limitExceeded(`${where}: ${symbols} symbols in ${bytes} bytes, limit ${mostSymbols}`);
+}
+
+/** @param {Uint8Array} payload @param {number} at @param {Fields} lengths @param {string} where */
+function cutSections(payload, at, lengths, where) {
+  const sections = SECTIONS.map((name, number) => {
+    if (!lengths.has(number)) return null;
+    const start = at;
+    at += asInteger(lengths.get(number), 1, MAX_PAYLOAD, `${where}: length of section ${name}`);
+    return payload.subarray(start, at); // cut short where it lies: the sum is checked below
+  });
+  if (at !== payload.length) throw malformed(`${where}: sections up to byte ${at} of a payload of ${payload.length}`);
+  return sections;
+}
+
+/** Key 3. @param {Fields} fields @param {LayerKind} kind @param {string} where @param {boolean} expected */
+function readSteps(fields, kind, where, expected) {
+  if (fields.has(3) !== expected) throw malformed(`${where}: steps ${expected ? "missing" : "without networks"}`);
+  if (!expected) return [];
+  return fields.reals(3, kind.classes.length, "steps").map((step) => checkStep(step, `${where}: step`));
+}
+
+/** Key 4: the planes of each scale. @param {Fields} fields @param {LayerKind} kind @param {string} where */
+function readScales(fields, kind, where) {
+  if (!fields.has(4)) return [];
+  if (kind.layer === 0) throw malformed(`${where}: planes, expected none`);
+  const rows = asList(fields.get(4), `${where}: scales`);
+  asInteger(rows.length, 1, MAX_SCALES, `${where}: number of scales`);
+  let expected = 0;
+  return rows.map((row) => {
+    const entry = asList(row, `${where}: a scale`, 11);
+    const channels = asInteger(entry[0], 1, MAX_CHANNELS, `${where}: channels of a scale`);
+    const [x, y, z, t] = entry.slice(1, 5).map((side) => asInteger(side, 1, MAX_SIDE, `${where}: side of a plane`));
+    const predictors = entry.slice(5).map((p) => asRegistered(p, PREDICTORS, `${where}: predictor`));
+    expected ||= channels;
+    if (channels !== expected) throw malformed(`${where}: a scale of ${channels} channels after one of ${expected}`);
+    const side = { x, y, z, t };
+    return PLANES.map((name, i) => ({
+      channels,
+      height: side[/** @type {keyof typeof side} */ (name[1])],
+      width: side[/** @type {keyof typeof side} */ (name[0])],
+      predictor: predictors[i],
+    }));
+  });
+}
+
+/** Key 5. @param {Fields} fields @param {LayerKind} kind @param {string} where @param {PlaneShape[][]} scales
+ * @returns {NetworkShape[]} */
+function readNetworks(fields, kind, where, scales) {
+  const deformation = kind.layer > 0;
+  if (!fields.has(5)) {
+    if (!deformation || scales.length) throw malformed(`${where}: networks are missing`);
+    return [];
+  }
+  const rows = asList(fields.get(5), `${where}: networks`);
+  if (!rows.length) throw malformed(`${where}: an empty list of networks`);
+  if (deformation && !scales.length) throw malformed(`${where}: a deformation without planes`);
+  let inputs = deformation ? scales.reduce((sum, planes) => sum + planes[0].channels, 0) : SCAFFOLD_INPUTS;
+  let last = -1;
+  const networks = rows.map((row) => {
+    const [id, ...widths] = asList(row, `${where}: a network`);
+    const number = asRegistered(id, kind.networks.length, `${where}: id of a network`);
+    if (number <= last) throw malformed(`${where}: network ${number} after ${last}, expected ascending ids`);
+    const [name, outputs] = kind.networks[number];
+    if (deformation && last < 0 && number > 0) throw malformed(`${where}: no trunk, expected one`);
+    last = number;
+    asInteger(widths.length, 1, MAX_LINEAR_LAYERS, `${where}: linear layers of ${name}`);
+    let width = inputs;
+    const layers = widths.map((value) => {
+      const layer = { inputs: width, outputs: asInteger(value, 1, MAX_WIDTH, `${where}: width of ${name}`) };
+      width = layer.outputs;
+      return layer;
+    });
+    if (outputs !== null && width !== outputs) throw malformed(`${where}: ${width} outputs of ${name}, expected ${outputs}`);
+    if (outputs === null) inputs = width; // the heads take the trunk's outputs
+    return { name, layers };
+  });
+  const least = deformation ? 2 : kind.networks.length;
+  if (networks.length < least) throw malformed(`${where}: ${networks.length} networks, expected at least ${least}`);
+  return networks;
+}

@@ -1,0 +1,86 @@
+// What the decoder yields. Arrays are in C order; units and axes are those of the specification.
+
+/**
+ * Linear layers from the input side, ReLU between them and none after the last. weight: row-major [outputs][inputs].
+ *
+ * @typedef {{weight: Float32Array, bias: Float32Array, inputs: number, outputs: number}[]} Network
+ */
+
+/** @typedef {"xy" | "xz" | "xt" | "yz" | "yt" | "zt"} PlaneName */
+
+/**
+ * A plane ab of a HexPlane, [channels, height, width]: rows follow b, columns a.
+ *
+ * @typedef {{data: Float32Array, channels: number, height: number, width: number}} Plane
+ */
+
+/**
+ * planes: per scale its six planes. networks: `trunk` and the heads that are there, in the order of their ids: of the
+ * global deformation position, feature, offset, scaling, of the local one mean, scale, quat, opacity, color.
+ *
+ * @typedef {{planes: Record<PlaneName, Plane>[], networks: Record<string, Network>}} Deformation
+ */
+
+/**
+ * A pinhole camera with the axes x right, y down, z forward. viewmat: world to camera, row-major [4][4]. K: row-major
+ * [3][3], pixels.
+ *
+ * @typedef {{viewmat: Float32Array, K: Float32Array, width: number, height: number}} Camera
+ */
+
+/**
+ * What every layer needs and a player shows the file with (clause 5.1). voxelSize: scene units. box: lower and upper
+ * corner. timeRange: seconds at normalised time 0 and 1. background: RGB, 0..1. unit: metres per scene unit, 0 if
+ * unknown.
+ *
+ * @typedef {object} Info
+ * @property {number} voxelSize
+ * @property {[[number, number, number], [number, number, number]]} box
+ * @property {[number, number]} timeRange
+ * @property {[number, number, number]} background
+ * @property {number} near
+ * @property {number} far
+ * @property {[number, number, number]} up
+ * @property {number} unit
+ * @property {Camera | null} camera
+ */
+
+/**
+ * Quantisation steps; those of tensors that the scene does not have are absent.
+ *
+ * @typedef {object} Steps
+ * @property {number} feature
+ * @property {number} scalingLog
+ * @property {number} offset
+ * @property {number} [weightsScaffold]
+ * @property {number} [planesGlobal]
+ * @property {number} [weightsGlobal]
+ * @property {number} [planesLocal]
+ * @property {number} [weightsLocal]
+ */
+
+/**
+ * A prefix of a scene, with N anchors. layers: the layer numbers that are there, ascending, 0 first. rows: rows[i] is
+ * the number of anchors in the prefix that ends with layers[i]. anchorQ: [N, 3] voxel indices; anchor: [N, 3] positions,
+ * scene units. feature: [N, 32]. scalingLog: [N, 6]. offset: [N, 10, 3]. mask: per layer the codes of its rows[i] rows,
+ * the gate times 255; 0 is inactive. A deformation belongs to the layer of its name, 1 global or 2 local, and is null
+ * where that layer has none or is not there.
+ *
+ * @typedef {object} Scene
+ * @property {Info} info
+ * @property {Steps} steps
+ * @property {number[]} layers
+ * @property {number[]} rows
+ * @property {Int32Array} anchorQ
+ * @property {Float32Array} anchor
+ * @property {Float32Array} feature
+ * @property {Float32Array} scalingLog
+ * @property {Float32Array} offset
+ * @property {Uint8Array[]} mask
+ * @property {{opacity: Network, covariance: Network, color: Network}} networks
+ * @property {Deformation | null} globalDeformation
+ * @property {Deformation | null} localDeformation
+ */
+
+/** The planes of a scale in the order of the file. @type {PlaneName[]} */
+export const PLANES = ["xy", "xz", "xt", "yz", "yt", "zt"];

@@ -1,0 +1,130 @@
+// Clause 8.9 and what 8.7 and 8.8 share: stages, class counts, relative magnitudes and classes by activity.
+
+import { decodeChannels } from "./channels.js";
+import { malformed } from "./errors.js";
+import { MAX_CLASSES } from "./limits.js";
+
+/** @typedef {import("./bytes.js").ByteReader} ByteReader */
+
+/** @param {ByteReader} reader */
+export function readClassCount(reader) {
+  const count = reader.varint(MAX_CLASSES, "a class count");
+  if (!count) throw malformed("a class count of 0");
+  return count;
+}
+
+/**
+ * The stages of a section: the lengths of all but the last, then their bytes, to the section's end.
+ *
+ * @param {ByteReader} reader @param {number} count
+ * @returns {Uint8Array[]} [count]
+ */
+export function readStages(reader, count) {
+  const lengths = [];
+  let sum = 0;
+  for (let i = 1; i < count; i++) {
+    const length = reader.varint(reader.remaining, "the length of a stage");
+    lengths.push(length);
+    sum += length;
+  }
+  const rest = reader.rest();
+  if (sum > rest.length) throw malformed(`stages of ${sum} bytes where ${rest.length} are left`);
+  let at = 0;
+  const stages = lengths.map((length) => rest.subarray(at, (at += length)));
+  return [...stages, rest.subarray(at)];
+}
+
+/** Magnitudes below it are looked up. */
+const LOOKED_UP = 256;
+
+/**
+ * Adds the relative magnitude of each place in one channel to `sums`.
+ *
+ * @param {Int32Array} residuals one per place @param {Float64Array} sums
+ */
+export function addRelativeMagnitudes(residuals, sums) {
+  const n = residuals.length;
+  let total = 1;
+  let largest = 0;
+  for (let p = 0; p < n; p++) {
+    const e = Math.abs(residuals[p]);
+    total += e;
+    if (e > largest) largest = e;
+  }
+  const factor = 256 * n;
+  if (largest * factor > Number.MAX_SAFE_INTEGER) {
+    for (let p = 0; p < n; p++) sums[p] += Number((BigInt(Math.abs(residuals[p])) * BigInt(factor)) / BigInt(total));
+    return;
+  }
+  // The quotient of two integers below 2^53, rounded to binary64, does not reach the next integer: the floor is exact.
+  const known = new Float64Array(Math.min(largest + 1, LOOKED_UP));
+  for (let e = 0; e < known.length; e++) known[e] = Math.floor((e * factor) / total);
+  for (let p = 0; p < n; p++) {
+    const e = Math.abs(residuals[p]);
+    sums[p] += e < LOOKED_UP ? known[e] : Math.floor((e * factor) / total);
+  }
+}
+
+/**
+ * The class of each place by its activity: the number of bounds that are at most its activity.
+ *
+ * @param {Float64Array} activity @param {number} count of classes, 1..8
+ * @returns {Uint8Array}
+ */
+export function classesByActivity(activity, count) {
+  const n = activity.length;
+  const classes = new Uint8Array(n);
+  if (count === 1) return classes;
+  const ascending = activity.slice().sort();
+  for (let i = 1; i < count; i++) {
+    const bound = ascending[Math.floor((i * n) / count)];
+    for (let p = 0; p < n; p++) if (activity[p] >= bound) classes[p]++;
+  }
+  return classes;
+}
+
+/**
+ * The places in the order in which a split channel holds them: class by class, in each as they come.
+ *
+ * @typedef {{order: Int32Array, sizes: Int32Array}} Groups sizes: places per class
+ */
+
+/** @param {Uint8Array} classes @param {number} count of classes @returns {Groups} */
+export function groupByClass(classes, count) {
+  const sizes = new Int32Array(count);
+  for (let p = 0; p < classes.length; p++) sizes[classes[p]]++;
+  const next = new Int32Array(count);
+  for (let c = 1; c < count; c++) next[c] = next[c - 1] + sizes[c - 1];
+  const order = new Int32Array(classes.length);
+  for (let p = 0; p < classes.length; p++) order[next[classes[p]]++] = p;
+  return { order, sizes };
+}
+
+/**
+ * Decodes one stage into its channels. groups: per channel how its rows are split, null if they are not.
+ *
+ * @param {Uint8Array} bytes @param {Int32Array[]} targets
+ * @param {(Groups | null)[]} groups
+ */
+export function decodeStage(bytes, targets, groups) {
+  /** @type {number[]} */
+  const counts = [];
+  let all = 0;
+  targets.forEach((target, i) => {
+    all += target.length;
+    const split = groups[i];
+    if (split) for (const size of split.sizes) counts.push(size);
+    else counts.push(target.length);
+  });
+  const coded = new Int32Array(all);
+  decodeChannels(bytes, counts, coded);
+  let at = 0;
+  targets.forEach((target, i) => {
+    const split = groups[i];
+    if (split) for (const place of split.order) target[place] = coded[at++];
+    else {
+      target.set(coded.subarray(at, at + target.length));
+      at += target.length;
+    }
+  });
+}

@@ -1,0 +1,126 @@
+// Clause 12.3: bytes as they arrive, to one scene per completed layer.
+
+import { CHUNK_OVERHEAD, PREAMBLE_SIZE } from "./container.js";
+import { DecodeError } from "./errors.js";
+import { LAYER_TYPES } from "./header.js";
+import { LayerReader } from "./reader.js";
+
+/** @typedef {import("./scene.js").Scene} Scene */
+
+const SMALLEST_BUFFER = 1 << 16;
+
+/** The least and the last layer of a prefix, or null for all layers. @param {number | null | undefined} maxLayer */
+export function checkMaxLayer(maxLayer) {
+  if (maxLayer == null) return null;
+  if (!Number.isInteger(maxLayer) || maxLayer < 0) throw new RangeError(`maxLayer is ${maxLayer}, expected 0 or more`);
+  return maxLayer;
+}
+
+/** A decoder that takes a file in pieces of any size. Its scenes do not depend on where the pieces are cut. */
+export class Stream {
+  /** @param {{maxLayer?: number | null}} [options] layers above maxLayer are not looked at */
+  constructor({ maxLayer = null } = {}) {
+    this._maxLayer = checkMaxLayer(maxLayer);
+    this._reader = new LayerReader();
+    this._buffer = new Uint8Array(0);
+    this._filled = 0;
+    /** @type {DecodeError | null} */
+    this._error = null;
+    this._done = false;
+  }
+
+  /** Whether every layer that was asked for has arrived. */
+  get complete() {
+    return this._done || this._reader.complete;
+  }
+
+  /** How many bytes of the file are decoded and no longer held: where a fetch that begins anew may go on. */
+  get consumed() {
+    return this._reader.offset;
+  }
+
+  /** Each layer with the end of its chunk in the file, in file order; empty until the header is there. */
+  get layerEnds() {
+    const header = this._reader.header;
+    if (!header) return [];
+    let end = PREAMBLE_SIZE + header.size;
+    const ends = [];
+    for (const { type, length } of header.chunks) {
+      end += CHUNK_OVERHEAD + length;
+      if (type < LAYER_TYPES) ends.push({ layer: type, end });
+    }
+    return ends;
+  }
+
+  /**
+   * One scene per layer that `bytes` complete, each with all layers so far. The bytes are copied.
+   *
+   * A fault raises its DecodeError now, or at the next call if this one completes a layer before it, and at every later
+   * call. Scenes given before stay valid.
+   *
+   * @param {Uint8Array} bytes
+   * @returns {Scene[]}
+   */
+  feed(bytes) {
+    if (this._error) throw this._error;
+    if (this._done) return [];
+    this._append(bytes);
+    /** @type {Scene[]} */
+    const scenes = [];
+    try {
+      while (this._next()) scenes.push(this._reader.scene());
+    } catch (error) {
+      if (!(error instanceof DecodeError)) throw error;
+      if (error.kind !== "Truncated") {
+        this._error = error;
+        if (!scenes.length) throw error;
+      }
+    }
+    return scenes;
+  }
+
+  /** Says that no bytes follow: raises the pending fault, or Truncated if a layer is missing. */
+  finish() {
+    if (this._error) throw this._error;
+    if (!this._done) this._next();
+  }
+
+  /** Forgets a fault and the bytes that are not decoded yet: the next ones fed are those of the file from `consumed` on. */
+  rewind() {
+    this._error = null;
+    this._filled = 0;
+    this._buffer = new Uint8Array(0);
+  }
+
+  /** Whether one more layer was read. */
+  _next() {
+    const before = this._reader.offset;
+    try {
+      const layer = this._reader.next(this._buffer.subarray(0, this._filled), this._maxLayer);
+      this._done = layer === null && this._maxLayer !== null;
+      return layer !== null;
+    } finally {
+      this._drop(this._reader.offset - before);
+    }
+  }
+
+  /** @param {Uint8Array} bytes */
+  _append(bytes) {
+    const size = this._filled + bytes.length;
+    if (size > this._buffer.length) {
+      const grown = new Uint8Array(Math.max(SMALLEST_BUFFER, size, Math.min(2 * this._buffer.length, size + (1 << 26))));
+      grown.set(this._buffer.subarray(0, this._filled));
+      this._buffer = grown;
+    }
+    this._buffer.set(bytes, this._filled);
+    this._filled = size;
+  }
+
+  /** Forgets the first `count` bytes. @param {number} count */
+  _drop(count) {
+    if (!count) return;
+    this._buffer.copyWithin(0, count, this._filled);
+    this._filled -= count;
+    if (!this._filled) this._buffer = new Uint8Array(0);
+  }
+}

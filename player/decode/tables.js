@@ -1,0 +1,114 @@
+// Clauses 7.2 to 7.6: frequency tables, lists cum of n + 1 integers from 0 to 2^24. All products stay below 2^53.
+
+const TOTAL = 2 ** 24;
+
+/** T of 7.3. Appendix B: binary64 yields the same list, as no entry is near a rounding boundary. */
+export const T = /* @__PURE__ */ (() => {
+  const list = new Float64Array(258);
+  for (let i = 0; i < 257; i++) {
+    // Phi(x) - 1/2 = exp(-x^2/2) / sqrt(2 pi) (x + x^3/3 + x^5/(3 5) + ...); no term is negative.
+    const x = i / 32;
+    let sum = x;
+    for (let k = 3, term = x; term > sum * 2 ** -60; k += 2) sum += term *= (x * x) / k;
+    list[i] = Math.round((2 ** 28 * Math.exp((-x * x) / 2) * sum) / Math.sqrt(2 * Math.PI));
+  }
+  list[257] = list[256];
+  return list;
+})();
+
+/** M of 7.3. */
+export const M = /* @__PURE__ */ Float64Array.from({ length: 64 }, (_, j) => Math.round(2 ** (31 - j / 64)));
+
+/**
+ * The C(0..n-2) of 7.3: a Gaussian of mean mu8/256 and standard deviation 2^(si/64), in units of 2^-28.
+ *
+ * @param {number} n @param {number} mu8 @param {number} si -640..1280
+ * @returns {Float64Array} [n - 1]
+ */
+function distribution(n, mu8, si) {
+  const out = new Float64Array(n - 1);
+  const e = si >> 6;
+  const narrow = Math.max(0, e - 8);
+  const byNarrow = 2 ** -narrow;
+  const m = M[si & 63];
+  const scale = 2 ** -(23 + e - narrow);
+  for (let k = 0; k < n - 1; k++) {
+    const t = 256 * k + 128 - mu8;
+    const a = Math.min(Math.floor(Math.abs(t) * byNarrow), 2 ** 21 - 1);
+    const z = Math.min(Math.floor(a * m * scale), 2 ** 19);
+    const i = z >> 11;
+    const v = T[i] + Math.floor(((T[i + 1] - T[i]) * (z & 2047)) / 2048);
+    out[k] = t < 0 ? 2 ** 27 - v : 2 ** 27 + v;
+  }
+  return out;
+}
+
+/** The table of a distribution function over n symbols. @param {Float64Array} c [n - 1] @param {number} floor */
+function tableOf(c, floor) {
+  const n = c.length + 1;
+  const cum = new Int32Array(n + 1);
+  const spread = TOTAL - n * floor;
+  for (let q = 1; q < n; q++) cum[q] = Math.floor((c[q - 1] * spread) / 2 ** 28) + floor * q;
+  cum[n] = TOTAL;
+  return cum;
+}
+
+/** NormTable, 7.3. @param {number} n @param {number} mu8 @param {number} si @param {number} floor */
+export function normTable(n, mu8, si, floor) {
+  return tableOf(distribution(n, mu8, si), floor);
+}
+
+/**
+ * A mixture of two Gaussians, 7.4.
+ *
+ * @param {number} n @param {{mu8: number, si: number, floor: number}} first @param {{mu8: number, si: number}} second
+ * @param {number} weight 1..255, of the second in 256
+ */
+export function mixtureTable(n, first, second, weight) {
+  const c = distribution(n, first.mu8, first.si);
+  const other = distribution(n, second.mu8, second.si);
+  for (let k = 0; k < n - 1; k++) c[k] = Math.floor(((256 - weight) * c[k] + weight * other[k]) / 256);
+  return tableOf(c, first.floor);
+}
+
+/**
+ * A histogram, 7.5.
+ *
+ * @param {Int32Array} classes 0..top, not all 0 @param {number} top @param {number} step
+ */
+export function histogramTable(classes, top, step) {
+  const n = classes.length;
+  const sums = new Float64Array(n + 1);
+  for (let s = 0; s < n; s++) {
+    const b = (top - classes[s]) * step; // at most 1984 where it is used
+    sums[s + 1] = sums[s] + (classes[s] ? M[b & 63] >>> (b >> 6) : 0);
+  }
+  let scale = 1; // 2^-h, which leaves the sums at most 28 binary digits
+  while (sums[n] * scale >= 2 ** 28) scale /= 2;
+  const all = Math.floor(sums[n] * scale);
+  const cum = new Int32Array(n + 1);
+  for (let q = 1; q <= n; q++) cum[q] = Math.floor((Math.floor(sums[q] * scale) * (TOTAL - n)) / all) + q;
+  return cum;
+}
+
+/** Tables are entered at the upper bits of a place. */
+const INDEX_BITS = 9;
+export const INDEX_SHIFT = 24 - INDEX_BITS;
+
+/** A frequency table, with for each value of a place's upper bits the symbol of the least such place. */
+export class Table {
+  /** @param {Int32Array} cum [n + 1], 7.2 */
+  constructor(cum) {
+    this.cum = cum;
+    const index = new Uint16Array((1 << INDEX_BITS) + 1);
+    for (let bucket = 0, s = 0; bucket < 1 << INDEX_BITS; bucket++) {
+      while (cum[s + 1] <= bucket << INDEX_SHIFT) s++;
+      index[bucket] = s;
+    }
+    index[1 << INDEX_BITS] = cum.length - 2;
+    this.index = index;
+  }
+
+  /** The table of one symbol. */
+  static CONSTANT = new Table(Int32Array.of(0, TOTAL));
+}

@@ -1,0 +1,191 @@
+import assert from "node:assert/strict";
+import { test } from "node:test";
+
+import { DecodeError, decode, hashes, openStream } from "../decode/index.js";
+import { readVector, readVectors, same } from "../testing/vectors.mjs";
+
+/** @typedef {import("../decode/index.js").Scene} Scene */
+
+const VECTORS = readVectors();
+
+/** The DecodeError that a function raises, or null. @param {() => unknown} run */
+function faultOf(run) {
+  try {
+    run();
+  } catch (error) {
+    assert.ok(error instanceof DecodeError, String(error));
+    assert.ok(!error.message.includes("\n") && error.message.length < 500, error.message);
+    return error;
+  }
+  return null;
+}
+
+test("there are vectors of every sort", () => {
+  assert.ok(VECTORS.filter(({ error }) => error === null).length > 100);
+  const kinds = new Set(VECTORS.map(({ error }) => error));
+  assert.equal(kinds.size, 8, [...kinds].join());
+});
+
+for (const { file, bytes, error, chunk, offset, layers } of VECTORS) {
+  test(`${file}: hashes, or the named error at its place`, () => {
+    const fault = faultOf(() => assert.deepEqual(hashes(bytes), layers));
+    assert.equal(fault?.kind ?? null, error, fault?.message);
+    if (fault && error !== null) {
+      assert.equal(fault.chunk, chunk);
+      if (offset !== null) assert.equal(fault.offset, offset);
+    }
+    for (let i = 0; i < layers.length; i++) {
+      if (error === null && i + 1 === layers.length) break;
+      assert.deepEqual(hashes(bytes, { maxLayer: layers[i].layer }), layers.slice(0, i + 1));
+    }
+  });
+
+  test(`${file}: a stream of any pieces gives each layer, then the same error`, () => {
+    for (const size of [1, 7, 1000]) {
+      const stream = openStream();
+      /** @type {Scene[]} */
+      const scenes = [];
+      const fault = faultOf(() => {
+        for (let at = 0; at < bytes.length; at += size) scenes.push(...stream.feed(bytes.subarray(at, at + size)));
+        stream.finish();
+      });
+      assert.equal(fault?.kind ?? null, error);
+      const numbers = layers.map(({ layer }) => layer);
+      assert.deepEqual(scenes.map((scene) => scene.layers), numbers.map((_, i) => numbers.slice(0, i + 1)));
+      if (scenes.length && error === null) assert.ok(same(scenes[scenes.length - 1], decode(bytes)));
+      if (size === 1 && bytes.length > 3000) break;
+    }
+  });
+}
+
+test("a scene has the arrays that scene.js describes", () => {
+  const scene = decode(readVector("valid/layers-0-1-2"));
+  const n = scene.rows[scene.rows.length - 1];
+  assert.deepEqual(scene.layers, [0, 1, 2]);
+  assert.ok(n > 0);
+  assert.deepEqual(
+    [scene.anchorQ, scene.anchor, scene.feature, scene.scalingLog, scene.offset].map(({ length }) => length / n),
+    [3, 3, 32, 6, 30],
+  );
+  assert.deepEqual(scene.mask.map(({ length }) => length), scene.rows);
+  assert.ok(scene.anchorQ instanceof Int32Array && scene.mask[0] instanceof Uint8Array);
+  scene.anchor.forEach((x, i) => assert.equal(x, Math.fround(scene.anchorQ[i] * scene.info.voxelSize)));
+  for (const [name, outputs] of /** @type {const} */ ([["opacity", 10], ["covariance", 70], ["color", 30]])) {
+    const network = scene.networks[name];
+    assert.equal(network[0].inputs, 35);
+    assert.equal(network[network.length - 1].outputs, outputs);
+    for (const { weight, bias, inputs, outputs: o } of network) {
+      assert.equal(weight.length, inputs * o);
+      assert.equal(bias.length, o);
+    }
+  }
+  for (const deformation of [scene.globalDeformation, scene.localDeformation]) {
+    assert.ok(deformation && deformation.networks.trunk);
+    for (const scale of deformation.planes) {
+      assert.deepEqual(Object.keys(scale), ["xy", "xz", "xt", "yz", "yt", "zt"]);
+      for (const { data, channels, height, width } of Object.values(scale)) {
+        assert.equal(data.length, channels * height * width);
+      }
+      assert.equal(scale.xy.width, scale.xz.width);
+      assert.equal(scale.xy.height, scale.yz.width);
+      assert.equal(scale.zt.height, scale.xt.height);
+    }
+  }
+  assert.equal(typeof scene.steps.planesLocal, "number");
+});
+
+test("masks never fall from layer to layer, and earlier rows stay", () => {
+  const bytes = readVector("valid/layers-0-1-2");
+  const [first, last] = [decode(bytes, { maxLayer: 0 }), decode(bytes)];
+  const rows = first.rows[0];
+  assert.ok(same(first.feature, last.feature.slice(0, 32 * rows)));
+  assert.ok(same(first.mask[0], last.mask[0]));
+  last.mask[2].slice(0, rows).forEach((code, i) => assert.ok(code >= last.mask[0][i]));
+  assert.equal(first.globalDeformation, null);
+});
+
+test("the camera has four rows and a matrix of intrinsics", () => {
+  const { camera } = decode(readVector("valid/camera")).info;
+  assert.ok(camera);
+  assert.deepEqual([...camera.viewmat.slice(12)], [0, 0, 0, 1]);
+  assert.deepEqual([camera.K[1], camera.K[3], ...camera.K.slice(6)], [0, 0, 0, 0, 1]);
+  assert.equal(decode(readVector("valid/one-anchor")).info.camera, null);
+});
+
+test("a cut file raises Truncated, or gives its longest prefix if asked", () => {
+  const bytes = readVector("faulty/cut-layer-2-payload-middle");
+  assert.equal(faultOf(() => decode(bytes))?.kind, "Truncated");
+  assert.deepEqual(decode(bytes, { allowPartial: true }).layers, [0, 1]);
+  assert.equal(faultOf(() => decode(bytes.subarray(0, 300), { allowPartial: true }))?.kind, "Truncated");
+  assert.equal(faultOf(() => decode(readVector("faulty/crc-layer-2"), { allowPartial: true }))?.kind, "ChecksumMismatch");
+});
+
+test("decode takes an ArrayBuffer, and bytes at odd addresses", () => {
+  const bytes = readVector("valid/layers-0-1-2");
+  const whole = decode(bytes);
+  assert.ok(same(decode(bytes.slice().buffer), whole));
+  const moved = new Uint8Array(bytes.length + 1);
+  moved.set(bytes, 1);
+  assert.ok(same(decode(moved.subarray(1)), whole));
+});
+
+test("maxLayer is a number of 0 or more", () => {
+  for (const maxLayer of [-1, 0.5, NaN]) {
+    assert.throws(() => decode(readVector("valid/one-anchor"), { maxLayer }), RangeError);
+    assert.throws(() => openStream({ maxLayer }), RangeError);
+  }
+});
+
+test("a stream raises its fault again at every call, and goes on after rewind", () => {
+  const bytes = readVector("valid/layers-0-1-2");
+  const stream = openStream();
+  const ends = (() => {
+    const whole = openStream();
+    whole.feed(bytes);
+    assert.ok(whole.complete);
+    assert.equal(whole.consumed, bytes.length);
+    return whole.layerEnds;
+  })();
+  assert.deepEqual(ends.map(({ layer }) => layer), [0, 1, 2]);
+  assert.equal(ends[2].end, bytes.length);
+  const damaged = bytes.slice();
+  damaged[ends[1].end - 10] ^= 1;
+  assert.deepEqual(stream.feed(damaged).map(({ layers }) => layers), [[0]]);
+  for (let i = 0; i < 2; i++) assert.equal(faultOf(() => stream.feed(new Uint8Array(0)))?.kind, "ChecksumMismatch");
+  assert.equal(faultOf(() => stream.finish())?.kind, "ChecksumMismatch");
+  assert.equal(stream.consumed, ends[0].end);
+  stream.rewind();
+  const rest = stream.feed(bytes.subarray(stream.consumed));
+  assert.deepEqual(rest.map(({ layers }) => layers), [[0, 1], [0, 1, 2]]);
+  assert.ok(same(rest[1], decode(bytes)));
+  stream.finish();
+});
+
+test("scenes given before do not change as later layers come", () => {
+  const bytes = readVector("valid/layers-0-1-2");
+  const stream = openStream();
+  const [first] = stream.feed(bytes.subarray(0, openEnds(bytes)[0].end));
+  const kept = structuredClone(first);
+  stream.feed(bytes.subarray(openEnds(bytes)[0].end));
+  assert.ok(same(first, kept));
+});
+
+/** @param {Uint8Array} bytes */
+function openEnds(bytes) {
+  const stream = openStream();
+  stream.feed(bytes);
+  return stream.layerEnds;
+}
+
+test("bytes behind the last layer asked for are not looked at", () => {
+  const bytes = readVector("valid/layers-0-1-2");
+  const end = openEnds(bytes)[0].end;
+  const damaged = bytes.slice();
+  damaged.fill(255, end);
+  assert.ok(same(decode(damaged, { maxLayer: 0 }), decode(bytes, { maxLayer: 0 })));
+  const stream = openStream({ maxLayer: 0 });
+  assert.equal(stream.feed(damaged).length, 1);
+  assert.ok(stream.complete);
+  assert.deepEqual(stream.feed(damaged), []);
+  stream.finish();
+});

@@ -1,0 +1,233 @@
+// The reader of remote files against a server in this process that behaves as it is told.
+
+import assert from "node:assert/strict";
+import { createServer } from "node:http";
+import { after, test } from "node:test";
+
+import { decode, openStream } from "../decode/index.js";
+import { FetchError, SceneSource } from "../decode/fetch.js";
+import { readVector, same } from "../testing/vectors.mjs";
+
+const BYTES = readVector("valid/layers-0-1-2");
+const OTHER = readVector("valid/layers-0-1");
+const ENDS = (() => {
+  const stream = openStream();
+  stream.feed(BYTES);
+  return stream.layerEnds.map(({ end }) => end);
+})();
+
+/**
+ * A server of one file. What it does for request i, counted from 0, is behave(i): `bytes` of the file, cut after `cut`
+ * bytes of the answer, or never ended if `hang`; `ranges`, `tag` and `status` as they say.
+ *
+ * @typedef {{bytes?: Uint8Array, cut?: number, hang?: boolean, ranges?: boolean, tag?: string | null, status?: number}} Act
+ */
+
+/** @type {import("node:http").Server[]} */
+const servers = [];
+after(() => servers.forEach((server) => server.closeAllConnections()));
+
+/** @param {(i: number) => Act} behave */
+async function serving(behave) {
+  /** @type {{range: string | undefined, ifRange: string | undefined}[]} */
+  const asked = [];
+  const server = createServer((request, response) => {
+    const { bytes = BYTES, cut, hang, ranges = true, tag = '"a"', status } = behave(asked.length);
+    const { range } = request.headers;
+    const ifRange = /** @type {string | undefined} */ (request.headers["if-range"]);
+    asked.push({ range, ifRange });
+    if (status) {
+      response.writeHead(status).end("no");
+      return;
+    }
+    const wanted = ranges && range && (!ifRange || ifRange === tag) ? Number(/** @type {any} */ (/bytes=(\d+)-/.exec(range))[1]) : 0;
+    if (wanted >= bytes.length) {
+      response.writeHead(416).end();
+      return;
+    }
+    const part = bytes.subarray(wanted);
+    /** @type {Record<string, string | number>} */
+    const headers = { "Content-Length": part.length };
+    if (tag !== null) headers["ETag"] = tag;
+    if (wanted) headers["Content-Range"] = `bytes ${wanted}-${bytes.length - 1}/${bytes.length}`;
+    response.writeHead(wanted ? 206 : 200, headers);
+    if (cut === undefined) response.end(part);
+    else response.write(part.subarray(0, cut), () => (hang ? undefined : setTimeout(() => response.destroy(), 20)));
+  });
+  servers.push(server);
+  await new Promise((resolve) => server.listen(0, "127.0.0.1", () => resolve(undefined)));
+  server.unref();
+  const { port } = /** @type {import("node:net").AddressInfo} */ (server.address());
+  return { url: `http://127.0.0.1:${port}/scene.pd4`, asked };
+}
+
+/** @param {SceneSource} source @param {import("../decode/fetch.js").Budget} [budget] */
+async function all(source, budget) {
+  const scenes = [];
+  for await (const scene of source.scenes(budget)) scenes.push(scene);
+  return scenes;
+}
+
+const OPTIONS = { pause: 0.01, stall: 5 };
+
+test("one request gives every layer", async () => {
+  const { url, asked } = await serving(() => ({}));
+  const source = new SceneSource(url, OPTIONS);
+  const scenes = await all(source);
+  assert.deepEqual(scenes.map(({ layers }) => layers), [[0], [0, 1], [0, 1, 2]]);
+  assert.ok(same(scenes[2], decode(BYTES)));
+  assert.deepEqual(asked, [{ range: undefined, ifRange: undefined }]);
+  assert.equal(source.received, BYTES.length);
+});
+
+test("a budget of layers or bytes stops, and a later call goes on where it stopped", async () => {
+  for (const budget of [{ maxLayer: 0 }, { bytes: ENDS[0] }, { bytes: ENDS[1] - 1 }]) {
+    const { url, asked } = await serving(() => ({}));
+    const source = new SceneSource(url, OPTIONS);
+    assert.deepEqual((await all(source, budget)).map(({ layers }) => layers), [[0]]);
+    assert.equal(source.received, ENDS[0], "nothing behind the layer is decoded or counted");
+    const rest = await all(source);
+    assert.deepEqual(rest.map(({ layers }) => layers), [[0, 1], [0, 1, 2]]);
+    assert.ok(same(rest[1], decode(BYTES)));
+    assert.deepEqual(asked[1], { range: `bytes=${ENDS[0]}-`, ifRange: '"a"' });
+    assert.deepEqual(await all(source), []);
+    assert.equal(asked.length, 2);
+  }
+});
+
+test("a budget too small for layer 0 gives nothing", async () => {
+  const { url } = await serving(() => ({}));
+  assert.deepEqual(await all(new SceneSource(url, OPTIONS), { bytes: ENDS[0] - 1 }), []);
+  assert.deepEqual(await all(new SceneSource(url, OPTIONS), { seconds: 0 }), []);
+});
+
+test("cuts anywhere are survived, and nothing is asked for twice", async () => {
+  for (const cut of [5, 30, 300, ENDS[0], ENDS[1] + 3]) {
+    const { url, asked } = await serving((i) => (i < 2 ? { cut } : {}));
+    const source = new SceneSource(url, OPTIONS);
+    const scenes = await all(source);
+    assert.ok(same(scenes[scenes.length - 1], decode(BYTES)));
+    assert.equal(scenes.length, 3);
+    assert.equal(asked[1].range, `bytes=${cut}-`);
+    assert.ok(source.cuts >= 1);
+    assert.equal(source.changes, 0);
+  }
+});
+
+test("a stalled connection counts as cut", async () => {
+  const { url, asked } = await serving((i) => (i === 0 ? { cut: 400, hang: true } : {}));
+  const source = new SceneSource(url, { ...OPTIONS, stall: 0.2 });
+  assert.equal((await all(source)).length, 3);
+  assert.deepEqual([asked.length, source.cuts], [2, 1]);
+});
+
+test("a server without ranges sends the same file again, and what is here is passed over", async () => {
+  const { url, asked } = await serving((i) => (i === 0 ? { cut: ENDS[0] + 5, ranges: false } : { ranges: false }));
+  const source = new SceneSource(url, OPTIONS);
+  assert.deepEqual((await all(source)).map(({ layers }) => layers), [[0], [0, 1], [0, 1, 2]]);
+  assert.deepEqual([asked.length, source.changes], [2, 0]);
+});
+
+test("another file begins anew with its layer 0", async () => {
+  for (const ranges of [true, false]) {
+    const { url } = await serving((i) => (i === 0 ? { cut: ENDS[0] + 5 } : { bytes: OTHER, tag: '"b"', ranges }));
+    const source = new SceneSource(url, OPTIONS);
+    const scenes = await all(source);
+    assert.deepEqual(scenes.map(({ layers }) => layers), [[0], [0], [0, 1]]);
+    assert.ok(same(scenes[2], decode(OTHER)));
+    assert.equal(source.changes, 1);
+  }
+});
+
+test("without a validator a cut file is fetched anew", async () => {
+  const { url, asked } = await serving((i) => (i === 0 ? { cut: 400, tag: null } : { tag: null }));
+  assert.equal((await all(new SceneSource(url, OPTIONS))).length, 3);
+  assert.equal(asked[1].range, undefined);
+});
+
+test("a file that never holds still is given up", async () => {
+  const { url } = await serving((i) => ({ cut: 400, tag: `"${i}"` }));
+  await assert.rejects(all(new SceneSource(url, OPTIONS)), (error) => error instanceof FetchError && /changed/.test(error.message));
+});
+
+test("a damaged layer is fetched once more, and is an error the second time", async () => {
+  const damaged = BYTES.slice();
+  damaged[ENDS[1] - 30] ^= 1;
+  const { url, asked } = await serving((i) => (i === 0 ? { bytes: damaged } : {}));
+  const scenes = await all(new SceneSource(url, OPTIONS));
+  assert.deepEqual(scenes.map(({ layers }) => layers), [[0], [0, 1], [0, 1, 2]]);
+  assert.ok(same(scenes[2], decode(BYTES)));
+  assert.equal(asked[1].range, `bytes=${ENDS[0]}-`);
+  const always = await serving(() => ({ bytes: damaged }));
+  const source = new SceneSource(always.url, OPTIONS);
+  /** @type {number[][]} */
+  const seen = [];
+  const run = async () => {
+    for await (const { layers } of source.scenes()) seen.push(layers);
+  };
+  await assert.rejects(run(), { kind: "ChecksumMismatch", chunk: 1 });
+  assert.deepEqual(seen, [[0]]);
+  assert.equal(always.asked.length, 2);
+});
+
+test("what is not a .pd4 file is refused at its first bytes", async () => {
+  const { url, asked } = await serving(() => ({ bytes: new TextEncoder().encode("<!doctype html>" + "x".repeat(1 << 16)) }));
+  await assert.rejects(all(new SceneSource(url, OPTIONS)), { kind: "BadSignature" });
+  assert.equal(asked.length, 1);
+});
+
+test("a file that ends within a layer is Truncated", async () => {
+  const short = BYTES.subarray(0, ENDS[1] - 7);
+  const { url } = await serving(() => ({ bytes: short }));
+  /** @type {number[][]} */
+  const seen = [];
+  const run = async () => {
+    for await (const { layers } of new SceneSource(url, OPTIONS).scenes()) seen.push(layers);
+  };
+  await assert.rejects(run(), { kind: "Truncated" });
+  assert.deepEqual(seen, [[0]]);
+});
+
+test("answers that pass are waited for, others are final, and a dead server is given up", async () => {
+  const passing = await serving((i) => (i < 2 ? { status: 503 } : {}));
+  assert.equal((await all(new SceneSource(passing.url, OPTIONS))).length, 3);
+  const gone = await serving(() => ({ status: 404 }));
+  await assert.rejects(all(new SceneSource(gone.url, OPTIONS)), /404/);
+  assert.equal(gone.asked.length, 1);
+  const dead = await serving(() => ({ status: 500 }));
+  await assert.rejects(all(new SceneSource(dead.url, { ...OPTIONS, attempts: 3 })), (error) => error instanceof FetchError);
+  assert.equal(dead.asked.length, 3);
+});
+
+test("an abort ends it with the signal's reason, before and on the way", async () => {
+  const { url } = await serving(() => ({ cut: ENDS[0] + 5, hang: true }));
+  const controller = new AbortController();
+  const source = new SceneSource(url, { ...OPTIONS, signal: controller.signal });
+  const reason = new Error("enough");
+  const run = async () => {
+    for await (const { layers } of source.scenes()) {
+      assert.deepEqual(layers, [0]);
+      setTimeout(() => controller.abort(reason), 20);
+    }
+  };
+  await assert.rejects(run(), reason);
+  await assert.rejects(all(source), reason);
+});
+
+test("when the seconds are over, what is here stays and a later call goes on", async () => {
+  const { url, asked } = await serving((i) => (i === 0 ? { cut: ENDS[0] + 5, hang: true } : {}));
+  const source = new SceneSource(url, OPTIONS);
+  assert.deepEqual((await all(source, { seconds: 0.5 })).map(({ layers }) => layers), [[0]]);
+  assert.equal(source.received, ENDS[0] + 5);
+  assert.equal((await all(source)).length, 2);
+  assert.equal(asked[1].range, `bytes=${ENDS[0] + 5}-`);
+});
+
+test("progress is told as bytes arrive", async () => {
+  const { url } = await serving(() => ({}));
+  /** @type {[number, number | null][]} */
+  const told = [];
+  await all(new SceneSource(url, { ...OPTIONS, progress: (...figures) => void told.push(figures) }));
+  assert.deepEqual(told[told.length - 1], [BYTES.length, BYTES.length]);
+  told.forEach(([received], i) => assert.ok(!i || received > told[i - 1][0]));
+});

@@ -1,0 +1,137 @@
+"""The player's decoder, in Node: its own tests, its command, and a sample of its fuzzer against the package.
+
+Types are checked where `npm install --no-package-lock` was called in player/. The long form of the sample is
+`python tools/player_fuzz.py`.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from strategies import make_scene
+
+from pd4dgs_codec import decode, encode
+from pd4dgs_codec.codec.info import hashes
+
+ROOT = Path(__file__).parents[2]
+PLAYER = ROOT / "player"
+NODE = shutil.which("node")
+TSC = PLAYER / "node_modules" / ".bin" / "tsc"
+OLDEST = 20
+
+pytestmark = pytest.mark.skipif(NODE is None, reason="no node on this machine")
+
+
+@pytest.fixture(autouse=True, scope="module")
+def recent_node():
+    version = subprocess.run([str(NODE), "--version"], capture_output=True, text=True, timeout=60).stdout
+    if int(re.match(r"v(\d+)", version)[1]) < OLDEST:
+        pytest.skip(f"node {version.strip()}, the player's tests need {OLDEST} or later")
+
+
+@pytest.fixture
+def tools(monkeypatch):
+    monkeypatch.syspath_prepend(str(ROOT / "tools"))
+
+
+def run_node(*arguments: object, **options) -> subprocess.CompletedProcess[str]:
+    command = [str(NODE), *map(str, arguments)]
+    return subprocess.run(command, capture_output=True, text=True, timeout=280, cwd=PLAYER, **options)
+
+
+def test_the_decoders_own_tests_pass():
+    done = run_node("--test", "--test-reporter=tap", *sorted((PLAYER / "test").glob("*.test.mjs")))
+    failed = [line for line in done.stdout.splitlines() if line.lstrip().startswith("not ok")]
+    assert done.returncode == 0, "\n".join([*failed[:20], done.stderr[-2000:]])
+    assert int(re.search(r"^# pass (\d+)$", done.stdout, flags=re.M)[1]) > 1300
+
+
+@pytest.mark.skipif(not TSC.exists(), reason="no typescript: npm install --no-package-lock in player/")
+def test_the_types_are_right():
+    done = subprocess.run([str(TSC), "-p", "tsconfig.json"], cwd=PLAYER, capture_output=True, text=True, timeout=280)
+    assert done.returncode == 0, done.stdout
+
+
+def test_the_command_prints_the_hashes_of_the_package(tmp_path):
+    data = encode(make_scene(5, anchors=60))
+    path = tmp_path / "scene.pd4"
+    path.write_bytes(data)
+    done = run_node(PLAYER / "cli.mjs", "hashes", path)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert json.loads(done.stdout) == hashes(data)
+    info = [sys.executable, "-m", "pd4dgs_codec", "info", str(path), "--hashes", "--json"]
+    printed = subprocess.run(info, capture_output=True, text=True, timeout=120, cwd=ROOT)
+    assert json.loads(done.stdout) == json.loads(printed.stdout)["hashes"]
+
+
+def test_the_command_refuses_a_damaged_file_in_one_line(tmp_path):
+    data = bytearray(encode(make_scene(6, anchors=20)))
+    data[-9] ^= 4
+    path = tmp_path / "scene.pd4"
+    path.write_bytes(data)
+    done = run_node(PLAYER / "cli.mjs", "hashes", path)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr.count("\n") == 1 and "ChecksumMismatch" in done.stderr
+
+
+def test_what_was_changed_at_random_ends_as_in_the_package(tools):
+    import player_fuzz
+    from player_speed import NodeDecoder
+
+    with NodeDecoder(str(NODE)) as node:
+        figures = player_fuzz.run_inputs(node, player_fuzz.all_seeds([]), 1, range(150))
+    assert figures.inputs == 150 and not figures.findings
+    assert figures.sealed > 50 and figures.outcomes["decoded"] > 0 and len(figures.outcomes) > 4
+
+
+def test_the_fuzzer_tells_a_decoder_that_is_wrong(tools):
+    import player_fuzz
+
+    data = encode(make_scene(7, anchors=10))
+
+    class Wrong:
+        def __init__(self, answer):
+            self.answer = answer
+
+        def ask(self, question):
+            return self.answer
+
+    def findings(answer, data=data):
+        figures = player_fuzz.Figures()
+        player_fuzz.compare(Wrong(answer), data, "it", figures)
+        return figures
+
+    right = {"hashes": hashes(data)}
+    assert not findings(right).findings
+    assert findings({"hashes": right["hashes"][:-1]}).findings
+    assert findings({"crash": "TypeError"}).findings
+    assert findings({"error": "Malformed", "message": ""}).findings
+    assert findings(right, data[:-1]).findings
+    other = findings({"error": "Malformed", "message": ""}, data[:-1])
+    assert not other.findings and other.differences.total() == 1
+
+
+def test_the_speed_tool_copies_anchors_side_by_side(tools):
+    import player_speed
+
+    scene = decode(encode(make_scene(8, anchors=30)))
+    grown = player_speed.grown(scene, 3 * scene.rows[-1])
+    assert grown.rows == tuple(3 * n for n in scene.rows)
+    assert decode(encode(grown, omit="nothing")).rows == grown.rows
+
+
+def test_the_speed_tool_compares_the_two(tools, tmp_path, capsys):
+    import player_speed
+
+    path = tmp_path / "scene.pd4"
+    path.write_bytes(encode(make_scene(9, anchors=30)))
+    assert player_speed.main([str(path), "--runs", "3", "--json", str(tmp_path / "times.json")]) == 0
+    (row,) = json.loads((tmp_path / "times.json").read_text())
+    assert row["runs"] == 3 and row["node_cpu_s"] > 0 and row["python_cpu_s"] > 0
+    assert "| scene.pd4 |" in capsys.readouterr().out
