@@ -2,11 +2,11 @@
 // there is no float rendering, and tests hold the evaluator on the GPU against it.
 
 import { deformationUnit, levelOf, MIN_OPACITY, widthsOf } from "./level.js";
+import { LENGTH_HEADS, sliceAt, SPATIAL, TEMPORAL } from "./planes.js";
 
 /** @typedef {import("../decode/scene.js").Scene} Scene */
 /** @typedef {import("../decode/scene.js").Network} Network */
 /** @typedef {import("../decode/scene.js").Deformation} Deformation */
-/** @typedef {import("../decode/scene.js").PlaneName} PlaneName */
 
 /**
  * Gaussians that are kept, in ascending order of their slot, anchor · slots + i. Opacity and scale are gated.
@@ -20,19 +20,6 @@ import { deformationUnit, levelOf, MIN_OPACITY, widthsOf } from "./level.js";
  * @property {Float32Array} quaternion [count, 4], w x y z, unit
  * @property {Float32Array} color [count, 3]
  */
-
-/** @type {[PlaneName, number, number][]} */
-const SPATIAL = [
-  ["xy", 0, 1],
-  ["xz", 0, 2],
-  ["yz", 1, 2],
-];
-/** @type {[PlaneName, number][]} */
-const TEMPORAL = [
-  ["xt", 0],
-  ["yt", 1],
-  ["zt", 2],
-];
 
 /** @param {number} x */
 const sigmoid = (x) => 1 / (1 + Math.exp(-x));
@@ -71,19 +58,10 @@ function spatialPlanes(deformation) {
  */
 function rowsAt(deformation, scale, t) {
   return TEMPORAL.map(([name]) => {
-    const { data, channels, height, width } = deformation.planes[scale][name];
-    const at = t * (height - 1);
-    const low = Math.min(Math.floor(at), height - 1);
-    const high = Math.min(low + 1, height - 1);
-    const f = at - low;
+    const plane = deformation.planes[scale][name];
+    const { channels, width } = plane;
     const out = new Float32Array(width * channels);
-    for (let c = 0; c < channels; c++) {
-      const start = c * height * width;
-      for (let i = 0; i < width; i++) {
-        const a = data[start + low * width + i];
-        out[i * channels + c] = a + f * (data[start + high * width + i] - a);
-      }
-    }
+    sliceAt(plane, t, (c, i, value) => (out[i * channels + c] = value));
     return { data: out, cells: width };
   });
 }
@@ -153,9 +131,7 @@ class Field {
     const out = {};
     for (const [name, chain] of this._heads) {
       const values = (out[name] = chain.run(hidden));
-      if (name === "position" || name === "mean" || name === "scale") {
-        for (let i = 0; i < values.length; i++) values[i] *= this._unit;
-      }
+      if (LENGTH_HEADS.includes(name)) for (let i = 0; i < values.length; i++) values[i] *= this._unit;
     }
     return out;
   }

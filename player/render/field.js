@@ -1,0 +1,290 @@
+// A deformation on the GPU: HexPlane, trunk and heads at points that lie in a texture.
+
+import { blocksOf, Linear, repeat, targets, TooLarge } from "./layers.js";
+import { LENGTH_HEADS, sliceAt, SPATIAL, TEMPORAL } from "./planes.js";
+
+/** @typedef {import("./gl.js").Gpu} Gpu */
+/** @typedef {import("./gl.js").Field} Field */
+/** @typedef {import("../decode/scene.js").Deformation} Deformation */
+/** @typedef {import("../decode/scene.js").Network} Network */
+
+/** Matrices that one fused shader may use: more make compilers slow. */
+const MAX_FUSED = 512;
+/** Texture units, less those for points and rows. */
+const MAX_SCALES = 8;
+
+export class FieldPass {
+  /**
+   * @param {Gpu} gpu @param {Deformation} deformation @param {import("../decode/scene.js").Info["box"]} box
+   * @param {number} unit of length heads, scene units
+   * @param {Record<string, number>} places first output of each head, and how outputs are laid out
+   * @param {number} blocks of the outputs
+   */
+  constructor(gpu, deformation, box, unit, places, blocks) {
+    this._gpu = gpu;
+    this._deformation = deformation;
+    this._box = box;
+    const { channels } = deformation.planes[0].xy;
+    this._scales = deformation.planes.length;
+    this._channelBlocks = blocksOf(channels);
+    if (this._scales > MAX_SCALES || this._channelBlocks > gpu.maxTargets) throw new TooLarge(`${channels} plane channels`);
+    const { trunk, ...heads } = deformation.networks;
+    // a scale's channels are padded to whole blocks; so are the columns that take them
+    const first = padInputs(trunk[0], channels, this._scales);
+    const layers = [first, ...trunk.slice(1), joinHeads(heads, unit, places, 4 * blocks)];
+    const matrices = layers.reduce((sum, l) => sum + blocksOf(l.inputs) * blocksOf(l.outputs), 0);
+    this._fused =
+      blocks <= gpu.maxTargets &&
+      matrices <= MAX_FUSED &&
+      layers.length <= 6 &&
+      layers.every((l) => blocksOf(l.outputs) * (blocksOf(l.inputs) * 64 + 16) <= gpu.maxUniformBytes);
+    this._linears = layers.map((layer) => new Linear(gpu, layer, this._fused ? blocksOf(layer.outputs) : gpu.maxTargets));
+    /** What the outputs' field must have room for. */
+    this.outputBlocks = this._linears[this._linears.length - 1].paddedBlocks;
+    this._planes = deformation.planes.map((planes) => this._upload(planes));
+    this._cells = Math.max(...deformation.planes.flatMap((planes) => TEMPORAL.map(([name]) => planes[name].width)));
+    if (this._cells > gpu.maxSide) throw new TooLarge(`${this._cells} cells`);
+    this._rowData = new Float32Array(this._channelBlocks * 3 * this._scales * this._cells * 4);
+    this._rows = gpu.field(this._cells, 3 * this._scales, this._channelBlocks);
+    /** @type {number | null} */
+    this._time = null;
+    /** @type {Field[]} */
+    this._scratch = [];
+  }
+
+  /** The three spatial planes of a scale, block after block. @param {Deformation["planes"][number]} planes */
+  _upload(planes) {
+    const gpu = this._gpu;
+    const width = Math.max(...SPATIAL.map(([name]) => planes[name].width));
+    const height = Math.max(...SPATIAL.map(([name]) => planes[name].height));
+    const layers = 3 * this._channelBlocks;
+    if (Math.max(width, height) > gpu.maxSide || layers > gpu.maxLayers) throw new TooLarge(`planes of ${width} × ${height}`);
+    const data = new Float32Array(layers * width * height * 4);
+    SPATIAL.forEach(([name], p) => {
+      const plane = planes[name];
+      for (let c = 0; c < plane.channels; c++) {
+        const to = (p * this._channelBlocks + (c >> 2)) * height * width * 4 + (c & 3);
+        const from = c * plane.height * plane.width;
+        for (let j = 0; j < plane.height; j++) {
+          for (let i = 0; i < plane.width; i++) data[to + (j * width + i) * 4] = plane.data[from + j * plane.width + i];
+        }
+      }
+    });
+    return gpu.field(width, height, layers, data);
+  }
+
+  /** Brings the rows of the planes with time to time t. @param {number} t 0..1 */
+  _setTime(t) {
+    if (t === this._time) return;
+    this._time = t;
+    const { _cells: cells, _scales: scales, _rowData: data } = this;
+    this._deformation.planes.forEach((planes, s) =>
+      TEMPORAL.forEach(([name], p) =>
+        sliceAt(planes[name], t, (c, i, value) => {
+          data[(((c >> 2) * 3 * scales + 3 * s + p) * cells + i) * 4 + (c & 3)] = value;
+        }),
+      ),
+    );
+    this._gpu.write(this._rows, data);
+  }
+
+  /**
+   * Residuals at points, into a field of at least `outputBlocks` blocks. Block 0 of `points` holds their positions.
+   *
+   * @param {number} t 0..1 @param {Field} points @param {number} rows rows of texels that count @param {Field} out of
+   * the points' size
+   */
+  run(t, points, rows, out) {
+    this._setTime(t);
+    if (this._fused) this._runFused(points, rows, out);
+    else this._runChain(points, rows, out);
+  }
+
+  /** @param {Field} points @param {number} rows @param {Field} out */
+  _runFused(points, rows, out) {
+    const gpu = this._gpu;
+    const last = this._linears[this._linears.length - 1];
+    const program = gpu.program(
+      this._linears.map((linear, i) => linear.declare(i)).join("") +
+        this._sampler(this._scales) +
+        targets(last.chunkBlocks) +
+        `void main() {
+ivec2 p = ivec2(gl_FragCoord.xy);
+vec3 u = place(texelFetch(points, ivec3(p, 0), 0).xyz);
+${repeat(this._scales, (s) => this._sample(s, "h0_", s * this._channelBlocks))}
+${this._linears.map((linear, i) => linear.apply(i, `h${i}_`, `h${i + 1}_`, i < this._linears.length - 1)).join("")}
+${repeat(last.chunkBlocks, (i) => `out${i} = h${this._linears.length}_${i};`)}}`,
+    );
+    this._use(program, points, [...this._planes.keys()]);
+    this._linears.forEach((linear, i) => linear.bind(i, 0));
+    gpu.cover(out, 0, last.chunkBlocks, 0, rows);
+  }
+
+  /** @param {Field} points @param {number} rows @param {Field} out */
+  _runChain(points, rows, out) {
+    const gpu = this._gpu;
+    const B = this._channelBlocks;
+    const features = this._room(0, points, this._scales * B);
+    const program = gpu.program(
+      this._sampler(1) +
+        targets(B) +
+        `void main() {
+vec3 u = place(texelFetch(points, ivec3(gl_FragCoord.xy, 0), 0).xyz);
+${this._sample(0, "h", 0)}
+${repeat(B, (i) => `out${i} = h${i};`)}}`,
+    );
+    for (let s = 0; s < this._scales; s++) {
+      this._use(program, points, [s]);
+      gpu.cover(features, s * B, B, 0, rows);
+    }
+    let from = features;
+    this._linears.forEach((linear, i) => {
+      const end = i === this._linears.length - 1;
+      const to = end ? out : this._room((i + 1) % 2, points, linear.paddedBlocks);
+      runLinear(gpu, linear, from, to, rows, !end);
+      from = to;
+    });
+  }
+
+  /** A scratch field. @param {number} i 0 or 1 @param {Field} like @param {number} blocks */
+  _room(i, like, blocks) {
+    const had = this._scratch[i];
+    const fits = had && had.width === like.width && had.height === like.height;
+    if (fits && had.blocks >= blocks) return had;
+    this._gpu.free(had);
+    const most = Math.max(this._scales * this._channelBlocks, ...this._linears.slice(0, -1).map((l) => l.paddedBlocks));
+    if (most > this._gpu.maxLayers) throw new TooLarge(`a network of ${4 * most} outputs`);
+    return (this._scratch[i] = this._gpu.field(like.width, like.height, most));
+  }
+
+  /** Source of the functions that sample planes. @param {number} scales */
+  _sampler(scales) {
+    return `uniform sampler2DArray points, rows${repeat(scales, (s) => `, planes${s}`)};
+uniform vec3 low, high, cells[${scales}];
+uniform int firstRow[${scales}];
+vec3 place(vec3 p) {
+  vec3 u = (p - low) / (high - low);
+  return vec3(p.x > low.x ? p.x >= high.x ? 1. : u.x : 0., p.y > low.y ? p.y >= high.y ? 1. : u.y : 0.,
+    p.z > low.z ? p.z >= high.z ? 1. : u.z : 0.);
+}
+vec4 plane(sampler2DArray s, int z, ivec2 a, ivec2 b, vec2 f) {
+  return mix(mix(texelFetch(s, ivec3(a, z), 0), texelFetch(s, ivec3(b.x, a.y, z), 0), f.x),
+    mix(texelFetch(s, ivec3(a.x, b.y, z), 0), texelFetch(s, ivec3(b, z), 0), f.x), f.y);
+}
+vec4 row(int y, int a, int b, float f, int z) {
+  return mix(texelFetch(rows, ivec3(a, y, z), 0), texelFetch(rows, ivec3(b, y, z), 0), f);
+}
+`;
+  }
+
+  /** Source that samples a scale at u. @param {number} s @param {string} to @param {number} first */
+  _sample(s, to, first) {
+    const B = this._channelBlocks;
+    const names = ["x", "y", "z"];
+    return `vec3 at${s} = u * (cells[${s}] - 1.);
+ivec3 from${s} = ivec3(at${s}), to${s} = min(from${s} + 1, ivec3(cells[${s}]) - 1);
+vec3 f${s} = at${s} - vec3(from${s});
+${repeat(B, (c) => {
+  const spatial = SPATIAL.map(([, i, j], p) => {
+    const ij = names[i] + names[j];
+    return `plane(planes${s}, ${p * B + c}, from${s}.${ij}, to${s}.${ij}, f${s}.${ij})`;
+  });
+  const temporal = TEMPORAL.map(([, i], p) => {
+    const n = names[i];
+    return `row(firstRow[${s}] + ${p}, from${s}.${n}, to${s}.${n}, f${s}.${n}, ${c})`;
+  });
+  return `vec4 ${to}${first + c} = ${[...spatial, ...temporal].join("\n  * ")};`;
+})}`;
+  }
+
+  /** Starts a program that samples `scales`. @param {import("./gl.js").Program} program @param {Field} points
+   * @param {number[]} scales */
+  _use(program, points, scales) {
+    const { gl } = this._gpu;
+    /** @type {Record<string, Field>} */
+    const textures = { points, rows: this._rows };
+    scales.forEach((s, i) => (textures[`planes${i}`] = this._planes[s]));
+    this._gpu.use(program, textures);
+    gl.uniform3fv(program.uniform("low"), this._box[0]);
+    gl.uniform3fv(program.uniform("high"), this._box[1]);
+    const cells = scales.flatMap((s) => {
+      const { xy, xz } = this._deformation.planes[s];
+      return [xy.width, xy.height, xz.height];
+    });
+    gl.uniform3fv(program.uniform("cells"), cells);
+    gl.uniform1iv(program.uniform("firstRow"), scales.map((s) => 3 * s));
+  }
+
+  free() {
+    this._gpu.free(...this._planes, this._rows, ...this._scratch);
+    for (const linear of this._linears) linear.free();
+  }
+}
+
+/**
+ * One linear layer from field to field.
+ *
+ * @param {Gpu} gpu @param {Linear} linear @param {Field} from @param {Field} to @param {number} rows
+ * @param {boolean} relu
+ */
+export function runLinear(gpu, linear, from, to, rows, relu) {
+  const program = gpu.program(
+    linear.declare(0) +
+      targets(linear.chunkBlocks) +
+      `uniform sampler2DArray source;
+void main() {
+ivec2 p = ivec2(gl_FragCoord.xy);
+${repeat(linear.inputBlocks, (k) => `vec4 x${k} = texelFetch(source, ivec3(p, ${k}), 0);`)}
+${linear.apply(0, "x", "y", relu)}
+${repeat(linear.chunkBlocks, (i) => `out${i} = y${i};`)}}`,
+  );
+  gpu.use(program, { source: from });
+  for (let c = 0; c < linear.chunks; c++) {
+    linear.bind(0, c);
+    gpu.cover(to, c * linear.chunkBlocks, linear.chunkBlocks, 0, rows);
+  }
+}
+
+/**
+ * The layer with the columns of each scale padded to whole blocks.
+ *
+ * @param {Network[number]} layer @param {number} channels @param {number} scales
+ * @returns {Network[number]}
+ */
+function padInputs(layer, channels, scales) {
+  const padded = 4 * blocksOf(channels);
+  if (padded === channels) return layer;
+  const weight = new Float32Array(layer.outputs * padded * scales);
+  for (let o = 0; o < layer.outputs; o++) {
+    for (let s = 0; s < scales; s++) {
+      const from = o * layer.inputs + s * channels;
+      weight.set(layer.weight.subarray(from, from + channels), (o * scales + s) * padded);
+    }
+  }
+  return { weight, bias: layer.bias, inputs: padded * scales, outputs: layer.outputs };
+}
+
+/**
+ * All heads as one layer. `places` says where each output goes: head name to the first of its outputs, which follow
+ * each other in runs of `${name}Run` (default: all) that start on whole blocks.
+ *
+ * @param {Record<string, Network>} heads @param {number} unit @param {Record<string, number>} places
+ * @param {number} outputs
+ * @returns {Network[number]}
+ */
+function joinHeads(heads, unit, places, outputs) {
+  const inputs = Object.values(heads)[0][0].inputs;
+  const weight = new Float32Array(inputs * outputs);
+  const bias = new Float32Array(outputs);
+  for (const [name, network] of Object.entries(heads)) {
+    if (network.length > 1) throw new TooLarge("a head of several layers");
+    const factor = LENGTH_HEADS.includes(name) ? unit : 1;
+    const run = places[`${name}Run`] ?? network[0].outputs;
+    for (let o = 0; o < network[0].outputs; o++) {
+      const to = places[name] + Math.floor(o / run) * 4 * blocksOf(run) + (o % run);
+      bias[to] = factor * network[0].bias[o];
+      for (let i = 0; i < inputs; i++) weight[to * inputs + i] = factor * network[0].weight[o * inputs + i];
+    }
+  }
+  return { weight, bias, inputs, outputs };
+}
