@@ -21,6 +21,12 @@ import { deformationUnit, levelOf, widthsOf } from "./level.js";
  * @typedef {{field: Field, texels: number}} Splats
  */
 
+/**
+ * What an evaluation gives. means: [texels, 4], mean and opacity; null if means and list are those of the call before.
+ *
+ * @typedef {{splats: Splats, means: Float32Array | null}} Evaluated
+ */
+
 /** Blocks of an anchor's attributes before its features: position, then log-scalings of the offsets, of the base. */
 const FEATURE_BLOCK = 3;
 /** Blocks of a Gaussian. */
@@ -224,7 +230,7 @@ export class GpuEvaluator {
    * @param {number} level 0, 1 or 2 @param {number} t normalised time @param {ArrayLike<number>} eye
    * @param {Splats | null} into what may be overwritten
    * @param {Lister} lister makes the list of kept Gaussians
-   * @returns {Promise<{splats: Splats, moved: boolean}>} moved: whether means may differ from the last call's
+   * @returns {Promise<Evaluated>}
    */
   async evaluate(level, t, eye, into, lister) {
     const gpu = this._gpu;
@@ -264,7 +270,7 @@ export class GpuEvaluator {
     this._level = number;
     this._time = t;
     this._eye = Array.from(eye);
-    return { splats, moved };
+    return { splats, means: moved ? await gpu.read(splats.field, 0, 1, this._listed.rows) : null };
   }
 
   /** The Gaussians of the last evaluation: anchor · slots + i of each texel, NO_ENTRY where there is none. */
@@ -369,7 +375,7 @@ ${repeat(some, (i) => `out${i} = x${b + i};`)}}`,
     }
     for (const linear of scaffold.middle) {
       const to = gpu.field(this._width, this._height, linear.paddedBlocks);
-      runLinear(gpu, linear, from, to, lines, true);
+      runLinear(gpu, linear, from, to, 0, lines, 0, true);
       gpu.free(from);
       from = to;
     }

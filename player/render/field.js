@@ -8,10 +8,8 @@ import { LENGTH_HEADS, sliceAt, SPATIAL, TEMPORAL } from "./planes.js";
 /** @typedef {import("../decode/scene.js").Deformation} Deformation */
 /** @typedef {import("../decode/scene.js").Network} Network */
 
-/** Matrices that one fused shader may use: more make compilers slow. */
-const MAX_FUSED = 512;
-/** Texture units, less those for points and rows. */
-const MAX_SCALES = 8;
+/** Points that are evaluated at a time, about: what lies between two layers takes memory. */
+const BAND_POINTS = 1 << 15;
 
 export class FieldPass {
   /**
@@ -27,18 +25,17 @@ export class FieldPass {
     const { channels } = deformation.planes[0].xy;
     this._scales = deformation.planes.length;
     this._channelBlocks = blocksOf(channels);
-    if (this._scales > MAX_SCALES || this._channelBlocks > gpu.maxTargets) throw new TooLarge(`${channels} plane channels`);
+    if (this._channelBlocks > gpu.maxTargets) throw new TooLarge(`${channels} plane channels`);
     const { trunk, ...heads } = deformation.networks;
     // a scale's channels are padded to whole blocks; so are the columns that take them
     const first = padInputs(trunk[0], channels, this._scales);
     const layers = [first, ...trunk.slice(1), joinHeads(heads, unit, places, 4 * blocks)];
-    const matrices = layers.reduce((sum, l) => sum + blocksOf(l.inputs) * blocksOf(l.outputs), 0);
-    this._fused =
-      blocks <= gpu.maxTargets &&
-      matrices <= MAX_FUSED &&
-      layers.length <= 6 &&
-      layers.every((l) => blocksOf(l.outputs) * (blocksOf(l.inputs) * 64 + 16) <= gpu.maxUniformBytes);
-    this._linears = layers.map((layer) => new Linear(gpu, layer, this._fused ? blocksOf(layer.outputs) : gpu.maxTargets));
+    this._linears = layers.map((layer) => new Linear(gpu, layer));
+    this._scratchBlocks = Math.max(
+      this._scales * this._channelBlocks,
+      ...this._linears.slice(0, -1).map((linear) => linear.paddedBlocks),
+    );
+    if (this._scratchBlocks > gpu.maxLayers) throw new TooLarge(`a network of ${4 * this._scratchBlocks} outputs`);
     /** What the outputs' field must have room for. */
     this.outputBlocks = this._linears[this._linears.length - 1].paddedBlocks;
     this._planes = deformation.planes.map((planes) => this._upload(planes));
@@ -96,80 +93,64 @@ export class FieldPass {
    */
   run(t, points, rows, out) {
     this._setTime(t);
-    if (this._fused) this._runFused(points, rows, out);
-    else this._runChain(points, rows, out);
+    const band = Math.max(1, Math.floor(BAND_POINTS / points.width));
+    for (let row = 0; row < rows; row += band) this._runBand(points, row, Math.min(band, rows - row), out);
   }
 
-  /** @param {Field} points @param {number} rows @param {Field} out */
-  _runFused(points, rows, out) {
+  /** @param {Field} points @param {number} row @param {number} rows @param {Field} out */
+  _runBand(points, row, rows, out) {
     const gpu = this._gpu;
-    const last = this._linears[this._linears.length - 1];
-    const program = gpu.program(
-      this._linears.map((linear, i) => linear.declare(i)).join("") +
-        this._sampler(this._scales) +
-        targets(last.chunkBlocks) +
-        `void main() {
-ivec2 p = ivec2(gl_FragCoord.xy);
-vec3 u = place(texelFetch(points, ivec3(p, 0), 0).xyz);
-${repeat(this._scales, (s) => this._sample(s, "h0_", s * this._channelBlocks))}
-${this._linears.map((linear, i) => linear.apply(i, `h${i}_`, `h${i + 1}_`, i < this._linears.length - 1)).join("")}
-${repeat(last.chunkBlocks, (i) => `out${i} = h${this._linears.length}_${i};`)}}`,
-    );
-    this._use(program, points, [...this._planes.keys()]);
-    this._linears.forEach((linear, i) => linear.bind(i, 0));
-    gpu.cover(out, 0, last.chunkBlocks, 0, rows);
-  }
-
-  /** @param {Field} points @param {number} rows @param {Field} out */
-  _runChain(points, rows, out) {
-    const gpu = this._gpu;
+    const { gl } = gpu;
     const B = this._channelBlocks;
-    const features = this._room(0, points, this._scales * B);
     const program = gpu.program(
-      this._sampler(1) +
-        targets(B) +
+      targets(B) +
+        this._sampler() +
         `void main() {
-vec3 u = place(texelFetch(points, ivec3(gl_FragCoord.xy, 0), 0).xyz);
-${this._sample(0, "h", 0)}
+vec3 u = place(texelFetch(points, ivec3(gl_FragCoord.xy, 0) + ivec3(0, shift, 0), 0).xyz);
+${this._sample()}
 ${repeat(B, (i) => `out${i} = h${i};`)}}`,
     );
-    for (let s = 0; s < this._scales; s++) {
-      this._use(program, points, [s]);
-      gpu.cover(features, s * B, B, 0, rows);
-    }
-    let from = features;
+    let from = this._room(0, points.width, rows);
+    this._planes.forEach((planes, s) => {
+      gpu.use(program, { points, planes, rows: this._rows });
+      const { xy, xz } = this._deformation.planes[s];
+      gl.uniform3fv(program.uniform("low"), this._box[0]);
+      gl.uniform3fv(program.uniform("high"), this._box[1]);
+      gl.uniform3f(program.uniform("cells"), xy.width, xy.height, xz.height);
+      gl.uniform1i(program.uniform("firstRow"), 3 * s);
+      gl.uniform1i(program.uniform("shift"), row);
+      gpu.cover(from, s * B, B, 0, rows);
+    });
     this._linears.forEach((linear, i) => {
-      const end = i === this._linears.length - 1;
-      const to = end ? out : this._room((i + 1) % 2, points, linear.paddedBlocks);
-      runLinear(gpu, linear, from, to, rows, !end);
+      const last = i === this._linears.length - 1;
+      const to = last ? out : this._room((i + 1) % 2, points.width, rows);
+      if (last) runLinear(gpu, linear, from, to, row, rows, -row, false);
+      else runLinear(gpu, linear, from, to, 0, rows, 0, true);
       from = to;
     });
   }
 
-  /** A scratch field. @param {number} i 0 or 1 @param {Field} like @param {number} blocks */
-  _room(i, like, blocks) {
+  /** A scratch field. @param {number} i 0 or 1 @param {number} width @param {number} rows */
+  _room(i, width, rows) {
     const had = this._scratch[i];
-    const fits = had && had.width === like.width && had.height === like.height;
-    if (fits && had.blocks >= blocks) return had;
+    if (had && had.width === width && had.height >= rows) return had;
     this._gpu.free(had);
-    const most = Math.max(this._scales * this._channelBlocks, ...this._linears.slice(0, -1).map((l) => l.paddedBlocks));
-    if (most > this._gpu.maxLayers) throw new TooLarge(`a network of ${4 * most} outputs`);
-    return (this._scratch[i] = this._gpu.field(like.width, like.height, most));
+    return (this._scratch[i] = this._gpu.field(width, rows, this._scratchBlocks));
   }
 
-  /** Source of the functions that sample planes. @param {number} scales */
-  _sampler(scales) {
-    return `uniform sampler2DArray points, rows${repeat(scales, (s) => `, planes${s}`)};
-uniform vec3 low, high, cells[${scales}];
-uniform int firstRow[${scales}];
+  /** Source of the functions that sample planes. */
+  _sampler() {
+    return `uniform sampler2DArray points, planes, rows;
+uniform vec3 low, high, cells;
+uniform int firstRow, shift;
 vec3 place(vec3 p) {
   vec3 u = (p - low) / (high - low);
   return vec3(p.x > low.x ? p.x >= high.x ? 1. : u.x : 0., p.y > low.y ? p.y >= high.y ? 1. : u.y : 0.,
     p.z > low.z ? p.z >= high.z ? 1. : u.z : 0.);
 }
-vec4 plane(sampler2DArray s, int z, ivec2 a, ivec2 b, vec2 f) {
-  return mix(mix(texelFetch(s, ivec3(a, z), 0), texelFetch(s, ivec3(b.x, a.y, z), 0), f.x),
-    mix(texelFetch(s, ivec3(a.x, b.y, z), 0), texelFetch(s, ivec3(b, z), 0), f.x), f.y);
+vec4 plane(int z, ivec2 a, ivec2 b, vec2 f) {
+  return mix(mix(texelFetch(planes, ivec3(a, z), 0), texelFetch(planes, ivec3(b.x, a.y, z), 0), f.x),
+    mix(texelFetch(planes, ivec3(a.x, b.y, z), 0), texelFetch(planes, ivec3(b, z), 0), f.x), f.y);
 }
 vec4 row(int y, int a, int b, float f, int z) {
   return mix(texelFetch(rows, ivec3(a, y, z), 0), texelFetch(rows, ivec3(b, y, z), 0), f);
@@ -177,42 +158,24 @@ vec4 row(int y, int a, int b, float f, int z) {
 `;
   }
 
-  /** Source that samples a scale at u. @param {number} s @param {string} to @param {number} first */
-  _sample(s, to, first) {
+  /** Source that samples the planes of a scale at u. */
+  _sample() {
     const B = this._channelBlocks;
     const names = ["x", "y", "z"];
-    return `vec3 at${s} = u * (cells[${s}] - 1.);
-ivec3 from${s} = ivec3(at${s}), to${s} = min(from${s} + 1, ivec3(cells[${s}]) - 1);
-vec3 f${s} = at${s} - vec3(from${s});
+    return `vec3 at = u * (cells - 1.);
+ivec3 a = ivec3(at), b = min(a + 1, ivec3(cells) - 1);
+vec3 f = at - vec3(a);
 ${repeat(B, (c) => {
   const spatial = SPATIAL.map(([, i, j], p) => {
     const ij = names[i] + names[j];
-    return `plane(planes${s}, ${p * B + c}, from${s}.${ij}, to${s}.${ij}, f${s}.${ij})`;
+    return `plane(${p * B + c}, a.${ij}, b.${ij}, f.${ij})`;
   });
   const temporal = TEMPORAL.map(([, i], p) => {
     const n = names[i];
-    return `row(firstRow[${s}] + ${p}, from${s}.${n}, to${s}.${n}, f${s}.${n}, ${c})`;
+    return `row(firstRow + ${p}, a.${n}, b.${n}, f.${n}, ${c})`;
   });
-  return `vec4 ${to}${first + c} = ${[...spatial, ...temporal].join("\n  * ")};`;
+  return `vec4 h${c} = ${[...spatial, ...temporal].join("\n  * ")};`;
 })}`;
-  }
-
-  /** Starts a program that samples `scales`. @param {import("./gl.js").Program} program @param {Field} points
-   * @param {number[]} scales */
-  _use(program, points, scales) {
-    const { gl } = this._gpu;
-    /** @type {Record<string, Field>} */
-    const textures = { points, rows: this._rows };
-    scales.forEach((s, i) => (textures[`planes${i}`] = this._planes[s]));
-    this._gpu.use(program, textures);
-    gl.uniform3fv(program.uniform("low"), this._box[0]);
-    gl.uniform3fv(program.uniform("high"), this._box[1]);
-    const cells = scales.flatMap((s) => {
-      const { xy, xz } = this._deformation.planes[s];
-      return [xy.width, xy.height, xz.height];
-    });
-    gl.uniform3fv(program.uniform("cells"), cells);
-    gl.uniform1iv(program.uniform("firstRow"), scales.map((s) => 3 * s));
   }
 
   free() {
@@ -224,24 +187,26 @@ ${repeat(B, (c) => {
 /**
  * One linear layer from field to field.
  *
- * @param {Gpu} gpu @param {Linear} linear @param {Field} from @param {Field} to @param {number} rows
- * @param {boolean} relu
+ * @param {Gpu} gpu @param {Linear} linear @param {Field} from @param {Field} to @param {number} row @param {number} rows
+ * of texels, in `to` @param {number} shift from there to the rows of `from` @param {boolean} relu
  */
-export function runLinear(gpu, linear, from, to, rows, relu) {
+export function runLinear(gpu, linear, from, to, row, rows, shift, relu) {
   const program = gpu.program(
     linear.declare(0) +
       targets(linear.chunkBlocks) +
       `uniform sampler2DArray source;
+uniform int shift;
 void main() {
-ivec2 p = ivec2(gl_FragCoord.xy);
+ivec2 p = ivec2(gl_FragCoord.xy) + ivec2(0, shift);
 ${repeat(linear.inputBlocks, (k) => `vec4 x${k} = texelFetch(source, ivec3(p, ${k}), 0);`)}
 ${linear.apply(0, "x", "y", relu)}
 ${repeat(linear.chunkBlocks, (i) => `out${i} = y${i};`)}}`,
   );
   gpu.use(program, { source: from });
+  gpu.gl.uniform1i(program.uniform("shift"), shift);
   for (let c = 0; c < linear.chunks; c++) {
     linear.bind(0, c);
-    gpu.cover(to, c * linear.chunkBlocks, linear.chunkBlocks, 0, rows);
+    gpu.cover(to, c * linear.chunkBlocks, linear.chunkBlocks, row, rows);
   }
 }
 

@@ -42,6 +42,10 @@ export class Gpu {
     this.gl = gl;
     /** Whether textures of floats can be rendered to. */
     this.floats = !!gl.getExtension("EXT_color_buffer_float");
+    const renderer = String(gl.getParameter(gl.getExtension("WEBGL_debug_renderer_info")?.UNMASKED_RENDERER_WEBGL ?? gl.RENDERER));
+    /** What blends pictures: half floats on GPUs; software converts them at a high price. */
+    this.pictureFormat =
+      /swiftshader|llvmpipe|software/i.test(renderer) && gl.getExtension("EXT_float_blend") ? gl.RGBA32F : gl.RGBA16F;
     this.maxTargets = Math.min(gl.getParameter(gl.MAX_DRAW_BUFFERS), gl.getParameter(gl.MAX_COLOR_ATTACHMENTS), 8);
     this.maxSide = /** @type {number} */ (gl.getParameter(gl.MAX_TEXTURE_SIZE));
     this.maxLayers = /** @type {number} */ (gl.getParameter(gl.MAX_ARRAY_TEXTURE_LAYERS));

@@ -4,6 +4,8 @@
 /** @typedef {import("./gl.js").Gpu} Gpu */
 /** @typedef {import("../decode/scene.js").Network} Network */
 
+/** Matrices of one shader, about: compilers unroll them, and take longer than in proportion. */
+const MAX_MATRICES = 64;
 /** Bytes of a 4 × 4 matrix, and of a vector of 4. */
 const MATRIX_BYTES = 64;
 const VECTOR_BYTES = 16;
@@ -15,16 +17,14 @@ export const blocksOf = (n) => Math.ceil(n / 4);
  * A linear layer on the GPU. Its outputs are cut into chunks of `chunkBlocks` blocks, one draw call each.
  */
 export class Linear {
-  /**
-   * @param {Gpu} gpu @param {Network[number]} layer @param {number} [maxBlocks] of a chunk; default: as many as a draw
-   * call has targets
-   */
-  constructor(gpu, layer, maxBlocks = gpu.maxTargets) {
+  /** @param {Gpu} gpu @param {Network[number]} layer */
+  constructor(gpu, layer) {
     this._gpu = gpu;
     this.inputBlocks = blocksOf(layer.inputs);
     this.outputBlocks = blocksOf(layer.outputs);
-    const most = Math.min(maxBlocks, Math.floor(gpu.maxUniformBytes / (this.inputBlocks * MATRIX_BYTES + VECTOR_BYTES)));
-    if (most < 1) throw new TooLarge(`a network of ${layer.inputs} inputs`);
+    const fitting = Math.floor(gpu.maxUniformBytes / (this.inputBlocks * MATRIX_BYTES + VECTOR_BYTES));
+    const most = Math.min(gpu.maxTargets, fitting, Math.max(1, Math.floor(MAX_MATRICES / this.inputBlocks)));
+    if (most < 1 || this.inputBlocks > MAX_MATRICES) throw new TooLarge(`a network of ${layer.inputs} inputs`);
     this.chunks = Math.ceil(this.outputBlocks / most);
     this.chunkBlocks = Math.ceil(this.outputBlocks / this.chunks);
     this._bytes = this.chunkBlocks * (VECTOR_BYTES + this.inputBlocks * MATRIX_BYTES);

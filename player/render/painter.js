@@ -12,22 +12,31 @@ const BLUR = 0.3;
 const MARGIN = 0.15;
 const MAX_ALPHA = 0.999;
 
+/** Quads of an instance. Instances of a single quad are slow on real GPUs and slower in software ones. */
+const BATCH = 128;
+/** Width of the texture of the order. */
+const ORDER_WIDTH = 1024;
+
 /** One quad per Gaussian, as wide as alpha reaches 1/255 along the ellipse's axes. The covariance is U·Uᵀ + blur with U
  * = J·W·R·S, and its determinant |u0 × u1|² + blur·trace + blur²: without cancellation for needles. */
 const VERTEX = `
 uniform sampler2DArray splats;
+uniform usampler2D order;
+uniform int count;
 uniform vec4 view[3];
 uniform vec4 lens; // fx, fy, cx, cy
 uniform vec4 slopes; // least and largest x/z, y/z
 uniform vec2 size;
 uniform float near;
-layout(location = 0) in uint index;
 flat out vec4 paint;
 out vec2 place;
 void main() {
   gl_Position = vec4(2, 2, 2, 1); // outside
+  int number = gl_InstanceID * ${BATCH} + (gl_VertexID >> 2);
+  if (number >= count) return;
+  int index = int(texelFetch(order, ivec2(number % ${ORDER_WIDTH}, number / ${ORDER_WIDTH}), 0).r);
   int width = textureSize(splats, 0).x;
-  ivec2 g = ivec2(int(index) % width, int(index) / width);
+  ivec2 g = ivec2(index % width, index / width);
   vec4 head = texelFetch(splats, ivec3(g, 0), 0);
   vec4 p = vec4(head.xyz, 1);
   vec3 c = vec3(dot(view[0], p), dot(view[1], p), dot(view[2], p));
@@ -52,7 +61,7 @@ void main() {
   vec2 axis = root > 0. ? half_ >= 0. ? vec2(half_ + root, b) : vec2(b, root - half_) : vec2(1, 0);
   axis = dot(axis, axis) > 0. ? normalize(axis) : vec2(1, 0);
   float reach = sqrt(2. * log(255. * head.w));
-  vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1) * 2. - 1.;
+  vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1 & 1) * 2. - 1.;
   vec2 extent = reach * sqrt(vec2(long_, det / long_));
   vec2 pixel = c.xy * iz * lens.xy + lens.zw
     + corner.x * extent.x * axis + corner.y * extent.y * vec2(-axis.y, axis.x);
@@ -84,24 +93,45 @@ export class Painter {
   constructor(gpu) {
     const { gl } = gpu;
     this._gpu = gpu;
-    this._order = gl.createBuffer();
+    const corners = new Uint16Array(6 * BATCH);
+    for (let q = 0; q < BATCH; q++) corners.set([0, 1, 2, 2, 1, 3].map((corner) => 4 * q + corner), 6 * q);
+    this._corners = gl.createBuffer();
     this._array = gl.createVertexArray();
     gl.bindVertexArray(this._array);
-    gl.bindBuffer(gl.ARRAY_BUFFER, this._order);
-    gl.enableVertexAttribArray(0);
-    gl.vertexAttribIPointer(0, 1, gl.UNSIGNED_INT, 0, 0);
-    gl.vertexAttribDivisor(0, 1);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this._corners);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
     gl.bindVertexArray(null);
+    /** @type {WebGLTexture | null} */
+    this._order = null;
+    this._orderRows = 0;
     this._count = 0;
-    /** Half floats: eight bits would round at every blending. @type {import("./gl.js").Field | null} */
+    /** Of floats: eight bits would round at every blending. @type {import("./gl.js").Field | null} */
     this._picture = null;
+  }
+
+  /** How many Gaussians are drawn. */
+  get count() {
+    return this._count;
   }
 
   /** Takes the order in which to draw, back to front. @param {Uint32Array} order texels of the splats */
   setOrder(order) {
     const { gl } = this._gpu;
-    gl.bindBuffer(gl.ARRAY_BUFFER, this._order);
-    gl.bufferData(gl.ARRAY_BUFFER, order, gl.STREAM_DRAW);
+    const rows = Math.ceil(order.length / ORDER_WIDTH);
+    if (rows > this._orderRows) {
+      this._gpu.free(this._order);
+      this._orderRows = Math.ceil(1.25 * rows);
+      this._order = this._gpu.plain(ORDER_WIDTH, this._orderRows, new Uint32Array(ORDER_WIDTH * this._orderRows));
+    }
+    gl.bindTexture(gl.TEXTURE_2D, this._order);
+    /** @param {number} row @param {number} height @param {number} width */
+    const put = (row, height, width) => {
+      const from = row * ORDER_WIDTH;
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row, width, height, gl.RED_INTEGER, gl.UNSIGNED_INT, order, from);
+    };
+    const whole = Math.floor(order.length / ORDER_WIDTH);
+    if (whole) put(0, whole, ORDER_WIDTH);
+    if (whole < rows) put(whole, 1, order.length - whole * ORDER_WIDTH);
     this._count = order.length;
   }
 
@@ -117,7 +147,7 @@ export class Painter {
     if (gpu.floats) {
       if (this._picture?.width !== width || this._picture.height !== height) {
         gpu.free(this._picture);
-        this._picture = gpu.field(width, height, 1, null, gl.RGBA16F);
+        this._picture = gpu.field(width, height, 1, null, gpu.pictureFormat);
       }
       gpu.bindTarget(this._picture, 0, 1);
     } else {
@@ -126,9 +156,10 @@ export class Painter {
     gl.viewport(0, 0, width, height);
     gl.clearColor(background[0], background[1], background[2], 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    if (splats && this._count) {
+    if (splats && this._order && this._count) {
       const program = gpu.program(FRAGMENT, VERTEX);
-      gpu.use(program, { splats: splats.field });
+      gpu.use(program, { splats: splats.field, order: this._order });
+      gl.uniform1i(program.uniform("count"), this._count);
       gl.uniform4fv(program.uniform("view"), viewmat.subarray(0, 12));
       gl.uniform4f(program.uniform("lens"), K[0], K[4], K[2], K[5]);
       gl.uniform4f(
@@ -143,7 +174,7 @@ export class Painter {
       gl.enable(gl.BLEND);
       gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
       gl.bindVertexArray(this._array);
-      gl.drawArraysInstanced(gl.TRIANGLE_STRIP, 0, 4, this._count);
+      gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(this._count / BATCH));
       gl.bindVertexArray(null);
       gl.disable(gl.BLEND);
     }
@@ -158,8 +189,8 @@ export class Painter {
 
   free() {
     const { gl } = this._gpu;
-    gl.deleteBuffer(this._order);
+    gl.deleteBuffer(this._corners);
     gl.deleteVertexArray(this._array);
-    this._gpu.free(this._picture);
+    this._gpu.free(this._order, this._picture);
   }
 }
