@@ -46,15 +46,30 @@ button, select { font: inherit; color: inherit; background: #0006; border: 1px s
   min-width: 32px; height: 28px; padding: 0 6px; cursor: pointer; }
 select option { color: #000; }
 button:focus-visible, select:focus-visible, input:focus-visible { outline: 2px solid #6bf; }
+button svg { display: block; width: 16px; height: 16px; margin: auto; fill: currentColor; }
 .time { position: relative; flex: 1 1 60px; min-width: 40px; height: 28px; }
-.time input { position: absolute; inset: 0; width: 100%; margin: 0; background: none; accent-color: #6bf; }
-.levels { position: absolute; inset: 9px 2px; display: flex; flex-direction: column-reverse; gap: 1px; border-radius: 3px;
+.levels { position: absolute; inset: 10px 0; display: flex; flex-direction: column-reverse; border-radius: 3px;
   overflow: hidden; background: #fff2; }
-.levels i { flex: 1; width: 0; background: #8cf9; }
+.levels i { flex: 1; width: 0; background: #6bf; opacity: .8; }
+.levels i:nth-child(2) { opacity: .6; }
+.levels i:nth-child(3) { opacity: .4; }
+input { -webkit-appearance: none; appearance: none; position: absolute; inset: 0; width: 100%; height: 100%; margin: 0;
+  background: none; cursor: pointer; }
+input::-webkit-slider-runnable-track { background: none; }
+input::-webkit-slider-thumb { -webkit-appearance: none; width: 6px; height: 22px; border-radius: 3px; background: #fff; }
+input::-moz-range-track { background: none; }
+input::-moz-range-thumb { width: 6px; height: 22px; border: 0; border-radius: 3px; background: #fff; }
 .clock, .status { font-variant-numeric: tabular-nums; }
 .status { position: absolute; inset: auto 10px 44px auto; opacity: .75; text-shadow: 0 0 3px #000; pointer-events: none; }
 [hidden] { display: none !important; }
 `;
+
+/** @param {string} path on a square of 16 */
+const icon = (path) => `<svg viewBox="0 0 16 16" aria-hidden="true"><path d="${path}"/></svg>`;
+const PLAY = icon("M3 1v14l11-7z");
+const PAUSE = icon("M3 1h4v14H3zM9 1h4v14H9z");
+const HOME = icon("M8 1 1 8h2v6h4v-4h2v4h4V8h2z");
+const FULL = icon("M1 1h5v2H3v3H1zM10 1h5v5h-2V3h-3zM1 10h2v3h3v2H1zM13 10h2v5h-5v-2h3z");
 
 const BODY = `
 <canvas tabindex="0" role="application" aria-label="Dynamic scene"
@@ -63,12 +78,12 @@ const BODY = `
 <p class="error" role="alert" hidden></p>
 <div class="status" part="status" aria-hidden="true"></div>
 <div class="bar" role="group" aria-label="Player" hidden>
-  <button class="play" type="button">▶</button>
+  <button class="play" type="button"></button>
   <div class="time"><div class="levels"></div><input type="range" min="0" max="1" step="any" value="0" aria-label="Time"></div>
   <span class="clock" aria-hidden="true"></span>
   <select aria-label="Highest level"></select>
-  <button class="home" type="button" aria-label="Reset the view" title="Reset the view">⌂</button>
-  <button class="full" type="button" aria-label="Full screen" title="Full screen">⛶</button>
+  <button class="home" type="button" aria-label="Reset the view" title="Reset the view">${HOME}</button>
+  <button class="full" type="button" aria-label="Full screen" title="Full screen">${FULL}</button>
 </div>
 `;
 
@@ -266,9 +281,11 @@ export class Pd4Player extends HTMLElement {
   _showState() {
     const { paused } = this;
     const label = paused ? "Play" : "Pause";
-    this._play.textContent = paused ? "▶" : "❚❚";
-    this._play.setAttribute("aria-label", label);
-    this._play.title = label;
+    if (this._play.title !== label) {
+      this._play.innerHTML = paused ? PLAY : PAUSE;
+      this._play.setAttribute("aria-label", label);
+      this._play.title = label;
+    }
     const [start, end] = this._player?.timeRange ?? [0, 0];
     this._slider.min = String(start);
     this._slider.max = String(end > start ? end : start + 1);

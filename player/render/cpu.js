@@ -19,7 +19,7 @@ export class CpuEvaluator {
   /**
    * As GpuEvaluator's.
    *
-   * @param {number} level @param {number} t @param {ArrayLike<number>} eye
+   * @param {number} level @param {number} t @param {number[]} eye
    * @param {import("./evaluator.js").Splats | null} into
    * @returns {Promise<import("./evaluator.js").Evaluated>}
    */

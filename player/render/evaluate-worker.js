@@ -11,7 +11,7 @@ serve({
   setScene(next) {
     scene = next;
   },
-  /** @param {number} level @param {number} t @param {ArrayLike<number>} eye */
+  /** @param {number} level @param {number} t @param {number[]} eye */
   evaluate(level, t, eye) {
     const result = packed(evaluate(scene, level, t, eye));
     return { result, transfer: [result.data.buffer] };

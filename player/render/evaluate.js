@@ -200,7 +200,7 @@ function normaliseQuaternion(q, at) {
  * The Gaussians of a level.
  *
  * @param {Scene} scene @param {number} level 0, 1 or 2 @param {number} t normalised time
- * @param {ArrayLike<number>} eye the camera's centre, scene units
+ * @param {number[]} eye the camera's centre, scene units
  * @returns {Gaussians}
  */
 export function evaluate(scene, level, t, eye) {

@@ -131,7 +131,10 @@ export class GpuEvaluator {
 
     const networks = [scene.networks.opacity, scene.networks.covariance, scene.networks.color];
     const scaffolds = networks.map((network) => new Scaffold(gpu, network, feature));
-    [this._opacity, this._covariance, this._color] = scaffolds;
+    this._opacity = scaffolds[0];
+    this._covariance = scaffolds[1];
+    this._color = scaffolds[2];
+    this._scaffolds = scaffolds;
     scaffolds.reduce((at, scaffold) => {
       scaffold.firstBlock = at;
       return at + scaffold.blocks;
@@ -175,7 +178,7 @@ export class GpuEvaluator {
     this._level = null;
     /** @type {number | null} */
     this._time = null;
-    /** @type {ArrayLike<number> | null} */
+    /** @type {number[] | null} */
     this._eye = null;
     /** Whether the listed Gaussians' means and changes are those of the time. */
     this._current = false;
@@ -227,7 +230,7 @@ export class GpuEvaluator {
   /**
    * Evaluates a level at a time for a camera's centre.
    *
-   * @param {number} level 0, 1 or 2 @param {number} t normalised time @param {ArrayLike<number>} eye
+   * @param {number} level 0, 1 or 2 @param {number} t normalised time @param {number[]} eye
    * @param {Splats | null} into what may be overwritten
    * @param {Lister} lister makes the list of kept Gaussians
    * @returns {Promise<Evaluated>}
@@ -269,7 +272,7 @@ export class GpuEvaluator {
     const splats = this._runShapes(residual, local ? this._changes : null, eye, into);
     this._level = number;
     this._time = t;
-    this._eye = Array.from(eye);
+    this._eye = eye;
     return { splats, means: moved ? await gpu.read(splats.field, 0, 1, this._listed.rows) : null };
   }
 
@@ -306,10 +309,10 @@ ${repeat(linear.chunkBlocks, (i) => `out${i} = y${i};`)}}`,
     return residual ? { anchors: this._anchors, residual } : { anchors: this._anchors };
   }
 
-  /** @param {Field | null} residual @param {ArrayLike<number>} eye @param {number} lines */
+  /** @param {Field | null} residual @param {number[]} eye @param {number} lines */
   _runOpacities(residual, eye, lines) {
     const gpu = this._gpu;
-    for (const scaffold of [this._opacity, this._covariance, this._color]) {
+    for (const scaffold of this._scaffolds) {
       if (scaffold.middle.length) this._runMiddle(scaffold, residual, eye, lines);
     }
     const linear = this._opacityLast;
@@ -345,7 +348,7 @@ ${repeat(linear.chunkBlocks, (i) => `out${i} = y${i} * vec4(greaterThanEqual(y${
   }
 
   /** Layers between first and last. @param {Scaffold} scaffold @param {Field | null} residual
-   * @param {ArrayLike<number>} eye @param {number} lines */
+   * @param {number[]} eye @param {number} lines */
   _runMiddle(scaffold, residual, eye, lines) {
     const gpu = this._gpu;
     const most = Math.max(...scaffold.middle.map((linear) => linear.paddedBlocks));
@@ -402,7 +405,7 @@ ${repeat(some, (i) => `out${i} = x${b + i};`)}}`,
         bind: () => {},
       };
     }
-    const which = [this._opacity, this._covariance, this._color].indexOf(scaffold);
+    const which = this._scaffolds.indexOf(scaffold);
     return {
       declare: `${index === 1 ? "uniform sampler2DArray before;\n" : ""}
 layout(std140) uniform U${index} { vec4 v${index}[${3 * scaffold.blocks}]; };\n`,
@@ -456,7 +459,7 @@ layout(std140) uniform U${index} { vec4 v${index}[${3 * scaffold.blocks}]; };\n`
 
   /**
    * @param {Field | null} residual @param {Field | null} changes of the local deformation
-   * @param {ArrayLike<number>} eye @param {Splats | null} into
+   * @param {number[]} eye @param {Splats | null} into
    * @returns {Splats}
    */
   _runShapes(residual, changes, eye, into) {
@@ -564,7 +567,7 @@ ${
     this._local?.free();
     this._first.free();
     this._opacityLast.free();
-    for (const scaffold of [this._opacity, this._covariance, this._color]) scaffold.free();
+    for (const scaffold of this._scaffolds) scaffold.free();
   }
 }
 

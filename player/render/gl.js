@@ -42,10 +42,13 @@ export class Gpu {
     this.gl = gl;
     /** Whether textures of floats can be rendered to. */
     this.floats = !!gl.getExtension("EXT_color_buffer_float");
+    const halves = this.floats || !!gl.getExtension("EXT_color_buffer_half_float");
     const renderer = String(gl.getParameter(gl.getExtension("WEBGL_debug_renderer_info")?.UNMASKED_RENDERER_WEBGL ?? gl.RENDERER));
-    /** What blends pictures: half floats on GPUs; software converts them at a high price. */
+    /** Whether the processor draws. */
+    this.software = /swiftshader|llvmpipe|software/i.test(renderer);
+    /** What pictures are blended in, 0 where there are no floats for it. Software converts half floats at a high price. */
     this.pictureFormat =
-      /swiftshader|llvmpipe|software/i.test(renderer) && gl.getExtension("EXT_float_blend") ? gl.RGBA32F : gl.RGBA16F;
+      this.software && this.floats && gl.getExtension("EXT_float_blend") ? gl.RGBA32F : halves ? gl.RGBA16F : 0;
     this.maxTargets = Math.min(gl.getParameter(gl.MAX_DRAW_BUFFERS), gl.getParameter(gl.MAX_COLOR_ATTACHMENTS), 8);
     this.maxSide = /** @type {number} */ (gl.getParameter(gl.MAX_TEXTURE_SIZE));
     this.maxLayers = /** @type {number} */ (gl.getParameter(gl.MAX_ARRAY_TEXTURE_LAYERS));

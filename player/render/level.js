@@ -21,7 +21,7 @@ export const MIN_OPACITY = 1 / 255;
 
 /** @param {Scene} scene @param {number} level 0, 1 or 2 @returns {Level} */
 export function levelOf(scene, level) {
-  const i = scene.layers.findLastIndex((layer) => layer <= level);
+  const i = scene.layers.filter((layer) => layer <= level).length - 1;
   const number = scene.layers[i];
   return {
     number,

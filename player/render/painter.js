@@ -144,7 +144,7 @@ export class Painter {
   draw(splats, { viewmat, K, width, height }, background, near) {
     const gpu = this._gpu;
     const { gl } = gpu;
-    if (gpu.floats) {
+    if (gpu.pictureFormat) {
       if (this._picture?.width !== width || this._picture.height !== height) {
         gpu.free(this._picture);
         this._picture = gpu.field(width, height, 1, null, gpu.pictureFormat);

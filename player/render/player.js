@@ -50,6 +50,9 @@ import { Remote } from "./remote.js";
 
 /** So long after the last movement a picture is drawn as well as it can be, milliseconds. */
 const REST_MS = 250;
+/** Up to so many anchors the first picture of a machine without a GPU is evaluated in JavaScript: its shaders are not
+ * compiled by then. */
+const FIRST_ANCHORS = 30_000;
 /** Without float textures only this level is evaluated while nothing else is asked for. */
 const CPU_LEVEL = 0;
 
@@ -514,11 +517,12 @@ export class Player extends EventTarget {
 
   /** @param {Gpu} gpu @param {Scene} scene */
   _evaluatorFor(gpu, scene) {
-    if (this._evaluator?.scene !== scene) {
+    const first = !this._front && gpu.software && scene.anchor.length <= 3 * FIRST_ANCHORS;
+    const Kind = this._useCpu || first ? CpuEvaluator : GpuEvaluator;
+    if (this._evaluator?.scene !== scene || !(this._evaluator.evaluator instanceof Kind)) {
       this._evaluator?.evaluator.free();
       this._evaluator = null;
-      const evaluator = this._useCpu ? new CpuEvaluator(gpu, scene) : new GpuEvaluator(gpu, scene);
-      this._evaluator = { evaluator, scene };
+      this._evaluator = { evaluator: new Kind(gpu, scene), scene };
     }
     return this._evaluator.evaluator;
   }
@@ -602,7 +606,7 @@ export class Player extends EventTarget {
   }
 }
 
-/** What Gaussians depend on. @typedef {{scene: Scene, level: number, t: number, eye: ArrayLike<number>}} State */
+/** What Gaussians depend on. @typedef {{scene: Scene, level: number, t: number, eye: number[]}} State */
 
 /** @param {State} a @param {State} b */
 function sameState(a, b) {

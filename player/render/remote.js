@@ -89,5 +89,5 @@ export function serve(functions) {
 
 /** Sends a message from a worker. @param {unknown} message @param {Transferable[]} [transfer] */
 export function tell(message, transfer = []) {
-  /** @type {DedicatedWorkerGlobalScope} */ (/** @type {unknown} */ (self)).postMessage(message, transfer);
+  /** @type {{postMessage: (message: unknown, transfer: Transferable[]) => void}} */ (self).postMessage(message, transfer);
 }
