@@ -43,9 +43,11 @@ export class Gpu {
     /** Whether textures of floats can be rendered to. */
     this.floats = !!gl.getExtension("EXT_color_buffer_float");
     const halves = this.floats || !!gl.getExtension("EXT_color_buffer_half_float");
-    const renderer = String(gl.getParameter(gl.getExtension("WEBGL_debug_renderer_info")?.UNMASKED_RENDERER_WEBGL ?? gl.RENDERER));
+    const names = gl.getExtension("WEBGL_debug_renderer_info");
+    /** What draws, in the driver's words. */
+    this.renderer = String(gl.getParameter(names ? names.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
     /** Whether the processor draws. */
-    this.software = /swiftshader|llvmpipe|software/i.test(renderer);
+    this.software = /swiftshader|llvmpipe|software/i.test(this.renderer);
     /** What pictures are blended in, 0 where there are no floats for it. Software converts half floats at a high price. */
     this.pictureFormat =
       this.software && this.floats && gl.getExtension("EXT_float_blend") ? gl.RGBA32F : halves ? gl.RGBA16F : 0;

@@ -110,6 +110,8 @@ export class Player extends EventTarget {
     /** Ends of draws in the last second. @type {number[]} */
     this._draws = [];
     this._started = performance.now();
+    /** Pictures drawn and evaluations made so far. */
+    this.counts = { drawn: 0, evaluated: 0 };
     this._closed = false;
 
     this._onLost = (/** @type {Event} */ event) => {
@@ -264,6 +266,11 @@ export class Player extends EventTarget {
       scale: this._moving(now) ? this._scale() : 1,
       gaussians: this._painter?.count ?? 0,
     };
+  }
+
+  /** What draws, in the driver's words; empty without WebGL2. */
+  get renderer() {
+    return this._gpu?.renderer ?? "";
   }
 
   /** Waits until what is shown is what was asked for, as well as it can be. */
@@ -496,6 +503,7 @@ export class Player extends EventTarget {
       }
       this._spare = this._front?.splats ?? null;
       this._front = { splats, state };
+      this.counts.evaluated++;
       this._dirty = true;
       if (playing) this._pace.evaluated(state.level, performance.now() - started, performance.now());
     } catch (error) {
@@ -577,6 +585,7 @@ export class Player extends EventTarget {
       if (gpu !== this._gpu) return;
       const now = performance.now();
       this._draws.push(now);
+      this.counts.drawn++;
       if (alone && moving) this._pace.drew(now - started);
       this._shown(level, now);
     } catch (error) {
