@@ -4,7 +4,7 @@
 //   <pd4-player src="scene.pd4" controls autoplay loop></pd4-player>
 //
 // Attributes: src; poster, a picture until there is one; controls; autoplay; loop; time, seconds to start at; level, the
-// highest to show; max-bytes and max-seconds, how much to load beyond the first picture.
+// highest to load and show; max-bytes and max-seconds, how much of the file to load, and how long beyond its first layer.
 
 import { Orbit } from "./render/orbit.js";
 import { Player } from "./render/player.js";

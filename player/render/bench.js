@@ -3,13 +3,8 @@
 import { centreOf, dot, downOf, forwardOf, lookAlong, plus, turn } from "./camera.js";
 import { Player } from "./player.js";
 
-/** CSS pixels. @type {[number, number][]} */
-const SIZES = [
-  [320, 240],
-  [640, 480],
-  [1280, 720],
-  [1920, 1080],
-];
+/** CSS pixels. */
+const SIZES = "320x240,640x480,1280x720,1920x1080";
 /** Of one measurement, milliseconds; slow machines do at least one picture. */
 const SPAN_MS = 2000;
 /** Where moving pictures come more slowly, larger ones are left out. */
@@ -34,9 +29,9 @@ const SWING_MS = 2000;
 /**
  * Measures a scene and writes a table into `place`. The result is also `window.benchResult`.
  *
- * @param {string} source @param {HTMLElement} place
+ * @param {string} source @param {HTMLElement} place @param {string} [sizes] to measure, smallest first
  */
-export async function bench(source, place) {
+export async function bench(source, place, sizes = SIZES) {
   const output = document.createElement("div");
   output.id = "bench";
   const state = document.createElement("p");
@@ -60,7 +55,7 @@ export async function bench(source, place) {
   const rows = [];
   for (const level of player.status.levels) {
     player.level = level;
-    for (const [width, height] of SIZES) {
+    for (const [width, height] of sizes.split(",").map((size) => size.split("x").map(Number))) {
       Object.assign(canvas.style, { width: `${width}px`, height: `${height}px` });
       state.textContent = `level ${level}, ${width} × ${height}`;
       await player.settled();

@@ -25,7 +25,6 @@ export class FieldPass {
     const { channels } = deformation.planes[0].xy;
     this._scales = deformation.planes.length;
     this._channelBlocks = blocksOf(channels);
-    if (this._channelBlocks > gpu.maxTargets) throw new TooLarge(`${channels} plane channels`);
     const { trunk, ...heads } = deformation.networks;
     // a scale's channels are padded to whole blocks; so are the columns that take them
     const first = padInputs(trunk[0], channels, this._scales);
@@ -102,13 +101,14 @@ export class FieldPass {
     const gpu = this._gpu;
     const { gl } = gpu;
     const B = this._channelBlocks;
+    const some = Math.min(B, gpu.maxTargets);
     const program = gpu.program(
-      targets(B) +
+      targets(some) +
         this._sampler() +
         `void main() {
 vec3 u = place(texelFetch(points, ivec3(gl_FragCoord.xy, 0) + ivec3(0, shift, 0), 0).xyz);
-${this._sample()}
-${repeat(B, (i) => `out${i} = h${i};`)}}`,
+${this._sample(some)}
+${repeat(some, (i) => `out${i} = h${i};`)}}`,
     );
     let from = this._room(0, points.width, rows);
     this._planes.forEach((planes, s) => {
@@ -119,7 +119,11 @@ ${repeat(B, (i) => `out${i} = h${i};`)}}`,
       gl.uniform3f(program.uniform("cells"), xy.width, xy.height, xz.height);
       gl.uniform1i(program.uniform("firstRow"), 3 * s);
       gl.uniform1i(program.uniform("shift"), row);
-      gpu.cover(from, s * B, B, 0, rows);
+      for (let b = 0; b < B; b += some) {
+        const first = Math.min(b, B - some);
+        gl.uniform1i(program.uniform("block"), first);
+        gpu.cover(from, s * B + first, some, 0, rows);
+      }
     });
     this._linears.forEach((linear, i) => {
       const last = i === this._linears.length - 1;
@@ -142,7 +146,7 @@ ${repeat(B, (i) => `out${i} = h${i};`)}}`,
   _sampler() {
     return `uniform sampler2DArray points, planes, rows;
 uniform vec3 low, high, cells;
-uniform int firstRow, shift;
+uniform int firstRow, shift, block;
 vec3 place(vec3 p) {
   vec3 u = (p - low) / (high - low);
   return vec3(p.x > low.x ? p.x >= high.x ? 1. : u.x : 0., p.y > low.y ? p.y >= high.y ? 1. : u.y : 0.,
@@ -158,21 +162,21 @@ vec4 row(int y, int a, int b, float f, int z) {
 `;
   }
 
-  /** Source that samples the planes of a scale at u. */
-  _sample() {
+  /** Source that samples the planes of a scale at u. @param {number} blocks of channels, from `block` on */
+  _sample(blocks) {
     const B = this._channelBlocks;
     const names = ["x", "y", "z"];
     return `vec3 at = u * (cells - 1.);
 ivec3 a = ivec3(at), b = min(a + 1, ivec3(cells) - 1);
 vec3 f = at - vec3(a);
-${repeat(B, (c) => {
+${repeat(blocks, (c) => {
   const spatial = SPATIAL.map(([, i, j], p) => {
     const ij = names[i] + names[j];
-    return `plane(${p * B + c}, a.${ij}, b.${ij}, f.${ij})`;
+    return `plane(block + ${p * B + c}, a.${ij}, b.${ij}, f.${ij})`;
   });
   const temporal = TEMPORAL.map(([, i], p) => {
     const n = names[i];
-    return `row(firstRow + ${p}, a.${n}, b.${n}, f.${n}, ${c})`;
+    return `row(firstRow + ${p}, a.${n}, b.${n}, f.${n}, block + ${c})`;
   });
   return `vec4 h${c} = ${[...spatial, ...temporal].join("\n  * ")};`;
 })}`;

@@ -1,97 +1,58 @@
-// The worker that loads and decodes: bytes in, one scene per completed layer out.
+// The worker that fetches and decodes: bytes in, one scene per completed layer out.
 
-import { openStream } from "../decode/index.js";
+import { SceneSource } from "../decode/fetch.js";
+import { Stream } from "../decode/stream.js";
 import { serve, tell } from "./remote.js";
 
-/** Attempts to go on after a connection broke, and the wait before each, milliseconds. */
-const RETRIES_MS = [300, 1000, 3000];
 /** Between two messages about progress, milliseconds. */
 const PROGRESS_MS = 100;
 
-/** Budgets, beyond the first layer. @typedef {{level?: number | null, bytes?: number | null, seconds?: number | null}} Budgets */
+/**
+ * What is told while a scene loads. ends: where in the file each layer ends, empty until the header is there.
+ *
+ * @typedef {object} News
+ * @property {import("../decode/scene.js").Scene} [scene]
+ * @property {number} bytes
+ * @property {number | null} total
+ * @property {{layer: number, end: number}[]} ends
+ */
+
+let decoder = new Stream();
+/** @type {SceneSource} */
+let source;
+let told = 0;
+
+/** @param {News["scene"]} [scene] */
+function report(scene) {
+  const { received: bytes, total } = source;
+  tell({ told: { ...(scene && { scene }), bytes, total, ends: decoder.layerEnds } });
+  told = performance.now();
+}
 
 serve({
+  /** @param {string | Blob} from */
+  open(from) {
+    source = new SceneSource(typeof from === "string" ? from : URL.createObjectURL(from), {
+      makeDecoder: () => (decoder = new Stream()),
+      progress: () => {
+        if (performance.now() - told > PROGRESS_MS) report();
+      },
+    });
+  },
+
   /**
-   * @param {string | Blob} source @param {Budgets} budgets
-   * @returns {Promise<{bytes: number, complete: boolean}>}
+   * Loads on within a budget.
+   *
+   * @param {import("../decode/fetch.js").Budget} budget
+   * @returns {Promise<{bytes: number, complete: boolean}>} complete: whether nothing is left to load
    */
-  async load(source, { level = null, bytes: mostBytes = null, seconds = null }) {
-    const started = performance.now();
-    const stream = openStream({ maxLayer: level });
-    let count = 0;
-    let shown = false;
-    let told = 0;
-    for await (const { piece, total } of typeof source === "string" ? download(source) : pieces(source)) {
-      count += piece.length;
-      const scenes = stream.feed(piece);
-      const ends = stream.layerEnds;
-      for (const scene of scenes) tell({ told: { scene, bytes: count, total, ends } });
-      shown ||= scenes.length > 0;
-      const now = performance.now();
-      if (!scenes.length && now - told > PROGRESS_MS) {
-        tell({ told: { bytes: count, total, ends } });
-        told = now;
-      }
-      if (stream.complete) break;
-      const spent = (mostBytes !== null && count >= mostBytes) || (seconds !== null && now - started >= 1000 * seconds);
-      if (shown && spent) return { bytes: count, complete: false };
+  async load(budget) {
+    try {
+      for await (const scene of source.scenes(budget)) report(scene);
+    } finally {
+      report();
     }
-    stream.finish();
-    return { bytes: count, complete: true };
+    const ends = decoder.layerEnds;
+    return { bytes: source.received, complete: ends.length > 0 && decoder.consumed >= ends[ends.length - 1].end };
   },
 });
-
-/** @typedef {{piece: Uint8Array, total: number | null}} Piece */
-
-/** @param {Blob} file @returns {AsyncGenerator<Piece>} */
-async function* pieces(file) {
-  const reader = file.stream().getReader();
-  for (;;) {
-    const { value, done } = await reader.read();
-    if (done) return;
-    yield { piece: value, total: file.size };
-  }
-}
-
-/**
- * The bytes of an address, in order, each once. Where the connection breaks, a range request goes on from there, if the
- * file is still the same.
- *
- * @param {string} url @returns {AsyncGenerator<Piece>}
- */
-async function* download(url) {
-  let count = 0;
-  let tag = "";
-  for (let attempt = 0; ; attempt++) {
-    try {
-      /** @type {Record<string, string>} */
-      const headers = count ? { Range: `bytes=${count}-`, ...(tag && { "If-Range": tag }) } : {};
-      const response = await fetch(url, { headers });
-      if (!response.ok) throw new HttpError(`the server answers ${response.status} to ${url}`);
-      let skip = response.status === 206 ? 0 : count;
-      const etag = response.headers.get("ETag") ?? "";
-      if (skip && etag !== tag) throw new HttpError(`${url} changed while it was loaded`);
-      if (!etag.startsWith("W/")) tag = etag;
-      const length = Number(response.headers.get("Content-Length") ?? NaN);
-      const encoded = response.headers.has("Content-Encoding");
-      const total = Number.isFinite(length) && !encoded ? length + count - skip : null;
-      const reader = /** @type {ReadableStream<Uint8Array>} */ (response.body).getReader();
-      for (;;) {
-        const { value, done } = await reader.read();
-        if (done) return;
-        const piece = value.subarray(Math.min(skip, value.length));
-        skip -= value.length - piece.length;
-        count += piece.length;
-        attempt = 0;
-        if (piece.length) yield { piece, total };
-      }
-    } catch (error) {
-      if (!(error instanceof TypeError) || attempt >= RETRIES_MS.length) {
-        throw error instanceof TypeError ? new Error(`${url} cannot be loaded: ${error.message}`) : error;
-      }
-      await new Promise((resolve) => setTimeout(resolve, RETRIES_MS[attempt]));
-    }
-  }
-}
-
-class HttpError extends Error {}

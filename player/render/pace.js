@@ -14,8 +14,9 @@ const RETRY_MS = [5_000, 60_000];
 const WEIGHT = 0.3;
 
 export class Pace {
-  constructor() {
-    this._step = 0;
+  /** @param {number} [step] of SCALES to begin with */
+  constructor(step = 0) {
+    this._step = step;
     this._draws = 0;
     this._drawMs = 0;
     /** The highest level that keeps up. */

@@ -4,7 +4,7 @@ import { centreOf, defaultCamera, fitted } from "./camera.js";
 import { CpuEvaluator } from "./cpu.js";
 import { GpuEvaluator } from "./evaluator.js";
 import { ContextLost, Gpu } from "./gl.js";
-import { levelOf, normalisedTime } from "./level.js";
+import { deformationUnit, levelOf, normalisedTime } from "./level.js";
 import { Pace } from "./pace.js";
 import { Painter } from "./painter.js";
 import { Remote } from "./remote.js";
@@ -14,8 +14,8 @@ import { Remote } from "./remote.js";
 /** @typedef {import("./evaluator.js").Splats} Splats */
 
 /**
- * How to play. level: the highest to show, default all. time: seconds of the scene's time to start at. bytes, seconds:
- * how much to load at most and how long, beyond the first picture. evaluator: "gpu" or "cpu", default what the machine
+ * How to play. level: the highest to load and show, default all. time: seconds of the scene's time to start at. bytes,
+ * seconds: how much of the file to load at most, and how long beyond the first layer. evaluator: "gpu" or "cpu", default what the machine
  * can do. degrade: whether a slow machine gets fewer pixels and lower levels, default true. pixelRatio: device pixels
  * per CSS pixel, default the window's, at most 2.
  *
@@ -53,6 +53,8 @@ const REST_MS = 250;
 /** Up to so many anchors the first picture of a machine without a GPU is evaluated in JavaScript: its shaders are not
  * compiled by then. */
 const FIRST_ANCHORS = 30_000;
+/** Where no GPU draws, pictures begin with this step of SCALES. */
+const SOFTWARE_STEP = 2;
 /** Without float textures only this level is evaluated while nothing else is asked for. */
 const CPU_LEVEL = 0;
 
@@ -80,6 +82,8 @@ export class Player extends EventTarget {
     this._sorter = new Remote(new URL("./sort-worker.js", import.meta.url));
     /** @type {Remote | null} */
     this._loader = null;
+    /** The highest level that loading went for. */
+    this._loadedLevel = Infinity;
     /** @type {Pick<Status, "bytes" | "total" | "loading" | "ends">} */
     this._status = { bytes: 0, total: null, loading: false, ends: [] };
 
@@ -145,9 +149,9 @@ export class Player extends EventTarget {
    */
   async load(source) {
     if (this._closed) return;
-    this._loader?.close();
-    const loader = new Remote(new URL("./loader-worker.js", import.meta.url), (message) => {
-      if (loader === this._loader) this._told(message);
+    this.stopLoading();
+    const loader = new Remote(new URL("./loader-worker.js", import.meta.url), (news) => {
+      if (loader === this._loader) this._told(news);
     });
     this._loader = loader;
     this._scene = null;
@@ -163,19 +167,28 @@ export class Player extends EventTarget {
     this._started = performance.now();
     this._touch();
     const from = source instanceof Blob ? source : new URL(source, document.baseURI).href;
-    const { level, bytes, seconds } = this._options;
+    loader.call("open", [from]).catch(() => {}); // a worker that fails says so to the next call as well
+    await this._loadOn(loader);
+  }
+
+  /** Loads as much as options and level allow. @param {Remote} loader */
+  async _loadOn(loader) {
+    const { bytes, seconds } = this._options;
+    const maxLayer = this._level ?? Infinity;
+    this._loadedLevel = maxLayer;
+    this._status.loading = true;
     try {
-      const result = await loader.call("load", [from, { level, bytes, seconds }]);
+      const budget = { maxLayer, bytes: bytes ?? undefined, seconds: seconds ?? undefined };
+      const result = await loader.call("load", [budget]);
       if (loader !== this._loader) return;
+      if (result.complete) this.stopLoading();
       this._emit("loaded", result);
     } catch (error) {
-      if (loader === this._loader) this._fail(error);
+      if (loader !== this._loader) return;
+      this.stopLoading();
+      this._fail(error);
     } finally {
-      loader.close();
-      if (loader === this._loader) {
-        this._status.loading = false;
-        this._loader = null;
-      }
+      if (loader === this._loader) this._status.loading = false;
     }
   }
 
@@ -241,6 +254,8 @@ export class Player extends EventTarget {
 
   set level(level) {
     this._level = level;
+    const more = (level ?? Infinity) > this._loadedLevel;
+    if (more && this._loader && !this._status.loading) this._loadOn(this._loader);
     this._touch();
   }
 
@@ -305,8 +320,7 @@ export class Player extends EventTarget {
     this._seen.disconnect();
     this.canvas.removeEventListener("webglcontextlost", this._onLost);
     this.canvas.removeEventListener("webglcontextrestored", this._onRestored);
-    this._loader?.close();
-    this._loader = null;
+    this.stopLoading();
     this._sorter.close();
     const gl = this._gpu?.gl;
     this._dropGpu();
@@ -317,7 +331,7 @@ export class Player extends EventTarget {
 
   // --- loading
 
-  /** @param {{scene?: Scene} & Pick<Status, "bytes" | "total" | "ends">} message */
+  /** @param {import("./loader-worker.js").News} news */
   _told({ scene, ...status }) {
     Object.assign(this._status, status);
     const { bytes, total } = status;
@@ -334,8 +348,8 @@ export class Player extends EventTarget {
 
   /** @param {unknown} error */
   _fail(error) {
-    const { message, kind } = /** @type {Error & {kind?: string}} */ (error);
-    this._emit("error", { message: String(message), kind: kind ?? "Error" });
+    const { message, name, kind = name } = /** @type {Error & {kind?: string}} */ (error);
+    this._emit("error", { message, kind });
   }
 
   /** @param {string} name @param {object} detail */
@@ -358,6 +372,7 @@ export class Player extends EventTarget {
     }
     if (gl.isContextLost()) return;
     this._gpu = new Gpu(gl);
+    this._pace = new Pace(this._gpu.software ? SOFTWARE_STEP : 0);
     if (!this._gpu.floats) this._useCpu = true;
     this._painter = new Painter(this._gpu);
     this._dirty = true;
@@ -389,7 +404,7 @@ export class Player extends EventTarget {
 
   /** @param {number} now */
   _moving(now) {
-    return this._playing || now - this._lastMoved < REST_MS;
+    return this._playing || this._status.loading || now - this._lastMoved < REST_MS;
   }
 
   _scale() {
@@ -617,9 +632,12 @@ export class Player extends EventTarget {
 
 /** What Gaussians depend on. @typedef {{scene: Scene, level: number, t: number, eye: number[]}} State */
 
+/** A camera's centre that moves by less, in units of a quarter of the box, changes nothing that is seen. */
+const EYE_TOLERANCE = 1e-5;
+
 /** @param {State} a @param {State} b */
 function sameState(a, b) {
-  return (
-    a.scene === b.scene && a.level === b.level && a.t === b.t && [0, 1, 2].every((k) => a.eye[k] === b.eye[k])
-  );
+  const tolerance = EYE_TOLERANCE * deformationUnit(a.scene);
+  const eyes = () => [0, 1, 2].every((k) => Math.abs(a.eye[k] - b.eye[k]) <= tolerance);
+  return a.scene === b.scene && a.level === b.level && a.t === b.t && eyes();
 }
