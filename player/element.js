@@ -32,13 +32,13 @@ export function open(source, { canvas, ...options }) {
 }
 
 const STYLE = `
-:host { display: block; position: relative; overflow: hidden; aspect-ratio: 4 / 3; background: #000; color: #eee;
+:host { display: block; position: relative; container-type: inline-size; overflow: hidden; aspect-ratio: 4 / 3; background: #000; color: #eee;
   font: 13px/1.4 system-ui, sans-serif; }
 :host([hidden]) { display: none; }
 canvas, img { position: absolute; inset: 0; width: 100%; height: 100%; }
 canvas:focus-visible { outline: 2px solid #6bf; outline-offset: -2px; }
 img { object-fit: contain; pointer-events: none; }
-.error { position: absolute; inset: 0 0 auto; margin: 0; padding: 8px 12px; background: #611; overflow-wrap: anywhere; }
+.error { position: absolute; inset: 0 0 auto; margin: 0; padding: 8px 12px; background: #611e; overflow-wrap: anywhere; }
 .bar { position: absolute; inset: auto 0 0; display: flex; gap: 8px; align-items: center; padding: 6px 10px;
   background: linear-gradient(transparent, #000a); }
 .bar > * { flex: none; }
@@ -60,7 +60,17 @@ input::-webkit-slider-thumb { -webkit-appearance: none; width: 6px; height: 22px
 input::-moz-range-track { background: none; }
 input::-moz-range-thumb { width: 6px; height: 22px; border: 0; border-radius: 3px; background: #fff; }
 .clock, .status { font-variant-numeric: tabular-nums; }
-.status { position: absolute; inset: auto 10px 44px auto; opacity: .75; text-shadow: 0 0 3px #000; pointer-events: none; }
+.status { position: absolute; inset: auto 10px 44px auto; opacity: .75; text-shadow: 0 0 4px #000, 0 0 2px #000;
+  pointer-events: none; }
+@container (max-width: 420px) {
+  .bar { flex-wrap: wrap; justify-content: flex-end; }
+  .bar .time { flex-basis: 100%; order: -1; }
+  .bar .play { margin-right: auto; }
+  .status { bottom: 78px; }
+}
+@container (max-width: 340px) {
+  .clock { display: none; }
+}
 [hidden] { display: none !important; }
 `;
 
