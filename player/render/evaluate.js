@@ -76,6 +76,7 @@ class Field {
     this._scales = spatial.map((planes, s) => ({ spatial: planes, rows: rowsAt(deformation, s, t) }));
     this._channels = deformation.planes[0].xy.channels;
     this._features = new Float64Array(this._channels * this._scales.length);
+    this._place = new Float64Array(3);
     const { trunk, ...heads } = deformation.networks;
     this._trunk = new Chain(trunk);
     this._unit = deformationUnit(scene);
@@ -90,41 +91,22 @@ class Field {
    * @returns {Record<string, Float64Array>}
    */
   at(x, y, z) {
+    const u = this._place;
+    u[0] = x;
+    u[1] = y;
+    u[2] = z;
     const [low, high] = this._box;
-    const u = [x, y, z].map((v, k) => (!(v > low[k]) ? 0 : v >= high[k] ? 1 : (v - low[k]) / (high[k] - low[k])));
-    const C = this._channels;
+    for (let k = 0; k < 3; k++) {
+      u[k] = !(u[k] > low[k]) ? 0 : u[k] >= high[k] ? 1 : (u[k] - low[k]) / (high[k] - low[k]);
+    }
     const features = this._features.fill(1);
-    this._scales.forEach(({ spatial, rows }, s) => {
-      SPATIAL.forEach(([, a, b], p) => {
-        const { data, width, height } = spatial[p];
-        const px = u[a] * (width - 1);
-        const py = u[b] * (height - 1);
-        const x0 = Math.floor(px);
-        const y0 = Math.floor(py);
-        const fx = px - x0;
-        const fy = py - y0;
-        const x1 = Math.min(x0 + 1, width - 1);
-        const y1 = Math.min(y0 + 1, height - 1);
-        const i00 = (y0 * width + x0) * C;
-        const i01 = (y0 * width + x1) * C;
-        const i10 = (y1 * width + x0) * C;
-        const i11 = (y1 * width + x1) * C;
-        for (let c = 0; c < C; c++) {
-          const top = data[i00 + c] + fx * (data[i01 + c] - data[i00 + c]);
-          const bottom = data[i10 + c] + fx * (data[i11 + c] - data[i10 + c]);
-          features[s * C + c] *= top + fy * (bottom - top);
-        }
-      });
-      TEMPORAL.forEach(([, a], p) => {
-        const { data, cells } = rows[p];
-        const px = u[a] * (cells - 1);
-        const x0 = Math.floor(px);
-        const f = px - x0;
-        const i0 = x0 * C;
-        const i1 = Math.min(x0 + 1, cells - 1) * C;
-        for (let c = 0; c < C; c++) features[s * C + c] *= data[i0 + c] + f * (data[i1 + c] - data[i0 + c]);
-      });
-    });
+    for (let s = 0; s < this._scales.length; s++) {
+      const { spatial, rows } = this._scales[s];
+      for (let p = 0; p < 3; p++) {
+        this._multiplyPlane(spatial[p], u[SPATIAL[p][1]], u[SPATIAL[p][2]], s);
+        this._multiplyRow(rows[p], u[TEMPORAL[p][1]], s);
+      }
+    }
     const hidden = this._trunk.run(features);
     for (let i = 0; i < hidden.length; i++) if (hidden[i] < 0) hidden[i] = 0;
     /** @type {Record<string, Float64Array>} */
@@ -134,6 +116,38 @@ class Field {
       if (LENGTH_HEADS.includes(name)) for (let i = 0; i < values.length; i++) values[i] *= this._unit;
     }
     return out;
+  }
+
+  /** @param {Scale["spatial"][number]} plane @param {number} u @param {number} v 0..1 @param {number} scale */
+  _multiplyPlane({ data, width, height }, u, v, scale) {
+    const C = this._channels;
+    const x = u * (width - 1);
+    const y = v * (height - 1);
+    const x0 = Math.floor(x);
+    const y0 = Math.floor(y);
+    const fx = x - x0;
+    const fy = y - y0;
+    const right = x0 + 1 < width ? C : 0;
+    const down = y0 + 1 < height ? width * C : 0;
+    const out = this._features;
+    let at = (y0 * width + x0) * C;
+    for (let c = scale * C; c < scale * C + C; c++, at++) {
+      const top = data[at] + fx * (data[at + right] - data[at]);
+      const bottom = data[at + down] + fx * (data[at + down + right] - data[at + down]);
+      out[c] *= top + fy * (bottom - top);
+    }
+  }
+
+  /** @param {Scale["rows"][number]} row @param {number} u 0..1 @param {number} scale */
+  _multiplyRow({ data, cells }, u, scale) {
+    const C = this._channels;
+    const x = u * (cells - 1);
+    const x0 = Math.floor(x);
+    const f = x - x0;
+    const right = x0 + 1 < cells ? C : 0;
+    const out = this._features;
+    let at = x0 * C;
+    for (let c = scale * C; c < scale * C + C; c++, at++) out[c] *= data[at] + f * (data[at + right] - data[at]);
   }
 }
 
@@ -175,13 +189,34 @@ class Chain {
 }
 
 /**
+ * Four outputs at a time: one after the other, each sum would wait for its last product.
+ *
  * @param {Network[number]} layer @param {Float64Array} x @param {number} first @param {number} count
  * @param {Float64Array} out
  */
 function multiply({ weight, bias, inputs }, x, first, count, out) {
-  for (let o = 0; o < count; o++) {
-    let sum = bias[first + o];
+  let o = 0;
+  for (; o + 4 <= count; o += 4) {
+    let row = (first + o) * inputs;
+    let a = bias[first + o];
+    let b = bias[first + o + 1];
+    let c = bias[first + o + 2];
+    let d = bias[first + o + 3];
+    for (let i = 0; i < inputs; i++, row++) {
+      const value = x[i];
+      a += weight[row] * value;
+      b += weight[row + inputs] * value;
+      c += weight[row + 2 * inputs] * value;
+      d += weight[row + 3 * inputs] * value;
+    }
+    out[o] = a;
+    out[o + 1] = b;
+    out[o + 2] = c;
+    out[o + 3] = d;
+  }
+  for (; o < count; o++) {
     const row = (first + o) * inputs;
+    let sum = bias[first + o];
     for (let i = 0; i < inputs; i++) sum += weight[row + i] * x[i];
     out[o] = sum;
   }
