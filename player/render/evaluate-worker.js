@@ -1,7 +1,7 @@
 // The worker of the evaluator in JavaScript.
 
 import { evaluate } from "./evaluate.js";
-import { serve } from "./remote.js";
+import { serve } from "./serve.js";
 
 /** @type {import("../decode/scene.js").Scene} */
 let scene;

@@ -2,7 +2,7 @@
 
 import { SceneSource } from "../decode/fetch.js";
 import { Stream } from "../decode/stream.js";
-import { serve, tell } from "./remote.js";
+import { serve, tell } from "./serve.js";
 
 /** Between two messages about progress, milliseconds. */
 const PROGRESS_MS = 100;

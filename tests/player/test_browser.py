@@ -10,11 +10,13 @@ import base64
 import math
 import os
 import shutil
+import sys
 import time
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
@@ -37,7 +39,11 @@ from pd4dgs_codec.scene import (
     Steps,
 )
 
-PLAYER = Path(__file__).parents[2] / "player"
+ROOT = Path(__file__).parents[2]
+PLAYER = ROOT / "player"
+sys.path.insert(0, str(ROOT / "tools"))
+import pack_player  # noqa: E402
+
 BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
 FLAGS = [
     "--no-sandbox",
@@ -637,6 +643,55 @@ def test_attributes_and_removal(page, server):
     page.wait_for_function("true")
     page.evaluate("document.body.append(player)")
     page.wait_for_function("player.player.status.level === 1")
+
+
+def test_packed_it_is_small_and_plays(page, server, folder):
+    (folder / "packed").mkdir(exist_ok=True)
+    files = pack_player.pack()
+    for name, content in files.items():
+        (folder / "packed" / name).write_bytes(content)
+    assert sum(pack_player.zipped(files[name]) for name in pack_player.FIRST_VISIT) <= 60_000
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(server.url_of("packed/index.html") + "?src=../scene.pd4&autoplay=0")
+    page.wait_for_function("document.querySelector('pd4-player')?.player.status.level === 2")
+    names = {Path(urlsplit(url).path).name for url in asked if url.startswith("http")}
+    assert names == {*pack_player.FIRST_VISIT, "evaluate-worker.js", "scene.pd4"}  # there is no GPU here
+
+
+@pytest.mark.parametrize(
+    ("source", "packed"),
+    [
+        ("let a = 1; // one\n\n  /* two */ let b = 2;\n", "let a = 1;\nlet b = 2;\n"),
+        ("const s = \"// no\" + '/* no */'; // yes", "const s = \"// no\" + '/* no */';\n"),
+        (
+            "f(`  // no\n  ${ {a: `/* ${x} */`}.a /* yes */ }\n  b`);",
+            "f(`  // no\n  ${ {a: `/* ${x} */`}.a  }\n  b`);\n",
+        ),
+        ("x = a / b; // c / d\ny = /[/]\\/'/.test(z);\n", "x = a / b;\ny = /[/]\\/'/.test(z);\n"),
+    ],
+)
+def test_packing_leaves_code_as_it_is(source, packed):
+    assert pack_player.strip(source) == packed
+
+
+@pytest.mark.parametrize(
+    "source", ["export default 1;\n", 'import * as x from "./y.js";\n', "/* no end", "`${", "'\n'"]
+)
+def test_packing_refuses_what_it_does_not_know(tmp_path, source):
+    (tmp_path / "a.js").write_text(source)
+    with pytest.raises(pack_player.PackError):
+        pack_player.bundle(tmp_path, "a.js")
+
+
+def test_packing_keeps_names_apart_and_finds_circles(tmp_path):
+    (tmp_path / "a.js").write_text('import { x as y } from "./b.js";\nconst z = y;\nexport const x = z + 1;\n')
+    (tmp_path / "b.js").write_text("const z = 1;\nexport const x = z;\n")
+    packed = pack_player.bundle(tmp_path, "a.js")
+    assert packed.index("const z = 1") < packed.index("const {x:y}=m0") < packed.index("export{x}")
+    (tmp_path / "b.js").write_text('import { x } from "./a.js";\n')
+    with pytest.raises(pack_player.PackError, match="imports itself"):
+        pack_player.bundle(tmp_path, "a.js")
 
 
 def test_the_page_asks_nobody_else_and_measures_itself(page, server):
