@@ -106,7 +106,10 @@ export class Pd4Player extends HTMLElement {
   constructor() {
     super();
     const root = this.attachShadow({ mode: "open" });
-    root.innerHTML = `<style>${STYLE}</style>${BODY}`;
+    const style = new CSSStyleSheet(); // a page may forbid style elements
+    style.replaceSync(STYLE);
+    root.adoptedStyleSheets = [style];
+    root.innerHTML = BODY;
     /** @template {Element} E @param {string} selector @returns {E} */
     const part = (selector) => /** @type {E} */ (root.querySelector(selector));
     /** @type {HTMLImageElement} */

@@ -31,6 +31,8 @@ import { deformationUnit, levelOf, widthsOf } from "./level.js";
 const FEATURE_BLOCK = 3;
 /** Blocks of a Gaussian. */
 export const SPLAT_BLOCKS = 4;
+/** What the textures of all anchors may take, bytes: beyond it devices fail in ways that cannot be told apart. */
+const MAX_BYTES = 2 ** 30;
 /** A list's texel that names no Gaussian. */
 export const NO_ENTRY = 0xffffffff;
 /** Bits of an anchor's number in an entry of a list; the slot lies above. */
@@ -127,7 +129,6 @@ export class GpuEvaluator {
     this._height = Math.ceil(anchors / this._width);
     if (this._width > gpu.maxSide) throw new TooLarge(`${anchors} anchors`);
     if (this._blocks > gpu.maxLayers) throw new TooLarge(`${slots} Gaussians of an anchor`);
-    this._anchors = gpu.field(this._width, this._height, this._blocks, this._attributes());
 
     const networks = [scene.networks.opacity, scene.networks.covariance, scene.networks.color];
     const scaffolds = networks.map((network) => new Scaffold(gpu, network, feature));
@@ -141,6 +142,9 @@ export class GpuEvaluator {
     }, 0);
     this._first = new Linear(gpu, stack(scaffolds.map((scaffold) => scaffold.features)));
     if (this._first.paddedBlocks > gpu.maxLayers) throw new TooLarge("the networks' first layers");
+    const blocks = this._blocks * (scene.globalDeformation ? 2 : 1) + this._first.paddedBlocks + blocksOf(slots);
+    if (16 * this._width * this._height * blocks > MAX_BYTES) throw new TooLarge(`${anchors} anchors`);
+    this._anchors = gpu.field(this._width, this._height, this._blocks, this._attributes());
     this._before = gpu.field(this._width, this._height, this._first.paddedBlocks);
     this._opacityLast = new Linear(gpu, this._opacity.last);
     this._opacities = gpu.field(this._width, this._height, this._opacityLast.paddedBlocks);

@@ -406,11 +406,12 @@ def test_budgets_are_kept_and_may_be_raised(harness, server, lively):
     harness.wait_for_function("harness.player.status.level === 2")
 
 
-def element(page: Any, server: Server, attributes: str = "controls", body: str = "") -> Any:
-    """A page with one element."""
-    html = f"""<!doctype html><title>t</title><script type="module" src="{server.url_of("player/element.js")}"></script>
-      <pd4-player {attributes} style="width: 320px; height: 240px"></pd4-player>{body}"""
-    page.route("**/element.html", lambda route: route.fulfill(body=html, content_type="text/html"))
+def element(page: Any, server: Server, attributes: str, code: Server | None = None) -> Any:
+    """A page of `server` with one element, whose code is on another server perhaps."""
+    script = (code or server).url_of("player/element.js")
+    html = f"""<!doctype html><title>t</title><script type="module" src="{script}"></script>
+      <pd4-player {attributes} style="width: 320px; height: 240px"></pd4-player>"""
+    (server.root / "element.html").write_text(html)
     page.add_init_script(
         """window.seen = [];
         for (const name of ["firstpicture", "upgrade", "error", "progress", "loaded", "statechange"]) {
@@ -584,9 +585,11 @@ def test_controls(page, server):
     assert page.evaluate(state) == home
     page.keyboard.press(",")
     assert page.evaluate("document.querySelector('pd4-player').time") == pytest.approx(3 - 1 / 30)
+    changes = "seen.filter(([name]) => name === 'statechange').length"
+    before = page.evaluate(changes)
     page.keyboard.press("Space")
-    assert page.evaluate("document.querySelector('pd4-player').paused") is False
-    page.keyboard.press("Space")
+    assert page.evaluate(changes) > before
+    page.evaluate("document.querySelector('pd4-player').pause()")
 
     area = surface.bounding_box()
     x, y = area["x"] + 160, area["y"] + 100
@@ -643,6 +646,12 @@ def test_attributes_and_removal(page, server):
     page.wait_for_function("true")
     page.evaluate("document.body.append(player)")
     page.wait_for_function("player.player.status.level === 1")
+
+
+def test_code_and_scene_may_come_from_other_servers(page, server, folder):
+    with Server(folder) as other, other.running():
+        element(page, server, f'src="{other.url_of("scene.pd4")}"', other)
+        page.wait_for_function("document.querySelector('pd4-player').player?.status.level === 2")
 
 
 def test_packed_it_is_small_and_plays(page, server, folder):
