@@ -8,11 +8,14 @@ import { Remote } from "./remote.js";
 
 /** Gaussians in the layout of `Splats`. @typedef {{data: Float32Array, width: number, height: number}} Packed */
 
+/** The worker, which may be started before there is a scene. */
+export const startWorker = () => new Remote(new URL("./evaluate-worker.js", import.meta.url));
+
 export class CpuEvaluator {
-  /** @param {Gpu} gpu @param {import("../decode/scene.js").Scene} scene */
-  constructor(gpu, scene) {
+  /** @param {Gpu} gpu @param {import("../decode/scene.js").Scene} scene @param {Remote} [worker] which it then owns */
+  constructor(gpu, scene, worker = startWorker()) {
     this._gpu = gpu;
-    this._remote = new Remote(new URL("./evaluate-worker.js", import.meta.url));
+    this._remote = worker;
     this._ready = this._remote.call("setScene", [scene]);
   }
 

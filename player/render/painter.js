@@ -107,6 +107,20 @@ export class Painter {
     this._count = 0;
     /** Of floats: eight bits would round at every blending. @type {import("./gl.js").Field | null} */
     this._picture = null;
+    this._warm();
+  }
+
+  /** Draws nothing, so that shaders are compiled before there is something to draw. */
+  _warm() {
+    const gpu = this._gpu;
+    const { gl } = gpu;
+    const nothing = gpu.field(1, 1, 4);
+    this.setOrder(new Uint32Array(1));
+    const K = new Float32Array([1, 0, 1, 0, 1, 1, 0, 0, 1]);
+    this.draw({ field: nothing, texels: 1 }, { viewmat: new Float32Array(16), K, width: 2, height: 2 }, [0, 0, 0], 1);
+    this._count = 0;
+    gpu.free(nothing);
+    gl.flush();
   }
 
   /** How many Gaussians are drawn. */

@@ -1,7 +1,7 @@
 // A player on a canvas: loads, evaluates, sorts, draws, and does each only when what it depends on has changed.
 
 import { centreOf, defaultCamera, fitted } from "./camera.js";
-import { CpuEvaluator } from "./cpu.js";
+import { CpuEvaluator, startWorker } from "./cpu.js";
 import { GpuEvaluator } from "./evaluator.js";
 import { ContextLost, Gpu } from "./gl.js";
 import { deformationUnit, levelOf, normalisedTime } from "./level.js";
@@ -94,6 +94,8 @@ export class Player extends EventTarget {
     /** @type {{evaluator: GpuEvaluator | CpuEvaluator, scene: Scene} | null} */
     this._evaluator = null;
     this._useCpu = options.evaluator === "cpu";
+    /** For the first picture. @type {Remote | null} */
+    this._cpuWorker = null;
     /** What is on show, and for which state. @type {{splats: Splats, state: State} | null} */
     this._front = null;
     /** @type {Splats | null} */
@@ -154,6 +156,7 @@ export class Player extends EventTarget {
       if (loader === this._loader) this._told(news);
     });
     this._loader = loader;
+    if (this._useCpu || this._gpu?.software) this._cpuWorker ??= startWorker();
     this._scene = null;
     this._shownLevel = null;
     this._camera = null;
@@ -322,6 +325,7 @@ export class Player extends EventTarget {
     this.canvas.removeEventListener("webglcontextrestored", this._onRestored);
     this.stopLoading();
     this._sorter.close();
+    this._cpuWorker?.close();
     const gl = this._gpu?.gl;
     this._dropGpu();
     gl?.getExtension("WEBGL_lose_context")?.loseContext(); // browsers keep few contexts alive
@@ -541,13 +545,20 @@ export class Player extends EventTarget {
   /** @param {Gpu} gpu @param {Scene} scene */
   _evaluatorFor(gpu, scene) {
     const first = !this._front && gpu.software && scene.anchor.length <= 3 * FIRST_ANCHORS;
-    const Kind = this._useCpu || first ? CpuEvaluator : GpuEvaluator;
-    if (this._evaluator?.scene !== scene || !(this._evaluator.evaluator instanceof Kind)) {
+    const onCpu = this._useCpu || first;
+    if (this._evaluator?.scene !== scene || this._evaluator.evaluator instanceof CpuEvaluator !== onCpu) {
       this._evaluator?.evaluator.free();
       this._evaluator = null;
-      this._evaluator = { evaluator: new Kind(gpu, scene), scene };
+      this._evaluator = { evaluator: onCpu ? this._onCpu(gpu, scene) : new GpuEvaluator(gpu, scene), scene };
     }
     return this._evaluator.evaluator;
+  }
+
+  /** @param {Gpu} gpu @param {Scene} scene */
+  _onCpu(gpu, scene) {
+    const evaluator = new CpuEvaluator(gpu, scene, this._cpuWorker ?? undefined);
+    this._cpuWorker = null;
+    return evaluator;
   }
 
   /** Brings the order to the camera, if the Gaussians on show are the sorter's. */
