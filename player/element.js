@@ -3,8 +3,8 @@
 //   <script type="module" src="player/element.js"></script>
 //   <pd4-player src="scene.pd4" controls autoplay loop></pd4-player>
 //
-// Attributes: src; poster, a picture until there is one; controls; autoplay; loop; time, seconds to start at; level, the
-// highest to load and show; max-bytes and max-seconds, how much of the file to load, and how long beyond its first layer.
+// Attributes: src; poster, a picture until there is one; controls; autoplay; loop; time, seconds to start at; level,
+// the highest to load and show; max-bytes and max-seconds, how much of the file to load, and how long beyond layer 0.
 
 import { Orbit } from "./render/orbit.js";
 import { Player } from "./render/player.js";
@@ -32,13 +32,14 @@ export function open(source, { canvas, ...options }) {
 }
 
 const STYLE = `
-:host { display: block; position: relative; container-type: inline-size; overflow: hidden; aspect-ratio: 4 / 3; background: #000; color: #eee;
-  font: 13px/1.4 system-ui, sans-serif; }
+:host { display: block; position: relative; container-type: inline-size; overflow: hidden; aspect-ratio: 4 / 3;
+  background: #000; color: #eee; font: 13px/1.4 system-ui, sans-serif; }
 :host([hidden]) { display: none; }
 canvas, img { position: absolute; inset: 0; width: 100%; height: 100%; }
 canvas:focus-visible { outline: 2px solid #6bf; outline-offset: -2px; }
 img { object-fit: contain; pointer-events: none; }
-.error { position: absolute; inset: 0 0 auto; margin: 0; padding: 8px 12px; background: #611e; overflow-wrap: anywhere; }
+.error { position: absolute; inset: 0 0 auto; margin: 0; padding: 8px 12px; background: #611e;
+  overflow-wrap: anywhere; }
 .bar { position: absolute; inset: auto 0 0; display: flex; gap: 8px; align-items: center; padding: 6px 10px;
   background: linear-gradient(transparent, #000a); }
 .bar > * { flex: none; }
@@ -56,7 +57,8 @@ button svg { display: block; width: 16px; height: 16px; margin: auto; fill: curr
 input { -webkit-appearance: none; appearance: none; position: absolute; inset: 0; width: 100%; height: 100%; margin: 0;
   background: none; cursor: pointer; }
 input::-webkit-slider-runnable-track { background: none; }
-input::-webkit-slider-thumb { -webkit-appearance: none; width: 6px; height: 22px; border-radius: 3px; background: #fff; }
+input::-webkit-slider-thumb { -webkit-appearance: none; width: 6px; height: 22px; border-radius: 3px;
+  background: #fff; }
 input::-moz-range-track { background: none; }
 input::-moz-range-thumb { width: 6px; height: 22px; border: 0; border-radius: 3px; background: #fff; }
 .clock, .status { font-variant-numeric: tabular-nums; }
@@ -89,7 +91,9 @@ const BODY = `
 <div class="status" part="status" aria-hidden="true"></div>
 <div class="bar" role="group" aria-label="Player" hidden>
   <button class="play" type="button"></button>
-  <div class="time"><div class="levels"></div><input type="range" min="0" max="1" step="any" value="0" aria-label="Time"></div>
+  <div class="time">
+    <div class="levels"></div><input type="range" min="0" max="1" step="any" value="0" aria-label="Time">
+  </div>
   <span class="clock" aria-hidden="true"></span>
   <select aria-label="Highest level"></select>
   <button class="home" type="button" aria-label="Reset the view" title="Reset the view">${HOME}</button>

@@ -128,7 +128,8 @@ function table(rows) {
   for (const row of rows) {
     const line = body.insertRow();
     for (const [name, value] of Object.entries(row)) {
-      line.insertCell().textContent = name === "moving" || name === "playing" ? value.toFixed(1) : value.toLocaleString();
+      const rate = name === "moving" || name === "playing";
+      line.insertCell().textContent = rate ? value.toFixed(1) : value.toLocaleString();
     }
   }
   return element;

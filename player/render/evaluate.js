@@ -27,7 +27,9 @@ const sigmoid = (x) => 1 / (1 + Math.exp(-x));
 /**
  * Planes at one time. Cells lie before channels, so that one sample reads one run of memory.
  *
- * @typedef {{spatial: {data: Float32Array, width: number, height: number}[], rows: {data: Float32Array, cells: number}[]}} Scale
+ * @typedef {object} Scale
+ * @property {{data: Float32Array, width: number, height: number}[]} spatial
+ * @property {{data: Float32Array, cells: number}[]} rows
  */
 
 /** Spatial planes with their channels last, by deformation. @type {WeakMap<Deformation, Scale["spatial"][]>} */
@@ -337,7 +339,10 @@ class Records {
     /** @param {number} start @param {number} width */
     const column = (start, width) => {
       const out = new Float32Array(n * width);
-      for (let i = 0; i < n; i++) for (let k = 0; k < width; k++) out[i * width + k] = this._data[i * RECORD + start + k];
+      for (let i = 0; i < n; i++) {
+        const at = i * RECORD + start;
+        for (let k = 0; k < width; k++) out[i * width + k] = this._data[at + k];
+      }
       return out;
     };
     return {

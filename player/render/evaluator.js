@@ -160,13 +160,19 @@ export class GpuEvaluator {
         global,
         scene.info.box,
         unit,
-        { position: 0, scaling: 4, scalingRun: 3, feature: 4 * FEATURE_BLOCK, offset: 4 * this._offsetBlock, offsetRun: 3 },
+        {
+          position: 0,
+          scaling: 4,
+          scalingRun: 3,
+          feature: 4 * FEATURE_BLOCK,
+          offset: 4 * this._offsetBlock,
+          offsetRun: 3,
+        },
         this._blocks,
       );
     this._residual = this._global && gpu.field(this._width, this._height, this._global.outputBlocks);
-    this._local =
-      local &&
-      new FieldPass(gpu, local, scene.info.box, unit, { mean: 0, opacity: 3, scale: 4, quat: 8, color: 12 }, SPLAT_BLOCKS);
+    const places = { mean: 0, opacity: 3, scale: 4, quat: 8, color: 12 };
+    this._local = local && new FieldPass(gpu, local, scene.info.box, unit, places, SPLAT_BLOCKS);
 
     /** @type {WebGLTexture | null} */
     this._codes = null;
@@ -564,7 +570,8 @@ ${
 
   free() {
     const { gl } = this._gpu;
-    this._gpu.free(this._anchors, this._before, this._opacities, this._residual, this._codes, this._list, this._means, this._changes);
+    this._gpu.free(this._anchors, this._before, this._opacities, this._residual, this._codes);
+    this._gpu.free(this._list, this._means, this._changes);
     for (const buffer of this._directions) gl.deleteBuffer(buffer);
     gl.deleteBuffer(this._shapes.buffer);
     this._global?.free();
@@ -616,5 +623,6 @@ ivec2 anchorOf(uint entry) {
  * if it would be the same.
  *
  * @typedef {object} Lister
- * @property {(opacities: Float32Array, slots: number, anchors: number, previous: List | null) => Promise<List | null>} list
+ * @property {(...args: [opacities: Float32Array, slots: number, anchors: number, previous: List | null])
+ *   => Promise<List | null>} list
  */

@@ -8,15 +8,11 @@ import { LENGTH_HEADS, sliceAt, SPATIAL, TEMPORAL } from "./planes.js";
 /** @typedef {import("../decode/scene.js").Deformation} Deformation */
 /** @typedef {import("../decode/scene.js").Network} Network */
 
-/** Points that are evaluated at a time, about: what lies between two layers takes memory. */
-const BAND_POINTS = 1 << 15;
-
 export class FieldPass {
   /**
    * @param {Gpu} gpu @param {Deformation} deformation @param {import("../decode/scene.js").Info["box"]} box
    * @param {number} unit of length heads, scene units
-   * @param {Record<string, number>} places first output of each head, and how outputs are laid out
-   * @param {number} blocks of the outputs
+   * @param {Record<string, number>} places how the outputs are laid out, see `joinHeads` @param {number} blocks of them
    */
   constructor(gpu, deformation, box, unit, places, blocks) {
     this._gpu = gpu;
@@ -54,7 +50,8 @@ export class FieldPass {
     const width = Math.max(...SPATIAL.map(([name]) => planes[name].width));
     const height = Math.max(...SPATIAL.map(([name]) => planes[name].height));
     const layers = 3 * this._channelBlocks;
-    if (Math.max(width, height) > gpu.maxSide || layers > gpu.maxLayers) throw new TooLarge(`planes of ${width} × ${height}`);
+    const fits = Math.max(width, height) <= gpu.maxSide && layers <= gpu.maxLayers;
+    if (!fits) throw new TooLarge(`planes of ${width} × ${height} × ${4 * this._channelBlocks}`);
     const data = new Float32Array(layers * width * height * 4);
     SPATIAL.forEach(([name], p) => {
       const plane = planes[name];
@@ -92,7 +89,7 @@ export class FieldPass {
    */
   run(t, points, rows, out) {
     this._setTime(t);
-    const band = Math.max(1, Math.floor(BAND_POINTS / points.width));
+    const band = Math.max(1, Math.floor(this._gpu.bandPoints / points.width));
     for (let row = 0; row < rows; row += band) this._runBand(points, row, Math.min(band, rows - row), out);
   }
 
@@ -191,8 +188,9 @@ ${repeat(blocks, (c) => {
 /**
  * One linear layer from field to field.
  *
- * @param {Gpu} gpu @param {Linear} linear @param {Field} from @param {Field} to @param {number} row @param {number} rows
- * of texels, in `to` @param {number} shift from there to the rows of `from` @param {boolean} relu
+ * @param {Gpu} gpu @param {Linear} linear @param {Field} from @param {Field} to
+ * @param {number} row @param {number} rows of texels, in `to` @param {number} shift from there to the rows of `from`
+ * @param {boolean} relu
  */
 export function runLinear(gpu, linear, from, to, row, rows, shift, relu) {
   const program = gpu.program(

@@ -12,7 +12,7 @@ precision highp usampler2D;
 const COVER = `${HEADER}
 void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4. - 1., 0, 1); }`;
 
-/** Texels between two looks at a fence, milliseconds. */
+/** Between two looks at a fence, milliseconds. */
 const POLL_MS = 1;
 
 /** The context is gone: whoever waits starts again when it is back. */
@@ -48,7 +48,7 @@ export class Gpu {
     this.renderer = String(gl.getParameter(names ? names.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
     /** Whether the processor draws. */
     this.software = /swiftshader|llvmpipe|software/i.test(this.renderer);
-    /** What pictures are blended in, 0 where there are no floats for it. Software converts half floats at a high price. */
+    /** What pictures are blended in, 0 where there are no floats for it. Half floats are slow in software. */
     this.pictureFormat =
       this.software && this.floats && gl.getExtension("EXT_float_blend") ? gl.RGBA32F : halves ? gl.RGBA16F : 0;
     this.maxTargets = Math.min(gl.getParameter(gl.MAX_DRAW_BUFFERS), gl.getParameter(gl.MAX_COLOR_ATTACHMENTS), 8);
@@ -60,6 +60,8 @@ export class Gpu {
     this._programs = new Map();
     /** Framebuffers by their targets, of each texture. @type {Map<WebGLTexture, Map<string, WebGLFramebuffer>>} */
     this._framebuffers = new Map();
+    /** Points that a chain of passes takes at a time, about: what lies between two of them takes memory. */
+    this.bandPoints = 1 << 15;
     gl.disable(gl.DITHER);
     gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
   }

@@ -100,7 +100,7 @@ export function pack({ weight, bias, inputs, outputs }, first, blocks, out) {
   }
 }
 
-/** Source that declares `count` targets and, from `values`, fills them. @param {number} count */
+/** Source that declares out0, out1, .. as targets. @param {number} count */
 export function targets(count) {
   let source = "";
   for (let i = 0; i < count; i++) source += `layout(location = ${i}) out vec4 out${i};\n`;

@@ -15,9 +15,9 @@ import { Remote } from "./remote.js";
 
 /**
  * How to play. level: the highest to load and show, default all. time: seconds of the scene's time to start at. bytes,
- * seconds: how much of the file to load at most, and how long beyond the first layer. evaluator: "gpu" or "cpu", default what the machine
- * can do. degrade: whether a slow machine gets fewer pixels and lower levels, default true. pixelRatio: device pixels
- * per CSS pixel, default the window's, at most 2.
+ * seconds: how much of the file to load at most, and how long beyond the first layer. evaluator: "gpu" or "cpu",
+ * default what the machine can do. degrade: whether a slow machine gets fewer pixels and lower levels, default true.
+ * pixelRatio: device pixels per CSS pixel, default the window's, at most 2.
  *
  * @typedef {object} Options
  * @property {number | null} [level]
@@ -33,8 +33,8 @@ import { Remote } from "./remote.js";
 
 /**
  * The state of a player, for a status line. bytes: arrived so far, of total (null: unknown). ends: where in the file
- * each layer ends, empty while that is unknown. level: shown, null before
- * the first picture. levels: that are there. fps: pictures drawn in the last second. scale: of the picture's sides.
+ * each layer ends, empty while that is unknown. level: shown, null before the first picture. levels: that are there.
+ * fps: pictures drawn in the last second. scale: of the picture's sides. gaussians: drawn.
  *
  * @typedef {object} Status
  * @property {number} bytes
@@ -60,8 +60,8 @@ const CPU_LEVEL = 0;
 
 /**
  * Events: `progress` {bytes, total}, `firstpicture` {level, bytes, seconds}, `upgrade` {level, bytes, seconds},
- * `loaded` {bytes, complete}, `timeupdate` {time}, `statechange` (play or pause), `error` {message, kind}. Seconds count
- * from `load`.
+ * `loaded` {bytes, complete}, `timeupdate` {time}, `statechange` (play or pause), `error` {message, kind}. Seconds
+ * count from `load`.
  */
 export class Player extends EventTarget {
   /** @param {HTMLCanvasElement} canvas @param {Options} [options] */
@@ -156,6 +156,7 @@ export class Player extends EventTarget {
       if (loader === this._loader) this._told(news);
     });
     this._loader = loader;
+    this._useCpu = this._options.evaluator === "cpu" || !(this._gpu?.floats ?? true);
     if (this._useCpu || this._gpu?.software) this._cpuWorker ??= startWorker();
     this._scene = null;
     this._shownLevel = null;

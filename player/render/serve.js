@@ -1,6 +1,10 @@
 // Calls across a worker's border: the worker's side. The page's is remote.js.
 
-/** What a worker's function may return to hand buffers over. @typedef {{result: unknown, transfer: Transferable[]}} Handed */
+/**
+ * What a worker's function may return to hand buffers over.
+ *
+ * @typedef {{result: unknown, transfer: Transferable[]}} Handed
+ */
 
 /**
  * Answers calls by name.
@@ -22,5 +26,5 @@ export function serve(functions) {
 
 /** Sends a message from a worker. @param {unknown} message @param {Transferable[]} [transfer] */
 export function tell(message, transfer = []) {
-  /** @type {{postMessage: (message: unknown, transfer: Transferable[]) => void}} */ (self).postMessage(message, transfer);
+  postMessage(message, { transfer });
 }

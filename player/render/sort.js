@@ -69,8 +69,8 @@ export class DepthSort {
   }
 
   /**
-   * The Gaussians in front of the near plane whose opacity is not negative, back to front; of equal depths, the later ones
-   * first. Two counting sorts over 16 bits of the depth's binary32 each: exact, and a multiple of nothing.
+   * The Gaussians in front of the near plane whose opacity is not negative, back to front; of equal depths, the later
+   * ones first. Two counting sorts, over 16 bits of the depth's binary32 each.
    *
    * @param {Float32Array} means [n, 4], mean and opacity @param {ArrayLike<number>} row of the view matrix, depth =
    * row · (mean, 1) @param {number} near scene units

@@ -18,13 +18,14 @@ async function sceneOf(url) {
  * difference of each quantity, relative to its largest magnitude, and how many Gaussians only one of them has although
  * its opacity is clear of the threshold.
  *
- * @param {string} url @param {{level: number, t: number, eye: number[]}[]} cases
+ * @param {string} url @param {{level: number, t: number, eye: number[]}[]} cases @param {number} bandPoints
  */
-async function compare(url, cases) {
+async function compare(url, cases, bandPoints) {
   const scene = await sceneOf(url);
   const canvas = document.createElement("canvas");
   const gl = /** @type {WebGL2RenderingContext} */ (canvas.getContext("webgl2"));
   const gpu = new Gpu(gl);
+  gpu.bandPoints = bandPoints;
   const evaluator = new GpuEvaluator(gpu, scene);
   const lister = { list: async (/** @type {Parameters<typeof listGaussians>} */ ...args) => listGaussians(...args) };
   const slots = scene.offset.length / scene.anchor.length;
@@ -102,7 +103,8 @@ async function open(url, width, height, options = {}) {
 /**
  * The settled picture as base64 of its RGBA bytes.
  *
- * @param {{level?: number, seconds?: number, viewmat?: number[], K?: number[], width?: number, height?: number}} [state]
+ * @param {{level?: number, seconds?: number, viewmat?: number[], K?: number[], width?: number, height?: number}}
+ * [state]
  */
 async function shoot({ level, seconds, viewmat, K, width, height } = {}) {
   if (!player) throw new Error("nothing is open");

@@ -237,7 +237,7 @@ def test_both_evaluators_agree(harness, folder, server, options):
     (folder / "agree.pd4").write_bytes(encode(scene, layers=2, effort=1))
     eyes = ([0.0, 0.0, -5.0], [2.0, 1.0, -4.0])
     cases = [dict(level=level, t=t, eye=eye) for level in scene.layers for t in (0.0, 0.4, 1.0) for eye in eyes]
-    result = call(harness, "harness.compare", server.url_of("agree.pd4"), cases)
+    result = call(harness, "harness.compare", server.url_of("agree.pd4"), cases, 1 << 8)
     assert result["error"] == 0
     for case, got in zip(cases, result["cases"], strict=True):
         assert got["count"] > 50 and got["lonely"] == 0, (case, got)
