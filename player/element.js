@@ -1,0 +1,370 @@
+// <pd4-player>: a dynamic scene in a page.
+//
+//   <script type="module" src="player/element.js"></script>
+//   <pd4-player src="scene.pd4" controls autoplay loop></pd4-player>
+//
+// Attributes: src; poster, a picture until there is one; controls; autoplay; loop; time, seconds to start at; level,
+// the highest to load and show; max-bytes and max-seconds, how much of the file to load, and how long beyond layer 0.
+
+import { Orbit } from "./render/orbit.js";
+import { Player } from "./render/player.js";
+
+export { Player } from "./render/player.js";
+
+/** Events that an element passes on from its player. */
+const EVENTS = ["progress", "firstpicture", "upgrade", "loaded", "timeupdate", "statechange", "error"];
+/** Between two looks at the status, milliseconds. */
+const STATUS_MS = 250;
+/** Seconds that a key steps through the scene. */
+const FRAME = 1 / 30;
+
+/**
+ * Plays an address or a file on a canvas, without an element.
+ *
+ * @param {string | URL | Blob} source
+ * @param {import("./render/player.js").Options & {canvas: HTMLCanvasElement}} options
+ * @returns {Player}
+ */
+export function open(source, { canvas, ...options }) {
+  const player = new Player(canvas, options);
+  player.load(source);
+  return player;
+}
+
+const STYLE = `
+:host { display: block; position: relative; container-type: inline-size; overflow: hidden; aspect-ratio: 4 / 3;
+  background: #000; color: #eee; font: 13px/1.4 system-ui, sans-serif; }
+:host([hidden]) { display: none; }
+canvas, img { position: absolute; inset: 0; width: 100%; height: 100%; }
+canvas:focus-visible { outline: 2px solid #6bf; outline-offset: -2px; }
+img { object-fit: contain; pointer-events: none; }
+.error { position: absolute; inset: 0 0 auto; margin: 0; padding: 8px 12px; background: #611e;
+  overflow-wrap: anywhere; }
+.bar { position: absolute; inset: auto 0 0; display: flex; gap: 8px; align-items: center; padding: 6px 10px;
+  background: linear-gradient(transparent, #000a); }
+.bar > * { flex: none; }
+button, select { font: inherit; color: inherit; background: #0006; border: 1px solid #fff4; border-radius: 4px;
+  min-width: 32px; height: 28px; padding: 0 6px; cursor: pointer; }
+select option { color: #000; }
+button:focus-visible, select:focus-visible, input:focus-visible { outline: 2px solid #6bf; }
+button svg { display: block; width: 16px; height: 16px; margin: auto; fill: currentColor; }
+.time { position: relative; flex: 1 1 60px; min-width: 40px; height: 28px; }
+.levels { position: absolute; inset: 10px 0; display: flex; flex-direction: column-reverse; border-radius: 3px;
+  overflow: hidden; background: #fff2; }
+.levels i { flex: 1; width: 0; background: #6bf; opacity: .8; }
+.levels i:nth-child(2) { opacity: .6; }
+.levels i:nth-child(3) { opacity: .4; }
+input { -webkit-appearance: none; appearance: none; position: absolute; inset: 0; width: 100%; height: 100%; margin: 0;
+  background: none; cursor: pointer; }
+input::-webkit-slider-runnable-track { background: none; }
+input::-webkit-slider-thumb { -webkit-appearance: none; width: 6px; height: 22px; border-radius: 3px;
+  background: #fff; }
+input::-moz-range-track { background: none; }
+input::-moz-range-thumb { width: 6px; height: 22px; border: 0; border-radius: 3px; background: #fff; }
+.clock, .status { font-variant-numeric: tabular-nums; }
+.status { position: absolute; inset: auto 10px 44px auto; opacity: .75; text-shadow: 0 0 4px #000, 0 0 2px #000;
+  pointer-events: none; }
+@container (max-width: 420px) {
+  .bar { flex-wrap: wrap; justify-content: flex-end; }
+  .bar .time { flex-basis: 100%; order: -1; }
+  .bar .play { margin-right: auto; }
+  .status { bottom: 78px; }
+}
+@container (max-width: 340px) {
+  .clock { display: none; }
+}
+[hidden] { display: none !important; }
+`;
+
+/** @param {string} path on a square of 16 */
+const icon = (path) => `<svg viewBox="0 0 16 16" aria-hidden="true"><path d="${path}"/></svg>`;
+const PLAY = icon("M3 1v14l11-7z");
+const PAUSE = icon("M3 1h4v14H3zM9 1h4v14H9z");
+const HOME = icon("M8 1 1 8h2v6h4v-4h2v4h4V8h2z");
+const FULL = icon("M1 1h5v2H3v3H1zM10 1h5v5h-2V3h-3zM1 10h2v3h3v2H1zM13 10h2v5h-5v-2h3z");
+
+const BODY = `
+<canvas tabindex="0" role="application" aria-label="Dynamic scene"
+  aria-keyshortcuts="Space ArrowLeft ArrowRight ArrowUp ArrowDown + - Home , . f"></canvas>
+<img alt="" hidden>
+<p class="error" role="alert" hidden></p>
+<div class="status" part="status" aria-hidden="true"></div>
+<div class="bar" role="group" aria-label="Player" hidden>
+  <button class="play" type="button"></button>
+  <div class="time">
+    <div class="levels"></div><input type="range" min="0" max="1" step="any" value="0" aria-label="Time">
+  </div>
+  <span class="clock" aria-hidden="true"></span>
+  <select aria-label="Highest level"></select>
+  <button class="home" type="button" aria-label="Reset the view" title="Reset the view">${HOME}</button>
+  <button class="full" type="button" aria-label="Full screen" title="Full screen">${FULL}</button>
+</div>
+`;
+
+/** A number from an attribute, null where there is none. @param {string | null} text */
+const number = (text) => (text === null || text.trim() === "" || Number.isNaN(Number(text)) ? null : Number(text));
+
+export class Pd4Player extends HTMLElement {
+  static observedAttributes = ["src", "level", "time", "controls", "poster"];
+
+  constructor() {
+    super();
+    const root = this.attachShadow({ mode: "open" });
+    const style = new CSSStyleSheet(); // a page may forbid style elements
+    style.replaceSync(STYLE);
+    root.adoptedStyleSheets = [style];
+    root.innerHTML = BODY;
+    /** @template {Element} E @param {string} selector @returns {E} */
+    const part = (selector) => /** @type {E} */ (root.querySelector(selector));
+    /** @type {HTMLImageElement} */
+    this._poster = part("img");
+    /** @type {HTMLElement} */
+    this._error = part(".error");
+    /** @type {HTMLElement} */
+    this._statusLine = part(".status");
+    /** @type {HTMLElement} */
+    this._bar = part(".bar");
+    /** @type {HTMLElement} */
+    this._levels = part(".levels");
+    /** @type {HTMLElement} */
+    this._clock = part(".clock");
+    /** @type {HTMLButtonElement} */
+    this._play = part(".play");
+    /** @type {HTMLInputElement} */
+    this._slider = part("input");
+    /** @type {HTMLSelectElement} */
+    this._select = part("select");
+    /** @type {Player | null} */
+    this._player = null;
+    /** @type {Orbit | null} */
+    this._orbit = null;
+    this._timer = 0;
+
+    this._play.addEventListener("click", () => this.toggle());
+    this._slider.addEventListener("input", () => this.seek(Number(this._slider.value)));
+    this._select.addEventListener("change", () => (this.level = number(this._select.value)));
+    part(".home").addEventListener("click", () => this._orbit?.reset());
+    part(".full").addEventListener("click", () => this._toggleFullScreen());
+    root.addEventListener("keydown", (event) => this._key(/** @type {KeyboardEvent} */ (event)));
+    this._showState();
+  }
+
+  connectedCallback() {
+    const old = /** @type {HTMLCanvasElement} */ (this.shadowRoot?.querySelector("canvas"));
+    const canvas = /** @type {HTMLCanvasElement} */ (old.cloneNode()); // a context that was given up does not return
+    old.replaceWith(canvas);
+    const player = new Player(canvas, {
+      level: number(this.getAttribute("level")),
+      time: number(this.getAttribute("time")),
+      autoplay: this.hasAttribute("autoplay"),
+      loop: this.hasAttribute("loop"),
+      bytes: number(this.getAttribute("max-bytes")),
+      seconds: number(this.getAttribute("max-seconds")),
+    });
+    this._player = player;
+    for (const name of EVENTS) {
+      player.addEventListener(name, (event) => {
+        const { detail } = /** @type {CustomEvent} */ (event);
+        this._react(name, detail);
+        this.dispatchEvent(new CustomEvent(name, { detail }));
+      });
+    }
+    this._timer = setInterval(() => this._showStatus(), STATUS_MS);
+    this._showControls();
+    this._showPoster();
+    this._load();
+  }
+
+  disconnectedCallback() {
+    clearInterval(this._timer);
+    this._orbit?.close();
+    this._orbit = null;
+    this._player?.close();
+    this._player = null;
+  }
+
+  /** @param {string} name @param {string | null} before @param {string | null} value */
+  attributeChangedCallback(name, before, value) {
+    if (!this._player || before === value) return;
+    if (name === "src") this._load();
+    else if (name === "level") this._player.level = number(value);
+    else if (name === "time") this.seek(number(value) ?? 0);
+    else if (name === "controls") this._showControls();
+    else this._showPoster();
+  }
+
+  // --- for scripts
+
+  /** What plays, null while the element is in no document. */
+  get player() {
+    return this._player;
+  }
+
+  /** Loads a scene in place of the one on show. @param {string | URL | Blob} source */
+  async load(source) {
+    this._error.hidden = true;
+    await this._player?.load(source);
+  }
+
+  get src() {
+    return this.getAttribute("src");
+  }
+
+  set src(value) {
+    if (value === null) this.removeAttribute("src");
+    else this.setAttribute("src", value);
+  }
+
+  /** The highest level to show, null: all. */
+  get level() {
+    return this._player ? this._player.level : number(this.getAttribute("level"));
+  }
+
+  set level(level) {
+    if (level === null) this.removeAttribute("level");
+    else this.setAttribute("level", String(level));
+  }
+
+  get camera() {
+    return this._player?.camera ?? null;
+  }
+
+  set camera(camera) {
+    if (this._player) this._player.camera = camera;
+  }
+
+  /** Seconds of the scene's time. */
+  get time() {
+    return this._player?.time ?? 0;
+  }
+
+  set time(seconds) {
+    this.seek(seconds);
+  }
+
+  get paused() {
+    return this._player?.paused ?? true;
+  }
+
+  /** @param {number} seconds of the scene's time */
+  seek(seconds) {
+    this._player?.seek(seconds);
+  }
+
+  play() {
+    this._player?.play();
+  }
+
+  pause() {
+    this._player?.pause();
+  }
+
+  toggle() {
+    if (this.paused) this.play();
+    else this.pause();
+  }
+
+  // --- inside
+
+  _load() {
+    const { src } = this;
+    if (src !== null && src !== "") this.load(src);
+  }
+
+  /** @param {string} name @param {any} detail */
+  _react(name, detail) {
+    if (name === "error") {
+      this._error.textContent = detail.message;
+      this._error.hidden = false;
+    }
+    if (name === "firstpicture") this._poster.hidden = true;
+    if (name === "statechange" || name === "timeupdate") this._showState();
+    if (name !== "timeupdate") this._showStatus();
+  }
+
+  _showPoster() {
+    const poster = this.getAttribute("poster");
+    if (poster !== null) this._poster.src = poster;
+    this._poster.hidden = poster === null || this._player?.status.level !== null;
+  }
+
+  _showControls() {
+    const controls = this.hasAttribute("controls");
+    this._bar.hidden = this._statusLine.hidden = !controls;
+    this._orbit?.close();
+    this._orbit = controls && this._player ? new Orbit(this._player, this._player.canvas) : null;
+  }
+
+  _showState() {
+    const { paused } = this;
+    const label = paused ? "Play" : "Pause";
+    if (this._play.title !== label) {
+      this._play.innerHTML = paused ? PLAY : PAUSE;
+      this._play.setAttribute("aria-label", label);
+      this._play.title = label;
+    }
+    const [start, end] = this._player?.timeRange ?? [0, 0];
+    this._slider.min = String(start);
+    this._slider.max = String(end > start ? end : start + 1);
+    this._slider.value = String(this.time);
+    const clock = `${(this.time - start).toFixed(1)} / ${(end - start).toFixed(1)} s`;
+    this._slider.setAttribute("aria-valuetext", clock);
+    this._clock.textContent = clock;
+  }
+
+  /** The status line, the levels on the time bar and in the list. */
+  _showStatus() {
+    const player = this._player;
+    if (!player || this._bar.hidden) return;
+    const { bytes, total, loading, ends, level, levels, fps, scale } = player.status;
+    const parts = [];
+    if (level !== null) parts.push(`level ${level}${levels.length ? ` of ${levels[levels.length - 1]}` : ""}`);
+    if (bytes) parts.push(`${size(bytes)}${loading && total ? ` of ${size(total)}` : ""}`);
+    if (fps > 1) parts.push(`${fps} fps`);
+    if (scale < 1) parts.push(`${Math.round(100 * scale)} %`);
+    setText(this._statusLine, parts.join(" · "));
+
+    while (this._levels.children.length < ends.length) this._levels.append(document.createElement("i"));
+    while (this._levels.children.length > ends.length) this._levels.lastChild?.remove();
+    ends.forEach(({ end }, i) => {
+      const begin = i ? ends[i - 1].end : 0;
+      const share = Math.min(Math.max((bytes - begin) / (end - begin), 0), 1);
+      /** @type {HTMLElement} */ (this._levels.children[i]).style.width = `${100 * share}%`;
+    });
+
+    const names = ["all levels", ...levels.map((n) => `level ${n}`)];
+    if (this._select.options.length !== names.length) {
+      this._select.replaceChildren(...names.map((name, i) => new Option(name, i ? String(levels[i - 1]) : "")));
+    }
+    this._select.value = this.level === null ? "" : String(this.level);
+    this._showState();
+  }
+
+  /** @param {KeyboardEvent} event */
+  _key(event) {
+    if (!this.hasAttribute("controls") || event.ctrlKey || event.metaKey || event.altKey) return;
+    if (event.target !== this._player?.canvas) return; // buttons and slider have keys of their own
+    if (event.key === " ") this.toggle();
+    else if (event.key === "f") this._toggleFullScreen();
+    else if (event.key === "," || event.key === ".") this.seek(this.time + (event.key === "." ? FRAME : -FRAME));
+    else if (!this._orbit?.key(event)) return;
+    event.preventDefault();
+  }
+
+  _toggleFullScreen() {
+    if (document.fullscreenElement) document.exitFullscreen();
+    else this.requestFullscreen?.().catch(() => {}); // a page may forbid it
+  }
+}
+
+/** @param {HTMLElement} element @param {string} text */
+function setText(element, text) {
+  if (element.textContent !== text) element.textContent = text;
+}
+
+/** @param {number} bytes */
+function size(bytes) {
+  return bytes < 1e6 ? `${Math.round(bytes / 1e3)} kB` : `${(bytes / 1e6).toFixed(1)} MB`;
+}
+
+customElements.define("pd4-player", Pd4Player);

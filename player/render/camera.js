@@ -1,0 +1,93 @@
+// Cameras: pinhole, axes x right, y down, z forward, as the format has them.
+
+/** @typedef {import("../decode/scene.js").Camera} Camera */
+/** @typedef {import("../decode/scene.js").Info} Info */
+/** @typedef {[number, number, number]} Vector */
+
+/** @param {ArrayLike<number>} a @param {ArrayLike<number>} b */
+export const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
+
+/** @param {ArrayLike<number>} a @param {ArrayLike<number>} b @returns {Vector} */
+export const cross = (a, b) => [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]];
+
+/** a + f · b. @param {ArrayLike<number>} a @param {ArrayLike<number>} b @param {number} f @returns {Vector} */
+export const plus = (a, b, f = 1) => [a[0] + f * b[0], a[1] + f * b[1], a[2] + f * b[2]];
+
+/** Of length 1; `otherwise` if it has no direction. @param {ArrayLike<number>} a @param {Vector} otherwise
+ * @returns {Vector} */
+export function unit(a, otherwise = [0, 0, 1]) {
+  const n = Math.hypot(a[0], a[1], a[2]);
+  return n > 1e-9 && n < Infinity ? [a[0] / n, a[1] / n, a[2] / n] : otherwise;
+}
+
+/** `v` turned about `axis`, of length 1. @param {Vector} v @param {Vector} axis @param {number} angle radians
+ * @returns {Vector} */
+export function turn(v, axis, angle) {
+  const c = Math.cos(angle);
+  return plus(plus([c * v[0], c * v[1], c * v[2]], cross(axis, v), Math.sin(angle)), axis, dot(axis, v) * (1 - c));
+}
+
+/** The centre of a camera. @param {Camera} camera @returns {Vector} */
+export function centreOf({ viewmat: v }) {
+  const [a, b, c] = [0, 1, 2].map((k) => -(v[k] * v[3] + v[4 + k] * v[7] + v[8 + k] * v[11]));
+  return [a, b, c];
+}
+
+/** Where a camera looks. @param {Camera} camera @returns {Vector} */
+export const forwardOf = ({ viewmat: v }) => [v[8], v[9], v[10]];
+
+/** Downwards in a camera's picture. @param {Camera} camera @returns {Vector} */
+export const downOf = ({ viewmat: v }) => [v[4], v[5], v[6]];
+
+/**
+ * A camera at `eye` that looks along `forward`.
+ *
+ * @param {Vector} eye @param {Vector} forward of length 1 @param {Vector} down roughly
+ * @param {Pick<Camera, "K" | "width" | "height">} like
+ * @returns {Camera}
+ */
+export function lookAlong(eye, forward, down, { K, width, height }) {
+  const right = unit(cross(down, forward), unit(cross([forward[1], forward[2], forward[0]], forward)));
+  const y = cross(forward, right);
+  const rows = [right, y, forward].flatMap((axis) => [...axis, -dot(axis, eye)]);
+  return { viewmat: new Float32Array([...rows, 0, 0, 0, 1]), K, width, height };
+}
+
+/**
+ * The camera that shows a scene first: its own, or one that looks at the box's middle from outside.
+ *
+ * @param {Info} info @returns {Camera}
+ */
+export function defaultCamera({ camera, box: [low, high], up }) {
+  if (camera) return camera;
+  const middle = plus(plus([0, 0, 0], low, 0.5), high, 0.5);
+  const size = Math.hypot(...plus(high, low, -1)) || 1;
+  const worldUp = unit(up, [0, 1, 0]);
+  const side = unit(cross(worldUp, [worldUp[1], worldUp[2], worldUp[0]]), [1, 0, 0]);
+  const forward = unit(plus(side, worldUp, -0.3));
+  const K = new Float32Array([600, 0, 320, 0, 600, 240, 0, 0, 1]);
+  const eye = plus(middle, forward, -1.2 * size);
+  return lookAlong(eye, forward, plus([0, 0, 0], worldUp, -1), { K, width: 640, height: 480 });
+}
+
+/**
+ * The camera for a picture of another size: all of its picture is seen, as large as it fits, in the middle.
+ *
+ * @param {Camera} camera @param {number} width @param {number} height pixels
+ * @returns {Camera}
+ */
+export function fitted(camera, width, height) {
+  if (camera.width === width && camera.height === height) return camera;
+  const { viewmat, K } = camera;
+  const scale = Math.min(width / camera.width, height / camera.height);
+  return {
+    viewmat,
+    K: new Float32Array([
+      ...[K[0] * scale, 0, width / 2 + scale * (K[2] - camera.width / 2)],
+      ...[0, K[4] * scale, height / 2 + scale * (K[5] - camera.height / 2)],
+      ...[0, 0, 1],
+    ]),
+    width,
+    height,
+  };
+}

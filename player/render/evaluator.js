@@ -1,0 +1,628 @@
+// Clauses 13.2 to 13.4 on the GPU, as fragment passes into float textures.
+//
+// Per anchor, when time moves: global deformation; first layers of the scaffold's networks, as far as features go.
+// Per anchor, when the camera's centre moves: opacities. They say which Gaussians are kept, some fifth of all, and only
+// those are evaluated further. Per Gaussian, when time moves: mean and local deformation. Per Gaussian, when the
+// camera's centre moves: shape and colour.
+
+import { FieldPass, runLinear } from "./field.js";
+import { blocksOf, Linear, pack, repeat, targets, TooLarge } from "./layers.js";
+import { deformationUnit, levelOf, widthsOf } from "./level.js";
+
+/** @typedef {import("./gl.js").Gpu} Gpu */
+/** @typedef {import("./gl.js").Field} Field */
+/** @typedef {import("../decode/scene.js").Scene} Scene */
+/** @typedef {import("../decode/scene.js").Network} Network */
+
+/**
+ * Kept Gaussians, as the renderer takes them: texels of four blocks, (mean, opacity), (scale, 0), quaternion w x y z,
+ * (colour, 0). Opacity and scale are gated. A texel that holds none has opacity −1.
+ *
+ * @typedef {{field: Field, texels: number}} Splats
+ */
+
+/**
+ * What an evaluation gives. means: [texels, 4], mean and opacity; null if means and list are those of the call before.
+ *
+ * @typedef {{splats: Splats, means: Float32Array | null}} Evaluated
+ */
+
+/** Blocks of an anchor's attributes before its features: position, then log-scalings of the offsets, of the base. */
+const FEATURE_BLOCK = 3;
+/** Blocks of a Gaussian. */
+export const SPLAT_BLOCKS = 4;
+/** What the textures of all anchors may take, bytes: beyond it devices fail in ways that cannot be told apart. */
+const MAX_BYTES = 2 ** 30;
+/** A list's texel that names no Gaussian. */
+export const NO_ENTRY = 0xffffffff;
+/** Bits of an anchor's number in an entry of a list; the slot lies above. */
+export const ANCHOR_BITS = 24;
+
+/** A texture's width for `n` texels. @param {number} n */
+const widthFor = (n) => 2 ** Math.max(4, Math.ceil(Math.log2(Math.sqrt(n))));
+
+/** The scaffold's network `name` cut into what depends on features, on the direction, and the rest. */
+class Scaffold {
+  /** @param {Gpu} gpu @param {Network} network @param {number} features */
+  constructor(gpu, network, features) {
+    this._gpu = gpu;
+    const single = network.length === 1;
+    const first = single ? identity(features + 3) : network[0];
+    /** Whether ReLU follows the first layer. */
+    this.relu = !single;
+    this.features = columns(first, 0, features);
+    const blocks = blocksOf(first.outputs);
+    this.blocks = blocks;
+    const direction = columns(first, features, 3);
+    this.direction = new Float32Array(12 * blocks);
+    for (let o = 0; o < first.outputs; o++) {
+      for (let k = 0; k < 3; k++) {
+        this.direction[((o >> 2) * 3 + k) * 4 + (o & 3)] = direction.weight[3 * o + k];
+      }
+    }
+    this.middle = network.slice(1, -1).map((layer) => new Linear(gpu, layer));
+    this.last = network[network.length - 1];
+    /** Of the networks' first layers, where this one's outputs begin. */
+    this.firstBlock = 0;
+    /** @type {Field | null} what the last layer takes, where there are layers in between */
+    this.hidden = null;
+  }
+
+  /** Blocks that the last layer takes. */
+  get hiddenBlocks() {
+    return blocksOf(this.last.inputs);
+  }
+
+  free() {
+    this._gpu.free(this.hidden);
+    for (const linear of this.middle) linear.free();
+  }
+}
+
+/** @param {number} n @returns {Network[number]} */
+function identity(n) {
+  const weight = new Float32Array(n * n);
+  for (let i = 0; i < n; i++) weight[i * n + i] = 1;
+  return { weight, bias: new Float32Array(n), inputs: n, outputs: n };
+}
+
+/** The layer for some of its inputs. @param {Network[number]} layer @param {number} start @param {number} count */
+function columns({ weight, bias, inputs, outputs }, start, count) {
+  const out = new Float32Array(outputs * count);
+  for (let o = 0; o < outputs; o++) {
+    out.set(weight.subarray(o * inputs + start, o * inputs + start + count), o * count);
+  }
+  return { weight: out, bias, inputs: count, outputs };
+}
+
+/** Layers of the same inputs as one, each padded to whole blocks. @param {Network[number][]} layers */
+function stack(layers) {
+  const outputs = layers.reduce((sum, layer) => sum + 4 * blocksOf(layer.outputs), 0);
+  const { inputs } = layers[0];
+  const weight = new Float32Array(inputs * outputs);
+  const bias = new Float32Array(outputs);
+  let at = 0;
+  for (const layer of layers) {
+    weight.set(layer.weight, at * inputs);
+    bias.set(layer.bias, at);
+    at += 4 * blocksOf(layer.outputs);
+  }
+  return { weight, bias, inputs, outputs };
+}
+
+export class GpuEvaluator {
+  /**
+   * Throws TooLarge where the scene's networks or planes are larger than shaders take.
+   *
+   * @param {Gpu} gpu @param {Scene} scene
+   */
+  constructor(gpu, scene) {
+    this._gpu = gpu;
+    this._scene = scene;
+    const { anchors, feature, slots } = widthsOf(scene);
+    this._features = feature;
+    this._slots = slots;
+    this._featureBlocks = blocksOf(feature);
+    this._offsetBlock = FEATURE_BLOCK + this._featureBlocks;
+    this._blocks = this._offsetBlock + slots;
+    this._width = widthFor(anchors);
+    this._height = Math.ceil(anchors / this._width);
+    if (this._width > gpu.maxSide) throw new TooLarge(`${anchors} anchors`);
+    if (this._blocks > gpu.maxLayers) throw new TooLarge(`${slots} Gaussians of an anchor`);
+
+    const networks = [scene.networks.opacity, scene.networks.covariance, scene.networks.color];
+    const scaffolds = networks.map((network) => new Scaffold(gpu, network, feature));
+    this._opacity = scaffolds[0];
+    this._covariance = scaffolds[1];
+    this._color = scaffolds[2];
+    this._scaffolds = scaffolds;
+    scaffolds.reduce((at, scaffold) => {
+      scaffold.firstBlock = at;
+      return at + scaffold.blocks;
+    }, 0);
+    this._first = new Linear(gpu, stack(scaffolds.map((scaffold) => scaffold.features)));
+    if (this._first.paddedBlocks > gpu.maxLayers) throw new TooLarge("the networks' first layers");
+    const blocks = this._blocks * (scene.globalDeformation ? 2 : 1) + this._first.paddedBlocks + blocksOf(slots);
+    if (16 * this._width * this._height * blocks > MAX_BYTES) throw new TooLarge(`${anchors} anchors`);
+    this._anchors = gpu.field(this._width, this._height, this._blocks, this._attributes());
+    this._before = gpu.field(this._width, this._height, this._first.paddedBlocks);
+    this._opacityLast = new Linear(gpu, this._opacity.last);
+    this._opacities = gpu.field(this._width, this._height, this._opacityLast.paddedBlocks);
+    this._directions = scaffolds.map((scaffold) => gpu.uniforms(scaffold.direction));
+    this._shapes = this._uploadShapes();
+
+    const unit = deformationUnit(scene);
+    const { global, local } = levelOf(scene, 2);
+    this._global =
+      global &&
+      new FieldPass(
+        gpu,
+        global,
+        scene.info.box,
+        unit,
+        {
+          position: 0,
+          scaling: 4,
+          scalingRun: 3,
+          feature: 4 * FEATURE_BLOCK,
+          offset: 4 * this._offsetBlock,
+          offsetRun: 3,
+        },
+        this._blocks,
+      );
+    this._residual = this._global && gpu.field(this._width, this._height, this._global.outputBlocks);
+    const places = { mean: 0, opacity: 3, scale: 4, quat: 8, color: 12 };
+    this._local = local && new FieldPass(gpu, local, scene.info.box, unit, places, SPLAT_BLOCKS);
+
+    /** @type {WebGLTexture | null} */
+    this._codes = null;
+    /** @type {WebGLTexture | null} */
+    this._list = null;
+    /** Of the listed Gaussians. @type {Field | null} */
+    this._means = null;
+    /** @type {Field | null} */
+    this._changes = null;
+    /** @type {List} */
+    this._listed = { width: 16, rows: 0, entries: new Uint32Array(0), starts: new Uint32Array(slots + 1), count: 0 };
+    /** What the textures hold: level, time, camera's centre. @type {number | null} */
+    this._level = null;
+    /** @type {number | null} */
+    this._time = null;
+    /** @type {number[] | null} */
+    this._eye = null;
+    /** Whether the listed Gaussians' means and changes are those of the time. */
+    this._current = false;
+  }
+
+  /** Anchors' attributes, [blocks, height, width, 4]. */
+  _attributes() {
+    const { anchor, feature, scalingLog, offset } = this._scene;
+    const { _features: F, _slots: S } = this;
+    const plane = this._width * this._height * 4;
+    const out = new Float32Array(plane * this._blocks);
+    const n = anchor.length / 3;
+    /** @param {Float32Array} from @param {number} width @param {number} run @param {number} block */
+    const put = (from, width, run, block) => {
+      for (let k = 0; k < width; k++) {
+        const to = (block + Math.floor(k / run) * blocksOf(run) + ((k % run) >> 2)) * plane + ((k % run) & 3);
+        for (let a = 0; a < n; a++) out[to + 4 * a] = from[width * a + k];
+      }
+    };
+    put(anchor, 3, 3, 0);
+    put(scalingLog, 6, 3, 1);
+    put(feature, F, F, FEATURE_BLOCK);
+    put(offset, 3 * S, 3, this._offsetBlock);
+    return out;
+  }
+
+  /** Last layers of shape and colour, one chunk per slot: (v 0..2, 0), v 3..6, (w, 0). */
+  _uploadShapes() {
+    const gpu = this._gpu;
+    const { last: covariance } = this._covariance;
+    const { last: color } = this._color;
+    const shapeBytes = 2 * (16 + 64 * blocksOf(covariance.inputs));
+    const colorBytes = 16 + 64 * blocksOf(color.inputs);
+    /** @param {number} bytes */
+    const align = (bytes) => Math.ceil(bytes / gpu.uniformAlignment) * gpu.uniformAlignment;
+    if (Math.max(shapeBytes, colorBytes) > gpu.maxUniformBytes) throw new TooLarge("the networks' last layers");
+    const colorAt = align(shapeBytes);
+    const stride = colorAt + align(colorBytes);
+    const data = new Float32Array((stride * this._slots) / 4);
+    for (let i = 0; i < this._slots; i++) {
+      const at = (stride * i) / 4;
+      const shape = stack([rowsOf(covariance, 7 * i, 3), rowsOf(covariance, 7 * i + 3, 4)]);
+      pack(shape, 0, 2, data.subarray(at, at + shapeBytes / 4));
+      pack(rowsOf(color, 3 * i, 3), 0, 1, data.subarray(at + colorAt / 4, at + (colorAt + colorBytes) / 4));
+    }
+    return { buffer: gpu.uniforms(data), stride, shapeBytes, colorAt, colorBytes };
+  }
+
+  /**
+   * Evaluates a level at a time for a camera's centre.
+   *
+   * @param {number} level 0, 1 or 2 @param {number} t normalised time @param {number[]} eye
+   * @param {Splats | null} into what may be overwritten
+   * @param {Lister} lister makes the list of kept Gaussians
+   * @returns {Promise<Evaluated>}
+   */
+  async evaluate(level, t, eye, into, lister) {
+    const gpu = this._gpu;
+    const { number, rows, codes, global, local } = levelOf(this._scene, level);
+    const lines = Math.ceil(rows / this._width);
+    const levelMoved = number !== this._level;
+    const timeMoved = levelMoved || (t !== this._time && !!(global || local));
+    const anchorsMoved = levelMoved || (t !== this._time && !!global);
+    const eyeMoved = !this._eye || [0, 1, 2].some((k) => this._eye?.[k] !== eye[k]);
+    if (levelMoved) {
+      const padded = new Uint8Array(this._width * this._height);
+      padded.set(codes);
+      gpu.free(this._codes);
+      this._codes = gpu.plain(this._width, this._height, padded);
+    }
+    this._level = null; // until all is done, the textures hold nothing in particular
+    const residual = global ? this._residual : null;
+    if (anchorsMoved) {
+      if (residual) this._global?.run(t, this._anchors, lines, residual);
+      this._runFirst(residual, lines);
+    }
+    if (timeMoved) this._current = false;
+    if (anchorsMoved || eyeMoved) {
+      this._runOpacities(residual, eye, lines);
+      const opacities = await gpu.read(this._opacities, 0, blocksOf(this._slots), lines);
+      const previous = timeMoved ? null : this._listed;
+      const list = await lister.list(opacities, this._slots, lines * this._width, previous);
+      if (list) this._setList(list);
+    }
+    const moved = !this._current;
+    if (!this._current) {
+      this._runMeans(residual);
+      if (local && this._changes && this._means) this._local?.run(t, this._means, this._listed.rows, this._changes);
+      this._current = true;
+    }
+    const splats = this._runShapes(residual, local ? this._changes : null, eye, into);
+    this._level = number;
+    this._time = t;
+    this._eye = eye;
+    return { splats, means: moved ? await gpu.read(splats.field, 0, 1, this._listed.rows) : null };
+  }
+
+  /** The Gaussians of the last evaluation: anchor · slots + i of each texel, NO_ENTRY where there is none. */
+  slotsOfTexels() {
+    return this._listed.entries.map((e) =>
+      e === NO_ENTRY ? NO_ENTRY : (e & (2 ** ANCHOR_BITS - 1)) * this._slots + (e >>> ANCHOR_BITS),
+    );
+  }
+
+  /** First layers. @param {Field | null} residual @param {number} lines */
+  _runFirst(residual, lines) {
+    const gpu = this._gpu;
+    const linear = this._first;
+    const program = gpu.program(
+      linear.declare(0) +
+        targets(linear.chunkBlocks) +
+        anchorSource(residual) +
+        `void main() {
+ivec2 p = ivec2(gl_FragCoord.xy);
+${repeat(linear.inputBlocks, (k) => `vec4 x${k} = anchorBlock(p, ${FEATURE_BLOCK + k});`)}
+${linear.apply(0, "x", "y", false)}
+${repeat(linear.chunkBlocks, (i) => `out${i} = y${i};`)}}`,
+    );
+    gpu.use(program, this._anchorTextures(residual));
+    for (let c = 0; c < linear.chunks; c++) {
+      linear.bind(0, c);
+      gpu.cover(this._before, c * linear.chunkBlocks, linear.chunkBlocks, 0, lines);
+    }
+  }
+
+  /** @param {Field | null} residual @returns {Record<string, Field>} */
+  _anchorTextures(residual) {
+    return residual ? { anchors: this._anchors, residual } : { anchors: this._anchors };
+  }
+
+  /** @param {Field | null} residual @param {number[]} eye @param {number} lines */
+  _runOpacities(residual, eye, lines) {
+    const gpu = this._gpu;
+    for (const scaffold of this._scaffolds) {
+      if (scaffold.middle.length) this._runMiddle(scaffold, residual, eye, lines);
+    }
+    const linear = this._opacityLast;
+    const front = this._front(this._opacity, 1);
+    const program = gpu.program(
+      linear.declare(0) +
+        front.declare +
+        targets(linear.chunkBlocks) +
+        anchorSource(residual) +
+        `uniform sampler2D codes;
+uniform vec3 eye;
+void main() {
+ivec2 p = ivec2(gl_FragCoord.xy);
+vec3 d = anchorBlock(p, 0).xyz - eye;
+d /= max(length(d), 1e-30);
+${front.compute("x")}
+${linear.apply(0, "x", "y", false)}
+float gate = texelFetch(codes, p, 0).r;
+${repeat(linear.chunkBlocks, (i) => `y${i} = tanh(clamp(y${i}, -15., 15.));`)}
+${repeat(linear.chunkBlocks, (i) => `out${i} = y${i} * vec4(greaterThanEqual(y${i} * gate, vec4(1. / 255.)));`)}}`,
+    );
+    gpu.use(program, {
+      ...this._anchorTextures(residual),
+      ...front.textures,
+      codes: /** @type {WebGLTexture} */ (this._codes),
+    });
+    gpu.gl.uniform3fv(program.uniform("eye"), eye);
+    front.bind();
+    for (let c = 0; c < linear.chunks; c++) {
+      linear.bind(0, c);
+      gpu.cover(this._opacities, c * linear.chunkBlocks, linear.chunkBlocks, 0, lines);
+    }
+  }
+
+  /** Layers between first and last. @param {Scaffold} scaffold @param {Field | null} residual
+   * @param {number[]} eye @param {number} lines */
+  _runMiddle(scaffold, residual, eye, lines) {
+    const gpu = this._gpu;
+    const most = Math.max(...scaffold.middle.map((linear) => linear.paddedBlocks));
+    if (most > gpu.maxLayers) throw new TooLarge("a network's layers");
+    const front = this._front(scaffold, 1, true);
+    let from = gpu.field(this._width, this._height, scaffold.blocks);
+    const count = Math.min(gpu.maxTargets, scaffold.blocks);
+    // the first layer, block by block: it is a copy with the direction's share added
+    for (let b = 0; b < scaffold.blocks; b += count) {
+      const some = Math.min(count, scaffold.blocks - b);
+      const program = gpu.program(
+        front.declare +
+          targets(some) +
+          anchorSource(residual) +
+          `uniform vec3 eye;
+void main() {
+ivec2 p = ivec2(gl_FragCoord.xy);
+vec3 d = anchorBlock(p, 0).xyz - eye;
+d /= max(length(d), 1e-30);
+${front.compute("x")}
+${repeat(some, (i) => `out${i} = x${b + i};`)}}`,
+      );
+      gpu.use(program, { ...this._anchorTextures(residual), ...front.textures });
+      gpu.gl.uniform3fv(program.uniform("eye"), eye);
+      front.bind();
+      gpu.cover(from, b, some, 0, lines);
+    }
+    for (const linear of scaffold.middle) {
+      const to = gpu.field(this._width, this._height, linear.paddedBlocks);
+      runLinear(gpu, linear, from, to, 0, lines, 0, true);
+      gpu.free(from);
+      from = to;
+    }
+    gpu.free(scaffold.hidden);
+    scaffold.hidden = from;
+  }
+
+  /**
+   * How a shader gets at what the last layer of a network takes, at anchor p seen in direction d.
+   *
+   * @param {Scaffold} scaffold @param {number} index of the uniform block with the direction's weights
+   * @param {boolean} [first] what the layer behind the first one takes, where that is not the last
+   * @returns {{declare: string, compute: (to: string) => string, textures: Record<string, Field>, bind: () => void}}
+   */
+  _front(scaffold, index, first = false) {
+    const { gl } = this._gpu;
+    if (scaffold.hidden && !first) {
+      const name = `hidden${index}`;
+      return {
+        declare: `uniform sampler2DArray ${name};\n`,
+        compute: (to) =>
+          repeat(scaffold.hiddenBlocks, (k) => `vec4 ${to}${k} = texelFetch(${name}, ivec3(p, ${k}), 0);`),
+        textures: { [name]: scaffold.hidden },
+        bind: () => {},
+      };
+    }
+    const which = this._scaffolds.indexOf(scaffold);
+    return {
+      declare: `${index === 1 ? "uniform sampler2DArray before;\n" : ""}
+layout(std140) uniform U${index} { vec4 v${index}[${3 * scaffold.blocks}]; };\n`,
+      compute: (to) =>
+        repeat(scaffold.blocks, (k) => {
+          const sum = `texelFetch(before, ivec3(p, ${scaffold.firstBlock + k}), 0)
+  + v${index}[${3 * k}] * d.x + v${index}[${3 * k + 1}] * d.y + v${index}[${3 * k + 2}] * d.z`;
+          return `vec4 ${to}${k} = ${scaffold.relu ? `max(${sum}, 0.)` : sum};`;
+        }),
+      textures: { before: this._before },
+      bind: () => gl.bindBufferBase(gl.UNIFORM_BUFFER, index, this._directions[which]),
+    };
+  }
+
+  /** @param {List} list */
+  _setList(list) {
+    const gpu = this._gpu;
+    const height = list.entries.length / list.width;
+    if (Math.max(list.width, height) > gpu.maxSide) throw new TooLarge(`${list.count} Gaussians`);
+    gpu.free(this._list);
+    this._list = gpu.plain(list.width, height, list.entries);
+    if (this._means?.width !== list.width || this._means.height !== height) {
+      gpu.free(this._means, this._changes);
+      this._means = gpu.field(list.width, height, 1);
+      this._changes = this._local && gpu.field(list.width, height, this._local.outputBlocks);
+    }
+    this._listed = list;
+    this._current = false;
+  }
+
+  /** Means before the local deformation. @param {Field | null} residual */
+  _runMeans(residual) {
+    if (!this._means || !this._list || !this._listed.rows) return;
+    const gpu = this._gpu;
+    const program = gpu.program(
+      targets(1) +
+        anchorSource(residual) +
+        entrySource(this._width) +
+        `void main() {
+  uint entry = texelFetch(list, ivec2(gl_FragCoord.xy), 0).r;
+  out0 = vec4(0);
+  if (entry == ${NO_ENTRY}u) return;
+  ivec2 p = anchorOf(entry);
+  vec3 offset = anchorBlock(p, ${this._offsetBlock} + int(entry >> ${ANCHOR_BITS})).xyz;
+  out0 = vec4(anchorBlock(p, 0).xyz + offset * exp(anchorBlock(p, 1).xyz), 0);
+}`,
+    );
+    gpu.use(program, { ...this._anchorTextures(residual), list: this._list });
+    gpu.cover(this._means, 0, 1, 0, this._listed.rows);
+  }
+
+  /**
+   * @param {Field | null} residual @param {Field | null} changes of the local deformation
+   * @param {number[]} eye @param {Splats | null} into
+   * @returns {Splats}
+   */
+  _runShapes(residual, changes, eye, into) {
+    const gpu = this._gpu;
+    const { gl } = gpu;
+    const { width, starts, rows } = this._listed;
+    const height = Math.max(this._listed.entries.length / width, 1);
+    let field = into?.field;
+    if (!field || field.width !== width || field.height !== height) {
+      gpu.free(field);
+      field = gpu.field(width, height, SPLAT_BLOCKS);
+    }
+    const splats = { field, texels: rows * width };
+    if (!rows || !this._means || !this._list || !this._codes) return splats;
+    const covariance = this._front(this._covariance, 1);
+    const color = this._front(this._color, 2);
+    const shapes = this._shapes;
+    const K = this._covariance.hiddenBlocks;
+    const L = this._color.hiddenBlocks;
+    const program = gpu.program(
+      targets(SPLAT_BLOCKS) +
+        anchorSource(residual) +
+        entrySource(this._width) +
+        covariance.declare +
+        (color.textures.before && !covariance.textures.before ? "uniform sampler2DArray before;\n" : "") +
+        color.declare +
+        `layout(std140) uniform U3 { vec4 b3[2]; mat4 w3[${2 * K}]; };
+layout(std140) uniform U4 { vec4 b4; mat4 w4[${L}]; };
+uniform sampler2DArray means, opacities${changes ? ", changes" : ""};
+uniform sampler2D codes;
+uniform vec3 eye;
+vec4 unit(vec4 q) {
+  float n = length(q);
+  return n > 0. ? q / n : vec4(1, 0, 0, 0);
+}
+void main() {
+  ivec2 g = ivec2(gl_FragCoord.xy);
+  uint entry = texelFetch(list, g, 0).r;
+  out0 = vec4(0, 0, 0, -1);
+  out1 = out2 = out3 = vec4(0);
+  if (entry == ${NO_ENTRY}u) return;
+  ivec2 p = anchorOf(entry);
+  int slot = int(entry >> ${ANCHOR_BITS});
+  float opacity = texelFetch(opacities, ivec3(p, slot >> 2), 0)[slot & 3];
+  vec3 mean = texelFetch(means, ivec3(g, 0), 0).xyz;
+  out0 = vec4(mean, 0);
+  if (!(opacity > 0.)) return;
+  vec3 d = anchorBlock(p, 0).xyz - eye;
+  d /= max(length(d), 1e-30);
+${covariance.compute("x")}
+  vec4 v = b3[0], q = b3[1], w = b4;
+${repeat(K, (k) => `v += w3[${k}] * x${k}; q += w3[${K + k}] * x${k};`)}
+${color.compute("c")}
+${repeat(L, (k) => `w += w4[${k}] * c${k};`)}
+  vec3 scale = exp(anchorBlock(p, 2).xyz) / (1. + exp(-v.xyz));
+  vec3 color = 1. / (1. + exp(-w.xyz));
+  q = unit(q);
+${
+  changes
+    ? `  vec4 first = texelFetch(changes, ivec3(g, 0), 0), second = texelFetch(changes, ivec3(g, 1), 0);
+  mean += first.xyz;
+  opacity = clamp(opacity + first.w, 0., 1.);
+  scale = max(scale + second.xyz, 0.);
+  q = unit(q + texelFetch(changes, ivec3(g, 2), 0));
+  color = clamp(color + texelFetch(changes, ivec3(g, 3), 0).xyz, 0., 1.);`
+    : ""
+}
+  float gate = texelFetch(codes, p, 0).r;
+  out0 = vec4(mean, opacity * gate);
+  out1 = vec4(scale * gate, 0);
+  out2 = q;
+  out3 = vec4(color, 0);
+}`,
+    );
+    /** @type {Record<string, Field | WebGLTexture>} */
+    const textures = {
+      ...this._anchorTextures(residual),
+      ...covariance.textures,
+      ...color.textures,
+      list: this._list,
+      means: this._means,
+      opacities: this._opacities,
+      codes: this._codes,
+    };
+    if (changes) textures.changes = changes;
+    gpu.use(program, textures);
+    gl.uniform3fv(program.uniform("eye"), eye);
+    covariance.bind();
+    color.bind();
+    for (let i = 0; i < this._slots; i++) {
+      if (starts[i + 1] === starts[i]) continue;
+      gl.bindBufferRange(gl.UNIFORM_BUFFER, 3, shapes.buffer, shapes.stride * i, shapes.shapeBytes);
+      gl.bindBufferRange(gl.UNIFORM_BUFFER, 4, shapes.buffer, shapes.stride * i + shapes.colorAt, shapes.colorBytes);
+      gpu.cover(field, 0, SPLAT_BLOCKS, starts[i], starts[i + 1] - starts[i]);
+    }
+    return splats;
+  }
+
+  free() {
+    const { gl } = this._gpu;
+    this._gpu.free(this._anchors, this._before, this._opacities, this._residual, this._codes);
+    this._gpu.free(this._list, this._means, this._changes);
+    for (const buffer of this._directions) gl.deleteBuffer(buffer);
+    gl.deleteBuffer(this._shapes.buffer);
+    this._global?.free();
+    this._local?.free();
+    this._first.free();
+    this._opacityLast.free();
+    for (const scaffold of this._scaffolds) scaffold.free();
+  }
+}
+
+/** Some outputs of a layer. @param {Network[number]} layer @param {number} first @param {number} count */
+function rowsOf({ weight, bias, inputs }, first, count) {
+  return {
+    weight: weight.subarray(first * inputs, (first + count) * inputs),
+    bias: bias.subarray(first, first + count),
+    inputs,
+    outputs: count,
+  };
+}
+
+/** Source that reads anchors' attributes, deformed if there is a residual. @param {Field | null} residual */
+function anchorSource(residual) {
+  return `uniform sampler2DArray anchors${residual ? ", residual" : ""};
+vec4 anchorBlock(ivec2 p, int block) {
+  return texelFetch(anchors, ivec3(p, block), 0)${residual ? " + texelFetch(residual, ivec3(p, block), 0)" : ""};
+}
+`;
+}
+
+/** Source that reads the list of kept Gaussians. @param {number} width of the anchors' textures */
+function entrySource(width) {
+  return `uniform usampler2D list;
+ivec2 anchorOf(uint entry) {
+  int a = int(entry & ${2 ** ANCHOR_BITS - 1}u);
+  return ivec2(a % ${width}, a / ${width});
+}
+`;
+}
+
+/**
+ * The kept Gaussians, slot after slot. entries: [height, width] texels, an anchor's number and above it the slot, or
+ * NO_ENTRY. starts: the row of texels where each slot starts, and where the last one ends. rows: that end.
+ *
+ * @typedef {{width: number, rows: number, entries: Uint32Array, starts: Uint32Array, count: number}} List
+ */
+
+/**
+ * Makes the list of Gaussians with an opacity. With a list before, the new one has its Gaussians as well, and is null
+ * if it would be the same.
+ *
+ * @typedef {object} Lister
+ * @property {(...args: [opacities: Float32Array, slots: number, anchors: number, previous: List | null])
+ *   => Promise<List | null>} list
+ */

@@ -1,0 +1,257 @@
+// A deformation on the GPU: HexPlane, trunk and heads at points that lie in a texture.
+
+import { blocksOf, Linear, repeat, targets, TooLarge } from "./layers.js";
+import { LENGTH_HEADS, sliceAt, SPATIAL, TEMPORAL } from "./planes.js";
+
+/** @typedef {import("./gl.js").Gpu} Gpu */
+/** @typedef {import("./gl.js").Field} Field */
+/** @typedef {import("../decode/scene.js").Deformation} Deformation */
+/** @typedef {import("../decode/scene.js").Network} Network */
+
+export class FieldPass {
+  /**
+   * @param {Gpu} gpu @param {Deformation} deformation @param {import("../decode/scene.js").Info["box"]} box
+   * @param {number} unit of length heads, scene units
+   * @param {Record<string, number>} places how the outputs are laid out, see `joinHeads` @param {number} blocks of them
+   */
+  constructor(gpu, deformation, box, unit, places, blocks) {
+    this._gpu = gpu;
+    this._deformation = deformation;
+    this._box = box;
+    const { channels } = deformation.planes[0].xy;
+    this._scales = deformation.planes.length;
+    this._channelBlocks = blocksOf(channels);
+    const { trunk, ...heads } = deformation.networks;
+    // a scale's channels are padded to whole blocks; so are the columns that take them
+    const first = padInputs(trunk[0], channels, this._scales);
+    const layers = [first, ...trunk.slice(1), joinHeads(heads, unit, places, 4 * blocks)];
+    this._linears = layers.map((layer) => new Linear(gpu, layer));
+    this._scratchBlocks = Math.max(
+      this._scales * this._channelBlocks,
+      ...this._linears.slice(0, -1).map((linear) => linear.paddedBlocks),
+    );
+    if (this._scratchBlocks > gpu.maxLayers) throw new TooLarge(`a network of ${4 * this._scratchBlocks} outputs`);
+    /** What the outputs' field must have room for. */
+    this.outputBlocks = this._linears[this._linears.length - 1].paddedBlocks;
+    this._planes = deformation.planes.map((planes) => this._upload(planes));
+    this._cells = Math.max(...deformation.planes.flatMap((planes) => TEMPORAL.map(([name]) => planes[name].width)));
+    if (this._cells > gpu.maxSide) throw new TooLarge(`${this._cells} cells`);
+    this._rowData = new Float32Array(this._channelBlocks * 3 * this._scales * this._cells * 4);
+    this._rows = gpu.field(this._cells, 3 * this._scales, this._channelBlocks);
+    /** @type {number | null} */
+    this._time = null;
+    /** @type {Field[]} */
+    this._scratch = [];
+  }
+
+  /** The three spatial planes of a scale, block after block. @param {Deformation["planes"][number]} planes */
+  _upload(planes) {
+    const gpu = this._gpu;
+    const width = Math.max(...SPATIAL.map(([name]) => planes[name].width));
+    const height = Math.max(...SPATIAL.map(([name]) => planes[name].height));
+    const layers = 3 * this._channelBlocks;
+    const fits = Math.max(width, height) <= gpu.maxSide && layers <= gpu.maxLayers;
+    if (!fits) throw new TooLarge(`planes of ${width} × ${height} × ${4 * this._channelBlocks}`);
+    const data = new Float32Array(layers * width * height * 4);
+    SPATIAL.forEach(([name], p) => {
+      const plane = planes[name];
+      for (let c = 0; c < plane.channels; c++) {
+        const to = (p * this._channelBlocks + (c >> 2)) * height * width * 4 + (c & 3);
+        const from = c * plane.height * plane.width;
+        for (let j = 0; j < plane.height; j++) {
+          for (let i = 0; i < plane.width; i++) data[to + (j * width + i) * 4] = plane.data[from + j * plane.width + i];
+        }
+      }
+    });
+    return gpu.field(width, height, layers, data);
+  }
+
+  /** Brings the rows of the planes with time to time t. @param {number} t 0..1 */
+  _setTime(t) {
+    if (t === this._time) return;
+    this._time = t;
+    const { _cells: cells, _scales: scales, _rowData: data } = this;
+    this._deformation.planes.forEach((planes, s) =>
+      TEMPORAL.forEach(([name], p) =>
+        sliceAt(planes[name], t, (c, i, value) => {
+          data[(((c >> 2) * 3 * scales + 3 * s + p) * cells + i) * 4 + (c & 3)] = value;
+        }),
+      ),
+    );
+    this._gpu.write(this._rows, data);
+  }
+
+  /**
+   * Residuals at points, into a field of at least `outputBlocks` blocks. Block 0 of `points` holds their positions.
+   *
+   * @param {number} t 0..1 @param {Field} points @param {number} rows rows of texels that count @param {Field} out of
+   * the points' size
+   */
+  run(t, points, rows, out) {
+    this._setTime(t);
+    const band = Math.max(1, Math.floor(this._gpu.bandPoints / points.width));
+    for (let row = 0; row < rows; row += band) this._runBand(points, row, Math.min(band, rows - row), out);
+  }
+
+  /** @param {Field} points @param {number} row @param {number} rows @param {Field} out */
+  _runBand(points, row, rows, out) {
+    const gpu = this._gpu;
+    const { gl } = gpu;
+    const B = this._channelBlocks;
+    const some = Math.min(B, gpu.maxTargets);
+    const program = gpu.program(
+      targets(some) +
+        this._sampler() +
+        `void main() {
+vec3 u = place(texelFetch(points, ivec3(gl_FragCoord.xy, 0) + ivec3(0, shift, 0), 0).xyz);
+${this._sample(some)}
+${repeat(some, (i) => `out${i} = h${i};`)}}`,
+    );
+    let from = this._room(0, points.width, rows);
+    this._planes.forEach((planes, s) => {
+      gpu.use(program, { points, planes, rows: this._rows });
+      const { xy, xz } = this._deformation.planes[s];
+      gl.uniform3fv(program.uniform("low"), this._box[0]);
+      gl.uniform3fv(program.uniform("high"), this._box[1]);
+      gl.uniform3f(program.uniform("cells"), xy.width, xy.height, xz.height);
+      gl.uniform1i(program.uniform("firstRow"), 3 * s);
+      gl.uniform1i(program.uniform("shift"), row);
+      for (let b = 0; b < B; b += some) {
+        const first = Math.min(b, B - some);
+        gl.uniform1i(program.uniform("block"), first);
+        gpu.cover(from, s * B + first, some, 0, rows);
+      }
+    });
+    this._linears.forEach((linear, i) => {
+      const last = i === this._linears.length - 1;
+      const to = last ? out : this._room((i + 1) % 2, points.width, rows);
+      if (last) runLinear(gpu, linear, from, to, row, rows, -row, false);
+      else runLinear(gpu, linear, from, to, 0, rows, 0, true);
+      from = to;
+    });
+  }
+
+  /** A scratch field. @param {number} i 0 or 1 @param {number} width @param {number} rows */
+  _room(i, width, rows) {
+    const had = this._scratch[i];
+    if (had && had.width === width && had.height >= rows) return had;
+    this._gpu.free(had);
+    return (this._scratch[i] = this._gpu.field(width, rows, this._scratchBlocks));
+  }
+
+  /** Source of the functions that sample planes. */
+  _sampler() {
+    return `uniform sampler2DArray points, planes, rows;
+uniform vec3 low, high, cells;
+uniform int firstRow, shift, block;
+vec3 place(vec3 p) {
+  vec3 u = (p - low) / (high - low);
+  return vec3(p.x > low.x ? p.x >= high.x ? 1. : u.x : 0., p.y > low.y ? p.y >= high.y ? 1. : u.y : 0.,
+    p.z > low.z ? p.z >= high.z ? 1. : u.z : 0.);
+}
+vec4 plane(int z, ivec2 a, ivec2 b, vec2 f) {
+  return mix(mix(texelFetch(planes, ivec3(a, z), 0), texelFetch(planes, ivec3(b.x, a.y, z), 0), f.x),
+    mix(texelFetch(planes, ivec3(a.x, b.y, z), 0), texelFetch(planes, ivec3(b, z), 0), f.x), f.y);
+}
+vec4 row(int y, int a, int b, float f, int z) {
+  return mix(texelFetch(rows, ivec3(a, y, z), 0), texelFetch(rows, ivec3(b, y, z), 0), f);
+}
+`;
+  }
+
+  /** Source that samples the planes of a scale at u. @param {number} blocks of channels, from `block` on */
+  _sample(blocks) {
+    const B = this._channelBlocks;
+    const names = ["x", "y", "z"];
+    return `vec3 at = u * (cells - 1.);
+ivec3 a = ivec3(at), b = min(a + 1, ivec3(cells) - 1);
+vec3 f = at - vec3(a);
+${repeat(blocks, (c) => {
+  const spatial = SPATIAL.map(([, i, j], p) => {
+    const ij = names[i] + names[j];
+    return `plane(block + ${p * B + c}, a.${ij}, b.${ij}, f.${ij})`;
+  });
+  const temporal = TEMPORAL.map(([, i], p) => {
+    const n = names[i];
+    return `row(firstRow + ${p}, a.${n}, b.${n}, f.${n}, block + ${c})`;
+  });
+  return `vec4 h${c} = ${[...spatial, ...temporal].join("\n  * ")};`;
+})}`;
+  }
+
+  free() {
+    this._gpu.free(...this._planes, this._rows, ...this._scratch);
+    for (const linear of this._linears) linear.free();
+  }
+}
+
+/**
+ * One linear layer from field to field.
+ *
+ * @param {Gpu} gpu @param {Linear} linear @param {Field} from @param {Field} to
+ * @param {number} row @param {number} rows of texels, in `to` @param {number} shift from there to the rows of `from`
+ * @param {boolean} relu
+ */
+export function runLinear(gpu, linear, from, to, row, rows, shift, relu) {
+  const program = gpu.program(
+    linear.declare(0) +
+      targets(linear.chunkBlocks) +
+      `uniform sampler2DArray source;
+uniform int shift;
+void main() {
+ivec2 p = ivec2(gl_FragCoord.xy) + ivec2(0, shift);
+${repeat(linear.inputBlocks, (k) => `vec4 x${k} = texelFetch(source, ivec3(p, ${k}), 0);`)}
+${linear.apply(0, "x", "y", relu)}
+${repeat(linear.chunkBlocks, (i) => `out${i} = y${i};`)}}`,
+  );
+  gpu.use(program, { source: from });
+  gpu.gl.uniform1i(program.uniform("shift"), shift);
+  for (let c = 0; c < linear.chunks; c++) {
+    linear.bind(0, c);
+    gpu.cover(to, c * linear.chunkBlocks, linear.chunkBlocks, row, rows);
+  }
+}
+
+/**
+ * The layer with the columns of each scale padded to whole blocks.
+ *
+ * @param {Network[number]} layer @param {number} channels @param {number} scales
+ * @returns {Network[number]}
+ */
+function padInputs(layer, channels, scales) {
+  const padded = 4 * blocksOf(channels);
+  if (padded === channels) return layer;
+  const weight = new Float32Array(layer.outputs * padded * scales);
+  for (let o = 0; o < layer.outputs; o++) {
+    for (let s = 0; s < scales; s++) {
+      const from = o * layer.inputs + s * channels;
+      weight.set(layer.weight.subarray(from, from + channels), (o * scales + s) * padded);
+    }
+  }
+  return { weight, bias: layer.bias, inputs: padded * scales, outputs: layer.outputs };
+}
+
+/**
+ * All heads as one layer. `places` says where each output goes: head name to the first of its outputs, which follow
+ * each other in runs of `${name}Run` (default: all) that start on whole blocks.
+ *
+ * @param {Record<string, Network>} heads @param {number} unit @param {Record<string, number>} places
+ * @param {number} outputs
+ * @returns {Network[number]}
+ */
+function joinHeads(heads, unit, places, outputs) {
+  const inputs = Object.values(heads)[0][0].inputs;
+  const weight = new Float32Array(inputs * outputs);
+  const bias = new Float32Array(outputs);
+  for (const [name, network] of Object.entries(heads)) {
+    if (network.length > 1) throw new TooLarge("a head of several layers");
+    const factor = LENGTH_HEADS.includes(name) ? unit : 1;
+    const run = places[`${name}Run`] ?? network[0].outputs;
+    for (let o = 0; o < network[0].outputs; o++) {
+      const to = places[name] + Math.floor(o / run) * 4 * blocksOf(run) + (o % run);
+      bias[to] = factor * network[0].bias[o];
+      for (let i = 0; i < inputs; i++) weight[to * inputs + i] = factor * network[0].weight[o * inputs + i];
+    }
+  }
+  return { weight, bias, inputs, outputs };
+}

@@ -1,0 +1,312 @@
+// WebGL2 without its ceremony: array textures of float blocks, passes over them, reading back behind a fence.
+
+const HEADER = `#version 300 es
+precision highp float;
+precision highp int;
+precision highp sampler2D;
+precision highp sampler2DArray;
+precision highp usampler2D;
+`;
+
+/** A triangle that covers the viewport. */
+const COVER = `${HEADER}
+void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4. - 1., 0, 1); }`;
+
+/** Between two looks at a fence, milliseconds. */
+const POLL_MS = 1;
+
+/** The context is gone: whoever waits starts again when it is back. */
+export class ContextLost extends Error {
+  constructor() {
+    super("the WebGL context is lost");
+  }
+}
+
+/**
+ * Texels of four floats in `blocks` layers, all of one size.
+ *
+ * @typedef {{texture: WebGLTexture, width: number, height: number, blocks: number}} Field
+ */
+
+/**
+ * A linked program. uniform: the location of a name.
+ *
+ * @typedef {{program: WebGLProgram, uniform: (name: string) => WebGLUniformLocation | null}} Program
+ */
+
+/** Some blocks of a field. @typedef {{field: Field, block: number}} Target */
+
+export class Gpu {
+  /** @param {WebGL2RenderingContext} gl */
+  constructor(gl) {
+    this.gl = gl;
+    /** Whether textures of floats can be rendered to. */
+    this.floats = !!gl.getExtension("EXT_color_buffer_float");
+    const halves = this.floats || !!gl.getExtension("EXT_color_buffer_half_float");
+    const names = gl.getExtension("WEBGL_debug_renderer_info");
+    /** What draws, in the driver's words. */
+    this.renderer = String(gl.getParameter(names ? names.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
+    /** Whether the processor draws. */
+    this.software = /swiftshader|llvmpipe|software/i.test(this.renderer);
+    /** What pictures are blended in, 0 where there are no floats for it. Half floats are slow in software. */
+    this.pictureFormat =
+      this.software && this.floats && gl.getExtension("EXT_float_blend") ? gl.RGBA32F : halves ? gl.RGBA16F : 0;
+    this.maxTargets = Math.min(gl.getParameter(gl.MAX_DRAW_BUFFERS), gl.getParameter(gl.MAX_COLOR_ATTACHMENTS), 8);
+    this.maxSide = /** @type {number} */ (gl.getParameter(gl.MAX_TEXTURE_SIZE));
+    this.maxLayers = /** @type {number} */ (gl.getParameter(gl.MAX_ARRAY_TEXTURE_LAYERS));
+    this.maxUniformBytes = /** @type {number} */ (gl.getParameter(gl.MAX_UNIFORM_BLOCK_SIZE));
+    this.uniformAlignment = /** @type {number} */ (gl.getParameter(gl.UNIFORM_BUFFER_OFFSET_ALIGNMENT));
+    /** @type {Map<string, Program>} */
+    this._programs = new Map();
+    /** Framebuffers by their targets, of each texture. @type {Map<WebGLTexture, Map<string, WebGLFramebuffer>>} */
+    this._framebuffers = new Map();
+    /** Points that a chain of passes takes at a time, about: what lies between two of them takes memory. */
+    this.bandPoints = 1 << 15;
+    gl.disable(gl.DITHER);
+    gl.pixelStorei(gl.UNPACK_ALIGNMENT, 1);
+  }
+
+  /**
+   * The program of two shaders, `#version` and precisions left out; compiled once.
+   *
+   * @param {string} fragment @param {string} [vertex] default: covers the viewport
+   * @returns {Program}
+   */
+  program(fragment, vertex) {
+    const key = `${vertex}\0${fragment}`;
+    let found = this._programs.get(key);
+    if (!found) {
+      found = this._link(vertex ? HEADER + vertex : COVER, HEADER + fragment);
+      this._programs.set(key, found);
+    }
+    return found;
+  }
+
+  /** @param {string} vertex @param {string} fragment @returns {Program} */
+  _link(vertex, fragment) {
+    const { gl } = this;
+    const program = gl.createProgram();
+    if (!program) throw new ContextLost();
+    for (const [type, source] of /** @type {[number, string][]} */ ([
+      [gl.VERTEX_SHADER, vertex],
+      [gl.FRAGMENT_SHADER, fragment],
+    ])) {
+      const shader = gl.createShader(type);
+      if (!shader) throw new ContextLost();
+      gl.shaderSource(shader, source);
+      gl.compileShader(shader);
+      gl.attachShader(program, shader);
+      if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS) && !gl.isContextLost()) {
+        throw new Error(`a shader does not compile: ${gl.getShaderInfoLog(shader)}`);
+      }
+      gl.deleteShader(shader); // it lives as long as the program
+    }
+    gl.linkProgram(program);
+    if (!gl.getProgramParameter(program, gl.LINK_STATUS)) {
+      if (gl.isContextLost()) throw new ContextLost();
+      throw new Error(`shaders do not link: ${gl.getProgramInfoLog(program)}`);
+    }
+    /** @type {Map<string, WebGLUniformLocation | null>} */
+    const locations = new Map();
+    gl.useProgram(program);
+    const blocks = gl.getProgramParameter(program, gl.ACTIVE_UNIFORM_BLOCKS);
+    for (let i = 0; i < blocks; i++) {
+      // blocks are named U0, U1, ..; each is bound to its number
+      const name = gl.getActiveUniformBlockName(program, i) ?? "";
+      gl.uniformBlockBinding(program, i, Number(name.slice(1)));
+    }
+    return {
+      program,
+      uniform: (name) => {
+        let location = locations.get(name);
+        if (location === undefined) locations.set(name, (location = gl.getUniformLocation(program, name)));
+        return location;
+      },
+    };
+  }
+
+  /**
+   * A field of zeros, or of `data`.
+   *
+   * @param {number} width @param {number} height @param {number} blocks
+   * @param {Float32Array | null} [data] [blocks, height, width, 4]
+   * @param {number} [format] of the texels; default RGBA32F
+   * @returns {Field}
+   */
+  field(width, height, blocks, data = null, format = this.gl.RGBA32F) {
+    const { gl } = this;
+    const texture = this._texture(gl.TEXTURE_2D_ARRAY);
+    gl.texStorage3D(gl.TEXTURE_2D_ARRAY, 1, format, width, height, blocks);
+    const field = { texture, width, height, blocks };
+    if (data) this.write(field, data);
+    return field;
+  }
+
+  /** Overwrites a field of floats. @param {Field} field @param {Float32Array} data [blocks, height, width, 4] */
+  write({ texture, width, height, blocks }, data) {
+    const { gl } = this;
+    gl.bindTexture(gl.TEXTURE_2D_ARRAY, texture);
+    gl.texSubImage3D(gl.TEXTURE_2D_ARRAY, 0, 0, 0, 0, width, height, blocks, gl.RGBA, gl.FLOAT, data);
+  }
+
+  /**
+   * A plain texture of one component.
+   *
+   * @param {number} width @param {number} height @param {Uint8Array | Uint32Array} data [height, width]
+   * @returns {WebGLTexture} R8, read as 0..1, or R32UI
+   */
+  plain(width, height, data) {
+    const { gl } = this;
+    const texture = this._texture(gl.TEXTURE_2D);
+    const [internal, format, type] =
+      data instanceof Uint8Array
+        ? [gl.R8, gl.RED, gl.UNSIGNED_BYTE]
+        : [gl.R32UI, gl.RED_INTEGER, gl.UNSIGNED_INT];
+    gl.texStorage2D(gl.TEXTURE_2D, 1, internal, width, height);
+    gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, 0, width, height, format, type, data);
+    return texture;
+  }
+
+  /** @param {number} target */
+  _texture(target) {
+    const { gl } = this;
+    const texture = gl.createTexture();
+    if (!texture) throw new ContextLost();
+    gl.bindTexture(target, texture);
+    gl.texParameteri(target, gl.TEXTURE_MIN_FILTER, gl.NEAREST);
+    gl.texParameteri(target, gl.TEXTURE_MAG_FILTER, gl.NEAREST);
+    gl.texParameteri(target, gl.TEXTURE_WRAP_S, gl.CLAMP_TO_EDGE);
+    gl.texParameteri(target, gl.TEXTURE_WRAP_T, gl.CLAMP_TO_EDGE);
+    return texture;
+  }
+
+  /** Frees fields and textures. @param {(Field | WebGLTexture | null | undefined)[]} things */
+  free(...things) {
+    const { gl } = this;
+    for (const thing of things) {
+      if (!thing) continue;
+      const texture = "texture" in thing ? thing.texture : thing;
+      for (const framebuffer of this._framebuffers.get(texture)?.values() ?? []) gl.deleteFramebuffer(framebuffer);
+      this._framebuffers.delete(texture);
+      gl.deleteTexture(texture);
+    }
+  }
+
+  /**
+   * Binds a framebuffer onto consecutive blocks of a field.
+   *
+   * @param {Field} field @param {number} first @param {number} count
+   */
+  bindTarget(field, first, count) {
+    const { gl } = this;
+    let framebuffers = this._framebuffers.get(field.texture);
+    if (!framebuffers) this._framebuffers.set(field.texture, (framebuffers = new Map()));
+    const key = `${first} ${count}`;
+    let framebuffer = framebuffers.get(key);
+    if (framebuffer) {
+      gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+      return;
+    }
+    framebuffer = gl.createFramebuffer() ?? undefined;
+    if (!framebuffer) throw new ContextLost();
+    framebuffers.set(key, framebuffer);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+    const buffers = [];
+    for (let i = 0; i < count; i++) {
+      gl.framebufferTextureLayer(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0 + i, field.texture, 0, first + i);
+      buffers.push(gl.COLOR_ATTACHMENT0 + i);
+    }
+    gl.drawBuffers(buffers);
+  }
+
+  /**
+   * Starts a program: its textures are bound in the order of their names.
+   *
+   * @param {Program} program @param {Record<string, Field | WebGLTexture>} textures
+   */
+  use(program, textures) {
+    const { gl } = this;
+    gl.useProgram(program.program);
+    Object.entries(textures).forEach(([name, thing], unit) => {
+      gl.activeTexture(gl.TEXTURE0 + unit);
+      if ("texture" in thing) gl.bindTexture(gl.TEXTURE_2D_ARRAY, thing.texture);
+      else gl.bindTexture(gl.TEXTURE_2D, thing);
+      gl.uniform1i(program.uniform(name), unit);
+    });
+  }
+
+  /** Runs the current program on rows of blocks of a field. @param {Field} field @param {number} first
+   * @param {number} count @param {number} row @param {number} rows */
+  cover(field, first, count, row, rows) {
+    const { gl } = this;
+    this.bindTarget(field, first, count);
+    gl.viewport(0, row, field.width, rows);
+    gl.drawArrays(gl.TRIANGLES, 0, 3);
+  }
+
+  /**
+   * The first `rows` rows of blocks of a field, [count, rows, width, 4], once the GPU has them.
+   *
+   * @param {Field} field @param {number} first @param {number} count @param {number} rows
+   * @returns {Promise<Float32Array>}
+   */
+  async read(field, first, count, rows) {
+    const { gl } = this;
+    const floats = 4 * field.width * rows;
+    const buffer = gl.createBuffer();
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, buffer);
+    gl.bufferData(gl.PIXEL_PACK_BUFFER, 4 * floats * count, gl.STREAM_READ);
+    for (let i = 0; i < count; i++) {
+      this.bindTarget(field, first + i, 1);
+      gl.readPixels(0, 0, field.width, rows, gl.RGBA, gl.FLOAT, 4 * floats * i);
+    }
+    gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
+    try {
+      await this.finished();
+      const out = new Float32Array(floats * count);
+      gl.bindBuffer(gl.PIXEL_PACK_BUFFER, buffer);
+      gl.getBufferSubData(gl.PIXEL_PACK_BUFFER, 0, out);
+      gl.bindBuffer(gl.PIXEL_PACK_BUFFER, null);
+      return out;
+    } finally {
+      gl.deleteBuffer(buffer);
+    }
+  }
+
+  /** Waits until the GPU has done what it was told so far. Throws ContextLost. */
+  async finished() {
+    const fence = this.fence();
+    while (!fence()) await new Promise((resolve) => setTimeout(resolve, POLL_MS));
+  }
+
+  /**
+   * A function that says whether the GPU has done what it was told so far. It throws ContextLost.
+   *
+   * @returns {() => boolean}
+   */
+  fence() {
+    const { gl } = this;
+    const sync = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
+    gl.flush();
+    let done = false;
+    return () => {
+      if (done) return true;
+      if (!sync || gl.isContextLost()) throw new ContextLost();
+      const status = gl.clientWaitSync(sync, 0, 0);
+      if (status === gl.WAIT_FAILED) throw new ContextLost();
+      done = status !== gl.TIMEOUT_EXPIRED;
+      if (done) gl.deleteSync(sync);
+      return done;
+    };
+  }
+
+  /** A uniform buffer. @param {Float32Array} data */
+  uniforms(data) {
+    const { gl } = this;
+    const buffer = gl.createBuffer();
+    if (!buffer) throw new ContextLost();
+    gl.bindBuffer(gl.UNIFORM_BUFFER, buffer);
+    gl.bufferData(gl.UNIFORM_BUFFER, data, gl.STATIC_DRAW);
+    return buffer;
+  }
+}

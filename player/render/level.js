@@ -1,0 +1,58 @@
+// What of a scene a level shows (clause 13.4).
+
+/** @typedef {import("../decode/scene.js").Scene} Scene */
+/** @typedef {import("../decode/scene.js").Deformation} Deformation */
+
+/**
+ * One level of a scene. rows: the anchors that it has, the first ones of the scene's. codes: their gates times 255.
+ *
+ * @typedef {object} Level
+ * @property {number} number the highest layer there is that is at most the level asked for
+ * @property {number} rows
+ * @property {Uint8Array} codes
+ * @property {Deformation | null} global
+ * @property {Deformation | null} local
+ */
+
+/**
+ * Opacities below this never reach a pixel: a picture has 255 steps.
+ */
+export const MIN_OPACITY = 1 / 255;
+
+/** @param {Scene} scene @param {number} level 0, 1 or 2 @returns {Level} */
+export function levelOf(scene, level) {
+  const i = scene.layers.filter((layer) => layer <= level).length - 1;
+  const number = scene.layers[i];
+  return {
+    number,
+    rows: scene.rows[i],
+    codes: scene.mask[i],
+    global: number >= 1 ? scene.globalDeformation : null,
+    local: number >= 2 ? scene.localDeformation : null,
+  };
+}
+
+/** The widths of a scene's arrays. @param {Scene} scene */
+export function widthsOf(scene) {
+  const anchors = scene.anchor.length / 3;
+  return {
+    anchors,
+    feature: scene.networks.opacity[0].inputs - 3,
+    slots: scene.networks.opacity[scene.networks.opacity.length - 1].outputs,
+  };
+}
+
+/**
+ * The unit of the heads position, mean and scale: a quarter of the longest side of the box, scene units.
+ *
+ * @param {Scene} scene
+ */
+export function deformationUnit({ info: { box } }) {
+  return 0.25 * Math.max(...[0, 1, 2].map((k) => box[1][k] - box[0][k]));
+}
+
+/** Normalised time of `seconds` (clause 13.1). @param {Scene["info"]} info @param {number} seconds */
+export function normalisedTime({ timeRange: [start, end] }, seconds) {
+  const t = (seconds - start) / (end - start);
+  return t > 0 ? Math.min(t, 1) : 0; // also where the range is empty
+}

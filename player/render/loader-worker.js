@@ -1,0 +1,58 @@
+// The worker that fetches and decodes: bytes in, one scene per completed layer out.
+
+import { SceneSource } from "../decode/fetch.js";
+import { Stream } from "../decode/stream.js";
+import { serve, tell } from "./serve.js";
+
+/** Between two messages about progress, milliseconds. */
+const PROGRESS_MS = 100;
+
+/**
+ * What is told while a scene loads. ends: where in the file each layer ends, empty until the header is there.
+ *
+ * @typedef {object} News
+ * @property {import("../decode/scene.js").Scene} [scene]
+ * @property {number} bytes
+ * @property {number | null} total
+ * @property {{layer: number, end: number}[]} ends
+ */
+
+let decoder = new Stream();
+/** @type {SceneSource} */
+let source;
+let told = 0;
+
+/** @param {News["scene"]} [scene] */
+function report(scene) {
+  const { received: bytes, total } = source;
+  tell({ told: { ...(scene && { scene }), bytes, total, ends: decoder.layerEnds } });
+  told = performance.now();
+}
+
+serve({
+  /** @param {string | Blob} from */
+  open(from) {
+    source = new SceneSource(typeof from === "string" ? from : URL.createObjectURL(from), {
+      makeDecoder: () => (decoder = new Stream()),
+      progress: () => {
+        if (performance.now() - told > PROGRESS_MS) report();
+      },
+    });
+  },
+
+  /**
+   * Loads on within a budget.
+   *
+   * @param {import("../decode/fetch.js").Budget} budget
+   * @returns {Promise<{bytes: number, complete: boolean}>} complete: whether nothing is left to load
+   */
+  async load(budget) {
+    try {
+      for await (const scene of source.scenes(budget)) report(scene);
+    } finally {
+      report();
+    }
+    const ends = decoder.layerEnds;
+    return { bytes: source.received, complete: ends.length > 0 && decoder.consumed >= ends[ends.length - 1].end };
+  },
+});

@@ -1,0 +1,210 @@
+// Clause 13.5: Gaussians as quads, blended back to front in display space.
+
+import { MIN_OPACITY } from "./level.js";
+
+/** @typedef {import("./gl.js").Gpu} Gpu */
+/** @typedef {import("./evaluator.js").Splats} Splats */
+/** @typedef {import("../decode/scene.js").Camera} Camera */
+
+/** Variance that every Gaussian gets on top, pixels squared. */
+const BLUR = 0.3;
+/** Share of the picture beyond its sides to which the projection's slope is clamped. */
+const MARGIN = 0.15;
+const MAX_ALPHA = 0.999;
+
+/** Quads of an instance. Instances of a single quad are slow on real GPUs and slower in software ones. */
+const BATCH = 128;
+/** Width of the texture of the order. */
+const ORDER_WIDTH = 1024;
+
+/** One quad per Gaussian, as wide as alpha reaches 1/255 along the ellipse's axes. The covariance is U·Uᵀ + blur with U
+ * = J·W·R·S, and its determinant |u0 × u1|² + blur·trace + blur²: without cancellation for needles. */
+const VERTEX = `
+uniform sampler2DArray splats;
+uniform usampler2D order;
+uniform int count;
+uniform vec4 view[3];
+uniform vec4 lens; // fx, fy, cx, cy
+uniform vec4 slopes; // least and largest x/z, y/z
+uniform vec2 size;
+uniform float near;
+flat out vec4 paint;
+out vec2 place;
+void main() {
+  gl_Position = vec4(2, 2, 2, 1); // outside
+  int number = gl_InstanceID * ${BATCH} + (gl_VertexID >> 2);
+  if (number >= count) return;
+  int index = int(texelFetch(order, ivec2(number % ${ORDER_WIDTH}, number / ${ORDER_WIDTH}), 0).r);
+  int width = textureSize(splats, 0).x;
+  ivec2 g = ivec2(index % width, index / width);
+  vec4 head = texelFetch(splats, ivec3(g, 0), 0);
+  vec4 p = vec4(head.xyz, 1);
+  vec3 c = vec3(dot(view[0], p), dot(view[1], p), dot(view[2], p));
+  if (!(c.z > near && head.w > ${MIN_OPACITY} && head.w <= 1.)) return;
+  float iz = 1. / c.z;
+  vec2 slope = clamp(c.xy * iz, slopes.xz, slopes.yw);
+  vec3 j0 = lens.x * iz * (view[0].xyz - slope.x * view[2].xyz);
+  vec3 j1 = lens.y * iz * (view[1].xyz - slope.y * view[2].xyz);
+  vec4 q = texelFetch(splats, ivec3(g, 2), 0);
+  vec3 s = texelFetch(splats, ivec3(g, 1), 0).xyz;
+  vec3 r0 = vec3(1. - 2. * (q.z * q.z + q.w * q.w), 2. * (q.y * q.z + q.x * q.w), 2. * (q.y * q.w - q.x * q.z));
+  vec3 r1 = vec3(2. * (q.y * q.z - q.x * q.w), 1. - 2. * (q.y * q.y + q.w * q.w), 2. * (q.z * q.w + q.x * q.y));
+  vec3 r2 = vec3(2. * (q.y * q.w + q.x * q.z), 2. * (q.z * q.w - q.x * q.y), 1. - 2. * (q.y * q.y + q.z * q.z));
+  vec3 u = vec3(dot(j0, r0), dot(j0, r1), dot(j0, r2)) * s;
+  vec3 v = vec3(dot(j1, r0), dot(j1, r1), dot(j1, r2)) * s;
+  vec3 w = cross(u, v);
+  float a = dot(u, u), b = dot(u, v), d = dot(v, v);
+  float det = dot(w, w) + ${BLUR} * (a + d) + ${BLUR * BLUR};
+  float half_ = .5 * (a - d), root = sqrt(half_ * half_ + b * b);
+  float long_ = .5 * (a + d) + ${BLUR} + root;
+  if (!(long_ < 1e18 && det < 1e36)) return; // also what is not a number
+  vec2 axis = root > 0. ? half_ >= 0. ? vec2(half_ + root, b) : vec2(b, root - half_) : vec2(1, 0);
+  axis = dot(axis, axis) > 0. ? normalize(axis) : vec2(1, 0);
+  float reach = sqrt(2. * log(255. * head.w));
+  vec2 corner = vec2(gl_VertexID & 1, gl_VertexID >> 1 & 1) * 2. - 1.;
+  vec2 extent = reach * sqrt(vec2(long_, det / long_));
+  vec2 pixel = c.xy * iz * lens.xy + lens.zw
+    + corner.x * extent.x * axis + corner.y * extent.y * vec2(-axis.y, axis.x);
+  vec4 color = texelFetch(splats, ivec3(g, 3), 0);
+  if (!(dot(color.rgb, vec3(1)) < 1e9)) return;
+  paint = vec4(color.rgb, head.w);
+  place = corner * reach;
+  gl_Position = vec4(pixel / size * vec2(2, -2) + vec2(-1, 1), 0, 1);
+}`;
+
+const FRAGMENT = `
+flat in vec4 paint;
+in vec2 place;
+out vec4 color;
+void main() {
+  float alpha = min(${MAX_ALPHA}, paint.a * exp(-.5 * dot(place, place)));
+  if (alpha < ${MIN_OPACITY}) discard;
+  color = vec4(paint.rgb * alpha, alpha);
+}`;
+
+/** The picture of floats onto the canvas. */
+const SHOW = `
+uniform sampler2DArray picture;
+out vec4 color;
+void main() { color = vec4(texelFetch(picture, ivec3(gl_FragCoord.xy, 0), 0).rgb, 1); }`;
+
+export class Painter {
+  /** @param {Gpu} gpu */
+  constructor(gpu) {
+    const { gl } = gpu;
+    this._gpu = gpu;
+    const corners = new Uint16Array(6 * BATCH);
+    for (let q = 0; q < BATCH; q++) corners.set([0, 1, 2, 2, 1, 3].map((corner) => 4 * q + corner), 6 * q);
+    this._corners = gl.createBuffer();
+    this._array = gl.createVertexArray();
+    gl.bindVertexArray(this._array);
+    gl.bindBuffer(gl.ELEMENT_ARRAY_BUFFER, this._corners);
+    gl.bufferData(gl.ELEMENT_ARRAY_BUFFER, corners, gl.STATIC_DRAW);
+    gl.bindVertexArray(null);
+    /** @type {WebGLTexture | null} */
+    this._order = null;
+    this._orderRows = 0;
+    this._count = 0;
+    /** Of floats: eight bits would round at every blending. @type {import("./gl.js").Field | null} */
+    this._picture = null;
+    this._warm();
+  }
+
+  /** Draws nothing, so that shaders are compiled before there is something to draw. */
+  _warm() {
+    const gpu = this._gpu;
+    const { gl } = gpu;
+    const nothing = gpu.field(1, 1, 4);
+    this.setOrder(new Uint32Array(1));
+    const K = new Float32Array([1, 0, 1, 0, 1, 1, 0, 0, 1]);
+    this.draw({ field: nothing, texels: 1 }, { viewmat: new Float32Array(16), K, width: 2, height: 2 }, [0, 0, 0], 1);
+    this._count = 0;
+    gpu.free(nothing);
+    gl.flush();
+  }
+
+  /** How many Gaussians are drawn. */
+  get count() {
+    return this._count;
+  }
+
+  /** Takes the order in which to draw, back to front. @param {Uint32Array} order texels of the splats */
+  setOrder(order) {
+    const { gl } = this._gpu;
+    const rows = Math.ceil(order.length / ORDER_WIDTH);
+    if (rows > this._orderRows) {
+      this._gpu.free(this._order);
+      this._orderRows = Math.ceil(1.25 * rows);
+      this._order = this._gpu.plain(ORDER_WIDTH, this._orderRows, new Uint32Array(ORDER_WIDTH * this._orderRows));
+    }
+    gl.bindTexture(gl.TEXTURE_2D, this._order);
+    /** @param {number} row @param {number} height @param {number} width */
+    const put = (row, height, width) => {
+      const from = row * ORDER_WIDTH;
+      gl.texSubImage2D(gl.TEXTURE_2D, 0, 0, row, width, height, gl.RED_INTEGER, gl.UNSIGNED_INT, order, from);
+    };
+    const whole = Math.floor(order.length / ORDER_WIDTH);
+    if (whole) put(0, whole, ORDER_WIDTH);
+    if (whole < rows) put(whole, 1, order.length - whole * ORDER_WIDTH);
+    this._count = order.length;
+  }
+
+  /**
+   * Draws onto the canvas, which has the camera's size.
+   *
+   * @param {Splats | null} splats @param {Camera} camera @param {ArrayLike<number>} background RGB
+   * @param {number} near scene units
+   */
+  draw(splats, { viewmat, K, width, height }, background, near) {
+    const gpu = this._gpu;
+    const { gl } = gpu;
+    if (gpu.pictureFormat) {
+      if (this._picture?.width !== width || this._picture.height !== height) {
+        gpu.free(this._picture);
+        this._picture = gpu.field(width, height, 1, null, gpu.pictureFormat);
+      }
+      gpu.bindTarget(this._picture, 0, 1);
+    } else {
+      gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    }
+    gl.viewport(0, 0, width, height);
+    gl.clearColor(background[0], background[1], background[2], 1);
+    gl.clear(gl.COLOR_BUFFER_BIT);
+    if (splats && this._order && this._count) {
+      const program = gpu.program(FRAGMENT, VERTEX);
+      gpu.use(program, { splats: splats.field, order: this._order });
+      gl.uniform1i(program.uniform("count"), this._count);
+      gl.uniform4fv(program.uniform("view"), viewmat.subarray(0, 12));
+      gl.uniform4f(program.uniform("lens"), K[0], K[4], K[2], K[5]);
+      gl.uniform4f(
+        program.uniform("slopes"),
+        (-K[2] - MARGIN * width) / K[0],
+        (width - K[2] + MARGIN * width) / K[0],
+        (-K[5] - MARGIN * height) / K[4],
+        (height - K[5] + MARGIN * height) / K[4],
+      );
+      gl.uniform2f(program.uniform("size"), width, height);
+      gl.uniform1f(program.uniform("near"), Math.max(near, 1e-6));
+      gl.enable(gl.BLEND);
+      gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
+      gl.bindVertexArray(this._array);
+      gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(this._count / BATCH));
+      gl.bindVertexArray(null);
+      gl.disable(gl.BLEND);
+    }
+    if (this._picture) {
+      const program = gpu.program(SHOW);
+      gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+      gpu.use(program, { picture: this._picture });
+      gl.viewport(0, 0, width, height);
+      gl.drawArrays(gl.TRIANGLES, 0, 3);
+    }
+  }
+
+  free() {
+    const { gl } = this._gpu;
+    gl.deleteBuffer(this._corners);
+    gl.deleteVertexArray(this._array);
+    this._gpu.free(this._order, this._picture);
+  }
+}

@@ -1,0 +1,655 @@
+// A player on a canvas: loads, evaluates, sorts, draws, and does each only when what it depends on has changed.
+
+import { centreOf, defaultCamera, fitted } from "./camera.js";
+import { CpuEvaluator, startWorker } from "./cpu.js";
+import { GpuEvaluator } from "./evaluator.js";
+import { ContextLost, Gpu } from "./gl.js";
+import { deformationUnit, levelOf, normalisedTime } from "./level.js";
+import { Pace } from "./pace.js";
+import { Painter } from "./painter.js";
+import { Remote } from "./remote.js";
+
+/** @typedef {import("../decode/scene.js").Scene} Scene */
+/** @typedef {import("../decode/scene.js").Camera} Camera */
+/** @typedef {import("./evaluator.js").Splats} Splats */
+
+/**
+ * How to play. level: the highest to load and show, default all. time: seconds of the scene's time to start at. bytes,
+ * seconds: how much of the file to load at most, and how long beyond the first layer. evaluator: "gpu" or "cpu",
+ * default what the machine can do. degrade: whether a slow machine gets fewer pixels and lower levels, default true.
+ * pixelRatio: device pixels per CSS pixel, default the window's, at most 2.
+ *
+ * @typedef {object} Options
+ * @property {number | null} [level]
+ * @property {number | null} [time]
+ * @property {boolean} [autoplay]
+ * @property {boolean} [loop]
+ * @property {number | null} [bytes]
+ * @property {number | null} [seconds]
+ * @property {"gpu" | "cpu" | null} [evaluator]
+ * @property {boolean} [degrade]
+ * @property {number | null} [pixelRatio]
+ */
+
+/**
+ * The state of a player, for a status line. bytes: arrived so far, of total (null: unknown). ends: where in the file
+ * each layer ends, empty while that is unknown. level: shown, null before the first picture. levels: that are there.
+ * fps: pictures drawn in the last second. scale: of the picture's sides. gaussians: drawn.
+ *
+ * @typedef {object} Status
+ * @property {number} bytes
+ * @property {number | null} total
+ * @property {boolean} loading
+ * @property {{layer: number, end: number}[]} ends
+ * @property {number | null} level
+ * @property {number[]} levels
+ * @property {number} fps
+ * @property {number} scale
+ * @property {number} gaussians
+ */
+
+/** So long after the last movement a picture is drawn as well as it can be, milliseconds. */
+const REST_MS = 250;
+/** Up to so many anchors the first picture of a machine without a GPU is evaluated in JavaScript: its shaders are not
+ * compiled by then. */
+const FIRST_ANCHORS = 30_000;
+/** Where no GPU draws, pictures begin with this step of SCALES. */
+const SOFTWARE_STEP = 2;
+/** Without float textures only this level is evaluated while nothing else is asked for. */
+const CPU_LEVEL = 0;
+
+/**
+ * Events: `progress` {bytes, total}, `firstpicture` {level, bytes, seconds}, `upgrade` {level, bytes, seconds},
+ * `loaded` {bytes, complete}, `timeupdate` {time}, `statechange` (play or pause), `error` {message, kind}. Seconds
+ * count from `load`.
+ */
+export class Player extends EventTarget {
+  /** @param {HTMLCanvasElement} canvas @param {Options} [options] */
+  constructor(canvas, options = {}) {
+    super();
+    this.canvas = canvas;
+    this._options = options;
+    /** @type {Scene | null} */
+    this._scene = null;
+    /** @type {Camera | null} */
+    this._camera = null;
+    /** @type {number | null} */
+    this._level = options.level ?? null;
+    /** Seconds of the scene's time, null: its start. @type {number | null} */
+    this._time = options.time ?? null;
+    this._playing = false;
+    this._pace = new Pace();
+    this._sorter = new Remote(new URL("./sort-worker.js", import.meta.url));
+    /** @type {Remote | null} */
+    this._loader = null;
+    /** The highest level that loading went for. */
+    this._loadedLevel = Infinity;
+    /** @type {Pick<Status, "bytes" | "total" | "loading" | "ends">} */
+    this._status = { bytes: 0, total: null, loading: false, ends: [] };
+
+    /** @type {Gpu | null} */
+    this._gpu = null;
+    /** @type {Painter | null} */
+    this._painter = null;
+    /** @type {{evaluator: GpuEvaluator | CpuEvaluator, scene: Scene} | null} */
+    this._evaluator = null;
+    this._useCpu = options.evaluator === "cpu";
+    /** For the first picture. @type {Remote | null} */
+    this._cpuWorker = null;
+    /** What is on show, and for which state. @type {{splats: Splats, state: State} | null} */
+    this._front = null;
+    /** @type {Splats | null} */
+    this._spare = null;
+    this._evaluating = false;
+    /** Whether the sorter may hold means that are not on show yet. */
+    this._swapping = false;
+    this._sorting = false;
+    this._drawing = false;
+    /** Row of the view matrix that the order is for. @type {ArrayLike<number> | null} */
+    this._sortedRow = null;
+    this._dirty = true;
+    /** @type {number | null} */
+    this._shownLevel = null;
+    this._frameRequest = 0;
+    this._lastFrame = 0;
+    this._lastMoved = -Infinity;
+    /** Ends of draws in the last second. @type {number[]} */
+    this._draws = [];
+    this._started = performance.now();
+    /** Pictures drawn and evaluations made so far. */
+    this.counts = { drawn: 0, evaluated: 0 };
+    this._closed = false;
+
+    this._onLost = (/** @type {Event} */ event) => {
+      event.preventDefault(); // else it never comes back
+      this._dropGpu();
+    };
+    this._onRestored = () => {
+      this._startGpu();
+      this._wake();
+    };
+    canvas.addEventListener("webglcontextlost", this._onLost);
+    canvas.addEventListener("webglcontextrestored", this._onRestored);
+    this._resize = new ResizeObserver(() => this._touch());
+    this._resize.observe(canvas);
+    this._visible = true;
+    this._seen = new IntersectionObserver(([entry]) => {
+      this._visible = entry.isIntersecting;
+      this._wake();
+    });
+    this._seen.observe(canvas);
+    this._startGpu();
+  }
+
+  // --- what users see
+
+  /**
+   * Loads a scene in place of what is shown: an address, or a file.
+   *
+   * @param {string | URL | Blob} source
+   * @returns {Promise<void>} settles when no more is loaded; errors are events
+   */
+  async load(source) {
+    if (this._closed) return;
+    this.stopLoading();
+    const loader = new Remote(new URL("./loader-worker.js", import.meta.url), (news) => {
+      if (loader === this._loader) this._told(news);
+    });
+    this._loader = loader;
+    this._useCpu = this._options.evaluator === "cpu" || !(this._gpu?.floats ?? true);
+    if (this._useCpu || this._gpu?.software) this._cpuWorker ??= startWorker();
+    this._scene = null;
+    this._shownLevel = null;
+    this._camera = null;
+    if (this._front) {
+      this._gpu?.free(this._spare?.field);
+      this._spare = this._front.splats;
+      this._front = null;
+    }
+    this._time = this._options.time ?? null;
+    this._status = { bytes: 0, total: null, loading: true, ends: [] };
+    this._started = performance.now();
+    this._touch();
+    const from = source instanceof Blob ? source : new URL(source, document.baseURI).href;
+    loader.call("open", [from]).catch(() => {}); // a worker that fails says so to the next call as well
+    await this._loadOn(loader);
+  }
+
+  /** Loads as much as options and level allow. @param {Remote} loader */
+  async _loadOn(loader) {
+    const { bytes, seconds } = this._options;
+    const maxLayer = this._level ?? Infinity;
+    this._loadedLevel = maxLayer;
+    this._status.loading = true;
+    try {
+      const budget = { maxLayer, bytes: bytes ?? undefined, seconds: seconds ?? undefined };
+      const result = await loader.call("load", [budget]);
+      if (loader !== this._loader) return;
+      if (result.complete) this.stopLoading();
+      this._emit("loaded", result);
+    } catch (error) {
+      if (loader !== this._loader) return;
+      this.stopLoading();
+      this._fail(error);
+    } finally {
+      if (loader === this._loader) this._status.loading = false;
+    }
+  }
+
+  /** Stops loading; what has arrived stays. */
+  stopLoading() {
+    this._loader?.close();
+    this._loader = null;
+    this._status.loading = false;
+  }
+
+  /** What every level needs, null before the first layer. */
+  get info() {
+    return this._scene?.info ?? null;
+  }
+
+  /** The scene as far as it has arrived. */
+  get scene() {
+    return this._scene;
+  }
+
+  /** Seconds of the scene's time at its start and end. @returns {[number, number]} */
+  get timeRange() {
+    return this._scene?.info.timeRange ?? [0, 0];
+  }
+
+  /** Seconds of the scene's time. */
+  get time() {
+    return this._time ?? this.timeRange[0];
+  }
+
+  /** Goes to a time. @param {number} seconds of the scene's time */
+  seek(seconds) {
+    const [start, end] = this.timeRange;
+    this._time = this._scene ? Math.min(Math.max(seconds, start), Math.max(start, end)) : seconds;
+    this._touch();
+    this._emit("timeupdate", { time: this.time });
+  }
+
+  get paused() {
+    return !this._playing;
+  }
+
+  play() {
+    if (this._playing) return;
+    this._playing = true;
+    if (this.time >= this.timeRange[1]) this._time = this.timeRange[0];
+    this._lastFrame = 0;
+    this._wake();
+    this._emit("statechange", {});
+  }
+
+  pause() {
+    if (!this._playing) return;
+    this._playing = false;
+    this._touch();
+    this._emit("statechange", {});
+  }
+
+  /** The highest level to show, null: the highest there is. */
+  get level() {
+    return this._level;
+  }
+
+  set level(level) {
+    this._level = level;
+    const more = (level ?? Infinity) > this._loadedLevel;
+    if (more && this._loader && !this._status.loading) this._loadOn(this._loader);
+    this._touch();
+  }
+
+  /** The camera in use; assign null for the scene's own. @returns {Camera | null} */
+  get camera() {
+    return this._camera ?? (this._scene && defaultCamera(this._scene.info));
+  }
+
+  set camera(camera) {
+    this._camera = camera;
+    this._touch();
+  }
+
+  /** @returns {Status} */
+  get status() {
+    const now = performance.now();
+    while (this._draws.length && now - this._draws[0] > 1000) this._draws.shift();
+    return {
+      ...this._status,
+      level: this._shownLevel,
+      levels: this._scene?.layers ?? [],
+      fps: this._draws.length,
+      scale: this._moving(now) ? this._scale() : 1,
+      gaussians: this._painter?.count ?? 0,
+    };
+  }
+
+  /** What draws, in the driver's words; empty without WebGL2. */
+  get renderer() {
+    return this._gpu?.renderer ?? "";
+  }
+
+  /** Waits until what is shown is what was asked for, as well as it can be. */
+  async settled() {
+    while (!this._closed && !(this._scene && this._isSettled())) {
+      await new Promise((resolve) => setTimeout(resolve, 5));
+    }
+  }
+
+  /** The picture on show, its size that of the canvas. */
+  snapshot() {
+    const { width, height } = this.canvas;
+    const picture = new ImageData(width, height);
+    if (!this._gpu || !this._draw()) return picture;
+    const { gl } = this._gpu;
+    const pixels = new Uint8Array(4 * width * height);
+    gl.bindFramebuffer(gl.FRAMEBUFFER, null);
+    gl.readPixels(0, 0, width, height, gl.RGBA, gl.UNSIGNED_BYTE, pixels);
+    for (let y = 0; y < height; y++) {
+      picture.data.set(pixels.subarray(4 * width * (height - 1 - y), 4 * width * (height - y)), 4 * width * y);
+    }
+    return picture;
+  }
+
+  /** Frees everything; the player cannot be used again. */
+  close() {
+    if (this._closed) return;
+    this._closed = true;
+    this._playing = false;
+    cancelAnimationFrame(this._frameRequest);
+    this._resize.disconnect();
+    this._seen.disconnect();
+    this.canvas.removeEventListener("webglcontextlost", this._onLost);
+    this.canvas.removeEventListener("webglcontextrestored", this._onRestored);
+    this.stopLoading();
+    this._sorter.close();
+    this._cpuWorker?.close();
+    const gl = this._gpu?.gl;
+    this._dropGpu();
+    gl?.getExtension("WEBGL_lose_context")?.loseContext(); // browsers keep few contexts alive
+    this._scene = null;
+    this.canvas.width = this.canvas.height = 1;
+  }
+
+  // --- loading
+
+  /** @param {import("./loader-worker.js").News} news */
+  _told({ scene, ...status }) {
+    Object.assign(this._status, status);
+    const { bytes, total } = status;
+    this._emit("progress", { bytes, total });
+    if (!scene) return;
+    const first = !this._scene;
+    this._scene = scene;
+    if (first) {
+      this.seek(this.time);
+      if (this._options.autoplay) this.play();
+    }
+    this._touch();
+  }
+
+  /** @param {unknown} error */
+  _fail(error) {
+    const { message, name, kind = name } = /** @type {Error & {kind?: string}} */ (error);
+    this._emit("error", { message, kind });
+  }
+
+  /** @param {string} name @param {object} detail */
+  _emit(name, detail) {
+    this.dispatchEvent(new CustomEvent(name, { detail }));
+  }
+
+  // --- the GPU
+
+  _startGpu() {
+    const gl = this.canvas.getContext("webgl2", {
+      alpha: false,
+      antialias: false,
+      depth: false,
+      powerPreference: "high-performance",
+    });
+    if (!gl) {
+      setTimeout(() => this._fail(new Error("this browser has no WebGL2, which the player draws with")));
+      return;
+    }
+    if (gl.isContextLost()) return;
+    this._gpu = new Gpu(gl);
+    this._pace = new Pace(this._gpu.software ? SOFTWARE_STEP : 0);
+    if (!this._gpu.floats) this._useCpu = true;
+    this._painter = new Painter(this._gpu);
+    this._dirty = true;
+  }
+
+  _dropGpu() {
+    this._painter?.free();
+    this._evaluator?.evaluator.free();
+    this._gpu?.free(this._front?.splats.field, this._spare?.field);
+    this._gpu = this._painter = this._evaluator = this._front = this._spare = null;
+  }
+
+  // --- the loop
+
+  /** Something that is seen has changed. */
+  _touch() {
+    this._dirty = true;
+    this._lastMoved = performance.now();
+    this._wake();
+  }
+
+  _wake() {
+    if (this._frameRequest || this._closed) return;
+    this._frameRequest = requestAnimationFrame((now) => {
+      this._frameRequest = 0;
+      this._frame(now);
+    });
+  }
+
+  /** @param {number} now */
+  _moving(now) {
+    return this._playing || this._status.loading || now - this._lastMoved < REST_MS;
+  }
+
+  _scale() {
+    return this._options.degrade === false ? 1 : this._pace.scale;
+  }
+
+  /** @param {number} now */
+  _frame(now) {
+    if (!this._visible || !this._gpu || !this._scene) {
+      this._lastFrame = 0;
+      return;
+    }
+    if (this._playing) this._advance(now);
+    if (!this._evaluating && !this._isEvaluated()) this._evaluate();
+    this._sort();
+    const size = this._size(now);
+    const sized = size[0] === this.canvas.width && size[1] === this.canvas.height;
+    if (this._front && !this._drawing && (this._dirty || !sized)) this._show(size);
+    if (this._playing || !this._isSettled()) this._wake();
+  }
+
+  /** @param {number} now */
+  _advance(now) {
+    const [start, end] = this.timeRange;
+    const elapsed = this._lastFrame ? Math.min((now - this._lastFrame) / 1000, 0.25) : 0;
+    this._lastFrame = now;
+    let time = this.time + elapsed;
+    if (time >= end) {
+      if (this._options.loop && end > start) {
+        time = start + ((time - start) % (end - start));
+      } else {
+        time = end;
+        this.pause();
+      }
+    }
+    this._time = time;
+    this._emit("timeupdate", { time });
+  }
+
+  /** What is to be seen. @returns {State} */
+  _state() {
+    const scene = /** @type {Scene} */ (this._scene);
+    const camera = /** @type {Camera} */ (this.camera);
+    let level = this._level ?? 2;
+    if (this._playing && this._options.degrade !== false) level = Math.min(level, this._pace.level);
+    if (this._useCpu && this._options.evaluator !== "cpu") level = Math.min(level, CPU_LEVEL);
+    const shown = levelOf(scene, Math.max(level, 0));
+    const still = !shown.global && !shown.local;
+    return {
+      scene,
+      level: shown.number,
+      t: still ? 0 : normalisedTime(scene.info, this.time),
+      eye: centreOf(camera),
+    };
+  }
+
+  _isEvaluated() {
+    return !!this._front && sameState(this._front.state, this._state());
+  }
+
+  _isSettled() {
+    const [width, height] = this._size(performance.now());
+    return (
+      !!this._front &&
+      !this._dirty &&
+      !this._drawing &&
+      !this._evaluating &&
+      !this._sorting &&
+      this._isEvaluated() &&
+      this._isSorted() &&
+      !this._moving(performance.now()) &&
+      width === this.canvas.width &&
+      height === this.canvas.height
+    );
+  }
+
+  _row() {
+    return /** @type {Camera} */ (this.camera).viewmat.slice(8, 12);
+  }
+
+  _isSorted() {
+    const row = this._row();
+    return !!this._sortedRow && row.every((value, k) => value === this._sortedRow?.[k]);
+  }
+
+  /** Brings the Gaussians to what is to be seen, then shows them. */
+  async _evaluate() {
+    const gpu = /** @type {Gpu} */ (this._gpu);
+    const state = this._state();
+    const playing = this._playing;
+    const started = performance.now();
+    this._evaluating = true;
+    try {
+      const evaluator = this._evaluatorFor(gpu, state.scene);
+      const spare = this._spare;
+      this._spare = null;
+      const { splats, means } = await evaluator.evaluate(state.level, state.t, state.eye, spare, {
+        list: (opacities, ...rest) => this._sorter.call("list", [opacities, ...rest], [opacities.buffer]),
+      });
+      this._spare = splats;
+      this._swapping = true;
+      while (this._sorting) await new Promise((resolve) => setTimeout(resolve, 1));
+      if (means) await this._sorter.call("setMeans", [means], [means.buffer]);
+      if (gpu !== this._gpu) return;
+      const row = this._row();
+      if (means || !this._isSorted()) {
+        const order = await this._sorter.call("sort", [row, state.scene.info.near]);
+        if (gpu !== this._gpu) return;
+        this._painter?.setOrder(order);
+        this._sortedRow = row;
+      }
+      this._spare = this._front?.splats ?? null;
+      this._front = { splats, state };
+      this.counts.evaluated++;
+      this._dirty = true;
+      if (playing) this._pace.evaluated(state.level, performance.now() - started, performance.now());
+    } catch (error) {
+      if (this._closed || error instanceof ContextLost || gpu !== this._gpu) return;
+      if (this._useCpu) {
+        this._fail(error);
+        this._scene = null;
+        return;
+      }
+      this._useCpu = true; // networks that shaders cannot hold, or a driver that cannot compile them
+      this._evaluator?.evaluator.free();
+      this._evaluator = null;
+    } finally {
+      this._evaluating = false;
+      this._swapping = false;
+      this._wake();
+    }
+  }
+
+  /** @param {Gpu} gpu @param {Scene} scene */
+  _evaluatorFor(gpu, scene) {
+    const first = !this._front && gpu.software && scene.anchor.length <= 3 * FIRST_ANCHORS;
+    const onCpu = this._useCpu || first;
+    if (this._evaluator?.scene !== scene || this._evaluator.evaluator instanceof CpuEvaluator !== onCpu) {
+      this._evaluator?.evaluator.free();
+      this._evaluator = null;
+      this._evaluator = { evaluator: onCpu ? this._onCpu(gpu, scene) : new GpuEvaluator(gpu, scene), scene };
+    }
+    return this._evaluator.evaluator;
+  }
+
+  /** @param {Gpu} gpu @param {Scene} scene */
+  _onCpu(gpu, scene) {
+    const evaluator = new CpuEvaluator(gpu, scene, this._cpuWorker ?? undefined);
+    this._cpuWorker = null;
+    return evaluator;
+  }
+
+  /** Brings the order to the camera, if the Gaussians on show are the sorter's. */
+  async _sort() {
+    if (!this._front || this._swapping || this._sorting || this._isSorted()) return;
+    const gpu = this._gpu;
+    const row = this._row();
+    this._sorting = true;
+    try {
+      const order = await this._sorter.call("sort", [row, this._front.state.scene.info.near]);
+      if (gpu !== this._gpu) return;
+      this._painter?.setOrder(order);
+      this._sortedRow = row;
+      this._dirty = true;
+    } catch (error) {
+      if (!this._closed) this._fail(error);
+    } finally {
+      this._sorting = false;
+      this._wake();
+    }
+  }
+
+  /** Width and height to draw, pixels. @param {number} now @returns {[number, number]} */
+  _size(now) {
+    const { clientWidth, clientHeight } = this.canvas;
+    const ratio = this._options.pixelRatio ?? Math.min(devicePixelRatio, 2);
+    const scale = ratio * (this._moving(now) ? this._scale() : 1);
+    const most = this._gpu?.maxSide ?? 4096;
+    /** @param {number} n */
+    const side = (n) => Math.min(Math.max(Math.round(n * scale), 1), most);
+    return [side(clientWidth), side(clientHeight)];
+  }
+
+  /** Draws, and takes note when that is done. @param {[number, number]} size */
+  async _show([width, height]) {
+    const gpu = /** @type {Gpu} */ (this._gpu);
+    if (this.canvas.width !== width || this.canvas.height !== height) {
+      this.canvas.width = width;
+      this.canvas.height = height;
+    }
+    const started = performance.now();
+    const alone = !this._evaluating;
+    const moving = this._moving(started);
+    this._dirty = false;
+    this._drawing = true;
+    try {
+      const level = /** @type {{state: State}} */ (this._front).state.level;
+      this._draw();
+      await gpu.finished();
+      if (gpu !== this._gpu) return;
+      const now = performance.now();
+      this._draws.push(now);
+      this.counts.drawn++;
+      if (alone && moving) this._pace.drew(now - started);
+      this._shown(level, now);
+    } catch (error) {
+      if (!(error instanceof ContextLost) && !this._closed) this._fail(error);
+    } finally {
+      this._drawing = false;
+      this._wake();
+    }
+  }
+
+  /** Draws at once what there is. @returns {boolean} whether there was something */
+  _draw() {
+    const { camera, _painter: painter, _front: front } = this;
+    if (!camera || !painter || !front) return false;
+    const { info } = front.state.scene;
+    painter.draw(front.splats, fitted(camera, this.canvas.width, this.canvas.height), info.background, info.near);
+    return true;
+  }
+
+  /** A picture of a level is on the screen. @param {number} level @param {number} now */
+  _shown(level, now) {
+    const before = this._shownLevel;
+    this._shownLevel = level;
+    const detail = { level, bytes: this._status.bytes, seconds: (now - this._started) / 1000 };
+    if (before === null) this._emit("firstpicture", detail);
+    else if (level > before) this._emit("upgrade", detail);
+  }
+}
+
+/** What Gaussians depend on. @typedef {{scene: Scene, level: number, t: number, eye: number[]}} State */
+
+/** A camera's centre that moves by less, in units of a quarter of the box, changes nothing that is seen. */
+const EYE_TOLERANCE = 1e-5;
+
+/** @param {State} a @param {State} b */
+function sameState(a, b) {
+  const tolerance = EYE_TOLERANCE * deformationUnit(a.scene);
+  const eyes = () => [0, 1, 2].every((k) => Math.abs(a.eye[k] - b.eye[k]) <= tolerance);
+  return a.scene === b.scene && a.level === b.level && a.t === b.t && eyes();
+}

@@ -1,0 +1,68 @@
+// Calls across a worker's border: the page's side. The worker's is serve.js.
+
+/**
+ * A worker whose functions are called by name. `url` is that of a module.
+ */
+export class Remote {
+  /** @param {URL} url @param {(message: any) => void} [told] takes what the worker says unasked */
+  constructor(url, told = () => {}) {
+    /** @type {Map<number, {resolve: (value: any) => void, reject: (error: Error) => void}>} */
+    this._waiting = new Map();
+    this._calls = 0;
+    this._worker = start(url);
+    this._worker.onmessage = ({ data }) => {
+      const waiting = this._waiting.get(data.call);
+      if (!waiting) {
+        told(data.told);
+        return;
+      }
+      this._waiting.delete(data.call);
+      if (data.error) waiting.reject(Object.assign(new Error(data.error.message), data.error));
+      else waiting.resolve(data.result);
+    };
+    this._worker.onerror = (event) => {
+      event.preventDefault();
+      this._fail(new Error(`a worker stopped: ${event.message || "it could not be loaded"}`));
+    };
+  }
+
+  /**
+   * Calls a function of the worker.
+   *
+   * @param {string} name @param {unknown[]} args @param {Transferable[]} [transfer]
+   * @returns {Promise<any>}
+   */
+  call(name, args, transfer = []) {
+    if (this._failed) return Promise.reject(this._failed);
+    return new Promise((resolve, reject) => {
+      const call = ++this._calls;
+      this._waiting.set(call, { resolve, reject });
+      this._worker.postMessage({ call, name, args }, transfer);
+    });
+  }
+
+  /** @param {Error} error */
+  _fail(error) {
+    /** @type {Error | undefined} */
+    this._failed = error;
+    for (const { reject } of this._waiting.values()) reject(error);
+    this._waiting.clear();
+  }
+
+  /** Ends the worker; calls under way are rejected. */
+  close() {
+    this._worker.terminate();
+    this._fail(new Error("closed"));
+  }
+}
+
+/** @param {URL} url @returns {Worker} */
+function start(url) {
+  if (url.origin === location.origin) return new Worker(url, { type: "module" });
+  // a browser starts no worker of another origin, but one that imports from there
+  const source = new Blob([`import ${JSON.stringify(url.href)};`], { type: "text/javascript" });
+  const local = URL.createObjectURL(source);
+  const worker = new Worker(local, { type: "module" });
+  setTimeout(() => URL.revokeObjectURL(local), 10_000);
+  return worker;
+}

@@ -1,0 +1,119 @@
+// Lists and orders of Gaussians: plain loops that run in a worker.
+
+/** @typedef {import("./evaluator.js").List} List */
+
+// as in evaluator.js, which a worker has no need to load
+const NO_ENTRY = 0xffffffff;
+const ANCHOR_BITS = 24;
+
+/**
+ * The list of Gaussians whose opacity is above 0, or that `previous` has; null if it would be `previous`.
+ *
+ * Rows of texels are short where there are few Gaussians, since each slot starts on a new one. Heights are rounded up,
+ * so that textures are not made anew for every time.
+ *
+ * @param {Float32Array} opacities [ceil(slots / 4), anchors, 4] @param {number} slots @param {number} anchors
+ * @param {List | null} previous
+ * @returns {List | null}
+ */
+export function listGaussians(opacities, slots, anchors, previous) {
+  const kept = new Uint8Array(slots * anchors);
+  const counts = new Uint32Array(slots);
+  let count = 0;
+  for (let i = 0; i < slots; i++) {
+    const base = (i >> 2) * anchors * 4 + (i & 3);
+    let n = 0;
+    for (let a = 0; a < anchors; a++) if (opacities[base + 4 * a] > 0) n += kept[i * anchors + a] = 1;
+    counts[i] = n;
+    count += n;
+  }
+  if (previous) {
+    let news = count;
+    for (const entry of previous.entries) {
+      if (entry === NO_ENTRY) continue;
+      const i = entry >>> ANCHOR_BITS;
+      const at = i * anchors + (entry & (2 ** ANCHOR_BITS - 1));
+      if (kept[at]) {
+        news--;
+      } else {
+        kept[at] = 1;
+        counts[i]++;
+        count++;
+      }
+    }
+    if (news === 0) return null;
+  }
+  const width = 2 ** Math.max(4, Math.ceil(Math.log2(Math.sqrt(count / 8 + 1))));
+  const starts = new Uint32Array(slots + 1);
+  for (let i = 0; i < slots; i++) starts[i + 1] = starts[i] + Math.ceil(counts[i] / width);
+  const rows = starts[slots];
+  const height = Math.max(64, Math.ceil(rows / 64) * 64);
+  const entries = new Uint32Array(width * height).fill(NO_ENTRY);
+  for (let i = 0; i < slots; i++) {
+    let at = starts[i] * width;
+    const tag = (i << ANCHOR_BITS) >>> 0;
+    for (let a = 0; a < anchors; a++) if (kept[i * anchors + a]) entries[at++] = tag | a;
+  }
+  return { width, rows, entries, starts, count };
+}
+
+const HALF = 65536;
+
+/** Orders Gaussians back to front. It keeps its buffers from call to call. */
+export class DepthSort {
+  constructor() {
+    this._counts = new Uint32Array(HALF);
+    this._keys = new Uint32Array(0);
+    this._first = new Uint32Array(0);
+    this._second = new Uint32Array(0);
+  }
+
+  /**
+   * The Gaussians in front of the near plane whose opacity is not negative, back to front; of equal depths, the later
+   * ones first. Two counting sorts, over 16 bits of the depth's binary32 each.
+   *
+   * @param {Float32Array} means [n, 4], mean and opacity @param {ArrayLike<number>} row of the view matrix, depth =
+   * row · (mean, 1) @param {number} near scene units
+   * @returns {Uint32Array}
+   */
+  sort(means, row, near) {
+    const n = means.length / 4;
+    if (this._keys.length < n) {
+      this._keys = new Uint32Array(n);
+      this._first = new Uint32Array(n);
+      this._second = new Uint32Array(n);
+    }
+    const depths = new Float32Array(this._keys.buffer);
+    const { _keys: keys, _first: first, _second: second, _counts: counts } = this;
+    const [a, b, c, d] = [row[0], row[1], row[2], row[3]];
+    let count = 0;
+    for (let i = n - 1; i >= 0; i--) {
+      const at = 4 * i;
+      const depth = a * means[at] + b * means[at + 1] + c * means[at + 2] + d;
+      if (!(depth > near && depth < Infinity && means[at + 3] >= 0)) continue;
+      depths[i] = depth; // positive: its bits rise with it
+      first[count++] = i;
+    }
+    // descending, hence the complement
+    counts.fill(0);
+    for (let i = 0; i < count; i++) counts[~keys[first[i]] & 0xffff]++;
+    accumulate(counts);
+    for (let i = 0; i < count; i++) second[counts[~keys[first[i]] & 0xffff]++] = first[i];
+    counts.fill(0);
+    for (let i = 0; i < count; i++) counts[~keys[second[i]] >>> 16]++;
+    accumulate(counts);
+    const out = new Uint32Array(count);
+    for (let i = 0; i < count; i++) out[counts[~keys[second[i]] >>> 16]++] = second[i];
+    return out;
+  }
+}
+
+/** Counts to places, in place. @param {Uint32Array} counts */
+function accumulate(counts) {
+  let sum = 0;
+  for (let i = 0; i < counts.length; i++) {
+    const n = counts[i];
+    counts[i] = sum;
+    sum += n;
+  }
+}

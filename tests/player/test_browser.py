@@ -1,0 +1,719 @@
+"""The player in a real browser: Chromium with its software renderer, driven by Playwright.
+
+PD4DGS_BROWSER names the browser, else one is looked for. Where there is none, or no Playwright, these tests are
+skipped, unless PD4DGS_REQUIRE_BROWSER is 1.
+"""
+
+from __future__ import annotations
+
+import base64
+import math
+import os
+import shutil
+import sys
+import time
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from urllib.parse import urlsplit
+
+import numpy as np
+import pytest
+from strategies import make_scene
+
+from pd4dgs_codec import encode
+from pd4dgs_codec.codec.info import info
+from pd4dgs_codec.delivery.link import Link
+from pd4dgs_codec.delivery.server import Server
+from pd4dgs_codec.scene import (
+    GLOBAL_HEADS,
+    LOCAL_HEADS,
+    PLANES,
+    SCAFFOLD_NETWORKS,
+    Camera,
+    Deformation,
+    Network,
+    Scene,
+    SceneInfo,
+    Steps,
+)
+
+ROOT = Path(__file__).parents[2]
+PLAYER = ROOT / "player"
+sys.path.insert(0, str(ROOT / "tools"))
+import pack_player  # noqa: E402
+
+BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
+FLAGS = [
+    "--no-sandbox",
+    "--disable-background-networking",
+    "--disable-component-update",
+    "--disable-sync",
+    "--no-first-run",
+    "--js-flags=--expose-gc",
+    "--enable-precise-memory-info",
+]
+WIDTH, HEIGHT = 96, 72
+#: Of pictures against the rasteriser. Eight bits alone leave 59.
+LEAST_DB = 45.0
+#: A busy machine may take long over a picture; only a hang takes this long, milliseconds.
+PATIENCE_MS = 120_000
+
+
+def _missing(reason: str) -> Any:
+    if os.environ.get("PD4DGS_REQUIRE_BROWSER") == "1":
+        pytest.fail(f"PD4DGS_REQUIRE_BROWSER is 1, but {reason}")
+    pytest.skip(reason)
+
+
+@pytest.fixture(scope="module")
+def browser() -> Iterator[Any]:
+    try:
+        from playwright.sync_api import sync_playwright
+    except ImportError:
+        _missing("playwright is not installed (pip install playwright)")
+    named = os.environ.get("PD4DGS_BROWSER")
+    found = shutil.which(named) if named else next(filter(None, map(shutil.which, BROWSERS)), None)
+    if found is None:
+        _missing(f"there is no browser {named or ' or '.join(BROWSERS)} (PD4DGS_BROWSER names one)")
+    with sync_playwright() as playwright:
+        launched = playwright.chromium.launch(executable_path=found, args=FLAGS)
+        yield launched
+        launched.close()
+
+
+# -- scenes ------------------------------------------------------------------------------------------------------------
+
+
+def _network(rng: np.random.Generator, *widths: int, scale: float) -> Network:
+    pairs = zip(widths, widths[1:], strict=False)
+    return tuple(
+        (rng.normal(0, scale, (b, a)).astype(np.float32), rng.normal(0, scale, b).astype(np.float32)) for a, b in pairs
+    )
+
+
+def _deformation(
+    rng: np.random.Generator, heads: dict[str, int], channels: int, scales: int, trunk: tuple[int, ...]
+) -> Deformation | None:
+    if not heads:
+        return None
+    sides = (9, 7, 8, 5)
+    planes = tuple(
+        {
+            name: rng.normal(1, 0.4, (channels, sides[b] << (s if b < 3 else 0), sides[a] << s)).astype(np.float32)
+            for name, a, b in PLANES
+        }
+        for s in range(scales)
+    )
+    networks = {"trunk": _network(rng, scales * channels, *trunk, scale=0.3)}
+    networks |= {name: _network(rng, trunk[-1], width, scale=0.05) for name, width in heads.items()}
+    return Deformation(planes, networks)
+
+
+def lively_scene(
+    anchors: int = 700,
+    seed: int = 3,
+    *,
+    hidden: tuple[int, ...] = (16,),
+    channels: int = 8,
+    scales: int = 2,
+    trunk: tuple[int, ...] = (16, 12),
+    heads: tuple[dict[str, int], dict[str, int]] = (GLOBAL_HEADS, LOCAL_HEADS),
+    layers: tuple[int, ...] = (0, 1, 2),
+) -> Scene:
+    """Layers that differ, some thousand Gaussians of all shapes in front of the scene's camera."""
+    rng = np.random.default_rng(seed)
+    cells = np.unique(rng.integers(-60, 61, (2 * anchors, 3)), axis=0)
+    cells = rng.permutation(cells)[:anchors].astype(np.int32)
+    viewmat = np.eye(4, dtype=np.float32)
+    viewmat[2, 3] = 4
+    K = np.array([[80, 0, WIDTH / 2 + 3], [0, 84, HEIGHT / 2 - 2], [0, 0, 1]], np.float32)
+    box = np.array([[-1.4, -1.6, -1.5], [1.5, 1.3, 1.4]], np.float32)
+    codes = np.sort(rng.choice(np.array([0, 60, 180, 255], np.uint8), (anchors, 3)), axis=1)
+    codes[: anchors // 2] = [140, 200, 255]
+    fields = [_deformation(rng, names, channels, scales, trunk) for names in heads]
+    return Scene(
+        info=SceneInfo(
+            voxel_size=float(np.float32(1 / 40)),
+            box=box,
+            time_range=(1.0, 3.0),
+            background=(float(np.float32(0.2)), 0.5, float(np.float32(0.7))),
+            near=0.125,
+            far=64.0,
+            up=(0.0, -1.0, 0.0),
+            unit=0.0,
+            camera=Camera(viewmat, K, WIDTH, HEIGHT),
+        ),
+        steps=Steps(),
+        layers=layers,
+        rows=(anchors,) * len(layers),
+        anchor_q=cells,
+        feature=rng.normal(0, 0.6, (anchors, 32)).astype(np.float32),
+        scaling_log=rng.normal(-2.4, 0.5, (anchors, 6)).astype(np.float32),
+        offset=rng.normal(0, 0.6, (anchors, 10, 3)).astype(np.float32),
+        mask=tuple(codes.T[list(layers)].copy()),
+        networks={name: _network(rng, 35, *hidden, width, scale=0.4) for name, width in SCAFFOLD_NETWORKS.items()},
+        global_deformation=fields[0] if 1 in layers else None,
+        local_deformation=fields[1] if 2 in layers else None,
+    )
+
+
+@pytest.fixture(scope="module")
+def lively() -> bytes:
+    return encode(lively_scene(), layers=2, effort=1)
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory, lively: bytes) -> Path:
+    """The player as it is installed, and scenes beside it."""
+    root = tmp_path_factory.mktemp("www")
+    ignored = shutil.ignore_patterns("node_modules", "test")
+    shutil.copytree(PLAYER, root / "player", ignore=ignored)
+    (root / "scene.pd4").write_bytes(lively)
+    shutil.copy(root / "scene.pd4", root / "player" / "scene.pd4")
+    return root
+
+
+@pytest.fixture(scope="module")
+def server(folder: Path) -> Iterator[Server]:
+    with Server(folder) as served, served.running():
+        yield served
+
+
+@pytest.fixture
+def page(browser: Any) -> Iterator[Any]:
+    """A page on which nothing goes wrong unnoticed."""
+    context = browser.new_context(viewport={"width": 480, "height": 360})
+    context.set_default_timeout(PATIENCE_MS)
+    opened = context.new_page()
+    errors: list[str] = []
+    opened.on("pageerror", lambda error: errors.append(str(error)))
+    yield opened
+    context.close()
+    assert not errors
+
+
+@pytest.fixture
+def harness(page: Any, server: Server) -> Any:
+    page.goto(server.url_of("player/test-browser/harness.html"))
+    page.wait_for_function("!!window.harness")
+    return page
+
+
+def call(page: Any, script: str, *args: Any) -> Any:
+    """The result of a function of the harness, given as JavaScript."""
+    return page.evaluate(f"(args) => ({script})(...args)", list(args))
+
+
+def pixels(text: str, width: int = WIDTH, height: int = HEIGHT) -> np.ndarray:
+    """A picture of the harness as float [H, W, 3]."""
+    return np.frombuffer(base64.b64decode(text), np.uint8).reshape(height, width, 4)[..., :3] / 255
+
+
+def decibels(a: np.ndarray, b: np.ndarray) -> float:
+    return -10 * math.log10(max(float(((a - b) ** 2).mean()), 1e-12))
+
+
+# -- evaluation and pictures -------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        dict(hidden=(), channels=2, scales=1, trunk=(3,)),
+        dict(hidden=(7, 5), channels=5, scales=3, trunk=(6, 21)),
+        dict(
+            hidden=(9, 8, 40), channels=33, scales=1, heads=({"position": 3, "scaling": 6}, {"mean": 3, "opacity": 1})
+        ),
+        dict(hidden=(4,), channels=3, heads=({"feature": 32}, {})),
+        dict(layers=(0, 2), heads=({}, {"quat": 4, "color": 3})),
+    ],
+    ids=["usual", "no hidden layers", "odd widths", "many channels", "global only", "no layer 1"],
+)
+def test_both_evaluators_agree(harness, folder, server, options):
+    scene = lively_scene(150, **options)
+    (folder / "agree.pd4").write_bytes(encode(scene, layers=2, effort=1))
+    eyes = ([0.0, 0.0, -5.0], [2.0, 1.0, -4.0])
+    cases = [dict(level=level, t=t, eye=eye) for level in scene.layers for t in (0.0, 0.4, 1.0) for eye in eyes]
+    result = call(harness, "harness.compare", server.url_of("agree.pd4"), cases, 1 << 8)
+    assert result["error"] == 0
+    for case, got in zip(cases, result["cases"], strict=True):
+        assert got["count"] > 50 and got["lonely"] == 0, (case, got)
+        assert max(got["worst"].values()) < 2e-4, (case, got)
+
+
+def cameras(camera: Camera) -> Iterator[Camera]:
+    """The scene's own camera, one from the side, and one from nearby that looks past most of the scene."""
+    for angle, distance, shift in ((0.0, 4.0, 0.0), (0.9, 3.5, 0.2), (-2.1, 1.2, -0.4)):
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = [
+            [math.cos(angle), 0, -math.sin(angle)],
+            [0, 1, 0],
+            [math.sin(angle), 0, math.cos(angle)],
+        ]
+        viewmat[:3, 3] = [shift, -shift / 2, distance]
+        yield replace(camera, viewmat=viewmat.astype(np.float32))
+
+
+@pytest.mark.parametrize("evaluator", ["gpu", "cpu"])
+def test_pictures_are_those_of_the_rasteriser(harness, server, lively, evaluator, monkeypatch):
+    pytest.importorskip("torch")
+    pytest.importorskip("numba")
+    from pd4dgs_codec import decode
+    from pd4dgs_codec.model.convert import from_scene
+    from pd4dgs_codec.model.model import Model
+    from pd4dgs_codec.render.picture import render_image
+
+    # clause 13.4 knows no frustum; the model leaves out anchors by where they stand before they are deformed
+    monkeypatch.setattr(Model, "visible", lambda self, level, *_: (self.masks(level) > 0.01).nonzero()[:, 0])
+    scene = decode(lively)
+    model = from_scene(scene)
+    own = scene.info.camera
+    assert own is not None
+    call(harness, "harness.open", server.url_of("scene.pd4"), WIDTH, HEIGHT, {"evaluator": evaluator})
+    seen = []
+    for camera in cameras(own) if evaluator == "gpu" else [own]:
+        for t in (0.0, 0.37, 1.0):
+            for level in (0, 1, 2):
+                expected = render_image(model, level, t, camera.viewmat, camera.K, WIDTH, HEIGHT)
+                state = dict(level=level, seconds=1 + 2 * t, width=WIDTH, height=HEIGHT)
+                state |= dict(viewmat=camera.viewmat.ravel().tolist(), K=camera.K.ravel().tolist())
+                got = pixels(call(harness, "harness.shoot", state))
+                assert np.abs(expected - scene.info.background).max() > 0.2
+                assert decibels(got, expected) > LEAST_DB, (level, t, camera.viewmat)
+                seen.append(got)
+    assert decibels(seen[1], seen[2]) < LEAST_DB and decibels(seen[2], seen[5]) < LEAST_DB  # levels and times differ
+
+
+def test_networks_that_shaders_cannot_hold_show_level_0(harness, folder, server):
+    (folder / "wide.pd4").write_bytes(encode(lively_scene(60, hidden=(300,)), layers=2, effort=1))
+    pictures = []
+    for evaluator in (None, "cpu"):
+        options = {"evaluator": evaluator, "level": 0 if evaluator else None}
+        call(harness, "harness.open", server.url_of("wide.pd4"), WIDTH, HEIGHT, options)
+        pictures.append(pixels(call(harness, "harness.shoot", {})))
+        assert harness.evaluate("harness.player.status.level") == 0
+    assert decibels(*pictures) > 60 and np.ptp(pictures[0]) > 0.3
+
+
+@pytest.mark.parametrize("kind", ["constant", "huge"])
+def test_absurd_values_leave_a_picture(harness, folder, server, kind):
+    (folder / "absurd.pd4").write_bytes(encode(make_scene(2, anchors=40, kind=kind), layers=2, effort=1))
+    events = call(harness, "harness.open", server.url_of("absurd.pd4"), WIDTH, HEIGHT)
+    assert "error" not in dict(events)
+    for level in (0, 1, 2):
+        assert pixels(call(harness, "harness.shoot", {"level": level, "seconds": 1.1})).shape == (HEIGHT, WIDTH, 3)
+
+
+def test_order_and_list(harness):
+    rng = np.random.default_rng(0)
+    means = rng.normal(size=(500, 4)).astype(np.float32)
+    means[:, 2] = np.round(means[:, 2], 1)  # depths that are equal keep their order
+    row = [0.0, 0.0, 1.0, 0.5]
+    depths = np.float32(means[:, 2]) + np.float32(0.5)
+    order = call(
+        harness,
+        "(means, row) => [...new harness.DepthSort().sort(new Float32Array(means), row, 0.1)]",
+        means.ravel().tolist(),
+        row,
+    )
+    shown = [i for i in range(500) if depths[i] > 0.1 and means[i, 3] >= 0]
+    assert sorted(order) == shown
+    pairs = zip(order, order[1:], strict=False)
+    assert all(depths[a] > depths[b] or (depths[a] == depths[b] and a > b) for a, b in pairs)
+
+    opacities = np.zeros((3, 40, 4), np.float32)
+    for anchor, slot in ((3, 0), (5, 0), (39, 9)):
+        opacities[slot // 4, anchor, slot % 4] = 0.5
+    listed = call(
+        harness,
+        """(opacities) => {
+          const entries = ({ entries }) =>
+            [...entries].map((e, i) => [i, e >>> 24, e & 0xffffff]).filter(([i]) => entries[i] !== 0xffffffff);
+          const first = harness.listGaussians(new Float32Array(opacities), 10, 40, null);
+          const again = harness.listGaussians(new Float32Array(opacities), 10, 40, first);
+          const other = new Float32Array(opacities.length); other[4 * 7] = 1;
+          const more = harness.listGaussians(other, 10, 40, first);
+          return { first: entries(first), width: first.width, starts: [...first.starts], again, more: entries(more) };
+        }""",
+        opacities.ravel().tolist(),
+    )
+    assert [entry[1:] for entry in listed["first"]] == [[0, 3], [0, 5], [9, 39]]
+    assert all(i // listed["width"] >= listed["starts"][slot] for i, slot, _ in listed["first"])
+    assert listed["again"] is None
+    assert [entry[1:] for entry in listed["more"]] == [[0, 3], [0, 5], [0, 7], [9, 39]]
+
+
+def test_nothing_is_evaluated_in_vain(harness, server):
+    call(harness, "harness.open", server.url_of("scene.pd4"), WIDTH, HEIGHT)
+
+    def after(change: str) -> dict[str, int]:
+        return call(
+            harness,
+            f"""async () => {{
+              const {{ player }} = harness;
+              await player.settled();
+              const before = {{ ...player.counts }};
+              {change}
+              await player.settled();
+              const {{ drawn, evaluated }} = player.counts;
+              return {{ drawn: drawn - before.drawn, evaluated: evaluated - before.evaluated }};
+            }}""",
+        )
+
+    turned = """const [a, b] = [Math.cos(.1), Math.sin(.1)];
+      const rows = [a, 0, -b, -4 * b, 0, 1, 0, 0, b, 0, a, 4 * a, 0, 0, 0, 1];
+      player.camera = { ...player.camera, viewmat: new Float32Array(rows) };"""
+    assert after("") == {"drawn": 0, "evaluated": 0}
+    assert after("player.seek(2)")["evaluated"] == 1
+    assert after("player.seek(2)")["evaluated"] == 0
+    assert after("player.level = 0")["evaluated"] == 1
+    moved = after("player.seek(1.5)")
+    assert moved["evaluated"] == 0  # level 0 stands still
+    moved = after(turned)
+    assert moved["evaluated"] == 0 and moved["drawn"] >= 1  # about the camera's centre: only the order changes
+
+
+# -- loading -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_first_picture_comes_before_the_last_layer(harness, folder, lively):
+    ends = [row["end"] for row in info(lively)["layers"]]
+    with Server(folder, link=Link(8 * len(lively) / 20)) as slow, slow.running():
+        harness.evaluate("(url) => void harness.open(url, 96, 72)", slow.url_of("scene.pd4"))
+        harness.wait_for_function("harness.events.some(([name]) => name === 'firstpicture')")
+        name, first = harness.evaluate("harness.events[0]")
+        assert name == "firstpicture" and first["level"] == 0
+        assert ends[0] <= first["bytes"] < ends[2]
+        harness.wait_for_function("harness.player.status.level === 2")
+    names = [(name, detail.get("level")) for name, detail in harness.evaluate("harness.events")]
+    assert [item for item in names if item[0] != "loaded"] == [("firstpicture", 0), ("upgrade", 1), ("upgrade", 2)]
+
+
+def test_budgets_are_kept_and_may_be_raised(harness, server, lively):
+    ends = [row["end"] for row in info(lively)["layers"]]
+    events = call(harness, "harness.open", server.url_of("scene.pd4"), WIDTH, HEIGHT, {"bytes": ends[1] + 10})
+    assert dict(events)["loaded"] == {"bytes": ends[1], "complete": False}
+    call(harness, "() => harness.player.settled()")
+    assert harness.evaluate("harness.player.status.levels") == [0, 1]
+
+    call(harness, "harness.open", server.url_of("scene.pd4"), WIDTH, HEIGHT, {"level": 0})
+    call(harness, "() => harness.player.settled()")
+    assert harness.evaluate("harness.player.status.levels") == [0]
+    harness.evaluate("harness.player.level = null")
+    harness.wait_for_function("harness.player.status.level === 2")
+
+
+def element(page: Any, server: Server, attributes: str, code: Server | None = None) -> Any:
+    """A page of `server` with one element, whose code is on another server perhaps."""
+    script = (code or server).url_of("player/element.js")
+    html = f"""<!doctype html><title>t</title><script type="module" src="{script}"></script>
+      <pd4-player {attributes} style="width: 320px; height: 240px"></pd4-player>"""
+    (server.root / "element.html").write_text(html)
+    page.add_init_script(
+        """window.seen = [];
+        for (const name of ["firstpicture", "upgrade", "error", "progress", "loaded", "statechange"]) {
+          document.addEventListener(name, (event) => seen.push([name, event.detail]), true);
+        }"""
+    )
+    page.goto(server.url_of("element.html"))
+    return page.locator("pd4-player")
+
+
+def damaged(data: bytes, at: int) -> bytes:
+    return data[:at] + bytes([data[at] ^ 4]) + data[at + 1 :]
+
+
+@pytest.mark.parametrize(
+    ("fault", "shown", "words"),
+    [
+        ("damaged in layer 1", 0, "CRC-32"),
+        ("cut in layer 2", 1, "needs"),
+        ("damaged in layer 0", None, "CRC-32"),
+        ("foreign", None, "pd4"),
+        ("absent", None, "404"),
+    ],
+)
+def test_bad_input_is_one_line_and_keeps_what_was_valid(page, server, folder, lively, fault, shown, words):
+    ends = [row["end"] for row in info(lively)["layers"]]
+    data = {
+        "damaged in layer 1": damaged(lively, ends[1] - 50),
+        "cut in layer 2": lively[: ends[2] - 20],
+        "damaged in layer 0": damaged(lively, ends[0] - 50),
+        "foreign": b"<!doctype html><p>no such scene" * 20,
+        "absent": None,
+    }[fault]
+    name = fault.replace(" ", "-") + ".pd4"
+    if data is not None:
+        (folder / name).write_bytes(data)
+    player = element(page, server, f'controls src="{server.url_of(name)}"')
+    alert = player.get_by_role("alert")
+    alert.wait_for()
+    text = alert.inner_text()
+    assert words in text and "\n" not in text and len(text) < 300
+    page.wait_for_function("seen.some(([name]) => name === 'error')")
+    (error,) = (detail for name, detail in page.evaluate("seen") if name == "error")
+    assert error["message"] == text and error["kind"]
+    if shown is not None:
+        page.wait_for_function(f"document.querySelector('pd4-player').player.status.level === {shown}")
+    else:
+        assert page.evaluate("document.querySelector('pd4-player').player.status.level") is None
+    page.evaluate("(url) => { document.querySelector('pd4-player').src = url }", server.url_of("scene.pd4"))
+    page.wait_for_function("document.querySelector('pd4-player').player.status.level === 2")
+    assert alert.is_hidden()
+
+
+# -- robustness --------------------------------------------------------------------------------------------------------
+
+
+def test_a_lost_context_comes_back(harness, server):
+    call(harness, "harness.open", server.url_of("scene.pd4"), WIDTH, HEIGHT)
+    before = pixels(call(harness, "harness.shoot", {"seconds": 1.8}))
+    call(harness, "harness.loseContext")
+    after = pixels(call(harness, "harness.shoot", {}))
+    assert decibels(before, after) > 60  # the order of equal depths may be another one
+    assert "error" not in dict(harness.evaluate("harness.events"))
+
+
+def test_scenes_opened_and_closed_leave_nothing(harness, server):
+    sizes = call(
+        harness,
+        """async (url) => {
+          const sizes = [];
+          for (let i = 0; i < 20; i++) {
+            await harness.open(url, 96, 72, { level: i % 4 ? 0 : null });
+            await harness.player.settled();
+            harness.close();
+            await new Promise((resolve) => setTimeout(resolve, 30));
+            gc();
+            sizes.push(performance.memory.usedJSHeapSize);
+          }
+          return sizes;
+        }""",
+        server.url_of("scene.pd4"),
+    )
+    assert harness.evaluate("document.querySelectorAll('canvas').length") == 0
+    held = 700 * (72 + 3) * 4  # the arrays of one scene
+    assert min(sizes[15:]) < min(sizes[3:8]) + held, sizes
+    assert len(harness.context.pages) == 1 and len(harness.workers) == 0
+
+
+def test_a_scene_that_replaces_another_while_it_loads(harness, server):
+    seen = call(
+        harness,
+        """async (url) => {
+          harness.open(url, 96, 72);
+          const { player } = harness;
+          for (let i = 0; i < 5; i++) {
+            player.load(url);
+            await new Promise((resolve) => setTimeout(resolve, 20 * i));
+          }
+          await player.load(url);
+          await player.settled();
+          return harness.events.map(([name]) => name);
+        }""",
+        server.url_of("scene.pd4"),
+    )
+    assert "error" not in seen and harness.evaluate("harness.player.status.level") == 2
+
+
+def test_the_pace_slows_down_and_comes_back(harness):
+    result = call(
+        harness,
+        """() => {
+          const pace = new harness.Pace();
+          const out = { scales: [], levels: [] };
+          for (let i = 0; i < 40; i++) { pace.drew(200); out.scales.push(pace.scale); }
+          for (let i = 0; i < 80; i++) { pace.drew(2); out.scales.push(pace.scale); }
+          let now = 0;
+          const play = (costs, seconds) => {
+            for (const end = now + 1000 * seconds; now < end; ) {
+              const ms = costs[pace.level];
+              now += ms;
+              pace.evaluated(pace.level, ms, now);
+              out.levels.push(pace.level);
+            }
+          };
+          play([1, 100, 300], 4);
+          play([1, 500, 900], 8);
+          play([1, 10, 20], 300);
+          return out;
+        }""",
+    )
+    scales, levels = result["scales"], result["levels"]
+    smallest = harness.evaluate("harness.SCALES.at(-1)")
+    assert scales[0] == 1 and smallest in scales and scales[-1] == 1
+    assert scales[:40] == sorted(scales[:40], reverse=True)
+    assert levels[0] == 2 and 1 in levels and 0 in levels and levels[-1] == 2
+
+
+# -- element -----------------------------------------------------------------------------------------------------------
+
+
+def test_controls(page, server):
+    player = element(page, server, f'controls src="{server.url_of("scene.pd4")}"')
+    page.wait_for_function("document.querySelector('pd4-player').player.status.level === 2")
+    state = "(() => { const p = document.querySelector('pd4-player'); return [...p.camera.viewmat] })()"
+
+    slider = player.get_by_role("slider", name="Time")
+    slider.fill("2.5")
+    assert page.evaluate("document.querySelector('pd4-player').time") == pytest.approx(2.5, abs=1e-6)
+    assert slider.get_attribute("aria-valuetext") == "1.5 / 2.0 s"
+    player.get_by_role("button", name="Play").click()
+    player.get_by_role("button", name="Pause").wait_for()
+    player.get_by_role("button", name="Play").wait_for()  # at the end it stops
+    assert page.evaluate("document.querySelector('pd4-player').time") == 3
+
+    box = player.get_by_role("combobox", name="Highest level")
+    box.select_option("1")
+    page.wait_for_function("document.querySelector('pd4-player').player.status.level === 1")
+    assert player.get_attribute("level") == "1"
+    box.select_option("")
+    assert player.get_attribute("level") is None
+
+    surface = player.get_by_role("application", name="Dynamic scene")
+    home = page.evaluate(state)
+    surface.focus()
+    views = [home]
+    for key in ("ArrowLeft", "ArrowUp", "Shift+ArrowRight", "+", "-"):
+        page.keyboard.press(key)
+        views.append(page.evaluate(state))
+        assert views[-1] != views[-2], key
+    page.keyboard.press("Home")
+    assert page.evaluate(state) == home
+    page.keyboard.press(",")
+    assert page.evaluate("document.querySelector('pd4-player').time") == pytest.approx(3 - 1 / 30)
+    changes = "seen.filter(([name]) => name === 'statechange').length"
+    before = page.evaluate(changes)
+    page.keyboard.press("Space")
+    assert page.evaluate(changes) > before
+    page.evaluate("document.querySelector('pd4-player').pause()")
+
+    area = surface.bounding_box()
+    x, y = area["x"] + 160, area["y"] + 100
+    page.mouse.move(x, y)
+    page.mouse.down()
+    page.mouse.move(x + 40, y + 10)
+    page.mouse.up()
+    turned = np.array(page.evaluate(state)).reshape(4, 4)
+    np.testing.assert_allclose(turned[:3, :3] @ turned[:3, :3].T, np.eye(3), atol=1e-5)
+    assert turned.ravel().tolist() != home
+    page.mouse.wheel(0, -200)
+    page.wait_for_function(f"(before) => {state}.some((v, i) => v !== before[i])", arg=turned.ravel().tolist())
+    player.get_by_role("button", name="Reset the view").click()
+    assert page.evaluate(state) == home
+
+    page.evaluate(
+        """() => {
+          const canvas = document.querySelector('pd4-player').player.canvas;
+          canvas.setPointerCapture = () => {};
+          const fire = (type, pointerId, x, y) =>
+            canvas.dispatchEvent(new PointerEvent(type, { pointerId, pointerType: 'touch', clientX: x, clientY: y }));
+          fire('pointerdown', 1, 100, 100); fire('pointerdown', 2, 200, 100);
+          fire('pointermove', 2, 260, 100); fire('pointerup', 1, 100, 100); fire('pointerup', 2, 260, 100);
+        }"""
+    )
+    pinched = page.evaluate(state)
+    assert np.linalg.norm(np.array(pinched)[[3, 7, 11]]) < np.linalg.norm(np.array(home)[[3, 7, 11]])  # closer
+
+
+def test_every_control_has_a_name_and_is_reached_by_key(page, server):
+    player = element(page, server, f'controls src="{server.url_of("scene.pd4")}"')
+    page.wait_for_function("document.querySelector('pd4-player').player.status.level === 2")
+    names = []
+    for _ in range(6):
+        page.keyboard.press("Tab")
+        names.append(
+            page.evaluate("document.querySelector('pd4-player').shadowRoot.activeElement?.getAttribute('aria-label')")
+        )
+    assert names == ["Dynamic scene", "Play", "Time", "Highest level", "Reset the view", "Full screen"]
+    assert player.locator("[part=status]").inner_text().startswith("level 2 of 2 · ")
+
+
+def test_attributes_and_removal(page, server):
+    attributes = f'src="{server.url_of("scene.pd4")}" time="2" level="1" autoplay loop poster="data:,"'
+    player = element(page, server, attributes)
+    assert player.locator("img").count() == 1
+    page.wait_for_function("document.querySelector('pd4-player').player.status.level === 1")
+    assert player.locator("img").is_hidden() and player.get_by_role("group").is_hidden()
+    page.wait_for_function("document.querySelector('pd4-player').time < 2")  # it plays, and begins anew
+    names = [name for name, _ in page.evaluate("seen")]
+    assert names.count("firstpicture") == 1 and names.count("upgrade") <= 1 and "progress" in names
+    page.evaluate("window.player = document.querySelector('pd4-player'); player.remove()")
+    assert page.evaluate("player.player") is None
+    page.wait_for_function("true")
+    page.evaluate("document.body.append(player)")
+    page.wait_for_function("player.player.status.level === 1")
+
+
+def test_code_and_scene_may_come_from_other_servers(page, server, folder):
+    with Server(folder) as other, other.running():
+        element(page, server, f'src="{other.url_of("scene.pd4")}"', other)
+        page.wait_for_function("document.querySelector('pd4-player').player?.status.level === 2")
+
+
+def test_packed_it_is_small_and_plays(page, server, folder):
+    (folder / "packed").mkdir(exist_ok=True)
+    files = pack_player.pack()
+    for name, content in files.items():
+        (folder / "packed" / name).write_bytes(content)
+    assert sum(pack_player.zipped(files[name]) for name in pack_player.FIRST_VISIT) <= 60_000
+    asked: list[str] = []
+    page.on("request", lambda request: asked.append(request.url))
+    page.goto(server.url_of("packed/index.html") + "?src=../scene.pd4&autoplay=0")
+    page.wait_for_function("document.querySelector('pd4-player')?.player.status.level === 2")
+    names = {Path(urlsplit(url).path).name for url in asked if url.startswith("http")}
+    assert names == {*pack_player.FIRST_VISIT, "evaluate-worker.js", "scene.pd4"}  # there is no GPU here
+
+
+@pytest.mark.parametrize(
+    ("source", "packed"),
+    [
+        ("let a = 1; // one\n\n  /* two */ let b = 2;\n", "let a = 1;\nlet b = 2;\n"),
+        ("const s = \"// no\" + '/* no */'; // yes", "const s = \"// no\" + '/* no */';\n"),
+        (
+            "f(`  // no\n  ${ {a: `/* ${x} */`}.a /* yes */ }\n  b`);",
+            "f(`  // no\n  ${ {a: `/* ${x} */`}.a  }\n  b`);\n",
+        ),
+        ("x = a / b; // c / d\ny = /[/]\\/'/.test(z);\n", "x = a / b;\ny = /[/]\\/'/.test(z);\n"),
+    ],
+)
+def test_packing_leaves_code_as_it_is(source, packed):
+    assert pack_player.strip(source) == packed
+
+
+@pytest.mark.parametrize(
+    "source", ["export default 1;\n", 'import * as x from "./y.js";\n', "/* no end", "`${", "'\n'"]
+)
+def test_packing_refuses_what_it_does_not_know(tmp_path, source):
+    (tmp_path / "a.js").write_text(source)
+    with pytest.raises(pack_player.PackError):
+        pack_player.bundle(tmp_path, "a.js")
+
+
+def test_packing_keeps_names_apart_and_finds_circles(tmp_path):
+    (tmp_path / "a.js").write_text('import { x as y } from "./b.js";\nconst z = y;\nexport const x = z + 1;\n')
+    (tmp_path / "b.js").write_text("const z = 1;\nexport const x = z;\n")
+    packed = pack_player.bundle(tmp_path, "a.js")
+    assert packed.index("const z = 1") < packed.index("const {x:y}=m0") < packed.index("export{x}")
+    (tmp_path / "b.js").write_text('import { x } from "./a.js";\n')
+    with pytest.raises(pack_player.PackError, match="imports itself"):
+        pack_player.bundle(tmp_path, "a.js")
+
+
+def test_the_page_asks_nobody_else_and_measures_itself(page, server):
+    hosts: set[str] = set()
+    page.on("request", lambda request: hosts.add(request.url.split("/player/")[0]))
+    page.goto(server.url_of("player/index.html"))
+    page.wait_for_function("document.querySelector('pd4-player')?.player.status.level === 2")
+    assert not page.evaluate("document.querySelector('pd4-player').paused")
+    page.goto(server.url_of("player/index.html") + "?bench&src=scene.pd4&sizes=64x48")
+    started = time.monotonic()
+    page.wait_for_function("!!window.benchResult")
+    assert time.monotonic() - started < PATIENCE_MS / 1000
+    rows = page.evaluate("benchResult.rows")
+    assert [row["level"] for row in rows] == [0, 1, 2]
+    assert all(row["moving"] > 0 for row in rows) and all(row["playing"] > 0 for row in rows[1:])
+    assert {host for host in hosts if not host.startswith(("blob:", "data:"))} == {server.url.rstrip("/")}
