@@ -4,9 +4,9 @@
     python tools/player_speed.py a.pd4 --runs 25 --json times.json
     python tools/player_speed.py a.pd4 --grow 100000 big.pd4  # writes copies of a.pd4's anchors side by side
 
-Both decode whole files from memory, warm, in processes of their own that stay. What counts is processor time, so that a
-busy machine changes less; wall time stands beside it. Both slow down alike when other work shares the cores, and as they
-take turns, the ratio is of decodes that met the same conditions.
+Both decode whole files from memory, warm, in processes of their own that stay. What counts is processor time, so that
+a busy machine changes less; wall time stands beside it. Both slow down alike when other work shares the cores, and as
+they take turns, the ratio is of decodes that met the same conditions.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
 
 from pd4dgs_codec import decode, encode  # noqa: E402
-from pd4dgs_codec.entropy.morton import morton_order  # noqa: E402
+from pd4dgs_codec.morton import morton_order  # noqa: E402
 from pd4dgs_codec.scene import Scene  # noqa: E402
 
 LOOP = ROOT / "player" / "testing" / "decoder_loop.mjs"
@@ -140,12 +140,16 @@ def main(argv: Sequence[str] | None = None) -> int:
     p = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     p.add_argument("files", nargs="+", type=Path)
     p.add_argument("--runs", type=int, default=9, help="decodes that count (default: 9)")
-    p.add_argument("--grow", nargs=2, metavar=("N", "FILE"), help="write a file of N anchors instead, from the first file")
+    p.add_argument(
+        "--grow", nargs=2, metavar=("N", "FILE"), help="write a file of N anchors instead, from the first file"
+    )
     p.add_argument("--json", type=Path, metavar="FILE", help="write the figures")
     args = p.parse_args(argv)
     if args.grow:
         count, path = args.grow
-        Path(path).write_bytes(encode(grown(decode(args.files[0].read_bytes()), int(count)), effort=1, omit="nothing", verify=False))
+        Path(path).write_bytes(
+            encode(grown(decode(args.files[0].read_bytes()), int(count)), effort=1, omit="nothing", verify=False)
+        )
         return 0
     with NodeDecoder() as node:
         rows = [row(path, *compare(path, args.runs, node)) for path in args.files]
@@ -153,8 +157,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     print("|---|---|---|---|---|---|---|---|")
     for r in rows:
         print(
-            f"| {r['file']} | {r['anchors']:,} | {r['node_cpu_s']:.4f} | {r['python_cpu_s']:.4f} | {r['cpu_ratio']:.2f} "
-            f"| {r['node_wall_s']:.4f} | {r['python_wall_s']:.4f} | {r['wall_ratio']:.2f} |"
+            f"| {r['file']} | {r['anchors']:,} | {r['node_cpu_s']:.4f} | {r['python_cpu_s']:.4f} "
+            f"| {r['cpu_ratio']:.2f} | {r['node_wall_s']:.4f} | {r['python_wall_s']:.4f} | {r['wall_ratio']:.2f} |"
         )
     if args.json:
         args.json.write_text(json.dumps(rows, indent=1) + "\n")

@@ -261,10 +261,11 @@ def cameras(camera: Camera) -> Iterator[Camera]:
 def test_pictures_are_those_of_the_rasteriser(harness, server, lively, evaluator, monkeypatch):
     pytest.importorskip("torch")
     pytest.importorskip("numba")
+    from pd4dgs_codec.render.picture import render_image
+
     from pd4dgs_codec import decode
     from pd4dgs_codec.model.convert import from_scene
     from pd4dgs_codec.model.model import Model
-    from pd4dgs_codec.render.picture import render_image
 
     # clause 13.4 knows no frustum; the model leaves out anchors by where they stand before they are deformed
     monkeypatch.setattr(Model, "visible", lambda self, level, *_: (self.masks(level) > 0.01).nonzero()[:, 0])
