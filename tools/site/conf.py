@@ -49,7 +49,15 @@ pygments_style = "friendly"
 
 #: The table of contents: caption and pages.
 CONTENTS = {
-    "Use": ["docs/README", "docs/training", "docs/target-size", "docs/delivery", "docs/player", "docs/evaluation", "docs/api/index"],
+    "Use": [
+        "docs/README",
+        "docs/training",
+        "docs/target-size",
+        "docs/delivery",
+        "docs/player",
+        "docs/evaluation",
+        "docs/api/index",
+    ],
     "Format": ["spec/format", "spec/vectors/README", "docs/robustness"],
     "Measured": [
         "docs/results",
