@@ -25,7 +25,7 @@ def test_info_needs_the_header_alone():
     first = info(data[: whole["header_bytes"]])
     with pytest.raises(Truncated):
         info(data[: whole["header_bytes"] - 1])
-    assert whole["format_version"] == FORMAT_VERSION == "1.0"
+    assert whole["format_version"] == FORMAT_VERSION == "2.0"
     assert whole["bytes"] == first["bytes"] == len(data)
     place = ("layer", "offset", "bytes", "end")
     assert [{k: row[k] for k in place} for row in whole["layers"]] == first["layers"]

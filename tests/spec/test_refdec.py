@@ -467,7 +467,7 @@ FRAME_FAULTS = {
     "Truncated": lambda data: data[:-1],
     "Malformed": lambda data: data + b"\0",
     "BadSignature": lambda data: b"\x88" + data[1:],
-    "UnsupportedVersion": lambda data: data[:8] + b"\2" + data[9:],
+    "UnsupportedVersion": lambda data: data[:8] + b"\1" + data[9:],
     "LimitExceeded": lambda data: data[:13] + b"\x11" + data[14:],
     "ChecksumMismatch": lambda data: data[:-30] + bytes([data[-30] ^ 1]) + data[-29:],
 }

@@ -24,7 +24,7 @@ from pd4dgs_codec.codec.kinds import LAYER_KINDS, SCAFFOLD_INPUT
 from pd4dgs_codec.codec.layer_meta import Section
 from pd4dgs_codec.codec.symbols import LayerSymbols
 from pd4dgs_codec.entropy.ans import ans_encode
-from pd4dgs_codec.entropy.positions import encode_positions
+from pd4dgs_codec.entropy.positions import position_channels
 from pd4dgs_codec.entropy.priors import (
     FIRST_REUSE,
     Const,
@@ -193,6 +193,12 @@ def coded(channels: Iterable[Iterable[int]], priors: Mapping[int, Prior] | None 
     for number, channel in enumerate(channels):
         section.add(channel, (priors or {}).get(number))
     return section.done()
+
+
+def positions(cells: np.ndarray) -> bytes:
+    """Section POSITIONS of cells int32 [n, 3] in Morton order (clause 10)."""
+    head, channels = position_channels(cells)
+    return head + coded(channels)
 
 
 def plain_attributes(k: np.ndarray, priors: Mapping[int, Prior] | None = None) -> bytes:
@@ -523,7 +529,7 @@ def make_layer(
 
 def _sections(meant: LayerSymbols, predictors: Sequence[int], mode: int) -> dict[int, bytes]:
     n = len(meant.anchor_q)
-    sections = {POSITIONS: encode_positions(meant.anchor_q)} if n else {}
+    sections = {POSITIONS: positions(meant.anchor_q)} if n else {}
     tensors = [] if meant.raw_deformation else list(meant.tensors())
     planes = [residual(p, k) if k.size else k for p, k in zip(predictors, tensors, strict=False)]
     weights = [k.ravel() for k in tensors[len(planes) :]]

@@ -104,7 +104,7 @@ def _preamble() -> Iterator[Vector]:
         yield bad(f"signature-{name}", what, "3.1", "BadSignature", replace(plain, signature=signature), at=SIGNATURE)
     short = replace(plain, signature=b"GIF89a")
     yield bad("signature-short", "A short file of another kind.", "3.1", "BadSignature", short, at=SIGNATURE, size=6)
-    for major in (0, 2, 65535):
+    for major in (0, 1, 3, 65535):
         what = f"Major version {major}."
         yield bad(f"version-major-{major}", what, "3.1", "UnsupportedVersion", replace(plain, major=major), at=VERSION)
     for name, size in (("over-limit", MAX_HEADER + 1), ("largest", 2**32 - 1)):
