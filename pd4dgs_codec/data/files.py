@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -16,6 +17,11 @@ if TYPE_CHECKING:
 IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 WHITE = 255
 LARGEST = float(np.finfo(np.float64).max)
+#: Pillow's names of pixels; of the others (CMYK, LAB, floats …) no conversion is the only right one.
+GREY16_MODES = {"I;16", "I;16L", "I;16B"}
+READABLE_MODES = {"1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX"} | GREY16_MODES
+ORIENTATION, UPRIGHT = 0x0112, 1  #: the EXIF flag, and its value for pixels stored as they are seen
+GAMMA = (0.40, 0.51)  #: exponents that PNG files give for sRGB: 1/2.2 and what encoders round it to
 
 
 def read_json(path: Path) -> dict[str, Any]:
@@ -93,10 +99,55 @@ def _has_alpha(image: Picture) -> bool:
     return "A" in image.getbands() or "transparency" in image.info
 
 
-def _rgb(image: Picture, *, composite: bool) -> Picture:
-    """The picture in mode RGB: alpha composited on white, or dropped."""
+def _check_readable(image: Picture, where: str) -> None:
+    """Refuses by name what would not be shown as its maker saw it."""
+    found = None
+    if getattr(image, "n_frames", 1) > 1:
+        found = f"holds {image.n_frames} pictures, expected one"
+    elif image.mode not in READABLE_MODES:
+        found = f"has pixels of kind {image.mode}, expected grey of 8 or 16 bits, a palette, RGB or RGBA"
+    elif image.mode in GREY16_MODES and _has_alpha(image):
+        found = "has 16-bit grey with a transparent value, expected 8 bits or an alpha channel"
+    elif image.getexif().get(ORIENTATION, UPRIGHT) != UPRIGHT:  # some tools turn such pictures and others do not
+        flag = image.getexif()[ORIENTATION]
+        found = f"is stored turned (orientation flag {flag}), expected upright pixels that fit the camera"
+    elif not GAMMA[0] <= image.info.get("gamma", GAMMA[0]) <= GAMMA[1]:
+        found = f"has a gamma of {image.info['gamma']:g}, expected that of sRGB (0.455)"
+    if found:
+        raise DataError(f"{where}: {found}")
+
+
+def _srgb(image: Picture, where: str) -> Picture:
+    """The picture with its colour profile, if it names one, applied."""
+    profile = image.info.get("icc_profile")
+    if not profile:
+        return image
+    from PIL import ImageCms
+
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        name = ImageCms.getProfileDescription(source).strip()
+        if "sRGB" in name:
+            return image
+        mode = image.mode if image.mode in ("L", "RGB", "RGBA") else "RGBA" if _has_alpha(image) else "RGB"
+        target = "RGB" if mode == "L" else mode
+        turned = ImageCms.profileToProfile(
+            image.convert(mode), source, ImageCms.createProfile("sRGB"), outputMode=target
+        )
+    except (ImageCms.PyCMSError, OSError, ValueError) as e:
+        raise DataError(f"{where}: its colour profile cannot be used: {e}") from None
+    assert turned is not None  # None is for changes in place
+    return turned
+
+
+def _rgb(image: Picture, where: str, *, composite: bool) -> Picture:
+    """The picture in mode RGB and in sRGB: alpha composited on white, or dropped."""
     from PIL import Image
 
+    _check_readable(image, where)
+    if image.mode in GREY16_MODES:  # Pillow itself would clip to 255
+        image = Image.fromarray(((np.asarray(image).astype(np.uint32) * 255 + 32_767) // 65_535).astype(np.uint8))
+    image = _srgb(image, where)
     if composite and _has_alpha(image):
         image = image.convert("RGBA")
         image = Image.alpha_composite(Image.new("RGBA", image.size, (WHITE,) * 4), image)
@@ -111,7 +162,7 @@ def read_image(path: Path, size: tuple[int, int], *, downscale: int = 1, composi
     with _open(path, "image", size) as image:
         check_downscale(size, downscale, str(path))
         try:
-            rgb = _rgb(image, composite=composite)
+            rgb = _rgb(image, str(path), composite=composite)
         except (OSError, SyntaxError, ValueError) as e:
             raise DataError(f"{path}: image data is broken: {e}") from None
         if downscale > 1:
