@@ -102,8 +102,9 @@ def _has_alpha(image: Picture) -> bool:
 def _check_readable(image: Picture, where: str) -> None:
     """Refuses by name what would not be shown as its maker saw it."""
     found = None
-    if getattr(image, "n_frames", 1) > 1:
-        found = f"holds {image.n_frames} pictures, expected one"
+    frames = getattr(image, "n_frames", 1)
+    if frames > 1:
+        found = f"holds {frames} pictures, expected one"
     elif image.mode not in READABLE_MODES:
         found = f"has pixels of kind {image.mode}, expected grey of 8 or 16 bits, a palette, RGB or RGBA"
     elif image.mode in GREY16_MODES and _has_alpha(image):

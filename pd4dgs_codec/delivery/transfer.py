@@ -7,7 +7,6 @@ redirects.
 from __future__ import annotations
 
 import http.client
-import io
 import math
 import queue
 import socket
@@ -19,6 +18,7 @@ from http import HTTPStatus
 from typing import Any
 from urllib.parse import quote, urljoin, urlsplit
 
+from pd4dgs_codec.delivery.patience import Patient
 from pd4dgs_codec.delivery.ranges import content_range, strong_etag
 from pd4dgs_codec.errors import DeliveryError
 
@@ -91,7 +91,7 @@ class Transfer:
         self._home = self._place = _Place.of(url)
         self._validator: str | None = None
         self._connection: http.client.HTTPConnection | None = None
-        self._socket: _Patient | None = None  # http.client forgets it once an answer is the last
+        self._socket: Patient | None = None  # http.client forgets it once an answer is the last
         self._response: http.client.HTTPResponse | None = None
         self._response_end: int | None = None  # of the part in the answer being read; None: not told
         self._skip = 0  # bytes of the answer that are here already
@@ -205,7 +205,7 @@ class Transfer:
             kind = http.client.HTTPSConnection if self._place.secure else http.client.HTTPConnection
             self._connection = kind(self._place.host, self._place.port)
         if self._connection.sock is None:  # new, or closed by the server after its last answer
-            self._socket = _Patient(_connect(self._place, min(until, time.monotonic() + self.stall)))
+            self._socket = Patient(_connect(self._place, min(until, time.monotonic() + self.stall)))
             self._connection.sock = self._socket
         self._wait_at_most(until)
         self.requests += 1
@@ -213,7 +213,7 @@ class Transfer:
         return self._connection.getresponse()
 
     def _wait_at_most(self, until: float) -> None:
-        """What is read or written next, be it in many pieces, must be done within the stall limit and before `until`."""
+        """All that is read or written next must be done within the stall limit and before `until`."""
         assert self._socket is not None
         self._socket.until = min(until, time.monotonic() + self.stall)
 
@@ -332,49 +332,3 @@ def _connect(place: _Place, until: float) -> socket.socket:
                 raise
             failure = error
     raise failure
-
-
-class _Patient:
-    """A socket as http.client uses it, whose reading and writing in all end at `until` (of time.monotonic).
-
-    A socket's own limit begins anew with every byte, so that a server which drips its header would hold for hours.
-    """
-
-    def __init__(self, connection: socket.socket):
-        self.connection, self.until = connection, math.inf
-
-    def makefile(self, mode: str) -> io.BufferedReader:
-        """For reading; it may outlive `close`, as a socket's does."""
-        return io.BufferedReader(_PatientStream(self, self.connection.makefile(mode, buffering=0)))
-
-    def sendall(self, data: bytes) -> None:
-        """Writes all of it."""
-        self.set_limit()
-        self.connection.sendall(data)
-
-    def close(self) -> None:
-        """Ends the connection once nothing reads from it any more."""
-        self.connection.close()
-
-    def set_limit(self) -> None:
-        """Lets the next operation of the socket last as long as there is time."""
-        left = self.until - time.monotonic()
-        if left <= 0:
-            raise TimeoutError
-        self.connection.settimeout(None if left == math.inf else left)
-
-
-class _PatientStream(io.RawIOBase):
-    def __init__(self, owner: _Patient, stream: socket.SocketIO):
-        self.owner, self.stream = owner, stream
-
-    def readable(self) -> bool:
-        return True
-
-    def readinto(self, buffer: Any) -> int | None:
-        self.owner.set_limit()
-        return self.stream.readinto(buffer)
-
-    def close(self) -> None:
-        self.stream.close()
-        super().close()

@@ -82,7 +82,7 @@ READ = {
         1,
     ),
     "key.png": (lambda p: Image.fromarray(RAMP).save(p, transparency=7), grey(np.where(RAMP == 7, 255, RAMP)), 0),
-    "upright.jpg": (lambda p: Image.fromarray(grey(RAMP // 4 * 4)).save(p, quality=100, exif=oriented(1)), grey(RAMP), 8),
+    "upright.jpg": (lambda p: Image.fromarray(grey(RAMP)).save(p, quality=100, exif=oriented(1)), grey(RAMP), 4),
     "srgb-profile.png": (lambda p: Image.fromarray(COLOUR).save(p, icc_profile=srgb_profile()), COLOUR, 0),
     "linear-profile.png": (
         lambda p: Image.fromarray(COLOUR).save(p, icc_profile=linear_profile()), from_linear(COLOUR), 3
