@@ -162,6 +162,11 @@ def _train(args: argparse.Namespace, console: Console) -> int:
         trainer.run(Path(args.output), log=Path(args.log) if args.log else None, progress=TrainingProgress())
     except KeyboardInterrupt:
         raise TrainError("interrupted twice; what was trained since the last save is lost") from None
+    if trainer.iteration and trainer.learner.skipped == trainer.iteration:
+        raise TrainError(
+            f"{args.output}: nothing was learnt: in all {trainer.iteration} steps the loss or its gradient was not "
+            "finite; expected views and a scene of ordinary size"
+        )
     result = _summary(args, trainer)
     console.result(result, _text(result), on_stdout=False)
     return OK

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 import json
 from pathlib import Path
@@ -9,14 +10,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.errors import DataError, one_line
 
 if TYPE_CHECKING:
     from PIL.Image import Image as Picture
 
 IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 WHITE = 255
-LARGEST = float(np.finfo(np.float64).max)
+#: Of lengths in scene units and in pixels: their products and squares stay far from the end of binary32.
+LARGEST = 1e9
 #: Pillow's names of pixels; of the others (CMYK, LAB, floats …) no conversion is the only right one.
 GREY16_MODES = {"I;16", "I;16L", "I;16B"}
 READABLE_MODES = {"1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX"} | GREY16_MODES
@@ -27,7 +29,7 @@ GAMMA = (0.40, 0.51)  #: exponents that PNG files give for sRGB: 1/2.2 and what 
 def read_json(path: Path) -> dict[str, Any]:
     """The JSON object in `path`."""
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
+        value = json.loads(read_file(path).decode("utf-8"))
     except FileNotFoundError:
         raise DataError(f"{path}: missing, expected a JSON file") from None
     except json.JSONDecodeError as e:
@@ -39,26 +41,42 @@ def read_json(path: Path) -> dict[str, Any]:
     return value
 
 
-def number(value: Any, where: str, *, positive: bool = False) -> float:
-    """`value` as a finite float (greater than zero if `positive`)."""
-    expected = "a finite number" + (" > 0" if positive else "")
+def read_file(path: Path) -> bytes:
+    """All of a regular file; DataError for a pipe or a device, whose end may never come, OSError or ValueError else."""
+    if path.exists() and not path.is_file():
+        raise DataError(f"{path}: is not a regular file")
+    return path.read_bytes()
+
+
+def number(value: Any, where: str, *, positive: bool = False, largest: float = LARGEST) -> float:
+    """`value` as a float of at most `largest` in magnitude (greater than zero if `positive`)."""
+    expected = "a number" + (" > 0" if positive else "")
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise DataError(f"{where} is {value!r}, expected {expected}")
-    if not abs(value) <= LARGEST or (positive and value <= 0):  # also true of NaN and of integers beyond any float
-        raise DataError(f"{where} is {str(value)[:24]}, expected {expected}")
+        raise DataError(f"{where} is {one_line(repr(value), 60)}, expected {expected}")
+    if not abs(value) <= largest or (positive and value <= 0):  # also true of NaN and of integers beyond any float
+        raise DataError(f"{where} is {one_line(str(value), 24)}, expected {expected} and at most {largest:g}")
     return float(value)
 
 
+def whole_number(value: Any, where: str, low: int = 0) -> int:
+    """`value` as an integer >= low; 2.0 is one."""
+    result = number(value, where)
+    if result != int(result) or result < low:
+        raise DataError(f"{where} is {result:g}, expected a whole number >= {low}")
+    return int(result)
+
+
 def array(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
-    """`value` as a finite float64 array of the given shape."""
+    """`value` as a float64 array of the given shape, its numbers at most LARGEST in magnitude."""
     try:
         result = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         raise DataError(f"{where} is not a numeric array, expected shape {shape}") from None
     if result.shape != shape:
         raise DataError(f"{where} has shape {result.shape}, expected {shape}")
-    if not np.isfinite(result).all():
-        raise DataError(f"{where} holds NaN or infinity, expected finite numbers")
+    if not (np.abs(result) <= LARGEST).all():  # also true of NaN
+        found = "NaN" if np.isnan(result).any() else f"{float(np.abs(result).max()):g}"
+        raise DataError(f"{where} holds {found}, expected numbers of at most {LARGEST:g} in magnitude")
     return result
 
 
@@ -66,8 +84,9 @@ def find_image(folder: Path, name: str) -> Path:
     """The image file of a `file_path` written with or without its extension."""
     for suffix in IMAGE_SUFFIXES:
         path = folder / (name + suffix)
-        if path.is_file():
-            return path
+        with contextlib.suppress(OSError):  # a name too long for the system
+            if path.is_file():
+                return path
     raise DataError(f"{folder / name}: image is missing (tried as it is, .png, .jpg and .jpeg)")
 
 
@@ -81,7 +100,7 @@ def _open(path: Path, what: str = "image", size: tuple[int, int] | None = None) 
         picture = Image.open(path)
     except FileNotFoundError:
         raise DataError(f"{path}: image is missing") from None
-    except (UnidentifiedImageError, OSError, Image.DecompressionBombError):
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, Image.DecompressionBombError):
         raise DataError(f"{path}: not an image that can be read") from None
     if size is not None and picture.size != tuple(size):
         picture.close()

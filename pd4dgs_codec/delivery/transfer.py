@@ -20,7 +20,7 @@ from urllib.parse import quote, urljoin, urlsplit
 
 from pd4dgs_codec.delivery.patience import Patient
 from pd4dgs_codec.delivery.ranges import content_range, strong_etag
-from pd4dgs_codec.errors import DeliveryError
+from pd4dgs_codec.errors import DeliveryError, one_line
 
 BLOCK = 1 << 16
 MAX_REDIRECTS = 5
@@ -194,7 +194,9 @@ class Transfer:
             try:
                 self._place = _Place.of(urljoin(here, place))
             except ValueError:
-                raise DeliveryError(f"{self.url}: a redirect to {_shown(place)!r}, which is no address") from None
+                raise DeliveryError(
+                    f"{self.url}: a redirect to {one_line(place, SHOWN)!r}, which is no address"
+                ) from None
         else:
             raise DeliveryError(f"{self.url}: more than {MAX_REDIRECTS} redirects")
         self._response = response
@@ -227,22 +229,21 @@ class Transfer:
                 return
             self._restart()  # the file has become shorter than what is here
         if status not in (HTTPStatus.OK, HTTPStatus.PARTIAL_CONTENT):
-            said = f"the server answers {status} {_shown(response.reason)}".rstrip()
+            said = f"the server answers {status} {one_line(response.reason, SHOWN)}".rstrip()
             if status in PASSING:
                 raise _Cut(said)
             self.close()
             raise DeliveryError(f"{self.url}: {said}")
         if response.headers.get("Content-Encoding", "identity").lower() != "identity":
             self.close()
-            raise DeliveryError(
-                f"{self.url}: sent as {_shown(response.headers['Content-Encoding'])}, expected the bytes as such"
-            )
+            coding = one_line(response.headers["Content-Encoding"], SHOWN)
+            raise DeliveryError(f"{self.url}: sent as {coding}, expected the bytes as such")
         tag = strong_etag(response.headers.get("ETag"))
         validator = tag or response.headers.get("Last-Modified")
         if status == HTTPStatus.PARTIAL_CONTENT:
             if not asked_range or part is None or part.start != start or part.total is None:
                 raise _Cut(
-                    f"found Content-Range {_shown(response.headers.get('Content-Range') or 'none')}, "
+                    f"found Content-Range {one_line(response.headers.get('Content-Range') or 'none', SHOWN)}, "
                     f"expected bytes from {start}"
                 )
             other = start and validator is not None and validator != self._validator
@@ -285,13 +286,7 @@ def _reason(error: BaseException) -> str:
         return error.strerror or str(error)
     if isinstance(error, _Cut):
         return str(error)
-    return f"not an HTTP answer: {_shown(str(error))}".rstrip(": ")
-
-
-def _shown(text: str) -> str:
-    """What a server said, fit for one line on a terminal."""
-    line = " ".join("".join(c if c.isprintable() else " " for c in text).split())
-    return line if len(line) <= SHOWN else line[: SHOWN - 1] + "…"
+    return f"not an HTTP answer: {one_line(str(error), SHOWN)}".rstrip(": ")
 
 
 def _connect(place: _Place, until: float) -> socket.socket:

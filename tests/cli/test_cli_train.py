@@ -193,6 +193,14 @@ def test_a_gpu_that_gsplat_cannot_use_is_left_alone(monkeypatch, capsys):
     assert _device("auto", console) == _device("cuda", console) == "cuda"
 
 
+def test_a_run_that_learnt_nothing_fails(train, tmp_path, monkeypatch):
+    from pd4dgs_codec.train.learner import Learner
+
+    monkeypatch.setattr(Learner, "_learn", lambda *_: False)
+    result = train(tmp_path / "m.pt")
+    assert result.code == 1 and "nothing was learnt: in all 4 steps" in result.error_lines[-1]
+
+
 def test_a_second_interrupt_is_one_line(train, tmp_path, monkeypatch):
     from pd4dgs_codec.train.learner import Learner
 
