@@ -39,8 +39,8 @@ def own_frames(info: SceneInfo, count: int, orbit: float = 0.0, downscale: int =
     camera = shrunk(info.camera, downscale)
     if camera.width * camera.height > MAX_PIXELS:
         raise RenderError(
-            f"the file's camera takes pictures of {camera.width}x{camera.height}, expected {MAX_PIXELS:,} pixels at most: "
-            "smaller with --downscale, or of another camera with --data"
+            f"the file's camera takes pictures of {camera.width}x{camera.height}, at most {MAX_PIXELS:,} pixels expected: "
+            "smaller with --downscale, or those of another camera with --data"
         )
     times = np.linspace(0.0, 1.0, count) if count > 1 else np.zeros(1)
     centre = look_at_point(info)
