@@ -16,8 +16,8 @@ import numpy as np
 
 from pd4dgs_codec.entropy import EFFORTS, PRIORS
 from pd4dgs_codec.entropy.ans import MAX_COUNT, AnsDecoder, ans_encode
-from pd4dgs_codec.entropy.bits import gaussian_bits
-from pd4dgs_codec.entropy.fitting import fit_best, histogram
+from pd4dgs_codec.entropy.bits import BIT, gaussian_bits
+from pd4dgs_codec.entropy.fitting import Fitted, fit_best, histogram
 from pd4dgs_codec.entropy.priors import (
     CONST,
     FIRST_REUSE,
@@ -76,18 +76,21 @@ def encode_channels(channels: Sequence[np.ndarray], *, priors: str = "best", eff
     arrays = check_channels(channels)
     histograms = [histogram(a) for a in arrays if len(a)]
     rounds = 0 if effort < 3 else effort // 2
-    payload, prior_ids = _encode(arrays, plan_priors(histograms, lambda h: h.gauss, rounds))
+    payload, prior_ids = b"", list[int]()
     if priors == "best":
-        other = _encode(arrays, plan_priors(histograms, lambda h: fit_best(h, effort), rounds))
-        if len(other[0]) < len(payload):
+        plan = plan_priors(histograms, lambda h: fit_best(h, effort), rounds)
+        payload, prior_ids = _encode(arrays, plan)
+    if priors == "gauss" or sum(h.gauss.own for h in histograms) <= 8 * BIT * len(payload):
+        other = _encode(arrays, plan_priors(histograms, lambda h: h.gauss, rounds))
+        if priors == "gauss" or len(other[0]) < len(payload):
             payload, prior_ids = other
     return CodedChannels(payload, 8 * len(payload), sum(gaussian_bits(a) for a in arrays), prior_ids)
 
 
-def _encode(arrays: Sequence[np.ndarray], plan: Sequence[Prior]) -> tuple[bytes, list[int]]:
+def _encode(arrays: Sequence[np.ndarray], plan: Sequence[Fitted]) -> tuple[bytes, list[int]]:
     out, defined, prior_ids = bytearray(), list[Prior](), []
     symbols, cums = list[np.ndarray](), list[np.ndarray]()
-    remaining = iter(plan)
+    remaining = (fitted.prior for fitted in plan)
     for array in arrays:
         if len(array) == 0:
             prior_ids.append(CONST)
