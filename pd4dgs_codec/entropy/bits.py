@@ -46,16 +46,19 @@ def entropy_bits(symbols: np.ndarray) -> float:
 
 
 def gaussian_bits(symbols: np.ndarray) -> float:
-    """Sum of R(a) = -log2(Phi((k + 1/2 - mu) / sigma) - Phi((k - 1/2 - mu) / sigma)) over integer symbols k, in bits.
+    """Sum of R(a) over integer symbols, in bits; see `gaussian_bits_of`."""
+    symbols = np.asarray(symbols)
+    return gaussian_bits_of(*symbol_counts(symbols)) if symbols.size else 0.0
+
+
+def gaussian_bits_of(values: np.ndarray, counts: np.ndarray) -> float:
+    """Sum of R(a) = -log2(Phi((k + 1/2 - mu) / sigma) - Phi((k - 1/2 - mu) / sigma)) over values k int64 [U] that occur
+    counts [U] times, in bits.
 
     mu and sigma are the symbols' mean and standard deviation (units of Q, sigma >= 2**-10), each probability is
     clipped at 1e-6. Written with the upper tail of |k - mu|, so nothing above the clip loses more than 1e-9 of itself.
     """
-    symbols = np.asarray(symbols)
-    if symbols.size == 0:
-        return 0.0
-    values, counts = symbol_counts(symbols)
-    weights = counts / symbols.size
+    weights = counts / counts.sum()
     mu = float(values @ weights)
     sigma = max(math.sqrt(float((values - mu) ** 2 @ weights)), SIGMA_MIN)
     scale = 1.0 / (sigma * math.sqrt(2.0))

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from pd4dgs_codec.entropy.bits import BIT, LOG2
+from pd4dgs_codec.entropy.bits import BIT, LOG2, P_MIN, SIGMA_MIN
 from pd4dgs_codec.entropy.fit_reference import CLASS_WIDTHS, ENOUGH, GAUSS_BITS, GAUSS_ROUNDS, MIXTURE_BITS
 from pd4dgs_codec.entropy.priors import CLASS_STEPS, FLOORS
 from pd4dgs_codec.entropy.tables import NORMAL, OCTAVE, SI_MAX, SI_MIN, TOTAL
@@ -455,3 +455,52 @@ def assign(costs: np.ndarray, prices: np.ndarray) -> tuple[np.ndarray, int]:
         if is_open[p]:
             total += prices[p]
     return first, total if total < none else none
+
+
+@_compiled
+def split_cost(channels: np.ndarray, classes: np.ndarray, count: int) -> int:
+    """See `fit_reference.split_cost`."""
+    n, cost = channels.shape[1], np.int64(0)
+    sizes = np.zeros(count, np.int64)
+    for i in range(n):
+        sizes[classes[i]] += 1
+    for channel in channels:
+        low, high = channel.min(), channel.max()
+        width = high - low + 1
+        if count * width > 16 * n + 4096:  # too wide to count in place
+            for k in range(count):
+                part = np.sort(channel[classes == k])
+                run = 0
+                for i in range(len(part)):
+                    run += 1
+                    if i + 1 == len(part) or part[i + 1] != part[i]:
+                        cost += run * _cost(run)
+                        run = 0
+        else:
+            seen = np.zeros((count, width), np.int64)
+            for i in range(n):
+                seen[classes[i], channel[i] - low] += 1
+            for k in range(count):
+                for i in range(width):
+                    if seen[k, i] > 0:
+                        cost += seen[k, i] * _cost(seen[k, i])
+        for k in range(count):
+            if sizes[k] > 0:
+                cost -= sizes[k] * _cost(sizes[k])
+    return cost
+
+
+@_compiled
+def gaussian_bits(values: np.ndarray, counts: np.ndarray) -> float:
+    """See `bits.gaussian_bits`, here of int64 values and their counts."""
+    total, mu, spread, bits = counts.sum(), 0.0, 0.0, 0.0
+    for i in range(len(values)):
+        mu += values[i] * (counts[i] / total)
+    for i in range(len(values)):
+        spread += (values[i] - mu) ** 2 * (counts[i] / total)
+    scale = 1.0 / (max(math.sqrt(spread), SIGMA_MIN) * math.sqrt(2.0))
+    for i in range(len(values)):
+        distance = abs(values[i] - mu)
+        p = 0.5 * (math.erfc((distance - 0.5) * scale) - math.erfc((distance + 0.5) * scale))
+        bits -= counts[i] * math.log2(max(p, P_MIN))
+    return bits

@@ -11,7 +11,7 @@ from collections.abc import Callable
 
 import numpy as np
 
-from pd4dgs_codec.entropy.bits import BIT, frequency_costs
+from pd4dgs_codec.entropy.bits import BIT, frequency_costs, gaussian_bits_of, symbol_counts
 from pd4dgs_codec.entropy.priors import CLASS_STEPS, FLOORS, top_limit
 from pd4dgs_codec.entropy.tables import (
     OCTAVE,
@@ -29,6 +29,8 @@ GAUSS_ROUNDS = 12
 ENOUGH = BIT // 8
 #: Widths that a histogram may give the Gaussian of its classes.
 CLASS_WIDTHS = 64
+
+gaussian_bits = gaussian_bits_of
 
 Cost = Callable[[np.ndarray], np.ndarray]  #: int64 [K, D] parameters -> int64 [K]
 
@@ -133,6 +135,18 @@ def assign(costs: np.ndarray, prices: np.ndarray) -> tuple[np.ndarray, int]:
             break
         open_ = np.delete(open_, saved.argmax())
     return open_[owner], int(table.min(axis=1).sum() + prices[open_].sum())
+
+
+def split_cost(channels: np.ndarray, classes: np.ndarray, count: int) -> int:
+    """Order-0 entropy of channels int64 [m, n], each split into the `count` classes int64 [n] of its places."""
+    cost = 0
+    for channel in channels:
+        for k in range(count):
+            part = channel[classes == k]
+            if part.size:
+                counts = symbol_counts(part)[1]
+                cost += int(counts @ frequency_costs(counts)) - part.size * int(frequency_costs(np.array(part.size)))
+    return cost
 
 
 def _coarsen(dense: np.ndarray, bits: int) -> tuple[np.ndarray, int]:

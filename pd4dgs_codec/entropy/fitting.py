@@ -44,6 +44,11 @@ class Histogram:
     def total(self) -> int:
         return int(self.counts.sum())
 
+    @property
+    def rate_bits(self) -> float:
+        """The sum of R(a), see `bits.gaussian_bits`."""
+        return float(loops.gaussian_bits(self.values, self.counts))
+
     @cached_property
     def gauss(self) -> Fitted:
         """Kept, because both policies start from it."""
@@ -79,6 +84,11 @@ def pool(histograms: Sequence[Histogram]) -> Histogram:
     return Histogram(present + low, dense[present])
 
 
+def split_bits(channels: np.ndarray, classes: np.ndarray, count: int) -> float:
+    """Order-0 entropy in bits of channels int64 [m, n], each split into the `count` classes int64 [n] of its places."""
+    return float(loops.split_cost(channels, classes, count)) / BIT
+
+
 def costs_of(histograms: Sequence[Histogram], priors: Sequence[Fitted]) -> np.ndarray:
     """Cost of coding each histogram's symbols under each prior, int64 [histograms, priors]; see `cost_matrix`."""
     windows = [p.prior.window for p in priors]
@@ -108,7 +118,7 @@ def fit_gauss(h: Histogram) -> Fitted:
 def fit_best(h: Histogram, effort: int) -> Fitted:
     """The cheapest of all priors, on the window that suits the Gaussian best."""
     found = h.gauss
-    if found.prior.window.n == 1 or effort == 1:
+    if found.prior.window.n == 1:
         return found
     return _cheapest([found, *_richer_priors(h, found, effort)])
 

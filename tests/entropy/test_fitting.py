@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pd4dgs_codec.entropy import fit_reference, fitting, sharing
-from pd4dgs_codec.entropy.bits import BIT, frequency_costs
+from pd4dgs_codec.entropy.bits import BIT, entropy_bits, frequency_costs, gaussian_bits
 from pd4dgs_codec.entropy.channels import encode_channels
 from pd4dgs_codec.entropy.fitting import fit_best, histogram, pool
 from pd4dgs_codec.entropy.tables import TOTAL
@@ -24,7 +24,7 @@ def _channel(seed: int) -> np.ndarray:
     return np.rint(k).astype(np.int64)
 
 
-CHANNELS = [_channel(seed) for seed in range(60)]
+CHANNELS = [_channel(seed) for seed in range(24)]
 
 
 def _dense(symbols: np.ndarray) -> np.ndarray:
@@ -79,6 +79,22 @@ def test_plans_are_the_same(kernels):
     np.testing.assert_array_equal(np.diag(matrix), [p.own for p in priors])
     prices = np.array([p.price for p in priors])
     _assert_same(kernels.assign(matrix, prices), fit_reference.assign(matrix, prices))
+
+
+def test_costs_of_classes_are_the_same(kernels):
+    rng = np.random.default_rng(0)
+    for spread, count in ((1, 1), (3, 5), (1 << 20, 3)):
+        channels, classes = rng.integers(-9, 9, (4, 700)) * spread, rng.integers(0, count, 700)
+        expected = sum(entropy_bits(channel[classes == k]) for channel in channels for k in range(count))
+        cost = fit_reference.split_cost(channels, classes, count)
+        assert kernels.split_cost(channels, classes, count) == cost
+        assert cost / BIT == pytest.approx(expected, rel=1e-6)
+
+
+def test_rates_are_the_same(kernels):
+    for symbols in CHANNELS:
+        h = histogram(symbols)
+        assert kernels.gaussian_bits(h.values, h.counts) == pytest.approx(gaussian_bits(symbols), rel=1e-12)
 
 
 def test_payloads_are_the_same_without_numba(kernels, monkeypatch):
