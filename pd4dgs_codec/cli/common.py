@@ -17,6 +17,7 @@ from typing import Any, NoReturn, TextIO, TypeVar
 
 from pd4dgs_codec.errors import DecodeError, EncodeError, Pd4Error
 from pd4dgs_codec.jsonable import finite
+from pd4dgs_codec.threads import configure
 
 T = TypeVar("T")
 
@@ -251,6 +252,7 @@ def run(parser: Parser, action: Action, argv: Sequence[str] | None) -> int:
     try:
         args = parser.parse_args(arguments)
         name = getattr(args, "input", "")
+        configure(getattr(args, "threads", None))  # before numpy, torch and numba are imported
         code = action(args, Console(args))
         sys.stdout.flush()
         return code
@@ -325,10 +327,3 @@ def _point_at_nothing(stream: TextIO) -> None:
         nothing = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nothing, stream.fileno())
         os.close(nothing)
-
-
-def use_threads(args: argparse.Namespace) -> None:
-    """Settles the number of threads; call it before the first import of torch or numba."""
-    from pd4dgs_codec.render.threads import configure
-
-    configure(args.threads)

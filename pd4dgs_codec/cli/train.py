@@ -23,7 +23,6 @@ from pd4dgs_codec.cli.common import (
     run,
     seed,
     table,
-    use_threads,
 )
 from pd4dgs_codec.cli.files import STDIO, check_output
 from pd4dgs_codec.cli.progress import TrainingProgress
@@ -130,7 +129,6 @@ def _train(args: argparse.Namespace, console: Console) -> int:
     check_output(args.output, args.overwrite or resuming_in_place)
     if args.log:
         check_output(args.log, args.overwrite or args.resume is not None)
-    use_threads(args)
     from pd4dgs_codec.data.dataset import load
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.train.loop import Trainer

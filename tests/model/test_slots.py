@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from pd4dgs_codec import threads
 from pd4dgs_codec.model import slots
-from pd4dgs_codec.render import threads
 
 N = 40
 
