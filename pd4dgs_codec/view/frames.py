@@ -38,8 +38,9 @@ def own_frames(info: SceneInfo, count: int, orbit: float = 0.0, downscale: int =
         raise RenderError("the file holds no camera of its own; expected --data SOURCE to take cameras from")
     camera = shrunk(info.camera, downscale)
     if camera.width * camera.height > MAX_PIXELS:
+        size = f"{camera.width}x{camera.height}"
         raise RenderError(
-            f"the file's camera takes pictures of {camera.width}x{camera.height}, at most {MAX_PIXELS:,} pixels expected: "
+            f"the file's camera takes pictures of {size}, expected {MAX_PIXELS:,} pixels at most: "
             "smaller with --downscale, or those of another camera with --data"
         )
     times = np.linspace(0.0, 1.0, count) if count > 1 else np.zeros(1)
