@@ -77,10 +77,13 @@ def test_the_command_refuses_a_damaged_file_in_one_line(tmp_path):
 
 def test_what_was_changed_at_random_ends_as_in_the_package(tools):
     import player_fuzz
+    from fuzz import VECTORS
+    from fuzzing.files import given_seeds
     from player_speed import NodeDecoder
 
+    seeds = given_seeds(sorted((VECTORS / "valid").glob("*.pd4"))[::4])
     with NodeDecoder(str(NODE)) as node:
-        figures = player_fuzz.run_inputs(node, player_fuzz.all_seeds([]), 1, range(100))
+        figures = player_fuzz.run_inputs(node, seeds, 1, range(100))
     assert figures.inputs == 100 and not figures.findings
     assert figures.sealed > 30 and figures.outcomes["decoded"] > 0 and len(figures.outcomes) > 4
 
