@@ -88,7 +88,7 @@ def _planes(resolution: Sequence[int], channels: int) -> Planes:
 
 
 def exact_samples(planes: Planes, box: np.ndarray, points: np.ndarray, t: float) -> np.ndarray:
-    """float64 [n, C * scales] by clause 13.2 of the format: every cell of a plane with its two weights, most of them 0."""
+    """float64 [n, C * scales] by clause 13.2 of the format: each cell of a plane with its weights, most of them 0."""
     low, high = box.astype(np.float64)
     unit = np.zeros((len(points), 4))
     for axis in range(3):
