@@ -70,13 +70,6 @@ def test_a_rate_weight_for_a_run_without_rate_is_wrong_usage(train, tmp_path):
     assert result.code == 2 and "--without rate" in result.err and not (tmp_path / "m.pt").exists()
 
 
-def test_seed_decides_the_result(train, tmp_path):
-    for name, seed in (("a", 1), ("b", 1), ("c", 2)):
-        assert train(tmp_path / f"{name}.pt", "--seed", seed, iterations=2).code == 0
-    a, b, c = (_state(tmp_path / f"{name}.pt") for name in "abc")
-    assert _same(a, b) and not _same(a, c)
-
-
 def test_interrupted_and_resumed_run_repeats_the_uninterrupted_one(train, tmp_path, monkeypatch):
     from pd4dgs_codec.train.learner import Learner
 
