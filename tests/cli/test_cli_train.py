@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import errno
 import json
 import os
 import signal
@@ -290,15 +289,3 @@ def test_scarce_data_is_said_to_be_so(cli, dataset, tmp_path):
     assert result.code == 0
     notes = [line for line in result.error_lines if line.startswith("note: ")]
     assert len(notes) == 2 and "one instant" in notes[0] and "one place" in notes[1]
-
-
-def test_a_full_disk_in_training_leaves_the_last_save(train, tmp_path, monkeypatch):
-    output = tmp_path / "m.pt"
-    assert train(output, iterations=2).code == 0
-    before = output.read_bytes()
-    monkeypatch.setattr("os.fsync", lambda _: (_ for _ in ()).throw(OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))))
-    result = train(output, "-f", iterations=3)
-    assert result.code == 1 and result.error_lines[-1].endswith(
-        "m.pt: cannot write the checkpoint: No space left on device"
-    )
-    assert output.read_bytes() == before and os.listdir(tmp_path) == ["m.pt"]
