@@ -37,6 +37,12 @@ settings.register_profile("pd4dgs", deadline=None, suppress_health_check=[Health
 settings.load_profile("pd4dgs")
 
 
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Rooms with kernels first. Each worker begins with a run of the tests in their order, so that one worker compiles
+    the kernels, which takes a minute, and the others find them compiled."""
+    items.sort(key=lambda item: item.path.relative_to(ROOT / "tests").parts[0] not in NEED_TRAIN)
+
+
 @pytest.fixture(autouse=True, scope="session")
 def _heed_interrupts() -> Iterator[None]:
     before = signal.getsignal(signal.SIGINT)

@@ -6,7 +6,8 @@ import argparse
 from collections.abc import Sequence
 from typing import Any
 
-from pd4dgs_codec.cli.common import OK, Console, Parser, number, rates, run, table
+from pd4dgs_codec.cli import values
+from pd4dgs_codec.cli.common import OK, Console, Parser, number, run, table
 from pd4dgs_codec.cli.files import STDIO, read_bytes
 
 DETAILS = """\
@@ -30,13 +31,8 @@ def parser() -> Parser:
     p.add_argument("input", metavar="FILE", help=".pd4 file or its URL; - reads stdin")
     p.add_argument("--check", action="store_true", help="decode everything, so that every checksum and rule is tested")
     p.add_argument("--hashes", action="store_true", help="SHA-256 per layer of its integers and of its float32 tensors")
-    p.add_argument(
-        "--at",
-        type=rates,
-        default="2M,10M,50M",
-        metavar="RATES",
-        help="link rates in bits per second for the first-frame times (default: 2M,10M,50M)",
-    )
+    what = "link rates in bits per second for the first-frame times (default: 2M,10M,50M)"
+    p.add_argument("--at", type=values.rates, default="2M,10M,50M", metavar="RATES", help=what)
     p.add_common()
     return p
 
