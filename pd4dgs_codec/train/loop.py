@@ -121,6 +121,7 @@ class Trainer:
                 record["total"] = self._fix_iterations(start)
             if self._curve_due():
                 record["held_out_psnr"] = self._evaluate()
+                record["plane_bits"] = self.learner.plane_bits()
                 self.seconds = time.monotonic() - start
             if not records.write(record | {"seconds": round(self.seconds, 3)}):
                 break
