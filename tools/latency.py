@@ -19,7 +19,7 @@ from pages.page import ROOT, Page, Row, keep, make, options, say
 from pages.scenes import SCENES
 
 from pd4dgs_codec.bench.report import markdown
-from pd4dgs_codec.render.threads import configure
+from pd4dgs_codec.threads import configure
 
 NAMES = ("shelf-hand", "shelf-hand-paper")
 RATES = (2e6, 10e6, 50e6)

@@ -24,7 +24,7 @@ from typing import Any
 
 from pages.scenes import SCENES, SHARED, Scene
 
-from pd4dgs_codec.render.threads import configure
+from pd4dgs_codec.threads import configure
 
 #: Iterations and seeds at most of the synthetic scenes, in the preset tiny.
 SYNTHETIC = ("tiny", 400, 3)

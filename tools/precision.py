@@ -23,7 +23,7 @@ from typing import Any
 from pages.page import Page, Row, keep, make, options, say, unpadded
 from pages.scenes import SCENES, Scene, present
 
-from pd4dgs_codec.render.threads import configure
+from pd4dgs_codec.threads import configure
 
 FULL = ("--step-scales", "1,2,4", "--efforts", "1,5", "--cold", "1")
 #: Without the efforts that take minutes.

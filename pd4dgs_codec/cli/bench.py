@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from pd4dgs_codec.atomic import whole_file
 from pd4dgs_codec.cli import common
-from pd4dgs_codec.cli.common import FAILED, OK, SOURCES, Console, Parser, UsageError, count, positive_int, use_threads
+from pd4dgs_codec.cli.common import FAILED, OK, SOURCES, Console, Parser, UsageError, count, positive_int
 from pd4dgs_codec.cli.files import STDIO, check_output, is_pd4, named_input, read_bytes, write_bytes
 from pd4dgs_codec.cli.progress import TrainingProgress, progress_bar
 from pd4dgs_codec.errors import DataError, DecodeError, TrainError
@@ -414,7 +414,6 @@ def _report(execute: Callable[..., Outcome], args: argparse.Namespace, console: 
     for path in (plot, None if args.json == STDIO else args.json):
         if path is not None:
             check_output(path, args.overwrite)
-    use_threads(args)
     found = execute(args, console)
     if plot is not None and found.draw is not None:
         with whole_file(plot, args.overwrite) as temporary:

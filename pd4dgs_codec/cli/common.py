@@ -13,10 +13,11 @@ import math
 import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn, TextIO, TypeVar
 
 from pd4dgs_codec.errors import DecodeError, EncodeError, Pd4Error
 from pd4dgs_codec.jsonable import finite
+from pd4dgs_codec.threads import configure
 
 T = TypeVar("T")
 
@@ -61,6 +62,10 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         raise UsageError(message)
 
+    def print_help(self, file: object = None) -> NoReturn:
+        """Prints the help on stdout and ends the program: with 0, or with 1 if stdout does not take it."""
+        self.exit(tell(self.prog, self.format_help().rstrip("\n")))
+
     def add_common(self, *, json_file: bool = False) -> None:
         """The options that every command has. json_file: --json may name a file; args.json is then its name, or "-"."""
         group = self.add_argument_group("common options")
@@ -81,8 +86,7 @@ class _Version(argparse.Action):
     """Prints the release and the format version; a plain "version" action would import the codec for every --help."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
-        print(version_line(parser.prog))
-        parser.exit()
+        parser.exit(tell(parser.prog, version_line(parser.prog)))
 
 
 def version_line(prog: str) -> str:
@@ -180,7 +184,7 @@ class Console:
 
     def message(self, text: str) -> None:
         """A line for the person at the terminal."""
-        print(text, file=sys.stderr, flush=True)
+        say(text)
 
     def detail(self, text: str) -> None:
         """A line shown with -v only."""
@@ -195,6 +199,26 @@ class Console:
             print(text, flush=True)
         else:
             self.message(text)
+
+
+def say(text: str) -> None:
+    """A line on stderr. One that is full or gone takes nothing more, and the work goes on without its words."""
+    try:
+        print(text, file=sys.stderr, flush=True)
+    except OSError:
+        _point_at_nothing(sys.stderr)
+
+
+def tell(prog: str, text: str) -> int:
+    """Prints all there is to say on stdout; returns the exit code."""
+    try:
+        print(text, flush=True)
+    except OSError as error:
+        if not isinstance(error, BrokenPipeError):
+            say(f"{prog}: error: stdout: {error.strerror}")
+        _point_at_nothing(sys.stdout)
+        return FAILED
+    return OK
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
@@ -221,19 +245,21 @@ Action = Callable[[argparse.Namespace, Console], int]
 
 def run(parser: Parser, action: Action, argv: Sequence[str] | None) -> int:
     """Parses, acts, and turns every failure into one line on stderr and an exit code."""
+    open_streams()
     arguments = list(sys.argv[1:] if argv is None else argv)
     as_json, verbose = "--json" in arguments, not {"-v", "--verbose"}.isdisjoint(arguments)
     name = ""
     try:
         args = parser.parse_args(arguments)
         name = getattr(args, "input", "")
+        configure(getattr(args, "threads", None))  # before numpy, torch and numba are imported
         code = action(args, Console(args))
         sys.stdout.flush()
         return code
     except UsageError as error:
         return _fail(parser, error, f"{error}; see {parser.prog} --help", as_json, USAGE)
     except BrokenPipeError:  # the reader went away, as `| head` does
-        _close_stdout()
+        _point_at_nothing(sys.stdout)
         return FAILED
     except (Exception, KeyboardInterrupt) as error:
         message = _explain(error, "stdin" if name == "-" else name)
@@ -264,7 +290,7 @@ def _explain(error: BaseException, name: str) -> str | None:
 
 def _fail(parser: Parser, error: BaseException, message: str, as_json: bool, code: int = FAILED) -> int:
     line = " ".join(message.split())
-    print(f"{parser.prog}: error: {line}", file=sys.stderr, flush=True)
+    say(f"{parser.prog}: error: {line}")
     if as_json:
         content: dict[str, Any] = {"type": type(error).__name__, "message": line}
         if isinstance(error, DecodeError) and error.offset is not None:
@@ -274,20 +300,30 @@ def _fail(parser: Parser, error: BaseException, message: str, as_json: bool, cod
     try:
         sys.stdout.flush()
     except OSError:
-        _close_stdout()
+        _point_at_nothing(sys.stdout)
     return code
 
 
-def _close_stdout() -> None:
-    """Points stdout at nothing, so that the interpreter's own flush at exit cannot fail a second time."""
+def open_streams() -> None:
+    """Opens what the caller closed of descriptors 0 to 2, so that no file of ours takes their numbers.
+
+    A closed stdin is empty, writing to a closed stdout is an error as it is of a full one, and a closed stderr takes
+    every word and keeps none.
+    """
+    for descriptor, flags in ((0, os.O_RDONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, flags)  # takes the lowest free number, which is this one
+    if sys.stdout is None:
+        sys.stdout = open(1, "w", encoding="utf-8", closefd=False)  # noqa: SIM115 - it lives as long as the process
+    if sys.stderr is None:
+        sys.stderr = open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115 - likewise
+
+
+def _point_at_nothing(stream: TextIO) -> None:
+    """So that the interpreter's own flush at exit cannot fail a second time."""
     with contextlib.suppress(OSError, ValueError):
         nothing = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nothing, sys.stdout.fileno())
+        os.dup2(nothing, stream.fileno())
         os.close(nothing)
-
-
-def use_threads(args: argparse.Namespace) -> None:
-    """Settles the number of threads; call it before the first import of torch or numba."""
-    from pd4dgs_codec.render.threads import configure
-
-    configure(args.threads)

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.cli.common import OK, PARTIAL, Console, Parser, UsageError, number, run, table, use_threads
+from pd4dgs_codec.cli.common import OK, PARTIAL, Console, Parser, UsageError, number, run, table
 from pd4dgs_codec.cli.files import STDIO, check_output, read_bytes, write_bytes
 from pd4dgs_codec.errors import DeliveryError
 
@@ -126,7 +126,6 @@ def _npz(scene: Scene, symbols: bool) -> bytes:
 
 
 def _write_checkpoint(scene: Scene, args: argparse.Namespace) -> None:
-    use_threads(args)
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.model.convert import from_scene
 

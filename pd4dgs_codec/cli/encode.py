@@ -22,7 +22,6 @@ from pd4dgs_codec.cli.common import (
     positive_int,
     run,
     table,
-    use_threads,
 )
 from pd4dgs_codec.cli.files import STDIO, check_output, is_pd4, read_bytes, write_bytes
 from pd4dgs_codec.cli.progress import progress_bar
@@ -132,8 +131,6 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
     options = _options(args)
     scene, trained = _load(args)
     console.detail(f"{args.input}: {len(scene.anchor_q)} anchors, layers {list(scene.layers)}, steps {scene.steps}")
-    if args.data is not None or args.target_size:
-        use_threads(args)
     from pd4dgs_codec.pack.packing import pack
 
     packed = pack(
@@ -173,7 +170,6 @@ def _load(args: argparse.Namespace) -> tuple[Scene, bool]:
         from pd4dgs_codec.codec.decoder import decode
 
         return decode(data), False
-    use_threads(args)
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.model.convert import to_scene
 

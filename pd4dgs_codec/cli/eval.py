@@ -16,7 +16,6 @@ from pd4dgs_codec.cli.common import (
     positive_int,
     run,
     table,
-    use_threads,
 )
 from pd4dgs_codec.cli.files import named_input
 from pd4dgs_codec.cli.progress import progress_bar
@@ -62,7 +61,6 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _evaluate(args: argparse.Namespace, console: Console) -> int:
-    use_threads(args)
     from pd4dgs_codec.data.dataset import load
     from pd4dgs_codec.metrics.perceptual import load_perceptual
     from pd4dgs_codec.view.evaluate import evaluate_file

@@ -8,6 +8,8 @@ import time
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
+from pd4dgs_codec.cli.common import say
+
 if TYPE_CHECKING:
     from pd4dgs_codec.train.loop import Trainer
 
@@ -35,7 +37,7 @@ def progress_bar(total: int | None, unit: str, label: str) -> Iterator[Callable[
         done += 1
         if time.monotonic() - told > LINE_SECONDS:
             told = time.monotonic()
-            print(f"{label}: {done}{f' of {total}' if total else ''} {unit}", file=sys.stderr, flush=True)
+            say(f"{label}: {done}{f' of {total}' if total else ''} {unit}")
 
     yield count_one
 
@@ -52,10 +54,11 @@ class TrainingProgress:
         psnr = "/".join(f"{value:.2f}" for value in trainer.curve[-1]["psnr"]) if trainer.curve else ""
         if self.stream.isatty():
             self._bar(trainer).set_postfix_str(f"{record['anchors']} anchors {psnr} dB" if psnr else "", refresh=False)
-            self.bar.update(1)
+            self.bar.update((int(trainer.seconds) if trainer.timed else trainer.iteration) - self.bar.n)
         elif "held_out_psnr" in record:
-            where = f"step {trainer.iteration}/{trainer.total}, {trainer.seconds:.0f} s"
-            print(f"{where}: {psnr} dB, {record['anchors']} anchors", file=self.stream, flush=True)
+            steps = f"step {trainer.iteration}" if trainer.timed else f"step {trainer.iteration}/{trainer.total}"
+            limit = f" of {trainer.config.max_seconds:g}" if trainer.timed else ""
+            say(f"{steps}, {trainer.seconds:.0f}{limit} s: {psnr} dB, {record['anchors']} anchors")
 
     def close(self) -> None:
         """Takes the bar away."""
@@ -66,10 +69,7 @@ class TrainingProgress:
         if self.bar is None:
             from tqdm import tqdm
 
-            self.bar = tqdm(
-                total=trainer.total or None, initial=trainer.iteration - 1, unit="step", file=self.stream, leave=False
-            )
-        if self.bar.total is None and trainer.total:  # a time limit fixes the number of steps after some have passed
-            self.bar.total = trainer.total
-            self.bar.refresh()
+            total, unit = (trainer.config.max_seconds, "s") if trainer.timed else (trainer.total, "step")
+            initial = int(trainer.seconds) if trainer.timed else trainer.iteration - 1
+            self.bar = tqdm(total=total, initial=initial, unit=unit, file=self.stream, leave=False)
         return self.bar

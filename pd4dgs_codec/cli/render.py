@@ -21,7 +21,6 @@ from pd4dgs_codec.cli.common import (
     positive_float,
     positive_int,
     run,
-    use_threads,
 )
 from pd4dgs_codec.cli.files import STDIO, check_output, named_input
 from pd4dgs_codec.cli.progress import progress_bar
@@ -94,7 +93,6 @@ def _render(args: argparse.Namespace, console: Console) -> int:
     kind = _check_usage(args)
     if kind in VIDEOS:
         check_output(args.output, args.overwrite)
-    use_threads(args)
     from pd4dgs_codec.view.levels import load_levels
 
     if kind == ".mp4":

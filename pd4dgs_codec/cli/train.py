@@ -23,7 +23,6 @@ from pd4dgs_codec.cli.common import (
     run,
     seed,
     table,
-    use_threads,
 )
 from pd4dgs_codec.cli.files import STDIO, check_output
 from pd4dgs_codec.cli.progress import TrainingProgress
@@ -36,9 +35,9 @@ if TYPE_CHECKING:
     from pd4dgs_codec.train.loop import Trainer
 
 DETAILS = f"""\
-Training ends after --iterations or --max-seconds, whichever comes first; the schedule follows from them. Ctrl-C (or
-SIGTERM) ends it early, after the step in hand, with a whole checkpoint, which --resume goes on from. A second Ctrl-C
-ends it at once, and what was trained since the last save (one a minute) is lost.
+Training ends after --iterations; --max-seconds alone goes through the whole schedule by the clock, beside --iterations
+it cuts the run. Ctrl-C (or SIGTERM) ends it early, after the step in hand, with a whole checkpoint, which --resume goes
+on from. A second Ctrl-C ends it at once, and what was trained since the last save (one a minute) is lost.
 
 --rollout: adaptive draws a level, the higher ones more often the more the layers differ; uniform draws all alike; fixed
 draws them with chances of .15, .30, .55; top trains the highest level alone; all trains every level in every step, at
@@ -65,10 +64,10 @@ def parser() -> Parser:
         "--iterations",
         type=positive_int,
         metavar="N",
-        help="training steps (default: by preset, or what fits --max-seconds)",
+        help="training steps (default: by preset, unless --max-seconds is given)",
     )
     p.add_argument(
-        "--max-seconds", type=positive_float, metavar="S", help="time limit; on --resume earlier time counts too"
+        "--max-seconds", type=positive_float, metavar="S", help="time to train; on --resume earlier time counts too"
     )
     p.add_argument(
         "--downscale", type=positive_int, metavar="K", help="train on images 1/K as wide and high (default: 1)"
@@ -137,7 +136,6 @@ def _train(args: argparse.Namespace, console: Console) -> int:
     check_output(args.output, args.overwrite or resuming_in_place)
     if args.log:
         check_output(args.log, args.overwrite or args.resume is not None)
-    use_threads(args)
     from pd4dgs_codec.data.dataset import load
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.train.loop import Trainer
@@ -169,6 +167,11 @@ def _train(args: argparse.Namespace, console: Console) -> int:
         trainer.run(Path(args.output), log=Path(args.log) if args.log else None, progress=TrainingProgress())
     except KeyboardInterrupt:
         raise TrainError("interrupted twice; what was trained since the last save is lost") from None
+    if trainer.iteration and trainer.learner.skipped == trainer.iteration:
+        raise TrainError(
+            f"{args.output}: nothing was learnt: in all {trainer.iteration} steps the loss or its gradient was not "
+            "finite; expected views and a scene of ordinary size"
+        )
     result = _summary(args, trainer)
     console.result(result, _text(result), on_stdout=False)
     return OK
@@ -211,11 +214,11 @@ def _summary(args: argparse.Namespace, trainer: Trainer) -> dict[str, Any]:
         "preset": trainer.config.preset,
         "device": str(learner.device),
         "iterations": trainer.iteration,
-        "total": trainer.total or 0,  # 0: ended before the steps that a time limit allows were known
+        "total": 0 if trainer.timed else trainer.total,  # 0: time ends the run, not a number of steps
         "finished": trainer.finished,
         "interrupted": trainer.interrupted,
         "seconds": round(trainer.seconds, 3),
-        "phases_not_reached": learner.schedule.phases_not_reached(trainer.iteration),
+        "phases_not_reached": learner.schedule.phases_not_reached(learner.place),
         "skipped": learner.skipped,
         "left_out": learner.left_out,
         "anchors": len(trainer.model.anchor_q),

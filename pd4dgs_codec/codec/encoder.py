@@ -22,6 +22,7 @@ from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.codec.symbols import LayerSymbols, assemble, check_last_layer, float_tensors, layer_symbols
 from pd4dgs_codec.errors import DecodeError, EncodeError
 from pd4dgs_codec.scene import Scene
+from pd4dgs_codec.threads import one_blas_thread
 
 
 @dataclass(frozen=True)
@@ -68,6 +69,7 @@ def encode(scene: Scene, options: EncodeOptions = DEFAULTS, **changes: Any) -> b
     return encode_with_report(scene, options, **changes)[0]
 
 
+@one_blas_thread()
 def encode_with_report(
     scene: Scene, options: EncodeOptions = DEFAULTS, *, left_out: Sequence[LeftOut] = (), **changes: Any
 ) -> tuple[bytes, Report]:

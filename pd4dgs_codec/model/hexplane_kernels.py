@@ -15,7 +15,7 @@ from __future__ import annotations
 import numba as nb
 import numpy as np
 
-from pd4dgs_codec.render.simd import LANES, Vector, kernel, load, splat, store, total
+from pd4dgs_codec.render.simd import LANES, Vector, fma, fnma, kernel, load, splat, store, total
 
 XY, XZ, XT, YZ, YT, ZT = range(6)
 
@@ -23,7 +23,7 @@ Six = tuple[int, int, int, int, int, int]
 Three = tuple[float, float, float]
 
 
-@kernel(fast=True, inline=True)
+@kernel(inline=True)
 def _locate(p: float, lower: float, upper: float, n: int) -> tuple[int, float, float]:
     """First cell, fraction and slope d(cell coordinate)/dp of p on an axis of n cells; slope 0 where clamped."""
     unit = (np.float64(p) - lower) / (np.float64(upper) - lower)
@@ -37,15 +37,15 @@ def _locate(p: float, lower: float, upper: float, n: int) -> tuple[int, float, f
     return cell, at - cell, (n - 1) / (np.float64(upper) - lower)
 
 
-@kernel(fast=True, inline=True)
+@kernel(inline=True)
 def _linear(table: np.ndarray, i: int, step: int, f: Vector) -> tuple[Vector, Vector]:
     """(sample, d sample / df) of the lanes at flat offset i and its neighbour `step` further."""
     a = load(table, i)
     d = load(table, i + step) - a
-    return a + d * f, d
+    return fma(d, f, a), d
 
 
-@kernel(fast=True, inline=True)
+@kernel(inline=True)
 def _bilinear(
     table: np.ndarray,
     i: int,
@@ -57,25 +57,24 @@ def _bilinear(
     """(sample, d sample / dfu, d sample / dfv)."""
     a, da = _linear(table, i, step_u, fu)
     b, db = _linear(table, i + step_v, step_u, fu)
-    return a + (b - a) * fv, da + (db - da) * fv, b - a
+    return fma(b - a, fv, a), fma(db - da, fv, da), b - a
 
 
-@kernel(fast=True, inline=True)
+@kernel(inline=True)
 def _add_linear(table: np.ndarray, i: int, step: int, f: Vector, g: Vector) -> None:
     """The transpose of `_linear`: adds (1 - f) g and f g."""
-    gf = g * f
-    store(table, i, load(table, i) + (g - gf))
-    store(table, i + step, load(table, i + step) + gf)
+    store(table, i, load(table, i) + fnma(g, f, g))
+    store(table, i + step, fma(g, f, load(table, i + step)))
 
 
-@kernel(fast=True, inline=True)
+@kernel(inline=True)
 def _add_bilinear(table: np.ndarray, i: int, step_u: int, step_v: int, fu: Vector, fv: Vector, g: Vector) -> None:
     gv = g * fv
     _add_linear(table, i, step_u, fu, g - gv)
     _add_linear(table, i + step_v, step_u, fu, gv)
 
 
-@kernel(fast=True, inline=True)
+@kernel(inline=True)
 def _address(
     s: int,
     point: np.ndarray,
@@ -101,7 +100,7 @@ def _address(
     return offsets, (dx, dy, dz, dy * nx, dz * nx, dz * ny), (fx, fy, fz), (sx, sy, sz)
 
 
-@kernel(fast=True, parallel=True)
+@kernel(parallel=True)
 def sample(
     out: np.ndarray,
     grid: np.ndarray,
@@ -129,7 +128,7 @@ def sample(
                 store(out, n * out.shape[1] + s * channels + c, a * b * d * e)
 
 
-@kernel(fast=True, inline=True)
+@kernel(inline=True)
 def _point_gradient(
     grad: np.ndarray,
     grad_rows: np.ndarray,
@@ -172,9 +171,9 @@ def _point_gradient(
         prefix = prefix * e
         g_f = suffix_f * prefix
         g_h = suffix_h * (prefix * f)
-        gx = gx + g_a * a_u + g_b * b_u + g_e * e_u
-        gy = gy + g_a * a_v + g_d * d_v + g_f * f_v
-        gz = gz + g_b * b_w + g_d * d_w + g_h * h_w
+        gx = fma(g_e, e_u, fma(g_b, b_u, fma(g_a, a_u, gx)))
+        gy = fma(g_f, f_v, fma(g_d, d_v, fma(g_a, a_v, gy)))
+        gz = fma(g_h, h_w, fma(g_d, d_w, fma(g_b, b_w, gz)))
         _add_bilinear(grad, xy + c, dx, xy_y, u, v, g_a)
         _add_bilinear(grad, xz + c, dx, xz_z, u, w, g_b)
         _add_bilinear(grad, yz + c, dy, yz_z, v, w, g_d)
@@ -186,7 +185,7 @@ def _point_gradient(
     out[out_offset + 2] = total(gz) * real(slopes[2])
 
 
-@kernel(fast=True, parallel=True)
+@kernel(parallel=True)
 def sample_backward(
     grad: np.ndarray,
     extra: np.ndarray,

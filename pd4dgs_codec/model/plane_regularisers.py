@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pd4dgs_codec.model.plane_layout import SPATIAL, TEMPORAL, PlaneLayout
-from pd4dgs_codec.render.simd import LANES, Vector, kernel, load, splat, store, total
+from pd4dgs_codec.render.simd import LANES, Vector, fma, fnma, kernel, load, select_gt, splat, store, total
 
 TERMS = ("plane_smooth", "time_smooth", "time_l1")
 
@@ -26,39 +26,40 @@ Band = tuple[float, float, float, float, float]  #: five numbers in the middle o
 # width, row, 1 if spatial. Sums are kept per line: results do not depend on the number of threads.
 
 
-@kernel(fast=True, inline=True)
+@kernel(inline=True)
 def _squares(grid: np.ndarray, start: int, stop: int, step: int) -> Any:
     """Sum of the squared second differences, over `step`, of the flat range start..stop."""
     two = splat(grid.dtype.type(2))
     value = splat(grid.dtype.type(0))
     for k in range(start, stop, LANES):
-        d = load(grid, k - step) - two * load(grid, k) + load(grid, k + step)
-        value = value + d * d
+        d = fnma(two, load(grid, k), load(grid, k - step) + load(grid, k + step))
+        value = fma(d, d, value)
     return np.float64(total(value))
 
 
-@kernel(fast=True, parallel=True)
+@kernel(parallel=True)
 def _values(sums: np.ndarray, grid: np.ndarray, lines: np.ndarray) -> None:
     """sums [R, 3] = each line's part of the three terms."""
     channels = grid.shape[1]
-    flat = grid.reshape(-1)
+    zero, one = splat(grid.dtype.type(0)), splat(grid.dtype.type(1))
     for r in nb.prange(len(lines)):
         first, height, width, j, spatial = lines[r]
         start, step = (first + j * width) * channels, width * channels
-        smooth = distance = 0.0
+        smooth, distance = 0.0, zero
         if 0 < j < height - 1:
             smooth += _squares(grid, start, start + step, step) / ((height - 2) * step)
         if spatial and width > 2:
             inner = _squares(grid, start + channels, start + step - channels, channels)
             smooth += inner / (height * (width - 2) * channels)
         if not spatial:
-            for k in range(start, start + step):
-                distance += abs(1 - flat[k])
+            for k in range(start, start + step, LANES):
+                d = one - load(grid, k)
+                distance = distance + select_gt(d, zero, d, zero - d)
         sums[r, 0], sums[r, 1] = (smooth, 0.0) if spatial else (0.0, smooth)
-        sums[r, 2] = distance / (height * step)
+        sums[r, 2] = np.float64(total(distance)) / (height * step)
 
 
-@kernel(fast=True, inline=True)
+@kernel(inline=True)
 def _band(i: int, n: int) -> Band:
     """Row i, from column i - 2, of D^T D, where D takes the n - 2 second differences of n values."""
     if 2 <= i < n - 2:
@@ -69,22 +70,22 @@ def _band(i: int, n: int) -> Band:
     return before, -2 * (before + here), before + 4 * here + after, -2 * (here + after), after
 
 
-@kernel(fast=True, inline=True)
+@kernel(inline=True)
 def _curve(grid: np.ndarray, k: int, i: int, n: int, step: int, band: Band, weight: float) -> Vector:
     """weight times the band's row applied around flat offset k, which is value i of n."""
     real = grid.dtype.type
     value = load(grid, k) * splat(real(weight * band[2]))
-    value = value + load(grid, k - min(i, 2) * step) * splat(real(weight * band[0]))
-    value = value + load(grid, k - min(i, 1) * step) * splat(real(weight * band[1]))
-    value = value + load(grid, k + min(n - 1 - i, 1) * step) * splat(real(weight * band[3]))
-    return value + load(grid, k + min(n - 1 - i, 2) * step) * splat(real(weight * band[4]))
+    value = fma(load(grid, k - min(i, 2) * step), splat(real(weight * band[0])), value)
+    value = fma(load(grid, k - min(i, 1) * step), splat(real(weight * band[1])), value)
+    value = fma(load(grid, k + min(n - 1 - i, 1) * step), splat(real(weight * band[3])), value)
+    return fma(load(grid, k + min(n - 1 - i, 2) * step), splat(real(weight * band[4])), value)
 
 
-@kernel(fast=True, parallel=True)
+@kernel(parallel=True)
 def _gradient(grad: np.ndarray, grid: np.ndarray, lines: np.ndarray, factors: np.ndarray) -> None:
     """grad [cells, C] = that of sum(factors * terms)."""
     channels = grid.shape[1]
-    flat, flat_grad = grid.reshape(-1), grad.reshape(-1)
+    zero, one = splat(grid.dtype.type(0)), splat(grid.dtype.type(1))
     for r in nb.prange(len(lines)):
         first, height, width, j, spatial = lines[r]
         start, step = (first + j * width) * channels, width * channels
@@ -98,11 +99,11 @@ def _gradient(grad: np.ndarray, grid: np.ndarray, lines: np.ndarray, factors: np
                     value = _curve(grid, k, j, height, step, band_j, weight_j)
                     store(grad, k, value + _curve(grid, k, i, width, channels, band_i, weight_i))
         else:
+            weight = splat(grid.dtype.type(factors[2] / (height * step)))
             for k in range(start, start + step, LANES):
-                store(grad, k, _curve(grid, k, j, height, step, band_j, weight_j))
-            weight = grid.dtype.type(factors[2] / (height * step))
-            for k in range(start, start + step):
-                flat_grad[k] += weight * np.sign(flat[k] - 1)
+                value = load(grid, k)
+                sign = select_gt(value, one, weight, select_gt(one, value, zero - weight, zero))
+                store(grad, k, sign + _curve(grid, k, j, height, step, band_j, weight_j))
 
 
 class _Regularisers(torch.autograd.Function):

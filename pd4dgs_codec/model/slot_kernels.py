@@ -15,14 +15,14 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from pd4dgs_codec.render.simd import LANES, kernel, load, splat, store, total
+from pd4dgs_codec.render.simd import LANES, fma, kernel, load, splat, store, total
 from pd4dgs_codec.scene import N_OFFSETS
 
 #: Below this a quaternion is divided by it instead of by its norm, as `torch.nn.functional.normalize` does.
 MIN_NORM = 1e-12
 
 
-@kernel(fast=True, inline=True)
+@kernel(inline=True)
 def _part(keep: np.ndarray, part: int, parts: int) -> tuple[int, int]:
     """The range of `keep` that is part's own: no anchor is in two parts."""
     begin, end = len(keep) * part // parts, len(keep) * (part + 1) // parts
@@ -33,7 +33,7 @@ def _part(keep: np.ndarray, part: int, parts: int) -> tuple[int, int]:
     return begin, end
 
 
-@kernel(fast=True, parallel=True)
+@kernel(parallel=True)
 def linear(out: np.ndarray, keep: np.ndarray, hidden: np.ndarray, weight: np.ndarray, bias: np.ndarray) -> None:
     """out [K, w] = the outputs of a linear layer (weight [10 w, H], bias [10 w]) that belong to the kept slots."""
     width, inputs = out.shape[1], hidden.shape[1]
@@ -44,11 +44,11 @@ def linear(out: np.ndarray, keep: np.ndarray, hidden: np.ndarray, weight: np.nda
         for o in range(width):
             value = zero
             for c in range(0, inputs, LANES):
-                value = value + load(hidden, row + c) * load(weight, (first + o) * inputs + c)
+                value = fma(load(hidden, row + c), load(weight, (first + o) * inputs + c), value)
             out[k, o] = total(value) + bias[first + o]
 
 
-@kernel(fast=True, parallel=True)
+@kernel(parallel=True)
 def linear_backward(
     grad_hidden: np.ndarray,
     grad_weight: np.ndarray,
@@ -74,15 +74,15 @@ def linear_backward(
                 for o in range(width):
                     at = (first + o) * inputs + c
                     slope = splat(g[k, o])
-                    value = value + slope * load(weight, at)
-                    store(own, at, load(own, at) + slope * h)
+                    value = fma(slope, load(weight, at), value)
+                    store(own, at, fma(slope, h, load(own, at)))
                 store(grad_hidden, row + c, value)
     for part in range(1, parts):
         grad_weight[0] += grad_weight[part]
         grad_bias[0] += grad_bias[part]
 
 
-@kernel(fast=True, parallel=True)
+@kernel(parallel=True)
 def assemble(
     means: np.ndarray,
     scales: np.ndarray,
@@ -117,14 +117,14 @@ def assemble(
         gates[k] = mask[n]
 
 
-@kernel(fast=True, inline=True)
+@kernel(inline=True)
 def _norm(shape: np.ndarray, k: int) -> Any:
     square = shape[k, 3] * shape[k, 3] + shape[k, 4] * shape[k, 4]
     square += shape[k, 5] * shape[k, 5] + shape[k, 6] * shape[k, 6]
     return max(math.sqrt(square), shape.dtype.type(MIN_NORM))
 
 
-@kernel(fast=True, parallel=True)
+@kernel(parallel=True)
 def assemble_backward(
     g_position: np.ndarray,
     g_scaling: np.ndarray,

@@ -5,9 +5,11 @@ not overlap (numba has no `noalias`), and on short rows it stores every sum back
 loop is what is written: each operation is one LLVM instruction, which LLVM splits where registers are narrower. On
 lookups in planes it was measured 2.6 to 4.5 times faster.
 
-Whether sums may be reordered is for the function to say in which the vectors are used: see `kernel`. A fast function
-may not call a function on vectors that is not fast, nor the other way round. Arrays are float32 or float64,
-C-contiguous, of any rank; an index is an offset into the flattened array, unchecked.
+No sum is reordered, and nothing is fused but what `fma` and `fnma` say: then the bits of a result do not depend on how
+often LLVM optimised a function. With numba's fast math they did: the process that compiles a parallel kernel runs its
+body as optimised once; linked into the kernel it is optimised again, and that is what the cache holds.
+
+Arrays are float32 or float64, C-contiguous, of any rank; an index is an offset into the flattened array, unchecked.
 
 numba's cache watches only the file of the function it stores: after an edit here, touch the modules that import this.
 """
@@ -25,25 +27,21 @@ from numba.extending import intrinsic as _numba_intrinsic
 from numba.extending import models, overload, register_model
 
 LANES = 8
-#: What `kernel(fast=True)` allows. No nnan or ninf: values that are not finite must pass through.
-FAST = frozenset(("reassoc", "contract", "arcp", "nsz"))
 
 Vector = Any  #: in annotations of kernels: a value of the numba type `Lanes`
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 _intrinsic: Callable[[Callable[..., Any]], Callable[..., Any]] = _numba_intrinsic
 
 
-def kernel(*, parallel: bool = False, fast: bool = False, inline: bool = False) -> Callable[[_Function], _Function]:
+def kernel(*, parallel: bool = False, inline: bool = False) -> Callable[[_Function], _Function]:
     """Decorator of a function that numba compiles at its first call and caches beside its source.
 
-    parallel: `numba.prange` splits its loops over threads. fast: sums may be reordered and fused (see FAST). inline:
-    into the functions that call it. Divisions by zero give what IEEE 754 says; the interpreter's lock is released.
+    parallel: `numba.prange` splits its loops over threads. inline: into the functions that call it. Divisions by zero
+    give what IEEE 754 says; the interpreter's lock is released.
     """
     options: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
     if parallel:
         options["parallel"] = True
-    if fast:
-        options["fastmath"] = set(FAST)
     if inline:
         options["forceinline"] = True
     compiled: Callable[[_Function], _Function] = numba.njit(**options)
@@ -201,10 +199,7 @@ _ROUND = 1.5 * 2.0**23
 
 @_intrinsic
 def exp2(typingctx: Any, x: Any) -> Any:
-    """2**x of float32 for -126 < x < 127, relative error < 2e-7: exponent bits for round(x), a polynomial for the rest.
-
-    Not for fast functions: the rounding is lost where sums are reordered.
-    """
+    """2**x of float32 for -126 < x < 127, relative error < 2e-7: exponent bits of round(x), polynomial for the rest."""
     if x != Lanes(types.float32):
         return None
 

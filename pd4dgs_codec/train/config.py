@@ -96,8 +96,8 @@ class TrainConfig:
     source: str = ""  #: what `data.load` was given; stored so that a resumed run meets the same data
     downscale: int = 1
     holdout: int = 8
-    iterations: int | None = None  #: None: the preset's default, or what fits `max_seconds`
-    max_seconds: float | None = None
+    iterations: int | None = None  #: None: the preset's default, or by the clock if there is a limit
+    max_seconds: float | None = None  #: without `iterations` the whole schedule is spread over it, else it cuts the run
     seed: int = 0
     lambdas: tuple[float, float, float] = (0.04, 0.01, 0.00025)  #: rate weight per level
     rate_scale: float = DIAL["rate_scale"][0]  #: multiplies every lambda; 1 is the paper's operating point

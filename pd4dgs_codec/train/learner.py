@@ -41,7 +41,9 @@ Probabilities = tuple[float, float, float]  #: of levels 0, 1, 2
 class Learner:
     """A model in training, with all that its steps change.
 
-    schedule: where the steps stand in the run; replaced once where a time limit fixes N after some steps.
+    schedule: the phases of the run; replaced once where a time limit settles its unit after some steps.
+    share: in a run that a time limit ends, how much of the schedule lies behind it, 0..1, which whoever holds the clock
+    says; None where the number of steps says it.
     iteration: steps done, those that were skipped included. skipped: those whose loss or gradient was not finite.
     left_out: levels judged not to pay, as the log and the report have them: level, gain in dB, number of views.
     """
@@ -68,11 +70,26 @@ class Learner:
         self.noise = Noise(config.seed + 1, device)
         self.shots = [Shot.of(view, device) for view in dataset.train]
         self.iteration = 0
+        self.share: float | None = None
+        self._passed = -1  #: `place` of the step before, which a share may leave behind by more than one
         self.rho = 0.0
         self.skipped = 0
         self.order: list[int] = []  #: training views drawn and not yet learnt from, the next one last
         self.left_out: list[dict[str, Any]] = []
         self._neighbours: losses.Neighbours | None = None  #: rebuilt when anchors come or go
+
+    @property
+    def place(self) -> int:
+        """Where the next step stands in its schedule, 0..N: the steps done, or the share of N."""
+        return self.iteration if self.share is None else int(self.share * (self.schedule.iterations or 0))
+
+    def _reached(self, start: float) -> bool:
+        """Whether this step is the first at or past place `start`."""
+        return (self.place - 1 if self.share is None else self._passed) < start <= self.place
+
+    def _reached_multiple(self, every: float) -> bool:
+        """Whether this step is the first at or past some multiple of `every`."""
+        return self._reached(self.place - self.place % every)
 
     def step(self, levels: Sequence[int] | None = None) -> dict[str, Any]:
         """One training step; returns its log record (every term unweighted). levels: those to train, ascending, each on
@@ -90,25 +107,18 @@ class Learner:
             self.skipped += 1
             record["skipped"] = self.skipped
         self.optimiser.zero_grad()
-        if self.iteration >= self.schedule.rho_start and self.iteration % self.schedule.rho_every == 0:
+        measured = self._reached_multiple(self.schedule.rho_every)
+        if measured and self.place >= self.schedule.rho_start:
             with torch.no_grad():
                 self.rho = updated_rho(self.rho, self.model.masks(0), self.model.masks(2))
         record |= {"rho": self.rho, "pi": probabilities, "anchors": len(self.model.anchor_q)}
-        if self.iteration % self.schedule.rho_every == 0:
+        if measured:
             record["active"] = self.active_anchors()
+        if self.share is not None:
+            record["place"] = self.place
+        self._passed = self.place
         self.iteration += 1
         return record
-
-    def rehearse(self, index: int, level: int) -> None:
-        """What a step at `level` on training view `index` costs, all its terms included, but for the update; leaves
-        model, optimiser and generators as they are."""
-        states = self.generator.get_state(), self.noise.generator.get_state()
-        _, _, loss = self.loss(index, level, Rounding(noise=self.noise), mask_terms=True)
-        torch.autograd.backward(loss)
-        self.optimiser.gradient_norm()
-        self.optimiser.zero_grad()
-        self.generator.set_state(states[0])
-        self.noise.generator.set_state(states[1])
 
     def active_anchors(self) -> list[int]:
         """Anchors active per level 0, 1, 2."""
@@ -135,13 +145,13 @@ class Learner:
 
     def _draw_levels(self) -> tuple[tuple[int, ...], Probabilities]:
         """The levels of this step, ascending, and the probabilities that they were drawn with."""
-        if self.iteration < self.schedule.coarse_end:
+        if self.place < self.schedule.coarse_end:
             return _given((0,))
         if self.config.rollout == "all":
             return tuple(range(self.model.level + 1)), (1.0, 1.0, 1.0)
         if self.config.rollout == "top":
             probabilities = TOP
-        elif self.config.rollout == "uniform" or self.iteration < self.schedule.rho_start:
+        elif self.config.rollout == "uniform" or self.place < self.schedule.rho_start:
             probabilities = UNIFORM
         elif self.config.rollout == "fixed":
             probabilities = CAPACITY_WEIGHTED
@@ -151,7 +161,7 @@ class Learner:
 
     def _next_view(self) -> int:
         if not self.order:
-            waiting = self.waiting_views() if self.iteration < self.schedule.rounding else set()
+            waiting = self.waiting_views() if self.place < self.schedule.rounding else set()
             drawn = torch.randperm(len(self.shots), generator=self.generator).tolist()
             self.order = [index for index in drawn if index not in waiting]
         return self.order.pop()
@@ -159,9 +169,9 @@ class Learner:
     def _rounding(self) -> Rounding:
         if not self.config.noise:
             return EXACT
-        exact = self.iteration >= self.schedule.exact_rounding
-        noisy = self.iteration >= self.schedule.coarse_end and not exact
-        weights = self.iteration >= self.schedule.rounding
+        exact = self.place >= self.schedule.exact_rounding
+        noisy = self.place >= self.schedule.coarse_end and not exact
+        weights = self.place >= self.schedule.rounding
         return Rounding(self.noise if noisy else None, attributes=exact, weights=weights)
 
     # -- loss and update -------------------------------------------------------------------------------------------
@@ -169,7 +179,7 @@ class Learner:
     def _learn(self, drawn: list[tuple[int, int]], record: dict[str, Any]) -> bool:
         """Losses of (view, level) pairs, gradients, update; False, with nothing changed, if any of it is not finite.
         The record is that of the last pair."""
-        rounding, mask_terms = self._rounding(), self.iteration >= self.schedule.progressive
+        rounding, mask_terms = self._rounding(), self.place >= self.schedule.progressive
         pictures = []
         for index, level in drawn:
             try:
@@ -227,7 +237,7 @@ class Learner:
         for term, value in field.planes.regularisers().items():
             terms[f"{name}_{term}"] = value
             total = total + getattr(weights, term) * value
-        weight = self.config.plane_rate * self.schedule.pressure(self.iteration)
+        weight = self.config.plane_rate * self.schedule.pressure(self.place)
         if weight:
             step = self.model.steps.planes({"global": 1, "local": 2}[name])
             terms[f"{name}_rate_proxy"] = field.planes.proxy_bits(step)
@@ -244,7 +254,7 @@ class Learner:
             total = total + config.lambdas[level] * config.rate_scale * terms["rate"]
         if config.tmc_binary:
             terms["tmc_binary"] = losses.binary_term(mask)
-            weight = config.tmc * config.tmc_binary_growth ** self.schedule.separation(self.iteration)
+            weight = config.tmc * config.tmc_binary_growth ** self.schedule.separation(self.place)
             total = total + weight * terms["tmc_binary"]
         if config.tmc_smooth:
             if self._neighbours is None:
@@ -257,17 +267,17 @@ class Learner:
     def _update(self, pictures: list[Picture], record: dict[str, Any]) -> None:
         """Adam; and while anchors grow, what growing goes by and the growing itself."""
         growing, known = self.schedule.grow, self.schedule.iterations is not None
-        if known and self.iteration <= growing.stop:
+        if known and self.place <= growing.stop:
             for picture in pictures:
                 self._observe(picture)
-        self.optimiser.step(self.schedule.progress(self.iteration))
-        if self.iteration in growing:
+        self.optimiser.step(self.schedule.progress(self.place))
+        if any(map(self._reached, growing)):
             pruned, grown = self.densifier.adjust(
                 self.model,
                 self.optimiser,
                 self.generator,
                 grow=len(self.model.anchor_q) < self.densifier.max_anchors,
-                prune=self.iteration >= self.schedule.coarse_end,  # before, colours are random and opacities fall
+                prune=self.place >= self.schedule.coarse_end,  # before, colours are random and opacities fall
             )
             self._neighbours = None
             record |= {"pruned": pruned, "grown": grown}
@@ -288,7 +298,7 @@ class Learner:
 
     def _judge_levels(self) -> list[float]:
         """Where the last third begins: leaves out the levels that do not pay. Returns the PSNR per level judged by."""
-        waiting = sorted(self.waiting_views()) if self.iteration == self.schedule.rounding else []
+        waiting = sorted(self.waiting_views()) if self._reached(self.schedule.rounding) else []
         if not waiting:
             return []
         psnr = self.level_psnr([self.dataset.train[index] for index in waiting])
@@ -303,25 +313,26 @@ class Learner:
     def _prune(self) -> list[int]:
         """Where growing has ended: takes out what the pictures hardly need, in a few rounds. Returns how many anchors
         left the model and how many left layer 0."""
-        rounds = self.schedule.prune
-        due = (self.schedule.iterations or 0) >= pruning.MIN_ITERATIONS and self.iteration in rounds
-        if not (self.config.prune and due):
+        if not self.config.prune or (self.schedule.iterations or 0) < pruning.MIN_ITERATIONS:
             return []
-        turn = rounds.index(self.iteration)
+        rounds = [self._prune_round(turn) for turn, start in enumerate(self.schedule.prune) if self._reached(start)]
+        return [sum(column) for column in zip(*rounds, strict=True)]
+
+    def _prune_round(self, turn: int) -> tuple[int, int]:
         waiting = self.waiting_views()
         shots = [shot for i, shot in enumerate(self.shots) if i not in waiting]
         stride = -(-len(shots) // pruning.VIEWS)
         levels = range(self.model.level if self.config.rollout == "top" else 0, self.model.level + 1)
-        before, share = len(self.model.anchor_q), self.config.prune / len(rounds)
+        before, share = len(self.model.anchor_q), self.config.prune / len(self.schedule.prune)
         try:
             keep, later = pruning.prune(
                 self.model, self.optimiser, shots[turn % stride :: stride], levels, share, turn, self._rounding()
             )
         except NotFinite:  # as a step that diverged: passed over, with nothing changed
-            return []
+            return 0, 0
         self.densifier.keep(keep)
         self._neighbours = None
-        return [before - len(keep), later]
+        return before - len(keep), later
 
     # -- checkpoints -----------------------------------------------------------------------------------------------
 
@@ -330,6 +341,9 @@ class Learner:
         return {
             "iteration": self.iteration,
             "total": self.schedule.iterations or 0,
+            "place": self.place,
+            "share": self.share or 0.0,
+            "passed": self._passed,
             "rho": self.rho,
             "skipped": self.skipped,
             "order": self.order,
@@ -351,6 +365,8 @@ class Learner:
         self.noise.generator.set_state(state["noise"])
         self.iteration, self.skipped = int(state["iteration"]), int(state["skipped"])
         self.schedule = Schedule(int(state["total"]) or None)
+        if self.share is not None:
+            self.share, self._passed = float(state.get("share", 0.0)), int(state.get("passed", -1))
         self.rho = float(state["rho"])
         self.order = [int(index) for index in state["order"]]
         self.left_out = list(json.loads(state.get("left_out", "[]")))

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 import time
-from dataclasses import replace
 from pathlib import Path
+from statistics import median
 from typing import Any, Protocol
 
 import torch
@@ -15,23 +15,17 @@ from pd4dgs_codec.errors import DataError, TrainError
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import ModelConfig
 from pd4dgs_codec.model.model import Model
-from pd4dgs_codec.train import pruning
-from pd4dgs_codec.train.config import COARSE_SHARE, DEFAULT_ITERATIONS, PRUNING_ROUNDS, Schedule, TrainConfig
+from pd4dgs_codec.train.config import COARSE_SHARE, DEFAULT_ITERATIONS, Schedule, TrainConfig
 from pd4dgs_codec.train.learner import Learner
 from pd4dgs_codec.train.log import RecordLog
 from pd4dgs_codec.train.stop import StopRequest
 
-#: Steps timed before a run with a time limit fixes N, and the share of the limit that N is meant to fill.
+#: A timed run settles the N of its schedule after so many steps; a slow one once it has spent the share of the limit
+#: that is the coarse phase's, but not before the fewer steps, of which the first ones compile.
 TIMED_STEPS = 50
-TIME_SHARE = 0.95
-#: Mean cost of a step over a run against the one measured at its start (more anchors, fewer visible Gaussians). It was
-#: 0.35 to 1.4 on the scenes measured: a run that ends early is better than one that is cut.
-LATER_COST = 1.4
-#: N is at least so much: where a limit is nearly spent the run is cut and says so, instead of squeezing the schedule.
-LEAST_TIMED_TOTAL = 10 * TIMED_STEPS
-#: Rehearsals of a step per level from which its cost is taken, and what an update, which is not in them, adds to it.
-REHEARSALS = 9
-UPDATE_COST = 1.1
+FEWEST_TIMED_STEPS = 5
+#: Mean cost of a step over a run against that of its first ones, which are all of level 0.
+LATER_COST = 1.5
 #: Held-out evaluations over a run, for the curve of quality against wall time, and views in each.
 CURVE_POINTS = 12
 CURVE_VIEWS = 6
@@ -50,15 +44,24 @@ class Progress(Protocol):
 class Trainer:
     """A run in progress; `run` carries it to its end.
 
+    A run with a number of steps goes through its schedule step by step; a time limit besides cuts it. A timed run, with
+    a limit alone, goes through it by the clock: each step takes it on by the share of what is left of the schedule that
+    the step took of what is left of the time. Its N is what it would take on a machine that stays as it was in the
+    first steps; it decides whether the run is long enough to prune and to judge, not when the run ends.
+
     learner: the model and its steps. seconds: of training, those before a resumption included. curve: quality against
     time, a row for each evaluation. interrupted: a signal ended the last `run`.
     """
 
     def __init__(self, config: TrainConfig, dataset: Dataset, device: str = "cpu", size: ModelConfig | None = None):
         """size: of the model, if not the preset's."""
-        total = config.iterations or (None if config.max_seconds else DEFAULT_ITERATIONS[config.preset])
+        self.timed = config.max_seconds is not None and config.iterations is None
+        total = config.iterations or (None if self.timed else DEFAULT_ITERATIONS[config.preset])
         self.config, self.dataset = config, dataset
         self.learner = Learner(config, dataset, Schedule(total), torch.device(device), size)
+        self.learner.share = 0.0 if self.timed else None
+        self._costs: list[float] = []  #: seconds of the steps from which a timed run settles N
+        self._step = self._evaluation = 0.0  #: seconds that the last step and the last evaluation took
         self.seconds = 0.0
         self.interrupted = False
         self.curve: list[dict[str, Any]] = []
@@ -75,13 +78,13 @@ class Trainer:
 
     @property
     def total(self) -> int | None:
-        """Steps of the whole run; None where a time limit has not fixed them yet."""
+        """N of the schedule: the steps of the whole run, about those of a timed one; None where it is not settled."""
         return self.learner.schedule.iterations
 
     @property
     def finished(self) -> bool:
-        """Whether all steps are done."""
-        return self.total is not None and self.iteration >= self.total
+        """Whether the whole schedule is done."""
+        return self.total is not None and self.learner.place >= self.total
 
     def run(
         self, output: Path, *, log: Path | None = None, progress: Progress | None = None, save_every: float = 60.0
@@ -112,17 +115,18 @@ class Trainer:
         self, output: Path, stop: StopRequest, records: RecordLog, progress: Progress | None, save_every: float
     ) -> None:
         """Steps until one of the ends of `run`; a record that cannot be logged is one too."""
-        start = time.monotonic() - self.seconds
-        saved = time.monotonic()
+        saved = told = time.monotonic()
         while not self.finished:
+            place = self.learner.place
             record = self.learner.step()
-            self.seconds = time.monotonic() - start
-            if self.total is None and self.iteration >= TIMED_STEPS:
-                record["total"] = self._fix_iterations(start)
-            if self._curve_due():
+            told, begun = time.monotonic(), told
+            late = self._spend(told - begun)
+            if self._curve_due(place):
                 record["held_out_psnr"] = self._evaluate()
                 record["plane_bits"] = self.learner.plane_bits()
-                self.seconds = time.monotonic() - start
+                told, begun = time.monotonic(), told
+                self._evaluation = told - begun
+                self.seconds += self._evaluation
             if not records.write(record | {"seconds": round(self.seconds, 3)}):
                 break
             if progress:
@@ -130,40 +134,36 @@ class Trainer:
             if time.monotonic() - saved > save_every:
                 self.save(output)
                 saved = time.monotonic()
-            if stop.requested or (self.config.max_seconds and self.seconds >= self.config.max_seconds):
+            if stop.requested or late:
                 break
 
-    def _fix_iterations(self, start: float) -> int:
-        """Fixes N from the cost of a step at each level, so that the run, which began at `start`, fills TIME_SHARE of
-        its limit; see LEAST_TIMED_TOTAL. Returns N."""
-        assert self.config.max_seconds
-        costs = self._level_costs()
-        highest = self.model.level
-        later = {"all": sum(costs[: highest + 1]), "top": costs[highest]}.get(self.config.rollout, sum(costs) / 3)
-        mean = COARSE_SHARE * costs[0] + (1 - COARSE_SHARE) * later
-        left = TIME_SHARE * self.config.max_seconds - (time.monotonic() - start)
-        left -= CURVE_POINTS * CURVE_VIEWS * sum(costs) / 3
-        if self.config.prune:  # to measure a harm takes about a quarter of a step
-            left -= PRUNING_ROUNDS * pruning.VIEWS * sum(costs) / 4
-        total = max(LEAST_TIMED_TOTAL, self.iteration + int(left / (mean * LATER_COST)))
-        self.learner.schedule = Schedule(total)
-        self.config = replace(self.config, iterations=total)
-        return total
+    def _spend(self, seconds: float) -> bool:
+        """Counts the time of a step; a timed run moves on in its schedule. Returns whether the limit is reached."""
+        begun, limit = self.seconds, self.config.max_seconds
+        self.seconds += seconds
+        usual, self._step = min(seconds, self._step), seconds  # a pause is not taken for what the next step will cost
+        if not (self.timed and limit):
+            return limit is not None and self.seconds >= limit
+        if self.total is None:
+            self._costs.append(seconds)
+            slow = self.iteration >= FEWEST_TIMED_STEPS and self.seconds >= COARSE_SHARE * limit
+            if self.iteration >= TIMED_STEPS or slow:
+                self.learner.schedule = Schedule(max(1, round(limit / (LATER_COST * median(self._costs)))))
+            return self.seconds >= limit
+        share, left = self.learner.share or 0.0, limit - self._evaluation - usual - begun
+        if seconds < left:
+            self.learner.share = share + (1 - share) * seconds / left
+            return False
+        if self.learner.place >= self.learner.schedule.exact_rounding:  # else the run is cut, and says so
+            self.learner.share = 1.0
+        return True
 
-    def _level_costs(self) -> list[float]:
-        """Median seconds of a full step at each level, leaving the learner as it is.
-
-        The levels take turns, so that a moment in which something else has the machine falls on all of them.
-        """
-        seconds: list[list[float]] = [[], [], []]
-        for i in range(3 * REHEARSALS):
-            before = time.monotonic()
-            self.learner.rehearse(i % len(self.dataset.train), i % 3)
-            seconds[i % 3].append(time.monotonic() - before)
-        return [UPDATE_COST * sorted(level)[REHEARSALS // 2] for level in seconds]
-
-    def _curve_due(self) -> bool:
-        return self.total is not None and (self.iteration % max(1, self.total // CURVE_POINTS) == 0 or self.finished)
+    def _curve_due(self, before: int) -> bool:
+        """Whether the step that began at place `before` ended at or past a point of the curve."""
+        if self.total is None:
+            return False
+        every = max(1, self.total // CURVE_POINTS)
+        return self.finished or self.learner.place // every > before // every
 
     def _evaluate(self) -> list[float]:
         """Mean PSNR per level on a few held-out views (training views if none are held out)."""

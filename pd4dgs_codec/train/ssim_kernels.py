@@ -14,7 +14,7 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from pd4dgs_codec.render.simd import LANES, kernel, load, splat, store
+from pd4dgs_codec.render.simd import LANES, fma, fnma, kernel, load, splat, store
 
 C1, C2 = 0.01**2, 0.03**2
 TAPS = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
@@ -36,16 +36,16 @@ def pad(image: np.ndarray) -> np.ndarray:
     return out
 
 
-@kernel(fast=True, inline=True)
+@kernel(inline=True)
 def _across(row: np.ndarray, k: int, taps: np.ndarray) -> Any:
     """The horizontal window at lane k of an image row, from a flat padded row (offset included in k)."""
     value = load(row, k) * splat(taps[0])
     for o in range(1, len(taps)):
-        value = value + load(row, k + 3 * o) * splat(taps[o])
+        value = fma(load(row, k + 3 * o), splat(taps[o]), value)
     return value
 
 
-@kernel(fast=True, parallel=True)
+@kernel(parallel=True)
 def target_moments(mean: np.ndarray, variance: np.ndarray, image: np.ndarray, taps: np.ndarray) -> None:
     """mean, variance [H, lanes] of a padded image under the window."""
     height, stride = len(mean), image.shape[1]
@@ -58,16 +58,16 @@ def target_moments(mean: np.ndarray, variance: np.ndarray, image: np.ndarray, ta
                 a = load(image, (j + o) * stride + k)
                 weighted = a * splat(taps[o])
                 first = first + weighted
-                second = second + weighted * a
+                second = fma(weighted, a, second)
             store(rows, k, first)
             store(rows, stride + k, second)
         for k in range(0, mean.shape[1], LANES):
             m = _across(rows, k, taps)
             store(mean, j * mean.shape[1] + k, m)
-            store(variance, j * mean.shape[1] + k, _across(rows, stride + k, taps) - m * m)
+            store(variance, j * mean.shape[1] + k, fnma(m, m, _across(rows, stride + k, taps)))
 
 
-@kernel(fast=True, inline=True)
+@kernel(inline=True)
 def _down(rows: np.ndarray, x: np.ndarray, y: np.ndarray, j: int, taps: np.ndarray) -> None:
     """rows [3, stride] = the vertical window of x, x^2 and x y at image row j."""
     stride = x.shape[1]
@@ -78,14 +78,14 @@ def _down(rows: np.ndarray, x: np.ndarray, y: np.ndarray, j: int, taps: np.ndarr
             a = load(x, (j + o) * stride + k)
             weighted = a * splat(taps[o])
             first = first + weighted
-            second = second + weighted * a
-            cross = cross + weighted * load(y, (j + o) * stride + k)
+            second = fma(weighted, a, second)
+            cross = fma(weighted, load(y, (j + o) * stride + k), cross)
         store(rows, k, first)
         store(rows, stride + k, second)
         store(rows, 2 * stride + k, cross)
 
 
-@kernel(fast=True, parallel=True)
+@kernel(parallel=True)
 def loss(
     slopes: np.ndarray,
     sums: np.ndarray,
@@ -114,8 +114,8 @@ def loss(
         _down(rows, x, y, j, taps)
         for k in range(0, n, LANES):
             mx, my, w = _across(rows, k, taps), load(mean_y, j * n + k), load(weight, k)
-            var_x = _across(rows, stride + k, taps) - mx * mx
-            cov = _across(rows, 2 * stride + k, taps) - mx * my
+            var_x = fnma(mx, mx, _across(rows, stride + k, taps))
+            cov = fnma(mx, my, _across(rows, 2 * stride + k, taps))
             a1, a2 = two * mx * my + c1, two * cov + c2
             b1, b2 = mx * mx + my * my + c1, var_x + load(var_y, j * n + k) + c2
             inverse1, inverse2 = one / b1, one / b2
@@ -135,7 +135,7 @@ def loss(
         sums[j, 0], sums[j, 1] = absolute, dissimilarity
 
 
-@kernel(fast=True, parallel=True)
+@kernel(parallel=True)
 def loss_backward(
     grad: np.ndarray,
     x: np.ndarray,
@@ -158,7 +158,7 @@ def loss_backward(
             for q in range(3):
                 value = zero
                 for o in range(len(taps)):
-                    value = value + load(slopes, q * size + (j + o) * stride + k) * splat(taps[o])
+                    value = fma(load(slopes, q * size + (j + o) * stride + k), splat(taps[o]), value)
                 store(rows, q * stride + k, value)
         at = (j + REACH) * stride + SIDE
         for k in range(0, 3 * width, LANES):

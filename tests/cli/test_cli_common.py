@@ -137,10 +137,10 @@ def test_internal_error_is_one_line_and_verbose_shows_where(cli, scene_pd4, monk
 
 
 def test_missing_module_is_named(cli, model_pt, tmp_path, monkeypatch):
-    def gone(args):
+    def gone(path):
         raise ModuleNotFoundError("No module named 'torch'", name="torch")
 
-    monkeypatch.setattr("pd4dgs_codec.cli.encode.use_threads", gone)
+    monkeypatch.setattr("pd4dgs_codec.model.checkpoint.load", gone)
     result = cli("encode", model_pt, "-o", tmp_path / "s.pd4")
     assert result.code == 1 and "torch" in result.err and "pip install" in result.err
     assert list(tmp_path.iterdir()) == []

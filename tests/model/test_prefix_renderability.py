@@ -13,6 +13,7 @@ from strategies import LAYER_SETS, RANGES, assert_same_scene, make_scene, scenes
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.codec.decoder import decode_layers
 from pd4dgs_codec.codec.info import info
+from pd4dgs_codec.errors import RenderError
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.scene import Camera, Deformation, Scene
@@ -175,3 +176,10 @@ def camera_at(scene: Scene) -> Camera:
     viewmat[2, 3] = 2
     K = np.array([[20, 0, WIDTH / 2], [0, 20, HEIGHT / 2], [0, 0, 1]], np.float32)
     return Camera(viewmat, K, WIDTH, HEIGHT)
+
+
+@pytest.mark.parametrize("t", [float("nan"), float("inf")])
+def test_a_time_that_is_no_number_is_refused(t):
+    scene = make_scene(1)
+    with pytest.raises(RenderError, match="time is"):
+        render_image(from_scene(scene), 0, t, own_camera(scene))

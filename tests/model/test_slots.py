@@ -3,8 +3,8 @@
 import pytest
 import torch
 
+from pd4dgs_codec import threads
 from pd4dgs_codec.model import slots
-from pd4dgs_codec.render import threads
 
 N = 40
 
@@ -21,21 +21,21 @@ def several_threads(request, monkeypatch):
 
 
 def draw(*shape: int) -> torch.Tensor:
-    return torch.randn(*shape, dtype=torch.float64, generator=torch.Generator().manual_seed(sum(shape)))
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(sum(shape)))
 
 
 def check(function, reference, inputs, keep) -> None:
-    """Same values, and the same gradients of one random weighting of them."""
+    """float32 values as of the reference in float64, and the same gradients of one random weighting of them."""
     found = [x.clone().requires_grad_() for x in inputs]
-    expected = [x.clone().requires_grad_() for x in inputs]
+    expected = [x.double().requires_grad_() for x in inputs]
     outputs = [f(*leaves, keep) for f, leaves in ((function, found), (reference, expected))]
     both = [o if isinstance(o, tuple) else (o,) for o in outputs]
     for a, b in zip(*both, strict=True):
-        torch.testing.assert_close(a, b, rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(a.double(), b, rtol=1e-5, atol=1e-5)
     for results in both:
         sum((result * (draw(*result.shape) + 0.5)).sum() for result in results).backward()
     for a, b in zip(found, expected, strict=True):
-        torch.testing.assert_close(a.grad, b.grad, rtol=1e-11, atol=1e-11)
+        torch.testing.assert_close(a.grad.double(), b.grad, rtol=1e-5, atol=2e-5)
 
 
 @pytest.mark.parametrize("width", [3, 7])
@@ -73,7 +73,7 @@ def test_a_quaternion_of_no_length(keep):
 
 def test_repeated_runs_give_the_same_bits(keep):
     threads.configure(1)
-    inputs = [draw(N, 16).float(), draw(70, 16).float(), draw(70).float()]
+    inputs = [draw(N, 16), draw(70, 16), draw(70)]
 
     def gradients():
         leaves = [x.clone().requires_grad_() for x in inputs]

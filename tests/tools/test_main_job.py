@@ -128,7 +128,7 @@ def test_an_unfinished_checkpoint_is_trained_again(job, copied, no_training):
     path, log = copied / "discs" / "model.pt", copied / "discs" / "train.jsonl"
     model, training = checkpoint.load(path)
     for iteration, total in ((39, 40), (0, 0)):
-        checkpoint.save(path, model, training | {"iteration": iteration, "total": total})
+        checkpoint.save(path, model, training | {"place": iteration, "total": total})
         with pytest.raises(_Started):
             _run(job, copied)
         assert len(log.read_text().splitlines()) == 40  # it goes on, and so does its log

@@ -58,22 +58,6 @@ def test_until_n_is_known_steps_stay_in_the_coarse_phase(dataset):
     assert "rate" in steps.step()
 
 
-def test_a_rehearsal_costs_a_whole_step_and_changes_nothing(dataset, monkeypatch):
-    steps = learner(dataset)
-    for _ in range(12):
-        steps.step()
-    expected = learner(dataset)
-    for _ in range(12):
-        expected.step()
-    seen = spied(steps, monkeypatch)
-    for level in range(3):
-        steps.rehearse(level, level)
-    assert seen == [(0, 0), (1, 1), (2, 2)]
-    assert steps.step() == expected.step()
-    for name, value in expected.model.state_dict().items():
-        assert torch.equal(value, steps.model.state_dict()[name])
-
-
 @pytest.mark.parametrize(
     "part, gone",
     [("rate", {"rate"}), ("binary", {"tmc_binary"}), ("smooth", {"tmc_smooth"}), ("tmc", {"tmc_binary", "tmc_smooth"})],

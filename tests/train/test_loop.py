@@ -15,8 +15,8 @@ from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import DataError, TrainError
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.convert import to_scene
-from pd4dgs_codec.train import loop
-from pd4dgs_codec.train.config import ABLATIONS, COARSE_SHARE, Schedule, TrainConfig
+from pd4dgs_codec.train import loop, pruning
+from pd4dgs_codec.train.config import ABLATIONS, PRUNING_ROUNDS, Schedule, TrainConfig
 from pd4dgs_codec.train.log import RecordLog
 from pd4dgs_codec.train.loop import Trainer
 
@@ -94,31 +94,96 @@ def clock(monkeypatch) -> Clock:
     return loop.time
 
 
-def test_a_time_limit_fixes_n_once_and_the_run_ends_within_it(dataset, tmp_path, monkeypatch, clock):
-    cost = (0.1, 0.2, 0.3)  # seconds of a step at each level
+LIMIT = 24.0
+COST = (0.1, 0.2, 0.3)  #: seconds of a step at each level
+#: What else the machine does: factor on the cost of a step that begins at `seconds`, and a pause within it.
+MACHINES = {
+    "quiet": lambda seconds: (1, 0.0),
+    "slow in the middle": lambda seconds: (5 if 0.4 * LIMIT < seconds < 0.6 * LIMIT else 1, 0.0),
+    "slow from the middle on": lambda seconds: (2 if 0.5 * LIMIT < seconds else 1, 0.0),
+    "fast from the middle on": lambda seconds: (0.5 if 0.5 * LIMIT < seconds else 1, 0.0),
+    "stopped": lambda seconds: (1, 0.25 * LIMIT if 0.3 * LIMIT < seconds < 0.35 * LIMIT else 0.0),
+}
+
+
+def timed(dataset, monkeypatch, clock, machine, limit: float = LIMIT) -> Trainer:
+    """A timed run whose steps and evaluations take the clock's time, and which is never too short to prune."""
     monkeypatch.setattr(loop, "TIMED_STEPS", 6)
-    monkeypatch.setattr(loop, "LEAST_TIMED_TOTAL", 10)
-    trainer = Trainer(TrainConfig(preset="tiny", max_seconds=60.0), dataset)
-    step, rehearse = trainer.learner.step, trainer.learner.rehearse
+    monkeypatch.setattr(pruning, "MIN_ITERATIONS", 0)
+    trainer = Trainer(TrainConfig(preset="tiny", max_seconds=limit), dataset)
+    step, level_psnr, begun = trainer.learner.step, trainer.learner.level_psnr, clock.now
 
     def slow_step():
+        factor, pause = MACHINES[machine](clock.now - begun)
         record = step()
-        clock.now += cost[record["level"]]
+        clock.now += factor * COST[record["level"]] + pause
         return record
 
-    def slow_rehearsal(index, level):
-        clock.now += cost[level]
-        rehearse(index, level)
+    def slow_evaluation(views):
+        clock.now += 0.4
+        return level_psnr(views)
 
     monkeypatch.setattr(trainer.learner, "step", slow_step)
-    monkeypatch.setattr(trainer.learner, "rehearse", slow_rehearsal)
+    monkeypatch.setattr(trainer.learner, "level_psnr", slow_evaluation)
+    return trainer
+
+
+@pytest.mark.parametrize("machine", MACHINES)
+def test_a_time_limit_is_kept_and_the_schedule_completes(dataset, tmp_path, monkeypatch, clock, machine):
+    turns, prune = [], pruning.prune
+    monkeypatch.setattr(pruning, "prune", lambda *args: turns.append(args[5]) or prune(*args))
+    trainer, begun = timed(dataset, monkeypatch, clock, machine), clock.now
     trainer.run(tmp_path / "m.pt", log=tmp_path / "log.jsonl")
-    assert trainer.finished and 30 < trainer.total < 300 and trainer.seconds < 60
-    totals = {r["iteration"]: r["total"] for r in read_log(tmp_path / "log.jsonl") if "total" in r}
-    assert totals == {loop.TIMED_STEPS - 1: trainer.total}
-    stored = checkpoint.load(tmp_path / "m.pt")[1]
-    assert stored["total"] == trainer.total
-    assert json.loads(stored["config"])["iterations"] == trainer.total
+    assert trainer.seconds == pytest.approx(clock.now - begun) == pytest.approx(LIMIT, rel=0.03)
+    assert trainer.finished and turns == list(range(PRUNING_ROUNDS))
+    schedule, stored = trainer.learner.schedule, checkpoint.load(tmp_path / "m.pt")[1]
+    assert stored["place"] == schedule.iterations and schedule.phases_not_reached(stored["place"]) == []
+    assert json.loads(stored["config"])["iterations"] is None
+    records = read_log(tmp_path / "log.jsonl")
+    coarse = [r["seconds"] for r in records if r["level"] == 0 and "rate" not in r]
+    assert {r["level"] for r in records} == {0, 1, 2} and any("grown" in r for r in records)
+    assert max(coarse) < (0.5 if machine == "stopped" else 0.4) * LIMIT  # the rate term begins at a third
+    assert trainer.learner.optimiser.adam.param_groups[0]["lr"] < 1e-3 * 0.4  # of a cooldown to 0 from 1.5e-3
+    assert len(trainer.curve) >= 0.75 * loop.CURVE_POINTS  # a pause passes some over
+
+
+@pytest.mark.parametrize("limit", [LIMIT, 1.5 * LIMIT])
+def test_a_resumed_timed_run_spends_what_is_left(dataset, tmp_path, monkeypatch, clock, limit):
+    first = timed(dataset, monkeypatch, clock, "quiet")
+    observe = first.learner._update
+
+    def interrupted(*args):
+        if first.seconds > 0.5 * LIMIT:
+            signal.raise_signal(signal.SIGINT)
+        observe(*args)
+
+    monkeypatch.setattr(first.learner, "_update", interrupted)
+    first.run(tmp_path / "m.pt")
+    assert first.interrupted and 0.5 * LIMIT < first.seconds < 0.6 * LIMIT
+    clock.now += 1e4  # between the runs
+    second = timed(dataset, monkeypatch, clock, "quiet", limit)
+    second.resume(tmp_path / "m.pt")
+    assert second.learner.share == first.learner.share and second.total == first.total
+    begun = clock.now
+    second.run(tmp_path / "n.pt", log=tmp_path / "log.jsonl")
+    assert second.finished and second.seconds == pytest.approx(limit, rel=0.03)
+    assert second.seconds - first.seconds == pytest.approx(clock.now - begun)
+    places = [r["place"] for r in read_log(tmp_path / "log.jsonl")]
+    assert places == sorted(places) and places[0] == first.learner.place
+
+
+def test_a_pause_beyond_the_limit_leaves_a_cut_run_that_says_so(dataset, tmp_path, monkeypatch, clock):
+    trainer = timed(dataset, monkeypatch, clock, "quiet")
+    step = trainer.learner.step
+
+    def stopped():
+        clock.now += LIMIT if trainer.seconds > 0.5 * LIMIT else 0.0
+        return step()
+
+    monkeypatch.setattr(trainer.learner, "step", stopped)
+    trainer.run(tmp_path / "m.pt")
+    assert not trainer.finished
+    assert "exact rounding of attributes" in trainer.learner.schedule.phases_not_reached(trainer.learner.place)
 
 
 def test_a_run_is_cut_at_its_limit(dataset, tmp_path, monkeypatch, clock):
@@ -152,25 +217,6 @@ def test_resuming_from_a_model_without_training_state_is_refused(dataset, tmp_pa
     checkpoint.save(tmp_path / "m.pt", trainer.model)
     with pytest.raises(TrainError, match="no training state"):
         trainer.resume(tmp_path / "m.pt")
-
-
-def test_a_limit_nearly_spent_gives_a_cut_run_that_says_so(dataset):
-    trainer = Trainer(TrainConfig(preset="tiny", max_seconds=1e-3), dataset)
-    trainer._fix_iterations(start=0.0)
-    assert trainer.total == loop.LEAST_TIMED_TOTAL
-    assert "levels 1 and 2" in trainer.learner.schedule.phases_not_reached(loop.TIMED_STEPS)
-
-
-def test_a_time_limit_allows_for_what_a_step_of_the_rollout_costs(dataset, monkeypatch, clock):
-    totals = {}
-    monkeypatch.setattr(Trainer, "_level_costs", lambda self: [1e-3, 2e-3, 3e-3])
-    for rollout in ("uniform", "top", "all"):
-        trainer = Trainer(TrainConfig(preset="tiny", max_seconds=1e3, rollout=rollout), dataset)
-        trainer._fix_iterations(start=clock.now)
-        totals[rollout] = trainer.total
-    tenth, rest = COARSE_SHARE, 1 - COARSE_SHARE
-    assert totals["uniform"] / totals["top"] == pytest.approx((tenth * 1 + rest * 3) / (tenth * 1 + rest * 2), rel=1e-2)
-    assert totals["uniform"] / totals["all"] == pytest.approx((tenth * 1 + rest * 6) / (tenth * 1 + rest * 2), rel=1e-2)
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])

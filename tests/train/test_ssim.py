@@ -1,5 +1,9 @@
 """The picture's loss: the kernels against plain torch, both against the definition."""
 
+import os
+import subprocess
+import sys
+
 import numba
 import numpy as np
 import pytest
@@ -128,3 +132,23 @@ def test_errors():
         TargetStats(target, torch.ones(14, 12))
     with pytest.raises(TrainError, match="float"):
         TargetStats((255 * target).to(torch.uint8))
+
+
+MOMENTS = """
+from pd4dgs_codec.render import threads
+threads.configure(1)
+import hashlib
+import numpy as np
+from pd4dgs_codec.train import ssim_kernels as kernels
+image = kernels.pad(np.random.default_rng(0).random((24, 32, 3), dtype=np.float32))
+found = np.zeros((2, 24, kernels.lanes(32)), np.float32)
+kernels.target_moments(found[0], found[1], image, kernels.TAPS.astype(np.float32))
+print(sum(kernels.target_moments.stats.cache_hits.values()), hashlib.sha256(found.tobytes()).hexdigest())
+"""
+
+
+def test_a_process_that_compiles_a_kernel_gets_the_bits_of_one_that_loads_it(tmp_path):
+    environment = os.environ | {"NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": os.pathsep.join(sys.path)}
+    runs = [subprocess.check_output([sys.executable, "-c", MOMENTS], env=environment, text=True) for _ in range(2)]
+    (compiled, bits), (loaded, again) = (run.split() for run in runs)
+    assert (compiled, loaded) == ("0", "1") and bits == again

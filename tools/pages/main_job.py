@@ -76,6 +76,7 @@ def run_job(job: Job, folder: Path, *, say: Callable[[str], None], progress: Any
     for row in packed["levels"]:
         row["loss_db"] = unpacked[row["level"]]["mpsnr"] - row["mpsnr"]
         row["first_frame_seconds"] = 8 * row["cumulative_bytes"] / LINK
+    place = training.get("place", training["iteration"])
     result = {
         "name": job.name,
         "source": config.source,
@@ -84,7 +85,7 @@ def run_job(job: Job, folder: Path, *, say: Callable[[str], None], progress: Any
         "seed": config.seed,
         "iterations": training["iteration"],
         "total": training["total"],
-        "phases_not_reached": Schedule(training["total"] or None).phases_not_reached(training["iteration"]),
+        "phases_not_reached": Schedule(training["total"] or None).phases_not_reached(place),
         "train_seconds": training["seconds"],
         "skipped_steps": training["skipped"],
         "rho": training["rho"],

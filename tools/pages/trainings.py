@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -36,8 +35,6 @@ def ensure_trained(
         log.unlink(missing_ok=True)
         trainer = Trainer(config, dataset)
     else:
-        if config.max_seconds and stored["total"]:  # the number of steps that the limit gave is part of the run
-            config = replace(config, iterations=stored["total"])
         trainer = Trainer(config, dataset)
         trainer.resume(path)
         say(f"going on from step {trainer.iteration}")
@@ -56,12 +53,10 @@ def _stored(path: Path, config: TrainConfig) -> dict[str, Any] | None:
     stored = json.loads(json.dumps(TrainConfig().__dict__, default=lambda value: value.__dict__))
     stored |= BEFORE | json.loads(training.get("config", "{}"))
     wanted = json.loads(json.dumps(config, default=lambda value: value.__dict__))
-    if wanted["iterations"] is None:
-        stored["iterations"] = None
     return training if stored == wanted else None
 
 
 def _ended(training: dict[str, Any], config: TrainConfig) -> bool:
     """Whether a run came to its end, or to that of its time."""
-    finished = 0 < training["total"] <= training["iteration"]
+    finished = 0 < training["total"] <= training.get("place", training["iteration"])
     return finished or bool(config.max_seconds and training["seconds"] >= config.max_seconds)

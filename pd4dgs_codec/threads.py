@@ -1,8 +1,17 @@
-"""The one policy of threads: how many, and how they wait. Import this before numpy, torch and numba; it imports none.
+"""The one policy of threads for the whole process: how many, and how they wait. It imports no numpy, torch or numba.
 
-`configure` governs torch's operations and numba's kernels at any time, and what reads the environment when it loads:
-OpenMP's wait policy, numba's threading layer, and numpy's OpenBLAS, which takes OMP_NUM_THREADS if it loads afterwards.
-A BLAS that is loaded already keeps its threads.
+| pool | threads | how they wait |
+|------|---------|---------------|
+| torch's operations (OpenMP) | as `configure` is told | asleep |
+| numba's kernels | the same | asleep, in the tbb layer |
+| the BLAS of numpy | 1 | |
+
+Every command calls `configure` before anything else is imported. As a library, rendering and training call it at the
+first kernel, and encoding keeps numpy's BLAS to one thread while it lasts (`one_blas_thread`). Decoding has no threads.
+
+The products of an encoder are small, and OpenBLAS's threads spin between them: beside one other job they made encoding
+two to four times slower than one thread. OPENBLAS_NUM_THREADS is read when numpy loads; of a numpy that is loaded
+already `threadpoolctl` limits the BLAS, where it is installed.
 
 OpenMP threads that spin while they wait make a training step 5-20 times slower as soon as another process takes a
 core; `OMP_WAIT_POLICY=passive` (read when torch loads) and numba's `tbb` layer avoid that. The `tbb` package puts its
@@ -14,7 +23,10 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 from pd4dgs_codec.errors import RenderError
 
@@ -74,8 +86,8 @@ def configure(threads: int | None = None) -> int:
     """Set the wait policy, the threading layer and the number of threads; returns that number.
 
     threads: 1 .. available CPUs, or None for OMP_NUM_THREADS if set, else all. Best called before numpy, torch and
-    numba are imported; afterwards it still sets the threads of torch and numba, but an OpenMP or a BLAS that is loaded
-    already stays as it is.
+    numba are imported; afterwards it still sets the threads of torch and numba and, with threadpoolctl, of numpy's
+    BLAS, but an OpenMP that is loaded already waits as it did.
     Starting processes: spawn, never fork (OpenMP kills forked children).
     """
     if threads is None:
@@ -85,6 +97,9 @@ def configure(threads: int | None = None) -> int:
         raise RenderError(f"threads is {threads}, expected 1 to {available()} (the CPUs this process may use)")
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
     os.environ["OMP_NUM_THREADS"] = str(threads)
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+    if "numpy" in sys.modules:
+        _limit_blas()
     choose_layer()
     keep_freed_memory()
     if "numba" not in sys.modules:
@@ -93,6 +108,26 @@ def configure(threads: int | None = None) -> int:
         torch.set_num_threads(threads)
     set_kernel_threads(threads)
     return threads
+
+
+def _limit_blas() -> Any:
+    """numpy's BLAS to one thread; what takes that back, or None without threadpoolctl."""
+    try:
+        from threadpoolctl import threadpool_limits
+    except ImportError:
+        return None
+    return threadpool_limits(1, user_api="blas")
+
+
+@contextmanager
+def one_blas_thread() -> Iterator[None]:
+    """Keeps numpy's BLAS to one thread meanwhile; afterwards the caller has the threads it had."""
+    limits = _limit_blas()
+    try:
+        yield
+    finally:
+        if limits is not None:
+            limits.restore_original_limits()
 
 
 _kernel_threads: int | None = None
