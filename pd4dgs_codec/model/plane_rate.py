@@ -37,7 +37,7 @@ _SIDES = np.array([(a, b) for _, a, b in PLANES])
 _LN2 = math.log(2.0)
 
 
-@kernel(fast=True, inline=True)
+@kernel(inline=True)
 def _row_residuals(r: np.ndarray, flat: np.ndarray, k: int, i: int, up: int, left: int, temporal: int) -> None:
     """r [up] = residuals of row i, whose first value lies at flat offset k; neighbours lie `up` and `left` before."""
     if i == 0:
@@ -54,7 +54,7 @@ def _row_residuals(r: np.ndarray, flat: np.ndarray, k: int, i: int, up: int, lef
         r[x] = flat[k + x] - max(min(w, n), min(max(w, n), w + n - flat[k + x - up - left]))
 
 
-@kernel(fast=True, parallel=True)
+@kernel(parallel=True)
 def _magnitudes(
     channel_sums: np.ndarray, cell_sums: np.ndarray, grid: np.ndarray, starts: np.ndarray, sizes: np.ndarray
 ) -> None:
@@ -78,7 +78,7 @@ def _magnitudes(
         channel_sums[p] = sums
 
 
-@kernel(fast=True, parallel=True)
+@kernel(parallel=True)
 def _gradient(
     grad: np.ndarray,
     grid: np.ndarray,
