@@ -70,15 +70,16 @@ def test_an_ablation_takes_out_its_terms_alone(dataset, part, gone):
 
 
 def test_the_planes_rate_joins_with_the_rate_terms_and_grows(dataset):
-    """Unweighted in the record, ramped in the loss; its gradient reaches the planes of the level alone."""
+    """Unweighted among the terms, ramped in the loss."""
     steps = learner(dataset, plane_rate=1e-3)
     assert not any("rate_proxy" in name for _ in range(10) for name in steps.step())
     shares = []
     for iteration in (11, 15, 25):
         steps.iteration = iteration
-        steps.config, (_, terms, loss) = TrainConfig(preset="tiny", plane_rate=1e-3), _loss(steps)
+        steps.config = TrainConfig(preset="tiny", plane_rate=1e-3)
+        _, terms, loss = _loss(steps)
         steps.config = TrainConfig(preset="tiny", plane_rate=0.0)
-        without, rest = _loss(steps)[1:]
+        _, without, rest = _loss(steps)
         assert set(terms) - set(without) == {"global_rate_proxy", "local_rate_proxy"}
         bits = float(terms["global_rate_proxy"].detach() + terms["local_rate_proxy"].detach())
         shares.append(float(loss.detach() - rest.detach()) / (1e-3 * bits))
