@@ -38,7 +38,7 @@ def stored_config(args: argparse.Namespace) -> TrainConfig:
             _expect_same(args.resume, f"--{name.replace('_', '-')}", getattr(config, name), asked)
     if args.quality is not None:
         for name, value in at_quality(args.quality).items():
-            if getattr(args, name, None) is None:
+            if getattr(args, name, None) is None and name not in ablated(args):
                 _expect_same(args.resume, f"{name}, as --quality has it,", getattr(config, name), value)
     for part in args.without:
         if any(getattr(config, name) != value for name, value in ABLATIONS[part].items()):
