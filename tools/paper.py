@@ -125,8 +125,10 @@ def scene(name: str, synthetic: tuple[str, int] | None, iterations: int | None) 
         source=known.source,
         downscale=known.downscale,
         iterations=iterations or steps,
-        prune=0.0,  # the paper's method does neither
+        prune=0.0,  # the paper's method does none of these
         cooldown=0.0,
+        plane_rate=0.0,
+        step_scale=1.0,
     )
     return runs.Scene(name if name in BUDGETS else given.name, config, seeds)
 

@@ -39,8 +39,9 @@ on from. A second Ctrl-C ends it at once, and what was trained since the last sa
 --rollout: adaptive draws a level, the higher ones more often the more the layers differ; uniform draws all alike; fixed
 draws them with chances of .15, .30, .55; top trains the highest level alone; all trains every level in every step, at
 about thrice the cost. Before a tenth of the run it is level 0 in any case.
---without: rate, the bit-rate term; binary and smooth, the two mask terms; tmc, both of them; noise, the imitation of
-quantisation; judge, which leaves out levels that gain too little on training views kept back until then.
+--without: rate, the bit-rate terms; planes, that of the planes alone; binary and smooth, the two mask terms; tmc, both
+of them; noise, the imitation of quantisation; judge, which leaves out levels that gain too little on training views
+kept back until then.
 
 {SOURCES}
 
@@ -65,14 +66,16 @@ def parser() -> Parser:
     p.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to train (default: auto)")
     p.add_argument("--resume", metavar="FILE.pt", help="go on from this checkpoint, with the settings stored in it")
     p.add_argument("--log", metavar="FILE.jsonl", help="write one JSON object per step")
-    what = "weight of the bit rate against quality (default: 0.1; 1: the paper's)"
+    what = "0 (small) to 100 (good): weights of the bit rates, pruning and steps at once (default: 50)"
+    p.add_argument("--quality", type=values.non_negative_float, metavar="Q", help=what)
+    what = "weight of the anchors' bit rate against quality, instead of the quality's (at 50: 0.1; 1: the paper's)"
     p.add_argument("--rate-scale", type=values.non_negative_float, metavar="X", help=what)
     p.add_argument(
         "--prune",
         type=values.non_negative_float,
         metavar="X",
-        help="half way, take out anchors whose absence adds at most this share to the squared error (default: 0.01; 0: "
-        "none)",
+        help="half way, take out anchors whose absence adds at most this share to the squared error, instead of the "
+        "quality's (at 50: 0.05; 0: none)",
     )
     p.add_argument("--max-layer", type=int, choices=(0, 1, 2), help="train without the layers above this one")
     what = "which level each step trains, see below (default: adaptive)"
@@ -148,9 +151,10 @@ def _train(args: argparse.Namespace, console: Console) -> int:
 
 
 def _fresh_config(args: argparse.Namespace) -> TrainConfig:
-    from pd4dgs_codec.train.config import TrainConfig
+    from pd4dgs_codec.train.config import TrainConfig, at_quality
 
-    named = {name: getattr(args, name) for name in (*FIXED, "max_seconds") if getattr(args, name) is not None}
+    dial = {} if args.quality is None else at_quality(args.quality)
+    named = dial | {name: getattr(args, name) for name in (*FIXED, "max_seconds") if getattr(args, name) is not None}
     return TrainConfig(source=args.source, **named | ablated(args))
 
 

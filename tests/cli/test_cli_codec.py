@@ -120,6 +120,22 @@ def test_info_states_layers_and_first_frame(cli, scene_pd4):
     assert "first frame" in text and f"{size:,} bytes" in text
 
 
+def test_info_tells_where_the_bytes_are(cli, scene_pd4):
+    report = cli("info", scene_pd4, "--json", "--bytes").json
+    assert sum(row["bytes"] for row in report["parts"]) == report["bytes"] == scene_pd4.stat().st_size
+    for i, layer in enumerate(report["layers"]):
+        header = report["header_bytes"] if i == 0 else 0
+        assert sum(row["layers"][i] for row in report["parts"]) == layer["bytes"] + header
+    rows = {row["part"]: row for row in report["parts"]}
+    assert {"positions", "masks", "attributes", "planes", "weights"} < set(rows)
+    assert rows["planes"]["layers"][0] == 0 < rows["planes"]["layers"][1]
+    text = cli("info", scene_pd4, "--bytes").out.decode()
+    assert f"{rows['attributes']['bytes']:,}" in text and "share" in text
+    assert "parts" not in cli("info", scene_pd4, "--json").json
+    cut = cli("info", "-", "--bytes", stdin=scene_pd4.read_bytes()[: report["layers"][1]["end"] - 1])
+    assert cut.code == 1 and "layer 1 is not all there" in cut.err
+
+
 def test_info_compares_the_error_bounds_with_those_of_rounding(cli, scene_pd4, tmp_path, monkeypatch):
     from pd4dgs_codec.codec import encoder
 

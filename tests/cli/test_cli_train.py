@@ -14,6 +14,7 @@ from tiny import TINY
 
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import PRESETS
+from pd4dgs_codec.train.config import at_quality
 
 
 @pytest.fixture(autouse=True)
@@ -62,6 +63,19 @@ def test_options_reach_the_configuration(train, tmp_path):
     ]
     assert found == [7, 2, 3, 0.5, "fixed", "tiny", 1, 0.1]
     assert not (config["noise"] or config["tmc_binary"] or config["tmc_smooth"])
+
+
+def test_the_quality_sets_the_dial_and_single_options_replace_parts_of_it(train, tmp_path):
+    first = tmp_path / "m.pt"
+    assert train(first, "--quality", 80, "--prune", 0.03, iterations=1).code == 0
+    config = json.loads(checkpoint.load(first)[1]["config"])
+    expected = at_quality(80) | {"prune": 0.03}
+    assert {name: config[name] for name in expected} == expected
+    resumed = ("--resume", first, "-f")
+    assert train(first, *resumed, "--quality", 80, "--prune", 0.03, iterations=None).code == 0
+    other = train(first, *resumed, "--quality", 20, "--prune", 0.03, iterations=None)
+    assert other.code == 1 and "as --quality has it" in other.err
+    assert train(tmp_path / "n.pt", "--quality", 101).code == 1 and not (tmp_path / "n.pt").exists()
 
 
 def test_a_rate_weight_for_a_run_without_rate_is_wrong_usage(train, tmp_path):

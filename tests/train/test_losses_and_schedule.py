@@ -7,8 +7,9 @@ import torch
 
 from pd4dgs_codec.errors import TrainError
 from pd4dgs_codec.model.masks import level_mask
+from pd4dgs_codec.scene import Steps
 from pd4dgs_codec.train import losses
-from pd4dgs_codec.train.config import Schedule, TrainConfig, learning_rate
+from pd4dgs_codec.train.config import COARSENED, DIAL, Schedule, TrainConfig, at_quality, learning_rate
 from pd4dgs_codec.train.rollout import rollout_probabilities, sample_level, updated_rho
 
 
@@ -121,3 +122,29 @@ def test_learning_rates_are_log_linear():
 def test_bad_configurations_are_refused(bad):
     with pytest.raises(TrainError, match="expected|must be"):
         TrainConfig(**bad)
+
+
+def test_the_planes_pressure_rises_from_the_rate_terms_to_rounding():
+    s = Schedule(3_000)
+    assert [s.pressure(i) for i in (0, 1_000, 1_500, 2_000, 2_999)] == pytest.approx([0, 0, 0.5, 1, 1])
+    assert Schedule(None).pressure(7) == 0
+
+
+def test_the_dial_is_log_linear_and_stands_at_the_defaults():
+    default = TrainConfig()
+    assert at_quality(50) == {name: getattr(default, name) for name in DIAL}
+    low, middle, high = (at_quality(q) for q in (20, 50, 80))
+    for name in DIAL:
+        assert low[name] > middle[name] > high[name] > 0
+        assert low[name] * high[name] == pytest.approx(middle[name] ** 2)
+    for bad in (-1, 101, math.nan):
+        with pytest.raises(TrainError, match="0 to 100"):
+            at_quality(bad)
+
+
+def test_the_step_scale_moves_features_scalings_and_planes_alone():
+    steps = Steps()
+    moved = TrainConfig(step_scale=2.0).model_steps(steps)
+    assert {name for name, value in vars(moved).items() if value != vars(steps)[name]} == set(COARSENED)
+    assert all(vars(moved)[name] == 2 * vars(steps)[name] for name in COARSENED)
+    assert TrainConfig(step_scale=1.0, steps=Steps(feature=1.0)).model_steps(steps).feature == 1.0
