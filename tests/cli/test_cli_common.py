@@ -9,8 +9,8 @@ from importlib import import_module
 
 import pytest
 
+from pd4dgs_codec import FORMAT_VERSION, jsonable
 from pd4dgs_codec import __main__ as dispatcher
-from pd4dgs_codec import jsonable
 from pd4dgs_codec.cli import common, values
 
 VERBS = ("train", "encode", "decode", "info", "render", "eval", "bench", "package", "serve")
@@ -95,7 +95,7 @@ def test_version_names_release_and_format():
     done = subprocess.run(
         [sys.executable, "-m", "pd4dgs_codec", "encode", "--version"], capture_output=True, text=True, timeout=60
     )
-    assert done.returncode == 0 and done.stdout.startswith("pd4dgs-encode ") and "format 1.0" in done.stdout
+    assert done.returncode == 0 and done.stdout.startswith("pd4dgs-encode ") and f"format {FORMAT_VERSION}" in done.stdout
 
 
 def test_help_and_usage_errors_load_no_heavy_module():
