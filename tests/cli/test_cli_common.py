@@ -95,7 +95,8 @@ def test_version_names_release_and_format():
     done = subprocess.run(
         [sys.executable, "-m", "pd4dgs_codec", "encode", "--version"], capture_output=True, text=True, timeout=60
     )
-    assert done.returncode == 0 and done.stdout.startswith("pd4dgs-encode ") and f"format {FORMAT_VERSION}" in done.stdout
+    assert done.returncode == 0 and done.stdout.startswith("pd4dgs-encode ")
+    assert done.stdout.endswith(f"format {FORMAT_VERSION}\n")
 
 
 def test_help_and_usage_errors_load_no_heavy_module():
