@@ -76,12 +76,18 @@ def _serve(args: argparse.Namespace, console: Console) -> int:
 
     log = console.message if console.verbose else None
     with Server(args.input, args.host, args.port, link=Link(args.rate), latency=args.latency, log=log) as server:
-        stop = threading.Event()
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                signal.signal(number, lambda *_: stop.set())
+        stop = set_by_signals()
         with server.running():
             result = {"url": server.url, "folder": str(server.root), "rate": args.rate, "latency": args.latency}
             console.result(result, server.url, on_stdout=True)
             stop.wait()
     return OK
+
+
+def set_by_signals() -> threading.Event:
+    """An event that Ctrl-C and SIGTERM set from now on."""
+    stop = threading.Event()
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: stop.set())
+    return stop
