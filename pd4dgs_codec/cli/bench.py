@@ -198,7 +198,7 @@ def _latency(args: argparse.Namespace, console: Console) -> Outcome:
         raise UsageError(f"found {len(args.data)} --data for {len(args.inputs)} files, expected one each or none")
     from pd4dgs_codec.bench import latency
     from pd4dgs_codec.data.dataset import load
-    from pd4dgs_codec.model.warm import warm_up
+    from pd4dgs_codec.playback.warm import warm_up
 
     contents = [_with_camera(name, args.anchors) for name in args.inputs]
     sets: list[Dataset | None] = [load(source, downscale=args.downscale) for source in args.data]

@@ -73,11 +73,12 @@ def _decode(args: argparse.Namespace, console: Console) -> int:
 
 def _input(args: argparse.Namespace, console: Console) -> bytes:
     """The file's bytes; of a URL only those that --max-layer needs."""
-    from pd4dgs_codec.delivery.transfer import Transfer, is_url
+    from pd4dgs_codec.delivery.urls import is_url
 
     if not is_url(args.input):
         return read_bytes(args.input)
     from pd4dgs_codec.delivery.prefix import fetch
+    from pd4dgs_codec.delivery.transfer import Transfer
 
     transfer = Transfer(args.input)
     try:

@@ -68,12 +68,13 @@ def _info(args: argparse.Namespace, console: Console) -> int:
 
 def _input(args: argparse.Namespace, console: Console) -> tuple[bytes, int]:
     """(bytes, length of the file): all of it, or of a URL the header alone where that suffices."""
-    from pd4dgs_codec.delivery.transfer import Transfer, is_url
+    from pd4dgs_codec.delivery.urls import is_url
 
     if not is_url(args.input):
         data = read_bytes(args.input)
         return data, len(data)
     from pd4dgs_codec.delivery.prefix import fetch, fetch_header
+    from pd4dgs_codec.delivery.transfer import Transfer
 
     transfer = Transfer(args.input)
     try:

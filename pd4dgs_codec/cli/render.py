@@ -72,11 +72,9 @@ def _render(args: argparse.Namespace, console: Console) -> int:
         from pd4dgs_codec.view.movie import check_mp4
 
         check_mp4()
-    levels = load_levels(named_input(args.input), args.max_layer)
+    levels = load_levels(named_input(args.input), args.max_layer, last_only=not args.side_by_side)
     console.detail(f"{args.input}: levels " + ", ".join(f"{row.level} ({row.anchors} anchors)" for row in levels))
     frames = _frames(args, levels[-1])
-    if not args.side_by_side:
-        levels = levels[-1:]
     milliseconds: list[float] = []
     with progress_bar(len(frames), "frames", "rendering") as step:
         outputs = _write(args, kind, _pictures(frames, levels, args.side_by_side, milliseconds, step), len(frames))

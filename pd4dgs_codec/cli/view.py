@@ -61,7 +61,7 @@ def player_folder() -> Path:
 def _view(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.delivery.link import Link
     from pd4dgs_codec.delivery.server import Server
-    from pd4dgs_codec.delivery.transfer import is_url
+    from pd4dgs_codec.delivery.urls import is_url
 
     with tempfile.TemporaryDirectory(prefix="pd4dgs-view-") as name:
         folder, source = Path(name), args.input

@@ -192,7 +192,9 @@ def _descend(
         if p.shape[1] == 5:
             cdf = ((256 - p[:, 4:]) * cdf + p[:, 4:] * norm_cdf28(n, p[:, 2], p[:, 3])) >> 8
         # the higher floor keeps outliers from steering the fit
-        return np.asarray(frequency_costs(np.diff(table_from_cdf28(cdf, FLOORS[-1]))) @ counts)
+        each = np.diff(table_from_cdf28(cdf, FLOORS[-1]))
+        total: np.ndarray = np.asarray(frequency_costs(each) @ counts)
+        return total
 
     f = cost(starts)
     x, fx = starts[f.argmin()], int(f.min())
@@ -215,8 +217,8 @@ def _descend(
                 break
         if best == len(f) - 1 or gain <= 0:
             steps = np.maximum(steps // 2, 1)
-    result: np.ndarray = x
-    return result
+    found: np.ndarray = x
+    return found
 
 
 def _moments(counts: np.ndarray) -> np.ndarray:
