@@ -13,7 +13,7 @@ from pd4dgs_codec.bitstream.container import write_chunk, write_preamble
 from pd4dgs_codec.codec.bounds import ErrorBound, rounding_bounds, verify_errors
 from pd4dgs_codec.codec.check import check_scene
 from pd4dgs_codec.codec.decoder import decode_layers
-from pd4dgs_codec.codec.header import Header, pack_header, scene_id_of
+from pd4dgs_codec.codec.header import Header, pack_header, payload_digest, scene_id_of
 from pd4dgs_codec.codec.kinds import LAYER_KINDS
 from pd4dgs_codec.codec.left_out import LeftOut
 from pd4dgs_codec.codec.options import DEFAULTS, EncodeOptions
@@ -118,9 +118,10 @@ def _container(meant: Scene, options: EncodeOptions, payloads: list[bytes]) -> b
         attribute_steps=meant.steps.attributes,
         info=meant.info,
         error_bounds=rounding_bounds(meant, options.raw_deformation),
+        digest=payload_digest(payloads),
     )
     packed = pack_header(header)
-    scene_id = scene_id_of(packed, payloads[0])
+    scene_id = scene_id_of(packed)
     chunks = [write_chunk(t, 0, scene_id, payload) for t, payload in zip(types, payloads, strict=True)]
     return b"".join([write_preamble(packed), *chunks])
 

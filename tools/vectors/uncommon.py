@@ -89,6 +89,9 @@ def _cases() -> Iterator[tuple[str, str, str, File]]:
     camera = {12: {**CAMERA, 64: "lens", 1000: [1.0]}}
     yield "camera-unknown-keys", "Keys from 64 on in the camera.", "4 5.3", plain.with_header(camera)
     bounds = {13: {**ERROR_BOUNDS, 64: "a class to come", 1000: 1}}
+    digest = {14: layers.fields()[14]}
+    fewer = replace(layers, chunks=layers.chunks[:2]).with_header(digest)
+    yield "layer-2-left-out", "Layer 2 was left out later: the digest is that of all three.", "3.3 5.5", fewer
     yield "bounds-unknown-keys", "Keys from 64 on in the error bounds.", "4 5.4", plain.with_header(bounds)
     layer = layers.layer(1)
     extended = layer.payload(lambda m: {**m, 64: [1, 2], 70000: {5: "x"}})
