@@ -120,6 +120,17 @@ def test_info_states_layers_and_first_frame(cli, scene_pd4):
     assert "first frame" in text and f"{size:,} bytes" in text
 
 
+def test_metadata_is_written_shown_and_kept(cli, scene_pd4, tmp_path):
+    told, again = tmp_path / "told.pd4", tmp_path / "again.pd4"
+    fast = ("--effort", 1, "--no-verify", "--omit", "nothing")
+    assert cli("encode", scene_pd4, "-o", told, "--title", "Kitchen", "--licence", "CC BY 4.0", *fast).code == 0
+    assert cli("encode", told, "-o", again, "--title", "Hall", *fast).code == 0
+    assert cli("info", told, "--json").json["metadata"] == {"title": "Kitchen", "licence": "CC BY 4.0"}
+    assert {"title: Hall", "licence: CC BY 4.0"} <= set(cli("info", again).out.decode().splitlines())
+    refused = cli("encode", scene_pd4, "-o", tmp_path / "no.pd4", "--source", "two\nlines", *fast)
+    assert refused.code == 1 and len(refused.error_lines) == 1 and not (tmp_path / "no.pd4").exists()
+
+
 def test_info_compares_the_error_bounds_with_those_of_rounding(cli, scene_pd4, tmp_path, monkeypatch):
     from pd4dgs_codec.codec import encoder
 
