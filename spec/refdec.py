@@ -249,8 +249,9 @@ def read_preamble(data):
 # 5.1 Header map: "The time at 1 MUST NOT precede the time at 0, the background MUST lie in 0..1, 0 ≤ near < far and
 # unit ≥ 0 MUST hold." "coding mode: 0 ans, 1 lzma; others UnsupportedFeature" "deformation: 0 coded as symbols, 1
 # float32 (9.2); others UnsupportedFeature"
+# 5.5 Digest: "The first 16 bytes of the SHA-256 of the payloads of all critical chunks that were encoded together"
 def read_header(data):
-    header = fields(unpack(data), range(1, 14), (*range(1, 12), 13), "header")
+    header = fields(unpack(data), range(1, 15), (*range(1, 12), 13, 14), "header")
     steps, box, (start, end), background, (near, far), _ = (
         reals(header[key], f"header key {key}", count)
         for key, count in ((4, 3), (6, 6), (7, 2), (8, 3), (9, 2), (10, 3))
@@ -266,6 +267,7 @@ def read_header(data):
     if 12 in header:
         read_camera(header[12])
     read_error_bounds(header[13])
+    need(type(header[14]) is bytes and len(header[14]) == 16, "the digest of the layers is not 16 bytes")
     read_chunk_list(header[1])
     for key in (2, 3):
         registered(header[key], (0, 1), f"header key {key}")
@@ -312,7 +314,7 @@ def behind_chunk_list(header):
 
 # 3.2 Chunks: "Type and length MUST equal those in the chunk list. Checks come in this order: L against its limit, L
 # against the list, the bytes that are there, CRC-32, reserved flags, type, scene id, flag bit 0 against the type"
-def read_chunk(data, at, kind, size, scene_id, described):
+def read_chunk(data, at, kind, size, scene_id):
     need(len(data) >= at + 16, "the file ends in a chunk's head", "Truncated")
     found_kind, flags, found_size, found_id = struct.unpack_from("<HHI8s", data, at)
     limited(found_size, (1 << 31) - 1, "a payload's length")
@@ -323,15 +325,14 @@ def read_chunk(data, at, kind, size, scene_id, described):
     need(zlib.crc32(data[at:end]) == crc, f"CRC-32 of the chunk at {at}", "ChecksumMismatch")
     need(flags >> 1 == 0, f"flags {flags:#x}")
     need(found_kind == kind, f"chunk type {found_kind}, listed {kind}")
-    payload = data[at + 16 : end]
-    check_scene_id(found_id, scene_id or hashlib.sha256(described + payload).digest()[:8])
+    check_scene_id(found_id, scene_id)
     check_critical(kind, flags & 1)
-    return payload, found_id, end + 4
+    return data[at + 16 : end], end + 4
 
 
 # 3.3 Scene identity: "Every chunk of a file, ancillary ones included, MUST carry it"
 def check_scene_id(found, expected):
-    need(found == expected, "the scene id is not that of the header and layer 0")
+    need(found == expected, "the scene id is not that of the header")
 
 
 # 3.4 Critical and ancillary chunks: "The chunk types of layers are critical: flag bit 0 MUST be zero there." "A
@@ -1226,13 +1227,13 @@ def decode(data, max_layer=None):
     """The layers of a file's bytes, or of prefix max_layer, each with `symbols` and `tensors` by name, flat and in C
     order."""
     header, at = read_preamble(data)
-    described = behind_chunk_list(data[20:at])
-    layers, scene_id, rows = [], None, 0
+    scene_id = hashlib.sha256(behind_chunk_list(data[20:at])).digest()[:8]
+    layers, rows = [], 0
     stop = len(header[1])
     if max_layer is not None:
         stop = 1 + max(i for i, (kind, _) in enumerate(header[1]) if kind <= min(max_layer, 2))
     for kind, size in header[1][:stop]:
-        payload, scene_id, at = read_chunk(data, at, kind, size, scene_id, described)
+        payload, at = read_chunk(data, at, kind, size, scene_id)
         if kind < 3:
             layers.append(read_layer(payload, kind, rows, header))
             finish_last(layers)

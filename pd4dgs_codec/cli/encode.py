@@ -6,6 +6,7 @@ import argparse
 import io
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.cli import values
@@ -26,6 +27,7 @@ from pd4dgs_codec.codec.options import CHOICES, DEFAULTS, EncodeOptions
 from pd4dgs_codec.pack import MIN_GAIN_PER_MEGABYTE
 
 if TYPE_CHECKING:
+    from pd4dgs_codec.codec.metadata import Metadata
     from pd4dgs_codec.pack.packing import Packed, Views
     from pd4dgs_codec.scene import Scene
 
@@ -68,6 +70,11 @@ def parser() -> Parser:
     p.add_argument("--no-verify", action="store_true", help="skip decoding the result and comparing every symbol")
     what = "most bytes that each layer may add to the file (layer 0 with the header): coarser steps, fewer anchors"
     p.add_argument("--target-size", type=values.layer_sizes, default={}, metavar="L0=425k,...", help=what)
+    about = p.add_argument_group(
+        "what the file says about itself", "shown by pd4dgs-info; a .pd4 that is packed again keeps it"
+    )
+    for name, what in (("title", "of the scene"), ("source", "what it was made of"), ("licence", "its terms of use")):
+        about.add_argument(f"--{name}", metavar="TEXT", help=what)
     views = p.add_argument_group("judging by pictures")
     what = "a dataset, see above: sizes are fitted on its training views, layers must pay on those held out"
     views.add_argument("--data", metavar="SOURCE", help=what)
@@ -104,7 +111,7 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
         raise UsageError("--min-gain needs --data SOURCE: a gain is measured on its views")
     check_output(args.output, args.overwrite)
     options = _options(args)
-    scene, trained = _load(args)
+    scene, trained, metadata = _load(args)
     console.detail(f"{args.input}: {len(scene.anchor_q)} anchors, layers {list(scene.layers)}, steps {scene.steps}")
     from pd4dgs_codec.pack.packing import pack
 
@@ -115,6 +122,7 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
         views=_views(args, console),
         min_gain=MIN_GAIN_PER_MEGABYTE if args.min_gain is None else args.min_gain,
         downscale=args.downscale,
+        metadata=metadata,
         progress=lambda what: progress_bar(None, "pictures", what),
     )
     result = {"input": args.input, "output": args.output, **packed.json()}
@@ -138,18 +146,30 @@ def _options(args: argparse.Namespace) -> EncodeOptions:
     )
 
 
-def _load(args: argparse.Namespace) -> tuple[Scene, bool]:
-    """(scene, whether it holds a checkpoint's own floats: those of a .pd4 are gone). Only a checkpoint needs torch."""
+def _load(args: argparse.Namespace) -> tuple[Scene, bool, Metadata | None]:
+    """(scene, whether it holds a checkpoint's own floats: those of a .pd4 are gone, metadata). Only a checkpoint needs
+    torch."""
     data = read_bytes(args.input)
     if is_pd4(data):
         from pd4dgs_codec.codec.decoder import decode
+        from pd4dgs_codec.codec.info import metadata_of
 
-        return decode(data), False
+        return decode(data), False, _metadata(args, metadata_of(data))
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.model.convert import to_scene
 
     model, _ = checkpoint.load(args.input if args.input != STDIO else _Stdin(data))  # type: ignore[arg-type]
-    return to_scene(model), True
+    return to_scene(model), True, _metadata(args, None)
+
+
+def _metadata(args: argparse.Namespace, had: Metadata | None) -> Metadata | None:
+    """What the options say, in place of what the file had."""
+    given = {name: vars(args)[name] for name in ("title", "source", "licence") if vars(args)[name] is not None}
+    if not given:
+        return had
+    from pd4dgs_codec.codec.metadata import Metadata
+
+    return replace(had or Metadata(), **given)
 
 
 def _views(args: argparse.Namespace, console: Console) -> Views | None:

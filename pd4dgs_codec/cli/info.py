@@ -137,6 +137,17 @@ def _left_out_line(left_out: list[dict[str, str]]) -> list[str]:
     return [f"left out: {', '.join(row['what'] for row in left_out)} ({left_out[0]['why']})"] if left_out else []
 
 
+def _about_lines(metadata: dict[str, Any] | None) -> list[str]:
+    if metadata is None:
+        return []
+    texts = [f"{name}: {value}" for name, value in metadata.items() if isinstance(value, str) and name != "fault"]
+    quality = ", ".join(f"level {level} {db:.2f} dB" for level, db in metadata.get("quality", {}).items())
+    lines = [*texts, *([f"quality on held-out views: {quality}"] if quality else [])]
+    if "still_bytes" in metadata:
+        lines.append(f"still picture: {metadata['still_bytes']:,} bytes")
+    return [*lines, *([f"metadata cannot be read: {metadata['fault']}"] if "fault" in metadata else [])]
+
+
 def _bound_lines(declared: dict[str, float], nearest: dict[str, float]) -> list[str]:
     other = [what for what, bound in nearest.items() if declared[what] != bound]
     if not other:
@@ -163,6 +174,7 @@ def _text(result: dict[str, Any]) -> str:
                 for row in result["layers"]
             ],
         ),
+        *_about_lines(result["metadata"]),
         *_left_out_line(result["left_out"]),
         "errors at most: " + ", ".join(f"{what} {bound:.4g}" for what, bound in result["error_bounds"].items()),
         "first frame: " + ", ".join(f"{s:.2f} s at {rate}bps" for rate, s in result["first_frame_seconds"].items()),

@@ -136,6 +136,17 @@ def test_info_tells_where_the_bytes_are(cli, scene_pd4):
     assert cut.code == 1 and "layer 1 is not all there" in cut.err
 
 
+def test_metadata_is_written_shown_and_kept(cli, scene_pd4, tmp_path):
+    told, again = tmp_path / "told.pd4", tmp_path / "again.pd4"
+    fast = ("--effort", 1, "--no-verify", "--omit", "nothing")
+    assert cli("encode", scene_pd4, "-o", told, "--title", "Kitchen", "--licence", "CC BY 4.0", *fast).code == 0
+    assert cli("encode", told, "-o", again, "--title", "Hall", *fast).code == 0
+    assert cli("info", told, "--json").json["metadata"] == {"title": "Kitchen", "licence": "CC BY 4.0"}
+    assert {"title: Hall", "licence: CC BY 4.0"} <= set(cli("info", again).out.decode().splitlines())
+    refused = cli("encode", scene_pd4, "-o", tmp_path / "no.pd4", "--source", "two\nlines", *fast)
+    assert refused.code == 1 and len(refused.error_lines) == 1 and not (tmp_path / "no.pd4").exists()
+
+
 def test_info_compares_the_error_bounds_with_those_of_rounding(cli, scene_pd4, tmp_path, monkeypatch):
     from pd4dgs_codec.codec import encoder
 

@@ -49,7 +49,7 @@ def put_together(header, chunks):
     """A file with right lengths, ids and CRCs, whatever its payloads say."""
     header = {**header, CHUNKS: [[t, len(p)] for t, _, p in chunks]}
     packed = canonical.pack(header)
-    scene_id = scene_id_of(packed, chunks[0][2])
+    scene_id = scene_id_of(packed)
     framed = [write_chunk(t, f, scene_id, p) for t, f, p in chunks]
     return b"".join([write_preamble(packed), *framed])
 

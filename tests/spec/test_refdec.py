@@ -432,7 +432,7 @@ def take_apart(data):
 def put_together(header, chunks):
     """A file with right lengths, ids and CRCs, whatever its payloads say."""
     packed = canonical.pack({**header, 1: [[t, len(p)] for t, _, p in chunks]})
-    scene_id = scene_id_of(packed, chunks[0][2])
+    scene_id = scene_id_of(packed)
     return write_preamble(packed) + b"".join(write_chunk(t, f, scene_id, p) for t, f, p in chunks)
 
 
