@@ -9,18 +9,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from pd4dgs_codec.cli import values
 from pd4dgs_codec.cli.common import (
     OK,
     SOURCES,
     Console,
     Parser,
     UsageError,
-    count,
-    layer_sizes,
-    non_negative_float,
+    add_reading,
     number,
-    positive_float,
-    positive_int,
     run,
     table,
 )
@@ -56,20 +53,14 @@ FIRST_FRAME_RATE = 2e6
 def parser() -> Parser:
     """The options of `pd4dgs-encode`."""
     p = Parser("encode", "model.pt -o FILE.pd4", "Pack a trained scene into a layered .pd4 file.", DETAILS)
-    p.add_argument(
-        "input", metavar="model.pt", help="checkpoint of pd4dgs-train, or a .pd4 file to pack again; - reads stdin"
-    )
+    what = "checkpoint of pd4dgs-train, or a .pd4 file to pack again; - reads stdin"
+    p.add_argument("input", metavar="model.pt", help=what)
     p.add_argument("-o", "--output", required=True, metavar="FILE.pd4", help="file to write; - writes stdout")
     _add_choice(p, "mode", "entropy coder")
     _add_choice(p, "deformation", "planes and networks of layers 1 and 2: coded integers, or float32 under LZMA")
     _add_choice(p, "priors", "distributions to choose from per channel")
-    p.add_argument(
-        "--step-scale",
-        type=positive_float,
-        default=DEFAULTS.step_scale,
-        metavar="X",
-        help="multiply every quantisation step: above 1 smaller and coarser (default: %(default)g)",
-    )
+    what = "multiply every quantisation step: above 1 smaller and coarser (default: %(default)g)"
+    p.add_argument("--step-scale", type=values.positive_float, default=DEFAULTS.step_scale, metavar="X", help=what)
     _add_choice(p, "layers", "auto leaves out layers without effect; a number keeps the layers up to it")
     efforts = CHOICES["effort"]
     _add_choice(p, "effort", f"{efforts[0]} fast, {efforts[-1]} small", type=int, metavar=f"{efforts[0]}-{efforts[-1]}")
@@ -77,38 +68,22 @@ def parser() -> Parser:
         p, "omit", "leave out what changes no picture and residuals too small to see, the former alone, or nothing"
     )
     p.add_argument("--no-verify", action="store_true", help="skip decoding the result and comparing every symbol")
-    p.add_argument(
-        "--target-size",
-        type=layer_sizes,
-        default={},
-        metavar="L0=425k,...",
-        help="most bytes that each layer may add to the file (layer 0 with the header): coarser steps, fewer anchors",
-    )
+    what = "most bytes that each layer may add to the file (layer 0 with the header): coarser steps, fewer anchors"
+    p.add_argument("--target-size", type=values.layer_sizes, default={}, metavar="L0=425k,...", help=what)
     about = p.add_argument_group(
         "what the file says about itself", "shown by pd4dgs-info; a .pd4 that is packed again keeps it"
     )
     for name, what in (("title", "of the scene"), ("source", "what it was made of"), ("licence", "its terms of use")):
         about.add_argument(f"--{name}", metavar="TEXT", help=what)
     views = p.add_argument_group("judging by pictures")
-    views.add_argument(
-        "--data",
-        metavar="SOURCE",
-        help="a dataset, see above: sizes are fitted on its training views, layers must pay on those held out",
-    )
-    views.add_argument(
-        "--downscale", type=positive_int, default=1, metavar="K", help="pictures 1/K as wide and high (default: 1)"
-    )
-    views.add_argument("--holdout", type=count, default=8, metavar="K", help="as in pd4dgs-train (default: 8)")
-    views.add_argument(
-        "--views",
-        type=positive_int,
-        default=16,
-        metavar="N",
-        help="use about N of its views of either kind, evenly spread (default: 16)",
-    )
+    what = "a dataset, see above: sizes are fitted on its training views, layers must pay on those held out"
+    views.add_argument("--data", metavar="SOURCE", help=what)
+    add_reading(views)
+    what = "use about N of its views of either kind, evenly spread (default: 16)"
+    views.add_argument("--views", type=values.positive_int, default=16, metavar="N", help=what)
     views.add_argument(
         "--min-gain",
-        type=non_negative_float,
+        type=values.non_negative_float,
         metavar="DB",
         help="with --data, leave out layers whose level gains less than DB dB mPSNR per megabyte "
         f"(default: {MIN_GAIN_PER_MEGABYTE:g}; 0: keep all)",

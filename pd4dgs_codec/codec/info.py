@@ -12,7 +12,7 @@ from pd4dgs_codec.codec.bounds import rounding_bounds
 from pd4dgs_codec.codec.decoder import read_layers
 from pd4dgs_codec.codec.header import unpack_header
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
-from pd4dgs_codec.codec.layer_meta import Declared
+from pd4dgs_codec.codec.layer_meta import Declared, Section
 from pd4dgs_codec.codec.metadata import CHUNK_TYPE, TEXTS, Metadata, read_metadata
 from pd4dgs_codec.codec.payload import read_meta
 from pd4dgs_codec.codec.symbols import float_tensors
@@ -25,7 +25,8 @@ def info(data: bytes) -> dict[str, Any]:
     """Header and layers of a file, or of its first bytes: only the preamble and header must be there.
 
     layers: {layer, offset, bytes, end} (whole chunks; end = length of the prefix that holds layers 0 .. this one) and,
-    for chunks that `data` holds whole, anchors, steps, planes ([C, x, y, z, t] per scale) and networks (output widths).
+    for chunks that `data` holds whole, anchors, steps, planes ([C, x, y, z, t] per scale), networks (output widths) and
+    sections (bytes by name; what else the chunk holds is its frame and its parameters).
     metadata: {title, source, licence, command, quality, still_bytes} as far as given, {"fault"} if it cannot be read,
     None where `data` holds no such chunk.
     """
@@ -48,6 +49,7 @@ def info(data: bytes) -> dict[str, Any]:
                 meta, _, declared = read_meta(payload, kind, declared, header.raw_deformation)
                 row |= {"anchors": meta.rows, "steps": meta.steps}
                 row["planes"] = [[s.channels, *s.sides] for s in meta.scales]
+                row["sections"] = {Section(key).name.lower(): length for key, length in sorted(meta.sections.items())}
                 row["networks"] = {name: list(widths) for name, widths in meta.networks.items()}
             layers.append(row)
         offset += size

@@ -23,15 +23,14 @@ CHANNELS = 8  #: of its planes, as many as take the kernel's path
 
 
 def warm_up() -> None:
-    """Imports torch and numba and loads the kernels (where none are cached: compiles them) by drawing one anchor with
-    both deformations. Draws no random numbers. A viewer calls it in a thread while the first layer is on its way."""
-    from pd4dgs_codec.model.convert import from_scene
-    from pd4dgs_codec.model.picture import render_image
+    """Imports numba and loads the kernels (where none are cached: compiles them) by drawing one anchor with both
+    deformations. A viewer calls it in a thread while the first layer is on its way."""
+    from pd4dgs_codec.playback.player import Player
 
     scene = _one_anchor()
     camera = scene.info.camera
     assert camera is not None
-    render_image(from_scene(scene), 2, 0.5, camera)
+    Player(scene).picture(camera, 0.5)
 
 
 def _one_anchor() -> Scene:
