@@ -6,6 +6,8 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
+from pd4dgs_codec.cli.common import USAGE, open_streams, say, tell, version_line
+
 VERBS = {
     "train": "train a layered scene from posed images",
     "encode": "pack a trained scene into a .pd4 file",
@@ -16,26 +18,27 @@ VERBS = {
     "bench": "measure what the codec, the renderer and the trainer promise",
     "package": "lay out a file for DASH, HLS and plain HTTP",
     "serve": "serve a folder over HTTP, at the rate of a slow link if wanted",
+    "view": "show a scene in the browser",
 }
 
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Runs one verb; returns its exit code."""
+    open_streams()
     arguments = list(sys.argv[1:] if argv is None else argv)
     verb = arguments[0] if arguments else "--help"
     if verb in ("-h", "--help"):
         lines = ["usage: python -m pd4dgs_codec VERB ...   (VERB --help explains each)", ""]
         lines += [f"  {name:<9}{summary}" for name, summary in VERBS.items()]
-        print("\n".join(lines), file=sys.stdout if arguments else sys.stderr)
-        return 0 if arguments else 2
+        if arguments:
+            return tell("pd4dgs", "\n".join(lines))
+        say("\n".join(lines))
+        return USAGE
     if verb == "--version":
-        from pd4dgs_codec.cli.common import version_line
-
-        print(version_line("pd4dgs_codec"))
-        return 0
+        return tell("pd4dgs", version_line("pd4dgs_codec"))
     if verb not in VERBS:
-        print(f"pd4dgs: error: found {verb!r}, expected one of {', '.join(VERBS)}", file=sys.stderr)
-        return 2
+        say(f"pd4dgs: error: found {verb!r}, expected one of {', '.join(VERBS)}")
+        return USAGE
     code: int = import_module(f"pd4dgs_codec.cli.{verb}").main(arguments[1:])
     return code
 

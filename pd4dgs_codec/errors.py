@@ -5,9 +5,20 @@ Every message says what was found, what was expected, and where.
 
 from __future__ import annotations
 
+LONGEST = 400  #: characters of a message; beyond, its middle is left out
+
+
+def one_line(text: str, longest: int = LONGEST) -> str:
+    """What somebody else may have written, fit for one line on a terminal: printable, and at most so long."""
+    line = " ".join("".join(c if c.isprintable() else " " for c in text).split())
+    return line if len(line) <= longest else f"{line[: longest * 2 // 3]} … {line[-longest // 3 + 3 :]}"
+
 
 class Pd4Error(Exception):
-    """Base of every error this package raises on purpose. The commands print it as one line and exit 1."""
+    """Base of every error this package raises on purpose: one line, which the commands print, exit 1."""
+
+    def __init__(self, message: str):
+        super().__init__(one_line(message))
 
 
 class DataError(Pd4Error):
@@ -42,10 +53,10 @@ class DecodeError(Pd4Error):
     """
 
     def __init__(self, message: str, *, offset: int | None = None, chunk: int | None = None):
-        self.message = message
+        super().__init__(message)
+        self.message: str = self.args[0]
         self.offset = offset
         self.chunk = chunk
-        super().__init__(message)
 
     def __str__(self) -> str:
         where = []

@@ -10,7 +10,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from pd4dgs_codec.render.threads import configure
+from pd4dgs_codec.threads import configure
 
 
 def say(line: str) -> None:

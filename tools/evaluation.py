@@ -14,7 +14,7 @@ from pages.page import Page, Row, keep, make, options, say
 from pages.scenes import SCENES, present
 
 from pd4dgs_codec.bench.report import markdown
-from pd4dgs_codec.render.threads import configure
+from pd4dgs_codec.threads import configure
 
 #: Figures that change from run to run; docs/results.md has them.
 TIMES = {"decode_seconds", "render_ms"}

@@ -19,7 +19,7 @@ from pages.page import ROOT, Page, Row, keep, make, options, say
 from pages.scenes import SCENES
 
 from pd4dgs_codec.bench.report import markdown
-from pd4dgs_codec.render.threads import configure
+from pd4dgs_codec.threads import configure
 
 NAMES = ("shelf-hand", "shelf-hand-paper")
 RATES = (2e6, 10e6, 50e6)
@@ -40,7 +40,7 @@ def fault_table() -> Any:
 def measure(out: Path, docs: Path, runs: int) -> Row:
     """All that the page shows, from the files of NAMES in `out`."""
     from pd4dgs_codec.bench import latency
-    from pd4dgs_codec.model.warm import warm_up
+    from pd4dgs_codec.playback.warm import warm_up
 
     contents = {name: (out / name / "scene.pd4").read_bytes() for name in NAMES}
     warm_up()

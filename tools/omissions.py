@@ -18,8 +18,8 @@ from pages.page import Page, Row, make, options, say
 from pages.scenes import SCENES, present
 
 from pd4dgs_codec.bench.report import markdown
-from pd4dgs_codec.render.threads import configure
 from pd4dgs_codec.scene import Camera, Scene
+from pd4dgs_codec.threads import configure
 
 SIDE = 64  #: of the pictures, pixels
 EFFORT = 5  #: of the encoder

@@ -24,7 +24,7 @@ from typing import Any
 
 from pages.scenes import SCENES, SHARED, Scene
 
-from pd4dgs_codec.render.threads import configure
+from pd4dgs_codec.threads import configure
 
 #: Iterations and seeds at most of the synthetic scenes, in the preset tiny.
 SYNTHETIC = ("tiny", 400, 3)
@@ -42,8 +42,8 @@ def main(argv: list[str] | None = None) -> int:
     configure()
     from pages.paper.tables import TABLES
 
-    from pd4dgs_codec.cli.common import positive_int
     from pd4dgs_codec.cli.progress import TrainingProgress
+    from pd4dgs_codec.cli.values import positive_int
     from pd4dgs_codec.errors import Pd4Error
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
@@ -125,8 +125,10 @@ def scene(name: str, synthetic: tuple[str, int] | None, iterations: int | None) 
         source=known.source,
         downscale=known.downscale,
         iterations=iterations or steps,
-        prune=0.0,  # the paper's method does neither
+        prune=0.0,  # the paper's method does none of these
         cooldown=0.0,
+        plane_rate=0.0,
+        step_scale=1.0,
     )
     return runs.Scene(name if name in BUDGETS else given.name, config, seeds)
 

@@ -184,7 +184,7 @@ def main() -> None:
     p.add_argument("--write", type=Path, metavar="PAGE.md", help="put the tables into this page, between its marks")
     args = p.parse_args()
 
-    from pd4dgs_codec.render.threads import configure
+    from pd4dgs_codec.threads import configure
 
     threads = configure(args.threads)
     tables = [profile(path, args.source, args.steps, args.at, threads) for path in args.checkpoints]

@@ -17,7 +17,7 @@ from pages.scenes import SCENES, present
 from pages.tables import coding_table, figures, quality_table, short_table, time_plot
 
 from pd4dgs_codec.bench.report import markdown
-from pd4dgs_codec.render.threads import configure
+from pd4dgs_codec.threads import configure
 
 #: Bytes per layer that the PD-4DGS paper publishes (average over the seven Dycheck iPhone scenes).
 PUBLISHED = (436_000, 1_187_000, 5_275_000)

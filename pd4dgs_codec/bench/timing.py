@@ -15,8 +15,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
 
+from pd4dgs_codec import threads
 from pd4dgs_codec.errors import Pd4Error
-from pd4dgs_codec.render import threads
 
 T = TypeVar("T")
 

@@ -18,7 +18,7 @@ import numpy as np
 
 def apply(constants: dict[str, float]) -> None:
     """Sets the constants; call it before anything imports the kernels."""
-    from pd4dgs_codec.render import threads
+    from pd4dgs_codec import threads
 
     threads.configure()
     from pd4dgs_codec.render import projection

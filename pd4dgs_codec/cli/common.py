@@ -9,16 +9,15 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import math
 import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NoReturn, TypeVar
+from typing import Any, NoReturn, TextIO
 
+from pd4dgs_codec.cli.values import count, positive_int
 from pd4dgs_codec.errors import DecodeError, EncodeError, Pd4Error
 from pd4dgs_codec.jsonable import finite
-
-T = TypeVar("T")
+from pd4dgs_codec.threads import configure
 
 OK, FAILED, USAGE, PARTIAL = 0, 1, 2, 3
 
@@ -34,10 +33,6 @@ SOURCE is one of
   synthetic:local    the same, and small parts move on their own
   synthetic:fast     quick motion
   (synthetic:NAME?seed=n gives another scene of that kind)"""
-
-
-#: How sizes of layers are named.
-LAYER_NAMES = {"L0": 0, "L1": 1, "L2": 2}
 
 
 class UsageError(Exception):
@@ -61,6 +56,10 @@ class Parser(argparse.ArgumentParser):
     def error(self, message: str) -> NoReturn:
         raise UsageError(message)
 
+    def print_help(self, file: object = None) -> NoReturn:
+        """Prints the help on stdout and ends the program: with 0, or with 1 if stdout does not take it."""
+        self.exit(tell(self.prog, self.format_help().rstrip("\n")))
+
     def add_common(self, *, json_file: bool = False) -> None:
         """The options that every command has. json_file: --json may name a file; args.json is then its name, or "-"."""
         group = self.add_argument_group("common options")
@@ -77,12 +76,20 @@ class Parser(argparse.ArgumentParser):
         group.add_argument("-f", "--overwrite", action="store_true", help="replace an output that exists")
 
 
+def add_reading(options: argparse._ActionsContainer, *, defaults: bool = True) -> None:
+    """How a dataset is read: --downscale and --holdout. defaults: False for None where an option is not given."""
+    add, (downscale, holdout) = options.add_argument, (1, 8) if defaults else (None, None)
+    what = "use images 1/K as wide and high (default: 1)"
+    add("--downscale", type=positive_int, default=downscale, metavar="K", help=what)
+    what = "without split files, hold out frames with i %% K == K/2 (default: 8; 0: none)"
+    add("--holdout", type=count, default=holdout, metavar="K", help=what)
+
+
 class _Version(argparse.Action):
     """Prints the release and the format version; a plain "version" action would import the codec for every --help."""
 
     def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
-        print(version_line(parser.prog))
-        parser.exit()
+        parser.exit(tell(parser.prog, version_line(parser.prog)))
 
 
 def version_line(prog: str) -> str:
@@ -90,83 +97,6 @@ def version_line(prog: str) -> str:
     from pd4dgs_codec import FORMAT_VERSION, __version__
 
     return f"{prog} {__version__}, format {FORMAT_VERSION}"
-
-
-# -- option types ------------------------------------------------------------------------------------------------------
-
-
-def positive_int(text: str) -> int:
-    """An integer >= 1."""
-    return _checked(text, int, lambda value: value >= 1, "an integer >= 1")
-
-
-def count(text: str) -> int:
-    """An integer >= 0."""
-    return _checked(text, int, lambda value: value >= 0, "an integer >= 0")
-
-
-def seed(text: str) -> int:
-    """An integer that torch's generators take, as does the next one."""
-    return _checked(text, int, lambda value: 0 <= value <= 2**63 - 2, "an integer from 0 to 2^63 - 2")
-
-
-def positive_float(text: str) -> float:
-    """A finite number > 0."""
-    return _checked(text, float, lambda value: 0 < value < math.inf, "a number > 0")
-
-
-def non_negative_float(text: str) -> float:
-    """A finite number >= 0."""
-    return _checked(text, float, lambda value: 0 <= value < math.inf, "a number >= 0")
-
-
-def finite_float(text: str) -> float:
-    """A finite number."""
-    return _checked(text, float, math.isfinite, "a number")
-
-
-def _checked(text: str, kind: Callable[[str], T], accept: Callable[[T], bool], expected: str) -> T:
-    with contextlib.suppress(ValueError):
-        if accept(value := kind(text)):
-            return value
-    raise argparse.ArgumentTypeError(f"found {text!r}, expected {expected}")
-
-
-def rate(text: str) -> float:
-    """A link rate in bits per second with k, M or G for 1e3, 1e6, 1e9: "2M" -> 2e6."""
-    return _scaled(text, {"k": 1e3, "M": 1e6, "G": 1e9}, "a rate in bits per second such as 2M or 500k")
-
-
-def rates(text: str) -> dict[str, float]:
-    """Comma-separated link rates: "2M,10M" -> {"2M": 2e6, "10M": 1e7}."""
-    return {name: rate(name) for name in text.split(",")}
-
-
-def duration(text: str) -> float:
-    """Seconds: "50ms", "1.5s" or "1.5"."""
-    return _scaled(text, {"ms": 1e-3, "s": 1.0}, "a time such as 50ms or 1.5s", low=0.0)
-
-
-def layer_sizes(text: str) -> dict[int, int]:
-    """Bytes by layer with k, M for 1e3, 1e6: "L0=425k,L1=80000" -> {0: 425000, 1: 80000}."""
-    expected = "sizes in bytes such as L0=425k,L1=120000"
-    sizes: dict[int, int] = {}
-    for part in text.split(","):
-        name, _, size = part.partition("=")
-        if name not in LAYER_NAMES or LAYER_NAMES[name] in sizes:
-            raise argparse.ArgumentTypeError(f"found {text!r}, expected {expected}, each layer once")
-        sizes[LAYER_NAMES[name]] = int(_scaled(size, {"k": 1e3, "M": 1e6}, expected, low=1.0))
-    return sizes
-
-
-def _scaled(text: str, units: dict[str, float], expected: str, low: float = math.ulp(0.0)) -> float:
-    """A finite number >= low times its unit."""
-    unit = next((unit for unit in units if text.endswith(unit)), "")
-    with contextlib.suppress(ValueError):
-        value = float(text.removesuffix(unit)) * units.get(unit, 1.0)
-        if low <= value < math.inf:
-            return value
-    raise argparse.ArgumentTypeError(f"found {text!r}, expected {expected}")
 
 
 # -- talking to the caller ---------------------------------------------------------------------------------------------
@@ -180,7 +110,7 @@ class Console:
 
     def message(self, text: str) -> None:
         """A line for the person at the terminal."""
-        print(text, file=sys.stderr, flush=True)
+        say(text)
 
     def detail(self, text: str) -> None:
         """A line shown with -v only."""
@@ -195,6 +125,26 @@ class Console:
             print(text, flush=True)
         else:
             self.message(text)
+
+
+def say(text: str) -> None:
+    """A line on stderr. One that is full or gone takes nothing more, and the work goes on without its words."""
+    try:
+        print(text, file=sys.stderr, flush=True)
+    except OSError:
+        _point_at_nothing(sys.stderr)
+
+
+def tell(prog: str, text: str) -> int:
+    """Prints all there is to say on stdout; returns the exit code."""
+    try:
+        print(text, flush=True)
+    except OSError as error:
+        if not isinstance(error, BrokenPipeError):
+            say(f"{prog}: error: stdout: {error.strerror}")
+        _point_at_nothing(sys.stdout)
+        return FAILED
+    return OK
 
 
 def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
@@ -221,19 +171,21 @@ Action = Callable[[argparse.Namespace, Console], int]
 
 def run(parser: Parser, action: Action, argv: Sequence[str] | None) -> int:
     """Parses, acts, and turns every failure into one line on stderr and an exit code."""
+    open_streams()
     arguments = list(sys.argv[1:] if argv is None else argv)
     as_json, verbose = "--json" in arguments, not {"-v", "--verbose"}.isdisjoint(arguments)
     name = ""
     try:
         args = parser.parse_args(arguments)
         name = getattr(args, "input", "")
+        configure(getattr(args, "threads", None))  # before numpy, torch and numba are imported
         code = action(args, Console(args))
         sys.stdout.flush()
         return code
     except UsageError as error:
         return _fail(parser, error, f"{error}; see {parser.prog} --help", as_json, USAGE)
     except BrokenPipeError:  # the reader went away, as `| head` does
-        _close_stdout()
+        _point_at_nothing(sys.stdout)
         return FAILED
     except (Exception, KeyboardInterrupt) as error:
         message = _explain(error, "stdin" if name == "-" else name)
@@ -264,7 +216,7 @@ def _explain(error: BaseException, name: str) -> str | None:
 
 def _fail(parser: Parser, error: BaseException, message: str, as_json: bool, code: int = FAILED) -> int:
     line = " ".join(message.split())
-    print(f"{parser.prog}: error: {line}", file=sys.stderr, flush=True)
+    say(f"{parser.prog}: error: {line}")
     if as_json:
         content: dict[str, Any] = {"type": type(error).__name__, "message": line}
         if isinstance(error, DecodeError) and error.offset is not None:
@@ -274,20 +226,30 @@ def _fail(parser: Parser, error: BaseException, message: str, as_json: bool, cod
     try:
         sys.stdout.flush()
     except OSError:
-        _close_stdout()
+        _point_at_nothing(sys.stdout)
     return code
 
 
-def _close_stdout() -> None:
-    """Points stdout at nothing, so that the interpreter's own flush at exit cannot fail a second time."""
+def open_streams() -> None:
+    """Opens what the caller closed of descriptors 0 to 2, so that no file of ours takes their numbers.
+
+    A closed stdin is empty, writing to a closed stdout is an error as it is of a full one, and a closed stderr takes
+    every word and keeps none.
+    """
+    for descriptor, flags in ((0, os.O_RDONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
+        try:
+            os.fstat(descriptor)
+        except OSError:
+            os.open(os.devnull, flags)  # takes the lowest free number, which is this one
+    if sys.stdout is None:
+        sys.stdout = open(1, "w", encoding="utf-8", closefd=False)  # noqa: SIM115 - it lives as long as the process
+    if sys.stderr is None:
+        sys.stderr = open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115 - likewise
+
+
+def _point_at_nothing(stream: TextIO) -> None:
+    """So that the interpreter's own flush at exit cannot fail a second time."""
     with contextlib.suppress(OSError, ValueError):
         nothing = os.open(os.devnull, os.O_WRONLY)
-        os.dup2(nothing, sys.stdout.fileno())
+        os.dup2(nothing, stream.fileno())
         os.close(nothing)
-
-
-def use_threads(args: argparse.Namespace) -> None:
-    """Settles the number of threads; call it before the first import of torch or numba."""
-    from pd4dgs_codec.render.threads import configure
-
-    configure(args.threads)

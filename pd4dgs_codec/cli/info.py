@@ -6,17 +6,20 @@ import argparse
 from collections.abc import Sequence
 from typing import Any
 
-from pd4dgs_codec.cli.common import OK, Console, Parser, number, rates, run, table
+from pd4dgs_codec.cli import values
+from pd4dgs_codec.cli.common import OK, Console, Parser, number, run, table
 from pd4dgs_codec.cli.files import STDIO, read_bytes
+from pd4dgs_codec.errors import DataError
 
 DETAILS = """\
 Times to the first frame are 8 * (bytes up to the end of layer 0) / rate: the network alone, no latency.
-Of a URL (http, https) only the header is fetched, unless --check or --hashes need everything.
+Of a URL (http, https) only the header is fetched, unless --check, --bytes or --hashes need everything.
 Error bounds are the encoder's word on how far a decoded value lies at most from the one given to it. What they would
 be after rounding to the nearest symbol follows from the file, and --check compares: the errors themselves do not.
 
 examples:
   pd4dgs-info scene.pd4
+  pd4dgs-info scene.pd4 --bytes
   pd4dgs-info scene.pd4 --check --at 500k,2M,50M --json
   pd4dgs-info http://127.0.0.1:8000/scene.pd4"""
 
@@ -29,14 +32,10 @@ def parser() -> Parser:
     p = Parser("info", "FILE", "Show the header and the layers of a .pd4 file.", DETAILS)
     p.add_argument("input", metavar="FILE", help=".pd4 file or its URL; - reads stdin")
     p.add_argument("--check", action="store_true", help="decode everything, so that every checksum and rule is tested")
+    p.add_argument("--bytes", action="store_true", help="show where the bytes are: sections by layer")
     p.add_argument("--hashes", action="store_true", help="SHA-256 per layer of its integers and of its float32 tensors")
-    p.add_argument(
-        "--at",
-        type=rates,
-        default="2M,10M,50M",
-        metavar="RATES",
-        help="link rates in bits per second for the first-frame times (default: 2M,10M,50M)",
-    )
+    what = "link rates in bits per second for the first-frame times (default: 2M,10M,50M)"
+    p.add_argument("--at", type=values.rates, default="2M,10M,50M", metavar="RATES", help=what)
     p.add_common()
     return p
 
@@ -54,6 +53,8 @@ def _info(args: argparse.Namespace, console: Console) -> int:
     end = result["layers"][0]["end"]
     result["first_frame_seconds"] = {name: 8 * end / rate for name, rate in args.at.items()}
     result["left_out"] = _left_out(result["layers"])
+    if args.bytes:
+        result["parts"] = _parts(result)
     if args.check:
         result["nearest_bounds"] = nearest_bounds(data)
         result["checked"] = True
@@ -67,20 +68,52 @@ def _info(args: argparse.Namespace, console: Console) -> int:
 
 def _input(args: argparse.Namespace, console: Console) -> tuple[bytes, int]:
     """(bytes, length of the file): all of it, or of a URL the header alone where that suffices."""
-    from pd4dgs_codec.delivery.transfer import Transfer, is_url
+    from pd4dgs_codec.delivery.urls import is_url
 
     if not is_url(args.input):
         data = read_bytes(args.input)
         return data, len(data)
     from pd4dgs_codec.delivery.prefix import fetch, fetch_header
+    from pd4dgs_codec.delivery.transfer import Transfer
 
     transfer = Transfer(args.input)
     try:
-        data = fetch(transfer) if args.check or args.hashes else fetch_header(transfer)
+        data = fetch(transfer) if args.check or args.bytes or args.hashes else fetch_header(transfer)
     finally:
         transfer.close()
     console.detail(f"fetched {len(transfer.data):,} bytes in {transfer.requests} requests")
     return data, len(data) if transfer.total is None else transfer.total
+
+
+def _parts(result: dict[str, Any]) -> list[dict[str, Any]]:
+    """Where the bytes of a file are: a row for each kind of section and for all else, with the bytes of each layer. The
+    header counts with layer 0, chunks that are no layers with none."""
+    layers = result["layers"]
+    missing = [row["layer"] for row in layers if "sections" not in row]
+    if missing:
+        raise DataError(
+            f"{result['input']}: layer {missing[0]} is not all there; expected a whole file to tell its parts"
+        )
+    names = dict.fromkeys(name for row in layers for name in row["sections"])
+    parts = [{"part": name, "layers": [row["sections"].get(name, 0) for row in layers]} for name in names]
+    frames = [row["bytes"] - sum(row["sections"].values()) for row in layers]
+    frames[0] += result["header_bytes"]
+    parts.append({"part": "header, frames, parameters", "layers": frames})
+    for row in parts:
+        row["bytes"] = sum(row["layers"])
+    other = sum(chunk["bytes"] for chunk in result["chunks"])
+    if other:
+        parts.append({"part": "other chunks", "layers": [0] * len(layers), "bytes": other})
+    return parts
+
+
+def _parts_table(result: dict[str, Any]) -> str:
+    heads = ("part", *(f"layer {row['layer']}" for row in result["layers"]), "all", "share")
+    rows = [
+        (row["part"], *(number(size, 0) for size in row["layers"]), number(row["bytes"], 0), row["bytes"])
+        for row in result["parts"]
+    ]
+    return table(heads, [(*row[:-1], f"{100 * row[-1] / result['bytes']:.1f} %") for row in rows])
 
 
 def _left_out(layers: list[dict[str, Any]]) -> list[dict[str, str]]:
@@ -102,6 +135,17 @@ def _left_out(layers: list[dict[str, Any]]) -> list[dict[str, str]]:
 
 def _left_out_line(left_out: list[dict[str, str]]) -> list[str]:
     return [f"left out: {', '.join(row['what'] for row in left_out)} ({left_out[0]['why']})"] if left_out else []
+
+
+def _about_lines(metadata: dict[str, Any] | None) -> list[str]:
+    if metadata is None:
+        return []
+    texts = [f"{name}: {value}" for name, value in metadata.items() if isinstance(value, str) and name != "fault"]
+    quality = ", ".join(f"level {level} {db:.2f} dB" for level, db in metadata.get("quality", {}).items())
+    lines = [*texts, *([f"quality on held-out views: {quality}"] if quality else [])]
+    if "still_bytes" in metadata:
+        lines.append(f"still picture: {metadata['still_bytes']:,} bytes")
+    return [*lines, *([f"metadata cannot be read: {metadata['fault']}"] if "fault" in metadata else [])]
 
 
 def _bound_lines(declared: dict[str, float], nearest: dict[str, float]) -> list[str]:
@@ -130,10 +174,13 @@ def _text(result: dict[str, Any]) -> str:
                 for row in result["layers"]
             ],
         ),
+        *_about_lines(result["metadata"]),
         *_left_out_line(result["left_out"]),
         "errors at most: " + ", ".join(f"{what} {bound:.4g}" for what, bound in result["error_bounds"].items()),
         "first frame: " + ", ".join(f"{s:.2f} s at {rate}bps" for rate, s in result["first_frame_seconds"].items()),
     ]
+    if "parts" in result:
+        lines.append(_parts_table(result))
     if result.get("checked"):
         lines.append("checked: every layer decodes")
         lines += _bound_lines(result["error_bounds"], result["nearest_bounds"])

@@ -8,6 +8,8 @@ import time
 from collections.abc import Callable, Iterator
 from typing import TYPE_CHECKING, Any
 
+from pd4dgs_codec.cli.common import say
+
 if TYPE_CHECKING:
     from pd4dgs_codec.train.loop import Trainer
 
@@ -35,7 +37,7 @@ def progress_bar(total: int | None, unit: str, label: str) -> Iterator[Callable[
         done += 1
         if time.monotonic() - told > LINE_SECONDS:
             told = time.monotonic()
-            print(f"{label}: {done}{f' of {total}' if total else ''} {unit}", file=sys.stderr, flush=True)
+            say(f"{label}: {done}{f' of {total}' if total else ''} {unit}")
 
     yield count_one
 
@@ -56,8 +58,7 @@ class TrainingProgress:
         elif "held_out_psnr" in record:
             steps = f"step {trainer.iteration}" if trainer.timed else f"step {trainer.iteration}/{trainer.total}"
             limit = f" of {trainer.config.max_seconds:g}" if trainer.timed else ""
-            where = f"{steps}, {trainer.seconds:.0f}{limit} s"
-            print(f"{where}: {psnr} dB, {record['anchors']} anchors", file=self.stream, flush=True)
+            say(f"{steps}, {trainer.seconds:.0f}{limit} s: {psnr} dB, {record['anchors']} anchors")
 
     def close(self) -> None:
         """Takes the bar away."""

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.cli.files import write_bytes
 from pd4dgs_codec.errors import TrainError
-from pd4dgs_codec.train.config import ABLATIONS, BEFORE
+from pd4dgs_codec.train.config import ABLATIONS, BEFORE, at_quality
 
 if TYPE_CHECKING:
     from pd4dgs_codec.train.config import TrainConfig
@@ -36,6 +36,10 @@ def stored_config(args: argparse.Namespace) -> TrainConfig:
         asked = getattr(args, name)
         if asked is not None:
             _expect_same(args.resume, f"--{name.replace('_', '-')}", getattr(config, name), asked)
+    if args.quality is not None:
+        for name, value in at_quality(args.quality).items():
+            if getattr(args, name, None) is None and name not in ablated(args):
+                _expect_same(args.resume, f"{name}, as --quality has it,", getattr(config, name), value)
     for part in args.without:
         if any(getattr(config, name) != value for name, value in ABLATIONS[part].items()):
             raise TrainError(f"{args.resume}: was not trained --without {part}; expected the same to resume")

@@ -9,21 +9,17 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.atomic import remove_leftovers
+from pd4dgs_codec.cli import values
 from pd4dgs_codec.cli.common import (
     OK,
     SOURCES,
     Console,
     Parser,
     UsageError,
-    count,
-    non_negative_float,
+    add_reading,
     number,
-    positive_float,
-    positive_int,
     run,
-    seed,
     table,
-    use_threads,
 )
 from pd4dgs_codec.cli.files import STDIO, check_output
 from pd4dgs_codec.cli.progress import TrainingProgress
@@ -43,8 +39,9 @@ on from. A second Ctrl-C ends it at once, and what was trained since the last sa
 --rollout: adaptive draws a level, the higher ones more often the more the layers differ; uniform draws all alike; fixed
 draws them with chances of .15, .30, .55; top trains the highest level alone; all trains every level in every step, at
 about thrice the cost. Before a tenth of the run it is level 0 in any case.
---without: rate, the bit-rate term; binary and smooth, the two mask terms; tmc, both of them; noise, the imitation of
-quantisation; judge, which leaves out levels that gain too little on training views kept back until then.
+--without: rate, the bit-rate terms; planes, that of the planes alone; binary and smooth, the two mask terms; tmc, both
+of them; noise, the imitation of quantisation; judge, which leaves out levels that gain too little on training views
+kept back until then.
 
 {SOURCES}
 
@@ -60,47 +57,29 @@ def parser() -> Parser:
     p.add_argument("source", metavar="SOURCE", help="dataset to train on, see below")
     p.add_argument("-o", "--output", required=True, metavar="FILE.pt", help="checkpoint to write")
     p.add_argument("--preset", choices=("tiny", "small", "paper"), help="model size (default: small)")
-    p.add_argument(
-        "--iterations",
-        type=positive_int,
-        metavar="N",
-        help="training steps (default: by preset, unless --max-seconds is given)",
-    )
-    p.add_argument(
-        "--max-seconds", type=positive_float, metavar="S", help="time to train; on --resume earlier time counts too"
-    )
-    p.add_argument(
-        "--downscale", type=positive_int, metavar="K", help="train on images 1/K as wide and high (default: 1)"
-    )
-    p.add_argument(
-        "--holdout",
-        type=count,
-        metavar="K",
-        help="without split files, hold out frames with i %% K == K/2 (default: 8; 0: none)",
-    )
-    p.add_argument("--seed", type=seed, metavar="N", help="seed of all that is random in training (default: 0)")
+    what = "training steps (default: by preset, unless --max-seconds is given)"
+    p.add_argument("--iterations", type=values.positive_int, metavar="N", help=what)
+    what = "time to train; on --resume earlier time counts too"
+    p.add_argument("--max-seconds", type=values.positive_float, metavar="S", help=what)
+    add_reading(p, defaults=False)
+    p.add_argument("--seed", type=values.seed, metavar="N", help="seed of all that is random in training (default: 0)")
     p.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to train (default: auto)")
     p.add_argument("--resume", metavar="FILE.pt", help="go on from this checkpoint, with the settings stored in it")
     p.add_argument("--log", metavar="FILE.jsonl", help="write one JSON object per step")
-    p.add_argument(
-        "--rate-scale",
-        type=non_negative_float,
-        metavar="X",
-        help="weight of the bit rate against quality (default: 0.1; 1: the paper's)",
-    )
+    what = "0 (small) to 100 (good): weights of the bit rates, pruning and steps at once (default: 50)"
+    p.add_argument("--quality", type=values.non_negative_float, metavar="Q", help=what)
+    what = "weight of the anchors' bit rate against quality, instead of the quality's (at 50: 0.1; 1: the paper's)"
+    p.add_argument("--rate-scale", type=values.non_negative_float, metavar="X", help=what)
     p.add_argument(
         "--prune",
-        type=non_negative_float,
+        type=values.non_negative_float,
         metavar="X",
-        help="half way, take out anchors whose absence adds at most this share to the squared error (default: 0.01; 0: "
-        "none)",
+        help="half way, take out anchors whose absence adds at most this share to the squared error, instead of the "
+        "quality's (at 50: 0.05; 0: none)",
     )
     p.add_argument("--max-layer", type=int, choices=(0, 1, 2), help="train without the layers above this one")
-    p.add_argument(
-        "--rollout",
-        choices=ROLLOUTS,
-        help="which level each step trains, see below (default: adaptive)",
-    )
+    what = "which level each step trains, see below (default: adaptive)"
+    p.add_argument("--rollout", choices=ROLLOUTS, help=what)
     p.add_argument(
         "--without",
         action="append",
@@ -130,7 +109,6 @@ def _train(args: argparse.Namespace, console: Console) -> int:
     check_output(args.output, args.overwrite or resuming_in_place)
     if args.log:
         check_output(args.log, args.overwrite or args.resume is not None)
-    use_threads(args)
     from pd4dgs_codec.data.dataset import load
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.train.loop import Trainer
@@ -162,15 +140,21 @@ def _train(args: argparse.Namespace, console: Console) -> int:
         trainer.run(Path(args.output), log=Path(args.log) if args.log else None, progress=TrainingProgress())
     except KeyboardInterrupt:
         raise TrainError("interrupted twice; what was trained since the last save is lost") from None
+    if trainer.iteration and trainer.learner.skipped == trainer.iteration:
+        raise TrainError(
+            f"{args.output}: nothing was learnt: in all {trainer.iteration} steps the loss or its gradient was not "
+            "finite; expected views and a scene of ordinary size"
+        )
     result = _summary(args, trainer)
     console.result(result, _text(result), on_stdout=False)
     return OK
 
 
 def _fresh_config(args: argparse.Namespace) -> TrainConfig:
-    from pd4dgs_codec.train.config import TrainConfig
+    from pd4dgs_codec.train.config import TrainConfig, at_quality
 
-    named = {name: getattr(args, name) for name in (*FIXED, "max_seconds") if getattr(args, name) is not None}
+    dial = {} if args.quality is None else at_quality(args.quality)
+    named = dial | {name: getattr(args, name) for name in (*FIXED, "max_seconds") if getattr(args, name) is not None}
     return TrainConfig(source=args.source, **named | ablated(args))
 
 

@@ -12,15 +12,14 @@ from pd4dgs_codec.scene import Scene
 
 
 class LayerReader:
-    """Walks a file's chunks in order. It holds no bytes but the header's: every call gets all that has arrived."""
+    """Walks a file's chunks in order. It holds no bytes: every call gets all that has arrived."""
 
     def __init__(self) -> None:
         self.header: Header | None = None
         self.layers: list[LayerSymbols] = []
         self.offset = 0  #: of the next chunk
         self._index = 0
-        self._packed_header = b""
-        self._scene_id: bytes | None = None
+        self._scene_id = b""
 
     @property
     def complete(self) -> bool:
@@ -41,7 +40,7 @@ class LayerReader:
         if self.header is None:
             preamble = read_preamble(data)
             self.header, self.offset = unpack_header(preamble.header, offset=PREAMBLE_SIZE), preamble.size
-            self._packed_header = preamble.header
+            self._scene_id = scene_id_of(preamble.header)
         chunks = self.header.chunks
         while self._index < len(chunks):
             if max_layer is not None and not _any_layer(chunks[self._index :], max_layer):
@@ -68,12 +67,6 @@ class LayerReader:
         if kind is not None and chunk.ancillary:
             message = f"layer {kind.layer} is flagged ancillary, expected a critical chunk"
             raise Malformed(message, offset=self.offset, chunk=self._index)
-        if self._scene_id is None:
-            self._scene_id = scene_id_of(self._packed_header, chunk.payload)
-            if chunk.scene_id != self._scene_id:
-                expected = f"{self._scene_id.hex()} from the header and the layer-0 payload"
-                message = f"scene id {chunk.scene_id.hex()}, expected {expected}"
-                raise Malformed(message, offset=self.offset + 8, chunk=self._index)
         layer = None
         if kind is not None:
             rows_before = sum(len(layer.anchor_q) for layer in self.layers)

@@ -45,7 +45,7 @@ ROWS, SECTIONS, STEPS, SCALES, NETWORKS = range(1, 6)
 #: constant channels cannot make a decoder allocate without end. Real scenes spend over 0.1 bit per symbol.
 FREE_SYMBOLS = 1 << 22
 SYMBOLS_PER_BYTE = 2048
-#: An anchor's position takes some 25 us to decode and may cost next to nothing; real anchors take tens of bytes.
+#: An anchor may cost next to nothing and its position takes up to 42 symbols; real anchors take tens of bytes.
 FREE_ROWS = 1 << 13
 ROWS_PER_BYTE = 2
 

@@ -16,7 +16,7 @@ import numpy as np
 from pd4dgs_codec.attributes import planes as decorrelation
 from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
 from pd4dgs_codec.attributes.table import N_CHANNELS
-from pd4dgs_codec.bitstream.limits import MAX_PARAMETERS, MAX_VOXEL
+from pd4dgs_codec.bitstream.limits import MAX_PARAMETERS
 from pd4dgs_codec.codec.attribute_section import read_attributes, write_attributes
 from pd4dgs_codec.codec.kinds import LayerKind
 from pd4dgs_codec.codec.layer_meta import LayerMeta, ScaleMeta, Section, check_symbol_count, pack_meta, unpack_meta
@@ -53,7 +53,7 @@ class StreamReport:
 def write_layer(symbols: LayerSymbols, options: EncodeOptions) -> tuple[bytes, list[StreamReport]]:
     """(payload, what each section took; the first report is the positions'). Inverse: read_layer."""
     groups, predictors = channel_groups(symbols)
-    positions = encode_positions(symbols.anchor_q) if len(symbols.anchor_q) else b""
+    positions = encode_positions(symbols.anchor_q, options.effort)
     sections = {Section.POSITIONS: positions}
     reports = [StreamReport("positions", 8 * len(positions), 0.0, symbols.anchor_q.size)]
     if options.mode == "lzma":
@@ -164,7 +164,7 @@ def read_layer(
         raise Malformed(f"layer {kind.layer}: section {min(parts)} is there, but nothing is left for it to code")
     anchor_q = channels[Section.POSITIONS][0]
     increase, own = channels[Section.MASKS]
-    _check_ranges(kind, anchor_q, increase, own)
+    _check_ranges(kind, increase, own)
     planes, networks = _shape_tensors(meta, tensors)
     attributes = np.stack(channels[Section.ATTRIBUTES])
     for tensor in (attributes, *tensors):
@@ -199,8 +199,7 @@ def _decode_groups(
 ) -> dict[Section, list[np.ndarray]]:
     rows = counts[Section.MASKS][1]
     data = _part(parts, Section.POSITIONS, rows)
-    empty = np.zeros((0, 3), np.int32)
-    channels: dict[Section, list[np.ndarray]] = {Section.POSITIONS: [decode_positions(data, rows) if rows else empty]}
+    channels: dict[Section, list[np.ndarray]] = {Section.POSITIONS: [decode_positions(data, rows)]}
     if mode == "lzma":
         flat = [count for section in GROUPS for count in counts[section]]
         data = _part(parts, Section.SYMBOLS, sum(flat))
@@ -245,9 +244,7 @@ def _shape_tensors(meta: LayerMeta, tensors: list[np.ndarray]) -> tuple[Planes, 
     return planes, networks
 
 
-def _check_ranges(kind: LayerKind, anchor_q: np.ndarray, increase: np.ndarray, own: np.ndarray) -> None:
-    if anchor_q.size and max(int(anchor_q.max()), -int(anchor_q.min())) > MAX_VOXEL:
-        raise Malformed(f"layer {kind.layer}: a voxel index over {MAX_VOXEL} in magnitude")
+def _check_ranges(kind: LayerKind, increase: np.ndarray, own: np.ndarray) -> None:
     for name, codes, low in (("rise of a mask code", increase, 0), ("mask code", own, MASK_MIN_CODE)):
         if codes.size and not (low <= codes.min() and codes.max() <= 255):
             found = f"{int(codes.min())}..{int(codes.max())}"

@@ -12,8 +12,9 @@ from itertools import accumulate
 
 import numpy as np
 
-from pd4dgs_codec.entropy.bits import entropy_bits
+from pd4dgs_codec.entropy.bits import entropy_bits, gaussian_bits
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
+from pd4dgs_codec.entropy.fitting import split_bits
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint
 from pd4dgs_codec.errors import Malformed
 
@@ -21,7 +22,7 @@ from pd4dgs_codec.errors import Malformed
 PLAIN, STAGED = 0, 1
 MAX_CLASSES = 8
 #: Encoder: numbers of classes to try, and about what each further prior costs.
-CLASS_COUNTS = (1, 3, 5, 8)
+CLASS_COUNTS = (1, 2, 3, 4, 5, 6, 8)
 PRIOR_BITS = 40
 
 
@@ -51,8 +52,9 @@ def cheapest_class_count(groups: Sequence[tuple[np.ndarray, np.ndarray]]) -> int
     for count in CLASS_COUNTS:
         bits = 0.0
         for residuals, activity in groups:
-            for places in places_of(activity_classes(activity, count), count):
-                bits += sum(entropy_bits(channel[places]) + PRIOR_BITS for channel in residuals)
+            bits += split_bits(residuals, activity_classes(activity, count), count) + PRIOR_BITS * count * len(
+                residuals
+            )
         costs.append((bits, count))
     return min(costs)[1]
 
@@ -64,11 +66,13 @@ def smaller_form(
 
     The form is plain with priors "gauss", the model of R(a), at effort 1, and without `staged`.
     """
-    plain = encode_channels(channels, priors=priors, effort=effort)
-    data = bytes([PLAIN]) + plain.payload
+    data = list[bytes]()
     if staged is not None and priors == "best" and effort > 1:
-        data = min(data, staged(), key=len)
-    return data, plain.rate_bits
+        data.append(staged())
+        if 8 * (len(data[0]) - 1) <= sum(entropy_bits(channel) for channel in channels):  # plain cannot be shorter
+            return data[0], sum(gaussian_bits(channel) for channel in channels)
+    plain = encode_channels(channels, priors=priors, effort=effort)
+    return min([bytes([PLAIN]) + plain.payload, *data], key=len), plain.rate_bits
 
 
 def put_stages(out: bytearray, stages: Sequence[Sequence[np.ndarray]], effort: int) -> None:

@@ -2,26 +2,34 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.errors import DataError, one_line
 
 if TYPE_CHECKING:
     from PIL.Image import Image as Picture
 
 IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 WHITE = 255
-LARGEST = float(np.finfo(np.float64).max)
+#: Of lengths in scene units and in pixels: their products and squares stay far from the end of binary32.
+LARGEST = 1e9
+#: Pillow's names of pixels; of the others (CMYK, LAB, floats …) no conversion is the only right one.
+GREY16_MODES = {"I;16", "I;16L", "I;16B"}
+READABLE_MODES = {"1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX"} | GREY16_MODES
+ORIENTATION, UPRIGHT = 0x0112, 1  #: the EXIF flag, and its value for pixels stored as they are seen
+GAMMA = (0.40, 0.51)  #: exponents that PNG files give for sRGB: 1/2.2 and what encoders round it to
 
 
 def read_json(path: Path) -> dict[str, Any]:
     """The JSON object in `path`."""
     try:
-        value = json.loads(path.read_text(encoding="utf-8"))
+        value = json.loads(read_file(path).decode("utf-8"))
     except FileNotFoundError:
         raise DataError(f"{path}: missing, expected a JSON file") from None
     except json.JSONDecodeError as e:
@@ -33,26 +41,42 @@ def read_json(path: Path) -> dict[str, Any]:
     return value
 
 
-def number(value: Any, where: str, *, positive: bool = False) -> float:
-    """`value` as a finite float (greater than zero if `positive`)."""
-    expected = "a finite number" + (" > 0" if positive else "")
+def read_file(path: Path) -> bytes:
+    """All of a regular file; DataError for a pipe or a device, whose end may never come, OSError or ValueError else."""
+    if path.exists() and not path.is_file():
+        raise DataError(f"{path}: is not a regular file")
+    return path.read_bytes()
+
+
+def number(value: Any, where: str, *, positive: bool = False, largest: float = LARGEST) -> float:
+    """`value` as a float of at most `largest` in magnitude (greater than zero if `positive`)."""
+    expected = "a number" + (" > 0" if positive else "")
     if isinstance(value, bool) or not isinstance(value, (int, float)):
-        raise DataError(f"{where} is {value!r}, expected {expected}")
-    if not abs(value) <= LARGEST or (positive and value <= 0):  # also true of NaN and of integers beyond any float
-        raise DataError(f"{where} is {str(value)[:24]}, expected {expected}")
+        raise DataError(f"{where} is {one_line(repr(value), 60)}, expected {expected}")
+    if not abs(value) <= largest or (positive and value <= 0):  # also true of NaN and of integers beyond any float
+        raise DataError(f"{where} is {one_line(str(value), 24)}, expected {expected} and at most {largest:g}")
     return float(value)
 
 
+def whole_number(value: Any, where: str, low: int = 0) -> int:
+    """`value` as an integer >= low; 2.0 is one."""
+    result = number(value, where)
+    if result != int(result) or result < low:
+        raise DataError(f"{where} is {result:g}, expected a whole number >= {low}")
+    return int(result)
+
+
 def array(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
-    """`value` as a finite float64 array of the given shape."""
+    """`value` as a float64 array of the given shape, its numbers at most LARGEST in magnitude."""
     try:
         result = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):
         raise DataError(f"{where} is not a numeric array, expected shape {shape}") from None
     if result.shape != shape:
         raise DataError(f"{where} has shape {result.shape}, expected {shape}")
-    if not np.isfinite(result).all():
-        raise DataError(f"{where} holds NaN or infinity, expected finite numbers")
+    if not (np.abs(result) <= LARGEST).all():  # also true of NaN
+        found = "NaN" if np.isnan(result).any() else f"{float(np.abs(result).max()):g}"
+        raise DataError(f"{where} holds {found}, expected numbers of at most {LARGEST:g} in magnitude")
     return result
 
 
@@ -60,8 +84,9 @@ def find_image(folder: Path, name: str) -> Path:
     """The image file of a `file_path` written with or without its extension."""
     for suffix in IMAGE_SUFFIXES:
         path = folder / (name + suffix)
-        if path.is_file():
-            return path
+        with contextlib.suppress(OSError):  # a name too long for the system
+            if path.is_file():
+                return path
     raise DataError(f"{folder / name}: image is missing (tried as it is, .png, .jpg and .jpeg)")
 
 
@@ -75,7 +100,7 @@ def _open(path: Path, what: str = "image", size: tuple[int, int] | None = None) 
         picture = Image.open(path)
     except FileNotFoundError:
         raise DataError(f"{path}: image is missing") from None
-    except (UnidentifiedImageError, OSError, Image.DecompressionBombError):
+    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, Image.DecompressionBombError):
         raise DataError(f"{path}: not an image that can be read") from None
     if size is not None and picture.size != tuple(size):
         picture.close()
@@ -93,10 +118,56 @@ def _has_alpha(image: Picture) -> bool:
     return "A" in image.getbands() or "transparency" in image.info
 
 
-def _rgb(image: Picture, *, composite: bool) -> Picture:
-    """The picture in mode RGB: alpha composited on white, or dropped."""
+def _check_readable(image: Picture, where: str) -> None:
+    """Refuses by name what would not be shown as its maker saw it."""
+    found = None
+    frames = getattr(image, "n_frames", 1)
+    if frames > 1:
+        found = f"holds {frames} pictures, expected one"
+    elif image.mode not in READABLE_MODES:
+        found = f"has pixels of kind {image.mode}, expected grey of 8 or 16 bits, a palette, RGB or RGBA"
+    elif image.mode in GREY16_MODES and _has_alpha(image):
+        found = "has 16-bit grey with a transparent value, expected 8 bits or an alpha channel"
+    elif image.getexif().get(ORIENTATION, UPRIGHT) != UPRIGHT:  # some tools turn such pictures and others do not
+        flag = image.getexif()[ORIENTATION]
+        found = f"is stored turned (orientation flag {flag}), expected upright pixels that fit the camera"
+    elif not GAMMA[0] <= image.info.get("gamma", GAMMA[0]) <= GAMMA[1]:
+        found = f"has a gamma of {image.info['gamma']:g}, expected that of sRGB (0.455)"
+    if found:
+        raise DataError(f"{where}: {found}")
+
+
+def _srgb(image: Picture, where: str) -> Picture:
+    """The picture with its colour profile, if it names one, applied."""
+    profile = image.info.get("icc_profile")
+    if not profile:
+        return image
+    from PIL import ImageCms
+
+    try:
+        source = ImageCms.ImageCmsProfile(io.BytesIO(profile))
+        name = ImageCms.getProfileDescription(source).strip()
+        if "sRGB" in name:
+            return image
+        mode = image.mode if image.mode in ("L", "RGB", "RGBA") else "RGBA" if _has_alpha(image) else "RGB"
+        target = "RGB" if mode == "L" else mode
+        turned = ImageCms.profileToProfile(
+            image.convert(mode), source, ImageCms.createProfile("sRGB"), outputMode=target
+        )
+    except (ImageCms.PyCMSError, OSError, ValueError) as e:
+        raise DataError(f"{where}: its colour profile cannot be used: {e}") from None
+    assert turned is not None  # None is for changes in place
+    return turned
+
+
+def _rgb(image: Picture, where: str, *, composite: bool) -> Picture:
+    """The picture in mode RGB and in sRGB: alpha composited on white, or dropped."""
     from PIL import Image
 
+    _check_readable(image, where)
+    if image.mode in GREY16_MODES:  # Pillow itself would clip to 255
+        image = Image.fromarray(((np.asarray(image).astype(np.uint32) * 255 + 32_767) // 65_535).astype(np.uint8))
+    image = _srgb(image, where)
     if composite and _has_alpha(image):
         image = image.convert("RGBA")
         image = Image.alpha_composite(Image.new("RGBA", image.size, (WHITE,) * 4), image)
@@ -111,7 +182,7 @@ def read_image(path: Path, size: tuple[int, int], *, downscale: int = 1, composi
     with _open(path, "image", size) as image:
         check_downscale(size, downscale, str(path))
         try:
-            rgb = _rgb(image, composite=composite)
+            rgb = _rgb(image, str(path), composite=composite)
         except (OSError, SyntaxError, ValueError) as e:
             raise DataError(f"{path}: image data is broken: {e}") from None
         if downscale > 1:

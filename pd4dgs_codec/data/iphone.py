@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.data.cameras import (
+    LARGEST_TIME,
     Lens,
     UnreadView,
     cameras_box,
@@ -21,7 +22,7 @@ from pd4dgs_codec.data.cameras import (
     seconds_range,
     world_to_camera,
 )
-from pd4dgs_codec.data.files import array, number, read_json, read_mask
+from pd4dgs_codec.data.files import LARGEST, array, number, read_json, read_mask, whole_number
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DataError
 
@@ -101,26 +102,22 @@ def _extra(folder: Path) -> tuple[dict[str, Any], int]:
     if not path.is_file():
         return {}, 1 if (folder / "rgb" / "1x").is_dir() and not (folder / "rgb" / "2x").is_dir() else 2
     extra = read_json(path)
-    factor = number(extra.get("factor", 1), f"{path}: factor", positive=True)
-    if factor != int(factor):
-        raise DataError(f"{path}: factor is {factor}, expected an integer")
-    return extra, int(factor)
+    return extra, whole_number(extra.get("factor", 1), f"{path}: factor", low=1)
 
 
 def _points(folder: Path, center: np.ndarray, scale: float) -> np.ndarray | None:
     path = folder / "points.npy"
     if not path.is_file():
         return None
-    try:
-        points = np.load(path, allow_pickle=False)
-    except (OSError, ValueError, EOFError):
+    try:  # mapped, so that a header which promises more than the file holds is refused before anything is allocated
+        points = np.load(path, allow_pickle=False, mmap_mode="r")
+    except Exception:  # numpy parses the header as Python and lets errors of many kinds out
         raise DataError(f"{path}: not a .npy file of numbers") from None
     if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind != "f":
         found = f"{points.dtype} {points.shape}" if isinstance(points, np.ndarray) else "an archive"
         raise DataError(f"{path}: found {found}, expected floats [M, 3]")
-    points = ((points.astype(np.float64) - center) * scale).astype(np.float32)
-    points = points[np.isfinite(points).all(axis=1)]
-    return points if len(points) else None
+    points = (points[(np.abs(points) <= LARGEST).all(axis=1)].astype(np.float64) - center) * scale  # without NaN, too
+    return points.astype(np.float32) if len(points) else None
 
 
 def read_cameras(folder: str | Path) -> CameraFiles:
@@ -136,10 +133,10 @@ def read_cameras(folder: str | Path) -> CameraFiles:
         entry = metadata.get(name)
         if not isinstance(entry, dict):
             raise DataError(f"{path}: no entry for frame {name!r}, which the split lists")
-        time = number(entry.get("warp_id", entry.get("time_id")), f"{path}: {name}: warp_id")
+        time = number(entry.get("warp_id", entry.get("time_id")), f"{path}: {name}: warp_id", largest=LARGEST_TIME)
         lens, rotation, position = read_camera(folder / "camera" / f"{name}.json", factor)
         viewmat = world_to_camera(rotation, (position - center) * scale)
-        camera_id = int(number(entry.get("camera_id", 0), f"{path}: {name}: camera_id"))
+        camera_id = whole_number(entry.get("camera_id", 0), f"{path}: {name}: camera_id")
         return UnreadView(name, camera_id, time, viewmat, lens, folder / "rgb" / f"{factor}x" / f"{name}.png")
 
     train, test = (tuple(frame(name) for name in names) for names in _split_names(folder))

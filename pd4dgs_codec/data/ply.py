@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pd4dgs_codec.data.files import LARGEST, read_file
 from pd4dgs_codec.errors import DataError
 
 SCALARS = {
@@ -14,6 +15,7 @@ SCALARS = {
     "double": "<f8", "float64": "<f8",
 }  # fmt: skip
 END = b"end_header"
+DIGITS = 12  #: of a count; Python itself refuses to read thousands
 
 
 def _header(path: Path, raw: bytes) -> tuple[str, int, list[tuple[str, str]], int]:
@@ -29,7 +31,7 @@ def _header(path: Path, raw: bytes) -> tuple[str, int, list[tuple[str, str]], in
             kind = words[1]
         elif words[:1] == ["element"] and len(words) == 3:
             elements += 1
-            if elements == 1 and words[1] == "vertex" and words[2].isdigit():
+            if elements == 1 and words[1] == "vertex" and words[2].isdigit() and len(words[2]) <= DIGITS:
                 count = int(words[2])
         elif words[:1] == ["property"] and elements == 1:
             if len(words) != 3 or words[1] not in SCALARS:
@@ -65,18 +67,21 @@ def _body(path: Path, raw: bytes, kind: str, count: int, dtype: np.dtype) -> np.
 
 
 def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Points float32 [M, 3] and colours uint8 [M, 3] (None if absent); points that are not finite are dropped."""
+    """Points float32 [M, 3] and colours uint8 [M, 3] (None if absent).
+
+    Points with a coordinate that is not finite or over LARGEST are dropped.
+    """
     try:
-        raw = path.read_bytes()
-    except OSError as e:
-        raise DataError(f"{path}: cannot be read: {e.strerror}") from None
+        raw = read_file(path)
+    except (OSError, ValueError) as e:  # ValueError: a NUL or half a surrogate in the name
+        raise DataError(f"{path}: cannot be read: {getattr(e, 'strerror', e)}") from None
     kind, count, fields, start = _header(path, raw)
     names = [name for name, _ in fields]
     if len(set(names)) != len(names) or not {"x", "y", "z"} <= set(names):
         raise DataError(f"{path}: vertex properties are {', '.join(names)}, expected x, y, z once each")
     vertices = _body(path, raw[start:], kind, count, np.dtype(fields))
-    points = np.stack([vertices[c] for c in "xyz"], axis=1).astype(np.float32)
-    keep = np.isfinite(points).all(axis=1)
+    points = np.stack([vertices[c] for c in "xyz"], axis=1)
+    keep = (np.abs(points) <= LARGEST).all(axis=1)  # also false of NaN
     has_color = all((c, "u1") in fields for c in ("red", "green", "blue"))
     colors = np.stack([vertices[c] for c in ("red", "green", "blue")], axis=1)[keep] if has_color else None
-    return points[keep], colors
+    return points[keep].astype(np.float32), colors

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.data.cameras import (
+    LARGEST_TIME,
+    ROTATION_TOLERANCE,
     Lens,
     UnreadView,
     cameras_box,
@@ -21,7 +23,7 @@ from pd4dgs_codec.data.cameras import (
     seconds_range,
     world_to_camera,
 )
-from pd4dgs_codec.data.files import array, find_image, image_info, number, read_json
+from pd4dgs_codec.data.files import array, find_image, image_info, number, read_json, whole_number
 from pd4dgs_codec.data.ply import read_ply
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DataError
@@ -56,7 +58,9 @@ def _focal(get: Callable[[str], Any], axis: str, size: int, where: str) -> float
     angle = number(angle, f"{where}: camera_angle_{axis}", positive=True)
     if angle >= np.pi:
         raise DataError(f"{where}: camera_angle_{axis} is {angle}, expected radians below pi")
-    return float(0.5 * size / np.tan(0.5 * angle))
+    return number(
+        float(0.5 * size / np.tan(0.5 * angle)), f"{where}: the focal length by camera_angle_{axis}", positive=True
+    )
 
 
 def _lens(file: dict[str, Any], frame: dict[str, Any], image: Path, where: str) -> Lens:
@@ -71,7 +75,7 @@ def _lens(file: dict[str, Any], frame: dict[str, Any], image: Path, where: str) 
     if get("w") is None or get("h") is None:
         width, height, _ = image_info(image)
     else:
-        width, height = (int(number(get(k), f"{where}: {k}", positive=True)) for k in ("w", "h"))
+        width, height = (whole_number(get(k), f"{where}: {k}", low=1) for k in ("w", "h"))
     model = get("camera_model")
     if (model is not None and model not in PINHOLE_MODELS) or value("k4"):
         raise DataError(f"{where}: camera_model {model!r} (k4 {value('k4'):g}) is not supported, expected a pinhole")
@@ -90,6 +94,8 @@ def _viewmat(matrix: Any, where: str) -> np.ndarray:
     """float64 [4, 4] world to camera, OpenCV, from an OpenGL camera-to-world matrix 4x4 or 3x4."""
     rows = 3 if isinstance(matrix, list) and len(matrix) == 3 else 4
     pose = array(matrix, (rows, 4), where)
+    if rows == 4 and not np.allclose(pose[3], (0, 0, 0, 1), atol=ROTATION_TOLERANCE):
+        raise DataError(f"{where} ends with the row {pose[3].tolist()}, expected 0 0 0 1")
     check_rotation(pose[:3, :3], where)
     return world_to_camera(OPENGL_TO_OPENCV @ pose[:3, :3].T, pose[:3, 3])
 
@@ -107,7 +113,11 @@ def _frames(folder: Path, path: Path) -> tuple[list[UnreadView], dict[str, Any]]
             raise DataError(f"{where} has no file_path, expected an object with file_path and transform_matrix")
         viewmat = _viewmat(frame.get("transform_matrix"), f"{where}: transform_matrix")
         image = find_image(folder, frame["file_path"])
-        time = i / max(len(listed) - 1, 1) if frame.get("time") is None else number(frame["time"], f"{where}: time")
+        time = (
+            i / max(len(listed) - 1, 1)
+            if frame.get("time") is None
+            else number(frame["time"], f"{where}: time", largest=LARGEST_TIME)
+        )
         frames.append(UnreadView(image.stem, 0, time, viewmat, _lens(file, frame, image, where), image))
     return frames, file
 

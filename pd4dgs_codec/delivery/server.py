@@ -21,6 +21,7 @@ from typing import BinaryIO
 from urllib.parse import quote, unquote, urlsplit
 
 from pd4dgs_codec.delivery.link import Link
+from pd4dgs_codec.delivery.patience import Patient
 from pd4dgs_codec.delivery.ranges import Unsatisfiable, http_time, lists_etag, requested_range
 from pd4dgs_codec.errors import DeliveryError
 
@@ -47,7 +48,7 @@ PREFLIGHT = {
     "Access-Control-Allow-Headers": "Range, If-Range, If-None-Match, If-Modified-Since",
     "Access-Control-Max-Age": "86400",
 }
-#: After which a silent or stuck client is let go.
+#: Within which a client must have sent its next request, all of it, and taken each block of the answer.
 IDLE_SECONDS = 60.0
 
 
@@ -138,7 +139,13 @@ class _Handler(BaseHTTPRequestHandler):
 
     def setup(self) -> None:
         super().setup()
+        self._patient = Patient(self.connection)
+        self.rfile = self._patient.makefile()
         time.sleep(self.server.latency)
+
+    def handle_one_request(self) -> None:
+        self._patient.until = time.monotonic() + IDLE_SECONDS
+        super().handle_one_request()
 
     def do_GET(self) -> None:
         self._answer(body=True)
@@ -223,6 +230,11 @@ class _Handler(BaseHTTPRequestHandler):
         self._begin(status, {**(headers or {}), **kind})
         if self.command != "HEAD":
             self.wfile.write(text)
+
+    def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
+        """Called for what is no request: answered like any other refusal, whatever version it spoke."""
+        self.request_version, self.close_connection = self.protocol_version, True
+        self._fail(HTTPStatus(code))
 
     def _begin(self, status: HTTPStatus, headers: dict[str, str]) -> None:
         time.sleep(self.server.latency)

@@ -8,15 +8,20 @@ from __future__ import annotations
 
 import http.client
 import math
+import queue
 import socket
 import ssl
+import threading
 import time
 from dataclasses import dataclass
 from http import HTTPStatus
+from typing import Any
 from urllib.parse import quote, urljoin, urlsplit
 
+from pd4dgs_codec.delivery.patience import Patient
 from pd4dgs_codec.delivery.ranges import content_range, strong_etag
-from pd4dgs_codec.errors import DeliveryError
+from pd4dgs_codec.delivery.urls import is_url
+from pd4dgs_codec.errors import DeliveryError, one_line
 
 BLOCK = 1 << 16
 MAX_REDIRECTS = 5
@@ -25,6 +30,8 @@ MAX_CHANGES = 4
 BACKOFF_SECONDS = 0.2
 #: Answers that may be another one a moment later; other errors are final.
 PASSING = {408, 425, 429, 500, 502, 503, 504}
+#: Of what a server says, at most so many characters are shown.
+SHOWN = 80
 REDIRECTS = {301, 302, 303, 307, 308}
 
 
@@ -38,11 +45,6 @@ class OutOfTime(Exception):
 
 class _Cut(Exception):
     """The connection ended before what it promised, or an answer makes no sense; asking again may help."""
-
-
-def is_url(name: str) -> bool:
-    """Whether an input names a remote file."""
-    return name.lower().startswith(("http://", "https://"))
 
 
 @dataclass(frozen=True)
@@ -71,9 +73,10 @@ class _Place:
 class Transfer:
     """Fetches one URL front to back, as far as asked, and goes on after cuts.
 
-    data: what has arrived, from byte 0. total: length of the file, None until told. stall: seconds without a byte
-    after which a connection counts as cut. attempts: failures in a row, without a byte between them, before giving up.
-    requests, cuts, changes: how often each happened.
+    data: what has arrived, from byte 0. total: length of the file, None until told. stall: seconds within which a
+    connection must stand, an answer's whole header be here, and the next block of its body; else it counts as cut.
+    attempts: failures in a row, without a byte between them, before giving up. requests, cuts, changes: how often each
+    happened.
     """
 
     def __init__(self, url: str, *, stall: float = 10.0, attempts: int = 5):
@@ -84,7 +87,7 @@ class Transfer:
         self._home = self._place = _Place.of(url)
         self._validator: str | None = None
         self._connection: http.client.HTTPConnection | None = None
-        self._socket: socket.socket | None = None
+        self._socket: Patient | None = None  # http.client forgets it once an answer is the last
         self._response: http.client.HTTPResponse | None = None
         self._response_end: int | None = None  # of the part in the answer being read; None: not told
         self._skip = 0  # bytes of the answer that are here already
@@ -184,7 +187,12 @@ class Transfer:
             if place is None:
                 raise DeliveryError(f"{self.url}: a redirect that leads nowhere")
             here = f"http{'s' if self._place.secure else ''}://{_netloc(self._place)}{self._place.target}"
-            self._place = _Place.of(urljoin(here, place))
+            try:
+                self._place = _Place.of(urljoin(here, place))
+            except ValueError:
+                raise DeliveryError(
+                    f"{self.url}: a redirect to {one_line(place, SHOWN)!r}, which is no address"
+                ) from None
         else:
             raise DeliveryError(f"{self.url}: more than {MAX_REDIRECTS} redirects")
         self._response = response
@@ -195,21 +203,17 @@ class Transfer:
             kind = http.client.HTTPSConnection if self._place.secure else http.client.HTTPConnection
             self._connection = kind(self._place.host, self._place.port)
         if self._connection.sock is None:  # new, or closed by the server after its last answer
-            self._connection.timeout = max(1e-3, min(self.stall, until - time.monotonic()))
-            self._connection.connect()
-            self._socket = self._connection.sock
+            self._socket = Patient(_connect(self._place, min(until, time.monotonic() + self.stall)))
+            self._connection.sock = self._socket
         self._wait_at_most(until)
         self.requests += 1
         self._connection.request("GET", self._place.target, headers=headers)
         return self._connection.getresponse()
 
     def _wait_at_most(self, until: float) -> None:
-        """No operation of the socket outlasts the stall limit or the time that is left."""
-        left = until - time.monotonic()
-        if left <= 0:
-            raise _Cut("out of time")
+        """All that is read or written next must be done within the stall limit and before `until`."""
         assert self._socket is not None
-        self._socket.settimeout(min(self.stall, left))
+        self._socket.until = min(until, time.monotonic() + self.stall)
 
     def _accept(self, response: http.client.HTTPResponse, start: int, asked_range: bool) -> None:
         """Takes an answer for bytes from `start` on; raises Changed where it is about another file than before."""
@@ -221,22 +225,22 @@ class Transfer:
                 return
             self._restart()  # the file has become shorter than what is here
         if status not in (HTTPStatus.OK, HTTPStatus.PARTIAL_CONTENT):
-            said = f"the server answers {status} {response.reason}"
+            said = f"the server answers {status} {one_line(response.reason, SHOWN)}".rstrip()
             if status in PASSING:
                 raise _Cut(said)
             self.close()
             raise DeliveryError(f"{self.url}: {said}")
         if response.headers.get("Content-Encoding", "identity").lower() != "identity":
             self.close()
-            raise DeliveryError(
-                f"{self.url}: sent as {response.headers['Content-Encoding']}, expected the bytes as such"
-            )
+            coding = one_line(response.headers["Content-Encoding"], SHOWN)
+            raise DeliveryError(f"{self.url}: sent as {coding}, expected the bytes as such")
         tag = strong_etag(response.headers.get("ETag"))
         validator = tag or response.headers.get("Last-Modified")
         if status == HTTPStatus.PARTIAL_CONTENT:
             if not asked_range or part is None or part.start != start or part.total is None:
                 raise _Cut(
-                    f"found Content-Range {response.headers.get('Content-Range')!r}, expected bytes from {start}"
+                    f"found Content-Range {one_line(response.headers.get('Content-Range') or 'none', SHOWN)}, "
+                    f"expected bytes from {start}"
                 )
             other = start and validator is not None and validator != self._validator
             if other or (start and part.total != self.total):
@@ -276,4 +280,46 @@ def _reason(error: BaseException) -> str:
         return "no byte arrived for too long"
     if isinstance(error, OSError):
         return error.strerror or str(error)
-    return str(error) or type(error).__name__
+    if isinstance(error, _Cut):
+        return str(error)
+    return f"not an HTTP answer: {one_line(str(error), SHOWN)}".rstrip(": ")
+
+
+def _connect(place: _Place, until: float) -> socket.socket:
+    """A connection that stands before `until`, TLS included; OSError."""
+    found: queue.Queue[list[Any] | OSError] = queue.Queue()
+
+    def resolve() -> None:
+        try:
+            port = place.port or (443 if place.secure else 80)
+            found.put(socket.getaddrinfo(place.host, port, type=socket.SOCK_STREAM))
+        except (OSError, UnicodeError) as error:  # a label too long for a name is a UnicodeError
+            found.put(error if isinstance(error, OSError) else OSError(f"{place.host} is no name of a host"))
+
+    threading.Thread(target=resolve, daemon=True).start()  # the system's resolver takes no time limit
+    try:
+        addresses = found.get(timeout=max(0.0, until - time.monotonic()))
+    except queue.Empty:
+        raise TimeoutError from None
+    if isinstance(addresses, OSError):
+        raise addresses
+    failure: OSError = TimeoutError()
+    for family, kind, protocol, _, address in addresses:
+        left = until - time.monotonic()
+        if left <= 0:
+            raise TimeoutError
+        connection = socket.socket(family, kind, protocol)
+        try:
+            connection.settimeout(left)
+            connection.connect(address)
+            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+            if place.secure:
+                connection.settimeout(max(1e-3, until - time.monotonic()))
+                return ssl.create_default_context().wrap_socket(connection, server_hostname=place.host)
+            return connection
+        except OSError as error:
+            connection.close()
+            if isinstance(error, ssl.SSLError):
+                raise
+            failure = error
+    raise failure

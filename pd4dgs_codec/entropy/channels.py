@@ -16,8 +16,8 @@ import numpy as np
 
 from pd4dgs_codec.entropy import EFFORTS, PRIORS
 from pd4dgs_codec.entropy.ans import MAX_COUNT, AnsDecoder, ans_encode
-from pd4dgs_codec.entropy.bits import gaussian_bits
-from pd4dgs_codec.entropy.fitting import fit_best, histogram
+from pd4dgs_codec.entropy.bits import BIT
+from pd4dgs_codec.entropy.fitting import Fitted, fit_best, histogram
 from pd4dgs_codec.entropy.priors import (
     CONST,
     FIRST_REUSE,
@@ -30,7 +30,7 @@ from pd4dgs_codec.entropy.priors import (
     read_prior,
     write_prior,
 )
-from pd4dgs_codec.entropy.sharing import plan_priors
+from pd4dgs_codec.entropy.sharing import Fit, plan_priors
 from pd4dgs_codec.entropy.tables import uniform_table
 from pd4dgs_codec.entropy.varint import VARINT_MAX, ByteReader, put_varint
 from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
@@ -75,19 +75,22 @@ def encode_channels(channels: Sequence[np.ndarray], *, priors: str = "best", eff
         raise EncodeError(f"expected priors best or gauss and effort 1..9, found {priors!r} and {effort}")
     arrays = check_channels(channels)
     histograms = [histogram(a) for a in arrays if len(a)]
-    rounds = 0 if effort < 3 else effort // 2
-    payload, prior_ids = _encode(arrays, plan_priors(histograms, lambda h: h.gauss, rounds))
-    if priors == "best":
-        other = _encode(arrays, plan_priors(histograms, lambda h: fit_best(h, effort), rounds))
+    rounds = 0 if effort < 3 else (effort + 1) // 2
+    richer = priors == "best" and effort > 1
+    fit: Fit = (lambda h: fit_best(h, effort)) if richer else (lambda h: h.gauss)
+    payload, prior_ids = _encode(arrays, plan_priors(histograms, fit, rounds))
+    least = sum(h.gauss.own for h in histograms) / BIT  # of Gaussians, but for what is estimated of exceptions
+    if richer and least < 1.005 * 8 * len(payload) + 256:
+        other = _encode(arrays, plan_priors(histograms, lambda h: h.gauss, rounds))
         if len(other[0]) < len(payload):
             payload, prior_ids = other
-    return CodedChannels(payload, 8 * len(payload), sum(gaussian_bits(a) for a in arrays), prior_ids)
+    return CodedChannels(payload, 8 * len(payload), sum(h.rate_bits for h in histograms), prior_ids)
 
 
-def _encode(arrays: Sequence[np.ndarray], plan: Sequence[Prior]) -> tuple[bytes, list[int]]:
+def _encode(arrays: Sequence[np.ndarray], plan: Sequence[Fitted]) -> tuple[bytes, list[int]]:
     out, defined, prior_ids = bytearray(), list[Prior](), []
     symbols, cums = list[np.ndarray](), list[np.ndarray]()
-    remaining = iter(plan)
+    remaining = (fitted.prior for fitted in plan)
     for array in arrays:
         if len(array) == 0:
             prior_ids.append(CONST)

@@ -245,13 +245,3 @@ def read_prior(reader: ByteReader, family: int) -> Prior:
     if family not in _FAMILIES:
         raise UnsupportedFeature(f"prior {family} is not in the registry {sorted(_FAMILIES)}", offset=reader.offset)
     return _FAMILIES[family].read(reader, shift)
-
-
-def header_bits(prior: Prior) -> float:
-    """Bits of the prior's own description: its bytes, and a histogram's classes."""
-    out = bytearray()
-    write_prior(out, prior)
-    bits = 8.0 * len(out)
-    if isinstance(prior, Hist):
-        bits += float((24 - np.log2(np.diff(prior.class_cum)))[prior.class_symbols].sum())
-    return bits

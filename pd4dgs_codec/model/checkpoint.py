@@ -1,15 +1,17 @@
 """Checkpoints: versioned, self-describing, and loaded with `weights_only=True`, so that a file cannot run code.
 
-A checkpoint is a dict {"format", "version", "scene": {info, steps, sizes}, "state": tensors, "training": {...}}.
+A checkpoint is a dict {"format", "version", "digest", "info", "steps", "deformations", "state": tensors, "training"}.
 Shapes are read from the tensors; nothing needs the configuration that made the model. "training" holds what resuming
-needs and may be empty.
+needs and may be empty. "digest" is that of all the others, for torch reads damaged archives without a word.
 """
 
 from __future__ import annotations
 
+import hashlib
 import io
 import os
 import pickle
+import zipfile
 from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -55,6 +57,7 @@ def save(path: str | Path, model: Model, training: dict[str, Any] | None = None)
         "state": {name: tensor.detach().cpu() for name, tensor in model.state_dict().items()},
         "training": training or {},
     }
+    content["digest"] = _digest(content)
     buffer = io.BytesIO()  # of a disk that fills, torch would say "unexpected pos" and nothing more
     try:
         torch.save(content, buffer)
@@ -87,8 +90,9 @@ def load(path: str | Path) -> tuple[Model, dict[str, Any]]:
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise DataError(f"{path}: not a {FORMAT}; found {_describe(content)}")
     version = content.get("version")
-    if not isinstance(version, int) or version != VERSION:
+    if type(version) is not int or version != VERSION:  # True is an int too, and equal to 1
         raise DataError(f"{path}: {FORMAT} version {version!r}, expected {VERSION}")
+    _refuse_damaged(path, content)
     try:
         _refuse_not_finite(content["state"])
         return _build(content), dict(content["training"])
@@ -104,6 +108,47 @@ def _begins_as_torch_files(path: str | Path | BinaryIO) -> bool:
     with open(path, "rb") if isinstance(path, (str, Path)) else nullcontext(path) as stream:
         stream.seek(0)
         return stream.read(2).startswith((b"PK", b"\x80"))
+
+
+def _digest(content: dict[str, Any]) -> str:
+    """SHA-256, in hexadecimal, of a content but its "digest": nested dicts, lists and tuples of tensors and scalars."""
+    hasher = hashlib.sha256()
+
+    def walk(value: Any) -> None:
+        if isinstance(value, torch.Tensor):
+            array = value.detach().cpu().contiguous().numpy()
+            hasher.update(f"tensor {array.dtype.str} {array.shape} ".encode())
+            hasher.update(array.data if array.size else b"")
+        elif isinstance(value, dict):
+            hasher.update(f"dict {len(value)} ".encode())
+            for key, item in value.items():
+                walk(key)
+                walk(item)
+        elif isinstance(value, (list, tuple)):
+            hasher.update(f"{type(value).__name__} {len(value)} ".encode())
+            for item in value:
+                walk(item)
+        else:
+            text = repr(value).encode()
+            hasher.update(f"{type(value).__name__} {len(text)} ".encode() + text)
+
+    walk({key: item for key, item in content.items() if key != "digest"})
+    return hasher.hexdigest()
+
+
+def _refuse_damaged(path: str | Path | BinaryIO, content: dict[str, Any]) -> None:
+    """By the digest; a file from before there was one, by the check sums of its archive."""
+    if "digest" in content:
+        if content["digest"] != _digest(content):
+            raise DataError(f"{path}: damaged: its digest is not that of its content")
+        return
+    try:
+        with zipfile.ZipFile(path) as archive:
+            damaged = archive.testzip()
+    except (zipfile.BadZipFile, NotImplementedError, OSError, RuntimeError, EOFError, ValueError):
+        raise DataError(f"{path}: damaged: expected a whole zip archive") from None
+    if damaged is not None:
+        raise DataError(f"{path}: damaged: the check sum of {damaged!r} in its archive is wrong")
 
 
 def _refuse_not_finite(state: dict[str, torch.Tensor]) -> None:

@@ -19,6 +19,11 @@ class DeformationConfig:
     heads: tuple[str, ...]
 
 
+#: Of the presets. The planes' rate makes planes so flat that coarse steps cost them nothing. 1, where time planes
+#: start, is a multiple of both.
+STEPS = Steps(planes_global=0.2, planes_local=1 / 3)
+
+
 @dataclass(frozen=True)
 class ModelConfig:
     """Both deformations (None: the level adds none) and how many anchors training starts from and stays below."""
@@ -28,7 +33,7 @@ class ModelConfig:
     hidden: int = 32
     initial_anchors: int = 20_000
     max_anchors: int = 40_000
-    steps: Steps = Steps()
+    steps: Steps = STEPS
 
     @property
     def level(self) -> int:
@@ -55,6 +60,5 @@ PRESETS: dict[str, ModelConfig] = {
         DeformationConfig(64, 100, 16, (1, 2), 64, _LOCAL),
         initial_anchors=26_000,
         max_anchors=50_000,
-        steps=Steps(planes_local=0.3),  # twice the cells: coarser, for the same bytes
     ),
 }

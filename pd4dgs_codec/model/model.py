@@ -24,7 +24,7 @@ from pd4dgs_codec.model.masks import level_mask
 from pd4dgs_codec.model.mlp import MLP
 from pd4dgs_codec.model.rounding import EXACT, Rounding, round_straight_through
 from pd4dgs_codec.model.slots import assemble, slot_linear
-from pd4dgs_codec.render.projection import ALPHA_MIN
+from pd4dgs_codec.model.visibility import FRUSTUM_MARGIN, MIN_OPACITY, OFFSET_REACH, SIGMA_REACH
 from pd4dgs_codec.scene import (
     FEATURE_DIM,
     GLOBAL_HEADS,
@@ -37,19 +37,9 @@ from pd4dgs_codec.scene import (
     Steps,
 )
 
-#: A Gaussian fainter than the rasteriser's threshold never reaches a pixel, so its networks are not evaluated.
-MIN_OPACITY = ALPHA_MIN
 #: Opacities of an anchor's ten Gaussians start spread between these: some are seen everywhere, and not all are, since
 #: they start at one place.
 START_OPACITY = (-0.1, 0.2)
-#: How far an anchor's Gaussians are taken to lie from it, in its largest extent: in trained scenes one anchor in 7,000
-#: has one farther away.
-OFFSET_REACH = 2.0
-#: How far a Gaussian of opacity 1 reaches, in its largest standard deviation: to where alpha is ALPHA_MIN, at
-#: sqrt(2 ln 255) = 3.3290.
-SIGMA_REACH = 3.33
-#: Anchors farther outside the image than this share of its size (plus what their Gaussians reach) are not evaluated.
-FRUSTUM_MARGIN = 0.15
 
 
 @dataclass

@@ -11,11 +11,10 @@ from torch import Tensor
 
 from pd4dgs_codec.model.model import Gaussians, Model, camera_tensors
 from pd4dgs_codec.model.rounding import EXACT, Rounding
+from pd4dgs_codec.model.visibility import LEAST_NEAR
 from pd4dgs_codec.render.autograd.rasterization import rasterization
+from pd4dgs_codec.render.checks import check_time
 from pd4dgs_codec.scene import Camera, SceneInfo
-
-#: Nearer than this nothing is drawn, whatever a scene says, scene units: the rasteriser divides by depths.
-LEAST_NEAR = 1e-6
 
 
 @dataclass
@@ -30,6 +29,7 @@ class Picture:
 
 def render(model: Model, level: int, t: float, camera: Camera, rounding: Rounding = EXACT) -> Picture:
     """Render_level at normalised time t in 0..1."""
+    check_time(t)
     gaussians = model.gaussians(level, t, camera, rounding)
     if torch.is_grad_enabled():
         return draw(model.info, gaussians, camera)

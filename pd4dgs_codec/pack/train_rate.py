@@ -10,6 +10,7 @@ from pd4dgs_codec.codec.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.codec.payload import channel_groups
 from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.codec.symbols import layer_symbols
+from pd4dgs_codec.model.plane_rate import gaussian_bits
 from pd4dgs_codec.model.rate import channel_moments, rate_bits
 from pd4dgs_codec.scene import Scene
 
@@ -32,8 +33,7 @@ def train_rate_bits(scene: Scene, options: EncodeOptions = DEFAULTS) -> list[dic
         groups, _ = channel_groups(layer_symbols(planned, i))
         row = {"layer": float(layer), "attributes": attributes}
         for section in (Section.PLANES, Section.WEIGHTS):
-            channels = (torch.from_numpy(c).double()[:, None] for c in groups[section] if c.size)
-            row[section.name.lower()] = sum(_bits(channel, 1.0) for channel in channels)
+            row[section.name.lower()] = gaussian_bits(groups[section])
         result.append(row)
     return result
 

@@ -8,6 +8,8 @@ from collections.abc import Sequence
 from pd4dgs_codec.errors import NotFinite, RenderError
 
 MAX_SIDE = 65535  #: pixels
+#: Least volume of a viewmat's 3 x 3 part; that of a rotation is 1.
+LEAST_VOLUME = 1e-9
 
 Rows = Sequence[Sequence[float]]  #: a matrix
 
@@ -30,10 +32,21 @@ def check_camera(viewmat: Rows, K: Rows, width: int, height: int) -> None:
         raise RenderError("viewmats or Ks has a value that is not finite")
     if [*viewmat[3]] != [0.0, 0.0, 0.0, 1.0]:
         raise RenderError(f"the last row of a viewmat is {viewmat[3]}, expected [0, 0, 0, 1]")
+    (a, b, c), (d, e, f), (g, h, i) = (row[:3] for row in viewmat[:3])
+    if not abs(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)) >= LEAST_VOLUME:
+        raise RenderError(
+            f"a viewmat of {[list(row[:3]) for row in viewmat[:3]]} flattens the scene, expected a rotation"
+        )
     if [K[0][1], K[1][0], *K[2]] != [0.0, 0.0, 0.0, 0.0, 1.0]:
         raise RenderError(f"a matrix in Ks is {K}, expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] (no skew)")
     if not (K[0][0] > 0 and K[1][1] > 0):
         raise RenderError(f"focal lengths {K[0][0]} and {K[1][1]} in Ks, expected both positive")
+
+
+def check_time(t: float) -> None:
+    """Raises RenderError unless a normalised time is a number; beyond 0..1 a scene stands as at its ends."""
+    if not math.isfinite(t):
+        raise RenderError(f"time is {t}, expected a number from 0 to 1")
 
 
 def check_limits(near_plane: float, far_plane: float, eps2d: float, radius_clip: float) -> None:

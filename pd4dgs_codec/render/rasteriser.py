@@ -12,8 +12,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from pd4dgs_codec import threads
 from pd4dgs_codec.errors import RenderError
-from pd4dgs_codec.render import threads
 
 threads.choose_layer()  # before numba reads its environment
 import numba  # noqa: E402

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 from pd4dgs_codec.errors import TrainError
@@ -25,7 +25,8 @@ PRUNING_ROUNDS = 4
 
 #: Parts of the method that an ablation takes out, as the fields of `TrainConfig` that do so.
 ABLATIONS: dict[str, dict[str, Any]] = {
-    "rate": {"rate_scale": 0.0},
+    "rate": {"rate_scale": 0.0, "plane_rate": 0.0},
+    "planes": {"plane_rate": 0.0},
     "binary": {"tmc_binary": False},
     "smooth": {"tmc_smooth": False},
     "tmc": {"tmc_binary": False, "tmc_smooth": False},
@@ -33,8 +34,34 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "judge": {"judge": False},
 }
 
+#: What the dial moves, as (value at 50, factor from there to 0). From 100 to 50 it is the same factor, so that each is
+#: log-linear in the quality: rate_scale, plane_rate, prune and step_scale of `TrainConfig`.
+DIAL: dict[str, tuple[float, float]] = {
+    "rate_scale": (0.1, 4.0),
+    "plane_rate": (2e-8, 4.0),
+    "prune": (0.05, 4.0),
+    "step_scale": (1.0, 1.6),
+}
+
+#: The steps that `step_scale` multiplies. Offsets and weights cost more quality per byte than any of these.
+COARSENED = ("feature", "scaling_log", "planes_global", "planes_local")
+
 #: What checkpoints that lack these fields were trained with, where it is not what has become their default.
-BEFORE: dict[str, Any] = {"judge": False, "tmc_binary_growth": 1.0, "prune": 0.0, "cooldown": 0.0}
+BEFORE: dict[str, Any] = {
+    "judge": False,
+    "tmc_binary_growth": 1.0,
+    "prune": 0.0,
+    "cooldown": 0.0,
+    "plane_rate": 0.0,
+    "step_scale": 1.0,
+}
+
+
+def at_quality(quality: float) -> dict[str, float]:
+    """The fields of `TrainConfig` that a quality of 0..100 stands for: weights of the rates, pruning, steps."""
+    if not 0 <= quality <= 100:
+        raise TrainError(f"quality must be from 0 to 100, found {quality:g}")
+    return {name: middle * factor ** ((50 - quality) / 50) for name, (middle, factor) in DIAL.items()}
 
 
 @dataclass(frozen=True)
@@ -73,8 +100,9 @@ class TrainConfig:
     max_seconds: float | None = None  #: without `iterations` the whole schedule is spread over it, else it cuts the run
     seed: int = 0
     lambdas: tuple[float, float, float] = (0.04, 0.01, 0.00025)  #: rate weight per level
-    rate_scale: float = 0.1  #: multiplies every lambda; 1 is the paper's operating point
+    rate_scale: float = DIAL["rate_scale"][0]  #: multiplies every lambda; 1 is the paper's operating point
     rate_share: float = 0.05  #: share of the anchors on which a step estimates the rate
+    plane_rate: float = DIAL["plane_rate"][0]  #: weight of a bit of the planes, ramped by `Schedule.pressure`
     tmc: float = 0.01
     tmc_binary: bool = True
     #: the binary term's weight grows to so many times its start, so that masks end near 0 or 1: an anchor that stays
@@ -87,7 +115,7 @@ class TrainConfig:
     max_layer: int = 2
     judge: bool = True  #: leave out levels that gain nothing on training views not seen yet, see `judge`
     #: where growing ends, anchors leave whose absence adds this share at most to the squared error; see `pruning`
-    prune: float = 0.01
+    prune: float = DIAL["prune"][0]
     #: share of the run, at its end, over which all learning rates fall to 0 besides: else the last steps carry weights
     #: over the edges of their rounding intervals, and pictures change by tenths of a dB from one step to the next
     cooldown: float = 0.1
@@ -96,10 +124,18 @@ class TrainConfig:
     noise: bool = True  #: imitate quantisation: noise on attributes, rounding of planes and weights, at last of all
     grow_threshold: float = 2e-4
     steps: Steps | None = None  #: None: the preset's
+    step_scale: float = DIAL["step_scale"][0]  #: multiplies the steps of features, log-scalings and planes
     rates: LearningRates = field(default_factory=LearningRates)
     global_planes: PlaneWeights = PlaneWeights(1e-4, 5e-4, 5e-5)
     local_planes: PlaneWeights = PlaneWeights(2e-4, 1e-3, 1e-4)
     max_gradient_norm: float = 100.0
+
+    def model_steps(self, preset: Steps) -> Steps:
+        """The steps of a fresh model whose preset has these; `step_scale` moves those that bytes depend on and pictures
+        hardly do."""
+        steps = self.steps or preset
+        coarser = {name: getattr(steps, name) * self.step_scale for name in COARSENED}
+        return replace(steps, **coarser)
 
     def __post_init__(self) -> None:
         if self.preset not in DEFAULT_ITERATIONS:
@@ -110,6 +146,11 @@ class TrainConfig:
             raise TrainError(f"max-seconds must be positive, found {self.max_seconds}")
         if not 0 <= self.seed <= 2**63 - 2:  # the next one seeds the noise
             raise TrainError(f"seed {self.seed} is out of range; expected an integer from 0 to 2^63 - 2")
+        for name in ("rate_scale", "plane_rate"):
+            if not 0 <= getattr(self, name) < math.inf:
+                raise TrainError(f"{name} must be 0 or more and finite, found {getattr(self, name)}")
+        if not 0 < self.step_scale < math.inf:
+            raise TrainError(f"step_scale must be positive and finite, found {self.step_scale}")
         for name in ("prune", "cooldown"):
             if not 0 <= getattr(self, name) <= 1:
                 raise TrainError(f"{name} must be from 0 to 1, found {getattr(self, name)}")
@@ -193,6 +234,14 @@ class Schedule:
         if self.iterations is None:
             return 0.0
         begin, end = self.progressive, self.exact_rounding
+        return min(max((iteration - begin) / max(1, end - begin), 0.0), 1.0)
+
+    def pressure(self, iteration: int) -> float:
+        """How much of the planes' rate weighs, 0..1: it begins with the rate term and is all there where planes are
+        rounded. All of it at once empties planes before they have learnt anything."""
+        if self.iterations is None:
+            return 0.0
+        begin, end = self.progressive, self.rounding
         return min(max((iteration - begin) / max(1, end - begin), 0.0), 1.0)
 
     def phases_not_reached(self, iteration: int) -> list[str]:

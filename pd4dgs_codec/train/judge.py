@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import torch
 
+from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.train.initialise import TIED
 from pd4dgs_codec.train.optimiser import Optimiser
@@ -18,6 +19,8 @@ MIN_VIEWS = 4
 #: level: on a scene where nothing moves by 0.5 to 0.7 dB, which cameras off the path do not confirm. Where things move
 #: level 1 gains 1.4 dB and more.
 MIN_GAIN_DB = {1: 0.9, 2: 0.1}
+#: dB per megabyte of a level's planes and networks under which it goes all the same: elsewhere these bytes gain more.
+MIN_GAIN_PER_MEGABYTE = 4.0
 MIN_ITERATIONS = 500
 
 
@@ -27,16 +30,22 @@ def waiting_views(count: int, iterations: int) -> set[int]:
     return views if len(views) >= MIN_VIEWS and iterations >= MIN_ITERATIONS else set()
 
 
-def levels_without_gain(psnr: list[float]) -> list[tuple[int, float]]:
-    """(level, gain in dB over the level below) from the top down, as far as the gain is under that of MIN_GAIN_DB.
-    psnr: per level, over views that training has not seen."""
+def levels_without_gain(psnr: list[float], sizes: list[float]) -> list[tuple[int, float]]:
+    """(level, gain in dB over the level below) from the top down, as far as the gain is under that of MIN_GAIN_DB or
+    MIN_GAIN_PER_MEGABYTE. psnr: per level, over views that training has not seen. sizes: about the bytes per level of
+    its planes and networks."""
     found = []
     for level in range(len(psnr) - 1, 0, -1):
         gain = psnr[level] - psnr[level - 1]
-        if gain >= MIN_GAIN_DB[level]:
+        if gain >= max(MIN_GAIN_DB[level], MIN_GAIN_PER_MEGABYTE * sizes[level] / 1e6):
             break
         found.append((level, gain))
     return found
+
+
+def field_bytes(field: DeformationField, plane_bits: float) -> float:
+    """About what a deformation costs whose planes cost `plane_bits`: a byte for each weight besides."""
+    return plane_bits / 8 + sum(p.numel() for part in (field.trunk, field.heads) for p in part.parameters())
 
 
 def drop_level(model: Model, optimiser: Optimiser, level: int) -> None:

@@ -23,6 +23,7 @@ from pd4dgs_codec.model.config import PRESETS, ModelConfig
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.picture import Picture, render, render_image
+from pd4dgs_codec.model.plane_rate import exact_bits
 from pd4dgs_codec.model.rounding import EXACT, Noise, Rounding
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train import judge, losses, pruning
@@ -60,7 +61,9 @@ class Learner:
         self.config, self.dataset, self.schedule, self.device = config, dataset, schedule, device
         if device.type == "cuda":  # the variances of SSIM are differences of blurred images: no ten-bit factors
             torch.backends.cudnn.allow_tf32 = False
-        self.model = fresh_model(size, dataset, config.steps or size.steps, config.seed, config.max_layer).to(device)
+        self.model = fresh_model(size, dataset, config.model_steps(size.steps), config.seed, config.max_layer).to(
+            device
+        )
         self.optimiser = Optimiser(self.model, config.rates, config.cooldown)
         self.densifier = Densifier(self.model, config.grow_threshold, size.max_anchors)
         self.generator = torch.Generator().manual_seed(config.seed)
@@ -121,6 +124,13 @@ class Learner:
         """Anchors active per level 0, 1, 2."""
         with torch.no_grad():
             return [int((self.model.masks(level) > MASK_THRESHOLD).sum()) for level in range(3)]
+
+    def plane_bits(self) -> list[float]:
+        """The sum of R(a) of the planes of layers 1 and 2 as they would be coded now, in the groups of `--priors
+        gauss`; 0 where there are none."""
+        steps = self.model.steps.scaled(1.0)
+        fields = enumerate((self.model.global_deformation, self.model.local_deformation), 1)
+        return [0.0 if f is None else exact_bits(f.planes.plane_arrays(), steps.planes(i)) for i, f in fields]
 
     def level_psnr(self, views: Sequence[View]) -> list[float]:
         """Per level of the model the mean mPSNR over `views`, dB, rounded as the steps round by now, without noise."""
@@ -227,6 +237,11 @@ class Learner:
         for term, value in field.planes.regularisers().items():
             terms[f"{name}_{term}"] = value
             total = total + getattr(weights, term) * value
+        weight = self.config.plane_rate * self.schedule.pressure(self.place)
+        if weight:
+            step = self.model.steps.planes({"global": 1, "local": 2}[name])
+            terms[f"{name}_rate_proxy"] = field.planes.proxy_bits(step)
+            total = total + weight * terms[f"{name}_rate_proxy"]
         return total
 
     def _mask_terms(self, level: int, terms: dict[str, Tensor]) -> Tensor:
@@ -287,7 +302,9 @@ class Learner:
         if not waiting:
             return []
         psnr = self.level_psnr([self.dataset.train[index] for index in waiting])
-        found = judge.levels_without_gain(psnr)
+        fields = (self.model.global_deformation, self.model.local_deformation)
+        sizes = [0.0 if f is None else judge.field_bytes(f, b) for f, b in zip(fields, self.plane_bits(), strict=True)]
+        found = judge.levels_without_gain(psnr, [0.0, *sizes])
         for level, _ in found:
             judge.drop_level(self.model, self.optimiser, level)
         self.left_out = [{"level": level, "gain": gain, "views": len(waiting)} for level, gain in found]

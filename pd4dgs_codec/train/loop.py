@@ -123,6 +123,7 @@ class Trainer:
             late = self._spend(told - begun)
             if self._curve_due(place):
                 record["held_out_psnr"] = self._evaluate()
+                record["plane_bits"] = self.learner.plane_bits()
                 told, begun = time.monotonic(), told
                 self._evaluation = told - begun
                 self.seconds += self._evaluation

@@ -11,6 +11,9 @@ from pd4dgs_codec.data.view import View
 from pd4dgs_codec.errors import RenderError
 from pd4dgs_codec.scene import Camera, SceneInfo
 
+#: Of a picture that a file alone asks for; a .pd4 of a few bytes may name a camera of 65,535 x 65,535.
+MAX_PIXELS = 1 << 25
+
 
 @dataclass(frozen=True, eq=False)
 class Frame:
@@ -29,11 +32,17 @@ def dataset_frames(views: Sequence[View]) -> list[Frame]:
 def own_frames(info: SceneInfo, count: int, orbit: float = 0.0, downscale: int = 1) -> list[Frame]:
     """`count` pictures over the whole time from the file's camera, which sways `orbit` degrees around what it looks at.
 
-    Raises RenderError if the file has no camera.
+    Raises RenderError if the file has no camera, or one of pictures over MAX_PIXELS.
     """
     if info.camera is None:
         raise RenderError("the file holds no camera of its own; expected --data SOURCE to take cameras from")
     camera = shrunk(info.camera, downscale)
+    if camera.width * camera.height > MAX_PIXELS:
+        size = f"{camera.width}x{camera.height}"
+        raise RenderError(
+            f"the file's camera takes pictures of {size}, expected {MAX_PIXELS:,} pixels at most: "
+            "smaller with --downscale, or those of another camera with --data"
+        )
     times = np.linspace(0.0, 1.0, count) if count > 1 else np.zeros(1)
     centre = look_at_point(info)
     # a full sine over the sequence: it starts and ends at rest in the given camera, so that a looped video has no jump

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 from PIL import Image
-from tiny import write_views
+from tiny import TINY, write_views
 
 from pd4dgs_codec.bench import codec, pictures, render, report, timing, train
 from pd4dgs_codec.cli import bench
@@ -20,6 +20,7 @@ from pd4dgs_codec.codec.encoder import encode
 from pd4dgs_codec.codec.options import EncodeOptions
 from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.errors import DataError, Pd4Error
+from pd4dgs_codec.model.config import PRESETS
 from pd4dgs_codec.render.autograd.rasterization import rasterization
 from pd4dgs_codec.view.frames import Frame
 
@@ -222,7 +223,8 @@ def test_a_run_without_evaluations_or_records_is_refused(tmp_path):
         train.of_file(str(log))
 
 
-def test_presets_are_trained_and_compared(tmp_path, capsys):
+def test_presets_are_trained_and_compared(tmp_path, capsys, monkeypatch):
+    monkeypatch.setitem(PRESETS, "tiny", TINY)
     argv = ["train", str(write_views(tmp_path)), "--holdout", "2", "--presets", "tiny", "--iterations", "4"]
     assert bench.main([*argv, "--plot", str(tmp_path / "t.png"), "--json"]) == 0
     (run,) = json.loads(capsys.readouterr().out)["runs"]

@@ -142,10 +142,14 @@ def digest(d) -> str:
     return h.hexdigest()
 
 
-def test_content_depends_on_the_string_alone(local):
+def test_content_depends_on_the_string_alone(local, monkeypatch):
+    assert load("synthetic:local?seed=0") is local
+    monkeypatch.setattr(syn, "TRAIN_FRAMES", 6)
+    monkeypatch.setattr(syn, "TEST_INSTANTS", (2,))
+    once = syn._dataset.__wrapped__("local", 0)
     np.random.seed(5)  # noqa: NPY002 - a global seed must not matter
-    again = syn._dataset.__wrapped__("local", 0)
-    assert digest(again) == digest(local) == digest(load("synthetic:local?seed=0"))
+    assert digest(syn._dataset.__wrapped__("local", 0)) == digest(once)
+    assert digest(syn._dataset.__wrapped__("local", 1)) != digest(once)
 
 
 def test_seed_and_name_change_the_picture():

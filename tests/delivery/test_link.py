@@ -123,7 +123,9 @@ def test_the_server_sends_bodies_and_nothing_else_over_the_link(folder, monkeypa
 
 def test_latency_is_paid_by_the_connection_and_by_each_request(folder, monkeypatch):
     waits = []
-    monkeypatch.setattr(server_module, "time", SimpleNamespace(sleep=waits.append, time=time.time))
+    monkeypatch.setattr(
+        server_module, "time", SimpleNamespace(sleep=waits.append, time=time.time, monotonic=time.monotonic)
+    )
     with Server(folder, latency=0.05) as server, server.running():
         ask(server, "/bytes.bin")
         assert waits == [0.05, 0.05]

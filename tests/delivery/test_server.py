@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import os
 import socket
 import threading
 import time
 from email.utils import formatdate
+from http import HTTPStatus
 
 import pytest
 from asking import ask
@@ -228,3 +230,33 @@ def test_request_lines_cannot_act_on_the_terminal(folder):
             raw.sendall(b"GET /\x1b[31m\x9b HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
             raw.recv(65536)
     assert len(lines) == 1 and lines[0].isprintable() and "404" in lines[0]
+
+
+@pytest.mark.parametrize(
+    ("request_line", "status"),
+    [
+        ("GET / HTTP/9.9", 505),
+        ("GET / HTTP/x", 400),
+        ("nonsense", 400),
+        ("BREW / HTTP/1.1", 501),
+        ("GET " + "/" * 70_000, 414),
+    ],
+)
+def test_what_is_no_request_is_refused_like_any_other(server, request_line, status):
+    host, port = server.server_address[:2]
+    with socket.create_connection((host, port), timeout=20) as client:
+        client.sendall(f"{request_line}\r\n\r\n".encode())
+        answer = client.makefile("rb").read().decode()
+    assert answer.startswith(f"HTTP/1.1 {status} ") and "Access-Control-Allow-Origin: *" in answer
+    assert answer.endswith(f"\r\n\r\n{status} {HTTPStatus(status).phrase}\n")
+
+
+def test_a_request_that_drips_is_left(folder, monkeypatch):
+    monkeypatch.setattr("pd4dgs_codec.delivery.server.IDLE_SECONDS", 0.2)
+    with Server(folder).running() as server:
+        with socket.create_connection(server.server_address[:2], timeout=20) as client:
+            with contextlib.suppress(OSError):
+                for _ in range(1000):  # 20 s of header, a byte at a time
+                    client.sendall(b"x")
+                    time.sleep(0.02)
+                pytest.fail("the server waits for the whole of it")

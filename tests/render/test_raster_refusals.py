@@ -61,6 +61,7 @@ def test_colours_that_are_not_finite_have_an_error_of_their_own():
 
 
 CAMERAS = [
+    ("viewmats", (0, slice(0, 3), slice(0, 3)), 0.0, "flattens the scene"),
     ("viewmats", (0, 3, 0), 0.5, "last row"),
     ("viewmats", (0, 0, 0), float("nan"), "not finite"),
     ("Ks", (0, 0, 1), 0.1, "skew"),

@@ -6,7 +6,7 @@ import pytest
 import torch
 from raster_scenes import camera, scene
 
-from pd4dgs_codec.render import threads
+from pd4dgs_codec import threads
 from pd4dgs_codec.render.autograd import reference
 from pd4dgs_codec.render.autograd.rasterization import rasterization
 

@@ -10,8 +10,8 @@ import pytest
 import torch
 from raster_scenes import camera, draw_with_gradients, scene
 
+from pd4dgs_codec import threads
 from pd4dgs_codec.errors import RenderError
-from pd4dgs_codec.render import threads
 
 needs_two = pytest.mark.skipif(threads.available() < 2, reason="needs 2 CPUs")
 
@@ -78,7 +78,7 @@ def _run(code, **variables):
 
 _CHILD = """
 import sys
-from pd4dgs_codec.render import threads
+from pd4dgs_codec import threads
 assert not {"torch", "numba"} & set(sys.modules)
 threads.configure(1)
 import os, torch
@@ -99,7 +99,7 @@ def test_before_torch_in_a_new_process():
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="needs Linux to count threads")
 def test_numpy_imported_afterwards_starts_no_threads_of_its_own():
-    code = "from pd4dgs_codec.render import threads; threads.configure(1); import numpy, os; "
+    code = "from pd4dgs_codec import threads; threads.configure(1); import numpy, os; "
     code += "a = numpy.ones((900, 900)); a @ a; print(len(os.listdir('/proc/self/task')))"
     assert _run(code) == ["1"]
 

@@ -3,30 +3,21 @@
 import dataclasses
 import importlib.util
 import json
+from functools import partial
 from pathlib import Path
 
 import pytest
-from pages.paper import plots, statistics, tables
+from pages.paper import plots, runs, statistics, tables
 from pages.paper.published import FIRST_FRAME
-from pages.paper.runs import (
-    FULL,
-    MONOLITHIC,
-    SCAFFOLD,
-    Run,
-    Scene,
-    at_rate,
-    held_to,
-    measure,
-)
-from tiny import TINY
+from pages.paper.runs import FULL, MONOLITHIC, SCAFFOLD, Run, Scene, at_rate, held_to, measure
+from tiny import TINY, disc, write_views
 
-from pd4dgs_codec.data.dataset import load
-from pd4dgs_codec.data.view import Dataset
+from pd4dgs_codec.codec.options import EncodeOptions
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import PRESETS
+from pd4dgs_codec.pack import target
 from pd4dgs_codec.train.config import TrainConfig
 
-STATIC = "synthetic:static"
 TOOL = Path(__file__).resolve().parents[2] / "tools" / "paper.py"
 
 
@@ -120,26 +111,28 @@ def test_published_seconds_are_those_of_the_published_sizes():
             assert seconds == pytest.approx(8e6 * row.megabytes / rate, rel=0.01), row
 
 
-@pytest.fixture(scope="module")
-def dataset() -> Dataset:
-    """Few views of the static scene."""
-    whole = load(STATIC, downscale=4)
-    return dataclasses.replace(whole, train=whole.train[::6], test=whole.test[::10])
-
-
 @pytest.fixture
 def small(monkeypatch):
-    """The tiny preset, tinier."""
+    """The tiny preset, tinier; files packed the fast way; few sizes to try; no perceptual distances."""
+    fast = EncodeOptions(mode="lzma", effort=1)
     monkeypatch.setitem(PRESETS, "tiny", TINY)
+    monkeypatch.setattr(runs, "encode_with_report", partial(runs.encode_with_report, options=fast))
+    monkeypatch.setattr(runs, "pack", partial(runs.pack, options=fast))
+    monkeypatch.setattr(runs, "load_perceptual", lambda: None)
+    monkeypatch.setattr(target, "OCTAVES", (0.0, 2.0))
+    monkeypatch.setattr(target, "SHARES", (0.0, 0.5))
 
 
-def test_runs_are_made_once_and_again_when_settings_change(small, tmp_path, dataset):
-    scene = Scene("static", TrainConfig(preset="tiny", source=STATIC, iterations=12), 1)
+#: Of six pictures.
+DISC = Scene("disc", TrainConfig(preset="tiny", source="disc", iterations=12), 1)
+
+
+def test_runs_are_made_once_and_again_when_settings_change(small, tmp_path):
     said: list[str] = []
 
     def made(variant, **changes):
-        changed = dataclasses.replace(scene, config=dataclasses.replace(scene.config, **changes))
-        return measure(Run(changed, variant, 0), lambda: dataset, tmp_path, say=said.append)
+        changed = dataclasses.replace(DISC, config=dataclasses.replace(DISC.config, **changes))
+        return measure(Run(changed, variant, 0), disc, tmp_path, say=said.append)
 
     full, scaffold, mono = made(FULL), made(SCAFFOLD), made(MONOLITHIC)
     assert [row["level"] for row in scaffold["levels"]] == [0]
@@ -150,22 +143,22 @@ def test_runs_are_made_once_and_again_when_settings_change(small, tmp_path, data
     begun = len(said)
     assert made(FULL) == full and len(said) == begun, "a kept result was made again"
     assert made(FULL, volume=0.02)["config"]["volume"] == 0.02 and len(said) > begun
-    model = Run(scene, FULL, 0).folder(tmp_path) / "model.pt"
+    model = Run(DISC, FULL, 0).folder(tmp_path) / "model.pt"
     assert json.loads(checkpoint.load(model)[1]["config"])["volume"] == 0.02
 
 
-def test_a_file_is_packed_again_if_its_layer_0_is_too_large_and_that_is_kept(small, tmp_path, dataset):
-    run = Run(Scene("static", TrainConfig(preset="tiny", source=STATIC, iterations=12), 1), FULL, 0)
+def test_a_file_is_packed_again_if_its_layer_0_is_too_large_and_that_is_kept(small, tmp_path):
+    run = Run(DISC, FULL, 0)
     said: list[str] = []
-    full = measure(run, lambda: dataset, tmp_path, say=said.append)
+    full = measure(run, disc, tmp_path, say=said.append)
     size = full["levels"][0]["cumulative_bytes"]
-    assert held_to(full, run, size, lambda: dataset, tmp_path, say=said.append) is full
+    assert held_to(full, run, size, disc, tmp_path, say=said.append) is full
     begun = len(said)
-    held = held_to(full, run, size - 200, lambda: dataset, tmp_path, say=said.append)
+    held = held_to(full, run, size - 200, disc, tmp_path, say=said.append)
     assert 0.5 * size < held["levels"][0]["cumulative_bytes"] <= size - 200 and len(said) == begun + 1
-    assert held_to(full, run, size - 200, lambda: dataset, tmp_path, say=said.append) == held
+    assert held_to(full, run, size - 200, disc, tmp_path, say=said.append) == held
     assert len(said) == begun + 1, "a kept file was made again"
-    assert measure(run, lambda: dataset, tmp_path, say=said.append) == full
+    assert measure(run, disc, tmp_path, say=said.append) == full
 
 
 def test_the_default_rate_is_the_full_method():
@@ -179,7 +172,7 @@ def test_the_tool_trains_and_writes_a_table(small, tmp_path, capsys):
     tool.OTHERS = ("tiny", 12, 1)
     docs = tmp_path / "docs"
     where = ("--out", str(tmp_path / "out"), "--docs", str(docs))
-    assert tool.main(["levels", "--scenes", f"{STATIC}@4", "--iterations", "12", *where]) == 0
+    assert tool.main(["levels", "--scenes", str(write_views(tmp_path / "six")), "--iterations", "12", *where]) == 0
     page = (docs / "paper" / "levels.md").read_text()
     assert "| level |" in page and (docs / "paper" / "levels.png").exists()
     assert json.loads((docs / "figures" / "paper" / "levels.json").read_text())[0]["variant"] == "full"

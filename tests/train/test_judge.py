@@ -28,7 +28,19 @@ from pd4dgs_codec.train.loop import Trainer
     ],
 )
 def test_levels_go_from_the_top_while_they_gain_nothing(psnr, levels):
-    assert [level for level, _ in judge.levels_without_gain(psnr)] == levels
+    assert [level for level, _ in judge.levels_without_gain(psnr, [0.0] * 3)] == levels
+
+
+def test_a_level_must_pay_for_its_bytes():
+    megabyte = 0.5 / judge.MIN_GAIN_PER_MEGABYTE
+    assert not judge.levels_without_gain([30, 32, 32.5], [0, 0, 0.9e6 * megabyte])
+    assert [level for level, _ in judge.levels_without_gain([30, 32, 32.5], [0, 0, 1.1e6 * megabyte])] == [2]
+
+
+def test_what_a_level_costs_is_its_planes_and_a_byte_a_weight(dataset):
+    field = Trainer(TrainConfig(preset="tiny", iterations=30), dataset).model.global_deformation
+    weights = 8 * 4 + 8 + 8 * 8 + 8 + (3 + 32 + 30 + 6) * (8 + 1)
+    assert judge.field_bytes(field, 800.0) == 100 + weights
 
 
 def test_short_runs_and_few_views_are_not_judged():
@@ -38,7 +50,7 @@ def test_short_runs_and_few_views_are_not_judged():
 
 def test_a_level_that_goes_stays_away(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(judge, "MIN_ITERATIONS", 10)
-    monkeypatch.setattr(judge, "levels_without_gain", lambda psnr: [(2, psnr[2] - psnr[1])])
+    monkeypatch.setattr(judge, "levels_without_gain", lambda psnr, _: [(2, psnr[2] - psnr[1])])
     views = replace(dataset, train=dataset.train * 12)
     config = TrainConfig(preset="tiny", iterations=30)
     trainer = Trainer(config, views)

@@ -6,6 +6,7 @@ import pytest
 import torch
 
 from pd4dgs_codec.errors import NotFinite, RenderError
+from pd4dgs_codec.model.rounding import EXACT
 from pd4dgs_codec.train.config import ABLATIONS, Schedule, TrainConfig
 from pd4dgs_codec.train.learner import Learner
 
@@ -66,6 +67,36 @@ def test_an_ablation_takes_out_its_terms_alone(dataset, part, gone):
     steps = learner(dataset, 3, **ABLATIONS[part])
     records = [steps.step() for _ in range(3)]
     assert terms & set(records[-1]) == terms - gone
+
+
+def test_the_planes_rate_joins_with_the_rate_terms_and_grows(dataset):
+    """Unweighted among the terms, ramped in the loss."""
+    steps = learner(dataset, plane_rate=1e-3)
+    assert not any("rate_proxy" in name for _ in range(10) for name in steps.step())
+    shares = []
+    for iteration in (11, 15, 25):
+        steps.iteration = iteration
+        steps.config = TrainConfig(preset="tiny", plane_rate=1e-3)
+        _, terms, loss = _loss(steps)
+        steps.config = TrainConfig(preset="tiny", plane_rate=0.0)
+        _, without, rest = _loss(steps)
+        assert set(terms) - set(without) == {"global_rate_proxy", "local_rate_proxy"}
+        bits = float(terms["global_rate_proxy"].detach() + terms["local_rate_proxy"].detach())
+        shares.append(float(loss.detach() - rest.detach()) / (1e-3 * bits))
+    assert shares == pytest.approx([0.1, 0.5, 1.0], rel=1e-2)
+
+
+def _loss(steps):
+    state = steps.generator.get_state()
+    result = steps.loss(0, 2, EXACT, mask_terms=True)
+    steps.generator.set_state(state)
+    return result
+
+
+def test_without_planes_they_have_no_rate_and_anchors_do(dataset):
+    steps = learner(dataset, 3, **ABLATIONS["planes"])
+    names = [name for _ in range(3) for name in steps.step()]
+    assert "rate" in names and not any("proxy" in name for name in names)
 
 
 def test_a_non_finite_step_is_skipped_and_counted(dataset):

@@ -50,7 +50,7 @@ def test_a_model_without_upper_layers_is_packed_as_it_was_trained(dataset, tmp_p
     assert model.level == max_layer
     own = [float((model.masks(level) - model.masks(level - 1)).detach().max()) > 1e-6 for level in (1, 2)]
     assert own == [max_layer >= 1, False], "absent levels have masks of their own"
-    scene = decode(encode(to_scene(model)))
+    scene = decode(encode(to_scene(model), effort=1))
     assert scene.level <= max_layer
 
 

@@ -6,17 +6,16 @@ import pytest
 import torch
 
 from pd4dgs_codec.errors import TrainError
-from pd4dgs_codec.model.masks import level_mask, mask_logits
+from pd4dgs_codec.model.masks import level_mask
+from pd4dgs_codec.scene import Steps
 from pd4dgs_codec.train import losses
-from pd4dgs_codec.train.config import Schedule, TrainConfig, learning_rate
+from pd4dgs_codec.train.config import COARSENED, DIAL, Schedule, TrainConfig, at_quality, learning_rate
 from pd4dgs_codec.train.rollout import rollout_probabilities, sample_level, updated_rho
 
 
-def test_masks_are_monotone_and_start_where_the_method_says():
-    logits = torch.tensor([[2.0, 0.0, 0.0], [-30.0, 5.0, -40.0], [40.0, 1.0, 1.0]])
-    masks = [level_mask(logits, level) for level in range(3)]
-    assert all((b >= a).all() for a, b in zip(masks, masks[1:], strict=False))
-    rho = float(masks[2][0] - masks[0][0])
+def test_masks_start_where_the_method_says():
+    first, _, last = (level_mask(torch.tensor([[2.0, 0.0, 0.0]]), level) for level in range(3))
+    rho = float(last - first)
     assert rho == pytest.approx(1 / (1 + math.exp(-2 - 2 * math.log(2))) - 1 / (1 + math.exp(-2)))
     assert rho == pytest.approx(0.0866, abs=5e-4)
 
@@ -28,16 +27,6 @@ def test_a_level_moves_its_own_masks_and_no_other_level_s(level):
     assert logits.grad is not None
     moved = (logits.grad != 0).all(0)
     assert moved.tolist() == [j == level for j in range(3)]
-
-
-def test_mask_logits_invert_the_masks():
-    import numpy as np
-
-    masks = np.array([[0.0, 0.0, 1.0], [0.2, 0.2, 0.7], [1.0, 1.0, 1.0], [0.012, 0.5, 0.5]])
-    logits = torch.from_numpy(mask_logits(masks))
-    assert torch.isfinite(logits).all()
-    for level in range(3):
-        assert np.allclose(level_mask(logits, level).numpy(), masks[:, level], atol=1e-6)
 
 
 def test_binary_term_is_the_mean_entropy_in_bits():
@@ -133,3 +122,29 @@ def test_learning_rates_are_log_linear():
 def test_bad_configurations_are_refused(bad):
     with pytest.raises(TrainError, match="expected|must be"):
         TrainConfig(**bad)
+
+
+def test_the_planes_pressure_rises_from_the_rate_terms_to_rounding():
+    s = Schedule(3_000)
+    assert [s.pressure(i) for i in (0, 1_000, 1_500, 2_000, 2_999)] == pytest.approx([0, 0, 0.5, 1, 1])
+    assert Schedule(None).pressure(7) == 0
+
+
+def test_the_dial_is_log_linear_and_stands_at_the_defaults():
+    default = TrainConfig()
+    assert at_quality(50) == {name: getattr(default, name) for name in DIAL}
+    low, middle, high = (at_quality(q) for q in (20, 50, 80))
+    for name in DIAL:
+        assert low[name] > middle[name] > high[name] > 0
+        assert low[name] * high[name] == pytest.approx(middle[name] ** 2)
+    for bad in (-1, 101, math.nan):
+        with pytest.raises(TrainError, match="0 to 100"):
+            at_quality(bad)
+
+
+def test_the_step_scale_moves_features_scalings_and_planes_alone():
+    steps = Steps()
+    moved = TrainConfig(step_scale=2.0).model_steps(steps)
+    assert {name for name, value in vars(moved).items() if value != vars(steps)[name]} == set(COARSENED)
+    assert all(vars(moved)[name] == 2 * vars(steps)[name] for name in COARSENED)
+    assert TrainConfig(step_scale=1.0, steps=Steps(feature=1.0)).model_steps(steps).feature == 1.0

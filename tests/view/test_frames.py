@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from PIL import Image
 
+from pd4dgs_codec.errors import RenderError
 from pd4dgs_codec.scene import Camera, SceneInfo
 from pd4dgs_codec.view import frames, movie, panels
 
@@ -54,6 +57,14 @@ def test_own_frames_span_the_time_and_begin_and_end_at_the_given_camera():
         np.testing.assert_allclose(path[i].camera.viewmat, info.camera.viewmat, atol=1e-5)
     assert not np.allclose(path[1].camera.viewmat, info.camera.viewmat, atol=1e-2)
     assert [f.time for f in frames.own_frames(info, 1)] == [0.0]
+
+
+def test_a_camera_of_too_many_pixels_is_refused_unless_shrunk():
+    info = _info()
+    vast = replace(info, camera=replace(info.camera, width=65_535, height=65_535))
+    with pytest.raises(RenderError, match="65535x65535.*--downscale"):
+        frames.own_frames(vast, 1)
+    assert frames.own_frames(vast, 1, downscale=16)[0].camera.width == 4095
 
 
 def test_shrunk_camera_sees_the_same_rays():

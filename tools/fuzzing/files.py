@@ -90,7 +90,7 @@ def put_together(parts: Parts, header: bytes | None = None) -> bytes:
         rows = [[chunk.type, len(payload)] for chunk, payload in zip(parts.chunks, payloads, strict=True)]
         header = canonical.pack({**parts.header, header_module.CHUNKS: rows})
     try:
-        scene_id = header_module.scene_id_of(header, payloads[0])
+        scene_id = header_module.scene_id_of(header)
     except (DecodeError, LookupError, TypeError):  # no header, or no chunk
         scene_id = bytes(8)
     framed = [write_chunk(c.type, c.flags & 1, scene_id, p) for c, p in zip(parts.chunks, payloads, strict=True)]
@@ -159,7 +159,10 @@ class Seed:
 
 def digests(data: bytes, **options: Any) -> tuple[bytes, ...]:
     """Of the header's fields and of each decoded layer's arrays. Raises DecodeError; options as in decode_layers."""
-    header, layers, _ = decode_layers(data, **options)
+    return _digests(data, *decode_layers(data, **options)[:2])
+
+
+def _digests(data: bytes, header: Any, layers: Sequence[Any]) -> tuple[bytes, ...]:
     fields = {key: value for key, value in canonical.unpack(read_preamble(data).header).items()}
     assert header.chunks
     result = [hashlib.sha256(repr(sorted(fields.items())).encode()).digest()]
@@ -173,8 +176,9 @@ def digests(data: bytes, **options: Any) -> tuple[bytes, ...]:
 
 def as_seed(name: str, data: bytes) -> Seed:
     """A seed of a valid file. Those that decode faster come more often: small ones, those without a tree of cells."""
-    rows = sum(len(layer.anchor_q) for layer in decode_layers(data)[1])
-    return Seed(name, data, digests(data), 1.0 / (len(data) + (3000 if rows > 1 else 0)))
+    header, layers, _ = decode_layers(data)
+    rows = sum(len(layer.anchor_q) for layer in layers)
+    return Seed(name, data, _digests(data, header, layers), 1.0 / (len(data) + (3000 if rows > 1 else 0)))
 
 
 def built_seeds() -> list[Seed]:

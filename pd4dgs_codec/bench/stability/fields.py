@@ -88,7 +88,7 @@ def _planes(resolution: Sequence[int], channels: int) -> Planes:
 
 
 def exact_samples(planes: Planes, box: np.ndarray, points: np.ndarray, t: float) -> np.ndarray:
-    """float64 [n, C * scales] by clause 13.2 of the format, one point, plane and corner after the other."""
+    """float64 [n, C * scales] by clause 13.2 of the format: each cell of a plane with its weights, most of them 0."""
     low, high = box.astype(np.float64)
     unit = np.zeros((len(points), 4))
     for axis in range(3):
@@ -103,12 +103,11 @@ def exact_samples(planes: Planes, box: np.ndarray, points: np.ndarray, t: float)
         for name, a, b in PLANES:
             plane = scale[name].astype(np.float64)
             u, v = unit[:, a] * (plane.shape[2] - 1), unit[:, b] * (plane.shape[1] - 1)
-            value = np.zeros_like(product)
-            for row in range(plane.shape[1]):
-                for column in range(plane.shape[2]):
-                    weight = np.maximum(1 - np.abs(u - column), 0) * np.maximum(1 - np.abs(v - row), 0)
-                    value += weight[:, None] * plane[:, row, column]
-            product *= value
+            columns, rows = (
+                np.maximum(1 - np.abs(x[:, None] - np.arange(n)), 0)
+                for x, n in zip((u, v), plane.shape[:0:-1], strict=True)
+            )
+            product *= np.einsum("nr,nc,krc->nk", rows, columns, plane)
         features.append(product)
     return np.concatenate(features, 1)
 
@@ -357,7 +356,7 @@ def _drawn_against_sent() -> Found:
 def _picture_of_mask(mask: int) -> Found:
     decoded = decoder.decode(encoder.encode(small_scene(mask=mask), effort=1))
     level = level_of(decoded)
-    error = picture_error(level.model, 0, 0.0)
+    error = picture_error(from_scene(decoded), 0, 0.0)
     if not mask:
         background = np.array(decoded.info.background, np.float32)
         error = largest([error, float(np.abs(level.picture(CAMERA, 0.0) - background).max())])

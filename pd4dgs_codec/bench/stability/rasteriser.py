@@ -11,9 +11,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pd4dgs_codec import threads
 from pd4dgs_codec.bench.stability.cases import Case, Found, refusal
 from pd4dgs_codec.errors import NotFinite, RenderError
-from pd4dgs_codec.render import threads
 from pd4dgs_codec.render.autograd.rasterization import rasterization
 
 NAMES = ("means", "quats", "scales", "opacities", "colors")

@@ -1,0 +1,506 @@
+"""The inner loops of `fitting` and `sharing`, compiled by numba: what `fit_reference` says in numpy, many times faster.
+
+Every function has its namesake there, with the same arguments and results. Costs are integers, so that both choose the
+same; only the starts of fits are floats, whose sums run in another order here.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numba import njit
+
+from pd4dgs_codec.entropy.bits import BIT, LOG2, P_MIN, SIGMA_MIN
+from pd4dgs_codec.entropy.fit_reference import CLASS_WIDTHS, ENOUGH, GAUSS_BITS, GAUSS_ROUNDS, MIXTURE_BITS
+from pd4dgs_codec.entropy.priors import CLASS_STEPS, FLOORS
+from pd4dgs_codec.entropy.tables import NORMAL, OCTAVE, SI_MAX, SI_MIN, TOTAL
+
+_compiled: Callable[[Callable[..., Any]], Callable[..., Any]] = njit(cache=True, nogil=True)
+_inlined: Callable[[Callable[..., Any]], Callable[..., Any]] = njit(cache=True, nogil=True, forceinline=True)
+
+_STEPS, _FLOORS = np.array(CLASS_STEPS), np.array(FLOORS)
+_LOW, _HIGH = FLOORS  # the higher floor keeps outliers from steering the fit
+
+
+@_inlined
+def _cost(frequency: int) -> Any:
+    """`bits.frequency_costs` of one frequency."""
+    bits = np.float64(frequency).view(np.int64)
+    i, f = (bits >> 40) & 4095, (bits >> 28) & 4095
+    log2 = (((bits >> 52) - 1023) * BIT) + LOG2[i] + (((LOG2[i + 1] - LOG2[i]) * f) >> 12)
+    return 24 * BIT - log2
+
+
+@_compiled
+def _cdf28(mu8: int, si: int, cdf: np.ndarray) -> None:
+    """`tables.norm_cdf28` into cdf int64 [n - 1]."""
+    e, octave = si >> 6, OCTAVE[si & 63]
+    nb = max(0, e - 8)
+    shift, t = 23 + e - nb, 128 - mu8
+    for k in range(len(cdf)):
+        a = min(abs(t) >> nb, (1 << 21) - 1)
+        z = min((a * octave) >> shift, 8 << 16)
+        i, f = z >> 11, z & 2047
+        v = NORMAL[i] + (((NORMAL[i + 1] - NORMAL[i]) * f) >> 11)
+        cdf[k] = (1 << 27) - v if t < 0 else (1 << 27) + v
+        t += 256
+
+
+@_compiled
+def _mixed(first: np.ndarray, second: np.ndarray, weight: int, cdf: np.ndarray) -> None:
+    """The mixture of two cdfs into a third."""
+    for k in range(len(cdf)):
+        cdf[k] = ((256 - weight) * first[k] + weight * second[k]) >> 8
+
+
+@_compiled
+def _table_cost(cdf: np.ndarray, floor: int, counts: np.ndarray) -> Any:
+    """Of counts int64 [n] under the table of cdf int64 [n - 1]."""
+    n = len(counts)
+    cost, before, spread = 0, 0, TOTAL - n * floor
+    for k in range(n - 1):
+        cum = ((cdf[k] * spread) >> 28) + floor * (k + 1)
+        if counts[k] > 0:
+            cost += counts[k] * _cost(cum - before)
+        before = cum
+    return cost + counts[n - 1] * _cost(TOTAL - before)
+
+
+@_compiled
+def _entry_costs(cdf: np.ndarray, floor: int) -> np.ndarray:
+    n = len(cdf) + 1
+    costs = np.empty(n, np.int64)
+    before, spread = 0, TOTAL - n * floor
+    for k in range(n):
+        cum = TOTAL if k == n - 1 else ((cdf[k] * spread) >> 28) + floor * (k + 1)
+        costs[k] = _cost(cum - before)
+        before = cum
+    return costs
+
+
+@_compiled
+def _cheaper_floor(cdf: np.ndarray, dense: np.ndarray) -> tuple[int, int, np.ndarray]:
+    """(index of the floor, cost of dense, costs of the entries)."""
+    low, high = _table_cost(cdf, _LOW, dense), _table_cost(cdf, _HIGH, dense)
+    if low <= high:
+        return 0, low, _entry_costs(cdf, _LOW)
+    return 1, high, _entry_costs(cdf, _HIGH)
+
+
+@_compiled
+def _coarsen(dense: np.ndarray, bits: int) -> tuple[np.ndarray, int]:
+    n, shift = len(dense), 0
+    while ((n - 1) >> shift) >= 1 << bits:
+        shift += 1
+    if shift == 0:
+        return dense, 0
+    counts = np.zeros(((n - 1) >> shift) + 1, np.int64)
+    for k in range(n):
+        counts[k >> shift] += dense[k]
+    return counts, shift
+
+
+@_compiled
+def _descend(
+    counts: np.ndarray, x: np.ndarray, steps: np.ndarray, low: np.ndarray, high: np.ndarray, rounds: int
+) -> np.ndarray:
+    """x int64 [2] (mu8, si) or [5] (mu8, si, mu8, si, weight) downhill on the cost of counts."""
+    dims, n = len(x), len(counts)
+    x, steps = x.copy(), steps.copy()
+    first, second, other, cdf = np.empty((4, n - 1), np.int64)
+    up, down = np.empty(dims, np.int64), np.empty(dims, np.int64)
+    probe, best = x.copy(), x.copy()
+    _cdf28(x[0], x[1], first)
+    if dims == 5:
+        _cdf28(x[2], x[3], second)
+        _mixed(first, second, x[4], cdf)
+        fx = _table_cost(cdf, _HIGH, counts)
+    else:
+        fx = _table_cost(first, _HIGH, counts)
+    for _ in range(rounds):
+        least, at = np.int64(1) << 62, -1
+        for number in range(2 * dims + 1):
+            probe[:] = x
+            if number == 2 * dims:
+                for axis in range(dims):
+                    curvature = up[axis] + down[axis] - 2 * fx
+                    newton = steps[axis] * (down[axis] - up[axis]) / (2.0 * curvature) if curvature > 0 else 0.0
+                    move = np.int64(np.rint(min(max(newton, -2.0 * steps[axis]), 2.0 * steps[axis])))
+                    probe[axis] = min(max(x[axis] + move, low[axis]), high[axis])
+                if dims == 2:
+                    _cdf28(probe[0], probe[1], cdf)
+                else:
+                    _cdf28(probe[0], probe[1], cdf)
+                    _cdf28(probe[2], probe[3], other)
+                    _mixed(cdf, other, probe[4], cdf)
+            else:
+                axis, sign = number % dims, 1 if number < dims else -1
+                probe[axis] = min(max(x[axis] + sign * steps[axis], low[axis]), high[axis])
+                if dims == 2:
+                    _cdf28(probe[0], probe[1], cdf)
+                elif axis < 2:
+                    _cdf28(probe[0], probe[1], other)
+                    _mixed(other, second, x[4], cdf)
+                elif axis < 4:
+                    _cdf28(probe[2], probe[3], other)
+                    _mixed(first, other, x[4], cdf)
+                else:
+                    _mixed(first, second, probe[4], cdf)
+            f = _table_cost(cdf, _HIGH, counts)
+            if number < dims:
+                up[number] = f
+            elif number < 2 * dims:
+                down[number - dims] = f
+            if f < least:
+                least, at = f, number
+                best[:] = probe
+        gain = fx - least
+        if gain <= 0 and steps.max() == 1:
+            break
+        if gain > 0:
+            x[:] = best
+            fx = least
+            if gain < ENOUGH:
+                break
+            _cdf28(x[0], x[1], first)
+            if dims == 5:
+                _cdf28(x[2], x[3], second)
+        if at == 2 * dims or gain <= 0:
+            for axis in range(dims):
+                steps[axis] = max(steps[axis] // 2, 1)
+    return x
+
+
+@_compiled
+def gauss(dense: np.ndarray) -> tuple[int, int, int, int, np.ndarray]:
+    """See `fit_reference.gauss`."""
+    counts, shift = _coarsen(dense, GAUSS_BITS)
+    n = len(counts)
+    k, weights = np.arange(n).astype(np.float64), counts / counts.sum()
+    mean = 0.0
+    for i in range(n):
+        mean += k[i] * weights[i]
+    spread = 0.0
+    for i in range(n):
+        spread += (k[i] - mean) ** 2 * weights[i]
+    sigma = math.sqrt(max(spread - 1 / 12, 0.01))
+    lower, median, upper = np.interp(np.array([0.25, 0.5, 0.75]), np.cumsum(weights) - weights / 2, k)
+    robust = max((upper - lower) / 1.349, 0.1)
+    low, high = np.array([-2048 * n, SI_MIN]), np.array([2048 * n, SI_MAX])
+    cdf, x, least = np.empty(n - 1, np.int64), np.zeros(2, np.int64), np.int64(1) << 62
+    for mu, sd in ((mean, sigma), (median, robust)):
+        mu8 = min(max(np.int64(np.rint(256 * mu)), low[0]), high[0])
+        si = min(max(np.int64(np.rint(64 * math.log2(sd))), low[1]), high[1])
+        _cdf28(mu8, si, cdf)
+        cost = _table_cost(cdf, _HIGH, counts)
+        if cost < least:
+            least = cost
+            x[0], x[1] = mu8, si
+    steps = np.array([max(1, np.int64(2.0 ** (x[1] / 64) * 64)), 16])
+    x = _descend(counts, x, steps, low, high, GAUSS_ROUNDS)
+    mu8, si = (x[0] << shift) + 128 * ((1 << shift) - 1), min(x[1] + 64 * shift, SI_MAX)
+    full = np.empty(len(dense) - 1, np.int64)
+    _cdf28(mu8, si, full)
+    floor, cost, costs = _cheaper_floor(full, dense)
+    return mu8, si, floor, cost, costs
+
+
+@_compiled
+def _expectation_maximisation(counts: np.ndarray, rounds: int) -> np.ndarray:
+    n = len(counts)
+    total, mean, mode = counts.sum(), 0.0, 0
+    for i in range(n):
+        mean += i * counts[i]
+        if counts[i] > counts[mode]:
+            mode = i
+    mean /= total
+    spread = 0.0
+    for i in range(n):
+        spread += (i - mean) ** 2 * counts[i]
+    sigma = math.sqrt(max(spread / total, 0.05))
+    mu = np.array([[mean, mean], [mean - sigma, mean + sigma], [mean, float(mode)]])
+    sd = np.array([[sigma / 2, 2 * sigma], [sigma / 2, sigma / 2], [sigma, 0.3]])
+    share = np.array([[0.6, 0.4], [0.5, 0.5], [0.5, 0.5]])
+    mass, cdf, table_spread = np.empty((2, n)), np.empty(n - 1, np.int64), TOTAL - n
+    size, first, second = np.empty(2), np.empty(2), np.empty(2)
+    found = np.empty((3, 5), np.int64)
+    for s in range(3):
+        for _ in range(rounds):
+            for c in range(2):
+                si = min(max(np.int64(np.rint(64 * math.log2(sd[s, c]))), SI_MIN), SI_MAX)
+                _cdf28(np.int64(np.rint(256 * mu[s, c])), si, cdf)
+                before = 0
+                for k in range(n):
+                    cum = TOTAL if k == n - 1 else ((cdf[k] * table_spread) >> 28) + k + 1
+                    mass[c, k] = (cum - before) * share[s, c]
+                    before = cum
+            size[:], first[:], second[:] = 0.0, 0.0, 0.0
+            for k in range(n):
+                if counts[k] > 0:
+                    scale = counts[k] / (mass[0, k] + mass[1, k])
+                    for c in range(2):
+                        weight = mass[c, k] * scale
+                        mass[c, k] = weight
+                        size[c] += weight
+                        first[c] += weight * k
+            for c in range(2):
+                size[c] = max(size[c], 1e-3)
+                mu[s, c] = first[c] / size[c]
+            for k in range(n):
+                if counts[k] > 0:
+                    for c in range(2):
+                        second[c] += mass[c, k] * (k - mu[s, c]) ** 2
+            for c in range(2):
+                share[s, c] = size[c] / (size[0] + size[1])
+                sd[s, c] = math.sqrt(max(second[c] / size[c] - 1 / 12, 0.02))
+        for c in range(2):
+            found[s, 2 * c] = np.int64(np.rint(256 * mu[s, c]))
+            found[s, 2 * c + 1] = np.int64(np.rint(64 * math.log2(sd[s, c])))
+        found[s, 4] = min(max(np.int64(np.rint(256 * share[s, 1])), 1), 255)
+    return found
+
+
+@_compiled
+def mixture(dense: np.ndarray, effort: int) -> tuple[int, int, int, int, int, int, int, np.ndarray]:
+    """See `fit_reference.mixture`."""
+    counts, shift = _coarsen(dense, MIXTURE_BITS)
+    n = len(counts)
+    first, second = np.empty(n - 1, np.int64), np.empty(n - 1, np.int64)
+    starts = _expectation_maximisation(counts, 4 + 2 * effort)
+    best, least = 0, np.int64(1) << 62
+    for s in range(3):
+        _cdf28(starts[s, 0], starts[s, 1], first)
+        _cdf28(starts[s, 2], starts[s, 3], second)
+        _mixed(first, second, starts[s, 4], first)
+        cost = _table_cost(first, _HIGH, counts)
+        if cost < least:
+            best, least = s, cost
+    x = starts[best].copy()
+    steps = np.array([0, 16, 0, 16, 8])
+    for c in range(2):
+        steps[2 * c] = max(1, np.int64(2.0 ** (x[2 * c + 1] / 64) * 32))
+    low = np.array([-2048 * n, SI_MIN, -2048 * n, SI_MIN, 1])
+    high = np.array([2048 * n, SI_MAX, 2048 * n, SI_MAX, 255])
+    x = _descend(counts, x, steps, low, high, 4 * effort)
+    for c in range(2):
+        x[2 * c] = (x[2 * c] << shift) + 128 * ((1 << shift) - 1)
+        x[2 * c + 1] = min(x[2 * c + 1] + 64 * shift, SI_MAX)
+    one, two = np.empty(len(dense) - 1, np.int64), np.empty(len(dense) - 1, np.int64)
+    _cdf28(x[0], x[1], one)
+    _cdf28(x[2], x[3], two)
+    _mixed(one, two, x[4], one)
+    floor, cost, costs = _cheaper_floor(one, dense)
+    return x[0], x[1], x[2], x[3], x[4], floor, cost, costs
+
+
+@_compiled
+def _class_width(counts: np.ndarray, mu8: int, symbols: int) -> tuple[int, int]:
+    """(class_si16, cost) of counts int64 [n] of class symbols, `symbols` in all."""
+    spread = 0.0
+    for k in range(len(counts)):
+        spread += (256.0 * k - mu8) ** 2 * counts[k]
+    si = 64 * math.log2(max(math.sqrt(spread / symbols) / 256, 0.1))
+    width = min(max(np.int64(np.rint((si + 160) / 16)), 0), CLASS_WIDTHS - 1)
+    cdf = np.empty(len(counts) - 1, np.int64)
+    _cdf28(mu8, 16 * width - 160, cdf)
+    least = _table_cost(cdf, 1, counts)
+    for step in (-1, 1):
+        moved = False
+        while 0 <= width + step < CLASS_WIDTHS:
+            _cdf28(mu8, 16 * (width + step) - 160, cdf)
+            cost = _table_cost(cdf, 1, counts)
+            if cost >= least:
+                break
+            width, least, moved = width + step, cost, True
+        if moved:
+            break
+    return width, least
+
+
+@_compiled
+def classes(dense: np.ndarray) -> tuple[int, int, int, int, int, int, int, np.ndarray, np.ndarray]:
+    """See `fit_reference.classes`."""
+    n, largest = len(dense), dense.max()
+    octaves = np.zeros(n, np.int64)
+    for k in range(n):
+        if dense[k] > 0:
+            octaves[k] = _cost(dense[k]) - _cost(largest)
+    below, weights = np.empty(n, np.int64), np.empty(n, np.int64)
+    costs, best_costs, best_classes = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
+    least, best = np.int64(1) << 62, (-1, 0, 0, 0, 0, np.int64(1) << 62, 0)
+    for number in range(len(_STEPS)):
+        step = _STEPS[number]
+        top = 0
+        for k in range(n):
+            if dense[k] > 0:
+                below[k] = (octaves[k] * 64 + step * BIT // 2) // (step * BIT)
+                top = max(top, below[k])
+        top += 1
+        if top > 1 + 31 * 64 // step:
+            continue
+        whole, total = 0, 0
+        for k in range(n):
+            weights[k] = 0
+            if dense[k] > 0:
+                down = below[k] * step
+                weights[k] = OCTAVE[down & 63] >> (down >> 6)
+            whole += weights[k]
+        shift = 0
+        while whole >> shift >= 1 << 28:
+            shift += 1
+        before, running, cost = 0, 0, 0
+        for k in range(n):
+            running += weights[k]
+            cum = (running >> shift) * (TOTAL - n) // (whole >> shift) + k + 1
+            costs[k] = _cost(cum - before)
+            cost += dense[k] * costs[k]
+            before = cum
+        for k in range(n):
+            if dense[k] > 0:
+                total += top - below[k]
+        for differences in range(2):
+            counts = np.zeros(2 * top + 1 if differences else top + 1, np.int64)
+            previous = 0
+            for k in range(n):
+                value = top - below[k] if dense[k] > 0 else 0
+                counts[value - previous + top if differences else value] += 1
+                previous = value
+            mean16 = 0 if differences else (32 * total + n) // (2 * n)
+            width, described = _class_width(counts, 256 * top if differences else 16 * mean16, n)
+            size = 1 + (top >= 1 << 7)
+            if not differences:
+                size += 1 + (mean16 >= 1 << 7) + (mean16 >= 1 << 14)
+            if cost + described + 8 * BIT * size < least:
+                least = cost + described + 8 * BIT * size
+                best = (number, differences, top, width, mean16, cost, described)
+                best_costs[:] = costs
+                for k in range(n):
+                    best_classes[k] = top - below[k] if dense[k] > 0 else 0
+    return best[0], best[1], best[2], best[3], best[4], best[5], best[6], best_costs, best_classes
+
+
+@_compiled
+def cost_matrix(
+    values: np.ndarray,
+    counts: np.ndarray,
+    ends: np.ndarray,
+    windows: np.ndarray,
+    costs: np.ndarray,
+) -> np.ndarray:
+    """See `fit_reference.cost_matrix`."""
+    matrix = np.empty((len(ends), len(windows)), np.int64)
+    for column in range(len(windows)):
+        kmin, n, shift, at = windows[column]
+        end = kmin + (n << shift)
+        first = 0
+        for channel in range(len(ends)):
+            cost, number, value_bytes, total = 0, 0, 0, 0
+            for i in range(first, ends[channel]):
+                value, count = values[i], counts[i]
+                total += count
+                if kmin <= value < end:
+                    cost += count * costs[at + ((value - kmin) >> shift)]
+                else:
+                    distance = 2 * (kmin - value if value < kmin else value - end)
+                    number += count
+                    value_bytes += count * (1 + (distance >= 1 << 7) + (distance >= 1 << 14) + (distance >= 1 << 21))
+            if number:
+                step_bytes = 1 + (total > 90 * number) + (total > 12000 * number)
+                cost += 8 * BIT * (1 + (number >= 128) + step_bytes * number + value_bytes)
+            matrix[channel, column] = cost
+            first = ends[channel]
+    return matrix
+
+
+@_compiled
+def assign(costs: np.ndarray, prices: np.ndarray) -> tuple[np.ndarray, int]:
+    """See `fit_reference.assign`."""
+    channels, priors = costs.shape
+    none = np.int64(1) << 62
+    is_open = np.ones(priors, np.bool_)
+    first, second = np.empty(channels, np.int64), np.empty(channels, np.int64)
+    stale = np.ones(channels, np.bool_)
+    saved, left = np.empty(priors, np.int64), priors
+    while True:
+        saved[:] = prices
+        for c in range(channels):
+            if stale[c]:
+                best, next_best = -1, -1
+                for p in range(priors):
+                    if is_open[p]:
+                        if best < 0 or costs[c, p] < costs[c, best]:
+                            best, next_best = p, best
+                        elif next_best < 0 or costs[c, p] < costs[c, next_best]:
+                            next_best = p
+                first[c], second[c], stale[c] = best, next_best, False
+            if left > 1:
+                saved[first[c]] -= costs[c, second[c]] - costs[c, first[c]]
+        closed, most = -1, np.int64(0)
+        for p in range(priors):
+            if is_open[p] and saved[p] > most:
+                closed, most = p, saved[p]
+        if left == 1 or closed < 0:
+            break
+        is_open[closed] = False
+        left -= 1
+        for c in range(channels):
+            stale[c] = first[c] == closed or second[c] == closed
+    total = np.int64(0)
+    for c in range(channels):
+        total += costs[c, first[c]]
+    for p in range(priors):
+        if is_open[p]:
+            total += prices[p]
+    return first, total if total < none else none
+
+
+@_compiled
+def split_cost(channels: np.ndarray, classes: np.ndarray, count: int) -> Any:
+    """See `fit_reference.split_cost`."""
+    n, cost = channels.shape[1], np.int64(0)
+    sizes = np.zeros(count, np.int64)
+    for i in range(n):
+        sizes[classes[i]] += 1
+    for channel in channels:
+        low, high = channel.min(), channel.max()
+        width = high - low + 1
+        if count * width > 16 * n + 4096:  # too wide to count in place
+            for k in range(count):
+                part = np.sort(channel[classes == k])
+                run = 0
+                for i in range(len(part)):
+                    run += 1
+                    if i + 1 == len(part) or part[i + 1] != part[i]:
+                        cost += run * _cost(run)
+                        run = 0
+        else:
+            seen = np.zeros((count, width), np.int64)
+            for i in range(n):
+                seen[classes[i], channel[i] - low] += 1
+            for k in range(count):
+                for i in range(width):
+                    if seen[k, i] > 0:
+                        cost += seen[k, i] * _cost(seen[k, i])
+        for k in range(count):
+            if sizes[k] > 0:
+                cost -= sizes[k] * _cost(sizes[k])
+    return cost
+
+
+@_compiled
+def gaussian_bits(values: np.ndarray, counts: np.ndarray) -> Any:
+    """See `bits.gaussian_bits`, here of int64 values and their counts."""
+    total, mu, spread, bits = counts.sum(), 0.0, 0.0, 0.0
+    for i in range(len(values)):
+        mu += values[i] * (counts[i] / total)
+    for i in range(len(values)):
+        spread += (values[i] - mu) ** 2 * (counts[i] / total)
+    scale = 1.0 / (max(math.sqrt(spread), SIGMA_MIN) * math.sqrt(2.0))
+    for i in range(len(values)):
+        distance = abs(values[i] - mu)
+        p = 0.5 * (math.erfc((distance - 0.5) * scale) - math.erfc((distance + 0.5) * scale))
+        bits -= counts[i] * math.log2(max(p, P_MIN))
+    return bits

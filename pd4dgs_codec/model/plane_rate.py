@@ -1,0 +1,219 @@
+"""What a HexPlane's planes cost: a smooth proxy for the gradient, and the exact R(a) of their coded residuals.
+
+The proxy takes each plane's residuals r, before rounding, under one fixed predictor of the codec: the median on spatial
+planes, the previous instant on time planes. b bits of a Laplacian of mean magnitude m in steps Q are about
+log2(2 e m / Q); with 1 added inside, nothing is free of cost but nothing. Half of it looks at the mean over a channel's
+cells, half at the mean over a cell's channels:
+
+    sum over values of 1/2 log2(1 + 2 e mean_channel|r| / Q) + 1/2 log2(1 + 2 e mean_cell|r| / Q)
+
+The first half makes channels small, the second empties whole cells, as the codec's classes of activity have it. The
+first value of a plane has no neighbour; it is free. Weighting of |r| by what it costs follows Candes, Wakin and Boyd,
+Enhancing sparsity by reweighted l1 minimization (2008).
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterable
+from typing import Any
+
+import numba as nb
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from pd4dgs_codec.attributes.quantise import quantise
+from pd4dgs_codec.codec.plane_choice import choose_predictor
+from pd4dgs_codec.model.plane_layout import TIME_AXIS, PlaneLayout
+from pd4dgs_codec.model.rate import channel_moments, rate_bits
+from pd4dgs_codec.render.simd import kernel
+from pd4dgs_codec.scene import PLANES, Planes
+
+#: Of the planes in the order of `PLANES`: whether one axis is time.
+_TEMPORAL = np.array([b == TIME_AXIS for _, _, b in PLANES])
+_SIDES = np.array([(a, b) for _, a, b in PLANES])
+_LN2 = math.log(2.0)
+
+
+@kernel(inline=True)
+def _row_residuals(r: np.ndarray, flat: np.ndarray, k: int, i: int, up: int, left: int, temporal: int) -> None:
+    """r [up] = residuals of row i, whose first value lies at flat offset k; neighbours lie `up` and `left` before."""
+    if i == 0:
+        r[:left] = 0
+        for x in range(left, up):
+            r[x] = flat[k + x] - flat[k + x - left]
+        return
+    for x in range(up if temporal else left):
+        r[x] = flat[k + x] - flat[k + x - up]
+    if temporal:
+        return
+    for x in range(left, up):
+        w, n = flat[k + x - left], flat[k + x - up]
+        r[x] = flat[k + x] - max(min(w, n), min(max(w, n), w + n - flat[k + x - up - left]))
+
+
+@kernel(parallel=True)
+def _magnitudes(
+    channel_sums: np.ndarray, cell_sums: np.ndarray, grid: np.ndarray, starts: np.ndarray, sizes: np.ndarray
+) -> None:
+    """channel_sums [P, C], cell_sums [cells] += sums of |r|. starts [P], sizes [P, 3]: height, width, 1 if temporal."""
+    channels = grid.shape[1]
+    flat = grid.reshape(-1)
+    for p in nb.prange(len(starts)):
+        height, width, temporal = sizes[p]
+        r = np.empty(width * channels, grid.dtype)
+        sums = np.zeros(channels, grid.dtype)
+        for i in range(height):
+            first = starts[p] + i * width
+            _row_residuals(r, flat, first * channels, i, width * channels, channels, temporal)
+            for j in range(width):
+                total = grid.dtype.type(0)
+                for c in range(channels):
+                    magnitude = abs(r[j * channels + c])
+                    sums[c] += magnitude
+                    total += magnitude
+                cell_sums[first + j] = total
+        channel_sums[p] = sums
+
+
+@kernel(parallel=True)
+def _gradient(
+    grad: np.ndarray,
+    grid: np.ndarray,
+    by_channel: np.ndarray,
+    by_cell: np.ndarray,
+    starts: np.ndarray,
+    sizes: np.ndarray,
+) -> None:
+    """grad [cells, C] += that of the sum of |r| weighted by by_channel [P, C] + by_cell [cells]."""
+    channels = grid.shape[1]
+    flat, out = grid.reshape(-1), grad.reshape(-1)
+    zero, one, huge = grid.dtype.type(0), grid.dtype.type(1), grid.dtype.type(1e30)
+    for p in nb.prange(len(starts)):
+        height, width, temporal = sizes[p]
+        up, left = width * channels, channels
+        g, west, north, corner = np.empty((4, up), grid.dtype)
+        for i in range(height):
+            first = starts[p] + i * width
+            k = first * channels
+            _row_residuals(g, flat, k, i, up, left, temporal)
+            for j in range(width):
+                for c in range(channels):
+                    x = j * channels + c
+                    weight = by_channel[p, c] + by_cell[first + j]
+                    g[x] = weight * max(-one, min(one, g[x] * huge))
+            for x in range(up):
+                out[k + x] += g[x]
+            if i == 0:
+                for x in range(left, up):
+                    out[k + x - left] -= g[x]
+                continue
+            if temporal:
+                for x in range(up):
+                    out[k + x - up] -= g[x]
+                continue
+            for x in range(left):
+                north[x] = g[x]
+            for x in range(left, up):  # the gradient goes to those neighbours that the median is made of
+                w, n = flat[k + x - left], flat[k + x - up]
+                plane = w + n - flat[k + x - up - left]
+                low, high = min(w, n), max(w, n)
+                inside = low < plane and plane < high
+                median = max(low, min(high, plane))
+                west[x] = g[x] if median == w or inside else zero
+                north[x] = g[x] if median != w else zero
+                corner[x] = g[x] if inside else zero
+            for x in range(up):
+                out[k + x - up] -= north[x]
+            for x in range(left, up):
+                out[k + x - left] -= west[x]
+            for x in range(left, up):
+                out[k + x - up - left] += corner[x]
+
+
+class _ProxyBits(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, grid: Tensor, layout: PlaneLayout, step: float) -> Tensor:
+        starts, sizes = _tables(layout)
+        channel_sums = np.zeros((len(starts), grid.shape[1]), grid.numpy().dtype)
+        cell_sums = np.zeros(len(grid), grid.numpy().dtype)
+        _magnitudes(channel_sums, cell_sums, grid.numpy(), starts, sizes)
+        scale, cells = 2 * math.e / step, sizes[:, 0] * sizes[:, 1]
+        by_channel = 1 + scale * channel_sums / cells[:, None]
+        by_cell = 1 + scale * cell_sums / grid.shape[1]
+        bits = 0.5 * float((cells[:, None] * np.log2(by_channel)).sum() + grid.shape[1] * np.log2(by_cell).sum())
+        ctx.weights = 0.5 * scale / _LN2 / by_channel, 0.5 * scale / _LN2 / by_cell
+        ctx.layout = layout
+        ctx.save_for_backward(grid)
+        return grid.new_tensor(bits)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, factor: Tensor) -> tuple[Tensor, None, None]:
+        (grid,) = ctx.saved_tensors
+        grad = torch.zeros_like(grid)
+        by_channel, by_cell = (w.astype(grad.numpy().dtype) for w in ctx.weights)
+        _gradient(grad.numpy(), grid.detach().numpy(), by_channel, by_cell, *_tables(ctx.layout))
+        return grad.mul_(factor), None, None
+
+
+def _tables(layout: PlaneLayout) -> tuple[np.ndarray, np.ndarray]:
+    """(first cells int64 [P], height, width and 1 if temporal int64 [P, 3]) of all planes of all scales."""
+    sizes = [(r[b], r[a], t) for r in layout.reso for (a, b), t in zip(_SIDES, _TEMPORAL, strict=True)]
+    return layout.start.ravel(), np.array(sizes, np.int64)
+
+
+def proxy_bits(grid: Tensor, layout: PlaneLayout, step: float) -> Tensor:
+    """The proxy, in bits, of planes grid [cells, C] at a quantisation step; its gradient reaches every value."""
+    if grid.device.type == "cpu":
+        bits: Tensor = _ProxyBits.apply(grid, layout, step)  # type: ignore[no-untyped-call]
+        return bits
+    return proxy_bits_reference(grid, layout, step)
+
+
+def proxy_bits_reference(grid: Tensor, layout: PlaneLayout, step: float) -> Tensor:
+    """The plain torch form of `proxy_bits`."""
+    scale, total = 2 * math.e / step, grid.new_zeros(())
+    for planes in layout.views(grid):
+        for name, _, b in PLANES:
+            r = _residuals(planes[name], b == TIME_AXIS).abs()
+            cells, channels = r.shape[0] * r.shape[1], r.shape[2]
+            by_channel = torch.log2(1 + scale * r.mean((0, 1))).sum() * cells
+            by_cell = torch.log2(1 + scale * r.mean(2)).sum() * channels
+            total = total + 0.5 * (by_channel + by_cell)
+    return total
+
+
+def _residuals(x: Tensor, temporal: bool) -> Tensor:
+    """Of a plane [H, W, C]; 0 for its first value."""
+    first_row = torch.cat([torch.zeros_like(x[:1, :1]), x[:1, 1:] - x[:1, :-1]], dim=1)
+    if temporal:
+        return torch.cat([first_row, x[1:] - x[:-1]])
+    w, n, nw = x[1:, :-1], x[:-1, 1:], x[:-1, :-1]
+    low, high = torch.minimum(w, n), torch.maximum(w, n)
+    inner = x[1:, 1:] - torch.maximum(low, torch.minimum(high, w + n - nw))
+    return torch.cat([first_row, torch.cat([x[1:, :1] - x[:-1, :1], inner], dim=1)])
+
+
+def exact_bits(planes: Planes, step: float) -> float:
+    """The sum of R(a) of the residuals that the codec codes of float32 planes, in bits: one Gaussian per channel of a
+    plane, as with `--priors gauss`, under the predictor that the codec picks."""
+    total = 0.0
+    for scale in planes:
+        for name, _, _ in PLANES:
+            _, residual = choose_predictor(quantise(scale[name], step, name))
+            total += gaussian_bits(residual.reshape(len(residual), -1))
+    return total
+
+
+def gaussian_bits(channels: Iterable[np.ndarray]) -> float:
+    """The sum of R(a) over integer channels, as the trainer computes it in float64: priors are a channel's moments."""
+    total = 0.0
+    for channel in channels:
+        if channel.size:
+            values = torch.from_numpy(channel.astype(np.float64))[:, None]
+            mu, sigma = channel_moments(values)
+            total += float(rate_bits(values, mu, sigma, 1.0).sum())
+    return total

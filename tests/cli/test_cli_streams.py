@@ -1,0 +1,51 @@
+"""Closed, full and broken standard streams: an exit code, at most one line, and never a traceback."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+
+import pytest
+
+pytestmark = pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a device that is always full, as Linux has")
+
+#: Arguments (FILE is a whole file), what the shell does to the streams, exit code, what stderr says if it is there.
+CASES = {
+    "stdout is closed": ("info FILE", ">&-", 1, "stdout: Bad file descriptor"),
+    "stdout is full": ("info FILE", ">/dev/full", 1, "stdout: No space left on device"),
+    "stdout is full, JSON": ("info FILE --json", ">/dev/full", 1, "stdout: No space left on device"),
+    "stderr is closed": ("info FILE", "2>&-", 0, ""),
+    "stderr is closed, an error": ("info none", "2>&-", 1, ""),
+    "stderr is full, an error": ("info none", "2>/dev/full", 1, ""),
+    "both are closed": ("info FILE", ">&- 2>&-", 1, ""),
+    "all are closed": ("info none", "<&- >&- 2>&-", 1, ""),
+    "stdin is closed": ("info -", "<&-", 2, "nothing is piped to stdin"),
+    "no stdin, and the file is written nevertheless": ("decode FILE -o OUT.npz", "<&-", 0, "wrote"),
+    "no stream at all, and the file is whole": ("decode FILE -o OUT.npz", "<&- >&- 2>&-", 0, ""),
+    "array data to a closed stdout": ("decode FILE -o -", ">&-", 1, "stdout: Bad file descriptor"),
+    "array data to a full stdout": ("decode FILE -o -", ">/dev/full", 1, "stdout: No space left on device"),
+    "array data to a reader that goes": ("decode FILE -o -", "| true", 1, ""),
+    "help to a closed stdout": ("info --help", ">&-", 1, "stdout: Bad file descriptor"),
+    "help to a full stdout": ("info --help", ">/dev/full", 1, "stdout: No space left on device"),
+    "the list of verbs to a full stdout": ("--help", ">/dev/full", 1, "stdout: No space left on device"),
+    "the version to a full stdout": ("info --version", ">/dev/full", 1, "stdout: No space left on device"),
+    "a verb that is none, stderr closed": ("nothing", "2>&-", 2, ""),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_streams(name, scene_pd4, tmp_path):
+    arguments, streams, code, says = CASES[name]
+    arguments = arguments.replace("FILE", f"'{scene_pd4}'").replace("OUT", str(tmp_path / "out"))
+    script = f"{{ '{sys.executable}' -m pd4dgs_codec {arguments}; echo $? >'{tmp_path}/code'; }} {streams}"
+    if not streams.startswith("|"):
+        script = f"'{sys.executable}' -m pd4dgs_codec {arguments} {streams}; echo $? >'{tmp_path}/code'"
+    done = subprocess.run(["sh", "-c", script], capture_output=True, text=True, timeout=120)
+    assert int((tmp_path / "code").read_text()) == code, done.stderr
+    assert says in done.stderr and "Traceback" not in done.stderr
+    assert code == 0 or len(done.stderr.splitlines()) == bool(says)
+    if "OUT" in CASES[name][0]:
+        import numpy as np
+
+        assert len(np.load(tmp_path / "out.npz").files) > 5

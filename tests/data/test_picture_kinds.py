@@ -1,0 +1,143 @@
+"""Every kind of pixel that a picture file may hold is read as its maker saw it, or refused by name."""
+
+from __future__ import annotations
+
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image, ImageCms
+from PIL.PngImagePlugin import PngInfo
+
+from pd4dgs_codec.data.files import read_image
+from pd4dgs_codec.errors import DataError
+
+RAMP = np.arange(256, dtype=np.uint8).reshape(16, 16)
+COLOUR = np.stack([RAMP, RAMP.T, 255 - RAMP], axis=-1)
+ALPHA = np.where(RAMP > 100, 255, RAMP).astype(np.uint8)
+ON_WHITE = np.rint(COLOUR * (ALPHA[..., None] / 255.0) + 255 - ALPHA[..., None]).astype(int)
+
+
+def grey(levels: np.ndarray) -> np.ndarray:
+    return np.repeat(levels[..., None], 3, axis=-1)
+
+
+def palette() -> Image.Image:
+    image = Image.fromarray(RAMP, "P")
+    image.putpalette(np.stack([RAMP.ravel(), 255 - RAMP.ravel(), RAMP.ravel() // 2], axis=-1).tobytes())
+    return image
+
+
+def deep(wide: np.ndarray, path: Path) -> None:
+    """A PNG of 16 bits a channel, uint16 [H, W, C] (C: 2 grey and alpha, 3 RGB, 4 RGBA), which Pillow cannot write."""
+    height, width, channels = wide.shape
+
+    def chunk(name: bytes, data: bytes) -> bytes:
+        return len(data).to_bytes(4, "big") + name + data + zlib.crc32(name + data).to_bytes(4, "big")
+
+    head = width.to_bytes(4, "big") + height.to_bytes(4, "big") + bytes([16, {2: 4, 3: 2, 4: 6}[channels], 0, 0, 0])
+    rows = b"".join(b"\0" + row.astype(">u2").tobytes() for row in wide)
+    parts = chunk(b"IHDR", head) + chunk(b"IDAT", zlib.compress(rows)) + chunk(b"IEND", b"")
+    path.write_bytes(b"\x89PNG\r\n\x1a\n" + parts)
+
+
+def linear_profile() -> bytes:
+    """An RGB profile of sRGB's primaries whose channels are linear in light: sRGB's own with its curves replaced."""
+    data = bytearray(ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes())
+    curve = b"curv" + bytes(8)  # a curve of no points is the identity
+    for i in range(int.from_bytes(data[128:132], "big")):
+        entry = 132 + 12 * i
+        offset = int.from_bytes(data[entry + 4 : entry + 8], "big")
+        if data[entry : entry + 4] in (b"rTRC", b"gTRC", b"bTRC"):
+            data[offset : offset + 12] = curve
+            data[entry + 8 : entry + 12] = (12).to_bytes(4, "big")
+        if data[entry : entry + 4] == b"desc":
+            start = data.find("sRGB".encode("utf-16-be"), offset)
+            data[start : start + 8] = "line".encode("utf-16-be")
+    return bytes(data)
+
+
+def from_linear(levels: np.ndarray) -> np.ndarray:
+    """8-bit levels that are linear in light as those of sRGB (IEC 61966-2-1)."""
+    light = levels / 255.0
+    return 255 * np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
+
+
+#: What is written, what is read, and by how many levels they may differ.
+READ = {
+    "grey.png": (lambda p: Image.fromarray(RAMP).save(p), grey(RAMP), 0),
+    "one-bit.png": (lambda p: Image.fromarray(RAMP > 99).save(p), grey(255 * (RAMP > 99)), 0),
+    "grey-16.png": (lambda p: Image.fromarray(RAMP.astype(np.uint16) * 257).save(p), grey(RAMP), 0),
+    "grey-16.tif": (lambda p: Image.fromarray(RAMP.astype(np.uint16) * 257).save(p), grey(RAMP), 0),
+    "rgb.png": (lambda p: Image.fromarray(COLOUR).save(p), COLOUR, 0),
+    "rgb.webp": (lambda p: Image.fromarray(COLOUR).save(p, lossless=True), COLOUR, 0),
+    "rgb-16.png": (lambda p: deep(COLOUR.astype(np.uint16) * 257, p), COLOUR, 1),
+    "palette.png": (lambda p: palette().save(p), np.asarray(palette().convert("RGB")), 0),
+    "rgba.png": (lambda p: Image.fromarray(np.dstack([COLOUR, ALPHA])).save(p), ON_WHITE, 1),
+    "rgba-16.png": (lambda p: deep(np.dstack([COLOUR, ALPHA]).astype(np.uint16) * 257, p), ON_WHITE, 1),
+    "grey-alpha.png": (
+        lambda p: Image.fromarray(np.dstack([RAMP, ALPHA]), "LA").save(p),
+        grey(np.rint(RAMP * (ALPHA / 255.0) + 255 - ALPHA)),
+        1,
+    ),
+    "key.png": (lambda p: Image.fromarray(RAMP).save(p, transparency=7), grey(np.where(RAMP == 7, 255, RAMP)), 0),
+    "upright.jpg": (lambda p: Image.fromarray(grey(RAMP)).save(p, quality=100, exif=oriented(1)), grey(RAMP), 4),
+    "srgb-profile.png": (lambda p: Image.fromarray(COLOUR).save(p, icc_profile=srgb_profile()), COLOUR, 0),
+    "linear-profile.png": (
+        lambda p: Image.fromarray(COLOUR).save(p, icc_profile=linear_profile()), from_linear(COLOUR), 3
+    ),
+}  # fmt: skip
+
+
+def oriented(flag: int) -> bytes:
+    exif = Image.Exif()
+    exif[0x0112] = flag
+    return exif.tobytes()
+
+
+def srgb_profile() -> bytes:
+    return ImageCms.ImageCmsProfile(ImageCms.createProfile("sRGB")).tobytes()
+
+
+def gamma_one() -> PngInfo:
+    info = PngInfo()
+    info.add(b"gAMA", (100_000).to_bytes(4, "big"))
+    return info
+
+
+REFUSED = {
+    "turned.jpg": (lambda p: Image.fromarray(COLOUR).save(p, exif=oriented(6)), "orientation flag 6"),
+    "turned.png": (lambda p: Image.fromarray(COLOUR).save(p, exif=oriented(3)), "orientation flag 3"),
+    "cmyk.jpg": (lambda p: Image.fromarray(COLOUR).convert("CMYK").save(p), "CMYK"),
+    "lab.tif": (lambda p: Image.fromarray(COLOUR, "LAB").save(p), "LAB"),
+    "float.tif": (lambda p: Image.fromarray(RAMP.astype(np.float32)).save(p), "pixels of kind F"),
+    "int.tif": (lambda p: Image.fromarray(RAMP.astype(np.int32)).save(p), "pixels of kind I,"),
+    "moving.png": (
+        lambda p: Image.fromarray(COLOUR).save(p, save_all=True, append_images=[Image.fromarray(255 - COLOUR)]),
+        "holds 2 pictures",
+    ),
+    "gamma.png": (lambda p: Image.fromarray(COLOUR).save(p, pnginfo=gamma_one()), "gamma of 1"),
+    "broken-profile.png": (lambda p: Image.fromarray(COLOUR).save(p, icc_profile=b"no profile"), "colour profile"),
+    "key-16.png": (
+        lambda p: Image.fromarray(RAMP.astype(np.uint16)).save(p, transparency=7), "16-bit grey with a transparent"
+    ),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", READ)
+def test_read_as_seen(tmp_path, name):
+    write, expected, tolerance = READ[name]
+    write(tmp_path / name)
+    got = read_image(tmp_path / name, (16, 16))
+    assert got.dtype == np.uint8 and got.shape == (16, 16, 3)
+    assert np.abs(got.astype(int) - expected).max() <= tolerance
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_refused_by_name(tmp_path, name):
+    write, says = REFUSED[name]
+    write(tmp_path / name)
+    with pytest.raises(DataError, match=f"{name}: .*{says}") as caught:
+        read_image(tmp_path / name, (16, 16))
+    assert "\n" not in str(caught.value)

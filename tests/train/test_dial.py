@@ -1,0 +1,45 @@
+"""The one dial: what it costs and what it shows are monotone over its range, on a run of seconds."""
+
+import pytest
+from runs import read_log
+
+from pd4dgs_codec.codec.encoder import encode, encode_with_report
+from pd4dgs_codec.metrics.levels import level_psnr
+from pd4dgs_codec.model.convert import to_scene
+from pd4dgs_codec.model.picture import render_image
+from pd4dgs_codec.pack.train_rate import train_rate_bits
+from pd4dgs_codec.train import pruning
+from pd4dgs_codec.train.config import TrainConfig, at_quality
+from pd4dgs_codec.train.loop import Trainer
+
+
+def test_bytes_and_quality_rise_with_the_dial(dataset, tmp_path, monkeypatch):
+    monkeypatch.setattr(pruning, "MIN_ITERATIONS", 10)
+    sizes, psnr = [], []
+    for quality in (0, 50, 100):
+        trainer = Trainer(TrainConfig(preset="tiny", iterations=150, **at_quality(quality)), dataset)
+        trainer.run(tmp_path / "m.pt")
+        model = trainer.model
+        levels = level_psnr(
+            lambda level, v, m=model: render_image(m, level, v.time, v.camera), [0, 1, 2], dataset.train
+        )
+        sizes.append(len(encode(to_scene(model), effort=1, omit="nothing")))
+        psnr.append(levels[2])
+    assert sizes[0] < 0.9 * sizes[1] and sizes[1] < 0.9 * sizes[2]
+    assert psnr[0] < psnr[2] and psnr[0] - 0.1 < psnr[1] < psnr[2] + 0.1, psnr  # chance is some .01 dB here
+
+
+def test_what_is_coded_of_planes_is_what_the_log_says(dataset, tmp_path):
+    """The trainer's own sum of R(a) of the planes, at the end of a run, is the encoder's within 2 %."""
+    trainer = Trainer(TrainConfig(preset="tiny", iterations=40, plane_rate=1e-6), dataset)
+    trainer.run(tmp_path / "m.pt", log=tmp_path / "log.jsonl")
+    records = read_log(tmp_path / "log.jsonl")
+    logged = records[-1]
+    assert {"global_rate_proxy", "local_rate_proxy"} <= set().union(*records)  # logged apart
+    scene = to_scene(trainer.model)
+    _, report = encode_with_report(scene, priors="gauss", effort=1, omit="nothing", layers=2)
+    for own, row in zip(train_rate_bits(scene), report.layers, strict=True):
+        if row.layer:
+            (coded,) = (s.rate_bits for s in row.streams if s.name == "planes")
+            assert logged["plane_bits"][row.layer - 1] == pytest.approx(coded, rel=0.02)
+            assert own["planes"] == pytest.approx(coded, rel=0.02)
