@@ -38,6 +38,8 @@ export class LayerReader {
     this._index = 0;
     /** The mask codes of all rows so far. */
     this._codes = new Uint8Array(0);
+    /** By those layers. @type {import("./parameters.js").Declared} */
+    this._declared = { rows: 0, symbols: 0, bytes: 0 };
   }
 
   /** Whether every chunk that the header lists has been read. */
@@ -110,8 +112,9 @@ export class LayerReader {
     let layer = null;
     if (isLayer) {
       try {
-        const symbols = decodeLayer(chunk.payload, LAYER_KINDS[listed.type], this.rows);
+        const symbols = decodeLayer(chunk.payload, LAYER_KINDS[listed.type], this._declared);
         layer = { symbols, tensors: this._accept(symbols) };
+        this._declared = symbols.parameters.declared;
       } catch (error) {
         // What an engine says where it cannot allocate an array.
         const full = error instanceof RangeError && /allocation|array length|buffer length/i.test(error.message);
