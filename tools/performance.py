@@ -3,8 +3,8 @@
     python tools/performance.py --before FOLDER [--only NAME ...] [--repeats 9] [--out out] [--docs docs] [--render]
 
 FOLDER is a checkout of another commit of this project, measured by turns with this one: one process of each, then the
-next pair (of encodings a third as many). Each checkpoint that tools/results.py left in --out/NAME/model.pt is one scene. Figures are medians over the
-repeats; the page states the processors and the load.
+next pair (of encodings a third as many). Each checkpoint that tools/results.py left in --out/NAME/model.pt is one
+scene. Figures are medians over the repeats; the page states the processors and the load.
 """
 
 from __future__ import annotations
