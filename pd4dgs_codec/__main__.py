@@ -18,6 +18,7 @@ VERBS = {
     "bench": "measure what the codec, the renderer and the trainer promise",
     "package": "lay out a file for DASH, HLS and plain HTTP",
     "serve": "serve a folder over HTTP, at the rate of a slow link if wanted",
+    "view": "show a scene in the browser",
 }
 
 

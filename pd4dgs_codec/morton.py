@@ -7,6 +7,7 @@ import numpy as np
 from pd4dgs_codec.errors import EncodeError
 
 AXIS_BITS = 21  #: bits per axis; three of them fit in one int64
+MAX_VOXEL = 1 << (AXIS_BITS - 1)  #: |voxel index| of an anchor along any axis, a limit of the format
 
 
 def spread_bits(values: np.ndarray) -> np.ndarray:
@@ -20,6 +21,20 @@ def spread_bits(values: np.ndarray) -> np.ndarray:
         (2, 0x1249249249249249),
     ):
         v = (v | (v << shift)) & mask
+    return v
+
+
+def join_bits(codes: np.ndarray) -> np.ndarray:
+    """Bit 3i of each code to bit i, the inverse of spread_bits; other bits are dropped. int64 -> int64."""
+    v = codes & 0x1249249249249249
+    for shift, mask in (
+        (2, 0x10C30C30C30C30C3),
+        (4, 0x100F00F00F00F00F),
+        (8, 0x1F0000FF0000FF),
+        (16, 0x1F00000000FFFF),
+        (32, 0x1FFFFF),
+    ):
+        v = (v | (v >> shift)) & mask
     return v
 
 

@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""The reference decoder of the `.pd4` format 1.0-draft, written from spec/format.md with the standard library alone.
+"""The reference decoder of the `.pd4` format 2.0-draft, written from spec/format.md with the standard library alone.
 
     python -I -S spec/refdec.py FILE
 
@@ -87,7 +87,7 @@ class Reader:
     def byte(self, high=255):
         return limited(self.number("B"), high, "a byte")
 
-    # 2.3 Reserved and unused: "A reserved bit or value MUST be zero or absent in a 1.0 file"
+    # 2.3 Reserved and unused: "A reserved bit or value MUST be zero or absent in a 2.0 file"
     def bits(self, used):
         value = self.byte()
         need(value >> used == 0, f"a byte is {value:#x}, expected {used} bits")
@@ -238,7 +238,7 @@ def read_preamble(data):
     need(SIGNATURE.startswith(data[:8]), "not a .pd4 file", "BadSignature")
     need(len(data) >= 20, "the file ends in the preamble", "Truncated")
     major, _, size, crc = struct.unpack_from("<HHII", data, 8)
-    need(major == 1, f"major version {major}", "UnsupportedVersion")
+    need(major == 2, f"major version {major}", "UnsupportedVersion")
     limited(size, 4096, "the header's length")
     need(len(data) >= 20 + size, "the file ends in the header", "Truncated")
     header = data[20 : 20 + size]
@@ -249,8 +249,9 @@ def read_preamble(data):
 # 5.1 Header map: "The time at 1 MUST NOT precede the time at 0, the background MUST lie in 0..1, 0 ≤ near < far and
 # unit ≥ 0 MUST hold." "coding mode: 0 ans, 1 lzma; others UnsupportedFeature" "deformation: 0 coded as symbols, 1
 # float32 (9.2); others UnsupportedFeature"
+# 5.5 Digest: "The first 16 bytes of the SHA-256 of the payloads of all critical chunks that were encoded together"
 def read_header(data):
-    header = fields(unpack(data), range(1, 14), (*range(1, 12), 13), "header")
+    header = fields(unpack(data), range(1, 15), (*range(1, 12), 13, 14), "header")
     steps, box, (start, end), background, (near, far), _ = (
         reals(header[key], f"header key {key}", count)
         for key, count in ((4, 3), (6, 6), (7, 2), (8, 3), (9, 2), (10, 3))
@@ -266,6 +267,7 @@ def read_header(data):
     if 12 in header:
         read_camera(header[12])
     read_error_bounds(header[13])
+    need(type(header[14]) is bytes and len(header[14]) == 16, "the digest of the layers is not 16 bytes")
     read_chunk_list(header[1])
     for key in (2, 3):
         registered(header[key], (0, 1), f"header key {key}")
@@ -312,7 +314,7 @@ def behind_chunk_list(header):
 
 # 3.2 Chunks: "Type and length MUST equal those in the chunk list. Checks come in this order: L against its limit, L
 # against the list, the bytes that are there, CRC-32, reserved flags, type, scene id, flag bit 0 against the type"
-def read_chunk(data, at, kind, size, scene_id, described):
+def read_chunk(data, at, kind, size, scene_id):
     need(len(data) >= at + 16, "the file ends in a chunk's head", "Truncated")
     found_kind, flags, found_size, found_id = struct.unpack_from("<HHI8s", data, at)
     limited(found_size, (1 << 31) - 1, "a payload's length")
@@ -323,15 +325,14 @@ def read_chunk(data, at, kind, size, scene_id, described):
     need(zlib.crc32(data[at:end]) == crc, f"CRC-32 of the chunk at {at}", "ChecksumMismatch")
     need(flags >> 1 == 0, f"flags {flags:#x}")
     need(found_kind == kind, f"chunk type {found_kind}, listed {kind}")
-    payload = data[at + 16 : end]
-    check_scene_id(found_id, scene_id or hashlib.sha256(described + payload).digest()[:8])
+    check_scene_id(found_id, scene_id)
     check_critical(kind, flags & 1)
-    return payload, found_id, end + 4
+    return data[at + 16 : end], end + 4
 
 
 # 3.3 Scene identity: "Every chunk of a file, ancillary ones included, MUST carry it"
 def check_scene_id(found, expected):
-    need(found == expected, "the scene id is not that of the header and layer 0")
+    need(found == expected, "the scene id is not that of the header")
 
 
 # 3.4 Critical and ancillary chunks: "The chunk types of layers are critical: flag bit 0 MUST be zero there." "A
@@ -351,14 +352,14 @@ class Layer:
 
 
 # 6.1 Layout: "The lengths of the sections MUST sum to the rest exactly."
-def read_layer(payload, number, rows_before, header):
-    layer = Layer(number, rows_before, header)
+def read_layer(payload, number, before, header):
+    layer = Layer(number, before[0], header)
     reader = Reader(payload)
     parameters = reader.take(limited(reader.number("<I"), 4096, "the parameters' length"))
     read_parameters(layer, unpack(parameters))
     parts = {section: reader.take(layer.sections[section]) for section in sorted(layer.sections)}
     need(not reader.left, f"{reader.left} bytes behind the sections")
-    check_sizes(layer, len(payload))
+    check_sizes(layer, len(payload), before)
     read_sections(layer, parts)
     return layer
 
@@ -446,14 +447,17 @@ def weight_shapes(layer):
     return shapes
 
 
-# 6.5 Declared sizes: "c MUST NOT exceed 2^28, n MUST NOT exceed 2^13 + 2·L, and E + 72·n + c + w MUST NOT exceed 2^22 +
-# 2048·L, L being the payload's length in bytes."
-def check_sizes(layer, payload_bytes):
+# 6.5 Declared sizes: "c MUST NOT exceed 2^28, N MUST NOT exceed 2^13 + 2·L, and S MUST NOT exceed 2^22 + 2048·L."
+# "N, S and L are sums over this layer and all layers before it in the file"
+def check_sizes(layer, payload_bytes, before):
+    """before: N, S and L of the layers before it. Sets those with it."""
     samples = sum(c * h * w for _, _, (c, h, w) in plane_shapes(layer))
     need(samples <= 1 << 28, f"{samples} plane samples", "LimitExceeded")
-    need(layer.rows <= (1 << 13) + 2 * payload_bytes, f"{layer.rows} own rows", "LimitExceeded")
     symbols = layer.rows_before + 72 * layer.rows + samples + sum(size for _, size in weight_shapes(layer))
-    need(symbols <= (1 << 22) + 2048 * payload_bytes, f"{symbols} symbols", "LimitExceeded")
+    layer.declared = [a + b for a, b in zip(before, (layer.rows, symbols, payload_bytes))]
+    rows, symbols, size = layer.declared
+    need(rows <= (1 << 13) + 2 * size, f"{rows} rows", "LimitExceeded")
+    need(symbols <= (1 << 22) + 2048 * size, f"{symbols} symbols", "LimitExceeded")
 
 
 # 6.4 Sections: "A section is present if and only if it has at least one symbol or value to code. Mode ans uses 0..4,
@@ -1085,187 +1089,103 @@ def decode_lzma_floats(data, counts):
     return arrays
 
 
-PULL_STEPS = (1, 2, 3, 4, 6, 8, 12, 16, 24, 32, 48, 64, 96, 128, 192, 256, 512)
-AROUND = [(x, y, z) for x in (-1, 0, 1) for y in (-1, 0, 1) for z in (-1, 0, 1)]
-PAIRS = ((0, 0), (1, 1), (2, 2), (0, 1), (0, 2), (1, 2))
+# 10.3 Channels: "an index into the ascending list of the bytes in which k bits are 1"
+PATTERNS = [[byte for byte in range(256) if bin(byte).count("1") == k] for k in range(9)]
 
 
-# 10.3 Grids: "A grid of N cells is dense if N < 100, or if its cells have at least 5·N occupied neighbours in all,
-# out of 26 each."
-class Grid:
-    def __init__(self, nodes, level):
-        index = {node: i for i, node in enumerate(nodes)}
-        self.level = level
-        boxes = ([(x + i, y + j, z + k) for i, j, k in AROUND] for x, y, z in nodes)
-        self.near = [[index[cell] for cell in box if cell in index] for box in boxes]
-        self.dense = len(nodes) < 100 or sum(map(len, self.near)) >= 6 * len(nodes)
-        self.cell = list(range(len(nodes)))  # the cell of each node; kept while nodes split
-
-    # 10.4 Prediction: "u_i = c_i << (8 − g) if g ≤ 8, else c_i >> (g − 8)"
-    def measure(self, centres):
-        g = self.level
-        self.units = [[v << (8 - g) if g <= 8 else v >> (g - 8) for v in c] for c in centres]
-        self.sums = [[0] * 10 for _ in self.near]
-        for cell, u in zip(self.cell, self.units):
-            terms = (1, *u, *(u[i] * u[j] for i, j in PAIRS))
-            self.sums[cell] = [a + b for a, b in zip(self.sums[cell], terms)]
-        self.boxes = {}
-
-    # 10.3 Grids: "A node's box in a grid is the 3 × 3 × 3 cells around the cell in which the node lies."
-    def box(self, node):
-        cell = self.cell[node]
-        if cell not in self.boxes:
-            self.boxes[cell] = [sum(column) for column in zip(*(self.sums[c] for c in self.near[cell]))]
-        return self.boxes[cell]
-
-
-# 10.4 Prediction: "For each node before a split along axis a. l_i is the number of unknown bits of coordinate p_i:
-# level − 1 for the axes already halved at this level, else level."
-def predict(nodes, left, axis, grids):
-    """Per node: context of sequence 1, context of sequence 2, 1 if the upper half is expected."""
-    centres = [[(p << (l + 1)) + (1 << l) for p, l in zip(node, left)] for node in nodes]
-    for grid in grids:
-        grid.measure(centres)
-    result = []
-    for node in range(len(nodes)):
-        grid = next((grid for grid in reversed(grids) if grid.box(node)[0] > 7), grids[0])
-        result.append(classify(grid.box(node), grid.units[node], grid.level, left, axis))
-    return result
-
-
-# 10.4 Prediction: "m_i = ((Σ d_i) << 4) // N' C_ij = (((Σ d_i d_j) << 8) // N' − m_i m_j) >> 8, and C_ii += max(2^(2
-# s_i) >> 3, 1) with s_i = max(9 − g + l_i, 0)"
-def classify(box, u, g, left, axis):
-    total, others = box[0], max(box[0] - 1, 1)
-    m = [((box[1 + i] - total * u[i]) << 4) // others for i in range(3)]
-    C = [[0] * 3 for _ in range(3)]
-    for slot, (i, j) in enumerate(PAIRS):
-        moment = box[4 + slot] - u[i] * box[1 + j] - u[j] * box[1 + i] + total * u[i] * u[j]  # appendix C
-        C[i][j] = C[j][i] = ((moment << 8) // others - m[i] * m[j]) >> 8
-    for i in range(3):
-        C[i][i] += max((1 << 2 * max(9 - g + left[i], 0)) >> 3, 1)
-    a, b, c = axis, (axis + 1) % 3, (axis + 2) % 3
-    A = [0] * 3
-    A[a] = C[b][b] * C[c][c] - C[b][c] ** 2
-    A[b] = C[a][c] * C[b][c] - C[a][b] * C[c][c]
-    A[c] = C[a][b] * C[b][c] - C[a][c] * C[b][b]
-    D = max(sum(C[a][j] * A[j] for j in range(3)), 1)
-    P = sum(A[j] * m[j] for j in range(3))
-    return contexts(total - 1, A[a], D, P, g, left, axis)
-
-
-# 10.4 Prediction: "density = clip((3 L − 16 (3 g − l_x − l_y − l_z)) // 12 + 30, 0, 39), L = bits(min(N, 4096)^8) −
-# 1, or 0 for N = 0 scale = clip(g − l_a, 0, 4)"
-def contexts(others, A, D, P, g, left, axis):
-    h = max(8 - g + left[axis], 0)
-    pull = bisect_right(PULL_STEPS, abs(P) // max(D >> h, 1)) if others else 0
-    sharpness = min(max((A << (2 * h + 4)) // D, 0).bit_length(), 9)
-    L = (min(others, 4096) ** 8).bit_length() - 1 if others else 0
-    density = min(max((3 * L - 16 * (3 * g - sum(left))) // 12 + 30, 0), 39)
-    scale = min(max(g - left[axis], 0), 4)
-    return (density, sharpness, min(pull // 3, 4)), (pull, sharpness, scale), int(P > 0)
-
-
-# 10.5 Adaptive bits: "Each of the six families keeps a pair of counts (c0, c1) per context, 0 at the start of the
-# payload."
-class AdaptiveBits:
-    def __init__(self, families):
-        self.families = families  # context -> its keys as (grandparent, parent, context)
-        self.counts = ({}, {}, {})
-
-    # 10.5 Adaptive bits: "p = 32768; for grandparent, parent, context with w = 1, 16, 16: p = (65536 c1 + 256 w p) //
-    # (c0 + c1 + 256 w)"
-    def probability(self, context):
-        p = 32768
-        for counts, key, w in zip(self.counts, self.families(context), (1, 16, 16)):
-            c0, c1 = counts.get(key, (0, 0))
-            p = (65536 * c1 + 256 * w * p) // (c0 + c1 + 256 * w)
-        q = max(min(p, 65536 - p), 16)
-        k = q.bit_length() - 3
-        q = min(((q >> k) << k) + ((1 << k) >> 1), 32768)
-        return q if p < 32768 else 65536 - q
-
-    # 10.5 Adaptive bits: "After the pass every bit adds 256 to its count in its context, parent and grandparent; then
-    # every pair that was added to and has t = c0 + c1 > 12288 becomes (12288 c0 // t, 12288 c1 // t)."
-    def update(self, coded):
-        for family, counts in enumerate(self.counts):
-            touched = {}
-            for context, bit in coded:
-                key = self.families(context)[family]
-                touched[key] = pair = counts.setdefault(key, [0, 0])
-                pair[bit] += 256
-            for key, (c0, c1) in touched.items():
-                if c0 + c1 > 12288:
-                    counts[key] = [12288 * c0 // (c0 + c1), 12288 * c1 // (c0 + c1)]
-
-    # 10.5 Adaptive bits: "With 64 elements or more there are four, of the elements whose index modulo 16 is 0; 1, 2;
-    # 3..6; 7..15; a shorter sequence has one. All tables of a pass are those at its start. Its elements are coded by
-    # ascending P(1), then by index."
-    def decode(self, stream, sequence):
-        bits = [0] * len(sequence)
-        for low, high in ((0, 1), (1, 3), (3, 7), (7, 16)) if len(sequence) >= 64 else ((0, 16),):
-            mine = [i for i in range(len(sequence)) if low <= i % 16 < high]
-            known = {context: self.probability(context) for context in {sequence[i] for i in mine}}
-            for p, i in sorted((known[sequence[i]], i) for i in mine):
-                bits[i] = stream.take(1, (0, TOTAL - 256 * p, TOTAL))[0]
-            self.update([(sequence[i], bits[i]) for i in mine])
-        return bits
-
-
-# 10.1 Payload: "For n = 0 the section is absent. Else: 3 × i32, the minimum of the voxel indices along x, y, z; 3 ×
-# u8, the depth of each axis: bits(largest index − minimum), 0..21; then one ANS stream to the end."
+# 10.1 Payload: "three zigzag varints, the minimum of the voxel indices along x, y, z, each at most 2^20 in magnitude;
+# then a u8, the depth R, 0..21"
+# 10.2 Counts: "Then, if n > 1, six varints, at most 2^26 each: how many nodes of all levels have 2, 3, .. 7 children.
+# Their sum MUST NOT exceed the number of nodes with more than one child, else Malformed."
 def decode_positions(data, count):
     if count == 0:
         return []
     reader = Reader(data)
-    low, depths = [reader.number("<i") for _ in range(3)], [reader.byte(21) for _ in range(3)]
-    stream = Ans(reader.take(reader.left))
-    nodes = decode_tree(stream, depths, count)
-    stream.finish()
+    low, depth = [reader.zigzag(MAX_VOXEL) for _ in range(3)], reader.byte(21)
+    levels = read_levels(reader, depth, count)
+    sizes = [reader.varint(MAX_COUNT) for _ in range(2, 8)] if count > 1 else []
+    several = sum(nodes - single for nodes, single in levels)
+    need(sum(sizes) <= several, f"{sum(sizes)} nodes with 2 to 7 children, {several} with more than one")
+    channels = decode_channels(reader.take(reader.left), channel_lengths(levels, count) + sizes)
+    nodes = grow(levels, iter(channels), count, sizes)
     for axis in range(3):
-        coordinates = [node[axis] for node in nodes]
-        need(min(coordinates) == 0, "no anchor at the minimum")
-        need(max(coordinates).bit_length() == depths[axis], "a depth does not fit")
+        need(min(node[axis] for node in nodes) == 0, "no anchor at the minimum")
+    need(max(v for node in nodes for v in node).bit_length() == depth, "the depth does not fit")
     cells = [tuple(p + m for p, m in zip(node, low)) for node in nodes]
-    need(all(abs(v) <= MAX_VOXEL for cell in cells for v in cell), "a voxel index over 2^20")
+    need(all(v <= MAX_VOXEL for cell in cells for v in cell), "a voxel index over 2^20")
     return cells
 
 
-# 10.2 Tree: "For level = R .. 1 and, in each, axis = z, y, x, every node is halved along the axis: its coordinate p
-# becomes 2p (lower half), 2p + 1 (upper half), or both in this order. If level exceeds the depth of the axis, it
-# becomes 2p and nothing is coded."
-def decode_tree(stream, depths, count):
-    flags = AdaptiveBits(lambda c: ((c[1] // 2, c[2]), (c[0] // 2, c[1] // 2, c[2]), c))
-    sides = AdaptiveBits(lambda c: (c[0], (c[0], c[2]), c))
-    nodes, grids = [(0, 0, 0)], []
-    for level in range(max(depths), 0, -1):
-        if not grids or grids[-1].dense:
-            grids = [*grids, Grid(nodes, level)][-3:]
-        for axis in (2, 1, 0):
-            if level > depths[axis]:
-                halves = [(0,)] * len(nodes)
-            else:
-                left = [level - 1 if a > axis else level for a in range(3)]
-                halves = decode_split(stream, flags, sides, predict(nodes, left, axis, grids), count)
-            for grid in grids:
-                grid.cell = [cell for cell, own in zip(grid.cell, halves) for _ in own]
-            nodes = [
-                tuple(2 * p + half if a == axis else p for a, p in enumerate(node))
-                for node, own in zip(nodes, halves)
-                for half in own
-            ]
-    need(len(nodes) == count, f"{len(nodes)} anchors, {count} declared")
+# 10.2 Counts: "two varints, at most 2^26 each: s, how many of its nodes have one child, and e, how many children there
+# are beyond one or two each" "s ≤ N, e ≤ 6·(N − s) and 2·N − s + e ≤ n MUST hold, and after level 1 there MUST be n
+# nodes, else Malformed."
+def read_levels(reader, depth, count):
+    """Per level, from the root's on: (number of nodes, number of nodes with one child)."""
+    levels, nodes = [], 1
+    for _ in range(depth):
+        if nodes == count:
+            levels.append((nodes, nodes))
+            continue
+        single, more = reader.varint(MAX_COUNT), reader.varint(MAX_COUNT)
+        need(
+            single <= nodes and more <= 6 * (nodes - single), f"{nodes} nodes, {single} with one child, {more} further"
+        )
+        levels.append((nodes, single))
+        nodes = 2 * nodes - single + more
+        need(nodes <= count, f"{nodes} nodes, {count} anchors")
+    need(nodes == count, f"{nodes} nodes at the end, {count} anchors")
+    return levels
+
+
+# 10.3 Channels: "if N < n, the numbers of children less 1 of the nodes whose parent has one child; then those of the
+# other nodes, of which the root is one" "the child's number of each node with one child"
+def channel_lengths(levels, count):
+    lengths, only = [], 0
+    for nodes, single in levels:
+        lengths += [only, nodes - only, single] if nodes < count else [single]
+        only = single
+    return lengths
+
+
+# 10.3 Channels: "Symbols MUST lie in 0..7, an index within its list, else Malformed."
+def within(channel, size):
+    need(all(0 <= k < size for k in channel), f"a symbol of the octree outside 0..{size - 1}")
+    return iter(channel)
+
+
+# 10.3 Channels: "The numbers of children MUST be those of 10.2, else Malformed: at each level s of them are 1 and their
+# sum is the next level's number of nodes, and over all levels as many are 2, 3, .. 7 as stated."
+def grow(levels, channels, count, sizes):
+    """The offsets (x, y, z) of the anchors, in Morton order."""
+    steps, only_child = [], [False]
+    for (nodes, single), (after, _) in zip(levels, [*levels[1:], (count, 0)]):
+        children = [1] * nodes
+        if nodes < count:
+            of_one, of_more = within(next(channels), 8), within(next(channels), 8)
+            children = [1 + next(of_one if only else of_more) for only in only_child]
+            need(children.count(1) == single, f"{children.count(1)} nodes with one child, stated {single}")
+            need(sum(children) == after, f"{sum(children)} children, stated {after}")
+        only_child = [k == 1 for k in children for _ in range(k)]
+        steps.append((children, within(next(channels), 8)))
+    numbers = [k for children, _ in steps for k in children]
+    need(not sizes or sizes == [numbers.count(k) for k in range(2, 8)], "the numbers of children are not those stated")
+    indices = {k: within(next(channels), len(PATTERNS[k])) for k in range(2, 8) if sizes}
+    nodes = [(0, 0, 0)]
+    for children, octants in steps:
+        nodes = [
+            tuple(2 * p + (child >> axis & 1) for axis, p in enumerate(node))
+            for node, k in zip(nodes, children)
+            for child in children_of(k, octants, indices)
+        ]
     return nodes
 
 
-# 10.2 Tree: "per node of which one half is occupied: 1 if it is the expected one (10.4)." "More than n nodes at any
-# time are Malformed."
-def decode_split(stream, flags, sides, guesses, count):
-    """Per node the halves that are occupied: (0,), (1,) or (0, 1)."""
-    both = flags.decode(stream, [flag for flag, _, _ in guesses]) if len(guesses) < count else [0] * len(guesses)
-    need(len(guesses) + sum(both) <= count, f"more than {count} anchors")
-    hits = iter(sides.decode(stream, [side for (_, side, _), two in zip(guesses, both) if not two]))
-    return [(0, 1) if two else (upper if next(hits) else 1 - upper,) for (_, _, upper), two in zip(guesses, both)]
+# 10.3 Channels: "Eight children have one pattern and no symbol."
+def children_of(k, octants, indices):
+    if k == 1:
+        return [next(octants)]
+    byte = PATTERNS[k][next(indices[k])] if k < 8 else 255
+    return [child for child in range(8) if byte >> child & 1]
 
 
 # 11.5 Dequantisation: "x̂ = binary32(binary64(k) · binary64(Q)): the product is exact, and the one rounding is to
@@ -1310,17 +1230,17 @@ def decode(data, max_layer=None):
     """The layers of a file's bytes, or of prefix max_layer, each with `symbols` and `tensors` by name, flat and in C
     order."""
     header, at = read_preamble(data)
-    described = behind_chunk_list(data[20:at])
-    layers, scene_id, rows = [], None, 0
+    scene_id = hashlib.sha256(behind_chunk_list(data[20:at])).digest()[:8]
+    layers, declared = [], (0, 0, 0)
     stop = len(header[1])
     if max_layer is not None:
         stop = 1 + max(i for i, (kind, _) in enumerate(header[1]) if kind <= min(max_layer, 2))
     for kind, size in header[1][:stop]:
-        payload, scene_id, at = read_chunk(data, at, kind, size, scene_id, described)
+        payload, at = read_chunk(data, at, kind, size, scene_id)
         if kind < 3:
-            layers.append(read_layer(payload, kind, rows, header))
+            layers.append(read_layer(payload, kind, declared, header))
             finish_last(layers)
-            rows += layers[-1].rows
+            declared = layers[-1].declared
     need(max_layer is not None or at == len(data), "bytes follow the last chunk")
     return layers
 

@@ -29,12 +29,18 @@ ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT / "tools"), str(ROOT / "spec")]
 
 #: Rooms that need the extra `train`; without it their tests are not even collected.
-NEED_TRAIN = ["bench", "cli", "data", "model", "pack", "render", "tools", "train", "view"]
+NEED_TRAIN = ["bench", "cli", "data", "model", "pack", "playback", "render", "tools", "train", "view"]
 NEED_TRAIN += ["fuzz/test_trained_file.py", "metrics/test_levels.py", "metrics/test_perceptual.py"]
 collect_ignore = [] if find_spec("torch") and find_spec("numba") else NEED_TRAIN
 
 settings.register_profile("pd4dgs", deadline=None, suppress_health_check=[HealthCheck.too_slow])
 settings.load_profile("pd4dgs")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Rooms with kernels first. Each worker begins with a run of the tests in their order, so that one worker compiles
+    the kernels, which takes a minute, and the others find them compiled."""
+    items.sort(key=lambda item: item.path.relative_to(ROOT / "tests").parts[0] not in NEED_TRAIN)
 
 
 @pytest.fixture(autouse=True, scope="session")

@@ -107,7 +107,10 @@ def test_the_decoder_uses_numpy_and_two_coders_beside_the_standard_library(room)
     for name in (n for n in MODULES if room_of(n) == room):
         for target in IMPORTS[name]:
             top = target.split(".")[0]
-            assert top in sys.stdlib_module_names | LIBRARIES | {"pd4dgs_codec"}, f"{name} imports {target}"
+            allowed = LIBRARIES | (
+                {"numba"} if name.endswith("_kernels") else set()
+            )  # loaded by encoders, if installed
+            assert top in sys.stdlib_module_names | allowed | {"pd4dgs_codec"}, f"{name} imports {target}"
 
 
 def test_every_mandatory_dependency_is_imported_by_the_package():
@@ -132,4 +135,4 @@ def test_decoding_needs_no_torch():
     data = encode(scene, layers=2, effort=1)
     done = subprocess.run([sys.executable, "-c", SCRIPT], input=data, capture_output=True, cwd=ROOT)
     assert done.returncode == 0, done.stderr.decode()
-    assert done.stdout.decode().split() == ["(0,", "1,", "2)", str(len(pd4dgs_codec.decode(data).anchor_q)), "1.0"]
+    assert done.stdout.decode().split() == ["(0,", "1,", "2)", str(len(pd4dgs_codec.decode(data).anchor_q)), "2.0"]

@@ -17,13 +17,16 @@ VARIANTS = {"best": {}, "gauss": {"priors": "gauss"}, "lzma": {"mode": "lzma"}}
 #: Spread of a channel over its step, from nearly constant to seven bits a symbol.
 SPREADS = 2.0 ** np.linspace(-0.5, 5.0, 68)
 
+#: Of a layer's hundred priors, at most.
+PRIOR_BITS = 5_000
+
 
 @cache
 def gaussian_scene() -> Scene:
-    """16,000 anchors, a third of them new at each level, all channels Gaussian with means and spreads of their own;
+    """6,000 anchors, a third of them new at each level, all channels Gaussian with means and spreads of their own;
     Gaussian weights, and planes that are Gaussian noise around 1."""
     rng = np.random.default_rng(21)
-    scene = make_scene(21, anchors=16_000, extent=500, hidden=(32,), channels=4, sides=(12, 12, 12, 8), width=32)
+    scene = make_scene(21, anchors=6_000, extent=500, hidden=(32,), channels=4, sides=(12, 12, 12, 8), width=32)
     n = len(scene.anchor_q)
     steps = {name: getattr(scene.steps, name) for name in ("feature", "scaling_log", "offset")}
     step = np.repeat([*steps.values()], [32, 6, 30])
@@ -73,8 +76,8 @@ def streams(variant: str, layer: int) -> dict[str, int]:
 @pytest.mark.parametrize("layer", [0, 1, 2])
 def test_gaussian_priors_spend_what_the_rate_model_says(layer):
     row = report("gauss").layers[layer]
-    assert row.layer == layer and row.anchors > 5000 and row.rate_bits > 1e6
-    assert 0.999 * row.rate_bits <= row.payload_bits <= 1.005 * row.rate_bits
+    assert row.layer == layer and row.anchors > 1800 and row.rate_bits > 5e5
+    assert 0.999 * row.rate_bits <= row.payload_bits <= 1.001 * row.rate_bits + PRIOR_BITS
 
 
 @pytest.mark.parametrize("layer", [0, 1, 2])

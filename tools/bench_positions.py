@@ -1,6 +1,7 @@
 """Bits per point and time of the position coder against Draco's kd-tree and a plain octree.
 
     python tools/bench_positions.py [--count 26000]
+    python tools/bench_positions.py FILE.pd4 ...      # of the layers of files
 
 Draco gets its highest compression level, no order to keep, and exactly the quantisation that leaves the integers as
 they are (checked). The plain octree is the entropy of its child masks under one table for all levels, not counted.
@@ -11,11 +12,13 @@ from __future__ import annotations
 
 import argparse
 import time
+from pathlib import Path
 
 import numpy as np
 from pages.draco import draco_encode
 from pages.scenes import SHARED
 
+from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.entropy.positions import decode_positions, encode_positions
 from pd4dgs_codec.morton import morton_codes, morton_order
 
@@ -96,6 +99,16 @@ def cases(count: int = 26000) -> dict[str, np.ndarray]:
     return {name: c[morton_order(c)] for name, c in distinct.items()}
 
 
+def layers(path: Path) -> dict[str, np.ndarray]:
+    """Name -> cells int32 [N, 3] in Morton order, of every layer of a `.pd4` file that has anchors of its own."""
+    scene, first, out = decode(path.read_bytes()), 0, {}
+    for layer, end in zip(scene.layers, scene.rows, strict=True):
+        if end > first:
+            out[f"{path.stem}, {layer}"] = scene.anchor_q[first:end]
+        first = end
+    return out
+
+
 def draco_bytes(cells: np.ndarray) -> int:
     """Size of Draco's kd-tree encoding at level 10, checked to be lossless."""
     import DracoPy
@@ -122,23 +135,33 @@ def octree_bits(cells: np.ndarray) -> float:
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--count", type=int, default=26000, help="points per surface (default: 26000)")
-    count = parser.parse_args().count
-    print(f"{'case':16} {'points':>7} {'ours':>7} {'Draco':>7} {'octree':>7} {'/Draco':>7}  encode  decode")
+    parser.add_argument("files", nargs="*", type=Path, metavar="FILE", help=".pd4 files, in place of made points")
+    arguments = parser.parse_args()
+    found = (
+        cases(arguments.count) if not arguments.files else {k: v for p in arguments.files for k, v in layers(p).items()}
+    )
+    print(
+        f"{'case':20} {'points':>7} {'bytes':>7} {'bits':>7} {'Draco':>7} {'octree':>7} {'/Draco':>7}   encode  decode"
+    )
     ours, draco = [], []
-    for name, cells in cases(count).items():
-        t0 = time.perf_counter()
+    for name, cells in found.items():
+        t0 = time.process_time()
         payload = encode_positions(cells)
-        t1 = time.perf_counter()
+        t1 = time.process_time()
         same = np.array_equal(decode_positions(payload, len(cells)), cells)
-        t2 = time.perf_counter()
+        t2 = time.process_time()
+        for _ in range(4):
+            decode_positions(payload, len(cells))
+        decoding = (time.process_time() - t2) / 4
         if not same:
             raise SystemExit(f"{name}: decoded cells differ")
         ours.append(8 * len(payload) / len(cells))
         draco.append(8 * draco_bytes(cells) / len(cells))
         plain = octree_bits(cells) / len(cells)
         row = f"{ours[-1]:7.3f} {draco[-1]:7.3f} {plain:7.3f} {ours[-1] / draco[-1]:7.3f}"
-        print(f"{name:16} {len(cells):7} {row} {t1 - t0:6.2f}s {t2 - t1:6.2f}s")
-    print(f"mean of the five surfaces: ours {np.mean(ours[:5]):.3f}, Draco {np.mean(draco[:5]):.3f} bits per point")
+        print(f"{name:20} {len(cells):7} {len(payload):7} {row} {t1 - t0:6.2f}s {1000 * decoding:5.1f}ms")
+    if not arguments.files:
+        print(f"mean of the five surfaces: ours {np.mean(ours[:5]):.3f}, Draco {np.mean(draco[:5]):.3f} bits per point")
 
 
 if __name__ == "__main__":

@@ -40,7 +40,7 @@ def fault_table() -> Any:
 def measure(out: Path, docs: Path, runs: int) -> Row:
     """All that the page shows, from the files of NAMES in `out`."""
     from pd4dgs_codec.bench import latency
-    from pd4dgs_codec.model.warm import warm_up
+    from pd4dgs_codec.playback.warm import warm_up
 
     contents = {name: (out / name / "scene.pd4").read_bytes() for name in NAMES}
     warm_up()

@@ -69,7 +69,7 @@ def _for_all(data: bytes) -> bool:
 def files(found: list[Vector]) -> dict[str, bytes]:
     """Path below spec/vectors -> content."""
     rows = ",\n".join(json.dumps(entry(v), ensure_ascii=False) for v in found)
-    manifest = f'{{"format": "1.0-draft", "vectors": [\n{rows}\n]}}\n'
+    manifest = f'{{"format": "2.0-draft", "vectors": [\n{rows}\n]}}\n'
     return {MANIFEST: manifest.encode(), **{v.name + SUFFIX: v.data for v in found}}
 
 

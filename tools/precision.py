@@ -29,6 +29,8 @@ FULL = ("--step-scales", "1,2,4", "--efforts", "1,5", "--cold", "1")
 #: Without the efforts that take minutes.
 SHORT = ("--step-scales", "1,4", "--efforts", "1", "--cold", "1")
 CODEC = ("--modes", "ans,lzma", "--repeats", "3", "--views", "4")
+#: Runs of each of the other coders.
+PEER_RUNS = 3
 #: Scenes whose symbols, anchors and splats other coders get too.
 PEERS = ("shelf-hand", "bouncing-balls", "synthetic-static")
 #: Kernels with other constants are compiled, which takes its time, and drawn for the first scene alone.
@@ -97,8 +99,8 @@ def beside(model: Path, scene: Scene, points: Sequence[dict[str, Any]]) -> dict[
     layers, level = decode_layers(data)[1], load_levels(data)[-1]
     symbols = peers.symbols_of(layers)
     pictures = frames(level.model.info, scene.source, 4, scene.downscale)
-    rows = peers.coder_rows(symbols, 3) + peers.position_rows(layers, 3)
-    rows += peers.splat_rows(level, pictures[len(pictures) // 2], usual["bytes"], 3)
+    rows = peers.coder_rows(symbols, PEER_RUNS) + peers.position_rows(layers, PEER_RUNS)
+    rows += peers.splat_rows(level, pictures[len(pictures) // 2], usual["bytes"], PEER_RUNS)
     return {"peers": peers.as_json(rows), "peers_rate_bits": symbols.rate_bits}
 
 

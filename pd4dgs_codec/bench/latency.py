@@ -143,7 +143,7 @@ def times(
 ) -> list[Times]:
     """A row per rate and level of a file, medians of `runs`. `step` is called after each run, 3 per rate and run.
 
-    The calling process must be warm (`model.warm.warm_up`).
+    The calling process must be warm (`playback.warm.warm_up`).
     """
     rows = []
     for rate in rates:

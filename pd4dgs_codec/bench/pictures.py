@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from pd4dgs_codec.bench.timing import clock
+from pd4dgs_codec.playback.player import Player
 from pd4dgs_codec.render.autograd.rasterization import rasterization
 from pd4dgs_codec.render.autograd.reference import composite, project
 from pd4dgs_codec.render.projection import ALPHA_MIN
@@ -49,10 +50,14 @@ def view(level: Level, frame: Frame) -> View:
     """The Gaussians that the frame's camera meets at its time, with the colours that it sees."""
     info, camera = level.model.info, frame.camera
     viewmat, K = np.array(camera.viewmat, np.float32), np.array(camera.K, np.float32)
-    with torch.no_grad():
-        g = level.model.gaussians(level.level, frame.time, camera)
+    if isinstance(level.model, Player):
+        splats = {name: getattr(level.model.gaussians(camera, frame.time), name) for name in SPLATS}
+    else:
+        with torch.no_grad():
+            g = level.model.gaussians(level.level, frame.time, camera)
+        splats = {name: getattr(g, name).numpy() for name in SPLATS}
     return {
-        **{name: getattr(g, name).numpy() for name in SPLATS},
+        **splats,
         "viewmat": viewmat,
         "K": K,
         "width": camera.width,

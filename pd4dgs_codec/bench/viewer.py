@@ -19,7 +19,7 @@ import numpy as np
 from pd4dgs_codec import threads
 from pd4dgs_codec.delivery.client import SceneClient
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.model.warm import warm_up
+from pd4dgs_codec.playback.warm import warm_up
 from pd4dgs_codec.scene import Camera, SceneInfo
 
 

@@ -11,7 +11,6 @@ MAX_DEPTH = 4  #: nested maps and lists in canonical msgpack
 
 # Scene
 MAX_ANCHORS = 1 << 24  #: rows over all layers; 68 int32 columns of them are 4.6 GB
-MAX_VOXEL = 1 << 20  #: |voxel index| per axis; a Morton code of three 21-bit offsets fits 63 bits
 
 # Deformation
 MAX_PLANE_SIDE = 4096  #: cells; eight times the paper's finest plane

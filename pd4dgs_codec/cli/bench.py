@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import re
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
@@ -14,8 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
 from pd4dgs_codec.atomic import whole_file
-from pd4dgs_codec.cli import common
-from pd4dgs_codec.cli.common import FAILED, OK, SOURCES, Console, Parser, UsageError, count, positive_int
+from pd4dgs_codec.cli import common, values
+from pd4dgs_codec.cli.common import FAILED, OK, SOURCES, Console, Parser, UsageError, add_reading
 from pd4dgs_codec.cli.files import STDIO, check_output, is_pd4, named_input, read_bytes, write_bytes
 from pd4dgs_codec.cli.progress import TrainingProgress, progress_bar
 from pd4dgs_codec.errors import DataError, DecodeError, TrainError
@@ -199,7 +198,7 @@ def _latency(args: argparse.Namespace, console: Console) -> Outcome:
         raise UsageError(f"found {len(args.data)} --data for {len(args.inputs)} files, expected one each or none")
     from pd4dgs_codec.bench import latency
     from pd4dgs_codec.data.dataset import load
-    from pd4dgs_codec.model.warm import warm_up
+    from pd4dgs_codec.playback.warm import warm_up
 
     contents = [_with_camera(name, args.anchors) for name in args.inputs]
     sets: list[Dataset | None] = [load(source, downscale=args.downscale) for source in args.data]
@@ -273,40 +272,40 @@ def _options(report: str, p: Parser) -> None:
     """What a report has beside the options that every command has."""
     add = p.add_argument
     if report == "codec":
-        scales, modes, efforts = _listed(common.positive_float), _listed(_mode), _listed(_effort)
+        kinds = (values.positive_float, values.one_of(*QUICK["modes"]), values.effort)
+        scales, modes, efforts = map(values.listed, kinds)
         add("input", metavar="FILE", help="checkpoint of pd4dgs-train, or a .pd4 file (- for stdin)")
         add("--step-scales", type=scales, metavar="X,...", help="factors on all steps (default: 0.5,1,2,4)")
         add("--modes", type=modes, metavar="M,...", help="entropy coders (default: ans,lzma)")
         add("--efforts", type=efforts, metavar="N,...", help="1 fast to 9 small (default: 1,5,9)")
-        add("--repeats", type=positive_int, metavar="N", help="runs per warm time (default: 5)")
-        add("--cold", type=count, metavar="N", help="fresh processes per cold time; 0: none (default: 1)")
+        add("--repeats", type=values.positive_int, metavar="N", help="runs per warm time (default: 5)")
+        add("--cold", type=values.count, metavar="N", help="fresh processes per cold time; 0: none (default: 1)")
         add("--quick", action="store_true", help="few points, one run each, no fresh processes")
         _add_views(p, "6; with --quick 2")
     elif report == "render":
         add("input", metavar="FILE", help=".pd4 file or .pt checkpoint; - reads a .pd4 from stdin")
-        add("--only", type=_listed(str), metavar="NAME,...", help="these ways to draw alone")
-        add("--repeats", type=positive_int, default=15, metavar="N", help="drawings per picture (default: 15)")
+        add("--only", type=values.listed(str), metavar="NAME,...", help="these ways to draw alone")
+        add("--repeats", type=values.positive_int, default=15, metavar="N", help="drawings per picture (default: 15)")
         add("--cache", metavar="FOLDER", help="where to keep compiled kernels (default: nowhere)")
         _add_views(p, "2")
     elif report == "train":
         presets = ("tiny", "small", "paper")
         add("source", nargs="?", metavar="SOURCE", help="dataset to train on, see below")
         add("--presets", nargs="+", choices=presets, metavar="PRESET", help="model sizes (default: tiny small)")
-        add("--seconds", type=common.positive_float, metavar="S", help="time limit per preset (default: 120)")
-        add("--iterations", type=positive_int, metavar="N", help="so many steps instead of a time limit")
-        add("--downscale", type=positive_int, metavar="K", help="images 1/K as wide and high (default: 1)")
-        add("--holdout", type=count, metavar="K", help="as in pd4dgs-train (default: 8)")
-        add("--seed", type=common.seed, metavar="N", help="seed of each run (default: 0)")
+        add("--seconds", type=values.positive_float, metavar="S", help="time limit per preset (default: 120)")
+        add("--iterations", type=values.positive_int, metavar="N", help="so many steps instead of a time limit")
+        add_reading(p, defaults=False)
+        add("--seed", type=values.seed, metavar="N", help="seed of each run (default: 0)")
         add("--from", dest="runs", nargs="+", metavar="FILE", help="instead of training: checkpoints or logs")
     elif report == "latency":
         larger = "measure a scene of N anchors in layer 0: those of FILE, and copies moved by up to 3 voxels"
         add("inputs", nargs="+", metavar="FILE", help=".pd4 files that hold a camera")
-        add("--rates", type=common.rates, default="2M,10M,50M", metavar="R", help="of the link (default: 2M,10M,50M)")
-        add("--runs", type=positive_int, default=9, metavar="N", help="runs per median (default: 9)")
-        add("--size", type=_size, metavar="WxH", help="of the pictures (default: that of the file's camera)")
-        add("--anchors", type=positive_int, metavar="N", help=larger)
+        add("--rates", type=values.rates, default="2M,10M,50M", metavar="R", help="of the link (default: 2M,10M,50M)")
+        add("--runs", type=values.positive_int, default=9, metavar="N", help="runs per median (default: 9)")
+        add("--size", type=values.picture_size, metavar="WxH", help="of the pictures (default: the file's camera's)")
+        add("--anchors", type=values.positive_int, metavar="N", help=larger)
         add("--data", action="append", default=[], metavar="SOURCE", help="dataset for quality, one per FILE")
-        add("--downscale", type=positive_int, default=1, metavar="K", help="its images 1/K as large (default: 1)")
+        add("--downscale", type=values.positive_int, default=1, metavar="K", help="images 1/K as large (default: 1)")
     else:
         add("--only", metavar="NAME", help="the group NAME, or the cases with NAME in their name")
     if report in PLOTS:
@@ -319,9 +318,8 @@ def _add_views(p: Parser, views: str) -> None:
     group = p.add_argument_group("pictures")
     what = "dataset whose held-out views give the cameras (default: the file's own camera over time)"
     group.add_argument("--data", metavar="SOURCE", help=what)
-    group.add_argument("--downscale", type=positive_int, metavar="K", help="pictures 1/K as wide and high (default: 1)")
-    group.add_argument("--holdout", type=count, metavar="K", help="as in pd4dgs-train (default: 8)")
-    group.add_argument("--views", type=positive_int, metavar="N", help=f"how many pictures (default: {views})")
+    add_reading(group, defaults=False)
+    group.add_argument("--views", type=values.positive_int, metavar="N", help=f"how many pictures (default: {views})")
 
 
 def _frames(args: argparse.Namespace, info: SceneInfo, views: int) -> list[Frame]:
@@ -333,30 +331,6 @@ def _frames(args: argparse.Namespace, info: SceneInfo, views: int) -> list[Frame
 def _given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
     """The options among `names` that were given a value."""
     return {name: getattr(args, name) for name in names if getattr(args, name) is not None}
-
-
-def _listed(kind: Callable[[str], T]) -> Callable[[str], tuple[T, ...]]:
-    """An option's type: comma-separated values of a kind, each once, in the order given."""
-    return lambda text: tuple(dict.fromkeys(kind(part) for part in text.split(",")))
-
-
-def _mode(text: str) -> str:
-    if text not in QUICK["modes"]:
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected one of {', '.join(QUICK['modes'])}")
-    return text
-
-
-def _effort(text: str) -> int:
-    if (value := positive_int(text)) > 9:
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected an integer from 1 to 9")
-    return value
-
-
-def _size(text: str) -> tuple[int, int]:
-    match = re.fullmatch(r"([1-9][0-9]{0,4})x([1-9][0-9]{0,4})", text)
-    if match is None or max(int(part) for part in match.groups()) > 65535:
-        raise argparse.ArgumentTypeError(f"found {text!r}, expected a size in pixels such as 480x360")
-    return int(match[1]), int(match[2])
 
 
 def _plot(panels: Sequence[Any], ylabel: str, path: Path) -> None:

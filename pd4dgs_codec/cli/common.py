@@ -9,17 +9,15 @@ from __future__ import annotations
 import argparse
 import contextlib
 import json
-import math
 import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NoReturn, TextIO, TypeVar
+from typing import Any, NoReturn, TextIO
 
+from pd4dgs_codec.cli.values import count, positive_int
 from pd4dgs_codec.errors import DecodeError, EncodeError, Pd4Error
 from pd4dgs_codec.jsonable import finite
 from pd4dgs_codec.threads import configure
-
-T = TypeVar("T")
 
 OK, FAILED, USAGE, PARTIAL = 0, 1, 2, 3
 
@@ -35,10 +33,6 @@ SOURCE is one of
   synthetic:local    the same, and small parts move on their own
   synthetic:fast     quick motion
   (synthetic:NAME?seed=n gives another scene of that kind)"""
-
-
-#: How sizes of layers are named.
-LAYER_NAMES = {"L0": 0, "L1": 1, "L2": 2}
 
 
 class UsageError(Exception):
@@ -82,6 +76,15 @@ class Parser(argparse.ArgumentParser):
         group.add_argument("-f", "--overwrite", action="store_true", help="replace an output that exists")
 
 
+def add_reading(options: argparse._ActionsContainer, *, defaults: bool = True) -> None:
+    """How a dataset is read: --downscale and --holdout. defaults: False for None where an option is not given."""
+    add, (downscale, holdout) = options.add_argument, (1, 8) if defaults else (None, None)
+    what = "use images 1/K as wide and high (default: 1)"
+    add("--downscale", type=positive_int, default=downscale, metavar="K", help=what)
+    what = "without split files, hold out frames with i %% K == K/2 (default: 8; 0: none)"
+    add("--holdout", type=count, default=holdout, metavar="K", help=what)
+
+
 class _Version(argparse.Action):
     """Prints the release and the format version; a plain "version" action would import the codec for every --help."""
 
@@ -94,83 +97,6 @@ def version_line(prog: str) -> str:
     from pd4dgs_codec import FORMAT_VERSION, __version__
 
     return f"{prog} {__version__}, format {FORMAT_VERSION}"
-
-
-# -- option types ------------------------------------------------------------------------------------------------------
-
-
-def positive_int(text: str) -> int:
-    """An integer >= 1."""
-    return _checked(text, int, lambda value: value >= 1, "an integer >= 1")
-
-
-def count(text: str) -> int:
-    """An integer >= 0."""
-    return _checked(text, int, lambda value: value >= 0, "an integer >= 0")
-
-
-def seed(text: str) -> int:
-    """An integer that torch's generators take, as does the next one."""
-    return _checked(text, int, lambda value: 0 <= value <= 2**63 - 2, "an integer from 0 to 2^63 - 2")
-
-
-def positive_float(text: str) -> float:
-    """A finite number > 0."""
-    return _checked(text, float, lambda value: 0 < value < math.inf, "a number > 0")
-
-
-def non_negative_float(text: str) -> float:
-    """A finite number >= 0."""
-    return _checked(text, float, lambda value: 0 <= value < math.inf, "a number >= 0")
-
-
-def finite_float(text: str) -> float:
-    """A finite number."""
-    return _checked(text, float, math.isfinite, "a number")
-
-
-def _checked(text: str, kind: Callable[[str], T], accept: Callable[[T], bool], expected: str) -> T:
-    with contextlib.suppress(ValueError):
-        if accept(value := kind(text)):
-            return value
-    raise argparse.ArgumentTypeError(f"found {text!r}, expected {expected}")
-
-
-def rate(text: str) -> float:
-    """A link rate in bits per second with k, M or G for 1e3, 1e6, 1e9: "2M" -> 2e6."""
-    return _scaled(text, {"k": 1e3, "M": 1e6, "G": 1e9}, "a rate in bits per second such as 2M or 500k")
-
-
-def rates(text: str) -> dict[str, float]:
-    """Comma-separated link rates: "2M,10M" -> {"2M": 2e6, "10M": 1e7}."""
-    return {name: rate(name) for name in text.split(",")}
-
-
-def duration(text: str) -> float:
-    """Seconds: "50ms", "1.5s" or "1.5"."""
-    return _scaled(text, {"ms": 1e-3, "s": 1.0}, "a time such as 50ms or 1.5s", low=0.0)
-
-
-def layer_sizes(text: str) -> dict[int, int]:
-    """Bytes by layer with k, M for 1e3, 1e6: "L0=425k,L1=80000" -> {0: 425000, 1: 80000}."""
-    expected = "sizes in bytes such as L0=425k,L1=120000"
-    sizes: dict[int, int] = {}
-    for part in text.split(","):
-        name, _, size = part.partition("=")
-        if name not in LAYER_NAMES or LAYER_NAMES[name] in sizes:
-            raise argparse.ArgumentTypeError(f"found {text!r}, expected {expected}, each layer once")
-        sizes[LAYER_NAMES[name]] = int(_scaled(size, {"k": 1e3, "M": 1e6}, expected, low=1.0))
-    return sizes
-
-
-def _scaled(text: str, units: dict[str, float], expected: str, low: float = math.ulp(0.0)) -> float:
-    """A finite number >= low times its unit."""
-    unit = next((unit for unit in units if text.endswith(unit)), "")
-    with contextlib.suppress(ValueError):
-        value = float(text.removesuffix(unit)) * units.get(unit, 1.0)
-        if low <= value < math.inf:
-            return value
-    raise argparse.ArgumentTypeError(f"found {text!r}, expected {expected}")
 
 
 # -- talking to the caller ---------------------------------------------------------------------------------------------

@@ -31,19 +31,15 @@ examples:
 def parser() -> Parser:
     """The options of `pd4dgs-decode`."""
     p = Parser("decode", "[scene.pd4] [-o FILE]", "Unpack a .pd4 file, or the first layers of one.", DETAILS)
-    p.add_argument(
-        "input", nargs="?", default=STDIO, metavar="scene.pd4", help="file or URL to read; - or nothing reads stdin"
-    )
-    p.add_argument(
-        "-o", "--output", metavar="FILE", help="FILE.npz or FILE.pt; - writes npz to stdout; without it only check"
-    )
+    what = "file or URL to read; - or nothing reads stdin"
+    p.add_argument("input", nargs="?", default=STDIO, metavar="scene.pd4", help=what)
+    what = "FILE.npz or FILE.pt; - writes npz to stdout; without it only check"
+    p.add_argument("-o", "--output", metavar="FILE", help=what)
     p.add_argument("--max-layer", type=int, choices=(0, 1, 2), help="stop after this layer")
-    p.add_argument(
-        "--symbols", action="store_true", help="with .npz: add the integers (NAME_q) and their steps (NAME_step)"
-    )
-    p.add_argument(
-        "--allow-partial", action="store_true", help="decode as many layers of a cut file as are whole; exit 3 then"
-    )
+    what = "with .npz: add the integers (NAME_q) and their steps (NAME_step)"
+    p.add_argument("--symbols", action="store_true", help=what)
+    what = "decode as many layers of a cut file as are whole; exit 3 then"
+    p.add_argument("--allow-partial", action="store_true", help=what)
     p.add_common()
     return p
 
@@ -77,11 +73,12 @@ def _decode(args: argparse.Namespace, console: Console) -> int:
 
 def _input(args: argparse.Namespace, console: Console) -> bytes:
     """The file's bytes; of a URL only those that --max-layer needs."""
-    from pd4dgs_codec.delivery.transfer import Transfer, is_url
+    from pd4dgs_codec.delivery.urls import is_url
 
     if not is_url(args.input):
         return read_bytes(args.input)
     from pd4dgs_codec.delivery.prefix import fetch
+    from pd4dgs_codec.delivery.transfer import Transfer
 
     transfer = Transfer(args.input)
     try:

@@ -6,20 +6,18 @@ import argparse
 import io
 import math
 from collections.abc import Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
+from pd4dgs_codec.cli import values
 from pd4dgs_codec.cli.common import (
     OK,
     SOURCES,
     Console,
     Parser,
     UsageError,
-    count,
-    layer_sizes,
-    non_negative_float,
+    add_reading,
     number,
-    positive_float,
-    positive_int,
     run,
     table,
 )
@@ -29,6 +27,7 @@ from pd4dgs_codec.codec.options import CHOICES, DEFAULTS, EncodeOptions
 from pd4dgs_codec.pack import MIN_GAIN_PER_MEGABYTE
 
 if TYPE_CHECKING:
+    from pd4dgs_codec.codec.metadata import Metadata
     from pd4dgs_codec.pack.packing import Packed, Views
     from pd4dgs_codec.scene import Scene
 
@@ -54,20 +53,14 @@ FIRST_FRAME_RATE = 2e6
 def parser() -> Parser:
     """The options of `pd4dgs-encode`."""
     p = Parser("encode", "model.pt -o FILE.pd4", "Pack a trained scene into a layered .pd4 file.", DETAILS)
-    p.add_argument(
-        "input", metavar="model.pt", help="checkpoint of pd4dgs-train, or a .pd4 file to pack again; - reads stdin"
-    )
+    what = "checkpoint of pd4dgs-train, or a .pd4 file to pack again; - reads stdin"
+    p.add_argument("input", metavar="model.pt", help=what)
     p.add_argument("-o", "--output", required=True, metavar="FILE.pd4", help="file to write; - writes stdout")
     _add_choice(p, "mode", "entropy coder")
     _add_choice(p, "deformation", "planes and networks of layers 1 and 2: coded integers, or float32 under LZMA")
     _add_choice(p, "priors", "distributions to choose from per channel")
-    p.add_argument(
-        "--step-scale",
-        type=positive_float,
-        default=DEFAULTS.step_scale,
-        metavar="X",
-        help="multiply every quantisation step: above 1 smaller and coarser (default: %(default)g)",
-    )
+    what = "multiply every quantisation step: above 1 smaller and coarser (default: %(default)g)"
+    p.add_argument("--step-scale", type=values.positive_float, default=DEFAULTS.step_scale, metavar="X", help=what)
     _add_choice(p, "layers", "auto leaves out layers without effect; a number keeps the layers up to it")
     efforts = CHOICES["effort"]
     _add_choice(p, "effort", f"{efforts[0]} fast, {efforts[-1]} small", type=int, metavar=f"{efforts[0]}-{efforts[-1]}")
@@ -75,33 +68,22 @@ def parser() -> Parser:
         p, "omit", "leave out what changes no picture and residuals too small to see, the former alone, or nothing"
     )
     p.add_argument("--no-verify", action="store_true", help="skip decoding the result and comparing every symbol")
-    p.add_argument(
-        "--target-size",
-        type=layer_sizes,
-        default={},
-        metavar="L0=425k,...",
-        help="most bytes that each layer may add to the file (layer 0 with the header): coarser steps, fewer anchors",
+    what = "most bytes that each layer may add to the file (layer 0 with the header): coarser steps, fewer anchors"
+    p.add_argument("--target-size", type=values.layer_sizes, default={}, metavar="L0=425k,...", help=what)
+    about = p.add_argument_group(
+        "what the file says about itself", "shown by pd4dgs-info; a .pd4 that is packed again keeps it"
     )
+    for name, what in (("title", "of the scene"), ("source", "what it was made of"), ("licence", "its terms of use")):
+        about.add_argument(f"--{name}", metavar="TEXT", help=what)
     views = p.add_argument_group("judging by pictures")
-    views.add_argument(
-        "--data",
-        metavar="SOURCE",
-        help="a dataset, see above: sizes are fitted on its training views, layers must pay on those held out",
-    )
-    views.add_argument(
-        "--downscale", type=positive_int, default=1, metavar="K", help="pictures 1/K as wide and high (default: 1)"
-    )
-    views.add_argument("--holdout", type=count, default=8, metavar="K", help="as in pd4dgs-train (default: 8)")
-    views.add_argument(
-        "--views",
-        type=positive_int,
-        default=16,
-        metavar="N",
-        help="use about N of its views of either kind, evenly spread (default: 16)",
-    )
+    what = "a dataset, see above: sizes are fitted on its training views, layers must pay on those held out"
+    views.add_argument("--data", metavar="SOURCE", help=what)
+    add_reading(views)
+    what = "use about N of its views of either kind, evenly spread (default: 16)"
+    views.add_argument("--views", type=values.positive_int, default=16, metavar="N", help=what)
     views.add_argument(
         "--min-gain",
-        type=non_negative_float,
+        type=values.non_negative_float,
         metavar="DB",
         help="with --data, leave out layers whose level gains less than DB dB mPSNR per megabyte "
         f"(default: {MIN_GAIN_PER_MEGABYTE:g}; 0: keep all)",
@@ -129,7 +111,7 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
         raise UsageError("--min-gain needs --data SOURCE: a gain is measured on its views")
     check_output(args.output, args.overwrite)
     options = _options(args)
-    scene, trained = _load(args)
+    scene, trained, metadata = _load(args)
     console.detail(f"{args.input}: {len(scene.anchor_q)} anchors, layers {list(scene.layers)}, steps {scene.steps}")
     from pd4dgs_codec.pack.packing import pack
 
@@ -140,6 +122,7 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
         views=_views(args, console),
         min_gain=MIN_GAIN_PER_MEGABYTE if args.min_gain is None else args.min_gain,
         downscale=args.downscale,
+        metadata=metadata,
         progress=lambda what: progress_bar(None, "pictures", what),
     )
     result = {"input": args.input, "output": args.output, **packed.json()}
@@ -163,18 +146,30 @@ def _options(args: argparse.Namespace) -> EncodeOptions:
     )
 
 
-def _load(args: argparse.Namespace) -> tuple[Scene, bool]:
-    """(scene, whether it holds a checkpoint's own floats: those of a .pd4 are gone). Only a checkpoint needs torch."""
+def _load(args: argparse.Namespace) -> tuple[Scene, bool, Metadata | None]:
+    """(scene, whether it holds a checkpoint's own floats: those of a .pd4 are gone, metadata). Only a checkpoint needs
+    torch."""
     data = read_bytes(args.input)
     if is_pd4(data):
         from pd4dgs_codec.codec.decoder import decode
+        from pd4dgs_codec.codec.info import metadata_of
 
-        return decode(data), False
+        return decode(data), False, _metadata(args, metadata_of(data))
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.model.convert import to_scene
 
     model, _ = checkpoint.load(args.input if args.input != STDIO else _Stdin(data))  # type: ignore[arg-type]
-    return to_scene(model), True
+    return to_scene(model), True, _metadata(args, None)
+
+
+def _metadata(args: argparse.Namespace, had: Metadata | None) -> Metadata | None:
+    """What the options say, in place of what the file had."""
+    given = {name: vars(args)[name] for name in ("title", "source", "licence") if vars(args)[name] is not None}
+    if not given:
+        return had
+    from pd4dgs_codec.codec.metadata import Metadata
+
+    return replace(had or Metadata(), **given)
 
 
 def _views(args: argparse.Namespace, console: Console) -> Views | None:

@@ -6,17 +6,7 @@ import argparse
 from collections.abc import Sequence
 from typing import Any
 
-from pd4dgs_codec.cli.common import (
-    OK,
-    SOURCES,
-    Console,
-    Parser,
-    count,
-    number,
-    positive_int,
-    run,
-    table,
-)
+from pd4dgs_codec.cli.common import OK, SOURCES, Console, Parser, add_reading, number, run, table
 from pd4dgs_codec.cli.files import named_input
 from pd4dgs_codec.cli.progress import progress_bar
 
@@ -40,16 +30,7 @@ def parser() -> Parser:
     p.add_argument("input", metavar="FILE", help=".pd4 file or .pt checkpoint; - reads a .pd4 from stdin")
     p.add_argument("source", metavar="SOURCE", help="dataset to compare with, see below")
     p.add_argument("--max-layer", type=int, choices=(0, 1, 2), help="leave out the layers above this one")
-    p.add_argument(
-        "--downscale", type=positive_int, default=1, metavar="K", help="use images 1/K as wide and high (default: 1)"
-    )
-    p.add_argument(
-        "--holdout",
-        type=count,
-        default=8,
-        metavar="K",
-        help="without split files, frames with i %% K == K/2 are held out (default: 8; 0: none)",
-    )
+    add_reading(p)
     p.add_argument("--perceptual", action="store_true", help="add perceptual distances, which take longer")
     p.add_common()
     return p

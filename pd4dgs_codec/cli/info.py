@@ -6,7 +6,8 @@ import argparse
 from collections.abc import Sequence
 from typing import Any
 
-from pd4dgs_codec.cli.common import OK, Console, Parser, number, rates, run, table
+from pd4dgs_codec.cli import values
+from pd4dgs_codec.cli.common import OK, Console, Parser, number, run, table
 from pd4dgs_codec.cli.files import STDIO, read_bytes
 from pd4dgs_codec.errors import DataError
 
@@ -33,13 +34,8 @@ def parser() -> Parser:
     p.add_argument("--check", action="store_true", help="decode everything, so that every checksum and rule is tested")
     p.add_argument("--bytes", action="store_true", help="show where the bytes are: sections by layer")
     p.add_argument("--hashes", action="store_true", help="SHA-256 per layer of its integers and of its float32 tensors")
-    p.add_argument(
-        "--at",
-        type=rates,
-        default="2M,10M,50M",
-        metavar="RATES",
-        help="link rates in bits per second for the first-frame times (default: 2M,10M,50M)",
-    )
+    what = "link rates in bits per second for the first-frame times (default: 2M,10M,50M)"
+    p.add_argument("--at", type=values.rates, default="2M,10M,50M", metavar="RATES", help=what)
     p.add_common()
     return p
 
@@ -72,12 +68,13 @@ def _info(args: argparse.Namespace, console: Console) -> int:
 
 def _input(args: argparse.Namespace, console: Console) -> tuple[bytes, int]:
     """(bytes, length of the file): all of it, or of a URL the header alone where that suffices."""
-    from pd4dgs_codec.delivery.transfer import Transfer, is_url
+    from pd4dgs_codec.delivery.urls import is_url
 
     if not is_url(args.input):
         data = read_bytes(args.input)
         return data, len(data)
     from pd4dgs_codec.delivery.prefix import fetch, fetch_header
+    from pd4dgs_codec.delivery.transfer import Transfer
 
     transfer = Transfer(args.input)
     try:
@@ -140,6 +137,17 @@ def _left_out_line(left_out: list[dict[str, str]]) -> list[str]:
     return [f"left out: {', '.join(row['what'] for row in left_out)} ({left_out[0]['why']})"] if left_out else []
 
 
+def _about_lines(metadata: dict[str, Any] | None) -> list[str]:
+    if metadata is None:
+        return []
+    texts = [f"{name}: {value}" for name, value in metadata.items() if isinstance(value, str) and name != "fault"]
+    quality = ", ".join(f"level {level} {db:.2f} dB" for level, db in metadata.get("quality", {}).items())
+    lines = [*texts, *([f"quality on held-out views: {quality}"] if quality else [])]
+    if "still_bytes" in metadata:
+        lines.append(f"still picture: {metadata['still_bytes']:,} bytes")
+    return [*lines, *([f"metadata cannot be read: {metadata['fault']}"] if "fault" in metadata else [])]
+
+
 def _bound_lines(declared: dict[str, float], nearest: dict[str, float]) -> list[str]:
     other = [what for what, bound in nearest.items() if declared[what] != bound]
     if not other:
@@ -166,6 +174,7 @@ def _text(result: dict[str, Any]) -> str:
                 for row in result["layers"]
             ],
         ),
+        *_about_lines(result["metadata"]),
         *_left_out_line(result["left_out"]),
         "errors at most: " + ", ".join(f"{what} {bound:.4g}" for what, bound in result["error_bounds"].items()),
         "first frame: " + ", ".join(f"{s:.2f} s at {rate}bps" for rate, s in result["first_frame_seconds"].items()),

@@ -8,9 +8,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.atomic import whole_files
-from pd4dgs_codec.cli.common import OK, Console, Parser, number, positive_float, run, table
+from pd4dgs_codec.cli.common import OK, Console, Parser, number, run, table
 from pd4dgs_codec.cli.files import read_bytes
 from pd4dgs_codec.cli.progress import progress_bar
+from pd4dgs_codec.cli.values import positive_float
 
 if TYPE_CHECKING:
     import numpy as np

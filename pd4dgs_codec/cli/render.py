@@ -10,18 +10,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.atomic import whole_file, whole_files
-from pd4dgs_codec.cli.common import (
-    OK,
-    SOURCES,
-    Console,
-    Parser,
-    UsageError,
-    count,
-    finite_float,
-    positive_float,
-    positive_int,
-    run,
-)
+from pd4dgs_codec.cli import values
+from pd4dgs_codec.cli.common import OK, SOURCES, Console, Parser, UsageError, add_reading, run
 from pd4dgs_codec.cli.files import STDIO, check_output, named_input
 from pd4dgs_codec.cli.progress import progress_bar
 
@@ -49,37 +39,20 @@ def parser() -> Parser:
     """The options of `pd4dgs-render`."""
     p = Parser("render", "FILE -o OUT", "Render a .pd4 file or a checkpoint to pictures or a video.", DETAILS)
     p.add_argument("input", metavar="FILE", help=".pd4 file or .pt checkpoint; - reads a .pd4 from stdin")
-    p.add_argument(
-        "-o", "--output", required=True, metavar="OUT", help="pictures such as out/%%04d.png, or a .gif or .mp4"
-    )
+    what = "pictures such as out/%%04d.png, or a .gif or .mp4"
+    p.add_argument("-o", "--output", required=True, metavar="OUT", help=what)
     p.add_argument("--max-layer", type=int, choices=(0, 1, 2), help="render what the layers up to this one give")
     p.add_argument("--data", metavar="SOURCE", help="take cameras, times and true images from a dataset")
     p.add_argument("--split", choices=("test", "train"), default="test", help="which views of it (default: test)")
-    p.add_argument(
-        "--downscale", type=positive_int, default=1, metavar="K", help="pictures 1/K as wide and high (default: 1)"
-    )
-    p.add_argument("--holdout", type=count, default=8, metavar="K", help="as in pd4dgs-train (default: 8)")
-    p.add_argument(
-        "--frames",
-        type=positive_int,
-        metavar="N",
-        help="pictures over the whole time (default: 60), or of --data the first N",
-    )
-    p.add_argument(
-        "--orbit",
-        type=finite_float,
-        default=0.0,
-        metavar="DEG",
-        help="sway the file's camera through DEG degrees around what it looks at",
-    )
-    p.add_argument(
-        "--fps", type=positive_float, default=20.0, metavar="F", help="frames per second of a video (default: 20)"
-    )
-    p.add_argument(
-        "--side-by-side",
-        action="store_true",
-        help="all levels next to each other, with the true image if --data is given",
-    )
+    add_reading(p)
+    what = "pictures over the whole time (default: 60), or of --data the first N"
+    p.add_argument("--frames", type=values.positive_int, metavar="N", help=what)
+    what = "sway the file's camera through DEG degrees around what it looks at"
+    p.add_argument("--orbit", type=values.finite_float, default=0.0, metavar="DEG", help=what)
+    what = "frames per second of a video (default: 20)"
+    p.add_argument("--fps", type=values.positive_float, default=20.0, metavar="F", help=what)
+    what = "all levels next to each other, with the true image if --data is given"
+    p.add_argument("--side-by-side", action="store_true", help=what)
     p.add_common()
     return p
 
@@ -99,11 +72,9 @@ def _render(args: argparse.Namespace, console: Console) -> int:
         from pd4dgs_codec.view.movie import check_mp4
 
         check_mp4()
-    levels = load_levels(named_input(args.input), args.max_layer)
+    levels = load_levels(named_input(args.input), args.max_layer, last_only=not args.side_by_side)
     console.detail(f"{args.input}: levels " + ", ".join(f"{row.level} ({row.anchors} anchors)" for row in levels))
     frames = _frames(args, levels[-1])
-    if not args.side_by_side:
-        levels = levels[-1:]
     milliseconds: list[float] = []
     with progress_bar(len(frames), "frames", "rendering") as step:
         outputs = _write(args, kind, _pictures(frames, levels, args.side_by_side, milliseconds, step), len(frames))

@@ -7,7 +7,8 @@ import signal
 import threading
 from collections.abc import Sequence
 
-from pd4dgs_codec.cli.common import OK, Console, Parser, duration, rate, run
+from pd4dgs_codec.cli.common import OK, Console, Parser, run
+from pd4dgs_codec.cli.values import duration, port, rate
 
 DETAILS = """\
 GET and HEAD with ranges, If-Range, ETag and CORS. Nothing outside DIR is served, nor names that begin with a dot.
@@ -57,17 +58,11 @@ def parser() -> Parser:
     p = Parser("serve", "DIR", "Serve a folder over HTTP, at the rate of a slow link if wanted.", DETAILS)
     p.add_argument("input", metavar="DIR", help="folder to serve")
     p.add_argument("--host", default="127.0.0.1", metavar="H", help="address to listen on (default: 127.0.0.1)")
-    p.add_argument("--port", type=_port, default=8000, metavar="N", help="port, 0 for any free one (default: 8000)")
+    p.add_argument("--port", type=port, default=8000, metavar="N", help="port, 0 for any free one (default: 8000)")
     p.add_argument("--rate", type=rate, metavar="BPS", help="rate of the link in bits per second, such as 2M")
     p.add_argument("--latency", type=duration, default=0.0, metavar="T", help="round trip, such as 50ms (default: 0)")
     p.add_common()
     return p
-
-
-def _port(text: str) -> int:
-    if text.isascii() and text.isdigit() and len(text) < 6 and int(text) < 65536:
-        return int(text)
-    raise argparse.ArgumentTypeError(f"found {text!r}, expected 0 to 65535")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -81,12 +76,18 @@ def _serve(args: argparse.Namespace, console: Console) -> int:
 
     log = console.message if console.verbose else None
     with Server(args.input, args.host, args.port, link=Link(args.rate), latency=args.latency, log=log) as server:
-        stop = threading.Event()
-        if threading.current_thread() is threading.main_thread():
-            for number in (signal.SIGINT, signal.SIGTERM):
-                signal.signal(number, lambda *_: stop.set())
+        stop = set_by_signals()
         with server.running():
             result = {"url": server.url, "folder": str(server.root), "rate": args.rate, "latency": args.latency}
             console.result(result, server.url, on_stdout=True)
             stop.wait()
     return OK
+
+
+def set_by_signals() -> threading.Event:
+    """An event that Ctrl-C and SIGTERM set from now on."""
+    stop = threading.Event()
+    if threading.current_thread() is threading.main_thread():
+        for number in (signal.SIGINT, signal.SIGTERM):
+            signal.signal(number, lambda *_: stop.set())
+    return stop

@@ -9,19 +9,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.atomic import remove_leftovers
+from pd4dgs_codec.cli import values
 from pd4dgs_codec.cli.common import (
     OK,
     SOURCES,
     Console,
     Parser,
     UsageError,
-    count,
-    non_negative_float,
+    add_reading,
     number,
-    positive_float,
-    positive_int,
     run,
-    seed,
     table,
 )
 from pd4dgs_codec.cli.files import STDIO, check_output
@@ -60,53 +57,29 @@ def parser() -> Parser:
     p.add_argument("source", metavar="SOURCE", help="dataset to train on, see below")
     p.add_argument("-o", "--output", required=True, metavar="FILE.pt", help="checkpoint to write")
     p.add_argument("--preset", choices=("tiny", "small", "paper"), help="model size (default: small)")
-    p.add_argument(
-        "--iterations",
-        type=positive_int,
-        metavar="N",
-        help="training steps (default: by preset, unless --max-seconds is given)",
-    )
-    p.add_argument(
-        "--max-seconds", type=positive_float, metavar="S", help="time to train; on --resume earlier time counts too"
-    )
-    p.add_argument(
-        "--downscale", type=positive_int, metavar="K", help="train on images 1/K as wide and high (default: 1)"
-    )
-    p.add_argument(
-        "--holdout",
-        type=count,
-        metavar="K",
-        help="without split files, hold out frames with i %% K == K/2 (default: 8; 0: none)",
-    )
-    p.add_argument("--seed", type=seed, metavar="N", help="seed of all that is random in training (default: 0)")
+    what = "training steps (default: by preset, unless --max-seconds is given)"
+    p.add_argument("--iterations", type=values.positive_int, metavar="N", help=what)
+    what = "time to train; on --resume earlier time counts too"
+    p.add_argument("--max-seconds", type=values.positive_float, metavar="S", help=what)
+    add_reading(p, defaults=False)
+    p.add_argument("--seed", type=values.seed, metavar="N", help="seed of all that is random in training (default: 0)")
     p.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to train (default: auto)")
     p.add_argument("--resume", metavar="FILE.pt", help="go on from this checkpoint, with the settings stored in it")
     p.add_argument("--log", metavar="FILE.jsonl", help="write one JSON object per step")
-    p.add_argument(
-        "--quality",
-        type=non_negative_float,
-        metavar="Q",
-        help="0 (small) to 100 (good): weights of the bit rates, pruning and steps at once (default: 50)",
-    )
-    p.add_argument(
-        "--rate-scale",
-        type=non_negative_float,
-        metavar="X",
-        help="weight of the anchors' bit rate against quality, instead of the quality's (at 50: 0.1; 1: the paper's)",
-    )
+    what = "0 (small) to 100 (good): weights of the bit rates, pruning and steps at once (default: 50)"
+    p.add_argument("--quality", type=values.non_negative_float, metavar="Q", help=what)
+    what = "weight of the anchors' bit rate against quality, instead of the quality's (at 50: 0.1; 1: the paper's)"
+    p.add_argument("--rate-scale", type=values.non_negative_float, metavar="X", help=what)
     p.add_argument(
         "--prune",
-        type=non_negative_float,
+        type=values.non_negative_float,
         metavar="X",
         help="half way, take out anchors whose absence adds at most this share to the squared error, instead of the "
         "quality's (at 50: 0.05; 0: none)",
     )
     p.add_argument("--max-layer", type=int, choices=(0, 1, 2), help="train without the layers above this one")
-    p.add_argument(
-        "--rollout",
-        choices=ROLLOUTS,
-        help="which level each step trains, see below (default: adaptive)",
-    )
+    what = "which level each step trains, see below (default: adaptive)"
+    p.add_argument("--rollout", choices=ROLLOUTS, help=what)
     p.add_argument(
         "--without",
         action="append",

@@ -8,9 +8,9 @@ import numpy as np
 
 from pd4dgs_codec.attributes.quantise import is_step
 from pd4dgs_codec.attributes.table import ATTRIBUTES
-from pd4dgs_codec.bitstream.limits import MAX_VOXEL
 from pd4dgs_codec.codec.kinds import LAYER_KINDS, SCAFFOLD_INPUT, LayerKind
 from pd4dgs_codec.errors import EncodeError
+from pd4dgs_codec.morton import MAX_VOXEL
 from pd4dgs_codec.scene import MASK_MIN_CODE, PLANES, TRUNK, Deformation, Network, Scene, SceneInfo, plane_sides
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pd4dgs_codec.bitstream.container import PREAMBLE_SIZE, read_chunk, read_preamble
 from pd4dgs_codec.codec.header import Header, scene_id_of, unpack_header
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
+from pd4dgs_codec.codec.layer_meta import Declared
 from pd4dgs_codec.codec.payload import read_layer
 from pd4dgs_codec.codec.symbols import LayerSymbols, assemble, check_last_layer
 from pd4dgs_codec.errors import DecodeError, Malformed, Truncated, UnsupportedFeature
@@ -12,15 +13,15 @@ from pd4dgs_codec.scene import Scene
 
 
 class LayerReader:
-    """Walks a file's chunks in order. It holds no bytes but the header's: every call gets all that has arrived."""
+    """Walks a file's chunks in order. It holds no bytes: every call gets all that has arrived."""
 
     def __init__(self) -> None:
         self.header: Header | None = None
         self.layers: list[LayerSymbols] = []
         self.offset = 0  #: of the next chunk
         self._index = 0
-        self._packed_header = b""
-        self._scene_id: bytes | None = None
+        self._scene_id = b""
+        self._declared = Declared()
 
     @property
     def complete(self) -> bool:
@@ -41,7 +42,7 @@ class LayerReader:
         if self.header is None:
             preamble = read_preamble(data)
             self.header, self.offset = unpack_header(preamble.header, offset=PREAMBLE_SIZE), preamble.size
-            self._packed_header = preamble.header
+            self._scene_id = scene_id_of(preamble.header)
         chunks = self.header.chunks
         while self._index < len(chunks):
             if max_layer is not None and not _any_layer(chunks[self._index :], max_layer):
@@ -68,21 +69,16 @@ class LayerReader:
         if kind is not None and chunk.ancillary:
             message = f"layer {kind.layer} is flagged ancillary, expected a critical chunk"
             raise Malformed(message, offset=self.offset, chunk=self._index)
-        if self._scene_id is None:
-            self._scene_id = scene_id_of(self._packed_header, chunk.payload)
-            if chunk.scene_id != self._scene_id:
-                expected = f"{self._scene_id.hex()} from the header and the layer-0 payload"
-                message = f"scene id {chunk.scene_id.hex()}, expected {expected}"
-                raise Malformed(message, offset=self.offset + 8, chunk=self._index)
         layer = None
         if kind is not None:
-            rows_before = sum(len(layer.anchor_q) for layer in self.layers)
             try:
-                layer = read_layer(chunk.payload, kind, rows_before, self.header.mode, self.header.raw_deformation)
+                layer = read_layer(chunk.payload, kind, self._declared, self.header.mode, self.header.raw_deformation)
                 check_last_layer([*self.layers, layer], self.header.info.voxel_size, self.header.attribute_steps)
                 _check_bounded(layer, self.header)
             except DecodeError as error:
                 raise _located(error, self._index, self.offset) from None
+            symbols = sum(a.size for a in layer.arrays())
+            self._declared = self._declared.and_layer(len(layer.anchor_q), symbols, len(chunk.payload))
         self._index += 1
         self.offset = chunk.end
         return layer

@@ -9,13 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.bitstream.container import write_chunk, write_preamble
+from pd4dgs_codec.bitstream.container import CHUNK_OVERHEAD, FLAG_ANCILLARY, write_chunk, write_preamble
 from pd4dgs_codec.codec.bounds import ErrorBound, rounding_bounds, verify_errors
 from pd4dgs_codec.codec.check import check_scene
 from pd4dgs_codec.codec.decoder import decode_layers
-from pd4dgs_codec.codec.header import Header, pack_header, scene_id_of
+from pd4dgs_codec.codec.header import Header, pack_header, payload_digest, scene_id_of
 from pd4dgs_codec.codec.kinds import LAYER_KINDS
+from pd4dgs_codec.codec.layer_meta import Declared
 from pd4dgs_codec.codec.left_out import LeftOut
+from pd4dgs_codec.codec.metadata import CHUNK_TYPE, Metadata, write_metadata
 from pd4dgs_codec.codec.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.codec.payload import StreamReport, read_meta, write_layer
 from pd4dgs_codec.codec.plan import plan
@@ -44,7 +46,8 @@ class LayerReport:
 @dataclass(frozen=True)
 class Report:
     """What encode did. left_out rows hold what, why, lossless and bytes: about what it would have cost. errors: how
-    far by the header decoded values may lie from those given and how far they do, empty if not verified."""
+    far by the header decoded values may lie from those given and how far they do, empty if not verified.
+    metadata_bytes: of the chunk that holds the metadata, 0 without one."""
 
     mode: str
     bytes: int
@@ -53,10 +56,11 @@ class Report:
     layers: list[LayerReport]
     left_out: list[dict[str, Any]]
     errors: list[ErrorBound]
+    metadata_bytes: int
 
     def added_bytes(self) -> dict[int, int]:
         """By layer what it adds to the file, the header counted with layer 0."""
-        header = self.bytes - sum(row.bytes for row in self.layers)
+        header = self.bytes - sum(row.bytes for row in self.layers) - self.metadata_bytes
         return {row.layer: row.bytes + (header if row.layer == 0 else 0) for row in self.layers}
 
     def json(self) -> dict[str, Any]:
@@ -71,12 +75,17 @@ def encode(scene: Scene, options: EncodeOptions = DEFAULTS, **changes: Any) -> b
 
 @one_blas_thread()
 def encode_with_report(
-    scene: Scene, options: EncodeOptions = DEFAULTS, *, left_out: Sequence[LeftOut] = (), **changes: Any
+    scene: Scene,
+    options: EncodeOptions = DEFAULTS,
+    *,
+    left_out: Sequence[LeftOut] = (),
+    metadata: Metadata | None = None,
+    **changes: Any,
 ) -> tuple[bytes, Report]:
     """(file, report) of a scene.
 
     changes: fields of EncodeOptions by name, in place of those of `options`. left_out: what the caller has taken out of
-    the scene, to be reported with the rest. Raises EncodeError.
+    the scene, to be reported with the rest. metadata: what the file says about itself. Raises EncodeError.
     """
     started = time.perf_counter()
     scene, options = replace(options, **changes).apply_scale(scene)
@@ -86,42 +95,47 @@ def encode_with_report(
     written = [write_layer(layer, options) for layer in symbols]
     _check_limits(planned, symbols, [payload for payload, _ in written])
     meant = assemble(planned.info, planned.steps.attributes, symbols)
-    data = _container(meant, options, [payload for payload, _ in written])
+    about = write_metadata(metadata) if metadata is not None else b""
+    data = _container(meant, options, [payload for payload, _ in written], about)
     errors = _verify(data, planned, symbols, meant) if options.verify else []
     reports = [_layer_report(layer, payload, r) for layer, (payload, r) in zip(symbols, written, strict=True)]
     kept = sum(r.anchors for r in reports)
     kept_bits = sum(r.position_bits + s.payload_bits for r in reports for s in r.streams if s.name == "attributes")
     rows = [item.row(scene.steps, options, kept, kept_bits) for item in (*left_out, *omitted)]
     seconds = round(time.perf_counter() - started, 4)
-    return data, Report(options.mode, len(data), options.verify, seconds, reports, rows, errors)
+    about_bytes = CHUNK_OVERHEAD + len(about) if about else 0
+    return data, Report(options.mode, len(data), options.verify, seconds, reports, rows, errors, about_bytes)
 
 
 def _check_limits(scene: Scene, symbols: list[LayerSymbols], payloads: list[bytes]) -> None:
     """Hold declared sizes and ranges of values against the format's limits as a decoder will, verified or not."""
-    rows = 0
+    declared = Declared()
     for index, (layer, payload) in enumerate(zip(symbols, payloads, strict=True)):
         try:
-            read_meta(payload, layer.kind, rows, layer.raw_deformation)
+            *_, declared = read_meta(payload, layer.kind, declared, layer.raw_deformation)
             check_last_layer(symbols[: index + 1], scene.info.voxel_size, scene.steps.attributes)
         except DecodeError as error:
             raise EncodeError(f"the scene is over a limit of the format: {error}") from None
-        rows += len(layer.anchor_q)
 
 
-def _container(meant: Scene, options: EncodeOptions, payloads: list[bytes]) -> bytes:
-    """The file of a scene as it will be decoded, from the payloads of its layers."""
-    types = [LAYER_KINDS[layer].chunk_type for layer in meant.layers]
+def _container(meant: Scene, options: EncodeOptions, payloads: list[bytes], metadata: bytes) -> bytes:
+    """The file of a scene as it will be decoded, from the payloads of its layers and of its metadata, if there is any.
+    The latter comes last: a picture does not wait for it."""
+    parts = [(LAYER_KINDS[layer].chunk_type, 0, payload) for layer, payload in zip(meant.layers, payloads, strict=True)]
+    if metadata:
+        parts.append((CHUNK_TYPE, FLAG_ANCILLARY, metadata))
     header = Header(
-        chunks=tuple(zip(types, map(len, payloads), strict=True)),
+        chunks=tuple((kind, len(payload)) for kind, _, payload in parts),
         mode=options.mode,
         deformation=options.deformation,
         attribute_steps=meant.steps.attributes,
         info=meant.info,
         error_bounds=rounding_bounds(meant, options.raw_deformation),
+        digest=payload_digest(payloads),
     )
     packed = pack_header(header)
-    scene_id = scene_id_of(packed, payloads[0])
-    chunks = [write_chunk(t, 0, scene_id, payload) for t, payload in zip(types, payloads, strict=True)]
+    scene_id = scene_id_of(packed)
+    chunks = [write_chunk(kind, flags, scene_id, payload) for kind, flags, payload in parts]
     return b"".join([write_preamble(packed), *chunks])
 
 

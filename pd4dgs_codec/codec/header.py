@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import Any
 
@@ -23,7 +24,7 @@ from pd4dgs_codec.scene import Camera, SceneInfo
 
 # Keys of the header map.
 CHUNKS, MODE, DEFORMATION, STEPS, VOXEL_SIZE, BOX, TIME_RANGE, BACKGROUND, NEAR_FAR, UP, UNIT = range(1, 12)
-CAMERA, ERROR_BOUNDS = 12, 13
+CAMERA, ERROR_BOUNDS, DIGEST = 12, 13, 14
 # Keys of the camera map.
 VIEWMAT, INTRINSICS, WIDTH, HEIGHT = range(1, 5)
 
@@ -42,6 +43,7 @@ TENSOR_CLASSES = {
 ALWAYS_BOUNDED = (*(a.name for a in ATTRIBUTES), LAYER_KINDS[0].weights_step)
 
 MAX_CAMERA_SIDE = 65535
+DIGEST_SIZE = 16  #: bytes
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,7 +51,7 @@ class Header:
     """chunks: (type, payload length in bytes) in file order. attribute_steps: by name, in the table's order.
 
     error_bounds: by field of Steps, how far a decoded value may lie from the one that the encoder was given, in the
-    unit of the values; a binary32 value >= 0.
+    unit of the values; a binary32 value >= 0. digest: payload_digest of the layers that were encoded together.
     """
 
     chunks: tuple[tuple[int, int], ...]
@@ -58,6 +60,7 @@ class Header:
     attribute_steps: dict[str, float]
     info: SceneInfo
     error_bounds: dict[str, float]
+    digest: bytes
 
     @property
     def raw_deformation(self) -> bool:
@@ -95,12 +98,13 @@ def pack_header(header: Header) -> bytes:
         }
     bounds = header.error_bounds
     fields[ERROR_BOUNDS] = {number: bounds[name] for name, number in TENSOR_CLASSES.items() if name in bounds}
+    fields[DIGEST] = header.digest
     return canonical.pack(fields)
 
 
 def unpack_header(data: bytes, offset: int = 0) -> Header:
     """The inverse of pack_header (clause "header"); `offset` is that of the header's first byte, for messages."""
-    fields = Fields(canonical.unpack(data, offset=offset), "header", set(range(CHUNKS, ERROR_BOUNDS + 1)))
+    fields = Fields(canonical.unpack(data, offset=offset), "header", set(range(CHUNKS, DIGEST + 1)))
     steps = fields.reals(STEPS, len(ATTRIBUTES))
     voxel_size = fields.real(VOXEL_SIZE)
     for name, step in zip(["voxel_size", *(a.name for a in ATTRIBUTES)], [voxel_size, *steps], strict=True):
@@ -131,19 +135,34 @@ def unpack_header(data: bytes, offset: int = 0) -> Header:
         attribute_steps={a.name: step for a, step in zip(ATTRIBUTES, steps, strict=True)},
         info=info,
         error_bounds=_unpack_error_bounds(fields),
+        digest=_unpack_digest(fields.get(DIGEST)),
     )
 
 
-def scene_id_of(header: bytes, payload: bytes) -> bytes:
+def payload_digest(payloads: Iterable[bytes]) -> bytes:
+    """What the header says of the layers' payloads, all those that were encoded together, in file order."""
+    digest = hashlib.sha256()
+    for payload in payloads:
+        digest.update(payload)
+    return digest.digest()[:DIGEST_SIZE]
+
+
+def scene_id_of(header: bytes) -> bytes:
     """The scene id of every chunk of a file: the first 8 bytes of the SHA-256 of the header's bytes behind its chunk
-    list, then of the layer-0 payload. Chunks may come and go without another id; whatever decodes them may not.
+    list. Chunks may come and go without another id; whatever decodes them may not.
 
     header: canonical, with a chunk list.
     """
     fields = canonical.unpack(header)
     map_head = 1 if len(fields) < 16 else 3
     chunk_list = len(canonical.pack(CHUNKS)) + len(canonical.pack(fields[CHUNKS]))
-    return hashlib.sha256(header[map_head + chunk_list :] + payload).digest()[:SCENE_ID_SIZE]
+    return hashlib.sha256(header[map_head + chunk_list :]).digest()[:SCENE_ID_SIZE]
+
+
+def _unpack_digest(value: object) -> bytes:
+    if not isinstance(value, bytes) or len(value) != DIGEST_SIZE:
+        raise Malformed(f"header: digest of the layers, expected {DIGEST_SIZE} bytes")
+    return value
 
 
 def _unpack_chunks(rows: list[Any]) -> tuple[tuple[int, int], ...]:

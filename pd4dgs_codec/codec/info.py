@@ -12,9 +12,11 @@ from pd4dgs_codec.codec.bounds import rounding_bounds
 from pd4dgs_codec.codec.decoder import read_layers
 from pd4dgs_codec.codec.header import unpack_header
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
-from pd4dgs_codec.codec.layer_meta import Section
+from pd4dgs_codec.codec.layer_meta import Declared, Section
+from pd4dgs_codec.codec.metadata import CHUNK_TYPE, TEXTS, Metadata, read_metadata
 from pd4dgs_codec.codec.payload import read_meta
 from pd4dgs_codec.codec.symbols import float_tensors
+from pd4dgs_codec.errors import DecodeError
 
 FORMAT_VERSION = f"{MAJOR}.{MINOR}"
 
@@ -25,22 +27,26 @@ def info(data: bytes) -> dict[str, Any]:
     layers: {layer, offset, bytes, end} (whole chunks; end = length of the prefix that holds layers 0 .. this one) and,
     for chunks that `data` holds whole, anchors, steps, planes ([C, x, y, z, t] per scale), networks (output widths) and
     sections (bytes by name; what else the chunk holds is its frame and its parameters).
+    metadata: {title, source, licence, command, quality, still_bytes} as far as given, {"fault"} if it cannot be read,
+    None where `data` holds no such chunk.
     """
     preamble = read_preamble(data)
     header = unpack_header(preamble.header, offset=PREAMBLE_SIZE)
-    layers, others, offset, rows = [], [], preamble.size, 0
+    layers, others, offset, declared = [], [], preamble.size, Declared()
+    metadata: dict[str, Any] | None = None
     for chunk_type, length in header.chunks:
         size = CHUNK_OVERHEAD + length
         kind = BY_CHUNK_TYPE.get(chunk_type)
         place = {"offset": offset, "bytes": size, "end": offset + size}
         if kind is None:
             others.append({"type": chunk_type, **place})
+            if chunk_type == CHUNK_TYPE and metadata is None and offset + size <= len(data):
+                metadata = _about(read_chunk(data, offset, type=chunk_type, length=length).payload)
         else:
             row: dict[str, Any] = {"layer": kind.layer, **place}
             if offset + size <= len(data):
                 payload = read_chunk(data, offset, type=chunk_type, length=length).payload
-                meta, _ = read_meta(payload, kind, rows, header.raw_deformation)
-                rows += meta.rows
+                meta, _, declared = read_meta(payload, kind, declared, header.raw_deformation)
                 row |= {"anchors": meta.rows, "steps": meta.steps}
                 row["planes"] = [[s.channels, *s.sides] for s in meta.scales]
                 row["sections"] = {Section(key).name.lower(): length for key, length in sorted(meta.sections.items())}
@@ -57,12 +63,35 @@ def info(data: bytes) -> dict[str, Any]:
         "voxel_size": header.info.voxel_size,
         "steps": header.attribute_steps,
         "error_bounds": header.error_bounds,
-        "anchors": rows if all("anchors" in row for row in layers) else None,
+        "anchors": declared.rows if all("anchors" in row for row in layers) else None,
         "time_range": list(header.info.time_range),
         "camera": header.info.camera is not None,
+        "metadata": metadata,
         "layers": layers,
         "chunks": others,
     }
+
+
+def metadata_of(data: bytes) -> Metadata | None:
+    """The metadata of a complete file, None if it has none. Raises DecodeError if it cannot be read."""
+    preamble = read_preamble(data)
+    offset = preamble.size
+    for chunk_type, length in unpack_header(preamble.header, offset=PREAMBLE_SIZE).chunks:
+        if chunk_type == CHUNK_TYPE:
+            return read_metadata(read_chunk(data, offset, type=chunk_type, length=length).payload)
+        offset += CHUNK_OVERHEAD + length
+    return None
+
+
+def _about(payload: bytes) -> dict[str, Any]:
+    """Metadata as JSON can hold it. A fault in it is none of the file's layers, so it is told and not raised."""
+    try:
+        found = read_metadata(payload)
+    except DecodeError as error:
+        return {"fault": str(error)}
+    texts = {name: text for name in TEXTS if (text := getattr(found, name))}
+    quality = {"quality": {str(level): db for level, db in found.quality.items()}} if found.quality else {}
+    return {**texts, **quality, **({"still_bytes": len(found.still)} if found.still else {})}
 
 
 def nearest_bounds(data: bytes) -> dict[str, float]:

@@ -1,7 +1,7 @@
 """What a file may say about itself beyond its scene: the content of an ancillary chunk, which decoders may skip.
 
 The content is canonical msgpack, one map of registered integer keys, in one zstd frame that declares its content's
-size. No file holds it yet: the format has no chunk type for it. Only these two functions import zstandard.
+size (clause "metadata" of the format). Only the two functions that pack and unpack it import zstandard.
 """
 
 from __future__ import annotations
@@ -14,6 +14,8 @@ import numpy as np
 from pd4dgs_codec.bitstream import canonical
 from pd4dgs_codec.codec.fields import Fields, as_integer
 from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
+
+CHUNK_TYPE = 3  #: ancillary
 
 # Keys of the map; what is empty is absent.
 TITLE, SOURCE, LICENCE, COMMAND, QUALITY, STILL = range(1, 7)

@@ -20,6 +20,7 @@ from urllib.parse import quote, urljoin, urlsplit
 
 from pd4dgs_codec.delivery.patience import Patient
 from pd4dgs_codec.delivery.ranges import content_range, strong_etag
+from pd4dgs_codec.delivery.urls import is_url
 from pd4dgs_codec.errors import DeliveryError, one_line
 
 BLOCK = 1 << 16
@@ -44,11 +45,6 @@ class OutOfTime(Exception):
 
 class _Cut(Exception):
     """The connection ended before what it promised, or an answer makes no sense; asking again may help."""
-
-
-def is_url(name: str) -> bool:
-    """Whether an input names a remote file."""
-    return name.lower().startswith(("http://", "https://"))
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ _LOW, _HIGH = FLOORS  # the higher floor keeps outliers from steering the fit
 
 
 @_inlined
-def _cost(frequency: int) -> int:
+def _cost(frequency: int) -> Any:
     """`bits.frequency_costs` of one frequency."""
     bits = np.float64(frequency).view(np.int64)
     i, f = (bits >> 40) & 4095, (bits >> 28) & 4095
@@ -57,7 +57,7 @@ def _mixed(first: np.ndarray, second: np.ndarray, weight: int, cdf: np.ndarray) 
 
 
 @_compiled
-def _table_cost(cdf: np.ndarray, floor: int, counts: np.ndarray) -> int:
+def _table_cost(cdf: np.ndarray, floor: int, counts: np.ndarray) -> Any:
     """Of counts int64 [n] under the table of cdf int64 [n - 1]."""
     n = len(counts)
     cost, before, spread = 0, 0, TOTAL - n * floor
@@ -458,7 +458,7 @@ def assign(costs: np.ndarray, prices: np.ndarray) -> tuple[np.ndarray, int]:
 
 
 @_compiled
-def split_cost(channels: np.ndarray, classes: np.ndarray, count: int) -> int:
+def split_cost(channels: np.ndarray, classes: np.ndarray, count: int) -> Any:
     """See `fit_reference.split_cost`."""
     n, cost = channels.shape[1], np.int64(0)
     sizes = np.zeros(count, np.int64)
@@ -491,7 +491,7 @@ def split_cost(channels: np.ndarray, classes: np.ndarray, count: int) -> int:
 
 
 @_compiled
-def gaussian_bits(values: np.ndarray, counts: np.ndarray) -> float:
+def gaussian_bits(values: np.ndarray, counts: np.ndarray) -> Any:
     """See `bits.gaussian_bits`, here of int64 values and their counts."""
     total, mu, spread, bits = counts.sum(), 0.0, 0.0, 0.0
     for i in range(len(values)):

@@ -8,6 +8,7 @@ Gaussians are fitted by interval likelihood (moments lose 15-130 % at sigma / Q 
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import numpy as np
 
@@ -137,7 +138,7 @@ def assign(costs: np.ndarray, prices: np.ndarray) -> tuple[np.ndarray, int]:
     return open_[owner], int(table.min(axis=1).sum() + prices[open_].sum())
 
 
-def split_cost(channels: np.ndarray, classes: np.ndarray, count: int) -> int:
+def split_cost(channels: np.ndarray, classes: np.ndarray, count: int) -> Any:
     """Order-0 entropy of channels int64 [m, n], each split into the `count` classes int64 [n] of its places."""
     cost = 0
     for channel in channels:
@@ -191,8 +192,9 @@ def _descend(
         if p.shape[1] == 5:
             cdf = ((256 - p[:, 4:]) * cdf + p[:, 4:] * norm_cdf28(n, p[:, 2], p[:, 3])) >> 8
         # the higher floor keeps outliers from steering the fit
-        each: np.ndarray = frequency_costs(np.diff(table_from_cdf28(cdf, FLOORS[-1]))) @ counts
-        return each
+        each = np.diff(table_from_cdf28(cdf, FLOORS[-1]))
+        total: np.ndarray = np.asarray(frequency_costs(each) @ counts)
+        return total
 
     f = cost(starts)
     x, fx = starts[f.argmin()], int(f.min())
@@ -215,7 +217,8 @@ def _descend(
                 break
         if best == len(f) - 1 or gain <= 0:
             steps = np.maximum(steps // 2, 1)
-    return x
+    found: np.ndarray = x
+    return found
 
 
 def _moments(counts: np.ndarray) -> np.ndarray:

@@ -1,15 +1,16 @@
 """Encoder side: choose the cheapest prior for a histogram of symbols. Nothing here is normative.
 
 Costs are exact, in units of 2^-20 bits: the integer table itself plus the prior's description. Only the position part
-of exceptions is an estimate. `loops` are the inner loops: numba's where it is installed, else numpy's, the same files
-from either.
+of exceptions is an estimate. Files are the same with and without numba.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cache, cached_property
+from importlib import import_module
+from types import ModuleType
 
 import numpy as np
 
@@ -29,10 +30,15 @@ from pd4dgs_codec.entropy.priors import (
     write_prior,
 )
 
-try:
-    from pd4dgs_codec.entropy import fit_kernels as loops
-except ImportError:
-    from pd4dgs_codec.entropy import fit_reference as loops  # type: ignore[no-redef]
+
+@cache
+def loops() -> ModuleType:
+    """The inner loops: numba's where it is installed, else numpy's. Loaded when first something is fitted, because
+    decoding imports this module too."""
+    try:
+        return import_module("pd4dgs_codec.entropy.fit_kernels")
+    except ImportError:
+        return import_module("pd4dgs_codec.entropy.fit_reference")
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,7 +53,7 @@ class Histogram:
     @property
     def rate_bits(self) -> float:
         """The sum of R(a), see `bits.gaussian_bits`."""
-        return float(loops.gaussian_bits(self.values, self.counts))
+        return float(loops().gaussian_bits(self.values, self.counts))
 
     @cached_property
     def gauss(self) -> Fitted:
@@ -86,7 +92,7 @@ def pool(histograms: Sequence[Histogram]) -> Histogram:
 
 def split_bits(channels: np.ndarray, classes: np.ndarray, count: int) -> float:
     """Order-0 entropy in bits of channels int64 [m, n], each split into the `count` classes int64 [n] of its places."""
-    return float(loops.split_cost(channels, classes, count)) / BIT
+    return float(loops().split_cost(channels, classes, count)) / BIT
 
 
 def costs_of(histograms: Sequence[Histogram], priors: Sequence[Fitted]) -> np.ndarray:
@@ -94,7 +100,7 @@ def costs_of(histograms: Sequence[Histogram], priors: Sequence[Fitted]) -> np.nd
     windows = [p.prior.window for p in priors]
     first = np.cumsum([0, *(len(p.costs) for p in priors[:-1])])
     shapes = np.array([(w.kmin, w.n, w.shift, at) for w, at in zip(windows, first.tolist(), strict=True)], np.int64)
-    matrix: np.ndarray = loops.cost_matrix(
+    matrix: np.ndarray = loops().cost_matrix(
         np.concatenate([h.values for h in histograms]),
         np.concatenate([h.counts for h in histograms]),
         np.cumsum([len(h.values) for h in histograms]),
@@ -133,7 +139,7 @@ def _const(h: Histogram, mode: int) -> Fitted:
 
 
 def _fit_gauss_in(h: Histogram, window: Window) -> Fitted:
-    mu8, si, floor, cost, costs = loops.gauss(_dense(h, window))
+    mu8, si, floor, cost, costs = loops().gauss(_dense(h, window))
     return _fitted(Gauss(window, Normal(mu8, si), FLOORS[floor]), costs, cost + _beside(h, window))
 
 
@@ -152,11 +158,11 @@ def _richer_priors(h: Histogram, found: Fitted, effort: int) -> list[Fitted]:
     spare = (found.own - beside) / BIT - order0_bits(seen)
     priors: list[Fitted] = []
     if spare > 40 + 0.72 * len(seen):  # a mixture's five more bytes; the entropy of a sample is low by log2(e) / 2 each
-        mu1, si1, mu2, si2, weight, floor, cost, costs = loops.mixture(dense, effort)
+        mu1, si1, mu2, si2, weight, floor, cost, costs = loops().mixture(dense, effort)
         mixture = Mixture(window, Normal(mu1, si1), Normal(mu2, si2), weight, FLOORS[floor])
         priors.append(_fitted(mixture, costs, cost + beside))
     if spare > len(seen):  # a class costs a bit or more
-        step, differences, top, width, mean16, cost, described, costs, classes = loops.classes(dense)
+        step, differences, top, width, mean16, cost, described, costs, classes = loops().classes(dense)
         if step >= 0:
             hist = Hist(window, CLASS_STEPS[step], top, bool(differences), width, mean16, classes)
             priors.append(_fitted(hist, costs, cost + beside, described))

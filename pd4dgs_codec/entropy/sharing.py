@@ -52,7 +52,7 @@ def _plan_block(histograms: Sequence[Histogram], plan: list[Fitted], fit: Fit, r
         priors.append(fit(pooled))
     best, costs = 1 << 62, costs_of(histograms, priors)
     for last in range(rounds - 1, -1, -1):
-        owner, total = loops.assign(costs, np.array([p.price for p in priors]))
+        owner, total = loops().assign(costs, np.array([p.price for p in priors]))
         if total >= best:
             break
         best, plan = total, [priors[p] for p in owner]

@@ -1,17 +1,22 @@
-"""Where a deformation's residuals lie over whole stretches of time, by interval arithmetic: bounds, not samples.
+"""Where a deformation's residuals lie over whole stretches of time: bounds, not samples.
 
-Between two instants of its grid a HexPlane's feature at a fixed point is A e(t) f(t) h(t), A the product of its spatial
-planes and e, f, h linear in t. Over a stretch of half-width 1 in u, the derivative of that cubic lies within
-A (e' f h + e f' h + e f h') +- |A| (2 |e' f' h + e' f h' + e f' h'| + 3 |e' f' h'|), all taken at its middle u = 0.
-Such (value, derivative, radius of the derivative) pass through linear layers exactly but for |W| on the radius, and
-through a ReLU by whether its input is positive, negative or of either sign on the stretch; the mean value theorem then
-encloses each output. Nothing here is normative.
+A quantity over a stretch, u = -1..1, is held as v + s u +- r: a line and how far it may be off (a Taylor model of order
+1). Between two instants of its grid a HexPlane's feature at a fixed point is A e(u) f(u) h(u), A the product of its
+spatial planes and e, f, h linear in u. Of this cubic c0 + c1 u + c2 u^2 + c3 u^3 the nearest line is
+c0 + c2 / 2 + (c1 + 3/4 c3) u, off by |c2| / 2 + |c3| / 4 at most (Chebyshev). Lines pass through linear layers as they
+are, and r with |W|. A ReLU whose input keeps its sign passes it or makes it 0; where the input lies in l..h with
+l < 0 < h, the output lies in m x .. m (x - l), m = h / (h - l) (Singh et al., "Fast and effective robustness
+certification", 2018). Nothing here is normative.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from types import ModuleType
+from typing import NamedTuple
 
 import numpy as np
 
@@ -20,19 +25,31 @@ from pd4dgs_codec.scene import LENGTH_HEADS, TRUNK, Deformation, Network, deform
 
 #: Added to both ends of every range, relative and absolute, for what binary32 sums lose.
 SLACK = 1e-4
-#: Parts into which the time between two instants is cut: with whole ones the ranges come out some thirty times as wide
-#: as what they enclose (trained scenes), with four twice, and each more costs its share of time.
-PARTS = 4
-#: Points enclosed at once: bounds the memory, about 20 kB a point at 100 instants.
-CHUNK = 1024
 
-Ranges = dict[str, tuple[np.ndarray, np.ndarray]]  #: head -> (low, high), float32 [n, width]
+
+class Range(NamedTuple):
+    """Where a head's residuals lie over a stretch of time: float32 [n, width]. middle: about in its middle."""
+
+    middle: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+
+Ranges = dict[str, Range]  #: by head
+
+
+@cache
+def kernels() -> ModuleType | None:
+    """The compiled loops, the same to the bit as those in numpy; None where numba is not installed."""
+    try:
+        return import_module("pd4dgs_codec.evaluate.reach_kernels")
+    except ImportError:
+        return None
 
 
 @dataclass(frozen=True, eq=False)
 class Stretch:
-    """A quantity over a stretch of time, u = -1..1: its value at u = 0, the middle of its derivative in u, and how far
-    the derivative may lie from that. float32 [n, width]."""
+    """A quantity over a stretch of time: value + slope u +- radius for u = -1..1, float32 [n, width]."""
 
     value: np.ndarray
     slope: np.ndarray
@@ -40,7 +57,7 @@ class Stretch:
 
     @property
     def reach(self) -> np.ndarray:
-        """How far the quantity may move from its middle value."""
+        """How far the quantity may lie from its value."""
         reach: np.ndarray = np.abs(self.slope) + self.radius
         return reach
 
@@ -50,40 +67,74 @@ class Stretch:
 
     def relu(self) -> Stretch:
         """After max(x, 0)."""
+        if found := kernels():
+            return Stretch(*found.relu(self.value, self.slope, self.radius))
         reach = self.reach
-        off, on = self.value + reach <= 0, self.value - reach >= 0
-        share = np.where(on, np.float32(1), np.where(off, np.float32(0), np.float32(0.5)))
-        either = np.where(on | off, np.float32(0), np.float32(0.5) * np.abs(self.slope))
-        return Stretch(np.maximum(self.value, 0), self.slope * share, np.where(off, 0, self.radius) + either)
+        low, high = self.value - reach, self.value + reach
+        share = np.where(low >= 0, np.float32(1), np.where(high <= 0, np.float32(0), high / (high - low)))
+        shift = np.where((low >= 0) | (high <= 0), np.float32(0), np.float32(-0.5) * share * low)
+        return Stretch(share * self.value + shift, share * self.slope, share * self.radius + shift)
 
 
-def time_grid(deformation: Deformation) -> np.ndarray:
-    """float64 [k]: 0 .. 1 with the instants of all scales, PARTS stretches from each to the next. A feature is a cubic
-    in t on each stretch."""
-    instants = [np.linspace(0.0, 1.0, s["zt"].shape[1]) if s["zt"].shape[1] > 1 else [0.0] for s in deformation.planes]
-    whole = np.unique(np.concatenate([[0.0, 1.0], *instants]))
-    grid: np.ndarray = np.interp(np.arange(PARTS * (len(whole) - 1) + 1) / PARTS, np.arange(len(whole)), whole)
-    return grid
+def instants(deformation: Deformation) -> np.ndarray:
+    """float64 [k]: 0 .. 1 with the instants of all scales. A feature is a cubic in t from each to the next."""
+    own = [np.linspace(0.0, 1.0, s["zt"].shape[1]) if s["zt"].shape[1] > 1 else [0.0] for s in deformation.planes]
+    return np.unique(np.concatenate([[0.0, 1.0], *own]))
 
 
-def residual_ranges(deformation: Deformation, box: np.ndarray, points: np.ndarray) -> Iterator[list[Ranges]]:
-    """Per chunk of CHUNK points [n, 3] (scene units), per stretch of time_grid the Ranges of all heads there.
+class Enclosure:
+    """The residuals of a deformation at fixed points [n, 3] (scene units), over stretches of time. It takes about 10 kB
+    a point at 100 instants."""
 
-    Lengths in scene units; an infinite range where the arithmetic overflows.
-    """
-    unit = deformation_unit(box)
-    with np.errstate(all="ignore"):
-        for first in range(0, len(points), CHUNK):
-            stretches = []
-            for features in _features(deformation, box, points[first : first + CHUNK]):
-                hidden = _run(deformation.networks[TRUNK], features).relu()
-                ranges: Ranges = {}
-                for name, network in deformation.networks.items():
-                    if name != TRUNK:
-                        scale = unit if name in LENGTH_HEADS else np.float32(1)
-                        ranges[name] = _ends(_run(network, hidden), scale)
-                stretches.append(ranges)
-            yield stretches
+    def __init__(self, deformation: Deformation, box: np.ndarray, points: np.ndarray):
+        self._networks = deformation.networks
+        self._unit = deformation_unit(box)
+        extent = np.maximum(box[1] - box[0], np.finfo(np.float32).tiny)
+        place = np.clip((points - box[0]) / extent, 0.0, 1.0).astype(np.float32)
+        self._spatial: list[np.ndarray] = []  # per scale the product of the spatial planes [n, C]
+        self._temporal: list[list[np.ndarray]] = []  # per scale the three time planes' columns [T, n, C]
+        for scale in deformation.planes:
+            at = place * (np.array(plane_sides(scale)[:3], dtype=np.float32) - 1)
+            pairs = (("xy", 0, 1), ("xz", 0, 2), ("yz", 1, 2))
+            self._spatial.append(np.prod([bilinear(scale[name], at[:, a], at[:, b]) for name, a, b in pairs], axis=0))
+            self._temporal.append([_columns(scale[name], at[:, a]) for a, name in enumerate(("xt", "yt", "zt"))])
+
+    def ranges(self, start: float, end: float, heads: Sequence[str], rows: np.ndarray | None = None) -> Ranges:
+        """The ranges of `heads`, those that there are, at the points `rows` (all if None) over the times start..end,
+        which no instant divides. Lengths in scene units; infinite or NaN where the arithmetic overflows."""
+        with np.errstate(all="ignore"):
+            hidden = _run(self._networks[TRUNK], self._features(start, end, rows)).relu()
+            found: Ranges = {}
+            for names, network in _together({n: self._networks[n] for n in heads if n in self._networks}):
+                x, first = _run(network, hidden), 0
+                for name in names:
+                    last = first + len(self._networks[name][-1][1])
+                    part = Stretch(x.value[:, first:last], x.slope[:, first:last], x.radius[:, first:last])
+                    found[name] = _ends(part, self._unit if name in LENGTH_HEADS else np.float32(1))
+                    first = last
+        return found
+
+    def _features(self, start: float, end: float, rows: np.ndarray | None) -> Stretch:
+        """The features [n, sum of C]."""
+        parts = []
+        for product, lines in zip(self._spatial, self._temporal, strict=True):
+            last = len(lines[0]) - 1
+            first = min(int((start + end) / 2 * last), max(last - 1, 0))
+            middle, half = np.float32((start + end) / 2 * last - first), np.float32((end - start) / 2 * last)
+            pairs = [(columns[first], columns[min(first + 1, last)]) for columns in lines]
+            parts.append(_cubic(product, pairs, middle, half, rows))
+        return Stretch(*(np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True)))
+
+
+def _together(networks: dict[str, Network]) -> Iterator[tuple[list[str], Network]]:
+    """Networks of one linear layer as one, and the others each."""
+    single = [name for name, network in networks.items() if len(network) == 1]
+    if single:
+        layers = [networks[name][0] for name in single]
+        yield single, ((np.concatenate([w for w, _ in layers]), np.concatenate([b for _, b in layers])),)
+    for name, network in networks.items():
+        if len(network) > 1:
+            yield [name], network
 
 
 def _run(network: Network, x: Stretch) -> Stretch:
@@ -92,29 +143,9 @@ def _run(network: Network, x: Stretch) -> Stretch:
     return x
 
 
-def _ends(x: Stretch, scale: np.float32) -> tuple[np.ndarray, np.ndarray]:
+def _ends(x: Stretch, scale: np.float32) -> Range:
     reach = x.reach + SLACK * (1 + np.abs(x.value))
-    low, high = (x.value - reach) * scale, (x.value + reach) * scale
-    return np.nan_to_num(low, nan=-np.inf, neginf=-np.inf), np.nan_to_num(high, nan=np.inf, posinf=np.inf)
-
-
-def _features(deformation: Deformation, box: np.ndarray, points: np.ndarray) -> Iterator[Stretch]:
-    """The features [n, sum of C] of fixed points, per stretch of the time grid."""
-    extent = np.maximum(box[1] - box[0], np.finfo(np.float32).tiny)
-    place = np.clip((points - box[0]) / extent, 0.0, 1.0).astype(np.float32)
-    spatial, temporal = [], []
-    for scale in deformation.planes:
-        at = place * (np.array(plane_sides(scale)[:3], dtype=np.float32) - 1)
-        pairs = (("xy", 0, 1), ("xz", 0, 2), ("yz", 1, 2))
-        spatial.append(np.prod([bilinear(scale[name], at[:, a], at[:, b]) for name, a, b in pairs], axis=0))
-        temporal.append([_columns(scale[name], at[:, a]) for a, name in enumerate(("xt", "yt", "zt"))])
-    grid = time_grid(deformation)
-    for start, end in zip(grid[:-1], grid[1:], strict=True):
-        parts = [
-            _product(product, [_at_times(rows, start, end) for rows in lines])
-            for product, lines in zip(spatial, temporal, strict=True)
-        ]
-        yield Stretch(*(np.concatenate(arrays, axis=1) for arrays in zip(*parts, strict=True)))
+    return Range(x.value * scale, (x.value - reach) * scale, (x.value + reach) * scale)
 
 
 def _columns(plane: np.ndarray, u: np.ndarray) -> np.ndarray:
@@ -126,18 +157,24 @@ def _columns(plane: np.ndarray, u: np.ndarray) -> np.ndarray:
     return columns
 
 
-def _at_times(rows: np.ndarray, start: float, end: float) -> tuple[np.ndarray, np.ndarray]:
-    """(value in the middle of start..end, half of the change over it) of what `rows` [T, n, C] hold, linear there."""
-    last = len(rows) - 1
-    first = min(int((start + end) / 2 * last), max(last - 1, 0))
-    a, change = rows[first], rows[min(first + 1, last)] - rows[first]
-    middle, half = (start + end) / 2 * last - first, (end - start) / 2 * last
-    return a + change * np.float32(middle), change * np.float32(half)
-
-
-def _product(a: np.ndarray, lines: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(value, slope, radius) of a times three linear functions, see the head of this file."""
-    (e, de), (f, df), (h, dh) = lines
-    slope = a * (de * f * h + e * df * h + e * f * dh)
-    radius = np.abs(a) * (2 * np.abs(de * df * h + de * f * dh + e * df * dh) + 3 * np.abs(de * df * dh))
-    return a * e * f * h, slope, radius
+def _cubic(
+    a: np.ndarray,
+    pairs: Sequence[tuple[np.ndarray, np.ndarray]],
+    middle: np.float32,
+    half: np.float32,
+    rows: np.ndarray | None,
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(value, slope, radius) of a times three linear functions, see the head of this file: each goes from the first of
+    its pair at 0 to the second at 1, over middle - half .. middle + half. float32 [n, C], of which `rows` are taken."""
+    if found := kernels():
+        at = np.arange(len(a)) if rows is None else rows
+        value, slope, radius = found.cubic(a, *pairs[0], *pairs[1], *pairs[2], middle, half, at)
+        return value, slope, radius
+    every: np.ndarray | slice = slice(None) if rows is None else rows
+    a = a[every]
+    lines = [(first[every], second[every] - first[every]) for first, second in pairs]
+    (e, de), (f, df), (h, dh) = ((first + change * middle, change * half) for first, change in lines)
+    second, third = a * (de * df * h + de * f * dh + e * df * dh), a * de * df * dh
+    slope = a * (de * f * h + e * df * h + e * f * dh) + np.float32(0.75) * third
+    radius = np.float32(0.5) * np.abs(second) + np.float32(0.25) * np.abs(third)
+    return a * e * f * h + np.float32(0.5) * second, slope, radius

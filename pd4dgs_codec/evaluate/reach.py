@@ -4,68 +4,118 @@ The global planes are read at the anchors, which stand still. The local ones are
 the local deformation: each mean lies in a box per stretch of time (see `enclosure`), and every cell that a point of
 the box may read counts. A Gaussian whose opacity stays under the threshold for every direction and time is never drawn
 (clause 13.4, step 4), so where it lies matters to no picture.
+
+Boxes over a whole stretch, from one instant to the next, may be far wider than what they enclose. But most wide boxes
+hold no cell that is not read anyway. Stretches are halved only where a wide box does, and where the opacity of a
+Gaussian that no sample shows is in doubt.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import TypeVar
 
 import numpy as np
 
-from pd4dgs_codec.evaluate.enclosure import CHUNK, Ranges, residual_ranges, time_grid
+from pd4dgs_codec import threads
+from pd4dgs_codec.evaluate.enclosure import Enclosure, Range, Ranges, instants, kernels
 from pd4dgs_codec.scene import FEATURE_DIM, N_OFFSETS, PLANES, Scene, plane_sides
 
 Reached = tuple[dict[str, np.ndarray], ...]  #: per scale, plane name -> bool [H, W]
 
-Cells = tuple[np.ndarray, np.ndarray]  #: (first, last) cell on an axis, int [n]
+Cells = tuple[np.ndarray, np.ndarray]  #: (first, last) cell on an axis, int64 [n]
+Span = tuple[float, float]  #: of time, 0..1
 
 #: Cells by which a position may be off: another renderer rounds its coordinates otherwise.
 CELL_SLACK = 0.02
 #: Share by which an opacity may be off, for the same reason.
 OPACITY_SLACK = 1e-3
+#: Halvings of the time between two instants, for cells and for what is shown (whose offsets are few bytes).
+HALVINGS, SHOW_HALVINGS = 2, 1
+#: A box at most so wide, in cells of the finest plane, is not made narrower.
+NARROW = 0.3
+#: Points enclosed at once: bounds the memory.
+CHUNK = 1024
+
+T, U = TypeVar("T"), TypeVar("U")
+
+
+class _Boxes:
+    """Where points may lie in the unit cube, float32 [n, 3], and over which times, float64 [n]."""
+
+    def __init__(self, low: np.ndarray, high: np.ndarray, start: np.ndarray, end: np.ndarray):
+        self.low, self.high, self.start, self.end = low, high, start, end
+
+    def of(self, chosen: np.ndarray) -> _Boxes:
+        return _Boxes(self.low[chosen], self.high[chosen], self.start[chosen], self.end[chosen])
 
 
 class _Marks:
     """The cells read so far of all planes of a deformation."""
 
-    def __init__(self, planes: tuple[dict[str, np.ndarray], ...], box: np.ndarray):
+    def __init__(self, planes: tuple[dict[str, np.ndarray], ...]):
         self.sides = [plane_sides(scale) for scale in planes]
-        self.box = box
         self.reached = tuple({n: np.zeros(scale[n].shape[1:], bool) for n, _, _ in PLANES} for scale in planes)
 
-    def read(self, low: np.ndarray, high: np.ndarray, start: float, end: float) -> None:
-        """Points may lie anywhere between low and high [n, 3] at any time in start..end; NaN stands for anywhere."""
-        extent = np.maximum(self.box[1] - self.box[0], np.finfo(np.float32).tiny)
-        low = np.clip(np.nan_to_num((low - self.box[0]) / extent, nan=0.0), 0.0, 1.0)
-        high = np.clip(np.nan_to_num((high - self.box[0]) / extent, nan=1.0), 0.0, 1.0)
-        for sides, marks in zip(self.sides, self.reached, strict=True):
-            ranges = [_cells(low[:, i], high[:, i], sides[i]) for i in range(3)]
-            times = _cells(np.array([start]), np.array([end]), sides[3])
+    def read(self, boxes: _Boxes) -> None:
+        """Points in the boxes may be read."""
+        for marks, axes in zip(self.reached, self._axes(boxes), strict=True):
             for name, a, b in PLANES:
-                rows = times if b == 3 else ranges[b]
-                marks[name] |= _rectangles(rows, ranges[a], marks[name].shape)
+                change = _one_wider(marks[name])
+                _add_rectangles(change, axes[b], axes[a])
+                marks[name] |= change.cumsum(0).cumsum(1)[:-1, :-1] > 0
+
+    def unread(self, boxes: _Boxes) -> np.ndarray:
+        """bool [n]: the boxes that hold a cell not read so far."""
+        found = np.zeros(len(boxes.low), bool)
+        for marks, axes in zip(self.reached, self._axes(boxes), strict=True):
+            for name, a, b in PLANES:
+                sums = _one_wider(marks[name])
+                np.cumsum(np.cumsum(~marks[name], axis=0), axis=1, out=sums[1:, 1:])
+                found |= _counted(sums, axes[b], axes[a])
+        return found
+
+    def _axes(self, boxes: _Boxes) -> Iterable[list[Cells]]:
+        """Per scale, the cells on the axes x, y, z, t."""
+        for sides in self.sides:
+            axes = [_cells(boxes.low[:, i], boxes.high[:, i], sides[i]) for i in range(3)]
+            yield [*axes, _cells(boxes.start, boxes.end, sides[3])]
+
+
+def _one_wider(marks: np.ndarray) -> np.ndarray:
+    """Zeros, int64 [H + 1, W + 1] for marks [H, W]."""
+    height, width = marks.shape
+    return np.zeros((height + 1, width + 1), np.int64)
 
 
 def _cells(low: np.ndarray, high: np.ndarray, side: int) -> Cells:
     """(first, last) cell that a sample between low and high, 0..1, reads on an axis of `side` cells."""
     last = side - 1
-    first = np.clip(np.floor(low * last - CELL_SLACK), 0, max(last - 1, 0)).astype(np.intp)
-    return first, np.clip(np.floor(high * last + CELL_SLACK) + 1, 0, last).astype(np.intp)
+    first = np.clip(np.floor(low * last - CELL_SLACK), 0, max(last - 1, 0)).astype(np.int64)
+    return first, np.clip(np.floor(high * last + CELL_SLACK) + 1, 0, last).astype(np.int64)
 
 
-def _rectangles(rows: Cells, columns: Cells, shape: tuple[int, ...]) -> np.ndarray:
-    """bool [H, W]: the union of the rectangles rows x columns, each (first, last) with both ends in it."""
-    height, width = shape
+def _add_rectangles(change: np.ndarray, rows: Cells, columns: Cells) -> None:
+    """Adds rectangles rows x columns, each (first, last) with both ends in it, to the mixed differences int64
+    [H + 1, W + 1] of how many cover a cell."""
     (top, bottom), (left, right) = rows, columns
-    if len(top) != len(left):  # the one stretch of time, for all points
-        top, bottom = np.broadcast_to(top, left.shape), np.broadcast_to(bottom, left.shape)
-    size, line = (height + 1) * (width + 1), width + 1
-    change = np.bincount(top * line + left, minlength=size) + np.bincount(
-        (bottom + 1) * line + right + 1, minlength=size
-    )
-    change -= np.bincount(top * line + right + 1, minlength=size)
-    change -= np.bincount((bottom + 1) * line + left, minlength=size)
-    return change.reshape(height + 1, width + 1).cumsum(0).cumsum(1)[:height, :width] > 0
+    if found := kernels():
+        found.add_rectangles(change, top, bottom, left, right)
+        return
+    for y, x, sign in ((top, left, 1), (bottom + 1, right + 1, 1), (top, right + 1, -1), (bottom + 1, left, -1)):
+        np.add.at(change, (y, x), sign)
+
+
+def _counted(sums: np.ndarray, rows: Cells, columns: Cells) -> np.ndarray:
+    """bool [n]: whether rectangles hold anything, from its sums over all cells before, int64 [H + 1, W + 1]."""
+    (top, bottom), (left, right) = rows, columns
+    if found := kernels():
+        counted: np.ndarray = found.counted(sums, top, bottom, left, right)
+        return counted
+    b, r = bottom + 1, right + 1
+    held: np.ndarray = sums[b, r] - sums[top, r] - sums[b, left] + sums[top, left] > 0
+    return held
 
 
 def reach(scene: Scene) -> tuple[Reached, Reached, np.ndarray]:
@@ -74,52 +124,139 @@ def reach(scene: Scene) -> tuple[Reached, Reached, np.ndarray]:
     scene: as decoded, whose rows are all active at its highest level. A deformation that it lacks has no cells.
     """
     field, local = scene.global_deformation, scene.local_deformation
-    box, anchor = scene.info.box, scene.anchor
-    cells = _Marks(field.planes if field else (), box)
-    local_cells = _Marks(local.planes if local else (), box)
-    cells.read(anchor, anchor, 0.0, 1.0)
-    shown = np.zeros((len(anchor), N_OFFSETS), bool)
-    for rows, stretches in _stretches(scene):
-        shown[rows] |= _may_show(scene, rows, {})
-        for _, _, ranges in stretches:
-            shown[rows] |= _may_show(scene, rows, ranges)
-        if local is None:
-            continue
-        for start, end, ranges in stretches:
-            low, high = (x[shown[rows]] for x in _mean_ranges(scene, anchor[rows], rows, ranges))
-            local_cells.read(low, high, start, end)
+    cells, local_cells = _Marks(field.planes if field else ()), _Marks(local.planes if local else ())
+    anchor = scene.anchor
+    count = len(anchor)
+    cells.read(_Boxes(*_unit(scene.info.box, anchor, anchor), np.zeros(count), np.ones(count)))
+    shown = np.zeros((count, N_OFFSETS), bool)
+    grid = instants(field) if field else np.array([0.0, 1.0])
+    spans = list(zip(grid[:-1].tolist(), grid[1:].tolist(), strict=True))
+    chunks = max(1, -(-count // CHUNK))
+    with ThreadPoolExecutor(threads.kernel_threads()) as pool:
+        for first in range(chunks if count else 0):
+            rows = np.arange(first, count, chunks)  # each chunk spreads over the scene: the first reads most cells
+            enclosure = Enclosure(field, scene.info.box, anchor[rows]) if field else None
+            shown[rows] = _shown(scene, rows, enclosure, spans, pool)
+            if local is not None:
+                _read_local(scene, anchor[rows], rows, shown[rows], local_cells, enclosure, spans, pool)
     return cells.reached, local_cells.reached, shown
 
 
-def _stretches(scene: Scene) -> Iterator[tuple[slice, list[tuple[float, float, Ranges]]]]:
-    """Chunks of rows, each with its (start, end, ranges of the global residuals) over time 0..1."""
-    field, anchor = scene.global_deformation, scene.anchor
-    chunks = [slice(i, min(i + CHUNK, len(anchor))) for i in range(0, len(anchor), CHUNK)]
-    if field is None:
-        for rows in chunks:
-            yield rows, [(0.0, 1.0, {})]
-        return
-    grid = time_grid(field).tolist()
-    for rows, found in zip(chunks, residual_ranges(field, scene.info.box, anchor), strict=True):
-        yield rows, list(zip(grid[:-1], grid[1:], found, strict=True))
+def _shown(
+    scene: Scene, rows: np.ndarray, enclosure: Enclosure | None, spans: Sequence[Span], pool: ThreadPoolExecutor
+) -> np.ndarray:
+    """bool [n, 10]: the Gaussians of the anchors `rows` that some view may show at some time."""
+    shown = _may_show(scene, rows, None)
+    field = scene.global_deformation
+    if enclosure is None or field is None or "feature" not in field.networks:
+        return shown
+
+    def found(span: Span, open_: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Gaussians [m, 10] that the middle of the span shows, and those that it may show at any of its times."""
+        feature = enclosure.ranges(*span, ["feature"], open_)["feature"]
+        middle = Range(feature.middle, feature.middle, feature.middle)
+        return _may_show(scene, rows[open_], middle), _may_show(scene, rows[open_], feature)
+
+    open_ = np.flatnonzero(~shown.all(axis=1))
+    pending = [(span, open_) for span in spans if open_.size]
+    for halving in range(SHOW_HALVINGS + 1):
+        results = list(pool.map(lambda pair: found(*pair), pending))
+        for (_, at), (sampled, possible) in zip(pending, results, strict=True):
+            shown[at] |= possible if halving == SHOW_HALVINGS else sampled
+        doubtful = [
+            (span, at[(possible & ~shown[at]).any(axis=1)])
+            for (span, at), (_, possible) in zip(pending, results, strict=True)
+        ]
+        pending = [(half, at) for span, at in doubtful if at.size for half in _halves(span)]
+    return shown
 
 
-def _mean_ranges(scene: Scene, anchor: np.ndarray, rows: slice, ranges: Ranges) -> tuple[np.ndarray, np.ndarray]:
-    """(low, high) float32 [n, 10, 3] of the Gaussians' means (13.4, step 3) before the local deformation."""
-    zero = (np.float32(0), np.float32(0))
-    position, scaling = ranges.get("position", zero), ranges.get("scaling", zero)
-    offset = tuple(x.reshape(-1, N_OFFSETS, 3) for x in ranges["offset"]) if "offset" in ranges else zero
+def _read_local(
+    scene: Scene,
+    anchor: np.ndarray,
+    rows: np.ndarray,
+    shown: np.ndarray,
+    marks: _Marks,
+    enclosure: Enclosure | None,
+    spans: Sequence[Span],
+    pool: ThreadPoolExecutor,
+) -> None:
+    """Marks the cells that the Gaussians `shown` bool [n, 10] of the anchors `rows` read."""
+    finest = np.array([max(sides[axis] for sides in marks.sides) - 1 for axis in range(3)], np.float32)
+
+    def boxes(span: Span, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Unit cube, float32 [m, 10, 3]: (in the middle of the span, low, high)."""
+        ranges = enclosure.ranges(*span, ["position", "offset", "scaling"], at) if enclosure else {}
+        return _mean_ranges(scene, anchor[at], rows[at], ranges)
+
+    pending = [(span, np.arange(len(rows))) for span in spans]
+    for halving in range(HALVINGS + 1):
+        results = list(pool.map(lambda pair: boxes(*pair), pending))
+        sizes = [at.size for _, at in pending]
+        which = np.repeat(np.arange(len(pending)), sizes)  # the span of each anchor
+        taken = np.concatenate([shown[at] for _, at in pending])  # bool [m, 10]
+        middle, low, high = (np.concatenate([r[i] for r in results]) for i in range(3))
+        start, end = (np.array([span[i] for span, _ in pending])[which] for i in range(2))
+        wide = ~((((high - low) * finest).max(axis=2) <= NARROW) | ~taken).all(axis=1)  # NaN is wide
+        if halving == HALVINGS:
+            wide[:] = False
+        slots, owner = taken & ~wide[:, None], np.repeat(np.arange(len(wide)), N_OFFSETS).reshape(taken.shape)
+        marks.read(_Boxes(low[slots], high[slots], start[owner[slots]], end[owner[slots]]))
+        slots = taken & wide[:, None]
+        of = owner[slots]
+        time = (start[of] + end[of]) / 2
+        marks.read(_Boxes(middle[slots], middle[slots], time, time))
+        unread = marks.unread(_Boxes(low[slots], high[slots], start[of], end[of]))
+        halved = np.zeros(len(wide), bool)
+        halved[of[unread]] = True
+        parts = np.split(halved, np.cumsum(sizes)[:-1])
+        pending = [
+            (half, at[part])
+            for (span, at), part in zip(pending, parts, strict=True)
+            if part.any()
+            for half in _halves(span)
+        ]
+        if not pending:
+            return
+
+
+def _halves(span: Span) -> tuple[Span, Span]:
+    middle = (span[0] + span[1]) / 2
+    return (span[0], middle), (middle, span[1])
+
+
+def _unit(box: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(low, high) float32 [..., 3] in the unit cube of points in scene units; NaN stands for anywhere."""
+    extent = np.maximum(box[1] - box[0], np.finfo(np.float32).tiny)
+    low, high = (low - box[0]) / extent, (high - box[0]) / extent
+    return np.fmin(np.fmax(low, 0), 1), np.fmax(np.fmin(high, 1), 0)
+
+
+def _mean_ranges(
+    scene: Scene, anchor: np.ndarray, rows: np.ndarray, ranges: Ranges
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """(in the middle, low, high) float32 [n, 10, 3] of the Gaussians' means (13.4, step 3) before the local
+    deformation, in the unit cube."""
+    nothing = Range(*(np.zeros(1, np.float32),) * 3)
+    position, scaling = ranges.get("position", nothing), ranges.get("scaling", nothing)
+    offset = [
+        scene.offset[rows] + (o.reshape(-1, N_OFFSETS, 3) if o.ndim > 1 else o) for o in ranges.get("offset", nothing)
+    ]
     with np.errstate(all="ignore"):
-        spread = [np.exp(scene.scaling_log[rows] + s)[:, None, :3] for s in scaling]
-        corners = [(scene.offset[rows] + o) * s for o in offset for s in spread]
-        low, high = np.min(corners, axis=0), np.max(corners, axis=0)  # NaN, of 0 times infinity, is kept
+        spread = [np.exp((scene.scaling_log[rows] + s)[:, :3])[:, None] for s in scaling]
         centre = [(anchor + p)[:, None] for p in position]
-        return low + centre[0], high + centre[1]
+        corners = [o * s for o in offset[1:] for s in spread[1:]]
+        low, high = np.minimum(corners[0], corners[1]), np.maximum(corners[0], corners[1])
+        for corner in corners[2:]:  # NaN, of 0 times infinity, is kept
+            low, high = np.minimum(low, corner), np.maximum(high, corner)
+        middle = offset[0] * spread[0] + centre[0]
+        return _unit(scene.info.box, middle, middle)[0], *_unit(scene.info.box, low + centre[1], high + centre[2])
 
 
-def _may_show(scene: Scene, rows: slice, ranges: Ranges) -> np.ndarray:
-    """bool [n, 10]: the opacity may reach the threshold from some direction, with the features anywhere in `ranges`."""
-    low, high = (scene.feature[rows] + r for r in ranges.get("feature", (np.float32(0), np.float32(0))))
+def _may_show(scene: Scene, rows: np.ndarray, feature: Range | None) -> np.ndarray:
+    """bool [n, 10]: the opacity may reach the threshold from some direction, with residuals of the features anywhere
+    in `feature`, or 0."""
+    low, high = (scene.feature[rows] + r for r in ((np.float32(0),) * 2 if feature is None else feature[1:]))
     (weight, bias), *rest = scene.networks["opacity"]
     with np.errstate(all="ignore"):
         middle, radius = (low + high) / 2, (high - low) / 2

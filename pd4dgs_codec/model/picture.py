@@ -11,12 +11,10 @@ from torch import Tensor
 
 from pd4dgs_codec.model.model import Gaussians, Model, camera_tensors
 from pd4dgs_codec.model.rounding import EXACT, Rounding
+from pd4dgs_codec.model.visibility import LEAST_NEAR
 from pd4dgs_codec.render.autograd.rasterization import rasterization
 from pd4dgs_codec.render.checks import check_time
 from pd4dgs_codec.scene import Camera, SceneInfo
-
-#: Nearer than this nothing is drawn, whatever a scene says, scene units: the rasteriser divides by depths.
-LEAST_NEAR = 1e-6
 
 
 @dataclass

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
-from torch import Tensor
 
 from pd4dgs_codec.scene import PLANES
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 TIME_AXIS = 3
 SPATIAL = tuple(p for p in PLANES if TIME_AXIS not in p[1:])

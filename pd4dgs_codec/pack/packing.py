@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.codec.encoder import Report, encode_with_report
 from pd4dgs_codec.codec.left_out import LeftOut
+from pd4dgs_codec.codec.metadata import Metadata
 from pd4dgs_codec.codec.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.codec.symbols import rounded
@@ -78,14 +79,16 @@ def pack(
     views: Views | None = None,
     min_gain: float = MIN_GAIN_PER_MEGABYTE,
     downscale: int = 1,
+    metadata: Metadata | None = None,
     progress: Progress = no_progress,
 ) -> Packed:
     """The file of a scene or a trained model.
 
     target_sizes: most bytes that each layer may add to the file, by layer. views: pictures to judge by; without them
     sizes are fitted on what the file's own camera shows, 1/downscale as wide and high, and no layer must pay. min_gain:
-    dB of mPSNR per megabyte under which a layer is left out, where all layers are asked for; 0 keeps all. Only views
-    and target sizes need torch. Raises EncodeError, RenderError for a file without a camera.
+    dB of mPSNR per megabyte under which a layer is left out, where all layers are asked for; 0 keeps all. metadata:
+    what the file says about itself. Only views and target sizes need torch. Raises EncodeError, RenderError for a file
+    without a camera.
     """
     scene = source if isinstance(source, Scene) else _scene_of(source)
     scene, options = options.apply_scale(scene)
@@ -99,7 +102,7 @@ def pack(
     if target_sizes:
         scene, more, target = _fit(scene, options, target_sizes, views, downscale, progress)
         left_out += more
-    data, report = encode_with_report(scene, options, left_out=left_out)
+    data, report = encode_with_report(scene, options, left_out=left_out, metadata=metadata)
     if target is not None:
         added = report.added_bytes()
         for row in target["layers"]:

@@ -1,23 +1,26 @@
-"""A file's levels as models ready to render: each one from the bytes that a receiver would hold at that level."""
+"""A file's levels ready to render: each one from the bytes that a receiver would hold at that level.
+
+A decoded level is drawn without torch, by `playback`; a checkpoint, and a level on another device, by the torch model.
+"""
 
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from pathlib import Path
 from time import perf_counter
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 
 from pd4dgs_codec.bitstream.container import SIGNATURE
 from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.info import info
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.model import checkpoint
-from pd4dgs_codec.model.convert import from_scene
-from pd4dgs_codec.model.model import Model
-from pd4dgs_codec.model.picture import render_image
+from pd4dgs_codec.playback.player import Player
 from pd4dgs_codec.scene import MASK_THRESHOLD, Camera, Scene
+
+if TYPE_CHECKING:
+    from pd4dgs_codec.model.model import Model
 
 
 @dataclass(frozen=True)
@@ -26,13 +29,17 @@ class Level:
     of decoding that; both None for a checkpoint."""
 
     level: int
-    model: Model
+    model: Player | Model
     anchors: int
     cumulative_bytes: int | None = None
     decode_seconds: float | None = None
 
     def picture(self, camera: Camera, time: float) -> np.ndarray:
         """float32 [H, W, 3] in 0..1 at normalised time 0..1."""
+        if isinstance(self.model, Player):
+            return self.model.picture(camera, time)
+        from pd4dgs_codec.model.picture import render_image
+
         return render_image(self.model, self.level, time, camera)
 
     def timed_picture(self, camera: Camera, time: float) -> tuple[np.ndarray, float]:
@@ -44,32 +51,37 @@ class Level:
 
 def level_of(scene: Scene, device: str = "cpu") -> Level:
     """The highest level of a decoded scene."""
-    return Level(scene.level, from_scene(scene).to(device), int((scene.mask[-1] > 0).sum()))
+    active = int((scene.mask[-1] > 0).sum())
+    if device == "cpu":
+        return Level(scene.level, Player(scene), active)
+    from pd4dgs_codec.model.convert import from_scene
+
+    return Level(scene.level, from_scene(scene).to(device), active)
 
 
-def load_levels(file: str | Path | bytes, max_layer: int | None = None, device: str = "cpu") -> list[Level]:
-    """The levels of a `.pd4` file (or its bytes) or of a checkpoint, ascending, up to max_layer.
+def load_levels(
+    file: str | Path | bytes, max_layer: int | None = None, device: str = "cpu", *, last_only: bool = False
+) -> list[Level]:
+    """The levels of a `.pd4` file (or its bytes) or of a checkpoint, ascending, up to max_layer; or only the
+    last of them.
 
     Each level of a `.pd4` is decoded from its own prefix, so nothing of a later layer can leak into it.
     """
     if isinstance(file, bytes):
-        return _of_bytes(file, max_layer, device)
+        return _of_bytes(file, max_layer, device, last_only)
     try:
         data = Path(file).read_bytes()
     except OSError as error:
         raise DataError(f"{file}: cannot be read: {error.strerror}") from None
-    return (
-        _of_bytes(data, max_layer, device)
-        if data.startswith(SIGNATURE[:4])
-        else _of_checkpoint(file, max_layer, device)
-    )
+    if data.startswith(SIGNATURE[:4]):
+        return _of_bytes(data, max_layer, device, last_only)
+    return _of_checkpoint(file, max_layer, device)[-1 if last_only else 0 :]
 
 
-def _of_bytes(data: bytes, max_layer: int | None, device: str) -> list[Level]:
+def _of_bytes(data: bytes, max_layer: int | None, device: str, last_only: bool) -> list[Level]:
     levels = []
-    for row in info(data)["layers"]:
-        if max_layer is not None and row["layer"] > max_layer:
-            continue
+    rows = [row for row in info(data)["layers"] if max_layer is None or row["layer"] <= max_layer]
+    for row in rows[-1:] if last_only else rows:
         start = perf_counter()
         scene = decode(data[: row["end"]], max_layer=row["layer"])
         seconds = perf_counter() - start
@@ -78,6 +90,10 @@ def _of_bytes(data: bytes, max_layer: int | None, device: str) -> list[Level]:
 
 
 def _of_checkpoint(path: str | Path, max_layer: int | None, device: str) -> list[Level]:
+    import torch
+
+    from pd4dgs_codec.model import checkpoint
+
     model, _ = checkpoint.load(path)
     present = [0]
     present += [1] if model.global_deformation is not None else []

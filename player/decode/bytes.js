@@ -25,14 +25,6 @@ export class ByteReader {
     return this.bytes[this.offset++];
   }
 
-  /** An i32. @param {string} what */
-  int32(what) {
-    const a = this.byte(what);
-    const b = this.byte(what);
-    const c = this.byte(what);
-    return a | (b << 8) | (c << 16) | (this.byte(what) << 24);
-  }
-
   /**
    * A varint of at most `limit`: LimitExceeded above it, Malformed if it is cut, over five bytes or not the shortest.
    *

@@ -1,5 +1,7 @@
 """Plane predictors: exact inverses, and the definition itself against a scalar loop."""
 
+import tracemalloc
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -56,6 +58,20 @@ def test_planes_restored_together_equal_planes_restored_alone():
     for got, k in zip(restore(coded), planes, strict=True):
         np.testing.assert_array_equal(got, k)
         assert got.dtype == np.int32
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 900), (1, 900, 1), (2, 900, 5), (1, 90, 90)])
+@pytest.mark.parametrize("predictor", list(PREDICTORS))
+def test_memory_is_linear_in_the_samples_of_any_shape(shape, predictor):
+    """A plane of one column took H * H cells once: 2 kB of a file asked for 47 GB."""
+    coded = [(predictor, np.ones(shape, np.int32))] * 6
+    samples = 6 * int(np.prod(shape))
+    tracemalloc.start()
+    try:
+        restore(coded)
+        assert tracemalloc.get_traced_memory()[1] < 40 * samples + (1 << 18)
+    finally:
+        tracemalloc.stop()
 
 
 @pytest.mark.parametrize("predictor", [p for p in PREDICTORS if p])

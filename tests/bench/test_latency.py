@@ -15,7 +15,7 @@ from pd4dgs_codec.bench import latency, viewer
 from pd4dgs_codec.cli import bench
 from pd4dgs_codec.delivery.server import Server
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.model.warm import warm_up
+from pd4dgs_codec.playback.warm import warm_up
 
 SIZE = (24, 16)
 

@@ -12,6 +12,7 @@ from pd4dgs_codec.bitstream.canonical import pack, unpack
 from pd4dgs_codec.bitstream.container import (
     CHUNK_OVERHEAD,
     FLAG_ANCILLARY,
+    MAJOR,
     SIGNATURE,
     read_chunk,
     read_preamble,
@@ -57,7 +58,7 @@ def test_round_trip():
 
 
 def test_exact_bytes():
-    front = bytes.fromhex("89504434 0d0a1a0a 0100 0000 03000000")
+    front = bytes.fromhex("89504434 0d0a1a0a 0200 0000 03000000")
     assert write_preamble(b"abc") == front + struct.pack("<I", zlib.crc32(front + b"abc")) + b"abc"
     body = bytes.fromhex("0500 0100 02000000 0102030405060708") + b"hi"
     chunk = write_chunk(5, FLAG_ANCILLARY, bytes(range(1, 9)), b"hi")
@@ -94,7 +95,7 @@ def test_each_fault_has_its_error():
     with pytest.raises(BadSignature):
         read_preamble(b"GIF")
     with pytest.raises(UnsupportedVersion):
-        read_preamble(SIGNATURE + b"\2\0" + good[10:])
+        read_preamble(SIGNATURE + b"\1\0" + good[10:])
     with pytest.raises(LimitExceeded):
         read_preamble(good[:12] + struct.pack("<I", MAX_HEADER + 1) + good[16:])
     with pytest.raises(ChecksumMismatch):
@@ -114,7 +115,7 @@ def test_each_fault_has_its_error():
 
 
 def test_a_later_minor_version_is_read():
-    front = SIGNATURE + struct.pack("<HHI", 1, 9, 0)
+    front = SIGNATURE + struct.pack("<HHI", MAJOR, 9, 0)
     assert read_preamble(front + struct.pack("<I", zlib.crc32(front))).minor == 9
 
 
@@ -128,7 +129,7 @@ def test_the_writer_refuses(args):
 
 @given(st.binary(max_size=80), st.integers(0, 40))
 def test_junk_gives_our_errors_only(data, offset):
-    for start in (b"", SIGNATURE, SIGNATURE + b"\1\0"):
+    for start in (b"", SIGNATURE, SIGNATURE + struct.pack("<H", MAJOR)):
         with pytest.raises(DecodeError):
             read_preamble(start + data)
     with pytest.raises(DecodeError):

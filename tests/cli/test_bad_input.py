@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import errno
-import json
 import os
 import subprocess
 import sys
@@ -41,36 +40,10 @@ def fails(cli, tmp_path):
 # -- datasets ----------------------------------------------------------------------------------------------------------
 
 
-def _edit(dataset: Path, change) -> None:
-    path = dataset / "transforms.json"
-    content = json.loads(path.read_text())
-    change(content)
-    path.write_text(json.dumps(content))
-
-
-def _wrong_size(dataset: Path) -> None:
-    from PIL import Image
-
-    Image.new("RGB", (7, 5)).save(dataset / "002.png")
-
-
-DATASET_FAULTS = {
-    "broken json": (lambda d: (d / "transforms.json").write_text('{"frames": [\n 1,, 2]}'), "transforms.json"),
-    "missing image": (lambda d: (d / "001.png").unlink(), "001"),
-    "image of the wrong size": (_wrong_size, "002.png"),
-    "not an image": (lambda d: (d / "003.png").write_bytes(b"GIF89a nonsense"), "003.png"),
-    "degenerate pose": (lambda d: _edit(d, lambda c: c["frames"][1].update(transform_matrix=[[0] * 4] * 4)), ""),
-    "infinite pose": (lambda d: _edit(d, lambda c: c["frames"][1]["transform_matrix"][0].__setitem__(3, 1e400)), ""),
-    "NaN focal": (lambda d: _edit(d, lambda c: c.update(fl_x=float("nan"))), ""),
-    "no frames": (lambda d: _edit(d, lambda c: c.update(frames=[])), ""),
-}
-
-
-@pytest.mark.parametrize("fault", DATASET_FAULTS)
-def test_train_on_a_broken_dataset(fails, dataset, tmp_path, fault):
-    break_it, says = DATASET_FAULTS[fault]
-    break_it(dataset)
-    fails("train", dataset, "-o", tmp_path / "m.pt", "--iterations", 3, "--log", tmp_path / "log.jsonl", says=says)
+def test_train_on_a_broken_dataset(fails, dataset, tmp_path):
+    """All that can be broken is tested with the readers."""
+    (dataset / "001.png").unlink()
+    fails("train", dataset, "-o", tmp_path / "m.pt", "--iterations", 3, "--log", tmp_path / "log.jsonl", says="001")
 
 
 @pytest.mark.parametrize("verb", ["train", "eval", "render"])
@@ -141,25 +114,9 @@ def test_checkpoint_with_a_number_that_is_not_finite(fails, model_pt, tmp_path, 
     fails("encode", tmp_path / "bad.pt", "-o", tmp_path / "s.pd4", says="feature")
 
 
-def _cut(path: Path, model_pt: Path) -> None:
-    path.write_bytes(model_pt.read_bytes()[:-200])
-
-
-CHECKPOINT_FAULTS = {
-    "another program's": lambda path, model: torch.save({"weights": torch.zeros(3)}, path),
-    "a tensor": lambda path, model: torch.save(torch.zeros(3), path),
-    "text": lambda path, model: path.write_text("hello"),
-    "empty": lambda path, model: path.write_bytes(b""),
-    "cut": _cut,
-    "a folder": lambda path, model: path.mkdir(),
-}
-
-
-@pytest.mark.parametrize("fault", CHECKPOINT_FAULTS)
-def test_files_that_are_no_checkpoint(fails, model_pt, tmp_path, fault):
-    path = tmp_path / "bad.pt"
-    CHECKPOINT_FAULTS[fault](path, model_pt)
-    fails("encode", path, "-o", tmp_path / "s.pd4", says="bad.pt")
+def test_a_cut_checkpoint(fails, model_pt, tmp_path):
+    (tmp_path / "bad.pt").write_bytes(model_pt.read_bytes()[:-200])
+    fails("encode", tmp_path / "bad.pt", "-o", tmp_path / "s.pd4", says="bad.pt")
 
 
 @pytest.mark.parametrize("verb", ["encode", "decode", "info", "render", "eval"])

@@ -9,11 +9,11 @@ from importlib import import_module
 
 import pytest
 
+from pd4dgs_codec import FORMAT_VERSION, jsonable
 from pd4dgs_codec import __main__ as dispatcher
-from pd4dgs_codec import jsonable
-from pd4dgs_codec.cli import common
+from pd4dgs_codec.cli import common, values
 
-VERBS = ("train", "encode", "decode", "info", "render", "eval", "bench", "package", "serve")
+VERBS = ("train", "encode", "decode", "info", "render", "eval", "bench", "package", "serve", "view")
 
 
 @pytest.mark.parametrize("verb", VERBS)
@@ -95,7 +95,8 @@ def test_version_names_release_and_format():
     done = subprocess.run(
         [sys.executable, "-m", "pd4dgs_codec", "encode", "--version"], capture_output=True, text=True, timeout=60
     )
-    assert done.returncode == 0 and done.stdout.startswith("pd4dgs-encode ") and "format 1.0" in done.stdout
+    assert done.returncode == 0 and done.stdout.startswith("pd4dgs-encode ")
+    assert done.stdout.endswith(f"format {FORMAT_VERSION}\n")
 
 
 def test_help_and_usage_errors_load_no_heavy_module():
@@ -114,7 +115,7 @@ def test_help_and_usage_errors_load_no_heavy_module():
 
 
 def test_rates_are_bits_per_second():
-    assert common.rates("500k,2M,1G,64") == {"500k": 5e5, "2M": 2e6, "1G": 1e9, "64": 64.0}
+    assert values.rates("500k,2M,1G,64") == {"500k": 5e5, "2M": 2e6, "1G": 1e9, "64": 64.0}
 
 
 def test_table_aligns_numbers_right():

@@ -85,7 +85,6 @@ def test_eval_adds_perceptual_distances_and_names_the_absent(cli, scene_pd4, sha
 def test_render_dataset_views_as_the_renderer_sees_them(cli, scene_pd4, shared_dataset, tmp_path):
     from pd4dgs_codec.data.dataset import load
     from pd4dgs_codec.metrics.image import to_uint8
-    from pd4dgs_codec.model.picture import render_image
     from pd4dgs_codec.view.levels import load_levels
 
     options = ("--data", shared_dataset, "--split", "train", "--max-layer", 1, "--json")
@@ -93,7 +92,7 @@ def test_render_dataset_views_as_the_renderer_sees_them(cli, scene_pd4, shared_d
     assert result.code == 0 and result.json["frames"] == 5 and result.json["levels"] == [1]
     view = load(str(shared_dataset)).train[2]
     level = load_levels(scene_pd4, 1)[-1]
-    expected = to_uint8(render_image(level.model, 1, view.time, view.camera))
+    expected = to_uint8(level.picture(view.camera, view.time))
     assert np.array_equal(np.asarray(Image.open(tmp_path / "out" / "02.png")), expected)
     assert len(list((tmp_path / "out").iterdir())) == 5
 

@@ -49,7 +49,7 @@ def put_together(header, chunks):
     """A file with right lengths, ids and CRCs, whatever its payloads say."""
     header = {**header, CHUNKS: [[t, len(p)] for t, _, p in chunks]}
     packed = canonical.pack(header)
-    scene_id = scene_id_of(packed, chunks[0][2])
+    scene_id = scene_id_of(packed)
     framed = [write_chunk(t, f, scene_id, p) for t, f, p in chunks]
     return b"".join([write_preamble(packed), *framed])
 
@@ -116,7 +116,7 @@ MESSAGES = {
     "signature-png": "not a .pd4 file: it begins with 89 50 4e 47 0d 0a 1a 0a, expected 89 50 44 34 0d 0a 1a 0a",
     "header-length-over-limit": "a header of 4097 bytes, limit 4096",
     "splice-layer-2": "the chunk belongs to scene .*, this file is",
-    "splice-header-steps": "scene id .*, expected .* from the header and the layer-0 payload",
+    "splice-header-steps": "the chunk belongs to scene .*, this file is .*",
     "critical-unknown-last": "critical chunk of unknown type 6",
     "layer-flagged-ancillary": "layer 1 is flagged ancillary, expected a critical chunk",
     "chunk-list-descends": "layer chunks .0, 2, 1., expected layer 0 first and each layer once, ascending",
@@ -146,7 +146,7 @@ MESSAGES = {
     "section-symbols-missing": "section symbols is missing",
     "section-floats-in-layer-0": "section 6 is there, but nothing is left for it to code",
     "samples-over-limit": r"planes of \d+ cells, limit 268435456",
-    "positions-index-over-limit": "a voxel index over 1048576 in magnitude",
+    "positions-index-over-limit": "a cell of 1048577, limit 1048576",
     "mask-code-2": "layer 0: mask code in 2..77, expected 3..255",
     "mask-rise-negative": "rise of a mask code in -1..0",
     "mask-sum-over-255-in-layer-2": "layer 2: mask code 256, expected at most 255",

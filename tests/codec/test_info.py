@@ -1,6 +1,7 @@
 """info from a file's first bytes, digests of its contents, and the npz keys."""
 
 import hashlib
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -10,12 +11,14 @@ from pd4dgs_codec import FORMAT_VERSION
 from pd4dgs_codec.bitstream import canonical
 from pd4dgs_codec.bitstream.container import FLAG_ANCILLARY, read_chunk, read_preamble, write_chunk, write_preamble
 from pd4dgs_codec.codec.decoder import decode
-from pd4dgs_codec.codec.encoder import encode
-from pd4dgs_codec.codec.info import hashes, info
+from pd4dgs_codec.codec.encoder import encode, encode_with_report
+from pd4dgs_codec.codec.info import hashes, info, metadata_of
+from pd4dgs_codec.codec.metadata import Metadata
 from pd4dgs_codec.codec.npz import to_npz_dict
-from pd4dgs_codec.errors import Truncated
+from pd4dgs_codec.errors import DecodeError, Truncated
 from pd4dgs_codec.scene import PLANES
 
+VECTORS = Path(__file__).parents[2] / "spec" / "vectors" / "uncommon"
 SCENE = make_scene(7, anchors=20)
 
 
@@ -25,7 +28,7 @@ def test_info_needs_the_header_alone():
     first = info(data[: whole["header_bytes"]])
     with pytest.raises(Truncated):
         info(data[: whole["header_bytes"] - 1])
-    assert whole["format_version"] == FORMAT_VERSION == "1.0"
+    assert whole["format_version"] == FORMAT_VERSION == "2.0"
     assert whole["bytes"] == first["bytes"] == len(data)
     place = ("layer", "offset", "bytes", "end")
     assert [{k: row[k] for k in place} for row in whole["layers"]] == first["layers"]
@@ -99,6 +102,27 @@ def test_info_names_chunks_it_does_not_know():
     longer = front + data[preamble.size :] + chunk
     assert info(longer)["chunks"] == [{"type": 99, "offset": len(longer) - 29, "bytes": 29, "end": len(longer)}]
     assert [row["layer"] for row in info(longer)["layers"]] == [0, 1, 2] and hashes(longer) == hashes(data)
+
+
+def test_metadata_is_written_shown_and_skipped():
+    scene, about = make_scene(3, anchors=4), Metadata("Kitchen", licence="CC BY 4.0", quality={1: 24.5})
+    plain, (told, report) = encode(scene, effort=1), encode_with_report(scene, effort=1, metadata=about)
+    assert info(plain)["metadata"] is None and metadata_of(plain) is None
+    assert metadata_of(told) == about
+    assert info(told)["metadata"] == {"title": "Kitchen", "licence": "CC BY 4.0", "quality": {"1": 24.5}}
+    assert info(told[:-1])["metadata"] is None  # not all of it is here
+    assert hashes(told) == hashes(plain)
+    assert report.metadata_bytes == info(told)["chunks"][0]["bytes"]
+    assert sum(report.added_bytes().values()) == len(told) - report.metadata_bytes
+
+
+@pytest.mark.parametrize("name", ["metadata-cut", "metadata-bomb"])
+def test_a_fault_in_metadata_is_told_and_the_layers_decode(name):
+    data = (VECTORS / f"{name}.pd4").read_bytes()
+    assert [row["layer"] for row in hashes(data)] == [0, 1, 2]
+    assert set(info(data)["metadata"]) == {"fault"}
+    with pytest.raises(DecodeError):
+        metadata_of(data)
 
 
 def test_a_scene_without_a_camera_has_no_camera_keys():

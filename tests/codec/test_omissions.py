@@ -15,7 +15,9 @@ from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.codec.plane_choice import fill_plane
 from pd4dgs_codec.codec.symbols import rounded
 from pd4dgs_codec.errors import EncodeError
-from pd4dgs_codec.evaluate.enclosure import residual_ranges, time_grid
+from pd4dgs_codec.evaluate import enclosure
+from pd4dgs_codec.evaluate import reach as reach_module
+from pd4dgs_codec.evaluate.enclosure import Enclosure, Stretch, instants
 from pd4dgs_codec.evaluate.reach import reach
 from pd4dgs_codec.evaluate.residuals import residuals
 from pd4dgs_codec.scene import PLANES, Camera, Deformation, Scene
@@ -158,15 +160,22 @@ def test_cells_that_any_instant_reads_are_marked():
     """Against sampling: residuals lie in their ranges, and every cell that a sampled Gaussian reads is reached."""
     scene, _ = plan(lively_scene(), EncodeOptions(layers=2, omit="nothing"))
     field, box = scene.global_deformation, scene.info.box
-    (stretches,) = residual_ranges(field, box, scene.anchor)
-    grid = time_grid(field)
-    assert len(stretches) == len(grid) - 1 and grid[0] == 0 and grid[-1] == 1
+    enclosed = Enclosure(field, box, scene.anchor)
+    heads = [name for name in field.networks if name != "trunk"]
+    grid = instants(field)
+    assert len(grid) == SIDES[3] and grid[0] == 0 and grid[-1] == 1
     _, reached, shown = reach(scene)
     rng = np.random.default_rng(1)
-    for ranges, start, end in zip(stretches, grid[:-1], grid[1:], strict=True):
-        for t in rng.uniform(start, end, 3):
+    some = np.array([1, 5, 30])
+    for start, end in zip(grid[:-1], grid[1:], strict=True):
+        ranges = enclosed.ranges(start, end, heads)
+        for name, found in enclosed.ranges(start, end, heads, some).items():
+            np.testing.assert_allclose(found, np.array(ranges[name])[:, some], rtol=1e-4, atol=1e-5)
+        for t in (start, end, *rng.uniform(start, end, 3)):
             moved = residuals(field, box, scene.anchor, float(t))
-            for name, (low, high) in ranges.items():
+            assert set(ranges) == set(heads)
+            for name, (middle, low, high) in ranges.items():
+                assert (low <= middle).all() and (middle <= high).all()
                 assert (low <= moved[name]).all() and (moved[name] <= high).all(), name
             spread = np.exp(scene.scaling_log + moved["scaling"])[:, None, :3]
             means = (scene.anchor + moved["position"])[:, None]
@@ -176,6 +185,36 @@ def test_cells_that_any_instant_reads_are_marked():
                 at = unit * (np.array([side << scale for side in SIDES[:3]]) - 1)
                 for name, a, b in PLANES[:2]:
                     assert marks[name][np.floor(at[:, b]).astype(int), np.floor(at[:, a]).astype(int)].all()
+
+
+def test_lines_through_a_relu_enclose_it():
+    rng = np.random.default_rng(4)
+    value, slope = rng.normal(size=(2, 50, 40)).astype(np.float32)
+    radius = np.abs(rng.normal(size=(50, 40)).astype(np.float32))
+    after = Stretch(value, slope, radius).relu()
+    for u in np.linspace(-1, 1, 7, dtype=np.float32):
+        for off in (-1, 0, 1):
+            x = np.maximum(value + slope * u + off * radius, 0)
+            assert (np.abs(x - after.value - after.slope * u) <= after.radius + 1e-5).all()
+
+
+def test_compiled_loops_prove_the_same(monkeypatch):
+    pytest.importorskip("numba")
+    scene, _ = plan(lively_scene(), EncodeOptions(layers=2, omit="nothing"))
+    rng = np.random.default_rng(5)
+    quantity = Stretch(*rng.normal(size=(3, 30, 8)).astype(np.float32))
+    found, through = reach(scene), quantity.relu()
+    for module in (enclosure, reach_module):
+        monkeypatch.setattr(module, "kernels", lambda: None)
+    expected, plain = reach(scene), quantity.relu()
+    for name in ("value", "slope", "radius"):
+        np.testing.assert_array_equal(getattr(through, name), getattr(plain, name))
+    for cells, others in zip(found[:2], expected[:2], strict=True):
+        for scale, other in zip(cells, others, strict=True):
+            for name in scale:
+                np.testing.assert_array_equal(scale[name], other[name])
+                assert 0 < scale[name].mean()
+    np.testing.assert_array_equal(found[2], expected[2])
 
 
 def test_a_filled_plane_keeps_what_is_given_and_costs_less():

@@ -144,7 +144,7 @@ def test_of_two_faults_every_door_names_that_of_the_earlier_layer(first, later):
         payloads[1] = write_layer(taken, EncodeOptions(effort=1))[0]
     chunks = tuple((i, len(payload)) for i, payload in enumerate(payloads))
     packed = pack_header(replace(header, attribute_steps=steps, chunks=chunks))
-    scene_id = scene_id_of(packed, payloads[0])
+    scene_id = scene_id_of(packed)
     framed = [write_chunk(i, 0, scene_id, payload) for i, payload in enumerate(payloads)]
     front = write_preamble(packed)
     data = bytearray(b"".join([front, *framed]))

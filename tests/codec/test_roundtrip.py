@@ -215,7 +215,7 @@ def test_verification_notices_a_changed_symbol(monkeypatch):
 
 
 def test_verification_notices_a_file_that_does_not_decode(monkeypatch):
-    monkeypatch.setattr(encoder, "scene_id_of", lambda header, payload: bytes(8))
+    monkeypatch.setattr(encoder, "scene_id_of", lambda header: bytes(8))
     with pytest.raises(EncodeError, match="verification: the file does not decode"):
         encode(make_scene(0, layers=(0,)))
 

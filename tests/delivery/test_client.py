@@ -1,9 +1,11 @@
-"""The streaming client against servers that misbehave: whatever happens, only whole layers of one file are shown."""
+"""The streaming client: whatever the server does, only whole layers of one file are shown.
+
+Cuts at random, silence, a slump of the link and files that change are rows of fault_table.py.
+"""
 
 from __future__ import annotations
 
 import math
-import random
 import shutil
 import ssl
 import subprocess
@@ -17,7 +19,6 @@ from strategies import assert_same_scene, make_scene
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.delivery import client as client_module
 from pd4dgs_codec.delivery.client import Budget, RateMeter, SceneClient, next_end
-from pd4dgs_codec.delivery.link import Link
 from pd4dgs_codec.delivery.prefix import layer_ends
 from pd4dgs_codec.delivery.server import Server
 from pd4dgs_codec.errors import BadSignature, ChecksumMismatch, DeliveryError, Truncated
@@ -42,21 +43,6 @@ def test_one_open_get_gives_every_layer(scene_bytes, levels):
     assert server.requests[0]["accept-encoding"] == "identity"
 
 
-@pytest.mark.parametrize("transfers", [20, pytest.param(100, marks=pytest.mark.slow)])
-def test_random_cuts_and_resumes(scene_bytes, levels, transfers):
-    rng, cuts = random.Random(4), 0
-    for _ in range(transfers):
-        how = rng.choice(["close", "reset"])
-        faults = [Fault(rng.randint(1, len(scene_bytes) // 11), how) for _ in range(10)]
-        with FaultyServer(scene_bytes, faults) as server, SceneClient(server.url) as client:
-            check(list(client.scenes()), levels)
-            cuts += client.transfer.cuts
-        if how == "close":  # what a reset destroys on its way, the first answer included, is asked for once more
-            assert all("if-range" in request for request in server.requests[1:])
-            assert server.sent == len(scene_bytes)
-    assert cuts == 10 * transfers
-
-
 def test_layers_appear_before_the_file_is_whole_and_each_end_is_a_cut(scene_bytes, levels):
     ends = [end for _, end in layer_ends(scene_bytes)]
     faults = [Fault(ends[0], "stall"), Fault(ends[1] - ends[0], "stall", then=lambda server: server.stopped.clear())]
@@ -66,17 +52,9 @@ def test_layers_appear_before_the_file_is_whole_and_each_end_is_a_cut(scene_byte
             shown.append(scene)
             server.stopped.set()  # the connection was silent until this layer had come; now it ends
         check(shown, levels)
-    assert [r.get("range") for r in server.requests] == [
-        None,
-        f"bytes={ends[0]}-{ends[2] - 1}",
-        f"bytes={ends[1]}-{ends[2] - 1}",
-    ]
-
-
-def test_a_silent_connection_counts_as_a_cut(scene_bytes, levels):
-    with FaultyServer(scene_bytes, [Fault(700, "stall")]) as server, SceneClient(server.url, stall=0.2) as client:
-        check(list(client.scenes()), levels)
-        assert client.transfer.cuts >= 1
+    ranges = [None, f"bytes={ends[0]}-{ends[2] - 1}", f"bytes={ends[1]}-{ends[2] - 1}"]
+    assert [r.get("range") for r in server.requests] == ranges and server.sent == ends[2]
+    assert ["if-range" in r for r in server.requests] == [False, True, True]
 
 
 def test_upgrades_fetch_the_missing_layers_only(scene_bytes, levels):
@@ -86,32 +64,6 @@ def test_upgrades_fetch_the_missing_layers_only(scene_bytes, levels):
         check(list(client.scenes(Budget(max_layer=2))), levels[1:])
     ends = [end for _, end in layer_ends(scene_bytes)]
     assert [r.get("range") for r in server.requests] == [None, f"bytes={ends[0]}-{ends[2] - 1}"]
-
-
-def test_a_file_that_changes_midway_begins_anew(scene_bytes, other_bytes, levels):
-    ends = [end for _, end in layer_ends(scene_bytes)]
-    others = [decode(other_bytes, max_layer=layer) for layer in range(3)]
-
-    def change(server):
-        server.content = other_bytes
-
-    for ranges in (True, False):
-        faults = [Fault(ends[0] + 50, then=change)]
-        with FaultyServer(scene_bytes, faults, ranges=ranges) as server, SceneClient(server.url) as client:
-            check(list(client.scenes()), [levels[0], *others])
-            assert client.transfer.changes == 1
-        assert len(server.requests) == 2
-
-
-def test_a_file_that_never_holds_still_is_given_up(scene_bytes):
-    def change(server):
-        server.content = server.content[:-1] + bytes([server.content[-1] ^ 1])
-        server.content += b"x"
-
-    faults = [Fault(1000, then=change) for _ in range(20)]
-    with FaultyServer(scene_bytes, faults) as server, SceneClient(server.url) as client:
-        with pytest.raises(DeliveryError, match="began anew 5 times"):
-            list(client.scenes())
 
 
 @pytest.mark.parametrize("etag", [True, False])
@@ -291,17 +243,6 @@ def test_stop_when_the_seconds_are_over_and_go_on_later(scene_bytes, levels, mon
         assert ends[0] <= have <= ends[0] + 20 and client.transfer.cuts == 0
         check(list(client.scenes()), levels[1:])
     assert server.requests[1]["range"] == f"bytes={have}-{ends[2] - 1}"
-
-
-def test_a_link_that_collapses_and_recovers_gives_every_layer(folder, levels, scene_bytes):
-    link = Link(8 * len(scene_bytes) / 0.2)
-    with Server(folder, link=link) as server, server.running():
-        with SceneClient(server.url_of("scene.pd4")) as client:
-            shown = []
-            for scene in client.scenes():
-                shown.append(scene)
-                link.rate = 8 * len(scene_bytes) / (1.0 if len(shown) == 1 else 0.2)
-    check(shown, levels)
 
 
 LAYERS = [(0, 1000), (1, 1500), (2, 3000)]

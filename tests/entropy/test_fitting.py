@@ -99,11 +99,11 @@ def test_rates_are_the_same(kernels):
 
 def test_payloads_are_the_same_without_numba(kernels, monkeypatch):
     channels = [symbols.astype(np.int32) for symbols in CHANNELS]
-    monkeypatch.setattr(fitting, "loops", kernels)
-    monkeypatch.setattr(sharing, "loops", kernels)
+    monkeypatch.setattr(fitting, "loops", lambda: kernels)
+    monkeypatch.setattr(sharing, "loops", lambda: kernels)
     payload = encode_channels(channels).payload
-    monkeypatch.setattr(fitting, "loops", fit_reference)
-    monkeypatch.setattr(sharing, "loops", fit_reference)
+    monkeypatch.setattr(fitting, "loops", lambda: fit_reference)
+    monkeypatch.setattr(sharing, "loops", lambda: fit_reference)
     assert encode_channels(channels).payload == payload
 
 

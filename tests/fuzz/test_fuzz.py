@@ -236,8 +236,8 @@ def test_another_exception_is_a_finding(monkeypatch, error):
     assert names(figures) == {"exception"} and len(figures.findings) == 3
 
 
-def test_two_lines_are_a_finding(monkeypatch):
-    monkeypatch.setattr(check, "decode", raising(DecodeError("one\ntwo")))
+def test_a_line_without_end_is_a_finding(monkeypatch):
+    monkeypatch.setattr(check, "decode", raising(DecodeError("x" * 501)))
     assert names(fuzz.run_inputs(seeds(), 0, 0, 3)) == {"message"}
 
 

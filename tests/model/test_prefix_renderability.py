@@ -1,4 +1,4 @@
-"""Every layer prefix of any file decodes to what max_layer gives and renders: a finite picture at any time."""
+"""Every layer prefix of any file renders: a finite picture at any time, from any camera."""
 
 from __future__ import annotations
 
@@ -8,10 +8,9 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from strategies import LAYER_SETS, RANGES, assert_same_scene, make_scene, scenes
+from strategies import LAYER_SETS, RANGES, make_scene, scenes
 
 from pd4dgs_codec import decode, encode
-from pd4dgs_codec.codec.decoder import decode_layers
 from pd4dgs_codec.codec.info import info
 from pd4dgs_codec.errors import RenderError
 from pd4dgs_codec.model.convert import from_scene
@@ -57,22 +56,8 @@ def prefixes(data: bytes) -> list[tuple[int, Scene]]:
     return [(row["layer"], decode(data[: row["end"]], max_layer=row["layer"])) for row in info(data)["layers"]]
 
 
-@given(scenes())
-@settings(max_examples=8)
-def test_prefixes_decode_to_the_symbols_and_floats_of_max_layer(scene):
-    data = encode(scene, layers=2, effort=1, verify=False)
-    whole = decode_layers(data)[1]
-    for i, (layer, got) in enumerate(prefixes(data)):
-        assert_same_scene(got, decode(data, max_layer=layer))
-        symbols = decode_layers(data[: info(data)["layers"][i]["end"]], max_layer=layer)[1]
-        assert [s.kind.layer for s in symbols] == list(got.layers)
-        for a, b in zip(symbols, whole[: i + 1], strict=True):
-            assert a.steps == b.steps and len(a.arrays()) == len(b.arrays())
-            assert all(x.dtype == y.dtype and np.array_equal(x, y) for x, y in zip(a.arrays(), b.arrays(), strict=True))
-
-
 @given(scenes(), st.integers(0, 2**32 - 1), st.floats(-10, 10, width=32))
-@settings(max_examples=25)
+@settings(max_examples=10)
 def test_every_prefix_renders_at_any_time_from_any_camera(scene, seed, t):
     data = encode(scene, layers=2, effort=1, verify=False)
     for layer, prefix in prefixes(data):
@@ -126,7 +111,7 @@ def test_a_box_without_extent(flat):
 
 
 @given(st.integers(0, 2**32 - 1))
-@settings(max_examples=4)
+@settings(max_examples=2)
 def test_log_scalings_beyond_float32_leave_pictures_finite(seed):
     """exp overflows from 88.7 on: such a Gaussian is skipped, the rest of the picture stays."""
     rng = np.random.default_rng(seed)

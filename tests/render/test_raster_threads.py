@@ -16,14 +16,6 @@ from pd4dgs_codec.errors import RenderError
 needs_two = pytest.mark.skipif(threads.available() < 2, reason="needs 2 CPUs")
 
 
-@pytest.fixture(autouse=True)
-def restore_threads():
-    before, torch_before = threads.kernel_threads(), torch.get_num_threads()
-    yield
-    threads.set_kernel_threads(before)
-    torch.set_num_threads(torch_before)
-
-
 def _draw(count, seed=0):
     threads.set_kernel_threads(count)
     return draw_with_gradients(scene(3000, seed, scale=0.04), *camera(150, 110), 150, 110, "cpu")

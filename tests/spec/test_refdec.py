@@ -432,7 +432,7 @@ def take_apart(data):
 def put_together(header, chunks):
     """A file with right lengths, ids and CRCs, whatever its payloads say."""
     packed = canonical.pack({**header, 1: [[t, len(p)] for t, _, p in chunks]})
-    scene_id = scene_id_of(packed, chunks[0][2])
+    scene_id = scene_id_of(packed)
     return write_preamble(packed) + b"".join(write_chunk(t, f, scene_id, p) for t, f, p in chunks)
 
 
@@ -467,7 +467,7 @@ FRAME_FAULTS = {
     "Truncated": lambda data: data[:-1],
     "Malformed": lambda data: data + b"\0",
     "BadSignature": lambda data: b"\x88" + data[1:],
-    "UnsupportedVersion": lambda data: data[:8] + b"\2" + data[9:],
+    "UnsupportedVersion": lambda data: data[:8] + b"\1" + data[9:],
     "LimitExceeded": lambda data: data[:13] + b"\x11" + data[14:],
     "ChecksumMismatch": lambda data: data[:-30] + bytes([data[-30] ^ 1]) + data[-29:],
 }

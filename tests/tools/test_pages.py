@@ -6,14 +6,16 @@ import json
 import math
 import re
 import sys
+from functools import partial
 
 import evaluation
 import latency
 import omissions
+import performance
 import precision
 import pytest
 import results
-from pages import page, tables
+from pages import page, peers, tables
 from pages import scenes as places
 from pages.page import Page
 from pages.paper.tables import TABLES
@@ -23,7 +25,7 @@ from pd4dgs_codec.errors import DataError
 
 ROOT = page.ROOT
 DOCS = ROOT / "docs"
-PAGES = [tool.PAGE for tool in (results, evaluation, precision, latency, omissions)]
+PAGES = [tool.PAGE for tool in (results, evaluation, precision, latency, omissions, performance)]
 PAGES += [table.page for table in TABLES.values()]
 #: Bytes that a text and a picture may have.
 TEXT, PICTURE = 50_000, 300_000
@@ -132,7 +134,9 @@ def test_scenes_that_are_not_there_are_named(tmp_path, capsys, monkeypatch):
 
 def test_the_reports_printed_are_those_of_the_page(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(sys.modules, "torchac", None)  # builds for minutes where it was never used
-    monkeypatch.setattr(precision, "CODEC", ("--modes", "ans,lzma", "--repeats", "2", "--views", "1"))
+    monkeypatch.setattr(peers, "coder_rows", partial(peers.coder_rows, effort=1))
+    monkeypatch.setattr(precision, "PEER_RUNS", 1)
+    monkeypatch.setattr(precision, "CODEC", ("--modes", "ans,lzma", "--repeats", "1", "--views", "1"))
     monkeypatch.setattr(precision, "FULL", ("--step-scales", "1,4", "--efforts", "1", "--cold", "0"))
     monkeypatch.setattr(precision, "WAYS_ALL", "oracle float64,kernels,gsplat")
     (tmp_path / "shelf-hand").mkdir()

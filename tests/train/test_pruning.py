@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from runs import assert_resumes_bit_for_bit, read_log
+from tiny import TINY, disc
 
 from pd4dgs_codec.errors import NotFinite
 from pd4dgs_codec.model.picture import render_image
@@ -21,11 +22,22 @@ def test_the_least_go_up_to_the_share():
     assert not pruning.least(torch.full((3,), torch.inf, dtype=torch.float64), 1.0).any()
 
 
+UNPRUNED = TrainConfig(preset="tiny", iterations=120, prune=0.0, noise=False)
+
+
+@pytest.fixture(scope="module")
+def finished(tmp_path_factory):
+    """The checkpoint of a short run without pruning."""
+    path = tmp_path_factory.mktemp("unpruned") / "m.pt"
+    Trainer(UNPRUNED, disc(), size=TINY).run(path)
+    return path
+
+
 @pytest.fixture
-def trained(dataset, tmp_path):
-    """A trainer after a short run without pruning, and its shots."""
-    trainer = Trainer(TrainConfig(preset="tiny", iterations=120, prune=0.0, noise=False), dataset)
-    trainer.run(tmp_path / "m.pt")
+def trained(dataset, finished):
+    """A trainer after that run, and its shots."""
+    trainer = Trainer(UNPRUNED, dataset)
+    trainer.resume(finished)
     return trainer, trainer.learner.shots
 
 

@@ -90,7 +90,7 @@ def put_together(parts: Parts, header: bytes | None = None) -> bytes:
         rows = [[chunk.type, len(payload)] for chunk, payload in zip(parts.chunks, payloads, strict=True)]
         header = canonical.pack({**parts.header, header_module.CHUNKS: rows})
     try:
-        scene_id = header_module.scene_id_of(header, payloads[0])
+        scene_id = header_module.scene_id_of(header)
     except (DecodeError, LookupError, TypeError):  # no header, or no chunk
         scene_id = bytes(8)
     framed = [write_chunk(c.type, c.flags & 1, scene_id, p) for c, p in zip(parts.chunks, payloads, strict=True)]

@@ -20,11 +20,12 @@ from pd4dgs_codec.attributes.quantise import dequantise
 from pd4dgs_codec.attributes.table import ATTRIBUTES, N_CHANNELS, dequantise_attributes
 from pd4dgs_codec.bitstream import canonical
 from pd4dgs_codec.bitstream.container import MAJOR, SCENE_ID_SIZE, SIGNATURE
+from pd4dgs_codec.codec.header import payload_digest
 from pd4dgs_codec.codec.kinds import LAYER_KINDS, SCAFFOLD_INPUT
 from pd4dgs_codec.codec.layer_meta import Section
 from pd4dgs_codec.codec.symbols import LayerSymbols
 from pd4dgs_codec.entropy.ans import ans_encode
-from pd4dgs_codec.entropy.positions import encode_positions
+from pd4dgs_codec.entropy.positions import position_channels
 from pd4dgs_codec.entropy.priors import (
     FIRST_REUSE,
     Const,
@@ -193,6 +194,12 @@ def coded(channels: Iterable[Iterable[int]], priors: Mapping[int, Prior] | None 
     for number, channel in enumerate(channels):
         section.add(channel, (priors or {}).get(number))
     return section.done()
+
+
+def positions(cells: np.ndarray) -> bytes:
+    """Section POSITIONS of cells int32 [n, 3] in Morton order (clause 10)."""
+    head, channels = position_channels(cells)
+    return head + coded(channels)
 
 
 def plain_attributes(k: np.ndarray, priors: Mapping[int, Prior] | None = None) -> bytes:
@@ -523,7 +530,7 @@ def make_layer(
 
 def _sections(meant: LayerSymbols, predictors: Sequence[int], mode: int) -> dict[int, bytes]:
     n = len(meant.anchor_q)
-    sections = {POSITIONS: encode_positions(meant.anchor_q)} if n else {}
+    sections = {POSITIONS: positions(meant.anchor_q)} if n else {}
     tensors = [] if meant.raw_deformation else list(meant.tensors())
     planes = [residual(p, k) if k.size else k for p, k in zip(predictors, tensors, strict=False)]
     weights = [k.ravel() for k in tensors[len(planes) :]]
@@ -579,7 +586,8 @@ def ancillary(type: int, payload: bytes = b"", **fields: object) -> Chunk:
 
 @dataclass(frozen=True, eq=False)
 class File:
-    """A file. header: without the chunk list, which follows from the chunks unless it is there. packed: the header's
+    """A file. header: without the chunk list and the digest, which follow from the chunks unless they are there; what
+    is None is taken out. packed: the header's
     bytes if they are not the canonical ones. declared: the header length in the preamble. crc: xored to the right
     CRC-32. tail: after the last chunk."""
 
@@ -595,7 +603,10 @@ class File:
 
     def fields(self) -> dict[int, object]:
         """The header map."""
-        return {1: [list(c.listed or (c.type, len(c.payload))) for c in self.chunks], **self.header}
+        chunk_list = [list(c.listed or (c.type, len(c.payload))) for c in self.chunks]
+        own = {k: v for k, v in self.header.items() if v is not None}
+        fields = {1: chunk_list, 14: payload_digest(c.payload for c in self.chunks if not c.flags), **own}
+        return {k: fields[k] for k in sorted(fields) if k not in self.header or self.header[k] is not None}
 
     def header_bytes(self) -> bytes:
         """The header."""
@@ -610,7 +621,7 @@ class File:
         """Clause 3.3, of the header as it is written; a header without its chunk list counts as a whole."""
         header, chunk_list = self.header_bytes(), canonical.pack(1) + canonical.pack(self.fields()[1])
         described = header[header.find(chunk_list) + len(chunk_list) :] if chunk_list in header else header
-        return hashlib.sha256(described + self.chunks[0].payload).digest()[:SCENE_ID_SIZE]
+        return hashlib.sha256(described).digest()[:SCENE_ID_SIZE]
 
     def data(self) -> bytes:
         """Its bytes."""
@@ -623,8 +634,7 @@ class File:
 
     def with_header(self, fields: Mapping[int, object]) -> File:
         """With other fields in the header; the value None takes one out."""
-        merged = {k: v for k, v in {**self.header, **fields}.items() if v is not None}
-        return replace(self, header=dict(sorted(merged.items())))
+        return replace(self, header={**self.header, **fields})
 
     def with_chunk(self, index: int, **fields: object) -> File:
         """With other fields in one chunk."""

@@ -104,7 +104,7 @@ def _preamble() -> Iterator[Vector]:
         yield bad(f"signature-{name}", what, "3.1", "BadSignature", replace(plain, signature=signature), at=SIGNATURE)
     short = replace(plain, signature=b"GIF89a")
     yield bad("signature-short", "A short file of another kind.", "3.1", "BadSignature", short, at=SIGNATURE, size=6)
-    for major in (0, 2, 65535):
+    for major in (0, 1, 3, 65535):
         what = f"Major version {major}."
         yield bad(f"version-major-{major}", what, "3.1", "UnsupportedVersion", replace(plain, major=major), at=VERSION)
     for name, size in (("over-limit", MAX_HEADER + 1), ("largest", 2**32 - 1)):
@@ -172,10 +172,13 @@ def _chunks() -> Iterator[Vector]:
     for c in range(3):
         same = same.with_chunk(c, scene_id=b"12345678")
     yield bad("scene-id-all", "All chunks agree on a wrong scene id.", "3.3", MALFORMED, same, chunk=0, at=SCENE_ID)
-    own_payload = hashlib.sha256(file.chunks[0].payload).digest()[:8]
-    alone = replace(file, chunks=tuple(replace(c, scene_id=own_payload) for c in file.chunks))
-    what = "A scene id of the payload of layer 0 without the header."
-    yield bad("scene-id-without-header", what, "3.3", MALFORMED, alone, chunk=0, at=SCENE_ID)
+    whole = hashlib.sha256(file.header_bytes()).digest()[:8]
+    alone = replace(file, chunks=tuple(replace(c, scene_id=whole) for c in file.chunks))
+    what = "A scene id of the header with its chunk list."
+    yield bad("scene-id-with-chunk-list", what, "3.3", MALFORMED, alone, chunk=0, at=SCENE_ID)
+    for name, value in (("short", bytes(15)), ("long", bytes(17)), ("text", "x" * 16)):
+        what = f"A digest of {len(value)} bytes." if name != "text" else "A digest that is a string."
+        yield bad(f"digest-{name}", what, "5.5", MALFORMED, file.with_header({14: value}))
     for name, fields, what in (
         ("steps", {4: [0.5, 0.5, 0.5]}, "The header of another scene, with other steps."),
         ("ignored-key", {64: 1}, "A key that is ignored was put into the header."),
@@ -188,6 +191,10 @@ def _chunks() -> Iterator[Vector]:
     donor = make_file(make_layer()).scene_id
     spliced = file.with_chunk(2, scene_id=donor)
     yield bad("splice-layer-2", "Layer 2 is from another scene.", "3.3", MALFORMED, spliced, chunk=2, at=SCENE_ID)
+    again = make_file(*(file.layer(i) for i in range(2)))
+    spliced = file.with_chunk(1, scene_id=again.scene_id)
+    what = "Layer 1 is from another encode, which had no layer 2."
+    yield bad("splice-encode", what, "3.3 5.5", MALFORMED, spliced, chunk=1, at=SCENE_ID)
     extra = replace(file, chunks=(file.chunks[0], ancillary(9, b"x", scene_id=donor), *file.chunks[1:]))
     yield bad(
         "splice-ancillary", "An ancillary chunk is from another scene.", "3.3", MALFORMED, extra, chunk=1, at=SCENE_ID
@@ -324,7 +331,10 @@ def _msgpack() -> Iterator[Vector]:
         header = _with_entry(packed, "40", value)
         yield bad(f"msgpack-{name}", f"In an ignored key: {what}", "4", MALFORMED, replace(plain, packed=header))
     entries = {
-        "key-twice": (_with_entry(packed, "0d", canonical.pack(HEADER[13]).hex()), "A key of the header twice."),
+        "key-twice": (
+            _with_entry(packed, "0e", canonical.pack(plain.fields()[14]).hex()),
+            "A key of the header twice.",
+        ),
         "keys-descend": (_with_entry(_with_entry(packed, "41", "00"), "40", "00"), "Keys of the header out of order."),
         "key-not-shortest": (_with_entry(packed, "cc40", "00"), "A key of the header as uint 8."),
         "map16": (b"\xde\0" + bytes([packed[0] & 15]) + packed[1:], "The header as map 16."),
@@ -334,7 +344,7 @@ def _msgpack() -> Iterator[Vector]:
         "empty": (b"", "The header is empty."),
         "empty-map": (b"\x80", "The header is a map of nothing."),
         "trailing-byte": (packed + b"\0", "A byte follows the header's map."),
-        "cut": (packed[:-1], "The header's map lacks its last byte."),
+        "cut": (_with_entry(packed, "40", "c403aabb"), "The header's map lacks its last byte."),
         "entry-missing": (bytes([packed[0] + 1]) + packed[1:], "The header's map lacks its last entry."),
         "entry-uncounted": (packed + bytes.fromhex("4000"), "The header's map has an entry more than it says."),
     }
@@ -371,12 +381,12 @@ def _msgpack() -> Iterator[Vector]:
 
 def _header() -> Iterator[Vector]:
     plain = _plain()
-    for key in (*range(2, 12), 13):
+    for key in (*range(2, 12), 13, 14):
         what = f"Key {key} is missing."
         yield bad(f"header-key-{key:02}-missing", what, "4 5.1", MALFORMED, plain.with_header({key: None}))
     without = canonical.pack({k: v for k, v in plain.fields().items() if k != 1})
     yield bad("header-key-01-missing", "Key 1 is missing.", "4 5.1", MALFORMED, replace(plain, packed=without))
-    for key in (0, 14, 63):
+    for key in (0, 15, 63):
         what = f"Unknown key {key}."
         yield bad(f"header-key-{key:02}-unknown", what, "4 17.2", FEATURE, plain.with_header({key: 1}))
     values: list[tuple[str, int, object, str]] = [
@@ -788,6 +798,9 @@ def _sizes() -> Iterator[Vector]:
     yield bad("symbols-of-rows-over-limit", what, "6.5", LIMIT, over, chunk=1)
     crowd = rows_at_limit(over=1)
     yield bad("rows-over-limit", "One anchor more than the payload may declare.", "6.5 14", LIMIT, crowd, chunk=0)
+    halves = make_file(make_layer(0, line(6000)), make_layer(1, line(6000, z=5), before=6000))
+    what = "6000 anchors in either of two layers, together more than their payloads may declare."
+    yield bad("rows-of-layers-over-limit", what, "6.5", LIMIT, halves, chunk=1)
     layer, file = make_layer(), _plain()
     for name, rows in (("rows", 1 << 15), ("most-rows", 58_000)):  # the other bounds let both pass
         payload = layer.payload(lambda m, rows=rows: {**m, 1: rows})

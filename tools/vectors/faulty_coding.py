@@ -2,19 +2,15 @@
 
 from __future__ import annotations
 
-import itertools
 import math
 import struct
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from types import ModuleType
 
 import numpy as np
 
 from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
-from pd4dgs_codec.bitstream.limits import MAX_VOXEL
 from pd4dgs_codec.entropy.ans import MAX_COUNT, ans_encode
-from pd4dgs_codec.entropy.positions import encode_positions
 from pd4dgs_codec.entropy.priors import (
     FIRST_REUSE,
     K_MAX,
@@ -28,8 +24,8 @@ from pd4dgs_codec.entropy.priors import (
     top_limit,
     write_prior,
 )
-from pd4dgs_codec.entropy.tables import TOTAL
 from pd4dgs_codec.entropy.varint import VARINT_MAX
+from pd4dgs_codec.morton import MAX_VOXEL
 
 from . import lzma2
 from .blocks import (
@@ -71,8 +67,7 @@ from .blocks import (
     words,
     zigzag,
 )
-from .reference import Reference
-from .valid import LARGEST, line, ordered, tables_at_limit
+from .valid import LARGEST, line, tables_at_limit
 
 CODES = [5, 9, 7]
 #: Name, clauses with the broken one first, error, the section, what is wrong.
@@ -534,145 +529,122 @@ def _floats() -> Iterator[Vector]:
 # -- clause 10 ---------------------------------------------------------------------------------------------------------
 
 
-class _Script:
-    """Stands for a stream of bits: gives those of a script, and keeps them with their tables."""
-
-    def __init__(self, bits: Sequence[int]) -> None:
-        self.rest, self.parts = list(bits), list[tuple[np.ndarray, np.ndarray]]()
-
-    def take(self, count: int, cum: Sequence[int]) -> list[int]:
-        """The next bits."""
-        taken, self.rest = self.rest[:count], self.rest[count:]
-        self.parts.append((np.array(taken), np.array(cum)))
-        return taken
-
-    def encode(self, *more: tuple[np.ndarray, np.ndarray]) -> bytes:
-        """The stream of what was taken, and of more symbols behind it."""
-        symbols, tables = zip(*self.parts, *more, strict=True)
-        return ans_encode(symbols, tables)
-
-
-def _lenient_reference() -> ModuleType:
-    """The reference decoder without any check."""
-    module = Reference().module
-    module.need = lambda ok, what, name="Malformed": None  # type: ignore[attr-defined]
-    return module
-
-
-def _tree(depths: tuple[int, int, int], count: int, bits: Sequence[int]) -> tuple[bytes, list[tuple[int, ...]]]:
-    """The stream of a tree of these bits for `count` anchors, and the voxels that it gives."""
-    script = _Script(bits)
-    voxels = _lenient_reference().decode_tree(script, depths, count)
-    assert not script.rest
-    return script.encode(), voxels
-
-
-def _positions_header(low: Sequence[int], depths: Sequence[int]) -> bytes:
-    return struct.pack("<3i3B", *low, *depths)
-
-
-def _with_symbol(section: bytes, count: int) -> bytes:
-    """A positions section whose stream holds a bit more than the tree takes."""
-    module = _lenient_reference()
-    script = _Script(())
-    stream = module.Ans(section[15:])
-
-    def take(count: int, cum: Sequence[int]) -> list[int]:
-        taken = stream.take(count, cum)
-        script.parts.append((np.array(taken), np.array(cum)))
-        return taken
-
-    script.take = take  # type: ignore[method-assign]
-    module.decode_tree(script, list(section[12:15]), count)
-    return section[:15] + script.encode((np.array([1]), np.array([0, TOTAL // 2, TOTAL])))
+def _octree(
+    depth: int,
+    counts: Sequence[tuple[int, int]] = (),
+    sizes: Sequence[int] = (),
+    channels: Sequence[Sequence[int]] = (),
+    low: Sequence[int] = (0, 0, 0),
+) -> bytes:
+    """A positions section of these fields. counts: per level (s, e). sizes: nodes with 2 .. 7 children."""
+    numbers = [number for pair in counts for number in pair] + list(sizes)
+    return b"".join(map(zigzag, low)) + bytes([depth]) + b"".join(map(varint, numbers)) + coded(channels)
 
 
 def _positions() -> Iterator[Vector]:
-    half = np.array([0, TOTAL // 2, TOTAL])
-
-    def bits(*values: int) -> bytes:
-        """A stream of first bits, each as likely as not."""
-        return ans_encode([np.array([v]) for v in values], [half] * len(values))
-
     def of(name: str, clauses: str, error: str, rows: int, section: bytes, what: str) -> Vector:
         layer = make_layer(0, line(rows))
         payload = layer.with_sections({POSITIONS: section}).payload()
         return in_layer(0, f"positions-{name}", what, clauses, error, payload, make_file(layer))
 
-    header, origin, none, one = _positions_header, (0, 0, 0), (0, 0, 0), (1, 0, 0)
-    every, voxels = _tree((1, 1, 1), 9, [1] * 7)
-    assert len(voxels) == 8
-    # Two nodes at the first level; at the second neither has both halves, and the first voxel is 0, the last one 3.
-    two, voxels = next(
-        found
-        for sides in itertools.product((0, 1), repeat=2)
-        if (found := _tree((2, 0, 0), 3, [1, 0, 0, *sides]))[1] == [(0, 0, 0), (3, 0, 0)]
-    )
-    four = encode_positions(np.array(line(4), np.int32))
-    edge = encode_positions(np.array([[MAX_VOXEL, 0, 0], [MAX_VOXEL + 1, 0, 0]], np.int32))
-    wraps = encode_positions(np.array([[2**31 - 2, 0, 0], [2**31 - 1, 0, 0]], np.int32))
-    past = struct.pack("<i", 2**31 - 1) + wraps[4:]
+    # Two anchors side by side: one level, whose one node has two children, the first of the patterns.
+    pair, none = ((0, 0),), (0,) * 6
+    one = (1, 0, 0, 0, 0, 0)
+    right = _octree(1, pair, one, [[1], [0]])
+    # Five anchors: a root with three children, of which one has one child.
+    five = ((0, 1), (1, 0))
+    above = _octree(1, pair, one, [[1], [0]], (MAX_VOXEL, 0, 0))
+    over = 2 * MAX_VOXEL + 1
     rows: tuple[tuple[str, str, str, int, bytes, str], ...] = (
-        ("cut", "10.1 15", MALFORMED, 1, header(origin, none)[:14], "The section ends inside the depths."),
-        ("depth-over-limit", "10.1 14", LIMIT, 1, header(origin, (0, 22, 0)), "A depth of 22."),
-        ("depth-255", "10.1 14", LIMIT, 1, header(origin, (0, 0, 255)), "A depth of 255."),
-        ("more-than-box", "10.2 10.1", MALFORMED, 2, header(origin, none), "Two anchors in a box of one voxel."),
-        (
-            "many-in-small-box",
-            "10.2 10.1",
-            MALFORMED,
-            9,
-            header(origin, (1, 1, 1)) + every,
-            "Nine anchors in a box of eight voxels.",
-        ),
-        (
-            "stream-of-nothing",
-            "7.7 10.1",
-            MALFORMED,
-            1,
-            header(origin, none) + words(1),
-            "A word, and nothing is coded.",
-        ),
-        ("stream-odd", "7.7 10.1", MALFORMED, 1, header(origin, none) + b"\1", "A byte where nothing is coded."),
-        (
-            "minimum-not-0",
-            "10.1 10.2",
-            MALFORMED,
-            1,
-            header(origin, one) + bits(0),
-            "No anchor has the smallest coordinate.",
-        ),
+        ("cut", "10.1 15", MALFORMED, 1, right[:3], "The section ends before the depth."),
+        ("cut-counts", "10.2 15", MALFORMED, 2, right[:5], "The section ends inside the counts."),
+        ("index-above", "10.1 14", LIMIT, 1, varint(over + 1) + bytes(3), "A minimum of 2^20 + 1."),
+        ("index-below", "10.1 14", LIMIT, 1, b"\0" + varint(over) + bytes(2), "A minimum of −2^20 − 1."),
+        ("index-over-limit", "10.1 14", MALFORMED, 2, above, "The second of two voxels lies at 2^20 + 1."),
+        ("depth-over-limit", "10.1 14", LIMIT, 1, _octree(22), "A depth of 22."),
+        ("depth-255", "10.1 14", LIMIT, 1, _octree(255), "A depth of 255."),
+        ("minimum-not-0", "10.1", MALFORMED, 1, _octree(1, channels=[[1]]), "No anchor has the smallest coordinate."),
         (
             "depth-too-large",
-            "10.1 10.2",
+            "10.1",
             MALFORMED,
             1,
-            header(origin, one) + bits(1),
+            _octree(1, channels=[[0]]),
             "No anchor has a coordinate of as many bits as the depth.",
         ),
-        ("fewer-than-declared", "10.2", MALFORMED, 3, header(origin, (2, 0, 0)) + two, "Two voxels for three anchors."),
-        ("more-than-declared", "10.2", MALFORMED, 3, four, "Four voxels for three anchors."),
-        ("index-above", "10.1 14", MALFORMED, 1, header((MAX_VOXEL + 1, 0, 0), none), "A voxel index of 2^20 + 1."),
-        ("index-below", "10.1 14", MALFORMED, 1, header((0, -MAX_VOXEL - 1, 0), none), "A voxel index of −2^20 − 1."),
-        ("index-far-above", "10.1 14", MALFORMED, 1, header((0, 0, 2**31 - 1), none), "A voxel index of 2^31 − 1."),
-        ("index-over-limit", "10.1 14", MALFORMED, 2, edge, "The second of two voxels lies at 2^20 + 1."),
-        ("index-over-i32", "10.1 14", MALFORMED, 2, past, "The second of two voxels lies at 2^31."),
+        ("single-over-nodes", "10.2", MALFORMED, 2, _octree(1, ((2, 0),), none), "Two nodes of one have one child."),
+        ("single-over-limit", "10.2", LIMIT, 2, _octree(1, ((MAX_COUNT + 1, 0),), none), "2^26 + 1 such nodes."),
+        ("further-over-six", "10.2", MALFORMED, 9, _octree(1, ((0, 7),), none), "A node with nine children."),
+        ("further-over-limit", "10.2", LIMIT, 9, _octree(1, ((0, MAX_COUNT + 1),), none), "2^26 + 1 further children."),
+        (
+            "more-than-declared",
+            "10.2",
+            MALFORMED,
+            2,
+            _octree(1, ((0, 1),), none, [[2]]),
+            "Three for two anchors.",
+        ),
+        ("fewer-than-declared", "10.2", MALFORMED, 3, right, "Two nodes at the end for three anchors."),
+        ("no-level", "10.2", MALFORMED, 2, _octree(0, (), none), "Two anchors in one voxel."),
+        (
+            "sizes-over-nodes",
+            "10.2",
+            MALFORMED,
+            2,
+            _octree(1, pair, (1, 1, 0, 0, 0, 0), [[1], [0], [0]]),
+            "Two nodes with two and with three children, where one has more than one.",
+        ),
+        ("size-over-limit", "10.2", LIMIT, 2, _octree(1, pair, (MAX_COUNT + 1, 0, 0, 0, 0, 0)), "2^26 + 1 nodes."),
+        (
+            "sizes-other",
+            "10.3",
+            MALFORMED,
+            2,
+            _octree(1, pair, (0, 1, 0, 0, 0, 0), [[1], [0]]),
+            "Two, said three.",
+        ),
+        ("sizes-fewer", "10.3", MALFORMED, 2, _octree(1, pair, none, [[1]]), "Two children, said none."),
+        (
+            "single-other",
+            "10.3",
+            MALFORMED,
+            5,
+            _octree(2, five, (0, 2, 0, 0, 0, 0), [[2], [2, 0, 0], [0], [0, 0]]),
+            "Two nodes have one child, said one.",
+        ),
+        (
+            "children-nine",
+            "10.3",
+            MALFORMED,
+            11,
+            _octree(2, ((0, 0), (0, 7)), (2, 0, 0, 0, 0, 0), [[1], [8, 1], [6, 0]]),
+            "A node with nine children.",
+        ),
+        (
+            "children-none",
+            "10.3",
+            MALFORMED,
+            4,
+            _octree(2, pair * 2, (1, 0, 1, 0, 0, 0), [[1], [-1, 3], [6], [0]]),
+            "A node without children.",
+        ),
+        (
+            "children-sum",
+            "10.3",
+            MALFORMED,
+            2,
+            _octree(1, pair, (0, 1, 0, 0, 0, 0), [[2], [0]]),
+            "Three, said two.",
+        ),
+        ("child-eight", "10.3", MALFORMED, 2, _octree(2, pair, one, [[1], [0, 8], [6]]), "A child's number of 8."),
+        ("child-negative", "10.3", MALFORMED, 2, _octree(2, pair, one, [[1], [0, -1], [6]]), "A child's number of −1."),
+        ("pattern-28", "10.3", MALFORMED, 2, _octree(1, pair, one, [[1], [28]]), "The 29th of 28 patterns."),
+        ("pattern-negative", "10.3", MALFORMED, 2, _octree(1, pair, one, [[1], [-28]]), "A pattern's index of −28."),
+        ("stream-of-nothing", "7.7", MALFORMED, 1, _octree(0) + words(1), "A word, and nothing is coded."),
+        ("stream-odd", "7.7", MALFORMED, 1, _octree(0) + b"\1", "A byte where nothing is coded."),
     )
     for row in rows:
         yield of(*row)
-    sphere = [c for c in itertools.product(range(9), repeat=3) if abs(sum((v - 4) ** 2 for v in c) - 14) < 3]
-    right = make_layer(0, ordered(sphere))
-    section = right.sections[POSITIONS]
-    for name, clauses, changed, what in (
-        ("symbol-left", "7.7", _with_symbol(section, len(sphere)), "A stream that holds a bit more."),
-        ("word-left", "7.7", section + words(5), "A word behind the stream."),
-        ("word-missing", "10.2 7.7", section[:-4], "A stream without its last word."),
-        ("cut", "10.2 7.7", section[:15], "No stream at all."),
-        ("zero-first", "7.7", section[:15] + words(0) + section[15:], "A stream that begins with a zero word."),
-        ("damaged", "10.2 7.7", section[:20] + bytes([section[20] ^ 8]) + section[21:], "A bit is flipped."),
-    ):
-        payload = right.with_sections({POSITIONS: changed}).payload()
-        yield in_layer(0, f"positions-stream-{name}", what, clauses, MALFORMED, payload, make_file(right))
 
 
 # -- clauses 11 and 12 -------------------------------------------------------------------------------------------------

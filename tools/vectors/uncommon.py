@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
+from pd4dgs_codec.bitstream import canonical
 from pd4dgs_codec.bitstream.limits import MAX_CHUNKS, MAX_HEADER, MAX_PARAMETERS
 
 from .blocks import (
@@ -49,9 +50,17 @@ def _cases() -> Iterator[tuple[str, str, str, File]]:
     plain, layers = make_file(make_layer()), three_layers()
     yield "version-minor-1", "Minor version 1.", "3.1", replace(plain, minor=1)
     yield "version-minor-65535", "The largest minor version.", "3.1", replace(plain, minor=65535)
-    empty, some = ancillary(3), ancillary(FIRST_PRIVATE, b"private")
+    empty, some = ancillary(4), ancillary(FIRST_PRIVATE, b"private")
     yield "ancillary-empty", "An empty ancillary chunk of a type kept for the text.", "3.4 17.1", _between(empty)
     yield "ancillary-private", "An ancillary chunk of a private type.", "3.4 17.1", _between(some)
+    about = canonical.pack({1: "Kitchen", 3: "CC BY 4.0"})
+    frame = b"\x28\xb5\x2f\xfd\x20" + bytes([len(about)]) + (8 * len(about) + 1).to_bytes(3, "little") + about
+    for name, payload, what in (
+        ("", frame, "A title and a licence, in a zstandard frame of one raw block."),
+        ("-cut", frame[:-1], "Metadata that cannot be read: no fault of the file."),
+        ("-bomb", frame[:4] + b"\xe0" + bytes([255] * 8), "Metadata that states 2^64 − 1 bytes: no fault of the file."),
+    ):
+        yield f"metadata{name}", what, "3.5 3.4", _between(ancillary(3, payload))
     last = ancillary(65535, bytes(range(256)))
     yield (
         "ancillary-last",
@@ -89,6 +98,9 @@ def _cases() -> Iterator[tuple[str, str, str, File]]:
     camera = {12: {**CAMERA, 64: "lens", 1000: [1.0]}}
     yield "camera-unknown-keys", "Keys from 64 on in the camera.", "4 5.3", plain.with_header(camera)
     bounds = {13: {**ERROR_BOUNDS, 64: "a class to come", 1000: 1}}
+    digest = {14: layers.fields()[14]}
+    fewer = replace(layers, chunks=layers.chunks[:2]).with_header(digest)
+    yield "layer-2-left-out", "Layer 2 was left out later: the digest is that of all three.", "3.3 5.5", fewer
     yield "bounds-unknown-keys", "Keys from 64 on in the error bounds.", "4 5.4", plain.with_header(bounds)
     layer = layers.layer(1)
     extended = layer.payload(lambda m: {**m, 64: [1, 2], 70000: {5: "x"}})

@@ -356,7 +356,7 @@ def _drawn_against_sent() -> Found:
 def _picture_of_mask(mask: int) -> Found:
     decoded = decoder.decode(encoder.encode(small_scene(mask=mask), effort=1))
     level = level_of(decoded)
-    error = picture_error(level.model, 0, 0.0)
+    error = picture_error(from_scene(decoded), 0, 0.0)
     if not mask:
         background = np.array(decoded.info.background, np.float32)
         error = largest([error, float(np.abs(level.picture(CAMERA, 0.0) - background).max())])

@@ -1,0 +1,1 @@
+"""Pictures of a decoded scene, without torch: networks and planes in compiled kernels, then the rasteriser."""

@@ -1,0 +1,179 @@
+"""Render_level of a decoded scene through a camera: the arithmetic of `model.Model`, in numpy and kernels.
+
+The two agree to rounding: both sum in binary32, in other orders.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pd4dgs_codec import threads
+from pd4dgs_codec.model import slot_kernels
+from pd4dgs_codec.model.visibility import FRUSTUM_MARGIN, LEAST_NEAR, MIN_OPACITY, OFFSET_REACH, SIGMA_REACH
+from pd4dgs_codec.playback.networks import Field, Layers, hidden_layers
+from pd4dgs_codec.render.rasteriser import draw
+from pd4dgs_codec.render.simd import LANES
+from pd4dgs_codec.scene import MASK_STEP, MASK_THRESHOLD, N_OFFSETS, Camera, Network, Scene
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """What the rasteriser takes, float32; K Gaussians, activated and gated."""
+
+    means: np.ndarray  #: [K, 3] world
+    quats: np.ndarray  #: [K, 4] wxyz, unit
+    scales: np.ndarray  #: [K, 3] scene units
+    opacities: np.ndarray  #: [K] 0..1
+    colors: np.ndarray  #: [K, 3] 0..1
+    slots: np.ndarray  #: int64 [K], anchor * 10 + offset
+
+
+class Player:
+    """Draws the highest level of a decoded scene.
+
+    The residuals at one time are kept for the anchors that were evaluated: a second view at that time asks for the
+    others only. Not for several threads at once.
+    """
+
+    def __init__(self, scene: Scene):
+        self.info, self.level = scene.info, scene.level
+        codes = scene.mask[-1]
+        self._mask = codes.astype(np.float32) * MASK_STEP
+        self._anchor = np.ascontiguousarray(scene.anchor[: len(codes)], np.float32)
+        self._feature, self._scaling_log = scene.feature, scene.scaling_log
+        self._offset = scene.offset
+        extent = np.exp(scene.scaling_log)
+        self._radius = OFFSET_REACH * extent[:, :3].max(axis=1) + SIGMA_REACH * extent[:, 3:].max(axis=1)
+        box = scene.info.box
+        self._global = None if scene.global_deformation is None else Field(scene.global_deformation, box)
+        self._local = None if scene.local_deformation is None else Field(scene.local_deformation, box)
+        self._opacity = Layers(scene.networks["opacity"])
+        self._covariance = _SlotNetwork(scene.networks["covariance"])
+        self._color = _SlotNetwork(scene.networks["color"])
+        self._time: float | None = None
+        if self._global is not None:
+            self._residuals = np.empty((len(codes), sum(self._global.widths.values())), np.float32)
+        self._known = np.zeros(len(codes), bool)  # anchors whose residuals at self._time are there
+
+    def picture(self, camera: Camera, t: float) -> np.ndarray:
+        """float32 [H, W, 3] in 0..1 at normalised time t in 0..1."""
+        g = self.gaussians(camera, t)
+        finite = np.isfinite(g.colors).all(axis=1)  # a colour that overflowed hides its Gaussian
+        image, _ = draw(
+            g.means,
+            g.quats,
+            g.scales,
+            np.where(finite, g.opacities, np.float32(0)),
+            np.nan_to_num(g.colors),
+            camera,
+            self.info.background,
+            near_plane=max(float(self.info.near), LEAST_NEAR),
+        )
+        picture: np.ndarray = np.clip(image, 0, 1)
+        return picture
+
+    def gaussians(self, camera: Camera, t: float) -> Gaussians:
+        """The Gaussians at normalised time t in 0..1 as the camera meets them."""
+        with np.errstate(all="ignore"):
+            return self._gaussians(camera, t)
+
+    def _gaussians(self, camera: Camera, t: float) -> Gaussians:
+        rows = self._visible(camera)
+        mask, position = self._mask[rows], self._anchor[rows]
+        feature, scaling_log, offset = self._feature[rows], self._scaling_log[rows], self._offset[rows]
+        if self._global is not None:
+            residuals = self._global.split(self._residuals_at(rows, t))
+            position = _moved(position, residuals, "position")
+            feature = _moved(feature, residuals, "feature")
+            offset = _moved(offset, residuals, "offset")
+            scaling_log = _moved(scaling_log, residuals, "scaling")
+        viewmat = np.asarray(camera.viewmat, np.float32)
+        inputs = np.concatenate([feature, _unit(position + viewmat[:3, :3].T @ viewmat[:3, 3])], axis=1)
+        raw_opacity = np.tanh(self._opacity(inputs))
+        keep = np.flatnonzero(raw_opacity * mask[:, None] >= np.float32(MIN_OPACITY))
+        shape = self._covariance(inputs, keep)
+        colors = _sigmoid(self._color(inputs, keep))
+        means, scales, quats = (np.empty((len(keep), width), np.float32) for width in (3, 3, 4))
+        opacities, gate = np.empty(len(keep), np.float32), np.empty(len(keep), np.float32)
+        threads.limit_numba()
+        slot_kernels.assemble(
+            *(means, scales, quats, opacities, gate, keep, position, np.exp(scaling_log), offset.reshape(-1, 3)),
+            *(raw_opacity.reshape(-1), mask, shape, _sigmoid(shape[:, :3])),
+        )
+        if self._local is not None:
+            moves = self._local.split(self._local(means, t))
+            means = _moved(means, moves, "mean")
+            scales = np.maximum(_moved(scales, moves, "scale"), 0) if "scale" in moves else scales
+            quats = _unit(_moved(quats, moves, "quat")) if "quat" in moves else quats
+            opacities = np.clip(_moved(opacities, moves, "opacity"), 0, 1) if "opacity" in moves else opacities
+            colors = np.clip(_moved(colors, moves, "color"), 0, 1) if "color" in moves else colors
+        slots = rows[keep // N_OFFSETS] * N_OFFSETS + keep % N_OFFSETS
+        return Gaussians(means, quats, scales * gate[:, None], opacities * gate, colors, slots)
+
+    def _visible(self, camera: Camera) -> np.ndarray:
+        """int64 [n]: active anchors that may reach the image, ascending; see `Model.visible`."""
+        viewmat, K = np.asarray(camera.viewmat, np.float32), np.asarray(camera.K, np.float32)
+        x, y, depth = viewmat[:3, :3] @ self._anchor.T + viewmat[:3, 3:]
+        z = np.maximum(depth, np.float32(self.info.near))
+        u, v = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+        width, height, radius = camera.width, camera.height, self._radius
+        margin = max(K[0, 0], K[1, 1]) * radius / z + np.float32(FRUSTUM_MARGIN * max(width, height))
+        inside = (u > -margin) & (u < width + margin) & (v > -margin) & (v < height + margin)
+        return np.flatnonzero(inside & (depth + radius > 0) & (self._mask > MASK_THRESHOLD))
+
+    def _residuals_at(self, rows: np.ndarray, t: float) -> np.ndarray:
+        """float32 [n, width] residuals of the global deformation at the anchors `rows`."""
+        assert self._global is not None
+        if self._time != t:
+            self._time = t
+            self._known[:] = False
+        missing = rows[~self._known[rows]]
+        if missing.size:
+            self._residuals[missing] = self._global(self._anchor[missing], t)
+            self._known[missing] = True
+        found: np.ndarray = self._residuals[rows]
+        return found
+
+
+class _SlotNetwork:
+    """A network with outputs per Gaussian of an anchor, for those Gaussians alone that are kept."""
+
+    def __init__(self, network: Network):
+        weight, bias = network[-1]
+        self._width = len(bias) // N_OFFSETS
+        self._inputs = -(-weight.shape[1] // LANES) * LANES  # the kernel's rows; the padding is 0
+        self._hidden = hidden_layers(network) if len(network) > 1 else None
+        self._weight = np.zeros((len(bias), self._inputs), np.float32)
+        self._weight[:, : weight.shape[1]] = weight
+        self._bias = np.ascontiguousarray(bias)
+
+    def __call__(self, x: np.ndarray, keep: np.ndarray) -> np.ndarray:
+        """float32 [K, width] of x float32 [n, inputs] for the slots keep int64 [K]."""
+        if self._hidden is not None:
+            hidden = self._hidden(x, self._inputs)
+        else:
+            hidden = np.zeros((len(x), self._inputs), np.float32)
+            hidden[:, : x.shape[1]] = x
+        out = np.empty((len(keep), self._width), np.float32)
+        threads.limit_numba()
+        slot_kernels.linear(out, keep, hidden, self._weight, self._bias)
+        return out
+
+
+def _moved(values: np.ndarray, residuals: dict[str, np.ndarray], head: str) -> np.ndarray:
+    """values plus what the head answers, if there is such a head."""
+    return values + residuals[head].reshape(values.shape) if head in residuals else values
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    """Rows [n, d] divided by their length, or by MIN_NORM where they are shorter."""
+    length = np.sqrt(np.einsum("nd,nd->n", vectors, vectors))
+    unit: np.ndarray = vectors / np.maximum(length, np.float32(slot_kernels.MIN_NORM))[:, None]
+    return unit
+
+
+def _sigmoid(x: np.ndarray) -> np.ndarray:
+    sigmoid: np.ndarray = 1 / (1 + np.exp(-x))
+    return sigmoid
