@@ -3,7 +3,7 @@
 import pytest
 import torch
 
-from pd4dgs_codec.render import threads
+from pd4dgs_codec import threads
 
 
 @pytest.fixture(autouse=True)
