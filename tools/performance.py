@@ -71,7 +71,11 @@ def _medians(rows: Sequence[Row]) -> Row:
 
 #: What a line says, by what was measured: (text, key, factor, decimals).
 LINES = {
-    "encode": (("encode in process, default effort, s", "wall", 1, 2), ("the same, processor s", "cpu", 1, 2)),
+    "encode": (
+        ("encode in process, default effort, s", "wall", 1, 2),
+        ("the same, processor s", "cpu", 1, 2),
+        ("its memory beside the loaded scene, MiB", "memory", 1, 0),
+    ),
     "decode": (("decode in process, ms", "wall", 1e3, 0), ("the same, processor ms", "cpu", 1e3, 0)),
     "draw": (("picture of the top level, 480 x 360, ms", "wall", 1e3, 1), ("the same, processor ms", "cpu", 1e3, 1)),
     "start": (("pd4dgs-render, start to picture, s", "wall", 1, 2), ("the same, processor s", "cpu", 1, 2)),
@@ -91,7 +95,7 @@ def render(rows: Sequence[Row]) -> str:
         old, new = (row["lines"]["encode"][name]["bytes"] for name in ("before", "after"))
         table.append((row["name"], "bytes at the default effort", f"{old:,.0f}", f"{new:,.0f}", f"{old / new:.4f}"))
     efforts = [
-        (row["name"], effort["effort"], f"{effort['wall']:.2f}", f"{effort['cpu']:.2f}", f"{effort['bytes']:,}")
+        (row["name"], str(effort["effort"]), f"{effort['wall']:.2f}", f"{effort['cpu']:.2f}", f"{effort['bytes']:,}")
         for row in rows
         for effort in row["efforts"]
     ]

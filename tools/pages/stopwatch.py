@@ -25,7 +25,8 @@ def timed(work: Callable[[], Any]) -> tuple[Any, dict[str, float]]:
 
 
 def encode(checkpoint: str, file: str, effort: str) -> dict[str, float]:
-    """Of a loaded scene, kernels warm; writes `file`. memory: MiB at the most, over what the imports took."""
+    """Of a loaded scene, kernels warm; writes `file`. memory: MiB at the most, beside the scene and the
+    kernels."""
     from pd4dgs_codec.codec.encoder import encode_with_report
     from pd4dgs_codec.model.checkpoint import load
     from pd4dgs_codec.model.convert import to_scene
