@@ -11,6 +11,7 @@ from pd4dgs_codec.attributes.quantise import all_finite, dequantise, quantise
 from pd4dgs_codec.attributes.table import attribute_rows, dequantise_attributes, quantise_attributes
 from pd4dgs_codec.codec.kinds import LAYER_KINDS, LayerKind
 from pd4dgs_codec.errors import Malformed
+from pd4dgs_codec.morton import MAX_VOXEL
 from pd4dgs_codec.scene import PLANES, Deformation, Network, Planes, Scene, SceneInfo, Steps
 
 #: (name for messages, array) -> array of the same shape.
@@ -216,7 +217,12 @@ def float_tensors(scene: Scene, index: int) -> list[np.ndarray]:
 
 
 def first_duplicate(anchor_q: np.ndarray) -> np.ndarray | None:
-    """A row [3] that occurs more than once in anchor_q [N, 3], or None."""
-    ordered = anchor_q[np.lexsort(anchor_q.T)]
-    same = np.flatnonzero((ordered[1:] == ordered[:-1]).all(axis=1))
-    return ordered[same[0]] if same.size else None
+    """A row [3] that occurs more than once in anchor_q [N, 3], all within ±MAX_VOXEL, or None."""
+    side = np.uint64(2 * MAX_VOXEL + 1)  # its third power is just below 2**64
+    x, y, z = (anchor_q.T.astype(np.int64) + MAX_VOXEL).astype(np.uint64)
+    keys = np.sort((x * side + y) * side + z, kind="stable")  # layers are sorted already, if by another key
+    same = np.flatnonzero(keys[1:] == keys[:-1])
+    if not same.size:
+        return None
+    rest, last = divmod(int(keys[same[0]]), int(side))
+    return np.array([*divmod(rest, int(side)), last]) - MAX_VOXEL

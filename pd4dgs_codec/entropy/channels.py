@@ -27,6 +27,7 @@ from pd4dgs_codec.entropy.priors import (
     Prior,
     Window,
     family_code,
+    make_tables,
     read_prior,
     write_prior,
 )
@@ -180,6 +181,7 @@ def decode_channels(payload: bytes | memoryview, counts: Sequence[int]) -> list[
             if entries > MAX_ENTRIES:
                 raise LimitExceeded(f"tables of {entries} entries in one section, limit {MAX_ENTRIES}")
     stream = AnsDecoder(reader.rest())
+    make_tables(defined)
     priors = [p.with_class_symbols(stream.take(p.window.n, p.class_cum)) if isinstance(p, Hist) else p for p in defined]
     remaining = iter(heads)
     arrays = []

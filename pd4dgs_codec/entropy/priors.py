@@ -9,13 +9,23 @@ Adding a prior: a class with an id, `cum`, `write` and `read`, and its row in _F
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import ClassVar
 
 import numpy as np
 
-from pd4dgs_codec.entropy.tables import OCTAVE, SI_MAX, SI_MIN, histogram_table, mixture_table, norm_table
+from pd4dgs_codec.entropy.tables import (
+    OCTAVE,
+    SI_MAX,
+    SI_MIN,
+    histogram_table,
+    mixture_table,
+    norm_cdf28_of_each,
+    norm_table,
+    tables_of_each,
+)
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
 from pd4dgs_codec.errors import Malformed, UnsupportedFeature
 
@@ -215,6 +225,44 @@ Prior = Const | Gauss | Mixture | Hist
 _FAMILIES: dict[int, type[Const] | type[Gauss] | type[Mixture] | type[Hist]] = {
     family.id: family for family in (Const, Gauss, Mixture, Hist)
 }
+
+
+#: Entries of the tables that are made at a time: enough to spare numpy's calls, too few to matter as memory.
+BATCH = 1 << 14
+
+
+def make_tables(priors: Sequence[Prior]) -> None:
+    """Fills in `cum` of all Gaussians and mixtures, many in one pass."""
+    batch, entries = list[Gauss | Mixture](), 0
+    for prior in priors:
+        if isinstance(prior, (Gauss, Mixture)):
+            batch.append(prior)
+            entries += prior.window.n
+        if entries > BATCH:
+            _make_batch(batch)
+            batch, entries = [], 0
+    if batch:
+        _make_batch(batch)
+
+
+def _make_batch(priors: Sequence[Gauss | Mixture]) -> None:
+    sizes, floors = (np.array(v, dtype=np.int64) for v in zip(*((p.window.n, p.floor) for p in priors), strict=True))
+    firsts = [p.first if isinstance(p, Mixture) else p.normal for p in priors]
+    cdf = norm_cdf28_of_each(sizes, *_columns(firsts))
+    mixed = [i for i, p in enumerate(priors) if isinstance(p, Mixture)]
+    if mixed:
+        second = norm_cdf28_of_each(sizes[mixed], *_columns([p.second for p in priors if isinstance(p, Mixture)]))
+        weights = [p.weight for p in priors if isinstance(p, Mixture)]
+        weight = np.repeat(np.array(weights, dtype=np.int64), sizes[mixed] + 1)
+        inside = np.repeat(np.isin(np.arange(len(priors)), mixed), sizes + 1)
+        cdf[inside] = ((256 - weight) * cdf[inside] + weight * second) >> 8
+    for prior, cum in zip(priors, tables_of_each(cdf, sizes, floors), strict=True):
+        prior.__dict__["cum"] = cum  # where cached_property keeps it
+
+
+def _columns(normals: Sequence[Normal]) -> tuple[np.ndarray, np.ndarray]:
+    mu8, si = zip(*((normal.mu8, normal.si) for normal in normals), strict=True)
+    return np.array(mu8, dtype=np.int64), np.array(si, dtype=np.int64)
 
 
 def top_limit(step: int) -> int:

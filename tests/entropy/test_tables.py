@@ -2,6 +2,7 @@
 
 import math
 import zlib
+from dataclasses import replace
 
 import mpmath
 import numpy as np
@@ -10,6 +11,7 @@ import refdec
 from hypothesis import given
 from hypothesis import strategies as st
 
+from pd4dgs_codec.entropy.priors import Const, Gauss, Mixture, Normal, Window, make_tables
 from pd4dgs_codec.entropy.tables import (
     MAX_FLOOR_MASS,
     NORMAL,
@@ -106,3 +108,18 @@ def test_tables_are_frozen():
         for mu8 in (-1000, 0, 4321, 10**6):
             crc = zlib.crc32(norm_table(33, mu8, si, 1 if si % 2 else 16).astype("<i8").tobytes(), crc)
     assert crc == 0xC5EA5B43
+
+
+def test_tables_made_together_are_those_made_alone():
+    rng = np.random.default_rng(3)
+    priors: list[Gauss | Mixture | Const] = [Const(Window(4, 1))]
+    for n in [2, 3, 7, 300, 20_000, 2, 900, *rng.integers(2, 60, 40).tolist()]:
+        means, widths = rng.integers(-(2**31), 2**31, 2) >> rng.integers(0, 31, 2), rng.integers(-640, 1281, 2)
+        first, second = map(Normal, means.tolist(), widths.tolist())
+        window, floor = Window(-3, min(n, 1 << 14)), int(rng.choice([1, 16]))
+        priors += [Gauss(window, first, floor), Mixture(window, first, second, int(rng.integers(1, 256)), floor)]
+    alone = [replace(prior).cum for prior in priors]
+    make_tables(priors)
+    assert all("cum" in prior.__dict__ for prior in priors[1:])
+    for prior, expected in zip(priors, alone, strict=True):
+        np.testing.assert_array_equal(prior.cum, expected)
