@@ -71,23 +71,25 @@ def watch(learner: Learner, stopwatch: Stopwatch) -> None:
     """Wraps the parts of a step, and the step itself as what is none of them."""
     import torch
 
-    from pd4dgs_codec.model import hexplane, plane_regularisers, slots
+    from pd4dgs_codec.model import fused, plane_regularisers
     from pd4dgs_codec.model.model import Model
     from pd4dgs_codec.render.autograd import cpu
     from pd4dgs_codec.train import learner as steps
     from pd4dgs_codec.train import losses, ssim
 
     for owner, name, part in (
-        (Model, "visible", "choosing anchors"),
+        (Model, "_visible", "choosing anchors"),
         (Model, "gaussians", "anchors to Gaussians, the rest"),
-        (Model, "_attribute", "picking attributes, noise"),
-        (Model, "_last_layers", "scaffold networks"),
-        (slots._SlotLinear, "forward", "scaffold networks"),
-        (slots._SlotLinear, "backward", "kept Gaussians, backward"),
-        (slots._Assemble, "forward", "anchors to Gaussians, the rest"),
-        (slots._Assemble, "backward", "kept Gaussians, backward"),
-        (hexplane._Sample, "forward", "HexPlane kernels"),
-        (hexplane._Sample, "backward", "HexPlane kernels, backward"),
+        (fused._Pick, "forward", "picking attributes, noise"),
+        (fused._Pick, "backward", "picking attributes, backward"),
+        (fused._Moved, "forward", "residuals: networks"),
+        (fused._Moved, "backward", "residuals: networks, backward"),
+        (fused._Grown, "forward", "scaffold networks"),
+        (fused._Grown, "backward", "scaffold networks, backward"),
+        (fused._Finish, "forward", "anchors to Gaussians, the rest"),
+        (fused._Finish, "backward", "scaffold networks, backward"),
+        (fused, "sample", "HexPlane kernels"),
+        (fused, "sample_gradient", "HexPlane kernels, backward"),
         (cpu, "rasterize", "rasteriser kernels"),
         (cpu._Composite, "backward", "rasteriser kernels, backward"),
         (ssim._ImageLoss, "forward", "image loss"),

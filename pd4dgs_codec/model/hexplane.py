@@ -29,21 +29,46 @@ from pd4dgs_codec.scene import PLANES
 Corners = np.ndarray | Sequence[Sequence[float]]  #: [2, 3], lower and upper corner of a box, scene units
 
 
-class _Sample(torch.autograd.Function):
-    """`sample_reference` at one time with rounding folded in, by the kernels; CPU, channels a multiple of LANES."""
+def sample(
+    grid: Tensor, layout: PlaneLayout, box: Tensor, points: Tensor, t: float, step: float | None
+) -> tuple[Tensor, Tensor, Tensor]:
+    """`sample_reference` at one time with rounding folded in, by the kernels; CPU, channels a multiple of LANES. After
+    the features what `sample_gradient` takes: the spatial planes as used, and the time planes' rows."""
+    tables = (layout.reso, layout.start, layout.rows)
+    spatial = grid[: layout.n_spatial]
+    if step is not None:
+        spatial = torch.div(spatial, step).round_().mul_(step)
+    rows = grid.new_empty(layout.n_rows, grid.shape[1])
+    kernels.collapse(rows.numpy(), grid.numpy(), *tables, t, 0.0 if step is None else step)
+    out = grid.new_empty(len(points), len(layout.reso) * grid.shape[1])
+    kernels.sample(out.numpy(), spatial.numpy(), rows.numpy(), *tables, points.numpy(), box.numpy())
+    return out, spatial, rows
 
+
+def sample_gradient(
+    g: Tensor, spatial: Tensor, rows: Tensor, layout: PlaneLayout, box: Tensor, points: Tensor, t: float
+) -> tuple[Tensor, Tensor]:
+    """Gradients by the grid [cells, C] and by the points [N, 3] from that of the features, g."""
+    channels, tables = spatial.shape[1], (layout.reso, layout.start, layout.rows)
+    # scales fill the threads first; only then are points split, which costs a buffer per part
+    parts = max(1, numba.get_num_threads() // len(layout.reso))
+    grad = g.new_zeros(layout.n_cells, channels)
+    extra = g.new_zeros(parts - 1, layout.n_spatial, channels)
+    grad_rows = g.new_zeros(parts, layout.n_rows, channels)
+    grad_points = g.new_empty(len(layout.reso), len(points), 3)
+    results = [x.numpy() for x in (grad, extra, grad_rows, grad_points)]
+    inputs = [x.numpy() for x in (g, spatial, rows)]
+    kernels.sample_backward(*[*results, *inputs, *tables, points.numpy(), box.numpy()])
+    kernels.collapse_backward(grad.numpy(), grad_rows[0].numpy(), *tables, t)
+    return grad, grad_points.sum(0)
+
+
+class _Sample(torch.autograd.Function):
     @staticmethod
     def forward(
         ctx: Any, grid: Tensor, layout: PlaneLayout, box: Tensor, points: Tensor, t: float, step: float | None
     ) -> Tensor:
-        tables = (layout.reso, layout.start, layout.rows)
-        spatial = grid[: layout.n_spatial]
-        if step is not None:
-            spatial = torch.div(spatial, step).round_().mul_(step)
-        rows = grid.new_empty(layout.n_rows, grid.shape[1])
-        kernels.collapse(rows.numpy(), grid.numpy(), *tables, t, 0.0 if step is None else step)
-        out = grid.new_empty(len(points), len(layout.reso) * grid.shape[1])
-        kernels.sample(out.numpy(), spatial.numpy(), rows.numpy(), *tables, points.numpy(), box.numpy())
+        out, spatial, rows = sample(grid, layout, box, points, t, step)
         ctx.layout, ctx.t = layout, t
         ctx.save_for_backward(spatial, rows, box, points)
         return out
@@ -52,19 +77,8 @@ class _Sample(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, g: Tensor) -> tuple[Tensor | None, ...]:
         spatial, rows, box, points = ctx.saved_tensors
-        layout, channels = ctx.layout, spatial.shape[1]
-        tables = (layout.reso, layout.start, layout.rows)
-        # scales fill the threads first; only then are points split, which costs a buffer per part
-        parts = max(1, numba.get_num_threads() // len(layout.reso))
-        grad = g.new_zeros(layout.n_cells, channels)
-        extra = g.new_zeros(parts - 1, layout.n_spatial, channels)
-        grad_rows = g.new_zeros(parts, layout.n_rows, channels)
-        grad_points = g.new_empty(len(layout.reso), len(points), 3)
-        results = [x.numpy() for x in (grad, extra, grad_rows, grad_points)]
-        inputs = [x.numpy() for x in (g.contiguous(), spatial, rows)]
-        kernels.sample_backward(*[*results, *inputs, *tables, points.numpy(), box.numpy()])
-        kernels.collapse_backward(grad.numpy(), grad_rows[0].numpy(), *tables, ctx.t)
-        return grad, None, None, grad_points.sum(0) if ctx.needs_input_grad[3] else None, None, None
+        grad, grad_points = sample_gradient(g.contiguous(), spatial, rows, ctx.layout, box, points, ctx.t)
+        return grad, None, None, grad_points, None, None
 
 
 def sample_reference(grid: Tensor, layout: PlaneLayout, box: Tensor, points: Tensor, t: float | Tensor) -> Tensor:

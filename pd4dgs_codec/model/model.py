@@ -18,13 +18,24 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from pd4dgs_codec.model import fused
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.masks import level_mask
 from pd4dgs_codec.model.mlp import MLP
 from pd4dgs_codec.model.rounding import EXACT, Rounding, round_straight_through
 from pd4dgs_codec.model.slots import assemble, slot_linear
 from pd4dgs_codec.model.visibility import FRUSTUM_MARGIN, MIN_OPACITY, OFFSET_REACH, SIGMA_REACH
-from pd4dgs_codec.scene import FEATURE_DIM, MASK_THRESHOLD, N_OFFSETS, SCAFFOLD_NETWORKS, Camera, SceneInfo, Steps
+from pd4dgs_codec.scene import (
+    FEATURE_DIM,
+    GLOBAL_HEADS,
+    LOCAL_HEADS,
+    MASK_THRESHOLD,
+    N_OFFSETS,
+    SCAFFOLD_NETWORKS,
+    Camera,
+    SceneInfo,
+    Steps,
+)
 
 #: Opacities of an anchor's ten Gaussians start spread between these: some are seen everywhere, and not all are, since
 #: they start at one place.
@@ -49,6 +60,12 @@ def camera_tensors(camera: Camera, device: torch.device) -> tuple[Tensor, Tensor
     """(viewmat [4, 4] world to camera, K [3, 3] pixels) as float32 tensors."""
     viewmat, K = (torch.as_tensor(np.array(m, np.float32), device=device) for m in (camera.viewmat, camera.K))
     return viewmat, K
+
+
+def camera_centre(camera: Camera, device: torch.device) -> Tensor:
+    """[3], world."""
+    viewmat, _ = camera_tensors(camera, device)
+    return -viewmat[:3, :3].T @ viewmat[:3, 3]
 
 
 class Model(nn.Module):
@@ -98,11 +115,14 @@ class Model(nn.Module):
         """m^(level) [N]."""
         return level_mask(self.mask_logits, level)
 
-    @torch.no_grad()
     def visible(self, level: int, camera: Camera) -> Tensor:
         """int64 [n]: anchors active at `level` that may reach the image, in ascending order."""
+        return self._visible(self.masks(level), self.anchor, camera)
+
+    @torch.no_grad()
+    def _visible(self, masks: Tensor, position: Tensor, camera: Camera) -> Tensor:
         viewmat, K = camera_tensors(camera, self.feature.device)
-        position = self.anchor @ viewmat[:3, :3].T + viewmat[:3, 3]
+        position = position @ viewmat[:3, :3].T + viewmat[:3, 3]
         extent = self.scaling_log.exp()
         radius = OFFSET_REACH * extent[:, :3].amax(1) + SIGMA_REACH * extent[:, 3:].amax(1)
         depth = position[:, 2]
@@ -112,28 +132,58 @@ class Model(nn.Module):
         width, height = camera.width, camera.height
         margin = torch.maximum(K[0, 0], K[1, 1]) * radius / z + FRUSTUM_MARGIN * max(width, height)
         inside = (x > -margin) & (x < width + margin) & (y > -margin) & (y < height + margin)
-        return (inside & (depth + radius > 0) & (self.masks(level) > MASK_THRESHOLD)).nonzero()[:, 0]
+        return (inside & (depth + radius > 0) & (masks > MASK_THRESHOLD)).nonzero()[:, 0]
 
     def gaussians(self, level: int, t: float, camera: Camera, rounding: Rounding = EXACT) -> Gaussians:
         """The Gaussians of `level` at normalised time t in 0..1 as the camera meets them."""
+        if not self._fusible():
+            return self.gaussians_reference(level, t, camera, rounding)
+        steps, masks, position = self.steps, self.masks(level), self.anchor
+        rows = self._visible(masks, position, camera)
+        noise = None
+        if rounding.noise is not None and not rounding.attributes:
+            draws = [rounding.noise.draw(torch.Size((len(rows), x[0].numel()))) for x in self._attributes()]
+            noise = draws[0], draws[2], draws[1]
+        anchors = fused.pick(
+            (self.feature, self.offset, self.scaling_log),
+            position,
+            rows,
+            (steps.feature, steps.offset, steps.scaling_log),
+            noise,
+            rounding.attributes,
+        )
+        if level >= 1 and (field := self.global_deformation) is not None and field.heads:
+            anchors = fused.moved(anchors, field, GLOBAL_HEADS, t, *self._field_steps("global", rounding), False)
+        step = steps.weights_scaffold if rounding.weights else None
+        networks = [self.network(name) for name in SCAFFOLD_NETWORKS]
+        mask = masks.index_select(0, rows)
+        found, gates, raw_opacity, keep = fused.grown(
+            anchors, mask, camera_centre(camera, self.feature.device), networks, step, MIN_OPACITY
+        )
+        loose = level >= 2 and self.local_deformation is not None
+        if (field := self.local_deformation) is not None and loose and field.heads:
+            found = fused.moved(found, field, LOCAL_HEADS, t, *self._field_steps("local", rounding), True)
+        means, quats, scales, opacities, colors = fused.finish(found, gates, loose)
+        slots = rows.index_select(0, torch.div(keep, N_OFFSETS, rounding_mode="floor")) * N_OFFSETS + keep % N_OFFSETS
+        return Gaussians(means, quats, scales, opacities, colors, slots, rows, raw_opacity)
+
+    def gaussians_reference(self, level: int, t: float, camera: Camera, rounding: Rounding = EXACT) -> Gaussians:
+        """The plain torch form of `gaussians`, for any device and any networks."""
         steps = self.steps
-        rows = self.visible(level, camera)
+        rows = self._visible(self.masks(level), self.anchor, camera)
         mask = self.masks(level).index_select(0, rows)
         position = self.anchor.index_select(0, rows)
         feature = self._attribute(self.feature, rows, steps.feature, rounding)
         scaling_log = self._attribute(self.scaling_log, rows, steps.scaling_log, rounding)
         offset = self._attribute(self.offset, rows, steps.offset, rounding)
         if level >= 1 and self.global_deformation is not None:
-            rounded = (steps.planes_global, steps.weights_global) if rounding.weights else (None, None)
-            residuals = self.global_deformation(position, t, *rounded)
+            residuals = self.global_deformation(position, t, *self._field_steps("global", rounding))
             position = _moved(position, residuals, "position")
             feature = _moved(feature, residuals, "feature")
             offset = _moved(offset, residuals, "offset")
             scaling_log = _moved(scaling_log, residuals, "scaling")
 
-        viewmat, _ = camera_tensors(camera, self.feature.device)
-        camera_centre = -viewmat[:3, :3].T @ viewmat[:3, 3]
-        direction = F.normalize(position - camera_centre, dim=1)
+        direction = F.normalize(position - camera_centre(camera, self.feature.device), dim=1)
         opacity, covariance, color = self._last_layers(torch.cat([feature, direction], dim=1), rounding)
         raw_opacity = torch.tanh(F.linear(*opacity))
         keep = (raw_opacity.detach() * mask.detach()[:, None] >= MIN_OPACITY).flatten().nonzero()[:, 0]
@@ -143,8 +193,7 @@ class Model(nn.Module):
             position, scaling_log.exp(), offset, raw_opacity, mask, shape, keep
         )
         if level >= 2 and self.local_deformation is not None:
-            rounded = (steps.planes_local, steps.weights_local) if rounding.weights else (None, None)
-            residuals = self.local_deformation(means, t, *rounded)
+            residuals = self.local_deformation(means, t, *self._field_steps("local", rounding))
             means = _moved(means, residuals, "mean")
             scales = F.relu(_moved(scales, residuals, "scale")) if "scale" in residuals else scales
             quats = F.normalize(_moved(quats, residuals, "quat"), dim=1) if "quat" in residuals else quats
@@ -180,6 +229,18 @@ class Model(nn.Module):
             for parameter in module.parameters():
                 parameter.copy_(torch.round(parameter / step) * step)
 
+    def _attributes(self) -> tuple[nn.Parameter, nn.Parameter, nn.Parameter]:
+        """In the order in which they take noise."""
+        return self.feature, self.scaling_log, self.offset
+
+    def _fusible(self) -> bool:
+        """Whether `fused` can evaluate all of the model."""
+        fields = [field for field in (self.global_deformation, self.local_deformation) if field is not None]
+        networks = [(self.network(name), 2) for name in SCAFFOLD_NETWORKS]
+        networks += [(field.trunk, len(field.trunk.layers)) for field in fields]
+        fits = all(fused.supports(*pair) for pair in networks) and all(map(fused.supports_field, fields))
+        return fits and self.feature.device.type == "cpu"
+
     def _last_layers(self, inputs: Tensor, rounding: Rounding) -> list[tuple[Tensor, Tensor, Tensor]]:
         """Per decoder what its last layer takes, its weight and its bias; first layers of two in one product."""
         step = self.steps.weights_scaffold if rounding.weights else None
@@ -190,6 +251,12 @@ class Model(nn.Module):
         hidden = F.relu(F.linear(inputs, torch.cat([w for w, _ in first]), torch.cat([b for _, b in first])))
         parts = torch.split(hidden, [len(b) for _, b in first], dim=1)
         return [(part, *layers[1]) for part, layers in zip(parts, networks, strict=True)]
+
+    def _field_steps(self, field: str, rounding: Rounding) -> tuple[float | None, float | None]:
+        """Of planes and weights of the field global or local, if they are rounded."""
+        if not rounding.weights:
+            return None, None
+        return getattr(self.steps, f"planes_{field}"), getattr(self.steps, f"weights_{field}")
 
     def _attribute(self, values: Tensor, rows: Tensor, step: float, rounding: Rounding) -> Tensor:
         picked = values.index_select(0, rows)

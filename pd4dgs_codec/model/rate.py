@@ -136,32 +136,40 @@ def rate_bits(a: Tensor, mu: Tensor, sigma: Tensor, q: Tensor | float) -> Tensor
     return bits
 
 
-class _ChannelMoments(torch.autograd.Function):
-    """`channel_moments_reference` with its gradient written out: two passes over x [n, c] less in each direction."""
+class _Sampled(torch.autograd.Function):
+    """`sampled_reference` with one gradient for all of it: no rows are copied or scattered but the few picked."""
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor) -> tuple[Tensor, Tensor]:
-        mu = x.mean(0)
-        centred = x - mu
-        sigma = (centred.square().mean(0) + MIN_VARIANCE).sqrt()
-        ctx.save_for_backward(centred, sigma)
-        return mu, sigma
+    def forward(ctx: Any, x: Tensor, active: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        n, weight = len(active), x.new_zeros(len(x)).index_fill_(0, active, 1.0)
+        mu = (weight @ x) / n
+        centred = (x - mu).mul_(weight[:, None])
+        sigma = (centred.square().sum(0) / n + MIN_VARIANCE).sqrt()
+        ctx.count = n
+        ctx.save_for_backward(rows, weight, centred, sigma)
+        return mu, sigma, x.index_select(0, rows)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, g_mu: Tensor, g_sigma: Tensor) -> Tensor:
-        centred, sigma = ctx.saved_tensors
-        n = len(centred)
-        return torch.addcmul(g_mu / n, centred, g_sigma / (n * sigma))
+    def backward(ctx: Any, g_mu: Tensor, g_sigma: Tensor, g_rows: Tensor) -> tuple[Tensor, None, None]:
+        rows, weight, centred, sigma = ctx.saved_tensors
+        grad = torch.outer(weight, g_mu / ctx.count).addcmul_(centred, g_sigma / (ctx.count * sigma))
+        return grad.index_add_(0, rows, g_rows), None, None
+
+
+def sampled(x: Tensor, active: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Mean and standard deviation per column over the rows `active` (int64 [n], n >= 1) of x [N, c], and the rows
+    `rows` [m, c]; no row comes twice in either. Gradient through all three."""
+    found: tuple[Tensor, Tensor, Tensor] = _Sampled.apply(x, active, rows)  # type: ignore[no-untyped-call]
+    return found
+
+
+def sampled_reference(x: Tensor, active: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """The plain torch form of `sampled`."""
+    return *channel_moments(x.index_select(0, active)), x.index_select(0, rows)
 
 
 def channel_moments(x: Tensor) -> tuple[Tensor, Tensor]:
     """Mean and standard deviation per column of x [n, c]; gradient through both; n >= 1."""
-    moments: tuple[Tensor, Tensor] = _ChannelMoments.apply(x)  # type: ignore[no-untyped-call]
-    return moments
-
-
-def channel_moments_reference(x: Tensor) -> tuple[Tensor, Tensor]:
-    """The plain torch form of `channel_moments`."""
     mu = x.mean(0)
     return mu, ((x - mu).square().mean(0) + MIN_VARIANCE).sqrt()

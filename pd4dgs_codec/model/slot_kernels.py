@@ -1,10 +1,11 @@
-"""Numba kernels for the Gaussians that are seen: the last layers' outputs, and what Gaussians are made of, for the kept
-slots alone. A slot is one of an anchor's ten Gaussians; about one in six is drawn.
+"""Numba kernels between anchors and the Gaussians that are seen: rows of attributes, the last layers' outputs and what
+Gaussians are made of, for the kept slots alone. A slot is one of an anchor's ten Gaussians; about one in six is drawn.
 
 Arguments everywhere, floats of one dtype: keep int64 [K], ascending, anchor * 10 + offset of each kept Gaussian;
-hidden [n, H], H a multiple of LANES. The backward passes split the Gaussians over threads at anchors, each part owning
-its rows of the result; sums over all Gaussians are kept per part and added in order, so that results are bitwise
-reproducible for a fixed number of parts.
+anchors [n, 71], a row of position, feature, offsets and log scalings; gaussians [K, 14], a row of mean, scales,
+quaternion, opacity and colour; hidden [n, columns], of which H from `column` on are a layer's, H a multiple of LANES.
+The backward passes split the Gaussians over threads at anchors, each part owning its rows of the result; sums over all
+Gaussians are kept per part and added in order, so that results are bitwise reproducible for a fixed number of parts.
 """
 
 from __future__ import annotations
@@ -16,10 +17,13 @@ import numba as nb
 import numpy as np
 
 from pd4dgs_codec.render.simd import LANES, fma, kernel, load, splat, store, total
-from pd4dgs_codec.scene import N_OFFSETS
+from pd4dgs_codec.scene import FEATURE_DIM, N_OFFSETS
 
 #: Below this a quaternion is divided by it instead of by its norm, as `torch.nn.functional.normalize` does.
 MIN_NORM = 1e-12
+#: First columns of an anchor's row and of a Gaussian's.
+OFFSET, SCALING = 3 + FEATURE_DIM, 3 + FEATURE_DIM + 3 * N_OFFSETS
+SCALE, QUAT, OPACITY, COLOR = 3, 6, 10, 11
 
 
 @kernel(inline=True)
@@ -34,12 +38,79 @@ def _part(keep: np.ndarray, part: int, parts: int) -> tuple[int, int]:
 
 
 @kernel(parallel=True)
-def linear(out: np.ndarray, keep: np.ndarray, hidden: np.ndarray, weight: np.ndarray, bias: np.ndarray) -> None:
+def pick(
+    out: np.ndarray, column: int, values: np.ndarray, rows: np.ndarray, noise: np.ndarray, step: float, rounding: bool
+) -> None:
+    """The columns of `out` from `column` on = values [N, w] at rows int64 [n], rounded to multiples of `step`, or with
+    noise [n, w] times `step`; noise [0, w] is none."""
+    real, width = values.dtype.type, values.shape[1]
+    size = real(step)
+    for i in nb.prange(len(rows)):
+        for c in range(width):
+            value = values[rows[i], c]
+            if rounding:
+                value = np.rint(value / size) * size
+            elif len(noise) > 0:
+                value = value + noise[i, c] * size
+            out[i, column + c] = value
+
+
+@kernel(parallel=True)
+def pick_backward(grad: np.ndarray, g: np.ndarray, column: int, rows: np.ndarray) -> None:
+    """The transpose of `pick`; grad [N, w] is given zeroed, no row comes twice."""
+    for i in nb.prange(len(rows)):
+        for c in range(grad.shape[1]):
+            grad[rows[i], c] = g[i, column + c]
+
+
+@kernel(parallel=True)
+def inputs(out: np.ndarray, distance: np.ndarray, anchors: np.ndarray, centre: np.ndarray) -> None:
+    """out [n, 35] = the features and the direction from centre [3] of anchors; distance [n] from it, MIN_NORM at
+    least."""
+    for n in nb.prange(len(anchors)):
+        x, y, z = anchors[n, 0] - centre[0], anchors[n, 1] - centre[1], anchors[n, 2] - centre[2]
+        distance[n] = max(math.sqrt(x * x + y * y + z * z), anchors.dtype.type(MIN_NORM))
+        for c in range(FEATURE_DIM):
+            out[n, c] = anchors[n, 3 + c]
+        out[n, FEATURE_DIM] = x / distance[n]
+        out[n, FEATURE_DIM + 1] = y / distance[n]
+        out[n, FEATURE_DIM + 2] = z / distance[n]
+
+
+@kernel(parallel=True)
+def inputs_backward(g_anchors: np.ndarray, g: np.ndarray, out: np.ndarray, distance: np.ndarray) -> None:
+    """The transpose of `inputs`, which gave `out` and `distance`; adds to g_anchors [n, 71]."""
+    for n in nb.prange(len(g)):
+        for c in range(FEATURE_DIM):
+            g_anchors[n, 3 + c] += g[n, c]
+        along = g.dtype.type(0)
+        if distance[n] > g.dtype.type(MIN_NORM):
+            for i in range(FEATURE_DIM, FEATURE_DIM + 3):
+                along += g[n, i] * out[n, i]
+        for i in range(3):
+            g_anchors[n, i] += (g[n, FEATURE_DIM + i] - along * out[n, FEATURE_DIM + i]) / distance[n]
+
+
+@kernel()
+def seen(keep: np.ndarray, opacity: np.ndarray, mask: np.ndarray, faintest: float) -> int:
+    """Writes to `keep` the slots whose opacity [n, 10] times mask [n] is `faintest` at least; returns how many."""
+    count = 0
+    for n in range(len(mask)):
+        for o in range(N_OFFSETS):
+            keep[count] = n * N_OFFSETS + o
+            count += opacity[n, o] * mask[n] >= opacity.dtype.type(faintest)
+    return count
+
+
+@kernel(parallel=True)
+def linear(
+    out: np.ndarray, keep: np.ndarray, hidden: np.ndarray, column: int, weight: np.ndarray, bias: np.ndarray
+) -> None:
     """out [K, w] = the outputs of a linear layer (weight [10 w, H], bias [10 w]) that belong to the kept slots."""
-    width, inputs = out.shape[1], hidden.shape[1]
+    width, inputs = out.shape[1], weight.shape[1]
     zero = splat(hidden.dtype.type(0))
     for k in nb.prange(len(keep)):
-        row = keep[k] // N_OFFSETS * inputs
+        row = keep[k] // N_OFFSETS * hidden.shape[1] + column
         first = keep[k] % N_OFFSETS * width
         for o in range(width):
             value = zero
@@ -56,16 +127,17 @@ def linear_backward(
     keep: np.ndarray,
     g: np.ndarray,
     hidden: np.ndarray,
+    column: int,
     weight: np.ndarray,
 ) -> None:
-    """The transpose of `linear`. Results, given zeroed: grad_hidden [n, H], grad_weight [parts, 10 w, H] and grad_bias
-    [parts, 10 w], summed into their first part."""
-    width, inputs, parts = g.shape[1], hidden.shape[1], len(grad_weight)
+    """The transpose of `linear`. Results, given zeroed: grad_hidden (as hidden), grad_weight [parts, 10 w, H] and
+    grad_bias [parts, 10 w], summed into their first part."""
+    width, inputs, parts = g.shape[1], weight.shape[1], len(grad_weight)
     for part in nb.prange(parts):
         begin, end = _part(keep, part, parts)
         own = grad_weight[part]
         for k in range(begin, end):
-            row = keep[k] // N_OFFSETS * inputs
+            row = keep[k] // N_OFFSETS * hidden.shape[1] + column
             first = keep[k] % N_OFFSETS * width
             for o in range(width):
                 grad_bias[part, first + o] += g[k, o]
@@ -84,88 +156,158 @@ def linear_backward(
 
 @kernel(parallel=True)
 def assemble(
-    means: np.ndarray,
-    scales: np.ndarray,
-    quats: np.ndarray,
-    opacities: np.ndarray,
+    gaussians: np.ndarray,
     gates: np.ndarray,
     keep: np.ndarray,
-    position: np.ndarray,
-    scaling: np.ndarray,
-    offset: np.ndarray,
+    anchors: np.ndarray,
+    extent: np.ndarray,
     opacity: np.ndarray,
     mask: np.ndarray,
     shape: np.ndarray,
     relative: np.ndarray,
+    color: np.ndarray,
 ) -> None:
-    """What the kept Gaussians are made of.
+    """gaussians and gates [K] of the kept slots.
 
-    position [n, 3], scaling [n, 6] (extents: of the offsets, then of the Gaussians), offset and opacity of all slots
-    [n * 10, 3] and [n * 10], mask [n]; shape [K, 7] (its last four the quaternion), relative [K, 3] sizes within 0..1.
-    Results: means, scales [K, 3], quats [K, 4] unit, opacities, gates [K].
+    extent [n, 6]: the exponentials of log scalings, of the offsets, then of the Gaussians; opacity [n, 10]; mask [n];
+    shape [K, 7], its last four the quaternion; relative [K, 7], its first three the sizes within 0..1; color [K, 3].
     """
     for k in nb.prange(len(keep)):
-        slot = keep[k]
-        n = slot // N_OFFSETS
+        n, o = keep[k] // N_OFFSETS, keep[k] % N_OFFSETS
         for i in range(3):
-            means[k, i] = position[n, i] + offset[slot, i] * scaling[n, i]
-            scales[k, i] = scaling[n, 3 + i] * relative[k, i]
-        inverse = 1 / _norm(shape, k)
+            gaussians[k, i] = anchors[n, i] + anchors[n, OFFSET + 3 * o + i] * extent[n, i]
+            gaussians[k, SCALE + i] = extent[n, 3 + i] * relative[k, i]
+            gaussians[k, COLOR + i] = color[k, i]
+        inverse = 1 / _norm(shape, k, 3)
         for i in range(4):
-            quats[k, i] = shape[k, 3 + i] * inverse
-        opacities[k] = opacity[slot]
+            gaussians[k, QUAT + i] = shape[k, 3 + i] * inverse
+        gaussians[k, OPACITY] = opacity[n, o]
         gates[k] = mask[n]
 
 
 @kernel(inline=True)
-def _norm(shape: np.ndarray, k: int) -> Any:
-    square = shape[k, 3] * shape[k, 3] + shape[k, 4] * shape[k, 4]
-    square += shape[k, 5] * shape[k, 5] + shape[k, 6] * shape[k, 6]
-    return max(math.sqrt(square), shape.dtype.type(MIN_NORM))
+def _norm(values: np.ndarray, k: int, first: int) -> Any:
+    """That of the four values of row k from column `first` on, and no less than MIN_NORM."""
+    square = values[k, first] * values[k, first] + values[k, first + 1] * values[k, first + 1]
+    square += values[k, first + 2] * values[k, first + 2] + values[k, first + 3] * values[k, first + 3]
+    return max(math.sqrt(square), values.dtype.type(MIN_NORM))
+
+
+@kernel(inline=True)
+def _unit_backward(out: np.ndarray, values: np.ndarray, g: np.ndarray, k: int, to: int, of: int, at: int) -> None:
+    """Row k of `out` from column `to` on = the gradient by the four values from `of` on of what `_norm` divides, from
+    that of the quotients, in g from `at` on."""
+    norm = _norm(values, k, of)
+    along = values.dtype.type(0)
+    if norm > values.dtype.type(MIN_NORM):
+        for i in range(4):
+            along += g[k, at + i] * values[k, of + i]
+        along /= norm * norm
+    for i in range(4):
+        out[k, to + i] = (g[k, at + i] - along * values[k, of + i]) / norm
 
 
 @kernel(parallel=True)
 def assemble_backward(
-    g_position: np.ndarray,
-    g_scaling: np.ndarray,
-    g_offset: np.ndarray,
+    g_anchors: np.ndarray,
     g_opacity: np.ndarray,
     g_mask: np.ndarray,
     g_shape: np.ndarray,
+    g_color: np.ndarray,
     keep: np.ndarray,
-    scaling: np.ndarray,
-    offset: np.ndarray,
+    anchors: np.ndarray,
+    extent: np.ndarray,
     shape: np.ndarray,
     relative: np.ndarray,
-    quats: np.ndarray,
-    g_means: np.ndarray,
-    g_scales: np.ndarray,
-    g_quats: np.ndarray,
-    g_opacities: np.ndarray,
+    gaussians: np.ndarray,
+    g: np.ndarray,
     g_gates: np.ndarray,
     parts: int,
 ) -> None:
-    """The transpose of `assemble`. Results, given zeroed but g_shape [K, 7], whose first three are the gradients before
-    the sigmoid that gave `relative`."""
+    """The transpose of `assemble`. Results, given zeroed but g_shape and g_color, whose gradients are those before the
+    sigmoids that gave `relative` and the colours; g_anchors by log scalings, and no features."""
     for part in nb.prange(parts):
         begin, end = _part(keep, part, parts)
         for k in range(begin, end):
-            slot = keep[k]
-            n = slot // N_OFFSETS
+            n, o = keep[k] // N_OFFSETS, keep[k] % N_OFFSETS
             for i in range(3):
-                g = g_means[k, i]
-                g_position[n, i] += g
-                g_offset[slot, i] = g * scaling[n, i]
-                g_scaling[n, i] += g * offset[slot, i]
-                g, size = g_scales[k, i], relative[k, i]
-                g_scaling[n, 3 + i] += g * size
-                g_shape[k, i] = g * scaling[n, 3 + i] * size * (1 - size)
-            norm = _norm(shape, k)
-            along = shape.dtype.type(0)
-            if norm > shape.dtype.type(MIN_NORM):
-                for i in range(4):
-                    along += g_quats[k, i] * quats[k, i]
-            for i in range(4):
-                g_shape[k, 3 + i] = (g_quats[k, i] - along * quats[k, i]) / norm
-            g_opacity[slot] = g_opacities[k]
+                slope = g[k, i]
+                g_anchors[n, i] += slope
+                g_anchors[n, OFFSET + 3 * o + i] = slope * extent[n, i]
+                g_anchors[n, SCALING + i] += slope * anchors[n, OFFSET + 3 * o + i] * extent[n, i]
+                slope, size = g[k, SCALE + i] * extent[n, 3 + i], relative[k, i]
+                g_anchors[n, SCALING + 3 + i] += slope * size
+                g_shape[k, i] = slope * size * (1 - size)
+                value = gaussians[k, COLOR + i]
+                g_color[k, i] = g[k, COLOR + i] * value * (1 - value)
+            _unit_backward(g_shape, shape, g, k, 3, 3, QUAT)
+            g_opacity[n, o] = g[k, OPACITY]
             g_mask[n] += g_gates[k]
+
+
+@kernel(inline=True)
+def _clamped(value: float) -> Any:
+    """value within 0..1; NaN passes."""
+    return value if value != value else min(max(value, 0), 1)
+
+
+@kernel(parallel=True)
+def finish(
+    means: np.ndarray,
+    quats: np.ndarray,
+    scales: np.ndarray,
+    opacities: np.ndarray,
+    colors: np.ndarray,
+    gaussians: np.ndarray,
+    gates: np.ndarray,
+    loose: bool,
+) -> None:
+    """The parts of gaussians under gates [K]; loose: clamped and normalised first."""
+    zero, one = gaussians.dtype.type(0), gaussians.dtype.type(1)
+    for k in nb.prange(len(gates)):
+        inverse = one / _norm(gaussians, k, QUAT) if loose else one
+        for i in range(4):
+            quats[k, i] = gaussians[k, QUAT + i] * inverse
+        for i in range(3):
+            means[k, i] = gaussians[k, i]
+            size, color = gaussians[k, SCALE + i], gaussians[k, COLOR + i]
+            scales[k, i] = gates[k] * (zero if loose and size < zero else size)
+            colors[k, i] = _clamped(color) if loose else color
+        opacity = gaussians[k, OPACITY]
+        opacities[k] = gates[k] * (_clamped(opacity) if loose else opacity)
+
+
+@kernel(parallel=True)
+def finish_backward(
+    g: np.ndarray,
+    g_gates: np.ndarray,
+    gaussians: np.ndarray,
+    gates: np.ndarray,
+    g_means: np.ndarray,
+    g_quats: np.ndarray,
+    g_scales: np.ndarray,
+    g_opacities: np.ndarray,
+    g_colors: np.ndarray,
+    loose: bool,
+) -> None:
+    """The transpose of `finish`: g [K, 14], g_gates [K]."""
+    zero, one = gaussians.dtype.type(0), gaussians.dtype.type(1)
+    for k in nb.prange(len(gates)):
+        opacity = gaussians[k, OPACITY]
+        inside = not loose or (opacity >= zero and opacity <= one)
+        g[k, OPACITY] = g_opacities[k] * gates[k] if inside else zero
+        by_gate = g_opacities[k] * (_clamped(opacity) if loose else opacity)
+        for i in range(3):
+            g[k, i] = g_means[k, i]
+            size, color = gaussians[k, SCALE + i], gaussians[k, COLOR + i]
+            inside = not loose or size > zero
+            g[k, SCALE + i] = g_scales[k, i] * gates[k] if inside else zero
+            by_gate += g_scales[k, i] * size if inside else zero
+            inside = not loose or (color >= zero and color <= one)
+            g[k, COLOR + i] = g_colors[k, i] if inside else zero
+        g_gates[k] = by_gate
+        if loose:
+            _unit_backward(g, gaussians, g_quats, k, QUAT, QUAT, 0)
+        else:
+            for i in range(4):
+                g[k, QUAT + i] = g_quats[k, i]

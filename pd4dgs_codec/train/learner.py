@@ -316,9 +316,9 @@ class Learner:
         if not self.config.prune or (self.schedule.iterations or 0) < pruning.MIN_ITERATIONS:
             return []
         rounds = [self._prune_round(turn) for turn, start in enumerate(self.schedule.prune) if self._reached(start)]
-        return [sum(column) for column in zip(*rounds, strict=True)]
+        return [sum(column) for column in zip(*filter(None, rounds), strict=True)]
 
-    def _prune_round(self, turn: int) -> tuple[int, int]:
+    def _prune_round(self, turn: int) -> tuple[int, ...]:
         waiting = self.waiting_views()
         shots = [shot for i, shot in enumerate(self.shots) if i not in waiting]
         stride = -(-len(shots) // pruning.VIEWS)
@@ -329,7 +329,7 @@ class Learner:
                 self.model, self.optimiser, shots[turn % stride :: stride], levels, share, turn, self._rounding()
             )
         except NotFinite:  # as a step that diverged: passed over, with nothing changed
-            return 0, 0
+            return ()
         self.densifier.keep(keep)
         self._neighbours = None
         return before - len(keep), later

@@ -6,7 +6,7 @@ import torch
 from torch import Tensor
 
 from pd4dgs_codec.model.model import Model
-from pd4dgs_codec.model.rate import channel_moments, rate_bits
+from pd4dgs_codec.model.rate import rate_bits, sampled
 from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import MASK_THRESHOLD
 
@@ -19,8 +19,8 @@ def attribute_bits(model: Model, rows: Tensor, active: Tensor) -> Tensor:
         (model.scaling_log, model.steps.scaling_log),
         (model.offset.flatten(1), model.steps.offset),
     ):
-        mu, sigma = channel_moments(values.index_select(0, active))
-        parts.append(rate_bits(values.index_select(0, rows), mu, sigma, step))
+        mu, sigma, picked = sampled(values, active, rows)
+        parts.append(rate_bits(picked, mu, sigma, step))
     return torch.cat(parts, dim=1)
 
 

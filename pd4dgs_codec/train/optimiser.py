@@ -40,8 +40,8 @@ class Optimiser:
 
     def gradient_norm(self) -> float:
         """Norm over all gradients; NaN or infinite if any is."""
-        norms = [p.grad.norm() for group in self.adam.param_groups for p in group["params"] if p.grad is not None]
-        return float(torch.stack(norms).norm()) if norms else 0.0
+        gradients = [p.grad for group in self.adam.param_groups for p in group["params"] if p.grad is not None]
+        return float(torch.stack(torch._foreach_norm(gradients)).norm()) if gradients else 0.0
 
     def scale_gradients(self, factor: float) -> None:
         """All gradients times `factor`."""

@@ -8,9 +8,10 @@ import torch
 
 from pd4dgs_codec.model.rate import (
     channel_moments,
-    channel_moments_reference,
     log_probability,
     rate_bits,
+    sampled,
+    sampled_reference,
 )
 
 RATIOS = [1e-3, 0.01, 0.1, 0.3, 0.5, 1.0, 2.0, 7.0, 50.0, 1e3, 1e6]
@@ -83,19 +84,22 @@ def test_gradient_through_the_moments_matches_finite_differences():
 
 
 @pytest.mark.parametrize("rows", [1, 2, 500])
-def test_moments_and_their_gradient_are_those_of_the_plain_form(rows):
-    x = torch.randn(rows, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(rows)) * 3 + 7
+def test_samples_and_their_gradient_are_those_of_the_plain_form(rows):
+    generator = torch.Generator().manual_seed(rows)
+    x = torch.randn(600, 5, dtype=torch.float64, generator=generator) * 3 + 7
     x[:, 1] = 4.0  # a channel without spread
-    weights = torch.randn(2, 5, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
+    active = torch.randperm(600, generator=generator)[:rows].sort().values
+    picked = active[torch.randperm(rows, generator=generator)[: (rows + 1) // 2]]
+    weights = torch.randn(2 + len(picked), 5, dtype=torch.float64, generator=generator)
     weights[1, 1] = 0.0  # the rate holds such a sigma at its floor, so that no gradient comes back
     results = []
-    for function in (channel_moments, channel_moments_reference):
+    for function in (sampled, sampled_reference):
         leaf = x.clone().requires_grad_()
-        moments = torch.stack(function(leaf))
-        (moments * weights).sum().backward()
-        results.append((moments, leaf.grad))
+        found = torch.cat([part.view(-1, 5) for part in function(leaf, active, picked)])
+        (found * weights).sum().backward()
+        results.append((found, leaf.grad))
     for found, expected in zip(*results, strict=True):
-        torch.testing.assert_close(found, expected, rtol=1e-12, atol=1e-12)
+        torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-12)
 
 
 @pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 2e-11), (torch.float32, 2e-4)])

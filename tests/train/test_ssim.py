@@ -135,7 +135,7 @@ def test_errors():
 
 
 MOMENTS = """
-from pd4dgs_codec.render import threads
+from pd4dgs_codec import threads
 threads.configure(1)
 import hashlib
 import numpy as np

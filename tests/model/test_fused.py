@@ -1,0 +1,116 @@
+"""The fused functions of the CPU against the plain torch graph: the same Gaussians and the same gradients."""
+
+import pytest
+import torch
+from test_model import ALL_HEADS, CAMERA, small_model, stir
+from torch.nn import functional as F
+
+from pd4dgs_codec.model import fused
+from pd4dgs_codec.model.mlp import MLP
+from pd4dgs_codec.model.model import Gaussians, Model
+from pd4dgs_codec.model.rounding import EXACT, Noise, Rounding
+
+PARTS = ("means", "quats", "scales", "opacities", "colors")
+
+
+def roundings() -> dict[str, Rounding]:
+    return {"exact": EXACT, "noise": Rounding(Noise(5)), "rounded": Rounding(attributes=True, weights=True)}
+
+
+def drawn(*shape: int) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(sum(shape)))
+
+
+def gradients(model: Model, gaussians: Gaussians) -> dict[str, torch.Tensor | None]:
+    """Those of one random weighting of what is drawn."""
+    model.zero_grad(set_to_none=True)
+    sum((getattr(gaussians, name) * drawn(*getattr(gaussians, name).shape)).sum() for name in PARTS).backward()
+    return {name: None if p.grad is None else p.grad.clone() for name, p in model.named_parameters()}
+
+
+def check(model: Model, level: int, rounding: str = "exact") -> Gaussians:
+    """Both forms agree to a few roundings of float32."""
+    assert model._fusible()
+    found, expected = (
+        form(level, 0.37, CAMERA, roundings()[rounding]) for form in (model.gaussians, model.gaussians_reference)
+    )
+    for name in ("slots", "anchors"):
+        assert torch.equal(getattr(found, name), getattr(expected, name))
+    for name in (*PARTS, "raw_opacity"):
+        torch.testing.assert_close(getattr(found, name), getattr(expected, name), rtol=1e-5, atol=1e-5)
+    both = gradients(model, found), gradients(model, expected)
+    assert [n for n, g in both[0].items() if g is None] == [n for n, g in both[1].items() if g is None]
+    for name, gradient in both[1].items():
+        if gradient is not None:
+            scale = float(gradient.abs().max())
+            torch.testing.assert_close(both[0][name], gradient, rtol=1e-4, atol=1e-5 * scale, msg=name)
+    return found
+
+
+@pytest.mark.parametrize("rounding", roundings())
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_it_is_the_plain_graph(level, rounding):
+    gaussians = check(stir(small_model(anchors=300, opacity=-0.1), 0.3), level, rounding)
+    assert 0 < len(gaussians.slots) < 10 * len(gaussians.anchors)
+
+
+@pytest.mark.parametrize("parts", [2, 5])
+def test_it_is_so_in_as_many_parts_as_there_are_threads(monkeypatch, parts):
+    monkeypatch.setattr("numba.get_num_threads", lambda: parts)
+    check(stir(small_model(opacity=-0.1), 0.3), 2)
+
+
+def test_rows_go_through_the_networks_in_blocks(monkeypatch):
+    monkeypatch.setattr(fused, "BLOCK", 7)
+    check(stir(small_model(), 0.3), 2)
+
+
+@pytest.mark.parametrize(
+    "heads", [(("position", "scaling"), ("color", "mean")), (ALL_HEADS[0], ()), ((), ALL_HEADS[1]), ((), ())]
+)
+def test_heads_and_fields_may_be_absent(heads):
+    check(stir(small_model(heads), 0.3), 2)
+
+
+@pytest.mark.parametrize(("opacity", "kept"), [(-3.0, 0), (3.0, 800)])
+def test_no_gaussian_or_every_one_is_seen(opacity, kept):
+    assert len(check(small_model(opacity=opacity), 2).slots) == kept
+
+
+@pytest.mark.parametrize("loose", [False, True])
+def test_finished_gaussians_and_their_gradients(loose):
+    """Values on both sides of every clamp, on it, and a quaternion of no length."""
+    rows, gates = drawn(200, 14) * 2, drawn(200).sigmoid()
+    rows[:5, 3:6], rows[5:10, 10:] = 0.0, torch.tensor([0.0, 1.0, -1.0, 2.0])
+    rows[10:13, 6:10] = 0.0
+
+    def plain(rows, gates):
+        means, scales, quats, opacities, colors = torch.split(rows, [3, 3, 4, 1, 3], dim=1)
+        if loose:
+            quats, colors = F.normalize(quats, dim=1), colors.clamp(0, 1)
+            scales, opacities = F.relu(scales), opacities.clamp(0, 1)
+        return means, quats, scales * gates[:, None], opacities[:, 0] * gates, colors
+
+    results = []
+    for form in (lambda *x: fused.finish(*x, loose), plain):
+        leaves = [x.clone().requires_grad_() for x in (rows, gates)]
+        outputs = form(*leaves)
+        sum((x * drawn(*x.shape)).sum() for x in outputs).backward()
+        results.append([*outputs, *(x.grad for x in leaves)])
+    for found, expected in zip(*results, strict=True):
+        torch.testing.assert_close(found, expected, rtol=1e-5, atol=1e-6)
+
+
+def test_networks_of_other_depths_and_widths_take_the_plain_form():
+    assert not small_model(channels=4)._fusible()
+    for widths in ((35, 16, 16, 10), (35, 12, 10)):
+        model = small_model()
+        model.networks["opacity"] = MLP(widths)
+        assert not model._fusible()
+        assert len(model.gaussians(2, 0.5, CAMERA).slots)
+
+
+def test_repeated_runs_give_the_same_bits():
+    model = stir(small_model(), 0.3)
+    first, second = (gradients(model, model.gaussians(2, 0.37, CAMERA)) for _ in range(2))
+    assert all(torch.equal(first[name], second[name]) for name in first)
