@@ -448,7 +448,7 @@ def weight_shapes(layer):
 
 
 # 6.5 Declared sizes: "c MUST NOT exceed 2^28, N MUST NOT exceed 2^13 + 2·L, and S MUST NOT exceed 2^22 + 2048·L."
-# "N, S and L are sums over this layer and all layers before it in the file"
+# "let N, S and L be sums over this layer and all layers before it in the file"
 def check_sizes(layer, payload_bytes, before):
     """before: N, S and L of the layers before it. Sets those with it."""
     samples = sum(c * h * w for _, _, (c, h, w) in plane_shapes(layer))

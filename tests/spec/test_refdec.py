@@ -30,7 +30,7 @@ from pd4dgs_codec.codec.plane_section import read_planes
 from pd4dgs_codec.codec.stages import PLAIN, STAGED
 from pd4dgs_codec.entropy.channels import encode_channels
 from pd4dgs_codec.entropy.lzma_mode import encode_channels_lzma
-from pd4dgs_codec.entropy.positions import encode_positions
+from pd4dgs_codec.entropy.positions import encode_positions, position_channels
 from pd4dgs_codec.entropy.priors import CONST, GAUSS, GMM2, HIST, K_MAX
 from pd4dgs_codec.entropy.tables import NORMAL, OCTAVE
 from pd4dgs_codec.entropy.varint import put_varint, put_zigzag
@@ -585,6 +585,16 @@ def test_the_tables_and_limits_of_the_specification():
     ).groups()
     found = refdec.relative_magnitude([[int(v.replace("−", "-")) for v in residuals.split(",")]], 4)
     assert found == [int(v) for v in magnitudes.split(",")]
+
+
+def test_the_example_of_an_octree():
+    text = plain(TEXT.split("### 10.4 ")[1].split("\n## ")[0])
+    places = re.search(r"Four anchors at (.*?)\. The minimum", text)[1]
+    cells = np.array([[int(v) for v in place.split(",")] for place in re.findall(r"\((.*?)\)", places)], np.int32)
+    head, channels = position_channels(cells[morton_order(cells)])
+    assert head == bytes.fromhex(re.search(r"begins ((?:[0-9A-F]{2} ?)+);", text)[1])
+    printed = re.search(r"that are not empty are ([\d ·]+) · 1,", text)[1] + " · 1"
+    assert [c.tolist() for c in channels if len(c)] == [[int(v) for v in c.split()] for c in printed.split("·")]
 
 
 def test_the_annotated_file():
