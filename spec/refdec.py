@@ -352,14 +352,14 @@ class Layer:
 
 
 # 6.1 Layout: "The lengths of the sections MUST sum to the rest exactly."
-def read_layer(payload, number, rows_before, header):
-    layer = Layer(number, rows_before, header)
+def read_layer(payload, number, before, header):
+    layer = Layer(number, before[0], header)
     reader = Reader(payload)
     parameters = reader.take(limited(reader.number("<I"), 4096, "the parameters' length"))
     read_parameters(layer, unpack(parameters))
     parts = {section: reader.take(layer.sections[section]) for section in sorted(layer.sections)}
     need(not reader.left, f"{reader.left} bytes behind the sections")
-    check_sizes(layer, len(payload))
+    check_sizes(layer, len(payload), before)
     read_sections(layer, parts)
     return layer
 
@@ -447,14 +447,17 @@ def weight_shapes(layer):
     return shapes
 
 
-# 6.5 Declared sizes: "c MUST NOT exceed 2^28, n MUST NOT exceed 2^13 + 2·L, and E + 72·n + c + w MUST NOT exceed 2^22 +
-# 2048·L, L being the payload's length in bytes."
-def check_sizes(layer, payload_bytes):
+# 6.5 Declared sizes: "c MUST NOT exceed 2^28, N MUST NOT exceed 2^13 + 2·L, and S MUST NOT exceed 2^22 + 2048·L."
+# "N, S and L are sums over this layer and all layers before it in the file"
+def check_sizes(layer, payload_bytes, before):
+    """before: N, S and L of the layers before it. Sets those with it."""
     samples = sum(c * h * w for _, _, (c, h, w) in plane_shapes(layer))
     need(samples <= 1 << 28, f"{samples} plane samples", "LimitExceeded")
-    need(layer.rows <= (1 << 13) + 2 * payload_bytes, f"{layer.rows} own rows", "LimitExceeded")
     symbols = layer.rows_before + 72 * layer.rows + samples + sum(size for _, size in weight_shapes(layer))
-    need(symbols <= (1 << 22) + 2048 * payload_bytes, f"{symbols} symbols", "LimitExceeded")
+    layer.declared = [a + b for a, b in zip(before, (layer.rows, symbols, payload_bytes))]
+    rows, symbols, size = layer.declared
+    need(rows <= (1 << 13) + 2 * size, f"{rows} rows", "LimitExceeded")
+    need(symbols <= (1 << 22) + 2048 * size, f"{symbols} symbols", "LimitExceeded")
 
 
 # 6.4 Sections: "A section is present if and only if it has at least one symbol or value to code. Mode ans uses 0..4,
@@ -1228,16 +1231,16 @@ def decode(data, max_layer=None):
     order."""
     header, at = read_preamble(data)
     scene_id = hashlib.sha256(behind_chunk_list(data[20:at])).digest()[:8]
-    layers, rows = [], 0
+    layers, declared = [], (0, 0, 0)
     stop = len(header[1])
     if max_layer is not None:
         stop = 1 + max(i for i, (kind, _) in enumerate(header[1]) if kind <= min(max_layer, 2))
     for kind, size in header[1][:stop]:
         payload, at = read_chunk(data, at, kind, size, scene_id)
         if kind < 3:
-            layers.append(read_layer(payload, kind, rows, header))
+            layers.append(read_layer(payload, kind, declared, header))
             finish_last(layers)
-            rows += layers[-1].rows
+            declared = layers[-1].declared
     need(max_layer is not None or at == len(data), "bytes follow the last chunk")
     return layers
 

@@ -40,6 +40,7 @@ def levers() -> dict[str, Changes]:
     middle = {name: value for name, (value, _) in DIAL.items()}
     return {
         "planes' rate and steps": BEFORE | {"steps": None, "plane_rate": middle["plane_rate"]},
+        "coarser steps": BEFORE | {"step_scale": middle["step_scale"]},
         "pruning": BEFORE | {"prune": middle["prune"]},
     }
 

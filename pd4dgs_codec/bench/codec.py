@@ -247,21 +247,11 @@ def values_table(points: Sequence[Point], masks: Deviation | None = None) -> str
     by_scale = {p.step_scale: p.values for p in reversed(points) if p.values}
     rows = [(f"{scale:g}", v) for scale, values in reversed(by_scale.items()) for v in values]
     rows += [("any", masks)] if masks else []
-    return markdown(
-        head,
-        [
-            (
-                scale,
-                v.what,
-                v.unit or "1",
-                f"{v.step:.4g}",
-                f"{v.largest:.3g}",
-                f"{v.rms:.3g}",
-                f"{v.largest / v.step:.3f}",
-            )
-            for scale, v in rows
-        ],
-    )
+    cells = []
+    for scale, v in rows:
+        errors = (f"{v.largest:.3g}", f"{v.rms:.3g}", f"{v.largest / v.step:.3f}")
+        cells.append((scale, v.what, v.unit or "1", f"{v.step:.4g}", *errors))
+    return markdown(head, cells)
 
 
 def panels(points: Sequence[Point]) -> list[Panel]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pd4dgs_codec.bitstream.container import PREAMBLE_SIZE, read_chunk, read_preamble
 from pd4dgs_codec.codec.header import Header, scene_id_of, unpack_header
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
+from pd4dgs_codec.codec.layer_meta import Declared
 from pd4dgs_codec.codec.payload import read_layer
 from pd4dgs_codec.codec.symbols import LayerSymbols, assemble, check_last_layer
 from pd4dgs_codec.errors import DecodeError, Malformed, Truncated, UnsupportedFeature
@@ -20,6 +21,7 @@ class LayerReader:
         self.offset = 0  #: of the next chunk
         self._index = 0
         self._scene_id = b""
+        self._declared = Declared()
 
     @property
     def complete(self) -> bool:
@@ -69,13 +71,14 @@ class LayerReader:
             raise Malformed(message, offset=self.offset, chunk=self._index)
         layer = None
         if kind is not None:
-            rows_before = sum(len(layer.anchor_q) for layer in self.layers)
             try:
-                layer = read_layer(chunk.payload, kind, rows_before, self.header.mode, self.header.raw_deformation)
+                layer = read_layer(chunk.payload, kind, self._declared, self.header.mode, self.header.raw_deformation)
                 check_last_layer([*self.layers, layer], self.header.info.voxel_size, self.header.attribute_steps)
                 _check_bounded(layer, self.header)
             except DecodeError as error:
                 raise _located(error, self._index, self.offset) from None
+            symbols = sum(a.size for a in layer.arrays())
+            self._declared = self._declared.and_layer(len(layer.anchor_q), symbols, len(chunk.payload))
         self._index += 1
         self.offset = chunk.end
         return layer

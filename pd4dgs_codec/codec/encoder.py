@@ -15,6 +15,7 @@ from pd4dgs_codec.codec.check import check_scene
 from pd4dgs_codec.codec.decoder import decode_layers
 from pd4dgs_codec.codec.header import Header, pack_header, payload_digest, scene_id_of
 from pd4dgs_codec.codec.kinds import LAYER_KINDS
+from pd4dgs_codec.codec.layer_meta import Declared
 from pd4dgs_codec.codec.left_out import LeftOut
 from pd4dgs_codec.codec.metadata import CHUNK_TYPE, Metadata, write_metadata
 from pd4dgs_codec.codec.options import DEFAULTS, EncodeOptions
@@ -108,14 +109,13 @@ def encode_with_report(
 
 def _check_limits(scene: Scene, symbols: list[LayerSymbols], payloads: list[bytes]) -> None:
     """Hold declared sizes and ranges of values against the format's limits as a decoder will, verified or not."""
-    rows = 0
+    declared = Declared()
     for index, (layer, payload) in enumerate(zip(symbols, payloads, strict=True)):
         try:
-            read_meta(payload, layer.kind, rows, layer.raw_deformation)
+            *_, declared = read_meta(payload, layer.kind, declared, layer.raw_deformation)
             check_last_layer(symbols[: index + 1], scene.info.voxel_size, scene.steps.attributes)
         except DecodeError as error:
             raise EncodeError(f"the scene is over a limit of the format: {error}") from None
-        rows += len(layer.anchor_q)
 
 
 def _container(meant: Scene, options: EncodeOptions, payloads: list[bytes], metadata: bytes) -> bytes:

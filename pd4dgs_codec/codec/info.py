@@ -12,7 +12,7 @@ from pd4dgs_codec.codec.bounds import rounding_bounds
 from pd4dgs_codec.codec.decoder import read_layers
 from pd4dgs_codec.codec.header import unpack_header
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
-from pd4dgs_codec.codec.layer_meta import Section
+from pd4dgs_codec.codec.layer_meta import Declared, Section
 from pd4dgs_codec.codec.metadata import CHUNK_TYPE, TEXTS, Metadata, read_metadata
 from pd4dgs_codec.codec.payload import read_meta
 from pd4dgs_codec.codec.symbols import float_tensors
@@ -32,7 +32,7 @@ def info(data: bytes) -> dict[str, Any]:
     """
     preamble = read_preamble(data)
     header = unpack_header(preamble.header, offset=PREAMBLE_SIZE)
-    layers, others, offset, rows = [], [], preamble.size, 0
+    layers, others, offset, declared = [], [], preamble.size, Declared()
     metadata: dict[str, Any] | None = None
     for chunk_type, length in header.chunks:
         size = CHUNK_OVERHEAD + length
@@ -46,8 +46,7 @@ def info(data: bytes) -> dict[str, Any]:
             row: dict[str, Any] = {"layer": kind.layer, **place}
             if offset + size <= len(data):
                 payload = read_chunk(data, offset, type=chunk_type, length=length).payload
-                meta, _ = read_meta(payload, kind, rows, header.raw_deformation)
-                rows += meta.rows
+                meta, _, declared = read_meta(payload, kind, declared, header.raw_deformation)
                 row |= {"anchors": meta.rows, "steps": meta.steps}
                 row["planes"] = [[s.channels, *s.sides] for s in meta.scales]
                 row["sections"] = {Section(key).name.lower(): length for key, length in sorted(meta.sections.items())}
@@ -64,7 +63,7 @@ def info(data: bytes) -> dict[str, Any]:
         "voxel_size": header.info.voxel_size,
         "steps": header.attribute_steps,
         "error_bounds": header.error_bounds,
-        "anchors": rows if all("anchors" in row for row in layers) else None,
+        "anchors": declared.rows if all("anchors" in row for row in layers) else None,
         "time_range": list(header.info.time_range),
         "camera": header.info.camera is not None,
         "metadata": metadata,

@@ -41,13 +41,26 @@ class Section(IntEnum):
 # Keys of the map.
 ROWS, SECTIONS, STEPS, SCALES, NETWORKS = range(1, 6)
 
-#: A layer of S symbols has at least (S - FREE_SYMBOLS) / SYMBOLS_PER_BYTE bytes, so that a few bytes that declare
+#: A file of S symbols has at least (S - FREE_SYMBOLS) / SYMBOLS_PER_BYTE bytes, so that a few bytes that declare
 #: constant channels cannot make a decoder allocate without end. Real scenes spend over 0.1 bit per symbol.
 FREE_SYMBOLS = 1 << 22
 SYMBOLS_PER_BYTE = 2048
 #: An anchor may cost next to nothing and its position takes up to 42 symbols; real anchors take tens of bytes.
 FREE_ROWS = 1 << 13
 ROWS_PER_BYTE = 2
+
+
+@dataclass(frozen=True)
+class Declared:
+    """What the layers of a file declare so far: rows, symbols (or values), and the bytes of their payloads."""
+
+    rows: int = 0
+    symbols: int = 0
+    payload_bytes: int = 0
+
+    def and_layer(self, rows: int, symbols: int, payload_bytes: int) -> Declared:
+        """With one more layer."""
+        return Declared(self.rows + rows, self.symbols + symbols, self.payload_bytes + payload_bytes)
 
 
 @dataclass(frozen=True)
@@ -135,17 +148,21 @@ def declared_symbols(meta: LayerMeta, kind: LayerKind, rows_before: int) -> int:
     return rows_before + meta.rows * (N_CHANNELS + 4) + cells + weights
 
 
-def check_symbol_count(meta: LayerMeta, kind: LayerKind, rows_before: int, payload_bytes: int) -> None:
-    """LimitExceeded if the layer declares more anchors or symbols than its payload could reasonably hold."""
+def check_symbol_count(meta: LayerMeta, kind: LayerKind, before: Declared, payload_bytes: int) -> Declared:
+    """What the file declares with this layer; LimitExceeded if that is more than its payloads could reasonably hold."""
     cells = sum(math.prod(shape) for shape in meta.plane_shapes())
     if cells > MAX_PLANE_CELLS:
         raise LimitExceeded(f"layer {kind.layer}: planes of {cells} cells, limit {MAX_PLANE_CELLS}")
-    most = FREE_ROWS + ROWS_PER_BYTE * payload_bytes
-    if meta.rows > most:
-        raise LimitExceeded(f"layer {kind.layer}: {meta.rows} anchors in {payload_bytes} bytes, limit {most}")
-    symbols, limit = declared_symbols(meta, kind, rows_before), FREE_SYMBOLS + SYMBOLS_PER_BYTE * payload_bytes
-    if symbols > limit:
-        raise LimitExceeded(f"layer {kind.layer}: {symbols} symbols in {payload_bytes} bytes, limit {limit}")
+    total = before.and_layer(meta.rows, declared_symbols(meta, kind, before.rows), payload_bytes)
+    for what, found, free, per_byte in (
+        ("anchors", total.rows, FREE_ROWS, ROWS_PER_BYTE),
+        ("symbols", total.symbols, FREE_SYMBOLS, SYMBOLS_PER_BYTE),
+    ):
+        limit = free + per_byte * total.payload_bytes
+        if found > limit:
+            size = f"{total.payload_bytes} bytes of payload so far"
+            raise LimitExceeded(f"layer {kind.layer}: {found} {what} in {size}, limit {limit}")
+    return total
 
 
 def _unpack_steps(fields: Fields, kind: LayerKind, where: str) -> dict[str, float]:

@@ -19,7 +19,15 @@ from pd4dgs_codec.attributes.table import N_CHANNELS
 from pd4dgs_codec.bitstream.limits import MAX_PARAMETERS
 from pd4dgs_codec.codec.attribute_section import read_attributes, write_attributes
 from pd4dgs_codec.codec.kinds import LayerKind
-from pd4dgs_codec.codec.layer_meta import LayerMeta, ScaleMeta, Section, check_symbol_count, pack_meta, unpack_meta
+from pd4dgs_codec.codec.layer_meta import (
+    Declared,
+    LayerMeta,
+    ScaleMeta,
+    Section,
+    check_symbol_count,
+    pack_meta,
+    unpack_meta,
+)
 from pd4dgs_codec.codec.options import EncodeOptions
 from pd4dgs_codec.codec.plane_choice import choose_predictor
 from pd4dgs_codec.codec.plane_section import read_planes, write_planes
@@ -121,9 +129,10 @@ def _meta(symbols: LayerSymbols, sections: dict[Section, bytes], predictors: lis
 
 
 def read_meta(
-    payload: bytes | memoryview, kind: LayerKind, rows_before: int, raw_deformation: bool
-) -> tuple[LayerMeta, int]:
-    """(parameters, offset of the first section) of a payload, all lengths checked against the bytes there are."""
+    payload: bytes | memoryview, kind: LayerKind, before: Declared, raw_deformation: bool
+) -> tuple[LayerMeta, int, Declared]:
+    """(parameters, offset of the first section, what the file declares with this layer) of a payload, all lengths
+    checked against the bytes there are. before: what the layers before it declare."""
     if len(payload) < 4:
         raise Malformed(f"layer {kind.layer}: payload of {len(payload)} bytes, expected at least 4")
     (length,) = struct.unpack_from("<I", payload)
@@ -131,29 +140,28 @@ def read_meta(
         raise LimitExceeded(f"layer {kind.layer}: parameters of {length} bytes, limit {MAX_PARAMETERS}")
     if length > len(payload) - 4:
         raise Malformed(f"layer {kind.layer}: parameters of {length} bytes in a payload of {len(payload)}")
-    meta = unpack_meta(bytes(payload[4 : 4 + length]), kind, rows_before, raw_deformation)
+    meta = unpack_meta(bytes(payload[4 : 4 + length]), kind, before.rows, raw_deformation)
     start, declared = 4 + length, sum(meta.sections.values())
     if start + declared != len(payload):
         raise Malformed(f"layer {kind.layer}: sections of {declared} bytes, expected {len(payload) - start}")
-    check_symbol_count(meta, kind, rows_before, len(payload))
-    return meta, start
+    return meta, start, check_symbol_count(meta, kind, before, len(payload))
 
 
 def read_layer(
-    payload: bytes | memoryview, kind: LayerKind, rows_before: int, mode: str, raw_deformation: bool
+    payload: bytes | memoryview, kind: LayerKind, before: Declared, mode: str, raw_deformation: bool
 ) -> LayerSymbols:
-    """The symbols of a payload (clause "layer payload"). rows_before: anchors in the layers before this one.
+    """The symbols of a payload (clause "layer payload"). before: what the layers before this one declare.
 
     Raises DecodeError's subclasses; nothing is allocated for a count that the limits or the payload do not cover.
     """
-    meta, start = read_meta(payload, kind, rows_before, raw_deformation)
+    meta, start, _ = read_meta(payload, kind, before, raw_deformation)
     parts: dict[int, bytes] = {}
     for section, length in sorted(meta.sections.items()):
         parts[section] = bytes(payload[start : start + length])
         start += length
     raw_deformation = raw_deformation and bool(meta.networks) and kind.layer > 0
     shapes = [*meta.plane_shapes(), *meta.weight_shapes(kind)]
-    counts = _channel_counts(meta, kind, rows_before, raw_deformation)
+    counts = _channel_counts(meta, kind, before.rows, raw_deformation)
     channels = _decode_groups(parts, counts, meta, mode)
     if raw_deformation:
         floats = decode_floats_lzma(_part(parts, Section.FLOATS, 1), [math.prod(shape) for shape in shapes])

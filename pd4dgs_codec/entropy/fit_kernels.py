@@ -26,7 +26,7 @@ _LOW, _HIGH = FLOORS  # the higher floor keeps outliers from steering the fit
 
 
 @_inlined
-def _cost(frequency: int) -> Any:
+def frequency_cost(frequency: int) -> Any:
     """`bits.frequency_costs` of one frequency."""
     bits = np.float64(frequency).view(np.int64)
     i, f = (bits >> 40) & 4095, (bits >> 28) & 4095
@@ -64,9 +64,9 @@ def _table_cost(cdf: np.ndarray, floor: int, counts: np.ndarray) -> Any:
     for k in range(n - 1):
         cum = ((cdf[k] * spread) >> 28) + floor * (k + 1)
         if counts[k] > 0:
-            cost += counts[k] * _cost(cum - before)
+            cost += counts[k] * frequency_cost(cum - before)
         before = cum
-    return cost + counts[n - 1] * _cost(TOTAL - before)
+    return cost + counts[n - 1] * frequency_cost(TOTAL - before)
 
 
 @_compiled
@@ -76,7 +76,7 @@ def _entry_costs(cdf: np.ndarray, floor: int) -> np.ndarray:
     before, spread = 0, TOTAL - n * floor
     for k in range(n):
         cum = TOTAL if k == n - 1 else ((cdf[k] * spread) >> 28) + floor * (k + 1)
-        costs[k] = _cost(cum - before)
+        costs[k] = frequency_cost(cum - before)
         before = cum
     return costs
 
@@ -327,7 +327,7 @@ def classes(dense: np.ndarray) -> tuple[int, int, int, int, int, int, int, np.nd
     octaves = np.zeros(n, np.int64)
     for k in range(n):
         if dense[k] > 0:
-            octaves[k] = _cost(dense[k]) - _cost(largest)
+            octaves[k] = frequency_cost(dense[k]) - frequency_cost(largest)
     below, weights = np.empty(n, np.int64), np.empty(n, np.int64)
     costs, best_costs, best_classes = np.empty(n, np.int64), np.empty(n, np.int64), np.empty(n, np.int64)
     least, best = np.int64(1) << 62, (-1, 0, 0, 0, 0, np.int64(1) << 62, 0)
@@ -355,7 +355,7 @@ def classes(dense: np.ndarray) -> tuple[int, int, int, int, int, int, int, np.nd
         for k in range(n):
             running += weights[k]
             cum = (running >> shift) * (TOTAL - n) // (whole >> shift) + k + 1
-            costs[k] = _cost(cum - before)
+            costs[k] = frequency_cost(cum - before)
             cost += dense[k] * costs[k]
             before = cum
         for k in range(n):
@@ -474,7 +474,7 @@ def split_cost(channels: np.ndarray, classes: np.ndarray, count: int) -> Any:
                 for i in range(len(part)):
                     run += 1
                     if i + 1 == len(part) or part[i + 1] != part[i]:
-                        cost += run * _cost(run)
+                        cost += run * frequency_cost(run)
                         run = 0
         else:
             seen = np.zeros((count, width), np.int64)
@@ -483,10 +483,10 @@ def split_cost(channels: np.ndarray, classes: np.ndarray, count: int) -> Any:
             for k in range(count):
                 for i in range(width):
                     if seen[k, i] > 0:
-                        cost += seen[k, i] * _cost(seen[k, i])
+                        cost += seen[k, i] * frequency_cost(seen[k, i])
         for k in range(count):
             if sizes[k] > 0:
-                cost -= sizes[k] * _cost(sizes[k])
+                cost -= sizes[k] * frequency_cost(sizes[k])
     return cost
 
 

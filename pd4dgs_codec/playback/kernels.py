@@ -15,7 +15,7 @@ WIDTH = 2 * LANES  #: outputs computed at once, each for four points: the sums s
 POINTS = 32  #: points of a task
 
 
-@kernel(fast=True, inline=True)
+@kernel(inline=True)
 def _layer(
     x: np.ndarray, y: np.ndarray, weights: np.ndarray, at: int, inputs: int, outputs: int, row: int, relu: bool
 ) -> None:
@@ -53,7 +53,7 @@ def _layer(
             store(y, x3 + o + LANES, b3)
 
 
-@kernel(fast=True, parallel=True)
+@kernel(parallel=True)
 def forward(out: np.ndarray, x: np.ndarray, widths: np.ndarray, weights: np.ndarray, relu_last: bool) -> None:
     """out [n, at most the last width] of x [n, inputs]; widths int64 [layers + 1]: the inputs, then each layer's padded
     outputs. relu_last: after the last layer as well."""

@@ -11,11 +11,15 @@ import numpy as np
 
 from pd4dgs_codec import threads
 from pd4dgs_codec.model import slot_kernels
+from pd4dgs_codec.model.slot_kernels import COLOR, OPACITY, QUAT, SCALE
 from pd4dgs_codec.model.visibility import FRUSTUM_MARGIN, LEAST_NEAR, MIN_OPACITY, OFFSET_REACH, SIGMA_REACH
 from pd4dgs_codec.playback.networks import Field, Layers, hidden_layers
 from pd4dgs_codec.render.rasteriser import draw
 from pd4dgs_codec.render.simd import LANES
 from pd4dgs_codec.scene import MASK_STEP, MASK_THRESHOLD, N_OFFSETS, Camera, Network, Scene
+
+#: Columns of the kernels' rows of Gaussians: mean, scales, quaternion, opacity, colour.
+GAUSSIAN_WIDTH = COLOR + 3
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,13 +99,14 @@ class Player:
         keep = np.flatnonzero(raw_opacity * mask[:, None] >= np.float32(MIN_OPACITY))
         shape = self._covariance(inputs, keep)
         colors = _sigmoid(self._color(inputs, keep))
-        means, scales, quats = (np.empty((len(keep), width), np.float32) for width in (3, 3, 4))
-        opacities, gate = np.empty(len(keep), np.float32), np.empty(len(keep), np.float32)
+        anchors = np.concatenate([position, feature, offset.reshape(len(rows), 3 * N_OFFSETS), scaling_log], axis=1)
+        made, gate = np.empty((len(keep), GAUSSIAN_WIDTH), np.float32), np.empty(len(keep), np.float32)
         threads.limit_numba()
         slot_kernels.assemble(
-            *(means, scales, quats, opacities, gate, keep, position, np.exp(scaling_log), offset.reshape(-1, 3)),
-            *(raw_opacity.reshape(-1), mask, shape, _sigmoid(shape[:, :3])),
+            made, gate, keep, anchors, np.exp(scaling_log), raw_opacity, mask, shape, _sigmoid(shape), colors
         )
+        means, scales, quats, opacities, colors = np.split(made, [SCALE, QUAT, OPACITY, COLOR], axis=1)
+        opacities = opacities[:, 0]
         if self._local is not None:
             moves = self._local.split(self._local(means, t))
             means = _moved(means, moves, "mean")
@@ -110,6 +115,7 @@ class Player:
             opacities = np.clip(_moved(opacities, moves, "opacity"), 0, 1) if "opacity" in moves else opacities
             colors = np.clip(_moved(colors, moves, "color"), 0, 1) if "color" in moves else colors
         slots = rows[keep // N_OFFSETS] * N_OFFSETS + keep % N_OFFSETS
+        means, quats, colors = (np.ascontiguousarray(part) for part in (means, quats, colors))
         return Gaussians(means, quats, scales * gate[:, None], opacities * gate, colors, slots)
 
     def _visible(self, camera: Camera) -> np.ndarray:
@@ -158,7 +164,7 @@ class _SlotNetwork:
             hidden[:, : x.shape[1]] = x
         out = np.empty((len(keep), self._width), np.float32)
         threads.limit_numba()
-        slot_kernels.linear(out, keep, hidden, self._weight, self._bias)
+        slot_kernels.linear(out, keep, hidden, 0, self._weight, self._bias)
         return out
 
 

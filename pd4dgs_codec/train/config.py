@@ -38,9 +38,9 @@ ABLATIONS: dict[str, dict[str, Any]] = {
 #: log-linear in the quality: rate_scale, plane_rate, prune and step_scale of `TrainConfig`.
 DIAL: dict[str, tuple[float, float]] = {
     "rate_scale": (0.1, 4.0),
-    "plane_rate": (2e-8, 4.0),
+    "plane_rate": (5e-9, 4.0),
     "prune": (0.05, 4.0),
-    "step_scale": (1.0, 1.6),
+    "step_scale": (1.25, 1.6),
 }
 
 #: The steps that `step_scale` multiplies. Offsets and weights cost more quality per byte than any of these.

@@ -56,16 +56,15 @@ export function readPreamble(bytes) {
 /**
  * @typedef {object} Chunk
  * @property {boolean} ancillary
- * @property {string} sceneId in hexadecimal
  * @property {Uint8Array} payload not copied
  */
 
 /**
  * The chunk that `bytes` begin with, of the listed type and length; what follows is not looked at. sceneId: that of the
- * file, null before layer 0. offset and index: of the chunk in the file.
+ * file. offset and index: of the chunk in the file.
  *
  * @param {Uint8Array} bytes
- * @param {{listed: import("./header.js").ListedChunk, sceneId: string | null, offset: number, index: number}} expected
+ * @param {{listed: import("./header.js").ListedChunk, sceneId: string, offset: number, index: number}} expected
  * @returns {Chunk}
  */
 export function readChunk(bytes, { listed, sceneId, offset, index }) {
@@ -86,19 +85,19 @@ export function readChunk(bytes, { listed, sceneId, offset, index }) {
   const type = view.getUint16(0, true);
   if (type !== listed.type) throw fault("Malformed", `chunk type ${type}, the header says ${listed.type}`, 0);
   const found = hex(bytes.subarray(8, 8 + SCENE_ID_SIZE));
-  if (sceneId !== null && found !== sceneId) {
+  if (found !== sceneId) {
     throw fault("Malformed", `the chunk belongs to scene ${found}, this file is ${sceneId}`, 8);
   }
-  return { ancillary: (flags & ANCILLARY) !== 0, sceneId: found, payload: bytes.subarray(CHUNK_HEAD, end) };
+  return { ancillary: (flags & ANCILLARY) !== 0, payload: bytes.subarray(CHUNK_HEAD, end) };
 }
 
 /**
  * The scene id of clause 3.3, in hexadecimal.
  *
- * @param {Uint8Array} described the header's bytes behind its chunk list @param {Uint8Array} payload of layer 0
+ * @param {Uint8Array} described the header's bytes behind its chunk list
  */
-export function sceneIdOf(described, payload) {
-  return hex(new Sha256().update(described).update(payload).digest().subarray(0, SCENE_ID_SIZE));
+export function sceneIdOf(described) {
+  return hex(new Sha256().update(described).digest().subarray(0, SCENE_ID_SIZE));
 }
 
 /** @param {Uint8Array} bytes @param {number} size @param {string} what @param {number} offset @param {number | null} chunk */

@@ -52,6 +52,13 @@ export function asReal(value, where) {
   return value.value;
 }
 
+/** Bytes, so many of them. @param {Value | undefined} value @param {number} size @param {string} where */
+export function asBytes(value, size, where) {
+  if (!(value instanceof Uint8Array)) throw malformed(`${where}: ${nameOf(value)}, expected bytes`);
+  if (value.length !== size) throw malformed(`${where}: ${value.length} bytes, expected ${size}`);
+  return value;
+}
+
 /** @param {number} step @param {string} where */
 export function checkStep(step, where) {
   if (!(step >= SMALLEST_NORMAL)) throw malformed(`${where}: ${step}, expected a positive normal binary32 value`);

@@ -1,15 +1,15 @@
 // Clause 5: the header.
 
+import { sceneIdOf } from "./container.js";
 import { malformed, unsupported } from "./errors.js";
-import { Fields, asInteger, asList, asRegistered, checkStep } from "./fields.js";
+import { Fields, asBytes, asInteger, asList, asRegistered, checkStep } from "./fields.js";
 import { MAX_CHUNKS, MAX_PAYLOAD } from "./limits.js";
 import { unpack } from "./msgpack.js";
 
 /** @typedef {{type: number, length: number}} ListedChunk */
 
 /**
- * size: in bytes. bounds: the classes of 5.4 that have an error bound, with it. described: the bytes behind the chunk
- * list, which the scene id covers (3.3).
+ * size: in bytes. bounds: the classes of 5.4 that have an error bound, with it. sceneId: in hexadecimal (3.3).
  *
  * @typedef {object} Header
  * @property {number} size
@@ -17,7 +17,7 @@ import { unpack } from "./msgpack.js";
  * @property {[number, number, number]} steps of feature, scaling_log and offset
  * @property {import("./scene.js").Info} info
  * @property {Map<number, number>} bounds
- * @property {Uint8Array} described
+ * @property {string} sceneId
  */
 
 /** How many layer types there are: 0, 1 and 2. */
@@ -26,6 +26,7 @@ export const LAYER_TYPES = 3;
 const CLASSES = 8;
 /** The error bounds that every file has: of the attributes and of layer 0's weights. */
 const REQUIRED_CLASSES = 4;
+const DIGEST_SIZE = 16;
 const MAX_CAMERA_SIDE = 65535;
 
 /**
@@ -34,7 +35,7 @@ const MAX_CAMERA_SIDE = 65535;
  */
 export function readHeader(bytes) {
   const { value, firstEntryEnd } = unpack(bytes, "header");
-  const fields = new Fields(value, "header", 1, 13);
+  const fields = new Fields(value, "header", 1, 14);
   const chunks = readChunkList(fields);
   const mode = asRegistered(fields.get(2), 2, "header: mode");
   const deformation = asRegistered(fields.get(3), 2, "header: deformation");
@@ -55,6 +56,7 @@ export function readHeader(bytes) {
   if (unit < 0) throw malformed(`header: unit ${unit}, expected 0 or more`);
   const camera = fields.has(12) ? readCamera(fields.get(12)) : null;
   const bounds = readBounds(fields.get(13));
+  asBytes(fields.get(14), DIGEST_SIZE, "header: digest"); // of all layers, so that a decoder of some cannot check it
   // An ans-only decoder (clause 16).
   if (mode === 1) throw unsupported("header: mode lzma, expected mode ans");
   if (deformation === 1) throw unsupported("header: a deformation of float32 values, expected one of symbols");
@@ -77,7 +79,7 @@ export function readHeader(bytes) {
       camera,
     },
     bounds,
-    described: bytes.slice(firstEntryEnd),
+    sceneId: sceneIdOf(bytes.subarray(firstEntryEnd)),
   };
 }
 

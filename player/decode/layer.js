@@ -32,11 +32,13 @@ export const MOST_CODE = 255;
 /**
  * The symbols of a layer's payload, each in the range that 11.1 and 11.2 allow.
  *
- * @param {Uint8Array} payload @param {import("./parameters.js").LayerKind} kind @param {number} earlierRows
+ * @param {Uint8Array} payload @param {import("./parameters.js").LayerKind} kind
+ * @param {import("./parameters.js").Declared} before by the layers before
  * @returns {LayerSymbols}
  */
-export function decodeLayer(payload, kind, earlierRows) {
-  const parameters = readParameters(payload, kind, earlierRows);
+export function decodeLayer(payload, kind, before) {
+  const earlierRows = before.rows;
+  const parameters = readParameters(payload, kind, before);
   const { rows, sections, planes: shapes, networks } = parameters;
   const positions = sections[POSITIONS];
   const masks = sections[MASKS];

@@ -85,15 +85,20 @@ const SECTIONS = ["positions", "masks", "attributes", "planes", "weights", "symb
  * @property {PlaneShape[]} planes
  * @property {NetworkShape[]} networks
  * @property {(Uint8Array | null)[]} sections
+ * @property {Declared} declared by the layers so far, this one included
  */
+
+/** What layers declare: rows, symbols, and the bytes of their payloads (6.5).
+ * @typedef {{rows: number, symbols: number, bytes: number}} Declared */
 
 /**
  * The parameters of a layer's payload, with its sections; all counts are held against the limits and the payload.
  *
- * @param {Uint8Array} payload @param {LayerKind} kind @param {number} earlierRows
+ * @param {Uint8Array} payload @param {LayerKind} kind @param {Declared} before by the layers before
  * @returns {Parameters}
  */
-export function readParameters(payload, kind, earlierRows) {
+export function readParameters(payload, kind, before) {
+  const earlierRows = before.rows;
   const where = `layer ${kind.layer}`;
   if (payload.length < 4) throw malformed(`${where}: a payload of ${payload.length} bytes, expected at least 4`);
   const length = new DataView(payload.buffer, payload.byteOffset).getUint32(0, true);
@@ -114,7 +119,7 @@ export function readParameters(payload, kind, earlierRows) {
     (sum, { layers }) => layers.reduce((all, { inputs, outputs }) => all + (inputs + 1) * outputs, sum),
     0,
   );
-  checkDeclared(where, payload.length, earlierRows, rows, cells, weights);
+  const declared = declare(where, before, payload.length, rows, cells, weights);
   const counts = [rows, earlierRows + rows, rows * ATTRIBUTE_CHANNELS, cells, weights, 0, 0];
   counts.forEach((count, section) => {
     if ((sections[section] !== null) !== count > 0) {
@@ -122,18 +127,21 @@ export function readParameters(payload, kind, earlierRows) {
       throw malformed(`${where}: section ${SECTIONS[section]} is ${found}, with ${count} symbols to code`);
     }
   });
-  return { rows, steps, planes, networks, sections };
+  return { rows, steps, planes, networks, sections, declared };
 }
 
-/** Clause 6.5. @param {string} where @param {number} bytes of the payload @param {number} earlierRows @param {number} rows
- * @param {number} cells @param {number} weights */
-function checkDeclared(where, bytes, earlierRows, rows, cells, weights) {
+/** Clause 6.5. @param {string} where @param {Declared} before @param {number} bytes of the payload @param {number} own rows
+ * @param {number} cells @param {number} weights @returns {Declared} */
+function declare(where, before, bytes, own, cells, weights) {
   if (cells > MAX_PLANE_CELLS) throw limitExceeded(`${where}: ${cells} plane cells, limit ${MAX_PLANE_CELLS}`);
-  const mostRows = 2 ** 13 + 2 * bytes;
-  if (rows > mostRows) throw limitExceeded(`${where}: ${rows} own rows in ${bytes} bytes, limit ${mostRows}`);
-  const symbols = earlierRows + 72 * rows + cells + weights;
-  const mostSymbols = 2 ** 22 + 2048 * bytes;
-  if (symbols > mostSymbols) throw limitExceeded(`${where}: ${symbols} symbols in ${bytes} bytes, limit ${mostSymbols}`);
+  const all = before.bytes + bytes;
+  const rows = before.rows + own;
+  const mostRows = 2 ** 13 + 2 * all;
+  if (rows > mostRows) throw limitExceeded(`${where}: ${rows} rows in ${all} bytes, limit ${mostRows}`);
+  const symbols = before.symbols + before.rows + 72 * own + cells + weights;
+  const mostSymbols = 2 ** 22 + 2048 * all;
+  if (symbols > mostSymbols) throw limitExceeded(`${where}: ${symbols} symbols in ${all} bytes, limit ${mostSymbols}`);
+  return { rows, symbols, bytes: all };
 }
 
 /** @param {Uint8Array} payload @param {number} at @param {Fields} lengths @param {string} where */

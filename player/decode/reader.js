@@ -1,6 +1,6 @@
 // Clause 12: a file's chunks in order, layer by layer, to scenes.
 
-import { CHUNK_OVERHEAD, PREAMBLE_SIZE, readChunk, readPreamble, sceneIdOf } from "./container.js";
+import { CHUNK_OVERHEAD, PREAMBLE_SIZE, readChunk, readPreamble } from "./container.js";
 import { DecodeError, limitExceeded, malformed, unsupported } from "./errors.js";
 import { LAYER_TYPES, readHeader } from "./header.js";
 import { MOST_CODE, decodeLayer, dequantise, transposed } from "./layer.js";
@@ -36,10 +36,10 @@ export class LayerReader {
     /** What the layers read so far hold. @type {LayerParts[]} */
     this._layers = [];
     this._index = 0;
-    /** @type {string | null} */
-    this._sceneId = null;
     /** The mask codes of all rows so far. */
     this._codes = new Uint8Array(0);
+    /** By those layers. @type {import("./parameters.js").Declared} */
+    this._declared = { rows: 0, symbols: 0, bytes: 0 };
   }
 
   /** Whether every chunk that the header lists has been read. */
@@ -103,25 +103,18 @@ export class LayerReader {
     const { header, offset } = this;
     const index = this._index;
     if (!header) throw new TypeError("no header");
-    const chunk = readChunk(bytes, { listed, sceneId: this._sceneId, offset, index });
+    const chunk = readChunk(bytes, { listed, sceneId: header.sceneId, offset, index });
     /** @param {DecodeError} error @param {number} at */
     const located = (error, at) => new DecodeError(error.kind, error.reason, { offset: offset + at, chunk: index });
-    if (this._sceneId === null) {
-      const expected = sceneIdOf(header.described, chunk.payload);
-      if (chunk.sceneId !== expected) {
-        const message = `scene id ${chunk.sceneId}, expected ${expected} from the header and layer 0`;
-        throw located(malformed(message), 8);
-      }
-      this._sceneId = expected;
-    }
     const isLayer = listed.type < LAYER_TYPES;
     if (!isLayer && !chunk.ancillary) throw located(unsupported(`critical chunk of unknown type ${listed.type}`), 0);
     if (isLayer && chunk.ancillary) throw located(malformed(`layer ${listed.type} is flagged ancillary`), 0);
     let layer = null;
     if (isLayer) {
       try {
-        const symbols = decodeLayer(chunk.payload, LAYER_KINDS[listed.type], this.rows);
+        const symbols = decodeLayer(chunk.payload, LAYER_KINDS[listed.type], this._declared);
         layer = { symbols, tensors: this._accept(symbols) };
+        this._declared = symbols.parameters.declared;
       } catch (error) {
         // What an engine says where it cannot allocate an array.
         const full = error instanceof RangeError && /allocation|array length|buffer length/i.test(error.message);

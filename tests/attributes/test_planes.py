@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 
 from pd4dgs_codec.attributes.planes import PREDICTORS, residual, restore
 from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
+from pd4dgs_codec.codec import plane_choice
 from pd4dgs_codec.codec.plane_choice import choose_predictor
 from pd4dgs_codec.errors import Malformed
 
@@ -95,3 +96,22 @@ def test_the_choice_suits_the_plane():
     assert PREDICTORS[choose_predictor(columns)[0]].name == "left"
     assert PREDICTORS[choose_predictor(rng.integers(-50, 50, (4, 30, 40), dtype=np.int32))[0]].name == "none"
     assert PREDICTORS[choose_predictor(rows + columns)[0]].name == "gradient"
+
+
+def test_compiled_loops_choose_and_fill_the_same(monkeypatch):
+    pytest.importorskip("numba")
+    rng = np.random.default_rng(8)
+    planes = [rng.integers(-9, 10, (3, 11, 9)), rng.integers(-(1 << 20), 1 << 20, (2, 5, 6)), np.zeros((1, 1, 4))]
+    planes = [np.cumsum(plane, axis=2).astype(np.int32) for plane in planes]
+    given = [rng.random(plane.shape[1:]) < 0.4 for plane in planes]
+    found = [plane_choice.fill_plane(k, g) for k, g in zip(planes, given, strict=True)]
+    fills = [plane_choice._fill(k, g, p) for k, g in zip(planes, given, strict=True) for p in PREDICTORS]
+    choices = [choose_predictor(k) for k in planes]
+    monkeypatch.setattr(plane_choice, "kernels", lambda: None)
+    for k, g, fill, (predictor, residuals) in zip(planes, given, found, choices, strict=True):
+        np.testing.assert_array_equal(plane_choice.fill_plane(k, g), fill)
+        assert choose_predictor(k)[0] == predictor
+        np.testing.assert_array_equal(choose_predictor(k)[1], residuals)
+    again = [plane_choice._fill(k, g, p) for k, g in zip(planes, given, strict=True) for p in PREDICTORS]
+    for one, other in zip(fills, again, strict=True):
+        np.testing.assert_array_equal(one, other)

@@ -116,7 +116,7 @@ MESSAGES = {
     "signature-png": "not a .pd4 file: it begins with 89 50 4e 47 0d 0a 1a 0a, expected 89 50 44 34 0d 0a 1a 0a",
     "header-length-over-limit": "a header of 4097 bytes, limit 4096",
     "splice-layer-2": "the chunk belongs to scene .*, this file is",
-    "splice-header-steps": "scene id .*, expected .* from the header and the layer-0 payload",
+    "splice-header-steps": "the chunk belongs to scene .*, this file is .*",
     "critical-unknown-last": "critical chunk of unknown type 6",
     "layer-flagged-ancillary": "layer 1 is flagged ancillary, expected a critical chunk",
     "chunk-list-descends": "layer chunks .0, 2, 1., expected layer 0 first and each layer once, ascending",

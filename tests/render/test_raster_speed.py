@@ -14,14 +14,6 @@ pytestmark = pytest.mark.slow
 TILE = 16
 
 
-@pytest.fixture(autouse=True)
-def restore_threads():
-    before, torch_before = threads.kernel_threads(), torch.get_num_threads()
-    yield
-    threads.set_kernel_threads(before)
-    torch.set_num_threads(torch_before)
-
-
 def _seconds(function, repeat=5):
     times = []
     for _ in range(repeat):

@@ -11,6 +11,7 @@ from functools import partial
 import evaluation
 import latency
 import omissions
+import performance
 import precision
 import pytest
 import results
@@ -24,7 +25,7 @@ from pd4dgs_codec.errors import DataError
 
 ROOT = page.ROOT
 DOCS = ROOT / "docs"
-PAGES = [tool.PAGE for tool in (results, evaluation, precision, latency, omissions)]
+PAGES = [tool.PAGE for tool in (results, evaluation, precision, latency, omissions, performance)]
 PAGES += [table.page for table in TABLES.values()]
 #: Bytes that a text and a picture may have.
 TEXT, PICTURE = 50_000, 300_000

@@ -26,7 +26,7 @@ from pd4dgs_codec.codec.decoder import decode_partial
 from pd4dgs_codec.codec.header import unpack_header
 from pd4dgs_codec.codec.info import hashes, info
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
-from pd4dgs_codec.codec.layer_meta import declared_symbols
+from pd4dgs_codec.codec.layer_meta import Declared
 from pd4dgs_codec.codec.payload import read_meta
 from pd4dgs_codec.errors import DecodeError, Truncated
 
@@ -101,7 +101,7 @@ def count_checksums(data: bytes) -> int:
 
 def declared(data: bytes) -> int:
     """Symbols that the layers of `data` declare within the limits, up to the first layer that is refused."""
-    total, rows = 0, 0
+    total = Declared()
     try:
         preamble = read_preamble(data)
         header, offset = unpack_header(preamble.header), preamble.size
@@ -109,13 +109,11 @@ def declared(data: bytes) -> int:
             kind = BY_CHUNK_TYPE.get(kind_number)
             if kind is not None:
                 payload = read_chunk(data, offset, length=length).payload
-                meta, _ = read_meta(payload, kind, rows, header.raw_deformation)
-                total += declared_symbols(meta, kind, rows)
-                rows += meta.rows
+                *_, total = read_meta(payload, kind, total, header.raw_deformation)
             offset += CHUNK_OVERHEAD + length
     except DecodeError:
         pass
-    return total
+    return total.symbols
 
 
 def memory_bound(data: bytes) -> int:

@@ -66,6 +66,7 @@ CONTENTS = {
         "docs/latency",
         "docs/stability",
         "docs/omissions",
+        "docs/performance",
     ],
     "Project": ["docs/design", "docs/dependencies", "CONTRIBUTING", "SECURITY", "CHANGELOG"],
 }

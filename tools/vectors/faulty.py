@@ -798,6 +798,9 @@ def _sizes() -> Iterator[Vector]:
     yield bad("symbols-of-rows-over-limit", what, "6.5", LIMIT, over, chunk=1)
     crowd = rows_at_limit(over=1)
     yield bad("rows-over-limit", "One anchor more than the payload may declare.", "6.5 14", LIMIT, crowd, chunk=0)
+    halves = make_file(make_layer(0, line(6000)), make_layer(1, line(6000, z=5), before=6000))
+    what = "6000 anchors in either of two layers, together more than their payloads may declare."
+    yield bad("rows-of-layers-over-limit", what, "6.5", LIMIT, halves, chunk=1)
     layer, file = make_layer(), _plain()
     for name, rows in (("rows", 1 << 15), ("most-rows", 58_000)):  # the other bounds let both pass
         payload = layer.payload(lambda m, rows=rows: {**m, 1: rows})

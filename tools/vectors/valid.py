@@ -522,20 +522,22 @@ def _with_weights() -> Layer:
 
 
 def symbols_at_limit(over: int = 0, rows: int = 0) -> File:
-    """As many constant channels as clause 6.5 allows, or `over` more, and `rows` anchors in either layer."""
+    """As many constant channels as clause 6.5 allows a file, or `over` more, and `rows` anchors in either layer."""
     plane = Scale(1, (2048, 2048, 1, 1), (0,) * 6, lambda name, shape: np.full(shape, 1, np.int32))
 
     def layer(first: int, second: int, hidden: int) -> Layer:
         networks = {0: (first, second), 1: (hidden, 3)}
         return make_layer(1, line(rows, z=5), before=rows, scales=[plane], networks=networks)
 
-    size = len(layer(300, 300, 1).payload())  # the same while no width takes more bytes
-    weights = FREE_SYMBOLS + SYMBOLS_PER_BYTE * size + over - (2048 * 2048 + 4 * 2048 + 1) - 73 * rows
+    below = make_layer(cells=line(rows))
+    size = len(below.payload()) + len(layer(300, 300, 1).payload())  # the same while no width takes more bytes
+    spent = sum(a.size for a in below.meant.arrays()) + (2048 * 2048 + 4 * 2048 + 1) + 73 * rows
+    weights = FREE_SYMBOLS + SYMBOLS_PER_BYTE * size + over - spent
     for first, hidden in itertools.product(range(256, 400), range(1, 100)):
         # weights = (1 + 1) first + (first + 1) second + (second + 1) hidden + (hidden + 1) 3
         second, rest = divmod(weights - 3 - 2 * first - 4 * hidden, first + 1 + hidden)
         if rest == 0 and second >= 256:
-            return make_file(make_layer(cells=line(rows)), layer(first, second, hidden))
+            return make_file(below, layer(first, second, hidden))
     raise AssertionError("no widths reach the limit")
 
 

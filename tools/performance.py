@@ -1,0 +1,130 @@
+"""How long encoding, decoding and drawing take, before and after. Writes docs/performance.md.
+
+    python tools/performance.py --before FOLDER [--only NAME ...] [--repeats 9] [--out out] [--docs docs] [--render]
+
+FOLDER is a checkout of another commit of this project, measured by turns with this one: one process of each, then the
+next pair (of encodings a third as many). Each checkpoint that tools/results.py left in --out/NAME/model.pt is one
+scene. Figures are medians over the repeats; the page states the processors and the load.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import statistics
+import subprocess
+import sys
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+
+from pages.page import ROOT, Page, Row, make, options, say
+
+from pd4dgs_codec.bench.report import markdown
+from pd4dgs_codec.bench.timing import machine, machine_line
+from pd4dgs_codec.errors import DataError
+
+NAMES = ("shelf-hand", "bouncing-balls", "synthetic-local")
+EFFORTS = (1, 3, 5, 7, 9)
+#: Runs in either checkout, so it keeps to what both have. argv: what to measure, a checkpoint, a file, options.
+PROGRAM = Path(__file__).parent / "pages" / "stopwatch.py"
+
+
+def run(checkout: Path, what: str, *arguments: str) -> Row:
+    """What the stopwatch prints, measured with the package of `checkout` in a process of its own."""
+    environment = os.environ | {"PYTHONPATH": str(checkout)}
+    command = [sys.executable, str(PROGRAM), what, *arguments]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=checkout)
+    if done.returncode:
+        raise DataError(f"{what} of {checkout}: {(done.stderr.strip().splitlines() or ['it failed'])[-1]}")
+    row: Row = json.loads(done.stdout.splitlines()[-1])
+    return row
+
+
+def measure(path: Path, before: Path, repeats: int) -> Row:
+    """Of one checkpoint: per line of the page the medians before and after, and what every effort takes."""
+    both = {"before": before, "after": ROOT}
+    with tempfile.TemporaryDirectory() as folder:
+        file = str(Path(folder) / "scene.pd4")
+        run(ROOT, "encode", str(path), file, "5")  # the file that both read, and warm caches
+        for checkout in both.values():
+            run(checkout, "start", str(path), file, "5")
+        lines: Row = {}
+        for what in ("encode", "decode", "draw", "start"):
+            found: dict[str, list[Row]] = {name: [] for name in both}
+            for _ in range(max(1, repeats // 3) if what == "encode" else repeats):
+                for name, checkout in both.items():
+                    target = str(Path(folder) / "other.pd4") if what == "encode" else file
+                    found[name].append(run(checkout, what, str(path), target, "5"))
+            lines[what] = {name: _medians(rows) for name, rows in found.items()}
+            say(f"{path.parent.name}: {what} {lines[what]}")
+        efforts = []
+        for effort in EFFORTS:
+            row = run(ROOT, "encode", str(path), str(Path(folder) / "other.pd4"), str(effort))
+            efforts.append({"effort": effort, **row})
+    return {"lines": lines, "efforts": efforts, "machine": machine_line(machine())}
+
+
+def _medians(rows: Sequence[Row]) -> Row:
+    return {key: statistics.median(row[key] for row in rows) for key in rows[0]}
+
+
+#: What a line says, by what was measured: (text, key, factor, decimals).
+LINES = {
+    "encode": (
+        ("encode in process, default effort, s", "wall", 1, 2),
+        ("the same, processor s", "cpu", 1, 2),
+        ("its memory beside the loaded scene, MiB", "memory", 1, 0),
+    ),
+    "decode": (("decode in process, ms", "wall", 1e3, 0), ("the same, processor ms", "cpu", 1e3, 0)),
+    "draw": (("picture of the top level, 480 x 360, ms", "wall", 1e3, 1), ("the same, processor ms", "cpu", 1e3, 1)),
+    "start": (("pd4dgs-render, start to picture, s", "wall", 1, 2), ("the same, processor s", "cpu", 1, 2)),
+}
+
+
+def render(rows: Sequence[Row]) -> str:
+    """One table of ratios, one of efforts."""
+    table = []
+    for row in rows:
+        for what, texts in LINES.items():
+            pair = row["lines"][what]
+            for text, key, factor, decimals in texts:
+                old, new = pair["before"][key], pair["after"][key]
+                figures = (f"{value * factor:,.{decimals}f}" for value in (old, new))
+                table.append((row["name"], text, *figures, f"{old / new:.1f}"))
+        old, new = (row["lines"]["encode"][name]["bytes"] for name in ("before", "after"))
+        table.append((row["name"], "bytes at the default effort", f"{old:,.0f}", f"{new:,.0f}", f"{old / new:.4f}"))
+    efforts = [
+        (row["name"], str(effort["effort"]), f"{effort['wall']:.2f}", f"{effort['cpu']:.2f}", f"{effort['bytes']:,}")
+        for row in rows
+        for effort in row["efforts"]
+    ]
+    return "\n\n".join(
+        [
+            "\n".join(sorted({row["machine"] for row in rows})),
+            markdown(("scene", "what", "before", "after", "times"), table),
+            "What each effort takes, all with warm caches and verified:",
+            markdown(("scene", "effort", "s", "processor s", "bytes"), efforts),
+        ]
+    )
+
+
+PAGE = Page("performance", "performance.py", render)
+
+
+def main(argv: list[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    parser = options(__doc__, NAMES)
+    parser.add_argument("--before", type=Path, metavar="FOLDER", help="a checkout to compare with")
+    parser.add_argument("--repeats", type=int, default=9, metavar="N", help="of each measurement (default: 9)")
+    args = parser.parse_args(argv)
+    if not args.render and (args.before is None or not (args.before / "pd4dgs_codec").is_dir()):
+        parser.error("--before FOLDER: expected a checkout of this project")
+    todo = [n for n in args.only or NAMES if (args.out / n / "model.pt").is_file()]  # needs no data
+    return make(
+        PAGE, NAMES, todo, args, lambda name: measure(args.out / name / "model.pt", args.before.resolve(), args.repeats)
+    )
+
+
+if __name__ == "__main__":
+    sys.exit(main())
