@@ -6,6 +6,7 @@ anchors [n, 71], a row of position, feature, offsets and log scalings; gaussians
 quaternion, opacity and colour; hidden [n, columns], of which H from `column` on are a layer's, H a multiple of LANES.
 The backward passes split the Gaussians over threads at anchors, each part owning its rows of the result; sums over all
 Gaussians are kept per part and added in order, so that results are bitwise reproducible for a fixed number of parts.
+What takes a fraction of a millisecond is not split: a parallel kernel takes numba thrice as long to compile.
 """
 
 from __future__ import annotations
@@ -37,7 +38,7 @@ def _part(keep: np.ndarray, part: int, parts: int) -> tuple[int, int]:
     return begin, end
 
 
-@kernel(parallel=True)
+@kernel()
 def pick(
     out: np.ndarray, column: int, values: np.ndarray, rows: np.ndarray, noise: np.ndarray, step: float, rounding: bool
 ) -> None:
@@ -45,7 +46,7 @@ def pick(
     noise [n, w] times `step`; noise [0, w] is none."""
     real, width = values.dtype.type, values.shape[1]
     size = real(step)
-    for i in nb.prange(len(rows)):
+    for i in range(len(rows)):
         for c in range(width):
             value = values[rows[i], c]
             if rounding:
@@ -55,19 +56,19 @@ def pick(
             out[i, column + c] = value
 
 
-@kernel(parallel=True)
+@kernel()
 def pick_backward(grad: np.ndarray, g: np.ndarray, column: int, rows: np.ndarray) -> None:
     """The transpose of `pick`; grad [N, w] is given zeroed, no row comes twice."""
-    for i in nb.prange(len(rows)):
+    for i in range(len(rows)):
         for c in range(grad.shape[1]):
             grad[rows[i], c] = g[i, column + c]
 
 
-@kernel(parallel=True)
+@kernel()
 def inputs(out: np.ndarray, distance: np.ndarray, anchors: np.ndarray, centre: np.ndarray) -> None:
     """out [n, 35] = the features and the direction from centre [3] of anchors; distance [n] from it, MIN_NORM at
     least."""
-    for n in nb.prange(len(anchors)):
+    for n in range(len(anchors)):
         x, y, z = anchors[n, 0] - centre[0], anchors[n, 1] - centre[1], anchors[n, 2] - centre[2]
         distance[n] = max(math.sqrt(x * x + y * y + z * z), anchors.dtype.type(MIN_NORM))
         for c in range(FEATURE_DIM):
@@ -77,10 +78,10 @@ def inputs(out: np.ndarray, distance: np.ndarray, anchors: np.ndarray, centre: n
         out[n, FEATURE_DIM + 2] = z / distance[n]
 
 
-@kernel(parallel=True)
+@kernel()
 def inputs_backward(g_anchors: np.ndarray, g: np.ndarray, out: np.ndarray, distance: np.ndarray) -> None:
     """The transpose of `inputs`, which gave `out` and `distance`; adds to g_anchors [n, 71]."""
-    for n in nb.prange(len(g)):
+    for n in range(len(g)):
         for c in range(FEATURE_DIM):
             g_anchors[n, 3 + c] += g[n, c]
         along = g.dtype.type(0)
@@ -251,7 +252,7 @@ def _clamped(value: float) -> Any:
     return value if value != value else min(max(value, 0), 1)
 
 
-@kernel(parallel=True)
+@kernel()
 def finish(
     means: np.ndarray,
     quats: np.ndarray,
@@ -264,7 +265,7 @@ def finish(
 ) -> None:
     """The parts of gaussians under gates [K]; loose: clamped and normalised first."""
     zero, one = gaussians.dtype.type(0), gaussians.dtype.type(1)
-    for k in nb.prange(len(gates)):
+    for k in range(len(gates)):
         inverse = one / _norm(gaussians, k, QUAT) if loose else one
         for i in range(4):
             quats[k, i] = gaussians[k, QUAT + i] * inverse
@@ -277,7 +278,7 @@ def finish(
         opacities[k] = gates[k] * (_clamped(opacity) if loose else opacity)
 
 
-@kernel(parallel=True)
+@kernel()
 def finish_backward(
     g: np.ndarray,
     g_gates: np.ndarray,
@@ -292,7 +293,7 @@ def finish_backward(
 ) -> None:
     """The transpose of `finish`: g [K, 14], g_gates [K]."""
     zero, one = gaussians.dtype.type(0), gaussians.dtype.type(1)
-    for k in nb.prange(len(gates)):
+    for k in range(len(gates)):
         opacity = gaussians[k, OPACITY]
         inside = not loose or (opacity >= zero and opacity <= one)
         g[k, OPACITY] = g_opacities[k] * gates[k] if inside else zero
