@@ -82,6 +82,12 @@ def keep_freed_memory() -> None:
         pass
 
 
+def _asked() -> int:
+    """OMP_NUM_THREADS if set, else all."""
+    asked = os.environ.get("OMP_NUM_THREADS", "")
+    return min(int(asked), available()) if asked.isdigit() and int(asked) > 0 else available()
+
+
 def configure(threads: int | None = None) -> int:
     """Set the wait policy, the threading layer and the number of threads; returns that number.
 
@@ -91,8 +97,7 @@ def configure(threads: int | None = None) -> int:
     Starting processes: spawn, never fork (OpenMP kills forked children).
     """
     if threads is None:
-        asked = os.environ.get("OMP_NUM_THREADS", "")
-        threads = min(int(asked), available()) if asked.isdigit() and int(asked) > 0 else available()
+        threads = _asked()
     if not 1 <= threads <= available():
         raise RenderError(f"threads is {threads}, expected 1 to {available()} (the CPUs this process may use)")
     os.environ.setdefault("OMP_WAIT_POLICY", "passive")
@@ -144,6 +149,11 @@ def limit_numba() -> None:
     import numba
 
     numba.set_num_threads(min(kernel_threads(), numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
+
+
+def encoder_threads() -> int:
+    """Threads that an encoder may start: as many as the kernels use. It settles nothing."""
+    return _asked() if _kernel_threads is None else _kernel_threads
 
 
 def kernel_threads() -> int:

@@ -12,9 +12,9 @@ from itertools import accumulate
 
 import numpy as np
 
-from pd4dgs_codec.entropy.bits import entropy_bits, gaussian_bits
+from pd4dgs_codec.entropy.bits import entropy_bits
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
-from pd4dgs_codec.entropy.fitting import split_bits
+from pd4dgs_codec.entropy.fitting import histogram, split_bits
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint
 from pd4dgs_codec.errors import Malformed
 
@@ -70,7 +70,7 @@ def smaller_form(
     if staged is not None and priors == "best" and effort > 1:
         data.append(staged())
         if 8 * (len(data[0]) - 1) <= sum(entropy_bits(channel) for channel in channels):  # plain cannot be shorter
-            return data[0], sum(gaussian_bits(channel) for channel in channels)
+            return data[0], sum(histogram(channel).rate_bits for channel in channels if channel.size)
     plain = encode_channels(channels, priors=priors, effort=effort)
     return min([bytes([PLAIN]) + plain.payload, *data], key=len), plain.rate_bits
 

@@ -132,7 +132,7 @@ def reach(scene: Scene) -> tuple[Reached, Reached, np.ndarray]:
     grid = instants(field) if field else np.array([0.0, 1.0])
     spans = list(zip(grid[:-1].tolist(), grid[1:].tolist(), strict=True))
     chunks = max(1, -(-count // CHUNK))
-    with ThreadPoolExecutor(threads.kernel_threads()) as pool:
+    with ThreadPoolExecutor(threads.encoder_threads()) as pool:
         for first in range(chunks if count else 0):
             rows = np.arange(first, count, chunks)  # each chunk spreads over the scene: the first reads most cells
             enclosure = Enclosure(field, scene.info.box, anchor[rows]) if field else None
