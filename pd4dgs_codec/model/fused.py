@@ -162,7 +162,7 @@ class _Moved(torch.autograd.Function):
     def forward(ctx: Any, base: Tensor, grid: Tensor, settings: tuple[Any, ...], *parameters: Tensor) -> Tensor:
         planes, rows, trunk, t, plane_step, weight_step, _ = settings
         used = _rounded(parameters, weight_step)
-        points = base[:, :3].contiguous()
+        points = base[:, :3].clone()  # of one row, `contiguous` would be a view
         features, spatial, time_rows = sample(grid, planes.layout, planes.box, points, t, plane_step)
         weight, bias = base.new_zeros(base.shape[1], used[trunk].shape[1]), base.new_zeros(base.shape[1])
         for (columns, unit), w, b in zip(rows, used[trunk::2], used[trunk + 1 :: 2], strict=True):
@@ -250,7 +250,7 @@ class _Grown(torch.autograd.Function):
         columns = (w_opacity.shape[1], w_opacity.shape[1] + w_shape.shape[1])
         for out, column, w, b in ((shape, columns[0], w_shape, b_shape), (color, columns[1], w_color, b_color)):
             kernels.linear(out.numpy(), keep.numpy(), hidden.numpy(), column, w.numpy(), b.numpy())
-        relative, extent = torch.sigmoid(shape), anchors[:, SCALING].contiguous().exp_()
+        relative, extent = torch.sigmoid(shape), torch.exp(anchors[:, SCALING])
         color.sigmoid_()
         gaussians, gates = anchors.new_empty(len(keep), 14), anchors.new_empty(len(keep))
         kernels.assemble(*_arrays(gaussians, gates, keep, anchors, extent, raw, mask, shape, relative, color))

@@ -155,8 +155,15 @@ def case_of(measure, refuses=None):
     return cases.Case("group", "name", "fed", "promised", 1.0, measure, refuses)
 
 
-def refuse(message):
-    raise EncodeError(message)
+class TwoLines(EncodeError):
+    """What no error of ours says, for each makes one line of its message."""
+
+    def __str__(self) -> str:
+        return "two\nlines"
+
+
+def refuse(error):
+    raise error if isinstance(error, EncodeError) else EncodeError(error)
 
 
 @pytest.mark.parametrize(
@@ -169,7 +176,7 @@ def refuse(message):
         (case_of(lambda: refuse("no")), "fail"),
         (case_of(lambda: refuse("no"), EncodeError), "refused"),
         (case_of(lambda: refuse("no"), DataError), "fail"),
-        (case_of(lambda: refuse("two\nlines"), EncodeError), "fail"),
+        (case_of(lambda: refuse(TwoLines("")), EncodeError), "fail"),
         (case_of(lambda: ("fine", 0.0), EncodeError), "fail"),
     ],
 )

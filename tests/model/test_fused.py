@@ -54,6 +54,15 @@ def test_it_is_the_plain_graph(level, rounding):
     assert 0 < len(gaussians.slots) < 10 * len(gaussians.anchors)
 
 
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_one_anchor_is_left_as_it_is(level):
+    """Columns of a single row are contiguous, so that what is made of them in place would change the row."""
+    model = stir(small_model(anchors=1, opacity=3.0), 0.3)
+    before = {name: value.clone() for name, value in model.state_dict().items()}
+    assert len(check(model, level).slots)
+    assert all(torch.equal(value, before[name]) for name, value in model.state_dict().items())
+
+
 @pytest.mark.parametrize("parts", [2, 5])
 def test_it_is_so_in_as_many_parts_as_there_are_threads(monkeypatch, parts):
     monkeypatch.setattr("numba.get_num_threads", lambda: parts)
