@@ -49,8 +49,6 @@ def render(rows: Sequence[Row]) -> str:
         lines += [f"- left out: {out['what']} ({out['bytes']:,} bytes): {out['why']}" for out in row["left_out"]]
         skipped = f"{row['skipped_steps']} skipped steps"
         lines += [f"- {row['iterations']} of {row['total']} iterations, rho {row['rho']:.3f}, {skipped}"]
-        if row["phases_not_reached"]:
-            lines += [f"- cut by its time limit before: {', '.join(row['phases_not_reached'])}"]
         lines += [""]
     return "\n".join(lines).rstrip("\n")
 
@@ -99,11 +97,7 @@ def main(argv: list[str] | None = None) -> int:
     def measure(name: str) -> Row:
         scene = SCENES[name]
         config = TrainConfig(
-            preset=scene.preset,
-            source=scene.source,
-            downscale=scene.downscale,
-            iterations=scene.iterations,
-            max_seconds=scene.seconds,
+            preset=scene.preset, source=scene.source, downscale=scene.downscale, iterations=scene.iterations
         )
         result = run_job(Job(name, config), args.out, say=say, progress=TrainingProgress())
         picture = args.docs / "img" / f"{name}.jpg"

@@ -18,14 +18,13 @@ SHARED = Path(os.environ.get("PD4DGS_SHARED") or Path(__file__).resolve().parent
 
 @dataclass(frozen=True)
 class Scene:
-    """One scene and how tools/results.py trains it. name: its folder in out/ and its rows. seconds: time limit."""
+    """One scene and how tools/results.py trains it. name: its folder in out/ and its rows."""
 
     name: str
     source: str
     downscale: int = 1
     preset: str = "small"
     iterations: int = 1_500
-    seconds: float = 600.0
 
     @property
     def there(self) -> bool:
@@ -45,7 +44,7 @@ SCENES = {
         Scene("shelf-hand", str(SHARED / "shelf-hand"), 2, iterations=5_000),
         Scene("bouncing-balls", str(SHARED / "bouncing-balls"), 4, iterations=7_000),
         *(Scene(f"synthetic-{name}", f"synthetic:{name}") for name in ("static", "global", "local", "fast")),
-        Scene("shelf-hand-paper", str(SHARED / "shelf-hand"), 2, "paper", 4_600, 1_500.0),
+        Scene("shelf-hand-paper", str(SHARED / "shelf-hand"), 2, "paper", 4_600),
     )
 }
 
