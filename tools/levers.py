@@ -25,7 +25,7 @@ from pd4dgs_codec.codec.encoder import encode
 from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.scene import Steps
 from pd4dgs_codec.threads import configure
-from pd4dgs_codec.train.config import DIAL, TrainConfig, at_quality
+from pd4dgs_codec.train.config import DEFAULT_QUALITY, TrainConfig, at_quality
 from pd4dgs_codec.view.evaluate import evaluate_file
 
 Changes = dict[str, Any]
@@ -37,7 +37,7 @@ BEFORE: Changes = {"steps": Steps(), "rate_scale": 0.1, "plane_rate": 0.0, "prun
 
 def levers() -> dict[str, Changes]:
     """Each lever alone, at its default."""
-    middle = {name: value for name, (value, _) in DIAL.items()}
+    middle = at_quality(DEFAULT_QUALITY)
     return {
         "planes' rate and steps": BEFORE | {"steps": None, "plane_rate": middle["plane_rate"]},
         "coarser steps": BEFORE | {"step_scale": middle["step_scale"]},

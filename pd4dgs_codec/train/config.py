@@ -64,6 +64,11 @@ def at_quality(quality: float) -> dict[str, float]:
     return {name: middle * factor ** ((50 - quality) / 50) for name, (middle, factor) in DIAL.items()}
 
 
+#: Where files are a third smaller, and pictures hardly change; see docs/training.md.
+DEFAULT_QUALITY = 70.0
+_DEFAULT = at_quality(DEFAULT_QUALITY)
+
+
 @dataclass(frozen=True)
 class LearningRates:
     """(start, end) of a log-linear schedule over the run; Adam, eps 1e-15."""
@@ -100,9 +105,9 @@ class TrainConfig:
     max_seconds: float | None = None  #: without `iterations` the whole schedule is spread over it, else it cuts the run
     seed: int = 0
     lambdas: tuple[float, float, float] = (0.04, 0.01, 0.00025)  #: rate weight per level
-    rate_scale: float = DIAL["rate_scale"][0]  #: multiplies every lambda; 1 is the paper's operating point
+    rate_scale: float = _DEFAULT["rate_scale"]  #: multiplies every lambda; 1 is the paper's operating point
     rate_share: float = 0.05  #: share of the anchors on which a step estimates the rate
-    plane_rate: float = DIAL["plane_rate"][0]  #: weight of a bit of the planes, ramped by `Schedule.pressure`
+    plane_rate: float = _DEFAULT["plane_rate"]  #: weight of a bit of the planes, ramped by `Schedule.pressure`
     tmc: float = 0.01
     tmc_binary: bool = True
     #: the binary term's weight grows to so many times its start, so that masks end near 0 or 1: an anchor that stays
@@ -115,7 +120,7 @@ class TrainConfig:
     max_layer: int = 2
     judge: bool = True  #: leave out levels that gain nothing on training views not seen yet, see `judge`
     #: where growing ends, anchors leave whose absence adds this share at most to the squared error; see `pruning`
-    prune: float = DIAL["prune"][0]
+    prune: float = _DEFAULT["prune"]
     #: share of the run, at its end, over which all learning rates fall to 0 besides: else the last steps carry weights
     #: over the edges of their rounding intervals, and pictures change by tenths of a dB from one step to the next
     cooldown: float = 0.1
@@ -124,7 +129,7 @@ class TrainConfig:
     noise: bool = True  #: imitate quantisation: noise on attributes, rounding of planes and weights, at last of all
     grow_threshold: float = 2e-4
     steps: Steps | None = None  #: None: the preset's
-    step_scale: float = DIAL["step_scale"][0]  #: multiplies the steps of features, log-scalings and planes
+    step_scale: float = _DEFAULT["step_scale"]  #: multiplies the steps of features, log-scalings and planes
     rates: LearningRates = field(default_factory=LearningRates)
     global_planes: PlaneWeights = PlaneWeights(1e-4, 5e-4, 5e-5)
     local_planes: PlaneWeights = PlaneWeights(2e-4, 1e-3, 1e-4)

@@ -9,7 +9,7 @@ from pd4dgs_codec.errors import TrainError
 from pd4dgs_codec.model.masks import level_mask
 from pd4dgs_codec.scene import Steps
 from pd4dgs_codec.train import losses
-from pd4dgs_codec.train.config import COARSENED, DIAL, Schedule, TrainConfig, at_quality, learning_rate
+from pd4dgs_codec.train.config import COARSENED, DEFAULT_QUALITY, DIAL, Schedule, TrainConfig, at_quality, learning_rate
 from pd4dgs_codec.train.rollout import rollout_probabilities, sample_level, updated_rho
 
 
@@ -132,7 +132,7 @@ def test_the_planes_pressure_rises_from_the_rate_terms_to_rounding():
 
 def test_the_dial_is_log_linear_and_stands_at_the_defaults():
     default = TrainConfig()
-    assert at_quality(50) == {name: getattr(default, name) for name in DIAL}
+    assert at_quality(DEFAULT_QUALITY) == {name: getattr(default, name) for name in DIAL}
     low, middle, high = (at_quality(q) for q in (20, 50, 80))
     for name in DIAL:
         assert low[name] > middle[name] > high[name] > 0
