@@ -125,6 +125,7 @@ def scene(name: str, synthetic: tuple[str, int] | None, iterations: int | None) 
         source=known.source,
         downscale=known.downscale,
         iterations=iterations or steps,
+        rate_scale=runs.RATE_SCALE,
         prune=0.0,  # the paper's method does none of these
         cooldown=0.0,
         plane_rate=0.0,

@@ -66,9 +66,13 @@ FIXED = Variant("fixed", {"rollout": "fixed"})
 WITHOUT = tuple(Variant(f"without {part}", ABLATIONS[part]) for part in ("rate", "binary", "smooth", "tmc"))
 
 
+#: What the tables' runs weigh the rate with, whatever the trainer's default is.
+RATE_SCALE = 0.1
+
+
 def at_rate(scale: float) -> Variant:
-    """The full method at another rate weight; `full` itself at the default one."""
-    return FULL if scale == TrainConfig().rate_scale else Variant(f"rate scale {scale:g}", {"rate_scale": scale})
+    """The full method at another rate weight; `full` itself at that of the tables."""
+    return FULL if scale == RATE_SCALE else Variant(f"rate scale {scale:g}", {"rate_scale": scale})
 
 
 @dataclass(frozen=True)
