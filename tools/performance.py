@@ -45,22 +45,21 @@ def measure(path: Path, before: Path, repeats: int) -> Row:
     """Of one checkpoint: per line of the page the medians before and after, and what every effort takes."""
     both = {"before": before, "after": ROOT}
     with tempfile.TemporaryDirectory() as folder:
-        file = str(Path(folder) / "scene.pd4")
-        run(ROOT, "encode", str(path), file, "5")  # the file that both read, and warm caches
-        for checkout in both.values():
-            run(checkout, "start", str(path), file, "5")
+        files = {name: str(Path(folder) / f"{name}.pd4") for name in both}  # each reads its own draft of the format
+        for name, checkout in both.items():  # and warm caches
+            run(checkout, "encode", str(path), files[name], "5")
+            run(checkout, "start", str(path), files[name], "5")
         lines: Row = {}
         for what in ("encode", "decode", "draw", "start"):
             found: dict[str, list[Row]] = {name: [] for name in both}
             for _ in range(max(1, repeats // 3) if what == "encode" else repeats):
                 for name, checkout in both.items():
-                    target = str(Path(folder) / "other.pd4") if what == "encode" else file
-                    found[name].append(run(checkout, what, str(path), target, "5"))
+                    found[name].append(run(checkout, what, str(path), files[name], "5"))
             lines[what] = {name: _medians(rows) for name, rows in found.items()}
             say(f"{path.parent.name}: {what} {lines[what]}")
         efforts = []
         for effort in EFFORTS:
-            row = run(ROOT, "encode", str(path), str(Path(folder) / "other.pd4"), str(effort))
+            row = run(ROOT, "encode", str(path), files["after"], str(effort))
             efforts.append({"effort": effort, **row})
     return {"lines": lines, "efforts": efforts, "machine": machine_line(machine())}
 
