@@ -21,6 +21,7 @@ from typing import BinaryIO
 from urllib.parse import quote, unquote, urlsplit
 
 from pd4dgs_codec.delivery.link import Link
+from pd4dgs_codec.delivery.page import PAGE
 from pd4dgs_codec.delivery.patience import Patient
 from pd4dgs_codec.delivery.ranges import Unsatisfiable, http_time, lists_etag, requested_range
 from pd4dgs_codec.errors import DeliveryError
@@ -55,11 +56,13 @@ IDLE_SECONDS = 60.0
 def locate(root: Path, target: str) -> Path | None:
     """The file under `root` that a request target names; None for all else: no such file, hidden names, ways out.
 
+    A target that ends in a slash names the folder's page.
     root: absolute and free of links. Links inside it count if what they lead to lies inside it as well.
     """
     try:
         path = unquote(urlsplit(target).path, errors="strict")
         names = path.split("/")[1:]
+        names[-1:] = [names[-1] or PAGE] if names else []
         if not path.startswith("/") or any(n.startswith(".") or not n or "\\" in n or "\0" in n for n in names):
             return None
         found = root.joinpath(*names).resolve(strict=True)

@@ -149,6 +149,14 @@ def test_only_files_of_the_folder(server, folder, target):
     assert answer.status == 404 and b"secret" not in answer.body
 
 
+def test_a_folder_shows_its_page(server, folder):
+    (folder / "sub").mkdir()
+    for place in (folder, folder / "sub"):
+        (place / "index.html").write_text(f"page of {place.name}")
+    assert ask(server, "/").body == b"page of www" and ask(server, "/sub/?level=1").body == b"page of sub"
+    assert ask(server, "/").headers["Content-Type"].startswith("text/html")
+
+
 def test_links_and_odd_names_inside_the_folder_are_served(server, folder):
     (folder / "a b%ü.txt").write_text("here")
     (folder / "link.txt").symlink_to("a b%ü.txt")
