@@ -401,6 +401,7 @@ def damaged(data: bytes, at: int) -> bytes:
         ("damaged in layer 0", None, "CRC-32"),
         ("foreign", None, "pd4"),
         ("absent", None, "404"),
+        ("hostile", None, "limit"),
     ],
 )
 def test_bad_input_is_one_line_and_keeps_what_was_valid(page, server, folder, lively, fault, shown, words):
@@ -411,6 +412,7 @@ def test_bad_input_is_one_line_and_keeps_what_was_valid(page, server, folder, li
         "damaged in layer 0": damaged(lively, ends[0] - 50),
         "foreign": b"<!doctype html><p>no such scene" * 20,
         "absent": None,
+        "hostile": (ROOT / "spec" / "vectors" / "faulty" / "bomb-most-rows.pd4").read_bytes(),
     }[fault]
     name = fault.replace(" ", "-") + ".pd4"
     if data is not None:
