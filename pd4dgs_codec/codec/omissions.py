@@ -20,7 +20,7 @@ from pd4dgs_codec.codec.plane_choice import choose_predictor, fill_plane
 from pd4dgs_codec.codec.symbols import rounded
 from pd4dgs_codec.entropy.bits import entropy_bits
 from pd4dgs_codec.evaluate.reach import reach
-from pd4dgs_codec.scene import FEATURE_DIM, N_OFFSETS, PLANES, TRUNK, Deformation, Network, Planes, Scene
+from pd4dgs_codec.scene import PLANES, TRUNK, Deformation, Network, Planes, Scene
 
 #: Networks whose values may exceed this are left as they are; binary32 overflows at 3.4e38.
 LARGEST = 1e30
@@ -86,10 +86,11 @@ class _Omissions:
     def _zero_unread_features(self) -> None:
         """Feature channels that no network reads: 0 in all anchors, and no residual; and the reverse, weights of
         channels that are 0 in all anchors and have no residual."""
+        width = self.scene.widths.feature
         firsts = {name: self.decoded.networks[name][0][0] for name in self.decoded.networks}
-        unread = ~np.any([w[:, :FEATURE_DIM].any(axis=0) for w in firsts.values()], axis=0)
+        unread = ~np.any([w[:, :width].any(axis=0) for w in firsts.values()], axis=0)
         head = self._networks(LAYER_KINDS[1]).get("feature")
-        moved = np.zeros(FEATURE_DIM, bool) if head is None else np.any([head[-1][0].any(1), head[-1][1] != 0], axis=0)
+        moved = np.zeros(width, bool) if head is None else np.any([head[-1][0].any(1), head[-1][1] != 0], axis=0)
         zero = ~self.decoded.feature.any(axis=0)
         stale = unread & ~zero
         if stale.any():
@@ -190,7 +191,7 @@ class _Omissions:
             return
         bits = _bits(symbols.T) - _bits(freed.T)
         self._note(f"offsets of {int((~shown).sum())} Gaussians", "no view shows them at any time", bits)
-        values = dequantise(freed, step).reshape(-1, N_OFFSETS, 3)
+        values = dequantise(freed, step).reshape(self.decoded.offset.shape)
         self._edit(lambda scene: replace(scene, offset=np.where(shown[..., None], scene.offset, values)))
 
     def _free_cells(self, kind: LayerKind, reached: tuple[dict[str, np.ndarray], ...]) -> None:
