@@ -11,7 +11,7 @@ from urllib.parse import quote
 
 from pd4dgs_codec.atomic import check_output, write_bytes
 from pd4dgs_codec.cli.common import OK, Console, Parser, run
-from pd4dgs_codec.cli.files import is_pd4, read_bytes
+from pd4dgs_codec.cli.files import STDIO, Stdin, is_pd4, read_bytes
 from pd4dgs_codec.cli.serve import set_by_signals
 from pd4dgs_codec.cli.values import duration, port, rate
 
@@ -92,7 +92,7 @@ def _packed(source: str, console: Console) -> bytes:
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.model.convert import to_scene
 
-    model, _ = checkpoint.load(source)
+    model, _ = checkpoint.load(source if source != STDIO else Stdin(data))
     console.message(f"{source}: packing the checkpoint")
     return encode(to_scene(model), effort=PACKING_EFFORT, omit="nothing")
 

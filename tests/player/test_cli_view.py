@@ -8,12 +8,15 @@ import subprocess
 import sys
 import urllib.request
 from pathlib import Path
+from typing import IO
 
 import pytest
 from strategies import make_scene
 
-from pd4dgs_codec import encode, show
+from pd4dgs_codec import decode, encode, show
 from pd4dgs_codec.delivery.page import page as whole_page
+from pd4dgs_codec.model.checkpoint import save
+from pd4dgs_codec.model.convert import from_scene
 
 ROOT = Path(__file__).parents[2]
 
@@ -25,9 +28,9 @@ def scene_pd4(tmp_path_factory) -> Path:
     return path
 
 
-def run(*argv: object) -> subprocess.Popen[str]:
+def run(*argv: object, stdin: IO[bytes] | None = None) -> subprocess.Popen[str]:
     command = [sys.executable, "-m", "pd4dgs_codec", "view", "--no-browser", *map(str, argv)]
-    return subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
+    return subprocess.Popen(command, stdin=stdin, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 def test_the_page_and_the_scene_come_from_one_address(scene_pd4):
@@ -55,6 +58,17 @@ def test_what_is_no_scene_is_one_line_and_no_page(tmp_path, content, says):
         path.write_bytes(content)
     out, err = run(path).communicate(timeout=300)
     assert out == "" and says in err and len(err.splitlines()) == 1
+
+
+def test_a_checkpoint_may_come_through_stdin(tmp_path):
+    save(tmp_path / "model.pt", from_scene(make_scene(0)), {})
+    with open(tmp_path / "model.pt", "rb") as stdin:
+        process = run("-", stdin=stdin)
+        assert process.stdout is not None
+        page = process.stdout.readline().strip()
+        assert decode(fetch(page.replace("index.html?src=", ""))).layers[0] == 0
+        process.send_signal(signal.SIGTERM)
+        assert process.wait(60) == 0
 
 
 def test_one_html_file_instead_of_a_server(scene_pd4, tmp_path):
