@@ -17,7 +17,7 @@ from pd4dgs_codec.playback.networks import Field, Layers, hidden_layers
 from pd4dgs_codec.render.checks import check_time
 from pd4dgs_codec.render.rasteriser import draw
 from pd4dgs_codec.render.simd import LANES
-from pd4dgs_codec.scene import MASK_STEP, MASK_THRESHOLD, N_OFFSETS, Camera, Network, Scene
+from pd4dgs_codec.scene import MASK_STEP, MASK_THRESHOLD, Camera, Network, Scene
 
 #: Columns of the kernels' rows of Gaussians: mean, scales, quaternion, opacity, colour.
 GAUSSIAN_WIDTH = COLOR + 3
@@ -32,7 +32,7 @@ class Gaussians:
     scales: np.ndarray  #: [K, 3] scene units
     opacities: np.ndarray  #: [K] 0..1
     colors: np.ndarray  #: [K, 3] 0..1
-    slots: np.ndarray  #: int64 [K], anchor * 10 + offset
+    slots: np.ndarray  #: int64 [K], anchor * G + offset, of G slots
 
 
 class Player:
@@ -49,14 +49,15 @@ class Player:
         self._anchor = np.ascontiguousarray(scene.anchor[: len(codes)], np.float32)
         self._feature, self._scaling_log = scene.feature, scene.scaling_log
         self._offset = scene.offset
+        self._slots = scene.widths.slots
         extent = np.exp(scene.scaling_log)
         self._radius = OFFSET_REACH * extent[:, :3].max(axis=1) + SIGMA_REACH * extent[:, 3:].max(axis=1)
         box = scene.info.box
         self._global = None if scene.global_deformation is None else Field(scene.global_deformation, box)
         self._local = None if scene.local_deformation is None else Field(scene.local_deformation, box)
         self._opacity = Layers(scene.networks["opacity"])
-        self._covariance = _SlotNetwork(scene.networks["covariance"])
-        self._color = _SlotNetwork(scene.networks["color"])
+        self._covariance = _SlotNetwork(scene.networks["covariance"], self._slots)
+        self._color = _SlotNetwork(scene.networks["color"], self._slots)
         self._time: float | None = None
         if self._global is not None:
             self._residuals = np.empty((len(codes), sum(self._global.widths.values())), np.float32)
@@ -101,7 +102,7 @@ class Player:
         keep = np.flatnonzero(raw_opacity * mask[:, None] >= np.float32(MIN_OPACITY))
         shape = self._covariance(inputs, keep)
         colors = _sigmoid(self._color(inputs, keep))
-        anchors = np.concatenate([position, feature, offset.reshape(len(rows), 3 * N_OFFSETS), scaling_log], axis=1)
+        anchors = np.concatenate([position, feature, offset.reshape(len(rows), 3 * self._slots), scaling_log], axis=1)
         made, gate = np.empty((len(keep), GAUSSIAN_WIDTH), np.float32), np.empty(len(keep), np.float32)
         threads.limit_numba()
         slot_kernels.assemble(
@@ -116,7 +117,7 @@ class Player:
             quats = _unit(_moved(quats, moves, "quat")) if "quat" in moves else quats
             opacities = np.clip(_moved(opacities, moves, "opacity"), 0, 1) if "opacity" in moves else opacities
             colors = np.clip(_moved(colors, moves, "color"), 0, 1) if "color" in moves else colors
-        slots = rows[keep // N_OFFSETS] * N_OFFSETS + keep % N_OFFSETS
+        slots = rows[keep // self._slots] * self._slots + keep % self._slots
         means, quats, colors = (np.ascontiguousarray(part) for part in (means, quats, colors))
         return Gaussians(means, quats, scales * gate[:, None], opacities * gate, colors, slots)
 
@@ -148,9 +149,9 @@ class Player:
 class _SlotNetwork:
     """A network with outputs per Gaussian of an anchor, for those Gaussians alone that are kept."""
 
-    def __init__(self, network: Network):
+    def __init__(self, network: Network, slots: int):
         weight, bias = network[-1]
-        self._width = len(bias) // N_OFFSETS
+        self._width = len(bias) // slots
         self._inputs = -(-weight.shape[1] // LANES) * LANES  # the kernel's rows; the padding is 0
         self._hidden = hidden_layers(network) if len(network) > 1 else None
         self._weight = np.zeros((len(bias), self._inputs), np.float32)

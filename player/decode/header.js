@@ -35,7 +35,7 @@ const MAX_CAMERA_SIDE = 65535;
  */
 export function readHeader(bytes) {
   const { value, firstEntryEnd } = unpack(bytes, "header");
-  const fields = new Fields(value, "header", 1, 14);
+  const fields = new Fields(value, "header", 1, 15);
   const chunks = readChunkList(fields);
   const mode = asRegistered(fields.get(2), 2, "header: mode");
   const deformation = asRegistered(fields.get(3), 2, "header: deformation");
@@ -57,6 +57,10 @@ export function readHeader(bytes) {
   const camera = fields.has(12) ? readCamera(fields.get(12)) : null;
   const bounds = readBounds(fields.get(13));
   asBytes(fields.get(14), DIGEST_SIZE, "header: digest"); // of all layers, so that a decoder of some cannot check it
+  const widths = asList(fields.get(15), "header: widths", 2);
+  const width = asInteger(widths[0], 1, 64, "header: feature width");
+  const slots = asInteger(widths[1], 1, 16, "header: slots");
+  if (width !== 32 || slots !== 10) throw unsupported(`header: widths ${width} and ${slots}, expected 32 and 10`);
   // An ans-only decoder (clause 16).
   if (mode === 1) throw unsupported("header: mode lzma, expected mode ans");
   if (deformation === 1) throw unsupported("header: a deformation of float32 values, expected one of symbols");

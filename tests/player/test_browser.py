@@ -31,16 +31,15 @@ from pd4dgs_codec.delivery.link import Link
 from pd4dgs_codec.delivery.server import Server
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.scene import (
-    GLOBAL_HEADS,
     LOCAL_HEADS,
     PLANES,
-    SCAFFOLD_NETWORKS,
     Camera,
     Deformation,
     Network,
     Scene,
     SceneInfo,
     Steps,
+    Widths,
 )
 
 ROOT = Path(__file__).parents[2]
@@ -104,7 +103,7 @@ def lively_scene(
     channels: int = 8,
     scales: int = 2,
     trunk: tuple[int, ...] = (16, 12),
-    heads: tuple[dict[str, int], dict[str, int]] = (GLOBAL_HEADS, LOCAL_HEADS),
+    heads: tuple[dict[str, int], dict[str, int]] = (Widths().global_heads, LOCAL_HEADS),
     layers: tuple[int, ...] = (0, 1, 2),
 ) -> Scene:
     """Layers that differ, some thousand Gaussians of all shapes in front of the scene's camera."""
@@ -138,7 +137,7 @@ def lively_scene(
         scaling_log=rng.normal(-2.4, 0.5, (anchors, 6)).astype(np.float32),
         offset=rng.normal(0, 0.6, (anchors, 10, 3)).astype(np.float32),
         mask=tuple(codes.T[list(layers)].copy()),
-        networks={name: _network(rng, 35, *hidden, width, scale=0.4) for name, width in SCAFFOLD_NETWORKS.items()},
+        networks={name: _network(rng, 35, *hidden, width, scale=0.4) for name, width in Widths().networks.items()},
         global_deformation=fields[0] if 1 in layers else None,
         local_deformation=fields[1] if 2 in layers else None,
     )
