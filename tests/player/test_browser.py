@@ -31,6 +31,7 @@ from pd4dgs_codec.delivery.link import Link
 from pd4dgs_codec.delivery.server import Server
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.scene import (
+    DEFAULT_WIDTHS,
     LOCAL_HEADS,
     PLANES,
     Camera,
@@ -103,8 +104,9 @@ def lively_scene(
     channels: int = 8,
     scales: int = 2,
     trunk: tuple[int, ...] = (16, 12),
-    heads: tuple[dict[str, int], dict[str, int]] = (Widths().global_heads, LOCAL_HEADS),
+    heads: tuple[dict[str, int], dict[str, int]] | None = None,
     layers: tuple[int, ...] = (0, 1, 2),
+    widths: Widths = DEFAULT_WIDTHS,
 ) -> Scene:
     """Layers that differ, some thousand Gaussians of all shapes in front of the scene's camera."""
     rng = np.random.default_rng(seed)
@@ -116,7 +118,9 @@ def lively_scene(
     box = np.array([[-1.4, -1.6, -1.5], [1.5, 1.3, 1.4]], np.float32)
     codes = np.sort(rng.choice(np.array([0, 60, 180, 255], np.uint8), (anchors, 3)), axis=1)
     codes[: anchors // 2] = [140, 200, 255]
-    fields = [_deformation(rng, names, channels, scales, trunk) for names in heads]
+    fields = [
+        _deformation(rng, names, channels, scales, trunk) for names in heads or (widths.global_heads, LOCAL_HEADS)
+    ]
     return Scene(
         info=SceneInfo(
             voxel_size=float(np.float32(1 / 40)),
@@ -133,11 +137,13 @@ def lively_scene(
         layers=layers,
         rows=(anchors,) * len(layers),
         anchor_q=cells,
-        feature=rng.normal(0, 0.6, (anchors, 32)).astype(np.float32),
+        feature=rng.normal(0, 0.6, (anchors, widths.feature)).astype(np.float32),
         scaling_log=rng.normal(-2.4, 0.5, (anchors, 6)).astype(np.float32),
-        offset=rng.normal(0, 0.6, (anchors, 10, 3)).astype(np.float32),
+        offset=rng.normal(0, 0.6, (anchors, widths.slots, 3)).astype(np.float32),
         mask=tuple(codes.T[list(layers)].copy()),
-        networks={name: _network(rng, 35, *hidden, width, scale=0.4) for name, width in Widths().networks.items()},
+        networks={
+            name: _network(rng, widths.inputs, *hidden, width, scale=0.4) for name, width in widths.networks.items()
+        },
         global_deformation=fields[0] if 1 in layers else None,
         local_deformation=fields[1] if 2 in layers else None,
     )
@@ -203,11 +209,24 @@ def pixels(text: str) -> np.ndarray:
         ),
         dict(hidden=(4,), channels=3, heads=({"feature": 32}, {})),
         dict(layers=(0, 2), heads=({}, {"quat": 4, "color": 3})),
+        dict(widths=Widths(16, 4)),
+        dict(widths=Widths(64, 16), hidden=(7,)),
+        dict(widths=Widths(1, 1), anchors=700, seed=6),
     ],
-    ids=["usual", "no hidden layers", "odd widths", "many channels", "global only", "no layer 1"],
+    ids=[
+        "usual",
+        "no hidden layers",
+        "odd widths",
+        "many channels",
+        "global only",
+        "no layer 1",
+        "16 and 4",
+        "most",
+        "least",
+    ],
 )
 def test_both_evaluators_agree(harness, folder, server, options):
-    scene = lively_scene(150, **options)
+    scene = lively_scene(**{"anchors": 150, **options})
     (folder / "agree.pd4").write_bytes(encode(scene, layers=2, effort=1))
     eyes = ([0.0, 0.0, -5.0], [2.0, 1.0, -4.0])
     cases = [dict(level=level, t=t, eye=eye) for level in scene.layers for t in (0.0, 0.4, 1.0) for eye in eyes]
@@ -232,16 +251,24 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     return encode(to_scene(trainer.model), layers=2, effort=1)
 
 
+@pytest.fixture(scope="module")
+def narrow() -> bytes:
+    """Features of 16 numbers, and four Gaussians an anchor."""
+    return encode(lively_scene(1500, widths=Widths(16, 4)), layers=2, effort=1)
+
+
 @pytest.mark.parametrize("evaluator", ["gpu", "cpu"])
-@pytest.mark.parametrize("kind", ["lively", "trained"])
+@pytest.mark.parametrize("kind", ["lively", "trained", "narrow"])
 def test_pictures_are_those_of_the_rasteriser(harness, server, folder, kind, evaluator, request):
     pytest.importorskip("numba")
     data = request.getfixturevalue(kind)
     (folder / f"{kind}.pd4").write_bytes(data)
     scene = decode(data)
     # the scene's own camera, one from the side, and one from nearby that looks past much of the scene
-    turns = ((0.9, 0.1), (-2.1, 0.7)) if kind == "lively" else ((0.3, 0.1), (-0.5, 0.6))
-    views = [resized(c, WIDTH, HEIGHT) for c in cameras(scene, turns if evaluator == "gpu" else ())]
+    turns = ((0.9, 0.1), (-2.1, 0.7)) if kind != "trained" else ((0.3, 0.1), (-0.5, 0.6))
+    views = [
+        resized(c, WIDTH, HEIGHT) for c in cameras(scene, turns if evaluator == "gpu" and kind != "narrow" else ())
+    ]
     call(harness, "harness.open", server.url_of(f"{kind}.pd4"), WIDTH, HEIGHT, {"evaluator": evaluator})
     seen = []
     for shot in shots(harness, data, views, (0.0, 0.37, 1.0)):
