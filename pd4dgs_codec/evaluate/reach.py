@@ -280,10 +280,9 @@ def _mean_ranges(
     """(in the middle, low, high) float32 [n, G, 3] of the Gaussians' means (13.4, step 3) before the local
     deformation, in the unit cube."""
     nothing = Range(*(np.zeros(1, np.float32),) * 3)
-    position, scaling = ranges.get("position", nothing), ranges.get("scaling", nothing)
+    position, scaling, slots = ranges.get("position", nothing), ranges.get("scaling", nothing), scene.widths.slots
     offset = [
-        scene.offset[rows] + (o.reshape(-1, scene.widths.slots, 3) if o.ndim > 1 else o)
-        for o in ranges.get("offset", nothing)
+        scene.offset[rows] + (o.reshape(-1, slots, 3) if o.ndim > 1 else o) for o in ranges.get("offset", nothing)
     ]
     with np.errstate(all="ignore"):
         spread = [np.exp((scene.scaling_log[rows] + s)[:, :3])[:, None] for s in scaling]
