@@ -15,6 +15,7 @@ VERBS = {
     "info": "show the header and the layers of a .pd4 file",
     "render": "render a file to pictures or a video",
     "eval": "measure each level of a file against a dataset",
+    "export": "write a scene as Gaussians that other viewers read",
     "bench": "measure what the codec, the renderer and the trainer promise",
     "package": "lay out a file for DASH, HLS and plain HTTP",
     "serve": "serve a folder over HTTP, at the rate of a slow link if wanted",
