@@ -12,15 +12,15 @@ Gaussian that no sample shows is in doubt.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from pd4dgs_codec import threads
 from pd4dgs_codec.evaluate.enclosure import Enclosure, Range, Ranges, instants, kernels
-from pd4dgs_codec.scene import FEATURE_DIM, N_OFFSETS, PLANES, Scene, plane_sides
+from pd4dgs_codec.scene import FEATURE_DIM, N_OFFSETS, PLANES, Deformation, Scene, plane_sides
 
 Reached = tuple[dict[str, np.ndarray], ...]  #: per scale, plane name -> bool [H, W]
 
@@ -38,7 +38,15 @@ NARROW = 0.3
 #: Points enclosed at once: bounds the memory.
 CHUNK = 1024
 
-T, U = TypeVar("T"), TypeVar("U")
+Known = TypeVar("Known")
+
+
+#: (what is known of the cells or Gaussians, evaluations of the global networks left) -> whether to go on.
+Pays = Callable[[Known, int], bool]
+
+
+def _always(*_: Any) -> bool:
+    return True
 
 
 class _Boxes:
@@ -118,38 +126,73 @@ def _counted(sums: np.ndarray, rows: Cells, columns: Cells) -> np.ndarray:
     return held
 
 
-def reach(scene: Scene) -> tuple[Reached, Reached, np.ndarray]:
-    """(cells of the global planes, cells of the local ones, bool [N, 10] Gaussians that some view may show).
+def global_cells(scene: Scene) -> Reached:
+    """The cells of the global planes that anchors read; () without such planes."""
+    field = scene.global_deformation
+    cells = _Marks(field.planes if field else ())
+    count = len(scene.anchor)
+    cells.read(_Boxes(*_unit(scene.info.box, scene.anchor, scene.anchor), np.zeros(count), np.ones(count)))
+    return cells.reached
 
-    scene: as decoded, whose rows are all active at its highest level. A deformation that it lacks has no cells.
-    """
-    field, local = scene.global_deformation, scene.local_deformation
-    cells, local_cells = _Marks(field.planes if field else ()), _Marks(local.planes if local else ())
-    anchor = scene.anchor
-    count = len(anchor)
-    cells.read(_Boxes(*_unit(scene.info.box, anchor, anchor), np.zeros(count), np.ones(count)))
-    shown = np.zeros((count, N_OFFSETS), bool)
-    grid = instants(field) if field else np.array([0.0, 1.0])
-    spans = list(zip(grid[:-1].tolist(), grid[1:].tolist(), strict=True))
-    chunks = max(1, -(-count // CHUNK))
+
+def shown_gaussians(scene: Scene, pays: Pays[np.ndarray] = _always) -> np.ndarray:
+    """bool [N, 10]: the Gaussians that some view may show. Those that features without residuals do not show are
+    looked at if it `pays`, which is told what is certain, as if no other were shown."""
+    shown = _may_show(scene, np.arange(len(scene.anchor)), None)
+    field = scene.global_deformation
+    if field is None or "feature" not in field.networks:
+        return shown
+    open_, spans = np.flatnonzero(~shown.all(axis=1)), _spans(field)
+    if not pays(shown, open_.size * len(spans)):
+        return np.ones_like(shown)
     with ThreadPoolExecutor(threads.encoder_threads()) as pool:
-        for first in range(chunks if count else 0):
-            rows = np.arange(first, count, chunks)  # each chunk spreads over the scene: the first reads most cells
-            enclosure = Enclosure(field, scene.info.box, anchor[rows]) if field else None
-            shown[rows] = _shown(scene, rows, enclosure, spans, pool)
-            if local is not None:
-                _read_local(scene, anchor[rows], rows, shown[rows], local_cells, enclosure, spans, pool)
-    return cells.reached, local_cells.reached, shown
+        for rows in _chunks(open_):
+            enclosure = Enclosure(field, scene.info.box, scene.anchor[rows])
+            shown[rows] = _shown(scene, rows, shown[rows], enclosure, spans, pool)
+    return shown
+
+
+def local_cells(scene: Scene, shown: np.ndarray, pays: Pays[Reached] = _always) -> Reached | None:
+    """The cells of the local planes that the Gaussians `shown` bool [N, 10] read; () without such planes. None if it
+    does not pay to go on: `pays` is told now and then which cells are read by the anchors so far."""
+    field, local = scene.global_deformation, scene.local_deformation
+    if local is None:
+        return ()
+    marks, spans = _Marks(local.planes), _spans(field)
+    asked, left = 0, len(scene.anchor)
+    with ThreadPoolExecutor(threads.encoder_threads()) as pool:
+        for index, rows in enumerate(_chunks(np.arange(left))):
+            if index == 2 * asked or index == 1:  # asking costs as much as some thousand evaluations
+                if not pays(marks.reached, left * len(spans)):
+                    return None
+                asked = index
+            enclosure = Enclosure(field, scene.info.box, scene.anchor[rows]) if field else None
+            _read_local(scene, scene.anchor[rows], rows, shown[rows], marks, enclosure, spans, pool)
+            left -= len(rows)
+    return marks.reached
+
+
+def _spans(field: Deformation | None) -> list[Span]:
+    grid = instants(field) if field else np.array([0.0, 1.0])
+    return list(zip(grid[:-1].tolist(), grid[1:].tolist(), strict=True))
+
+
+def _chunks(rows: np.ndarray) -> list[np.ndarray]:
+    """At most CHUNK rows each, every one spread over the scene: the first read most cells."""
+    count = -(-len(rows) // CHUNK)
+    return [rows[first::count] for first in range(count)]
 
 
 def _shown(
-    scene: Scene, rows: np.ndarray, enclosure: Enclosure | None, spans: Sequence[Span], pool: ThreadPoolExecutor
+    scene: Scene,
+    rows: np.ndarray,
+    certain: np.ndarray,
+    enclosure: Enclosure,
+    spans: Sequence[Span],
+    pool: ThreadPoolExecutor,
 ) -> np.ndarray:
-    """bool [n, 10]: the Gaussians of the anchors `rows` that some view may show at some time."""
-    shown = _may_show(scene, rows, None)
-    field = scene.global_deformation
-    if enclosure is None or field is None or "feature" not in field.networks:
-        return shown
+    """bool [n, 10]: the Gaussians of the anchors `rows` that some view may show at some time, with those `certain`."""
+    shown: np.ndarray = certain.copy()
 
     def found(span: Span, open_: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Gaussians [m, 10] that the middle of the span shows, and those that it may show at any of its times."""
@@ -157,8 +200,7 @@ def _shown(
         middle = Range(feature.middle, feature.middle, feature.middle)
         return _may_show(scene, rows[open_], middle), _may_show(scene, rows[open_], feature)
 
-    open_ = np.flatnonzero(~shown.all(axis=1))
-    pending = [(span, open_) for span in spans if open_.size]
+    pending = [(span, np.arange(len(rows))) for span in spans]
     for halving in range(SHOW_HALVINGS + 1):
         results = list(pool.map(lambda pair: found(*pair), pending))
         for (_, at), (sampled, possible) in zip(pending, results, strict=True):

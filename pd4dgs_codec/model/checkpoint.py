@@ -74,7 +74,7 @@ def target(path: str | Path) -> Path:
     return real
 
 
-def load(path: str | Path) -> tuple[Model, dict[str, Any]]:
+def load(path: str | Path | BinaryIO) -> tuple[Model, dict[str, Any]]:
     """(model, training) from a checkpoint; DataError in one line for anything that is not a whole one of ours."""
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)

@@ -15,6 +15,7 @@ from pd4dgs_codec.model import slot_kernels
 from pd4dgs_codec.model.slot_kernels import COLOR, OPACITY, QUAT, SCALE
 from pd4dgs_codec.model.visibility import FRUSTUM_MARGIN, LEAST_NEAR, MIN_OPACITY, OFFSET_REACH, SIGMA_REACH
 from pd4dgs_codec.playback.networks import Field, Layers, hidden_layers
+from pd4dgs_codec.render.checks import check_time
 from pd4dgs_codec.render.rasteriser import draw
 from pd4dgs_codec.render.simd import LANES
 from pd4dgs_codec.scene import MASK_STEP, MASK_THRESHOLD, N_OFFSETS, Camera, Network, Scene
@@ -88,7 +89,8 @@ class Player:
         return self._anchor
 
     def picture(self, camera: Camera, t: float) -> np.ndarray:
-        """float32 [H, W, 3] in 0..1 at normalised time t in 0..1."""
+        """float32 [H, W, 3] in 0..1 at normalised time t in 0..1. Raises RenderError unless t is finite."""
+        check_time(t)
         g = self.gaussians(camera, t)
         finite = np.isfinite(g.colors).all(axis=1)  # a colour that overflowed hides its Gaussian
         image, _ = draw(

@@ -112,14 +112,6 @@ test("ANS decodes as the recurrence of 7.7 does in whole numbers", () => {
       assert.ok(cum[s] <= q && q < cum[s + 1]);
       step(cum[s], cum[s + 1]);
     }
-    const zero = 1 + Math.floor(draw() * (2 ** 24 - 1));
-    const bits = new Uint8Array(20);
-    stream.bits(zero, Int32Array.from(bits, (_, i) => 19 - i), 0, 20, bits);
-    for (const bit of bits.reverse()) {
-      assert.equal(bit, Number(x & 0xffffffn) < zero ? 0 : 1);
-      if (bit) step(zero, 2 ** 24);
-      else step(0, zero);
-    }
     const numbers = new Int32Array(10);
     stream.addUniform(5, numbers, 0, 10);
     for (const number of numbers) {
