@@ -2,7 +2,8 @@
 
     python tools/interchange.py [--only NAME ...] [--out out] [--docs docs] [--render]
 
-Reads the files that tools/results.py left in --out/NAME/scene.pd4. Needs the extra `interchange`, plyfile and pygltflib.
+Reads the files that tools/results.py left in --out/NAME/scene.pd4. Needs the extra `interchange`, plyfile
+and pygltflib.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pages.page import Page, Row, make, options, say
+from pages.page import Page, Row, make, options, paragraph, say, unpadded
 from pages.scenes import SCENES, present
 
 from pd4dgs_codec.bench.report import markdown
@@ -135,10 +136,8 @@ def _gaussforge(path: Path, player: Any, view: Any) -> float:
     with quiet():
         found = gaussforge.GaussForge().read(path.read_bytes(), "spz")["data"]
     n = found["numPoints"]
-    fields = {
-        key: np.asarray(found[key], np.float32)
-        for key in ("positions", "scales", "rotations", "alphas", "colors", "sh")
-    }
+    keys = ("positions", "scales", "rotations", "alphas", "colors", "sh")
+    fields = {key: np.asarray(found[key], np.float32) for key in keys}
     sh = np.concatenate([fields["colors"].reshape(n, 1, 3), fields["sh"].reshape(n, 15, 3)], axis=1)
     scales, quats = np.exp(fields["scales"]).reshape(n, 3), fields["rotations"].reshape(n, 4)
     splats = _contiguous(fields["positions"].reshape(n, 3), quats, scales, _sigmoid(fields["alphas"]), sh)
@@ -201,50 +200,28 @@ READERS: dict[str, tuple[str, Callable[[Path, Any, Any], float]]] = {
 
 def render(rows: Sequence[Row]) -> str:
     """Costs of variants, then files."""
-    costs = [
-        (
-            row["name"], c["eyes"], c["degree"], c["steps"], f"{c['direct_mpsnr']:.2f}", f"{c['exported_mpsnr']:.2f}",
-            f"{c['direct_mpsnr'] - c['exported_mpsnr']:.2f}", f"{c['exported_to_direct_psnr']:.2f}", f"{c['seconds']:.1f}",
-        )
-        for row in rows
-        for c in row["costs"]
-    ]  # fmt: skip
-    files = []
+    costs, files = [], []
     for row in rows:
+        for c in row["costs"]:
+            direct, exported = c["direct_mpsnr"], c["exported_mpsnr"]
+            decibels = (direct, exported, direct - exported, c["exported_to_direct_psnr"])
+            cells = (row["name"], c["eyes"], c["degree"], c["steps"], *(f"{v:.2f}" for v in decibels))
+            costs.append((*cells, f"{c['seconds']:.1f}"))
         files.append((row["name"], ".pd4, all times and views", "-", "-", f"{row['file_bytes']:,}", "-", "-", "-"))
-        files += [
-            (
-                row["name"], f["kind"] + (f", {f['frames']} frames" if f["frames"] > 1 else ""), f["reader"],
-                f"{f['gaussians']:,}", f"{f['bytes']:,}", f"{f['psnr']:.2f}", f"{f['seconds']:.0f}", f"{f['megabytes']:.0f}",
-            )
-            for f in row["files"]
-        ]  # fmt: skip
-    head = (
-        "scene",
-        "eyes",
-        "degree",
-        "steps",
-        "direct dB",
-        "exported dB",
-        "cost dB",
-        "to direct dB",
-        "seconds an instant",
-    )
+        for f in row["files"]:
+            what = f["kind"] + (f", {f['frames']} frames" if f["frames"] > 1 else "")
+            counts = f"{f['gaussians']:,}", f"{f['bytes']:,}", f"{f['psnr']:.2f}"
+            files.append((row["name"], what, f["reader"], *counts, f"{f['seconds']:.0f}", f"{f['megabytes']:.0f}"))
+    about_costs = f"""Held-out views, up to {VIEWS} per scene, each exported at its own instant: mPSNR of the scene's
+own picture and of the exported Gaussians against the truth, and PSNR of the second against the first. Eyes are those
+of the data set's training cameras or of the file alone."""
+    about_files = f"""Files of degree 3 after {STEPS} steps, eyes of the data set, each read by a library that is not
+ours and drawn by our rasteriser against the scene's own picture. Sequences are read at the frame nearest to the
+view's instant. Seconds and peak memory are of the whole command."""
+    head = ("scene", "eyes", "degree", "steps", "direct dB", "exported dB", "cost dB", "to direct dB", "s an instant")
     files_head = ("scene", "file", "read by", "Gaussians", "bytes", "to direct dB", "seconds", "MiB")
-    lines = [
-        f"Held-out views, up to {VIEWS} per scene, each exported at its own instant: mPSNR of the scene's own picture and of",
-        "the exported Gaussians against the truth, and PSNR of the second against the first. Eyes are those of the data",
-        "set's training cameras or of the file alone.",
-        "",
-        markdown(head, costs),
-        "",
-        f"Files of degree 3 after {STEPS} steps, eyes of the data set, each read by a library that is not ours and drawn by",
-        "our rasteriser against the scene's own picture. Sequences are read at the frame nearest to the view's instant.",
-        "Seconds and peak memory are of the whole command.",
-        "",
-        markdown(files_head, files),
-    ]
-    return "\n".join(lines)
+    lines = [*paragraph(about_costs), "", unpadded(markdown(head, costs)), "", *paragraph(about_files), ""]
+    return "\n".join([*lines, unpadded(markdown(files_head, files))])
 
 
 PAGE = Page("interchange", "interchange.py", render)
