@@ -169,7 +169,7 @@ export class Pd4Player extends HTMLElement {
         this.dispatchEvent(new CustomEvent(name, { detail }));
       });
     }
-    this._timer = setInterval(() => this._showStatus(), STATUS_MS);
+    this._timer = window.setInterval(() => this._showStatus(), STATUS_MS);
     this._showControls();
     this._showPoster();
     this._load();
