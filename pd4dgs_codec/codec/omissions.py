@@ -190,9 +190,8 @@ class _Omissions:
 
     def _without_offsets(self, shown: np.ndarray) -> tuple[np.ndarray, float]:
         """(offset symbols [N, 3 G], the commonest ones for Gaussians that are not `shown` bool [N, G], bits saved)."""
-        symbols = quantise(self.decoded.offset, self.scene.steps.offset, "offset").reshape(
-            shown.shape[0], 3 * shown.shape[1]
-        )
+        n, slots = shown.shape
+        symbols = quantise(self.decoded.offset, self.scene.steps.offset, "offset").reshape(n, 3 * slots)
         free = np.repeat(~shown, 3, axis=1)
         freed = symbols.copy()
         for channel in range(symbols.shape[1]):

@@ -170,7 +170,7 @@ def test_hashes_of_a_scene_in_stages(staged_file):
     section, rows = section_of(chunks[0][2], Section.ATTRIBUTES)
     assert section[0] == STAGED and rows >= 400
     reader = refdec.Reader(section[1:])
-    assert any([refdec.read_terms(reader, c) for c in range(1, 38)])
+    assert any([refdec.read_terms(reader, 38, c) for c in range(1, 38)])
     assert max([refdec.read_class_count(reader) for _ in range(5)]) > 1
     assert (1, 1) in [refdec.read_split(reader)[:2] for _ in range(10)]
     section, _ = section_of(chunks[1][2], Section.PLANES)
