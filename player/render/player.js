@@ -140,7 +140,8 @@ export class Player extends EventTarget {
       this._wake();
     });
     this._seen.observe(canvas);
-    this._startGpu();
+    /** Whether something was loaded before. */
+    this._loaded = false;
   }
 
   // --- what users see
@@ -158,8 +159,6 @@ export class Player extends EventTarget {
       if (loader === this._loader) this._told(news);
     });
     this._loader = loader;
-    this._useCpu = this._options.evaluator === "cpu" || !(this._gpu?.floats ?? true);
-    if (this._useCpu || (this._gpu?.software && this._options.evaluator !== "gpu")) this._cpuWorker ??= startWorker();
     this._scene = null;
     this._shownLevel = null;
     this._camera = null;
@@ -174,7 +173,12 @@ export class Player extends EventTarget {
     this._touch();
     const from = source instanceof Blob ? source : new URL(source, document.baseURI).href;
     loader.call("open", [from]).catch(() => {}); // a worker that fails says so to the next call as well
-    await this._loadOn(loader);
+    const loading = this._loadOn(loader);
+    if (!this._loaded) this._startGpu(); // which takes longer than to ask a server
+    this._loaded = true;
+    this._useCpu = this._options.evaluator === "cpu" || !(this._gpu?.floats ?? true);
+    if (this._useCpu || (this._gpu?.software && this._options.evaluator !== "gpu")) this._cpuWorker ??= startWorker();
+    await loading;
   }
 
   /** Loads as much as options and level allow. @param {Remote} loader */
