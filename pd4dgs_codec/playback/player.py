@@ -5,7 +5,8 @@ The two agree to rounding: both sum in binary32, in other orders.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 
@@ -35,6 +36,15 @@ class Gaussians:
     slots: np.ndarray  #: int64 [K], anchor * G + offset, of G slots
 
 
+class _Anchors(NamedTuple):
+    """n anchors at an instant, float32."""
+
+    position: np.ndarray  #: [n, 3] world
+    feature: np.ndarray  #: [n, F]
+    offset: np.ndarray  #: [n, K, 3]
+    scaling_log: np.ndarray  #: [n, 6]
+
+
 class Player:
     """Draws the highest level of a decoded scene.
 
@@ -49,19 +59,29 @@ class Player:
         self._anchor = np.ascontiguousarray(scene.anchor[: len(codes)], np.float32)
         self._feature, self._scaling_log = scene.feature, scene.scaling_log
         self._offset = scene.offset
-        self._slots = scene.widths.slots
+        self.slots = scene.widths.slots  #: Gaussians of an anchor
         extent = np.exp(scene.scaling_log)
         self._radius = OFFSET_REACH * extent[:, :3].max(axis=1) + SIGMA_REACH * extent[:, 3:].max(axis=1)
         box = scene.info.box
         self._global = None if scene.global_deformation is None else Field(scene.global_deformation, box)
         self._local = None if scene.local_deformation is None else Field(scene.local_deformation, box)
         self._opacity = Layers(scene.networks["opacity"])
-        self._covariance = _SlotNetwork(scene.networks["covariance"], self._slots)
-        self._color = _SlotNetwork(scene.networks["color"], self._slots)
+        self._covariance = _SlotNetwork(scene.networks["covariance"], self.slots)
+        self._color = _SlotNetwork(scene.networks["color"], self.slots)
         self._time: float | None = None
         if self._global is not None:
             self._residuals = np.empty((len(codes), sum(self._global.widths.values())), np.float32)
         self._known = np.zeros(len(codes), bool)  # anchors whose residuals at self._time are there
+
+    @property
+    def active(self) -> np.ndarray:
+        """int64 [n]: the anchors active at this level, ascending."""
+        return np.flatnonzero(self._mask > MASK_THRESHOLD)
+
+    @property
+    def positions(self) -> np.ndarray:
+        """float32 [N, 3]: all anchors at rest, world."""
+        return self._anchor
 
     def picture(self, camera: Camera, t: float) -> np.ndarray:
         """float32 [H, W, 3] in 0..1 at normalised time t in 0..1. Raises RenderError unless t is finite."""
@@ -88,36 +108,77 @@ class Player:
 
     def _gaussians(self, camera: Camera, t: float) -> Gaussians:
         rows = self._visible(camera)
-        mask, position = self._mask[rows], self._anchor[rows]
-        feature, scaling_log, offset = self._feature[rows], self._scaling_log[rows], self._offset[rows]
+        mask, anchors = self._mask[rows], self._anchors(rows, t)
+        viewmat = np.asarray(camera.viewmat, np.float32)
+        inputs = _inputs(anchors, -viewmat[:3, :3].T @ viewmat[:3, 3])
+        raw_opacity = np.tanh(self._opacity(inputs))
+        keep = np.flatnonzero(raw_opacity * mask[:, None] >= np.float32(MIN_OPACITY))
+        return self._grown(rows, anchors, inputs, raw_opacity, mask, keep, t)
+
+    def gaussians_of_eyes(self, rows: np.ndarray, t: float, eyes: np.ndarray) -> Gaussians:
+        """The Gaussians of the anchors `rows` int64 [n] that any of E eyes, float32 [E, 3] world, would see, at
+        normalised time t: those of the first eye, then as many of the second, and so on, slot by slot.
+
+        An eye that does not see one meets it with opacity 0. Frusta do not matter here.
+        """
+        with np.errstate(all="ignore"):
+            anchors = self._anchors(rows, t)
+            inputs = np.concatenate([_inputs(anchors, eye) for eye in eyes])
+            mask = np.tile(self._mask[rows], len(eyes))
+            raw_opacity = np.tanh(self._opacity(inputs))
+            shown = (raw_opacity * mask[:, None] >= np.float32(MIN_OPACITY)).reshape(len(eyes), -1)
+            slots = np.flatnonzero(shown.any(axis=0))
+            keep = (np.arange(len(eyes))[:, None] * shown.shape[1] + slots).ravel()
+            grown = self._grown(
+                np.tile(rows, len(eyes)),
+                _Anchors(*(np.concatenate([part] * len(eyes)) for part in anchors)),
+                inputs, raw_opacity, mask, keep, t, len(eyes),
+            )  # fmt: skip
+        return replace(grown, opacities=np.where(shown[:, slots].ravel(), grown.opacities, np.float32(0)))
+
+    def _anchors(self, rows: np.ndarray, t: float) -> _Anchors:
+        """The anchors `rows` where the global deformation takes them."""
+        position, feature = self._anchor[rows], self._feature[rows]
+        scaling_log, offset = self._scaling_log[rows], self._offset[rows]
         if self._global is not None:
             residuals = self._global.split(self._residuals_at(rows, t))
             position = _moved(position, residuals, "position")
             feature = _moved(feature, residuals, "feature")
             offset = _moved(offset, residuals, "offset")
             scaling_log = _moved(scaling_log, residuals, "scaling")
-        viewmat = np.asarray(camera.viewmat, np.float32)
-        inputs = np.concatenate([feature, _unit(position + viewmat[:3, :3].T @ viewmat[:3, 3])], axis=1)
-        raw_opacity = np.tanh(self._opacity(inputs))
-        keep = np.flatnonzero(raw_opacity * mask[:, None] >= np.float32(MIN_OPACITY))
+        return _Anchors(position, feature, offset, scaling_log)
+
+    def _grown(
+        self,
+        rows: np.ndarray,
+        anchors: _Anchors,
+        inputs: np.ndarray,
+        raw_opacity: np.ndarray,
+        mask: np.ndarray,
+        keep: np.ndarray,
+        t: float,
+        copies: int = 1,
+    ) -> Gaussians:
+        """The Gaussians of the slots `keep`, which are `copies` times the same means."""
         shape = self._covariance(inputs, keep)
         colors = _sigmoid(self._color(inputs, keep))
-        anchors = np.concatenate([position, feature, offset.reshape(len(rows), 3 * self._slots), scaling_log], axis=1)
+        position, feature, offset, scaling_log = anchors
+        table = np.concatenate([position, feature, offset.reshape(len(rows), 3 * self.slots), scaling_log], axis=1)
         made, gate = np.empty((len(keep), GAUSSIAN_WIDTH), np.float32), np.empty(len(keep), np.float32)
         threads.limit_numba()
         slot_kernels.assemble(
-            made, gate, keep, anchors, np.exp(scaling_log), raw_opacity, mask, shape, _sigmoid(shape), colors
+            made, gate, keep, table, np.exp(scaling_log), raw_opacity, mask, shape, _sigmoid(shape), colors
         )
         means, scales, quats, opacities, colors = np.split(made, [SCALE, QUAT, OPACITY, COLOR], axis=1)
         opacities = opacities[:, 0]
         if self._local is not None:
-            moves = self._local.split(self._local(means, t))
+            moves = self._local.split(np.tile(self._local(means[: len(means) // copies], t), (copies, 1)))
             means = _moved(means, moves, "mean")
             scales = np.maximum(_moved(scales, moves, "scale"), 0) if "scale" in moves else scales
             quats = _unit(_moved(quats, moves, "quat")) if "quat" in moves else quats
             opacities = np.clip(_moved(opacities, moves, "opacity"), 0, 1) if "opacity" in moves else opacities
             colors = np.clip(_moved(colors, moves, "color"), 0, 1) if "color" in moves else colors
-        slots = rows[keep // self._slots] * self._slots + keep % self._slots
+        slots = rows[keep // self.slots] * self.slots + keep % self.slots
         means, quats, colors = (np.ascontiguousarray(part) for part in (means, quats, colors))
         return Gaussians(means, quats, scales * gate[:, None], opacities * gate, colors, slots)
 
@@ -169,6 +230,11 @@ class _SlotNetwork:
         threads.limit_numba()
         slot_kernels.linear(out, keep, hidden, 0, self._weight, self._bias)
         return out
+
+
+def _inputs(anchors: _Anchors, eye: np.ndarray) -> np.ndarray:
+    """float32 [n, F + 3]: what the networks take, features and directions from the eye [3]."""
+    return np.concatenate([anchors.feature, _unit(anchors.position - eye)], axis=1)
 
 
 def _moved(values: np.ndarray, residuals: dict[str, np.ndarray], head: str) -> np.ndarray:
