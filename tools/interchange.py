@@ -137,7 +137,7 @@ def _gaussforge(path: Path, player: Any, view: Any) -> float:
         found = gaussforge.GaussForge().read(path.read_bytes(), "spz")["data"]
     n = found["numPoints"]
     keys = ("positions", "scales", "rotations", "alphas", "colors", "sh")
-    fields = {key: np.asarray(found[key], np.float32) for key in keys}
+    fields = {key: np.frombuffer(found[key], "<f4") for key in keys}
     sh = np.concatenate([fields["colors"].reshape(n, 1, 3), fields["sh"].reshape(n, 15, 3)], axis=1)
     scales, quats = np.exp(fields["scales"]).reshape(n, 3), fields["rotations"].reshape(n, 4)
     splats = _contiguous(fields["positions"].reshape(n, 3), quats, scales, _sigmoid(fields["alphas"]), sh)

@@ -126,7 +126,7 @@ def _gaussforge(path: Path) -> Splats:
     ir = found["data"]
     n = int(ir["numPoints"])
     flat = {
-        key: np.asarray(ir[key], np.float32) for key in ("positions", "scales", "rotations", "alphas", "colors", "sh")
+        key: np.frombuffer(ir[key], "<f4") for key in ("positions", "scales", "rotations", "alphas", "colors", "sh")
     }
     rest = flat["sh"].size // (3 * n) if n else 0
     if not n or rest not in REST or flat["sh"].size != 3 * n * rest:
