@@ -26,12 +26,6 @@ MAX_ENTRIES = 1 << 21
 VARINT_MAX = (1 << 35) - 1  # clause 7.1: five bytes of seven bits
 TOTAL = 1 << 24
 PLANES = (("xy", 0, 1), ("xz", 0, 2), ("xt", 0, 3), ("yz", 1, 2), ("yt", 1, 3), ("zt", 2, 3))
-ATTRIBUTES = (("feature", 32), ("scaling_log", 6), ("offset", 30))
-NETWORKS = (  # clause 6.3: per layer the outputs by id, None for any
-    {0: 10, 1: 70, 2: 30},
-    {0: None, 1: 3, 2: 32, 3: 30, 4: 6},
-    {0: None, 1: 3, 2: 3, 3: 4, 4: 1, 5: 3},
-)
 POSITIONS, MASKS, ATTRIBUTE_SECTION, PLANE_SECTION, WEIGHTS, SYMBOLS, FLOATS = range(7)
 
 
@@ -251,7 +245,7 @@ def read_preamble(data):
 # float32 (9.2); others UnsupportedFeature"
 # 5.5 Digest: "The first 16 bytes of the SHA-256 of the payloads of all critical chunks that were encoded together"
 def read_header(data):
-    header = fields(unpack(data), range(1, 15), (*range(1, 12), 13, 14), "header")
+    header = fields(unpack(data), range(1, 16), (*range(1, 12), 13, 14, 15), "header")
     steps, box, (start, end), background, (near, far), _ = (
         reals(header[key], f"header key {key}", count)
         for key, count in ((4, 3), (6, 6), (7, 2), (8, 3), (9, 2), (10, 3))
@@ -268,10 +262,30 @@ def read_header(data):
         read_camera(header[12])
     read_error_bounds(header[13])
     need(type(header[14]) is bytes and len(header[14]) == 16, "the digest of the layers is not 16 bytes")
+    for value, most in zip(a_list(header[15], "the widths", 2), (64, 16)):
+        limited(value, most, "a width", 1)
     read_chunk_list(header[1])
     for key in (2, 3):
         registered(header[key], (0, 1), f"header key {key}")
     return header
+
+
+# 5.1 Header map: "feature width D, 1..64, and slots G, 1..16"
+# 11.2 Attributes: "The D + 6 + 3·G channels are the scalars of an anchor: feature 0 .. D − 1, scaling_log 0..5,
+# offset 0 .. 3·G − 1."
+def attribute_channels(header):
+    feature, slots = header[15]
+    return {"feature": feature, "scaling_log": 6, "offset": 3 * slots}
+
+
+# 6.3 Planes and networks: the outputs by id, None for any
+def network_outputs(number, header):
+    feature, slots = header[15]
+    return (
+        {0: slots, 1: 7 * slots, 2: 3 * slots},
+        {0: None, 1: 3, 2: feature, 3: 3 * slots, 4: 6},
+        {0: None, 1: 3, 2: 3, 3: 4, 4: 1, 5: 3},
+    )[number]
 
 
 # 5.3 Camera map: "fx and fy MUST be positive" "All four are required."
@@ -373,7 +387,7 @@ def read_parameters(layer, value):
     layer.sections = {s: limited(sections[s], (1 << 31) - 1, "a section", 1) for s in sections if s < 64}
     found = {3, 4, 5} & set(parameters)
     need(found in ([{3, 4, 5}, set()] if layer.number else [{3, 5}]), f"layer {layer.number} with keys {found}")
-    layer.networks = read_networks(layer.number, parameters[5]) if 5 in parameters else {}
+    layer.networks = read_networks(layer.number, layer.header, parameters[5]) if 5 in parameters else {}
     layer.deformed = bool(layer.networks) and layer.number > 0
     layer.raw = layer.deformed and layer.header[3] == 1
     steps = reals(parameters[3], "steps", 1 + layer.deformed) if layer.networks else []
@@ -406,16 +420,16 @@ def read_scales(layer, rows):
 
 # 6.3 Planes and networks: "Ids ascend." "The last width MUST be the number of outputs in this table." "Layer 0 has all
 # three networks. A deformation has its trunk and at least one head."
-def read_networks(number, rows):
-    networks, last = {}, -1
+def read_networks(number, header, rows):
+    networks, last, known = {}, -1, network_outputs(number, header)
     for row in a_list(rows, "networks"):
         need(a_list(row, "a network"), "an empty network")
-        key = registered(row[0], NETWORKS[number], "a network's id")
+        key = registered(row[0], known, "a network's id")
         need(key > last, f"network {key} after {last}")
         limited(len(row) - 1, 16, "linear layers", 1)
         for width in row[1:]:
             limited(width, 4096, "a network's width", 1)
-        need(NETWORKS[number][key] in (None, row[-1]), f"network {key} with {row[-1]} outputs")
+        need(known[key] in (None, row[-1]), f"network {key} with {row[-1]} outputs")
         networks[key], last = row[1:], key
     if number == 0:
         need(len(networks) == 3, f"networks {list(networks)} in layer 0")
@@ -438,9 +452,11 @@ def plane_shapes(layer):
 # 6.3 Planes and networks: "Linear layer i is a weight [o_i, o_{i−1}] and a bias [o_i]; o_0 is the network's input
 # width."
 def weight_shapes(layer):
-    shapes = []
+    shapes, feature = [], layer.header[15][0]
     for key, widths in layer.networks.items():
-        width = 35 if layer.number == 0 else layer.networks[0][-1] if key else sum(s[0] for s in layer.scales)
+        width = sum(s[0] for s in layer.scales) if layer.number else feature + 3
+        if layer.number and key:
+            width = layer.networks[0][-1]
         for i, outputs in enumerate(widths):
             shapes += [(f"network.{key}.weight.{i}", outputs * width), (f"network.{key}.bias.{i}", outputs)]
             width = outputs
@@ -453,7 +469,8 @@ def check_sizes(layer, payload_bytes, before):
     """before: N, S and L of the layers before it. Sets those with it."""
     samples = sum(c * h * w for _, _, (c, h, w) in plane_shapes(layer))
     need(samples <= 1 << 28, f"{samples} plane samples", "LimitExceeded")
-    symbols = layer.rows_before + 72 * layer.rows + samples + sum(size for _, size in weight_shapes(layer))
+    row = sum(attribute_channels(layer.header).values()) + 4
+    symbols = layer.rows_before + row * layer.rows + samples + sum(size for _, size in weight_shapes(layer))
     layer.declared = [a + b for a, b in zip(before, (layer.rows, symbols, payload_bytes))]
     rows, symbols, size = layer.declared
     need(rows <= (1 << 13) + 2 * size, f"{rows} rows", "LimitExceeded")
@@ -468,7 +485,8 @@ def read_sections(layer, parts):
         return parts.pop(section, b"") if count else b""
 
     planes, weights = plane_shapes(layer), weight_shapes(layer)
-    counts = {MASKS: [layer.rows_before, layer.rows], ATTRIBUTE_SECTION: [layer.rows] * 68}
+    counts = {MASKS: [layer.rows_before, layer.rows], ATTRIBUTE_SECTION: []}
+    counts[ATTRIBUTE_SECTION] = [layer.rows] * sum(attribute_channels(layer.header).values())
     counts[PLANE_SECTION] = [] if layer.raw else [h * w for _, _, (c, h, w) in planes for _ in range(c)]
     counts[WEIGHTS] = [] if layer.raw else [size for _, size in weights]
     positions = decode_positions(part(POSITIONS, layer.rows), layer.rows)
@@ -482,7 +500,7 @@ def read_sections(layer, parts):
         for section, sizes in counts.items():
             data = part(section, sum(sizes))
             if section == ATTRIBUTE_SECTION and sum(sizes):
-                channels[section] = decode_attributes(data, layer.rows)
+                channels[section] = decode_attributes(data, *layer.header[15], layer.rows)
             elif section == PLANE_SECTION and sizes:
                 channels[section] = decode_planes(data, [shape for _, _, shape in planes])
             else:
@@ -505,7 +523,7 @@ def keep_symbols(layer, positions, channels, planes, weights):
     need(all(v >= 3 for v in own), "a mask code under 3")
     layer.symbols = {"anchor": [v for cell in positions for v in cell], "mask_rise": rise, "mask_own": own}
     first = 0
-    for name, width in ATTRIBUTES:  # [width, n], channel by channel
+    for name, width in attribute_channels(layer.header).items():  # [width, n], channel by channel
         layer.symbols[name] = [k for channel in channels[ATTRIBUTE_SECTION][first : first + width] for k in channel]
         first += width
     if not layer.raw:
@@ -746,19 +764,21 @@ def take_channel(stream, count, prior, exceptions):
 # channels, the stages 0..7 (8.7)"
 # 8.7 Stages of the attributes: "The activity of a row is the relative magnitude (8.9) of the residuals named, the
 # places being the n rows."
-def decode_attributes(data, n):
-    reader = Reader(data)
+# 8.7 Stages of the attributes: "The bounds are b_s = (P·a_s) // 38, a_1 .. a_5 being 6, 12, 20, 29 and 38"
+def decode_attributes(data, feature, slots, n):
+    reader, p = Reader(data), feature + 6
     if read_form(reader) == 0:
-        return decode_channels(reader.take(reader.left), [n] * 68)
-    terms = [read_terms(reader, c) for c in range(1, 38)]
+        return decode_channels(reader.take(reader.left), [n] * (p + 3 * slots))
+    terms = [read_terms(reader, p, c) for c in range(1, p)]
     class_counts = [read_class_count(reader) for _ in range(5)]
-    splits = [read_split(reader) for _ in range(10)]
+    splits = [read_split(reader) for _ in range(slots)]
     *stages, stage_y, stage_z = take_stages(reader, 8)
-    k = []  # r_0 .. r_37, then x_0 .. x_9
-    for stage, end, class_count in zip(stages, (6, 12, 20, 29, 38, 48), [1, *class_counts]):
+    k = []  # r_0 .. r_(P − 1), then x_0 .. x_(G − 1)
+    ends = [p * a // 38 for a in (6, 12, 20, 29, 38)] + [p + slots]
+    for stage, end, class_count in zip(stages, ends, [1, *class_counts]):
         classes = classes_by_activity(relative_magnitude(k, n), class_count)
         k += decode_classes(stage, [classes] * (end - len(k)), class_count)
-    residuals, x = k[:38], k[38:]
+    residuals, x = k[:p], k[p:]
     y = decode_classes(stage_y, [y_classes(split, *own) for split, *own in zip(splits, x)], 5)
     z = decode_classes(stage_z, [z_classes(split, *own) for split, *own in zip(splits, x, y)], 7)
     return add_predictions(residuals, terms) + [channel for offset in zip(x, y, z) for channel in offset]
@@ -772,14 +792,14 @@ def read_form(reader):
     return form
 
 
-# 8.6 Prediction block: "a varint m ≤ c, then m times a varint g ≤ 38 and a zigzag weight w, |w| ≤ 2^15. The term
+# 8.6 Prediction block: "a varint m ≤ c, then m times a varint g ≤ P and a zigzag weight w, |w| ≤ 2^15. The term
 # refers to channel j = j' + 1 + g, where j' is the channel of the term before, −1 for the first; so the j ascend. j
 # MUST be less than c, else Malformed"
-def read_terms(reader, c):
+def read_terms(reader, p, c):
     """[(channel, weight)] of channel c."""
     terms, j = [], -1
     for _ in range(reader.varint(c)):
-        j += 1 + reader.varint(38)
+        j += 1 + reader.varint(p)
         need(j < c, f"channel {c} is predicted from channel {j}")
         terms.append((j, reader.zigzag(1 << 15)))
     return terms
@@ -1200,9 +1220,10 @@ def dequantise(symbols, step):
 # 11.5 Dequantisation: "An anchor's position is dequantised from its voxel index with the voxel size as Q." "Values of
 # section 6 are taken as they are."
 def dequantise_layer(layer):
-    steps = dict(zip([name for name, _ in ATTRIBUTES], layer.header[4])) | {"anchor": layer.header[5]}
+    attributes = attribute_channels(layer.header)
+    steps = dict(zip(attributes, layer.header[4])) | {"anchor": layer.header[5]}
     for name, symbols in layer.symbols.items():
-        if name in dict(ATTRIBUTES):  # [width, n] -> [n, width]
+        if name in attributes:  # [width, n] -> [n, width]
             symbols = [k for row in range(layer.rows) for k in symbols[row :: layer.rows]]
         if not name.startswith("mask"):
             step = steps.get(name) or layer.steps[0 if name.startswith("planes") else -1]

@@ -57,6 +57,10 @@ def parser() -> Parser:
     p.add_argument("source", metavar="SOURCE", help="dataset to train on, see below")
     p.add_argument("-o", "--output", required=True, metavar="FILE.pt", help="checkpoint to write")
     p.add_argument("--preset", choices=("tiny", "small", "paper"), help="model size (default: small)")
+    what = "numbers of an anchor's feature, 1..64 (default: 32)"
+    p.add_argument("--feature-width", type=values.positive_int, metavar="N", help=what)
+    what = "Gaussians of an anchor, 1..16 (default: 10)"
+    p.add_argument("--slots", type=values.positive_int, metavar="N", help=what)
     what = "training steps (default: by preset, unless --max-seconds is given)"
     p.add_argument("--iterations", type=values.positive_int, metavar="N", help=what)
     what = "time to train; on --resume earlier time counts too"

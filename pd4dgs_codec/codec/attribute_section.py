@@ -1,17 +1,19 @@
-"""The attributes section of mode ans: 68 channels as they are, or with what one channel tells of another taken out.
+"""The attributes section of mode ans: the channels as they are, or with what one tells of another taken out.
 
-Byte 0 is the form. Form 0: the rest is one channels payload of the 68 channels. Form 1: a block of varints, then eight
-channels payloads, the *stages*, each decoded before the next. All arithmetic is on integers.
+Byte 0 is the form. Form 0: the rest is one channels payload of all channels. Form 1: a block of varints, then eight
+channels payloads, the *stages*, each decoded before the next. All arithmetic is on integers. With D feature numbers and
+G Gaussians, the first P = D + 6 channels are features and log-scalings, the others G offsets x, y, z.
 
-*Linear prediction*, channels 1..37 (features, log-scalings): for channel c a varint m <= c, then m terms in ascending
+*Linear prediction*, channels 1 .. P - 1: for channel c a varint m <= c, then m terms in ascending
 order of the channel j they refer to: a varint j - (previous j) - 1, starting from previous j = -1, and a zigzag weight
 w, |w| <= 2^15. Coded is the residual e_c = k_c - ((sum_j w_j k_j + 512) >> 10), the shift rounding down.
 
-*Activity*. The residuals of an anchor tend to be large together. Stages 0..4 hold the residuals of channels 0..37 in
-the runs that STAGES names, stage 5 the ten offsets x. For each of stages 1..5 the block has a varint C in 1..8: each
-channel of the stage is split into C classes of rows by how large the residuals of the earlier stages are (`activity`).
+*Activity*. The residuals of an anchor tend to be large together. Stages 0..4 hold the residuals of channels 0 .. P - 1
+in the runs that `stage_bounds` names, stage 5 the offsets x. For each of stages 1..5 the block has a varint C in 1..8:
+each channel of the stage is split into C classes of rows by how large the residuals of the earlier stages are
+(`activity`).
 
-*Distance*, the offsets y and z of ten Gaussians: per Gaussian a varint f in 0..3: bit 0, y is split by x; bit 1, z is
+*Distance*, the offsets y and z: per Gaussian a varint f in 0..3: bit 0, y is split by x; bit 1, z is
 split by x and y. If f > 0 follow a zigzag centre of x and, if bit 1 is set, one of y, each |.| <= 2^24 - 1. The symbols
 of a split y go to class min(|x - centre_x|, 4), those of a split z to class min(|x - centre_x| + |y - centre_y|, 6).
 Stage 6 holds the y, stage 7 the z.
@@ -27,7 +29,6 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pd4dgs_codec.attributes.table import N_CHANNELS
 from pd4dgs_codec.codec.stages import (
     PLAIN,
     PRIOR_BITS,
@@ -46,15 +47,12 @@ from pd4dgs_codec.entropy.channels import decode_channels
 from pd4dgs_codec.entropy.priors import K_MAX
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
 from pd4dgs_codec.errors import Malformed, UnsupportedFeature
-from pd4dgs_codec.scene import FEATURE_DIM, N_OFFSETS, SCALING_DIM
+from pd4dgs_codec.scene import Widths
 
-N_PREDICTED = FEATURE_DIM + SCALING_DIM
 WEIGHT_SHIFT = 10
 MAX_WEIGHT = 1 << 15
-#: First channel of each stage of residuals, and the end of the last.
-STAGES = (0, 6, 12, 20, 29, N_PREDICTED)
-#: Channels of the ten offsets x.
-X_CHANNELS = tuple(range(N_PREDICTED, N_PREDICTED + 3 * N_OFFSETS, 3))
+#: Where the stages of residuals begin and end, of 38 predicted channels; those of another number in proportion.
+STAGES = (0, 6, 12, 20, 29, 38)
 Y_CLASSES, Z_CLASSES = 5, 7
 SPLIT_Y, SPLIT_Z = 1, 2
 
@@ -99,29 +97,36 @@ class Split:
         return classes
 
 
-def _stage_channels(stage: int) -> tuple[int, ...]:
-    """The channels of stages 0..5."""
-    return tuple(range(STAGES[stage], STAGES[stage + 1])) if stage < len(STAGES) - 1 else X_CHANNELS
+def stage_bounds(widths: Widths) -> list[int]:
+    """First channel of each stage of residuals, and the end of the last."""
+    return [widths.predicted * bound // STAGES[-1] for bound in STAGES]
+
+
+def stage_channels(widths: Widths, stage: int) -> range:
+    """The channels of stages 0..5; those of the last are the offsets x."""
+    if stage == len(STAGES) - 1:
+        return range(widths.predicted, widths.channels, 3)
+    return range(*stage_bounds(widths)[stage : stage + 2])
 
 
 # -- writing -----------------------------------------------------------------------------------------------------------
 
 
-def write_attributes(attributes: np.ndarray, priors: str, effort: int) -> tuple[bytes, float]:
-    """(section bytes, sum of R(a) over the 68 channels) of attributes int32 [68, n], in the smaller form."""
+def write_attributes(attributes: np.ndarray, widths: Widths, priors: str, effort: int) -> tuple[bytes, float]:
+    """(section bytes, sum of R(a) over all channels) of attributes int32 [channels, n], in the smaller form."""
     one_row = attributes.shape[1] < 2  # has no spread to predict
-    staged = None if one_row else lambda: _write_staged(attributes.astype(np.int64), effort)
+    staged = None if one_row else lambda: _write_staged(attributes.astype(np.int64), widths, effort)
     return smaller_form(list(attributes), staged, priors, effort)
 
 
-def _write_staged(symbols: np.ndarray, effort: int) -> bytes:
-    terms = [_fit_terms(symbols, c) for c in range(1, N_PREDICTED)]
-    splits = [_fit_split(*symbols[x : x + 3]) for x in X_CHANNELS]
+def _write_staged(symbols: np.ndarray, widths: Widths, effort: int) -> bytes:
+    terms = [_fit_terms(symbols, c) for c in range(1, widths.predicted)]
+    splits = [_fit_split(*symbols[x : x + 3]) for x in stage_channels(widths, len(STAGES) - 1)]
     coded = symbols.copy()
     for c, term in enumerate(terms, start=1):
         coded[c] = symbols[c] - term.prediction(symbols)
     counts = [
-        cheapest_class_count([(coded[list(_stage_channels(stage))], _activity(coded, stage))])
+        cheapest_class_count([(coded[list(stage_channels(widths, stage))], _activity(coded, widths, stage))])
         for stage in range(1, len(STAGES))
     ]
 
@@ -139,23 +144,23 @@ def _write_staged(symbols: np.ndarray, effort: int) -> bytes:
             put_zigzag(out, split.centre_x)
         if split.flags & SPLIT_Z:
             put_zigzag(out, split.centre_y)
-    stages = [[channel[rows] for channel, rows in places] for places in _places(coded, counts, splits)]
+    stages = [[channel[rows] for channel, rows in places] for places in _places(coded, widths, counts, splits)]
     put_stages(out, stages, effort)
     return bytes(out)
 
 
 def _places(
-    coded: np.ndarray, counts: Sequence[int], splits: Sequence[Split]
+    coded: np.ndarray, widths: Widths, counts: Sequence[int], splits: Sequence[Split]
 ) -> Iterator[list[tuple[np.ndarray, np.ndarray]]]:
-    """Per stage, the (channel, rows) that it codes, in order. `coded` int64 [68, n] is read only as far as the stages
-    before reach."""
+    """Per stage, the (channel, rows) that it codes, in order. `coded` int64 [channels, n] is read only as far as the
+    stages before reach."""
     every = np.arange(coded.shape[1])
     for stage, count in enumerate((1, *counts)):
-        parts = places_of(activity_classes(_activity(coded, stage), count), count) if count > 1 else [every]
-        yield [(coded[c], part) for c in _stage_channels(stage) for part in parts]
+        parts = places_of(activity_classes(_activity(coded, widths, stage), count), count) if count > 1 else [every]
+        yield [(coded[c], part) for c in stage_channels(widths, stage) for part in parts]
     for axis, flag, count in ((1, SPLIT_Y, Y_CLASSES), (2, SPLIT_Z, Z_CLASSES)):
         places = []
-        for x, split in zip(X_CHANNELS, splits, strict=True):
+        for x, split in zip(stage_channels(widths, len(STAGES) - 1), splits, strict=True):
             parts = [every]
             if split.flags & flag:
                 classes = split.y_classes(coded[x]) if axis == 1 else split.z_classes(coded[x], coded[x + 1])
@@ -164,8 +169,8 @@ def _places(
         yield places
 
 
-def _activity(coded: np.ndarray, stage: int) -> np.ndarray:
-    return relative_magnitude(coded[: STAGES[stage]])
+def _activity(coded: np.ndarray, widths: Widths, stage: int) -> np.ndarray:
+    return relative_magnitude(coded[: stage_bounds(widths)[stage]])
 
 
 def _fit_terms(symbols: np.ndarray, c: int) -> Terms:
@@ -213,19 +218,20 @@ def _mode(symbols: np.ndarray) -> int:
 # -- reading -----------------------------------------------------------------------------------------------------------
 
 
-def read_attributes(data: bytes, rows: int) -> np.ndarray:
-    """attributes int32 [68, rows]; the inverse of write_attributes. rows was checked against the limits before."""
+def read_attributes(data: bytes, widths: Widths, rows: int) -> np.ndarray:
+    """attributes int32 [channels, rows]; the inverse of write_attributes. rows was checked against the limits
+    before."""
     reader = ByteReader(data)
     form = reader.byte("the form of the attributes")
     if form == PLAIN:
-        return np.stack(decode_channels(reader.rest(), [rows] * N_CHANNELS))
+        return np.stack(decode_channels(reader.rest(), [rows] * widths.channels))
     if form != STAGED:
         raise UnsupportedFeature(f"form {form} of the attributes, expected {PLAIN} or {STAGED}")
-    terms = [_read_terms(reader, c) for c in range(1, N_PREDICTED)]
+    terms = [_read_terms(reader, widths, c) for c in range(1, widths.predicted)]
     counts = [read_class_count(reader, stage) for stage in range(1, len(STAGES))]
-    splits = [_read_split(reader) for _ in range(N_OFFSETS)]
-    symbols = np.zeros((N_CHANNELS, rows), np.int64)
-    read_stages(reader, len(STAGES) + 2, _places(symbols, counts, splits))
+    splits = [_read_split(reader) for _ in range(widths.slots)]
+    symbols = np.zeros((widths.channels, rows), np.int64)
+    read_stages(reader, len(STAGES) + 2, _places(symbols, widths, counts, splits))
     for c, term in enumerate(terms, start=1):
         symbols[c] += term.prediction(symbols)
     if symbols.size and max(int(symbols.max()), -int(symbols.min())) > K_MAX:
@@ -233,10 +239,10 @@ def read_attributes(data: bytes, rows: int) -> np.ndarray:
     return symbols.astype(np.int32)
 
 
-def _read_terms(reader: ByteReader, c: int) -> Terms:
+def _read_terms(reader: ByteReader, widths: Widths, c: int) -> Terms:
     channels, weights, last = [], [], -1
     for _ in range(reader.varint(c, f"the number of terms of channel {c}")):
-        last += 1 + reader.varint(N_PREDICTED, f"a term of channel {c}")
+        last += 1 + reader.varint(widths.predicted, f"a term of channel {c}")
         if last >= c:
             raise Malformed(f"channel {c} is predicted from channel {last}, expected one before it")
         channels.append(last)

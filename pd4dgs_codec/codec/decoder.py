@@ -72,7 +72,14 @@ class LayerReader:
         layer = None
         if kind is not None:
             try:
-                layer = read_layer(chunk.payload, kind, self._declared, self.header.mode, self.header.raw_deformation)
+                layer = read_layer(
+                    chunk.payload,
+                    kind,
+                    self.header.widths,
+                    self._declared,
+                    self.header.mode,
+                    self.header.raw_deformation,
+                )
                 check_last_layer([*self.layers, layer], self.header.info.voxel_size, self.header.attribute_steps)
                 _check_bounded(layer, self.header)
             except DecodeError as error:

@@ -112,7 +112,7 @@ def _check_limits(scene: Scene, symbols: list[LayerSymbols], payloads: list[byte
     declared = Declared()
     for index, (layer, payload) in enumerate(zip(symbols, payloads, strict=True)):
         try:
-            *_, declared = read_meta(payload, layer.kind, declared, layer.raw_deformation)
+            *_, declared = read_meta(payload, layer.kind, layer.widths, declared, layer.raw_deformation)
             check_last_layer(symbols[: index + 1], scene.info.voxel_size, scene.steps.attributes)
         except DecodeError as error:
             raise EncodeError(f"the scene is over a limit of the format: {error}") from None
@@ -129,6 +129,7 @@ def _container(meant: Scene, options: EncodeOptions, payloads: list[bytes], meta
         mode=options.mode,
         deformation=options.deformation,
         attribute_steps=meant.steps.attributes,
+        widths=meant.widths,
         info=meant.info,
         error_bounds=rounding_bounds(meant, options.raw_deformation),
         digest=payload_digest(payloads),

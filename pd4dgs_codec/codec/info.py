@@ -46,7 +46,7 @@ def info(data: bytes) -> dict[str, Any]:
             row: dict[str, Any] = {"layer": kind.layer, **place}
             if offset + size <= len(data):
                 payload = read_chunk(data, offset, type=chunk_type, length=length).payload
-                meta, _, declared = read_meta(payload, kind, declared, header.raw_deformation)
+                meta, _, declared = read_meta(payload, kind, header.widths, declared, header.raw_deformation)
                 row |= {"anchors": meta.rows, "steps": meta.steps}
                 row["planes"] = [[s.channels, *s.sides] for s in meta.scales]
                 row["sections"] = {Section(key).name.lower(): length for key, length in sorted(meta.sections.items())}
@@ -61,6 +61,8 @@ def info(data: bytes) -> dict[str, Any]:
         "mode": header.mode,
         "deformation": header.deformation,
         "voxel_size": header.info.voxel_size,
+        "feature_width": header.widths.feature,
+        "slots": header.widths.slots,
         "steps": header.attribute_steps,
         "error_bounds": header.error_bounds,
         "anchors": declared.rows if all("anchors" in row for row in layers) else None,
@@ -109,9 +111,9 @@ def hashes(data: bytes, max_layer: int | None = None) -> list[dict[str, Any]]:
     those of its layers <= max_layer alone (bytes after those are not looked at).
 
     symbols: int32 little-endian, C order, of anchor_q [n, 3], the rise of earlier rows' mask codes, the codes of own
-    rows, attributes [68, n], then planes [C, H, W] scale by scale in the order xy xz xt yz yt zt, then weight [out, in]
-    and bias [out] per linear layer, networks by ascending id; float32 planes and weights are left out.
-    tensors: float32 little-endian of anchor [n, 3], feature [n, 32], scaling_log [n, 6], offset [n, 10, 3] of own rows,
+    rows, attributes [channels, n], then planes [C, H, W] scale by scale in the order xy xz xt yz yt zt, then weight
+    [out, in] and bias [out] per linear layer, networks by ascending id; float32 planes and weights are left out.
+    tensors: float32 little-endian of anchor [n, 3], feature [n, D], scaling_log [n, 6], offset [n, G, 3] of own rows,
     then planes and networks as above.
     """
     reader, _ = read_layers(data, max_layer=max_layer)

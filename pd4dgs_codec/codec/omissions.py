@@ -20,7 +20,7 @@ from pd4dgs_codec.codec.plane_choice import choose_predictor, fill_plane
 from pd4dgs_codec.codec.symbols import rounded
 from pd4dgs_codec.entropy.bits import entropy_bits
 from pd4dgs_codec.evaluate.reach import Reached, global_cells, local_cells, shown_gaussians
-from pd4dgs_codec.scene import FEATURE_DIM, N_OFFSETS, PLANES, TRUNK, Deformation, Network, Planes, Scene
+from pd4dgs_codec.scene import PLANES, TRUNK, Deformation, Network, Planes, Scene
 
 #: Networks whose values may exceed this are left as they are; binary32 overflows at 3.4e38.
 LARGEST = 1e30
@@ -90,10 +90,11 @@ class _Omissions:
     def _zero_unread_features(self) -> None:
         """Feature channels that no network reads: 0 in all anchors, and no residual; and the reverse, weights of
         channels that are 0 in all anchors and have no residual."""
+        width = self.scene.widths.feature
         firsts = {name: self.decoded.networks[name][0][0] for name in self.decoded.networks}
-        unread = ~np.any([w[:, :FEATURE_DIM].any(axis=0) for w in firsts.values()], axis=0)
+        unread = ~np.any([w[:, :width].any(axis=0) for w in firsts.values()], axis=0)
         head = self._networks(LAYER_KINDS[1]).get("feature")
-        moved = np.zeros(FEATURE_DIM, bool) if head is None else np.any([head[-1][0].any(1), head[-1][1] != 0], axis=0)
+        moved = np.zeros(width, bool) if head is None else np.any([head[-1][0].any(1), head[-1][1] != 0], axis=0)
         zero = ~self.decoded.feature.any(axis=0)
         stale = unread & ~zero
         if stale.any():
@@ -188,8 +189,9 @@ class _Omissions:
             self._free_cells(kind, cells)
 
     def _without_offsets(self, shown: np.ndarray) -> tuple[np.ndarray, float]:
-        """(offset symbols [N, 30], the commonest ones for Gaussians that are not `shown` bool [N, 10], bits saved)."""
-        symbols = quantise(self.decoded.offset, self.scene.steps.offset, "offset").reshape(len(shown), 3 * N_OFFSETS)
+        """(offset symbols [N, 3 G], the commonest ones for Gaussians that are not `shown` bool [N, G], bits saved)."""
+        n, slots = shown.shape
+        symbols = quantise(self.decoded.offset, self.scene.steps.offset, "offset").reshape(n, 3 * slots)
         free = np.repeat(~shown, 3, axis=1)
         freed = symbols.copy()
         for channel in range(symbols.shape[1]):
@@ -202,7 +204,7 @@ class _Omissions:
         if shown.all():
             return
         freed, bits = self._without_offsets(shown)
-        values = dequantise(freed, self.scene.steps.offset).reshape(-1, N_OFFSETS, 3)
+        values = dequantise(freed, self.scene.steps.offset).reshape(self.decoded.offset.shape)
         if (values == self.decoded.offset).all():
             return
         self._note(f"offsets of {int((~shown).sum())} Gaussians", "no view shows them at any time", bits)

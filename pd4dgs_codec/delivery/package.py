@@ -18,7 +18,7 @@ from typing import Any
 from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.info import info
 from pd4dgs_codec.delivery import mp4
-from pd4dgs_codec.delivery.page import page_files
+from pd4dgs_codec.delivery.page import PAGE, page
 from pd4dgs_codec.errors import DeliveryError
 from pd4dgs_codec.scene import Scene
 
@@ -70,7 +70,8 @@ def package(data: bytes, render: Callable[[Scene], Video | None] | None = None) 
         files |= {VIDEO: video.data, VIDEO_PLAYLIST: _video_playlist(video)}
     files[PLAYLIST] = _playlist(video)
     files[INDEX] = _index(data, init, parts, seconds, video)
-    return files | page_files()
+    files[PAGE] = page().encode()
+    return files
 
 
 def _segments(data: bytes, seconds: float) -> tuple[bytes, int, list[Part]]:

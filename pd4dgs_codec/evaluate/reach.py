@@ -20,7 +20,7 @@ import numpy as np
 
 from pd4dgs_codec import threads
 from pd4dgs_codec.evaluate.enclosure import Enclosure, Range, Ranges, instants, kernels
-from pd4dgs_codec.scene import FEATURE_DIM, N_OFFSETS, PLANES, Deformation, Scene, plane_sides
+from pd4dgs_codec.scene import PLANES, Deformation, Scene, plane_sides
 
 Reached = tuple[dict[str, np.ndarray], ...]  #: per scale, plane name -> bool [H, W]
 
@@ -136,7 +136,7 @@ def global_cells(scene: Scene) -> Reached:
 
 
 def shown_gaussians(scene: Scene, pays: Pays[np.ndarray] = _always) -> np.ndarray:
-    """bool [N, 10]: the Gaussians that some view may show. Those that features without residuals do not show are
+    """bool [N, G]: the Gaussians that some view may show. Those that features without residuals do not show are
     looked at if it `pays`, which is told what is certain, as if no other were shown."""
     shown = _may_show(scene, np.arange(len(scene.anchor)), None)
     field = scene.global_deformation
@@ -153,7 +153,7 @@ def shown_gaussians(scene: Scene, pays: Pays[np.ndarray] = _always) -> np.ndarra
 
 
 def local_cells(scene: Scene, shown: np.ndarray, pays: Pays[Reached] = _always) -> Reached | None:
-    """The cells of the local planes that the Gaussians `shown` bool [N, 10] read; () without such planes. None if it
+    """The cells of the local planes that the Gaussians `shown` bool [N, G] read; () without such planes. None if it
     does not pay to go on: `pays` is told now and then which cells are read by the anchors so far."""
     field, local = scene.global_deformation, scene.local_deformation
     if local is None:
@@ -191,11 +191,11 @@ def _shown(
     spans: Sequence[Span],
     pool: ThreadPoolExecutor,
 ) -> np.ndarray:
-    """bool [n, 10]: the Gaussians of the anchors `rows` that some view may show at some time, with those `certain`."""
+    """bool [n, G]: the Gaussians of the anchors `rows` that some view may show at some time, with those `certain`."""
     shown: np.ndarray = certain.copy()
 
     def found(span: Span, open_: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Gaussians [m, 10] that the middle of the span shows, and those that it may show at any of its times."""
+        """Gaussians [m, G] that the middle of the span shows, and those that it may show at any of its times."""
         feature = enclosure.ranges(*span, ["feature"], open_)["feature"]
         middle = Range(feature.middle, feature.middle, feature.middle)
         return _may_show(scene, rows[open_], middle), _may_show(scene, rows[open_], feature)
@@ -223,11 +223,11 @@ def _read_local(
     spans: Sequence[Span],
     pool: ThreadPoolExecutor,
 ) -> None:
-    """Marks the cells that the Gaussians `shown` bool [n, 10] of the anchors `rows` read."""
+    """Marks the cells that the Gaussians `shown` bool [n, G] of the anchors `rows` read."""
     finest = np.array([max(sides[axis] for sides in marks.sides) - 1 for axis in range(3)], np.float32)
 
     def boxes(span: Span, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Unit cube, float32 [m, 10, 3]: (in the middle of the span, low, high)."""
+        """Unit cube, float32 [m, G, 3]: (in the middle of the span, low, high)."""
         ranges = enclosure.ranges(*span, ["position", "offset", "scaling"], at) if enclosure else {}
         return _mean_ranges(scene, anchor[at], rows[at], ranges)
 
@@ -236,13 +236,13 @@ def _read_local(
         results = list(pool.map(lambda pair: boxes(*pair), pending))
         sizes = [at.size for _, at in pending]
         which = np.repeat(np.arange(len(pending)), sizes)  # the span of each anchor
-        taken = np.concatenate([shown[at] for _, at in pending])  # bool [m, 10]
+        taken = np.concatenate([shown[at] for _, at in pending])  # bool [m, G]
         middle, low, high = (np.concatenate([r[i] for r in results]) for i in range(3))
         start, end = (np.array([span[i] for span, _ in pending])[which] for i in range(2))
         wide = ~((((high - low) * finest).max(axis=2) <= NARROW) | ~taken).all(axis=1)  # NaN is wide
         if halving == HALVINGS:
             wide[:] = False
-        slots, owner = taken & ~wide[:, None], np.repeat(np.arange(len(wide)), N_OFFSETS).reshape(taken.shape)
+        slots, owner = taken & ~wide[:, None], np.repeat(np.arange(len(wide)), taken.shape[1]).reshape(taken.shape)
         marks.read(_Boxes(low[slots], high[slots], start[owner[slots]], end[owner[slots]]))
         slots = taken & wide[:, None]
         of = owner[slots]
@@ -277,12 +277,12 @@ def _unit(box: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarra
 def _mean_ranges(
     scene: Scene, anchor: np.ndarray, rows: np.ndarray, ranges: Ranges
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(in the middle, low, high) float32 [n, 10, 3] of the Gaussians' means (13.4, step 3) before the local
+    """(in the middle, low, high) float32 [n, G, 3] of the Gaussians' means (13.4, step 3) before the local
     deformation, in the unit cube."""
     nothing = Range(*(np.zeros(1, np.float32),) * 3)
-    position, scaling = ranges.get("position", nothing), ranges.get("scaling", nothing)
+    position, scaling, slots = ranges.get("position", nothing), ranges.get("scaling", nothing), scene.widths.slots
     offset = [
-        scene.offset[rows] + (o.reshape(-1, N_OFFSETS, 3) if o.ndim > 1 else o) for o in ranges.get("offset", nothing)
+        scene.offset[rows] + (o.reshape(-1, slots, 3) if o.ndim > 1 else o) for o in ranges.get("offset", nothing)
     ]
     with np.errstate(all="ignore"):
         spread = [np.exp((scene.scaling_log[rows] + s)[:, :3])[:, None] for s in scaling]
@@ -296,14 +296,15 @@ def _mean_ranges(
 
 
 def _may_show(scene: Scene, rows: np.ndarray, feature: Range | None) -> np.ndarray:
-    """bool [n, 10]: the opacity may reach the threshold from some direction, with residuals of the features anywhere
+    """bool [n, G]: the opacity may reach the threshold from some direction, with residuals of the features anywhere
     in `feature`, or 0."""
     low, high = (scene.feature[rows] + r for r in ((np.float32(0),) * 2 if feature is None else feature[1:]))
     (weight, bias), *rest = scene.networks["opacity"]
+    width = scene.widths.feature
     with np.errstate(all="ignore"):
         middle, radius = (low + high) / 2, (high - low) / 2
-        value = middle @ weight[:, :FEATURE_DIM].T + bias
-        reach = radius @ np.abs(weight[:, :FEATURE_DIM]).T + np.linalg.norm(weight[:, FEATURE_DIM:], axis=1)
+        value = middle @ weight[:, :width].T + bias
+        reach = radius @ np.abs(weight[:, :width]).T + np.linalg.norm(weight[:, width:], axis=1)
         low, high = value - reach, value + reach
         low, high = _through(rest, low, high)
         code = scene.mask[-1][rows].astype(np.float32)[:, None]

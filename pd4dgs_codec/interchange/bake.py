@@ -127,7 +127,7 @@ def _bake(
     opacities = np.where(finite, opacities, 0)
     colors = np.nan_to_num(g.colors).reshape(count, -1, 3)
     prior = eyes.weigh(player.positions[rows])
-    prior = prior[:, np.searchsorted(rows, slots // player.n_offsets)]
+    prior = prior[:, np.searchsorted(rows, slots // player.slots)]
     prior /= prior.sum(axis=0)
     weights = prior * opacities
     opacity = weights.sum(axis=0)

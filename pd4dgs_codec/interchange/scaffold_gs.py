@@ -24,15 +24,15 @@ from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.tensors import Module, read_tensors
 from pd4dgs_codec.morton import MAX_VOXEL
 from pd4dgs_codec.scene import (
-    FEATURE_DIM,
-    N_OFFSETS,
-    SCAFFOLD_NETWORKS,
+    MAX_FEATURE,
+    MAX_SLOTS,
     SCALING_DIM,
     Camera,
     Network,
     Scene,
     SceneInfo,
     Steps,
+    Widths,
 )
 
 #: Our names of the decoders and theirs.
@@ -67,8 +67,9 @@ def read_scaffold_gs(folder: Path, choices: Choices) -> Scene:
     ply = place / "point_cloud.ply"
     table = _columns(ply)
     decoders, embedding = _decoders(place)
+    widths = Widths(table["feature"].shape[1], table["offset"].shape[1])
     networks = {
-        name: _network(name, decoder, place / f"{DECODERS[name]}.pt", table["feature"].shape[1], embedding, choices)
+        name: _network(name, decoder, place / f"{DECODERS[name]}.pt", widths, embedding, choices)
         for name, decoder in decoders.items()
     }
     anchor = table["anchor"]
@@ -158,10 +159,12 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
     if not (np.abs(anchor) <= LARGEST).all():
         raise DataError(f"{path}: x, y, z hold a NaN or a number over {LARGEST:g}")
     offsets, feature = stack("f_offset_"), stack("f_anchor_feat_")
-    found = (feature.shape[1], offsets.shape[1])
-    if found != (FEATURE_DIM, 3 * N_OFFSETS):
-        what = f"{found[0]} features and {found[1] / 3:g} offsets per anchor"
-        raise DataError(f"{path}: has {what}, expected {FEATURE_DIM} and {N_OFFSETS}, which is all that .pd4 holds")
+    slots, rest = divmod(offsets.shape[1], 3)
+    if rest or slots > MAX_SLOTS or feature.shape[1] > MAX_FEATURE:
+        what = f"{feature.shape[1]} features and {offsets.shape[1]} coordinates of offsets per anchor"
+        raise DataError(
+            f"{path}: has {what}, expected at most {MAX_FEATURE} and {MAX_SLOTS} times 3, as many as .pd4 holds"
+        )
     return {
         "anchor": anchor,
         "feature": feature,
@@ -215,7 +218,7 @@ def _flat(content: Any, prefix: str = "") -> dict[str, Any]:
 
 
 def _network(
-    name: str, decoder: Any, path: Path, features: int, embedding: np.ndarray | None, choices: Choices
+    name: str, decoder: Any, path: Path, widths: Widths, embedding: np.ndarray | None, choices: Choices
 ) -> Network:
     """Two linear layers with a ReLU between them, the embedding of the chosen picture in the first one's bias."""
     _check_activations(name, decoder, path)
@@ -228,21 +231,23 @@ def _network(
     first, second = (
         (tensors[f"{i}.weight"].astype(np.float64), tensors[f"{i}.bias"].astype(np.float64)) for i in (0, 2)
     )
-    outputs, hidden = SCAFFOLD_NETWORKS[name], len(first[0])
+    outputs, hidden = widths.networks[name], len(first[0])
     fits = first[0].ndim == 2 and first[1].shape == (hidden,) and second[0].shape == (outputs, hidden)
     if not fits or second[1].shape != (outputs,):
         shapes = ", ".join(f"{key} {tensors[key].shape}" for key in sorted(tensors))
         raise DataError(f"{path}: found {shapes}; expected two layers with {outputs} outputs")
     if not all(np.isfinite(part).all() for part in (*first, *second)):
         raise DataError(f"{path}: holds a NaN or an infinity; expected finite numbers")
-    inputs, usual = first[0].shape[1], features + 3
+    inputs, usual = first[0].shape[1], widths.inputs
     taken = 0 if embedding is None or name != "color" else embedding.shape[1]
     if inputs == usual + 1 + taken:
         raise DataError(
             f"{path}: takes the distance as well ({inputs} inputs), expected {usual + taken}: features, direction"
         )
     if inputs != usual + taken:
-        raise DataError(f"{path}: takes {inputs} inputs, expected {usual + taken}: {features} features and a direction")
+        raise DataError(
+            f"{path}: takes {inputs} inputs, expected {usual + taken}: {widths.feature} features and a direction"
+        )
     if taken:
         assert embedding is not None
         if choices.appearance is None or not 0 <= choices.appearance < len(embedding):

@@ -10,7 +10,7 @@ from torch import Tensor
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.picture import draw
 from pd4dgs_codec.model.rounding import EXACT, Rounding
-from pd4dgs_codec.scene import N_OFFSETS, Camera
+from pd4dgs_codec.scene import Camera
 
 #: Random pictures of signs per view from which an anchor's weight is estimated.
 PROBES = 2
@@ -41,7 +41,7 @@ def anchor_harm(
     met = torch.zeros(n, dtype=torch.bool, device=device)
     met[g.anchors] = True
     gate = torch.ones(n, device=device, requires_grad=True)
-    shown = gate[torch.div(g.slots, N_OFFSETS, rounding_mode="floor")]
+    shown = gate[torch.div(g.slots, model.widths.slots, rounding_mode="floor")]
     gated = replace(g, scales=g.scales * shown[:, None], opacities=g.opacities * shown)
     image = draw(model.info, gated, camera).image
     for _ in range(PROBES):

@@ -12,7 +12,7 @@ import { decodePositions } from "./positions.js";
 
 /**
  * What one layer with n own rows carries. voxels: [n, 3]. rises: of the earlier rows' mask codes. codes: of the own
- * rows. attributes: [68, n]. planes: per scale six [C, H, W]. weights: weight, bias, weight, bias and so on, network by
+ * rows. attributes: [D + 6 + 3·G, n]. planes: per scale six [C, H, W]. weights: weight, bias, weight, bias and so on, network by
  * network.
  *
  * @typedef {object} LayerSymbols
@@ -50,7 +50,7 @@ export function decodeLayer(payload, kind, before) {
   if (masks) decodeChannels(masks, [earlierRows, rows], codes);
   checkRange(codes.subarray(0, earlierRows), 0, MOST_CODE, "a rise of a mask code");
   checkRange(codes.subarray(earlierRows), LEAST_OWN_CODE, MOST_CODE, "a mask code");
-  const decoded = attributes ? decodeAttributes(attributes, rows) : new Int32Array(0);
+  const decoded = attributes ? decodeAttributes(attributes, rows, kind.widths) : new Int32Array(0);
   checkRange(decoded, -MAX_SYMBOL, MAX_SYMBOL, "a symbol of an attribute");
   return {
     kind,

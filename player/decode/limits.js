@@ -9,6 +9,8 @@ export const MAX_PAYLOAD = 2 ** 31 - 1;
 export const MAX_NESTING = 4;
 /** The format's is 2^24, the least 2^20. */
 export const MAX_ROWS = 2 ** 21;
+export const MAX_FEATURE = 64;
+export const MAX_SLOTS = 16;
 export const MAX_VOXEL = 2 ** 20;
 /** K: the largest coded symbol. */
 export const MAX_CODED = 2 ** 24 - 1;

@@ -4,7 +4,7 @@ import { CHUNK_OVERHEAD, PREAMBLE_SIZE, readChunk, readPreamble } from "./contai
 import { DecodeError, limitExceeded, malformed, unsupported } from "./errors.js";
 import { LAYER_TYPES, readHeader } from "./header.js";
 import { MOST_CODE, decodeLayer, dequantise, transposed } from "./layer.js";
-import { LAYER_KINDS } from "./parameters.js";
+import { layerKind } from "./parameters.js";
 import { PLANES } from "./scene.js";
 import { VoxelTable } from "./voxels.js";
 
@@ -22,9 +22,6 @@ import { VoxelTable } from "./voxels.js";
  * @property {Float32Array[]} planes
  * @property {Float32Array[]} weights
  */
-
-/** Widths of feature, scaling_log and offset. */
-const WIDTHS = [32, 6, 30];
 
 /** Reads a file layer by layer. It keeps no bytes but the header's: every call gets what follows those it consumed. */
 export class LayerReader {
@@ -112,7 +109,7 @@ export class LayerReader {
     let layer = null;
     if (isLayer) {
       try {
-        const symbols = decodeLayer(chunk.payload, LAYER_KINDS[listed.type], this._declared);
+        const symbols = decodeLayer(chunk.payload, layerKind(listed.type, header.widths), this._declared);
         layer = { symbols, tensors: this._accept(symbols) };
         this._declared = symbols.parameters.declared;
       } catch (error) {
@@ -175,8 +172,9 @@ export class LayerReader {
   /** @param {LayerSymbols} symbols @param {import("./header.js").Header} header @returns {LayerTensors} */
   _tensorsOf({ parameters, voxels, attributes, planes, weights }, header) {
     const { rows, steps } = parameters;
+    const { feature: D, slots: G } = header.widths;
     let at = 0;
-    const [feature, scalingLog, offset] = WIDTHS.map((width, i) =>
+    const [feature, scalingLog, offset] = [D, 6, 3 * G].map((width, i) =>
       transposed(attributes.subarray(at, (at += width * rows)), rows, width, header.steps[i]),
     );
     return {

@@ -85,7 +85,7 @@ def test_what_eyes_see_is_what_their_cameras_see(player):
             np.testing.assert_allclose(scales[here], direct.scales[there], atol=1e-5)
             np.testing.assert_allclose(opacities[here], direct.opacities[there], atol=1e-5)
             np.testing.assert_allclose(colors[here], direct.colors[there], atol=1e-5)
-            inside = np.isin(slots // player.n_offsets, direct.slots // player.n_offsets)
+            inside = np.isin(slots // player.slots, direct.slots // player.slots)
             unseen = np.setdiff1d(np.flatnonzero(inside), here)
             np.testing.assert_array_equal(opacities[unseen], 0)
 

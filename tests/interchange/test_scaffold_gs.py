@@ -189,7 +189,11 @@ def test_an_appearance_has_to_be_chosen(tmp_path, cli):
 
 @pytest.mark.parametrize(
     "name, message",
-    [("scale_4", "has no property scale_4"), ("f_anchor_feat_31", "has 31 features and 10 offsets")],
+    [
+        ("scale_4", "has no property scale_4"),
+        ("f_anchor_feat_31", "(35 inputs), expected 34"),
+        ("f_offset_29", "29 coordinates of offsets"),
+    ],
 )
 def test_plys_with_missing_fields(tmp_path, cli, name, message):
     Checkpoint().write(tmp_path / "run", omit=name)

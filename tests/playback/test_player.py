@@ -18,7 +18,7 @@ from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.playback.networks import Layers
 from pd4dgs_codec.playback.player import Player
-from pd4dgs_codec.scene import Camera, Deformation, Scene
+from pd4dgs_codec.scene import Camera, Deformation, Scene, Widths
 
 ROOT = Path(__file__).parents[2]
 K = np.array([[40, 0, 24], [0, 40, 18], [0, 0, 1]], np.float32)
@@ -42,7 +42,9 @@ def _scene(**changes: object) -> Scene:
 
 
 @pytest.mark.parametrize(
-    "changes", [{}, {"hidden": (16, 8)}, {"channels": 5, "width": 7}], ids=["usual", "deep", "odd"]
+    "changes",
+    [{}, {"hidden": (16, 8)}, {"channels": 5, "width": 7}, {"widths": Widths(16, 4)}, {"widths": Widths(3, 13)}],
+    ids=["usual", "deep", "odd", "narrow", "odd widths"],
 )
 def test_pictures_are_those_of_the_torch_model(changes):
     scene = _scene(**changes)

@@ -109,7 +109,7 @@ def declared(data: bytes) -> int:
             kind = BY_CHUNK_TYPE.get(kind_number)
             if kind is not None:
                 payload = read_chunk(data, offset, length=length).payload
-                *_, total = read_meta(payload, kind, total, header.raw_deformation)
+                *_, total = read_meta(payload, kind, header.widths, total, header.raw_deformation)
             offset += CHUNK_OVERHEAD + length
     except DecodeError:
         pass
