@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from pd4dgs_codec.codec.stream import open_stream
-from pd4dgs_codec.delivery.prefix import LONGEST_HEADER, layer_ends
+from pd4dgs_codec.delivery.prefix import HEADER_GUESS, LONGEST_HEADER, layer_ends
 from pd4dgs_codec.delivery.transfer import Changed, OutOfTime, Transfer
 from pd4dgs_codec.errors import BadSignature, DecodeError, UnsupportedVersion
 from pd4dgs_codec.scene import Scene
@@ -131,7 +131,7 @@ class SceneClient:
             while ready := self._ready(budget):  # until empty: a fault behind a layer shows at the next feed
                 yield from ready
             left = until - time.monotonic()
-            end: int | None = LONGEST_HEADER
+            end: int | None = HEADER_GUESS if len(self.transfer.data) < HEADER_GUESS else LONGEST_HEADER
             reach = None
             if self._layers:
                 end = next_end(self._layers, len(self.transfer.data), budget, left, self._meter.rate)
