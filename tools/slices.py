@@ -185,9 +185,9 @@ def render(rows: Sequence[Row]) -> str:
         *paragraph(
             f"Slices of {rows[0]['size']:,} bytes. `pd4dgs-encode --slices` orders the anchors of each layer by what "
             f"{VIEWS} training views show; dB are mPSNR on the views held out. *random*: the first slice with anchors "
-            "in random order. *layer 0*: the first picture of a file with one slice per layer. *time ratio*: the median, "
-            f"over qualities {STEP} dB apart from {LEAST:g} dB up, of the time to that quality on a link of constant "
-            "rate, relative to that file."
+            "in random order. *layer 0*: the first picture of a file with one slice per layer. *time ratio*: the "
+            f"median, over qualities {STEP} dB apart from {LEAST:g} dB up, of the time to that quality on a link of "
+            "constant rate, relative to that file."
         ),
         "",
         markdown(heads, first),

@@ -137,7 +137,7 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
     if trained and args.json:  # shown nowhere else, and it takes its time
         _add_train_rate(result, packed, options)
     write_bytes(args.output, packed.data, args.overwrite)
-    console.result(result, _text(result, 8 * packed.report.added_bytes()[0] / FIRST_FRAME_RATE), on_stdout=False)
+    console.result(result, _text(result, 8 * packed.report.first_bytes / FIRST_FRAME_RATE), on_stdout=False)
     return OK
 
 

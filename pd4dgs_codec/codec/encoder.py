@@ -92,6 +92,11 @@ class Report:
         header = self.bytes - sum(row.bytes for row in self.layers) - self.metadata_bytes
         return {row.layer: row.bytes + (header if row.layer == 0 else 0) for row in self.layers}
 
+    @property
+    def first_bytes(self) -> int:
+        """What the first picture takes: the header and the first slice."""
+        return self.added_bytes()[0] - sum(part.bytes for part in self.layers[0].slices[1:])
+
     def json(self) -> dict[str, Any]:
         """The report as plain dicts, lists, strings and numbers."""
         return asdict(self)

@@ -81,6 +81,12 @@ def test_every_prefix_of_slices_is_a_scene_by_every_door():
         assert prefix.level == chunks[count - 1][0]
         for first, last in zip((0, *prefix.rows[:-1]), prefix.rows, strict=True):
             np.testing.assert_array_equal(morton_order(prefix.anchor_q[first:last]), np.arange(last - first))
+        for extra in (0, 1):
+            assert_same_scene(prefix, decode(sliced() + b"x", max_bytes=end + extra))
+        with pytest.raises(DecodeError):
+            decode(sliced()[: end - 1], max_bytes=end)
+    with pytest.raises(Truncated, match=f"{ends[0] - 1} bytes end before the first slice"):
+        decode(sliced(), max_bytes=ends[0] - 1)
     for level in (0, 1):
         assert_same_scene(decode(sliced(), max_layer=level), decode(one_slice(), max_layer=level))
 
@@ -164,3 +170,18 @@ def test_slices_that_cannot_be_are_refused(monkeypatch):
 def test_flags_number_as_many_slices_as_a_file_may_have_chunks():
     assert slice_flags(MAX_CHUNKS - 1, MAX_CHUNKS) < 1 << 16
     assert CHUNKS == 1
+
+
+def test_every_prefix_renders_finite_pictures():
+    from pd4dgs_codec.model.convert import from_scene
+    from pd4dgs_codec.model.picture import render_image
+    from pd4dgs_codec.scene import Camera
+
+    viewmat = np.eye(4, dtype=np.float32)
+    viewmat[2, 3] = 3.0
+    camera = Camera(viewmat, np.array([[20, 0, 12], [0, 20, 8], [0, 0, 1]], np.float32), 24, 16)
+    pictures = []
+    for prefix in open_stream().feed(sliced()):
+        pictures.append(render_image(from_scene(prefix), prefix.level, 0.3, camera))
+        assert np.isfinite(pictures[-1]).all()
+    assert (pictures[0] != pictures[-1]).any()
