@@ -3,6 +3,7 @@
     data = encode(scene)                    # scene.Scene -> bytes of a .pd4 file
     scene = decode(data, max_layer=1)       # a prefix of its layers
     stream = open_stream()                  # stream.feed(bytes) -> one Scene per completed layer
+    show(scene)                             # in a notebook: the player
 
 Importing the package loads none of its modules; each name below loads what it needs at first use.
 """
@@ -17,15 +18,17 @@ if TYPE_CHECKING:
     from pd4dgs_codec.codec.encoder import encode
     from pd4dgs_codec.codec.info import FORMAT_VERSION
     from pd4dgs_codec.codec.stream import open_stream
+    from pd4dgs_codec.delivery.page import show
 
 __version__ = "0.1.0"
-__all__ = ["FORMAT_VERSION", "decode", "encode", "open_stream"]
+__all__ = ["FORMAT_VERSION", "decode", "encode", "open_stream", "show"]
 
 _HOMES = {
     "FORMAT_VERSION": "pd4dgs_codec.codec.info",
     "decode": "pd4dgs_codec.codec.decoder",
     "encode": "pd4dgs_codec.codec.encoder",
     "open_stream": "pd4dgs_codec.codec.stream",
+    "show": "pd4dgs_codec.delivery.page",
 }
 
 

@@ -12,9 +12,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-FEATURE_DIM = 32
 SCALING_DIM = 6
-N_OFFSETS = 10
+
+#: Limits of `Widths`: a feature twice as wide as Scaffold-GS has it.
+MAX_FEATURE, MAX_SLOTS = 64, 16
 
 #: Plane (a, b) of a HexPlane has shape [C, reso[b], reso[a]]; axes x, y, z, t = 0, 1, 2, 3.
 PLANES: tuple[tuple[str, int, int], ...] = (
@@ -31,8 +32,12 @@ MASK_STEP = np.float32(1.0 / 255.0)
 MASK_THRESHOLD = 0.01
 MASK_MIN_CODE = 3
 
-#: Residual heads each deformation may have, with their output width.
-GLOBAL_HEADS: dict[str, int] = {"position": 3, "feature": FEATURE_DIM, "offset": 3 * N_OFFSETS, "scaling": SCALING_DIM}
+#: Attributes of an anchor, in coding order: fields of Scene and of Steps.
+ATTRIBUTES = ("feature", "scaling_log", "offset")
+#: The decoders of the scaffold, and the residual heads that the global deformation may have; widths in `Widths`.
+SCAFFOLD_NETWORKS = ("opacity", "covariance", "color")
+GLOBAL_HEADS = ("position", "feature", "offset", "scaling")
+#: Residual heads that the local deformation may have, with their output width.
 LOCAL_HEADS: dict[str, int] = {"mean": 3, "scale": 3, "quat": 4, "opacity": 1, "color": 3}
 
 #: Heads whose output is a length, in units of `deformation_unit`; the others add to what they name as they are.
@@ -48,8 +53,48 @@ def deformation_unit(box: np.ndarray) -> np.float32:
     return unit
 
 
-#: The decoders of the scaffold (input [feature 32, view direction 3]) with their output width.
-SCAFFOLD_NETWORKS: dict[str, int] = {"opacity": N_OFFSETS, "covariance": 7 * N_OFFSETS, "color": 3 * N_OFFSETS}
+@dataclass(frozen=True)
+class Widths:
+    """What an anchor holds: `feature` numbers D for the networks, and `slots` G, the Gaussians that it spawns. Every
+    other width of a scene's anchors and of the networks at them follows from these two."""
+
+    feature: int = 32
+    slots: int = 10
+
+    @property
+    def attributes(self) -> dict[str, tuple[int, ...]]:
+        """By name, in coding order, the shape of one anchor's value."""
+        return dict(zip(ATTRIBUTES, ((self.feature,), (SCALING_DIM,), (self.slots, 3)), strict=True))
+
+    @property
+    def predicted(self) -> int:
+        """Scalars of an anchor before its offsets."""
+        return self.feature + SCALING_DIM
+
+    @property
+    def channels(self) -> int:
+        """Scalars of an anchor."""
+        return self.predicted + 3 * self.slots
+
+    @property
+    def inputs(self) -> int:
+        """Of the scaffold's decoders: the feature and the view direction."""
+        return self.feature + 3
+
+    @property
+    def networks(self) -> dict[str, int]:
+        """The scaffold's decoders with their outputs."""
+        return dict(zip(SCAFFOLD_NETWORKS, (self.slots, 7 * self.slots, 3 * self.slots), strict=True))
+
+    @property
+    def global_heads(self) -> dict[str, int]:
+        """GLOBAL_HEADS with their outputs."""
+        return dict(zip(GLOBAL_HEADS, (3, self.feature, 3 * self.slots, SCALING_DIM), strict=True))
+
+
+#: Those of Scaffold-GS.
+DEFAULT_WIDTHS = Widths()
+
 
 #: Name of the network, in each deformation, that turns plane features into what the heads read.
 TRUNK = "trunk"
@@ -141,8 +186,8 @@ class Scene:
     layers: ascending layer numbers present, starting with 0, e.g. (0,), (0, 1), (0, 2), (0, 1, 2).
     rows: rows[i] = number of anchors in the prefix that ends with layers[i].
     anchor_q: int32 [N, 3] voxel indices; position = anchor_q * voxel_size, world, scene units.
-    feature: float32 [N, 32]. scaling_log: float32 [N, 6], natural log of scene units (0..2 spread of the offsets,
-    3..5 base scale). offset: float32 [N, 10, 3], in units of exp(scaling_log[:3]).
+    feature: float32 [N, D]. scaling_log: float32 [N, 6], natural log of scene units (0..2 spread of the offsets,
+    3..5 base scale). offset: float32 [N, G, 3], in units of exp(scaling_log[:3]).
     mask: per present layer i, uint8 [rows[i]] codes (see MASK_STEP), non-decreasing from layer to layer.
     networks: "opacity", "covariance", "color". local_deformation belongs to layer 2, global_deformation to layer 1;
     either may be None (left out).
@@ -160,6 +205,11 @@ class Scene:
     networks: dict[str, Network]
     global_deformation: Deformation | None = None
     local_deformation: Deformation | None = None
+
+    @property
+    def widths(self) -> Widths:
+        """D and G, as its arrays have them."""
+        return Widths(self.feature.shape[1], self.offset.shape[1])
 
     @property
     def level(self) -> int:

@@ -26,12 +26,6 @@ MAX_ENTRIES = 1 << 21
 VARINT_MAX = (1 << 35) - 1  # clause 7.1: five bytes of seven bits
 TOTAL = 1 << 24
 PLANES = (("xy", 0, 1), ("xz", 0, 2), ("xt", 0, 3), ("yz", 1, 2), ("yt", 1, 3), ("zt", 2, 3))
-ATTRIBUTES = (("feature", 32), ("scaling_log", 6), ("offset", 30))
-NETWORKS = (  # clause 6.3: per layer the outputs by id, None for any
-    {0: 10, 1: 70, 2: 30},
-    {0: None, 1: 3, 2: 32, 3: 30, 4: 6},
-    {0: None, 1: 3, 2: 3, 3: 4, 4: 1, 5: 3},
-)
 POSITIONS, MASKS, ATTRIBUTE_SECTION, PLANE_SECTION, WEIGHTS, SYMBOLS, FLOATS = range(7)
 
 
@@ -252,7 +246,7 @@ def read_preamble(data):
 # 5.2 Chunk list: "In mode lzma each occurs at most once."
 # 5.5 Digest: "The first 16 bytes of the SHA-256 of the payloads of all critical chunks that were encoded together"
 def read_header(data):
-    header = fields(unpack(data), range(1, 15), (*range(1, 12), 13, 14), "header")
+    header = fields(unpack(data), range(1, 16), (*range(1, 12), 13, 14, 15), "header")
     steps, box, (start, end), background, (near, far), _ = (
         reals(header[key], f"header key {key}", count)
         for key, count in ((4, 3), (6, 6), (7, 2), (8, 3), (9, 2), (10, 3))
@@ -269,12 +263,32 @@ def read_header(data):
         read_camera(header[12])
     read_error_bounds(header[13])
     need(type(header[14]) is bytes and len(header[14]) == 16, "the digest of the layers is not 16 bytes")
+    for value, most in zip(a_list(header[15], "the widths", 2), (64, 16)):
+        limited(value, most, "a width", 1)
     read_chunk_list(header[1])
     for key in (2, 3):
         registered(header[key], (0, 1), f"header key {key}")
     layers = [kind for kind, _ in header[1] if kind < 3]
     need(header[2] == 0 or len(layers) == len(set(layers)), "a layer in several slices in mode lzma")
     return header
+
+
+# 5.1 Header map: "feature width D, 1..64, and slots G, 1..16"
+# 11.2 Attributes: "The D + 6 + 3·G channels are the scalars of an anchor: feature 0 .. D − 1, scaling_log 0..5,
+# offset 0 .. 3·G − 1."
+def attribute_channels(header):
+    feature, slots = header[15]
+    return {"feature": feature, "scaling_log": 6, "offset": 3 * slots}
+
+
+# 6.3 Planes and networks: the outputs by id, None for any
+def network_outputs(number, header):
+    feature, slots = header[15]
+    return (
+        {0: slots, 1: 7 * slots, 2: 3 * slots},
+        {0: None, 1: 3, 2: feature, 3: 3 * slots, 4: 6},
+        {0: None, 1: 3, 2: 3, 3: 4, 4: 1, 5: 3},
+    )[number]
 
 
 # 5.3 Camera map: "fx and fy MUST be positive" "All four are required."
@@ -398,7 +412,7 @@ def read_parameters(layer, value):
     found = {3, 4, 5} & set(parameters)
     wanted = [set()] if layer.later else [{3, 4, 5}, set()] if layer.number else [{3, 5}]
     need(found in wanted, f"layer {layer.number} with keys {found}")
-    layer.networks = read_networks(layer.number, parameters[5]) if 5 in parameters else {}
+    layer.networks = read_networks(layer.number, layer.header, parameters[5]) if 5 in parameters else {}
     layer.deformed = bool(layer.networks) and layer.number > 0
     layer.raw = layer.deformed and layer.header[3] == 1
     steps = reals(parameters[3], "steps", 1 + layer.deformed) if layer.networks else []
@@ -431,16 +445,16 @@ def read_scales(layer, rows):
 
 # 6.3 Planes and networks: "Ids ascend." "The last width MUST be the number of outputs in this table." "Layer 0 has all
 # three networks. A deformation has its trunk and at least one head."
-def read_networks(number, rows):
-    networks, last = {}, -1
+def read_networks(number, header, rows):
+    networks, last, known = {}, -1, network_outputs(number, header)
     for row in a_list(rows, "networks"):
         need(a_list(row, "a network"), "an empty network")
-        key = registered(row[0], NETWORKS[number], "a network's id")
+        key = registered(row[0], known, "a network's id")
         need(key > last, f"network {key} after {last}")
         limited(len(row) - 1, 16, "linear layers", 1)
         for width in row[1:]:
             limited(width, 4096, "a network's width", 1)
-        need(NETWORKS[number][key] in (None, row[-1]), f"network {key} with {row[-1]} outputs")
+        need(known[key] in (None, row[-1]), f"network {key} with {row[-1]} outputs")
         networks[key], last = row[1:], key
     if number == 0:
         need(len(networks) == 3, f"networks {list(networks)} in layer 0")
@@ -463,9 +477,11 @@ def plane_shapes(layer):
 # 6.3 Planes and networks: "Linear layer i is a weight [o_i, o_{i−1}] and a bias [o_i]; o_0 is the network's input
 # width."
 def weight_shapes(layer):
-    shapes = []
+    shapes, feature = [], layer.header[15][0]
     for key, widths in layer.networks.items():
-        width = 35 if layer.number == 0 else layer.networks[0][-1] if key else sum(s[0] for s in layer.scales)
+        width = sum(s[0] for s in layer.scales) if layer.number else feature + 3
+        if layer.number and key:
+            width = layer.networks[0][-1]
         for i, outputs in enumerate(widths):
             shapes += [(f"network.{key}.weight.{i}", outputs * width), (f"network.{key}.bias.{i}", outputs)]
             width = outputs
@@ -478,7 +494,8 @@ def check_sizes(layer, payload_bytes, before):
     """before: N, S and L of the slices before it. Sets those with it."""
     samples = sum(c * h * w for _, _, (c, h, w) in plane_shapes(layer))
     need(samples <= 1 << 28, f"{samples} plane samples", "LimitExceeded")
-    symbols = layer.rises + 72 * layer.rows + samples + sum(size for _, size in weight_shapes(layer))
+    row = sum(attribute_channels(layer.header).values()) + 4
+    symbols = layer.rises + row * layer.rows + samples + sum(size for _, size in weight_shapes(layer))
     layer.declared = [a + b for a, b in zip(before, (layer.rows, symbols, payload_bytes))]
     rows, symbols, size = layer.declared
     need(rows <= (1 << 13) + 2 * size, f"{rows} rows", "LimitExceeded")
@@ -493,7 +510,8 @@ def read_sections(layer, parts):
         return parts.pop(section, b"") if count else b""
 
     planes, weights, past = plane_shapes(layer), weight_shapes(layer), layer.past
-    counts = {MASKS: [layer.rises, layer.rows], ATTRIBUTE_SECTION: [layer.rows] * 68}
+    counts = {MASKS: [layer.rises, layer.rows], ATTRIBUTE_SECTION: []}
+    counts[ATTRIBUTE_SECTION] = [layer.rows] * sum(attribute_channels(layer.header).values())
     counts[PLANE_SECTION] = [] if layer.raw else [h * w for _, _, (c, h, w) in planes for _ in range(c)]
     counts[WEIGHTS] = [] if layer.raw else [size for _, size in weights]
     positions = decode_positions(part(POSITIONS, layer.rows), layer.rows, past.of(POSITIONS))
@@ -507,7 +525,7 @@ def read_sections(layer, parts):
         for section, sizes in counts.items():
             data = part(section, sum(sizes))
             if section == ATTRIBUTE_SECTION and sum(sizes):
-                channels[section] = decode_attributes(data, layer.rows, past)
+                channels[section] = decode_attributes(data, *layer.header[15], layer.rows, past)
             elif section == PLANE_SECTION and sizes:
                 channels[section] = decode_planes(data, [shape for _, _, shape in planes])
             else:
@@ -530,7 +548,7 @@ def keep_symbols(layer, positions, channels, planes, weights):
     need(all(v >= 3 for v in own), "a mask code under 3")
     layer.symbols = {"anchor": [v for cell in positions for v in cell], "mask_rise": rise, "mask_own": own}
     first = 0
-    for name, width in ATTRIBUTES:  # [width, n], channel by channel
+    for name, width in attribute_channels(layer.header).items():  # [width, n], channel by channel
         layer.symbols[name] = [k for channel in channels[ATTRIBUTE_SECTION][first : first + width] for k in channel]
         first += width
     if not layer.raw:
@@ -776,25 +794,27 @@ def take_channel(stream, count, prior, exceptions):
 # latest slice of form 1 before; Malformed if the layer has none"
 # 8.7 Stages of the attributes: "The activity of a row is the relative magnitude (8.9) of the residuals named, the
 # places being the n rows." "In form 2 places, sums and bounds are those of the slice that the block stands in"
-def decode_attributes(data, n, past):
-    reader = Reader(data)
+# 8.7 Stages of the attributes: "The bounds are b_s = (P·a_s) // 38, a_1 .. a_5 being 6, 12, 20, 29 and 38"
+def decode_attributes(data, feature, slots, n, past):
+    reader, p = Reader(data), feature + 6
     form = read_form(reader, 3)
     if form == 0:
-        return decode_channels(reader.take(reader.left), [n] * 68, past.of(ATTRIBUTE_SECTION))
+        return decode_channels(reader.take(reader.left), [n] * (p + 3 * slots), past.of(ATTRIBUTE_SECTION))
     if form == 1:
-        past.block = read_block(reader)
+        past.block = read_block(reader, p, slots)
     need(past.block, "no slice before has a prediction block")
     terms, class_counts, splits, scales = past.block
     *stages, stage_y, stage_z = take_stages(reader, 8)
     known = [past.of(ATTRIBUTE_SECTION, stage) for stage in range(8)]
-    k = []  # r_0 .. r_37, then x_0 .. x_9
-    for s, (stage, end, class_count) in enumerate(zip(stages, (6, 12, 20, 29, 38, 48), [1, *class_counts])):
+    k = []  # r_0 .. r_(P − 1), then x_0 .. x_(G − 1)
+    ends = [p * a // 38 for a in (6, 12, 20, 29, 38)] + [p + slots]
+    for s, (stage, end, class_count) in enumerate(zip(stages, ends, [1, *class_counts])):
         if s not in scales:  # the slice that the block stands in
             scales[s] = n, channel_sums(k), class_bounds(relative_magnitude(k, n), class_count)
         places, sums, bounds = scales[s]
         classes = classes_within(bounds, relative_magnitude(k, n, places, sums))
         k += decode_classes(stage, [classes] * (end - len(k)), class_count, known[s])
-    residuals, x = k[:38], k[38:]
+    residuals, x = k[:p], k[p:]
     y = decode_classes(stage_y, [y_classes(split, *own) for split, *own in zip(splits, x)], 5, known[6])
     z = decode_classes(stage_z, [z_classes(split, *own) for split, *own in zip(splits, x, y)], 7, known[7])
     return add_predictions(residuals, terms) + [channel for offset in zip(x, y, z) for channel in offset]
@@ -809,21 +829,21 @@ def read_form(reader, forms=2):
 
 
 # 8.6 Prediction block: "The block holds, without gaps"
-def read_block(reader):
+def read_block(reader, p, slots):
     """(terms, class counts, splits, what the classes of each stage are measured by, empty)."""
-    terms = [read_terms(reader, c) for c in range(1, 38)]
+    terms = [read_terms(reader, p, c) for c in range(1, p)]
     class_counts = [read_class_count(reader) for _ in range(5)]
-    return terms, class_counts, [read_split(reader) for _ in range(10)], {}
+    return terms, class_counts, [read_split(reader) for _ in range(slots)], {}
 
 
-# 8.6 Prediction block: "a varint m ≤ c, then m times a varint g ≤ 38 and a zigzag weight w, |w| ≤ 2^15. The term
+# 8.6 Prediction block: "a varint m ≤ c, then m times a varint g ≤ P and a zigzag weight w, |w| ≤ 2^15. The term
 # refers to channel j = j' + 1 + g, where j' is the channel of the term before, −1 for the first; so the j ascend. j
 # MUST be less than c, else Malformed"
-def read_terms(reader, c):
+def read_terms(reader, p, c):
     """[(channel, weight)] of channel c."""
     terms, j = [], -1
     for _ in range(reader.varint(c)):
-        j += 1 + reader.varint(38)
+        j += 1 + reader.varint(p)
         need(j < c, f"channel {c} is predicted from channel {j}")
         terms.append((j, reader.zigzag(1 << 15)))
     return terms
@@ -1259,9 +1279,10 @@ def dequantise(symbols, step):
 # 11.5 Dequantisation: "An anchor's position is dequantised from its voxel index with the voxel size as Q." "Values of
 # section 6 are taken as they are."
 def dequantise_layer(layer):
-    steps = dict(zip([name for name, _ in ATTRIBUTES], layer.header[4])) | {"anchor": layer.header[5]}
+    attributes = attribute_channels(layer.header)
+    steps = dict(zip(attributes, layer.header[4])) | {"anchor": layer.header[5]}
     for name, symbols in layer.symbols.items():
-        if name in dict(ATTRIBUTES):  # [width, n] -> [n, width]
+        if name in attributes:  # [width, n] -> [n, width]
             symbols = [k for row in range(layer.rows) for k in symbols[row :: layer.rows]]
         if not name.startswith("mask"):
             step = steps.get(name) or layer.steps[0 if name.startswith("planes") else -1]
@@ -1276,7 +1297,7 @@ def add_slice(layer, part):
     cells = [cell for own in (layer, part) for cell in zip(*[iter(own.symbols["anchor"])] * 3)]
     low = [min((cell[axis] for cell in cells), default=0) for axis in range(3)]
     order = sorted(range(len(cells)), key=lambda row: morton_code([v - m for v, m in zip(cells[row], low)]))
-    for name, width in (("mask_own", 1), *ATTRIBUTES):
+    for name, width in (("mask_own", 1), *attribute_channels(layer.header).items()):
         channels = []
         for c in range(width):
             both = [k for own in (layer, part) for k in own.symbols[name][c * own.rows : (c + 1) * own.rows]]

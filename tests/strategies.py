@@ -14,19 +14,16 @@ from hypothesis import strategies as st
 from pd4dgs_codec import encode
 from pd4dgs_codec.attributes.quantise import dequantise
 from pd4dgs_codec.scene import (
-    FEATURE_DIM,
-    GLOBAL_HEADS,
+    DEFAULT_WIDTHS,
     LOCAL_HEADS,
-    N_OFFSETS,
     PLANES,
-    SCAFFOLD_NETWORKS,
-    SCALING_DIM,
     Camera,
     Deformation,
     Network,
     Scene,
     SceneInfo,
     Steps,
+    Widths,
 )
 
 HUGE = 1 << 23
@@ -97,7 +94,8 @@ def make_scene(
     layers: tuple[int, ...] = (0, 1, 2),
     anchors: int = 6,
     kind: str = "small",
-    heads: tuple[dict[str, int], dict[str, int]] = (GLOBAL_HEADS, LOCAL_HEADS),
+    heads: tuple[dict[str, int] | None, dict[str, int]] = (None, LOCAL_HEADS),
+    widths: Widths = DEFAULT_WIDTHS,
     with_camera: bool = True,
     extent: int = 8,
     hidden: tuple[int, ...] = (4,),
@@ -105,9 +103,11 @@ def make_scene(
 ) -> Scene:
     """An unplanned scene: every anchor in every layer's prefix, in random order, some of them inactive.
 
+    heads: with their outputs; None stands for all global ones.
     Steps are powers of two, so that even the largest symbols come back from their float32 values.
     """
     rng = np.random.default_rng(seed)
+    heads = (widths.global_heads if heads[0] is None else heads[0], heads[1])
     steps = Steps(0.0625, 0.03125, 0.125, 0.25, 0.5, 0.0078125, 0.015625, 0.0078125)
     cells = np.unique(rng.integers(-extent, extent + 1, (anchors, 3), dtype=np.int32), axis=0)
     cells = rng.permutation(cells)
@@ -119,13 +119,14 @@ def make_scene(
         layers=layers,
         rows=(n,) * len(layers),
         anchor_q=cells,
-        feature=dequantise(symbols(rng, (n, FEATURE_DIM), kind), steps.feature),
-        scaling_log=dequantise(symbols(rng, (n, SCALING_DIM), kind), steps.scaling_log),
-        offset=dequantise(symbols(rng, (n, N_OFFSETS, 3), kind), steps.offset),
+        **{
+            name: dequantise(symbols(rng, (n, *shape), kind), steps.attributes[name])
+            for name, shape in widths.attributes.items()
+        },
         mask=tuple(codes.T.copy()),
         networks={
-            name: network(rng, (FEATURE_DIM + 3, *hidden, outputs), steps.weights_scaffold, kind)
-            for name, outputs in SCAFFOLD_NETWORKS.items()
+            name: network(rng, (widths.inputs, *hidden, outputs), steps.weights_scaffold, kind)
+            for name, outputs in widths.networks.items()
         },
         global_deformation=deformation(
             rng, heads[0], (steps.planes_global, steps.weights_global), kind=kind, **deformation_options
@@ -158,12 +159,14 @@ def scenes(draw: st.DrawFn) -> Scene:
     Fitting priors to a channel over the whole range takes some 20 ms, so those scenes have at most one anchor.
     """
     kind = draw(st.sampled_from(RANGES))
+    widths = draw(st.sampled_from((Widths(), Widths(1, 1), Widths(5, 2), Widths(64, 16))))
     return make_scene(
         draw(st.integers(0, 2**32 - 1)),
         layers=draw(st.sampled_from(LAYER_SETS)),
         anchors=draw(st.sampled_from((0, 1) if kind == "huge" else (0, 1, 2, 5, 40))),
         kind=kind,
-        heads=(draw(_subset(GLOBAL_HEADS)), draw(_subset(LOCAL_HEADS))),
+        heads=(draw(_subset(widths.global_heads)), draw(_subset(LOCAL_HEADS))),
+        widths=widths,
         with_camera=draw(st.booleans()),
         extent=draw(st.sampled_from((1, 30, 1 << 19))),
         hidden=draw(st.sampled_from(((), (1,), (5, 2)))),

@@ -16,18 +16,18 @@ from pd4dgs_codec.scene import (
     GLOBAL_HEADS,
     LOCAL_HEADS,
     PLANES,
-    SCAFFOLD_NETWORKS,
     Camera,
     Deformation,
     Network,
     Scene,
     SceneInfo,
     Steps,
+    Widths,
 )
 
 #: The preset `tiny` with few anchors and cells.
 TINY = ModelConfig(
-    DeformationConfig(4, 4, 4, (1,), 8, tuple(GLOBAL_HEADS)),
+    DeformationConfig(4, 4, 4, (1,), 8, GLOBAL_HEADS),
     DeformationConfig(4, 4, 4, (1,), 8, tuple(LOCAL_HEADS)),
     hidden=8,
     initial_anchors=300,
@@ -111,8 +111,8 @@ def trained_like_scene() -> Scene:
         scaling_log=rng.normal(-2.5, 0.3, (n, 6)).astype(np.float32),
         offset=rng.normal(0, 0.5, (n, 10, 3)).astype(np.float32),
         mask=tuple(np.full(r, 200, np.uint8) for r in rows),
-        networks={name: _network(rng, 35, 16, width) for name, width in SCAFFOLD_NETWORKS.items()},
-        global_deformation=_deformation(rng, GLOBAL_HEADS),
+        networks={name: _network(rng, 35, 16, width) for name, width in Widths().networks.items()},
+        global_deformation=_deformation(rng, Widths().global_heads),
         local_deformation=_deformation(rng, LOCAL_HEADS),
     )
 

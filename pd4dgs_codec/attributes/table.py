@@ -1,57 +1,34 @@
-"""The table of per-anchor attributes. Adding an attribute is adding a row here (and a row in the specification)."""
+"""The attributes of anchors <-> symbols, channel-major: one channel per scalar, in the order of `Widths.attributes`."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterator
-from dataclasses import dataclass
 
 import numpy as np
 
 from pd4dgs_codec.attributes.quantise import dequantise, quantise
-from pd4dgs_codec.scene import FEATURE_DIM, N_OFFSETS, SCALING_DIM
+from pd4dgs_codec.scene import ATTRIBUTES, Widths
 
 
-@dataclass(frozen=True)
-class Attribute:
-    """One attribute: `name` is the field of Scene and of Steps, `shape` the shape of one anchor's value."""
-
-    name: str
-    shape: tuple[int, ...]
-
-    @property
-    def width(self) -> int:
-        """Number of channels: scalars per anchor."""
-        return math.prod(self.shape)
-
-
-#: In coding order; the channels of an anchor are these attributes' scalars, last axis fastest.
-ATTRIBUTES: tuple[Attribute, ...] = (
-    Attribute("feature", (FEATURE_DIM,)),
-    Attribute("scaling_log", (SCALING_DIM,)),
-    Attribute("offset", (N_OFFSETS, 3)),
-)
-
-N_CHANNELS = sum(a.width for a in ATTRIBUTES)
-
-
-def attribute_rows(symbols: np.ndarray) -> Iterator[tuple[Attribute, np.ndarray]]:
-    """(attribute, its rows [width, n]) of channel-major symbols [N_CHANNELS, n]."""
+def attribute_rows(symbols: np.ndarray, widths: Widths) -> Iterator[tuple[str, np.ndarray]]:
+    """(name, its rows [scalars, n]) of channel-major symbols [widths.channels, n]."""
     first = 0
-    for a in ATTRIBUTES:
-        yield a, symbols[first : first + a.width]
-        first += a.width
+    for name, shape in widths.attributes.items():
+        last = first + math.prod(shape)
+        yield name, symbols[first:last]
+        first = last
 
 
 def quantise_attributes(values: dict[str, np.ndarray], steps: dict[str, float]) -> np.ndarray:
-    """int32 [N_CHANNELS, n] symbols, channel-major, of float32 [n, *shape] per attribute name."""
-    columns = [quantise(values[a.name].reshape(-1, a.width), steps[a.name], a.name).T for a in ATTRIBUTES]
-    return np.ascontiguousarray(np.concatenate(columns))
+    """int32 [channels, n] symbols, channel-major, of float32 [n, *shape] per attribute name."""
+    flat = [(name, values[name].reshape(len(values[name]), math.prod(values[name].shape[1:]))) for name in ATTRIBUTES]
+    return np.ascontiguousarray(np.concatenate([quantise(x, steps[name], name).T for name, x in flat]))
 
 
-def dequantise_attributes(symbols: np.ndarray, steps: dict[str, float]) -> dict[str, np.ndarray]:
+def dequantise_attributes(symbols: np.ndarray, widths: Widths, steps: dict[str, float]) -> dict[str, np.ndarray]:
     """The inverse of quantise_attributes: float32 [n, *shape] per attribute name, C-contiguous."""
     return {
-        a.name: dequantise(np.ascontiguousarray(rows.T), steps[a.name]).reshape(-1, *a.shape)
-        for a, rows in attribute_rows(symbols)
+        name: dequantise(np.ascontiguousarray(rows.T), steps[name]).reshape(-1, *widths.attributes[name])
+        for name, rows in attribute_rows(symbols, widths)
     }

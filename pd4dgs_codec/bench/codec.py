@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.attributes.table import ATTRIBUTES
 from pd4dgs_codec.bench.report import Panel, markdown, pareto_front
 from pd4dgs_codec.bench.timing import Cold, Timing, cold, measure
 from pd4dgs_codec.codec.decoder import decode
@@ -25,7 +24,7 @@ from pd4dgs_codec.codec.kinds import LAYER_KINDS
 from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.codec.symbols import float_tensors
 from pd4dgs_codec.metrics.image import mssim
-from pd4dgs_codec.scene import MASK_STEP, Scene
+from pd4dgs_codec.scene import ATTRIBUTES, MASK_STEP, Scene
 from pd4dgs_codec.view.frames import Frame
 from pd4dgs_codec.view.levels import Level, load_levels
 
@@ -164,7 +163,7 @@ def deviations(given: Scene, decoded: Scene) -> list[Deviation]:
     for index, layer in enumerate(given.layers):
         kind = LAYER_KINDS[layer]
         before, after = float_tensors(given, index), float_tensors(decoded, index)
-        names = ["anchor", *(a.name for a in ATTRIBUTES)]
+        names = ["anchor", *ATTRIBUTES]
         names += [str(kind.planes_step) if x.ndim == 3 else kind.weights_step for x in before[len(names) :]]
         for name, x, y in zip(names, before, after, strict=True):
             errors.setdefault(name, []).append(np.abs(x.astype(np.float64) - y))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import io
 import math
 from collections.abc import Sequence
 from dataclasses import replace
@@ -21,7 +20,7 @@ from pd4dgs_codec.cli.common import (
     run,
     table,
 )
-from pd4dgs_codec.cli.files import STDIO, check_output, is_pd4, read_bytes, write_bytes
+from pd4dgs_codec.cli.files import STDIO, Stdin, check_output, is_pd4, read_bytes, write_bytes
 from pd4dgs_codec.cli.progress import progress_bar
 from pd4dgs_codec.codec.options import CHOICES, DEFAULTS, EncodeOptions
 from pd4dgs_codec.pack import MIN_GAIN_PER_MEGABYTE
@@ -167,7 +166,7 @@ def _load(args: argparse.Namespace) -> tuple[Scene, bool, Metadata | None]:
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.model.convert import to_scene
 
-    model, _ = checkpoint.load(args.input if args.input != STDIO else _Stdin(data))  # type: ignore[arg-type]
+    model, _ = checkpoint.load(args.input if args.input != STDIO else Stdin(data))
     return to_scene(model), True, _metadata(args, None)
 
 
@@ -184,22 +183,15 @@ def _metadata(args: argparse.Namespace, had: Metadata | None) -> Metadata | None
 def _views(args: argparse.Namespace, console: Console) -> Views | None:
     if args.data is None:
         return None
-    from pd4dgs_codec.data.dataset import load
+    from pd4dgs_codec.interchange.teacher import load_source
     from pd4dgs_codec.pack.packing import Views
 
-    dataset = load(args.data, downscale=args.downscale, holdout=args.holdout)
+    dataset = load_source(args.data, downscale=args.downscale, holdout=args.holdout)
     views = Views.of(dataset, args.data, args.views)
     console.detail(f"{args.data}: {len(views.fitting)} training views, {len(views.held_out)} to judge by")
     if not dataset.test:
         console.message("no views are held out: layers are judged on training views")
     return views
-
-
-class _Stdin(io.BytesIO):
-    """Bytes that call themselves stdin in a message."""
-
-    def __str__(self) -> str:
-        return "stdin"
 
 
 def _add_train_rate(result: dict[str, Any], packed: Packed, options: EncodeOptions) -> None:

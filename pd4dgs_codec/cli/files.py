@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import sys
 from pathlib import Path
 
@@ -18,6 +19,13 @@ def read_bytes(path: str) -> bytes:
     if sys.stdin is None or sys.stdin.isatty():
         raise UsageError("nothing is piped to stdin; name a file")
     return sys.stdin.buffer.read()
+
+
+class Stdin(io.BytesIO):
+    """What was read from stdin, for a reader of files that names its input in messages."""
+
+    def __str__(self) -> str:
+        return "stdin"
 
 
 def named_input(path: str) -> str | bytes:

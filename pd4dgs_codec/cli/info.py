@@ -119,6 +119,7 @@ def _parts_table(result: dict[str, Any]) -> str:
 def _left_out(layers: list[dict[str, Any]]) -> list[dict[str, str]]:
     """Layers, deformations and residual heads that the format has room for and this file does without."""
     from pd4dgs_codec.codec.kinds import LAYER_KINDS
+    from pd4dgs_codec.scene import TRUNK
 
     why = "the encoder found that it changes nothing visible, or was told to stop below"
     rows = {row["layer"]: row for row in layers}
@@ -128,8 +129,10 @@ def _left_out(layers: list[dict[str, Any]]) -> list[dict[str, str]]:
         if row is None:
             missing.append(f"layer {kind.layer}")
         elif "networks" in row:  # known only where the file holds the whole chunk
-            gone = [head for head in kind.heads if head not in row["networks"]]
-            missing += [kind.name] if len(gone) == len(kind.heads) else [f"{kind.name} head {h}" for h in gone]
+            gone = [head for head in kind.network_ids if head not in (TRUNK, *row["networks"])]
+            missing += (
+                [kind.name] if len(gone) == len(kind.network_ids) - 1 else [f"{kind.name} head {h}" for h in gone]
+            )
     return [{"what": what, "why": why} for what in missing]
 
 

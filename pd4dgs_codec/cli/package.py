@@ -1,4 +1,4 @@
-"""`pd4dgs-package`: a `.pd4` file as a folder for DASH, HLS and plain HTTP."""
+"""`pd4dgs-package`: a `.pd4` file as a folder for any web server, with a page that plays it."""
 
 from __future__ import annotations
 
@@ -20,7 +20,8 @@ if TYPE_CHECKING:
     from pd4dgs_codec.scene import Scene
 
 DETAILS = """\
-DIR then holds scene.pd4, index.json (byte ranges and SHA-256 of the layers), scene.mp4 and scene.mpd (DASH: each
+DIR then holds scene.pd4 and index.html: a page that plays it in a browser, from any web server that DIR is copied to.
+For other players there are index.json (byte ranges and SHA-256 of the layers), scene.mp4 and scene.mpd (DASH: each
 layer a fragment and an AdaptationSet of its own, with dependencyId) and scene.m3u8 (HLS, whose session data names
 index.json).
 
@@ -40,7 +41,12 @@ FRAGMENT_SECONDS = 2
 
 def parser() -> Parser:
     """The options of `pd4dgs-package`."""
-    p = Parser("package", "scene.pd4 -o DIR", "Lay out a .pd4 file for DASH, HLS and plain HTTP.", DETAILS)
+    p = Parser(
+        "package",
+        "scene.pd4 -o DIR",
+        "Make a folder for web servers: a page that plays the scene, DASH, HLS.",
+        DETAILS,
+    )
     p.add_argument("input", metavar="scene.pd4", help="file to package; - reads stdin")
     p.add_argument("-o", "--output", required=True, metavar="DIR", help="folder to write, made if missing")
     p.add_argument("--no-video", action="store_true", help="do without the 2D video")

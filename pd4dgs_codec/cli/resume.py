@@ -17,7 +17,19 @@ if TYPE_CHECKING:
     from pd4dgs_codec.train.loop import Trainer
 
 #: Options that a resumed run takes from its checkpoint: naming another value there is an error.
-FIXED = ("preset", "seed", "downscale", "holdout", "iterations", "rate_scale", "prune", "rollout", "max_layer")
+FIXED = (
+    "preset",
+    "feature_width",
+    "slots",
+    "seed",
+    "downscale",
+    "holdout",
+    "iterations",
+    "rate_scale",
+    "prune",
+    "rollout",
+    "max_layer",
+)
 
 
 def stored_config(args: argparse.Namespace) -> TrainConfig:

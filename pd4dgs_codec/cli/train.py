@@ -57,6 +57,10 @@ def parser() -> Parser:
     p.add_argument("source", metavar="SOURCE", help="dataset to train on, see below")
     p.add_argument("-o", "--output", required=True, metavar="FILE.pt", help="checkpoint to write")
     p.add_argument("--preset", choices=("tiny", "small", "paper"), help="model size (default: small)")
+    what = "numbers of an anchor's feature, 1..64 (default: 32)"
+    p.add_argument("--feature-width", type=values.positive_int, metavar="N", help=what)
+    what = "Gaussians of an anchor, 1..16 (default: 10)"
+    p.add_argument("--slots", type=values.positive_int, metavar="N", help=what)
     what = "training steps (default: by preset, unless --max-seconds is given)"
     p.add_argument("--iterations", type=values.positive_int, metavar="N", help=what)
     what = "time to train; on --resume earlier time counts too"
@@ -109,14 +113,14 @@ def _train(args: argparse.Namespace, console: Console) -> int:
     check_output(args.output, args.overwrite or resuming_in_place)
     if args.log:
         check_output(args.log, args.overwrite or args.resume is not None)
-    from pd4dgs_codec.data.dataset import load
+    from pd4dgs_codec.interchange.teacher import load_source
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.train.loop import Trainer
 
     checkpoint.target(args.output)  # refuses a device now, not after the first minute
     device = _device(args.device, console)
     config = stored_config(args) if args.resume else _fresh_config(args)
-    dataset = load(args.source, downscale=config.downscale, holdout=config.holdout)
+    dataset = load_source(args.source, downscale=config.downscale, holdout=config.holdout)
     trainer = Trainer(config, dataset, device)
     if args.resume:
         trainer.resume(Path(args.resume))

@@ -31,6 +31,7 @@ port = _checked(int, lambda value: 0 <= value < 65536, "0 to 65535")
 seed = _checked(int, lambda value: 0 <= value <= 2**63 - 2, "an integer from 0 to 2^63 - 2")
 positive_float = _checked(float, lambda value: 0 < value < math.inf, "a number > 0")
 non_negative_float = _checked(float, lambda value: 0 <= value < math.inf, "a number >= 0")
+share = _checked(float, lambda value: 0 <= value <= 1, "a number from 0 to 1")
 finite_float = _checked(float, math.isfinite, "a number")
 
 

@@ -4,30 +4,30 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import shutil
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
 
+from pd4dgs_codec.atomic import check_output, write_bytes
 from pd4dgs_codec.cli.common import OK, Console, Parser, run
-from pd4dgs_codec.cli.files import is_pd4, read_bytes
+from pd4dgs_codec.cli.files import STDIO, Stdin, is_pd4, read_bytes
 from pd4dgs_codec.cli.serve import set_by_signals
 from pd4dgs_codec.cli.values import duration, port, rate
-from pd4dgs_codec.errors import DataError
 
 DETAILS = """\
 SCENE is a .pd4 file, a checkpoint, which is packed quickly first, or the URL of a .pd4. The first line on stdout is the
 page's address, printed when it can be opened; the command ends on Ctrl-C or SIGTERM. A browser of this machine opens
 the page by itself. A server of another site must allow pages of others to read it, as pd4dgs-serve does.
 
+With -o the page is written instead, player and scene in one HTML file, which browsers open without a server.
+
 examples:
   pd4dgs-view scene.pd4
   pd4dgs-view model.pt --no-browser --port 8000
+  pd4dgs-view scene.pd4 -o scene.html
   pd4dgs-view scene.pd4 --rate 2M --latency 50ms"""
 
-#: What the page needs of the player's folder, by name.
-PLAYER_PARTS = ("index.html", "element.js", "decode", "render")
 SCENE = "scene.pd4"
 PACKING_EFFORT = 1
 
@@ -36,6 +36,7 @@ def parser() -> Parser:
     """The options of `pd4dgs-view`."""
     p = Parser("view", "SCENE", "Show a scene in the browser.", DETAILS)
     p.add_argument("input", metavar="SCENE", help=".pd4 file, .pt checkpoint or URL of a .pd4; - reads stdin")
+    p.add_argument("-o", "--output", metavar="FILE", help="write one HTML file that shows the scene, and serve nothing")
     p.add_argument("--port", type=port, default=0, metavar="N", help="port to listen on (default: any free one)")
     p.add_argument("--no-browser", action="store_true", help="print the address and open nothing")
     p.add_argument("--rate", type=rate, metavar="BPS", help="show it as over a link of this rate, such as 2M")
@@ -49,28 +50,21 @@ def main(argv: Sequence[str] | None = None) -> int:
     return run(parser(), _view, argv)
 
 
-def player_folder() -> Path:
-    """Where the player lies: in the installed package, or beside it in a checkout. DataError if it is nowhere."""
-    package = Path(__file__).parents[1]
-    for folder in (package / "player", package.parent / "player"):
-        if (folder / PLAYER_PARTS[0]).is_file():
-            return folder
-    raise DataError(f"{package}: holds no player; expected the package as pip installs it, or a checkout")
-
-
 def _view(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.delivery.link import Link
+    from pd4dgs_codec.delivery.page import PAGE, page
     from pd4dgs_codec.delivery.server import Server
     from pd4dgs_codec.delivery.urls import is_url
 
+    if args.output:
+        check_output(args.output, args.overwrite)
+        content = args.input if is_url(args.input) else _packed(args.input, console)
+        write_bytes(args.output, page(content).encode(), args.overwrite)
+        console.result({"output": args.output, "input": args.input}, args.output, on_stdout=False)
+        return OK
     with tempfile.TemporaryDirectory(prefix="pd4dgs-view-") as name:
         folder, source = Path(name), args.input
-        for part in PLAYER_PARTS:
-            whole = player_folder() / part
-            if whole.is_dir():
-                shutil.copytree(whole, folder / part)
-            else:
-                shutil.copy(whole, folder / part)
+        (folder / PAGE).write_bytes(page().encode())
         if not is_url(source):
             (folder / SCENE).write_bytes(_packed(source, console))
             source = SCENE
@@ -78,7 +72,7 @@ def _view(args: argparse.Namespace, console: Console) -> int:
         with Server(folder, port=args.port, link=Link(args.rate), latency=args.latency, log=log) as server:
             stop = set_by_signals()
             with server.running():
-                url = f"{server.url}{PLAYER_PARTS[0]}?src={quote(source, safe='')}"
+                url = f"{server.url}{PAGE}?src={quote(source, safe='')}"
                 console.result({"url": url, "input": args.input}, url, on_stdout=True)
                 if not args.no_browser:
                     _open(url)
@@ -98,7 +92,7 @@ def _packed(source: str, console: Console) -> bytes:
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.model.convert import to_scene
 
-    model, _ = checkpoint.load(source)
+    model, _ = checkpoint.load(source if source != STDIO else Stdin(data))
     console.message(f"{source}: packing the checkpoint")
     return encode(to_scene(model), effort=PACKING_EFFORT, omit="nothing")
 

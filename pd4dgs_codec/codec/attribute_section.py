@@ -1,17 +1,19 @@
-"""The attributes section of mode ans: 68 channels as they are, or with what one channel tells of another taken out.
+"""The attributes section of mode ans: the channels as they are, or with what one tells of another taken out.
 
-Byte 0 is the form. Form 0: the rest is one channels payload of the 68 channels. Form 1: a block of varints, then eight
-channels payloads, the *stages*, each decoded before the next. All arithmetic is on integers.
+Byte 0 is the form. Form 0: the rest is one channels payload of all channels. Form 1: a block of varints, then eight
+channels payloads, the *stages*, each decoded before the next. All arithmetic is on integers. With D feature numbers and
+G Gaussians, the first P = D + 6 channels are features and log-scalings, the others G offsets x, y, z.
 
-*Linear prediction*, channels 1..37 (features, log-scalings): for channel c a varint m <= c, then m terms in ascending
+*Linear prediction*, channels 1 .. P - 1: for channel c a varint m <= c, then m terms in ascending
 order of the channel j they refer to: a varint j - (previous j) - 1, starting from previous j = -1, and a zigzag weight
 w, |w| <= 2^15. Coded is the residual e_c = k_c - ((sum_j w_j k_j + 512) >> 10), the shift rounding down.
 
-*Activity*. The residuals of an anchor tend to be large together. Stages 0..4 hold the residuals of channels 0..37 in
-the runs that STAGES names, stage 5 the ten offsets x. For each of stages 1..5 the block has a varint C in 1..8: each
-channel of the stage is split into C classes of rows by how large the residuals of the earlier stages are (`activity`).
+*Activity*. The residuals of an anchor tend to be large together. Stages 0..4 hold the residuals of channels 0 .. P - 1
+in the runs that `stage_bounds` names, stage 5 the offsets x. For each of stages 1..5 the block has a varint C in 1..8:
+each channel of the stage is split into C classes of rows by how large the residuals of the earlier stages are
+(`activity`).
 
-*Distance*, the offsets y and z of ten Gaussians: per Gaussian a varint f in 0..3: bit 0, y is split by x; bit 1, z is
+*Distance*, the offsets y and z: per Gaussian a varint f in 0..3: bit 0, y is split by x; bit 1, z is
 split by x and y. If f > 0 follow a zigzag centre of x and, if bit 1 is set, one of y, each |.| <= 2^24 - 1. The symbols
 of a split y go to class min(|x - centre_x|, 4), those of a split z to class min(|x - centre_x| + |y - centre_y|, 6).
 Stage 6 holds the y, stage 7 the z.
@@ -31,7 +33,6 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
-from pd4dgs_codec.attributes.table import N_CHANNELS
 from pd4dgs_codec.codec.stages import (
     PLAIN,
     PRIOR_BITS,
@@ -52,16 +53,13 @@ from pd4dgs_codec.entropy.fitting import Fitted
 from pd4dgs_codec.entropy.priors import K_MAX, Prior
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
 from pd4dgs_codec.errors import Malformed, UnsupportedFeature
-from pd4dgs_codec.scene import FEATURE_DIM, N_OFFSETS, SCALING_DIM
+from pd4dgs_codec.scene import Widths
 
 CONTINUED = 2  #: the form that goes on with an earlier block
-N_PREDICTED = FEATURE_DIM + SCALING_DIM
 WEIGHT_SHIFT = 10
 MAX_WEIGHT = 1 << 15
-#: First channel of each stage of residuals, and the end of the last.
-STAGES = (0, 6, 12, 20, 29, N_PREDICTED)
-#: Channels of the ten offsets x.
-X_CHANNELS = tuple(range(N_PREDICTED, N_PREDICTED + 3 * N_OFFSETS, 3))
+#: Where the stages of residuals begin and end, of 38 predicted channels; those of another number in proportion.
+STAGES = (0, 6, 12, 20, 29, 38)
 N_STAGES = len(STAGES) + 2
 Y_CLASSES, Z_CLASSES = 5, 7
 SPLIT_Y, SPLIT_Z = 1, 2
@@ -107,6 +105,18 @@ class Split:
         return classes
 
 
+def stage_bounds(widths: Widths) -> list[int]:
+    """First channel of each stage of residuals, and the end of the last."""
+    return [widths.predicted * bound // STAGES[-1] for bound in STAGES]
+
+
+def stage_channels(widths: Widths, stage: int) -> range:
+    """The channels of stages 0..5; those of the last are the offsets x."""
+    if stage == len(STAGES) - 1:
+        return range(widths.predicted, widths.channels, 3)
+    return range(*stage_bounds(widths)[stage : stage + 2])
+
+
 @dataclass(frozen=True, eq=False)
 class Scale:
     """What the classes of one stage are measured by. places, sums: of the residuals of the stages before, int64 [m] the
@@ -119,17 +129,18 @@ class Scale:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """The prediction block. counts: of classes, of stages 1 to 5. scales: by stage, of the slice that the block stands
-    in; known once that slice has been coded so far."""
+    """The prediction block. widths: of the anchors. counts: of classes, of stages 1 to 5. scales: by stage, of the
+    slice that the block stands in; known once that slice has been coded so far."""
 
+    widths: Widths
     terms: list[Terms]
     counts: list[int]
     splits: list[Split]
     scales: dict[int, Scale] = field(default_factory=dict)
 
     def classes(self, coded: np.ndarray, stage: int) -> np.ndarray:
-        """int64 [n] of rows whose residuals in the stages before are in coded int64 [68, n]."""
-        residuals = coded[: STAGES[stage]]
+        """int64 [n] of rows whose residuals in the stages before are in coded int64 [channels, n]."""
+        residuals = coded[: stage_bounds(self.widths)[stage]]
         scale = self.scales.get(stage)
         if scale is None:
             activity = relative_magnitude(residuals)
@@ -161,30 +172,26 @@ class Past(Generic[AnyPrior]):
         return Past(self.block, list(self.positions), list(self.masks), list(self.plain), stages)
 
 
-def _stage_channels(stage: int) -> tuple[int, ...]:
-    """The channels of stages 0..5."""
-    return tuple(range(STAGES[stage], STAGES[stage + 1])) if stage < len(STAGES) - 1 else X_CHANNELS
-
-
 # -- writing -----------------------------------------------------------------------------------------------------------
 
 
 def write_attributes(
     attributes: np.ndarray,
+    widths: Widths,
     priors: str,
     effort: int,
     past: Past[Fitted] | None = None,
     population: np.ndarray | None = None,
 ) -> tuple[bytes, float]:
-    """(section bytes, sum of R(a) over the 68 channels) of attributes int32 [68, n], in the smallest form.
+    """(section bytes, sum of R(a) over all channels) of attributes int32 [channels, n], in the smallest form.
 
-    past: of the layer's slices before, to which this one is added. population: int32 [68, m], what a block is fitted
-    to: the attributes of this slice and of those that may refer to it; these alone if None.
+    past: of the layer's slices before, to which this one is added. population: int32 [channels, m], what a block is
+    fitted to: the attributes of this slice and of those that may refer to it; these alone if None.
     """
     past = past or Past()
     population = attributes if population is None else population
     one_row = population.shape[1] < 2  # has no spread to predict
-    block = past.block or (None if one_row else _fit_block(population.astype(np.int64)))
+    block = past.block or (None if one_row else _fit_block(population.astype(np.int64), widths))
     section, rate_bits = smaller_form(
         list(attributes),
         None if block is None else lambda: _write_staged(attributes.astype(np.int64), block, past, effort),
@@ -201,15 +208,15 @@ def write_attributes(
     return section.data, rate_bits
 
 
-def _fit_block(symbols: np.ndarray) -> Block:
-    terms = [_fit_terms(symbols, c) for c in range(1, N_PREDICTED)]
-    splits = [_fit_split(*symbols[x : x + 3]) for x in X_CHANNELS]
-    coded = _residuals(symbols, terms)
+def _fit_block(symbols: np.ndarray, widths: Widths) -> Block:
+    terms = [_fit_terms(symbols, c) for c in range(1, widths.predicted)]
+    splits = [_fit_split(*symbols[x : x + 3]) for x in stage_channels(widths, len(STAGES) - 1)]
+    coded, bounds = _residuals(symbols, terms), stage_bounds(widths)
     counts = [
-        cheapest_class_count([(coded[list(_stage_channels(stage))], relative_magnitude(coded[: STAGES[stage]]))])
+        cheapest_class_count([(coded[list(stage_channels(widths, stage))], relative_magnitude(coded[: bounds[stage]]))])
         for stage in range(1, len(STAGES))
     ]
-    return Block(terms, counts, splits)
+    return Block(widths, terms, counts, splits)
 
 
 def _residuals(symbols: np.ndarray, terms: Sequence[Terms]) -> np.ndarray:
@@ -246,15 +253,15 @@ def _put_block(out: bytearray, block: Block) -> None:
 
 
 def _places(coded: np.ndarray, block: Block) -> Iterator[list[tuple[np.ndarray, np.ndarray]]]:
-    """Per stage, the (channel, rows) that it codes, in order. `coded` int64 [68, n] is read only as far as the stages
-    before reach."""
+    """Per stage, the (channel, rows) that it codes, in order. `coded` int64 [channels, n] is read only as far as the
+    stages before reach."""
     every = np.arange(coded.shape[1])
     for stage, count in enumerate((1, *block.counts)):
         parts = places_of(block.classes(coded, stage), count) if count > 1 else [every]
-        yield [(coded[c], part) for c in _stage_channels(stage) for part in parts]
+        yield [(coded[c], part) for c in stage_channels(block.widths, stage) for part in parts]
     for axis, flag, count in ((1, SPLIT_Y, Y_CLASSES), (2, SPLIT_Z, Z_CLASSES)):
         places = []
-        for x, split in zip(X_CHANNELS, block.splits, strict=True):
+        for x, split in zip(stage_channels(block.widths, len(STAGES) - 1), block.splits, strict=True):
             parts = [every]
             if split.flags & flag:
                 classes = split.y_classes(coded[x]) if axis == 1 else split.z_classes(coded[x], coded[x + 1])
@@ -308,20 +315,20 @@ def _mode(symbols: np.ndarray) -> int:
 # -- reading -----------------------------------------------------------------------------------------------------------
 
 
-def read_attributes(data: bytes, rows: int, past: Past[Prior] | None = None) -> np.ndarray:
-    """attributes int32 [68, rows]; the inverse of write_attributes. rows was checked against the limits before.
+def read_attributes(data: bytes, widths: Widths, rows: int, past: Past[Prior] | None = None) -> np.ndarray:
+    """attributes int32 [channels, rows]; the inverse of write_attributes. rows was checked against the limits before.
     past: of the layer's slices before, to which this one is added."""
     reader, block = ByteReader(data), past.block if past else None
     form = reader.byte("the form of the attributes")
     if form == PLAIN:
-        return np.stack(decode_channels(reader.rest(), [rows] * N_CHANNELS, past.plain if past else None))
+        return np.stack(decode_channels(reader.rest(), [rows] * widths.channels, past.plain if past else None))
     if form not in (STAGED, CONTINUED):
         raise UnsupportedFeature(f"form {form} of the attributes, expected {PLAIN}, {STAGED} or {CONTINUED}")
     if form == STAGED:
-        block = _read_block(reader)
+        block = _read_block(reader, widths)
     if block is None:
         raise Malformed("attributes that go on with a prediction block, but no slice before has one")
-    symbols = np.zeros((N_CHANNELS, rows), np.int64)
+    symbols = np.zeros((widths.channels, rows), np.int64)
     read_stages(reader, N_STAGES, _places(symbols, block), past.stages if past else None)
     if past:
         past.block = block
@@ -332,16 +339,16 @@ def read_attributes(data: bytes, rows: int, past: Past[Prior] | None = None) -> 
     return symbols.astype(np.int32)
 
 
-def _read_block(reader: ByteReader) -> Block:
-    terms = [_read_terms(reader, c) for c in range(1, N_PREDICTED)]
+def _read_block(reader: ByteReader, widths: Widths) -> Block:
+    terms = [_read_terms(reader, widths, c) for c in range(1, widths.predicted)]
     counts = [read_class_count(reader, stage) for stage in range(1, len(STAGES))]
-    return Block(terms, counts, [_read_split(reader) for _ in range(N_OFFSETS)])
+    return Block(widths, terms, counts, [_read_split(reader) for _ in range(widths.slots)])
 
 
-def _read_terms(reader: ByteReader, c: int) -> Terms:
+def _read_terms(reader: ByteReader, widths: Widths, c: int) -> Terms:
     channels, weights, last = [], [], -1
     for _ in range(reader.varint(c, f"the number of terms of channel {c}")):
-        last += 1 + reader.varint(N_PREDICTED, f"a term of channel {c}")
+        last += 1 + reader.varint(widths.predicted, f"a term of channel {c}")
         if last >= c:
             raise Malformed(f"channel {c} is predicted from channel {last}, expected one before it")
         channels.append(last)

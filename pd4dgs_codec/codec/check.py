@@ -7,11 +7,22 @@ from itertools import pairwise
 import numpy as np
 
 from pd4dgs_codec.attributes.quantise import is_step
-from pd4dgs_codec.attributes.table import ATTRIBUTES
-from pd4dgs_codec.codec.kinds import LAYER_KINDS, SCAFFOLD_INPUT, LayerKind
+from pd4dgs_codec.codec.kinds import LAYER_KINDS, LayerKind
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.morton import MAX_VOXEL
-from pd4dgs_codec.scene import MASK_MIN_CODE, PLANES, TRUNK, Deformation, Network, Scene, SceneInfo, plane_sides
+from pd4dgs_codec.scene import (
+    MASK_MIN_CODE,
+    MAX_FEATURE,
+    MAX_SLOTS,
+    PLANES,
+    TRUNK,
+    Deformation,
+    Network,
+    Scene,
+    SceneInfo,
+    Widths,
+    plane_sides,
+)
 
 
 def _expect(ok: bool, message: str) -> None:
@@ -38,20 +49,26 @@ def check_scene(scene: Scene) -> None:
     if n:
         reach = max(int(scene.anchor_q.max()), -int(scene.anchor_q.min()))
         _expect(reach <= MAX_VOXEL, f"anchor_q: voxel index of magnitude {reach}, expected at most {MAX_VOXEL}")
-    for a in ATTRIBUTES:
-        _expect_array(a.name, scene.attributes[a.name], np.float32, (n, *a.shape))
+    for name, axes in (("feature", 2), ("offset", 3)):
+        found = scene.attributes[name].shape
+        _expect(len(found) == axes, f"{name}: an array of {len(found)} axes, expected {axes}")
+    widths = scene.widths
+    for what, width, limit in (("feature width", widths.feature, MAX_FEATURE), ("slots", widths.slots, MAX_SLOTS)):
+        _expect(1 <= width <= limit, f"{what}: {width}, expected 1..{limit}")
+    for name, shape in widths.attributes.items():
+        _expect_array(name, scene.attributes[name], np.float32, (n, *shape))
     _check_masks(scene)
     _check_info(scene)
     for name, step in vars(scene.steps).items():
         _expect(is_step(step), f"step of {name}: {step!r}, expected a positive normal binary32 value")
-    _check_networks(LAYER_KINDS[0].name, scene.networks, LAYER_KINDS[0], SCAFFOLD_INPUT)
-    missing = set(LAYER_KINDS[0].heads) - set(scene.networks)
+    _check_networks(LAYER_KINDS[0].name, scene.networks, LAYER_KINDS[0], widths, widths.inputs)
+    missing = set(widths.networks) - set(scene.networks)
     _expect(not missing, f"scaffold networks {sorted(missing)} are missing")
     for kind in LAYER_KINDS[1:]:
         deformation = scene.deformation(kind.layer)
         if deformation is not None:
             _expect(kind.layer in layers, f"{kind.name} is given, but layer {kind.layer} is not among {layers}")
-            _check_deformation(deformation, kind)
+            _check_deformation(deformation, kind, widths)
 
 
 def _check_masks(scene: Scene) -> None:
@@ -98,7 +115,7 @@ def info_fault(info: SceneInfo) -> str | None:
     return next((fault for holds, fault in rules if not holds), None)
 
 
-def _check_deformation(deformation: Deformation, kind: LayerKind) -> None:
+def _check_deformation(deformation: Deformation, kind: LayerKind, widths: Widths) -> None:
     name, width = kind.name, 0
     _expect(len(deformation.planes) > 0, f"{name}: no planes, expected at least one scale")
     for s, planes in enumerate(deformation.planes):
@@ -113,10 +130,10 @@ def _check_deformation(deformation: Deformation, kind: LayerKind) -> None:
     _expect(TRUNK in deformation.networks, f"{name}: the network 'trunk' is missing")
     trunk_out = deformation.networks[TRUNK][-1][0].shape[0]
     for network, layers in deformation.networks.items():
-        _check_networks(name, {network: layers}, kind, width if network == TRUNK else trunk_out)
+        _check_networks(name, {network: layers}, kind, widths, width if network == TRUNK else trunk_out)
 
 
-def _check_networks(owner: str, networks: dict[str, Network], kind: LayerKind, width_in: int) -> None:
+def _check_networks(owner: str, networks: dict[str, Network], kind: LayerKind, widths: Widths, width_in: int) -> None:
     for name, network in networks.items():
         _expect(name in kind.network_ids, f"{owner}: network {name!r}, expected one of {list(kind.network_ids)}")
         _expect(len(network) > 0, f"{owner} network {name}: no layers")
@@ -125,5 +142,5 @@ def _check_networks(owner: str, networks: dict[str, Network], kind: LayerKind, w
             _expect_array(f"{owner} network {name} weight {i}", weight, np.float32, (None, width))
             width = weight.shape[0]
             _expect_array(f"{owner} network {name} bias {i}", bias, np.float32, (width,))
-        out = kind.heads.get(name, width)
+        out = kind.heads(widths).get(name, width)
         _expect(width == out, f"{owner} network {name}: {width} outputs, expected {out}")

@@ -112,11 +112,12 @@ class LayerReader:
         later = self._goes_on(kind.layer)
         before = self._whole if later else self.layers
         past = self._past if later else Past[Prior]() if chunk.more else None
+        header = self.header
         read = read_layer(
-            chunk.payload, kind, self._declared, self.header.mode, self.header.raw_deformation, later, past
+            chunk.payload, kind, header.widths, self._declared, header.mode, header.raw_deformation, later, past
         )
-        check_last_layer([*before, read], self._taken, self.header.info.voxel_size, self.header.attribute_steps)
-        _check_bounded(read, self.header)
+        check_last_layer([*before, read], self._taken, header.info.voxel_size, header.attribute_steps)
+        _check_bounded(read, header)
         symbols = sum(a.size for a in read.arrays())
         self._declared = self._declared.and_slice(len(read.anchor_q), symbols, len(chunk.payload))
         self._whole, self._past = before, past

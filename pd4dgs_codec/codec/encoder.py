@@ -171,11 +171,11 @@ def _check_limits(scene: Scene, symbols: list[LayerSymbols], written: list[list[
     chunks = sum(map(len, written))
     if chunks > MAX_CHUNKS:
         raise EncodeError(f"{chunks} slices, expected at most {MAX_CHUNKS}: let slices take more bytes")
-    for index, slices in enumerate(written):
+    for index, (layer, slices) in enumerate(zip(symbols, written, strict=True)):
         for number, part in enumerate(slices):
             try:
                 *_, declared = read_meta(
-                    part.payload, part.symbols.kind, declared, part.symbols.raw_deformation, number > 0
+                    part.payload, layer.kind, layer.widths, declared, layer.raw_deformation, number > 0
                 )
                 layers = [*symbols[:index], part.symbols]
                 check_last_layer(layers, taken, scene.info.voxel_size, scene.steps.attributes)
@@ -199,6 +199,7 @@ def _container(meant: Scene, options: EncodeOptions, written: list[list[Slice]],
         mode=options.mode,
         deformation=options.deformation,
         attribute_steps=meant.steps.attributes,
+        widths=meant.widths,
         info=meant.info,
         error_bounds=rounding_bounds(meant, options.raw_deformation),
         digest=payload_digest(payloads),

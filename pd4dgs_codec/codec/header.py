@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from pd4dgs_codec.attributes.quantise import is_step
-from pd4dgs_codec.attributes.table import ATTRIBUTES
 from pd4dgs_codec.bitstream import canonical
 from pd4dgs_codec.bitstream.container import SCENE_ID_SIZE
 from pd4dgs_codec.bitstream.limits import MAX_CHUNKS, MAX_PAYLOAD
@@ -20,11 +19,11 @@ from pd4dgs_codec.codec.fields import Fields, as_integer, as_list
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE, LAYER_KINDS
 from pd4dgs_codec.codec.options import DEFORMATIONS, MODES, RAW_DEFORMATION
 from pd4dgs_codec.errors import Malformed
-from pd4dgs_codec.scene import Camera, SceneInfo
+from pd4dgs_codec.scene import ATTRIBUTES, MAX_FEATURE, MAX_SLOTS, Camera, SceneInfo, Widths
 
 # Keys of the header map.
 CHUNKS, MODE, DEFORMATION, STEPS, VOXEL_SIZE, BOX, TIME_RANGE, BACKGROUND, NEAR_FAR, UP, UNIT = range(1, 12)
-CAMERA, ERROR_BOUNDS, DIGEST = 12, 13, 14
+CAMERA, ERROR_BOUNDS, DIGEST, WIDTHS = range(12, 16)
 # Keys of the camera map.
 VIEWMAT, INTRINSICS, WIDTH, HEIGHT = range(1, 5)
 
@@ -40,7 +39,7 @@ TENSOR_CLASSES = {
     "weights_local": 7,
 }
 #: What every layer 0 has; the other classes belong to layers that a file may do without.
-ALWAYS_BOUNDED = (*(a.name for a in ATTRIBUTES), LAYER_KINDS[0].weights_step)
+ALWAYS_BOUNDED = (*ATTRIBUTES, LAYER_KINDS[0].weights_step)
 
 MAX_CAMERA_SIDE = 65535
 DIGEST_SIZE = 16  #: bytes
@@ -50,14 +49,16 @@ DIGEST_SIZE = 16  #: bytes
 class Header:
     """chunks: (type, payload length in bytes) in file order. attribute_steps: by name, in the table's order.
 
-    error_bounds: by field of Steps, how far a decoded value may lie from the one that the encoder was given, in the
-    unit of the values; a binary32 value >= 0. digest: payload_digest of the layers that were encoded together.
+    widths: of the anchors. error_bounds: by field of Steps, how far a decoded value may lie from the one that the
+    encoder was given, in the unit of the values; a binary32 value >= 0. digest: payload_digest of the layers that were
+    encoded together.
     """
 
     chunks: tuple[tuple[int, int], ...]
     mode: str
     deformation: str
     attribute_steps: dict[str, float]
+    widths: Widths
     info: SceneInfo
     error_bounds: dict[str, float]
     digest: bytes
@@ -79,7 +80,7 @@ def pack_header(header: Header) -> bytes:
         CHUNKS: [list(chunk) for chunk in header.chunks],
         MODE: MODES[header.mode],
         DEFORMATION: DEFORMATIONS[header.deformation],
-        STEPS: _f32([header.attribute_steps[a.name] for a in ATTRIBUTES]),
+        STEPS: _f32([header.attribute_steps[name] for name in ATTRIBUTES]),
         VOXEL_SIZE: _f32(info.voxel_size)[0],
         BOX: _f32(info.box),
         TIME_RANGE: _f32(info.time_range),
@@ -98,16 +99,16 @@ def pack_header(header: Header) -> bytes:
         }
     bounds = header.error_bounds
     fields[ERROR_BOUNDS] = {number: bounds[name] for name, number in TENSOR_CLASSES.items() if name in bounds}
-    fields[DIGEST] = header.digest
+    fields |= {DIGEST: header.digest, WIDTHS: [header.widths.feature, header.widths.slots]}
     return canonical.pack(fields)
 
 
 def unpack_header(data: bytes, offset: int = 0) -> Header:
     """The inverse of pack_header (clause "header"); `offset` is that of the header's first byte, for messages."""
-    fields = Fields(canonical.unpack(data, offset=offset), "header", set(range(CHUNKS, DIGEST + 1)))
+    fields = Fields(canonical.unpack(data, offset=offset), "header", set(range(CHUNKS, WIDTHS + 1)))
     steps = fields.reals(STEPS, len(ATTRIBUTES))
     voxel_size = fields.real(VOXEL_SIZE)
-    for name, step in zip(["voxel_size", *(a.name for a in ATTRIBUTES)], [voxel_size, *steps], strict=True):
+    for name, step in zip(["voxel_size", *ATTRIBUTES], [voxel_size, *steps], strict=True):
         if not is_step(step):
             raise Malformed(f"header: step {step!r} of {name}, expected a positive normal binary32 value")
     box = np.array(fields.reals(BOX, 6), dtype=np.float32).reshape(2, 3)
@@ -136,7 +137,8 @@ def unpack_header(data: bytes, offset: int = 0) -> Header:
         chunks=chunks,
         mode=mode,
         deformation=fields.choice(DEFORMATION, DEFORMATIONS),
-        attribute_steps={a.name: step for a, step in zip(ATTRIBUTES, steps, strict=True)},
+        attribute_steps=dict(zip(ATTRIBUTES, steps, strict=True)),
+        widths=_unpack_widths(fields.sequence(WIDTHS, 2)),
         info=info,
         error_bounds=_unpack_error_bounds(fields),
         digest=_unpack_digest(fields.get(DIGEST)),
@@ -189,6 +191,11 @@ def _unpack_chunks(rows: list[Any]) -> tuple[tuple[int, int], ...]:
 def layers_of(chunks: Iterable[tuple[int, int]]) -> list[int]:
     """The layer of each slice in a chunk list."""
     return [kind for kind, _ in chunks if kind in BY_CHUNK_TYPE]
+
+
+def _unpack_widths(values: list[Any]) -> Widths:
+    feature = as_integer(values[0], MAX_FEATURE, "header: feature width", low=1)
+    return Widths(feature, as_integer(values[1], MAX_SLOTS, "header: slots", low=1))
 
 
 def _unpack_error_bounds(header: Fields) -> dict[str, float]:

@@ -53,7 +53,7 @@ def info(data: bytes) -> dict[str, Any]:
             row |= {"bytes": row["bytes"] + size, "end": place["end"]}
             if offset + size <= len(data):
                 payload = read_chunk(data, offset, type=chunk_type, length=length).payload
-                meta, _, declared = read_meta(payload, kind, declared, header.raw_deformation, later)
+                meta, _, declared = read_meta(payload, kind, header.widths, declared, header.raw_deformation, later)
                 place["anchors"] = meta.rows
                 row["anchors"] = row.get("anchors", 0) + meta.rows
                 if not later:
@@ -78,6 +78,8 @@ def info(data: bytes) -> dict[str, Any]:
         "mode": header.mode,
         "deformation": header.deformation,
         "voxel_size": header.info.voxel_size,
+        "feature_width": header.widths.feature,
+        "slots": header.widths.slots,
         "steps": header.attribute_steps,
         "error_bounds": header.error_bounds,
         "anchors": declared.rows if all("anchors" in row for row in layers) else None,
@@ -127,9 +129,9 @@ def hashes(data: bytes, max_layer: int | None = None) -> list[dict[str, Any]]:
     those of its layers <= max_layer alone (bytes after those are not looked at).
 
     symbols: int32 little-endian, C order, of anchor_q [n, 3], the rise of earlier rows' mask codes, the codes of own
-    rows, attributes [68, n], then planes [C, H, W] scale by scale in the order xy xz xt yz yt zt, then weight [out, in]
-    and bias [out] per linear layer, networks by ascending id; float32 planes and weights are left out.
-    tensors: float32 little-endian of anchor [n, 3], feature [n, 32], scaling_log [n, 6], offset [n, 10, 3] of own rows,
+    rows, attributes [channels, n], then planes [C, H, W] scale by scale in the order xy xz xt yz yt zt, then weight
+    [out, in] and bias [out] per linear layer, networks by ascending id; float32 planes and weights are left out.
+    tensors: float32 little-endian of anchor [n, 3], feature [n, D], scaling_log [n, 6], offset [n, G, 3] of own rows,
     then planes and networks as above.
     """
     reader, _ = read_layers(data, max_layer=max_layer)

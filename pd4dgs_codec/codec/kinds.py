@@ -5,27 +5,25 @@ All numbers here are those of the bitstream.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
-from pd4dgs_codec.scene import FEATURE_DIM, GLOBAL_HEADS, LOCAL_HEADS, SCAFFOLD_NETWORKS, TRUNK
-
-#: Input of the scaffold's networks: feature and view direction.
-SCAFFOLD_INPUT = FEATURE_DIM + 3
+from pd4dgs_codec.scene import LOCAL_HEADS, TRUNK, Widths
 
 
 @dataclass(frozen=True)
 class LayerKind:
     """A layer of the format.
 
-    name: of its planes and networks, for messages and reports. heads: output width per network (the trunk's is free).
-    network_ids: registry numbers in the layer's chunk, ascending in this order. planes_step, weights_step: names of the
-    classes of tensors that share a step; None if the layer has no planes.
+    name: of its planes and networks, for messages and reports. heads: the outputs per network in a scene of those
+    widths (the trunk's are free). network_ids: registry numbers in the layer's chunk, ascending in this order.
+    planes_step, weights_step: names of the classes of tensors that share a step; None if the layer has no planes.
     """
 
     layer: int
     chunk_type: int
     name: str
-    heads: dict[str, int]
+    heads: Callable[[Widths], dict[str, int]]
     network_ids: dict[str, int]
     weights_step: str
     planes_step: str | None = None
@@ -41,7 +39,7 @@ LAYER_KINDS: tuple[LayerKind, ...] = (
         layer=0,
         chunk_type=0,
         name="scaffold",
-        heads=SCAFFOLD_NETWORKS,
+        heads=lambda widths: widths.networks,
         network_ids={"opacity": 0, "covariance": 1, "color": 2},
         weights_step="weights_scaffold",
     ),
@@ -49,7 +47,7 @@ LAYER_KINDS: tuple[LayerKind, ...] = (
         layer=1,
         chunk_type=1,
         name="global_deformation",
-        heads=GLOBAL_HEADS,
+        heads=lambda widths: widths.global_heads,
         network_ids={TRUNK: 0, "position": 1, "feature": 2, "offset": 3, "scaling": 4},
         weights_step="weights_global",
         planes_step="planes_global",
@@ -58,7 +56,7 @@ LAYER_KINDS: tuple[LayerKind, ...] = (
         layer=2,
         chunk_type=2,
         name="local_deformation",
-        heads=LOCAL_HEADS,
+        heads=lambda widths: LOCAL_HEADS,
         network_ids={TRUNK: 0, "mean": 1, "scale": 2, "quat": 3, "opacity": 4, "color": 5},
         weights_step="weights_local",
         planes_step="planes_local",

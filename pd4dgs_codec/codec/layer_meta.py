@@ -9,7 +9,6 @@ from enum import IntEnum
 
 from pd4dgs_codec.attributes.planes import PREDICTORS
 from pd4dgs_codec.attributes.quantise import is_step
-from pd4dgs_codec.attributes.table import N_CHANNELS
 from pd4dgs_codec.bitstream import canonical
 from pd4dgs_codec.bitstream.limits import (
     MAX_ANCHORS,
@@ -22,9 +21,9 @@ from pd4dgs_codec.bitstream.limits import (
     MAX_PLANE_SIDE,
 )
 from pd4dgs_codec.codec.fields import Fields, as_integer, as_list, as_registered
-from pd4dgs_codec.codec.kinds import SCAFFOLD_INPUT, LayerKind
+from pd4dgs_codec.codec.kinds import LayerKind
 from pd4dgs_codec.errors import LimitExceeded, Malformed
-from pd4dgs_codec.scene import PLANES, TRUNK
+from pd4dgs_codec.scene import PLANES, TRUNK, Widths
 
 
 class Section(IntEnum):
@@ -81,7 +80,8 @@ class ScaleMeta:
 class LayerMeta:
     """rows: the slice's own anchors. sections: length in bytes by Section. steps: by field of Steps.
 
-    networks: per name the widths of its linear layers' outputs; the first input follows from the layer (input_width).
+    networks: per name the outputs of its linear layers; the first input follows from the layer (input_width). widths:
+    those of the scene's anchors.
     """
 
     rows: int
@@ -89,11 +89,12 @@ class LayerMeta:
     steps: dict[str, float]
     scales: tuple[ScaleMeta, ...]
     networks: dict[str, tuple[int, ...]]
+    widths: Widths
 
     def input_width(self, name: str, kind: LayerKind) -> int:
         """Inputs of network `name`: the scaffold's fixed ones, the sampled planes' or the trunk's outputs."""
         if kind.layer == 0:
-            return SCAFFOLD_INPUT
+            return self.widths.inputs
         return sum(s.channels for s in self.scales) if name == TRUNK else self.networks[TRUNK][-1]
 
     def weight_shapes(self, kind: LayerKind) -> list[tuple[int, ...]]:
@@ -122,7 +123,9 @@ def pack_meta(meta: LayerMeta, kind: LayerKind) -> bytes:
     return canonical.pack(fields)
 
 
-def unpack_meta(data: bytes, kind: LayerKind, rows_before: int, raw_deformation: bool, later: bool) -> LayerMeta:
+def unpack_meta(
+    data: bytes, kind: LayerKind, widths: Widths, rows_before: int, raw_deformation: bool, later: bool
+) -> LayerMeta:
     """The inverse of pack_meta (clause "layer parameters"); every count is within its limit afterwards.
 
     later: whether it is a slice behind the layer's first."""
@@ -130,13 +133,14 @@ def unpack_meta(data: bytes, kind: LayerKind, rows_before: int, raw_deformation:
     fields = Fields(canonical.unpack(data), where, set(range(ROWS, NETWORKS + 1)))
     known_sections = {int(s) for s in Section}
     sections = Fields(fields.get(SECTIONS), f"{where} sections", known_sections)
-    networks = {} if later else _unpack_networks(fields, kind, where)
+    networks = {} if later else _unpack_networks(fields, kind, widths, where)
     meta = LayerMeta(
         rows=fields.integer(ROWS, MAX_ANCHORS - rows_before),
         sections={s: sections.integer(s, MAX_PAYLOAD, low=1) for s in known_sections if s in sections},
         steps=_unpack_steps(fields, kind, where) if networks else {},
         scales=_unpack_scales(fields, raw_deformation, where) if networks and kind.layer > 0 else (),
         networks=networks,
+        widths=widths,
     )
     for key, expected in ((STEPS, bool(networks)), (SCALES, bool(meta.scales)), (NETWORKS, bool(networks))):
         if (key in fields) != expected:
@@ -148,7 +152,7 @@ def declared_symbols(meta: LayerMeta, kind: LayerKind, rises: int) -> int:
     """Symbols (or float32 values) that the parameters say the slice has, voxel indices and masks included."""
     cells = sum(math.prod(shape) for shape in meta.plane_shapes())
     weights = sum(math.prod(shape) for shape in meta.weight_shapes(kind)) if meta.networks else 0
-    return rises + meta.rows * (N_CHANNELS + 4) + cells + weights
+    return rises + meta.rows * (meta.widths.channels + 4) + cells + weights
 
 
 def check_symbol_count(meta: LayerMeta, kind: LayerKind, before: Declared, payload_bytes: int, rises: int) -> Declared:
@@ -194,9 +198,9 @@ def _unpack_scales(fields: Fields, raw_deformation: bool, where: str) -> tuple[S
     return tuple(scales)
 
 
-def _unpack_networks(fields: Fields, kind: LayerKind, where: str) -> dict[str, tuple[int, ...]]:
+def _unpack_networks(fields: Fields, kind: LayerKind, widths: Widths, where: str) -> dict[str, tuple[int, ...]]:
     rows = fields.sequence(NETWORKS) if NETWORKS in fields else []
-    names = {number: name for name, number in kind.network_ids.items()}
+    names, heads = {number: name for name, number in kind.network_ids.items()}, kind.heads(widths)
     if NETWORKS in fields and not rows:
         raise Malformed(f"{where}: an empty list of networks, expected some or no list")
     networks: dict[str, tuple[int, ...]] = {}
@@ -205,16 +209,16 @@ def _unpack_networks(fields: Fields, kind: LayerKind, where: str) -> dict[str, t
         entry = as_list(row, f"{where} network")
         if not entry:
             raise Malformed(f"{where}: an empty network entry, expected an id and widths")
-        number, *widths = entry
+        number, *outputs = entry
         if as_registered(number, names, f"{where} network id") <= last:
             raise Malformed(f"{where}: network {number} after {last}, expected ascending ids")
         last, name = number, names[number]
-        as_integer(len(widths), MAX_NETWORK_LAYERS, f"{where} network {name} layers", low=1)
-        for width in widths:
+        as_integer(len(outputs), MAX_NETWORK_LAYERS, f"{where} network {name} layers", low=1)
+        for width in outputs:
             as_integer(width, MAX_NETWORK_WIDTH, f"{where} network {name} width", low=1)
-        if widths[-1] != kind.heads.get(name, widths[-1]):
-            raise Malformed(f"{where} network {name}: {widths[-1]} outputs, expected {kind.heads[name]}")
-        networks[name] = tuple(widths)
+        if outputs[-1] != heads.get(name, outputs[-1]):
+            raise Malformed(f"{where} network {name}: {outputs[-1]} outputs, expected {heads[name]}")
+        networks[name] = tuple(outputs)
     if kind.layer == 0 and len(networks) != len(names):
         raise Malformed(f"{where}: networks {list(networks)}, expected {list(kind.network_ids)}")
     if networks and kind.layer > 0 and (TRUNK not in networks or len(networks) == 1):

@@ -11,7 +11,7 @@ from pd4dgs_codec.codec.kinds import LayerKind
 from pd4dgs_codec.codec.options import EncodeOptions
 from pd4dgs_codec.codec.payload import write_layer
 from pd4dgs_codec.codec.symbols import LayerSymbols, layer_steps, quantise_tensors
-from pd4dgs_codec.scene import Deformation, Steps
+from pd4dgs_codec.scene import Deformation, Steps, Widths
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,6 +45,7 @@ def tensor_bytes(tensors: Deformation, kind: LayerKind, steps: Steps, options: E
     empty = np.zeros(0, np.int32)
     alone = LayerSymbols(
         kind=kind,
+        widths=Widths(),  # of no anchors
         anchor_q=np.zeros((0, 3), np.int32),
         mask_increase=empty,
         mask_own=empty,

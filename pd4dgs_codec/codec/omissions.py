@@ -19,22 +19,26 @@ from pd4dgs_codec.codec.left_out import LeftOut
 from pd4dgs_codec.codec.plane_choice import choose_predictor, fill_plane
 from pd4dgs_codec.codec.symbols import rounded
 from pd4dgs_codec.entropy.bits import entropy_bits
-from pd4dgs_codec.evaluate.reach import reach
-from pd4dgs_codec.scene import FEATURE_DIM, N_OFFSETS, PLANES, TRUNK, Deformation, Network, Planes, Scene
+from pd4dgs_codec.evaluate.reach import Reached, global_cells, local_cells, shown_gaussians
+from pd4dgs_codec.scene import PLANES, TRUNK, Deformation, Network, Planes, Scene
 
 #: Networks whose values may exceed this are left as they are; binary32 overflows at 3.4e38.
 LARGEST = 1e30
+#: Bits that an evaluation of the global networks at one anchor, over one stretch of time, may cost at the usual effort:
+#: some 5 kB for a second. Two levels of effort are a factor of ten.
+PRICE, USUAL_EFFORT = 0.3, 5
 
 
-def leave_out_unseen(scene: Scene, raw_deformation: bool) -> tuple[Scene, list[LeftOut]]:
+def leave_out_unseen(scene: Scene, raw_deformation: bool, effort: int) -> tuple[Scene, list[LeftOut]]:
     """(`scene` without what no picture needs, what went). scene: as planned, all its rows active at its highest level.
 
-    Where nothing is left out the values stay those given; what takes another value takes one that has a symbol.
+    Where nothing is left out the values stay those given; what takes another value takes one that has a symbol. effort:
+    1..9, how little a proof may save that takes its time.
     """
     omissions = _Omissions(scene, raw_deformation)
     while omissions.within_range() and omissions.simplify_networks():
         pass
-    omissions.free_offsets_and_cells()
+    omissions.free_offsets_and_cells(PRICE * 10.0 ** ((USUAL_EFFORT - effort) / 2))
     return omissions.scene, omissions.found
 
 
@@ -86,10 +90,11 @@ class _Omissions:
     def _zero_unread_features(self) -> None:
         """Feature channels that no network reads: 0 in all anchors, and no residual; and the reverse, weights of
         channels that are 0 in all anchors and have no residual."""
+        width = self.scene.widths.feature
         firsts = {name: self.decoded.networks[name][0][0] for name in self.decoded.networks}
-        unread = ~np.any([w[:, :FEATURE_DIM].any(axis=0) for w in firsts.values()], axis=0)
+        unread = ~np.any([w[:, :width].any(axis=0) for w in firsts.values()], axis=0)
         head = self._networks(LAYER_KINDS[1]).get("feature")
-        moved = np.zeros(FEATURE_DIM, bool) if head is None else np.any([head[-1][0].any(1), head[-1][1] != 0], axis=0)
+        moved = np.zeros(width, bool) if head is None else np.any([head[-1][0].any(1), head[-1][1] != 0], axis=0)
         zero = ~self.decoded.feature.any(axis=0)
         stale = unread & ~zero
         if stale.any():
@@ -166,68 +171,79 @@ class _Omissions:
 
     # -- offsets and cells -------------------------------------------------------------------------------------------
 
-    def free_offsets_and_cells(self) -> None:
-        """Offsets of Gaussians never shown, and plane cells never read, as `reach` proves; in this order, for the
-        offsets say where cells are read."""
-        reached = reach(self.decoded)
-        shown = reached[2]
-        if not shown.all():
-            self._free_offsets(shown)
-        for kind, cells in zip(LAYER_KINDS[1:], reached[:2], strict=True):
-            if cells:
-                self._free_cells(kind, cells)
+    def free_offsets_and_cells(self, price: float) -> None:
+        """Offsets of Gaussians never shown, and plane cells never read, as `reach` proves where that may save `price`
+        bits an evaluation; in this order, for the offsets say where cells are read."""
+        self._free_cells(LAYER_KINDS[1], global_cells(self.decoded))
+        shown = shown_gaussians(
+            self.decoded, lambda certain, evaluations: self._without_offsets(certain)[1] > price * evaluations
+        )
+        self._free_offsets(shown)
+        kind = LAYER_KINDS[2]
+        cells = local_cells(
+            self.decoded,
+            shown,
+            lambda read, evaluations: self._without_cells(kind, read)[1] > price * evaluations,
+        )
+        if cells:
+            self._free_cells(kind, cells)
 
-    def _free_offsets(self, shown: np.ndarray) -> None:
-        step = self.scene.steps.offset
-        symbols = quantise(self.decoded.offset, step, "offset").reshape(len(shown), -1)
+    def _without_offsets(self, shown: np.ndarray) -> tuple[np.ndarray, float]:
+        """(offset symbols [N, 3 G], the commonest ones for Gaussians that are not `shown` bool [N, G], bits saved)."""
+        n, slots = shown.shape
+        symbols = quantise(self.decoded.offset, self.scene.steps.offset, "offset").reshape(n, 3 * slots)
         free = np.repeat(~shown, 3, axis=1)
         freed = symbols.copy()
         for channel in range(symbols.shape[1]):
             taken = symbols[~free[:, channel], channel]
             values, counts = np.unique(taken, return_counts=True)
             freed[free[:, channel], channel] = values[counts.argmax()] if taken.size else 0
-        if (freed == symbols).all():
+        return freed, 0.0 if (freed == symbols).all() else _bits(symbols.T) - _bits(freed.T)
+
+    def _free_offsets(self, shown: np.ndarray) -> None:
+        if shown.all():
             return
-        bits = _bits(symbols.T) - _bits(freed.T)
+        freed, bits = self._without_offsets(shown)
+        values = dequantise(freed, self.scene.steps.offset).reshape(self.decoded.offset.shape)
+        if (values == self.decoded.offset).all():
+            return
         self._note(f"offsets of {int((~shown).sum())} Gaussians", "no view shows them at any time", bits)
-        values = dequantise(freed, step).reshape(-1, N_OFFSETS, 3)
         self._edit(lambda scene: replace(scene, offset=np.where(shown[..., None], scene.offset, values)))
 
-    def _free_cells(self, kind: LayerKind, reached: tuple[dict[str, np.ndarray], ...]) -> None:
-        decoded = self.decoded.tensors(kind.layer).planes
-        free: list[dict[str, np.ndarray]] = []  # what unread cells take, by name of the planes that have some
-        saved, count, cells = 0.0, 0, 0
-        for scale, marks in zip(decoded, reached, strict=True):
-            free.append({})
-            for name, _, _ in PLANES:
-                read = marks[name]
-                cells += read.size
-                if read.all():
+    def _without_cells(self, kind: LayerKind, read: Reached) -> tuple[list[dict[str, np.ndarray]], float]:
+        """(per scale, by name, the planes that may take other values in cells that are not `read`; bits saved)."""
+        planes: list[dict[str, np.ndarray]] = []
+        saved = 0.0
+        for scale, marks in zip(self.decoded.tensors(kind.layer).planes, read, strict=True):
+            planes.append({})
+            for name, mark in marks.items():
+                symbols = self._plane_symbols(kind, scale[name])
+                cheap = np.where(mark, symbols, 0) if self.raw_deformation else fill_plane(symbols, mark)
+                if (cheap == symbols).all():
                     continue
-                count += int((~read).sum())
                 if self.raw_deformation:
-                    free[-1][name] = np.zeros_like(scale[name])
-                    saved += 32.0 * len(scale[name]) * int((~read).sum())
+                    planes[-1][name] = cheap.view(np.float32)
+                    saved += 32.0 * len(symbols) * int((~mark).sum())
                 else:
-                    symbols = self._plane_symbols(kind, scale[name])
-                    fill = fill_plane(symbols, read)
-                    saved += _plane_bits(symbols) - _plane_bits(fill)
-                    free[-1][name] = dequantise(fill, self.scene.steps.planes(kind.layer))
+                    planes[-1][name] = dequantise(cheap, self.scene.steps.planes(kind.layer))
+                    saved += _plane_bits(symbols) - _plane_bits(cheap)
+        return planes, saved
 
-        def filled(planes: Planes) -> Planes:
-            return tuple(
-                scale | {name: np.where(marks[name], scale[name], values[name]) for name in values}
-                for scale, marks, values in zip(planes, reached, free, strict=True)
-            )
-
-        if any(
-            (p[n] != s[n]).any()
-            for p, s in zip(filled(self.scene.tensors(kind.layer).planes), decoded, strict=True)
-            for n in p
-        ):
-            why = "no anchor is ever there" if kind.layer == 1 else "no Gaussian shown is ever there"
-            self._note(f"{kind.name}: {count:,} of {cells:,} plane cells", why, saved)
-            self._edit_planes(kind, filled)
+    def _free_cells(self, kind: LayerKind, read: Reached) -> None:
+        values, saved = self._without_cells(kind, read)
+        if not any(values):
+            return
+        marks = [mark for scale in read for mark in scale.values()]
+        free, cells = sum(int((~mark).sum()) for mark in marks), sum(mark.size for mark in marks)
+        why = "no anchor is ever there" if kind.layer == 1 else "no Gaussian shown is ever there"
+        self._note(f"{kind.name}: {free:,} of {cells:,} plane cells", why, saved)
+        self._edit_planes(
+            kind,
+            lambda planes: tuple(
+                scale | {name: np.where(marks[name], scale[name], cheap[name]) for name in cheap}
+                for scale, marks, cheap in zip(planes, read, values, strict=True)
+            ),
+        )
 
     # -- bookkeeping -------------------------------------------------------------------------------------------------
 

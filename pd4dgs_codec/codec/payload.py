@@ -15,7 +15,6 @@ import numpy as np
 
 from pd4dgs_codec.attributes import planes as decorrelation
 from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
-from pd4dgs_codec.attributes.table import N_CHANNELS
 from pd4dgs_codec.bitstream.limits import MAX_PARAMETERS
 from pd4dgs_codec.codec.attribute_section import Past, read_attributes, write_attributes
 from pd4dgs_codec.codec.kinds import LayerKind
@@ -44,7 +43,7 @@ from pd4dgs_codec.entropy.lzma_mode import (
 from pd4dgs_codec.entropy.positions import decode_positions, encode_positions
 from pd4dgs_codec.entropy.priors import Prior
 from pd4dgs_codec.errors import LimitExceeded, Malformed
-from pd4dgs_codec.scene import MASK_MIN_CODE, PLANES, Network, Planes
+from pd4dgs_codec.scene import MASK_MIN_CODE, PLANES, Network, Planes, Widths
 
 #: The groups of channels, by section, in coding order; FLOATS and POSITIONS are not channels.
 GROUPS = (Section.MASKS, Section.ATTRIBUTES, Section.PLANES, Section.WEIGHTS)
@@ -81,7 +80,9 @@ def write_layer(
         if not any(channel.size for channel in channels):
             continue
         if section == Section.ATTRIBUTES:
-            data, rate_bits = write_attributes(symbols.attributes, options.priors, options.effort, past, population)
+            data, rate_bits = write_attributes(
+                symbols.attributes, symbols.widths, options.priors, options.effort, past, population
+            )
         elif section == Section.PLANES:
             data, rate_bits = write_planes(_by_plane(channels, symbols), options.priors, options.effort)
         elif options.mode == "lzma":  # one stream for all, but a layer's rate counts no masks
@@ -138,14 +139,21 @@ def _meta(symbols: LayerSymbols, sections: dict[Section, bytes], predictors: lis
         steps=symbols.steps,
         scales=tuple(scales),
         networks={name: tuple(w.shape[0] for w, _ in network) for name, network in symbols.networks.items()},
+        widths=symbols.widths,
     )
 
 
 def read_meta(
-    payload: bytes | memoryview, kind: LayerKind, before: Declared, raw_deformation: bool, later: bool = False
+    payload: bytes | memoryview,
+    kind: LayerKind,
+    widths: Widths,
+    before: Declared,
+    raw_deformation: bool,
+    later: bool = False,
 ) -> tuple[LayerMeta, int, Declared]:
     """(parameters, offset of the first section, what the file declares with this slice) of a payload, all lengths
-    checked against the bytes there are. before: what the slices before it declare. later: behind its layer's first."""
+    checked against the bytes there are. widths: of the anchors. before: what the slices before it declare. later:
+    behind its layer's first."""
     if len(payload) < 4:
         raise Malformed(f"layer {kind.layer}: payload of {len(payload)} bytes, expected at least 4")
     (length,) = struct.unpack_from("<I", payload)
@@ -153,7 +161,7 @@ def read_meta(
         raise LimitExceeded(f"layer {kind.layer}: parameters of {length} bytes, limit {MAX_PARAMETERS}")
     if length > len(payload) - 4:
         raise Malformed(f"layer {kind.layer}: parameters of {length} bytes in a payload of {len(payload)}")
-    meta = unpack_meta(bytes(payload[4 : 4 + length]), kind, before.rows, raw_deformation, later)
+    meta = unpack_meta(bytes(payload[4 : 4 + length]), kind, widths, before.rows, raw_deformation, later)
     start, declared = 4 + length, sum(meta.sections.values())
     if start + declared != len(payload):
         raise Malformed(f"layer {kind.layer}: sections of {declared} bytes, expected {len(payload) - start}")
@@ -163,18 +171,20 @@ def read_meta(
 def read_layer(
     payload: bytes | memoryview,
     kind: LayerKind,
+    widths: Widths,
     before: Declared,
     mode: str,
     raw_deformation: bool,
     later: bool = False,
     past: Past[Prior] | None = None,
 ) -> LayerSymbols:
-    """The symbols of a payload (clause "layer payload"). before: what the slices before this one declare. later: it
-    stands behind its layer's first. past: of the layer's slices before, to which this one is added.
+    """The symbols of a payload (clause "layer payload"). widths: of the anchors. before: what the slices before this
+    one declare. later: it stands behind its layer's first. past: of the layer's slices before, to which this one is
+    added.
 
     Raises DecodeError's subclasses; nothing is allocated for a count that the limits or the payload do not cover.
     """
-    meta, start, _ = read_meta(payload, kind, before, raw_deformation, later)
+    meta, start, _ = read_meta(payload, kind, widths, before, raw_deformation, later)
     parts: dict[int, bytes] = {}
     for section, length in sorted(meta.sections.items()):
         parts[section] = bytes(payload[start : start + length])
@@ -198,7 +208,9 @@ def read_layer(
     for tensor in (attributes, *tensors):
         if tensor.dtype.kind == "i" and tensor.size and max(int(tensor.max()), -int(tensor.min())) > MAX_SYMBOL:
             raise Malformed(f"layer {kind.layer}: a symbol over {MAX_SYMBOL} in magnitude")
-    return LayerSymbols(kind, anchor_q, increase, own, attributes, planes, networks, meta.steps, raw_deformation)
+    return LayerSymbols(
+        kind, widths, anchor_q, increase, own, attributes, planes, networks, meta.steps, raw_deformation
+    )
 
 
 def _part(parts: dict[int, bytes], section: Section, symbols: int) -> bytes:
@@ -214,7 +226,7 @@ def _channel_counts(meta: LayerMeta, kind: LayerKind, rises: int, raw_deformatio
     weights = [] if raw_deformation else [math.prod(shape) for shape in meta.weight_shapes(kind)]
     return {
         Section.MASKS: [rises, meta.rows],
-        Section.ATTRIBUTES: [meta.rows] * N_CHANNELS,
+        Section.ATTRIBUTES: [meta.rows] * meta.widths.channels,
         Section.PLANES: planes,
         Section.WEIGHTS: weights,
     }
@@ -238,7 +250,7 @@ def _decode_groups(
         if not data:
             channels[section] = _zeros(counts[section])
         elif section == Section.ATTRIBUTES:
-            channels[section] = list(read_attributes(data, rows, past))
+            channels[section] = list(read_attributes(data, meta.widths, rows, past))
         elif section == Section.PLANES:
             channels[section] = [
                 channel.ravel() for plane in read_planes(data, meta.plane_shapes()) for channel in plane

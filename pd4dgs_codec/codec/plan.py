@@ -44,7 +44,7 @@ def plan(scene: Scene, options: EncodeOptions = DEFAULTS) -> tuple[Scene, list[L
         why = f"mask at or below the threshold at level {scene.level}"
         left_out.append(LeftOut(f"{inactive} anchors", why, anchors=inactive))
     if options.omit != "nothing":
-        arranged, lossless = leave_out_unseen(arranged, options.raw_deformation)
+        arranged, lossless = leave_out_unseen(arranged, options.raw_deformation, options.effort)
         left_out += lossless
     return arranged, left_out
 

@@ -23,6 +23,7 @@ from pd4dgs_codec.errors import Malformed
 #: The two forms of a section: one payload of all its channels as they are, or a block and stages.
 PLAIN, STAGED = 0, 1
 MAX_CLASSES = 8
+EXACT = 1 << 53  #: binary64 holds every integer up to here
 #: Encoder: numbers of classes to try, and about what each further prior costs.
 CLASS_COUNTS = (1, 2, 3, 4, 5, 6, 8)
 PRIOR_BITS = 40
@@ -40,8 +41,13 @@ def relative_magnitude(residuals: np.ndarray, places: int = 0, sums: np.ndarray 
         places, sums = magnitude.shape[1], magnitude.sum(axis=1)
     else:
         magnitude = np.minimum(magnitude, sums[:, None])
-    relative = magnitude * (places << 8) // (sums[:, None] + 1)
-    total: np.ndarray = relative.sum(axis=0)
+    total: np.ndarray
+    if int(magnitude.max(initial=0)) * (places << 8) < EXACT:
+        # of integers below 2^53 the rounded quotient has the floor of the true one, and processors divide reals faster
+        shares = (magnitude * float(places << 8)) / (sums[:, None] + 1)
+        total = np.floor(shares, out=shares).sum(axis=0).astype(np.int64)
+    else:
+        total = (magnitude * (places << 8) // (sums[:, None] + 1)).sum(axis=0)
     return total
 
 

@@ -12,7 +12,7 @@ from pd4dgs_codec.attributes.table import attribute_rows, dequantise_attributes,
 from pd4dgs_codec.codec.kinds import LAYER_KINDS, LayerKind
 from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.morton import MAX_VOXEL, morton_order
-from pd4dgs_codec.scene import PLANES, Deformation, Network, Planes, Scene, SceneInfo, Steps
+from pd4dgs_codec.scene import PLANES, Deformation, Network, Planes, Scene, SceneInfo, Steps, Widths
 
 #: (name for messages, array) -> array of the same shape.
 ArrayMap = Callable[[str, np.ndarray], np.ndarray]
@@ -22,13 +22,15 @@ ArrayMap = Callable[[str, np.ndarray], np.ndarray]
 class LayerSymbols:
     """What one layer carries, or one slice of it: later slices have anchors with their masks and attributes alone.
 
-    anchor_q: int32 [n, 3] voxel indices of its own anchors, in Morton order. mask_increase: int32 [rows before] rise of
-    the earlier anchors' mask codes, mask_own: int32 [n] codes of its own. attributes: int32 [68, n].
-    planes, networks: int32 symbols, or float32 values if raw_deformation; networks in the order of their registry ids.
-    steps: quantisation steps of this layer by name, as in LayerKind.step_names; empty if it has no networks.
+    widths: of the anchors. anchor_q: int32 [n, 3] voxel indices of its own anchors, in Morton order. mask_increase:
+    int32 [rows before] rise of the earlier anchors' mask codes, mask_own: int32 [n] codes of its own. attributes: int32
+    [channels, n]. planes, networks: int32 symbols, or float32 values if raw_deformation; networks in the order of their
+    registry ids. steps: quantisation steps of this layer by name, as in LayerKind.step_names; empty if it has no
+    networks.
     """
 
     kind: LayerKind
+    widths: Widths
     anchor_q: np.ndarray
     mask_increase: np.ndarray
     mask_own: np.ndarray
@@ -138,6 +140,7 @@ def layer_symbols(scene: Scene, index: int, raw_deformation: bool = False) -> La
         tensors = quantise_tensors(tensors, kind, scene.steps)
     return LayerSymbols(
         kind=kind,
+        widths=scene.widths,
         anchor_q=scene.anchor_q[first:last],
         mask_increase=codes[:first] - before,
         mask_own=codes[first:],
@@ -156,7 +159,7 @@ def assemble(info: SceneInfo, attribute_steps: dict[str, float], layers: Sequenc
     """
     steps = Steps(**attribute_steps, **{k: v for layer in layers for k, v in layer.steps.items()})
     attributes = np.concatenate([layer.attributes for layer in layers], axis=1)
-    values = dequantise_attributes(attributes, attribute_steps)
+    values = dequantise_attributes(attributes, layers[0].widths, attribute_steps)
     masks = _mask_codes(layers)
     tensors = {layer.kind.layer: _decoded_tensors(layer, steps) for layer in layers}
     return Scene(
@@ -223,7 +226,7 @@ def _with_steps(
 ) -> Iterator[tuple[np.ndarray, float]]:
     """(symbols, their step) of everything in `layer` that is dequantised."""
     yield layer.anchor_q, voxel_size
-    yield from ((rows, attribute_steps[a.name]) for a, rows in attribute_rows(layer.attributes))
+    yield from ((rows, attribute_steps[name]) for name, rows in attribute_rows(layer.attributes, layer.widths))
     if not layer.raw_deformation:
         planes, steps = len(PLANES) * len(layer.planes), list(layer.steps.values())
         yield from ((k, steps[0 if i < planes else -1]) for i, k in enumerate(layer.tensors()))

@@ -1,4 +1,4 @@
-"""A `.pd4` file as a folder that web players know what to do with: DASH, HLS and a JSON index beside it.
+"""A `.pd4` file as a folder for any web server: a page that plays it, DASH, HLS and a JSON index beside it.
 
 DASH carries the layers themselves: `scene.mp4` holds each slice in a fragment of its own, and the manifest names the
 fragments with their dependencies. Concatenated, the samples are the `.pd4` file again. HLS has no layers that depend on
@@ -18,6 +18,7 @@ from typing import Any
 from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.info import info
 from pd4dgs_codec.delivery import mp4
+from pd4dgs_codec.delivery.page import PAGE, page
 from pd4dgs_codec.errors import DeliveryError
 from pd4dgs_codec.scene import Scene
 
@@ -75,6 +76,7 @@ def package(data: bytes, render: Callable[[Scene], Video | None] | None = None) 
         files |= {VIDEO: video.data, VIDEO_PLAYLIST: _video_playlist(video)}
     files[PLAYLIST] = _playlist(video)
     files[INDEX] = _index(data, init, parts, seconds, video)
+    files[PAGE] = page().encode()
     return files
 
 

@@ -6,6 +6,7 @@ It is for trying, measuring and showing; `pd4dgs-serve --help` says how nginx or
 from __future__ import annotations
 
 import contextlib
+import gzip
 import os
 import socket
 import stat
@@ -21,6 +22,7 @@ from typing import BinaryIO
 from urllib.parse import quote, unquote, urlsplit
 
 from pd4dgs_codec.delivery.link import Link
+from pd4dgs_codec.delivery.page import PAGE
 from pd4dgs_codec.delivery.patience import Patient
 from pd4dgs_codec.delivery.ranges import Unsatisfiable, http_time, lists_etag, requested_range
 from pd4dgs_codec.errors import DeliveryError
@@ -36,6 +38,8 @@ MEDIA_TYPES = {
     ".png": "image/png",
     ".wasm": "application/wasm",
 }
+#: Sent compressed to who takes that, up to a size in bytes, as any server of pages does.
+ZIPPED, MAX_ZIPPED = {".html", ".js", ".json"}, 1 << 20
 METHODS = "GET, HEAD, OPTIONS"
 CORS = {
     "Access-Control-Allow-Origin": "*",
@@ -55,11 +59,13 @@ IDLE_SECONDS = 60.0
 def locate(root: Path, target: str) -> Path | None:
     """The file under `root` that a request target names; None for all else: no such file, hidden names, ways out.
 
+    A target that ends in a slash names the folder's page.
     root: absolute and free of links. Links inside it count if what they lead to lies inside it as well.
     """
     try:
         path = unquote(urlsplit(target).path, errors="strict")
         names = path.split("/")[1:]
+        names[-1:] = [names[-1] or PAGE] if names else []
         if not path.startswith("/") or any(n.startswith(".") or not n or "\\" in n or "\0" in n for n in names):
             return None
         found = root.joinpath(*names).resolve(strict=True)
@@ -176,12 +182,20 @@ class _Handler(BaseHTTPRequestHandler):
     def _send_file(self, file: BinaryIO, suffix: str, body: bool) -> None:
         state = os.fstat(file.fileno())
         size, etag = state.st_size, _etag(state)
+        zipped = suffix in ZIPPED and size <= MAX_ZIPPED and self._takes_gzip()
+        if zipped:  # another representation: neither its ranges nor its ETag are those of the plain one
+            etag = etag[:-1] + '-gzip"'
         headers = {"Accept-Ranges": "bytes", "Cache-Control": "no-cache", "ETag": etag}
         headers["Last-Modified"] = formatdate(state.st_mtime, usegmt=True)
+        if suffix in ZIPPED:
+            headers["Vary"] = "Accept-Encoding"
         if self._unchanged(etag, state.st_mtime):
             self._begin(HTTPStatus.NOT_MODIFIED, headers)
             return
         headers["Content-Type"] = MEDIA_TYPES.get(suffix, "application/octet-stream")
+        if zipped:
+            self._send_zipped(file, headers, body)
+            return
         try:
             # HTTP defines ranges for GET alone
             part = requested_range(self.headers.get("Range"), size) if body and self._range_holds(etag, state) else None
@@ -196,6 +210,18 @@ class _Handler(BaseHTTPRequestHandler):
         if body:
             file.seek(start)
             self._send_body(file, end - start, etag)
+
+    def _takes_gzip(self) -> bool:
+        listed = self.headers.get("Accept-Encoding", "").lower().replace(" ", "").split(",")
+        return "gzip" in listed and "Range" not in self.headers
+
+    def _send_zipped(self, file: BinaryIO, headers: dict[str, str], body: bool) -> None:
+        content = gzip.compress(file.read(MAX_ZIPPED), 9, mtime=0)
+        self._begin(HTTPStatus.OK, {**headers, "Content-Encoding": "gzip", "Content-Length": str(len(content))})
+        if body:
+            with self.server.link.transfer():
+                self.server.link.cross(len(content))
+                self.wfile.write(content)
 
     def _send_body(self, file: BinaryIO, left: int, etag: str) -> None:
         link = self.server.link

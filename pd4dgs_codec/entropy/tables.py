@@ -28,16 +28,14 @@ def norm_cdf28(n: int, mu8: int | np.ndarray, si: int | np.ndarray) -> np.ndarra
     mu8: 256 * (mean - kmin), in symbols; si: 64 * log2(sigma / Q). Arrays broadcast as leading axes.
     """
     mu8, si = np.asarray(mu8, dtype=np.int64)[..., None], np.asarray(si, dtype=np.int64)[..., None]
-    e, j = si >> 6, si & 63
-    nb = np.maximum(0, e - 8)
-    t = np.arange(n - 1, dtype=np.int64) * 256 + 128 - mu8
-    return _mass(t, nb, OCTAVE[j], 23 + e - nb)
+    return _mass(np.arange(n - 1, dtype=np.int64) * 256 + 128 - mu8, si)
 
 
-def _mass(t: np.ndarray, nb: np.ndarray, octave: np.ndarray, shift: np.ndarray) -> np.ndarray:
-    """The Gaussian's mass up to t / 256 from its mean, in units of 2**-28."""
+def _mass(t: np.ndarray, si: np.ndarray) -> np.ndarray:
+    """The Gaussian's mass up to t / 256 from its mean, in units of 2**-28; si broadcasts against t."""
+    e, nb = si >> 6, np.maximum(0, (si >> 6) - 8)
     a = np.minimum(np.abs(t) >> nb, (1 << 21) - 1)
-    z = np.minimum((a * octave) >> shift, 8 << 16)
+    z = np.minimum((a * OCTAVE[si & 63]) >> (23 + e - nb), 8 << 16)
     i, f = z >> 11, z & 2047
     v = NORMAL[i] + (((NORMAL[i + 1] - NORMAL[i]) * f) >> 11)
     mass: np.ndarray = (1 << 27) + np.where(t < 0, -v, v)
@@ -50,21 +48,22 @@ def norm_cdf28_of_each(sizes: np.ndarray, mu8: np.ndarray, si: np.ndarray) -> np
     Decoding a short table costs less than calling numpy for it. A table takes neither the first nor the last value.
     """
     lengths = sizes + 1
-    k = np.arange(int(lengths.sum())) - np.repeat(np.cumsum(lengths) - lengths, lengths)
-    e, j = si >> 6, si & 63
-    nb = np.maximum(0, e - 8)
-    t = k * 256 - np.repeat(128 + mu8, lengths)
-    return _mass(t, np.repeat(nb, lengths), np.repeat(OCTAVE[j], lengths), np.repeat(23 + e - nb, lengths))
+    return _mass(_counted(lengths) * 256 - np.repeat(128 + mu8, lengths), np.repeat(si, lengths))
 
 
 def tables_of_each(cdf: np.ndarray, sizes: np.ndarray, floor: np.ndarray) -> list[np.ndarray]:
     """`table_from_cdf28` of what norm_cdf28_of_each gives for tables of `sizes`, with a floor int64 [m] each."""
     lengths = sizes + 1
     ends = np.cumsum(lengths)
-    k = np.arange(len(cdf)) - np.repeat(ends - lengths, lengths)
-    cum = ((cdf * np.repeat(TOTAL - sizes * floor, lengths)) >> 28) + np.repeat(floor, lengths) * k
+    cum = ((cdf * np.repeat(TOTAL - sizes * floor, lengths)) >> 28) + np.repeat(floor, lengths) * _counted(lengths)
     cum[ends - lengths], cum[ends - 1] = 0, TOTAL
     return np.split(cum, ends[:-1])
+
+
+def _counted(lengths: np.ndarray) -> np.ndarray:
+    """0 .. length - 1 of each of `lengths`, one behind the other."""
+    counted: np.ndarray = np.arange(int(lengths.sum())) - np.repeat(np.cumsum(lengths) - lengths, lengths)
+    return counted
 
 
 def table_from_cdf28(cdf: np.ndarray, floor: int) -> np.ndarray:

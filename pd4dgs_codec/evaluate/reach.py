@@ -12,15 +12,15 @@ Gaussian that no sample shows is in doubt.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
 from pd4dgs_codec import threads
 from pd4dgs_codec.evaluate.enclosure import Enclosure, Range, Ranges, instants, kernels
-from pd4dgs_codec.scene import FEATURE_DIM, N_OFFSETS, PLANES, Scene, plane_sides
+from pd4dgs_codec.scene import PLANES, Deformation, Scene, plane_sides
 
 Reached = tuple[dict[str, np.ndarray], ...]  #: per scale, plane name -> bool [H, W]
 
@@ -38,7 +38,15 @@ NARROW = 0.3
 #: Points enclosed at once: bounds the memory.
 CHUNK = 1024
 
-T, U = TypeVar("T"), TypeVar("U")
+Known = TypeVar("Known")
+
+
+#: (what is known of the cells or Gaussians, evaluations of the global networks left) -> whether to go on.
+Pays = Callable[[Known, int], bool]
+
+
+def _always(*_: Any) -> bool:
+    return True
 
 
 class _Boxes:
@@ -118,47 +126,81 @@ def _counted(sums: np.ndarray, rows: Cells, columns: Cells) -> np.ndarray:
     return held
 
 
-def reach(scene: Scene) -> tuple[Reached, Reached, np.ndarray]:
-    """(cells of the global planes, cells of the local ones, bool [N, 10] Gaussians that some view may show).
+def global_cells(scene: Scene) -> Reached:
+    """The cells of the global planes that anchors read; () without such planes."""
+    field = scene.global_deformation
+    cells = _Marks(field.planes if field else ())
+    count = len(scene.anchor)
+    cells.read(_Boxes(*_unit(scene.info.box, scene.anchor, scene.anchor), np.zeros(count), np.ones(count)))
+    return cells.reached
 
-    scene: as decoded, whose rows are all active at its highest level. A deformation that it lacks has no cells.
-    """
-    field, local = scene.global_deformation, scene.local_deformation
-    cells, local_cells = _Marks(field.planes if field else ()), _Marks(local.planes if local else ())
-    anchor = scene.anchor
-    count = len(anchor)
-    cells.read(_Boxes(*_unit(scene.info.box, anchor, anchor), np.zeros(count), np.ones(count)))
-    shown = np.zeros((count, N_OFFSETS), bool)
-    grid = instants(field) if field else np.array([0.0, 1.0])
-    spans = list(zip(grid[:-1].tolist(), grid[1:].tolist(), strict=True))
-    chunks = max(1, -(-count // CHUNK))
+
+def shown_gaussians(scene: Scene, pays: Pays[np.ndarray] = _always) -> np.ndarray:
+    """bool [N, G]: the Gaussians that some view may show. Those that features without residuals do not show are
+    looked at if it `pays`, which is told what is certain, as if no other were shown."""
+    shown = _may_show(scene, np.arange(len(scene.anchor)), None)
+    field = scene.global_deformation
+    if field is None or "feature" not in field.networks:
+        return shown
+    open_, spans = np.flatnonzero(~shown.all(axis=1)), _spans(field)
+    if not pays(shown, open_.size * len(spans)):
+        return np.ones_like(shown)
     with ThreadPoolExecutor(threads.encoder_threads()) as pool:
-        for first in range(chunks if count else 0):
-            rows = np.arange(first, count, chunks)  # each chunk spreads over the scene: the first reads most cells
-            enclosure = Enclosure(field, scene.info.box, anchor[rows]) if field else None
-            shown[rows] = _shown(scene, rows, enclosure, spans, pool)
-            if local is not None:
-                _read_local(scene, anchor[rows], rows, shown[rows], local_cells, enclosure, spans, pool)
-    return cells.reached, local_cells.reached, shown
+        for rows in _chunks(open_):
+            enclosure = Enclosure(field, scene.info.box, scene.anchor[rows])
+            shown[rows] = _shown(scene, rows, shown[rows], enclosure, spans, pool)
+    return shown
+
+
+def local_cells(scene: Scene, shown: np.ndarray, pays: Pays[Reached] = _always) -> Reached | None:
+    """The cells of the local planes that the Gaussians `shown` bool [N, G] read; () without such planes. None if it
+    does not pay to go on: `pays` is told now and then which cells are read by the anchors so far."""
+    field, local = scene.global_deformation, scene.local_deformation
+    if local is None:
+        return ()
+    marks, spans = _Marks(local.planes), _spans(field)
+    asked, left = 0, len(scene.anchor)
+    with ThreadPoolExecutor(threads.encoder_threads()) as pool:
+        for index, rows in enumerate(_chunks(np.arange(left))):
+            if index == 2 * asked or index == 1:  # asking costs as much as some thousand evaluations
+                if not pays(marks.reached, left * len(spans)):
+                    return None
+                asked = index
+            enclosure = Enclosure(field, scene.info.box, scene.anchor[rows]) if field else None
+            _read_local(scene, scene.anchor[rows], rows, shown[rows], marks, enclosure, spans, pool)
+            left -= len(rows)
+    return marks.reached
+
+
+def _spans(field: Deformation | None) -> list[Span]:
+    grid = instants(field) if field else np.array([0.0, 1.0])
+    return list(zip(grid[:-1].tolist(), grid[1:].tolist(), strict=True))
+
+
+def _chunks(rows: np.ndarray) -> list[np.ndarray]:
+    """At most CHUNK rows each, every one spread over the scene: the first read most cells."""
+    count = -(-len(rows) // CHUNK)
+    return [rows[first::count] for first in range(count)]
 
 
 def _shown(
-    scene: Scene, rows: np.ndarray, enclosure: Enclosure | None, spans: Sequence[Span], pool: ThreadPoolExecutor
+    scene: Scene,
+    rows: np.ndarray,
+    certain: np.ndarray,
+    enclosure: Enclosure,
+    spans: Sequence[Span],
+    pool: ThreadPoolExecutor,
 ) -> np.ndarray:
-    """bool [n, 10]: the Gaussians of the anchors `rows` that some view may show at some time."""
-    shown = _may_show(scene, rows, None)
-    field = scene.global_deformation
-    if enclosure is None or field is None or "feature" not in field.networks:
-        return shown
+    """bool [n, G]: the Gaussians of the anchors `rows` that some view may show at some time, with those `certain`."""
+    shown: np.ndarray = certain.copy()
 
     def found(span: Span, open_: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Gaussians [m, 10] that the middle of the span shows, and those that it may show at any of its times."""
+        """Gaussians [m, G] that the middle of the span shows, and those that it may show at any of its times."""
         feature = enclosure.ranges(*span, ["feature"], open_)["feature"]
         middle = Range(feature.middle, feature.middle, feature.middle)
         return _may_show(scene, rows[open_], middle), _may_show(scene, rows[open_], feature)
 
-    open_ = np.flatnonzero(~shown.all(axis=1))
-    pending = [(span, open_) for span in spans if open_.size]
+    pending = [(span, np.arange(len(rows))) for span in spans]
     for halving in range(SHOW_HALVINGS + 1):
         results = list(pool.map(lambda pair: found(*pair), pending))
         for (_, at), (sampled, possible) in zip(pending, results, strict=True):
@@ -181,11 +223,11 @@ def _read_local(
     spans: Sequence[Span],
     pool: ThreadPoolExecutor,
 ) -> None:
-    """Marks the cells that the Gaussians `shown` bool [n, 10] of the anchors `rows` read."""
+    """Marks the cells that the Gaussians `shown` bool [n, G] of the anchors `rows` read."""
     finest = np.array([max(sides[axis] for sides in marks.sides) - 1 for axis in range(3)], np.float32)
 
     def boxes(span: Span, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Unit cube, float32 [m, 10, 3]: (in the middle of the span, low, high)."""
+        """Unit cube, float32 [m, G, 3]: (in the middle of the span, low, high)."""
         ranges = enclosure.ranges(*span, ["position", "offset", "scaling"], at) if enclosure else {}
         return _mean_ranges(scene, anchor[at], rows[at], ranges)
 
@@ -194,13 +236,13 @@ def _read_local(
         results = list(pool.map(lambda pair: boxes(*pair), pending))
         sizes = [at.size for _, at in pending]
         which = np.repeat(np.arange(len(pending)), sizes)  # the span of each anchor
-        taken = np.concatenate([shown[at] for _, at in pending])  # bool [m, 10]
+        taken = np.concatenate([shown[at] for _, at in pending])  # bool [m, G]
         middle, low, high = (np.concatenate([r[i] for r in results]) for i in range(3))
         start, end = (np.array([span[i] for span, _ in pending])[which] for i in range(2))
         wide = ~((((high - low) * finest).max(axis=2) <= NARROW) | ~taken).all(axis=1)  # NaN is wide
         if halving == HALVINGS:
             wide[:] = False
-        slots, owner = taken & ~wide[:, None], np.repeat(np.arange(len(wide)), N_OFFSETS).reshape(taken.shape)
+        slots, owner = taken & ~wide[:, None], np.repeat(np.arange(len(wide)), taken.shape[1]).reshape(taken.shape)
         marks.read(_Boxes(low[slots], high[slots], start[owner[slots]], end[owner[slots]]))
         slots = taken & wide[:, None]
         of = owner[slots]
@@ -235,12 +277,12 @@ def _unit(box: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarra
 def _mean_ranges(
     scene: Scene, anchor: np.ndarray, rows: np.ndarray, ranges: Ranges
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(in the middle, low, high) float32 [n, 10, 3] of the Gaussians' means (13.4, step 3) before the local
+    """(in the middle, low, high) float32 [n, G, 3] of the Gaussians' means (13.4, step 3) before the local
     deformation, in the unit cube."""
     nothing = Range(*(np.zeros(1, np.float32),) * 3)
-    position, scaling = ranges.get("position", nothing), ranges.get("scaling", nothing)
+    position, scaling, slots = ranges.get("position", nothing), ranges.get("scaling", nothing), scene.widths.slots
     offset = [
-        scene.offset[rows] + (o.reshape(-1, N_OFFSETS, 3) if o.ndim > 1 else o) for o in ranges.get("offset", nothing)
+        scene.offset[rows] + (o.reshape(-1, slots, 3) if o.ndim > 1 else o) for o in ranges.get("offset", nothing)
     ]
     with np.errstate(all="ignore"):
         spread = [np.exp((scene.scaling_log[rows] + s)[:, :3])[:, None] for s in scaling]
@@ -254,14 +296,15 @@ def _mean_ranges(
 
 
 def _may_show(scene: Scene, rows: np.ndarray, feature: Range | None) -> np.ndarray:
-    """bool [n, 10]: the opacity may reach the threshold from some direction, with residuals of the features anywhere
+    """bool [n, G]: the opacity may reach the threshold from some direction, with residuals of the features anywhere
     in `feature`, or 0."""
     low, high = (scene.feature[rows] + r for r in ((np.float32(0),) * 2 if feature is None else feature[1:]))
     (weight, bias), *rest = scene.networks["opacity"]
+    width = scene.widths.feature
     with np.errstate(all="ignore"):
         middle, radius = (low + high) / 2, (high - low) / 2
-        value = middle @ weight[:, :FEATURE_DIM].T + bias
-        reach = radius @ np.abs(weight[:, :FEATURE_DIM]).T + np.linalg.norm(weight[:, FEATURE_DIM:], axis=1)
+        value = middle @ weight[:, :width].T + bias
+        reach = radius @ np.abs(weight[:, :width]).T + np.linalg.norm(weight[:, width:], axis=1)
         low, high = value - reach, value + reach
         low, high = _through(rest, low, high)
         code = scene.mask[-1][rows].astype(np.float32)[:, None]

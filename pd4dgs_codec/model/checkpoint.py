@@ -26,6 +26,7 @@ from pd4dgs_codec.errors import DataError, Pd4Error
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.scene import (
+    ATTRIBUTES,
     GLOBAL_HEADS,
     LOCAL_HEADS,
     PLANES,
@@ -74,7 +75,7 @@ def target(path: str | Path) -> Path:
     return real
 
 
-def load(path: str | Path) -> tuple[Model, dict[str, Any]]:
+def load(path: str | Path | BinaryIO) -> tuple[Model, dict[str, Any]]:
     """(model, training) from a checkpoint; DataError in one line for anything that is not a whole one of ours."""
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
@@ -179,7 +180,7 @@ def _build(content: dict[str, Any]) -> Model:
         planes = tuple({plane: np.zeros((channels, r[b], r[a]), np.float32) for plane, a, b in PLANES} for r in reso)
         # the registry's order, not the dictionary's: optimiser states are matched to parameters by order
         present = {k.split(".")[2] for k in state if k.startswith(f"{prefix}.heads.")}
-        heads = [head for head in (GLOBAL_HEADS | LOCAL_HEADS) if head in present]
+        heads = [head for head in (*GLOBAL_HEADS, *LOCAL_HEADS) if head in present]
         networks = {"trunk": network(f"{prefix}.trunk")} | {h: network(f"{prefix}.heads.{h}") for h in heads}
         return Deformation(planes, networks)
 
@@ -189,9 +190,7 @@ def _build(content: dict[str, Any]) -> Model:
         layers=(0, 1, 2),
         rows=(n, n, n),
         anchor_q=state["anchor_q"],
-        feature=np.zeros((n, 32), np.float32),
-        scaling_log=np.zeros((n, 6), np.float32),
-        offset=np.zeros((n, 10, 3), np.float32),
+        **{name: np.zeros(state[name].shape, np.float32) for name in ATTRIBUTES},
         mask=(np.full(n, 255, np.uint8),) * 3,
         networks={name: network(f"networks.{name}") for name in SCAFFOLD_NETWORKS},
         global_deformation=deformation("global"),

@@ -41,7 +41,7 @@ class ModelConfig:
         return 2 if self.local_deformation is not None else 1 if self.global_deformation is not None else 0
 
 
-_GLOBAL, _LOCAL = tuple(GLOBAL_HEADS), tuple(LOCAL_HEADS)
+_GLOBAL, _LOCAL = GLOBAL_HEADS, tuple(LOCAL_HEADS)
 
 PRESETS: dict[str, ModelConfig] = {
     "tiny": ModelConfig(

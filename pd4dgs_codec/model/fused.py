@@ -1,7 +1,7 @@
 """The parts of `Model.gaussians` on the CPU, each one autograd function with its gradient written out.
 
-    pick   rows of the attributes, with noise or rounding      [n, 71]
-    moved  them, or Gaussians, plus a deformation's residuals   [n, 71] or [K, 14]
+    pick   rows of the attributes, with noise or rounding      [n, 9 + D + 3 G]
+    moved  them, or Gaussians, plus a deformation's residuals   [n, 9 + D + 3 G] or [K, 14]
     grown  the scaffold's networks: Gaussians of anchors        [K, 14]
     finish their activations and gates, as the rasteriser takes them
 
@@ -27,11 +27,11 @@ from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.hexplane import sample, sample_gradient
 from pd4dgs_codec.model.mlp import MLP
 from pd4dgs_codec.render.simd import LANES
-from pd4dgs_codec.scene import FEATURE_DIM, LENGTH_HEADS, N_OFFSETS
+from pd4dgs_codec.scene import LENGTH_HEADS, SCALING_DIM
 
 #: Rows that go through the layers of a network together.
 BLOCK = 2048
-SCALING = slice(kernels.SCALING, None)  #: the last columns of an anchor's row
+SCALING = slice(-SCALING_DIM, None)  #: the last columns of an anchor's row
 
 Layer = tuple[Tensor, Tensor]  #: weight [out, in] and bias [out]
 
@@ -83,9 +83,9 @@ def pick(
     noise: tuple[Tensor, Tensor, Tensor] | None,
     rounding: bool,
 ) -> Tensor:
-    """[n, 71]: the anchors `rows` (int64 [n], none twice) with noise of so many steps, or rounded to steps.
+    """[n, 9 + D + 3 G]: the anchors `rows` (int64 [n], none twice) with noise of so many steps, or rounded to steps.
 
-    attributes: feature [N, 32], offset [N, 10, 3], scaling [N, 6]; steps and noise ([n, width] each) of the same.
+    attributes: feature [N, D], offset [N, G, 3], scaling [N, 6]; steps and noise ([n, width] each) of the same.
     """
     row: Tensor = _Pick.apply(*attributes, position, rows, steps, noise, rounding)  # type: ignore[no-untyped-call]
     return row
@@ -213,8 +213,8 @@ class _Moved(torch.autograd.Function):
 def grown(
     anchors: Tensor, mask: Tensor, centre: Tensor, networks: Sequence[MLP], step: float | None, faintest: float
 ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """(Gaussians [K, 14], their gates [K], raw opacities [n, 10], the slots kept int64 [K]) of anchors [n, 71] under
-    mask [n], seen from centre [3]. networks: opacity, covariance, colour; step: of their weights, if rounded. Kept are
+    """(Gaussians [K, 14], their gates [K], raw opacities [n, G], the slots kept int64 [K]) of anchors under mask [n],
+    seen from centre [3]. networks: opacity, covariance, colour; step: of their weights, if rounded. Kept are
     the slots whose gated opacity is `faintest` at least."""
     parameters = [p for network in networks for layer in network.layers for p in (layer.weight, layer.bias)]
     found: tuple[Tensor, Tensor, Tensor, Tensor] = _Grown.apply(  # type: ignore[no-untyped-call]
@@ -237,16 +237,16 @@ class _Grown(torch.autograd.Function):
         used = _rounded(parameters, step)
         w1, b1 = torch.cat(used[::4]), torch.cat(used[1::4])
         (w_opacity, w_shape, w_color), (b_opacity, b_shape, b_color) = used[2::4], used[3::4]
-        n = len(anchors)
-        inputs, distance = anchors.new_empty(n, FEATURE_DIM + 3), torch.empty_like(mask)
+        n, slots = len(anchors), len(b_opacity)
+        inputs, distance = anchors.new_empty(n, w1.shape[1]), torch.empty_like(mask)
         kernels.inputs(*_arrays(inputs, distance, anchors, centre))
-        hidden, raw = anchors.new_empty(n, len(b1)), anchors.new_empty(n, N_OFFSETS)
+        hidden, raw = anchors.new_empty(n, len(b1)), anchors.new_empty(n, slots)
         for block in _blocks(n):
             x = torch.addmm(b1, inputs[block], w1.T, out=hidden[block]).relu_()
             torch.addmm(b_opacity, x[:, : w_opacity.shape[1]], w_opacity.T, out=raw[block]).tanh_()
-        keep = torch.empty(n * N_OFFSETS + 1, dtype=torch.int64)  # a place past the last, which is always written
+        keep = torch.empty(n * slots + 1, dtype=torch.int64)  # a place past the last, which is always written
         keep = keep[: kernels.seen(keep.numpy(), raw.numpy(), mask.numpy(), faintest)].clone()
-        shape, color = (anchors.new_empty(len(keep), len(b) // N_OFFSETS) for b in (b_shape, b_color))
+        shape, color = (anchors.new_empty(len(keep), len(b) // slots) for b in (b_shape, b_color))
         columns = (w_opacity.shape[1], w_opacity.shape[1] + w_shape.shape[1])
         for out, column, w, b in ((shape, columns[0], w_shape, b_shape), (color, columns[1], w_color, b_color)):
             kernels.linear(out.numpy(), keep.numpy(), hidden.numpy(), column, w.numpy(), b.numpy())

@@ -10,7 +10,7 @@ from torch import Tensor
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.picture import draw
 from pd4dgs_codec.model.rounding import EXACT, Rounding
-from pd4dgs_codec.scene import N_OFFSETS, Camera
+from pd4dgs_codec.scene import Camera
 
 #: Random pictures of signs per view from which an anchor's weight is estimated.
 PROBES = 2
@@ -56,7 +56,7 @@ def _gated(model: Model, level: int, t: float, camera: Camera, rounding: Roundin
     met = torch.zeros(n, dtype=torch.bool, device=device)
     met[g.anchors] = True
     gate = torch.ones(n, device=device, requires_grad=True)
-    shown = gate[torch.div(g.slots, N_OFFSETS, rounding_mode="floor")]
+    shown = gate[torch.div(g.slots, model.widths.slots, rounding_mode="floor")]
     gated = replace(g, scales=g.scales * shown[:, None], opacities=g.opacities * shown)
     return draw(model.info, gated, camera).image, gate, met
 

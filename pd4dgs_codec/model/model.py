@@ -26,18 +26,16 @@ from pd4dgs_codec.model.rounding import EXACT, Rounding, round_straight_through
 from pd4dgs_codec.model.slots import assemble, slot_linear
 from pd4dgs_codec.model.visibility import FRUSTUM_MARGIN, MIN_OPACITY, OFFSET_REACH, SIGMA_REACH
 from pd4dgs_codec.scene import (
-    FEATURE_DIM,
-    GLOBAL_HEADS,
     LOCAL_HEADS,
     MASK_THRESHOLD,
-    N_OFFSETS,
     SCAFFOLD_NETWORKS,
     Camera,
     SceneInfo,
     Steps,
+    Widths,
 )
 
-#: Opacities of an anchor's ten Gaussians start spread between these: some are seen everywhere, and not all are, since
+#: Opacities of an anchor's Gaussians start spread between these: some are seen everywhere, and not all are, since
 #: they start at one place.
 START_OPACITY = (-0.1, 0.2)
 
@@ -51,9 +49,9 @@ class Gaussians:
     scales: Tensor  #: [K, 3] scene units
     opacities: Tensor  #: [K] 0..1
     colors: Tensor  #: [K, 3] 0..1
-    slots: Tensor  #: int64 [K], anchor * 10 + offset
+    slots: Tensor  #: int64 [K], anchor * G + offset, of G slots
     anchors: Tensor  #: int64 [n], the anchors that were evaluated
-    raw_opacity: Tensor  #: [n, 10] before the gate
+    raw_opacity: Tensor  #: [n, G] before the gate
 
 
 def camera_tensors(camera: Camera, device: torch.device) -> tuple[Tensor, Tensor]:
@@ -103,6 +101,11 @@ class Model(nn.Module):
         return (self.anchor_q.double() * float(self.info.voxel_size)).float()
 
     @property
+    def widths(self) -> Widths:
+        """Feature width and slots, as its tensors have them."""
+        return Widths(self.feature.shape[1], self.offset.shape[1])
+
+    @property
     def level(self) -> int:
         """The highest level that differs from the one below in more than its masks."""
         return 2 if self.local_deformation is not None else 1 if self.global_deformation is not None else 0
@@ -138,7 +141,7 @@ class Model(nn.Module):
         """The Gaussians of `level` at normalised time t in 0..1 as the camera meets them."""
         if not self._fusible():
             return self.gaussians_reference(level, t, camera, rounding)
-        steps, masks, position = self.steps, self.masks(level), self.anchor
+        steps, masks, position, widths = self.steps, self.masks(level), self.anchor, self.widths
         rows = self._visible(masks, position, camera)
         noise = None
         if rounding.noise is not None and not rounding.attributes:
@@ -153,7 +156,7 @@ class Model(nn.Module):
             rounding.attributes,
         )
         if level >= 1 and (field := self.global_deformation) is not None and field.heads:
-            anchors = fused.moved(anchors, field, GLOBAL_HEADS, t, *self._field_steps("global", rounding), False)
+            anchors = fused.moved(anchors, field, widths.global_heads, t, *self._field_steps("global", rounding), False)
         step = steps.weights_scaffold if rounding.weights else None
         networks = [self.network(name) for name in SCAFFOLD_NETWORKS]
         mask = masks.index_select(0, rows)
@@ -164,12 +167,13 @@ class Model(nn.Module):
         if (field := self.local_deformation) is not None and loose and field.heads:
             found = fused.moved(found, field, LOCAL_HEADS, t, *self._field_steps("local", rounding), True)
         means, quats, scales, opacities, colors = fused.finish(found, gates, loose)
-        slots = rows.index_select(0, torch.div(keep, N_OFFSETS, rounding_mode="floor")) * N_OFFSETS + keep % N_OFFSETS
+        owner = rows.index_select(0, torch.div(keep, widths.slots, rounding_mode="floor"))
+        slots = owner * widths.slots + keep % widths.slots
         return Gaussians(means, quats, scales, opacities, colors, slots, rows, raw_opacity)
 
     def gaussians_reference(self, level: int, t: float, camera: Camera, rounding: Rounding = EXACT) -> Gaussians:
         """The plain torch form of `gaussians`, for any device and any networks."""
-        steps = self.steps
+        steps, slots = self.steps, self.widths.slots
         rows = self._visible(self.masks(level), self.anchor, camera)
         mask = self.masks(level).index_select(0, rows)
         position = self.anchor.index_select(0, rows)
@@ -187,8 +191,8 @@ class Model(nn.Module):
         opacity, covariance, color = self._last_layers(torch.cat([feature, direction], dim=1), rounding)
         raw_opacity = torch.tanh(F.linear(*opacity))
         keep = (raw_opacity.detach() * mask.detach()[:, None] >= MIN_OPACITY).flatten().nonzero()[:, 0]
-        shape = slot_linear(*covariance, keep)
-        colors = torch.sigmoid(slot_linear(*color, keep))
+        shape = slot_linear(*covariance, keep, slots)
+        colors = torch.sigmoid(slot_linear(*color, keep, slots))
         means, scales, quats, opacities, gate = assemble(
             position, scaling_log.exp(), offset, raw_opacity, mask, shape, keep
         )
@@ -199,14 +203,14 @@ class Model(nn.Module):
             quats = F.normalize(_moved(quats, residuals, "quat"), dim=1) if "quat" in residuals else quats
             opacities = _moved(opacities, residuals, "opacity").clamp(0, 1) if "opacity" in residuals else opacities
             colors = _moved(colors, residuals, "color").clamp(0, 1) if "color" in residuals else colors
-        anchors = rows.index_select(0, torch.div(keep, N_OFFSETS, rounding_mode="floor"))
+        anchors = rows.index_select(0, torch.div(keep, slots, rounding_mode="floor"))
         return Gaussians(
             means=means,
             quats=quats,
             scales=scales * gate[:, None],
             opacities=opacities * gate,
             colors=colors,
-            slots=anchors * N_OFFSETS + keep % N_OFFSETS,
+            slots=anchors * slots + keep % slots,
             anchors=rows,
             raw_opacity=raw_opacity,
         )
@@ -277,10 +281,9 @@ def _before_last(layers: list[tuple[Tensor, Tensor]], x: Tensor) -> Tensor:
     return x
 
 
-def fresh_networks(hidden: int) -> dict[str, MLP]:
-    """The scaffold's decoders, untrained: input [feature 32, view direction 3]."""
-    width = FEATURE_DIM + 3
-    networks = {name: MLP((width, hidden, outputs)) for name, outputs in SCAFFOLD_NETWORKS.items()}
+def fresh_networks(widths: Widths, hidden: int) -> dict[str, MLP]:
+    """The scaffold's decoders, untrained: input [feature, view direction 3]."""
+    networks = {name: MLP((widths.inputs, hidden, outputs)) for name, outputs in widths.networks.items()}
     with torch.no_grad():  # else chance decides what is ever seen
-        networks["opacity"].layers[-1].bias.copy_(torch.linspace(*START_OPACITY, N_OFFSETS))
+        networks["opacity"].layers[-1].bias.copy_(torch.linspace(*START_OPACITY, widths.slots))
     return networks

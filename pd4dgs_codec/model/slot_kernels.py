@@ -1,12 +1,12 @@
 """Numba kernels between anchors and the Gaussians that are seen: rows of attributes, the last layers' outputs and what
-Gaussians are made of, for the kept slots alone. A slot is one of an anchor's ten Gaussians; about one in six is drawn.
+Gaussians are made of, for the kept slots alone. A slot is one of an anchor's G Gaussians; about one in six is drawn.
 
-Arguments everywhere, floats of one dtype: keep int64 [K], ascending, anchor * 10 + offset of each kept Gaussian;
-anchors [n, 71], a row of position, feature, offsets and log scalings; gaussians [K, 14], a row of mean, scales,
-quaternion, opacity and colour; hidden [n, columns], of which H from `column` on are a layer's, H a multiple of LANES.
-The backward passes split the Gaussians over threads at anchors, each part owning its rows of the result; sums over all
-Gaussians are kept per part and added in order, so that results are bitwise reproducible for a fixed number of parts.
-What takes a fraction of a millisecond is not split: a parallel kernel takes numba thrice as long to compile.
+Arguments everywhere, floats of one dtype: keep int64 [K], ascending, anchor * G + offset of each kept Gaussian; anchors
+[n, 9 + D + 3 G], a row of position, feature [D], offsets [G, 3] and log scalings [6]; gaussians [K, 14], a row of mean,
+scales, quaternion, opacity and colour; hidden [n, columns], of which H from `column` on are a layer's, H a multiple of
+LANES. The backward passes split the Gaussians over threads at anchors, each part owning its rows of the result; sums
+over all Gaussians are kept per part and added in order, so that results are bitwise reproducible for a fixed number of
+parts. What takes a fraction of a millisecond is not split: a parallel kernel takes numba thrice as long to compile.
 """
 
 from __future__ import annotations
@@ -18,22 +18,21 @@ import numba as nb
 import numpy as np
 
 from pd4dgs_codec.render.simd import LANES, fma, kernel, load, splat, store, total
-from pd4dgs_codec.scene import FEATURE_DIM, N_OFFSETS
+from pd4dgs_codec.scene import SCALING_DIM
 
 #: Below this a quaternion is divided by it instead of by its norm, as `torch.nn.functional.normalize` does.
 MIN_NORM = 1e-12
-#: First columns of an anchor's row and of a Gaussian's.
-OFFSET, SCALING = 3 + FEATURE_DIM, 3 + FEATURE_DIM + 3 * N_OFFSETS
+#: First columns of the parts of a Gaussian's row.
 SCALE, QUAT, OPACITY, COLOR = 3, 6, 10, 11
 
 
 @kernel(inline=True)
-def _part(keep: np.ndarray, part: int, parts: int) -> tuple[int, int]:
+def _part(keep: np.ndarray, slots: int, part: int, parts: int) -> tuple[int, int]:
     """The range of `keep` that is part's own: no anchor is in two parts."""
     begin, end = len(keep) * part // parts, len(keep) * (part + 1) // parts
-    while 0 < begin < len(keep) and keep[begin] // N_OFFSETS == keep[begin - 1] // N_OFFSETS:
+    while 0 < begin < len(keep) and keep[begin] // slots == keep[begin - 1] // slots:
         begin += 1
-    while 0 < end < len(keep) and keep[end] // N_OFFSETS == keep[end - 1] // N_OFFSETS:
+    while 0 < end < len(keep) and keep[end] // slots == keep[end - 1] // slots:
         end += 1
     return begin, end
 
@@ -66,39 +65,41 @@ def pick_backward(grad: np.ndarray, g: np.ndarray, column: int, rows: np.ndarray
 
 @kernel()
 def inputs(out: np.ndarray, distance: np.ndarray, anchors: np.ndarray, centre: np.ndarray) -> None:
-    """out [n, 35] = the features and the direction from centre [3] of anchors; distance [n] from it, MIN_NORM at
+    """out [n, D + 3] = the features and the direction from centre [3] of anchors; distance [n] from it, MIN_NORM at
     least."""
+    width = out.shape[1] - 3
     for n in range(len(anchors)):
         x, y, z = anchors[n, 0] - centre[0], anchors[n, 1] - centre[1], anchors[n, 2] - centre[2]
         distance[n] = max(math.sqrt(x * x + y * y + z * z), anchors.dtype.type(MIN_NORM))
-        for c in range(FEATURE_DIM):
+        for c in range(width):
             out[n, c] = anchors[n, 3 + c]
-        out[n, FEATURE_DIM] = x / distance[n]
-        out[n, FEATURE_DIM + 1] = y / distance[n]
-        out[n, FEATURE_DIM + 2] = z / distance[n]
+        out[n, width] = x / distance[n]
+        out[n, width + 1] = y / distance[n]
+        out[n, width + 2] = z / distance[n]
 
 
 @kernel()
 def inputs_backward(g_anchors: np.ndarray, g: np.ndarray, out: np.ndarray, distance: np.ndarray) -> None:
-    """The transpose of `inputs`, which gave `out` and `distance`; adds to g_anchors [n, 71]."""
+    """The transpose of `inputs`, which gave `out` and `distance`; adds to g_anchors."""
+    width = g.shape[1] - 3
     for n in range(len(g)):
-        for c in range(FEATURE_DIM):
+        for c in range(width):
             g_anchors[n, 3 + c] += g[n, c]
         along = g.dtype.type(0)
         if distance[n] > g.dtype.type(MIN_NORM):
-            for i in range(FEATURE_DIM, FEATURE_DIM + 3):
+            for i in range(width, width + 3):
                 along += g[n, i] * out[n, i]
         for i in range(3):
-            g_anchors[n, i] += (g[n, FEATURE_DIM + i] - along * out[n, FEATURE_DIM + i]) / distance[n]
+            g_anchors[n, i] += (g[n, width + i] - along * out[n, width + i]) / distance[n]
 
 
 @kernel()
 def seen(keep: np.ndarray, opacity: np.ndarray, mask: np.ndarray, faintest: float) -> int:
-    """Writes to `keep` the slots whose opacity [n, 10] times mask [n] is `faintest` at least; returns how many."""
-    count = 0
+    """Writes to `keep` the slots whose opacity [n, G] times mask [n] is `faintest` at least; returns how many."""
+    count, slots = 0, opacity.shape[1]
     for n in range(len(mask)):
-        for o in range(N_OFFSETS):
-            keep[count] = n * N_OFFSETS + o
+        for o in range(slots):
+            keep[count] = n * slots + o
             count += opacity[n, o] * mask[n] >= opacity.dtype.type(faintest)
     return count
 
@@ -107,12 +108,12 @@ def seen(keep: np.ndarray, opacity: np.ndarray, mask: np.ndarray, faintest: floa
 def linear(
     out: np.ndarray, keep: np.ndarray, hidden: np.ndarray, column: int, weight: np.ndarray, bias: np.ndarray
 ) -> None:
-    """out [K, w] = the outputs of a linear layer (weight [10 w, H], bias [10 w]) that belong to the kept slots."""
-    width, inputs = out.shape[1], weight.shape[1]
+    """out [K, w] = the outputs of a linear layer (weight [G w, H], bias [G w]) that belong to the kept slots."""
+    width, inputs, slots = out.shape[1], weight.shape[1], len(bias) // out.shape[1]
     zero = splat(hidden.dtype.type(0))
     for k in nb.prange(len(keep)):
-        row = keep[k] // N_OFFSETS * hidden.shape[1] + column
-        first = keep[k] % N_OFFSETS * width
+        row = keep[k] // slots * hidden.shape[1] + column
+        first = keep[k] % slots * width
         for o in range(width):
             value = zero
             for c in range(0, inputs, LANES):
@@ -131,15 +132,15 @@ def linear_backward(
     column: int,
     weight: np.ndarray,
 ) -> None:
-    """The transpose of `linear`. Results, given zeroed: grad_hidden (as hidden), grad_weight [parts, 10 w, H] and
-    grad_bias [parts, 10 w], summed into their first part."""
-    width, inputs, parts = g.shape[1], weight.shape[1], len(grad_weight)
+    """The transpose of `linear`. Results, given zeroed: grad_hidden (as hidden), grad_weight [parts, G w, H] and
+    grad_bias [parts, G w], summed into their first part."""
+    width, inputs, parts, slots = g.shape[1], weight.shape[1], len(grad_weight), len(weight) // g.shape[1]
     for part in nb.prange(parts):
-        begin, end = _part(keep, part, parts)
+        begin, end = _part(keep, slots, part, parts)
         own = grad_weight[part]
         for k in range(begin, end):
-            row = keep[k] // N_OFFSETS * hidden.shape[1] + column
-            first = keep[k] % N_OFFSETS * width
+            row = keep[k] // slots * hidden.shape[1] + column
+            first = keep[k] % slots * width
             for o in range(width):
                 grad_bias[part, first + o] += g[k, o]
             for c in range(0, inputs, LANES):
@@ -170,13 +171,15 @@ def assemble(
 ) -> None:
     """gaussians and gates [K] of the kept slots.
 
-    extent [n, 6]: the exponentials of log scalings, of the offsets, then of the Gaussians; opacity [n, 10]; mask [n];
+    extent [n, 6]: the exponentials of log scalings, of the offsets, then of the Gaussians; opacity [n, G]; mask [n];
     shape [K, 7], its last four the quaternion; relative [K, 7], its first three the sizes within 0..1; color [K, 3].
     """
+    slots = opacity.shape[1]
+    offset = anchors.shape[1] - SCALING_DIM - 3 * slots
     for k in nb.prange(len(keep)):
-        n, o = keep[k] // N_OFFSETS, keep[k] % N_OFFSETS
+        n, o = keep[k] // slots, keep[k] % slots
         for i in range(3):
-            gaussians[k, i] = anchors[n, i] + anchors[n, OFFSET + 3 * o + i] * extent[n, i]
+            gaussians[k, i] = anchors[n, i] + anchors[n, offset + 3 * o + i] * extent[n, i]
             gaussians[k, SCALE + i] = extent[n, 3 + i] * relative[k, i]
             gaussians[k, COLOR + i] = color[k, i]
         inverse = 1 / _norm(shape, k, 3)
@@ -227,17 +230,19 @@ def assemble_backward(
 ) -> None:
     """The transpose of `assemble`. Results, given zeroed but g_shape and g_color, whose gradients are those before the
     sigmoids that gave `relative` and the colours; g_anchors by log scalings, and no features."""
+    slots, scaling = g_opacity.shape[1], anchors.shape[1] - SCALING_DIM
+    offset = scaling - 3 * slots
     for part in nb.prange(parts):
-        begin, end = _part(keep, part, parts)
+        begin, end = _part(keep, slots, part, parts)
         for k in range(begin, end):
-            n, o = keep[k] // N_OFFSETS, keep[k] % N_OFFSETS
+            n, o = keep[k] // slots, keep[k] % slots
             for i in range(3):
                 slope = g[k, i]
                 g_anchors[n, i] += slope
-                g_anchors[n, OFFSET + 3 * o + i] = slope * extent[n, i]
-                g_anchors[n, SCALING + i] += slope * anchors[n, OFFSET + 3 * o + i] * extent[n, i]
+                g_anchors[n, offset + 3 * o + i] = slope * extent[n, i]
+                g_anchors[n, scaling + i] += slope * anchors[n, offset + 3 * o + i] * extent[n, i]
                 slope, size = g[k, SCALE + i] * extent[n, 3 + i], relative[k, i]
-                g_anchors[n, SCALING + 3 + i] += slope * size
+                g_anchors[n, scaling + 3 + i] += slope * size
                 g_shape[k, i] = slope * size * (1 - size)
                 value = gaussians[k, COLOR + i]
                 g_color[k, i] = g[k, COLOR + i] * value * (1 - value)

@@ -5,19 +5,17 @@ from __future__ import annotations
 import numpy as np
 
 from pd4dgs_codec.scene import (
-    FEATURE_DIM,
-    N_OFFSETS,
     PLANES,
-    SCAFFOLD_NETWORKS,
-    SCALING_DIM,
     Camera,
     Deformation,
     Network,
     Scene,
     SceneInfo,
     Steps,
+    Widths,
 )
 
+WIDTHS = Widths()
 SIDE = 16  #: pixels of the picture drawn and thrown away
 CHANNELS = 8  #: of its planes, as many as take the kernel's path
 
@@ -34,7 +32,7 @@ def warm_up() -> None:
 
 
 def _one_anchor() -> Scene:
-    """Ten Gaussians in front of a camera."""
+    """The Gaussians of one anchor in front of a camera."""
     box = np.array([[-1, -1, 1], [1, 1, 3]], np.float32)
     K = np.array([[SIDE, 0, SIDE / 2], [0, SIDE, SIDE / 2], [0, 0, 1]], np.float32)
     camera = Camera(np.eye(4, dtype=np.float32), K, SIDE, SIDE)
@@ -44,11 +42,11 @@ def _one_anchor() -> Scene:
         layers=(0, 1, 2),
         rows=(1, 1, 1),
         anchor_q=np.array([[0, 0, 2]], np.int32),
-        feature=np.zeros((1, FEATURE_DIM), np.float32),
-        scaling_log=np.full((1, SCALING_DIM), -2, np.float32),
-        offset=np.zeros((1, N_OFFSETS, 3), np.float32),
+        feature=np.zeros((1, WIDTHS.feature), np.float32),
+        scaling_log=np.full((1, *WIDTHS.attributes["scaling_log"]), -2, np.float32),
+        offset=np.zeros((1, WIDTHS.slots, 3), np.float32),
         mask=(np.full(1, 255, np.uint8),) * 3,
-        networks={name: _constant(FEATURE_DIM + 3, n, 0.5) for name, n in SCAFFOLD_NETWORKS.items()},
+        networks={name: _constant(WIDTHS.inputs, n, 0.5) for name, n in WIDTHS.networks.items()},
         global_deformation=_deformation("position"),
         local_deformation=_deformation("mean"),
     )

@@ -7,7 +7,7 @@ from dataclasses import dataclass, field, replace
 from typing import Any
 
 from pd4dgs_codec.errors import TrainError
-from pd4dgs_codec.scene import Steps
+from pd4dgs_codec.scene import MAX_FEATURE, MAX_SLOTS, Steps, Widths
 
 #: Iterations per preset when neither a count nor a time limit is given.
 DEFAULT_ITERATIONS = {"tiny": 3_000, "small": 10_000, "paper": 15_000}
@@ -54,6 +54,8 @@ BEFORE: dict[str, Any] = {
     "cooldown": 0.0,
     "plane_rate": 0.0,
     "step_scale": 1.0,
+    "feature_width": 32,
+    "slots": 10,
 }
 
 
@@ -99,6 +101,8 @@ class TrainConfig:
 
     preset: str = "small"
     source: str = ""  #: what `data.load` was given; stored so that a resumed run meets the same data
+    feature_width: int = 32  #: numbers of an anchor's feature
+    slots: int = 10  #: Gaussians of an anchor
     downscale: int = 1
     holdout: int = 8
     iterations: int | None = None  #: None: the preset's default, or by the clock if there is a limit
@@ -135,6 +139,11 @@ class TrainConfig:
     local_planes: PlaneWeights = PlaneWeights(2e-4, 1e-3, 1e-4)
     max_gradient_norm: float = 100.0
 
+    @property
+    def widths(self) -> Widths:
+        """Of a fresh model's anchors."""
+        return Widths(self.feature_width, self.slots)
+
     def model_steps(self, preset: Steps) -> Steps:
         """The steps of a fresh model whose preset has these; `step_scale` moves those that bytes depend on and pictures
         hardly do."""
@@ -151,6 +160,9 @@ class TrainConfig:
             raise TrainError(f"max-seconds must be positive, found {self.max_seconds}")
         if not 0 <= self.seed <= 2**63 - 2:  # the next one seeds the noise
             raise TrainError(f"seed {self.seed} is out of range; expected an integer from 0 to 2^63 - 2")
+        for name, limit in (("feature_width", MAX_FEATURE), ("slots", MAX_SLOTS)):
+            if not 1 <= getattr(self, name) <= limit:
+                raise TrainError(f"{name} must be from 1 to {limit}, found {getattr(self, name)}")
         for name in ("rate_scale", "plane_rate"):
             if not 0 <= getattr(self, name) < math.inf:
                 raise TrainError(f"{name} must be 0 or more and finite, found {getattr(self, name)}")

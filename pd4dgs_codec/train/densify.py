@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from pd4dgs_codec.model.model import Gaussians, Model
-from pd4dgs_codec.scene import MASK_THRESHOLD, N_OFFSETS
+from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train.initialise import fresh_mask_logits
 from pd4dgs_codec.train.optimiser import Optimiser
 
@@ -26,9 +26,9 @@ class Densifier:
 
     def __init__(self, model: Model, threshold: float, max_anchors: int):
         self.threshold, self.max_anchors = threshold, max_anchors
-        n = len(model.anchor_q)
-        self.pull = torch.zeros(n, N_OFFSETS)
-        self.visits = torch.zeros(n, N_OFFSETS)
+        n, slots = len(model.anchor_q), model.widths.slots
+        self.pull = torch.zeros(n, slots)
+        self.visits = torch.zeros(n, slots)
         self.opacity = torch.zeros(n)
         self.anchor_visits = torch.zeros(n)
 
@@ -71,7 +71,7 @@ class Densifier:
                 "anchor_q": cells[:, :3].to(torch.int32).to(device),
                 "feature": feature.to(device),
                 "scaling_log": size.log()[:, None].repeat(1, 6).to(device),
-                "offset": torch.zeros(n, N_OFFSETS, 3, device=device),
+                "offset": torch.zeros(n, *model.offset.shape[1:], device=device),
                 "mask_logits": fresh_mask_logits(n, model.level).to(device),
             },
         )
@@ -92,7 +92,7 @@ class Densifier:
             setattr(self, name, torch.cat([value[rows.cpu()], value.new_zeros(added, *value.shape[1:])]))
 
     def _new_cells(self, model: Model, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """(int64 [n, 4] voxel cell and cell size, float [n, 32] feature) of free cells, the strongest pull first."""
+        """(int64 [n, 4] voxel cell and cell size, float [n, D] feature) of free cells, the strongest pull first."""
         mean_pull = (self.pull / self.visits.clamp(min=1)).flatten()
         seen = self.visits.flatten() >= MIN_SLOT_VISITS
         anchor_q, scaling = model.anchor_q.cpu(), model.scaling_log.detach().cpu().exp()
@@ -109,7 +109,7 @@ class Densifier:
             slots = wanted.nonzero()[:, 0]
             if len(slots) == 0:
                 continue
-            rows = slots // N_OFFSETS
+            rows = slots // offset.shape[1]
             shift = offset.view(-1, 3)[slots] * scaling[rows, :3]
             position = anchor_q[rows].double() + shift.double() / model.info.voxel_size
             inside = ((position > low - reach) & (position < high + reach)).all(1)

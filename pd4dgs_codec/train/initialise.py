@@ -12,7 +12,7 @@ from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.model.config import ModelConfig
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model, fresh_networks
-from pd4dgs_codec.scene import FEATURE_DIM, GLOBAL_HEADS, LOCAL_HEADS, N_OFFSETS, SceneInfo, Steps
+from pd4dgs_codec.scene import LOCAL_HEADS, SceneInfo, Steps, Widths
 
 #: Voxels along the longest side of the scene's box.
 GRID = 1024
@@ -24,7 +24,9 @@ CARVE_CANDIDATES = 20
 CARVE_VIEWS = 40
 
 
-def fresh_model(config: ModelConfig, dataset: Dataset, steps: Steps, seed: int, max_layer: int = 2) -> Model:
+def fresh_model(
+    config: ModelConfig, dataset: Dataset, widths: Widths, steps: Steps, seed: int, max_layer: int = 2
+) -> Model:
     """An untrained model without the deformations of the layers above max_layer: anchors on the dataset's points
     (topped up near them), or spread over its box. What it has starts the same whatever max_layer is."""
     generator = torch.Generator().manual_seed(seed)
@@ -34,20 +36,25 @@ def fresh_model(config: ModelConfig, dataset: Dataset, steps: Steps, seed: int, 
     n = len(anchor_q)
     spacing = nearest_distances((anchor_q.double() * info.voxel_size).float()).clamp(min=info.voxel_size)
     fields = []
-    for field, widths, start_spacing, step in (
-        (config.global_deformation, GLOBAL_HEADS, 4, steps.planes_global),  # few cells: places differ from the start
+    for field, heads, start_spacing, step in (
+        (
+            config.global_deformation,
+            widths.global_heads,
+            4,
+            steps.planes_global,
+        ),  # few cells: places differ at the start
         (config.local_deformation, LOCAL_HEADS, None, steps.planes_local),
     ):
-        fields.append(None if field is None else DeformationField.fresh(field, info.box, widths, start_spacing, step))
+        fields.append(None if field is None else DeformationField.fresh(field, info.box, heads, start_spacing, step))
     model = Model(
         info,
         steps,
         anchor_q,
-        torch.zeros(n, FEATURE_DIM),
+        torch.zeros(n, widths.feature),
         spacing.log()[:, None].repeat(1, 6),
-        torch.zeros(n, N_OFFSETS, 3),
+        torch.zeros(n, widths.slots, 3),
         fresh_mask_logits(n, min(config.level, max_layer)),
-        fresh_networks(config.hidden),
+        fresh_networks(widths, config.hidden),
         *fields,
     )
     if max_layer < 2:

@@ -61,9 +61,9 @@ class Learner:
         self.config, self.dataset, self.schedule, self.device = config, dataset, schedule, device
         if device.type == "cuda":  # the variances of SSIM are differences of blurred images: no ten-bit factors
             torch.backends.cudnn.allow_tf32 = False
-        self.model = fresh_model(size, dataset, config.model_steps(size.steps), config.seed, config.max_layer).to(
-            device
-        )
+        steps = config.model_steps(size.steps)
+        model = fresh_model(size, dataset, config.widths, steps, config.seed, config.max_layer)
+        self.model = model.to(device)
         self.optimiser = Optimiser(self.model, config.rates, config.cooldown)
         self.densifier = Densifier(self.model, config.grow_threshold, size.max_anchors)
         self.generator = torch.Generator().manual_seed(config.seed)

@@ -12,7 +12,8 @@ from pd4dgs_codec.scene import MASK_THRESHOLD
 
 
 def attribute_bits(model: Model, rows: Tensor, active: Tensor) -> Tensor:
-    """R per scalar [n, 68] of the anchors `rows` (int64 [n]); priors are the moments over the anchors `active`."""
+    """R per scalar [n, channels] of the anchors `rows` (int64 [n]); priors are the moments over the anchors
+    `active`."""
     parts = []
     for values, step in (
         (model.feature, model.steps.feature),
@@ -25,7 +26,7 @@ def attribute_bits(model: Model, rows: Tensor, active: Tensor) -> Tensor:
 
 
 def rate_term(model: Model, mask: Tensor, share: float, generator: torch.Generator) -> Tensor:
-    """R_l = 1/|V| sum_i m_i Rbar_i, Rbar_i the mean bits over the 68 scalars of anchor i, estimated on a random share
+    """R_l = 1/|V| sum_i m_i Rbar_i, Rbar_i the mean bits over the scalars of anchor i, estimated on a random share
     of the anchors; the gradient reaches masks, attributes and the priors' moments. mask: m^(l) [N]."""
     active = (mask.detach() > MASK_THRESHOLD).nonzero()[:, 0]
     if len(active) < 2:

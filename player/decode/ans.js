@@ -89,42 +89,6 @@ export class AnsDecoder {
     this._q = q;
   }
 
-  /**
-   * Writes the next bits, each 0 with probability zero / 2^24, to out[order[k]] for k = from .. end - 1.
-   *
-   * @param {number} zero 1..2^24 - 1 @param {Int32Array} order @param {number} from @param {number} end
-   * @param {Uint8Array} out
-   */
-  bits(zero, order, from, end, out) {
-    const words = this._words;
-    const available = words.length;
-    let at = this._at;
-    let th = this._th;
-    let tl = this._tl;
-    let q = this._q;
-    for (let k = from; k < end; k++) {
-      const bit = q < zero ? 0 : 1;
-      out[order[k]] = bit;
-      const f = bit ? 16777216 - zero : zero;
-      const r = bit ? q - zero : q;
-      q = (Math.imul(tl, f) + r) & LOW;
-      const carry = (tl * f + r - q) / 16777216;
-      const low = (Math.imul(th, f) + carry) & LOW;
-      th = (th * f + carry - low) / 16777216;
-      tl = low;
-      if (th === 0 && tl < 256 && at < available) {
-        const word = words[at++];
-        th = (tl << 8) | (q >>> 16);
-        tl = ((q << 8) | (word >>> 24)) & LOW;
-        q = word & LOW;
-      }
-    }
-    this._at = at;
-    this._th = th;
-    this._tl = tl;
-    this._q = q;
-  }
-
   /** Adds the next `count` numbers of `bits` uniform bits (7.6) to out[start ..]. @param {number} bits
    * @param {Int32Array} out @param {number} start @param {number} count */
   addUniform(bits, out, start, count) {

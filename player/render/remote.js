@@ -58,6 +58,7 @@ export class Remote {
 
 /** @param {URL} url @returns {Worker} */
 function start(url) {
+  if (url.protocol === "blob:") return new Worker(url); // packed: no module, which a page from a file cannot load
   if (url.origin === location.origin) return new Worker(url, { type: "module" });
   // a browser starts no worker of another origin, but one that imports from there
   const source = new Blob([`import ${JSON.stringify(url.href)};`], { type: "text/javascript" });

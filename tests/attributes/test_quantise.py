@@ -6,8 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pd4dgs_codec.attributes.quantise import MAX_SYMBOL, dequantise, is_step, mask_codes, quantise
-from pd4dgs_codec.attributes.table import ATTRIBUTES, N_CHANNELS, dequantise_attributes, quantise_attributes
+from pd4dgs_codec.attributes.table import dequantise_attributes, quantise_attributes
 from pd4dgs_codec.errors import EncodeError
+from pd4dgs_codec.scene import Widths
 
 steps = st.floats(2.0**-100, 2.0**90, width=32)
 
@@ -74,11 +75,12 @@ def test_mask_codes_keep_order(values):
     assert (np.diff(codes.astype(int)) >= 0).all() and not ((codes > 0) & (codes < 3)).any()
 
 
-def test_the_table_is_a_bijection_on_channels():
-    k = np.arange(N_CHANNELS * 7, dtype=np.int32).reshape(N_CHANNELS, 7)
+@pytest.mark.parametrize("widths", [Widths(), Widths(1, 2), Widths(64, 16)])
+def test_the_table_is_a_bijection_on_channels(widths):
+    k = np.arange(widths.channels * 7, dtype=np.int32).reshape(widths.channels, 7)
     q = {"feature": 0.5, "scaling_log": 0.25, "offset": 2.0}
-    values = dequantise_attributes(k, q)
-    shapes = {a.name: values[a.name].shape for a in ATTRIBUTES}
-    assert shapes == {"feature": (7, 32), "scaling_log": (7, 6), "offset": (7, 10, 3)}
-    assert values["offset"][3, 1, 2] == 2.0 * k[32 + 6 + 3 * 1 + 2, 3]
+    values = dequantise_attributes(k, widths, q)
+    shapes = {name: array.shape for name, array in values.items()}
+    assert shapes == {"feature": (7, widths.feature), "scaling_log": (7, 6), "offset": (7, widths.slots, 3)}
+    assert values["offset"][3, 1, 2] == 2.0 * k[widths.feature + 6 + 3 * 1 + 2, 3]
     np.testing.assert_array_equal(quantise_attributes(values, q), k)

@@ -12,8 +12,11 @@ import pytest
 import torch
 from tiny import TINY
 
+from pd4dgs_codec import decode, encode
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import PRESETS
+from pd4dgs_codec.model.convert import to_scene
+from pd4dgs_codec.scene import Widths
 from pd4dgs_codec.train.config import at_quality
 
 
@@ -56,11 +59,14 @@ def test_train_reports_and_logs(train, tmp_path, shared_dataset):
 def test_options_reach_the_configuration(train, tmp_path):
     options = ("--seed", 7, "--downscale", 2, "--holdout", 3, "--rate-scale", 0.5, "--rollout", "fixed")
     options += ("--without", "noise", "--without", "tmc", "--max-layer", 1, "--prune", 0.1)
+    options += ("--feature-width", 5, "--slots", 3)
     assert train(tmp_path / "m.pt", *options, iterations=1).code == 0
     config = json.loads(checkpoint.load(tmp_path / "m.pt")[1]["config"])
     found = [
         config[k] for k in ("seed", "downscale", "holdout", "rate_scale", "rollout", "preset", "max_layer", "prune")
     ]
+    scene = to_scene(checkpoint.load(tmp_path / "m.pt")[0])
+    assert scene.widths == decode(encode(scene)).widths == Widths(5, 3)
     assert found == [7, 2, 3, 0.5, "fixed", "tiny", 1, 0.1]
     assert not (config["noise"] or config["tmc_binary"] or config["tmc_smooth"])
 
@@ -115,6 +121,7 @@ def test_resume_refuses_what_contradicts_the_checkpoint(cli, train, tmp_path, sh
         "--preset": ("--preset", "small"),
         "--without noise": ("--without", "noise"),
         "--max-layer": ("--max-layer", 1),
+        "--feature-width": ("--feature-width", 16),
     }
     for what, options in contradictions.items():
         result = cli("train", shared_dataset, "-o", first, "--resume", first, *options)
@@ -250,6 +257,8 @@ import json, sys
 from tiny import TINY
 from pd4dgs_codec.cli.train import main
 from pd4dgs_codec.model.config import PRESETS
+from pd4dgs_codec.model.convert import to_scene
+from pd4dgs_codec.scene import Widths
 
 PRESETS["tiny"] = TINY
 sys.exit(max(main(argv) for argv in json.loads(sys.argv[1])))
@@ -259,6 +268,8 @@ KILLED = """
 import json, os, signal, sys
 from tiny import TINY
 from pd4dgs_codec.model.config import PRESETS
+from pd4dgs_codec.model.convert import to_scene
+from pd4dgs_codec.scene import Widths
 from pd4dgs_codec.train.loop import Trainer
 from pd4dgs_codec.cli.train import main
 

@@ -8,7 +8,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
-from pd4dgs_codec.attributes.table import N_CHANNELS
 from pd4dgs_codec.codec import attribute_section
 from pd4dgs_codec.codec.attribute_section import MAX_WEIGHT, read_attributes, write_attributes
 from pd4dgs_codec.codec.stages import PLAIN, STAGED
@@ -16,6 +15,9 @@ from pd4dgs_codec.entropy.channels import encode_channels
 from pd4dgs_codec.entropy.priors import K_MAX
 from pd4dgs_codec.entropy.varint import put_varint, put_zigzag
 from pd4dgs_codec.errors import DecodeError, LimitExceeded, Malformed
+from pd4dgs_codec.scene import Widths
+
+WIDTHS = Widths()
 
 
 def correlated(rows: int, seed: int = 0) -> np.ndarray:
@@ -29,32 +31,33 @@ def correlated(rows: int, seed: int = 0) -> np.ndarray:
 
 def test_dependent_channels_are_predicted_and_come_back():
     attributes = correlated(1500)
-    data, rate = write_attributes(attributes, "best", 5)
+    data, rate = write_attributes(attributes, WIDTHS, "best", 5)
     assert data[0] == STAGED
     plain = encode_channels(list(attributes))
     assert len(data) < 0.75 * len(plain.payload)
     assert rate == plain.rate_bits
-    np.testing.assert_array_equal(read_attributes(data, 1500), attributes)
+    np.testing.assert_array_equal(read_attributes(data, WIDTHS, 1500), attributes)
 
 
 def test_the_rate_model_forbids_prediction():
-    data, _ = write_attributes(correlated(800), "gauss", 5)
+    data, _ = write_attributes(correlated(800), WIDTHS, "gauss", 5)
     assert data[0] == PLAIN
 
 
 def test_independent_channels_stay_plain():
-    attributes = np.random.default_rng(1).integers(-9, 10, (N_CHANNELS, 300)).astype(np.int32)
-    data, _ = write_attributes(attributes, "best", 5)
+    attributes = np.random.default_rng(1).integers(-9, 10, (WIDTHS.channels, 300)).astype(np.int32)
+    data, _ = write_attributes(attributes, WIDTHS, "best", 5)
     assert data[0] == PLAIN
-    np.testing.assert_array_equal(read_attributes(data, 300), attributes)
+    np.testing.assert_array_equal(read_attributes(data, WIDTHS, 300), attributes)
 
 
-def written_in_stages(attributes, class_count=None):
+def written_in_stages(attributes, class_count=None, widths=WIDTHS):
     """The section in form 1, even where form 0 is shorter; class_count, if any, instead of the best."""
     choose = attribute_section.cheapest_class_count if class_count is None else lambda _: class_count
     with patch.object(attribute_section, "cheapest_class_count", choose):
         symbols, past = attributes.astype(np.int64), attribute_section.Past()
-        return attribute_section._write_staged(symbols, attribute_section._fit_block(symbols), past, 1).data
+        block = attribute_section._fit_block(symbols, widths)
+        return attribute_section._write_staged(symbols, block, past, 1).data
 
 
 @settings(max_examples=10)
@@ -62,54 +65,54 @@ def written_in_stages(attributes, class_count=None):
 def test_any_symbols_come_back(rows, seed, class_count, scale):
     """Few channels have the whole scale: fitting priors to wide ones takes time."""
     rng = np.random.default_rng(seed)
-    scales = np.where(rng.random((N_CHANNELS, 1)) < 0.1, scale, min(scale, 3))
-    attributes = np.clip(np.rint(rng.standard_t(2, (N_CHANNELS, rows)) * scales), -MAX_SYMBOL, MAX_SYMBOL)
+    scales = np.where(rng.random((WIDTHS.channels, 1)) < 0.1, scale, min(scale, 3))
+    attributes = np.clip(np.rint(rng.standard_t(2, (WIDTHS.channels, rows)) * scales), -MAX_SYMBOL, MAX_SYMBOL)
     attributes = attributes.astype(np.int32)
-    attributes[rng.random(N_CHANNELS) < 0.3] = int(rng.integers(-5, 5))
-    for data in (written_in_stages(attributes, class_count), write_attributes(attributes, "best", 1)[0]):
-        np.testing.assert_array_equal(read_attributes(data, rows), attributes)
+    attributes[rng.random(WIDTHS.channels) < 0.3] = int(rng.integers(-5, 5))
+    for data in (written_in_stages(attributes, class_count), write_attributes(attributes, WIDTHS, "best", 1)[0]):
+        np.testing.assert_array_equal(read_attributes(data, WIDTHS, rows), attributes)
 
 
 def test_the_largest_symbols_come_back():
     rng, rows = np.random.default_rng(4), 200
-    attributes = np.ones((N_CHANNELS, rows), np.int32)
+    attributes = np.ones((WIDTHS.channels, rows), np.int32)
     wide = [0, 6, 7, 29, 38, 39, 40]
     attributes[wide] = rng.choice([-MAX_SYMBOL, -1, 0, MAX_SYMBOL], (len(wide), rows))
-    np.testing.assert_array_equal(read_attributes(written_in_stages(attributes, 3), rows), attributes)
+    np.testing.assert_array_equal(read_attributes(written_in_stages(attributes, 3), WIDTHS, rows), attributes)
 
 
 def test_terms_that_would_break_a_limit_are_left_out():
     """A weight of 40, and one that predicts 2^23 where -2^23 stands."""
     source = np.resize(np.array([1, -1, 0, 2], np.int32), 4200)
-    attributes = np.zeros((N_CHANNELS, 4200), np.int32)
+    attributes = np.zeros((WIDTHS.channels, 4200), np.int32)
     attributes[0], attributes[1] = source * 100, source * 4000
     attributes[2] = np.where(source > 0, MAX_SYMBOL, -MAX_SYMBOL)
     attributes[3] = attributes[2]
     attributes[3, 0] = -MAX_SYMBOL
     assert abs(attributes[1]).max() > abs(attributes[0]).max() * MAX_WEIGHT >> 10
-    np.testing.assert_array_equal(read_attributes(written_in_stages(attributes), 4200), attributes)
+    np.testing.assert_array_equal(read_attributes(written_in_stages(attributes), WIDTHS, 4200), attributes)
 
 
 def test_damage_raises_only_decode_errors():
     rows = 400
-    data, _ = write_attributes(correlated(rows), "best", 2)
+    data, _ = write_attributes(correlated(rows), WIDTHS, "best", 2)
     assert data[0] == STAGED
     rng = np.random.default_rng(2)
     for cut in rng.integers(0, len(data), 60):
         with pytest.raises(DecodeError):
-            read_attributes(data[:cut], rows)
+            read_attributes(data[:cut], WIDTHS, rows)
     for _ in range(300):
         broken = bytearray(data)
         broken[rng.integers(0, min(len(data), 900))] ^= 1 << rng.integers(0, 8)
         try:
-            assert read_attributes(bytes(broken), rows).shape == (N_CHANNELS, rows)
+            assert read_attributes(bytes(broken), WIDTHS, rows).shape == (WIDTHS.channels, rows)
         except DecodeError:
             pass
 
 
 def test_an_unknown_form_is_refused():
     with pytest.raises(DecodeError, match="form 3"):
-        read_attributes(b"\x03", 3)
+        read_attributes(b"\x03", WIDTHS, 3)
 
 
 def block(*, terms=None, counts=(1, 1, 1, 1, 1), split=(0,), lengths=(0,) * 7):
@@ -149,7 +152,7 @@ def block(*, terms=None, counts=(1, 1, 1, 1, 1), split=(0,), lengths=(0,) * 7):
 )
 def test_a_faulty_block_is_refused(options, error, message):
     with pytest.raises(error, match=message):
-        read_attributes(block(**options), 3)
+        read_attributes(block(**options), WIDTHS, 3)
 
 
 @pytest.mark.parametrize("symbol", [K_MAX >> 1, -(K_MAX >> 1), (K_MAX >> 1) + 1, -(K_MAX >> 1) - 1])
@@ -158,7 +161,7 @@ def test_a_predicted_symbol_over_the_limit_is_refused(symbol):
     stages = [encode_channels([np.full(3, symbol)] * number).payload for number in (6, 6, 8, 9, 9, 10, 10, 10)]
     data = block(terms={1: (1, [(0, 1 << 10)])}, lengths=[len(s) for s in stages[:-1]]) + b"".join(stages)
     if abs(2 * symbol) <= K_MAX:
-        assert read_attributes(data, 3)[:3, 0].tolist() == [symbol, 2 * symbol, symbol]
+        assert read_attributes(data, WIDTHS, 3)[:3, 0].tolist() == [symbol, 2 * symbol, symbol]
     else:
         with pytest.raises(Malformed, match=f"a predicted attribute over {K_MAX}"):
-            read_attributes(data, 3)
+            read_attributes(data, WIDTHS, 3)

@@ -18,11 +18,17 @@ from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.evaluate import enclosure
 from pd4dgs_codec.evaluate import reach as reach_module
 from pd4dgs_codec.evaluate.enclosure import Enclosure, Stretch, instants
-from pd4dgs_codec.evaluate.reach import reach
+from pd4dgs_codec.evaluate.reach import global_cells, local_cells, shown_gaussians
 from pd4dgs_codec.evaluate.residuals import residuals
 from pd4dgs_codec.scene import PLANES, Camera, Deformation, Scene
 
 SIDES = (6, 5, 7, 5)
+
+
+def reach(scene):
+    """(cells of the global planes, of the local ones, Gaussians shown): the whole proof, whatever it takes."""
+    shown = shown_gaussians(scene)
+    return global_cells(scene), local_cells(scene, shown), shown
 
 
 def lively_scene() -> Scene:
@@ -82,15 +88,15 @@ def test_edits_of_the_scene_and_of_its_decoded_twin_are_alike(raw_deformation):
     omissions = _Omissions(planned, raw_deformation)
     while omissions.simplify_networks():
         pass
-    omissions.free_offsets_and_cells()
+    omissions.free_offsets_and_cells(price=0)
     assert len(omissions.found) > 8
     assert_same_scene(omissions.decoded, rounded(omissions.scene, raw_deformation))
 
 
 def test_every_dead_part_is_found_and_costs_less():
     scene = dead_scene()
-    whole, _ = encode_with_report(scene, layers=2, effort=1, omit="nothing")
-    data, report = encode_with_report(scene, layers=2, effort=1)
+    whole, _ = encode_with_report(scene, layers=2, effort=9, omit="nothing")
+    data, report = encode_with_report(scene, layers=2, effort=9)
     found = {row["what"]: row["bytes"] for row in report.left_out}
     expected = [
         "global_deformation head scaling",
@@ -112,7 +118,7 @@ def test_every_dead_part_is_found_and_costs_less():
     assert not got.networks["opacity"][0][0][[3, 5]].any() and not got.networks["opacity"][1][0][:, [3, 5]].any()
     assert not got.feature[:, 7].any() and not got.global_deformation.planes[0]["xy"][4].any()
     assert set(got.global_deformation.networks) == {"trunk", "position", "feature", "offset"}
-    assert encode(got, layers=2, effort=1) == data
+    assert encode(got, layers=2, effort=9) == data
 
 
 def test_no_pixel_changes():
@@ -138,6 +144,23 @@ def test_no_pixel_changes():
             np.testing.assert_array_equal(a, b)
             seen += float(np.ptp(a))
     assert seen > 1, "the pictures show something"
+
+
+def test_a_proof_that_does_not_pay_is_not_made():
+    """It costs bytes and no picture: all Gaussians count as shown, and all cells as read."""
+    scene, _ = plan(dead_scene(), EncodeOptions(layers=2, omit="nothing"))
+    asked = []
+
+    def pays(known, evaluations):
+        asked.append((known, evaluations))
+        return False
+
+    assert shown_gaussians(scene, pays).all() and not shown_gaussians(scene).all()
+    assert local_cells(scene, np.ones((len(scene.anchor), 10), bool), pays) is None
+    certain, evaluations = asked[0]
+    assert not certain[:, 6].any() and evaluations > 0
+    sizes = [len(encode(dead_scene(), layers=2, effort=effort)) for effort in (1, 9)]
+    assert sizes[1] < sizes[0]
 
 
 def test_nothing_that_matters_goes():

@@ -14,7 +14,7 @@ from pd4dgs_codec.codec.kinds import LAYER_KINDS
 from pd4dgs_codec.codec.options import EncodeOptions
 from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.evaluate import residuals as evaluate
-from pd4dgs_codec.scene import GLOBAL_HEADS, LENGTH_HEADS, LOCAL_HEADS, PLANES, Deformation, deformation_unit
+from pd4dgs_codec.scene import LENGTH_HEADS, LOCAL_HEADS, PLANES, Deformation, Widths, deformation_unit
 
 VOXEL = 0.0078125
 encode, encode_with_report = (partial(f, effort=1) for f in (encoder.encode, encoder.encode_with_report))
@@ -41,7 +41,7 @@ def scene_with(global_value=None, local_value=None, **options):
     scene = make_scene(4, anchors=30, heads=({}, {}))
     fields = {}
     if global_value is not None:
-        fields["global_deformation"] = constant_deformation(GLOBAL_HEADS, global_value, **options)
+        fields["global_deformation"] = constant_deformation(Widths().global_heads, global_value, **options)
     if local_value is not None:
         fields["local_deformation"] = constant_deformation(LOCAL_HEADS, local_value, **options)
     return replace(scene, **fields)
@@ -85,7 +85,7 @@ def test_inactive_anchors_are_dropped_and_reported():
 @pytest.mark.parametrize("layer", [1, 2])
 def test_each_head_is_judged_by_its_own_bound(layer):
     kind = LAYER_KINDS[layer]
-    heads = GLOBAL_HEADS if layer == 1 else LOCAL_HEADS
+    heads = kind.heads(Widths())
     bounds = head_bounds(scene_with(), kind)
     assert set(bounds) == set(heads) and bounds["position" if layer == 1 else "mean"] == 1e-3 * VOXEL
     unit = float(deformation_unit(scene_with().info.box))

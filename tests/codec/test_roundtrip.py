@@ -13,7 +13,7 @@ from pd4dgs_codec.codec import encoder, slicing
 from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.morton import morton_codes
-from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS
+from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS, Widths
 
 encode, encode_with_report = (partial(f, effort=1) for f in (encoder.encode, encoder.encode_with_report))
 MODES = [("ans", "coded"), ("lzma", "coded"), ("ans", "float32"), ("lzma", "float32")]
@@ -254,7 +254,7 @@ def test_positions_that_overflow_are_refused_verified_or_not(verify):
 @given(st.sampled_from(sorted(GLOBAL_HEADS)), st.sampled_from(sorted(LOCAL_HEADS)))
 @settings(max_examples=3)
 def test_single_heads(global_head, local_head):
-    heads = ({global_head: GLOBAL_HEADS[global_head]}, {local_head: LOCAL_HEADS[local_head]})
+    heads = ({global_head: Widths().global_heads[global_head]}, {local_head: LOCAL_HEADS[local_head]})
     scene = make_scene(0, heads=heads)
     decoded = decode(encode(scene, layers=2))
     assert_same_scene(decoded, decode(encode(decoded, layers=2)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import gzip
 import http.client
 import os
 import socket
@@ -147,6 +148,31 @@ def test_only_files_of_the_folder(server, folder, target):
     os.mkfifo(folder / "pipe")
     answer = ask(server, target)
     assert answer.status == 404 and b"secret" not in answer.body
+
+
+def test_a_folder_shows_its_page(server, folder):
+    (folder / "sub").mkdir()
+    for place in (folder, folder / "sub"):
+        (place / "index.html").write_text(f"page of {place.name}")
+    assert ask(server, "/").body == b"page of www" and ask(server, "/sub/?level=1").body == b"page of sub"
+    assert ask(server, "/").headers["Content-Type"].startswith("text/html")
+
+
+def test_pages_and_scripts_are_compressed_for_who_takes_that(server, folder):
+    text = b"let a = 1;\n" * 500
+    (folder / "a.js").write_bytes(text)
+    (folder / "long.js").write_bytes(text * 200)
+    plain = ask(server, "/a.js")
+    assert plain.body == text and plain.headers["Vary"] == "Accept-Encoding"
+    zipped = ask(server, "/a.js", Accept_Encoding="br, gzip")
+    assert zipped.headers["Content-Encoding"] == "gzip" and gzip.decompress(zipped.body) == text
+    assert zipped.headers["ETag"] != plain.headers["ETag"] and len(zipped.body) < 200
+    again = ask(server, "/a.js", Accept_Encoding="gzip", If_None_Match=zipped.headers["ETag"])
+    assert again.status == 304
+    assert ask(server, "/a.js", "HEAD", Accept_Encoding="gzip").headers["Content-Length"] == str(len(zipped.body))
+    assert ask(server, "/a.js", Accept_Encoding="gzip", Range="bytes=4-8").body == text[4:9]
+    for name in ("/long.js", "/bytes.bin"):
+        assert "Content-Encoding" not in ask(server, name, Accept_Encoding="gzip").headers
 
 
 def test_links_and_odd_names_inside_the_folder_are_served(server, folder):

@@ -9,6 +9,7 @@ from pd4dgs_codec.model import fused
 from pd4dgs_codec.model.mlp import MLP
 from pd4dgs_codec.model.model import Gaussians, Model
 from pd4dgs_codec.model.rounding import EXACT, Noise, Rounding
+from pd4dgs_codec.scene import Widths
 
 PARTS = ("means", "quats", "scales", "opacities", "colors")
 
@@ -52,6 +53,12 @@ def check(model: Model, level: int, rounding: str = "exact") -> Gaussians:
 def test_it_is_the_plain_graph(level, rounding):
     gaussians = check(stir(small_model(anchors=300, opacity=-0.1), 0.3), level, rounding)
     assert 0 < len(gaussians.slots) < 10 * len(gaussians.anchors)
+
+
+@pytest.mark.parametrize("widths", [Widths(16, 4), Widths(1, 1), Widths(5, 13)])
+def test_it_is_so_at_other_widths(widths):
+    gaussians = check(stir(small_model(widths=widths, anchors=300, opacity=0.0), 0.3), 2)
+    assert 0 < len(gaussians.slots) < widths.slots * len(gaussians.anchors)
 
 
 @pytest.mark.parametrize("level", [0, 1, 2])

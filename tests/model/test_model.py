@@ -20,6 +20,7 @@ from pd4dgs_codec.model.masks import level_mask, mask_logits
 from pd4dgs_codec.model.model import Model, fresh_networks
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.scene import (
+    DEFAULT_WIDTHS,
     GLOBAL_HEADS,
     LOCAL_HEADS,
     MASK_STEP,
@@ -38,10 +39,12 @@ CAMERA = Camera(VIEWMAT, np.array([[40.0, 0, 19.5], [0, 40.0, 15.5], [0, 0, 1]],
 FLAT = (200, 200, 200)  #: one mask at all levels
 
 
-ALL_HEADS = (tuple(GLOBAL_HEADS), tuple(LOCAL_HEADS))
+ALL_HEADS = (GLOBAL_HEADS, tuple(LOCAL_HEADS))
 
 
-def small_model(heads=ALL_HEADS, masks=FLAT, *, anchors=80, seed=0, channels=8, reach=1.0, opacity=1.0) -> Model:
+def small_model(
+    heads=ALL_HEADS, masks=FLAT, *, anchors=80, seed=0, channels=8, reach=1.0, opacity=1.0, widths=DEFAULT_WIDTHS
+) -> Model:
     """An untrained model with `anchors` of different looks within +-reach; masks: codes per level, for all anchors or
     [anchors, 3]. Deformations without heads are None."""
     torch.manual_seed(seed)
@@ -50,15 +53,15 @@ def small_model(heads=ALL_HEADS, masks=FLAT, *, anchors=80, seed=0, channels=8, 
     cells = np.unique(rng.integers(-side, side + 1, (2 * anchors, 3), dtype=np.int32), axis=0)
     cells = rng.permutation(cells)[:anchors]
     info = SceneInfo(VOXEL, BOX, (0.0, 1.0), (0.25, 0.5, 0.75), 0.125, 64.0, (0.0, -1.0, 0.0), 0.0, CAMERA)
-    networks = fresh_networks(16)
+    networks = fresh_networks(widths, 16)
     torch.nn.init.constant_(networks["opacity"].linears[-1].bias, opacity)
     config = DeformationConfig(5, 4, channels, (1, 2), 8, ())
     fields = [
-        DeformationField.fresh(replace(config, heads=names), BOX, widths, None, 0.02) if names else None
-        for names, widths in zip(heads, (GLOBAL_HEADS, LOCAL_HEADS), strict=True)
+        DeformationField.fresh(replace(config, heads=names), BOX, outputs, None, 0.02) if names else None
+        for names, outputs in zip(heads, (widths.global_heads, LOCAL_HEADS), strict=True)
     ]
     codes = np.broadcast_to(np.asarray(masks, np.float64), (anchors, 3)) * MASK_STEP
-    values = [0.5 * rng.normal(size=shape) for shape in ((anchors, 32), (anchors, 6), (anchors, 10, 3))]
+    values = [0.5 * rng.normal(size=(anchors, *shape)) for shape in widths.attributes.values()]
     feature, scaling_log, offset = (torch.from_numpy(v.astype(np.float32)) for v in values)
     logits = torch.from_numpy(mask_logits(codes))
     steps = Steps().scaled(1.0)
@@ -193,7 +196,7 @@ ACTIVATIONS = {
 @pytest.mark.parametrize("alone", [False, True])
 def test_a_local_residual_changes_its_own_quantity_before_the_gate(head, alone):
     """After the global deformation, and with `alone` in a model that has no other local head."""
-    model = stir(small_model((tuple(GLOBAL_HEADS), (head,) if alone else tuple(LOCAL_HEADS))), 0.1)
+    model = stir(small_model((GLOBAL_HEADS, (head,) if alone else tuple(LOCAL_HEADS))), 0.1)
     with torch.no_grad():
         for name, net in model.local_deformation.heads.items():
             for parameter in net.parameters():
@@ -269,7 +272,7 @@ def test_culling_changes_no_pixel(level, monkeypatch):
 @pytest.mark.parametrize("level", [0, 1, 2])
 def test_faint_gaussians_left_out_change_no_pixel(level, monkeypatch):
     """At level 2 without the opacity head, which could raise them: the set is fixed before the residuals."""
-    model = stir(small_model((tuple(GLOBAL_HEADS), ("mean", "scale", "quat", "color")), opacity=0.0), 0.05)
+    model = stir(small_model((GLOBAL_HEADS, ("mean", "scale", "quat", "color")), opacity=0.0), 0.05)
     with torch.no_grad():  # from clearly negative over just visible to opaque
         model.networks["opacity"].linears[-1].bias.copy_(torch.linspace(-0.3, 0.4, 10))
     image, kept = picture(model, level), len(gaussians(model, level).slots)
@@ -306,7 +309,7 @@ MIXED = np.sort(np.random.default_rng(9).choice(np.array([0, 3, 4, 90, 255]), (8
     [
         ((("position",), ("mean", "color")), (0, 1, 2)),
         (((), ("scale",)), (0, 2)),
-        ((tuple(GLOBAL_HEADS), ()), (0, 1)),
+        ((GLOBAL_HEADS, ()), (0, 1)),
         (((), ()), (0,)),
     ],
 )

@@ -13,11 +13,12 @@ from strategies import make_scene
 
 from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.encoder import encode
+from pd4dgs_codec.errors import RenderError
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.playback.networks import Layers
 from pd4dgs_codec.playback.player import Player
-from pd4dgs_codec.scene import Camera, Deformation, Scene
+from pd4dgs_codec.scene import Camera, Deformation, Scene, Widths
 
 ROOT = Path(__file__).parents[2]
 K = np.array([[40, 0, 24], [0, 40, 18], [0, 0, 1]], np.float32)
@@ -41,7 +42,9 @@ def _scene(**changes: object) -> Scene:
 
 
 @pytest.mark.parametrize(
-    "changes", [{}, {"hidden": (16, 8)}, {"channels": 5, "width": 7}], ids=["usual", "deep", "odd"]
+    "changes",
+    [{}, {"hidden": (16, 8)}, {"channels": 5, "width": 7}, {"widths": Widths(16, 4)}, {"widths": Widths(3, 13)}],
+    ids=["usual", "deep", "odd", "narrow", "odd widths"],
 )
 def test_pictures_are_those_of_the_torch_model(changes):
     scene = _scene(**changes)
@@ -58,6 +61,12 @@ def test_pictures_are_those_of_the_torch_model(changes):
             assert np.abs(got - expected).max() < 5e-3 and np.abs(got - expected).mean() < 1e-5
             seen += float(np.ptp(got))
     assert seen > 2, "the pictures show something"
+
+
+@pytest.mark.parametrize("t", [float("nan"), float("inf")])
+def test_a_time_that_is_no_number_is_refused(t):
+    with pytest.raises(RenderError, match="time is"):
+        Player(_scene()).picture(_camera(0), t)
 
 
 def test_what_depends_on_time_alone_is_kept_and_changes_nothing():

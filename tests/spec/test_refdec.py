@@ -36,6 +36,7 @@ from pd4dgs_codec.entropy.tables import NORMAL, OCTAVE
 from pd4dgs_codec.entropy.varint import put_varint, put_zigzag
 from pd4dgs_codec.errors import DecodeError
 from pd4dgs_codec.morton import morton_order
+from pd4dgs_codec.scene import Widths
 
 SPEC = Path(__file__).parents[2] / "spec"
 TEXT = (SPEC / "format.md").read_text(encoding="utf-8")
@@ -169,7 +170,7 @@ def test_hashes_of_a_scene_in_stages(staged_file):
     section, rows = section_of(chunks[0][2], Section.ATTRIBUTES)
     assert section[0] == STAGED and rows >= 400
     reader = refdec.Reader(section[1:])
-    assert any([refdec.read_terms(reader, c) for c in range(1, 38)])
+    assert any([refdec.read_terms(reader, 38, c) for c in range(1, 38)])
     assert max([refdec.read_class_count(reader) for _ in range(5)]) > 1
     assert (1, 1) in [refdec.read_split(reader)[:2] for _ in range(10)]
     section, _ = section_of(chunks[1][2], Section.PLANES)
@@ -200,7 +201,7 @@ def assert_same_outcomes(section, decode_both, number, begin):
     return seen
 
 
-ROWS = 9
+ROWS, WIDTHS = 9, (32, 10)
 STAGE_BOUNDS = (0, 6, 12, 20, 29, 38)
 
 
@@ -274,8 +275,8 @@ def staged(stages, lengths=None):
 
 def both(section, rows=ROWS):
     """Outcome of the reference decoder and of the package: symbols or the error's name."""
-    ours = outcome(lambda d: refdec.decode_attributes(d, rows, refdec.Past()), section, refdec.Fault)
-    return ours, outcome(lambda d: read_attributes(d, rows).tolist(), section, DecodeError)
+    ours = outcome(lambda d: refdec.decode_attributes(d, *WIDTHS, rows, refdec.Past()), section, refdec.Fault)
+    return ours, outcome(lambda d: read_attributes(d, Widths(*WIDTHS), rows).tolist(), section, DecodeError)
 
 
 def both_planes(section, shapes):

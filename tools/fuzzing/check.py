@@ -111,7 +111,7 @@ def declared(data: bytes) -> tuple[int, int]:
             kind = BY_CHUNK_TYPE.get(kind_number)
             if kind is not None:
                 payload = read_chunk(data, offset, length=length).payload
-                *_, total = read_meta(payload, kind, total, header.raw_deformation, kind.layer in seen)
+                *_, total = read_meta(payload, kind, header.widths, total, header.raw_deformation, kind.layer in seen)
                 later += kind.layer in seen
                 seen.add(kind.layer)
             offset += CHUNK_OVERHEAD + length

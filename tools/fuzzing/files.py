@@ -28,7 +28,7 @@ from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
 from pd4dgs_codec.codec.layer_meta import Section
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint
 from pd4dgs_codec.errors import DecodeError
-from pd4dgs_codec.scene import N_OFFSETS, Scene
+from pd4dgs_codec.scene import DEFAULT_WIDTHS, Scene, Widths
 
 
 @dataclass
@@ -42,6 +42,7 @@ class Chunk:
     payload: bytes
     meta: dict[int, Any] | None = None
     sections: dict[int, bytes] | None = None
+    widths: Widths = DEFAULT_WIDTHS
 
     def packed(self) -> bytes:
         """The payload, written anew if it was taken apart: section lengths follow the sections."""
@@ -65,10 +66,11 @@ class Parts:
 def take_apart(data: bytes) -> Parts:
     """The parts of a valid file, each a copy."""
     preamble = read_preamble(data)
+    header = canonical.unpack(preamble.header)
     chunks, offset = [], preamble.size
     while offset < len(data):
         chunk = read_chunk(data, offset)
-        part = Chunk(chunk.type, chunk.flags, chunk.payload)
+        part = Chunk(chunk.type, chunk.flags, chunk.payload, widths=Widths(*header[header_module.WIDTHS]))
         if chunk.type in BY_CHUNK_TYPE:
             (length,) = struct.unpack_from("<I", chunk.payload)
             part.meta, at = canonical.unpack(chunk.payload[4 : 4 + length]), 4 + length
@@ -79,7 +81,7 @@ def take_apart(data: bytes) -> Parts:
                 part.sections[number], at = chunk.payload[at : at + size], at + size
         chunks.append(part)
         offset = chunk.end
-    return Parts(canonical.unpack(preamble.header), chunks)
+    return Parts(header, chunks)
 
 
 def put_together(parts: Parts, header: bytes | None = None) -> bytes:
@@ -133,8 +135,8 @@ def _pass_block(reader: ByteReader, chunk: Chunk, number: int) -> int:
     """Reads on to the lengths of the stages and returns how many stages there are."""
     assert chunk.meta is not None
     if number == Section.ATTRIBUTES:
-        for channel in range(1, attribute_section.N_PREDICTED):
-            attribute_section._read_terms(reader, channel)
+        for channel in range(1, chunk.widths.predicted):
+            attribute_section._read_terms(reader, chunk.widths, channel)
         counts = len(attribute_section.STAGES) - 1
     else:
         counts = max(1, (chunk.meta[layer_meta.SCALES][0][0] - 1).bit_length()) - 1
@@ -142,7 +144,7 @@ def _pass_block(reader: ByteReader, chunk: Chunk, number: int) -> int:
         stages.read_class_count(reader, stage)
     if number == Section.PLANES:
         return counts + 1
-    for _ in range(N_OFFSETS):
+    for _ in range(chunk.widths.slots):
         attribute_section._read_split(reader)
     return counts + 3
 

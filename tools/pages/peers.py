@@ -113,7 +113,7 @@ def _encode_own(priors: str, effort: int) -> Callable[[Symbols], list[bytes]]:
                 if not any(c.size for c in groups[section]):
                     payloads.append(b"")
                 elif section == Section.ATTRIBUTES:
-                    payloads.append(write_attributes(layer.attributes, priors, effort)[0])
+                    payloads.append(write_attributes(layer.attributes, layer.widths, priors, effort)[0])
                 elif section == Section.PLANES:
                     payloads.append(write_planes(planes, priors, effort)[0])
                 else:
@@ -131,7 +131,7 @@ def _decode_own(payloads: list[bytes], symbols: Symbols) -> list[np.ndarray]:
             if not data:
                 continue
             if section == Section.ATTRIBUTES:
-                channels += list(read_attributes(data, layer.attributes.shape[1]))
+                channels += list(read_attributes(data, layer.widths, layer.attributes.shape[1]))
             elif section == Section.PLANES:
                 shapes = [plane.shape for plane in planes]
                 channels += [c.ravel() for plane in read_planes(data, shapes) for c in plane]

@@ -18,11 +18,11 @@ import numpy as np
 
 from pd4dgs_codec.attributes.planes import residual
 from pd4dgs_codec.attributes.quantise import dequantise
-from pd4dgs_codec.attributes.table import ATTRIBUTES, N_CHANNELS, dequantise_attributes
+from pd4dgs_codec.attributes.table import dequantise_attributes
 from pd4dgs_codec.bitstream import canonical
 from pd4dgs_codec.bitstream.container import MAJOR, SCENE_ID_SIZE, SIGNATURE, slice_flags
 from pd4dgs_codec.codec.header import payload_digest
-from pd4dgs_codec.codec.kinds import LAYER_KINDS, SCAFFOLD_INPUT
+from pd4dgs_codec.codec.kinds import LAYER_KINDS
 from pd4dgs_codec.codec.layer_meta import Section
 from pd4dgs_codec.codec.symbols import LayerSymbols, merged
 from pd4dgs_codec.entropy.ans import ans_encode
@@ -40,7 +40,7 @@ from pd4dgs_codec.entropy.priors import (
 )
 from pd4dgs_codec.entropy.tables import uniform_table
 from pd4dgs_codec.entropy.varint import put_varint, put_zigzag
-from pd4dgs_codec.scene import PLANES
+from pd4dgs_codec.scene import ATTRIBUTES, DEFAULT_WIDTHS, PLANES, Widths
 
 from . import lzma2
 
@@ -72,6 +72,7 @@ HEADER: dict[int, object] = {
     10: [0.0, -1.0, 0.0],
     11: 1.5,
     13: ERROR_BOUNDS,
+    15: [32, 10],
 }
 CAMERA: dict[int, object] = {
     1: [1.0, 0.0, 0.0, 0.25, 0.0, 0.0, -1.0, 0.5, 0.0, 1.0, 0.0, 4.0],
@@ -209,7 +210,7 @@ def positions(cells: np.ndarray, known: Known | None = None) -> bytes:
 
 
 def plain_attributes(k: np.ndarray, priors: Mapping[int, Prior] | None = None, known: Known | None = None) -> bytes:
-    """Section ATTRIBUTES of int32 [68, n], form 0 (clause 8.5)."""
+    """Section ATTRIBUTES of int32 [channels, n], form 0 (clause 8.5)."""
     return b"\0" + coded(k, priors, known)
 
 
@@ -303,19 +304,22 @@ def staged_planes(
 Terms = Mapping[int, Sequence[tuple[int, int]]]
 Splits = Mapping[int, tuple[int, int, int]]
 ONE_CLASS = (1,) * 5  # in each of the stages 1 to 5
-RESIDUAL_STAGES = (0, 6, 12, 20, 29, 38)
 
 
 def prediction_block(
-    terms: Terms, splits: Splits, counts: Mapping[int, int], classes: Sequence[int] = ONE_CLASS
+    terms: Terms,
+    splits: Splits,
+    counts: Mapping[int, int],
+    classes: Sequence[int] = ONE_CLASS,
+    widths: Widths = DEFAULT_WIDTHS,
 ) -> bytes:
     """Items 1 to 3 of clause 8.6. terms: channel -> (g, w) as they are stored; counts: other numbers of terms."""
     out = b""
-    for c in range(1, 38):
+    for c in range(1, widths.predicted):
         own = terms.get(c, ())
         out += varint(counts.get(c, len(own))) + b"".join(varint(g) + zigzag(w) for g, w in own)
     out += b"".join(map(varint, classes))
-    for i in range(10):
+    for i in range(widths.slots):
         flags, a, b = splits.get(i, (0, 0, 0))
         out += varint(flags) + (zigzag(a) if flags else b"") + (zigzag(b) if flags & 2 else b"")
     return out
@@ -327,20 +331,25 @@ def gaps(terms: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def attribute_stages(
-    e: np.ndarray, splits: Splits, classes: Sequence[int], of: np.ndarray | None = None
+    e: np.ndarray,
+    splits: Splits,
+    classes: Sequence[int],
+    widths: Widths = DEFAULT_WIDTHS,
+    of: np.ndarray | None = None,
 ) -> list[list[np.ndarray]]:
-    """The channels of the eight stages of clause 8.7, of residuals and offsets int64 [68, n]. of: those of the slice
-    that the block stands in, if it is another one."""
-    of = e if of is None else of
-    stages = [list(e[:6])]
+    """The channels of the eight stages of clause 8.7, of residuals and offsets int64 [channels, n]. of: those of the
+    slice that the block stands in, if it is another one."""
+    of, p = e if of is None else of, widths.predicted
+    bounds = [p * a // 38 for a in (0, 6, 12, 20, 29, 38)]
+    stages = [list(e[: bounds[1]])]
     for stage, count in enumerate(classes, 1):
-        first = RESIDUAL_STAGES[stage]
-        channels = e[first : RESIDUAL_STAGES[stage + 1]] if stage < 5 else e[38:68:3]
+        first = bounds[stage]
+        channels = e[first : bounds[stage + 1]] if stage < 5 else e[p::3]
         activity, measure = relative_magnitude(e[:first], of[:first]), relative_magnitude(of[:first])
         stages.append([part for channel in channels for part in split_by_activity(channel, activity, count, measure)])
     ys, zs = list[np.ndarray](), list[np.ndarray]()
-    for i in range(10):
-        x, y, z = e[38 + 3 * i : 41 + 3 * i]
+    for i in range(widths.slots):
+        x, y, z = e[p + 3 * i : p + 3 * i + 3]
         flags, a, b = splits.get(i, (0, 0, 0))
         near_x, near_xy = np.minimum(abs(x - a), CLASSES_Y - 1), np.minimum(abs(x - a) + abs(y - b), CLASSES_Z - 1)
         ys += [y[near_x == q] for q in range(CLASSES_Y)] if flags & 1 else [y]
@@ -354,26 +363,28 @@ def predicted_attributes(
     splits: Splits,
     classes: Sequence[int] = ONE_CLASS,
     *,
+    widths: Widths = DEFAULT_WIDTHS,
     lengths: Lengths = lambda sizes: sizes,
     tail: bytes = b"",
     known: Sequence[Known] | None = None,
     of: np.ndarray | None = None,
 ) -> bytes:
-    """Section ATTRIBUTES of int32 [68, n], form 1 (clauses 8.5 to 8.9). terms: channel -> (channel, weight) ascending.
+    """Section ATTRIBUTES of int32 [channels, n], form 1 (clauses 8.5 to 8.9).
 
-    classes: of stages 1 to 5. lengths: what the block says of stages 0 to 6, from the true lengths. tail: after the
-    last stage. of: the attributes of the slice that the block stands in, if it is another one: form 2.
+    terms: channel -> (channel, weight) ascending. classes: of stages 1 to 5. lengths: what the block says of stages 0
+    to 6, from the true lengths. tail: after the last stage. of: the attributes of the slice that the block stands in,
+    if it is another one: form 2.
     """
-    e = residuals(k, terms)
-    stages = attribute_stages(e, splits, classes, None if of is None else residuals(of, terms))
-    block = b"\1" + prediction_block({c: gaps(own) for c, own in terms.items()}, splits, {}, classes)
+    e = residuals(k, terms, widths)
+    stages = attribute_stages(e, splits, classes, widths, None if of is None else residuals(of, terms, widths))
+    block = b"\1" + prediction_block({c: gaps(own) for c, own in terms.items()}, splits, {}, classes, widths)
     return (block if of is None else b"\2") + staged(stages, lengths, tail, known=known)
 
 
-def residuals(k: np.ndarray, terms: Terms) -> np.ndarray:
-    """int64 [68, n]: attributes int32 [68, n], the predicted channels without their prediction (clause 8.7)."""
+def residuals(k: np.ndarray, terms: Terms, widths: Widths = DEFAULT_WIDTHS) -> np.ndarray:
+    """int64 [channels, n]: attributes int32 [channels, n], the predicted ones without their prediction (clause 8.7)."""
     e = k.astype(np.int64)
-    for c in range(1, 38):
+    for c in range(1, widths.predicted):
         total = sum((w * k[j].astype(np.int64) for j, w in terms.get(c, ())), np.zeros_like(e[c]))
         e[c] -= total + 512 >> WEIGHT_SHIFT
     return e
@@ -483,9 +494,6 @@ def constant_networks(number: int, widths: Mapping[int, Sequence[int]], inputs: 
     return networks
 
 
-SCAFFOLD = {0: (10,), 1: (70,), 2: (30,)}
-
-
 @dataclass(frozen=True)
 class Scale:
     """One scale of a HexPlane. fill: makes the symbols of one plane from its name and shape."""
@@ -513,18 +521,25 @@ def make_layer(
     steps: Sequence[float] | None = None,
     mode: int = ANS,
     raw: bool = False,
+    widths: Widths = DEFAULT_WIDTHS,
 ) -> Layer:
     """A layer of `cells` (in Morton order) after `before` earlier rows.
 
     Without further words: every rise 0, every code 77, attributes all 2, in layer 0 the networks without hidden layers,
-    elsewhere no deformation unless `scales` are given, then with a trunk and the head 1. networks: widths by id, or
-    the tensors by name. raw: planes and weights are those symbols times their step, as float32 values.
+    elsewhere no deformation unless `scales` are given, then with a trunk and the head 1. networks: outputs by id,
+    or the tensors by name. raw: planes and weights are those symbols times their step, as float32 values.
     """
     n, kind = len(cells), LAYER_KINDS[number]
     if networks is None:
-        networks = SCAFFOLD if number == 0 else {0: (3,), 1: (3,)} if scales else {}
+        networks = (
+            {i: (n,) for i, n in enumerate(widths.networks.values())}
+            if number == 0
+            else {0: (3,), 1: (3,)}
+            if scales
+            else {}
+        )
     if not any(isinstance(key, str) for key in networks):
-        inputs = SCAFFOLD_INPUT if number == 0 else sum(s.channels for s in scales)
+        inputs = widths.inputs if number == 0 else sum(s.channels for s in scales)
         networks = constant_networks(number, networks, inputs)
     steps = list(steps or ([2.0**-7] if number == 0 else [2.0**-4, 2.0**-6]))
     planes = tuple(s.planes() for s in scales)
@@ -535,10 +550,11 @@ def make_layer(
         }
     meant = LayerSymbols(
         kind=kind,
+        widths=widths,
         anchor_q=np.array(cells, np.int32).reshape(-1, 3),
         mask_increase=np.array([0] * before if rises is None else rises, np.int32),
         mask_own=np.array([77] * n if codes is None else codes, np.int32),
-        attributes=np.full((N_CHANNELS, n), 2, np.int32) if attributes is None else attributes,
+        attributes=np.full((widths.channels, n), 2, np.int32) if attributes is None else attributes,
         planes=planes,
         networks=networks,
         steps=dict(zip(kind.step_names, steps, strict=True)) if networks else {},
@@ -698,13 +714,14 @@ def make_file(*layers: Layer, header: Mapping[int, object] | None = None) -> Fil
         chunks += [
             Chunk(kind.chunk_type, x.payload(), slice_flags(number, len(own)), layer=x) for number, x in enumerate(own)
         ]
-    return File(tuple(chunks)).with_header(header or {})
+    widths = layers[0].meant.widths
+    return File(tuple(chunks)).with_header({15: [widths.feature, widths.slots], **(header or {})})
 
 
 def _hashes(m: LayerSymbols, header: Mapping[int, object]) -> dict:
-    steps = dict(zip([a.name for a in ATTRIBUTES], header[4], strict=True))  # type: ignore[call-overload]
-    values = dequantise_attributes(m.attributes, steps)
-    tensors = [dequantise(m.anchor_q, header[5]), *(values[a.name] for a in ATTRIBUTES)]  # type: ignore[arg-type]
+    steps = dict(zip(ATTRIBUTES, header[4], strict=True))  # type: ignore[call-overload]
+    values = dequantise_attributes(m.attributes, m.widths, steps)
+    tensors = [dequantise(m.anchor_q, header[5]), *(values[name] for name in ATTRIBUTES)]  # type: ignore[arg-type]
     own = list(m.tensors())
     count = len(PLANES) * len(m.planes)
     if m.raw_deformation:

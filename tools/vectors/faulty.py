@@ -22,6 +22,7 @@ from pd4dgs_codec.bitstream.limits import (
     MAX_PLANE_SCALES,
     MAX_PLANE_SIDE,
 )
+from pd4dgs_codec.scene import Widths
 
 from . import faulty_coding
 from .blocks import (
@@ -332,10 +333,13 @@ def _msgpack() -> Iterator[Vector]:
         yield bad(f"msgpack-{name}", f"In an ignored key: {what}", "4", MALFORMED, replace(plain, packed=header))
     entries = {
         "key-twice": (
-            _with_entry(packed, "0e", canonical.pack(plain.fields()[14]).hex()),
+            _with_entry(packed, "0f", canonical.pack(plain.fields()[15]).hex()),
             "A key of the header twice.",
         ),
-        "keys-descend": (_with_entry(_with_entry(packed, "41", "00"), "40", "00"), "Keys of the header out of order."),
+        "keys-descend": (
+            _with_entry(plain.with_header({11: None}).header_bytes(), "0b", canonical.pack(HEADER[11]).hex()),
+            "Keys of the header out of order.",
+        ),
         "key-not-shortest": (_with_entry(packed, "cc40", "00"), "A key of the header as uint 8."),
         "map16": (b"\xde\0" + bytes([packed[0] & 15]) + packed[1:], "The header as map 16."),
         "map32": (b"\xdf\0\0\0" + bytes([packed[0] & 15]) + packed[1:], "The header as map 32."),
@@ -386,7 +390,7 @@ def _header() -> Iterator[Vector]:
         yield bad(f"header-key-{key:02}-missing", what, "4 5.1", MALFORMED, plain.with_header({key: None}))
     without = canonical.pack({k: v for k, v in plain.fields().items() if k != 1})
     yield bad("header-key-01-missing", "Key 1 is missing.", "4 5.1", MALFORMED, replace(plain, packed=without))
-    for key in (0, 15, 63):
+    for key in (0, 16, 63):
         what = f"Unknown key {key}."
         yield bad(f"header-key-{key:02}-unknown", what, "4 17.2", FEATURE, plain.with_header({key: 1}))
     values: list[tuple[str, int, object, str]] = [
@@ -429,10 +433,21 @@ def _header() -> Iterator[Vector]:
         ("unit-negative", 11, -1.0, MALFORMED),
         ("unit-integer", 11, 1, MALFORMED),
         ("unit-boolean", 11, True, MALFORMED),
+        ("slots-zero", 15, [32, 0], MALFORMED),
+        ("slots-real", 15, [32, 10.0], MALFORMED),
+        ("widths-one", 15, [32], MALFORMED),
+        ("widths-integer", 15, 32, MALFORMED),
     ]
     for name, key, value, error in values:
         what = f"Header key {key} is {value!r}."
         yield bad(f"header-{name}", what, "5.1", error, plain.with_header({key: value}))
+    for name, widths, error in (
+        ("feature-width-zero", Widths(0, 10), MALFORMED),
+        ("feature-width-over-limit", Widths(65, 10), LIMIT),
+        ("slots-over-limit", Widths(32, 17), LIMIT),
+    ):
+        what = f"Widths {widths.feature} and {widths.slots}, and a layer that has them."
+        yield bad(f"header-{name}", what, "5.1", error, make_file(make_layer(widths=widths)))
 
 
 def _chunk_list() -> Iterator[Vector]:

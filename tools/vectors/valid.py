@@ -28,6 +28,7 @@ from pd4dgs_codec.entropy.priors import (
 )
 from pd4dgs_codec.entropy.tables import SI_MAX, SI_MIN
 from pd4dgs_codec.morton import morton_order
+from pd4dgs_codec.scene import Widths
 
 from . import lzma2
 from .blocks import (
@@ -59,7 +60,6 @@ from .blocks import (
     staged_planes,
 )
 
-GLOBAL_HEADS = {0: (4, 3), 1: (3,), 2: (5, 32), 3: (30,), 4: (6,)}
 LOCAL_HEADS = {0: (3,), 1: (3,), 2: (2, 3), 3: (4,), 4: (1,), 5: (3,)}
 LEAST_NORMAL, LARGEST = 2.0**-126, (2.0 - 2.0**-23) * 2.0**127
 
@@ -85,9 +85,26 @@ def three_layers(**fields: object) -> File:
     return make_file(first, second, third, **fields)  # type: ignore[arg-type]
 
 
+def _global_heads(widths: Widths) -> dict[int, tuple[int, ...]]:
+    """The outputs of the linear layers of layer 1's networks by id."""
+    return {0: (4, 3), 1: (3,), 2: (5, widths.feature), 3: (3 * widths.slots,), 4: (6,)}
+
+
 def cases() -> Iterator[Vector]:
     """All vectors under valid/."""
-    for make in (_scenes, _priors, _histograms, _exceptions, _attributes, _planes, _positions, _lzma, _floats, _ranges):
+    for make in (
+        _scenes,
+        _widths,
+        _priors,
+        _histograms,
+        _exceptions,
+        _attributes,
+        _planes,
+        _positions,
+        _lzma,
+        _floats,
+        _ranges,
+    ):
         for name, sentence, clauses, file in make():
             yield good("valid/" + name, sentence, clauses, file)
 
@@ -125,10 +142,31 @@ def _scenes() -> Iterator[Case]:
     only = make_layer(1, (), scales=[Scale()])
     yield "deformation-without-anchors", "A deformation in a scene without anchors.", "6.4", make_file(empty[0], only)
     one, two = Scale(1, (1, 3, 2, 4)), Scale(1, (2, 6, 4, 4))
-    first = make_layer(1, (), before=1, scales=[one, two], networks=GLOBAL_HEADS)
+    first = make_layer(1, (), before=1, scales=[one, two], networks=_global_heads(Widths()))
     second = make_layer(2, (), before=1, scales=[two], networks=LOCAL_HEADS)
     scaffold = make_layer(networks={0: (5, 10), 1: (3, 2, 70), 2: (30,)})
     yield "all-heads", "Every network, two scales, hidden layers.", "6.3 6.4", make_file(scaffold, first, second)
+
+
+def _widths() -> Iterator[Case]:
+    for name, what, widths in (
+        ("least", "One feature and one Gaussian per anchor.", Widths(1, 1)),
+        ("16-4", "16 features and four Gaussians per anchor.", Widths(16, 4)),
+        ("most", "64 features and 16 Gaussians per anchor.", Widths(64, 16)),
+    ):
+        k = pattern(widths.channels, ROWS) * (1 + np.arange(ROWS) % 4)
+        base = make_layer(0, line(ROWS), attributes=k, widths=widths)
+        moves = make_layer(
+            1, (), before=ROWS, scales=[Scale(1, (1, 3, 2, 4))], networks=_global_heads(widths), widths=widths
+        )
+        yield f"widths-{name}", what, "5.1 6.3 6.4 11.2", make_file(base, moves)
+        p = widths.predicted
+        terms = {c: [(j, 97 * c - 1800 + 31 * j) for j in range(c % 7, c, 5)] for c in range(1, p)}
+        terms[p - 1] = [(p - 2, 512)]  # the longest gap
+        flags = {i: (i % 4, i - 4, 5 - i) for i in range(widths.slots)}
+        section = predicted_attributes(k, terms, flags, (8, 3, 2, 6, 4), widths=widths)
+        file = make_file(base.with_sections({ATTRIBUTE: section}))
+        yield f"widths-{name}-staged", what + " Form 1.", "8.5 8.6 8.7", file
 
 
 # -- priors ------------------------------------------------------------------------------------------------------------

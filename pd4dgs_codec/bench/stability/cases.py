@@ -17,7 +17,7 @@ from pd4dgs_codec.errors import DataError, Pd4Error
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.picture import render
 from pd4dgs_codec.render.autograd.rasterization import rasterization
-from pd4dgs_codec.scene import SCAFFOLD_NETWORKS, Camera, Deformation, Network, Scene, SceneInfo, Steps
+from pd4dgs_codec.scene import Camera, Deformation, Network, Scene, SceneInfo, Steps, Widths
 
 PASS, REFUSED, FAIL = "pass", "refused", "fail"
 #: Modules of this folder, in the table's order.
@@ -142,7 +142,7 @@ def small_scene(deformation: Deformation | None = None, anchors: int = 40, mask:
     layers = (0,) if deformation is None else (0, 1)
     networks: dict[str, Network] = {
         name: ((rng.normal(0, 0.3, (n, 35)).astype(np.float32), np.full(n, 0.2, np.float32)),)
-        for name, n in SCAFFOLD_NETWORKS.items()
+        for name, n in Widths().networks.items()
     }
     return Scene(
         info=SceneInfo(0.0625, BOX, (0.0, 1.0), (0.25, 0.5, 0.75), 0.0625, 100.0, (0.0, -1.0, 0.0), 0.0, CAMERA),

@@ -1,32 +1,35 @@
-"""Packs the player for the web: one file per page and worker, without comments and indentation.
+"""The player as one HTML file: beside a scene on any web server, with the scene inside, or in a notebook.
 
-usage: python tools/pack_player.py FOLDER
-
-The player runs as it is, module by module. Packed it is half the bytes and, more important, four requests instead of
-forty. Modules keep their names and bodies: each becomes a function that returns what it exports, in the order in which
-a browser would run them. That takes the few forms of import and export that the player uses, and refuses others.
+The player's modules run as they are. Packed, the page and its workers are one file without comments and indentation:
+half the bytes and, more important, one request instead of forty. Modules keep their names and bodies: each becomes a
+function that returns what it exports, in the order in which a browser would run them. That takes the few forms of
+import and export that the player uses, and refuses others.
 """
 
 from __future__ import annotations
 
-import gzip
+import base64
+import html
+import json
+import os
 import re
-import sys
+from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
 
-PLAYER = Path(__file__).parents[1] / "player"
-#: Entry -> name of its packed file. They lie side by side, so that workers are found beside what starts them.
-ENTRIES = {
-    "element.js": "element.js",
-    "render/bench.js": "bench.js",
-    "render/loader-worker.js": "loader-worker.js",
-    "render/sort-worker.js": "sort-worker.js",
-    "render/evaluate-worker.js": "evaluate-worker.js",
-}
-PAGE = "index.html"
-#: What a first visit loads: not the measuring, and not the evaluator for machines without a GPU.
-FIRST_VISIT = (PAGE, "element.js", "loader-worker.js", "sort-worker.js")
+from pd4dgs_codec.codec.decoder import decode
+from pd4dgs_codec.delivery.urls import is_url
+from pd4dgs_codec.errors import DataError, DeliveryError
+from pd4dgs_codec.scene import Scene
 
+PAGE = "index.html"
+MODULE = "page.js"
+WORKERS = ("loader-worker.js", "sort-worker.js", "evaluate-worker.js")
+#: Of packing a scene that is shown at once.
+EFFORT = 1
+
+#: How the player names what it starts a worker from.
+_WORKER_URL = re.compile(r'new URL\("\./([\w-]+-worker\.js)", import\.meta\.url\)')
 _NAMES = r"\{([^}]*)\}"
 _IMPORT = re.compile(rf'^import {_NAMES} from "([^"]+)";\n', re.MULTILINE)
 _REEXPORT = re.compile(rf'^export {_NAMES} from "([^"]+)";\n', re.MULTILINE)
@@ -34,10 +37,6 @@ _EXPORT = re.compile(r"^export (?=(?:async )?(?:const|function\*?|class) (\w+))"
 _LEFT = re.compile(r"^(?:import|export)\b.*", re.MULTILINE)
 #: A slash after one of these begins a regular expression, not a division.
 _BEFORE_REGEX = re.compile(r"(?:[(,=:\[!&|?{};+*%<>~^-]|\b(?:return|typeof|case|of|in))\s*$")
-
-
-class PackError(Exception):
-    """A module is written in a way that the packer does not know."""
 
 
 def strip(source: str) -> str:
@@ -53,7 +52,7 @@ def strip(source: str) -> str:
         if two == "/*":
             end = source.find("*/", at)
             if end < 0:
-                raise PackError(f"a comment without end: {source[at : at + 40]!r}")
+                raise DeliveryError(f"a comment without end: {source[at : at + 40]!r}")
             at = end + 2
             continue
         if one == "/" and _BEFORE_REGEX.search("".join(out[-40:])):
@@ -83,7 +82,7 @@ def strip(source: str) -> str:
         out.append(source[at:end])
         at = end
     if depths:
-        raise PackError("a template without end")
+        raise DeliveryError("a template without end")
     return "".join(out).rstrip() + "\n"
 
 
@@ -98,7 +97,7 @@ def _quoted(source: str, at: int) -> int:
         elif source[i] == quote and not in_class:
             return i + 1
         i += 1
-    raise PackError(f"a string or pattern without end: {source[at : at + 40]!r}")
+    raise DeliveryError(f"a string or pattern without end: {source[at : at + 40]!r}")
 
 
 def _template(source: str, at: int) -> tuple[int, bool]:
@@ -112,7 +111,7 @@ def _template(source: str, at: int) -> tuple[int, bool]:
         elif source[i : i + 2] == "${":
             return i + 2, True
         i += 1
-    raise PackError(f"a template without end: {source[at : at + 40]!r}")
+    raise DeliveryError(f"a template without end: {source[at : at + 40]!r}")
 
 
 def bundle(root: Path, entry: str) -> str:
@@ -123,7 +122,7 @@ def bundle(root: Path, entry: str) -> str:
 
     def pack(path: Path) -> str:
         if path in packing:
-            raise PackError(f"{path}: imports itself through {packing[-1]}")
+            raise DeliveryError(f"{path}: imports itself through {packing[-1]}")
         if path not in modules:
             packing.append(path)
             modules[path] = _wrapped(path, pack, exports)
@@ -137,7 +136,7 @@ def bundle(root: Path, entry: str) -> str:
     return "".join(parts) + (f"const {{{names}}}=m{len(parts) - 1};\nexport{{{names}}};\n" if names else "")
 
 
-def _wrapped(path: Path, pack, exports: dict[Path, list[str]]) -> str:
+def _wrapped(path: Path, pack: Callable[[Path], str], exports: dict[Path, list[str]]) -> str:
     body = strip(path.read_text(encoding="utf-8"))
     names: list[str] = []
     packed: dict[str, str] = {}
@@ -162,37 +161,77 @@ def _wrapped(path: Path, pack, exports: dict[Path, list[str]]) -> str:
     body = _EXPORT.sub("", body)
     left = _LEFT.search(body)
     if left:
-        raise PackError(f"{path}: the packer does not know {left[0]!r}")
+        raise DeliveryError(f"{path}: the packer does not know {left[0]!r}")
     exports[path] = [name.split(":")[0] for name in names]
     return f"{body}return{{{','.join(names)}}};\n"
 
 
-def pack(root: Path = PLAYER) -> dict[str, bytes]:
-    """Name -> content of every file of the packed player. root: the player's folder."""
-    files = {name: bundle(root, entry).encode() for entry, name in ENTRIES.items()}
-    page = (root / PAGE).read_text(encoding="utf-8").replace('"./render/bench.js"', '"./bench.js"')
-    head = '<link rel="modulepreload" href="./element.js">\n'
-    files[PAGE] = re.sub(r"<!--.*?-->\s*", head, page, count=1, flags=re.DOTALL).encode()
-    return files
+def player_folder() -> Path:
+    """Where the player lies: in the installed package, or beside it in a checkout. DataError if it is nowhere."""
+    package = Path(__file__).parents[1]
+    for folder in (package / "player", package.parent / "player"):
+        if (folder / PAGE).is_file():
+            return folder
+    raise DataError(f"{package}: holds no player; expected the package as pip installs it, or a checkout")
 
 
-def main(folder: str) -> None:
-    """Writes the packed player into `folder` and prints sizes."""
-    files = pack()
-    target = Path(folder)
-    target.mkdir(parents=True, exist_ok=True)
-    for name, content in files.items():
-        (target / name).write_bytes(content)
-        print(f"{name:20} {len(content):>8,} bytes, {zipped(content):>7,} gzipped")
-    print(f"first visit: {sum(zipped(files[name]) for name in FIRST_VISIT):,} bytes gzipped")
+def page(source: bytes | str | None = None) -> str:
+    """The player as one HTML file. It needs no server for a scene that it holds, and no network.
+
+    source: the bytes of a `.pd4`, or its URL; None: `scene.pd4` beside the page, or the page's `?src=address`.
+    """
+    root = player_folder()
+    workers = {name: bundle(root, f"render/{name}") for name in WORKERS}
+    code = _WORKER_URL.sub(r"new URL(workers['\1'])", bundle(root, MODULE))
+    script = f"""<script type="module">
+const workers={_literal(workers)};
+for(const name in workers)workers[name]=URL.createObjectURL(new Blob([workers[name]],{{type:"text/javascript"}}));
+{code}</script>
+"""
+    text = re.sub(r"<!--.*?-->\s*", "", (root / PAGE).read_text(encoding="utf-8"), flags=re.DOTALL)
+    head, body, _ = re.split(r'(?=<p id="note")|<script type="module".*', text, maxsplit=2)
+    if isinstance(source, str):
+        body = f'<body data-src="{html.escape(source)}">\n'
+    elif source is not None:
+        body = f'<body>\n<script type="text/plain" id="scene">{base64.b64encode(source).decode()}</script>\n'
+    return f"{head}{body}{script}</html>\n"
 
 
-def zipped(content: bytes) -> int:
-    """Bytes after gzip -9."""
-    return len(gzip.compress(content, 9, mtime=0))
+def _literal(value: object) -> str:
+    """As JavaScript inside a page, where `</script` and `<!--` would be the page's."""
+    return json.dumps(value).replace("<", "\\u003c")
 
 
-if __name__ == "__main__":
-    if len(sys.argv) != 2:
-        sys.exit(__doc__)
-    main(sys.argv[1])
+@dataclass(frozen=True)
+class Shown:
+    """What a notebook shows as the result of a cell. page: the whole HTML file. width: CSS. height: pixels."""
+
+    page: str
+    width: str
+    height: int
+
+    def _repr_html_(self) -> str:
+        frame = f'style="width:{html.escape(self.width)};height:{self.height:d}px;border:0" allow="fullscreen"'
+        return f'<iframe title="Dynamic scene" {frame} srcdoc="{html.escape(self.page)}"></iframe>'
+
+    def __repr__(self) -> str:
+        return f"<a page of {len(self.page):,} characters; a notebook shows it>"
+
+
+def show(scene: Scene | bytes | str | os.PathLike[str], *, width: str = "100%", height: int = 480) -> Shown:
+    """The player with a scene, for a notebook: the last line of a cell, or `display(show(scene))`.
+
+    scene: a decoded scene, the bytes of a `.pd4`, its path or its URL. The page holds all but the last; the server of
+    a URL must allow pages of other sites to read it, as pd4dgs-serve does. width: CSS. height: pixels. Raises
+    DecodeError for bytes that are no whole, valid `.pd4` file.
+    """
+    if isinstance(scene, str) and is_url(scene):
+        return Shown(page(scene), width, height)
+    if isinstance(scene, Scene):
+        from pd4dgs_codec.codec.encoder import encode
+
+        data = encode(scene, effort=EFFORT)
+    else:
+        data = scene if isinstance(scene, bytes) else Path(scene).read_bytes()
+        decode(data)  # a fault is better said here than in a page
+    return Shown(page(data), width, height)
