@@ -1,6 +1,6 @@
 """Measures what docs/player.md shows: the player's pictures, seconds to them, frame rates, decode times and sizes.
 
-    python tools/player.py [--out out] [--docs docs] [--runs 9] [--only shelf-hand] [--render]
+    python tools/player_page.py [--out out] [--docs docs] [--runs 9] [--only shelf-hand] [--render]
 
 Reads out/NAME/scene.pd4, which tools/results.py makes. Needs Chromium and Playwright, and Node. About ten minutes a
 scene on two quiet cores; on busy ones the times are worthless.
@@ -19,7 +19,7 @@ from statistics import median
 from typing import Any
 
 from pages.browser import HARNESS, PATIENCE_MS, call, cameras, copy_player, decibels, launched, resized, shoot, shots
-from pages.page import Page, Row, keep, make, options, say
+from pages.page import Page, Row, keep, make, options, paragraph, say, unpadded
 from pages.scenes import SCENES
 from player_speed import NodeDecoder, compare, grown
 from player_speed import row as speed_row
@@ -230,9 +230,14 @@ def measure(name: str, out: Path, docs: Path, runs: int) -> Row:
 def render(rows: Sequence[Row]) -> str:
     """Sizes, pictures, seconds, frame rates and decode times of every scene."""
     visit = rows[-1]["page"]
-    heads = [f"{rows[-1]['browser']}, {rows[-1]['renderer']}; two cores. Page and player: {visit:,} bytes gzipped."]
-    parts = [*heads, _pictures(rows), _seconds(rows, visit), _rates(rows), _decoding(rows)]
-    return "\n\n".join(parts)
+    first = f"{rows[-1]['browser']}, {rows[-1]['renderer']}; two cores. Page and player: {visit:,} bytes gzipped."
+    heads = ["\n".join(paragraph(first))]
+    return "\n\n".join([*heads, _pictures(rows), _seconds(rows, visit), _rates(rows), _decoding(rows)])
+
+
+def _block(said: str, head: Sequence[str], cells: Sequence[Sequence[str]]) -> str:
+    """A paragraph and its table."""
+    return "\n".join([*paragraph(said), "", unpadded(markdown(head, cells))])
 
 
 def _pictures(rows: Sequence[Row]) -> str:
@@ -246,7 +251,7 @@ def _pictures(rows: Sequence[Row]) -> str:
         "whose own 8 bits alone leave 59. Truth: mean mPSNR of the player's pictures against views that training did "
         f"not see, up to {VIEWS} of them."
     )
-    return f"{said}\n\n{markdown(('scene', 'level', 'least', 'truth'), cells)}"
+    return _block(said, ("scene", "level", "least", "truth"), cells)
 
 
 def _seconds(rows: Sequence[Row], visit: int) -> str:
@@ -274,7 +279,7 @@ def _seconds(rows: Sequence[Row], visit: int) -> str:
         "last of these bytes. Then decoding, and what it takes to evaluate, sort and draw, in software."
     )
     head = ("scene", "Mbps", "level", "S", "8S/B", "8(S+P)/B", "arrived", "decode", "evaluate, draw", "picture")
-    return f"{said}\n\n{markdown(head, cells)}"
+    return _block(said, head, cells)
 
 
 def _rates(rows: Sequence[Row]) -> str:
@@ -294,7 +299,7 @@ def _rates(rows: Sequence[Row]) -> str:
         "**Pictures per second** as `?bench` measures them, without the steps that make a slow machine faster. Moving: "
         "the camera turns. Playing: time moves."
     )
-    return f"{said}\n\n{markdown(('scene', 'level', 'size', 'Gaussians', 'moving', 'playing'), cells)}"
+    return _block(said, ("scene", "level", "size", "Gaussians", "moving", "playing"), cells)
 
 
 def _decoding(rows: Sequence[Row]) -> str:
@@ -314,10 +319,10 @@ def _decoding(rows: Sequence[Row]) -> str:
         f"**Decoding**, seconds of processor time, median of {rows[-1]['runs']} in turn, warm. The large file "
         "is made of copies of the scene's anchors."
     )
-    return f"{said}\n\n{markdown(('file', 'anchors', 'bytes', 'Node', 'Python', 'Node/Python'), cells)}"
+    return _block(said, ("file", "anchors", "bytes", "Node", "Python", "Node/Python"), cells)
 
 
-PAGE = Page("player", "player.py", render)
+PAGE = Page("player", "player_page.py", render)
 
 
 def main(argv: list[str] | None = None) -> int:
