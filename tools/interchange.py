@@ -27,14 +27,11 @@ from pd4dgs_codec.interchange.splats import Splats
 from pd4dgs_codec.threads import configure
 
 NAMES = ("shelf-hand", "bouncing-balls")
-FRAMES = 10  #: of a sequence
-VIEWS = 6  #: held-out views that the cost is measured on
+FRAMES = 5  #: of a sequence
+VIEWS = 2  #: held-out views that the cost is measured on
 STEPS = 300  #: of refinement
 #: (eyes, degree, steps) of the rows on what exporting costs.
-VARIANTS = (
-    ("data", 3, 0), ("data", 0, STEPS), ("data", 1, STEPS), ("data", 2, STEPS), ("data", 3, STEPS),
-    ("data", 3, 4 * STEPS), ("file", 3, STEPS),
-)  # fmt: skip
+VARIANTS = (("data", 3, 0), ("data", 0, STEPS), ("data", 3, STEPS), ("file", 3, STEPS))
 
 
 def measure(name: str, out: Path) -> Row:
@@ -137,7 +134,7 @@ def _gaussforge(path: Path, player: Any, view: Any) -> float:
         found = gaussforge.GaussForge().read(path.read_bytes(), "spz")["data"]
     n = found["numPoints"]
     keys = ("positions", "scales", "rotations", "alphas", "colors", "sh")
-    fields = {key: np.asarray(found[key], np.float32) for key in keys}
+    fields = {key: np.frombuffer(found[key], "<f4") for key in keys}
     sh = np.concatenate([fields["colors"].reshape(n, 1, 3), fields["sh"].reshape(n, 15, 3)], axis=1)
     scales, quats = np.exp(fields["scales"]).reshape(n, 3), fields["rotations"].reshape(n, 4)
     splats = _contiguous(fields["positions"].reshape(n, 3), quats, scales, _sigmoid(fields["alphas"]), sh)

@@ -32,7 +32,11 @@ SOURCE is one of
   synthetic:global   large objects move slowly
   synthetic:local    the same, and small parts move on their own
   synthetic:fast     quick motion
-  (synthetic:NAME?seed=n gives another scene of that kind)"""
+  (synthetic:NAME?seed=n gives another scene of that kind)
+  teacher:PATH       pictures of explicit Gaussians: a folder of .ply or .spz files, one per frame, one such file, a
+                     .4dgs file, a checkpoint of gsplat, or module:function (time -> Gaussians)
+  (teacher:PATH?cameras=SOURCE takes the cameras, times and held-out pictures of another source;
+  else ?views=N&size=WxH&fps=F&background=white&up=X,Y,Z)"""
 
 
 class UsageError(Exception):

@@ -174,10 +174,10 @@ def _metadata(args: argparse.Namespace, had: Metadata | None) -> Metadata | None
 def _views(args: argparse.Namespace, console: Console) -> Views | None:
     if args.data is None:
         return None
-    from pd4dgs_codec.data.dataset import load
+    from pd4dgs_codec.interchange.teacher import load_source
     from pd4dgs_codec.pack.packing import Views
 
-    dataset = load(args.data, downscale=args.downscale, holdout=args.holdout)
+    dataset = load_source(args.data, downscale=args.downscale, holdout=args.holdout)
     views = Views.of(dataset, args.data, args.views)
     console.detail(f"{args.data}: {len(views.fitting)} training views, {len(views.held_out)} to judge by")
     if not dataset.test:

@@ -136,12 +136,12 @@ def _player(args: argparse.Namespace) -> Player:
 
 
 def _eyes(args: argparse.Namespace, player: Player) -> Eyes:
-    from pd4dgs_codec.data.dataset import load
     from pd4dgs_codec.interchange.bake import eyes_of_cameras, eyes_of_scene
+    from pd4dgs_codec.interchange.teacher import load_source
 
     if args.data is None:
         return eyes_of_scene(player)
-    dataset = load(args.data, downscale=args.downscale, holdout=args.holdout)
+    dataset = load_source(args.data, downscale=args.downscale, holdout=args.holdout)
     return eyes_of_cameras([view.camera for view in dataset.train])
 
 
@@ -235,11 +235,11 @@ def _write_folder(args: argparse.Namespace, count: int, frames: Iterator[bytes])
 
 
 def _cost(args: argparse.Namespace, export: Export) -> dict[str, Any]:
-    from pd4dgs_codec.data.dataset import load
     from pd4dgs_codec.errors import DataError
     from pd4dgs_codec.interchange.export import cost
+    from pd4dgs_codec.interchange.teacher import load_source
 
-    views = load(args.compare, downscale=args.downscale, holdout=args.holdout).test
+    views = load_source(args.compare, downscale=args.downscale, holdout=args.holdout).test
     if not views:
         raise DataError(f"{args.compare}: has no held-out views; expected another --holdout")
     with progress_bar(len(views), "views", "comparing") as step:

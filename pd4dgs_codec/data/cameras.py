@@ -210,12 +210,13 @@ def cameras_box(frames: Sequence[UnreadView], depth: tuple[float, float] | None 
     return np.stack([middle - half, middle + half]).astype(np.float32)
 
 
-def depth_range(frames: Sequence[UnreadView], box: np.ndarray, points: np.ndarray | None) -> tuple[float, float]:
-    """(near, far): half the nearest and 1.5 times the farthest depth of the points, else of the box's corners."""
+def depth_range(views: Sequence[np.ndarray], box: np.ndarray, points: np.ndarray | None) -> tuple[float, float]:
+    """(near, far) of cameras, world-to-camera matrices [4, 4]: half the nearest and 1.5 times the farthest depth of the
+    points, else of the box's corners."""
     if points is None or not len(points):
         points = np.stack(np.meshgrid(*box.T.astype(np.float64)), axis=-1).reshape(-1, 3)
-    views = np.stack([f.viewmat for f in frames])
-    depths = points[:: max(1, len(points) // 2000)] @ views[:, 2, :3].T + views[:, 2, 3]
+    axes = np.stack([view[2] for view in views])
+    depths = points[:: max(1, len(points) // 2000)] @ axes[:, :3].T + axes[:, 3]
     ahead = depths[depths > 0]
     if not len(ahead):
         return 0.01, 100.0

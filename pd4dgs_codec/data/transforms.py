@@ -174,7 +174,7 @@ def read_transforms(folder: Path, downscale: int, holdout: int) -> Dataset:
     views = [read_view(f, t, downscale, composite=True) for f, t in zip(frames, times, strict=True)]
     transparent = image_info(train[0].image)[2]
     box = cameras_box(frames, depth) if points is None else points_box(points)
-    near, far = depth or depth_range(frames, box, points)
+    near, far = depth or depth_range([f.viewmat for f in frames], box, points)
     return Dataset(
         name=folder.resolve().name,
         train=tuple(views[: len(train)]),

@@ -12,11 +12,11 @@ eye to eye. What is kept is found from a set of eyes, each with a weight per anc
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
-from pd4dgs_codec.interchange.splats import Splats, camera_eye, harmonics, quaternions, rotations, unit
+from pd4dgs_codec.interchange.splats import Splats, camera_eye, harmonics, looking, quaternions, rotations, sphere, unit
 from pd4dgs_codec.model.visibility import LEAST_NEAR, MIN_OPACITY
 from pd4dgs_codec.playback.player import Player
 from pd4dgs_codec.scene import Camera
@@ -70,9 +70,7 @@ def eyes_of_scene(player: Player, count: int = EYES) -> Eyes:
     if camera is not None and len(positions) and (seen := _inside(camera, positions)).any():
         positions = positions[seen]
     middle = np.median(positions, axis=0) if len(positions) else np.zeros(3)
-    i = np.arange(count) + 0.5  # a Fibonacci lattice
-    polar, turn = np.arccos(1 - 2 * i / count), np.pi * (1 + 5**0.5) * i
-    sphere = np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
+    places = sphere(count)
     if camera is None:
         distance = 2 * float(np.linalg.norm(positions - middle, axis=1).max(initial=LEAST_NEAR))
         K = np.array([[PIXELS, 0, PIXELS / 2], [0, PIXELS, PIXELS / 2], [0, 0, 1]], np.float32)
@@ -80,21 +78,9 @@ def eyes_of_scene(player: Player, count: int = EYES) -> Eyes:
     else:
         away = camera_eye(camera) - middle
         distance = max(float(np.linalg.norm(away)), LEAST_NEAR)
-        like, weights = camera, np.exp(CONCENTRATION * (sphere @ (away / distance) - 1))
+        like, weights = camera, np.exp(CONCENTRATION * (places @ (away / distance) - 1))
     up = np.asarray(info.up, np.float64)
-    return Eyes(tuple(_looking(middle + distance * d, -d, up, like) for d in sphere), weights)
-
-
-def _looking(eye: np.ndarray, ahead: np.ndarray, up: np.ndarray, like: Camera) -> Camera:
-    """The camera `like` at `eye` [3], looking along the unit vector `ahead` [3]."""
-    right = np.cross(ahead, up)
-    if np.linalg.norm(right) < 1e-6:  # straight up or down: any roll will do
-        right = np.cross(ahead, np.roll(ahead, 1) + np.array([1e-3, 0, 0]))
-    right = unit(right)
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = np.stack([right, np.cross(ahead, right), ahead])
-    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
-    return replace(like, viewmat=viewmat.astype(np.float32))
+    return Eyes(tuple(looking(middle + distance * d, -d, up, like) for d in places), weights)
 
 
 def bake(

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.data.cameras import points_box
+from pd4dgs_codec.data.cameras import ROTATION_TOLERANCE, points_box, world_to_camera
 from pd4dgs_codec.data.files import LARGEST, read_file
 from pd4dgs_codec.data.ply import read_vertices
 from pd4dgs_codec.errors import DataError
@@ -42,6 +42,7 @@ BANKS = ("feature_bank_mlp.pt", "mlp_feature_bank", "feature_bank_mlp")
 EMBEDDING = "embedding_appearance.pt"
 #: Their rasteriser skips what is nearer; and the far plane of their cameras.
 NEAR, FAR = 0.2, 100.0
+UP = (0.0, -1.0, 0.0)  #: of a run that does not keep its cameras
 #: An anchor may lie this share of a voxel off the grid, and as many units in the last place of its coordinate.
 OFF_GRID, ULPS = 1e-3, 8
 #: The activation behind each decoder, by TorchScript's names.
@@ -74,7 +75,10 @@ def read_scaffold_gs(folder: Path, choices: Choices) -> Scene:
     anchor = table["anchor"]
     voxel = choices.voxel_size or config.get("voxel_size") or 0.0
     voxel = float(np.float32(voxel if voxel > 0 else _grid(anchor, ply)))
-    scene = Scene(
+    camera, up = None, UP
+    if (run / "cameras.json").is_file():
+        (camera, *_), up = read_cameras(run / "cameras.json")
+    return Scene(
         info=SceneInfo(
             voxel,
             points_box(anchor),
@@ -82,7 +86,9 @@ def read_scaffold_gs(folder: Path, choices: Choices) -> Scene:
             (1.0, 1.0, 1.0) if config.get("white_background") else (0.0, 0.0, 0.0),
             float(np.float32(NEAR)),
             FAR,
-            *_cameras(run / "cameras.json"),
+            up,
+            0.0,
+            camera,
         ),
         steps=Steps().scaled(1.0),
         layers=(0,),
@@ -94,7 +100,6 @@ def read_scaffold_gs(folder: Path, choices: Choices) -> Scene:
         mask=(np.full(len(anchor), 255, np.uint8),),
         networks=networks,
     )
-    return scene
 
 
 def _iteration(folder: Path, number: int | None) -> Path:
@@ -299,26 +304,25 @@ def _cells(anchor: np.ndarray, voxel: float, path: Path) -> np.ndarray:
     return cells.astype(np.int32)
 
 
-def _cameras(path: Path) -> tuple[tuple[float, float, float], float, Camera | None]:
-    """(up, metres per unit, the first camera) of the run's cameras.json; a guess and none without it."""
-    if not path.is_file():
-        return (0.0, -1.0, 0.0), 0.0, None
+def read_cameras(path: Path) -> tuple[list[Camera], tuple[float, float, float]]:
+    """(the cameras, their mean direction up) of a cameras.json as 3D Gaussian splatting writes it."""
     try:
         rows = json.loads(read_file(path))
         turns = np.array([row["rotation"] for row in rows], np.float64)
         places = np.array([row["position"] for row in rows], np.float64)
-        fx, fy, width, height = (float(rows[0][key]) for key in ("fx", "fy", "width", "height"))
-        good = turns.shape == (len(rows), 3, 3) and places.shape == (len(rows), 3)
-        good = good and bool(np.isfinite(turns).all() and (np.abs(places) <= LARGEST).all()) and min(fx, fy) > 0
-        good = good and max(fx, fy) <= LARGEST and 1 <= min(width, height) <= max(width, height) <= 65535
-    except (ValueError, TypeError, KeyError, IndexError, RecursionError):
+        lenses = np.array([[row[key] for key in ("fx", "fy", "width", "height")] for row in rows], np.float64)
+        good = turns.shape == (len(rows), 3, 3) and places.shape == (len(rows), 3) and lenses.shape == (len(rows), 4)
+        good = good and bool((np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)) <= ROTATION_TOLERANCE).all())
+        good = good and bool((np.abs(places) <= LARGEST).all() and (lenses > 0).all() and (lenses <= LARGEST).all())
+        good = good and bool((lenses[:, 2:] == np.round(lenses[:, 2:])).all() and lenses[:, 2:].max() <= 65535)
+    except (ValueError, TypeError, KeyError, IndexError, RecursionError, OSError):
         good = False
     if not good:
         raise DataError(f"{path}: expected a list of cameras with position, rotation, fx, fy, width and height")
+    cameras = []
+    for turn, place, (fx, fy, width, height) in zip(turns, places, lenses, strict=True):
+        K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]], np.float32)
+        cameras.append(Camera(world_to_camera(turn.T, place).astype(np.float32), K, int(width), int(height)))
     up = -turns[:, :, 1].mean(axis=0)
     x, y, z = (float(np.float32(v)) for v in up / max(float(np.linalg.norm(up)), 1e-12))
-    viewmat = np.eye(4)
-    viewmat[:3, :3] = turns[0].T
-    viewmat[:3, 3] = -turns[0].T @ places[0]
-    K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]], np.float32)
-    return (x, y, z), 0.0, Camera(viewmat.astype(np.float32), K, int(width), int(height))
+    return cameras, (x, y, z)

@@ -66,6 +66,25 @@ def camera_eye(camera: Camera) -> np.ndarray:
     return eye
 
 
+def looking(eye: np.ndarray, ahead: np.ndarray, up: np.ndarray, like: Camera) -> Camera:
+    """The camera `like` at `eye` [3], looking along the unit vector `ahead` [3]."""
+    right = np.cross(ahead, up)
+    if np.linalg.norm(right) < 1e-6:  # straight up or down: any roll will do
+        right = np.cross(ahead, np.roll(ahead, 1) + np.array([1e-3, 0, 0]))
+    right = unit(right)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = np.stack([right, np.cross(ahead, right), ahead])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+    return replace(like, viewmat=viewmat.astype(np.float32))
+
+
+def sphere(count: int) -> np.ndarray:
+    """float64 [count, 3] unit vectors spread evenly, from +z to -z: a Fibonacci lattice."""
+    i = np.arange(count) + 0.5
+    polar, turn = np.arccos(1 - 2 * i / count), np.pi * (1 + 5**0.5) * i
+    return np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
+
+
 def unit(vectors: np.ndarray) -> np.ndarray:
     """Vectors [..., d] divided by their length; a zero stays one."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)

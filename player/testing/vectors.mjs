@@ -37,11 +37,7 @@ function isUnsupported(bytes) {
 /** @returns {Vector[]} */
 export function readVectors() {
   const manifest = JSON.parse(readFileSync(new URL("manifest.json", FOLDER), "utf8"));
-  // The package is about to read slices (clause 3.6), which make these legal or faulty in another place.
-  const sliced = manifest.vectors.some((/** @type {any} */ row) => row.feature === "slices");
-  const changing = /header-length-over|header-4097|chunk-list-65|-twice\.|predicted-form-2/;
-  const known = manifest.vectors.filter((/** @type {any} */ row) => sliced || !changing.test(row.file));
-  return known.map((/** @type {any} */ row) => {
+  return manifest.vectors.map((/** @type {any} */ row) => {
     const bytes = new Uint8Array(readFileSync(new URL(row.file, FOLDER)));
     // an ans-only decoder's answer, where the manifest does not name it
     const unsupported = row.ans_only ? row.ans_only === "UnsupportedFeature" : isUnsupported(bytes);

@@ -95,10 +95,8 @@ def test_gaussforge_reads_the_spz_back(capfdbinary):
     data = spz_bytes(splats)
     assert capfdbinary.readouterr().out == b""
     ir = gaussforge.GaussForge().read(data, "spz")["data"]
-    fields = {
-        key: np.frombuffer(ir[key], "<f4") if isinstance(ir[key], bytes) else np.array(ir[key])
-        for key in ("positions", "scales", "rotations", "alphas", "colors", "sh")
-    }
+    names = ("positions", "scales", "rotations", "alphas", "colors", "sh")
+    fields = {name: np.frombuffer(ir[name], "<f4") for name in names}
     np.testing.assert_allclose(fields["positions"].reshape(-1, 3), splats.means, atol=1 / 4096)
     np.testing.assert_allclose(np.exp(fields["scales"].reshape(-1, 3)), splats.scales, rtol=0.04)
     dots = np.einsum("nd,nd->n", fields["rotations"].reshape(-1, 4), splats.quats)
