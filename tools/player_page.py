@@ -273,7 +273,11 @@ def _pictures(rows: Sequence[Row]) -> str:
 def _seconds(rows: Sequence[Row], visit: int) -> str:
     cells = []
     named = [(row["name"], row["seconds"]) for row in rows]
-    named += [(f"{row['name']}, {row['sliced']['slices']} slices", row["sliced"]["seconds"]) for row in rows]
+    named += [
+        (f"{row['name']}, {row['sliced']['slices']} slices", row["sliced"]["seconds"])
+        for row in rows
+        if "sliced" in row
+    ]
     for name, found in named:
         for r in found:
             ideal = 8 * (r["bytes"] + visit) / r["rate"]
