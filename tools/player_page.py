@@ -285,7 +285,7 @@ def _seconds(rows: Sequence[Row], visit: int) -> str:
                 (
                     name,
                     f"{r['rate'] / 1e6:g}",
-                    r["level"],
+                    str(r["level"]),
                     f"{r['bytes']:,}",
                     f"{8 * r['bytes'] / r['rate']:.2f}",
                     f"{ideal:.2f}",
