@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from pd4dgs_codec.bitstream.container import PREAMBLE_SIZE, read_chunk, read_preamble
-from pd4dgs_codec.codec.header import Header, scene_id_of, unpack_header
-from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
+from pd4dgs_codec.bitstream.container import PREAMBLE_SIZE, Chunk, read_chunk, read_preamble
+from pd4dgs_codec.codec.attribute_section import Past
+from pd4dgs_codec.codec.header import Header, layers_of, scene_id_of, unpack_header
+from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE, LayerKind
 from pd4dgs_codec.codec.layer_meta import Declared
 from pd4dgs_codec.codec.payload import read_layer
-from pd4dgs_codec.codec.symbols import LayerSymbols, assemble, check_last_layer
+from pd4dgs_codec.codec.symbols import LayerSymbols, TakenVoxels, assemble, check_last_layer, merged
+from pd4dgs_codec.entropy.priors import Prior
 from pd4dgs_codec.errors import DecodeError, Malformed, Truncated, UnsupportedFeature
 from pd4dgs_codec.scene import Scene
 
@@ -17,11 +19,19 @@ class LayerReader:
 
     def __init__(self) -> None:
         self.header: Header | None = None
-        self.layers: list[LayerSymbols] = []
         self.offset = 0  #: of the next chunk
+        self._whole: list[LayerSymbols] = []  # the layers before the last
+        self._slices: list[LayerSymbols] = []  # of the last layer
         self._index = 0
         self._scene_id = b""
         self._declared = Declared()
+        self._taken = TakenVoxels()
+        self._past: Past[Prior] | None = None
+
+    @property
+    def layers(self) -> list[LayerSymbols]:
+        """The layers read so far; slices of the last one may be missing."""
+        return [*self._whole, merged(self._slices)] if self._slices else []
 
     @property
     def complete(self) -> bool:
@@ -33,8 +43,9 @@ class LayerReader:
         assert self.header is not None
         return assemble(self.header.info, self.header.attribute_steps, self.layers)
 
-    def next_layer(self, data: bytes | bytearray, max_layer: int | None = None) -> LayerSymbols | None:
-        """Read on to the end of one more layer <= max_layer; None if the file has no more (clause "decoding process").
+    def next_slice(self, data: bytes | bytearray, max_layer: int | None = None) -> bool:
+        """Read on to the end of one more slice of a layer <= max_layer; whether the file has one more (clause "decoding
+        process").
 
         Raises Truncated, with nothing consumed that a later call would miss, if `data` ends before; Malformed if
         bytes follow the last chunk of a file that is read whole (max_layer None).
@@ -46,17 +57,15 @@ class LayerReader:
         chunks = self.header.chunks
         while self._index < len(chunks):
             if max_layer is not None and not _any_layer(chunks[self._index :], max_layer):
-                return None
-            layer = self._read_chunk(data)
-            if layer is not None:
-                self.layers.append(layer)
-                return layer
+                return False
+            if self._read_chunk(data):
+                return True
         if max_layer is None and len(data) > self.offset:
             raise Malformed(f"{len(data) - self.offset} bytes follow the last chunk, expected none", offset=self.offset)
-        return None
+        return False
 
-    def _read_chunk(self, data: bytes | bytearray) -> LayerSymbols | None:
-        """The layer in the next chunk, or None if it is an ancillary one that is not known."""
+    def _read_chunk(self, data: bytes | bytearray) -> bool:
+        """Whether the next chunk is a slice, not an ancillary chunk."""
         assert self.header is not None
         expected_type, length = self.header.chunks[self._index]
         chunk = read_chunk(
@@ -69,30 +78,52 @@ class LayerReader:
         if kind is not None and chunk.ancillary:
             message = f"layer {kind.layer} is flagged ancillary, expected a critical chunk"
             raise Malformed(message, offset=self.offset, chunk=self._index)
-        layer = None
         if kind is not None:
+            self._check_place(chunk, kind.layer)
             try:
-                layer = read_layer(
-                    chunk.payload,
-                    kind,
-                    self.header.widths,
-                    self._declared,
-                    self.header.mode,
-                    self.header.raw_deformation,
-                )
-                check_last_layer([*self.layers, layer], self.header.info.voxel_size, self.header.attribute_steps)
-                _check_bounded(layer, self.header)
+                self._read_slice(chunk, kind)
             except DecodeError as error:
                 raise _located(error, self._index, self.offset) from None
-            symbols = sum(a.size for a in layer.arrays())
-            self._declared = self._declared.and_layer(len(layer.anchor_q), symbols, len(chunk.payload))
         self._index += 1
         self.offset = chunk.end
-        return layer
+        return kind is not None
+
+    def _goes_on(self, layer: int) -> bool:
+        """Whether a slice of `layer` before was read."""
+        return bool(self._slices) and self._slices[0].kind.layer == layer
+
+    def _check_place(self, chunk: Chunk, layer: int) -> None:
+        """Raise Malformed unless the slice's flags fit its place (clause "slices")."""
+        assert self.header is not None
+        expected, message = len(self._slices) if self._goes_on(layer) else 0, ""
+        following = layers_of(self.header.chunks[self._index + 1 :])[:1]
+        if chunk.slice != expected:
+            message = f"slice {chunk.slice} of layer {layer}, expected {expected}"
+        elif following and chunk.more != (following == [layer]):
+            told = "announces a further slice" if chunk.more else "ends its layer"
+            message = f"slice {expected} of layer {layer} {told}, but layer {following[0]} follows"
+        if message:
+            raise Malformed(message, offset=self.offset + 2, chunk=self._index)
+
+    def _read_slice(self, chunk: Chunk, kind: LayerKind) -> None:
+        assert self.header is not None
+        later = self._goes_on(kind.layer)
+        before = self._whole if later else self.layers
+        past = self._past if later else Past[Prior]() if chunk.more else None
+        header = self.header
+        read = read_layer(
+            chunk.payload, kind, header.widths, self._declared, header.mode, header.raw_deformation, later, past
+        )
+        check_last_layer([*before, read], self._taken, header.info.voxel_size, header.attribute_steps)
+        _check_bounded(read, header)
+        symbols = sum(a.size for a in read.arrays())
+        self._declared = self._declared.and_slice(len(read.anchor_q), symbols, len(chunk.payload))
+        self._whole, self._past = before, past
+        self._slices = [*self._slices, read] if later else [read]
 
 
 def _any_layer(chunks: tuple[tuple[int, int], ...], max_layer: int) -> bool:
-    return any(kind in BY_CHUNK_TYPE and BY_CHUNK_TYPE[kind].layer <= max_layer for kind, _ in chunks)
+    return any(layer <= max_layer for layer in layers_of(chunks))
 
 
 def _check_bounded(layer: LayerSymbols, header: Header) -> None:
@@ -114,7 +145,7 @@ def read_layers(data: bytes, *, max_layer: int | None = None, allow_partial: boo
         raise ValueError(f"max_layer must be 0 or more, found {max_layer}")
     reader = LayerReader()
     try:
-        while reader.next_layer(data, max_layer) is not None:
+        while reader.next_slice(data, max_layer):
             pass
     except Truncated:
         if not (allow_partial and reader.layers):

@@ -9,7 +9,14 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.bitstream.container import CHUNK_OVERHEAD, FLAG_ANCILLARY, write_chunk, write_preamble
+from pd4dgs_codec.bitstream.container import (
+    CHUNK_OVERHEAD,
+    FLAG_ANCILLARY,
+    slice_flags,
+    write_chunk,
+    write_preamble,
+)
+from pd4dgs_codec.bitstream.limits import MAX_CHUNKS
 from pd4dgs_codec.codec.bounds import ErrorBound, rounding_bounds, verify_errors
 from pd4dgs_codec.codec.check import check_scene
 from pd4dgs_codec.codec.decoder import decode_layers
@@ -19,18 +26,38 @@ from pd4dgs_codec.codec.layer_meta import Declared
 from pd4dgs_codec.codec.left_out import LeftOut
 from pd4dgs_codec.codec.metadata import CHUNK_TYPE, Metadata, write_metadata
 from pd4dgs_codec.codec.options import DEFAULTS, EncodeOptions
-from pd4dgs_codec.codec.payload import StreamReport, read_meta, write_layer
+from pd4dgs_codec.codec.payload import StreamReport, read_meta
 from pd4dgs_codec.codec.plan import plan
-from pd4dgs_codec.codec.symbols import LayerSymbols, assemble, check_last_layer, float_tensors, layer_symbols
+from pd4dgs_codec.codec.slicing import Slice, whole_layer, write_slices
+from pd4dgs_codec.codec.symbols import (
+    LayerSymbols,
+    TakenVoxels,
+    assemble,
+    check_last_layer,
+    float_tensors,
+    layer_symbols,
+)
 from pd4dgs_codec.errors import DecodeError, EncodeError
 from pd4dgs_codec.scene import Scene
 from pd4dgs_codec.threads import one_blas_thread
 
+#: Bytes that preamble, header and chunk list of a sliced file take at most; they count with the first slice.
+HEADER = 1000
+
+
+@dataclass(frozen=True)
+class SliceReport:
+    """One slice. bytes: its whole chunk."""
+
+    bytes: int
+    anchors: int
+
 
 @dataclass(frozen=True)
 class LayerReport:
-    """One layer. bytes: its whole chunk. payload_bits and rate_bits: sums over attributes, planes and weights (in mode
-    lzma one stream codes these and the masks together, and payload_bits is all of it). streams: every coded section.
+    """One layer. bytes: its chunks. slices: each of them. payload_bits and rate_bits: sums over attributes, planes and
+    weights (in mode lzma one stream codes these and the masks together, and payload_bits is all of it). streams: every
+    coded section.
     """
 
     layer: int
@@ -40,6 +67,7 @@ class LayerReport:
     position_bits: int
     symbols: int
     anchors: int
+    slices: list[SliceReport]
     streams: list[StreamReport]
 
 
@@ -80,10 +108,12 @@ def encode_with_report(
     *,
     left_out: Sequence[LeftOut] = (),
     metadata: Metadata | None = None,
+    utility: np.ndarray | None = None,
     **changes: Any,
 ) -> tuple[bytes, Report]:
     """(file, report) of a scene.
 
+    utility: float [N], what the pictures gain by each anchor, if the layers are sliced; by_size if None.
     changes: fields of EncodeOptions by name, in place of those of `options`. left_out: what the caller has taken out of
     the scene, to be reported with the rest. metadata: what the file says about itself. Raises EncodeError.
     """
@@ -92,13 +122,17 @@ def encode_with_report(
     check_scene(scene)
     planned, omitted = plan(scene, options)
     symbols = [layer_symbols(planned, i, options.raw_deformation) for i in range(len(planned.layers))]
-    written = [write_layer(layer, options) for layer in symbols]
-    _check_limits(planned, symbols, [payload for payload, _ in written])
+    if options.slices:
+        utilities = _of_planned(by_size(scene) if utility is None else utility, scene, planned)
+        written = [write_slices(layer, options, u, HEADER) for layer, u in zip(symbols, utilities, strict=True)]
+    else:
+        written = [[whole_layer(layer, options)] for layer in symbols]
+    _check_limits(planned, symbols, written)
     meant = assemble(planned.info, planned.steps.attributes, symbols)
     about = write_metadata(metadata) if metadata is not None else b""
-    data = _container(meant, options, [payload for payload, _ in written], about)
+    data = _container(meant, options, written, about)
     errors = _verify(data, planned, symbols, meant) if options.verify else []
-    reports = [_layer_report(layer, payload, r) for layer, (payload, r) in zip(symbols, written, strict=True)]
+    reports = [_layer_report(layer, slices) for layer, slices in zip(symbols, written, strict=True)]
     kept = sum(r.anchors for r in reports)
     kept_bits = sum(r.position_bits + s.payload_bits for r in reports for s in r.streams if s.name == "attributes")
     rows = [item.row(scene.steps, options, kept, kept_bits) for item in (*left_out, *omitted)]
@@ -107,21 +141,50 @@ def encode_with_report(
     return data, Report(options.mode, len(data), options.verify, seconds, reports, rows, errors, about_bytes)
 
 
-def _check_limits(scene: Scene, symbols: list[LayerSymbols], payloads: list[bytes]) -> None:
+def by_size(scene: Scene) -> np.ndarray:
+    """float32 [N]: a guess at what the pictures gain by each anchor where no view is known: its gate in the highest
+    layer times the area that its Gaussians cover at most."""
+    scales = np.sort(scene.scaling_log[:, 3:], axis=1)[:, 1:].sum(axis=1)
+    utility: np.ndarray = scene.mask[-1] * np.exp(scales - scales.max(initial=0))
+    return utility
+
+
+def _of_planned(utility: np.ndarray, scene: Scene, planned: Scene) -> list[np.ndarray]:
+    """By layer, float [n] of its own rows: the utility of a scene's anchors where the planned scene has them."""
+    if utility.shape != (scene.rows[-1],):
+        raise EncodeError(f"utility: {utility.shape}, expected one value per anchor, {scene.rows[-1]}")
+    values = dict(zip(map(tuple, scene.anchor_q.tolist()), utility.tolist(), strict=True))
+    kept = np.array([values[tuple(voxel)] for voxel in planned.anchor_q.tolist()])
+    return np.split(kept, planned.rows[:-1])
+
+
+def _check_limits(scene: Scene, symbols: list[LayerSymbols], written: list[list[Slice]]) -> None:
     """Hold declared sizes and ranges of values against the format's limits as a decoder will, verified or not."""
-    declared = Declared()
-    for index, (layer, payload) in enumerate(zip(symbols, payloads, strict=True)):
-        try:
-            *_, declared = read_meta(payload, layer.kind, layer.widths, declared, layer.raw_deformation)
-            check_last_layer(symbols[: index + 1], scene.info.voxel_size, scene.steps.attributes)
-        except DecodeError as error:
-            raise EncodeError(f"the scene is over a limit of the format: {error}") from None
+    declared, taken = Declared(), TakenVoxels()
+    chunks = sum(map(len, written))
+    if chunks > MAX_CHUNKS:
+        raise EncodeError(f"{chunks} slices, expected at most {MAX_CHUNKS}: let slices take more bytes")
+    for index, (layer, slices) in enumerate(zip(symbols, written, strict=True)):
+        for number, part in enumerate(slices):
+            try:
+                *_, declared = read_meta(
+                    part.payload, layer.kind, layer.widths, declared, layer.raw_deformation, number > 0
+                )
+                layers = [*symbols[:index], part.symbols]
+                check_last_layer(layers, taken, scene.info.voxel_size, scene.steps.attributes)
+            except DecodeError as error:
+                raise EncodeError(f"the scene is over a limit of the format: {error}") from None
 
 
-def _container(meant: Scene, options: EncodeOptions, payloads: list[bytes], metadata: bytes) -> bytes:
-    """The file of a scene as it will be decoded, from the payloads of its layers and of its metadata, if there is any.
+def _container(meant: Scene, options: EncodeOptions, written: list[list[Slice]], metadata: bytes) -> bytes:
+    """The file of a scene as it will be decoded, from the slices of its layers and its metadata, if there is any.
     The latter comes last: a picture does not wait for it."""
-    parts = [(LAYER_KINDS[layer].chunk_type, 0, payload) for layer, payload in zip(meant.layers, payloads, strict=True)]
+    parts = [
+        (LAYER_KINDS[layer].chunk_type, slice_flags(number, len(slices)), part.payload)
+        for layer, slices in zip(meant.layers, written, strict=True)
+        for number, part in enumerate(slices)
+    ]
+    payloads = [payload for *_, payload in parts]
     if metadata:
         parts.append((CHUNK_TYPE, FLAG_ANCILLARY, metadata))
     header = Header(
@@ -163,16 +226,32 @@ def _same(a: list[np.ndarray], b: list[np.ndarray]) -> bool:
     return len(a) == len(b) and all(x.shape == y.shape and np.array_equal(x, y) for x, y in zip(a, b, strict=True))
 
 
-def _layer_report(layer: LayerSymbols, payload: bytes, reports: list[StreamReport]) -> LayerReport:
-    positions, *streams = reports
+def _layer_report(layer: LayerSymbols, slices: list[Slice]) -> LayerReport:
+    positions, *streams = _added(slices)
+    rows = [SliceReport(CHUNK_OVERHEAD + len(part.payload), len(part.symbols.anchor_q)) for part in slices]
     counted = [s for s in streams if s.name not in ("masks", "floats")]
     return LayerReport(
         layer=layer.kind.layer,
-        bytes=len(write_chunk(layer.kind.chunk_type, 0, bytes(8), payload)),
+        bytes=sum(row.bytes for row in rows),
         payload_bits=sum(s.payload_bits for s in counted),
         rate_bits=sum(s.rate_bits for s in counted),
         position_bits=positions.payload_bits,
         symbols=sum(s.symbols for s in counted),
         anchors=len(layer.anchor_q),
+        slices=rows,
         streams=streams,
     )
+
+
+def _added(slices: list[Slice]) -> list[StreamReport]:
+    """By section, what all slices took; the positions come first."""
+    found: dict[str, StreamReport] = {}
+    for row in (row for part in slices for row in part.streams):
+        so_far = found.get(row.name, StreamReport(row.name, 0, 0.0, 0))
+        found[row.name] = StreamReport(
+            row.name,
+            so_far.payload_bits + row.payload_bits,
+            so_far.rate_bits + row.rate_bits,
+            so_far.symbols + row.symbols,
+        )
+    return list(found.values())

@@ -65,6 +65,8 @@ export function readHeader(bytes) {
     feature: asInteger(width, 1, MAX_FEATURE, "header: feature width"),
     slots: asInteger(count, 1, MAX_SLOTS, "header: slots"),
   };
+  const layers = chunks.filter(({ type }) => type < LAYER_TYPES).map(({ type }) => type);
+  if (mode === 1 && new Set(layers).size < layers.length) throw malformed("header: mode lzma, and a layer in slices");
   // An ans-only decoder (clause 16).
   if (mode === 1) throw unsupported("header: mode lzma, expected mode ans");
   if (deformation === 1) throw unsupported("header: a deformation of float32 values, expected one of symbols");
@@ -106,7 +108,7 @@ function readChunkList(header) {
   let last = -1;
   for (const { type } of chunks) {
     if (type >= LAYER_TYPES) continue;
-    if (type <= last) throw malformed(`header: layer ${type} after layer ${last}, expected each once, ascending`);
+    if (type < last) throw malformed(`header: layer ${type} after layer ${last}, expected ascending ones`);
     last = type;
   }
   if (chunks[0].type !== 0) throw malformed(`header: the first chunk is of type ${chunks[0].type}, expected layer 0`);

@@ -1,9 +1,11 @@
 // Clause 14: what a file may declare. Two limits are this decoder's own, lower than the format's, and above the least that
 // the clause asks of a decoder: so that what a page allocates stays near a gigabyte.
 
-/** Bytes of a header, and of a layer's parameters. */
+/** Bytes of a header. */
+export const MAX_HEADER = 2 ** 14;
+/** Bytes of a slice's parameters. */
 export const MAX_FIELDS = 4096;
-export const MAX_CHUNKS = 64;
+export const MAX_CHUNKS = 1024;
 /** Bytes of a payload or a section. */
 export const MAX_PAYLOAD = 2 ** 31 - 1;
 export const MAX_NESTING = 4;
@@ -19,7 +21,7 @@ export const MAX_SYMBOL = 2 ** 23;
 /** Symbols of one channel. */
 export const MAX_COUNT = 2 ** 26;
 export const MAX_WINDOW = 2 ** 14;
-/** Entries of all windows defined in one section of coded channels. */
+/** Entries of all windows that the tokens of one section of coded channels may refer to. */
 export const MAX_ENTRIES = 2 ** 21;
 export const MAX_CLASSES = 8;
 export const MAX_SCALES = 8;

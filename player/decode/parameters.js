@@ -1,4 +1,4 @@
-// Clause 6: the parameters of a layer and the sections behind them.
+// Clause 6: the parameters of a slice and the sections behind them.
 
 import { limitExceeded, malformed } from "./errors.js";
 import { Fields, asInteger, asList, asRegistered, checkStep } from "./fields.js";
@@ -84,20 +84,21 @@ const SECTIONS = ["positions", "masks", "attributes", "planes", "weights", "symb
  * @property {PlaneShape[]} planes
  * @property {NetworkShape[]} networks
  * @property {(Uint8Array | null)[]} sections
- * @property {Declared} declared by the layers so far, this one included
+ * @property {Declared} declared by the slices so far, this one included
  */
 
-/** What layers declare: rows, symbols, and the bytes of their payloads (6.5).
+/** What slices declare: rows, symbols, and the bytes of their payloads (6.5).
  * @typedef {{rows: number, symbols: number, bytes: number}} Declared */
 
 /**
- * The parameters of a layer's payload, with its sections; all counts are held against the limits and the payload.
+ * The parameters of a slice's payload, with its sections; all counts are held against the limits and the payload.
  *
- * @param {Uint8Array} payload @param {LayerKind} kind @param {Declared} before by the layers before
+ * @param {Uint8Array} payload @param {LayerKind} kind @param {Declared} before by the slices before
+ * @param {boolean} later whether slices of the layer came before: this one holds anchors alone
  * @returns {Parameters}
  */
-export function readParameters(payload, kind, before) {
-  const earlierRows = before.rows;
+export function readParameters(payload, kind, before, later) {
+  const rises = later ? 0 : before.rows;
   const where = `layer ${kind.layer}`;
   if (payload.length < 4) throw malformed(`${where}: a payload of ${payload.length} bytes, expected at least 4`);
   const length = new DataView(payload.buffer, payload.byteOffset).getUint32(0, true);
@@ -106,10 +107,11 @@ export function readParameters(payload, kind, before) {
     throw malformed(`${where}: parameters of ${length} bytes in a payload of ${payload.length}`);
   }
   const fields = new Fields(unpack(payload.subarray(4, 4 + length), where).value, where, 1, 5);
-  const rows = asInteger(fields.get(1), 0, MAX_ROWS - earlierRows, `${where}: own rows`);
+  const rows = asInteger(fields.get(1), 0, MAX_ROWS - before.rows, `${where}: own rows`);
   const lengths = new Fields(fields.get(2), `${where}: sections`, 0, SECTIONS.length - 1);
+  if (later) for (const key of [3, 4, 5]) if (fields.has(key)) throw malformed(`${where}: key ${key} in a later slice`);
   const scales = readScales(fields, kind, where);
-  const networks = readNetworks(fields, kind, where, scales);
+  const networks = later ? [] : readNetworks(fields, kind, where, scales);
   const steps = readSteps(fields, kind, where, networks.length > 0);
   const planes = scales.flat();
   const sections = cutSections(payload, 4 + length, lengths, where);
@@ -119,8 +121,8 @@ export function readParameters(payload, kind, before) {
     0,
   );
   const channels = channelCount(kind.widths);
-  const declared = declare(where, before, payload.length, rows, channels, cells, weights);
-  const counts = [rows, earlierRows + rows, rows * channels, cells, weights, 0, 0];
+  const declared = declare(where, before, payload.length, rises, rows, channels, cells, weights);
+  const counts = [rows, rises + rows, rows * channels, cells, weights, 0, 0];
   counts.forEach((count, section) => {
     if ((sections[section] !== null) !== count > 0) {
       const found = sections[section] === null ? "missing" : "there";
@@ -130,15 +132,15 @@ export function readParameters(payload, kind, before) {
   return { rows, steps, planes, networks, sections, declared };
 }
 
-/** Clause 6.5. @param {string} where @param {Declared} before @param {number} bytes of the payload @param {number} own rows
- * @param {number} channels @param {number} cells @param {number} weights @returns {Declared} */
-function declare(where, before, bytes, own, channels, cells, weights) {
+/** Clause 6.5. @param {string} where @param {Declared} before @param {number} bytes of the payload @param {number} rises
+ * @param {number} own rows @param {number} channels @param {number} cells @param {number} weights @returns {Declared} */
+function declare(where, before, bytes, rises, own, channels, cells, weights) {
   if (cells > MAX_PLANE_CELLS) throw limitExceeded(`${where}: ${cells} plane cells, limit ${MAX_PLANE_CELLS}`);
   const all = before.bytes + bytes;
   const rows = before.rows + own;
   const mostRows = 2 ** 13 + 2 * all;
   if (rows > mostRows) throw limitExceeded(`${where}: ${rows} rows in ${all} bytes, limit ${mostRows}`);
-  const symbols = before.symbols + before.rows + (channels + 4) * own + cells + weights;
+  const symbols = before.symbols + rises + (channels + 4) * own + cells + weights;
   const mostSymbols = 2 ** 22 + 2048 * all;
   if (symbols > mostSymbols) throw limitExceeded(`${where}: ${symbols} symbols in ${all} bytes, limit ${mostSymbols}`);
   return { rows, symbols, bytes: all };

@@ -1,4 +1,4 @@
-// The worker that fetches and decodes: bytes in, one scene per completed layer out.
+// The worker that fetches and decodes: bytes in, one scene per completed slice out.
 
 import { SceneSource } from "../decode/fetch.js";
 import { Stream } from "../decode/stream.js";
@@ -8,7 +8,7 @@ import { serve, tell } from "./serve.js";
 const PROGRESS_MS = 100;
 
 /**
- * What is told while a scene loads. ends: where in the file each layer ends, empty until the header is there. arrived,
+ * What is told while a scene loads. ends: where in the file each slice ends, empty until the header is there. arrived,
  * decoded: when the last byte of the scene came and when it was decoded, milliseconds since the epoch.
  *
  * @typedef {object} News

@@ -33,7 +33,7 @@ import { Remote } from "./remote.js";
 
 /**
  * The state of a player, for a status line. bytes: arrived so far, of total (null: unknown). ends: where in the file
- * each layer ends, empty while that is unknown. level: shown, null before the first picture. levels: that are there.
+ * each slice ends, empty while that is unknown. level: shown, null before the first picture. levels: that are there.
  * fps: pictures drawn in the last second. scale: of the picture's sides. gaussians: drawn.
  *
  * @typedef {object} Status
@@ -110,6 +110,8 @@ export class Player extends EventTarget {
     this._dirty = true;
     /** @type {number | null} */
     this._shownLevel = null;
+    /** Anchors of that level. */
+    this._shownRows = 0;
     this._frameRequest = 0;
     this._lastFrame = 0;
     this._lastMoved = -Infinity;
@@ -140,7 +142,8 @@ export class Player extends EventTarget {
       this._wake();
     });
     this._seen.observe(canvas);
-    this._startGpu();
+    /** Whether something was loaded before. */
+    this._loaded = false;
   }
 
   // --- what users see
@@ -158,8 +161,6 @@ export class Player extends EventTarget {
       if (loader === this._loader) this._told(news);
     });
     this._loader = loader;
-    this._useCpu = this._options.evaluator === "cpu" || !(this._gpu?.floats ?? true);
-    if (this._useCpu || (this._gpu?.software && this._options.evaluator !== "gpu")) this._cpuWorker ??= startWorker();
     this._scene = null;
     this._shownLevel = null;
     this._camera = null;
@@ -174,7 +175,12 @@ export class Player extends EventTarget {
     this._touch();
     const from = source instanceof Blob ? source : new URL(source, document.baseURI).href;
     loader.call("open", [from]).catch(() => {}); // a worker that fails says so to the next call as well
-    await this._loadOn(loader);
+    const loading = this._loadOn(loader);
+    if (!this._loaded) this._startGpu(); // which takes longer than to ask a server
+    this._loaded = true;
+    this._useCpu = this._options.evaluator === "cpu" || !(this._gpu?.floats ?? true);
+    if (this._useCpu || (this._gpu?.software && this._options.evaluator !== "gpu")) this._cpuWorker ??= startWorker();
+    await loading;
   }
 
   /** Loads as much as options and level allow. @param {Remote} loader */
@@ -645,11 +651,14 @@ export class Player extends EventTarget {
   /** A picture of a state is on the screen. @param {State} state @param {number} now */
   _shown({ scene, level }, now) {
     const before = this._shownLevel;
+    const { rows } = levelOf(scene, level);
+    const more = before !== null && (level > before || (level === before && rows > this._shownRows));
     this._shownLevel = level;
+    this._shownRows = rows;
     const seconds = (now - this._started) / 1000;
     const detail = { level, bytes: this._status.bytes, seconds, ...this._came.get(scene) };
     if (before === null) this._emit("firstpicture", detail);
-    else if (level > before) this._emit("upgrade", detail);
+    else if (more) this._emit("upgrade", detail);
   }
 }
 

@@ -324,7 +324,7 @@ def _prediction() -> Iterator[Vector]:
     beyond = said(lambda sizes: [*sizes[:-1], sizes[-1] + 40])
     left = predicted_attributes(k, {}, {}, tail=words(1))
     rows: tuple[Row, ...] = (
-        ("form-2", "8.5", FEATURE, b"\2" + coded(k), "Form 2 of the attributes."),
+        ("form-3", "8.5", FEATURE, b"\3" + coded(k), "Form 3 of the attributes."),
         ("form-255", "8.5", FEATURE, b"\xff" + coded(k), "Form 255 of the attributes."),
         ("form-alone", "8.6 15", MALFORMED, b"\1", "The section ends after its form."),
         ("block-cut", "8.6 15", MALFORMED, block()[:30], "The section ends inside the prediction block."),
