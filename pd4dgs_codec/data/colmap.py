@@ -29,6 +29,7 @@ MODELS = {
     2: ("SIMPLE_RADIAL", ("f", "cx", "cy", "k1")),
     3: ("RADIAL", ("f", "cx", "cy", "k1", "k2")),
     4: ("OPENCV", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
+    5: ("OPENCV_FISHEYE", ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")),
 }
 PARAMETERS = dict(MODELS.values())
 #: Quaternions are unit to this.
@@ -132,6 +133,8 @@ def _lens(model: str, width: int, height: int, values: list[float], where: str) 
         for key, value in zip(keys, values, strict=True)
     }
     fx, fy = p.get("fx", p.get("f", 0.0)), p.get("fy", p.get("f", 0.0))
+    if model == "OPENCV_FISHEYE":
+        return Lens(width, height, fx, fy, p["cx"], p["cy"], fisheye=(p["k1"], p["k2"], p["k3"], p["k4"]))
     radial, tangential = (p.get("k1", 0.0), p.get("k2", 0.0), 0.0), (p.get("p1", 0.0), p.get("p2", 0.0))
     return Lens(width, height, fx, fy, p["cx"], p["cy"], 0.0, radial, tangential)
 

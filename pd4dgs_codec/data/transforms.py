@@ -23,6 +23,7 @@ from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.errors import DataError
 
 PINHOLE_MODELS = {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
+FISHEYE_MODEL = "OPENCV_FISHEYE"
 #: OpenGL's camera looks along -z with y up; OpenCV's along +z with y down.
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0])
 
@@ -69,8 +70,10 @@ def _lens(file: dict[str, Any], frame: dict[str, Any], image: Path, where: str) 
     else:
         width, height = (whole_number(get(k), f"{where}: {k}", low=1) for k in ("w", "h"))
     model = get("camera_model")
-    if (model is not None and model not in PINHOLE_MODELS) or value("k4"):
-        raise DataError(f"{where}: camera_model {model!r} (k4 {value('k4'):g}) is not supported, expected a pinhole")
+    fisheye = model == FISHEYE_MODEL
+    if (model is not None and model not in PINHOLE_MODELS and not fisheye) or (value("k4") and not fisheye):
+        expected = f"a pinhole or {FISHEYE_MODEL}"
+        raise DataError(f"{where}: camera_model {model!r} (k4 {value('k4'):g}) is not supported, expected {expected}")
     fx = _focal(get, "x", width, where)
     fy = _focal(get, "y", height, where)
     if fx is None and fy is None:
@@ -79,6 +82,8 @@ def _lens(file: dict[str, Any], frame: dict[str, Any], image: Path, where: str) 
     assert fx is not None and fy is not None
     cx, cy = value("cx", width / 2), value("cy", height / 2)
     radial, tangential = (value("k1"), value("k2"), value("k3")), (value("p1"), value("p2"))
+    if fisheye:
+        return Lens(width, height, fx, fy, cx, cy, fisheye=(*radial, value("k4")))
     return Lens(width, height, fx, fy, cx, cy, 0.0, radial, tangential)
 
 

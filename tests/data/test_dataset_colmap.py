@@ -145,7 +145,10 @@ def test_distortion_is_taken_out(scene, tmp_path):
 @pytest.mark.parametrize(
     "line, message",
     [
-        ("7 OPENCV_FISHEYE 40 30 1 1 1 1 0 0 0 0", "camera model OPENCV_FISHEYE, expected one of SIMPLE_PINHOLE"),
+        (
+            "7 THIN_PRISM_FISHEYE 40 30 1 1 1 1 0 0 0 0",
+            "camera model THIN_PRISM_FISHEYE, expected one of SIMPLE_PINHOLE",
+        ),
         ("7 PINHOLE 40 30 1 1 1", "PINHOLE with 40x30 pixels and 3 parameters"),
         ("7 PINHOLE 40 30 -1 1 1 1", "camera 7: fx"),
         ("7 PINHOLE 40", "is not what COLMAP writes"),
@@ -174,9 +177,9 @@ def test_broken_binary_models(scene, tmp_path):
             load(folder)
         (place / name).write_bytes(data)
     (place / "cameras.bin").write_bytes(
-        whole["cameras.bin"].replace(struct.pack("<ii", 7, 1), struct.pack("<ii", 7, 5))
+        whole["cameras.bin"].replace(struct.pack("<ii", 7, 1), struct.pack("<ii", 7, 9))
     )
-    with pytest.raises(DataError, match="camera model number 5, expected one of"):
+    with pytest.raises(DataError, match="camera model number 9, expected one of"):
         load(folder)
     (place / "cameras.bin").write_bytes(whole["cameras.bin"])
     (place / "images.bin").write_bytes(whole["images.bin"].replace(b"cam/frame_0002", b"../frame_00002"))
