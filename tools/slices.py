@@ -171,7 +171,7 @@ def render(rows: Sequence[Row]) -> str:
         cost.append(
             (
                 row["name"],
-                len(sliced),
+                f"{len(sliced)}",
                 f"{sliced[-1][0]:,}",
                 f"{more:+.2%}",
                 f"{seconds['slices']:.2f}",
