@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -51,6 +52,9 @@ def test_spz_and_4dgs_come_back_rounded(tmp_path):
     path = tmp_path / "a.spz"
     path.write_bytes(spz_bytes(splats))
     _same(read_splats(path), splats, atol=0.07)
+    still = make_splats(30, 0)  # without harmonics but the constant
+    path.write_bytes(spz_bytes(still))
+    _same(read_splats(path), still, atol=0.07)
     path = tmp_path / "a.4dgs"
     path.write_bytes(fourdgs_bytes([(0.0, splats, np.arange(30)), (0.5, _moved(splats, 1), np.arange(30))], 1.0))
     teacher = read_model(str(path), 30)
@@ -60,6 +64,17 @@ def test_spz_and_4dgs_come_back_rounded(tmp_path):
         goal = splats.means + np.float32([shift, 0, 0])
         distance = np.abs(found.means[:, None] - goal[None]).max(axis=2)
         assert len(found.means) == 30 and distance.min(axis=0).max() < 0.02
+
+
+@pytest.mark.parametrize("name, count", [("guitar.compressed.ply", 90_854), ("biker.spz", 152_746)])
+def test_splats_of_others(name, count):
+    pytest.importorskip("gaussforge")
+    path = Path(os.environ.get("PD4DGS_SHARED", Path(__file__).parents[3] / "shared" / "data")) / "splats" / name
+    if not path.is_file():
+        pytest.skip(f"{path} is not there")
+    splats = read_splats(path)
+    assert len(splats.means) == count and splats.degree == 0
+    assert (splats.scales > 0).all() and np.ptp(splats.means, axis=0).max() > 1
 
 
 def test_frames_are_in_the_order_of_their_numbers(tmp_path):
