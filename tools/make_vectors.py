@@ -19,7 +19,7 @@ from vectors import faulty, slices, uncommon, valid
 from vectors.blocks import Vector
 
 from pd4dgs_codec.bitstream.container import read_preamble
-from pd4dgs_codec.codec.header import unpack_header
+from pd4dgs_codec.codec.header import layers_of, unpack_header
 from pd4dgs_codec.codec.info import hashes
 from pd4dgs_codec.errors import DecodeError, UnsupportedFeature
 
@@ -54,10 +54,19 @@ def entry(vector: Vector) -> dict:
     if vector.feature is not None:
         row["feature"] = vector.feature
     row["ans_only"] = "same" if _for_all(vector.data) else UnsupportedFeature.__name__
-    if len(vector.slices) != len(vector.layers):
+    listed = _listed(vector.data)
+    if len(listed) > len(set(listed)):
         row["slices"] = list(vector.slices)
     row["layers"] = vector.layers
     return row
+
+
+def _listed(data: bytes) -> list[int]:
+    """The layer of each slice in the header's list, none of a header that cannot be read."""
+    try:
+        return layers_of(unpack_header(read_preamble(data).header).chunks)
+    except DecodeError:
+        return []
 
 
 def _for_all(data: bytes) -> bool:

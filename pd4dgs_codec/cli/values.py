@@ -60,6 +60,11 @@ def duration(text: str) -> float:
     return _scaled(text, {"ms": 1e-3, "s": 1.0}, "a time such as 50ms or 1.5s", low=0.0)
 
 
+def size(text: str) -> int:
+    """Bytes with k, M for 1e3, 1e6: "50k" -> 50000."""
+    return int(_scaled(text, {"k": 1e3, "M": 1e6}, "a size in bytes such as 50k", low=1.0))
+
+
 def layer_sizes(text: str) -> dict[int, int]:
     """Bytes by layer with k, M for 1e3, 1e6: "L0=425k,L1=80000" -> {0: 425000, 1: 80000}."""
     layers, expected = {"L0": 0, "L1": 1, "L2": 2}, "sizes in bytes such as L0=425k,L1=120000"

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from pd4dgs_codec.bitstream.container import PREAMBLE_SIZE, Chunk, read_chunk, read_preamble
+from pd4dgs_codec.bitstream.container import CHUNK_OVERHEAD, PREAMBLE_SIZE, Chunk, read_chunk, read_preamble
 from pd4dgs_codec.codec.attribute_section import Past
 from pd4dgs_codec.codec.header import Header, layers_of, scene_id_of, unpack_header
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE, LayerKind
@@ -43,12 +43,12 @@ class LayerReader:
         assert self.header is not None
         return assemble(self.header.info, self.header.attribute_steps, self.layers)
 
-    def next_slice(self, data: bytes | bytearray, max_layer: int | None = None) -> bool:
-        """Read on to the end of one more slice of a layer <= max_layer; whether the file has one more (clause "decoding
-        process").
+    def next_slice(self, data: bytes | bytearray, max_layer: int | None = None, max_bytes: int | None = None) -> bool:
+        """Read on to the end of one more slice of a layer <= max_layer that ends within the first max_bytes; whether
+        the file has one more (clause "decoding process").
 
         Raises Truncated, with nothing consumed that a later call would miss, if `data` ends before; Malformed if
-        bytes follow the last chunk of a file that is read whole (max_layer None).
+        bytes follow the last chunk of a file that is read whole (neither limit).
         """
         if self.header is None:
             preamble = read_preamble(data)
@@ -58,9 +58,11 @@ class LayerReader:
         while self._index < len(chunks):
             if max_layer is not None and not _any_layer(chunks[self._index :], max_layer):
                 return False
+            if max_bytes is not None and self.offset + CHUNK_OVERHEAD + chunks[self._index][1] > max_bytes:
+                return False
             if self._read_chunk(data):
                 return True
-        if max_layer is None and len(data) > self.offset:
+        if max_layer is None and max_bytes is None and len(data) > self.offset:
             raise Malformed(f"{len(data) - self.offset} bytes follow the last chunk, expected none", offset=self.offset)
         return False
 
@@ -139,14 +141,18 @@ def _located(error: DecodeError, chunk: int, offset: int) -> DecodeError:
     return kind(error.message, offset=offset, chunk=chunk)
 
 
-def read_layers(data: bytes, *, max_layer: int | None = None, allow_partial: bool = False) -> tuple[LayerReader, bool]:
+def read_layers(
+    data: bytes, *, max_layer: int | None = None, max_bytes: int | None = None, allow_partial: bool = False
+) -> tuple[LayerReader, bool]:
     """(reader that holds the layers asked for, whether none of them is missing); arguments as in `decode`."""
     if max_layer is not None and max_layer < 0:
         raise ValueError(f"max_layer must be 0 or more, found {max_layer}")
     reader = LayerReader()
     try:
-        while reader.next_slice(data, max_layer):
+        while reader.next_slice(data, max_layer, max_bytes):
             pass
+        if not reader.layers:
+            raise Truncated(f"{max_bytes} bytes end before the first slice does", offset=max_bytes)
     except Truncated:
         if not (allow_partial and reader.layers):
             raise
@@ -155,24 +161,29 @@ def read_layers(data: bytes, *, max_layer: int | None = None, allow_partial: boo
 
 
 def decode_layers(
-    data: bytes, *, max_layer: int | None = None, allow_partial: bool = False
+    data: bytes, *, max_layer: int | None = None, max_bytes: int | None = None, allow_partial: bool = False
 ) -> tuple[Header, list[LayerSymbols], bool]:
     """(header, symbols per layer, whether nothing asked for is missing)."""
-    reader, complete = read_layers(data, max_layer=max_layer, allow_partial=allow_partial)
+    reader, complete = read_layers(data, max_layer=max_layer, max_bytes=max_bytes, allow_partial=allow_partial)
     assert reader.header is not None
     return reader.header, reader.layers, complete
 
 
-def decode(data: bytes, *, max_layer: int | None = None, allow_partial: bool = False) -> Scene:
-    """The scene of a file, or of its layers <= max_layer (bytes after those are not looked at).
+def decode(
+    data: bytes, *, max_layer: int | None = None, max_bytes: int | None = None, allow_partial: bool = False
+) -> Scene:
+    """The scene of a file, or of its layers <= max_layer, or of the slices within its first max_bytes bytes, at least
+    one (bytes after those are not looked at).
 
-    A cut file raises Truncated, or yields its longest valid prefix of layers if allow_partial, which still needs
-    layer 0. Other faults raise the other DecodeErrors.
+    A cut file raises Truncated, or yields its longest valid prefix of slices if allow_partial, which still needs the
+    first one. Other faults raise the other DecodeErrors.
     """
-    return decode_partial(data, max_layer=max_layer, allow_partial=allow_partial)[0]
+    return decode_partial(data, max_layer=max_layer, max_bytes=max_bytes, allow_partial=allow_partial)[0]
 
 
-def decode_partial(data: bytes, *, max_layer: int | None = None, allow_partial: bool = True) -> tuple[Scene, bool]:
-    """(scene, complete): as decode, and whether every layer asked for was there."""
-    reader, complete = read_layers(data, max_layer=max_layer, allow_partial=allow_partial)
+def decode_partial(
+    data: bytes, *, max_layer: int | None = None, max_bytes: int | None = None, allow_partial: bool = True
+) -> tuple[Scene, bool]:
+    """(scene, complete): as decode, and whether every slice asked for was there."""
+    reader, complete = read_layers(data, max_layer=max_layer, max_bytes=max_bytes, allow_partial=allow_partial)
     return reader.scene(), complete

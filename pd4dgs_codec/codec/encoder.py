@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -12,6 +12,7 @@ import numpy as np
 from pd4dgs_codec.bitstream.container import (
     CHUNK_OVERHEAD,
     FLAG_ANCILLARY,
+    read_preamble,
     slice_flags,
     write_chunk,
     write_preamble,
@@ -20,7 +21,7 @@ from pd4dgs_codec.bitstream.limits import MAX_CHUNKS
 from pd4dgs_codec.codec.bounds import ErrorBound, rounding_bounds, verify_errors
 from pd4dgs_codec.codec.check import check_scene
 from pd4dgs_codec.codec.decoder import decode_layers
-from pd4dgs_codec.codec.header import Header, pack_header, payload_digest, scene_id_of
+from pd4dgs_codec.codec.header import Header, pack_header, payload_digest, scene_id_of, unpack_header
 from pd4dgs_codec.codec.kinds import LAYER_KINDS
 from pd4dgs_codec.codec.layer_meta import Declared
 from pd4dgs_codec.codec.left_out import LeftOut
@@ -91,6 +92,11 @@ class Report:
         header = self.bytes - sum(row.bytes for row in self.layers) - self.metadata_bytes
         return {row.layer: row.bytes + (header if row.layer == 0 else 0) for row in self.layers}
 
+    @property
+    def first_bytes(self) -> int:
+        """What the first picture takes: the header and the first slice."""
+        return self.added_bytes()[0] - sum(part.bytes for part in self.layers[0].slices[1:])
+
     def json(self) -> dict[str, Any]:
         """The report as plain dicts, lists, strings and numbers."""
         return asdict(self)
@@ -108,12 +114,13 @@ def encode_with_report(
     *,
     left_out: Sequence[LeftOut] = (),
     metadata: Metadata | None = None,
-    utility: np.ndarray | None = None,
+    utility: Callable[[Scene], np.ndarray] | None = None,
     **changes: Any,
 ) -> tuple[bytes, Report]:
     """(file, report) of a scene.
 
-    utility: float [N], what the pictures gain by each anchor, if the layers are sliced; by_size if None.
+    utility: of the scene as it will be decoded, float [N]: what the pictures gain by each anchor, if the layers are
+    sliced; by_size if None.
     changes: fields of EncodeOptions by name, in place of those of `options`. left_out: what the caller has taken out of
     the scene, to be reported with the rest. metadata: what the file says about itself. Raises EncodeError.
     """
@@ -122,13 +129,13 @@ def encode_with_report(
     check_scene(scene)
     planned, omitted = plan(scene, options)
     symbols = [layer_symbols(planned, i, options.raw_deformation) for i in range(len(planned.layers))]
+    meant = assemble(planned.info, planned.steps.attributes, symbols)
     if options.slices:
-        utilities = _of_planned(by_size(scene) if utility is None else utility, scene, planned)
-        written = [write_slices(layer, options, u, HEADER) for layer, u in zip(symbols, utilities, strict=True)]
+        values = np.split((utility or by_size)(meant), meant.rows[:-1])
+        written = [write_slices(layer, options, u, HEADER) for layer, u in zip(symbols, values, strict=True)]
     else:
         written = [[whole_layer(layer, options)] for layer in symbols]
     _check_limits(planned, symbols, written)
-    meant = assemble(planned.info, planned.steps.attributes, symbols)
     about = write_metadata(metadata) if metadata is not None else b""
     data = _container(meant, options, written, about)
     errors = _verify(data, planned, symbols, meant) if options.verify else []
@@ -149,13 +156,13 @@ def by_size(scene: Scene) -> np.ndarray:
     return utility
 
 
-def _of_planned(utility: np.ndarray, scene: Scene, planned: Scene) -> list[np.ndarray]:
-    """By layer, float [n] of its own rows: the utility of a scene's anchors where the planned scene has them."""
-    if utility.shape != (scene.rows[-1],):
-        raise EncodeError(f"utility: {utility.shape}, expected one value per anchor, {scene.rows[-1]}")
-    values = dict(zip(map(tuple, scene.anchor_q.tolist()), utility.tolist(), strict=True))
-    kept = np.array([values[tuple(voxel)] for voxel in planned.anchor_q.tolist()])
-    return np.split(kept, planned.rows[:-1])
+def with_metadata(data: bytes, metadata: Metadata) -> bytes:
+    """A complete file with a metadata chunk more at its end; nothing else changes but the chunk list."""
+    preamble = read_preamble(data)
+    header, about = unpack_header(preamble.header), write_metadata(metadata)
+    packed = pack_header(replace(header, chunks=(*header.chunks, (CHUNK_TYPE, len(about)))))
+    chunk = write_chunk(CHUNK_TYPE, FLAG_ANCILLARY, scene_id_of(packed), about)
+    return write_preamble(packed) + data[preamble.size :] + chunk
 
 
 def _check_limits(scene: Scene, symbols: list[LayerSymbols], written: list[list[Slice]]) -> None:

@@ -28,8 +28,8 @@ def info(data: bytes) -> dict[str, Any]:
     one) and, for layers that `data` holds whole, anchors, steps, planes ([C, x, y, z, t] per scale), networks (output
     widths) and sections (bytes by name; what else the chunks hold is their frames and their parameters). slices:
     {offset, bytes, end} and, of those that `data` holds whole, anchors.
-    metadata: {title, source, licence, command, quality, still_bytes} as far as given, {"fault"} if it cannot be read,
-    None where `data` holds no such chunk.
+    metadata: {title, source, licence, command, quality, slices, still_bytes} as far as given, {"fault"} if it cannot be
+    read, None where `data` holds no such chunk.
     """
     preamble = read_preamble(data)
     header = unpack_header(preamble.header, offset=PREAMBLE_SIZE)
@@ -110,7 +110,8 @@ def _about(payload: bytes) -> dict[str, Any]:
         return {"fault": str(error)}
     texts = {name: text for name in TEXTS if (text := getattr(found, name))}
     quality = {"quality": {str(level): db for level, db in found.quality.items()}} if found.quality else {}
-    return {**texts, **quality, **({"still_bytes": len(found.still)} if found.still else {})}
+    slices = {"slices": list(found.slices)} if found.slices else {}
+    return {**texts, **quality, **slices, **({"still_bytes": len(found.still)} if found.still else {})}
 
 
 def nearest_bounds(data: bytes) -> dict[str, float]:

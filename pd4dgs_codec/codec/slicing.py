@@ -42,7 +42,7 @@ def write_slices(layer: LayerSymbols, options: EncodeOptions, utility: np.ndarra
     at that, but for layer 0: a picture needs anchors.
     """
     rows = np.argsort(-utility, kind="stable")
-    costs = np.cumsum(_bits_per_row(layer)[rows]) / 8
+    costs = np.cumsum(bits_per_row(layer)[rows]) / 8
     done, found, past = 0, list[Slice](), Past[Fitted]()
     scale = 1.0  # bytes that a slice takes per byte expected
     while done < len(rows) or not found:
@@ -69,7 +69,7 @@ def write_slices(layer: LayerSymbols, options: EncodeOptions, utility: np.ndarra
     return found
 
 
-def _bits_per_row(layer: LayerSymbols) -> np.ndarray:
+def bits_per_row(layer: LayerSymbols) -> np.ndarray:
     """float64 [n]: about what each anchor costs, by the frequencies of its symbols in their channels."""
     n = len(layer.anchor_q)
     bits = np.full(n, 3.0 * max(n, 2).bit_length())  # of a position

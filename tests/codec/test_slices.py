@@ -81,6 +81,12 @@ def test_every_prefix_of_slices_is_a_scene_by_every_door():
         assert prefix.level == chunks[count - 1][0]
         for first, last in zip((0, *prefix.rows[:-1]), prefix.rows, strict=True):
             np.testing.assert_array_equal(morton_order(prefix.anchor_q[first:last]), np.arange(last - first))
+        for extra in (0, 1):
+            assert_same_scene(prefix, decode(sliced() + b"x", max_bytes=end + extra))
+        with pytest.raises(DecodeError):
+            decode(sliced()[: end - 1], max_bytes=end)
+    with pytest.raises(Truncated, match=f"{ends[0] - 1} bytes end before the first slice"):
+        decode(sliced(), max_bytes=ends[0] - 1)
     for level in (0, 1):
         assert_same_scene(decode(sliced(), max_layer=level), decode(one_slice(), max_layer=level))
 
@@ -99,7 +105,7 @@ def test_slices_swapped_doubled_or_left_out_are_refused(order, at):
 
 def test_slices_of_another_encode_are_refused():
     """Even where lengths, numbers and the scene's fields are the same."""
-    other = encode(scene(), effort=2, slices=2000, utility=-encoder.by_size(scene()))
+    other = encode(scene(), effort=2, slices=2000, utility=lambda scene: -encoder.by_size(scene))
     (header, mine, _), (_, others, _) = chunks_of(sliced()), chunks_of(other)
     alien = read_chunk(other, read_preamble(other).size).scene_id
     packed = pack_header(replace(header, chunks=tuple((k, len(p)) for k, _, p in [mine[0], others[1], *mine[2:]])))
@@ -124,18 +130,16 @@ def test_cuts_and_flips_are_refused(place, bit):
 
 
 def test_utility_decides_what_comes_first():
-    given_one = scene()
-    utility = np.arange(len(given_one.anchor_q), dtype=float)[::-1].copy()
-    utility[7] = 1e9
-    data = encode(given_one, effort=2, slices=2000, utility=utility)
-    _, _, ends = chunks_of(data)
-    first = {tuple(q) for q in decode_partial(data[: ends[0]])[0].anchor_q.tolist()}
-    own = [tuple(q) for q in given_one.anchor_q.tolist()]
-    in_layer_0 = [i for i in range(given_one.rows[0]) if given_one.mask[0][i]]
-    expected = sorted(in_layer_0, key=lambda i: -utility[i])[: len(first)]
-    assert first == {own[i] for i in expected}
-    with pytest.raises(EncodeError, match=r"utility: \(5,\), expected one value per anchor"):
-        encode(given_one, slices=2000, utility=utility[:5])
+    def utility(scene):
+        values = np.arange(len(scene.anchor_q), dtype=float)[::-1].copy()
+        values[7] = 1e9
+        return values
+
+    data = encode(scene(), effort=2, slices=2000, utility=utility)
+    whole, (_, _, ends) = decode(data), chunks_of(data)
+    first = decode_partial(data[: ends[0]])[0].anchor_q.tolist()
+    expected = sorted(range(whole.rows[0]), key=lambda i: -utility(whole)[i])[: len(first)]
+    assert sorted(first) == sorted(whole.anchor_q[expected].tolist())
 
 
 def test_slices_take_what_was_asked_and_the_report_says_so():
@@ -166,3 +170,18 @@ def test_slices_that_cannot_be_are_refused(monkeypatch):
 def test_flags_number_as_many_slices_as_a_file_may_have_chunks():
     assert slice_flags(MAX_CHUNKS - 1, MAX_CHUNKS) < 1 << 16
     assert CHUNKS == 1
+
+
+def test_every_prefix_renders_finite_pictures():
+    from pd4dgs_codec.model.convert import from_scene
+    from pd4dgs_codec.model.picture import render_image
+    from pd4dgs_codec.scene import Camera
+
+    viewmat = np.eye(4, dtype=np.float32)
+    viewmat[2, 3] = 3.0
+    camera = Camera(viewmat, np.array([[20, 0, 12], [0, 20, 8], [0, 0, 1]], np.float32), 24, 16)
+    pictures = []
+    for prefix in open_stream().feed(sliced()):
+        pictures.append(render_image(from_scene(prefix), prefix.level, 0.3, camera))
+        assert np.isfinite(pictures[-1]).all()
+    assert (pictures[0] != pictures[-1]).any()
