@@ -22,7 +22,7 @@ K = (1 << 24) - 1  # clause 14: coded symbols
 MAX_SYMBOL = 1 << 23  # clause 14: symbols of attributes, plane samples and weights
 MAX_VOXEL = 1 << 20
 MAX_COUNT = 1 << 26
-MAX_ENTRIES = 1 << 21
+FREE_ENTRIES, MORE_ENTRIES = 1 << 18, 1 << 10
 VARINT_MAX = (1 << 35) - 1  # clause 7.1: five bytes of seven bits
 TOTAL = 1 << 24
 PLANES = (("xy", 0, 1), ("xz", 0, 2), ("xt", 0, 3), ("yz", 1, 2), ("yt", 1, 3), ("zt", 2, 3))
@@ -488,7 +488,7 @@ def weight_shapes(layer):
     return shapes
 
 
-# 6.5 Declared sizes: "c MUST NOT exceed 2^28, N MUST NOT exceed 2^13 + 2·L, and S MUST NOT exceed 2^22 + 2048·L."
+# 6.5 Declared sizes: "c MUST NOT exceed 2^28, N MUST NOT exceed 2^13 + 2·L, and S MUST NOT exceed 2^22 + 1024·L."
 # "let N, S and L be sums over this slice and all slices before it in the file"
 def check_sizes(layer, payload_bytes, before):
     """before: N, S and L of the slices before it. Sets those with it."""
@@ -499,7 +499,7 @@ def check_sizes(layer, payload_bytes, before):
     layer.declared = [a + b for a, b in zip(before, (layer.rows, symbols, payload_bytes))]
     rows, symbols, size = layer.declared
     need(rows <= (1 << 13) + 2 * size, f"{rows} rows", "LimitExceeded")
-    need(symbols <= (1 << 22) + 2048 * size, f"{symbols} symbols", "LimitExceeded")
+    need(symbols <= (1 << 22) + 1024 * size, f"{symbols} symbols", "LimitExceeded")
 
 
 # 6.4 Sections: "A section is present if and only if it has at least one symbol or value to code. Mode ans uses 0..4,
@@ -750,7 +750,7 @@ def read_exceptions(reader, count, prior):
 def decode_channels(data, counts, known=None):
     """known: the priors of the slices before, to which those defined here are added."""
     reader, defined, heads = Reader(data), [] if known is None else known, []
-    first, entries = len(defined), sum(prior.n for prior in defined)
+    first, entries, most = len(defined), 0, sum(counts) + (MORE_ENTRIES if defined else FREE_ENTRIES)
     for count in counts:
         if count == 0:
             continue
@@ -758,7 +758,7 @@ def decode_channels(data, counts, known=None):
         token = reader.varint(2 * (MAX_COUNT + 8))
         if token >> 1 < 8:
             defined.append(read_prior(reader, token >> 1))
-            entries = limited(entries + defined[-1].n, MAX_ENTRIES, "the entries of a section's tables")
+            entries = limited(entries + defined[-1].n, most, "the entries of a section's tables")
         back = max(token >> 1, 8) - 8
         need(back < len(defined), "a channel reuses a prior before the first")
         prior = defined[-1 - back]

@@ -28,6 +28,8 @@ SOURCES = """\
 SOURCE is one of
   a folder in the iPhone/Nerfies layout (camera/, rgb/, splits/; its split files decide what is held out)
   a folder with transforms*.json (Blender, D-NeRF, nerfstudio)
+  a folder with poses_bounds.npy and a video per camera, cam*.mp4 (Neu3D; the first camera is held out)
+  a folder with a model of COLMAP in sparse/0 and its pictures in images/; times.txt may say when they were taken
   synthetic:static   nothing moves
   synthetic:global   large objects move slowly
   synthetic:local    the same, and small parts move on their own

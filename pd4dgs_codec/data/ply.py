@@ -66,10 +66,11 @@ def _body(path: Path, raw: bytes, kind: str, count: int, dtype: np.dtype) -> np.
     raise DataError(f"{path}: {len(rows)} vertex lines, expected {count}")
 
 
-def read_vertices(path: Path) -> np.ndarray:
-    """Structured array [count] of the vertex element, a field per property. Raises DataError, one line."""
+def read_vertices(path: Path, raw: bytes | None = None) -> np.ndarray:
+    """Structured array [count] of the vertex element, a field per property. raw: the file's bytes, if they are read
+    already. Raises DataError, one line."""
     try:
-        raw = read_file(path)
+        raw = read_file(path) if raw is None else raw
     except (OSError, ValueError) as e:  # ValueError: a NUL or half a surrogate in the name
         raise DataError(f"{path}: cannot be read: {getattr(e, 'strerror', e)}") from None
     kind, count, fields, start = _header(path, raw)

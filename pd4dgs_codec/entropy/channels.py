@@ -22,8 +22,9 @@ from pd4dgs_codec.entropy.fitting import Fitted, fit_best, histogram
 from pd4dgs_codec.entropy.priors import (
     CONST,
     FIRST_REUSE,
+    FREE_ENTRIES,
     K_MAX,
-    MAX_ENTRIES,
+    MORE_ENTRIES,
     Hist,
     Prior,
     Window,
@@ -187,14 +188,15 @@ def decode_channels(
             raise LimitExceeded(f"channel {index}: {count} symbols, limit {MAX_COUNT}")
     reader = ByteReader(payload)
     defined = [] if known is None else known
-    first, heads, entries = len(defined), [], sum(prior.window.n for prior in defined)
+    first, heads, entries = len(defined), [], 0
+    most = sum(counts) + (MORE_ENTRIES if defined else FREE_ENTRIES)
     for count in counts:
         if count:
             before = len(defined)
             heads.append(_read_channel(reader, count, defined))
             entries += sum(prior.window.n for prior in defined[before:])
-            if entries > MAX_ENTRIES:
-                raise LimitExceeded(f"tables of {entries} entries in one section, limit {MAX_ENTRIES}")
+            if entries > most:
+                raise LimitExceeded(f"tables of {entries} entries in one section, limit {most}")
     stream = AnsDecoder(reader.rest())
     make_tables(defined[first:])
     for at in range(first, len(defined)):

@@ -12,7 +12,7 @@ from dataclasses import replace
 import numpy as np
 
 from pd4dgs_codec.entropy.fitting import Fitted, Histogram, costs_of, loops, pool
-from pd4dgs_codec.entropy.priors import MAX_ENTRIES, MAX_WINDOW
+from pd4dgs_codec.entropy.priors import FREE_ENTRIES, MAX_WINDOW, MORE_ENTRIES
 
 BLOCK = 256  #: channels planned together; keeps the cost matrix small
 WIDE = 1024  #: a channel with more distinct symbols spends too much on each for its prior's few bytes to matter
@@ -41,13 +41,13 @@ def plan_priors(histograms: Sequence[Histogram], fit: Fit, rounds: int, known: S
 
 
 def _within_limit(histograms: Sequence[Histogram], plan: list[Fitted], free: list[Fitted], fit: Fit) -> list[Fitted]:
-    """The plan, its widest new priors replaced by one for all their channels where the tables would pass MAX_ENTRIES,
-    or by known ones where there is no room for it."""
+    """The plan, its widest new priors replaced by one for all their channels where the tables would be larger
+    than a section may define, or by known ones where there is no room for it."""
     known = {id(p.prior) for p in free}
     distinct = {id(p.prior): p for p in plan if id(p.prior) not in known}.values()
     ordered = sorted(distinct, key=lambda p: p.prior.window.n)
     ends = np.cumsum([p.prior.window.n for p in ordered])
-    left = MAX_ENTRIES - sum(p.prior.window.n for p in free)
+    left = sum(int(h.counts.sum()) for h in histograms) + (MORE_ENTRIES if free else FREE_ENTRIES)
     if not ordered or ends[-1] <= left:
         return plan
     kept = known | {id(p.prior) for p, end in zip(ordered, ends, strict=True) if end <= left - MAX_WINDOW}

@@ -85,9 +85,11 @@ def _folder(folder: Path, fps: float) -> Teacher:
 
 def read_splats(path: Path) -> Splats:
     """The Gaussians of a PLY as 3D Gaussian splatting writes it, of a compressed PLY or of an SPZ file."""
-    if path.suffix.lower() == ".spz" or path.name.lower().endswith(".compressed.ply"):
-        return _gaussforge(path)
-    rows = read_vertices(path)
+    compressed = path.name.lower().endswith(".compressed.ply")
+    if path.suffix.lower() == ".spz" or compressed:
+        rows = read_vertices(path, _unpacked(path, "compressed.ply" if compressed else "spz"))
+    else:
+        rows = read_vertices(path)
     names = set(rows.dtype.names or ())
 
     def stack(*wanted: str) -> np.ndarray:
@@ -114,34 +116,18 @@ def read_splats(path: Path) -> Splats:
         )
 
 
-def _gaussforge(path: Path) -> Splats:
-    """An SPZ file or a compressed PLY."""
-    kind = "spz" if path.suffix.lower() == ".spz" else "compressed.ply"
+def _unpacked(path: Path, kind: str) -> bytes:
+    """The PLY that gaussforge makes of an SPZ file or a compressed PLY."""
     forge = library("gaussforge", "SPZ files and compressed PLYs").GaussForge()
-    data = read_file(path)
+    try:
+        data = read_file(path)
+    except OSError as error:
+        raise DataError(f"{path}: cannot be read: {error.strerror}") from None
     with quiet():
-        found = forge.read(data, kind)
+        found = forge.convert(data, kind, "ply")
     if "error" in found:
         raise DataError(f"{path}: gaussforge cannot read it: {one_line(str(found['error']), 120)}")
-    ir = found["data"]
-    n = int(ir["numPoints"])
-    flat = {
-        key: np.frombuffer(ir[key], "<f4") for key in ("positions", "scales", "rotations", "alphas", "colors", "sh")
-    }
-    rest = flat["sh"].size // (3 * n) if n else 0
-    if not n or rest not in REST or flat["sh"].size != 3 * n * rest:
-        raise DataError(
-            f"{path}: {n} Gaussians with {flat['sh'].size} coefficients, expected whole degrees of harmonics"
-        )
-    with np.errstate(over="ignore"):
-        return checked(
-            str(path),
-            means=flat["positions"].reshape(n, 3),
-            quats=flat["rotations"].reshape(n, 4),
-            scales=np.exp(flat["scales"].reshape(n, 3)),
-            opacities=1 / (1 + np.exp(-flat["alphas"].reshape(n))),
-            sh=np.concatenate([flat["colors"].reshape(n, 1, 3), flat["sh"].reshape(n, rest, 3)], axis=1),
-        )
+    return bytes(found["data"])
 
 
 def _fourdgs(path: Path) -> Teacher:
@@ -247,7 +233,7 @@ def checked(
         )
     good = np.ones(n, bool)
     for array in parts.values():
-        good &= (np.abs(array.reshape(n, -1)) <= LARGEST).all(axis=1)  # also false of NaN
+        good &= (np.abs(array) <= LARGEST).all(axis=tuple(range(1, array.ndim)))  # also false of NaN
     good &= (np.linalg.norm(quats, axis=1) > 0) & (scales >= 0).all(axis=1) & (opacities >= 0) & (opacities <= 1)
     if not good.any():
         raise DataError(f"{where}: none of {n} Gaussians is finite with a rotation, expected one at least")

@@ -3,7 +3,7 @@
 import { AnsDecoder } from "./ans.js";
 import { ByteReader, MAX_VARINT } from "./bytes.js";
 import { limitExceeded, malformed, unsupported } from "./errors.js";
-import { MAX_CODED, MAX_COUNT, MAX_ENTRIES, MAX_WINDOW } from "./limits.js";
+import { FREE_ENTRIES, MAX_CODED, MAX_COUNT, MAX_WINDOW, MORE_ENTRIES } from "./limits.js";
 import { Table, histogramTable, mixtureTable, normTable } from "./tables.js";
 
 const CONST = 0;
@@ -26,12 +26,11 @@ const FIRST_REUSE = 8;
 
 /** positions ascend. @typedef {{positions: number[], values: number[]}} Exceptions */
 
-/** The priors that tokens of one section may refer to, in the order of their definition; entries: of their windows. */
+/** The priors that tokens of one section may refer to, in the order of their definition. */
 export class Definitions {
   constructor() {
     /** @type {Prior[]} */
     this.priors = [];
-    this.entries = 0;
   }
 }
 
@@ -45,6 +44,9 @@ export function decodeChannels(bytes, counts, out, known = new Definitions()) {
   const reader = new ByteReader(bytes);
   const { priors } = known;
   const before = priors.length;
+  let entries = 0;
+  let most = before ? MORE_ENTRIES : FREE_ENTRIES;
+  for (let i = 0; i < counts.length; i++) most += counts[i];
   /** @type {{count: number, prior: Prior, exceptions: Exceptions | null}[]} */
   const channels = [];
   for (let i = 0; i < counts.length; i++) {
@@ -56,10 +58,8 @@ export function decodeChannels(bytes, counts, out, known = new Definitions()) {
     if (family < FIRST_REUSE) {
       prior = readPrior(reader, family);
       priors.push(prior);
-      known.entries += prior.window.n;
-      if (known.entries > MAX_ENTRIES) {
-        throw limitExceeded(`tables of ${known.entries} entries for one section, limit ${MAX_ENTRIES}`);
-      }
+      entries += prior.window.n;
+      if (entries > most) throw limitExceeded(`tables of ${entries} entries for one section, limit ${most}`);
     } else {
       prior = priors[priors.length - 1 - (family - FIRST_REUSE)];
       if (!prior) throw malformed("a channel refers to a prior before the first");

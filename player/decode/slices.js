@@ -24,13 +24,11 @@ export class Continuation {
   /** A function that forgets what a slice added from now on: a fault in it may be mended by fetching it again. */
   mark() {
     const { block } = this;
-    const sizes = new Map([...this._sections].map(([name, { priors, entries }]) => [name, { count: priors.length, entries }]));
+    const sizes = new Map([...this._sections].map(([name, { priors }]) => [name, priors.length]));
     return () => {
       this.block = block;
       for (const [name, known] of this._sections) {
-        const { count, entries } = sizes.get(name) ?? { count: 0, entries: 0 };
-        known.priors.length = count;
-        known.entries = entries;
+        known.priors.length = sizes.get(name) ?? 0;
       }
     };
   }

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import sys
 from pathlib import Path
 
@@ -51,6 +52,9 @@ def test_spz_and_4dgs_come_back_rounded(tmp_path):
     path = tmp_path / "a.spz"
     path.write_bytes(spz_bytes(splats))
     _same(read_splats(path), splats, atol=0.07)
+    still = make_splats(30, 0)  # without harmonics but the constant
+    path.write_bytes(spz_bytes(still))
+    _same(read_splats(path), still, atol=0.07)
     path = tmp_path / "a.4dgs"
     path.write_bytes(fourdgs_bytes([(0.0, splats, np.arange(30)), (0.5, _moved(splats, 1), np.arange(30))], 1.0))
     teacher = read_model(str(path), 30)
@@ -60,6 +64,17 @@ def test_spz_and_4dgs_come_back_rounded(tmp_path):
         goal = splats.means + np.float32([shift, 0, 0])
         distance = np.abs(found.means[:, None] - goal[None]).max(axis=2)
         assert len(found.means) == 30 and distance.min(axis=0).max() < 0.02
+
+
+@pytest.mark.parametrize("name, count", [("guitar.compressed.ply", 90_854), ("biker.spz", 152_746)])
+def test_splats_of_others(name, count):
+    pytest.importorskip("gaussforge")
+    path = Path(os.environ.get("PD4DGS_SHARED", Path(__file__).parents[3] / "shared" / "data")) / "splats" / name
+    if not path.is_file():
+        pytest.skip(f"{path} is not there")
+    splats = read_splats(path)
+    assert len(splats.means) == count and splats.degree == 0
+    assert (splats.scales > 0).all() and np.ptp(splats.means, axis=0).max() > 1
 
 
 def test_frames_are_in_the_order_of_their_numbers(tmp_path):
@@ -162,6 +177,15 @@ def test_a_cameras_json_beside_the_frames_is_heeded(tmp_path):
     data = load_source(f"teacher:{folder}?size=40x30", holdout=0)
     assert len(data.train) == 3 and data.up == (0.0, -1.0, 0.0) and data.train[0].width == 40
     np.testing.assert_allclose([camera_eye(v.camera) for v in data.train], [r["position"] for r in rows], atol=1e-6)
+
+
+def test_an_instant_without_gaussians_is_one_line(tmp_path):
+    pytest.importorskip("fourdgs")
+    splats, path = make_splats(5, 1), tmp_path / "late.4dgs"
+    path.write_bytes(fourdgs_bytes([(0.5, splats, np.arange(5))], 1.0))
+    assert len(read_model(str(path), 30).splats(0.9).means) == 5
+    with pytest.raises(DataError, match="late.4dgs at 0.1: none of 0 Gaussians"):
+        read_model(str(path), 30).splats(0.1)
 
 
 @pytest.mark.parametrize(

@@ -388,6 +388,23 @@ def test_the_first_picture_comes_before_the_last_layer(harness, folder, lively):
     assert [item for item in names if item[0] != "loaded"] == [("firstpicture", 0), ("upgrade", 1), ("upgrade", 2)]
 
 
+def test_the_first_picture_comes_before_layer_0_is_whole(harness, folder):
+    data = encode(lively_scene(), layers=2, effort=1, slices=12_000)
+    ends = {row["layer"]: row["end"] for row in info(data)["layers"]}
+    (folder / "slices.pd4").write_bytes(data)
+    with Server(folder, link=Link(8 * len(data) / 6)) as slow, slow.running():
+        harness.evaluate("(url) => void harness.open(url, 96, 72)", slow.url_of("slices.pd4"))
+        harness.wait_for_function("harness.events.some(([name]) => name === 'loaded')")
+        call(harness, "() => harness.player.settled()")
+    shown = [detail for name, detail in harness.evaluate("harness.events") if name in ("firstpicture", "upgrade")]
+    assert shown[0]["bytes"] < ends[0] and shown[0]["level"] == shown[1]["level"] == 0
+    assert [detail["level"] for detail in shown][-1] == 2 and len(shown) > 4
+    scene = decode(data)
+    assert scene.info.camera is not None
+    (shot,) = shots(harness, data, [scene.info.camera], [0.37], [2])
+    assert decibels(shot.player, shot.expected) > LEAST_DB
+
+
 def test_budgets_are_kept_and_may_be_raised(harness, server, lively):
     ends = [row["end"] for row in info(lively)["layers"]]
     events = call(harness, "harness.open", server.url_of("scene.pd4"), WIDTH, HEIGHT, {"bytes": ends[1] + 10})

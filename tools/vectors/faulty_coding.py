@@ -234,7 +234,14 @@ def _priors() -> Iterator[Vector]:
     yield _attributed("channel-missing", "8.1 15", MALFORMED, one, "67 channels of attributes.")
     yield _attributed("channel-too-many", "7.7 8.1", MALFORMED, more, "69 channels of attributes.")
     over = tables_at_limit(more=True)
-    yield bad("prior-tables-over-limit", "Tables of 2^21 + 1 entries in a section.", "14 8.2", LIMIT, over, chunk=1)
+    yield bad(
+        "prior-tables-over-limit",
+        "Tables of an entry more than 2^18 and one per symbol of their section.",
+        "14 8.2",
+        LIMIT,
+        over,
+        chunk=1,
+    )
     yield _steep("symbol-over-k", "8.4", gauss(K_MAX - 2 * 4095, 2, shift=12), "A scaled symbol of K + 1.")
 
 

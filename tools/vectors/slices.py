@@ -10,7 +10,15 @@ import numpy as np
 
 from pd4dgs_codec.bitstream.limits import MAX_CHUNKS
 from pd4dgs_codec.codec.layer_meta import FREE_ROWS, ROWS_PER_BYTE
-from pd4dgs_codec.entropy.priors import CLASS_STEPS, FIRST_REUSE, MAX_ENTRIES, MAX_WINDOW, Hist, Window
+from pd4dgs_codec.entropy.priors import (
+    CLASS_STEPS,
+    FIRST_REUSE,
+    FREE_ENTRIES,
+    MAX_WINDOW,
+    MORE_ENTRIES,
+    Hist,
+    Window,
+)
 
 from .blocks import (
     ATTRIBUTE,
@@ -157,7 +165,8 @@ def _good() -> Iterator[Case]:
     yield "uncommon/slices-around-ancillary", "An ancillary chunk between slices.", "3.4 3.6", between
     many = make_file(make_layer(), *[later(0, ()) for _ in range(MAX_CHUNKS - 2)], later(0, line(2)))
     yield "uncommon/slices-1024", "A layer of 1024 slices.", "3.6 5.2 14", many
-    yield "uncommon/slices-entries-at-limit", "Tables of 2^21 entries in two slices.", "8.1 14", _wide(0)
+    what = "Tables of 2^18 entries in a slice, of 2^10 and one per symbol in the next."
+    yield "uncommon/slices-entries-at-limit", what, "8.1 14", _wide(0)
 
 
 BLOCK: tuple[Terms, Splits, Sequence[int]] = (
@@ -173,7 +182,7 @@ def _continued() -> File:
     slices = Slices()
     k = pattern(68, 24, low=-9, high=9)
     k[[5, 11, 25]] = 0
-    loud, quiet = pattern(68, 9, low=-400, high=400, seed=5), pattern(68, 5, low=0, high=1, seed=6)
+    loud, quiet = pattern(68, 9, low=-40, high=40, seed=5), pattern(68, 5, low=0, high=1, seed=6)
     other: tuple[Terms, Splits, Sequence[int]] = ({1: [(0, -1024)]}, {2: (3, 0, 0)}, (3, 1, 2, 1, 2))
     return make_file(
         slices.add(make_layer(0, line(24), attributes=k), BLOCK),
@@ -187,12 +196,11 @@ def _continued() -> File:
 
 
 def _wide(over: int) -> File:
-    """Windows of 2^14 entries, as many as one list of priors may have, or `over` more."""
-    most, layers = MAX_ENTRIES // MAX_WINDOW + over, list[Layer]()
-    known: Known = []
-    for number, count in enumerate((68, most - 68)):
+    """Windows of 2^18 entries in a first slice; in a second one of as many as it may define, or `over` more."""
+    layers, known = list[Layer](), list[Any]()
+    for number, (count, n) in enumerate(((FREE_ENTRIES // MAX_WINDOW, MAX_WINDOW), (1, MORE_ENTRIES + 68 + over))):
         k = np.full((68, 1), number, np.int32)
-        priors = {c: gauss(min(c, count - 1) - 100 - 100 * number, MAX_WINDOW) for c in range(68)}
+        priors = {c: gauss(min(c, count - 1) - 20, n) for c in range(68)}
         layer = make_layer(0, line(1)) if number == 0 else later(0, line(1, z=4))
         layer = replace(layer, meant=replace(layer.meant, attributes=k))
         layers.append(layer.with_sections({ATTRIBUTE: plain_attributes(k, priors, known)}))
@@ -318,7 +326,7 @@ def _payloads() -> Iterator[Vector]:
 
 
 def _limits() -> Iterator[Vector]:
-    what = "Tables of 2^21 + 2^14 entries in two slices."
+    what = "Tables of an entry more than 2^10 and one per symbol in a second slice."
     yield bad("slices-entries-over-limit", what, "8.1 14", LIMIT, _wide(1), chunk=1)
     first = make_layer()
     least = FREE_ROWS + ROWS_PER_BYTE * len(first.payload())

@@ -1,6 +1,6 @@
 """Measures what docs/player.md shows: the player's pictures, seconds to them, frame rates, decode times and sizes.
 
-    python tools/player.py [--out out] [--docs docs] [--runs 9] [--only shelf-hand] [--render]
+    python tools/player_page.py [--out out] [--docs docs] [--runs 9] [--only shelf-hand] [--render]
 
 Reads out/NAME/scene.pd4, which tools/results.py makes. Needs Chromium and Playwright, and Node. About ten minutes a
 scene on two quiet cores; on busy ones the times are worthless.
@@ -19,7 +19,7 @@ from statistics import median
 from typing import Any
 
 from pages.browser import HARNESS, PATIENCE_MS, call, cameras, copy_player, decibels, launched, resized, shoot, shots
-from pages.page import Page, Row, keep, make, options, say
+from pages.page import Page, Row, keep, make, options, paragraph, say, unpadded
 from pages.scenes import SCENES
 from player_speed import NodeDecoder, compare, grown
 from player_speed import row as speed_row
@@ -45,6 +45,8 @@ SIDE, VIEWS = 320, 6
 WINDOW = {"width": 480, "height": 360}
 BENCH_SIZES = "320x240,640x480"
 MANY = 100_000
+#: Bytes of a slice, and the name of the first one's row.
+SLICES, FIRST = 50_000, "0, first slice"
 #: What the page writes down of each picture, against the start of the navigation.
 NOTE = """window.noted = [];
   for (const name of ["firstpicture", "upgrade"]) {
@@ -135,8 +137,12 @@ def against_truth(
 
 
 def seconds(browser: Any, data: bytes, runs: int) -> list[Row]:
-    """A row per rate and level: bytes, 8S/B, and medians of the seconds since the navigation began."""
-    ends = {row["layer"]: row["end"] for row in info(data)["layers"]}
+    """A row per rate and level, and of a first slice: bytes, and medians of the seconds since the navigation began."""
+    layers = info(data)["layers"]
+    ends = {str(row["layer"]): row["end"] for row in layers}
+    if len(layers[0]["slices"]) > 1:
+        ends = {FIRST: layers[0]["slices"][0]["end"], **ends}
+    last = layers[-1]["layer"]
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as folder:
         lay_out(Path(folder), data)
@@ -147,15 +153,21 @@ def seconds(browser: Any, data: bytes, runs: int) -> list[Row]:
                     page = opened(browser)
                     page.add_init_script(NOTE)
                     page.goto(f"{url}?autoplay=0")
-                    page.wait_for_function(f"noted.some(({{ level }}) => level === {max(ends)})")
+                    page.wait_for_function(f"noted.some(({{ level }}) => level === {last})")
                     found.append(page.evaluate("noted"))
                     page.context.close()
             for level, end in ends.items():
                 # a level is skipped where the next one is there before it is evaluated
-                noted = [next(note for note in run if note["level"] >= level) for run in found]
+                noted = [run[0] if level == FIRST else _shown(run, int(level)) for run in found]
                 row: Row = {"rate": rate, "level": level, "bytes": end}
                 rows.append(row | {key: median(n[key] for n in noted) for key in ("arrived", "decoded", "shown")})
     return rows
+
+
+def _shown(run: Sequence[Row], level: int) -> Row:
+    """When a level and all its slices were shown."""
+    whole = [note for note in run if note["level"] == level]
+    return whole[-1] if whole else next(note for note in run if note["level"] > level)
 
 
 def frame_rates(browser: Any, data: bytes) -> list[Row]:
@@ -214,6 +226,10 @@ def measure(name: str, out: Path, docs: Path, runs: int) -> Row:
         row["browser"] = f"Chromium {browser.version.split('.')[0]}"
         say(f"{name}: seconds to pictures")
         row["seconds"] = seconds(browser, data, runs)
+        say(f"{name}: seconds to pictures, in slices of {SLICES:,} bytes")
+        sliced = encode(scene, effort=1, omit="nothing", slices=SLICES)
+        row["sliced"] = {"slices": sum(len(r["slices"]) for r in info(sliced)["layers"])}
+        row["sliced"]["seconds"] = seconds(browser, sliced, runs)
         say(f"{name}: frame rates")
         row["rates"] = frame_rates(browser, data)
         say(f"{name}: pictures")
@@ -230,9 +246,14 @@ def measure(name: str, out: Path, docs: Path, runs: int) -> Row:
 def render(rows: Sequence[Row]) -> str:
     """Sizes, pictures, seconds, frame rates and decode times of every scene."""
     visit = rows[-1]["page"]
-    heads = [f"{rows[-1]['browser']}, {rows[-1]['renderer']}; two cores. Page and player: {visit:,} bytes gzipped."]
-    parts = [*heads, _pictures(rows), _seconds(rows, visit), _rates(rows), _decoding(rows)]
-    return "\n\n".join(parts)
+    first = f"{rows[-1]['browser']}, {rows[-1]['renderer']}; two cores. Page and player: {visit:,} bytes gzipped."
+    heads = ["\n".join(paragraph(first))]
+    return "\n\n".join([*heads, _pictures(rows), _seconds(rows, visit), _rates(rows), _decoding(rows)])
+
+
+def _block(said: str, head: Sequence[str], cells: Sequence[Sequence[str]]) -> str:
+    """A paragraph and its table."""
+    return "\n".join([*paragraph(said), "", unpadded(markdown(head, cells))])
 
 
 def _pictures(rows: Sequence[Row]) -> str:
@@ -246,17 +267,23 @@ def _pictures(rows: Sequence[Row]) -> str:
         "whose own 8 bits alone leave 59. Truth: mean mPSNR of the player's pictures against views that training did "
         f"not see, up to {VIEWS} of them."
     )
-    return f"{said}\n\n{markdown(('scene', 'level', 'least', 'truth'), cells)}"
+    return _block(said, ("scene", "level", "least", "truth"), cells)
 
 
 def _seconds(rows: Sequence[Row], visit: int) -> str:
     cells = []
-    for row in rows:
-        for r in row["seconds"]:
+    named = [(row["name"], row["seconds"]) for row in rows]
+    named += [
+        (f"{row['name']}, {row['sliced']['slices']} slices", row["sliced"]["seconds"])
+        for row in rows
+        if "sliced" in row
+    ]
+    for name, found in named:
+        for r in found:
             ideal = 8 * (r["bytes"] + visit) / r["rate"]
             cells.append(
                 (
-                    row["name"],
+                    name,
                     f"{r['rate'] / 1e6:g}",
                     str(r["level"]),
                     f"{r['bytes']:,}",
@@ -270,11 +297,12 @@ def _seconds(rows: Sequence[Row], visit: int) -> str:
             )
     said = (
         f"**Seconds from navigation to each picture**, cold cache, median of {rows[-1]['runs']}, round trip "
-        f"{LATENCY * 1e3:g} ms. S: bytes up to the end of the layer. P: page and player, {visit:,} bytes. Arrived: the "
-        "last of these bytes. Then decoding, and what it takes to evaluate, sort and draw, in software."
+        f"{LATENCY * 1e3:g} ms. S: bytes up to the end of the layer or slice. P: page and player, {visit:,} bytes. "
+        "Arrived: the last of these bytes. Then decoding, and what it takes to evaluate, sort and draw, in software. "
+        "Files in slices are of the same scene, encoded with less effort."
     )
     head = ("scene", "Mbps", "level", "S", "8S/B", "8(S+P)/B", "arrived", "decode", "evaluate, draw", "picture")
-    return f"{said}\n\n{markdown(head, cells)}"
+    return _block(said, head, cells)
 
 
 def _rates(rows: Sequence[Row]) -> str:
@@ -294,7 +322,7 @@ def _rates(rows: Sequence[Row]) -> str:
         "**Pictures per second** as `?bench` measures them, without the steps that make a slow machine faster. Moving: "
         "the camera turns. Playing: time moves."
     )
-    return f"{said}\n\n{markdown(('scene', 'level', 'size', 'Gaussians', 'moving', 'playing'), cells)}"
+    return _block(said, ("scene", "level", "size", "Gaussians", "moving", "playing"), cells)
 
 
 def _decoding(rows: Sequence[Row]) -> str:
@@ -314,10 +342,10 @@ def _decoding(rows: Sequence[Row]) -> str:
         f"**Decoding**, seconds of processor time, median of {rows[-1]['runs']} in turn, warm. The large file "
         "is made of copies of the scene's anchors."
     )
-    return f"{said}\n\n{markdown(('file', 'anchors', 'bytes', 'Node', 'Python', 'Node/Python'), cells)}"
+    return _block(said, ("file", "anchors", "bytes", "Node", "Python", "Node/Python"), cells)
 
 
-PAGE = Page("player", "player.py", render)
+PAGE = Page("player", "player_page.py", render)
 
 
 def main(argv: list[str] | None = None) -> int:
