@@ -47,7 +47,7 @@ def measure(path: Path, dataset: Dataset, size: int, strip: Path) -> Row:
     say("  one slice per layer")
     one = pack(scene, views=views)
     say("  slices")
-    packed = pack(scene, EncodeOptions(slices=size), views=Views(views.source, views.fitting))
+    packed = pack(one.scene, EncodeOptions(slices=size), views=Views(views.source, views.fitting))
     rng = np.random.default_rng(0)
     shuffled = encode(one.scene, slices=size, utility=lambda decoded: rng.random(len(decoded.anchor_q)))
     files = {"layers": one.data, "slices": packed.data, "random": shuffled}
