@@ -245,7 +245,7 @@ def read_preamble(data):
 # float32 (9.2); others UnsupportedFeature"
 # 5.5 Digest: "The first 16 bytes of the SHA-256 of the payloads of all critical chunks that were encoded together"
 def read_header(data):
-    header = fields(unpack(data), range(1, 16), (*range(1, 12), 13, 14, 15), "header")
+    header = fields(unpack(data), range(1, 17), (*range(1, 12), 13, 14, 15), "header")
     steps, box, (start, end), background, (near, far), _ = (
         reals(header[key], f"header key {key}", count)
         for key, count in ((4, 3), (6, 6), (7, 2), (8, 3), (9, 2), (10, 3))
@@ -264,6 +264,8 @@ def read_header(data):
     need(type(header[14]) is bytes and len(header[14]) == 16, "the digest of the layers is not 16 bytes")
     for value, most in zip(a_list(header[15], "the widths", 2), (64, 16)):
         limited(value, most, "a width", 1)
+    for centre in a_list(header[16], "the centres", channel_count(header)) if 16 in header else ():
+        limited(centre, MAX_SYMBOL, "a centre", -MAX_SYMBOL)
     read_chunk_list(header[1])
     for key in (2, 3):
         registered(header[key], (0, 1), f"header key {key}")
@@ -276,6 +278,10 @@ def read_header(data):
 def attribute_channels(header):
     feature, slots = header[15]
     return {"feature": feature, "scaling_log": 6, "offset": 3 * slots}
+
+
+def channel_count(header):
+    return sum(attribute_channels(header).values())
 
 
 # 6.3 Planes and networks: the outputs by id, None for any
@@ -469,7 +475,7 @@ def check_sizes(layer, payload_bytes, before):
     """before: N, S and L of the layers before it. Sets those with it."""
     samples = sum(c * h * w for _, _, (c, h, w) in plane_shapes(layer))
     need(samples <= 1 << 28, f"{samples} plane samples", "LimitExceeded")
-    row = sum(attribute_channels(layer.header).values()) + 4
+    row = channel_count(layer.header) + 4 + (16 in layer.header)
     symbols = layer.rows_before + row * layer.rows + samples + sum(size for _, size in weight_shapes(layer))
     layer.declared = [a + b for a, b in zip(before, (layer.rows, symbols, payload_bytes))]
     rows, symbols, size = layer.declared
@@ -486,7 +492,7 @@ def read_sections(layer, parts):
 
     planes, weights = plane_shapes(layer), weight_shapes(layer)
     counts = {MASKS: [layer.rows_before, layer.rows], ATTRIBUTE_SECTION: []}
-    counts[ATTRIBUTE_SECTION] = [layer.rows] * sum(attribute_channels(layer.header).values())
+    counts[ATTRIBUTE_SECTION] = [layer.rows] * (channel_count(layer.header) + (16 in layer.header))
     counts[PLANE_SECTION] = [] if layer.raw else [h * w for _, _, (c, h, w) in planes for _ in range(c)]
     counts[WEIGHTS] = [] if layer.raw else [size for _, size in weights]
     positions = decode_positions(part(POSITIONS, layer.rows), layer.rows)
@@ -496,11 +502,12 @@ def read_sections(layer, parts):
         decoded = decode_lzma_symbols(part(SYMBOLS, sum(flat)), flat)
         for section in counts:
             channels[section], decoded = decoded[: len(counts[section])], decoded[len(counts[section]) :]
+        step_classes(channels[ATTRIBUTE_SECTION][0] if 16 in layer.header else [])
     else:
         for section, sizes in counts.items():
             data = part(section, sum(sizes))
             if section == ATTRIBUTE_SECTION and sum(sizes):
-                channels[section] = decode_attributes(data, *layer.header[15], layer.rows)
+                channels[section] = decode_attributes(data, *layer.header[15], layer.rows, 16 in layer.header)
             elif section == PLANE_SECTION and sizes:
                 channels[section] = decode_planes(data, [shape for _, _, shape in planes])
             else:
@@ -523,6 +530,8 @@ def keep_symbols(layer, positions, channels, planes, weights):
     need(all(v >= 3 for v in own), "a mask code under 3")
     layer.symbols = {"anchor": [v for cell in positions for v in cell], "mask_rise": rise, "mask_own": own}
     first = 0
+    if 16 in layer.header:
+        layer.symbols["step_class"], first = channels[ATTRIBUTE_SECTION][0], 1
     for name, width in attribute_channels(layer.header).items():  # [width, n], channel by channel
         layer.symbols[name] = [k for channel in channels[ATTRIBUTE_SECTION][first : first + width] for k in channel]
         first += width
@@ -531,7 +540,7 @@ def keep_symbols(layer, positions, channels, planes, weights):
         for name, predictor, (c, h, w) in planes:
             layer.symbols[name] = [k for _ in range(c) for k in restore(next(residuals), predictor, h, w)]
         layer.symbols |= {name: channel for (name, _), channel in zip(weights, channels[WEIGHTS])}
-    valued = [name for name in layer.symbols if name not in ("anchor", "mask_rise", "mask_own")]
+    valued = [name for name in layer.symbols if name not in ("anchor", "mask_rise", "mask_own", "step_class")]
     need(all(abs(k) <= MAX_SYMBOL for name in valued for k in layer.symbols[name]), "a symbol over 2^23")
 
 
@@ -765,23 +774,42 @@ def take_channel(stream, count, prior, exceptions):
 # 8.7 Stages of the attributes: "The activity of a row is the relative magnitude (8.9) of the residuals named, the
 # places being the n rows."
 # 8.7 Stages of the attributes: "The bounds are b_s = (P·a_s) // 38, a_1 .. a_5 being 6, 12, 20, 29 and 38"
-def decode_attributes(data, feature, slots, n):
+def decode_attributes(data, feature, slots, n, graded):
     reader, p = Reader(data), feature + 6
-    if read_form(reader) == 0:
-        return decode_channels(reader.take(reader.left), [n] * (p + 3 * slots))
+    form = read_form(reader)
+    grades = [decode_grades(reader, n)] if graded else []
+    if form == 0:
+        one = grades[0] if graded else [0] * n
+        return grades + decode_classes(reader.take(reader.left), [one] * (p + 3 * slots), 7 if graded else 1)
     terms = [read_terms(reader, p, c) for c in range(1, p)]
-    class_counts = [read_class_count(reader) for _ in range(5)]
+    class_counts = [read_class_count(reader) for _ in range(5 + graded)]
     splits = [read_split(reader) for _ in range(slots)]
     *stages, stage_y, stage_z = take_stages(reader, 8)
     k = []  # r_0 .. r_(P − 1), then x_0 .. x_(G − 1)
     ends = [p * a // 38 for a in (6, 12, 20, 29, 38)] + [p + slots]
-    for stage, end, class_count in zip(stages, ends, [1, *class_counts]):
-        classes = classes_by_activity(relative_magnitude(k, n), class_count)
+    for stage, end, class_count in zip(stages, ends, class_counts if graded else [1, *class_counts]):
+        activity = relative_magnitude(k, n)
+        if graded:
+            activity = [a + 4 * own for a, own in zip(activity, relative_magnitude([[64 >> c for c in grades[0]]], n))]
+        classes = classes_by_activity(activity, class_count)
         k += decode_classes(stage, [classes] * (end - len(k)), class_count)
     residuals, x = k[:p], k[p:]
     y = decode_classes(stage_y, [y_classes(split, *own) for split, *own in zip(splits, x)], 5)
     z = decode_classes(stage_z, [z_classes(split, *own) for split, *own in zip(splits, x, y)], 7)
-    return add_predictions(residuals, terms) + [channel for offset in zip(x, y, z) for channel in offset]
+    return grades + add_predictions(residuals, terms) + [channel for offset in zip(x, y, z) for channel in offset]
+
+
+# 8.5 The attributes section: "the step classes of the rows: a varint, the length in bytes of what follows, then a
+# section of coded channels with one channel of n symbols"
+def decode_grades(reader, n):
+    (grades,) = decode_channels(reader.take(reader.varint(reader.left)), [n])
+    return step_classes(grades)
+
+
+# 8.5 The attributes section: "each MUST lie in 0..6, else Malformed"
+def step_classes(symbols):
+    need(all(0 <= c <= 6 for c in symbols), "a step class over 6")
+    return symbols
 
 
 # 8.5 The attributes section: "Other forms are UnsupportedFeature."
@@ -1217,15 +1245,21 @@ def dequantise(symbols, step):
     return list(struct.unpack(form, struct.pack(form, *products)))
 
 
-# 11.5 Dequantisation: "An anchor's position is dequantised from its voxel index with the voxel size as Q." "Values of
+# 11.5 Dequantisation: "In place of its symbol k, an attribute has m + k·2^c" "It MUST lie in −2^23..2^23, else
+# Malformed." "An anchor's position is dequantised from its voxel index with the voxel size as Q." "Values of
 # section 6 are taken as they are."
 def dequantise_layer(layer):
     attributes = attribute_channels(layer.header)
     steps = dict(zip(attributes, layer.header[4])) | {"anchor": layer.header[5]}
+    classes = layer.symbols.get("step_class", [0] * layer.rows)
+    centres = iter(layer.header.get(16, [0] * channel_count(layer.header)))
     for name, symbols in layer.symbols.items():
         if name in attributes:  # [width, n] -> [n, width]
-            symbols = [k for row in range(layer.rows) for k in symbols[row :: layer.rows]]
-        if not name.startswith("mask"):
+            own = [next(centres) for _ in range(attributes[name])]
+            rows = [symbols[row :: layer.rows] for row in range(layer.rows)]
+            symbols = [m + (k << c) for row, c in zip(rows, classes) for m, k in zip(own, row)]
+            need(all(abs(k) <= MAX_SYMBOL for k in symbols), "an attribute over 2^23 steps")
+        if name != "step_class" and not name.startswith("mask"):
             step = steps.get(name) or layer.steps[0 if name.startswith("planes") else -1]
             layer.tensors[name] = dequantise(symbols, step)
     layer.tensors |= layer.raw_values

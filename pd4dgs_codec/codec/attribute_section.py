@@ -1,8 +1,13 @@
 """The attributes section of mode ans: the channels as they are, or with what one tells of another taken out.
 
-Byte 0 is the form. Form 0: the rest is one channels payload of all channels. Form 1: a block of varints, then eight
+Byte 0 is the form. Where anchors are graded, a varint follows, the length of one channels payload, and that: the step
+class of each row. Form 0: the rest is one channels payload of all channels. Form 1: a block of varints, then eight
 channels payloads, the *stages*, each decoded before the next. All arithmetic is on integers. With D feature numbers and
 G Gaussians, the first P = D + 6 channels are features and log-scalings, the others G offsets x, y, z.
+
+*Step classes*. In form 0 each channel is split into the step classes 0..6 of its rows. In form 1 an anchor's activity
+(below) begins with GRADE_WEIGHT times the relative magnitude of a channel that holds 2^(6 - class), and stage 0 is
+split by it as well.
 
 *Linear prediction*, channels 1 .. P - 1: for channel c a varint m <= c, then m terms in ascending
 order of the channel j they refer to: a varint j - (previous j) - 1, starting from previous j = -1, and a zigzag weight
@@ -29,6 +34,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pd4dgs_codec.attributes.table import NO_CLASSES
 from pd4dgs_codec.codec.stages import (
     PLAIN,
     PRIOR_BITS,
@@ -43,11 +49,11 @@ from pd4dgs_codec.codec.stages import (
     smaller_form,
 )
 from pd4dgs_codec.entropy.bits import entropy_bits
-from pd4dgs_codec.entropy.channels import decode_channels
+from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
 from pd4dgs_codec.entropy.priors import K_MAX
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
 from pd4dgs_codec.errors import Malformed, UnsupportedFeature
-from pd4dgs_codec.scene import Widths
+from pd4dgs_codec.scene import MAX_CLASS, Widths
 
 WEIGHT_SHIFT = 10
 MAX_WEIGHT = 1 << 15
@@ -55,6 +61,8 @@ MAX_WEIGHT = 1 << 15
 STAGES = (0, 6, 12, 20, 29, 38)
 Y_CLASSES, Z_CLASSES = 5, 7
 SPLIT_Y, SPLIT_Z = 1, 2
+#: How much an anchor's step class counts for its activity, beside the channels' residuals, which count 1 each.
+GRADE_WEIGHT = 4
 
 #: Encoder: a term must explain this share of its channel's spread; a term costs about so many bits.
 MIN_SHARE = 0.03
@@ -112,22 +120,40 @@ def stage_channels(widths: Widths, stage: int) -> range:
 # -- writing -----------------------------------------------------------------------------------------------------------
 
 
-def write_attributes(attributes: np.ndarray, widths: Widths, priors: str, effort: int) -> tuple[bytes, float]:
-    """(section bytes, sum of R(a) over all channels) of attributes int32 [channels, n], in the smaller form."""
+def write_attributes(
+    attributes: np.ndarray, classes: np.ndarray, widths: Widths, priors: str, effort: int
+) -> tuple[bytes, float]:
+    """(section bytes, sum of R(a) over all channels, by step class, and the classes' entropy) of attributes int32
+    [channels, n] and classes int32 [n], or NO_CLASSES, in the smaller form."""
     one_row = attributes.shape[1] < 2  # has no spread to predict
-    staged = None if one_row else lambda: _write_staged(attributes.astype(np.int64), widths, effort)
-    return smaller_form(list(attributes), staged, priors, effort)
+    staged = None if one_row else lambda: _write_staged(attributes.astype(np.int64), classes, widths, effort)
+    channels = by_class(attributes, classes)
+    data, rate_bits = smaller_form(channels, staged, priors, effort)
+    if not widths.graded:
+        return data, rate_bits
+    out = bytearray(data[:1])
+    graded = encode_channels([classes], effort=effort).payload
+    put_varint(out, len(graded))
+    return bytes(out + graded + data[1:]), rate_bits + entropy_bits(classes)
 
 
-def _write_staged(symbols: np.ndarray, widths: Widths, effort: int) -> bytes:
+def by_class(attributes: np.ndarray, classes: np.ndarray) -> list[np.ndarray]:
+    """The channels of form 0: each channel int [n] as its rows of class 0, 1 .. MAX_CLASS; as it is without classes."""
+    if not classes.size:
+        return list(attributes)
+    parts = places_of(classes, MAX_CLASS + 1)
+    return [channel[rows] for channel in attributes for rows in parts]
+
+
+def _write_staged(symbols: np.ndarray, classes: np.ndarray, widths: Widths, effort: int) -> bytes:
     terms = [_fit_terms(symbols, c) for c in range(1, widths.predicted)]
     splits = [_fit_split(*symbols[x : x + 3]) for x in stage_channels(widths, len(STAGES) - 1)]
     coded = symbols.copy()
     for c, term in enumerate(terms, start=1):
         coded[c] = symbols[c] - term.prediction(symbols)
     counts = [
-        cheapest_class_count([(coded[list(stage_channels(widths, stage))], _activity(coded, widths, stage))])
-        for stage in range(1, len(STAGES))
+        cheapest_class_count([(coded[list(stage_channels(widths, stage))], _activity(coded, classes, widths, stage))])
+        for stage in _split_stages(widths)
     ]
 
     out = bytearray([STAGED])
@@ -144,19 +170,23 @@ def _write_staged(symbols: np.ndarray, widths: Widths, effort: int) -> bytes:
             put_zigzag(out, split.centre_x)
         if split.flags & SPLIT_Z:
             put_zigzag(out, split.centre_y)
-    stages = [[channel[rows] for channel, rows in places] for places in _places(coded, widths, counts, splits)]
+    stages = [[channel[rows] for channel, rows in places] for places in _places(coded, classes, widths, counts, splits)]
     put_stages(out, stages, effort)
     return bytes(out)
 
 
 def _places(
-    coded: np.ndarray, widths: Widths, counts: Sequence[int], splits: Sequence[Split]
+    coded: np.ndarray, classes: np.ndarray, widths: Widths, counts: Sequence[int], splits: Sequence[Split]
 ) -> Iterator[list[tuple[np.ndarray, np.ndarray]]]:
     """Per stage, the (channel, rows) that it codes, in order. `coded` int64 [channels, n] is read only as far as the
     stages before reach."""
     every = np.arange(coded.shape[1])
-    for stage, count in enumerate((1, *counts)):
-        parts = places_of(activity_classes(_activity(coded, widths, stage), count), count) if count > 1 else [every]
+    for stage, count in enumerate(counts if widths.graded else (1, *counts)):
+        parts = (
+            places_of(activity_classes(_activity(coded, classes, widths, stage), count), count)
+            if count > 1
+            else [every]
+        )
         yield [(coded[c], part) for c in stage_channels(widths, stage) for part in parts]
     for axis, flag, count in ((1, SPLIT_Y, Y_CLASSES), (2, SPLIT_Z, Z_CLASSES)):
         places = []
@@ -169,8 +199,18 @@ def _places(
         yield places
 
 
-def _activity(coded: np.ndarray, widths: Widths, stage: int) -> np.ndarray:
-    return relative_magnitude(coded[: stage_bounds(widths)[stage]])
+def _split_stages(widths: Widths) -> range:
+    """The stages whose channels are split by activity."""
+    return range(0 if widths.graded else 1, len(STAGES))
+
+
+def _activity(coded: np.ndarray, classes: np.ndarray, widths: Widths, stage: int) -> np.ndarray:
+    """int64 [n] of the rows, by what comes before the stage."""
+    known = coded[: stage_bounds(widths)[stage]]
+    activity = relative_magnitude(known) if len(known) else np.zeros(coded.shape[1], np.int64)
+    if widths.graded:
+        activity += GRADE_WEIGHT * relative_magnitude((1 << MAX_CLASS >> classes.astype(np.int64))[None])
+    return activity
 
 
 def _fit_terms(symbols: np.ndarray, c: int) -> Terms:
@@ -218,25 +258,50 @@ def _mode(symbols: np.ndarray) -> int:
 # -- reading -----------------------------------------------------------------------------------------------------------
 
 
-def read_attributes(data: bytes, widths: Widths, rows: int) -> np.ndarray:
-    """attributes int32 [channels, rows]; the inverse of write_attributes. rows was checked against the limits
-    before."""
+def read_attributes(data: bytes, widths: Widths, rows: int) -> tuple[np.ndarray, np.ndarray]:
+    """(classes int32 [rows] or NO_CLASSES, attributes int32 [channels, rows]); the inverse of write_attributes.
+    rows was checked against the limits before."""
     reader = ByteReader(data)
     form = reader.byte("the form of the attributes")
-    if form == PLAIN:
-        return np.stack(decode_channels(reader.rest(), [rows] * widths.channels))
-    if form != STAGED:
+    if form not in (PLAIN, STAGED):
         raise UnsupportedFeature(f"form {form} of the attributes, expected {PLAIN} or {STAGED}")
+    classes = _read_classes(reader, rows) if widths.graded else NO_CLASSES
+    if form == PLAIN:
+        return classes, _read_plain(reader.rest(), classes, widths, rows)
     terms = [_read_terms(reader, widths, c) for c in range(1, widths.predicted)]
-    counts = [read_class_count(reader, stage) for stage in range(1, len(STAGES))]
+    counts = [read_class_count(reader, stage) for stage in _split_stages(widths)]
     splits = [_read_split(reader) for _ in range(widths.slots)]
     symbols = np.zeros((widths.channels, rows), np.int64)
-    read_stages(reader, len(STAGES) + 2, _places(symbols, widths, counts, splits))
+    read_stages(reader, len(STAGES) + 2, _places(symbols, classes, widths, counts, splits))
     for c, term in enumerate(terms, start=1):
         symbols[c] += term.prediction(symbols)
     if symbols.size and max(int(symbols.max()), -int(symbols.min())) > K_MAX:
         raise Malformed(f"a predicted attribute over {K_MAX} in magnitude")
-    return symbols.astype(np.int32)
+    return classes, symbols.astype(np.int32)
+
+
+def _read_classes(reader: ByteReader, rows: int) -> np.ndarray:
+    length = reader.varint(reader.remaining, "the length of the step classes")
+    (classes,) = decode_channels(reader.take(length), [rows])
+    check_classes(classes)
+    return classes
+
+
+def check_classes(classes: np.ndarray) -> None:
+    """Raise Malformed unless int32 [n] are step classes."""
+    if classes.size and not (0 <= classes.min() and classes.max() <= MAX_CLASS):
+        raise Malformed(f"step classes in {int(classes.min())}..{int(classes.max())}, expected 0..{MAX_CLASS}")
+
+
+def _read_plain(data: memoryview, classes: np.ndarray, widths: Widths, rows: int) -> np.ndarray:
+    if not widths.graded:
+        return np.stack(decode_channels(data, [rows] * widths.channels))
+    parts = places_of(classes, MAX_CLASS + 1)
+    symbols = np.zeros((widths.channels, rows), np.int32)
+    decoded = decode_channels(data, [len(part) for part in parts] * widths.channels)
+    for i, values in enumerate(decoded):
+        symbols[i // len(parts), parts[i % len(parts)]] = values
+    return symbols
 
 
 def _read_terms(reader: ByteReader, widths: Widths, c: int) -> Terms:

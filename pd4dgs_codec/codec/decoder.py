@@ -31,7 +31,7 @@ class LayerReader:
     def scene(self) -> Scene:
         """The scene of the layers read so far, at least one."""
         assert self.header is not None
-        return assemble(self.header.info, self.header.attribute_steps, self.layers)
+        return assemble(self.header.info, self.header.grid, self.layers)
 
     def next_layer(self, data: bytes | bytearray, max_layer: int | None = None) -> LayerSymbols | None:
         """Read on to the end of one more layer <= max_layer; None if the file has no more (clause "decoding process").
@@ -80,7 +80,7 @@ class LayerReader:
                     self.header.mode,
                     self.header.raw_deformation,
                 )
-                check_last_layer([*self.layers, layer], self.header.info.voxel_size, self.header.attribute_steps)
+                check_last_layer([*self.layers, layer], self.header.info.voxel_size, self.header.grid)
                 _check_bounded(layer, self.header)
             except DecodeError as error:
                 raise _located(error, self._index, self.offset) from None

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pd4dgs_codec.attributes.table import Grid
 from pd4dgs_codec.bitstream.container import CHUNK_OVERHEAD, FLAG_ANCILLARY, write_chunk, write_preamble
 from pd4dgs_codec.codec.bounds import ErrorBound, rounding_bounds, verify_errors
 from pd4dgs_codec.codec.check import check_scene
@@ -94,7 +95,7 @@ def encode_with_report(
     symbols = [layer_symbols(planned, i, options.raw_deformation) for i in range(len(planned.layers))]
     written = [write_layer(layer, options) for layer in symbols]
     _check_limits(planned, symbols, [payload for payload, _ in written])
-    meant = assemble(planned.info, planned.steps.attributes, symbols)
+    meant = assemble(planned.info, Grid.of(planned), symbols)
     about = write_metadata(metadata) if metadata is not None else b""
     data = _container(meant, options, [payload for payload, _ in written], about)
     errors = _verify(data, planned, symbols, meant) if options.verify else []
@@ -113,7 +114,7 @@ def _check_limits(scene: Scene, symbols: list[LayerSymbols], payloads: list[byte
     for index, (layer, payload) in enumerate(zip(symbols, payloads, strict=True)):
         try:
             *_, declared = read_meta(payload, layer.kind, layer.widths, declared, layer.raw_deformation)
-            check_last_layer(symbols[: index + 1], scene.info.voxel_size, scene.steps.attributes)
+            check_last_layer(symbols[: index + 1], scene.info.voxel_size, Grid.of(scene))
         except DecodeError as error:
             raise EncodeError(f"the scene is over a limit of the format: {error}") from None
 
@@ -130,6 +131,7 @@ def _container(meant: Scene, options: EncodeOptions, payloads: list[bytes], meta
         deformation=options.deformation,
         attribute_steps=meant.steps.attributes,
         widths=meant.widths,
+        centre=Grid.of(meant).centre if meant.widths.graded else None,
         info=meant.info,
         error_bounds=rounding_bounds(meant, options.raw_deformation),
         digest=payload_digest(payloads),
@@ -145,7 +147,7 @@ def _verify(data: bytes, planned: Scene, symbols: list[LayerSymbols], meant: Sce
     and these with the ones given, those of `planned`."""
     try:
         header, decoded, _ = decode_layers(data)
-        scene = assemble(header.info, header.attribute_steps, decoded)
+        scene = assemble(header.info, header.grid, decoded)
     except DecodeError as error:
         raise EncodeError(f"verification: the file does not decode: {error}") from error
     if scene.layers != planned.layers or scene.rows != planned.rows:

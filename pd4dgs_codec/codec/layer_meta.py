@@ -147,7 +147,7 @@ def declared_symbols(meta: LayerMeta, kind: LayerKind, rows_before: int) -> int:
     """Symbols (or float32 values) that the parameters say the layer has, voxel indices and masks included."""
     cells = sum(math.prod(shape) for shape in meta.plane_shapes())
     weights = sum(math.prod(shape) for shape in meta.weight_shapes(kind))
-    return rows_before + meta.rows * (meta.widths.channels + 4) + cells + weights
+    return rows_before + meta.rows * (meta.widths.channels + meta.widths.graded + 4) + cells + weights
 
 
 def check_symbol_count(meta: LayerMeta, kind: LayerKind, before: Declared, payload_bytes: int) -> Declared:

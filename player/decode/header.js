@@ -35,7 +35,7 @@ const MAX_CAMERA_SIDE = 65535;
  */
 export function readHeader(bytes) {
   const { value, firstEntryEnd } = unpack(bytes, "header");
-  const fields = new Fields(value, "header", 1, 15);
+  const fields = new Fields(value, "header", 1, 16);
   const chunks = readChunkList(fields);
   const mode = asRegistered(fields.get(2), 2, "header: mode");
   const deformation = asRegistered(fields.get(3), 2, "header: deformation");
@@ -60,6 +60,11 @@ export function readHeader(bytes) {
   const widths = asList(fields.get(15), "header: widths", 2);
   const width = asInteger(widths[0], 1, 64, "header: feature width");
   const slots = asInteger(widths[1], 1, 16, "header: slots");
+  if (fields.has(16)) {
+    const centres = asList(fields.get(16), "header: centres", width + 6 + 3 * slots);
+    centres.forEach((m) => asInteger(m, -(2 ** 23), 2 ** 23, "header: a channel's centre"));
+    throw unsupported("header: step classes, expected none");
+  }
   if (width !== 32 || slots !== 10) throw unsupported(`header: widths ${width} and ${slots}, expected 32 and 10`);
   // An ans-only decoder (clause 16).
   if (mode === 1) throw unsupported("header: mode lzma, expected mode ans");

@@ -9,6 +9,7 @@ const FOLDER = new URL("../../spec/vectors/", import.meta.url);
 const MODE = 2;
 const DEFORMATION = 3;
 const WIDTHS = 15;
+const CENTRES = 16;
 
 /**
  * error: the kind that is due, null if the file decodes. layers: the hashes of all layers that decode.
@@ -33,7 +34,7 @@ function isUnsupported(bytes) {
   return fields instanceof Map && (fields.get(MODE) === 1 || fields.get(DEFORMATION) === 1);
 }
 
-/** Whether the widths of anchors are legal, but not the only ones that this decoder takes yet. @param {Uint8Array} bytes */
+/** Whether the header's widths and centres are legal, but not what this decoder takes yet. @param {Uint8Array} bytes */
 function hasOtherWidths(bytes) {
   let fields;
   try {
@@ -44,7 +45,11 @@ function hasOtherWidths(bytes) {
   const widths = fields instanceof Map ? fields.get(WIDTHS) : null;
   if (!Array.isArray(widths) || widths.length !== 2 || !widths.every(Number.isInteger)) return false;
   const [feature, slots] = /** @type {number[]} */ (widths);
-  return feature >= 1 && feature <= 64 && slots >= 1 && slots <= 16 && (feature !== 32 || slots !== 10);
+  if (feature < 1 || feature > 64 || slots < 1 || slots > 16) return false;
+  const centres = /** @type {Map<number, any>} */ (fields).get(CENTRES);
+  if (centres === undefined) return feature !== 32 || slots !== 10;
+  if (!Array.isArray(centres) || centres.length !== feature + 6 + 3 * slots) return false;
+  return centres.every((m) => Number.isInteger(m) && Math.abs(m) <= 2 ** 23);
 }
 
 /** @returns {Vector[]} */

@@ -170,7 +170,7 @@ def test_hashes_of_a_scene_in_stages(staged_file):
     section, rows = section_of(chunks[0][2], Section.ATTRIBUTES)
     assert section[0] == STAGED and rows >= 400
     reader = refdec.Reader(section[1:])
-    assert any([refdec.read_terms(reader, c) for c in range(1, 38)])
+    assert any([refdec.read_terms(reader, 38, c) for c in range(1, 38)])
     assert max([refdec.read_class_count(reader) for _ in range(5)]) > 1
     assert (1, 1) in [refdec.read_split(reader)[:2] for _ in range(10)]
     section, _ = section_of(chunks[1][2], Section.PLANES)
@@ -275,8 +275,8 @@ def staged(stages, lengths=None):
 
 def both(section, rows=ROWS):
     """Outcome of the reference decoder and of the package: symbols or the error's name."""
-    ours = outcome(lambda d: refdec.decode_attributes(d, *WIDTHS, rows), section, refdec.Fault)
-    return ours, outcome(lambda d: read_attributes(d, Widths(*WIDTHS), rows).tolist(), section, DecodeError)
+    ours = outcome(lambda d: refdec.decode_attributes(d, *WIDTHS, rows, False), section, refdec.Fault)
+    return ours, outcome(lambda d: read_attributes(d, Widths(*WIDTHS), rows)[1].tolist(), section, DecodeError)
 
 
 def both_planes(section, shapes):

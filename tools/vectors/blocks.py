@@ -17,7 +17,7 @@ import numpy as np
 
 from pd4dgs_codec.attributes.planes import residual
 from pd4dgs_codec.attributes.quantise import dequantise
-from pd4dgs_codec.attributes.table import dequantise_attributes
+from pd4dgs_codec.attributes.table import NO_CLASSES, Grid
 from pd4dgs_codec.bitstream import canonical
 from pd4dgs_codec.bitstream.container import MAJOR, SCENE_ID_SIZE, SIGNATURE
 from pd4dgs_codec.codec.header import payload_digest
@@ -203,9 +203,22 @@ def positions(cells: np.ndarray) -> bytes:
     return head + coded(channels)
 
 
-def plain_attributes(k: np.ndarray, priors: Mapping[int, Prior] | None = None) -> bytes:
+def plain_attributes(
+    k: np.ndarray, priors: Mapping[int, Prior] | None = None, *, classes: np.ndarray = NO_CLASSES
+) -> bytes:
     """Section ATTRIBUTES of int32 [channels, n], form 0 (clause 8.5)."""
-    return b"\0" + coded(k, priors)
+    if not classes.size:
+        return b"\0" + coded(k, priors)
+    return b"\0" + graded_part(classes) + coded([channel[classes == c] for channel in k for c in range(7)], priors)
+
+
+def graded_part(classes: np.ndarray, length: int | None = None) -> bytes:
+    """What says the step classes of the rows; nothing where there are none. length: what is said instead of the true
+    one."""
+    if not classes.size:
+        return b""
+    section = coded([classes])
+    return varint(len(section) if length is None else length) + section
 
 
 def plain_planes(residuals: Iterable[Iterable[int]], priors: Mapping[int, Prior] | None = None) -> bytes:
@@ -316,16 +329,23 @@ def gaps(terms: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
 
 
 def attribute_stages(
-    e: np.ndarray, splits: Splits, classes: Sequence[int], widths: Widths = DEFAULT_WIDTHS
+    e: np.ndarray,
+    splits: Splits,
+    classes: Sequence[int],
+    widths: Widths = DEFAULT_WIDTHS,
+    grades: np.ndarray = NO_CLASSES,
 ) -> list[list[np.ndarray]]:
-    """The channels of the eight stages of clause 8.7, of residuals and offsets int64 [channels, n]."""
-    p = widths.predicted
+    """The channels of the eight stages of clause 8.7, of residuals and offsets int64 [channels, n] of anchors of the
+    step classes `grades`."""
+    p, stages = widths.predicted, list[list[np.ndarray]]()
     bounds = [p * a // 38 for a in (0, 6, 12, 20, 29, 38)]
-    stages = [list(e[: bounds[1]])]
-    for stage, count in enumerate(classes, 1):
+    graded = [64 >> grades.astype(np.int64)] if grades.size else []
+    for stage, count in enumerate(classes if graded else (1, *classes)):
         first = bounds[stage]
         channels = e[first : bounds[stage + 1]] if stage < 5 else e[p::3]
-        activity = relative_magnitude(e[:first])
+        activity = relative_magnitude(e[:first]) if first else np.zeros(e.shape[1], np.int64)
+        for own in graded:
+            activity += 4 * relative_magnitude(own[None])
         stages.append([part for channel in channels for part in split_by_activity(channel, activity, count)])
     ys, zs = list[np.ndarray](), list[np.ndarray]()
     for i in range(widths.slots):
@@ -344,6 +364,7 @@ def predicted_attributes(
     classes: Sequence[int] = ONE_CLASS,
     *,
     widths: Widths = DEFAULT_WIDTHS,
+    grades: np.ndarray = NO_CLASSES,
     lengths: Lengths = lambda sizes: sizes,
     tail: bytes = b"",
 ) -> bytes:
@@ -358,7 +379,8 @@ def predicted_attributes(
         total = sum((w * k[j] for j, w in terms.get(c, ())), np.zeros_like(k[c]))
         e[c] -= total + 512 >> WEIGHT_SHIFT
     block = prediction_block({c: gaps(own) for c, own in terms.items()}, splits, {}, classes, widths)
-    return b"\1" + block + staged(attribute_stages(e, splits, classes, widths), lengths, tail)
+    stages = staged(attribute_stages(e, splits, classes, widths, grades), lengths, tail)
+    return b"\1" + graded_part(grades) + block + stages
 
 
 # -- LZMA sections (clause 9) ------------------------------------------------------------------------------------------
@@ -493,6 +515,7 @@ def make_layer(
     mode: int = ANS,
     raw: bool = False,
     widths: Widths = DEFAULT_WIDTHS,
+    classes: Sequence[int] | None = None,
 ) -> Layer:
     """A layer of `cells` (in Morton order) after `before` earlier rows.
 
@@ -521,10 +544,11 @@ def make_layer(
         }
     meant = LayerSymbols(
         kind=kind,
-        widths=widths,
+        widths=replace(widths, graded=classes is not None),
         anchor_q=np.array(cells, np.int32).reshape(-1, 3),
         mask_increase=np.array([0] * before if rises is None else rises, np.int32),
         mask_own=np.array([77] * n if codes is None else codes, np.int32),
+        classes=NO_CLASSES if classes is None else np.array(classes, np.int32),
         attributes=np.full((widths.channels, n), 2, np.int32) if attributes is None else attributes,
         planes=planes,
         networks=networks,
@@ -551,14 +575,15 @@ def _sections(meant: LayerSymbols, predictors: Sequence[int], mode: int) -> dict
     flat = [row for r in planes for row in plane_channels(r)]
     masks = [meant.mask_increase, meant.mask_own]
     if mode == LZMA:
-        channels = [*masks, *meant.attributes, *flat, *weights]
+        grades = [meant.classes] if meant.widths.graded else []
+        channels = [*masks, *grades, *meant.attributes, *flat, *weights]
         if any(c.size for c in channels):
             sections[SYMBOLS] = lzma_symbols(channels, stream=lzma2.packed)
     else:
         if meant.mask_increase.size or n:
             sections[MASKS] = coded(masks)
         if n:
-            sections[ATTRIBUTE] = plain_attributes(meant.attributes)
+            sections[ATTRIBUTE] = plain_attributes(meant.attributes, classes=meant.classes)
         if flat:
             sections[PLANE] = plain_planes(flat)
         if weights:
@@ -675,13 +700,15 @@ def make_file(*layers: Layer, header: Mapping[int, object] | None = None) -> Fil
     """A file of these layers in their chunks."""
     chunks = tuple(Chunk(x.meant.kind.chunk_type, x.payload(), layer=x) for x in layers)
     widths = layers[0].meant.widths
-    return File(chunks).with_header({15: [widths.feature, widths.slots], **(header or {})})
+    centres = {16: [i % 5 - 2 for i in range(widths.channels)]} if widths.graded else {}
+    return File(chunks).with_header({15: [widths.feature, widths.slots], **centres, **(header or {})})
 
 
 def _hashes(layer: Layer, header: Mapping[int, object]) -> dict:
     m = layer.meant
     steps = dict(zip(ATTRIBUTES, header[4], strict=True))  # type: ignore[call-overload]
-    values = dequantise_attributes(m.attributes, m.widths, steps)
+    centre = np.array(header.get(16, [0] * m.widths.channels), np.int32)
+    values = Grid(steps, m.widths, centre).dequantise(m.attributes, m.classes)
     tensors = [dequantise(m.anchor_q, header[5]), *(values[name] for name in ATTRIBUTES)]  # type: ignore[arg-type]
     own = list(m.tensors())
     count = len(PLANES) * len(m.planes)
