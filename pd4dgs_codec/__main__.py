@@ -15,11 +15,15 @@ VERBS = {
     "info": "show the header and the layers of a .pd4 file",
     "render": "render a file to pictures or a video",
     "eval": "measure each level of a file against a dataset",
+    "import": "take over a model that another trainer made",
+    "export": "write a scene as Gaussians that other viewers read",
     "bench": "measure what the codec, the renderer and the trainer promise",
     "package": "lay out a file for DASH, HLS and plain HTTP",
     "serve": "serve a folder over HTTP, at the rate of a slow link if wanted",
     "view": "show a scene in the browser",
 }
+
+MODULES = {"import": "import_model"}  #: verbs that cannot be a module's name
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -39,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if verb not in VERBS:
         say(f"pd4dgs: error: found {verb!r}, expected one of {', '.join(VERBS)}")
         return USAGE
-    code: int = import_module(f"pd4dgs_codec.cli.{verb}").main(arguments[1:])
+    code: int = import_module(f"pd4dgs_codec.cli.{MODULES.get(verb, verb)}").main(arguments[1:])
     return code
 
 

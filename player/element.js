@@ -169,7 +169,7 @@ export class Pd4Player extends HTMLElement {
         this.dispatchEvent(new CustomEvent(name, { detail }));
       });
     }
-    this._timer = setInterval(() => this._showStatus(), STATUS_MS);
+    this._timer = window.setInterval(() => this._showStatus(), STATUS_MS);
     this._showControls();
     this._showPoster();
     this._load();
@@ -324,10 +324,11 @@ export class Pd4Player extends HTMLElement {
     if (scale < 1) parts.push(`${Math.round(100 * scale)} %`);
     setText(this._statusLine, parts.join(" · "));
 
-    while (this._levels.children.length < ends.length) this._levels.append(document.createElement("i"));
-    while (this._levels.children.length > ends.length) this._levels.lastChild?.remove();
-    ends.forEach(({ end }, i) => {
-      const begin = i ? ends[i - 1].end : 0;
+    const whole = ends.filter(({ layer }, i) => layer !== ends[i + 1]?.layer); // of slices the last one
+    while (this._levels.children.length < whole.length) this._levels.append(document.createElement("i"));
+    while (this._levels.children.length > whole.length) this._levels.lastChild?.remove();
+    whole.forEach(({ end }, i) => {
+      const begin = i ? whole[i - 1].end : 0;
       const share = Math.min(Math.max((bytes - begin) / (end - begin), 0), 1);
       /** @type {HTMLElement} */ (this._levels.children[i]).style.width = `${100 * share}%`;
     });

@@ -22,7 +22,7 @@ K = (1 << 24) - 1  # clause 14: coded symbols
 MAX_SYMBOL = 1 << 23  # clause 14: symbols of attributes, plane samples and weights
 MAX_VOXEL = 1 << 20
 MAX_COUNT = 1 << 26
-MAX_ENTRIES = 1 << 21
+FREE_ENTRIES, MORE_ENTRIES = 1 << 18, 1 << 10
 VARINT_MAX = (1 << 35) - 1  # clause 7.1: five bytes of seven bits
 TOTAL = 1 << 24
 PLANES = (("xy", 0, 1), ("xz", 0, 2), ("xt", 0, 3), ("yz", 1, 2), ("yt", 1, 3), ("zt", 2, 3))
@@ -233,7 +233,7 @@ def read_preamble(data):
     need(len(data) >= 20, "the file ends in the preamble", "Truncated")
     major, _, size, crc = struct.unpack_from("<HHII", data, 8)
     need(major == 2, f"major version {major}", "UnsupportedVersion")
-    limited(size, 4096, "the header's length")
+    limited(size, 1 << 14, "the header's length")
     need(len(data) >= 20 + size, "the file ends in the header", "Truncated")
     header = data[20 : 20 + size]
     need(zlib.crc32(data[:16] + header) == crc, "CRC-32 of the header", "ChecksumMismatch")
@@ -243,6 +243,7 @@ def read_preamble(data):
 # 5.1 Header map: "The time at 1 MUST NOT precede the time at 0, the background MUST lie in 0..1, 0 ≤ near < far and
 # unit ≥ 0 MUST hold." "coding mode: 0 ans, 1 lzma; others UnsupportedFeature" "deformation: 0 coded as symbols, 1
 # float32 (9.2); others UnsupportedFeature"
+# 5.2 Chunk list: "In mode lzma each occurs at most once."
 # 5.5 Digest: "The first 16 bytes of the SHA-256 of the payloads of all critical chunks that were encoded together"
 def read_header(data):
     header = fields(unpack(data), range(1, 17), (*range(1, 12), 13, 14, 15), "header")
@@ -269,6 +270,8 @@ def read_header(data):
     read_chunk_list(header[1])
     for key in (2, 3):
         registered(header[key], (0, 1), f"header key {key}")
+    layers = [kind for kind, _ in header[1] if kind < 3]
+    need(header[2] == 0 or len(layers) == len(set(layers)), "a layer in several slices in mode lzma")
     return header
 
 
@@ -311,16 +314,16 @@ def read_error_bounds(value):
         need(real(bounds[key], f"error bound {key}") >= 0, f"error bound {key} is {bounds[key]}")
 
 
-# 5.2 Chunk list: "The first type MUST be 0; the types of layers among all entries MUST ascend, each at most once."
+# 5.2 Chunk list: "The first type MUST be 0; the types of layers among all entries MUST NOT descend"
 def read_chunk_list(rows):
-    limited(len(a_list(rows, "chunk list")), 64, "the number of chunks", 1)
+    limited(len(a_list(rows, "chunk list")), 1024, "the number of chunks", 1)
     for row in rows:
         kind, size = a_list(row, "a chunk", 2)
         limited(kind, 65535, "a chunk type")
         limited(size, (1 << 31) - 1, "a payload's length")
     layers = [kind for kind, _ in rows if kind in range(3)]
     need(rows[0][0] == 0, f"the first chunk is of type {rows[0][0]}")
-    need(layers == sorted(set(layers)), f"layers {layers}")
+    need(layers == sorted(layers), f"layers {layers}")
 
 
 # 3.3 Scene identity: "the header from the end of its chunk list (the value of key 1, its first entry) to its own end"
@@ -343,11 +346,12 @@ def read_chunk(data, at, kind, size, scene_id):
     need(len(data) >= end + 4, "the file ends in a chunk", "Truncated")
     crc = struct.unpack_from("<I", data, end)[0]
     need(zlib.crc32(data[at:end]) == crc, f"CRC-32 of the chunk at {at}", "ChecksumMismatch")
-    need(flags >> 1 == 0, f"flags {flags:#x}")
+    need(flags & 0b111100 == 0, f"flags {flags:#x}")
+    need(flags & 1 == 0 or flags == 1, f"flags {flags:#x} of an ancillary chunk")
     need(found_kind == kind, f"chunk type {found_kind}, listed {kind}")
     check_scene_id(found_id, scene_id)
     check_critical(kind, flags & 1)
-    return data[at + 16 : end], end + 4
+    return data[at + 16 : end], flags, end + 4
 
 
 # 3.3 Scene identity: "Every chunk of a file, ancillary ones included, MUST carry it"
@@ -362,18 +366,38 @@ def check_critical(kind, ancillary):
     need(kind >= 3 or not ancillary, "a layer marked as ancillary")
 
 
-class Layer:
-    """What one layer says: symbols {name: [int]} in the order of clause 12.4, and what dequantisation needs."""
+# 3.6 Slices: "The slices of a layer are numbered from 0 in their order" "Bit 1 MUST be 1 if the next layer chunk in the
+# list is of the same layer, and 0 if it is of another one."
+def check_slice(flags, number, kind, following):
+    """following: the layers of the chunks behind it."""
+    need(flags >> 6 == number, f"slice {flags >> 6} of layer {kind}, expected {number}")
+    need(not following or (flags >> 1 & 1) == (following[0] == kind), f"flags {flags:#x} before layers {following}")
 
-    def __init__(self, number, rows_before, header):
-        self.number, self.rows_before, self.header = number, rows_before, header
+
+class Past:
+    """What a slice may refer to of its layer's slices before it: priors by section and stage, the prediction block."""
+
+    def __init__(self):
+        self.priors, self.block = {}, None
+
+    def of(self, *section):
+        return self.priors.setdefault(section, [])
+
+
+class Layer:
+    """What one slice of a layer says: symbols {name: [int]} in the order of clause 12.4, and what dequantisation
+    needs."""
+
+    def __init__(self, number, later, rows_before, header, past):
+        self.number, self.later, self.rows_before, self.header, self.past = number, later, rows_before, header, past
+        self.rises, self.slices = 0 if later else rows_before, 1
         self.symbols = {}
         self.tensors = {}  # {name: [float]}, every one a binary32 value
 
 
 # 6.1 Layout: "The lengths of the sections MUST sum to the rest exactly."
-def read_layer(payload, number, before, header):
-    layer = Layer(number, before[0], header)
+def read_layer(payload, number, later, before, header, past):
+    layer = Layer(number, later, before[0], header, past)
     reader = Reader(payload)
     parameters = reader.take(limited(reader.number("<I"), 4096, "the parameters' length"))
     read_parameters(layer, unpack(parameters))
@@ -384,15 +408,16 @@ def read_layer(payload, number, before, header):
     return layer
 
 
-# 6.2 Layer parameters: "Layer 0 has keys 3 and 5 and not 4. Layers 1 and 2 have keys 3, 4 and 5 if the layer has a
-# deformation, else none of them."
+# 6.2 Layer parameters: "In its first slice, layer 0 has keys 3 and 5 and not 4. Layers 1 and 2 have keys 3, 4 and 5 if
+# the layer has a deformation, else none of them. No later slice has any of the three."
 def read_parameters(layer, value):
     parameters = fields(value, range(1, 6), (1, 2), "layer parameters")
     layer.rows = limited(parameters[1], (1 << 24) - layer.rows_before, "own rows")
     sections = fields(parameters[2], range(7), (), "sections")
     layer.sections = {s: limited(sections[s], (1 << 31) - 1, "a section", 1) for s in sections if s < 64}
     found = {3, 4, 5} & set(parameters)
-    need(found in ([{3, 4, 5}, set()] if layer.number else [{3, 5}]), f"layer {layer.number} with keys {found}")
+    wanted = [set()] if layer.later else [{3, 4, 5}, set()] if layer.number else [{3, 5}]
+    need(found in wanted, f"layer {layer.number} with keys {found}")
     layer.networks = read_networks(layer.number, layer.header, parameters[5]) if 5 in parameters else {}
     layer.deformed = bool(layer.networks) and layer.number > 0
     layer.raw = layer.deformed and layer.header[3] == 1
@@ -469,18 +494,18 @@ def weight_shapes(layer):
     return shapes
 
 
-# 6.5 Declared sizes: "c MUST NOT exceed 2^28, N MUST NOT exceed 2^13 + 2·L, and S MUST NOT exceed 2^22 + 2048·L."
-# "let N, S and L be sums over this layer and all layers before it in the file"
+# 6.5 Declared sizes: "c MUST NOT exceed 2^28, N MUST NOT exceed 2^13 + 2·L, and S MUST NOT exceed 2^22 + 1024·L."
+# "let N, S and L be sums over this slice and all slices before it in the file"
 def check_sizes(layer, payload_bytes, before):
-    """before: N, S and L of the layers before it. Sets those with it."""
+    """before: N, S and L of the slices before it. Sets those with it."""
     samples = sum(c * h * w for _, _, (c, h, w) in plane_shapes(layer))
     need(samples <= 1 << 28, f"{samples} plane samples", "LimitExceeded")
     row = channel_count(layer.header) + 4 + (16 in layer.header)
-    symbols = layer.rows_before + row * layer.rows + samples + sum(size for _, size in weight_shapes(layer))
+    symbols = layer.rises + row * layer.rows + samples + sum(size for _, size in weight_shapes(layer))
     layer.declared = [a + b for a, b in zip(before, (layer.rows, symbols, payload_bytes))]
     rows, symbols, size = layer.declared
     need(rows <= (1 << 13) + 2 * size, f"{rows} rows", "LimitExceeded")
-    need(symbols <= (1 << 22) + 2048 * size, f"{symbols} symbols", "LimitExceeded")
+    need(symbols <= (1 << 22) + 1024 * size, f"{symbols} symbols", "LimitExceeded")
 
 
 # 6.4 Sections: "A section is present if and only if it has at least one symbol or value to code. Mode ans uses 0..4,
@@ -490,12 +515,12 @@ def read_sections(layer, parts):
         need(section in parts or not count, f"section {section} is missing")
         return parts.pop(section, b"") if count else b""
 
-    planes, weights = plane_shapes(layer), weight_shapes(layer)
-    counts = {MASKS: [layer.rows_before, layer.rows], ATTRIBUTE_SECTION: []}
+    planes, weights, past = plane_shapes(layer), weight_shapes(layer), layer.past
+    counts = {MASKS: [layer.rises, layer.rows], ATTRIBUTE_SECTION: []}
     counts[ATTRIBUTE_SECTION] = [layer.rows] * (channel_count(layer.header) + (16 in layer.header))
     counts[PLANE_SECTION] = [] if layer.raw else [h * w for _, _, (c, h, w) in planes for _ in range(c)]
     counts[WEIGHTS] = [] if layer.raw else [size for _, size in weights]
-    positions = decode_positions(part(POSITIONS, layer.rows), layer.rows)
+    positions = decode_positions(part(POSITIONS, layer.rows), layer.rows, past.of(POSITIONS))
     channels = {}
     if layer.header[2] == 1:
         flat = [count for section in counts for count in counts[section]]
@@ -507,11 +532,11 @@ def read_sections(layer, parts):
         for section, sizes in counts.items():
             data = part(section, sum(sizes))
             if section == ATTRIBUTE_SECTION and sum(sizes):
-                channels[section] = decode_attributes(data, *layer.header[15], layer.rows, 16 in layer.header)
+                channels[section] = decode_attributes(data, *layer.header[15], layer.rows, past, 16 in layer.header)
             elif section == PLANE_SECTION and sizes:
                 channels[section] = decode_planes(data, [shape for _, _, shape in planes])
             else:
-                channels[section] = decode_channels(data, sizes)
+                channels[section] = decode_channels(data, sizes, past.of(section))
     layer.raw_values = {}
     if layer.raw:
         sizes = {name: c * h * w for name, _, (c, h, w) in planes} | dict(weights)
@@ -729,8 +754,12 @@ def read_exceptions(reader, count, prior):
 
 # 8.1 Parameter block: "For each non-empty channel in order: a varint token, at most 2·(2^26 + 8); the parameters of a
 # new prior (8.2), if any; its exceptions (8.3), if bit 0 of the token is set."
-def decode_channels(data, counts):
-    reader, defined, heads, entries = Reader(data), [], [], 0
+# 8 Coded channels: "tokens ≥ 8 refer to priors of the same section, or stage, only, and the definitions of the slices
+# of the same layer before count, in their order."
+def decode_channels(data, counts, known=None):
+    """known: the priors of the slices before, to which those defined here are added."""
+    reader, defined, heads = Reader(data), [] if known is None else known, []
+    first, entries, most = len(defined), 0, sum(counts) + (MORE_ENTRIES if defined else FREE_ENTRIES)
     for count in counts:
         if count == 0:
             continue
@@ -738,13 +767,13 @@ def decode_channels(data, counts):
         token = reader.varint(2 * (MAX_COUNT + 8))
         if token >> 1 < 8:
             defined.append(read_prior(reader, token >> 1))
-            entries = limited(entries + defined[-1].n, MAX_ENTRIES, "the entries of a section's tables")
+            entries = limited(entries + defined[-1].n, most, "the entries of a section's tables")
         back = max(token >> 1, 8) - 8
         need(back < len(defined), "a channel reuses a prior before the first")
         prior = defined[-1 - back]
         heads.append((prior, read_exceptions(reader, count, prior) if token & 1 else {}))
     stream = Ans(reader.take(reader.left))
-    for prior in defined:
+    for prior in defined[first:]:
         if prior.classes:
             take_classes(stream, prior)
     heads = iter(heads)
@@ -770,32 +799,36 @@ def take_channel(stream, count, prior, exceptions):
 
 
 # 8.5 The attributes section: "Section 2 is a u8, the form" "the prediction block (8.6), then eight sections of coded
-# channels, the stages 0..7 (8.7)"
+# channels, the stages 0..7 (8.7)" "the lengths (8.9) of stages 0..6, then the stages 0..7, under the block of the
+# latest slice of form 1 before; Malformed if the layer has none"
 # 8.7 Stages of the attributes: "The activity of a row is the relative magnitude (8.9) of the residuals named, the
-# places being the n rows."
+# places being the n rows." "In form 2 places, sums and bounds are those of the slice that the block stands in"
 # 8.7 Stages of the attributes: "The bounds are b_s = (P·a_s) // 38, a_1 .. a_5 being 6, 12, 20, 29 and 38"
-def decode_attributes(data, feature, slots, n, graded):
+def decode_attributes(data, feature, slots, n, past, graded):
     reader, p = Reader(data), feature + 6
-    form = read_form(reader)
+    form = read_form(reader, 3)
     grades = [decode_grades(reader, n)] if graded else []
     if form == 0:
-        one = grades[0] if graded else [0] * n
-        return grades + decode_classes(reader.take(reader.left), [one] * (p + 3 * slots), 7 if graded else 1)
-    terms = [read_terms(reader, p, c) for c in range(1, p)]
-    class_counts = [read_class_count(reader) for _ in range(5 + graded)]
-    splits = [read_split(reader) for _ in range(slots)]
+        one, known = grades[0] if graded else [0] * n, past.of(ATTRIBUTE_SECTION)
+        return grades + decode_classes(reader.take(reader.left), [one] * (p + 3 * slots), 7 if graded else 1, known)
+    if form == 1:
+        past.block = read_block(reader, p, slots, graded)
+    need(past.block, "no slice before has a prediction block")
+    terms, class_counts, splits, scales = past.block
+    own = [[64 >> c for c in grades[0]]] * 4 if graded else []  # four times the relative magnitude of one
     *stages, stage_y, stage_z = take_stages(reader, 8)
+    known = [past.of(ATTRIBUTE_SECTION, stage) for stage in range(8)]
     k = []  # r_0 .. r_(P − 1), then x_0 .. x_(G − 1)
     ends = [p * a // 38 for a in (6, 12, 20, 29, 38)] + [p + slots]
-    for stage, end, class_count in zip(stages, ends, class_counts if graded else [1, *class_counts]):
-        activity = relative_magnitude(k, n)
-        if graded:
-            activity = [a + 4 * own for a, own in zip(activity, relative_magnitude([[64 >> c for c in grades[0]]], n))]
-        classes = classes_by_activity(activity, class_count)
-        k += decode_classes(stage, [classes] * (end - len(k)), class_count)
+    for s, (stage, end, class_count) in enumerate(zip(stages, ends, class_counts if graded else [1, *class_counts])):
+        if s not in scales:  # the slice that the block stands in
+            scales[s] = n, channel_sums(own + k), class_bounds(relative_magnitude(own + k, n), class_count)
+        places, sums, bounds = scales[s]
+        classes = classes_within(bounds, relative_magnitude(own + k, n, places, sums))
+        k += decode_classes(stage, [classes] * (end - len(k)), class_count, known[s])
     residuals, x = k[:p], k[p:]
-    y = decode_classes(stage_y, [y_classes(split, *own) for split, *own in zip(splits, x)], 5)
-    z = decode_classes(stage_z, [z_classes(split, *own) for split, *own in zip(splits, x, y)], 7)
+    y = decode_classes(stage_y, [y_classes(split, *each) for split, *each in zip(splits, x)], 5, known[6])
+    z = decode_classes(stage_z, [z_classes(split, *each) for split, *each in zip(splits, x, y)], 7, known[7])
     return grades + add_predictions(residuals, terms) + [channel for offset in zip(x, y, z) for channel in offset]
 
 
@@ -814,10 +847,18 @@ def step_classes(symbols):
 
 # 8.5 The attributes section: "Other forms are UnsupportedFeature."
 # 8.8 The planes section: "Other forms are UnsupportedFeature."
-def read_form(reader):
+def read_form(reader, forms=2):
     form = reader.byte()
-    need(form <= 1, f"form {form} of a section", "UnsupportedFeature")
+    need(form < forms, f"form {form} of a section", "UnsupportedFeature")
     return form
+
+
+# 8.6 Prediction block: "The block holds, without gaps"
+def read_block(reader, p, slots, graded):
+    """(terms, class counts, splits, what the classes of each stage are measured by, empty)."""
+    terms = [read_terms(reader, p, c) for c in range(1, p)]
+    class_counts = [read_class_count(reader) for _ in range(5 + graded)]
+    return terms, class_counts, [read_split(reader) for _ in range(slots)], {}
 
 
 # 8.6 Prediction block: "a varint m ≤ c, then m times a varint g ≤ P and a zigzag weight w, |w| ≤ 2^15. The term
@@ -858,9 +899,9 @@ def z_classes(split, x, y):
 # 8.7 Stages of the attributes: "A channel that is split stands in its stage as its classes 0, 1, .. in order, each a
 # channel of its own that holds, in row order, the symbols of the rows of that class"
 # 8 Coded channels: "Channels of length 0 leave no trace."
-def decode_classes(data, classes, class_count):
+def decode_classes(data, classes, class_count, known=None):
     """The channels of a stage, given the class of each place of each; a channel that is not split is all class 0."""
-    parts = map(iter, decode_channels(data, [own.count(q) for own in classes for q in range(class_count)]))
+    parts = map(iter, decode_channels(data, [own.count(q) for own in classes for q in range(class_count)], known))
     channels = []
     for own in classes:
         of_class = [next(parts) for _ in range(class_count)]
@@ -926,22 +967,37 @@ def take_stages(reader, number):
     return [reader.take(size) for size in sizes] + [reader.take(reader.left)]
 
 
-# 8.9 Classes by activity: "Σ over channels c of (|e_c[p]| · 256·N) // (1 + Σ over places q of |e_c[q]|)"
-def relative_magnitude(channels, n):
-    """Of each of the n places."""
+# 8.9 Classes by activity: "Σ over channels c of (min(|e_c[p]|, s_c) · 256·N) // (1 + s_c)"
+def relative_magnitude(channels, n, places=None, sums=None):
+    """Of each of the n places; places and sums: N and s_c of another slice, if it is theirs that count."""
+    if sums is None:
+        places, sums = n, channel_sums(channels)
     magnitude = [0] * n
-    for e in channels:
-        total = 1 + sum(abs(v) for v in e)
-        magnitude = [m + abs(v) * 256 * n // total for m, v in zip(magnitude, e)]
+    for e, s in zip(channels, sums):
+        magnitude = [m + min(abs(v), s) * 256 * places // (1 + s) for m, v in zip(magnitude, e)]
     return magnitude
 
 
-# 8.9 Classes by activity: "let A be the activities in ascending order. The class of a place is the number of i in 1 ..
-# C − 1 with A[(i·N) // C] at most its activity."
-def classes_by_activity(activity, class_count):
+# 8.9 Classes by activity: "s_c the sum over places q of |e_c[q]|"
+def channel_sums(channels):
+    return [sum(abs(v) for v in e) for e in channels]
+
+
+# 8.9 Classes by activity: "let A be the activities in ascending order. The bounds are A[(i·N) // C] for i in 1 .. C −
+# 1"
+def class_bounds(activity, class_count):
     ascending = sorted(activity)
-    bounds = [ascending[i * len(ascending) // class_count] for i in range(1, class_count)]
+    return [ascending[i * len(ascending) // class_count] for i in range(1, class_count)]
+
+
+# 8.9 Classes by activity: "the class of a place is the number of bounds that are at most its activity."
+def classes_within(bounds, activity):
     return [bisect_right(bounds, value) for value in activity]
+
+
+# 8.9 Classes by activity: "With C = 1 every place has class 0."
+def classes_by_activity(activity, class_count):
+    return classes_within(class_bounds(activity, class_count), activity)
 
 
 # 9.3 LZMA2: "A stream is a list of chunks, each behind its control byte, and ends with the control byte 0."
@@ -1145,7 +1201,7 @@ PATTERNS = [[byte for byte in range(256) if bin(byte).count("1") == k] for k in 
 # then a u8, the depth R, 0..21"
 # 10.2 Counts: "Then, if n > 1, six varints, at most 2^26 each: how many nodes of all levels have 2, 3, .. 7 children.
 # Their sum MUST NOT exceed the number of nodes with more than one child, else Malformed."
-def decode_positions(data, count):
+def decode_positions(data, count, known=None):
     if count == 0:
         return []
     reader = Reader(data)
@@ -1154,7 +1210,7 @@ def decode_positions(data, count):
     sizes = [reader.varint(MAX_COUNT) for _ in range(2, 8)] if count > 1 else []
     several = sum(nodes - single for nodes, single in levels)
     need(sum(sizes) <= several, f"{sum(sizes)} nodes with 2 to 7 children, {several} with more than one")
-    channels = decode_channels(reader.take(reader.left), channel_lengths(levels, count) + sizes)
+    channels = decode_channels(reader.take(reader.left), channel_lengths(levels, count) + sizes, known)
     nodes = grow(levels, iter(channels), count, sizes)
     for axis in range(3):
         need(min(node[axis] for node in nodes) == 0, "no anchor at the minimum")
@@ -1265,8 +1321,31 @@ def dequantise_layer(layer):
     layer.tensors |= layer.raw_values
 
 
+# 12.2 Prefixes: "The rows of a layer are those of its slices, sorted by the code (10.1) of their voxel index less the
+# minimum of those that there are"
+def add_slice(layer, part):
+    """Makes `part` the last slice of `layer`."""
+    cells = [cell for own in (layer, part) for cell in zip(*[iter(own.symbols["anchor"])] * 3)]
+    low = [min((cell[axis] for cell in cells), default=0) for axis in range(3)]
+    order = sorted(range(len(cells)), key=lambda row: morton_code([v - m for v, m in zip(cells[row], low)]))
+    classes = [("step_class", 1)] if 16 in layer.header else []
+    for name, width in (("mask_own", 1), *classes, *attribute_channels(layer.header).items()):
+        channels = []
+        for c in range(width):
+            both = [k for own in (layer, part) for k in own.symbols[name][c * own.rows : (c + 1) * own.rows]]
+            channels += [both[row] for row in order]
+        layer.symbols[name] = channels
+    layer.symbols["anchor"] = [v for row in order for v in cells[row]]
+    layer.rows, layer.declared, layer.slices = len(cells), part.declared, layer.slices + 1
+
+
+# 10.1 Payload: "bit 3i of the code is bit i of x, 3i + 1 of y, 3i + 2 of z"
+def morton_code(offset):
+    return sum((v >> i & 1) << 3 * i + axis for axis, v in enumerate(offset) for i in range(21))
+
+
 # 12.1 Order: "For each layer chunk, before the next chunk is looked at: parameters and their limits, sections, the
-# ranges of 11.1 and 11.2, sums of masks, each voxel at most once over the layers so far, and dequantisation."
+# ranges of 11.1 and 11.2, sums of masks, each voxel at most once over the slices so far, and dequantisation."
 # 11.1 Masks: "No sum may exceed 255."
 def finish_last(layers):
     codes = []
@@ -1290,18 +1369,24 @@ def decode(data, max_layer=None):
     stop = len(header[1])
     if max_layer is not None:
         stop = 1 + max(i for i, (kind, _) in enumerate(header[1]) if kind <= min(max_layer, 2))
-    for kind, size in header[1][:stop]:
-        payload, at = read_chunk(data, at, kind, size, scene_id)
+    for i, (kind, size) in enumerate(header[1][:stop]):
+        payload, flags, at = read_chunk(data, at, kind, size, scene_id)
         if kind < 3:
-            layers.append(read_layer(payload, kind, declared, header))
+            later = bool(layers) and layers[-1].number == kind
+            check_slice(flags, layers[-1].slices if later else 0, kind, [k for k, _ in header[1][i + 1 :] if k < 3])
+            read = read_layer(payload, kind, later, declared, header, layers[-1].past if later else Past())
+            if later:
+                add_slice(layers[-1], read)
+            else:
+                layers.append(read)
             finish_last(layers)
-            declared = layers[-1].declared
+            declared = read.declared
     need(max_layer is not None or at == len(data), "bytes follow the last chunk")
     return layers
 
 
-# 12.4 Hashes: "For conformance, two SHA-256 digests per layer, printed in hexadecimal as a JSON list of {"layer",
-# "symbols", "tensors"}."
+# 12.4 Hashes: "For conformance, two SHA-256 digests per layer, of the slices that there are, the rows as in 12.2,
+# printed in hexadecimal as a JSON list of {"layer", "symbols", "tensors"}."
 def hashes(data, max_layer=None):
     rows = []
     for layer in decode(data, max_layer):

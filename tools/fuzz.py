@@ -5,6 +5,7 @@
     python tools/fuzz.py --input 4711                     # one input again, with its recipe
     python tools/fuzz.py --atheris 300                    # coverage-guided, 300 s; needs `pip install atheris`
     python tools/fuzz.py --coverage 20000                 # which branches those inputs alone reach; needs `coverage`
+    python tools/fuzz.py --cost 3600                      # legal files, steered to what decoding costs most
     python tools/fuzz.py --damage 100000 a.pd4 b.pd4      # flips, bursts, swaps, splices and cuts of files of any size
 
 Inputs are numbered: input i of run S over the same seed files is the same on every machine, whatever --jobs is. Each is
@@ -36,6 +37,7 @@ ROOT = Path(__file__).resolve().parents[1]
 sys.path[:0] = [str(ROOT), str(ROOT / "tools"), str(ROOT / "tests")]
 
 from fuzzing.check import Finding, check_memory, compare_reference, examine  # noqa: E402
+from fuzzing.costly import search  # noqa: E402
 from fuzzing.damage import damage  # noqa: E402
 from fuzzing.files import Seed, built_seeds, given_seeds, known_prefixes  # noqa: E402
 from fuzzing.mutate import Case, make_case  # noqa: E402
@@ -312,6 +314,22 @@ def guided(seconds: int, run: int, folder: Path, paths: Sequence[Path]) -> dict[
     return {"inputs": inputs, "edges": edges, "features": features, "corpus": kept, "findings": found}
 
 
+# -- cost --------------------------------------------------------------------------------------------------------------
+
+
+def dearest(seconds: float, run: int, folder: Path) -> dict[str, Any]:
+    """The legal files that cost most processor time and most memory, found in half of `seconds` each and written to
+    `folder`."""
+    folder.mkdir(parents=True, exist_ok=True)
+    result: dict[str, Any] = {}
+    for what in ("seconds", "memory"):
+        found = search(run, seconds / 2, what == "memory", report=lambda line: print(line, file=sys.stderr))
+        for i, one in enumerate(found):
+            (folder / f"dear-{what}-{i}.pd4").write_bytes(one.data)
+        result[what] = [one.row() for one in found]
+    return result
+
+
 # -- the command -------------------------------------------------------------------------------------------------------
 
 
@@ -335,6 +353,7 @@ def parser() -> argparse.ArgumentParser:
     p.add_argument("--input", type=int, metavar="I", help="examine input I alone, in this process")
     p.add_argument("--atheris", type=int, metavar="S", help="a coverage-guided run of S seconds instead")
     p.add_argument("--damage", type=int, metavar="N", help="N changes of the given files, checksums left as they are")
+    p.add_argument("--cost", type=float, metavar="S", help="search S seconds for the legal files that cost most")
     p.add_argument("--coverage", type=int, metavar="N", help="measure what N inputs reach instead")
     return p
 
@@ -354,6 +373,13 @@ def main(argv: Sequence[str] | None = None) -> int:
         result = {"files": len(data), "outcomes": outcomes, "findings": found}
         rows = [f"| ends in {name} | {count:,} |" for name, count in outcomes.most_common()]
         text = "\n".join(["| figure | value |", "|---|---|", *rows, f"| findings | {len(found)} |", *found[:20]])
+    elif args.cost is not None:
+        result, found = dearest(args.cost, args.seed, args.out), []
+        columns = ("share", "bytes", "seconds", "memory")
+        rows = [f"| {what} | {' | '.join(str(row[c]) for c in columns)} |" for what in result for row in result[what]]
+        text = "\n".join(
+            ["| dearest in | share of the bound | bytes | seconds | memory |", "|---|---|---|---|---|", *rows]
+        )
     elif args.coverage is not None:
         result, found = reach(all_seeds(args.files), args.seed, args.coverage), []
         rows = [f"| {k} | {v:.1f} % |" for k, v in result["reached"].items()]

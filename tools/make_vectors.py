@@ -15,11 +15,11 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from vectors import faulty, uncommon, valid
+from vectors import faulty, slices, uncommon, valid
 from vectors.blocks import Vector
 
 from pd4dgs_codec.bitstream.container import read_preamble
-from pd4dgs_codec.codec.header import unpack_header
+from pd4dgs_codec.codec.header import layers_of, unpack_header
 from pd4dgs_codec.codec.info import hashes
 from pd4dgs_codec.errors import DecodeError, UnsupportedFeature
 
@@ -30,7 +30,7 @@ SUFFIX = ".pd4"
 
 def vectors() -> list[Vector]:
     """All vectors, in the manifest's order."""
-    found = [*valid.cases(), *uncommon.cases(), *faulty.cases()]
+    found = [*valid.cases(), *uncommon.cases(), *faulty.cases(), *slices.cases()]
     names = [v.name for v in found]
     doubled = {name for name in names if names.count(name) > 1}
     if doubled:
@@ -51,9 +51,22 @@ def entry(vector: Vector) -> dict:
         row["error"], row["clause"] = vector.error, vector.clauses[0]
         row |= {key: value for key, value in (("chunk", vector.chunk), ("offset", vector.offset)) if value is not None}
         row["prefix"] = vector.layers[-1]["layer"] if vector.layers else None
+    if vector.feature is not None:
+        row["feature"] = vector.feature
     row["ans_only"] = "same" if _for_all(vector.data) else UnsupportedFeature.__name__
+    listed = _listed(vector.data)
+    if len(listed) > len(set(listed)):
+        row["slices"] = list(vector.slices)
     row["layers"] = vector.layers
     return row
+
+
+def _listed(data: bytes) -> list[int]:
+    """The layer of each slice in the header's list, none of a header that cannot be read."""
+    try:
+        return layers_of(unpack_header(read_preamble(data).header).chunks)
+    except DecodeError:
+        return []
 
 
 def _for_all(data: bytes) -> bool:

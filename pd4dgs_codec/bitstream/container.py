@@ -30,7 +30,10 @@ PREAMBLE_SIZE = 20
 CHUNK_HEAD_SIZE = 16
 CHUNK_OVERHEAD = CHUNK_HEAD_SIZE + 4
 SCENE_ID_SIZE = 8
-FLAG_ANCILLARY = 1  #: a decoder that does not know the type may skip the chunk; other flag bits are reserved, zero
+FLAG_ANCILLARY = 1  #: a decoder that does not know the type may skip the chunk; its other flag bits are zero
+FLAG_MORE = 2  #: further slices of the same layer follow
+SLICE_SHIFT = 6  #: the number of a slice is the flags' upper bits; bits 2 to 5 are reserved, zero
+_RESERVED = ((1 << SLICE_SHIFT) - 1) & ~(FLAG_ANCILLARY | FLAG_MORE)
 
 _PREAMBLE = struct.Struct("<8sHHI")
 _CHUNK = struct.Struct("<HHI8s")
@@ -58,6 +61,26 @@ class Chunk:
     @property
     def ancillary(self) -> bool:
         return bool(self.flags & FLAG_ANCILLARY)
+
+    @property
+    def slice(self) -> int:
+        """Its number within its layer."""
+        return self.flags >> SLICE_SHIFT
+
+    @property
+    def more(self) -> bool:
+        """Whether further slices of its layer follow."""
+        return bool(self.flags & FLAG_MORE)
+
+
+def slice_flags(number: int, of: int) -> int:
+    """The flags of slice `number` of a layer of so many slices."""
+    return number << SLICE_SHIFT | FLAG_MORE * (number + 1 < of)
+
+
+def _reserved(flags: int) -> int:
+    """The bits that must be zero, as far as they are not."""
+    return flags & ~FLAG_ANCILLARY if flags & FLAG_ANCILLARY else flags & _RESERVED
 
 
 def write_preamble(header: bytes) -> bytes:
@@ -92,7 +115,7 @@ def read_preamble(data: Buffer) -> Preamble:
 
 def write_chunk(type: int, flags: int, scene_id: bytes, payload: bytes) -> bytes:
     """One framed chunk. Raises EncodeError for a field out of range."""
-    if not 0 <= type < 1 << 16 or flags & ~FLAG_ANCILLARY or len(scene_id) != SCENE_ID_SIZE:
+    if not (0 <= type < 1 << 16 and 0 <= flags < 1 << 16) or _reserved(flags) or len(scene_id) != SCENE_ID_SIZE:
         raise EncodeError(f"chunk type {type}, flags {flags}, scene id of {len(scene_id)} bytes: out of range")
     if len(payload) > MAX_PAYLOAD:
         raise EncodeError(f"a payload of {len(payload)} bytes, limit {MAX_PAYLOAD}")
@@ -124,7 +147,7 @@ def read_chunk(
     body_end = offset + CHUNK_HEAD_SIZE + found_length
     _need(view, body_end + _CRC.size, "a chunk", index)
     _check_crc(view, body_end, zlib.crc32(view[offset:body_end]), "chunk", index)
-    if flags & ~FLAG_ANCILLARY:
+    if _reserved(flags):
         raise Malformed(f"flags {flags:#06x}, reserved bits must be zero", offset=offset + 2, chunk=index)
     if type is not None and found_type != type:
         raise Malformed(f"chunk type {found_type}, the header says {type}", offset=offset, chunk=index)

@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 # File structure
-MAX_HEADER = 4096  #: bytes; a header lists chunks and a few reals, and must arrive with the first packets
+MAX_HEADER = 1 << 14  #: bytes; the longest chunk list takes two thirds of it
 MAX_PARAMETERS = 4096  #: bytes of a layer's parameters; msgpack takes up to 130 times its bytes in memory
-MAX_CHUNKS = 64  #: three layers and ancillary chunks; bounds the walk over a hostile header
+MAX_CHUNKS = 1024  #: slices of layers and ancillary chunks; a slice's number takes ten bits
 MAX_PAYLOAD = (1 << 31) - 1  #: bytes in one chunk; fits a signed 32-bit size on every platform
 MAX_DEPTH = 4  #: nested maps and lists in canonical msgpack
 

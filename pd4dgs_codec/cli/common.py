@@ -28,11 +28,17 @@ SOURCES = """\
 SOURCE is one of
   a folder in the iPhone/Nerfies layout (camera/, rgb/, splits/; its split files decide what is held out)
   a folder with transforms*.json (Blender, D-NeRF, nerfstudio)
+  a folder with poses_bounds.npy and a video per camera, cam*.mp4 (Neu3D; the first camera is held out)
+  a folder with a model of COLMAP in sparse/0 and its pictures in images/; times.txt may say when they were taken
   synthetic:static   nothing moves
   synthetic:global   large objects move slowly
   synthetic:local    the same, and small parts move on their own
   synthetic:fast     quick motion
-  (synthetic:NAME?seed=n gives another scene of that kind)"""
+  (synthetic:NAME?seed=n gives another scene of that kind)
+  teacher:PATH       pictures of explicit Gaussians: a folder of .ply or .spz files, one per frame, one such file, a
+                     .4dgs file, a checkpoint of gsplat, or module:function (time -> Gaussians)
+  (teacher:PATH?cameras=SOURCE takes the cameras, times and held-out pictures of another source;
+  else ?views=N&size=WxH&fps=F&background=white&up=X,Y,Z)"""
 
 
 class UsageError(Exception):

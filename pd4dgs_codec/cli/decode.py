@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from pd4dgs_codec.cli import values
 from pd4dgs_codec.cli.common import OK, PARTIAL, Console, Parser, UsageError, number, run, table
 from pd4dgs_codec.cli.files import STDIO, check_output, read_bytes, write_bytes
 from pd4dgs_codec.errors import DeliveryError
@@ -25,6 +26,7 @@ examples:
   pd4dgs-decode scene.pd4
   pd4dgs-decode http://127.0.0.1:8000/scene.pd4 --max-layer 1 -o prefix.npz
   pd4dgs-decode scene.pd4 --max-layer 0 -o base.npz
+  pd4dgs-decode scene.pd4 --max-bytes 100k -o early.npz
   head -c 300000 scene.pd4 | pd4dgs-decode - --allow-partial -o prefix.pt"""
 
 
@@ -36,6 +38,9 @@ def parser() -> Parser:
     what = "FILE.npz or FILE.pt; - writes npz to stdout; without it only check"
     p.add_argument("-o", "--output", metavar="FILE", help=what)
     p.add_argument("--max-layer", type=int, choices=(0, 1, 2), help="stop after this layer")
+    p.add_argument(
+        "--max-bytes", type=values.size, metavar="SIZE", help="stop after SIZE bytes, such as 50k, at a slice"
+    )
     what = "with .npz: add the integers (NAME_q) and their steps (NAME_step)"
     p.add_argument("--symbols", action="store_true", help=what)
     what = "decode as many layers of a cut file as are whole; exit 3 then"
@@ -57,7 +62,9 @@ def _decode(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.codec.decoder import decode_partial
 
     start = time.perf_counter()
-    scene, complete = decode_partial(data, max_layer=args.max_layer, allow_partial=args.allow_partial)
+    scene, complete = decode_partial(
+        data, max_layer=args.max_layer, max_bytes=args.max_bytes, allow_partial=args.allow_partial
+    )
     seconds = time.perf_counter() - start
     console.detail(f"steps {scene.steps}")
     if kind == ".pt":
@@ -72,7 +79,7 @@ def _decode(args: argparse.Namespace, console: Console) -> int:
 
 
 def _input(args: argparse.Namespace, console: Console) -> bytes:
-    """The file's bytes; of a URL only those that --max-layer needs."""
+    """The file's bytes; of a URL only those that --max-layer and --max-bytes need."""
     from pd4dgs_codec.delivery.urls import is_url
 
     if not is_url(args.input):
@@ -82,7 +89,7 @@ def _input(args: argparse.Namespace, console: Console) -> bytes:
 
     transfer = Transfer(args.input)
     try:
-        data = fetch(transfer, args.max_layer)
+        data = fetch(transfer, args.max_layer, args.max_bytes)
     except DeliveryError as error:
         if not (args.allow_partial and transfer.data):
             raise

@@ -37,11 +37,15 @@ prefix that ends with a layer can be shown. What has no visible effect is left o
 --target-size makes layers small enough for a link with the least loss in the pictures: 425k for layer 0 is 1.7 s at
 2 Mbps. It takes a minute or more. Give --data, or only what the file's own camera shows is judged.
 
+--slices 50k lets a picture appear after the first 50 kB and improve with each further slice. It takes minutes as well,
+and the same pictures decide which anchors come first.
+
 {SOURCES}
 
 examples:
   pd4dgs-encode model.pt -o scene.pd4
   pd4dgs-encode model.pt -o small.pd4 --step-scale 2
+  pd4dgs-encode model.pt -o early.pd4 --slices 50k --data recordings/kitchen --downscale 2
   pd4dgs-encode model.pt -o fast.pd4 --target-size L0=350k --data recordings/kitchen --downscale 2
   pd4dgs-encode model.pt -o - | pd4dgs-decode -"""
 
@@ -67,6 +71,10 @@ def parser() -> Parser:
         p, "omit", "leave out what changes no picture and residuals too small to see, the former alone, or nothing"
     )
     p.add_argument("--no-verify", action="store_true", help="skip decoding the result and comparing every symbol")
+    what = (
+        "cut layers into slices of SIZE bytes, where planes and networks allow it; what pictures need most comes first"
+    )
+    p.add_argument("--slices", type=values.size, default=DEFAULTS.slices, metavar="SIZE", help=what)
     what = "most bytes that each layer may add to the file (layer 0 with the header): coarser steps, fewer anchors"
     p.add_argument("--target-size", type=values.layer_sizes, default={}, metavar="L0=425k,...", help=what)
     about = p.add_argument_group(
@@ -128,7 +136,7 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
     if trained and args.json:  # shown nowhere else, and it takes its time
         _add_train_rate(result, packed, options)
     write_bytes(args.output, packed.data, args.overwrite)
-    console.result(result, _text(result, 8 * packed.report.added_bytes()[0] / FIRST_FRAME_RATE), on_stdout=False)
+    console.result(result, _text(result, 8 * packed.report.first_bytes / FIRST_FRAME_RATE), on_stdout=False)
     return OK
 
 
@@ -141,6 +149,7 @@ def _options(args: argparse.Namespace) -> EncodeOptions:
         effort=args.effort,
         omit=args.omit,
         step_scale=args.step_scale,
+        slices=args.slices,
         verify=not args.no_verify,
     )
 
@@ -174,10 +183,10 @@ def _metadata(args: argparse.Namespace, had: Metadata | None) -> Metadata | None
 def _views(args: argparse.Namespace, console: Console) -> Views | None:
     if args.data is None:
         return None
-    from pd4dgs_codec.data.dataset import load
+    from pd4dgs_codec.interchange.teacher import load_source
     from pd4dgs_codec.pack.packing import Views
 
-    dataset = load(args.data, downscale=args.downscale, holdout=args.holdout)
+    dataset = load_source(args.data, downscale=args.downscale, holdout=args.holdout)
     views = Views.of(dataset, args.data, args.views)
     console.detail(f"{args.data}: {len(views.fitting)} training views, {len(views.held_out)} to judge by")
     if not dataset.test:
@@ -221,11 +230,27 @@ def _text(result: dict[str, Any], first_frame: float) -> str:
         lines.append(f"left out: {item['what']} ({item['bytes']:,} bytes{exactly}): {item['why']}")
     if "target" in result:
         lines += _target_lines(result["target"])
+    if "slices" in result:
+        lines += _slice_lines(result)
     verified = "verified" if result["verified"] else "not verified"
     name = "stdout" if result["output"] == STDIO else result["output"]
     lines.append(f"{name}: {result['bytes']:,} bytes, {verified}, {result['seconds']:.2f} s")
     lines.append(f"first frame after {first_frame:.2f} s at {FIRST_FRAME_RATE / 1e6:g} Mbps")
     return "\n".join(lines)
+
+
+def _slice_lines(result: dict[str, Any]) -> list[str]:
+    about = result["slices"]
+    sizes = [[row["bytes"] for row in layer["slices"]] for layer in result["layers"]]
+    lines = [
+        f"layer {layer['layer']}: slices of {', '.join(f'{size:,}' for size in own)} bytes"
+        for layer, own in zip(result["layers"], sizes, strict=True)
+    ]
+    seen = f" on {about['pictures']} pictures: {about['cameras']}" if about["pictures"] else ": the file has no camera"
+    lines.append(f"anchors ordered by {about['order']}{seen}")
+    if "psnr" in about:
+        lines.append(f"mPSNR after each slice: {', '.join(f'{db:.2f}' for db in about['psnr'])} dB on held-out views")
+    return lines
 
 
 def _target_lines(target: dict[str, Any]) -> list[str]:

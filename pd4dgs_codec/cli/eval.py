@@ -42,12 +42,12 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _evaluate(args: argparse.Namespace, console: Console) -> int:
-    from pd4dgs_codec.data.dataset import load
+    from pd4dgs_codec.interchange.teacher import load_source
     from pd4dgs_codec.metrics.perceptual import load_perceptual
     from pd4dgs_codec.view.evaluate import evaluate_file
 
     file = named_input(args.input)
-    dataset = load(args.source, downscale=args.downscale, holdout=args.holdout)
+    dataset = load_source(args.source, downscale=args.downscale, holdout=args.holdout)
     console.detail(f"{args.source}: {len(dataset.train)} training views, {len(dataset.test)} held out")
     if not dataset.test:
         console.message("no views are held out: measuring on the training views")

@@ -50,7 +50,7 @@ def _info(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.codec.info import hashes, info, nearest_bounds
 
     result = {"input": args.input, **info(data), "available": total}
-    end = result["layers"][0]["end"]
+    end = result["layers"][0]["slices"][0]["end"]
     result["first_frame_seconds"] = {name: 8 * end / rate for name, rate in args.at.items()}
     result["left_out"] = _left_out(result["layers"])
     if args.bytes:
@@ -151,6 +151,19 @@ def _about_lines(metadata: dict[str, Any] | None) -> list[str]:
     return [*lines, *([f"metadata cannot be read: {metadata['fault']}"] if "fault" in metadata else [])]
 
 
+def _slice_lines(result: dict[str, Any]) -> list[str]:
+    """Where the slices of layers in several end, and what each shows if the file says so."""
+    ends = [(row["layer"], part["end"]) for row in result["layers"] for part in row["slices"]]
+    if len(ends) == len(result["layers"]):
+        return []
+    quality = (result["metadata"] or {}).get("slices", [])
+    shown = quality if len(quality) == len(ends) else [None] * len(ends)
+    rows = [
+        (i, layer, number(end, 0), number(db, 2)) for i, ((layer, end), db) in enumerate(zip(ends, shown, strict=True))
+    ]
+    return [table(("slice", "layer", "prefix", "mPSNR dB"), rows)]
+
+
 def _bound_lines(declared: dict[str, float], nearest: dict[str, float]) -> list[str]:
     other = [what for what, bound in nearest.items() if declared[what] != bound]
     if not other:
@@ -177,6 +190,7 @@ def _text(result: dict[str, Any]) -> str:
                 for row in result["layers"]
             ],
         ),
+        *_slice_lines(result),
         *_about_lines(result["metadata"]),
         *_left_out_line(result["left_out"]),
         "errors at most: " + ", ".join(f"{what} {bound:.4g}" for what, bound in result["error_bounds"].items()),

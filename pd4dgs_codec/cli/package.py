@@ -21,9 +21,9 @@ if TYPE_CHECKING:
 
 DETAILS = """\
 DIR then holds scene.pd4 and index.html: a page that plays it in a browser, from any web server that DIR is copied to.
-The scripts of the player lie beside it. For other players there are index.json (byte ranges and SHA-256 of the layers),
-scene.mp4 and scene.mpd (DASH: each layer a fragment and an AdaptationSet of its own, with dependencyId) and scene.m3u8
-(HLS, whose session data names index.json).
+For other players there are index.json (byte ranges and SHA-256 of the layers), scene.mp4 and scene.mpd (DASH: each
+layer a fragment and an AdaptationSet of its own, with dependencyId) and scene.m3u8 (HLS, whose session data names
+index.json).
 
 DASH clients that follow dependencyId deliver the layers; showing them takes a .pd4 decoder. Stock DASH and HLS players
 play the 2D video: fallback.mp4, rendered from the scene with its own camera over its whole time. It needs torch, numba

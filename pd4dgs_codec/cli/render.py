@@ -42,6 +42,8 @@ def parser() -> Parser:
     what = "pictures such as out/%%04d.png, or a .gif or .mp4"
     p.add_argument("-o", "--output", required=True, metavar="OUT", help=what)
     p.add_argument("--max-layer", type=int, choices=(0, 1, 2), help="render what the layers up to this one give")
+    what = "render what the slices within the first SIZE bytes give, such as 50k"
+    p.add_argument("--max-bytes", type=values.size, metavar="SIZE", help=what)
     p.add_argument("--data", metavar="SOURCE", help="take cameras, times and true images from a dataset")
     p.add_argument("--split", choices=("test", "train"), default="test", help="which views of it (default: test)")
     add_reading(p)
@@ -72,7 +74,9 @@ def _render(args: argparse.Namespace, console: Console) -> int:
         from pd4dgs_codec.view.movie import check_mp4
 
         check_mp4()
-    levels = load_levels(named_input(args.input), args.max_layer, last_only=not args.side_by_side)
+    levels = load_levels(
+        named_input(args.input), args.max_layer, max_bytes=args.max_bytes, last_only=not args.side_by_side
+    )
     console.detail(f"{args.input}: levels " + ", ".join(f"{row.level} ({row.anchors} anchors)" for row in levels))
     frames = _frames(args, levels[-1])
     milliseconds: list[float] = []
@@ -107,13 +111,13 @@ def _check_usage(args: argparse.Namespace) -> str:
 
 
 def _frames(args: argparse.Namespace, level: Level) -> list[Frame]:
-    from pd4dgs_codec.data.dataset import load
     from pd4dgs_codec.errors import DataError
+    from pd4dgs_codec.interchange.teacher import load_source
     from pd4dgs_codec.view.frames import dataset_frames, own_frames
 
     if args.data is None:
         return own_frames(level.model.info, args.frames or 60, args.orbit, args.downscale)
-    dataset = load(args.data, downscale=args.downscale, holdout=args.holdout)
+    dataset = load_source(args.data, downscale=args.downscale, holdout=args.holdout)
     views = dataset.test if args.split == "test" else dataset.train
     if not views:
         raise DataError(f"{args.data}: has no held-out views; expected --split train or another --holdout")

@@ -117,14 +117,14 @@ def _train(args: argparse.Namespace, console: Console) -> int:
     check_output(args.output, args.overwrite or resuming_in_place)
     if args.log:
         check_output(args.log, args.overwrite or args.resume is not None)
-    from pd4dgs_codec.data.dataset import load
+    from pd4dgs_codec.interchange.teacher import load_source
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.train.loop import Trainer
 
     checkpoint.target(args.output)  # refuses a device now, not after the first minute
     device = _device(args.device, console)
     config = stored_config(args) if args.resume else _fresh_config(args)
-    dataset = load(args.source, downscale=config.downscale, holdout=config.holdout)
+    dataset = load_source(args.source, downscale=config.downscale, holdout=config.holdout)
     trainer = Trainer(config, dataset, device)
     if args.resume:
         trainer.resume(Path(args.resume))

@@ -31,6 +31,7 @@ port = _checked(int, lambda value: 0 <= value < 65536, "0 to 65535")
 seed = _checked(int, lambda value: 0 <= value <= 2**63 - 2, "an integer from 0 to 2^63 - 2")
 positive_float = _checked(float, lambda value: 0 < value < math.inf, "a number > 0")
 non_negative_float = _checked(float, lambda value: 0 <= value < math.inf, "a number >= 0")
+share = _checked(float, lambda value: 0 <= value <= 1, "a number from 0 to 1")
 finite_float = _checked(float, math.isfinite, "a number")
 
 
@@ -57,6 +58,11 @@ def rates(text: str) -> dict[str, float]:
 def duration(text: str) -> float:
     """Seconds: "50ms", "1.5s" or "1.5"."""
     return _scaled(text, {"ms": 1e-3, "s": 1.0}, "a time such as 50ms or 1.5s", low=0.0)
+
+
+def size(text: str) -> int:
+    """Bytes with k, M for 1e3, 1e6: "50k" -> 50000."""
+    return int(_scaled(text, {"k": 1e3, "M": 1e6}, "a size in bytes such as 50k", low=1.0))
 
 
 def layer_sizes(text: str) -> dict[int, int]:

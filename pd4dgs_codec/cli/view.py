@@ -52,20 +52,19 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _view(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.delivery.link import Link
-    from pd4dgs_codec.delivery.page import PAGE, page_files, single_page
+    from pd4dgs_codec.delivery.page import PAGE, page
     from pd4dgs_codec.delivery.server import Server
     from pd4dgs_codec.delivery.urls import is_url
 
     if args.output:
         check_output(args.output, args.overwrite)
         content = args.input if is_url(args.input) else _packed(args.input, console)
-        write_bytes(args.output, single_page(content).encode(), args.overwrite)
+        write_bytes(args.output, page(content).encode(), args.overwrite)
         console.result({"output": args.output, "input": args.input}, args.output, on_stdout=False)
         return OK
     with tempfile.TemporaryDirectory(prefix="pd4dgs-view-") as name:
         folder, source = Path(name), args.input
-        for part, content in page_files().items():
-            (folder / part).write_bytes(content)
+        (folder / PAGE).write_bytes(page().encode())
         if not is_url(source):
             (folder / SCENE).write_bytes(_packed(source, console))
             source = SCENE

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from pd4dgs_codec.bitstream.container import PREAMBLE_SIZE, read_chunk, read_preamble
-from pd4dgs_codec.codec.header import Header, scene_id_of, unpack_header
-from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
+from pd4dgs_codec.bitstream.container import CHUNK_OVERHEAD, PREAMBLE_SIZE, Chunk, read_chunk, read_preamble
+from pd4dgs_codec.codec.attribute_section import Past
+from pd4dgs_codec.codec.header import Header, layers_of, scene_id_of, unpack_header
+from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE, LayerKind
 from pd4dgs_codec.codec.layer_meta import Declared
 from pd4dgs_codec.codec.payload import read_layer
-from pd4dgs_codec.codec.symbols import LayerSymbols, assemble, check_last_layer
+from pd4dgs_codec.codec.symbols import LayerSymbols, TakenVoxels, assemble, check_last_layer, merged
+from pd4dgs_codec.entropy.priors import Prior
 from pd4dgs_codec.errors import DecodeError, Malformed, Truncated, UnsupportedFeature
 from pd4dgs_codec.scene import Scene
 
@@ -17,11 +19,19 @@ class LayerReader:
 
     def __init__(self) -> None:
         self.header: Header | None = None
-        self.layers: list[LayerSymbols] = []
         self.offset = 0  #: of the next chunk
+        self._whole: list[LayerSymbols] = []  # the layers before the last
+        self._slices: list[LayerSymbols] = []  # of the last layer
         self._index = 0
         self._scene_id = b""
         self._declared = Declared()
+        self._taken = TakenVoxels()
+        self._past: Past[Prior] | None = None
+
+    @property
+    def layers(self) -> list[LayerSymbols]:
+        """The layers read so far; slices of the last one may be missing."""
+        return [*self._whole, merged(self._slices)] if self._slices else []
 
     @property
     def complete(self) -> bool:
@@ -33,11 +43,12 @@ class LayerReader:
         assert self.header is not None
         return assemble(self.header.info, self.header.grid, self.layers)
 
-    def next_layer(self, data: bytes | bytearray, max_layer: int | None = None) -> LayerSymbols | None:
-        """Read on to the end of one more layer <= max_layer; None if the file has no more (clause "decoding process").
+    def next_slice(self, data: bytes | bytearray, max_layer: int | None = None, max_bytes: int | None = None) -> bool:
+        """Read on to the end of one more slice of a layer <= max_layer that ends within the first max_bytes; whether
+        the file has one more (clause "decoding process").
 
         Raises Truncated, with nothing consumed that a later call would miss, if `data` ends before; Malformed if
-        bytes follow the last chunk of a file that is read whole (max_layer None).
+        bytes follow the last chunk of a file that is read whole (neither limit).
         """
         if self.header is None:
             preamble = read_preamble(data)
@@ -46,17 +57,17 @@ class LayerReader:
         chunks = self.header.chunks
         while self._index < len(chunks):
             if max_layer is not None and not _any_layer(chunks[self._index :], max_layer):
-                return None
-            layer = self._read_chunk(data)
-            if layer is not None:
-                self.layers.append(layer)
-                return layer
-        if max_layer is None and len(data) > self.offset:
+                return False
+            if max_bytes is not None and self.offset + CHUNK_OVERHEAD + chunks[self._index][1] > max_bytes:
+                return False
+            if self._read_chunk(data):
+                return True
+        if max_layer is None and max_bytes is None and len(data) > self.offset:
             raise Malformed(f"{len(data) - self.offset} bytes follow the last chunk, expected none", offset=self.offset)
-        return None
+        return False
 
-    def _read_chunk(self, data: bytes | bytearray) -> LayerSymbols | None:
-        """The layer in the next chunk, or None if it is an ancillary one that is not known."""
+    def _read_chunk(self, data: bytes | bytearray) -> bool:
+        """Whether the next chunk is a slice, not an ancillary chunk."""
         assert self.header is not None
         expected_type, length = self.header.chunks[self._index]
         chunk = read_chunk(
@@ -69,30 +80,52 @@ class LayerReader:
         if kind is not None and chunk.ancillary:
             message = f"layer {kind.layer} is flagged ancillary, expected a critical chunk"
             raise Malformed(message, offset=self.offset, chunk=self._index)
-        layer = None
         if kind is not None:
+            self._check_place(chunk, kind.layer)
             try:
-                layer = read_layer(
-                    chunk.payload,
-                    kind,
-                    self.header.widths,
-                    self._declared,
-                    self.header.mode,
-                    self.header.raw_deformation,
-                )
-                check_last_layer([*self.layers, layer], self.header.info.voxel_size, self.header.grid)
-                _check_bounded(layer, self.header)
+                self._read_slice(chunk, kind)
             except DecodeError as error:
                 raise _located(error, self._index, self.offset) from None
-            symbols = sum(a.size for a in layer.arrays())
-            self._declared = self._declared.and_layer(len(layer.anchor_q), symbols, len(chunk.payload))
         self._index += 1
         self.offset = chunk.end
-        return layer
+        return kind is not None
+
+    def _goes_on(self, layer: int) -> bool:
+        """Whether a slice of `layer` before was read."""
+        return bool(self._slices) and self._slices[0].kind.layer == layer
+
+    def _check_place(self, chunk: Chunk, layer: int) -> None:
+        """Raise Malformed unless the slice's flags fit its place (clause "slices")."""
+        assert self.header is not None
+        expected, message = len(self._slices) if self._goes_on(layer) else 0, ""
+        following = layers_of(self.header.chunks[self._index + 1 :])[:1]
+        if chunk.slice != expected:
+            message = f"slice {chunk.slice} of layer {layer}, expected {expected}"
+        elif following and chunk.more != (following == [layer]):
+            told = "announces a further slice" if chunk.more else "ends its layer"
+            message = f"slice {expected} of layer {layer} {told}, but layer {following[0]} follows"
+        if message:
+            raise Malformed(message, offset=self.offset + 2, chunk=self._index)
+
+    def _read_slice(self, chunk: Chunk, kind: LayerKind) -> None:
+        assert self.header is not None
+        later = self._goes_on(kind.layer)
+        before = self._whole if later else self.layers
+        past = self._past if later else Past[Prior]() if chunk.more else None
+        header = self.header
+        read = read_layer(
+            chunk.payload, kind, header.widths, self._declared, header.mode, header.raw_deformation, later, past
+        )
+        check_last_layer([*before, read], self._taken, header.info.voxel_size, header.grid)
+        _check_bounded(read, header)
+        symbols = sum(a.size for a in read.arrays())
+        self._declared = self._declared.and_slice(len(read.anchor_q), symbols, len(chunk.payload))
+        self._whole, self._past = before, past
+        self._slices = [*self._slices, read] if later else [read]
 
 
 def _any_layer(chunks: tuple[tuple[int, int], ...], max_layer: int) -> bool:
-    return any(kind in BY_CHUNK_TYPE and BY_CHUNK_TYPE[kind].layer <= max_layer for kind, _ in chunks)
+    return any(layer <= max_layer for layer in layers_of(chunks))
 
 
 def _check_bounded(layer: LayerSymbols, header: Header) -> None:
@@ -108,14 +141,18 @@ def _located(error: DecodeError, chunk: int, offset: int) -> DecodeError:
     return kind(error.message, offset=offset, chunk=chunk)
 
 
-def read_layers(data: bytes, *, max_layer: int | None = None, allow_partial: bool = False) -> tuple[LayerReader, bool]:
+def read_layers(
+    data: bytes, *, max_layer: int | None = None, max_bytes: int | None = None, allow_partial: bool = False
+) -> tuple[LayerReader, bool]:
     """(reader that holds the layers asked for, whether none of them is missing); arguments as in `decode`."""
     if max_layer is not None and max_layer < 0:
         raise ValueError(f"max_layer must be 0 or more, found {max_layer}")
     reader = LayerReader()
     try:
-        while reader.next_layer(data, max_layer) is not None:
+        while reader.next_slice(data, max_layer, max_bytes):
             pass
+        if not reader.layers:
+            raise Truncated(f"{max_bytes} bytes end before the first slice does", offset=max_bytes)
     except Truncated:
         if not (allow_partial and reader.layers):
             raise
@@ -124,24 +161,29 @@ def read_layers(data: bytes, *, max_layer: int | None = None, allow_partial: boo
 
 
 def decode_layers(
-    data: bytes, *, max_layer: int | None = None, allow_partial: bool = False
+    data: bytes, *, max_layer: int | None = None, max_bytes: int | None = None, allow_partial: bool = False
 ) -> tuple[Header, list[LayerSymbols], bool]:
     """(header, symbols per layer, whether nothing asked for is missing)."""
-    reader, complete = read_layers(data, max_layer=max_layer, allow_partial=allow_partial)
+    reader, complete = read_layers(data, max_layer=max_layer, max_bytes=max_bytes, allow_partial=allow_partial)
     assert reader.header is not None
     return reader.header, reader.layers, complete
 
 
-def decode(data: bytes, *, max_layer: int | None = None, allow_partial: bool = False) -> Scene:
-    """The scene of a file, or of its layers <= max_layer (bytes after those are not looked at).
+def decode(
+    data: bytes, *, max_layer: int | None = None, max_bytes: int | None = None, allow_partial: bool = False
+) -> Scene:
+    """The scene of a file, or of its layers <= max_layer, or of the slices within its first max_bytes bytes, at least
+    one (bytes after those are not looked at).
 
-    A cut file raises Truncated, or yields its longest valid prefix of layers if allow_partial, which still needs
-    layer 0. Other faults raise the other DecodeErrors.
+    A cut file raises Truncated, or yields its longest valid prefix of slices if allow_partial, which still needs the
+    first one. Other faults raise the other DecodeErrors.
     """
-    return decode_partial(data, max_layer=max_layer, allow_partial=allow_partial)[0]
+    return decode_partial(data, max_layer=max_layer, max_bytes=max_bytes, allow_partial=allow_partial)[0]
 
 
-def decode_partial(data: bytes, *, max_layer: int | None = None, allow_partial: bool = True) -> tuple[Scene, bool]:
-    """(scene, complete): as decode, and whether every layer asked for was there."""
-    reader, complete = read_layers(data, max_layer=max_layer, allow_partial=allow_partial)
+def decode_partial(
+    data: bytes, *, max_layer: int | None = None, max_bytes: int | None = None, allow_partial: bool = True
+) -> tuple[Scene, bool]:
+    """(scene, complete): as decode, and whether every slice asked for was there."""
+    reader, complete = read_layers(data, max_layer=max_layer, max_bytes=max_bytes, allow_partial=allow_partial)
     return reader.scene(), complete

@@ -3,35 +3,63 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 import numpy as np
 
 from pd4dgs_codec.attributes.table import Grid
-from pd4dgs_codec.bitstream.container import CHUNK_OVERHEAD, FLAG_ANCILLARY, write_chunk, write_preamble
+from pd4dgs_codec.bitstream.container import (
+    CHUNK_OVERHEAD,
+    FLAG_ANCILLARY,
+    read_preamble,
+    slice_flags,
+    write_chunk,
+    write_preamble,
+)
+from pd4dgs_codec.bitstream.limits import MAX_CHUNKS
 from pd4dgs_codec.codec.bounds import ErrorBound, rounding_bounds, verify_errors
 from pd4dgs_codec.codec.check import check_scene
 from pd4dgs_codec.codec.decoder import decode_layers
-from pd4dgs_codec.codec.header import Header, pack_header, payload_digest, scene_id_of
+from pd4dgs_codec.codec.header import Header, pack_header, payload_digest, scene_id_of, unpack_header
 from pd4dgs_codec.codec.kinds import LAYER_KINDS
 from pd4dgs_codec.codec.layer_meta import Declared
 from pd4dgs_codec.codec.left_out import LeftOut
 from pd4dgs_codec.codec.metadata import CHUNK_TYPE, Metadata, write_metadata
 from pd4dgs_codec.codec.options import DEFAULTS, EncodeOptions
-from pd4dgs_codec.codec.payload import StreamReport, read_meta, write_layer
+from pd4dgs_codec.codec.payload import StreamReport, read_meta
 from pd4dgs_codec.codec.plan import plan
-from pd4dgs_codec.codec.symbols import LayerSymbols, assemble, check_last_layer, float_tensors, layer_symbols
+from pd4dgs_codec.codec.slicing import Slice, whole_layer, write_slices
+from pd4dgs_codec.codec.symbols import (
+    LayerSymbols,
+    TakenVoxels,
+    assemble,
+    check_last_layer,
+    float_tensors,
+    layer_symbols,
+)
 from pd4dgs_codec.errors import DecodeError, EncodeError
 from pd4dgs_codec.scene import Scene
 from pd4dgs_codec.threads import one_blas_thread
 
+#: Bytes that preamble, header and chunk list of a sliced file take at most; they count with the first slice.
+HEADER = 1000
+
+
+@dataclass(frozen=True)
+class SliceReport:
+    """One slice. bytes: its whole chunk."""
+
+    bytes: int
+    anchors: int
+
 
 @dataclass(frozen=True)
 class LayerReport:
-    """One layer. bytes: its whole chunk. payload_bits and rate_bits: sums over attributes, planes and weights (in mode
-    lzma one stream codes these and the masks together, and payload_bits is all of it). streams: every coded section.
+    """One layer. bytes: its chunks. slices: each of them. payload_bits and rate_bits: sums over attributes, planes and
+    weights (in mode lzma one stream codes these and the masks together, and payload_bits is all of it). streams: every
+    coded section.
     """
 
     layer: int
@@ -41,6 +69,7 @@ class LayerReport:
     position_bits: int
     symbols: int
     anchors: int
+    slices: list[SliceReport]
     streams: list[StreamReport]
 
 
@@ -64,6 +93,11 @@ class Report:
         header = self.bytes - sum(row.bytes for row in self.layers) - self.metadata_bytes
         return {row.layer: row.bytes + (header if row.layer == 0 else 0) for row in self.layers}
 
+    @property
+    def first_bytes(self) -> int:
+        """What the first picture takes: the header and the first slice."""
+        return self.added_bytes()[0] - sum(part.bytes for part in self.layers[0].slices[1:])
+
     def json(self) -> dict[str, Any]:
         """The report as plain dicts, lists, strings and numbers."""
         return asdict(self)
@@ -81,10 +115,13 @@ def encode_with_report(
     *,
     left_out: Sequence[LeftOut] = (),
     metadata: Metadata | None = None,
+    utility: Callable[[Scene], np.ndarray] | None = None,
     **changes: Any,
 ) -> tuple[bytes, Report]:
     """(file, report) of a scene.
 
+    utility: of the scene as it will be decoded, float [N]: what the pictures gain by each anchor, if the layers are
+    sliced; by_size if None.
     changes: fields of EncodeOptions by name, in place of those of `options`. left_out: what the caller has taken out of
     the scene, to be reported with the rest. metadata: what the file says about itself. Raises EncodeError.
     """
@@ -93,13 +130,17 @@ def encode_with_report(
     check_scene(scene)
     planned, omitted = plan(scene, options)
     symbols = [layer_symbols(planned, i, options.raw_deformation) for i in range(len(planned.layers))]
-    written = [write_layer(layer, options) for layer in symbols]
-    _check_limits(planned, symbols, [payload for payload, _ in written])
     meant = assemble(planned.info, Grid.of(planned), symbols)
+    if options.slices:
+        values = np.split((utility or by_size)(meant), meant.rows[:-1])
+        written = [write_slices(layer, options, u, HEADER) for layer, u in zip(symbols, values, strict=True)]
+    else:
+        written = [[whole_layer(layer, options)] for layer in symbols]
+    _check_limits(planned, symbols, written)
     about = write_metadata(metadata) if metadata is not None else b""
-    data = _container(meant, options, [payload for payload, _ in written], about)
+    data = _container(meant, options, written, about)
     errors = _verify(data, planned, symbols, meant) if options.verify else []
-    reports = [_layer_report(layer, payload, r) for layer, (payload, r) in zip(symbols, written, strict=True)]
+    reports = [_layer_report(layer, slices) for layer, slices in zip(symbols, written, strict=True)]
     kept = sum(r.anchors for r in reports)
     kept_bits = sum(r.position_bits + s.payload_bits for r in reports for s in r.streams if s.name == "attributes")
     rows = [item.row(scene.steps, options, kept, kept_bits) for item in (*left_out, *omitted)]
@@ -108,21 +149,50 @@ def encode_with_report(
     return data, Report(options.mode, len(data), options.verify, seconds, reports, rows, errors, about_bytes)
 
 
-def _check_limits(scene: Scene, symbols: list[LayerSymbols], payloads: list[bytes]) -> None:
+def by_size(scene: Scene) -> np.ndarray:
+    """float32 [N]: a guess at what the pictures gain by each anchor where no view is known: its gate in the highest
+    layer times the area that its Gaussians cover at most."""
+    scales = np.sort(scene.scaling_log[:, 3:], axis=1)[:, 1:].sum(axis=1)
+    utility: np.ndarray = scene.mask[-1] * np.exp(scales - scales.max(initial=0))
+    return utility
+
+
+def with_metadata(data: bytes, metadata: Metadata) -> bytes:
+    """A complete file with a metadata chunk more at its end; nothing else changes but the chunk list."""
+    preamble = read_preamble(data)
+    header, about = unpack_header(preamble.header), write_metadata(metadata)
+    packed = pack_header(replace(header, chunks=(*header.chunks, (CHUNK_TYPE, len(about)))))
+    chunk = write_chunk(CHUNK_TYPE, FLAG_ANCILLARY, scene_id_of(packed), about)
+    return write_preamble(packed) + data[preamble.size :] + chunk
+
+
+def _check_limits(scene: Scene, symbols: list[LayerSymbols], written: list[list[Slice]]) -> None:
     """Hold declared sizes and ranges of values against the format's limits as a decoder will, verified or not."""
-    declared = Declared()
-    for index, (layer, payload) in enumerate(zip(symbols, payloads, strict=True)):
-        try:
-            *_, declared = read_meta(payload, layer.kind, layer.widths, declared, layer.raw_deformation)
-            check_last_layer(symbols[: index + 1], scene.info.voxel_size, Grid.of(scene))
-        except DecodeError as error:
-            raise EncodeError(f"the scene is over a limit of the format: {error}") from None
+    declared, taken, grid = Declared(), TakenVoxels(), Grid.of(scene)
+    chunks = sum(map(len, written))
+    if chunks > MAX_CHUNKS:
+        raise EncodeError(f"{chunks} slices, expected at most {MAX_CHUNKS}: let slices take more bytes")
+    for index, (layer, slices) in enumerate(zip(symbols, written, strict=True)):
+        for number, part in enumerate(slices):
+            try:
+                *_, declared = read_meta(
+                    part.payload, layer.kind, layer.widths, declared, layer.raw_deformation, number > 0
+                )
+                layers = [*symbols[:index], part.symbols]
+                check_last_layer(layers, taken, scene.info.voxel_size, grid)
+            except DecodeError as error:
+                raise EncodeError(f"the scene is over a limit of the format: {error}") from None
 
 
-def _container(meant: Scene, options: EncodeOptions, payloads: list[bytes], metadata: bytes) -> bytes:
-    """The file of a scene as it will be decoded, from the payloads of its layers and of its metadata, if there is any.
+def _container(meant: Scene, options: EncodeOptions, written: list[list[Slice]], metadata: bytes) -> bytes:
+    """The file of a scene as it will be decoded, from the slices of its layers and its metadata, if there is any.
     The latter comes last: a picture does not wait for it."""
-    parts = [(LAYER_KINDS[layer].chunk_type, 0, payload) for layer, payload in zip(meant.layers, payloads, strict=True)]
+    parts = [
+        (LAYER_KINDS[layer].chunk_type, slice_flags(number, len(slices)), part.payload)
+        for layer, slices in zip(meant.layers, written, strict=True)
+        for number, part in enumerate(slices)
+    ]
+    payloads = [payload for *_, payload in parts]
     if metadata:
         parts.append((CHUNK_TYPE, FLAG_ANCILLARY, metadata))
     header = Header(
@@ -165,16 +235,32 @@ def _same(a: list[np.ndarray], b: list[np.ndarray]) -> bool:
     return len(a) == len(b) and all(x.shape == y.shape and np.array_equal(x, y) for x, y in zip(a, b, strict=True))
 
 
-def _layer_report(layer: LayerSymbols, payload: bytes, reports: list[StreamReport]) -> LayerReport:
-    positions, *streams = reports
+def _layer_report(layer: LayerSymbols, slices: list[Slice]) -> LayerReport:
+    positions, *streams = _added(slices)
+    rows = [SliceReport(CHUNK_OVERHEAD + len(part.payload), len(part.symbols.anchor_q)) for part in slices]
     counted = [s for s in streams if s.name not in ("masks", "floats")]
     return LayerReport(
         layer=layer.kind.layer,
-        bytes=len(write_chunk(layer.kind.chunk_type, 0, bytes(8), payload)),
+        bytes=sum(row.bytes for row in rows),
         payload_bits=sum(s.payload_bits for s in counted),
         rate_bits=sum(s.rate_bits for s in counted),
         position_bits=positions.payload_bits,
         symbols=sum(s.symbols for s in counted),
         anchors=len(layer.anchor_q),
+        slices=rows,
         streams=streams,
     )
+
+
+def _added(slices: list[Slice]) -> list[StreamReport]:
+    """By section, what all slices took; the positions come first."""
+    found: dict[str, StreamReport] = {}
+    for row in (row for part in slices for row in part.streams):
+        so_far = found.get(row.name, StreamReport(row.name, 0, 0.0, 0))
+        found[row.name] = StreamReport(
+            row.name,
+            so_far.payload_bits + row.payload_bits,
+            so_far.rate_bits + row.rate_bits,
+            so_far.symbols + row.symbols,
+        )
+    return list(found.values())

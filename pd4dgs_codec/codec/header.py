@@ -17,7 +17,7 @@ from pd4dgs_codec.bitstream.container import SCENE_ID_SIZE
 from pd4dgs_codec.bitstream.limits import MAX_CHUNKS, MAX_PAYLOAD
 from pd4dgs_codec.codec.check import info_fault
 from pd4dgs_codec.codec.fields import Fields, as_integer, as_list
-from pd4dgs_codec.codec.kinds import LAYER_KINDS
+from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE, LAYER_KINDS
 from pd4dgs_codec.codec.options import DEFORMATIONS, MODES, RAW_DEFORMATION
 from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.scene import ATTRIBUTES, MAX_FEATURE, MAX_SLOTS, Camera, SceneInfo, Widths
@@ -140,9 +140,13 @@ def unpack_header(data: bytes, offset: int = 0) -> Header:
     if fault is not None:
         raise Malformed(f"header: {fault}")
     widths = _unpack_widths(fields)
+    chunks, mode = _unpack_chunks(fields.sequence(CHUNKS)), fields.choice(MODE, MODES)
+    layers = layers_of(chunks)
+    if mode == "lzma" and len(set(layers)) < len(layers):
+        raise Malformed(f"header: layer chunks {layers} in mode lzma, expected each layer in one slice")
     return Header(
-        chunks=_unpack_chunks(fields.sequence(CHUNKS)),
-        mode=fields.choice(MODE, MODES),
+        chunks=chunks,
+        mode=mode,
         deformation=fields.choice(DEFORMATION, DEFORMATIONS),
         attribute_steps=dict(zip(ATTRIBUTES, steps, strict=True)),
         widths=widths,
@@ -190,10 +194,15 @@ def _unpack_chunks(rows: list[Any]) -> tuple[tuple[int, int], ...]:
                 as_integer(length, MAX_PAYLOAD, f"header: length of chunk {i}"),
             )
         )
-    layers = [kind for kind, _ in chunks if kind < len(LAYER_KINDS)]
-    if chunks[0][0] != 0 or layers != sorted(set(layers)):
-        raise Malformed(f"header: layer chunks {layers}, expected layer 0 first and each layer once, ascending")
+    layers = layers_of(chunks)
+    if chunks[0][0] != 0 or layers != sorted(layers):
+        raise Malformed(f"header: layer chunks {layers}, expected layer 0 first and the layers ascending")
     return tuple(chunks)
+
+
+def layers_of(chunks: Iterable[tuple[int, int]]) -> list[int]:
+    """The layer of each slice in a chunk list."""
+    return [kind for kind, _ in chunks if kind in BY_CHUNK_TYPE]
 
 
 def _unpack_widths(header: Fields) -> Widths:

@@ -24,15 +24,17 @@ FORMAT_VERSION = f"{MAJOR}.{MINOR}"
 def info(data: bytes) -> dict[str, Any]:
     """Header and layers of a file, or of its first bytes: only the preamble and header must be there.
 
-    layers: {layer, offset, bytes, end} (whole chunks; end = length of the prefix that holds layers 0 .. this one) and,
-    for chunks that `data` holds whole, anchors, steps, planes ([C, x, y, z, t] per scale), networks (output widths) and
-    sections (bytes by name; what else the chunk holds is its frame and its parameters).
-    metadata: {title, source, licence, command, quality, still_bytes} as far as given, {"fault"} if it cannot be read,
-    None where `data` holds no such chunk.
+    layers: {layer, offset, bytes, end, slices} (whole chunks; end = length of the prefix that holds layers 0 .. this
+    one) and, for layers that `data` holds whole, anchors, steps, planes ([C, x, y, z, t] per scale), networks (output
+    widths) and sections (bytes by name; what else the chunks hold is their frames and their parameters). slices:
+    {offset, bytes, end} and, of those that `data` holds whole, anchors.
+    metadata: {title, source, licence, command, quality, slices, still_bytes} as far as given, {"fault"} if it cannot be
+    read, None where `data` holds no such chunk.
     """
     preamble = read_preamble(data)
     header = unpack_header(preamble.header, offset=PREAMBLE_SIZE)
-    layers, others, offset, declared = [], [], preamble.size, Declared()
+    others, offset, declared = [], preamble.size, Declared()
+    layers: list[dict[str, Any]] = []
     metadata: dict[str, Any] | None = None
     for chunk_type, length in header.chunks:
         size = CHUNK_OVERHEAD + length
@@ -43,15 +45,30 @@ def info(data: bytes) -> dict[str, Any]:
             if chunk_type == CHUNK_TYPE and metadata is None and offset + size <= len(data):
                 metadata = _about(read_chunk(data, offset, type=chunk_type, length=length).payload)
         else:
-            row: dict[str, Any] = {"layer": kind.layer, **place}
+            later = bool(layers) and layers[-1]["layer"] == kind.layer
+            if not later:
+                layers.append({"layer": kind.layer, **place, "bytes": 0, "slices": []})
+            row = layers[-1]
+            row["slices"].append(place)
+            row |= {"bytes": row["bytes"] + size, "end": place["end"]}
             if offset + size <= len(data):
                 payload = read_chunk(data, offset, type=chunk_type, length=length).payload
-                meta, _, declared = read_meta(payload, kind, header.widths, declared, header.raw_deformation)
-                row |= {"anchors": meta.rows, "steps": meta.steps}
-                row["planes"] = [[s.channels, *s.sides] for s in meta.scales]
-                row["sections"] = {Section(key).name.lower(): length for key, length in sorted(meta.sections.items())}
-                row["networks"] = {name: list(widths) for name, widths in meta.networks.items()}
-            layers.append(row)
+                meta, _, declared = read_meta(payload, kind, header.widths, declared, header.raw_deformation, later)
+                place["anchors"] = meta.rows
+                row["anchors"] = row.get("anchors", 0) + meta.rows
+                if not later:
+                    row |= {
+                        "steps": meta.steps,
+                        "planes": [[s.channels, *s.sides] for s in meta.scales],
+                        "sections": {},
+                    }
+                    row["networks"] = {name: list(widths) for name, widths in meta.networks.items()}
+                for key, section_bytes in sorted(meta.sections.items()):
+                    name = Section(key).name.lower()
+                    row["sections"][name] = row["sections"].get(name, 0) + section_bytes
+            else:
+                for told in ("anchors", "steps", "planes", "sections", "networks"):
+                    row.pop(told, None)
         offset += size
     return {
         "format_version": f"{preamble.major}.{preamble.minor}",
@@ -94,7 +111,8 @@ def _about(payload: bytes) -> dict[str, Any]:
         return {"fault": str(error)}
     texts = {name: text for name in TEXTS if (text := getattr(found, name))}
     quality = {"quality": {str(level): db for level, db in found.quality.items()}} if found.quality else {}
-    return {**texts, **quality, **({"still_bytes": len(found.still)} if found.still else {})}
+    slices = {"slices": list(found.slices)} if found.slices else {}
+    return {**texts, **quality, **slices, **({"still_bytes": len(found.still)} if found.still else {})}
 
 
 def nearest_bounds(data: bytes) -> dict[str, float]:

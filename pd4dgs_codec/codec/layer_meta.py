@@ -1,4 +1,5 @@
-"""What only one layer needs, at the start of its payload: rows, section lengths, steps, plane sizes, network widths."""
+"""What only one slice needs, at the start of its payload: rows and section lengths; in a layer's first slice steps,
+plane sizes and network widths as well."""
 
 from __future__ import annotations
 
@@ -43,7 +44,7 @@ ROWS, SECTIONS, STEPS, SCALES, NETWORKS = range(1, 6)
 #: A file of S symbols has at least (S - FREE_SYMBOLS) / SYMBOLS_PER_BYTE bytes, so that a few bytes that declare
 #: constant channels cannot make a decoder allocate without end. Real scenes spend over 0.1 bit per symbol.
 FREE_SYMBOLS = 1 << 22
-SYMBOLS_PER_BYTE = 2048
+SYMBOLS_PER_BYTE = 1024
 #: An anchor may cost next to nothing and its position takes up to 42 symbols; real anchors take tens of bytes.
 FREE_ROWS = 1 << 13
 ROWS_PER_BYTE = 2
@@ -51,14 +52,14 @@ ROWS_PER_BYTE = 2
 
 @dataclass(frozen=True)
 class Declared:
-    """What the layers of a file declare so far: rows, symbols (or values), and the bytes of their payloads."""
+    """What the slices of a file declare so far: rows, symbols (or values), and the bytes of their payloads."""
 
     rows: int = 0
     symbols: int = 0
     payload_bytes: int = 0
 
-    def and_layer(self, rows: int, symbols: int, payload_bytes: int) -> Declared:
-        """With one more layer."""
+    def and_slice(self, rows: int, symbols: int, payload_bytes: int) -> Declared:
+        """With one more slice."""
         return Declared(self.rows + rows, self.symbols + symbols, self.payload_bytes + payload_bytes)
 
 
@@ -77,7 +78,7 @@ class ScaleMeta:
 
 @dataclass(frozen=True)
 class LayerMeta:
-    """rows: the layer's own anchors. sections: length in bytes by Section. steps: by field of Steps.
+    """rows: the slice's own anchors. sections: length in bytes by Section. steps: by field of Steps.
 
     networks: per name the outputs of its linear layers; the first input follows from the layer (input_width). widths:
     those of the scene's anchors.
@@ -122,13 +123,17 @@ def pack_meta(meta: LayerMeta, kind: LayerKind) -> bytes:
     return canonical.pack(fields)
 
 
-def unpack_meta(data: bytes, kind: LayerKind, widths: Widths, rows_before: int, raw_deformation: bool) -> LayerMeta:
-    """The inverse of pack_meta (clause "layer parameters"); every count is within its limit afterwards."""
+def unpack_meta(
+    data: bytes, kind: LayerKind, widths: Widths, rows_before: int, raw_deformation: bool, later: bool
+) -> LayerMeta:
+    """The inverse of pack_meta (clause "layer parameters"); every count is within its limit afterwards.
+
+    later: whether it is a slice behind the layer's first."""
     where = f"layer {kind.layer}"
     fields = Fields(canonical.unpack(data), where, set(range(ROWS, NETWORKS + 1)))
     known_sections = {int(s) for s in Section}
     sections = Fields(fields.get(SECTIONS), f"{where} sections", known_sections)
-    networks = _unpack_networks(fields, kind, widths, where)
+    networks = {} if later else _unpack_networks(fields, kind, widths, where)
     meta = LayerMeta(
         rows=fields.integer(ROWS, MAX_ANCHORS - rows_before),
         sections={s: sections.integer(s, MAX_PAYLOAD, low=1) for s in known_sections if s in sections},
@@ -137,25 +142,25 @@ def unpack_meta(data: bytes, kind: LayerKind, widths: Widths, rows_before: int, 
         networks=networks,
         widths=widths,
     )
-    for key, expected in ((STEPS, bool(networks)), (SCALES, bool(meta.scales))):
+    for key, expected in ((STEPS, bool(networks)), (SCALES, bool(meta.scales)), (NETWORKS, bool(networks))):
         if (key in fields) != expected:
             raise Malformed(f"{where}: key {key} is {'missing' if expected else 'there'} without reason")
     return meta
 
 
-def declared_symbols(meta: LayerMeta, kind: LayerKind, rows_before: int) -> int:
-    """Symbols (or float32 values) that the parameters say the layer has, voxel indices and masks included."""
+def declared_symbols(meta: LayerMeta, kind: LayerKind, rises: int) -> int:
+    """Symbols (or float32 values) that the parameters say the slice has, voxel indices and masks included."""
     cells = sum(math.prod(shape) for shape in meta.plane_shapes())
-    weights = sum(math.prod(shape) for shape in meta.weight_shapes(kind))
-    return rows_before + meta.rows * (meta.widths.channels + meta.widths.graded + 4) + cells + weights
+    weights = sum(math.prod(shape) for shape in meta.weight_shapes(kind)) if meta.networks else 0
+    return rises + meta.rows * (meta.widths.channels + meta.widths.graded + 4) + cells + weights
 
 
-def check_symbol_count(meta: LayerMeta, kind: LayerKind, before: Declared, payload_bytes: int) -> Declared:
-    """What the file declares with this layer; LimitExceeded if that is more than its payloads could reasonably hold."""
+def check_symbol_count(meta: LayerMeta, kind: LayerKind, before: Declared, payload_bytes: int, rises: int) -> Declared:
+    """What the file declares with this slice; LimitExceeded if that is more than its payloads could reasonably hold."""
     cells = sum(math.prod(shape) for shape in meta.plane_shapes())
     if cells > MAX_PLANE_CELLS:
         raise LimitExceeded(f"layer {kind.layer}: planes of {cells} cells, limit {MAX_PLANE_CELLS}")
-    total = before.and_layer(meta.rows, declared_symbols(meta, kind, before.rows), payload_bytes)
+    total = before.and_slice(meta.rows, declared_symbols(meta, kind, rises), payload_bytes)
     for what, found, free, per_byte in (
         ("anchors", total.rows, FREE_ROWS, ROWS_PER_BYTE),
         ("symbols", total.symbols, FREE_SYMBOLS, SYMBOLS_PER_BYTE),

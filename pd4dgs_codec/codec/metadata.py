@@ -12,13 +12,14 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from pd4dgs_codec.bitstream import canonical
+from pd4dgs_codec.bitstream.limits import MAX_CHUNKS
 from pd4dgs_codec.codec.fields import Fields, as_integer
 from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
 
 CHUNK_TYPE = 3  #: ancillary
 
 # Keys of the map; what is empty is absent.
-TITLE, SOURCE, LICENCE, COMMAND, QUALITY, STILL = range(1, 7)
+TITLE, SOURCE, LICENCE, COMMAND, QUALITY, STILL, SLICES = range(1, 8)
 TEXTS = {"title": TITLE, "source": SOURCE, "licence": LICENCE, "command": COMMAND}
 
 MAX_COMPRESSED = MAX_CONTENT = 1 << 18  #: bytes; a reader allocates no more than the second
@@ -34,7 +35,8 @@ COMPRESSION_LEVEL = 19
 class Metadata:
     """title, source (what the scene was made of), licence, command (that made the file): one line of printable text
     each, "" if not given. quality: mPSNR in dB on held-out views by level, binary32 values. still: a small picture of
-    the scene, the bytes of a PNG, JPEG or WebP file, b"" if there is none."""
+    the scene, the bytes of a PNG, JPEG or WebP file, b"" if there is none. slices: mPSNR in dB on held-out views after
+    each slice, in file order."""
 
     title: str = ""
     source: str = ""
@@ -42,6 +44,7 @@ class Metadata:
     command: str = ""
     quality: Mapping[int, float] = field(default_factory=dict)
     still: bytes = b""
+    slices: tuple[float, ...] = ()
 
 
 def write_metadata(metadata: Metadata) -> bytes:
@@ -53,9 +56,11 @@ def write_metadata(metadata: Metadata) -> bytes:
         fields[QUALITY] = {level: float(np.float32(db)) for level, db in metadata.quality.items()}
     if metadata.still:
         fields[STILL] = metadata.still
+    if metadata.slices:
+        fields[SLICES] = [float(np.float32(db)) for db in metadata.slices]
     content = canonical.pack(fields)
     try:
-        _checked(Fields(canonical.unpack(content), "metadata", set(range(TITLE, STILL + 1))))
+        _checked(Fields(canonical.unpack(content), "metadata", set(range(TITLE, SLICES + 1))))
     except (Malformed, LimitExceeded) as error:
         raise EncodeError(str(error)) from None
     compressor = zstandard.ZstdCompressor(level=COMPRESSION_LEVEL, write_content_size=True, write_checksum=False)
@@ -78,7 +83,7 @@ def read_metadata(data: bytes) -> Metadata:
         content = zstandard.ZstdDecompressor().decompress(data, allow_extra_data=False)
     except zstandard.ZstdError as error:
         raise Malformed(f"metadata: not one whole zstd frame: {error}") from None
-    return _checked(Fields(canonical.unpack(content), "metadata", set(range(TITLE, STILL + 1))))
+    return _checked(Fields(canonical.unpack(content), "metadata", set(range(TITLE, SLICES + 1))))
 
 
 def _check_size(what: str, size: int, limit: int, error: type[EncodeError] | type[LimitExceeded]) -> None:
@@ -91,6 +96,7 @@ def _checked(fields: Fields) -> Metadata:
         **{name: _text(fields, key, name) for name, key in TEXTS.items()},
         quality=_quality(fields),
         still=_still(fields),
+        slices=_slices(fields),
     )
 
 
@@ -111,6 +117,13 @@ def _quality(fields: Fields) -> dict[int, float]:
     if not isinstance(levels, dict) or not levels or not all(isinstance(db, float) for db in levels.values()):
         raise Malformed("metadata: quality, expected dB as float 32 by level")
     return {as_integer(level, MAX_LEVEL, "metadata: level"): db for level, db in levels.items()}
+
+
+def _slices(fields: Fields) -> tuple[float, ...]:
+    if SLICES not in fields:
+        return ()
+    as_integer(len(fields.sequence(SLICES)), MAX_CHUNKS, "metadata: slices", low=1)
+    return fields.reals(SLICES, len(fields.sequence(SLICES)))
 
 
 def _still(fields: Fields) -> bytes:

@@ -32,6 +32,10 @@ CHOICES: Mapping[str, Sequence[str | int]] = {
 }
 
 
+#: A slice's frame and parameters take some 50 bytes, and its channels name a prior each.
+LEAST_SLICE = 1000
+
+
 @dataclass(frozen=True)
 class EncodeOptions:
     """Options of the encoder. Raises EncodeError for a value that is none.
@@ -42,6 +46,8 @@ class EncodeOptions:
     keeps the layers up to that number and only drops heads that are exactly zero. effort: 1 (fast) .. 9 (small). omit:
     "bounded" leaves out what those bounds allow and what changes no picture, "lossless" only the latter, "nothing" only
     heads that are exactly zero and anchors below the mask threshold. step_scale multiplies every quantisation step.
+    slices: bytes that a slice of a layer takes at most where its planes and networks allow it, the header counted with
+    the first; 0 for one slice per layer.
     verify: decode the result, compare every symbol and every float, and hold every float against the error bound in the
     header.
     """
@@ -53,6 +59,7 @@ class EncodeOptions:
     effort: int = 5
     omit: str = "bounded"
     step_scale: float = 1.0
+    slices: int = 0
     verify: bool = True
 
     def __post_init__(self) -> None:
@@ -62,6 +69,10 @@ class EncodeOptions:
                 raise EncodeError(f"{name} {value!r}, expected one of {list(allowed)}")
         if not 0 < self.step_scale < math.inf:
             raise EncodeError(f"step_scale {self.step_scale!r}, expected a positive number")
+        if self.slices and self.slices < LEAST_SLICE:
+            raise EncodeError(f"slices of {self.slices} bytes, expected 0 or {LEAST_SLICE} and more")
+        if self.slices and self.mode != "ans":
+            raise EncodeError(f"slices in mode {self.mode}, expected mode ans or one slice per layer")
 
     @property
     def raw_deformation(self) -> bool:

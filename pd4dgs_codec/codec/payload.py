@@ -1,8 +1,8 @@
-"""A layer's symbols <-> its chunk's payload.
+"""A slice's symbols <-> its chunk's payload. A layer is one slice or more; the later ones hold anchors alone.
 
 Payload: u32 length of the parameters, the parameters (layer_meta), then the sections in the order of Section.
 Mode ans codes each group of channels as one section; mode lzma codes all of them as one LZMA2 stream. A channel is one
-attribute scalar over the layer's anchors, one plane channel (its residuals, row by row), or one weight matrix or bias.
+attribute scalar over the slice's anchors, one plane channel (its residuals, row by row), or one weight matrix or bias.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from pd4dgs_codec.attributes import planes as decorrelation
 from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
 from pd4dgs_codec.attributes.table import NO_CLASSES
 from pd4dgs_codec.bitstream.limits import MAX_PARAMETERS
-from pd4dgs_codec.codec.attribute_section import by_class, check_classes, read_attributes, write_attributes
+from pd4dgs_codec.codec.attribute_section import Past, by_class, check_classes, read_attributes, write_attributes
 from pd4dgs_codec.codec.kinds import LayerKind
 from pd4dgs_codec.codec.layer_meta import (
     Declared,
@@ -34,6 +34,7 @@ from pd4dgs_codec.codec.plane_section import read_planes, write_planes
 from pd4dgs_codec.codec.symbols import LayerSymbols
 from pd4dgs_codec.entropy.bits import entropy_bits, gaussian_bits
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
+from pd4dgs_codec.entropy.fitting import Fitted
 from pd4dgs_codec.entropy.lzma_mode import (
     decode_channels_lzma,
     decode_floats_lzma,
@@ -41,6 +42,7 @@ from pd4dgs_codec.entropy.lzma_mode import (
     encode_floats_lzma,
 )
 from pd4dgs_codec.entropy.positions import decode_positions, encode_positions
+from pd4dgs_codec.entropy.priors import Prior
 from pd4dgs_codec.errors import LimitExceeded, Malformed
 from pd4dgs_codec.scene import MASK_MIN_CODE, PLANES, Network, Planes, Widths
 
@@ -58,10 +60,19 @@ class StreamReport:
     symbols: int
 
 
-def write_layer(symbols: LayerSymbols, options: EncodeOptions) -> tuple[bytes, list[StreamReport]]:
-    """(payload, what each section took; the first report is the positions'). Inverse: read_layer."""
+def write_layer(
+    symbols: LayerSymbols,
+    options: EncodeOptions,
+    past: Past[Fitted] | None = None,
+    population: LayerSymbols | None = None,
+) -> tuple[bytes, list[StreamReport]]:
+    """(payload, what each section took; the first report is the positions'). Inverse: read_layer.
+
+    past: of the layer's slices before this one, which is added. population: the whole layer.
+    """
     groups, predictors = channel_groups(symbols)
-    positions = encode_positions(symbols.anchor_q, options.effort)
+    past = past or Past()
+    positions = encode_positions(symbols.anchor_q, options.effort, past.positions)
     sections = {Section.POSITIONS: positions}
     reports = [StreamReport("positions", 8 * len(positions), 0.0, symbols.anchor_q.size)]
     if options.mode == "lzma":
@@ -70,8 +81,9 @@ def write_layer(symbols: LayerSymbols, options: EncodeOptions) -> tuple[bytes, l
         if not any(channel.size for channel in channels):
             continue
         if section == Section.ATTRIBUTES:
+            everything = None if population is None else (population.attributes, population.classes)
             data, rate_bits = write_attributes(
-                symbols.attributes, symbols.classes, symbols.widths, options.priors, options.effort
+                symbols.attributes, symbols.classes, symbols.widths, options.priors, options.effort, past, everything
             )
         elif section == Section.PLANES:
             data, rate_bits = write_planes(_by_plane(channels, symbols), options.priors, options.effort)
@@ -79,7 +91,9 @@ def write_layer(symbols: LayerSymbols, options: EncodeOptions) -> tuple[bytes, l
             coded = encode_channels_lzma(channels, effort=options.effort)
             data, rate_bits = coded.payload, _rate_bits(symbols, coded.rate_bits, channels)
         else:
-            coded = encode_channels(channels, priors=options.priors, effort=options.effort)
+            known = past.masks if section == Section.MASKS else []
+            coded = encode_channels(channels, priors=options.priors, effort=options.effort, known=known)
+            known += coded.defined
             data, rate_bits = coded.payload, coded.rate_bits
         sections[section] = data
         count = sum(channel.size for channel in channels)
@@ -143,10 +157,16 @@ def _meta(symbols: LayerSymbols, sections: dict[Section, bytes], predictors: lis
 
 
 def read_meta(
-    payload: bytes | memoryview, kind: LayerKind, widths: Widths, before: Declared, raw_deformation: bool
+    payload: bytes | memoryview,
+    kind: LayerKind,
+    widths: Widths,
+    before: Declared,
+    raw_deformation: bool,
+    later: bool = False,
 ) -> tuple[LayerMeta, int, Declared]:
-    """(parameters, offset of the first section, what the file declares with this layer) of a payload, all lengths
-    checked against the bytes there are. widths: of the anchors; before: what the layers before it declare."""
+    """(parameters, offset of the first section, what the file declares with this slice) of a payload, all lengths
+    checked against the bytes there are. widths: of the anchors. before: what the slices before it declare. later:
+    behind its layer's first."""
     if len(payload) < 4:
         raise Malformed(f"layer {kind.layer}: payload of {len(payload)} bytes, expected at least 4")
     (length,) = struct.unpack_from("<I", payload)
@@ -154,30 +174,38 @@ def read_meta(
         raise LimitExceeded(f"layer {kind.layer}: parameters of {length} bytes, limit {MAX_PARAMETERS}")
     if length > len(payload) - 4:
         raise Malformed(f"layer {kind.layer}: parameters of {length} bytes in a payload of {len(payload)}")
-    meta = unpack_meta(bytes(payload[4 : 4 + length]), kind, widths, before.rows, raw_deformation)
+    meta = unpack_meta(bytes(payload[4 : 4 + length]), kind, widths, before.rows, raw_deformation, later)
     start, declared = 4 + length, sum(meta.sections.values())
     if start + declared != len(payload):
         raise Malformed(f"layer {kind.layer}: sections of {declared} bytes, expected {len(payload) - start}")
-    return meta, start, check_symbol_count(meta, kind, before, len(payload))
+    return meta, start, check_symbol_count(meta, kind, before, len(payload), 0 if later else before.rows)
 
 
 def read_layer(
-    payload: bytes | memoryview, kind: LayerKind, widths: Widths, before: Declared, mode: str, raw_deformation: bool
+    payload: bytes | memoryview,
+    kind: LayerKind,
+    widths: Widths,
+    before: Declared,
+    mode: str,
+    raw_deformation: bool,
+    later: bool = False,
+    past: Past[Prior] | None = None,
 ) -> LayerSymbols:
-    """The symbols of a payload (clause "layer payload"). widths: of the anchors; before: what the layers before this
-    one declare.
+    """The symbols of a payload (clause "layer payload"). widths: of the anchors. before: what the slices before this
+    one declare. later: it stands behind its layer's first. past: of the layer's slices before, to which this one is
+    added.
 
     Raises DecodeError's subclasses; nothing is allocated for a count that the limits or the payload do not cover.
     """
-    meta, start, _ = read_meta(payload, kind, widths, before, raw_deformation)
+    meta, start, _ = read_meta(payload, kind, widths, before, raw_deformation, later)
     parts: dict[int, bytes] = {}
     for section, length in sorted(meta.sections.items()):
         parts[section] = bytes(payload[start : start + length])
         start += length
     raw_deformation = raw_deformation and bool(meta.networks) and kind.layer > 0
     shapes = [*meta.plane_shapes(), *meta.weight_shapes(kind)]
-    counts = _channel_counts(meta, kind, before.rows, raw_deformation)
-    channels = _decode_groups(parts, counts, meta, mode)
+    counts = _channel_counts(meta, kind, 0 if later else before.rows, raw_deformation)
+    channels = _decode_groups(parts, counts, meta, mode, past)
     if raw_deformation:
         floats = decode_floats_lzma(_part(parts, Section.FLOATS, 1), [math.prod(shape) for shape in shapes])
         tensors = [x.reshape(shape) for x, shape in zip(floats, shapes, strict=True)]
@@ -208,13 +236,11 @@ def _part(parts: dict[int, bytes], section: Section, symbols: int) -> bytes:
     return parts.pop(section, b"")
 
 
-def _channel_counts(
-    meta: LayerMeta, kind: LayerKind, rows_before: int, raw_deformation: bool
-) -> dict[Section, list[int]]:
+def _channel_counts(meta: LayerMeta, kind: LayerKind, rises: int, raw_deformation: bool) -> dict[Section, list[int]]:
     planes = [] if raw_deformation else [h * w for c, h, w in meta.plane_shapes() for _ in range(c)]
     weights = [] if raw_deformation else [math.prod(shape) for shape in meta.weight_shapes(kind)]
     return {
-        Section.MASKS: [rows_before, meta.rows],
+        Section.MASKS: [rises, meta.rows],
         Section.ATTRIBUTES: [meta.rows] * (meta.widths.channels + meta.widths.graded),
         Section.PLANES: planes,
         Section.WEIGHTS: weights,
@@ -222,11 +248,11 @@ def _channel_counts(
 
 
 def _decode_groups(
-    parts: dict[int, bytes], counts: dict[Section, list[int]], meta: LayerMeta, mode: str
+    parts: dict[int, bytes], counts: dict[Section, list[int]], meta: LayerMeta, mode: str, past: Past[Prior] | None
 ) -> dict[Section, list[np.ndarray]]:
     rows = counts[Section.MASKS][1]
-    data = _part(parts, Section.POSITIONS, rows)
-    channels: dict[Section, list[np.ndarray]] = {Section.POSITIONS: [decode_positions(data, rows)]}
+    anchor_q = decode_positions(_part(parts, Section.POSITIONS, rows), rows, past.positions if past else None)
+    channels: dict[Section, list[np.ndarray]] = {Section.POSITIONS: [anchor_q]}
     if mode == "lzma":
         flat = [count for section in GROUPS for count in counts[section]]
         data = _part(parts, Section.SYMBOLS, sum(flat))
@@ -239,14 +265,15 @@ def _decode_groups(
         if not data:
             channels[section] = _zeros(counts[section])
         elif section == Section.ATTRIBUTES:
-            classes, attributes = read_attributes(data, meta.widths, rows)
+            classes, attributes = read_attributes(data, meta.widths, rows, past)
             channels[section] = [*([classes] if meta.widths.graded else []), *attributes]
         elif section == Section.PLANES:
             channels[section] = [
                 channel.ravel() for plane in read_planes(data, meta.plane_shapes()) for channel in plane
             ]
         else:
-            channels[section] = decode_channels(data, counts[section])
+            known = past.masks if past and section == Section.MASKS else None
+            channels[section] = decode_channels(data, counts[section], known)
     return channels
 
 

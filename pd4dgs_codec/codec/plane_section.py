@@ -16,10 +16,11 @@ import numpy as np
 from pd4dgs_codec.codec.stages import (
     PLAIN,
     STAGED,
+    CodedSection,
     activity_classes,
     cheapest_class_count,
+    coded_stages,
     places_of,
-    put_stages,
     read_class_count,
     read_stages,
     relative_magnitude,
@@ -35,7 +36,8 @@ Shape = tuple[int, int, int]  #: channels, rows, columns
 def write_planes(residuals: Sequence[np.ndarray], priors: str, effort: int) -> tuple[bytes, float]:
     """(section bytes, sum of R(a) over all channels) of residuals int32 [C, H, W] per plane, in the smaller form."""
     channels = [channel.ravel() for plane in residuals for channel in plane]
-    return smaller_form(channels, lambda: _write_staged(residuals, effort), priors, effort)
+    section, rate_bits = smaller_form(channels, lambda: _write_staged(residuals, effort), priors, effort)
+    return section.data, rate_bits
 
 
 def read_planes(data: bytes, shapes: Sequence[Shape]) -> list[np.ndarray]:
@@ -54,7 +56,7 @@ def read_planes(data: bytes, shapes: Sequence[Shape]) -> list[np.ndarray]:
     return [plane.astype(np.int32).reshape(shape) for plane, shape in zip(planes, shapes, strict=True)]
 
 
-def _write_staged(residuals: Sequence[np.ndarray], effort: int) -> bytes:
+def _write_staged(residuals: Sequence[np.ndarray], effort: int) -> CodedSection:
     shapes: list[Shape] = [plane.shape for plane in residuals]
     planes = [plane.reshape(len(plane), -1).astype(np.int64) for plane in residuals]
     counts = []
@@ -65,8 +67,8 @@ def _write_staged(residuals: Sequence[np.ndarray], effort: int) -> bytes:
     out = bytearray([STAGED])
     for count in counts:
         put_varint(out, count)
-    put_stages(out, [[channel[at] for channel, at in places] for places in _places(planes, shapes, counts)], effort)
-    return bytes(out)
+    stages = [[channel[at] for channel, at in places] for places in _places(planes, shapes, counts)]
+    return coded_stages(out, stages, effort)
 
 
 def _stage_count(shapes: Sequence[Shape]) -> int:

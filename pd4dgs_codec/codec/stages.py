@@ -8,13 +8,15 @@ each class has a prior of its own. All arithmetic is on integers.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
 from itertools import accumulate
 
 import numpy as np
 
 from pd4dgs_codec.entropy.bits import entropy_bits
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
-from pd4dgs_codec.entropy.fitting import histogram, split_bits
+from pd4dgs_codec.entropy.fitting import Fitted, histogram, split_bits
+from pd4dgs_codec.entropy.priors import Prior
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint
 from pd4dgs_codec.errors import Malformed
 
@@ -27,24 +29,38 @@ CLASS_COUNTS = (1, 2, 3, 4, 5, 6, 8)
 PRIOR_BITS = 40
 
 
-def relative_magnitude(residuals: np.ndarray) -> np.ndarray:
+def relative_magnitude(residuals: np.ndarray, places: int = 0, sums: np.ndarray | None = None) -> np.ndarray:
     """int64 [n]: sum over channels of the magnitudes of residuals int64 [m, n] relative to their channel's mean, in
-    units of 1/256. Below 2^8 m n."""
+    units of 1/256. Below 2^8 m n.
+
+    places, sums: of other residuals, int64 [m] the sums of their magnitudes, if theirs is the mean that counts; a
+    magnitude then counts as no more than the sum.
+    """
     magnitude = np.abs(residuals)
+    if sums is None:
+        places, sums = magnitude.shape[1], magnitude.sum(axis=1)
+    else:
+        magnitude = np.minimum(magnitude, sums[:, None])
     total: np.ndarray
-    if int(magnitude.max(initial=0)) * (magnitude.shape[1] << 8) < EXACT:
+    if int(magnitude.max(initial=0)) * (places << 8) < EXACT:
         # of integers below 2^53 the rounded quotient has the floor of the true one, and processors divide reals faster
-        shares = (magnitude * float(magnitude.shape[1] << 8)) / (magnitude.sum(axis=1, keepdims=True) + 1)
+        shares = (magnitude * float(places << 8)) / (sums[:, None] + 1)
         total = np.floor(shares, out=shares).sum(axis=0).astype(np.int64)
     else:
-        total = (magnitude * (magnitude.shape[1] << 8) // (magnitude.sum(axis=1, keepdims=True) + 1)).sum(axis=0)
+        total = (magnitude * (places << 8) // (sums[:, None] + 1)).sum(axis=0)
     return total
+
+
+def activity_bounds(activity: np.ndarray, count: int) -> np.ndarray:
+    """int64 [count - 1]: the activity at which each class but the first begins, so that places of this activity int64
+    [n] fall into classes of about equal size."""
+    bounds: np.ndarray = np.sort(activity)[[i * len(activity) // count for i in range(1, count)]]
+    return bounds
 
 
 def activity_classes(activity: np.ndarray, count: int) -> np.ndarray:
     """int64 [n] in 0..count-1: places by their activity int64 [n], in classes of about equal size."""
-    bounds = np.sort(activity)[[i * len(activity) // count for i in range(1, count)]]
-    return np.searchsorted(bounds, activity, side="right")
+    return np.searchsorted(activity_bounds(activity, count), activity, side="right")
 
 
 def places_of(classes: np.ndarray, count: int) -> list[np.ndarray]:
@@ -65,28 +81,48 @@ def cheapest_class_count(groups: Sequence[tuple[np.ndarray, np.ndarray]]) -> int
     return min(costs)[1]
 
 
+@dataclass(frozen=True, eq=False)
+class CodedSection:
+    """Bytes of a section with its form in front, and the priors that each of its stages defined; one stage if plain."""
+
+    data: bytes
+    defined: list[list[Fitted]]
+
+
 def smaller_form(
-    channels: Sequence[np.ndarray], staged: Callable[[], bytes] | None, priors: str, effort: int
-) -> tuple[bytes, float]:
-    """(section bytes, sum of R(a) over all channels) of channels int32: plain, or what `staged` makes if it is shorter.
+    channels: Sequence[np.ndarray],
+    staged: Callable[[], CodedSection] | None,
+    priors: str,
+    effort: int,
+    known: Sequence[Fitted] = (),
+) -> tuple[CodedSection, float]:
+    """(section, sum of R(a) over all channels) of channels int32: plain, or what `staged` makes if it is shorter.
 
-    The form is plain with priors "gauss", the model of R(a), at effort 1, and without `staged`.
+    The form is plain with priors "gauss", the model of R(a), at effort 1, and without `staged`. known: priors that the
+    plain form may refer to.
     """
-    data = list[bytes]()
+    found = list[CodedSection]()
     if staged is not None and priors == "best" and effort > 1:
-        data.append(staged())
-        if 8 * (len(data[0]) - 1) <= sum(entropy_bits(channel) for channel in channels):  # plain cannot be shorter
-            return data[0], sum(histogram(channel).rate_bits for channel in channels if channel.size)
-    plain = encode_channels(channels, priors=priors, effort=effort)
-    return min([bytes([PLAIN]) + plain.payload, *data], key=len), plain.rate_bits
+        found.append(staged())
+        if 8 * (len(found[0].data) - 1) <= sum(entropy_bits(channel) for channel in channels):  # no plain is shorter
+            return found[0], sum(histogram(channel).rate_bits for channel in channels if channel.size)
+    plain = encode_channels(channels, priors=priors, effort=effort, known=known)
+    found.insert(0, CodedSection(bytes([PLAIN]) + plain.payload, [plain.defined]))
+    return min(found, key=lambda section: len(section.data)), plain.rate_bits
 
 
-def put_stages(out: bytearray, stages: Sequence[Sequence[np.ndarray]], effort: int) -> None:
-    """Appends the lengths of all stages but the last, then their payloads."""
-    payloads = [encode_channels(stage, effort=effort).payload for stage in stages]
-    for payload in payloads[:-1]:
-        put_varint(out, len(payload))
-    out += b"".join(payloads)
+def coded_stages(
+    front: bytearray,
+    stages: Sequence[Sequence[np.ndarray]],
+    effort: int,
+    known: Sequence[Sequence[Fitted]] | None = None,
+) -> CodedSection:
+    """`front`, the lengths of all stages but the last, then their payloads. known: by stage what it may refer to."""
+    out, known = bytearray(front), known or [()] * len(stages)
+    coded = [encode_channels(stage, effort=effort, known=k) for stage, k in zip(stages, known, strict=True)]
+    for stage in coded[:-1]:
+        put_varint(out, len(stage.payload))
+    return CodedSection(bytes(out) + b"".join(stage.payload for stage in coded), [stage.defined for stage in coded])
 
 
 def read_class_count(reader: ByteReader, stage: int) -> int:
@@ -97,9 +133,15 @@ def read_class_count(reader: ByteReader, stage: int) -> int:
     return count
 
 
-def read_stages(reader: ByteReader, number: int, places: Iterator[list[tuple[np.ndarray, np.ndarray]]]) -> None:
+def read_stages(
+    reader: ByteReader,
+    number: int,
+    places: Iterator[list[tuple[np.ndarray, np.ndarray]]],
+    known: Sequence[list[Prior]] | None = None,
+) -> None:
     """Decodes `number` stages. `places` yields per stage, after those before are decoded, its channels: (int64 [n] to
-    decode into, the places int64 [k] there)."""
+    decode into, the places int64 [k] there). known: by stage the priors of payloads before, to which its own are
+    appended."""
     lengths = [reader.varint(reader.remaining, f"the length of stage {stage}") for stage in range(number - 1)]
     rest = reader.rest()
     if sum(lengths) > len(rest):
@@ -107,6 +149,6 @@ def read_stages(reader: ByteReader, number: int, places: Iterator[list[tuple[np.
     bounds = [0, *accumulate(lengths), len(rest)]
     for stage, targets in enumerate(places):
         payload = rest[bounds[stage] : bounds[stage + 1]]
-        decoded = decode_channels(payload, [len(at) for _, at in targets])
+        decoded = decode_channels(payload, [len(at) for _, at in targets], known[stage] if known else None)
         for (channel, at), values in zip(targets, decoded, strict=True):
             channel[at] = values

@@ -1,4 +1,4 @@
-"""Incremental decoding: bytes as they arrive -> one upgraded scene per completed layer."""
+"""Incremental decoding: bytes as they arrive -> one upgraded scene per completed slice."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ class Stream:
 
     @property
     def complete(self) -> bool:
-        """Whether every layer that the header lists has arrived."""
+        """Whether everything that the header lists has arrived."""
         return self._reader.complete
 
     def feed(self, data: bytes) -> list[Scene]:
-        """One scene per layer that `data` completes, each holding all layers so far.
+        """One scene per slice that `data` completes, each holding all slices so far; a layer is one slice or more.
 
-        A fault raises its DecodeError now, or at the next call if this one completes a layer before it, and at every
+        A fault raises its DecodeError now, or at the next call if this one completes a slice before it, and at every
         later call. Scenes returned before stay valid.
         """
         if self._error is not None:
@@ -31,7 +31,7 @@ class Stream:
         self._buffer += data
         scenes: list[Scene] = []
         try:
-            while self._reader.next_layer(self._buffer) is not None:
+            while self._reader.next_slice(self._buffer):
                 scenes.append(self._reader.scene())
         except Truncated:
             pass
@@ -42,10 +42,10 @@ class Stream:
         return scenes
 
     def finish(self) -> None:
-        """Say that no bytes follow: raises the pending fault, or Truncated if a layer is missing."""
+        """Say that no bytes follow: raises the pending fault, or Truncated if a chunk is missing."""
         if self._error is not None:
             raise self._error
-        self._reader.next_layer(self._buffer)
+        self._reader.next_slice(self._buffer)
 
 
 def open_stream() -> Stream:

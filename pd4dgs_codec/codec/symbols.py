@@ -11,7 +11,7 @@ from pd4dgs_codec.attributes.quantise import MAX_SYMBOL, all_finite, dequantise,
 from pd4dgs_codec.attributes.table import Grid, attribute_rows, classes_of
 from pd4dgs_codec.codec.kinds import LAYER_KINDS, LayerKind
 from pd4dgs_codec.errors import Malformed
-from pd4dgs_codec.morton import MAX_VOXEL
+from pd4dgs_codec.morton import MAX_VOXEL, morton_order
 from pd4dgs_codec.scene import PLANES, Deformation, Grading, Network, Planes, Scene, SceneInfo, Steps, Widths
 
 #: (name for messages, array) -> array of the same shape.
@@ -20,13 +20,13 @@ ArrayMap = Callable[[str, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class LayerSymbols:
-    """What one layer carries.
+    """What one layer carries, or one slice of it: later slices have anchors with their masks and attributes alone.
 
-    widths: of the anchors. anchor_q: int32 [n, 3] voxel indices of the layer's own anchors. mask_increase: int32 [rows
-    before] rise of the earlier anchors' mask codes, mask_own: int32 [n] codes of its own. classes: int32 [n] step
-    classes, or NO_CLASSES. attributes: int32 [channels, n]. planes, networks: int32 symbols, or float32 values if
-    raw_deformation; networks in the order of their registry ids. steps: quantisation steps of this layer by name, as in
-    LayerKind.step_names; empty if it has no networks.
+    widths: of the anchors. anchor_q: int32 [n, 3] voxel indices of its own anchors, in Morton order. mask_increase:
+    int32 [rows before] rise of the earlier anchors' mask codes, mask_own: int32 [n] codes of its own. classes: int32
+    [n] step classes, or NO_CLASSES. attributes: int32 [channels, n]. planes, networks: int32 symbols, or float32 values
+    if raw_deformation; networks in the order of their registry ids. steps: quantisation steps of this layer by name, as
+    in LayerKind.step_names; empty if it has no networks.
     """
 
     kind: LayerKind
@@ -53,6 +53,39 @@ class LayerSymbols:
     def arrays(self) -> list[np.ndarray]:
         """All arrays in their canonical order, the one in which info --hashes digests the integers among them."""
         return [self.anchor_q, self.mask_increase, self.mask_own, self.classes, self.attributes, *self.tensors()]
+
+
+def merged(slices: Sequence[LayerSymbols]) -> LayerSymbols:
+    """The layer of these slices, its first ones."""
+    if len(slices) == 1:
+        return slices[0]
+    anchor_q = np.concatenate([part.anchor_q for part in slices])
+    order = morton_order(anchor_q)
+    return replace(
+        slices[0],
+        anchor_q=anchor_q[order],
+        mask_own=np.concatenate([part.mask_own for part in slices])[order],
+        classes=np.concatenate([part.classes for part in slices])[order if slices[0].widths.graded else slice(0)],
+        attributes=np.concatenate([part.attributes for part in slices], axis=1)[:, order],
+    )
+
+
+def sliced(layer: LayerSymbols, parts: Sequence[np.ndarray]) -> list[LayerSymbols]:
+    """The slices of a layer, of these rows int64 [n] each, all rows once. The inverse of `merged`."""
+    ordered = [rows[morton_order(layer.anchor_q[rows])] for rows in parts]
+    bare = replace(
+        layer, mask_increase=layer.mask_increase[:0], planes=(), networks={}, steps={}, raw_deformation=False
+    )
+    return [
+        replace(
+            bare if number else layer,
+            anchor_q=layer.anchor_q[rows],
+            mask_own=layer.mask_own[rows],
+            classes=layer.classes[rows] if layer.widths.graded else layer.classes,
+            attributes=layer.attributes[:, rows],
+        )
+        for number, rows in enumerate(ordered)
+    ]
 
 
 def map_deformation(deformation: Deformation, of_planes: ArrayMap, of_weights: ArrayMap) -> Deformation:
@@ -166,20 +199,35 @@ def _mask_codes(layers: Sequence[LayerSymbols]) -> list[np.ndarray]:
     return masks
 
 
-def check_last_layer(layers: Sequence[LayerSymbols], voxel_size: float, grid: Grid) -> None:
-    """The rules for a layer that its payload alone cannot show broken, given the header and the layers before it.
+class TakenVoxels:
+    """The voxels of the slices so far."""
 
-    Raises Malformed if a mask code is above 255, a voxel is taken, an attribute lies too many steps from 0, or a
-    reconstructed value would not be finite.
+    def __init__(self) -> None:
+        self._keys = np.zeros(0, np.uint64)  # ascending
+
+    def take(self, anchor_q: np.ndarray) -> None:
+        """Adds int32 [n, 3], which differ among themselves. Raises Malformed if one is taken."""
+        keys = np.sort(_voxel_keys(anchor_q))
+        at = np.searchsorted(self._keys, keys)
+        taken = np.flatnonzero(self._keys[np.minimum(at, self._keys.size - 1)] == keys) if self._keys.size else at[:0]
+        if taken.size:
+            raise Malformed(f"voxel {_voxel_of(keys[taken[0]])} holds more than one anchor, expected one")
+        self._keys = np.insert(self._keys, at, keys)
+
+
+def check_last_layer(layers: Sequence[LayerSymbols], taken: TakenVoxels, voxel_size: float, grid: Grid) -> None:
+    """The rules for a slice that its payload alone cannot show broken, given the header and what stands before it.
+
+    layers: the slice, after the layers before its own. taken: by the slices before; its own voxels are added. Raises
+    Malformed if a mask code is above 255, a voxel is taken, an attribute lies too many steps from 0, or a reconstructed
+    value would not be finite.
     """
-    layer, *before = layers[-1], *layers[:-1]
-    codes = _mask_codes(layers)[-1]
-    if codes.size and codes.max() > 255:
-        raise Malformed(f"layer {layer.kind.layer}: mask code {int(codes.max())}, expected at most 255")
-    if len(layer.anchor_q) and any(len(other.anchor_q) for other in before):  # within a layer voxels differ anyway
-        row = first_duplicate(np.concatenate([other.anchor_q for other in layers]))
-        if row is not None:
-            raise Malformed(f"voxel {row.tolist()} holds more than one anchor, expected one")
+    layer = layers[-1]
+    if layer.mask_increase.size:
+        highest = int((_mask_codes(layers[:-1])[-1] + layer.mask_increase).max())
+        if highest > 255:
+            raise Malformed(f"layer {layer.kind.layer}: mask code {highest}, expected at most 255")
+    taken.take(layer.anchor_q)
     indices = grid.indices(layer.attributes, layer.classes)
     if indices.size and max(int(indices.max()), -int(indices.min())) > MAX_SYMBOL:
         raise Malformed(f"layer {layer.kind.layer}: an attribute more than {MAX_SYMBOL} steps from 0")
@@ -231,11 +279,22 @@ def float_tensors(scene: Scene, index: int) -> list[np.ndarray]:
 
 def first_duplicate(anchor_q: np.ndarray) -> np.ndarray | None:
     """A row [3] that occurs more than once in anchor_q [N, 3], all within ±MAX_VOXEL, or None."""
-    side = np.uint64(2 * MAX_VOXEL + 1)  # its third power is just below 2**64
-    x, y, z = (anchor_q.T.astype(np.int64) + MAX_VOXEL).astype(np.uint64)
-    keys = np.sort((x * side + y) * side + z, kind="stable")  # layers are sorted already, if by another key
+    keys = np.sort(_voxel_keys(anchor_q), kind="stable")  # layers are sorted already, if by another key
     same = np.flatnonzero(keys[1:] == keys[:-1])
-    if not same.size:
-        return None
-    rest, last = divmod(int(keys[same[0]]), int(side))
-    return np.array([*divmod(rest, int(side)), last]) - MAX_VOXEL
+    return np.array(_voxel_of(keys[same[0]])) if same.size else None
+
+
+_SIDE = 2 * MAX_VOXEL + 1  # its third power is just below 2**64
+
+
+def _voxel_keys(anchor_q: np.ndarray) -> np.ndarray:
+    """uint64 [N]: a number of its own for each voxel int [N, 3]."""
+    x, y, z = (anchor_q.T.astype(np.int64) + MAX_VOXEL).astype(np.uint64)
+    keys: np.ndarray = (x * np.uint64(_SIDE) + y) * np.uint64(_SIDE) + z
+    return keys
+
+
+def _voxel_of(key: np.uint64) -> list[int]:
+    rest, z = divmod(int(key), _SIDE)
+    x, y = divmod(rest, _SIDE)
+    return [v - MAX_VOXEL for v in (x, y, z)]

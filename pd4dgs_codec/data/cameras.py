@@ -17,13 +17,16 @@ from pd4dgs_codec.errors import DataError
 ROTATION_TOLERANCE = 1e-3
 #: Of binary32, in which files hold the first and the last time; and by what share of itself a span may change there.
 LARGEST_TIME, SPAN_TOLERANCE = float(np.finfo(np.float32).max), 1e-3
+#: Angles at which it is looked where a fisheye's polynomial turns back.
+FISHEYE_STEPS = 1000
 #: Half side of D-NeRF's box of initial points (1.3) over the distance of its cameras (4).
 BOX_OVER_DISTANCE = 1.3 / 4.0
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics in pixels of the stored image; pixel centres at +0.5; OpenCV distortion k1 k2 k3 and p1 p2."""
+    """Intrinsics in pixels of the stored image; pixel centres at +0.5; OpenCV distortion k1 k2 k3 and p1 p2, or, if
+    fisheye is given, OpenCV's fisheye with its k1 k2 k3 k4."""
 
     width: int
     height: int
@@ -34,11 +37,12 @@ class Lens:
     skew: float = 0.0
     radial: tuple[float, float, float] = (0.0, 0.0, 0.0)
     tangential: tuple[float, float] = (0.0, 0.0)
+    fisheye: tuple[float, float, float, float] | None = None
 
     @property
     def is_pinhole(self) -> bool:
         """True if the stored image needs no resampling."""
-        return not (self.skew or any(self.radial) or any(self.tangential))
+        return not (self.skew or any(self.radial) or any(self.tangential) or self.fisheye is not None)
 
     def matrix(self, downscale: int = 1) -> np.ndarray:
         """float32 [3, 3] of the undistorted, downscaled image. With centres at +0.5 all four numbers just divide."""
@@ -92,6 +96,23 @@ def distort(x: np.ndarray, y: np.ndarray, lens: Lens) -> tuple[np.ndarray, ...]:
     return xd, yd, xx, cross, yy
 
 
+def distort_fisheye(x: np.ndarray, y: np.ndarray, k: tuple[float, float, float, float]) -> tuple[np.ndarray, ...]:
+    """OpenCV's fisheye on normalised pinhole coordinates: (xd, yd), and where no other point is as far out."""
+    r = np.hypot(x, y)
+    angle = np.arctan(r)
+
+    def bent(a: np.ndarray) -> np.ndarray:
+        a2 = a * a
+        turned: np.ndarray = a * (1 + a2 * (k[0] + a2 * (k[1] + a2 * (k[2] + a2 * k[3]))))
+        return turned
+
+    grid = np.linspace(0, np.pi / 2, FISHEYE_STEPS)
+    falls = np.flatnonzero(np.diff(bent(grid)) <= 0)
+    last = grid[falls[0]] if falls.size else np.pi / 2
+    scale = np.where(r > 0, bent(angle) / np.where(r > 0, r, 1), 1)
+    return x * scale, y * scale, angle < last
+
+
 def undistort(xd: np.ndarray, yd: np.ndarray, lens: Lens, iterations: int = 12) -> tuple[np.ndarray, np.ndarray]:
     """Inverse of `distort` by Newton's method on all points at once, started at the distorted point."""
     x, y = np.array(xd, np.float64), np.array(yd, np.float64)
@@ -113,9 +134,12 @@ def _warp(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     u, v = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     x, y = (u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy
     with np.errstate(all="ignore"):
-        xd, yd, xx, xy, yy = distort(x, y, lens)
-        xi, yi = undistort(xd, yd, lens)
-        single = (np.hypot(xi - x, yi - y) * lens.fx < 0.01) & (xx * yy - xy * xy > 0)
+        if lens.fisheye is not None:
+            xd, yd, single = distort_fisheye(x, y, lens.fisheye)
+        else:
+            xd, yd, xx, xy, yy = distort(x, y, lens)
+            xi, yi = undistort(xd, yd, lens)
+            single = (np.hypot(xi - x, yi - y) * lens.fx < 0.01) & (xx * yy - xy * xy > 0)
     u, v = lens.fx * xd + lens.skew * yd + lens.cx, lens.fy * yd + lens.cy
     inside = (u >= 0.5) & (v >= 0.5) & (u <= lens.width - 0.5) & (v <= lens.height - 0.5)
     return u, v, single & inside
@@ -210,12 +234,13 @@ def cameras_box(frames: Sequence[UnreadView], depth: tuple[float, float] | None 
     return np.stack([middle - half, middle + half]).astype(np.float32)
 
 
-def depth_range(frames: Sequence[UnreadView], box: np.ndarray, points: np.ndarray | None) -> tuple[float, float]:
-    """(near, far): half the nearest and 1.5 times the farthest depth of the points, else of the box's corners."""
+def depth_range(views: Sequence[np.ndarray], box: np.ndarray, points: np.ndarray | None) -> tuple[float, float]:
+    """(near, far) of cameras, world-to-camera matrices [4, 4]: half the nearest and 1.5 times the farthest depth of the
+    points, else of the box's corners."""
     if points is None or not len(points):
         points = np.stack(np.meshgrid(*box.T.astype(np.float64)), axis=-1).reshape(-1, 3)
-    views = np.stack([f.viewmat for f in frames])
-    depths = points[:: max(1, len(points) // 2000)] @ views[:, 2, :3].T + views[:, 2, 3]
+    axes = np.stack([view[2] for view in views])
+    depths = points[:: max(1, len(points) // 2000)] @ axes[:, :3].T + axes[:, 3]
     ahead = depths[depths > 0]
     if not len(ahead):
         return 0.01, 100.0

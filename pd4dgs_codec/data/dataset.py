@@ -5,7 +5,9 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from pd4dgs_codec.data.colmap import find_model, read_colmap
 from pd4dgs_codec.data.iphone import read_iphone
+from pd4dgs_codec.data.neu3d import POSES, read_neu3d
 from pd4dgs_codec.data.synthetic import PREFIX, read_synthetic
 from pd4dgs_codec.data.transforms import read_transforms
 from pd4dgs_codec.data.view import Dataset, View
@@ -15,7 +17,8 @@ from pd4dgs_codec.errors import DataError
 def load(source: str | Path, *, downscale: int = 1, holdout: int = 8) -> Dataset:
     """Read a dataset.
 
-    source: `synthetic:NAME[?seed=n]`, a folder in the iPhone/Nerfies layout, or a folder with transforms*.json.
+    source: `synthetic:NAME[?seed=n]`, a folder in the iPhone/Nerfies layout, a folder with
+        transforms*.json, one with poses_bounds.npy and videos, or one with a model of COLMAP.
     downscale: images are averaged over downscale x downscale blocks (the remainder is cropped), intrinsics follow.
     holdout: without split files, frames with i % holdout == holdout // 2 are the test frames; 0 = none.
     Views whose masks hold no valid pixel are left out, see `Dataset.left_out`.
@@ -53,5 +56,12 @@ def _read(source: str | Path, downscale: int, holdout: int) -> Dataset:
         return read_iphone(folder, downscale)
     if any(folder.glob("transforms*.json")):
         return read_transforms(folder, downscale, holdout)
+    if (folder / POSES).is_file():
+        return read_neu3d(folder, downscale, holdout)
+    if (model := find_model(folder)) is not None:
+        return read_colmap(folder, *model, downscale, holdout)
     found = "other files" if any(folder.iterdir()) else "an empty folder"
-    raise DataError(f"{folder}: found {found}, expected camera/ (iPhone, Nerfies) or transforms*.json (Blender)")
+    raise DataError(
+        f"{folder}: found {found}, expected camera/ (iPhone, Nerfies), transforms*.json (Blender), {POSES} (Neu3D) "
+        "or sparse/0 (COLMAP)"
+    )

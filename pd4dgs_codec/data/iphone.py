@@ -167,7 +167,7 @@ def _near_far(files: CameraFiles, frames: list[UnreadView], box: np.ndarray, fol
     """scene.json's near and far: already in scene units."""
     where = folder / "scene.json"
     if files.scene.get("near") is None or files.scene.get("far") is None:
-        return depth_range(frames, box, files.points)
+        return depth_range([f.viewmat for f in frames], box, files.points)
     near, far = (number(files.scene[k], f"{where}: {k}", positive=True) for k in ("near", "far"))
     if near >= far:
         raise DataError(f"{where}: near {near:g} and far {far:g}, expected near < far")

@@ -1,4 +1,4 @@
-"""Initial points from a PLY file: x, y, z and optional red, green, blue of the vertex element, nothing else."""
+"""PLY files: their vertex element, and initial points, which are its x, y, z and optional red, green, blue."""
 
 from __future__ import annotations
 
@@ -66,22 +66,29 @@ def _body(path: Path, raw: bytes, kind: str, count: int, dtype: np.dtype) -> np.
     raise DataError(f"{path}: {len(rows)} vertex lines, expected {count}")
 
 
-def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
-    """Points float32 [M, 3] and colours uint8 [M, 3] (None if absent).
-
-    Points with a coordinate that is not finite or over LARGEST are dropped.
-    """
+def read_vertices(path: Path, raw: bytes | None = None) -> np.ndarray:
+    """Structured array [count] of the vertex element, a field per property. raw: the file's bytes, if they are read
+    already. Raises DataError, one line."""
     try:
-        raw = read_file(path)
+        raw = read_file(path) if raw is None else raw
     except (OSError, ValueError) as e:  # ValueError: a NUL or half a surrogate in the name
         raise DataError(f"{path}: cannot be read: {getattr(e, 'strerror', e)}") from None
     kind, count, fields, start = _header(path, raw)
     names = [name for name, _ in fields]
     if len(set(names)) != len(names) or not {"x", "y", "z"} <= set(names):
         raise DataError(f"{path}: vertex properties are {', '.join(names)}, expected x, y, z once each")
-    vertices = _body(path, raw[start:], kind, count, np.dtype(fields))
+    return _body(path, raw[start:], kind, count, np.dtype(fields))
+
+
+def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """Points float32 [M, 3] and colours uint8 [M, 3] (None if absent).
+
+    Points with a coordinate that is not finite or over LARGEST are dropped.
+    """
+    vertices = read_vertices(path)
     points = np.stack([vertices[c] for c in "xyz"], axis=1)
     keep = (np.abs(points) <= LARGEST).all(axis=1)  # also false of NaN
-    has_color = all((c, "u1") in fields for c in ("red", "green", "blue"))
+    names = vertices.dtype.names or ()
+    has_color = all(c in names and vertices.dtype[c] == np.uint8 for c in ("red", "green", "blue"))
     colors = np.stack([vertices[c] for c in ("red", "green", "blue")], axis=1)[keep] if has_color else None
     return points[keep].astype(np.float32), colors

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -13,26 +13,19 @@ from pd4dgs_codec.data.cameras import (
     ROTATION_TOLERANCE,
     Lens,
     UnreadView,
-    cameras_box,
     check_rotation,
-    depth_range,
-    mean_up,
-    normalised_times,
-    points_box,
-    read_view,
-    seconds_range,
     world_to_camera,
 )
 from pd4dgs_codec.data.files import array, find_image, image_info, number, read_json, whole_number
 from pd4dgs_codec.data.ply import read_ply
-from pd4dgs_codec.data.view import Dataset, View
+from pd4dgs_codec.data.posed import held_out, posed_dataset
+from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.errors import DataError
 
 PINHOLE_MODELS = {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
+FISHEYE_MODEL = "OPENCV_FISHEYE"
 #: OpenGL's camera looks along -z with y up; OpenCV's along +z with y down.
 OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0])
-#: A border is one colour if this share of it lies within this many 8-bit levels of its median.
-BORDER_SHARE, BORDER_LEVELS = 0.99, 3
 
 
 def _choose(folder: Path) -> tuple[Path, Path | None]:
@@ -77,8 +70,10 @@ def _lens(file: dict[str, Any], frame: dict[str, Any], image: Path, where: str) 
     else:
         width, height = (whole_number(get(k), f"{where}: {k}", low=1) for k in ("w", "h"))
     model = get("camera_model")
-    if (model is not None and model not in PINHOLE_MODELS) or value("k4"):
-        raise DataError(f"{where}: camera_model {model!r} (k4 {value('k4'):g}) is not supported, expected a pinhole")
+    fisheye = model == FISHEYE_MODEL
+    if (model is not None and model not in PINHOLE_MODELS and not fisheye) or (value("k4") and not fisheye):
+        expected = f"a pinhole or {FISHEYE_MODEL}"
+        raise DataError(f"{where}: camera_model {model!r} (k4 {value('k4'):g}) is not supported, expected {expected}")
     fx = _focal(get, "x", width, where)
     fy = _focal(get, "y", height, where)
     if fx is None and fy is None:
@@ -87,6 +82,8 @@ def _lens(file: dict[str, Any], frame: dict[str, Any], image: Path, where: str) 
     assert fx is not None and fy is not None
     cx, cy = value("cx", width / 2), value("cy", height / 2)
     radial, tangential = (value("k1"), value("k2"), value("k3")), (value("p1"), value("p2"))
+    if fisheye:
+        return Lens(width, height, fx, fy, cx, cy, fisheye=(*radial, value("k4")))
     return Lens(width, height, fx, fy, cx, cy, 0.0, radial, tangential)
 
 
@@ -128,9 +125,7 @@ def _split(folder: Path, holdout: int) -> tuple[list[UnreadView], list[UnreadVie
     frames, file = _frames(folder, train_file)
     if test_file is not None:
         return frames, _frames(folder, test_file)[0], file
-    held = [holdout > 0 and i % holdout == holdout // 2 for i in range(len(frames))]
-    train = [f for f, h in zip(frames, held, strict=True) if not h]
-    return train, [f for f, h in zip(frames, held, strict=True) if h], file
+    return *held_out(frames, holdout), file
 
 
 def _points(folder: Path, file: dict[str, Any]) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -153,40 +148,9 @@ def _stored_depth(folder: Path, file: dict[str, Any]) -> tuple[float, float] | N
     return near, far
 
 
-def border_color(views: Sequence[View]) -> tuple[float, float, float]:
-    """The colour behind everything: that of the images' border if it is one colour throughout, else black."""
-    edges = np.concatenate([e for v in views for e in (v.image[0], v.image[-1], v.image[:, 0], v.image[:, -1])])
-    middle = np.median(edges, axis=0)
-    same = (np.abs(edges - middle) <= BORDER_LEVELS).all(axis=1).mean() >= BORDER_SHARE
-    r, g, b = middle / 255.0 if same else np.zeros(3)
-    return float(r), float(g), float(b)
-
-
 def read_transforms(folder: Path, downscale: int, holdout: int) -> Dataset:
     """Read a folder with transforms*.json (see `dataset.load`)."""
     train, test, file = _split(folder, holdout)
-    frames = train + test
-    times, start, stop = normalised_times([f.time for f in frames], str(folder))
-    depth = _stored_depth(folder, file)
     points, colors = _points(folder, file)
-    if points is not None and not len(points):
-        points, colors = None, None
-    views = [read_view(f, t, downscale, composite=True) for f, t in zip(frames, times, strict=True)]
-    transparent = image_info(train[0].image)[2]
-    box = cameras_box(frames, depth) if points is None else points_box(points)
-    near, far = depth or depth_range(frames, box, points)
-    return Dataset(
-        name=folder.resolve().name,
-        train=tuple(views[: len(train)]),
-        test=tuple(views[len(train) :]),
-        points=points,
-        point_colors=colors,
-        box=box,
-        near=near,
-        far=far,
-        background=(1.0, 1.0, 1.0) if transparent else border_color(views[: len(train)]),
-        time_range=seconds_range(start, stop),
-        up=mean_up(frames),
-        unit=0.0,
-        masked=False,
-    )
+    background = (1.0, 1.0, 1.0) if image_info(train[0].image)[2] else None
+    return posed_dataset(folder, train, test, points, colors, downscale, _stored_depth(folder, file), background)

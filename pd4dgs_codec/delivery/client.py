@@ -1,13 +1,13 @@
-"""A viewer's side of a `.pd4` file on a web server: layers as they arrive, upgrades later, cuts survived.
+"""A viewer's side of a `.pd4` file on a web server: slices as they arrive, upgrades later, cuts survived.
 
-Which layer next, and when to stop. Layers build on each other, so the next one is always the next in the file, and the
-only question is whether to take it. `next_end` answers after every layer:
+Which slice next, and when to stop. Slices build on each other, so the next one is always the next in the file, and the
+only question is whether to take it. A layer is one slice or more. `next_end` answers after every slice:
 
-1. no layer beyond `max_layer`, and none that ends beyond `bytes`;
-2. the first layer always, as long as `seconds` last: without it there is no picture;
-3. a further layer only if the rest of it would arrive within `seconds` at the rate of the last second of transfer.
+1. no slice of a layer beyond `max_layer`, and none that ends beyond `bytes`;
+2. the first slice always, as long as `seconds` last: without it there is no picture;
+3. a further slice only if the rest of it would arrive within `seconds` at the rate of the last second of transfer.
 
-What arrives of a layer before the seconds are over is kept, and a later call goes on from there.
+What arrives of a slice before the seconds are over is kept, and a later call goes on from there.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from pd4dgs_codec.codec.stream import open_stream
-from pd4dgs_codec.delivery.prefix import LONGEST_HEADER, layer_ends
+from pd4dgs_codec.delivery.prefix import HEADER_GUESS, LONGEST_HEADER, slice_ends, within
 from pd4dgs_codec.delivery.transfer import Changed, OutOfTime, Transfer
 from pd4dgs_codec.errors import BadSignature, DecodeError, UnsupportedVersion
 from pd4dgs_codec.scene import Scene
@@ -37,28 +37,19 @@ class Budget:
 
 
 def next_end(
-    layers: list[tuple[int, int]], have: int, budget: Budget, seconds_left: float, rate: float | None
+    slices: list[tuple[int, int]], have: int, budget: Budget, seconds_left: float, rate: float | None
 ) -> int | None:
-    """Where the next layer to fetch ends, in bytes of the file, or None to stop.
+    """Where the next slice to fetch ends, in bytes of the file, or None to stop.
 
-    layers: (layer, end) in file order. have: bytes here. rate: bytes per second lately, None if not known yet.
+    slices: (layer, end) in file order. have: bytes here. rate: bytes per second lately, None if not known yet.
     """
-    wanted = within(layers, budget)
+    wanted = within(slices, budget.max_layer, budget.bytes)
     end = next((end for _, end in wanted if end > have), None)
     if end is None or seconds_left <= 0:
         return None
-    first = end == layers[0][1]
+    first = end == slices[0][1]
     in_time = rate is None or seconds_left == math.inf or end - have <= rate * seconds_left
     return end if first or in_time else None
-
-
-def within(layers: list[tuple[int, int]], budget: Budget) -> list[tuple[int, int]]:
-    """The layers that the budget's `max_layer` and `bytes` allow."""
-    return [
-        (layer, end)
-        for layer, end in layers
-        if (budget.max_layer is None or layer <= budget.max_layer) and (budget.bytes is None or end <= budget.bytes)
-    ]
 
 
 class RateMeter:
@@ -92,9 +83,9 @@ class RateMeter:
 class SceneClient:
     """Scenes of one URL, best first picture first. Use it in a `with` block, or close it.
 
-    The first request is one open-ended GET, read as it arrives; after a cut, and for layers taken later, Range with
+    The first request is one open-ended GET, read as it arrives; after a cut, and for slices taken later, Range with
     If-Range fetches what is missing and nothing twice. If the file is another one then, everything begins anew with its
-    layer 0. A damaged layer is fetched once more and never shown. Stopping leaves what is on its way, at most what the
+    layer 0. A damaged slice is fetched once more and never shown. Stopping leaves what is on its way, at most what the
     sockets' buffers hold. transfer: bytes and counts, see Transfer.
     """
 
@@ -112,30 +103,36 @@ class SceneClient:
 
     @property
     def arrived_at(self) -> float:
-        """time.monotonic() of the latest bytes: when a scene is given, that of its layer's last one."""
+        """time.monotonic() of the latest bytes: when a scene is given, that of its slice's last one."""
         return self._meter.latest
+
+    def due(self) -> list[tuple[int, int, float]]:
+        """(layer, end, seconds until it is there at the latest rate) of each slice that is still to come; nothing
+        before a rate is known."""
+        rate, have = self._meter.rate, len(self.transfer.data)
+        return [(layer, end, (end - have) / rate) for layer, end in self._slices if end > have] if rate else []
 
     def close(self) -> None:
         """Ends the connection; `scenes` may still be called and opens another."""
         self.transfer.close()
 
     def scenes(self, budget: Budget = Budget()) -> Iterator[Scene]:
-        """One scene per layer that completes, each holding all layers so far; ends where the budget says.
+        """One scene per slice that completes, each holding all slices so far; ends where the budget says.
 
-        Called again, it goes on after the last layer given. Raises DeliveryError if the file cannot be had, DecodeError
+        Called again, it goes on after the last slice given. Raises DeliveryError if the file cannot be had, DecodeError
         if it is not a valid one; scenes given before stay valid.
         """
         until = time.monotonic() + budget.seconds
         self._meter.start(time.monotonic())
         while True:
-            while ready := self._ready(budget):  # until empty: a fault behind a layer shows at the next feed
+            while ready := self._ready(budget):  # until empty: a fault behind a slice shows at the next feed
                 yield from ready
             left = until - time.monotonic()
-            end: int | None = LONGEST_HEADER
+            end: int | None = HEADER_GUESS if len(self.transfer.data) < HEADER_GUESS else LONGEST_HEADER
             reach = None
-            if self._layers:
-                end = next_end(self._layers, len(self.transfer.data), budget, left, self._meter.rate)
-                reach = within(self._layers, budget)[-1][1] if end is not None else None
+            if self._slices:
+                end = next_end(self._slices, len(self.transfer.data), budget, left, self._meter.rate)
+                reach = within(self._slices, budget.max_layer, budget.bytes)[-1][1] if end is not None else None
             if end is None:
                 break
             try:
@@ -147,36 +144,37 @@ class SceneClient:
             except OutOfTime:
                 break
             if not block:
-                self._stream.finish()  # the file ends within this layer: Truncated
+                self._stream.finish()  # the file ends within this slice: Truncated
             self._meter.note(time.monotonic(), len(block))
         self.close()
 
     def _begin(self) -> None:
         self._stream, self._fed, self._done = open_stream(), 0, 0
-        self._layers: list[tuple[int, int]] = []
+        self._slices: list[tuple[int, int]] = []
 
     def _ready(self, budget: Budget) -> list[Scene]:
-        """Feeds what is new to the decoder; a fault sends the transfer back to the end of the last good layer."""
+        """Feeds what is new to the decoder; a fault sends the transfer back to the end of the last good slice."""
         try:
             return self._feed(budget)
         except (BadSignature, UnsupportedVersion):
             raise  # not what damage on the way looks like
         except DecodeError:
-            good = self._layers[self._done - 1][1] if self._done else 0
+            good = self._slices[self._done - 1][1] if self._done else 0
             if self._repaired_at == good:
                 raise
             self._repaired_at = good
             self.transfer.rewind(good)
             self._begin()
-            self._feed(Budget())  # the good layers once more; they were given already
+            self._feed(Budget())  # the good slices once more; they were given already
             return []
 
     def _feed(self, budget: Budget) -> list[Scene]:
         data, end = self.transfer.data, len(self.transfer.data)
-        if not self._layers:
-            self._layers = layer_ends(data)
-        if self._layers:  # the first bytes of a small file may hold more than was asked for
-            end = min(end, max((end for _, end in within(self._layers, budget)), default=0))
+        if not self._slices:
+            self._slices = slice_ends(data)
+        if self._slices:  # the first bytes of a small file may hold more than was asked for
+            wanted = within(self._slices, budget.max_layer, budget.bytes)
+            end = min(end, wanted[-1][1] if wanted else 0)
         block, self._fed = bytes(data[self._fed : end]), max(self._fed, end)
         scenes = self._stream.feed(block)
         self._done += len(scenes)

@@ -1,6 +1,6 @@
 """A `.pd4` file as a folder for any web server: a page that plays it, DASH, HLS and a JSON index beside it.
 
-DASH carries the layers themselves: `scene.mp4` holds each in a fragment of its own, and the manifest names the
+DASH carries the layers themselves: `scene.mp4` holds each slice in a fragment of its own, and the manifest names the
 fragments with their dependencies. Concatenated, the samples are the `.pd4` file again. HLS has no layers that depend on
 each other: its playlist shows the 2D video and points to the index, which says where the layers lie in `scene.pd4`.
 """
@@ -18,7 +18,7 @@ from typing import Any
 from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.info import info
 from pd4dgs_codec.delivery import mp4
-from pd4dgs_codec.delivery.page import page_files
+from pd4dgs_codec.delivery.page import PAGE, page
 from pd4dgs_codec.errors import DeliveryError
 from pd4dgs_codec.scene import Scene
 
@@ -43,12 +43,18 @@ class Video:
 
 @dataclass(frozen=True)
 class Part:
-    """A layer's share of the file: start..end, bytes of the `.pd4`; segment: its bytes in scene.mp4, end exclusive."""
+    """A slice's share of the file: start..end, bytes of the `.pd4`; segment: its bytes in scene.mp4, end exclusive."""
 
     layer: int
+    slice: int
     start: int
     end: int
     segment: tuple[int, int]
+
+    @property
+    def id(self) -> str:
+        """Of its representation: L0 for layer 0, L0.1 for its second slice."""
+        return f"L{self.layer}.{self.slice}" if self.slice else f"L{self.layer}"
 
 
 def package(data: bytes, render: Callable[[Scene], Video | None] | None = None) -> dict[str, bytes]:
@@ -70,19 +76,24 @@ def package(data: bytes, render: Callable[[Scene], Video | None] | None = None) 
         files |= {VIDEO: video.data, VIDEO_PLAYLIST: _video_playlist(video)}
     files[PLAYLIST] = _playlist(video)
     files[INDEX] = _index(data, init, parts, seconds, video)
-    return files | page_files()
+    files[PAGE] = page().encode()
+    return files
 
 
 def _segments(data: bytes, seconds: float) -> tuple[bytes, int, list[Part]]:
-    """(scene.mp4, bytes of its initialisation, parts). What stands between layers travels with the layer after it."""
-    rows = info(data)["layers"]
+    """(scene.mp4, bytes of its initialisation, parts). What stands between slices travels with the slice after it."""
+    rows = [
+        (layer["layer"], number, part["end"])
+        for layer in info(data)["layers"]
+        for number, part in enumerate(layer["slices"])
+    ]
     ticks = max(1, round(seconds * mp4.TIMESCALE))
     content = mp4.initialisation(len(rows), ticks)
     init, start, parts = len(content), 0, []
-    for number, row in enumerate(rows, 1):
-        end = len(data) if number == len(rows) else row["end"]
+    for number, (layer, place, end) in enumerate(rows, 1):
+        end = len(data) if number == len(rows) else end
         piece = mp4.fragment(number, number, data[start:end], ticks)
-        parts.append(Part(row["layer"], start, end, (len(content), len(content) + len(piece))))
+        parts.append(Part(layer, place, start, end, (len(content), len(content) + len(piece))))
         content += piece
         start = end
     return content, init, parts
@@ -112,10 +123,10 @@ def _manifest(init: int, parts: list[Part], seconds: float, video: Video | None)
         ElementTree.SubElement(group, "SupplementalProperty", schemeIdUri=LAYER_SCHEME, value=str(part.layer))
         bandwidth = math.ceil(8 * part.segment[1] / MIN_BUFFER_SECONDS)
         representation = ElementTree.SubElement(
-            group, "Representation", id=f"L{part.layer}", bandwidth=str(min(bandwidth, (1 << 32) - 1))
+            group, "Representation", id=part.id, bandwidth=str(min(bandwidth, (1 << 32) - 1))
         )
         if i:
-            representation.set("dependencyId", " ".join(f"L{before.layer}" for before in parts[:i]))
+            representation.set("dependencyId", " ".join(before.id for before in parts[:i]))
         whole = max(1, round(seconds * mp4.TIMESCALE))
         _segment_list(representation, SEGMENTS, init, mp4.TIMESCALE, whole, [part.segment])
     ElementTree.indent(root)
@@ -207,9 +218,10 @@ def _index(data: bytes, init: int, parts: list[Part], seconds: float, video: Vid
     layers = [
         {
             "layer": part.layer,
+            "slice": part.slice,
             "range": [part.start, part.end],
             "sha256": hashlib.sha256(data[part.start : part.end]).hexdigest(),
-            "depends_on": [before.layer for before in parts[:i]],
+            "depends_on": sorted({before.layer for before in parts[:i]}),
             "dash": {"file": SEGMENTS, "init": [0, init], "range": list(part.segment)},
         }
         for i, part in enumerate(parts)

@@ -1,7 +1,7 @@
-"""The player as a page: few files for any web server, one file that needs none, or an element in a notebook.
+"""The player as one HTML file: beside a scene on any web server, with the scene inside, or in a notebook.
 
-The player's modules run as they are. Packed, each page and worker is one file without comments and indentation: half
-the bytes and, more important, four requests instead of forty. Modules keep their names and bodies: each becomes a
+The player's modules run as they are. Packed, the page and its workers are one file without comments and indentation:
+half the bytes and, more important, one request instead of forty. Modules keep their names and bodies: each becomes a
 function that returns what it exports, in the order in which a browser would run them. That takes the few forms of
 import and export that the player uses, and refuses others.
 """
@@ -22,17 +22,9 @@ from pd4dgs_codec.delivery.urls import is_url
 from pd4dgs_codec.errors import DataError, DeliveryError
 from pd4dgs_codec.scene import Scene
 
-#: Module -> name of its packed file. They lie side by side, so that workers are found beside what starts them.
-ENTRIES = {
-    "element.js": "element.js",
-    "render/bench.js": "bench.js",
-    "render/loader-worker.js": "loader-worker.js",
-    "render/sort-worker.js": "sort-worker.js",
-    "render/evaluate-worker.js": "evaluate-worker.js",
-}
 PAGE = "index.html"
-#: What a first visit loads: not the measuring, and not the evaluator for machines without a GPU.
-FIRST_VISIT = (PAGE, "element.js", "loader-worker.js", "sort-worker.js")
+MODULE = "page.js"
+WORKERS = ("loader-worker.js", "sort-worker.js", "evaluate-worker.js")
 #: Of packing a scene that is shown at once.
 EFFORT = 1
 
@@ -183,38 +175,26 @@ def player_folder() -> Path:
     raise DataError(f"{package}: holds no player; expected the package as pip installs it, or a checkout")
 
 
-def page_files() -> dict[str, bytes]:
-    """Name -> content of the files of the packed player. Its page shows `scene.pd4` beside it, or `?src=address`."""
-    root = player_folder()
-    files = {name: bundle(root, entry).encode() for entry, name in ENTRIES.items()}
-    page = (root / PAGE).read_text(encoding="utf-8").replace('"./render/bench.js"', '"./bench.js"')
-    head = '<link rel="modulepreload" href="./element.js">\n'
-    files[PAGE] = re.sub(r"<!--.*?-->\s*", head, page, count=1, flags=re.DOTALL).encode()
-    return files
+def page(source: bytes | str | None = None) -> str:
+    """The player as one HTML file. It needs no server for a scene that it holds, and no network.
 
-
-def single_page(source: bytes | str) -> str:
-    """The player and a scene as one HTML file. It needs no server, and no network unless the scene is an address.
-
-    source: the bytes of a `.pd4` or its URL.
+    source: the bytes of a `.pd4`, or its URL; None: `scene.pd4` beside the page, or the page's `?src=address`.
     """
     root = player_folder()
-    workers = {name: bundle(root, entry) for entry, name in ENTRIES.items() if name.endswith("-worker.js")}
-    element = _WORKER_URL.sub(r"new URL(workers['\1'])", bundle(root, "element.js"))
-    scene = _literal(source if isinstance(source, str) else base64.b64encode(source).decode())
-    load = scene if isinstance(source, str) else f"new Blob([Uint8Array.from(atob({scene}),c=>c.charCodeAt(0))])"
-    return f"""<!doctype html>
-<meta charset="utf-8">
-<title>.pd4 player</title>
-<style>html,body{{margin:0;height:100%;background:#111}}pd4-player{{width:100%;height:100%;aspect-ratio:auto}}</style>
-<pd4-player controls autoplay loop></pd4-player>
-<script type="module">
+    workers = {name: bundle(root, f"render/{name}") for name in WORKERS}
+    code = _WORKER_URL.sub(r"new URL(workers['\1'])", bundle(root, MODULE))
+    script = f"""<script type="module">
 const workers={_literal(workers)};
 for(const name in workers)workers[name]=URL.createObjectURL(new Blob([workers[name]],{{type:"text/javascript"}}));
-{element}
-document.querySelector("pd4-player").load({load});
-</script>
+{code}</script>
 """
+    text = re.sub(r"<!--.*?-->\s*", "", (root / PAGE).read_text(encoding="utf-8"), flags=re.DOTALL)
+    head, body, _ = re.split(r'(?=<p id="note")|<script type="module".*', text, maxsplit=2)
+    if isinstance(source, str):
+        body = f'<body data-src="{html.escape(source)}">\n'
+    elif source is not None:
+        body = f'<body>\n<script type="text/plain" id="scene">{base64.b64encode(source).decode()}</script>\n'
+    return f"{head}{body}{script}</html>\n"
 
 
 def _literal(value: object) -> str:
@@ -246,7 +226,7 @@ def show(scene: Scene | bytes | str | os.PathLike[str], *, width: str = "100%", 
     DecodeError for bytes that are no whole, valid `.pd4` file.
     """
     if isinstance(scene, str) and is_url(scene):
-        return Shown(single_page(scene), width, height)
+        return Shown(page(scene), width, height)
     if isinstance(scene, Scene):
         from pd4dgs_codec.codec.encoder import encode
 
@@ -254,4 +234,4 @@ def show(scene: Scene | bytes | str | os.PathLike[str], *, width: str = "100%", 
     else:
         data = scene if isinstance(scene, bytes) else Path(scene).read_bytes()
         decode(data)  # a fault is better said here than in a page
-    return Shown(single_page(data), width, height)
+    return Shown(page(data), width, height)

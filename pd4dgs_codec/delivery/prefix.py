@@ -21,10 +21,22 @@ def header_size(data: bytes | bytearray) -> int | None:
         return None
 
 
-def layer_ends(data: bytes | bytearray) -> list[tuple[int, int]]:
-    """(layer, end of its chunk in the file) from a file's first bytes; empty if its header is not whole yet."""
+def slice_ends(data: bytes | bytearray) -> list[tuple[int, int]]:
+    """(layer, end in the file) of each slice, from a file's first bytes; empty if its header is not whole yet."""
     size = header_size(data)
-    return [] if size is None else [(row["layer"], row["end"]) for row in info(bytes(data[:size]))["layers"]]
+    layers = [] if size is None else info(bytes(data[:size]))["layers"]
+    return [(row["layer"], part["end"]) for row in layers for part in row["slices"]]
+
+
+def within(
+    slices: list[tuple[int, int]], max_layer: int | None = None, max_bytes: int | None = None
+) -> list[tuple[int, int]]:
+    """Those of the slices (layer, end) that are of a layer <= max_layer and end within max_bytes."""
+    return [
+        (layer, end)
+        for layer, end in slices
+        if (max_layer is None or layer <= max_layer) and (max_bytes is None or end <= max_bytes)
+    ]
 
 
 def fetch_header(transfer: Transfer) -> bytes:
@@ -41,18 +53,20 @@ def fetch_header(transfer: Transfer) -> bytes:
             continue
 
 
-def fetch(transfer: Transfer, max_layer: int | None = None) -> bytes:
-    """The file, or its prefix of layers <= max_layer; fewer bytes where the remote file ends early.
+def fetch(transfer: Transfer, max_layer: int | None = None, max_bytes: int | None = None) -> bytes:
+    """The file, or its prefix of layers <= max_layer, or of slices within max_bytes; fewer bytes where the remote file
+    ends early.
 
     The prefix takes two requests of exactly those bytes, the whole file one. Of bytes after the last chunk one is
     fetched, so that the decoder sees them. Raises as Transfer.read does, and DecodeError for a bad header.
     """
     while True:
         try:
-            if max_layer is None:
+            if max_layer is None and max_bytes is None:
                 return _fetch_whole(transfer)
             header = fetch_header(transfer)
-            end = max((end for layer, end in layer_ends(header) if layer <= max_layer), default=len(header))
+            wanted = within(slice_ends(header), max_layer, max_bytes)
+            end = wanted[-1][1] if wanted else len(header)
             _fill(transfer, end, end)
             return bytes(transfer.data[:end])
         except Changed:

@@ -3,6 +3,7 @@
 Payload: for each non-empty channel a varint token, (family << 1 | has_exceptions), then, if the family is below 8, a
 new prior's parameters, else the prior defined (family - 8) definitions before the latest; then the channel's
 exceptions, if any: their number, and for each the gap to the previous position and the distance outside the window.
+Definitions of payloads before count too, where a caller hands them on.
 After the last channel the ANS words: the classes of each histogram prior in order of definition, then each channel's
 symbols, those of a scaled prior as all table entries followed by all low bits.
 """
@@ -10,7 +11,7 @@ symbols, those of a scaled prior as all table entries followed by all low bits.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -21,8 +22,9 @@ from pd4dgs_codec.entropy.fitting import Fitted, fit_best, histogram
 from pd4dgs_codec.entropy.priors import (
     CONST,
     FIRST_REUSE,
+    FREE_ENTRIES,
     K_MAX,
-    MAX_ENTRIES,
+    MORE_ENTRIES,
     Hist,
     Prior,
     Window,
@@ -43,6 +45,7 @@ class CodedChannels:
     payload_bits: int  #: 8 * len(payload): symbols, prior parameters, tables and exceptions
     rate_bits: float  #: the sum of R(a), whatever prior was chosen
     prior_ids: list[int]  #: one per channel; an empty channel counts as const
+    defined: list[Fitted] = field(default_factory=list)  #: the new priors, in the order of definition
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,11 +69,14 @@ def check_channels(channels: Sequence[np.ndarray]) -> list[np.ndarray]:
     return checked
 
 
-def encode_channels(channels: Sequence[np.ndarray], *, priors: str = "best", effort: int = 5) -> CodedChannels:
+def encode_channels(
+    channels: Sequence[np.ndarray], *, priors: str = "best", effort: int = 5, known: Sequence[Fitted] = ()
+) -> CodedChannels:
     """Encode int32 channels (1-D, any lengths, |k| <= 2**24 - 1) into one payload.
 
     priors: "gauss" allows const and gauss only, the model of R(a); "best" every prior and is never larger.
-    effort: 1..9, time spent on fitting. Raises EncodeError.
+    effort: 1..9, time spent on fitting. known: what the payloads before defined, in order; a decoder must have it too.
+    Raises EncodeError.
     """
     if priors not in PRIORS or effort not in EFFORTS:
         raise EncodeError(f"expected priors best or gauss and effort 1..9, found {priors!r} and {effort}")
@@ -79,33 +85,38 @@ def encode_channels(channels: Sequence[np.ndarray], *, priors: str = "best", eff
     rounds = 0 if effort < 3 else (effort + 1) // 2
     richer = priors == "best" and effort > 1
     fit: Fit = (lambda h: fit_best(h, effort)) if richer else (lambda h: h.gauss)
-    payload, prior_ids = _encode(arrays, plan_priors(histograms, fit, rounds))
+    best = _encode(arrays, plan_priors(histograms, fit, rounds, known), known)
     least = sum(h.gauss.own for h in histograms) / BIT  # of Gaussians, but for what is estimated of exceptions
-    if richer and least < 1.005 * 8 * len(payload) + 256:
-        other = _encode(arrays, plan_priors(histograms, lambda h: h.gauss, rounds))
-        if len(other[0]) < len(payload):
-            payload, prior_ids = other
-    return CodedChannels(payload, 8 * len(payload), sum(h.rate_bits for h in histograms), prior_ids)
+    if richer and least < 1.005 * 8 * len(best[0]) + 256:
+        other = _encode(arrays, plan_priors(histograms, lambda h: h.gauss, rounds, known), known)
+        best = min(best, other, key=lambda encoded: len(encoded[0]))
+    payload, prior_ids, defined = best
+    return CodedChannels(payload, 8 * len(payload), sum(h.rate_bits for h in histograms), prior_ids, defined)
 
 
-def _encode(arrays: Sequence[np.ndarray], plan: Sequence[Fitted]) -> tuple[bytes, list[int]]:
-    out, defined, prior_ids = bytearray(), list[Prior](), []
+def _encode(
+    arrays: Sequence[np.ndarray], plan: Sequence[Fitted], known: Sequence[Fitted]
+) -> tuple[bytes, list[int], list[Fitted]]:
+    out, prior_ids = bytearray(), []
+    defined, fresh = [fitted.prior for fitted in known], list[Fitted]()
     symbols, cums = list[np.ndarray](), list[np.ndarray]()
-    remaining = (fitted.prior for fitted in plan)
+    remaining = iter(plan)
     for array in arrays:
         if len(array) == 0:
             prior_ids.append(CONST)
             continue
-        prior = next(remaining)
+        fitted = next(remaining)
+        prior = fitted.prior
         prior_ids.append(prior.id)
         inside, exceptions = _split(array, prior.window)
-        _write_channel(out, prior, exceptions, defined)
+        if _write_channel(out, prior, exceptions, defined):
+            fresh.append(fitted)
         for part, cum in _parts(inside, prior):
             symbols.append(part)
             cums.append(cum)
-    tables = [p for p in defined if isinstance(p, Hist)]
+    tables = [f.prior for f in fresh if isinstance(f.prior, Hist)]
     words = ans_encode([*(p.class_symbols for p in tables), *symbols], [*(p.class_cum for p in tables), *cums])
-    return bytes(out) + words, prior_ids
+    return bytes(out) + words, prior_ids, fresh
 
 
 def _parts(inside: np.ndarray, prior: Prior) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -124,7 +135,8 @@ def _split(array: np.ndarray, window: Window) -> tuple[np.ndarray, _Exceptions]:
     return symbols[~out], _Exceptions(positions, symbols[positions])
 
 
-def _write_channel(out: bytearray, prior: Prior, exceptions: _Exceptions, defined: list[Prior]) -> None:
+def _write_channel(out: bytearray, prior: Prior, exceptions: _Exceptions, defined: list[Prior]) -> bool:
+    """Whether it defines its prior, which then joins `defined`."""
     back = next((i for i, known in enumerate(reversed(defined)) if known is prior), None)
     family = family_code(prior) if back is None else FIRST_REUSE + back
     put_varint(out, 2 * family + (len(exceptions.positions) > 0))
@@ -133,6 +145,7 @@ def _write_channel(out: bytearray, prior: Prior, exceptions: _Exceptions, define
         defined.append(prior)
     if len(exceptions.positions):
         _write_exceptions(out, exceptions, prior.window)
+    return back is None
 
 
 def _write_exceptions(out: bytearray, exceptions: _Exceptions, window: Window) -> None:
@@ -161,28 +174,35 @@ def _read_exceptions(reader: ByteReader, count: int, window: Window) -> _Excepti
     return _Exceptions(np.array(positions, dtype=np.int64), np.array(values, dtype=np.int64))
 
 
-def decode_channels(payload: bytes | memoryview, counts: Sequence[int]) -> list[np.ndarray]:
+def decode_channels(
+    payload: bytes | memoryview, counts: Sequence[int], known: list[Prior] | None = None
+) -> list[np.ndarray]:
     """Inverse of encode_channels: one int32 [count] array per count.
 
-    The caller has held the counts against its limits. Raises Malformed (cut, trailing or corrupt bytes),
+    known: what the payloads before defined, in order; this one's definitions are appended. The caller has held the
+    counts against its limits. Raises Malformed (cut, trailing or corrupt bytes),
     LimitExceeded, or UnsupportedFeature (a prior outside the registry).
     """
     for index, count in enumerate(counts):
         if not 0 <= count <= MAX_COUNT:
             raise LimitExceeded(f"channel {index}: {count} symbols, limit {MAX_COUNT}")
     reader = ByteReader(payload)
-    defined: list[Prior] = []
-    heads, entries = [], 0
+    defined = [] if known is None else known
+    first, heads, entries = len(defined), [], 0
+    most = sum(counts) + (MORE_ENTRIES if defined else FREE_ENTRIES)
     for count in counts:
         if count:
-            known = len(defined)
+            before = len(defined)
             heads.append(_read_channel(reader, count, defined))
-            entries += sum(prior.window.n for prior in defined[known:])
-            if entries > MAX_ENTRIES:
-                raise LimitExceeded(f"tables of {entries} entries in one section, limit {MAX_ENTRIES}")
+            entries += sum(prior.window.n for prior in defined[before:])
+            if entries > most:
+                raise LimitExceeded(f"tables of {entries} entries in one section, limit {most}")
     stream = AnsDecoder(reader.rest())
-    make_tables(defined)
-    priors = [p.with_class_symbols(stream.take(p.window.n, p.class_cum)) if isinstance(p, Hist) else p for p in defined]
+    make_tables(defined[first:])
+    for at in range(first, len(defined)):
+        prior = defined[at]
+        if isinstance(prior, Hist):
+            defined[at] = prior.with_class_symbols(stream.take(prior.window.n, prior.class_cum))
     remaining = iter(heads)
     arrays = []
     for count in counts:
@@ -190,7 +210,7 @@ def decode_channels(payload: bytes | memoryview, counts: Sequence[int]) -> list[
             arrays.append(np.zeros(0, dtype=np.int32))
             continue
         index, exceptions = next(remaining)
-        arrays.append(_take_channel(stream, count, priors[index], exceptions))
+        arrays.append(_take_channel(stream, count, defined[index], exceptions))
     stream.finish()
     return arrays
 

@@ -22,6 +22,8 @@ import numpy as np
 
 from pd4dgs_codec.entropy.ans import MAX_COUNT
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
+from pd4dgs_codec.entropy.fitting import Fitted
+from pd4dgs_codec.entropy.priors import Prior
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
 from pd4dgs_codec.errors import EncodeError, Malformed
 from pd4dgs_codec.morton import AXIS_BITS, MAX_VOXEL, join_bits, morton_codes
@@ -39,13 +41,19 @@ _CHILD = np.argsort((_BYTES[:, None] >> np.arange(8) & 1) == 0, axis=1, kind="st
 _CODED = range(2, 8)  # numbers of children with more than one pattern; nodes with one child have channels of their own
 
 
-def encode_positions(cells: np.ndarray, effort: int = 5) -> bytes:
+def encode_positions(cells: np.ndarray, effort: int = 5, known: list[Fitted] | None = None) -> bytes:
     """The payload of cells int32 [N, 3] (voxels), which must be distinct and in Morton order (`morton_order`).
 
-    effort: 1..9, time spent on fitting tables, of which there are few. Raises EncodeError as position_channels does.
+    effort: 1..9, time spent on fitting tables, of which there are few. known: priors of payloads before, to which new
+    ones are appended. Raises EncodeError as position_channels does.
     """
     head, channels = position_channels(cells)
-    return head + encode_channels(channels, effort=max(effort, LEAST_EFFORT)).payload if head else b""
+    if not head:
+        return b""
+    coded = encode_channels(channels, effort=max(effort, LEAST_EFFORT), known=known or ())
+    if known is not None:
+        known += coded.defined
+    return head + coded.payload
 
 
 def position_channels(cells: np.ndarray) -> tuple[bytes, list[np.ndarray]]:
@@ -101,9 +109,10 @@ def _occupancies(codes: np.ndarray, depth: int) -> list[np.ndarray]:
     return levels[::-1]
 
 
-def decode_positions(payload: bytes | memoryview, count: int) -> np.ndarray:
+def decode_positions(payload: bytes | memoryview, count: int, known: list[Prior] | None = None) -> np.ndarray:
     """The cells int32 [count, 3] of a payload, in Morton order. Memory is O(count), whatever the bytes say.
 
+    known: priors of payloads before, to which this one's are appended.
     Raises Malformed or LimitExceeded if the payload is not one that encode_positions could make for them.
     """
     if count <= 0:
@@ -122,7 +131,7 @@ def decode_positions(payload: bytes | memoryview, count: int) -> np.ndarray:
     for have, alone in zip(nodes, single, strict=True):
         lengths += [only, have - only, alone] if have < count else [alone]
         only = alone
-    channels = decode_channels(reader.rest(), [*lengths, *sizes])
+    channels = decode_channels(reader.rest(), [*lengths, *sizes], known)
     codes = _grow(channels, nodes, single, sizes, count)
     offsets = np.stack([join_bits(codes >> axis) for axis in range(3)], axis=1)
     if offsets.min(axis=0).any() or int(offsets.max()).bit_length() != depth:

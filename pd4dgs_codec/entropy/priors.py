@@ -31,7 +31,9 @@ from pd4dgs_codec.errors import Malformed, UnsupportedFeature
 
 K_MAX = (1 << 24) - 1  #: |k| of any symbol
 MAX_WINDOW = 1 << 14
-MAX_ENTRIES = 1 << 21  #: of all tables of one section: eight bytes can define a table of 2**14 entries, 128 KiB
+#: Entries of all tables that a section defines, over one for each of its symbols: where nothing is defined before, and
+#: where something is. Eight bytes can define a table of 2**14 entries, 128 KiB, and anew in each section of each slice.
+FREE_ENTRIES, MORE_ENTRIES = 1 << 18, 1 << 10
 MAX_SHIFT = 12
 MU8_MAX = 1 << 31
 FLOORS = (1, 16)  #: 16 / 2**24 is the clip of R(a)

@@ -37,21 +37,41 @@ def anchor_harm(
     1 to 0: ||dI/dg||^2, the diagonal of the Gauss-Newton matrix, from products with random signs (Bekas, Kokiopoulou
     and Saad, An estimator for the diagonal of a matrix, 2007).
     """
+    image, gate, met = _gated(model, level, t, camera, rounding)
+    return _squared(image, gate, generator, weights), met, image.detach()
+
+
+def anchor_slopes(
+    model: Model, level: int, t: float, camera: Camera, generator: torch.Generator, reference: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """(float64 [N] <I - J, dI/dg> of each anchor, I the picture, J the reference [H, W, 3]; float64 [N] ||dI/dg||^2 as
+    in anchor_harm; bool [N] whether the picture comes near it)."""
+    image, gate, met = _gated(model, level, t, camera, EXACT)
+    (slope,) = torch.autograd.grad((image * (image.detach() - reference)).sum(), gate, retain_graph=True)
+    return slope.double(), _squared(image, gate, generator), met
+
+
+def _gated(model: Model, level: int, t: float, camera: Camera, rounding: Rounding) -> tuple[Tensor, Tensor, Tensor]:
+    """(picture [H, W, 3], gates of the anchors [N], all 1, from which it was drawn, bool [N] which it comes near)."""
     with torch.no_grad():
         g = model.gaussians(level, t, camera, rounding)
     n, device = len(model.anchor_q), g.means.device
-    total = torch.zeros(n, dtype=torch.float64, device=device)
     met = torch.zeros(n, dtype=torch.bool, device=device)
     met[g.anchors] = True
     gate = torch.ones(n, device=device, requires_grad=True)
     shown = gate[torch.div(g.slots, model.widths.slots, rounding_mode="floor")]
     gated = replace(g, scales=g.scales * shown[:, None], opacities=g.opacities * shown)
-    image = draw(model.info, gated, camera).image
+    return draw(model.info, gated, camera).image, gate, met
+
+
+def _squared(image: Tensor, gate: Tensor, generator: torch.Generator, weights: Tensor | None = None) -> Tensor:
+    """float64 [N]: the squared norm of the picture's derivative by each gate, estimated."""
+    total = torch.zeros(len(gate), dtype=torch.float64, device=gate.device)
     for _ in range(PROBES):
         signs = _signs(image, generator, weights)
         (slope,) = torch.autograd.grad((image * signs).sum(), gate, retain_graph=True)
         total += slope.double().square() / PROBES
-    return total, met, image.detach()
+    return total
 
 
 def step_harm(

@@ -7,18 +7,22 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.codec.encoder import Report, encode_with_report
+from pd4dgs_codec.codec.encoder import Report, encode_with_report, with_metadata
 from pd4dgs_codec.codec.left_out import LeftOut
 from pd4dgs_codec.codec.metadata import Metadata
 from pd4dgs_codec.codec.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.codec.plan import plan
+from pd4dgs_codec.codec.stream import open_stream
 from pd4dgs_codec.codec.symbols import rounded
 from pd4dgs_codec.pack import MIN_GAIN_PER_MEGABYTE
 from pd4dgs_codec.scene import Scene
 
 if TYPE_CHECKING:
+    import numpy as np
+
     from pd4dgs_codec.data.view import Dataset, View
     from pd4dgs_codec.model.model import Model
+    from pd4dgs_codec.view.frames import Frame
 
 #: Pictures of the file's own camera, and how many degrees it sways, where there are no views.
 OWN_PICTURES, OWN_ORBIT = 16, 20.0
@@ -54,18 +58,22 @@ class Views:
 class Packed:
     """A `.pd4` file. scene: what was encoded, at the steps of the file. target: how sizes were met, or None where none
     were asked for: cameras, pictures, layers (as in target.Fit) and levels (level, error_psnr in dB against the
-    unquantised pictures, and with held-out views lost_db, their mPSNR)."""
+    unquantised pictures, and with held-out views lost_db, their mPSNR). slices: of a sliced file, by what its anchors
+    are ordered, in how many pictures, and with held-out views the mPSNR in dB after each slice; else None."""
 
     data: bytes
     scene: Scene
     report: Report
     target: dict[str, Any] | None
+    slices: dict[str, Any] | None = None
 
     def json(self) -> dict[str, Any]:
         """The report, with the target and per layer the ratio of payload to R(a)."""
         result = self.report.json()
         if self.target is not None:
             result["target"] = self.target
+        if self.slices is not None:
+            result["slices"] = self.slices
         for row in result["layers"]:
             row["ratio"] = row["payload_bits"] / row["rate_bits"] if row["rate_bits"] else None
         return result
@@ -87,8 +95,9 @@ def pack(
     target_sizes: most bytes that each layer may add to the file, by layer. views: pictures to judge by; without them
     sizes are fitted on what the file's own camera shows, 1/downscale as wide and high, and no layer must pay. min_gain:
     dB of mPSNR per megabyte under which a layer is left out, where all layers are asked for; 0 keeps all. metadata:
-    what the file says about itself. Only views and target sizes need torch. Raises EncodeError, RenderError for a file
-    without a camera.
+    what the file says about itself. If options.slices, anchors come in the order of what they gain in the views that
+    sizes are fitted on, or in what the file's own camera shows; a file without either has the largest first. Only
+    views, target sizes and slices need torch. Raises EncodeError, RenderError for a file without a camera.
     """
     scene = source if isinstance(source, Scene) else _scene_of(source)
     scene, options = options.apply_scale(scene)
@@ -102,12 +111,69 @@ def pack(
     if target_sizes:
         scene, more, target = _fit(scene, options, target_sizes, views, downscale, progress)
         left_out += more
+    if options.slices:
+        return _in_slices(scene, options, left_out, target, views, downscale, metadata, progress)
     data, report = encode_with_report(scene, options, left_out=left_out, metadata=metadata)
+    _note_sizes(target, report)
+    return Packed(data, scene, report, target)
+
+
+def _note_sizes(target: dict[str, Any] | None, report: Report) -> None:
     if target is not None:
         added = report.added_bytes()
         for row in target["layers"]:
             row["bytes"] = added.get(row["layer"], 0)
-    return Packed(data, scene, report, target)
+
+
+def _in_slices(
+    scene: Scene,
+    options: EncodeOptions,
+    left_out: list[LeftOut],
+    target: dict[str, Any] | None,
+    views: Views | None,
+    downscale: int,
+    metadata: Metadata | None,
+    progress: Progress,
+) -> Packed:
+    from pd4dgs_codec.pack.rendered import true_psnr
+    from pd4dgs_codec.pack.utility import utility
+
+    about: dict[str, Any] = {"order": "gate times area", "cameras": None, "pictures": 0}
+    order: Callable[[Scene], np.ndarray] | None = None
+    frames = _frames(scene, views, downscale) if views is not None or scene.info.camera is not None else []
+    if frames:
+        about = {"order": "rendered gain per byte", "cameras": _cameras(views), "pictures": len(frames)}
+
+        def order(decoded: Scene) -> np.ndarray:
+            with progress("ordering anchors") as step:
+                return utility(decoded, frames, step)
+
+    data, report = encode_with_report(scene, options, left_out=left_out, utility=order)
+    _note_sizes(target, report)
+    if views is not None and views.held_out:
+        with progress("judging slices") as step:
+            about["psnr"] = [
+                true_psnr(prefix, views.held_out, step, levels=[prefix.level])[prefix.level]
+                for prefix in open_stream().feed(data)
+            ]
+        metadata = replace(metadata or Metadata(), slices=tuple(about["psnr"]))
+    if metadata is not None:
+        plain, data = len(data), with_metadata(data, metadata)
+        report = replace(report, bytes=len(data), metadata_bytes=len(data) - plain)
+    return Packed(data, scene, report, target, about)
+
+
+def _frames(scene: Scene, views: Views | None, downscale: int) -> list[Frame]:
+    """The pictures to fit to."""
+    from pd4dgs_codec.view.frames import dataset_frames, own_frames
+
+    if views is None:
+        return own_frames(scene.info, OWN_PICTURES, OWN_ORBIT, downscale)
+    return dataset_frames(views.fitting)
+
+
+def _cameras(views: Views | None) -> str:
+    return "the file's own camera" if views is None else f"training views of {views.source}"
 
 
 def _scene_of(model: Model) -> Scene:
@@ -127,13 +193,9 @@ def _fit(
     """(scene whose layers meet the sizes, what that leaves out, the target of the report)."""
     from pd4dgs_codec.pack.rendered import RenderedLoss, psnr_of, true_psnr
     from pd4dgs_codec.pack.target import fit
-    from pd4dgs_codec.view.frames import dataset_frames, own_frames
 
     scene, left_out = plan(scene, options)
-    if views is None:
-        frames = own_frames(scene.info, OWN_PICTURES, OWN_ORBIT, downscale)
-    else:
-        frames = dataset_frames(views.fitting)
+    frames = _frames(scene, views, downscale)
     held_out = () if views is None else views.held_out
     with progress("fitting sizes") as step:
         loss = RenderedLoss(scene, frames, step)
@@ -146,7 +208,7 @@ def _fit(
         lost = {"lost_db": before[level] - after[level]} if held_out else {}
         levels.append({"level": level, "error_psnr": psnr_of(mse), **lost})
     report = {
-        "cameras": "the file's own camera" if views is None else f"training views of {views.source}",
+        "cameras": _cameras(views),
         "pictures": len(frames),
         "layers": [asdict(row) for row in fits],
         "levels": levels,

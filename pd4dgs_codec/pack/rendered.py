@@ -68,11 +68,17 @@ def psnr_of(mse: float) -> float:
     return -10.0 * math.log10(mse) if mse else math.inf
 
 
-def true_psnr(scene: Scene, views: Sequence[View], step: Callable[[], None] = lambda: None) -> dict[int, float]:
-    """Per level of a decoded scene the mean mPSNR over views, dB."""
+def true_psnr(
+    scene: Scene,
+    views: Sequence[View],
+    step: Callable[[], None] = lambda: None,
+    *,
+    levels: Sequence[int] | None = None,
+) -> dict[int, float]:
+    """Per level of a decoded scene, of all of them if None, the mean mPSNR over views, dB."""
     model = from_scene(scene)
 
     def draw(level: int, view: View) -> np.ndarray:
         return render_image(model, level, view.time, view.camera)
 
-    return level_psnr(draw, scene.layers, views, step)
+    return level_psnr(draw, scene.layers if levels is None else levels, views, step)

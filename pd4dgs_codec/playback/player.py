@@ -5,7 +5,8 @@ The two agree to rounding: both sum in binary32, in other orders.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from itertools import pairwise
 
 import numpy as np
 
@@ -17,7 +18,7 @@ from pd4dgs_codec.playback.networks import Field, Layers, hidden_layers
 from pd4dgs_codec.render.checks import check_time
 from pd4dgs_codec.render.rasteriser import draw
 from pd4dgs_codec.render.simd import LANES
-from pd4dgs_codec.scene import MASK_STEP, MASK_THRESHOLD, Camera, Network, Scene
+from pd4dgs_codec.scene import GLOBAL_HEADS, MASK_STEP, MASK_THRESHOLD, Camera, Network, Scene
 
 #: Columns of the kernels' rows of Gaussians: mean, scales, quaternion, opacity, colour.
 GAUSSIAN_WIDTH = COLOR + 3
@@ -47,21 +48,35 @@ class Player:
         codes = scene.mask[-1]
         self._mask = codes.astype(np.float32) * MASK_STEP
         self._anchor = np.ascontiguousarray(scene.anchor[: len(codes)], np.float32)
-        self._feature, self._scaling_log = scene.feature, scene.scaling_log
-        self._offset = scene.offset
-        self._slots = scene.widths.slots
+        self.slots = scene.widths.slots  #: Gaussians of an anchor
+        # what an anchor holds side by side, as the kernels take it and as the heads of the global deformation move it
+        self._table = np.concatenate(
+            [self._anchor, scene.feature, scene.offset.reshape(len(codes), 3 * self.slots), scene.scaling_log], axis=1
+        )
+        ends = np.cumsum([*scene.widths.global_heads.values()]).tolist()
+        self._columns = {head: slice(*bounds) for head, bounds in zip(GLOBAL_HEADS, pairwise([0, *ends]), strict=True)}
         extent = np.exp(scene.scaling_log)
         self._radius = OFFSET_REACH * extent[:, :3].max(axis=1) + SIGMA_REACH * extent[:, 3:].max(axis=1)
         box = scene.info.box
         self._global = None if scene.global_deformation is None else Field(scene.global_deformation, box)
         self._local = None if scene.local_deformation is None else Field(scene.local_deformation, box)
         self._opacity = Layers(scene.networks["opacity"])
-        self._covariance = _SlotNetwork(scene.networks["covariance"], self._slots)
-        self._color = _SlotNetwork(scene.networks["color"], self._slots)
+        self._covariance = _SlotNetwork(scene.networks["covariance"], self.slots)
+        self._color = _SlotNetwork(scene.networks["color"], self.slots)
         self._time: float | None = None
         if self._global is not None:
             self._residuals = np.empty((len(codes), sum(self._global.widths.values())), np.float32)
         self._known = np.zeros(len(codes), bool)  # anchors whose residuals at self._time are there
+
+    @property
+    def active(self) -> np.ndarray:
+        """int64 [n]: the anchors active at this level, ascending."""
+        return np.flatnonzero(self._mask > MASK_THRESHOLD)
+
+    @property
+    def positions(self) -> np.ndarray:
+        """float32 [N, 3]: all anchors at rest, world."""
+        return self._anchor
 
     def picture(self, camera: Camera, t: float) -> np.ndarray:
         """float32 [H, W, 3] in 0..1 at normalised time t in 0..1. Raises RenderError unless t is finite."""
@@ -88,36 +103,76 @@ class Player:
 
     def _gaussians(self, camera: Camera, t: float) -> Gaussians:
         rows = self._visible(camera)
-        mask, position = self._mask[rows], self._anchor[rows]
-        feature, scaling_log, offset = self._feature[rows], self._scaling_log[rows], self._offset[rows]
-        if self._global is not None:
-            residuals = self._global.split(self._residuals_at(rows, t))
-            position = _moved(position, residuals, "position")
-            feature = _moved(feature, residuals, "feature")
-            offset = _moved(offset, residuals, "offset")
-            scaling_log = _moved(scaling_log, residuals, "scaling")
+        mask, anchors = self._mask[rows], self._anchors(rows, t)
         viewmat = np.asarray(camera.viewmat, np.float32)
-        inputs = np.concatenate([feature, _unit(position + viewmat[:3, :3].T @ viewmat[:3, 3])], axis=1)
+        inputs = self._inputs(anchors, -viewmat[:3, :3].T @ viewmat[:3, 3])
         raw_opacity = np.tanh(self._opacity(inputs))
         keep = np.flatnonzero(raw_opacity * mask[:, None] >= np.float32(MIN_OPACITY))
+        return self._grown(rows, anchors, inputs, raw_opacity, mask, keep, t)
+
+    def gaussians_of_eyes(self, rows: np.ndarray, t: float, eyes: np.ndarray) -> Gaussians:
+        """The Gaussians of the anchors `rows` int64 [n] that any of E eyes, float32 [E, 3] world, would see, at
+        normalised time t: those of the first eye, then as many of the second, and so on, slot by slot.
+
+        An eye that does not see one meets it with opacity 0. Frusta do not matter here.
+        """
+        with np.errstate(all="ignore"):
+            anchors = self._anchors(rows, t)
+            inputs = np.concatenate([self._inputs(anchors, eye) for eye in eyes])
+            mask = np.tile(self._mask[rows], len(eyes))
+            raw_opacity = np.tanh(self._opacity(inputs))
+            shown = (raw_opacity * mask[:, None] >= np.float32(MIN_OPACITY)).reshape(len(eyes), -1)
+            slots = np.flatnonzero(shown.any(axis=0))
+            keep = (np.arange(len(eyes))[:, None] * shown.shape[1] + slots).ravel()
+            repeated = np.tile(rows, len(eyes)), np.tile(anchors, (len(eyes), 1))
+            grown = self._grown(*repeated, inputs, raw_opacity, mask, keep, t, len(eyes))
+        return replace(grown, opacities=np.where(shown[:, slots].ravel(), grown.opacities, np.float32(0)))
+
+    def _anchors(self, rows: np.ndarray, t: float) -> np.ndarray:
+        """float32 [n, D + 3 G + 9]: the anchors `rows` where the global deformation takes them."""
+        anchors = self._table.take(rows, axis=0)
+        if self._global is not None:
+            residuals = self._residuals_at(rows, t)
+            if tuple(self._global.widths) == GLOBAL_HEADS:  # all of them, as they stand in the table
+                anchors += residuals
+            else:
+                for head, part in self._global.split(residuals).items():
+                    anchors[:, self._columns[head]] += part
+        return anchors
+
+    def _inputs(self, anchors: np.ndarray, eye: np.ndarray) -> np.ndarray:
+        """float32 [n, D + 3]: what the networks take, features and directions from the eye [3]."""
+        return np.concatenate([anchors[:, self._columns["feature"]], _unit(anchors[:, :3] - eye)], axis=1)
+
+    def _grown(
+        self,
+        rows: np.ndarray,
+        anchors: np.ndarray,
+        inputs: np.ndarray,
+        raw_opacity: np.ndarray,
+        mask: np.ndarray,
+        keep: np.ndarray,
+        t: float,
+        copies: int = 1,
+    ) -> Gaussians:
+        """The Gaussians of the slots `keep`, which are `copies` times the same means."""
         shape = self._covariance(inputs, keep)
         colors = _sigmoid(self._color(inputs, keep))
-        anchors = np.concatenate([position, feature, offset.reshape(len(rows), 3 * self._slots), scaling_log], axis=1)
+        extent = np.exp(anchors[:, self._columns["scaling"]])
         made, gate = np.empty((len(keep), GAUSSIAN_WIDTH), np.float32), np.empty(len(keep), np.float32)
         threads.limit_numba()
-        slot_kernels.assemble(
-            made, gate, keep, anchors, np.exp(scaling_log), raw_opacity, mask, shape, _sigmoid(shape), colors
-        )
+        slot_kernels.assemble(made, gate, keep, anchors, extent, raw_opacity, mask, shape, _sigmoid(shape), colors)
         means, scales, quats, opacities, colors = np.split(made, [SCALE, QUAT, OPACITY, COLOR], axis=1)
         opacities = opacities[:, 0]
         if self._local is not None:
-            moves = self._local.split(self._local(means, t))
+            residuals = self._local(means[: len(means) // copies], t)
+            moves = self._local.split(residuals if copies == 1 else np.tile(residuals, (copies, 1)))
             means = _moved(means, moves, "mean")
             scales = np.maximum(_moved(scales, moves, "scale"), 0) if "scale" in moves else scales
             quats = _unit(_moved(quats, moves, "quat")) if "quat" in moves else quats
             opacities = np.clip(_moved(opacities, moves, "opacity"), 0, 1) if "opacity" in moves else opacities
             colors = np.clip(_moved(colors, moves, "color"), 0, 1) if "color" in moves else colors
-        slots = rows[keep // self._slots] * self._slots + keep % self._slots
+        slots = rows[keep // self.slots] * self.slots + keep % self.slots
         means, quats, colors = (np.ascontiguousarray(part) for part in (means, quats, colors))
         return Gaussians(means, quats, scales * gate[:, None], opacities * gate, colors, slots)
 

@@ -60,32 +60,44 @@ def level_of(scene: Scene, device: str = "cpu") -> Level:
 
 
 def load_levels(
-    file: str | Path | bytes, max_layer: int | None = None, device: str = "cpu", *, last_only: bool = False
+    file: str | Path | bytes,
+    max_layer: int | None = None,
+    device: str = "cpu",
+    *,
+    max_bytes: int | None = None,
+    last_only: bool = False,
 ) -> list[Level]:
     """The levels of a `.pd4` file (or its bytes) or of a checkpoint, ascending, up to max_layer; or only the
-    last of them.
+    last of them. max_bytes: of a `.pd4`, only what the slices within so many bytes give.
 
     Each level of a `.pd4` is decoded from its own prefix, so nothing of a later layer can leak into it.
     """
     if isinstance(file, bytes):
-        return _of_bytes(file, max_layer, device, last_only)
+        return _of_bytes(file, max_layer, device, max_bytes, last_only)
     try:
         data = Path(file).read_bytes()
     except OSError as error:
         raise DataError(f"{file}: cannot be read: {error.strerror}") from None
     if data.startswith(SIGNATURE[:4]):
-        return _of_bytes(data, max_layer, device, last_only)
+        return _of_bytes(data, max_layer, device, max_bytes, last_only)
+    if max_bytes is not None:
+        raise DataError(f"{file}: a checkpoint has no slices; expected a .pd4 file")
     return _of_checkpoint(file, max_layer, device)[-1 if last_only else 0 :]
 
 
-def _of_bytes(data: bytes, max_layer: int | None, device: str, last_only: bool) -> list[Level]:
-    levels = []
-    rows = [row for row in info(data)["layers"] if max_layer is None or row["layer"] <= max_layer]
-    for row in rows[-1:] if last_only else rows:
+def _of_bytes(data: bytes, max_layer: int | None, device: str, max_bytes: int | None, last_only: bool) -> list[Level]:
+    levels, ends = [], dict[int, int]()
+    for row in info(data)["layers"]:
+        within = [part["end"] for part in row["slices"] if max_bytes is None or part["end"] <= max_bytes]
+        if within and (max_layer is None or row["layer"] <= max_layer):
+            ends[row["layer"]] = within[-1]
+    if not ends and max_bytes is not None:
+        decode(data, max_bytes=max_bytes)  # which says why there is none
+    for layer in list(ends)[-1:] if last_only else ends:
         start = perf_counter()
-        scene = decode(data[: row["end"]], max_layer=row["layer"])
+        scene = decode(data[: ends[layer]], max_layer=layer, max_bytes=ends[layer])
         seconds = perf_counter() - start
-        levels.append(replace(level_of(scene, device), cumulative_bytes=row["end"], decode_seconds=seconds))
+        levels.append(replace(level_of(scene, device), cumulative_bytes=ends[layer], decode_seconds=seconds))
     return levels
 
 

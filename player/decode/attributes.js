@@ -1,24 +1,24 @@
-// Clauses 8.5 to 8.7: the attributes section. Its result is the 68 channels of 11.2, still unchecked against 11.2.
+// Clauses 8.5 to 8.7: the attributes section. Its result is the channels of 11.2, still unchecked against 11.2.
 
 import { ByteReader } from "./bytes.js";
 import { decodeChannels } from "./channels.js";
 import { malformed, unsupported } from "./errors.js";
 import { MAX_CODED } from "./limits.js";
+import { channelCount } from "./parameters.js";
 import {
+  activityBounds,
   addRelativeMagnitudes,
   classesByActivity,
   decodeStage,
   groupByClass,
   readClassCount,
   readStages,
+  referenceOf,
 } from "./stages.js";
 
-export const CHANNELS = 68;
-/** Features and log-scalings, the channels that are predicted from each other. */
-const PREDICTED = 38;
-const GAUSSIANS = 10;
-/** The channels of stages 0..4 are those from one bound to the next; stage 5 is split by the activity of all of them. */
-const STAGE_BOUNDS = [0, 6, 12, 20, 29, PREDICTED];
+/** Where the channels of stages 0..4 begin, and those of stage 4 end, in parts of the predicted ones; stage 5 is split by
+ * the activity of all of them. */
+const STAGE_BOUNDS = [0, 6, 12, 20, 29, 38];
 const X_STAGE = 5;
 const STAGES = 8;
 /** Classes by distance of a Gaussian's second and third coordinate. */
@@ -28,27 +28,57 @@ const DISTANCES = [5, 7];
 /** split: bit 0 for y, bit 1 for z. @typedef {{split: number, a: number, b: number}} Split */
 
 /**
- * @param {Uint8Array} bytes the section @param {number} rows at least 1
- * @returns {Int32Array} [68, rows]
+ * A prediction block (8.6), with what its slice was classed by: per channel that counts, and per stage.
+ *
+ * @typedef {object} Block
+ * @property {Terms[]} terms
+ * @property {number[]} classCounts
+ * @property {Split[]} splits
+ * @property {Map<number, import("./stages.js").Reference>} references
+ * @property {number[][]} bounds
  */
-export function decodeAttributes(bytes, rows) {
+
+/**
+ * @param {Uint8Array} bytes the section @param {number} rows at least 1 @param {import("./header.js").Widths} widths
+ * @param {import("./slices.js").Continuation} continuation of the layer
+ * @returns {Int32Array} [D + 6 + 3·G, rows]
+ */
+export function decodeAttributes(bytes, rows, widths, continuation) {
   const reader = new ByteReader(bytes);
   const form = reader.byte("the form of the attributes");
-  const out = new Int32Array(CHANNELS * rows);
-  if (form === 0) decodeChannels(reader.rest(), new Array(CHANNELS).fill(rows), out);
-  else if (form === 1) decodeStaged(reader, rows, out);
-  else throw unsupported(`form ${form} of the attributes`);
+  const channels = channelCount(widths);
+  const out = new Int32Array(channels * rows);
+  if (form === 0) decodeChannels(reader.rest(), new Array(channels).fill(rows), out, continuation.definitions("plain"));
+  else if (form === 1) {
+    const block = readBlock(reader, widths);
+    decodeStaged(reader, rows, widths, block, true, continuation, out);
+    continuation.block = block;
+  } else if (form === 2) {
+    if (!continuation.block) throw malformed("attributes that go on with a block, and none before in the layer");
+    decodeStaged(reader, rows, widths, continuation.block, false, continuation, out);
+  } else throw unsupported(`form ${form} of the attributes`);
   return out;
 }
 
-/** @param {ByteReader} reader @param {number} rows @param {Int32Array} out */
-function decodeStaged(reader, rows, out) {
+/** 8.6. @param {ByteReader} reader @param {import("./header.js").Widths} widths @returns {Block} */
+function readBlock(reader, { feature, slots }) {
+  const predicted = feature + 6;
   /** @type {Terms[]} */
   const terms = [[]];
-  for (let c = 1; c < PREDICTED; c++) terms.push(readTerms(reader, c));
+  for (let c = 1; c < predicted; c++) terms.push(readTerms(reader, c, predicted));
   const classCounts = [1];
   for (let stage = 1; stage <= X_STAGE; stage++) classCounts.push(readClassCount(reader));
-  const splits = Array.from({ length: GAUSSIANS }, () => readSplit(reader));
+  const splits = Array.from({ length: slots }, () => readSplit(reader));
+  return { terms, classCounts, splits, references: new Map(), bounds: [] };
+}
+
+/** 8.7. @param {ByteReader} reader @param {number} rows @param {import("./header.js").Widths} widths @param {Block} block
+ * @param {boolean} own whether the block stands in this slice, and takes down what it is classed by
+ * @param {import("./slices.js").Continuation} continuation @param {Int32Array} out */
+function decodeStaged(reader, rows, { feature, slots }, block, own, continuation, out) {
+  const { terms, classCounts, splits, references } = block;
+  const predicted = feature + 6; // features and log-scalings, from each other
+  const firsts = STAGE_BOUNDS.map((part) => Math.floor((predicted * part) / 38));
   const stages = readStages(reader, STAGES);
   /** @param {number} c */
   const channel = (c) => out.subarray(c * rows, (c + 1) * rows);
@@ -56,36 +86,41 @@ function decodeStaged(reader, rows, out) {
   const activity = new Float64Array(rows);
   for (let stage = 0; stage <= X_STAGE; stage++) {
     const count = classCounts[stage];
-    const classes = classesByActivity(activity, count);
-    const groups = count > 1 ? groupByClass(classes, count) : null;
+    if (own) block.bounds.push(activityBounds(activity, count));
+    const groups = count > 1 ? groupByClass(classesByActivity(activity, block.bounds[stage]), count) : null;
     const channels = [];
-    if (stage === X_STAGE) for (let i = 0; i < GAUSSIANS; i++) channels.push(PREDICTED + 3 * i);
-    else for (let c = STAGE_BOUNDS[stage]; c < STAGE_BOUNDS[stage + 1]; c++) channels.push(c);
-    decodeStage(stages[stage], channels.map(channel), channels.map(() => groups));
+    if (stage === X_STAGE) for (let i = 0; i < slots; i++) channels.push(predicted + 3 * i);
+    else for (let c = firsts[stage]; c < firsts[stage + 1]; c++) channels.push(c);
+    const targets = channels.map(channel);
+    decodeStage(stages[stage], targets, channels.map(() => groups), continuation.definitions(stage));
     if (stage < X_STAGE && classCounts.slice(stage + 1).some((later) => later > 1)) {
-      for (const c of channels) addRelativeMagnitudes(channel(c), activity);
+      channels.forEach((c, i) => {
+        if (own) references.set(c, referenceOf(targets[i]));
+        addRelativeMagnitudes(targets[i], activity, references.get(c));
+      });
     }
   }
   for (let coordinate = 1; coordinate <= 2; coordinate++) {
-    const targets = splits.map((_, i) => channel(PREDICTED + 3 * i + coordinate));
+    const targets = splits.map((_, i) => channel(predicted + 3 * i + coordinate));
     const groups = splits.map(({ split, a, b }, i) => {
       if (!(split & coordinate)) return null;
-      const x = channel(PREDICTED + 3 * i);
-      const y = coordinate === 2 ? channel(PREDICTED + 3 * i + 1) : null;
+      const x = channel(predicted + 3 * i);
+      const y = coordinate === 2 ? channel(predicted + 3 * i + 1) : null;
       return groupByClass(classesByDistance(x, a, y, b), DISTANCES[coordinate - 1]);
     });
-    decodeStage(stages[X_STAGE + coordinate], targets, groups);
+    const stage = X_STAGE + coordinate;
+    decodeStage(stages[stage], targets, groups, continuation.definitions(stage));
   }
-  for (let c = 1; c < PREDICTED; c++) predict(channel(c), terms[c], channel);
+  for (let c = 1; c < predicted; c++) predict(channel(c), terms[c], channel);
 }
 
-/** Item 1 of 8.6. @param {ByteReader} reader @param {number} c @returns {Terms} */
-function readTerms(reader, c) {
+/** Item 1 of 8.6. @param {ByteReader} reader @param {number} c @param {number} predicted @returns {Terms} */
+function readTerms(reader, c, predicted) {
   /** @type {Terms} */
   const terms = [];
   let channel = -1;
   for (let left = reader.varint(c, "a number of terms"); left > 0; left--) {
-    channel += 1 + reader.varint(PREDICTED, "a term's channel");
+    channel += 1 + reader.varint(predicted, "a term's channel");
     const weight = reader.zigzag(2 ** 15, "a term's weight");
     if (channel >= c) throw malformed(`channel ${c} is predicted from channel ${channel}, expected one below it`);
     terms.push({ channel, weight });

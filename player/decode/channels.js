@@ -3,7 +3,7 @@
 import { AnsDecoder } from "./ans.js";
 import { ByteReader, MAX_VARINT } from "./bytes.js";
 import { limitExceeded, malformed, unsupported } from "./errors.js";
-import { MAX_CODED, MAX_COUNT, MAX_ENTRIES, MAX_WINDOW } from "./limits.js";
+import { MAX_CODED, MAX_COUNT, FREE_ENTRIES, MAX_WINDOW, MORE_ENTRIES } from "./limits.js";
 import { Table, histogramTable, mixtureTable, normTable } from "./tables.js";
 
 const CONST = 0;
@@ -26,18 +26,29 @@ const FIRST_REUSE = 8;
 
 /** positions ascend. @typedef {{positions: number[], values: number[]}} Exceptions */
 
+/** The priors that tokens of one section may refer to, in the order of their definition. */
+export class Definitions {
+  constructor() {
+    /** @type {Prior[]} */
+    this.priors = [];
+  }
+}
+
 /**
  * Decodes a section of coded channels of these lengths, one behind the other into `out`, which they fill.
  *
  * @param {Uint8Array} bytes @param {ArrayLike<number>} counts @param {Int32Array} out
+ * @param {Definitions} [known] of the slices before; what this section defines is added
  */
-export function decodeChannels(bytes, counts, out) {
+export function decodeChannels(bytes, counts, out, known = new Definitions()) {
   const reader = new ByteReader(bytes);
-  /** @type {Prior[]} */
-  const priors = [];
+  const { priors } = known;
+  const before = priors.length;
+  let entries = 0;
+  let most = before ? MORE_ENTRIES : FREE_ENTRIES;
+  for (let i = 0; i < counts.length; i++) most += counts[i];
   /** @type {{count: number, prior: Prior, exceptions: Exceptions | null}[]} */
   const channels = [];
-  let entries = 0;
   for (let i = 0; i < counts.length; i++) {
     const count = counts[i];
     if (!count) continue;
@@ -48,9 +59,7 @@ export function decodeChannels(bytes, counts, out) {
       prior = readPrior(reader, family);
       priors.push(prior);
       entries += prior.window.n;
-      if (entries > MAX_ENTRIES) {
-        throw limitExceeded(`tables of ${entries} entries in one section, limit ${MAX_ENTRIES}`);
-      }
+      if (entries > most) throw limitExceeded(`tables of ${entries} entries for one section, limit ${most}`);
     } else {
       prior = priors[priors.length - 1 - (family - FIRST_REUSE)];
       if (!prior) throw malformed("a channel refers to a prior before the first");
@@ -58,7 +67,7 @@ export function decodeChannels(bytes, counts, out) {
     channels.push({ count, prior, exceptions: token & 1 ? readExceptions(reader, count, prior.window) : null });
   }
   const stream = new AnsDecoder(reader.rest());
-  for (const prior of priors) prior.readClasses?.(stream);
+  for (let i = before; i < priors.length; i++) priors[i].readClasses?.(stream);
   let at = 0;
   for (const { count, prior, exceptions } of channels) {
     takeChannel(stream, prior, exceptions, out, at, count);

@@ -2,18 +2,22 @@
 
 import { DecodeError } from "./errors.js";
 import { crc32, hex, Sha256 } from "./digests.js";
-import { MAX_FIELDS, MAX_PAYLOAD } from "./limits.js";
+import { MAX_HEADER, MAX_PAYLOAD } from "./limits.js";
 
 const SIGNATURE = [0x89, 0x50, 0x44, 0x34, 0x0d, 0x0a, 0x1a, 0x0a];
 const MAJOR = 2;
 export const PREAMBLE_SIZE = 20;
 /** Bytes of preamble and the longest header. */
-export const LONGEST_HEADER = PREAMBLE_SIZE + MAX_FIELDS;
+export const LONGEST_HEADER = PREAMBLE_SIZE + MAX_HEADER;
 const CHUNK_HEAD = 16;
 /** Bytes of a chunk around its payload. */
 export const CHUNK_OVERHEAD = CHUNK_HEAD + 4;
 const SCENE_ID_SIZE = 8;
 const ANCILLARY = 1;
+const MORE = 2;
+/** Bits 2..5. */
+const RESERVED = 0x3c;
+const NUMBER_SHIFT = 6;
 
 /** @param {Uint8Array} bytes */
 const viewOf = (bytes) => new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
@@ -44,8 +48,8 @@ export function readPreamble(bytes) {
     throw new DecodeError("UnsupportedVersion", message, { offset: 8 });
   }
   const length = headerLength(bytes);
-  if (length > MAX_FIELDS) {
-    throw new DecodeError("LimitExceeded", `a header of ${length} bytes, limit ${MAX_FIELDS}`, { offset: 12 });
+  if (length > MAX_HEADER) {
+    throw new DecodeError("LimitExceeded", `a header of ${length} bytes, limit ${MAX_HEADER}`, { offset: 12 });
   }
   need(bytes, PREAMBLE_SIZE + length, "the header", 0, null);
   const header = bytes.subarray(PREAMBLE_SIZE, PREAMBLE_SIZE + length);
@@ -54,8 +58,12 @@ export function readPreamble(bytes) {
 }
 
 /**
+ * more: whether the layer has further slices. number: of the slice (3.6).
+ *
  * @typedef {object} Chunk
  * @property {boolean} ancillary
+ * @property {boolean} more
+ * @property {number} number
  * @property {Uint8Array} payload not copied
  */
 
@@ -81,14 +89,19 @@ export function readChunk(bytes, { listed, sceneId, offset, index }) {
   need(bytes, end + 4, "a chunk", offset, index);
   checkCrc(view, end, crc32(bytes.subarray(0, end)), offset, index);
   const flags = view.getUint16(2, true);
-  if (flags & ~ANCILLARY) throw fault("Malformed", `flags ${flags}, reserved bits must be zero`, 2);
+  if (flags & (flags & ANCILLARY ? ~ANCILLARY : RESERVED)) throw fault("Malformed", `flags ${flags}, reserved bits must be zero`, 2);
   const type = view.getUint16(0, true);
   if (type !== listed.type) throw fault("Malformed", `chunk type ${type}, the header says ${listed.type}`, 0);
   const found = hex(bytes.subarray(8, 8 + SCENE_ID_SIZE));
   if (found !== sceneId) {
     throw fault("Malformed", `the chunk belongs to scene ${found}, this file is ${sceneId}`, 8);
   }
-  return { ancillary: (flags & ANCILLARY) !== 0, payload: bytes.subarray(CHUNK_HEAD, end) };
+  return {
+    ancillary: (flags & ANCILLARY) !== 0,
+    more: (flags & MORE) !== 0,
+    number: flags >> NUMBER_SHIFT,
+    payload: bytes.subarray(CHUNK_HEAD, end),
+  };
 }
 
 /**

@@ -1,7 +1,9 @@
 // Clause 12.4: digests of what a file decodes to.
 
 import { Sha256, hex } from "./digests.js";
-import { LayerReader } from "./reader.js";
+import { channelCount } from "./parameters.js";
+import { readAll } from "./reader.js";
+import { joined, mortonOrder, reordered } from "./slices.js";
 
 /** In hexadecimal. @typedef {{layer: number, symbols: string, tensors: string}} LayerHashes */
 
@@ -22,24 +24,44 @@ function digest(arrays) {
 }
 
 /**
- * Per layer the SHA-256 of its integers and of its float32 values, of a complete file or of its layers up to maxLayer.
- * Raises as `decode` does.
+ * Per layer the SHA-256 of its integers and of its float32 values, of a complete file, of its layers up to maxLayer, or,
+ * if allowPartial, of the slices that a cut file has. Raises as `decode` does.
  *
- * @param {Uint8Array} bytes @param {{maxLayer?: number | null}} [options]
+ * @param {Uint8Array} bytes @param {{maxLayer?: number | null, allowPartial?: boolean}} [options]
  * @returns {LayerHashes[]}
  */
-export function hashes(bytes, { maxLayer = null } = {}) {
-  const reader = new LayerReader();
-  const rows = [];
-  for (;;) {
-    const layer = reader.next(bytes.subarray(reader.offset), maxLayer);
-    if (!layer) return rows;
-    const { kind, voxels, rises, codes, attributes, planes, weights } = layer.symbols;
-    const { anchor, feature, scalingLog, offset, ...networks } = layer.tensors;
-    rows.push({
-      layer: kind.layer,
-      symbols: digest([voxels, rises, codes, attributes, ...planes, ...weights]),
-      tensors: digest([anchor, feature, scalingLog, offset, ...networks.planes, ...networks.weights]),
-    });
-  }
+export function hashes(bytes, { maxLayer = null, allowPartial = false } = {}) {
+  /** @type {import("./reader.js").Slice[][]} */
+  const layers = [];
+  readAll(bytes, maxLayer, allowPartial, (slice) => {
+    if (slice.later) layers[layers.length - 1].push(slice);
+    else layers.push([slice]);
+  });
+  return layers.map(hashesOf);
+}
+
+/** @param {import("./reader.js").Slice[]} slices of one layer @returns {LayerHashes} */
+function hashesOf(slices) {
+  const [{ symbols, tensors }] = slices;
+  const voxels = joined(slices.map((slice) => slice.symbols.voxels));
+  const order = slices.length > 1 ? mortonOrder(voxels) : null;
+  /** The rows of all slices. @template {Int32Array | Float32Array} A @param {A[]} arrays */
+  const sorted = (arrays) => (order ? reordered(joined(arrays), order) : arrays[0]);
+  const channels = channelCount(symbols.kind.widths);
+  const attributes = Array.from({ length: channels }, (_, c) =>
+    sorted(
+      slices.map(({ symbols: { attributes: all, parameters } }) =>
+        all.subarray(c * parameters.rows, (c + 1) * parameters.rows),
+      ),
+    ),
+  );
+  /** @param {"anchor" | "feature" | "scalingLog" | "offset"} name */
+  const values = (name) => sorted(slices.map((slice) => slice.tensors[name]));
+  const codes = sorted(slices.map((slice) => slice.symbols.codes));
+  const own = [values("anchor"), values("feature"), values("scalingLog"), values("offset")];
+  return {
+    layer: symbols.kind.layer,
+    symbols: digest([sorted([voxels]), symbols.rises, codes, ...attributes, ...symbols.planes, ...symbols.weights]),
+    tensors: digest([...own, ...tensors.planes, ...tensors.weights]),
+  };
 }

@@ -3,10 +3,12 @@
 import { sceneIdOf } from "./container.js";
 import { malformed, unsupported } from "./errors.js";
 import { Fields, asBytes, asInteger, asList, asRegistered, checkStep } from "./fields.js";
-import { MAX_CHUNKS, MAX_PAYLOAD } from "./limits.js";
+import { MAX_CHUNKS, MAX_FEATURE, MAX_PAYLOAD, MAX_SLOTS } from "./limits.js";
 import { unpack } from "./msgpack.js";
 
 /** @typedef {{type: number, length: number}} ListedChunk */
+
+/** D and G of the text: scalars of a feature, and Gaussians of an anchor. @typedef {{feature: number, slots: number}} Widths */
 
 /**
  * size: in bytes. bounds: the classes of 5.4 that have an error bound, with it. sceneId: in hexadecimal (3.3).
@@ -17,6 +19,7 @@ import { unpack } from "./msgpack.js";
  * @property {[number, number, number]} steps of feature, scaling_log and offset
  * @property {import("./scene.js").Info} info
  * @property {Map<number, number>} bounds
+ * @property {Widths} widths
  * @property {string} sceneId
  */
 
@@ -57,15 +60,18 @@ export function readHeader(bytes) {
   const camera = fields.has(12) ? readCamera(fields.get(12)) : null;
   const bounds = readBounds(fields.get(13));
   asBytes(fields.get(14), DIGEST_SIZE, "header: digest"); // of all layers, so that a decoder of some cannot check it
-  const widths = asList(fields.get(15), "header: widths", 2);
-  const width = asInteger(widths[0], 1, 64, "header: feature width");
-  const slots = asInteger(widths[1], 1, 16, "header: slots");
+  const [width, count] = asList(fields.get(15), "header: widths", 2);
+  const widths = {
+    feature: asInteger(width, 1, MAX_FEATURE, "header: feature width"),
+    slots: asInteger(count, 1, MAX_SLOTS, "header: slots"),
+  };
   if (fields.has(16)) {
-    const centres = asList(fields.get(16), "header: centres", width + 6 + 3 * slots);
+    const centres = asList(fields.get(16), "header: centres", widths.feature + 6 + 3 * widths.slots);
     centres.forEach((m) => asInteger(m, -(2 ** 23), 2 ** 23, "header: a channel's centre"));
     throw unsupported("header: step classes, expected none");
   }
-  if (width !== 32 || slots !== 10) throw unsupported(`header: widths ${width} and ${slots}, expected 32 and 10`);
+  const layers = chunks.filter(({ type }) => type < LAYER_TYPES).map(({ type }) => type);
+  if (mode === 1 && new Set(layers).size < layers.length) throw malformed("header: mode lzma, and a layer in slices");
   // An ans-only decoder (clause 16).
   if (mode === 1) throw unsupported("header: mode lzma, expected mode ans");
   if (deformation === 1) throw unsupported("header: a deformation of float32 values, expected one of symbols");
@@ -88,6 +94,7 @@ export function readHeader(bytes) {
       camera,
     },
     bounds,
+    widths,
     sceneId: sceneIdOf(bytes.subarray(firstEntryEnd)),
   };
 }
@@ -106,7 +113,7 @@ function readChunkList(header) {
   let last = -1;
   for (const { type } of chunks) {
     if (type >= LAYER_TYPES) continue;
-    if (type <= last) throw malformed(`header: layer ${type} after layer ${last}, expected each once, ascending`);
+    if (type < last) throw malformed(`header: layer ${type} after layer ${last}, expected ascending ones`);
     last = type;
   }
   if (chunks[0].type !== 0) throw malformed(`header: the first chunk is of type ${chunks[0].type}, expected layer 0`);

@@ -6,8 +6,7 @@
  * @module
  */
 
-import { DecodeError } from "./errors.js";
-import { LayerReader } from "./reader.js";
+import { readAll } from "./reader.js";
 import { Stream, checkMaxLayer } from "./stream.js";
 
 export { DecodeError } from "./errors.js";
@@ -26,8 +25,8 @@ export { Stream } from "./stream.js";
 /**
  * The scene of a file, or of its layers up to maxLayer (bytes behind them are not looked at).
  *
- * A cut file raises Truncated, or yields its longest prefix of complete layers if allowPartial, which still needs layer
- * 0; `scene.layers` then ends early. Other faults raise the other kinds of DecodeError.
+ * A cut file raises Truncated, or yields its longest prefix of complete slices if allowPartial, which still needs the
+ * first; the scene then ends early. Other faults raise the other kinds of DecodeError.
  *
  * @param {Uint8Array | ArrayBuffer} bytes
  * @param {{maxLayer?: number | null, allowPartial?: boolean}} [options]
@@ -35,19 +34,11 @@ export { Stream } from "./stream.js";
  */
 export function decode(bytes, { maxLayer = null, allowPartial = false } = {}) {
   const data = bytes instanceof Uint8Array ? bytes : new Uint8Array(bytes);
-  const limit = checkMaxLayer(maxLayer);
-  const reader = new LayerReader();
-  try {
-    while (reader.next(data.subarray(reader.offset), limit));
-  } catch (error) {
-    const cut = error instanceof DecodeError && error.kind === "Truncated";
-    if (!cut || !allowPartial || !reader.count) throw error;
-  }
-  return reader.scene();
+  return readAll(data, checkMaxLayer(maxLayer), allowPartial).scene();
 }
 
 /**
- * A decoder that takes a file in pieces: `feed(bytes)` gives one scene per layer that they complete.
+ * A decoder that takes a file in pieces: `feed(bytes)` gives one scene per slice that they complete.
  *
  * @param {{maxLayer?: number | null}} [options]
  * @returns {Stream}

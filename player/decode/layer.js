@@ -1,4 +1,4 @@
-// Clauses 6.4, 11 and 12.1: one layer's payload to symbols, and symbols to float32 values.
+// Clauses 6.4, 11 and 12.1: one slice's payload to symbols, and symbols to float32 values.
 
 import { decodeAttributes } from "./attributes.js";
 import { decodeChannels } from "./channels.js";
@@ -11,8 +11,8 @@ import { decodePositions } from "./positions.js";
 /** @typedef {import("./parameters.js").Parameters} Parameters */
 
 /**
- * What one layer with n own rows carries. voxels: [n, 3]. rises: of the earlier rows' mask codes. codes: of the own
- * rows. attributes: [68, n]. planes: per scale six [C, H, W]. weights: weight, bias, weight, bias and so on, network by
+ * What one slice with n own rows carries. voxels: [n, 3]. rises: of the earlier rows' mask codes. codes: of the own
+ * rows. attributes: [D + 6 + 3·G, n]. planes: per scale six [C, H, W]. weights: weight, bias, weight, bias and so on, network by
  * network.
  *
  * @typedef {object} LayerSymbols
@@ -30,27 +30,29 @@ const LEAST_OWN_CODE = 3;
 export const MOST_CODE = 255;
 
 /**
- * The symbols of a layer's payload, each in the range that 11.1 and 11.2 allow.
+ * The symbols of a slice's payload, each in the range that 11.1 and 11.2 allow.
  *
  * @param {Uint8Array} payload @param {import("./parameters.js").LayerKind} kind
- * @param {import("./parameters.js").Declared} before by the layers before
+ * @param {import("./parameters.js").Declared} before by the slices before
+ * @param {import("./slices.js").Continuation} continuation what the slices of the layer before left
+ * @param {boolean} later whether there are such
  * @returns {LayerSymbols}
  */
-export function decodeLayer(payload, kind, before) {
-  const earlierRows = before.rows;
-  const parameters = readParameters(payload, kind, before);
+export function decodeLayer(payload, kind, before, continuation, later) {
+  const earlierRows = later ? 0 : before.rows;
+  const parameters = readParameters(payload, kind, before, later);
   const { rows, sections, planes: shapes, networks } = parameters;
   const positions = sections[POSITIONS];
   const masks = sections[MASKS];
   const attributes = sections[ATTRIBUTES];
   const planes = sections[PLANE_SECTION];
   const weights = sections[WEIGHTS];
-  const voxels = positions ? decodePositions(positions, rows) : new Int32Array(0);
+  const voxels = positions ? decodePositions(positions, rows, continuation.definitions("positions")) : new Int32Array(0);
   const codes = new Int32Array(earlierRows + rows);
-  if (masks) decodeChannels(masks, [earlierRows, rows], codes);
+  if (masks) decodeChannels(masks, [earlierRows, rows], codes, continuation.definitions("masks"));
   checkRange(codes.subarray(0, earlierRows), 0, MOST_CODE, "a rise of a mask code");
   checkRange(codes.subarray(earlierRows), LEAST_OWN_CODE, MOST_CODE, "a mask code");
-  const decoded = attributes ? decodeAttributes(attributes, rows) : new Int32Array(0);
+  const decoded = attributes ? decodeAttributes(attributes, rows, kind.widths, continuation) : new Int32Array(0);
   checkRange(decoded, -MAX_SYMBOL, MAX_SYMBOL, "a symbol of an attribute");
   return {
     kind,

@@ -1,14 +1,18 @@
 // Clause 14: what a file may declare. Two limits are this decoder's own, lower than the format's, and above the least that
 // the clause asks of a decoder: so that what a page allocates stays near a gigabyte.
 
-/** Bytes of a header, and of a layer's parameters. */
+/** Bytes of a header. */
+export const MAX_HEADER = 2 ** 14;
+/** Bytes of a slice's parameters. */
 export const MAX_FIELDS = 4096;
-export const MAX_CHUNKS = 64;
+export const MAX_CHUNKS = 1024;
 /** Bytes of a payload or a section. */
 export const MAX_PAYLOAD = 2 ** 31 - 1;
 export const MAX_NESTING = 4;
 /** The format's is 2^24, the least 2^20. */
 export const MAX_ROWS = 2 ** 21;
+export const MAX_FEATURE = 64;
+export const MAX_SLOTS = 16;
 export const MAX_VOXEL = 2 ** 20;
 /** K: the largest coded symbol. */
 export const MAX_CODED = 2 ** 24 - 1;
@@ -17,8 +21,9 @@ export const MAX_SYMBOL = 2 ** 23;
 /** Symbols of one channel. */
 export const MAX_COUNT = 2 ** 26;
 export const MAX_WINDOW = 2 ** 14;
-/** Entries of all windows defined in one section of coded channels. */
-export const MAX_ENTRIES = 2 ** 21;
+/** Entries of all windows that a section of coded channels defines, over one per symbol: where nothing is defined before, and where something is. */
+export const FREE_ENTRIES = 2 ** 18;
+export const MORE_ENTRIES = 2 ** 10;
 export const MAX_CLASSES = 8;
 export const MAX_SCALES = 8;
 export const MAX_CHANNELS = 256;

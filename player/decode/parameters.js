@@ -1,4 +1,4 @@
-// Clause 6: the parameters of a layer and the sections behind them.
+// Clause 6: the parameters of a slice and the sections behind them.
 
 import { limitExceeded, malformed } from "./errors.js";
 import { Fields, asInteger, asList, asRegistered, checkStep } from "./fields.js";
@@ -18,37 +18,36 @@ import { PREDICTORS } from "./planes.js";
 import { PLANES } from "./scene.js";
 
 /**
- * What a layer's number decides. networks: name and outputs by id, null for any number of outputs. classes: of the error
- * bounds of its steps, in their order (5.4).
+ * What a layer's number and the header's widths decide. networks: name and outputs by id, null for any number of outputs.
+ * inputs: of layer 0's networks, feature and view direction. classes: of the error bounds of its steps, in their order
+ * (5.4).
  *
- * @typedef {{layer: number, networks: [string, number | null][], classes: number[]}} LayerKind
+ * @typedef {object} LayerKind
+ * @property {number} layer
+ * @property {[string, number | null][]} networks
+ * @property {number} inputs
+ * @property {number[]} classes
+ * @property {import("./header.js").Widths} widths
  */
 
-/** @type {LayerKind[]} */
-export const LAYER_KINDS = [
-  {
-    layer: 0,
-    networks: [
-      ["opacity", 10],
-      ["covariance", 70],
-      ["color", 30],
+/** @param {number} layer @param {import("./header.js").Widths} widths @returns {LayerKind} */
+export function layerKind(layer, widths) {
+  const { feature: D, slots: G } = widths;
+  /** @type {[string, number | null][][]} */
+  const networks = [
+    [
+      ["opacity", G],
+      ["covariance", 7 * G],
+      ["color", 3 * G],
     ],
-    classes: [3],
-  },
-  {
-    layer: 1,
-    networks: [
+    [
       ["trunk", null],
       ["position", 3],
-      ["feature", 32],
-      ["offset", 30],
+      ["feature", D],
+      ["offset", 3 * G],
       ["scaling", 6],
     ],
-    classes: [4, 5],
-  },
-  {
-    layer: 2,
-    networks: [
+    [
       ["trunk", null],
       ["mean", 3],
       ["scale", 3],
@@ -56,13 +55,13 @@ export const LAYER_KINDS = [
       ["opacity", 1],
       ["color", 3],
     ],
-    classes: [6, 7],
-  },
-];
+  ];
+  const classes = layer ? [2 + 2 * layer, 3 + 2 * layer] : [3];
+  return { layer, networks: networks[layer], inputs: D + 3, classes, widths };
+}
 
-/** Feature and view direction, what layer 0's networks take. */
-const SCAFFOLD_INPUTS = 32 + 3;
-const ATTRIBUTE_CHANNELS = 68;
+/** The channels of an anchor (11.2). @param {import("./header.js").Widths} widths */
+export const channelCount = ({ feature, slots }) => feature + 6 + 3 * slots;
 
 /** Section numbers of mode ans (6.4). */
 export const POSITIONS = 0;
@@ -85,20 +84,21 @@ const SECTIONS = ["positions", "masks", "attributes", "planes", "weights", "symb
  * @property {PlaneShape[]} planes
  * @property {NetworkShape[]} networks
  * @property {(Uint8Array | null)[]} sections
- * @property {Declared} declared by the layers so far, this one included
+ * @property {Declared} declared by the slices so far, this one included
  */
 
-/** What layers declare: rows, symbols, and the bytes of their payloads (6.5).
+/** What slices declare: rows, symbols, and the bytes of their payloads (6.5).
  * @typedef {{rows: number, symbols: number, bytes: number}} Declared */
 
 /**
- * The parameters of a layer's payload, with its sections; all counts are held against the limits and the payload.
+ * The parameters of a slice's payload, with its sections; all counts are held against the limits and the payload.
  *
- * @param {Uint8Array} payload @param {LayerKind} kind @param {Declared} before by the layers before
+ * @param {Uint8Array} payload @param {LayerKind} kind @param {Declared} before by the slices before
+ * @param {boolean} later whether slices of the layer came before: this one holds anchors alone
  * @returns {Parameters}
  */
-export function readParameters(payload, kind, before) {
-  const earlierRows = before.rows;
+export function readParameters(payload, kind, before, later) {
+  const rises = later ? 0 : before.rows;
   const where = `layer ${kind.layer}`;
   if (payload.length < 4) throw malformed(`${where}: a payload of ${payload.length} bytes, expected at least 4`);
   const length = new DataView(payload.buffer, payload.byteOffset).getUint32(0, true);
@@ -107,10 +107,11 @@ export function readParameters(payload, kind, before) {
     throw malformed(`${where}: parameters of ${length} bytes in a payload of ${payload.length}`);
   }
   const fields = new Fields(unpack(payload.subarray(4, 4 + length), where).value, where, 1, 5);
-  const rows = asInteger(fields.get(1), 0, MAX_ROWS - earlierRows, `${where}: own rows`);
+  const rows = asInteger(fields.get(1), 0, MAX_ROWS - before.rows, `${where}: own rows`);
   const lengths = new Fields(fields.get(2), `${where}: sections`, 0, SECTIONS.length - 1);
+  if (later) for (const key of [3, 4, 5]) if (fields.has(key)) throw malformed(`${where}: key ${key} in a later slice`);
   const scales = readScales(fields, kind, where);
-  const networks = readNetworks(fields, kind, where, scales);
+  const networks = later ? [] : readNetworks(fields, kind, where, scales);
   const steps = readSteps(fields, kind, where, networks.length > 0);
   const planes = scales.flat();
   const sections = cutSections(payload, 4 + length, lengths, where);
@@ -119,8 +120,9 @@ export function readParameters(payload, kind, before) {
     (sum, { layers }) => layers.reduce((all, { inputs, outputs }) => all + (inputs + 1) * outputs, sum),
     0,
   );
-  const declared = declare(where, before, payload.length, rows, cells, weights);
-  const counts = [rows, earlierRows + rows, rows * ATTRIBUTE_CHANNELS, cells, weights, 0, 0];
+  const channels = channelCount(kind.widths);
+  const declared = declare(where, before, payload.length, rises, rows, channels, cells, weights);
+  const counts = [rows, rises + rows, rows * channels, cells, weights, 0, 0];
   counts.forEach((count, section) => {
     if ((sections[section] !== null) !== count > 0) {
       const found = sections[section] === null ? "missing" : "there";
@@ -130,16 +132,16 @@ export function readParameters(payload, kind, before) {
   return { rows, steps, planes, networks, sections, declared };
 }
 
-/** Clause 6.5. @param {string} where @param {Declared} before @param {number} bytes of the payload @param {number} own rows
- * @param {number} cells @param {number} weights @returns {Declared} */
-function declare(where, before, bytes, own, cells, weights) {
+/** Clause 6.5. @param {string} where @param {Declared} before @param {number} bytes of the payload @param {number} rises
+ * @param {number} own rows @param {number} channels @param {number} cells @param {number} weights @returns {Declared} */
+function declare(where, before, bytes, rises, own, channels, cells, weights) {
   if (cells > MAX_PLANE_CELLS) throw limitExceeded(`${where}: ${cells} plane cells, limit ${MAX_PLANE_CELLS}`);
   const all = before.bytes + bytes;
   const rows = before.rows + own;
   const mostRows = 2 ** 13 + 2 * all;
   if (rows > mostRows) throw limitExceeded(`${where}: ${rows} rows in ${all} bytes, limit ${mostRows}`);
-  const symbols = before.symbols + before.rows + 72 * own + cells + weights;
-  const mostSymbols = 2 ** 22 + 2048 * all;
+  const symbols = before.symbols + rises + (channels + 4) * own + cells + weights;
+  const mostSymbols = 2 ** 22 + 1024 * all;
   if (symbols > mostSymbols) throw limitExceeded(`${where}: ${symbols} symbols in ${all} bytes, limit ${mostSymbols}`);
   return { rows, symbols, bytes: all };
 }
@@ -198,7 +200,7 @@ function readNetworks(fields, kind, where, scales) {
   const rows = asList(fields.get(5), `${where}: networks`);
   if (!rows.length) throw malformed(`${where}: an empty list of networks`);
   if (deformation && !scales.length) throw malformed(`${where}: a deformation without planes`);
-  let inputs = deformation ? scales.reduce((sum, planes) => sum + planes[0].channels, 0) : SCAFFOLD_INPUTS;
+  let inputs = deformation ? scales.reduce((sum, planes) => sum + planes[0].channels, 0) : kind.inputs;
   let last = -1;
   const networks = rows.map((row) => {
     const [id, ...widths] = asList(row, `${where}: a network`);

@@ -4,6 +4,7 @@ import { ByteReader } from "./bytes.js";
 import { malformed, unsupported } from "./errors.js";
 import { MAX_SYMBOL } from "./limits.js";
 import {
+  activityBounds,
   addRelativeMagnitudes,
   classesByActivity,
   decodeStage,
@@ -63,10 +64,8 @@ function decodeStaged(reader, shapes, planes) {
     /** @type {(import("./stages.js").Groups | null)[]} */
     const groups = [];
     shapes.forEach(({ height, width }, i) => {
-      const own =
-        classCount > 1
-          ? groupByClass(classesByActivity(sumOfNine(magnitudes[i], height, width), classCount), classCount)
-          : null;
+      const activity = classCount > 1 ? sumOfNine(magnitudes[i], height, width) : null;
+      const own = activity && groupByClass(classesByActivity(activity, activityBounds(activity, classCount)), classCount);
       for (const target of channelsOf(planes[i], channels, first, end)) {
         targets.push(target);
         groups.push(own);

@@ -21,9 +21,10 @@ for (let byte = 0; byte < 256; byte++) {
 
 /**
  * @param {Uint8Array} bytes the section @param {number} rows at least 1
+ * @param {import("./channels.js").Definitions} known see decodeChannels
  * @returns {Int32Array} [rows, 3] voxel indices, in Morton order of their offsets from the minimum
  */
-export function decodePositions(bytes, rows) {
+export function decodePositions(bytes, rows, known) {
   const reader = new ByteReader(bytes);
   const minimum = [0, 1, 2].map(() => reader.zigzag(MAX_VOXEL, "the minimum of the voxel indices"));
   const depth = reader.byte("the depth of the octree");
@@ -39,7 +40,7 @@ export function decodePositions(bytes, rows) {
   }
   lengths.push(...patterns);
   const symbols = new Int32Array(lengths.reduce((sum, length) => sum + length, 0));
-  decodeChannels(reader.rest(), lengths, symbols);
+  decodeChannels(reader.rest(), lengths, symbols, known);
   return placed(grow(levels, patterns, symbols, rows), minimum, depth);
 }
 

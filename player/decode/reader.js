@@ -1,18 +1,19 @@
-// Clause 12: a file's chunks in order, layer by layer, to scenes.
+// Clause 12: a file's chunks in order, slice by slice, to scenes.
 
 import { CHUNK_OVERHEAD, PREAMBLE_SIZE, readChunk, readPreamble } from "./container.js";
 import { DecodeError, limitExceeded, malformed, unsupported } from "./errors.js";
 import { LAYER_TYPES, readHeader } from "./header.js";
 import { MOST_CODE, decodeLayer, dequantise, transposed } from "./layer.js";
-import { LAYER_KINDS } from "./parameters.js";
+import { layerKind } from "./parameters.js";
 import { PLANES } from "./scene.js";
+import { Continuation, joined, mortonOrder, reordered } from "./slices.js";
 import { VoxelTable } from "./voxels.js";
 
 /** @typedef {import("./layer.js").LayerSymbols} LayerSymbols */
 /** @typedef {import("./scene.js").Scene} Scene */
 
 /**
- * The float32 values of one layer's own rows and networks, in the order of 12.4.
+ * The float32 values of one slice's own rows and networks, in the order of 12.4.
  *
  * @typedef {object} LayerTensors
  * @property {Float32Array} anchor
@@ -23,10 +24,27 @@ import { VoxelTable } from "./voxels.js";
  * @property {Float32Array[]} weights
  */
 
-/** Widths of feature, scaling_log and offset. */
-const WIDTHS = [32, 6, 30];
+/** later: whether slices of the same layer came before. @typedef {{symbols: LayerSymbols, tensors: LayerTensors, later: boolean}} Slice */
 
-/** Reads a file layer by layer. It keeps no bytes but the header's: every call gets what follows those it consumed. */
+/**
+ * Reads a whole file, or its layers up to maxLayer; of a cut file, if allowPartial, the slices that are there, at least
+ * one. Raises DecodeError.
+ *
+ * @param {Uint8Array} bytes @param {number | null} maxLayer @param {boolean} allowPartial
+ * @param {(slice: Slice) => void} [take] is given each slice
+ */
+export function readAll(bytes, maxLayer, allowPartial, take) {
+  const reader = new LayerReader();
+  try {
+    for (let slice; (slice = reader.next(bytes.subarray(reader.offset), maxLayer)); ) take?.(slice);
+  } catch (error) {
+    const cut = error instanceof DecodeError && error.kind === "Truncated";
+    if (!cut || !allowPartial || !reader.count) throw error;
+  }
+  return reader;
+}
+
+/** Reads a file slice by slice. It keeps no bytes but the header's: every call gets what follows those it consumed. */
 export class LayerReader {
   constructor() {
     /** @type {import("./header.js").Header | null} */
@@ -36,25 +54,18 @@ export class LayerReader {
     /** What the layers read so far hold. @type {LayerParts[]} */
     this._layers = [];
     this._index = 0;
-    /** The mask codes of all rows so far. */
-    this._codes = new Uint8Array(0);
-    /** By those layers. @type {import("./parameters.js").Declared} */
+    /** How many slices have been read. */
+    this.count = 0;
+    /** By those slices. @type {import("./parameters.js").Declared} */
     this._declared = { rows: 0, symbols: 0, bytes: 0 };
+    this._voxels = new VoxelTable();
+    /** Voxels that are not in the table yet: of one slice nothing is looked up. @type {Int32Array[]} */
+    this._loose = [];
   }
 
   /** Whether every chunk that the header lists has been read. */
   get complete() {
     return this.header !== null && this._index === this.header.chunks.length;
-  }
-
-  /** How many layers have been read. */
-  get count() {
-    return this._layers.length;
-  }
-
-  /** The rows of the layers read so far. */
-  get rows() {
-    return this._codes.length;
   }
 
   /**
@@ -72,13 +83,13 @@ export class LayerReader {
   }
 
   /**
-   * Reads on to the end of one more layer of at most maxLayer; null if the file has no more.
+   * Reads on to the end of one more slice of a layer of at most maxLayer; null if the file has no more.
    *
    * Raises Truncated if the bytes end before: what was consumed until then stays so. Of a file that is read whole
    * (maxLayer null), bytes behind the last chunk are Malformed.
    *
    * @param {Uint8Array} bytes the file from byte `offset` of it on, where this reader stands @param {number | null} maxLayer
-   * @returns {{symbols: LayerSymbols, tensors: LayerTensors} | null}
+   * @returns {Slice | null}
    */
   next(bytes, maxLayer) {
     const start = this.offset;
@@ -87,8 +98,8 @@ export class LayerReader {
       if (maxLayer !== null && !chunks.slice(this._index).some(({ type }) => type < LAYER_TYPES && type <= maxLayer)) {
         return null;
       }
-      const layer = this._readChunk(bytes.subarray(this.offset - start), chunks[this._index]);
-      if (layer) return layer;
+      const slice = this._readChunk(bytes.subarray(this.offset - start), chunks[this._index]);
+      if (slice) return slice;
     }
     const left = start + bytes.length - this.offset;
     if (maxLayer === null && left > 0) {
@@ -109,36 +120,51 @@ export class LayerReader {
     const isLayer = listed.type < LAYER_TYPES;
     if (!isLayer && !chunk.ancillary) throw located(unsupported(`critical chunk of unknown type ${listed.type}`), 0);
     if (isLayer && chunk.ancillary) throw located(malformed(`layer ${listed.type} is flagged ancillary`), 0);
-    let layer = null;
+    let slice = null;
     if (isLayer) {
+      const latest = this._layers[this._layers.length - 1];
+      const later = latest?.layer === listed.type;
+      const expected = later ? latest.slices : 0;
+      if (chunk.number !== expected) throw located(malformed(`slice ${chunk.number}, expected ${expected}`), 2);
+      const next = header.chunks.slice(index + 1).find(({ type }) => type < LAYER_TYPES);
+      if (next && chunk.more !== (next.type === listed.type)) {
+        const said = chunk.more ? "further slices" : "no further slice";
+        throw located(malformed(`layer ${listed.type} has ${said}, and layer ${next.type} follows`), 2);
+      }
+      const continuation = later ? latest.continuation : new Continuation();
+      const forget = continuation.mark();
       try {
-        const symbols = decodeLayer(chunk.payload, LAYER_KINDS[listed.type], this._declared);
-        layer = { symbols, tensors: this._accept(symbols) };
+        const symbols = decodeLayer(chunk.payload, layerKind(listed.type, header.widths), this._declared, continuation, later);
+        slice = { symbols, tensors: this._accept(symbols, continuation, later), later };
         this._declared = symbols.parameters.declared;
       } catch (error) {
+        forget();
         // What an engine says where it cannot allocate an array.
         const full = error instanceof RangeError && /allocation|array length|buffer length/i.test(error.message);
         const fault = full ? limitExceeded(`layer ${listed.type} takes more memory than there is`) : error;
         throw fault instanceof DecodeError ? located(fault, 0) : fault;
       }
+      this.count++;
     }
     this._index++;
     this.offset += CHUNK_OVERHEAD + listed.length;
-    return layer;
+    return slice;
   }
 
-  /** The rules of 12.1 that need header and earlier layers, then dequantisation. @param {LayerSymbols} symbols */
-  _accept(symbols) {
-    const { kind, parameters, voxels, rises, codes } = symbols;
+  /** The rules of 12.1 that need header and earlier slices, then dequantisation.
+   * @param {LayerSymbols} symbols @param {Continuation} continuation @param {boolean} later */
+  _accept(symbols, continuation, later) {
+    const { kind, parameters, voxels, rises } = symbols;
     const header = /** @type {import("./header.js").Header} */ (this.header);
     const where = `layer ${kind.layer}`;
-    const all = new Uint8Array(rises.length + codes.length);
+    const latest = this._layers[this._layers.length - 1];
+    const before = rises.length ? joined([latest.earlier, ownOf(latest).codes]) : rises;
+    const earlier = Uint8Array.from(rises);
     for (let i = 0; i < rises.length; i++) {
-      const code = this._codes[i] + rises[i];
+      const code = before[i] + rises[i];
       if (code > MOST_CODE) throw malformed(`${where}: a mask code of ${code}, limit ${MOST_CODE}`);
-      all[i] = code;
+      earlier[i] = code;
     }
-    all.set(codes, rises.length);
     this._checkVoxels(voxels);
     const tensors = this._tensorsOf(symbols, header);
     if (parameters.steps.length) {
@@ -146,37 +172,37 @@ export class LayerReader {
         if (!header.bounds.has(number)) throw malformed(`${where}: the header has no error bound of class ${number}`);
       }
     }
-    this._codes = all;
-    const { steps, planes, networks } = parameters;
-    this._layers.push({ layer: kind.layer, steps, planes, networks, voxels, tensors, mask: all });
+    const { anchor, feature, scalingLog, offset } = tensors;
+    const own = { voxels, codes: Uint8Array.from(symbols.codes), anchor, feature, scalingLog, offset };
+    this._loose.push(voxels);
+    if (later) {
+      latest.parts.push(own);
+      latest.slices++;
+    } else {
+      const { steps, planes, networks } = parameters;
+      const kept = { planes: tensors.planes, weights: tensors.weights };
+      this._layers.push({ layer: kind.layer, slices: 1, steps, planes, networks, tensors: kept, earlier, parts: [own], continuation });
+    }
     return tensors;
   }
 
-  /** @param {Int32Array} voxels of the next layer, distinct among themselves */
+  /** Malformed if a voxel is one of the slices before. @param {Int32Array} voxels of a slice, distinct among themselves */
   _checkVoxels(voxels) {
-    const parts = [...this._layers.map((layer) => layer.voxels), voxels].filter((part) => part.length);
-    if (parts.length < 2 || !voxels.length) return;
-    const count = parts.reduce((sum, part) => sum + part.length, 0) / 3;
-    const axes = [0, 1, 2].map(() => new Int32Array(count));
-    const table = new VoxelTable(count, axes);
-    let row = 0;
-    for (const part of parts) {
-      for (let i = 0; i < part.length; i += 3, row++) {
-        const x = part[i], y = part[i + 1], z = part[i + 2];
-        if (table.find(x, y, z) >= 0) throw malformed(`voxel ${x} ${y} ${z} holds more than one anchor`);
-        axes[0][row] = x;
-        axes[1][row] = y;
-        axes[2][row] = z;
-        table.add(row);
-      }
+    if (!voxels.length) return;
+    for (const part of this._loose) this._voxels.add(part);
+    this._loose = [];
+    for (let i = 0; i < voxels.length; i += 3) {
+      const x = voxels[i], y = voxels[i + 1], z = voxels[i + 2];
+      if (this._voxels.has(x, y, z)) throw malformed(`voxel ${x} ${y} ${z} holds more than one anchor`);
     }
   }
 
   /** @param {LayerSymbols} symbols @param {import("./header.js").Header} header @returns {LayerTensors} */
   _tensorsOf({ parameters, voxels, attributes, planes, weights }, header) {
     const { rows, steps } = parameters;
+    const { feature: D, slots: G } = header.widths;
     let at = 0;
-    const [feature, scalingLog, offset] = WIDTHS.map((width, i) =>
+    const [feature, scalingLog, offset] = [D, 6, 3 * G].map((width, i) =>
       transposed(attributes.subarray(at, (at += width * rows)), rows, width, header.steps[i]),
     );
     return {
@@ -208,17 +234,18 @@ export class LayerReader {
       else Object.assign(steps, { planesLocal: ofPlanes, weightsLocal: ofWeights });
     }
     const layers = this._layers;
+    const owns = layers.map(ownOf);
     return {
       info: header.info,
       steps,
       layers: layers.map(({ layer }) => layer),
-      rows: layers.map(({ mask }) => mask.length),
-      anchorQ: joined(layers.map(({ voxels }) => voxels), Int32Array),
-      anchor: joined(layers.map(({ tensors }) => tensors.anchor), Float32Array),
-      feature: joined(layers.map(({ tensors }) => tensors.feature), Float32Array),
-      scalingLog: joined(layers.map(({ tensors }) => tensors.scalingLog), Float32Array),
-      offset: joined(layers.map(({ tensors }) => tensors.offset), Float32Array),
-      mask: layers.map(({ mask }) => mask),
+      rows: layers.map(({ earlier }, i) => earlier.length + owns[i].codes.length),
+      anchorQ: joined(owns.map(({ voxels }) => voxels)),
+      anchor: joined(owns.map(({ anchor }) => anchor)),
+      feature: joined(owns.map(({ feature }) => feature)),
+      scalingLog: joined(owns.map(({ scalingLog }) => scalingLog)),
+      offset: joined(owns.map(({ offset }) => offset)),
+      mask: layers.map(({ earlier }, i) => joined([earlier, owns[i].codes])),
       networks: { opacity: networks.opacity, covariance: networks.covariance, color: networks.color },
       globalDeformation: deformations[0],
       localDeformation: deformations[1],
@@ -227,17 +254,50 @@ export class LayerReader {
 }
 
 /**
- * What is kept of a layer. mask: the codes of all rows so far.
+ * What is kept of a slice's own rows, or of a layer's, then in the order of 12.2.
+ *
+ * @typedef {object} Own
+ * @property {Int32Array} voxels
+ * @property {Uint8Array} codes of the mask
+ * @property {Float32Array} anchor
+ * @property {Float32Array} feature
+ * @property {Float32Array} scalingLog
+ * @property {Float32Array} offset
+ */
+
+/**
+ * What is kept of a layer. slices: read so far. tensors: of the layer's planes and networks. earlier: the mask codes of earlier rows.
  *
  * @typedef {object} LayerParts
  * @property {number} layer
+ * @property {number} slices
  * @property {number[]} steps
  * @property {import("./parameters.js").PlaneShape[]} planes
  * @property {import("./parameters.js").NetworkShape[]} networks
- * @property {Int32Array} voxels
- * @property {LayerTensors} tensors
- * @property {Uint8Array} mask
+ * @property {Pick<LayerTensors, "planes" | "weights">} tensors
+ * @property {Uint8Array} earlier
+ * @property {Own[]} parts that make up its rows
+ * @property {Continuation} continuation
  */
+
+/** The rows of a layer, put in order once. @param {LayerParts} layer @returns {Own} */
+function ownOf(layer) {
+  const { parts } = layer;
+  if (parts.length === 1) return parts[0];
+  const order = mortonOrder(joined(parts.map(({ voxels }) => voxels)));
+  /** @template {Int32Array | Float32Array | Uint8Array} A @param {(part: Own) => A} get */
+  const all = (get) => reordered(joined(parts.map(get)), order);
+  const own = {
+    voxels: all(({ voxels }) => voxels),
+    codes: all(({ codes }) => codes),
+    anchor: all(({ anchor }) => anchor),
+    feature: all(({ feature }) => feature),
+    scalingLog: all(({ scalingLog }) => scalingLog),
+    offset: all(({ offset }) => offset),
+  };
+  layer.parts = [own];
+  return own;
+}
 
 /** @param {LayerParts} layer */
 function networksOf({ networks, tensors }) {
@@ -261,23 +321,4 @@ function planesOf({ planes, tensors }) {
     scales.push(Object.fromEntries(named));
   }
   return scales;
-}
-
-/**
- * The arrays one behind the other; the only one that is not empty as it is.
- *
- * @template {Int32Array | Float32Array} A
- * @param {A[]} arrays @param {new (length: number) => A} type
- * @returns {A}
- */
-function joined(arrays, type) {
-  const filled = arrays.filter((array) => array.length);
-  if (filled.length === 1) return filled[0];
-  const all = new type(filled.reduce((sum, array) => sum + array.length, 0));
-  let at = 0;
-  for (const array of filled) {
-    all.set(array, at);
-    at += array.length;
-  }
-  return all;
 }

@@ -62,7 +62,7 @@
 /**
  * A prefix of a scene, with N anchors. layers: the layer numbers that are there, ascending, 0 first. rows: rows[i] is
  * the number of anchors in the prefix that ends with layers[i]. anchorQ: [N, 3] voxel indices; anchor: [N, 3] positions,
- * scene units. feature: [N, 32]. scalingLog: [N, 6]. offset: [N, 10, 3]. mask: per layer the codes of its rows[i] rows,
+ * scene units. feature: [N, D]. scalingLog: [N, 6]. offset: [N, G, 3]. mask: per layer the codes of its rows[i] rows,
  * the gate times 255; 0 is inactive. A deformation belongs to the layer of its name, 1 global or 2 local, and is null
  * where that layer has none or is not there.
  *

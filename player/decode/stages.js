@@ -37,49 +37,63 @@ export function readStages(reader, count) {
 /** Magnitudes below it are looked up. */
 const LOOKED_UP = 256;
 
+/** What magnitudes are relative to: so many places, whose magnitudes have this sum. @typedef {{places: number, sum: number}} Reference */
+
+/** @param {Int32Array} residuals one per place @returns {Reference} */
+export function referenceOf(residuals) {
+  let sum = 0;
+  for (let p = 0; p < residuals.length; p++) sum += Math.abs(residuals[p]);
+  return { places: residuals.length, sum };
+}
+
 /**
  * Adds the relative magnitude of each place in one channel to `sums`.
  *
- * @param {Int32Array} residuals one per place @param {Float64Array} sums
+ * @param {Int32Array} residuals one per place @param {Float64Array} sums @param {Reference} [reference] by default that
+ * of these residuals
  */
-export function addRelativeMagnitudes(residuals, sums) {
+export function addRelativeMagnitudes(residuals, sums, reference = referenceOf(residuals)) {
   const n = residuals.length;
-  let total = 1;
+  const most = reference.sum;
+  const total = 1 + most;
+  const factor = 256 * reference.places;
   let largest = 0;
-  for (let p = 0; p < n; p++) {
-    const e = Math.abs(residuals[p]);
-    total += e;
-    if (e > largest) largest = e;
-  }
-  const factor = 256 * n;
+  for (let p = 0; p < n; p++) largest = Math.max(largest, Math.abs(residuals[p]));
+  largest = Math.min(largest, most);
   if (largest * factor > Number.MAX_SAFE_INTEGER) {
-    for (let p = 0; p < n; p++) sums[p] += Number((BigInt(Math.abs(residuals[p])) * BigInt(factor)) / BigInt(total));
+    for (let p = 0; p < n; p++) {
+      const e = Math.min(Math.abs(residuals[p]), most);
+      sums[p] += Number((BigInt(e) * BigInt(factor)) / BigInt(total));
+    }
     return;
   }
   // The quotient of two integers below 2^53, rounded to binary64, does not reach the next integer: the floor is exact.
   const known = new Float64Array(Math.min(largest + 1, LOOKED_UP));
   for (let e = 0; e < known.length; e++) known[e] = Math.floor((e * factor) / total);
   for (let p = 0; p < n; p++) {
-    const e = Math.abs(residuals[p]);
+    const e = Math.min(Math.abs(residuals[p]), most);
     sums[p] += e < LOOKED_UP ? known[e] : Math.floor((e * factor) / total);
   }
+}
+
+/** Between classes of about equally many places. @param {Float64Array} activity @param {number} count of classes, 1..8 */
+export function activityBounds(activity, count) {
+  if (count === 1) return [];
+  const n = activity.length;
+  const ascending = activity.slice().sort();
+  return Array.from({ length: count - 1 }, (_, i) => ascending[Math.floor(((i + 1) * n) / count)]);
 }
 
 /**
  * The class of each place by its activity: the number of bounds that are at most its activity.
  *
- * @param {Float64Array} activity @param {number} count of classes, 1..8
+ * @param {Float64Array} activity @param {number[]} bounds
  * @returns {Uint8Array}
  */
-export function classesByActivity(activity, count) {
+export function classesByActivity(activity, bounds) {
   const n = activity.length;
   const classes = new Uint8Array(n);
-  if (count === 1) return classes;
-  const ascending = activity.slice().sort();
-  for (let i = 1; i < count; i++) {
-    const bound = ascending[Math.floor((i * n) / count)];
-    for (let p = 0; p < n; p++) if (activity[p] >= bound) classes[p]++;
-  }
+  for (const bound of bounds) for (let p = 0; p < n; p++) if (activity[p] >= bound) classes[p]++;
   return classes;
 }
 
@@ -104,9 +118,9 @@ export function groupByClass(classes, count) {
  * Decodes one stage into its channels. groups: per channel how its rows are split, null if they are not.
  *
  * @param {Uint8Array} bytes @param {Int32Array[]} targets
- * @param {(Groups | null)[]} groups
+ * @param {(Groups | null)[]} groups @param {import("./channels.js").Definitions} [known] see decodeChannels
  */
-export function decodeStage(bytes, targets, groups) {
+export function decodeStage(bytes, targets, groups, known) {
   /** @type {number[]} */
   const counts = [];
   let all = 0;
@@ -117,7 +131,7 @@ export function decodeStage(bytes, targets, groups) {
     else counts.push(target.length);
   });
   const coded = new Int32Array(all);
-  decodeChannels(bytes, counts, coded);
+  decodeChannels(bytes, counts, coded, known);
   let at = 0;
   targets.forEach((target, i) => {
     const split = groups[i];

@@ -1,4 +1,4 @@
-// Clause 12.3: bytes as they arrive, to one scene per completed layer.
+// Clause 12.3: bytes as they arrive, to one scene per completed slice.
 
 import { CHUNK_OVERHEAD, PREAMBLE_SIZE } from "./container.js";
 import { DecodeError } from "./errors.js";
@@ -39,7 +39,7 @@ export class Stream {
     return this._reader.offset;
   }
 
-  /** Each layer with the end of its chunk in the file, in file order; empty until the header is there. */
+  /** Each slice's layer with the end of its chunk in the file, in file order; empty until the header is there. */
   get layerEnds() {
     const header = this._reader.header;
     if (!header) return [];
@@ -53,9 +53,9 @@ export class Stream {
   }
 
   /**
-   * One scene per layer that `bytes` complete, each with all layers so far. The bytes are copied.
+   * One scene per slice that `bytes` complete, each with all slices so far. The bytes are copied.
    *
-   * A fault raises its DecodeError now, or at the next call if this one completes a layer before it, and at every later
+   * A fault raises its DecodeError now, or at the next call if this one completes a slice before it, and at every later
    * call. Scenes given before stay valid.
    *
    * @param {Uint8Array} bytes
@@ -79,7 +79,7 @@ export class Stream {
     return scenes;
   }
 
-  /** Says that no bytes follow: raises the pending fault, or Truncated if a layer is missing. */
+  /** Says that no bytes follow: raises the pending fault, or Truncated if a slice is missing. */
   finish() {
     if (this._error) throw this._error;
     if (!this._done) this._next();
@@ -92,7 +92,7 @@ export class Stream {
     this._buffer = new Uint8Array(0);
   }
 
-  /** Whether one more layer was read. */
+  /** Whether one more slice was read. */
   _next() {
     const before = this._reader.offset;
     try {

@@ -1,41 +1,51 @@
-// A hash table of voxels: which row has these coordinates.
+// A hash table of voxels that hold an anchor.
 
 /** Random, so that nobody can prepare voxels that all fall into one place. */
 const SEEDS = Int32Array.from({ length: 3 }, () => (Math.random() * 2 ** 32) | 1);
 
-/** Rows by their voxels. */
+/** A set of voxels. */
 export class VoxelTable {
-  /** @param {number} capacity rows that may be added @param {Int32Array[]} axes the coordinates of all rows along x, y, z,
-   * each set before its row is added */
-  constructor(capacity, [x, y, z]) {
-    this._x = x;
-    this._y = y;
-    this._z = z;
-    const size = 2 ** Math.max(4, 34 - Math.clz32(capacity)); // mostly empty: most look-ups find nothing
-    this._rows = new Int32Array(size).fill(-1);
-    this._mask = size - 1;
+  constructor() {
+    /** x, y, z of each voxel; after the last one anything. */
+    this._voxels = new Int32Array(0);
+    this._count = 0;
+    /** Numbers of voxels, -1 where there is none. */
+    this._slots = new Int32Array(0);
   }
 
-  /** @param {number} x @param {number} y @param {number} z */
+  /** Where this voxel stands in the table, or would stand. @param {number} x @param {number} y @param {number} z */
   _slot(x, y, z) {
+    const slots = this._slots;
+    const voxels = this._voxels;
     let h = Math.imul(x, SEEDS[0]) + Math.imul(y, SEEDS[1]) + Math.imul(z, SEEDS[2]);
     h = Math.imul(h ^ (h >>> 15), 0x2c1b3c6d);
-    return (h ^ (h >>> 13)) & this._mask;
-  }
-
-  /** The row with this voxel among those added, or -1. @param {number} x @param {number} y @param {number} z */
-  find(x, y, z) {
-    const rows = this._rows;
-    for (let slot = this._slot(x, y, z); ; slot = (slot + 1) & this._mask) {
-      const row = rows[slot];
-      if (row < 0 || (this._x[row] === x && this._y[row] === y && this._z[row] === z)) return row;
+    const mask = slots.length - 1;
+    for (let slot = (h ^ (h >>> 13)) & mask; ; slot = (slot + 1) & mask) {
+      const at = 3 * slots[slot];
+      if (at < 0 || (voxels[at] === x && voxels[at + 1] === y && voxels[at + 2] === z)) return slot;
     }
   }
 
-  /** Adds a row whose voxel is not there yet. @param {number} row */
-  add(row) {
-    let slot = this._slot(this._x[row], this._y[row], this._z[row]);
-    while (this._rows[slot] >= 0) slot = (slot + 1) & this._mask;
-    this._rows[slot] = row;
+  /** Whether the table has this voxel. @param {number} x @param {number} y @param {number} z */
+  has(x, y, z) {
+    return this._count > 0 && this._slots[this._slot(x, y, z)] >= 0;
+  }
+
+  /** Adds voxels, none of which is there. @param {Int32Array} voxels [n, 3] */
+  add(voxels) {
+    const first = this._count;
+    this._count += voxels.length / 3;
+    const grown = 3 * this._count > this._voxels.length;
+    if (grown) {
+      const old = this._voxels;
+      this._voxels = new Int32Array(3 * 2 ** Math.ceil(Math.log2(this._count)));
+      this._voxels.set(old.subarray(0, 3 * first));
+      this._slots = new Int32Array((4 * this._voxels.length) / 3).fill(-1); // mostly empty: most look-ups find nothing
+    }
+    this._voxels.set(voxels, 3 * first);
+    for (let i = grown ? 0 : first; i < this._count; i++) {
+      const [x, y, z] = this._voxels.subarray(3 * i, 3 * i + 3);
+      this._slots[this._slot(x, y, z)] = i;
+    }
   }
 }

@@ -29,7 +29,7 @@ const SWING_MS = 2000;
 /**
  * Measures a scene and writes a table into `place`. The result is also `window.benchResult`.
  *
- * @param {string} source @param {HTMLElement} place @param {string} [sizes] to measure, smallest first
+ * @param {string | Blob} source @param {HTMLElement} place @param {string} [sizes] to measure, smallest first
  */
 export async function bench(source, place, sizes = SIZES) {
   const output = document.createElement("div");
@@ -46,7 +46,8 @@ export async function bench(source, place, sizes = SIZES) {
     state.textContent = /** @type {CustomEvent} */ (event).detail.message;
   });
   Object.assign(canvas.style, { width: "640px", height: "480px" });
-  state.textContent = `loading ${source}`;
+  const name = source instanceof Blob ? "the scene" : source;
+  state.textContent = `loading ${name}`;
   const started = performance.now();
   await player.load(source);
   const loaded = (performance.now() - started) / 1000;
@@ -66,12 +67,12 @@ export async function bench(source, place, sizes = SIZES) {
       if (moving < SLOWEST) break;
     }
   }
-  const result = { renderer: player.renderer, agent: navigator.userAgent, source, loaded, first, rows };
+  const result = { renderer: player.renderer, agent: navigator.userAgent, source: name, loaded, first, rows };
   player.close();
   canvas.remove();
   output.append(table(rows));
   state.textContent =
-    `${source}: ${player.status.bytes.toLocaleString()} bytes in ${loaded.toFixed(2)} s. ` +
+    `${name}: ${player.status.bytes.toLocaleString()} bytes in ${loaded.toFixed(2)} s. ` +
     `Drawn by ${result.renderer}. Pictures per second:`;
   Object.assign(window, { benchResult: result });
 }

@@ -16,7 +16,13 @@ export class CpuEvaluator {
   constructor(gpu, scene, worker = startWorker()) {
     this._gpu = gpu;
     this._remote = worker;
+    this.setScene(scene);
+  }
+
+  /** @param {import("../decode/scene.js").Scene} scene that is evaluated from now on */
+  setScene(scene) {
     this._ready = this._remote.call("setScene", [scene]);
+    this._ready.catch(() => {}); // a worker that fails says so to the next call as well
   }
 
   /**

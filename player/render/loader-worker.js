@@ -1,4 +1,4 @@
-// The worker that fetches and decodes: bytes in, one scene per completed layer out.
+// The worker that fetches and decodes: bytes in, one scene per completed slice out.
 
 import { SceneSource } from "../decode/fetch.js";
 import { Stream } from "../decode/stream.js";
@@ -8,10 +8,13 @@ import { serve, tell } from "./serve.js";
 const PROGRESS_MS = 100;
 
 /**
- * What is told while a scene loads. ends: where in the file each layer ends, empty until the header is there.
+ * What is told while a scene loads. ends: where in the file each slice ends, empty until the header is there. arrived,
+ * decoded: when the last byte of the scene came and when it was decoded, milliseconds since the epoch.
  *
  * @typedef {object} News
  * @property {import("../decode/scene.js").Scene} [scene]
+ * @property {number} arrived
+ * @property {number} decoded
  * @property {number} bytes
  * @property {number | null} total
  * @property {{layer: number, end: number}[]} ends
@@ -21,11 +24,14 @@ let decoder = new Stream();
 /** @type {SceneSource} */
 let source;
 let told = 0;
+let arrived = 0;
+const epochNow = () => performance.timeOrigin + performance.now();
 
 /** @param {News["scene"]} [scene] */
 function report(scene) {
   const { received: bytes, total } = source;
-  tell({ told: { ...(scene && { scene }), bytes, total, ends: decoder.layerEnds } });
+  const times = { arrived, decoded: epochNow() };
+  tell({ told: { ...(scene && { scene }), bytes, total, ends: decoder.layerEnds, ...times } });
   told = performance.now();
 }
 
@@ -35,6 +41,7 @@ serve({
     source = new SceneSource(typeof from === "string" ? from : URL.createObjectURL(from), {
       makeDecoder: () => (decoder = new Stream()),
       progress: () => {
+        arrived = epochNow();
         if (performance.now() - told > PROGRESS_MS) report();
       },
     });

@@ -33,7 +33,7 @@ import { Remote } from "./remote.js";
 
 /**
  * The state of a player, for a status line. bytes: arrived so far, of total (null: unknown). ends: where in the file
- * each layer ends, empty while that is unknown. level: shown, null before the first picture. levels: that are there.
+ * each slice ends, empty while that is unknown. level: shown, null before the first picture. levels: that are there.
  * fps: pictures drawn in the last second. scale: of the picture's sides. gaussians: drawn.
  *
  * @typedef {object} Status
@@ -50,18 +50,18 @@ import { Remote } from "./remote.js";
 
 /** So long after the last movement a picture is drawn as well as it can be, milliseconds. */
 const REST_MS = 250;
-/** Up to so many anchors the first picture of a machine without a GPU is evaluated in JavaScript: its shaders are not
- * compiled by then. */
-const FIRST_ANCHORS = 30_000;
+/** Up to so many anchors a machine without a GPU evaluates in JavaScript: it would take seconds to compile shaders, which
+ * then are hardly faster. */
+const SOFTWARE_ANCHORS = 30_000;
 /** Where no GPU draws, pictures begin with this step of SCALES. */
 const SOFTWARE_STEP = 2;
 /** Without float textures only this level is evaluated while nothing else is asked for. */
 const CPU_LEVEL = 0;
 
 /**
- * Events: `progress` {bytes, total}, `firstpicture` {level, bytes, seconds}, `upgrade` {level, bytes, seconds},
+ * Events: `progress` {bytes, total}, `firstpicture` and `upgrade` {level, bytes, seconds, arrived, decoded},
  * `loaded` {bytes, complete}, `timeupdate` {time}, `statechange` (play or pause), `error` {message, kind}. Seconds
- * count from `load`.
+ * count from `load`: to the picture, to the last byte that it is made of, and to the end of their decoding.
  */
 export class Player extends EventTarget {
   /** @param {HTMLCanvasElement} canvas @param {Options} [options] */
@@ -110,12 +110,16 @@ export class Player extends EventTarget {
     this._dirty = true;
     /** @type {number | null} */
     this._shownLevel = null;
+    /** Anchors of that level. */
+    this._shownRows = 0;
     this._frameRequest = 0;
     this._lastFrame = 0;
     this._lastMoved = -Infinity;
     /** Ends of draws in the last second. @type {number[]} */
     this._draws = [];
     this._started = performance.now();
+    /** When scenes came. @type {WeakMap<Scene, {arrived: number, decoded: number}>} */
+    this._came = new WeakMap();
     /** Pictures drawn and evaluations made so far. */
     this.counts = { drawn: 0, evaluated: 0 };
     this._closed = false;
@@ -138,7 +142,8 @@ export class Player extends EventTarget {
       this._wake();
     });
     this._seen.observe(canvas);
-    this._startGpu();
+    /** Whether something was loaded before. */
+    this._loaded = false;
   }
 
   // --- what users see
@@ -156,8 +161,6 @@ export class Player extends EventTarget {
       if (loader === this._loader) this._told(news);
     });
     this._loader = loader;
-    this._useCpu = this._options.evaluator === "cpu" || !(this._gpu?.floats ?? true);
-    if (this._useCpu || this._gpu?.software) this._cpuWorker ??= startWorker();
     this._scene = null;
     this._shownLevel = null;
     this._camera = null;
@@ -172,7 +175,12 @@ export class Player extends EventTarget {
     this._touch();
     const from = source instanceof Blob ? source : new URL(source, document.baseURI).href;
     loader.call("open", [from]).catch(() => {}); // a worker that fails says so to the next call as well
-    await this._loadOn(loader);
+    const loading = this._loadOn(loader);
+    if (!this._loaded) this._startGpu(); // which takes longer than to ask a server
+    this._loaded = true;
+    this._useCpu = this._options.evaluator === "cpu" || !(this._gpu?.floats ?? true);
+    if (this._useCpu || (this._gpu?.software && this._options.evaluator !== "gpu")) this._cpuWorker ??= startWorker();
+    await loading;
   }
 
   /** Loads as much as options and level allow. @param {Remote} loader */
@@ -337,13 +345,15 @@ export class Player extends EventTarget {
   // --- loading
 
   /** @param {import("./loader-worker.js").News} news */
-  _told({ scene, ...status }) {
+  _told({ scene, arrived, decoded, ...status }) {
     Object.assign(this._status, status);
     const { bytes, total } = status;
     this._emit("progress", { bytes, total });
     if (!scene) return;
     const first = !this._scene;
     this._scene = scene;
+    const start = performance.timeOrigin + this._started;
+    this._came.set(scene, { arrived: (arrived - start) / 1000, decoded: (decoded - start) / 1000 });
     if (first) {
       this.seek(this.time);
       if (this._options.autoplay) this.play();
@@ -423,7 +433,8 @@ export class Player extends EventTarget {
       return;
     }
     if (this._playing) this._advance(now);
-    if (!this._evaluating && !this._isEvaluated()) this._evaluate();
+    const undrawn = this._front && this._shownLevel === null; // the first picture does not wait for the second
+    if (!this._evaluating && !undrawn && !this._isEvaluated()) this._evaluate();
     this._sort();
     const size = this._size(now);
     const sized = size[0] === this.canvas.width && size[1] === this.canvas.height;
@@ -453,7 +464,7 @@ export class Player extends EventTarget {
   _state() {
     const scene = /** @type {Scene} */ (this._scene);
     const camera = /** @type {Camera} */ (this.camera);
-    let level = this._level ?? 2;
+    let level = this._front ? (this._level ?? 2) : 0; // the first picture is the one that comes soonest
     if (this._playing && this._options.degrade !== false) level = Math.min(level, this._pace.level);
     if (this._useCpu && this._options.evaluator !== "cpu") level = Math.min(level, CPU_LEVEL);
     const shown = levelOf(scene, Math.max(level, 0));
@@ -545,13 +556,18 @@ export class Player extends EventTarget {
 
   /** @param {Gpu} gpu @param {Scene} scene */
   _evaluatorFor(gpu, scene) {
-    const first = !this._front && gpu.software && scene.anchor.length <= 3 * FIRST_ANCHORS;
-    const onCpu = this._useCpu || first;
-    if (this._evaluator?.scene !== scene || this._evaluator.evaluator instanceof CpuEvaluator !== onCpu) {
-      this._evaluator?.evaluator.free();
-      this._evaluator = null;
-      this._evaluator = { evaluator: onCpu ? this._onCpu(gpu, scene) : new GpuEvaluator(gpu, scene), scene };
+    const few = gpu.software && scene.anchor.length <= 3 * SOFTWARE_ANCHORS;
+    const onCpu = this._useCpu || (few && this._options.evaluator !== "gpu");
+    const had = this._evaluator;
+    if (had?.scene === scene && had.evaluator instanceof CpuEvaluator === onCpu) return had.evaluator;
+    if (onCpu && had?.evaluator instanceof CpuEvaluator) {
+      had.evaluator.setScene(scene);
+      had.scene = scene;
+      return had.evaluator;
     }
+    had?.evaluator.free();
+    this._evaluator = null;
+    this._evaluator = { evaluator: onCpu ? this._onCpu(gpu, scene) : new GpuEvaluator(gpu, scene), scene };
     return this._evaluator.evaluator;
   }
 
@@ -606,7 +622,7 @@ export class Player extends EventTarget {
     this._dirty = false;
     this._drawing = true;
     try {
-      const level = /** @type {{state: State}} */ (this._front).state.level;
+      const { state } = /** @type {{state: State}} */ (this._front);
       this._draw();
       await gpu.finished();
       if (gpu !== this._gpu) return;
@@ -614,7 +630,7 @@ export class Player extends EventTarget {
       this._draws.push(now);
       this.counts.drawn++;
       if (alone && moving) this._pace.drew(now - started);
-      this._shown(level, now);
+      this._shown(state, now);
     } catch (error) {
       if (!(error instanceof ContextLost) && !this._closed) this._fail(error);
     } finally {
@@ -632,13 +648,17 @@ export class Player extends EventTarget {
     return true;
   }
 
-  /** A picture of a level is on the screen. @param {number} level @param {number} now */
-  _shown(level, now) {
+  /** A picture of a state is on the screen. @param {State} state @param {number} now */
+  _shown({ scene, level }, now) {
     const before = this._shownLevel;
+    const { rows } = levelOf(scene, level);
+    const more = before !== null && (level > before || (level === before && rows > this._shownRows));
     this._shownLevel = level;
-    const detail = { level, bytes: this._status.bytes, seconds: (now - this._started) / 1000 };
+    this._shownRows = rows;
+    const seconds = (now - this._started) / 1000;
+    const detail = { level, bytes: this._status.bytes, seconds, ...this._came.get(scene) };
     if (before === null) this._emit("firstpicture", detail);
-    else if (level > before) this._emit("upgrade", detail);
+    else if (more) this._emit("upgrade", detail);
   }
 }
 

@@ -12,7 +12,7 @@ import { Sha256, crc32, hex } from "../decode/digests.js";
 import { DecodeError } from "../decode/errors.js";
 import { dequantise, transposed } from "../decode/layer.js";
 import { Real, unpack } from "../decode/msgpack.js";
-import { addRelativeMagnitudes, classesByActivity, groupByClass } from "../decode/stages.js";
+import { activityBounds, addRelativeMagnitudes, classesByActivity, groupByClass } from "../decode/stages.js";
 import { M, T, Table, histogramTable, mixtureTable, normTable } from "../decode/tables.js";
 import { VoxelTable } from "../decode/voxels.js";
 
@@ -126,7 +126,10 @@ test("relative magnitudes and classes are those of 8.9", () => {
   const sums = new Float64Array(4);
   addRelativeMagnitudes(Int32Array.of(3, -1, 0, 4), sums);
   assert.deepEqual([...sums], [341, 113, 0, 455]);
-  const classes = classesByActivity(Float64Array.of(5, 1, 5, 9, 1, 7), 3);
+  const activity = Float64Array.of(5, 1, 5, 9, 1, 7);
+  const bounds = activityBounds(activity, 3);
+  assert.deepEqual(bounds, [5, 7]);
+  const classes = classesByActivity(activity, bounds);
   assert.deepEqual([...classes], [1, 0, 1, 2, 0, 2]);
   const { order, sizes } = groupByClass(classes, 3);
   assert.deepEqual([...order], [1, 4, 0, 2, 3, 5]);
@@ -198,17 +201,19 @@ test("msgpack keeps integers, reals, booleans, texts and bytes apart", () => {
 
 test("a table of voxels finds what was added and nothing else", () => {
   const draw = random(4);
-  const axes = [0, 1, 2].map(() => Int32Array.from({ length: 500 }, () => Math.floor(draw() * 9) - 4));
-  const table = new VoxelTable(500, axes);
-  /** @type {Map<string, number>} */
-  const known = new Map();
-  for (let row = 0; row < 500; row++) {
-    const [x, y, z] = axes.map((axis) => axis[row]);
-    const expected = known.get(`${x} ${y} ${z}`) ?? -1;
-    assert.equal(table.find(x, y, z), expected);
-    if (expected >= 0) continue;
-    known.set(`${x} ${y} ${z}`, row);
-    table.add(row);
+  const table = new VoxelTable();
+  const known = new Set();
+  for (let round = 0; round < 40; round++) {
+    /** @type {number[][]} */
+    const added = [];
+    for (let i = 0; i < 1 + 20 * (round % 3); i++) {
+      const voxel = [0, 1, 2].map(() => Math.floor(draw() * 9) - 4);
+      assert.equal(table.has(voxel[0], voxel[1], voxel[2]), known.has(`${voxel}`) && !added.map(String).includes(`${voxel}`));
+      if (!known.has(`${voxel}`)) added.push(voxel);
+      known.add(`${voxel}`);
+    }
+    table.add(Int32Array.from(added.flat()));
+    assert.ok(added.every(([x, y, z]) => table.has(x, y, z)));
   }
-  assert.equal(table.find(99, 0, 0), -1);
+  assert.ok(known.size > 300 && !table.has(99, 0, 0));
 });

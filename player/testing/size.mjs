@@ -1,15 +1,15 @@
-// Sizes of the decoder, bundled and minified, in bytes: `npm install && npm run size`. One line per entry, as JSON.
+// Sizes of what a page loads, bundled and minified, in bytes: `npm install && npm run size`. One line each, as JSON.
 
 import { fileURLToPath } from "node:url";
 import { gzipSync } from "node:zlib";
 
 import { build } from "esbuild";
 
-const ENTRIES = { decoder: "index.js", "decoder, in a Worker": "worker.js", "decoder and fetch": "fetch.js", "page's side of the Worker": "worker-decoder.js" };
+const ENTRIES = ["decode/index.js", "element.js", "render/loader-worker.js", "render/sort-worker.js", "render/evaluate-worker.js"];
 
-for (const [name, file] of Object.entries(ENTRIES)) {
+for (const entry of ENTRIES) {
   const { outputFiles } = await build({
-    entryPoints: [fileURLToPath(new URL(`../decode/${file}`, import.meta.url))],
+    entryPoints: [fileURLToPath(new URL(`../${entry}`, import.meta.url))],
     bundle: true,
     minify: true,
     format: "esm",
@@ -17,5 +17,5 @@ for (const [name, file] of Object.entries(ENTRIES)) {
     write: false,
   });
   const code = outputFiles[0].contents;
-  console.log(JSON.stringify({ entry: name, minified: code.length, gzipped: gzipSync(code, { level: 9 }).length }));
+  console.log(JSON.stringify({ entry, minified: code.length, gzipped: gzipSync(code, { level: 9 }).length }));
 }

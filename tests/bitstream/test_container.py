@@ -16,6 +16,7 @@ from pd4dgs_codec.bitstream.container import (
     SIGNATURE,
     read_chunk,
     read_preamble,
+    slice_flags,
     write_chunk,
     write_preamble,
 )
@@ -103,7 +104,9 @@ def test_each_fault_has_its_error():
     with pytest.raises(LimitExceeded):
         read_chunk(chunk[:4] + struct.pack("<I", MAX_PAYLOAD + 1) + chunk[8:], 0)
     with pytest.raises(Malformed, match="reserved"):
-        read_chunk(refit(chunk[:2] + b"\2\0" + chunk[4:]), 0)
+        read_chunk(refit(chunk[:2] + b"\4\0" + chunk[4:]), 0)
+    with pytest.raises(Malformed, match="flags 0x0041, reserved"):
+        read_chunk(refit(chunk[:2] + b"\x41\0" + chunk[4:]), 0)
     with pytest.raises(Malformed, match="type"):
         read_chunk(chunk, 0, type=3)
     with pytest.raises(Malformed, match="length"):
@@ -114,12 +117,19 @@ def test_each_fault_has_its_error():
         read_chunk(chunk[:-5] + b"?" + chunk[-4:], 0)
 
 
+def test_the_flags_of_slices():
+    flags = [slice_flags(number, 1024) for number in (0, 1, 1022, 1023)]
+    chunks = [read_chunk(write_chunk(0, f, bytes(8), b""), 0) for f in flags]
+    assert [(c.slice, c.more, c.ancillary) for c in chunks] == [(n, n < 1023, False) for n in (0, 1, 1022, 1023)]
+    assert slice_flags(0, 1) == 0
+
+
 def test_a_later_minor_version_is_read():
     front = SIGNATURE + struct.pack("<HHI", MAJOR, 9, 0)
     assert read_preamble(front + struct.pack("<I", zlib.crc32(front))).minor == 9
 
 
-@pytest.mark.parametrize("args", [(-1, 0, bytes(8)), (1 << 16, 0, bytes(8)), (0, 2, bytes(8)), (0, 0, bytes(7))])
+@pytest.mark.parametrize("args", [(-1, 0, bytes(8)), (1 << 16, 0, bytes(8)), (0, 4, bytes(8)), (0, 0, bytes(7))])
 def test_the_writer_refuses(args):
     with pytest.raises(EncodeError):
         write_chunk(*args, b"")

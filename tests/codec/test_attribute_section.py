@@ -57,7 +57,9 @@ def written_in_stages(attributes, class_count=None, widths=WIDTHS):
     """The section in form 1, even where form 0 is shorter; class_count, if any, instead of the best."""
     choose = attribute_section.cheapest_class_count if class_count is None else lambda _: class_count
     with patch.object(attribute_section, "cheapest_class_count", choose):
-        return attribute_section._write_staged(attributes.astype(np.int64), NO_CLASSES, widths, 1)
+        symbols, past = attributes.astype(np.int64), attribute_section.Past()
+        block = attribute_section._fit_block(symbols, NO_CLASSES, widths)
+        return attribute_section._write_staged(symbols, NO_CLASSES, block, past, 1).data
 
 
 @settings(max_examples=10)
@@ -114,8 +116,8 @@ def test_damage_raises_only_decode_errors():
 
 
 def test_an_unknown_form_is_refused():
-    with pytest.raises(DecodeError, match="form 2"):
-        read_attributes(b"\x02", WIDTHS, 3)
+    with pytest.raises(DecodeError, match="form 3"):
+        read_attributes(b"\x03", WIDTHS, 3)
 
 
 def block(*, terms=None, counts=(1, 1, 1, 1, 1), split=(0,), lengths=(0,) * 7):

@@ -31,7 +31,10 @@ def test_info_needs_the_header_alone():
     assert whole["format_version"] == FORMAT_VERSION == "2.0"
     assert whole["bytes"] == first["bytes"] == len(data)
     place = ("layer", "offset", "bytes", "end")
-    assert [{k: row[k] for k in place} for row in whole["layers"]] == first["layers"]
+    assert [{k: row[k] for k in place} for row in whole["layers"]] == [
+        {k: row[k] for k in place} for row in first["layers"]
+    ]
+    assert [set(row) for row in first["layers"]] == [{*place, "slices"}] * len(whole["layers"])
     ends = [whole["header_bytes"], *(row["end"] for row in whole["layers"])]
     assert [row["offset"] for row in whole["layers"]] == ends[:-1] and ends[-1] == len(data)
     decoded = decode(data)

@@ -29,6 +29,7 @@ TEXT = st.text(st.characters(exclude_categories=("C", "Z")), max_size=40)
         command=TEXT,
         quality=st.dictionaries(st.integers(0, 2), st.floats(0, 99, width=32)),
         still=st.sampled_from((b"", *(s + b"rest" for s in metadata.STILL_SIGNATURES))),
+        slices=st.lists(st.floats(0, 99, width=32), max_size=5).map(tuple),
     )
 )
 def test_what_is_written_comes_back(given_one):
@@ -43,6 +44,7 @@ def test_what_is_written_comes_back(given_one):
         ({"command": "x" * 4097}, "4097, expected at most 4096"),
         ({"quality": {3: 1.0}}, "level: 3, expected at most 2"),
         ({"quality": {0: float("nan")}}, "not a finite binary32"),
+        ({"slices": (1.0,) * 1025}, "1025, (expected at most|limit) 1024"),
         ({"still": b"GIF89a"}, "PNG, JPEG or WebP"),
         ({"still": PNG.ljust((1 << 17) + 1)}, "131073, expected at most 131072"),
     ],

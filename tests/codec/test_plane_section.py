@@ -34,7 +34,7 @@ def written_in_stages(planes, class_count=None):
     """The section in form 1, even where form 0 is shorter; class_count, if any, instead of the best."""
     choose = plane_section.cheapest_class_count if class_count is None else lambda _: class_count
     with patch.object(plane_section, "cheapest_class_count", choose):
-        return plane_section._write_staged(planes, 1)
+        return plane_section._write_staged(planes, 1).data
 
 
 @pytest.mark.parametrize("channels", [4, 7])

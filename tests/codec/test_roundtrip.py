@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import HUGE, RANGES, assert_same_networks, assert_same_scene, make_scene, scenes
 
-from pd4dgs_codec.codec import encoder
+from pd4dgs_codec.codec import encoder, slicing
 from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.morton import morton_codes
@@ -206,8 +206,8 @@ def test_verification_notices_a_changed_symbol(monkeypatch):
         changed[5, 0] += 1
         return original(replace(symbols, attributes=changed), coding)
 
-    original = encoder.write_layer
-    monkeypatch.setattr(encoder, "write_layer", write_wrong)
+    original = slicing.write_layer
+    monkeypatch.setattr(slicing, "write_layer", write_wrong)
     scene = make_scene(0, layers=(0,))
     with pytest.raises(EncodeError, match="verification: layer 0"):
         encode(scene)

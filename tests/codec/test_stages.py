@@ -10,8 +10,8 @@ from pd4dgs_codec.codec.stages import (
     MAX_CLASSES,
     activity_classes,
     cheapest_class_count,
+    coded_stages,
     places_of,
-    put_stages,
     read_class_count,
     read_stages,
     relative_magnitude,
@@ -93,13 +93,16 @@ def halves(target):
     yield [(target, 1 + 2 * np.flatnonzero(zero)), (target, 1 + 2 * np.flatnonzero(~zero))]
 
 
+def in_halves(symbols):
+    return coded_stages(bytearray(), [[channel[at] for channel, at in places] for places in halves(symbols)], 1).data
+
+
 @given(st.lists(st.integers(-2, 2), max_size=20).map(lambda v: v + v))
 @settings(max_examples=30)
 def test_what_is_put_in_stages_comes_back(values):
-    symbols, out = np.array(values, np.int64), bytearray()
-    put_stages(out, [[channel[at] for channel, at in places] for places in halves(symbols)], 1)
+    symbols = np.array(values, np.int64)
     found = np.zeros_like(symbols)
-    read_stages(ByteReader(bytes(out)), 2, halves(found))
+    read_stages(ByteReader(in_halves(symbols)), 2, halves(found))
     assert found.tolist() == values
 
 
@@ -113,16 +116,14 @@ def test_what_is_put_in_stages_comes_back(values):
     ],
 )
 def test_a_wrong_length_is_refused(length, error, message):
-    symbols, out = np.array([0, 1, 1, 0] * 4), bytearray()
-    put_stages(out, [[channel[at] for channel, at in places] for places in halves(symbols)], 1)
+    out = in_halves(np.array([0, 1, 1, 0] * 4))
     true, rest, wrong = out[0], out[1:], bytearray()
     put_varint(wrong, len(out) if length == "rest" else true + length)
     with pytest.raises(error, match=message):
-        read_stages(ByteReader(bytes(wrong + rest)), 2, halves(np.zeros(16, np.int64)))
+        read_stages(ByteReader(bytes(wrong) + rest), 2, halves(np.zeros(16, np.int64)))
 
 
 def test_bytes_after_the_last_stage_are_refused():
-    out = bytearray()
-    put_stages(out, [[channel[at] for channel, at in places] for places in halves(np.zeros(8, np.int64))], 1)
+    out = in_halves(np.zeros(8, np.int64))
     with pytest.raises(DecodeError):
-        read_stages(ByteReader(bytes(out) + b"\1\0\0\0"), 2, halves(np.zeros(8, np.int64)))
+        read_stages(ByteReader(out + b"\1\0\0\0"), 2, halves(np.zeros(8, np.int64)))

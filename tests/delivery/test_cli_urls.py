@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from faulty import Fault, FaultyServer
 
-from pd4dgs_codec.delivery.prefix import HEADER_GUESS, header_size, layer_ends
+from pd4dgs_codec.delivery.prefix import HEADER_GUESS, header_size, slice_ends
 
 
 def test_info_reads_the_header_alone(cli, folder, scene_bytes):
@@ -39,7 +39,7 @@ def test_info_checks_and_hashes_the_whole_remote_file(cli, folder, scene_bytes):
 
 @pytest.mark.parametrize("layer", [0, 1, 2])
 def test_decode_fetches_the_prefix_and_nothing_more(cli, folder, tmp_path, scene_bytes, layer):
-    end = dict(layer_ends(scene_bytes))[layer]
+    end = dict(slice_ends(scene_bytes))[layer]
     with FaultyServer(scene_bytes, [Fault(100), Fault(), Fault(1234)]) as server:
         done = cli("decode", server.url, "--max-layer", layer, "-o", tmp_path / "there.npz", "-v")
         assert server.sent == end
@@ -62,12 +62,12 @@ def test_a_server_without_ranges_serves_prefixes_too(cli, scene_bytes):
     with FaultyServer(scene_bytes, ranges=False) as server:
         done = cli("decode", server.url, "--max-layer", 0, "--json")
         assert len(server.requests) == 1
-    assert done.code == 0 and done.json["bytes"] == layer_ends(scene_bytes)[0][1]
+    assert done.code == 0 and done.json["bytes"] == slice_ends(scene_bytes)[0][1]
 
 
 def test_partial_files_and_failing_links(cli, scene_bytes, monkeypatch):
     monkeypatch.setattr("pd4dgs_codec.delivery.transfer.BACKOFF_SECONDS", 0.0)
-    cut = layer_ends(scene_bytes)[1][1] + 5
+    cut = slice_ends(scene_bytes)[1][1] + 5
     with FaultyServer(scene_bytes[:cut]) as server:
         assert cli("decode", server.url).code == 1
         done = cli("decode", server.url, "--allow-partial", "--json")
@@ -97,4 +97,4 @@ def test_bad_urls_and_missing_files_are_one_line(cli, scene_bytes, verb):
 def test_the_header_is_found_where_it_ends(scene_bytes):
     size = header_size(scene_bytes)
     assert size is not None and header_size(scene_bytes[: size - 1]) is None
-    assert [layer for layer, _ in layer_ends(scene_bytes[:size])] == [0, 1, 2] and layer_ends(scene_bytes[:9]) == []
+    assert [layer for layer, _ in slice_ends(scene_bytes[:size])] == [0, 1, 2] and slice_ends(scene_bytes[:9]) == []

@@ -19,7 +19,7 @@ from strategies import assert_same_scene, make_scene
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.delivery import client as client_module
 from pd4dgs_codec.delivery.client import Budget, RateMeter, SceneClient, next_end
-from pd4dgs_codec.delivery.prefix import layer_ends
+from pd4dgs_codec.delivery.prefix import slice_ends
 from pd4dgs_codec.delivery.server import Server
 from pd4dgs_codec.errors import BadSignature, ChecksumMismatch, DeliveryError, Truncated
 
@@ -44,7 +44,7 @@ def test_one_open_get_gives_every_layer(scene_bytes, levels):
 
 
 def test_layers_appear_before_the_file_is_whole_and_each_end_is_a_cut(scene_bytes, levels):
-    ends = [end for _, end in layer_ends(scene_bytes)]
+    ends = [end for _, end in slice_ends(scene_bytes)]
     faults = [Fault(ends[0], "stall"), Fault(ends[1] - ends[0], "stall", then=lambda server: server.stopped.clear())]
     with FaultyServer(scene_bytes, faults) as server, SceneClient(server.url) as client:
         shown = []
@@ -62,7 +62,7 @@ def test_upgrades_fetch_the_missing_layers_only(scene_bytes, levels):
         check(list(client.scenes(Budget(max_layer=0))), levels[:1])
         check(list(client.scenes(Budget(max_layer=0))), [])
         check(list(client.scenes(Budget(max_layer=2))), levels[1:])
-    ends = [end for _, end in layer_ends(scene_bytes)]
+    ends = [end for _, end in slice_ends(scene_bytes)]
     assert [r.get("range") for r in server.requests] == [None, f"bytes={ends[0]}-{ends[2] - 1}"]
 
 
@@ -76,7 +76,7 @@ def test_servers_without_ranges_or_validators(scene_bytes, levels, etag):
 
 
 def test_a_damaged_layer_is_fetched_again_and_never_shown(scene_bytes, levels):
-    ends = [end for _, end in layer_ends(scene_bytes)]
+    ends = [end for _, end in slice_ends(scene_bytes)]
     for layer in range(3):
         damaged = bytearray(scene_bytes)
         damaged[ends[layer] - 30] ^= 1
@@ -95,7 +95,7 @@ def test_a_damaged_layer_is_fetched_again_and_never_shown(scene_bytes, levels):
 
 def test_a_damaged_layer_within_the_first_block():
     data = encode(make_scene(7, anchors=6), layers=2, effort=1)
-    ends = [end for _, end in layer_ends(data)]
+    ends = [end for _, end in slice_ends(data)]
     assert ends[-1] < 4000
     damaged = bytearray(data)
     damaged[ends[1] - 30] ^= 1
@@ -158,7 +158,7 @@ def test_a_part_of_another_file_is_not_appended(scene_bytes, levels):
 
 def test_a_file_that_is_shorter_now_begins_anew(scene_bytes, other_bytes):
     others = [decode(other_bytes, max_layer=layer) for layer in range(3)]
-    size = layer_ends(scene_bytes)[1][1]
+    size = slice_ends(scene_bytes)[1][1]
     assert len(other_bytes) < size
     fault = Fault(size, headers={"ETag": '"same"'}, then=lambda server: setattr(server, "content", other_bytes))
     with FaultyServer(scene_bytes, [fault]) as server, SceneClient(server.url) as client:
@@ -178,7 +178,7 @@ def test_other_data_and_short_files(scene_bytes, levels):
     with FaultyServer(b"<html>not found</html>") as server, SceneClient(server.url) as client:
         with pytest.raises(BadSignature):
             list(client.scenes())
-    ends = [end for _, end in layer_ends(scene_bytes)]
+    ends = [end for _, end in slice_ends(scene_bytes)]
     for size in (0, 5, 100, ends[1] + 3):
         with FaultyServer(scene_bytes[:size]) as server, SceneClient(server.url) as client:
             shown = []
@@ -232,7 +232,7 @@ def test_stop_when_the_seconds_are_over_and_go_on_later(scene_bytes, levels, mon
     """Nearly all of a minute is over once the first layer is shown; the rest of it goes by in silence."""
     over = 0.0
     monkeypatch.setattr(client_module, "time", SimpleNamespace(monotonic=lambda: time.monotonic() + over))
-    ends = [end for _, end in layer_ends(scene_bytes)]
+    ends = [end for _, end in slice_ends(scene_bytes)]
     with FaultyServer(scene_bytes, [Fault(ends[0] + 20, "stall")]) as server, SceneClient(server.url) as client:
         shown = []
         for scene in client.scenes(Budget(seconds=60)):

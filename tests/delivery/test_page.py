@@ -13,16 +13,12 @@ from pd4dgs_codec.delivery import page
 from pd4dgs_codec.errors import DataError, DecodeError, DeliveryError
 
 
-def test_files_ask_for_nothing_but_each_other():
-    files = page.page_files()
-    assert set(files) == {page.PAGE, *page.ENTRIES.values()} >= set(page.FIRST_VISIT)
-    for name, content in files.items():
-        text = content.decode()
-        asked = re.findall(r'(?:import|from|URL|import\() ?\(?"([^"]+)"', text) + re.findall(
-            r'(?:src|href)="([^"]+)"', text
-        )
-        assert {target.removeprefix("./") for target in asked} <= {*files, "data:,"}, name
-    assert not re.search(rb"https?://", b"".join(files.values()))
+def test_a_page_asks_for_nothing_but_a_scene():
+    text = page.page()
+    asked = re.findall(r'(?:\b(?:import|from)|URL\(|import\() ?"([^"]+)"', text) + re.findall(
+        r' (?:src|href)="([^"]+)"', text
+    )
+    assert set(asked) <= {"data:,"} and not re.search(r"https?://", text)
 
 
 def test_a_notebook_gets_a_frame_that_holds_everything(tmp_path):
@@ -31,12 +27,12 @@ def test_a_notebook_gets_a_frame_that_holds_everything(tmp_path):
     (tmp_path / "scene.pd4").write_bytes(data)
     pages = [show(given).page for given in (data, tmp_path / "scene.pd4", str(tmp_path / "scene.pd4"), scene)]
     assert pages[0] == pages[1] == pages[2] and "import.meta" not in pages[0]
-    assert len(re.findall("</script", pages[0])) == 1  # the page's own
+    assert len(re.findall("</script", pages[0])) == 2  # scene and player
     frame = show(data, width='50%" x="', height=200)._repr_html_()
     (source,) = re.findall(r'srcdoc="([^"]*)"', frame)
     assert html.unescape(source) == pages[0] and "height:200px" in frame and 'x="' not in frame
-    remote = show("https://example.org/a.pd4?b=</script>").page
-    assert "https://example.org/a.pd4?b=\\u003c/script>" in remote and len(remote) < len(pages[0])
+    remote = show('https://example.org/a.pd4?b=">').page
+    assert 'data-src="https://example.org/a.pd4?b=&quot;&gt;"' in remote and len(remote) < len(pages[0])
 
 
 @pytest.mark.parametrize("cut", [0, 100, -1])
@@ -48,7 +44,7 @@ def test_a_notebook_shows_no_damaged_scene(cut):
 def test_a_player_that_is_nowhere_is_named(tmp_path, monkeypatch):
     monkeypatch.setattr(page, "__file__", str(tmp_path / "a" / "b" / "page.py"))
     with pytest.raises(DataError, match="holds no player"):
-        page.page_files()
+        page.page()
 
 
 @pytest.mark.parametrize(

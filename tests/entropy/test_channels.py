@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pd4dgs_codec.entropy.ans import ans_encode
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
-from pd4dgs_codec.entropy.priors import CONST, GAUSS, GMM2, HIST, K_MAX, MAX_ENTRIES, MAX_WINDOW
+from pd4dgs_codec.entropy.priors import CONST, FREE_ENTRIES, GAUSS, GMM2, HIST, K_MAX, MAX_WINDOW
 from pd4dgs_codec.entropy.tables import norm_table, uniform_table
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
 from pd4dgs_codec.errors import DecodeError, EncodeError, LimitExceeded, Malformed, UnsupportedFeature
@@ -243,7 +243,7 @@ def test_counts_are_bounded(count):
 def test_tables_of_a_section_are_bounded():
     """Eight bytes define a table of 128 KiB: 86 kB of them took 1.6 GB."""
     wide = payload_of(2, 0, MAX_WINDOW - 2, 0, 1280)
-    most = MAX_ENTRIES // MAX_WINDOW
+    most = FREE_ENTRIES // MAX_WINDOW
     assert len(decode_channels(wide * most, [1] * most)) == most
     with pytest.raises(LimitExceeded, match="entries"):
         decode_channels(wide * (most + 1), [1] * (most + 1))
@@ -251,7 +251,7 @@ def test_tables_of_a_section_are_bounded():
 
 def test_wide_channels_share_a_table_rather_than_pass_the_limit():
     rng = np.random.default_rng(6)
-    centres = rng.integers(-(2**23), 2**23, MAX_ENTRIES // MAX_WINDOW + 20)
+    centres = rng.integers(-(2**23), 2**23, FREE_ENTRIES // MAX_WINDOW + 20)
     narrow = np.array([0, 1, 1, 2, 5], np.int32)
     channels = [narrow, *((c + rng.integers(-8000, 8000, 40)).astype(np.int32) for c in centres)]
     coded = encode_channels(channels, effort=1)

@@ -20,7 +20,7 @@ from pd4dgs_codec import decode, encode
 from pd4dgs_codec.codec.decoder import decode_layers
 from pd4dgs_codec.codec.layer_meta import NETWORKS, ROWS, SCALES, Section
 from pd4dgs_codec.codec.stages import PLAIN, STAGED
-from pd4dgs_codec.entropy.priors import FIRST_REUSE, GAUSS, MAX_ENTRIES, MAX_WINDOW
+from pd4dgs_codec.entropy.priors import FIRST_REUSE, FREE_ENTRIES, GAUSS, MAX_WINDOW
 from pd4dgs_codec.entropy.varint import put_varint
 from pd4dgs_codec.errors import DecodeError, LimitExceeded
 
@@ -106,7 +106,7 @@ def many_exceptions():
 
 def most_wide_tables():
     """As many tables of full width as a section may have, for one symbol each."""
-    section = wide_tables(MAX_ENTRIES // MAX_WINDOW, 6 * 64)
+    section = wide_tables(FREE_ENTRIES // MAX_WINDOW, 6 * 64)
     return crafted("wide-planes", 1, {Section.PLANES: section}, planes_of_one_cell(64))
 
 

@@ -23,6 +23,8 @@ PLAYER = ROOT / "player"
 NODE = shutil.which("node")
 TSC = PLAYER / "node_modules" / ".bin" / "tsc"
 OLDEST = 20
+#: What a module names by its path.
+IMPORTS = re.compile(r'(?:from|import|URL\()\s*"(\.[^"]+)"')
 
 pytestmark = pytest.mark.skipif(NODE is None, reason="no node on this machine")
 
@@ -55,6 +57,21 @@ def test_the_decoders_own_tests_pass():
 def test_the_types_are_right():
     done = subprocess.run([str(TSC), "-p", "tsconfig.json"], cwd=PLAYER, capture_output=True, text=True, timeout=280)
     assert done.returncode == 0, done.stdout
+
+
+@pytest.mark.skipif(shutil.which("npm") is None, reason="no npm on this machine")
+def test_the_npm_package_holds_what_it_exports_and_runs_nothing_when_it_is_installed():
+    told = json.loads((PLAYER / "package.json").read_text())
+    command = ["npm", "pack", "--dry-run", "--ignore-scripts", "--json"]
+    done = subprocess.run(command, cwd=PLAYER, capture_output=True, text=True, timeout=280)
+    assert done.returncode == 0, done.stderr
+    packed = {entry["path"] for entry in json.loads(done.stdout)[0]["files"]}
+    assert {entry["default"].removeprefix("./") for entry in told["exports"].values()} <= packed
+    modules = [PLAYER / name for name in packed if name.endswith("js")]
+    imported = [(m.parent / target).resolve() for m in modules for target in IMPORTS.findall(m.read_text())]
+    assert len(imported) > 100 and {str(path.relative_to(PLAYER)) for path in imported} <= packed
+    assert not {"preinstall", "install", "postinstall"} & set(told["scripts"]) and "dependencies" not in told
+    assert f'version = "{told["version"]}"' in (ROOT / "pyproject.toml").read_text()
 
 
 def test_the_command_prints_the_hashes_of_the_package(cli, tmp_path):

@@ -275,7 +275,7 @@ def staged(stages, lengths=None):
 
 def both(section, rows=ROWS):
     """Outcome of the reference decoder and of the package: symbols or the error's name."""
-    ours = outcome(lambda d: refdec.decode_attributes(d, *WIDTHS, rows, False), section, refdec.Fault)
+    ours = outcome(lambda d: refdec.decode_attributes(d, *WIDTHS, rows, refdec.Past(), False), section, refdec.Fault)
     return ours, outcome(lambda d: read_attributes(d, Widths(*WIDTHS), rows)[1].tolist(), section, DecodeError)
 
 
@@ -312,7 +312,7 @@ def test_prediction_blocks_at_their_limits_are_read_by_both(name):
 
 
 BROKEN_BLOCKS = {
-    "unknown form": ({"form": 2}, "UnsupportedFeature"),
+    "unknown form": ({"form": 3}, "UnsupportedFeature"),
     "more terms than channels before": ({"terms": {2: (3, [(0, 1), (0, 1), (0, 1)])}}, "LimitExceeded"),
     "predicted from itself": ({"terms": {2: (1, [(2, 1)])}}, "Malformed"),
     "predicted from a later channel": ({"terms": {2: (2, [(1, 1), (30, 1)])}}, "Malformed"),
@@ -469,7 +469,7 @@ FRAME_FAULTS = {
     "Malformed": lambda data: data + b"\0",
     "BadSignature": lambda data: b"\x88" + data[1:],
     "UnsupportedVersion": lambda data: data[:8] + b"\1" + data[9:],
-    "LimitExceeded": lambda data: data[:13] + b"\x11" + data[14:],
+    "LimitExceeded": lambda data: data[:13] + b"\x41" + data[14:],
     "ChecksumMismatch": lambda data: data[:-30] + bytes([data[-30] ^ 1]) + data[-29:],
 }
 

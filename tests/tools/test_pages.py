@@ -12,6 +12,7 @@ import evaluation
 import latency
 import omissions
 import performance
+import player_page
 import precision
 import pytest
 import results
@@ -25,7 +26,7 @@ from pd4dgs_codec.errors import DataError
 
 ROOT = page.ROOT
 DOCS = ROOT / "docs"
-PAGES = [tool.PAGE for tool in (results, evaluation, precision, latency, omissions, performance)]
+PAGES = [tool.PAGE for tool in (results, evaluation, precision, latency, omissions, performance, player_page)]
 PAGES += [table.page for table in TABLES.values()]
 #: Bytes that a text and a picture may have.
 TEXT, PICTURE = 50_000, 300_000

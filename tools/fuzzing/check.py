@@ -31,8 +31,9 @@ from pd4dgs_codec.codec.payload import read_meta
 from pd4dgs_codec.errors import DecodeError, Truncated
 
 MAX_SECONDS = 2.0  #: of processor time, per input
-#: Peak memory of decoding is at most these times the symbols declared, the bytes given, and a constant (clause 15).
-BYTES_PER_SYMBOL, BYTES_PER_BYTE, BYTES_ALWAYS = 48, 48, 64 << 20
+#: Peak memory of decoding is at most these times the symbols declared, the bytes given, and a constant, a larger one
+#: where a layer has several slices (clause 15).
+BYTES_PER_SYMBOL, BYTES_PER_BYTE, BYTES_ALWAYS, BYTES_OF_SLICES = 48, 48, 64 << 20, 256 << 20
 
 REFERENCE = Path(__file__).resolve().parents[2] / "spec" / "refdec.py"
 REFERENCE_SYMBOLS = 20_000
@@ -99,9 +100,10 @@ def count_checksums(data: bytes) -> int:
     return count
 
 
-def declared(data: bytes) -> int:
-    """Symbols that the layers of `data` declare within the limits, up to the first layer that is refused."""
-    total = Declared()
+def declared(data: bytes) -> tuple[int, int]:
+    """(symbols, slices behind a layer's first) that `data` declares within the limits, up to the first slice that is
+    refused."""
+    total, seen, later = Declared(), set[int](), 0
     try:
         preamble = read_preamble(data)
         header, offset = unpack_header(preamble.header), preamble.size
@@ -109,16 +111,19 @@ def declared(data: bytes) -> int:
             kind = BY_CHUNK_TYPE.get(kind_number)
             if kind is not None:
                 payload = read_chunk(data, offset, length=length).payload
-                *_, total = read_meta(payload, kind, header.widths, total, header.raw_deformation)
+                *_, total = read_meta(payload, kind, header.widths, total, header.raw_deformation, kind.layer in seen)
+                later += kind.layer in seen
+                seen.add(kind.layer)
             offset += CHUNK_OVERHEAD + length
     except DecodeError:
         pass
-    return total.symbols
+    return total.symbols, later
 
 
 def memory_bound(data: bytes) -> int:
     """The most bytes that decoding `data` may hold at once."""
-    return BYTES_PER_SYMBOL * declared(data) + BYTES_PER_BYTE * len(data) + BYTES_ALWAYS
+    symbols, later = declared(data)
+    return BYTES_PER_SYMBOL * symbols + BYTES_PER_BYTE * len(data) + (BYTES_OF_SLICES if later else BYTES_ALWAYS)
 
 
 def peak_memory(data: bytes) -> int:
@@ -135,7 +140,9 @@ def check_memory(data: bytes) -> float:
     """Peak memory as a share of its bound; Finding if it is over."""
     peak, bound = peak_memory(data), memory_bound(data)
     if peak > bound:
-        raise Finding("memory", f"{peak} bytes at once, bound {bound} for {declared(data)} symbols, {len(data)} bytes")
+        raise Finding(
+            "memory", f"{peak} bytes at once, bound {bound} for {declared(data)[0]} symbols, {len(data)} bytes"
+        )
     return peak / bound
 
 
@@ -206,7 +213,7 @@ def compare_reference(data: bytes) -> bool:
 
     It is plain Python: an input that declares more than REFERENCE_SYMBOLS is left out.
     """
-    if declared(data) > REFERENCE_SYMBOLS:
+    if declared(data)[0] > REFERENCE_SYMBOLS:
         return False
     name, ours = _end(hashes, data)
     reference = _reference()

@@ -95,7 +95,7 @@ def put_together(parts: Parts, header: bytes | None = None) -> bytes:
         scene_id = header_module.scene_id_of(header)
     except (DecodeError, LookupError, TypeError):  # no header, or no chunk
         scene_id = bytes(8)
-    framed = [write_chunk(c.type, c.flags & 1, scene_id, p) for c, p in zip(parts.chunks, payloads, strict=True)]
+    framed = [write_chunk(c.type, c.flags, scene_id, p) for c, p in zip(parts.chunks, payloads, strict=True)]
     return b"".join([write_preamble(header), *framed])
 
 

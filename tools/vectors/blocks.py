@@ -8,6 +8,7 @@ unless a caller asks for others.
 from __future__ import annotations
 
 import hashlib
+import itertools
 import struct
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -19,11 +20,11 @@ from pd4dgs_codec.attributes.planes import residual
 from pd4dgs_codec.attributes.quantise import dequantise
 from pd4dgs_codec.attributes.table import NO_CLASSES, Grid
 from pd4dgs_codec.bitstream import canonical
-from pd4dgs_codec.bitstream.container import MAJOR, SCENE_ID_SIZE, SIGNATURE
+from pd4dgs_codec.bitstream.container import MAJOR, SCENE_ID_SIZE, SIGNATURE, slice_flags
 from pd4dgs_codec.codec.header import payload_digest
 from pd4dgs_codec.codec.kinds import LAYER_KINDS
 from pd4dgs_codec.codec.layer_meta import Section
-from pd4dgs_codec.codec.symbols import LayerSymbols
+from pd4dgs_codec.codec.symbols import LayerSymbols, merged
 from pd4dgs_codec.entropy.ans import ans_encode
 from pd4dgs_codec.entropy.positions import position_channels
 from pd4dgs_codec.entropy.priors import (
@@ -135,12 +136,15 @@ def default_prior(symbols: np.ndarray) -> Prior:
     return gauss(low, n, si=64 * n.bit_length() - 128, shift=shift)
 
 
-class Channels:
-    """A section of coded channels, one `add` per channel."""
+Known = list[tuple[bytes, bytes]]
 
-    def __init__(self) -> None:
+
+class Channels:
+    """A section of coded channels, one `add` per channel. known: the priors of slices before, which it adds to."""
+
+    def __init__(self, known: Known | None = None) -> None:
         self.block = bytearray()
-        self._defined: list[tuple[bytes, bytes]] = []
+        self._defined = [] if known is None else known
         self._tables: list[Hist] = []
         self._parts: list[tuple[np.ndarray, np.ndarray]] = []
 
@@ -189,27 +193,34 @@ class Channels:
         return bytes(self.block) + ans_encode([symbols for symbols, _ in parts], [cum for _, cum in parts])
 
 
-def coded(channels: Iterable[Iterable[int]], priors: Mapping[int, Prior] | None = None) -> bytes:
+def coded(
+    channels: Iterable[Iterable[int]], priors: Mapping[int, Prior] | None = None, known: Known | None = None
+) -> bytes:
     """A section of coded channels; `priors` names those of some channels by their number."""
-    section = Channels()
+    section = Channels(known)
     for number, channel in enumerate(channels):
         section.add(channel, (priors or {}).get(number))
     return section.done()
 
 
-def positions(cells: np.ndarray) -> bytes:
+def positions(cells: np.ndarray, known: Known | None = None) -> bytes:
     """Section POSITIONS of cells int32 [n, 3] in Morton order (clause 10)."""
     head, channels = position_channels(cells)
-    return head + coded(channels)
+    return head + coded(channels, known=known)
 
 
 def plain_attributes(
-    k: np.ndarray, priors: Mapping[int, Prior] | None = None, *, classes: np.ndarray = NO_CLASSES
+    k: np.ndarray,
+    priors: Mapping[int, Prior] | None = None,
+    known: Known | None = None,
+    *,
+    classes: np.ndarray = NO_CLASSES,
 ) -> bytes:
     """Section ATTRIBUTES of int32 [channels, n], form 0 (clause 8.5)."""
     if not classes.size:
-        return b"\0" + coded(k, priors)
-    return b"\0" + graded_part(classes) + coded([channel[classes == c] for channel in k for c in range(7)], priors)
+        return b"\0" + coded(k, priors, known)
+    by_class = [channel[classes == c] for channel in k for c in range(7)]
+    return b"\0" + graded_part(classes) + coded(by_class, priors, known)
 
 
 def graded_part(classes: np.ndarray, length: int | None = None) -> bytes:
@@ -226,20 +237,25 @@ def plain_planes(residuals: Iterable[Iterable[int]], priors: Mapping[int, Prior]
     return b"\0" + coded(residuals, priors)
 
 
-def relative_magnitude(e: np.ndarray) -> np.ndarray:
-    """int64 [n] of residuals int64 [m, n] (clause 8.9)."""
-    return sum((abs(c) * 256 * len(c) // (1 + abs(c).sum()) for c in e), np.zeros(e.shape[1], np.int64))
+def relative_magnitude(e: np.ndarray, of: np.ndarray | None = None) -> np.ndarray:
+    """int64 [n] of residuals int64 [m, n], N and s_c those of the residuals `of` if given (clause 8.9)."""
+    of = e if of is None else of
+    sums = [int(abs(c).sum()) for c in of]
+    parts = (np.minimum(abs(c), s) * 256 * of.shape[1] // (1 + s) for c, s in zip(e, sums, strict=True))
+    return sum(parts, np.zeros(e.shape[1], np.int64))
 
 
-def classes_by_activity(activity: np.ndarray, count: int) -> np.ndarray:
-    """The class of each place, 0 .. count − 1 (clause 8.9)."""
-    n = len(activity)
-    return np.searchsorted(np.sort(activity)[[i * n // count for i in range(1, count)]], activity, side="right")
+def classes_by_activity(activity: np.ndarray, count: int, of: np.ndarray | None = None) -> np.ndarray:
+    """The class of each place, 0 .. count − 1, by the bounds of the activity `of` if given (clause 8.9)."""
+    of = activity if of is None else of
+    return np.searchsorted(np.sort(of)[[i * len(of) // count for i in range(1, count)]], activity, side="right")
 
 
-def split_by_activity(channel: np.ndarray, activity: np.ndarray, count: int) -> list[np.ndarray]:
+def split_by_activity(
+    channel: np.ndarray, activity: np.ndarray, count: int, of: np.ndarray | None = None
+) -> list[np.ndarray]:
     """The symbols of each of `count` classes (clause 8.9)."""
-    classes = classes_by_activity(activity, count)
+    classes = classes_by_activity(activity, count, of)
     return [channel[classes == q] for q in range(count)]
 
 
@@ -267,10 +283,14 @@ def staged(
     lengths: Lengths = lambda sizes: sizes,
     tail: bytes = b"",
     priors: Mapping[int, Mapping[int, Prior]] | None = None,
+    known: Sequence[Known] | None = None,
 ) -> bytes:
     """The lengths of all stages but the last, then the stages. lengths: what is said, from the true lengths. priors: by
-    stage, then by channel of the stage."""
-    payloads = [coded(stage, (priors or {}).get(number)) for number, stage in enumerate(stages)]
+    stage, then by channel of the stage. known: by stage."""
+    payloads = [
+        coded(stage, (priors or {}).get(number), known[number] if known else None)
+        for number, stage in enumerate(stages)
+    ]
     said = lengths([len(p) for p in payloads[:-1]])
     return b"".join(map(varint, said)) + b"".join(payloads) + tail
 
@@ -333,20 +353,23 @@ def attribute_stages(
     splits: Splits,
     classes: Sequence[int],
     widths: Widths = DEFAULT_WIDTHS,
-    grades: np.ndarray = NO_CLASSES,
+    of: np.ndarray | None = None,
+    grades: tuple[np.ndarray, np.ndarray] = (NO_CLASSES, NO_CLASSES),
 ) -> list[list[np.ndarray]]:
-    """The channels of the eight stages of clause 8.7, of residuals and offsets int64 [channels, n] of anchors of the
-    step classes `grades`."""
-    p, stages = widths.predicted, list[list[np.ndarray]]()
+    """The channels of the eight stages of clause 8.7, of residuals and offsets int64 [channels, n]. of: those of the
+    slice that the block stands in, if it is another one. grades: step classes of both."""
+    of, p, stages = e if of is None else of, widths.predicted, list[list[np.ndarray]]()
+    graded = bool(grades[0].size)
     bounds = [p * a // 38 for a in (0, 6, 12, 20, 29, 38)]
-    graded = [64 >> grades.astype(np.int64)] if grades.size else []
     for stage, count in enumerate(classes if graded else (1, *classes)):
         first = bounds[stage]
         channels = e[first : bounds[stage + 1]] if stage < 5 else e[p::3]
-        activity = relative_magnitude(e[:first]) if first else np.zeros(e.shape[1], np.int64)
-        for own in graded:
-            activity += 4 * relative_magnitude(own[None])
-        stages.append([part for channel in channels for part in split_by_activity(channel, activity, count)])
+        measured, by = (
+            np.concatenate([*[(64 >> g.astype(np.int64))[None]] * 4, x[:first]]) if graded else x[:first]
+            for x, g in zip((e, of), grades, strict=True)
+        )
+        activity, measure = relative_magnitude(measured, by), relative_magnitude(by, by)
+        stages.append([part for channel in channels for part in split_by_activity(channel, activity, count, measure)])
     ys, zs = list[np.ndarray](), list[np.ndarray]()
     for i in range(widths.slots):
         x, y, z = e[p + 3 * i : p + 3 * i + 3]
@@ -367,20 +390,31 @@ def predicted_attributes(
     grades: np.ndarray = NO_CLASSES,
     lengths: Lengths = lambda sizes: sizes,
     tail: bytes = b"",
+    known: Sequence[Known] | None = None,
+    of: np.ndarray | None = None,
+    of_grades: np.ndarray = NO_CLASSES,
 ) -> bytes:
     """Section ATTRIBUTES of int32 [channels, n], form 1 (clauses 8.5 to 8.9).
 
     terms: channel -> (channel, weight) ascending. classes: of stages 1 to 5. lengths: what the block says of stages 0
-    to 6, from the true lengths. tail: after the last stage.
+    to 6, from the true lengths. tail: after the last stage. of, of_grades: the attributes and step classes of the slice
+    that the block stands in, if it is another one: form 2.
     """
-    k = k.astype(np.int64)
-    e = k.copy()
-    for c in range(1, widths.predicted):
-        total = sum((w * k[j] for j, w in terms.get(c, ())), np.zeros_like(k[c]))
-        e[c] -= total + 512 >> WEIGHT_SHIFT
+    e = residuals(k, terms, widths)
+    before = None if of is None else residuals(of, terms, widths)
+    stages = attribute_stages(e, splits, classes, widths, before, (grades, grades if of is None else of_grades))
     block = prediction_block({c: gaps(own) for c, own in terms.items()}, splits, {}, classes, widths)
-    stages = staged(attribute_stages(e, splits, classes, widths, grades), lengths, tail)
-    return b"\1" + graded_part(grades) + block + stages
+    front = b"\1" + graded_part(grades) + block if of is None else b"\2" + graded_part(grades)
+    return front + staged(stages, lengths, tail, known=known)
+
+
+def residuals(k: np.ndarray, terms: Terms, widths: Widths = DEFAULT_WIDTHS) -> np.ndarray:
+    """int64 [channels, n]: attributes int32 [channels, n], the predicted ones without their prediction (clause 8.7)."""
+    e = k.astype(np.int64)
+    for c in range(1, widths.predicted):
+        total = sum((w * k[j].astype(np.int64) for j, w in terms.get(c, ())), np.zeros_like(e[c]))
+        e[c] -= total + 512 >> WEIGHT_SHIFT
+    return e
 
 
 # -- LZMA sections (clause 9) ------------------------------------------------------------------------------------------
@@ -644,7 +678,7 @@ class File:
         """The header map."""
         chunk_list = [list(c.listed or (c.type, len(c.payload))) for c in self.chunks]
         own = {k: v for k, v in self.header.items() if v is not None}
-        fields = {1: chunk_list, 14: payload_digest(c.payload for c in self.chunks if not c.flags), **own}
+        fields = {1: chunk_list, 14: payload_digest(c.payload for c in self.chunks if not c.flags & 1), **own}
         return {k: fields[k] for k in sorted(fields) if k not in self.header or self.header[k] is not None}
 
     def header_bytes(self) -> bytes:
@@ -691,21 +725,31 @@ class File:
         assert layer is not None
         return layer
 
+    def slices(self, chunks: int | None = None) -> tuple[int, ...]:
+        """The layer of each slice among the first `chunks` chunks."""
+        return tuple(c.layer.meant.kind.layer for c in self.chunks[:chunks] if c.layer is not None)
+
     def hashes(self, chunks: int | None = None) -> list[dict]:
         """Clause 12.4 of the layers among the first `chunks` chunks, from what they mean."""
-        return [_hashes(c.layer, self.header) for c in self.chunks[:chunks] if c.layer is not None]
+        meant = [c.layer.meant for c in self.chunks[:chunks] if c.layer is not None]
+        layers = [merged(list(slices)) for _, slices in itertools.groupby(meant, key=lambda m: m.kind)]
+        return [_hashes(m, self.header) for m in layers]
 
 
 def make_file(*layers: Layer, header: Mapping[int, object] | None = None) -> File:
-    """A file of these layers in their chunks."""
-    chunks = tuple(Chunk(x.meant.kind.chunk_type, x.payload(), layer=x) for x in layers)
+    """A file of these layers in their chunks. Layers of one kind are its slices, numbered as they come."""
+    chunks = []
+    for kind, slices in itertools.groupby(layers, key=lambda x: x.meant.kind):
+        own = list(slices)
+        chunks += [
+            Chunk(kind.chunk_type, x.payload(), slice_flags(number, len(own)), layer=x) for number, x in enumerate(own)
+        ]
     widths = layers[0].meant.widths
     centres = {16: [i % 5 - 2 for i in range(widths.channels)]} if widths.graded else {}
-    return File(chunks).with_header({15: [widths.feature, widths.slots], **centres, **(header or {})})
+    return File(tuple(chunks)).with_header({15: [widths.feature, widths.slots], **centres, **(header or {})})
 
 
-def _hashes(layer: Layer, header: Mapping[int, object]) -> dict:
-    m = layer.meant
+def _hashes(m: LayerSymbols, header: Mapping[int, object]) -> dict:
     steps = dict(zip(ATTRIBUTES, header[4], strict=True))  # type: ignore[call-overload]
     centre = np.array(header.get(16, [0] * m.widths.channels), np.int32)
     values = Grid(steps, m.widths, centre).dequantise(m.attributes, m.classes)
@@ -731,7 +775,8 @@ def _hashes(layer: Layer, header: Mapping[int, object]) -> dict:
 class Vector:
     """One file of spec/vectors. layers: the hashes of what decodes, of all of a valid file or of the layers before a
     fault. error: its name (clause 15), None for a valid file. chunk, offset: where the fault lies, if in a chunk and
-    if at a field that the frame fixes."""
+    if at a field that the frame fixes. slices: the layer of each slice that decodes. feature: what of the format it is
+    about, where decoders may yet lack it."""
 
     name: str
     sentence: str
@@ -741,11 +786,13 @@ class Vector:
     error: str | None = None
     chunk: int | None = None
     offset: int | None = None
+    slices: tuple[int, ...] = ()
+    feature: str | None = None
 
 
 def good(name: str, sentence: str, clauses: str, file: File) -> Vector:
     """A file that decodes."""
-    return Vector(name, sentence, tuple(clauses.split()), file.data(), file.hashes())
+    return Vector(name, sentence, tuple(clauses.split()), file.data(), file.hashes(), slices=file.slices())
 
 
 def bad(
@@ -767,8 +814,9 @@ def bad(
     """
     data = file.data()[:size]
     offset = size if at is None else at + (0 if chunk is None else file.start(chunk))
-    layers = file.hashes(None if whole else chunk or 0)
-    return Vector("faulty/" + name, sentence, tuple(clauses.split()), data, layers, error, chunk, offset)
+    count = None if whole else chunk or 0
+    layers, slices = file.hashes(count), file.slices(count)
+    return Vector("faulty/" + name, sentence, tuple(clauses.split()), data, layers, error, chunk, offset, slices)
 
 
 MALFORMED, LIMIT, FEATURE = "Malformed", "LimitExceeded", "UnsupportedFeature"

@@ -235,7 +235,14 @@ def _priors() -> Iterator[Vector]:
     yield _attributed("channel-missing", "8.1 15", MALFORMED, one, "67 channels of attributes.")
     yield _attributed("channel-too-many", "7.7 8.1", MALFORMED, more, "69 channels of attributes.")
     over = tables_at_limit(more=True)
-    yield bad("prior-tables-over-limit", "Tables of 2^21 + 1 entries in a section.", "14 8.2", LIMIT, over, chunk=1)
+    yield bad(
+        "prior-tables-over-limit",
+        "Tables of an entry more than 2^18 and one per symbol of their section.",
+        "14 8.2",
+        LIMIT,
+        over,
+        chunk=1,
+    )
     yield _steep("symbol-over-k", "8.4", gauss(K_MAX - 2 * 4095, 2, shift=12), "A scaled symbol of K + 1.")
 
 
@@ -325,7 +332,7 @@ def _prediction() -> Iterator[Vector]:
     beyond = said(lambda sizes: [*sizes[:-1], sizes[-1] + 40])
     left = predicted_attributes(k, {}, {}, tail=words(1))
     rows: tuple[Row, ...] = (
-        ("form-2", "8.5", FEATURE, b"\2" + coded(k), "Form 2 of the attributes."),
+        ("form-3", "8.5", FEATURE, b"\3" + coded(k), "Form 3 of the attributes."),
         ("form-255", "8.5", FEATURE, b"\xff" + coded(k), "Form 255 of the attributes."),
         ("form-alone", "8.6 15", MALFORMED, b"\1", "The section ends after its form."),
         ("block-cut", "8.6 15", MALFORMED, block()[:30], "The section ends inside the prediction block."),

@@ -80,7 +80,8 @@ def stored(folder: Path) -> list[Stored]:
     for row in json.loads((folder / "manifest.json").read_text(encoding="utf-8"))["vectors"]:
         layers = row["layers"]
         whole = (None, row.get("error", layers))
-        prefixes = [(layers[i]["layer"], layers[: i + 1]) for i in range(len(layers) - ("error" not in row))]
+        last_may_be_cut = "error" not in row or "slices" in row
+        prefixes = [(layers[i]["layer"], layers[: i + 1]) for i in range(len(layers) - last_may_be_cut)]
         data = (folder / row["file"]).read_bytes()
         found.append(Stored(row["file"].removesuffix(".pd4"), data, tuple(row["clauses"]), (whole, *prefixes)))
     return found

@@ -47,6 +47,7 @@ AGAIN = {
         "layer-0-rows-over-limit",
         "layer-0-rows-largest",
         "layer-1-rows-over-limit",
+        "slices-later-rows-over-limit",
         "bomb-most-cells",
     ),
     "no number of rows under 0 is that of a tree": ("layer-0-rows-negative",),

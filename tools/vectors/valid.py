@@ -14,8 +14,8 @@ from pd4dgs_codec.bitstream.limits import MAX_NETWORK_LAYERS, MAX_NETWORK_WIDTH,
 from pd4dgs_codec.codec.layer_meta import FREE_ROWS, FREE_SYMBOLS, ROWS_PER_BYTE, SYMBOLS_PER_BYTE
 from pd4dgs_codec.entropy.priors import (
     CLASS_STEPS,
+    FREE_ENTRIES,
     K_MAX,
-    MAX_ENTRIES,
     MAX_WINDOW,
     MU8_MAX,
     Const,
@@ -264,15 +264,16 @@ def _priors() -> Iterator[Case]:
     k = _of_widths(0, 8000, 8000)
     k[0] = pattern(ROWS, low=0, high=1)
     yield "prior-windows", "Windows of 2 and of 2^14 entries.", "7.2 8.2 14", _with_priors(windows, k)
-    wide_tables = [gauss(-(MAX_WINDOW >> 1), MAX_WINDOW, si=200 + c) for c in range(96)]
-    yield "prior-tables-at-limit", "Tables of 2^21 entries in one section.", "8.2 14", tables_at_limit()
+    wide_tables = [gauss(-(MAX_WINDOW >> 1), MAX_WINDOW, si=200 + c) for c in range(14)]
+    what = "Tables of 2^18 entries and one per symbol in one section."
+    yield "prior-tables-at-limit", what, "8.2 14", tables_at_limit()
     many = Scale(32, (1, 1, 1, 1))
     deformed = make_layer(1, (), before=1, scales=[many])
-    own = {3: dict(enumerate(wide_tables[:40])), 4: dict(enumerate(wide_tables))}
+    own = {3: dict(enumerate(wide_tables[:7])), 4: dict(enumerate(wide_tables))}
     section = staged_planes(list(deformed.meant.planes[0].values()), (1,) * 4, priors=own)
     yield (
         "prior-tables-per-stage",
-        "Tables of more than 2^21 entries in all stages, not in any of them.",
+        "Tables of more than 2^18 entries in all stages, not in any of them.",
         "8 8.8 14",
         make_file(make_layer(), deformed.with_sections({PLANE: section})),
     )
@@ -306,12 +307,14 @@ def _priors() -> Iterator[Case]:
 
 
 def tables_at_limit(more: bool = False) -> File:
-    """A section of 128 windows of 2^14 entries, 2^21 in all, and one of a single entry if there are to be more."""
+    """A section of 16 windows of 2^14 entries, 2^18 in all, and one of as many as its symbols; and one of a single
+    entry if there are to be more."""
     layer = make_layer(1, (), before=1, scales=[Scale(32, (1, 1, 1, 1))])
     channels = [c for plane in layer.meant.planes[0].values() for c in plane_channels(plane)]
     different: list[Prior] = [
-        gauss(-(MAX_WINDOW >> 1), MAX_WINDOW, si=200 + c) for c in range(MAX_ENTRIES // MAX_WINDOW)
+        gauss(-(MAX_WINDOW >> 1), MAX_WINDOW, si=200 + c) for c in range(FREE_ENTRIES // MAX_WINDOW)
     ]
+    different.append(gauss(-(len(channels) >> 1), len(channels)))
     priors = {c: different[c % len(different)] for c in range(len(channels))}
     if more:
         last = len(channels) - 1
@@ -844,11 +847,12 @@ def _ranges() -> Iterator[Case]:
     layer = make_layer(
         0, ordered([[-99991, 7, 1 << 20], [3, 3, 3], [1, 2, 77777]]), attributes=k, steps=[float(np.float32(1e-3))]
     )
+    everywhere = dict.fromkeys(range(68), gauss(-MAX_SYMBOL, (1 << 13) + 1, si=900, shift=11))
     yield (
         "dequantise-rounding",
         "Steps whose multiples are rounded to binary32.",
         "11.5",
-        make_file(layer, header=rounded),
+        make_file(layer.with_sections({ATTRIBUTE: plain_attributes(k, everywhere)}), header=rounded),
     )
     ties = {4: [1.0 + 2.0**-23, 3.0 * 2.0**-3, 2.0**-126 * 1.5]}
     close = (1 << 23) - np.arange(68 * 3, dtype=np.int32).reshape(68, 3)

@@ -1,0 +1,258 @@
+"""`pd4dgs-export`: a `.pd4` file as explicit Gaussians that other viewers read."""
+
+from __future__ import annotations
+
+import argparse
+import math
+import time
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pd4dgs_codec.atomic import whole_files
+from pd4dgs_codec.cli import values
+from pd4dgs_codec.cli.common import OK, SOURCES, Console, Parser, UsageError, add_reading, run
+from pd4dgs_codec.cli.files import STDIO, check_output, is_pd4, read_bytes, write_bytes
+from pd4dgs_codec.cli.progress import progress_bar
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from pd4dgs_codec.interchange.bake import Eyes
+    from pd4dgs_codec.interchange.export import Export
+    from pd4dgs_codec.interchange.splats import Splats
+    from pd4dgs_codec.playback.player import Player
+    from pd4dgs_codec.scene import SceneInfo
+
+DETAILS = f"""\
+What depends on the viewer's place becomes spherical harmonics (colour) and means over many places (opacity, size), and
+is then refined against the scene's own pictures. The places are the training cameras of --data, else around what the
+file's camera looks at. --compare measures what that costs.
+
+  ply       one PLY as 3D Gaussian splatting writes it
+  ply-seq   a folder of them, one per frame
+  spz       one SPZ file (needs gaussforge)
+  glb       one glTF file with KHR_gaussian_splatting
+  4dgs      the whole time in one .4dgs file (needs fourdgs)
+
+PLY and 4dgs keep the file's axes. In glTF and SPZ +y is up, and the scene is turned that way.
+
+{SOURCES}
+
+examples:
+  pd4dgs-export scene.pd4 -o scene.ply --to ply --time 0.5
+  pd4dgs-export scene.pd4 -o frames --to ply-seq --fps 10 --sh 1 --data recordings/kitchen
+  pd4dgs-export scene.pd4 -o scene.glb --to glb --compare recordings/kitchen"""
+
+SEQUENCES = ("ply-seq", "4dgs")
+KINDS = ("ply", "ply-seq", "spz", "glb", "4dgs")
+FPS, STEPS, MAX_FRAMES = 30.0, 300, 100_000
+
+
+def parser() -> Parser:
+    """The options of `pd4dgs-export`."""
+    p = Parser("export", "FILE -o OUT --to KIND", "Write a scene as Gaussians that other viewers read.", DETAILS)
+    p.add_argument("input", metavar="FILE", help=".pd4 file; - reads it from stdin")
+    p.add_argument("-o", "--output", required=True, metavar="OUT", help="file to write; with ply-seq a folder")
+    p.add_argument("--to", required=True, choices=KINDS, help="kind of file")
+    what = "instant of ply, spz and glb, 0..1 of the file's time (default: 0)"
+    p.add_argument("--time", type=values.share, metavar="T", help=what)
+    what = f"frames per second of ply-seq and 4dgs (default: {FPS:g})"
+    p.add_argument("--fps", type=values.positive_float, metavar="F", help=what)
+    p.add_argument("--level", type=int, choices=(0, 1, 2), help="level to write (default: the file's highest)")
+    what = "degree of the spherical harmonics (default: 3)"
+    p.add_argument("--sh", type=int, choices=(0, 1, 2, 3), default=3, help=what)
+    what = f"steps of refinement; a sequence's later frames take a quarter (default: {STEPS}; 0: none)"
+    p.add_argument("--refine", type=values.count, default=STEPS, metavar="N", help=what)
+    what = "multiply all lengths, so that small scenes fit SPZ's fixed point (default: 1)"
+    p.add_argument("--scale", type=values.positive_float, default=1.0, metavar="X", help=what)
+    p.add_argument("--data", metavar="SOURCE", help="look from the training cameras of a dataset")
+    what = "measure dB of direct and of exported pictures on the held-out views of a dataset"
+    p.add_argument("--compare", metavar="SOURCE", help=what)
+    add_reading(p)
+    p.add_common()
+    return p
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    return run(parser(), _export, argv)
+
+
+def _export(args: argparse.Namespace, console: Console) -> int:
+    _check_usage(args)
+    if args.to == "ply-seq":
+        _check_folder(args.output, args.overwrite)
+    else:
+        check_output(args.output, args.overwrite)
+    from pd4dgs_codec.interchange.export import Export
+    from pd4dgs_codec.interchange.libraries import library
+
+    if args.to == "spz":
+        library("gaussforge", "SPZ files")
+    if args.to == "4dgs":
+        library("fourdgs", ".4dgs files")
+    player = _player(args)
+    export = Export(player, _eyes(args, player), args.sh, args.refine)
+    start = time.perf_counter()
+    result = {"input": args.input, "output": args.output, "to": args.to, "level": player.level, "sh": args.sh}
+    result |= _write_sequence(args, export) if args.to in SEQUENCES else _write_still(args, export, console)
+    result["seconds"] = time.perf_counter() - start
+    if args.compare:
+        result["cost"] = _cost(args, export)
+    console.result(result, _text(result), on_stdout=False)
+    return OK
+
+
+def _check_usage(args: argparse.Namespace) -> None:
+    if args.to in SEQUENCES and args.time is not None:
+        raise UsageError(f"--time chooses one instant and --to {args.to} writes them all; leave one out")
+    if args.to not in SEQUENCES and args.fps is not None:
+        raise UsageError(f"--fps is of sequences and --to {args.to} writes one instant; expected --time")
+    if args.output == STDIO:
+        raise UsageError("found -o -, expected the name of a file or folder")
+
+
+def _check_folder(path: str, overwrite: bool) -> None:
+    """Frames of another run must not mix with these."""
+    from pd4dgs_codec.errors import DataError
+
+    folder = Path(path)
+    if folder.exists() and not folder.is_dir():
+        raise DataError(f"{path}: is a file, expected the name of a folder")
+    if not overwrite and any(folder.glob("*.ply")):
+        raise DataError(f"{path}: holds PLY files already; --overwrite removes them")
+
+
+def _player(args: argparse.Namespace) -> Player:
+    from pd4dgs_codec.codec.decoder import decode
+    from pd4dgs_codec.errors import DataError
+    from pd4dgs_codec.playback.player import Player
+
+    data = read_bytes(args.input)
+    if not is_pd4(data):
+        raise DataError(f"{args.input}: is not a .pd4 file; pd4dgs-encode makes one of a checkpoint")
+    return Player(decode(data, max_layer=args.level))
+
+
+def _eyes(args: argparse.Namespace, player: Player) -> Eyes:
+    from pd4dgs_codec.interchange.bake import eyes_of_cameras, eyes_of_scene
+    from pd4dgs_codec.interchange.teacher import load_source
+
+    if args.data is None:
+        return eyes_of_scene(player)
+    dataset = load_source(args.data, downscale=args.downscale, holdout=args.holdout)
+    return eyes_of_cameras([view.camera for view in dataset.train])
+
+
+def _write_still(args: argparse.Namespace, export: Export, console: Console) -> dict[str, Any]:
+    """One instant."""
+    from pd4dgs_codec.interchange.export import upright
+    from pd4dgs_codec.interchange.glb import glb_bytes
+    from pd4dgs_codec.interchange.libraries import SPZ_STEP, spz_bytes
+    from pd4dgs_codec.interchange.ply import ply_bytes
+
+    turn = upright(export.player.info.up) if args.to in ("glb", "spz") else None
+    with progress_bar(args.refine, "steps", "refining") as step:
+        splats, _ = export.splats(args.time or 0.0, turn, step=step)
+    splats = _scaled(splats, args)
+    if args.to == "spz" and (size := _median_size(splats)) < 4 * SPZ_STEP:
+        what = f"half of the Gaussians are smaller than {size:.2g} units"
+        console.message(
+            f"pd4dgs-export: {what}, and SPZ rounds positions to {SPZ_STEP:.2g}; --scale enlarges the scene"
+        )
+    data = {"ply": ply_bytes, "spz": spz_bytes, "glb": glb_bytes}[args.to](splats)
+    write_bytes(args.output, data, args.overwrite)
+    return {"frames": 1, "gaussians": len(splats.means), "bytes": len(data), "time": args.time or 0.0}
+
+
+def _scaled(splats: Splats, args: argparse.Namespace) -> Splats:
+    from pd4dgs_codec.errors import DataError
+
+    if not len(splats.means):
+        raise DataError(f"{args.input}: shows no Gaussian at this level and time, expected one at least to write")
+    return splats.scaled(args.scale)
+
+
+def _median_size(splats: Splats) -> float:
+    import numpy as np
+
+    return float(np.median(splats.scales.max(axis=1)))
+
+
+def frame_times(info: SceneInfo, fps: float) -> list[float]:
+    """Seconds from the start of the frames of a scene at a rate; the last is no later than its end."""
+    from pd4dgs_codec.errors import DataError
+
+    start, stop = info.time_range
+    count = math.floor((stop - start) * fps * (1 + 1e-6)) + 1
+    if count > MAX_FRAMES:
+        raise DataError(
+            f"{stop - start:g} seconds at {fps:g} frames per second are {count} frames, expected {MAX_FRAMES} at most"
+        )
+    return [i / fps for i in range(count)]
+
+
+def _write_sequence(args: argparse.Namespace, export: Export) -> dict[str, Any]:
+    """One frame after another over the whole time."""
+    from pd4dgs_codec.interchange.libraries import fourdgs_bytes
+    from pd4dgs_codec.interchange.ply import ply_bytes
+
+    info, fps = export.player.info, args.fps or FPS
+    seconds = info.time_range[1] - info.time_range[0]
+    starts = frame_times(info, fps)
+    with progress_bar(len(starts), "frames", "exporting") as step:
+        frames = _frames(args, export, [min(s / seconds, 1.0) if seconds else 0.0 for s in starts], step)
+        if args.to == "4dgs":
+            kept = [(s, splats, slots) for s, (splats, slots) in zip(starts, frames, strict=True)]
+            data = fourdgs_bytes(kept, starts[-1] + 1 / fps)
+            write_bytes(args.output, data, args.overwrite)
+            return {"frames": len(starts), "gaussians": max(len(g.means) for _, g, _ in kept), "bytes": len(data)}
+        return _write_folder(args, len(starts), (ply_bytes(splats) for splats, _ in frames))
+
+
+def _frames(
+    args: argparse.Namespace, export: Export, times: list[float], step: Callable[[], None]
+) -> Iterator[tuple[Splats, np.ndarray]]:
+    """(Gaussians, slots) at normalised times."""
+    learnt = None
+    for t in times:
+        splats, learnt = export.splats(t, before=learnt)
+        yield _scaled(splats, args), learnt.slots
+        step()
+
+
+def _write_folder(args: argparse.Namespace, count: int, frames: Iterator[bytes]) -> dict[str, Any]:
+    folder, most, total = Path(args.output), 0, 0
+    names = [str(folder / f"{i:05d}.ply") for i in range(count)]
+    with whole_files(names[0], names, args.overwrite) as temporaries:
+        for temporary, data in zip(temporaries, frames, strict=True):
+            temporary.write_bytes(data)
+            most, total = max(most, int(data[: data.index(b"\nproperty")].split()[-1])), total + len(data)
+    for other in set(folder.glob("*.ply")) - {Path(name) for name in names}:
+        other.unlink()
+    return {"frames": count, "gaussians": most, "bytes": total}
+
+
+def _cost(args: argparse.Namespace, export: Export) -> dict[str, Any]:
+    from pd4dgs_codec.errors import DataError
+    from pd4dgs_codec.interchange.export import cost
+    from pd4dgs_codec.interchange.teacher import load_source
+
+    views = load_source(args.compare, downscale=args.downscale, holdout=args.holdout).test
+    if not views:
+        raise DataError(f"{args.compare}: has no held-out views; expected another --holdout")
+    with progress_bar(len(views), "views", "comparing") as step:
+        return dict(vars(cost(export, views, step)))
+
+
+def _text(result: dict[str, Any]) -> str:
+    frames = f"{result['frames']} frames, " if result["to"] in SEQUENCES else ""
+    text = f"{result['output']}: {frames}{result['gaussians']:,} Gaussians, {result['bytes']:,} bytes"
+    if "cost" in result:
+        c = result["cost"]
+        text += (
+            f"\non {c['views']} held-out views: {c['direct_mpsnr']:.2f} dB drawn directly, "
+            f"{c['exported_mpsnr']:.2f} dB exported; the second against the first {c['exported_to_direct_psnr']:.2f} dB"
+        )
+    return text

@@ -1,0 +1,79 @@
+"""Encoder: a layer's payload in one piece, or in slices of about equal size, the anchors that matter most first.
+
+Nothing here is normative.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from pd4dgs_codec.bitstream.container import CHUNK_OVERHEAD
+from pd4dgs_codec.codec.attribute_section import Past
+from pd4dgs_codec.codec.options import EncodeOptions
+from pd4dgs_codec.codec.payload import StreamReport, write_layer
+from pd4dgs_codec.codec.symbols import LayerSymbols, sliced
+from pd4dgs_codec.entropy.fitting import Fitted
+
+TRIES = 4  #: at most so many encodes of one slice to hit its size
+SLACK = 0.97  #: of the size wanted, what a slice is aimed at
+
+
+@dataclass(frozen=True, eq=False)
+class Slice:
+    """A slice as it is written: its own symbols, its payload, and what each section took."""
+
+    symbols: LayerSymbols
+    payload: bytes
+    streams: list[StreamReport]
+
+
+def whole_layer(layer: LayerSymbols, options: EncodeOptions) -> Slice:
+    """A layer in one slice."""
+    return Slice(layer, *write_layer(layer, options))
+
+
+def write_slices(layer: LayerSymbols, options: EncodeOptions, utility: np.ndarray, reserved: int = 0) -> list[Slice]:
+    """The slices of a layer, in order, of about options.slices bytes at most.
+
+    utility: float [n], of the layer's anchors; the highest come first. reserved: bytes that stand before the first
+    slice and count as part of it. A first slice that is larger without anchors, for its planes and networks, is left
+    at that, but for layer 0: a picture needs anchors.
+    """
+    rows = np.argsort(-utility, kind="stable")
+    costs = np.cumsum(bits_per_row(layer)[rows]) / 8
+    done, found, past = 0, list[Slice](), Past[Fitted]()
+    scale = 1.0  # bytes that a slice takes per byte expected
+    while done < len(rows) or not found:
+        room = options.slices - CHUNK_OVERHEAD - (0 if found else reserved)
+        least = 1 if found or layer.kind.layer == 0 else 0
+        before = costs[done - 1] if done else 0.0
+        fixed = 0 if found else len(write_layer(sliced(layer, [rows[:0]])[0], options)[0])
+        if not found and layer.kind.layer == 0:
+            room = max(room, 2 * fixed)
+        for _ in range(TRIES):
+            expected = (costs[done:] - before) * scale + fixed
+            fits = int(np.searchsorted(expected, room * SLACK, side="right"))
+            count = min(max(fits, least), len(rows) - done)
+            part = rows[done : done + count]
+            symbols = sliced(layer, [rows[:0], part] if found else [part])[-1]
+            trial = past.copy()
+            payload, streams = write_layer(symbols, options, trial, layer)
+            if count:
+                scale *= max(len(payload) - fixed, 1) / max(expected[count - 1] - fixed, 1)
+            if len(payload) <= room or count <= least:
+                break
+        found.append(Slice(symbols, payload, streams))
+        done, past = done + count, trial
+    return found
+
+
+def bits_per_row(layer: LayerSymbols) -> np.ndarray:
+    """float64 [n]: about what each anchor costs, by the frequencies of its symbols in their channels."""
+    n = len(layer.anchor_q)
+    bits = np.full(n, 3.0 * max(n, 2).bit_length())  # of a position
+    for channel in (layer.mask_own, *layer.attributes):
+        _, index, counts = np.unique(channel, return_inverse=True, return_counts=True)
+        bits += np.log2(n / counts)[index]
+    return bits

@@ -1,0 +1,328 @@
+"""Checkpoints of Scaffold-GS (Lu et al. 2024) as a scene with layer 0 alone.
+
+A folder `point_cloud/iteration_N` holds `point_cloud.ply`, the anchors, and the decoders: either `opacity_mlp.pt`,
+`cov_mlp.pt` and `color_mlp.pt` (TorchScript), or `checkpoints.pth` (a dict of state dicts). Its formulas are those of
+clause 13.4 if no decoder takes the distance and there is no bank of features. An appearance embedding enters the colour
+decoder's first layer linearly, so that for one picture it is a part of the bias. Two folders up, `cfg_args` and
+`cameras.json` say the voxel size, the background and the cameras; nothing of them is evaluated.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pd4dgs_codec.data.cameras import ROTATION_TOLERANCE, points_box, world_to_camera
+from pd4dgs_codec.data.files import LARGEST, read_file
+from pd4dgs_codec.data.ply import read_vertices
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.interchange.tensors import Module, read_tensors
+from pd4dgs_codec.morton import MAX_VOXEL
+from pd4dgs_codec.scene import (
+    MAX_FEATURE,
+    MAX_SLOTS,
+    SCALING_DIM,
+    Camera,
+    Network,
+    Scene,
+    SceneInfo,
+    Steps,
+    Widths,
+)
+
+#: Our names of the decoders and theirs.
+DECODERS = {"opacity": "opacity_mlp", "covariance": "cov_mlp", "color": "color_mlp"}
+#: Files and keys of what our format cannot hold, or of what goes into the colours.
+BANKS = ("feature_bank_mlp.pt", "mlp_feature_bank", "feature_bank_mlp")
+EMBEDDING = "embedding_appearance.pt"
+#: Their rasteriser skips what is nearer; and the far plane of their cameras.
+NEAR, FAR = 0.2, 100.0
+UP = (0.0, -1.0, 0.0)  #: of a run that does not keep its cameras
+#: An anchor may lie this share of a voxel off the grid, and as many units in the last place of its coordinate.
+OFF_GRID, ULPS = 1e-3, 8
+#: The activation behind each decoder, by TorchScript's names.
+ENDS: dict[str, str | None] = {"opacity": "Tanh", "covariance": None, "color": "Sigmoid"}
+
+
+@dataclass(frozen=True)
+class Choices:
+    """appearance: the picture whose embedding is folded in, or None; voxel_size: scene units, None to find it;
+    iteration: of several in the folder, None for the last."""
+
+    appearance: int | None = None
+    voxel_size: float | None = None
+    iteration: int | None = None
+
+
+def read_scaffold_gs(folder: Path, choices: Choices) -> Scene:
+    """The scene, unquantised but for its anchors, which lie on the grid. Raises DataError naming what is not taken."""
+    place = _iteration(folder, choices.iteration)
+    run = place.parent.parent if place.parent.name == "point_cloud" else place
+    config = _config(run / "cfg_args")
+    ply = place / "point_cloud.ply"
+    table = _columns(ply)
+    decoders, embedding = _decoders(place)
+    widths = Widths(table["feature"].shape[1], table["offset"].shape[1])
+    networks = {
+        name: _network(name, decoder, place / f"{DECODERS[name]}.pt", widths, embedding, choices)
+        for name, decoder in decoders.items()
+    }
+    anchor = table["anchor"]
+    voxel = choices.voxel_size or config.get("voxel_size") or 0.0
+    voxel = float(np.float32(voxel if voxel > 0 else _grid(anchor, ply)))
+    camera, up = None, UP
+    if (run / "cameras.json").is_file():
+        (camera, *_), up = read_cameras(run / "cameras.json")
+    return Scene(
+        info=SceneInfo(
+            voxel,
+            points_box(anchor),
+            (0.0, 1.0),
+            (1.0, 1.0, 1.0) if config.get("white_background") else (0.0, 0.0, 0.0),
+            float(np.float32(NEAR)),
+            FAR,
+            up,
+            0.0,
+            camera,
+        ),
+        steps=Steps().scaled(1.0),
+        layers=(0,),
+        rows=(len(anchor),),
+        anchor_q=_cells(anchor, voxel, ply),
+        feature=table["feature"],
+        scaling_log=table["scaling_log"],
+        offset=table["offset"],
+        mask=(np.full(len(anchor), 255, np.uint8),),
+        networks=networks,
+    )
+
+
+def _iteration(folder: Path, number: int | None) -> Path:
+    """The folder with point_cloud.ply: `folder` itself, or an iteration below it."""
+    if not folder.is_dir():
+        raise DataError(f"{folder}: found {'a file' if folder.exists() else 'nothing'}, expected a folder")
+    if (folder / "point_cloud.ply").is_file():
+        return folder
+    base = folder / "point_cloud" if (folder / "point_cloud").is_dir() else folder
+    found = {
+        int(match[1]): path
+        for path in base.glob("iteration_*")
+        if (match := re.fullmatch(r"iteration_(\d{1,9})", path.name)) and (path / "point_cloud.ply").is_file()
+    }
+    if not found or number is not None and number not in found:
+        what = f"iteration_{number}" if number is not None else "point_cloud.ply, here or in point_cloud/iteration_N"
+        raise DataError(f"{folder}: has no {what}; expected a checkpoint of Scaffold-GS")
+    return found[max(found) if number is None else number]
+
+
+def _config(path: Path) -> dict[str, Any]:
+    """Voxel size and background from `Namespace(...)`, read as text."""
+    if not path.is_file():
+        return {}
+    text = read_file(path).decode("utf-8", "replace")
+    config: dict[str, Any] = {"white_background": re.search(r"\bwhite_background=True\b", text) is not None}
+    if voxel := re.search(r"\bvoxel_size=([-+0-9.eE]{1,32})[,)]", text):
+        try:
+            config["voxel_size"] = float(voxel[1])
+        except ValueError:
+            raise DataError(f"{path}: voxel_size is {voxel[1]!r}, expected a number") from None
+    return config
+
+
+def _columns(path: Path) -> dict[str, np.ndarray]:
+    """anchor [N, 3], feature [N, F], scaling_log [N, 6], offset [N, K, 3], float32 and finite."""
+    vertices = read_vertices(path)
+    names = set(vertices.dtype.names or ())
+
+    def stack(prefix: str, count: int | None = None) -> np.ndarray:
+        n = sum(re.fullmatch(rf"{prefix}\d+", name) is not None for name in names) if count is None else count
+        wanted = [f"{prefix}{i}" for i in range(n)]
+        missing = [name for name in wanted if name not in names]
+        if missing or not n:
+            raise DataError(
+                f"{path}: has no property {missing[0] if missing else prefix + '0'}; expected Scaffold-GS's"
+            )
+        columns = np.stack([vertices[name] for name in wanted], axis=1).astype(np.float32)
+        if not (np.abs(columns) <= LARGEST).all():  # also true of NaN
+            raise DataError(f"{path}: {prefix}* holds a NaN or a number over {LARGEST:g}")
+        return columns
+
+    n = len(vertices)
+    if not n:
+        raise DataError(f"{path}: holds no anchor, expected one at least")
+    anchor = np.stack([vertices[c] for c in "xyz"], axis=1).astype(np.float32)
+    if not (np.abs(anchor) <= LARGEST).all():
+        raise DataError(f"{path}: x, y, z hold a NaN or a number over {LARGEST:g}")
+    offsets, feature = stack("f_offset_"), stack("f_anchor_feat_")
+    slots, rest = divmod(offsets.shape[1], 3)
+    if rest or slots > MAX_SLOTS or feature.shape[1] > MAX_FEATURE:
+        what = f"{feature.shape[1]} features and {offsets.shape[1]} coordinates of offsets per anchor"
+        raise DataError(
+            f"{path}: has {what}, expected at most {MAX_FEATURE} and {MAX_SLOTS} times 3, as many as .pd4 holds"
+        )
+    return {
+        "anchor": anchor,
+        "feature": feature,
+        "scaling_log": stack("scale_", SCALING_DIM),
+        "offset": np.ascontiguousarray(offsets.reshape(n, 3, -1).transpose(0, 2, 1)),  # stored axis by axis
+    }
+
+
+def _decoders(place: Path) -> tuple[dict[str, Any], np.ndarray | None]:
+    """(what each decoder's file or key holds, the appearance embedding [pictures, A] or None)."""
+    united = place / "checkpoints.pth"
+    if united.is_file():
+        content = read_tensors(united)
+        if not isinstance(content, dict):
+            raise DataError(f"{united}: holds a {type(content).__name__}, expected a dict of state dicts")
+        bank, embedding = next((key for key in BANKS if key in content), None), content.get("appearance")
+        found, where = {name: content.get(key) for name, key in DECODERS.items()}, united
+    else:
+        bank = next((name for name in BANKS if (place / name).exists()), None)
+        found = {name: read_tensors(place / f"{key}.pt") for name, key in DECODERS.items()}
+        where = place / EMBEDDING
+        embedding = read_tensors(where) if where.exists() else None
+    if bank:
+        raise DataError(
+            f"{place}: has a bank of features ({bank}), which .pd4 cannot hold; expected a model without one"
+        )
+    for name, decoder in found.items():
+        if decoder is None:
+            raise DataError(f"{united}: has no {DECODERS[name]}, expected Scaffold-GS's three decoders")
+    if embedding is None:
+        return found, None
+    tables = [value for value in _flat(embedding).values() if isinstance(value, np.ndarray)]
+    if len(tables) != 1 or tables[0].ndim != 2 or not len(tables[0]) or not np.isfinite(tables[0]).all():
+        raise DataError(f"{where}: expected one embedding of finite numbers, pictures x dimensions")
+    return found, tables[0].astype(np.float64)
+
+
+def _flat(content: Any, prefix: str = "") -> dict[str, Any]:
+    """Members of nested modules and dicts under dotted names, as in a state dict; each is entered once."""
+    flat: dict[str, Any] = {}
+    waiting, entered = [(prefix, content)], set()
+    while waiting:
+        name, value = waiting.pop()
+        members = vars(value) if isinstance(value, Module) else value
+        if not isinstance(members, dict):
+            flat[name] = value
+        elif id(value) not in entered:
+            entered.add(id(value))
+            waiting += [(f"{name}.{key}" if name else str(key), part) for key, part in members.items()]
+    return flat
+
+
+def _network(
+    name: str, decoder: Any, path: Path, widths: Widths, embedding: np.ndarray | None, choices: Choices
+) -> Network:
+    """Two linear layers with a ReLU between them, the embedding of the chosen picture in the first one's bias."""
+    _check_activations(name, decoder, path)
+    tensors = {key: value for key, value in _flat(decoder).items() if isinstance(value, np.ndarray)}
+    expected = {"0.weight", "0.bias", "2.weight", "2.bias"}
+    if set(tensors) != expected:
+        raise DataError(
+            f"{path}: has tensors {', '.join(sorted(tensors))[:120]}, expected {', '.join(sorted(expected))}"
+        )
+    first, second = (
+        (tensors[f"{i}.weight"].astype(np.float64), tensors[f"{i}.bias"].astype(np.float64)) for i in (0, 2)
+    )
+    outputs, hidden = widths.networks[name], len(first[0])
+    fits = first[0].ndim == 2 and first[1].shape == (hidden,) and second[0].shape == (outputs, hidden)
+    if not fits or second[1].shape != (outputs,):
+        shapes = ", ".join(f"{key} {tensors[key].shape}" for key in sorted(tensors))
+        raise DataError(f"{path}: found {shapes}; expected two layers with {outputs} outputs")
+    if not all(np.isfinite(part).all() for part in (*first, *second)):
+        raise DataError(f"{path}: holds a NaN or an infinity; expected finite numbers")
+    inputs, usual = first[0].shape[1], widths.inputs
+    taken = 0 if embedding is None or name != "color" else embedding.shape[1]
+    if inputs == usual + 1 + taken:
+        raise DataError(
+            f"{path}: takes the distance as well ({inputs} inputs), expected {usual + taken}: features, direction"
+        )
+    if inputs != usual + taken:
+        raise DataError(
+            f"{path}: takes {inputs} inputs, expected {usual + taken}: {widths.feature} features and a direction"
+        )
+    if taken:
+        assert embedding is not None
+        if choices.appearance is None or not 0 <= choices.appearance < len(embedding):
+            raise DataError(
+                f"{path.parent}: colours depend on the picture; choose the appearance of one of {len(embedding)} with "
+                f"--appearance 0..{len(embedding) - 1}"
+            )
+        first = first[0][:, :usual], first[1] + first[0][:, usual:] @ embedding[choices.appearance]
+    return tuple((weight.astype(np.float32), bias.astype(np.float32)) for weight, bias in (first, second))
+
+
+def _check_activations(name: str, decoder: Any, path: Path) -> None:
+    """What TorchScript says of the layers' kinds; state dicts say nothing."""
+    if not isinstance(decoder, Module):
+        return
+    found = [type(part).__name__ for key, part in vars(decoder).items() if key.isdigit() and isinstance(part, Module)]
+    end = ENDS[name]
+    expected = ["Linear", "ReLU", "Linear", *([end] if end else [])]
+    if found != expected:
+        raise DataError(f"{path}: layers are {', '.join(found)[:120]}; expected {', '.join(expected)}")
+
+
+def _grid(anchor: np.ndarray, path: Path) -> float:
+    """The largest voxel that all coordinates are multiples of, found from the smallest up."""
+    values = np.unique(np.abs(anchor.astype(np.float64)))
+    tolerance = ULPS * np.spacing(np.abs(anchor).max()).astype(np.float64)
+    gaps = np.diff(np.concatenate([[0.0], values]))
+    gaps = gaps[gaps > 4 * tolerance]
+    if not gaps.size:
+        raise DataError(f"{path}: no voxel size can be found in the anchors; expected --voxel-size")
+    voxel = float(gaps.min())
+    for limit in np.geomspace(16, MAX_VOXEL, 24):  # a better estimate reaches farther
+        near = values[values <= limit * voxel]
+        cells = np.round(near / voxel)
+        if cells.any():
+            voxel = float((cells @ near) / (cells @ cells))
+    return voxel
+
+
+def _cells(anchor: np.ndarray, voxel: float, path: Path) -> np.ndarray:
+    """int32 [N, 3]: the anchors in voxels."""
+    exact = anchor.astype(np.float64) / voxel
+    cells = np.round(exact)
+    if np.abs(cells).max() > MAX_VOXEL:
+        raise DataError(
+            f"{path}: an anchor lies {np.abs(cells).max():.3g} voxels of {voxel:g} away, expected {MAX_VOXEL} at most"
+        )
+    off = np.abs(exact - cells) - ULPS * np.spacing(np.abs(anchor)).astype(np.float64) / voxel
+    if off.max() > OFF_GRID:
+        raise DataError(
+            f"{path}: anchors lie up to {off.max():.3g} voxels off the grid of {voxel:g}, expected multiples of it; "
+            "--voxel-size names another"
+        )
+    return cells.astype(np.int32)
+
+
+def read_cameras(path: Path) -> tuple[list[Camera], tuple[float, float, float]]:
+    """(the cameras, their mean direction up) of a cameras.json as 3D Gaussian splatting writes it."""
+    try:
+        rows = json.loads(read_file(path))
+        turns = np.array([row["rotation"] for row in rows], np.float64)
+        places = np.array([row["position"] for row in rows], np.float64)
+        lenses = np.array([[row[key] for key in ("fx", "fy", "width", "height")] for row in rows], np.float64)
+        good = turns.shape == (len(rows), 3, 3) and places.shape == (len(rows), 3) and lenses.shape == (len(rows), 4)
+        good = good and bool((np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)) <= ROTATION_TOLERANCE).all())
+        good = good and bool((np.abs(places) <= LARGEST).all() and (lenses > 0).all() and (lenses <= LARGEST).all())
+        good = good and bool((lenses[:, 2:] == np.round(lenses[:, 2:])).all() and lenses[:, 2:].max() <= 65535)
+    except (ValueError, TypeError, KeyError, IndexError, RecursionError, OSError):
+        good = False
+    if not good:
+        raise DataError(f"{path}: expected a list of cameras with position, rotation, fx, fy, width and height")
+    cameras = []
+    for turn, place, (fx, fy, width, height) in zip(turns, places, lenses, strict=True):
+        K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]], np.float32)
+        cameras.append(Camera(world_to_camera(turn.T, place).astype(np.float32), K, int(width), int(height)))
+    up = -turns[:, :, 1].mean(axis=0)
+    x, y, z = (float(np.float32(v)) for v in up / max(float(np.linalg.norm(up)), 1e-12))
+    return cameras, (x, y, z)

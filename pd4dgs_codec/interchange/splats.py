@@ -1,0 +1,149 @@
+"""Explicit Gaussians as 3D Gaussian splatting has them: colours in spherical harmonics, nothing else seen from a side.
+
+The real spherical harmonics and their signs are those of the reference implementation of 3D Gaussian splatting (Kerbl
+et al. 2023), which PLY, SPZ and KHR_gaussian_splatting share: a colour is 0.5 + sum c_j Y_j(d), cut off below at 0, d
+the unit vector from the eye to the mean.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pd4dgs_codec.render.rasteriser import draw
+from pd4dgs_codec.scene import Camera
+
+MAX_DEGREE = 3
+#: Y_0, a constant: the factor between a colour and its first coefficient.
+SH_C0 = 0.28209479177387814
+
+
+@dataclass(frozen=True, eq=False)
+class Splats:
+    """N Gaussians at an instant, float32."""
+
+    means: np.ndarray  #: [N, 3] world, scene units
+    quats: np.ndarray  #: [N, 4] wxyz, unit
+    scales: np.ndarray  #: [N, 3] standard deviations, scene units
+    opacities: np.ndarray  #: [N] 0..1
+    sh: np.ndarray  #: [N, (degree + 1)^2, 3] coefficients of red, green and blue
+
+    @property
+    def degree(self) -> int:
+        """Of the harmonics, 0 to 3."""
+        return int(np.sqrt(self.sh.shape[1])) - 1
+
+    def colors(self, eye: np.ndarray) -> np.ndarray:
+        """float32 [N, 3] >= 0 as an eye at [3], world, sees them."""
+        basis = harmonics(unit(self.means - eye.astype(np.float32)), self.degree)
+        colors: np.ndarray = np.maximum(np.einsum("nj,njc->nc", basis, self.sh) + np.float32(0.5), 0)
+        return colors
+
+    def taken(self, rows: np.ndarray) -> Splats:
+        """The Gaussians `rows`."""
+        return Splats(*(part[rows] for part in vars(self).values()))
+
+    def scaled(self, factor: float) -> Splats:
+        """With all lengths times `factor`."""
+        return replace(self, means=self.means * np.float32(factor), scales=self.scales * np.float32(factor))
+
+
+def picture(splats: Splats, camera: Camera, background: tuple[float, float, float], near: float = 0.01) -> np.ndarray:
+    """float32 [H, W, 3] in 0..1 of the Gaussians by our rasteriser. near: scene units."""
+    colors = splats.colors(camera_eye(camera))
+    image, _ = draw(
+        splats.means, splats.quats, splats.scales, splats.opacities, colors, camera, background, near_plane=near
+    )
+    clipped: np.ndarray = np.clip(image, 0, 1)
+    return clipped
+
+
+def camera_eye(camera: Camera) -> np.ndarray:
+    """float64 [3] where a camera stands, world."""
+    viewmat = camera.viewmat.astype(np.float64)
+    eye: np.ndarray = -viewmat[:3, :3].T @ viewmat[:3, 3]
+    return eye
+
+
+def looking(eye: np.ndarray, ahead: np.ndarray, up: np.ndarray, like: Camera) -> Camera:
+    """The camera `like` at `eye` [3], looking along the unit vector `ahead` [3]."""
+    right = np.cross(ahead, up)
+    if np.linalg.norm(right) < 1e-6:  # straight up or down: any roll will do
+        right = np.cross(ahead, np.roll(ahead, 1) + np.array([1e-3, 0, 0]))
+    right = unit(right)
+    viewmat = np.eye(4)
+    viewmat[:3, :3] = np.stack([right, np.cross(ahead, right), ahead])
+    viewmat[:3, 3] = -viewmat[:3, :3] @ eye
+    return replace(like, viewmat=viewmat.astype(np.float32))
+
+
+def sphere(count: int) -> np.ndarray:
+    """float64 [count, 3] unit vectors spread evenly, from +z to -z: a Fibonacci lattice."""
+    i = np.arange(count) + 0.5
+    polar, turn = np.arccos(1 - 2 * i / count), np.pi * (1 + 5**0.5) * i
+    return np.stack([np.cos(turn) * np.sin(polar), np.sin(turn) * np.sin(polar), np.cos(polar)], axis=1)
+
+
+def unit(vectors: np.ndarray) -> np.ndarray:
+    """Vectors [..., d] divided by their length; a zero stays one."""
+    length = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    result: np.ndarray = vectors / np.maximum(length, np.finfo(vectors.dtype).tiny)
+    return result
+
+
+def harmonics(directions: np.ndarray, degree: int) -> np.ndarray:
+    """The first (degree + 1)^2 real harmonics [..., j] at unit vectors [..., 3], degree 0 to 3, of the same dtype."""
+    x, y, z = np.moveaxis(directions, -1, 0)
+    rows = [np.full_like(x, SH_C0)]
+    if degree >= 1:
+        c = 0.4886025119029199
+        rows += [-c * y, c * z, -c * x]
+    if degree >= 2:
+        c = 1.0925484305920792
+        xx, yy, zz = x * x, y * y, z * z
+        rows += [c * x * y, -c * y * z, 0.31539156525252005 * (2 * zz - xx - yy), -c * x * z, c / 2 * (xx - yy)]
+    if degree >= 3:
+        rows += [
+            -0.5900435899266435 * y * (3 * xx - yy),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (4 * zz - xx - yy),
+            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+            -0.4570457994644658 * x * (4 * zz - xx - yy),
+            1.445305721320277 * z * (xx - yy),
+            -0.5900435899266435 * x * (xx - 3 * yy),
+        ]
+    return np.stack(rows, axis=-1).astype(directions.dtype)
+
+
+def rotations(quats: np.ndarray) -> np.ndarray:
+    """[..., 3, 3] of unit quaternions [..., 4] wxyz."""
+    w, x, y, z = np.moveaxis(quats, -1, 0)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return np.stack(rows, axis=-1).reshape(*quats.shape[:-1], 3, 3)
+
+
+def quaternions(matrices: np.ndarray) -> np.ndarray:
+    """Unit quaternions [n, 4] wxyz of rotations [n, 3, 3]: of the four formulas the one that divides by the most."""
+    m = matrices
+    trace = m[:, 0, 0] + m[:, 1, 1] + m[:, 2, 2]
+    diagonal = np.stack([trace, m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]], axis=1)
+    squares = 1 + 2 * diagonal - trace[:, None]  # 4 w^2, 4 x^2, 4 y^2, 4 z^2
+    squares[:, 0] = 1 + trace
+    a, b, c = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]  # 4wx, 4wy, 4wz
+    d, e, f = m[:, 0, 1] + m[:, 1, 0], m[:, 0, 2] + m[:, 2, 0], m[:, 1, 2] + m[:, 2, 1]  # 4xy, 4xz, 4yz
+    products = np.stack(
+        [
+            np.stack([squares[:, 0], a, b, c], axis=1),
+            np.stack([a, squares[:, 1], d, e], axis=1),
+            np.stack([b, d, squares[:, 2], f], axis=1),
+            np.stack([c, e, f, squares[:, 3]], axis=1),
+        ],
+        axis=1,
+    )
+    best = products[np.arange(len(m)), squares.argmax(axis=1)]
+    return unit(best)

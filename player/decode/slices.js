@@ -1,0 +1,99 @@
+// Clauses 3.6, 8 and 12.2: what the slices of a layer go on with, and the order of their rows.
+
+import { Definitions } from "./channels.js";
+
+/**
+ * What later slices of a layer may refer to: the priors of each section, by its name or the number of a stage, and the
+ * latest prediction block.
+ */
+export class Continuation {
+  constructor() {
+    /** @type {Map<string | number, Definitions>} */
+    this._sections = new Map();
+    /** @type {import("./attributes.js").Block | null} */
+    this.block = null;
+  }
+
+  /** @param {string | number} section */
+  definitions(section) {
+    let known = this._sections.get(section);
+    if (!known) this._sections.set(section, (known = new Definitions()));
+    return known;
+  }
+
+  /** A function that forgets what a slice added from now on: a fault in it may be mended by fetching it again. */
+  mark() {
+    const { block } = this;
+    const sizes = new Map([...this._sections].map(([name, { priors }]) => [name, priors.length]));
+    return () => {
+      this.block = block;
+      for (const [name, known] of this._sections) {
+        known.priors.length = sizes.get(name) ?? 0;
+      }
+    };
+  }
+}
+
+/** Whether the highest bit of a is lower than that of b, both below 2^31. @param {number} a @param {number} b */
+const isLower = (a, b) => a < b && a < (a ^ b);
+
+/**
+ * The rows in the order of the codes (10.1) of their voxels.
+ *
+ * @param {Int32Array} voxels [n, 3]
+ * @returns {Uint32Array} [n]
+ */
+export function mortonOrder(voxels) {
+  const n = voxels.length / 3;
+  const least = [Infinity, Infinity, Infinity];
+  for (let i = 0; i < voxels.length; i++) if (voxels[i] < least[i % 3]) least[i % 3] = voxels[i];
+  const offsets = voxels.map((v, i) => v - least[i % 3]);
+  return Uint32Array.from({ length: n }, (_, i) => i).sort((a, b) => {
+    // Codes differ first in the highest bit in which a coordinate does; of equally high ones, z's is the highest.
+    let axis = 2;
+    let highest = offsets[3 * a + 2] ^ offsets[3 * b + 2];
+    for (let k = 1; k >= 0; k--) {
+      const difference = offsets[3 * a + k] ^ offsets[3 * b + k];
+      if (isLower(highest, difference)) {
+        axis = k;
+        highest = difference;
+      }
+    }
+    return offsets[3 * a + axis] - offsets[3 * b + axis];
+  });
+}
+
+/**
+ * The rows of an array in another order.
+ *
+ * @template {Int32Array | Float32Array | Uint8Array} A
+ * @param {A} values @param {Uint32Array} order
+ * @returns {A}
+ */
+export function reordered(values, order) {
+  const out = /** @type {A} */ (values.slice());
+  const width = values.length / order.length;
+  if (width === 1) order.forEach((row, i) => (out[i] = values[row]));
+  else order.forEach((row, i) => out.set(values.subarray(width * row, width * (row + 1)), width * i));
+  return out;
+}
+
+/**
+ * The arrays one behind the other; the only one that is not empty as it is.
+ *
+ * @template {Int32Array | Float32Array | Uint8Array} A
+ * @param {A[]} arrays at least one
+ * @returns {A}
+ */
+export function joined(arrays) {
+  const filled = arrays.filter((array) => array.length);
+  if (filled.length <= 1) return filled[0] ?? arrays[0];
+  const type = /** @type {new (length: number) => A} */ (arrays[0].constructor);
+  const all = new type(filled.reduce((sum, array) => sum + array.length, 0));
+  let at = 0;
+  for (const array of filled) {
+    all.set(array, at);
+    at += array.length;
+  }
+  return all;
+}

@@ -1,0 +1,29 @@
+// The script of index.html.
+
+import { Pd4Player } from "./element.js";
+import { bench } from "./render/bench.js";
+
+const query = new URLSearchParams(location.search);
+/** A packed page may hold its scene, or name it. */
+const held = document.getElementById("scene")?.textContent;
+const bytes = held ? Uint8Array.from(atob(held), (c) => c.charCodeAt(0)) : null;
+const source = bytes ? new Blob([bytes]) : (document.body.dataset.src ?? query.get("src") ?? "scene.pd4");
+
+if (query.has("bench")) {
+  bench(source, document.body, query.get("sizes") ?? undefined);
+} else {
+  const player = new Pd4Player();
+  for (const name of ["controls", "autoplay", "loop"]) player.toggleAttribute(name, query.get(name) !== "0");
+  for (const name of ["level", "time", "poster", "max-bytes", "max-seconds"]) {
+    const value = query.get(name);
+    if (value !== null) player.setAttribute(name, value);
+  }
+  document.body.append(player);
+  player.load(source);
+  document.body.addEventListener("dragover", (event) => event.preventDefault());
+  document.body.addEventListener("drop", (event) => {
+    event.preventDefault();
+    const file = event.dataTransfer?.files[0];
+    if (file) player.load(file);
+  });
+}

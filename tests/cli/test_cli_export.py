@@ -1,0 +1,106 @@
+"""`pd4dgs-export`: what it writes, and one line for what it cannot."""
+
+from __future__ import annotations
+
+import sys
+
+import pytest
+
+from pd4dgs_codec.interchange.ply import properties
+
+
+def _count(path) -> int:
+    head = path.read_bytes().split(b"end_header\n")[0].decode().splitlines()
+    assert [line.split()[2] for line in head if line.startswith("property")] == properties(1)
+    return int(head[2].split()[2])
+
+
+def test_one_instant_as_ply(cli, scene_pd4, tmp_path):
+    out = tmp_path / "scene.ply"
+    command = ("export", scene_pd4, "-o", out, "--to", "ply", "--sh", 1, "--refine", 2, "--json")
+    result = cli(*command, "--time", 0.5)
+    assert result.code == 0, result.err
+    assert result.json["gaussians"] == _count(out) > 20 and result.json["bytes"] == out.stat().st_size
+    assert result.json["level"] == 2 and result.json["frames"] == 1
+    middle = out.read_bytes()
+    again = cli(*command, "--time", 0.5)
+    assert again.code == 1 and "exists already; --overwrite replaces it" in again.err and out.read_bytes() == middle
+    assert cli(*command, "--time", 0, "-f").code == 0 and out.read_bytes() != middle
+    assert cli(*command, "--time", 0, "-f", "--level", 0, "-v").json["level"] == 0
+
+
+def test_the_whole_time_as_a_folder_of_plys(cli, scene_pd4, tmp_path):
+    out = tmp_path / "frames"
+    command = ("export", scene_pd4, "-o", out, "--to", "ply-seq", "--sh", 1, "--refine", 0, "--json")
+    result = cli(*command, "--fps", 2)  # the scene takes two seconds
+    assert result.code == 0, result.err
+    frames = sorted(out.iterdir())
+    assert [path.name for path in frames] == [f"{i:05d}.ply" for i in range(5)] and result.json["frames"] == 5
+    assert all(_count(path) > 20 for path in frames) and len({path.read_bytes() for path in frames}) == 5
+    again = cli(*command, "--fps", 1)
+    assert again.code == 1 and "holds PLY files already" in again.err
+    assert cli(*command, "--fps", 1, "-f").code == 0
+    assert sorted(path.name for path in out.iterdir()) == ["00000.ply", "00001.ply", "00002.ply"]
+
+
+def test_the_cost_is_printed(cli, scene_pd4, shared_dataset, tmp_path):
+    command = ("export", scene_pd4, "--to", "ply", "--refine", 0, "--sh", 0)
+    result = cli(*command, "-o", tmp_path / "a.ply", "--data", shared_dataset, "--compare", shared_dataset, "--json")
+    assert result.code == 0, result.err
+    cost = result.json["cost"]
+    assert cost["views"] == 1 and all(0 < cost[key] < 100 for key in cost)
+    told = cli(*command, "-o", tmp_path / "b.ply", "--compare", shared_dataset)
+    assert "1 held-out views" in told.err and "dB drawn directly" in told.err
+
+
+@pytest.mark.parametrize("kind", ["glb", "spz", "4dgs"])
+def test_other_kinds(cli, scene_pd4, tmp_path, kind):
+    if kind in ("spz", "4dgs"):
+        pytest.importorskip({"spz": "gaussforge", "4dgs": "fourdgs"}[kind])
+    out = tmp_path / f"scene.{kind}"
+    options = ("--fps", 2) if kind == "4dgs" else ("--time", 1)
+    result = cli("export", scene_pd4, "-o", out, "--to", kind, "--refine", 0, "--json", *options)
+    assert result.code == 0, result.err
+    assert result.json["bytes"] == out.stat().st_size > 100
+
+
+@pytest.mark.parametrize(
+    "options, message",
+    [
+        (("--to", "ply-seq", "--time", 0.5), "--time chooses one instant"),
+        (("--to", "ply", "--fps", 5), "--fps is of sequences"),
+        (("--to", "ply", "--time", 1.5), "expected a number from 0 to 1"),
+        (
+            (
+                "--to",
+                "obj",
+            ),
+            "invalid choice: 'obj'",
+        ),
+    ],
+)
+def test_wrong_usage(cli, scene_pd4, tmp_path, options, message):
+    result = cli("export", scene_pd4, "-o", tmp_path / "out", *options)
+    assert result.code == 2 and message in result.err and len(result.error_lines) == 1
+
+
+def test_bad_input_is_one_line_and_writes_nothing(cli, scene_pd4, tmp_path, model_pt, monkeypatch):
+    out = tmp_path / "out" / "scene.ply"
+    out.parent.mkdir()
+
+    def line(*argv):
+        result = cli("export", *argv, "-o", out, "--refine", 0)
+        assert result.code == 1 and len(result.error_lines) == 1 and not any(out.parent.iterdir())
+        return result.err
+
+    assert "is not a .pd4 file" in line(model_pt, "--to", "ply")
+    assert "No such file" in line(tmp_path / "no.pd4", "--to", "ply")
+    cut = tmp_path / "cut.pd4"
+    cut.write_bytes(scene_pd4.read_bytes()[:-10])
+    assert "cut.pd4" in line(cut, "--to", "ply")
+    assert "frames per second are" in line(scene_pd4, "--to", "4dgs", "--fps", 1e9)
+    monkeypatch.setitem(sys.modules, "gaussforge", None)
+    monkeypatch.setitem(sys.modules, "fourdgs", None)
+    for kind, name in (("spz", "gaussforge"), ("4dgs", "fourdgs")):
+        assert f"need the package {name}" in line(scene_pd4, "--to", kind)
+        assert "pip install 'pd4dgs-codec[interchange]'" in line(scene_pd4, "--to", kind)

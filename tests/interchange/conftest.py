@@ -1,0 +1,34 @@
+"""A scene to export: the one of a trained file's kind, decoded, and the same with networks that see no direction."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+from tiny import trained_like_scene
+
+from pd4dgs_codec.codec.decoder import decode
+from pd4dgs_codec.codec.encoder import encode
+from pd4dgs_codec.playback.player import Player
+from pd4dgs_codec.scene import Scene
+
+
+@pytest.fixture(scope="session")
+def scene() -> Scene:
+    return decode(encode(trained_like_scene(), layers=2, effort=1))
+
+
+@pytest.fixture
+def player(scene) -> Player:
+    return Player(scene)
+
+
+@pytest.fixture
+def blind_player(scene) -> Player:
+    """Its Gaussians are the same from everywhere."""
+    networks = {}
+    for name, ((weight, bias), *rest) in scene.networks.items():
+        weight = weight.copy()
+        weight[:, -3:] = 0
+        networks[name] = ((weight, bias), *rest)
+    return Player(replace(scene, networks=networks))

@@ -1,0 +1,85 @@
+"""Files of others with bytes changed, cut out or repeated: what is read is a DataError or a value, and nothing else."""
+
+from __future__ import annotations
+
+import random
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from test_formats import make_splats
+
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.interchange.models import read_model, read_splats
+from pd4dgs_codec.interchange.ply import ply_bytes
+from pd4dgs_codec.interchange.scaffold_gs import read_cameras
+from pd4dgs_codec.interchange.tensors import read_tensors
+
+CASES = 150
+
+
+def damaged(data: bytes, rng: random.Random) -> bytes:
+    """A few bytes changed, the end cut off, or a stretch taken out or written twice."""
+    found, kind = bytearray(data), rng.randrange(4)
+    a, b = sorted(rng.randrange(len(data) + 1) for _ in range(2))
+    if kind == 0:
+        for _ in range(rng.randint(1, 8)):
+            found[rng.randrange(len(found))] = rng.choice((0, 1, 0x7F, 0x80, 0xFF, rng.randrange(256)))
+    elif kind == 1:
+        del found[a:]
+    elif kind == 2:
+        del found[a : min(b, a + 40)]
+    else:
+        found[a:a] = found[a : min(b, a + 40)]
+    return bytes(found)
+
+
+def _gsplat(path: Path) -> None:
+    splats = make_splats(4, 1)
+    parts = {"means": splats.means, "quats": splats.quats, "scales": splats.scales, "opacities": splats.opacities}
+    parts |= {"sh0": splats.sh[:, :1].copy(), "shN": splats.sh[:, 1:].copy()}
+    torch.save({"splats": {name: torch.from_numpy(value) for name, value in parts.items()}}, path)
+
+
+def _script(path: Path) -> None:
+    layer = torch.nn.Sequential(torch.nn.Linear(3, 2), torch.nn.Tanh())
+    torch.jit.trace(layer, torch.zeros(1, 3)).save(path)
+
+
+def _ply(path: Path) -> None:
+    path.write_bytes(ply_bytes(make_splats(4, 1)))
+
+
+def _cameras(path: Path) -> None:
+    row = (
+        '{"position": [0, 0, -4], "rotation": [[1,0,0],[0,1,0],[0,0,1]], "width": 80, "height": 60, "fx": 70, "fy": 7}'
+    )
+    path.write_text(f"[{row}, {row}]")
+
+
+@pytest.mark.parametrize(
+    "name, make, read",
+    [
+        ("ckpt.pt", _gsplat, lambda path: read_model(str(path), 30).splats(0)),
+        ("mlp.pt", _script, read_tensors),
+        ("a.ply", _ply, read_splats),
+        ("cameras.json", _cameras, read_cameras),
+    ],
+)
+def test_damaged_files(tmp_path, name: str, make: Callable[[Path], None], read: Callable[[Path], object]):
+    path = tmp_path / name
+    make(path)
+    whole = path.read_bytes()
+    read(path)
+    refused = 0
+    for seed in range(CASES):
+        path.write_bytes(damaged(whole, random.Random(seed)))
+        try:
+            with np.errstate(all="raise"):
+                read(path)
+        except DataError as error:
+            assert str(path.name) in str(error) and "\n" not in str(error)
+            refused += 1
+    assert refused > CASES / 4

@@ -1,0 +1,128 @@
+"""Exported files as independent readers find them."""
+
+import io
+
+import numpy as np
+import pytest
+
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.interchange.glb import glb_bytes
+from pd4dgs_codec.interchange.libraries import fourdgs_bytes, spz_bytes
+from pd4dgs_codec.interchange.ply import ply_bytes
+from pd4dgs_codec.interchange.splats import Splats, unit
+
+
+def make_splats(n: int = 40, degree: int = 3, seed: int = 0) -> Splats:
+    rng = np.random.default_rng(seed)
+    return Splats(
+        rng.normal(size=(n, 3)).astype(np.float32),
+        unit(rng.normal(size=(n, 4))).astype(np.float32),
+        np.exp(rng.normal(-2, 0.5, (n, 3))).astype(np.float32),
+        rng.uniform(0.05, 0.95, n).astype(np.float32),
+        rng.normal(0, 0.2, (n, (degree + 1) ** 2, 3)).astype(np.float32),
+    )
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_plyfile_reads_what_3d_gaussian_splatting_would_have_written(degree):
+    plyfile = pytest.importorskip("plyfile")
+    splats = make_splats(degree=degree)
+    vertices = plyfile.PlyData.read(io.BytesIO(ply_bytes(splats)))["vertex"].data
+    rest = 3 * ((degree + 1) ** 2 - 1)
+    assert len(vertices) == 40 and len(vertices.dtype.names) == 17 + rest
+    assert vertices.dtype.names[:9] == ("x", "y", "z", "nx", "ny", "nz", "f_dc_0", "f_dc_1", "f_dc_2")
+
+    def columns(*names):
+        return np.stack([vertices[name] for name in names], axis=1)
+
+    np.testing.assert_array_equal(columns("x", "y", "z"), splats.means)
+    np.testing.assert_array_equal(columns("f_dc_0", "f_dc_1", "f_dc_2"), splats.sh[:, 0])
+    for channel in range(3):  # all coefficients of red, then of green, then of blue
+        for j in range(1, (degree + 1) ** 2):
+            np.testing.assert_array_equal(vertices[f"f_rest_{channel * rest // 3 + j - 1}"], splats.sh[:, j, channel])
+    np.testing.assert_allclose(1 / (1 + np.exp(-vertices["opacity"])), splats.opacities, rtol=1e-5)
+    np.testing.assert_allclose(np.exp(columns("scale_0", "scale_1", "scale_2")), splats.scales, rtol=1e-5)
+    np.testing.assert_array_equal(columns("rot_0", "rot_1", "rot_2", "rot_3"), splats.quats)
+
+
+def test_opacities_of_0_and_1_and_flat_gaussians_are_finite_in_a_ply():
+    plyfile = pytest.importorskip("plyfile")
+    splats = make_splats(2)
+    splats.opacities[:] = 0, 1
+    splats.scales[0, 0] = 0
+    vertices = plyfile.PlyData.read(io.BytesIO(ply_bytes(splats)))["vertex"].data
+    assert all(np.isfinite(vertices[name]).all() for name in vertices.dtype.names)
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_pygltflib_and_fourdgs_read_the_glb(tmp_path, degree):
+    pygltflib, fourdgs = pytest.importorskip("pygltflib"), pytest.importorskip("fourdgs")
+    splats, path = make_splats(degree=degree), tmp_path / "scene.glb"
+    path.write_bytes(glb_bytes(splats))
+    document = pygltflib.GLTF2().load(str(path))
+    (primitive,) = document.meshes[0].primitives
+    assert document.extensionsUsed == ["KHR_gaussian_splatting"] and primitive.mode == pygltflib.POINTS
+    assert primitive.extensions["KHR_gaussian_splatting"]["kernel"] == "ellipse"
+
+    def accessor(name):
+        row = document.accessors[getattr(primitive.attributes, name)]
+        view = document.bufferViews[row.bufferView]
+        width = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}[row.type]
+        return np.frombuffer(document.binary_blob(), "<f4", row.count * width, view.byteOffset).reshape(-1, width)
+
+    prefix = "KHR_gaussian_splatting:"
+    np.testing.assert_array_equal(accessor("POSITION"), splats.means)
+    np.testing.assert_array_equal(accessor(prefix + "SCALE"), splats.scales)
+    np.testing.assert_array_equal(accessor(prefix + "OPACITY")[:, 0], splats.opacities)
+    np.testing.assert_array_equal(accessor(prefix + "ROTATION")[:, [3, 0, 1, 2]], splats.quats)
+    names = [f"SH_DEGREE_{l}_COEF_{i}" for l in range(degree + 1) for i in range(2 * l + 1)]
+    for j, name in enumerate(names):
+        np.testing.assert_array_equal(accessor(prefix + name), splats.sh[:, j])
+    row = document.accessors[primitive.attributes.POSITION]
+    np.testing.assert_array_equal([row.min, row.max], [splats.means.min(axis=0), splats.means.max(axis=0)])
+
+    other = fourdgs.from_gltf(str(path)).gaussians
+    np.testing.assert_allclose(other.positions, splats.means, atol=1e-6)
+    np.testing.assert_allclose(other.scales, splats.scales, rtol=1e-6)
+    np.testing.assert_allclose(other.rotations[:, [3, 0, 1, 2]], splats.quats, atol=1e-6)
+    np.testing.assert_allclose(other.colors[:, 3], splats.opacities, atol=1e-6)
+    assert other.sh_degree == degree
+
+
+def test_gaussforge_reads_the_spz_back(capfdbinary):
+    gaussforge = pytest.importorskip("gaussforge")
+    splats = make_splats()
+    data = spz_bytes(splats)
+    assert capfdbinary.readouterr().out == b""
+    ir = gaussforge.GaussForge().read(data, "spz")["data"]
+    names = ("positions", "scales", "rotations", "alphas", "colors", "sh")
+    fields = {name: np.frombuffer(ir[name], "<f4") for name in names}
+    np.testing.assert_allclose(fields["positions"].reshape(-1, 3), splats.means, atol=1 / 4096)
+    np.testing.assert_allclose(np.exp(fields["scales"].reshape(-1, 3)), splats.scales, rtol=0.04)
+    dots = np.einsum("nd,nd->n", fields["rotations"].reshape(-1, 4), splats.quats)
+    assert np.abs(dots).min() > 0.999
+    np.testing.assert_allclose(1 / (1 + np.exp(-fields["alphas"])), splats.opacities, atol=1 / 255)
+    np.testing.assert_allclose(fields["colors"].reshape(-1, 3), splats.sh[:, 0], atol=0.03)
+    np.testing.assert_allclose(fields["sh"].reshape(-1, 15, 3), splats.sh[:, 1:], atol=0.07)
+
+
+def test_spz_refuses_what_its_fixed_point_cannot_hold():
+    pytest.importorskip("gaussforge")
+    with pytest.raises(DataError, match="a Gaussian lies .* units from 0, SPZ holds 2048 at most"):
+        spz_bytes(make_splats().scaled(1e4))
+
+
+def test_fourdgs_reads_frames_whose_gaussians_move_to_their_next_places():
+    fourdgs = pytest.importorskip("fourdgs")
+    first, second = make_splats(30, 1, 1), make_splats(20, 1, 1)
+    second = Splats(first.means[:20] + np.float32(0.1), *list(vars(second).values())[1:])
+    data = fourdgs_bytes([(0.0, first, np.arange(30)), (0.5, second, np.arange(20))], 1.0)
+    back = fourdgs.read(data)
+    assert back.header.duration_sec == 1.0 and back.gaussians.sh_degree == 1
+    for t, expected, moved in ((0.0, first, 0.0), (0.25, first, 0.05), (0.75, second, 0.0)):
+        centres = back.gaussians.state_at(t)["centers"]
+        assert len(centres) == len(expected.means)
+        goal = expected.means.copy()
+        goal[:20] += np.float32(moved)
+        distance = np.abs(centres[:, None] - goal[None]).max(axis=2)
+        assert distance.min(axis=0).max() < 0.01 and distance.min(axis=1).max() < 0.01

@@ -1,0 +1,228 @@
+"""Explicit Gaussians of others as datasets: read, checked, seen from around, and learnt."""
+
+from __future__ import annotations
+
+import os
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from test_formats import make_splats
+
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.interchange.libraries import fourdgs_bytes, spz_bytes
+from pd4dgs_codec.interchange.models import read_model, read_splats
+from pd4dgs_codec.interchange.ply import ply_bytes
+from pd4dgs_codec.interchange.splats import Splats, camera_eye, picture
+from pd4dgs_codec.interchange.teacher import load_source
+
+
+def _same(found: Splats, expected: Splats, **tolerance: float) -> None:
+    for name, values in vars(expected).items():
+        got = getattr(found, name)
+        if name == "quats":
+            got = got * np.sign(np.einsum("nd,nd->n", got, values))[:, None]
+        np.testing.assert_allclose(got, values, err_msg=name, **(tolerance or {"atol": 1e-5}))
+
+
+def _moved(splats: Splats, x: float) -> Splats:
+    return Splats(splats.means + np.float32([x, 0, 0]), *list(vars(splats).values())[1:])
+
+
+def _sequence(folder: Path, frames: int = 3) -> Path:
+    folder.mkdir()
+    for i in range(frames):
+        (folder / f"frame_{8 + i}.ply").write_bytes(ply_bytes(_moved(make_splats(200, 1), 0.2 * i)))  # 8, 9, 10
+    return folder
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_a_ply_comes_back_as_it_was(tmp_path, degree):
+    path = tmp_path / "a.ply"
+    path.write_bytes(ply_bytes(make_splats(degree=degree)))
+    _same(read_splats(path), make_splats(degree=degree))
+
+
+def test_spz_and_4dgs_come_back_rounded(tmp_path):
+    pytest.importorskip("gaussforge")
+    pytest.importorskip("fourdgs")
+    splats = make_splats(30, 1)
+    path = tmp_path / "a.spz"
+    path.write_bytes(spz_bytes(splats))
+    _same(read_splats(path), splats, atol=0.07)
+    still = make_splats(30, 0)  # without harmonics but the constant
+    path.write_bytes(spz_bytes(still))
+    _same(read_splats(path), still, atol=0.07)
+    path = tmp_path / "a.4dgs"
+    path.write_bytes(fourdgs_bytes([(0.0, splats, np.arange(30)), (0.5, _moved(splats, 1), np.arange(30))], 1.0))
+    teacher = read_model(str(path), 30)
+    assert teacher.seconds == 1 and teacher.times is None
+    for t, shift in ((0.0, 0.0), (0.25, 0.5), (1.0, 1.0)):
+        found = teacher.splats(t)
+        goal = splats.means + np.float32([shift, 0, 0])
+        distance = np.abs(found.means[:, None] - goal[None]).max(axis=2)
+        assert len(found.means) == 30 and distance.min(axis=0).max() < 0.02
+
+
+@pytest.mark.parametrize("name, count", [("guitar.compressed.ply", 90_854), ("biker.spz", 152_746)])
+def test_splats_of_others(name, count):
+    pytest.importorskip("gaussforge")
+    path = Path(os.environ.get("PD4DGS_SHARED", Path(__file__).parents[3] / "shared" / "data")) / "splats" / name
+    if not path.is_file():
+        pytest.skip(f"{path} is not there")
+    splats = read_splats(path)
+    assert len(splats.means) == count and splats.degree == 0
+    assert (splats.scales > 0).all() and np.ptp(splats.means, axis=0).max() > 1
+
+
+def test_frames_are_in_the_order_of_their_numbers(tmp_path):
+    teacher = read_model(str(_sequence(tmp_path / "seq")), 10)
+    assert teacher.times == (0.0, 0.5, 1.0) and teacher.seconds == pytest.approx(0.2)
+    base = make_splats(200, 1).means[:, 0].mean()
+    shifts = [teacher.splats(t).means[:, 0].mean() - base for t in teacher.times]
+    np.testing.assert_allclose(shifts, [0, 0.2, 0.4], atol=1e-6)
+
+
+def test_a_checkpoint_of_gsplat(tmp_path):
+    splats = make_splats(20, 2)
+    p = splats.opacities
+    state = {
+        "means": splats.means, "quats": splats.quats * 3, "scales": np.log(splats.scales),
+        "opacities": np.log(p / (1 - p)), "sh0": splats.sh[:, :1], "shN": splats.sh[:, 1:],
+    }  # fmt: skip
+    path = tmp_path / "ckpt_29999_rank0.pt"
+    splat_state = {name: torch.from_numpy(np.ascontiguousarray(value)) for name, value in state.items()}
+    torch.save({"step": 29999, "splats": splat_state}, path)
+    _same(read_model(str(path), 30).splats(0.0), splats)
+    torch.save({"step": 1, "splats": {"means": splat_state["means"]}}, path)
+    with pytest.raises(DataError, match="has no splats.quats; expected a checkpoint of gsplat"):
+        read_model(str(path), 30)
+
+
+FUNCTION = """
+import numpy as np, torch
+def ball(t):
+    rng = np.random.default_rng(0)
+    means = rng.normal(0, 0.3, (300, 3)); means[:, 0] += t
+    return {"means": means, "quats": np.tile([1.0, 0, 0, 0], (300, 1)), "scales": torch.full((300, 3), 0.08),
+            "opacities": np.full(300, 0.9), "colors": np.tile([0.9, 0.2, 0.1], (300, 1))}
+def wrong(t):
+    return {"means": np.zeros((3, 2))}
+def nothing(t):
+    raise KeyError("model")
+"""
+
+
+def test_a_function_is_asked_at_any_time(tmp_path, monkeypatch):
+    (tmp_path / "my_model.py").write_text(FUNCTION)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delitem(sys.modules, "my_model", raising=False)
+    data = load_source("teacher:my_model:ball?views=16&size=40x30&background=white")
+    assert len(data.train) == 14 and len(data.test) == 2 and data.background == (1.0, 1.0, 1.0)
+    assert len({view.time for view in data.train}) == 14
+    for view in (data.train[0], data.test[1]):
+        assert view.image.shape == (30, 40, 3)
+        middle = view.image[10:20, 13:27].reshape(-1, 3).astype(int)  # the cameras look at it
+        assert (middle[:, 0] > middle[:, 2] + 60).mean() > 0.2
+        x, y, depth = view.viewmat[:3, :3] @ [0.5, 0, 0] + view.viewmat[:3, 3]
+        assert depth > 0 and data.near < depth < data.far
+    assert (data.box[0] < [-0.3, -0.3, -0.3]).all() and (data.box[1] > [1.2, 0.3, 0.3]).all()
+    assert np.abs(data.points[:, 0].mean() - 0.5) < 0.1 and data.point_colors.shape == data.points.shape
+    for name, message in (
+        ("wrong", "colors is NoneType, expected an array"),
+        ("nothing", "raised KeyError"),
+        ("absent", "cannot be imported"),
+    ):
+        with pytest.raises(DataError, match=message):
+            load_source(f"teacher:my_model:{name}?views=8")
+
+
+def test_pictures_are_those_of_the_frame_next_to_each_view(tmp_path):
+    folder = _sequence(tmp_path / "seq")
+    data = load_source(f"teacher:{folder}?views=12&size=40x30&fps=5", holdout=0)
+    assert data.time_range == (0.0, pytest.approx(0.4)) and not data.test
+    assert {view.time for view in data.train} == {0.0, 0.5, 1.0}
+    for view in data.train:
+        splats = _moved(make_splats(200, 1), 0.4 * view.time)
+        expected = np.rint(picture(splats, view.camera, (0.0, 0.0, 0.0), data.near) * 255)
+        assert np.abs(view.image - expected).max() <= 1
+    assert np.ptp([view.image for view in data.train]) > 100
+
+
+def test_cameras_of_a_dataset_keep_its_held_out_pictures(tmp_path):
+    from tiny import write_views
+
+    from pd4dgs_codec.data.dataset import load
+
+    folder, like = _sequence(tmp_path / "seq"), write_views(tmp_path / "set")
+    data, truth = load_source(f"teacher:{folder}?cameras={like}"), load(like)
+    assert [view.image.tobytes() for view in data.test] == [view.image.tobytes() for view in truth.test]
+    assert len(data.train) == len(truth.train)
+    for mine, theirs in zip(data.train, truth.train, strict=True):
+        np.testing.assert_array_equal(mine.viewmat, theirs.viewmat)
+        assert mine.image.tobytes() != theirs.image.tobytes()
+
+
+def test_a_cameras_json_beside_the_frames_is_heeded(tmp_path):
+    import json
+
+    folder = _sequence(tmp_path / "seq", 1)
+    rows = []
+    for i in range(3):
+        row = {"position": [0.1 * i, 0, -4], "rotation": np.eye(3).tolist(), "width": 80, "height": 60}
+        rows.append(row | {"fx": 70, "fy": 70})
+    (folder / "cameras.json").write_text(json.dumps(rows))
+    data = load_source(f"teacher:{folder}?size=40x30", holdout=0)
+    assert len(data.train) == 3 and data.up == (0.0, -1.0, 0.0) and data.train[0].width == 40
+    np.testing.assert_allclose([camera_eye(v.camera) for v in data.train], [r["position"] for r in rows], atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    "source, message",
+    [
+        ("teacher:", "names no teacher"),
+        ("teacher:nothing-here", "found nothing, expected a folder"),
+        ("teacher:{folder}?colour=red", "found 'colour=red', expected each of cameras, views"),
+        ("teacher:{folder}?views=1", "views is '1'; expected for example views=200"),
+        ("teacher:{folder}?size=9", "size is '9'"),
+        ("teacher:{empty}", "holds no file that ends in .ply or .spz"),
+        ("teacher:{rest}", "has 10 properties f_rest_"),
+        ("teacher:{plain}", "has no property f_dc_0"),
+        ("teacher:{nan}", "none of 40 Gaussians is finite"),
+        ("teacher:{faint}", "no Gaussian is as opaque as 0.1"),
+        ("teacher:{cut}", "bytes of vertices, expected"),
+    ],
+)
+def test_bad_teachers_are_one_line(tmp_path, source, message):
+    folder = _sequence(tmp_path / "seq", 1)
+    places = {"folder": folder, "empty": tmp_path / "empty"}
+    places["empty"].mkdir()
+    whole = ply_bytes(make_splats(degree=1))
+    splats = make_splats(degree=0)
+    faint = Splats(splats.means, splats.quats, splats.scales, np.full(40, 0.01, np.float32), splats.sh)
+    nan = Splats(splats.means + np.float32(np.nan), *list(vars(splats).values())[1:])
+    for name, data in {
+        "rest": whole.replace(b"property float nx", b"property float f_rest_9"),
+        "plain": b"ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nproperty float y\nproperty float z\n"
+        b"end_header\n0 0 0\n",
+        "nan": ply_bytes(nan),
+        "faint": ply_bytes(faint),
+        "cut": whole[:-40],
+    }.items():
+        places[name] = tmp_path / f"{name}.ply"
+        places[name].write_bytes(data)
+    with pytest.raises(DataError, match=message):
+        load_source(source.format(**places))
+
+
+def test_training_learns_from_a_teacher(tmp_path, cli):
+    folder = _sequence(tmp_path / "seq")
+    out = tmp_path / "model.pt"
+    source = f"teacher:{folder}?views=16&size=40x30"
+    result = cli("train", source, "-o", out, "--preset", "tiny", "--iterations", 4, "--json")
+    assert result.code == 0, result.err
+    assert result.json["anchors"] > 100 and out.is_file()
+    wrong = cli("train", f"teacher:{tmp_path / 'nowhere'}", "-o", tmp_path / "no.pt")
+    assert wrong.code == 1 and len(wrong.error_lines) == 1 and not (tmp_path / "no.pt").exists()
