@@ -16,6 +16,8 @@ SCALING_DIM = 6
 
 #: Limits of `Widths`: a feature twice as wide as Scaffold-GS has it.
 MAX_FEATURE, MAX_SLOTS = 64, 16
+#: Step classes of anchors are 0 .. MAX_CLASS.
+MAX_CLASS = 6
 
 #: Plane (a, b) of a HexPlane has shape [C, reso[b], reso[a]]; axes x, y, z, t = 0, 1, 2, 3.
 PLANES: tuple[tuple[str, int, int], ...] = (
@@ -56,10 +58,12 @@ def deformation_unit(box: np.ndarray) -> np.float32:
 @dataclass(frozen=True)
 class Widths:
     """What an anchor holds: `feature` numbers D for the networks, and `slots` G, the Gaussians that it spawns. Every
-    other width of a scene's anchors and of the networks at them follows from these two."""
+    other width of a scene's anchors and of the networks at them follows from these two. graded: whether each anchor has
+    a step class."""
 
     feature: int = 32
     slots: int = 10
+    graded: bool = False
 
     @property
     def attributes(self) -> dict[str, tuple[int, ...]]:
@@ -180,6 +184,22 @@ class Steps:
 
 
 @dataclass(frozen=True, eq=False)
+class Grading:
+    """Steps of the attributes that differ from anchor to anchor.
+
+    classes: uint8 [N], 0 .. MAX_CLASS; an anchor of class c has 2^c times the steps. centre: float32 [channels], in
+    each channel a value that anchors of every class can have; that of what is decoded is a multiple of the step.
+    """
+
+    classes: np.ndarray
+    centre: np.ndarray
+
+    def take(self, rows: np.ndarray | slice) -> Grading:
+        """Of these anchors, in this order."""
+        return replace(self, classes=self.classes[rows])
+
+
+@dataclass(frozen=True, eq=False)
 class Scene:
     """A prefix of a scene, from the layers `layers`.
 
@@ -190,7 +210,7 @@ class Scene:
     3..5 base scale). offset: float32 [N, G, 3], in units of exp(scaling_log[:3]).
     mask: per present layer i, uint8 [rows[i]] codes (see MASK_STEP), non-decreasing from layer to layer.
     networks: "opacity", "covariance", "color". local_deformation belongs to layer 2, global_deformation to layer 1;
-    either may be None (left out).
+    either may be None (left out). grading: None where every anchor has the steps as they are.
     """
 
     info: SceneInfo
@@ -205,11 +225,12 @@ class Scene:
     networks: dict[str, Network]
     global_deformation: Deformation | None = None
     local_deformation: Deformation | None = None
+    grading: Grading | None = None
 
     @property
     def widths(self) -> Widths:
         """D and G, as its arrays have them."""
-        return Widths(self.feature.shape[1], self.offset.shape[1])
+        return Widths(self.feature.shape[1], self.offset.shape[1], self.grading is not None)
 
     @property
     def level(self) -> int:
@@ -271,4 +292,5 @@ class Scene:
             mask=self.mask[:n],
             global_deformation=self.global_deformation if 1 in self.layers[:n] else None,
             local_deformation=self.local_deformation if 2 in self.layers[:n] else None,
+            grading=None if self.grading is None else self.grading.take(slice(rows)),
         )

@@ -246,7 +246,7 @@ def read_preamble(data):
 # 5.2 Chunk list: "In mode lzma each occurs at most once."
 # 5.5 Digest: "The first 16 bytes of the SHA-256 of the payloads of all critical chunks that were encoded together"
 def read_header(data):
-    header = fields(unpack(data), range(1, 16), (*range(1, 12), 13, 14, 15), "header")
+    header = fields(unpack(data), range(1, 17), (*range(1, 12), 13, 14, 15), "header")
     steps, box, (start, end), background, (near, far), _ = (
         reals(header[key], f"header key {key}", count)
         for key, count in ((4, 3), (6, 6), (7, 2), (8, 3), (9, 2), (10, 3))
@@ -265,6 +265,8 @@ def read_header(data):
     need(type(header[14]) is bytes and len(header[14]) == 16, "the digest of the layers is not 16 bytes")
     for value, most in zip(a_list(header[15], "the widths", 2), (64, 16)):
         limited(value, most, "a width", 1)
+    for centre in a_list(header[16], "the centres", channel_count(header)) if 16 in header else ():
+        limited(centre, MAX_SYMBOL, "a centre", -MAX_SYMBOL)
     read_chunk_list(header[1])
     for key in (2, 3):
         registered(header[key], (0, 1), f"header key {key}")
@@ -279,6 +281,10 @@ def read_header(data):
 def attribute_channels(header):
     feature, slots = header[15]
     return {"feature": feature, "scaling_log": 6, "offset": 3 * slots}
+
+
+def channel_count(header):
+    return sum(attribute_channels(header).values())
 
 
 # 6.3 Planes and networks: the outputs by id, None for any
@@ -494,7 +500,7 @@ def check_sizes(layer, payload_bytes, before):
     """before: N, S and L of the slices before it. Sets those with it."""
     samples = sum(c * h * w for _, _, (c, h, w) in plane_shapes(layer))
     need(samples <= 1 << 28, f"{samples} plane samples", "LimitExceeded")
-    row = sum(attribute_channels(layer.header).values()) + 4
+    row = channel_count(layer.header) + 4 + (16 in layer.header)
     symbols = layer.rises + row * layer.rows + samples + sum(size for _, size in weight_shapes(layer))
     layer.declared = [a + b for a, b in zip(before, (layer.rows, symbols, payload_bytes))]
     rows, symbols, size = layer.declared
@@ -511,7 +517,7 @@ def read_sections(layer, parts):
 
     planes, weights, past = plane_shapes(layer), weight_shapes(layer), layer.past
     counts = {MASKS: [layer.rises, layer.rows], ATTRIBUTE_SECTION: []}
-    counts[ATTRIBUTE_SECTION] = [layer.rows] * sum(attribute_channels(layer.header).values())
+    counts[ATTRIBUTE_SECTION] = [layer.rows] * (channel_count(layer.header) + (16 in layer.header))
     counts[PLANE_SECTION] = [] if layer.raw else [h * w for _, _, (c, h, w) in planes for _ in range(c)]
     counts[WEIGHTS] = [] if layer.raw else [size for _, size in weights]
     positions = decode_positions(part(POSITIONS, layer.rows), layer.rows, past.of(POSITIONS))
@@ -521,11 +527,12 @@ def read_sections(layer, parts):
         decoded = decode_lzma_symbols(part(SYMBOLS, sum(flat)), flat)
         for section in counts:
             channels[section], decoded = decoded[: len(counts[section])], decoded[len(counts[section]) :]
+        step_classes(channels[ATTRIBUTE_SECTION][0] if 16 in layer.header else [])
     else:
         for section, sizes in counts.items():
             data = part(section, sum(sizes))
             if section == ATTRIBUTE_SECTION and sum(sizes):
-                channels[section] = decode_attributes(data, *layer.header[15], layer.rows, past)
+                channels[section] = decode_attributes(data, *layer.header[15], layer.rows, past, 16 in layer.header)
             elif section == PLANE_SECTION and sizes:
                 channels[section] = decode_planes(data, [shape for _, _, shape in planes])
             else:
@@ -548,6 +555,8 @@ def keep_symbols(layer, positions, channels, planes, weights):
     need(all(v >= 3 for v in own), "a mask code under 3")
     layer.symbols = {"anchor": [v for cell in positions for v in cell], "mask_rise": rise, "mask_own": own}
     first = 0
+    if 16 in layer.header:
+        layer.symbols["step_class"], first = channels[ATTRIBUTE_SECTION][0], 1
     for name, width in attribute_channels(layer.header).items():  # [width, n], channel by channel
         layer.symbols[name] = [k for channel in channels[ATTRIBUTE_SECTION][first : first + width] for k in channel]
         first += width
@@ -556,7 +565,7 @@ def keep_symbols(layer, positions, channels, planes, weights):
         for name, predictor, (c, h, w) in planes:
             layer.symbols[name] = [k for _ in range(c) for k in restore(next(residuals), predictor, h, w)]
         layer.symbols |= {name: channel for (name, _), channel in zip(weights, channels[WEIGHTS])}
-    valued = [name for name in layer.symbols if name not in ("anchor", "mask_rise", "mask_own")]
+    valued = [name for name in layer.symbols if name not in ("anchor", "mask_rise", "mask_own", "step_class")]
     need(all(abs(k) <= MAX_SYMBOL for name in valued for k in layer.symbols[name]), "a symbol over 2^23")
 
 
@@ -795,29 +804,45 @@ def take_channel(stream, count, prior, exceptions):
 # 8.7 Stages of the attributes: "The activity of a row is the relative magnitude (8.9) of the residuals named, the
 # places being the n rows." "In form 2 places, sums and bounds are those of the slice that the block stands in"
 # 8.7 Stages of the attributes: "The bounds are b_s = (P·a_s) // 38, a_1 .. a_5 being 6, 12, 20, 29 and 38"
-def decode_attributes(data, feature, slots, n, past):
+def decode_attributes(data, feature, slots, n, past, graded):
     reader, p = Reader(data), feature + 6
     form = read_form(reader, 3)
+    grades = [decode_grades(reader, n)] if graded else []
     if form == 0:
-        return decode_channels(reader.take(reader.left), [n] * (p + 3 * slots), past.of(ATTRIBUTE_SECTION))
+        one, known = grades[0] if graded else [0] * n, past.of(ATTRIBUTE_SECTION)
+        return grades + decode_classes(reader.take(reader.left), [one] * (p + 3 * slots), 7 if graded else 1, known)
     if form == 1:
-        past.block = read_block(reader, p, slots)
+        past.block = read_block(reader, p, slots, graded)
     need(past.block, "no slice before has a prediction block")
     terms, class_counts, splits, scales = past.block
+    own = [[64 >> c for c in grades[0]]] * 4 if graded else []  # four times the relative magnitude of one
     *stages, stage_y, stage_z = take_stages(reader, 8)
     known = [past.of(ATTRIBUTE_SECTION, stage) for stage in range(8)]
     k = []  # r_0 .. r_(P − 1), then x_0 .. x_(G − 1)
     ends = [p * a // 38 for a in (6, 12, 20, 29, 38)] + [p + slots]
-    for s, (stage, end, class_count) in enumerate(zip(stages, ends, [1, *class_counts])):
+    for s, (stage, end, class_count) in enumerate(zip(stages, ends, class_counts if graded else [1, *class_counts])):
         if s not in scales:  # the slice that the block stands in
-            scales[s] = n, channel_sums(k), class_bounds(relative_magnitude(k, n), class_count)
+            scales[s] = n, channel_sums(own + k), class_bounds(relative_magnitude(own + k, n), class_count)
         places, sums, bounds = scales[s]
-        classes = classes_within(bounds, relative_magnitude(k, n, places, sums))
+        classes = classes_within(bounds, relative_magnitude(own + k, n, places, sums))
         k += decode_classes(stage, [classes] * (end - len(k)), class_count, known[s])
     residuals, x = k[:p], k[p:]
-    y = decode_classes(stage_y, [y_classes(split, *own) for split, *own in zip(splits, x)], 5, known[6])
-    z = decode_classes(stage_z, [z_classes(split, *own) for split, *own in zip(splits, x, y)], 7, known[7])
-    return add_predictions(residuals, terms) + [channel for offset in zip(x, y, z) for channel in offset]
+    y = decode_classes(stage_y, [y_classes(split, *each) for split, *each in zip(splits, x)], 5, known[6])
+    z = decode_classes(stage_z, [z_classes(split, *each) for split, *each in zip(splits, x, y)], 7, known[7])
+    return grades + add_predictions(residuals, terms) + [channel for offset in zip(x, y, z) for channel in offset]
+
+
+# 8.5 The attributes section: "the step classes of the rows: a varint, the length in bytes of what follows, then a
+# section of coded channels with one channel of n symbols"
+def decode_grades(reader, n):
+    (grades,) = decode_channels(reader.take(reader.varint(reader.left)), [n])
+    return step_classes(grades)
+
+
+# 8.5 The attributes section: "each MUST lie in 0..6, else Malformed"
+def step_classes(symbols):
+    need(all(0 <= c <= 6 for c in symbols), "a step class over 6")
+    return symbols
 
 
 # 8.5 The attributes section: "Other forms are UnsupportedFeature."
@@ -829,10 +854,10 @@ def read_form(reader, forms=2):
 
 
 # 8.6 Prediction block: "The block holds, without gaps"
-def read_block(reader, p, slots):
+def read_block(reader, p, slots, graded):
     """(terms, class counts, splits, what the classes of each stage are measured by, empty)."""
     terms = [read_terms(reader, p, c) for c in range(1, p)]
-    class_counts = [read_class_count(reader) for _ in range(5)]
+    class_counts = [read_class_count(reader) for _ in range(5 + graded)]
     return terms, class_counts, [read_split(reader) for _ in range(slots)], {}
 
 
@@ -1276,15 +1301,21 @@ def dequantise(symbols, step):
     return list(struct.unpack(form, struct.pack(form, *products)))
 
 
-# 11.5 Dequantisation: "An anchor's position is dequantised from its voxel index with the voxel size as Q." "Values of
+# 11.5 Dequantisation: "In place of its symbol k, an attribute has m + k·2^c" "It MUST lie in −2^23..2^23, else
+# Malformed." "An anchor's position is dequantised from its voxel index with the voxel size as Q." "Values of
 # section 6 are taken as they are."
 def dequantise_layer(layer):
     attributes = attribute_channels(layer.header)
     steps = dict(zip(attributes, layer.header[4])) | {"anchor": layer.header[5]}
+    classes = layer.symbols.get("step_class", [0] * layer.rows)
+    centres = iter(layer.header.get(16, [0] * channel_count(layer.header)))
     for name, symbols in layer.symbols.items():
         if name in attributes:  # [width, n] -> [n, width]
-            symbols = [k for row in range(layer.rows) for k in symbols[row :: layer.rows]]
-        if not name.startswith("mask"):
+            own = [next(centres) for _ in range(attributes[name])]
+            rows = [symbols[row :: layer.rows] for row in range(layer.rows)]
+            symbols = [m + (k << c) for row, c in zip(rows, classes) for m, k in zip(own, row)]
+            need(all(abs(k) <= MAX_SYMBOL for k in symbols), "an attribute over 2^23 steps")
+        if name != "step_class" and not name.startswith("mask"):
             step = steps.get(name) or layer.steps[0 if name.startswith("planes") else -1]
             layer.tensors[name] = dequantise(symbols, step)
     layer.tensors |= layer.raw_values
@@ -1297,7 +1328,8 @@ def add_slice(layer, part):
     cells = [cell for own in (layer, part) for cell in zip(*[iter(own.symbols["anchor"])] * 3)]
     low = [min((cell[axis] for cell in cells), default=0) for axis in range(3)]
     order = sorted(range(len(cells)), key=lambda row: morton_code([v - m for v, m in zip(cells[row], low)]))
-    for name, width in (("mask_own", 1), *attribute_channels(layer.header).items()):
+    classes = [("step_class", 1)] if 16 in layer.header else []
+    for name, width in (("mask_own", 1), *classes, *attribute_channels(layer.header).items()):
         channels = []
         for c in range(width):
             both = [k for own in (layer, part) for k in own.symbols[name][c * own.rows : (c + 1) * own.rows]]

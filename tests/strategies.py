@@ -6,6 +6,8 @@ said otherwise, so that a test knows every symbol that must come back.
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -13,12 +15,15 @@ from hypothesis import strategies as st
 
 from pd4dgs_codec import encode
 from pd4dgs_codec.attributes.quantise import dequantise
+from pd4dgs_codec.attributes.table import NO_CLASSES, Grid, attribute_rows
 from pd4dgs_codec.scene import (
     DEFAULT_WIDTHS,
     LOCAL_HEADS,
+    MAX_CLASS,
     PLANES,
     Camera,
     Deformation,
+    Grading,
     Network,
     Scene,
     SceneInfo,
@@ -113,16 +118,28 @@ def make_scene(
     cells = rng.permutation(cells)
     n = len(cells)
     codes = np.sort(rng.choice(np.array([0, 0, 3, 4, 77, 255], np.uint8), (n, len(layers))), axis=1)
+    values = [symbols(rng, (n, *shape), kind) for shape in widths.attributes.values()]
+    k = np.concatenate([x.reshape(n, math.prod(x.shape[1:])).T for x in values])
+    centre, classes, grading = np.zeros(widths.channels, np.int32), NO_CLASSES, None
+    if widths.graded:
+        classes = rng.integers(0, MAX_CLASS + 1, n).astype(np.int32)
+        if kind == "huge":
+            k = k // (1 << classes)
+        else:
+            centre = rng.integers(-3, 4, widths.channels).astype(np.int32)
+    grid = Grid(steps.attributes, widths, centre)
+    if widths.graded:
+        rows = attribute_rows(centre, widths)
+        values_of_centre = np.concatenate([dequantise(m, steps.attributes[name]) for name, m in rows])
+        grading = Grading(classes.astype(np.uint8), values_of_centre)
     return Scene(
         info=info(rng, with_camera),
         steps=steps,
         layers=layers,
         rows=(n,) * len(layers),
         anchor_q=cells,
-        **{
-            name: dequantise(symbols(rng, (n, *shape), kind), steps.attributes[name])
-            for name, shape in widths.attributes.items()
-        },
+        **grid.dequantise(k, classes),
+        grading=grading,
         mask=tuple(codes.T.copy()),
         networks={
             name: network(rng, (widths.inputs, *hidden, outputs), steps.weights_scaffold, kind)
@@ -159,7 +176,8 @@ def scenes(draw: st.DrawFn) -> Scene:
     Fitting priors to a channel over the whole range takes some 20 ms, so those scenes have at most one anchor.
     """
     kind = draw(st.sampled_from(RANGES))
-    widths = draw(st.sampled_from((Widths(), Widths(1, 1), Widths(5, 2), Widths(64, 16))))
+    graded = draw(st.booleans())
+    widths = replace(draw(st.sampled_from((Widths(), Widths(1, 1), Widths(5, 2), Widths(64, 16)))), graded=graded)
     return make_scene(
         draw(st.integers(0, 2**32 - 1)),
         layers=draw(st.sampled_from(LAYER_SETS)),
@@ -183,6 +201,10 @@ def assert_same_scene(a: Scene, b: Scene) -> None:
     for name in ("anchor_q", "feature", "scaling_log", "offset"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
         assert getattr(a, name).dtype == getattr(b, name).dtype
+    assert (a.grading is None) == (b.grading is None)
+    if a.grading is not None and b.grading is not None:
+        np.testing.assert_array_equal(a.grading.classes, b.grading.classes)
+        np.testing.assert_array_equal(a.grading.centre, b.grading.centre)
     for x, y in zip(a.mask, b.mask, strict=True):
         np.testing.assert_array_equal(x, y)
     assert_same_networks(a.networks, b.networks)

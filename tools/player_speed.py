@@ -98,6 +98,7 @@ def grown(scene: Scene, anchors: int) -> Scene:
         feature=scene.feature[index],
         scaling_log=scene.scaling_log[index],
         offset=scene.offset[index],
+        grading=None if scene.grading is None else scene.grading.take(index),
         mask=tuple(codes[index[: copies * len(codes)]] for codes in scene.mask),
     )
 

@@ -21,22 +21,30 @@ def is_step(value: float) -> bool:
     return bool(_SMALLEST_STEP <= value <= _LARGEST_STEP and float(np.float32(value)) == value)
 
 
-def quantise(x: np.ndarray, step: float, name: str = "tensor") -> np.ndarray:
-    """k = round-half-to-even(binary64(x) / binary64(step)), int32 of x's shape.
+#: Integers that broadcast against the symbols: where a channel's grid lies and how far apart its points are, in steps.
+Integers = np.ndarray | int
 
-    x: float32 array. step: positive normal binary32. quantise(dequantise(k, step), step) == k for |k| <= 2^23; above
-    that two neighbouring k can share one binary32 value unless step is a power of two.
-    Raises EncodeError naming the tensor if a value is not finite, |k| would exceed MAX_SYMBOL, or x_hat be infinite.
+
+def quantise(
+    x: np.ndarray, step: float, name: str = "tensor", centre: Integers = 0, spacing: Integers = 1
+) -> np.ndarray:
+    """k = round-half-to-even((binary64(x) / binary64(step) - centre) / spacing), int32 of x's shape.
+
+    x: float32 array. step: positive normal binary32. spacing: powers of two. quantise(dequantise(k, ...), ...) == k
+    while |centre + k spacing| <= 2^23; above that two neighbouring k can share one binary32 value unless step is a
+    power of two. Raises EncodeError naming the tensor if a value is not finite, that or |k| would exceed MAX_SYMBOL, or
+    x_hat be infinite.
     """
     if not is_step(step):
         raise EncodeError(f"{name}: quantisation step {step!r}, expected a positive normal binary32 value")
     if not np.isfinite(x).all():
         raise EncodeError(f"{name}: {np.size(x) - int(np.isfinite(x).sum())} values are NaN or infinite, expected none")
-    k = np.rint(x.astype(np.float64) / np.float64(step))
-    largest = float(np.abs(k).max()) if k.size else 0.0
+    k = np.rint((x.astype(np.float64) / np.float64(step) - centre) / spacing)
+    at = centre + k * spacing
+    largest = float(max(np.abs(k).max(), np.abs(at).max())) if k.size else 0.0
     if largest > MAX_SYMBOL:
         raise EncodeError(f"{name}: symbol of magnitude {largest:.0f} at step {step:g}, expected at most {MAX_SYMBOL}")
-    if not all_finite(k, step):
+    if not all_finite(at, step):
         raise EncodeError(f"{name}: a value that comes back as infinity at step {step:g}, expected a finite one")
     symbols: np.ndarray = k.astype(np.int32)
     return symbols
@@ -49,10 +57,11 @@ def all_finite(k: np.ndarray, step: float) -> bool:
     return not k.size or max(int(k.max()), -int(k.min())) * step < _TO_INFINITY
 
 
-def dequantise(k: np.ndarray, step: float) -> np.ndarray:
-    """x_hat = binary32(binary64(k) * binary64(step)), float32 of k's shape: an exact product and one rounding."""
+def dequantise(k: np.ndarray, step: float, centre: Integers = 0, spacing: Integers = 1) -> np.ndarray:
+    """x_hat = binary32(binary64(centre + k spacing) * binary64(step)), float32 of k's shape: an exact product and one
+    rounding."""
     with np.errstate(over="ignore"):  # an overflow to infinity is the caller's to refuse, see all_finite
-        values: np.ndarray = (k.astype(np.float64) * np.float64(step)).astype(np.float32)
+        values: np.ndarray = ((centre + k.astype(np.float64) * spacing) * np.float64(step)).astype(np.float32)
     return values
 
 

@@ -4,31 +4,78 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from dataclasses import dataclass
 
 import numpy as np
 
 from pd4dgs_codec.attributes.quantise import dequantise, quantise
-from pd4dgs_codec.scene import ATTRIBUTES, Widths
+from pd4dgs_codec.scene import ATTRIBUTES, Scene, Widths
+
+NO_CLASSES = np.zeros(0, np.int32)  #: of anchors that are not graded
 
 
-def attribute_rows(symbols: np.ndarray, widths: Widths) -> Iterator[tuple[str, np.ndarray]]:
-    """(name, its rows [scalars, n]) of channel-major symbols [widths.channels, n]."""
+@dataclass(frozen=True, eq=False)
+class Grid:
+    """The values that attributes can have: (m + k 2^c) Q, with a symbol k, the step Q of the attribute, the centre m of
+    the channel and the class c of the anchor (clause "dequantisation").
+
+    steps: by name. centre: int32 [channels] in steps, 0 if the anchors are not graded.
+    """
+
+    steps: dict[str, float]
+    widths: Widths
+    centre: np.ndarray
+
+    @staticmethod
+    def of(scene: Scene) -> Grid:
+        """That of a scene's attributes at its steps. Raises EncodeError for a centre that has no symbol."""
+        steps, widths = scene.steps.attributes, scene.widths
+        centre = np.zeros(widths.channels, np.int32)
+        if scene.grading is not None:
+            rows = attribute_rows(scene.grading.centre, widths)
+            centre = np.concatenate([quantise(x, steps[name], f"centre of {name}") for name, x in rows])
+        return Grid(steps, widths, centre)
+
+    def spacing(self, classes: np.ndarray) -> np.ndarray | int:
+        """2^c of anchors int [n], as it broadcasts against [..., n]; 1 if they are not graded."""
+        return 1 << classes.astype(np.int64) if self.widths.graded else 1
+
+    def indices(self, symbols: np.ndarray, classes: np.ndarray) -> np.ndarray:
+        """int64 [channels, n]: m + k 2^c of symbols [channels, n]."""
+        at: np.ndarray = self.centre[:, None] + symbols.astype(np.int64) * self.spacing(classes)
+        return at
+
+    def quantise(self, values: dict[str, np.ndarray], classes: np.ndarray) -> np.ndarray:
+        """int32 [channels, n] symbols, channel-major, of float32 [n, *shape] per attribute name. classes: int [n], or
+        NO_CLASSES."""
+        return np.ascontiguousarray(np.concatenate([self.symbols_of(a, values[a], classes) for a in ATTRIBUTES]))
+
+    def symbols_of(self, name: str, x: np.ndarray, classes: np.ndarray) -> np.ndarray:
+        """int32 [scalars, n] of one attribute float32 [n, *shape]."""
+        centre = dict(attribute_rows(self.centre, self.widths))[name]
+        channels = x.reshape(len(x), len(centre)).T
+        return quantise(channels, self.steps[name], name, centre[:, None], self.spacing(classes))
+
+    def dequantise(self, symbols: np.ndarray, classes: np.ndarray) -> dict[str, np.ndarray]:
+        """The inverse of `quantise`: float32 [n, *shape] per attribute name, C-contiguous."""
+        return {name: self.values_of(name, rows, classes) for name, rows in attribute_rows(symbols, self.widths)}
+
+    def values_of(self, name: str, symbols: np.ndarray, classes: np.ndarray) -> np.ndarray:
+        """The inverse of `symbols_of`."""
+        centre = dict(attribute_rows(self.centre, self.widths))[name]
+        values = dequantise(symbols, self.steps[name], centre[:, None], self.spacing(classes))
+        return np.ascontiguousarray(values.T).reshape(-1, *self.widths.attributes[name])
+
+
+def attribute_rows(channels: np.ndarray, widths: Widths) -> Iterator[tuple[str, np.ndarray]]:
+    """(name, its rows) of what has a row per channel."""
     first = 0
-    for name, shape in widths.attributes.items():
-        last = first + math.prod(shape)
-        yield name, symbols[first:last]
+    for name in ATTRIBUTES:
+        last = first + math.prod(widths.attributes[name])
+        yield name, channels[first:last]
         first = last
 
 
-def quantise_attributes(values: dict[str, np.ndarray], steps: dict[str, float]) -> np.ndarray:
-    """int32 [channels, n] symbols, channel-major, of float32 [n, *shape] per attribute name."""
-    flat = [(name, values[name].reshape(len(values[name]), math.prod(values[name].shape[1:]))) for name in ATTRIBUTES]
-    return np.ascontiguousarray(np.concatenate([quantise(x, steps[name], name).T for name, x in flat]))
-
-
-def dequantise_attributes(symbols: np.ndarray, widths: Widths, steps: dict[str, float]) -> dict[str, np.ndarray]:
-    """The inverse of quantise_attributes: float32 [n, *shape] per attribute name, C-contiguous."""
-    return {
-        name: dequantise(np.ascontiguousarray(rows.T), steps[name]).reshape(-1, *widths.attributes[name])
-        for name, rows in attribute_rows(symbols, widths)
-    }
+def classes_of(scene: Scene) -> np.ndarray:
+    """int32 [N] step classes, or NO_CLASSES."""
+    return NO_CLASSES if scene.grading is None else scene.grading.classes.astype(np.int32)

@@ -216,6 +216,7 @@ def with_anchors(data: bytes, count: int, seed: int = 5) -> bytes:
         feature=scene.feature[rows],
         scaling_log=scene.scaling_log[rows],
         offset=scene.offset[rows],
+        grading=None if scene.grading is None else scene.grading.take(rows),
         mask=tuple(codes[rows] for codes in masks),
     )
     return encode(larger, effort=EFFORT)

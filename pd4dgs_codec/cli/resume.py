@@ -27,6 +27,7 @@ FIXED = (
     "iterations",
     "rate_scale",
     "prune",
+    "grading",
     "rollout",
     "max_layer",
 )

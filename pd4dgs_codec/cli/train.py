@@ -81,6 +81,10 @@ def parser() -> Parser:
         help="half way, take out anchors whose absence adds at most this share to the squared error, instead of the "
         "quality's (at 70: 0.03; 0: none)",
     )
+    what = (
+        "coarser steps for anchors that pictures hardly depend on, up to this share of the squared error (default: 0)"
+    )
+    p.add_argument("--grading", type=values.non_negative_float, metavar="X", help=what)
     p.add_argument("--max-layer", type=int, choices=(0, 1, 2), help="train without the layers above this one")
     what = "which level each step trains, see below (default: adaptive)"
     p.add_argument("--rollout", choices=ROLLOUTS, help=what)

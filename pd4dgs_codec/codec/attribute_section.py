@@ -1,8 +1,13 @@
 """The attributes section of mode ans: the channels as they are, or with what one tells of another taken out.
 
-Byte 0 is the form. Form 0: the rest is one channels payload of all channels. Form 1: a block of varints, then eight
+Byte 0 is the form. Where anchors are graded, a varint follows, the length of one channels payload, and that: the step
+class of each row. Form 0: the rest is one channels payload of all channels. Form 1: a block of varints, then eight
 channels payloads, the *stages*, each decoded before the next. All arithmetic is on integers. With D feature numbers and
 G Gaussians, the first P = D + 6 channels are features and log-scalings, the others G offsets x, y, z.
+
+*Step classes*. In form 0 each channel is split into the step classes 0..6 of its rows. In form 1 an anchor's activity
+(below) begins with GRADE_WEIGHT times the relative magnitude of a channel that holds 2^(6 - class), and stage 0 is
+split by it as well.
 
 *Linear prediction*, channels 1 .. P - 1: for channel c a varint m <= c, then m terms in ascending
 order of the channel j they refer to: a varint j - (previous j) - 1, starting from previous j = -1, and a zigzag weight
@@ -33,6 +38,7 @@ from typing import Generic, TypeVar
 
 import numpy as np
 
+from pd4dgs_codec.attributes.table import NO_CLASSES
 from pd4dgs_codec.codec.stages import (
     PLAIN,
     PRIOR_BITS,
@@ -48,12 +54,12 @@ from pd4dgs_codec.codec.stages import (
     smaller_form,
 )
 from pd4dgs_codec.entropy.bits import entropy_bits
-from pd4dgs_codec.entropy.channels import decode_channels
+from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
 from pd4dgs_codec.entropy.fitting import Fitted
 from pd4dgs_codec.entropy.priors import K_MAX, Prior
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
 from pd4dgs_codec.errors import Malformed, UnsupportedFeature
-from pd4dgs_codec.scene import Widths
+from pd4dgs_codec.scene import MAX_CLASS, Widths
 
 CONTINUED = 2  #: the form that goes on with an earlier block
 WEIGHT_SHIFT = 10
@@ -63,6 +69,8 @@ STAGES = (0, 6, 12, 20, 29, 38)
 N_STAGES = len(STAGES) + 2
 Y_CLASSES, Z_CLASSES = 5, 7
 SPLIT_Y, SPLIT_Z = 1, 2
+#: How much an anchor's step class counts for its activity, beside the channels' residuals, which count 1 each.
+GRADE_WEIGHT = 4
 
 #: Encoder: a term must explain this share of its channel's spread; a term costs about so many bits.
 MIN_SHARE = 0.03
@@ -129,7 +137,8 @@ class Scale:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """The prediction block. widths: of the anchors. counts: of classes, of stages 1 to 5. scales: by stage, of the
+    """The prediction block. widths: of the anchors. counts: of classes, of stages 1 to 5, with step
+    classes 0 to 5. scales: by stage, of the
     slice that the block stands in; known once that slice has been coded so far."""
 
     widths: Widths
@@ -138,13 +147,14 @@ class Block:
     splits: list[Split]
     scales: dict[int, Scale] = field(default_factory=dict)
 
-    def classes(self, coded: np.ndarray, stage: int) -> np.ndarray:
-        """int64 [n] of rows whose residuals in the stages before are in coded int64 [channels, n]."""
-        residuals = coded[: stage_bounds(self.widths)[stage]]
+    def classes(self, coded: np.ndarray, grades: np.ndarray, stage: int) -> np.ndarray:
+        """int64 [n] of rows whose residuals in the stages before are in coded int64 [channels, n], of those step
+        classes."""
+        residuals = _measured(coded, grades, stage_bounds(self.widths)[stage])
         scale = self.scales.get(stage)
         if scale is None:
             activity = relative_magnitude(residuals)
-            bounds = activity_bounds(activity, self.counts[stage - 1])
+            bounds = activity_bounds(activity, self.counts[stage - (not self.widths.graded)])
             self.scales[stage] = Scale(residuals.shape[1], np.abs(residuals).sum(axis=1), bounds)
         else:
             activity, bounds = relative_magnitude(residuals, scale.places, scale.sums), scale.bounds
@@ -177,24 +187,26 @@ class Past(Generic[AnyPrior]):
 
 def write_attributes(
     attributes: np.ndarray,
+    classes: np.ndarray,
     widths: Widths,
     priors: str,
     effort: int,
     past: Past[Fitted] | None = None,
-    population: np.ndarray | None = None,
+    population: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> tuple[bytes, float]:
-    """(section bytes, sum of R(a) over all channels) of attributes int32 [channels, n], in the smallest form.
+    """(section bytes, sum of R(a) over all channels, by step class, and the classes' entropy) of attributes int32
+    [channels, n] and classes int32 [n], or NO_CLASSES, in the smallest form.
 
-    past: of the layer's slices before, to which this one is added. population: int32 [channels, m], what a block is
-    fitted to: the attributes of this slice and of those that may refer to it; these alone if None.
+    past: of the layer's slices before, to which this one is added. population: (attributes, classes) that a
+    block is fitted to: of this slice and of those that may refer to it; these alone if None.
     """
     past = past or Past()
-    population = attributes if population is None else population
-    one_row = population.shape[1] < 2  # has no spread to predict
-    block = past.block or (None if one_row else _fit_block(population.astype(np.int64), widths))
+    everything, grades = (attributes, classes) if population is None else population
+    one_row = everything.shape[1] < 2  # has no spread to predict
+    block = past.block or (None if one_row else _fit_block(everything.astype(np.int64), grades, widths))
     section, rate_bits = smaller_form(
-        list(attributes),
-        None if block is None else lambda: _write_staged(attributes.astype(np.int64), block, past, effort),
+        by_class(attributes, classes),
+        None if block is None else lambda: _write_staged(attributes.astype(np.int64), classes, block, past, effort),
         priors,
         effort,
         past.plain,
@@ -205,16 +217,30 @@ def write_attributes(
         past.block = block
         for known, defined in zip(past.stages, section.defined, strict=True):
             known += defined
-    return section.data, rate_bits
+    if not widths.graded:
+        return section.data, rate_bits
+    out, graded = bytearray(section.data[:1]), encode_channels([classes], effort=effort).payload
+    put_varint(out, len(graded))
+    return bytes(out + graded + section.data[1:]), rate_bits + entropy_bits(classes)
 
 
-def _fit_block(symbols: np.ndarray, widths: Widths) -> Block:
+def by_class(attributes: np.ndarray, classes: np.ndarray) -> list[np.ndarray]:
+    """The channels of form 0: each channel int [n] as its rows of class 0, 1 .. MAX_CLASS; as it is without classes."""
+    if not classes.size:
+        return list(attributes)
+    parts = places_of(classes, MAX_CLASS + 1)
+    return [channel[rows] for channel in attributes for rows in parts]
+
+
+def _fit_block(symbols: np.ndarray, grades: np.ndarray, widths: Widths) -> Block:
     terms = [_fit_terms(symbols, c) for c in range(1, widths.predicted)]
     splits = [_fit_split(*symbols[x : x + 3]) for x in stage_channels(widths, len(STAGES) - 1)]
     coded, bounds = _residuals(symbols, terms), stage_bounds(widths)
     counts = [
-        cheapest_class_count([(coded[list(stage_channels(widths, stage))], relative_magnitude(coded[: bounds[stage]]))])
-        for stage in range(1, len(STAGES))
+        cheapest_class_count(
+            [(coded[list(stage_channels(widths, stage))], relative_magnitude(_measured(coded, grades, bounds[stage])))]
+        )
+        for stage in _split_stages(widths)
     ]
     return Block(widths, terms, counts, splits)
 
@@ -226,12 +252,14 @@ def _residuals(symbols: np.ndarray, terms: Sequence[Terms]) -> np.ndarray:
     return coded
 
 
-def _write_staged(symbols: np.ndarray, block: Block, past: Past[Fitted], effort: int) -> CodedSection:
+def _write_staged(
+    symbols: np.ndarray, grades: np.ndarray, block: Block, past: Past[Fitted], effort: int
+) -> CodedSection:
     out = bytearray([CONTINUED])
     if past.block is None:
         out = bytearray([STAGED])
         _put_block(out, block)
-    places = _places(_residuals(symbols, block.terms), block)
+    places = _places(_residuals(symbols, block.terms), grades, block)
     stages = [[channel[rows] for channel, rows in channels] for channels in places]
     return coded_stages(out, stages, effort, past.stages)
 
@@ -252,12 +280,12 @@ def _put_block(out: bytearray, block: Block) -> None:
             put_zigzag(out, split.centre_y)
 
 
-def _places(coded: np.ndarray, block: Block) -> Iterator[list[tuple[np.ndarray, np.ndarray]]]:
+def _places(coded: np.ndarray, grades: np.ndarray, block: Block) -> Iterator[list[tuple[np.ndarray, np.ndarray]]]:
     """Per stage, the (channel, rows) that it codes, in order. `coded` int64 [channels, n] is read only as far as the
     stages before reach."""
     every = np.arange(coded.shape[1])
-    for stage, count in enumerate((1, *block.counts)):
-        parts = places_of(block.classes(coded, stage), count) if count > 1 else [every]
+    for stage, count in enumerate(block.counts if block.widths.graded else (1, *block.counts)):
+        parts = places_of(block.classes(coded, grades, stage), count) if count > 1 else [every]
         yield [(coded[c], part) for c in stage_channels(block.widths, stage) for part in parts]
     for axis, flag, count in ((1, SPLIT_Y, Y_CLASSES), (2, SPLIT_Z, Z_CLASSES)):
         places = []
@@ -268,6 +296,20 @@ def _places(coded: np.ndarray, block: Block) -> Iterator[list[tuple[np.ndarray, 
                 parts = places_of(classes, count)
             places += [(coded[x + axis], part) for part in parts]
         yield places
+
+
+def _split_stages(widths: Widths) -> range:
+    """The stages whose channels are split by activity."""
+    return range(0 if widths.graded else 1, len(STAGES))
+
+
+def _measured(coded: np.ndarray, grades: np.ndarray, end: int) -> np.ndarray:
+    """int64 [m, n], of which rows have their activity: the first `end` channels of coded, and for step classes `grades`
+    GRADE_WEIGHT times one that holds 2^(6 - class)."""
+    if not grades.size:
+        return coded[:end]
+    own = 1 << (MAX_CLASS - grades.astype(np.int64))
+    return np.concatenate([np.repeat(own[None], GRADE_WEIGHT, axis=0), coded[:end]])
 
 
 def _fit_terms(symbols: np.ndarray, c: int) -> Terms:
@@ -315,33 +357,62 @@ def _mode(symbols: np.ndarray) -> int:
 # -- reading -----------------------------------------------------------------------------------------------------------
 
 
-def read_attributes(data: bytes, widths: Widths, rows: int, past: Past[Prior] | None = None) -> np.ndarray:
-    """attributes int32 [channels, rows]; the inverse of write_attributes. rows was checked against the limits before.
-    past: of the layer's slices before, to which this one is added."""
+def read_attributes(
+    data: bytes, widths: Widths, rows: int, past: Past[Prior] | None = None
+) -> tuple[np.ndarray, np.ndarray]:
+    """(classes int32 [rows] or NO_CLASSES, attributes int32 [channels, rows]); the inverse of write_attributes.
+    rows was checked against the limits before. past: of the layer's slices before, to which this one is added."""
     reader, block = ByteReader(data), past.block if past else None
     form = reader.byte("the form of the attributes")
-    if form == PLAIN:
-        return np.stack(decode_channels(reader.rest(), [rows] * widths.channels, past.plain if past else None))
-    if form not in (STAGED, CONTINUED):
+    if form not in (PLAIN, STAGED, CONTINUED):
         raise UnsupportedFeature(f"form {form} of the attributes, expected {PLAIN}, {STAGED} or {CONTINUED}")
+    classes = _read_classes(reader, rows) if widths.graded else NO_CLASSES
+    if form == PLAIN:
+        return classes, _read_plain(reader.rest(), classes, widths, rows, past.plain if past else None)
     if form == STAGED:
         block = _read_block(reader, widths)
     if block is None:
         raise Malformed("attributes that go on with a prediction block, but no slice before has one")
     symbols = np.zeros((widths.channels, rows), np.int64)
-    read_stages(reader, N_STAGES, _places(symbols, block), past.stages if past else None)
+    read_stages(reader, N_STAGES, _places(symbols, classes, block), past.stages if past else None)
     if past:
         past.block = block
     for c, term in enumerate(block.terms, start=1):
         symbols[c] += term.prediction(symbols)
     if symbols.size and max(int(symbols.max()), -int(symbols.min())) > K_MAX:
         raise Malformed(f"a predicted attribute over {K_MAX} in magnitude")
-    return symbols.astype(np.int32)
+    return classes, symbols.astype(np.int32)
+
+
+def _read_classes(reader: ByteReader, rows: int) -> np.ndarray:
+    length = reader.varint(reader.remaining, "the length of the step classes")
+    (classes,) = decode_channels(reader.take(length), [rows])
+    check_classes(classes)
+    return classes
+
+
+def check_classes(classes: np.ndarray) -> None:
+    """Raise Malformed unless int32 [n] are step classes."""
+    if classes.size and not (0 <= classes.min() and classes.max() <= MAX_CLASS):
+        raise Malformed(f"step classes in {int(classes.min())}..{int(classes.max())}, expected 0..{MAX_CLASS}")
+
+
+def _read_plain(
+    data: memoryview, classes: np.ndarray, widths: Widths, rows: int, known: list[Prior] | None
+) -> np.ndarray:
+    if not widths.graded:
+        return np.stack(decode_channels(data, [rows] * widths.channels, known))
+    parts = places_of(classes, MAX_CLASS + 1)
+    symbols = np.zeros((widths.channels, rows), np.int32)
+    decoded = decode_channels(data, [len(part) for part in parts] * widths.channels, known)
+    for i, values in enumerate(decoded):
+        symbols[i // len(parts), parts[i % len(parts)]] = values
+    return symbols
 
 
 def _read_block(reader: ByteReader, widths: Widths) -> Block:
     terms = [_read_terms(reader, widths, c) for c in range(1, widths.predicted)]
-    counts = [read_class_count(reader, stage) for stage in range(1, len(STAGES))]
+    counts = [read_class_count(reader, stage) for stage in _split_stages(widths)]
     return Block(widths, terms, counts, [_read_split(reader) for _ in range(widths.slots)])
 
 

@@ -3,7 +3,8 @@
 By clause 11.5 and half-to-even rounding |x - x_hat| <= Q/2, plus half a unit in the last place of x_hat: the product
 k Q is rounded to binary32 once. Voxel indices and mask codes are integers and come back as they are.
 
-The header declares one bound per class of tensors (clause "error bounds"), the classes being the fields of Steps.
+The header declares one bound per class of tensors (clause "error bounds"), the classes being the fields of Steps. An
+anchor of step class c has 2^c times the steps, and 2^c times the bounds.
 """
 
 from __future__ import annotations
@@ -13,9 +14,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pd4dgs_codec.attributes.table import classes_of
 from pd4dgs_codec.codec.kinds import LAYER_KINDS
 from pd4dgs_codec.errors import EncodeError
-from pd4dgs_codec.scene import PLANES, Scene
+from pd4dgs_codec.scene import ATTRIBUTES, PLANES, Scene
 
 #: |x| / Q <= 2^23 is computed in binary64, which is off by 2^-30 at most and may turn a tie: so much of Q more.
 _TIES = 2.0**-29
@@ -52,8 +54,11 @@ def verify_errors(
     """
     steps, largest = dict.fromkeys(declared, 0.0), dict.fromkeys(declared, 0.0)
     pairs = zip(_tensors(given, raw_deformation), _tensors(decoded, raw_deformation), strict=True)
+    spacing = 2.0 ** classes_of(decoded)
     for (what, step, x), (_, _, restored) in pairs:
         errors = np.abs(x.astype(np.float64) - restored)
+        if what in ATTRIBUTES and spacing.size:
+            errors /= spacing.reshape(-1, *(1,) * (x.ndim - 1))
         bounds = np.minimum(_bounds(np.abs(restored), step), declared[what])
         if not (errors <= bounds).all():
             place = np.unravel_index(int((errors - bounds).argmax()), errors.shape)

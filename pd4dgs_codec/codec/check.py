@@ -12,6 +12,7 @@ from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.morton import MAX_VOXEL
 from pd4dgs_codec.scene import (
     MASK_MIN_CODE,
+    MAX_CLASS,
     MAX_FEATURE,
     MAX_SLOTS,
     PLANES,
@@ -57,6 +58,11 @@ def check_scene(scene: Scene) -> None:
         _expect(1 <= width <= limit, f"{what}: {width}, expected 1..{limit}")
     for name, shape in widths.attributes.items():
         _expect_array(name, scene.attributes[name], np.float32, (n, *shape))
+    if scene.grading is not None:
+        _expect_array("step classes", scene.grading.classes, np.uint8, (n,))
+        largest = int(scene.grading.classes.max(initial=0))
+        _expect(largest <= MAX_CLASS, f"step classes: {largest}, expected at most {MAX_CLASS}")
+        _expect_array("centre of the attributes", scene.grading.centre, np.float32, (widths.channels,))
     _check_masks(scene)
     _check_info(scene)
     for name, step in vars(scene.steps).items():

@@ -41,7 +41,7 @@ class LayerReader:
     def scene(self) -> Scene:
         """The scene of the layers read so far, at least one."""
         assert self.header is not None
-        return assemble(self.header.info, self.header.attribute_steps, self.layers)
+        return assemble(self.header.info, self.header.grid, self.layers)
 
     def next_slice(self, data: bytes | bytearray, max_layer: int | None = None, max_bytes: int | None = None) -> bool:
         """Read on to the end of one more slice of a layer <= max_layer that ends within the first max_bytes; whether
@@ -116,7 +116,7 @@ class LayerReader:
         read = read_layer(
             chunk.payload, kind, header.widths, self._declared, header.mode, header.raw_deformation, later, past
         )
-        check_last_layer([*before, read], self._taken, header.info.voxel_size, header.attribute_steps)
+        check_last_layer([*before, read], self._taken, header.info.voxel_size, header.grid)
         _check_bounded(read, header)
         symbols = sum(a.size for a in read.arrays())
         self._declared = self._declared.and_slice(len(read.anchor_q), symbols, len(chunk.payload))

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from pd4dgs_codec.attributes.table import Grid
 from pd4dgs_codec.bitstream.container import (
     CHUNK_OVERHEAD,
     FLAG_ANCILLARY,
@@ -129,7 +130,7 @@ def encode_with_report(
     check_scene(scene)
     planned, omitted = plan(scene, options)
     symbols = [layer_symbols(planned, i, options.raw_deformation) for i in range(len(planned.layers))]
-    meant = assemble(planned.info, planned.steps.attributes, symbols)
+    meant = assemble(planned.info, Grid.of(planned), symbols)
     if options.slices:
         values = np.split((utility or by_size)(meant), meant.rows[:-1])
         written = [write_slices(layer, options, u, HEADER) for layer, u in zip(symbols, values, strict=True)]
@@ -167,7 +168,7 @@ def with_metadata(data: bytes, metadata: Metadata) -> bytes:
 
 def _check_limits(scene: Scene, symbols: list[LayerSymbols], written: list[list[Slice]]) -> None:
     """Hold declared sizes and ranges of values against the format's limits as a decoder will, verified or not."""
-    declared, taken = Declared(), TakenVoxels()
+    declared, taken, grid = Declared(), TakenVoxels(), Grid.of(scene)
     chunks = sum(map(len, written))
     if chunks > MAX_CHUNKS:
         raise EncodeError(f"{chunks} slices, expected at most {MAX_CHUNKS}: let slices take more bytes")
@@ -178,7 +179,7 @@ def _check_limits(scene: Scene, symbols: list[LayerSymbols], written: list[list[
                     part.payload, layer.kind, layer.widths, declared, layer.raw_deformation, number > 0
                 )
                 layers = [*symbols[:index], part.symbols]
-                check_last_layer(layers, taken, scene.info.voxel_size, scene.steps.attributes)
+                check_last_layer(layers, taken, scene.info.voxel_size, grid)
             except DecodeError as error:
                 raise EncodeError(f"the scene is over a limit of the format: {error}") from None
 
@@ -200,6 +201,7 @@ def _container(meant: Scene, options: EncodeOptions, written: list[list[Slice]],
         deformation=options.deformation,
         attribute_steps=meant.steps.attributes,
         widths=meant.widths,
+        centre=Grid.of(meant).centre if meant.widths.graded else None,
         info=meant.info,
         error_bounds=rounding_bounds(meant, options.raw_deformation),
         digest=payload_digest(payloads),
@@ -215,7 +217,7 @@ def _verify(data: bytes, planned: Scene, symbols: list[LayerSymbols], meant: Sce
     and these with the ones given, those of `planned`."""
     try:
         header, decoded, _ = decode_layers(data)
-        scene = assemble(header.info, header.attribute_steps, decoded)
+        scene = assemble(header.info, header.grid, decoded)
     except DecodeError as error:
         raise EncodeError(f"verification: the file does not decode: {error}") from error
     if scene.layers != planned.layers or scene.rows != planned.rows:

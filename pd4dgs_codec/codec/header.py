@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike
 
-from pd4dgs_codec.attributes.quantise import is_step
+from pd4dgs_codec.attributes.quantise import MAX_SYMBOL, is_step
+from pd4dgs_codec.attributes.table import Grid
 from pd4dgs_codec.bitstream import canonical
 from pd4dgs_codec.bitstream.container import SCENE_ID_SIZE
 from pd4dgs_codec.bitstream.limits import MAX_CHUNKS, MAX_PAYLOAD
@@ -23,7 +24,7 @@ from pd4dgs_codec.scene import ATTRIBUTES, MAX_FEATURE, MAX_SLOTS, Camera, Scene
 
 # Keys of the header map.
 CHUNKS, MODE, DEFORMATION, STEPS, VOXEL_SIZE, BOX, TIME_RANGE, BACKGROUND, NEAR_FAR, UP, UNIT = range(1, 12)
-CAMERA, ERROR_BOUNDS, DIGEST, WIDTHS = range(12, 16)
+CAMERA, ERROR_BOUNDS, DIGEST, WIDTHS, CENTRE = range(12, 17)
 # Keys of the camera map.
 VIEWMAT, INTRINSICS, WIDTH, HEIGHT = range(1, 5)
 
@@ -49,9 +50,9 @@ DIGEST_SIZE = 16  #: bytes
 class Header:
     """chunks: (type, payload length in bytes) in file order. attribute_steps: by name, in the table's order.
 
-    widths: of the anchors. error_bounds: by field of Steps, how far a decoded value may lie from the one that the
-    encoder was given, in the unit of the values; a binary32 value >= 0. digest: payload_digest of the layers that were
-    encoded together.
+    widths: of the anchors. centre: int32 [channels] in steps, if they are graded. error_bounds: by field of Steps, how
+    far a decoded value may lie from the one that the encoder was given, in the unit of the values; a binary32 value >=
+    0. digest: payload_digest of the layers that were encoded together.
     """
 
     chunks: tuple[tuple[int, int], ...]
@@ -59,9 +60,16 @@ class Header:
     deformation: str
     attribute_steps: dict[str, float]
     widths: Widths
+    centre: np.ndarray | None
     info: SceneInfo
     error_bounds: dict[str, float]
     digest: bytes
+
+    @property
+    def grid(self) -> Grid:
+        """That of the attributes."""
+        centre = np.zeros(self.widths.channels, np.int32) if self.centre is None else self.centre
+        return Grid(self.attribute_steps, self.widths, centre)
 
     @property
     def raw_deformation(self) -> bool:
@@ -100,12 +108,14 @@ def pack_header(header: Header) -> bytes:
     bounds = header.error_bounds
     fields[ERROR_BOUNDS] = {number: bounds[name] for name, number in TENSOR_CLASSES.items() if name in bounds}
     fields |= {DIGEST: header.digest, WIDTHS: [header.widths.feature, header.widths.slots]}
+    if header.centre is not None:
+        fields[CENTRE] = header.centre.tolist()
     return canonical.pack(fields)
 
 
 def unpack_header(data: bytes, offset: int = 0) -> Header:
     """The inverse of pack_header (clause "header"); `offset` is that of the header's first byte, for messages."""
-    fields = Fields(canonical.unpack(data, offset=offset), "header", set(range(CHUNKS, WIDTHS + 1)))
+    fields = Fields(canonical.unpack(data, offset=offset), "header", set(range(CHUNKS, CENTRE + 1)))
     steps = fields.reals(STEPS, len(ATTRIBUTES))
     voxel_size = fields.real(VOXEL_SIZE)
     for name, step in zip(["voxel_size", *ATTRIBUTES], [voxel_size, *steps], strict=True):
@@ -129,6 +139,7 @@ def unpack_header(data: bytes, offset: int = 0) -> Header:
     fault = info_fault(info)
     if fault is not None:
         raise Malformed(f"header: {fault}")
+    widths = _unpack_widths(fields)
     chunks, mode = _unpack_chunks(fields.sequence(CHUNKS)), fields.choice(MODE, MODES)
     layers = layers_of(chunks)
     if mode == "lzma" and len(set(layers)) < len(layers):
@@ -138,7 +149,8 @@ def unpack_header(data: bytes, offset: int = 0) -> Header:
         mode=mode,
         deformation=fields.choice(DEFORMATION, DEFORMATIONS),
         attribute_steps=dict(zip(ATTRIBUTES, steps, strict=True)),
-        widths=_unpack_widths(fields.sequence(WIDTHS, 2)),
+        widths=widths,
+        centre=_unpack_centre(fields, widths),
         info=info,
         error_bounds=_unpack_error_bounds(fields),
         digest=_unpack_digest(fields.get(DIGEST)),
@@ -193,9 +205,19 @@ def layers_of(chunks: Iterable[tuple[int, int]]) -> list[int]:
     return [kind for kind, _ in chunks if kind in BY_CHUNK_TYPE]
 
 
-def _unpack_widths(values: list[Any]) -> Widths:
-    feature = as_integer(values[0], MAX_FEATURE, "header: feature width", low=1)
-    return Widths(feature, as_integer(values[1], MAX_SLOTS, "header: slots", low=1))
+def _unpack_widths(header: Fields) -> Widths:
+    feature, slots = header.sequence(WIDTHS, 2)
+    as_integer(feature, MAX_FEATURE, "header: feature width", low=1)
+    return Widths(feature, as_integer(slots, MAX_SLOTS, "header: slots", low=1), CENTRE in header)
+
+
+def _unpack_centre(header: Fields, widths: Widths) -> np.ndarray | None:
+    if not widths.graded:
+        return None
+    values = header.sequence(CENTRE, widths.channels)
+    return np.array(
+        [as_integer(m, MAX_SYMBOL, "header: a channel's centre", low=-MAX_SYMBOL) for m in values], np.int32
+    )
 
 
 def _unpack_error_bounds(header: Fields) -> dict[str, float]:

@@ -80,6 +80,7 @@ def info(data: bytes) -> dict[str, Any]:
         "voxel_size": header.info.voxel_size,
         "feature_width": header.widths.feature,
         "slots": header.widths.slots,
+        "graded": header.widths.graded,
         "steps": header.attribute_steps,
         "error_bounds": header.error_bounds,
         "anchors": declared.rows if all("anchors" in row for row in layers) else None,
@@ -129,10 +130,10 @@ def hashes(data: bytes, max_layer: int | None = None) -> list[dict[str, Any]]:
     those of its layers <= max_layer alone (bytes after those are not looked at).
 
     symbols: int32 little-endian, C order, of anchor_q [n, 3], the rise of earlier rows' mask codes, the codes of own
-    rows, attributes [channels, n], then planes [C, H, W] scale by scale in the order xy xz xt yz yt zt, then weight
-    [out, in] and bias [out] per linear layer, networks by ascending id; float32 planes and weights are left out.
-    tensors: float32 little-endian of anchor [n, 3], feature [n, D], scaling_log [n, 6], offset [n, G, 3] of own rows,
-    then planes and networks as above.
+    rows, their step classes if there are any, attributes [channels, n], then planes [C, H, W] scale by scale in the
+    order xy xz xt yz yt zt, then weight [out, in] and bias [out] per linear layer, networks by ascending id; float32
+    planes and weights are left out. tensors: float32 little-endian of anchor [n, 3], feature [n, D], scaling_log [n,
+    6], offset [n, G, 3] of own rows, then planes and networks as above.
     """
     reader, _ = read_layers(data, max_layer=max_layer)
     scene = reader.scene()

@@ -152,7 +152,7 @@ def declared_symbols(meta: LayerMeta, kind: LayerKind, rises: int) -> int:
     """Symbols (or float32 values) that the parameters say the slice has, voxel indices and masks included."""
     cells = sum(math.prod(shape) for shape in meta.plane_shapes())
     weights = sum(math.prod(shape) for shape in meta.weight_shapes(kind)) if meta.networks else 0
-    return rises + meta.rows * (meta.widths.channels + 4) + cells + weights
+    return rises + meta.rows * (meta.widths.channels + meta.widths.graded + 4) + cells + weights
 
 
 def check_symbol_count(meta: LayerMeta, kind: LayerKind, before: Declared, payload_bytes: int, rises: int) -> Declared:

@@ -49,6 +49,7 @@ def tensor_bytes(tensors: Deformation, kind: LayerKind, steps: Steps, options: E
         anchor_q=np.zeros((0, 3), np.int32),
         mask_increase=empty,
         mask_own=empty,
+        classes=empty,
         attributes=np.zeros((0, 0), np.int32),
         planes=tensors.planes,
         networks=tensors.networks,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from pd4dgs_codec.attributes.quantise import quantise
+from pd4dgs_codec.attributes.table import Grid, attribute_rows, classes_of
 from pd4dgs_codec.scene import MASK_STEP, Scene
 
 #: First part of the names of each layer's networks and planes.
@@ -16,10 +17,16 @@ def to_npz_dict(scene: Scene, symbols: bool = False) -> dict[str, np.ndarray]:
     (float32 masks of the first rows); mlp.NAME.weight.i and .bias.i with NAME opacity, covariance, color, global.trunk,
     global.position ... local.mean ...; planes.{global,local}.SCALE.PLANE; meta_* for the rest.
 
+    Where anchors are graded also step_class (uint8) and NAME_centre (float32) per attribute: its values are the centre
+    and multiples of 2^step_class steps beside it.
+
     symbols: also NAME_q (int32) and NAME_step (float32) for every quantised array; anchor_step is the voxel size.
     """
-    arrays = {"anchor": scene.anchor, **scene.attributes}
-    steps = scene.steps.attributes
+    arrays, steps = {"anchor": scene.anchor, **scene.attributes}, dict[str, float]()
+    if scene.grading is not None:
+        arrays["step_class"] = scene.grading.classes
+        for name, centre in attribute_rows(scene.grading.centre, scene.widths):
+            arrays[f"{name}_centre"] = centre.reshape(scene.widths.attributes[name])
     for layer, owner in PREFIXES.items():
         tensors = scene.tensors(layer)
         for name, network in tensors.networks.items():
@@ -33,6 +40,10 @@ def to_npz_dict(scene: Scene, symbols: bool = False) -> dict[str, np.ndarray]:
                 steps[f"planes.{owner}.{s}.{name}"] = scene.steps.planes(layer)
     if symbols:
         quantised = {name: quantise(arrays[name], step, name) for name, step in steps.items()}
+        channels = Grid.of(scene).quantise(scene.attributes, classes_of(scene))
+        for name, rows in attribute_rows(channels, scene.widths):
+            quantised[name] = rows.T.reshape(arrays[name].shape)
+        steps |= scene.steps.attributes
         arrays |= {f"{name}_q": k for name, k in quantised.items()}
         arrays |= {f"{name}_step": np.float32(step) for name, step in steps.items()}
         arrays |= {"anchor_q": scene.anchor_q, "anchor_step": np.float32(scene.info.voxel_size)}

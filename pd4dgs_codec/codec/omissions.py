@@ -14,6 +14,7 @@ from dataclasses import replace
 import numpy as np
 
 from pd4dgs_codec.attributes.quantise import dequantise, quantise
+from pd4dgs_codec.attributes.table import Grid, classes_of
 from pd4dgs_codec.codec.kinds import LAYER_KINDS, LayerKind
 from pd4dgs_codec.codec.left_out import LeftOut
 from pd4dgs_codec.codec.plane_choice import choose_predictor, fill_plane
@@ -96,11 +97,13 @@ class _Omissions:
         head = self._networks(LAYER_KINDS[1]).get("feature")
         moved = np.zeros(width, bool) if head is None else np.any([head[-1][0].any(1), head[-1][1] != 0], axis=0)
         zero = ~self.decoded.feature.any(axis=0)
-        stale = unread & ~zero
+        grid, classes = Grid.of(self.decoded), classes_of(self.decoded)
+        idle_value = dequantise(grid.centre[:width], grid.steps["feature"])  # which anchors of every class can have
+        stale = unread & (self.decoded.feature != idle_value).any(axis=0)
         if stale.any():
-            symbols = quantise(self.decoded.feature[:, stale], self.scene.steps.feature, "feature")
-            self._note(f"{int(stale.sum())} feature channels", "no network reads them", _bits(symbols.T))
-            self._edit(lambda scene: replace(scene, feature=np.where(unread, np.float32(0), scene.feature)))
+            symbols = grid.symbols_of("feature", self.decoded.feature, classes)
+            self._note(f"{int(stale.sum())} feature channels", "no network reads them", _bits(symbols[stale]))
+            self._edit(lambda scene: replace(scene, feature=np.where(unread, idle_value, scene.feature)))
         if (unread & moved).any():
             self._zero_weights(LAYER_KINDS[1], "feature", -1, lambda w, b: _zero(w, b, rows=unread), "rows")
         idle = np.concatenate([zero & ~moved, np.zeros(3, bool)])
@@ -189,22 +192,21 @@ class _Omissions:
             self._free_cells(kind, cells)
 
     def _without_offsets(self, shown: np.ndarray) -> tuple[np.ndarray, float]:
-        """(offset symbols [N, 3 G], the commonest ones for Gaussians that are not `shown` bool [N, G], bits saved)."""
-        n, slots = shown.shape
-        symbols = quantise(self.decoded.offset, self.scene.steps.offset, "offset").reshape(n, 3 * slots)
-        free = np.repeat(~shown, 3, axis=1)
+        """(offset symbols [3 G, N], the commonest ones for Gaussians that are not `shown` bool [N, G], bits saved)."""
+        symbols = Grid.of(self.decoded).symbols_of("offset", self.decoded.offset, classes_of(self.decoded))
+        free = np.repeat(~shown.T, 3, axis=0)
         freed = symbols.copy()
-        for channel in range(symbols.shape[1]):
-            taken = symbols[~free[:, channel], channel]
+        for channel, own in enumerate(free):
+            taken = symbols[channel, ~own]
             values, counts = np.unique(taken, return_counts=True)
-            freed[free[:, channel], channel] = values[counts.argmax()] if taken.size else 0
-        return freed, 0.0 if (freed == symbols).all() else _bits(symbols.T) - _bits(freed.T)
+            freed[channel, own] = values[counts.argmax()] if taken.size else 0
+        return freed, 0.0 if (freed == symbols).all() else _bits(symbols) - _bits(freed)
 
     def _free_offsets(self, shown: np.ndarray) -> None:
         if shown.all():
             return
         freed, bits = self._without_offsets(shown)
-        values = dequantise(freed, self.scene.steps.offset).reshape(self.decoded.offset.shape)
+        values = Grid.of(self.decoded).values_of("offset", freed, classes_of(self.decoded))
         if (values == self.decoded.offset).all():
             return
         self._note(f"offsets of {int((~shown).sum())} Gaussians", "no view shows them at any time", bits)

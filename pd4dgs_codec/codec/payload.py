@@ -15,8 +15,9 @@ import numpy as np
 
 from pd4dgs_codec.attributes import planes as decorrelation
 from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
+from pd4dgs_codec.attributes.table import NO_CLASSES
 from pd4dgs_codec.bitstream.limits import MAX_PARAMETERS
-from pd4dgs_codec.codec.attribute_section import Past, read_attributes, write_attributes
+from pd4dgs_codec.codec.attribute_section import Past, by_class, check_classes, read_attributes, write_attributes
 from pd4dgs_codec.codec.kinds import LayerKind
 from pd4dgs_codec.codec.layer_meta import (
     Declared,
@@ -31,7 +32,7 @@ from pd4dgs_codec.codec.options import EncodeOptions
 from pd4dgs_codec.codec.plane_choice import choose_predictor
 from pd4dgs_codec.codec.plane_section import read_planes, write_planes
 from pd4dgs_codec.codec.symbols import LayerSymbols
-from pd4dgs_codec.entropy.bits import gaussian_bits
+from pd4dgs_codec.entropy.bits import entropy_bits, gaussian_bits
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
 from pd4dgs_codec.entropy.fitting import Fitted
 from pd4dgs_codec.entropy.lzma_mode import (
@@ -63,11 +64,11 @@ def write_layer(
     symbols: LayerSymbols,
     options: EncodeOptions,
     past: Past[Fitted] | None = None,
-    population: np.ndarray | None = None,
+    population: LayerSymbols | None = None,
 ) -> tuple[bytes, list[StreamReport]]:
     """(payload, what each section took; the first report is the positions'). Inverse: read_layer.
 
-    past: of the layer's slices before this one, which is added. population: attributes int32 [68, m] of the layer.
+    past: of the layer's slices before this one, which is added. population: the whole layer.
     """
     groups, predictors = channel_groups(symbols)
     past = past or Past()
@@ -80,14 +81,15 @@ def write_layer(
         if not any(channel.size for channel in channels):
             continue
         if section == Section.ATTRIBUTES:
+            everything = None if population is None else (population.attributes, population.classes)
             data, rate_bits = write_attributes(
-                symbols.attributes, symbols.widths, options.priors, options.effort, past, population
+                symbols.attributes, symbols.classes, symbols.widths, options.priors, options.effort, past, everything
             )
         elif section == Section.PLANES:
             data, rate_bits = write_planes(_by_plane(channels, symbols), options.priors, options.effort)
         elif options.mode == "lzma":  # one stream for all, but a layer's rate counts no masks
             coded = encode_channels_lzma(channels, effort=options.effort)
-            data, rate_bits = coded.payload, coded.rate_bits - sum(gaussian_bits(c) for c in channels[:2])
+            data, rate_bits = coded.payload, _rate_bits(symbols, coded.rate_bits, channels)
         else:
             known = past.masks if section == Section.MASKS else []
             coded = encode_channels(channels, priors=options.priors, effort=options.effort, known=known)
@@ -103,11 +105,22 @@ def write_layer(
     return b"".join([struct.pack("<I", len(meta)), meta, *sections.values()]), reports
 
 
+def _rate_bits(symbols: LayerSymbols, rate_bits: float, channels: list[np.ndarray]) -> float:
+    """The rate of all channels of a layer but the masks, with attributes by step class, from that of each as it is."""
+    rate_bits -= sum(gaussian_bits(c) for c in channels[:2])
+    if symbols.widths.graded:
+        graded = channels[2 : 3 + symbols.widths.channels]
+        parts = by_class(symbols.attributes, symbols.classes)
+        rate_bits += entropy_bits(symbols.classes) + sum(gaussian_bits(c) for c in parts if c.size)
+        rate_bits -= sum(gaussian_bits(c) for c in graded if c.size)
+    return rate_bits
+
+
 def channel_groups(symbols: LayerSymbols) -> tuple[dict[Section, list[np.ndarray]], list[int]]:
     """(1-D int32 channels per group, predictor per plane)."""
     groups: dict[Section, list[np.ndarray]] = {section: [] for section in GROUPS}
     groups[Section.MASKS] = [symbols.mask_increase, symbols.mask_own]
-    groups[Section.ATTRIBUTES] = list(symbols.attributes)
+    groups[Section.ATTRIBUTES] = [*([symbols.classes] if symbols.widths.graded else []), *symbols.attributes]
     tensors = [] if symbols.raw_deformation else list(symbols.tensors())
     n_planes = len(PLANES) * len(symbols.planes)
     predictors = [0] * n_planes
@@ -204,12 +217,14 @@ def read_layer(
     increase, own = channels[Section.MASKS]
     _check_ranges(kind, increase, own)
     planes, networks = _shape_tensors(meta, tensors)
+    classes = channels[Section.ATTRIBUTES].pop(0) if widths.graded else NO_CLASSES
+    check_classes(classes)
     attributes = np.stack(channels[Section.ATTRIBUTES])
     for tensor in (attributes, *tensors):
         if tensor.dtype.kind == "i" and tensor.size and max(int(tensor.max()), -int(tensor.min())) > MAX_SYMBOL:
             raise Malformed(f"layer {kind.layer}: a symbol over {MAX_SYMBOL} in magnitude")
     return LayerSymbols(
-        kind, widths, anchor_q, increase, own, attributes, planes, networks, meta.steps, raw_deformation
+        kind, widths, anchor_q, increase, own, classes, attributes, planes, networks, meta.steps, raw_deformation
     )
 
 
@@ -226,7 +241,7 @@ def _channel_counts(meta: LayerMeta, kind: LayerKind, rises: int, raw_deformatio
     weights = [] if raw_deformation else [math.prod(shape) for shape in meta.weight_shapes(kind)]
     return {
         Section.MASKS: [rises, meta.rows],
-        Section.ATTRIBUTES: [meta.rows] * meta.widths.channels,
+        Section.ATTRIBUTES: [meta.rows] * (meta.widths.channels + meta.widths.graded),
         Section.PLANES: planes,
         Section.WEIGHTS: weights,
     }
@@ -250,7 +265,8 @@ def _decode_groups(
         if not data:
             channels[section] = _zeros(counts[section])
         elif section == Section.ATTRIBUTES:
-            channels[section] = list(read_attributes(data, meta.widths, rows, past))
+            classes, attributes = read_attributes(data, meta.widths, rows, past)
+            channels[section] = [*([classes] if meta.widths.graded else []), *attributes]
         elif section == Section.PLANES:
             channels[section] = [
                 channel.ravel() for plane in read_planes(data, meta.plane_shapes()) for channel in plane

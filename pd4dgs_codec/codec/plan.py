@@ -66,6 +66,7 @@ def _cut(scene: Scene, highest: int) -> tuple[Scene, list[LeftOut]]:
         scaling_log=scene.scaling_log,
         offset=scene.offset,
         mask=tuple(scene.full_masks()[:kept]),
+        grading=scene.grading,
     )
     return cut, left_out
 
@@ -89,6 +90,7 @@ def _arrange(scene: Scene, kept: tuple[int, ...]) -> tuple[Scene, int]:
         scaling_log=scene.scaling_log[order],
         offset=scene.offset[order],
         mask=tuple(m[order][:n] for m, n in zip(masks, rows, strict=True)),
+        grading=scene.grading.take(order) if scene.grading is not None and scene.grading.classes[order].any() else None,
     )
     return arranged, scene.rows[-1] - order.size
 

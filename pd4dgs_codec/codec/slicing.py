@@ -59,7 +59,7 @@ def write_slices(layer: LayerSymbols, options: EncodeOptions, utility: np.ndarra
             part = rows[done : done + count]
             symbols = sliced(layer, [rows[:0], part] if found else [part])[-1]
             trial = past.copy()
-            payload, streams = write_layer(symbols, options, trial, layer.attributes)
+            payload, streams = write_layer(symbols, options, trial, layer)
             if count:
                 scale *= max(len(payload) - fixed, 1) / max(expected[count - 1] - fixed, 1)
             if len(payload) <= room or count <= least:

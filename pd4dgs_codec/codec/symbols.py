@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from pd4dgs_codec.attributes.quantise import all_finite, dequantise, quantise
-from pd4dgs_codec.attributes.table import attribute_rows, dequantise_attributes, quantise_attributes
+from pd4dgs_codec.attributes.quantise import MAX_SYMBOL, all_finite, dequantise, quantise
+from pd4dgs_codec.attributes.table import Grid, attribute_rows, classes_of
 from pd4dgs_codec.codec.kinds import LAYER_KINDS, LayerKind
 from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.morton import MAX_VOXEL, morton_order
-from pd4dgs_codec.scene import PLANES, Deformation, Network, Planes, Scene, SceneInfo, Steps, Widths
+from pd4dgs_codec.scene import PLANES, Deformation, Grading, Network, Planes, Scene, SceneInfo, Steps, Widths
 
 #: (name for messages, array) -> array of the same shape.
 ArrayMap = Callable[[str, np.ndarray], np.ndarray]
@@ -23,10 +23,10 @@ class LayerSymbols:
     """What one layer carries, or one slice of it: later slices have anchors with their masks and attributes alone.
 
     widths: of the anchors. anchor_q: int32 [n, 3] voxel indices of its own anchors, in Morton order. mask_increase:
-    int32 [rows before] rise of the earlier anchors' mask codes, mask_own: int32 [n] codes of its own. attributes: int32
-    [channels, n]. planes, networks: int32 symbols, or float32 values if raw_deformation; networks in the order of their
-    registry ids. steps: quantisation steps of this layer by name, as in LayerKind.step_names; empty if it has no
-    networks.
+    int32 [rows before] rise of the earlier anchors' mask codes, mask_own: int32 [n] codes of its own. classes: int32
+    [n] step classes, or NO_CLASSES. attributes: int32 [channels, n]. planes, networks: int32 symbols, or float32 values
+    if raw_deformation; networks in the order of their registry ids. steps: quantisation steps of this layer by name, as
+    in LayerKind.step_names; empty if it has no networks.
     """
 
     kind: LayerKind
@@ -34,6 +34,7 @@ class LayerSymbols:
     anchor_q: np.ndarray
     mask_increase: np.ndarray
     mask_own: np.ndarray
+    classes: np.ndarray
     attributes: np.ndarray
     planes: Planes
     networks: dict[str, Network]
@@ -51,7 +52,7 @@ class LayerSymbols:
 
     def arrays(self) -> list[np.ndarray]:
         """All arrays in their canonical order, the one in which info --hashes digests the integers among them."""
-        return [self.anchor_q, self.mask_increase, self.mask_own, self.attributes, *self.tensors()]
+        return [self.anchor_q, self.mask_increase, self.mask_own, self.classes, self.attributes, *self.tensors()]
 
 
 def merged(slices: Sequence[LayerSymbols]) -> LayerSymbols:
@@ -64,6 +65,7 @@ def merged(slices: Sequence[LayerSymbols]) -> LayerSymbols:
         slices[0],
         anchor_q=anchor_q[order],
         mask_own=np.concatenate([part.mask_own for part in slices])[order],
+        classes=np.concatenate([part.classes for part in slices])[order if slices[0].widths.graded else slice(0)],
         attributes=np.concatenate([part.attributes for part in slices], axis=1)[:, order],
     )
 
@@ -79,6 +81,7 @@ def sliced(layer: LayerSymbols, parts: Sequence[np.ndarray]) -> list[LayerSymbol
             bare if number else layer,
             anchor_q=layer.anchor_q[rows],
             mask_own=layer.mask_own[rows],
+            classes=layer.classes[rows] if layer.widths.graded else layer.classes,
             attributes=layer.attributes[:, rows],
         )
         for number, rows in enumerate(ordered)
@@ -138,13 +141,15 @@ def layer_symbols(scene: Scene, index: int, raw_deformation: bool = False) -> La
     raw_deformation = raw_deformation and kind.layer > 0 and bool(tensors.networks)
     if not raw_deformation:
         tensors = quantise_tensors(tensors, kind, scene.steps)
+    classes = classes_of(scene)[first:last]
     return LayerSymbols(
         kind=kind,
         widths=scene.widths,
         anchor_q=scene.anchor_q[first:last],
         mask_increase=codes[:first] - before,
         mask_own=codes[first:],
-        attributes=quantise_attributes({k: v[first:last] for k, v in scene.attributes.items()}, scene.steps.attributes),
+        classes=classes,
+        attributes=Grid.of(scene).quantise({k: v[first:last] for k, v in scene.attributes.items()}, classes),
         planes=tensors.planes,
         networks={name: tensors.networks[name] for name in kind.network_ids if name in tensors.networks},
         steps=layer_steps(scene.steps, kind) if tensors.networks else {},
@@ -152,14 +157,20 @@ def layer_symbols(scene: Scene, index: int, raw_deformation: bool = False) -> La
     )
 
 
-def assemble(info: SceneInfo, attribute_steps: dict[str, float], layers: Sequence[LayerSymbols]) -> Scene:
+def assemble(info: SceneInfo, grid: Grid, layers: Sequence[LayerSymbols]) -> Scene:
     """The decoded scene of a prefix of layers (clause "dequantisation"), each of which check_last_layer let pass.
 
     Steps of absent tensors keep Steps' defaults.
     """
-    steps = Steps(**attribute_steps, **{k: v for layer in layers for k, v in layer.steps.items()})
+    steps = Steps(**grid.steps, **{k: v for layer in layers for k, v in layer.steps.items()})
     attributes = np.concatenate([layer.attributes for layer in layers], axis=1)
-    values = dequantise_attributes(attributes, layers[0].widths, attribute_steps)
+    classes = np.concatenate([layer.classes for layer in layers])
+    values = grid.dequantise(attributes, classes)
+    grading = None
+    if grid.widths.graded:
+        rows = attribute_rows(grid.centre, grid.widths)
+        centre = np.concatenate([dequantise(m, grid.steps[name]) for name, m in rows])
+        grading = Grading(classes.astype(np.uint8), centre)
     masks = _mask_codes(layers)
     tensors = {layer.kind.layer: _decoded_tensors(layer, steps) for layer in layers}
     return Scene(
@@ -175,6 +186,7 @@ def assemble(info: SceneInfo, attribute_steps: dict[str, float], layers: Sequenc
         networks=tensors[0].networks,
         global_deformation=tensors[1] if 1 in tensors and tensors[1].networks else None,
         local_deformation=tensors[2] if 2 in tensors and tensors[2].networks else None,
+        grading=grading,
     )
 
 
@@ -203,13 +215,12 @@ class TakenVoxels:
         self._keys = np.insert(self._keys, at, keys)
 
 
-def check_last_layer(
-    layers: Sequence[LayerSymbols], taken: TakenVoxels, voxel_size: float, attribute_steps: dict[str, float]
-) -> None:
+def check_last_layer(layers: Sequence[LayerSymbols], taken: TakenVoxels, voxel_size: float, grid: Grid) -> None:
     """The rules for a slice that its payload alone cannot show broken, given the header and what stands before it.
 
     layers: the slice, after the layers before its own. taken: by the slices before; its own voxels are added. Raises
-    Malformed if a mask code is above 255, a voxel is taken, or a reconstructed value would not be finite.
+    Malformed if a mask code is above 255, a voxel is taken, an attribute lies too many steps from 0, or a reconstructed
+    value would not be finite.
     """
     layer = layers[-1]
     if layer.mask_increase.size:
@@ -217,16 +228,19 @@ def check_last_layer(
         if highest > 255:
             raise Malformed(f"layer {layer.kind.layer}: mask code {highest}, expected at most 255")
     taken.take(layer.anchor_q)
-    if not all(all_finite(k, step) for k, step in _with_steps(layer, voxel_size, attribute_steps)):
+    indices = grid.indices(layer.attributes, layer.classes)
+    if indices.size and max(int(indices.max()), -int(indices.min())) > MAX_SYMBOL:
+        raise Malformed(f"layer {layer.kind.layer}: an attribute more than {MAX_SYMBOL} steps from 0")
+    if not all(all_finite(k, step) for k, step in _with_steps(layer, indices, voxel_size, grid)):
         raise Malformed(f"layer {layer.kind.layer}: a reconstructed value is not finite")
 
 
 def _with_steps(
-    layer: LayerSymbols, voxel_size: float, attribute_steps: dict[str, float]
+    layer: LayerSymbols, indices: np.ndarray, voxel_size: float, grid: Grid
 ) -> Iterator[tuple[np.ndarray, float]]:
-    """(symbols, their step) of everything in `layer` that is dequantised."""
+    """(multiples, their step) of everything in `layer` that is dequantised. indices: those of the attributes."""
     yield layer.anchor_q, voxel_size
-    yield from ((rows, attribute_steps[name]) for name, rows in attribute_rows(layer.attributes, layer.widths))
+    yield from ((rows, grid.steps[name]) for name, rows in attribute_rows(indices, grid.widths))
     if not layer.raw_deformation:
         planes, steps = len(PLANES) * len(layer.planes), list(layer.steps.values())
         yield from ((k, steps[0 if i < planes else -1]) for i, k in enumerate(layer.tensors()))
@@ -240,13 +254,9 @@ def _decoded_tensors(layer: LayerSymbols, steps: Steps) -> Deformation:
 def rounded(scene: Scene, raw_deformation: bool = False) -> Scene:
     """`scene` with the values that come back from its file. Raises EncodeError for one that has no symbol."""
     steps = scene.steps
-    attributes = {
-        name: dequantise(quantise(x, steps.attributes[name], name), steps.attributes[name])
-        for name, x in scene.attributes.items()
-    }
-    result = replace(
-        scene, feature=attributes["feature"], scaling_log=attributes["scaling_log"], offset=attributes["offset"]
-    )
+    grid, classes = Grid.of(scene), classes_of(scene)
+    values = grid.dequantise(grid.quantise(scene.attributes, classes), classes)
+    result = replace(scene, feature=values["feature"], scaling_log=values["scaling_log"], offset=values["offset"])
     for kind in LAYER_KINDS[:1] if raw_deformation else LAYER_KINDS:
         if kind.layer == 0 or scene.deformation(kind.layer) is not None:
             result = result.with_tensors(kind.layer, round_tensors(scene.tensors(kind.layer), kind, steps))

@@ -49,6 +49,11 @@ class ByteReader:
                 return value
         raise Malformed(f"{what} is longer than {_MAX_BYTES} bytes", offset=start)
 
+    def take(self, size: int) -> bytes:
+        """The next `size` bytes, which are there."""
+        self.offset += size
+        return bytes(self._data[self.offset - size : self.offset])
+
     def byte(self, what: str, limit: int = 255) -> int:
         """The next byte, at most `limit`."""
         if not self.remaining:

@@ -26,13 +26,13 @@ from pd4dgs_codec.errors import DataError, Pd4Error
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.scene import (
-    ATTRIBUTES,
     GLOBAL_HEADS,
     LOCAL_HEADS,
     PLANES,
     SCAFFOLD_NETWORKS,
     Camera,
     Deformation,
+    Grading,
     Network,
     Scene,
     SceneInfo,
@@ -190,15 +190,19 @@ def _build(content: dict[str, Any]) -> Model:
         layers=(0, 1, 2),
         rows=(n, n, n),
         anchor_q=state["anchor_q"],
-        **{name: np.zeros(state[name].shape, np.float32) for name in ATTRIBUTES},
+        feature=np.zeros(state["feature"].shape, np.float32),
+        scaling_log=np.zeros(state["scaling_log"].shape, np.float32),
+        offset=np.zeros(state["offset"].shape, np.float32),
         mask=(np.full(n, 255, np.uint8),) * 3,
         networks={name: network(f"networks.{name}") for name in SCAFFOLD_NETWORKS},
         global_deformation=deformation("global"),
         local_deformation=deformation("local"),
+        grading=Grading(state["step_class"], state["centre"]) if "step_class" in state else None,
     )
     check_scene(replace(scene, steps=scene.steps.scaled(1.0)))
     model = from_scene(scene)
-    model.load_state_dict(content["state"])
+    without = {name: tensor for name, tensor in model.state_dict().items() if name in ("step_class", "centre")}
+    model.load_state_dict(without | content["state"])  # checkpoints from before there were classes have none
     return model
 
 

@@ -11,7 +11,7 @@ from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.masks import mask_logits
 from pd4dgs_codec.model.mlp import MLP
 from pd4dgs_codec.model.model import Model
-from pd4dgs_codec.scene import MASK_STEP, SCAFFOLD_NETWORKS, Scene
+from pd4dgs_codec.scene import MASK_STEP, SCAFFOLD_NETWORKS, Grading, Scene
 
 
 def to_scene(model: Model) -> Scene:
@@ -41,6 +41,7 @@ def to_scene(model: Model) -> Scene:
         networks={name: model.network(name).arrays() for name in SCAFFOLD_NETWORKS},
         global_deformation=global_deformation,
         local_deformation=local_deformation,
+        grading=Grading(_numpy(model.step_class), _numpy(model.centre)) if model.step_class.any() else None,
     )
 
 
@@ -69,6 +70,7 @@ def from_scene(scene: Scene) -> Model:
         {name: MLP.from_arrays(net) for name, net in scene.networks.items()},
         global_field,
         local_field,
+        *(() if scene.grading is None else map(torch.from_numpy, (scene.grading.classes, scene.grading.centre))),
     )
 
 

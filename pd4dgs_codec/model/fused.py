@@ -82,12 +82,17 @@ def pick(
     steps: tuple[float, float, float],
     noise: tuple[Tensor, Tensor, Tensor] | None,
     rounding: bool,
+    spacing: Tensor,
+    centres: tuple[Tensor, Tensor, Tensor],
 ) -> Tensor:
     """[n, 9 + D + 3 G]: the anchors `rows` (int64 [n], none twice) with noise of so many steps, or rounded to steps.
 
-    attributes: feature [N, D], offset [N, G, 3], scaling [N, 6]; steps and noise ([n, width] each) of the same.
+    attributes: feature [N, D], offset [N, G, 3], scaling [N, 6]; steps, noise ([n, width] each) and
+    centres [width] of the same; spacing [N]: what an anchor's steps are multiplied with.
     """
-    row: Tensor = _Pick.apply(*attributes, position, rows, steps, noise, rounding)  # type: ignore[no-untyped-call]
+    row: Tensor = _Pick.apply(  # type: ignore[no-untyped-call]
+        *attributes, position, rows, steps, noise, rounding, spacing, centres
+    )
     return row
 
 
@@ -103,15 +108,21 @@ class _Pick(torch.autograd.Function):
         steps: tuple[float, float, float],
         noise: tuple[Tensor, Tensor, Tensor] | None,
         rounding: bool,
+        spacing: Tensor,
+        centres: tuple[Tensor, Tensor, Tensor],
     ) -> Tensor:
         ctx.save_for_backward(rows)
         ctx.shapes = [feature.shape, offset.shape, scaling.shape]
         parts = [position, feature, offset.flatten(1), scaling]
         out = feature.new_empty(len(rows), sum(part.shape[1] for part in parts))
         column = 0
-        for part, step, drawn in zip(parts, (0.0, *steps), (None, *(noise or (None,) * 3)), strict=True):
-            given = part[:0] if drawn is None else drawn.reshape(len(rows), -1)
-            kernels.pick(out.numpy(), column, part.numpy(), rows.numpy(), given.numpy(), step, rounding and step > 0)
+        drawn = (None, *(noise or (None,) * 3))
+        for part, step, own, centre in zip(parts, (0.0, *steps), drawn, (position[:1], *centres), strict=True):
+            given = part[:0] if own is None else own.reshape(len(rows), -1)
+            kernels.pick(
+                out.numpy(), column, part.numpy(), rows.numpy(), given.numpy(), step, rounding and step > 0,
+                spacing.numpy(), centre.flatten().numpy(),
+            )  # fmt: skip
             column += part.shape[1]
         return out
 
@@ -125,7 +136,7 @@ class _Pick(torch.autograd.Function):
             flat = gradient.flatten(1)
             kernels.pick_backward(flat.numpy(), g.numpy(), column, rows.numpy())
             column += flat.shape[1]
-        return *gradients, None, None, None, None, None
+        return *gradients, None, None, None, None, None, None, None
 
 
 # -- deformation -------------------------------------------------------------------------------------------------------

@@ -1,4 +1,7 @@
-"""How much a picture would change without an anchor: the measure by which anchors leave a layer or a model."""
+"""How much a picture would change without an anchor, or by a step of its attributes.
+
+The measures by which anchors leave a layer or a model, and by which they get their step classes.
+"""
 
 from __future__ import annotations
 
@@ -10,7 +13,7 @@ from torch import Tensor
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.picture import draw
 from pd4dgs_codec.model.rounding import EXACT, Rounding
-from pd4dgs_codec.scene import Camera
+from pd4dgs_codec.scene import ATTRIBUTES, Camera
 
 #: Random pictures of signs per view from which an anchor's weight is estimated.
 PROBES = 2
@@ -65,9 +68,43 @@ def _squared(image: Tensor, gate: Tensor, generator: torch.Generator, weights: T
     """float64 [N]: the squared norm of the picture's derivative by each gate, estimated."""
     total = torch.zeros(len(gate), dtype=torch.float64, device=gate.device)
     for _ in range(PROBES):
-        signs = (torch.randint(0, 2, image.shape, generator=generator).float() * 2 - 1).to(gate.device)
-        if weights is not None:
-            signs = signs * weights.sqrt()[:, :, None]
+        signs = _signs(image, generator, weights)
         (slope,) = torch.autograd.grad((image * signs).sum(), gate, retain_graph=True)
         total += slope.double().square() / PROBES
     return total
+
+
+def step_harm(
+    model: Model,
+    level: int,
+    t: float,
+    camera: Camera,
+    generator: torch.Generator,
+    *,
+    weights: Tensor | None = None,
+    rounding: Rounding = EXACT,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """(float64 [N] the squared error, summed over pixels and colours, that rounding an anchor's attributes to the
+    model's steps adds, about; bool [N] whether the picture comes near it; the picture [H, W, 3]). Arguments as those of
+    `anchor_harm`, by whose method the derivative by each scalar is squared; the error of a step Q is Q^2 / 12 on
+    average.
+    """
+    values = [getattr(model, name) for name in ATTRIBUTES]
+    with torch.enable_grad():
+        g = model.gaussians(level, t, camera, rounding)
+        image = draw(model.info, g, camera).image
+        met = torch.zeros(len(model.anchor_q), dtype=torch.bool, device=image.device)
+        met[g.anchors] = True
+        if not len(g.scales):
+            return met.double(), met, image.detach()
+        slopes = torch.autograd.grad((image * _signs(image, generator, weights)).sum(), values)
+    total = torch.zeros(len(met), dtype=torch.float64, device=image.device)
+    for name, slope in zip(ATTRIBUTES, slopes, strict=True):
+        total += slope.double().square().flatten(1).sum(1) * (getattr(model.steps, name) ** 2 / 12)
+    return total, met, image.detach()
+
+
+def _signs(image: Tensor, generator: torch.Generator, weights: Tensor | None) -> Tensor:
+    """Random signs [H, W, 3] times the roots of the pixels' weights [H, W]."""
+    signs = (torch.randint(0, 2, image.shape, generator=generator).float() * 2 - 1).to(image.device)
+    return signs if weights is None else signs * weights.sqrt()[:, :, None]

@@ -10,6 +10,7 @@ The gate m^(level) multiplies each Gaussian's final opacity and scale, after the
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import cast
 
@@ -26,6 +27,7 @@ from pd4dgs_codec.model.rounding import EXACT, Rounding, round_straight_through
 from pd4dgs_codec.model.slots import assemble, slot_linear
 from pd4dgs_codec.model.visibility import FRUSTUM_MARGIN, MIN_OPACITY, OFFSET_REACH, SIGMA_REACH
 from pd4dgs_codec.scene import (
+    ATTRIBUTES,
     LOCAL_HEADS,
     MASK_THRESHOLD,
     SCAFFOLD_NETWORKS,
@@ -67,9 +69,12 @@ def camera_centre(camera: Camera, device: torch.device) -> Tensor:
 
 
 class Model(nn.Module):
-    """Anchors, networks, deformations and masks. All tensors float32 but anchor_q (int32 [N, 3])."""
+    """Anchors, networks, deformations and masks. All tensors float32 but anchor_q (int32 [N, 3]) and step_class (uint8
+    [N]). step_class and centre [channels] are those of `scene.Grading`."""
 
     anchor_q: Tensor
+    step_class: Tensor
+    centre: Tensor
 
     def __init__(
         self,
@@ -83,10 +88,16 @@ class Model(nn.Module):
         networks: dict[str, MLP],
         global_deformation: DeformationField | None,
         local_deformation: DeformationField | None,
+        step_class: Tensor | None = None,
+        centre: Tensor | None = None,
     ):
         super().__init__()
         self.info, self.steps = info, steps
         self.register_buffer("anchor_q", anchor_q)
+        widths = Widths(feature.shape[1], offset.shape[1])
+        no_class, no_centre = torch.zeros(len(anchor_q), dtype=torch.uint8), torch.zeros(widths.channels)
+        self.register_buffer("step_class", no_class if step_class is None else step_class)
+        self.register_buffer("centre", no_centre if centre is None else centre)
         self.feature = nn.Parameter(feature)
         self.scaling_log = nn.Parameter(scaling_log)
         self.offset = nn.Parameter(offset)
@@ -104,6 +115,18 @@ class Model(nn.Module):
     def widths(self) -> Widths:
         """Feature width and slots, as its tensors have them."""
         return Widths(self.feature.shape[1], self.offset.shape[1])
+
+    @property
+    def spacing(self) -> Tensor:
+        """[N], 2^c: what the steps of each anchor's attributes are multiplied with."""
+        return torch.exp2(self.step_class.float())
+
+    @property
+    def centres(self) -> dict[str, Tensor]:
+        """The centre of the attributes by name, in the shape of one anchor's value."""
+        shapes = self.widths.attributes
+        parts = torch.split(self.centre, [math.prod(shape) for shape in shapes.values()])
+        return {name: part.view(shape) for (name, shape), part in zip(shapes.items(), parts, strict=True)}
 
     @property
     def level(self) -> int:
@@ -142,6 +165,7 @@ class Model(nn.Module):
         if not self._fusible():
             return self.gaussians_reference(level, t, camera, rounding)
         steps, masks, position, widths = self.steps, self.masks(level), self.anchor, self.widths
+        centres = self.centres
         rows = self._visible(masks, position, camera)
         noise = None
         if rounding.noise is not None and not rounding.attributes:
@@ -154,6 +178,8 @@ class Model(nn.Module):
             (steps.feature, steps.offset, steps.scaling_log),
             noise,
             rounding.attributes,
+            self.spacing,
+            (centres["feature"], centres["offset"], centres["scaling_log"]),
         )
         if level >= 1 and (field := self.global_deformation) is not None and field.heads:
             anchors = fused.moved(anchors, field, widths.global_heads, t, *self._field_steps("global", rounding), False)
@@ -173,13 +199,11 @@ class Model(nn.Module):
 
     def gaussians_reference(self, level: int, t: float, camera: Camera, rounding: Rounding = EXACT) -> Gaussians:
         """The plain torch form of `gaussians`, for any device and any networks."""
-        steps, slots = self.steps, self.widths.slots
+        slots = self.widths.slots
         rows = self._visible(self.masks(level), self.anchor, camera)
         mask = self.masks(level).index_select(0, rows)
         position = self.anchor.index_select(0, rows)
-        feature = self._attribute(self.feature, rows, steps.feature, rounding)
-        scaling_log = self._attribute(self.scaling_log, rows, steps.scaling_log, rounding)
-        offset = self._attribute(self.offset, rows, steps.offset, rounding)
+        feature, scaling_log, offset = (self._attribute(name, rows, rounding) for name in ATTRIBUTES)
         if level >= 1 and self.global_deformation is not None:
             residuals = self.global_deformation(position, t, *self._field_steps("global", rounding))
             position = _moved(position, residuals, "position")
@@ -219,9 +243,10 @@ class Model(nn.Module):
     def round_to_steps(self) -> None:
         """Attributes, planes and weights in place to multiples of their steps: what `Rounding` imitates."""
         steps = self.steps
-        for name in ("feature", "scaling_log", "offset"):
-            values, step = getattr(self, name), getattr(steps, name)
-            values.copy_(torch.round(values / step) * step)
+        for name, centre in self.centres.items():
+            values = getattr(self, name)
+            step = getattr(steps, name) * self.spacing.view(-1, *(1,) * centre.dim())
+            values.copy_(centre + torch.round((values - centre) / step) * step)
         parts: list[tuple[nn.Module, float]] = [(self.networks, steps.weights_scaffold)]
         for field, planes, weights in (
             (self.global_deformation, steps.planes_global, steps.weights_global),
@@ -262,10 +287,12 @@ class Model(nn.Module):
             return None, None
         return getattr(self.steps, f"planes_{field}"), getattr(self.steps, f"weights_{field}")
 
-    def _attribute(self, values: Tensor, rows: Tensor, step: float, rounding: Rounding) -> Tensor:
-        picked = values.index_select(0, rows)
+    def _attribute(self, name: str, rows: Tensor, rounding: Rounding) -> Tensor:
+        picked: Tensor = getattr(self, name).index_select(0, rows)
+        centre = self.centres[name]
+        step = getattr(self.steps, name) * self.spacing.index_select(0, rows).view(-1, *(1,) * centre.dim())
         if rounding.attributes:
-            return round_straight_through(picked, step)
+            return centre + round_straight_through(picked - centre, step)
         return picked if rounding.noise is None else picked + rounding.noise.draw(picked.shape) * step
 
 

@@ -41,7 +41,7 @@ EXACT = Rounding()
 
 class _Round(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, x: Tensor, step: float) -> Tensor:
+    def forward(ctx: Any, x: Tensor, step: float | Tensor) -> Tensor:
         return torch.div(x, step).round_().mul_(step)
 
     @staticmethod
@@ -49,7 +49,7 @@ class _Round(torch.autograd.Function):
         return g, None
 
 
-def round_straight_through(x: Tensor, step: float | None) -> Tensor:
+def round_straight_through(x: Tensor, step: float | Tensor | None) -> Tensor:
     """round(x / step) * step with the identity's gradient; x itself if step is None."""
     if step is None:
         return x

@@ -39,17 +39,25 @@ def _part(keep: np.ndarray, slots: int, part: int, parts: int) -> tuple[int, int
 
 @kernel()
 def pick(
-    out: np.ndarray, column: int, values: np.ndarray, rows: np.ndarray, noise: np.ndarray, step: float, rounding: bool
+    out: np.ndarray,
+    column: int,
+    values: np.ndarray,
+    rows: np.ndarray,
+    noise: np.ndarray,
+    step: float,
+    rounding: bool,
+    spacing: np.ndarray,
+    centre: np.ndarray,
 ) -> None:
-    """The columns of `out` from `column` on = values [N, w] at rows int64 [n], rounded to multiples of `step`, or with
-    noise [n, w] times `step`; noise [0, w] is none."""
+    """The columns of `out` from `column` on = values [N, w] at rows int64 [n], rounded to centre [w] and multiples of
+    `step` times spacing [N] beside it, or with noise [n, w] times as much; noise [0, w] is none."""
     real, width = values.dtype.type, values.shape[1]
-    size = real(step)
     for i in range(len(rows)):
+        size = real(step) * spacing[rows[i]]
         for c in range(width):
             value = values[rows[i], c]
             if rounding:
-                value = np.rint(value / size) * size
+                value = centre[c] + np.rint((value - centre[c]) / size) * size
             elif len(noise) > 0:
                 value = value + noise[i, c] * size
             out[i, column + c] = value

@@ -83,6 +83,7 @@ def without(scene: Scene, rows: np.ndarray) -> Scene:
         feature=scene.feature[kept],
         scaling_log=scene.scaling_log[kept],
         offset=scene.offset[kept],
+        grading=None if scene.grading is None else scene.grading.take(kept),
         mask=tuple(codes[kept[: len(codes)]] for codes in scene.mask),
     )
 

@@ -35,7 +35,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
 }
 
 #: What the dial moves, as (value at 50, factor from there to 0). From 100 to 50 it is the same factor, so that each is
-#: log-linear in the quality: rate_scale, plane_rate, prune and step_scale of `TrainConfig`.
+#: log-linear in the quality: fields of `TrainConfig`.
 DIAL: dict[str, tuple[float, float]] = {
     "rate_scale": (0.1, 4.0),
     "plane_rate": (5e-9, 4.0),
@@ -125,6 +125,9 @@ class TrainConfig:
     judge: bool = True  #: leave out levels that gain nothing on training views not seen yet, see `judge`
     #: where growing ends, anchors leave whose absence adds this share at most to the squared error; see `pruning`
     prune: float = _DEFAULT["prune"]
+    #: share that coarser steps of single anchors add at most to the squared error where planes begin to be rounded; 0:
+    #: all anchors keep the steps; see `grading`
+    grading: float = 0.0
     #: share of the run, at its end, over which all learning rates fall to 0 besides: else the last steps carry weights
     #: over the edges of their rounding intervals, and pictures change by tenths of a dB from one step to the next
     cooldown: float = 0.1
@@ -168,7 +171,7 @@ class TrainConfig:
                 raise TrainError(f"{name} must be 0 or more and finite, found {getattr(self, name)}")
         if not 0 < self.step_scale < math.inf:
             raise TrainError(f"step_scale must be positive and finite, found {self.step_scale}")
-        for name in ("prune", "cooldown"):
+        for name in ("prune", "cooldown", "grading"):
             if not 0 <= getattr(self, name) <= 1:
                 raise TrainError(f"{name} must be from 0 to 1, found {getattr(self, name)}")
         if self.rollout not in ROLLOUTS:

@@ -35,7 +35,7 @@ def fresh_model(
     anchor_q = initial_cells(dataset, config.initial_anchors, info.voxel_size, generator)
     n = len(anchor_q)
     spacing = nearest_distances((anchor_q.double() * info.voxel_size).float()).clamp(min=info.voxel_size)
-    fields = []
+    fields: list[DeformationField | None] = []
     for field, heads, start_spacing, step in (
         (
             config.global_deformation,
@@ -55,7 +55,8 @@ def fresh_model(
         torch.zeros(n, widths.slots, 3),
         fresh_mask_logits(n, min(config.level, max_layer)),
         fresh_networks(widths, config.hidden),
-        *fields,
+        fields[0],
+        fields[1],
     )
     if max_layer < 2:
         model.local_deformation = None

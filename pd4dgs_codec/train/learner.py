@@ -26,7 +26,7 @@ from pd4dgs_codec.model.picture import Picture, render, render_image
 from pd4dgs_codec.model.plane_rate import exact_bits
 from pd4dgs_codec.model.rounding import EXACT, Noise, Rounding
 from pd4dgs_codec.scene import MASK_THRESHOLD
-from pd4dgs_codec.train import judge, losses, pruning
+from pd4dgs_codec.train import grading, judge, losses, pruning
 from pd4dgs_codec.train.config import PlaneWeights, Schedule, TrainConfig
 from pd4dgs_codec.train.densify import Densifier
 from pd4dgs_codec.train.initialise import fresh_model
@@ -95,12 +95,15 @@ class Learner:
         """One training step; returns its log record (every term unweighted). levels: those to train, ascending, each on
         a view of its own; None draws what the rollout says."""
         judged = self._judge_levels()
+        graded = self._grade()
         left = self._prune()
         chosen, probabilities = self._draw_levels() if levels is None else _given(levels)
         drawn = [(self._next_view(), level) for level in chosen]
         record: dict[str, Any] = {"iteration": self.iteration, "level": chosen[-1]}
         if judged:
             record |= {"judged_psnr": judged, "left_out": self.left_out}
+        if graded:
+            record["step_classes"] = graded
         if left:
             record["left_model"], record["left_level_0"] = left
         if not self._learn(drawn, record):
@@ -333,6 +336,19 @@ class Learner:
         self.densifier.keep(keep)
         self._neighbours = None
         return before - len(keep), later
+
+    def _grade(self) -> list[int]:
+        """Where planes and weights begin to be rounded: gives anchors their step classes. Returns how many each has."""
+        enough = (self.schedule.iterations or 0) >= pruning.MIN_ITERATIONS
+        if not (self.config.grading and self.config.noise and enough and self._reached(self.schedule.rounding)):
+            return []
+        stride = -(-len(self.shots) // grading.VIEWS)
+        levels = range(self.model.level if self.config.rollout == "top" else 0, self.model.level + 1)
+        try:
+            rounding = replace(self._rounding(), noise=None)
+            return grading.grade(self.model, self.shots[::stride], levels, self.config.grading, rounding)
+        except NotFinite:  # as a step that diverged: passed over, with nothing changed
+            return []
 
     # -- checkpoints -----------------------------------------------------------------------------------------------
 

@@ -8,12 +8,23 @@ from torch import Tensor
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.rate import rate_bits, sampled
 from pd4dgs_codec.morton import morton_order
-from pd4dgs_codec.scene import MASK_THRESHOLD
+from pd4dgs_codec.scene import MASK_THRESHOLD, MAX_CLASS
 
 
 def attribute_bits(model: Model, rows: Tensor, active: Tensor) -> Tensor:
     """R per scalar [n, channels] of the anchors `rows` (int64 [n]); priors are the moments over the anchors
-    `active`."""
+    `active` of the same step class."""
+    if not model.step_class.any():
+        return _class_bits(model, rows, active, 1.0)
+    of_rows, of_active = model.step_class[rows], model.step_class[active]
+    bits = [_class_bits(model, rows[of_rows == c], active[of_active == c], 2.0**c) for c in range(MAX_CLASS + 1)]
+    return torch.cat(bits)[of_rows.argsort(stable=True).argsort()]
+
+
+def _class_bits(model: Model, rows: Tensor, active: Tensor, spacing: float) -> Tensor:
+    """The same of anchors of one step class, whose steps are `spacing` times the model's."""
+    if not len(rows):
+        return model.feature.new_zeros(0, model.widths.channels)
     parts = []
     for values, step in (
         (model.feature, model.steps.feature),
@@ -21,7 +32,7 @@ def attribute_bits(model: Model, rows: Tensor, active: Tensor) -> Tensor:
         (model.offset.flatten(1), model.steps.offset),
     ):
         mu, sigma, picked = sampled(values, active, rows)
-        parts.append(rate_bits(picked, mu, sigma, step))
+        parts.append(rate_bits(picked, mu, sigma, step * spacing))
     return torch.cat(parts, dim=1)
 
 
@@ -33,6 +44,7 @@ def rate_term(model: Model, mask: Tensor, share: float, generator: torch.Generat
         return mask.sum() * 0.0
     n = max(1, int(len(active) * share))
     rows = active[torch.randperm(len(active), generator=generator)[:n]]
+    rows = rows[model.step_class[rows].argsort(stable=True)]  # the order of attribute_bits
     weighted = mask.index_select(0, rows) * attribute_bits(model, rows, active).mean(1)
     return weighted.mean() * (len(active) / len(mask))
 

@@ -70,6 +70,8 @@ class Optimiser:
             group["params"][0] = new
             setattr(self.model, name, new)
         self.model.anchor_q = torch.cat([self.model.anchor_q[keep], added["anchor_q"]])
+        graded = self.model.step_class
+        self.model.step_class = torch.cat([graded[keep], graded.new_zeros(len(added["anchor_q"]))])
 
     def keep_anchors(self, keep: Tensor) -> None:
         """Keeps the anchors `keep` (int64) alone."""

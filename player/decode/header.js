@@ -38,7 +38,7 @@ const MAX_CAMERA_SIDE = 65535;
  */
 export function readHeader(bytes) {
   const { value, firstEntryEnd } = unpack(bytes, "header");
-  const fields = new Fields(value, "header", 1, 15);
+  const fields = new Fields(value, "header", 1, 16);
   const chunks = readChunkList(fields);
   const mode = asRegistered(fields.get(2), 2, "header: mode");
   const deformation = asRegistered(fields.get(3), 2, "header: deformation");
@@ -65,6 +65,11 @@ export function readHeader(bytes) {
     feature: asInteger(width, 1, MAX_FEATURE, "header: feature width"),
     slots: asInteger(count, 1, MAX_SLOTS, "header: slots"),
   };
+  if (fields.has(16)) {
+    const centres = asList(fields.get(16), "header: centres", widths.feature + 6 + 3 * widths.slots);
+    centres.forEach((m) => asInteger(m, -(2 ** 23), 2 ** 23, "header: a channel's centre"));
+    throw unsupported("header: step classes, expected none");
+  }
   const layers = chunks.filter(({ type }) => type < LAYER_TYPES).map(({ type }) => type);
   if (mode === 1 && new Set(layers).size < layers.length) throw malformed("header: mode lzma, and a layer in slices");
   // An ans-only decoder (clause 16).

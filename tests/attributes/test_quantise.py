@@ -6,9 +6,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pd4dgs_codec.attributes.quantise import MAX_SYMBOL, dequantise, is_step, mask_codes, quantise
-from pd4dgs_codec.attributes.table import dequantise_attributes, quantise_attributes
+from pd4dgs_codec.attributes.table import NO_CLASSES, Grid
 from pd4dgs_codec.errors import EncodeError
-from pd4dgs_codec.scene import Widths
+from pd4dgs_codec.scene import ATTRIBUTES, MAX_CLASS, Widths
 
 steps = st.floats(2.0**-100, 2.0**90, width=32)
 
@@ -79,8 +79,35 @@ def test_mask_codes_keep_order(values):
 def test_the_table_is_a_bijection_on_channels(widths):
     k = np.arange(widths.channels * 7, dtype=np.int32).reshape(widths.channels, 7)
     q = {"feature": 0.5, "scaling_log": 0.25, "offset": 2.0}
-    values = dequantise_attributes(k, widths, q)
+    grid = Grid(q, widths, np.zeros(widths.channels, np.int32))
+    values = grid.dequantise(k, NO_CLASSES)
     shapes = {name: array.shape for name, array in values.items()}
     assert shapes == {"feature": (7, widths.feature), "scaling_log": (7, 6), "offset": (7, widths.slots, 3)}
     assert values["offset"][3, 1, 2] == 2.0 * k[widths.feature + 6 + 3 * 1 + 2, 3]
-    np.testing.assert_array_equal(quantise_attributes(values, q), k)
+    np.testing.assert_array_equal(grid.quantise(values, NO_CLASSES), k)
+
+
+@given(st.lists(st.integers(-MAX_SYMBOL, MAX_SYMBOL), min_size=1, max_size=20), steps, st.integers(0, 2**32 - 1))
+def test_symbols_of_any_class_survive_their_float32_values(indices, step, seed):
+    """k of m + k 2^c, with m and c such that it stays within the limit."""
+    rng, widths = np.random.default_rng(seed), Widths(1, 1, graded=True)
+    centre = rng.integers(-MAX_SYMBOL, MAX_SYMBOL + 1, widths.channels).astype(np.int32)
+    classes = rng.integers(0, MAX_CLASS + 1, len(indices)).astype(np.int32)
+    k = (np.array(indices)[None] - centre[:, None]) // (1 << classes.astype(np.int64))
+    at = centre[:, None] + k * (1 << classes.astype(np.int64))
+    k = np.where((np.abs(at) <= MAX_SYMBOL) & (np.abs(k) <= MAX_SYMBOL), k, 0).astype(np.int32)
+    grid = Grid(dict.fromkeys(ATTRIBUTES, step), widths, centre)
+    values = grid.dequantise(k, classes)
+    np.testing.assert_array_equal(grid.quantise(values, classes), k)
+    expected = (grid.indices(k, classes)[0].astype(np.float64) * step).astype(np.float32)
+    np.testing.assert_array_equal(values["feature"][:, 0], expected)
+
+
+def test_a_class_rounds_to_multiples_of_its_step_around_the_centre():
+    grid = Grid(dict.fromkeys(ATTRIBUTES, 0.5), Widths(1, 1, graded=True), np.array([3, *[0] * 9], np.int32))
+    values = {"feature": np.float32([[1.4], [1.4], [3.6]]), "scaling_log": np.zeros((3, 6), np.float32)}
+    values["offset"] = np.zeros((3, 1, 3), np.float32)
+    classes = np.array([0, 2, 2], np.int32)
+    k = grid.quantise(values, classes)
+    assert k[0].tolist() == [0, 0, 1]
+    assert grid.dequantise(k, classes)["feature"][:, 0].tolist() == [1.5, 1.5, 3.5]

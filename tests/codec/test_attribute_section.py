@@ -1,5 +1,6 @@
 """The attributes section: both forms give back the symbols; prediction pays where channels depend on each other."""
 
+from dataclasses import replace
 from unittest.mock import patch
 
 import numpy as np
@@ -8,6 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
+from pd4dgs_codec.attributes.table import NO_CLASSES
 from pd4dgs_codec.codec import attribute_section
 from pd4dgs_codec.codec.attribute_section import MAX_WEIGHT, read_attributes, write_attributes
 from pd4dgs_codec.codec.stages import PLAIN, STAGED
@@ -31,24 +33,24 @@ def correlated(rows: int, seed: int = 0) -> np.ndarray:
 
 def test_dependent_channels_are_predicted_and_come_back():
     attributes = correlated(1500)
-    data, rate = write_attributes(attributes, WIDTHS, "best", 5)
+    data, rate = write_attributes(attributes, NO_CLASSES, WIDTHS, "best", 5)
     assert data[0] == STAGED
     plain = encode_channels(list(attributes))
     assert len(data) < 0.75 * len(plain.payload)
     assert rate == plain.rate_bits
-    np.testing.assert_array_equal(read_attributes(data, WIDTHS, 1500), attributes)
+    np.testing.assert_array_equal(read_attributes(data, WIDTHS, 1500)[1], attributes)
 
 
 def test_the_rate_model_forbids_prediction():
-    data, _ = write_attributes(correlated(800), WIDTHS, "gauss", 5)
+    data, _ = write_attributes(correlated(800), NO_CLASSES, WIDTHS, "gauss", 5)
     assert data[0] == PLAIN
 
 
 def test_independent_channels_stay_plain():
     attributes = np.random.default_rng(1).integers(-9, 10, (WIDTHS.channels, 300)).astype(np.int32)
-    data, _ = write_attributes(attributes, WIDTHS, "best", 5)
+    data, _ = write_attributes(attributes, NO_CLASSES, WIDTHS, "best", 5)
     assert data[0] == PLAIN
-    np.testing.assert_array_equal(read_attributes(data, WIDTHS, 300), attributes)
+    np.testing.assert_array_equal(read_attributes(data, WIDTHS, 300)[1], attributes)
 
 
 def written_in_stages(attributes, class_count=None, widths=WIDTHS):
@@ -56,8 +58,8 @@ def written_in_stages(attributes, class_count=None, widths=WIDTHS):
     choose = attribute_section.cheapest_class_count if class_count is None else lambda _: class_count
     with patch.object(attribute_section, "cheapest_class_count", choose):
         symbols, past = attributes.astype(np.int64), attribute_section.Past()
-        block = attribute_section._fit_block(symbols, widths)
-        return attribute_section._write_staged(symbols, block, past, 1).data
+        block = attribute_section._fit_block(symbols, NO_CLASSES, widths)
+        return attribute_section._write_staged(symbols, NO_CLASSES, block, past, 1).data
 
 
 @settings(max_examples=10)
@@ -69,8 +71,11 @@ def test_any_symbols_come_back(rows, seed, class_count, scale):
     attributes = np.clip(np.rint(rng.standard_t(2, (WIDTHS.channels, rows)) * scales), -MAX_SYMBOL, MAX_SYMBOL)
     attributes = attributes.astype(np.int32)
     attributes[rng.random(WIDTHS.channels) < 0.3] = int(rng.integers(-5, 5))
-    for data in (written_in_stages(attributes, class_count), write_attributes(attributes, WIDTHS, "best", 1)[0]):
-        np.testing.assert_array_equal(read_attributes(data, WIDTHS, rows), attributes)
+    for data in (
+        written_in_stages(attributes, class_count),
+        write_attributes(attributes, NO_CLASSES, WIDTHS, "best", 1)[0],
+    ):
+        np.testing.assert_array_equal(read_attributes(data, WIDTHS, rows)[1], attributes)
 
 
 def test_the_largest_symbols_come_back():
@@ -78,7 +83,7 @@ def test_the_largest_symbols_come_back():
     attributes = np.ones((WIDTHS.channels, rows), np.int32)
     wide = [0, 6, 7, 29, 38, 39, 40]
     attributes[wide] = rng.choice([-MAX_SYMBOL, -1, 0, MAX_SYMBOL], (len(wide), rows))
-    np.testing.assert_array_equal(read_attributes(written_in_stages(attributes, 3), WIDTHS, rows), attributes)
+    np.testing.assert_array_equal(read_attributes(written_in_stages(attributes, 3), WIDTHS, rows)[1], attributes)
 
 
 def test_terms_that_would_break_a_limit_are_left_out():
@@ -90,12 +95,12 @@ def test_terms_that_would_break_a_limit_are_left_out():
     attributes[3] = attributes[2]
     attributes[3, 0] = -MAX_SYMBOL
     assert abs(attributes[1]).max() > abs(attributes[0]).max() * MAX_WEIGHT >> 10
-    np.testing.assert_array_equal(read_attributes(written_in_stages(attributes), WIDTHS, 4200), attributes)
+    np.testing.assert_array_equal(read_attributes(written_in_stages(attributes), WIDTHS, 4200)[1], attributes)
 
 
 def test_damage_raises_only_decode_errors():
     rows = 400
-    data, _ = write_attributes(correlated(rows), WIDTHS, "best", 2)
+    data, _ = write_attributes(correlated(rows), NO_CLASSES, WIDTHS, "best", 2)
     assert data[0] == STAGED
     rng = np.random.default_rng(2)
     for cut in rng.integers(0, len(data), 60):
@@ -105,7 +110,7 @@ def test_damage_raises_only_decode_errors():
         broken = bytearray(data)
         broken[rng.integers(0, min(len(data), 900))] ^= 1 << rng.integers(0, 8)
         try:
-            assert read_attributes(bytes(broken), WIDTHS, rows).shape == (WIDTHS.channels, rows)
+            assert read_attributes(bytes(broken), WIDTHS, rows)[1].shape == (WIDTHS.channels, rows)
         except DecodeError:
             pass
 
@@ -161,7 +166,30 @@ def test_a_predicted_symbol_over_the_limit_is_refused(symbol):
     stages = [encode_channels([np.full(3, symbol)] * number).payload for number in (6, 6, 8, 9, 9, 10, 10, 10)]
     data = block(terms={1: (1, [(0, 1 << 10)])}, lengths=[len(s) for s in stages[:-1]]) + b"".join(stages)
     if abs(2 * symbol) <= K_MAX:
-        assert read_attributes(data, WIDTHS, 3)[:3, 0].tolist() == [symbol, 2 * symbol, symbol]
+        assert read_attributes(data, WIDTHS, 3)[1][:3, 0].tolist() == [symbol, 2 * symbol, symbol]
     else:
         with pytest.raises(Malformed, match=f"a predicted attribute over {K_MAX}"):
             read_attributes(data, WIDTHS, 3)
+
+
+@pytest.mark.parametrize(("priors", "effort", "share"), [("best", 3, 0.97), ("best", 1, 0.9), ("gauss", 3, 0.9)])
+def test_step_classes_come_back_and_split_the_channels(priors, effort, share):
+    """Symbols shrink with the class: split by it they cost less than as they are, in either form."""
+    widths, rng = Widths(5, 2, graded=True), np.random.default_rng(4)
+    classes = rng.integers(0, 7, 2000).astype(np.int32)
+    attributes = np.rint(rng.normal(size=(widths.channels, 2000)) * 40 / 2.0**classes).astype(np.int32)
+    data, rate = write_attributes(attributes, classes, widths, priors, effort)
+    found = read_attributes(data, widths, 2000)
+    np.testing.assert_array_equal(found[0], classes)
+    np.testing.assert_array_equal(found[1], attributes)
+    as_they_are, more = write_attributes(attributes, NO_CLASSES, Widths(5, 2), priors, effort)
+    assert len(data) < share * len(as_they_are) and rate < 0.9 * more
+    if priors == "gauss":
+        assert data[0] == PLAIN and 8 * len(data) <= 1.005 * rate + 24 * 7 * (widths.channels + 1)
+
+
+def test_one_step_class_costs_a_few_bytes():
+    attributes = correlated(500)
+    alone, rate = write_attributes(attributes, NO_CLASSES, WIDTHS, "best", 3)
+    data, graded_rate = write_attributes(attributes, np.full(500, 3, np.int32), replace(WIDTHS, graded=True), "best", 3)
+    assert len(data) <= len(alone) + 10 and rate == pytest.approx(graded_rate)

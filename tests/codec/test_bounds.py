@@ -111,7 +111,7 @@ def test_a_deformation_without_a_bound_is_refused_and_the_layers_before_it_decod
 def test_a_quantiser_that_rounds_wrongly_is_found(monkeypatch, module, what):
     """The file decodes to the symbols that were meant: only the given values show that these are not the nearest."""
     right = module.quantise
-    monkeypatch.setattr(module, "quantise", lambda x, step, name: right(x, step, name) + (x.size > 20))
+    monkeypatch.setattr(module, "quantise", lambda x, *rest: right(x, *rest) + (x.size > 20))
     with pytest.raises(EncodeError, match=f"verification: {what}: .*expected at most .* between them"):
         encode_with_report(scene_off_the_grid(), layers=2, effort=1)
 

@@ -251,6 +251,29 @@ def test_positions_that_overflow_are_refused_verified_or_not(verify):
         encode(replace(scene, info=replace(scene.info, voxel_size=2.0**127)), verify=verify)
 
 
+@given(st.integers(0, 2**32 - 1), st.sampled_from(("best", "gauss")), st.sampled_from(("ans", "lzma")))
+@settings(max_examples=10)
+def test_step_classes_and_centres_come_back(seed, priors, mode):
+    """Values off the grid of their class are rounded to it, those on it stay, and steps may be scaled meanwhile."""
+    given = make_scene(seed % 50, anchors=40, kind="gaussian", widths=Widths(4, 2, graded=True))
+    options = {"layers": 2, "effort": 1, "priors": priors, "mode": mode, "omit": "nothing"}
+    rng = np.random.default_rng(seed)
+    noisy = replace(given, feature=(given.feature + rng.normal(size=given.feature.shape) / 50).astype(np.float32))
+    scene, data = decode(encode(noisy, **options)), encode(noisy, **options)
+    assert scene.grading is not None and scene.grading.classes.max() > 0
+    assert encode(scene, **options) == data
+    scaled = decode(encode(noisy, step_scale=1.5, **options))
+    assert_same_scene(scaled, decode(encode(scaled, **options)))
+    for step, found in ((1.0, scene), (1.5, scaled)):
+        error = np.abs(np.sort(found.feature.ravel()) - np.sort(_sent(noisy).feature.ravel())).max()
+        assert error <= 2.0**6 * 0.0625 * step / 2 * 1.001
+
+
+def _sent(scene):
+    """Its anchors that are active at its highest level."""
+    return replace(scene, feature=scene.feature[scene.mask[-1] > 0])
+
+
 @given(st.sampled_from(sorted(GLOBAL_HEADS)), st.sampled_from(sorted(LOCAL_HEADS)))
 @settings(max_examples=3)
 def test_single_heads(global_head, local_head):

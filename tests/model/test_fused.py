@@ -55,6 +55,14 @@ def test_it_is_the_plain_graph(level, rounding):
     assert 0 < len(gaussians.slots) < 10 * len(gaussians.anchors)
 
 
+@pytest.mark.parametrize("rounding", roundings())
+def test_it_is_so_with_step_classes(rounding):
+    model = small_model(anchors=300, opacity=-0.1)
+    model.step_class.copy_(torch.arange(300) % 7)
+    model.centre.copy_(torch.linspace(-0.5, 0.5, len(model.centre)))
+    check(stir(model, 0.3), 2, rounding)
+
+
 @pytest.mark.parametrize("widths", [Widths(16, 4), Widths(1, 1), Widths(5, 13)])
 def test_it_is_so_at_other_widths(widths):
     gaussians = check(stir(small_model(widths=widths, anchors=300, opacity=0.0), 0.3), 2)

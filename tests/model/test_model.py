@@ -12,6 +12,7 @@ from hypothesis.extra import numpy as hnp
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.evaluate.residuals import residuals
+from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model import model as graph
 from pd4dgs_codec.model.config import DeformationConfig
 from pd4dgs_codec.model.convert import from_scene, to_scene
@@ -29,6 +30,7 @@ from pd4dgs_codec.scene import (
     SceneInfo,
     Steps,
 )
+from pd4dgs_codec.train.grading import centre
 
 WIDTH, HEIGHT = 40, 30
 VOXEL = 2.0**-6
@@ -330,6 +332,40 @@ def test_a_decoded_file_encodes_to_the_same_bytes_also_through_the_model():
     assert decoded.layers == (0, 1, 2)
     assert encode(decoded, **options) == data
     assert encode(to_scene(from_scene(decoded)), **options) == data
+
+
+def graded_model() -> Model:
+    """Anchors of all step classes, off their grids."""
+    model = stir(small_model(anchors=70), 0.1)
+    model.step_class.copy_(torch.arange(70) % 7)
+    model.centre.copy_(centre(model))
+    return model
+
+
+def test_what_training_rounds_is_what_the_file_holds():
+    """Rounded attributes are those of the decoded file, which encodes to the same bytes, through a model as well."""
+    model = graded_model()
+    model.round_to_steps()
+    data = encode(to_scene(model), layers=2, omit="nothing", effort=1)
+    scene = decode(data)
+    assert scene.grading is not None and set(scene.grading.classes) == set(range(7))
+    decoded = from_scene(scene)
+    assert encode(to_scene(decoded), layers=2, omit="nothing", effort=1) == data
+    own, other = (np.lexsort(m.anchor_q.numpy().T) for m in (model, decoded))
+    assert torch.equal(decoded.step_class[other], model.step_class[own])
+    for name, values in scene.attributes.items():
+        np.testing.assert_allclose(values[other], getattr(model, name).detach().numpy()[own], atol=1e-6)
+
+
+def test_a_checkpoint_keeps_the_step_classes(tmp_path):
+    model = graded_model()
+    checkpoint.save(tmp_path / "m.pt", model)
+    found = checkpoint.load(tmp_path / "m.pt")[0]
+    assert torch.equal(found.step_class, model.step_class) and torch.equal(found.centre, model.centre)
+    model.step_class[3] = 7
+    checkpoint.save(tmp_path / "bad.pt", model)
+    with pytest.raises(DataError, match="step classes: 7, expected at most 6"):
+        checkpoint.load(tmp_path / "bad.pt")
 
 
 def test_a_model_with_a_nan_becomes_no_scene():

@@ -275,8 +275,8 @@ def staged(stages, lengths=None):
 
 def both(section, rows=ROWS):
     """Outcome of the reference decoder and of the package: symbols or the error's name."""
-    ours = outcome(lambda d: refdec.decode_attributes(d, *WIDTHS, rows, refdec.Past()), section, refdec.Fault)
-    return ours, outcome(lambda d: read_attributes(d, Widths(*WIDTHS), rows).tolist(), section, DecodeError)
+    ours = outcome(lambda d: refdec.decode_attributes(d, *WIDTHS, rows, refdec.Past(), False), section, refdec.Fault)
+    return ours, outcome(lambda d: read_attributes(d, Widths(*WIDTHS), rows)[1].tolist(), section, DecodeError)
 
 
 def both_planes(section, shapes):

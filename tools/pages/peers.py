@@ -113,7 +113,7 @@ def _encode_own(priors: str, effort: int) -> Callable[[Symbols], list[bytes]]:
                 if not any(c.size for c in groups[section]):
                     payloads.append(b"")
                 elif section == Section.ATTRIBUTES:
-                    payloads.append(write_attributes(layer.attributes, layer.widths, priors, effort)[0])
+                    payloads.append(_write_attributes(layer, priors, effort))
                 elif section == Section.PLANES:
                     payloads.append(write_planes(planes, priors, effort)[0])
                 else:
@@ -121,6 +121,10 @@ def _encode_own(priors: str, effort: int) -> Callable[[Symbols], list[bytes]]:
         return payloads
 
     return encode
+
+
+def _write_attributes(layer: LayerSymbols, priors: str, effort: int) -> bytes:
+    return write_attributes(layer.attributes, layer.classes, layer.widths, priors, effort)[0]
 
 
 def _decode_own(payloads: list[bytes], symbols: Symbols) -> list[np.ndarray]:
@@ -131,7 +135,8 @@ def _decode_own(payloads: list[bytes], symbols: Symbols) -> list[np.ndarray]:
             if not data:
                 continue
             if section == Section.ATTRIBUTES:
-                channels += list(read_attributes(data, layer.widths, layer.attributes.shape[1]))
+                classes, attributes = read_attributes(data, layer.widths, layer.attributes.shape[1])
+                channels += [*([classes] if classes.size else []), *attributes]
             elif section == Section.PLANES:
                 shapes = [plane.shape for plane in planes]
                 channels += [c.ravel() for plane in read_planes(data, shapes) for c in plane]

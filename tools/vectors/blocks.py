@@ -18,7 +18,7 @@ import numpy as np
 
 from pd4dgs_codec.attributes.planes import residual
 from pd4dgs_codec.attributes.quantise import dequantise
-from pd4dgs_codec.attributes.table import dequantise_attributes
+from pd4dgs_codec.attributes.table import NO_CLASSES, Grid
 from pd4dgs_codec.bitstream import canonical
 from pd4dgs_codec.bitstream.container import MAJOR, SCENE_ID_SIZE, SIGNATURE, slice_flags
 from pd4dgs_codec.codec.header import payload_digest
@@ -209,9 +209,27 @@ def positions(cells: np.ndarray, known: Known | None = None) -> bytes:
     return head + coded(channels, known=known)
 
 
-def plain_attributes(k: np.ndarray, priors: Mapping[int, Prior] | None = None, known: Known | None = None) -> bytes:
+def plain_attributes(
+    k: np.ndarray,
+    priors: Mapping[int, Prior] | None = None,
+    known: Known | None = None,
+    *,
+    classes: np.ndarray = NO_CLASSES,
+) -> bytes:
     """Section ATTRIBUTES of int32 [channels, n], form 0 (clause 8.5)."""
-    return b"\0" + coded(k, priors, known)
+    if not classes.size:
+        return b"\0" + coded(k, priors, known)
+    by_class = [channel[classes == c] for channel in k for c in range(7)]
+    return b"\0" + graded_part(classes) + coded(by_class, priors, known)
+
+
+def graded_part(classes: np.ndarray, length: int | None = None) -> bytes:
+    """What says the step classes of the rows; nothing where there are none. length: what is said instead of the true
+    one."""
+    if not classes.size:
+        return b""
+    section = coded([classes])
+    return varint(len(section) if length is None else length) + section
 
 
 def plain_planes(residuals: Iterable[Iterable[int]], priors: Mapping[int, Prior] | None = None) -> bytes:
@@ -336,16 +354,21 @@ def attribute_stages(
     classes: Sequence[int],
     widths: Widths = DEFAULT_WIDTHS,
     of: np.ndarray | None = None,
+    grades: tuple[np.ndarray, np.ndarray] = (NO_CLASSES, NO_CLASSES),
 ) -> list[list[np.ndarray]]:
     """The channels of the eight stages of clause 8.7, of residuals and offsets int64 [channels, n]. of: those of the
-    slice that the block stands in, if it is another one."""
-    of, p = e if of is None else of, widths.predicted
+    slice that the block stands in, if it is another one. grades: step classes of both."""
+    of, p, stages = e if of is None else of, widths.predicted, list[list[np.ndarray]]()
+    graded = bool(grades[0].size)
     bounds = [p * a // 38 for a in (0, 6, 12, 20, 29, 38)]
-    stages = [list(e[: bounds[1]])]
-    for stage, count in enumerate(classes, 1):
+    for stage, count in enumerate(classes if graded else (1, *classes)):
         first = bounds[stage]
         channels = e[first : bounds[stage + 1]] if stage < 5 else e[p::3]
-        activity, measure = relative_magnitude(e[:first], of[:first]), relative_magnitude(of[:first])
+        measured, by = (
+            np.concatenate([*[(64 >> g.astype(np.int64))[None]] * 4, x[:first]]) if graded else x[:first]
+            for x, g in zip((e, of), grades, strict=True)
+        )
+        activity, measure = relative_magnitude(measured, by), relative_magnitude(by, by)
         stages.append([part for channel in channels for part in split_by_activity(channel, activity, count, measure)])
     ys, zs = list[np.ndarray](), list[np.ndarray]()
     for i in range(widths.slots):
@@ -364,21 +387,25 @@ def predicted_attributes(
     classes: Sequence[int] = ONE_CLASS,
     *,
     widths: Widths = DEFAULT_WIDTHS,
+    grades: np.ndarray = NO_CLASSES,
     lengths: Lengths = lambda sizes: sizes,
     tail: bytes = b"",
     known: Sequence[Known] | None = None,
     of: np.ndarray | None = None,
+    of_grades: np.ndarray = NO_CLASSES,
 ) -> bytes:
     """Section ATTRIBUTES of int32 [channels, n], form 1 (clauses 8.5 to 8.9).
 
     terms: channel -> (channel, weight) ascending. classes: of stages 1 to 5. lengths: what the block says of stages 0
-    to 6, from the true lengths. tail: after the last stage. of: the attributes of the slice that the block stands in,
-    if it is another one: form 2.
+    to 6, from the true lengths. tail: after the last stage. of, of_grades: the attributes and step classes of the slice
+    that the block stands in, if it is another one: form 2.
     """
     e = residuals(k, terms, widths)
-    stages = attribute_stages(e, splits, classes, widths, None if of is None else residuals(of, terms, widths))
-    block = b"\1" + prediction_block({c: gaps(own) for c, own in terms.items()}, splits, {}, classes, widths)
-    return (block if of is None else b"\2") + staged(stages, lengths, tail, known=known)
+    before = None if of is None else residuals(of, terms, widths)
+    stages = attribute_stages(e, splits, classes, widths, before, (grades, grades if of is None else of_grades))
+    block = prediction_block({c: gaps(own) for c, own in terms.items()}, splits, {}, classes, widths)
+    front = b"\1" + graded_part(grades) + block if of is None else b"\2" + graded_part(grades)
+    return front + staged(stages, lengths, tail, known=known)
 
 
 def residuals(k: np.ndarray, terms: Terms, widths: Widths = DEFAULT_WIDTHS) -> np.ndarray:
@@ -522,6 +549,7 @@ def make_layer(
     mode: int = ANS,
     raw: bool = False,
     widths: Widths = DEFAULT_WIDTHS,
+    classes: Sequence[int] | None = None,
 ) -> Layer:
     """A layer of `cells` (in Morton order) after `before` earlier rows.
 
@@ -550,10 +578,11 @@ def make_layer(
         }
     meant = LayerSymbols(
         kind=kind,
-        widths=widths,
+        widths=replace(widths, graded=classes is not None),
         anchor_q=np.array(cells, np.int32).reshape(-1, 3),
         mask_increase=np.array([0] * before if rises is None else rises, np.int32),
         mask_own=np.array([77] * n if codes is None else codes, np.int32),
+        classes=NO_CLASSES if classes is None else np.array(classes, np.int32),
         attributes=np.full((widths.channels, n), 2, np.int32) if attributes is None else attributes,
         planes=planes,
         networks=networks,
@@ -580,14 +609,15 @@ def _sections(meant: LayerSymbols, predictors: Sequence[int], mode: int) -> dict
     flat = [row for r in planes for row in plane_channels(r)]
     masks = [meant.mask_increase, meant.mask_own]
     if mode == LZMA:
-        channels = [*masks, *meant.attributes, *flat, *weights]
+        grades = [meant.classes] if meant.widths.graded else []
+        channels = [*masks, *grades, *meant.attributes, *flat, *weights]
         if any(c.size for c in channels):
             sections[SYMBOLS] = lzma_symbols(channels, stream=lzma2.packed)
     else:
         if meant.mask_increase.size or n:
             sections[MASKS] = coded(masks)
         if n:
-            sections[ATTRIBUTE] = plain_attributes(meant.attributes)
+            sections[ATTRIBUTE] = plain_attributes(meant.attributes, classes=meant.classes)
         if flat:
             sections[PLANE] = plain_planes(flat)
         if weights:
@@ -715,12 +745,14 @@ def make_file(*layers: Layer, header: Mapping[int, object] | None = None) -> Fil
             Chunk(kind.chunk_type, x.payload(), slice_flags(number, len(own)), layer=x) for number, x in enumerate(own)
         ]
     widths = layers[0].meant.widths
-    return File(tuple(chunks)).with_header({15: [widths.feature, widths.slots], **(header or {})})
+    centres = {16: [i % 5 - 2 for i in range(widths.channels)]} if widths.graded else {}
+    return File(tuple(chunks)).with_header({15: [widths.feature, widths.slots], **centres, **(header or {})})
 
 
 def _hashes(m: LayerSymbols, header: Mapping[int, object]) -> dict:
     steps = dict(zip(ATTRIBUTES, header[4], strict=True))  # type: ignore[call-overload]
-    values = dequantise_attributes(m.attributes, m.widths, steps)
+    centre = np.array(header.get(16, [0] * m.widths.channels), np.int32)
+    values = Grid(steps, m.widths, centre).dequantise(m.attributes, m.classes)
     tensors = [dequantise(m.anchor_q, header[5]), *(values[name] for name in ATTRIBUTES)]  # type: ignore[arg-type]
     own = list(m.tensors())
     count = len(PLANES) * len(m.planes)

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
 from pd4dgs_codec.bitstream import canonical
 from pd4dgs_codec.bitstream.limits import (
     MAX_ANCHORS,
@@ -390,9 +391,10 @@ def _header() -> Iterator[Vector]:
         yield bad(f"header-key-{key:02}-missing", what, "4 5.1", MALFORMED, plain.with_header({key: None}))
     without = canonical.pack({k: v for k, v in plain.fields().items() if k != 1})
     yield bad("header-key-01-missing", "Key 1 is missing.", "4 5.1", MALFORMED, replace(plain, packed=without))
-    for key in (0, 16, 63):
+    for key in (0, 17, 63):
         what = f"Unknown key {key}."
         yield bad(f"header-key-{key:02}-unknown", what, "4 17.2", FEATURE, plain.with_header({key: 1}))
+    graded = make_file(make_layer(classes=[3]))
     values: list[tuple[str, int, object, str]] = [
         ("mode-unknown", 2, 2, FEATURE),
         ("mode-largest", 2, 2**64 - 1, FEATURE),
@@ -437,10 +439,16 @@ def _header() -> Iterator[Vector]:
         ("slots-real", 15, [32, 10.0], MALFORMED),
         ("widths-one", 15, [32], MALFORMED),
         ("widths-integer", 15, 32, MALFORMED),
+        ("centres-67", 16, [0] * 67, MALFORMED),
+        ("centres-69", 16, [0] * 69, MALFORMED),
+        ("centres-reals", 16, [0.0] * 68, MALFORMED),
+        ("centre-over-limit", 16, [*[0] * 67, MAX_SYMBOL + 1], LIMIT),
+        ("centre-under-limit", 16, [-MAX_SYMBOL - 1, *[0] * 67], MALFORMED),
     ]
     for name, key, value, error in values:
         what = f"Header key {key} is {value!r}."
-        yield bad(f"header-{name}", what, "5.1", error, plain.with_header({key: value}))
+        given = graded if key == 16 else plain
+        yield bad(f"header-{name}", what, "5.1", error, given.with_header({key: value}))
     for name, widths, error in (
         ("feature-width-zero", Widths(0, 10), MALFORMED),
         ("feature-width-over-limit", Widths(65, 10), LIMIT),
@@ -809,6 +817,8 @@ def _sizes() -> Iterator[Vector]:
     yield bad("symbols-over-limit", "One symbol more than the payload may declare.", "6.5", LIMIT, over, chunk=1)
     over, what = symbols_at_limit(over=1, rows=2), "One symbol more, those of own and of earlier rows counted."
     yield bad("symbols-of-rows-over-limit", what, "6.5", LIMIT, over, chunk=1)
+    over, what = symbols_at_limit(over=1, rows=2, graded=True), "One symbol more, step classes counted."
+    yield bad("symbols-of-step-classes-over-limit", what, "6.5", LIMIT, over, chunk=1)
     crowd = rows_at_limit(over=1)
     yield bad("rows-over-limit", "One anchor more than the payload may declare.", "6.5 14", LIMIT, crowd, chunk=0)
     halves = make_file(make_layer(0, line(6000)), make_layer(1, line(6000, z=5), before=6000))

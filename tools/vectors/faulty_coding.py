@@ -51,6 +51,7 @@ from .blocks import (
     coded,
     constant_networks,
     gauss,
+    graded_part,
     in_layer,
     lzma_floats,
     lzma_symbols,
@@ -76,7 +77,7 @@ Row = tuple[str, str, str, bytes, str]
 
 def cases() -> Iterator[Vector]:
     """All of them, by clause."""
-    parts = _varints, _priors, _histograms, _streams, _exceptions, _prediction, _staged_planes, _lzma, _floats
+    parts = _varints, _priors, _histograms, _streams, _exceptions, _prediction, _grades, _staged_planes, _lzma, _floats
     for part in (*parts, _positions, _ranges):
         yield from part()
 
@@ -358,6 +359,39 @@ def _prediction() -> Iterator[Vector]:
     )
     for name, *row in rows:
         yield _attributed(f"predicted-{name}", *row)
+
+
+def _grades() -> Iterator[Vector]:
+    own, k = np.array([0, 6, 2], np.int32), np.full((68, 3), 3, np.int32)
+    rest = plain_attributes(k, classes=own)[1 + len(graded_part(own)) :]
+
+    def held(part: bytes) -> bytes:
+        return b"\0" + part + rest
+
+    over, under = (graded_part(np.array([0, symbol, 2], np.int32)) for symbol in (7, -1))
+    staged_over = predicted_attributes(k, {}, {}, (1,) * 6, grades=own).replace(graded_part(own), over, 1)
+    rows: tuple[Row, ...] = (
+        ("7", "8.5", MALFORMED, held(over), "A step class of 7."),
+        ("negative", "8.5", MALFORMED, held(under), "A step class of −1."),
+        ("7-staged", "8.5", MALFORMED, staged_over, "A step class of 7 in form 1."),
+        ("length-over-rest", "8.5 8.9", LIMIT, b"\0" + graded_part(own, 999), "Step classes longer than the section."),
+        ("short", "7.7 8.5", MALFORMED, held(graded_part(own, len(graded_part(own)) - 2)), "A byte short."),
+        ("nothing", "8.5 15", MALFORMED, b"\0", "The section ends after its form."),
+    )
+    layer = make_layer(0, line(3), attributes=k, classes=[0, 7, 2], mode=LZMA)
+    packed = make_file(layer, header={2: LZMA})
+    yield bad("step-classes-7-lzma", "A step class of 7 in mode lzma.", "8.5", MALFORMED, packed, chunk=0)
+    for name, clauses, error, section, what in rows:
+        layer = make_layer(0, line(3), attributes=k, classes=own.tolist())
+        yield bad(
+            f"step-classes-{name}", what, clauses, error, make_file(layer.with_sections({ATTRIBUTE: section})), chunk=0
+        )
+    edge = np.full((68, 1), 2, np.int32)
+    edge[5] = MAX_SYMBOL >> 6
+    far = make_file(make_layer(0, line(1), attributes=edge, classes=[6]), header={16: [0] * 5 + [1] + [0] * 62})
+    yield bad("step-classes-value-over-limit", "A value of 2^23 + 1 steps.", "11.5", MALFORMED, far, chunk=0)
+    near = make_file(make_layer(0, line(1), attributes=-edge, classes=[6]), header={16: [0] * 5 + [-1] + [0] * 62})
+    yield bad("step-classes-value-under-limit", "A value of −2^23 − 1 steps.", "11.5", MALFORMED, near, chunk=0)
 
 
 def _over_k() -> bytes:
@@ -680,7 +714,9 @@ def _ranges() -> Iterator[Vector]:
         k = np.full((68, 2), 1, np.int32)
         k[5, 1] = sign * (MAX_SYMBOL + 1)
         what = f"An attribute's symbol of {sign * (MAX_SYMBOL + 1)}."
-        yield of(f"attribute-{name}", "11.2", what, make_layer(0, line(2), attributes=k))
+        centre = {16: [*[0] * 5, -sign, *[0] * 62]}  # so that the value itself is within its range
+        file = make_file(make_layer(0, line(2), attributes=k, classes=[0, 0]), header=centre)
+        yield bad(f"attribute-{name}", what, "11.2", MALFORMED, file, chunk=0)
     networks = constant_networks(0, {0: (10,), 1: (70,), 2: (30,)}, 35)
     networks["color"][0][1][:] = MAX_SYMBOL + 1
     yield of("weight-above", "11.2 11.4", "A bias of 2^23 + 1.", make_layer(networks=networks))

@@ -10,6 +10,7 @@ import numpy as np
 
 from pd4dgs_codec.bitstream.limits import MAX_CHUNKS
 from pd4dgs_codec.codec.layer_meta import FREE_ROWS, ROWS_PER_BYTE
+from pd4dgs_codec.codec.symbols import LayerSymbols
 from pd4dgs_codec.entropy.priors import (
     CLASS_STEPS,
     FIRST_REUSE,
@@ -77,7 +78,7 @@ class Slices:
     plain: Known = field(default_factory=list)
     stages: list[Known] = field(default_factory=lambda: [[] for _ in range(8)])
     block: tuple[Terms, Splits, Sequence[int]] = ({}, {}, ONE_CLASS)
-    of: np.ndarray | None = None  #: attributes of the slice that the block stands in
+    of: LayerSymbols | None = None  #: the slice that the block stands in
 
     def add(self, layer: Layer, block: tuple[Terms, Splits, Sequence[int]] | None = None, go_on: bool = False) -> Layer:
         """The slice as it is written: in form 1 with this block, in form 2 with the one before, else in form 0."""
@@ -88,13 +89,20 @@ class Slices:
         if m.mask_own.size:
             sections[POSITIONS] = positions(m.anchor_q, self.positions)
             if block is not None:
-                self.block, self.of = block, m.attributes
-                sections[ATTRIBUTE] = predicted_attributes(m.attributes, *block, known=self.stages)
+                self.block, self.of = block, m
+                sections[ATTRIBUTE] = predicted_attributes(m.attributes, *block, known=self.stages, grades=m.classes)
             elif go_on:
-                own = {"known": self.stages, "of": self.of}
-                sections[ATTRIBUTE] = predicted_attributes(m.attributes, *self.block, **own)
+                assert self.of is not None
+                sections[ATTRIBUTE] = predicted_attributes(
+                    m.attributes,
+                    *self.block,
+                    known=self.stages,
+                    grades=m.classes,
+                    of=self.of.attributes,
+                    of_grades=self.of.classes,
+                )
             else:
-                sections[ATTRIBUTE] = plain_attributes(m.attributes, known=self.plain)
+                sections[ATTRIBUTE] = plain_attributes(m.attributes, known=self.plain, classes=m.classes)
         return layer.with_sections(sections)
 
 
@@ -128,6 +136,14 @@ def _good() -> Iterator[Case]:
         "8.5 8.7 8.9",
         _continued(),
     )
+    graded, block = Slices(), ({5: [(0, 700), (3, -300)]}, {0: (3, 1, 0)}, (3, 4, 2, 1, 5, 2))
+    classes = (
+        graded.add(make_layer(0, line(9), attributes=pattern(68, 9), classes=[0, 6, 3, 1, 0, 2, 5, 4, 6]), block),
+        graded.add(later(0, line(4, z=2), attributes=pattern(68, 4, seed=1), classes=[6, 0, 0, 1]), go_on=True),
+        graded.add(later(0, line(3, z=4), attributes=pattern(68, 3, seed=2), classes=[2, 2, 5])),
+        graded.add(later(0, line(3, z=-4), attributes=pattern(68, 3, seed=3), classes=[0, 1, 0])),
+    )
+    yield "valid/slices-classes", "Slices with step classes, in all forms.", "3.6 8.5 8.7 11.2", make_file(*classes)
     apart = Slices()
     mixed = (
         apart.add(make_layer(0, ordered([[0, 0, 1], [6, 3, 0]]), codes=[40, 50], attributes=pattern(68, 2))),

@@ -95,6 +95,7 @@ def cases() -> Iterator[Vector]:
     for make in (
         _scenes,
         _widths,
+        _step_classes,
         _priors,
         _histograms,
         _exceptions,
@@ -167,6 +168,44 @@ def _widths() -> Iterator[Case]:
         section = predicted_attributes(k, terms, flags, (8, 3, 2, 6, 4), widths=widths)
         file = make_file(base.with_sections({ATTRIBUTE: section}))
         yield f"widths-{name}-staged", what + " Form 1.", "8.5 8.6 8.7", file
+
+
+def _step_classes() -> Iterator[Case]:
+    own = np.resize([0, 6, 3, 1, 0, 2, 5, 4, 6, 1, 0], ROWS).astype(np.int32)
+    k, grades = pattern(68, ROWS) * (1 + np.arange(ROWS) % 3), own.tolist()
+    base = make_layer(0, line(ROWS), attributes=k, classes=grades)
+    yield "classes", "Anchors of all step classes.", "5.1 8.5 11.2 11.5", make_file(base)
+    more = make_layer(1, line(2, z=5), before=ROWS, attributes=pattern(68, 2), classes=[6, 0], scales=[Scale()])
+    two = make_file(base, more)
+    yield "classes-layers", "Step classes of two layers, which share their centres.", "5.1 11.5 12.4", two
+    yield "classes-alike", "Every anchor has class 2.", "8.5", make_file(make_layer(0, line(3), classes=[2] * 3))
+    empty = make_file(make_layer(0, (), classes=()), header={16: [7] * 68})
+    yield "classes-of-no-anchors", "Centres and no anchor.", "5.1 6.4", empty
+    ladder = {c: [(j, 97 * c - 1800 + 31 * j) for j in range(c % 7, c, 5)] for c in range(1, 38)}
+    flags = {i: (i % 4, i - 4, 5 - i) for i in range(10)}
+    for name, what, terms, splits, counts in (
+        ("one", "Form 1, one class by activity in each stage.", {}, {}, (1,) * 6),
+        ("first", "Stage 0 split by the step classes alone.", {}, {}, (7, 1, 1, 1, 1, 1)),
+        ("all", "Step classes, terms, splits, and classes by activity.", ladder, flags, (4, 8, 3, 2, 6, 5)),
+    ):
+        section = predicted_attributes(k, terms, splits, counts, grades=own)
+        file = make_file(base.with_sections({ATTRIBUTE: section}))
+        yield f"classes-staged-{name}", what, "8.5 8.6 8.7 8.9", file
+    edge = np.full((68, 2), 2, np.int32)
+    edge[0], edge[1], edge[2] = MAX_SYMBOL >> 6, -MAX_SYMBOL >> 6, [0, MAX_SYMBOL]
+    centres = [0, 0, -MAX_SYMBOL, MAX_SYMBOL, *[0] * 64]
+    edge[3] = [0, -MAX_SYMBOL]
+    extremes = make_layer(0, line(2), attributes=edge, classes=[6, 0])
+    yield (
+        "classes-extremes",
+        "The largest values and centres.",
+        "11.2 11.5 14",
+        make_file(extremes, header={16: centres}),
+    )
+    coded = make_layer(0, line(ROWS), attributes=k, classes=grades, mode=LZMA)
+    yield "classes-lzma", "Step classes in mode lzma.", "6.4 8.5 9.1", make_file(coded, header={2: LZMA})
+    wide = make_layer(0, line(ROWS), attributes=pattern(15, ROWS), classes=grades, widths=Widths(3, 2))
+    yield "classes-other-widths", "Step classes and other widths.", "5.1 8.5 11.5", make_file(wide)
 
 
 # -- priors ------------------------------------------------------------------------------------------------------------
@@ -562,17 +601,19 @@ def _with_weights() -> Layer:
     return make_layer(networks=networks)
 
 
-def symbols_at_limit(over: int = 0, rows: int = 0) -> File:
-    """As many constant channels as clause 6.5 allows a file, or `over` more, and `rows` anchors in either layer."""
+def symbols_at_limit(over: int = 0, rows: int = 0, graded: bool = False) -> File:
+    """As many constant channels as clause 6.5 allows a file, or `over` more, and `rows` anchors in either layer, which
+    may have step classes."""
+    classes = [1] * rows if graded else None
     plane = Scale(1, (2048, 2048, 1, 1), (0,) * 6, lambda name, shape: np.full(shape, 1, np.int32))
 
     def layer(first: int, second: int, hidden: int) -> Layer:
         networks = {0: (first, second), 1: (hidden, 3)}
-        return make_layer(1, line(rows, z=5), before=rows, scales=[plane], networks=networks)
+        return make_layer(1, line(rows, z=5), before=rows, scales=[plane], networks=networks, classes=classes)
 
-    below = make_layer(cells=line(rows))
+    below = make_layer(cells=line(rows), classes=classes)
     size = len(below.payload()) + len(layer(300, 300, 1).payload())  # the same while no width takes more bytes
-    spent = sum(a.size for a in below.meant.arrays()) + (2048 * 2048 + 4 * 2048 + 1) + 73 * rows
+    spent = sum(a.size for a in below.meant.arrays()) + (2048 * 2048 + 4 * 2048 + 1) + (73 + graded) * rows
     weights = FREE_SYMBOLS + SYMBOLS_PER_BYTE * size + over - spent
     for first, hidden in itertools.product(range(256, 400), range(1, 100)):
         # weights = (1 + 1) first + (first + 1) second + (second + 1) hidden + (hidden + 1) 3
