@@ -143,7 +143,10 @@ def _summary(scene: Scene, data: bytes, complete: bool, seconds: float, args: ar
     described = {row["layer"]: row for row in info(data)["layers"]}
     rows = []
     for i, (layer, total) in enumerate(zip(scene.layers, scene.rows, strict=True)):
-        place = {key: described[layer][key] for key in ("offset", "bytes", "end")}
+        ends = [part["end"] for part in described[layer]["slices"]]
+        end = max(end for end in ends if end == ends[0] or args.max_bytes is None or end <= args.max_bytes)
+        size = sum(part["bytes"] for part in described[layer]["slices"] if part["end"] <= end)
+        place = {"offset": described[layer]["offset"], "bytes": size, "end": end}
         anchors = total - (scene.rows[i - 1] if i else 0)
         rows.append({"layer": layer, **place, "anchors": anchors, "active": int((scene.mask[i] > 0).sum())})
     wanted = range(3 if args.max_layer is None else args.max_layer + 1)
@@ -153,6 +156,7 @@ def _summary(scene: Scene, data: bytes, complete: bool, seconds: float, args: ar
         "bytes": len(data),
         "complete": complete,
         "max_layer": args.max_layer,
+        "max_bytes": args.max_bytes,
         "seconds": round(seconds, 4),
         "anchors": len(scene.anchor_q),
         "global_deformation": scene.global_deformation is not None,
@@ -169,6 +173,8 @@ def _text(result: dict[str, Any]) -> str:
     ]
     if not result["complete"]:
         state = "cut; valid so far"
+    elif result["max_bytes"] is not None:
+        state = f"valid in the first {result['layers'][-1]['end']:,}"
     elif result["max_layer"] is not None:  # what follows the prefix was not looked at
         state = f"layers {', '.join(str(row['layer']) for row in result['layers'])} whole and valid"
     else:

@@ -191,3 +191,20 @@ def test_decoding_runs_where_torch_and_numba_cannot_be_imported(scene_pd4):
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, timeout=60)
     assert done.returncode == 0, done.stderr
     assert json.loads(done.stdout.splitlines()[0])["complete"] is True
+
+
+def test_max_bytes_stops_at_a_slice(cli, tmp_path):
+    from strategies import make_scene
+
+    from pd4dgs_codec import decode, encode
+    from pd4dgs_codec.codec.info import info
+
+    data, path = encode(make_scene(3, anchors=200), slices=2000, effort=1), tmp_path / "scene.pd4"
+    path.write_bytes(data)
+    ends = [part["end"] for row in info(data)["layers"] for part in row["slices"]]
+    done = cli("decode", path, "--max-bytes", str(ends[1] + 3), "--json")
+    assert (done.code, done.json["layers"][-1]["end"], done.json["complete"]) == (0, ends[1], True)
+    assert done.json["anchors"] == len(decode(data, max_bytes=ends[1]).anchor_q)
+    done = cli("decode", path, "--max-bytes", str(ends[0] - 1))
+    assert done.code == 1 and f"{ends[0] - 1} bytes end before the first slice" in done.err
+    assert f"{ends[1]:,}".encode() in cli("info", path).out
