@@ -202,7 +202,7 @@ def render(rows: Sequence[Row]) -> str:
         for c in row["costs"]:
             direct, exported = c["direct_mpsnr"], c["exported_mpsnr"]
             decibels = (direct, exported, direct - exported, c["exported_to_direct_psnr"])
-            cells = (row["name"], c["eyes"], c["degree"], c["steps"], *(f"{v:.2f}" for v in decibels))
+            cells = (row["name"], c["eyes"], str(c["degree"]), str(c["steps"]), *(f"{v:.2f}" for v in decibels))
             costs.append((*cells, f"{c['seconds']:.1f}"))
         files.append((row["name"], ".pd4, all times and views", "-", "-", f"{row['file_bytes']:,}", "-", "-", "-"))
         for f in row["files"]:

@@ -298,7 +298,8 @@ def _seconds(rows: Sequence[Row], visit: int) -> str:
     said = (
         f"**Seconds from navigation to each picture**, cold cache, median of {rows[-1]['runs']}, round trip "
         f"{LATENCY * 1e3:g} ms. S: bytes up to the end of the layer or slice. P: page and player, {visit:,} bytes. "
-        "Arrived: the last of these bytes. Then decoding, and what it takes to evaluate, sort and draw, in software."
+        "Arrived: the last of these bytes. Then decoding, and what it takes to evaluate, sort and draw, in software. "
+        "Files in slices are of the same scene, encoded with less effort."
     )
     head = ("scene", "Mbps", "level", "S", "8S/B", "8(S+P)/B", "arrived", "decode", "evaluate, draw", "picture")
     return _block(said, head, cells)

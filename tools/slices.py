@@ -47,7 +47,7 @@ def measure(path: Path, dataset: Dataset, size: int, strip: Path) -> Row:
     say("  one slice per layer")
     one = pack(scene, views=views)
     say("  slices")
-    packed = pack(scene, EncodeOptions(slices=size), views=Views(views.source, views.fitting))
+    packed = pack(one.scene, EncodeOptions(slices=size), views=Views(views.source, views.fitting))
     rng = np.random.default_rng(0)
     shuffled = encode(one.scene, slices=size, utility=lambda decoded: rng.random(len(decoded.anchor_q)))
     files = {"layers": one.data, "slices": packed.data, "random": shuffled}
@@ -171,7 +171,7 @@ def render(rows: Sequence[Row]) -> str:
         cost.append(
             (
                 row["name"],
-                len(sliced),
+                f"{len(sliced)}",
                 f"{sliced[-1][0]:,}",
                 f"{more:+.2%}",
                 f"{seconds['slices']:.2f}",

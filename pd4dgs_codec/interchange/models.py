@@ -233,7 +233,7 @@ def checked(
         )
     good = np.ones(n, bool)
     for array in parts.values():
-        good &= (np.abs(array.reshape(n, -1)) <= LARGEST).all(axis=1)  # also false of NaN
+        good &= (np.abs(array) <= LARGEST).all(axis=tuple(range(1, array.ndim)))  # also false of NaN
     good &= (np.linalg.norm(quats, axis=1) > 0) & (scales >= 0).all(axis=1) & (opacities >= 0) & (opacities <= 1)
     if not good.any():
         raise DataError(f"{where}: none of {n} Gaussians is finite with a rotation, expected one at least")

@@ -3,7 +3,7 @@
 import { AnsDecoder } from "./ans.js";
 import { ByteReader, MAX_VARINT } from "./bytes.js";
 import { limitExceeded, malformed, unsupported } from "./errors.js";
-import { MAX_CODED, MAX_COUNT, FREE_ENTRIES, MAX_WINDOW, MORE_ENTRIES } from "./limits.js";
+import { FREE_ENTRIES, MAX_CODED, MAX_COUNT, MAX_WINDOW, MORE_ENTRIES } from "./limits.js";
 import { Table, histogramTable, mixtureTable, normTable } from "./tables.js";
 
 const CONST = 0;

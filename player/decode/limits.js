@@ -21,7 +21,8 @@ export const MAX_SYMBOL = 2 ** 23;
 /** Symbols of one channel. */
 export const MAX_COUNT = 2 ** 26;
 export const MAX_WINDOW = 2 ** 14;
-/** Entries of all windows that a section of coded channels defines, over one per symbol: where nothing is defined before, and where something is. */
+/** Entries of all windows that a section of coded channels defines, over one per symbol: where nothing is defined before,
+ * and where something is. */
 export const FREE_ENTRIES = 2 ** 18;
 export const MORE_ENTRIES = 2 ** 10;
 export const MAX_CLASSES = 8;

@@ -179,6 +179,15 @@ def test_a_cameras_json_beside_the_frames_is_heeded(tmp_path):
     np.testing.assert_allclose([camera_eye(v.camera) for v in data.train], [r["position"] for r in rows], atol=1e-6)
 
 
+def test_an_instant_without_gaussians_is_one_line(tmp_path):
+    pytest.importorskip("fourdgs")
+    splats, path = make_splats(5, 1), tmp_path / "late.4dgs"
+    path.write_bytes(fourdgs_bytes([(0.5, splats, np.arange(5))], 1.0))
+    assert len(read_model(str(path), 30).splats(0.9).means) == 5
+    with pytest.raises(DataError, match="late.4dgs at 0.1: none of 0 Gaussians"):
+        read_model(str(path), 30).splats(0.1)
+
+
 @pytest.mark.parametrize(
     "source, message",
     [

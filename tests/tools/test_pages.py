@@ -9,6 +9,7 @@ import sys
 from functools import partial
 
 import evaluation
+import interchange
 import latency
 import omissions
 import performance
@@ -16,6 +17,7 @@ import player_page
 import precision
 import pytest
 import results
+import slices
 from pages import page, peers, tables
 from pages import scenes as places
 from pages.page import Page
@@ -26,7 +28,8 @@ from pd4dgs_codec.errors import DataError
 
 ROOT = page.ROOT
 DOCS = ROOT / "docs"
-PAGES = [tool.PAGE for tool in (results, evaluation, precision, latency, omissions, performance, player_page)]
+TOOLS = (results, evaluation, precision, latency, interchange, omissions, performance, player_page, slices)
+PAGES = [tool.PAGE for tool in TOOLS]
 PAGES += [table.page for table in TABLES.values()]
 #: Bytes that a text and a picture may have.
 TEXT, PICTURE = 50_000, 300_000

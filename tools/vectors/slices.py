@@ -11,7 +11,15 @@ import numpy as np
 from pd4dgs_codec.bitstream.limits import MAX_CHUNKS
 from pd4dgs_codec.codec.layer_meta import FREE_ROWS, ROWS_PER_BYTE
 from pd4dgs_codec.codec.symbols import LayerSymbols
-from pd4dgs_codec.entropy.priors import FIRST_REUSE, FREE_ENTRIES, MAX_WINDOW, MORE_ENTRIES
+from pd4dgs_codec.entropy.priors import (
+    CLASS_STEPS,
+    FIRST_REUSE,
+    FREE_ENTRIES,
+    MAX_WINDOW,
+    MORE_ENTRIES,
+    Hist,
+    Window,
+)
 
 from .blocks import (
     ATTRIBUTE,
@@ -156,6 +164,15 @@ def _good() -> Iterator[Case]:
     floats = make_layer(1, line(2, z=3), before=1, scales=[Scale()], raw=True)
     raw = make_file(make_layer(), floats, later(1, line(1, z=4)), header={3: FLOAT32})
     yield "uncommon/slices-floats", "Layer 1 in two slices, planes and weights as float32 values.", "3.6 9.2", raw
+    classes = np.array([1, 2, 3, 3, 3, 2, 1])
+    hist = Hist(Window(-3, 7), CLASS_STEPS[0], 3, False, 20, 2, classes)
+    parts = make_layer(0, line(3)), later(0, line(2, z=3))
+    spiky, lists = list[Layer](), Known()
+    for seed, part in enumerate(parts):
+        k = pattern(68, len(part.meant.mask_own), seed=seed)
+        part = replace(part, meant=replace(part.meant, attributes=k))
+        spiky.append(part.with_sections({ATTRIBUTE: plain_attributes(k, {0: hist}, lists)}))
+    yield "valid/slices-histogram", "A histogram that slice 1 takes from slice 0.", "8 8.4", make_file(*spiky)
     digest = {14: whole.fields()[14]}
     for count in (1, 2, 4):
         cut = replace(whole, chunks=whole.chunks[:count]).with_header(digest)
