@@ -7,6 +7,7 @@ eye to eye. What is kept is found from a set of eyes, each with a weight per anc
 - covariance: its mean weighted by the eyes' weights times the opacities that they see;
 - colour: harmonics by least squares over the eyes' directions with those same weights, with a ridge that keeps what no
   eye has seen near the mean.
+
 """
 
 from __future__ import annotations

@@ -41,7 +41,7 @@ class Refused(Exception):
 
 
 def read_tensors(path: Path) -> Any:
-    """What the file holds: dicts, lists, scalars, `Module`s, and tensors as numpy arrays. Raises DataError."""
+    """What the file holds: dicts, lists, scalars, modules, and tensors as numpy arrays. Raises DataError."""
     try:
         raw = read_file(path)
     except FileNotFoundError:
