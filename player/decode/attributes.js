@@ -1,10 +1,11 @@
-// Clauses 8.5 to 8.7: the attributes section. Its result is the channels of 11.2, still unchecked against 11.2.
+// Clauses 8.5 to 8.7: the attributes section. Its result is the step classes and the channels of 11.2, the latter still
+// unchecked against 11.2.
 
 import { ByteReader } from "./bytes.js";
 import { decodeChannels } from "./channels.js";
 import { malformed, unsupported } from "./errors.js";
+import { channelCount } from "./header.js";
 import { MAX_CODED } from "./limits.js";
-import { channelCount } from "./parameters.js";
 import {
   activityBounds,
   addRelativeMagnitudes,
@@ -20,6 +21,7 @@ import {
  * the activity of all of them. */
 const STAGE_BOUNDS = [0, 6, 12, 20, 29, 38];
 const X_STAGE = 5;
+const STEP_CLASSES = 7;
 const STAGES = 8;
 /** Classes by distance of a Gaussian's second and third coordinate. */
 const DISTANCES = [5, 7];
@@ -34,48 +36,73 @@ const DISTANCES = [5, 7];
  * @property {Terms[]} terms
  * @property {number[]} classCounts
  * @property {Split[]} splits
- * @property {Map<number, import("./stages.js").Reference>} references
+ * @property {Map<number | "step classes", import("./stages.js").Reference>} references
  * @property {number[][]} bounds
  */
 
 /**
- * @param {Uint8Array} bytes the section @param {number} rows at least 1 @param {import("./header.js").Widths} widths
+ * @param {Uint8Array} bytes the section @param {number} rows at least 1 @param {import("./parameters.js").LayerKind} kind
  * @param {import("./slices.js").Continuation} continuation of the layer
- * @returns {Int32Array} [D + 6 + 3·G, rows]
+ * @returns {{stepClasses: Int32Array, attributes: Int32Array}} [rows], empty without step classes; [D + 6 + 3·G, rows]
  */
-export function decodeAttributes(bytes, rows, widths, continuation) {
+export function decodeAttributes(bytes, rows, kind, continuation) {
   const reader = new ByteReader(bytes);
   const form = reader.byte("the form of the attributes");
-  const channels = channelCount(widths);
-  const out = new Int32Array(channels * rows);
-  if (form === 0) decodeChannels(reader.rest(), new Array(channels).fill(rows), out, continuation.definitions("plain"));
+  const stepClasses = kind.stepClasses ? readStepClasses(reader, rows) : new Int32Array(0);
+  const attributes = new Int32Array(channelCount(kind.widths) * rows);
+  if (form === 0) decodePlain(reader.rest(), stepClasses, rows, attributes, continuation.definitions("plain"));
   else if (form === 1) {
-    const block = readBlock(reader, widths);
-    decodeStaged(reader, rows, widths, block, true, continuation, out);
+    const block = readBlock(reader, kind);
+    decodeStaged(reader, stepClasses, rows, kind.widths, block, true, continuation, attributes);
     continuation.block = block;
   } else if (form === 2) {
     if (!continuation.block) throw malformed("attributes that go on with a block, and none before in the layer");
-    decodeStaged(reader, rows, widths, continuation.block, false, continuation, out);
+    decodeStaged(reader, stepClasses, rows, kind.widths, continuation.block, false, continuation, attributes);
   } else throw unsupported(`form ${form} of the attributes`);
-  return out;
+  return { stepClasses, attributes };
 }
 
-/** 8.6. @param {ByteReader} reader @param {import("./header.js").Widths} widths @returns {Block} */
-function readBlock(reader, { feature, slots }) {
+/** Of each row; no slice goes on with its priors. @param {ByteReader} reader @param {number} rows */
+function readStepClasses(reader, rows) {
+  const length = reader.varint(reader.remaining, "the length of the step classes");
+  const classes = new Int32Array(rows);
+  decodeChannels(reader.take(length, "the end of the step classes"), [rows], classes);
+  for (const c of classes) {
+    if (c < 0 || c >= STEP_CLASSES) throw malformed(`a step class of ${c}, expected 0..${STEP_CLASSES - 1}`);
+  }
+  return classes;
+}
+
+/** Form 0. @param {Uint8Array} bytes @param {Int32Array} stepClasses @param {number} rows @param {Int32Array} out
+ * @param {import("./channels.js").Definitions} known */
+function decodePlain(bytes, stepClasses, rows, out, known) {
+  const groups = stepClasses.length ? groupByClass(stepClasses, STEP_CLASSES) : null;
+  const sizes = groups ? [...groups.sizes] : [rows];
+  decodeChannels(bytes, Array.from({ length: out.length / rows }, () => sizes).flat(), out, known);
+  if (!groups) return;
+  for (let at = 0; at < out.length; at += rows) {
+    const coded = out.slice(at, at + rows);
+    groups.order.forEach((row, i) => (out[at + row] = coded[i]));
+  }
+}
+
+/** 8.6. @param {ByteReader} reader @param {import("./parameters.js").LayerKind} kind @returns {Block} */
+function readBlock(reader, { widths: { feature, slots }, stepClasses }) {
   const predicted = feature + 6;
   /** @type {Terms[]} */
   const terms = [[]];
   for (let c = 1; c < predicted; c++) terms.push(readTerms(reader, c, predicted));
-  const classCounts = [1];
-  for (let stage = 1; stage <= X_STAGE; stage++) classCounts.push(readClassCount(reader));
+  const classCounts = stepClasses ? [] : [1];
+  while (classCounts.length <= X_STAGE) classCounts.push(readClassCount(reader));
   const splits = Array.from({ length: slots }, () => readSplit(reader));
   return { terms, classCounts, splits, references: new Map(), bounds: [] };
 }
 
-/** 8.7. @param {ByteReader} reader @param {number} rows @param {import("./header.js").Widths} widths @param {Block} block
+/** 8.7. @param {ByteReader} reader @param {Int32Array} stepClasses @param {number} rows
+ * @param {import("./header.js").Widths} widths @param {Block} block
  * @param {boolean} own whether the block stands in this slice, and takes down what it is classed by
  * @param {import("./slices.js").Continuation} continuation @param {Int32Array} out */
-function decodeStaged(reader, rows, { feature, slots }, block, own, continuation, out) {
+function decodeStaged(reader, stepClasses, rows, { feature, slots }, block, own, continuation, out) {
   const { terms, classCounts, splits, references } = block;
   const predicted = feature + 6; // features and log-scalings, from each other
   const firsts = STAGE_BOUNDS.map((part) => Math.floor((predicted * part) / 38));
@@ -84,6 +111,13 @@ function decodeStaged(reader, rows, { feature, slots }, block, own, continuation
   const channel = (c) => out.subarray(c * rows, (c + 1) * rows);
 
   const activity = new Float64Array(rows);
+  if (stepClasses.length) {
+    // A row of finer steps has larger symbols.
+    const fineness = stepClasses.map((c) => 1 << (STEP_CLASSES - 1 - c));
+    if (own) references.set("step classes", referenceOf(fineness));
+    addRelativeMagnitudes(fineness, activity, references.get("step classes"));
+    for (let p = 0; p < rows; p++) activity[p] *= 4;
+  }
   for (let stage = 0; stage <= X_STAGE; stage++) {
     const count = classCounts[stage];
     if (own) block.bounds.push(activityBounds(activity, count));

@@ -54,10 +54,14 @@ export class ByteReader {
     return value;
   }
 
+  /** The next `size` bytes. @param {number} size @param {string} what names their end in messages */
+  take(size, what) {
+    if (size > this.remaining) throw malformed(`the section ends before ${what}`);
+    return this.bytes.subarray(this.offset, (this.offset += size));
+  }
+
   /** All bytes that are left. */
   rest() {
-    const rest = this.bytes.subarray(this.offset);
-    this.offset = this.bytes.length;
-    return rest;
+    return this.take(this.remaining, "its end");
   }
 }

@@ -1,7 +1,7 @@
 // Clause 12.4: digests of what a file decodes to.
 
 import { Sha256, hex } from "./digests.js";
-import { channelCount } from "./parameters.js";
+import { channelCount } from "./header.js";
 import { readAll } from "./reader.js";
 import { joined, mortonOrder, reordered } from "./slices.js";
 
@@ -58,10 +58,12 @@ function hashesOf(slices) {
   /** @param {"anchor" | "feature" | "scalingLog" | "offset"} name */
   const values = (name) => sorted(slices.map((slice) => slice.tensors[name]));
   const codes = sorted(slices.map((slice) => slice.symbols.codes));
+  const classes = symbols.kind.stepClasses ? [sorted(slices.map((slice) => slice.symbols.stepClasses))] : [];
+  const rows = [sorted([voxels]), symbols.rises, codes, ...classes, ...attributes];
   const own = [values("anchor"), values("feature"), values("scalingLog"), values("offset")];
   return {
     layer: symbols.kind.layer,
-    symbols: digest([sorted([voxels]), symbols.rises, codes, ...attributes, ...symbols.planes, ...symbols.weights]),
+    symbols: digest([...rows, ...symbols.planes, ...symbols.weights]),
     tensors: digest([...own, ...tensors.planes, ...tensors.weights]),
   };
 }

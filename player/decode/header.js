@@ -3,7 +3,7 @@
 import { sceneIdOf } from "./container.js";
 import { malformed, unsupported } from "./errors.js";
 import { Fields, asBytes, asInteger, asList, asRegistered, checkStep } from "./fields.js";
-import { MAX_CHUNKS, MAX_FEATURE, MAX_PAYLOAD, MAX_SLOTS } from "./limits.js";
+import { MAX_CHUNKS, MAX_FEATURE, MAX_PAYLOAD, MAX_SLOTS, MAX_SYMBOL } from "./limits.js";
 import { unpack } from "./msgpack.js";
 
 /** @typedef {{type: number, length: number}} ListedChunk */
@@ -20,8 +20,12 @@ import { unpack } from "./msgpack.js";
  * @property {import("./scene.js").Info} info
  * @property {Map<number, number>} bounds
  * @property {Widths} widths
+ * @property {number[] | null} centres of the attributes' channels; null if anchors have no step classes
  * @property {string} sceneId
  */
+
+/** The channels of an anchor (11.2). @param {Widths} widths */
+export const channelCount = ({ feature, slots }) => feature + 6 + 3 * slots;
 
 /** How many layer types there are: 0, 1 and 2. */
 export const LAYER_TYPES = 3;
@@ -65,11 +69,7 @@ export function readHeader(bytes) {
     feature: asInteger(width, 1, MAX_FEATURE, "header: feature width"),
     slots: asInteger(count, 1, MAX_SLOTS, "header: slots"),
   };
-  if (fields.has(16)) {
-    const centres = asList(fields.get(16), "header: centres", widths.feature + 6 + 3 * widths.slots);
-    centres.forEach((m) => asInteger(m, -(2 ** 23), 2 ** 23, "header: a channel's centre"));
-    throw unsupported("header: step classes, expected none");
-  }
+  const centres = fields.has(16) ? readCentres(fields.get(16), channelCount(widths)) : null;
   const layers = chunks.filter(({ type }) => type < LAYER_TYPES).map(({ type }) => type);
   if (mode === 1 && new Set(layers).size < layers.length) throw malformed("header: mode lzma, and a layer in slices");
   // An ans-only decoder (clause 16).
@@ -95,6 +95,7 @@ export function readHeader(bytes) {
     },
     bounds,
     widths,
+    centres,
     sceneId: sceneIdOf(bytes.subarray(firstEntryEnd)),
   };
 }
@@ -132,6 +133,12 @@ function readCamera(value) {
     width: asInteger(fields.get(3), 1, MAX_CAMERA_SIDE, "header: camera: width"),
     height: asInteger(fields.get(4), 1, MAX_CAMERA_SIDE, "header: camera: height"),
   };
+}
+
+/** @param {import("./msgpack.js").Value} value @param {number} count */
+function readCentres(value, count) {
+  const centres = asList(value, "header: centres", count);
+  return centres.map((m) => asInteger(m, -MAX_SYMBOL, MAX_SYMBOL, "header: a channel's centre"));
 }
 
 /** @param {import("./msgpack.js").Value} value @returns {Map<number, number>} */

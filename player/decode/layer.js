@@ -12,8 +12,8 @@ import { decodePositions } from "./positions.js";
 
 /**
  * What one slice with n own rows carries. voxels: [n, 3]. rises: of the earlier rows' mask codes. codes: of the own
- * rows. attributes: [D + 6 + 3·G, n]. planes: per scale six [C, H, W]. weights: weight, bias, weight, bias and so on, network by
- * network.
+ * rows. stepClasses: [n], empty if anchors have none. attributes: [D + 6 + 3·G, n]. planes: per scale six [C, H, W].
+ * weights: weight, bias, weight, bias and so on, network by network.
  *
  * @typedef {object} LayerSymbols
  * @property {import("./parameters.js").LayerKind} kind
@@ -21,6 +21,7 @@ import { decodePositions } from "./positions.js";
  * @property {Int32Array} voxels
  * @property {Int32Array} rises
  * @property {Int32Array} codes
+ * @property {Int32Array} stepClasses
  * @property {Int32Array} attributes
  * @property {Int32Array[]} planes
  * @property {Int32Array[]} weights
@@ -44,7 +45,7 @@ export function decodeLayer(payload, kind, before, continuation, later) {
   const { rows, sections, planes: shapes, networks } = parameters;
   const positions = sections[POSITIONS];
   const masks = sections[MASKS];
-  const attributes = sections[ATTRIBUTES];
+  const section = sections[ATTRIBUTES];
   const planes = sections[PLANE_SECTION];
   const weights = sections[WEIGHTS];
   const voxels = positions ? decodePositions(positions, rows, continuation.definitions("positions")) : new Int32Array(0);
@@ -52,15 +53,17 @@ export function decodeLayer(payload, kind, before, continuation, later) {
   if (masks) decodeChannels(masks, [earlierRows, rows], codes, continuation.definitions("masks"));
   checkRange(codes.subarray(0, earlierRows), 0, MOST_CODE, "a rise of a mask code");
   checkRange(codes.subarray(earlierRows), LEAST_OWN_CODE, MOST_CODE, "a mask code");
-  const decoded = attributes ? decodeAttributes(attributes, rows, kind.widths, continuation) : new Int32Array(0);
-  checkRange(decoded, -MAX_SYMBOL, MAX_SYMBOL, "a symbol of an attribute");
+  const none = { stepClasses: new Int32Array(0), attributes: new Int32Array(0) };
+  const { stepClasses, attributes } = section ? decodeAttributes(section, rows, kind, continuation) : none;
+  checkRange(attributes, -MAX_SYMBOL, MAX_SYMBOL, "a symbol of an attribute");
   return {
     kind,
     parameters,
     voxels,
     rises: codes.subarray(0, earlierRows),
     codes: codes.subarray(earlierRows),
-    attributes: decoded,
+    stepClasses,
+    attributes,
     planes: planes ? decodePlanes(planes, shapes) : [],
     weights: weights ? decodeWeights(weights, networks) : [],
   };
@@ -90,21 +93,40 @@ function checkRange(symbols, least, most, what) {
  * @returns {Float32Array}
  */
 export function dequantise(symbols, step) {
-  return transposed(symbols, symbols.length, 1, step);
+  return transposed(symbols, symbols.length, 1, step, null);
 }
 
 /** Rows that are transposed at a time, so few that they stay in the cache. */
 const BLOCK = 128;
 
-/** As dequantise, of [columns, rows] symbols to [rows, columns] values. @param {Int32Array} symbols @param {number} rows
- * @param {number} columns @param {number} step */
-export function transposed(symbols, rows, columns, step) {
+/** centres: [columns]. stepClasses: [rows]. @typedef {{centres: number[], stepClasses: Int32Array}} Grading */
+
+/** @param {number} centre @param {number} symbol at most 2^23 in magnitude @param {number} stepClass 0..6 */
+function levelOf(centre, symbol, stepClass) {
+  const level = centre + (symbol << stepClass);
+  if (level > MAX_SYMBOL || level < -MAX_SYMBOL) throw malformed(`an attribute of ${level} steps, limit ${MAX_SYMBOL}`);
+  return level;
+}
+
+/**
+ * As dequantise, of [columns, rows] symbols to [rows, columns] values. Malformed if a graded one is out of its range.
+ *
+ * @param {Int32Array} symbols @param {number} rows @param {number} columns @param {number} step
+ * @param {Grading | null} grading null without step classes
+ * @returns {Float32Array}
+ */
+export function transposed(symbols, rows, columns, step, grading) {
   const values = new Float32Array(symbols.length);
   for (let first = 0; first < rows; first += BLOCK) {
     const end = Math.min(first + BLOCK, rows);
     for (let c = 0; c < columns; c++) {
       // The product is exact: 24 bits by 24 bits.
-      for (let r = first; r < end; r++) values[r * columns + c] = symbols[c * rows + r] * step;
+      if (grading) {
+        const { centres, stepClasses } = grading;
+        for (let r = first; r < end; r++) {
+          values[r * columns + c] = levelOf(centres[c], symbols[c * rows + r], stepClasses[r]) * step;
+        }
+      } else for (let r = first; r < end; r++) values[r * columns + c] = symbols[c * rows + r] * step;
     }
   }
   // Rounding is monotone, so that where the largest symbol stays finite all do.

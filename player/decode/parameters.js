@@ -2,6 +2,7 @@
 
 import { limitExceeded, malformed } from "./errors.js";
 import { Fields, asInteger, asList, asRegistered, checkStep } from "./fields.js";
+import { channelCount } from "./header.js";
 import {
   MAX_CHANNELS,
   MAX_FIELDS,
@@ -20,7 +21,7 @@ import { PLANES } from "./scene.js";
 /**
  * What a layer's number and the header's widths decide. networks: name and outputs by id, null for any number of outputs.
  * inputs: of layer 0's networks, feature and view direction. classes: of the error bounds of its steps, in their order
- * (5.4).
+ * (5.4). stepClasses: whether anchors have them (11.2).
  *
  * @typedef {object} LayerKind
  * @property {number} layer
@@ -28,10 +29,11 @@ import { PLANES } from "./scene.js";
  * @property {number} inputs
  * @property {number[]} classes
  * @property {import("./header.js").Widths} widths
+ * @property {boolean} stepClasses
  */
 
-/** @param {number} layer @param {import("./header.js").Widths} widths @returns {LayerKind} */
-export function layerKind(layer, widths) {
+/** @param {number} layer @param {import("./header.js").Header} header @returns {LayerKind} */
+export function layerKind(layer, { widths, centres }) {
   const { feature: D, slots: G } = widths;
   /** @type {[string, number | null][][]} */
   const networks = [
@@ -57,11 +59,8 @@ export function layerKind(layer, widths) {
     ],
   ];
   const classes = layer ? [2 + 2 * layer, 3 + 2 * layer] : [3];
-  return { layer, networks: networks[layer], inputs: D + 3, classes, widths };
+  return { layer, networks: networks[layer], inputs: D + 3, classes, widths, stepClasses: centres !== null };
 }
-
-/** The channels of an anchor (11.2). @param {import("./header.js").Widths} widths */
-export const channelCount = ({ feature, slots }) => feature + 6 + 3 * slots;
 
 /** Section numbers of mode ans (6.4). */
 export const POSITIONS = 0;
@@ -120,9 +119,9 @@ export function readParameters(payload, kind, before, later) {
     (sum, { layers }) => layers.reduce((all, { inputs, outputs }) => all + (inputs + 1) * outputs, sum),
     0,
   );
-  const channels = channelCount(kind.widths);
-  const declared = declare(where, before, payload.length, rises, rows, channels, cells, weights);
-  const counts = [rows, rises + rows, rows * channels, cells, weights, 0, 0];
+  const perRow = channelCount(kind.widths) + (kind.stepClasses ? 1 : 0);
+  const declared = declare(where, before, payload.length, rises, rows, perRow, cells, weights);
+  const counts = [rows, rises + rows, rows * perRow, cells, weights, 0, 0];
   counts.forEach((count, section) => {
     if ((sections[section] !== null) !== count > 0) {
       const found = sections[section] === null ? "missing" : "there";
@@ -133,14 +132,15 @@ export function readParameters(payload, kind, before, later) {
 }
 
 /** Clause 6.5. @param {string} where @param {Declared} before @param {number} bytes of the payload @param {number} rises
- * @param {number} own rows @param {number} channels @param {number} cells @param {number} weights @returns {Declared} */
-function declare(where, before, bytes, rises, own, channels, cells, weights) {
+ * @param {number} own rows @param {number} perRow symbols of the attributes @param {number} cells
+ * @param {number} weights @returns {Declared} */
+function declare(where, before, bytes, rises, own, perRow, cells, weights) {
   if (cells > MAX_PLANE_CELLS) throw limitExceeded(`${where}: ${cells} plane cells, limit ${MAX_PLANE_CELLS}`);
   const all = before.bytes + bytes;
   const rows = before.rows + own;
   const mostRows = 2 ** 13 + 2 * all;
   if (rows > mostRows) throw limitExceeded(`${where}: ${rows} rows in ${all} bytes, limit ${mostRows}`);
-  const symbols = before.symbols + rises + (channels + 4) * own + cells + weights;
+  const symbols = before.symbols + rises + (perRow + 4) * own + cells + weights;
   const mostSymbols = 2 ** 22 + 1024 * all;
   if (symbols > mostSymbols) throw limitExceeded(`${where}: ${symbols} symbols in ${all} bytes, limit ${mostSymbols}`);
   return { rows, symbols, bytes: all };

@@ -134,7 +134,7 @@ export class LayerReader {
       const continuation = later ? latest.continuation : new Continuation();
       const forget = continuation.mark();
       try {
-        const symbols = decodeLayer(chunk.payload, layerKind(listed.type, header.widths), this._declared, continuation, later);
+        const symbols = decodeLayer(chunk.payload, layerKind(listed.type, header), this._declared, continuation, later);
         slice = { symbols, tensors: this._accept(symbols, continuation, later), later };
         this._declared = symbols.parameters.declared;
       } catch (error) {
@@ -198,13 +198,15 @@ export class LayerReader {
   }
 
   /** @param {LayerSymbols} symbols @param {import("./header.js").Header} header @returns {LayerTensors} */
-  _tensorsOf({ parameters, voxels, attributes, planes, weights }, header) {
+  _tensorsOf({ kind, parameters, voxels, stepClasses, attributes, planes, weights }, header) {
     const { rows, steps } = parameters;
-    const { feature: D, slots: G } = header.widths;
-    let at = 0;
-    const [feature, scalingLog, offset] = [D, 6, 3 * G].map((width, i) =>
-      transposed(attributes.subarray(at, (at += width * rows)), rows, width, header.steps[i]),
-    );
+    const { feature: D, slots: G } = kind.widths;
+    let first = 0;
+    const [feature, scalingLog, offset] = [D, 6, 3 * G].map((width, i) => {
+      const centres = header.centres?.slice(first, first + width);
+      const symbols = attributes.subarray(first * rows, (first += width) * rows);
+      return transposed(symbols, rows, width, header.steps[i], centres ? { centres, stepClasses } : null);
+    });
     return {
       anchor: dequantise(voxels, header.info.voxelSize),
       feature,

@@ -46,7 +46,7 @@
  */
 
 /**
- * Quantisation steps; those of tensors that the scene does not have are absent.
+ * Quantisation steps, of attributes those of step class 0; those of tensors that the scene does not have are absent.
  *
  * @typedef {object} Steps
  * @property {number} feature

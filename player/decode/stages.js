@@ -103,7 +103,7 @@ export function classesByActivity(activity, bounds) {
  * @typedef {{order: Int32Array, sizes: Int32Array}} Groups sizes: places per class
  */
 
-/** @param {Uint8Array} classes @param {number} count of classes @returns {Groups} */
+/** @param {Uint8Array | Int32Array} classes @param {number} count of classes @returns {Groups} */
 export function groupByClass(classes, count) {
   const sizes = new Int32Array(count);
   for (let p = 0; p < classes.length; p++) sizes[classes[p]]++;

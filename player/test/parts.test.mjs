@@ -153,10 +153,24 @@ test("values are the product rounded once to binary32, by rows where symbols com
   const step = Math.fround(0.1);
   const symbols = Int32Array.of(-(2 ** 23), 2 ** 23, 1, -1, 0, 12345677);
   assert.deepEqual([...dequantise(symbols, step)], [...symbols].map((k) => Math.fround(k * step)));
-  assert.deepEqual([...transposed(Int32Array.of(1, 2, 3, 4, 5, 6), 3, 2, 1)], [1, 4, 2, 5, 3, 6]);
+  assert.deepEqual([...transposed(Int32Array.of(1, 2, 3, 4, 5, 6), 3, 2, 1, null)], [1, 4, 2, 5, 3, 6]);
   assert.equal(kindOf(() => dequantise(Int32Array.of(2), 3e38)), "Malformed");
   assert.deepEqual([...dequantise(Int32Array.of(1, -1), Math.fround(3e38))], [3e38, -3e38].map(Math.fround));
   assert.equal(dequantise(Int32Array.of(3), 2 ** -126)[0], 3 * 2 ** -126);
+});
+
+test("with step classes a value is its centre plus the symbol times 2^class, and that lies in its range", () => {
+  const symbols = Int32Array.of(3, -1, 0, 5, -7, 2); // two columns of three rows
+  const grading = { centres: [10, -4], stepClasses: Int32Array.of(0, 6, 2) };
+  assert.deepEqual([...transposed(symbols, 3, 2, 0.5, grading)], [13, 1, -54, -452, 10, 4].map((level) => level / 2));
+  /** @param {number} symbol @param {number} centre @param {number} stepClass */
+  const kind = (symbol, centre, stepClass) =>
+    kindOf(() => transposed(Int32Array.of(symbol), 1, 1, 1, { centres: [centre], stepClasses: Int32Array.of(stepClass) }));
+  assert.equal(kind(2 ** 17 - 1, 64, 6), null);
+  assert.equal(kind(2 ** 17 - 1, 65, 6), "Malformed");
+  assert.equal(kind(-(2 ** 17), 0, 6), null);
+  assert.equal(kind(-(2 ** 17), -1, 6), "Malformed");
+  assert.equal(kind(2 ** 23, 2 ** 23, 6), "Malformed");
 });
 
 test("CRC-32 and SHA-256 agree with Node's, in pieces too", () => {

@@ -8,7 +8,6 @@ import { unpack } from "../decode/msgpack.js";
 const FOLDER = new URL("../../spec/vectors/", import.meta.url);
 const MODE = 2;
 const DEFORMATION = 3;
-const CENTRES = 16;
 
 /**
  * error: the kind that is due, null if the file decodes. layers: the hashes of all layers that decode. slices: the layer
@@ -35,20 +34,6 @@ function isUnsupported(bytes) {
   return fields instanceof Map && (fields.get(MODE) === 1 || fields.get(DEFORMATION) === 1);
 }
 
-/** Whether the header says that anchors have step classes, which this decoder does not take yet. @param {Uint8Array} bytes */
-function hasClasses(bytes) {
-  let fields;
-  try {
-    fields = unpack(readPreamble(bytes), "header").value;
-  } catch {
-    return false;
-  }
-  const centres = fields instanceof Map ? fields.get(CENTRES) : null;
-  const [feature, slots] = fields instanceof Map && Array.isArray(fields.get(15)) ? /** @type {any} */ (fields.get(15)) : [0, 0];
-  if (!Array.isArray(centres) || centres.length !== feature + 6 + 3 * slots) return false;
-  return centres.every((m) => Number.isInteger(m) && Math.abs(m) <= 2 ** 23);
-}
-
 /** @returns {Vector[]} */
 export function readVectors() {
   const manifest = JSON.parse(readFileSync(new URL("manifest.json", FOLDER), "utf8"));
@@ -58,7 +43,7 @@ export function readVectors() {
     const unsupported = row.ans_only ? row.ans_only === "UnsupportedFeature" : isUnsupported(bytes);
     const { file, error = null, chunk = null, offset = null, layers } = row;
     const slices = row.slices ?? layers.map((/** @type {{layer: number}} */ { layer }) => layer);
-    if (!unsupported && !hasClasses(bytes)) return { file, bytes, error, chunk, offset, layers, slices };
+    if (!unsupported) return { file, bytes, error, chunk, offset, layers, slices };
     return { file, bytes, error: "UnsupportedFeature", chunk: null, offset: null, layers: [], slices: [] };
   });
 }
