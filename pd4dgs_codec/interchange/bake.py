@@ -1,13 +1,10 @@
 """A decoded scene's Gaussians at an instant, made independent of the eye but for colours in spherical harmonics.
 
 The scaffold's networks take the direction from the eye, so opacity, size, rotation and colour of a Gaussian differ from
-eye to eye. What is kept is found from a set of eyes, each with a weight per anchor:
-
-- opacity: its weighted mean over the eyes, 0 where an eye does not see the Gaussian;
-- covariance: its mean weighted by the eyes' weights times the opacities that they see;
-- colour: harmonics by least squares over the eyes' directions with those same weights, with a ridge that keeps what no
-  eye has seen near the mean.
-
+eye to eye. What is kept is found from a set of eyes, each with a weight per anchor. The opacity is its weighted mean
+over the eyes, 0 where an eye does not see the Gaussian. The covariance is its mean weighted by the eyes' weights times
+the opacities that they see. The colours are harmonics by least squares over the eyes' directions with those same
+weights, with a ridge that keeps what no eye has seen near the mean.
 """
 
 from __future__ import annotations

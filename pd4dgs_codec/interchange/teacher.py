@@ -1,11 +1,9 @@
 """Models that can say their Gaussians at a time, as a dataset: pictures of them from cameras around them.
 
-`teacher:PATH[?key=value&...]`, PATH one of
-
-- a folder of PLY or SPZ files, one per frame, in the order of the last number in their names; or one such file;
-- a `.4dgs` file; a checkpoint of gsplat (`.pt`, `.ckpt`), which stands still;
-- `module:function`, called with t in 0..1: it returns means, quats (wxyz), scales, opacities and either colors or sh,
-  as a mapping or as attributes, numpy arrays or tensors.
+The source is `teacher:PATH[?key=value&...]`. PATH is a folder of PLY or SPZ files, one per frame, in the order of the
+last number in their names, or one such file; a `.4dgs` file; a checkpoint of gsplat (`.pt`, `.ckpt`), which stands
+still; or `module:function`, called with t in 0..1: it returns means, quats (wxyz), scales, opacities and either colors
+or sh, as a mapping or as attributes, numpy arrays or tensors.
 
 Keys: cameras=SOURCE looks from the training cameras of a dataset at their times; else views=N cameras (200) of
 size=WxH (400x400) stand around the Gaussians, or where a `cameras.json` beside them says. fps=F (30) tells how long a
