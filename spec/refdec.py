@@ -832,8 +832,8 @@ def decode_attributes(data, feature, slots, n, past, graded):
     return grades + add_predictions(residuals, terms) + [channel for offset in zip(x, y, z) for channel in offset]
 
 
-# 8.5 The attributes section: "the step classes of the rows: a varint, the length in bytes of what follows, then a
-# section of coded channels with one channel of n symbols"
+# 8.5 The attributes section: "the step classes of the rows: a varint, the length in bytes of what follows, at most the
+# bytes left in the section, the varint's own included; then a section of coded channels with one channel of n symbols"
 def decode_grades(reader, n):
     (grades,) = decode_channels(reader.take(reader.varint(reader.left)), [n])
     return step_classes(grades)
