@@ -41,6 +41,7 @@ DIAL: dict[str, tuple[float, float]] = {
     "plane_rate": (5e-9, 4.0),
     "prune": (0.05, 4.0),
     "step_scale": (1.25, 1.6),
+    "grading": (0.06, 3.0),
 }
 
 #: The steps that `step_scale` multiplies. Offsets and weights cost more quality per byte than any of these.
@@ -56,6 +57,7 @@ BEFORE: dict[str, Any] = {
     "step_scale": 1.0,
     "feature_width": 32,
     "slots": 10,
+    "grading": 0.0,
 }
 
 
@@ -127,7 +129,7 @@ class TrainConfig:
     prune: float = _DEFAULT["prune"]
     #: share that coarser steps of single anchors add at most to the squared error where planes begin to be rounded; 0:
     #: all anchors keep the steps; see `grading`
-    grading: float = 0.0
+    grading: float = _DEFAULT["grading"]
     #: share of the run, at its end, over which all learning rates fall to 0 besides: else the last steps carry weights
     #: over the edges of their rounding intervals, and pictures change by tenths of a dB from one step to the next
     cooldown: float = 0.1
