@@ -21,6 +21,7 @@ from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.encoder import Report, encode_with_report
 from pd4dgs_codec.codec.info import hashes, info
 from pd4dgs_codec.codec.kinds import LAYER_KINDS
+from pd4dgs_codec.codec.options import EncodeOptions
 from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.codec.symbols import float_tensors
 from pd4dgs_codec.metrics.image import mssim
@@ -105,14 +106,15 @@ def sweep(
     pictures: dict[str, tuple[PictureDeviation, ...]] = {}
     points = []
     for scale in what.step_scales:
-        planned, _ = plan(replace(scene, steps=scene.steps.scaled(scale)))
+        scaled = replace(scene, steps=scene.steps.scaled(scale))
         fresh = what.cold if abs(math.log(scale)) == nearest else 0
         for mode in what.modes:
             for effort in what.efforts:
                 point, data = _point(model, scene, scale, mode, effort, what.repeats, fresh)
-                key = json.dumps(hashes(data))  # modes and efforts change no value: their pictures are the same
+                key = json.dumps(hashes(data))  # modes change no value: their pictures are the same
                 if key not in pictures:
                     pictures[key] = picture_deviations(load_levels(data), frames, reference)
+                planned, _ = plan(scaled, EncodeOptions(effort=effort))  # what no picture reads has other values
                 values = tuple(deviations(planned, decode(data)))
                 points.append(replace(point, values=values, pictures=pictures[key]))
                 step()

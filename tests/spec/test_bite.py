@@ -105,7 +105,8 @@ def test_the_mutants_are_many_and_apply_to_the_reference_decoder():
 
 @pytest.mark.parametrize("mutant", [m for m in MUTANTS if not m.equivalent][::SAMPLE], ids=lambda m: m.name)
 def test_a_mutant_is_noticed(mutant):
-    small = [v for v in in_likely_order(mutant, STORED) if len(v.data) < 6000]
+    likely = in_likely_order(mutant, STORED)
+    small = [v for v in likely if len(v.data) < 6000 or mutant.clause in v.clauses]
     assert noticed(mutant, small)
 
 
