@@ -82,8 +82,8 @@ def parser() -> Parser:
         "quality's (at 70: 0.03; 0: none)",
     )
     what = (
-        "coarser steps for anchors that pictures hardly depend on, up to this share of the squared error, instead of the "
-        "quality's (at 70: 0.039; 0: none)"
+        "coarser steps for anchors that pictures hardly depend on, up to this share of the squared error, instead of "
+        "the quality's (at 70: 0.039; 0: none)"
     )
     p.add_argument("--grading", type=values.non_negative_float, metavar="X", help=what)
     p.add_argument("--max-layer", type=int, choices=(0, 1, 2), help="train without the layers above this one")
