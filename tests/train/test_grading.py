@@ -72,7 +72,7 @@ def test_a_run_grades_its_anchors_once_and_packs_them(dataset, monkeypatch):
 
 def test_without_classes_there_are_none(dataset, monkeypatch):
     monkeypatch.setattr(pruning, "MIN_ITERATIONS", 10)
-    trainer = Trainer(TrainConfig(preset="tiny", iterations=30), dataset)
+    trainer = Trainer(TrainConfig(preset="tiny", iterations=30, grading=0.0), dataset)
     assert not any("step_classes" in trainer.learner.step() for _ in range(30))
     assert to_scene(trainer.model).grading is None
 
