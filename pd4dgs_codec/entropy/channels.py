@@ -51,7 +51,7 @@ class CodedChannels:
 @dataclass(frozen=True, eq=False)
 class _Exceptions:
     positions: np.ndarray  #: int64 [M], ascending
-    values: np.ndarray  #: int64 [M]
+    values: np.ndarray  #: int [M]
 
 
 def check_channels(channels: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -65,7 +65,7 @@ def check_channels(channels: Sequence[np.ndarray]) -> list[np.ndarray]:
             )
         if array.size and (int(array.min()) < -K_MAX or int(array.max()) > K_MAX):
             raise EncodeError(f"channel {index}: symbols {array.min()}..{array.max()}, limit |k| <= {K_MAX}")
-        checked.append(array.astype(np.int32))
+        checked.append(array.astype(np.int32, copy=False))
     return checked
 
 
@@ -129,10 +129,12 @@ def _parts(inside: np.ndarray, prior: Prior) -> list[tuple[np.ndarray, np.ndarra
 
 
 def _split(array: np.ndarray, window: Window) -> tuple[np.ndarray, _Exceptions]:
-    symbols = array.astype(np.int64)
-    out = (symbols < window.kmin) | (symbols >= window.end)
+    if window.kmin <= int(array.min()) and int(array.max()) < window.end:
+        nothing = np.zeros(0, np.int64)
+        return array, _Exceptions(nothing, nothing)
+    out = (array < window.kmin) | (array >= window.end)
     positions = np.flatnonzero(out)
-    return symbols[~out], _Exceptions(positions, symbols[positions])
+    return array[~out], _Exceptions(positions, array[positions])
 
 
 def _write_channel(out: bytearray, prior: Prior, exceptions: _Exceptions, defined: list[Prior]) -> bool:
