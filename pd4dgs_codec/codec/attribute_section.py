@@ -141,9 +141,12 @@ def stage_channels(widths: Widths, stage: int) -> range:
 
 @dataclass(eq=False)
 class Block:
-    """The prediction block. widths: of the anchors. counts: of classes, of stages 1 to 5, with step
-    classes 0 to 5. scale, and by stage the activity int64 [classes - 1] at which each class but the first begins: of
-    the slice that the block stands in; known once that slice has been coded so far."""
+    """The prediction block.
+
+    widths: of the anchors. counts: of classes, of stages 1 to 5, with step classes 0 to 5. scale, and by stage the
+    activity int64 [classes - 1] at which each class but the first begins: of the slice that the block stands in; known
+    once that slice has been coded so far.
+    """
 
     widths: Widths
     terms: list[Terms]
