@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 
@@ -196,7 +197,8 @@ def decode_channels(
         if count:
             before = len(defined)
             heads.append(_read_channel(reader, count, defined))
-            entries += sum(prior.window.n for prior in defined[before:])
+            if len(defined) > before:
+                entries += defined[-1].window.n
             if entries > most:
                 raise LimitExceeded(f"tables of {entries} entries in one section, limit {most}")
     stream = AnsDecoder(reader.rest())
@@ -232,11 +234,17 @@ def _read_channel(reader: ByteReader, count: int, defined: list[Prior]) -> tuple
     return index, _read_exceptions(reader, count, defined[index].window) if token & 1 else None
 
 
+@cache
+def _low_bits(shift: int) -> np.ndarray:
+    """One table for all channels of that shift: a stream keeps the models of those that it has met."""
+    return uniform_table(shift)
+
+
 def _take_channel(stream: AnsDecoder, count: int, prior: Prior, exceptions: _Exceptions | None) -> np.ndarray:
     window, left = prior.window, count - (0 if exceptions is None else len(exceptions.positions))
     inside = stream.take(left, prior.cum)
     if window.shift:
-        inside = (inside << window.shift) + stream.take(left, uniform_table(window.shift))
+        inside = (inside << window.shift) + stream.take(left, _low_bits(window.shift))
         if left and int(inside.max()) + window.kmin > K_MAX:
             raise Malformed(f"symbol {int(inside.max()) + window.kmin}, limit {K_MAX}")
     inside += np.int32(window.kmin)
