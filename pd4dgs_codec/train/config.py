@@ -31,6 +31,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "smooth": {"tmc_smooth": False},
     "tmc": {"tmc_binary": False, "tmc_smooth": False},
     "noise": {"noise": False},
+    "whitening": {"whitening": False},
     "judge": {"judge": False},
 }
 
@@ -58,6 +59,7 @@ BEFORE: dict[str, Any] = {
     "feature_width": 32,
     "slots": 10,
     "grading": 0.0,
+    "whitening": False,
 }
 
 
@@ -130,6 +132,7 @@ class TrainConfig:
     #: share that coarser steps of single anchors add at most to the squared error where planes begin to be rounded; 0:
     #: all anchors keep the steps; see `grading`
     grading: float = _DEFAULT["grading"]
+    whitening: bool = True  #: where planes begin to be rounded, mix the features' channels; see `whitening`
     #: share of the run, at its end, over which all learning rates fall to 0 besides: else the last steps carry weights
     #: over the edges of their rounding intervals, and pictures change by tenths of a dB from one step to the next
     cooldown: float = 0.1

@@ -26,7 +26,7 @@ from pd4dgs_codec.model.picture import Picture, render, render_image
 from pd4dgs_codec.model.plane_rate import exact_bits
 from pd4dgs_codec.model.rounding import EXACT, Noise, Rounding
 from pd4dgs_codec.scene import MASK_THRESHOLD
-from pd4dgs_codec.train import grading, judge, losses, pruning
+from pd4dgs_codec.train import grading, judge, losses, pruning, whitening
 from pd4dgs_codec.train.config import PlaneWeights, Schedule, TrainConfig
 from pd4dgs_codec.train.densify import Densifier
 from pd4dgs_codec.train.initialise import fresh_model
@@ -338,17 +338,24 @@ class Learner:
         return before - len(keep), later
 
     def _grade(self) -> list[int]:
-        """Where planes and weights begin to be rounded: gives anchors their step classes. Returns how many each has."""
+        """Where planes and weights begin to be rounded: mixes the features' channels and gives anchors their step
+        classes. Returns how many each has."""
         enough = (self.schedule.iterations or 0) >= pruning.MIN_ITERATIONS
-        if not (self.config.grading and self.config.noise and enough and self._reached(self.schedule.rounding)):
+        if not (self.config.noise and enough and self._reached(self.schedule.rounding)):
             return []
         stride = -(-len(self.shots) // grading.VIEWS)
         levels = range(self.model.level if self.config.rollout == "top" else 0, self.model.level + 1)
+        rounding, shots, found = replace(self._rounding(), noise=None), self.shots[::stride], list[int]()
         try:
-            rounding = replace(self._rounding(), noise=None)
-            return grading.grade(self.model, self.shots[::stride], levels, self.config.grading, rounding)
-        except NotFinite:  # as a step that diverged: passed over, with nothing changed
+            if self.config.grading:
+                found = grading.grade(self.model, shots, levels, self.config.grading, rounding)
+            if self.config.whitening:
+                whitening.whiten(self.model, self.optimiser, shots, levels, rounding)
+                if self.config.grading:  # a step of the features is another one now
+                    found = grading.grade(self.model, shots, levels, self.config.grading, rounding)
+        except NotFinite:  # as a step that diverged: passed over
             return []
+        return found
 
     # -- checkpoints -----------------------------------------------------------------------------------------------
 
