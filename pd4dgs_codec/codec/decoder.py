@@ -34,9 +34,9 @@ class LayerReader:
         return [*self._whole, merged(self._slices)] if self._slices else []
 
     @property
-    def layer(self) -> int:
-        """The layer of the slice read last."""
-        return self._slices[0].kind.layer
+    def latest(self) -> LayerSymbols:
+        """The slice read last."""
+        return self._slices[-1]
 
     @property
     def complete(self) -> bool:

@@ -173,7 +173,9 @@ def test_a_thousand_slices_at_once_make_one_scene():
     last = max(i for i, (layer, _, _) in enumerate(chunks) if layer == 0)
     stream = open_stream()
     scenes = stream.feed(sliced())
-    assert [scene.layers[-1] for scene in scenes] == sorted({layer for layer, *_ in chunks}) and stream.slices == len(ends)
+    assert [scene.layers[-1] for scene in scenes] == sorted({layer for layer, *_ in chunks}) and stream.slices == len(
+        ends
+    )
     assert_same_scene(scenes[0], decode(sliced(), max_bytes=ends[last]))
     assert_same_scene(scenes[-1], decode(sliced()))
 

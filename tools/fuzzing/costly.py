@@ -251,8 +251,19 @@ def _changed_widths(rng: random.Random, recipe: Recipe) -> Recipe:
 
 def _changed_layer(rng: random.Random, layer: LayerRecipe) -> LayerRecipe:
     what = rng.choice(
-        ("anchors", "spread", "attributes", "terms", "scales", "scales", "predictor", "planes", "widths", "slices",
-         "redefined")  # fmt: skip
+        (
+            "anchors",
+            "spread",
+            "attributes",
+            "terms",
+            "scales",
+            "scales",
+            "predictor",
+            "planes",
+            "widths",
+            "slices",
+            "redefined",
+        )  # fmt: skip
     )
     if what in ("attributes", "planes"):
         return replace(layer, **{what: _changed_coded(rng, getattr(layer, what))})
