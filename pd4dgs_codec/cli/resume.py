@@ -28,6 +28,7 @@ FIXED = (
     "rate_scale",
     "prune",
     "grading",
+    "prefixes",
     "rollout",
     "max_layer",
 )

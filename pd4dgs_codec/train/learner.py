@@ -26,7 +26,7 @@ from pd4dgs_codec.model.picture import Picture, render, render_image
 from pd4dgs_codec.model.plane_rate import exact_bits
 from pd4dgs_codec.model.rounding import EXACT, Noise, Rounding
 from pd4dgs_codec.scene import MASK_THRESHOLD
-from pd4dgs_codec.train import grading, judge, losses, pruning, whitening
+from pd4dgs_codec.train import grading, judge, losses, prefixes, pruning, whitening
 from pd4dgs_codec.train.config import PlaneWeights, Schedule, TrainConfig
 from pd4dgs_codec.train.densify import Densifier
 from pd4dgs_codec.train.initialise import fresh_model
@@ -76,6 +76,7 @@ class Learner:
         self.skipped = 0
         self.order: list[int] = []  #: training views drawn and not yet learnt from, the next one last
         self.left_out: list[dict[str, Any]] = []
+        self.rank: Tensor | None = None  #: of the anchors in a file, float64 [N], once `prefixes` are trained
         self._neighbours: losses.Neighbours | None = None  #: rebuilt when anchors come or go
 
     @property
@@ -97,6 +98,10 @@ class Learner:
         judged = self._judge_levels()
         graded = self._grade()
         left = self._prune()
+        self._rank()
+        only = self._draw_prefix() if levels is None else None
+        if only is not None:
+            levels = (0,)
         chosen, probabilities = self._draw_levels() if levels is None else _given(levels)
         drawn = [(self._next_view(), level) for level in chosen]
         record: dict[str, Any] = {"iteration": self.iteration, "level": chosen[-1]}
@@ -106,7 +111,9 @@ class Learner:
             record["step_classes"] = graded
         if left:
             record["left_model"], record["left_level_0"] = left
-        if not self._learn(drawn, record):
+        if only is not None:
+            record["prefix"] = int(only.sum())
+        if not self._learn(drawn, record, only):
             self.skipped += 1
             record["skipped"] = self.skipped
         self.optimiser.zero_grad()
@@ -179,14 +186,14 @@ class Learner:
 
     # -- loss and update -------------------------------------------------------------------------------------------
 
-    def _learn(self, drawn: list[tuple[int, int]], record: dict[str, Any]) -> bool:
+    def _learn(self, drawn: list[tuple[int, int]], record: dict[str, Any], only: Tensor | None) -> bool:
         """Losses of (view, level) pairs, gradients, update; False, with nothing changed, if any of it is not finite.
-        The record is that of the last pair."""
+        The record is that of the last pair. only: the anchors to render, bool [N], if not all."""
         rounding, mask_terms = self._rounding(), self.place >= self.schedule.progressive
         pictures = []
         for index, level in drawn:
             try:
-                picture, terms, loss = self.loss(index, level, rounding, mask_terms)
+                picture, terms, loss = self.loss(index, level, rounding, mask_terms, only)
             except NotFinite as error:  # a diverged step may be passed over; any other refusal is here to stay
                 record["refused"] = str(error)
                 return False
@@ -205,15 +212,16 @@ class Learner:
         return True
 
     def loss(
-        self, index: int, level: int, rounding: Rounding, mask_terms: bool
+        self, index: int, level: int, rounding: Rounding, mask_terms: bool, only: Tensor | None = None
     ) -> tuple[Picture, dict[str, Tensor], Tensor]:
         """(picture of training view `index` at `level`, terms unweighted and by name, their weighted sum).
 
-        mask_terms: whether rate and mask terms belong to it yet. Raises NotFinite where the model has diverged.
+        mask_terms: whether rate and mask terms belong to it yet. only: the anchors to render, bool [N],
+        if not all. Raises NotFinite where the model has diverged.
         """
         config, shot = self.config, self.shots[index]
         view = shot.view
-        picture = render(self.model, level, view.time, view.camera, rounding)
+        picture = render(self.model, level, view.time, view.camera, rounding, only)
         if picture.meta["means2d"].requires_grad:
             picture.meta["means2d"].retain_grad()
         l1, dissimilarity = image_loss(picture.image, shot.target)
@@ -357,6 +365,20 @@ class Learner:
             return []
         return found
 
+    def _rank(self) -> None:
+        """Where the last third begins, if prefixes are to be trained: the order of the anchors in a file."""
+        if self.config.prefixes and self._reached(self.schedule.rounding):
+            try:
+                self.rank = prefixes.rank_anchors(self.model, self.shots)
+            except NotFinite:  # as a step that diverged: passed over
+                pass
+
+    def _draw_prefix(self) -> Tensor | None:
+        """The anchors that this step sees, bool [N]; None if it is all."""
+        if self.rank is None or float(torch.rand((), generator=self.generator)) >= self.config.prefixes:
+            return None
+        return prefixes.draw_prefix(self.rank, self.generator).to(self.device)
+
     # -- checkpoints -----------------------------------------------------------------------------------------------
 
     def state(self) -> dict[str, Any]:
@@ -370,6 +392,7 @@ class Learner:
             "rho": self.rho,
             "skipped": self.skipped,
             "order": self.order,
+            "rank": torch.empty(0) if self.rank is None else self.rank,
             "left_out": json.dumps(self.left_out),
             "optimiser": self.optimiser.state(),
             "densifier": self.densifier.state(),
@@ -393,6 +416,8 @@ class Learner:
         self.rho = float(state["rho"])
         self.order = [int(index) for index in state["order"]]
         self.left_out = list(json.loads(state.get("left_out", "[]")))
+        rank = state.get("rank")
+        self.rank = rank if rank is not None and len(rank) else None
 
 
 def _given(levels: Sequence[int]) -> tuple[tuple[int, ...], Probabilities]:

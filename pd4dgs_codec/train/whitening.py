@@ -41,13 +41,16 @@ def whiten(
 
 
 def mixing(harm: Tensor, covariance: Tensor) -> Tensor:
-    """float64 [D, D]: A of features f' = A f, with trace(harm) A^-T harm A^-1 = D and A covariance A^T diagonal, its
-    entries falling; both [D, D], symmetric, not negative."""
-    width = len(harm)
-    identity = torch.eye(width, dtype=harm.dtype, device=harm.device)
-    root = torch.linalg.cholesky(harm / harm.trace() * width * (1 - LEAST_HARM) + LEAST_HARM * identity)
+    """float64 [D, D]: A of features f' = A f for which A^-T harm A^-1, the harm in the new channels, is about the
+    identity times a number, its trace that of `harm`, and A covariance A^T is diagonal, its entries falling. Both
+    [D, D], symmetric, not negative."""
+    floor = LEAST_HARM * harm.trace() / len(harm) * torch.eye(len(harm), dtype=harm.dtype, device=harm.device)
+    root = torch.linalg.cholesky(harm + floor)
+    back = torch.linalg.inv(root)
+    root = root * ((back @ harm @ back.T).trace() / harm.trace()).sqrt()
     _, axes = torch.linalg.eigh(root.T @ covariance @ root)
-    return axes.flip(1).T @ root.T
+    mix: Tensor = axes.flip(1).T @ root.T
+    return mix
 
 
 def _feature_harm(model: Model, level: int, shots: Sequence[Shot], rounding: Rounding) -> Tensor:
