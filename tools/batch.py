@@ -42,7 +42,7 @@ CASES = {
     "ray": "a head and two nodes of one core each",
     "ray, worker and node killed": "the same; a worker killed at a third, a node at two thirds",
     "ray, killed and resumed": "the same; the batch killed in the middle, then begun again",
-    "slurm": "submitit's local executor, two at a time, a process per scene; 20 scenes",
+    "slurm": "submitit's local executor, two at a time, a process per scene; 8 scenes",
 }
 
 
@@ -161,7 +161,7 @@ def measure(name: str, count: int, out: Path) -> Row:
     folder = out / "batch"
     scenes(folder / "models", count)
     if name == "slurm":
-        count = 20
+        count = 8
     with tempfile.TemporaryDirectory() as temporary, ExitStack() as stack:
         work = Path(temporary)
         path = f"{ROOT}:{flaky.python_path(work / 'flaky')}"
