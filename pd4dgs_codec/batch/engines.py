@@ -165,16 +165,16 @@ def ray(work: Work, feed: Feed, settings: Settings) -> Outcomes:
 
     try:
         ray.init(address=settings.address or os.environ.get("RAY_ADDRESS"), log_to_driver=False, logging_level="ERROR")
-    except (ConnectionError, ValueError, RuntimeError) as error:
+    except Exception as error:  # a bare one too, where a node does not come up
         raise DataError(f"Ray cannot be reached at {settings.address or 'its address'}: {error}") from None
     # lost nodes and workers are outcomes: one bound for all retries
-    task = ray.remote(num_cpus=settings.threads, num_gpus=settings.gpus, max_retries=0)(work)
+    task = ray.remote(num_cpus=settings.threads, num_gpus=settings.gpus, max_retries=0)(_call)
     running: dict[Any, tuple[Job, float]] = {}
     try:
         while True:
             room = settings.workers or int(ray.cluster_resources().get("CPU", 1) // settings.threads) or 1
             while len(running) < room and (job := feed.take()):
-                running[task.remote(job)] = job, time.monotonic()
+                running[task.remote(work, job)] = job, time.monotonic()
             if not running:
                 return
             ready, _ = ray.wait(list(running), timeout=POLL_SECONDS if settings.timeout else None)
@@ -192,6 +192,11 @@ def ray(work: Work, feed: Feed, settings: Settings) -> Outcomes:
                     yield job, settings.late(job)
     finally:
         ray.shutdown()
+
+
+def _call(work: Work, job: Job) -> Outcome:
+    """What Ray takes for a task: a function, where `work` may be any callable."""
+    return work(job)
 
 
 # -- Slurm -------------------------------------------------------------------------------------------------------------
