@@ -43,7 +43,9 @@ def _train(program: Path, workers: int, output: str, *options: object) -> subpro
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    launch = ["-m", "torch.distributed.run", f"--nproc-per-node={workers}", f"--master-port={port}", "--"] if workers else []
+    launch = (
+        ["-m", "torch.distributed.run", f"--nproc-per-node={workers}", f"--master-port={port}", "--"] if workers else []
+    )
     argv = ["set", "-o", output, "--preset", "tiny", "--device", "cpu", *map(str, options)]
     command = [sys.executable, *launch, str(program), *argv]
     return subprocess.run(command, cwd=program.parent, capture_output=True, text=True, timeout=300)
