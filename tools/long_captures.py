@@ -199,10 +199,10 @@ def render(rows: Sequence[Row]) -> str:
     head = ("capture", "trained", "dB", "bytes", "of these layers 0", "at seams dB", "inside dB")
     captures = "; ".join(f"{row['name']}: {CAPTURES[row['name']][1]}" for row in rows)
     text = paragraph(
-        f"{captures}. Preset tiny, {SEGMENTS} segments of equal length. *dB*: PSNR on held-out frames, every eighth. *at "
-        f"seams*: PSNR between the pictures of successive frames on both sides of a seam, from {EYES} cameras that stand "
-        "still; *inside*: the same in the middle of a segment. A seam that is lower than inside, and lower than where the "
-        "whole has none, is seen as a jump."
+        f"{captures}. Preset tiny, {SEGMENTS} segments of equal length. *dB*: PSNR on held-out frames, every eighth. "
+        "*at seams*: PSNR between the pictures of successive frames on both sides of a seam, from "
+        f"{EYES} cameras that stand still; *inside*: the same in the middle of a segment. A seam that is lower than "
+        "inside, and lower than where the whole has none, is seen as a jump."
     )
     return "\n".join([unpadded(markdown(head, cells)), "", *text])
 
