@@ -157,6 +157,7 @@ def _checked(model: Any | None, count: int) -> Any:
             f"no camera poses: found those of {found} of {count} frames, expected half at least; record things "
             "that stand still and have texture, from a camera that moves slowly and sideways"
         )
+    return model
 
 
 def _finish(
