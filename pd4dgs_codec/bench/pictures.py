@@ -40,9 +40,9 @@ def frames(info: SceneInfo, source: str | None, count: int, downscale: int = 1, 
     the file's own camera over time. Raises DataError, RenderError."""
     if source is None:
         return own_frames(info, count, downscale=downscale)
-    from pd4dgs_codec.data.dataset import load
+    from pd4dgs_codec.interchange.teacher import load_source
 
-    dataset = load(source, downscale=downscale, holdout=holdout)
+    dataset = load_source(source, downscale=downscale, holdout=holdout)
     return dataset_frames(spread(dataset.test or dataset.train, count))
 
 

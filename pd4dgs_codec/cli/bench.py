@@ -155,7 +155,7 @@ def _train(args: argparse.Namespace, console: Console) -> Outcome:
 
 def _trained(args: argparse.Namespace, console: Console) -> list[Run]:
     from pd4dgs_codec.bench import train
-    from pd4dgs_codec.data.dataset import load
+    from pd4dgs_codec.interchange.teacher import load_source
     from pd4dgs_codec.train.config import TrainConfig
     from pd4dgs_codec.train.loop import Trainer
 
@@ -163,7 +163,7 @@ def _trained(args: argparse.Namespace, console: Console) -> list[Run]:
     runs = []
     for preset in dict.fromkeys(args.presets or ("tiny", "small")):
         config = TrainConfig(preset=preset, source=args.source, max_seconds=limit, **_given(args, *TRAIN_FIELDS))
-        dataset = load(args.source, downscale=config.downscale, holdout=config.holdout)
+        dataset = load_source(args.source, downscale=config.downscale, holdout=config.holdout)
         trainer = Trainer(config, dataset)
         console.message(f"training {preset} on {len(dataset.train)} views")
         with tempfile.TemporaryDirectory() as folder:
@@ -197,11 +197,11 @@ def _latency(args: argparse.Namespace, console: Console) -> Outcome:
     if args.data and len(args.data) != len(args.inputs):
         raise UsageError(f"found {len(args.data)} --data for {len(args.inputs)} files, expected one each or none")
     from pd4dgs_codec.bench import latency
-    from pd4dgs_codec.data.dataset import load
+    from pd4dgs_codec.interchange.teacher import load_source
     from pd4dgs_codec.playback.warm import warm_up
 
     contents = [_with_camera(name, args.anchors) for name in args.inputs]
-    sets: list[Dataset | None] = [load(source, downscale=args.downscale) for source in args.data]
+    sets: list[Dataset | None] = [load_source(source, downscale=args.downscale) for source in args.data]
     sets = sets or [None] * len(contents)
     speeds, files = list(args.rates.values()), []
     warm_up()

@@ -198,7 +198,8 @@ def _add_train_rate(result: dict[str, Any], packed: Packed, options: EncodeOptio
     """The trainer's own sum of R over the float values, at the steps and for the layers of this file."""
     from pd4dgs_codec.pack.train_rate import train_rate_bits
 
-    rows = train_rate_bits(packed.scene, EncodeOptions(layers=options.layers))
+    coded = EncodeOptions(layers=options.layers, effort=options.effort, omit=options.omit)
+    rows = train_rate_bits(packed.scene, coded)
     per_layer = [
         {**row, "layer": int(row["layer"]), "bits": sum(bits for name, bits in row.items() if name != "layer")}
         for row in rows

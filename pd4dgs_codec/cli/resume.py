@@ -29,6 +29,7 @@ FIXED = (
     "rate_scale",
     "prune",
     "grading",
+    "prefixes",
     "rollout",
     "max_layer",
 )

@@ -40,8 +40,8 @@ on from. A second Ctrl-C ends it at once, and what was trained since the last sa
 draws them with chances of .15, .30, .55; top trains the highest level alone; all trains every level in every step, at
 about thrice the cost. Before a tenth of the run it is level 0 in any case.
 --without: rate, the bit-rate terms; planes, that of the planes alone; binary and smooth, the two mask terms; tmc, both
-of them; noise, the imitation of quantisation; judge, which leaves out levels that gain too little on training views
-kept back until then.
+of them; noise, the imitation of quantisation; whitening, the mixing of the features' channels; judge, which leaves out
+levels that gain too little on training views kept back until then.
 
 Several workers train one scene where torchrun starts them: V views a step are shared out, gradients are averaged, and
 the first one writes. N must divide V. A run may be resumed with another N.
@@ -92,6 +92,11 @@ def parser() -> Parser:
         "the quality's (at 70: 0.039; 0: none)"
     )
     p.add_argument("--grading", type=values.non_negative_float, metavar="X", help=what)
+    what = (
+        "share of the steps of the last third that see the most useful anchors of level 0 alone, for pictures from the "
+        "first slices of pd4dgs-encode --slices (default: 0; 0.3 is much)"
+    )
+    p.add_argument("--prefixes", type=values.non_negative_float, metavar="X", help=what)
     p.add_argument("--max-layer", type=int, choices=(0, 1, 2), help="train without the layers above this one")
     what = "which level each step trains, see below (default: adaptive)"
     p.add_argument("--rollout", choices=ROLLOUTS, help=what)

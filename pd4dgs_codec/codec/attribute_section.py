@@ -137,9 +137,11 @@ class Scale:
 
 @dataclass(frozen=True, eq=False)
 class Block:
-    """The prediction block. widths: of the anchors. counts: of classes, of stages 1 to 5, with step
-    classes 0 to 5. scales: by stage, of the
-    slice that the block stands in; known once that slice has been coded so far."""
+    """The prediction block.
+
+    widths: of the anchors. counts: of classes, of stages 1 to 5, with step classes 0 to 5. scales: by stage, of the
+    slice that the block stands in; known once that slice has been coded so far.
+    """
 
     widths: Widths
     terms: list[Terms]

@@ -89,12 +89,13 @@ def fourdgs_bytes(frames: Sequence[tuple[float, Splats, np.ndarray]], seconds: f
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """What a library prints on descriptor 1 goes to descriptor 2."""
+    """What libraries print on stdout, from C too, goes to stderr."""
     sys.stdout.flush()
     kept = os.dup(1)
     os.dup2(2, 1)
     try:
-        yield
+        with contextlib.redirect_stdout(sys.stderr):
+            yield
     finally:
         os.dup2(kept, 1)
         os.close(kept)

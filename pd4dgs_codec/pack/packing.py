@@ -135,8 +135,8 @@ def _in_slices(
     metadata: Metadata | None,
     progress: Progress,
 ) -> Packed:
+    from pd4dgs_codec.model.utility import utility
     from pd4dgs_codec.pack.rendered import true_psnr
-    from pd4dgs_codec.pack.utility import utility
 
     about: dict[str, Any] = {"order": "gate times area", "cameras": None, "pictures": 0}
     order: Callable[[Scene], np.ndarray] | None = None
@@ -146,7 +146,7 @@ def _in_slices(
 
         def order(decoded: Scene) -> np.ndarray:
             with progress("ordering anchors") as step:
-                return utility(decoded, frames, step)
+                return utility(decoded, [(frame.camera, frame.time) for frame in frames], step)
 
     data, report = encode_with_report(scene, options, left_out=left_out, utility=order)
     _note_sizes(target, report)

@@ -22,8 +22,8 @@ def train_rate_bits(scene: Scene, options: EncodeOptions = DEFAULTS) -> list[dic
     """Per layer of the file that `scene` becomes: bits of R(a) as the trainer computes them, in float64.
 
     attributes: R of the unrounded values over the layer's anchors, by step class, priors their moments, and the entropy
-    of the classes. planes, weights: R of the
-    rounded residuals and weights, which is what the last third of training sees.
+    of the classes. planes, weights: R of the rounded residuals and weights, which is what the last third of training
+    sees.
     """
     planned, _ = plan(scene, options)
     rows = (0, *planned.rows)

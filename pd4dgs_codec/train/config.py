@@ -31,6 +31,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "smooth": {"tmc_smooth": False},
     "tmc": {"tmc_binary": False, "tmc_smooth": False},
     "noise": {"noise": False},
+    "whitening": {"whitening": False},
     "judge": {"judge": False},
 }
 
@@ -59,6 +60,7 @@ BEFORE: dict[str, Any] = {
     "slots": 10,
     "grading": 0.0,
     "views_per_step": 1,
+    "whitening": False,
 }
 
 
@@ -133,6 +135,9 @@ class TrainConfig:
     #: share that coarser steps of single anchors add at most to the squared error where planes begin to be rounded; 0:
     #: all anchors keep the steps; see `grading`
     grading: float = _DEFAULT["grading"]
+    whitening: bool = True  #: where planes begin to be rounded, mix the features' channels; see `whitening`
+    #: share of the last third's steps that see the most useful anchors of level 0 alone; see `prefixes`
+    prefixes: float = 0.0
     #: share of the run, at its end, over which all learning rates fall to 0 besides: else the last steps carry weights
     #: over the edges of their rounding intervals, and pictures change by tenths of a dB from one step to the next
     cooldown: float = 0.1
@@ -178,7 +183,7 @@ class TrainConfig:
                 raise TrainError(f"{name} must be 0 or more and finite, found {getattr(self, name)}")
         if not 0 < self.step_scale < math.inf:
             raise TrainError(f"step_scale must be positive and finite, found {self.step_scale}")
-        for name in ("prune", "cooldown", "grading"):
+        for name in ("prune", "cooldown", "grading", "prefixes"):
             if not 0 <= getattr(self, name) <= 1:
                 raise TrainError(f"{name} must be from 0 to 1, found {getattr(self, name)}")
         if self.rollout not in ROLLOUTS:

@@ -27,7 +27,7 @@ from pd4dgs_codec.model.picture import Picture, render, render_image
 from pd4dgs_codec.model.plane_rate import exact_bits
 from pd4dgs_codec.model.rounding import EXACT, Noise, Rounding
 from pd4dgs_codec.scene import MASK_THRESHOLD
-from pd4dgs_codec.train import grading, judge, losses, pruning, workers
+from pd4dgs_codec.train import grading, judge, losses, prefixes, pruning, whitening, workers
 from pd4dgs_codec.train.config import PlaneWeights, Schedule, TrainConfig
 from pd4dgs_codec.train.densify import Densifier
 from pd4dgs_codec.train.initialise import fresh_model
@@ -77,6 +77,7 @@ class Learner:
         self.skipped = 0
         self.order: list[int] = []  #: training views drawn and not yet learnt from, the next one last
         self.left_out: list[dict[str, Any]] = []
+        self.rank: Tensor | None = None  #: of the anchors in a file, float64 [N], once `prefixes` are trained
         self._neighbours: losses.Neighbours | None = None  #: rebuilt when anchors come or go
 
     @property
@@ -98,6 +99,10 @@ class Learner:
         judged = self._judge_levels()
         graded = self._grade()
         left = self._prune()
+        self._rank()
+        only = self._draw_prefix() if levels is None else None
+        if only is not None:
+            levels = (0,)
         chosen, probabilities = self._draw_levels() if levels is None else _given(levels)
         drawn = [(self._next_view(), level) for level in chosen for _ in range(self.config.views_per_step)]
         record: dict[str, Any] = {"iteration": self.iteration, "level": chosen[-1]}
@@ -107,7 +112,9 @@ class Learner:
             record["step_classes"] = graded
         if left:
             record["left_model"], record["left_level_0"] = left
-        if not self._learn(drawn, record):
+        if only is not None:
+            record["prefix"] = int(only.sum())
+        if not self._learn(drawn, record, only):
             self.skipped += 1
             record["skipped"] = self.skipped
         self.optimiser.zero_grad()
@@ -180,10 +187,11 @@ class Learner:
 
     # -- loss and update -------------------------------------------------------------------------------------------
 
-    def _learn(self, drawn: list[tuple[int, int]], record: dict[str, Any]) -> bool:
+    def _learn(self, drawn: list[tuple[int, int]], record: dict[str, Any], only: Tensor | None) -> bool:
         """Losses of (view, level) pairs, gradients, update; False, with nothing changed, if any of it is not finite.
-        The record is that of the last pair of this worker, which takes every Nth where there are N."""
-        pictures = self._pictures(drawn, record)
+        The record is that of the last pair of this worker, which takes every Nth where there are N. only: the anchors
+        to render, bool [N], if not all."""
+        pictures = self._pictures(drawn, record, only)
         if workers.count() > 1:
             pictures = self._shared_gradients(pictures)
         if pictures is None:
@@ -196,7 +204,9 @@ class Learner:
         self._update(pictures, record)
         return True
 
-    def _pictures(self, drawn: list[tuple[int, int]], record: dict[str, Any]) -> list[Picture] | None:
+    def _pictures(
+        self, drawn: list[tuple[int, int]], record: dict[str, Any], only: Tensor | None
+    ) -> list[Picture] | None:
         """The pictures of this worker's share of the pairs, their gradients gathered; None if one is not finite."""
         rounding, mask_terms = self._rounding(), self.place >= self.schedule.progressive
         pictures, views = [], self.config.views_per_step
@@ -207,7 +217,7 @@ class Learner:
         for (index, level), seed in own:
             try:
                 with self._drawing_from(seed):
-                    picture, terms, loss = self.loss(index, level, rounding, mask_terms)
+                    picture, terms, loss = self.loss(index, level, rounding, mask_terms, only)
             except NotFinite as error:  # a diverged step may be passed over; any other refusal is here to stay
                 record["refused"] = str(error)
                 return None
@@ -246,15 +256,16 @@ class Learner:
         return None if failed else pictures
 
     def loss(
-        self, index: int, level: int, rounding: Rounding, mask_terms: bool
+        self, index: int, level: int, rounding: Rounding, mask_terms: bool, only: Tensor | None = None
     ) -> tuple[Picture, dict[str, Tensor], Tensor]:
         """(picture of training view `index` at `level`, terms unweighted and by name, their weighted sum).
 
-        mask_terms: whether rate and mask terms belong to it yet. Raises NotFinite where the model has diverged.
+        mask_terms: whether rate and mask terms belong to it yet. only: the anchors to render, bool [N],
+        if not all. Raises NotFinite where the model has diverged.
         """
         config, shot = self.config, self.shots[index]
         view = shot.view
-        picture = render(self.model, level, view.time, view.camera, rounding)
+        picture = render(self.model, level, view.time, view.camera, rounding, only)
         if picture.meta["means2d"].requires_grad:
             picture.meta["means2d"].retain_grad()
         l1, dissimilarity = image_loss(picture.image, shot.target)
@@ -387,17 +398,38 @@ class Learner:
         return before - len(keep), later
 
     def _grade(self) -> list[int]:
-        """Where planes and weights begin to be rounded: gives anchors their step classes. Returns how many each has."""
+        """Where planes and weights begin to be rounded: mixes the features' channels and gives anchors their step
+        classes. Returns how many each has."""
         enough = (self.schedule.iterations or 0) >= pruning.MIN_ITERATIONS
-        if not (self.config.grading and self.config.noise and enough and self._reached(self.schedule.rounding)):
+        if not (self.config.noise and enough and self._reached(self.schedule.rounding)):
             return []
         stride = -(-len(self.shots) // grading.VIEWS)
         levels = range(self.model.level if self.config.rollout == "top" else 0, self.model.level + 1)
+        rounding, shots, found = replace(self._rounding(), noise=None), self.shots[::stride], list[int]()
         try:
-            rounding = replace(self._rounding(), noise=None)
-            return grading.grade(self.model, self.shots[::stride], levels, self.config.grading, rounding)
-        except NotFinite:  # as a step that diverged: passed over, with nothing changed
+            if self.config.grading:
+                found = grading.grade(self.model, shots, levels, self.config.grading, rounding)
+            if self.config.whitening:
+                whitening.whiten(self.model, self.optimiser, shots, levels, rounding)
+                if self.config.grading:  # a step of the features is another one now
+                    found = grading.grade(self.model, shots, levels, self.config.grading, rounding)
+        except NotFinite:  # as a step that diverged: passed over
             return []
+        return found
+
+    def _rank(self) -> None:
+        """Where the last third begins, if prefixes are to be trained: the order of the anchors in a file."""
+        if self.config.prefixes and self._reached(self.schedule.rounding):
+            try:
+                self.rank = workers.alike(lambda: prefixes.rank_anchors(self.model, self.shots))
+            except NotFinite:  # as a step that diverged: passed over
+                pass
+
+    def _draw_prefix(self) -> Tensor | None:
+        """The anchors that this step sees, bool [N]; None if it is all."""
+        if self.rank is None or float(torch.rand((), generator=self.generator)) >= self.config.prefixes:
+            return None
+        return prefixes.draw_prefix(self.rank, self.generator).to(self.device)
 
     # -- checkpoints -----------------------------------------------------------------------------------------------
 
@@ -412,6 +444,7 @@ class Learner:
             "rho": self.rho,
             "skipped": self.skipped,
             "order": self.order,
+            "rank": torch.empty(0) if self.rank is None else self.rank,
             "left_out": json.dumps(self.left_out),
             "optimiser": self.optimiser.state(),
             "densifier": self.densifier.state(),
@@ -435,6 +468,8 @@ class Learner:
         self.rho = float(state["rho"])
         self.order = [int(index) for index in state["order"]]
         self.left_out = list(json.loads(state.get("left_out", "[]")))
+        rank = state.get("rank")
+        self.rank = rank if rank is not None and len(rank) else None
 
 
 def _given(levels: Sequence[int]) -> tuple[tuple[int, ...], Probabilities]:

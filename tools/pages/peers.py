@@ -6,12 +6,9 @@ hold the data, says so in a word instead of a figure.
 
 from __future__ import annotations
 
-import contextlib
 import io
 import math
-import os
-import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -32,6 +29,7 @@ from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
 from pd4dgs_codec.entropy.lzma_mode import decode_channels_lzma, encode_channels_lzma
 from pd4dgs_codec.entropy.positions import decode_positions, encode_positions
 from pd4dgs_codec.errors import Pd4Error
+from pd4dgs_codec.interchange.libraries import quiet
 from pd4dgs_codec.view.frames import Frame
 from pd4dgs_codec.view.levels import Level
 
@@ -456,20 +454,6 @@ def _peer_row(what: str, coder: str, make: Callable[[], Row]) -> Row:
     except Exception as error:
         reason = "not installed" if isinstance(error, ModuleNotFoundError) else f"{type(error).__name__}: {error}"
         return Row(what, coder, missing=" ".join(reason.split())[:160])
-
-
-@contextlib.contextmanager
-def quiet() -> Iterator[None]:
-    """What libraries print on stdout, from C too, goes to stderr."""
-    sys.stdout.flush()
-    kept = os.dup(1)
-    os.dup2(2, 1)
-    try:
-        with contextlib.redirect_stdout(sys.stderr):
-            yield
-    finally:
-        os.dup2(kept, 1)
-        os.close(kept)
 
 
 def table(rows: Sequence[Row], rate_bits: float | None = None) -> str:
