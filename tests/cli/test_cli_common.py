@@ -13,11 +13,9 @@ from pd4dgs_codec import FORMAT_VERSION, jsonable
 from pd4dgs_codec import __main__ as dispatcher
 from pd4dgs_codec.cli import common, values
 
-<<<<<<< HEAD
-VERBS = ("prepare", "train", "encode", "decode", "info", "render", "eval", "bench", "package", "serve", "view")
-=======
-VERBS = ("train", "encode", "decode", "info", "render", "eval", "bench", "package", "serve", "view", "batch")
->>>>>>> s4-batch
+VERBS = (
+    "prepare", "train", "encode", "decode", "info", "render", "eval", "bench", "package", "serve", "view", "batch",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("verb", VERBS)
