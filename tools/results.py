@@ -92,14 +92,9 @@ def main(argv: list[str] | None = None) -> int:
     from PIL import Image
 
     from pd4dgs_codec.cli.progress import TrainingProgress
-    from pd4dgs_codec.train.config import TrainConfig
 
     def measure(name: str) -> Row:
-        scene = SCENES[name]
-        config = TrainConfig(
-            preset=scene.preset, source=scene.source, downscale=scene.downscale, iterations=scene.iterations
-        )
-        result = run_job(Job(name, config), args.out, say=say, progress=TrainingProgress())
+        result = run_job(Job(name, SCENES[name].config()), args.out, say=say, progress=TrainingProgress())
         picture = args.docs / "img" / f"{name}.jpg"
         picture.parent.mkdir(parents=True, exist_ok=True)
         Image.open(args.out / name / "levels.png").convert("RGB").save(picture, quality=95, subsampling=0)

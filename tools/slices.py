@@ -4,11 +4,13 @@
 
 Each checkpoint that tools/results.py left in --out/NAME/model.pt is packed in one slice per layer, in slices of --size
 bytes ordered by what the training views show, and in slices of anchors in random order. Every prefix is decoded and
-scored on the held-out views. Writes docs/slices.md, its plot and a film strip per scene.
+scored on the held-out views. A scene of PREFIXED is trained first, with --prefixes. Writes docs/slices.md, its plot and
+a film strip per scene.
 """
 
 from __future__ import annotations
 
+import argparse
 import sys
 import time
 from collections.abc import Sequence
@@ -19,13 +21,16 @@ from statistics import median
 import numpy as np
 from pages.page import Page, Row, make, options, paragraph, say
 from pages.scenes import SCENES, present
+from pages.trainings import ensure_trained
 
 from pd4dgs_codec.bench.report import markdown
 from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.scene import Scene
 from pd4dgs_codec.threads import configure
 
-NAMES = ("shelf-hand", "bouncing-balls", "synthetic-local", "synthetic-global")
+#: Scenes trained for their first slices, and the share of steps that see these alone.
+PREFIXED, SHARE = {"shelf-hand-prefixes": "shelf-hand"}, 0.3
+NAMES = ("shelf-hand", *PREFIXED, "bouncing-balls", "synthetic-local", "synthetic-global")
 VIEWS = 16  #: training views that order the anchors
 STEP, LEAST = 0.5, 20.0  #: dB between the qualities whose times are compared, and the lowest of them
 RATE = 2e6  #: bits per second
@@ -185,7 +190,8 @@ def render(rows: Sequence[Row]) -> str:
         *paragraph(
             f"Slices of {rows[0]['size']:,} bytes. `pd4dgs-encode --slices` orders the anchors of each layer by what "
             f"{VIEWS} training views show; dB are mPSNR on the views held out. *random*: the first slice with anchors "
-            "in random order. *layer 0*: the first picture of a file with one slice per layer. *time ratio*: the "
+            f"in random order. *{', '.join(PREFIXED)}*: trained with `--prefixes {SHARE}`. *layer 0*: the first "
+            "picture of a file with one slice per layer. *time ratio*: the "
             f"median, over qualities {STEP} dB apart from {LEAST:g} dB up, of the time to that quality on a link of "
             "constant rate, relative to that file."
         ),
@@ -215,12 +221,17 @@ def main(argv: list[str] | None = None) -> int:
     configure(1)
     images = args.docs / "img"
     images.mkdir(parents=True, exist_ok=True)
-    todo = [scene.name for scene in present(args, NAMES) if (args.out / scene.name / "model.pt").is_file()]
+    kept = [name for name in NAMES if name in PREFIXED or (args.out / name / "model.pt").is_file()]
+    there = {scene.name for scene in present(argparse.Namespace(only=None, render=args.render))}
+    todo = [n for n in kept if PREFIXED.get(n, n) in there and (not args.only or n in args.only)]
 
     def measured(name: str) -> Row:
         say(f"{name}:")
-        path = args.out / name / "model.pt"
-        return measure(path, SCENES[name].load(), args.size, images / f"slices-{name}.jpg")
+        path, scene = args.out / name / "model.pt", SCENES[PREFIXED.get(name, name)]
+        dataset = scene.load()
+        if name in PREFIXED:
+            ensure_trained(scene.config(prefixes=SHARE), dataset, path, say=say)
+        return measure(path, dataset, args.size, images / f"slices-{name}.jpg")
 
     return make(PAGE, NAMES, todo, args, measured, lambda rows: plot(rows, images / "slices.png"))
 

@@ -7,10 +7,11 @@ import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from pd4dgs_codec.data.view import Dataset
+    from pd4dgs_codec.train.config import TrainConfig
 
 #: The folder of the real scenes, which are not part of the repository.
 SHARED = Path(os.environ.get("PD4DGS_SHARED") or Path(__file__).resolve().parents[3] / "shared" / "data")
@@ -36,6 +37,13 @@ class Scene:
         from pd4dgs_codec.data.dataset import load
 
         return load(self.source, downscale=self.downscale)
+
+    def config(self, **changes: Any) -> TrainConfig:
+        """Of its training, all at the defaults but for `changes`."""
+        from pd4dgs_codec.train.config import TrainConfig
+
+        given = {"preset": self.preset, "source": self.source, "downscale": self.downscale}
+        return TrainConfig(**given | {"iterations": self.iterations} | changes)
 
 
 SCENES = {
