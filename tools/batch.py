@@ -26,6 +26,7 @@ import flaky
 from pages.page import ROOT, Page, Row, make, options, paragraph, unpadded
 
 from pd4dgs_codec.bench.report import markdown
+from pd4dgs_codec.errors import DataError
 
 TICK = os.sysconf("SC_CLK_TCK")
 RECORD = ".done.json"
@@ -141,7 +142,10 @@ class Batch:
         self._look()
         self.output.seek(0)
         text = self.output.read()
-        return dict(json.loads(text)) if text.strip() else {}
+        summary = dict(json.loads(text)) if text.strip() else {}
+        if "error" in summary:
+            raise DataError(summary["error"]["message"])
+        return summary
 
     def _look(self) -> None:
         table = processes()

@@ -55,6 +55,10 @@ class FlakyFileSystem(AbstractFileSystem):
         finally:
             temporary.unlink(missing_ok=True)
 
+    def get_file(self, rpath: str, lpath: str, **named: Any) -> None:
+        """As on the disk, unless it fails."""
+        self._call("get_file", rpath, lpath)
+
     def put_file(self, lpath: str, rpath: str, *args: Any, **named: Any) -> None:
         """As on the disk, unless it fails."""
         self.pipe_file(rpath, Path(lpath).read_bytes())

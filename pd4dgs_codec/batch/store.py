@@ -106,7 +106,10 @@ def fetch(place: str, folder: Path) -> Path:
         return Path(path)
     target = folder / posixpath.basename(path.rstrip("/"))
     entry = patiently(lambda: system.info(path), place)
-    patiently(lambda: system.get(path, str(target), recursive=entry["type"] != "file"), place)
+    if entry["type"] == "file":  # get() would ask again what it is
+        patiently(lambda: system.get_file(path, str(target)), place)
+    else:
+        patiently(lambda: system.get(path, str(target), recursive=True), place)
     return target
 
 

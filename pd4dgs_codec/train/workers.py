@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, distributed
@@ -50,16 +50,20 @@ def alike(measure: Callable[[], T]) -> T:
     is raised on all of them."""
     if count() == 1:
         return measure()
-    found: list[T | str | None] = [None, None]
+    found: list[Any] = [None, None, None]
     if rank() == 0:
         try:
-            found[0] = measure()
+            value = measure()
+            device = value.device.type if isinstance(value, Tensor) else None
+            found = [None, value.cpu() if isinstance(value, Tensor) else value, device]
         except NotFinite as error:
-            found[1] = str(error)
+            found[0] = str(error)
     distributed.broadcast_object_list(found)
-    if found[1] is not None:
-        raise NotFinite(str(found[1]))
-    return found[0]  # type: ignore[return-value]
+    diverged, value, device = found
+    if diverged is not None:
+        raise NotFinite(diverged)
+    result: T = value.to(device) if device else value  # each worker has a device of its own
+    return result
 
 
 def largest(*values: float) -> tuple[float, ...]:

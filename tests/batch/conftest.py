@@ -7,9 +7,6 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-
-pytest.importorskip("fsspec", reason="needs fsspec (the extra `cluster`)")
-
 from standin import upper
 
 from pd4dgs_codec.batch.engines import ENGINES, Settings

@@ -48,7 +48,7 @@ def _train(program: Path, workers: int, output: str, *options: object) -> subpro
     )
     argv = ["set", "-o", output, "--preset", "tiny", "--device", "cpu", *map(str, options)]
     command = [sys.executable, *launch, str(program), *argv]
-    return subprocess.run(command, cwd=program.parent, capture_output=True, text=True, timeout=300)
+    return subprocess.run(command, cwd=program.parent, capture_output=True, text=True, timeout=900)
 
 
 def _same_model(first: Path, second: Path) -> None:
