@@ -120,11 +120,14 @@ import sys
 sys.modules["torch"] = None
 from pd4dgs_codec.cli.render import main
 code = main([sys.argv[1], "-o", sys.argv[2], "--frames", "1"])
+late = "data.dataset", "interchange.teacher", "metrics.perceptual", "train", "delivery.client"
+loaded = {f"pd4dgs_codec.{name}" for name in late} & set(sys.modules)
+assert not loaded, f"a file of its own camera waits for {loaded}"
 sys.exit(code)
 """
 
 
-def test_rendering_a_file_needs_no_torch(tmp_path):
+def test_rendering_a_file_needs_no_torch_and_no_datasets(tmp_path):
     file = tmp_path / "scene.pd4"
     scene = _scene()
     file.write_bytes(encode(replace(scene, info=replace(scene.info, camera=_camera(0))), layers=2, effort=1))
