@@ -9,6 +9,7 @@ from importlib import import_module
 from pd4dgs_codec.cli.common import USAGE, open_streams, say, tell, version_line
 
 VERBS = {
+    "prepare": "find the camera's poses in a video or its frames",
     "train": "train a layered scene from posed images",
     "encode": "pack a trained scene into a .pd4 file",
     "decode": "unpack a .pd4 file, or the first layers of one",
@@ -21,6 +22,7 @@ VERBS = {
     "package": "lay out a file for DASH, HLS and plain HTTP",
     "serve": "serve a folder over HTTP, at the rate of a slow link if wanted",
     "view": "show a scene in the browser",
+    "batch": "run a command on every scene of a library",
 }
 
 MODULES = {"import": "import_model"}  #: verbs that cannot be a module's name

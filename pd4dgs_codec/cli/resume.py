@@ -25,6 +25,7 @@ FIXED = (
     "downscale",
     "holdout",
     "iterations",
+    "views_per_step",
     "rate_scale",
     "prune",
     "grading",
