@@ -85,7 +85,7 @@ def parser() -> Parser:
         type=values.non_negative_float,
         metavar="X",
         help="half way, take out anchors whose absence adds at most this share to the squared error, instead of the "
-        "quality's (at 80: 0.04; 0: none)",
+        "quality's (at 80: 0.09; 0: none)",
     )
     what = (
         "coarser steps for anchors that pictures hardly depend on, up to this share of the squared error, instead of "

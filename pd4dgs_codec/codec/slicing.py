@@ -18,6 +18,7 @@ from pd4dgs_codec.entropy.fitting import Fitted
 
 TRIES = 4  #: at most so many encodes of one slice to hit its size
 SLACK = 0.97  #: of the size wanted, what a slice is aimed at
+FULL = 0.92  #: of the size wanted, what is large enough
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,20 +53,24 @@ def write_slices(layer: LayerSymbols, options: EncodeOptions, utility: np.ndarra
         fixed = 0 if found else len(write_layer(sliced(layer, [rows[:0]])[0], options)[0])
         if not found and layer.kind.layer == 0:
             room = max(room, 2 * fixed)
+        tries: list[tuple[bool, int, Slice, Past[Fitted]]] = []  # fits, anchors, slice, what the next may reuse
         for _ in range(TRIES):
             expected = (costs[done:] - before) * scale + fixed
-            fits = int(np.searchsorted(expected, room * SLACK, side="right"))
-            count = min(max(fits, least), len(rows) - done)
+            likely = int(np.searchsorted(expected, room * SLACK, side="right"))
+            count = min(max(likely, least), len(rows) - done)
             part = rows[done : done + count]
             symbols = sliced(layer, [rows[:0], part] if found else [part])[-1]
             trial = past.copy()
             payload, streams = write_layer(symbols, options, trial, layer)
             if count:
                 scale *= max(len(payload) - fixed, 1) / max(expected[count - 1] - fixed, 1)
-            if len(payload) <= room or count <= least:
+            fits = len(payload) <= room or count <= least
+            tries.append((fits, count, Slice(symbols, payload, streams), trial))
+            if fits and (len(payload) >= room * FULL or count in (least, len(rows) - done)):
                 break
-        found.append(Slice(symbols, payload, streams))
-        done, past = done + count, trial
+        _, count, made, past = max(tries, key=lambda tried: (tried[0], tried[1] if tried[0] else -tried[1]))
+        found.append(made)
+        done += count
     return found
 
 
