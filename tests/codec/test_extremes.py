@@ -98,7 +98,7 @@ def many(anchors, widths):
     )
 
 
-@pytest.mark.parametrize("slices", [0, 200_000])
+@pytest.mark.parametrize("slices", [0, pytest.param(200_000, marks=pytest.mark.slow)])
 def test_three_hundred_thousand_anchors(slices):
     scene = many(MANY, Widths(1, 1))
     got = decode(encode(scene, layers=0, effort=1, slices=slices, omit="nothing", verify=False))
