@@ -9,6 +9,7 @@ from importlib import import_module
 from pd4dgs_codec.cli.common import USAGE, open_streams, say, tell, version_line
 
 VERBS = {
+    "prepare": "find the camera's poses in a video or its frames",
     "train": "train a layered scene from posed images",
     "encode": "pack a trained scene into a .pd4 file",
     "decode": "unpack a .pd4 file, or the first layers of one",

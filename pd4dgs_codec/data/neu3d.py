@@ -8,9 +8,7 @@ held out, as everyone does.
 from __future__ import annotations
 
 import io
-from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -25,6 +23,7 @@ from pd4dgs_codec.data.cameras import (
 )
 from pd4dgs_codec.data.files import LARGEST, check_downscale, read_file, shrink_image
 from pd4dgs_codec.data.ply import read_ply
+from pd4dgs_codec.data.videos import open_video
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DataError, one_line
 
@@ -113,28 +112,18 @@ def _camera(row: np.ndarray, i: int, size: tuple[int, int], video: Path) -> Unre
 
 def _decoded(video: Path, downscale: int, videos: int) -> tuple[list[np.ndarray], float, tuple[int, int]]:
     """(frames uint8 [H, W, 3], downscaled; frames per second; size before that)."""
-    from imageio_ffmpeg import read_frames
-
+    source = open_video(video, output=["-fps_mode", "passthrough"])
+    width, height = source.size
+    check_downscale(source.size, downscale, str(video))
     frames: list[np.ndarray] = []
-    try:
-        reader: Iterator[Any] = read_frames(str(video), output_params=["-fps_mode", "passthrough"])
-        meta = next(reader)
-        width, height = meta["size"]
-        check_downscale((width, height), downscale, str(video))
-        fps = float(meta["fps"])
-        for data in reader:
-            image = np.frombuffer(data, np.uint8).reshape(height, width, 3)
-            frames.append(shrink_image(image, downscale))
-            if len(frames) * frames[0].nbytes * videos > MOST_BYTES:
-                gigabytes = MOST_BYTES / 2**30
-                raise DataError(
-                    f"{video}: {videos} videos of more than {len(frames)} frames of {width // downscale}x"
-                    f"{height // downscale} take over {gigabytes:g} GiB; expected a larger --downscale"
-                )
-    except DataError:
-        raise
-    except (OSError, RuntimeError, StopIteration, ValueError, KeyError) as error:
-        raise DataError(f"{video}: cannot be decoded: {one_line(str(error), 120)}") from None
-    if not frames or not 0 < fps < 1e6:
-        raise DataError(f"{video}: {len(frames)} frames at {fps:g} per second, expected one at least")
-    return [np.ascontiguousarray(frame) for frame in frames], fps, (width, height)
+    for image in source.pictures:
+        frames.append(shrink_image(image, downscale))
+        if len(frames) * frames[0].nbytes * videos > MOST_BYTES:
+            gigabytes = MOST_BYTES / 2**30
+            raise DataError(
+                f"{video}: {videos} videos of more than {len(frames)} frames of {width // downscale}x"
+                f"{height // downscale} take over {gigabytes:g} GiB; expected a larger --downscale"
+            )
+    if not frames:
+        raise DataError(f"{video}: holds no frame, expected one at least")
+    return [np.ascontiguousarray(frame) for frame in frames], source.fps, source.size

@@ -59,8 +59,8 @@ BEFORE: dict[str, Any] = {
     "feature_width": 32,
     "slots": 10,
     "grading": 0.0,
-    "views_per_step": 1,
     "whitening": False,
+    "views_per_step": 1,
 }
 
 

@@ -31,14 +31,19 @@ def whiten(
 ) -> None:
     """Mixes the feature's channels, in the anchors and in all that reads or moves them: pictures stay, to rounding.
     A step's harm, summed over the channels, stays the same too."""
-    harm = workers.alike(lambda: sum(_feature_harm(model, level, shots, rounding) for level in levels))
-    assert isinstance(harm, Tensor)
+    mix = workers.alike(lambda: _measured(model, shots, levels, rounding))
+    if mix is not None:
+        _mix(model, optimiser, mix)
+
+
+def _measured(model: Model, shots: Sequence[Shot], levels: Sequence[int], rounding: Rounding) -> Tensor | None:
+    """float64 [D, D]: the mix that fits the model; None where no picture shows a feature."""
+    harm = torch.stack([_feature_harm(model, level, shots, rounding) for level in levels]).sum(0)
     active = model.masks(2).detach() > MASK_THRESHOLD
     if not harm.trace() > 0 or int(active.sum()) < 2:
-        return
+        return None
     scaled = model.feature.detach()[active].double() / model.spacing[active, None]
-    mix = mixing(harm, torch.cov(scaled.T))
-    _mix(model, optimiser, mix)
+    return mixing(harm, torch.cov(scaled.T))
 
 
 def mixing(harm: Tensor, covariance: Tensor) -> Tensor:

@@ -13,7 +13,10 @@ from pd4dgs_codec import FORMAT_VERSION, jsonable
 from pd4dgs_codec import __main__ as dispatcher
 from pd4dgs_codec.cli import common, values
 
-VERBS = ("train", "encode", "decode", "info", "render", "eval", "bench", "package", "serve", "view", "batch")
+VERBS = (
+    *("prepare", "train", "encode", "decode", "info", "render", "eval", "bench", "package", "serve", "view"),
+    "batch",
+)
 
 
 @pytest.mark.parametrize("verb", VERBS)

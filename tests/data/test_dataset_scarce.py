@@ -7,7 +7,7 @@ import pytest
 from dataset_pictures import pose
 from PIL import Image
 
-from pd4dgs_codec.data import load
+from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.errors import DataError
 
 #: A lens that sees nothing: its picture lies thousands of pixels off the axis.

@@ -1,0 +1,186 @@
+"""Which frames of a recording are worth a pose: spread over its time, sharp, and each different from the one before."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pd4dgs_codec.data.files import image_info, read_image, shrink_image
+from pd4dgs_codec.data.videos import open_video
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.prepare.progress import Advance
+
+#: Frames are judged at this width at most, pixels.
+LOOK_WIDTH = 640
+#: Blurred: less than this share of the median sharpness of the frames around it, this many on either side.
+BLURRED, AROUND = 0.4, 15
+#: Two frames are one if their mean difference is below this, 8-bit levels. Coding one picture twice costs less.
+SAME = 0.3
+#: Frames that are looked at: an hour at 60 per second is as much. And the fewest that can be given poses.
+MOST_FRAMES, FEWEST_FRAMES = 216_000, 8
+PICTURES = {".png", ".jpg", ".jpeg"}
+
+
+@dataclass(frozen=True)
+class Look:
+    """What a first look says of a frame. index: its place in the recording; time: seconds; sharpness: variance of its
+    Laplacian, squared 8-bit levels; change: mean difference from the frame before, 8-bit levels, infinite for the
+    first."""
+
+    index: int
+    time: float
+    sharpness: float
+    change: float
+
+
+@dataclass(frozen=True)
+class Choice:
+    """Indices of frames, ascending: those to use, and those left out because they are blurred or repeat another."""
+
+    chosen: tuple[int, ...]
+    blurred: tuple[int, ...]
+    repeated: tuple[int, ...]
+
+
+class VideoFile:
+    """A video. Its frames are taken at its mean rate, so that frame k is of time k / fps even where a phone's rate
+    varies; ffmpeg repeats or drops frames for that."""
+
+    def __init__(self, path: Path):
+        video = open_video(path)
+        video.pictures.close()  # type: ignore[attr-defined]
+        self.path, self.size, self.fps = path, video.size, video.fps
+
+    def looks(self) -> Iterator[np.ndarray]:
+        """Every frame, small and grey, uint8 [h, w]."""
+        width = min(self.size[0], LOOK_WIDTH)
+        scale = f"scale={width}:{max(1, round(self.size[1] * width / self.size[0]))}:flags=area"
+        return open_video(self.path, grey=True, output=["-vf", scale, *self._rate()]).pictures
+
+    def pictures(self, indices: Sequence[int]) -> Iterator[np.ndarray]:
+        """uint8 [H, W, 3] of these frames, in this order, which is ascending."""
+        wanted = set(indices)
+        for k, picture in enumerate(open_video(self.path, output=self._rate()).pictures):
+            if k in wanted:
+                yield picture
+            if k >= indices[-1]:
+                return
+
+    def time(self, index: int) -> float:
+        """Seconds of a frame."""
+        return index / self.fps
+
+    def _rate(self) -> list[str]:
+        return ["-fps_mode", "cfr", "-r", f"{self.fps:.6f}"]
+
+
+class FrameFolder:
+    """A folder of pictures of one size, frames in the order of the last number in their names, which counts at `fps`
+    per second."""
+
+    def __init__(self, path: Path, fps: float):
+        files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in PICTURES]
+        if not files:
+            raise DataError(f"{path}: found no picture, expected frames as {', '.join(sorted(PICTURES))}")
+        numbers = [re.findall(r"\d{1,15}", file.stem) for file in files]
+        if all(numbers):
+            order = sorted(range(len(files)), key=lambda i: (int(numbers[i][-1]), files[i].name))
+            self.places = [int(numbers[i][-1]) for i in order]
+            files = [files[i] for i in order]
+        else:
+            self.places = list(range(len(files)))
+        if len(set(self.places)) < len(self.places):
+            raise DataError(f"{path}: two pictures have the same number, expected one per frame")
+        self.path, self.files, self.fps = path, files, fps
+        self.size = image_info(files[0])[:2]
+
+    def looks(self) -> Iterator[np.ndarray]:
+        """Every frame, small and grey, uint8 [h, w]."""
+        k = max(1, -(-self.size[0] // LOOK_WIDTH))
+        for file in self.files:
+            yield read_image(file, self.size, downscale=k).mean(axis=2).astype(np.uint8)
+
+    def pictures(self, indices: Sequence[int]) -> Iterator[np.ndarray]:
+        """uint8 [H, W, 3] of these frames."""
+        for k in indices:
+            yield read_image(self.files[k], self.size)
+
+    def time(self, index: int) -> float:
+        """Seconds of a frame after the first one."""
+        return (self.places[index] - self.places[0]) / self.fps
+
+
+Recording = VideoFile | FrameFolder
+
+
+def open_recording(path: Path, fps: float) -> Recording:
+    """A video, or a folder of frames taken `fps` times per second; DataError for what is neither."""
+    if path.is_dir():
+        return FrameFolder(path, fps)
+    if not path.exists():
+        raise DataError(f"{path}: found nothing, expected a video or a folder of frames")
+    return VideoFile(path)
+
+
+def look(recording: Recording, advance: Advance) -> list[Look]:
+    """A first look at every frame."""
+    looks: list[Look] = []
+    before: np.ndarray | None = None
+    for index, small in enumerate(recording.looks()):
+        if index >= MOST_FRAMES:
+            raise DataError(f"{recording.path}: more than {MOST_FRAMES:,} frames, expected a shorter recording")
+        picture = small.astype(np.float32)
+        change = float("inf") if before is None else float(np.abs(picture - before).mean())
+        looks.append(Look(index, recording.time(index), sharpness(picture), change))
+        before = picture
+        advance()
+    if len(looks) < FEWEST_FRAMES:
+        raise DataError(f"{recording.path}: {len(looks)} frames, expected {FEWEST_FRAMES} at least")
+    return looks
+
+
+def sharpness(picture: np.ndarray) -> float:
+    """Variance of the Laplacian of float32 [h, w] (Pech-Pacheco et al., ICPR 2000)."""
+    if min(picture.shape) < 3:
+        return 0.0
+    middle = picture[1:-1, 1:-1]
+    around = picture[:-2, 1:-1] + picture[2:, 1:-1] + picture[1:-1, :-2] + picture[1:-1, 2:]
+    return float((around - 4 * middle).var())
+
+
+def choose(looks: Sequence[Look], count: int) -> Choice:
+    """At most `count` of the frames (0: no limit): of each of as many equal stretches of time the sharpest."""
+    sharp = np.array([frame.sharpness for frame in looks])
+    usual = np.array([np.median(sharp[max(0, i - AROUND) : i + AROUND + 1]) for i in range(len(sharp))])
+    is_blurred = sharp < BLURRED * usual
+    is_repeated = np.array([frame.change < SAME for frame in looks])
+    usable = np.flatnonzero(~is_blurred & ~is_repeated)
+    stretches = np.array_split(np.arange(len(looks)), count) if 0 < count < len(usable) else usable[:, None]
+    left = [stretch[np.isin(stretch, usable)] for stretch in stretches]
+    chosen = [int(stretch[np.argmax(sharp[stretch])]) for stretch in left if len(stretch)]
+    repeated = is_repeated & ~is_blurred
+    return Choice(tuple(chosen), *(tuple(map(int, np.flatnonzero(which))) for which in (is_blurred, repeated)))
+
+
+def write_frames(
+    recording: Recording, indices: Sequence[int], folder: Path, downscale: int, advance: Advance
+) -> dict[str, float]:
+    """Writes these frames as PNG into the folder, averaged over blocks of downscale x downscale; the names of the files
+    with their times in seconds."""
+    from PIL import Image
+
+    if min(recording.size) // downscale < 1:
+        raise DataError(f"{recording.path}: downscale {downscale} leaves nothing of {recording.size} pixels")
+    times: dict[str, float] = {}
+    for index, picture in zip(indices, recording.pictures(indices), strict=False):
+        name = f"frame_{index:06d}.png"
+        Image.fromarray(shrink_image(picture, downscale)).save(folder / name, compress_level=1)
+        times[name] = recording.time(index)
+        advance()
+    if len(times) < len(indices):
+        raise DataError(f"{recording.path}: {len(times)} of {len(indices)} frames could be decoded a second time")
+    return times

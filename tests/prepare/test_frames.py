@@ -1,0 +1,111 @@
+"""Which frames are taken: sharp ones, spread over the time, none twice."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import Image, ImageFilter
+from rooms import HEIGHT, WIDTH, walk
+
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.prepare.frames import FEWEST_FRAMES, Look, choose, look, open_recording, sharpness, write_frames
+
+imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+FPS = 10
+
+
+def nothing() -> None:
+    pass
+
+
+def blurred(picture: np.ndarray) -> np.ndarray:
+    return np.asarray(Image.fromarray(picture).filter(ImageFilter.GaussianBlur(4)))
+
+
+@pytest.fixture(scope="module")
+def recording() -> list[np.ndarray]:
+    """16 frames, of which the 5th is blurred and the 9th repeats the one before."""
+    pictures = walk(16)[0]
+    pictures[5], pictures[9] = blurred(pictures[5]), pictures[8]
+    return pictures
+
+
+def write_video(path, pictures) -> None:
+    writer = imageio_ffmpeg.write_frames(
+        str(path), (WIDTH, HEIGHT), fps=FPS, codec="libx264rgb", pix_fmt_out="rgb24", quality=None,
+        macro_block_size=2, output_params=["-qp", "0"],
+    )  # fmt: skip
+    writer.send(None)
+    for picture in pictures:
+        writer.send(np.ascontiguousarray(picture))
+    writer.close()
+
+
+def write_folder(path, pictures) -> None:
+    path.mkdir()
+    for i, picture in enumerate(pictures):
+        Image.fromarray(picture).save(path / f"shot{i + 1}.png")  # 10 comes after 9
+
+
+@pytest.mark.parametrize("kind", ["video", "folder"])
+def test_the_blurred_and_the_repeated_frame_are_left_out(kind, recording, tmp_path):
+    path = tmp_path / ("film.mp4" if kind == "video" else "film")
+    (write_video if kind == "video" else write_folder)(path, recording)
+    source = open_recording(path, FPS)
+    looks = look(source, nothing)
+    assert [frame.time for frame in looks] == pytest.approx([i / FPS for i in range(16)])
+    choice = choose(looks, 0)
+    assert choice.blurred == (5,) and choice.repeated == (9,)
+    assert choice.chosen == tuple(i for i in range(16) if i not in (5, 9))
+    (tmp_path / "out").mkdir()
+    times = write_frames(source, choice.chosen, tmp_path / "out", 2, nothing)
+    for (name, seconds), i in zip(times.items(), choice.chosen, strict=True):
+        assert seconds == pytest.approx(i / FPS)
+        written = np.asarray(Image.open(tmp_path / "out" / name), np.float64)
+        blocks = recording[i].reshape(HEIGHT // 2, 2, WIDTH // 2, 2, 3).mean(axis=(1, 3))
+        assert np.abs(written - blocks).max() <= 0.5
+
+
+def test_frames_are_spread_over_the_time_and_are_the_sharpest_of_their_stretch():
+    sharp = [100.0 + 10 * (i % 5 == 3) for i in range(50)]
+    choice = choose([Look(i, i / 10, s, 5.0) for i, s in enumerate(sharp)], 10)
+    assert choice.chosen == tuple(range(3, 50, 5))
+
+
+def test_a_still_camera_before_a_still_scene_leaves_one_frame():
+    choice = choose([Look(i, i / 10, 100.0, 0.0 if i else float("inf")) for i in range(20)], 10)
+    assert choice.chosen == (0,) and len(choice.repeated) == 19
+
+
+def test_blur_lowers_sharpness(recording):
+    picture = recording[0].mean(axis=2).astype(np.float32)
+    assert sharpness(blurred(recording[0]).mean(axis=2).astype(np.float32)) < 0.1 * sharpness(picture)
+
+
+def test_sharpness_is_the_variance_of_the_laplacian():
+    picture = np.random.default_rng(0).random((7, 9), dtype=np.float32)
+    expected = [
+        picture[y - 1, x] + picture[y + 1, x] + picture[y, x - 1] + picture[y, x + 1] - 4 * picture[y, x]
+        for y in range(1, 6)
+        for x in range(1, 8)
+    ]
+    assert sharpness(picture) == pytest.approx(np.var(expected), rel=1e-5)
+
+
+def test_broken_recordings_are_one_line(recording, tmp_path):
+    def line(path) -> str:
+        with pytest.raises(DataError) as caught:
+            look(open_recording(path, FPS), nothing)
+        return str(caught.value)
+
+    assert line(tmp_path / "none.mp4").endswith("found nothing, expected a video or a folder of frames")
+    (tmp_path / "text.mp4").write_text("no video")
+    assert "text.mp4: cannot be decoded" in line(tmp_path / "text.mp4")
+    (tmp_path / "empty").mkdir()
+    assert "found no picture" in line(tmp_path / "empty")
+    write_folder(tmp_path / "short", recording[:3])
+    assert f"3 frames, expected {FEWEST_FRAMES} at least" in line(tmp_path / "short")
+    Image.fromarray(recording[3][:100]).save(tmp_path / "short" / "shot4.png")
+    assert "is 320x100, expected 320x240" in line(tmp_path / "short")
+    Image.fromarray(recording[3]).save(tmp_path / "short" / "other1.png")
+    assert "two pictures have the same number" in line(tmp_path / "short")

@@ -1,0 +1,115 @@
+"""`pd4dgs-prepare` on a room whose camera poses are known."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+from rooms import FOCAL, walk
+
+from pd4dgs_codec.cli.prepare import main
+from pd4dgs_codec.data import load
+from pd4dgs_codec.prepare import poses, stages
+
+pytest.importorskip("pycolmap")
+COUNT = 12
+
+
+def write(folder, pictures):
+    folder.mkdir()
+    for i, picture in enumerate(pictures):
+        Image.fromarray(picture).save(folder / f"{i:03d}.png")
+    return folder
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    """A folder of frames in which a square moves, and the true poses."""
+    pictures, views = walk(COUNT, moves=True)
+    return write(tmp_path_factory.mktemp("room") / "frames", pictures), views
+
+
+@pytest.fixture(scope="module")
+def prepared(room, tmp_path_factory):
+    """What the command makes of it, interrupted once on the way."""
+    output = tmp_path_factory.mktemp("prepared") / "out"
+    arguments = [str(room[0]), "-o", str(output), "--fps", "10", "--camera", "SIMPLE_PINHOLE", "-j", "2"]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(poses, "reconstruct", _interrupted)
+        assert main(arguments) == 1
+    assert not output.exists() and output.with_name("out.partial").is_dir()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(stages, "write_frames", _never)
+        assert main(arguments) == 0
+    return output
+
+
+def _interrupted(*_: object) -> None:
+    raise KeyboardInterrupt
+
+
+def _never(*_: object) -> None:
+    raise AssertionError("the frames were written before")
+
+
+def test_the_poses_are_those_of_the_camera(prepared, room):
+    data = load(prepared, holdout=0)
+    assert len(data.train) == COUNT and data.time_range == (0.0, pytest.approx((COUNT - 1) / 10))
+    assert data.train[0].K[0, 0] == pytest.approx(FOCAL, rel=0.05)
+    found = np.stack([view.viewmat for view in data.train]).astype(np.float64)
+    true = np.stack(room[1])
+    for k in range(COUNT):  # rotations against the first picture's
+        turn = found[k, :3, :3] @ found[0, :3, :3].T @ (true[k, :3, :3] @ true[0, :3, :3].T).T
+        assert np.degrees(np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))) < 1.0
+    places, expected = (np.stack([-v[:3, :3].T @ v[:3, 3] for v in views]) for views in (found, true))
+    gaps, wanted = (np.linalg.norm(p[:, None] - p, axis=2) for p in (places, expected))
+    np.testing.assert_allclose(gaps / gaps.max(), wanted / wanted.max(), atol=0.03)
+
+
+def test_the_model_stands_upright_around_0(prepared):
+    data = load(prepared, holdout=0)
+    assert data.up == pytest.approx((0, -1, 0), abs=1e-3)
+    assert np.abs(np.median(data.points, axis=0)).max() < 1e-3
+
+
+def test_the_report_says_what_was_found(prepared):
+    report = json.loads((prepared / "report.json").read_text())
+    assert report["frames"] == {"seen": COUNT, "blurred": 0, "repeated": 0, "chosen": COUNT, "registered": COUNT}
+    assert 0 < report["reprojection_error"] < 1.5 and report["points"] > 200
+    assert 0.005 < report["moving_share"] < 0.4
+    assert len(report["pictures"]) == COUNT and all(row["pose"] for row in report["pictures"])
+    assert Image.open(prepared / "report.png").width > 1000
+    assert sorted(path.name for path in prepared.iterdir()) == [
+        "images", "report.json", "report.png", "sparse", "times.txt",
+    ]  # fmt: skip
+
+
+def test_an_interruption_says_how_to_go_on(room, tmp_path, monkeypatch, capsys):
+    monkeypatch.setattr(poses, "extract", _interrupted)
+    assert main([str(room[0]), "-o", str(tmp_path / "out")]) == 1
+    line = f"interrupted; the same command goes on from {tmp_path / 'out'}.partial"
+    assert capsys.readouterr().err.splitlines()[-1].endswith(line)
+
+
+def test_what_cannot_be_registered_is_one_line_and_leaves_nothing(tmp_path, capsys):
+    rng = np.random.default_rng(0)
+    frames = write(tmp_path / "noise", [rng.integers(0, 255, (96, 128, 3), np.uint8) for _ in range(10)])
+    assert main([str(frames), "-o", str(tmp_path / "out"), "-j", "2"]) == 1
+    lines = capsys.readouterr().err.strip().splitlines()
+    assert "no camera poses: found those of 0 of 10 frames" in lines[-1]
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["noise"]
+
+
+def test_a_folder_of_someone_else_is_not_replaced(room, prepared, tmp_path, capsys):
+    assert main([str(room[0]), "-o", str(prepared)]) == 1
+    assert "exists already; --overwrite replaces" in capsys.readouterr().err
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / "letter.txt").write_text("dear")
+    assert main([str(room[0]), "-o", str(tmp_path / "out"), "--overwrite"]) == 1
+    assert "expected a folder that pd4dgs-prepare made" in capsys.readouterr().err
+    assert (tmp_path / "out" / "letter.txt").is_file()
+    (tmp_path / "new.partial").mkdir()
+    assert main([str(room[0]), "-o", str(tmp_path / "new")]) == 1
+    assert "is not of an earlier run" in capsys.readouterr().err
