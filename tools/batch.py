@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import secrets
 import signal
 import socket
 import subprocess
@@ -251,6 +252,7 @@ def _is_worker(number: int) -> bool:
 def _cluster(stack: ExitStack, environment: dict[str, str]) -> tuple[list[int], str]:
     """(processes of a head without cores and of two nodes with one each, address)."""
     ray, port = str(Path(sys.executable).with_name("ray")), free_port()
+    environment |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}  # nobody else's cluster
     common = ["--block", "--disable-usage-stats", "--object-store-memory", "100000000"]
     head = [ray, "start", "--head", f"--port={port}", "--num-cpus=0", "--include-dashboard=false", *common]
     numbers = [stack.enter_context(started(head, environment)).pid]
