@@ -50,7 +50,7 @@ CASES = {
 
 def scenes(folder: Path, count: int) -> None:
     """Checkpoints of untrained models of a few hundred anchors, each of another seed."""
-    from pd4dgs_codec.data import load
+    from pd4dgs_codec.data.dataset import load
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.model.config import DeformationConfig, ModelConfig
     from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS

@@ -56,7 +56,8 @@ def capture(name: str, folder: Path) -> tuple[dict[str, Any], list[dict[str, Any
 def _synthetic(folder: Path) -> tuple[dict[str, Any], list[dict[str, Any]], np.ndarray]:
     from PIL import Image
 
-    from pd4dgs_codec.data import load, synthetic
+    from pd4dgs_codec.data import synthetic
+    from pd4dgs_codec.data.dataset import load
     from pd4dgs_codec.data.scenes import SceneBuilder
 
     bodies, frames, count = SceneBuilder("local", 0).bodies(), [], 180
@@ -138,7 +139,7 @@ def _row(way: str, home: Path, downscale: int, cuts: Sequence[int]) -> Row:
     """Bytes, dB on held-out frames, and steps of the pictures in time: across seams and elsewhere."""
     from pd4dgs_codec import decode
     from pd4dgs_codec.codec.info import info
-    from pd4dgs_codec.data import load
+    from pd4dgs_codec.data.dataset import load
     from pd4dgs_codec.metrics.image import to_uint8
     from pd4dgs_codec.playback.player import Player
 
