@@ -57,7 +57,7 @@ def scenes(folder: Path, count: int) -> None:
     from pd4dgs_codec.train.config import TrainConfig
     from pd4dgs_codec.train.initialise import fresh_model
 
-    if len(list(folder.glob("*.pt"))) == count:
+    if len(list(folder.glob("*.pt"))) >= count:
         return
     folder.mkdir(parents=True, exist_ok=True)
     size = ModelConfig(
@@ -249,6 +249,18 @@ def _is_worker(number: int) -> bool:
     return b"spawn_main" in line or line.startswith(b"ray::")
 
 
+#: Waits until a Ray cluster has so many cores.
+JOINED = """
+import ray, sys, time
+ray.init(sys.argv[1], log_to_driver=False, logging_level="ERROR")
+for _ in range(120):
+    if ray.cluster_resources().get("CPU", 0) >= int(sys.argv[2]):
+        sys.exit(0)
+    time.sleep(0.5)
+sys.exit(1)
+"""
+
+
 def _cluster(stack: ExitStack, environment: dict[str, str]) -> tuple[list[int], str]:
     """(processes of a head without cores and of two nodes with one each, address)."""
     ray, port = str(Path(sys.executable).with_name("ray")), free_port()
@@ -257,11 +269,14 @@ def _cluster(stack: ExitStack, environment: dict[str, str]) -> tuple[list[int], 
     head = [ray, "start", "--head", f"--port={port}", "--num-cpus=0", "--include-dashboard=false", *common]
     numbers = [stack.enter_context(started(head, environment)).pid]
     _wait_for(port)
-    for _ in range(2):
-        node = [ray, "start", f"--address=127.0.0.1:{port}", "--num-cpus=1", *common]
+    address = f"127.0.0.1:{port}"
+    for count in (1, 2):  # one after the other: two that begin at once take each other's ports
+        node = [ray, "start", f"--address={address}", "--num-cpus=1", *common]
         numbers.append(stack.enter_context(started(node, environment)).pid)
-    time.sleep(15)  # until both have joined
-    return numbers, f"127.0.0.1:{port}"
+        joined = subprocess.run([sys.executable, "-c", JOINED, address, str(count)], env=environment)
+        if joined.returncode:
+            raise DataError(f"node {count} of the Ray cluster did not join")
+    return numbers, address
 
 
 def _wait_for(port: int) -> None:
