@@ -252,10 +252,13 @@ def _is_worker(number: int) -> bool:
 #: Waits until a Ray cluster has so many cores.
 JOINED = """
 import ray, sys, time
-ray.init(sys.argv[1], log_to_driver=False, logging_level="ERROR")
 for _ in range(120):
-    if ray.cluster_resources().get("CPU", 0) >= int(sys.argv[2]):
-        sys.exit(0)
+    try:
+        ray.init(sys.argv[1], log_to_driver=False, logging_level="ERROR", ignore_reinit_error=True)
+        if ray.cluster_resources().get("CPU", 0) >= int(sys.argv[2]):
+            sys.exit(0)
+    except ConnectionError:
+        pass
     time.sleep(0.5)
 sys.exit(1)
 """
