@@ -37,6 +37,8 @@ HALVINGS, SHOW_HALVINGS = 2, 1
 NARROW = 0.3
 #: Points enclosed at once: bounds the memory.
 CHUNK = 1024
+#: Chunks after which it is first asked again whether going on pays.
+SAMPLE = 16
 #: Anchors that are looked at at once where nothing is enclosed.
 BLOCK = 1 << 13
 
@@ -142,7 +144,8 @@ def global_cells(scene: Scene) -> Reached:
 
 def shown_gaussians(scene: Scene, pays: Pays[np.ndarray] = _always) -> np.ndarray:
     """bool [N, G]: the Gaussians that some view may show. Those that features without residuals do not show are
-    looked at if it `pays`, which is told what is certain, as if no other were shown."""
+    looked at if it `pays`, which is told what is certain, as if no other were shown. In large scenes it is asked again
+    now and then, as if the share that was proven not to be shown so far held for all; the rest then counts as shown."""
     shown = np.concatenate([_may_show(scene, rows, None) for rows in _blocks(scene)])
     field = scene.global_deformation
     if field is None or "feature" not in field.networks:
@@ -151,10 +154,18 @@ def shown_gaussians(scene: Scene, pays: Pays[np.ndarray] = _always) -> np.ndarra
     if not pays(shown, open_.size * len(spans)):
         return np.ones_like(shown)
     anchor = scene.anchor  # worked out at each access
+    certain, chunks, looked, hidden = shown.copy(), _chunks(open_), 0, 0
     with ThreadPoolExecutor(threads.encoder_threads()) as pool:
-        for rows in _chunks(open_):
+        for index, rows in enumerate(chunks):
+            if index >= SAMPLE and index & (index - 1) == 0:
+                share = max(hidden, 1) / looked
+                if not pays(certain, int(open_.size * len(spans) / share)):
+                    shown[np.concatenate(chunks[index:])] = True
+                    break
+            looked += int((~shown[rows]).sum())
             enclosure = Enclosure(field, scene.info.box, anchor[rows])
             shown[rows] = _shown(scene, rows, shown[rows], enclosure, spans, pool)
+            hidden += int((~shown[rows]).sum())
     return shown
 
 

@@ -40,7 +40,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
 DIAL: dict[str, tuple[float, float]] = {
     "rate_scale": (0.1, 4.0),
     "plane_rate": (5e-9, 4.0),
-    "prune": (0.05, 4.0),
+    "prune": (0.17, 3.0),
     "step_scale": (1.25, 1.6),
     "grading": (0.06, 3.0),
 }
@@ -72,7 +72,7 @@ def at_quality(quality: float) -> dict[str, float]:
 
 
 #: Where files are a third smaller, and pictures hardly change; see docs/training.md.
-DEFAULT_QUALITY = 70.0
+DEFAULT_QUALITY = 80.0
 _DEFAULT = at_quality(DEFAULT_QUALITY)
 
 

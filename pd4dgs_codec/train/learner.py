@@ -189,8 +189,8 @@ class Learner:
 
     def _learn(self, drawn: list[tuple[int, int]], record: dict[str, Any], only: Tensor | None) -> bool:
         """Losses of (view, level) pairs, gradients, update; False, with nothing changed, if any of it is not finite.
-        The record is that of the last pair of this worker, which takes every Nth where there are N.
-        only: the anchors to render, bool [N], if not all."""
+        The record is that of the last pair of this worker, which takes every Nth where there are N. only: the anchors
+        to render, bool [N], if not all."""
         pictures = self._pictures(drawn, record, only)
         if workers.count() > 1:
             pictures = self._shared_gradients(pictures)

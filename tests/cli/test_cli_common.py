@@ -14,9 +14,8 @@ from pd4dgs_codec import __main__ as dispatcher
 from pd4dgs_codec.cli import common, values
 
 VERBS = (
-    *("prepare", "train", "encode", "decode", "info", "render", "eval", "bench", "package", "serve", "view"),
-    "batch",
-)
+    "prepare", "train", "encode", "decode", "info", "render", "eval", "bench", "package", "serve", "view", "batch",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("verb", VERBS)

@@ -168,7 +168,7 @@ def test_slices_that_cannot_be_are_refused(monkeypatch):
 
 
 def test_a_thousand_slices_at_once_make_one_scene():
-    """Else a file of 70 kB with 8192 rows asks a stream for 2 GB, and one of 160 kB for 50 GB."""
+    """Else 10 kB with 8,192 rows in 60 slices ask a stream for 83 MB, and 131 kB in 1,000 slices for 17 times that."""
     header, chunks, ends = chunks_of(sliced())
     last = max(i for i, (layer, _, _) in enumerate(chunks) if layer == 0)
     stream = open_stream()
