@@ -249,6 +249,8 @@ def _is_worker(number: int) -> bool:
     return b"spawn_main" in line or line.startswith(b"ray::")
 
 
+#: Ports that nodes on one machine must not share.
+OWN_PORTS = ("dashboard-agent-listen", "dashboard-agent-grpc", "runtime-env-agent", "metrics-export")
 #: Waits until a Ray cluster has so many cores.
 JOINED = """
 import ray, sys, time
@@ -274,7 +276,9 @@ def _cluster(stack: ExitStack, environment: dict[str, str]) -> tuple[list[int], 
     _wait_for(port)
     address = f"127.0.0.1:{port}"
     for count in (1, 2):  # one after the other: two that begin at once take each other's ports
-        node = [ray, "start", f"--address={address}", "--num-cpus=1", *common]
+        ports = [f"--{name}-port={free_port()}" for name in OWN_PORTS]
+        ports += [f"--min-worker-port={20_000 + 1000 * count}", f"--max-worker-port={20_999 + 1000 * count}"]
+        node = [ray, "start", f"--address={address}", "--num-cpus=1", *ports, *common]
         numbers.append(stack.enter_context(started(node, environment)).pid)
         joined = subprocess.run([sys.executable, "-c", JOINED, address, str(count)], env=environment)
         if joined.returncode:
