@@ -11,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 import os
+import secrets
 import signal
 import socket
 import subprocess
@@ -49,14 +50,14 @@ CASES = {
 
 def scenes(folder: Path, count: int) -> None:
     """Checkpoints of untrained models of a few hundred anchors, each of another seed."""
-    from pd4dgs_codec.data import load
+    from pd4dgs_codec.data.dataset import load
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.model.config import DeformationConfig, ModelConfig
     from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS
     from pd4dgs_codec.train.config import TrainConfig
     from pd4dgs_codec.train.initialise import fresh_model
 
-    if len(list(folder.glob("*.pt"))) == count:
+    if len(list(folder.glob("*.pt"))) >= count:
         return
     folder.mkdir(parents=True, exist_ok=True)
     size = ModelConfig(
@@ -248,18 +249,41 @@ def _is_worker(number: int) -> bool:
     return b"spawn_main" in line or line.startswith(b"ray::")
 
 
+#: Ports that nodes on one machine must not share.
+OWN_PORTS = ("dashboard-agent-listen", "dashboard-agent-grpc", "runtime-env-agent", "metrics-export")
+#: Waits until a Ray cluster has so many cores.
+JOINED = """
+import ray, sys, time
+for _ in range(120):
+    try:
+        ray.init(sys.argv[1], log_to_driver=False, logging_level="ERROR", ignore_reinit_error=True)
+        if ray.cluster_resources().get("CPU", 0) >= int(sys.argv[2]):
+            sys.exit(0)
+    except ConnectionError:
+        pass
+    time.sleep(0.5)
+sys.exit(1)
+"""
+
+
 def _cluster(stack: ExitStack, environment: dict[str, str]) -> tuple[list[int], str]:
     """(processes of a head without cores and of two nodes with one each, address)."""
     ray, port = str(Path(sys.executable).with_name("ray")), free_port()
+    environment |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}  # nobody else's cluster
     common = ["--block", "--disable-usage-stats", "--object-store-memory", "100000000"]
     head = [ray, "start", "--head", f"--port={port}", "--num-cpus=0", "--include-dashboard=false", *common]
     numbers = [stack.enter_context(started(head, environment)).pid]
     _wait_for(port)
-    for _ in range(2):
-        node = [ray, "start", f"--address=127.0.0.1:{port}", "--num-cpus=1", *common]
+    address = f"127.0.0.1:{port}"
+    for count in (1, 2):  # one after the other: two that begin at once take each other's ports
+        ports = [f"--{name}-port={free_port()}" for name in OWN_PORTS]
+        ports += [f"--min-worker-port={20_000 + 1000 * count}", f"--max-worker-port={20_999 + 1000 * count}"]
+        node = [ray, "start", f"--address={address}", "--num-cpus=1", *ports, *common]
         numbers.append(stack.enter_context(started(node, environment)).pid)
-    time.sleep(15)  # until both have joined
-    return numbers, f"127.0.0.1:{port}"
+        joined = subprocess.run([sys.executable, "-c", JOINED, address, str(count)], env=environment)
+        if joined.returncode:
+            raise DataError(f"node {count} of the Ray cluster did not join")
+    return numbers, address
 
 
 def _wait_for(port: int) -> None:

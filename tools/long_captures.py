@@ -24,7 +24,7 @@ from pd4dgs_codec.bench.report import markdown
 
 SEGMENTS = 3
 HOLDOUT = 8
-EYES = 3  #: cameras that look at a seam
+EYES = 3  #: cameras that look at a seam, three frames apart
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
 #: Name -> (downscale, what it is).
 CAPTURES = {
@@ -56,7 +56,8 @@ def capture(name: str, folder: Path) -> tuple[dict[str, Any], list[dict[str, Any
 def _synthetic(folder: Path) -> tuple[dict[str, Any], list[dict[str, Any]], np.ndarray]:
     from PIL import Image
 
-    from pd4dgs_codec.data import load, synthetic
+    from pd4dgs_codec.data import synthetic
+    from pd4dgs_codec.data.dataset import load
     from pd4dgs_codec.data.scenes import SceneBuilder
 
     bodies, frames, count = SceneBuilder("local", 0).bodies(), [], 180
@@ -138,7 +139,7 @@ def _row(way: str, home: Path, downscale: int, cuts: Sequence[int]) -> Row:
     """Bytes, dB on held-out frames, and steps of the pictures in time: across seams and elsewhere."""
     from pd4dgs_codec import decode
     from pd4dgs_codec.codec.info import info
-    from pd4dgs_codec.data import load
+    from pd4dgs_codec.data.dataset import load
     from pd4dgs_codec.metrics.image import to_uint8
     from pd4dgs_codec.playback.player import Player
 
@@ -157,7 +158,10 @@ def _row(way: str, home: Path, downscale: int, cuts: Sequence[int]) -> Row:
             psnr.append(_psnr(drawn, view.image))
     whole = load(str(home / "whole"), downscale=downscale)
     views = sorted([*whole.train, *whole.test], key=lambda view: view.time)
-    eyes = [view.camera for view in views[:: max(1, len(views) // EYES)][:EYES]]
+
+    def eyes(frame: int) -> list[Any]:
+        """Cameras of frames around this one: places that both sides of a seam have seen."""
+        return [views[frame + 3 * (i - EYES // 2)].camera for i in range(EYES)]
 
     def shown(frame: int, eye: Any) -> np.ndarray:
         """What is shown of a frame: segments have times of their own, 0..1 over their frames."""
@@ -167,7 +171,7 @@ def _row(way: str, home: Path, downscale: int, cuts: Sequence[int]) -> Row:
 
     seams, inside = cuts[1:-1], [(a + b) // 2 for a, b in zip(cuts, cuts[1:], strict=False)]
     step = {
-        place: float(np.mean([_psnr(shown(f - 1, eye), shown(f, eye)) for f in at for eye in eyes]))
+        place: float(np.mean([_psnr(shown(f - 1, eye), shown(f, eye)) for f in at for eye in eyes(f)]))
         for place, at in (("seam", seams), ("inside", inside))
     }
     return {"way": way, "psnr": float(np.mean(psnr)), "bytes": sum(sizes), "layer_0": sum(base), "step": step}
@@ -201,7 +205,7 @@ def render(rows: Sequence[Row]) -> str:
     text = paragraph(
         f"{captures}. Preset tiny, {SEGMENTS} segments of equal length. *dB*: PSNR on held-out frames, every eighth. "
         "*at seams*: PSNR between the pictures of successive frames on both sides of a seam, from "
-        f"{EYES} cameras that stand still; *inside*: the same in the middle of a segment. A seam that is lower than "
+        f"{EYES} cameras of frames around it; *inside*: the same in the middle of a segment. A seam that is lower than "
         "inside, and lower than where the whole has none, is seen as a jump."
     )
     return "\n".join([unpadded(markdown(head, cells)), "", *text])

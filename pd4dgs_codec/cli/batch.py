@@ -9,7 +9,6 @@ import json
 import sys
 from collections.abc import Sequence
 from importlib import import_module
-from importlib.util import find_spec
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -130,8 +129,6 @@ def _scan(args: argparse.Namespace, console: Console) -> int:
 
 
 def _batch(args: argparse.Namespace, console: Console) -> int:
-    if find_spec(f"pd4dgs_codec.cli.{args.op}") is None:
-        raise DataError(f"--op {args.op}: this release has no pd4dgs-{args.op}")
     cores = args.threads or available()
     workers = args.workers if args.workers is not None else {"local": cores, "ray": 0, "slurm": 0}[args.on]
     threads = args.cpus or (max(1, cores // max(1, workers)) if args.on == "local" else 1)

@@ -79,13 +79,7 @@ def test_a_store_that_refuses_ends_it_before_any_work(cli, tmp_path, manifest):
     assert done.code == 1 and len(done.error_lines) == 1 and "taken" in done.err
 
 
-def test_what_this_release_cannot_do_is_said(cli, manifest):
-    from importlib.util import find_spec
-
-    lines = manifest({"source": "models/a.pt"})
-    if find_spec("pd4dgs_codec.cli.prepare") is None:
-        done = cli("batch", lines, "--op", "prepare", "-o", "out")
-        assert done.code == 1 and "has no pd4dgs-prepare" in done.err
+def test_manifests_and_folders_that_are_not_there_are_named(cli, manifest):
     done = cli("batch", "nowhere.jsonl", "--op", "encode", "-o", "out")
     assert done.code == 1 and "nowhere.jsonl" in done.err and len(done.error_lines) == 1
     done = cli("batch", "scan", "nowhere")

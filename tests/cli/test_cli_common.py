@@ -64,7 +64,6 @@ USAGE_ERRORS = [
     ("batch", ["m.jsonl", "-o", "out"]),
     ("batch", ["m.jsonl", "-o", "out", "--op", "explode"]),
     ("batch", ["m.jsonl", "-o", "out", "--op", "encode", "--slurm", "partition"]),
-    ("batch", ["scan", "models", "--json"]),
     ("eval", ["s.pd4"]),
     ("eval", ["s.pd4", "set", "--downscale", "half"]),
 ]

@@ -8,9 +8,11 @@ import re
 import sys
 from functools import partial
 
+import batch
 import evaluation
 import interchange
 import latency
+import long_captures
 import omissions
 import performance
 import player_page
@@ -29,6 +31,7 @@ from pd4dgs_codec.errors import DataError
 ROOT = page.ROOT
 DOCS = ROOT / "docs"
 TOOLS = (results, evaluation, precision, latency, interchange, omissions, performance, player_page, slices)
+TOOLS += (batch, long_captures)
 PAGES = [tool.PAGE for tool in TOOLS]
 PAGES += [table.page for table in TABLES.values()]
 #: Bytes that a text and a picture may have.
