@@ -87,6 +87,8 @@ def parser() -> Parser:
     )
     p.add_argument("--grading", type=values.non_negative_float, metavar="X", help=what)
     p.add_argument("--max-layer", type=int, choices=(0, 1, 2), help="train without the layers above this one")
+    what = "show the scene in the browser while it trains, at this port of this machine (default: 8080; needs viser)"
+    p.add_argument("--view", type=values.port, nargs="?", const=8080, metavar="PORT", help=what)
     what = "which level each step trains, see below (default: adaptive)"
     p.add_argument("--rollout", choices=ROLLOUTS, help=what)
     p.add_argument(
@@ -145,8 +147,9 @@ def _train(args: argparse.Namespace, console: Console) -> int:
     for remark in dataset.remarks():
         console.message(f"note: {remark}")
     console.detail(f"{config}")
+    progress = TrainingProgress() if args.view is None else _watched(trainer, args.view, console)
     try:
-        trainer.run(Path(args.output), log=Path(args.log) if args.log else None, progress=TrainingProgress())
+        trainer.run(Path(args.output), log=Path(args.log) if args.log else None, progress=progress)
     except KeyboardInterrupt:
         raise TrainError("interrupted twice; what was trained since the last save is lost") from None
     if trainer.iteration and trainer.learner.skipped == trainer.iteration:
@@ -157,6 +160,14 @@ def _train(args: argparse.Namespace, console: Console) -> int:
     result = _summary(args, trainer)
     console.result(result, _text(result), on_stdout=False)
     return OK
+
+
+def _watched(trainer: Trainer, port: int, console: Console) -> TrainingProgress:
+    from pd4dgs_codec.cli.watch import WatchedProgress
+
+    progress = WatchedProgress(trainer, port)
+    console.message(f"the scene is at {progress.url}")
+    return progress
 
 
 def _fresh_config(args: argparse.Namespace) -> TrainConfig:
