@@ -2,7 +2,7 @@
 
     data = encode(scene)                    # scene.Scene -> bytes of a .pd4 file
     scene = decode(data, max_layer=1)       # a prefix of its layers
-    stream = open_stream()                  # stream.feed(bytes) -> one Scene per completed layer
+    stream = open_stream()                  # stream.feed(bytes) -> a Scene per layer it adds to
     show(scene)                             # in a notebook: the player
 
 Importing the package loads none of its modules; each name below loads what it needs at first use.

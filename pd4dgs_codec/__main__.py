@@ -22,6 +22,7 @@ VERBS = {
     "package": "lay out a file for DASH, HLS and plain HTTP",
     "serve": "serve a folder over HTTP, at the rate of a slow link if wanted",
     "view": "show a scene in the browser",
+    "batch": "run a command on every scene of a library",
 }
 
 MODULES = {"import": "import_model"}  #: verbs that cannot be a module's name

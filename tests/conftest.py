@@ -29,7 +29,20 @@ ROOT = Path(__file__).parents[1]
 sys.path[:0] = [str(ROOT / "tools"), str(ROOT / "spec")]
 
 #: Rooms that need the extra `train`; without it their tests are not even collected.
-NEED_TRAIN = ["bench", "cli", "data", "interchange", "model", "pack", "playback", "render", "tools", "train", "view"]
+NEED_TRAIN = [
+    "batch",
+    "bench",
+    "cli",
+    "data",
+    "interchange",
+    "model",
+    "pack",
+    "playback",
+    "render",
+    "tools",
+    "train",
+    "view",
+]
 NEED_TRAIN += ["fuzz/test_trained_file.py", "metrics/test_levels.py", "metrics/test_perceptual.py"]
 collect_ignore = [] if find_spec("torch") and find_spec("numba") else NEED_TRAIN
 

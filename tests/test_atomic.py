@@ -1,6 +1,11 @@
 """Outputs appear whole or not at all, flushed to the disk before they take their name."""
 
+import errno
 import os
+import signal
+import sys
+from functools import partial
+from itertools import count
 
 import pytest
 
@@ -57,3 +62,63 @@ def test_leftovers_of_a_killed_process_are_found_by_the_file_they_hold(tmp_path)
         file.write_bytes(b"x")
     atomic.remove_leftovers(tmp_path / "m.pt")
     assert not mine.parent.exists() and all(file.exists() for file in others)
+
+
+#: What a save asks of the system, as far as it can be cut short between two of them.
+STEPS = {"open", "write", "fsync", "replace", "mkdir", "rmdir", "unlink", "close", "flush", "fileno", "stat", "lstat"}
+
+
+def _calls_of_the_system(act, save):
+    """Calls save(), and act(number) before each call of a built-in function in STEPS."""
+    numbers = count(1)
+
+    def see(frame, event, function):
+        if event == "c_call" and function.__name__ in STEPS:
+            act(next(numbers))
+
+    sys.setprofile(see)
+    try:
+        save()
+    finally:
+        sys.setprofile(None)
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork and SIGKILL")
+def test_a_process_killed_at_any_call_leaves_the_old_file_or_the_new_one(tmp_path):
+    target, old, new = tmp_path / "x.bin", b"old" * 9000, b"new" * 9001
+    left = set()
+    for last in count(1):
+        atomic.write_bytes(target, old, overwrite=True)
+        process = os.fork()
+        if not process:  # the child: it ends by the signal or, if it is not killed, without pytest's clearing up
+            kill = partial(os.kill, os.getpid(), signal.SIGKILL)
+            _calls_of_the_system(
+                lambda number, last=last, kill=kill: kill() if number == last else None,
+                lambda: atomic.write_bytes(target, new, overwrite=True),
+            )
+            os._exit(0)
+        _, status = os.waitpid(process, 0)
+        if os.WIFEXITED(status):  # all of its calls were made
+            break
+        assert os.WTERMSIG(status) == signal.SIGKILL
+        assert target.read_bytes() in (old, new)
+        left.add(target.read_bytes())
+        atomic.remove_leftovers(target)
+    assert left == {old, new} and last > 8 and target.read_bytes() == new
+
+
+@pytest.mark.parametrize("code", [errno.ENOSPC, errno.EIO, errno.EDQUOT])
+@pytest.mark.parametrize("name", ["fsync", "replace", "mkdir"])
+def test_a_call_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, monkeypatch, name, code):
+    target = tmp_path / "x.bin"
+    target.write_bytes(b"old")
+
+    def fail(*args, **options):
+        raise OSError(code, os.strerror(code), "a name that nobody knows")
+
+    monkeypatch.setattr(os, name, fail)
+    with pytest.raises(OSError, match=os.strerror(code)) as caught:
+        atomic.write_bytes(target, b"new", overwrite=True)
+    monkeypatch.undo()
+    assert caught.value.filename == str(target)
+    assert target.read_bytes() == b"old" and os.listdir(tmp_path) == ["x.bin"]

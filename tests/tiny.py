@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 from strategies import make_scene
 
-from pd4dgs_codec.data import Dataset, View
+from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.model.config import DeformationConfig, ModelConfig
 from pd4dgs_codec.scene import (
     GLOBAL_HEADS,

@@ -51,8 +51,6 @@ def entry(vector: Vector) -> dict:
         row["error"], row["clause"] = vector.error, vector.clauses[0]
         row |= {key: value for key, value in (("chunk", vector.chunk), ("offset", vector.offset)) if value is not None}
         row["prefix"] = vector.layers[-1]["layer"] if vector.layers else None
-    if vector.feature is not None:
-        row["feature"] = vector.feature
     row["ans_only"] = "same" if _for_all(vector.data) else UnsupportedFeature.__name__
     listed = _listed(vector.data)
     if len(listed) > len(set(listed)):

@@ -131,6 +131,7 @@ def scene(name: str, synthetic: tuple[str, int] | None, iterations: int | None) 
         plane_rate=0.0,
         step_scale=1.0,
         grading=0.0,
+        whitening=False,
     )
     return runs.Scene(name if name in BUDGETS else given.name, config, seeds)
 

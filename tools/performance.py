@@ -3,8 +3,10 @@
     python tools/performance.py --before FOLDER [--only NAME ...] [--repeats 9] [--out out] [--docs docs] [--render]
 
 FOLDER is a checkout of another commit of this project, measured by turns with this one: one process of each, then the
-next pair (of encodings a third as many). Each checkpoint that tools/results.py left in --out/NAME/model.pt is one
-scene. Figures are medians over the repeats; the page states the processors and the load.
+next pair (of encodings and trainings a ninth as many). Each checkpoint in --out/NAME/model.pt that both can read is one
+scene; its data must be there for the lines on training. Figures are medians over the repeats; the page states the
+processors and the load. How cost grows, and what other coders take for the same symbols, is measured of this checkout
+alone, on the first scene. Two scenes and nine repeats take some ten minutes on two idle processors.
 """
 
 from __future__ import annotations
@@ -18,7 +20,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from pages.page import ROOT, Page, Row, make, options, say
+from pages.page import ROOT, Page, Row, make, options, paragraph, say
 
 from pd4dgs_codec.bench.report import markdown
 from pd4dgs_codec.bench.timing import machine, machine_line
@@ -26,6 +28,8 @@ from pd4dgs_codec.errors import DataError
 
 NAMES = ("shelf-hand", "bouncing-balls", "synthetic-local")
 EFFORTS = (1, 3, 5, 7, 9)
+#: Anchors of the scenes that show how cost grows.
+GROWTH = (10_000, 100_000, 300_000, 1_000_000)
 #: Runs in either checkout, so it keeps to what both have. argv: what to measure, a checkpoint, a file, options.
 PROGRAM = Path(__file__).parent / "pages" / "stopwatch.py"
 
@@ -50,9 +54,9 @@ def measure(path: Path, before: Path, repeats: int) -> Row:
             run(checkout, "encode", str(path), files[name], "5")
             run(checkout, "start", str(path), files[name], "5")
         lines: Row = {}
-        for what in ("encode", "decode", "draw", "start"):
+        for what in LINES:
             found: dict[str, list[Row]] = {name: [] for name in both}
-            for _ in range(max(1, repeats // 3) if what == "encode" else repeats):
+            for _ in range(-(-repeats // 9) if what in SLOW else repeats):
                 for name, checkout in both.items():
                     found[name].append(run(checkout, what, str(path), files[name], "5"))
             lines[what] = {name: _medians(rows) for name, rows in found.items()}
@@ -61,7 +65,13 @@ def measure(path: Path, before: Path, repeats: int) -> Row:
         for effort in EFFORTS:
             row = run(ROOT, "encode", str(path), files["after"], str(effort))
             efforts.append({"effort": effort, **row})
-    return {"lines": lines, "efforts": efforts, "machine": machine_line(machine())}
+        alone: Row = {}
+        if path.parent.name == NAMES[0]:
+            say("growth and other coders")
+            alone["beside"] = run(ROOT, "beside", str(path), files["after"], "5")
+            own = str(Path(folder) / "grown.pd4")
+            alone["growth"] = [run(ROOT, "grow", str(path), own, str(anchors)) for anchors in GROWTH]
+    return {"lines": lines, "efforts": efforts, **alone, "machine": machine_line(machine())}
 
 
 def _medians(rows: Sequence[Row]) -> Row:
@@ -75,10 +85,20 @@ LINES = {
         ("the same, processor s", "cpu", 1, 2),
         ("its memory beside the loaded scene, MiB", "memory", 1, 0),
     ),
-    "decode": (("decode in process, ms", "wall", 1e3, 0), ("the same, processor ms", "cpu", 1e3, 0)),
+    "decode": (
+        ("decode in process, ms", "wall", 1e3, 0),
+        ("the same, processor ms", "cpu", 1e3, 0),
+        ("million symbols per processor second", "rate", 1e-6, 1),
+    ),
+    "command": (("pd4dgs-decode, s", "wall", 1, 2), ("the same, processor s", "cpu", 1, 2)),
     "draw": (("picture of the top level, 480 x 360, ms", "wall", 1e3, 1), ("the same, processor ms", "cpu", 1e3, 1)),
     "start": (("pd4dgs-render, start to picture, s", "wall", 1, 2), ("the same, processor s", "cpu", 1, 2)),
+    "first": (("pd4dgs-train, one step with its data, s", "wall", 1, 2), ("the same, processor s", "cpu", 1, 2)),
+    "step": tuple((f"training step at level {n}, processor ms", f"level {n}", 1e3, 1) for n in range(3)),
 }
+SLOW = ("encode", "first", "step")
+#: Lines whose figures are better when they are larger.
+RATES = ("rate",)
 
 
 def render(rows: Sequence[Row]) -> str:
@@ -86,11 +106,15 @@ def render(rows: Sequence[Row]) -> str:
     table = []
     for row in rows:
         for what, texts in LINES.items():
-            pair = row["lines"][what]
+            pair = row["lines"].get(what, {})
+            if not pair:
+                continue
             for text, key, factor, decimals in texts:
+                if not all(key in side for side in pair.values()):  # a model of fewer levels
+                    continue
                 old, new = pair["before"][key], pair["after"][key]
                 figures = (f"{value * factor:,.{decimals}f}" for value in (old, new))
-                table.append((row["name"], text, *figures, f"{old / new:.1f}"))
+                table.append((row["name"], text, *figures, f"{new / old if key in RATES else old / new:.1f}"))
         old, new = (row["lines"]["encode"][name]["bytes"] for name in ("before", "after"))
         table.append((row["name"], "bytes at the default effort", f"{old:,.0f}", f"{new:,.0f}", f"{old / new:.4f}"))
     efforts = [
@@ -98,14 +122,53 @@ def render(rows: Sequence[Row]) -> str:
         for row in rows
         for effort in row["efforts"]
     ]
-    return "\n\n".join(
-        [
-            "\n".join(sorted({row["machine"] for row in rows})),
-            markdown(("scene", "what", "before", "after", "times"), table),
-            "What each effort takes, all with warm caches and verified:",
-            markdown(("scene", "effort", "s", "processor s", "bytes"), efforts),
-        ]
+    parts = [
+        "\n".join(sorted({row["machine"] for row in rows})),
+        markdown(("scene", "what", "before", "after", "times"), table),
+        "What each effort takes, all with warm caches and verified:",
+        markdown(("scene", "effort", "s", "processor s", "bytes"), efforts),
+    ]
+    for row in rows:
+        parts += [*_growth(row), *_beside(row)]
+    return "\n\n".join(parts)
+
+
+def _growth(row: Row) -> list[str]:
+    """How cost grows with the number of anchors, if it was measured of this scene."""
+    if "growth" not in row:
+        return []
+    table = [
+        (
+            f"{found['anchors']:,}",
+            *(f"{found[key]:.2f}" for key in ("encode", "decode")),
+            f"{found['bytes'] / found['anchors']:.1f}",
+            *(f"{found[key]:,.0f}" for key in ("arrays", "memory")),
+        )
+        for found in row["growth"]
+    ]
+    text = (
+        f"Growth: {row['name']} and copies of its anchors some voxels off, with noise of two steps, at the default "
+        "effort. Processor seconds in process; memory beside the imports, the scene that is encoded included."
     )
+    heads = ("anchors", "encode, s", "decode, s", "bytes per anchor", "float32 arrays, MiB", "encoder's memory, MiB")
+    return ["\n".join(paragraph(text)), markdown(heads, table)]
+
+
+def _beside(row: Row) -> list[str]:
+    """What other coders take for the same symbols, if it was measured of this scene."""
+    if "beside" not in row:
+        return []
+    found = row["beside"]
+    count = f"{found['symbols']:,.0f} attributes of layer 0"
+    table = [
+        (count, "constriction, QuantizedGaussian per channel", found["gaussian bytes"], found["gaussian decode"]),
+        (count, "this codec", found["own bytes"], found["own decode"]),
+        ("the whole file", "LZMA (`--mode lzma`)", found["xz file"], found["xz decode"]),
+        ("the whole file", "this codec", found["own file"], found["own file decode"]),
+    ]
+    rows = [(what, how, f"{size:,.0f}", f"{1e3 * seconds:.0f}") for what, how, size, seconds in table]
+    text = f"Other coders on the same symbols, {row['name']}:"
+    return [text, markdown(("symbols", "coder", "bytes", "decode, processor ms"), rows)]
 
 
 PAGE = Page("performance", "performance.py", render)

@@ -61,10 +61,10 @@ def measure(path: Path, dataset: Dataset, size: int, strip: Path) -> Row:
 def prefixes(data: bytes) -> list[tuple[int, Scene]]:
     """(bytes, scene) of every prefix of slices."""
     from pd4dgs_codec.codec.info import info
-    from pd4dgs_codec.codec.stream import open_stream
+    from pd4dgs_codec.codec.stream import every_prefix
 
     ends = [part["end"] for layer in info(data)["layers"] for part in layer["slices"]]
-    return list(zip(ends, open_stream().feed(data), strict=True))
+    return list(zip(ends, every_prefix(data), strict=True))
 
 
 def points(data: bytes, dataset: Dataset) -> Points:

@@ -18,7 +18,8 @@ import numpy as np
 import torch
 from imageio_ffmpeg import get_ffmpeg_exe
 
-from pd4dgs_codec.data import frame_cache, load
+from pd4dgs_codec.data import frame_cache
+from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.train.shot import Shots
 
 FPS = 30

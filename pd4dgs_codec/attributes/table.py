@@ -45,16 +45,34 @@ class Grid:
         at: np.ndarray = self.centre[:, None] + symbols.astype(np.int64) * self.spacing(classes)
         return at
 
+    def farthest(self, symbols: np.ndarray, classes: np.ndarray) -> dict[str, int]:
+        """By name, how many steps from 0 the farthest value of symbols [channels, n] lies; 0 without anchors."""
+        most = dict.fromkeys(ATTRIBUTES, 0)
+        for rows in row_blocks(symbols.shape[1]) if self.widths.graded else [slice(None)]:
+            at = self.indices(symbols[:, rows], classes[rows]) if self.widths.graded else symbols
+            for name, own in attribute_rows(at, self.widths):
+                most[name] = max(most[name], int(own.max(initial=0)), -int(own.min(initial=0)))
+        return most
+
     def quantise(self, values: dict[str, np.ndarray], classes: np.ndarray) -> np.ndarray:
         """int32 [channels, n] symbols, channel-major, of float32 [n, *shape] per attribute name. classes: int [n], or
         NO_CLASSES."""
-        return np.ascontiguousarray(np.concatenate([self.symbols_of(a, values[a], classes) for a in ATTRIBUTES]))
+        symbols = np.empty((self.widths.channels, len(values[ATTRIBUTES[0]])), np.int32)
+        for name, own in attribute_rows(symbols, self.widths):
+            self._quantise(name, values[name], classes, own)
+        return symbols
 
     def symbols_of(self, name: str, x: np.ndarray, classes: np.ndarray) -> np.ndarray:
         """int32 [scalars, n] of one attribute float32 [n, *shape]."""
+        symbols = np.empty((math.prod(self.widths.attributes[name]), len(x)), np.int32)
+        self._quantise(name, x, classes, symbols)
+        return symbols
+
+    def _quantise(self, name: str, x: np.ndarray, classes: np.ndarray, symbols: np.ndarray) -> None:
         centre = dict(attribute_rows(self.centre, self.widths))[name]
-        channels = x.reshape(len(x), len(centre)).T
-        return quantise(channels, self.steps[name], name, centre[:, None], self.spacing(classes))
+        for rows in row_blocks(len(x)):
+            channels, spacing = x[rows].reshape(-1, len(centre)).T, self.spacing(classes[rows])
+            symbols[:, rows] = quantise(channels, self.steps[name], name, centre[:, None], spacing)
 
     def dequantise(self, symbols: np.ndarray, classes: np.ndarray) -> dict[str, np.ndarray]:
         """The inverse of `quantise`: float32 [n, *shape] per attribute name, C-contiguous."""
@@ -63,8 +81,20 @@ class Grid:
     def values_of(self, name: str, symbols: np.ndarray, classes: np.ndarray) -> np.ndarray:
         """The inverse of `symbols_of`."""
         centre = dict(attribute_rows(self.centre, self.widths))[name]
-        values = dequantise(symbols, self.steps[name], centre[:, None], self.spacing(classes))
-        return np.ascontiguousarray(values.T).reshape(-1, *self.widths.attributes[name])
+        values = np.empty(symbols.shape[::-1], np.float32)
+        for rows in row_blocks(symbols.shape[1]):
+            spacing = self.spacing(classes[rows])
+            values[rows] = dequantise(symbols[:, rows], self.steps[name], centre[:, None], spacing).T
+        return values.reshape(-1, *self.widths.attributes[name])
+
+
+#: Anchors that are quantised and dequantised at a time: intermediate values are twice as wide.
+BLOCK = 4096
+
+
+def row_blocks(n: int) -> Iterator[slice]:
+    """0 .. n - 1, BLOCK at a time; of nothing one empty block."""
+    yield from (slice(first, min(first + BLOCK, n)) for first in range(0, max(n, 1), BLOCK))
 
 
 def attribute_rows(channels: np.ndarray, widths: Widths) -> Iterator[tuple[str, np.ndarray]]:

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.atomic import whole_files
 from pd4dgs_codec.cli.common import OK, Console, Parser, number, run, table
-from pd4dgs_codec.cli.files import read_bytes
+from pd4dgs_codec.cli.files import STDIO, read_bytes
 from pd4dgs_codec.cli.progress import progress_bar
 from pd4dgs_codec.cli.values import positive_float
 
@@ -30,8 +30,15 @@ play the 2D video: fallback.mp4, rendered from the scene with its own camera ove
 and ffmpeg (the extra [train]) and a file with a camera; else the folder is made without it, and stock players find
 nothing to play.
 
+--immutable puts a digest into the names of what other files name: a CDN may keep these for ever, and a new version is
+a new name. index.json says which header Cache-Control each file should have. Where the first argument is a folder of
+packages, library.json and index.html are written beside them: what there is, with posters, sizes and times to the first
+picture.
+
 examples:
   pd4dgs-package scene.pd4 -o out/scene
+  pd4dgs-package scene.pd4 -o out/scene --immutable
+  pd4dgs-package out -o out
   pd4dgs-package scene.pd4 -o out/scene --no-video --json"""
 
 STILL_FRAMES = 60  #: for a scene whose time stands still
@@ -47,8 +54,9 @@ def parser() -> Parser:
         "Make a folder for web servers: a page that plays the scene, DASH, HLS.",
         DETAILS,
     )
-    p.add_argument("input", metavar="scene.pd4", help="file to package; - reads stdin")
+    p.add_argument("input", metavar="scene.pd4", help="file to package, - reads stdin; or a folder of packages")
     p.add_argument("-o", "--output", required=True, metavar="DIR", help="folder to write, made if missing")
+    p.add_argument("--immutable", action="store_true", help="names with digests, for caches that keep them")
     p.add_argument("--no-video", action="store_true", help="do without the 2D video")
     p.add_argument("--fps", type=positive_float, default=20.0, metavar="F", help="of the 2D video (default: 20)")
     p.add_common()
@@ -61,6 +69,8 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 
 def _package(args: argparse.Namespace, console: Console) -> int:
+    if args.input != STDIO and Path(args.input).is_dir():
+        return _library(args, console)
     data = read_bytes(args.input)
     from pd4dgs_codec.delivery.package import package
 
@@ -73,15 +83,31 @@ def _package(args: argparse.Namespace, console: Console) -> int:
             console.message(f"pd4dgs-package: no 2D video: {why_not}")
         return video
 
-    files = package(data, None if args.no_video else render)
+    files = package(data, None if args.no_video else render, immutable=args.immutable)
+    rows = _write(args, files)
+    result = {"input": args.input, "output": args.output, "files": rows, "video": why_not is None}
+    console.result(result | {"why_no_video": why_not}, _text(result), on_stdout=False)
+    return OK
+
+
+def _library(args: argparse.Namespace, console: Console) -> int:
+    from pd4dgs_codec.delivery.library import library
+    from pd4dgs_codec.errors import DeliveryError
+
+    if Path(args.input).resolve() != Path(args.output).resolve():
+        raise DeliveryError(f"-o {args.output}: expected {args.input}: the index of packages lies beside them")
+    result = {"input": args.input, "output": args.output, "files": _write(args, library(Path(args.input)))}
+    console.result(result, _text(result), on_stdout=False)
+    return OK
+
+
+def _write(args: argparse.Namespace, files: dict[str, bytes]) -> list[dict[str, Any]]:
+    """Writes them all or none; returns their names and sizes."""
     names = [str(Path(args.output) / name) for name in files]
     with whole_files(names[0], names, args.overwrite) as temporaries:
         for temporary, content in zip(temporaries, files.values(), strict=True):
             temporary.write_bytes(content)
-    rows = [{"name": name, "bytes": len(content)} for name, content in files.items()]
-    result = {"input": args.input, "output": args.output, "files": rows, "video": why_not is None}
-    console.result(result | {"why_no_video": why_not}, _text(result), on_stdout=False)
-    return OK
+    return [{"name": name, "bytes": len(content)} for name, content in files.items()]
 
 
 def _video(scene: Scene, args: argparse.Namespace) -> tuple[Video | None, str | None]:
@@ -121,10 +147,23 @@ def _render(scene: Scene, fps: float) -> Video:
     with tempfile.TemporaryDirectory(prefix="pd4dgs-") as folder, progress_bar(len(frames), "frames", "video") as step:
         path = Path(folder) / "video.mp4"
         write_mp4(_pictures(frames, level_of(scene), step), path, fps, fragment=max(1, round(FRAGMENT_SECONDS * fps)))
-        return Video(path.read_bytes(), camera.width // 2 * 2, camera.height // 2 * 2, fps)
+        size = camera.width // 2 * 2, camera.height // 2 * 2
+        return Video(
+            path.read_bytes(), *size, fps, _poster(next(_pictures(frames[len(frames) // 2 :], level_of(scene))))
+        )
 
 
-def _pictures(frames: list[Any], level: Any, step: Callable[[], None]) -> Iterator[np.ndarray]:
+def _poster(picture: np.ndarray) -> bytes:
+    from io import BytesIO
+
+    from PIL import Image
+
+    content = BytesIO()
+    Image.fromarray(picture).save(content, "jpeg", quality=85)
+    return content.getvalue()
+
+
+def _pictures(frames: list[Any], level: Any, step: Callable[[], None] = lambda: None) -> Iterator[np.ndarray]:
     from pd4dgs_codec.metrics.image import to_uint8
 
     for frame in frames:

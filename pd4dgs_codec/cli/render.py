@@ -112,11 +112,12 @@ def _check_usage(args: argparse.Namespace) -> str:
 
 def _frames(args: argparse.Namespace, level: Level) -> list[Frame]:
     from pd4dgs_codec.errors import DataError
-    from pd4dgs_codec.interchange.teacher import load_source
     from pd4dgs_codec.view.frames import dataset_frames, own_frames
 
     if args.data is None:
         return own_frames(level.model.info, args.frames or 60, args.orbit, args.downscale)
+    from pd4dgs_codec.interchange.teacher import load_source
+
     dataset = load_source(args.data, downscale=args.downscale, holdout=args.holdout)
     views = dataset.test if args.split == "test" else dataset.train
     if not views:

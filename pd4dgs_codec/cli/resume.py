@@ -25,9 +25,11 @@ FIXED = (
     "downscale",
     "holdout",
     "iterations",
+    "views_per_step",
     "rate_scale",
     "prune",
     "grading",
+    "prefixes",
     "rollout",
     "max_layer",
 )

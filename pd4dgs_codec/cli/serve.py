@@ -24,7 +24,10 @@ In production any server of static files will do. nginx:
     include mime.types;
     types { application/octet-stream pd4; application/dash+xml mpd; }
     gzip off;
+    set $kept no-cache;
+    if ($uri ~ "-[0-9a-f]{16}[.]") { set $kept "public, max-age=31536000, immutable"; }
     location / {
+      add_header Cache-Control $kept;
       add_header Access-Control-Allow-Origin * always;
       add_header Access-Control-Expose-Headers "Accept-Ranges, Content-Length, Content-Range, ETag" always;
       if ($request_method = OPTIONS) {
@@ -38,6 +41,9 @@ Caddy:
   :80
   root * /srv/scenes
   header Access-Control-Allow-Origin *
+  header Cache-Control no-cache
+  @kept path_regexp -[0-9a-f]{16}[.]
+  header @kept Cache-Control "public, max-age=31536000, immutable"
   header Access-Control-Allow-Headers "Range, If-Range"
   header Access-Control-Expose-Headers "Accept-Ranges, Content-Length, Content-Range, ETag"
   @preflight method OPTIONS

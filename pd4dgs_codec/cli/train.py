@@ -40,12 +40,16 @@ on from. A second Ctrl-C ends it at once, and what was trained since the last sa
 draws them with chances of .15, .30, .55; top trains the highest level alone; all trains every level in every step, at
 about thrice the cost. Before a tenth of the run it is level 0 in any case.
 --without: rate, the bit-rate terms; planes, that of the planes alone; binary and smooth, the two mask terms; tmc, both
-of them; noise, the imitation of quantisation; judge, which leaves out levels that gain too little on training views
-kept back until then.
+of them; noise, the imitation of quantisation; whitening, the mixing of the features' channels; judge, which leaves out
+levels that gain too little on training views kept back until then.
+
+Several workers train one scene where torchrun starts them: V views a step are shared out, gradients are averaged, and
+the first one writes. N must divide V. A run may be resumed with another N.
 
 {SOURCES}
 
 examples:
+  torchrun --nproc-per-node=2 -m pd4dgs_codec train synthetic:local -o local.pt --views-per-step 2
   pd4dgs-train synthetic:local -o local.pt --preset tiny --max-seconds 300
   pd4dgs-train recordings/kitchen -o kitchen.pt --downscale 2 --iterations 10000
   pd4dgs-train recordings/kitchen -o kitchen.pt --resume kitchen.pt"""
@@ -63,6 +67,8 @@ def parser() -> Parser:
     p.add_argument("--slots", type=values.positive_int, metavar="N", help=what)
     what = "training steps (default: by preset, unless --max-seconds is given)"
     p.add_argument("--iterations", type=values.positive_int, metavar="N", help=what)
+    what = "views that each step learns from (default: 1); several workers share them, see below"
+    p.add_argument("--views-per-step", type=values.positive_int, metavar="V", help=what)
     what = "time to train; on --resume earlier time counts too"
     p.add_argument("--max-seconds", type=values.positive_float, metavar="S", help=what)
     add_reading(p, defaults=False)
@@ -70,22 +76,27 @@ def parser() -> Parser:
     p.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to train (default: auto)")
     p.add_argument("--resume", metavar="FILE.pt", help="go on from this checkpoint, with the settings stored in it")
     p.add_argument("--log", metavar="FILE.jsonl", help="write one JSON object per step")
-    what = "0 (small) to 100 (good): weights of the bit rates, pruning and steps at once (default: 70)"
+    what = "0 (small) to 100 (good): weights of the bit rates, pruning and steps at once (default: 80)"
     p.add_argument("--quality", type=values.non_negative_float, metavar="Q", help=what)
-    what = "weight of the anchors' bit rate against quality, instead of the quality's (at 70: 0.057; 1: the paper's)"
+    what = "weight of the anchors' bit rate against quality, instead of the quality's (at 80: 0.044; 1: the paper's)"
     p.add_argument("--rate-scale", type=values.non_negative_float, metavar="X", help=what)
     p.add_argument(
         "--prune",
         type=values.non_negative_float,
         metavar="X",
         help="half way, take out anchors whose absence adds at most this share to the squared error, instead of the "
-        "quality's (at 70: 0.03; 0: none)",
+        "quality's (at 80: 0.04; 0: none)",
     )
     what = (
         "coarser steps for anchors that pictures hardly depend on, up to this share of the squared error, instead of "
-        "the quality's (at 70: 0.039; 0: none)"
+        "the quality's (at 80: 0.031; 0: none)"
     )
     p.add_argument("--grading", type=values.non_negative_float, metavar="X", help=what)
+    what = (
+        "share of the steps of the last third that see the most useful anchors of level 0 alone, for pictures from the "
+        "first slices of pd4dgs-encode --slices (default: 0; 0.3 is much)"
+    )
+    p.add_argument("--prefixes", type=values.non_negative_float, metavar="X", help=what)
     p.add_argument("--max-layer", type=int, choices=(0, 1, 2), help="train without the layers above this one")
     what = "show the scene in the browser while it trains, at this port of this machine (default: 8080; needs viser)"
     p.add_argument("--view", type=values.port, nargs="?", const=8080, metavar="PORT", help=what)
@@ -122,52 +133,71 @@ def _train(args: argparse.Namespace, console: Console) -> int:
         check_output(args.log, args.overwrite or args.resume is not None)
     from pd4dgs_codec.interchange.teacher import load_source
     from pd4dgs_codec.model import checkpoint
+    from pd4dgs_codec.train import workers
     from pd4dgs_codec.train.loop import Trainer
 
     checkpoint.target(args.output)  # refuses a device now, not after the first minute
     device = _device(args.device, console)
     config = stored_config(args) if args.resume else _fresh_config(args)
+    workers.start(device, config.views_per_step)
+    first = workers.rank() == 0
     dataset = load_source(args.source, downscale=config.downscale, holdout=config.holdout)
     trainer = Trainer(config, dataset, device)
     if args.resume:
         trainer.resume(Path(args.resume))
         check_time_left(trainer, args.resume)
-    if args.log and os.path.isfile(args.log):  # a device or a pipe has nothing to take back
+    if first and args.log and os.path.isfile(args.log):  # a device or a pipe has nothing to take back
         if args.resume:
             cut_log(args.log, trainer.iteration)
         else:
             open(args.log, "w").close()
-    remove_leftovers(args.output)
-    limit = f", at most {config.max_seconds:g} s" if config.max_seconds else ""
-    held_out = f"{len(dataset.test)} held out" if dataset.test else "none held out"
-    start = f", from step {trainer.iteration}" if trainer.iteration else ""
-    console.message(
-        f"training {config.preset} on {len(dataset.train)} views ({held_out}), {trainer.learner.device}{limit}{start}"
-    )
-    for remark in dataset.remarks():
-        console.message(f"note: {remark}")
-    console.detail(f"{config}")
-    progress = TrainingProgress() if args.view is None else _watched(trainer, args.view, console)
+    if first:
+        remove_leftovers(args.output)
+        _announce(args, trainer, console)
+    log = Path(args.log) if args.log and first else None
+    progress = _progress(args, trainer, console) if first else None
     try:
-        trainer.run(Path(args.output), log=Path(args.log) if args.log else None, progress=progress)
+        trainer.run(Path(args.output), log=log, progress=progress)
     except KeyboardInterrupt:
         raise TrainError("interrupted twice; what was trained since the last save is lost") from None
+    workers.stop()
     if trainer.iteration and trainer.learner.skipped == trainer.iteration:
         raise TrainError(
             f"{args.output}: nothing was learnt: in all {trainer.iteration} steps the loss or its gradient was not "
             "finite; expected views and a scene of ordinary size"
         )
-    result = _summary(args, trainer)
-    console.result(result, _text(result), on_stdout=False)
+    if first:
+        result = _summary(args, trainer)
+        console.result(result, _text(result), on_stdout=False)
     return OK
 
 
-def _watched(trainer: Trainer, port: int, console: Console) -> TrainingProgress:
+def _progress(args: argparse.Namespace, trainer: Trainer, console: Console) -> TrainingProgress:
+    if args.view is None:
+        return TrainingProgress()
     from pd4dgs_codec.cli.watch import WatchedProgress
 
-    progress = WatchedProgress(trainer, port)
+    progress = WatchedProgress(trainer, args.view)
     console.message(f"the scene is at {progress.url}")
     return progress
+
+
+def _announce(args: argparse.Namespace, trainer: Trainer, console: Console) -> None:
+    """What is about to be trained, on what."""
+    from pd4dgs_codec.train import workers
+
+    config, dataset = trainer.config, trainer.dataset
+    limit = f", at most {config.max_seconds:g} s" if config.max_seconds else ""
+    held_out = f"{len(dataset.test)} held out" if dataset.test else "none held out"
+    start = f", from step {trainer.iteration}" if trainer.iteration else ""
+    several = f", {workers.count()} workers" if workers.count() > 1 else ""
+    console.message(
+        f"training {config.preset} on {len(dataset.train)} views ({held_out}), {trainer.learner.device}{several}{limit}"
+        f"{start}"
+    )
+    for remark in dataset.remarks():
+        console.message(f"note: {remark}")
+    console.detail(f"{config}")
 
 
 def _fresh_config(args: argparse.Namespace) -> TrainConfig:

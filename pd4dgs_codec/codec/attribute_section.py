@@ -34,6 +34,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property
 from typing import Generic, TypeVar
 
 import numpy as np
@@ -43,14 +44,16 @@ from pd4dgs_codec.codec.stages import (
     PLAIN,
     PRIOR_BITS,
     STAGED,
+    Activity,
+    Cells,
     CodedSection,
+    Scale,
     activity_bounds,
     cheapest_class_count,
     coded_stages,
     places_of,
     read_class_count,
     read_stages,
-    relative_magnitude,
     smaller_form,
 )
 from pd4dgs_codec.entropy.bits import entropy_bits
@@ -69,6 +72,8 @@ STAGES = (0, 6, 12, 20, 29, 38)
 N_STAGES = len(STAGES) + 2
 Y_CLASSES, Z_CLASSES = 5, 7
 SPLIT_Y, SPLIT_Z = 1, 2
+#: Rows that are predicted at a time.
+BLOCK_ROWS = 2048
 #: How much an anchor's step class counts for its activity, beside the channels' residuals, which count 1 each.
 GRADE_WEIGHT = 4
 
@@ -82,14 +87,23 @@ ROUNDING_VARIANCE = 0.08
 
 @dataclass(frozen=True)
 class Terms:
-    """The linear prediction of one channel: channels int64 [m] and weights int64 [m] in units of 2^-10."""
+    """The linear prediction of one channel: channels int64 [m], ascending, and weights int64 [m] in units of 2^-10."""
 
     channels: np.ndarray
     weights: np.ndarray
 
+    @cached_property
+    def _dense(self) -> np.ndarray:
+        dense = np.zeros(int(self.channels.max(initial=-1)) + 1)
+        dense[self.channels] = self.weights / (1 << WEIGHT_SHIFT)
+        return dense
+
     def prediction(self, symbols: np.ndarray) -> np.ndarray:
-        """int64 [n] from symbols int64 [>= max channel + 1, n]."""
-        predicted: np.ndarray = (self.weights @ symbols[self.channels] + (1 << WEIGHT_SHIFT >> 1)) >> WEIGHT_SHIFT
+        """Integers [n] from integers [>= max channel + 1, n] of magnitude <= K_MAX, all in binary64, where their sums
+        of products, below 2^45, are exact. einsum starts no threads."""
+        predicted: np.ndarray = np.einsum("i,ij->j", self._dense, symbols[: len(self._dense)])
+        predicted += 0.5
+        np.floor(predicted, out=predicted)
         return predicted
 
 
@@ -102,12 +116,12 @@ class Split:
     centre_y: int = 0
 
     def y_classes(self, x: np.ndarray) -> np.ndarray:
-        """int64 [n] in 0..4."""
+        """int [n] in 0..4."""
         classes: np.ndarray = np.minimum(np.abs(x - self.centre_x), Y_CLASSES - 1)
         return classes
 
     def z_classes(self, x: np.ndarray, y: np.ndarray) -> np.ndarray:
-        """int64 [n] in 0..6."""
+        """int [n] in 0..6."""
         distance = np.abs(x - self.centre_x) + np.abs(y - self.centre_y)
         classes: np.ndarray = np.minimum(distance, Z_CLASSES - 1)
         return classes
@@ -125,41 +139,27 @@ def stage_channels(widths: Widths, stage: int) -> range:
     return range(*stage_bounds(widths)[stage : stage + 2])
 
 
-@dataclass(frozen=True, eq=False)
-class Scale:
-    """What the classes of one stage are measured by. places, sums: of the residuals of the stages before, int64 [m] the
-    sums of their magnitudes. bounds: int64 [classes - 1], where each class but the first begins."""
-
-    places: int
-    sums: np.ndarray
-    bounds: np.ndarray
-
-
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Block:
     """The prediction block.
 
-    widths: of the anchors. counts: of classes, of stages 1 to 5, with step classes 0 to 5. scales: by stage, of the
-    slice that the block stands in; known once that slice has been coded so far.
+    widths: of the anchors. counts: of classes, of stages 1 to 5, with step classes 0 to 5. scale, and by stage the
+    activity int64 [classes - 1] at which each class but the first begins: of the slice that the block stands in; known
+    once that slice has been coded so far.
     """
 
     widths: Widths
     terms: list[Terms]
     counts: list[int]
     splits: list[Split]
-    scales: dict[int, Scale] = field(default_factory=dict)
+    scale: Scale | None = None
+    bounds: dict[int, np.ndarray] = field(default_factory=dict)
 
-    def classes(self, coded: np.ndarray, grades: np.ndarray, stage: int) -> np.ndarray:
-        """int64 [n] of rows whose residuals in the stages before are in coded int64 [channels, n], of those step
-        classes."""
-        residuals = _measured(coded, grades, stage_bounds(self.widths)[stage])
-        scale = self.scales.get(stage)
-        if scale is None:
-            activity = relative_magnitude(residuals)
-            bounds = activity_bounds(activity, self.counts[stage - (not self.widths.graded)])
-            self.scales[stage] = Scale(residuals.shape[1], np.abs(residuals).sum(axis=1), bounds)
-        else:
-            activity, bounds = relative_magnitude(residuals, scale.places, scale.sums), scale.bounds
+    def classes(self, activity: np.ndarray, stage: int, count: int) -> np.ndarray:
+        """int64 [n] of rows with this activity in the stages before."""
+        bounds = self.bounds.get(stage)
+        if bounds is None:
+            bounds = self.bounds[stage] = activity_bounds(activity, count)
         classes: np.ndarray = np.searchsorted(bounds, activity, side="right")
         return classes
 
@@ -205,10 +205,11 @@ def write_attributes(
     past = past or Past()
     everything, grades = (attributes, classes) if population is None else population
     one_row = everything.shape[1] < 2  # has no spread to predict
-    block = past.block or (None if one_row else _fit_block(everything.astype(np.int64), grades, widths))
+    staged = not one_row and priors == "best" and effort > 1
+    block = past.block or (_fit_block(everything, grades, widths) if staged else None)
     section, rate_bits = smaller_form(
-        by_class(attributes, classes),
-        None if block is None else lambda: _write_staged(attributes.astype(np.int64), classes, block, past, effort),
+        lambda: by_class(attributes, classes),
+        None if block is None else lambda: _write_staged(attributes, classes, block, past, effort),
         priors,
         effort,
         past.plain,
@@ -226,32 +227,53 @@ def write_attributes(
     return bytes(out + graded + section.data[1:]), rate_bits + entropy_bits(classes)
 
 
-def by_class(attributes: np.ndarray, classes: np.ndarray) -> list[np.ndarray]:
+def by_class(attributes: np.ndarray, classes: np.ndarray) -> Iterator[np.ndarray]:
     """The channels of form 0: each channel int [n] as its rows of class 0, 1 .. MAX_CLASS; as it is without classes."""
     if not classes.size:
-        return list(attributes)
+        yield from attributes
+        return
     parts = places_of(classes, MAX_CLASS + 1)
-    return [channel[rows] for channel in attributes for rows in parts]
+    yield from (channel[rows] for channel in attributes for rows in parts)
 
 
 def _fit_block(symbols: np.ndarray, grades: np.ndarray, widths: Widths) -> Block:
-    terms = [_fit_terms(symbols, c) for c in range(1, widths.predicted)]
+    covariance = _covariance(symbols[: widths.predicted])
+    terms = [_fit_terms(symbols, covariance[: c + 1, : c + 1]) for c in range(1, widths.predicted)]
     splits = [_fit_split(*symbols[x : x + 3]) for x in stage_channels(widths, len(STAGES) - 1)]
-    coded, bounds = _residuals(symbols, terms), stage_bounds(widths)
-    counts = [
-        cheapest_class_count(
-            [(coded[list(stage_channels(widths, stage))], relative_magnitude(_measured(coded, grades, bounds[stage])))]
-        )
-        for stage in _split_stages(widths)
-    ]
+    counts, activity = [], _activity(symbols.shape[1], grades)
+    for stage in range(len(STAGES)):
+        residuals = _residuals(symbols, terms, stage_channels(widths, stage))
+        if stage in _split_stages(widths):
+            counts.append(cheapest_class_count([(residuals, activity.now)]))
+        if stage < len(STAGES) - 1:
+            for channel in residuals:
+                activity.add(channel)
     return Block(widths, terms, counts, splits)
 
 
-def _residuals(symbols: np.ndarray, terms: Sequence[Terms]) -> np.ndarray:
-    coded: np.ndarray = symbols.copy()
-    for c, term in enumerate(terms, start=1):
-        coded[c] = symbols[c] - term.prediction(symbols)
+def _residuals(symbols: np.ndarray, terms: Sequence[Terms], channels: Sequence[int]) -> np.ndarray:
+    """int32 [len(channels), n]: the residuals of these channels, ascending, of symbols int32 [channels, n]; the offsets
+    are their own."""
+    coded: np.ndarray = symbols[list(channels)]
+    for rows in _row_blocks(symbols):
+        block = symbols[: min(channels[-1], len(terms)) + 1, rows].astype(np.float64)
+        for at, c in enumerate(channels):
+            if 0 < c <= len(terms) and terms[c - 1].channels.size:
+                coded[at, rows] = block[c] - terms[c - 1].prediction(block)
     return coded
+
+
+def _row_blocks(symbols: np.ndarray) -> Iterator[slice]:
+    """So many rows of symbols [channels, n] at a time as fit a processor's cache."""
+    yield from (slice(first, first + BLOCK_ROWS) for first in range(0, symbols.shape[1], BLOCK_ROWS))
+
+
+def _activity(rows: int, grades: np.ndarray, scale: Scale | None = None) -> Activity:
+    """That of rows before stage 0: of those step classes, GRADE_WEIGHT times that of a channel of 2^(6 - class)."""
+    activity = Activity(rows, scale)
+    if grades.size:
+        activity.add(1 << (MAX_CLASS - grades), GRADE_WEIGHT)
+    return activity
 
 
 def _write_staged(
@@ -261,8 +283,9 @@ def _write_staged(
     if past.block is None:
         out = bytearray([STAGED])
         _put_block(out, block)
-    places = _places(_residuals(symbols, block.terms), grades, block)
-    stages = [[channel[rows] for channel, rows in channels] for channels in places]
+    coded = (_residuals(symbols, block.terms, channels) for channels in _measured_stages(block.widths))
+    places = _places(symbols, coded, grades, block)
+    stages = ([channel[rows] for channel, rows in channels] for channels in places)
     return coded_stages(out, stages, effort, past.stages)
 
 
@@ -282,22 +305,38 @@ def _put_block(out: bytearray, block: Block) -> None:
             put_zigzag(out, split.centre_y)
 
 
-def _places(coded: np.ndarray, grades: np.ndarray, block: Block) -> Iterator[list[tuple[np.ndarray, np.ndarray]]]:
-    """Per stage, the (channel, rows) that it codes, in order. `coded` int64 [channels, n] is read only as far as the
-    stages before reach."""
-    every = np.arange(coded.shape[1])
-    for stage, count in enumerate(block.counts if block.widths.graded else (1, *block.counts)):
-        parts = places_of(block.classes(coded, grades, stage), count) if count > 1 else [every]
-        yield [(coded[c], part) for c in stage_channels(block.widths, stage) for part in parts]
+def _places(
+    symbols: np.ndarray, residuals: Iterator[np.ndarray], grades: np.ndarray, block: Block
+) -> Iterator[list[tuple[np.ndarray, Cells]]]:
+    """Per stage, the (channel, rows) that it codes, in order. residuals: int32 [channels, n] of each of
+    `_measured_stages`. They and `symbols` int32 [channels, n], of which the offsets are read here, are read only as far
+    as the stages before reach."""
+    counts = block.counts if block.widths.graded else [1, *block.counts]
+    activity = _activity(symbols.shape[1], grades, block.scale)
+    block.scale = activity.scale
+    offsets = stage_channels(block.widths, len(STAGES) - 1)
+    for stage, count in enumerate(counts):
+        parts: list[Cells] = [slice(None)]
+        if count > 1:
+            parts = list(places_of(block.classes(activity.now, stage, count), count))
+        channels = next(residuals) if stage < len(STAGES) - 1 else symbols[offsets.start :: offsets.step]
+        yield [(channel, part) for channel in channels for part in parts]
+        if any(later > 1 for later in counts[stage + 1 :]):
+            for channel in channels:
+                activity.add(channel)
     for axis, flag, count in ((1, SPLIT_Y, Y_CLASSES), (2, SPLIT_Z, Z_CLASSES)):
-        places = []
-        for x, split in zip(stage_channels(block.widths, len(STAGES) - 1), block.splits, strict=True):
-            parts = [every]
+        places: list[tuple[np.ndarray, Cells]] = []
+        for first, split in zip(offsets, block.splits, strict=True):
+            x, y, parts = symbols[first], symbols[first + 1], [slice(None)]
             if split.flags & flag:
-                classes = split.y_classes(coded[x]) if axis == 1 else split.z_classes(coded[x], coded[x + 1])
-                parts = places_of(classes, count)
-            places += [(coded[x + axis], part) for part in parts]
+                parts = list(places_of(split.y_classes(x) if axis == 1 else split.z_classes(x, y), count))
+            places += [(symbols[first + axis], part) for part in parts]
         yield places
+
+
+def _measured_stages(widths: Widths) -> list[range]:
+    """The channels of the stages of residuals, of which later stages have their classes."""
+    return [stage_channels(widths, stage) for stage in range(len(STAGES) - 1)]
 
 
 def _split_stages(widths: Widths) -> range:
@@ -305,20 +344,20 @@ def _split_stages(widths: Widths) -> range:
     return range(0 if widths.graded else 1, len(STAGES))
 
 
-def _measured(coded: np.ndarray, grades: np.ndarray, end: int) -> np.ndarray:
-    """int64 [m, n], of which rows have their activity: the first `end` channels of coded, and for step classes `grades`
-    GRADE_WEIGHT times one that holds 2^(6 - class)."""
-    if not grades.size:
-        return coded[:end]
-    own = 1 << (MAX_CLASS - grades.astype(np.int64))
-    return np.concatenate([np.repeat(own[None], GRADE_WEIGHT, axis=0), coded[:end]])
+def _covariance(symbols: np.ndarray) -> np.ndarray:
+    """float64 [channels, channels] of symbols int32 [channels, n], and of their rounding."""
+    mean, products = symbols.mean(axis=1, keepdims=True), np.zeros((len(symbols), len(symbols)))
+    for rows in _row_blocks(symbols):
+        centred = symbols[:, rows] - mean
+        products += centred @ centred.T
+    covariance: np.ndarray = products / symbols.shape[1] + ROUNDING_VARIANCE * np.eye(len(symbols))
+    return covariance
 
 
-def _fit_terms(symbols: np.ndarray, c: int) -> Terms:
-    """Least squares of channel c on those before it, weak terms dropped; no terms unless the entropy gains by them."""
-    nothing = Terms(np.zeros(0, np.int64), np.zeros(0, np.int64))
-    centred = (symbols[: c + 1] - symbols[: c + 1].mean(axis=1, keepdims=True)).astype(np.float64)
-    covariance = centred @ centred.T / symbols.shape[1] + ROUNDING_VARIANCE * np.eye(c + 1)
+def _fit_terms(symbols: np.ndarray, covariance: np.ndarray) -> Terms:
+    """Least squares of channel c on those before it, by their covariance float64 [c + 1, c + 1], weak terms dropped; no
+    terms unless the entropy gains by them."""
+    nothing, c = Terms(np.zeros(0, np.int64), np.zeros(0, np.int64)), len(covariance) - 1
     spread = np.sqrt(np.diag(covariance))
     chosen = np.arange(c)
     for _ in range(2):
@@ -332,8 +371,13 @@ def _fit_terms(symbols: np.ndarray, c: int) -> Terms:
     integers = np.rint(weights * (1 << WEIGHT_SHIFT)).astype(np.int64)
     kept = (integers != 0) & (np.abs(integers) <= MAX_WEIGHT)
     terms = Terms(chosen[kept].astype(np.int64), integers[kept])
-    residual = symbols[c] - terms.prediction(symbols)
-    if not terms.channels.size or np.abs(residual).max() > K_MAX:
+    if not terms.channels.size:
+        return nothing
+    residual = np.empty(symbols.shape[1], np.int64)
+    for rows in _row_blocks(symbols):
+        block = symbols[: c + 1, rows].astype(np.float64)
+        residual[rows] = block[c] - terms.prediction(block)
+    if np.abs(residual).max() > K_MAX:
         return nothing
     return terms if entropy_bits(residual) + TERM_BITS * len(terms.channels) < entropy_bits(symbols[c]) else nothing
 
@@ -375,15 +419,25 @@ def read_attributes(
         block = _read_block(reader, widths)
     if block is None:
         raise Malformed("attributes that go on with a prediction block, but no slice before has one")
-    symbols = np.zeros((widths.channels, rows), np.int64)
-    read_stages(reader, N_STAGES, _places(symbols, classes, block), past.stages if past else None)
+    symbols = np.zeros((widths.channels, rows), np.int32)
+    coded = (symbols[channels.start : channels.stop] for channels in _measured_stages(widths))
+    read_stages(reader, N_STAGES, _places(symbols, coded, classes, block), past.stages if past else None)
     if past:
         past.block = block
-    for c, term in enumerate(block.terms, start=1):
-        symbols[c] += term.prediction(symbols)
-    if symbols.size and max(int(symbols.max()), -int(symbols.min())) > K_MAX:
-        raise Malformed(f"a predicted attribute over {K_MAX} in magnitude")
-    return classes, symbols.astype(np.int32)
+    _restore(symbols[: widths.predicted], block.terms)
+    return classes, symbols
+
+
+def _restore(symbols: np.ndarray, terms: Sequence[Terms]) -> None:
+    """Residuals int32 [channels, n] become the symbols, in place. Raises Malformed if one is over K_MAX."""
+    predicted = [(c, term) for c, term in enumerate(terms, start=1) if term.channels.size]
+    for rows in _row_blocks(symbols) if predicted else ():
+        block = symbols[:, rows].astype(np.float64)
+        for c, term in predicted:
+            block[c] += term.prediction(block)
+        if max(block.max(), -block.min()) > K_MAX:
+            raise Malformed(f"a predicted attribute over {K_MAX} in magnitude")
+        symbols[:, rows] = block
 
 
 def _read_classes(reader: ByteReader, rows: int) -> np.ndarray:

@@ -9,15 +9,15 @@ anchor of step class c has 2^c times the steps, and 2^c times the bounds.
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
-from pd4dgs_codec.attributes.table import classes_of
+from pd4dgs_codec.attributes.table import classes_of, row_blocks
 from pd4dgs_codec.codec.kinds import LAYER_KINDS
 from pd4dgs_codec.errors import EncodeError
-from pd4dgs_codec.scene import ATTRIBUTES, PLANES, Scene
+from pd4dgs_codec.scene import PLANES, Scene
 
 #: |x| / Q <= 2^23 is computed in binary64, which is off by 2^-30 at most and may turn a tie: so much of Q more.
 _TIES = 2.0**-29
@@ -34,31 +34,41 @@ class ErrorBound:
     largest: float
 
 
-def rounding_bounds(decoded: Scene, raw_deformation: bool) -> dict[str, float]:
+#: Attributes float32 [rows, ...] by name, some rows of a scene at a time, together all of them.
+Blocks = Iterable[tuple[slice, Mapping[str, np.ndarray]]]
+
+
+def blocks_of(scene: Scene) -> Blocks:
+    """Those of a scene that is there."""
+    for rows in row_blocks(scene.rows[-1]):
+        yield rows, {name: values[rows] for name, values in scene.attributes.items()}
+
+
+def rounding_bounds(decoded: Scene, blocks: Blocks, raw_deformation: bool) -> dict[str, float]:
     """By field of Steps that the scene's tensors use: what bounds the error of them all if each value was rounded to
-    the nearest symbol, rounded up to binary32."""
+    the nearest symbol, rounded up to binary32. The attributes are those of `blocks`."""
     bounds: dict[str, float] = {}
-    for what, step, restored in _tensors(decoded, raw_deformation):
+    for what, step, restored in _tensors(decoded, blocks, raw_deformation):
         largest = np.abs(restored).max(initial=np.float32(0))
         bounds[what] = max(bounds.get(what, 0.0), float(_bounds(largest, step)))
     return {what: _rounded_up(bound) for what, bound in bounds.items()}
 
 
 def verify_errors(
-    given: Scene, decoded: Scene, declared: Mapping[str, float], raw_deformation: bool
+    given: Scene, decoded: Scene, blocks: Blocks, declared: Mapping[str, float], raw_deformation: bool
 ) -> list[ErrorBound]:
     """One row per entry of `declared`, the bounds in the header of the file.
 
-    given: the planned scene, its steps those of the file; decoded: what the file holds, of the same rows and shapes.
-    Raises EncodeError naming the field if any value lies farther off than declared, or than rounding takes it.
+    given: the planned scene, its steps those of the file; decoded: what the file holds, of the same rows and shapes,
+    its attributes those of `blocks`. Raises EncodeError naming the field if any value lies farther off than declared,
+    or than rounding takes it.
     """
     steps, largest = dict.fromkeys(declared, 0.0), dict.fromkeys(declared, 0.0)
-    pairs = zip(_tensors(given, raw_deformation), _tensors(decoded, raw_deformation), strict=True)
     spacing = 2.0 ** classes_of(decoded)
-    for (what, step, x), (_, _, restored) in pairs:
+    for rows, what, step, x, restored in _pairs(given, decoded, blocks, raw_deformation):
         errors = np.abs(x.astype(np.float64) - restored)
-        if what in ATTRIBUTES and spacing.size:
-            errors /= spacing.reshape(-1, *(1,) * (x.ndim - 1))
+        if rows is not None and spacing.size:
+            errors /= spacing[rows].reshape(-1, *(1,) * (x.ndim - 1))
         bounds = np.minimum(_bounds(np.abs(restored), step), declared[what])
         if not (errors <= bounds).all():
             place = np.unravel_index(int((errors - bounds).argmax()), errors.shape)
@@ -80,10 +90,21 @@ def _rounded_up(value: float) -> float:
     return float(nearest if nearest >= value else np.nextafter(nearest, np.float32(np.inf)))
 
 
-def _tensors(scene: Scene, raw_deformation: bool) -> Iterator[tuple[str, float, np.ndarray]]:
-    """(field of Steps, step or 0 for values that are stored as they are, float32 values)."""
-    for name, values in scene.attributes.items():
-        yield name, scene.steps.attributes[name], values
+def _pairs(
+    given: Scene, decoded: Scene, blocks: Blocks, raw_deformation: bool
+) -> Iterator[tuple[slice | None, str, float, np.ndarray, np.ndarray]]:
+    """(rows of an attribute, field of Steps, step, values given, values decoded)."""
+    for rows, values in blocks:
+        for name, x in values.items():
+            yield rows, name, given.steps.attributes[name], given.attributes[name][rows], x
+    both = zip(_tensors(given, (), raw_deformation), _tensors(decoded, (), raw_deformation), strict=True)
+    yield from ((None, what, step, x, restored) for (what, step, x), (_, _, restored) in both)
+
+
+def _tensors(scene: Scene, blocks: Blocks, raw_deformation: bool) -> Iterator[tuple[str, float, np.ndarray]]:
+    """(field of Steps, step or 0 for values that are stored as they are, float32 values); attributes of `blocks`."""
+    for _, values in blocks:
+        yield from ((name, scene.steps.attributes[name], x) for name, x in values.items())
     for kind in LAYER_KINDS:
         tensors, stored = scene.tensors(kind.layer), raw_deformation and kind.layer > 0
         for scale in tensors.planes:

@@ -34,6 +34,11 @@ class LayerReader:
         return [*self._whole, merged(self._slices)] if self._slices else []
 
     @property
+    def latest(self) -> LayerSymbols:
+        """The slice read last."""
+        return self._slices[-1]
+
+    @property
     def complete(self) -> bool:
         """Whether every chunk that the header lists has been read."""
         return self.header is not None and self._index == len(self.header.chunks)

@@ -35,9 +35,11 @@ from pd4dgs_codec.codec.symbols import (
     LayerSymbols,
     TakenVoxels,
     assemble,
+    attribute_blocks,
     check_last_layer,
     float_tensors,
     layer_symbols,
+    outline,
 )
 from pd4dgs_codec.errors import DecodeError, EncodeError
 from pd4dgs_codec.scene import Scene
@@ -130,16 +132,23 @@ def encode_with_report(
     check_scene(scene)
     planned, omitted = plan(scene, options)
     symbols = [layer_symbols(planned, i, options.raw_deformation) for i in range(len(planned.layers))]
-    meant = assemble(planned.info, Grid.of(planned), symbols)
+    grid = Grid.of(planned)
+    meant = outline(planned.info, grid, symbols)
+    bounds = rounding_bounds(meant, attribute_blocks(grid, symbols), options.raw_deformation)
+    errors = list[ErrorBound]()
+    if options.verify:
+        errors = verify_errors(planned, meant, attribute_blocks(grid, symbols), bounds, options.raw_deformation)
+    del planned  # as large as the scene
     if options.slices:
-        values = np.split((utility or by_size)(meant), meant.rows[:-1])
+        values = np.split((utility or by_size)(assemble(meant.info, grid, symbols)), meant.rows[:-1])
         written = [write_slices(layer, options, u, HEADER) for layer, u in zip(symbols, values, strict=True)]
     else:
         written = [[whole_layer(layer, options)] for layer in symbols]
-    _check_limits(planned, symbols, written)
+    _check_limits(meant.info.voxel_size, grid, symbols, written)
     about = write_metadata(metadata) if metadata is not None else b""
-    data = _container(meant, options, written, about)
-    errors = _verify(data, planned, symbols, meant) if options.verify else []
+    data = _container(meant, grid, bounds, options, written, about)
+    if options.verify:
+        _verify(data, meant, grid, symbols, bounds)
     reports = [_layer_report(layer, slices) for layer, slices in zip(symbols, written, strict=True)]
     kept = sum(r.anchors for r in reports)
     kept_bits = sum(r.position_bits + s.payload_bits for r in reports for s in r.streams if s.name == "attributes")
@@ -166,9 +175,9 @@ def with_metadata(data: bytes, metadata: Metadata) -> bytes:
     return write_preamble(packed) + data[preamble.size :] + chunk
 
 
-def _check_limits(scene: Scene, symbols: list[LayerSymbols], written: list[list[Slice]]) -> None:
+def _check_limits(voxel_size: float, grid: Grid, symbols: list[LayerSymbols], written: list[list[Slice]]) -> None:
     """Hold declared sizes and ranges of values against the format's limits as a decoder will, verified or not."""
-    declared, taken, grid = Declared(), TakenVoxels(), Grid.of(scene)
+    declared, taken = Declared(), TakenVoxels()
     chunks = sum(map(len, written))
     if chunks > MAX_CHUNKS:
         raise EncodeError(f"{chunks} slices, expected at most {MAX_CHUNKS}: let slices take more bytes")
@@ -179,12 +188,19 @@ def _check_limits(scene: Scene, symbols: list[LayerSymbols], written: list[list[
                     part.payload, layer.kind, layer.widths, declared, layer.raw_deformation, number > 0
                 )
                 layers = [*symbols[:index], part.symbols]
-                check_last_layer(layers, taken, scene.info.voxel_size, grid)
+                check_last_layer(layers, taken, voxel_size, grid)
             except DecodeError as error:
                 raise EncodeError(f"the scene is over a limit of the format: {error}") from None
 
 
-def _container(meant: Scene, options: EncodeOptions, written: list[list[Slice]], metadata: bytes) -> bytes:
+def _container(
+    meant: Scene,
+    grid: Grid,
+    bounds: dict[str, float],
+    options: EncodeOptions,
+    written: list[list[Slice]],
+    metadata: bytes,
+) -> bytes:
     """The file of a scene as it will be decoded, from the slices of its layers and its metadata, if there is any.
     The latter comes last: a picture does not wait for it."""
     parts = [
@@ -200,10 +216,10 @@ def _container(meant: Scene, options: EncodeOptions, written: list[list[Slice]],
         mode=options.mode,
         deformation=options.deformation,
         attribute_steps=meant.steps.attributes,
-        widths=meant.widths,
-        centre=Grid.of(meant).centre if meant.widths.graded else None,
+        widths=grid.widths,
+        centre=grid.centre if grid.widths.graded else None,
         info=meant.info,
-        error_bounds=rounding_bounds(meant, options.raw_deformation),
+        error_bounds=bounds,
         digest=payload_digest(payloads),
     )
     packed = pack_header(header)
@@ -212,27 +228,30 @@ def _container(meant: Scene, options: EncodeOptions, written: list[list[Slice]],
     return b"".join([write_preamble(packed), *chunks])
 
 
-def _verify(data: bytes, planned: Scene, symbols: list[LayerSymbols], meant: Scene) -> list[ErrorBound]:
-    """Decode `data`, compare all integers with `symbols`, all floats with those `meant`, which the integers stand for,
-    and these with the ones given, those of `planned`."""
+def _verify(data: bytes, meant: Scene, grid: Grid, symbols: list[LayerSymbols], bounds: dict[str, float]) -> None:
+    """Decode `data`, compare all integers with `symbols`, all floats with those that the integers stand for, which
+    lie within `bounds` of those given, and the bounds themselves."""
     try:
         header, decoded, _ = decode_layers(data)
-        scene = assemble(header.info, header.grid, decoded)
+        scene = outline(header.info, header.grid, decoded)
     except DecodeError as error:
         raise EncodeError(f"verification: the file does not decode: {error}") from error
-    if scene.layers != planned.layers or scene.rows != planned.rows:
-        meant_rows = f"{planned.layers}, {planned.rows}"
+    if header.error_bounds != bounds:
+        raise EncodeError(f"verification: bounds {header.error_bounds}, meant {bounds}")
+    if scene.layers != meant.layers or scene.rows != meant.rows:
+        meant_rows = f"{meant.layers}, {meant.rows}"
         raise EncodeError(f"verification: layers and rows {scene.layers}, {scene.rows}; meant {meant_rows}")
     for index, (got, want) in enumerate(zip(decoded, symbols, strict=True)):
         if got.steps != want.steps or not _same(got.arrays(), want.arrays()):
             raise EncodeError(f"verification: layer {want.kind.layer} decodes to other symbols")
-        if not _same(float_tensors(scene, index), float_tensors(meant, index)):
+        pairs = zip(attribute_blocks(header.grid, [got]), attribute_blocks(grid, [want]), strict=True)
+        same = all(_same(list(x.values()), list(y.values())) for (_, x), (_, y) in pairs)
+        if not same or not _same(float_tensors(scene, index), float_tensors(meant, index)):
             raise EncodeError(f"verification: layer {want.kind.layer} decodes to other values")
-    return verify_errors(planned, scene, header.error_bounds, header.raw_deformation)
 
 
 def _same(a: list[np.ndarray], b: list[np.ndarray]) -> bool:
-    return len(a) == len(b) and all(x.shape == y.shape and np.array_equal(x, y) for x, y in zip(a, b, strict=True))
+    return len(a) == len(b) and all(map(np.array_equal, a, b))
 
 
 def _layer_report(layer: LayerSymbols, slices: list[Slice]) -> LayerReport:

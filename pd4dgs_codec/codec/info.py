@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.bitstream.container import CHUNK_OVERHEAD, MAJOR, MINOR, PREAMBLE_SIZE, read_chunk, read_preamble
-from pd4dgs_codec.codec.bounds import rounding_bounds
+from pd4dgs_codec.codec.bounds import blocks_of, rounding_bounds
 from pd4dgs_codec.codec.decoder import read_layers
 from pd4dgs_codec.codec.header import unpack_header
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
@@ -122,7 +122,8 @@ def nearest_bounds(data: bytes) -> dict[str, float]:
     """
     reader, _ = read_layers(data)
     assert reader.header is not None
-    return rounding_bounds(reader.scene(), reader.header.raw_deformation)
+    scene = reader.scene()
+    return rounding_bounds(scene, blocks_of(scene), reader.header.raw_deformation)
 
 
 def hashes(data: bytes, max_layer: int | None = None) -> list[dict[str, Any]]:

@@ -19,7 +19,7 @@ from pd4dgs_codec.codec.kinds import LAYER_KINDS, LayerKind
 from pd4dgs_codec.codec.left_out import LeftOut
 from pd4dgs_codec.codec.plane_choice import choose_predictor, fill_plane
 from pd4dgs_codec.codec.symbols import rounded
-from pd4dgs_codec.entropy.bits import entropy_bits
+from pd4dgs_codec.entropy.bits import entropy_bits, symbol_counts
 from pd4dgs_codec.evaluate.reach import Reached, global_cells, local_cells, shown_gaussians
 from pd4dgs_codec.scene import PLANES, TRUNK, Deformation, Network, Planes, Scene
 
@@ -193,14 +193,17 @@ class _Omissions:
 
     def _without_offsets(self, shown: np.ndarray) -> tuple[np.ndarray, float]:
         """(offset symbols [3 G, N], the commonest ones for Gaussians that are not `shown` bool [N, G], bits saved)."""
-        symbols = Grid.of(self.decoded).symbols_of("offset", self.decoded.offset, classes_of(self.decoded))
-        free = np.repeat(~shown.T, 3, axis=0)
-        freed = symbols.copy()
-        for channel, own in enumerate(free):
-            taken = symbols[channel, ~own]
-            values, counts = np.unique(taken, return_counts=True)
-            freed[channel, own] = values[counts.argmax()] if taken.size else 0
-        return freed, 0.0 if (freed == symbols).all() else _bits(symbols) - _bits(freed)
+        freed = Grid.of(self.decoded).symbols_of("offset", self.decoded.offset, classes_of(self.decoded))
+        saved = 0.0
+        for channel, symbols in enumerate(freed):
+            own = shown[:, channel // 3]
+            if own.all():
+                continue
+            saved += entropy_bits(symbols)
+            values, counts = symbol_counts(symbols[own]) if own.any() else (np.zeros(1, int), np.ones(1, int))
+            symbols[~own] = values[counts.argmax()]
+            saved -= entropy_bits(symbols)
+        return freed, saved
 
     def _free_offsets(self, shown: np.ndarray) -> None:
         if shown.all():

@@ -110,8 +110,8 @@ def _rate_bits(symbols: LayerSymbols, rate_bits: float, channels: list[np.ndarra
     rate_bits -= sum(gaussian_bits(c) for c in channels[:2])
     if symbols.widths.graded:
         graded = channels[2 : 3 + symbols.widths.channels]
-        parts = by_class(symbols.attributes, symbols.classes)
-        rate_bits += entropy_bits(symbols.classes) + sum(gaussian_bits(c) for c in parts if c.size)
+        rate_bits += entropy_bits(symbols.classes)
+        rate_bits += sum(gaussian_bits(c) for c in by_class(symbols.attributes, symbols.classes) if c.size)
         rate_bits -= sum(gaussian_bits(c) for c in graded if c.size)
     return rate_bits
 
@@ -217,9 +217,8 @@ def read_layer(
     increase, own = channels[Section.MASKS]
     _check_ranges(kind, increase, own)
     planes, networks = _shape_tensors(meta, tensors)
-    classes = channels[Section.ATTRIBUTES].pop(0) if widths.graded else NO_CLASSES
+    classes, attributes = channels[Section.ATTRIBUTES]
     check_classes(classes)
-    attributes = np.stack(channels[Section.ATTRIBUTES])
     for tensor in (attributes, *tensors):
         if tensor.dtype.kind == "i" and tensor.size and max(int(tensor.max()), -int(tensor.min())) > MAX_SYMBOL:
             raise Malformed(f"layer {kind.layer}: a symbol over {MAX_SYMBOL} in magnitude")
@@ -250,6 +249,7 @@ def _channel_counts(meta: LayerMeta, kind: LayerKind, rises: int, raw_deformatio
 def _decode_groups(
     parts: dict[int, bytes], counts: dict[Section, list[int]], meta: LayerMeta, mode: str, past: Past[Prior] | None
 ) -> dict[Section, list[np.ndarray]]:
+    """By section its channels; of the attributes, what `_attributes` gives."""
     rows = counts[Section.MASKS][1]
     anchor_q = decode_positions(_part(parts, Section.POSITIONS, rows), rows, past.positions if past else None)
     channels: dict[Section, list[np.ndarray]] = {Section.POSITIONS: [anchor_q]}
@@ -259,14 +259,16 @@ def _decode_groups(
         decoded = decode_channels_lzma(data, flat) if data else _zeros(flat)
         for section in GROUPS:
             channels[section], decoded = decoded[: len(counts[section])], decoded[len(counts[section]) :]
+        channels[Section.ATTRIBUTES] = _attributes(channels[Section.ATTRIBUTES], meta.widths)
         return channels
     for section in GROUPS:
         data = _part(parts, section, sum(counts[section]))
         if not data:
             channels[section] = _zeros(counts[section])
+            if section == Section.ATTRIBUTES:
+                channels[section] = _attributes(channels[section], meta.widths)
         elif section == Section.ATTRIBUTES:
-            classes, attributes = read_attributes(data, meta.widths, rows, past)
-            channels[section] = [*([classes] if meta.widths.graded else []), *attributes]
+            channels[section] = list(read_attributes(data, meta.widths, rows, past))
         elif section == Section.PLANES:
             channels[section] = [
                 channel.ravel() for plane in read_planes(data, meta.plane_shapes()) for channel in plane
@@ -275,6 +277,11 @@ def _decode_groups(
             known = past.masks if past and section == Section.MASKS else None
             channels[section] = decode_channels(data, counts[section], known)
     return channels
+
+
+def _attributes(channels: list[np.ndarray], widths: Widths) -> list[np.ndarray]:
+    """[step classes int32 [rows] or NO_CLASSES, attributes int32 [channels, rows]]."""
+    return [channels[0] if widths.graded else NO_CLASSES, np.stack(channels[int(widths.graded) :])]
 
 
 def _zeros(counts: list[int]) -> list[np.ndarray]:

@@ -16,6 +16,8 @@ import numpy as np
 from pd4dgs_codec.codec.stages import (
     PLAIN,
     STAGED,
+    Activity,
+    Cells,
     CodedSection,
     activity_classes,
     cheapest_class_count,
@@ -23,7 +25,6 @@ from pd4dgs_codec.codec.stages import (
     places_of,
     read_class_count,
     read_stages,
-    relative_magnitude,
     smaller_form,
 )
 from pd4dgs_codec.entropy.channels import decode_channels
@@ -36,7 +37,7 @@ Shape = tuple[int, int, int]  #: channels, rows, columns
 def write_planes(residuals: Sequence[np.ndarray], priors: str, effort: int) -> tuple[bytes, float]:
     """(section bytes, sum of R(a) over all channels) of residuals int32 [C, H, W] per plane, in the smaller form."""
     channels = [channel.ravel() for plane in residuals for channel in plane]
-    section, rate_bits = smaller_form(channels, lambda: _write_staged(residuals, effort), priors, effort)
+    section, rate_bits = smaller_form(lambda: channels, lambda: _write_staged(residuals, effort), priors, effort)
     return section.data, rate_bits
 
 
@@ -51,23 +52,30 @@ def read_planes(data: bytes, shapes: Sequence[Shape]) -> list[np.ndarray]:
         raise UnsupportedFeature(f"form {form} of the planes, expected {PLAIN} or {STAGED}")
     number = _stage_count(shapes)
     counts = [read_class_count(reader, stage) for stage in range(1, number)]
-    planes = [np.zeros((c, h * w), np.int64) for c, h, w in shapes]
+    planes = [np.zeros((c, h * w), np.int32) for c, h, w in shapes]
     read_stages(reader, number, _places(planes, shapes, counts))
-    return [plane.astype(np.int32).reshape(shape) for plane, shape in zip(planes, shapes, strict=True)]
+    return [plane.reshape(shape) for plane, shape in zip(planes, shapes, strict=True)]
 
 
 def _write_staged(residuals: Sequence[np.ndarray], effort: int) -> CodedSection:
     shapes: list[Shape] = [plane.shape for plane in residuals]
-    planes = [plane.reshape(len(plane), -1).astype(np.int64) for plane in residuals]
-    counts = []
-    for stage in range(1, _stage_count(shapes)):
-        first, end = 1 << stage, 2 << stage
-        groups = [(p[first:end], _activity(p[:first], shape)) for p, shape in zip(planes, shapes, strict=True)]
-        counts.append(cheapest_class_count(groups))
+    planes = [plane.reshape(len(plane), -1) for plane in residuals]
+    counts, activities = [], [Activity(plane.shape[1]) for plane in planes]
+    for stage in range(_stage_count(shapes)):
+        first, end = _bounds(stage)
+        if stage:
+            groups = [
+                (plane[first:end], _around(activity.now, shape))
+                for plane, activity, shape in zip(planes, activities, shapes, strict=True)
+            ]
+            counts.append(cheapest_class_count(groups))
+        for plane, activity in zip(planes, activities, strict=True):
+            for channel in plane[first:end]:
+                activity.add(channel)
     out = bytearray([STAGED])
     for count in counts:
         put_varint(out, count)
-    stages = [[channel[at] for channel, at in places] for places in _places(planes, shapes, counts)]
+    stages = ([channel[at] for channel, at in places] for places in _places(planes, shapes, counts))
     return coded_stages(out, stages, effort)
 
 
@@ -76,26 +84,36 @@ def _stage_count(shapes: Sequence[Shape]) -> int:
     return max(1, (shapes[0][0] - 1).bit_length())
 
 
+def _bounds(stage: int) -> tuple[int, int]:
+    """Its first channel, and that of the next stage."""
+    return (1 << stage if stage else 0), 2 << stage
+
+
 def _places(
     planes: Sequence[np.ndarray], shapes: Sequence[Shape], counts: Sequence[int]
-) -> Iterator[list[tuple[np.ndarray, np.ndarray]]]:
-    """Per stage, the (channel, cells) that it codes, in order. `planes` int64 [C, H * W] are read only as far as the
+) -> Iterator[list[tuple[np.ndarray, Cells]]]:
+    """Per stage, the (channel, cells) that it codes, in order. `planes` int32 [C, H * W] are read only as far as the
     stages before reach."""
+    activities = [Activity(plane.shape[1]) for plane in planes]
     for stage, count in enumerate((1, *counts)):
-        first, end = (1 << stage if stage else 0), 2 << stage
-        places = []
-        for plane, shape in zip(planes, shapes, strict=True):
-            parts = [np.arange(plane.shape[1])]
+        first, end = _bounds(stage)
+        places: list[tuple[np.ndarray, Cells]] = []
+        for plane, activity, shape in zip(planes, activities, shapes, strict=True):
+            parts: list[Cells] = [slice(None)]
             if count > 1:
-                parts = places_of(activity_classes(_activity(plane[:first], shape), count), count)
+                parts = list(places_of(activity_classes(_around(activity.now, shape), count), count))
             places += [(channel, part) for channel in plane[first:end] for part in parts]
         yield places
+        if any(later > 1 for later in counts[stage:]):
+            for plane, activity in zip(planes, activities, strict=True):
+                for channel in plane[first:end]:
+                    activity.add(channel)
 
 
-def _activity(channels: np.ndarray, shape: Shape) -> np.ndarray:
-    """int64 [H * W]: relative magnitudes of channels int64 [m, H * W], summed over 3 x 3 cells, the border repeated."""
+def _around(activity: np.ndarray, shape: Shape) -> np.ndarray:
+    """int64 [H * W]: activity int64 [H * W] summed over 3 x 3 cells, the border repeated."""
     _, height, width = shape
-    padded = np.pad(relative_magnitude(channels).reshape(height, width), 1, mode="edge")
+    padded = np.pad(activity.reshape(height, width), 1, mode="edge")
     columns = padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]
     around: np.ndarray = columns[:-2] + columns[1:-1] + columns[2:]
     return around.ravel()

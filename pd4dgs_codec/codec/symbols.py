@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pd4dgs_codec.attributes.quantise import MAX_SYMBOL, all_finite, dequantise, quantise
-from pd4dgs_codec.attributes.table import Grid, attribute_rows, classes_of
+from pd4dgs_codec.attributes.table import Grid, attribute_rows, classes_of, row_blocks
 from pd4dgs_codec.codec.kinds import LAYER_KINDS, LayerKind
 from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.morton import MAX_VOXEL, morton_order
@@ -162,10 +162,29 @@ def assemble(info: SceneInfo, grid: Grid, layers: Sequence[LayerSymbols]) -> Sce
 
     Steps of absent tensors keep Steps' defaults.
     """
+    scene = outline(info, grid, layers)
+    values = {name: np.empty((scene.rows[-1], *x.shape[1:]), np.float32) for name, x in scene.attributes.items()}
+    for rows, block in attribute_blocks(grid, layers):
+        for name, x in block.items():
+            values[name][rows] = x
+    return replace(scene, feature=values["feature"], scaling_log=values["scaling_log"], offset=values["offset"])
+
+
+def attribute_blocks(grid: Grid, layers: Sequence[LayerSymbols]) -> Iterator[tuple[slice, dict[str, np.ndarray]]]:
+    """(some rows of the decoded scene, float32 [rows, ...] by name of the attribute), together all of them."""
+    first = 0
+    for layer in layers:
+        for rows in row_blocks(len(layer.anchor_q)):
+            values = grid.dequantise(layer.attributes[:, rows], layer.classes[rows])
+            yield slice(first + rows.start, first + rows.stop), values
+        first += len(layer.anchor_q)
+
+
+def outline(info: SceneInfo, grid: Grid, layers: Sequence[LayerSymbols]) -> Scene:
+    """The scene that `assemble` gives, with attributes of no rows: they are most of it."""
     steps = Steps(**grid.steps, **{k: v for layer in layers for k, v in layer.steps.items()})
-    attributes = np.concatenate([layer.attributes for layer in layers], axis=1)
     classes = np.concatenate([layer.classes for layer in layers])
-    values = grid.dequantise(attributes, classes)
+    values = grid.dequantise(layers[0].attributes[:, :0], classes[:0])
     grading = None
     if grid.widths.graded:
         rows = attribute_rows(grid.centre, grid.widths)
@@ -228,19 +247,19 @@ def check_last_layer(layers: Sequence[LayerSymbols], taken: TakenVoxels, voxel_s
         if highest > 255:
             raise Malformed(f"layer {layer.kind.layer}: mask code {highest}, expected at most 255")
     taken.take(layer.anchor_q)
-    indices = grid.indices(layer.attributes, layer.classes)
-    if indices.size and max(int(indices.max()), -int(indices.min())) > MAX_SYMBOL:
+    farthest = grid.farthest(layer.attributes, layer.classes)
+    if max(farthest.values()) > MAX_SYMBOL:
         raise Malformed(f"layer {layer.kind.layer}: an attribute more than {MAX_SYMBOL} steps from 0")
-    if not all(all_finite(k, step) for k, step in _with_steps(layer, indices, voxel_size, grid)):
+    if not all(all_finite(k, step) for k, step in _with_steps(layer, farthest, voxel_size, grid)):
         raise Malformed(f"layer {layer.kind.layer}: a reconstructed value is not finite")
 
 
 def _with_steps(
-    layer: LayerSymbols, indices: np.ndarray, voxel_size: float, grid: Grid
+    layer: LayerSymbols, farthest: dict[str, int], voxel_size: float, grid: Grid
 ) -> Iterator[tuple[np.ndarray, float]]:
-    """(multiples, their step) of everything in `layer` that is dequantised. indices: those of the attributes."""
+    """(multiples, their step) of everything in `layer` that is dequantised; of the attributes the farthest alone."""
     yield layer.anchor_q, voxel_size
-    yield from ((rows, grid.steps[name]) for name, rows in attribute_rows(indices, grid.widths))
+    yield from ((np.array(steps), grid.steps[name]) for name, steps in farthest.items())
     if not layer.raw_deformation:
         planes, steps = len(PLANES) * len(layer.planes), list(layer.steps.values())
         yield from ((k, steps[0 if i < planes else -1]) for i, k in enumerate(layer.tensors()))
@@ -255,7 +274,9 @@ def rounded(scene: Scene, raw_deformation: bool = False) -> Scene:
     """`scene` with the values that come back from its file. Raises EncodeError for one that has no symbol."""
     steps = scene.steps
     grid, classes = Grid.of(scene), classes_of(scene)
-    values = grid.dequantise(grid.quantise(scene.attributes, classes), classes)
+    values = {
+        name: grid.values_of(name, grid.symbols_of(name, x, classes), classes) for name, x in scene.attributes.items()
+    }
     result = replace(scene, feature=values["feature"], scaling_log=values["scaling_log"], offset=values["offset"])
     for kind in LAYER_KINDS[:1] if raw_deformation else LAYER_KINDS:
         if kind.layer == 0 or scene.deformation(kind.layer) is not None:

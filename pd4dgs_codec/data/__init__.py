@@ -1,6 +1,1 @@
-"""Dataset readers and the synthetic scenes."""
-
-from pd4dgs_codec.data.dataset import load
-from pd4dgs_codec.data.view import Dataset, View
-
-__all__ = ["Dataset", "View", "load"]
+"""Dataset readers and the synthetic scenes: `dataset.load`. Importing the package loads none of them."""

@@ -117,7 +117,7 @@ class SceneClient:
         self.transfer.close()
 
     def scenes(self, budget: Budget = Budget()) -> Iterator[Scene]:
-        """One scene per slice that completes, each holding all slices so far; ends where the budget says.
+        """A scene whenever slices have arrived, holding all slices so far; ends where the budget says.
 
         Called again, it goes on after the last slice given. Raises DeliveryError if the file cannot be had, DecodeError
         if it is not a valid one; scenes given before stay valid.
@@ -177,5 +177,5 @@ class SceneClient:
             end = min(end, wanted[-1][1] if wanted else 0)
         block, self._fed = bytes(data[self._fed : end]), max(self._fed, end)
         scenes = self._stream.feed(block)
-        self._done += len(scenes)
+        self._done = self._stream.slices
         return scenes

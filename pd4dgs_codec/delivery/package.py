@@ -18,12 +18,15 @@ from typing import Any
 from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.info import info
 from pd4dgs_codec.delivery import mp4
+from pd4dgs_codec.delivery.names import addressed, cache_control
 from pd4dgs_codec.delivery.page import PAGE, page
 from pd4dgs_codec.errors import DeliveryError
 from pd4dgs_codec.scene import Scene
 
 SCENE, SEGMENTS, MPD, PLAYLIST, INDEX = "scene.pd4", "scene.mp4", "scene.mpd", "scene.m3u8", "index.json"
-VIDEO, VIDEO_PLAYLIST = "fallback.mp4", "fallback.m3u8"
+VIDEO, VIDEO_PLAYLIST, POSTER = "fallback.mp4", "fallback.m3u8", "poster.jpg"
+#: Link rates, bits per second, for which the index tells when the first picture is there.
+RATES = {"2M": 2e6, "10M": 1e7, "50M": 5e7}
 LAYER_SCHEME = "urn:pd4dgs:layer:2026"
 SESSION_DATA_ID = "org.pd4dgs.layers"
 MIN_BUFFER_SECONDS = 1  #: the time that the manifest's bandwidths are for
@@ -33,12 +36,14 @@ MAX_SECONDS = ((1 << 32) - 1) // mp4.TIMESCALE  #: a sample's duration has 32 bi
 
 @dataclass(frozen=True)
 class Video:
-    """A 2D rendition of the scene: fragmented MP4 of H.264. width, height: pixels. fps: frames per second."""
+    """A 2D rendition of the scene: fragmented MP4 of H.264. width, height: pixels. fps: frames per second. poster: a
+    JPEG of a frame, if there is one."""
 
     data: bytes
     width: int
     height: int
     fps: float
+    poster: bytes = b""
 
 
 @dataclass(frozen=True)
@@ -57,11 +62,14 @@ class Part:
         return f"L{self.layer}.{self.slice}" if self.slice else f"L{self.layer}"
 
 
-def package(data: bytes, render: Callable[[Scene], Video | None] | None = None) -> dict[str, bytes]:
+def package(
+    data: bytes, render: Callable[[Scene], Video | None] | None = None, *, immutable: bool = False
+) -> dict[str, bytes]:
     """Name -> content of every file of the folder.
 
-    render: makes the 2D rendition of the decoded scene, if it can. Raises DecodeError unless `data` is a whole, valid
-    `.pd4` file, DeliveryError for one too long or large to wrap, both before anything is rendered.
+    render: makes the 2D rendition of the decoded scene, if it can. immutable: files that others name carry the digest
+    of their content in their names, so that caches may keep them forever. Raises DecodeError unless `data` is a whole,
+    valid `.pd4` file, DeliveryError for one too long or large to wrap, both before anything is rendered.
     """
     scene = decode(data)
     low, high = info(data)["time_range"]
@@ -70,13 +78,18 @@ def package(data: bytes, render: Callable[[Scene], Video | None] | None = None) 
         raise DeliveryError(f"the scene lasts {seconds:g} s, DASH takes at most {MAX_SECONDS:,}")
     segments, init, parts = _segments(data, seconds)
     video = render(scene) if render is not None else None
-    files = {SCENE: data, SEGMENTS: segments}
-    files[MPD] = _manifest(init, parts, seconds, video)
+    media = {SCENE: data, SEGMENTS: segments}
     if video is not None:
-        files |= {VIDEO: video.data, VIDEO_PLAYLIST: _video_playlist(video)}
+        media |= {VIDEO: video.data} | ({POSTER: video.poster} if video.poster else {})
+    names = {name: addressed(name, content) if immutable else name for name, content in media.items()}
+    files = {names[name]: content for name, content in media.items()}
+    files[MPD] = _manifest(init, parts, seconds, video, names)
+    if video is not None:
+        files[VIDEO_PLAYLIST] = _video_playlist(video, names[VIDEO])
     files[PLAYLIST] = _playlist(video)
-    files[INDEX] = _index(data, init, parts, seconds, video)
-    files[PAGE] = page().encode()
+    files[PAGE] = (page(names[SCENE]) if immutable else page()).encode()
+    cache = {name: cache_control(name) for name in (*files, INDEX)}
+    files[INDEX] = _index(data, init, parts, seconds, video, names, cache)
     return files
 
 
@@ -102,7 +115,7 @@ def _segments(data: bytes, seconds: float) -> tuple[bytes, int, list[Part]]:
 # -- DASH --------------------------------------------------------------------------------------------------------------
 
 
-def _manifest(init: int, parts: list[Part], seconds: float, video: Video | None) -> bytes:
+def _manifest(init: int, parts: list[Part], seconds: float, video: Video | None, names: dict[str, str]) -> bytes:
     root = ElementTree.Element(
         "MPD",
         {
@@ -115,7 +128,7 @@ def _manifest(init: int, parts: list[Part], seconds: float, video: Video | None)
     )
     period = ElementTree.SubElement(root, "Period", id="0", start="PT0S")
     if video is not None:
-        _video_set(period, video)
+        _video_set(period, video, names[VIDEO])
     for i, part in enumerate(parts):
         group = ElementTree.SubElement(
             period, "AdaptationSet", contentType="application", mimeType="application/mp4", codecs="mett"
@@ -128,13 +141,13 @@ def _manifest(init: int, parts: list[Part], seconds: float, video: Video | None)
         if i:
             representation.set("dependencyId", " ".join(before.id for before in parts[:i]))
         whole = max(1, round(seconds * mp4.TIMESCALE))
-        _segment_list(representation, SEGMENTS, init, mp4.TIMESCALE, whole, [part.segment])
+        _segment_list(representation, names[SEGMENTS], init, mp4.TIMESCALE, whole, [part.segment])
     ElementTree.indent(root)
     text: bytes = ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
     return text + b"\n"
 
 
-def _video_set(period: ElementTree.Element, video: Video) -> None:
+def _video_set(period: ElementTree.Element, video: Video, name: str) -> None:
     init, pieces = mp4.fragments(video.data)
     group = ElementTree.SubElement(
         period, "AdaptationSet", contentType="video", mimeType="video/mp4", segmentAlignment="true", startWithSAP="1"
@@ -150,7 +163,7 @@ def _video_set(period: ElementTree.Element, video: Video) -> None:
         frameRate=f"{round(video.fps * 1000)}/1000",
     )
     ticks = round(1000 * max(piece.samples for piece in pieces) / video.fps)
-    _segment_list(representation, VIDEO, init, 1000, ticks, [(piece.start, piece.end) for piece in pieces])
+    _segment_list(representation, name, init, 1000, ticks, [(piece.start, piece.end) for piece in pieces])
 
 
 def _segment_list(
@@ -184,14 +197,14 @@ def _playlist(video: Video | None) -> bytes:
     return ("\n".join(lines) + "\n").encode()
 
 
-def _video_playlist(video: Video) -> bytes:
+def _video_playlist(video: Video, name: str) -> bytes:
     init, pieces = mp4.fragments(video.data)
     seconds = [piece.samples / video.fps for piece in pieces]
     lines = ["#EXTM3U", "#EXT-X-VERSION:7", "#EXT-X-PLAYLIST-TYPE:VOD", "#EXT-X-INDEPENDENT-SEGMENTS"]
     lines.append(f"#EXT-X-TARGETDURATION:{max(1, math.ceil(max(seconds)))}")
-    lines.append(f'#EXT-X-MAP:URI="{VIDEO}",BYTERANGE="{init}@0"')
+    lines.append(f'#EXT-X-MAP:URI="{name}",BYTERANGE="{init}@0"')
     for piece, length in zip(pieces, seconds, strict=True):
-        lines += [f"#EXTINF:{length:.6f},", f"#EXT-X-BYTERANGE:{piece.end - piece.start}@{piece.start}", VIDEO]
+        lines += [f"#EXTINF:{length:.6f},", f"#EXT-X-BYTERANGE:{piece.end - piece.start}@{piece.start}", name]
     return ("\n".join([*lines, "#EXT-X-ENDLIST"]) + "\n").encode()
 
 
@@ -212,7 +225,15 @@ def _codec(init: bytes) -> str:
 # -- the index ---------------------------------------------------------------------------------------------------------
 
 
-def _index(data: bytes, init: int, parts: list[Part], seconds: float, video: Video | None) -> bytes:
+def _index(
+    data: bytes,
+    init: int,
+    parts: list[Part],
+    seconds: float,
+    video: Video | None,
+    names: dict[str, str],
+    cache: dict[str, str],
+) -> bytes:
     """Where everything is. Byte ranges are [first, one past the last]; sha256 are of the `.pd4` file's bytes."""
     about = info(data)
     layers = [
@@ -222,12 +243,12 @@ def _index(data: bytes, init: int, parts: list[Part], seconds: float, video: Vid
             "range": [part.start, part.end],
             "sha256": hashlib.sha256(data[part.start : part.end]).hexdigest(),
             "depends_on": sorted({before.layer for before in parts[:i]}),
-            "dash": {"file": SEGMENTS, "init": [0, init], "range": list(part.segment)},
+            "dash": {"file": names[SEGMENTS], "init": [0, init], "range": list(part.segment)},
         }
         for i, part in enumerate(parts)
     ]
     content: dict[str, Any] = {
-        "file": SCENE,
+        "file": names[SCENE],
         "format_version": about["format_version"],
         "bytes": len(data),
         "sha256": hashlib.sha256(data).hexdigest(),
@@ -237,7 +258,10 @@ def _index(data: bytes, init: int, parts: list[Part], seconds: float, video: Vid
         "dash": MPD,
         "hls": PLAYLIST,
         "video": None,
+        "poster": names.get(POSTER),
+        "first_frame_seconds": {name: 8 * parts[0].end / rate for name, rate in RATES.items()},
+        "cache_control": cache,
     }
     if video is not None:
-        content["video"] = {"file": VIDEO, "width": video.width, "height": video.height, "fps": video.fps}
+        content["video"] = {"file": names[VIDEO], "width": video.width, "height": video.height, "fps": video.fps}
     return (json.dumps(content, indent=1) + "\n").encode()

@@ -22,6 +22,7 @@ from typing import BinaryIO
 from urllib.parse import quote, unquote, urlsplit
 
 from pd4dgs_codec.delivery.link import Link
+from pd4dgs_codec.delivery.names import cache_control
 from pd4dgs_codec.delivery.page import PAGE
 from pd4dgs_codec.delivery.patience import Patient
 from pd4dgs_codec.delivery.ranges import Unsatisfiable, http_time, lists_etag, requested_range
@@ -29,6 +30,7 @@ from pd4dgs_codec.errors import DeliveryError
 
 MEDIA_TYPES = {
     ".html": "text/html; charset=utf-8",
+    ".jpg": "image/jpeg",
     ".js": "text/javascript; charset=utf-8",
     ".json": "application/json",
     ".m3u8": "application/vnd.apple.mpegurl",
@@ -177,15 +179,16 @@ class _Handler(BaseHTTPRequestHandler):
             self._fail(HTTPStatus.NOT_FOUND)
             return
         with file:
-            self._send_file(file, path.suffix.lower(), body)
+            self._send_file(file, path, body)
 
-    def _send_file(self, file: BinaryIO, suffix: str, body: bool) -> None:
+    def _send_file(self, file: BinaryIO, path: Path, body: bool) -> None:
+        suffix = path.suffix.lower()
         state = os.fstat(file.fileno())
         size, etag = state.st_size, _etag(state)
         zipped = suffix in ZIPPED and size <= MAX_ZIPPED and self._takes_gzip()
         if zipped:  # another representation: neither its ranges nor its ETag are those of the plain one
             etag = etag[:-1] + '-gzip"'
-        headers = {"Accept-Ranges": "bytes", "Cache-Control": "no-cache", "ETag": etag}
+        headers = {"Accept-Ranges": "bytes", "Cache-Control": cache_control(path.name), "ETag": etag}
         headers["Last-Modified"] = formatdate(state.st_mtime, usegmt=True)
         if suffix in ZIPPED:
             headers["Vary"] = "Accept-Encoding"

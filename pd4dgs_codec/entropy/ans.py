@@ -74,15 +74,24 @@ class AnsDecoder:
         if len(words) and words[-1] == 0:
             raise Malformed("an ANS stream begins with a zero word")
         self._coder = constriction.stream.stack.AnsCoder(np.ascontiguousarray(words))
+        self._models: dict[int, tuple[np.ndarray, constriction.stream.model.Categorical | None]] = {}
 
     def take(self, count: int, cum: np.ndarray) -> np.ndarray:
-        """The next `count` symbols under the table, int32 [count]. Junk bytes decode to junk: see finish()."""
+        """The next `count` symbols under the table, int32 [count]. Junk bytes decode to junk: see finish().
+
+        The table must not change any more: many channels share one, whose model is kept.
+        """
         if not 0 <= count <= MAX_COUNT:
             raise LimitExceeded(f"{count} symbols in one channel, limit {MAX_COUNT}")
-        frequencies = _frequencies(cum, Malformed)
-        if count == 0 or len(cum) == 2:
+        known = self._models.get(id(cum))
+        if known is None:
+            frequencies = _frequencies(cum, Malformed)
+            known = cum, _model(frequencies) if len(frequencies) > 1 else None
+            self._models[id(cum)] = known  # which keeps the table, so that no other takes its id
+        model = known[1]
+        if count == 0 or model is None:
             return np.zeros(count, dtype=np.int32)
-        return np.asarray(self._coder.decode(_model(frequencies), count), dtype=np.int32)
+        return np.asarray(self._coder.decode(model, count), dtype=np.int32)
 
     def finish(self) -> None:
         """Raise Malformed unless exactly the stream's symbols have been taken: state 0 and no words left.

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import cache
 
 import numpy as np
 
@@ -51,7 +52,7 @@ class CodedChannels:
 @dataclass(frozen=True, eq=False)
 class _Exceptions:
     positions: np.ndarray  #: int64 [M], ascending
-    values: np.ndarray  #: int64 [M]
+    values: np.ndarray  #: int [M]
 
 
 def check_channels(channels: Sequence[np.ndarray]) -> list[np.ndarray]:
@@ -65,7 +66,7 @@ def check_channels(channels: Sequence[np.ndarray]) -> list[np.ndarray]:
             )
         if array.size and (int(array.min()) < -K_MAX or int(array.max()) > K_MAX):
             raise EncodeError(f"channel {index}: symbols {array.min()}..{array.max()}, limit |k| <= {K_MAX}")
-        checked.append(array.astype(np.int32))
+        checked.append(array.astype(np.int32, copy=False))
     return checked
 
 
@@ -129,10 +130,12 @@ def _parts(inside: np.ndarray, prior: Prior) -> list[tuple[np.ndarray, np.ndarra
 
 
 def _split(array: np.ndarray, window: Window) -> tuple[np.ndarray, _Exceptions]:
-    symbols = array.astype(np.int64)
-    out = (symbols < window.kmin) | (symbols >= window.end)
+    if window.kmin <= int(array.min()) and int(array.max()) < window.end:
+        nothing = np.zeros(0, np.int64)
+        return array, _Exceptions(nothing, nothing)
+    out = (array < window.kmin) | (array >= window.end)
     positions = np.flatnonzero(out)
-    return symbols[~out], _Exceptions(positions, symbols[positions])
+    return array[~out], _Exceptions(positions, array[positions])
 
 
 def _write_channel(out: bytearray, prior: Prior, exceptions: _Exceptions, defined: list[Prior]) -> bool:
@@ -194,7 +197,8 @@ def decode_channels(
         if count:
             before = len(defined)
             heads.append(_read_channel(reader, count, defined))
-            entries += sum(prior.window.n for prior in defined[before:])
+            if len(defined) > before:
+                entries += defined[-1].window.n
             if entries > most:
                 raise LimitExceeded(f"tables of {entries} entries in one section, limit {most}")
     stream = AnsDecoder(reader.rest())
@@ -230,11 +234,17 @@ def _read_channel(reader: ByteReader, count: int, defined: list[Prior]) -> tuple
     return index, _read_exceptions(reader, count, defined[index].window) if token & 1 else None
 
 
+@cache
+def _low_bits(shift: int) -> np.ndarray:
+    """One table for all channels of that shift: a stream keeps the models of those that it has met."""
+    return uniform_table(shift)
+
+
 def _take_channel(stream: AnsDecoder, count: int, prior: Prior, exceptions: _Exceptions | None) -> np.ndarray:
     window, left = prior.window, count - (0 if exceptions is None else len(exceptions.positions))
     inside = stream.take(left, prior.cum)
     if window.shift:
-        inside = (inside << window.shift) + stream.take(left, uniform_table(window.shift))
+        inside = (inside << window.shift) + stream.take(left, _low_bits(window.shift))
         if left and int(inside.max()) + window.kmin > K_MAX:
             raise Malformed(f"symbol {int(inside.max()) + window.kmin}, limit {K_MAX}")
     inside += np.int32(window.kmin)

@@ -87,6 +87,9 @@ class Normal:
         return cls(mu8, (code >> 1) + SI_MIN), code & 1
 
 
+_ONE_SYMBOL = norm_table(1, 0, 0, 1)
+
+
 @dataclass(frozen=True, eq=False)
 class Const:
     """Every symbol is kmin; costs nothing per symbol."""
@@ -94,9 +97,9 @@ class Const:
     id: ClassVar[int] = CONST
     window: Window
 
-    @cached_property
+    @property
     def cum(self) -> np.ndarray:
-        return norm_table(1, 0, 0, 1)
+        return _ONE_SYMBOL
 
     def write(self, out: bytearray) -> None:
         put_zigzag(out, self.window.kmin)

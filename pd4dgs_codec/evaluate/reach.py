@@ -37,6 +37,10 @@ HALVINGS, SHOW_HALVINGS = 2, 1
 NARROW = 0.3
 #: Points enclosed at once: bounds the memory.
 CHUNK = 1024
+#: Chunks after which it is first asked again whether going on pays.
+SAMPLE = 16
+#: Anchors that are looked at at once where nothing is enclosed.
+BLOCK = 1 << 13
 
 Known = TypeVar("Known")
 
@@ -130,25 +134,38 @@ def global_cells(scene: Scene) -> Reached:
     """The cells of the global planes that anchors read; () without such planes."""
     field = scene.global_deformation
     cells = _Marks(field.planes if field else ())
-    count = len(scene.anchor)
-    cells.read(_Boxes(*_unit(scene.info.box, scene.anchor, scene.anchor), np.zeros(count), np.ones(count)))
+    every = scene.anchor
+    for rows in _blocks(scene):
+        anchor = every[rows]
+        whole = np.zeros(len(anchor)), np.ones(len(anchor))
+        cells.read(_Boxes(*_unit(scene.info.box, anchor, anchor), *whole))
     return cells.reached
 
 
 def shown_gaussians(scene: Scene, pays: Pays[np.ndarray] = _always) -> np.ndarray:
     """bool [N, G]: the Gaussians that some view may show. Those that features without residuals do not show are
-    looked at if it `pays`, which is told what is certain, as if no other were shown."""
-    shown = _may_show(scene, np.arange(len(scene.anchor)), None)
+    looked at if it `pays`, which is told what is certain, as if no other were shown. In large scenes it is asked again
+    now and then, as if the share that was proven not to be shown so far held for all; the rest then counts as shown."""
+    shown = np.concatenate([_may_show(scene, rows, None) for rows in _blocks(scene)])
     field = scene.global_deformation
     if field is None or "feature" not in field.networks:
         return shown
     open_, spans = np.flatnonzero(~shown.all(axis=1)), _spans(field)
     if not pays(shown, open_.size * len(spans)):
         return np.ones_like(shown)
+    anchor = scene.anchor  # worked out at each access
+    certain, chunks, looked, hidden = shown.copy(), _chunks(open_), 0, 0
     with ThreadPoolExecutor(threads.encoder_threads()) as pool:
-        for rows in _chunks(open_):
-            enclosure = Enclosure(field, scene.info.box, scene.anchor[rows])
+        for index, rows in enumerate(chunks):
+            if index >= SAMPLE and index & (index - 1) == 0:
+                share = max(hidden, 1) / looked
+                if not pays(certain, int(open_.size * len(spans) / share)):
+                    shown[np.concatenate(chunks[index:])] = True
+                    break
+            looked += int((~shown[rows]).sum())
+            enclosure = Enclosure(field, scene.info.box, anchor[rows])
             shown[rows] = _shown(scene, rows, shown[rows], enclosure, spans, pool)
+            hidden += int((~shown[rows]).sum())
     return shown
 
 
@@ -158,18 +175,23 @@ def local_cells(scene: Scene, shown: np.ndarray, pays: Pays[Reached] = _always) 
     field, local = scene.global_deformation, scene.local_deformation
     if local is None:
         return ()
-    marks, spans = _Marks(local.planes), _spans(field)
-    asked, left = 0, len(scene.anchor)
+    marks, spans, anchor = _Marks(local.planes), _spans(field), scene.anchor
+    asked, left = 0, len(anchor)
     with ThreadPoolExecutor(threads.encoder_threads()) as pool:
         for index, rows in enumerate(_chunks(np.arange(left))):
             if index == 2 * asked or index == 1:  # asking costs as much as some thousand evaluations
                 if not pays(marks.reached, left * len(spans)):
                     return None
                 asked = index
-            enclosure = Enclosure(field, scene.info.box, scene.anchor[rows]) if field else None
-            _read_local(scene, scene.anchor[rows], rows, shown[rows], marks, enclosure, spans, pool)
+            enclosure = Enclosure(field, scene.info.box, anchor[rows]) if field else None
+            _read_local(scene, anchor[rows], rows, shown[rows], marks, enclosure, spans, pool)
             left -= len(rows)
     return marks.reached
+
+
+def _blocks(scene: Scene) -> Iterable[slice]:
+    """All anchors, so many at a time that what is worked out about each takes little memory. Of none one block."""
+    yield from (slice(first, first + BLOCK) for first in range(0, max(len(scene.anchor_q), 1), BLOCK))
 
 
 def _spans(field: Deformation | None) -> list[Span]:
@@ -295,7 +317,7 @@ def _mean_ranges(
         return _unit(scene.info.box, middle, middle)[0], *_unit(scene.info.box, low + centre[1], high + centre[2])
 
 
-def _may_show(scene: Scene, rows: np.ndarray, feature: Range | None) -> np.ndarray:
+def _may_show(scene: Scene, rows: np.ndarray | slice, feature: Range | None) -> np.ndarray:
     """bool [n, G]: the opacity may reach the threshold from some direction, with residuals of the features anywhere
     in `feature`, or 0."""
     low, high = (scene.feature[rows] + r for r in ((np.float32(0),) * 2 if feature is None else feature[1:]))

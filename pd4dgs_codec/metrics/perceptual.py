@@ -15,7 +15,6 @@ from importlib import metadata
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
-from unittest import mock
 
 import numpy as np
 
@@ -110,6 +109,8 @@ def _lpips() -> Distance:
 def _stlpips() -> Distance:
     # The package imports these on loading, each for something that the shift-tolerant AlexNet does not use. Afterwards
     # sys.modules is as it was, so that nobody else meets the stand-ins, or the package loaded with them.
+    from unittest import mock  # a tenth of a second
+
     unused = {"torchvision": "models", "IPython": "embed", "torchsummary": "summary"}
     with mock.patch.dict(sys.modules, {name: _empty_module(name, part) for name, part in unused.items()}):
         from stlpips_pytorch import stlpips

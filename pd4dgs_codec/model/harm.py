@@ -89,19 +89,39 @@ def step_harm(
     `anchor_harm`, by whose method the derivative by each scalar is squared; the error of a step Q is Q^2 / 12 on
     average.
     """
+    slopes, met, image = attribute_slopes(model, level, t, camera, generator, weights=weights, rounding=rounding)
+    total = torch.zeros(len(met), dtype=torch.float64, device=image.device)
+    for name, slope in slopes.items():
+        total += slope.double().square().flatten(1).sum(1) * (getattr(model.steps, name) ** 2 / 12)
+    return total, met, image
+
+
+def attribute_slopes(
+    model: Model,
+    level: int,
+    t: float,
+    camera: Camera,
+    generator: torch.Generator,
+    *,
+    weights: Tensor | None = None,
+    rounding: Rounding = EXACT,
+) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+    """(by attribute, in its shape, the derivative by it of the picture's product with random signs; bool [N] whether
+    the picture comes near an anchor; the picture [H, W, 3]). Arguments as those of `anchor_harm`.
+
+    On average over the signs, products of two derivatives by scalars of one anchor are the entries of its Gauss-Newton
+    matrix.
+    """
     values = [getattr(model, name) for name in ATTRIBUTES]
     with torch.enable_grad():
         g = model.gaussians(level, t, camera, rounding)
         image = draw(model.info, g, camera).image
         met = torch.zeros(len(model.anchor_q), dtype=torch.bool, device=image.device)
         met[g.anchors] = True
-        if not len(g.scales):
-            return met.double(), met, image.detach()
-        slopes = torch.autograd.grad((image * _signs(image, generator, weights)).sum(), values)
-    total = torch.zeros(len(met), dtype=torch.float64, device=image.device)
-    for name, slope in zip(ATTRIBUTES, slopes, strict=True):
-        total += slope.double().square().flatten(1).sum(1) * (getattr(model.steps, name) ** 2 / 12)
-    return total, met, image.detach()
+        slopes = [torch.zeros_like(value) for value in values]
+        if len(g.scales):
+            slopes = list(torch.autograd.grad((image * _signs(image, generator, weights)).sum(), values))
+    return dict(zip(ATTRIBUTES, slopes, strict=True)), met, image.detach()
 
 
 def _signs(image: Tensor, generator: torch.Generator, weights: Tensor | None) -> Tensor:

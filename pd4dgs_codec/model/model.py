@@ -146,7 +146,7 @@ class Model(nn.Module):
         return self._visible(self.masks(level), self.anchor, camera)
 
     @torch.no_grad()
-    def _visible(self, masks: Tensor, position: Tensor, camera: Camera) -> Tensor:
+    def _visible(self, masks: Tensor, position: Tensor, camera: Camera, only: Tensor | None = None) -> Tensor:
         viewmat, K = camera_tensors(camera, self.feature.device)
         position = position @ viewmat[:3, :3].T + viewmat[:3, 3]
         extent = self.scaling_log.exp()
@@ -158,15 +158,19 @@ class Model(nn.Module):
         width, height = camera.width, camera.height
         margin = torch.maximum(K[0, 0], K[1, 1]) * radius / z + FRUSTUM_MARGIN * max(width, height)
         inside = (x > -margin) & (x < width + margin) & (y > -margin) & (y < height + margin)
-        return (inside & (depth + radius > 0) & (masks > MASK_THRESHOLD)).nonzero()[:, 0]
+        seen = inside & (depth + radius > 0) & (masks > MASK_THRESHOLD)
+        return (seen if only is None else seen & only).nonzero()[:, 0]
 
-    def gaussians(self, level: int, t: float, camera: Camera, rounding: Rounding = EXACT) -> Gaussians:
-        """The Gaussians of `level` at normalised time t in 0..1 as the camera meets them."""
+    def gaussians(
+        self, level: int, t: float, camera: Camera, rounding: Rounding = EXACT, only: Tensor | None = None
+    ) -> Gaussians:
+        """The Gaussians of `level` at normalised time t in 0..1 as the camera meets them; of the anchors `only` (bool
+        [N]) where it is given."""
         if not self._fusible():
-            return self.gaussians_reference(level, t, camera, rounding)
+            return self.gaussians_reference(level, t, camera, rounding, only)
         steps, masks, position, widths = self.steps, self.masks(level), self.anchor, self.widths
         centres = self.centres
-        rows = self._visible(masks, position, camera)
+        rows = self._visible(masks, position, camera, only)
         noise = None
         if rounding.noise is not None and not rounding.attributes:
             draws = [rounding.noise.draw(torch.Size((len(rows), x[0].numel()))) for x in self._attributes()]
@@ -197,10 +201,12 @@ class Model(nn.Module):
         slots = owner * widths.slots + keep % widths.slots
         return Gaussians(means, quats, scales, opacities, colors, slots, rows, raw_opacity)
 
-    def gaussians_reference(self, level: int, t: float, camera: Camera, rounding: Rounding = EXACT) -> Gaussians:
+    def gaussians_reference(
+        self, level: int, t: float, camera: Camera, rounding: Rounding = EXACT, only: Tensor | None = None
+    ) -> Gaussians:
         """The plain torch form of `gaussians`, for any device and any networks."""
         slots = self.widths.slots
-        rows = self._visible(self.masks(level), self.anchor, camera)
+        rows = self._visible(self.masks(level), self.anchor, camera, only)
         mask = self.masks(level).index_select(0, rows)
         position = self.anchor.index_select(0, rows)
         feature, scaling_log, offset = (self._attribute(name, rows, rounding) for name in ATTRIBUTES)

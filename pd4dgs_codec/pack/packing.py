@@ -12,7 +12,7 @@ from pd4dgs_codec.codec.left_out import LeftOut
 from pd4dgs_codec.codec.metadata import Metadata
 from pd4dgs_codec.codec.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.codec.plan import plan
-from pd4dgs_codec.codec.stream import open_stream
+from pd4dgs_codec.codec.stream import every_prefix
 from pd4dgs_codec.codec.symbols import rounded
 from pd4dgs_codec.pack import MIN_GAIN_PER_MEGABYTE
 from pd4dgs_codec.scene import Scene
@@ -135,8 +135,8 @@ def _in_slices(
     metadata: Metadata | None,
     progress: Progress,
 ) -> Packed:
+    from pd4dgs_codec.model.utility import utility
     from pd4dgs_codec.pack.rendered import true_psnr
-    from pd4dgs_codec.pack.utility import utility
 
     about: dict[str, Any] = {"order": "gate times area", "cameras": None, "pictures": 0}
     order: Callable[[Scene], np.ndarray] | None = None
@@ -146,7 +146,7 @@ def _in_slices(
 
         def order(decoded: Scene) -> np.ndarray:
             with progress("ordering anchors") as step:
-                return utility(decoded, frames, step)
+                return utility(decoded, [(frame.camera, frame.time) for frame in frames], step)
 
     data, report = encode_with_report(scene, options, left_out=left_out, utility=order)
     _note_sizes(target, report)
@@ -154,7 +154,7 @@ def _in_slices(
         with progress("judging slices") as step:
             about["psnr"] = [
                 true_psnr(prefix, views.held_out, step, levels=[prefix.level])[prefix.level]
-                for prefix in open_stream().feed(data)
+                for prefix in every_prefix(data)
             ]
         metadata = replace(metadata or Metadata(), slices=tuple(about["psnr"]))
     if metadata is not None:

@@ -31,6 +31,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
     "smooth": {"tmc_smooth": False},
     "tmc": {"tmc_binary": False, "tmc_smooth": False},
     "noise": {"noise": False},
+    "whitening": {"whitening": False},
     "judge": {"judge": False},
 }
 
@@ -39,7 +40,7 @@ ABLATIONS: dict[str, dict[str, Any]] = {
 DIAL: dict[str, tuple[float, float]] = {
     "rate_scale": (0.1, 4.0),
     "plane_rate": (5e-9, 4.0),
-    "prune": (0.05, 4.0),
+    "prune": (0.1, 4.0),
     "step_scale": (1.25, 1.6),
     "grading": (0.06, 3.0),
 }
@@ -58,6 +59,8 @@ BEFORE: dict[str, Any] = {
     "feature_width": 32,
     "slots": 10,
     "grading": 0.0,
+    "whitening": False,
+    "views_per_step": 1,
 }
 
 
@@ -69,7 +72,7 @@ def at_quality(quality: float) -> dict[str, float]:
 
 
 #: Where files are a third smaller, and pictures hardly change; see docs/training.md.
-DEFAULT_QUALITY = 70.0
+DEFAULT_QUALITY = 80.0
 _DEFAULT = at_quality(DEFAULT_QUALITY)
 
 
@@ -121,6 +124,8 @@ class TrainConfig:
     tmc_binary_growth: float = 20.0
     tmc_smooth: bool = True
     tmc_tau: float = 4.0  #: voxels
+    #: views of each level that a step trains; their gradients are averaged, and several workers share them
+    views_per_step: int = 1
     rollout: str = "adaptive"  #: one of ROLLOUTS
     #: layers above it are not there: 0 is a static scaffold, 1 a scaffold and its global deformation
     max_layer: int = 2
@@ -130,6 +135,9 @@ class TrainConfig:
     #: share that coarser steps of single anchors add at most to the squared error where planes begin to be rounded; 0:
     #: all anchors keep the steps; see `grading`
     grading: float = _DEFAULT["grading"]
+    whitening: bool = True  #: where planes begin to be rounded, mix the features' channels; see `whitening`
+    #: share of the last third's steps that see the most useful anchors of level 0 alone; see `prefixes`
+    prefixes: float = 0.0
     #: share of the run, at its end, over which all learning rates fall to 0 besides: else the last steps carry weights
     #: over the edges of their rounding intervals, and pictures change by tenths of a dB from one step to the next
     cooldown: float = 0.1
@@ -165,6 +173,8 @@ class TrainConfig:
             raise TrainError(f"max-seconds must be positive, found {self.max_seconds}")
         if not 0 <= self.seed <= 2**63 - 2:  # the next one seeds the noise
             raise TrainError(f"seed {self.seed} is out of range; expected an integer from 0 to 2^63 - 2")
+        if self.views_per_step < 1:
+            raise TrainError(f"views_per_step must be at least 1, found {self.views_per_step}")
         for name, limit in (("feature_width", MAX_FEATURE), ("slots", MAX_SLOTS)):
             if not 1 <= getattr(self, name) <= limit:
                 raise TrainError(f"{name} must be from 1 to {limit}, found {getattr(self, name)}")
@@ -173,7 +183,7 @@ class TrainConfig:
                 raise TrainError(f"{name} must be 0 or more and finite, found {getattr(self, name)}")
         if not 0 < self.step_scale < math.inf:
             raise TrainError(f"step_scale must be positive and finite, found {self.step_scale}")
-        for name in ("prune", "cooldown", "grading"):
+        for name in ("prune", "cooldown", "grading", "prefixes"):
             if not 0 <= getattr(self, name) <= 1:
                 raise TrainError(f"{name} must be from 0 to 1, found {getattr(self, name)}")
         if self.rollout not in ROLLOUTS:

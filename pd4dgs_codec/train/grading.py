@@ -16,6 +16,7 @@ from pd4dgs_codec.model.harm import step_harm
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.rounding import Rounding
 from pd4dgs_codec.scene import MASK_THRESHOLD, MAX_CLASS
+from pd4dgs_codec.train import workers
 from pd4dgs_codec.train.shot import Shot
 
 #: Training views in which the harm of a step is measured.
@@ -27,7 +28,7 @@ HALVINGS = 40
 def grade(model: Model, shots: Sequence[Shot], levels: Sequence[int], share: float, rounding: Rounding) -> list[int]:
     """Gives every anchor the class at which quantisation adds `share` at most to the squared error of each of `levels`,
     beside what it adds at class 0, and the attributes their centres. Returns how many anchors each class has."""
-    harm = torch.stack([_relative_harm(model, level, shots, rounding) for level in levels])
+    harm = workers.alike(lambda: torch.stack([_relative_harm(model, level, shots, rounding) for level in levels]))
     met = harm.isfinite()
     worst = torch.where(met, harm, 0.0).amax(0)  # a level that is far off anyway must not set the others' budget
     classes = classes_within(torch.where(met.any(0), worst, torch.inf), share)

@@ -8,7 +8,8 @@ from __future__ import annotations
 
 import json
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import replace
 from typing import Any
 
@@ -26,7 +27,7 @@ from pd4dgs_codec.model.picture import Picture, render, render_image
 from pd4dgs_codec.model.plane_rate import exact_bits
 from pd4dgs_codec.model.rounding import EXACT, Noise, Rounding
 from pd4dgs_codec.scene import MASK_THRESHOLD
-from pd4dgs_codec.train import grading, judge, losses, pruning
+from pd4dgs_codec.train import grading, judge, losses, prefixes, pruning, whitening, workers
 from pd4dgs_codec.train.config import PlaneWeights, Schedule, TrainConfig
 from pd4dgs_codec.train.densify import Densifier
 from pd4dgs_codec.train.initialise import fresh_model
@@ -76,6 +77,7 @@ class Learner:
         self.skipped = 0
         self.order: list[int] = []  #: training views drawn and not yet learnt from, the next one last
         self.left_out: list[dict[str, Any]] = []
+        self.rank: Tensor | None = None  #: of the anchors in a file, float64 [N], once `prefixes` are trained
         self._neighbours: losses.Neighbours | None = None  #: rebuilt when anchors come or go
 
     @property
@@ -93,12 +95,16 @@ class Learner:
 
     def step(self, levels: Sequence[int] | None = None) -> dict[str, Any]:
         """One training step; returns its log record (every term unweighted). levels: those to train, ascending, each on
-        a view of its own; None draws what the rollout says."""
+        views of its own; None draws what the rollout says."""
         judged = self._judge_levels()
         graded = self._grade()
         left = self._prune()
+        self._rank()
+        only = self._draw_prefix() if levels is None else None
+        if only is not None:
+            levels = (0,)
         chosen, probabilities = self._draw_levels() if levels is None else _given(levels)
-        drawn = [(self._next_view(), level) for level in chosen]
+        drawn = [(self._next_view(), level) for level in chosen for _ in range(self.config.views_per_step)]
         record: dict[str, Any] = {"iteration": self.iteration, "level": chosen[-1]}
         if judged:
             record |= {"judged_psnr": judged, "left_out": self.left_out}
@@ -106,7 +112,9 @@ class Learner:
             record["step_classes"] = graded
         if left:
             record["left_model"], record["left_level_0"] = left
-        if not self._learn(drawn, record):
+        if only is not None:
+            record["prefix"] = int(only.sum())
+        if not self._learn(drawn, record, only):
             self.skipped += 1
             record["skipped"] = self.skipped
         self.optimiser.zero_grad()
@@ -179,23 +187,15 @@ class Learner:
 
     # -- loss and update -------------------------------------------------------------------------------------------
 
-    def _learn(self, drawn: list[tuple[int, int]], record: dict[str, Any]) -> bool:
+    def _learn(self, drawn: list[tuple[int, int]], record: dict[str, Any], only: Tensor | None) -> bool:
         """Losses of (view, level) pairs, gradients, update; False, with nothing changed, if any of it is not finite.
-        The record is that of the last pair."""
-        rounding, mask_terms = self._rounding(), self.place >= self.schedule.progressive
-        pictures = []
-        for index, level in drawn:
-            try:
-                picture, terms, loss = self.loss(index, level, rounding, mask_terms)
-            except NotFinite as error:  # a diverged step may be passed over; any other refusal is here to stay
-                record["refused"] = str(error)
-                return False
-            record["loss"] = float(loss.detach())
-            record |= {name: float(value.detach()) for name, value in terms.items()}
-            torch.autograd.backward(loss)
-            pictures.append(picture)
-            if not math.isfinite(record["loss"]):
-                return False
+        The record is that of the last pair of this worker, which takes every Nth where there are N. only: the anchors
+        to render, bool [N], if not all."""
+        pictures = self._pictures(drawn, record, only)
+        if workers.count() > 1:
+            pictures = self._shared_gradients(pictures)
+        if pictures is None:
+            return False
         record["gradient_norm"] = norm = self.optimiser.gradient_norm()
         if not math.isfinite(norm):
             return False
@@ -204,16 +204,68 @@ class Learner:
         self._update(pictures, record)
         return True
 
+    def _pictures(
+        self, drawn: list[tuple[int, int]], record: dict[str, Any], only: Tensor | None
+    ) -> list[Picture] | None:
+        """The pictures of this worker's share of the pairs, their gradients gathered; None if one is not finite."""
+        rounding, mask_terms = self._rounding(), self.place >= self.schedule.progressive
+        pictures, views = [], self.config.views_per_step
+        seeds: list[int | None] = [None] * len(drawn)
+        if views > 1:
+            seeds = torch.randint(1 << 62, (len(drawn),), generator=self.generator).tolist()
+        own = list(zip(drawn, seeds, strict=True))[workers.rank() :: workers.count()]
+        for (index, level), seed in own:
+            try:
+                with self._drawing_from(seed):
+                    picture, terms, loss = self.loss(index, level, rounding, mask_terms, only)
+            except NotFinite as error:  # a diverged step may be passed over; any other refusal is here to stay
+                record["refused"] = str(error)
+                return None
+            record["loss"] = float(loss.detach())
+            record |= {name: float(value.detach()) for name, value in terms.items()}
+            torch.autograd.backward(loss / views)
+            pictures.append(picture)
+            if not math.isfinite(record["loss"]):
+                return None
+        return pictures
+
+    @contextmanager
+    def _drawing_from(self, seed: int | None) -> Iterator[None]:
+        """What is random in the loss of one of several views follows its seed, whichever worker it falls to."""
+        if seed is None:
+            yield
+            return
+        state = self.generator.get_state()
+        self.generator.manual_seed(seed)
+        self.noise.generator.manual_seed(seed + 1)
+        try:
+            yield
+        finally:
+            self.generator.set_state(state)
+
+    def _shared_gradients(self, pictures: list[Picture] | None) -> list[Picture] | None:
+        """Sums the gradients of all workers; None where any of them has met what is not finite."""
+        parameters = [p for group in self.optimiser.adam.param_groups for p in group["params"]]
+        met = torch.tensor([p.grad is not None for p in parameters], dtype=torch.float32, device=self.device)
+        failed = torch.full((1,), float(pictures is None), device=self.device)
+        for p in parameters:
+            p.grad = torch.zeros_like(p) if p.grad is None else p.grad
+        workers.add_up([failed, met, *(p.grad for p in parameters if p.grad is not None)])
+        for p, anywhere in zip(parameters, met.tolist(), strict=True):
+            p.grad = p.grad if anywhere else None
+        return None if failed else pictures
+
     def loss(
-        self, index: int, level: int, rounding: Rounding, mask_terms: bool
+        self, index: int, level: int, rounding: Rounding, mask_terms: bool, only: Tensor | None = None
     ) -> tuple[Picture, dict[str, Tensor], Tensor]:
         """(picture of training view `index` at `level`, terms unweighted and by name, their weighted sum).
 
-        mask_terms: whether rate and mask terms belong to it yet. Raises NotFinite where the model has diverged.
+        mask_terms: whether rate and mask terms belong to it yet. only: the anchors to render, bool [N],
+        if not all. Raises NotFinite where the model has diverged.
         """
         config, shot = self.config, self.shots[index]
         view = shot.view
-        picture = render(self.model, level, view.time, view.camera, rounding)
+        picture = render(self.model, level, view.time, view.camera, rounding, only)
         if picture.meta["means2d"].requires_grad:
             picture.meta["means2d"].retain_grad()
         l1, dissimilarity = image_loss(picture.image, shot.target)
@@ -271,8 +323,15 @@ class Learner:
         """Adam; and while anchors grow, what growing goes by and the growing itself."""
         growing, known = self.schedule.grow, self.schedule.iterations is not None
         if known and self.place <= growing.stop:
+            before = self.densifier.state()
+            if workers.count() > 1:
+                self.densifier.load_state({name: torch.zeros_like(value) for name, value in before.items()})
             for picture in pictures:
                 self._observe(picture)
+            if workers.count() > 1:
+                seen = self.densifier.state()
+                workers.add_up(list(seen.values()))
+                self.densifier.load_state({name: before[name] + value for name, value in seen.items()})
         self.optimiser.step(self.schedule.progress(self.place))
         if any(map(self._reached, growing)):
             pruned, grown = self.densifier.adjust(
@@ -290,7 +349,8 @@ class Learner:
         if gradient is not None and len(picture.gaussians.slots):
             drawn = (picture.meta["radii"][0] > 0).all(-1)
             height, width = picture.alpha.shape
-            self.densifier.observe(picture.gaussians, gradient[0], drawn, width, height)
+            pull = gradient[0] * self.config.views_per_step  # as if the loss were of this view alone
+            self.densifier.observe(picture.gaussians, pull, drawn, width, height)
 
     # -- what happens once or a few times in a run -------------------------------------------------------------------
 
@@ -304,7 +364,7 @@ class Learner:
         waiting = sorted(self.waiting_views()) if self._reached(self.schedule.rounding) else []
         if not waiting:
             return []
-        psnr = self.level_psnr([self.dataset.train[index] for index in waiting])
+        psnr = workers.alike(lambda: self.level_psnr([self.dataset.train[index] for index in waiting]))
         fields = (self.model.global_deformation, self.model.local_deformation)
         sizes = [0.0 if f is None else judge.field_bytes(f, b) for f, b in zip(fields, self.plane_bits(), strict=True)]
         found = judge.levels_without_gain(psnr, [0.0, *sizes])
@@ -337,18 +397,38 @@ class Learner:
         return before - len(keep), later
 
     def _grade(self) -> list[int]:
-        """Where planes and weights begin to be rounded: gives anchors their step classes. Returns how many each has."""
+        """Where planes and weights begin to be rounded: mixes the features' channels and gives anchors their step
+        classes. Returns how many each has."""
         enough = (self.schedule.iterations or 0) >= pruning.MIN_ITERATIONS
-        if not (self.config.grading and self.config.noise and enough and self._reached(self.schedule.rounding)):
+        if not (self.config.noise and enough and self._reached(self.schedule.rounding)):
             return []
         stride = -(-len(self.shots) // grading.VIEWS)
-        shots = [self.shots[i] for i in range(0, len(self.shots), stride)]
         levels = range(self.model.level if self.config.rollout == "top" else 0, self.model.level + 1)
+        rounding, shots, found = replace(self._rounding(), noise=None), self.shots[::stride], list[int]()
         try:
-            rounding = replace(self._rounding(), noise=None)
-            return grading.grade(self.model, shots, levels, self.config.grading, rounding)
-        except NotFinite:  # as a step that diverged: passed over, with nothing changed
+            if self.config.grading:
+                found = grading.grade(self.model, shots, levels, self.config.grading, rounding)
+            if self.config.whitening:
+                whitening.whiten(self.model, self.optimiser, shots, levels, rounding)
+                if self.config.grading:  # a step of the features is another one now
+                    found = grading.grade(self.model, shots, levels, self.config.grading, rounding)
+        except NotFinite:  # as a step that diverged: passed over
             return []
+        return found
+
+    def _rank(self) -> None:
+        """Where the last third begins, if prefixes are to be trained: the order of the anchors in a file."""
+        if self.config.prefixes and self._reached(self.schedule.rounding):
+            try:
+                self.rank = workers.alike(lambda: prefixes.rank_anchors(self.model, self.shots))
+            except NotFinite:  # as a step that diverged: passed over
+                pass
+
+    def _draw_prefix(self) -> Tensor | None:
+        """The anchors that this step sees, bool [N]; None if it is all."""
+        if self.rank is None or float(torch.rand((), generator=self.generator)) >= self.config.prefixes:
+            return None
+        return prefixes.draw_prefix(self.rank, self.generator).to(self.device)
 
     # -- checkpoints -----------------------------------------------------------------------------------------------
 
@@ -363,6 +443,7 @@ class Learner:
             "rho": self.rho,
             "skipped": self.skipped,
             "order": self.order,
+            "rank": torch.empty(0) if self.rank is None else self.rank,
             "left_out": json.dumps(self.left_out),
             "optimiser": self.optimiser.state(),
             "densifier": self.densifier.state(),
@@ -386,6 +467,8 @@ class Learner:
         self.rho = float(state["rho"])
         self.order = [int(index) for index in state["order"]]
         self.left_out = list(json.loads(state.get("left_out", "[]")))
+        rank = state.get("rank")
+        self.rank = rank if rank is not None and len(rank) else None
 
 
 def _given(levels: Sequence[int]) -> tuple[tuple[int, ...], Probabilities]:

@@ -15,6 +15,7 @@ from pd4dgs_codec.errors import DataError, TrainError
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import ModelConfig
 from pd4dgs_codec.model.model import Model
+from pd4dgs_codec.train import workers
 from pd4dgs_codec.train.config import COARSE_SHARE, DEFAULT_ITERATIONS, Schedule, TrainConfig
 from pd4dgs_codec.train.learner import Learner
 from pd4dgs_codec.train.log import RecordLog
@@ -120,21 +121,23 @@ class Trainer:
             place = self.learner.place
             record = self.learner.step()
             told, begun = time.monotonic(), told
-            late = self._spend(told - begun)
+            late = self._spend(*workers.largest(told - begun))  # one clock for all workers
             if self._curve_due(place):
-                record["held_out_psnr"] = self._evaluate()
+                record["held_out_psnr"] = workers.alike(self._level_psnr)
+                self.curve.append(
+                    {"iteration": self.iteration, "seconds": self.seconds, "psnr": record["held_out_psnr"]}
+                )
                 record["plane_bits"] = self.learner.plane_bits()
                 told, begun = time.monotonic(), told
-                self._evaluation = told - begun
+                (self._evaluation,) = workers.largest(told - begun)
                 self.seconds += self._evaluation
-            if not records.write(record | {"seconds": round(self.seconds, 3)}):
-                break
+            logged = records.write(record | {"seconds": round(self.seconds, 3)})
             if progress:
                 progress.update(self, record)
             if time.monotonic() - saved > save_every:
                 self.save(output)
                 saved = time.monotonic()
-            if stop.requested or late:
+            if any(workers.largest(stop.requested or late or not logged)):
                 break
 
     def _spend(self, seconds: float) -> bool:
@@ -165,15 +168,15 @@ class Trainer:
         every = max(1, self.total // CURVE_POINTS)
         return self.finished or self.learner.place // every > before // every
 
-    def _evaluate(self) -> list[float]:
+    def _level_psnr(self) -> list[float]:
         """Mean PSNR per level on a few held-out views (training views if none are held out)."""
         views = self.dataset.test or self.dataset.train
-        psnr = self.learner.level_psnr(views[:: max(1, len(views) // CURVE_VIEWS)][:CURVE_VIEWS])
-        self.curve.append({"iteration": self.iteration, "seconds": self.seconds, "psnr": psnr})
-        return psnr
+        return self.learner.level_psnr(views[:: max(1, len(views) // CURVE_VIEWS)][:CURVE_VIEWS])
 
     def save(self, path: Path) -> None:
-        """Writes the checkpoint with all that resuming needs."""
+        """Writes the checkpoint with all that resuming needs; of several workers the first one does."""
+        if workers.rank():
+            return
         training = {
             "config": json.dumps(self.config, default=vars),
             "source": self.dataset.name,

@@ -78,6 +78,21 @@ class Optimiser:
         names = (*PER_ANCHOR, "anchor_q")
         self.replace_anchors(keep, {name: getattr(self.model, name).detach()[:0] for name in names})
 
+    @torch.no_grad()
+    def transform(self, parameter: Tensor, columns: slice, right: Tensor, *, transposed: bool = False) -> None:
+        """The parameter's `columns` X become X M, M = `right` [d, d]; of a transposed one its rows, as columns.
+
+        Its gradients then come as G M^-T, and so do their means. Their mean squares follow as if the gradients of the
+        columns were independent.
+        """
+        moment = torch.linalg.inv(right).T
+        state = self.adam.state.get(parameter, {})
+        changes = [(parameter, right)]
+        changes += [(state[name], by) for name, by in (("exp_avg", moment), ("exp_avg_sq", moment**2)) if name in state]
+        for tensor, by in changes:
+            part = (tensor.T if transposed else tensor)[..., columns]
+            part.copy_((part.double() @ by).to(part))
+
     def forget(self, module: nn.Module) -> None:
         """Takes the parameters of `module` out, and groups that hold no others."""
         gone = {id(p) for p in module.parameters()}

@@ -19,6 +19,7 @@ from pd4dgs_codec.model.masks import mask_logits
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.rounding import Rounding
 from pd4dgs_codec.scene import MASK_THRESHOLD
+from pd4dgs_codec.train import workers
 from pd4dgs_codec.train.config import PRUNING_ROUNDS
 from pd4dgs_codec.train.optimiser import Optimiser
 from pd4dgs_codec.train.shot import Shot
@@ -46,7 +47,7 @@ def prune(
     Returns int64 [n], the anchors that stayed, and how many of them left level 0. Anchors that no shot comes near stay,
     and all do where none would be left: better a needless model than none.
     """
-    harms = torch.stack([relative_harm(model, level, shots, rounding) for level in levels])
+    harms = workers.alike(lambda: torch.stack([relative_harm(model, level, shots, rounding) for level in levels]))
     harms[:, turns(model.anchor_q) != turn] = torch.inf
     needless = least(harms.amax(0), share)
     keep = (~needless | needless.all()).nonzero()[:, 0]

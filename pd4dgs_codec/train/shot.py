@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import overload
 
 import torch
 
@@ -31,7 +32,7 @@ class Shot:
 KEPT_BYTES = 1 << 30
 
 
-class Shots:
+class Shots(Sequence[Shot]):
     """The shots of a data set's views, made when they are asked for and kept as long as KEPT_BYTES hold them."""
 
     def __init__(self, views: Sequence[View], device: torch.device):
@@ -42,7 +43,15 @@ class Shots:
     def __len__(self) -> int:
         return len(self.views)
 
-    def __getitem__(self, index: int) -> Shot:
+    @overload
+    def __getitem__(self, index: int) -> Shot: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[Shot]: ...
+
+    def __getitem__(self, index: int | slice) -> Shot | list[Shot]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
         shot = self._kept.pop(index, None)
         if shot is None:
             shot = Shot.of(self.views[index], self.device)

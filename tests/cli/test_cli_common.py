@@ -13,7 +13,9 @@ from pd4dgs_codec import FORMAT_VERSION, jsonable
 from pd4dgs_codec import __main__ as dispatcher
 from pd4dgs_codec.cli import common, values
 
-VERBS = ("prepare", "train", "encode", "decode", "info", "render", "eval", "bench", "package", "serve", "view")
+VERBS = (
+    "prepare", "train", "encode", "decode", "info", "render", "eval", "bench", "package", "serve", "view", "batch",
+)  # fmt: skip
 
 
 @pytest.mark.parametrize("verb", VERBS)
@@ -59,6 +61,10 @@ USAGE_ERRORS = [
     ("render", ["s.pd4", "-o", "%s.png"]),
     ("render", ["s.pd4", "-o", "%04d-%04d.png"]),
     ("render", ["s.pd4", "-o", "a.gif", "--data", "set", "--orbit", "3"]),
+    ("batch", ["m.jsonl", "-o", "out"]),
+    ("batch", ["m.jsonl", "-o", "out", "--op", "explode"]),
+    ("batch", ["m.jsonl", "-o", "out", "--op", "encode", "--slurm", "partition"]),
+    ("batch", ["scan", "models", "--json"]),
     ("eval", ["s.pd4"]),
     ("eval", ["s.pd4", "set", "--downscale", "half"]),
 ]

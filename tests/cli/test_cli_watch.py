@@ -11,7 +11,7 @@ import pytest
 from pd4dgs_codec.cli import watch
 from pd4dgs_codec.cli.train import main
 from pd4dgs_codec.cli.watch import RESTING_PIXELS, WatchedProgress, camera_of
-from pd4dgs_codec.data import load
+from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.errors import TrainError
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.train.config import TrainConfig

@@ -163,6 +163,24 @@ def test_a_proof_that_does_not_pay_is_not_made():
     assert sizes[1] < sizes[0]
 
 
+def test_in_a_large_scene_the_proof_goes_on_while_what_it_found_pays(monkeypatch):
+    """Anchors that were not looked at count as shown, those before keep what was proven of them."""
+    scene, _ = plan(dead_scene(), EncodeOptions(layers=2, omit="nothing"))
+    whole, asked = shown_gaussians(scene), []
+    monkeypatch.setattr(reach_module, "CHUNK", 1)
+    monkeypatch.setattr(reach_module, "SAMPLE", 2)
+
+    def pays(known, evaluations):
+        asked.append(evaluations)
+        return len(asked) < 3  # before all chunks, the second, the fourth
+
+    shown = shown_gaussians(scene, pays)
+    assert len(asked) == 3 and min(asked[1:]) >= asked[0], "less is found than the first question hoped for"
+    assert (shown | whole == shown).all() and (shown != whole).any() and not shown.all()
+    monkeypatch.undo()
+    assert (shown_gaussians(scene) == whole).all()
+
+
 def test_nothing_that_matters_goes():
     """Of a scene without dead parts only cells that nothing reaches go, and what is kept stays as given."""
     scene = lively_scene()

@@ -224,24 +224,27 @@ def test_verification_notices_lost_rows_and_wrong_values(monkeypatch):
     """What the decoder hands out is compared, not only what it reads."""
     scene = make_scene(0, layers=(0,))
 
-    def last_changed(change):
-        """assemble, with the scene of its second call changed: that of the file, after the one that was meant."""
-        calls = []
+    def changed(name, call, change):
+        """What the encoder imports as `name`, with the result of one call changed."""
+        original, calls = getattr(encoder, name), []
 
-        def changed(*args):
+        def run(*args):
             calls.append(args)
-            return change(assemble(*args)) if len(calls) == 2 else assemble(*args)
+            return change(original(*args)) if len(calls) == call else original(*args)
 
-        return changed
+        return run
 
-    assemble = encoder.assemble
-    for message, change in (
-        ("layers and rows", lambda s: replace(s, rows=(s.rows[0] + 1,))),
-        ("layer 0 decodes to other values", lambda s: replace(s, feature=s.feature + np.float32(1))),
+    def louder(blocks):
+        return [(rows, {name: x + np.float32(1) for name, x in values.items()}) for rows, values in blocks]
+
+    for message, name, call, change in (
+        ("layers and rows", "outline", 2, lambda s: replace(s, rows=(s.rows[0] + 1,))),  # after the one that was meant
+        ("layer 0 decodes to other values", "attribute_blocks", 3, louder),  # after the bounds and the errors
     ):
-        monkeypatch.setattr(encoder, "assemble", last_changed(change))
-        with pytest.raises(EncodeError, match=f"verification: .*{message}"):
-            encode(scene)
+        with monkeypatch.context() as patched:
+            patched.setattr(encoder, name, changed(name, call, change))
+            with pytest.raises(EncodeError, match=f"verification: .*{message}"):
+                encode(scene)
 
 
 @pytest.mark.parametrize("verify", [True, False])

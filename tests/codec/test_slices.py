@@ -18,7 +18,7 @@ from pd4dgs_codec.codec.decoder import decode_partial
 from pd4dgs_codec.codec.encoder import encode_with_report
 from pd4dgs_codec.codec.header import CHUNKS, pack_header, scene_id_of, unpack_header
 from pd4dgs_codec.codec.info import hashes, info
-from pd4dgs_codec.codec.stream import open_stream
+from pd4dgs_codec.codec.stream import every_prefix, open_stream
 from pd4dgs_codec.errors import ChecksumMismatch, DecodeError, EncodeError, LimitExceeded, Malformed, Truncated
 from pd4dgs_codec.morton import morton_order
 
@@ -65,7 +65,7 @@ def test_all_slices_are_what_one_slice_per_layer_holds():
 def test_every_prefix_of_slices_is_a_scene_by_every_door():
     """Cut off, as a file of its own, from a stream: the same scene, of rows that the whole has too."""
     whole, (header, chunks, ends) = decode(sliced()), chunks_of(sliced())
-    streamed = open_stream().feed(sliced())
+    streamed = list(every_prefix(sliced()))
     assert len(streamed) == len(ends)
     rows = {tuple(q): i for i, q in enumerate(whole.anchor_q.tolist())}
     for count, (end, from_stream) in enumerate(zip(ends, streamed, strict=True), start=1):
@@ -167,6 +167,19 @@ def test_slices_that_cannot_be_are_refused(monkeypatch):
         encode(scene(), effort=1, slices=2000)
 
 
+def test_a_thousand_slices_at_once_make_one_scene():
+    """Else 10 kB with 8,192 rows in 60 slices ask a stream for 83 MB, and 131 kB in 1,000 slices for 17 times that."""
+    header, chunks, ends = chunks_of(sliced())
+    last = max(i for i, (layer, _, _) in enumerate(chunks) if layer == 0)
+    stream = open_stream()
+    scenes = stream.feed(sliced())
+    assert [scene.layers[-1] for scene in scenes] == sorted({layer for layer, *_ in chunks}) and stream.slices == len(
+        ends
+    )
+    assert_same_scene(scenes[0], decode(sliced(), max_bytes=ends[last]))
+    assert_same_scene(scenes[-1], decode(sliced()))
+
+
 def test_flags_number_as_many_slices_as_a_file_may_have_chunks():
     assert slice_flags(MAX_CHUNKS - 1, MAX_CHUNKS) < 1 << 16
     assert CHUNKS == 1
@@ -181,7 +194,7 @@ def test_every_prefix_renders_finite_pictures():
     viewmat[2, 3] = 3.0
     camera = Camera(viewmat, np.array([[20, 0, 12], [0, 20, 8], [0, 0, 1]], np.float32), 24, 16)
     pictures = []
-    for prefix in open_stream().feed(sliced()):
+    for prefix in every_prefix(sliced()):
         pictures.append(render_image(from_scene(prefix), prefix.level, 0.3, camera))
         assert np.isfinite(pictures[-1]).all()
     assert (pictures[0] != pictures[-1]).any()

@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from pd4dgs_codec.data import Dataset, View
 from pd4dgs_codec.data.files import shrink_image, shrink_mask
+from pd4dgs_codec.data.view import Dataset, View
 
 FACTORS = (1, 2)  #: resolutions written; extra.json names the first as the dataset's own
 

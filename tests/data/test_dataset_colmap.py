@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pd4dgs_codec.data import load
+from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.data.synthetic import read_synthetic
 from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.errors import DataError

@@ -11,7 +11,8 @@ import pytest
 from PIL import Image
 from test_dataset_colmap import _quaternion
 
-from pd4dgs_codec.data import frame_cache, load
+from pd4dgs_codec.data import frame_cache
+from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.data.synthetic import read_synthetic
 from pd4dgs_codec.data.transforms import OPENGL_TO_OPENCV
 from pd4dgs_codec.data.view import Dataset

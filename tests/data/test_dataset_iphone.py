@@ -8,8 +8,10 @@ import pytest
 from iphone_export import export_iphone
 from PIL import Image
 
-from pd4dgs_codec.data import Dataset, View, load, synthetic
+from pd4dgs_codec.data import synthetic
+from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.data.iphone import read_cameras
+from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DataError
 
 

@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pd4dgs_codec.data import frame_cache, load
+from pd4dgs_codec.data import frame_cache
+from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.data.synthetic import read_synthetic
 from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.errors import DataError

@@ -7,7 +7,7 @@ import pytest
 from dataset_pictures import pose
 from PIL import Image
 
-from pd4dgs_codec.data import load
+from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.errors import DataError
 
 #: A lens that sees nothing: its picture lies thousands of pixels off the axis.
@@ -96,3 +96,23 @@ def test_test_views_that_were_never_covisible_do_not_count(tmp_path):
     dataset = load(tmp_path)
     assert [view.name for view in dataset.test] == ["1_00001"] and dataset.left_out == ("1_00000",)
     assert dataset.masked
+
+
+def test_a_dataset_is_read_only(blender):
+    """Nothing is written beside it: it may lie on a medium that cannot be written to."""
+    folder = blender()
+    files = sorted(folder.iterdir())
+    for path in (*files, folder):
+        path.chmod(0o555 if path is folder else 0o444)  # root may write all the same, which the times show
+
+    def state():
+        return [(path, path.stat().st_mtime_ns, path.stat().st_size) for path in (folder, *sorted(folder.iterdir()))]
+
+    before = state()
+    try:
+        dataset = load(str(folder))
+        for view in (*dataset.train, *dataset.test):
+            assert view.image.size
+        assert state() == before
+    finally:
+        folder.chmod(0o755)

@@ -5,8 +5,8 @@ import hashlib
 import numpy as np
 import pytest
 
-from pd4dgs_codec.data import load
 from pd4dgs_codec.data import synthetic as syn
+from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.data.raycast import NO_BODY, Eye, enter, place
 from pd4dgs_codec.data.scenes import MOTIONS, SceneBuilder
 

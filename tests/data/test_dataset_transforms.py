@@ -8,7 +8,7 @@ import pytest
 from dataset_pictures import gradient, pose
 from PIL import Image
 
-from pd4dgs_codec.data import load
+from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.errors import DataError
 
 

@@ -91,6 +91,9 @@ def test_a_page_of_another_site_may_fetch_and_resume(port, folder, scene_bytes):
     whole = ask(port)
     assert whole.read() == scene_bytes and whole.headers["Content-Type"] == "application/octet-stream"
     assert whole.headers["Access-Control-Allow-Origin"] == "*"
+    assert whole.headers["Cache-Control"] == "no-cache"
+    (folder / "scene-0123456789abcdef.pd4").write_bytes(scene_bytes)
+    assert "immutable" in ask(port, "HEAD", "/scene-0123456789abcdef.pd4").headers["Cache-Control"]
     part = ask(port, Range="bytes=5-9", If_Range=whole.headers["ETag"])
     assert part.status == 206 and part.read() == scene_bytes[5:10]
     assert "Content-Range" in part.headers["Access-Control-Expose-Headers"]

@@ -6,6 +6,7 @@ import os
 import random
 import struct
 import time
+from collections import Counter
 from functools import cache, partial
 from pathlib import Path
 from types import SimpleNamespace
@@ -14,15 +15,17 @@ import fuzz
 import numpy as np
 import pytest
 from fuzzing import check, damage, files, mutate
-from strategies import make_scene
+from strategies import assert_same_scene, make_scene
 
 from pd4dgs_codec import decode, encode
+from pd4dgs_codec.codec.attribute_section import CONTINUED
 from pd4dgs_codec.codec.decoder import decode_layers
 from pd4dgs_codec.codec.layer_meta import NETWORKS, ROWS, SCALES, Section
+from pd4dgs_codec.codec.metadata import CHUNK_TYPE
 from pd4dgs_codec.codec.stages import PLAIN, STAGED
 from pd4dgs_codec.entropy.priors import FIRST_REUSE, FREE_ENTRIES, GAUSS, MAX_WINDOW
 from pd4dgs_codec.entropy.varint import put_varint
-from pd4dgs_codec.errors import DecodeError, LimitExceeded
+from pd4dgs_codec.errors import DecodeError, EncodeError, LimitExceeded
 
 
 @cache
@@ -166,9 +169,22 @@ def test_a_file_that_once_broke_a_promise(limit):
 
 def test_damage_and_cuts_of_a_file_are_noticed():
     data = [bytes_of("all-heads"), encode(make_scene(9, anchors=200, extent=9), layers=2, effort=1)]
-    outcomes, findings = damage.damage(data, 0, 1500)
+    outcomes, findings = damage.damage([*data, bytes_of("sliced"), bytes_of("valid/slices-classes")], 0, 1500)
     assert not findings
     assert {"ChecksumMismatch", "Truncated", "Malformed"} <= set(outcomes)
+
+
+def test_a_slice_is_read_behind_those_that_are_known():
+    """Its payload repaired after damage: the decoder is not given another one's symbols, nor priors that are none."""
+    data = bytes_of("valid/slices-continued")
+    parts = files.take_apart(data)
+    parts.chunks[4].meta[64] = 1  # means nothing
+    other = files.put_together(parts)
+    with damage.whole_payloads_known([data]) as originals:
+        got = decode(other)
+        with pytest.raises(check.Finding, match="damaged file decodes"):
+            damage.check_change(other, originals)
+    assert_same_scene(got, decode(other))
 
 
 # -- the fuzzer sees what it is to see ---------------------------------------------------------------------------------
@@ -196,7 +212,8 @@ def test_seeds_use_both_forms_of_both_sections_and_stages_come_apart():
         sections = {
             chunk.sections[number]: files.take_stages(chunk, number) for chunk in chunks if number in chunk.sections
         }
-        staged = {data: taken for data, taken in sections.items() if data[0] == STAGED}
+        forms = (STAGED, CONTINUED) if number == Section.ATTRIBUTES else (STAGED,)
+        staged = {data: taken for data, taken in sections.items() if data[0] in forms}
         assert staged and any(data[0] == PLAIN for data in sections)
         for data, taken in staged.items():
             assert taken.packed() == data and len(taken.stages) == count
@@ -216,6 +233,46 @@ def test_a_change_in_a_stage_leaves_the_other_stages_as_they_were():
             same = [a == b for a, b in zip(before.stages, after.stages, strict=True)]
             assert same[: int(place)] + same[int(place) + 1 :] == [True] * 7 and after.block == before.block
     assert seen == {"block", *"01234567"}
+
+
+def test_seeds_have_slices_classes_widths_and_metadata():
+    parts = {seed.name: files.take_apart(seed.data) for seed in seeds()}
+    sliced = {name: p for name, p in parts.items() if len(p.chunks) > len({chunk.type for chunk in p.chunks})}
+    forms = {c.sections[Section.ATTRIBUTES][0] for p in sliced.values() for c in p.chunks if c.meta[ROWS]}
+    assert forms == {PLAIN, STAGED, CONTINUED} and "sliced" in sliced
+    widths = {chunk.widths for p in parts.values() for chunk in p.chunks if chunk.meta}
+    assert len(widths) > 4 and any(w.graded and w.slots > 10 for w in widths)
+    assert any(p.chunks[0].widths.graded for p in sliced.values())
+    assert any(chunk.type == CHUNK_TYPE for chunk in parts["narrow"].chunks)
+
+
+@pytest.mark.parametrize("name", ["sliced", "valid/slices", "valid/slices-continued", "valid/slices-classes"])
+def test_a_prefix_of_slices_is_what_a_cut_file_may_decode_to(name):
+    data, known = bytes_of(name), files.known_prefixes(seeds())
+    ends = [end for end, is_slice in damage.chunk_ends(data) if is_slice]
+    assert len(next(seed for seed in seeds() if seed.name == name).prefixes) == len(ends) > 2
+    for end in ends:
+        for random_door in range(8):
+            check.examine(mutate.Case(data[: end + 1], False, "cut"), known, random.Random(random_door))
+    for missing in ends[:-1]:
+        with pytest.raises(check.Finding, match="no prefix of a seed"):
+            few = frozenset(known - {files.digests(data[:missing], allow_partial=True)})
+            for random_door in range(8):
+                check.examine(mutate.Case(data[: missing + 1], False, "cut"), few, random.Random(random_door))
+
+
+def test_changes_of_chunks_reach_slices_that_are_numbered_right():
+    parts, other, outcomes = files.take_apart(bytes_of("sliced")), files.take_apart(bytes_of("valid/slices")), Counter()
+    for i in range(150):
+        changed = copy.deepcopy(parts)
+        mutate.chunks(random.Random(i), changed, other, [])
+        try:
+            decode(files.put_together(changed))
+        except (DecodeError, EncodeError) as error:
+            outcomes[str(error).partition(":")[0]] += 1
+        else:
+            outcomes["decoded"] += 1
+    assert outcomes["decoded"] > 5 and any("holds more than one anchor" in outcome for outcome in outcomes)
 
 
 def raising(error):
@@ -276,7 +333,7 @@ def test_a_reference_decoder_that_differs_is_a_finding(monkeypatch, change):
     reference = check._reference()
     true = reference.hashes
     monkeypatch.setattr(reference, "hashes", lambda data: change(true(data)))
-    assert "reference" in names(fuzz.run_inputs(seeds(), 1, 0, 30, reference=1))
+    assert "reference" in names(fuzz.run_inputs(seeds(), 1, 0, 90, reference=1))
 
 
 def test_a_file_that_only_we_decode_is_a_finding(monkeypatch):

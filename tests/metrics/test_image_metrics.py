@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.metrics import mean_image_baseline, mpsnr, mssim, to_uint8
+from pd4dgs_codec.metrics.image import mean_image_baseline, mpsnr, mssim, to_uint8
 
 
 def random_pair(h=15, w=17, seed=0):

@@ -9,7 +9,7 @@ import torch
 import torch.nn.functional as F
 
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.metrics import Distance, load_perceptual
+from pd4dgs_codec.metrics.perceptual import Distance, load_perceptual
 
 MEAN_DIFFERENCE = Distance("mean difference", "by hand", lambda a, b: np.abs(a - b).mean(axis=2), least=2)
 

@@ -10,10 +10,9 @@ from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.info import hashes, info, metadata_of
 from pd4dgs_codec.codec.options import EncodeOptions
 from pd4dgs_codec.data.view import View
+from pd4dgs_codec.model.utility import utility, without
 from pd4dgs_codec.pack.packing import Views, pack
-from pd4dgs_codec.pack.utility import utility, without
 from pd4dgs_codec.scene import Camera
-from pd4dgs_codec.view.frames import Frame
 
 SLICED = EncodeOptions(effort=1, slices=1500)
 
@@ -61,7 +60,7 @@ def test_views_held_out_are_scored_after_each_slice(scene):
 
 
 def test_anchors_that_show_nothing_are_worth_least(scene):
-    values = utility(scene, [Frame(camera(), 0.0), Frame(camera(), 1.0)])
+    values = utility(scene, [(camera(), 0.0), (camera(), 1.0)])
     assert values.shape == (len(scene.anchor_q),) and np.isfinite(values).all()
     hidden = scene.mask[-1] == 0
     assert hidden.any() and (values > 0).any() and (values[hidden] == 0).all()

@@ -3,7 +3,7 @@
 import pytest
 from tiny import TINY, disc
 
-from pd4dgs_codec.data import Dataset
+from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.model.config import PRESETS
 
 

@@ -38,7 +38,7 @@ def trained(dataset, finished):
     """A trainer after that run, and its shots."""
     trainer = Trainer(UNPRUNED, dataset)
     trainer.resume(finished)
-    return trainer, [trainer.learner.shots[i] for i in range(len(trainer.learner.shots))]
+    return trainer, trainer.learner.shots
 
 
 def _pictures(trainer, level: int) -> list[np.ndarray]:

@@ -9,23 +9,26 @@ from __future__ import annotations
 
 import random
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass, field, replace
 from typing import Any
 
 import numpy as np
 from vectors import blocks
+from vectors.blocks import Known
 
-from fuzzing.check import peak_memory
+from fuzzing.check import memory_bound, peak_memory
 from pd4dgs_codec import decode
+from pd4dgs_codec.attributes.table import NO_CLASSES
 from pd4dgs_codec.entropy.priors import Gauss, Hist, Mixture, Normal, Prior, Window
 from pd4dgs_codec.errors import DecodeError, Pd4Error
 from pd4dgs_codec.morton import morton_order
-from pd4dgs_codec.scene import DEFAULT_WIDTHS, PLANES
+from pd4dgs_codec.scene import DEFAULT_WIDTHS, PLANES, Widths
 
 PRIORS = ("const", "gauss", "mixture", "hist", "scaled", "exceptions")
 LARGEST = 1 << 18  #: bytes of a file that is kept: what is dear by the byte shows in small ones
 MOST_SYMBOLS = (1 << 22) + 64 * LARGEST  #: fewer than clause 6.5 allows, so that many files are tried
+MOST_SLICES = 64  #: of a layer, so that many files are tried: what a slice costs besides shows in a few
 #: What a file may cost, in seconds of a processor of 2023 and in bytes of memory: once, and for each of its bytes. The
 #: symbols of clause 6.5 at 48 bytes and some 0.1 microseconds each.
 SECONDS, MEMORY = (0.4, 100e-6), (48 << 22, 48 << 10)
@@ -46,7 +49,8 @@ class Coded:
 @dataclass(frozen=True)
 class LayerRecipe:
     """A layer. scales: (channels, x, y, z, t) each, all of as many channels. terms: of each predicted channel. spread:
-    voxels between anchors. widths: of hidden layers."""
+    voxels between anchors. widths: of hidden layers. slices: among which the anchors are divided, some of them empty.
+    redefined: later slices define priors of their own."""
 
     anchors: int = 1
     spread: int = 1
@@ -56,22 +60,29 @@ class LayerRecipe:
     predictor: int = 0
     planes: Coded = Coded()
     widths: tuple[int, ...] = ()
+    slices: int = 1
+    redefined: bool = False
 
 
 @dataclass(frozen=True)
 class Recipe:
-    """A file."""
+    """A file. feature, slots: the widths of its anchors. graded: whether they have step classes."""
 
     layers: tuple[LayerRecipe, ...] = (LayerRecipe(),)
+    feature: int = DEFAULT_WIDTHS.feature
+    slots: int = DEFAULT_WIDTHS.slots
+    graded: bool = False
 
 
 @dataclass(order=True)
 class Found:
-    """What a recipe costs: `share` is that of the seconds or of the memory that a file of its length may cost."""
+    """What a recipe costs: `share` is that of the seconds or of the memory that a file of its length may cost. bound:
+    the most memory that decoding it may take (clause 15), 0 where none was measured."""
 
     share: float
     seconds: float = field(compare=False)
     memory: int = field(compare=False)
+    bound: int = field(compare=False)
     data: bytes = field(compare=False, repr=False)
     recipe: Recipe = field(compare=False)
 
@@ -82,6 +93,7 @@ class Found:
             "bytes": len(self.data),
             "seconds": round(self.seconds, 3),
             "memory": self.memory,
+            "bound": self.bound,
             "recipe": asdict(self.recipe),
         }
 
@@ -91,52 +103,81 @@ class Found:
 
 def build(recipe: Recipe) -> bytes:
     """The file. Raises Pd4Error or ValueError where the parts of a recipe exclude each other."""
-    if sum(_symbols(layer) for layer in recipe.layers) > MOST_SYMBOLS:
+    widths = Widths(recipe.feature, recipe.slots, recipe.graded)
+    if sum(_symbols(layer, widths) for layer in recipe.layers) > MOST_SYMBOLS:
         raise ValueError("more symbols than a file of LARGEST bytes may declare")
-    layers, before = [], 0
+    slices, before = list[blocks.Layer](), 0
     for number, layer in enumerate(recipe.layers):
-        layers.append(_layer(number, layer, before))
+        slices += _slices(number, layer, before, widths)
         before += layer.anchors
-    return blocks.make_file(*layers).data()
+    return blocks.make_file(*slices).data()
 
 
-def _symbols(layer: LayerRecipe) -> int:
+def _symbols(layer: LayerRecipe, widths: Widths) -> int:
     planes = sum(s[0] * s[1 + a] * s[1 + b] for s in layer.scales for _, a, b in PLANES)
-    return planes + layer.anchors * DEFAULT_WIDTHS.channels
+    return planes + layer.anchors * widths.channels
 
 
-def _layer(number: int, recipe: LayerRecipe, before: int) -> blocks.Layer:
-    cells = _cells(recipe.anchors, recipe.spread, number)
+def _slices(number: int, recipe: LayerRecipe, before: int, widths: Widths) -> Iterator[blocks.Layer]:
+    """The slices of a layer. Later ones go on with the block of the first one and, unless redefined, its priors."""
     scales = [blocks.Scale(s[0], s[1:], (recipe.predictor,) * 6, lambda _, shape: np.zeros(shape, np.int32))
               for s in recipe.scales if number > 0]  # fmt: skip
     networks = {0: (*recipe.widths, 3), 1: (3,)} if scales else None
-    layer = blocks.make_layer(number, cells, before=before, scales=scales, networks=networks)
-    sections: dict[int, bytes | None] = {}
-    if recipe.anchors:
-        sections[blocks.ATTRIBUTE] = _attributes(layer.meant.attributes, recipe)
-    if scales:
-        planes = [p for scale in scales for p in scale.planes().values()]
-        sections[blocks.PLANE] = _planes(planes, recipe.planes)
-    return layer.with_sections(sections)
+    plain, stages, first = Known(), [Known() for _ in range(8)], None
+    for index, cells in enumerate(np.array_split(_cells(recipe.anchors, recipe.spread, number), recipe.slices)):
+        ordered = cells[morton_order(cells)]
+        own: dict[str, Any] = {"networks": {}} if index else {"networks": networks, "scales": scales, "before": before}
+        classes = np.arange(len(cells)) % 7 if widths.graded else None
+        layer = blocks.make_layer(number, ordered, widths=replace(widths, graded=False), classes=classes, **own)
+        sections: dict[int, bytes | None] = {}
+        if len(cells):
+            symbols, grades = _filled(layer.meant.attributes, recipe.attributes), layer.meant.classes
+            if recipe.attributes.staged:
+                written = _staged(symbols, grades, recipe, first, stages, widths)
+                first = first or (symbols, grades)
+            else:
+                shift = index * recipe.redefined
+                written = b"\0" + blocks.graded_part(grades) + _channels(
+                    _by_class(symbols, grades), recipe.attributes, plain, shift)  # fmt: skip
+            sections[blocks.ATTRIBUTE] = written
+        if scales and not index:
+            planes = [p for scale in scales for p in scale.planes().values()]
+            sections[blocks.PLANE] = _planes(planes, recipe.planes)
+        yield layer.with_sections(sections)
 
 
 def _cells(count: int, spread: int, number: int) -> np.ndarray:
     """int32 [count, 3] in Morton order, `spread` voxels apart on a cube's corners."""
     side = max(1, round(count ** (1 / 3)) + 1)
     index = np.arange(count)
-    cells = np.stack([index % side, index // side % side, index // side**2], axis=1) * spread + number
+    cells = np.stack([index % side, index // side % side, index // side**2], axis=1) * spread
+    cells[:, 2] += number << 18  # where no layer before has any
     if np.abs(cells).max(initial=0) > 1 << 20:
         raise ValueError("the voxels do not fit")
     return cells[morton_order(cells)].astype(np.int32)
 
 
-def _attributes(symbols: np.ndarray, recipe: LayerRecipe) -> bytes:
-    coded = recipe.attributes
-    if not coded.staged:
-        return b"\0" + _channels(list(_filled(symbols, coded)), coded)
-    terms = {c: [(j, 0) for j in range(min(c, recipe.terms))] for c in range(1, 38)}
-    splits = {i: (3, 2, 2) for i in range(symbols.shape[1] and 10)}
-    return blocks.predicted_attributes(_filled(symbols, coded), terms, splits, (coded.classes,) * 5)
+def _by_class(symbols: np.ndarray, grades: np.ndarray) -> list[np.ndarray]:
+    """The channels, each in its step classes if there are any."""
+    return [channel[grades == c] for channel in symbols for c in range(7)] if grades.size else list(symbols)
+
+
+def _staged(
+    symbols: np.ndarray,
+    grades: np.ndarray,
+    recipe: LayerRecipe,
+    first: tuple[np.ndarray, np.ndarray] | None,
+    known: Sequence[Known],
+    widths: Widths,
+) -> bytes:
+    """Form 1, or form 2 behind the slice with the attributes and step classes `first`."""
+    terms = {c: [(j, 0) for j in range(min(c, recipe.terms))] for c in range(1, widths.predicted)}
+    splits = {i: (3, 2, 2) for i in range(widths.slots)}
+    classes = (recipe.attributes.classes,) * (6 if widths.graded else 5)
+    of, of_grades = first or (None, NO_CLASSES)
+    return blocks.predicted_attributes(
+        symbols, terms, splits, classes, widths=widths, grades=grades, known=known, of=of, of_grades=of_grades
+    )
 
 
 def _planes(planes: Sequence[np.ndarray], coded: Coded) -> bytes:
@@ -153,10 +194,12 @@ def _filled(symbols: np.ndarray, coded: Coded) -> np.ndarray:
     return symbols
 
 
-def _channels(channels: Sequence[np.ndarray], coded: Coded) -> bytes:
-    section = blocks.Channels()
+def _channels(channels: Sequence[np.ndarray], coded: Coded, known: Known | None = None, shift: int = 0) -> bytes:
+    """shift: makes the priors differ from those of other slices."""
+    section = blocks.Channels(known)
     for i, channel in enumerate(channels):
-        section.add(channel, _prior(coded, i if coded.own else 0, int(channel[-1])) if channel.size else None)
+        number = shift + (i if coded.own else 0)
+        section.add(channel, _prior(coded, number, int(channel[-1])) if channel.size else None)
     return section.done()
 
 
@@ -190,12 +233,38 @@ def changed(rng: random.Random, recipe: Recipe) -> Recipe:
         else:
             at = rng.randrange(len(layers))
             layers[at] = _changed_layer(rng, layers[at])
-        recipe = Recipe(tuple(layers))
+        recipe = replace(recipe, layers=tuple(layers))
+        if rng.random() < 0.15:
+            recipe = _changed_widths(rng, recipe)
     return recipe
 
 
+def _changed_widths(rng: random.Random, recipe: Recipe) -> Recipe:
+    what = rng.choice(("feature", "slots", "graded"))
+    choices: dict[str, Callable[[], Any]] = {
+        "feature": lambda: rng.choice((1, 2, 32, 64)),
+        "slots": lambda: rng.choice((1, 4, 10, 16)),
+        "graded": lambda: not recipe.graded,
+    }
+    return replace(recipe, **{what: choices[what]()})
+
+
 def _changed_layer(rng: random.Random, layer: LayerRecipe) -> LayerRecipe:
-    what = rng.choice(("anchors", "spread", "attributes", "terms", "scales", "scales", "predictor", "planes", "widths"))
+    what = rng.choice(
+        (
+            "anchors",
+            "spread",
+            "attributes",
+            "terms",
+            "scales",
+            "scales",
+            "predictor",
+            "planes",
+            "widths",
+            "slices",
+            "redefined",
+        )  # fmt: skip
+    )
     if what in ("attributes", "planes"):
         return replace(layer, **{what: _changed_coded(rng, getattr(layer, what))})
     if what == "scales":
@@ -206,6 +275,8 @@ def _changed_layer(rng: random.Random, layer: LayerRecipe) -> LayerRecipe:
         "terms": lambda: rng.choice((0, 1, 8, 37)),
         "predictor": lambda: rng.randrange(6),
         "widths": lambda: tuple(rng.choice((1, 16, 64, 1024)) for _ in range(rng.randrange(4))),
+        "slices": lambda: _scaled(rng, layer.slices, MOST_SLICES),
+        "redefined": lambda: not layer.redefined,
     }
     return replace(layer, **{what: choices[what]()})
 
@@ -259,9 +330,9 @@ def measured(recipe: Recipe, of_memory: bool) -> Found | None:
         seconds = time.process_time() - start
     except DecodeError:
         return None
-    memory = peak_memory(data) if of_memory else 0
+    memory, bound = (peak_memory(data), memory_bound(data)) if of_memory else (0, 0)
     (once, per_byte), cost = (MEMORY, memory) if of_memory else (SECONDS, seconds)
-    return Found(cost / (once + per_byte * len(data)), seconds, memory, data, recipe)
+    return Found(cost / (once + per_byte * len(data)), seconds, memory, bound, data, recipe)
 
 
 def search(

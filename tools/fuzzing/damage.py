@@ -6,12 +6,16 @@ megabyte take a millisecond or two each.
 
 from __future__ import annotations
 
+import itertools
 import random
+import weakref
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from typing import Any
 from unittest import mock
+
+import numpy as np
 
 from fuzzing.check import DECODED, Finding
 from fuzzing.mutate import CHANGES, truncate
@@ -19,35 +23,62 @@ from pd4dgs_codec.bitstream.container import CHUNK_OVERHEAD, read_preamble
 from pd4dgs_codec.codec import decoder
 from pd4dgs_codec.codec.header import unpack_header
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
-from pd4dgs_codec.codec.symbols import LayerSymbols
+from pd4dgs_codec.codec.symbols import LayerSymbols, merged
 from pd4dgs_codec.errors import DecodeError, Truncated
 
 BOUNDARY = 8  #: bytes to each side of a boundary
 CUTS_PER_CHANGE = 0.02
 
-Layers = Sequence[LayerSymbols]
+Slices = Sequence[LayerSymbols]
+
+
+class _Payloads:
+    """A read_layer that remembers what payloads hold. A slice is read with the Past of its layer's slices before, so it
+    is known by their payloads and its own."""
+
+    def __init__(self) -> None:
+        self._read = decoder.read_layer  # type: ignore[attr-defined]
+        self._known: dict[Any, LayerSymbols] = {}
+        self._before = weakref.WeakKeyDictionary[Any, tuple[Any, ...]]()
+
+    def remember(self, payload: bytes, kind: Any, *rest: Any) -> LayerSymbols:
+        return self._known.setdefault(self._key(payload, kind, rest), self._read(payload, kind, *rest))
+
+    def recall(self, payload: bytes, kind: Any, *rest: Any) -> LayerSymbols:
+        past, before = rest[-1], self._before.get(rest[-1], ()) if rest[-1] else ()
+        found = self._known.get(self._key(payload, kind, rest))
+        if found is None:
+            for arguments in before:  # which were recalled, so that their priors are not in `past` yet
+                self._read(*arguments, past)
+            found = self._read(payload, kind, *rest)
+        return found
+
+    def _key(self, payload: bytes, kind: Any, rest: Sequence[Any]) -> Any:
+        *rest, past = rest
+        before = self._before.get(past, ()) if past else ()
+        if past:
+            self._before[past] = (*before, (payload, kind, *rest))
+        return (payload, kind.layer, *rest, *(arguments[0] for arguments in before))
 
 
 @contextmanager
-def whole_payloads_known(files: Sequence[bytes]) -> Iterator[Mapping[bytes, Layers]]:
-    """The layers of each file; while this holds, the decoder takes those of an unchanged payload from here."""
-    known: dict[Any, LayerSymbols] = {}
-    read_layer = decoder.read_layer  # type: ignore[attr-defined]
+def whole_payloads_known(files: Sequence[bytes]) -> Iterator[Mapping[bytes, Slices]]:
+    """The slices of each file; while this holds, the decoder takes those of an unchanged payload from here."""
+    payloads = _Payloads()
+    with mock.patch.object(decoder, "read_layer", payloads.remember):
+        slices = {data: list(_slices(data)) for data in files}
+    with mock.patch.object(decoder, "read_layer", payloads.recall):
+        yield slices
 
-    def remember(payload: bytes, kind: Any, *rest: Any) -> LayerSymbols:
-        return known.setdefault((payload, kind.layer, *rest), read_layer(payload, kind, *rest))
 
-    def recall(payload: bytes, kind: Any, *rest: Any) -> LayerSymbols:
-        return known.get((payload, kind.layer, *rest)) or read_layer(payload, kind, *rest)
-
-    with mock.patch.object(decoder, "read_layer", remember):
-        layers = {data: decoder.decode_layers(data)[1] for data in files}
-    with mock.patch.object(decoder, "read_layer", recall):
-        yield layers
+def _slices(data: bytes) -> Iterator[LayerSymbols]:
+    reader = decoder.LayerReader()
+    while reader.next_slice(data):
+        yield reader.latest
 
 
 def chunk_ends(data: bytes) -> list[tuple[int, bool]]:
-    """(offset of the first byte after it, whether it is a layer) of header and chunks."""
+    """(offset of the first byte after it, whether it is a slice) of header and chunks."""
     preamble = read_preamble(data)
     ends = [(preamble.size, False)]
     for kind, length in unpack_header(preamble.header).chunks:
@@ -55,7 +86,7 @@ def chunk_ends(data: bytes) -> list[tuple[int, bool]]:
     return ends
 
 
-def check_change(data: bytes, originals: Mapping[bytes, Layers]) -> str:
+def check_change(data: bytes, originals: Mapping[bytes, Slices]) -> str:
     """What a damaged file ends in; Finding if it decodes and is none of the originals."""
     try:
         decoder.decode_layers(data)
@@ -66,9 +97,10 @@ def check_change(data: bytes, originals: Mapping[bytes, Layers]) -> str:
     return DECODED
 
 
-def check_cut(data: bytes, size: int, layers: Layers, ends: Sequence[tuple[int, bool]]) -> str:
-    """A cut file is Truncated, and with allow_partial its whole layers and no others come back, flagged."""
-    whole = sum(end <= size for end, is_layer in ends if is_layer)
+def check_cut(data: bytes, size: int, slices: Slices, ends: Sequence[tuple[int, bool]]) -> str:
+    """A cut file is Truncated, and with allow_partial its whole slices and no others come back, flagged."""
+    whole = slices[: sum(end <= size for end, is_slice in ends if is_slice)]
+    layers = [merged(list(of_layer)) for _, of_layer in itertools.groupby(whole, key=lambda part: part.kind)]
     cut = data[:size]
     try:
         decoder.decode_layers(cut)
@@ -80,9 +112,15 @@ def check_cut(data: bytes, size: int, layers: Layers, ends: Sequence[tuple[int, 
         _, got, complete = decoder.decode_layers(cut, allow_partial=True)
     except Truncated:
         got, complete = [], False
-    if complete or len(got) != whole or any(a is not b for a, b in zip(got, layers, strict=False)):
-        raise Finding("silent", f"the first {size} bytes give {len(got)} layers, complete {complete}; meant {whole}")
+    if complete or len(got) != len(layers) or not all(map(_alike, got, layers)):
+        meant = f"{len(whole)} slices of {len(layers)} layers"
+        raise Finding("silent", f"the first {size} bytes give {len(got)} layers, complete {complete}; meant {meant}")
     return Truncated.__name__
+
+
+def _alike(a: LayerSymbols, b: LayerSymbols) -> bool:
+    """Whether two layers hold the same. One of a single slice is the slice itself."""
+    return a is b or all(np.array_equal(x, y) for x, y in zip(a.arrays(), b.arrays(), strict=True))
 
 
 def damage(files: Sequence[bytes], run: int, changes: int) -> tuple[Counter[str], list[str]]:

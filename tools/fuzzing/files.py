@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from strategies import LAYER_SETS, RANGES, make_scene
-from vectors import blocks
+from vectors import blocks, slices
 
 from pd4dgs_codec import encode
 from pd4dgs_codec.attributes.quantise import dequantise
@@ -23,9 +23,10 @@ from pd4dgs_codec.bitstream import canonical
 from pd4dgs_codec.bitstream.container import read_chunk, read_preamble, write_chunk, write_preamble
 from pd4dgs_codec.codec import attribute_section, layer_meta, stages
 from pd4dgs_codec.codec import header as header_module
-from pd4dgs_codec.codec.decoder import decode_layers
+from pd4dgs_codec.codec.decoder import LayerReader, decode_layers
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
 from pd4dgs_codec.codec.layer_meta import Section
+from pd4dgs_codec.codec.metadata import Metadata
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint
 from pd4dgs_codec.errors import DecodeError
 from pd4dgs_codec.scene import DEFAULT_WIDTHS, Scene, Widths
@@ -70,7 +71,8 @@ def take_apart(data: bytes) -> Parts:
     chunks, offset = [], preamble.size
     while offset < len(data):
         chunk = read_chunk(data, offset)
-        part = Chunk(chunk.type, chunk.flags, chunk.payload, widths=Widths(*header[header_module.WIDTHS]))
+        widths = Widths(*header[header_module.WIDTHS], graded=header_module.CENTRE in header)
+        part = Chunk(chunk.type, chunk.flags, chunk.payload, widths=widths)
         if chunk.type in BY_CHUNK_TYPE:
             (length,) = struct.unpack_from("<I", chunk.payload)
             part.meta, at = canonical.unpack(chunk.payload[4 : 4 + length]), 4 + length
@@ -117,12 +119,15 @@ class Staged:
 def take_stages(chunk: Chunk, number: int) -> Staged | None:
     """The stages of a section; None if it has none or is not valid."""
     data = (chunk.sections or {}).get(number, b"")
-    if number not in (Section.ATTRIBUTES, Section.PLANES) or data[:1] != bytes([stages.STAGED]):
-        return None
     try:
         reader = ByteReader(data)
-        reader.byte("the form")
-        count = _pass_block(reader, chunk, number)
+        form = reader.byte("the form")
+        if number == Section.ATTRIBUTES and form in (stages.STAGED, attribute_section.CONTINUED):
+            count = _pass_attributes(reader, chunk.widths, form)
+        elif number == Section.PLANES and form == stages.STAGED:
+            count = _pass_planes(reader, chunk)
+        else:
+            return None
         block = data[: reader.offset]
         lengths = [reader.varint(len(data), "the length of a stage") for _ in range(count - 1)]
     except (DecodeError, LookupError, TypeError):  # the section, or the parameters, were changed before
@@ -131,31 +136,31 @@ def take_stages(chunk: Chunk, number: int) -> Staged | None:
     return Staged(block, [data[start:end] for start, end in itertools.pairwise(bounds)])
 
 
-def _pass_block(reader: ByteReader, chunk: Chunk, number: int) -> int:
+def _pass_attributes(reader: ByteReader, widths: Widths, form: int) -> int:
     """Reads on to the lengths of the stages and returns how many stages there are."""
+    if widths.graded:
+        reader.take(reader.varint(reader.remaining, "the length of the step classes"))
+    if form == stages.STAGED:
+        attribute_section._read_block(reader, widths)
+    return attribute_section.N_STAGES
+
+
+def _pass_planes(reader: ByteReader, chunk: Chunk) -> int:
     assert chunk.meta is not None
-    if number == Section.ATTRIBUTES:
-        for channel in range(1, chunk.widths.predicted):
-            attribute_section._read_terms(reader, chunk.widths, channel)
-        counts = len(attribute_section.STAGES) - 1
-    else:
-        counts = max(1, (chunk.meta[layer_meta.SCALES][0][0] - 1).bit_length()) - 1
-    for stage in range(counts):
+    count: int = max(1, (chunk.meta[layer_meta.SCALES][0][0] - 1).bit_length())
+    for stage in range(1, count):
         stages.read_class_count(reader, stage)
-    if number == Section.PLANES:
-        return counts + 1
-    for _ in range(chunk.widths.slots):
-        attribute_section._read_split(reader)
-    return counts + 3
+    return count
 
 
 @dataclass(frozen=True)
 class Seed:
-    """A valid file. digests: of the header and of each layer, all that is decoded. weight: how often to take it."""
+    """A valid file. prefixes: what each prefix of slices decodes to, as digests of the header and of each layer.
+    weight: how often to take it."""
 
     name: str
     data: bytes
-    digests: tuple[bytes, ...]
+    prefixes: frozenset[tuple[bytes, ...]]
     weight: float
 
 
@@ -178,9 +183,11 @@ def _digests(data: bytes, header: Any, layers: Sequence[Any]) -> tuple[bytes, ..
 
 def as_seed(name: str, data: bytes) -> Seed:
     """A seed of a valid file. Those that decode faster come more often: small ones, those without a tree of cells."""
-    header, layers, _ = decode_layers(data)
-    rows = sum(len(layer.anchor_q) for layer in layers)
-    return Seed(name, data, _digests(data, header, layers), 1.0 / (len(data) + (3000 if rows > 1 else 0)))
+    prefixes, reader = set(), LayerReader()
+    while reader.next_slice(data):
+        prefixes.add(_digests(data, reader.header, reader.layers))
+    rows = sum(len(layer.anchor_q) for layer in reader.layers)
+    return Seed(name, data, frozenset(prefixes), 1.0 / (len(data) + (3000 if rows > 1 else 0)))
 
 
 def built_seeds() -> list[Seed]:
@@ -195,7 +202,7 @@ def built_seeds() -> list[Seed]:
     files["no-anchor"] = encode(make_scene(1, anchors=0, with_camera=False), layers=2, effort=1)
     files["all-heads"] = encode(make_scene(2, anchors=6, scales=2), layers=2, effort=5)
     files["predicted"] = encode(_correlated(60), layers=0, effort=2)
-    files |= _staged()
+    files |= _staged() | _of_other_widths() | _in_slices()
     for mode in ("ans", "lzma"):
         files[f"priors-{mode}"] = encode(_all_priors(), layers=0, effort=5, mode=mode)
     flat = make_scene(3, layers=(0, 1), anchors=0, kind="constant", **{**tiny, "sides": (90, 3, 40, 2), "scales": 2})
@@ -240,6 +247,27 @@ def _staged() -> dict[str, bytes]:
     }
 
 
+def _of_other_widths() -> dict[str, bytes]:
+    """Other feature widths and slots, step classes, and a file that tells of itself."""
+    tiny = {"channels": 1, "width": 1, "hidden": (), "extent": 2}
+    narrow = make_scene(6, anchors=5, widths=Widths(1, 1), **tiny)
+    wide = make_scene(7, layers=(0,), anchors=3, widths=Widths(64, 16, graded=True), **tiny)
+    packed = make_scene(8, layers=(0, 1), anchors=4, widths=Widths(3, 2, graded=True), **tiny)
+    about = Metadata("title", quality={0: 20.5}, still=b"\xff\xd8\xff" + bytes(9), slices=(19.5,))
+    return {
+        "narrow": encode(narrow, layers=2, effort=1, metadata=about),
+        "wide-classes": encode(wide, layers=2, effort=1),
+        "narrow-classes-lzma": encode(packed, layers=2, effort=1, mode="lzma"),
+    }
+
+
+def _in_slices() -> dict[str, bytes]:
+    """Slices in every form, with and without step classes, by hand and as an encoder makes them."""
+    by_hand = itertools.takewhile(lambda v: v.name.startswith("valid/"), slices.cases())
+    scene = make_scene(9, layers=(0, 1), anchors=90, extent=3, hidden=(), widths=Widths(2, 2))
+    return {vector.name: vector.data for vector in by_hand} | {"sliced": encode(scene, layers=2, effort=2, slices=1000)}
+
+
 def _all_priors() -> Scene:
     """No anchors, and weights that are spiky, heavy-tailed, or wide with outliers: a kind of prior for each."""
     rng = np.random.default_rng(0)
@@ -270,5 +298,5 @@ def given_seeds(paths: Iterable[Path]) -> list[Seed]:
 
 
 def known_prefixes(seeds: Sequence[Seed]) -> frozenset[tuple[bytes, ...]]:
-    """The digests of every prefix of layers of every seed: what an unrepaired input may decode to, and nothing else."""
-    return frozenset(seed.digests[:k] for seed in seeds for k in range(2, len(seed.digests) + 1))
+    """The digests of every prefix of slices of every seed: what an unrepaired input may decode to, and nothing else."""
+    return frozenset[tuple[bytes, ...]]().union(*(seed.prefixes for seed in seeds))

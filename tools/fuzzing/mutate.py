@@ -6,6 +6,7 @@ Everything is drawn from the given random.Random, so an input is named by its se
 from __future__ import annotations
 
 import copy
+import itertools
 import random
 import struct
 import zlib
@@ -14,8 +15,16 @@ from dataclasses import dataclass
 from typing import Any
 
 from fuzzing.files import Chunk, Parts, Seed, put_together, take_apart, take_stages
-from pd4dgs_codec.bitstream.container import CHUNK_HEAD_SIZE, SIGNATURE, read_chunk, read_preamble
+from pd4dgs_codec.bitstream.container import (
+    CHUNK_HEAD_SIZE,
+    FLAG_MORE,
+    SIGNATURE,
+    read_chunk,
+    read_preamble,
+    slice_flags,
+)
 from pd4dgs_codec.codec.header import STEPS, VOXEL_SIZE
+from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
 from pd4dgs_codec.entropy.varint import put_varint
 from pd4dgs_codec.errors import EncodeError
 
@@ -251,7 +260,7 @@ def payload_bytes(rng: random.Random, parts: Parts, other: Parts, names: list[st
 
 
 def chunks(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:
-    """Chunks are dropped, doubled, swapped, renumbered, flagged, or come from another file."""
+    """Chunks are dropped, doubled, swapped, of another type, flagged, or come from another file."""
     i, j = rng.randrange(len(parts.chunks)), rng.randrange(len(parts.chunks))
     act = rng.randrange(6)
     if act == 0 and len(parts.chunks) > 1:
@@ -263,10 +272,16 @@ def chunks(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> 
     elif act == 3:
         parts.chunks[i].type = rng.choice((0, 1, 2, 3, 99, 65535))
     elif act == 4:
-        parts.chunks[i].flags ^= 1
+        parts.chunks[i].flags ^= rng.choice((1, FLAG_MORE, slice_flags(1, 1), slice_flags(512, 1)))
     else:
         parts.chunks[i] = copy.deepcopy(rng.choice(other.chunks))
     names.append("chunks")
+    if act != 4 and rng.random() < 0.7:  # else hardly a changed order of slices gets past the flags
+        for kind, run in itertools.groupby(parts.chunks, key=lambda chunk: chunk.type):
+            own = list(run)
+            for number, chunk in enumerate(own if kind in BY_CHUNK_TYPE else ()):
+                chunk.flags = slice_flags(number, len(own))
+        names.append("renumbered")
 
 
 PART_CHANGES = (section_bytes, stage_bytes, section_swap, parameters, header_value, overflow, payload_bytes, chunks)

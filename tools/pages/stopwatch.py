@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import json
 import resource
+import statistics
 import subprocess
 import sys
 import time
@@ -15,6 +16,8 @@ from typing import Any
 
 SIZE = (480, 360)  #: of the picture drawn
 PICTURES = 10
+STEPS = 9  #: of training at each level
+SHARE = 0.55  #: of its run, where a checkpoint is taken to stand
 
 
 def timed(work: Callable[[], Any]) -> tuple[Any, dict[str, float]]:
@@ -40,13 +43,24 @@ def encode(checkpoint: str, file: str, effort: str) -> dict[str, float]:
     return {**seconds, "bytes": len(data), "memory": memory}
 
 
+def symbols_of(scene: Any) -> int:
+    """How many integers a scene was decoded from."""
+    arrays = [scene.anchor_q, *(getattr(scene, name) for name in ("feature", "scaling_log", "offset")), *scene.mask]
+    for layer in range(3):
+        tensors = scene.tensors(layer)
+        arrays += [plane for scale in tensors.planes for plane in scale.values()]
+        arrays += [array for network in tensors.networks.values() for pair in network for array in pair]
+    return sum(array.size for array in arrays)
+
+
 def decode(checkpoint: str, file: str, effort: str) -> dict[str, float]:
     """The second time in a process."""
     from pd4dgs_codec import decode
 
     data = Path(file).read_bytes()
-    decode(data)
-    return timed(lambda: decode(data))[1]
+    symbols = symbols_of(decode(data))
+    seconds = timed(lambda: decode(data))[1]
+    return {**seconds, "rate": symbols / seconds["cpu"]}
 
 
 def draw(checkpoint: str, file: str, effort: str) -> dict[str, float]:
@@ -72,14 +86,166 @@ def draw(checkpoint: str, file: str, effort: str) -> dict[str, float]:
 
 def start(checkpoint: str, file: str, effort: str) -> dict[str, float]:
     """A command of its own: from nothing to a picture on disk, numba's cache warm."""
-    code = "import sys; from pd4dgs_codec.cli.render import main; sys.exit(main())"
-    picture = str(Path(file).with_suffix(".png"))
-    command = [sys.executable, "-c", code, file, "-o", picture, "--frames", "1", "-f"]
+    return _command("render", file, "-o", str(Path(file).with_suffix(".png")), "--frames", "1", "-f")
+
+
+def command(checkpoint: str, file: str, effort: str) -> dict[str, float]:
+    """pd4dgs-decode FILE: every byte decoded and checked."""
+    return _command("decode", file)
+
+
+def first(checkpoint: str, file: str, effort: str) -> dict[str, float]:
+    """From nothing to the first step of training and its checkpoint, numba's cache warm: one iteration."""
+    from pd4dgs_codec.model import checkpoint as checkpoints
+
+    source, own = checkpoints.load(checkpoint)[1]["config"]["source"], str(Path(file).with_suffix(".pt"))
+    return _command("train", source, "-o", own, "--iterations", "1", "-f")
+
+
+def _command(name: str, *arguments: str) -> dict[str, float]:
+    code = f"import sys; from pd4dgs_codec.cli.{name} import main; sys.exit(main())"
+    command = [sys.executable, "-c", code, *arguments]
     wall, used = time.perf_counter(), resource.getrusage(resource.RUSAGE_CHILDREN)
     subprocess.run(command, check=True, capture_output=True)
     now = resource.getrusage(resource.RUSAGE_CHILDREN)
     cpu = now.ru_utime + now.ru_stime - used.ru_utime - used.ru_stime
     return {"wall": time.perf_counter() - wall, "cpu": cpu}
+
+
+def step(checkpoint: str, file: str, effort: str) -> dict[str, float]:
+    """Median processor seconds of a step at each level, one thread, the levels in turn, as if at SHARE of the run."""
+    from pd4dgs_codec.cli.resume import parse_config
+    from pd4dgs_codec.data.dataset import load as load_data
+    from pd4dgs_codec.model.checkpoint import load
+    from pd4dgs_codec.train.loop import Trainer
+
+    config = parse_config(load(checkpoint)[1]["config"], checkpoint)
+    trainer = Trainer(config, load_data(config.source, downscale=config.downscale, holdout=config.holdout))
+    trainer.resume(Path(checkpoint))
+    levels = range(trainer.model.level + 1)
+
+    def one(level: int) -> float:
+        learner = getattr(trainer, "learner", trainer)
+        learner.iteration = round(trainer.total * SHARE)
+        if learner is trainer:  # as the first commits had it
+            trainer._draw_levels = lambda schedule: ((level,), (1 / 3,) * 3)
+            return timed(trainer.step)[1]["cpu"]
+        return timed(lambda: learner.step((level,)))[1]["cpu"]
+
+    for level in levels:
+        one(level)  # compiles
+    turns = [[one(level) for level in levels] for _ in range(STEPS)]
+    return {f"level {level}": statistics.median(times) for level, times in enumerate(zip(*turns, strict=True))}
+
+
+def grow(checkpoint: str, file: str, anchors: str) -> dict[str, float]:
+    """So many anchors: the checkpoint's own, and copies of them some voxels off with noise of two steps. Memory is MiB
+    beside the imports, the scene itself included; arrays: MiB of the scene's float32 arrays."""
+    import numpy as np
+
+    from pd4dgs_codec import decode
+    from pd4dgs_codec.codec.encoder import encode_with_report
+    from pd4dgs_codec.codec.symbols import float_tensors
+    from pd4dgs_codec.entropy.fitting import loops
+    from pd4dgs_codec.model.checkpoint import load
+    from pd4dgs_codec.model.convert import to_scene
+
+    given, rng, wanted = to_scene(load(checkpoint)[0]), np.random.default_rng(0), int(anchors)
+    loops()
+    before = _resident()
+    own = len(given.anchor_q)
+    copies = -(-2 * wanted // own)
+    places = np.concatenate([given.anchor_q + (rng.integers(-6, 7, (own, 3)) if i else 0) for i in range(copies)])
+    source = np.tile(np.arange(own), copies)
+    chosen = np.sort(np.unique(places, axis=0, return_index=True)[1])[:wanted]
+    source = source[chosen]
+    values = {}
+    for name, step_of in (("feature", "feature"), ("scaling_log", "scaling_log"), ("offset", "offset")):
+        value = getattr(given, name)[source]
+        noise = rng.standard_normal(value.shape, np.float32) * np.float32(2 * getattr(given.steps, step_of))
+        noise[:own] = 0
+        values[name] = value + noise
+        del noise
+    masks = tuple(codes[source] for codes in given.full_masks())
+    scene = replace(
+        given,
+        rows=(len(chosen),) * len(given.layers),
+        anchor_q=places[chosen].astype(np.int32),
+        mask=masks,
+        grading=None,
+        **values,
+    )
+    del places, values
+    arrays = sum(array.nbytes for i in range(len(scene.layers)) for array in float_tensors(scene, i)[1:])
+    (data, _), coded = timed(lambda: encode_with_report(scene))
+    memory = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024) - before
+    Path(file).write_bytes(data)
+    decoded = timed(lambda: decode(data))[1]
+    return {
+        "anchors": len(chosen),
+        "bytes": len(data),
+        "encode": coded["cpu"],
+        "decode": decoded["cpu"],
+        "memory": memory,
+        "arrays": (arrays + scene.anchor.nbytes) / 2**20,
+    }
+
+
+def _resident() -> float:
+    """MiB that the process has in memory."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith("VmRSS"):
+            return int(line.split()[1]) / 1024
+    return 0.0
+
+
+def beside(checkpoint: str, file: str, effort: str) -> dict[str, float]:
+    """What others take for the same symbols: constriction's QuantizedGaussian, one per channel of the attributes of
+    layer 0, against their section here; xz for all of the file's symbols."""
+    import constriction
+    import numpy as np
+
+    from pd4dgs_codec import decode, encode
+    from pd4dgs_codec.codec.attribute_section import read_attributes, write_attributes
+    from pd4dgs_codec.codec.decoder import decode_layers
+
+    data = Path(file).read_bytes()
+    layer = decode_layers(data)[1][0]
+    channels = layer.attributes
+    coder = constriction.stream.stack.AnsCoder()
+    models = []
+    for channel in channels:
+        low, high = int(channel.min()), int(channel.max())
+        family = constriction.stream.model.QuantizedGaussian(low - 1, high + 1)
+        models.append((family, float(channel.mean()), max(float(channel.std()), 0.05)))
+    rows = channels.shape[1]
+
+    def parameters(mean: float, spread: float) -> list[Any]:
+        return [np.full(rows, mean), np.full(rows, spread)]
+
+    for channel, (family, mean, spread) in zip(channels[::-1], models[::-1], strict=True):
+        coder.encode_reverse(np.ascontiguousarray(channel), family, *parameters(mean, spread))
+    words = coder.get_compressed()
+
+    def gaussians() -> None:
+        again = constriction.stream.stack.AnsCoder(words)
+        for family, mean, spread in models:
+            again.decode(family, *parameters(mean, spread))
+
+    section = write_attributes(channels, layer.classes, layer.widths, "best", 5)[0]
+    scene = decode(data)
+    packed, own = encode(scene, mode="lzma", verify=False), encode(scene, verify=False)
+    return {
+        "symbols": channels.size,
+        "gaussian bytes": 4 * len(words),
+        "gaussian decode": timed(gaussians)[1]["cpu"],
+        "own bytes": len(section),
+        "own decode": timed(lambda: read_attributes(section, layer.widths, rows))[1]["cpu"],
+        "xz file": len(packed),
+        "xz decode": timed(lambda: decode(packed))[1]["cpu"],
+        "own file": len(own),
+        "own file decode": timed(lambda: decode(own))[1]["cpu"],
+    }
 
 
 def main() -> None:
@@ -88,9 +254,12 @@ def main() -> None:
         from pd4dgs_codec.threads import configure
     except ImportError:
         from pd4dgs_codec.render.threads import configure  # type: ignore[import-not-found,no-redef]
-    configure()
     what, *arguments = sys.argv[1:]
-    works = {"encode": encode, "decode": decode, "draw": draw, "start": start}
+    configure(1 if what == "step" else None)
+    works = {
+        "encode": encode, "decode": decode, "command": command, "draw": draw, "start": start, "first": first,
+        "step": step, "grow": grow, "beside": beside,
+    }  # fmt: skip
     print(json.dumps(works[what](*arguments)))
 
 

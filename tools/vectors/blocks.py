@@ -775,8 +775,7 @@ def _hashes(m: LayerSymbols, header: Mapping[int, object]) -> dict:
 class Vector:
     """One file of spec/vectors. layers: the hashes of what decodes, of all of a valid file or of the layers before a
     fault. error: its name (clause 15), None for a valid file. chunk, offset: where the fault lies, if in a chunk and
-    if at a field that the frame fixes. slices: the layer of each slice that decodes. feature: what of the format it is
-    about, where decoders may yet lack it."""
+    if at a field that the frame fixes. slices: the layer of each slice that decodes."""
 
     name: str
     sentence: str
@@ -787,7 +786,6 @@ class Vector:
     chunk: int | None = None
     offset: int | None = None
     slices: tuple[int, ...] = ()
-    feature: str | None = None
 
 
 def good(name: str, sentence: str, clauses: str, file: File) -> Vector:

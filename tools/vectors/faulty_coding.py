@@ -378,9 +378,11 @@ def _grades() -> Iterator[Vector]:
         ("short", "7.7 8.5", MALFORMED, held(graded_part(own, len(graded_part(own)) - 2)), "A byte short."),
         ("nothing", "8.5 15", MALFORMED, b"\0", "The section ends after its form."),
     )
-    layer = make_layer(0, line(3), attributes=k, classes=[0, 7, 2], mode=LZMA)
-    packed = make_file(layer, header={2: LZMA})
-    yield bad("step-classes-7-lzma", "A step class of 7 in mode lzma.", "8.5", MALFORMED, packed, chunk=0)
+    for name, said, symbol in (("7", "7", 7), ("negative", "−1", -1)):
+        layer = make_layer(0, line(3), attributes=k, classes=[0, symbol, 2], mode=LZMA)
+        packed = make_file(layer, header={2: LZMA})
+        what = f"A step class of {said} in mode lzma."
+        yield bad(f"step-classes-{name}-lzma", what, "8.5", MALFORMED, packed, chunk=0)
     for name, clauses, error, section, what in rows:
         layer = make_layer(0, line(3), attributes=k, classes=own.tolist())
         yield bad(
@@ -392,6 +394,15 @@ def _grades() -> Iterator[Vector]:
     yield bad("step-classes-value-over-limit", "A value of 2^23 + 1 steps.", "11.5", MALFORMED, far, chunk=0)
     near = make_file(make_layer(0, line(1), attributes=-edge, classes=[6]), header={16: [0] * 5 + [-1] + [0] * 62})
     yield bad("step-classes-value-under-limit", "A value of −2^23 − 1 steps.", "11.5", MALFORMED, near, chunk=0)
+    for name, clauses, symbol, centre, what in (
+        ("symbol-over-limit", "11.2 11.5", MAX_SYMBOL + 1, -1, "A symbol of 2^23 + 1, the value of 2^23."),
+        ("symbol-under-limit", "11.2 11.5", -MAX_SYMBOL - 1, 1, "A symbol of −2^23 − 1, the value of −2^23."),
+        ("sum-over-limit", "11.5 11.2", MAX_SYMBOL, 1, "A symbol of 2^23 in class 0, the value of 2^23 + 1."),
+    ):
+        edge[5] = symbol
+        layer = make_layer(0, line(1), attributes=edge.copy(), classes=[0])
+        file = make_file(layer, header={16: [0] * 5 + [centre] + [0] * 62})
+        yield bad(f"step-classes-{name}", what, clauses, MALFORMED, file, chunk=0)
 
 
 def _over_k() -> bytes:

@@ -50,6 +50,7 @@ AGAIN = {
         "slices-later-rows-over-limit",
         "bomb-most-cells",
     ),
+    "2^28 samples are over the bound of clause 6.5 too, in any payload of less than 258 kB": ("samples-over-limit",),
     "no number of rows under 0 is that of a tree": ("layer-0-rows-negative",),
     "layers that ascend begin with layer 0, if it is there": ("chunk-list-layer-0-second",),
     "where no network is, neither a trunk nor a head is": ("layer-1-networks-empty",),
@@ -67,6 +68,7 @@ UNSHOWN = {
     "single <= nodes and more <= 6 * (nodes - single)": "as many nodes have so many children",
     "nodes <= count": "the tree ends with as many nodes",
     "count <= MAX_COUNT": "clause 6.5 bounds a channel below 2^26 in any file of less than 30 MB",
+    "samples <= 1 << 28": "clause 6.5 bounds the samples in any file of less than 258 kB",
     "size <= 1 << 31": "clause 6.5 bounds the bytes in any file of less than 250 kB",
 }
 FAULTY = "faulty/"

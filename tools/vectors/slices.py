@@ -45,6 +45,7 @@ from .blocks import (
     coded,
     gauss,
     good,
+    graded_part,
     make_file,
     make_layer,
     pattern,
@@ -57,16 +58,14 @@ from .blocks import (
 from .faulty import FLAGS, PAYLOAD, SCENE_ID
 from .valid import line, ordered
 
-FEATURE_NAME = "slices"
 MORE, NUMBER = 2, 64  # flags: bit 1, and the slice of number 1
 
 
 def cases() -> Iterator[Vector]:
     """All vectors about slices."""
     for name, sentence, clauses, file in _good():
-        yield replace(good(name, sentence, clauses, file), feature=FEATURE_NAME)
-    for vector in (*_frames(), *_payloads(), *_limits()):
-        yield replace(vector, feature=FEATURE_NAME)
+        yield good(name, sentence, clauses, file)
+    yield from (*_frames(), *_payloads(), *_limits())
 
 
 @dataclass
@@ -144,6 +143,7 @@ def _good() -> Iterator[Case]:
         graded.add(later(0, line(3, z=-4), attributes=pattern(68, 3, seed=3), classes=[0, 1, 0])),
     )
     yield "valid/slices-classes", "Slices with step classes, in all forms.", "3.6 8.5 8.7 11.2", make_file(*classes)
+    yield "uncommon/slices-classes-wide", "Step classes under a wide table in slice 1.", "8.5 14 8", _of_classes(False)
     apart = Slices()
     mixed = (
         apart.add(make_layer(0, ordered([[0, 0, 1], [6, 3, 0]]), codes=[40, 50], attributes=pattern(68, 2))),
@@ -209,6 +209,20 @@ def _continued() -> File:
         slices.add(later(0, line(7, z=6), attributes=pattern(68, 7, low=-5, high=5, seed=9)), other),
         slices.add(later(0, line(6, z=7), attributes=k[:, 4:10]), go_on=True),
     )
+
+
+def _of_classes(go_on: bool) -> File:
+    """Two slices with step classes; those of the second one under the prior of the first one's, or under one of its own
+    of more entries than a section may define that goes on."""
+    known, grades = Known(), ([0, 3, 6], [6, 0, 3])
+    coded([grades[0]], known=known)
+    wide = {} if go_on else {0: gauss(0, 2 * MORE_ENTRIES)}
+    part = coded([grades[1]], wide, known if go_on else None)
+    first = make_layer(0, line(3), attributes=pattern(68, 3), classes=grades[0])
+    second = later(0, line(3, z=2), attributes=pattern(68, 3, seed=1), classes=grades[1])
+    form, own = b"\0", graded_part(second.meant.classes)
+    rest = second.sections[ATTRIBUTE][len(form + own) :]
+    return make_file(first, second.with_sections({ATTRIBUTE: form + varint(len(part)) + part + rest}))
 
 
 def _wide(over: int) -> File:
@@ -321,6 +335,8 @@ def _payloads() -> Iterator[Vector]:
     form = second.with_sections({ATTRIBUTE: b"\2" + bytes(7)})
     yield of("block-missing", "8.5", MALFORMED, "Form 2 behind a slice of form 0.", form.payload())
 
+    what = "Step classes under the prior of those of slice 0."
+    yield bad("slices-step-classes-go-on", what, "8.1 8.5", MALFORMED, _of_classes(True), chunk=1)
     block, one = Slices(), make_layer(0, line(5), attributes=pattern(68, 5))
     base = block.add(one, ({}, {}, ONE_CLASS))
     on = block.add(later(0, line(4, z=3), attributes=pattern(68, 4, seed=2)), go_on=True)

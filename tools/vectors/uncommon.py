@@ -24,8 +24,6 @@ from .blocks import (
 from .valid import rows_at_limit, three_layers
 
 FIRST_PRIVATE = 1 << 15
-#: At limits that were raised for slices.
-RAISED_WITH_SLICES = ("chunks-1024", "header-longest")
 #: A value of every form that canonical msgpack has, nested as deep as a value in the header may be.
 EVERY_FORM: list = [
     [0, 127, 128, 255, 256, 65535, 65536, 2**32 - 1, 2**32, 2**64 - 1],
@@ -39,8 +37,7 @@ EVERY_FORM: list = [
 def cases() -> Iterator[Vector]:
     """All vectors under uncommon/."""
     for name, sentence, clauses, file in _cases():
-        vector = good("uncommon/" + name, sentence, clauses, file)
-        yield replace(vector, feature="slices") if name in RAISED_WITH_SLICES else vector
+        yield good("uncommon/" + name, sentence, clauses, file)
 
 
 def _between(*chunks: Chunk) -> File:

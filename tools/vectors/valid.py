@@ -191,6 +191,11 @@ def _step_classes() -> Iterator[Case]:
         section = predicted_attributes(k, terms, splits, counts, grades=own)
         file = make_file(base.with_sections({ATTRIBUTE: section}))
         yield f"classes-staged-{name}", what, "8.5 8.6 8.7 8.9", file
+    near, small = pattern(11, low=4, high=6, seed=1), pattern(68, 11, low=-1, high=1, seed=2)
+    section = predicted_attributes(small, {}, {}, (4,) * 6, grades=near)
+    layer = make_layer(0, line(11), attributes=small, classes=near.tolist()).with_sections({ATTRIBUTE: section})
+    what = "Activities so near each other that 2^(7 − c) in place of 2^(6 − c) gives other classes."
+    yield "classes-staged-near", what, "8.7 8.9", make_file(layer)
     edge = np.full((68, 2), 2, np.int32)
     edge[0], edge[1], edge[2] = MAX_SYMBOL >> 6, -MAX_SYMBOL >> 6, [0, MAX_SYMBOL]
     centres = [0, 0, -MAX_SYMBOL, MAX_SYMBOL, *[0] * 64]

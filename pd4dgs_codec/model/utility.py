@@ -22,7 +22,8 @@ from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.harm import anchor_slopes
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.scene import Camera, Scene
-from pd4dgs_codec.view.frames import Frame
+
+Place = tuple[Camera, float]
 
 #: Pixels along the longer side of the pictures that utility is measured on, about: holes are larger than that.
 SIDE = 128
@@ -30,36 +31,37 @@ SIDE = 128
 STAY, FEW = 0.8, 64
 
 
-def utility(scene: Scene, frames: Sequence[Frame], step: Callable[[], None] = lambda: None) -> np.ndarray:
+def utility(scene: Scene, places: Sequence[Place], step: Callable[[], None] = lambda: None) -> np.ndarray:
     """float64 [N]: the order in which the anchors of each layer should come, the highest first; see above.
 
-    Of a layer's own anchors only, at its level, all earlier layers being there: what they gain per byte. Anchors that
-    no picture comes near have 0, the least. step is called after each round.
+    places: cameras and times, 0..1, whose pictures decide. Of a layer's own anchors only, at its level, all earlier
+    layers being there: what they gain per byte. Anchors that no picture comes near have 0, the least. step is called
+    after each round.
     """
-    frames = [_smaller(frame) for frame in frames]
+    places = [(_smaller(camera), time) for camera, time in places]
     rank, first = np.zeros(len(scene.anchor_q)), 0
     for index, (layer, end) in enumerate(zip(scene.layers, scene.rows, strict=True)):
         bits = bits_per_row(layer_symbols(scene, index))
-        rank[first:end] = _layer_utility(scene.prefix(layer), layer, first, bits, frames, step)
+        rank[first:end] = _layer_utility(scene.prefix(layer), layer, first, bits, places, step)
         first = end
     return rank
 
 
 def _layer_utility(
-    scene: Scene, level: int, first: int, bits: np.ndarray, frames: Sequence[Frame], step: Callable[[], None]
+    scene: Scene, level: int, first: int, bits: np.ndarray, places: Sequence[Place], step: Callable[[], None]
 ) -> np.ndarray:
     """float64 [rows of the highest layer]: in which round each leaves, and within it what it was worth."""
     own = scene.rows[-1] - first
     rank, alive = np.zeros(own), np.ones(own, bool)
     whole = from_scene(scene)
-    references = [torch.from_numpy(render_image(whole, level, f.time, f.camera)) for f in frames]
+    references = [torch.from_numpy(render_image(whole, level, time, camera)) for camera, time in places]
     generator, rounds = torch.Generator().manual_seed(0), 0
     while alive.any():
         rows = np.flatnonzero(alive)
         model = from_scene(without(scene, first + np.flatnonzero(~alive)))
         gain, met = np.zeros(len(rows)), np.zeros(len(rows), bool)
-        for frame, reference in zip(frames, references, strict=True):
-            linear, square, near = anchor_slopes(model, level, frame.time, frame.camera, generator, reference)
+        for (camera, time), reference in zip(places, references, strict=True):
+            linear, square, near = anchor_slopes(model, level, time, camera, generator, reference)
             gain += (square - 2 * linear).numpy()[first:]
             met |= near.numpy()[first:]
         step()
@@ -88,10 +90,9 @@ def without(scene: Scene, rows: np.ndarray) -> Scene:
     )
 
 
-def _smaller(frame: Frame) -> Frame:
+def _smaller(camera: Camera) -> Camera:
     """The same picture in as few pixels as SIDE says."""
-    camera = frame.camera
     factor = min(1.0, SIDE / max(camera.width, camera.height))
     width, height = (max(1, round(side * factor)) for side in (camera.width, camera.height))
     scale = np.array([[width / camera.width], [height / camera.height], [1.0]], np.float32)
-    return Frame(Camera(camera.viewmat, (camera.K * scale).astype(np.float32), width, height), frame.time)
+    return Camera(camera.viewmat, (camera.K * scale).astype(np.float32), width, height)

@@ -1,0 +1,204 @@
+"""`pd4dgs-batch`: one command over a library of scenes."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import json
+import sys
+from collections.abc import Sequence
+from importlib import import_module
+from importlib.util import find_spec
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pd4dgs_codec.batch.ops import OPS, arguments
+from pd4dgs_codec.cli import values
+from pd4dgs_codec.cli.common import FAILED, OK, Console, Parser, UsageError, run, say
+from pd4dgs_codec.cli.files import STDIO, check_output, write_bytes
+from pd4dgs_codec.cli.progress import progress_bar
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.threads import available
+
+if TYPE_CHECKING:
+    from pd4dgs_codec.batch.job import Job, Outcome
+    from pd4dgs_codec.batch.manifest import Manifest
+
+VERBS = tuple(OPS)
+ENGINES = ("local", "ray", "slurm")
+
+DETAILS = """\
+MANIFEST has a JSON object per line:
+  {"source": "s3://films/kitchen.pt", "output": "kitchen.pd4", "options": {"effort": 3}}
+source is what the command takes first, a path or a URI (s3, gs, https, ...). output is a path below -o; without it the
+source's name is taken. options are those of the command, without their dashes: true for a switch, a list for several.
+eval takes the dataset as the option data. `pd4dgs-batch scan FOLDER` writes a manifest of what is in a folder.
+
+Beside each output stands OUTPUT.done.json: what it was made of, by which version, and its digests. A scene whose record
+has the same input, options and version is not done again, so that a batch that was killed goes on where it was. Outputs
+appear whole or not at all. Lines that fail are tried again, then named with their logs; the others go on. The exit code
+is 1 if any line failed.
+
+--on local is a pool of processes, which share -j threads. --on ray takes the cluster at --address (or RAY_ADDRESS),
+--on slurm submits array jobs; both need the extra [cluster]. docs/batch.md tells more.
+
+examples:
+  pd4dgs-batch scan models -o scenes.jsonl
+  pd4dgs-batch scenes.jsonl --op encode -o out
+  pd4dgs-batch scenes.jsonl --op encode --on ray --address 10.0.0.1:6379 -o s3://films/pd4"""
+
+SCAN_DETAILS = """\
+Writes a line for each source below FOLDER: checkpoints for encode, .pd4 files for package, datasets for train, videos
+for prepare. Outputs keep the sources' paths.
+
+examples:
+  pd4dgs-batch scan models -o scenes.jsonl
+  pd4dgs-batch scan s3://films/pd4 --op eval -o eval.jsonl"""
+
+
+def parser() -> Parser:
+    """The options of `pd4dgs-batch`."""
+    p = Parser("batch", "MANIFEST --op OP -o URI", "Run a command on every scene of a library.", DETAILS)
+    p.add_argument("input", metavar="MANIFEST", help="JSON lines, see below")
+    p.add_argument("-o", "--output", required=True, metavar="URI", help="folder or URI to write below")
+    p.add_argument("--op", required=True, choices=VERBS, help="the command: pd4dgs-OP")
+    p.add_argument("--on", choices=ENGINES, default="local", help="what runs it (default: local)")
+    what = "scenes at a time (default: a core each; ray: what the cluster holds; 0: in this process, one by one)"
+    p.add_argument("--workers", type=values.count, metavar="N", help=what)
+    what = "threads of a scene (default: local: an equal share of -j; else 1)"
+    p.add_argument("--cpus", type=values.positive_int, metavar="N", help=what)
+    p.add_argument(
+        "--gpus", type=values.non_negative_float, default=0, metavar="N", help="GPUs of a scene (default: 0)"
+    )
+    what = "try a scene that failed so often again (default: %(default)s)"
+    p.add_argument("--retries", type=values.count, default=2, metavar="N", help=what)
+    what = "end a scene that takes longer, and try it again (default: never)"
+    p.add_argument("--timeout", type=values.duration, metavar="T", help=what)
+    what = "for the logs of scenes that fail, made when there is one (default: %(default)s)"
+    p.add_argument("--logs", default="batch-logs", metavar="DIR", help=what)
+    p.add_argument("--address", metavar="A", help="of the Ray cluster (default: RAY_ADDRESS, else one of this machine)")
+    what = "parameter of submitit, such as slurm_partition=gpu; cluster=local tries it on this machine"
+    p.add_argument("--slurm", type=_parameter, action="append", default=[], metavar="KEY=VALUE", help=what)
+    p.add_common()
+    return p
+
+
+def scan_parser() -> Parser:
+    """The options of `pd4dgs-batch scan`."""
+    p = Parser("batch scan", "FOLDER", "Write a manifest of the sources in a folder.", SCAN_DETAILS)
+    p.add_argument("input", metavar="FOLDER", help="folder or URI")
+    p.add_argument("--op", choices=VERBS, help="the command that it is for (default: as there are sources)")
+    p.add_argument("-o", "--output", default=STDIO, metavar="FILE", help="file to write (default: stdout)")
+    p.add_common()
+    return p
+
+
+def _parameter(text: str) -> tuple[str, str]:
+    key, equals, value = text.partition("=")
+    if not (key and equals):
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected KEY=VALUE")
+    return key, value
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    arguments = list(sys.argv[1:] if argv is None else argv)
+    if arguments[:1] == ["scan"]:
+        return run(scan_parser(), _scan, arguments[1:])
+    return run(parser(), _batch, arguments)
+
+
+def command(verb: str, argv: list[str]) -> tuple[int, str, str]:
+    """Runs `pd4dgs-VERB` in this process: (exit code, stdout, stderr)."""
+    out, err = io.StringIO(), io.StringIO()
+    with contextlib.redirect_stdout(out), contextlib.redirect_stderr(err):
+        code = import_module(f"pd4dgs_codec.cli.{verb}").main(argv)
+    return code, out.getvalue(), err.getvalue()
+
+
+def _scan(args: argparse.Namespace, console: Console) -> int:
+    if args.json and args.output == STDIO:
+        raise UsageError("the manifest and --json both want stdout; name a file with -o")
+    check_output(args.output, args.overwrite)
+    from pd4dgs_codec.batch.manifest import scan
+
+    lines = [json.dumps(line) + "\n" for line in scan(args.input, args.op)]
+    write_bytes(args.output, "".join(lines).encode(), args.overwrite)
+    console.result({"output": args.output, "scenes": len(lines)}, f"{len(lines)} scenes", on_stdout=False)
+    return OK
+
+
+def _batch(args: argparse.Namespace, console: Console) -> int:
+    if find_spec(f"pd4dgs_codec.cli.{args.op}") is None:
+        raise DataError(f"--op {args.op}: this release has no pd4dgs-{args.op}")
+    cores = args.threads or available()
+    workers = args.workers if args.workers is not None else {"local": cores, "ray": 0, "slurm": 0}[args.on]
+    threads = args.cpus or (max(1, cores // max(1, workers)) if args.on == "local" else 1)
+    from pd4dgs_codec.batch import engines, store
+    from pd4dgs_codec.batch.job import Job
+    from pd4dgs_codec.batch.manifest import Manifest
+    from pd4dgs_codec.batch.run import run as run_jobs
+
+    takes = import_module(f"pd4dgs_codec.cli.{args.op}").parser()
+
+    def check(options: dict[str, Any]) -> None:
+        try:
+            takes.parse_args(arguments(args.op, "source", "output", options))
+        except UsageError as error:
+            raise DataError(str(error)) from None
+
+    manifest = Manifest(args.input, OPS[args.op], check)
+    output = store.absolute(args.output)
+    store.Root(output).check()
+    failures = _Failures(args, manifest)
+    jobs = (Job(line, args.op, output, threads, args.overwrite) for line in manifest.lines())
+    settings = engines.Settings(
+        workers, threads, args.gpus, args.timeout or None, args.address, Path(args.logs), dict(args.slurm)
+    )
+    with progress_bar(manifest.count, "scenes", args.op) as step:
+
+        def told(job: Job, outcome: Outcome, tries: int) -> None:
+            failures.see(job, outcome, tries)
+            step()
+
+        summary = run_jobs(jobs, command, engines.ENGINES[args.on], settings, args.retries, told)
+    summary.failures = failures.rows
+    result = {"output": args.output, "op": args.op, "on": args.on, **summary.json()}
+    console.result(result, _text(result), on_stdout=False)
+    return FAILED if failures.rows else OK
+
+
+class _Failures:
+    """Lines that failed, each told as it happens, with its log in a file of its own."""
+
+    def __init__(self, args: argparse.Namespace, manifest: Manifest):
+        self.prog, self.place, self.folder = "pd4dgs-batch", args.input, Path(args.logs)
+        self.rows: list[dict[str, Any]] = []
+        for fault in manifest.faults:
+            self._add(fault.number, None, fault.message)
+
+    def see(self, job: Job, outcome: Outcome, tries: int) -> None:
+        """Takes note of a job that is over."""
+        if outcome.state != "failed":
+            return
+        log = None
+        if outcome.log:
+            path = self.folder / f"{job.line.output}.log"
+            with contextlib.suppress(OSError):  # the batch matters more than its logs
+                path.parent.mkdir(parents=True, exist_ok=True)
+                path.write_text(outcome.log)
+                log = str(path)
+        again = f", tried {tries} times" if tries > 1 else ""
+        self._add(job.line.number, job.line.output, outcome.message + again, log)
+
+    def _add(self, number: int, output: str | None, message: str, log: str | None = None) -> None:
+        row = {"line": number, "output": output, "message": message, "log": log}
+        self.rows.append(row)
+        named = f" {output}:" if output else ""
+        say(f"{self.prog}: {self.place}, line {number}:{named} {message}" + (f" (log: {log})" if log else ""))
+
+
+def _text(result: dict[str, Any]) -> str:
+    parts = [f"{result['done']} done", f"{result['already']} were done before", f"{result['failed']} failed"]
+    return f"{result['output']}: {', '.join(parts)}; {result['bytes']:,} bytes in {result['seconds']:.0f} s"

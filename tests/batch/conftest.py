@@ -1,0 +1,64 @@
+"""Batches of stand-in scenes: small texts, which the stand-in command writes in capitals."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+from standin import upper
+
+from pd4dgs_codec.batch.engines import ENGINES, Settings
+from pd4dgs_codec.batch.job import Job, Outcome
+from pd4dgs_codec.batch.manifest import Manifest
+from pd4dgs_codec.batch.ops import OPS
+from pd4dgs_codec.batch.run import Summary, run
+
+
+class Library:
+    """Texts as sources, a manifest of them, and batches over it."""
+
+    def __init__(self, folder: Path):
+        self.folder, self.out, self.notes = folder, folder / "out", folder / "notes"
+        (folder / "in").mkdir()
+        self.notes.mkdir()
+        self.lines: list[str] = []
+        self.outcomes: dict[str, tuple[Outcome, int]] = {}
+
+    def add(self, name: str, text: str, **fields: Any) -> None:
+        """A source and its line."""
+        (self.folder / "in" / name).write_text(text)
+        self.lines.append(json.dumps({"source": str(self.folder / "in" / name)} | fields))
+
+    def manifest(self) -> Manifest:
+        """The lines so far."""
+        path = self.folder / "m.jsonl"
+        path.write_text("\n".join(self.lines) + "\n")
+        return Manifest(str(path), OPS["encode"], lambda options: None)
+
+    def run(self, on: str = "local", root: str | None = None, retries: int = 2, **settings: Any) -> Summary:
+        """One batch over the lines so far; `outcomes` has the last outcome and the tries by output."""
+        overwrite, version = settings.pop("overwrite", False), settings.pop("version", None)
+        more = {"version": version} if version else {}
+        jobs = (Job(line, "encode", root or str(self.out), 1, overwrite, **more) for line in self.manifest().lines())
+        settings = {"workers": 0} | settings
+
+        def told(job: Job, outcome: Outcome, tries: int) -> None:
+            self.outcomes[job.line.output] = outcome, tries
+
+        return run(jobs, upper, ENGINES[on], Settings(**settings), retries, told)
+
+    def made(self) -> list[str]:
+        """The texts that the command has written, as often as it did."""
+        return sorted(path.read_text() for path in self.notes.iterdir())
+
+
+@pytest.fixture
+def library(tmp_path, monkeypatch) -> Library:
+    monkeypatch.setenv("COUNT", str(tmp_path / "notes"))
+    here = str(Path(__file__).parent)
+    monkeypatch.setenv("PYTHONPATH", f"{here}:{Path(__file__).parents[2]}")  # of workers that are processes
+    monkeypatch.setattr("pd4dgs_codec.batch.store.PAUSES", (0.0, 0.0, 0.0))
+    made = Library(tmp_path)
+    return made

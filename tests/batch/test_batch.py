@@ -1,0 +1,198 @@
+"""A batch in this process: records, what is not done twice, and what is named."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from pd4dgs_codec import __version__
+from pd4dgs_codec.batch import store
+from pd4dgs_codec.batch.job import key_of
+from pd4dgs_codec.batch.manifest import scan
+from pd4dgs_codec.batch.ops import arguments
+from pd4dgs_codec.errors import DataError
+
+
+def test_outputs_have_a_record_and_are_not_done_twice(library):
+    for name in ("a.pt", "b.pt"):
+        library.add(name, f"text of {name}", options={"effort": 1})
+    first, second = library.run(), library.run()
+    assert (first.done, first.already, second.done, second.already) == (2, 0, 0, 2)
+    assert (library.out / "a.pd4").read_text() == "TEXT OF A.PT"
+    record = json.loads((library.out / "a.pd4.done.json").read_text())
+    assert record["version"] == __version__ and record["report"] == {"bytes": 12}
+    assert record["key"] == key_of("encode", record["inputs"], {"effort": 1}, __version__)
+    assert record["files"][""]["bytes"] == 12
+    assert library.made() == ["text of a.pt", "text of b.pt"]
+
+
+def test_a_source_that_was_touched_and_is_the_same_is_not_done_again(library):
+    library.add("a.pt", "text")
+    library.run()
+    library.folder.joinpath("in/a.pt").write_text("text")
+    assert library.run().already == 1 and library.made() == ["text"]
+
+
+def test_a_killed_run_goes_on_after_its_last_record(library):
+    library.add("a.pt", "text")
+    library.run()
+    (library.out / "a.pd4.done.json").unlink()  # killed between the file and its record
+    assert library.run().done == 1
+    assert (library.out / "a.pd4.done.json").exists()
+
+
+def test_an_output_that_vanished_or_was_cut_is_made_again(library):
+    library.add("a.pt", "text")
+    library.run()
+    (library.out / "a.pd4").write_text("TE")
+    assert library.run().done == 1 and (library.out / "a.pd4").read_text() == "TEXT"
+
+
+def test_files_of_others_stay_unless_told_otherwise(library):
+    library.add("a.pt", "text")
+    library.out.mkdir()
+    (library.out / "a.pd4").write_text("mine")
+    assert library.run().done == 0
+    assert "--overwrite" in library.outcomes["a.pd4"][0].message and (library.out / "a.pd4").read_text() == "mine"
+    assert library.run(overwrite=True).done == 1 and (library.out / "a.pd4").read_text() == "TEXT"
+
+
+@pytest.mark.parametrize("change", ["source", "options", "version"])
+def test_what_another_input_made_is_named_and_the_others_go_on(library, change):
+    library.add("a.pt", "text")
+    library.run()
+    if change == "source":
+        (library.folder / "in" / "a.pt").write_text("other")
+    elif change == "options":
+        library.lines[0] = library.lines[0].replace("}", ', "options": {"effort": 1}}')
+    else:
+        path = library.out / "a.pd4.done.json"
+        record = json.loads(path.read_text())
+        old = {"version": "0.0.1", "key": key_of("encode", record["inputs"], {}, "0.0.1")}
+        path.write_text(json.dumps(record | old))
+    library.add("b.pt", "more")
+    assert library.run().done == 1
+    outcome, tries = library.outcomes["a.pd4"]
+    assert outcome.final and tries == 1 and "a.pd4" in outcome.message and "--overwrite" in outcome.message
+    assert ("0.0.1" in outcome.message) == (change == "version")
+    assert library.run(overwrite=True).done == 1
+
+
+def test_a_worker_of_another_version_refuses(library):
+    library.add("a.pt", "text")
+    assert library.run(version="9.9").done == 0
+    assert "9.9" in library.outcomes["a.pd4"][0].message and __version__ in library.outcomes["a.pd4"][0].message
+
+
+def test_failures_are_tried_again_within_a_bound(library):
+    library.add("a.pt", f"fail {library.folder}/flag")
+    library.add("b.pt", "bad")
+    library.add("c.pt", "wrong")
+    library.add("d.pt", "fine")
+    summary = library.run(retries=1)
+    tries = {output: (outcome.state, count) for output, (outcome, count) in library.outcomes.items()}
+    assert tries == {"a.pd4": ("done", 2), "b.pd4": ("failed", 2), "c.pd4": ("failed", 1), "d.pd4": ("done", 1)}
+    assert summary.retried == 2
+    assert library.outcomes["b.pd4"][0].message == "pd4dgs-encode: error: never"
+    assert library.outcomes["b.pd4"][0].log.startswith("a long story")
+
+
+LINES = [
+    ("{", "not JSON"),
+    ("[1]", "found list"),
+    ('{"source": "a.pt", "colour": 1}', "colour"),
+    ('{"source": ""}', "source is ''"),
+    ('{"source": 3}', "source is 3"),
+    ('{"source": "a.pt", "options": []}', "options"),
+    ('{"source": "a.pt", "output": "../x.pd4"}', "../x.pd4"),
+    ('{"source": "a.pt", "output": "/x.pd4"}', "/x.pd4"),
+    ('{"source": "a.pt", "output": "x.done.json"}', "x.done.json"),
+    ('{"source": "nowhere://a.pt"}', "nowhere"),
+]
+
+
+@pytest.mark.parametrize(("line", "what"), LINES)
+def test_a_broken_line_is_named_and_the_others_go_on(library, line, what):
+    library.lines.append(line)
+    library.add("b.pt", "fine")
+    (fault,) = library.manifest().faults
+    assert fault.number == 1 and what in fault.message
+    assert library.run().done == 1
+
+
+def test_two_lines_with_one_output_are_named(library):
+    library.add("a.pt", "first", output="x.pd4")
+    library.add("b.pt", "second", output="x.pd4")
+    (fault,) = library.manifest().faults
+    assert fault.number == 2 and "'x.pd4'" in fault.message and "line 1" in fault.message
+    assert library.run().done == 1 and (library.out / "x.pd4").read_text() == "FIRST"
+
+
+def test_a_source_that_is_not_there_is_named(library):
+    library.add("a.pt", "x")
+    (library.folder / "in" / "a.pt").unlink()
+    library.add("b.pt", "y")
+    assert library.run().done == 1
+    outcome, tries = library.outcomes["a.pd4"]
+    assert tries == 1 and "a.pt" in outcome.message and "No such file" in outcome.message
+
+
+@pytest.mark.parametrize("options", [{"output": "x"}, {"threads": 3}, {"-o": "x"}, {"a b": 1}, {"effort": {"a": 1}}])
+def test_options_that_a_line_cannot_set_are_named(options):
+    with pytest.raises(DataError, match="option"):
+        arguments("encode", "a.pt", "a.pd4", options)
+
+
+def test_options_become_a_command_line():
+    options = {"effort": 3, "no-verify": True, "mode": "ans", "lossy": False, "without": ["rate", "noise"]}
+    said = arguments("encode", "a.pt", "a.pd4", options)
+    assert said == [
+        "a.pt",
+        "--output",
+        "a.pd4",
+        "--effort=3",
+        "--no-verify",
+        "--mode=ans",
+        "--without=rate",
+        "--without=noise",
+    ]
+    assert arguments("eval", "a.pd4", "", {"data": "set"}) == ["a.pd4", "set"]
+
+
+def test_scan_finds_sources_of_one_kind(tmp_path):
+    for name in ("a/x.pt", "b.pt", ".hidden/c.pt", "notes.txt"):
+        (tmp_path / name).parent.mkdir(exist_ok=True)
+        (tmp_path / name).touch()
+    lines = list(scan(str(tmp_path), None))
+    assert lines == [
+        {"source": f"{tmp_path}/a/x.pt", "output": "a/x.pd4"},
+        {"source": f"{tmp_path}/b.pt", "output": "b.pd4"},
+    ]
+    (tmp_path / "set/camera").mkdir(parents=True)
+    (tmp_path / "set/camera/0.json").touch()
+    with pytest.raises(DataError, match="train and encode; expected --op"):
+        list(scan(str(tmp_path), None))
+    assert [line["output"] for line in scan(str(tmp_path), "train")] == ["set.pt"]
+    with pytest.raises(DataError, match="holds no sources"):
+        list(scan(str(tmp_path), "prepare"))
+
+
+def test_uris_of_fsspec_are_sources_and_outputs(library):
+    import fsspec
+
+    memory = fsspec.filesystem("memory")
+    memory.pipe_file("/films/a.pt", b"text")
+    library.lines.append(json.dumps({"source": "memory://films/a.pt"}))
+    assert library.run(root="memory://made/here").done == 1
+    assert memory.cat_file("/made/here/a.pd4") == b"TEXT"
+    record = json.loads(memory.cat_file("/made/here/a.pd4.done.json"))
+    assert record["source"] == "memory://films/a.pt"
+    assert library.run(root="memory://made/here").already == 1
+    assert library.made() == ["text"]
+
+
+def test_a_store_that_refuses_is_named_before_any_work(tmp_path):
+    (tmp_path / "file").touch()
+    with pytest.raises(OSError, match="file"):
+        store.Root(str(tmp_path / "file")).check()

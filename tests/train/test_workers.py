@@ -1,0 +1,100 @@
+"""Several workers on one scene learn what one process learns, write one checkpoint, and go on in another number."""
+
+from __future__ import annotations
+
+import json
+import socket
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+from runs import read_log
+from tiny import write_views
+
+from pd4dgs_codec.errors import TrainError
+from pd4dgs_codec.model import checkpoint
+from pd4dgs_codec.train import workers
+
+#: Trains the folder given as argument in the tiny size of the tests, so long that anchors grow and are judged.
+PROGRAM = """
+import sys
+sys.path.insert(0, {tests!r})
+from tiny import TINY
+from pd4dgs_codec.model.config import PRESETS
+PRESETS["tiny"] = TINY
+from pd4dgs_codec.cli.train import main
+sys.exit(main(sys.argv[1:]))
+"""
+STEPS = 60
+
+
+@pytest.fixture(scope="module")
+def program(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("program")
+    path = folder / "train.py"
+    path.write_text(PROGRAM.format(tests=str(Path(__file__).parents[1])))
+    write_views(folder / "set")
+    return path
+
+
+def _train(program: Path, workers: int, output: str, *options: object) -> subprocess.CompletedProcess[str]:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        port = probe.getsockname()[1]
+    launch = (
+        ["-m", "torch.distributed.run", f"--nproc-per-node={workers}", f"--master-port={port}", "--"] if workers else []
+    )
+    argv = ["set", "-o", output, "--preset", "tiny", "--device", "cpu", *map(str, options)]
+    command = [sys.executable, *launch, str(program), *argv]
+    return subprocess.run(command, cwd=program.parent, capture_output=True, text=True, timeout=900)
+
+
+def _same_model(first: Path, second: Path) -> None:
+    a, b = (checkpoint.load(path)[0].state_dict() for path in (first, second))
+    assert a.keys() == b.keys()
+    for name in a:
+        assert a[name].shape == b[name].shape, name
+        assert torch.allclose(a[name].float(), b[name].float(), rtol=1e-3, atol=1e-4), name
+
+
+@pytest.fixture(scope="module")
+def one(program) -> Path:
+    """What one process makes of two views a step."""
+    done = _train(program, 0, "one.pt", "--iterations", STEPS, "--views-per-step", 2, "--log", "one.jsonl")
+    assert done.returncode == 0, done.stderr
+    return program.parent / "one.pt"
+
+
+def test_two_workers_learn_what_one_process_learns(program, one):
+    done = _train(program, 2, "two.pt", "--iterations", STEPS, "--views-per-step", 2, "--json", "--log", "two.jsonl")
+    assert done.returncode == 0, done.stderr
+    told = json.loads(done.stdout)  # the first worker alone speaks
+    assert told["iterations"] == STEPS and told["finished"]
+    _same_model(one, program.parent / "two.pt")
+    single, double = (read_log(program.parent / name) for name in ("one.jsonl", "two.jsonl"))
+    assert len(double) == STEPS
+    assert sum(record.get("grown", 0) for record in single) > 0  # else nothing was decided
+    assert [r["anchors"] for r in single] == [r["anchors"] for r in double]
+
+
+def test_a_run_goes_on_with_another_number_of_workers(program, one):
+    cut = _train(program, 2, "cut.pt", "--iterations", STEPS, "--views-per-step", 2, "--max-seconds", "0.01")
+    assert cut.returncode == 0, cut.stderr
+    begun = int(checkpoint.load(program.parent / "cut.pt")[1]["iteration"])
+    assert 0 < begun < STEPS
+    rest = _train(program, 0, "cut.pt", "--resume", "cut.pt", "--max-seconds", "1000")
+    assert rest.returncode == 0, rest.stderr
+    _same_model(one, program.parent / "cut.pt")
+
+
+def test_workers_that_cannot_share_the_views_evenly_are_named(monkeypatch):
+    monkeypatch.setenv("WORLD_SIZE", "2")
+    with pytest.raises(TrainError, match="2 workers.*divides --views-per-step 3"):
+        workers.start("cpu", 3)
+
+
+def test_one_process_talks_to_nobody():
+    assert (workers.count(), workers.rank()) == (1, 0)
+    assert workers.alike(lambda: 3) == 3 and workers.largest(1.0, 2.0) == (1.0, 2.0)
