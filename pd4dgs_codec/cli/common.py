@@ -30,6 +30,8 @@ SOURCE is one of
   a folder with transforms*.json (Blender, D-NeRF, nerfstudio)
   a folder with poses_bounds.npy and a video per camera, cam*.mp4 (Neu3D; the first camera is held out)
   a folder with a model of COLMAP in sparse/0 and its pictures in images/; times.txt may say when they were taken
+  a folder with such a model and a synchronised video per picture in videos/ (the first camera is held out)
+  a folder of Panoptic Studio (train_meta.json, ims/) or an unpacked recording of Record3D (metadata, rgbd/)
   synthetic:static   nothing moves
   synthetic:global   large objects move slowly
   synthetic:local    the same, and small parts move on their own

@@ -98,6 +98,8 @@ def parser() -> Parser:
     )
     p.add_argument("--prefixes", type=values.non_negative_float, metavar="X", help=what)
     p.add_argument("--max-layer", type=int, choices=(0, 1, 2), help="train without the layers above this one")
+    what = "show the scene in the browser while it trains, at this port of this machine (default: 8080; needs viser)"
+    p.add_argument("--view", type=values.port, nargs="?", const=8080, metavar="PORT", help=what)
     what = "which level each step trains, see below (default: adaptive)"
     p.add_argument("--rollout", choices=ROLLOUTS, help=what)
     p.add_argument(
@@ -153,8 +155,9 @@ def _train(args: argparse.Namespace, console: Console) -> int:
         remove_leftovers(args.output)
         _announce(args, trainer, console)
     log = Path(args.log) if args.log and first else None
+    progress = _progress(args, trainer, console) if first else None
     try:
-        trainer.run(Path(args.output), log=log, progress=TrainingProgress() if first else None)
+        trainer.run(Path(args.output), log=log, progress=progress)
     except KeyboardInterrupt:
         raise TrainError("interrupted twice; what was trained since the last save is lost") from None
     workers.stop()
@@ -167,6 +170,16 @@ def _train(args: argparse.Namespace, console: Console) -> int:
         result = _summary(args, trainer)
         console.result(result, _text(result), on_stdout=False)
     return OK
+
+
+def _progress(args: argparse.Namespace, trainer: Trainer, console: Console) -> TrainingProgress:
+    if args.view is None:
+        return TrainingProgress()
+    from pd4dgs_codec.cli.watch import WatchedProgress
+
+    progress = WatchedProgress(trainer, args.view)
+    console.message(f"the scene is at {progress.url}")
+    return progress
 
 
 def _announce(args: argparse.Namespace, trainer: Trainer, console: Console) -> None:

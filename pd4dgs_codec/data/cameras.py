@@ -73,6 +73,16 @@ def check_rotation(rotation: np.ndarray, where: str) -> None:
         )
 
 
+def rotation_matrix(wxyz: Sequence[float] | np.ndarray) -> np.ndarray:
+    """float64 [3, 3] of a unit quaternion."""
+    w, x, y, z = (float(value) for value in wxyz)
+    return np.array([
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ])  # fmt: skip
+
+
 def world_to_camera(rotation: np.ndarray, center: np.ndarray) -> np.ndarray:
     """float64 [4, 4] from the world-to-camera rotation and the camera centre."""
     viewmat = np.eye(4)

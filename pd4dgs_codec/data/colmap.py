@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.data.cameras import LARGEST_TIME, Lens, UnreadView, world_to_camera
+from pd4dgs_codec.data.cameras import LARGEST_TIME, Lens, UnreadView, rotation_matrix, world_to_camera
 from pd4dgs_codec.data.files import LARGEST, number, read_file
 from pd4dgs_codec.data.posed import held_out, posed_dataset
 from pd4dgs_codec.data.view import Dataset
@@ -57,30 +57,39 @@ def find_model(folder: Path) -> tuple[Path, str] | None:
 
 def read_colmap(folder: Path, model: Path, suffix: str, downscale: int, holdout: int) -> Dataset:
     """Read a folder with a model of COLMAP, see `find_model` and `dataset.load`."""
+    listed, points, colors = registered(model, suffix)
+    pictures = folder / "images" if (folder / "images").is_dir() else folder
+    times = _times(folder, [image.name for image, _, _ in listed])
+    frames = []
+    for (image, viewmat, lens), time in zip(listed, times, strict=True):
+        path = pictures / image.name
+        if pictures.resolve() not in path.resolve().parents or not path.is_file():
+            raise DataError(f"{model / f'images{suffix}'}: {image.name}: there is no such picture in {pictures}")
+        frames.append(UnreadView(Path(image.name).stem, image.camera, time, viewmat, lens, path))
+    return posed_dataset(folder, *held_out(frames, holdout), points, colors, downscale)
+
+
+def registered(
+    model: Path, suffix: str
+) -> tuple[list[tuple[Image, np.ndarray, Lens]], np.ndarray | None, np.ndarray | None]:
+    """The pictures of a model by name, each with its pose (float64 [4, 4] world to camera) and lens; points float32
+    [M, 3] and colours uint8 [M, 3], or None."""
     read = _Binary if suffix == ".bin" else _Text
     lenses = read(model / f"cameras{suffix}").cameras()
-    listed = sorted(read(model / f"images{suffix}").images(), key=lambda image: image.name)
-    if not listed:
+    images = sorted(read(model / f"images{suffix}").images(), key=lambda image: image.name)
+    if not images:
         raise DataError(f"{model}: no picture is registered, expected one at least")
-    pictures = folder / "images" if (folder / "images").is_dir() else folder
-    times = _times(folder, [image.name for image in listed])
-    frames = []
-    for image, time in zip(listed, times, strict=True):
+    listed = []
+    for image in images:
         where = f"{model / f'images{suffix}'}: {image.name}"
         if image.camera not in lenses:
             raise DataError(f"{where}: taken by camera {image.camera}, which cameras{suffix} does not have")
-        path = pictures / image.name
-        if pictures.resolve() not in path.resolve().parents or not path.is_file():
-            raise DataError(f"{where}: there is no such picture in {pictures}")
-        frames.append(
-            UnreadView(Path(image.name).stem, image.camera, time, _viewmat(image, where), lenses[image.camera], path)
-        )
-    points, colors = None, None
-    if (model / f"points3D{suffix}").is_file():
-        points, colors = read(model / f"points3D{suffix}").points()
-        keep = (np.abs(points) <= LARGEST).all(axis=1)  # also false of NaN
-        points, colors = points[keep].astype(np.float32), colors[keep]
-    return posed_dataset(folder, *held_out(frames, holdout), points, colors, downscale)
+        listed.append((image, _viewmat(image, where), lenses[image.camera]))
+    if not (model / f"points3D{suffix}").is_file():
+        return listed, None, None
+    points, colors = read(model / f"points3D{suffix}").points()
+    keep = (np.abs(points) <= LARGEST).all(axis=1)  # also false of NaN
+    return listed, points[keep].astype(np.float32), colors[keep]
 
 
 def _viewmat(image: Image, where: str) -> np.ndarray:
@@ -89,12 +98,7 @@ def _viewmat(image: Image, where: str) -> np.ndarray:
     length = float(np.sqrt(w * w + x * x + y * y + z * z))
     if abs(length - 1) > UNIT_TOLERANCE:
         raise DataError(f"{where}: quaternion of length {length:.4g}, expected 1")
-    w, x, y, z = (v / length for v in (w, x, y, z))
-    rotation = np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
+    rotation = rotation_matrix([value / length for value in (w, x, y, z)])
     return world_to_camera(rotation, -rotation.T @ np.array(translation))
 
 

@@ -8,6 +8,9 @@ from pathlib import Path
 from pd4dgs_codec.data.colmap import find_model, read_colmap
 from pd4dgs_codec.data.iphone import read_iphone
 from pd4dgs_codec.data.neu3d import POSES, read_neu3d
+from pd4dgs_codec.data.panoptic import META, read_panoptic
+from pd4dgs_codec.data.record3d import is_record3d, read_record3d
+from pd4dgs_codec.data.synchronised import find_videos, read_synchronised
 from pd4dgs_codec.data.synthetic import PREFIX, read_synthetic
 from pd4dgs_codec.data.transforms import read_transforms
 from pd4dgs_codec.data.view import Dataset, View
@@ -18,7 +21,8 @@ def load(source: str | Path, *, downscale: int = 1, holdout: int = 8) -> Dataset
     """Read a dataset.
 
     source: `synthetic:NAME[?seed=n]`, a folder in the iPhone/Nerfies layout, a folder with
-        transforms*.json, one with poses_bounds.npy and videos, or one with a model of COLMAP.
+        transforms*.json, one with poses_bounds.npy and videos, one of Panoptic Studio or Record3D, or one with a model
+        of COLMAP and pictures or videos.
     downscale: images are averaged over downscale x downscale blocks (the remainder is cropped), intrinsics follow.
     holdout: without split files, frames with i % holdout == holdout // 2 are the test frames; 0 = none.
     Views whose masks hold no valid pixel are left out, see `Dataset.left_out`.
@@ -58,10 +62,16 @@ def _read(source: str | Path, downscale: int, holdout: int) -> Dataset:
         return read_transforms(folder, downscale, holdout)
     if (folder / POSES).is_file():
         return read_neu3d(folder, downscale, holdout)
+    if (folder / META).is_file():
+        return read_panoptic(folder, downscale, holdout)
+    if is_record3d(folder):
+        return read_record3d(folder, downscale, holdout)
     if (model := find_model(folder)) is not None:
+        if videos := find_videos(folder):
+            return read_synchronised(folder, videos, *model, downscale, holdout)
         return read_colmap(folder, *model, downscale, holdout)
     found = "other files" if any(folder.iterdir()) else "an empty folder"
     raise DataError(
         f"{folder}: found {found}, expected camera/ (iPhone, Nerfies), transforms*.json (Blender), {POSES} (Neu3D) "
-        "or sparse/0 (COLMAP)"
+        f"{META} (Panoptic Studio), metadata with rgbd/ (Record3D) or sparse/0 (COLMAP)"
     )

@@ -12,24 +12,15 @@ from pathlib import Path
 
 import numpy as np
 
-from pd4dgs_codec.data.cameras import (
-    Lens,
-    UnreadView,
-    cameras_box,
-    check_rotation,
-    mean_up,
-    points_box,
-    world_to_camera,
-)
-from pd4dgs_codec.data.files import LARGEST, check_downscale, read_file, shrink_image
+from pd4dgs_codec.data.cameras import Lens, UnreadView, check_rotation, world_to_camera
+from pd4dgs_codec.data.files import LARGEST, read_file
 from pd4dgs_codec.data.ply import read_ply
-from pd4dgs_codec.data.videos import open_video
-from pd4dgs_codec.data.view import Dataset, View
+from pd4dgs_codec.data.synchronised import synchronised_dataset
+from pd4dgs_codec.data.videos import video_size
+from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.errors import DataError, one_line
 
 POSES = "poses_bounds.npy"
-#: Bytes of all pictures, which are held in memory.
-MOST_BYTES = 4 << 30
 #: By what share width and height of a video may differ from the pose's in their ratio.
 ASPECT_TOLERANCE = 0.01
 MAX_CAMERAS = 10_000
@@ -41,43 +32,13 @@ def read_neu3d(folder: Path, downscale: int, holdout: int) -> Dataset:
     poses = _poses(folder / POSES)
     if len(videos) != len(poses):
         raise DataError(f"{folder}: {len(poses)} poses in {POSES} and {len(videos)} videos cam*.mp4, expected as many")
-    cameras, views, fps, count = [], [], 0.0, 0
-    for i, (video, row) in enumerate(zip(videos, poses, strict=True)):
-        frames, rate, size = _decoded(video, downscale, len(videos))
-        camera = _camera(row, i, size, video)
-        if i and (len(frames) != count or rate != fps):
-            found = f"{len(frames)} frames at {rate:g} per second and {videos[0].name} {count} at {fps:g}"
-            raise DataError(f"{video}: has {found}, expected synchronised videos")
-        cameras.append(camera)
-        fps, count = rate, len(frames)
-        viewmat, K = camera.viewmat.astype(np.float32), camera.lens.matrix(downscale)
-        for k, image in enumerate(frames):
-            height, width = image.shape[:2]
-            time = k / (count - 1) if count > 1 else 0.0
-            views.append(View(viewmat, K, width, height, time, image, None, f"{video.stem}_{k:04d}", i))
-    train = [view for view in views if not holdout or view.camera_id > 0]
-    if not train:
-        raise DataError(f"{folder}: one camera, which is held out, expected others to train on or --holdout 0")
+    cameras = [
+        _camera(row, i, video_size(video), video) for i, (video, row) in enumerate(zip(videos, poses, strict=True))
+    ]
     near, far = 0.5 * float(poses[:, 15].min()), float(poses[:, 16].max())
     plys = sorted(folder.glob("*.ply"))
     points, colors = read_ply(plys[0]) if len(plys) == 1 else (None, None)
-    if points is not None and not len(points):
-        points, colors = None, None
-    return Dataset(
-        name=folder.resolve().name,
-        train=tuple(train),
-        test=tuple(view for view in views if holdout and view.camera_id == 0),
-        points=points,
-        point_colors=colors,
-        box=cameras_box(cameras, (near, far)) if points is None else points_box(points),
-        near=near,
-        far=far,
-        background=(0.0, 0.0, 0.0),
-        time_range=(0.0, (count - 1) / fps if count > 1 else 1.0),
-        up=mean_up(cameras),
-        unit=0.0,
-        masked=False,
-    )
+    return synchronised_dataset(folder, cameras, points, colors, downscale, holdout, (near, far))
 
 
 def _poses(path: Path) -> np.ndarray:
@@ -108,22 +69,3 @@ def _camera(row: np.ndarray, i: int, size: tuple[int, int], video: Path) -> Unre
     fx, fy = focal * size[0] / width, focal * size[1] / height
     lens = Lens(*size, fx, fy, size[0] / 2, size[1] / 2)
     return UnreadView(video.stem, i, 0.0, world_to_camera(rotation, pose[:, 3]), lens, video)
-
-
-def _decoded(video: Path, downscale: int, videos: int) -> tuple[list[np.ndarray], float, tuple[int, int]]:
-    """(frames uint8 [H, W, 3], downscaled; frames per second; size before that)."""
-    source = open_video(video, output=["-fps_mode", "passthrough"])
-    width, height = source.size
-    check_downscale(source.size, downscale, str(video))
-    frames: list[np.ndarray] = []
-    for image in source.pictures:
-        frames.append(shrink_image(image, downscale))
-        if len(frames) * frames[0].nbytes * videos > MOST_BYTES:
-            gigabytes = MOST_BYTES / 2**30
-            raise DataError(
-                f"{video}: {videos} videos of more than {len(frames)} frames of {width // downscale}x"
-                f"{height // downscale} take over {gigabytes:g} GiB; expected a larger --downscale"
-            )
-    if not frames:
-        raise DataError(f"{video}: holds no frame, expected one at least")
-    return [np.ascontiguousarray(frame) for frame in frames], source.fps, source.size

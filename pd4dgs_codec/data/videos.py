@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Generator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +22,9 @@ class Video:
     path: Path
     size: tuple[int, int]
     fps: float
-    pictures: Iterator[np.ndarray]  #: uint8 [height, width, 3], or [height, width] in grey; to be gone through once
+    pictures: Generator[
+        np.ndarray, None, None
+    ]  #: uint8 [height, width, 3], or [height, width] in grey; to be gone through once
 
 
 def open_video(path: Path, *, grey: bool = False, output: Sequence[str] = ()) -> Video:
@@ -49,7 +51,14 @@ def open_video(path: Path, *, grey: bool = False, output: Sequence[str] = ()) ->
     return Video(path, (width, height), fps, _pictures(reader, path, shape))
 
 
-def _pictures(reader: Any, path: Path, shape: tuple[int, ...]) -> Iterator[np.ndarray]:
+def video_size(path: Path) -> tuple[int, int]:
+    """(width, height) of a video as it is seen."""
+    video = open_video(path)
+    video.pictures.close()
+    return video.size
+
+
+def _pictures(reader: Any, path: Path, shape: tuple[int, ...]) -> Generator[np.ndarray, None, None]:
     try:
         while True:
             with _failures(path):

@@ -52,7 +52,7 @@ class VideoFile:
 
     def __init__(self, path: Path):
         video = open_video(path)
-        video.pictures.close()  # type: ignore[attr-defined]
+        video.pictures.close()
         self.path, self.size, self.fps = path, video.size, video.fps
 
     def looks(self) -> Iterator[np.ndarray]:

@@ -33,7 +33,7 @@ from pd4dgs_codec.train.densify import Densifier
 from pd4dgs_codec.train.initialise import fresh_model
 from pd4dgs_codec.train.optimiser import Optimiser
 from pd4dgs_codec.train.rollout import CAPACITY_WEIGHTED, TOP, UNIFORM, rollout_probabilities, sample_level, updated_rho
-from pd4dgs_codec.train.shot import Shot
+from pd4dgs_codec.train.shot import Shots
 from pd4dgs_codec.train.ssim import image_loss
 
 Probabilities = tuple[float, float, float]  #: of levels 0, 1, 2
@@ -69,7 +69,7 @@ class Learner:
         self.densifier = Densifier(self.model, config.grow_threshold, size.max_anchors)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.noise = Noise(config.seed + 1, device)
-        self.shots = [Shot.of(view, device) for view in dataset.train]
+        self.shots = Shots(dataset.train, device)
         self.iteration = 0
         self.share: float | None = None
         self._passed = -1  #: `place` of the step before, which a share may leave behind by more than one
@@ -383,14 +383,13 @@ class Learner:
 
     def _prune_round(self, turn: int) -> tuple[int, ...]:
         waiting = self.waiting_views()
-        shots = [shot for i, shot in enumerate(self.shots) if i not in waiting]
-        stride = -(-len(shots) // pruning.VIEWS)
+        order = [i for i in range(len(self.shots)) if i not in waiting]
+        stride = -(-len(order) // pruning.VIEWS)
+        shots = [self.shots[i] for i in order[turn % stride :: stride]]
         levels = range(self.model.level if self.config.rollout == "top" else 0, self.model.level + 1)
         before, share = len(self.model.anchor_q), self.config.prune / len(self.schedule.prune)
         try:
-            keep, later = pruning.prune(
-                self.model, self.optimiser, shots[turn % stride :: stride], levels, share, turn, self._rounding()
-            )
+            keep, later = pruning.prune(self.model, self.optimiser, shots, levels, share, turn, self._rounding())
         except NotFinite:  # as a step that diverged: passed over, with nothing changed
             return ()
         self.densifier.keep(keep)

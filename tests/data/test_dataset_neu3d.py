@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pd4dgs_codec.data import frame_cache
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.data.synthetic import read_synthetic
 from pd4dgs_codec.data.view import Dataset
@@ -15,6 +16,11 @@ from pd4dgs_codec.errors import DataError
 imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
 CAMERAS, FRAMES, FPS = 3, 5, 12
 BOUNDS = (1.0, 9.0)
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv(frame_cache.FOLDER, str(tmp_path / "cache"))
 
 
 @pytest.fixture(scope="module")
@@ -105,8 +111,8 @@ def test_faults_are_one_line(scene, tmp_path, monkeypatch):
     refused("not a file of numpy")
     np.save(folder / "poses_bounds.npy", whole)
     with monkeypatch.context() as patch:
-        patch.setattr("pd4dgs_codec.data.neu3d.MOST_BYTES", 10_000)
-        refused("expected a larger --downscale")
+        patch.setenv(frame_cache.SIZE, "1e-6")
+        refused("expected a larger PD4DGS_CACHE_GIB or a larger --downscale")
     _video(folder / "cam01.mp4", [view.image for view in _views(scene, 1)[:3]])
     refused("cam01.mp4: has 3 frames at 12 per second and cam00.mp4 5")
     (folder / "cam01.mp4").write_bytes(b"no video")

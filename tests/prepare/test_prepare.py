@@ -10,7 +10,7 @@ from PIL import Image
 from rooms import FOCAL, walk
 
 from pd4dgs_codec.cli.prepare import main
-from pd4dgs_codec.data import load
+from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.prepare import poses, stages
 
 pytest.importorskip("pycolmap")

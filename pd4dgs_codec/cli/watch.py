@@ -1,0 +1,157 @@
+"""`pd4dgs-train --view`: the scene in the browser while it trains, served by viser.
+
+Pictures are drawn between two steps, in the trainer's own thread, so that none shows half an update. While nobody looks
+a step costs one look at an empty table.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import time
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from pd4dgs_codec.cli.progress import TrainingProgress
+from pd4dgs_codec.data.cameras import rotation_matrix, world_to_camera
+from pd4dgs_codec.errors import RenderError, TrainError
+from pd4dgs_codec.scene import Camera
+
+if TYPE_CHECKING:
+    from pd4dgs_codec.train.loop import Trainer
+
+#: On this machine alone: what trains is nobody else's business.
+HOST = "127.0.0.1"
+#: Pixels of the longer side of a picture, while the camera moves and once it rests.
+MOVING_PIXELS, RESTING_PIXELS = 320, 640
+#: Drawing takes at most this share of the time, however many look on.
+SHARE = 0.25
+#: Seconds between two pictures for an eye that rests.
+REFRESH = 2.0
+LEVELS = 3
+
+
+@dataclass
+class _Shown:
+    """What a browser was sent last: the camera's numbers, level and time, whether in full size, and when."""
+
+    what: tuple[Any, ...] = ()
+    full: bool = False
+    at: float = float("-inf")
+
+
+class WatchedProgress(TrainingProgress):
+    """The terminal's progress, and a page with pictures of the scene from wherever its viewers stand."""
+
+    def __init__(self, trainer: Trainer, port: int) -> None:
+        """Raises TrainError where viser is missing or the port cannot be had."""
+        super().__init__()
+        try:
+            import viser
+        except ImportError:
+            raise TrainError(
+                "--view needs the package viser, which is not installed: pip install 'pd4dgs-codec[watch]'"
+            ) from None
+        try:
+            with contextlib.redirect_stdout(io.StringIO()):  # its banner; stdout is for what was asked for
+                self.server = viser.ViserServer(host=HOST, port=port, label="pd4dgs-train", verbose=False)
+        except (OSError, RuntimeError) as error:
+            raise TrainError(f"--view {port}: cannot listen on this port: {error}") from None
+        self.url = f"http://{HOST}:{self.server.get_port()}"
+        self._shown: dict[int, _Shown] = {}
+        self._next, self._rows, self._began = 0.0, -1, time.monotonic()
+        data, gui = trainer.dataset, self.server.gui
+        self._span = max(data.time_range[1] - data.time_range[0], 1e-3)
+        eye = np.linalg.inv(data.camera.viewmat.astype(np.float64))
+        middle = data.box.astype(np.float64).mean(axis=0)
+        ahead = max(float(eye[:3, 2] @ (middle - eye[:3, 3])), data.near)
+        self.server.scene.set_up_direction(data.up)
+        self.server.initial_camera.position = tuple(eye[:3, 3])
+        self.server.initial_camera.look_at = tuple(eye[:3, 3] + ahead * eye[:3, 2])
+        self.server.initial_camera.up = data.up
+        self.server.initial_camera.fov = float(2 * np.arctan(data.camera.height / 2 / data.camera.K[1, 1]))
+        self.state = gui.add_markdown("starting")
+        levels = [str(level) for level in range(LEVELS)]
+        self.level = gui.add_dropdown("level", levels, initial_value=levels[-1])
+        self.time = gui.add_slider("time", min=0.0, max=1.0, step=0.001, initial_value=0.0)
+        self.play = gui.add_checkbox("play", initial_value=False)
+        self.curve: Any = None
+
+    def update(self, trainer: Trainer, record: dict[str, Any]) -> None:
+        """Called after every step."""
+        super().update(trainer, record)
+        clients = self.server.get_clients()
+        if not clients:
+            return
+        now = time.monotonic()
+        if now < self._next:
+            return
+        self._tell(trainer, record)
+        for key, client in clients.items():
+            with contextlib.suppress(RenderError, KeyError):  # a model that diverged; a browser that just left
+                self._show(trainer, key, client)
+        spent = time.monotonic() - now
+        self._next = now + spent / SHARE
+        self._shown = {key: shown for key, shown in self._shown.items() if key in clients}
+
+    def close(self) -> None:
+        """Takes the bar away and the page down."""
+        super().close()
+        with contextlib.redirect_stdout(io.StringIO()):
+            self.server.stop()
+
+    def _tell(self, trainer: Trainer, record: dict[str, Any]) -> None:
+        """How far it is, and the curve of quality where it has a new point."""
+        loss = record.get("loss", float("nan"))
+        total = f" of {trainer.total}" if trainer.total and not trainer.timed else ""
+        lines = (f"step {trainer.iteration}{total}, {trainer.seconds:.0f} s", f"loss {loss:.4f}")
+        self.state.content = "\n\n".join([*lines, f"{record['anchors']:,} anchors"])
+        if len(trainer.curve) == self._rows or not trainer.curve:
+            return
+        self._rows = len(trainer.curve)
+        steps = np.array([row["iteration"] for row in trainer.curve], np.float64)
+        psnr = [
+            np.array([(row["psnr"] + [np.nan] * LEVELS)[level] for row in trainer.curve]) for level in range(LEVELS)
+        ]
+        if self.curve is None:
+            colors = ("#888888", "#3377cc", "#cc5533")
+            series = [{"label": "step"}, *({"label": f"level {i}", "stroke": c} for i, c in enumerate(colors))]
+            self.curve = self.server.gui.add_uplot(
+                (steps, *psnr), tuple(series), title="PSNR dB", scales={"x": {"time": False}}, aspect=1.4
+            )
+        else:
+            self.curve.data = (steps, *psnr)
+
+    def _show(self, trainer: Trainer, key: int, client: Any) -> None:
+        """Draws for one browser, small at once where it moved, else in full now and then."""
+        from pd4dgs_codec.metrics.image import to_uint8
+        from pd4dgs_codec.model.picture import render_image
+
+        now = time.monotonic()
+        if self.play.value:
+            self.time.value = ((now - self._began) / self._span) % 1.0
+        level, t = min(int(self.level.value), trainer.model.level), float(np.clip(self.time.value, 0, 1))
+        eye = client.camera
+        what = (tuple(eye.wxyz), tuple(eye.position), eye.fov, eye.aspect, level, t)
+        shown = self._shown.setdefault(key, _Shown())
+        moved = what != shown.what
+        if not moved and shown.full and now - shown.at < REFRESH:
+            return
+        camera = camera_of(eye.wxyz, eye.position, eye.fov, eye.aspect, MOVING_PIXELS if moved else RESTING_PIXELS)
+        client.scene.set_background_image(to_uint8(render_image(trainer.model, level, t, camera)), format="jpeg")
+        self._shown[key] = _Shown(what, not moved, time.monotonic())
+
+
+def camera_of(wxyz: Any, position: Any, fov: float, aspect: float, pixels: int) -> Camera:
+    """A browser's camera: rotation camera to world as a quaternion, OpenCV axes; fov: vertical, radians; aspect: width
+    over height; pixels: of the longer side."""
+    rotation = rotation_matrix(np.asarray(wxyz) / max(float(np.linalg.norm(wxyz)), 1e-12))
+    viewmat = world_to_camera(rotation.T, np.asarray(position, np.float64))
+    width, height = (
+        (pixels, max(1, round(pixels / aspect))) if aspect >= 1 else (max(1, round(pixels * aspect)), pixels)
+    )
+    focal = 0.5 * height / np.tan(0.5 * fov)
+    K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]])
+    return Camera(viewmat.astype(np.float32), K.astype(np.float32), width, height)

@@ -1,0 +1,162 @@
+"""`pd4dgs-train --view`: a browser's part is played by a socket that speaks viser's messages."""
+
+from __future__ import annotations
+
+import importlib.metadata
+import time
+
+import numpy as np
+import pytest
+
+from pd4dgs_codec.cli import watch
+from pd4dgs_codec.cli.train import main
+from pd4dgs_codec.cli.watch import RESTING_PIXELS, WatchedProgress, camera_of
+from pd4dgs_codec.data.dataset import load
+from pd4dgs_codec.errors import TrainError
+from pd4dgs_codec.model.picture import render_image
+from pd4dgs_codec.train.config import TrainConfig
+from pd4dgs_codec.train.loop import Trainer
+
+WIDTH, HEIGHT, FOV = 64, 48, 0.9
+PATIENCE = 300.0
+
+
+@pytest.fixture(scope="module")
+def dataset():
+    return load("synthetic:local", downscale=8)
+
+
+@pytest.fixture
+def trainer(dataset):
+    return Trainer(TrainConfig(source="synthetic:local", preset="tiny", iterations=6), dataset)
+
+
+@pytest.fixture
+def watched(trainer):
+    pytest.importorskip("viser")
+    progress = WatchedProgress(trainer, 0)
+    yield progress
+    progress.close()
+
+
+class Browser:
+    """Looks from the data set's first camera."""
+
+    def __init__(self, progress: WatchedProgress, view):
+        import msgspec
+        from viser import _messages
+        from websockets.sync.client import connect
+
+        self.encode, self.messages, self.progress = msgspec.msgpack.encode, _messages, progress
+        version = importlib.metadata.version("viser")
+        address = progress.url.replace("http", "ws")
+        self.socket = connect(address, subprotocols=[f"viser-v{version}"], max_size=None)
+        eye = np.linalg.inv(view.viewmat.astype(np.float64))
+        self.pose = (wxyz_of(eye[:3, :3]), tuple(map(float, eye[:3, 3])))
+        look_at = tuple(map(float, eye[:3, 3] + eye[:3, 2]))
+        self.send(_messages.ViewerCameraMessage(*self.pose, FOV, 0.01, 100.0, HEIGHT, WIDTH, look_at, (0.0, 0.0, 1.0)))
+        wait_for(lambda: progress.server.get_clients())
+
+    def send(self, message) -> None:
+        self.socket.send(self.encode(message.as_serializable_dict()))
+
+    def choose(self, handle, value) -> None:
+        self.send(self.messages.GuiUpdateMessage(handle._impl.uuid, {"value": value}))
+        wait_for(lambda: handle.value == value)
+
+
+def wxyz_of(rotation: np.ndarray) -> tuple[float, float, float, float]:
+    w = np.sqrt(max(0.0, 1 + np.trace(rotation))) / 2
+    assert w > 0.01
+    x, y, z = (rotation[i, j] - rotation[j, i] for i, j in ((2, 1), (0, 2), (1, 0)))
+    return float(w), *(float(v / (4 * w)) for v in (x, y, z))
+
+
+def wait_for(condition) -> None:
+    end = time.monotonic() + PATIENCE
+    while not condition():
+        assert time.monotonic() < end, "nothing came"
+        time.sleep(0.01)
+
+
+def _step(trainer, progress) -> None:
+    progress._next = 0.0  # as if the time that drawing may take had come
+    progress.update(trainer, trainer.learner.step())
+
+
+def test_a_browser_sees_the_scene_from_its_camera(watched, trainer, dataset, monkeypatch):
+    monkeypatch.setattr(watch, "REFRESH", float("inf"))
+    sent = []
+    browser = Browser(watched, dataset.train[0])
+    client = next(iter(watched.server.get_clients().values()))
+    monkeypatch.setattr(client.scene, "set_background_image", lambda image, format: sent.append(image))
+    _step(trainer, watched)
+    _step(trainer, watched)
+    assert max(sent[0].shape) < max(sent[1].shape) == RESTING_PIXELS  # small at once, then in full
+    camera = camera_of(*browser.pose, FOV, WIDTH / HEIGHT, RESTING_PIXELS)
+    np.testing.assert_allclose(camera.viewmat, dataset.train[0].viewmat, atol=1e-5)
+    assert 2 * np.arctan(camera.height / 2 / camera.K[1, 1]) == pytest.approx(FOV)
+    expected = render_image(trainer.model, trainer.model.level, 0.0, camera)
+    assert np.abs(sent[1] / 255 - expected).max() <= 0.5 / 255 + 1e-3
+    _step(trainer, watched)
+    assert len(sent) == 2  # it rests, and the next picture is not due
+    browser.choose(watched.time, 0.5)
+    browser.choose(watched.level, "0")
+    _step(trainer, watched)
+    expected = render_image(trainer.model, 0, 0.5, camera_of(*browser.pose, FOV, WIDTH / HEIGHT, sent[2].shape[1]))
+    assert np.abs(sent[2] / 255 - expected).max() <= 0.5 / 255 + 1e-3
+    assert watched.state.content.startswith("step 4 of 6")
+
+
+def test_the_picture_travels_to_the_browser(watched, trainer, dataset):
+    browser = Browser(watched, dataset.train[0])
+    _step(trainer, watched)
+    received = b""
+    end = time.monotonic() + PATIENCE
+    while b"BackgroundImageMessage" not in received and time.monotonic() < end:
+        received = browser.socket.recv(timeout=PATIENCE)
+    assert b"BackgroundImageMessage" in received and b"\xff\xd8\xff" in received  # a JPEG
+
+
+def test_nothing_is_drawn_while_nobody_looks(watched, trainer, monkeypatch):
+    def never(*_: object) -> None:
+        raise AssertionError("drawn for nobody")
+
+    monkeypatch.setattr(watched, "_show", never)
+    monkeypatch.setattr(watched, "_tell", never)
+    for _ in range(3):
+        _step(trainer, watched)
+
+
+def test_curves_grow_with_the_run(watched, trainer, dataset):
+    Browser(watched, dataset.train[0])
+    trainer.curve = [{"iteration": 1, "seconds": 1.0, "psnr": [20.0, 21.0, 22.0]}]
+    _step(trainer, watched)
+    trainer.curve.append({"iteration": 2, "seconds": 2.0, "psnr": [23.0]})
+    _step(trainer, watched)
+    steps, *levels = watched.curve.data
+    assert list(steps) == [1, 2] and list(levels[0]) == [20, 23] and np.isnan(levels[2][1])
+
+
+def test_being_watched_changes_no_bit(dataset, trainer, watched):
+    other = Trainer(trainer.config, dataset)
+    Browser(watched, dataset.train[0])
+    for _ in range(6):
+        _step(trainer, watched)
+        other.learner.step()
+    mine, others = (t.model.state_dict() for t in (trainer, other))
+    assert all(bool((mine[name] == others[name]).all()) for name in mine)
+
+
+def test_without_viser_it_is_one_line(trainer, monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "viser", None)
+    with pytest.raises(TrainError, match=r"needs the package viser.*\[watch\]"):
+        WatchedProgress(trainer, 0)
+
+
+def test_the_command_says_where_to_look(tmp_path, capsys):
+    pytest.importorskip("viser")
+    options = ["--preset", "tiny", "--iterations", "2", "--downscale", "8", "--view", "0"]
+    assert main(["synthetic:local", "-o", str(tmp_path / "m.pt"), *options]) == 0
+    told = capsys.readouterr()
+    assert "the scene is at http://127.0.0.1:" in told.err and told.out == ""
