@@ -51,6 +51,45 @@ export function deformationUnit({ info: { box } }) {
   return 0.25 * Math.max(...[0, 1, 2].map((k) => box[1][k] - box[0][k]));
 }
 
+/**
+ * What Gaussians depend on. t: normalised time. eye: the camera's centre, scene units.
+ *
+ * @typedef {{scene: Scene, level: number, t: number, eye: number[]}} State
+ */
+
+/** A camera's centre that moves by less, in units of a quarter of the box, changes nothing that is seen. */
+const EYE_TOLERANCE = 1e-5;
+
+/**
+ * @param {Scene} scene @param {number} level the highest to show @param {number} seconds of the scene's time
+ * @param {number[]} eye the camera's centre, scene units
+ * @returns {State} with a time only where something moves
+ */
+export function stateOf(scene, level, seconds, eye) {
+  const shown = levelOf(scene, level);
+  const still = !shown.global && !shown.local;
+  return { scene, level: shown.number, t: still ? 0 : normalisedTime(scene.info, seconds), eye };
+}
+
+/** @param {State} a @param {State} b */
+export function sameState(a, b) {
+  const tolerance = EYE_TOLERANCE * deformationUnit(a.scene);
+  const eyes = () => [0, 1, 2].every((k) => Math.abs(a.eye[k] - b.eye[k]) <= tolerance);
+  return a.scene === b.scene && a.level === b.level && a.t === b.t && eyes();
+}
+
+/**
+ * Where playing arrives. ended: whether that is the end, which it does not leave.
+ *
+ * @param {number} time @param {number} elapsed seconds @param {[number, number]} range @param {boolean} loop
+ */
+export function timeAfter(time, elapsed, [start, end], loop) {
+  const next = time + elapsed;
+  if (next < end) return { time: next, ended: false };
+  if (loop && end > start) return { time: start + ((next - start) % (end - start)), ended: false };
+  return { time: end, ended: true };
+}
+
 /** Normalised time of `seconds` (clause 13.1). @param {Scene["info"]} info @param {number} seconds */
 export function normalisedTime({ timeRange: [start, end] }, seconds) {
   const t = (seconds - start) / (end - start);

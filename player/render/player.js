@@ -4,14 +4,15 @@ import { centreOf, defaultCamera, fitted } from "./camera.js";
 import { CpuEvaluator, startWorker } from "./cpu.js";
 import { GpuEvaluator } from "./evaluator.js";
 import { ContextLost, Gpu } from "./gl.js";
-import { deformationUnit, levelOf, normalisedTime } from "./level.js";
+import { levelOf, sameState, stateOf, timeAfter } from "./level.js";
 import { Pace } from "./pace.js";
 import { Painter } from "./painter.js";
-import { Remote } from "./remote.js";
+import { Remote, startLoader } from "./remote.js";
 
 /** @typedef {import("../decode/scene.js").Scene} Scene */
 /** @typedef {import("../decode/scene.js").Camera} Camera */
 /** @typedef {import("./evaluator.js").Splats} Splats */
+/** @typedef {import("./level.js").State} State */
 
 /**
  * How to play. level: the highest to load and show, default all. time: seconds of the scene's time to start at. bytes,
@@ -157,7 +158,7 @@ export class Player extends EventTarget {
   async load(source) {
     if (this._closed) return;
     this.stopLoading();
-    const loader = new Remote(new URL("./loader-worker.js", import.meta.url), (news) => {
+    const loader = startLoader((news) => {
       if (loader === this._loader) this._told(news);
     });
     this._loader = loader;
@@ -444,18 +445,10 @@ export class Player extends EventTarget {
 
   /** @param {number} now */
   _advance(now) {
-    const [start, end] = this.timeRange;
     const elapsed = this._lastFrame ? Math.min((now - this._lastFrame) / 1000, 0.25) : 0;
     this._lastFrame = now;
-    let time = this.time + elapsed;
-    if (time >= end) {
-      if (this._options.loop && end > start) {
-        time = start + ((time - start) % (end - start));
-      } else {
-        time = end;
-        this.pause();
-      }
-    }
+    const { time, ended } = timeAfter(this.time, elapsed, this.timeRange, !!this._options.loop);
+    if (ended) this.pause();
     this._time = time;
     this._emit("timeupdate", { time });
   }
@@ -467,14 +460,7 @@ export class Player extends EventTarget {
     let level = this._front ? (this._level ?? 2) : 0; // the first picture is the one that comes soonest
     if (this._playing && this._options.degrade !== false) level = Math.min(level, this._pace.level);
     if (this._useCpu && this._options.evaluator !== "cpu") level = Math.min(level, CPU_LEVEL);
-    const shown = levelOf(scene, Math.max(level, 0));
-    const still = !shown.global && !shown.local;
-    return {
-      scene,
-      level: shown.number,
-      t: still ? 0 : normalisedTime(scene.info, this.time),
-      eye: centreOf(camera),
-    };
+    return stateOf(scene, Math.max(level, 0), this.time, centreOf(camera));
   }
 
   _isEvaluated() {
@@ -660,16 +646,4 @@ export class Player extends EventTarget {
     if (before === null) this._emit("firstpicture", detail);
     else if (more) this._emit("upgrade", detail);
   }
-}
-
-/** What Gaussians depend on. @typedef {{scene: Scene, level: number, t: number, eye: number[]}} State */
-
-/** A camera's centre that moves by less, in units of a quarter of the box, changes nothing that is seen. */
-const EYE_TOLERANCE = 1e-5;
-
-/** @param {State} a @param {State} b */
-function sameState(a, b) {
-  const tolerance = EYE_TOLERANCE * deformationUnit(a.scene);
-  const eyes = () => [0, 1, 2].every((k) => Math.abs(a.eye[k] - b.eye[k]) <= tolerance);
-  return a.scene === b.scene && a.level === b.level && a.t === b.t && eyes();
 }

@@ -56,6 +56,9 @@ export class Remote {
   }
 }
 
+/** The worker that fetches and decodes. @param {(news: import("./loader-worker.js").News) => void} told */
+export const startLoader = (told) => new Remote(new URL("./loader-worker.js", import.meta.url), told);
+
 /** @param {URL} url @returns {Worker} */
 function start(url) {
   if (url.protocol === "blob:") return new Worker(url); // packed: no module, which a page from a file cannot load

@@ -5,7 +5,8 @@ import { gzipSync } from "node:zlib";
 
 import { build } from "esbuild";
 
-const ENTRIES = ["decode/index.js", "element.js", "render/loader-worker.js", "render/sort-worker.js", "render/evaluate-worker.js"];
+const WORKERS = ["render/loader-worker.js", "render/sort-worker.js", "render/evaluate-worker.js"];
+const ENTRIES = ["decode/index.js", "element.js", "spark.js", ...WORKERS];
 
 for (const entry of ENTRIES) {
   const { outputFiles } = await build({

@@ -45,12 +45,14 @@ from pd4dgs_codec.scene import (
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "tools"))
-from pages.browser import PATIENCE_MS, call, cameras, copy_player, decibels, launched, resized, shots  # noqa: E402
+from pages.browser import PATIENCE_MS, PLAYER, call, cameras, copy_player, decibels, launched, resized, shots  # noqa: E402
 from pages.browser import pixels as pixels_of  # noqa: E402
 
 WIDTH, HEIGHT = 96, 72
 #: Of pictures against the rasteriser. Eight bits alone leave 59.
 LEAST_DB = 45.0
+#: Of pictures that Spark draws, whose Gaussians are half floats and small integers.
+SPARK_DB = 40.0
 
 
 def _missing(reason: str) -> Any:
@@ -277,6 +279,40 @@ def test_pictures_are_those_of_the_rasteriser(harness, server, folder, kind, eva
         seen.append(shot.player)
     assert len(seen) == 9 * len(views)
     assert decibels(seen[1], seen[2]) < 60 and decibels(seen[2], seen[5]) < 60  # levels and times differ
+
+
+#: What a page with Spark asks for, of the packages in player/node_modules.
+SPARK_FILES = (
+    "three/build/three.module.js",
+    "three/build/three.core.js",
+    "three/examples/jsm/postprocessing/Pass.js",
+    "@sparkjsdev/spark/dist/spark.module.js",
+)
+
+
+@pytest.mark.parametrize(("kind", "levels"), [("lively", (0, 1)), ("trained", (0, 1, 2))])
+def test_pictures_through_spark_are_those_of_the_rasteriser(page, server, folder, kind, levels, request):
+    pytest.importorskip("numba")
+    for name in SPARK_FILES:
+        if not (PLAYER / "node_modules" / name).is_file():
+            pytest.skip("no Spark: npm install --no-package-lock in player/")
+        (folder / "packages" / name).parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(PLAYER / "node_modules" / name, folder / "packages" / name)
+    # level 2 of the lively scene has large Gaussians that stand outside the picture, which Spark leaves out
+    data = request.getfixturevalue(kind)
+    (folder / f"{kind}.pd4").write_bytes(data)
+    page.goto(server.url_of("player/test-browser/spark.html"))
+    page.wait_for_function("!!window.harness")
+    call(page, "harness.open", server.url_of(f"{kind}.pd4"), WIDTH, HEIGHT)
+    scene = decode(data)
+    views = [resized(camera, WIDTH, HEIGHT) for camera in cameras(scene, [(0.3, 0.1)])]
+    seen = []
+    for shot in shots(page, data, views, (0.0, 1.0), levels):
+        assert decibels(shot.player, shot.expected) > SPARK_DB, (shot.level, shot.t, shot.camera)
+        assert np.abs(shot.expected - scene.info.background).max() > 0.2
+        seen.append(shot.player)
+    assert decibels(seen[0], seen[1]) < 60  # levels differ
+    call(page, "harness.close")
 
 
 def test_networks_that_shaders_cannot_hold_show_level_0(harness, folder, server):

@@ -1,0 +1,263 @@
+// The adapter to Spark, with real workers in threads, and doubles for what it uses of Spark and three.js.
+
+import assert from "node:assert/strict";
+import { after, test } from "node:test";
+import { Worker as Thread } from "node:worker_threads";
+
+import { decode } from "../decode/index.js";
+import { evaluate } from "../render/evaluate.js";
+import { Pd4Splats } from "../spark.js";
+import { readVector } from "../testing/vectors.mjs";
+
+const BYTES = readVector("valid/layers-0-1-2");
+const ADDRESS = addressOf(BYTES);
+
+/** @param {Uint8Array} bytes */
+function addressOf(bytes) {
+  return `data:application/octet-stream;base64,${Buffer.from(bytes).toString("base64")}`;
+}
+
+/** What workers expect around them, in a thread. */
+const AROUND = `
+const { parentPort, workerData } = require("node:worker_threads");
+globalThis.addEventListener = (_, take) => parentPort.on("message", (data) => take({ data }));
+globalThis.postMessage = (message, { transfer }) => parentPort.postMessage(message, transfer);
+import(workerData);`;
+
+let threads = 0;
+
+/** A browser's Worker as far as the player uses it. */
+class Worker {
+  /** @param {URL} url */
+  constructor(url) {
+    threads++;
+    this._thread = new Thread(AROUND, { eval: true, workerData: url.href });
+    this._thread.on("message", (data) => this.onmessage({ data }));
+    this._thread.on("exit", () => threads--);
+  }
+
+  /** @param {{data: any}} _event */
+  onmessage(_event) {}
+
+  /** @param {any} message @param {any[]} transfer */
+  postMessage(message, transfer) {
+    this._thread.postMessage(message, transfer);
+  }
+
+  terminate() {
+    this._thread.terminate();
+  }
+}
+
+Object.assign(globalThis, { Worker, location: { origin: "null" }, document: { baseURI: "http://localhost/" } });
+after(async () => {
+  for (let i = 0; threads && i < 500; i++) await new Promise((resolve) => setTimeout(resolve, 20));
+  assert.equal(threads, 0, "threads are left");
+});
+
+class Vector {
+  x = 0;
+  y = 0;
+  z = 0;
+  r = 0;
+  g = 0;
+  b = 0;
+
+  /** @param {ArrayLike<number>} array @param {number} at */
+  fromArray(array, at) {
+    [this.x, this.y, this.z] = [this.r, this.g, this.b] = Array.from(array).slice(at, at + 3);
+    return this;
+  }
+
+  /** @param {number} x @param {number} y @param {number} z @param {number} w */
+  set(x, y, z, w) {
+    Object.assign(this, { x, y, z, w });
+  }
+
+  setFromMatrixPosition({ eye = [0, 0, 0] }) {
+    [this.x, this.y, this.z] = eye;
+    return this;
+  }
+
+  applyMatrix4() {
+    return this;
+  }
+
+  /** @param {any[]} values */
+  setRGB(...values) {
+    return Object.assign(this, { values });
+  }
+}
+
+/** The identity. */
+class Matrix4 {
+  copy() {
+    return this;
+  }
+
+  invert() {
+    return this;
+  }
+}
+
+const THREE = { Vector3: Vector, Quaternion: Vector, Color: Vector, Matrix4, SRGBColorSpace: "srgb" };
+
+/** Spark's: arrays of whole rows of 2,048, which grow at least twofold; textures that are made anew with them. */
+class ExtSplats {
+  constructor() {
+    this.maxSplats = this.numSplats = 0;
+    this.extArrays = [new Uint32Array(0), new Uint32Array(0)];
+    this.textures = [{ needsUpdate: false }, { needsUpdate: false }];
+    /** @type {any[]} */
+    this.content = [];
+    this.made = 0;
+  }
+
+  /** @param {number} count */
+  ensureSplats(count) {
+    if (count <= this.maxSplats) return;
+    this.maxSplats = 2048 * Math.ceil(Math.max(count, 2 * this.maxSplats) / 2048);
+    this.extArrays = [new Uint32Array(4 * this.maxSplats), new Uint32Array(4 * this.maxSplats)];
+  }
+
+  /**
+   * @param {number} index @param {any} centre @param {any} scales @param {any} q @param {number} opacity
+   * @param {any} color
+   */
+  setSplat(index, centre, scales, q, opacity, color) {
+    assert.ok(index < this.maxSplats);
+    this.numSplats = Math.max(this.numSplats, index + 1);
+    this.content[index] = [
+      ...[centre.x, centre.y, centre.z, scales.x, scales.y, scales.z, q.w, q.x, q.y, q.z],
+      ...[opacity, color.r, color.g, color.b],
+    ];
+  }
+
+  /** @param {{extArrays: Uint32Array[], numSplats: number}} options */
+  reinitialize({ extArrays, numSplats }) {
+    this.made++;
+    assert.equal(extArrays[0].length, 4 * this.maxSplats);
+    this.numSplats = numSplats;
+    this.textures = [{ needsUpdate: false }, { needsUpdate: false }];
+  }
+}
+
+class SplatMesh {
+  /** @param {{extSplats: ExtSplats}} options */
+  constructor({ extSplats }) {
+    this.extSplats = extSplats;
+    this.matrixWorld = {};
+    this.mappings = 0;
+    this.disposed = false;
+  }
+
+  updateWorldMatrix() {}
+
+  updateMappingVersion() {
+    this.mappings++;
+  }
+
+  dispose() {
+    this.disposed = true;
+  }
+}
+
+/** @param {number[]} eye */
+const cameraAt = (eye) => ({ matrixWorld: { eye }, updateWorldMatrix() {} });
+const modules = /** @type {any} */ ({ THREE, spark: { ExtSplats, SplatMesh } });
+
+/** @param {Pd4Splats} splats @param {any} camera */
+async function settle(splats, camera) {
+  splats.update(camera);
+  while (!splats.settled) await new Promise((resolve) => setTimeout(resolve, 2));
+}
+
+/** @param {EventTarget} target @param {string} name @returns {Promise<any>} */
+const detailOf = (target, name) =>
+  new Promise((resolve) => target.addEventListener(name, (event) => resolve(/** @type {any} */ (event).detail)));
+
+/** What the mesh must hold. @param {number} level @param {number} t @param {number[]} eye */
+function expected(level, t, eye) {
+  const g = evaluate(decode(BYTES), level, t, eye);
+  return Array.from({ length: g.count }, (_, i) => {
+    const columns = /** @type {const} */ ([[g.mean, 3], [g.scale, 3], [g.quaternion, 4], [g.opacity, 1], [g.color, 3]]);
+    return columns.flatMap(([values, width]) => Array.from(values.subarray(width * i, width * (i + 1))));
+  });
+}
+
+test("the mesh holds the Gaussians of a level at a time before a camera", async () => {
+  const splats = await Pd4Splats.open(ADDRESS, modules);
+  /** @type {any[]} */
+  const upgrades = [];
+  splats.addEventListener("upgrade", (event) => upgrades.push(/** @type {any} */ (event).detail));
+  const { bytes, complete } = await detailOf(splats, "loaded");
+  assert.ok(complete && bytes === BYTES.length);
+  const { info, levels, mesh } = splats;
+  assert.deepEqual(levels, [0, 1, 2]);
+  assert.deepEqual(splats.background.values, [...info.background, "srgb"]);
+  const [start, end] = info.timeRange;
+  let seen = 0;
+  for (const [level, share, eye] of /** @type {[number, number, number[]][]} */ ([
+    [0, 0, [0, 0, -4]],
+    [1, 0.5, [0, 0, -4]],
+    [2, 1, [1, 2, -3]],
+  ])) {
+    splats.level = level;
+    splats.time = start + share * (end - start);
+    await settle(splats, cameraAt(eye));
+    const wanted = expected(level, level ? share : 0, eye);
+    assert.ok(wanted.length > 0);
+    assert.equal(mesh.extSplats.numSplats, wanted.length);
+    assert.deepEqual(mesh.extSplats.content.slice(0, wanted.length), wanted);
+    assert.equal(mesh.mappings, ++seen);
+    await settle(splats, cameraAt(eye));
+    assert.equal(mesh.mappings, seen, "nothing is evaluated in vain");
+  }
+  assert.equal(mesh.extSplats.made, 1);
+  assert.ok(mesh.extSplats.textures.every((/** @type {any} */ texture) => texture.needsUpdate));
+  assert.deepEqual(upgrades.map(({ level }) => level), [0, 1, 2]);
+  splats.close();
+  assert.ok(mesh.disposed);
+  assert.throws(() => splats.update(cameraAt([0, 0, 0])), /closed/);
+});
+
+test("time passes while it plays, and begins anew or stops", async () => {
+  const splats = await Pd4Splats.open(ADDRESS, { ...modules, time: 1e9, level: 0 });
+  const [start, end] = splats.info.timeRange;
+  assert.deepEqual([splats.time, splats.levels], [end, [0]]);
+  const camera = cameraAt([0, 0, -4]);
+  const now = performance.now;
+  let clock = 1;
+  performance.now = () => clock;
+  try {
+    splats.play();
+    splats.update(camera);
+    assert.equal(splats.time, start);
+    clock += 500 * (end - start);
+    splats.update(camera);
+    assert.ok(Math.abs(splats.time - (start + end) / 2) < 1e-9);
+    clock += 1000 * (end - start);
+    splats.update(camera);
+    assert.ok(Math.abs(splats.time - (start + end) / 2) < 1e-9 && !splats.paused);
+    splats.loop = false;
+    clock += 1000 * (end - start);
+    splats.update(camera);
+    assert.ok(splats.time === end && splats.paused);
+  } finally {
+    performance.now = now;
+    splats.close();
+  }
+});
+
+test("a file that is none is refused, one that ends badly keeps its layers", async () => {
+  await assert.rejects(Pd4Splats.open(addressOf(new Uint8Array(64)), modules), { kind: "BadSignature" });
+  const damaged = BYTES.slice();
+  damaged[damaged.length - 20] ^= 4;
+  const splats = await Pd4Splats.open(addressOf(damaged), modules);
+  const { kind, message } = await detailOf(splats, "error");
+  assert.equal(kind, "FetchError"); // a damaged slice is asked for once more, and these addresses know no ranges
+  assert.ok(message && !message.includes("\n"));
+  await settle(splats, cameraAt([0, 0, -4]));
+  assert.deepEqual(splats.levels, [0, 1]);
+  splats.close();
+});
