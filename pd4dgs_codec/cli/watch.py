@@ -75,7 +75,7 @@ class WatchedProgress(TrainingProgress):
         self.state = gui.add_markdown("starting")
         levels = [str(level) for level in range(LEVELS)]
         self.level = gui.add_dropdown("level", levels, initial_value=levels[-1])
-        self.time = gui.add_slider("time", min=0.0, max=1.0, step=0.001, initial_value=0.0)
+        self.time: Any = gui.add_slider("time", min=0.0, max=1.0, step=0.001, initial_value=0.0)
         self.play = gui.add_checkbox("play", initial_value=False)
         self.curve: Any = None
 
@@ -117,7 +117,8 @@ class WatchedProgress(TrainingProgress):
         ]
         if self.curve is None:
             colors = ("#888888", "#3377cc", "#cc5533")
-            series = [{"label": "step"}, *({"label": f"level {i}", "stroke": c} for i, c in enumerate(colors))]
+            series: list[Any] = [{"label": "step"}]
+            series += [{"label": f"level {i}", "stroke": c} for i, c in enumerate(colors)]
             self.curve = self.server.gui.add_uplot(
                 (steps, *psnr), tuple(series), title="PSNR dB", scales={"x": {"time": False}}, aspect=1.4
             )
