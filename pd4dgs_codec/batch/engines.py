@@ -35,7 +35,7 @@ class Feed(Protocol):
 
 
 @dataclass(frozen=True)
-class Settings:
+class EngineSettings:
     """How an engine runs jobs.
 
     workers: jobs at a time; 0: in this process, one after the other. threads: CPUs of a job. gpus: of a job. timeout:
@@ -62,7 +62,7 @@ def lost(why: str) -> Outcome:
 
 
 Outcomes = Generator[tuple[Job, Outcome], None, None]
-Engine = Callable[[Work, Feed, Settings], Outcomes]
+Engine = Callable[[Work, Feed, EngineSettings], Outcomes]
 
 # -- this machine ------------------------------------------------------------------------------------------------------
 
@@ -114,7 +114,7 @@ def _serve(pipe: Connection, work: Work) -> None:
         pipe.send(work(job))
 
 
-def local(work: Work, feed: Feed, settings: Settings) -> Outcomes:
+def local(work: Work, feed: Feed, settings: EngineSettings) -> Outcomes:
     """A pool of processes; with 0 workers this process alone, which nothing can end early."""
     if settings.workers == 0:
         while job := feed.take():
@@ -149,7 +149,7 @@ def local(work: Work, feed: Feed, settings: Settings) -> Outcomes:
             worker.kill()
 
 
-def _patience(busy: list[_Worker], settings: Settings) -> float | None:
+def _patience(busy: list[_Worker], settings: EngineSettings) -> float | None:
     """Seconds until the next job is late."""
     if settings.timeout is None:
         return None
@@ -159,7 +159,7 @@ def _patience(busy: list[_Worker], settings: Settings) -> float | None:
 # -- Ray ---------------------------------------------------------------------------------------------------------------
 
 
-def ray(work: Work, feed: Feed, settings: Settings) -> Outcomes:
+def ray(work: Work, feed: Feed, settings: EngineSettings) -> Outcomes:
     """Tasks of Ray Core on the cluster at `address` (RAY_ADDRESS if None, else one on this machine)."""
     import ray
 
@@ -202,7 +202,7 @@ def _call(work: Work, job: Job) -> Outcome:
 # -- Slurm -------------------------------------------------------------------------------------------------------------
 
 
-def slurm(work: Work, feed: Feed, settings: Settings) -> Outcomes:
+def slurm(work: Work, feed: Feed, settings: EngineSettings) -> Outcomes:
     """Array jobs of Slurm, through submitit; `cluster=local` in `slurm` runs them as processes of this machine."""
     import submitit
 

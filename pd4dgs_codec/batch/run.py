@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from typing import Any
 
-from pd4dgs_codec.batch.engines import Engine, Settings
+from pd4dgs_codec.batch.engines import Engine, EngineSettings
 from pd4dgs_codec.batch.job import ALREADY, DONE, FAILED, Job, Outcome, run_job
 from pd4dgs_codec.batch.ops import Command
 
@@ -59,7 +59,9 @@ class Summary:
 Told = Callable[[Job, Outcome, int], None]
 
 
-def run(jobs: Iterator[Job], command: Command, engine: Engine, settings: Settings, retries: int, told: Told) -> Summary:
+def run(
+    jobs: Iterator[Job], command: Command, engine: Engine, settings: EngineSettings, retries: int, told: Told
+) -> Summary:
     """Runs all jobs; one that fails is tried again `retries` times, unless that would end the same."""
     summary, tries, begun = Summary(), Counter[int](), time.monotonic()
     feed = JobFeed(jobs)

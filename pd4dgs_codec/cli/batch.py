@@ -150,7 +150,7 @@ def _batch(args: argparse.Namespace, console: Console) -> int:
     store.Root(output).check()
     failures = _Failures(args, manifest)
     jobs = (Job(line, args.op, output, threads, args.overwrite) for line in manifest.lines())
-    settings = engines.Settings(
+    settings = engines.EngineSettings(
         workers, threads, args.gpus, args.timeout or None, args.address, Path(args.logs), dict(args.slurm)
     )
     with progress_bar(manifest.count, "scenes", args.op) as step:

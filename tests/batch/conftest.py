@@ -9,7 +9,7 @@ from typing import Any
 import pytest
 from standin import upper
 
-from pd4dgs_codec.batch.engines import ENGINES, Settings
+from pd4dgs_codec.batch.engines import ENGINES, EngineSettings
 from pd4dgs_codec.batch.job import Job, Outcome
 from pd4dgs_codec.batch.manifest import Manifest
 from pd4dgs_codec.batch.ops import OPS
@@ -47,7 +47,7 @@ class Library:
         def told(job: Job, outcome: Outcome, tries: int) -> None:
             self.outcomes[job.line.output] = outcome, tries
 
-        return run(jobs, upper, ENGINES[on], Settings(**settings), retries, told)
+        return run(jobs, upper, ENGINES[on], EngineSettings(**settings), retries, told)
 
     def made(self) -> list[str]:
         """The texts that the command has written, as often as it did."""

@@ -29,7 +29,19 @@ myst_heading_anchors = 4
 myst_enable_extensions = ["strikethrough"]
 
 # The site needs neither torch nor numba: what is not installed is a stand-in while docstrings are read.
-autodoc_mock_imports = ["torch", "numba", "PIL", "imageio_ffmpeg", "matplotlib", "tqdm", "gsplat", "llvmlite"]
+autodoc_mock_imports = [
+    "torch",
+    "numba",
+    "PIL",
+    "imageio_ffmpeg",
+    "matplotlib",
+    "tqdm",
+    "gsplat",
+    "llvmlite",
+    "fsspec",
+    "pycolmap",
+    "viser",
+]
 autodoc_member_order = "bysource"
 autodoc_default_options = {"members": True, "ignore-module-all": True}
 autodoc_preserve_defaults = True
@@ -56,6 +68,7 @@ CONTENTS = {
         "docs/delivery",
         "docs/player",
         "docs/interchange",
+        "docs/batch",
         "docs/evaluation",
         "docs/api/index",
     ],
@@ -69,6 +82,7 @@ CONTENTS = {
         "docs/stability",
         "docs/omissions",
         "docs/performance",
+        "docs/long-captures",
     ],
     "Project": ["docs/design", "docs/dependencies", "CONTRIBUTING", "SECURITY", "CHANGELOG"],
 }
