@@ -35,6 +35,7 @@ VIEWS = 16  #: training views that order the anchors
 STEP, LEAST = 0.5, 20.0  #: dB between the qualities whose times are compared, and the lowest of them
 RATE = 2e6  #: bits per second
 STRIP = 6  #: pictures of a film strip
+COLUMNS = 3  #: panels of the plot beside each other
 
 Points = list[tuple[int, float]]  #: (bytes, dB) after each slice
 
@@ -135,9 +136,13 @@ def plot(rows: Sequence[Row], path: Path) -> None:
     matplotlib.use("Agg")
     from matplotlib import pyplot
 
-    figure, axes = pyplot.subplots(1, len(rows), figsize=(5.2 * len(rows), 3.8), squeeze=False)
+    across = min(COLUMNS, len(rows))
+    down = -(-len(rows) // across)
+    figure, axes = pyplot.subplots(down, across, figsize=(4.6 * across, 3.4 * down), squeeze=False)
     styles = {"slices": ("-o", "slices, by utility"), "random": (":x", "slices, random"), "layers": ("--s", "layers")}
-    for axis, row in zip(axes.flat, rows, strict=True):
+    for axis in axes.flat[len(rows) :]:
+        axis.set_axis_off()
+    for axis, row in zip(axes.flat, rows, strict=False):
         for name, (style, label) in styles.items():
             sizes, db = zip(*row[name], strict=True)
             where = "steps-post" if name == "layers" else "default"
