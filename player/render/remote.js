@@ -13,7 +13,7 @@ export class Remote {
     this._worker.onmessage = ({ data }) => {
       const waiting = this._waiting.get(data.call);
       if (!waiting) {
-        told(data.told);
+        if (data.told && !this._failed) told(data.told); // else a reply to a call that was given up
         return;
       }
       this._waiting.delete(data.call);
