@@ -47,7 +47,7 @@ def _relative_harm(model: Model, level: int, shots: Sequence[Shot], rounding: Ro
         found, near, image = step_harm(model, *place, generator, weights=weights, rounding=rounding)
         harm += found.cpu()
         met |= near.cpu()
-        error += float(((image - shot.target.image).square().sum(-1) * weights).sum())
+        error += shot.squared_error(image)
     return torch.where(met, harm / max(error, 1e-12), torch.inf)
 
 

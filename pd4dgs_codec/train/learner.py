@@ -420,7 +420,7 @@ class Learner:
         """Where the last third begins, if prefixes are to be trained: the order of the anchors in a file."""
         if self.config.prefixes and self._reached(self.schedule.rounding):
             try:
-                self.rank = workers.alike(lambda: prefixes.rank_anchors(self.model, self.shots))
+                self.rank = workers.alike(lambda: prefixes.rank_anchors(self.model, self.dataset.train))
             except NotFinite:  # as a step that diverged: passed over
                 pass
 

@@ -14,11 +14,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pd4dgs_codec.data.view import View
 from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.utility import utility, without
 from pd4dgs_codec.scene import MASK_THRESHOLD
-from pd4dgs_codec.train.shot import Shot
 
 #: Training views whose pictures order the anchors.
 VIEWS = 12
@@ -26,15 +26,15 @@ VIEWS = 12
 OCTAVES = 4
 
 
-def rank_anchors(model: Model, shots: Sequence[Shot]) -> Tensor:
+def rank_anchors(model: Model, views: Sequence[View]) -> Tensor:
     """float64 [N]: what each anchor is worth at level 0, the highest first in a file; -inf if it is not there."""
     absent = (model.masks(0).detach() <= MASK_THRESHOLD).cpu().numpy()
     scene = without(to_scene(model).prefix(0), np.flatnonzero(absent))
     scene = replace(scene, steps=scene.steps.scaled(1.0))  # binary32, as a file has them
-    stride = -(-len(shots) // VIEWS)
+    stride = -(-len(views) // VIEWS)
     rank = torch.full((len(absent),), -torch.inf, dtype=torch.float64)
     rank[torch.from_numpy(~absent)] = torch.from_numpy(
-        utility(scene, [(shot.view.camera, shot.view.time) for shot in shots[::stride]])
+        utility(scene, [(view.camera, view.time) for view in views[::stride]])
     )
     return rank
 

@@ -74,7 +74,7 @@ def relative_harm(model: Model, level: int, shots: Sequence[Shot], rounding: Rou
         harm, near, image = anchor_harm(model, *place, generator, weights=weights, rounding=rounding)
         total += harm
         met |= near
-        error += float(((image - shot.target.image).square().sum(-1) * weights).sum())
+        error += shot.squared_error(image)
     return torch.where(met, total / max(error, 1e-12), torch.inf)
 
 

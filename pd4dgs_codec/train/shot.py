@@ -8,6 +8,7 @@ from dataclasses import dataclass
 from typing import overload
 
 import torch
+from torch import Tensor
 
 from pd4dgs_codec.data.view import View
 from pd4dgs_codec.train.ssim import TargetStats
@@ -26,6 +27,10 @@ class Shot:
         image = torch.as_tensor(view.image, device=device).float() / 255
         mask = None if view.mask is None else torch.as_tensor(view.mask, device=device).float()
         return Shot(view, TargetStats(image, mask))
+
+    def squared_error(self, image: Tensor) -> float:
+        """Of a picture [H, W, 3] of this view, summed over colours and weighted pixels."""
+        return float(((image - self.target.image).square().sum(-1) * self.target.weights).sum())
 
 
 #: Bytes of images on the device, weights included, beyond which those not used for longest leave.

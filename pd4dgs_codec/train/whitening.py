@@ -70,7 +70,7 @@ def _feature_harm(model: Model, level: int, shots: Sequence[Shot], rounding: Rou
         slopes, _, image = attribute_slopes(model, *place, generator, weights=weights, rounding=rounding)
         slope = (slopes["feature"] * model.spacing[:, None]).double()
         total += slope.T @ slope
-        error += float(((image - shot.target.image).square().sum(-1) * weights).sum())
+        error += shot.squared_error(image)
     return total / max(error, 1e-12)
 
 
