@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
+from importlib import import_module
 from typing import Any, TypeVar
 
 import torch
@@ -24,6 +25,9 @@ def start(device: str, views: int) -> None:
     if views % workers:
         raise TrainError(f"found {workers} workers, expected a number that divides --views-per-step {views}")
     if workers > 1:
+        # Its functions have the group of all workers as a default, taken when it is loaded. Adam loads it. Loaded later
+        # than the group it would keep the group's threads beyond stop(), to abort the process now and then at its end.
+        import_module("torch.distributed.nn.functional")
         if device == "cuda":
             torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
         distributed.init_process_group("cpu:gloo,cuda:nccl" if device == "cuda" else "gloo")
