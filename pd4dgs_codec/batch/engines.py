@@ -11,6 +11,7 @@ import contextlib
 import multiprocessing
 import os
 import signal
+import socket
 import threading
 import time
 from collections.abc import Callable, Generator
@@ -161,12 +162,19 @@ def _patience(busy: list[_Worker], settings: EngineSettings) -> float | None:
 
 def ray(work: Work, feed: Feed, settings: EngineSettings) -> Outcomes:
     """Tasks of Ray Core on the cluster at `address` (RAY_ADDRESS if None, else one on this machine)."""
+    address = settings.address or os.environ.get("RAY_ADDRESS")
+    _reach(address)
     import ray
 
     try:
-        ray.init(address=settings.address or os.environ.get("RAY_ADDRESS"), log_to_driver=False, logging_level="ERROR")
+        ray.init(address=address, log_to_driver=False, logging_level="ERROR")
     except Exception as error:  # a bare one too, where a node does not come up
-        raise DataError(f"Ray cannot be reached at {settings.address or 'its address'}: {error}") from None
+        raise DataError(f"Ray cannot be reached at {address or 'an address of its own'}: {error}") from None
+    needed = {"CPU": settings.threads, "GPU": settings.gpus}
+    if not any(_has(node, needed) for node in ray.nodes()):
+        ray.shutdown()
+        wanted = " and ".join(f"{count:g} {kind}" for kind, count in needed.items() if count)
+        raise DataError(f"no node of the Ray cluster has the {wanted} that a scene takes")  # Ray would wait for one
     # lost nodes and workers are outcomes: one bound for all retries
     task = ray.remote(num_cpus=settings.threads, num_gpus=settings.gpus, max_retries=0)(_call)
     running: dict[Any, tuple[Job, float]] = {}
@@ -192,6 +200,22 @@ def ray(work: Work, feed: Feed, settings: EngineSettings) -> Outcomes:
                     yield job, settings.late(job)
     finally:
         ray.shutdown()
+
+
+def _has(node: dict[str, Any], needed: dict[str, float]) -> bool:
+    return bool(node["Alive"]) and all(node["Resources"].get(kind, 0) >= count for kind, count in needed.items())
+
+
+def _reach(address: str | None) -> None:
+    """Sees that something listens at HOST:PORT: Ray itself tries for a quarter of an hour. Raises DataError."""
+    host, colon, port = (address or "").removeprefix("ray://").rpartition(":")
+    if not (colon and port.isdecimal()):
+        return  # auto, local, or none: Ray looks on this machine
+    os.environ.setdefault("RAY_gcs_server_port_wait_time_s", "1")  # tries, of 40 s each, of what listens and is no Ray
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
+    except (OSError, OverflowError) as error:
+        raise DataError(f"no Ray cluster answers at {address}: {error}") from None
 
 
 def _call(work: Work, job: Job) -> Outcome:

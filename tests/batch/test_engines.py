@@ -150,9 +150,11 @@ def test_ray_makes_what_one_process_makes_though_a_worker_dies(filled, ray_clust
     assert summary.done == 9 and filled.outcomes["z.pd4"][1] == 2 and filled.outcomes["bad.pd4"][1] == 2
     assert {name: text for name, text in _outputs(filled).items() if name in WANTED} == WANTED
     assert filled.run("ray", workers=2, retries=0, address="local").already == 9
+    with pytest.raises(engines.DataError, match="no node .* has the 999 CPU"):
+        filled.run("ray", address="local", threads=999)
 
 
-def test_a_cluster_that_is_not_there_is_named(filled, ray_cluster, monkeypatch):
+def test_a_cluster_that_is_not_there_is_named(filled, ray_cluster):
     with pytest.raises(engines.DataError, match="127.0.0.1:1"):
         filled.run("ray", address="127.0.0.1:1")
     assert filled.made() == []
