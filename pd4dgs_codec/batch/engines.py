@@ -12,9 +12,10 @@ import multiprocessing
 import os
 import signal
 import socket
+import subprocess
 import threading
 import time
-from collections.abc import Callable, Generator
+from collections.abc import Callable, Generator, Iterable
 from dataclasses import dataclass, field
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
@@ -25,6 +26,7 @@ from pd4dgs_codec.errors import DataError
 
 Work = Callable[[Job], Outcome]
 POLL_SECONDS = 1.0  #: between looks at jobs whose end nothing tells
+QUEUE_SECONDS = 30.0  #: between looks at Slurm's queue; a result on a shared disk may be seen later than its job's end
 ARRAY = 1000  #: jobs of a Slurm array at most; its usual limit (MaxArraySize) is 1001
 
 
@@ -246,6 +248,7 @@ def slurm(work: Work, feed: Feed, settings: EngineSettings) -> Outcomes:
         raise DataError(f"submitit takes no such jobs: {error}") from None
     room = ARRAY if cluster == "slurm" else settings.workers or 1
     running: dict[str, tuple[Any, Job]] = {}
+    looked, gone = time.monotonic(), set[str]()
     try:
         while True:
             jobs: list[Job] = []
@@ -262,11 +265,24 @@ def slurm(work: Work, feed: Feed, settings: EngineSettings) -> Outcomes:
                 except Exception as error:  # submitit has several for jobs that ended without a result
                     outcome = lost(type(error).__name__)
                 yield job, outcome
-            if not ended:
+            if cluster == "slurm" and time.monotonic() - looked >= QUEUE_SECONDS:
+                before, gone, looked = gone, set(running) - _queued(running), time.monotonic()
+                for number in before & gone:
+                    yield running.pop(number)[1], lost("Slurm has it no more, and it left no result")
+            elif not ended:
                 time.sleep(POLL_SECONDS)
     finally:
         for task, _ in running.values():
             task.cancel()
+
+
+def _queued(running: Iterable[str]) -> set[str]:
+    """Which jobs wait or run. submitit asks sacct alone, which knows of none where a site keeps no accounts."""
+    command = ["squeue", "--noheader", "--array", "--me", "--format=%i"]
+    try:
+        return set(subprocess.run(command, capture_output=True, text=True, check=True).stdout.split())
+    except (OSError, subprocess.CalledProcessError):
+        return set(running)  # who does not answer has lost none
 
 
 def _array(executor: Any, work: Work, jobs: list[Job]) -> list[Any]:

@@ -7,6 +7,7 @@ import subprocess
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import flaky
 import pytest
@@ -133,6 +134,26 @@ def test_parameters_that_submitit_does_not_know_are_named(library):
     library.add("a.pt", "text")
     with pytest.raises(engines.DataError, match="submitit.*colour"):
         library.run("slurm", workers=1, slurm={"cluster": "local", "colour": "red"}, folder=library.folder / "slurm")
+
+
+def test_a_slurm_job_that_left_the_queue_without_a_result_is_lost(library, monkeypatch, tmp_path):
+    """Sites without accounting: submitit waits for ever for a job whose process was killed."""
+    submitit = pytest.importorskip("submitit", reason="needs submitit (the extra `cluster`)")
+
+    task = SimpleNamespace(job_id="7_0", done=lambda: False, cancel=lambda: None)
+    executor = SimpleNamespace(update_parameters=lambda **parameters: None)
+    queue = tmp_path / "bin" / "squeue"
+    queue.parent.mkdir()
+    queue.write_text("#!/bin/sh\n[ -e asked ] || echo 7_0\ntouch asked\n")
+    queue.chmod(0o755)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("PATH", f"{queue.parent}:/usr/bin:/bin")
+    monkeypatch.setattr(engines, "QUEUE_SECONDS", 0.0)
+    monkeypatch.setattr(engines, "_array", lambda executor, work, jobs: [task] * len(jobs))
+    monkeypatch.setattr(submitit, "AutoExecutor", lambda folder, cluster: executor)
+    library.add("a.pt", "text")
+    summary = library.run("slurm", workers=1, retries=0, folder=tmp_path / "slurm")
+    assert summary.done == 0 and "left no result" in library.outcomes["a.pd4"][0].message
 
 
 @pytest.fixture
