@@ -13,6 +13,7 @@ import os
 import signal
 import socket
 import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Generator, Iterable
@@ -54,7 +55,7 @@ class EngineSettings:
     folder: Path = Path("batch-logs")
     slurm: dict[str, str] = field(default_factory=dict)
 
-    def late(self, job: Job) -> Outcome:
+    def late(self) -> Outcome:
         """Of a job that took too long."""
         return Outcome(FAILED, f"was ended after {self.timeout:g} s, the most that --timeout allows")
 
@@ -140,7 +141,7 @@ def local(work: Work, feed: Feed, settings: EngineSettings) -> Outcomes:
                 if worker.pipe in ready:
                     job, outcome = worker.end()
                 elif settings.timeout and time.monotonic() - worker.begun >= settings.timeout and worker.job:
-                    job, outcome = worker.job, settings.late(worker.job)
+                    job, outcome = worker.job, settings.late()
                     worker.kill()
                 else:
                     continue
@@ -177,31 +178,38 @@ def ray(work: Work, feed: Feed, settings: EngineSettings) -> Outcomes:
         ray.shutdown()
         wanted = " and ".join(f"{count:g} {kind}" for kind, count in needed.items() if count)
         raise DataError(f"no node of the Ray cluster has the {wanted} that a scene takes")  # Ray would wait for one
+    try:
+        with contextlib.redirect_stdout(sys.stderr):  # Ray prints what became of its workers; stdout is for --json
+            yield from _tasks(work, feed, settings)
+    finally:
+        ray.shutdown()
+
+
+def _tasks(work: Work, feed: Feed, settings: EngineSettings) -> Outcomes:
+    import ray
+
     # lost nodes and workers are outcomes: one bound for all retries
     task = ray.remote(num_cpus=settings.threads, num_gpus=settings.gpus, max_retries=0)(_call)
     running: dict[Any, tuple[Job, float]] = {}
-    try:
-        while True:
-            room = settings.workers or int(ray.cluster_resources().get("CPU", 1) // settings.threads) or 1
-            while len(running) < room and (job := feed.take()):
-                running[task.remote(work, job)] = job, time.monotonic()
-            if not running:
-                return
-            ready, _ = ray.wait(list(running), timeout=POLL_SECONDS if settings.timeout else None)
-            for task_id in ready:
-                job, _ = running.pop(task_id)
-                try:
-                    outcome = ray.get(task_id)
-                except ray.exceptions.RayError as error:
-                    outcome = lost(type(error).__name__)
-                yield job, outcome
-            for task_id, (job, begun) in list(running.items()):
-                if settings.timeout and time.monotonic() - begun >= settings.timeout:
-                    ray.cancel(task_id, force=True)
-                    del running[task_id]
-                    yield job, settings.late(job)
-    finally:
-        ray.shutdown()
+    while True:
+        room = settings.workers or int(ray.cluster_resources().get("CPU", 1) // settings.threads) or 1
+        while len(running) < room and (job := feed.take()):
+            running[task.remote(work, job)] = job, time.monotonic()
+        if not running:
+            return
+        ready, _ = ray.wait(list(running), timeout=POLL_SECONDS if settings.timeout else None)
+        for task_id in ready:
+            job, _ = running.pop(task_id)
+            try:
+                outcome = ray.get(task_id)
+            except ray.exceptions.RayError as error:
+                outcome = lost(type(error).__name__)
+            yield job, outcome
+        for task_id, (job, begun) in list(running.items()):
+            if settings.timeout and time.monotonic() - begun >= settings.timeout:
+                ray.cancel(task_id, force=True)
+                del running[task_id]
+                yield job, settings.late()
 
 
 def _has(node: dict[str, Any], needed: dict[str, float]) -> bool:
@@ -288,8 +296,12 @@ def _queued(running: Iterable[str]) -> set[str]:
 def _array(executor: Any, work: Work, jobs: list[Job]) -> list[Any]:
     if not jobs:
         return []
-    with executor.batch():
-        return [executor.submit(work, job) for job in jobs]
+    try:
+        with executor.batch():
+            tasks = [executor.submit(work, job) for job in jobs]
+    except RuntimeError as error:
+        raise DataError(f"Slurm takes no jobs: {error}") from None
+    return tasks
 
 
 ENGINES: dict[str, Engine] = {"local": local, "ray": ray, "slurm": slurm}

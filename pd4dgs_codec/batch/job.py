@@ -10,7 +10,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +18,7 @@ from pd4dgs_codec import __version__
 from pd4dgs_codec.batch import store
 from pd4dgs_codec.batch.manifest import SPECIFICATIONS, Line
 from pd4dgs_codec.batch.ops import OPS, Command, arguments
-from pd4dgs_codec.errors import Pd4Error, one_line
+from pd4dgs_codec.errors import DataError, Pd4Error, one_line
 
 LOG_BYTES = 1 << 16  #: kept of a command's log
 DONE, ALREADY, FAILED = "done", "already", "failed"
@@ -54,11 +54,6 @@ class Outcome:
     cpu: float = 0.0
     work: float = 0.0
     peak: int = 0
-    process: int = field(default_factory=os.getpid)
-
-
-class Refused(Pd4Error):
-    """A job that ends the same however often it is tried."""
 
 
 class CommandFailed(Exception):
@@ -84,10 +79,8 @@ def run_job(job: Job, command: Command) -> Outcome:
     except CommandFailed as error:
         usage = error.code == 2
         return outcome(FAILED, str(error), final=usage, log=error.log, work=error.work)
-    except Refused as error:
-        return outcome(FAILED, str(error), final=True)
     except Pd4Error as error:
-        return outcome(FAILED, str(error))
+        return outcome(FAILED, str(error), final=True)
     except OSError as error:
         message = f"{error.filename}: {error.strerror}" if error.filename else str(error)
         return outcome(FAILED, message, final=isinstance(error, store.FINAL))
@@ -98,15 +91,15 @@ def run_job(job: Job, command: Command) -> Outcome:
 def _done_once(job: Job, command: Command) -> tuple[str, int, float]:
     """(state, bytes of the output, CPU seconds of the command)."""
     if job.version != __version__:
-        raise Refused(f"the worker has pd4dgs-codec {__version__}, the batch began with {job.version}")
+        raise DataError(f"the worker has pd4dgs-codec {__version__}, the batch began with {job.version}")
     line, root = job.line, store.Root(job.root)
-    record = root.record(line.output)
+    record = root.record(line.output, job.overwrite)
     stamps = _stamps(job)
     if record and _is_of(record, job, stamps) and root.holds(line.output, record["files"]):
         return ALREADY, 0, 0.0
     if record and record.get("version") != __version__ and not job.overwrite:
         found = f"was made by pd4dgs-codec {record.get('version')}, this is {__version__}"
-        raise Refused(f"{line.output}: {found}; --overwrite makes it anew")
+        raise DataError(f"{found}; --overwrite makes it anew")
     with tempfile.TemporaryDirectory(prefix="pd4dgs-batch-") as name, _inside(Path(name)) as folder:
         sources = {key: _fetched(place, folder) for key, place in _places(job).items()}
         digests = {key: found for key, (_, found) in sources.items()}
@@ -114,7 +107,7 @@ def _done_once(job: Job, command: Command) -> tuple[str, int, float]:
         if record and record.get("key") == key and root.holds(line.output, record["files"]):
             return ALREADY, 0, 0.0
         if record and record.get("key") != key and not job.overwrite:
-            raise Refused(f"{line.output}: holds what other input or options gave; --overwrite makes it anew")
+            raise DataError("holds what other input or options gave; --overwrite makes it anew")
         files, report, work = _run(job, command, {key: text for key, (text, _) in sources.items()}, folder)
         about = {"key": key, "op": job.verb, "source": line.source, "options": line.options, "inputs": digests}
         about |= {"stamps": stamps, "version": __version__, "report": report}

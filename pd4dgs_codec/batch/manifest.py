@@ -64,6 +64,8 @@ class Manifest:
             self.faults.append(item)
             refused.add(item.number)
         self._refused, self.count = refused, count  #: count: of lines that can be tried
+        if not (count or self.faults):
+            raise DataError(f"{place}: holds no lines, expected a JSON object for each scene")
 
     def lines(self) -> Iterator[Line]:
         """The lines that can be tried, in their order."""
@@ -82,7 +84,9 @@ class Manifest:
 
     def _line(self, number: int, raw: bytes) -> Line:
         try:
-            content = json.loads(raw)
+            content = json.loads(raw.decode("utf-8-sig").rstrip())
+        except json.JSONDecodeError as error:
+            raise DataError(f"not JSON: {error.msg}, at its character {error.pos + 1}") from None
         except (ValueError, RecursionError) as error:
             raise DataError(f"not JSON: {error}") from None
         if not isinstance(content, dict) or not set(content) <= set(KEYS):
@@ -138,12 +142,10 @@ def scan(folder: str, verb: str | None) -> Iterator[dict[str, str]]:
         raise DataError(f"{folder}: holds no sources, expected {wanted}")
     op = OPS[kinds[0]]
     for name in found[kinds[0]]:
-        yield {"source": posixpath.join(folder, name), "output": default_output_below(name, op)}
-
-
-def default_output_below(name: str, op: Op) -> str:
-    """The output of a source below a scanned folder: its own path there, with the operation's suffix."""
-    return posixpath.join(posixpath.dirname(name), default_output(name, op))
+        yield {
+            "source": posixpath.join(folder, name),
+            "output": posixpath.join(posixpath.dirname(name), default_output(name, op)),
+        }
 
 
 def _sources(names: list[str], op: Op) -> list[str]:

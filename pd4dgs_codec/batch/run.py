@@ -33,7 +33,7 @@ class JobFeed:
 
 @dataclass
 class Summary:
-    """What became of a batch. cpu, work: as of an Outcome, over all tries. peak: by worker process."""
+    """What became of a batch. cpu, work: as of an Outcome, over all tries. peak: of the largest worker."""
 
     done: int = 0
     already: int = 0
@@ -42,7 +42,7 @@ class Summary:
     seconds: float = 0.0
     cpu: float = 0.0
     work: float = 0.0
-    peak: dict[int, int] = field(default_factory=dict)
+    peak: int = 0
     failures: list[dict[str, Any]] = field(default_factory=list)
 
     def json(self) -> dict[str, Any]:
@@ -50,7 +50,7 @@ class Summary:
         return {
             "done": self.done, "already": self.already, "failed": len(self.failures), "retried": self.retried,
             "bytes": self.bytes, "seconds": round(self.seconds, 3), "cpu_seconds": round(self.cpu, 3),
-            "work_cpu_seconds": round(self.work, 3), "peak_memory": max(self.peak.values(), default=0),
+            "work_cpu_seconds": round(self.work, 3), "peak_memory": self.peak,
             "failures": self.failures,
         }  # fmt: skip
 
@@ -70,8 +70,7 @@ def run(
             summary.cpu += outcome.cpu
             summary.work += outcome.work
             summary.bytes += outcome.bytes
-            if outcome.peak:
-                summary.peak[outcome.process] = outcome.peak
+            summary.peak = max(summary.peak, outcome.peak)
             tries[job.line.number] += 1
             count = tries[job.line.number]
             if outcome.state == FAILED and not outcome.final and count <= retries:

@@ -32,7 +32,7 @@ PAUSES = (0.2, 1.0, 4.0)
 #: Fields of a file's entry in a store that change when the file does, the first one that there is.
 STAMPS = ("ETag", "etag", "md5Hash", "generation", "LastModified", "Last-Modified", "mtime")
 #: What answers the same however often it is asked.
-FINAL = (FileNotFoundError, PermissionError, IsADirectoryError, NotADirectoryError, DataError)
+FINAL = (FileNotFoundError, FileExistsError, PermissionError, IsADirectoryError, NotADirectoryError, DataError)
 
 T = TypeVar("T")
 
@@ -136,11 +136,17 @@ class Root:
         self.local = isinstance(self.system, LocalFileSystem)
 
     def check(self) -> None:
-        """Raises OSError or DataError, before any work, for a place that takes no output."""
-        self._put(PROBE, b"")
+        """Raises DataError, before any work, for a place that takes no output."""
+        try:
+            self._put(PROBE, b"")
+        except OSError as error:
+            raise DataError(f"{self.place}: takes no output: {error.strerror}") from None
+        with contextlib.suppress(Exception):  # a store where nothing may be deleted keeps an empty object
+            self.system.rm_file(self._at(PROBE))
 
-    def record(self, output: str) -> dict[str, Any] | None:
-        """What is said of a finished output; None if it is not finished."""
+    def record(self, output: str, overwrite: bool) -> dict[str, Any] | None:
+        """What is said of a finished output; None if it is not finished. Raises DataError for what is no record, unless
+        that may be overwritten."""
         try:
             raw = patiently(lambda: self.system.cat_file(self._at(output + RECORD)), self._named(output + RECORD))
         except FileNotFoundError:
@@ -149,9 +155,11 @@ class Root:
             content = json.loads(raw)
         except ValueError:
             content = None
-        if not isinstance(content, dict):
-            raise DataError(f"{self._named(output + RECORD)}: is not a record of a batch")
-        return content
+        if isinstance(content, dict):
+            return content
+        if overwrite:
+            return None
+        raise DataError(f"{self._named(output + RECORD)}: is not a record of a batch; --overwrite replaces it")
 
     def holds(self, output: str, files: dict[str, Any]) -> bool:
         """Whether all files of an output are there, of the sizes in its record."""

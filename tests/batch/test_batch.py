@@ -74,7 +74,7 @@ def test_what_another_input_made_is_named_and_the_others_go_on(library, change):
     library.add("b.pt", "more")
     assert library.run().done == 1
     outcome, tries = library.outcomes["a.pd4"]
-    assert outcome.final and tries == 1 and "a.pd4" in outcome.message and "--overwrite" in outcome.message
+    assert outcome.final and tries == 1 and "--overwrite" in outcome.message
     assert ("0.0.1" in outcome.message) == (change == "version")
     assert library.run(overwrite=True).done == 1
 
@@ -99,7 +99,8 @@ def test_failures_are_tried_again_within_a_bound(library):
 
 
 LINES = [
-    ("{", "not JSON"),
+    ("{", "not JSON: Expecting property name enclosed in double quotes, at its character 2"),
+    ("nonsense", "at its character 1"),
     ("[1]", "found list"),
     ('{"source": "a.pt", "colour": 1}', "colour"),
     ('{"source": ""}', "source is ''"),
@@ -194,5 +195,22 @@ def test_uris_of_fsspec_are_sources_and_outputs(library):
 
 def test_a_store_that_refuses_is_named_before_any_work(tmp_path):
     (tmp_path / "file").touch()
-    with pytest.raises(OSError, match="file"):
+    with pytest.raises(DataError, match="file: takes no output: File exists"):
         store.Root(str(tmp_path / "file")).check()
+    store.Root(str(tmp_path / "folder")).check()
+    assert not list((tmp_path / "folder").iterdir())
+
+
+def test_a_damaged_record_is_named_and_can_be_overwritten(library):
+    library.add("a.pt", "text")
+    library.run()
+    (library.out / "a.pd4.done.json").write_text("garbage")
+    assert library.run().done == 0
+    outcome, tries = library.outcomes["a.pd4"]
+    assert tries == 1 and "a.pd4.done.json" in outcome.message and "--overwrite" in outcome.message
+    assert library.run(overwrite=True).done == 1 and library.run().already == 1
+
+
+def test_a_manifest_without_lines_is_named(library):
+    with pytest.raises(DataError, match="holds no lines"):
+        library.manifest()
