@@ -155,7 +155,7 @@ class Root:
             content = json.loads(raw)
         except ValueError:
             content = None
-        if isinstance(content, dict):
+        if isinstance(content, dict) and isinstance(content.get("files"), dict):
             return content
         if overwrite:
             return None
