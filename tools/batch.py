@@ -260,13 +260,14 @@ def _is_worker(number: int) -> bool:
     return b"spawn_main" in line or line.startswith(b"ray::")
 
 
-START_SECONDS = 300  #: for a Ray node to start
+NODE_TRIES = 5  #: Ray gives a node 30 s to start, which nothing raises; a busy machine may take longer
 #: Ports that nodes on one machine must not share.
 OWN_PORTS = ("dashboard-agent-listen", "dashboard-agent-grpc", "runtime-env-agent", "metrics-export")
 #: Waits until a Ray cluster has so many cores.
 JOINED = """
 import ray, sys, time
-for _ in range(120):
+begun = time.monotonic()
+while time.monotonic() - begun < 60:
     try:
         ray.init(sys.argv[1], log_to_driver=False, logging_level="ERROR", ignore_reinit_error=True)
         if ray.cluster_resources().get("CPU", 0) >= int(sys.argv[2]):
@@ -282,22 +283,28 @@ def _cluster(stack: ExitStack, environment: dict[str, str]) -> tuple[list[int], 
     """(processes of a head without cores and of two nodes with one each, address)."""
     ray, port = str(Path(sys.executable).with_name("ray")), free_port()
     environment |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": secrets.token_hex(32)}  # nobody else's cluster
-    patience = str(1000 * START_SECONDS)  # a machine that works on other things starts a node's agents late
-    environment |= {"RAY_agent_register_timeout_ms": patience}
+    environment |= {"RAY_agent_register_timeout_ms": "300000"}  # a busy machine starts a node's agents late
     common = ["--block", "--disable-usage-stats", "--object-store-memory", "100000000"]
     head = [ray, "start", "--head", f"--port={port}", "--num-cpus=0", "--include-dashboard=false", *common]
-    numbers = [stack.enter_context(started(head, environment)).pid]
-    _wait_for(port)
     address = f"127.0.0.1:{port}"
+    numbers = [_joined(stack, head, environment, address, 0)]
     for count in (1, 2):  # one after the other: two that begin at once take each other's ports
         ports = [f"--{name}-port={free_port()}" for name in OWN_PORTS]
         ports += [f"--min-worker-port={20_000 + 1000 * count}", f"--max-worker-port={20_999 + 1000 * count}"]
         node = [ray, "start", f"--address={address}", "--num-cpus=1", *ports, *common]
-        numbers.append(stack.enter_context(started(node, environment)).pid)
-        joined = subprocess.run([sys.executable, "-c", JOINED, address, str(count)], env=environment)
-        if joined.returncode:
-            raise DataError(f"node {count} of the Ray cluster did not join")
+        numbers.append(_joined(stack, node, environment, address, count))
     return numbers, address
+
+
+def _joined(stack: ExitStack, command: Sequence[str], environment: dict[str, str], address: str, cores: int) -> int:
+    """The process of a Ray node, with which the cluster at `address` has so many cores."""
+    for _ in range(NODE_TRIES):
+        process = stack.enter_context(started(command, environment))
+        wait = [sys.executable, "-c", JOINED, address, str(cores)]
+        once = environment | {"RAY_gcs_server_port_wait_time_s": "1"}  # else it tries for a quarter of an hour
+        if subprocess.run(wait, env=once).returncode == 0 and process.poll() is None:
+            return process.pid
+    raise DataError(f"the Ray cluster did not come to {cores} cores")
 
 
 def _wait_for(port: int) -> None:
