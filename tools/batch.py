@@ -355,29 +355,36 @@ def _sha(path: Path) -> str:
 # -- the page ----------------------------------------------------------------------------------------------------------
 
 
+def _done(row: Row) -> str:
+    before, found = row["finished_before"], row["already"] - row["finished_before"]
+    parts = [f"{before}"] if before else []
+    return " + ".join([*parts, f"{row['done']}", *([f"{found} found"] if found else [])])
+
+
 def render(rows: Sequence[Row]) -> str:
     """A line per case."""
     cells = [
         (
             row["name"],
             CASES[row["name"]],
-            f"{row['finished_before']} + {row['done']}" if row["finished_before"] else row["done"],
+            _done(row),
             row["retried"],
             row["failed"],
             "yes" if row["same"] else "no",
             f"{row['work'] / row['done']:.2f}",
             f"{100 * (row['in_job'] - row['work']) / row['work']:.1f} %",
-            f"{100 * (row['cpu'] - row['work']) / row['work']:.1f} %",
+            "" if "node" in row["name"] else f"{100 * (row['cpu'] - row['work']) / row['work']:.1f} %",
             " → ".join(f"{value / 1e6:.0f}" for value in row["memory"]),
         )
         for row in rows
     ]
     head = ("case", "what happens", "done", "tried again", "failed", "same bytes", "work s", "in job", "in all", "MB")
     text = paragraph(
-        "*done*: scenes encoded; before the kill and after it, where there was one. *work s*: CPU seconds of "
-        "`pd4dgs-encode` per scene. *in job*: CPU time of a scene's job beside that. *in all*: CPU time of all "
-        "processes beside that: starting interpreters, importing torch's files, the driver, Ray's own. *MB*: most "
-        "memory of all processes together in the second and in the last third of the run."
+        "*done*: scenes encoded; before the kill and after it, where there was one; *found*: finished, though the "
+        "worker died before it could say so. *work s*: CPU seconds of `pd4dgs-encode` per scene. *in job*: CPU time of "
+        "a scene's job beside that. *in all*: CPU time of all processes beside that: starting interpreters, importing "
+        "torch's files, the driver, Ray's own; a node that was killed takes its count along. *MB*: most memory of all "
+        "processes together in the second and in the last third of the run."
     )
     table = markdown(head, [[str(cell) for cell in row] for row in cells])
     return "\n".join([unpadded(table), "", *text])
