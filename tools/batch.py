@@ -289,8 +289,7 @@ def _cluster(stack: ExitStack, environment: dict[str, str]) -> tuple[list[int], 
     address = f"127.0.0.1:{port}"
     numbers = [_joined(stack, head, environment, address, 0)]
     for count in (1, 2):  # one after the other: two that begin at once take each other's ports
-        ports = [f"--{name}-port={free_port()}" for name in OWN_PORTS]
-        ports += [f"--min-worker-port={20_000 + 1000 * count}", f"--max-worker-port={20_999 + 1000 * count}"]
+        ports = [f"--min-worker-port={20_000 + 1000 * count}", f"--max-worker-port={20_999 + 1000 * count}"]
         node = [ray, "start", f"--address={address}", "--num-cpus=1", *ports, *common]
         numbers.append(_joined(stack, node, environment, address, count))
     return numbers, address
@@ -298,12 +297,15 @@ def _cluster(stack: ExitStack, environment: dict[str, str]) -> tuple[list[int], 
 
 def _joined(stack: ExitStack, command: Sequence[str], environment: dict[str, str], address: str, cores: int) -> int:
     """The process of a Ray node, with which the cluster at `address` has so many cores."""
+    wait = [sys.executable, "-c", JOINED, address, str(cores)]
+    once = environment | {"RAY_gcs_server_port_wait_time_s": "1"}  # else it tries for a quarter of an hour
     for _ in range(NODE_TRIES):
-        process = stack.enter_context(started(command, environment))
-        wait = [sys.executable, "-c", JOINED, address, str(cores)]
-        once = environment | {"RAY_gcs_server_port_wait_time_s": "1"}  # else it tries for a quarter of an hour
-        if subprocess.run(wait, env=once).returncode == 0 and process.poll() is None:
-            return process.pid
+        ports = [f"--{name}-port={free_port()}" for name in OWN_PORTS]
+        with ExitStack() as tried:
+            process = tried.enter_context(started([*command, *ports], environment))
+            if subprocess.run(wait, env=once).returncode == 0 and process.poll() is None:
+                stack.push(tried.pop_all())
+                return process.pid
     raise DataError(f"the Ray cluster did not come to {cores} cores")
 
 

@@ -12,7 +12,7 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,8 @@ SEGMENTS = 3
 HOLDOUT = 8
 EYES = 3  #: cameras that look at a seam, three frames apart
 OPENGL = np.diag([1.0, -1.0, -1.0, 1.0])
+#: (frame, whose camera) -> uint8 picture [H, W, 3] of the scene itself, where that can be had.
+Truth = Callable[[int, int], np.ndarray]
 #: Name -> (downscale, what it is).
 CAPTURES = {
     "shelf-hand": (4, "86 frames from a hand-held camera"),
@@ -38,8 +40,9 @@ WAYS = {"whole": None, "segments, shared scaffold": "first", "segments, each on 
 # -- captures ----------------------------------------------------------------------------------------------------------
 
 
-def capture(name: str, folder: Path) -> tuple[dict[str, Any], list[dict[str, Any]], np.ndarray]:
-    """(what holds for all frames, frames in their order, initial points) of a capture as a transforms.json has them."""
+def capture(name: str, folder: Path) -> tuple[dict[str, Any], list[dict[str, Any]], np.ndarray, Truth | None]:
+    """(what holds for all frames, frames in their order, initial points) of a capture as a transforms.json has them,
+    and the scene itself."""
     from pd4dgs_codec.data.ply import read_ply
 
     if name == "synthetic-60s":
@@ -50,10 +53,10 @@ def capture(name: str, folder: Path) -> tuple[dict[str, Any], list[dict[str, Any
     for frame, depth in zip(frames, near_far, strict=True):
         frame |= {"file_path": str(source / frame["file_path"]), "depth": depth}
     (points,) = source.glob("*.ply")
-    return content, frames, read_ply(points)[0]
+    return content, frames, read_ply(points)[0], None
 
 
-def _synthetic(folder: Path) -> tuple[dict[str, Any], list[dict[str, Any]], np.ndarray]:
+def _synthetic(folder: Path) -> tuple[dict[str, Any], list[dict[str, Any]], np.ndarray, Truth]:
     from PIL import Image
 
     from pd4dgs_codec.data import synthetic
@@ -62,18 +65,24 @@ def _synthetic(folder: Path) -> tuple[dict[str, Any], list[dict[str, Any]], np.n
 
     bodies, frames, count = SceneBuilder("local", 0).bodies(), [], 180
     folder.mkdir(parents=True, exist_ok=True)
-    for i in range(count):
-        t = i / (count - 1)
-        phase = 1 - abs(1 - 12 * t % 2)  # to and fro, six times
-        viewmat, path = synthetic._train_viewmat(2 * t % 1), folder / f"{i:03d}.png"
+
+    times = [i / (count - 1) for i in range(count)]
+    viewmats = [synthetic._train_viewmat(2 * t % 1) for t in times]
+
+    def truth(frame: int, eye: int) -> np.ndarray:
+        phase = 1 - abs(1 - 12 * times[frame] % 2)  # to and fro, six times
+        return synthetic._render(bodies, viewmats[eye], phase)
+
+    for i, (t, viewmat) in enumerate(zip(times, viewmats, strict=True)):
+        path = folder / f"{i:03d}.png"
         if not path.exists():
-            Image.fromarray(synthetic._render(bodies, viewmat, phase)).save(path)
+            Image.fromarray(truth(i, i)).save(path)
         pose = np.linalg.inv(viewmat) @ OPENGL
         frames.append({"file_path": str(path), "time": 60 * t, "transform_matrix": pose.tolist()})
     lens, points = synthetic.LENS, load("synthetic:local").points
     assert points is not None
     about = {"fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy, "w": lens.width, "h": lens.height}
-    return about, frames, points
+    return about, frames, points, truth
 
 
 def write(folder: Path, about: dict[str, Any], frames: list[dict[str, Any]], points: np.ndarray) -> None:
@@ -109,7 +118,7 @@ def measure(name: str, steps: int, out: Path) -> Row:
 
     downscale, _ = CAPTURES[name]
     home = out / "long-captures" / name
-    about, frames, points = capture(name, home / "images")
+    about, frames, points, truth = capture(name, home / "images")
     for i, frame in enumerate(frames):
         frame["held_out"] = i % HOLDOUT == HOLDOUT // 2
     cuts = [round(i * len(frames) / SEGMENTS) for i in range(SEGMENTS + 1)]
@@ -132,10 +141,10 @@ def measure(name: str, steps: int, out: Path) -> Row:
     batch("train", rest, home)
     labels = [job["output"].removesuffix(".pt") for job in [*first, *rest]]
     batch("encode", [{"source": str(home / "train" / f"{label}.pt")} for label in labels], home)
-    return {"frames": len(frames), "steps": steps, "rows": [_row(way, home, downscale, cuts) for way in WAYS]}
+    return {"frames": len(frames), "steps": steps, "rows": [_row(way, home, downscale, cuts, truth) for way in WAYS]}
 
 
-def _row(way: str, home: Path, downscale: int, cuts: Sequence[int]) -> Row:
+def _row(way: str, home: Path, downscale: int, cuts: Sequence[int], truth: Truth | None) -> Row:
     """Bytes, dB on held-out frames, and steps of the pictures in time: across seams and elsewhere."""
     from pd4dgs_codec import decode
     from pd4dgs_codec.codec.info import info
@@ -159,26 +168,39 @@ def _row(way: str, home: Path, downscale: int, cuts: Sequence[int]) -> Row:
     whole = load(str(home / "whole"), downscale=downscale)
     views = sorted([*whole.train, *whole.test], key=lambda view: view.time)
 
-    def eyes(frame: int) -> list[Any]:
-        """Cameras of frames around this one: places that both sides of a seam have seen."""
-        return [views[frame + 3 * (i - EYES // 2)].camera for i in range(EYES)]
+    def eyes(frame: int) -> list[int]:
+        """Frames around this one, whose cameras both sides of a seam have seen."""
+        return [frame + 3 * (i - EYES // 2) for i in range(EYES)]
 
-    def shown(frame: int, eye: Any) -> np.ndarray:
+    def shown(frame: int, eye: int) -> np.ndarray:
         """What is shown of a frame: segments have times of their own, 0..1 over their frames."""
         which = next(i for i in range(SEGMENTS) if frame < cuts[i + 1]) if kind else 0
         begin, end = (cuts[which], cuts[which + 1]) if kind else (0, cuts[-1])
-        return to_uint8(players[which][0].picture(eye, (frame - begin) / (end - begin - 1)))
+        return to_uint8(players[which][0].picture(views[eye].camera, (frame - begin) / (end - begin - 1)))
 
-    seams, inside = cuts[1:-1], [(a + b) // 2 for a, b in zip(cuts, cuts[1:], strict=False)]
-    step = {
-        place: float(np.mean([_psnr(shown(f - 1, eye), shown(f, eye)) for f in at for eye in eyes(f)]))
-        for place, at in (("seam", seams), ("inside", inside))
-    }
-    return {"way": way, "psnr": float(np.mean(psnr)), "bytes": sum(sizes), "layer_0": sum(base), "step": step}
+    def change(picture: Truth, frame: int, eye: int) -> np.ndarray:
+        return picture(frame, eye).astype(np.float64) - picture(frame - 1, eye)
+
+    row: Row = {"way": way, "psnr": float(np.mean(psnr)), "bytes": sum(sizes), "layer_0": sum(base)}
+    step, error, scene = {}, {}, {}
+    for place, at in (("seam", cuts[1:-1]), ("inside", [(a + b) // 2 for a, b in zip(cuts, cuts[1:], strict=False)])):
+        pairs = [(frame, eye) for frame in at for eye in eyes(frame)]
+        drawn = [change(shown, *pair) for pair in pairs]
+        step[place] = _decibels(drawn)
+        if truth:
+            true = [change(truth, *pair) for pair in pairs]
+            scene[place] = _decibels(true)
+            error[place] = _decibels([a - b for a, b in zip(drawn, true, strict=True)])
+    return row | {"step": step} | ({"error": error, "scene": scene} if truth else {})
 
 
 def _psnr(a: np.ndarray, b: np.ndarray) -> float:
-    error = float(np.square(a.astype(np.float64) - b).mean()) / 255**2
+    return _decibels([a.astype(np.float64) - b])
+
+
+def _decibels(differences: Sequence[np.ndarray]) -> float:
+    """PSNR of the mean square of differences of 8-bit pictures."""
+    error = float(np.mean([np.square(difference).mean() for difference in differences])) / 255**2
     return float(-10 * np.log10(max(error, 1e-10)))
 
 
@@ -196,17 +218,25 @@ def render(rows: Sequence[Row]) -> str:
             f"{way['layer_0']:,}",
             f"{way['step']['seam']:.1f}",
             f"{way['step']['inside']:.1f}",
+            *(f"{way['error'][place]:.1f}" if "error" in way else "" for place in ("seam", "inside")),
         ]
         for row in rows
         for way in row["rows"]
     ]
     head = ("capture", "trained", "dB", "bytes", "of these layers 0", "at seams dB", "inside dB")
+    head += ("error at seams dB", "error inside dB")
+    scenes = "; ".join(
+        f"{row['name']}: {scene['seam']:.1f} at seams, {scene['inside']:.1f} inside"
+        for row in rows
+        if (scene := row["rows"][0].get("scene"))
+    )
     captures = "; ".join(f"{row['name']}: {CAPTURES[row['name']][1]}" for row in rows)
     text = paragraph(
         f"{captures}. Preset tiny, {SEGMENTS} segments of equal length. *dB*: PSNR on held-out frames, every eighth. "
         "*at seams*: PSNR between the pictures of successive frames on both sides of a seam, from "
-        f"{EYES} cameras of frames around it; *inside*: the same in the middle of a segment. A seam that is lower than "
-        "inside, and lower than where the whole has none, is seen as a jump."
+        f"{EYES} cameras of frames around it; *inside*: the same in the middle of a segment. What is lower than the "
+        f"scene itself is seen as a jump ({scenes}). *error*: PSNR of the change from frame to frame against that of "
+        "the scene itself, where that can be had."
     )
     return "\n".join([unpadded(markdown(head, cells)), "", *text])
 
