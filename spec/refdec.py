@@ -494,7 +494,7 @@ def weight_shapes(layer):
     return shapes
 
 
-# 6.5 Declared sizes: "c MUST NOT exceed 2^28, N MUST NOT exceed 2^13 + 2·L, and S MUST NOT exceed 2^22 + 1024·L."
+# 6.5 Declared sizes: "c MUST NOT exceed 2^28, N MUST NOT exceed 2^13 + 2·L, and S MUST NOT exceed 2^22 + 256·L."
 # "let N, S and L be sums over this slice and all slices before it in the file"
 def check_sizes(layer, payload_bytes, before):
     """before: N, S and L of the slices before it. Sets those with it."""
@@ -505,7 +505,7 @@ def check_sizes(layer, payload_bytes, before):
     layer.declared = [a + b for a, b in zip(before, (layer.rows, symbols, payload_bytes))]
     rows, symbols, size = layer.declared
     need(rows <= (1 << 13) + 2 * size, f"{rows} rows", "LimitExceeded")
-    need(symbols <= (1 << 22) + 1024 * size, f"{symbols} symbols", "LimitExceeded")
+    need(symbols <= (1 << 22) + 256 * size, f"{symbols} symbols", "LimitExceeded")
 
 
 # 6.4 Sections: "A section is present if and only if it has at least one symbol or value to code. Mode ans uses 0..4,

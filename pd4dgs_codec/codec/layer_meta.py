@@ -44,7 +44,7 @@ ROWS, SECTIONS, STEPS, SCALES, NETWORKS = range(1, 6)
 #: A file of S symbols has at least (S - FREE_SYMBOLS) / SYMBOLS_PER_BYTE bytes, so that a few bytes that declare
 #: constant channels cannot make a decoder allocate without end. Real scenes spend over 0.1 bit per symbol.
 FREE_SYMBOLS = 1 << 22
-SYMBOLS_PER_BYTE = 1024
+SYMBOLS_PER_BYTE = 256
 #: An anchor may cost next to nothing and its position takes up to 42 symbols; real anchors take tens of bytes.
 FREE_ROWS = 1 << 13
 ROWS_PER_BYTE = 2

@@ -192,17 +192,23 @@ class _Omissions:
             self._free_cells(kind, cells)
 
     def _without_offsets(self, shown: np.ndarray) -> tuple[np.ndarray, float]:
-        """(offset symbols [3 G, N], the commonest ones for Gaussians that are not `shown` bool [N, G], bits saved)."""
-        freed = Grid.of(self.decoded).symbols_of("offset", self.decoded.offset, classes_of(self.decoded))
+        """(offset symbols [3 G, N], the commonest ones of a step class for Gaussians that are not `shown` bool [N, G]
+        where that takes fewer bits, bits saved)."""
+        classes = classes_of(self.decoded)
+        freed = Grid.of(self.decoded).symbols_of("offset", self.decoded.offset, classes)
+        groups = [np.flatnonzero(classes == k) for k in np.unique(classes)] or [np.arange(freed.shape[1])]
         saved = 0.0
         for channel, symbols in enumerate(freed):
-            own = shown[:, channel // 3]
-            if own.all():
-                continue
-            saved += entropy_bits(symbols)
-            values, counts = symbol_counts(symbols[own]) if own.any() else (np.zeros(1, int), np.ones(1, int))
-            symbols[~own] = values[counts.argmax()]
-            saved -= entropy_bits(symbols)
+            for rows in groups:
+                own, before = shown[rows, channel // 3], symbols[rows]
+                if own.all():
+                    continue
+                values, counts = symbol_counts(before[own]) if own.any() else (np.zeros(1, int), np.ones(1, int))
+                after = np.where(own, before, values[counts.argmax()])
+                bits = entropy_bits(before) - entropy_bits(after)
+                if bits > 0:
+                    symbols[rows] = after
+                    saved += bits
         return freed, saved
 
     def _free_offsets(self, shown: np.ndarray) -> None:

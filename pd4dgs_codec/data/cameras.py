@@ -74,13 +74,14 @@ def check_rotation(rotation: np.ndarray, where: str) -> None:
 
 
 def rotation_matrix(wxyz: Sequence[float] | np.ndarray) -> np.ndarray:
-    """float64 [3, 3] of a unit quaternion."""
-    w, x, y, z = (float(value) for value in wxyz)
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
+    """float64 [..., 3, 3] of unit quaternions [..., 4]."""
+    w, x, y, z = np.moveaxis(np.asarray(wxyz, np.float64), -1, 0)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return np.stack(rows, axis=-1).reshape(*w.shape, 3, 3)
 
 
 def world_to_camera(rotation: np.ndarray, center: np.ndarray) -> np.ndarray:

@@ -39,6 +39,9 @@ from pd4dgs_codec.entropy.tables import uniform_table
 from pd4dgs_codec.entropy.varint import VARINT_MAX, ByteReader, put_varint
 from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
 
+#: Bytes of a payload that is so soon coded again that nobody estimates whether Gaussians alone might take fewer.
+SMALL = 4096
+
 
 @dataclass(frozen=True)
 class CodedChannels:
@@ -75,7 +78,8 @@ def encode_channels(
 ) -> CodedChannels:
     """Encode int32 channels (1-D, any lengths, |k| <= 2**24 - 1) into one payload.
 
-    priors: "gauss" allows const and gauss only, the model of R(a); "best" every prior and is never larger.
+    priors: "gauss" allows const and gauss only, the model of R(a); "best" every prior. It is never larger in payloads
+    under 4 kB, and in longer ones where Gaussians alone come near.
     effort: 1..9, time spent on fitting. known: what the payloads before defined, in order; a decoder must have it too.
     Raises EncodeError.
     """
@@ -87,8 +91,8 @@ def encode_channels(
     richer = priors == "best" and effort > 1
     fit: Fit = (lambda h: fit_best(h, effort)) if richer else (lambda h: h.gauss)
     best = _encode(arrays, plan_priors(histograms, fit, rounds, known), known)
-    least = sum(h.gauss.own for h in histograms) / BIT  # of Gaussians, but for what is estimated of exceptions
-    if richer and least < 1.005 * 8 * len(best[0]) + 256:
+    least = sum(h.gauss.own for h in histograms) / BIT  # what Gaussians take, nearly: sharing can save more
+    if richer and (len(best[0]) < SMALL or least < 1.005 * 8 * len(best[0])):
         other = _encode(arrays, plan_priors(histograms, lambda h: h.gauss, rounds, known), known)
         best = min(best, other, key=lambda encoded: len(encoded[0]))
     payload, prior_ids, defined = best

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pd4dgs_codec.interchange.splats import Splats, camera_eye, harmonics, looking, quaternions, rotations, sphere, unit
+from pd4dgs_codec.data.cameras import rotation_matrix
+from pd4dgs_codec.interchange.splats import Splats, camera_eye, harmonics, looking, quaternions, sphere, unit
 from pd4dgs_codec.model.visibility import LEAST_NEAR, MIN_OPACITY
 from pd4dgs_codec.playback.player import Player
 from pd4dgs_codec.scene import Camera
@@ -147,7 +148,7 @@ def _bake(
 
 def _covariances(quats: np.ndarray, scales: np.ndarray) -> np.ndarray:
     """float64 [n, 3, 3]."""
-    factor = rotations(quats.astype(np.float64)) * scales[:, None, :]
+    factor = rotation_matrix(quats) * scales[:, None, :]
     product: np.ndarray = factor @ factor.transpose(0, 2, 1)
     return product
 

@@ -116,17 +116,6 @@ def harmonics(directions: np.ndarray, degree: int) -> np.ndarray:
     return np.stack(rows, axis=-1).astype(directions.dtype)
 
 
-def rotations(quats: np.ndarray) -> np.ndarray:
-    """[..., 3, 3] of unit quaternions [..., 4] wxyz."""
-    w, x, y, z = np.moveaxis(quats, -1, 0)
-    rows = [
-        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
-        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
-        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
-    ]  # fmt: skip
-    return np.stack(rows, axis=-1).reshape(*quats.shape[:-1], 3, 3)
-
-
 def quaternions(matrices: np.ndarray) -> np.ndarray:
     """Unit quaternions [n, 4] wxyz of rotations [n, 3, 3]: of the four formulas the one that divides by the most."""
     m = matrices

@@ -263,7 +263,7 @@ class _Grown(torch.autograd.Function):
             kernels.linear(out.numpy(), keep.numpy(), hidden.numpy(), column, w.numpy(), b.numpy())
         relative, extent = torch.sigmoid(shape), torch.exp(anchors[:, SCALING])
         color.sigmoid_()
-        gaussians, gates = anchors.new_empty(len(keep), 14), anchors.new_empty(len(keep))
+        gaussians, gates = anchors.new_empty(len(keep), kernels.GAUSSIAN_WIDTH), anchors.new_empty(len(keep))
         kernels.assemble(*_arrays(gaussians, gates, keep, anchors, extent, raw, mask, shape, relative, color))
         ctx.columns = columns
         ctx.widths = [len(b) for b in used[1::4]]

@@ -24,6 +24,7 @@ from pd4dgs_codec.scene import SCALING_DIM
 MIN_NORM = 1e-12
 #: First columns of the parts of a Gaussian's row.
 SCALE, QUAT, OPACITY, COLOR = 3, 6, 10, 11
+GAUSSIAN_WIDTH = COLOR + 3
 
 
 @kernel(inline=True)

@@ -12,16 +12,13 @@ import numpy as np
 
 from pd4dgs_codec import threads
 from pd4dgs_codec.model import slot_kernels
-from pd4dgs_codec.model.slot_kernels import COLOR, OPACITY, QUAT, SCALE
+from pd4dgs_codec.model.slot_kernels import COLOR, GAUSSIAN_WIDTH, OPACITY, QUAT, SCALE
 from pd4dgs_codec.model.visibility import FRUSTUM_MARGIN, LEAST_NEAR, MIN_OPACITY, OFFSET_REACH, SIGMA_REACH
 from pd4dgs_codec.playback.networks import Field, Layers, hidden_layers
 from pd4dgs_codec.render.checks import check_time
 from pd4dgs_codec.render.rasteriser import draw
 from pd4dgs_codec.render.simd import LANES
 from pd4dgs_codec.scene import GLOBAL_HEADS, MASK_STEP, MASK_THRESHOLD, Camera, Network, Scene
-
-#: Columns of the kernels' rows of Gaussians: mean, scales, quaternion, opacity, colour.
-GAUSSIAN_WIDTH = COLOR + 3
 
 
 @dataclass(frozen=True, eq=False)

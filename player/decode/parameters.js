@@ -141,7 +141,7 @@ function declare(where, before, bytes, rises, own, perRow, cells, weights) {
   const mostRows = 2 ** 13 + 2 * all;
   if (rows > mostRows) throw limitExceeded(`${where}: ${rows} rows in ${all} bytes, limit ${mostRows}`);
   const symbols = before.symbols + rises + (perRow + 4) * own + cells + weights;
-  const mostSymbols = 2 ** 22 + 1024 * all;
+  const mostSymbols = 2 ** 22 + 256 * all;
   if (symbols > mostSymbols) throw limitExceeded(`${where}: ${symbols} symbols in ${all} bytes, limit ${mostSymbols}`);
   return { rows, symbols, bytes: all };
 }

@@ -8,6 +8,8 @@ import sys
 
 import pytest
 
+from pd4dgs_codec.__main__ import VERBS
+
 pytestmark = pytest.mark.skipif(not os.path.exists("/dev/full"), reason="a device that is always full, as Linux has")
 
 #: Arguments (FILE is a whole file), what the shell does to the streams, exit code, what stderr says if it is there.
@@ -49,3 +51,17 @@ def test_streams(name, scene_pd4, tmp_path):
         import numpy as np
 
         assert len(np.load(tmp_path / "out.npz").files) > 5
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("streams", [">&-", ">/dev/full", "| true", "<&- >&- 2>&-"])
+@pytest.mark.parametrize("verb", VERBS)
+def test_help_and_errors_of_every_command(verb, streams, tmp_path):
+    for arguments in ("--help", f"none -o '{tmp_path}/none/out'"):
+        script = f"{{ '{sys.executable}' -m pd4dgs_codec {verb} {arguments}; echo $? >'{tmp_path}/code'; }} {streams}"
+        done = subprocess.run(
+            ["sh", "-c", script], capture_output=True, text=True, timeout=120, stdin=subprocess.DEVNULL
+        )
+        code = int((tmp_path / "code").read_text())
+        assert code in (0, 1, 2) and "Traceback" not in done.stderr and len(done.stderr.splitlines()) < 2, done.stderr
+        assert code or arguments == "--help"

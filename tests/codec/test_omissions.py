@@ -7,6 +7,7 @@ import pytest
 from strategies import assert_same_scene, make_scene
 
 from pd4dgs_codec.attributes import planes as decorrelation
+from pd4dgs_codec.attributes.table import Grid, classes_of
 from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.encoder import encode, encode_with_report
 from pd4dgs_codec.codec.omissions import _Omissions
@@ -14,13 +15,14 @@ from pd4dgs_codec.codec.options import EncodeOptions
 from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.codec.plane_choice import fill_plane
 from pd4dgs_codec.codec.symbols import rounded
+from pd4dgs_codec.entropy.bits import entropy_bits
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.evaluate import enclosure
 from pd4dgs_codec.evaluate import reach as reach_module
 from pd4dgs_codec.evaluate.enclosure import Enclosure, Stretch, instants
 from pd4dgs_codec.evaluate.reach import global_cells, local_cells, shown_gaussians
 from pd4dgs_codec.evaluate.residuals import residuals
-from pd4dgs_codec.scene import PLANES, Camera, Deformation, Scene
+from pd4dgs_codec.scene import DEFAULT_WIDTHS, PLANES, Camera, Deformation, Scene, Widths
 
 SIDES = (6, 5, 7, 5)
 
@@ -31,11 +33,10 @@ def reach(scene):
     return global_cells(scene), local_cells(scene, shown), shown
 
 
-def lively_scene() -> Scene:
+def lively_scene(widths: Widths = DEFAULT_WIDTHS) -> Scene:
     """A scene in which every value matters, but for the cells that nothing reaches."""
-    scene = make_scene(
-        5, anchors=60, kind="gaussian", hidden=(12,), channels=8, sides=SIDES, scales=2, width=8, extent=30
-    )
+    options = dict(hidden=(12,), channels=8, sides=SIDES, scales=2, width=8, extent=30, widths=widths)
+    scene = make_scene(5, anchors=60, kind="gaussian", **options)
     scaling_log = scene.scaling_log.copy()
     scaling_log[:, :3] = -4  # Gaussians stay near their anchors
     field = scene.global_deformation
@@ -56,9 +57,9 @@ def edited(network, layer, **places):
     return tuple(layers)
 
 
-def dead_scene() -> Scene:
+def dead_scene(widths: Widths = DEFAULT_WIDTHS) -> Scene:
     """lively_scene with dead channels, units and a dead head, and a Gaussian of each anchor that never shows."""
-    scene = lively_scene()
+    scene = lively_scene(widths)
     networks = {name: edited(network, 0, columns=[7]) for name, network in scene.networks.items()}  # feature 7: unread
     networks["opacity"] = edited(networks["opacity"], 0, rows=[3], bias=-1)  # a silent unit
     networks["opacity"] = edited(networks["opacity"], 1, columns=[5])  # an unread one
@@ -91,6 +92,21 @@ def test_edits_of_the_scene_and_of_its_decoded_twin_are_alike(raw_deformation):
     omissions.free_offsets_and_cells(price=0)
     assert len(omissions.found) > 8
     assert_same_scene(omissions.decoded, rounded(omissions.scene, raw_deformation))
+
+
+def test_hidden_offsets_take_the_commonest_symbol_of_their_step_class_where_that_is_cheaper():
+    planned, _ = plan(dead_scene(replace(DEFAULT_WIDTHS, graded=True)), EncodeOptions(layers=2, omit="nothing"))
+    omissions = _Omissions(planned, raw_deformation=False)
+
+    def coded() -> list[float]:
+        classes = classes_of(omissions.decoded)
+        symbols = Grid.of(omissions.decoded).symbols_of("offset", omissions.decoded.offset, classes)
+        return [entropy_bits(channel[classes == k]) for k in np.unique(classes) for channel in symbols]
+
+    before = coded()
+    omissions.free_offsets_and_cells(price=0)
+    after = coded()
+    assert len(before) > 30 and all(a <= b for a, b in zip(after, before, strict=True)) and sum(after) < sum(before)
 
 
 def test_every_dead_part_is_found_and_costs_less():

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 from test_dataset_colmap import _quaternion
+from videos import write_video
 
 from pd4dgs_codec.data import frame_cache
 from pd4dgs_codec.data.dataset import load
@@ -19,7 +20,7 @@ from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.train.shot import Shots
 
-imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+pytest.importorskip("imageio_ffmpeg")
 COUNT = 12
 CAMERAS, INSTANTS, FPS = 3, 4, 10
 SCALE, CENTER = 0.25, np.array([3.0, -1.0, 2.0])
@@ -219,18 +220,6 @@ def test_faults_of_record3d_are_one_line(scene, tmp_path):
 # -- videos with one model of COLMAP -----------------------------------------------------------------------------------
 
 
-def write_video(path: Path, images: list[np.ndarray], fps: int = FPS) -> None:
-    height, width = images[0].shape[:2]
-    writer = imageio_ffmpeg.write_frames(
-        str(path), (width, height), fps=fps, codec="libx264rgb", pix_fmt_out="rgb24", quality=None,
-        macro_block_size=1, output_params=["-qp", "0"],
-    )  # fmt: skip
-    writer.send(None)
-    for image in images:
-        writer.send(np.ascontiguousarray(image))
-    writer.close()
-
-
 def write_synchronised(scene: Dataset, folder: Path, camera: str = "") -> Path:
     """The camera stands where its first view is; its video shows the views after that."""
     model = folder / "sparse" / "0"
@@ -243,7 +232,7 @@ def write_synchronised(scene: Dataset, folder: Path, camera: str = "") -> Path:
     lines = []
     for i in range(CAMERAS):
         views = scene.train[i * INSTANTS : (i + 1) * INSTANTS]
-        write_video(folder / "videos" / f"cam{i}.mp4", [each.image for each in views])
+        write_video(folder / "videos" / f"cam{i}.mp4", [each.image for each in views], FPS)
         viewmat = views[0].viewmat.astype(float)
         numbers = map(repr, map(float, (*_quaternion(viewmat[:3, :3]), *viewmat[:3, 3])))
         lines += [" ".join([str(i + 1), *numbers, "1", f"cam{i}.png"]), ""]
@@ -272,9 +261,9 @@ def test_faults_of_videos_with_a_model_are_one_line(scene, tmp_path):
     folder = write_synchronised(scene, tmp_path / "set")
     videos = folder / "videos"
     images = [view.image for view in scene.train[:INSTANTS]]
-    write_video(videos / "cam1.mp4", images[:2])
+    write_video(videos / "cam1.mp4", images[:2], FPS)
     refused(folder, "has 2 frames at 10 per second and cam0.mp4 4 at 10, expected synchronised videos")
-    write_video(videos / "cam1.mp4", [image[:30, :32] for image in images])
+    write_video(videos / "cam1.mp4", [image[:30, :32] for image in images], FPS)
     refused(folder, "cam1.mp4: is 32x30, and its camera in")
     (videos / "cam1.mp4").write_bytes(b"no video")
     refused(folder, "cam1.mp4: cannot be decoded")

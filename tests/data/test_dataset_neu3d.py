@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from videos import write_video
 
 from pd4dgs_codec.data import frame_cache
 from pd4dgs_codec.data.dataset import load
@@ -13,7 +14,7 @@ from pd4dgs_codec.data.synthetic import read_synthetic
 from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.errors import DataError
 
-imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+pytest.importorskip("imageio_ffmpeg")
 CAMERAS, FRAMES, FPS = 3, 5, 12
 BOUNDS = (1.0, 9.0)
 
@@ -41,24 +42,12 @@ def _row(view, width: int, height: int, focal: float) -> np.ndarray:
     return np.concatenate([pose.ravel(), BOUNDS])
 
 
-def _video(path: Path, images: list[np.ndarray]) -> None:
-    height, width = images[0].shape[:2]
-    writer = imageio_ffmpeg.write_frames(
-        str(path), (width, height), fps=FPS, codec="libx264rgb", pix_fmt_out="rgb24", quality=None,
-        macro_block_size=2, output_params=["-qp", "0"],
-    )  # fmt: skip
-    writer.send(None)
-    for image in images:
-        writer.send(np.ascontiguousarray(image))
-    writer.close()
-
-
 def write(scene: Dataset, folder: Path) -> Path:
     folder.mkdir()
     rows = []
     for camera in range(CAMERAS):
         views = _views(scene, camera)
-        _video(folder / f"cam{camera:02d}.mp4", [view.image for view in views])
+        write_video(folder / f"cam{camera:02d}.mp4", [view.image for view in views], FPS)
         rows.append(_row(views[0], views[0].width, views[0].height, float(views[0].K[0, 0])))
     np.save(folder / "poses_bounds.npy", np.array(rows))
     return folder
@@ -113,7 +102,7 @@ def test_faults_are_one_line(scene, tmp_path, monkeypatch):
     with monkeypatch.context() as patch:
         patch.setenv(frame_cache.SIZE, "1e-6")
         refused("expected a larger PD4DGS_CACHE_GIB or a larger --downscale")
-    _video(folder / "cam01.mp4", [view.image for view in _views(scene, 1)[:3]])
+    write_video(folder / "cam01.mp4", [view.image for view in _views(scene, 1)[:3]], FPS)
     refused("cam01.mp4: has 3 frames at 12 per second and cam00.mp4 5")
     (folder / "cam01.mp4").write_bytes(b"no video")
     refused("cam01.mp4: cannot be decoded")

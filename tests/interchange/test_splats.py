@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from tiny import camera_ahead
 
-from pd4dgs_codec.interchange.splats import SH_C0, Splats, camera_eye, harmonics, picture, quaternions, rotations, unit
+from pd4dgs_codec.data.cameras import rotation_matrix
+from pd4dgs_codec.interchange.splats import SH_C0, Splats, camera_eye, harmonics, picture, quaternions, unit
 
 
 def _directions(n: int, seed: int = 0) -> np.ndarray:
@@ -36,9 +37,9 @@ def test_quaternions_and_rotations_are_inverse():
     quats = unit(np.random.default_rng(1).normal(size=(200, 4)))
     half_turns = np.eye(4)[1:]
     for q in (quats, half_turns, -quats):
-        back = quaternions(rotations(q))
+        back = quaternions(rotation_matrix(q))
         np.testing.assert_allclose(np.abs(np.einsum("nd,nd->n", back, q)), 1, atol=1e-12)
-    matrices = rotations(quats)
+    matrices = rotation_matrix(quats)
     np.testing.assert_allclose(
         matrices @ matrices.transpose(0, 2, 1), np.broadcast_to(np.eye(3), (200, 3, 3)), atol=1e-12
     )

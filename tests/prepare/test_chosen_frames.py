@@ -6,11 +6,12 @@ import numpy as np
 import pytest
 from PIL import Image, ImageFilter
 from rooms import HEIGHT, WIDTH, walk
+from videos import write_video
 
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.prepare.frames import FEWEST_FRAMES, Look, choose, look, open_recording, sharpness, write_frames
 
-imageio_ffmpeg = pytest.importorskip("imageio_ffmpeg")
+pytest.importorskip("imageio_ffmpeg")
 FPS = 10
 
 
@@ -30,17 +31,6 @@ def recording() -> list[np.ndarray]:
     return pictures
 
 
-def write_video(path, pictures) -> None:
-    writer = imageio_ffmpeg.write_frames(
-        str(path), (WIDTH, HEIGHT), fps=FPS, codec="libx264rgb", pix_fmt_out="rgb24", quality=None,
-        macro_block_size=2, output_params=["-qp", "0"],
-    )  # fmt: skip
-    writer.send(None)
-    for picture in pictures:
-        writer.send(np.ascontiguousarray(picture))
-    writer.close()
-
-
 def write_folder(path, pictures) -> None:
     path.mkdir()
     for i, picture in enumerate(pictures):
@@ -50,7 +40,10 @@ def write_folder(path, pictures) -> None:
 @pytest.mark.parametrize("kind", ["video", "folder"])
 def test_the_blurred_and_the_repeated_frame_are_left_out(kind, recording, tmp_path):
     path = tmp_path / ("film.mp4" if kind == "video" else "film")
-    (write_video if kind == "video" else write_folder)(path, recording)
+    if kind == "video":
+        write_video(path, recording, FPS)
+    else:
+        write_folder(path, recording)
     source = open_recording(path, FPS)
     looks = look(source, nothing)
     assert [frame.time for frame in looks] == pytest.approx([i / FPS for i in range(16)])

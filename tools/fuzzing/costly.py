@@ -31,7 +31,7 @@ MOST_SYMBOLS = (1 << 22) + 64 * LARGEST  #: fewer than clause 6.5 allows, so tha
 MOST_SLICES = 64  #: of a layer, so that many files are tried: what a slice costs besides shows in a few
 #: What a file may cost, in seconds of a processor of 2023 and in bytes of memory: once, and for each of its bytes. The
 #: symbols of clause 6.5 at 48 bytes and some 0.1 microseconds each.
-SECONDS, MEMORY = (0.4, 100e-6), (48 << 22, 48 << 10)
+SECONDS, MEMORY = (0.4, 25e-6), (48 << 22, 48 << 8)
 
 
 @dataclass(frozen=True)

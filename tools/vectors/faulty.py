@@ -836,9 +836,7 @@ def _sizes() -> Iterator[Vector]:
     ):
         payload = deformed.payload(lambda m, scale=scale: {**m, 4: [[*scale, *[0] * 6]]})
         yield _in_layer(1, f"bomb-{name}", what, "6.5", LIMIT, payload)
-    # So long a payload that its own bound lets more than 2^28 samples pass.
-    written = deformed.with_sections({PLANE: bytes((2**28 - 2**22) // 2048)})
-    payload = written.payload(lambda m: {**m, 4: [[16, 4096, 4096, 1, 1, *[0] * 6]]})
+    payload = deformed.payload(lambda m: {**m, 4: [[16, 4096, 4096, 1, 1, *[0] * 6]]})
     yield _in_layer(1, "samples-over-limit", "More than 2^28 plane samples.", "6.5 14", LIMIT, payload)
     wide = [[0, *[4096] * 15, 10], [1, 70], [2, 30]]
     payload = layer.payload(lambda m: {**m, 5: wide})

@@ -50,7 +50,7 @@ AGAIN = {
         "slices-later-rows-over-limit",
         "bomb-most-cells",
     ),
-    "2^28 samples are over the bound of clause 6.5 too, in any payload of less than 258 kB": ("samples-over-limit",),
+    "2^28 samples are over the bound of clause 6.5 too, in any payload of less than 1 MB": ("samples-over-limit",),
     "no number of rows under 0 is that of a tree": ("layer-0-rows-negative",),
     "layers that ascend begin with layer 0, if it is there": ("chunk-list-layer-0-second",),
     "where no network is, neither a trunk nor a head is": ("layer-1-networks-empty",),

@@ -610,7 +610,7 @@ def symbols_at_limit(over: int = 0, rows: int = 0, graded: bool = False) -> File
     """As many constant channels as clause 6.5 allows a file, or `over` more, and `rows` anchors in either layer, which
     may have step classes."""
     classes = [1] * rows if graded else None
-    plane = Scale(1, (2048, 2048, 1, 1), (0,) * 6, lambda name, shape: np.full(shape, 1, np.int32))
+    plane = Scale(1, (2048, 1920, 1, 1), (0,) * 6, lambda name, shape: np.full(shape, 1, np.int32))
 
     def layer(first: int, second: int, hidden: int) -> Layer:
         networks = {0: (first, second), 1: (hidden, 3)}
@@ -618,7 +618,7 @@ def symbols_at_limit(over: int = 0, rows: int = 0, graded: bool = False) -> File
 
     below = make_layer(cells=line(rows), classes=classes)
     size = len(below.payload()) + len(layer(300, 300, 1).payload())  # the same while no width takes more bytes
-    spent = sum(a.size for a in below.meant.arrays()) + (2048 * 2048 + 4 * 2048 + 1) + (73 + graded) * rows
+    spent = sum(a.size for a in below.meant.arrays()) + (2048 * 1920 + 2 * (2048 + 1920) + 1) + (73 + graded) * rows
     weights = FREE_SYMBOLS + SYMBOLS_PER_BYTE * size + over - spent
     for first, hidden in itertools.product(range(256, 400), range(1, 100)):
         # weights = (1 + 1) first + (first + 1) second + (second + 1) hidden + (hidden + 1) 3
