@@ -1,13 +1,16 @@
 """Measures what docs/player.md shows: the player's pictures, seconds to them, frame rates, decode times and sizes.
 
     python tools/player_page.py [--out out] [--docs docs] [--runs 9] [--only shelf-hand] [--render]
+    python tools/player_page.py --others node_modules --before FOLDER
 
 Reads out/NAME/scene.pd4, which tools/results.py makes. Needs Chromium and Playwright, and Node. About ten minutes a
-scene on two quiet cores; on busy ones the times are worthless.
+scene on two quiet cores; on busy ones the times are worthless. --others also times other players, whose packages npm
+put there (see pages/other_players.py). --before also times the decoder of the checkout in FOLDER.
 """
 
 from __future__ import annotations
 
+import argparse
 import gzip
 import subprocess
 import sys
@@ -19,9 +22,12 @@ from statistics import median
 from typing import Any
 
 from pages.browser import HARNESS, PATIENCE_MS, call, cameras, copy_player, decibels, launched, resized, shoot, shots
+from pages.other_players import PAGES as OTHERS
+from pages.other_players import STEPS, export
+from pages.other_players import lay_out as lay_out_other
 from pages.page import Page, Row, keep, make, options, paragraph, say, unpadded
 from pages.scenes import SCENES
-from player_speed import NodeDecoder, compare, grown
+from player_speed import MANY, NodeDecoder, beside, compare, grown
 from player_speed import row as speed_row
 
 from pd4dgs_codec import decode, encode
@@ -44,7 +50,6 @@ RATES, LATENCY = (2e6, 10e6), 0.05
 SIDE, VIEWS = 320, 6
 WINDOW = {"width": 480, "height": 360}
 BENCH_SIZES = "320x240,640x480"
-MANY = 100_000
 #: Bytes of a slice, and the name of the first one's row.
 SLICES, FIRST = 50_000, "0, first slice"
 #: What the page writes down of each picture, against the start of the navigation.
@@ -199,6 +204,32 @@ def screenshot(browser: Any, data: bytes, path: Path) -> None:
             page.context.close()
 
 
+def others(browser: Any, name: str, path: Path, modules: Path, out: Path, runs: int) -> list[Row]:
+    """A row per rate and other player: bytes, and the median of the seconds until its picture of the first instant is
+    there. Leaves a picture of each page in `out`."""
+    source, known, rows = SCENES[name], decode(path.read_bytes()).info, []
+    with tempfile.TemporaryDirectory() as splats:
+        export(path, source.source, source.downscale, modules, Path(splats))
+        for other in OTHERS:
+            with tempfile.TemporaryDirectory() as folder:
+                size = WINDOW["width"], WINDOW["height"]
+                laid = lay_out_other(other, known, size, Path(splats), modules, Path(folder))
+                for rate in RATES:
+                    found = []
+                    with served(Path(folder), rate) as url:
+                        for _ in range(runs):
+                            page = opened(browser)
+                            page.goto(url)
+                            page.wait_for_function("!!window.seen")
+                            found.append(page.evaluate("window.seen"))
+                            if len(found) == runs:
+                                page.screenshot(path=str(out / f"{name}-{other}.png"))
+                            page.context.close()
+                    row = {"rate": rate, "player": other, "page": laid.page, "bytes": laid.splats}
+                    rows.append(row | {"shown": median(found)})
+    return rows
+
+
 def decoding(name: str, data: bytes, runs: int) -> list[Row]:
     """Decode times of the file and of one with MANY anchors, in Node and in Python."""
     with tempfile.TemporaryDirectory() as folder, NodeDecoder() as node:
@@ -212,8 +243,9 @@ def decoding(name: str, data: bytes, runs: int) -> list[Row]:
     return rows
 
 
-def measure(name: str, out: Path, docs: Path, runs: int) -> Row:
+def measure(name: str, args: argparse.Namespace) -> Row:
     """All that the page shows of one scene."""
+    out, docs, runs = args.out, args.docs, args.runs
     path = out / name / "scene.pd4"
     if not path.is_file():
         raise DataError(f"{path}: is not there; tools/results.py makes it")
@@ -222,6 +254,9 @@ def measure(name: str, out: Path, docs: Path, runs: int) -> Row:
     row: Row = {"bytes": len(data), "anchors": scene.rows[-1], "layers": list(scene.layers), "runs": runs}
     say(f"{name}: decoding")
     row["decoding"] = decoding(name, data, runs)
+    if args.before:
+        with NodeDecoder() as node:
+            row["before"] = beside(out / name / "model.pt", args.before, runs, node)
     with launched() as browser:
         row["browser"] = f"Chromium {browser.version.split('.')[0]}"
         say(f"{name}: seconds to pictures")
@@ -230,6 +265,9 @@ def measure(name: str, out: Path, docs: Path, runs: int) -> Row:
         sliced = encode(scene, effort=1, omit="nothing", slices=SLICES)
         row["sliced"] = {"slices": sum(len(r["slices"]) for r in info(sliced)["layers"])}
         row["sliced"]["seconds"] = seconds(browser, sliced, runs)
+        if args.others:
+            say(f"{name}: other players")
+            row["others"] = others(browser, name, path, args.others.resolve(), out, runs)
         say(f"{name}: frame rates")
         row["rates"] = frame_rates(browser, data)
         say(f"{name}: pictures")
@@ -248,7 +286,8 @@ def render(rows: Sequence[Row]) -> str:
     visit = rows[-1]["page"]
     first = f"{rows[-1]['browser']}, {rows[-1]['renderer']}; two cores. Page and player: {visit:,} bytes gzipped."
     heads = ["\n".join(paragraph(first))]
-    return "\n\n".join([*heads, _pictures(rows), _seconds(rows, visit), _rates(rows), _decoding(rows)])
+    parts = [_pictures(rows), _seconds(rows, visit), _others(rows, visit), _rates(rows), _decoding(rows)]
+    return "\n\n".join([*heads, *filter(None, [*parts, _before(rows)])])
 
 
 def _block(said: str, head: Sequence[str], cells: Sequence[Sequence[str]]) -> str:
@@ -305,6 +344,31 @@ def _seconds(rows: Sequence[Row], visit: int) -> str:
     return _block(said, head, cells)
 
 
+def _others(rows: Sequence[Row], visit: int) -> str:
+    """Other players beside this one, where they were measured."""
+    cells = []
+    for row in [row for row in rows if "others" in row]:
+        for rate in RATES:
+            own = [r for r in row["seconds"] if r["rate"] == rate]
+            found = [("this player, first picture", visit, own[0]["bytes"], own[0]["shown"])]
+            found += [("this player, every level", visit, own[-1]["bytes"], own[-1]["shown"])]
+            found += [(r["player"], r["page"], r["bytes"], r["shown"]) for r in row["others"] if r["rate"] == rate]
+            cells += [
+                (row["name"], f"{rate / 1e6:g}", player, f"{page:,}", f"{size:,}", f"{8 * (page + size) / rate:.2f}")
+                + (f"{shown:.2f}",)
+                for player, page, size, shown in found
+            ]
+    said = (
+        "**Beside other players**, seconds from navigation to a picture as above. They show one instant of the scene, "
+        f"exported with {STEPS} steps of refinement: Spark 2.2 with three.js 0.180 an SPZ file with harmonics of "
+        "degree 3, PlayCanvas 2.23 an SOG file without any; both at their defaults. Their picture counts as there when "
+        "a hundredth of its pixels is no longer background. Page: bytes of the page and its scripts, gzipped. Network: "
+        "all these bytes at the rate."
+    )
+    head = ("scene", "Mbps", "player", "page", "scene's bytes", "network", "picture")
+    return _block(said, head, cells) if cells else ""
+
+
 def _rates(rows: Sequence[Row]) -> str:
     cells = [
         (
@@ -345,6 +409,23 @@ def _decoding(rows: Sequence[Row]) -> str:
     return _block(said, ("file", "anchors", "bytes", "Node", "Python", "Node/Python"), cells)
 
 
+def _before(rows: Sequence[Row]) -> str:
+    """The same beside another commit's package, where it was measured."""
+    cells = [
+        (r["file"], f"{r['anchors']:,}")
+        + tuple(f"{r[key]:.3f}" for key in ("node_cpu_s", "python_cpu_s", "before_cpu_s"))
+        + tuple(f"{r[key]:.2f}" for key in ("cpu_ratio", "before_ratio"))
+        for row in rows
+        for r in row.get("before", [])
+    ]
+    said = (
+        "**Decoding, beside commit 9275c5f**, measured likewise. Each commit packed the same checkpoint, as it is and "
+        "with copies of its anchors; Node decodes this commit's file."
+    )
+    head = ("file", "anchors", "Node", "Python", "Python before", "Node/Python", "Node/Python before")
+    return _block(said, head, cells) if cells else ""
+
+
 PAGE = Page("player", "player_page.py", render)
 
 
@@ -352,10 +433,12 @@ def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     parser = options(__doc__, NAMES)
     parser.add_argument("--runs", type=int, default=9, metavar="N", help="runs that medians are taken of (default: 9)")
+    parser.add_argument("--others", type=Path, metavar="FOLDER", help="a node_modules with other players")
+    parser.add_argument("--before", type=Path, metavar="FOLDER", help="a checkout of another commit")
     args = parser.parse_args(argv)
     configure()
     todo = [name for name in NAMES if not args.only or name in args.only]
-    return make(PAGE, NAMES, [] if args.render else todo, args, lambda n: measure(n, args.out, args.docs, args.runs))
+    return make(PAGE, NAMES, [] if args.render else todo, args, lambda name: measure(name, args))
 
 
 if __name__ == "__main__":

@@ -40,6 +40,7 @@ def main(frames: int, size: str) -> None:
         for camera in range(2):  # the first is held out and is short work: its frames are all the same
             source = f"testsrc2=size={size}:rate={FPS}" if camera else f"color=gray:size={size}:rate={FPS}"
             command = [get_ffmpeg_exe(), "-v", "error", "-f", "lavfi", "-i", source, "-frames:v", str(frames)]
+            command += ["-vf", f"scale={width}:{height}"]  # testsrc2 makes odd sides even
             command += ["-c:v", "libx264", "-preset", "ultrafast", "-pix_fmt", "yuv444p"]
             subprocess.run([*command, str(folder / f"cam{camera}.mp4")], check=True)
         row = [0, 1, 0, 0, height, 1, 0, 0, 0, width, 0, 0, -1, 0, width]

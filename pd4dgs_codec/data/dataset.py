@@ -72,6 +72,6 @@ def _read(source: str | Path, downscale: int, holdout: int) -> Dataset:
         return read_colmap(folder, *model, downscale, holdout)
     found = "other files" if any(folder.iterdir()) else "an empty folder"
     raise DataError(
-        f"{folder}: found {found}, expected camera/ (iPhone, Nerfies), transforms*.json (Blender), {POSES} (Neu3D) "
+        f"{folder}: found {found}, expected camera/ (iPhone, Nerfies), transforms*.json (Blender), {POSES} (Neu3D), "
         f"{META} (Panoptic Studio), metadata with rgbd/ (Record3D) or sparse/0 (COLMAP)"
     )

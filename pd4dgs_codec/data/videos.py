@@ -82,4 +82,6 @@ class _failures:  # noqa: N801 - used as a statement
 
     def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
         if isinstance(error, (OSError, RuntimeError, StopIteration, ValueError, KeyError)):
-            raise DataError(f"{self.path}: cannot be decoded: {one_line(str(error), 120)}") from None
+            # imageio-ffmpeg appends all that ffmpeg printed, whose last line says what is wrong
+            said = str(error).strip().rpartition("\n")[2]
+            raise DataError(f"{self.path}: cannot be decoded: {one_line(said, 120)}") from None

@@ -51,6 +51,7 @@ class Dataset:
         time 0 and 1, (0, 1) if unknown. up: unit vector, world. unit: metres per scene unit, 0 if unknown.
     masked: True where the test masks are covisibility masks. left_out: names of views that are in neither split because
         their masks hold no valid pixel.
+    paths: float32 [T, M, 3], where the points are at path_times, T normalised times; None if nobody knows.
     """
 
     name: str
@@ -67,6 +68,8 @@ class Dataset:
     unit: float
     masked: bool
     left_out: tuple[str, ...] = ()
+    paths: np.ndarray | None = None
+    path_times: tuple[float, ...] = ()
 
     @property
     def camera(self) -> Camera:

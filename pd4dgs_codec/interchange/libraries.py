@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import io
 import os
 import sys
@@ -89,13 +90,18 @@ def fourdgs_bytes(frames: Sequence[tuple[float, Splats, np.ndarray]], seconds: f
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """What libraries print on stdout, from C too, goes to stderr."""
+    """What libraries print, from C too, is dropped: what a caller must know comes back to it."""
     sys.stdout.flush()
-    kept = os.dup(1)
-    os.dup2(2, 1)
-    try:
-        with contextlib.redirect_stdout(sys.stderr):
+    sys.stderr.flush()
+    kept = [os.dup(stream) for stream in (1, 2)]
+    with open(os.devnull, "w") as nowhere:
+        try:
+            for stream in (1, 2):
+                os.dup2(nowhere.fileno(), stream)
             yield
-    finally:
-        os.dup2(kept, 1)
-        os.close(kept)
+        finally:
+            with contextlib.suppress(TypeError):  # Windows finds no C library by this name
+                ctypes.CDLL(None).fflush(None)  # else what C's stdio holds back comes out later
+            for stream, old in zip((1, 2), kept, strict=True):
+                os.dup2(old, stream)
+                os.close(old)

@@ -7,6 +7,7 @@ import importlib
 import os
 import re
 import sys
+import zlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
@@ -24,6 +25,9 @@ from pd4dgs_codec.interchange.tensors import read_tensors
 FRAME_SUFFIXES = (".ply", ".spz")
 #: Coefficients of the harmonics but the constant, by degree.
 REST = {(degree + 1) ** 2 - 1: degree for degree in range(MAX_DEGREE + 1)}
+#: Of an SPZ file: its first bytes, Gaussians at most, and unpacked bytes of each at most: 65 with all harmonics, and
+#: extensions.
+SPZ_MAGIC, SPZ_MOST, SPZ_BYTES = b"NGSP", 10_000_000, 128
 #: What a function answers, with colors in the place of sh if it has no harmonics.
 PARTS = ("means", "quats", "scales", "opacities", "sh")
 
@@ -123,11 +127,39 @@ def _unpacked(path: Path, kind: str) -> bytes:
         data = read_file(path)
     except OSError as error:
         raise DataError(f"{path}: cannot be read: {error.strerror}") from None
+    if kind == "spz":
+        _check_spz(path, data)
     with quiet():
         found = forge.convert(data, kind, "ply")
-    if "error" in found:
-        raise DataError(f"{path}: gaussforge cannot read it: {one_line(str(found['error']), 120)}")
+    if "error" in found or not found["data"]:
+        why = one_line(str(found.get("error", "no Gaussians were found")), 120)
+        raise DataError(f"{path}: gaussforge cannot read it: {why}")
     return bytes(found["data"])
+
+
+def _check_spz(path: Path, data: bytes) -> None:
+    """Refuses what is no SPZ file, and what unpacks to more than its Gaussians take: gaussforge would keep it all."""
+    unpacker, zipped = zlib.decompressobj(wbits=31), data[:4] != SPZ_MAGIC  # from version 4 on the header is bare
+    try:
+        head = unpacker.decompress(data, 20) if zipped else data[:20]
+        if head[:4] != SPZ_MAGIC or len(head) < 16:
+            raise DataError(f"{path}: is no SPZ file, expected one that begins with {SPZ_MAGIC.decode()}")
+        count = int.from_bytes(head[8:12], "little")
+        if count > SPZ_MOST:
+            raise DataError(f"{path}: says it has {count:,} Gaussians, expected {SPZ_MOST:,} at most")
+        size, most = len(head), len(head) + SPZ_BYTES * count
+        while zipped and not unpacker.eof and size <= most:
+            part = unpacker.decompress(unpacker.unconsumed_tail, 1 << 20)
+            if not part:
+                break
+            size += len(part)
+    except zlib.error as error:
+        raise DataError(f"{path}: is no SPZ file: {error}") from None
+    if not zipped:  # a table of streams: packed and unpacked bytes of each
+        table = data[int.from_bytes(head[16:20], "little") :][: 16 * head[15]]
+        size = sum(int.from_bytes(table[i + 8 : i + 16], "little") for i in range(0, len(table), 16))
+    if size > most:
+        raise DataError(f"{path}: unpacks to more than its {count:,} Gaussians take")
 
 
 def _fourdgs(path: Path) -> Teacher:

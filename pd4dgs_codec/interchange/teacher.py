@@ -27,7 +27,7 @@ from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.models import Teacher, read_model
 from pd4dgs_codec.interchange.scaffold_gs import read_cameras
-from pd4dgs_codec.interchange.splats import SH_C0, Splats, looking, picture, sphere
+from pd4dgs_codec.interchange.splats import SH_C0, looking, picture, sphere
 from pd4dgs_codec.scene import Camera
 from pd4dgs_codec.view.frames import shrunk
 
@@ -39,7 +39,12 @@ FIELD_OF_VIEW = math.radians(50)
 #: Cameras stand so far from the middle, in radii of the sphere around 90 of 100 Gaussians, and no lower than this sine
 #: below it.
 DISTANCE, LOWEST = 2.6, -0.35
+MIDDLE = 0.5  #: the instant whose Gaussians the anchors start at
 BOX_TIMES = 5  #: instants at which it is looked how far the Gaussians reach
+PATH_TIMES = 17  #: instants of their paths, at most
+#: Rows of two instants are the same Gaussians if the median distance from one to the other is below this share of the
+#: median distance between rows drawn at random.
+SAME = 0.25
 #: Of the times of cameras that have none: any stretch of them is spread over the whole time.
 GOLDEN = (5**0.5 - 1) / 2
 EXAMPLES = {
@@ -75,51 +80,72 @@ def load_source(source: str, *, downscale: int = 1, holdout: int = 8) -> Dataset
 
 def _like(source: str, teacher: Teacher, data: Dataset) -> Dataset:
     """The dataset with the teacher's pictures in the place of its training pictures; held-out ones stay true."""
-    solid = _solid(source, teacher)
+    solid = _solid(source, teacher, MIDDLE)
     shots = [(view.camera, view.time) for view in data.train]
     train = _pictures(teacher, shots, data.background, data.near)
-    points, colors = _points(solid)
-    return replace(data, name=source, train=tuple(train), points=points, point_colors=colors)
+    return replace(data, name=source, train=tuple(train), **_points(teacher, solid))
 
 
 def _around(source: str, place: Path, teacher: Teacher, options: Options, downscale: int, holdout: int) -> Dataset:
     """Cameras around the teacher, every holdout-th of them held out."""
-    solid = _solid(source, teacher)
-    cameras, up = _cameras(place, solid.means, options, downscale)
+    solid = _solid(source, teacher, MIDDLE)
+    cameras, up = _cameras(place, teacher.splats(teacher.nearest(MIDDLE)).means[solid], options, downscale)
     still = teacher.times is not None and len(teacher.times) == 1
     shots = [(camera, 0.0 if still else i * GOLDEN % 1.0) for i, camera in enumerate(cameras)]
     times = teacher.times or tuple(np.linspace(0, 1, BOX_TIMES))
-    some = [times[i] for i in np.unique(np.linspace(0, len(times) - 1, BOX_TIMES).round().astype(int))]
-    everywhere = np.concatenate([_solid(source, teacher, t).means for t in some])
+    some = _spread(times, BOX_TIMES)
+    everywhere = np.concatenate([teacher.splats(t).means[_solid(source, teacher, t)] for t in some])
     box = points_box(everywhere)
     near, far = depth_range([c.viewmat.astype(np.float64) for c in cameras], box, everywhere)
     views = _pictures(teacher, shots, options.background, near)
     held = [holdout > 0 and i % holdout == holdout // 2 for i in range(len(views))]
-    points, colors = _points(solid)
     return Dataset(
         name=source,
         train=tuple(view for view, out in zip(views, held, strict=True) if not out),
         test=tuple(view for view, out in zip(views, held, strict=True) if out),
-        points=points, point_colors=colors, box=box, near=near, far=far, background=options.background,
+        box=box, near=near, far=far, background=options.background,
         time_range=(0.0, teacher.seconds), up=up, unit=0.0, masked=False,
+        **_points(teacher, solid),
     )  # fmt: skip
 
 
-def _solid(source: str, teacher: Teacher, t: float = 0.5) -> Splats:
-    """The Gaussians at an instant that are not faint."""
-    splats = teacher.splats(teacher.nearest(t))
-    rows = np.flatnonzero(splats.opacities >= SOLID)
+def _solid(source: str, teacher: Teacher, t: float) -> np.ndarray:
+    """Rows of the Gaussians at an instant that are not faint."""
+    rows = np.flatnonzero(teacher.splats(teacher.nearest(t)).opacities >= SOLID)
     if not len(rows):
         raise DataError(f"{source}: no Gaussian is as opaque as {SOLID:g} at {t:g}, expected one at least")
-    return splats.taken(rows)
+    return rows
 
 
-def _points(solid: Splats) -> tuple[np.ndarray, np.ndarray]:
-    """Positions float32 [M, 3] and colours uint8 [M, 3] of POINTS of them at most."""
-    if len(solid.means) > POINTS:
-        solid = solid.taken(np.random.default_rng(0).permutation(len(solid.means))[:POINTS])
-    colors = np.clip(solid.sh[:, 0] * np.float32(SH_C0) + np.float32(0.5), 0, 1)
-    return solid.means, np.rint(colors * 255).astype(np.uint8)
+def _points(teacher: Teacher, solid: np.ndarray) -> dict[str, Any]:
+    """The fields of a Dataset on its points: POINTS of these rows at most, with their paths where rows stay the same
+    Gaussians."""
+    rows = solid if len(solid) <= POINTS else solid[np.random.default_rng(0).permutation(len(solid))[:POINTS]]
+    splats = teacher.splats(teacher.nearest(MIDDLE))
+    colors = np.clip(splats.sh[rows, 0] * np.float32(SH_C0) + np.float32(0.5), 0, 1)
+    points = {"points": splats.means[rows], "point_colors": np.rint(colors * 255).astype(np.uint8)}
+    return points | _paths(teacher, rows, len(splats.means))
+
+
+def _paths(teacher: Teacher, rows: np.ndarray, count: int) -> dict[str, Any]:
+    """Where these rows of `count` are over the time; nothing if they do not stay the same Gaussians."""
+    times = _spread(teacher.times or tuple(np.linspace(0, 1, PATH_TIMES)), PATH_TIMES)
+    others, places = np.random.default_rng(0).permutation(len(rows)), list[np.ndarray]()
+    for t in times:
+        means = teacher.splats(t).means
+        if len(means) != count:
+            return {}
+        places.append(means[rows])
+        if len(places) > 1:
+            near, far = (np.median(np.linalg.norm(places[-1][k] - places[-2], axis=1)) for k in (slice(None), others))
+            if not near <= SAME * far:
+                return {}
+    return {"paths": np.stack(places), "path_times": times} if len(times) > 1 else {}
+
+
+def _spread(times: Sequence[float], count: int) -> tuple[float, ...]:
+    """So many of the times at most, spread over all of them."""
+    return tuple(times[i] for i in np.unique(np.linspace(0, len(times) - 1, count).round().astype(int)))
 
 
 def _pictures(teacher: Teacher, shots: Sequence[tuple[Camera, float]], background: Triple, near: float) -> list[View]:

@@ -22,13 +22,16 @@ TIED = -40.0
 #: Random candidates per initial point, and the training views that judge them, where a dataset has no points.
 CARVE_CANDIDATES = 20
 CARVE_VIEWS = 40
+#: Where a dataset knows its paths: steps that teach them, anchors in each, and the rates of planes and networks.
+PATH_STEPS, PATH_ANCHORS, PATH_RATES = 400, 4096, (0.02, 0.002)
 
 
 def fresh_model(
     config: ModelConfig, dataset: Dataset, widths: Widths, steps: Steps, seed: int, max_layer: int = 2
 ) -> Model:
     """An untrained model without the deformations of the layers above max_layer: anchors on the dataset's points
-    (topped up near them), or spread over its box. What it has starts the same whatever max_layer is."""
+    (topped up near them), or spread over its box; they move along the points' paths where the dataset knows them. What
+    it has starts the same whatever max_layer is."""
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)  # nn.Linear and HexPlane draw their start values from the global generator
     info = scene_info(dataset)
@@ -62,7 +65,32 @@ def fresh_model(
         model.local_deformation = None
     if max_layer < 1:
         model.global_deformation = None
+    elif dataset.paths is not None:
+        learn_paths(model, dataset, generator)
     return model
+
+
+def learn_paths(model: Model, dataset: Dataset, generator: torch.Generator) -> None:
+    """Teaches the global deformation to move each anchor as the dataset's point next to it moves."""
+    field = model.global_deformation
+    if field is None or "position" not in field.heads or dataset.points is None or dataset.paths is None:
+        return
+    anchors, points = model.anchor, torch.from_numpy(dataset.points)
+    blocks = torch.split(anchors, max(1, 8_000_000 // len(points)))
+    nearest = torch.cat([torch.cdist(block, points).argmin(1) for block in blocks])
+    moves = (torch.from_numpy(dataset.paths) - points)[:, nearest] / field.unit
+    if not moves.any():
+        return
+    networks = [*field.trunk.parameters(), *field.heads["position"].parameters()]
+    groups = zip((list(field.planes.parameters()), networks), PATH_RATES, strict=True)
+    adam = torch.optim.Adam([{"params": params, "lr": rate} for params, rate in groups])
+    for _ in range(PATH_STEPS):
+        k = int(torch.randint(len(moves), (), generator=generator))
+        rows = torch.randperm(len(anchors), generator=generator)[:PATH_ANCHORS]
+        found = field(anchors[rows], dataset.path_times[k])["position"] / field.unit
+        (found - moves[k, rows]).square().mean().backward()  # type: ignore[no-untyped-call]
+        adam.step()
+        adam.zero_grad()
 
 
 def fresh_mask_logits(n: int, level: int) -> Tensor:
