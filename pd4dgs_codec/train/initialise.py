@@ -88,7 +88,7 @@ def learn_paths(model: Model, dataset: Dataset, generator: torch.Generator) -> N
         k = int(torch.randint(len(moves), (), generator=generator))
         rows = torch.randperm(len(anchors), generator=generator)[:PATH_ANCHORS]
         found = field(anchors[rows], dataset.path_times[k])["position"] / field.unit
-        (found - moves[k, rows]).square().mean().backward()  # type: ignore[no-untyped-call]
+        torch.autograd.backward((found - moves[k, rows]).square().mean())
         adam.step()
         adam.zero_grad()
 
