@@ -246,6 +246,7 @@ def _header(version: int, count: int, streams: int = 0) -> bytes:
         (_header(4, 5, 1) + struct.pack("<IIQQQ", 32, 0, 0, 9, 1 << 40), "unpacks to more than its 5 Gaussians take"),
         (gzip.compress(_header(3, 5)), "gaussforge cannot read it"),
     ],
+    ids=["empty", "junk", "other bytes", "a bomb", "a count", "a bomb of version 4", "no Gaussians"],
 )
 def test_bad_spz_files_are_one_line_before_they_fill_the_memory(tmp_path, capfd, data, message):
     pytest.importorskip("gaussforge")
