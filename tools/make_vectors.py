@@ -15,7 +15,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from vectors import faulty, slices, uncommon, valid
+from vectors import dear, faulty, slices, uncommon, valid
 from vectors.blocks import Vector
 
 from pd4dgs_codec.bitstream.container import read_preamble
@@ -30,7 +30,7 @@ SUFFIX = ".pd4"
 
 def vectors() -> list[Vector]:
     """All vectors, in the manifest's order."""
-    found = [*valid.cases(), *uncommon.cases(), *faulty.cases(), *slices.cases()]
+    found = [*valid.cases(), *uncommon.cases(), *faulty.cases(), *slices.cases(), *dear.cases()]
     names = [v.name for v in found]
     doubled = {name for name in names if names.count(name) > 1}
     if doubled:

@@ -1,13 +1,17 @@
 """The search for dear files: what it builds is legal or refused, and it keeps what costs most."""
 
 import random
+from pathlib import Path
 
 import pytest
 from fuzzing import check, mutate
-from fuzzing.costly import PRIORS, Coded, Found, LayerRecipe, Recipe, build, changed, measured
+from fuzzing.costly import Found, build, changed, measured
+from vectors.recipes import PRIORS, Coded, LayerRecipe, Recipe
 
 from pd4dgs_codec import decode
 from pd4dgs_codec.errors import Pd4Error
+
+ROOT = Path(__file__).parents[2]
 
 
 @pytest.mark.parametrize("prior", PRIORS)
@@ -40,24 +44,21 @@ def test_costs_are_shares_of_what_a_file_of_that_length_may_cost():
     assert isinstance(small, Found) and small.row()["bytes"] == len(small.data)
 
 
-def dearest_in_seconds():
-    """Near the dearest that was found: 1,677 bytes that declare 4.3 million plane samples, by the median."""
-    one, three = (2, 2048, 64, 1, 16), (2, 64, 64, 4096, 64)
-    wide = LayerRecipe(1, 1 << 19, Coded("exceptions", 4, classes=6), 1, (one,), 3, Coded(own=True), (1024, 1, 64))
-    second = LayerRecipe(
-        1, 4, Coded(window=4), 1, (one, (2, 16, 256, 4096, 2)), 3, Coded(own=True, classes=6), (1024, 1, 64), 16, True
-    )
-    local = LayerRecipe(
-        2, 1 << 19, Coded("gauss", 1), 1, ((2, 800, *one[2:]), three), 3, Coded(window=4, own=True), (1,), 16, True
-    )
-    return build(Recipe((wide, second, local), 2, 4))
+DEAR = sorted((ROOT / "spec" / "vectors" / "dear").glob("*.pd4"))
 
 
-def test_the_dearest_file_that_was_found_stays_within_its_bounds():
-    data = dearest_in_seconds()
-    assert len(data) < 2000 and check.declared(data)[0] > 4_000_000
+@pytest.mark.parametrize(
+    "path", [pytest.param(p, id=p.stem, marks=[pytest.mark.slow] * (not p.stem.endswith("-0"))) for p in DEAR]
+)
+def test_the_dearest_files_that_were_found_stay_within_their_bounds(path):
+    data = path.read_bytes()
+    assert len(data) < 2000 and check.declared(data)[0] > 3_000_000
     check.examine(mutate.Case(data, True, "dear"), frozenset(), random.Random(1))  # within MAX_SECONDS, as all inputs
     assert check.check_memory(data) < 1
+
+
+def test_there_are_dear_files():
+    assert len(DEAR) == 10
 
 
 def test_what_breaks_a_limit_is_dropped():
