@@ -196,6 +196,9 @@ def read_iphone(folder: Path, downscale: int) -> Dataset:
     near, far = _near_far(files, frames, box, folder)
     fps = files.extra.get("fps")
     fps = None if fps is None else number(fps, f"{folder / 'extra.json'}: fps", positive=True)
+    if fps and not stop / fps <= LARGEST_TIME:
+        found = f"{fps:g}, with which the last frame is at {stop / fps:g} s"
+        raise DataError(f"{folder / 'extra.json'}: fps is {found}, expected {LARGEST_TIME:.2g} s at most")
     r, g, b = array(files.extra.get("background", [0.0] * 3), (3,), f"{folder / 'extra.json'}: background").tolist()
     return Dataset(
         name=folder.resolve().name,

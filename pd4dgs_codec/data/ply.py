@@ -58,8 +58,9 @@ def _body(path: Path, raw: bytes, kind: str, count: int, dtype: np.dtype) -> np.
         if len(rows) == count:
             table = np.asarray(rows, np.float64).reshape(count, len(names))
             vertices = np.empty(count, dtype)
-            for i, name in enumerate(names):
-                vertices[name] = table[:, i]
+            with np.errstate(over="ignore"):  # what a type cannot hold becomes infinite there
+                for i, name in enumerate(names):
+                    vertices[name] = table[:, i]
             return vertices
     except ValueError:
         raise DataError(f"{path}: vertex lines are not {len(names)} numbers each") from None

@@ -189,6 +189,7 @@ def test_the_unbroken_camera_folder_loads(tmp_path):
         (dict(extra={"factor": 1.5}), "factor is 1.5"),
         (dict(extra={"bbox": [[1, 1, 1], [0, 0, 0]]}), "expected a lower and an upper corner"),
         (dict(extra={"fps": 0}), "fps is 0"),
+        (dict(extra={"fps": 1e-300}, metadata={"0_00000": {"warp_id": 9}}), "with which the last frame is at 9e+300 s"),
     ],
 )
 def test_broken_camera_folders(tmp_path, broken, text):

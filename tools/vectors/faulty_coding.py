@@ -757,6 +757,9 @@ def _ranges() -> Iterator[Vector]:
         ),
     ):
         yield of(f"overflow-{name}", "11.5", what, *layers, header=header)
+    rounded = Scale(1, (2, 1, 1, 1), (0,) * 6, lambda name, shape: np.full(shape, 31 * 601, np.int32))
+    layer = make_layer(1, (), before=1, scales=[rounded], steps=[1801 * 2.0**103, 1.0])
+    yield of("overflow-by-rounding", "11.5", "Samples of 2^128 - 2^103, which rounds to infinity.", make_layer(), layer)
 
     what = "A voxel of layer 0 again in layer 1."
     yield of("voxel-twice", "12.1", what, three, make_layer(1, [[2, 0, 0]], before=3))
