@@ -4,10 +4,11 @@ import { Pd4Player } from "./element.js";
 import { bench } from "./render/bench.js";
 
 const query = new URLSearchParams(location.search);
-/** A packed page may hold its scene, or name it. */
+/** @typedef {{early?: import("./render/remote.js").Early}} Begun */
+/** A packed page may hold its scene. */
 const held = document.getElementById("scene")?.textContent;
 const bytes = held ? Uint8Array.from(atob(held), (c) => c.charCodeAt(0)) : null;
-const source = bytes ? new Blob([bytes]) : (document.body.dataset.src ?? query.get("src") ?? "scene.pd4");
+const source = bytes ? new Blob([bytes]) : /** @type {Begun} */ (globalThis).early?.url ?? "scene.pd4";
 
 if (query.has("bench")) {
   bench(source, document.body, query.get("sizes") ?? undefined);

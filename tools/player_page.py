@@ -5,7 +5,8 @@
 
 Reads out/NAME/scene.pd4, which tools/results.py makes. Needs Chromium and Playwright, and Node. About ten minutes a
 scene on two quiet cores; on busy ones the times are worthless. --others also times other players, whose packages npm
-put there (see pages/other_players.py). --before also times the decoder of the checkout in FOLDER.
+put there (see pages/other_players.py). --before also times the decoder of the checkout in FOLDER, on files that both
+pack from FOLDER/out/NAME/model.pt, which the older trainer made.
 """
 
 from __future__ import annotations
@@ -256,7 +257,7 @@ def measure(name: str, args: argparse.Namespace) -> Row:
     row["decoding"] = decoding(name, data, runs)
     if args.before:
         with NodeDecoder() as node:
-            row["before"] = beside(out / name / "model.pt", args.before, runs, node)
+            row["before"] = beside(args.before / "out" / name / "model.pt", args.before, runs, node)
     with launched() as browser:
         row["browser"] = f"Chromium {browser.version.split('.')[0]}"
         say(f"{name}: seconds to pictures")

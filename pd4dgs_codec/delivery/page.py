@@ -24,6 +24,8 @@ from pd4dgs_codec.scene import Scene
 
 PAGE = "index.html"
 MODULE = "page.js"
+#: Asks for the scene before the rest of the page is there.
+EARLY = "early.js"
 WORKERS = ("loader-worker.js", "sort-worker.js", "evaluate-worker.js")
 #: Of packing a scene that is shown at once.
 EFFORT = 1
@@ -190,8 +192,10 @@ for(const name in workers)workers[name]=URL.createObjectURL(new Blob([workers[na
 """
     text = re.sub(r"<!--.*?-->\s*", "", (root / PAGE).read_text(encoding="utf-8"), flags=re.DOTALL)
     head, body, _ = re.split(r'(?=<p id="note")|<script type="module".*', text, maxsplit=2)
+    early = "" if isinstance(source, bytes) else f"<script>\n{strip((root / EARLY).read_text(encoding='utf-8'))}</script>"
+    head = head.replace(f'<script src="./{EARLY}"></script>', early)
     if isinstance(source, str):
-        body = f'<body data-src="{html.escape(source)}">\n'
+        head, body = head.replace("<html ", f'<html data-src="{html.escape(source)}" ', 1), "<body>\n"
     elif source is not None:
         body = f'<body>\n<script type="text/plain" id="scene">{base64.b64encode(source).decode()}</script>\n'
     return f"{head}{body}{script}</html>\n"

@@ -222,9 +222,12 @@ class _Handler(BaseHTTPRequestHandler):
         content = gzip.compress(file.read(MAX_ZIPPED), 9, mtime=0)
         self._begin(HTTPStatus.OK, {**headers, "Content-Encoding": "gzip", "Content-Length": str(len(content))})
         if body:
-            with self.server.link.transfer():
-                self.server.link.cross(len(content))
-                self.wfile.write(content)
+            link = self.server.link
+            with link.transfer():
+                for start in range(0, len(content), link.block):
+                    block = content[start : start + link.block]
+                    link.cross(len(block))
+                    self.wfile.write(block)
 
     def _send_body(self, file: BinaryIO, left: int, etag: str) -> None:
         link = self.server.link

@@ -20,6 +20,18 @@ const PROGRESS_MS = 100;
  * @property {{layer: number, end: number}[]} ends
  */
 
+/** The answer that early.js asked for, which serves once. */
+let { early } = /** @type {{early?: {url: string, answer: Promise<Response>, controller: AbortController}}} */ (globalThis);
+
+/** As fetch. @param {RequestInfo | URL} url @param {RequestInit} [options] */
+function ask(url, options) {
+  if (!early || url !== early.url) return fetch(url, options);
+  const { answer, controller } = early;
+  early = undefined;
+  options?.signal?.addEventListener("abort", () => controller.abort());
+  return answer;
+}
+
 let decoder = new Stream();
 /** @type {SceneSource} */
 let source;
@@ -39,6 +51,7 @@ serve({
   /** @param {string | Blob} from */
   open(from) {
     source = new SceneSource(typeof from === "string" ? from : URL.createObjectURL(from), {
+      fetch: ask,
       makeDecoder: () => (decoder = new Stream()),
       progress: () => {
         arrived = epochNow();

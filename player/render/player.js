@@ -158,9 +158,10 @@ export class Player extends EventTarget {
   async load(source) {
     if (this._closed) return;
     this.stopLoading();
+    const from = source instanceof Blob ? source : new URL(source, document.baseURI).href;
     const loader = startLoader((news) => {
       if (loader === this._loader) this._told(news);
-    });
+    }, from);
     this._loader = loader;
     this._scene = null;
     this._shownLevel = null;
@@ -174,7 +175,6 @@ export class Player extends EventTarget {
     this._status = { bytes: 0, total: null, loading: true, ends: [] };
     this._started = performance.now();
     this._touch();
-    const from = source instanceof Blob ? source : new URL(source, document.baseURI).href;
     loader.call("open", [from]).catch(() => {}); // a worker that fails says so to the next call as well
     const loading = this._loadOn(loader);
     if (!this._loaded) this._startGpu(); // which takes longer than to ask a server

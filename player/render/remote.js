@@ -1,15 +1,15 @@
 // Calls across a worker's border: the page's side. The worker's is serve.js.
 
 /**
- * A worker whose functions are called by name. `url` is that of a module.
+ * A worker whose functions are called by name, or one made from the module at a URL.
  */
 export class Remote {
-  /** @param {URL} url @param {(message: any) => void} [told] takes what the worker says unasked */
-  constructor(url, told = () => {}) {
+  /** @param {URL | Worker} from @param {(message: any) => void} [told] takes what the worker says unasked */
+  constructor(from, told = () => {}) {
     /** @type {Map<number, {resolve: (value: any) => void, reject: (error: Error) => void}>} */
     this._waiting = new Map();
     this._calls = 0;
-    this._worker = start(url);
+    this._worker = from instanceof Worker ? from : start(from);
     this._worker.onmessage = ({ data }) => {
       const waiting = this._waiting.get(data.call);
       if (!waiting) {
@@ -56,8 +56,28 @@ export class Remote {
   }
 }
 
-/** The worker that fetches and decodes. @param {(news: import("./loader-worker.js").News) => void} told */
-export const startLoader = (told) => new Remote(new URL("./loader-worker.js", import.meta.url), told);
+/**
+ * What early.js began: a worker that asks `url` for a scene, and takes the address of the loader's code as its first
+ * message. null: it could not.
+ *
+ * @typedef {{url: string, worker: Worker | null}} Early
+ */
+
+/**
+ * The worker that fetches and decodes.
+ *
+ * @param {(news: import("./loader-worker.js").News) => void} told
+ * @param {string | Blob} [from] what it will be asked to open
+ */
+export function startLoader(told, from) {
+  const code = new URL("./loader-worker.js", import.meta.url);
+  const { early } = /** @type {{early?: Early}} */ (globalThis);
+  const worker = early?.worker;
+  if (!worker || early.url !== from) return new Remote(code, told);
+  early.worker = null; // its answer serves once
+  worker.postMessage(code.href);
+  return new Remote(worker, told);
+}
 
 /** @param {URL} url @returns {Worker} */
 function start(url) {

@@ -28,6 +28,7 @@ from tiny import TINY, disc
 from pd4dgs_codec import decode, encode, show
 from pd4dgs_codec.codec.info import info
 from pd4dgs_codec.delivery.link import Link
+from pd4dgs_codec.delivery.page import page as packed_page
 from pd4dgs_codec.delivery.server import Server
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.scene import (
@@ -736,6 +737,20 @@ def test_a_package_by_the_installed_wheel_plays_from_any_web_server(page, instal
         page.wait_for_function("document.querySelector('pd4-player')?.player.status.level === 2")
         plain.shutdown()
     assert [Path(urlsplit(url).path).name for url in asked if url.startswith("http")] == ["moved", "scene.pd4"]
+
+
+def test_the_scene_is_asked_for_while_the_page_arrives(page, folder, lively):
+    """Once, and the answer is the one that is shown."""
+    (folder / "packed").mkdir()
+    (folder / "packed" / "index.html").write_text(packed_page())
+    (folder / "packed" / "scene.pd4").write_bytes(lively)
+    asked: list[float] = []
+    log = lambda line: asked.append(time.time()) if "scene.pd4" in line else None  # noqa: E731
+    with Server(folder, link=Link(2e5), log=log) as slow, slow.running():
+        page.goto(slow.url_of("packed/index.html"))
+        page.wait_for_function("document.querySelector('pd4-player')?.player.status.level === 2")
+    arrived = page.evaluate("performance.timeOrigin + performance.getEntriesByType('navigation')[0].responseEnd")
+    assert len(asked) == 1 and asked[0] < arrived / 1000
 
 
 @pytest.mark.parametrize("place", ["notebook", "file"])
