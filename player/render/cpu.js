@@ -1,4 +1,4 @@
-// The evaluator in JavaScript, in a worker of its own: for machines that cannot render to float textures, and for
+// The evaluator without a GPU, in a worker of its own: for machines that cannot render to float textures, and for
 // networks that shaders cannot hold.
 
 import { SPLAT_BLOCKS } from "./evaluator.js";

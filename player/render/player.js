@@ -56,8 +56,6 @@ const REST_MS = 250;
 const SOFTWARE_ANCHORS = 30_000;
 /** Where no GPU draws, pictures begin with this step of SCALES. */
 const SOFTWARE_STEP = 2;
-/** Without float textures only this level is evaluated while nothing else is asked for. */
-const CPU_LEVEL = 0;
 
 /**
  * Events: `progress` {bytes, total}, `firstpicture` and `upgrade` {level, bytes, seconds, arrived, decoded},
@@ -459,7 +457,6 @@ export class Player extends EventTarget {
     const camera = /** @type {Camera} */ (this.camera);
     let level = this._front ? (this._level ?? 2) : 0; // the first picture is the one that comes soonest
     if (this._playing && this._options.degrade !== false) level = Math.min(level, this._pace.level);
-    if (this._useCpu && this._options.evaluator !== "cpu") level = Math.min(level, CPU_LEVEL);
     return stateOf(scene, Math.max(level, 0), this.time, centreOf(camera));
   }
 

@@ -313,14 +313,13 @@ def test_pictures_through_spark_are_those_of_the_rasteriser(page, server, folder
     call(page, "harness.close")
 
 
-def test_networks_that_shaders_cannot_hold_show_level_0(harness, folder, server):
+def test_networks_that_shaders_cannot_hold_are_evaluated_without(harness, folder, server):
     (folder / "wide.pd4").write_bytes(encode(lively_scene(60, hidden=(300,)), layers=2, effort=1))
     pictures = []
-    for evaluator, level in (("gpu", None), ("cpu", 0)):
-        options = {"evaluator": evaluator, "level": level}
-        call(harness, "harness.open", server.url_of("wide.pd4"), WIDTH, HEIGHT, options)
+    for evaluator in ("gpu", "cpu"):
+        call(harness, "harness.open", server.url_of("wide.pd4"), WIDTH, HEIGHT, {"evaluator": evaluator})
         pictures.append(pixels(call(harness, "harness.shoot", {})))
-        assert harness.evaluate("harness.player.status.level") == 0
+        assert harness.evaluate("harness.player.status.level") == 2
     assert decibels(*pictures) > 60 and np.ptp(pictures[0]) > 0.3
 
 
