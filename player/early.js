@@ -1,5 +1,5 @@
 // The first script of index.html, and no module: a worker asks for the scene while the rest of the page arrives. It
-// becomes the loader once that code is there (see render/remote.js).
+// becomes the loader once it is given the address of that code, by the packed page or by render/remote.js.
 
 {
   const query = new URLSearchParams(location.search);
@@ -22,6 +22,11 @@
     };`;
   const start = () => new Worker(URL.createObjectURL(new Blob([code], { type: "text/javascript" })));
   // a file: is no place to ask, and a bench loads by itself
-  const asks = /^https?:/.test(url) && !query.has("bench");
-  Object.assign(globalThis, { early: { url, worker: asks ? start() : null } });
+  const worker = /^https?:/.test(url) && !query.has("bench") ? start() : null;
+  let begun = false;
+  const begin = (/** @type {string} */ loader) => {
+    if (!begun) worker?.postMessage(loader);
+    begun = true;
+  };
+  Object.assign(globalThis, { early: { url, worker, begin } });
 }

@@ -1,9 +1,10 @@
 """Trains the scenes, packs and measures them: docs/results.md with its pictures, and the short table of README.md.
 
-    python tools/results.py [--only NAME ...] [--out out] [--docs docs] [--render]
+    python tools/results.py [--only NAME ...] [--seeds 1] [--out out] [--docs docs] [--render]
 
 Finished trainings in --out are kept, so a stopped run goes on where it was. Real scenes are read from the folder in
-PD4DGS_SHARED (default ../shared/data beside the repository); those not there are named and left out.
+PD4DGS_SHARED (default ../shared/data beside the repository); those not there are named and left out. With --seeds N
+each scene is trained N times, and a table shows how far that spreads.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from pathlib import Path
 
 from pages.page import Page, Row, filled, make, options, say
 from pages.scenes import SCENES, present
-from pages.tables import coding_table, figures, quality_table, short_table, time_plot
+from pages.tables import coding_table, figures, point, quality_table, short_table, spread_table, time_plot
 
 from pd4dgs_codec.bench.report import markdown
 from pd4dgs_codec.threads import configure
@@ -35,6 +36,7 @@ def render(rows: Sequence[Row]) -> str:
         "",
         quality_table(rows),
         "",
+        *_spread_lines(rows),
         "![held-out PSNR against training wall time](img/quality-over-time.png)",
         "",
         "## Coding",
@@ -51,6 +53,14 @@ def render(rows: Sequence[Row]) -> str:
         lines += [f"- {row['iterations']} of {row['total']} iterations, rho {row['rho']:.3f}, {skipped}"]
         lines += [""]
     return "\n".join(lines).rstrip("\n")
+
+
+def _spread_lines(rows: Sequence[Row]) -> list[str]:
+    spread = [row for row in rows if len(row.get("seeds", ())) > 1]
+    if not spread:
+        return []
+    said = "Other seeds, the first of them above: the median, and in brackets least and most."
+    return [said, "", spread_table(spread), ""]
 
 
 def _paper_lines(row: Row) -> list[str]:
@@ -85,20 +95,28 @@ def fill_readme(readme: Path, rows: Sequence[Row]) -> None:
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    args = options(__doc__, list(SCENES)).parse_args(argv)
+    parser = options(__doc__, list(SCENES))
+    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="train each scene with seeds 0 to N - 1 (1)")
+    args = parser.parse_args(argv)
     threads = configure()
 
-    from pages.main_job import Job, run_job
+    from pages.main_job import Job, pack_seed, run_job
     from PIL import Image
 
     from pd4dgs_codec.cli.progress import TrainingProgress
 
     def measure(name: str) -> Row:
-        result = run_job(Job(name, SCENES[name].config()), args.out, say=say, progress=TrainingProgress())
+        scene, progress = SCENES[name], TrainingProgress()
+        result = run_job(Job(name, scene.config()), args.out, say=say, progress=progress)
+        seeds = [result["evaluation"]["levels"]]
+        seeds += [
+            pack_seed(Job(name, scene.config(seed=seed)), args.out, say=say, progress=progress)
+            for seed in range(1, args.seeds)
+        ]
         picture = args.docs / "img" / f"{name}.jpg"
         picture.parent.mkdir(parents=True, exist_ok=True)
         Image.open(args.out / name / "levels.png").convert("RGB").save(picture, quality=95, subsampling=0)
-        return figures(result) | {"threads": threads}
+        return figures(result) | {"threads": threads, "seeds": [list(map(point, levels)) for levels in seeds]}
 
     def finish(rows: list[Row]) -> None:
         if not args.render:

@@ -185,9 +185,13 @@ def page(source: bytes | str | None = None) -> str:
     root = player_folder()
     workers = {name: bundle(root, f"render/{name}") for name in WORKERS}
     code = _WORKER_URL.sub(r"new URL(workers['\1'])", bundle(root, MODULE))
-    script = f"""<script type="module">
+    # no module, so that the loader begins while the browser still reads the player
+    script = f"""<script>
 const workers={_literal(workers)};
 for(const name in workers)workers[name]=URL.createObjectURL(new Blob([workers[name]],{{type:"text/javascript"}}));
+globalThis.early?.begin(workers["{WORKERS[0]}"]);
+</script>
+<script type="module">
 {code}</script>
 """
     text = re.sub(r"<!--.*?-->\s*", "", (root / PAGE).read_text(encoding="utf-8"), flags=re.DOTALL)

@@ -20,7 +20,7 @@ export class Arena {
     this._top = 0;
     this._memory = wasm ? newMemory() : null;
     /** Taking more may replace it. */
-    this.floats = new Float32Array(this._memory?.buffer ?? 0);
+    this.floats = this._memory ? new Float32Array(this._memory.buffer) : new Float32Array(0);
     this._linear = this._memory ? instance(this._memory) : null;
   }
 

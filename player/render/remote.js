@@ -57,10 +57,10 @@ export class Remote {
 }
 
 /**
- * What early.js began: a worker that asks `url` for a scene, and takes the address of the loader's code as its first
- * message. null: it could not.
+ * What early.js began: a worker that asks `url` for a scene, null if it could not. begin: gives it the address of the
+ * loader's code, which counts once.
  *
- * @typedef {{url: string, worker: Worker | null}} Early
+ * @typedef {{url: string, worker: Worker | null, begin: (code: string) => void}} Early
  */
 
 /**
@@ -75,7 +75,7 @@ export function startLoader(told, from) {
   const worker = early?.worker;
   if (!worker || early.url !== from) return new Remote(code, told);
   early.worker = null; // its answer serves once
-  worker.postMessage(code.href);
+  early.begin(code.href);
   return new Remote(worker, told);
 }
 

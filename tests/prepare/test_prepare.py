@@ -102,10 +102,10 @@ def test_what_cannot_be_registered_is_one_line_and_leaves_nothing(tmp_path, caps
     assert sorted(path.name for path in tmp_path.iterdir()) == ["noise"]
 
 
-def test_a_folder_of_someone_else_is_not_replaced(room, prepared, tmp_path, capsys):
-    assert main([str(room[0]), "-o", str(prepared)]) == 1
-    assert "exists already; --overwrite replaces" in capsys.readouterr().err
+def test_a_folder_of_someone_else_is_not_replaced(room, tmp_path, capsys):
     (tmp_path / "out").mkdir()
+    assert main([str(room[0]), "-o", str(tmp_path / "out")]) == 1
+    assert "exists already; --overwrite replaces" in capsys.readouterr().err
     (tmp_path / "out" / "letter.txt").write_text("dear")
     assert main([str(room[0]), "-o", str(tmp_path / "out"), "--overwrite"]) == 1
     assert "expected a folder that pd4dgs-prepare made" in capsys.readouterr().err

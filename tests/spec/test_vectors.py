@@ -29,8 +29,16 @@ refdec = importlib.util.module_from_spec(_module)
 _module.loader.exec_module(refdec)
 
 each_vector = pytest.mark.parametrize("vector", MANIFEST, ids=[v["file"] for v in MANIFEST])
+DEAR = {v["file"] for v in MANIFEST if v["file"].startswith("dear/")}
 #: The reference decoder, which is plain Python, takes up to a quarter of a minute for these.
-LARGE = {"valid/planes-products-over-2-53.pd4", *(v["file"] for v in MANIFEST if v["file"].startswith("dear/"))}
+LARGE = {"valid/planes-products-over-2-53.pd4", *DEAR}
+
+
+def but_slow(files):
+    """Every vector; those of `files` with `-m slow` only."""
+    marks = [pytest.mark.slow]
+    listed = [pytest.param(v, id=v["file"], marks=marks if v["file"] in files else []) for v in MANIFEST]
+    return pytest.mark.parametrize("vector", listed)
 
 
 def read(vector):
@@ -113,9 +121,7 @@ def test_the_package_gives_what_the_manifest_says(vector):
         assert hashes(data, layer) == expected
 
 
-@pytest.mark.parametrize(
-    "vector", [pytest.param(v, id=v["file"], marks=[pytest.mark.slow] * (v["file"] in LARGE)) for v in MANIFEST]
-)
+@but_slow(LARGE)
 def test_the_reference_decoder_gives_what_the_manifest_says(vector):
     data = read(vector)
     assert outcome(refdec.hashes, data) == vector.get("error", vector["layers"])
@@ -123,7 +129,7 @@ def test_the_reference_decoder_gives_what_the_manifest_says(vector):
         assert refdec.hashes(data, layer) == expected
 
 
-@each_vector
+@but_slow(DEAR)
 def test_a_stream_yields_the_layers_before_the_fault(vector):
     stream, scenes = open_stream(), []
     error = outcome(lambda: scenes.extend(stream.feed(read(vector))))

@@ -196,6 +196,24 @@ def test_the_results_become_markdown_tables_and_a_plot(finished, tmp_path):
     assert Image.open(tmp_path / "plot.png").width > 300
 
 
+def test_another_seed_is_measured_likewise(job, finished, copied, no_training):
+    folder = copied / "discs" / f"seed-{job.config.seed}"
+    folder.mkdir()
+    shutil.copy(copied / "discs" / "model.pt", folder)
+    levels = main_job.pack_seed(job, copied, say=lambda text: None)
+    for row, first in zip(levels, finished[1]["evaluation"]["levels"], strict=True):
+        assert row["level"] == first["level"] and row["mpsnr"] == pytest.approx(first["mpsnr"], abs=1e-3)
+        assert 0.8 < row["cumulative_bytes"] / first["cumulative_bytes"] <= 1  # at the default effort
+
+
+def test_a_spread_is_that_of_the_levels_that_every_seed_has():
+    seeds = [[(0, 1000, 20.0), (1, 3000, 30.0)], [(0, 1200, 21.0)], [(0, 900, 23.0), (1, 2500, 31.0)]]
+    named = [[dict(zip(("level", "bytes", "mpsnr"), row, strict=True)) for row in seed] for seed in seeds]
+    _, _, *rows = tables.spread_table([{"name": "discs", "seeds": named}]).splitlines()
+    (cells,) = ([cell.strip() for cell in row.strip("|").split("|")] for row in rows)
+    assert cells == ["discs", "0", "3", "1,000 (900 to 1,200)", "21.00 (20.00 to 23.00)"]
+
+
 def test_the_row_of_all_layers_holds_sums_and_ratios_of_sums():
     row = {"ans_bytes": 10, "lzma_bytes": 20, "lzma_float32_bytes": 30, "position_bytes": 1.0}
     row |= {"draco_position_bytes": 2.0, "rate_bits": 100.0, "payload_over_rate": 1.0, "train_over_rate": 1.0}

@@ -11,10 +11,12 @@ from pathlib import Path
 import pytest
 import torch
 from runs import read_log
-from tiny import write_views
+from tiny import TINY, write_views
 
+from pd4dgs_codec.cli import train
 from pd4dgs_codec.errors import TrainError
 from pd4dgs_codec.model import checkpoint
+from pd4dgs_codec.model.config import PRESETS
 from pd4dgs_codec.train import workers
 
 #: Trains the folder given as argument in the tiny size of the tests, so long that anchors grow and are judged. No
@@ -43,16 +45,26 @@ def program(tmp_path_factory) -> Path:
     return path
 
 
-def _train(program: Path, workers: int, output: str, *options: object) -> subprocess.CompletedProcess[str]:
+def _arguments(folder: Path, output: str, *options: object) -> list[str]:
+    paths = [str(folder / "set"), "-o", str(folder / output)]
+    return [*paths, "--preset", "tiny", "--device", "cpu", *map(str, options)]
+
+
+def _together(program: Path, output: str, *options: object) -> subprocess.CompletedProcess[str]:
+    """Two workers' training."""
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    launch = (
-        ["-m", "torch.distributed.run", f"--nproc-per-node={workers}", f"--master-port={port}", "--"] if workers else []
-    )
-    argv = ["set", "-o", output, "--preset", "tiny", "--device", "cpu", *map(str, options)]
-    command = [sys.executable, *launch, str(program), *argv]
+    launch = ["-m", "torch.distributed.run", "--nproc-per-node=2", f"--master-port={port}", "--", str(program)]
+    command = [sys.executable, *launch, *_arguments(program.parent, output, *options)]
     return subprocess.run(command, cwd=program.parent, capture_output=True, text=True, timeout=900)
+
+
+def _alone(program: Path, output: str, *options: object) -> int:
+    """That of this process."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PRESETS, "tiny", TINY)
+        return train.main(_arguments(program.parent, output, *options))
 
 
 def _same_model(first: Path, second: Path) -> None:
@@ -66,13 +78,13 @@ def _same_model(first: Path, second: Path) -> None:
 @pytest.fixture(scope="module")
 def one(program) -> Path:
     """What one process makes of two views a step."""
-    done = _train(program, 0, "one.pt", "--iterations", STEPS, "--views-per-step", 2, "--log", "one.jsonl")
-    assert done.returncode == 0, done.stderr
+    log = program.with_name("one.jsonl")
+    assert _alone(program, "one.pt", "--iterations", STEPS, "--views-per-step", 2, "--log", log) == 0
     return program.parent / "one.pt"
 
 
 def test_two_workers_learn_what_one_process_learns(program, one):
-    done = _train(program, 2, "two.pt", "--iterations", STEPS, "--views-per-step", 2, "--json", "--log", "two.jsonl")
+    done = _together(program, "two.pt", "--iterations", STEPS, "--views-per-step", 2, "--json", "--log", "two.jsonl")
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)  # the first worker alone speaks
     assert told["iterations"] == STEPS and told["finished"]
@@ -84,12 +96,11 @@ def test_two_workers_learn_what_one_process_learns(program, one):
 
 
 def test_a_run_goes_on_with_another_number_of_workers(program, one):
-    cut = _train(program, 2, "cut.pt", "--iterations", STEPS, "--views-per-step", 2, "--max-seconds", "0.01")
+    cut = _together(program, "cut.pt", "--iterations", STEPS, "--views-per-step", 2, "--max-seconds", "0.01")
     assert cut.returncode == 0, cut.stderr
     begun = int(checkpoint.load(program.parent / "cut.pt")[1]["iteration"])
     assert 0 < begun < STEPS
-    rest = _train(program, 0, "cut.pt", "--resume", "cut.pt", "--max-seconds", "1000")
-    assert rest.returncode == 0, rest.stderr
+    assert _alone(program, "cut.pt", "--resume", program.with_name("cut.pt"), "--max-seconds", "1000") == 0
     _same_model(one, program.parent / "cut.pt")
 
 

@@ -104,6 +104,19 @@ def run_job(job: Job, folder: Path, *, say: Callable[[str], None], progress: Any
     return result
 
 
+def pack_seed(job: Job, folder: Path, *, say: Callable[[str], None], progress: Any = None) -> list[dict[str, Any]]:
+    """Levels of the file of another seed, trained in folder/name/seed-N, as `run_job` measures them of seed 0."""
+    config = job.config
+    dataset = load(config.source, downscale=config.downscale, holdout=config.holdout)
+    path = folder / job.name / f"seed-{config.seed}" / "model.pt"
+    label = f"{job.name}, seed {config.seed}"
+    model, _ = ensure_trained(config, dataset, path, say=lambda text: say(f"{label}: {text}"), progress=progress)
+    say(f"{label}: packing")
+    data, _ = encode_with_report(to_scene(model))
+    levels: list[dict[str, Any]] = evaluate_file(data, dataset)["levels"]
+    return levels
+
+
 def coding_rows(reports: dict[str, Report], planned: Scene) -> list[dict[str, Any]]:
     """One row per layer of `planned` (see `plan`): its bytes under every variant, payload against rate, positions
     against Draco's.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 from pd4dgs_codec.bench.report import markdown
@@ -32,6 +33,24 @@ def figures(result: dict[str, Any]) -> dict[str, Any]:
         "left_out": [{name: row[name] for name in ("what", "why", "bytes")} for row in result["left_out"]],
         "curve": [{name: point[name] for name in ("seconds", "psnr")} for point in result["curve"]],
     }
+
+
+def point(level: dict[str, Any]) -> dict[str, Any]:
+    """What `spread_table` shows of a level of one seed's file."""
+    return {"level": level["level"], "bytes": level["cumulative_bytes"], "mpsnr": level["mpsnr"]}
+
+
+def spread_table(results: Sequence[dict[str, Any]]) -> str:
+    """Per scene and level that all its seeds have: bytes and held-out mPSNR over the seeds."""
+    rows = []
+    for result in results:
+        seeds = [{found["level"]: found for found in seed} for seed in result["seeds"]]
+        for level in sorted(set.intersection(*map(set, seeds))):
+            sizes, quality = ([seed[level][key] for seed in seeds] for key in ("bytes", "mpsnr"))
+            spread = f"{median(sizes):,.0f} ({min(sizes):,} to {max(sizes):,})"
+            shown = f"{median(quality):.2f} ({min(quality):.2f} to {max(quality):.2f})"
+            rows.append((result["name"], str(level), str(len(seeds)), spread, shown))
+    return markdown(("scene", "level", "seeds", "bytes so far", "mPSNR dB"), rows)
 
 
 def quality_table(results: Sequence[dict[str, Any]]) -> str:
