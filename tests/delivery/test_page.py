@@ -27,7 +27,7 @@ def test_a_notebook_gets_a_frame_that_holds_everything(tmp_path):
     (tmp_path / "scene.pd4").write_bytes(data)
     pages = [show(given).page for given in (data, tmp_path / "scene.pd4", str(tmp_path / "scene.pd4"), scene)]
     assert pages[0] == pages[1] == pages[2] and "import.meta" not in pages[0]
-    assert len(re.findall("</script", pages[0])) == 2  # scene and player
+    assert len(re.findall("</script", pages[0])) == 3  # scene, workers and player
     frame = show(data, width='50%" x="', height=200)._repr_html_()
     (source,) = re.findall(r'srcdoc="([^"]*)"', frame)
     assert html.unescape(source) == pages[0] and "height:200px" in frame and 'x="' not in frame
