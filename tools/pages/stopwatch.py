@@ -46,10 +46,11 @@ def encode(checkpoint: str, file: str, effort: str) -> dict[str, float]:
 def symbols_of(scene: Any) -> int:
     """How many integers a scene was decoded from."""
     arrays = [scene.anchor_q, *(getattr(scene, name) for name in ("feature", "scaling_log", "offset")), *scene.mask]
-    for layer in range(3):
-        tensors = scene.tensors(layer)
-        arrays += [plane for scale in tensors.planes for plane in scale.values()]
-        arrays += [array for network in tensors.networks.values() for pair in network for array in pair]
+    networks = [*scene.networks.values()]
+    for deformation in filter(None, (scene.global_deformation, scene.local_deformation)):
+        arrays += [plane for scale in deformation.planes for plane in scale.values()]
+        networks += deformation.networks.values()
+    arrays += [array for network in networks for pair in network for array in pair]
     return sum(array.size for array in arrays)
 
 
@@ -98,8 +99,9 @@ def first(checkpoint: str, file: str, effort: str) -> dict[str, float]:
     """From nothing to the first step of training and its checkpoint, numba's cache warm: one iteration."""
     from pd4dgs_codec.model import checkpoint as checkpoints
 
-    source, own = checkpoints.load(checkpoint)[1]["config"]["source"], str(Path(file).with_suffix(".pt"))
-    return _command("train", source, "-o", own, "--iterations", "1", "-f")
+    config, own = json.loads(checkpoints.load(checkpoint)[1]["config"]), str(Path(file).with_suffix(".pt"))
+    source = [config["source"], "--downscale", str(config["downscale"])]
+    return _command("train", *source, "-o", own, "--iterations", "1", "-f")
 
 
 def _command(name: str, *arguments: str) -> dict[str, float]:
@@ -113,7 +115,7 @@ def _command(name: str, *arguments: str) -> dict[str, float]:
 
 
 def step(checkpoint: str, file: str, effort: str) -> dict[str, float]:
-    """Median processor seconds of a step at each level, one thread, the levels in turn, as if at SHARE of the run."""
+    """Median processor seconds of a step at each level, the levels in turn, as if at SHARE of the run."""
     from pd4dgs_codec.cli.resume import parse_config
     from pd4dgs_codec.data.dataset import load as load_data
     from pd4dgs_codec.model.checkpoint import load
