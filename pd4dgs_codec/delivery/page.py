@@ -196,7 +196,8 @@ globalThis.early?.begin(workers["{WORKERS[0]}"]);
 """
     text = re.sub(r"<!--.*?-->\s*", "", (root / PAGE).read_text(encoding="utf-8"), flags=re.DOTALL)
     head, body, _ = re.split(r'(?=<p id="note")|<script type="module".*', text, maxsplit=2)
-    early = "" if isinstance(source, bytes) else f"<script>\n{strip((root / EARLY).read_text(encoding='utf-8'))}</script>"
+    first = strip((root / EARLY).read_text(encoding="utf-8"))
+    early = "" if isinstance(source, bytes) else f"<script>\n{first}</script>"
     head = head.replace(f'<script src="./{EARLY}"></script>', early)
     if isinstance(source, str):
         head, body = head.replace("<html ", f'<html data-src="{html.escape(source)}" ', 1), "<body>\n"
