@@ -23,13 +23,13 @@ PATIENCE = 60.0
 
 
 @pytest.fixture(scope="module")
-def dataset(shared_dataset):
-    return load(shared_dataset)
+def dataset():
+    return load("synthetic:local", downscale=8)
 
 
 @pytest.fixture
 def trainer(dataset):
-    return Trainer(TrainConfig(source="views", preset="tiny", iterations=6), dataset)
+    return Trainer(TrainConfig(source="synthetic:local", preset="tiny", iterations=6), dataset)
 
 
 @pytest.fixture
@@ -158,9 +158,9 @@ def test_without_viser_it_is_one_line(trainer, monkeypatch):
         WatchedProgress(trainer, 0)
 
 
-def test_the_command_says_where_to_look(shared_dataset, tmp_path, capsys):
+def test_the_command_says_where_to_look(tmp_path, capsys):
     pytest.importorskip("viser")
-    options = ["--preset", "tiny", "--iterations", "2", "--view", "0"]
-    assert main([str(shared_dataset), "-o", str(tmp_path / "m.pt"), *options]) == 0
+    options = ["--preset", "tiny", "--iterations", "2", "--downscale", "8", "--view", "0"]
+    assert main(["synthetic:local", "-o", str(tmp_path / "m.pt"), *options]) == 0
     told = capsys.readouterr()
     assert "the scene is at http://127.0.0.1:" in told.err and told.out == ""

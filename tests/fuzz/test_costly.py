@@ -25,7 +25,7 @@ def test_a_recipe_is_a_legal_file(prior, staged):
 
 def test_changes_reach_legal_files_of_many_costs():
     rng, recipe, found = random.Random(0), Recipe(), []
-    for _ in range(30):
+    for _ in range(60):
         recipe = changed(rng, recipe)
         try:
             data = build(recipe)
