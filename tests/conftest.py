@@ -44,6 +44,7 @@ NEED_TRAIN = [
     "view",
 ]
 NEED_TRAIN += ["fuzz/test_trained_file.py", "metrics/test_levels.py", "metrics/test_perceptual.py"]
+NEED_NO_KERNEL = ["bitstream", "spec"]
 collect_ignore = [] if find_spec("torch") and find_spec("numba") else NEED_TRAIN
 
 settings.register_profile("pd4dgs", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -51,9 +52,13 @@ settings.load_profile("pd4dgs")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Rooms with kernels first. Each worker begins with a run of the tests in their order, so that one worker compiles
-    the kernels, which takes a minute, and the others find them compiled."""
-    items.sort(key=lambda item: item.path.relative_to(ROOT / "tests").parts[0] not in NEED_TRAIN)
+    """Each worker begins with a run of the tests in their order. The first one's needs kernels, the others' begin with
+    rooms that need none: one worker compiles the kernels, which takes a minute, and the others find them compiled."""
+    free = [item for item in items if item.path.relative_to(ROOT / "tests").parts[0] in NEED_NO_KERNEL]
+    named = set(free)
+    others = [item for item in items if item not in named]
+    run = len(items) // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+    items[:] = [*others[:run], *free, *others[run:]]
 
 
 @pytest.fixture(autouse=True, scope="session")
