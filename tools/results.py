@@ -59,7 +59,7 @@ def _spread_lines(rows: Sequence[Row]) -> list[str]:
     spread = [row for row in rows if len(row.get("seeds", ())) > 1]
     if not spread:
         return []
-    said = "Other seeds, the first of them above: the median, and in brackets least and most."
+    said = "All seeds, the first of which stands above: the median, and in brackets the least and the most."
     return [said, "", spread_table(spread), ""]
 
 
