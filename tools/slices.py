@@ -29,8 +29,9 @@ from pd4dgs_codec.scene import Scene
 from pd4dgs_codec.threads import configure
 
 #: Scenes trained for their first slices, and the share of steps that see these alone.
-PREFIXED, SHARE = {"shelf-hand-prefixes": "shelf-hand"}, 0.3
-NAMES = ("shelf-hand", *PREFIXED, "bouncing-balls", "synthetic-local", "synthetic-global")
+PREFIXED, SHARE = {f"{name}-prefixes": name for name in ("shelf-hand", "bouncing-balls")}, 0.3
+NAMES = ("shelf-hand", "shelf-hand-prefixes", "bouncing-balls", "bouncing-balls-prefixes")
+NAMES += ("synthetic-local", "synthetic-global")
 VIEWS = 16  #: training views that order the anchors
 STEP, LEAST = 0.5, 20.0  #: dB between the qualities whose times are compared, and the lowest of them
 RATE = 2e6  #: bits per second
