@@ -54,9 +54,9 @@ settings.load_profile("pd4dgs")
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Each worker begins with a run of the tests in their order. The first one's needs kernels, the others' begin with
     rooms that need none: one worker compiles the kernels, which takes a minute, and the others find them compiled."""
-    free = [item for item in items if item.path.relative_to(ROOT / "tests").parts[0] in NEED_NO_KERNEL]
-    named = set(free)
-    others = [item for item in items if item not in named]
+    rooms = [item.path.relative_to(ROOT / "tests").parts[0] for item in items]
+    free = [item for item, room in zip(items, rooms, strict=True) if room in NEED_NO_KERNEL]
+    others = [item for item, room in zip(items, rooms, strict=True) if room not in NEED_NO_KERNEL]
     run = len(items) // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     items[:] = [*others[:run], *free, *others[run:]]
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 
 #: Of link time per block: short against the milliseconds to be measured, long against what waking a thread costs.
 QUANTUM_SECONDS = 0.005
@@ -40,6 +40,14 @@ class Link:
         finally:
             with self._lock:
                 self._transfers -= 1
+
+    def send(self, body: bytes, write: Callable[[bytes], object]) -> None:
+        """Hands `body` to `write` block by block, each once it has crossed."""
+        with self.transfer():
+            for start in range(0, len(body), self.block):
+                block = body[start : start + self.block]
+                self.cross(len(block))
+                write(block)
 
     def cross(self, size: int) -> None:
         """Returns when `size` more bytes have crossed. Deadlines are absolute, so that late wakings do not add up."""

@@ -222,12 +222,7 @@ class _Handler(BaseHTTPRequestHandler):
         content = gzip.compress(file.read(MAX_ZIPPED), 9, mtime=0)
         self._begin(HTTPStatus.OK, {**headers, "Content-Encoding": "gzip", "Content-Length": str(len(content))})
         if body:
-            link = self.server.link
-            with link.transfer():
-                for start in range(0, len(content), link.block):
-                    block = content[start : start + link.block]
-                    link.cross(len(block))
-                    self.wfile.write(block)
+            self.server.link.send(content, self.wfile.write)
 
     def _send_body(self, file: BinaryIO, left: int, etag: str) -> None:
         link = self.server.link

@@ -269,14 +269,16 @@ class Networks {
 
 /** Those of the last scene: what is evaluated next is mostly the same one at another time.
  * @type {{scene: Scene, networks: Networks} | null} */
-let last = null;
+let current = null;
 
 /** @param {Scene} scene @param {Arena} [arena] another one than the last scene's */
 function networksOf(scene, arena) {
-  if (arena || last?.scene !== scene) {
-    last = { scene, networks: new Networks(scene, arena ?? last?.networks.arena ?? new Arena()) };
-  }
-  return last.networks;
+  if (!arena && current?.scene === scene) return current.networks;
+  const room = arena ?? current?.networks.arena ?? new Arena();
+  current = null; // what it held is gone, even if there is no room for the new one
+  const networks = new Networks(scene, room);
+  current = { scene, networks };
+  return networks;
 }
 
 /**
@@ -335,14 +337,16 @@ function keep(scene, { arena, opacity, covariance, color, inputs, stride }, move
   }
 
   opacity.run(count, inputs, stride);
+  const opacities = new Float32Array(count * S);
   /** @param {number} r @param {number} i */
-  const opacityOf = (r, i) => Math.tanh(floats[opacity.out + r * opacity.stride + i]);
-  /** @param {number} r @param {number} i */
-  const shows = (r, i) => opacityOf(r, i) * (codes[anchors[r]] / 255) >= MIN_OPACITY;
+  const shows = (r, i) => opacities[r * S + i] * (codes[anchors[r]] / 255) >= MIN_OPACITY;
   const alive = [];
   for (let r = 0; r < count; r++) {
     let any = false;
-    for (let i = 0; i < S && !any; i++) any = shows(r, i);
+    for (let i = 0; i < S; i++) {
+      opacities[r * S + i] = Math.tanh(floats[opacity.out + r * opacity.stride + i]);
+      any ||= shows(r, i);
+    }
     if (!any) continue;
     const to = inputs + alive.length * stride;
     floats.copyWithin(to, inputs + r * stride, inputs + (r + 1) * stride);
@@ -370,7 +374,7 @@ function keep(scene, { arena, opacity, covariance, color, inputs, stride }, move
         record[4 + k] = spread[3 + k] * sigmoid(floats[v + k]);
         record[11 + k] = sigmoid(floats[w + k]);
       }
-      record[3] = opacityOf(r, i);
+      record[3] = opacities[r * S + i];
       for (let k = 0; k < 4; k++) record[7 + k] = floats[v + 3 + k];
       normaliseQuaternion(record, 7);
       kept.add(S * a + i, record);

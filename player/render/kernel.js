@@ -18,15 +18,14 @@ export class Arena {
   /** @param {boolean} [wasm] default: if the machine allows it */
   constructor(wasm = true) {
     this._top = 0;
-    this._memory = wasm ? newMemory() : null;
+    this._wasm = wasm ? start() : null;
     /** Taking more may replace it. */
-    this.floats = this._memory ? new Float32Array(this._memory.buffer) : new Float32Array(0);
-    this._linear = this._memory ? instance(this._memory) : null;
+    this.floats = this._wasm ? new Float32Array(this._wasm.memory.buffer) : new Float32Array(0);
   }
 
   /** Whether layers run in WebAssembly. */
   get fast() {
-    return !!this._linear;
+    return !!this._wasm;
   }
 
   reset() {
@@ -40,9 +39,9 @@ export class Arena {
     if (this._top > this.floats.length) {
       const pages = Math.ceil((this._top - this.floats.length) / PAGE_FLOATS);
       const old = this.floats;
-      if (this._memory) {
-        this._memory.grow(pages);
-        this.floats = new Float32Array(this._memory.buffer);
+      if (this._wasm) {
+        this._wasm.memory.grow(pages);
+        this.floats = new Float32Array(this._wasm.memory.buffer);
       } else {
         this.floats = new Float32Array(old.length + pages * PAGE_FLOATS);
         this.floats.set(old);
@@ -78,7 +77,8 @@ export class Arena {
   linear(layer, rows, x, stride, out) {
     if (!rows) return;
     const { at, inputs, groups, relu } = layer;
-    if (this._linear) this._linear(rows, 4 * x, 4 * stride, 4 * at, inputs, groups, 4 * out, relu ? 0 : -Infinity);
+    const floor = relu ? 0 : -Infinity;
+    if (this._wasm) this._wasm.linear(rows, 4 * x, 4 * stride, 4 * at, inputs, groups, 4 * out, floor);
     else linear(this.floats, layer, rows, x, stride, out);
   }
 }
@@ -181,21 +181,18 @@ function program() {
   ]);
 }
 
-/** @returns {WebAssembly.Memory | null} null where there is no WebAssembly with vectors */
-function newMemory() {
+/**
+ * The program and its memory; null where there is no WebAssembly with vectors, or a content security policy without
+ * 'wasm-unsafe-eval'.
+ *
+ * @returns {{memory: WebAssembly.Memory, linear: (...args: number[]) => void} | null}
+ */
+function start() {
   try {
-    return WebAssembly.validate(program()) ? new WebAssembly.Memory({ initial: 1 }) : null;
+    const memory = new WebAssembly.Memory({ initial: 1 });
+    const { exports } = new WebAssembly.Instance(new WebAssembly.Module(program()), { e: { m: memory } });
+    return { memory, linear: /** @type {(...args: number[]) => void} */ (exports.linear) };
   } catch {
     return null;
-  }
-}
-
-/** @param {WebAssembly.Memory} memory @returns {((...args: number[]) => void) | null} */
-function instance(memory) {
-  try {
-    const made = new WebAssembly.Instance(new WebAssembly.Module(program()), { e: { m: memory } });
-    return /** @type {(...args: number[]) => void} */ (made.exports.linear);
-  } catch {
-    return null; // a content security policy without 'wasm-unsafe-eval'
   }
 }

@@ -121,7 +121,7 @@ class _Handler(StreamRequestHandler):
         sent = body[: fault.after]
         server.sent += len(sent)
         fault.then(server)  # not after the body: the client may ask again before it is through
-        self._cross(sent)
+        self.server.link.send(sent, self.wfile.write)
         if fault.after is None:
             return fault.headers.get("Connection") != "close"
         if fault.how == "stall":
@@ -131,11 +131,3 @@ class _Handler(StreamRequestHandler):
                 self.request.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
                 self.request.close()
         return False
-
-    def _cross(self, body: bytes) -> None:
-        link = self.server.link
-        with link.transfer():
-            for start in range(0, len(body), link.block):
-                block = body[start : start + link.block]
-                link.cross(len(block))
-                self.wfile.write(block)

@@ -14,7 +14,7 @@ from pages.draco import draco_encode
 from pages.pictures import draw_levels
 from pages.trainings import ensure_trained
 from pd4dgs_codec.atomic import whole_file, whole_files, write_bytes
-from pd4dgs_codec.codec.encoder import LayerReport, Report, encode_with_report
+from pd4dgs_codec.codec.encoder import LayerReport, Report, encode, encode_with_report
 from pd4dgs_codec.codec.options import EncodeOptions
 from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.data.dataset import load
@@ -112,8 +112,7 @@ def pack_seed(job: Job, folder: Path, *, say: Callable[[str], None], progress: A
     label = f"{job.name}, seed {config.seed}"
     model, _ = ensure_trained(config, dataset, path, say=lambda text: say(f"{label}: {text}"), progress=progress)
     say(f"{label}: packing")
-    data, _ = encode_with_report(to_scene(model))
-    levels: list[dict[str, Any]] = evaluate_file(data, dataset)["levels"]
+    levels: list[dict[str, Any]] = evaluate_file(encode(to_scene(model)), dataset)["levels"]
     return levels
 
 
