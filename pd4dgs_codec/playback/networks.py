@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+from itertools import accumulate
+
 import numpy as np
 
 from pd4dgs_codec import threads
 from pd4dgs_codec.model import hexplane_kernels
 from pd4dgs_codec.model.plane_layout import PlaneLayout
 from pd4dgs_codec.playback import kernels
-from pd4dgs_codec.render.simd import LANES
+from pd4dgs_codec.render.simd import LANES, WIDE
 from pd4dgs_codec.scene import LENGTH_HEADS, PLANES, TRUNK, Deformation, Network, deformation_unit, plane_sides
 
 
@@ -20,7 +22,7 @@ class Layers:
         self._relu_last = relu_last
         widths, parts = [layers[0][0].shape[1]], []
         for weight, bias in layers:
-            inputs, outputs = widths[-1], -(-len(bias) // kernels.WIDTH) * kernels.WIDTH
+            inputs, outputs = widths[-1], -(-len(bias) // WIDE) * WIDE
             table = np.zeros((inputs + 1, outputs), np.float32)
             table[: weight.shape[1], : len(bias)] = weight.T
             table[-1, : len(bias)] = bias
@@ -30,16 +32,21 @@ class Layers:
 
     def __call__(self, x: np.ndarray, outputs: int | None = None) -> np.ndarray:
         """float32 [n, outputs] of x float32 [n, inputs]; more outputs than there are come out as 0."""
-        out = np.empty((len(x), self.outputs if outputs is None else outputs), np.float32)
+        out = np.zeros((len(x), self.outputs if outputs is None else outputs), np.float32)
+        self.add(out, x)
+        return out
+
+    def add(self, out: np.ndarray, x: np.ndarray) -> None:
+        """Adds what a call answers to out float32 [n, at most the last width], C-contiguous."""
         threads.limit_numba()
         kernels.forward(out, np.ascontiguousarray(x), self._widths, self._weights, self._relu_last)
-        return out
 
 
 class Field:
-    """A deformation: residuals of all heads side by side at points and a time."""
+    """A deformation: it adds the residuals of its heads to rows whose columns are all heads of the registry."""
 
-    def __init__(self, deformation: Deformation, box: np.ndarray):
+    def __init__(self, deformation: Deformation, box: np.ndarray, widths: dict[str, int]):
+        """widths: of the heads that there may be, in the order of the columns."""
         self._box = np.ascontiguousarray(box, np.float32)
         self._layout = PlaneLayout.build([plane_sides(scale) for scale in deformation.planes])
         channels = deformation.planes[0]["xy"].shape[0]
@@ -50,20 +57,20 @@ class Field:
                 cells = scale[name].reshape(channels, -1).T
                 self._grid[first : first + len(cells), :channels] = cells
         self._rows: tuple[float, np.ndarray] | None = None
-        heads = {name: network for name, network in deformation.networks.items() if name != TRUNK}
-        self.widths = {name: len(network[-1][1]) for name, network in heads.items()}
         trunk = _with_padded_inputs(deformation.networks[TRUNK], channels, self._channels)
-        unit = deformation_unit(box)
-        scaled = {n: _scaled(net, unit if n in LENGTH_HEADS else np.float32(1)) for n, net in heads.items()}
-        self._together: Layers | None = None
-        if heads and all(len(network) == 1 for network in heads.values()):  # one product for all heads
-            layers = [network[0] for network in scaled.values()]
-            last = np.concatenate([weight for weight, _ in layers]), np.concatenate([bias for _, bias in layers])
-            self._together = Layers((*trunk, last))
-        self._trunk, self._heads = Layers(trunk, relu_last=True), {n: Layers(net) for n, net in scaled.items()}
+        unit, networks = deformation_unit(box), deformation.networks
+        heads = {n: _scaled(networks[n], unit if n in LENGTH_HEADS else np.float32(1)) for n in widths if n in networks}
+        self._trunk: Layers | None = None
+        if all(len(network) == 1 for network in heads.values()):  # one product for all heads
+            self._heads = [(slice(None), Layers((*trunk, _side_by_side(heads, widths, len(trunk[-1][1])))))]
+        else:
+            self._trunk = Layers(trunk, relu_last=True)
+            ends = dict(zip(widths, accumulate(widths.values()), strict=True))
+            self._heads = [(slice(ends[n] - widths[n], ends[n]), Layers(network)) for n, network in heads.items()]
 
-    def __call__(self, points: np.ndarray, t: float) -> np.ndarray:
-        """float32 [n, sum of widths] at points float32 [n, 3] and normalised time t; lengths in scene units."""
+    def move(self, values: np.ndarray, points: np.ndarray, t: float) -> None:
+        """Adds the residuals at points float32 [n, 3] and normalised time t to values float32 [n, sum of widths],
+        C-contiguous; lengths in scene units."""
         layout = self._layout
         tables = layout.reso, layout.start, layout.rows
         threads.limit_numba()
@@ -74,15 +81,13 @@ class Field:
         features = np.empty((len(points), len(layout.reso) * self._channels), np.float32)
         spatial = self._grid[: layout.n_spatial]
         hexplane_kernels.sample(features, spatial, self._rows[1], *tables, np.ascontiguousarray(points), self._box)
-        if self._together is not None:
-            return self._together(features)
+        if self._trunk is None:
+            ((_, together),) = self._heads
+            together.add(values, features)
+            return
         hidden = self._trunk(features)
-        return np.concatenate([head(hidden) for head in self._heads.values()], axis=1)
-
-    def split(self, residuals: np.ndarray) -> dict[str, np.ndarray]:
-        """head -> its columns of what a call answers."""
-        ends = np.cumsum(list(self.widths.values()))[:-1]
-        return dict(zip(self.widths, np.split(residuals, ends, axis=1), strict=True))
+        for columns, head in self._heads:
+            values[:, columns] += head(hidden)
 
 
 def hidden_layers(network: Network) -> Layers:
@@ -97,6 +102,17 @@ def _with_padded_inputs(network: Network, channels: int, padded: int) -> Network
     wide = np.zeros((len(weight), scales, padded), np.float32)
     wide[:, :, :channels] = weight.reshape(len(weight), scales, channels)
     return ((wide.reshape(len(weight), -1), bias), *rest)
+
+
+def _side_by_side(heads: dict[str, Network], widths: dict[str, int], inputs: int) -> tuple[np.ndarray, np.ndarray]:
+    """One layer for all heads, each of one layer; 0 for those that are not there."""
+    weight, bias = np.zeros((sum(widths.values()), inputs), np.float32), np.zeros(sum(widths.values()), np.float32)
+    first = 0
+    for name, width in widths.items():
+        if name in heads:
+            ((weight[first : first + width], bias[first : first + width]),) = heads[name]
+        first += width
+    return weight, bias
 
 
 def _scaled(network: Network, unit: np.float32) -> Network:

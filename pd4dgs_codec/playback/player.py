@@ -12,13 +12,13 @@ import numpy as np
 
 from pd4dgs_codec import threads
 from pd4dgs_codec.model import slot_kernels
-from pd4dgs_codec.model.slot_kernels import COLOR, GAUSSIAN_WIDTH, OPACITY, QUAT, SCALE
+from pd4dgs_codec.model.slot_kernels import GAUSSIAN_WIDTH
 from pd4dgs_codec.model.visibility import FRUSTUM_MARGIN, LEAST_NEAR, MIN_OPACITY, OFFSET_REACH, SIGMA_REACH
 from pd4dgs_codec.playback.networks import Field, Layers, hidden_layers
 from pd4dgs_codec.render.checks import check_time
 from pd4dgs_codec.render.rasteriser import draw
 from pd4dgs_codec.render.simd import LANES
-from pd4dgs_codec.scene import GLOBAL_HEADS, MASK_STEP, MASK_THRESHOLD, Camera, Network, Scene
+from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS, MASK_STEP, MASK_THRESHOLD, Camera, Network, Scene
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,15 +55,14 @@ class Player:
         extent = np.exp(scene.scaling_log)
         self._radius = OFFSET_REACH * extent[:, :3].max(axis=1) + SIGMA_REACH * extent[:, 3:].max(axis=1)
         box = scene.info.box
-        self._global = None if scene.global_deformation is None else Field(scene.global_deformation, box)
-        self._local = None if scene.local_deformation is None else Field(scene.local_deformation, box)
+        fields = (scene.global_deformation, scene.widths.global_heads), (scene.local_deformation, LOCAL_HEADS)
+        self._global, self._local = (None if field is None else Field(field, box, heads) for field, heads in fields)
         self._opacity = Layers(scene.networks["opacity"])
         self._covariance = _SlotNetwork(scene.networks["covariance"], self.slots)
         self._color = _SlotNetwork(scene.networks["color"], self.slots)
         self._time: float | None = None
-        if self._global is not None:
-            self._residuals = np.empty((len(codes), sum(self._global.widths.values())), np.float32)
-        self._known = np.zeros(len(codes), bool)  # anchors whose residuals at self._time are there
+        self._moved = self._table if self._global is None else np.empty_like(self._table)  # at self._time
+        self._known = np.full(len(codes), self._global is None)  # the rows of it that are there
 
     @property
     def active(self) -> np.ndarray:
@@ -127,15 +126,18 @@ class Player:
 
     def _anchors(self, rows: np.ndarray, t: float) -> np.ndarray:
         """float32 [n, D + 3 G + 9]: the anchors `rows` where the global deformation takes them."""
-        anchors = self._table.take(rows, axis=0)
         if self._global is not None:
-            residuals = self._residuals_at(rows, t)
-            if tuple(self._global.widths) == GLOBAL_HEADS:  # all of them, as they stand in the table
-                anchors += residuals
-            else:
-                for head, part in self._global.split(residuals).items():
-                    anchors[:, self._columns[head]] += part
-        return anchors
+            if self._time != t:
+                self._time = t
+                self._known[:] = False
+            missing = rows[~self._known[rows]]
+            if missing.size:
+                moved = self._table.take(missing, axis=0)
+                self._global.move(moved, self._anchor.take(missing, axis=0), t)
+                self._moved[missing] = moved
+                self._known[missing] = True
+        found: np.ndarray = self._moved.take(rows, axis=0)
+        return found
 
     def _inputs(self, anchors: np.ndarray, eye: np.ndarray) -> np.ndarray:
         """float32 [n, D + 3]: what the networks take, features and directions from the eye [3]."""
@@ -159,19 +161,22 @@ class Player:
         made, gate = np.empty((len(keep), GAUSSIAN_WIDTH), np.float32), np.empty(len(keep), np.float32)
         threads.limit_numba()
         slot_kernels.assemble(made, gate, keep, anchors, extent, raw_opacity, mask, shape, _sigmoid(shape), colors)
-        means, scales, quats, opacities, colors = np.split(made, [SCALE, QUAT, OPACITY, COLOR], axis=1)
-        opacities = opacities[:, 0]
+        loose = self._local is not None
         if self._local is not None:
-            residuals = self._local(means[: len(means) // copies], t)
-            moves = self._local.split(residuals if copies == 1 else np.tile(residuals, (copies, 1)))
-            means = _moved(means, moves, "mean")
-            scales = np.maximum(_moved(scales, moves, "scale"), 0) if "scale" in moves else scales
-            quats = _unit(_moved(quats, moves, "quat")) if "quat" in moves else quats
-            opacities = np.clip(_moved(opacities, moves, "opacity"), 0, 1) if "opacity" in moves else opacities
-            colors = np.clip(_moved(colors, moves, "color"), 0, 1) if "color" in moves else colors
+            once = made[: len(made) // copies]
+            points = np.ascontiguousarray(once[:, :3])
+            if copies == 1:
+                self._local.move(made, points, t)
+            else:
+                residuals = np.zeros_like(once)
+                self._local.move(residuals, points, t)
+                made += np.tile(residuals, (copies, 1))
+        means, quats, scales, opacities, colors = (
+            np.empty((len(keep), *width), np.float32) for width in ((3,), (4,), (3,), (), (3,))
+        )
+        slot_kernels.finish(means, quats, scales, opacities, colors, made, gate, loose)
         slots = rows[keep // self.slots] * self.slots + keep % self.slots
-        means, quats, colors = (np.ascontiguousarray(part) for part in (means, quats, colors))
-        return Gaussians(means, quats, scales * gate[:, None], opacities * gate, colors, slots)
+        return Gaussians(means, quats, scales, opacities, colors, slots)
 
     def _visible(self, camera: Camera) -> np.ndarray:
         """int64 [n]: active anchors that may reach the image, ascending; see `Model.visible`."""
@@ -183,19 +188,6 @@ class Player:
         margin = max(K[0, 0], K[1, 1]) * radius / z + np.float32(FRUSTUM_MARGIN * max(width, height))
         inside = (u > -margin) & (u < width + margin) & (v > -margin) & (v < height + margin)
         return np.flatnonzero(inside & (depth + radius > 0) & (self._mask > MASK_THRESHOLD))
-
-    def _residuals_at(self, rows: np.ndarray, t: float) -> np.ndarray:
-        """float32 [n, width] residuals of the global deformation at the anchors `rows`."""
-        assert self._global is not None
-        if self._time != t:
-            self._time = t
-            self._known[:] = False
-        missing = rows[~self._known[rows]]
-        if missing.size:
-            self._residuals[missing] = self._global(self._anchor[missing], t)
-            self._known[missing] = True
-        found: np.ndarray = self._residuals[rows]
-        return found
 
 
 class _SlotNetwork:
@@ -221,11 +213,6 @@ class _SlotNetwork:
         threads.limit_numba()
         slot_kernels.linear(out, keep, hidden, 0, self._weight, self._bias)
         return out
-
-
-def _moved(values: np.ndarray, residuals: dict[str, np.ndarray], head: str) -> np.ndarray:
-    """values plus what the head answers, if there is such a head."""
-    return values + residuals[head].reshape(values.shape) if head in residuals else values
 
 
 def _unit(vectors: np.ndarray) -> np.ndarray:

@@ -3,7 +3,8 @@
 `composite` draws, `composite_backward` returns one gradient slot per (Gaussian, tile) pair. No atomics: every result
 is the same for any number of threads. Inside a tile the loop is Gaussian-major over the blocks of 8 pixels in a row
 that its ellipse touches and that are not finished yet: a tile has 64 blocks, so both sets are one 64-bit word, and a
-small Gaussian costs few lanes.
+small Gaussian costs few lanes. Where vectors have 16 lanes two rows are one block, named by the first; a picture has
+the same bits.
 """
 
 from __future__ import annotations
@@ -29,26 +30,35 @@ from pd4dgs_codec.render.projection import (
 )
 from pd4dgs_codec.render.simd import (
     LANES,
+    WIDE,
+    aligned,
     exp2,
     fma,
     fnma,
+    folded,
+    in_row,
     iota,
+    iota64,
     kernel,
-    load,
     mask_gt,
     prefetch,
     select_gt,
-    splat,
+    single,
+    spread,
     sqrt,
     store,
     total,
     totals,
     trailing_zeros,
 )
+from pd4dgs_codec.render.simd import wide_load as load
+from pd4dgs_codec.render.simd import wide_splat as splat
 
 TILE_WIDTH, TILE_HEIGHT = 32, 16  #: pixels
 T_MIN = 1e-4  #: a pixel is finished when its transmittance would fall to this
 _COLUMNS = TILE_WIDTH // LANES
+_ROWS = WIDE // LANES  #: of pixels in a block
+_FIRST_ROWS = np.uint64(0xFFFFFFFFFFFFFFFF // (2**_ROWS - 1))  #: a bit for the first row of each block
 _BLOCKS = _COLUMNS * TILE_HEIGHT
 _STATE = 5  #: vectors of state per block
 _AHEAD = 4  #: Gaussians by which memory is fetched early
@@ -78,8 +88,8 @@ def _coverage(geom: np.ndarray, g: int, left: int, top: int) -> Bits:
     width = splat(_F(min(geom[g + INV_SA], 1e30) * (1.0 + 1e-6)))
     slack = splat(_F(1e-3 + 1e-5 * abs(shear)))
     mask = np.uint64(0)
-    for half in range(2):
-        row = iota() + splat(_F(half * LANES))
+    for top_row in range(0, TILE_HEIGHT, WIDE):
+        row = iota() + splat(_F(top_row))
         r = fma(row, splat(_F(geom[g + SB])), splat(_F(geom[g + SB] * dy)))
         rest = fnma(r, r, reach)
         centre = fma(row, splat(_F(shear)), splat(_F(geom[g + X] - 0.5 - left + shear * dy)))
@@ -88,19 +98,25 @@ def _coverage(geom: np.ndarray, g: int, left: int, top: int) -> Bits:
         for column in range(_COLUMNS):
             x = column * LANES
             hit = mask_gt(end, splat(_F(x))) & mask_gt(splat(_F(x + LANES - 1)), begin)
-            mask |= hit << np.uint64(column * TILE_HEIGHT + half * LANES)
-    return mask
+            mask |= hit << np.uint64(column * TILE_HEIGHT + top_row)
+    for row_of_block in range(1, _ROWS):
+        mask |= mask >> np.uint64(row_of_block)
+    return mask & _FIRST_ROWS
 
 
-@kernel()
-def _steps(geom: np.ndarray, g: int, left: int, top: int) -> tuple[float, float, float, float, float]:
-    """Start and steps per row and per column of t at a block's first pixel, then start and step of r per row."""
-    dy = top + 0.5 - geom[g + Y]
-    sa = geom[g + SA]
-    return (
-        sa * (left + 0.5 - geom[g + X] - geom[g + K] * dy), -sa * geom[g + K], sa * LANES,
-        geom[g + SB] * dy, geom[g + SB],
-    )  # fmt: skip
+@kernel(inline=True)
+def _tabulate(ts: np.ndarray, rs: np.ndarray, rests: np.ndarray, geom: np.ndarray, g: int, left: int, top: int) -> None:
+    """Of Gaussian g, float32: ts = t at the first pixel of each block of 8 in a row, rs = r and rests = q - r^2 of each
+    row of the tile."""
+    dy, sa, sb = top + 0.5 - geom[g + Y], geom[g + SA], geom[g + SB]
+    start, step = splat(sa * (left + 0.5 - geom[g + X] - geom[g + K] * dy)), splat(-sa * geom[g + K])
+    for first in range(0, TILE_HEIGHT, WIDE):
+        row = iota64() + splat(float(first))
+        t, r = start + row * step, splat(sb * dy) + row * splat(sb)
+        store(rs, first, single(r))
+        store(rests, first, single(splat(geom[g + Q]) - r * r))
+        for column in range(_COLUMNS):
+            store(ts, column * TILE_HEIGHT + first, single(t + splat(float(column) * (sa * LANES))))
 
 
 @kernel()
@@ -108,18 +124,20 @@ def _begin(state: np.ndarray, channel: int, left: int, top: int, width: int, hei
     """Transmittance 1 inside the image, 0 outside; returns the blocks with a pixel inside, as bits."""
     alive = np.uint64(0)
     for block in range(_BLOCKS):
-        y, x = top + block % TILE_HEIGHT, left + block // TILE_HEIGHT * LANES
+        row, column = block % TILE_HEIGHT, block // TILE_HEIGHT * LANES
+        y, x, p = top + row, left + column, _place(column, row) + channel * WIDE
         if y < height and x < width:
             alive |= np.uint64(1) << np.uint64(block)
         for lane in range(LANES):
-            state[(block * _STATE + channel) * LANES + lane] = _F(1.0) if y < height and x + lane < width else _F(0.0)
-    return alive
+            state[p + lane] = _F(1.0) if y < height and x + lane < width else _F(0.0)
+    return alive & _FIRST_ROWS
 
 
-@kernel()
+@kernel(inline=True)
 def _place(x: int, y: int) -> int:
     """Offset in `state` of pixel (x, y) of the tile, in its block's first vector."""
-    return (x // LANES * TILE_HEIGHT + y) * _STATE * LANES + x % LANES
+    block = x // LANES * TILE_HEIGHT + y
+    return block // _ROWS * _STATE * WIDE + block % _ROWS * LANES + x % LANES
 
 
 @kernel()
@@ -143,37 +161,39 @@ def _composite_tile(
     one = np.uint64(1)
     zero, faintest = splat(_F(0.0)), splat(_F(ALPHA_MIN))
     low, high, t_min = splat(_F(-9.0)), splat(_F(ALPHA_MAX)), splat(_F(T_MIN))
+    ts, rs, rests = aligned(_BLOCKS, _F), aligned(TILE_HEIGHT, _F), aligned(TILE_HEIGHT, _F)
     for n in range(start, end):
         if not alive:
             break
         _prefetch(items, n, end, geom, colors, stride)
         g = np.int64(items[n]) * GEOM_COLUMNS
         mask = _coverage(geom, g, left, top) & alive
-        t_start, t_row, t_column, r_start, r_row = _steps(geom, g, left, top)
-        opacity, step = geom[g + Q], splat(_F(geom[g + SA]))
+        if not mask:
+            continue
+        _tabulate(ts, rs, rests, geom, g, left, top)
+        step = splat(_F(geom[g + SA]))
         c = np.int64(items[n]) * stride + channel
         red, green, blue = splat(colors[c]), splat(colors[c + 1]), splat(colors[c + 2])
         while mask:
             block = trailing_zeros(mask)
             mask &= mask - one
-            row, column = float(block % TILE_HEIGHT), float(block // TILE_HEIGHT)
-            r = r_start + row * r_row
-            t = fma(iota(), step, splat(_F(t_start + row * t_row + column * t_column)))
-            exponent = fnma(t, t, splat(_F(opacity - r * r)))
+            row = block % TILE_HEIGHT
+            t = fma(in_row(), step, spread(ts, block))
+            exponent = fnma(t, t, spread(rests, row))
             alpha = exp2(select_gt(exponent, low, exponent, low))
             alpha = select_gt(high, alpha, alpha, high)
             alpha = select_gt(faintest, alpha, zero, alpha)
-            p = block * (_STATE * LANES)
+            p = block * (_STATE * LANES)  # of whole blocks, so that of `_place`
             before = load(state, p)
             weight = alpha * before
             after = before - weight
             weight = select_gt(after, t_min, weight, zero)
-            store(state, p + 4 * LANES, select_gt(after, t_min, after, load(state, p + 4 * LANES)))
+            store(state, p + 4 * WIDE, select_gt(after, t_min, after, load(state, p + 4 * WIDE)))
             after = select_gt(after, t_min, after, zero)
             store(state, p, after)
-            store(state, p + LANES, fma(weight, red, load(state, p + LANES)))
-            store(state, p + 2 * LANES, fma(weight, green, load(state, p + 2 * LANES)))
-            store(state, p + 3 * LANES, fma(weight, blue, load(state, p + 3 * LANES)))
+            store(state, p + WIDE, fma(weight, red, load(state, p + WIDE)))
+            store(state, p + 2 * WIDE, fma(weight, green, load(state, p + 2 * WIDE)))
+            store(state, p + 3 * WIDE, fma(weight, blue, load(state, p + 3 * WIDE)))
             if not mask_gt(after, zero):
                 alive &= ~(one << np.uint64(block))
 
@@ -200,7 +220,7 @@ def composite(
     flat_geom, flat_colors = geom.reshape(-1), colors.reshape(-1)
     for tile in prange(starts.size - 1):
         left, top = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
-        state = np.zeros(_BLOCKS * _STATE * LANES, np.float32)
+        state = aligned(_BLOCKS * _STATE * LANES, _F)
         _composite_tile(
             items, starts[tile], starts[tile + 1], flat_geom, flat_colors, stride, channel, left, top, width, height,
             state,
@@ -208,11 +228,11 @@ def composite(
         for y in range(top, min(top + TILE_HEIGHT, height)):
             for x in range(left, min(left + TILE_WIDTH, width)):
                 p = _place(x - left, y - top)
-                behind = state[p + 4 * LANES]
+                behind = state[p + 4 * WIDE]
                 transmittance[y, x] = behind
                 for c in range(min(3, channels - channel)):
                     back = behind * background[channel + c]
-                    out_colors[y, x, channel + c] = state[p + (1 + c) * LANES] + back
+                    out_colors[y, x, channel + c] = state[p + (1 + c) * WIDE] + back
 
 
 @kernel()
@@ -239,12 +259,14 @@ def _composite_tile_backward(
     scratch = np.empty(LANES, np.float32)
     zero, one, faintest = splat(_F(0.0)), splat(_F(1.0)), splat(_F(ALPHA_MIN))
     low, high, t_min = splat(_F(-9.0)), splat(_F(ALPHA_MAX)), splat(_F(T_MIN))
+    ts, rs, rests = aligned(_BLOCKS, _F), aligned(TILE_HEIGHT, _F), aligned(TILE_HEIGHT, _F)
     for n in range(start, end):
         _prefetch(items, n, end, geom, colors, stride)
         g = np.int64(items[n]) * GEOM_COLUMNS
         mask = _coverage(geom, g, left, top) & alive if alive else alive
-        t_start, t_row, t_column, r_start, r_row = _steps(geom, g, left, top)
-        opacity, step = geom[g + Q], splat(_F(geom[g + SA]))
+        if mask:
+            _tabulate(ts, rs, rests, geom, g, left, top)
+        step = splat(_F(geom[g + SA]))
         c = np.int64(items[n]) * stride + channel
         red, green, blue = splat(colors[c]), splat(colors[c + 1]), splat(colors[c + 2])
         sum_g, sum_gt, sum_gtt, sum_gr, sum_grr, sum_gtr = zero, zero, zero, zero, zero, zero
@@ -252,35 +274,37 @@ def _composite_tile_backward(
         while mask:
             block = trailing_zeros(mask)
             mask &= mask - one_bit
-            row, column = float(block % TILE_HEIGHT), float(block // TILE_HEIGHT)
-            r = r_start + row * r_row
-            t = fma(iota(), step, splat(_F(t_start + row * t_row + column * t_column)))
-            exponent = fnma(t, t, splat(_F(opacity - r * r)))
+            row = block % TILE_HEIGHT
+            t = fma(in_row(), step, spread(ts, block))
+            exponent = fnma(t, t, spread(rests, row))
             unclamped = exp2(select_gt(exponent, low, exponent, low))
             alpha = select_gt(high, unclamped, unclamped, high)
             alpha = select_gt(faintest, alpha, zero, alpha)
-            p = block * (_STATE * LANES)
+            p = block * (_STATE * LANES)  # of whole blocks, so that of `_place`
             before = load(state, p)
             weight = alpha * before
             after = before - weight
             weight = select_gt(after, t_min, weight, zero)
             after = select_gt(after, t_min, after, zero)
             store(state, p, after)
-            v_red, v_green, v_blue = load(state, p + 2 * LANES), load(state, p + 3 * LANES), load(state, p + 4 * LANES)
+            v_red, v_green, v_blue = load(state, p + 2 * WIDE), load(state, p + 3 * WIDE), load(state, p + 4 * WIDE)
             v = fma(v_red, red, fma(v_green, green, v_blue * blue))
-            behind = fnma(weight, v, load(state, p + LANES))
-            store(state, p + LANES, behind)
+            behind = fnma(weight, v, load(state, p + WIDE))
+            store(state, p + WIDE, behind)
             gradient = alpha * (before * v - behind / (one - alpha))
             gradient = select_gt(weight, zero, select_gt(unclamped, high, zero, gradient), zero)
-            r_vector = splat(_F(r))
-            gt, gr = gradient * t, gradient * r_vector
+            r = spread(rs, row)
+            gt, gr = gradient * t, gradient * r
             sum_g, sum_gt, sum_gr = sum_g + gradient, sum_gt + gt, sum_gr + gr
-            sum_gtt, sum_grr, sum_gtr = fma(gt, t, sum_gtt), fma(gr, r_vector, sum_grr), fma(gt, r_vector, sum_gtr)
+            sum_gtt, sum_grr, sum_gtr = fma(gt, t, sum_gtt), fma(gr, r, sum_grr), fma(gt, r, sum_gtr)
             sum_red, sum_green = fma(weight, v_red, sum_red), fma(weight, v_green, sum_green)
             sum_blue = fma(weight, v_blue, sum_blue)
             if not mask_gt(after, zero):
                 alive &= ~(one_bit << np.uint64(block))
-        sums = totals(sum_g, sum_gt, sum_gtt, sum_gr, sum_grr, sum_gtr, sum_red, sum_green)
+        sums = totals(
+            folded(sum_g), folded(sum_gt), folded(sum_gtt), folded(sum_gr), folded(sum_grr), folded(sum_gtr),
+            folded(sum_red), folded(sum_green),
+        )  # fmt: skip
         slot = np.int64(slot_of[n]) * slot_stride
         if channel == 0:
             store(slots, slot, sums)
@@ -290,7 +314,7 @@ def _composite_tile_backward(
                 slots[slot + s] += scratch[s]
             slots[slot + SLOT_GEOMETRY + channel] = scratch[SLOT_GEOMETRY]
             slots[slot + SLOT_GEOMETRY + channel + 1] = scratch[SLOT_GEOMETRY + 1]
-        slots[slot + SLOT_GEOMETRY + channel + 2] = total(sum_blue)
+        slots[slot + SLOT_GEOMETRY + channel + 2] = total(folded(sum_blue))
 
 
 @kernel(parallel=True)
@@ -317,7 +341,7 @@ def composite_backward(
     flat_geom, flat_colors, flat_slots = geom.reshape(-1), colors.reshape(-1), slots.reshape(-1)
     for tile in prange(starts.size - 1):
         left, top = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
-        state = np.zeros(_BLOCKS * _STATE * LANES, np.float32)
+        state = aligned(_BLOCKS * _STATE * LANES, _F)
         for y in range(top, min(top + TILE_HEIGHT, height)):
             for x in range(left, min(left + TILE_WIDTH, width)):
                 p = _place(x - left, y - top)
@@ -326,8 +350,8 @@ def composite_backward(
                 for c in range(min(3, channels - channel)):
                     v = g_colors[y, x, channel + c]
                     behind += v * out_colors[y, x, channel + c]
-                    state[p + (2 + c) * LANES] = v
-                state[p + LANES] = behind
+                    state[p + (2 + c) * WIDE] = v
+                state[p + WIDE] = behind
         _composite_tile_backward(
             items, slot_of, starts[tile], starts[tile + 1], flat_geom, flat_colors, stride, channel, left, top, width,
             height, state, flat_slots, slot_stride,

@@ -1,4 +1,4 @@
-"""How numba kernels are compiled, and explicit vectors for them: `LANES` floats as one value.
+"""How numba kernels are compiled, and explicit vectors for them: `LANES` floats, or `WIDE`, as one value.
 
 LLVM's loop vectoriser gives up on a loop that reads a dozen rows and writes others, since it cannot prove that they do
 not overlap (numba has no `noalias`), and on short rows it stores every sum back to memory. With a vector type the inner
@@ -21,12 +21,20 @@ from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
 
 import numba
+import numpy as np
 from llvmlite import ir
-from numba.core import types
+from numba.core import cgutils, types
+from numba.core.registry import cpu_target
 from numba.extending import intrinsic as _numba_intrinsic
 from numba.extending import models, overload, register_model
 
 LANES = 8
+#: Floats of the widest register of the CPU that numba compiles for, which is what its cache is keyed by.
+WIDE = 16 if "+avx512f" in cpu_target.target_context.codegen().magic_tuple()[2] else LANES
+#: Rows and vectors of WIDE floats of a `product`: their sums leave registers for the rows that are read.
+PRODUCT_ROWS, PRODUCT_VECTORS = 12 if WIDE > LANES else 6, 2
+
+CACHE_LINE = 64  #: bytes
 
 Vector = Any  #: in annotations of kernels: a value of the numba type `Lanes`
 _Function = TypeVar("_Function", bound=Callable[..., Any])
@@ -49,18 +57,18 @@ def kernel(*, parallel: bool = False, inline: bool = False) -> Callable[[_Functi
 
 
 class Lanes(types.Type):
-    """The numba type of a vector of LANES scalars."""
+    """The numba type of a vector of `count` scalars."""
 
-    def __init__(self, scalar: types.Float):
-        self.scalar = scalar
-        super().__init__(name=f"Lanes({scalar}x{LANES})")
+    def __init__(self, scalar: types.Float, count: int):
+        self.scalar, self.count = scalar, count
+        super().__init__(name=f"Lanes({scalar}x{count})")
 
 
 @register_model(Lanes)
 class _LanesModel(models.PrimitiveModel):
     def __init__(self, manager: Any, fe_type: Lanes):
         scalar = ir.FloatType() if fe_type.scalar.bitwidth == 32 else ir.DoubleType()
-        super().__init__(manager, fe_type, ir.VectorType(scalar, LANES))  # type: ignore[no-untyped-call]
+        super().__init__(manager, fe_type, ir.VectorType(scalar, fe_type.count))  # type: ignore[no-untyped-call]
 
 
 def _define(op: Callable[..., Any], instruction: str) -> None:
@@ -95,7 +103,14 @@ def _address(context: Any, builder: Any, array_type: Any, array: Any, index: Any
 
 
 def _constant(kind: Any, value: float) -> Any:
-    return ir.Constant(kind, [value] * LANES)
+    return ir.Constant(kind, [value] * kind.count)
+
+
+def _splat(builder: Any, scalar: Any, kind: Any) -> Any:
+    """The scalar in every lane of a vector of the LLVM type `kind`."""
+    undefined, index = ir.Constant(kind, ir.Undefined), ir.IntType(32)
+    first = builder.insert_element(undefined, scalar, index(0))
+    return builder.shuffle_vector(first, undefined, _constant(ir.VectorType(index, kind.count), 0))
 
 
 def _call(builder: Any, name: str, arguments: Sequence[Any]) -> Any:
@@ -103,29 +118,34 @@ def _call(builder: Any, name: str, arguments: Sequence[Any]) -> Any:
     kind = arguments[0].type
     width = 32 if isinstance(kind.element, ir.FloatType) else 64
     function_type = ir.FunctionType(kind, [kind] * len(arguments))
-    function = builder.module.declare_intrinsic(f"llvm.{name}.v{LANES}f{width}", (), function_type)
+    function = builder.module.declare_intrinsic(f"llvm.{name}.v{kind.count}f{width}", (), function_type)
     return builder.call(function, arguments)
 
 
-@_intrinsic
-def load(typingctx: Any, array: Any, index: Any) -> Any:
-    """flat array[index : index + LANES]"""
-    if not _readable(array):
-        return None
-    result = Lanes(array.dtype)
+def _load(count: int) -> Callable[..., Any]:
+    def function(typingctx: Any, array: Any, index: Any) -> Any:
+        if not _readable(array):
+            return None
+        result = Lanes(array.dtype, count)
 
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        pointer = _address(context, builder, sig.args[0], *args)
-        pointer = builder.bitcast(pointer, context.get_value_type(result).as_pointer())
-        return builder.load(pointer, align=array.dtype.bitwidth // 8)
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            pointer = _address(context, builder, sig.args[0], *args)
+            pointer = builder.bitcast(pointer, context.get_value_type(result).as_pointer())
+            return builder.load(pointer, align=array.dtype.bitwidth // 8)
 
-    return result(array, types.intp), codegen
+        return result(array, types.intp), codegen
+
+    return _intrinsic(function)
+
+
+#: flat array[index : index + LANES], and the same of WIDE
+load, wide_load = _load(LANES), _load(WIDE)
 
 
 @_intrinsic
 def store(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
-    """flat array[index : index + LANES] = value"""
-    if not _readable(array) or value != Lanes(array.dtype):
+    """flat array[index : index + lanes of the value] = value"""
+    if not (_readable(array) and isinstance(value, Lanes) and value.scalar == array.dtype):
         return None
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -137,30 +157,63 @@ def store(typingctx: Any, array: Any, index: Any, value: Any) -> Any:
     return types.void(array, types.intp, value), codegen
 
 
+def _splat_of(count: int) -> Callable[..., Any]:
+    def function(typingctx: Any, scalar: Any) -> Any:
+        if not isinstance(scalar, types.Float):
+            return None
+        result = Lanes(scalar, count)
+
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            return _splat(builder, args[0], context.get_value_type(result))
+
+        return result(scalar), codegen
+
+    return _intrinsic(function)
+
+
+#: The float `scalar` in each of LANES lanes, and of WIDE
+splat, wide_splat = _splat_of(LANES), _splat_of(WIDE)
+
+
 @_intrinsic
-def splat(typingctx: Any, scalar: Any) -> Any:
-    """The float `scalar` in every lane."""
-    if not isinstance(scalar, types.Float):
+def spread(typingctx: Any, array: Any, index: Any) -> Any:
+    """WIDE lanes: flat array[index] in the first LANES of them, and what comes next in the others, if there are any."""
+    if not _readable(array):
         return None
-    result = Lanes(scalar)
+    result = Lanes(array.dtype, WIDE)
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        undefined, index = ir.Constant(context.get_value_type(result), ir.Undefined), ir.IntType(32)
-        first = builder.insert_element(undefined, args[0], index(0))
-        return builder.shuffle_vector(first, undefined, _constant(ir.VectorType(index, LANES), 0))
+        kind = context.get_value_type(result)
+        few = ir.VectorType(kind.element, WIDE // LANES)
+        pointer = builder.bitcast(_address(context, builder, sig.args[0], *args), few.as_pointer())
+        values = builder.load(pointer, align=array.dtype.bitwidth // 8)
+        chosen = ir.Constant(ir.VectorType(ir.IntType(32), WIDE), [i // LANES for i in range(WIDE)])
+        return builder.shuffle_vector(values, ir.Constant(few, ir.Undefined), chosen)
 
-    return result(scalar), codegen
+    return result(array, types.intp), codegen
+
+
+def _constant_of(scalar: types.Float, values: Sequence[float]) -> Callable[..., Any]:
+    def function(typingctx: Any) -> Any:
+        result = Lanes(scalar, len(values))
+        return result(), lambda context, builder, sig, args: ir.Constant(context.get_value_type(result), list(values))
+
+    return _intrinsic(function)
+
+
+#: WIDE lanes, float32 and float64: 0, 1, 2, ...
+iota, iota64 = (_constant_of(kind, [float(i) for i in range(WIDE)]) for kind in (types.float32, types.float64))
+#: WIDE lanes, float32: 0, 1, ..., LANES - 1, and again, if there are more
+in_row = _constant_of(types.float32, [float(i % LANES) for i in range(WIDE)])
 
 
 @_intrinsic
-def iota(typingctx: Any) -> Any:
-    """Lanes 0, 1, ..., 7, float32."""
-    result = Lanes(types.float32)
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return ir.Constant(context.get_value_type(result), [float(i) for i in range(LANES)])
-
-    return result(), codegen
+def single(typingctx: Any, a: Any) -> Any:
+    """float64 to float32."""
+    if not isinstance(a, Lanes) or a.scalar != types.float64:
+        return None
+    result = Lanes(types.float32, a.count)
+    return result(a), lambda context, builder, sig, args: builder.fptrunc(args[0], context.get_value_type(result))
 
 
 @_intrinsic
@@ -183,6 +236,67 @@ def fnma(typingctx: Any, a: Any, b: Any, c: Any) -> Any:
     return a(a, b, c), codegen
 
 
+def _product(rows: int, vectors: int) -> Callable[..., Any]:
+    """`product`, of so many rows and vectors."""
+
+    def function(
+        typingctx: Any, y: Any, y_at: Any, y_row: Any, start: Any, start_at: Any, start_row: Any, a: Any, a_at: Any,
+        a_row: Any, a_step: Any, b: Any, b_at: Any, b_row: Any, count: Any, relu: Any,
+    ) -> Any:  # fmt: skip
+        if not all(_readable(array) and array.dtype == y.dtype for array in (y, start, a, b)):
+            return None
+
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            kind = ir.VectorType(context.get_value_type(y.dtype), WIDE)
+            align, index, whole = y.dtype.bitwidth // 8, ir.IntType(64), range(vectors)
+
+            def place(first: int, step: Any, row: int) -> Any:
+                """Of row number `row` of the array that is argument `first`, and whose rows are `step` apart."""
+                at = builder.add(args[first + 1], builder.mul(step, index(row)))
+                return _address(context, builder, sig.args[first], args[first], at)
+
+            def vector(pointer: Any, v: int) -> Any:
+                return builder.bitcast(builder.gep(pointer, [index(v * WIDE)]), kind.as_pointer())
+
+            new: Any = cgutils.alloca_once  # on the stack; LLVM makes them registers
+            sums = [[new(builder, kind) for _ in whole] for _ in range(rows)]
+            for row, own in enumerate(sums):
+                for v in whole:
+                    builder.store(builder.load(vector(place(3, args[5], row), v), align=align), own[v])
+            scalars = [place(6, args[8], row) for row in range(rows)]
+            with cgutils.for_range(builder, args[13], intp=index) as loop:
+                pointer = builder.gep(place(10, args[12], 0), [builder.mul(loop.index, args[12])])
+                factors = [builder.load(vector(pointer, v), align=align) for v in whole]
+                at = builder.mul(loop.index, args[9])
+                for scalar, own in zip(scalars, sums, strict=True):
+                    factor = _splat(builder, builder.load(builder.gep(scalar, [at])), kind)
+                    for v in whole:
+                        builder.store(_call(builder, "fmuladd", [factor, factors[v], builder.load(own[v])]), own[v])
+            zero, clamps = _constant(kind, 0.0), _splat(builder, args[14], ir.VectorType(ir.IntType(1), WIDE))
+            for row, own in enumerate(sums):
+                for v in whole:
+                    value = builder.load(own[v])
+                    negative = builder.and_(clamps, builder.fcmp_ordered("<", value, zero))
+                    builder.store(builder.select(negative, zero, value), vector(place(0, args[2], row), v), align=align)
+            return context.get_dummy_value()
+
+        indices = dict.fromkeys((1, 2, 4, 5, 7, 8, 9, 11, 12, 13), types.intp)
+        given = (y, y_at, y_row, start, start_at, start_row, a, a_at, a_row, a_step, b, b_at, b_row, count, relu)
+        return types.void(*(indices.get(i, kind) for i, kind in enumerate(given))), codegen
+
+    return _intrinsic(function)
+
+
+#: y = start + a b, what is negative 0 if `relu` (NaN passes), of PRODUCT_ROWS rows and PRODUCT_VECTORS * WIDE columns.
+#:
+#: Each array comes with the offset of its first number and the distance between its rows: 0 where they are one row.
+#: a's columns are `a_step` apart; it has `count` of them, and b as many rows. Sums are in the order of the columns,
+#: fused where the CPU can, so the bits do not depend on how the whole is cut into blocks.
+product = _product(PRODUCT_ROWS, PRODUCT_VECTORS)
+#: The same of WIDE columns.
+narrow_product = _product(PRODUCT_ROWS, 1)
+
+
 @_intrinsic
 def sqrt(typingctx: Any, a: Any) -> Any:
     """Square root per lane."""
@@ -200,11 +314,11 @@ _ROUND = 1.5 * 2.0**23
 @_intrinsic
 def exp2(typingctx: Any, x: Any) -> Any:
     """2**x of float32 for -126 < x < 127, relative error < 2e-7: exponent bits of round(x), polynomial for the rest."""
-    if x != Lanes(types.float32):
+    if not isinstance(x, Lanes) or x.scalar != types.float32:
         return None
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        kind, integers = args[0].type, ir.VectorType(ir.IntType(32), LANES)
+        kind, integers = args[0].type, ir.VectorType(ir.IntType(32), x.count)
         shifted = builder.fadd(args[0], _constant(kind, _ROUND))
         fraction = builder.fsub(args[0], builder.fsub(shifted, _constant(kind, _ROUND)))
         value = _constant(kind, _EXP2[-1])
@@ -235,7 +349,7 @@ def mask_gt(typingctx: Any, a: Any, b: Any) -> Any:
         return None
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        mask = builder.bitcast(builder.fcmp_ordered(">", args[0], args[1]), ir.IntType(LANES))
+        mask = builder.bitcast(builder.fcmp_ordered(">", args[0], args[1]), ir.IntType(a.count))
         return builder.zext(mask, ir.IntType(64))
 
     return types.uint64(a, b), codegen
@@ -259,9 +373,23 @@ def _sum_of(builder: Any, a: Any, b: Any, even: Sequence[int], odd: Sequence[int
 
 
 @_intrinsic
+def folded(typingctx: Any, a: Any) -> Any:
+    """LANES lanes of WIDE: the first plus the others, if there are others."""
+    if not isinstance(a, Lanes) or a.count != WIDE:
+        return None
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        if WIDE == LANES:
+            return args[0]
+        return _sum_of(builder, args[0], args[0], range(LANES), range(LANES, WIDE))
+
+    return Lanes(a.scalar, LANES)(a), codegen
+
+
+@_intrinsic
 def totals(typingctx: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: Any, h: Any) -> Any:
     """The sums over lanes of eight vectors as one vector, pairwise in one fixed order, so that results repeat."""
-    if not _same(a, b, c, d, e, f, g, h):
+    if not _same(a, b, c, d, e, f, g, h) or a.count != LANES:
         return None
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -278,8 +406,8 @@ def totals(typingctx: Any, a: Any, b: Any, c: Any, d: Any, e: Any, f: Any, g: An
 
 @_intrinsic
 def total(typingctx: Any, a: Any) -> Any:
-    """The sum over lanes, pairwise in one fixed order."""
-    if not _same(a):
+    """The sum over LANES lanes, pairwise in one fixed order."""
+    if not _same(a) or a.count != LANES:
         return None
 
     def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
@@ -290,6 +418,14 @@ def total(typingctx: Any, a: Any) -> Any:
         return builder.extract_element(value, ir.Constant(ir.IntType(32), 0))
 
     return a.scalar(a), codegen
+
+
+@kernel()
+def aligned(size: int, dtype: Any) -> np.ndarray:
+    """`size` zeros that start where a cache line does: a WIDE vector that lies in two lines takes twice as long."""
+    array = np.zeros(size + CACHE_LINE, dtype)
+    first = -array.ctypes.data % CACHE_LINE // array.itemsize
+    return array[first : first + size]
 
 
 @_intrinsic
