@@ -6,9 +6,8 @@
     finish their activations and gates, as the rasteriser takes them
 
 What belongs to an anchor, and what belongs to a Gaussian, is one row whose columns are the heads of its deformation in
-the registry's order. Products are torch's. They go through the rows in blocks that stay in the cache, activations are
-applied in place, and what is left of the work is numba kernels (`slot_kernels.py`). `Model.gaussians_reference` has
-the plain torch form of the whole; it was measured against in docs/training.md.
+the registry's order. The work is numba kernels: networks in `layer_kernels.py`, the rest in `slot_kernels.py`.
+`Model.gaussians_reference` has the plain torch form of the whole; it was measured against in docs/training.md.
 """
 
 from __future__ import annotations
@@ -18,10 +17,12 @@ from itertools import accumulate
 from typing import Any
 
 import numba
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
+from pd4dgs_codec.model import layer_kernels
 from pd4dgs_codec.model import slot_kernels as kernels
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.hexplane import sample, sample_gradient
@@ -29,8 +30,6 @@ from pd4dgs_codec.model.mlp import MLP
 from pd4dgs_codec.render.simd import LANES
 from pd4dgs_codec.scene import LENGTH_HEADS, SCALING_DIM
 
-#: Rows that go through the layers of a network together.
-BLOCK = 2048
 SCALING = slice(-SCALING_DIM, None)  #: the last columns of an anchor's row
 
 Layer = tuple[Tensor, Tensor]  #: weight [out, in] and bias [out]
@@ -56,20 +55,24 @@ def _arrays(*tensors: Tensor) -> list[Any]:
     return [tensor.numpy() for tensor in tensors]
 
 
-def _blocks(n: int) -> list[slice]:
-    return [slice(first, min(first + BLOCK, n)) for first in range(0, n, BLOCK)]
+def _run(out: Tensor, x: Tensor, layers: Sequence[Layer]) -> tuple[Tensor, np.ndarray, Tensor]:
+    """Adds what the layers make of x to out; gives the hidden activations, sizes and weights that `_run_back` takes."""
+    sizes, weights = layer_kernels.pack([(w.numpy(), b.numpy()) for w, b in layers])
+    hidden = x.new_empty(len(x), layer_kernels.hidden_width(sizes))
+    layer_kernels.forward(*[*_arrays(out, hidden, x), sizes, weights, False])
+    return hidden, sizes, torch.from_numpy(weights)
 
 
-def _backward_layer(g: Tensor, x: Tensor, weight: Tensor, grad_weight: Tensor, grad_bias: Tensor) -> Tensor:
-    """The gradient [n, in] by what a linear layer took, x, from that of its result; adds to those of its weights."""
-    grad_weight.addmm_(g.T, x)
-    grad_bias.addmv_(g.T, g.new_ones(len(g)))
-    return g @ weight
-
-
-def _relu_backward(g: Tensor, activated: Tensor) -> Tensor:
-    """g in place, zero where the activation was."""
-    return torch.ops.aten.threshold_backward.grad_input(g, activated, 0, grad_input=g)  # type: ignore[no-any-return]
+def _run_back(
+    g: Tensor, g_hidden: Tensor | None, hidden: Tensor, x: Tensor, sizes: np.ndarray, weights: Tensor
+) -> tuple[Tensor, list[Layer]]:
+    """The gradients by x and by each layer, from that by what `_run` added, and by its activations, if they are used
+    elsewhere."""
+    g_x, sums = torch.empty_like(x), x.new_zeros(numba.get_num_threads(), layer_kernels.sums_width(sizes))
+    given = (g, hidden[:0] if g_hidden is None else g_hidden, hidden, x)
+    layer_kernels.backward(*[*_arrays(g_x, sums, *given), sizes, weights.numpy()])
+    found = layer_kernels.gradients(sums.numpy(), sizes)
+    return g_x, [(torch.from_numpy(w), torch.from_numpy(b)) for w, b in found]
 
 
 # -- attributes --------------------------------------------------------------------------------------------------------
@@ -179,34 +182,20 @@ class _Moved(torch.autograd.Function):
         for (columns, unit), w, b in zip(rows, used[trunk::2], used[trunk + 1 :: 2], strict=True):
             torch.mul(w, unit, out=weight[columns])
             torch.mul(b, unit, out=bias[columns])
-        layers = [*zip(used[:trunk:2], used[1:trunk:2], strict=True)]
-        hidden = [base.new_empty(len(base), len(b)) for _, b in layers]
-        out = torch.empty_like(base)
-        for block in _blocks(len(base)):
-            x = features[block]
-            for (w, b), activated in zip(layers, hidden, strict=True):
-                x = torch.addmm(b, x, w.T, out=activated[block]).relu_()
-            torch.addmm(base[block], x, weight.T, out=out[block]).add_(bias)
-        ctx.settings = settings
-        ctx.save_for_backward(points, features, spatial, time_rows, weight, *(w for w, _ in layers), *hidden)
+        layers = [*zip(used[:trunk:2], used[1:trunk:2], strict=True), (weight, bias)]
+        out = base.clone()
+        hidden, sizes, packed = _run(out, features, layers)
+        ctx.settings, ctx.sizes = settings, sizes
+        ctx.save_for_backward(points, features, spatial, time_rows, hidden, packed)
         return out
 
     @staticmethod
     @once_differentiable
     def backward(ctx: Any, g: Tensor) -> tuple[Tensor | None, ...]:
-        planes, rows, trunk, t, _, _, follows = ctx.settings
-        points, features, spatial, time_rows, weight, *rest = ctx.saved_tensors
-        weights, hidden = [*rest[: trunk // 2], weight], rest[trunk // 2 :]
+        planes, rows, _, t, _, _, follows = ctx.settings
+        points, features, spatial, time_rows, hidden, packed = ctx.saved_tensors
         g = g.contiguous()
-        inputs = [features, *hidden]
-        grads = [(torch.zeros_like(w), w.new_zeros(len(w))) for w in weights]
-        g_features = torch.empty_like(features)
-        for block in _blocks(len(g)):
-            slope = g[block]
-            for i in range(len(weights) - 1, 0, -1):
-                x = inputs[i][block]
-                slope = _relu_backward(_backward_layer(slope, x, weights[i], *grads[i]), x)
-            g_features[block] = _backward_layer(slope, inputs[0][block], weights[0], *grads[0])
+        g_features, grads = _run_back(g, None, hidden, features, ctx.sizes, packed)
         g_grid, g_points = sample_gradient(g_features, spatial, time_rows, planes.layout, planes.box, points, t)
         if follows:
             g = g.clone()
@@ -251,10 +240,9 @@ class _Grown(torch.autograd.Function):
         n, slots = len(anchors), len(b_opacity)
         inputs, distance = anchors.new_empty(n, w1.shape[1]), torch.empty_like(mask)
         kernels.inputs(*_arrays(inputs, distance, anchors, centre))
-        hidden, raw = anchors.new_empty(n, len(b1)), anchors.new_empty(n, slots)
-        for block in _blocks(n):
-            x = torch.addmm(b1, inputs[block], w1.T, out=hidden[block]).relu_()
-            torch.addmm(b_opacity, x[:, : w_opacity.shape[1]], w_opacity.T, out=raw[block]).tanh_()
+        raw = anchors.new_zeros(n, slots)
+        hidden, sizes, packed = _run(raw, inputs, [(w1, b1), (w_opacity, b_opacity)])
+        raw.tanh_()
         keep = torch.empty(n * slots + 1, dtype=torch.int64)  # a place past the last, which is always written
         keep = keep[: kernels.seen(keep.numpy(), raw.numpy(), mask.numpy(), faintest)].clone()
         shape, color = (anchors.new_empty(len(keep), len(b) // slots) for b in (b_shape, b_color))
@@ -265,11 +253,10 @@ class _Grown(torch.autograd.Function):
         color.sigmoid_()
         gaussians, gates = anchors.new_empty(len(keep), kernels.GAUSSIAN_WIDTH), anchors.new_empty(len(keep))
         kernels.assemble(*_arrays(gaussians, gates, keep, anchors, extent, raw, mask, shape, relative, color))
-        ctx.columns = columns
+        ctx.columns, ctx.sizes = columns, sizes
         ctx.widths = [len(b) for b in used[1::4]]
         ctx.save_for_backward(
-            anchors, keep, inputs, distance, hidden, raw, shape, relative, extent, gaussians, w1, w_opacity, w_shape,
-            w_color,
+            anchors, keep, inputs, distance, hidden, raw, shape, relative, extent, gaussians, packed, w_shape, w_color,
         )  # fmt: skip
         ctx.mark_non_differentiable(raw, keep)
         return gaussians, gates, raw, keep
@@ -278,8 +265,7 @@ class _Grown(torch.autograd.Function):
     @once_differentiable
     def backward(ctx: Any, g: Tensor, g_gates: Tensor, *_: Tensor) -> tuple[Tensor | None, ...]:
         (
-            anchors, keep, inputs, distance, hidden, raw, shape, relative, extent, gaussians, w1, w_opacity, w_shape,
-            w_color,
+            anchors, keep, inputs, distance, hidden, raw, shape, relative, extent, gaussians, packed, w_shape, w_color,
         ) = ctx.saved_tensors  # fmt: skip
         parts = numba.get_num_threads()
         g_anchors, g_raw = torch.zeros_like(anchors), torch.zeros_like(raw)
@@ -290,21 +276,15 @@ class _Grown(torch.autograd.Function):
         g_raw.mul_(1 - raw * raw)
 
         g_hidden = torch.zeros_like(hidden)
-        last: list[Layer] = [(torch.zeros_like(w_opacity), g.new_zeros(len(w_opacity)))]
+        last = []
         for slope, column, w in ((g_shape, ctx.columns[0], w_shape), (g_color, ctx.columns[1], w_color)):
             grads = g.new_zeros(parts, *w.shape), g.new_zeros(parts, len(w))
             kernels.linear_backward(*[*_arrays(g_hidden, *grads, keep, slope, hidden), column, w.numpy()])
             last.append((grads[0][0], grads[1][0]))
-        first, g_inputs = (torch.zeros_like(w1), w1.new_zeros(len(w1))), torch.empty_like(inputs)
-        for block in _blocks(len(anchors)):
-            x = hidden[block]
-            own = x[:, : w_opacity.shape[1]]
-            g_hidden[block, : w_opacity.shape[1]] = _backward_layer(g_raw[block], own, w_opacity, *last[0])
-            slope = _relu_backward(g_hidden[block], x)
-            g_inputs[block] = _backward_layer(slope, inputs[block], w1, *first)
+        g_inputs, (first, opacity) = _run_back(g_raw, g_hidden, hidden, inputs, ctx.sizes, packed)
         kernels.inputs_backward(*_arrays(g_anchors, g_inputs, inputs, distance))
         gradients = []
-        for w, b, outer in zip(*(torch.split(part, ctx.widths) for part in first), last, strict=True):
+        for w, b, outer in zip(*(torch.split(part, ctx.widths) for part in first), (opacity, *last), strict=True):
             gradients += [w, b, *outer]
         return g_anchors, g_mask, None, None, None, *gradients
 

@@ -7,10 +7,9 @@ from itertools import accumulate
 import numpy as np
 
 from pd4dgs_codec import threads
-from pd4dgs_codec.model import hexplane_kernels
+from pd4dgs_codec.model import hexplane_kernels, layer_kernels
 from pd4dgs_codec.model.plane_layout import PlaneLayout
-from pd4dgs_codec.playback import kernels
-from pd4dgs_codec.render.simd import LANES, WIDE
+from pd4dgs_codec.render.simd import LANES
 from pd4dgs_codec.scene import LENGTH_HEADS, PLANES, TRUNK, Deformation, Network, deformation_unit, plane_sides
 
 
@@ -18,17 +17,8 @@ class Layers:
     """Linear layers with ReLU between them, and after the last if `relu_last`."""
 
     def __init__(self, layers: Network, relu_last: bool = False):
-        self.outputs = len(layers[-1][1])
-        self._relu_last = relu_last
-        widths, parts = [layers[0][0].shape[1]], []
-        for weight, bias in layers:
-            inputs, outputs = widths[-1], -(-len(bias) // WIDE) * WIDE
-            table = np.zeros((inputs + 1, outputs), np.float32)
-            table[: weight.shape[1], : len(bias)] = weight.T
-            table[-1, : len(bias)] = bias
-            widths.append(outputs)
-            parts.append(table.ravel())
-        self._widths, self._weights = np.array(widths), np.concatenate(parts)
+        self.outputs, self._relu_last = len(layers[-1][1]), relu_last
+        self._sizes, self._weights = layer_kernels.pack(layers)
 
     def __call__(self, x: np.ndarray, outputs: int | None = None) -> np.ndarray:
         """float32 [n, outputs] of x float32 [n, inputs]; more outputs than there are come out as 0."""
@@ -39,7 +29,8 @@ class Layers:
     def add(self, out: np.ndarray, x: np.ndarray) -> None:
         """Adds what a call answers to out float32 [n, at most the last width], C-contiguous."""
         threads.limit_numba()
-        kernels.forward(out, np.ascontiguousarray(x), self._widths, self._weights, self._relu_last)
+        hidden = np.empty((0, 0), np.float32)
+        layer_kernels.forward(out, hidden, np.ascontiguousarray(x), self._sizes, self._weights, self._relu_last)
 
 
 class Field:

@@ -420,6 +420,21 @@ def total(typingctx: Any, a: Any) -> Any:
     return a.scalar(a), codegen
 
 
+@_intrinsic
+def copy(typingctx: Any, to: Any, to_at: Any, array: Any, at: Any, count: Any) -> Any:
+    """flat to[to_at : to_at + count] = flat array[at : at + count]"""
+    if not (_readable(to) and _readable(array) and to.dtype == array.dtype):
+        return None
+
+    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+        pointers = (_address(context, builder, sig.args[i], *args[i : i + 2]) for i in (0, 2))
+        move: Any = cgutils.raw_memcpy
+        move(builder, *pointers, args[4], array.dtype.bitwidth // 8)
+        return context.get_dummy_value()
+
+    return types.void(to, types.intp, array, types.intp, types.intp), codegen
+
+
 @kernel()
 def aligned(size: int, dtype: Any) -> np.ndarray:
     """`size` zeros that start where a cache line does: a WIDE vector that lies in two lines takes twice as long."""

@@ -1,14 +1,16 @@
 """The fused functions of the CPU against the plain torch graph: the same Gaussians and the same gradients."""
 
+import numpy as np
 import pytest
 import torch
 from test_model import ALL_HEADS, CAMERA, small_model, stir
 from torch.nn import functional as F
 
-from pd4dgs_codec.model import fused
+from pd4dgs_codec.model import fused, layer_kernels
 from pd4dgs_codec.model.mlp import MLP
 from pd4dgs_codec.model.model import Gaussians, Model
 from pd4dgs_codec.model.rounding import EXACT, Noise, Rounding
+from pd4dgs_codec.render import simd
 from pd4dgs_codec.scene import Widths
 
 PARTS = ("means", "quats", "scales", "opacities", "colors")
@@ -84,9 +86,39 @@ def test_it_is_so_in_as_many_parts_as_there_are_threads(monkeypatch, parts):
     check(stir(small_model(opacity=-0.1), 0.3), 2)
 
 
-def test_rows_go_through_the_networks_in_blocks(monkeypatch):
-    monkeypatch.setattr(fused, "BLOCK", 7)
-    check(stir(small_model(), 0.3), 2)
+@pytest.mark.parametrize("count", [0, 1, 47, 48, 400])
+@pytest.mark.parametrize("parts", [1, 3])
+def test_layers_and_their_gradients_are_those_of_torch(count, parts):
+    """The last layer takes some of what it is given, and what the others give is used elsewhere too."""
+    shapes, dtype = ((40, 13), (24, 40), (21, 8)), torch.float64
+    layers = [
+        (drawn(*shape).to(dtype).requires_grad_(), drawn(shape[0]).to(dtype).requires_grad_()) for shape in shapes
+    ]
+    x, base = (drawn(count, width).to(dtype).requires_grad_() for width in (13, 21))
+    hidden = [torch.relu(x @ layers[0][0].T + layers[0][1])]
+    hidden.append(torch.relu(hidden[0] @ layers[1][0].T + layers[1][1]))
+    out = base + hidden[1][:, :8] @ layers[2][0].T + layers[2][1]
+
+    sizes, weights = layer_kernels.pack([(w.detach().numpy(), b.detach().numpy()) for w, b in layers])
+    found, kept = base.detach().numpy().copy(), np.full((count, layer_kernels.hidden_width(sizes)), np.nan)
+    layer_kernels.forward(found, kept, x.detach().numpy(), sizes, weights, False)
+    np.testing.assert_allclose(found, out.detach(), rtol=1e-9, atol=1e-9)
+    ends = np.cumsum([0, *(-(-w // simd.WIDE) * simd.WIDE for w in (40, 24))])
+    for values, first, end in zip(hidden, ends, ends[1:], strict=False):
+        np.testing.assert_allclose(kept[:, first : first + values.shape[1]], values.detach(), rtol=1e-9, atol=1e-9)
+        assert (kept[:, first + values.shape[1] : end] == 0).all()
+
+    g, elsewhere = drawn(count, 21).double(), [drawn(*h.shape).double() for h in hidden]
+    ((out * g).sum() + sum((h * e).sum() for h, e in zip(hidden, elsewhere, strict=True))).backward()
+    g_hidden = np.zeros_like(kept)
+    for values, first in zip(elsewhere, ends, strict=False):
+        g_hidden[:, first : first + values.shape[1]] = values
+    g_x, sums = np.empty((count, 13)), np.zeros((parts, layer_kernels.sums_width(sizes)))
+    layer_kernels.backward(g_x, sums, g.numpy(), g_hidden, kept, x.detach().numpy(), sizes, weights)
+    np.testing.assert_allclose(g_x, x.grad, rtol=1e-9, atol=1e-9)
+    for pair, own in zip(layers, layer_kernels.gradients(sums, sizes), strict=True):
+        for parameter, gradient in zip(pair, own, strict=True):
+            np.testing.assert_allclose(gradient, parameter.grad, rtol=1e-9, atol=1e-9)
 
 
 @pytest.mark.parametrize(
