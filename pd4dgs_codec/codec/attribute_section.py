@@ -45,19 +45,21 @@ from pd4dgs_codec.codec.stages import (
     PRIOR_BITS,
     STAGED,
     Activity,
-    Cells,
     CodedSection,
+    Group,
+    Places,
     Scale,
     activity_bounds,
     cheapest_class_count,
+    classes_within,
     coded_stages,
-    places_of,
+    parts_of,
     read_class_count,
     read_stages,
     smaller_form,
 )
 from pd4dgs_codec.entropy.bits import entropy_bits
-from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
+from pd4dgs_codec.entropy.channels import decode_channels, decode_joined, encode_channels
 from pd4dgs_codec.entropy.fitting import Fitted
 from pd4dgs_codec.entropy.priors import K_MAX, Prior
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
@@ -144,7 +146,7 @@ class Block:
     """The prediction block.
 
     widths: of the anchors. counts: of classes, of stages 1 to 5, with step classes 0 to 5. scale, and by stage the
-    activity int64 [classes - 1] at which each class but the first begins: of the slice that the block stands in; known
+    activity [classes - 1] at which each class but the first begins: of the slice that the block stands in; known
     once that slice has been coded so far.
     """
 
@@ -156,12 +158,11 @@ class Block:
     bounds: dict[int, np.ndarray] = field(default_factory=dict)
 
     def classes(self, activity: np.ndarray, stage: int, count: int) -> np.ndarray:
-        """int64 [n] of rows with this activity in the stages before."""
+        """uint8 [n] of rows with this activity in the stages before."""
         bounds = self.bounds.get(stage)
         if bounds is None:
             bounds = self.bounds[stage] = activity_bounds(activity, count)
-        classes: np.ndarray = np.searchsorted(bounds, activity, side="right")
-        return classes
+        return classes_within(activity, bounds)
 
 
 AnyPrior = TypeVar("AnyPrior", Prior, Fitted)
@@ -232,8 +233,7 @@ def by_class(attributes: np.ndarray, classes: np.ndarray) -> Iterator[np.ndarray
     if not classes.size:
         yield from attributes
         return
-    parts = places_of(classes, MAX_CLASS + 1)
-    yield from (channel[rows] for channel in attributes for rows in parts)
+    yield from Places.by(classes, MAX_CLASS + 1).parts(attributes)
 
 
 def _fit_block(symbols: np.ndarray, grades: np.ndarray, widths: Widths) -> Block:
@@ -284,9 +284,7 @@ def _write_staged(
         out = bytearray([STAGED])
         _put_block(out, block)
     coded = (_residuals(symbols, block.terms, channels) for channels in _measured_stages(block.widths))
-    places = _places(symbols, coded, grades, block)
-    stages = ([channel[rows] for channel, rows in channels] for channels in places)
-    return coded_stages(out, stages, effort, past.stages)
+    return coded_stages(out, map(parts_of, _groups(symbols, coded, grades, block)), effort, past.stages)
 
 
 def _put_block(out: bytearray, block: Block) -> None:
@@ -305,33 +303,32 @@ def _put_block(out: bytearray, block: Block) -> None:
             put_zigzag(out, split.centre_y)
 
 
-def _places(
+def _groups(
     symbols: np.ndarray, residuals: Iterator[np.ndarray], grades: np.ndarray, block: Block
-) -> Iterator[list[tuple[np.ndarray, Cells]]]:
-    """Per stage, the (channel, rows) that it codes, in order. residuals: int32 [channels, n] of each of
-    `_measured_stages`. They and `symbols` int32 [channels, n], of which the offsets are read here, are read only as far
-    as the stages before reach."""
+) -> Iterator[list[Group]]:
+    """Per stage, what it codes. residuals: int32 [channels, n] of each of `_measured_stages`. They and `symbols` int32
+    [channels, n], of which the offsets are read here, are read only as far as the stages before reach."""
     counts = block.counts if block.widths.graded else [1, *block.counts]
-    activity = _activity(symbols.shape[1], grades, block.scale)
+    activity, whole = _activity(symbols.shape[1], grades, block.scale), Places.whole(symbols.shape[1])
     block.scale = activity.scale
     offsets = stage_channels(block.widths, len(STAGES) - 1)
     for stage, count in enumerate(counts):
-        parts: list[Cells] = [slice(None)]
+        places = whole
         if count > 1:
-            parts = list(places_of(block.classes(activity.now, stage, count), count))
+            places = Places.by(block.classes(activity.now, stage, count), count)
         channels = next(residuals) if stage < len(STAGES) - 1 else symbols[offsets.start :: offsets.step]
-        yield [(channel, part) for channel in channels for part in parts]
+        yield [(channels, places)]
         if any(later > 1 for later in counts[stage + 1 :]):
             for channel in channels:
                 activity.add(channel)
     for axis, flag, count in ((1, SPLIT_Y, Y_CLASSES), (2, SPLIT_Z, Z_CLASSES)):
-        places: list[tuple[np.ndarray, Cells]] = []
+        groups: list[Group] = []
         for first, split in zip(offsets, block.splits, strict=True):
-            x, y, parts = symbols[first], symbols[first + 1], [slice(None)]
+            x, y, places = symbols[first], symbols[first + 1], whole
             if split.flags & flag:
-                parts = list(places_of(split.y_classes(x) if axis == 1 else split.z_classes(x, y), count))
-            places += [(symbols[first + axis], part) for part in parts]
-        yield places
+                places = Places.by(split.y_classes(x) if axis == 1 else split.z_classes(x, y), count)
+            groups.append((symbols[first + axis : first + axis + 1], places))
+        yield groups
 
 
 def _measured_stages(widths: Widths) -> list[range]:
@@ -421,7 +418,7 @@ def read_attributes(
         raise Malformed("attributes that go on with a prediction block, but no slice before has one")
     symbols = np.zeros((widths.channels, rows), np.int32)
     coded = (symbols[channels.start : channels.stop] for channels in _measured_stages(widths))
-    read_stages(reader, N_STAGES, _places(symbols, coded, classes, block), past.stages if past else None)
+    read_stages(reader, N_STAGES, _groups(symbols, coded, classes, block), past.stages if past else None)
     if past:
         past.block = block
     _restore(symbols[: widths.predicted], block.terms)
@@ -457,12 +454,10 @@ def _read_plain(
     data: memoryview, classes: np.ndarray, widths: Widths, rows: int, known: list[Prior] | None
 ) -> np.ndarray:
     if not widths.graded:
-        return np.stack(decode_channels(data, [rows] * widths.channels, known))
-    parts = places_of(classes, MAX_CLASS + 1)
-    symbols = np.zeros((widths.channels, rows), np.int32)
-    decoded = decode_channels(data, [len(part) for part in parts] * widths.channels, known)
-    for i, values in enumerate(decoded):
-        symbols[i // len(parts), parts[i % len(parts)]] = values
+        return decode_joined(data, [rows] * widths.channels, known).reshape(widths.channels, rows)
+    places = Places.by(classes, MAX_CLASS + 1)
+    symbols = np.empty((widths.channels, rows), np.int32)
+    places.put(decode_joined(data, places.sizes * widths.channels, known), symbols)
     return symbols
 
 
