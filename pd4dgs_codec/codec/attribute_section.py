@@ -100,10 +100,17 @@ class Terms:
         dense[self.channels] = self.weights / (1 << WEIGHT_SHIFT)
         return dense
 
+    @cached_property
+    def reach(self) -> int:
+        """How often the largest magnitude the sum of products can be, in its units of 2^-10."""
+        return int(np.abs(self.weights).sum())
+
     def prediction(self, symbols: np.ndarray) -> np.ndarray:
         """Integers [n] from integers [>= max channel + 1, n] of magnitude <= K_MAX, all in binary64, where their sums
-        of products, below 2^45, are exact. einsum starts no threads."""
-        predicted: np.ndarray = np.einsum("i,ij->j", self._dense, symbols[: len(self._dense)])
+        of products, below 2^45, are exact; or in binary32, where they are as long as they stay below 2^14. einsum
+        starts no threads."""
+        dense = self._dense.astype(symbols.dtype, copy=False)
+        predicted: np.ndarray = np.einsum("i,ij->j", dense, symbols[: len(dense)])
         predicted += 0.5
         np.floor(predicted, out=predicted)
         return predicted
@@ -428,13 +435,23 @@ def read_attributes(
 def _restore(symbols: np.ndarray, terms: Sequence[Terms]) -> None:
     """Residuals int32 [channels, n] become the symbols, in place. Raises Malformed if one is over K_MAX."""
     predicted = [(c, term) for c, term in enumerate(terms, start=1) if term.channels.size]
+    reach = max([term.reach for _, term in predicted], default=0)
     for rows in _row_blocks(symbols) if predicted else ():
-        block = symbols[:, rows].astype(np.float64)
-        for c, term in predicted:
-            block[c] += term.prediction(block)
-        if max(block.max(), -block.min()) > K_MAX:
+        block, largest = _predicted(symbols[:, rows].astype(np.float32), predicted)
+        # so far sums of products and 1/2 are multiples of 2^-10 below 2^14, and binary32 has them all
+        if not largest * reach + 512 < 1 << 24:
+            block, largest = _predicted(symbols[:, rows].astype(np.float64), predicted)
+        if largest > K_MAX:
             raise Malformed(f"a predicted attribute over {K_MAX} in magnitude")
         symbols[:, rows] = block
+
+
+def _predicted(block: np.ndarray, terms: Sequence[tuple[int, Terms]]) -> tuple[np.ndarray, float]:
+    """(symbols [channels, n], made in place of their residuals, the largest magnitude among them)."""
+    with np.errstate(all="ignore"):  # what overflows in binary32 is done again
+        for c, term in terms:
+            block[c] += term.prediction(block)
+    return block, max(float(block.max()), -float(block.min()))
 
 
 def _read_classes(reader: ByteReader, rows: int) -> np.ndarray:

@@ -204,20 +204,23 @@ def decode_joined(payload: bytes | memoryview, counts: Sequence[int], known: lis
             raise LimitExceeded(f"channel {index}: {count} symbols, limit {MAX_COUNT}")
     reader = ByteReader(payload)
     defined = [] if known is None else known
-    first, heads, entries = len(defined), [], 0
+    first, heads, entries = len(defined), list[_Head](), 0
     most = sum(counts) + (MORE_ENTRIES if defined else FREE_ENTRIES)
-    for count in counts:
-        if count:
-            before = len(defined)
-            heads.append(_read_channel(reader, count, defined))
-            if len(defined) > before:
-                entries += defined[-1].window.n
+    for count in filter(None, counts):
+        before = len(defined)
+        head = _read_channel(reader, count, defined)
+        if len(defined) > before:
+            entries += defined[-1].window.n
             if entries > most:
                 raise LimitExceeded(f"tables of {entries} entries in one section, limit {most}")
+        elif heads and head[0] == heads[-1][0] and (longer := _joined(heads[-1], head, defined)):
+            heads[-1] = longer
+            continue
+        heads.append(head)
     stream = AnsDecoder(reader.rest())
     _complete(defined, first, stream)
     symbols, end = np.empty(sum(counts), np.int32), 0
-    for (index, exceptions), count in zip(heads, filter(None, counts), strict=True):
+    for index, count, exceptions in heads:
         end += count
         _take_channel(stream, defined[index], exceptions, symbols[end - count : end])
     stream.finish()
@@ -234,8 +237,18 @@ def _complete(defined: list[Prior], first: int, stream: AnsDecoder) -> None:
         defined[at] = prior
 
 
-def _read_channel(reader: ByteReader, count: int, defined: list[Prior]) -> tuple[int, _Exceptions | None]:
-    """One channel's head: the index of its prior among those defined so far, and its exceptions."""
+#: Of a channel: the index of its prior among those defined, its symbols, and which of them are exceptions.
+_Head = tuple[int, int, _Exceptions | None]
+
+
+def _joined(one: _Head, next: _Head, defined: list[Prior]) -> _Head | None:
+    """The head of two channels of one prior as one, if their symbols follow each other under its table."""
+    (index, some, exceptions), (_, more, others) = one, next
+    apart = exceptions or others or defined[index].window.shift or some + more > MAX_COUNT
+    return None if apart else (index, some + more, None)
+
+
+def _read_channel(reader: ByteReader, count: int, defined: list[Prior]) -> _Head:
     at = reader.offset
     token = reader.varint(2 * (FIRST_REUSE + MAX_COUNT), "a channel's prior")
     family = token >> 1
@@ -246,7 +259,7 @@ def _read_channel(reader: ByteReader, count: int, defined: list[Prior]) -> tuple
         index = len(defined) - 1 - (family - FIRST_REUSE)
         if index < 0:
             raise Malformed(f"a channel reuses a prior {-index} before the first", offset=at)
-    return index, _read_exceptions(reader, count, defined[index].window) if token & 1 else None
+    return index, count, _read_exceptions(reader, count, defined[index].window) if token & 1 else None
 
 
 @cache
