@@ -253,8 +253,7 @@ def _fit_block(symbols: np.ndarray, grades: np.ndarray, widths: Widths) -> Block
         if stage in _split_stages(widths):
             counts.append(cheapest_class_count([(residuals, activity.now)]))
         if stage < len(STAGES) - 1:
-            for channel in residuals:
-                activity.add(channel)
+            activity.add(residuals)
     return Block(widths, terms, counts, splits)
 
 
@@ -279,7 +278,7 @@ def _activity(rows: int, grades: np.ndarray, scale: Scale | None = None) -> Acti
     """That of rows before stage 0: of those step classes, GRADE_WEIGHT times that of a channel of 2^(6 - class)."""
     activity = Activity(rows, scale)
     if grades.size:
-        activity.add(1 << (MAX_CLASS - grades), GRADE_WEIGHT)
+        activity.add(1 << (MAX_CLASS - grades[None]), GRADE_WEIGHT)
     return activity
 
 
@@ -326,8 +325,7 @@ def _groups(
         channels = next(residuals) if stage < len(STAGES) - 1 else symbols[offsets.start :: offsets.step]
         yield [(channels, places)]
         if any(later > 1 for later in counts[stage + 1 :]):
-            for channel in channels:
-                activity.add(channel)
+            activity.add(channels)
     for axis, flag, count in ((1, SPLIT_Y, Y_CLASSES), (2, SPLIT_Z, Z_CLASSES)):
         groups: list[Group] = []
         for first, split in zip(offsets, block.splits, strict=True):

@@ -73,8 +73,7 @@ def _write_staged(residuals: Sequence[np.ndarray], effort: int) -> CodedSection:
             ]
             counts.append(cheapest_class_count(groups))
         for plane, activity in zip(planes, activities, strict=True):
-            for channel in plane[first:end]:
-                activity.add(channel)
+            activity.add(plane[first:end])
     out = bytearray([STAGED])
     for count in counts:
         put_varint(out, count)
@@ -106,8 +105,7 @@ def _groups(planes: Sequence[np.ndarray], shapes: Sequence[Shape], counts: Seque
         yield groups
         if any(later > 1 for later in counts[stage:]):
             for plane, activity in zip(planes, activities, strict=True):
-                for channel in plane[first:end]:
-                    activity.add(channel)
+                activity.add(plane[first:end])
 
 
 def _around(activity: np.ndarray, shape: Shape) -> np.ndarray:

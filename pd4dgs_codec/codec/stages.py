@@ -24,6 +24,7 @@ from pd4dgs_codec.errors import Malformed
 PLAIN, STAGED = 0, 1
 MAX_CLASSES = 8
 EXACT = 1 << 53  #: binary64 holds every integer up to here
+SHARES = 1 << 16  #: of an activity, worked out at a time: many channels of small planes, one of many anchors
 #: Encoder: numbers of classes to try, and about what each further prior costs.
 CLASS_COUNTS = (1, 2, 3, 4, 5, 6, 8)
 PRIOR_BITS = 40
@@ -36,8 +37,7 @@ def relative_magnitude(residuals: np.ndarray, scale: Scale | None = None) -> np.
     scale: of other residuals, if theirs are the means that count.
     """
     activity = Activity(residuals.shape[1], scale)
-    for channel in residuals:
-        activity.add(channel)
+    activity.add(residuals)
     return activity.now
 
 
@@ -65,25 +65,30 @@ class Activity:
         return self._total
 
     def add(self, residuals: np.ndarray, times: int = 1) -> None:
-        """One more channel, int [n], as if it stood there so many times."""
+        """Further channels, int [m, n], each as if it stood there so many times."""
+        step = max(1, SHARES // max(1, residuals.shape[1]))
+        for first in range(0, len(residuals), step):
+            self._add(residuals[first : first + step], times)
+
+    def _add(self, residuals: np.ndarray, times: int) -> None:
         shares, sums = residuals.astype(np.float64), self.scale.sums
         np.abs(shares, out=shares)
-        if self._channels == len(sums):
-            sums.append(int(shares.sum()))  # of integers below 2^53
-        else:
-            np.minimum(shares, sums[self._channels], out=shares)
-        unit, divisor = self.scale.places << 8, sums[self._channels] + 1
-        if divisor * unit <= EXACT or int(shares.max(initial=0)) * unit < EXACT:
+        end = self._channels + len(shares)
+        sums += map(int, shares[len(sums) - end :].sum(axis=1).tolist() if len(sums) < end else ())  # below 2^53
+        of_each = np.array(sums[self._channels : end], np.float64)[:, None]
+        self._channels = end
+        np.minimum(shares, of_each, out=shares)
+        unit = self.scale.places << 8
+        if (int(of_each.max()) + 1) * unit <= EXACT or int(shares.max(initial=0)) * unit < EXACT:
             # of integers below 2^53 the rounded quotient has the floor of the true one: processors divide reals faster
             shares *= unit
-            shares /= divisor
+            shares /= of_each + 1
             np.floor(shares, out=shares)
         else:
-            shares = (shares.astype(np.int64) * unit // divisor).astype(np.float64)
+            shares = (shares.astype(np.int64) * unit // (of_each.astype(np.int64) + 1)).astype(np.float64)
         if times > 1:
             shares *= times
-        self._total += shares
-        self._channels += 1
+        self._total += shares.sum(axis=0)
 
 
 def activity_bounds(activity: np.ndarray, count: int) -> np.ndarray:
