@@ -25,6 +25,7 @@ import os
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
+from importlib import import_module
 from pathlib import Path
 from typing import Any
 
@@ -142,6 +143,24 @@ def set_kernel_threads(threads: int) -> None:
     """Threads of the CPU kernels from the next call on."""
     global _kernel_threads
     _kernel_threads = threads
+
+
+#: What numba loads where it is installed, for the matrix products and the line counts of a kernel. Ours have neither.
+_BESIDE_NUMBA = ("scipy", "coverage")
+
+
+def load_numba() -> None:
+    """Imports numba without its idle companions, which take a quarter of a second of a first picture.
+
+    For processes that run nothing but our kernels: afterwards numba compiles no matrix product.
+    """
+    hidden = [name for name in _BESIDE_NUMBA if name not in sys.modules]
+    sys.modules.update(dict.fromkeys(hidden))  # type: ignore[arg-type]  # None: an import of it fails
+    try:
+        import_module("numba.np.arraymath")  # which looks for both
+    finally:
+        for name in hidden:
+            del sys.modules[name]
 
 
 def limit_numba() -> None:

@@ -32,11 +32,15 @@ EFFORTS = (1, 3, 5, 7, 9)
 GROWTH = (10_000, 100_000, 300_000, 1_000_000)
 #: Runs in either checkout, so it keeps to what both have. argv: what to measure, a checkpoint, a file, options.
 PROGRAM = Path(__file__).parent / "pages" / "stopwatch.py"
+#: Of both checkouts, kept as that of an installed package is: else commands compile their modules anew each time.
+BYTECODE = tempfile.TemporaryDirectory(prefix="pd4dgs-bytecode-")
 
 
 def run(checkout: Path, what: str, *arguments: str) -> Row:
     """What the stopwatch prints, measured with the package of `checkout` in a process of its own."""
-    environment = os.environ | {"PYTHONPATH": str(checkout)} | ({"OMP_NUM_THREADS": "1"} if what == "step" else {})
+    environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
+    environment |= {"PYTHONPATH": str(checkout), "PYTHONPYCACHEPREFIX": BYTECODE.name}
+    environment |= {"OMP_NUM_THREADS": "1"} if what == "step" else {}
     command = [sys.executable, str(PROGRAM), what, *arguments]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=checkout)
     if done.returncode:

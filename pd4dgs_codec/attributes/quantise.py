@@ -59,9 +59,18 @@ def all_finite(k: np.ndarray, step: float) -> bool:
 
 def dequantise(k: np.ndarray, step: float, centre: Integers = 0, spacing: Integers = 1) -> np.ndarray:
     """x_hat = binary32(binary64(centre + k spacing) * binary64(step)), float32 of k's shape: an exact product and one
-    rounding."""
+    rounding.
+
+    So is that product in binary32, because |k|, |centre| and |centre + k spacing| are at most MAX_SYMBOL, spacings are
+    powers of two and the step is a binary32: all that is rounded is the last result.
+    """
+    values: np.ndarray = k.astype(np.float32)
+    if np.ndim(spacing) or spacing != 1:
+        values *= np.asarray(spacing, np.float32)
+    if np.any(centre):
+        values += np.asarray(centre, np.float32)
     with np.errstate(over="ignore"):  # an overflow to infinity is the caller's to refuse, see all_finite
-        values: np.ndarray = ((centre + k.astype(np.float64) * spacing) * np.float64(step)).astype(np.float32)
+        values *= np.float32(step)
     return values
 
 

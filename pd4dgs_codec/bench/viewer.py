@@ -64,6 +64,7 @@ def own_camera(info: SceneInfo, size: tuple[int, int]) -> Camera:
 def main(url: str, width: str, height: str) -> None:
     """Imports and kernels load in a thread while the bytes arrive."""
     threads.configure()
+    threads.load_numba()
     warming = threading.Thread(target=warm_up)
     warming.start()
     for shown in pictures(url, (int(width), int(height)), ready=warming.join):

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
 import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
@@ -128,6 +127,8 @@ class Console:
     def result(self, data: dict[str, Any], text: str, *, on_stdout: bool) -> None:
         """The outcome: `data` with --json, else `text`, on stdout where it is what was asked for, else on stderr."""
         if self.json:
+            import json
+
             print(json.dumps(finite(data)), flush=True)
         elif on_stdout:
             print(text, flush=True)
@@ -226,6 +227,8 @@ def _fail(parser: Parser, error: BaseException, message: str, as_json: bool, cod
     line = " ".join(message.split())
     say(f"{parser.prog}: error: {line}")
     if as_json:
+        import json
+
         content: dict[str, Any] = {"type": type(error).__name__, "message": line}
         if isinstance(error, DecodeError) and error.offset is not None:
             content["offset"] = error.offset

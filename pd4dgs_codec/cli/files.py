@@ -6,7 +6,6 @@ import io
 import sys
 from pathlib import Path
 
-from pd4dgs_codec import atomic
 from pd4dgs_codec.cli.common import UsageError
 
 STDIO = "-"
@@ -43,12 +42,16 @@ def is_pd4(data: bytes) -> bool:
 def check_output(path: str, overwrite: bool) -> None:
     """Refuses, before any work, an output that exists or a folder that cannot take it."""
     if path != STDIO:
+        from pd4dgs_codec import atomic  # where nothing is written, nothing waits for it
+
         atomic.check_output(path, overwrite)
 
 
 def write_bytes(path: str, data: bytes, overwrite: bool) -> None:
     """Writes all of `data`, to a file whole or not at all."""
     if path != STDIO:
+        from pd4dgs_codec import atomic
+
         atomic.write_bytes(path, data, overwrite)
         return
     sys.stdout.buffer.write(data)

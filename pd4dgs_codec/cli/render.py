@@ -14,6 +14,7 @@ from pd4dgs_codec.cli import values
 from pd4dgs_codec.cli.common import OK, SOURCES, Console, Parser, UsageError, add_reading, run
 from pd4dgs_codec.cli.files import STDIO, check_output, named_input
 from pd4dgs_codec.cli.progress import progress_bar
+from pd4dgs_codec.threads import load_numba
 
 if TYPE_CHECKING:
     import numpy as np
@@ -68,6 +69,7 @@ def _render(args: argparse.Namespace, console: Console) -> int:
     kind = _check_usage(args)
     if kind in VIDEOS:
         check_output(args.output, args.overwrite)
+    load_numba()
     from pd4dgs_codec.view.levels import load_levels
 
     if kind == ".mp4":

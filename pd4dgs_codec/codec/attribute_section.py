@@ -45,19 +45,21 @@ from pd4dgs_codec.codec.stages import (
     PRIOR_BITS,
     STAGED,
     Activity,
-    Cells,
     CodedSection,
+    Group,
+    Places,
     Scale,
     activity_bounds,
     cheapest_class_count,
+    classes_within,
     coded_stages,
-    places_of,
+    parts_of,
     read_class_count,
     read_stages,
     smaller_form,
 )
 from pd4dgs_codec.entropy.bits import entropy_bits
-from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
+from pd4dgs_codec.entropy.channels import decode_channels, decode_joined, encode_channels
 from pd4dgs_codec.entropy.fitting import Fitted
 from pd4dgs_codec.entropy.priors import K_MAX, Prior
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
@@ -98,10 +100,17 @@ class Terms:
         dense[self.channels] = self.weights / (1 << WEIGHT_SHIFT)
         return dense
 
+    @cached_property
+    def reach(self) -> int:
+        """How often the largest magnitude the sum of products can be, in its units of 2^-10."""
+        return int(np.abs(self.weights).sum())
+
     def prediction(self, symbols: np.ndarray) -> np.ndarray:
         """Integers [n] from integers [>= max channel + 1, n] of magnitude <= K_MAX, all in binary64, where their sums
-        of products, below 2^45, are exact. einsum starts no threads."""
-        predicted: np.ndarray = np.einsum("i,ij->j", self._dense, symbols[: len(self._dense)])
+        of products, below 2^45, are exact; or in binary32, where they are as long as they stay below 2^14. einsum
+        starts no threads."""
+        dense = self._dense.astype(symbols.dtype, copy=False)
+        predicted: np.ndarray = np.einsum("i,ij->j", dense, symbols[: len(dense)])
         predicted += 0.5
         np.floor(predicted, out=predicted)
         return predicted
@@ -144,7 +153,7 @@ class Block:
     """The prediction block.
 
     widths: of the anchors. counts: of classes, of stages 1 to 5, with step classes 0 to 5. scale, and by stage the
-    activity int64 [classes - 1] at which each class but the first begins: of the slice that the block stands in; known
+    activity [classes - 1] at which each class but the first begins: of the slice that the block stands in; known
     once that slice has been coded so far.
     """
 
@@ -156,12 +165,11 @@ class Block:
     bounds: dict[int, np.ndarray] = field(default_factory=dict)
 
     def classes(self, activity: np.ndarray, stage: int, count: int) -> np.ndarray:
-        """int64 [n] of rows with this activity in the stages before."""
+        """uint8 [n] of rows with this activity in the stages before."""
         bounds = self.bounds.get(stage)
         if bounds is None:
             bounds = self.bounds[stage] = activity_bounds(activity, count)
-        classes: np.ndarray = np.searchsorted(bounds, activity, side="right")
-        return classes
+        return classes_within(activity, bounds)
 
 
 AnyPrior = TypeVar("AnyPrior", Prior, Fitted)
@@ -232,8 +240,7 @@ def by_class(attributes: np.ndarray, classes: np.ndarray) -> Iterator[np.ndarray
     if not classes.size:
         yield from attributes
         return
-    parts = places_of(classes, MAX_CLASS + 1)
-    yield from (channel[rows] for channel in attributes for rows in parts)
+    yield from Places.by(classes, MAX_CLASS + 1).parts(attributes)
 
 
 def _fit_block(symbols: np.ndarray, grades: np.ndarray, widths: Widths) -> Block:
@@ -246,8 +253,7 @@ def _fit_block(symbols: np.ndarray, grades: np.ndarray, widths: Widths) -> Block
         if stage in _split_stages(widths):
             counts.append(cheapest_class_count([(residuals, activity.now)]))
         if stage < len(STAGES) - 1:
-            for channel in residuals:
-                activity.add(channel)
+            activity.add(residuals)
     return Block(widths, terms, counts, splits)
 
 
@@ -272,7 +278,7 @@ def _activity(rows: int, grades: np.ndarray, scale: Scale | None = None) -> Acti
     """That of rows before stage 0: of those step classes, GRADE_WEIGHT times that of a channel of 2^(6 - class)."""
     activity = Activity(rows, scale)
     if grades.size:
-        activity.add(1 << (MAX_CLASS - grades), GRADE_WEIGHT)
+        activity.add(1 << (MAX_CLASS - grades[None]), GRADE_WEIGHT)
     return activity
 
 
@@ -284,9 +290,7 @@ def _write_staged(
         out = bytearray([STAGED])
         _put_block(out, block)
     coded = (_residuals(symbols, block.terms, channels) for channels in _measured_stages(block.widths))
-    places = _places(symbols, coded, grades, block)
-    stages = ([channel[rows] for channel, rows in channels] for channels in places)
-    return coded_stages(out, stages, effort, past.stages)
+    return coded_stages(out, map(parts_of, _groups(symbols, coded, grades, block)), effort, past.stages)
 
 
 def _put_block(out: bytearray, block: Block) -> None:
@@ -305,33 +309,31 @@ def _put_block(out: bytearray, block: Block) -> None:
             put_zigzag(out, split.centre_y)
 
 
-def _places(
+def _groups(
     symbols: np.ndarray, residuals: Iterator[np.ndarray], grades: np.ndarray, block: Block
-) -> Iterator[list[tuple[np.ndarray, Cells]]]:
-    """Per stage, the (channel, rows) that it codes, in order. residuals: int32 [channels, n] of each of
-    `_measured_stages`. They and `symbols` int32 [channels, n], of which the offsets are read here, are read only as far
-    as the stages before reach."""
+) -> Iterator[list[Group]]:
+    """Per stage, what it codes. residuals: int32 [channels, n] of each of `_measured_stages`. They and `symbols` int32
+    [channels, n], of which the offsets are read here, are read only as far as the stages before reach."""
     counts = block.counts if block.widths.graded else [1, *block.counts]
-    activity = _activity(symbols.shape[1], grades, block.scale)
+    activity, whole = _activity(symbols.shape[1], grades, block.scale), Places.whole(symbols.shape[1])
     block.scale = activity.scale
     offsets = stage_channels(block.widths, len(STAGES) - 1)
     for stage, count in enumerate(counts):
-        parts: list[Cells] = [slice(None)]
+        places = whole
         if count > 1:
-            parts = list(places_of(block.classes(activity.now, stage, count), count))
+            places = Places.by(block.classes(activity.now, stage, count), count)
         channels = next(residuals) if stage < len(STAGES) - 1 else symbols[offsets.start :: offsets.step]
-        yield [(channel, part) for channel in channels for part in parts]
+        yield [(channels, places)]
         if any(later > 1 for later in counts[stage + 1 :]):
-            for channel in channels:
-                activity.add(channel)
+            activity.add(channels)
     for axis, flag, count in ((1, SPLIT_Y, Y_CLASSES), (2, SPLIT_Z, Z_CLASSES)):
-        places: list[tuple[np.ndarray, Cells]] = []
+        groups: list[Group] = []
         for first, split in zip(offsets, block.splits, strict=True):
-            x, y, parts = symbols[first], symbols[first + 1], [slice(None)]
+            x, y, places = symbols[first], symbols[first + 1], whole
             if split.flags & flag:
-                parts = list(places_of(split.y_classes(x) if axis == 1 else split.z_classes(x, y), count))
-            places += [(symbols[first + axis], part) for part in parts]
-        yield places
+                places = Places.by(split.y_classes(x) if axis == 1 else split.z_classes(x, y), count)
+            groups.append((symbols[first + axis : first + axis + 1], places))
+        yield groups
 
 
 def _measured_stages(widths: Widths) -> list[range]:
@@ -421,7 +423,7 @@ def read_attributes(
         raise Malformed("attributes that go on with a prediction block, but no slice before has one")
     symbols = np.zeros((widths.channels, rows), np.int32)
     coded = (symbols[channels.start : channels.stop] for channels in _measured_stages(widths))
-    read_stages(reader, N_STAGES, _places(symbols, coded, classes, block), past.stages if past else None)
+    read_stages(reader, N_STAGES, _groups(symbols, coded, classes, block), past.stages if past else None)
     if past:
         past.block = block
     _restore(symbols[: widths.predicted], block.terms)
@@ -431,13 +433,23 @@ def read_attributes(
 def _restore(symbols: np.ndarray, terms: Sequence[Terms]) -> None:
     """Residuals int32 [channels, n] become the symbols, in place. Raises Malformed if one is over K_MAX."""
     predicted = [(c, term) for c, term in enumerate(terms, start=1) if term.channels.size]
+    reach = max([term.reach for _, term in predicted], default=0)
     for rows in _row_blocks(symbols) if predicted else ():
-        block = symbols[:, rows].astype(np.float64)
-        for c, term in predicted:
-            block[c] += term.prediction(block)
-        if max(block.max(), -block.min()) > K_MAX:
+        block, largest = _predicted(symbols[:, rows].astype(np.float32), predicted)
+        # so far sums of products and 1/2 are multiples of 2^-10 below 2^14, and binary32 has them all
+        if not largest * reach + 512 < 1 << 24:
+            block, largest = _predicted(symbols[:, rows].astype(np.float64), predicted)
+        if largest > K_MAX:
             raise Malformed(f"a predicted attribute over {K_MAX} in magnitude")
         symbols[:, rows] = block
+
+
+def _predicted(block: np.ndarray, terms: Sequence[tuple[int, Terms]]) -> tuple[np.ndarray, float]:
+    """(symbols [channels, n], made in place of their residuals, the largest magnitude among them)."""
+    with np.errstate(all="ignore"):  # what overflows in binary32 is done again
+        for c, term in terms:
+            block[c] += term.prediction(block)
+    return block, max(float(block.max()), -float(block.min()))
 
 
 def _read_classes(reader: ByteReader, rows: int) -> np.ndarray:
@@ -457,12 +469,10 @@ def _read_plain(
     data: memoryview, classes: np.ndarray, widths: Widths, rows: int, known: list[Prior] | None
 ) -> np.ndarray:
     if not widths.graded:
-        return np.stack(decode_channels(data, [rows] * widths.channels, known))
-    parts = places_of(classes, MAX_CLASS + 1)
-    symbols = np.zeros((widths.channels, rows), np.int32)
-    decoded = decode_channels(data, [len(part) for part in parts] * widths.channels, known)
-    for i, values in enumerate(decoded):
-        symbols[i // len(parts), parts[i % len(parts)]] = values
+        return decode_joined(data, [rows] * widths.channels, known).reshape(widths.channels, rows)
+    places = Places.by(classes, MAX_CLASS + 1)
+    symbols = np.empty((widths.channels, rows), np.int32)
+    places.put(decode_joined(data, places.sizes * widths.channels, known), symbols)
     return symbols
 
 

@@ -10,6 +10,7 @@ the border repeated. In a stage, planes come in order, then channels, then class
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from itertools import accumulate
 
 import numpy as np
 
@@ -17,17 +18,18 @@ from pd4dgs_codec.codec.stages import (
     PLAIN,
     STAGED,
     Activity,
-    Cells,
     CodedSection,
+    Group,
+    Places,
     activity_classes,
     cheapest_class_count,
     coded_stages,
-    places_of,
+    parts_of,
     read_class_count,
     read_stages,
     smaller_form,
 )
-from pd4dgs_codec.entropy.channels import decode_channels
+from pd4dgs_codec.entropy.channels import decode_joined
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint
 from pd4dgs_codec.errors import UnsupportedFeature
 
@@ -46,14 +48,15 @@ def read_planes(data: bytes, shapes: Sequence[Shape]) -> list[np.ndarray]:
     reader = ByteReader(data)
     form = reader.byte("the form of the planes")
     if form == PLAIN:
-        channels = iter(decode_channels(reader.rest(), [h * w for c, h, w in shapes for _ in range(c)]))
-        return [np.stack([next(channels) for _ in range(c)]).reshape(c, h, w) for c, h, w in shapes]
+        symbols = decode_joined(reader.rest(), [h * w for c, h, w in shapes for _ in range(c)])
+        ends = accumulate(c * h * w for c, h, w in shapes)
+        return [symbols[end - c * h * w : end].reshape(c, h, w) for (c, h, w), end in zip(shapes, ends, strict=True)]
     if form != STAGED:
         raise UnsupportedFeature(f"form {form} of the planes, expected {PLAIN} or {STAGED}")
     number = _stage_count(shapes)
     counts = [read_class_count(reader, stage) for stage in range(1, number)]
     planes = [np.zeros((c, h * w), np.int32) for c, h, w in shapes]
-    read_stages(reader, number, _places(planes, shapes, counts))
+    read_stages(reader, number, _groups(planes, shapes, counts))
     return [plane.reshape(shape) for plane, shape in zip(planes, shapes, strict=True)]
 
 
@@ -70,13 +73,11 @@ def _write_staged(residuals: Sequence[np.ndarray], effort: int) -> CodedSection:
             ]
             counts.append(cheapest_class_count(groups))
         for plane, activity in zip(planes, activities, strict=True):
-            for channel in plane[first:end]:
-                activity.add(channel)
+            activity.add(plane[first:end])
     out = bytearray([STAGED])
     for count in counts:
         put_varint(out, count)
-    stages = ([channel[at] for channel, at in places] for places in _places(planes, shapes, counts))
-    return coded_stages(out, stages, effort)
+    return coded_stages(out, map(parts_of, _groups(planes, shapes, counts)), effort)
 
 
 def _stage_count(shapes: Sequence[Shape]) -> int:
@@ -89,31 +90,37 @@ def _bounds(stage: int) -> tuple[int, int]:
     return (1 << stage if stage else 0), 2 << stage
 
 
-def _places(
-    planes: Sequence[np.ndarray], shapes: Sequence[Shape], counts: Sequence[int]
-) -> Iterator[list[tuple[np.ndarray, Cells]]]:
-    """Per stage, the (channel, cells) that it codes, in order. `planes` int32 [C, H * W] are read only as far as the
-    stages before reach."""
+def _groups(planes: Sequence[np.ndarray], shapes: Sequence[Shape], counts: Sequence[int]) -> Iterator[list[Group]]:
+    """Per stage, what it codes of each plane. `planes` int32 [C, H * W] are read only as far as the stages before
+    reach."""
     activities = [Activity(plane.shape[1]) for plane in planes]
     for stage, count in enumerate((1, *counts)):
         first, end = _bounds(stage)
-        places: list[tuple[np.ndarray, Cells]] = []
+        groups: list[Group] = []
         for plane, activity, shape in zip(planes, activities, shapes, strict=True):
-            parts: list[Cells] = [slice(None)]
+            places = Places.whole(plane.shape[1])
             if count > 1:
-                parts = list(places_of(activity_classes(_around(activity.now, shape), count), count))
-            places += [(channel, part) for channel in plane[first:end] for part in parts]
-        yield places
+                places = Places.by(activity_classes(_around(activity.now, shape), count), count)
+            groups.append((plane[first:end], places))
+        yield groups
         if any(later > 1 for later in counts[stage:]):
             for plane, activity in zip(planes, activities, strict=True):
-                for channel in plane[first:end]:
-                    activity.add(channel)
+                activity.add(plane[first:end])
 
 
 def _around(activity: np.ndarray, shape: Shape) -> np.ndarray:
-    """int64 [H * W]: activity int64 [H * W] summed over 3 x 3 cells, the border repeated."""
+    """[H * W]: activity [H * W] summed over 3 x 3 cells, the border repeated."""
     _, height, width = shape
-    padded = np.pad(activity.reshape(height, width), 1, mode="edge")
-    columns = padded[:, :-2] + padded[:, 1:-1] + padded[:, 2:]
-    around: np.ndarray = columns[:-2] + columns[1:-1] + columns[2:]
-    return around.ravel()
+    cells = activity.reshape(height, width)
+    around: np.ndarray = _of_three(_of_three(cells).T).T.ravel()
+    return around
+
+
+def _of_three(cells: np.ndarray) -> np.ndarray:
+    """[H, W]: each cell with the one before and the one behind it in its row, the first and the last repeated."""
+    sums: np.ndarray = cells.copy(order="K")
+    sums[:, 1:] += cells[:, :-1]
+    sums[:, :-1] += cells[:, 1:]
+    sums[:, 0] += cells[:, 0]
+    sums[:, -1] += cells[:, -1]
+    return sums

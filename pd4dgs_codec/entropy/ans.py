@@ -14,6 +14,7 @@ process on a count it cannot allocate. So everything is checked before it sees i
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import TypeAlias
 
 import constriction
 import numpy as np
@@ -30,14 +31,38 @@ def _frequencies(cum: np.ndarray, error: type[Pd4Error], where: str = "") -> np.
     if cum.ndim != 1 or len(cum) < 2 or cum[0] != 0 or cum[-1] != TOTAL:
         raise error(f"{where}a frequency table must run from 0 to {TOTAL}")
     frequencies: np.ndarray = cum[1:] - cum[:-1]
-    if frequencies[frequencies.argmin()] < 1:  # a tenth of the time that min() takes on the short tables of positions
+    if frequencies[frequencies.argmin()] < 1:  # a tenth of the time that min() takes on short tables
         raise error(f"{where}a frequency table has a symbol of zero frequency")
     return frequencies
 
 
-def _model(frequencies: np.ndarray) -> constriction.stream.model.Categorical:
-    # Passed like this, constriction's own rounding has scale exactly 1 and reproduces the integer table.
-    return constriction.stream.model.Categorical((frequencies - 1).astype(np.float64), perfect=False)
+#: A table as constriction has it. Passed less one, its own rounding has scale exactly 1 and reproduces the integers.
+Model: TypeAlias = constriction.stream.model.Categorical
+
+
+def _model(frequencies: np.ndarray) -> Model:
+    return Model((frequencies - 1).astype(np.float64), perfect=False)
+
+
+def model_of(cum: np.ndarray) -> Model | None:
+    """What a stream decodes with, of a table int64 [n + 1]; None where it has one symbol. Raises Malformed for what is
+    no table."""
+    frequencies = _frequencies(cum, Malformed)
+    return _model(frequencies) if len(frequencies) > 1 else None
+
+
+def models_of_each(cums: np.ndarray, sizes: np.ndarray) -> list[Model | None]:
+    """`model_of` of tables one behind the other, int64 [sum of sizes + 1], in one pass."""
+    ends = np.cumsum(sizes + 1)
+    firsts = ends - sizes - 1
+    frequencies = np.empty(len(cums))
+    np.subtract(cums[1:], cums[:-1], out=frequencies[:-1])
+    frequencies -= 1
+    frequencies[ends - 1] = 0  # what lies between two tables
+    if cums[firsts].any() or np.any(cums[ends - 1] != TOTAL) or frequencies.min(initial=0) < 0:
+        raise Malformed(f"a frequency table does not ascend from 0 to {TOTAL}")
+    pairs = zip(firsts.tolist(), sizes.tolist(), strict=True)
+    return [Model(frequencies[at : at + n], perfect=False) if n > 1 else None for at, n in pairs]
 
 
 def ans_encode(channels: Sequence[np.ndarray], cums: Sequence[np.ndarray]) -> bytes:
@@ -74,24 +99,15 @@ class AnsDecoder:
         if len(words) and words[-1] == 0:
             raise Malformed("an ANS stream begins with a zero word")
         self._coder = constriction.stream.stack.AnsCoder(np.ascontiguousarray(words))
-        self._models: dict[int, tuple[np.ndarray, constriction.stream.model.Categorical | None]] = {}
 
-    def take(self, count: int, cum: np.ndarray) -> np.ndarray:
-        """The next `count` symbols under the table, int32 [count]. Junk bytes decode to junk: see finish().
-
-        The table must not change any more: many channels share one, whose model is kept.
-        """
+    def take(self, count: int, model: Model | None) -> np.ndarray:
+        """The next `count` symbols under a table, int32 [count]. Junk bytes decode to junk: see finish()."""
         if not 0 <= count <= MAX_COUNT:
             raise LimitExceeded(f"{count} symbols in one channel, limit {MAX_COUNT}")
-        known = self._models.get(id(cum))
-        if known is None:
-            frequencies = _frequencies(cum, Malformed)
-            known = cum, _model(frequencies) if len(frequencies) > 1 else None
-            self._models[id(cum)] = known  # which keeps the table, so that no other takes its id
-        model = known[1]
         if count == 0 or model is None:
             return np.zeros(count, dtype=np.int32)
-        return np.asarray(self._coder.decode(model, count), dtype=np.int32)
+        symbols: np.ndarray = self._coder.decode(model, count)
+        return symbols
 
     def finish(self) -> None:
         """Raise Malformed unless exactly the stream's symbols have been taken: state 0 and no words left.

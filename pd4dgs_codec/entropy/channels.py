@@ -13,11 +13,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cache
+from itertools import accumulate
 
 import numpy as np
 
 from pd4dgs_codec.entropy import EFFORTS, PRIORS
-from pd4dgs_codec.entropy.ans import MAX_COUNT, AnsDecoder, ans_encode
+from pd4dgs_codec.entropy.ans import MAX_COUNT, AnsDecoder, Model, ans_encode, model_of
 from pd4dgs_codec.entropy.bits import BIT
 from pd4dgs_codec.entropy.fitting import Fitted, fit_best, histogram
 from pd4dgs_codec.entropy.priors import (
@@ -30,8 +31,9 @@ from pd4dgs_codec.entropy.priors import (
     Prior,
     Window,
     family_code,
-    make_tables,
+    make_models,
     read_prior,
+    with_class_symbols,
     write_prior,
 )
 from pd4dgs_codec.entropy.sharing import Fit, plan_priors
@@ -184,7 +186,14 @@ def _read_exceptions(reader: ByteReader, count: int, window: Window) -> _Excepti
 def decode_channels(
     payload: bytes | memoryview, counts: Sequence[int], known: list[Prior] | None = None
 ) -> list[np.ndarray]:
-    """Inverse of encode_channels: one int32 [count] array per count.
+    """Inverse of encode_channels: one int32 [count] array per count; see `decode_joined`."""
+    symbols = decode_joined(payload, counts, known)
+    ends = accumulate(counts)
+    return [symbols[end - count : end] for count, end in zip(counts, ends, strict=True)]
+
+
+def decode_joined(payload: bytes | memoryview, counts: Sequence[int], known: list[Prior] | None = None) -> np.ndarray:
+    """int32 [sum of counts]: the channels of a payload one behind the other.
 
     known: what the payloads before defined, in order; this one's definitions are appended. The caller has held the
     counts against its limits. Raises Malformed (cut, trailing or corrupt bytes),
@@ -195,36 +204,51 @@ def decode_channels(
             raise LimitExceeded(f"channel {index}: {count} symbols, limit {MAX_COUNT}")
     reader = ByteReader(payload)
     defined = [] if known is None else known
-    first, heads, entries = len(defined), [], 0
+    first, heads, entries = len(defined), list[_Head](), 0
     most = sum(counts) + (MORE_ENTRIES if defined else FREE_ENTRIES)
-    for count in counts:
-        if count:
-            before = len(defined)
-            heads.append(_read_channel(reader, count, defined))
-            if len(defined) > before:
-                entries += defined[-1].window.n
+    for count in filter(None, counts):
+        before = len(defined)
+        head = _read_channel(reader, count, defined)
+        if len(defined) > before:
+            entries += defined[-1].window.n
             if entries > most:
                 raise LimitExceeded(f"tables of {entries} entries in one section, limit {most}")
-    stream = AnsDecoder(reader.rest())
-    make_tables(defined[first:])
-    for at in range(first, len(defined)):
-        prior = defined[at]
-        if isinstance(prior, Hist):
-            defined[at] = prior.with_class_symbols(stream.take(prior.window.n, prior.class_cum))
-    remaining = iter(heads)
-    arrays = []
-    for count in counts:
-        if count == 0:
-            arrays.append(np.zeros(0, dtype=np.int32))
+        elif heads and head[0] == heads[-1][0] and (longer := _joined(heads[-1], head, defined)):
+            heads[-1] = longer
             continue
-        index, exceptions = next(remaining)
-        arrays.append(_take_channel(stream, count, defined[index], exceptions))
+        heads.append(head)
+    stream = AnsDecoder(reader.rest())
+    _complete(defined, first, stream)
+    symbols, end = np.empty(sum(counts), np.int32), 0
+    for index, count, exceptions in heads:
+        end += count
+        _take_channel(stream, defined[index], exceptions, symbols[end - count : end])
     stream.finish()
-    return arrays
+    return symbols
 
 
-def _read_channel(reader: ByteReader, count: int, defined: list[Prior]) -> tuple[int, _Exceptions | None]:
-    """One channel's head: the index of its prior among those defined so far, and its exceptions."""
+def _complete(defined: list[Prior], first: int, stream: AnsDecoder) -> None:
+    """Makes the models of the priors from `first` on, and takes the classes of the histograms among them."""
+    make_models(defined[first:])
+    places = [at for at in range(first, len(defined)) if isinstance(defined[at], Hist)]
+    histograms = [prior for prior in defined[first:] if isinstance(prior, Hist)]
+    classes = [stream.take(prior.window.n, prior.class_model) for prior in histograms]
+    for at, prior in zip(places, with_class_symbols(histograms, classes), strict=True):
+        defined[at] = prior
+
+
+#: Of a channel: the index of its prior among those defined, its symbols, and which of them are exceptions.
+_Head = tuple[int, int, _Exceptions | None]
+
+
+def _joined(one: _Head, next: _Head, defined: list[Prior]) -> _Head | None:
+    """The head of two channels of one prior as one, if their symbols follow each other under its table."""
+    (index, some, exceptions), (_, more, others) = one, next
+    apart = exceptions or others or defined[index].window.shift or some + more > MAX_COUNT
+    return None if apart else (index, some + more, None)
+
+
+def _read_channel(reader: ByteReader, count: int, defined: list[Prior]) -> _Head:
     at = reader.offset
     token = reader.varint(2 * (FIRST_REUSE + MAX_COUNT), "a channel's prior")
     family = token >> 1
@@ -235,27 +259,25 @@ def _read_channel(reader: ByteReader, count: int, defined: list[Prior]) -> tuple
         index = len(defined) - 1 - (family - FIRST_REUSE)
         if index < 0:
             raise Malformed(f"a channel reuses a prior {-index} before the first", offset=at)
-    return index, _read_exceptions(reader, count, defined[index].window) if token & 1 else None
+    return index, count, _read_exceptions(reader, count, defined[index].window) if token & 1 else None
 
 
 @cache
-def _low_bits(shift: int) -> np.ndarray:
-    """One table for all channels of that shift: a stream keeps the models of those that it has met."""
-    return uniform_table(shift)
+def _low_bits(shift: int) -> Model | None:
+    return model_of(uniform_table(shift))
 
 
-def _take_channel(stream: AnsDecoder, count: int, prior: Prior, exceptions: _Exceptions | None) -> np.ndarray:
-    window, left = prior.window, count - (0 if exceptions is None else len(exceptions.positions))
-    inside = stream.take(left, prior.cum)
+def _take_channel(stream: AnsDecoder, prior: Prior, exceptions: _Exceptions | None, out: np.ndarray) -> None:
+    """Decodes a channel into `out` int32 [count]."""
+    window, left = prior.window, len(out) - (0 if exceptions is None else len(exceptions.positions))
+    inside = stream.take(left, prior.model)
     if window.shift:
         inside = (inside << window.shift) + stream.take(left, _low_bits(window.shift))
         if left and int(inside.max()) + window.kmin > K_MAX:
             raise Malformed(f"symbol {int(inside.max()) + window.kmin}, limit {K_MAX}")
-    inside += np.int32(window.kmin)
     if exceptions is None:
-        return inside
-    array = np.empty(count, dtype=np.int32)
-    listed = np.zeros(count, dtype=bool)
+        np.add(inside, window.kmin, out=out)
+        return
+    listed = np.zeros(len(out), dtype=bool)
     listed[exceptions.positions] = True
-    array[listed], array[~listed] = exceptions.values, inside
-    return array
+    out[listed], out[~listed] = exceptions.values, inside + np.int32(window.kmin)

@@ -9,18 +9,20 @@ Adding a prior: a class with an id, `cum`, `write` and `read`, and its row in _F
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar
+from typing import ClassVar, TypeVar
 
 import numpy as np
 
+from pd4dgs_codec.entropy.ans import Model, model_of, models_of_each
 from pd4dgs_codec.entropy.tables import (
     OCTAVE,
     SI_MAX,
     SI_MIN,
     histogram_table,
+    histogram_tables_of_each,
     mixture_table,
     norm_cdf28_of_each,
     norm_table,
@@ -101,6 +103,10 @@ class Const:
     def cum(self) -> np.ndarray:
         return _ONE_SYMBOL
 
+    @property
+    def model(self) -> None:
+        return None
+
     def write(self, out: bytearray) -> None:
         put_zigzag(out, self.window.kmin)
 
@@ -121,6 +127,10 @@ class Gauss:
     @cached_property
     def cum(self) -> np.ndarray:
         return norm_table(self.window.n, self.normal.mu8, self.normal.si, self.floor)
+
+    @cached_property
+    def model(self) -> Model | None:
+        return model_of(self.cum)
 
     def write(self, out: bytearray) -> None:
         self.window.write(out)
@@ -148,6 +158,10 @@ class Mixture:
     def cum(self) -> np.ndarray:
         first, second = (self.first.mu8, self.first.si), (self.second.mu8, self.second.si)
         return mixture_table(self.window.n, first, second, self.weight, self.floor)
+
+    @cached_property
+    def model(self) -> Model | None:
+        return model_of(self.cum)
 
     def write(self, out: bytearray) -> None:
         self.window.write(out)
@@ -182,10 +196,20 @@ class Hist:
     class_mean16: int  #: mu8 = 16 * class_mean16; 0 and not stored for differences, whose mean is 0
     classes: np.ndarray | None  #: int [n] in 0..top; None until the stream has given them
 
+    @property
+    def class_normal(self) -> tuple[int, Normal]:
+        """Entries and Gaussian of the table of the classes."""
+        n, mu8 = (2 * self.top + 1, 256 * self.top) if self.differences else (self.top + 1, 16 * self.class_mean16)
+        return n, Normal(mu8, 16 * self.class_si16 - 160)
+
     @cached_property
     def class_cum(self) -> np.ndarray:
-        n, mu8 = (2 * self.top + 1, 256 * self.top) if self.differences else (self.top + 1, 16 * self.class_mean16)
-        return norm_table(n, mu8, 16 * self.class_si16 - 160, 1)
+        n, normal = self.class_normal
+        return norm_table(n, normal.mu8, normal.si, 1)
+
+    @cached_property
+    def class_model(self) -> Model | None:
+        return model_of(self.class_cum)
 
     @property
     def class_symbols(self) -> np.ndarray:
@@ -193,17 +217,15 @@ class Hist:
         classes = np.asarray(self.classes, dtype=np.int64)
         return np.diff(classes, prepend=0) + self.top if self.differences else classes
 
-    def with_class_symbols(self, symbols: np.ndarray) -> Hist:
-        classes = np.cumsum(symbols.astype(np.int64) - self.top) if self.differences else symbols.astype(np.int64)
-        if classes.min() < 0 or classes.max() > self.top or classes.max() == 0:
-            raise Malformed(f"histogram classes {classes.min()}..{classes.max()}, expected 0..{self.top}, not all 0")
-        return replace(self, classes=classes)
-
     @cached_property
     def cum(self) -> np.ndarray:
         classes = np.asarray(self.classes, dtype=np.int64)
         below = (self.top - classes) * self.step
         return histogram_table(np.where(classes > 0, OCTAVE[below & 63] >> (below >> 6), 0))
+
+    @cached_property
+    def model(self) -> Model | None:
+        return model_of(self.cum)
 
     def write(self, out: bytearray) -> None:
         self.window.write(out)
@@ -227,6 +249,7 @@ class Hist:
 
 
 Prior = Const | Gauss | Mixture | Hist
+AnyPrior = TypeVar("AnyPrior", bound=Prior)
 _FAMILIES: dict[int, type[Const] | type[Gauss] | type[Mixture] | type[Hist]] = {
     family.id: family for family in (Const, Gauss, Mixture, Hist)
 }
@@ -236,33 +259,80 @@ _FAMILIES: dict[int, type[Const] | type[Gauss] | type[Mixture] | type[Hist]] = {
 BATCH = 1 << 14
 
 
-def make_tables(priors: Sequence[Prior]) -> None:
-    """Fills in `cum` of all Gaussians and mixtures, many in one pass."""
-    batch, entries = list[Gauss | Mixture](), 0
+def make_models(priors: Sequence[Prior]) -> None:
+    """Fills in `model` of Gaussians and mixtures, and `class_model` of histograms, many in one pass."""
+    for batch in _batches([prior for prior in priors if not isinstance(prior, Const)]):
+        for prior, model in zip(batch, models_of_each(*normal_tables(batch)), strict=True):
+            # where cached_property keeps it
+            prior.__dict__["class_model" if isinstance(prior, Hist) else "model"] = model
+
+
+def _batches(priors: Sequence[AnyPrior]) -> Iterator[list[AnyPrior]]:
+    """The priors in order, with windows of about BATCH entries together."""
+    batch, entries = list[AnyPrior](), 0
     for prior in priors:
-        if isinstance(prior, (Gauss, Mixture)):
-            batch.append(prior)
-            entries += prior.window.n
+        batch.append(prior)
+        entries += prior.window.n
         if entries > BATCH:
-            _make_batch(batch)
+            yield batch
             batch, entries = [], 0
     if batch:
-        _make_batch(batch)
+        yield batch
 
 
-def _make_batch(priors: Sequence[Gauss | Mixture]) -> None:
-    sizes, floors = (np.array(v, dtype=np.int64) for v in zip(*((p.window.n, p.floor) for p in priors), strict=True))
-    firsts = [p.first if isinstance(p, Mixture) else p.normal for p in priors]
-    cdf = norm_cdf28_of_each(sizes, *_columns(firsts))
-    mixed = [i for i, p in enumerate(priors) if isinstance(p, Mixture)]
+def normal_tables(priors: Sequence[Prior]) -> tuple[np.ndarray, np.ndarray]:
+    """(tables int64 one behind the other, their entries int64 [m]) of Gaussians, mixtures and histograms' classes."""
+    rows, seconds, weights, mixed = list[tuple[int, Normal, int]](), list[Normal](), list[int](), list[int]()
+    for at, prior in enumerate(priors):
+        if isinstance(prior, Hist):
+            rows.append((*prior.class_normal, 1))
+        elif isinstance(prior, Mixture):
+            rows.append((prior.window.n, prior.first, prior.floor))
+            seconds.append(prior.second)
+            weights.append(prior.weight)
+            mixed.append(at)
+        elif isinstance(prior, Gauss):
+            rows.append((prior.window.n, prior.normal, prior.floor))
+    sizes, floors = (np.array([row[i] for row in rows], dtype=np.int64) for i in (0, 2))
+    cdf = norm_cdf28_of_each(sizes, *_columns([normal for _, normal, _ in rows]))
     if mixed:
-        second = norm_cdf28_of_each(sizes[mixed], *_columns([p.second for p in priors if isinstance(p, Mixture)]))
-        weights = [p.weight for p in priors if isinstance(p, Mixture)]
+        second = norm_cdf28_of_each(sizes[mixed], *_columns(seconds))
         weight = np.repeat(np.array(weights, dtype=np.int64), sizes[mixed] + 1)
-        inside = np.repeat(np.isin(np.arange(len(priors)), mixed), sizes + 1)
+        inside = np.zeros(len(rows), bool)
+        inside[mixed] = True
+        inside = np.repeat(inside, sizes + 1)
         cdf[inside] = ((256 - weight) * cdf[inside] + weight * second) >> 8
-    for prior, cum in zip(priors, tables_of_each(cdf, sizes, floors), strict=True):
-        prior.__dict__["cum"] = cum  # where cached_property keeps it
+    return tables_of_each(cdf, sizes, floors), sizes
+
+
+def with_class_symbols(priors: Sequence[Hist], symbols: Sequence[np.ndarray]) -> list[Hist]:
+    """The histograms, at least one, with the classes of these symbols of class_cum, int32 [n] each, and with `model`.
+
+    Raises Malformed for classes that none can have."""
+    whole = list[Hist]()
+    rest = iter(symbols)
+    for batch in _batches(priors):
+        sizes = np.array([prior.window.n for prior in batch], np.int64)
+        tops, steps = (np.array([getattr(p, name) for p in batch], np.int64) for name in ("top", "step"))
+        of_each = np.repeat(np.arange(len(batch)), sizes)
+        classes = np.concatenate([next(rest) for _ in batch]).astype(np.int64)
+        summed = np.array([prior.differences for prior in batch])[of_each]
+        running = np.cumsum(np.where(summed, classes - tops[of_each], 0))
+        firsts = np.cumsum(sizes) - sizes
+        before = np.concatenate([[0], running])[firsts]
+        classes = np.where(summed, running - before[of_each], classes)
+        low, high = np.minimum.reduceat(classes, firsts), np.maximum.reduceat(classes, firsts)
+        wrong = np.flatnonzero((low < 0) | (high > tops) | (high == 0))
+        if wrong.size:
+            at = wrong[0]
+            raise Malformed(f"histogram classes {low[at]}..{high[at]}, expected 0..{tops[at]}, not all 0")
+        below = (tops[of_each] - classes) * steps[of_each]
+        freqs = np.where(classes > 0, OCTAVE[below & 63] >> (below >> 6), 0)
+        models = models_of_each(histogram_tables_of_each(freqs, sizes), sizes)
+        for prior, first, model in zip(batch, firsts.tolist(), models, strict=True):
+            whole.append(replace(prior, classes=classes[first : first + prior.window.n]))
+            whole[-1].__dict__["model"] = model
+    return whole
 
 
 def _columns(normals: Sequence[Normal]) -> tuple[np.ndarray, np.ndarray]:

@@ -51,13 +51,15 @@ def norm_cdf28_of_each(sizes: np.ndarray, mu8: np.ndarray, si: np.ndarray) -> np
     return _mass(_counted(lengths) * 256 - np.repeat(128 + mu8, lengths), np.repeat(si, lengths))
 
 
-def tables_of_each(cdf: np.ndarray, sizes: np.ndarray, floor: np.ndarray) -> list[np.ndarray]:
-    """`table_from_cdf28` of what norm_cdf28_of_each gives for tables of `sizes`, with a floor int64 [m] each."""
+def tables_of_each(cdf: np.ndarray, sizes: np.ndarray, floor: np.ndarray) -> np.ndarray:
+    """`table_from_cdf28` of what norm_cdf28_of_each gives for tables of `sizes`, with a floor int64 [m] each; one
+    behind the other."""
     lengths = sizes + 1
     ends = np.cumsum(lengths)
-    cum = ((cdf * np.repeat(TOTAL - sizes * floor, lengths)) >> 28) + np.repeat(floor, lengths) * _counted(lengths)
+    cum: np.ndarray = (cdf * np.repeat(TOTAL - sizes * floor, lengths)) >> 28
+    cum += np.repeat(floor, lengths) * _counted(lengths)
     cum[ends - lengths], cum[ends - 1] = 0, TOTAL
-    return np.split(cum, ends[:-1])
+    return cum
 
 
 def _counted(lengths: np.ndarray) -> np.ndarray:
@@ -101,6 +103,21 @@ def histogram_table(freqs: np.ndarray) -> np.ndarray:
     n, shift = len(total), max(0, int(total[-1]).bit_length() - 28)
     cum = np.zeros(n + 1, dtype=np.int64)
     cum[1:] = (total >> shift) * (TOTAL - n) // (int(total[-1]) >> shift) + np.arange(1, n + 1)
+    return cum
+
+
+def histogram_tables_of_each(freqs: np.ndarray, sizes: np.ndarray) -> np.ndarray:
+    """`histogram_table` of weights int64 [sum of sizes] that stand one behind the other, as do the tables."""
+    lengths, running = sizes + 1, np.zeros(len(freqs) + 1, np.int64)
+    np.cumsum(freqs, out=running[1:])
+    bounds = np.cumsum(np.concatenate([[0], sizes]))
+    total = np.diff(running[bounds])
+    shift = np.maximum(0, np.frexp(total.astype(np.float64))[1] - 28)  # below 2^53 the exponent is the bit length
+    within = running[np.arange(len(freqs) + len(sizes)) - np.repeat(np.arange(len(sizes)), lengths)]
+    within -= np.repeat(running[bounds[:-1]], lengths)
+    cum: np.ndarray = (within >> np.repeat(shift, lengths)) * np.repeat(TOTAL - sizes, lengths)
+    cum //= np.repeat(total >> shift, lengths)
+    cum += _counted(lengths)
     return cum
 
 

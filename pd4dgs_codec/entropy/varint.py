@@ -26,17 +26,21 @@ class ByteReader:
 
     def __init__(self, data: bytes | memoryview):
         self._data = memoryview(data)
+        self._size = len(self._data)
         self.offset = 0
 
     @property
     def remaining(self) -> int:
-        return len(self._data) - self.offset
+        return self._size - self.offset
 
     def varint(self, limit: int, what: str) -> int:
         """The next integer, at most `limit`."""
         value, start = 0, self.offset
+        if start < self._size and (byte := self._data[start]) < 0x80 and byte <= limit:  # most of them
+            self.offset = start + 1
+            return byte
         for index in range(_MAX_BYTES):
-            if self.offset >= len(self._data):
+            if self.offset >= self._size:
                 raise Malformed(f"the payload ends inside {what}", offset=start)
             byte = self._data[self.offset]
             self.offset += 1

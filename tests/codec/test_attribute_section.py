@@ -193,3 +193,26 @@ def test_one_step_class_costs_a_few_bytes():
     alone, rate = write_attributes(attributes, NO_CLASSES, WIDTHS, "best", 3)
     data, graded_rate = write_attributes(attributes, np.full(500, 3, np.int32), replace(WIDTHS, graded=True), "best", 3)
     assert len(data) <= len(alone) + 10 and rate == pytest.approx(graded_rate)
+
+
+@pytest.mark.parametrize("top, weight", [(9, 1 << 10), (9, MAX_WEIGHT), (1 << 12, 1 << 10), (1 << 18, 1 << 12)])
+def test_restored_symbols_are_those_of_integers(top, weight):
+    """In binary32 where that is exact, else in binary64."""
+    rng, n = np.random.default_rng(top + weight), 50
+    residuals = rng.integers(-top, top + 1, (6, n)).astype(np.int32)
+    terms = []
+    for c in range(1, 6):
+        chosen = np.flatnonzero(rng.random(c) < 0.7)
+        terms.append(attribute_section.Terms(chosen, rng.integers(-weight, weight + 1, len(chosen)) // c))
+    expected = residuals.astype(object)
+    for c, term in enumerate(terms, start=1):
+        sums = sum(
+            (int(w) * expected[j] for j, w in zip(term.channels, term.weights, strict=True)), np.zeros(n, object)
+        )
+        expected[c] = expected[c] + ((sums + 512) >> 10)
+    if np.abs(expected).max() > K_MAX:
+        with pytest.raises(Malformed, match="a predicted attribute over"):
+            attribute_section._restore(residuals, terms)
+        return
+    attribute_section._restore(residuals, terms)
+    np.testing.assert_array_equal(residuals, expected.astype(np.int64))

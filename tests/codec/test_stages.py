@@ -8,10 +8,11 @@ from hypothesis import strategies as st
 from pd4dgs_codec.codec.stages import (
     CLASS_COUNTS,
     MAX_CLASSES,
+    Places,
     activity_classes,
     cheapest_class_count,
     coded_stages,
-    places_of,
+    parts_of,
     read_class_count,
     read_stages,
     relative_magnitude,
@@ -34,20 +35,22 @@ def test_the_class_of_a_place_is_the_number_of_bounds_it_reaches(activity, count
     bounds = [ascending[i * len(activity) // count] for i in range(1, count)]
     classes = activity_classes(np.array(activity), count)
     assert classes.tolist() == [sum(bound <= a for bound in bounds) for a in activity]
-    places = places_of(classes, count)
-    assert sorted(np.concatenate(places).tolist()) == list(range(len(activity)))
+    places, channels = Places.by(classes, count), np.arange(2 * len(activity)).reshape(2, -1)
+    parts, back = list(places.parts(channels)), np.zeros_like(channels)
+    assert [part.tolist() for part in parts] == [c[classes == k].tolist() for c in channels for k in range(count)]
+    places.put(np.concatenate(parts), back)
+    np.testing.assert_array_equal(back, channels)
 
 
 def test_different_activities_make_classes_of_about_equal_size():
-    sizes = [len(p) for p in places_of(activity_classes(np.random.default_rng(0).permutation(100), 8), 8)]
-    assert set(sizes) <= {12, 13}
+    places = Places.by(activity_classes(np.random.default_rng(0).permutation(100), 8), 8)
+    assert set(places.sizes) <= {12, 13}
 
 
 @given(st.lists(st.sampled_from((-K_MAX, -1, 0, 1, 7, K_MAX)), min_size=1, max_size=40), st.integers(0, 3))
 def test_relative_magnitudes_at_the_limits(symbols, channels):
     n, total = len(symbols), 1 + sum(abs(k) for k in symbols)
     found = relative_magnitude(np.array([symbols] * channels, np.int64).reshape(channels, n))
-    assert found.dtype == np.int64
     assert found.tolist() == [channels * (abs(k) * 256 * n // total) for k in symbols]
 
 
@@ -87,14 +90,14 @@ def test_class_counts_at_and_over_their_limits():
 
 
 def halves(target):
-    """Two stages of one channel each: the places of `target` that are even, then those where the one before is 0."""
-    yield [(target, np.arange(0, len(target), 2))]
-    zero = target[:-1:2] == 0
-    yield [(target, 1 + 2 * np.flatnonzero(zero)), (target, 1 + 2 * np.flatnonzero(~zero))]
+    """Two stages: the places of `target` that are even, then the others, by whether the one before is 0."""
+    channels = target.reshape(-1, 2).T
+    yield [(channels[:1], Places.whole(channels.shape[1]))]
+    yield [(channels[1:], Places.by(channels[0] != 0, 2))]
 
 
 def in_halves(symbols):
-    return coded_stages(bytearray(), [[channel[at] for channel, at in places] for places in halves(symbols)], 1).data
+    return coded_stages(bytearray(), map(parts_of, halves(symbols)), 1).data
 
 
 @given(st.lists(st.integers(-2, 2), max_size=20).map(lambda v: v + v))

@@ -6,7 +6,7 @@ import refdec
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pd4dgs_codec.entropy.ans import MAX_COUNT, AnsDecoder, ans_encode
+from pd4dgs_codec.entropy.ans import MAX_COUNT, AnsDecoder, ans_encode, model_of, models_of_each
 from pd4dgs_codec.entropy.tables import histogram_table, norm_table, uniform_table
 from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
 
@@ -39,7 +39,7 @@ def test_round_trip_by_both_decoders(case):
     data = ans_encode(channels, cums)
     decoder = AnsDecoder(data)
     for channel, cum in zip(channels, cums, strict=True):
-        taken = decoder.take(len(channel), cum)
+        taken = decoder.take(len(channel), model_of(cum))
         assert taken.dtype == np.int32 and np.array_equal(taken, channel)
     decoder.finish()
     decoded = reference_decode(data, [len(c) for c in channels], [c.tolist() for c in cums])
@@ -60,7 +60,7 @@ def test_nothing_costs_nothing():
     const = norm_table(1, 0, 0, 1)
     assert ans_encode([], []) == b"" == ans_encode([np.zeros(1000, np.int32)], [const])
     decoder = AnsDecoder(b"")
-    assert np.array_equal(decoder.take(1000, const), np.zeros(1000))
+    assert np.array_equal(decoder.take(1000, model_of(const)), np.zeros(1000))
     decoder.finish()
 
 
@@ -90,7 +90,7 @@ def test_the_encoder_refuses_a_missing_table():
 @pytest.mark.parametrize("count", [-1, MAX_COUNT + 1, 10**11])
 def test_the_decoder_refuses_counts_that_would_abort(count):
     with pytest.raises(LimitExceeded):
-        AnsDecoder(b"\1\0\0\0").take(count, uniform_table(4))
+        AnsDecoder(b"\1\0\0\0").take(count, model_of(uniform_table(4)))
 
 
 @pytest.mark.parametrize("data", [b"\1", b"\1\0\0", b"\0\0\0\0", b"\0\0\0\0\1\0\0\0"])
@@ -99,9 +99,22 @@ def test_the_decoder_refuses_impossible_streams(data):
         AnsDecoder(data)
 
 
-def test_the_decoder_refuses_a_bad_table():
+@pytest.mark.parametrize("table", [[0, 7, 7, 2**24], [1, 7, 2**24], [0, 7, 2**24 - 1], [0, 9, 8, 2**24]])
+def test_the_decoder_refuses_a_bad_table(table):
     with pytest.raises(Malformed):
-        AnsDecoder(b"\1\0\0\0").take(1, np.array([0, 7, 7, 2**24]))
+        model_of(np.array(table))
+    good = [0, 5, 2**24]
+    with pytest.raises(Malformed):
+        models_of_each(np.array([*good, *table, *good]), np.array([2, len(table) - 1, 2]))
+
+
+@given(st.lists(tables, max_size=6), st.binary(min_size=4, max_size=80).filter(lambda data: any(data[:4])))
+def test_models_made_together_decode_as_those_made_alone(cums, data):
+    data = data[: len(data) // 4 * 4]
+    together = models_of_each(np.concatenate([*cums, np.zeros(0, np.int64)]), np.array([len(c) - 1 for c in cums], int))
+    one, other = AnsDecoder(data), AnsDecoder(data)
+    for cum, model in zip(cums, together, strict=True):
+        np.testing.assert_array_equal(one.take(9, model), other.take(9, model_of(cum)))
 
 
 @settings(max_examples=60)
@@ -118,5 +131,5 @@ def test_damage_shows_in_the_final_state(at, bit, cut):
         bad[at % len(good)] ^= 1 << bit
     with pytest.raises(Malformed):
         decoder = AnsDecoder(bytes(bad))
-        decoder.take(len(symbols), cum)
+        decoder.take(len(symbols), model_of(cum))
         decoder.finish()

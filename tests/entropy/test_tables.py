@@ -11,7 +11,19 @@ import refdec
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pd4dgs_codec.entropy.priors import Const, Gauss, Mixture, Normal, Window, make_tables
+from pd4dgs_codec.entropy.priors import (
+    CLASS_STEPS,
+    Const,
+    Gauss,
+    Hist,
+    Mixture,
+    Normal,
+    Window,
+    make_models,
+    normal_tables,
+    top_limit,
+    with_class_symbols,
+)
 from pd4dgs_codec.entropy.tables import (
     MAX_FLOOR_MASS,
     NORMAL,
@@ -20,10 +32,12 @@ from pd4dgs_codec.entropy.tables import (
     SI_MIN,
     TOTAL,
     histogram_table,
+    histogram_tables_of_each,
     mixture_table,
     norm_table,
     uniform_table,
 )
+from pd4dgs_codec.errors import Malformed
 
 
 def is_table(cum: np.ndarray, n: int) -> bool:
@@ -118,8 +132,41 @@ def test_tables_made_together_are_those_made_alone():
         first, second = map(Normal, means.tolist(), widths.tolist())
         window, floor = Window(-3, min(n, 1 << 14)), int(rng.choice([1, 16]))
         priors += [Gauss(window, first, floor), Mixture(window, first, second, int(rng.integers(1, 256)), floor)]
-    alone = [replace(prior).cum for prior in priors]
-    make_tables(priors)
-    assert all("cum" in prior.__dict__ for prior in priors[1:])
-    for prior, expected in zip(priors, alone, strict=True):
-        np.testing.assert_array_equal(prior.cum, expected)
+    priors += [
+        Hist(Window(0, 9), 8, int(rng.integers(1, 30)), bool(i % 2), int(rng.integers(0, 64)), 40, None)
+        for i in range(9)
+    ]
+    cums, sizes = normal_tables(priors[1:])
+    alone = [prior.class_cum if isinstance(prior, Hist) else prior.cum for prior in priors[1:]]
+    for found, expected in zip(np.split(cums, np.cumsum(sizes + 1)[:-1]), alone, strict=True):
+        np.testing.assert_array_equal(found, expected)
+    make_models(priors)
+    assert all({"model", "class_model"} & {*prior.__dict__} for prior in priors[1:])
+
+
+def test_histograms_completed_together_are_those_made_alone():
+    rng = np.random.default_rng(4)
+    whole = []
+    for n in [2, 3, 1 << 14, *rng.integers(2, 60, 40).tolist()]:
+        step = int(rng.choice(CLASS_STEPS))
+        classes = rng.integers(0, (top := int(rng.integers(1, top_limit(step) + 1))) + 1, n)
+        classes[rng.integers(n)] = top
+        whole.append(Hist(Window(0, n), step, top, bool(rng.integers(2)), 0, 0, classes))
+    found = with_class_symbols(
+        [replace(prior, classes=None) for prior in whole], [p.class_symbols.astype(np.int32) for p in whole]
+    )
+    for prior, expected in zip(found, whole, strict=True):
+        np.testing.assert_array_equal(prior.classes, expected.classes)
+        assert "model" in prior.__dict__
+    weights = [rng.integers(0, 1 << 31, n) for n in (2, 5, 1 << 14, 33)]
+    weights.append(np.array([0, 1, 0]))
+    cums = histogram_tables_of_each(np.concatenate(weights), np.array([len(w) for w in weights]))
+    for table, w in zip(np.split(cums, np.cumsum([len(w) + 1 for w in weights])[:-1]), weights, strict=True):
+        np.testing.assert_array_equal(table, histogram_table(w))
+
+
+@pytest.mark.parametrize("symbols", [[0, 0, 0], [0, 4, 0]])
+def test_histograms_with_classes_out_of_range_are_malformed(symbols):
+    good = Hist(Window(0, 2), 8, 3, False, 0, 0, None)
+    with pytest.raises(Malformed, match=r"histogram classes 0\.\.\d, expected 0\.\.3, not all 0"):
+        with_class_symbols([good, replace(good, window=Window(0, 3))], [np.array([0, 3]), np.array(symbols)])
