@@ -57,7 +57,9 @@ def _layer(
 def forward(out: np.ndarray, x: np.ndarray, widths: np.ndarray, weights: np.ndarray, relu_last: bool) -> None:
     """out [n, at most the last width] of x [n, inputs]; widths int64 [layers + 1]: the inputs, then each layer's padded
     outputs. relu_last: after the last layer as well."""
-    row, layers = widths.max(), len(widths) - 1
+    row, layers = widths[0], len(widths) - 1
+    for layer in range(1, layers + 1):
+        row = max(row, widths[layer])
     for task in nb.prange((len(x) + POINTS - 1) // POINTS):
         first = task * POINTS
         count = min(POINTS, len(x) - first)
