@@ -5,6 +5,7 @@ ask for them by number. The shell of a background job ignores SIGINT, and its ch
 it heeded.
 """
 
+import contextlib
 import io
 import json
 import math
@@ -59,6 +60,47 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     others = [item for item, room in zip(items, rooms, strict=True) if room not in NEED_NO_KERNEL]
     run = len(items) // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     items[:] = [*others[:run], *free, *others[run:]]
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _kernels_are_compiled_once() -> Iterator[None]:
+    """A worker that needs a kernel which another one compiles waits for it, asleep, and loads it from numba's cache:
+    two that compile the same one take as long on two cores, and the others wait for both."""
+    if not find_spec("numba") or os.name != "posix":
+        yield
+        return
+    import fcntl
+
+    from pd4dgs_codec import threads
+
+    threads.choose_layer()  # before numba reads its environment
+    from numba.core.compiler_lock import global_compiler_lock
+    from numba.core.dispatcher import Dispatcher
+
+    compile, held = Dispatcher.compile, set()
+
+    @contextlib.contextmanager
+    def own(path: str) -> Iterator[None]:
+        """The lock of a source file. Kernels of one file call those of others, never both ways: none waits for ever."""
+        if path in held or not os.path.isfile(path):
+            yield
+            return
+        with open(path) as file:
+            fcntl.flock(file, fcntl.LOCK_EX)
+            held.add(path)
+            try:
+                yield
+            finally:
+                held.discard(path)
+
+    def alone(self: Any, sig: Any) -> Any:
+        cached = self.stats.cache_path is not None
+        with global_compiler_lock, own(self.py_func.__code__.co_filename) if cached else contextlib.nullcontext():
+            return compile(self, sig)
+
+    Dispatcher.compile = alone
+    yield
+    Dispatcher.compile = compile
 
 
 @pytest.fixture(autouse=True, scope="session")
