@@ -5,10 +5,12 @@ ask for them by number. The shell of a background job ignores SIGINT, and its ch
 it heeded.
 """
 
+import contextlib
 import io
 import json
 import math
 import os
+import shutil
 import signal
 import sys
 from collections.abc import Callable, Iterator
@@ -61,6 +63,57 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     items[:] = [*others[:run], *free, *others[run:]]
 
 
+@contextlib.contextmanager
+def locked(path: Path) -> Iterator[None]:
+    """No two processes at once; where files have no locks, those that share nothing but time."""
+    if os.name != "posix":
+        yield
+        return
+    import fcntl
+
+    with path.open("r" if path.exists() else "w") as file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+@pytest.fixture(autouse=True, scope="session")
+def _kernels_are_compiled_once() -> Iterator[None]:
+    """A worker that needs a kernel which another one compiles waits for it, asleep, and loads it from numba's cache:
+    two that compile the same one take as long on two cores, and the others wait for both."""
+    if not find_spec("numba"):
+        yield
+        return
+    from pd4dgs_codec import threads
+
+    threads.choose_layer()  # before numba reads its environment
+    from numba.core.compiler_lock import global_compiler_lock
+    from numba.core.dispatcher import Dispatcher
+
+    compile, held = Dispatcher.compile, set()
+
+    @contextlib.contextmanager
+    def own(path: str) -> Iterator[None]:
+        """The lock of a source file. Kernels of one file call those of others, never both ways: none waits for ever."""
+        if path in held or not os.path.isfile(path):
+            yield
+            return
+        with locked(Path(path)):
+            held.add(path)
+            try:
+                yield
+            finally:
+                held.discard(path)
+
+    def alone(self: Any, sig: Any) -> Any:
+        cached = self.stats.cache_path is not None
+        with global_compiler_lock, own(self.py_func.__code__.co_filename) if cached else contextlib.nullcontext():
+            return compile(self, sig)
+
+    Dispatcher.compile = alone
+    yield
+    Dispatcher.compile = compile
+
+
 @pytest.fixture(autouse=True, scope="session")
 def _heed_interrupts() -> Iterator[None]:
     before = signal.getsignal(signal.SIGINT)
@@ -68,6 +121,26 @@ def _heed_interrupts() -> Iterator[None]:
         signal.signal(signal.SIGINT, signal.default_int_handler)
     yield
     signal.signal(signal.SIGINT, before)
+
+
+@pytest.fixture(scope="session")
+def once(tmp_path_factory) -> Callable[[str, Callable[[Path], object]], Path]:
+    """once(name, make) -> a folder that make(folder) has filled, in one of all workers: what takes seconds to make and
+    is only read. A fixture is made in each worker that has a test of it; those of one module go to several."""
+    base = tmp_path_factory.getbasetemp()
+    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+
+    def call(name: str, make: Callable[[Path], object]) -> Path:
+        folder, done = base / f"once-{name}", base / f"once-{name}.done"
+        with locked(base / f"once-{name}.lock"):
+            if not done.exists():
+                shutil.rmtree(folder, ignore_errors=True)  # of a try that failed
+                folder.mkdir()
+                make(folder)
+                done.touch()
+        return folder
+
+    return call
 
 
 @dataclass(frozen=True)

@@ -4,6 +4,7 @@ import ast
 import re
 import subprocess
 import sys
+from functools import cache
 from graphlib import CycleError, TopologicalSorter
 from pathlib import Path
 
@@ -41,6 +42,12 @@ DECODER = ("errors", "scene", "bitstream", "entropy", "attributes", "evaluate", 
 LIBRARIES = {"numpy", "constriction", "msgpack", "zstandard"}
 
 
+@cache
+def imports() -> dict[str, set[str]]:
+    """Absolute name of every module -> what it imports. Worked out where it is tested, not in all that collect it."""
+    return {name: imported(path) for name, path in MODULES.items()}
+
+
 def room_of(module: str) -> str:
     """The room of an absolute module name of ours."""
     return module.split(".")[1] if "." in module else "__init__"
@@ -70,12 +77,11 @@ def imported(path: Path) -> set[str]:
 
 
 MODULES = modules()
-IMPORTS = {name: imported(path) for name, path in MODULES.items()}
 ROOMS = sorted({room_of(name) for name in MODULES})
 
 
 def test_the_reader_of_imports_reads_relative_ones():
-    assert {"pd4dgs_codec.errors", "numpy", "constriction"} <= IMPORTS["pd4dgs_codec.entropy.ans"]
+    assert {"pd4dgs_codec.errors", "numpy", "constriction"} <= imports()["pd4dgs_codec.entropy.ans"]
 
 
 def test_every_folder_with_modules_is_a_package():
@@ -91,13 +97,13 @@ def test_every_room_has_its_rule_and_every_rule_its_room():
 def test_rooms_import_only_what_lies_below_them(room):
     allowed = set(ROOMS) - ABOVE_ALL | {room} if room in ABOVE_ALL else ALLOWED[room] | EVERYWHERE | {room}
     for name in (n for n in MODULES if room_of(n) == room):
-        for target in (t for t in IMPORTS[name] if t.split(".")[0] == "pd4dgs_codec"):
+        for target in (t for t in imports()[name] if t.split(".")[0] == "pd4dgs_codec"):
             assert room_of(target) in allowed, f"{name} imports {target}"
 
 
 def test_no_two_modules_need_each_other():
     try:
-        TopologicalSorter({name: IMPORTS[name] & set(MODULES) for name in MODULES}).prepare()
+        TopologicalSorter({name: imports()[name] & set(MODULES) for name in MODULES}).prepare()
     except CycleError as error:
         pytest.fail(f"a circle of imports: {' -> '.join(error.args[1])}")
 
@@ -105,7 +111,7 @@ def test_no_two_modules_need_each_other():
 @pytest.mark.parametrize("room", DECODER)
 def test_the_decoder_uses_numpy_and_two_coders_beside_the_standard_library(room):
     for name in (n for n in MODULES if room_of(n) == room):
-        for target in IMPORTS[name]:
+        for target in imports()[name]:
             top = target.split(".")[0]
             allowed = LIBRARIES | (
                 {"numba"} if name.endswith("_kernels") else set()
@@ -115,7 +121,7 @@ def test_the_decoder_uses_numpy_and_two_coders_beside_the_standard_library(room)
 
 def test_every_mandatory_dependency_is_imported_by_the_package():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
-    used = {target.split(".")[0] for names in IMPORTS.values() for target in names}
+    used = {target.split(".")[0] for names in imports().values() for target in names}
     assert set(project["dependencies"]) <= used
 
 

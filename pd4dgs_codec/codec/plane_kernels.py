@@ -55,7 +55,9 @@ def order0(channels: np.ndarray, widest: int) -> tuple[np.ndarray, np.ndarray]:
     counts = np.zeros(widest + 1, np.int64)
     for c in range(len(channels)):
         channel = channels[c]
-        low, high = np.int64(channel.min()), np.int64(channel.max())
+        low, high = np.int64(channel[0]), np.int64(channel[0])
+        for i in range(len(channel)):
+            low, high = min(low, np.int64(channel[i])), max(high, np.int64(channel[i]))
         if high - low > widest:
             continue
         counts[: high - low + 1] = 0

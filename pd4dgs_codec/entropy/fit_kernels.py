@@ -2,6 +2,10 @@
 
 Every function has its namesake there, with the same arguments and results. Costs are integers, so that both choose the
 same; only the starts of fits are floats, whose sums run in another order here.
+
+The first fit of an installation waits for their compilation, so what numba compiles slowly is written out: an array
+assigned to a slice takes five seconds for its error message, `np.interp` takes two, and a function is compiled once
+more for each constant that it is called with.
 """
 
 from __future__ import annotations
@@ -123,7 +127,8 @@ def _descend(
     for _ in range(rounds):
         least, at = np.int64(1) << 62, -1
         for number in range(2 * dims + 1):
-            probe[:] = x
+            for axis in range(dims):
+                probe[axis] = x[axis]
             if number == 2 * dims:
                 for axis in range(dims):
                     curvature = up[axis] + down[axis] - 2 * fx
@@ -156,12 +161,14 @@ def _descend(
                 down[number - dims] = f
             if f < least:
                 least, at = f, number
-                best[:] = probe
+                for axis in range(dims):
+                    best[axis] = probe[axis]
         gain = fx - least
-        if gain <= 0 and steps.max() == 1:
+        if gain <= 0 and (steps <= 1).all():
             break
         if gain > 0:
-            x[:] = best
+            for axis in range(dims):
+                x[axis] = best[axis]
             fx = least
             if gain < ENOUGH:
                 break
@@ -175,20 +182,33 @@ def _descend(
 
 
 @_compiled
+def _quantile(weights: np.ndarray, share: float) -> float:
+    """np.interp(share, np.cumsum(weights) - weights / 2, np.arange(n))."""
+    total, before = 0.0, 0.0
+    for i in range(len(weights)):
+        total += weights[i]
+        middle = total - weights[i] / 2
+        if middle > share:
+            return max(i - 1, 0) if i == 0 or before == share else 1.0 / (middle - before) * (share - before) + (i - 1)
+        before = middle
+    return len(weights) - 1.0
+
+
+@_compiled
 def gauss(dense: np.ndarray) -> tuple[int, int, int, int, np.ndarray]:
     """See `fit_reference.gauss`."""
     counts, shift = _coarsen(dense, GAUSS_BITS)
     n = len(counts)
-    k, weights = np.arange(n).astype(np.float64), counts / counts.sum()
+    weights = counts / counts.sum()
     mean = 0.0
     for i in range(n):
-        mean += k[i] * weights[i]
+        mean += i * weights[i]
     spread = 0.0
     for i in range(n):
-        spread += (k[i] - mean) ** 2 * weights[i]
+        spread += (i - mean) ** 2 * weights[i]
     sigma = math.sqrt(max(spread - 1 / 12, 0.01))
-    lower, median, upper = np.interp(np.array([0.25, 0.5, 0.75]), np.cumsum(weights) - weights / 2, k)
-    robust = max((upper - lower) / 1.349, 0.1)
+    median = _quantile(weights, np.float64(0.5))
+    robust = max((_quantile(weights, np.float64(0.75)) - _quantile(weights, np.float64(0.25))) / 1.349, 0.1)
     low, high = np.array([-2048 * n, SI_MIN]), np.array([2048 * n, SI_MAX])
     cdf, x, least = np.empty(n - 1, np.int64), np.zeros(2, np.int64), np.int64(1) << 62
     for mu, sd in ((mean, sigma), (median, robust)):
@@ -200,7 +220,7 @@ def gauss(dense: np.ndarray) -> tuple[int, int, int, int, np.ndarray]:
             least = cost
             x[0], x[1] = mu8, si
     steps = np.array([max(1, np.int64(2.0 ** (x[1] / 64) * 64)), 16])
-    x = _descend(counts, x, steps, low, high, GAUSS_ROUNDS)
+    x = _descend(counts, x, steps, low, high, np.int64(GAUSS_ROUNDS))
     mu8, si = (x[0] << shift) + 128 * ((1 << shift) - 1), min(x[1] + 64 * shift, SI_MAX)
     full = np.empty(len(dense) - 1, np.int64)
     _cdf28(mu8, si, full)
@@ -323,7 +343,9 @@ def _class_width(counts: np.ndarray, mu8: int, symbols: int) -> tuple[int, int]:
 @_compiled
 def classes(dense: np.ndarray) -> tuple[int, int, int, int, int, int, int, np.ndarray, np.ndarray]:
     """See `fit_reference.classes`."""
-    n, largest = len(dense), dense.max()
+    n, largest = len(dense), dense[0]
+    for k in range(n):
+        largest = max(largest, dense[k])
     octaves = np.zeros(n, np.int64)
     for k in range(n):
         if dense[k] > 0:
@@ -376,8 +398,8 @@ def classes(dense: np.ndarray) -> tuple[int, int, int, int, int, int, int, np.nd
             if cost + described + 8 * BIT * size < least:
                 least = cost + described + 8 * BIT * size
                 best = (number, differences, top, width, mean16, cost, described)
-                best_costs[:] = costs
                 for k in range(n):
+                    best_costs[k] = costs[k]
                     best_classes[k] = top - below[k] if dense[k] > 0 else 0
     return best[0], best[1], best[2], best[3], best[4], best[5], best[6], best_costs, best_classes
 
@@ -425,7 +447,8 @@ def assign(costs: np.ndarray, prices: np.ndarray) -> tuple[np.ndarray, int]:
     stale = np.ones(channels, np.bool_)
     saved, left = np.empty(priors, np.int64), priors
     while True:
-        saved[:] = prices
+        for p in range(priors):
+            saved[p] = prices[p]
         for c in range(channels):
             if stale[c]:
                 best, next_best = -1, -1
@@ -465,7 +488,9 @@ def split_cost(channels: np.ndarray, classes: np.ndarray, count: int) -> Any:
     for i in range(n):
         sizes[classes[i]] += 1
     for channel in channels:
-        low, high = channel.min(), channel.max()
+        low, high = channel[0], channel[0]
+        for i in range(n):
+            low, high = min(low, channel[i]), max(high, channel[i])
         width = high - low + 1
         if count * width > 16 * n + 4096:  # too wide to count in place
             for k in range(count):

@@ -217,7 +217,9 @@ def sample_backward(
                 own, grad_rows[part], g, at, grid, rows, channels, offsets, steps, fractions, slopes, flat, 3 * n
             )
     for part in range(1, parts):
-        grad_rows[0] += grad_rows[part]
+        for row in range(grad_rows.shape[1]):
+            for c in range(channels):
+                grad_rows[0, row, c] += grad_rows[part, row, c]
         for cell in nb.prange(extra.shape[1]):
             for c in range(channels):
                 grad[cell, c] += extra[part - 1, cell, c]

@@ -107,6 +107,15 @@ def _multiply(
 
 
 @kernel(inline=True)
+def _widest(sizes: np.ndarray) -> int:
+    """Its largest number; numba's own way takes seconds to compile."""
+    found = 0
+    for layer in range(len(sizes)):
+        found = max(found, sizes[layer, 0], sizes[layer, 1])
+    return found
+
+
+@kernel(inline=True)
 def _take(block: np.ndarray, row: int, values: np.ndarray, first: int, count: int, column: int, columns: int) -> None:
     """The first columns of `block`, rows of `row` numbers, = `columns` of those of `values` from `first` on."""
     for p in range(count):
@@ -126,7 +135,7 @@ def forward(
 ) -> None:
     """out [n, at most the last outputs in whole vectors] += what the network makes of x; relu_last: after the last
     layer as well. hidden is filled, but if it has no rows."""
-    row, layers, columns = _up(sizes.max(), WIDE), len(sizes), out.shape[1]
+    row, layers, columns = _up(_widest(sizes), WIDE), len(sizes), out.shape[1]
     vectors = columns - columns % LANES
     for task in nb.prange((len(x) + POINTS * BLOCKS - 1) // (POINTS * BLOCKS)):
         a, b = aligned(POINTS * row, x.dtype.type), aligned(POINTS * row, x.dtype.type)
@@ -169,7 +178,7 @@ def backward(
     g_x [n, inputs]; sums [parts, `sums_width`], given zeroed, added up in the first part: per layer the gradient by its
     weights and that by its bias, in whole blocks.
     """
-    row, layers, parts = _up(sizes.max(), WIDE), len(sizes), len(sums)
+    row, layers, parts = _up(_widest(sizes), WIDE), len(sizes), len(sums)
     blocks, real = (len(x) + POINTS - 1) // POINTS, x.dtype.type
     zero = wide_splat(real(0))
     for part in nb.prange(parts):
@@ -179,8 +188,9 @@ def backward(
             first = block * POINTS
             count = min(POINTS, len(x) - first)
             if count < POINTS:
-                slope[:] = 0
-                taken[:] = 0
+                for i in range(0, size, WIDE):
+                    store(slope, i, zero)
+                    store(taken, i, zero)
             _take(slope, row, g, first, count, 0, g.shape[1])
             at, total, column = len(weights), len(own), hidden.shape[1]
             for layer in range(layers - 1, -1, -1):

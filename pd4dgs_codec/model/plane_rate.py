@@ -75,7 +75,8 @@ def _magnitudes(
                     sums[c] += magnitude
                     total += magnitude
                 cell_sums[first + j] = total
-        channel_sums[p] = sums
+        for c in range(channels):
+            channel_sums[p, c] = sums[c]
 
 
 @kernel(parallel=True)
@@ -94,7 +95,8 @@ def _gradient(
     for p in nb.prange(len(starts)):
         height, width, temporal = sizes[p]
         up, left = width * channels, channels
-        g, west, north, corner = np.empty((4, up), grid.dtype)
+        g, west = np.empty(up, grid.dtype), np.empty(up, grid.dtype)
+        north, corner = np.empty(up, grid.dtype), np.empty(up, grid.dtype)
         for i in range(height):
             first = starts[p] + i * width
             k = first * channels

@@ -161,8 +161,10 @@ def linear_backward(
                     store(own, at, fma(slope, h, load(own, at)))
                 store(grad_hidden, row + c, value)
     for part in range(1, parts):
-        grad_weight[0] += grad_weight[part]
-        grad_bias[0] += grad_bias[part]
+        for row in range(len(weight)):
+            for c in range(inputs):
+                grad_weight[0, row, c] += grad_weight[part, row, c]
+            grad_bias[0, row] += grad_bias[part, row]
 
 
 @kernel(parallel=True)

@@ -42,7 +42,8 @@ for (const [index, { file, bytes, error, chunk, offset, layers, slices }] of VEC
     }
   });
 
-  if (file.startsWith("dear/")) continue; // a second each, and no other code
+  // a second or three each decoding, and no other code
+  if (file.startsWith("dear/") || file === "valid/planes-products-over-2-53.pd4") continue;
   test(`${file}: a stream of any pieces gives each slice, then the same error`, () => {
     const size = PIECES[index % PIECES.length];
     const stream = openStream();

@@ -252,24 +252,10 @@ def test_a_run_from_before_a_part_of_the_method_goes_on_without_it():
     assert (config.preset, config.judge, config.tmc_binary_growth, config.noise) == ("tiny", False, 1.0, True)
 
 
-TINY_TRAIN = """
-import json, sys
-from tiny import TINY
-from pd4dgs_codec.cli.train import main
-from pd4dgs_codec.model.config import PRESETS
-from pd4dgs_codec.model.convert import to_scene
-from pd4dgs_codec.scene import Widths
-
-PRESETS["tiny"] = TINY
-sys.exit(max(main(argv) for argv in json.loads(sys.argv[1])))
-"""
-
 KILLED = """
 import json, os, signal, sys
 from tiny import TINY
 from pd4dgs_codec.model.config import PRESETS
-from pd4dgs_codec.model.convert import to_scene
-from pd4dgs_codec.scene import Widths
 from pd4dgs_codec.train.loop import Trainer
 from pd4dgs_codec.cli.train import main
 
@@ -285,27 +271,24 @@ def replace_or_die(*paths):
 
 os.replace = replace_or_die
 Trainer.run = lambda self, *args, **options: run(self, *args, **options, save_every=0.0)  # a save after each step
-main(*json.loads(sys.argv[1]))
+main(json.loads(sys.argv[1]))
 """
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
-def test_a_run_killed_while_it_saves_goes_on_as_if_nothing_had_happened(tmp_path, shared_dataset):
+def test_a_run_killed_while_it_saves_goes_on_as_if_nothing_had_happened(train, tmp_path, shared_dataset):
     whole, killed, log = tmp_path / "whole.pt", tmp_path / "killed.pt", tmp_path / "log.jsonl"
-    new = ("--preset", "tiny", "--iterations", 20)
-
-    def run(program, *runs):
-        calls = [[str(shared_dataset), "-j", "1", "-o", *map(str, options)] for options in runs]
-        command = [sys.executable, "-c", program, json.dumps(calls)]
-        environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
-        return subprocess.run(command, stderr=subprocess.DEVNULL, timeout=600, env=environment).returncode
-
-    assert run(KILLED, (killed, *new, "--log", log)) == -signal.SIGKILL
+    arguments = [shared_dataset, "-j", 1, "-o", killed, "--preset", "tiny", "--iterations", 20, "--log", log]
+    command = [sys.executable, "-c", KILLED, json.dumps([str(a) for a in arguments])]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = subprocess.run(command, stderr=subprocess.DEVNULL, timeout=600, env=environment)
+    assert done.returncode == -signal.SIGKILL
     assert checkpoint.load(killed)[1]["iteration"] == 9 and len(log.read_text().splitlines()) == 10
     assert len(list(tmp_path.glob(".pd4dgs-*/killed.pt"))) == 1  # what it was writing
     with log.open("a") as stream:
         stream.write('{"iteration": 2')  # a line cut in its middle
-    assert run(TINY_TRAIN, (killed, "--resume", killed, "--log", log), (whole, *new)) == 0
+    assert train(killed, "--resume", killed, "--log", log, iterations=None).code == 0
+    assert train(whole, iterations=20).code == 0
     assert _same(_state(whole), _state(killed))
     assert [json.loads(line)["iteration"] for line in log.read_text().splitlines()] == list(range(20))
     assert not list(tmp_path.glob(".pd4dgs-*/killed.pt"))

@@ -84,7 +84,8 @@ def test_plans_are_the_same(kernels):
 def test_costs_of_classes_are_the_same(kernels):
     rng = np.random.default_rng(0)
     for spread, count in ((1, 1), (3, 5), (1 << 20, 3)):
-        channels, classes = rng.integers(-9, 9, (4, 700)) * spread, rng.integers(0, count, 700)
+        channels = (rng.integers(-9, 9, (4, 700)) * spread).astype(np.int32)  # as in files: nothing else is compiled
+        classes = rng.integers(0, count, 700)
         expected = sum(entropy_bits(channel[classes == k]) for channel in channels for k in range(count))
         cost = fit_reference.split_cost(channels, classes, count)
         assert kernels.split_cost(channels, classes, count) == cost

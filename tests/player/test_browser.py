@@ -241,7 +241,7 @@ def test_both_evaluators_agree(harness, folder, server, options):
 
 
 @pytest.fixture(scope="module")
-def trained(tmp_path_factory: pytest.TempPathFactory) -> bytes:
+def trained(once) -> bytes:
     """A small scene that training made, of three layers."""
     pytest.importorskip("torch")
     pytest.importorskip("numba")
@@ -249,9 +249,12 @@ def trained(tmp_path_factory: pytest.TempPathFactory) -> bytes:
     from pd4dgs_codec.train.config import TrainConfig
     from pd4dgs_codec.train.loop import Trainer
 
-    trainer = Trainer(TrainConfig(preset="tiny", source="disc", iterations=60), disc(), size=TINY)
-    trainer.run(tmp_path_factory.mktemp("trained") / "model.pt")
-    return encode(to_scene(trainer.model), layers=2, effort=1)
+    def make(folder: Path) -> None:
+        trainer = Trainer(TrainConfig(preset="tiny", source="disc", iterations=60), disc(), size=TINY)
+        trainer.run(folder / "model.pt")
+        (folder / "scene.pd4").write_bytes(encode(to_scene(trainer.model), layers=2, effort=1))
+
+    return (once("trained", make) / "scene.pd4").read_bytes()
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,7 @@ import json
 import numpy as np
 import pytest
 from PIL import Image
-from rooms import FOCAL, walk
+from rooms import FOCAL, pose, walk
 
 from pd4dgs_codec.cli.prepare import main
 from pd4dgs_codec.data.dataset import load
@@ -25,16 +25,19 @@ def write(folder, pictures):
 
 
 @pytest.fixture(scope="module")
-def room(tmp_path_factory):
+def room(once):
     """A folder of frames in which a square moves, and the true poses."""
-    pictures, views = walk(COUNT, moves=True)
-    return write(tmp_path_factory.mktemp("room") / "frames", pictures), views
+    folder = once("room", lambda folder: write(folder / "frames", walk(COUNT, moves=True)[0]))
+    return folder / "frames", [pose(i / (COUNT - 1)) for i in range(COUNT)]
 
 
 @pytest.fixture(scope="module")
-def prepared(room, tmp_path_factory):
+def prepared(room, once):
     """What the command makes of it, interrupted once on the way."""
-    output = tmp_path_factory.mktemp("prepared") / "out"
+    return once("prepared", lambda folder: prepare(room, folder / "out")) / "out"
+
+
+def prepare(room, output):
     arguments = [str(room[0]), "-o", str(output), "--fps", "10", "--camera", "SIMPLE_PINHOLE", "-j", "2"]
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(poses, "reconstruct", _interrupted)
@@ -43,7 +46,6 @@ def prepared(room, tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(stages, "write_frames", _never)
         assert main(arguments) == 0
-    return output
 
 
 def _interrupted(*_: object) -> None:

@@ -5,6 +5,7 @@ Samples here; `pytest -m slow` and tools/bite.py take all.
 
 import re
 from dataclasses import replace
+from functools import cache
 
 import pytest
 from make_vectors import VECTORS, vectors
@@ -14,14 +15,19 @@ from vectors.faulty import cases
 from vectors.mutants import Mutant, in_likely_order, noticed, stored, written
 from vectors.reference import HELPERS, Reference, reference_source
 
-FAULTY = list(cases())
 MUTANTS = written()
 STORED = stored(VECTORS)
 SAMPLE = 9  #: every so many vectors and mutants are taken by default
 
 
+@cache
+def faulty():
+    """All of them. They take seconds to make, which not every process that collects these tests need spend."""
+    return list(cases())
+
+
 def of_name(name):
-    (found,) = (v for v in FAULTY if v.name == f"faulty/{name}")
+    (found,) = (v for v in faulty() if v.name == f"faulty/{name}")
     return found
 
 
@@ -34,7 +40,7 @@ def findings(*found):
 
 
 def test_faulty_vectors_fail_for_their_own_reason():
-    assert findings(*FAULTY[::SAMPLE]) == []
+    assert findings(*faulty()[::SAMPLE]) == []
 
 
 @pytest.mark.slow

@@ -168,9 +168,9 @@ def test_the_reference_decoder_as_a_command(name):
         assert done.returncode == 0 and json.loads(done.stdout) == vector["layers"]
 
 
-def test_the_tool_rebuilds_the_same_bytes():
-    done = subprocess.run([sys.executable, str(TOOL), "--check"], capture_output=True, text=True, timeout=600)
-    assert done.returncode == 0, done.stderr
+def test_the_tool_rebuilds_the_same_bytes(monkeypatch, capsys):
+    monkeypatch.setattr(sys, "argv", [str(TOOL), "--check"])
+    assert importlib.import_module("make_vectors").main() == 0, capsys.readouterr().err
 
 
 def test_the_tool_names_every_difference(tmp_path, monkeypatch):

@@ -94,7 +94,7 @@ def clock(monkeypatch) -> Clock:
     return loop.time
 
 
-LIMIT = 24.0
+LIMIT = 18.0
 COST = (0.1, 0.2, 0.3)  #: seconds of a step at each level
 #: What else the machine does: factor on the cost of a step that begins at `seconds`, and a pause within it.
 MACHINES = {

@@ -26,11 +26,9 @@ UNPRUNED = TrainConfig(preset="tiny", iterations=120, prune=0.0, noise=False)
 
 
 @pytest.fixture(scope="module")
-def finished(tmp_path_factory):
+def finished(once):
     """The checkpoint of a short run without pruning."""
-    path = tmp_path_factory.mktemp("unpruned") / "m.pt"
-    Trainer(UNPRUNED, disc(), size=TINY).run(path)
-    return path
+    return once("unpruned", lambda folder: Trainer(UNPRUNED, disc(), size=TINY).run(folder / "m.pt")) / "m.pt"
 
 
 @pytest.fixture

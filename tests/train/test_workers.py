@@ -37,12 +37,16 @@ STEPS = 60
 
 
 @pytest.fixture(scope="module")
-def program(tmp_path_factory) -> Path:
-    folder = tmp_path_factory.mktemp("program")
-    path = folder / "train.py"
-    path.write_text(PROGRAM.format(tests=str(Path(__file__).parents[1])))
-    write_views(folder / "set")
-    return path
+def program(once) -> Path:
+    """In a folder with the views, and what one process makes of two views a step."""
+
+    def make(folder: Path) -> None:
+        (folder / "train.py").write_text(PROGRAM.format(tests=str(Path(__file__).parents[1])))
+        write_views(folder / "set")
+        options = ("--iterations", STEPS, "--views-per-step", 2, "--log", folder / "one.jsonl")
+        assert _alone(folder / "train.py", "one.pt", *options) == 0
+
+    return once("workers", make) / "train.py"
 
 
 def _arguments(folder: Path, output: str, *options: object) -> list[str]:
@@ -75,33 +79,25 @@ def _same_model(first: Path, second: Path) -> None:
         assert torch.allclose(a[name].float(), b[name].float(), rtol=1e-3, atol=1e-4), name
 
 
-@pytest.fixture(scope="module")
-def one(program) -> Path:
-    """What one process makes of two views a step."""
-    log = program.with_name("one.jsonl")
-    assert _alone(program, "one.pt", "--iterations", STEPS, "--views-per-step", 2, "--log", log) == 0
-    return program.parent / "one.pt"
-
-
-def test_two_workers_learn_what_one_process_learns(program, one):
+def test_two_workers_learn_what_one_process_learns(program):
     done = _together(program, "two.pt", "--iterations", STEPS, "--views-per-step", 2, "--json", "--log", "two.jsonl")
     assert done.returncode == 0, done.stderr
     told = json.loads(done.stdout)  # the first worker alone speaks
     assert told["iterations"] == STEPS and told["finished"]
-    _same_model(one, program.parent / "two.pt")
+    _same_model(program.with_name("one.pt"), program.with_name("two.pt"))
     single, double = (read_log(program.parent / name) for name in ("one.jsonl", "two.jsonl"))
     assert len(double) == STEPS
     assert sum(record.get("grown", 0) for record in single) > 0  # else nothing was decided
     assert [r["anchors"] for r in single] == [r["anchors"] for r in double]
 
 
-def test_a_run_goes_on_with_another_number_of_workers(program, one):
+def test_a_run_goes_on_with_another_number_of_workers(program):
     cut = _together(program, "cut.pt", "--iterations", STEPS, "--views-per-step", 2, "--max-seconds", "0.01")
     assert cut.returncode == 0, cut.stderr
     begun = int(checkpoint.load(program.parent / "cut.pt")[1]["iteration"])
     assert 0 < begun < STEPS
     assert _alone(program, "cut.pt", "--resume", program.with_name("cut.pt"), "--max-seconds", "1000") == 0
-    _same_model(one, program.parent / "cut.pt")
+    _same_model(program.with_name("one.pt"), program.with_name("cut.pt"))
 
 
 def test_workers_that_cannot_share_the_views_evenly_are_named(monkeypatch):

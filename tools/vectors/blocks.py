@@ -702,7 +702,8 @@ class File:
         declared = len(header) if self.declared is None else self.declared
         front = struct.pack("<8sHHI", self.signature, self.major, self.minor, declared)
         crc = zlib.crc32(header, zlib.crc32(front)) ^ self.crc
-        frames = b"".join(c.frame(self.scene_id) for c in self.chunks)
+        scene_id = self.scene_id  # once: it takes the whole header, of up to thousands of chunks
+        frames = b"".join(c.frame(scene_id) for c in self.chunks)
         return front + struct.pack("<I", crc) + header + frames + self.tail
 
     def with_header(self, fields: Mapping[int, object]) -> File:

@@ -124,11 +124,13 @@ class _Encoder:
 
     def _matching(self, at: int, distance: int, end: int) -> int:
         """How many bytes at `at` are those `distance` before them."""
-        data, size = self._data, 0
-        if 0 < distance <= at - self.reach:
-            while size < MATCH_MAX and at + size < end and data[at + size] == data[at + size - distance]:
-                size += 1
-        return size
+        if not 0 < distance <= at - self.reach:
+            return 0
+        longest = min(MATCH_MAX, end - at)
+        here, before = (self._data[place : place + longest] for place in (at, at - distance))
+        if here == before:  # at once: a bomb of 2^21 zeros is nothing else
+            return longest
+        return next(size for size in range(longest) if here[size] != before[size])
 
     def _low_bits(self, at: int) -> int:
         """Those of the position that choose the probabilities of a match."""
