@@ -6,9 +6,18 @@ from pd4dgs_codec.bitstream.container import CHUNK_OVERHEAD, PREAMBLE_SIZE, Chun
 from pd4dgs_codec.codec.attribute_section import Past
 from pd4dgs_codec.codec.header import Header, layers_of, scene_id_of, unpack_header
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE, LayerKind
-from pd4dgs_codec.codec.layer_meta import Declared
+from pd4dgs_codec.codec.layer_meta import Declared, check_declared
 from pd4dgs_codec.codec.payload import read_layer
-from pd4dgs_codec.codec.symbols import LayerSymbols, TakenVoxels, assemble, check_last_layer, merged
+from pd4dgs_codec.codec.refining import read_refinement, shifted
+from pd4dgs_codec.codec.symbols import (
+    LayerSymbols,
+    Refinement,
+    TakenVoxels,
+    assemble,
+    check_attributes,
+    check_last_layer,
+    merged,
+)
 from pd4dgs_codec.entropy.priors import Prior
 from pd4dgs_codec.errors import DecodeError, Malformed, Truncated, UnsupportedFeature
 from pd4dgs_codec.scene import Scene
@@ -21,7 +30,8 @@ class LayerReader:
         self.header: Header | None = None
         self.offset = 0  #: of the next chunk
         self._whole: list[LayerSymbols] = []  # the layers before the last
-        self._slices: list[LayerSymbols] = []  # of the last layer
+        self._slices: list[list[LayerSymbols]] = []  # of each layer
+        self._refined = [0] * len(BY_CHUNK_TYPE)  # by layer, how many of its slices
         self._index = 0
         self._scene_id = b""
         self._declared = Declared()
@@ -31,12 +41,12 @@ class LayerReader:
     @property
     def layers(self) -> list[LayerSymbols]:
         """The layers read so far; slices of the last one may be missing."""
-        return [*self._whole, merged(self._slices)] if self._slices else []
+        return [*self._whole, merged(self._slices[-1])] if self._slices else []
 
     @property
     def latest(self) -> LayerSymbols:
         """The slice read last."""
-        return self._slices[-1]
+        return self._slices[-1][-1]
 
     @property
     def complete(self) -> bool:
@@ -97,12 +107,12 @@ class LayerReader:
 
     def _goes_on(self, layer: int) -> bool:
         """Whether a slice of `layer` before was read."""
-        return bool(self._slices) and self._slices[0].kind.layer == layer
+        return bool(self._slices) and self._slices[-1][0].kind.layer == layer
 
     def _check_place(self, chunk: Chunk, layer: int) -> None:
         """Raise Malformed unless the slice's flags fit its place (clause "slices")."""
         assert self.header is not None
-        expected, message = len(self._slices) if self._goes_on(layer) else 0, ""
+        expected, message = len(self._slices[-1]) if self._goes_on(layer) else 0, ""
         following = layers_of(self.header.chunks[self._index + 1 :])[:1]
         if chunk.slice != expected:
             message = f"slice {chunk.slice} of layer {layer}, expected {expected}"
@@ -121,12 +131,38 @@ class LayerReader:
         read = read_layer(
             chunk.payload, kind, header.widths, self._declared, header.mode, header.raw_deformation, later, past
         )
+        if header.low_bits:
+            read = shifted(read, header.low_bits)
         check_last_layer([*before, read], self._taken, header.info.voxel_size, header.grid)
         _check_bounded(read, header)
         symbols = sum(a.size for a in read.arrays())
         self._declared = self._declared.and_slice(len(read.anchor_q), symbols, len(chunk.payload))
+        if read.refines is not None:
+            self._refine(read.refines, kind)
+            before = self._whole
         self._whole, self._past = before, past
-        self._slices = [*self._slices, read] if later else [read]
+        self._slices = [*self._slices[:-1], [*self._slices[-1], read]] if later else [*self._slices, [read]]
+
+    def _refine(self, refinement: Refinement, kind: LayerKind) -> None:
+        """Give earlier slices the low bits of their attributes (clause "low bits")."""
+        assert self.header is not None
+        header, layer = self.header, refinement.layer
+        place = next((i for i, parts in enumerate(self._slices) if parts[0].kind.layer == layer), None)
+        first, end = self._refined[layer], self._refined[layer] + refinement.slices
+        parts = [] if place is None else self._slices[place][first:end]
+        if place is None or not header.low_bits or len(parts) < refinement.slices or any(p.refines for p in parts):
+            found = f"{len(parts)} slices of layer {layer} that wait for low bits"
+            raise Malformed(f"layer {kind.layer}: {found}, expected {refinement.slices}")
+        symbols = sum(part.attributes.size for part in parts)
+        self._declared = check_declared(self._declared.and_slice(0, symbols, 0), kind)
+        refined = read_refinement(refinement.section, parts, header.low_bits)
+        for part in refined:
+            check_attributes(part, header.grid)
+        slices = [*self._slices[place][:first], *refined, *self._slices[place][end:]]
+        self._slices = [*self._slices[:place], slices, *self._slices[place + 1 :]]
+        self._refined = [*self._refined[:layer], end, *self._refined[layer + 1 :]]
+        if place < len(self._whole):
+            self._whole = [*self._whole[:place], merged(slices), *self._whole[place + 1 :]]
 
 
 def _any_layer(chunks: tuple[tuple[int, int], ...], max_layer: int) -> bool:

@@ -30,7 +30,8 @@ from pd4dgs_codec.codec.metadata import CHUNK_TYPE, Metadata, write_metadata
 from pd4dgs_codec.codec.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.codec.payload import StreamReport, read_meta
 from pd4dgs_codec.codec.plan import plan
-from pd4dgs_codec.codec.slicing import Slice, whole_layer, write_slices
+from pd4dgs_codec.codec.refining import coarse, shifted
+from pd4dgs_codec.codec.slicing import Slice, whole_layer, write_refining, write_slices
 from pd4dgs_codec.codec.symbols import (
     LayerSymbols,
     TakenVoxels,
@@ -140,10 +141,14 @@ def encode_with_report(
         errors = verify_errors(planned, meant, attribute_blocks(grid, symbols), bounds, options.raw_deformation)
     del planned  # as large as the scene
     if options.slices:
-        values = np.split((utility or by_size)(assemble(meant.info, grid, symbols)), meant.rows[:-1])
+        first = [shifted(coarse(layer, options.low_bits), options.low_bits) for layer in symbols]
+        values = np.split((utility or by_size)(assemble(meant.info, grid, first)), meant.rows[:-1])
+        del first
         written = [write_slices(layer, options, u, HEADER) for layer, u in zip(symbols, values, strict=True)]
     else:
         written = [[whole_layer(layer, options)] for layer in symbols]
+    if options.low_bits:
+        written[-1] += write_refining(written, options)
     _check_limits(meant.info.voxel_size, grid, symbols, written)
     about = write_metadata(metadata) if metadata is not None else b""
     data = _container(meant, grid, bounds, options, written, about)
@@ -221,6 +226,7 @@ def _container(
         info=meant.info,
         error_bounds=bounds,
         digest=payload_digest(payloads),
+        low_bits=options.low_bits,
     )
     packed = pack_header(header)
     scene_id = scene_id_of(packed)

@@ -1,0 +1,60 @@
+"""Attributes whose low bits come late: slices hold coarse symbols, and later slices the bits that refine them.
+
+With `bits` low bits a symbol q is coded as k, its nearest multiple of 2**bits, and as what is left. Until the rest has
+come a decoder shows k * 2**bits. By the sign of k the rest is mirrored, so that it leans to zero in all channels, and
+it stands in two channels each: where k is 0 most of it is 0 too, elsewhere it is about uniform.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
+from pd4dgs_codec.codec.options import EncodeOptions
+from pd4dgs_codec.codec.symbols import LayerSymbols
+from pd4dgs_codec.entropy.channels import CodedChannels, decode_channels, encode_channels
+from pd4dgs_codec.errors import Malformed
+
+
+def coarse(layer: LayerSymbols, bits: int) -> LayerSymbols:
+    """The layer with attributes in units of 2**bits, rounded to nearest, halves away from 0."""
+    q = layer.attributes
+    return replace(layer, attributes=np.sign(q) * ((np.abs(q) + (1 << bits >> 1)) >> bits)) if bits else layer
+
+
+def shifted(layer: LayerSymbols, bits: int) -> LayerSymbols:
+    """The layer of coarse attributes as it is shown until they are refined. Raises Malformed."""
+    k = layer.attributes
+    if k.size and max(int(k.max()), -int(k.min())) > MAX_SYMBOL >> bits:
+        raise Malformed(f"layer {layer.kind.layer}: a coarse symbol over {MAX_SYMBOL >> bits} in magnitude")
+    return replace(layer, attributes=k << bits) if bits else layer
+
+
+def write_refinement(parts: Sequence[LayerSymbols], bits: int, options: EncodeOptions) -> CodedChannels:
+    """The low bits of these slices' attributes. Inverse: read_refinement."""
+    q = np.concatenate([part.attributes for part in parts], axis=1)
+    k = np.concatenate([coarse(part, bits).attributes for part in parts], axis=1)
+    rest = np.where(k < 0, -1, 1).astype(np.int32) * (q - (k << bits))
+    channels = [row[chosen] for row, zero in zip(rest, k == 0, strict=True) for chosen in (zero, ~zero)]
+    return encode_channels(channels, priors=options.priors, effort=options.effort)
+
+
+def read_refinement(section: bytes, parts: Sequence[LayerSymbols], bits: int) -> list[LayerSymbols]:
+    """The slices, as `shifted` left them, with their low bits. Raises DecodeError's subclasses."""
+    k = np.concatenate([part.attributes for part in parts], axis=1)
+    zero = k == 0
+    counts = [int(count) for row in zero for count in (row.sum(), (~row).sum())]
+    found = iter(decode_channels(section, counts))
+    for row, at in zip(k, zero, strict=True):
+        for chosen in (at, ~at):
+            rest = next(found)
+            if rest.size and max(int(rest.max()), -int(rest.min())) > 1 << bits >> 1:
+                raise Malformed(f"low bits over {1 << bits >> 1} in magnitude, of {bits} bits")
+            row[chosen] += np.where(row[chosen] < 0, -rest, rest)
+    if k.size and max(int(k.max()), -int(k.min())) > MAX_SYMBOL:
+        raise Malformed(f"a refined symbol over {MAX_SYMBOL} in magnitude")
+    ends = np.cumsum([part.attributes.shape[1] for part in parts])[:-1]
+    return [replace(part, attributes=own) for part, own in zip(parts, np.split(k, ends, axis=1), strict=True)]
