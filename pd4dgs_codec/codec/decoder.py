@@ -150,10 +150,12 @@ class LayerReader:
         place = next((i for i, parts in enumerate(self._slices) if parts[0].kind.layer == layer), None)
         first, end = self._refined[layer], self._refined[layer] + refinement.slices
         parts = [] if place is None else self._slices[place][first:end]
+        symbols = sum(part.attributes.size for part in parts)
         if place is None or not header.low_bits or len(parts) < refinement.slices or any(p.refines for p in parts):
             found = f"{len(parts)} slices of layer {layer} that wait for low bits"
             raise Malformed(f"layer {kind.layer}: {found}, expected {refinement.slices}")
-        symbols = sum(part.attributes.size for part in parts)
+        if not symbols:
+            raise Malformed(f"layer {kind.layer}: low bits of slices without anchors, expected some")
         self._declared = check_declared(self._declared.and_slice(0, symbols, 0), kind)
         refined = read_refinement(refinement.section, parts, header.low_bits)
         for part in refined:

@@ -84,12 +84,13 @@ def write_refining(layers: Sequence[Sequence[Slice]], options: EncodeOptions) ->
     bare = sliced(layers[-1][0].symbols, [np.zeros(0, np.int64)] * 2)[-1]
     for parts in layers:
         done = 0
-        while done < len(parts):
+        while any(len(part.symbols.anchor_q) for part in parts[done:]):
+            least = next(i + 1 for i, part in enumerate(parts[done:]) if len(part.symbols.anchor_q))
             count, made = len(parts) - done, None
             while made is None:
                 made = _refining(bare, [part.symbols for part in parts[done : done + count]], options)
-                if count > 1 and options.slices and len(made.payload) + CHUNK_OVERHEAD > options.slices:
-                    count, made = min(count - 1, max(1, count * options.slices // len(made.payload))), None
+                if count > least and options.slices and len(made.payload) + CHUNK_OVERHEAD > options.slices:
+                    count, made = min(count - 1, max(least, count * options.slices // len(made.payload))), None
             found.append(made)
             done += count
     return found
