@@ -30,6 +30,7 @@ CHOICES: Mapping[str, Sequence[str | int]] = {
     "layers": ("auto", 0, 1, 2),
     "effort": EFFORTS,
     "omit": ("bounded", "lossless", "nothing"),
+    "low_bits": tuple(range(MAX_LOW_BITS + 1)),
 }
 
 
@@ -74,8 +75,6 @@ class EncodeOptions:
             raise EncodeError(f"step_scale {self.step_scale!r}, expected a positive number")
         if self.slices and self.slices < LEAST_SLICE:
             raise EncodeError(f"slices of {self.slices} bytes, expected 0 or {LEAST_SLICE} and more")
-        if not 0 <= self.low_bits <= MAX_LOW_BITS:
-            raise EncodeError(f"{self.low_bits} low bits, expected 0 to {MAX_LOW_BITS}")
         if self.low_bits and self.mode != "ans":
             raise EncodeError(f"low bits in mode {self.mode}, expected mode ans or none")
         if self.slices and self.mode != "ans":
