@@ -110,7 +110,7 @@ def _parts(result: dict[str, Any]) -> list[dict[str, Any]]:
 def _parts_table(result: dict[str, Any]) -> str:
     heads = ("part", *(f"layer {row['layer']}" for row in result["layers"]), "all", "share")
     rows = [
-        (row["part"], *(number(size, 0) for size in row["layers"]), number(row["bytes"], 0), row["bytes"])
+        (row["part"].replace("_", " "), *(number(size, 0) for size in row["layers"]), number(row["bytes"], 0), row["bytes"])
         for row in result["parts"]
     ]
     return table(heads, [(*row[:-1], f"{100 * row[-1] / result['bytes']:.1f} %") for row in rows])
@@ -168,7 +168,8 @@ def _slice_lines(result: dict[str, Any]) -> list[str]:
 def _brought(part: dict[str, Any], low_bits: int) -> str:
     """What a slice holds, as far as that is here."""
     if "refines" in part:
-        return f"low bits ({low_bits}) of {part['refines']['slices']} slices of layer {part['refines']['layer']}"
+        slices = f"{number} slices" if (number := part["refines"]["slices"]) > 1 else "a slice"
+        return f"{low_bits} low bits of {slices} of layer {part['refines']['layer']}"
     return f"{part['anchors']:,} anchors" if "anchors" in part else "-"
 
 
