@@ -110,7 +110,12 @@ def _parts(result: dict[str, Any]) -> list[dict[str, Any]]:
 def _parts_table(result: dict[str, Any]) -> str:
     heads = ("part", *(f"layer {row['layer']}" for row in result["layers"]), "all", "share")
     rows = [
-        (row["part"].replace("_", " "), *(number(size, 0) for size in row["layers"]), number(row["bytes"], 0), row["bytes"])
+        (
+            row["part"].replace("_", " "),
+            *(number(size, 0) for size in row["layers"]),
+            number(row["bytes"], 0),
+            row["bytes"],
+        )
         for row in result["parts"]
     ]
     return table(heads, [(*row[:-1], f"{100 * row[-1] / result['bytes']:.1f} %") for row in rows])

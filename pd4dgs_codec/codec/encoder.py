@@ -31,7 +31,7 @@ from pd4dgs_codec.codec.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.codec.payload import StreamReport, read_meta
 from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.codec.refining import coarse, shifted
-from pd4dgs_codec.codec.slicing import Slice, whole_layer, write_refining, write_slices
+from pd4dgs_codec.codec.slicing import Slice, whole_layer, with_low_bits, write_slices
 from pd4dgs_codec.codec.symbols import (
     LayerSymbols,
     TakenVoxels,
@@ -148,7 +148,7 @@ def encode_with_report(
     else:
         written = [[whole_layer(layer, options)] for layer in symbols]
     if options.low_bits:
-        written[-1] += write_refining(written, options)
+        written = with_low_bits(written, options)
     _check_limits(meant.info.voxel_size, grid, symbols, written)
     about = write_metadata(metadata) if metadata is not None else b""
     data = _container(meant, grid, bounds, options, written, about)

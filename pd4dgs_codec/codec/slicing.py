@@ -77,11 +77,21 @@ def write_slices(layer: LayerSymbols, options: EncodeOptions, utility: np.ndarra
     return found
 
 
-def write_refining(layers: Sequence[Sequence[Slice]], options: EncodeOptions) -> list[Slice]:
-    """Slices of the last layer more, which bring the low bits of all: each as many slices of one layer as keep to
-    options.slices."""
+def with_low_bits(layers: Sequence[list[Slice]], options: EncodeOptions) -> list[list[Slice]]:
+    """The layers' slices, and behind them those that bring low bits. Those of layer 0 wait for layer 1: that things
+    move shows more than the last bits of where they are. Layer 2 waits for all of them."""
+    if len(layers) == 1:
+        return [[*layers[0], *_refining_slices(layers[0], layers, options)]]
+    base, first, *more = layers
+    first = [*first, *_refining_slices(first, (base, first), options)]
+    return [base, first, *([*parts, *_refining_slices(parts, (parts,), options)] for parts in more)]
+
+
+def _refining_slices(owner: Sequence[Slice], layers: Sequence[Sequence[Slice]], options: EncodeOptions) -> list[Slice]:
+    """Slices of the owner's layer that bring the low bits of these layers: each those of as many slices of one layer as
+    keep to options.slices."""
     found: list[Slice] = []
-    bare = sliced(layers[-1][0].symbols, [np.zeros(0, np.int64)] * 2)[-1]
+    bare = sliced(owner[0].symbols, [np.zeros(0, np.int64)] * 2)[-1]
     for parts in layers:
         done = 0
         while any(len(part.symbols.anchor_q) for part in parts[done:]):
