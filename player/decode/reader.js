@@ -186,8 +186,10 @@ export class LayerReader {
     }
     const layer = this._layers[this._layers.length - 1];
     layer.slices++;
-    layer.parts.push(own);
-    layer.whole = null;
+    if (!parameters.refines) {
+      layer.parts.push(own);
+      layer.whole = null;
+    }
     if (header.lowBits) layer.waiting.push({ symbols, tensors, own });
     return tensors;
   }
