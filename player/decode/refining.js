@@ -15,29 +15,26 @@ export function refined(section, coarse, channels, lowBits) {
   const slices = coarse.map((symbols) => symbols.slice());
   /** One channel of each slice. @param {number} c */
   const rowsOf = (c) => slices.map((all) => all.subarray((c * all.length) / channels, ((c + 1) * all.length) / channels));
-  const counts = [];
-  let all = 0;
+  /** Which of its three channels holds a symbol's rest: coarse symbols that are 0, odd, others. @param {number} s */
+  const classOf = (s) => (s === 0 ? 0 : (s >> lowBits) & 1 ? 1 : 2);
+  const counts = new Array(3 * channels).fill(0);
   for (let c = 0; c < channels; c++) {
-    let zeros = 0;
-    let others = 0;
-    for (const symbols of rowsOf(c)) for (const s of symbols) s ? others++ : zeros++;
-    counts.push(zeros, others);
-    all += zeros + others;
+    for (const symbols of rowsOf(c)) for (const s of symbols) counts[3 * c + classOf(s)]++;
   }
-  const rests = new Int32Array(all);
+  const rests = new Int32Array(counts.reduce((a, b) => a + b));
   decodeChannels(section, counts, rests);
   const most = 2 ** (lowBits - 1);
   checkRange(rests, -most, most, "low bits of a symbol");
-  let at = 0;
+  let end = 0;
+  const next = counts.map((count) => (end += count) - count);
   for (let c = 0; c < channels; c++) {
-    let other = at + counts[2 * c];
     for (const symbols of rowsOf(c)) {
       for (let i = 0; i < symbols.length; i++) {
         const s = symbols[i];
-        symbols[i] += s ? Math.sign(s) * rests[other++] : rests[at++];
+        const r = rests[next[3 * c + classOf(s)]++];
+        symbols[i] = s < 0 ? s - r : s + r;
       }
     }
-    at = other;
   }
   for (const symbols of slices) checkRange(symbols, -MAX_SYMBOL, MAX_SYMBOL, "a refined symbol of an attribute");
   return slices;
