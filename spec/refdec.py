@@ -1394,9 +1394,9 @@ def refine(layers, part):
     dequantise_layer(layer)
 
 
-# 11.6 Low bits: "it holds for each channel of 11.2, in order, two channels: first a rest r for each row whose symbol is
+# 11.6 Low bits: "It holds for each channel of 11.2, in order, two channels: first a rest r for each row whose symbol is
 # 0, then one for each other row, in the order of the rows. Each r MUST lie in −2^(a−1)..2^(a−1), else Malformed. The
-# symbol s of the row becomes s + r if s ≥ 0, else s − r. It MUST lie in −2^23..2^23"
+# symbol s of the row, k·2^a, becomes s + r if s ≥ 0, else s − r. It MUST lie in −2^23..2^23"
 def add_low_bits(layer, rows, section):
     most = 1 << layer.header[17] - 1
     places = []  # of each channel: (name, index)
@@ -1420,7 +1420,8 @@ def morton_code(offset):
 
 
 # 12.1 Order: "For each layer chunk, before the next chunk is looked at: parameters and their limits, sections, the
-# ranges of 11.1 and 11.2, sums of masks, each voxel at most once over the slices so far, and dequantisation."
+# ranges of 11.1 and 11.2, sums of masks, each voxel at most once over the slices so far, dequantisation, and low bits
+# with all that 11.6 asks for."
 # 11.1 Masks: "No sum may exceed 255."
 def finish_last(layers):
     codes = []

@@ -24,13 +24,14 @@ from pd4dgs_codec.scene import Scene
 
 
 class LayerReader:
-    """Walks a file's chunks in order. It holds no bytes: every call gets all that has arrived."""
+    """Walks a file's chunks in order. It holds no bytes: every call gets all that has arrived. Its lists are replaced
+    and never changed, so that a copy stays what it is."""
 
     def __init__(self) -> None:
         self.header: Header | None = None
         self.offset = 0  #: of the next chunk
-        self._whole: list[LayerSymbols] = []  # the layers before the last
         self._slices: list[list[LayerSymbols]] = []  # of each layer
+        self._merged: list[LayerSymbols | None] = []  # each layer, None until somebody asks for it as it is now
         self._refined = [0] * len(BY_CHUNK_TYPE)  # by layer, how many of its slices
         self._index = 0
         self._scene_id = b""
@@ -41,7 +42,9 @@ class LayerReader:
     @property
     def layers(self) -> list[LayerSymbols]:
         """The layers read so far; slices of the last one may be missing."""
-        return [*self._whole, merged(self._slices[-1])] if self._slices else []
+        layers = [layer or merged(parts) for layer, parts in zip(self._merged, self._slices, strict=True)]
+        self._merged = [*layers]
+        return layers
 
     @property
     def latest(self) -> LayerSymbols:
@@ -125,7 +128,6 @@ class LayerReader:
     def _read_slice(self, chunk: Chunk, kind: LayerKind) -> None:
         assert self.header is not None
         later = self._goes_on(kind.layer)
-        before = self._whole if later else self.layers
         past = self._past if later else Past[Prior]() if chunk.more else None
         header = self.header
         read = read_layer(
@@ -133,15 +135,17 @@ class LayerReader:
         )
         if header.low_bits:
             read = shifted(read, header.low_bits)
+        before = self.layers if read.mask_increase.size else []
         check_last_layer([*before, read], self._taken, header.info.voxel_size, header.grid)
         _check_bounded(read, header)
         symbols = sum(a.size for a in read.arrays())
         self._declared = self._declared.and_slice(len(read.anchor_q), symbols, len(chunk.payload))
         if read.refines is not None:
             self._refine(read.refines, kind)
-            before = self._whole
-        self._whole, self._past = before, past
-        self._slices = [*self._slices[:-1], [*self._slices[-1], read]] if later else [*self._slices, [read]]
+        self._past = past
+        at = -1 if later else len(self._slices)
+        self._slices = [*self._slices[:at], [*(self._slices[-1] if later else ()), read]]
+        self._merged = [*self._merged[:at], None]
 
     def _refine(self, refinement: Refinement, kind: LayerKind) -> None:
         """Give earlier slices the low bits of their attributes (clause "low bits")."""
@@ -162,9 +166,8 @@ class LayerReader:
             check_attributes(part, header.grid)
         slices = [*self._slices[place][:first], *refined, *self._slices[place][end:]]
         self._slices = [*self._slices[:place], slices, *self._slices[place + 1 :]]
+        self._merged = [*self._merged[:place], None, *self._merged[place + 1 :]]
         self._refined = [*self._refined[:layer], end, *self._refined[layer + 1 :]]
-        if place < len(self._whole):
-            self._whole = [*self._whole[:place], merged(slices), *self._whole[place + 1 :]]
 
 
 def _any_layer(chunks: tuple[tuple[int, int], ...], max_layer: int) -> bool:

@@ -16,6 +16,7 @@ from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
 from pd4dgs_codec.codec.options import EncodeOptions
 from pd4dgs_codec.codec.symbols import LayerSymbols
 from pd4dgs_codec.entropy.channels import CodedChannels, decode_channels, encode_channels
+from pd4dgs_codec.entropy.priors import MORE_ENTRIES
 from pd4dgs_codec.errors import Malformed
 
 
@@ -39,7 +40,7 @@ def write_refinement(parts: Sequence[LayerSymbols], bits: int, options: EncodeOp
     k = np.concatenate([coarse(part, bits).attributes for part in parts], axis=1)
     rest = np.where(k < 0, -1, 1).astype(np.int32) * (q - (k << bits))
     channels = [row[chosen] for row, zero in zip(rest, k == 0, strict=True) for chosen in (zero, ~zero)]
-    return encode_channels(channels, priors=options.priors, effort=options.effort)
+    return encode_channels(channels, priors=options.priors, effort=options.effort, entries=MORE_ENTRIES)
 
 
 def read_refinement(section: bytes, parts: Sequence[LayerSymbols], bits: int) -> list[LayerSymbols]:
@@ -47,7 +48,7 @@ def read_refinement(section: bytes, parts: Sequence[LayerSymbols], bits: int) ->
     k = np.concatenate([part.attributes for part in parts], axis=1)
     zero = k == 0
     counts = [int(count) for row in zero for count in (row.sum(), (~row).sum())]
-    found = iter(decode_channels(section, counts))
+    found = iter(decode_channels(section, counts, entries=MORE_ENTRIES))
     for row, at in zip(k, zero, strict=True):
         for chosen in (at, ~at):
             rest = next(found)
