@@ -36,6 +36,7 @@ AGAIN = {
         "low-bits-slices-0",
         "low-bits-slices-twice",
         "low-bits-slices-named-again",
+        "low-bits-behind-refining-slice",
         "low-bits-of-no-rows",
     ),
     "the rule spares a decoder work: exceptions take a place and two bytes each, which are checked as well": (

@@ -10,7 +10,7 @@ import numpy as np
 
 from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
 from pd4dgs_codec.bitstream.limits import MAX_CHUNKS
-from pd4dgs_codec.entropy.priors import CLASS_STEPS, FIRST_REUSE, MORE_ENTRIES, Hist, Prior, Window
+from pd4dgs_codec.entropy.priors import CLASS_STEPS, MORE_ENTRIES, Hist, Prior, Window
 from pd4dgs_codec.scene import Widths
 
 from .blocks import (
@@ -30,7 +30,6 @@ from .blocks import (
     make_file,
     make_layer,
     pattern,
-    varint,
     words,
 )
 from .faulty import PAYLOAD
@@ -283,16 +282,16 @@ def _names() -> Iterator[Vector]:
     def saying(layer: Layer, value: Sequence[int]) -> Layer:
         return replace(layer, meta={**layer.meta, REFINES: list(value)})
 
-    all_three = refining(0, 0, parts, fine)
-    four = saying(all_three, (0, 4))
-    yield of("slices-not-there", "Four slices are named, three are there.", *parts, four, chunk=3)
+    one = first(bits, 1, 2, z=30, before=9)
+    four = saying(refining(1, 0, parts, fine), (0, 4))
+    yield of("slices-not-there", "Four slices are named, three are there.", *parts, one, four, chunk=4)
     early = saying(refining(0, 0, parts[:2], fine[:2]), (0, 3))
     what = "A slice is named before it has come."
     yield of("slices-not-yet-there", what, *parts[:2], early, parts[2], chunk=2)
-    twice = [refining(0, 0, parts[:1], fine[:1])] * 2
+    whole = [replace(p, meant=replace(p.meant, attributes=q)) for p, q in zip(parts, fine, strict=True)]
+    twice = [refining(0, 0, layers[:1], fine[:1]) for layers in (parts, whole)]
     yield of("slices-twice", "The one slice of layer 0 is named twice.", parts[0], *twice, chunk=2)
-    one = first(bits, 1, 2, z=30, before=9)
-    above = [refining(1, 0, parts[i:], fine[i:]) for i in (0, 2)]
+    above = [refining(1, 0, parts, fine), refining(1, 0, whole[2:], [moved(whole[2], bits, 5)])]
     yield of("slices-named-again", "Layer 1 names the slices of layer 0 twice.", *parts, one, *above, chunk=5)
     two = first(bits, 2, 2, z=9, before=3)
     missing = saying(refining(2, 2, [two], [moved(two, bits)]), (1, 1))
@@ -301,6 +300,9 @@ def _names() -> Iterator[Vector]:
     early = refining(0, 0, parts[:1], fine[:1])
     what = "A refining slice is named with the slice behind it."
     yield of("of-refining-slice", what, parts[0], early, parts[1], itself, chunk=3)
+    passed = refining(0, 0, parts[1:2], fine[1:2])
+    what = "The slice that is named is a refining one; low bits are those of the slice behind it."
+    yield of("behind-refining-slice", what, parts[0], early, parts[1], passed, chunk=3)
     empty = later(0, (), widths=NARROW)
     nothing = replace(saying(empty, (0, 1)), sections={LOW_BITS: bytes(4)})
     what = "Only a slice without anchors is named."
@@ -371,10 +373,14 @@ def _sections() -> Iterator[Vector]:
     yield bad("low-bits-left", what, "7.7 11.6", MALFORMED, same.with_payload(1, left), chunk=1)
     yield of("cut", "15 11.6", "Section 7 ends in its parameters.", section[:3])
     yield of("byte-missing", "7.7 11.6", "Section 7 lacks its last byte.", section[:-1])
-    far = varint(2 * FIRST_REUSE)
+    parts, known = interleaved(), list[tuple[bytes, bytes]]()
+    fine = [moved(part, 2, i) for i, part in enumerate(parts)]
+    slices = [refining(0, 0, [part], [q]) for part, q in zip(parts[:2], fine, strict=False)]
+    own = [low_bits([part], [q]) for part, q in zip(parts, fine, strict=True)]
+    slices = [x.with_sections({LOW_BITS: coded(c, known=known)}) for x, c in zip(slices, own, strict=False)]
+    both = make_file(*parts, *slices, header={KEY: 2})
     what = "The second refining slice goes on with a prior of the first."
-    both = file.layer(3).with_sections({LOW_BITS: far + coded([[0]])[2:]})
-    yield bad("low-bits-prior-goes-on", what, "8.1 8 11.6", MALFORMED, file.with_payload(3, both.payload()), chunk=3)
+    yield bad("low-bits-prior-goes-on", what, "8.1 8 11.6", MALFORMED, both, chunk=4)
     what = "Section 7 defines tables of an entry more than 2^10 and one per symbol."
     yield bad("low-bits-entries-over-limit", what, "14 8.1 11.6", LIMIT, _wide(1), chunk=1)
     end = file.start(3) + PAYLOAD + 3
