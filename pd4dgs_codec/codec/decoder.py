@@ -30,7 +30,7 @@ class LayerReader:
     def __init__(self) -> None:
         self.header: Header | None = None
         self.offset = 0  #: of the next chunk
-        self._slices: list[list[LayerSymbols]] = []  # of each layer
+        self.slices: list[list[LayerSymbols]] = []  #: of each layer
         self._merged: list[LayerSymbols | None] = []  # each layer, None until somebody asks for it as it is now
         self._refined = [0] * len(BY_CHUNK_TYPE)  # by layer, how many of its slices
         self._index = 0
@@ -42,14 +42,14 @@ class LayerReader:
     @property
     def layers(self) -> list[LayerSymbols]:
         """The layers read so far; slices of the last one may be missing."""
-        layers = [layer or merged(parts) for layer, parts in zip(self._merged, self._slices, strict=True)]
+        layers = [layer or merged(parts) for layer, parts in zip(self._merged, self.slices, strict=True)]
         self._merged = [*layers]
         return layers
 
     @property
     def latest(self) -> LayerSymbols:
         """The slice read last."""
-        return self._slices[-1][-1]
+        return self.slices[-1][-1]
 
     @property
     def complete(self) -> bool:
@@ -110,12 +110,12 @@ class LayerReader:
 
     def _goes_on(self, layer: int) -> bool:
         """Whether a slice of `layer` before was read."""
-        return bool(self._slices) and self._slices[-1][0].kind.layer == layer
+        return bool(self.slices) and self.slices[-1][0].kind.layer == layer
 
     def _check_place(self, chunk: Chunk, layer: int) -> None:
         """Raise Malformed unless the slice's flags fit its place (clause "slices")."""
         assert self.header is not None
-        expected, message = len(self._slices[-1]) if self._goes_on(layer) else 0, ""
+        expected, message = len(self.slices[-1]) if self._goes_on(layer) else 0, ""
         following = layers_of(self.header.chunks[self._index + 1 :])[:1]
         if chunk.slice != expected:
             message = f"slice {chunk.slice} of layer {layer}, expected {expected}"
@@ -143,17 +143,17 @@ class LayerReader:
         if read.refines is not None:
             self._refine(read.refines, kind)
         self._past = past
-        at = -1 if later else len(self._slices)
-        self._slices = [*self._slices[:at], [*(self._slices[-1] if later else ()), read]]
+        at = -1 if later else len(self.slices)
+        self.slices = [*self.slices[:at], [*(self.slices[-1] if later else ()), read]]
         self._merged = [*self._merged[:at], None]
 
     def _refine(self, refinement: Refinement, kind: LayerKind) -> None:
         """Give earlier slices the low bits of their attributes (clause "low bits")."""
         assert self.header is not None
         header, layer = self.header, refinement.layer
-        place = next((i for i, parts in enumerate(self._slices) if parts[0].kind.layer == layer), None)
+        place = next((i for i, parts in enumerate(self.slices) if parts[0].kind.layer == layer), None)
         first, end = self._refined[layer], self._refined[layer] + refinement.slices
-        parts = [] if place is None else self._slices[place][first:end]
+        parts = [] if place is None else self.slices[place][first:end]
         symbols = sum(part.attributes.size for part in parts)
         if place is None or not header.low_bits or len(parts) < refinement.slices or any(p.refines for p in parts):
             found = f"{len(parts)} slices of layer {layer} that wait for low bits"
@@ -164,8 +164,8 @@ class LayerReader:
         refined = read_refinement(refinement.section, parts, header.low_bits)
         for part in refined:
             check_attributes(part, header.grid)
-        slices = [*self._slices[place][:first], *refined, *self._slices[place][end:]]
-        self._slices = [*self._slices[:place], slices, *self._slices[place + 1 :]]
+        slices = [*self.slices[place][:first], *refined, *self.slices[place][end:]]
+        self.slices = [*self.slices[:place], slices, *self.slices[place + 1 :]]
         self._merged = [*self._merged[:place], None, *self._merged[place + 1 :]]
         self._refined = [*self._refined[:layer], end, *self._refined[layer + 1 :]]
 
