@@ -247,7 +247,8 @@ def test_a_layer_is_merged_when_it_is_asked_for_and_not_at_each_refining_slice(m
     """Else a thousand refining slices of a large layer sort it a thousand times."""
     calls, merged = [], decoder.merged
     monkeypatch.setattr(decoder, "merged", lambda slices: calls.append(len(slices)) or merged(slices))
-    data = low(4, 1000)[0]
+    many = make_scene(3, anchors=800, kind="gaussian", layers=(0, 1), widths=Widths(3, 2), **TINY)
+    data = encode(many, effort=1, layers=2, slices=1000, low_bits=4)
     assert ends_of(data)[1] > 3
     calls.clear()
     decode(data)
