@@ -37,6 +37,7 @@ from pd4dgs_codec.codec.symbols import (
     TakenVoxels,
     assemble,
     attribute_blocks,
+    check_attributes,
     check_last_layer,
     float_tensors,
     layer_symbols,
@@ -149,7 +150,7 @@ def encode_with_report(
         written = [[whole_layer(layer, options)] for layer in symbols]
     if options.low_bits:
         written = with_low_bits(written, options)
-    _check_limits(meant.info.voxel_size, grid, symbols, written)
+    _check_limits(meant.info.voxel_size, grid, symbols, written, options.low_bits)
     about = write_metadata(metadata) if metadata is not None else b""
     data = _container(meant, grid, bounds, options, written, about)
     if options.verify:
@@ -180,7 +181,9 @@ def with_metadata(data: bytes, metadata: Metadata) -> bytes:
     return write_preamble(packed) + data[preamble.size :] + chunk
 
 
-def _check_limits(voxel_size: float, grid: Grid, symbols: list[LayerSymbols], written: list[list[Slice]]) -> None:
+def _check_limits(
+    voxel_size: float, grid: Grid, symbols: list[LayerSymbols], written: list[list[Slice]], low_bits: int
+) -> None:
     """Hold declared sizes and ranges of values against the format's limits as a decoder will, verified or not."""
     declared, taken = Declared(), TakenVoxels()
     chunks = sum(map(len, written))
@@ -194,6 +197,7 @@ def _check_limits(voxel_size: float, grid: Grid, symbols: list[LayerSymbols], wr
                 )
                 layers = [*symbols[:index], part.symbols]
                 check_last_layer(layers, taken, voxel_size, grid)
+                check_attributes(shifted(coarse(part.symbols, low_bits), low_bits), grid)
             except DecodeError as error:
                 raise EncodeError(f"the scene is over a limit of the format: {error}") from None
 

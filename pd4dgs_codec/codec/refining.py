@@ -18,6 +18,7 @@ from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
 from pd4dgs_codec.codec.options import EncodeOptions
 from pd4dgs_codec.codec.symbols import LayerSymbols
 from pd4dgs_codec.entropy.channels import CodedChannels, decode_channels, encode_channels
+from pd4dgs_codec.entropy.priors import MORE_ENTRIES
 from pd4dgs_codec.errors import Malformed
 
 
@@ -41,14 +42,14 @@ def write_refinement(parts: Sequence[LayerSymbols], bits: int, options: EncodeOp
     k = np.concatenate([coarse(part, bits).attributes for part in parts], axis=1)
     rest = np.where(k < 0, -1, 1).astype(np.int32) * (q - (k << bits))
     channels = [row[chosen] for row, own in zip(rest, k, strict=True) for chosen in _classes(own)]
-    return encode_channels(channels, priors=options.priors, effort=options.effort)
+    return encode_channels(channels, priors=options.priors, effort=options.effort, entries=MORE_ENTRIES)
 
 
 def read_refinement(section: bytes, parts: Sequence[LayerSymbols], bits: int) -> list[LayerSymbols]:
     """The slices, as `shifted` left them, with their low bits. Raises DecodeError's subclasses."""
     k = np.concatenate([part.attributes for part in parts], axis=1)
     counts = [int(chosen.sum()) for row in k for chosen in _classes(row >> bits)]
-    found = iter(decode_channels(section, counts))
+    found = iter(decode_channels(section, counts, entries=MORE_ENTRIES))
     for row in k:
         for chosen in _classes(row >> bits):
             rest = next(found)

@@ -175,11 +175,11 @@ test("with step classes a value is its centre plus the symbol times 2^class, and
 });
 
 test("low bits are those of 11.6, over slices of different lengths", () => {
-  // Constants with exceptions: -1 0 1 for the zeros, -2 for the odd one, -2 -1 for the others; then odd ones alone: 2.
-  const section = Uint8Array.of(1, 0, 1, 0, 1, 1, 0, 0, 3, 1, 3, 0, 1, 0, 0, 4);
+  // Constants with exceptions: -1 0 1 for the zeros, -1 for the odd one, -2 -1 for the others; then odd ones alone: 2.
+  const section = Uint8Array.of(1, 0, 1, 0, 1, 1, 0, 0, 1, 1, 3, 0, 1, 0, 0, 4);
   const coarse = [[-8, 0, 4, 4], [0, 0, 4, 8, -4, 4, 4, -4]].map((symbols) => Int32Array.from(symbols));
   const fine = refined(section, coarse, 2, 2);
-  assert.deepEqual(fine.map((symbols) => [...symbols]), [[-6, -1, 6, 6], [0, 1, 2, 7, -6, 6, 6, -6]]);
+  assert.deepEqual(fine.map((symbols) => [...symbols]), [[-6, -1, 6, 6], [0, 1, 3, 7, -6, 6, 6, -6]]);
   assert.deepEqual([...coarse[0]], [-8, 0, 4, 4]);
   /** @param {number} symbol @param {number} rest @param {number} lowBits */
   const kind = (symbol, rest, lowBits) =>
