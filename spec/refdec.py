@@ -26,7 +26,7 @@ FREE_ENTRIES, MORE_ENTRIES = 1 << 18, 1 << 10
 VARINT_MAX = (1 << 35) - 1  # clause 7.1: five bytes of seven bits
 TOTAL = 1 << 24
 PLANES = (("xy", 0, 1), ("xz", 0, 2), ("xt", 0, 3), ("yz", 1, 2), ("yt", 1, 3), ("zt", 2, 3))
-POSITIONS, MASKS, ATTRIBUTE_SECTION, PLANE_SECTION, WEIGHTS, SYMBOLS, FLOATS = range(7)
+POSITIONS, MASKS, ATTRIBUTE_SECTION, PLANE_SECTION, WEIGHTS, SYMBOLS, FLOATS, LOW_BITS = range(8)
 
 
 class Fault(Exception):
@@ -242,11 +242,12 @@ def read_preamble(data):
 
 # 5.1 Header map: "The time at 1 MUST NOT precede the time at 0, the background MUST lie in 0..1, 0 ≤ near < far and
 # unit ≥ 0 MUST hold." "coding mode: 0 ans, 1 lzma; others UnsupportedFeature" "deformation: 0 coded as symbols, 1
-# float32 (9.2); others UnsupportedFeature"
+# float32 (9.2); others UnsupportedFeature" "the number a of low bits (11.6); absent for none. In mode lzma it is
+# Malformed"
 # 5.2 Chunk list: "In mode lzma each occurs at most once."
 # 5.5 Digest: "The first 16 bytes of the SHA-256 of the payloads of all critical chunks that were encoded together"
 def read_header(data):
-    header = fields(unpack(data), range(1, 17), (*range(1, 12), 13, 14, 15), "header")
+    header = fields(unpack(data), range(1, 18), (*range(1, 12), 13, 14, 15), "header")
     steps, box, (start, end), background, (near, far), _ = (
         reals(header[key], f"header key {key}", count)
         for key, count in ((4, 3), (6, 6), (7, 2), (8, 3), (9, 2), (10, 3))
@@ -267,11 +268,14 @@ def read_header(data):
         limited(value, most, "a width", 1)
     for centre in a_list(header[16], "the centres", channel_count(header)) if 16 in header else ():
         limited(centre, MAX_SYMBOL, "a centre", -MAX_SYMBOL)
+    if 17 in header:
+        limited(header[17], 4, "the number of low bits", 1)
     read_chunk_list(header[1])
     for key in (2, 3):
         registered(header[key], (0, 1), f"header key {key}")
     layers = [kind for kind, _ in header[1] if kind < 3]
     need(header[2] == 0 or len(layers) == len(set(layers)), "a layer in several slices in mode lzma")
+    need(header[2] == 0 or 17 not in header, "low bits in mode lzma")
     return header
 
 
@@ -390,7 +394,9 @@ class Layer:
 
     def __init__(self, number, later, rows_before, header, past):
         self.number, self.later, self.rows_before, self.header, self.past = number, later, rows_before, header, past
-        self.rises, self.slices = 0 if later else rows_before, 1
+        self.rises, self.refines = 0 if later else rows_before, None
+        self.slices = [self]  # those of its layer, each with its own voxels, if it is the first
+        self.refined = 0  # how many of them have their low bits
         self.symbols = {}
         self.tensors = {}  # {name: [float]}, every one a binary32 value
 
@@ -404,17 +410,23 @@ def read_layer(payload, number, later, before, header, past):
     parts = {section: reader.take(layer.sections[section]) for section in sorted(layer.sections)}
     need(not reader.left, f"{reader.left} bytes behind the sections")
     check_sizes(layer, len(payload), before)
+    layer.low_bits = parts.pop(LOW_BITS, b"")
     read_sections(layer, parts)
+    layer.cells = list(zip(*[iter(layer.symbols["anchor"])] * 3))
     return layer
 
 
 # 6.2 Layer parameters: "In its first slice, layer 0 has keys 3 and 5 and not 4. Layers 1 and 2 have keys 3, 4 and 5 if
-# the layer has a deformation, else none of them. No later slice has any of the three."
+# the layer has a deformation, else none of them. No later slice has any of the three." "without key 6 there is no
+# section 7"
 def read_parameters(layer, value):
-    parameters = fields(value, range(1, 6), (1, 2), "layer parameters")
+    parameters = fields(value, range(1, 7), (1, 2), "layer parameters")
     layer.rows = limited(parameters[1], (1 << 24) - layer.rows_before, "own rows")
-    sections = fields(parameters[2], range(7), (), "sections")
+    sections = fields(parameters[2], range(8), (), "sections")
     layer.sections = {s: limited(sections[s], (1 << 31) - 1, "a section", 1) for s in sections if s < 64}
+    if 6 in parameters:
+        read_refines(layer, parameters[6])
+    need(6 in parameters or LOW_BITS not in layer.sections, "low bits without key 6")
     found = {3, 4, 5} & set(parameters)
     wanted = [set()] if layer.later else [{3, 4, 5}, set()] if layer.number else [{3, 5}]
     need(found in wanted, f"layer {layer.number} with keys {found}")
@@ -425,6 +437,15 @@ def read_parameters(layer, value):
     layer.steps = [a_step(step) for step in steps]
     layer.scales = read_scales(layer, parameters[4]) if layer.deformed else []
     check_bounded(layer)
+
+
+# 6.2 Layer parameters: "refining slices: a layer ℓ, 0..that of the slice, and a number m, 1..1024, of its slices" "A
+# slice with key 6 is not the first of its layer, its key 1 is 0, and its section map holds section 7 and no other"
+def read_refines(layer, value):
+    number, count = a_list(value, "the slices to refine", 2)
+    layer.refines = limited(number, layer.number, "the layer to refine"), limited(count, 1024, "slices to refine", 1)
+    bare = layer.later and not layer.rows and list(layer.sections) == [LOW_BITS]
+    need(bare, f"a refining slice with {layer.rows} rows and sections {list(layer.sections)}")
 
 
 # 5.4 Error bounds: "4 and 5 if layer 1 has a deformation, 6 and 7 if layer 2 has one, else the layer is Malformed."
@@ -494,8 +515,8 @@ def weight_shapes(layer):
     return shapes
 
 
-# 6.5 Declared sizes: "c MUST NOT exceed 2^28, N MUST NOT exceed 2^13 + 2·L, and S MUST NOT exceed 2^22 + 256·L."
-# "let N, S and L be sums over this slice and all slices before it in the file"
+# 6.5 Declared sizes: "let N, S and L be sums over this slice and all slices before it in the file" "c MUST NOT exceed
+# 2^28"
 def check_sizes(layer, payload_bytes, before):
     """before: N, S and L of the slices before it. Sets those with it."""
     samples = sum(c * h * w for _, _, (c, h, w) in plane_shapes(layer))
@@ -503,13 +524,17 @@ def check_sizes(layer, payload_bytes, before):
     row = channel_count(layer.header) + 4 + (16 in layer.header)
     symbols = layer.rises + row * layer.rows + samples + sum(size for _, size in weight_shapes(layer))
     layer.declared = [a + b for a, b in zip(before, (layer.rows, symbols, payload_bytes))]
-    rows, symbols, size = layer.declared
+    check_declared(*layer.declared)
+
+
+# 6.5 Declared sizes: "N MUST NOT exceed 2^13 + 2·L, and S MUST NOT exceed 2^22 + 256·L."
+def check_declared(rows, symbols, size):
     need(rows <= (1 << 13) + 2 * size, f"{rows} rows", "LimitExceeded")
     need(symbols <= (1 << 22) + 256 * size, f"{symbols} symbols", "LimitExceeded")
 
 
-# 6.4 Sections: "A section is present if and only if it has at least one symbol or value to code. Mode ans uses 0..4,
-# mode lzma 0 and 5."
+# 6.4 Sections: "A section is present if and only if it has at least one symbol or value to code. Mode ans uses 0..4 and
+# 7, mode lzma 0 and 5."
 def read_sections(layer, parts):
     def part(section, count):
         need(section in parts or not count, f"section {section} is missing")
@@ -549,6 +574,8 @@ def read_sections(layer, parts):
 # 11.1 Masks: "Layer ℓ codes a rise 0..255 for each earlier row, added to that row's code in the layer before in the
 # file, and a code 3..255 for each own row."
 # 11.2 Attributes: "Symbols, here and in 11.3 and 11.4, MUST lie in −2^23..2^23, else Malformed."
+# 11.6 Low bits: "Once 8.5 to 8.7 have given a coarse symbol k, it is replaced by k·2^a, which MUST lie in −2^23..2^23,
+# else Malformed."
 def keep_symbols(layer, positions, channels, planes, weights):
     rise, own = channels[MASKS]
     need(all(v >= 0 for v in rise), "a mask code that falls")  # that neither is over 255 follows in finish_last
@@ -558,7 +585,8 @@ def keep_symbols(layer, positions, channels, planes, weights):
     if 16 in layer.header:
         layer.symbols["step_class"], first = channels[ATTRIBUTE_SECTION][0], 1
     for name, width in attribute_channels(layer.header).items():  # [width, n], channel by channel
-        layer.symbols[name] = [k for channel in channels[ATTRIBUTE_SECTION][first : first + width] for k in channel]
+        coarse = [k for channel in channels[ATTRIBUTE_SECTION][first : first + width] for k in channel]
+        layer.symbols[name] = [k << layer.header.get(17, 0) for k in coarse]
         first += width
     if not layer.raw:
         residuals = iter(channels[PLANE_SECTION])
@@ -756,10 +784,12 @@ def read_exceptions(reader, count, prior):
 # new prior (8.2), if any; its exceptions (8.3), if bit 0 of the token is set."
 # 8 Coded channels: "tokens ≥ 8 refer to priors of the same section, or stage, only, and the definitions of the slices
 # of the same layer before count, in their order."
-def decode_channels(data, counts, known=None):
-    """known: the priors of the slices before, to which those defined here are added."""
+# 14 Limits: "entries of all windows that a section of coded channels defines" "one per symbol of its channels, and
+# 2^18, or 2^10 where slices before it defined some, and in section 7"
+def decode_channels(data, counts, known=None, few=False):
+    """known: the priors of the slices before, to which those defined here are added. few: as if there were some."""
     reader, defined, heads = Reader(data), [] if known is None else known, []
-    first, entries, most = len(defined), 0, sum(counts) + (MORE_ENTRIES if defined else FREE_ENTRIES)
+    first, entries, most = len(defined), 0, sum(counts) + (MORE_ENTRIES if defined or few else FREE_ENTRIES)
     for count in counts:
         if count == 0:
             continue
@@ -1336,7 +1366,55 @@ def add_slice(layer, part):
             channels += [both[row] for row in order]
         layer.symbols[name] = channels
     layer.symbols["anchor"] = [v for row in order for v in cells[row]]
-    layer.rows, layer.declared, layer.slices = len(cells), part.declared, layer.slices + 1
+    layer.rows, layer.declared = len(cells), part.declared
+    layer.slices.append(part)
+
+
+# 11.6 Low bits: "A refining slice with key 6 [ℓ, m] names the next m slices of layer ℓ, in their order, that no
+# refining slice has named yet. They MUST have come, MUST NOT be refining slices and MUST have a row between them, and
+# header key 17 MUST be there, else Malformed." "and 11.5 holds for it anew."
+# 6.5 Declared sizes: "in a refining slice D + 3·G + 6 for each row of the slices that it names, 11.6"
+def refine(layers, part):
+    """Gives rows of `layers` the low bits that the slice `part` brings."""
+    number, count = part.refines
+    need(17 in part.header, "a refining slice of a file without low bits")
+    found = [layer for layer in layers if layer.number == number]
+    need(found, f"low bits of layer {number}, which is not there")
+    layer = found[0]
+    named = layer.slices[layer.refined : layer.refined + count]
+    need(len(named) == count, f"{len(named)} slices of layer {number} wait for low bits, expected {count}")
+    need(not any(own.refines for own in named), "low bits of a refining slice")
+    place = {cell: row for row, cell in enumerate(zip(*[iter(layer.symbols["anchor"])] * 3))}
+    rows = [place[cell] for own in named for cell in own.cells]
+    need(rows, "low bits of slices without rows")
+    part.declared[1] += channel_count(layer.header) * len(rows)
+    check_declared(*part.declared)
+    add_low_bits(layer, rows, part.low_bits)
+    layer.refined += count
+    dequantise_layer(layer)
+
+
+# 11.6 Low bits: "It holds for each channel of 11.2, in order, three channels of rests r: for the rows whose k is 0, for
+# those whose k is odd, and for the others, each in the order of the rows. Each r MUST lie in −2^(a−1)..2^(a−1), else
+# Malformed. The symbol s of the row, k·2^a, becomes s + r if s ≥ 0, else s − r. It MUST lie in −2^23..2^23"
+def add_low_bits(layer, rows, section):
+    most = 1 << layer.header[17] - 1
+    places = []  # of each channel: (name, index)
+    for name, width in attribute_channels(layer.header).items():
+        for c in range(width):
+            own = [(name, c * layer.rows + row) for row in rows]
+            kinds = [], [], []
+            for at in own:
+                k = layer.symbols[name][at[1]] >> layer.header[17]
+                kinds[0 if k == 0 else 1 if k & 1 else 2].append(at)
+            places += kinds
+    for channel, rests in zip(places, decode_channels(section, [len(channel) for channel in places], few=True)):
+        need(all(abs(r) <= most for r in rests), f"a rest over {most}")
+        for (name, at), r in zip(channel, rests):
+            s = layer.symbols[name][at]
+            s = s + r if s >= 0 else s - r
+            need(abs(s) <= MAX_SYMBOL, "a refined symbol over 2^23")
+            layer.symbols[name][at] = s
 
 
 # 10.1 Payload: "bit 3i of the code is bit i of x, 3i + 1 of y, 3i + 2 of z"
@@ -1345,7 +1423,8 @@ def morton_code(offset):
 
 
 # 12.1 Order: "For each layer chunk, before the next chunk is looked at: parameters and their limits, sections, the
-# ranges of 11.1 and 11.2, sums of masks, each voxel at most once over the slices so far, and dequantisation."
+# ranges of 11.1 and 11.2, sums of masks, each voxel at most once over the slices so far, dequantisation, and low bits
+# with all that 11.6 asks for."
 # 11.1 Masks: "No sum may exceed 255."
 def finish_last(layers):
     codes = []
@@ -1373,13 +1452,16 @@ def decode(data, max_layer=None):
         payload, flags, at = read_chunk(data, at, kind, size, scene_id)
         if kind < 3:
             later = bool(layers) and layers[-1].number == kind
-            check_slice(flags, layers[-1].slices if later else 0, kind, [k for k, _ in header[1][i + 1 :] if k < 3])
+            number, following = len(layers[-1].slices) if later else 0, [k for k, _ in header[1][i + 1 :] if k < 3]
+            check_slice(flags, number, kind, following)
             read = read_layer(payload, kind, later, declared, header, layers[-1].past if later else Past())
             if later:
                 add_slice(layers[-1], read)
             else:
                 layers.append(read)
             finish_last(layers)
+            if read.refines:
+                refine(layers, read)
             declared = read.declared
     need(max_layer is not None or at == len(data), "bytes follow the last chunk")
     return layers

@@ -16,7 +16,7 @@ import sys
 from collections.abc import Iterator
 from pathlib import Path
 
-from vectors import dear, faulty, slices, uncommon, valid
+from vectors import dear, faulty, refining, slices, uncommon, valid
 from vectors.blocks import Vector
 
 from pd4dgs_codec.bitstream.container import read_preamble
@@ -31,7 +31,7 @@ SUFFIX = ".pd4"
 
 def vectors() -> list[Vector]:
     """All vectors, in the manifest's order."""
-    found = [*valid.cases(), *uncommon.cases(), *faulty.cases(), *slices.cases(), *dear.cases()]
+    found = [*valid.cases(), *uncommon.cases(), *faulty.cases(), *slices.cases(), *refining.cases(), *dear.cases()]
     names = [v.name for v in found]
     doubled = {name for name in names if names.count(name) > 1}
     if doubled:
@@ -56,6 +56,8 @@ def entry(vector: Vector) -> dict:
     listed = _listed(vector.data)
     if len(listed) > len(set(listed)):
         row["slices"] = list(vector.slices)
+    if vector.prefixes:
+        row["prefixes"] = {str(layer): rows for layer, rows in vector.prefixes.items()}
     row["layers"] = vector.layers
     return row
 

@@ -110,7 +110,12 @@ def _parts(result: dict[str, Any]) -> list[dict[str, Any]]:
 def _parts_table(result: dict[str, Any]) -> str:
     heads = ("part", *(f"layer {row['layer']}" for row in result["layers"]), "all", "share")
     rows = [
-        (row["part"], *(number(size, 0) for size in row["layers"]), number(row["bytes"], 0), row["bytes"])
+        (
+            row["part"].replace("_", " "),
+            *(number(size, 0) for size in row["layers"]),
+            number(row["bytes"], 0),
+            row["bytes"],
+        )
         for row in result["parts"]
     ]
     return table(heads, [(*row[:-1], f"{100 * row[-1] / result['bytes']:.1f} %") for row in rows])
@@ -153,15 +158,24 @@ def _about_lines(metadata: dict[str, Any] | None) -> list[str]:
 
 def _slice_lines(result: dict[str, Any]) -> list[str]:
     """Where the slices of layers in several end, and what each shows if the file says so."""
-    ends = [(row["layer"], part["end"]) for row in result["layers"] for part in row["slices"]]
-    if len(ends) == len(result["layers"]):
+    parts = [(row["layer"], part) for row in result["layers"] for part in row["slices"]]
+    if len(parts) == len(result["layers"]):
         return []
     quality = (result["metadata"] or {}).get("slices", [])
-    shown = quality if len(quality) == len(ends) else [None] * len(ends)
+    shown = quality if len(quality) == len(parts) else [None] * len(parts)
     rows = [
-        (i, layer, number(end, 0), number(db, 2)) for i, ((layer, end), db) in enumerate(zip(ends, shown, strict=True))
+        (i, layer, number(part["end"], 0), _brought(part, result["low_bits"]), number(db, 2))
+        for i, ((layer, part), db) in enumerate(zip(parts, shown, strict=True))
     ]
-    return [table(("slice", "layer", "prefix", "mPSNR dB"), rows)]
+    return [table(("slice", "layer", "prefix", "brings", "mPSNR dB"), rows)]
+
+
+def _brought(part: dict[str, Any], low_bits: int) -> str:
+    """What a slice holds, as far as that is here."""
+    if "refines" in part:
+        slices = f"{number} slices" if (number := part["refines"]["slices"]) > 1 else "a slice"
+        return f"{low_bits} low bits of {slices} of layer {part['refines']['layer']}"
+    return f"{part['anchors']:,} anchors" if "anchors" in part else "-"
 
 
 def _bound_lines(declared: dict[str, float], nearest: dict[str, float]) -> list[str]:

@@ -6,22 +6,33 @@ from pd4dgs_codec.bitstream.container import CHUNK_OVERHEAD, PREAMBLE_SIZE, Chun
 from pd4dgs_codec.codec.attribute_section import Past
 from pd4dgs_codec.codec.header import Header, layers_of, scene_id_of, unpack_header
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE, LayerKind
-from pd4dgs_codec.codec.layer_meta import Declared
+from pd4dgs_codec.codec.layer_meta import Declared, check_declared
 from pd4dgs_codec.codec.payload import read_layer
-from pd4dgs_codec.codec.symbols import LayerSymbols, TakenVoxels, assemble, check_last_layer, merged
+from pd4dgs_codec.codec.refining import read_refinement, shifted
+from pd4dgs_codec.codec.symbols import (
+    LayerSymbols,
+    Refinement,
+    TakenVoxels,
+    assemble,
+    check_attributes,
+    check_last_layer,
+    merged,
+)
 from pd4dgs_codec.entropy.priors import Prior
 from pd4dgs_codec.errors import DecodeError, Malformed, Truncated, UnsupportedFeature
 from pd4dgs_codec.scene import Scene
 
 
 class LayerReader:
-    """Walks a file's chunks in order. It holds no bytes: every call gets all that has arrived."""
+    """Walks a file's chunks in order. It holds no bytes: every call gets all that has arrived. Its lists are replaced
+    and never changed, so that a copy stays what it is."""
 
     def __init__(self) -> None:
         self.header: Header | None = None
         self.offset = 0  #: of the next chunk
-        self._whole: list[LayerSymbols] = []  # the layers before the last
-        self._slices: list[LayerSymbols] = []  # of the last layer
+        self.slices: list[list[LayerSymbols]] = []  #: of each layer
+        self._merged: list[LayerSymbols | None] = []  # each layer, None until somebody asks for it as it is now
+        self._refined = [0] * len(BY_CHUNK_TYPE)  # by layer, how many of its slices
         self._index = 0
         self._scene_id = b""
         self._declared = Declared()
@@ -31,12 +42,14 @@ class LayerReader:
     @property
     def layers(self) -> list[LayerSymbols]:
         """The layers read so far; slices of the last one may be missing."""
-        return [*self._whole, merged(self._slices)] if self._slices else []
+        layers = [layer or merged(parts) for layer, parts in zip(self._merged, self.slices, strict=True)]
+        self._merged = [*layers]
+        return layers
 
     @property
     def latest(self) -> LayerSymbols:
         """The slice read last."""
-        return self._slices[-1]
+        return self.slices[-1][-1]
 
     @property
     def complete(self) -> bool:
@@ -97,12 +110,12 @@ class LayerReader:
 
     def _goes_on(self, layer: int) -> bool:
         """Whether a slice of `layer` before was read."""
-        return bool(self._slices) and self._slices[0].kind.layer == layer
+        return bool(self.slices) and self.slices[-1][0].kind.layer == layer
 
     def _check_place(self, chunk: Chunk, layer: int) -> None:
         """Raise Malformed unless the slice's flags fit its place (clause "slices")."""
         assert self.header is not None
-        expected, message = len(self._slices) if self._goes_on(layer) else 0, ""
+        expected, message = len(self.slices[-1]) if self._goes_on(layer) else 0, ""
         following = layers_of(self.header.chunks[self._index + 1 :])[:1]
         if chunk.slice != expected:
             message = f"slice {chunk.slice} of layer {layer}, expected {expected}"
@@ -115,18 +128,46 @@ class LayerReader:
     def _read_slice(self, chunk: Chunk, kind: LayerKind) -> None:
         assert self.header is not None
         later = self._goes_on(kind.layer)
-        before = self._whole if later else self.layers
         past = self._past if later else Past[Prior]() if chunk.more else None
         header = self.header
         read = read_layer(
             chunk.payload, kind, header.widths, self._declared, header.mode, header.raw_deformation, later, past
         )
+        if header.low_bits:
+            read = shifted(read, header.low_bits)
+        before = self.layers if read.mask_increase.size else []
         check_last_layer([*before, read], self._taken, header.info.voxel_size, header.grid)
         _check_bounded(read, header)
         symbols = sum(a.size for a in read.arrays())
         self._declared = self._declared.and_slice(len(read.anchor_q), symbols, len(chunk.payload))
-        self._whole, self._past = before, past
-        self._slices = [*self._slices, read] if later else [read]
+        if read.refines is not None:
+            self._refine(read.refines, kind)
+        self._past = past
+        at = -1 if later else len(self.slices)
+        self.slices = [*self.slices[:at], [*(self.slices[-1] if later else ()), read]]
+        self._merged = [*self._merged[:at], None]
+
+    def _refine(self, refinement: Refinement, kind: LayerKind) -> None:
+        """Give earlier slices the low bits of their attributes (clause "low bits")."""
+        assert self.header is not None
+        header, layer = self.header, refinement.layer
+        place = next((i for i, parts in enumerate(self.slices) if parts[0].kind.layer == layer), None)
+        first, end = self._refined[layer], self._refined[layer] + refinement.slices
+        parts = [] if place is None else self.slices[place][first:end]
+        symbols = sum(part.attributes.size for part in parts)
+        if place is None or not header.low_bits or len(parts) < refinement.slices or any(p.refines for p in parts):
+            found = f"{len(parts)} slices of layer {layer} that wait for low bits"
+            raise Malformed(f"layer {kind.layer}: {found}, expected {refinement.slices}")
+        if not symbols:
+            raise Malformed(f"layer {kind.layer}: low bits of slices without anchors, expected some")
+        self._declared = check_declared(self._declared.and_slice(0, symbols, 0), kind)
+        refined = read_refinement(refinement.section, parts, header.low_bits)
+        for part in refined:
+            check_attributes(part, header.grid)
+        slices = [*self.slices[place][:first], *refined, *self.slices[place][end:]]
+        self.slices = [*self.slices[:place], slices, *self.slices[place + 1 :]]
+        self._merged = [*self._merged[:place], None, *self._merged[place + 1 :]]
+        self._refined = [*self._refined[:layer], end, *self._refined[layer + 1 :]]
 
 
 def _any_layer(chunks: tuple[tuple[int, int], ...], max_layer: int) -> bool:

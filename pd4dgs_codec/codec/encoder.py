@@ -30,12 +30,14 @@ from pd4dgs_codec.codec.metadata import CHUNK_TYPE, Metadata, write_metadata
 from pd4dgs_codec.codec.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.codec.payload import StreamReport, read_meta
 from pd4dgs_codec.codec.plan import plan
-from pd4dgs_codec.codec.slicing import Slice, whole_layer, write_slices
+from pd4dgs_codec.codec.refining import coarse, shifted
+from pd4dgs_codec.codec.slicing import Slice, whole_layer, with_low_bits, write_slices
 from pd4dgs_codec.codec.symbols import (
     LayerSymbols,
     TakenVoxels,
     assemble,
     attribute_blocks,
+    check_attributes,
     check_last_layer,
     float_tensors,
     layer_symbols,
@@ -140,11 +142,15 @@ def encode_with_report(
         errors = verify_errors(planned, meant, attribute_blocks(grid, symbols), bounds, options.raw_deformation)
     del planned  # as large as the scene
     if options.slices:
-        values = np.split((utility or by_size)(assemble(meant.info, grid, symbols)), meant.rows[:-1])
+        first = [shifted(coarse(layer, options.low_bits), options.low_bits) for layer in symbols]
+        values = np.split((utility or by_size)(assemble(meant.info, grid, first)), meant.rows[:-1])
+        del first
         written = [write_slices(layer, options, u, HEADER) for layer, u in zip(symbols, values, strict=True)]
     else:
         written = [[whole_layer(layer, options)] for layer in symbols]
-    _check_limits(meant.info.voxel_size, grid, symbols, written)
+    if options.low_bits:
+        written = with_low_bits(written, options)
+    _check_limits(meant.info.voxel_size, grid, symbols, written, options.low_bits)
     about = write_metadata(metadata) if metadata is not None else b""
     data = _container(meant, grid, bounds, options, written, about)
     if options.verify:
@@ -175,7 +181,9 @@ def with_metadata(data: bytes, metadata: Metadata) -> bytes:
     return write_preamble(packed) + data[preamble.size :] + chunk
 
 
-def _check_limits(voxel_size: float, grid: Grid, symbols: list[LayerSymbols], written: list[list[Slice]]) -> None:
+def _check_limits(
+    voxel_size: float, grid: Grid, symbols: list[LayerSymbols], written: list[list[Slice]], low_bits: int
+) -> None:
     """Hold declared sizes and ranges of values against the format's limits as a decoder will, verified or not."""
     declared, taken = Declared(), TakenVoxels()
     chunks = sum(map(len, written))
@@ -189,6 +197,7 @@ def _check_limits(voxel_size: float, grid: Grid, symbols: list[LayerSymbols], wr
                 )
                 layers = [*symbols[:index], part.symbols]
                 check_last_layer(layers, taken, voxel_size, grid)
+                check_attributes(shifted(coarse(part.symbols, low_bits), low_bits), grid)
             except DecodeError as error:
                 raise EncodeError(f"the scene is over a limit of the format: {error}") from None
 
@@ -221,6 +230,7 @@ def _container(
         info=meant.info,
         error_bounds=bounds,
         digest=payload_digest(payloads),
+        low_bits=options.low_bits,
     )
     packed = pack_header(header)
     scene_id = scene_id_of(packed)

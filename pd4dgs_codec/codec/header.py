@@ -14,7 +14,7 @@ from pd4dgs_codec.attributes.quantise import MAX_SYMBOL, is_step
 from pd4dgs_codec.attributes.table import Grid
 from pd4dgs_codec.bitstream import canonical
 from pd4dgs_codec.bitstream.container import SCENE_ID_SIZE
-from pd4dgs_codec.bitstream.limits import MAX_CHUNKS, MAX_PAYLOAD
+from pd4dgs_codec.bitstream.limits import MAX_CHUNKS, MAX_LOW_BITS, MAX_PAYLOAD
 from pd4dgs_codec.codec.check import info_fault
 from pd4dgs_codec.codec.fields import Fields, as_integer, as_list
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE, LAYER_KINDS
@@ -24,7 +24,7 @@ from pd4dgs_codec.scene import ATTRIBUTES, MAX_FEATURE, MAX_SLOTS, Camera, Scene
 
 # Keys of the header map.
 CHUNKS, MODE, DEFORMATION, STEPS, VOXEL_SIZE, BOX, TIME_RANGE, BACKGROUND, NEAR_FAR, UP, UNIT = range(1, 12)
-CAMERA, ERROR_BOUNDS, DIGEST, WIDTHS, CENTRE = range(12, 17)
+CAMERA, ERROR_BOUNDS, DIGEST, WIDTHS, CENTRE, LOW_BITS = range(12, 18)
 # Keys of the camera map.
 VIEWMAT, INTRINSICS, WIDTH, HEIGHT = range(1, 5)
 
@@ -52,7 +52,8 @@ class Header:
 
     widths: of the anchors. centre: int32 [channels] in steps, if they are graded. error_bounds: by field of Steps, how
     far a decoded value may lie from the one that the encoder was given, in the unit of the values; a binary32 value >=
-    0. digest: payload_digest of the layers that were encoded together.
+    0. digest: payload_digest of the layers that were encoded together. low_bits: how many of the attributes' symbols
+    come in slices of their own, 0 for none.
     """
 
     chunks: tuple[tuple[int, int], ...]
@@ -64,6 +65,7 @@ class Header:
     info: SceneInfo
     error_bounds: dict[str, float]
     digest: bytes
+    low_bits: int = 0
 
     @property
     def grid(self) -> Grid:
@@ -110,12 +112,14 @@ def pack_header(header: Header) -> bytes:
     fields |= {DIGEST: header.digest, WIDTHS: [header.widths.feature, header.widths.slots]}
     if header.centre is not None:
         fields[CENTRE] = header.centre.tolist()
+    if header.low_bits:
+        fields[LOW_BITS] = header.low_bits
     return canonical.pack(fields)
 
 
 def unpack_header(data: bytes, offset: int = 0) -> Header:
     """The inverse of pack_header (clause "header"); `offset` is that of the header's first byte, for messages."""
-    fields = Fields(canonical.unpack(data, offset=offset), "header", set(range(CHUNKS, CENTRE + 1)))
+    fields = Fields(canonical.unpack(data, offset=offset), "header", set(range(CHUNKS, LOW_BITS + 1)))
     steps = fields.reals(STEPS, len(ATTRIBUTES))
     voxel_size = fields.real(VOXEL_SIZE)
     for name, step in zip(["voxel_size", *ATTRIBUTES], [voxel_size, *steps], strict=True):
@@ -144,6 +148,9 @@ def unpack_header(data: bytes, offset: int = 0) -> Header:
     layers = layers_of(chunks)
     if mode == "lzma" and len(set(layers)) < len(layers):
         raise Malformed(f"header: layer chunks {layers} in mode lzma, expected each layer in one slice")
+    low_bits = fields.integer(LOW_BITS, MAX_LOW_BITS, low=1) if LOW_BITS in fields else 0
+    if low_bits and mode == "lzma":
+        raise Malformed(f"header: {low_bits} low bits in mode lzma, expected none")
     return Header(
         chunks=chunks,
         mode=mode,
@@ -154,6 +161,7 @@ def unpack_header(data: bytes, offset: int = 0) -> Header:
         info=info,
         error_bounds=_unpack_error_bounds(fields),
         digest=_unpack_digest(fields.get(DIGEST)),
+        low_bits=low_bits,
     )
 
 

@@ -27,7 +27,8 @@ def info(data: bytes) -> dict[str, Any]:
     layers: {layer, offset, bytes, end, slices} (whole chunks; end = length of the prefix that holds layers 0 .. this
     one) and, for layers that `data` holds whole, anchors, steps, planes ([C, x, y, z, t] per scale), networks (output
     widths) and sections (bytes by name; what else the chunks hold is their frames and their parameters). slices:
-    {offset, bytes, end} and, of those that `data` holds whole, anchors.
+    {offset, bytes, end} and, of those that `data` holds whole, anchors, and where low bits come instead, refines:
+    {layer, slices}.
     metadata: {title, source, licence, command, quality, slices, still_bytes} as far as given, {"fault"} if it cannot be
     read, None where `data` holds no such chunk.
     """
@@ -39,7 +40,7 @@ def info(data: bytes) -> dict[str, Any]:
     for chunk_type, length in header.chunks:
         size = CHUNK_OVERHEAD + length
         kind = BY_CHUNK_TYPE.get(chunk_type)
-        place = {"offset": offset, "bytes": size, "end": offset + size}
+        place: dict[str, Any] = {"offset": offset, "bytes": size, "end": offset + size}
         if kind is None:
             others.append({"type": chunk_type, **place})
             if chunk_type == CHUNK_TYPE and metadata is None and offset + size <= len(data):
@@ -55,6 +56,8 @@ def info(data: bytes) -> dict[str, Any]:
                 payload = read_chunk(data, offset, type=chunk_type, length=length).payload
                 meta, _, declared = read_meta(payload, kind, header.widths, declared, header.raw_deformation, later)
                 place["anchors"] = meta.rows
+                if meta.refines:
+                    place["refines"] = {"layer": meta.refines[0], "slices": meta.refines[1]}
                 row["anchors"] = row.get("anchors", 0) + meta.rows
                 if not later:
                     row |= {
@@ -81,6 +84,7 @@ def info(data: bytes) -> dict[str, Any]:
         "feature_width": header.widths.feature,
         "slots": header.widths.slots,
         "graded": header.widths.graded,
+        "low_bits": header.low_bits,
         "steps": header.attribute_steps,
         "error_bounds": header.error_bounds,
         "anchors": declared.rows if all("anchors" in row for row in layers) else None,

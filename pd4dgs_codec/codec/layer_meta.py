@@ -12,6 +12,7 @@ from pd4dgs_codec.attributes.quantise import is_step
 from pd4dgs_codec.bitstream import canonical
 from pd4dgs_codec.bitstream.limits import (
     MAX_ANCHORS,
+    MAX_CHUNKS,
     MAX_NETWORK_LAYERS,
     MAX_NETWORK_WIDTH,
     MAX_PAYLOAD,
@@ -27,7 +28,8 @@ from pd4dgs_codec.scene import PLANES, TRUNK, Widths
 
 
 class Section(IntEnum):
-    """Parts of a payload, in order; one without symbols is absent. SYMBOLS (mode lzma) stands for 1..4 together."""
+    """Parts of a payload, in order; one without symbols is absent. SYMBOLS (mode lzma) stands for 1..4 together,
+    LOW_BITS alone in a slice that refines earlier ones."""
 
     POSITIONS = 0
     MASKS = 1
@@ -36,10 +38,11 @@ class Section(IntEnum):
     WEIGHTS = 4
     SYMBOLS = 5
     FLOATS = 6
+    LOW_BITS = 7
 
 
 # Keys of the map.
-ROWS, SECTIONS, STEPS, SCALES, NETWORKS = range(1, 6)
+ROWS, SECTIONS, STEPS, SCALES, NETWORKS, REFINES = range(1, 7)
 
 #: A file of S symbols has at least (S - FREE_SYMBOLS) / SYMBOLS_PER_BYTE bytes, so that a few bytes that declare
 #: constant channels cannot make a decoder allocate without end. Real scenes spend over 0.1 bit per symbol.
@@ -81,7 +84,7 @@ class LayerMeta:
     """rows: the slice's own anchors. sections: length in bytes by Section. steps: by field of Steps.
 
     networks: per name the outputs of its linear layers; the first input follows from the layer (input_width). widths:
-    those of the scene's anchors.
+    those of the scene's anchors. refines: of a slice that brings low bits, (layer, how many of its slices).
     """
 
     rows: int
@@ -90,6 +93,7 @@ class LayerMeta:
     scales: tuple[ScaleMeta, ...]
     networks: dict[str, tuple[int, ...]]
     widths: Widths
+    refines: tuple[int, int] | None = None
 
     def input_width(self, name: str, kind: LayerKind) -> int:
         """Inputs of network `name`: the scaffold's fixed ones, the sampled planes' or the trunk's outputs."""
@@ -120,6 +124,8 @@ def pack_meta(meta: LayerMeta, kind: LayerKind) -> bytes:
         fields[SCALES] = [[s.channels, *s.sides, *s.predictors] for s in meta.scales]
     if meta.networks:
         fields[NETWORKS] = [[kind.network_ids[name], *widths] for name, widths in meta.networks.items()]
+    if meta.refines:
+        fields[REFINES] = list(meta.refines)
     return canonical.pack(fields)
 
 
@@ -130,7 +136,7 @@ def unpack_meta(
 
     later: whether it is a slice behind the layer's first."""
     where = f"layer {kind.layer}"
-    fields = Fields(canonical.unpack(data), where, set(range(ROWS, NETWORKS + 1)))
+    fields = Fields(canonical.unpack(data), where, set(range(ROWS, REFINES + 1)))
     known_sections = {int(s) for s in Section}
     sections = Fields(fields.get(SECTIONS), f"{where} sections", known_sections)
     networks = {} if later else _unpack_networks(fields, kind, widths, where)
@@ -141,11 +147,26 @@ def unpack_meta(
         scales=_unpack_scales(fields, raw_deformation, where) if networks and kind.layer > 0 else (),
         networks=networks,
         widths=widths,
+        refines=_unpack_refines(fields, kind, where) if REFINES in fields else None,
     )
+    if meta.refines and not later:
+        raise Malformed(f"{where}: its first slice refines others, expected a later one")
+    if (Section.LOW_BITS in meta.sections) != bool(meta.refines) or (meta.refines and len(meta.sections) > 1):
+        raise Malformed(f"{where}: sections {sorted(meta.sections)}, expected {int(Section.LOW_BITS)} with key 6 alone")
+    if meta.refines and meta.rows:
+        raise Malformed(f"{where}: a slice that refines others has {meta.rows} anchors, expected none")
     for key, expected in ((STEPS, bool(networks)), (SCALES, bool(meta.scales)), (NETWORKS, bool(networks))):
         if (key in fields) != expected:
             raise Malformed(f"{where}: key {key} is {'missing' if expected else 'there'} without reason")
     return meta
+
+
+def _unpack_refines(fields: Fields, kind: LayerKind, where: str) -> tuple[int, int]:
+    layer, slices = fields.sequence(REFINES, 2)
+    return (
+        as_integer(layer, kind.layer, f"{where}: the layer that it refines"),
+        as_integer(slices, MAX_CHUNKS, f"{where}: number of slices that it refines", low=1),
+    )
 
 
 def declared_symbols(meta: LayerMeta, kind: LayerKind, rises: int) -> int:
@@ -160,7 +181,11 @@ def check_symbol_count(meta: LayerMeta, kind: LayerKind, before: Declared, paylo
     cells = sum(math.prod(shape) for shape in meta.plane_shapes())
     if cells > MAX_PLANE_CELLS:
         raise LimitExceeded(f"layer {kind.layer}: planes of {cells} cells, limit {MAX_PLANE_CELLS}")
-    total = before.and_slice(meta.rows, declared_symbols(meta, kind, rises), payload_bytes)
+    return check_declared(before.and_slice(meta.rows, declared_symbols(meta, kind, rises), payload_bytes), kind)
+
+
+def check_declared(total: Declared, kind: LayerKind) -> Declared:
+    """`total`; LimitExceeded if the slices so far, of which this layer has the last, cannot hold so much."""
     for what, found, free, per_byte in (
         ("anchors", total.rows, FREE_ROWS, ROWS_PER_BYTE),
         ("symbols", total.symbols, FREE_SYMBOLS, SYMBOLS_PER_BYTE),

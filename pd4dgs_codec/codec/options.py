@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
+from pd4dgs_codec.bitstream.limits import MAX_LOW_BITS
 from pd4dgs_codec.entropy import EFFORTS, PRIORS
 from pd4dgs_codec.errors import EncodeError
 
@@ -29,6 +30,7 @@ CHOICES: Mapping[str, Sequence[str | int]] = {
     "layers": ("auto", 0, 1, 2),
     "effort": EFFORTS,
     "omit": ("bounded", "lossless", "nothing"),
+    "low_bits": tuple(range(MAX_LOW_BITS + 1)),
 }
 
 
@@ -48,6 +50,7 @@ class EncodeOptions:
     heads that are exactly zero and anchors below the mask threshold. step_scale multiplies every quantisation step.
     slices: bytes that a slice of a layer takes at most where its planes and networks allow it, the header counted with
     the first; 0 for one slice per layer.
+    low_bits: so many bits of the attributes' symbols come at the end of the file, 0..4: earlier pictures, more bytes.
     verify: decode the result, compare every symbol and every float, and hold every float against the error bound in the
     header.
     """
@@ -60,6 +63,7 @@ class EncodeOptions:
     omit: str = "bounded"
     step_scale: float = 1.0
     slices: int = 0
+    low_bits: int = 0
     verify: bool = True
 
     def __post_init__(self) -> None:
@@ -71,6 +75,8 @@ class EncodeOptions:
             raise EncodeError(f"step_scale {self.step_scale!r}, expected a positive number")
         if self.slices and self.slices < LEAST_SLICE:
             raise EncodeError(f"slices of {self.slices} bytes, expected 0 or {LEAST_SLICE} and more")
+        if self.low_bits and self.mode != "ans":
+            raise EncodeError(f"low bits in mode {self.mode}, expected mode ans or none")
         if self.slices and self.mode != "ans":
             raise EncodeError(f"slices in mode {self.mode}, expected mode ans or one slice per layer")
 

@@ -31,7 +31,7 @@ from pd4dgs_codec.codec.layer_meta import (
 from pd4dgs_codec.codec.options import EncodeOptions
 from pd4dgs_codec.codec.plane_choice import choose_predictor
 from pd4dgs_codec.codec.plane_section import read_planes, write_planes
-from pd4dgs_codec.codec.symbols import LayerSymbols
+from pd4dgs_codec.codec.symbols import LayerSymbols, Refinement
 from pd4dgs_codec.entropy.bits import entropy_bits, gaussian_bits
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
 from pd4dgs_codec.entropy.fitting import Fitted
@@ -101,6 +101,8 @@ def write_layer(
     if symbols.raw_deformation and symbols.networks:
         sections[Section.FLOATS] = encode_floats_lzma([a.ravel() for a in symbols.tensors()], effort=options.effort)
         reports.append(StreamReport("floats", 8 * len(sections[Section.FLOATS]), 0.0, 0))
+    if symbols.refines:
+        sections[Section.LOW_BITS] = symbols.refines.section
     meta = pack_meta(_meta(symbols, sections, predictors), symbols.kind)
     return b"".join([struct.pack("<I", len(meta)), meta, *sections.values()]), reports
 
@@ -153,6 +155,7 @@ def _meta(symbols: LayerSymbols, sections: dict[Section, bytes], predictors: lis
         scales=tuple(scales),
         networks={name: tuple(w.shape[0] for w, _ in network) for name, network in symbols.networks.items()},
         widths=symbols.widths,
+        refines=(symbols.refines.layer, symbols.refines.slices) if symbols.refines else None,
     )
 
 
@@ -202,6 +205,7 @@ def read_layer(
     for section, length in sorted(meta.sections.items()):
         parts[section] = bytes(payload[start : start + length])
         start += length
+    refines = Refinement(*meta.refines, parts.pop(Section.LOW_BITS)) if meta.refines else None
     raw_deformation = raw_deformation and bool(meta.networks) and kind.layer > 0
     shapes = [*meta.plane_shapes(), *meta.weight_shapes(kind)]
     counts = _channel_counts(meta, kind, 0 if later else before.rows, raw_deformation)
@@ -222,8 +226,9 @@ def read_layer(
     for tensor in (attributes, *tensors):
         if tensor.dtype.kind == "i" and tensor.size and max(int(tensor.max()), -int(tensor.min())) > MAX_SYMBOL:
             raise Malformed(f"layer {kind.layer}: a symbol over {MAX_SYMBOL} in magnitude")
+    steps = meta.steps
     return LayerSymbols(
-        kind, widths, anchor_q, increase, own, classes, attributes, planes, networks, meta.steps, raw_deformation
+        kind, widths, anchor_q, increase, own, classes, attributes, planes, networks, steps, raw_deformation, refines
     )
 
 

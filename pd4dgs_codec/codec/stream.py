@@ -40,7 +40,7 @@ class Stream:
         try:
             while self._reader.next_slice(self._buffer):
                 self.slices += 1
-                newest[self._reader.latest.kind.layer] = copy(self._reader)  # which replaces its lists and changes none
+                newest[self._reader.latest.kind.layer] = copy(self._reader)
         except Truncated:
             pass
         except DecodeError as error:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +18,16 @@ from pd4dgs_codec.scene import PLANES, Deformation, Grading, Network, Planes, Sc
 ArrayMap = Callable[[str, np.ndarray], np.ndarray]
 
 
+@dataclass(frozen=True)
+class Refinement:
+    """Low bits of the attributes of earlier rows, coded: those of the next `slices` slices of `layer` that have none
+    yet. See `refining`."""
+
+    layer: int
+    slices: int
+    section: bytes
+
+
 @dataclass(frozen=True, eq=False)
 class LayerSymbols:
     """What one layer carries, or one slice of it: later slices have anchors with their masks and attributes alone.
@@ -26,7 +36,7 @@ class LayerSymbols:
     int32 [rows before] rise of the earlier anchors' mask codes, mask_own: int32 [n] codes of its own. classes: int32
     [n] step classes, or NO_CLASSES. attributes: int32 [channels, n]. planes, networks: int32 symbols, or float32 values
     if raw_deformation; networks in the order of their registry ids. steps: quantisation steps of this layer by name, as
-    in LayerKind.step_names; empty if it has no networks.
+    in LayerKind.step_names; empty if it has no networks. refines: of a slice without anchors, what it brings instead.
     """
 
     kind: LayerKind
@@ -40,6 +50,7 @@ class LayerSymbols:
     networks: dict[str, Network]
     steps: dict[str, float]
     raw_deformation: bool = False
+    refines: Refinement | None = None
 
     def tensors(self) -> Iterator[np.ndarray]:
         """The planes (scale by scale, in PLANES' order), then weight and bias of each linear layer of each network."""
@@ -247,19 +258,26 @@ def check_last_layer(layers: Sequence[LayerSymbols], taken: TakenVoxels, voxel_s
         if highest > 255:
             raise Malformed(f"layer {layer.kind.layer}: mask code {highest}, expected at most 255")
     taken.take(layer.anchor_q)
+    check_attributes(layer, grid)
+    _check_finite(layer, _with_steps(layer, voxel_size))
+
+
+def check_attributes(layer: LayerSymbols, grid: Grid) -> None:
+    """Raises Malformed if an attribute lies too many steps from 0, or would not be finite."""
     farthest = grid.farthest(layer.attributes, layer.classes)
     if max(farthest.values()) > MAX_SYMBOL:
         raise Malformed(f"layer {layer.kind.layer}: an attribute more than {MAX_SYMBOL} steps from 0")
-    if not all(all_finite(k, step) for k, step in _with_steps(layer, farthest, voxel_size, grid)):
+    _check_finite(layer, ((np.array(steps), grid.steps[name]) for name, steps in farthest.items()))
+
+
+def _check_finite(layer: LayerSymbols, multiples: Iterable[tuple[np.ndarray, float]]) -> None:
+    if not all(all_finite(k, step) for k, step in multiples):
         raise Malformed(f"layer {layer.kind.layer}: a reconstructed value is not finite")
 
 
-def _with_steps(
-    layer: LayerSymbols, farthest: dict[str, int], voxel_size: float, grid: Grid
-) -> Iterator[tuple[np.ndarray, float]]:
-    """(multiples, their step) of everything in `layer` that is dequantised; of the attributes the farthest alone."""
+def _with_steps(layer: LayerSymbols, voxel_size: float) -> Iterator[tuple[np.ndarray, float]]:
+    """(multiples, their step) of everything in `layer` that is dequantised but the attributes."""
     yield layer.anchor_q, voxel_size
-    yield from ((np.array(steps), grid.steps[name]) for name, steps in farthest.items())
     if not layer.raw_deformation:
         planes, steps = len(PLANES) * len(layer.planes), list(layer.steps.values())
         yield from ((k, steps[0 if i < planes else -1]) for i, k in enumerate(layer.tensors()))

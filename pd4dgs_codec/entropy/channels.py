@@ -76,13 +76,19 @@ def check_channels(channels: Sequence[np.ndarray]) -> list[np.ndarray]:
 
 
 def encode_channels(
-    channels: Sequence[np.ndarray], *, priors: str = "best", effort: int = 5, known: Sequence[Fitted] = ()
+    channels: Sequence[np.ndarray],
+    *,
+    priors: str = "best",
+    effort: int = 5,
+    known: Sequence[Fitted] = (),
+    entries: int = FREE_ENTRIES,
 ) -> CodedChannels:
     """Encode int32 channels (1-D, any lengths, |k| <= 2**24 - 1) into one payload.
 
     priors: "gauss" allows const and gauss only, the model of R(a); "best" every prior. It is never larger in payloads
     under 4 kB, and in longer ones where Gaussians alone come near.
     effort: 1..9, time spent on fitting. known: what the payloads before defined, in order; a decoder must have it too.
+    entries: of all tables, beyond one per symbol, where nothing is known.
     Raises EncodeError.
     """
     if priors not in PRIORS or effort not in EFFORTS:
@@ -92,10 +98,10 @@ def encode_channels(
     rounds = 0 if effort < 3 else (effort + 1) // 2
     richer = priors == "best" and effort > 1
     fit: Fit = (lambda h: fit_best(h, effort)) if richer else (lambda h: h.gauss)
-    best = _encode(arrays, plan_priors(histograms, fit, rounds, known), known)
+    best = _encode(arrays, plan_priors(histograms, fit, rounds, known, entries), known)
     least = sum(h.gauss.own for h in histograms) / BIT  # what Gaussians take, nearly: sharing can save more
     if richer and (len(best[0]) < SMALL or least < 1.005 * 8 * len(best[0])):
-        other = _encode(arrays, plan_priors(histograms, lambda h: h.gauss, rounds, known), known)
+        other = _encode(arrays, plan_priors(histograms, lambda h: h.gauss, rounds, known, entries), known)
         best = min(best, other, key=lambda encoded: len(encoded[0]))
     payload, prior_ids, defined = best
     return CodedChannels(payload, 8 * len(payload), sum(h.rate_bits for h in histograms), prior_ids, defined)
@@ -184,35 +190,43 @@ def _read_exceptions(reader: ByteReader, count: int, window: Window) -> _Excepti
 
 
 def decode_channels(
-    payload: bytes | memoryview, counts: Sequence[int], known: list[Prior] | None = None
+    payload: bytes | memoryview,
+    counts: Sequence[int],
+    known: list[Prior] | None = None,
+    entries: int = FREE_ENTRIES,
 ) -> list[np.ndarray]:
     """Inverse of encode_channels: one int32 [count] array per count; see `decode_joined`."""
-    symbols = decode_joined(payload, counts, known)
+    symbols = decode_joined(payload, counts, known, entries)
     ends = accumulate(counts)
     return [symbols[end - count : end] for count, end in zip(counts, ends, strict=True)]
 
 
-def decode_joined(payload: bytes | memoryview, counts: Sequence[int], known: list[Prior] | None = None) -> np.ndarray:
+def decode_joined(
+    payload: bytes | memoryview,
+    counts: Sequence[int],
+    known: list[Prior] | None = None,
+    entries: int = FREE_ENTRIES,
+) -> np.ndarray:
     """int32 [sum of counts]: the channels of a payload one behind the other.
 
-    known: what the payloads before defined, in order; this one's definitions are appended. The caller has held the
-    counts against its limits. Raises Malformed (cut, trailing or corrupt bytes),
-    LimitExceeded, or UnsupportedFeature (a prior outside the registry).
+    known: what the payloads before defined, in order; this one's definitions are appended. entries: as in
+    encode_channels. The caller has held the counts against its limits. Raises Malformed (cut, trailing or corrupt
+    bytes), LimitExceeded, or UnsupportedFeature (a prior outside the registry).
     """
     for index, count in enumerate(counts):
         if not 0 <= count <= MAX_COUNT:
             raise LimitExceeded(f"channel {index}: {count} symbols, limit {MAX_COUNT}")
     reader = ByteReader(payload)
     defined = [] if known is None else known
-    first, heads, entries = len(defined), list[_Head](), 0
-    most = sum(counts) + (MORE_ENTRIES if defined else FREE_ENTRIES)
+    first, heads, found = len(defined), list[_Head](), 0
+    most = sum(counts) + (MORE_ENTRIES if defined else entries)
     for count in filter(None, counts):
         before = len(defined)
         head = _read_channel(reader, count, defined)
         if len(defined) > before:
-            entries += defined[-1].window.n
-            if entries > most:
-                raise LimitExceeded(f"tables of {entries} entries in one section, limit {most}")
+            found += defined[-1].window.n
+            if found > most:
+                raise LimitExceeded(f"tables of {found} entries in one section, limit {most}")
         elif heads and head[0] == heads[-1][0] and (longer := _joined(heads[-1], head, defined)):
             heads[-1] = longer
             continue

@@ -20,9 +20,12 @@ WIDE = 1024  #: a channel with more distinct symbols spends too much on each for
 Fit = Callable[[Histogram], Fitted]
 
 
-def plan_priors(histograms: Sequence[Histogram], fit: Fit, rounds: int, known: Sequence[Fitted] = ()) -> list[Fitted]:
+def plan_priors(
+    histograms: Sequence[Histogram], fit: Fit, rounds: int, known: Sequence[Fitted] = (), entries: int = FREE_ENTRIES
+) -> list[Fitted]:
     """The prior of each channel; channels that share one hold the same object. known: priors that need no description
-    any more."""
+    any more. entries: of all tables, beyond one per symbol, where nothing is known; fewer than MAX_WINDOW only if no
+    channel's range takes more."""
     plan = [fit(h) for h in histograms]
     free = [replace(fitted, price=0) for fitted in known]
     if free and plan:
@@ -37,22 +40,24 @@ def plan_priors(histograms: Sequence[Histogram], fit: Fit, rounds: int, known: S
         shared = _plan_block([histograms[c] for c in block], [plan[c] for c in block], free, fit, rounds)
         for c, prior in zip(block, shared, strict=True):
             plan[c] = prior
-    return _within_limit(histograms, plan, free, fit)
+    return _within_limit(histograms, plan, free, fit, MORE_ENTRIES if free else entries)
 
 
-def _within_limit(histograms: Sequence[Histogram], plan: list[Fitted], free: list[Fitted], fit: Fit) -> list[Fitted]:
+def _within_limit(
+    histograms: Sequence[Histogram], plan: list[Fitted], free: list[Fitted], fit: Fit, entries: int
+) -> list[Fitted]:
     """The plan, its widest new priors replaced by one for all their channels where the tables would be larger
     than a section may define, or by known ones where there is no room for it."""
     known = {id(p.prior) for p in free}
     distinct = {id(p.prior): p for p in plan if id(p.prior) not in known}.values()
     ordered = sorted(distinct, key=lambda p: p.prior.window.n)
     ends = np.cumsum([p.prior.window.n for p in ordered])
-    left = sum(int(h.counts.sum()) for h in histograms) + (MORE_ENTRIES if free else FREE_ENTRIES)
+    left = sum(int(h.counts.sum()) for h in histograms) + entries
     if not ordered or ends[-1] <= left:
         return plan
     kept = known | {id(p.prior) for p, end in zip(ordered, ends, strict=True) if end <= left - MAX_WINDOW}
     rest = [c for c, p in enumerate(plan) if id(p.prior) not in kept]
-    if left < MAX_WINDOW:
+    if free and left < MAX_WINDOW:
         nearest = costs_of([histograms[c] for c in rest], free).argmin(axis=1)
         replaced = dict(zip(rest, [free[i] for i in nearest], strict=True))
     else:

@@ -3,7 +3,7 @@
 import { sceneIdOf } from "./container.js";
 import { malformed, unsupported } from "./errors.js";
 import { Fields, asBytes, asInteger, asList, asRegistered, checkStep } from "./fields.js";
-import { MAX_CHUNKS, MAX_FEATURE, MAX_PAYLOAD, MAX_SLOTS, MAX_SYMBOL } from "./limits.js";
+import { MAX_CHUNKS, MAX_FEATURE, MAX_LOW_BITS, MAX_PAYLOAD, MAX_SLOTS, MAX_SYMBOL } from "./limits.js";
 import { unpack } from "./msgpack.js";
 
 /** @typedef {{type: number, length: number}} ListedChunk */
@@ -11,7 +11,8 @@ import { unpack } from "./msgpack.js";
 /** D and G of the text: scalars of a feature, and Gaussians of an anchor. @typedef {{feature: number, slots: number}} Widths */
 
 /**
- * size: in bytes. bounds: the classes of 5.4 that have an error bound, with it. sceneId: in hexadecimal (3.3).
+ * size: in bytes. bounds: the classes of 5.4 that have an error bound, with it. lowBits: how many of the attributes'
+ * symbols come late (11.6), 0 for none. sceneId: in hexadecimal (3.3).
  *
  * @typedef {object} Header
  * @property {number} size
@@ -21,6 +22,7 @@ import { unpack } from "./msgpack.js";
  * @property {Map<number, number>} bounds
  * @property {Widths} widths
  * @property {number[] | null} centres of the attributes' channels; null if anchors have no step classes
+ * @property {number} lowBits
  * @property {string} sceneId
  */
 
@@ -42,7 +44,7 @@ const MAX_CAMERA_SIDE = 65535;
  */
 export function readHeader(bytes) {
   const { value, firstEntryEnd } = unpack(bytes, "header");
-  const fields = new Fields(value, "header", 1, 16);
+  const fields = new Fields(value, "header", 1, 17);
   const chunks = readChunkList(fields);
   const mode = asRegistered(fields.get(2), 2, "header: mode");
   const deformation = asRegistered(fields.get(3), 2, "header: deformation");
@@ -72,6 +74,8 @@ export function readHeader(bytes) {
   const centres = fields.has(16) ? readCentres(fields.get(16), channelCount(widths)) : null;
   const layers = chunks.filter(({ type }) => type < LAYER_TYPES).map(({ type }) => type);
   if (mode === 1 && new Set(layers).size < layers.length) throw malformed("header: mode lzma, and a layer in slices");
+  const lowBits = fields.has(17) ? asInteger(fields.get(17), 1, MAX_LOW_BITS, "header: low bits") : 0;
+  if (mode === 1 && lowBits) throw malformed("header: mode lzma, and low bits");
   // An ans-only decoder (clause 16).
   if (mode === 1) throw unsupported("header: mode lzma, expected mode ans");
   if (deformation === 1) throw unsupported("header: a deformation of float32 values, expected one of symbols");
@@ -96,6 +100,7 @@ export function readHeader(bytes) {
     bounds,
     widths,
     centres,
+    lowBits,
     sceneId: sceneIdOf(bytes.subarray(firstEntryEnd)),
   };
 }

@@ -5,6 +5,7 @@ import { Fields, asInteger, asList, asRegistered, checkStep } from "./fields.js"
 import { channelCount } from "./header.js";
 import {
   MAX_CHANNELS,
+  MAX_CHUNKS,
   MAX_FIELDS,
   MAX_LINEAR_LAYERS,
   MAX_PAYLOAD,
@@ -21,7 +22,7 @@ import { PLANES } from "./scene.js";
 /**
  * What a layer's number and the header's widths decide. networks: name and outputs by id, null for any number of outputs.
  * inputs: of layer 0's networks, feature and view direction. classes: of the error bounds of its steps, in their order
- * (5.4). stepClasses: whether anchors have them (11.2).
+ * (5.4). stepClasses: whether anchors have them (11.2). lowBits: how many of their symbols' come late (11.6).
  *
  * @typedef {object} LayerKind
  * @property {number} layer
@@ -30,10 +31,11 @@ import { PLANES } from "./scene.js";
  * @property {number[]} classes
  * @property {import("./header.js").Widths} widths
  * @property {boolean} stepClasses
+ * @property {number} lowBits
  */
 
 /** @param {number} layer @param {import("./header.js").Header} header @returns {LayerKind} */
-export function layerKind(layer, { widths, centres }) {
+export function layerKind(layer, { widths, centres, lowBits }) {
   const { feature: D, slots: G } = widths;
   /** @type {[string, number | null][][]} */
   const networks = [
@@ -59,7 +61,7 @@ export function layerKind(layer, { widths, centres }) {
     ],
   ];
   const classes = layer ? [2 + 2 * layer, 3 + 2 * layer] : [3];
-  return { layer, networks: networks[layer], inputs: D + 3, classes, widths, stepClasses: centres !== null };
+  return { layer, networks: networks[layer], inputs: D + 3, classes, widths, stepClasses: centres !== null, lowBits };
 }
 
 /** Section numbers of mode ans (6.4). */
@@ -68,23 +70,27 @@ export const MASKS = 1;
 export const ATTRIBUTES = 2;
 export const PLANE_SECTION = 3;
 export const WEIGHTS = 4;
-const SECTIONS = ["positions", "masks", "attributes", "planes", "weights", "symbols", "floats"];
+export const LOW_BITS = 7;
+const SECTIONS = ["positions", "masks", "attributes", "planes", "weights", "symbols", "floats", "low bits"];
 
 /** One plane of a scale. @typedef {{channels: number, height: number, width: number, predictor: number}} PlaneShape */
 /** Linear layers from the input side. @typedef {{name: string, layers: {inputs: number, outputs: number}[]}} NetworkShape */
 
 /**
  * planes: six per scale. steps: of the weights in layer 0, else of planes and weights, empty without a deformation.
- * sections: by number.
+ * refines: of a refining slice what it refines, else null. sections: by number.
  *
  * @typedef {object} Parameters
  * @property {number} rows
  * @property {number[]} steps
  * @property {PlaneShape[]} planes
  * @property {NetworkShape[]} networks
+ * @property {Refinement | null} refines
  * @property {(Uint8Array | null)[]} sections
  * @property {Declared} declared by the slices so far, this one included
  */
+
+/** So many slices of a layer (11.6). @typedef {{layer: number, slices: number}} Refinement */
 
 /** What slices declare: rows, symbols, and the bytes of their payloads (6.5).
  * @typedef {{rows: number, symbols: number, bytes: number}} Declared */
@@ -105,7 +111,7 @@ export function readParameters(payload, kind, before, later) {
   if (length > payload.length - 4) {
     throw malformed(`${where}: parameters of ${length} bytes in a payload of ${payload.length}`);
   }
-  const fields = new Fields(unpack(payload.subarray(4, 4 + length), where).value, where, 1, 5);
+  const fields = new Fields(unpack(payload.subarray(4, 4 + length), where).value, where, 1, 6);
   const rows = asInteger(fields.get(1), 0, MAX_ROWS - before.rows, `${where}: own rows`);
   const lengths = new Fields(fields.get(2), `${where}: sections`, 0, SECTIONS.length - 1);
   if (later) for (const key of [3, 4, 5]) if (fields.has(key)) throw malformed(`${where}: key ${key} in a later slice`);
@@ -119,31 +125,33 @@ export function readParameters(payload, kind, before, later) {
     (sum, { layers }) => layers.reduce((all, { inputs, outputs }) => all + (inputs + 1) * outputs, sum),
     0,
   );
+  const refines = fields.has(6) ? readRefinement(fields, kind, where) : null;
+  if (refines && (rows || !later)) throw malformed(`${where}: key 6 in a slice ${later ? "with rows" : "that is the first"}`);
   const perRow = channelCount(kind.widths) + (kind.stepClasses ? 1 : 0);
-  const declared = declare(where, before, payload.length, rises, rows, perRow, cells, weights);
-  const counts = [rows, rises + rows, rows * perRow, cells, weights, 0, 0];
+  if (cells > MAX_PLANE_CELLS) throw limitExceeded(`${where}: ${cells} plane cells, limit ${MAX_PLANE_CELLS}`);
+  const declared = checkDeclared(where, {
+    rows: before.rows + rows,
+    symbols: before.symbols + rises + (perRow + 4) * rows + cells + weights,
+    bytes: before.bytes + payload.length,
+  });
+  const counts = [rows, rises + rows, rows * perRow, cells, weights, 0, 0, refines ? 1 : 0];
   counts.forEach((count, section) => {
     if ((sections[section] !== null) !== count > 0) {
       const found = sections[section] === null ? "missing" : "there";
       throw malformed(`${where}: section ${SECTIONS[section]} is ${found}, with ${count} symbols to code`);
     }
   });
-  return { rows, steps, planes, networks, sections, declared };
+  return { rows, steps, planes, networks, refines, sections, declared };
 }
 
-/** Clause 6.5. @param {string} where @param {Declared} before @param {number} bytes of the payload @param {number} rises
- * @param {number} own rows @param {number} perRow symbols of the attributes @param {number} cells
- * @param {number} weights @returns {Declared} */
-function declare(where, before, bytes, rises, own, perRow, cells, weights) {
-  if (cells > MAX_PLANE_CELLS) throw limitExceeded(`${where}: ${cells} plane cells, limit ${MAX_PLANE_CELLS}`);
-  const all = before.bytes + bytes;
-  const rows = before.rows + own;
-  const mostRows = 2 ** 13 + 2 * all;
-  if (rows > mostRows) throw limitExceeded(`${where}: ${rows} rows in ${all} bytes, limit ${mostRows}`);
-  const symbols = before.symbols + rises + (perRow + 4) * own + cells + weights;
-  const mostSymbols = 2 ** 22 + 256 * all;
-  if (symbols > mostSymbols) throw limitExceeded(`${where}: ${symbols} symbols in ${all} bytes, limit ${mostSymbols}`);
-  return { rows, symbols, bytes: all };
+/** Clause 6.5. @param {string} where @param {Declared} declared with the latest slice @returns {Declared} the same */
+export function checkDeclared(where, declared) {
+  const { rows, symbols, bytes } = declared;
+  const mostRows = 2 ** 13 + 2 * bytes;
+  if (rows > mostRows) throw limitExceeded(`${where}: ${rows} rows in ${bytes} bytes, limit ${mostRows}`);
+  const mostSymbols = 2 ** 22 + 256 * bytes;
+  if (symbols > mostSymbols) throw limitExceeded(`${where}: ${symbols} symbols in ${bytes} bytes, limit ${mostSymbols}`);
+  return declared;
 }
 
 /** @param {Uint8Array} payload @param {number} at @param {Fields} lengths @param {string} where */
@@ -156,6 +164,15 @@ function cutSections(payload, at, lengths, where) {
   });
   if (at !== payload.length) throw malformed(`${where}: sections up to byte ${at} of a payload of ${payload.length}`);
   return sections;
+}
+
+/** Key 6. @param {Fields} fields @param {LayerKind} kind @param {string} where @returns {Refinement} */
+function readRefinement(fields, kind, where) {
+  const [layer, slices] = asList(fields.get(6), `${where}: key 6`, 2);
+  return {
+    layer: asInteger(layer, 0, kind.layer, `${where}: the layer that it refines`),
+    slices: asInteger(slices, 1, MAX_CHUNKS, `${where}: slices that it refines`),
+  };
 }
 
 /** Key 3. @param {Fields} fields @param {LayerKind} kind @param {string} where @param {boolean} expected */

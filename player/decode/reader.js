@@ -2,9 +2,10 @@
 
 import { CHUNK_OVERHEAD, PREAMBLE_SIZE, readChunk, readPreamble } from "./container.js";
 import { DecodeError, limitExceeded, malformed, unsupported } from "./errors.js";
-import { LAYER_TYPES, readHeader } from "./header.js";
+import { LAYER_TYPES, channelCount, readHeader } from "./header.js";
 import { MOST_CODE, decodeLayer, dequantise, transposed } from "./layer.js";
-import { layerKind } from "./parameters.js";
+import { LOW_BITS, checkDeclared, layerKind } from "./parameters.js";
+import { refined } from "./refining.js";
 import { PLANES } from "./scene.js";
 import { Continuation, joined, mortonOrder, reordered } from "./slices.js";
 import { VoxelTable } from "./voxels.js";
@@ -24,7 +25,8 @@ import { VoxelTable } from "./voxels.js";
  * @property {Float32Array[]} weights
  */
 
-/** later: whether slices of the same layer came before. @typedef {{symbols: LayerSymbols, tensors: LayerTensors, later: boolean}} Slice */
+/** later: whether slices of the same layer came before. A refining slice changes those that it names.
+ * @typedef {{symbols: LayerSymbols, tensors: LayerTensors, later: boolean}} Slice */
 
 /**
  * Reads a whole file, or its layers up to maxLayer; of a cut file, if allowPartial, the slices that are there, at least
@@ -174,16 +176,51 @@ export class LayerReader {
     }
     const { anchor, feature, scalingLog, offset } = tensors;
     const own = { voxels, codes: Uint8Array.from(symbols.codes), anchor, feature, scalingLog, offset };
+    if (parameters.refines) this._refine(parameters.refines, parameters, where);
     this._loose.push(voxels);
-    if (later) {
-      latest.parts.push(own);
-      latest.slices++;
-    } else {
+    if (!later) {
       const { steps, planes, networks } = parameters;
       const kept = { planes: tensors.planes, weights: tensors.weights };
-      this._layers.push({ layer: kind.layer, slices: 1, steps, planes, networks, tensors: kept, earlier, parts: [own], continuation });
+      const none = { slices: 0, refined: 0, parts: [], whole: null, waiting: [] };
+      this._layers.push({ layer: kind.layer, steps, planes, networks, tensors: kept, earlier, continuation, ...none });
     }
+    const layer = this._layers[this._layers.length - 1];
+    layer.slices++;
+    if (!parameters.refines) {
+      layer.parts.push(own);
+      layer.whole = null;
+    }
+    if (header.lowBits) layer.waiting.push({ symbols, tensors, own });
     return tensors;
+  }
+
+  /** 11.6: gives slices that came before their low bits; if there is a fault, none of them.
+   * @param {import("./parameters.js").Refinement} refines @param {import("./parameters.js").Parameters} parameters of the
+   * refining slice @param {string} where */
+  _refine({ layer: number, slices }, parameters, where) {
+    const header = /** @type {import("./header.js").Header} */ (this.header);
+    const layer = this._layers.find((known) => known.layer === number);
+    const named = layer ? layer.waiting.slice(0, slices) : [];
+    if (!layer || named.length < slices || named.some(({ symbols }) => symbols.parameters.refines)) {
+      throw malformed(`${where}: low bits of ${slices} slices of layer ${number}, which has not so many that wait for them`);
+    }
+    const coarse = named.map(({ symbols }) => symbols.attributes);
+    const count = coarse.reduce((sum, { length }) => sum + length, 0);
+    if (!count) throw malformed(`${where}: low bits of slices without rows`);
+    const { declared, sections } = parameters;
+    parameters.declared = checkDeclared(where, { ...declared, symbols: declared.symbols + count });
+    const channels = channelCount(header.widths);
+    const section = /** @type {Uint8Array} */ (sections[LOW_BITS]);
+    const fine = refined(section, coarse, channels, header.lowBits);
+    const values = named.map(({ symbols }, i) => attributesOf({ ...symbols, attributes: fine[i] }, header));
+    named.forEach(({ symbols, tensors, own }, i) => {
+      symbols.attributes = fine[i];
+      Object.assign(tensors, values[i]);
+      Object.assign(own, values[i]); // arrays that were given out stay as they are
+    });
+    layer.waiting.splice(0, slices);
+    layer.refined += count / channels;
+    layer.whole = null;
   }
 
   /** Malformed if a voxel is one of the slices before. @param {Int32Array} voxels of a slice, distinct among themselves */
@@ -198,20 +235,11 @@ export class LayerReader {
   }
 
   /** @param {LayerSymbols} symbols @param {import("./header.js").Header} header @returns {LayerTensors} */
-  _tensorsOf({ kind, parameters, voxels, stepClasses, attributes, planes, weights }, header) {
-    const { rows, steps } = parameters;
-    const { feature: D, slots: G } = kind.widths;
-    let first = 0;
-    const [feature, scalingLog, offset] = [D, 6, 3 * G].map((width, i) => {
-      const centres = header.centres?.slice(first, first + width);
-      const symbols = attributes.subarray(first * rows, (first += width) * rows);
-      return transposed(symbols, rows, width, header.steps[i], centres ? { centres, stepClasses } : null);
-    });
+  _tensorsOf(symbols, header) {
+    const { parameters: { steps }, voxels, planes, weights } = symbols;
     return {
       anchor: dequantise(voxels, header.info.voxelSize),
-      feature,
-      scalingLog,
-      offset,
+      ...attributesOf(symbols, header),
       planes: planes.map((plane) => dequantise(plane, steps[0])),
       weights: weights.map((weight) => dequantise(weight, steps[steps.length - 1])),
     };
@@ -237,11 +265,13 @@ export class LayerReader {
     }
     const layers = this._layers;
     const owns = layers.map(ownOf);
+    let refinedRows = 0;
     return {
       info: header.info,
       steps,
       layers: layers.map(({ layer }) => layer),
       rows: layers.map(({ earlier }, i) => earlier.length + owns[i].codes.length),
+      refined: layers.map(({ refined }) => (refinedRows += refined)),
       anchorQ: joined(owns.map(({ voxels }) => voxels)),
       anchor: joined(owns.map(({ anchor }) => anchor)),
       feature: joined(owns.map(({ feature }) => feature)),
@@ -268,7 +298,8 @@ export class LayerReader {
  */
 
 /**
- * What is kept of a layer. slices: read so far. tensors: of the layer's planes and networks. earlier: the mask codes of earlier rows.
+ * What is kept of a layer. slices: read so far. tensors: of the layer's planes and networks. earlier: the mask codes of
+ * earlier rows. refined: rows whose low bits have come. waiting: the slices whose low bits have not.
  *
  * @typedef {object} LayerParts
  * @property {number} layer
@@ -279,13 +310,34 @@ export class LayerReader {
  * @property {Pick<LayerTensors, "planes" | "weights">} tensors
  * @property {Uint8Array} earlier
  * @property {Own[]} parts that make up its rows
+ * @property {Own | null} whole those parts as one, null until that is asked for
+ * @property {number} refined
+ * @property {{symbols: LayerSymbols, tensors: LayerTensors, own: Own}[]} waiting
  * @property {Continuation} continuation
  */
+
+/**
+ * The attributes of a slice's rows.
+ *
+ * @param {Pick<LayerSymbols, "kind" | "parameters" | "stepClasses" | "attributes">} symbols
+ * @param {import("./header.js").Header} header
+ */
+function attributesOf({ kind, parameters: { rows }, stepClasses, attributes }, header) {
+  const { feature: D, slots: G } = kind.widths;
+  let first = 0;
+  const [feature, scalingLog, offset] = [D, 6, 3 * G].map((width, i) => {
+    const centres = header.centres?.slice(first, first + width);
+    const symbols = attributes.subarray(first * rows, (first += width) * rows);
+    return transposed(symbols, rows, width, header.steps[i], centres ? { centres, stepClasses } : null);
+  });
+  return { feature, scalingLog, offset };
+}
 
 /** The rows of a layer, put in order once. @param {LayerParts} layer @returns {Own} */
 function ownOf(layer) {
   const { parts } = layer;
   if (parts.length === 1) return parts[0];
+  if (layer.whole) return layer.whole;
   const order = mortonOrder(joined(parts.map(({ voxels }) => voxels)));
   /** @template {Int32Array | Float32Array | Uint8Array} A @param {(part: Own) => A} get */
   const all = (get) => reordered(joined(parts.map(get)), order);
@@ -297,7 +349,8 @@ function ownOf(layer) {
     scalingLog: all(({ scalingLog }) => scalingLog),
     offset: all(({ offset }) => offset),
   };
-  layer.parts = [own];
+  layer.whole = own;
+  if (!layer.waiting.length) layer.parts = [own]; // else low bits will change some of them
   return own;
 }
 

@@ -8,6 +8,7 @@ import { unpack } from "../decode/msgpack.js";
 const FOLDER = new URL("../../spec/vectors/", import.meta.url);
 const MODE = 2;
 const DEFORMATION = 3;
+const LOW_BITS = 17;
 
 /**
  * error: the kind that is due, null if the file decodes. layers: the hashes of all layers that decode. slices: the layer
@@ -21,17 +22,17 @@ const DEFORMATION = 3;
  * @property {number | null} offset null if it is not fixed
  * @property {import("../decode/hashes.js").LayerHashes[]} layers
  * @property {number[]} slices
+ * @property {boolean} lowBits whether later slices change what layers decode to
  */
 
-/** Whether the header asks for mode lzma or float32 values. @param {Uint8Array} bytes */
-function isUnsupported(bytes) {
-  let fields;
+/** What the header has under a key, if it can be read. @param {Uint8Array} bytes @param {number} key */
+function headerHas(bytes, key) {
   try {
-    fields = unpack(readPreamble(bytes), "header").value;
+    const fields = unpack(readPreamble(bytes), "header").value;
+    return fields instanceof Map ? fields.get(key) : undefined;
   } catch {
-    return false;
+    return undefined;
   }
-  return fields instanceof Map && (fields.get(MODE) === 1 || fields.get(DEFORMATION) === 1);
 }
 
 /** @returns {Vector[]} */
@@ -40,11 +41,13 @@ export function readVectors() {
   return manifest.vectors.map((/** @type {any} */ row) => {
     const bytes = new Uint8Array(readFileSync(new URL(row.file, FOLDER)));
     // an ans-only decoder's answer, where the manifest does not name it
-    const unsupported = row.ans_only ? row.ans_only === "UnsupportedFeature" : isUnsupported(bytes);
+    const asks = headerHas(bytes, MODE) === 1 || headerHas(bytes, DEFORMATION) === 1; // for lzma, or float32 values
+    const unsupported = row.ans_only ? row.ans_only === "UnsupportedFeature" : asks;
+    const lowBits = headerHas(bytes, LOW_BITS) !== undefined;
     const { file, error = null, chunk = null, offset = null, layers } = row;
     const slices = row.slices ?? layers.map((/** @type {{layer: number}} */ { layer }) => layer);
-    if (!unsupported) return { file, bytes, error, chunk, offset, layers, slices };
-    return { file, bytes, error: "UnsupportedFeature", chunk: null, offset: null, layers: [], slices: [] };
+    if (!unsupported) return { file, bytes, error, chunk, offset, layers, slices, lowBits };
+    return { file, bytes, error: "UnsupportedFeature", chunk: null, offset: null, layers: [], slices: [], lowBits };
   });
 }
 

@@ -113,9 +113,9 @@ def most_wide_tables():
     return crafted("wide-planes", 1, {Section.PLANES: section}, planes_of_one_cell(64))
 
 
-def many_anchors(mode):
+def many_anchors(mode, low_bits=0):
     scene = make_scene(1, layers=(0, 1), anchors=12_000, extent=40, kind="gaussian")
-    return encode(scene, layers=2, effort=1, mode=mode, verify=False)
+    return encode(scene, layers=2, effort=1, mode=mode, verify=False, low_bits=low_bits)
 
 
 BIG = {
@@ -126,6 +126,7 @@ BIG = {
     "tables": most_wide_tables,
     "anchors": partial(many_anchors, "ans"),
     "anchors, lzma": partial(many_anchors, "lzma"),
+    "anchors, low bits": partial(many_anchors, "ans", 4),
 }
 
 
@@ -169,7 +170,7 @@ def test_a_file_that_once_broke_a_promise(limit):
 
 def test_damage_and_cuts_of_a_file_are_noticed():
     data = [bytes_of("all-heads"), encode(make_scene(9, anchors=200, extent=9), layers=2, effort=1)]
-    outcomes, findings = damage.damage([*data, bytes_of("sliced"), bytes_of("valid/slices-classes")], 0, 1500)
+    outcomes, findings = damage.damage([*data, *map(bytes_of, ("sliced", "valid/slices-classes", "low-bits"))], 0, 1500)
     assert not findings
     assert {"ChecksumMismatch", "Truncated", "Malformed"} <= set(outcomes)
 
@@ -246,7 +247,10 @@ def test_seeds_have_slices_classes_widths_and_metadata():
     assert any(chunk.type == CHUNK_TYPE for chunk in parts["narrow"].chunks)
 
 
-@pytest.mark.parametrize("name", ["sliced", "valid/slices", "valid/slices-continued", "valid/slices-classes"])
+IN_SLICES = ("sliced", "valid/slices", "valid/slices-continued", "valid/slices-classes")
+
+
+@pytest.mark.parametrize("name", [*IN_SLICES, "low-bits", "valid/low-bits", "valid/low-bits-slices"])
 def test_a_prefix_of_slices_is_what_a_cut_file_may_decode_to(name):
     data, known = bytes_of(name), files.known_prefixes(seeds())
     ends = [end for end, is_slice in damage.chunk_ends(data) if is_slice]

@@ -11,6 +11,7 @@ import random
 import time
 import tracemalloc
 import warnings
+from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cache
@@ -26,7 +27,7 @@ from pd4dgs_codec.codec.decoder import decode_partial
 from pd4dgs_codec.codec.header import unpack_header
 from pd4dgs_codec.codec.info import hashes, info
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
-from pd4dgs_codec.codec.layer_meta import Declared
+from pd4dgs_codec.codec.layer_meta import Declared, check_declared
 from pd4dgs_codec.codec.payload import read_meta
 from pd4dgs_codec.errors import DecodeError, Truncated
 
@@ -103,7 +104,8 @@ def count_checksums(data: bytes) -> int:
 def declared(data: bytes) -> tuple[int, int]:
     """(symbols, slices behind a layer's first) that `data` declares within the limits, up to the first slice that is
     refused."""
-    total, seen, later = Declared(), set[int](), 0
+    total, later = Declared(), 0
+    rows, refined = dict[int, list[int]](), Counter[int]()  # by layer: anchors of each slice, slices with low bits
     try:
         preamble = read_preamble(data)
         header, offset = unpack_header(preamble.header), preamble.size
@@ -111,9 +113,15 @@ def declared(data: bytes) -> tuple[int, int]:
             kind = BY_CHUNK_TYPE.get(kind_number)
             if kind is not None:
                 payload = read_chunk(data, offset, length=length).payload
-                *_, total = read_meta(payload, kind, header.widths, total, header.raw_deformation, kind.layer in seen)
-                later += kind.layer in seen
-                seen.add(kind.layer)
+                again = kind.layer in rows
+                meta, _, total = read_meta(payload, kind, header.widths, total, header.raw_deformation, again)
+                later += again
+                if meta.refines:
+                    layer, count = meta.refines
+                    named = rows.get(layer, [])[refined[layer] :][:count]
+                    total = check_declared(total.and_slice(0, sum(named) * header.widths.channels, 0), kind)
+                    refined[layer] += count
+                rows.setdefault(kind.layer, []).append(meta.rows)
             offset += CHUNK_OVERHEAD + length
     except DecodeError:
         pass

@@ -6,7 +6,6 @@ megabyte take a millisecond or two each.
 
 from __future__ import annotations
 
-import itertools
 import random
 import weakref
 from collections import Counter
@@ -29,7 +28,8 @@ from pd4dgs_codec.errors import DecodeError, Truncated
 BOUNDARY = 8  #: bytes to each side of a boundary
 CUTS_PER_CHANGE = 0.02
 
-Slices = Sequence[LayerSymbols]
+#: By the number of slices that have come, those of each layer as they are then.
+Prefixes = Sequence[Sequence[Sequence[LayerSymbols]]]
 
 
 class _Payloads:
@@ -62,19 +62,20 @@ class _Payloads:
 
 
 @contextmanager
-def whole_payloads_known(files: Sequence[bytes]) -> Iterator[Mapping[bytes, Slices]]:
-    """The slices of each file; while this holds, the decoder takes those of an unchanged payload from here."""
+def whole_payloads_known(files: Sequence[bytes]) -> Iterator[Mapping[bytes, Prefixes]]:
+    """The prefixes of each file; while this holds, the decoder takes those of an unchanged payload from here."""
     payloads = _Payloads()
     with mock.patch.object(decoder, "read_layer", payloads.remember):
-        slices = {data: list(_slices(data)) for data in files}
+        prefixes = {data: list(_prefixes(data)) for data in files}
     with mock.patch.object(decoder, "read_layer", payloads.recall):
-        yield slices
+        yield prefixes
 
 
-def _slices(data: bytes) -> Iterator[LayerSymbols]:
+def _prefixes(data: bytes) -> Iterator[Sequence[Sequence[LayerSymbols]]]:
     reader = decoder.LayerReader()
+    yield reader.slices
     while reader.next_slice(data):
-        yield reader.latest
+        yield reader.slices
 
 
 def chunk_ends(data: bytes) -> list[tuple[int, bool]]:
@@ -86,7 +87,7 @@ def chunk_ends(data: bytes) -> list[tuple[int, bool]]:
     return ends
 
 
-def check_change(data: bytes, originals: Mapping[bytes, Slices]) -> str:
+def check_change(data: bytes, originals: Mapping[bytes, Prefixes]) -> str:
     """What a damaged file ends in; Finding if it decodes and is none of the originals."""
     try:
         decoder.decode_layers(data)
@@ -97,10 +98,10 @@ def check_change(data: bytes, originals: Mapping[bytes, Slices]) -> str:
     return DECODED
 
 
-def check_cut(data: bytes, size: int, slices: Slices, ends: Sequence[tuple[int, bool]]) -> str:
+def check_cut(data: bytes, size: int, prefixes: Prefixes, ends: Sequence[tuple[int, bool]]) -> str:
     """A cut file is Truncated, and with allow_partial its whole slices and no others come back, flagged."""
-    whole = slices[: sum(end <= size for end, is_slice in ends if is_slice)]
-    layers = [merged(list(of_layer)) for _, of_layer in itertools.groupby(whole, key=lambda part: part.kind)]
+    whole = sum(end <= size for end, is_slice in ends if is_slice)
+    layers = [merged(of_layer) for of_layer in prefixes[whole]]
     cut = data[:size]
     try:
         decoder.decode_layers(cut)
@@ -113,7 +114,7 @@ def check_cut(data: bytes, size: int, slices: Slices, ends: Sequence[tuple[int, 
     except Truncated:
         got, complete = [], False
     if complete or len(got) != len(layers) or not all(map(_alike, got, layers)):
-        meant = f"{len(whole)} slices of {len(layers)} layers"
+        meant = f"{whole} slices of {len(layers)} layers"
         raise Finding("silent", f"the first {size} bytes give {len(got)} layers, complete {complete}; meant {meant}")
     return Truncated.__name__
 

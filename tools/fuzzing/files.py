@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 from strategies import LAYER_SETS, RANGES, make_scene
-from vectors import blocks, slices
+from vectors import blocks, refining, slices
 
 from pd4dgs_codec import encode
 from pd4dgs_codec.attributes.quantise import dequantise
@@ -202,7 +202,7 @@ def built_seeds() -> list[Seed]:
     files["no-anchor"] = encode(make_scene(1, anchors=0, with_camera=False), layers=2, effort=1)
     files["all-heads"] = encode(make_scene(2, anchors=6, scales=2), layers=2, effort=5)
     files["predicted"] = encode(_correlated(60), layers=0, effort=2)
-    files |= _staged() | _of_other_widths() | _in_slices()
+    files |= _staged() | _of_other_widths() | _in_slices() | _with_low_bits()
     for mode in ("ans", "lzma"):
         files[f"priors-{mode}"] = encode(_all_priors(), layers=0, effort=5, mode=mode)
     flat = make_scene(3, layers=(0, 1), anchors=0, kind="constant", **{**tiny, "sides": (90, 3, 40, 2), "scales": 2})
@@ -266,6 +266,14 @@ def _in_slices() -> dict[str, bytes]:
     by_hand = itertools.takewhile(lambda v: v.name.startswith("valid/"), slices.cases())
     scene = make_scene(9, layers=(0, 1), anchors=90, extent=3, hidden=(), widths=Widths(2, 2))
     return {vector.name: vector.data for vector in by_hand} | {"sliced": encode(scene, layers=2, effort=2, slices=1000)}
+
+
+def _with_low_bits() -> dict[str, bytes]:
+    """Slices that refine others, by hand and as an encoder makes them."""
+    by_hand = (v for v in refining.cases() if v.error is None)
+    scene = make_scene(9, layers=(0, 1), anchors=70, extent=3, kind="gaussian", hidden=(), widths=Widths(2, 2, True))
+    low = encode(scene, layers=2, effort=2, slices=1000, low_bits=3)
+    return {vector.name: vector.data for vector in by_hand} | {"low-bits": low}
 
 
 def _all_priors() -> Scene:

@@ -25,6 +25,7 @@ from pd4dgs_codec.bitstream.container import (
 )
 from pd4dgs_codec.codec.header import STEPS, VOXEL_SIZE
 from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
+from pd4dgs_codec.codec.layer_meta import Section
 from pd4dgs_codec.entropy.varint import put_varint
 from pd4dgs_codec.errors import EncodeError
 
@@ -222,7 +223,7 @@ def section_swap(rng: random.Random, parts: Parts, other: Parts, names: list[str
     chunk, donor = _layer(rng, parts), _layer(rng, other if rng.random() < 0.6 else parts)
     if chunk is None or chunk.sections is None or donor is None:
         return
-    number = rng.choice([*chunk.sections, rng.randrange(7)])
+    number = rng.choice([*chunk.sections, rng.randrange(len(Section))])
     given = (donor.sections or {}).get(number, b"")
     size = rng.randint(1, 200)
     chunk.sections[number] = rng.choice((given, given, b"", rng.randbytes(size), bytes(size), b"\x10" * size))

@@ -44,7 +44,7 @@ from pd4dgs_codec.scene import ATTRIBUTES, DEFAULT_WIDTHS, PLANES, Widths
 
 from . import lzma2
 
-POSITIONS, MASKS, ATTRIBUTE, PLANE, WEIGHTS, SYMBOLS, FLOATS = (int(s) for s in Section)
+POSITIONS, MASKS, ATTRIBUTE, PLANE, WEIGHTS, SYMBOLS, FLOATS, LOW_BITS = (int(s) for s in Section)
 ANS, LZMA = 0, 1
 CODED, FLOAT32 = 0, 1
 WEIGHT_SHIFT, CLASSES_Y, CLASSES_Z = 10, 5, 7  # clause 8.7
@@ -466,11 +466,13 @@ def lzma_floats(arrays: Sequence[np.ndarray], *, planar: bool = False, stream: S
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """A layer as it is meant and as it is written. meta: the layer parameters without the lengths of the sections."""
+    """A layer as it is meant and as it is written. meta: the layer parameters without the lengths of the sections.
+    brings: of a refining slice, the layer and the attributes of the slices that it names, as they are then."""
 
     meant: LayerSymbols
     meta: dict[int, object]
     sections: dict[int, bytes]
+    brings: tuple[int, Sequence[np.ndarray]] | None = None
 
     def payload(self, meta: Callable[[dict], dict] = lambda m: m, pack: Callable[[object], bytes] = canonical.pack):
         """Its bytes, the parameters changed by `meta` and written by `pack`."""
@@ -732,9 +734,27 @@ class File:
 
     def hashes(self, chunks: int | None = None) -> list[dict]:
         """Clause 12.4 of the layers among the first `chunks` chunks, from what they mean."""
-        meant = [c.layer.meant for c in self.chunks[:chunks] if c.layer is not None]
+        meant, refined = list[LayerSymbols](), set[int]()
+        for layer in (c.layer for c in self.chunks[:chunks] if c.layer is not None):
+            meant.append(layer.meant)
+            number, brought = layer.brings or (0, ())
+            waiting = [i for i, m in enumerate(meant) if m.kind.layer == number and i not in refined]
+            for i, attributes in zip(waiting, brought, strict=False):
+                meant[i] = replace(meant[i], attributes=attributes)
+                refined.add(i)
         layers = [merged(list(slices)) for _, slices in itertools.groupby(meant, key=lambda m: m.kind)]
         return [_hashes(m, self.header) for m in layers]
+
+    def prefixes(self, chunks: int | None = None) -> dict[int, list[dict]]:
+        """By their highest layer, the hashes of those prefixes of layers whose low bits come behind them."""
+        whole, found = self.hashes(chunks), {}
+        for count, row in enumerate(whole[:-1], start=1):
+            numbers = [c.layer.meant.kind.layer if c.layer else -1 for c in self.chunks[:chunks]]
+            end = max(i for i, number in enumerate(numbers) if number == row["layer"])
+            prefix = self.hashes(end + 1)
+            if prefix != whole[:count]:
+                found[row["layer"]] = prefix
+        return found
 
 
 def make_file(*layers: Layer, header: Mapping[int, object] | None = None) -> File:
@@ -776,7 +796,8 @@ def _hashes(m: LayerSymbols, header: Mapping[int, object]) -> dict:
 class Vector:
     """One file of spec/vectors. layers: the hashes of what decodes, of all of a valid file or of the layers before a
     fault. error: its name (clause 15), None for a valid file. chunk, offset: where the fault lies, if in a chunk and
-    if at a field that the frame fixes. slices: the layer of each slice that decodes."""
+    if at a field that the frame fixes. slices: the layer of each slice that decodes. prefixes: the hashes of those
+    prefixes that are not the first of `layers`, by their highest layer."""
 
     name: str
     sentence: str
@@ -787,11 +808,20 @@ class Vector:
     chunk: int | None = None
     offset: int | None = None
     slices: tuple[int, ...] = ()
+    prefixes: Mapping[int, list[dict]] = field(default_factory=dict)
 
 
 def good(name: str, sentence: str, clauses: str, file: File) -> Vector:
     """A file that decodes."""
-    return Vector(name, sentence, tuple(clauses.split()), file.data(), file.hashes(), slices=file.slices())
+    return Vector(
+        name,
+        sentence,
+        tuple(clauses.split()),
+        file.data(),
+        file.hashes(),
+        slices=file.slices(),
+        prefixes=file.prefixes(),
+    )
 
 
 def bad(
@@ -814,8 +844,9 @@ def bad(
     data = file.data()[:size]
     offset = size if at is None else at + (0 if chunk is None else file.start(chunk))
     count = None if whole else chunk or 0
-    layers, slices = file.hashes(count), file.slices(count)
-    return Vector("faulty/" + name, sentence, tuple(clauses.split()), data, layers, error, chunk, offset, slices)
+    layers, slices, prefixes = file.hashes(count), file.slices(count), file.prefixes(count)
+    clauses_of = tuple(clauses.split())
+    return Vector("faulty/" + name, sentence, clauses_of, data, layers, error, chunk, offset, slices, prefixes)
 
 
 MALFORMED, LIMIT, FEATURE = "Malformed", "LimitExceeded", "UnsupportedFeature"

@@ -391,7 +391,7 @@ def _header() -> Iterator[Vector]:
         yield bad(f"header-key-{key:02}-missing", what, "4 5.1", MALFORMED, plain.with_header({key: None}))
     without = canonical.pack({k: v for k, v in plain.fields().items() if k != 1})
     yield bad("header-key-01-missing", "Key 1 is missing.", "4 5.1", MALFORMED, replace(plain, packed=without))
-    for key in (0, 17, 63):
+    for key in (0, 18, 63):
         what = f"Unknown key {key}."
         yield bad(f"header-key-{key:02}-unknown", what, "4 17.2", FEATURE, plain.with_header({key: 1}))
     graded = make_file(make_layer(classes=[3]))
@@ -638,7 +638,7 @@ def _parameters() -> Iterator[Vector]:
         ("section-length-negative", length(PLANE, -1), MALFORMED, "A section of −1 bytes."),
         ("section-length-over-limit", length(MASKS, MAX_PAYLOAD + 1), LIMIT, "A section of 2^31 bytes."),
         ("section-length-text", length(MASKS, "3"), MALFORMED, "A length that is a string."),
-        ("section-unknown", length(7, 1), FEATURE, "Section 7."),
+        ("section-unknown", length(8, 1), FEATURE, "Section 8."),
         ("section-63-unknown", length(63, 1), FEATURE, "Section 63."),
         ("steps-missing", without(3), MALFORMED, "Layer 0 without steps."),
         ("steps-two", put(3, [1.0, 1.0]), MALFORMED, "Layer 0 with two steps."),
@@ -647,7 +647,7 @@ def _parameters() -> Iterator[Vector]:
         ("step-subnormal", put(3, [SUBNORMAL]), MALFORMED, "A subnormal step."),
         ("step-integer", put(3, [1]), MALFORMED, "A step that is an integer."),
         ("scales-in-layer-0", put(4, [[1] * 5 + [0] * 6]), MALFORMED, "Planes in layer 0."),
-        ("key-unknown", put(6, 1), FEATURE, "Unknown key 6."),
+        ("key-unknown", put(7, 1), FEATURE, "Unknown key 7."),
         ("key-0-unknown", put(0, 1), FEATURE, "Unknown key 0."),
         ("key-63-unknown", put(63, []), FEATURE, "Unknown key 63."),
     ]

@@ -81,7 +81,9 @@ def stored(folder: Path) -> list[Stored]:
         layers = row["layers"]
         whole = (None, row.get("error", layers))
         last_may_be_cut = "error" not in row or "slices" in row
-        prefixes = [(layers[i]["layer"], layers[: i + 1]) for i in range(len(layers) - last_may_be_cut)]
+        own = {int(layer): rows for layer, rows in row.get("prefixes", {}).items()}
+        numbers = [layer["layer"] for layer in layers[: len(layers) - last_may_be_cut]]
+        prefixes = [(number, own.get(number, layers[: i + 1])) for i, number in enumerate(numbers)]
         data = (folder / row["file"]).read_bytes()
         found.append(Stored(row["file"].removesuffix(".pd4"), data, tuple(row["clauses"]), (whole, *prefixes)))
     return found

@@ -25,10 +25,19 @@ AGAIN = {
         "predicted-stages-over-rest",
         "planes-stages-over-rest",
         "planes-stage-of-rest",
+        "low-bits-section-missing",
     ),
     "a section of no bytes or fewer is missing, or has nothing to code": (
         "layer-0-section-length-zero",
         "layer-0-section-length-negative",
+        "low-bits-section-besides",
+    ),
+    "slices that are not there, or have no rows, leave section 7 nothing to code": (
+        "low-bits-slices-0",
+        "low-bits-slices-twice",
+        "low-bits-slices-named-again",
+        "low-bits-behind-refining-slice",
+        "low-bits-of-no-rows",
     ),
     "the rule spares a decoder work: exceptions take a place and two bytes each, which are checked as well": (
         "exceptions-more-than-symbols",
@@ -69,6 +78,7 @@ UNSHOWN = {
     "nodes <= count": "the tree ends with as many nodes",
     "count <= MAX_COUNT": "clause 6.5 bounds a channel below 2^26 in any file of less than 30 MB",
     "samples <= 1 << 28": "clause 6.5 bounds the samples in any file of less than 258 kB",
+    "rows": "where no row is, section 7 has nothing to code",
     "size <= 1 << 31": "clause 6.5 bounds the bytes in any file of less than 250 kB",
 }
 FAULTY = "faulty/"
