@@ -38,7 +38,7 @@ prefix that ends with a layer can be shown. What has no visible effect is left o
 2 Mbps. It takes a minute or more. Give --data, or only what the file's own camera shows is judged.
 
 --slices 50k lets a picture appear after the first 50 kB and improve with each further slice. It takes minutes as well,
-and the same pictures decide which anchors come first. --low-bits 2 makes earlier pictures better for some 4 % more
+and the same pictures decide which anchors come first. --low-bits 1 makes earlier pictures better for some 4 % more
 bytes: all attributes come coarse, and their last bits behind everything else.
 
 {SOURCES}
@@ -46,7 +46,7 @@ bytes: all attributes come coarse, and their last bits behind everything else.
 examples:
   pd4dgs-encode model.pt -o scene.pd4
   pd4dgs-encode model.pt -o small.pd4 --step-scale 2
-  pd4dgs-encode model.pt -o early.pd4 --slices 50k --low-bits 2 --data recordings/kitchen --downscale 2
+  pd4dgs-encode model.pt -o early.pd4 --slices 50k --low-bits 1 --data recordings/kitchen --downscale 2
   pd4dgs-encode model.pt -o fast.pd4 --target-size L0=350k --data recordings/kitchen --downscale 2
   pd4dgs-encode model.pt -o - | pd4dgs-decode -"""
 
