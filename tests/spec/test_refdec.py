@@ -49,6 +49,8 @@ _module.loader.exec_module(refdec)
 CODINGS = {
     "ans best": {},
     "ans gauss": {"priors": "gauss"},
+    "low bits": {"low_bits": 2},
+    "low bits in slices": {"low_bits": 3, "slices": 1500},
     "lzma": {"mode": "lzma"},
     "ans float32": {"deformation": "float32"},
     "lzma float32": {"mode": "lzma", "deformation": "float32"},
