@@ -39,13 +39,14 @@ export class Definitions {
  *
  * @param {Uint8Array} bytes @param {ArrayLike<number>} counts @param {Int32Array} out
  * @param {Definitions} [known] of the slices before; what this section defines is added
+ * @param {number} [free] entries of all tables, beyond one per symbol, where nothing is known
  */
-export function decodeChannels(bytes, counts, out, known = new Definitions()) {
+export function decodeChannels(bytes, counts, out, known = new Definitions(), free = FREE_ENTRIES) {
   const reader = new ByteReader(bytes);
   const { priors } = known;
   const before = priors.length;
   let entries = 0;
-  let most = before ? MORE_ENTRIES : FREE_ENTRIES;
+  let most = before ? MORE_ENTRIES : free;
   for (let i = 0; i < counts.length; i++) most += counts[i];
   /** @type {{count: number, prior: Prior, exceptions: Exceptions | null}[]} */
   const channels = [];

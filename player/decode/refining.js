@@ -2,7 +2,7 @@
 
 import { decodeChannels } from "./channels.js";
 import { checkRange } from "./layer.js";
-import { MAX_SYMBOL } from "./limits.js";
+import { MAX_SYMBOL, MORE_ENTRIES } from "./limits.js";
 
 /**
  * The attributes of some slices with their low bits; those given stay as they are.
@@ -22,7 +22,7 @@ export function refined(section, coarse, channels, lowBits) {
     for (const symbols of rowsOf(c)) for (const s of symbols) counts[3 * c + classOf(s)]++;
   }
   const rests = new Int32Array(counts.reduce((a, b) => a + b));
-  decodeChannels(section, counts, rests);
+  decodeChannels(section, counts, rests, undefined, MORE_ENTRIES);
   const most = 2 ** (lowBits - 1);
   checkRange(rests, -most, most, "low bits of a symbol");
   let end = 0;

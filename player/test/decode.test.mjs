@@ -29,7 +29,7 @@ test("there are vectors of every sort", () => {
 /** Bytes that a stream is fed at once, one of them per vector: some vectors take a second to decode. */
 const PIECES = [1, 7, 1000];
 
-for (const [index, { file, bytes, error, chunk, offset, layers, slices, lowBits }] of VECTORS.entries()) {
+for (const [index, { file, bytes, error, chunk, offset, layers, slices, prefixes }] of VECTORS.entries()) {
   test(`${file}: hashes, or the named error at its place`, () => {
     const fault = faultOf(() => assert.deepEqual(hashes(bytes), layers));
     assert.equal(fault?.kind ?? null, error, fault?.message);
@@ -37,9 +37,9 @@ for (const [index, { file, bytes, error, chunk, offset, layers, slices, lowBits 
       assert.equal(fault.chunk, chunk);
       if (offset !== null) assert.equal(fault.offset, offset);
     }
-    if (lowBits) return;
     for (let i = 0; i + 1 < layers.length; i++) {
-      assert.deepEqual(hashes(bytes, { maxLayer: layers[i].layer }), layers.slice(0, i + 1));
+      const expected = prefixes[layers[i].layer] ?? layers.slice(0, i + 1);
+      assert.deepEqual(hashes(bytes, { maxLayer: layers[i].layer }), expected);
     }
   });
 

@@ -8,11 +8,10 @@ import { unpack } from "../decode/msgpack.js";
 const FOLDER = new URL("../../spec/vectors/", import.meta.url);
 const MODE = 2;
 const DEFORMATION = 3;
-const LOW_BITS = 17;
 
 /**
  * error: the kind that is due, null if the file decodes. layers: the hashes of all layers that decode. slices: the layer
- * of each slice that does.
+ * of each slice that does. prefixes: by the highest layer of a prefix its hashes, where low bits come behind it.
  *
  * @typedef {object} Vector
  * @property {string} file
@@ -22,7 +21,7 @@ const LOW_BITS = 17;
  * @property {number | null} offset null if it is not fixed
  * @property {import("../decode/hashes.js").LayerHashes[]} layers
  * @property {number[]} slices
- * @property {boolean} lowBits whether later slices change what layers decode to
+ * @property {Record<string, import("../decode/hashes.js").LayerHashes[]>} prefixes
  */
 
 /** What the header has under a key, if it can be read. @param {Uint8Array} bytes @param {number} key */
@@ -43,11 +42,10 @@ export function readVectors() {
     // an ans-only decoder's answer, where the manifest does not name it
     const asks = headerHas(bytes, MODE) === 1 || headerHas(bytes, DEFORMATION) === 1; // for lzma, or float32 values
     const unsupported = row.ans_only ? row.ans_only === "UnsupportedFeature" : asks;
-    const lowBits = headerHas(bytes, LOW_BITS) !== undefined;
-    const { file, error = null, chunk = null, offset = null, layers } = row;
+    const { file, error = null, chunk = null, offset = null, layers, prefixes = {} } = row;
     const slices = row.slices ?? layers.map((/** @type {{layer: number}} */ { layer }) => layer);
-    if (!unsupported) return { file, bytes, error, chunk, offset, layers, slices, lowBits };
-    return { file, bytes, error: "UnsupportedFeature", chunk: null, offset: null, layers: [], slices: [], lowBits };
+    if (!unsupported) return { file, bytes, error, chunk, offset, layers, slices, prefixes };
+    return { file, bytes, error: "UnsupportedFeature", chunk: null, offset: null, layers: [], slices: [], prefixes };
   });
 }
 
