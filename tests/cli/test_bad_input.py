@@ -91,12 +91,16 @@ CHECKPOINT_USERS = {
 @pytest.fixture(autouse=True)
 def _quick_dataset(monkeypatch, shared_dataset):
     """`synthetic:static` takes seconds to make; the faults here lie elsewhere."""
-    from pd4dgs_codec.data import dataset as module
+    from pd4dgs_codec.data import dataset
+    from pd4dgs_codec.interchange import teacher
 
-    real = module.load
-    monkeypatch.setattr(
-        module, "load", lambda source, **kw: real(shared_dataset if source == "synthetic:static" else source, **kw)
-    )
+    real = dataset.load
+
+    def load(source, **options):
+        return real(shared_dataset if source == "synthetic:static" else source, **options)
+
+    for module in (dataset, teacher):  # the second has a name of its own for it
+        monkeypatch.setattr(module, "load", load)
 
 
 @pytest.mark.parametrize("verb", CHECKPOINT_USERS)
