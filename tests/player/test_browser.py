@@ -173,24 +173,52 @@ def server(folder: Path) -> Iterator[Server]:
         yield served
 
 
-@pytest.fixture
-def page(browser: Any) -> Iterator[Any]:
-    """A page on which nothing goes wrong unnoticed."""
+def _opened(browser: Any) -> tuple[Any, list[str]]:
+    """A page, and what goes wrong on it from now on."""
     context = browser.new_context(viewport={"width": 480, "height": 360})
     context.set_default_timeout(PATIENCE_MS)
     opened = context.new_page()
     errors: list[str] = []
     opened.on("pageerror", lambda error: errors.append(str(error)))
+    return opened, errors
+
+
+def _load_harness(page: Any, server: Server) -> Any:
+    page.goto(server.url_of("player/test-browser/harness.html"))
+    page.wait_for_function("!!window.harness")
+    return page
+
+
+@pytest.fixture
+def page(browser: Any) -> Iterator[Any]:
+    """A page on which nothing goes wrong unnoticed."""
+    opened, errors = _opened(browser)
     yield opened
-    context.close()
+    opened.context.close()
     assert not errors
 
 
 @pytest.fixture
-def harness(page: Any, server: Server) -> Any:
-    page.goto(server.url_of("player/test-browser/harness.html"))
-    page.wait_for_function("!!window.harness")
-    return page
+def new_harness(page: Any, server: Server) -> Any:
+    """The harness on a page of its own."""
+    return _load_harness(page, server)
+
+
+@pytest.fixture(scope="module")
+def _shared_harness(browser: Any, server: Server) -> Iterator[tuple[Any, list[str]]]:
+    opened, errors = _opened(browser)
+    yield _load_harness(opened, server), errors
+    opened.context.close()
+
+
+@pytest.fixture
+def harness(_shared_harness: tuple[Any, list[str]]) -> Iterator[Any]:
+    """The harness, closed again. One page for all, since a new one takes more than a second of CPU."""
+    opened, errors = _shared_harness
+    errors.clear()
+    yield opened
+    opened.evaluate("harness.close()")
+    assert not errors
 
 
 def pixels(text: str) -> np.ndarray:
@@ -548,18 +576,18 @@ def test_bad_input_is_one_line_and_keeps_what_was_valid(page, server, folder, li
 # -- robustness --------------------------------------------------------------------------------------------------------
 
 
-def test_a_lost_context_comes_back(harness, server):
-    call(harness, "harness.open", server.url_of("scene.pd4"), WIDTH, HEIGHT, {"evaluator": "gpu"})
-    before = pixels(call(harness, "harness.shoot", {"seconds": 1.8}))
-    call(harness, "harness.loseContext")
-    after = pixels(call(harness, "harness.shoot", {}))
+def test_a_lost_context_comes_back(new_harness, server):
+    call(new_harness, "harness.open", server.url_of("scene.pd4"), WIDTH, HEIGHT, {"evaluator": "gpu"})
+    before = pixels(call(new_harness, "harness.shoot", {"seconds": 1.8}))
+    call(new_harness, "harness.loseContext")
+    after = pixels(call(new_harness, "harness.shoot", {}))
     assert decibels(before, after) > 60  # the order of equal depths may be another one
-    assert "error" not in dict(harness.evaluate("harness.events"))
+    assert "error" not in dict(new_harness.evaluate("harness.events"))
 
 
-def test_scenes_opened_and_closed_leave_nothing(harness, server):
+def test_scenes_opened_and_closed_leave_nothing(new_harness, server):
     sizes = call(
-        harness,
+        new_harness,
         """async (url) => {
           const sizes = [];
           for (let i = 0; i < 20; i++) {
@@ -574,10 +602,10 @@ def test_scenes_opened_and_closed_leave_nothing(harness, server):
         }""",
         server.url_of("scene.pd4"),
     )
-    assert harness.evaluate("document.querySelectorAll('canvas').length") == 0
+    assert new_harness.evaluate("document.querySelectorAll('canvas').length") == 0
     held = 700 * (72 + 3) * 4  # the arrays of one scene
     assert min(sizes[15:]) < min(sizes[3:8]) + held, sizes
-    assert len(harness.context.pages) == 1 and len(harness.workers) == 0
+    assert len(new_harness.context.pages) == 1 and len(new_harness.workers) == 0
 
 
 def test_a_scene_that_replaces_another_while_it_loads(harness, server):
