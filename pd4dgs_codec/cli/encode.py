@@ -39,7 +39,7 @@ prefix that ends with a layer can be shown. What has no visible effect is left o
 
 --slices 50k lets a picture appear after the first 50 kB and improve with each further slice. It takes minutes as well,
 and the same pictures decide which anchors come first. --low-bits 1 makes earlier pictures better for some 4 % more
-bytes: all attributes come coarse, and their last bits behind everything else.
+bytes: all attributes come coarse, and their last bits behind layer 1.
 
 {SOURCES}
 
@@ -76,7 +76,7 @@ def parser() -> Parser:
         "cut layers into slices of SIZE bytes, where planes and networks allow it; what pictures need most comes first"
     )
     p.add_argument("--slices", type=values.size, default=DEFAULTS.slices, metavar="SIZE", help=what)
-    _add_choice(p, "low_bits", "put so many bits of the attributes at the end of the file", type=int)
+    _add_choice(p, "low_bits", "bring so many bits of the attributes behind layer 1; not with --target-size", type=int)
     what = "most bytes that each layer may add to the file (layer 0 with the header): coarser steps, fewer anchors"
     p.add_argument("--target-size", type=values.layer_sizes, default={}, metavar="L0=425k,...", help=what)
     about = p.add_argument_group(

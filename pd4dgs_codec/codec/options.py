@@ -50,7 +50,7 @@ class EncodeOptions:
     heads that are exactly zero and anchors below the mask threshold. step_scale multiplies every quantisation step.
     slices: bytes that a slice of a layer takes at most where its planes and networks allow it, the header counted with
     the first; 0 for one slice per layer.
-    low_bits: so many bits of the attributes' symbols come at the end of the file, 0..4: earlier pictures, more bytes.
+    low_bits: so many bits of the attributes' symbols come behind those of layer 1, 0..4: earlier pictures, more bytes.
     verify: decode the result, compare every symbol and every float, and hold every float against the error bound in the
     header.
     """

@@ -14,6 +14,7 @@ from pd4dgs_codec.codec.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.codec.stream import every_prefix
 from pd4dgs_codec.codec.symbols import rounded
+from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.pack import MIN_GAIN_PER_MEGABYTE
 from pd4dgs_codec.scene import Scene
 
@@ -99,6 +100,8 @@ def pack(
     sizes are fitted on, or in what the file's own camera shows; a file without either has the largest first. Only
     views, target sizes and slices need torch. Raises EncodeError, RenderError for a file without a camera.
     """
+    if target_sizes and options.low_bits:
+        raise EncodeError("target sizes with low bits: layer 1 brings those of layer 0 too, expected one or the other")
     scene = source if isinstance(source, Scene) else _scene_of(source)
     scene, options = options.apply_scale(scene)
     left_out: list[LeftOut] = []

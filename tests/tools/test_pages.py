@@ -20,6 +20,7 @@ import precision
 import pytest
 import results
 import slices
+import training_growth
 from pages import page, peers, tables
 from pages import scenes as places
 from pages.page import Page
@@ -31,7 +32,7 @@ from pd4dgs_codec.errors import DataError
 ROOT = page.ROOT
 DOCS = ROOT / "docs"
 TOOLS = (results, evaluation, precision, latency, interchange, omissions, performance, player_page, slices)
-TOOLS += (batch, long_captures)
+TOOLS += (batch, long_captures, training_growth)
 PAGES = [tool.PAGE for tool in TOOLS]
 PAGES += [table.page for table in TABLES.values()]
 #: Bytes that a text and a picture may have.
