@@ -208,7 +208,7 @@ def render(rows: Sequence[Row]) -> str:
             "picture of a file with one slice per layer. *time ratio*: the "
             f"median, over qualities {STEP} dB apart from {LEAST:g} dB up, of the time to that quality on a link of "
             f"constant rate, relative to that file. *low bits last*: the same with `--low-bits {LOW_BITS}`: attributes "
-            "are coarse until the last slices."
+            "are coarse until the slices behind those of layer 1."
         ),
         "",
         markdown(heads, first),

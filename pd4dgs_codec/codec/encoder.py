@@ -30,7 +30,7 @@ from pd4dgs_codec.codec.metadata import CHUNK_TYPE, Metadata, write_metadata
 from pd4dgs_codec.codec.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.codec.payload import StreamReport, read_meta
 from pd4dgs_codec.codec.plan import plan
-from pd4dgs_codec.codec.refining import coarse, shifted
+from pd4dgs_codec.codec.refining import unrefined
 from pd4dgs_codec.codec.slicing import Slice, whole_layer, with_low_bits, write_slices
 from pd4dgs_codec.codec.symbols import (
     LayerSymbols,
@@ -142,7 +142,7 @@ def encode_with_report(
         errors = verify_errors(planned, meant, attribute_blocks(grid, symbols), bounds, options.raw_deformation)
     del planned  # as large as the scene
     if options.slices:
-        first = [shifted(coarse(layer, options.low_bits), options.low_bits) for layer in symbols]
+        first = [unrefined(layer, options.low_bits) for layer in symbols]
         values = np.split((utility or by_size)(assemble(meant.info, grid, first)), meant.rows[:-1])
         del first
         written = [write_slices(layer, options, u, HEADER) for layer, u in zip(symbols, values, strict=True)]
@@ -197,7 +197,8 @@ def _check_limits(
                 )
                 layers = [*symbols[:index], part.symbols]
                 check_last_layer(layers, taken, voxel_size, grid)
-                check_attributes(shifted(coarse(part.symbols, low_bits), low_bits), grid)
+                if low_bits:
+                    check_attributes(unrefined(part.symbols, low_bits), grid)
             except DecodeError as error:
                 raise EncodeError(f"the scene is over a limit of the format: {error}") from None
 

@@ -36,6 +36,11 @@ def shifted(layer: LayerSymbols, bits: int) -> LayerSymbols:
     return replace(layer, attributes=k << bits) if bits else layer
 
 
+def unrefined(layer: LayerSymbols, bits: int) -> LayerSymbols:
+    """The layer as it is shown before its low bits have come. Raises Malformed."""
+    return shifted(coarse(layer, bits), bits)
+
+
 def write_refinement(parts: Sequence[LayerSymbols], bits: int, options: EncodeOptions) -> CodedChannels:
     """The low bits of these slices' attributes. Inverse: read_refinement."""
     q = np.concatenate([part.attributes for part in parts], axis=1)
@@ -48,10 +53,11 @@ def write_refinement(parts: Sequence[LayerSymbols], bits: int, options: EncodeOp
 def read_refinement(section: bytes, parts: Sequence[LayerSymbols], bits: int) -> list[LayerSymbols]:
     """The slices, as `shifted` left them, with their low bits. Raises DecodeError's subclasses."""
     k = np.concatenate([part.attributes for part in parts], axis=1)
-    counts = [int(chosen.sum()) for row in k for chosen in _classes(row >> bits)]
+    classes = [_classes(row >> bits) for row in k]
+    counts = [int(chosen.sum()) for own in classes for chosen in own]
     found = iter(decode_channels(section, counts, entries=MORE_ENTRIES))
-    for row in k:
-        for chosen in _classes(row >> bits):
+    for row, own in zip(k, classes, strict=True):
+        for chosen in own:
             rest = next(found)
             if rest.size and max(int(rest.max()), -int(rest.min())) > 1 << bits >> 1:
                 raise Malformed(f"low bits over {1 << bits >> 1} in magnitude, of {bits} bits")
@@ -59,7 +65,7 @@ def read_refinement(section: bytes, parts: Sequence[LayerSymbols], bits: int) ->
     if k.size and max(int(k.max()), -int(k.min())) > MAX_SYMBOL:
         raise Malformed(f"a refined symbol over {MAX_SYMBOL} in magnitude")
     ends = np.cumsum([part.attributes.shape[1] for part in parts])[:-1]
-    return [replace(part, attributes=own) for part, own in zip(parts, np.split(k, ends, axis=1), strict=True)]
+    return [replace(part, attributes=refined) for part, refined in zip(parts, np.split(k, ends, axis=1), strict=True)]
 
 
 def _classes(k: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
