@@ -14,6 +14,7 @@ from __future__ import annotations
 import math
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
@@ -22,6 +23,7 @@ from pd4dgs_codec.model import rate_kernels as kernels
 
 #: The clip of the training rate: no scalar costs more than log2(1e6) = 19.93 bits.
 MIN_PROBABILITY = 1e-6
+MAX_BITS = -math.log2(MIN_PROBABILITY)
 #: sigma is kept at or above Q * MIN_SIGMA_RATIO.
 MIN_SIGMA_RATIO = 2.0**-10
 #: h max(z, 1) below which P is taken as narrow.
@@ -60,17 +62,6 @@ def _log_ratio(z: Tensor, h: Tensor, u: Tensor, v: Tensor) -> Tensor:
     return out
 
 
-def _log_probability(z: Tensor, h: Tensor, u: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    """(ln P, ln(phi(u) / P)); kernels (`rate_kernels.py`) for [n, c] on the CPU, else the plain torch form."""
-    if z.device.type == "cpu" and z.dim() == 2:
-        results = torch.empty_like(z), torch.empty_like(z)
-        log_p, log_ratio = (x.numpy() for x in results)
-        kernels.log_probability(log_p, log_ratio, z.numpy(), h.numpy(), u.numpy(), v.numpy(), NARROW[z.dtype])
-        return results
-    ratio = _log_ratio(z, h, u, v)
-    return -0.5 * u * u - _HALF_LN_2PI - ratio, ratio
-
-
 class _LogProbability(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, a: Tensor, mu: Tensor, sigma: Tensor, q: Tensor) -> Tensor:
@@ -82,25 +73,18 @@ class _LogProbability(torch.autograd.Function):
         signed = a - mu
         d = signed.abs()
         z, h, u, v = d / sigma, 0.5 * q / sigma, (d - 0.5 * q) / sigma, (d + 0.5 * q) / sigma
-        log_p, log_ratio = _log_probability(z, h, u, v)
+        log_ratio = _log_ratio(z, h, u, v)
         ctx.save_for_backward(signed, sigma, q, z, h, v, log_ratio)
         ctx.shapes, ctx.dtype = shapes, dtype
-        return log_p.to(dtype)
+        return (-0.5 * u * u - _HALF_LN_2PI - log_ratio).to(dtype)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
         signed, sigma, q, z, h, v, log_ratio = ctx.saved_tensors
-        grad, grad_q = grad.to(log_ratio.dtype), grad
-        if z.device.type == "cpu" and z.dim() == 2 and not ctx.needs_input_grad[3]:
-            grad_a, grad_sigma = torch.empty_like(z), torch.empty_like(z)
-            inputs = (grad_a, grad_sigma, grad.contiguous(), signed, sigma, z, h, v, log_ratio)
-            kernels.gradients(*(x.numpy() for x in inputs))
-        else:
-            ratio = torch.exp(log_ratio)
-            m = torch.expm1(-2 * z * h)
-            grad_a = grad * torch.sign(signed) * ratio * m / sigma
-            grad_sigma = -grad * ratio * (2 * h + v * m) / sigma
-            grad_q = grad * ratio * h * (2 + m) / q
+        ratio, m = torch.exp(log_ratio), torch.expm1(-2 * z * h)
+        grad_a = grad * torch.sign(signed) * ratio * m / sigma
+        grad_sigma = -grad * ratio * (2 * h + v * m) / sigma
+        grad_q = grad * ratio * h * (2 + m) / q
         grads = (grad_a, -grad_a, grad_sigma, grad_q)
         reduced = [
             g.sum_to_size(shape).to(ctx.dtype) if need else None
@@ -121,7 +105,7 @@ class _ClipValue(torch.autograd.Function):
 
     @staticmethod
     def forward(ctx: Any, bits: Tensor) -> Tensor:
-        return bits.clamp(max=-math.log2(MIN_PROBABILITY))
+        return bits.clamp(max=MAX_BITS)
 
     @staticmethod
     def backward(ctx: Any, grad: Tensor) -> Tensor:
@@ -136,37 +120,68 @@ def rate_bits(a: Tensor, mu: Tensor, sigma: Tensor, q: Tensor | float) -> Tensor
     return bits
 
 
-class _Sampled(torch.autograd.Function):
-    """`sampled_reference` with one gradient for all of it: no rows are copied or scattered but the few picked."""
+class _RowBits(torch.autograd.Function):
+    """`row_bits_reference` in numba, with one gradient for all of it."""
 
     @staticmethod
-    def forward(ctx: Any, x: Tensor, active: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        n, weight = len(active), x.new_zeros(len(x)).index_fill_(0, active, 1.0)
-        mu = (weight @ x) / n
-        centred = (x - mu).mul_(weight[:, None])
-        sigma = (centred.square().sum(0) / n + MIN_VARIANCE).sqrt()
-        ctx.count = n
-        ctx.save_for_backward(rows, weight, centred, sigma)
-        return mu, sigma, x.index_select(0, rows)
+    def forward(ctx: Any, values: Tensor, classes: Tensor, rows: Tensor, step: float) -> Tensor:
+        x, of, picked = values.numpy(), classes.numpy(), rows.numpy()
+        counts = np.bincount(of[of >= 0], minlength=1)
+        each = np.maximum(counts, 1)[:, None]
+        mu = _sums(x, of, np.zeros((len(counts), x.shape[1])), 1) / each
+        sigma = np.sqrt(_sums(x, of, mu, 2) / each + MIN_VARIANCE)
+        bits, by_value = np.empty(len(picked)), np.empty((len(picked), x.shape[1]))
+        by_sigma = np.empty_like(by_value)
+        limits = MIN_SIGMA_RATIO, MAX_BITS, NARROW[torch.float64]
+        kernels.row_bits(bits, by_value, by_sigma, x, picked, of, mu, sigma, step, *limits)
+        ctx.save_for_backward(values, classes, rows)
+        ctx.moments = each, mu, sigma, by_value, by_sigma
+        return torch.from_numpy(bits).to(values.dtype)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, g_mu: Tensor, g_sigma: Tensor, g_rows: Tensor) -> tuple[Tensor, None, None]:
-        rows, weight, centred, sigma = ctx.saved_tensors
-        grad = torch.outer(weight, g_mu / ctx.count).addcmul_(centred, g_sigma / (ctx.count * sigma))
-        return grad.index_add_(0, rows, g_rows), None, None
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
+        values, classes, rows = ctx.saved_tensors
+        each, mu, sigma, by_value, by_sigma = ctx.moments
+        x, of, weight = values.detach().numpy(), classes.numpy(), grad.numpy().astype(np.float64)[:, None]
+        of_rows = of[rows.numpy()] == np.arange(len(mu))[:, None]  # [K, n]
+        by_mu = -(of_rows @ (weight * by_value)) / each
+        by_square = of_rows @ (weight * by_sigma) / (each * sigma)
+        found = np.empty_like(x)
+        kernels.moments_gradient(found, x, of, *(a.astype(x.dtype) for a in (by_mu, mu, by_square)))
+        found[rows.numpy()] += (weight * by_value).astype(x.dtype)
+        return torch.from_numpy(found), None, None, None
 
 
-def sampled(x: Tensor, active: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Mean and standard deviation per column over the rows `active` (int64 [n], n >= 1) of x [N, c], and the rows
-    `rows` [m, c]; no row comes twice in either. Gradient through all three."""
-    found: tuple[Tensor, Tensor, Tensor] = _Sampled.apply(x, active, rows)  # type: ignore[no-untyped-call]
-    return found
+def _sums(values: np.ndarray, classes: np.ndarray, centre: np.ndarray, power: int) -> np.ndarray:
+    """float64 [K, c]: those of `rate_kernels.sums`."""
+    parts = np.zeros((-(-len(values) // kernels.BLOCK), *centre.shape))
+    kernels.sums(parts, values, classes, centre, power)
+    total: np.ndarray = parts.sum(0)
+    return total
 
 
-def sampled_reference(x: Tensor, active: Tensor, rows: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """The plain torch form of `sampled`."""
-    return *channel_moments(x.index_select(0, active)), x.index_select(0, rows)
+def row_bits(values: Tensor, classes: Tensor, rows: Tensor, step: float) -> Tensor:
+    """R summed over each of the rows `rows` (int64 [n], none twice) of values [N, c]: [n], gradient through all.
+
+    classes: int8 [N], the step class of an active row and -1 of others; `rows` are active. A scalar's step is
+    step * 2^class, and its prior are mean and standard deviation of its column over the active rows of its class.
+    """
+    if values.device.type == "cpu":
+        bits: Tensor = _RowBits.apply(values, classes, rows, step)  # type: ignore[no-untyped-call]
+        return bits
+    return row_bits_reference(values, classes, rows, step)
+
+
+def row_bits_reference(values: Tensor, classes: Tensor, rows: Tensor, step: float) -> Tensor:
+    """The plain torch form of `row_bits`."""
+    of_rows = classes[rows]
+    bits = values.new_zeros(len(rows))
+    for c in sorted(set(of_rows.tolist())):
+        mu, sigma = channel_moments(values[classes == c])
+        own = rate_bits(values[rows[of_rows == c]], mu, sigma, step * 2.0**c).sum(1)
+        bits = bits.index_put(((of_rows == c).nonzero()[:, 0],), own)
+    return bits
 
 
 def channel_moments(x: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,6 +1,8 @@
-"""Numba kernels of the training rate: the two element-wise functions of `rate.py`, in one pass each.
+"""Numba kernels of the training rate: the bits of some rows under the moments of all, and their gradient.
 
-Arrays are [n, c] of one float type, computed in float64 whatever that is; broadcast ones may repeat their elements.
+A row is an anchor; `classes` int8 [N] holds the step class of each, -1 of one that is not active. Values are [N, c] of
+one float type, computed in float64 whatever that is. Sums are kept per block of rows: results do not depend on the
+number of threads.
 """
 
 from __future__ import annotations
@@ -12,10 +14,13 @@ import numpy as np
 
 from pd4dgs_codec.render.simd import kernel
 
+BLOCK = 1024  #: rows
+
 _SQRT_HALF = math.sqrt(0.5)
 _HALF_LN_2PI = 0.5 * math.log(2.0 * math.pi)
 _SQRT_HALF_PI = math.sqrt(0.5 * math.pi)
 _INVERSE_SQRT_PI = 1.0 / math.sqrt(math.pi)
+_LN2 = math.log(2.0)
 #: From here on erfcx is its asymptotic series, to 4e-12; below it exp(x^2) erfc(x), to 1e-13.
 _FAR = 20.0
 
@@ -29,56 +34,80 @@ def _erfcx(x: float) -> float:
     return _INVERSE_SQRT_PI / x * (1.0 - y * (1.0 - 3.0 * y * (1.0 - 5.0 * y * (1.0 - 7.0 * y))))
 
 
+@kernel()
+def _log_ratio(z: float, h: float, u: float, v: float, narrow_below: float) -> float:
+    """ln(phi(u) / P) in the forms of `rate.py`; narrow_below: h max(z, 1) below which P is taken as narrow."""
+    if h * max(z, 1.0) < narrow_below:
+        z2, h2 = z * z, h * h
+        series = (z2 - 1) * h2 / 6 + ((z2 - 6) * z2 + 3) * h2 * h2 / 120
+        series += (((z2 - 15) * z2 + 45) * z2 - 15) * h2 * h2 * h2 / 5040
+        return z * h - 0.5 * h2 - math.log(2 * h) - math.log1p(series)
+    if u < 0:
+        p = 0.5 * (math.erfc(u * _SQRT_HALF) - math.erfc(v * _SQRT_HALF))
+        return -0.5 * u * u - _HALF_LN_2PI - math.log(p)
+    far = math.exp(-2 * z * h) * _erfcx(v * _SQRT_HALF)
+    return -math.log(_SQRT_HALF_PI * (_erfcx(u * _SQRT_HALF) - far))
+
+
 @kernel(parallel=True)
-def log_probability(
-    out: np.ndarray,
-    log_ratio: np.ndarray,
-    z: np.ndarray,
-    h: np.ndarray,
-    u: np.ndarray,
-    v: np.ndarray,
+def sums(parts: np.ndarray, values: np.ndarray, classes: np.ndarray, centre: np.ndarray, power: int) -> None:
+    """parts [blocks, K, c] += of each class the sum of values, or with power 2 that of their squared distances from
+    centre [K, c]."""
+    channels = values.shape[1]
+    for block in nb.prange(len(parts)):
+        for i in range(block * BLOCK, min(len(values), (block + 1) * BLOCK)):
+            k = classes[i]
+            if k < 0:
+                continue
+            if power == 1:
+                for j in range(channels):
+                    parts[block, k, j] += values[i, j]
+            else:
+                for j in range(channels):
+                    distance = values[i, j] - centre[k, j]
+                    parts[block, k, j] += distance * distance
+
+
+@kernel(parallel=True)
+def row_bits(
+    bits: np.ndarray,
+    by_value: np.ndarray,
+    by_sigma: np.ndarray,
+    values: np.ndarray,
+    rows: np.ndarray,
+    classes: np.ndarray,
+    mu: np.ndarray,
+    sigma: np.ndarray,
+    step: float,
+    least_sigma: float,
+    most_bits: float,
     narrow_below: float,
 ) -> None:
-    """out = ln P and log_ratio = ln(phi(u) / P) in the forms of `rate.py`; narrow_below: h max(z, 1) below which P is
-    taken as narrow."""
-    for i in nb.prange(z.shape[0]):
-        for j in range(z.shape[1]):
-            zi, hi, ui, vi = np.float64(z[i, j]), np.float64(h[i, j]), np.float64(u[i, j]), np.float64(v[i, j])
-            log_phi = -0.5 * ui * ui - _HALF_LN_2PI
-            if ui < 0 and hi * max(zi, 1.0) >= narrow_below:
-                out[i, j] = math.log(0.5 * (math.erfc(ui * _SQRT_HALF) - math.erfc(vi * _SQRT_HALF)))
-                log_ratio[i, j] = log_phi - out[i, j]
-                continue
-            if hi * max(zi, 1.0) < narrow_below:
-                z2, h2 = zi * zi, hi * hi
-                series = (z2 - 1) * h2 / 6 + ((z2 - 6) * z2 + 3) * h2 * h2 / 120
-                series += (((z2 - 15) * z2 + 45) * z2 - 15) * h2 * h2 * h2 / 5040
-                ratio = zi * hi - 0.5 * h2 - math.log(2 * hi) - math.log1p(series)
-            else:
-                far = math.exp(-2 * zi * hi) * _erfcx(vi * _SQRT_HALF)
-                ratio = -math.log(_SQRT_HALF_PI * (_erfcx(ui * _SQRT_HALF) - far))
-            log_ratio[i, j] = ratio
-            out[i, j] = log_phi - ratio
+    """bits float64 [n]: the sum of R over each of `rows` int64 [n], a scalar's bits clipped to most_bits; by_value and
+    by_sigma [n, c]: the gradients of each scalar's R, not clipped. sigma [K, c] is held above least_sigma steps."""
+    for r in nb.prange(len(rows)):
+        i = rows[r]
+        k = classes[i]
+        q, total = step * 2.0**k, 0.0
+        for j in range(values.shape[1]):
+            s = max(sigma[k, j], q * least_sigma)
+            signed = values[i, j] - mu[k, j]
+            z, h = abs(signed) / s, 0.5 * q / s
+            u, v = (abs(signed) - 0.5 * q) / s, (abs(signed) + 0.5 * q) / s
+            log_ratio = _log_ratio(z, h, u, v, narrow_below)
+            total += min((0.5 * u * u + _HALF_LN_2PI + log_ratio) / _LN2, most_bits)
+            m, slope = math.expm1(-2 * z * h), math.exp(log_ratio) / (s * _LN2)
+            by_value[r, j] = -slope * m if signed > 0 else slope * m if signed < 0 else 0.0
+            by_sigma[r, j] = slope * (2 * h + v * m) if s == sigma[k, j] else 0.0
+        bits[r] = total
 
 
 @kernel(parallel=True)
-def gradients(
-    grad_a: np.ndarray,
-    grad_sigma: np.ndarray,
-    grad: np.ndarray,
-    signed: np.ndarray,
-    sigma: np.ndarray,
-    z: np.ndarray,
-    h: np.ndarray,
-    v: np.ndarray,
-    log_ratio: np.ndarray,
+def moments_gradient(
+    grad: np.ndarray, values: np.ndarray, classes: np.ndarray, by_mu: np.ndarray, mu: np.ndarray, by_square: np.ndarray
 ) -> None:
-    """The gradients by a and sigma; grad: that of ln P; signed: a - mu; log_ratio: from `log_probability`."""
-    for i in nb.prange(z.shape[0]):
-        for j in range(z.shape[1]):
-            zi, hi, vi = np.float64(z[i, j]), np.float64(h[i, j]), np.float64(v[i, j])
-            m = math.expm1(-2 * zi * hi)
-            slope = np.float64(grad[i, j]) * math.exp(np.float64(log_ratio[i, j])) / np.float64(sigma[i, j])
-            sign = 1.0 if signed[i, j] > 0 else -1.0 if signed[i, j] < 0 else 0.0
-            grad_a[i, j] = slope * sign * m
-            grad_sigma[i, j] = -slope * (2 * hi + vi * m)
+    """grad [N, c] = by_mu + (values - mu) by_square of each row's class, all [K, c] of the type of `values`."""
+    for i in nb.prange(len(values)):
+        k = classes[i]
+        for j in range(values.shape[1]):
+            grad[i, j] = by_mu[k, j] + (values[i, j] - mu[k, j]) * by_square[k, j] if k >= 0 else 0.0

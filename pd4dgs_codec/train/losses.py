@@ -6,34 +6,23 @@ import torch
 from torch import Tensor
 
 from pd4dgs_codec.model.model import Model
-from pd4dgs_codec.model.rate import rate_bits, sampled
+from pd4dgs_codec.model.rate import row_bits
 from pd4dgs_codec.morton import morton_order
-from pd4dgs_codec.scene import MASK_THRESHOLD, MAX_CLASS
+from pd4dgs_codec.scene import MASK_THRESHOLD
 
 
-def attribute_bits(model: Model, rows: Tensor, active: Tensor) -> Tensor:
-    """R per scalar [n, channels] of the anchors `rows` (int64 [n]); priors are the moments over the anchors
-    `active` of the same step class."""
-    if not model.step_class.any():
-        return _class_bits(model, rows, active, 1.0)
-    of_rows, of_active = model.step_class[rows], model.step_class[active]
-    bits = [_class_bits(model, rows[of_rows == c], active[of_active == c], 2.0**c) for c in range(MAX_CLASS + 1)]
-    return torch.cat(bits)[of_rows.argsort(stable=True).argsort()]
-
-
-def _class_bits(model: Model, rows: Tensor, active: Tensor, spacing: float) -> Tensor:
-    """The same of anchors of one step class, whose steps are `spacing` times the model's."""
-    if not len(rows):
-        return model.feature.new_zeros(0, model.widths.channels)
-    parts = []
-    for values, step in (
+def anchor_bits(model: Model, rows: Tensor, active: Tensor) -> Tensor:
+    """Rbar [n]: the mean R over the scalars of each of the anchors `rows` (int64 [n], none twice, all active); priors
+    are the moments over the anchors `active` (int64) of the same step class."""
+    classes = torch.full_like(model.step_class, -1, dtype=torch.int8)
+    classes[active] = model.step_class[active].to(torch.int8)
+    parts = (
         (model.feature, model.steps.feature),
         (model.scaling_log, model.steps.scaling_log),
         (model.offset.flatten(1), model.steps.offset),
-    ):
-        mu, sigma, picked = sampled(values, active, rows)
-        parts.append(rate_bits(picked, mu, sigma, step * spacing))
-    return torch.cat(parts, dim=1)
+    )
+    total = torch.stack([row_bits(values, classes, rows, step) for values, step in parts]).sum(0)
+    return total / model.widths.channels
 
 
 def rate_term(model: Model, mask: Tensor, share: float, generator: torch.Generator) -> Tensor:
@@ -44,8 +33,7 @@ def rate_term(model: Model, mask: Tensor, share: float, generator: torch.Generat
         return mask.sum() * 0.0
     n = max(1, int(len(active) * share))
     rows = active[torch.randperm(len(active), generator=generator)[:n]]
-    rows = rows[model.step_class[rows].argsort(stable=True)]  # the order of attribute_bits
-    weighted = mask.index_select(0, rows) * attribute_bits(model, rows, active).mean(1)
+    weighted = mask.index_select(0, rows) * anchor_bits(model, rows, active)
     return weighted.mean() * (len(active) / len(mask))
 
 

@@ -10,8 +10,8 @@ from pd4dgs_codec.model.rate import (
     channel_moments,
     log_probability,
     rate_bits,
-    sampled,
-    sampled_reference,
+    row_bits,
+    row_bits_reference,
 )
 
 RATIOS = [1e-3, 0.01, 0.1, 0.3, 0.5, 1.0, 2.0, 7.0, 50.0, 1e3, 1e6]
@@ -83,38 +83,24 @@ def test_gradient_through_the_moments_matches_finite_differences():
     assert torch.autograd.gradcheck(total, (x,), atol=1e-7)
 
 
-@pytest.mark.parametrize("rows", [1, 2, 500])
-def test_samples_and_their_gradient_are_those_of_the_plain_form(rows):
-    generator = torch.Generator().manual_seed(rows)
-    x = torch.randn(600, 5, dtype=torch.float64, generator=generator) * 3 + 7
-    x[:, 1] = 4.0  # a channel without spread
-    active = torch.randperm(600, generator=generator)[:rows].sort().values
-    picked = active[torch.randperm(rows, generator=generator)[: (rows + 1) // 2]]
-    weights = torch.randn(2 + len(picked), 5, dtype=torch.float64, generator=generator)
-    weights[1, 1] = 0.0  # the rate holds such a sigma at its floor, so that no gradient comes back
+@pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 1e-8), (torch.float32, 3e-4)])
+@pytest.mark.parametrize("active", [1, 2, 5000])
+def test_the_kernels_give_the_plain_form_s_bits_and_gradients(dtype, bound, active):
+    """Columns from a thousandth of a step to a thousand steps wide, without spread, and with values far outside."""
+    generator = torch.Generator().manual_seed(active)
+    width = torch.logspace(-3, 3, 7, dtype=torch.float64)
+    values = 2.0 + torch.randn(6000, 9, dtype=torch.float64, generator=generator) * torch.cat([width, torch.zeros(2)])
+    values[::50, 8] = 60.0
+    chosen = torch.randperm(6000, generator=generator)[:active]
+    classes = torch.full((6000,), -1, dtype=torch.int8)
+    classes[chosen] = torch.randint(0, 3, (active,), generator=generator).to(torch.int8) * 2
+    rows, weights = chosen[: (active + 9) // 10], torch.rand((active + 9) // 10, generator=generator) + 0.5
     results = []
-    for function in (sampled, sampled_reference):
-        leaf = x.clone().requires_grad_()
-        found = torch.cat([part.view(-1, 5) for part in function(leaf, active, picked)])
-        (found * weights).sum().backward()
-        results.append((found, leaf.grad))
-    for found, expected in zip(*results, strict=True):
-        torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-12)
-
-
-@pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 2e-11), (torch.float32, 2e-4)])
-def test_the_kernels_give_the_plain_forms_rate_and_gradients(dtype, bound):
-    """Widths from a thousandth of a step to a thousand steps, distances up to 60 sigma and both sides of Q/2."""
-    sigma = torch.logspace(-3, 3, 25, dtype=torch.float64)
-    z = torch.cat([torch.linspace(-60, 60, 41, dtype=torch.float64), torch.logspace(-6, 0, 7, dtype=torch.float64)])
-    a = torch.cat([z[:, None] * sigma, z[:, None].clamp(-1, 1) * sigma + 0.5]).to(dtype)
-    sigma, mu, weights = sigma.to(dtype), torch.zeros(25, dtype=dtype), torch.rand(a.shape, dtype=dtype) + 0.5
-    results = []
-    for form in (lambda x: x, lambda x: x[None]):  # the plain form takes what has another number of axes
-        leaves = [x.clone().requires_grad_() for x in (a, mu, sigma)]
-        bits = log_probability(*map(form, leaves), 1.0)
-        (bits * weights).sum().backward()
-        results.append([bits.detach().reshape(a.shape), *(x.grad for x in leaves)])
+    for form in (row_bits, row_bits_reference):
+        leaf = values.to(dtype).requires_grad_()
+        bits = form(leaf, classes, rows, 0.25)
+        (bits * weights.to(dtype)).sum().backward()
+        results.append((bits.detach(), leaf.grad))
     for found, expected in zip(*results, strict=True):
         scale = expected.abs().clamp(min=1.0)
         assert float(((found - expected).abs() / scale).max()) < bound

@@ -92,13 +92,13 @@ def test_a_step_that_diverges_leaves_the_classes_as_they_are(dataset, monkeypatc
 def test_the_rate_is_that_of_each_class_alone(dataset):
     model = Trainer(TrainConfig(preset="tiny", iterations=30), dataset).model
     with torch.no_grad():
-        model.feature.normal_(generator=torch.Generator().manual_seed(1))
+        for values in (model.feature, model.scaling_log, model.offset):
+            values.normal_(generator=torch.Generator().manual_seed(1))
     rows = torch.arange(40)
-    plain = losses.attribute_bits(model, rows, rows)
+    plain = losses.anchor_bits(model, rows, rows)
     model.step_class[20:40] = 3
-    graded = losses.attribute_bits(model, rows.flip(0), rows).flip(0)
+    graded = losses.anchor_bits(model, rows.flip(0), rows).flip(0)
     first, second = rows[:20], rows[20:]
-    torch.testing.assert_close(graded[:20], losses.attribute_bits(model, first, first))
-    width = model.widths.feature
-    assert float((plain[20:, :width] - graded[20:, :width]).detach().mean()) == pytest.approx(3, abs=0.4)
-    torch.testing.assert_close(graded[20:], losses.attribute_bits(model, second, second))
+    torch.testing.assert_close(graded[:20], losses.anchor_bits(model, first, first))
+    assert float((plain[20:] - graded[20:]).detach().mean()) == pytest.approx(3, abs=0.4)
+    torch.testing.assert_close(graded[20:], losses.anchor_bits(model, second, second))
