@@ -28,7 +28,7 @@ from pd4dgs_codec.attributes.quantise import quantise
 from pd4dgs_codec.codec.plane_choice import choose_predictor
 from pd4dgs_codec.model.plane_layout import TIME_AXIS, PlaneLayout
 from pd4dgs_codec.model.rate import channel_moments, rate_bits
-from pd4dgs_codec.render.simd import kernel
+from pd4dgs_codec.render.simd import LANES, Vector, kernel, load, select_gt, splat, store, total
 from pd4dgs_codec.scene import PLANES, Planes
 
 #: Of the planes in the order of `PLANES`: whether one axis is time.
@@ -38,20 +38,27 @@ _LN2 = math.log(2.0)
 
 
 @kernel(inline=True)
-def _row_residuals(r: np.ndarray, flat: np.ndarray, k: int, i: int, up: int, left: int, temporal: int) -> None:
-    """r [up] = residuals of row i, whose first value lies at flat offset k; neighbours lie `up` and `left` before."""
+def _neighbour(i: int, j: int, up: int, left: int, temporal: int) -> int:
+    """How far before the value of row i, column j its only neighbour lies, not both in the first; 0: it has three."""
     if i == 0:
-        r[:left] = 0
-        for x in range(left, up):
-            r[x] = flat[k + x] - flat[k + x - left]
-        return
-    for x in range(up if temporal else left):
-        r[x] = flat[k + x] - flat[k + x - up]
-    if temporal:
-        return
-    for x in range(left, up):
-        w, n = flat[k + x - left], flat[k + x - up]
-        r[x] = flat[k + x] - max(min(w, n), min(max(w, n), w + n - flat[k + x - up - left]))
+        return left
+    return up if temporal or j == 0 else 0
+
+
+@kernel(inline=True)
+def _median(w: Vector, n: Vector, plane: Vector) -> Vector:
+    low, high = select_gt(w, n, n, w), select_gt(w, n, w, n)
+    value = select_gt(plane, high, high, plane)
+    return select_gt(value, low, value, low)
+
+
+@kernel(inline=True)
+def _residual(grid: np.ndarray, k: int, before: int, up: int, left: int) -> Vector:
+    """Of the values at flat offset k, whose only neighbours lie `before`, or, if that is 0, one `up` and one `left`."""
+    if before:
+        return load(grid, k) - load(grid, k - before)
+    w, n = load(grid, k - left), load(grid, k - up)
+    return load(grid, k) - _median(w, n, w + n - load(grid, k - up - left))
 
 
 @kernel(parallel=True)
@@ -59,24 +66,27 @@ def _magnitudes(
     channel_sums: np.ndarray, cell_sums: np.ndarray, grid: np.ndarray, starts: np.ndarray, sizes: np.ndarray
 ) -> None:
     """channel_sums [P, C], cell_sums [cells] += sums of |r|. starts [P], sizes [P, 3]: height, width, 1 if temporal."""
-    channels = grid.shape[1]
-    flat = grid.reshape(-1)
+    channels, zero = grid.shape[1], splat(grid.dtype.type(0))
     for p in nb.prange(len(starts)):
         height, width, temporal = sizes[p]
-        r = np.empty(width * channels, grid.dtype)
         sums = np.zeros(channels, grid.dtype)
         for i in range(height):
-            first = starts[p] + i * width
-            _row_residuals(r, flat, first * channels, i, width * channels, channels, temporal)
-            for j in range(width):
-                total = grid.dtype.type(0)
-                for c in range(channels):
-                    magnitude = abs(r[j * channels + c])
-                    sums[c] += magnitude
-                    total += magnitude
-                cell_sums[first + j] = total
-        for c in range(channels):
-            channel_sums[p, c] = sums[c]
+            for j in range(0 if i else 1, width):
+                cell = starts[p] + i * width + j
+                before = _neighbour(i, j, width * channels, channels, temporal)
+                whole = zero
+                for c in range(0, channels, LANES):
+                    r = _residual(grid, cell * channels + c, before, width * channels, channels)
+                    magnitude = select_gt(r, zero, r, zero - r)
+                    store(sums, c, load(sums, c) + magnitude)
+                    whole = whole + magnitude
+                cell_sums[cell] = total(whole)
+        channel_sums[p] = sums
+
+
+@kernel(inline=True)
+def _add(grad: np.ndarray, k: int, value: Vector) -> None:
+    store(grad, k, load(grad, k) + value)
 
 
 @kernel(parallel=True)
@@ -89,50 +99,34 @@ def _gradient(
     sizes: np.ndarray,
 ) -> None:
     """grad [cells, C] += that of the sum of |r| weighted by by_channel [P, C] + by_cell [cells]."""
-    channels = grid.shape[1]
-    flat, out = grid.reshape(-1), grad.reshape(-1)
-    zero, one, huge = grid.dtype.type(0), grid.dtype.type(1), grid.dtype.type(1e30)
+    channels, zero = grid.shape[1], splat(grid.dtype.type(0))
     for p in nb.prange(len(starts)):
         height, width, temporal = sizes[p]
         up, left = width * channels, channels
-        g, west = np.empty(up, grid.dtype), np.empty(up, grid.dtype)
-        north, corner = np.empty(up, grid.dtype), np.empty(up, grid.dtype)
         for i in range(height):
-            first = starts[p] + i * width
-            k = first * channels
-            _row_residuals(g, flat, k, i, up, left, temporal)
-            for j in range(width):
-                for c in range(channels):
-                    x = j * channels + c
-                    weight = by_channel[p, c] + by_cell[first + j]
-                    g[x] = weight * max(-one, min(one, g[x] * huge))
-            for x in range(up):
-                out[k + x] += g[x]
-            if i == 0:
-                for x in range(left, up):
-                    out[k + x - left] -= g[x]
-                continue
-            if temporal:
-                for x in range(up):
-                    out[k + x - up] -= g[x]
-                continue
-            for x in range(left):
-                north[x] = g[x]
-            for x in range(left, up):  # the gradient goes to those neighbours that the median is made of
-                w, n = flat[k + x - left], flat[k + x - up]
-                plane = w + n - flat[k + x - up - left]
-                low, high = min(w, n), max(w, n)
-                inside = low < plane and plane < high
-                median = max(low, min(high, plane))
-                west[x] = g[x] if median == w or inside else zero
-                north[x] = g[x] if median != w else zero
-                corner[x] = g[x] if inside else zero
-            for x in range(up):
-                out[k + x - up] -= north[x]
-            for x in range(left, up):
-                out[k + x - left] -= west[x]
-            for x in range(left, up):
-                out[k + x - up - left] += corner[x]
+            for j in range(0 if i else 1, width):
+                cell = starts[p] + i * width + j
+                before = _neighbour(i, j, up, left, temporal)
+                own = splat(by_cell[cell])
+                for c in range(0, channels, LANES):
+                    k = cell * channels + c
+                    r, weight = _residual(grid, k, before, up, left), load(by_channel, p * channels + c) + own
+                    g = select_gt(r, zero, weight, select_gt(zero, r, zero - weight, zero))
+                    _add(grad, k, g)
+                    if before:
+                        _add(grad, k - before, zero - g)
+                        continue
+                    # the gradient goes to those neighbours that the median is made of
+                    w, n = load(grid, k - left), load(grid, k - up)
+                    plane = w + n - load(grid, k - up - left)
+                    median = _median(w, n, plane)
+                    west = select_gt(median, w, zero, select_gt(w, median, zero, g))
+                    north = g - west
+                    low, high = select_gt(w, n, n, w), select_gt(w, n, w, n)
+                    corner = select_gt(plane, low, select_gt(high, plane, g, zero), zero)
+                    _add(grad, k - up, zero - north)
+                    _add(grad, k - left, zero - west - corner)
+                    _add(grad, k - up - left, corner)
 
 
 class _ProxyBits(torch.autograd.Function):
@@ -156,9 +150,9 @@ class _ProxyBits(torch.autograd.Function):
     def backward(ctx: Any, factor: Tensor) -> tuple[Tensor, None, None]:
         (grid,) = ctx.saved_tensors
         grad = torch.zeros_like(grid)
-        by_channel, by_cell = (w.astype(grad.numpy().dtype) for w in ctx.weights)
+        by_channel, by_cell = ((factor.item() * w).astype(grad.numpy().dtype) for w in ctx.weights)
         _gradient(grad.numpy(), grid.detach().numpy(), by_channel, by_cell, *_tables(ctx.layout))
-        return grad.mul_(factor), None, None
+        return grad, None, None
 
 
 def _tables(layout: PlaneLayout) -> tuple[np.ndarray, np.ndarray]:
@@ -169,7 +163,7 @@ def _tables(layout: PlaneLayout) -> tuple[np.ndarray, np.ndarray]:
 
 def proxy_bits(grid: Tensor, layout: PlaneLayout, step: float) -> Tensor:
     """The proxy, in bits, of planes grid [cells, C] at a quantisation step; its gradient reaches every value."""
-    if grid.device.type == "cpu":
+    if grid.device.type == "cpu" and grid.shape[1] % LANES == 0:
         bits: Tensor = _ProxyBits.apply(grid, layout, step)  # type: ignore[no-untyped-call]
         return bits
     return proxy_bits_reference(grid, layout, step)

@@ -132,7 +132,7 @@ class _RowBits(torch.autograd.Function):
         sigma = np.sqrt(_sums(x, of, mu, 2) / each + MIN_VARIANCE)
         bits, by_value = np.empty(len(picked)), np.empty((len(picked), x.shape[1]))
         by_sigma = np.empty_like(by_value)
-        limits = MIN_SIGMA_RATIO, MAX_BITS, NARROW[torch.float64]
+        limits = MIN_SIGMA_RATIO, MAX_BITS, NARROW[values.dtype]
         kernels.row_bits(bits, by_value, by_sigma, x, picked, of, mu, sigma, step, *limits)
         ctx.save_for_backward(values, classes, rows)
         ctx.moments = each, mu, sigma, by_value, by_sigma

@@ -34,19 +34,20 @@ def _erfcx(x: float) -> float:
     return _INVERSE_SQRT_PI / x * (1.0 - y * (1.0 - 3.0 * y * (1.0 - 5.0 * y * (1.0 - 7.0 * y))))
 
 
-@kernel()
-def _log_ratio(z: float, h: float, u: float, v: float, narrow_below: float) -> float:
-    """ln(phi(u) / P) in the forms of `rate.py`; narrow_below: h max(z, 1) below which P is taken as narrow."""
+@kernel(inline=True)
+def _probability(z: float, h: float, u: float, v: float, narrow_below: float) -> tuple[float, float]:
+    """(ln P, phi(u) / P) in the forms of `rate.py`; narrow_below: h max(z, 1) below which P is taken as narrow."""
     if h * max(z, 1.0) < narrow_below:
         z2, h2 = z * z, h * h
         series = (z2 - 1) * h2 / 6 + ((z2 - 6) * z2 + 3) * h2 * h2 / 120
         series += (((z2 - 15) * z2 + 45) * z2 - 15) * h2 * h2 * h2 / 5040
-        return z * h - 0.5 * h2 - math.log(2 * h) - math.log1p(series)
+        mass = 2 * h * (1 + series)
+        return math.log(mass) - 0.5 * z2 - _HALF_LN_2PI, math.exp(z * h - 0.5 * h2) / mass
     if u < 0:
         p = 0.5 * (math.erfc(u * _SQRT_HALF) - math.erfc(v * _SQRT_HALF))
-        return -0.5 * u * u - _HALF_LN_2PI - math.log(p)
-    far = math.exp(-2 * z * h) * _erfcx(v * _SQRT_HALF)
-    return -math.log(_SQRT_HALF_PI * (_erfcx(u * _SQRT_HALF) - far))
+        return math.log(p), math.exp(-0.5 * u * u - _HALF_LN_2PI) / p
+    mass = _SQRT_HALF_PI * (_erfcx(u * _SQRT_HALF) - math.exp(-2 * z * h) * _erfcx(v * _SQRT_HALF))
+    return math.log(mass) - 0.5 * u * u - _HALF_LN_2PI, 1.0 / mass
 
 
 @kernel(parallel=True)
@@ -94,9 +95,9 @@ def row_bits(
             signed = values[i, j] - mu[k, j]
             z, h = abs(signed) / s, 0.5 * q / s
             u, v = (abs(signed) - 0.5 * q) / s, (abs(signed) + 0.5 * q) / s
-            log_ratio = _log_ratio(z, h, u, v, narrow_below)
-            total += min((0.5 * u * u + _HALF_LN_2PI + log_ratio) / _LN2, most_bits)
-            m, slope = math.expm1(-2 * z * h), math.exp(log_ratio) / (s * _LN2)
+            log_p, ratio = _probability(z, h, u, v, narrow_below)
+            total += min(-log_p / _LN2, most_bits)
+            m, slope = math.expm1(-2 * z * h), ratio / (s * _LN2)
             by_value[r, j] = -slope * m if signed > 0 else slope * m if signed < 0 else 0.0
             by_sigma[r, j] = slope * (2 * h + v * m) if s == sigma[k, j] else 0.0
         bits[r] = total

@@ -54,17 +54,16 @@ class Neighbours:
     """Draws pairs of near anchors: those that stand close along a space-filling (Morton) curve."""
 
     def __init__(self, anchor_q: Tensor):
-        self.anchor_q = anchor_q.cpu().to(torch.int64)
-        self.order = torch.from_numpy(morton_order(self.anchor_q.numpy()))
+        self.order = torch.from_numpy(morton_order(anchor_q.cpu().numpy()))
+        self.places = anchor_q.cpu()[self.order].float().T.contiguous()  # [3, N], along the curve
 
     def draw(self, tau: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
         """Pairs int64 [2, S] and their weights exp(-|x_i - x_j| / tau) [S], distances in voxels."""
         n = len(self.order)
         if n < 2:
             return torch.zeros(2, 0, dtype=torch.int64), torch.zeros(0)
-        gap = torch.randint(1, min(9, n), (n,), generator=generator)
-        first = torch.arange(n)
-        inside = first + gap < n
-        pairs = torch.stack([self.order[first[inside]], self.order[(first + gap)[inside]]])
-        distance = (self.anchor_q[pairs[0]] - self.anchor_q[pairs[1]]).float().norm(dim=1)
-        return pairs, torch.exp(-distance / tau)
+        second = torch.arange(n) + torch.randint(1, min(9, n), (n,), generator=generator)
+        first = (second < n).nonzero()[:, 0]
+        second = second[first]
+        distance = (self.places[:, first] - self.places[:, second]).square().sum(0).sqrt()
+        return torch.stack([self.order[first], self.order[second]]), torch.exp(distance / -tau)
