@@ -209,7 +209,7 @@ def gaussian_bits(channels: Iterable[np.ndarray]) -> float:
     total = 0.0
     for channel in channels:
         if channel.size:
-            values = torch.from_numpy(channel.astype(np.float64))[:, None]
-            mu, sigma = channel_moments(values)
-            total += float(rate_bits(values, mu, sigma, 1.0).sum())
+            mu, sigma = channel_moments(torch.from_numpy(channel.astype(np.float64)))
+            symbols, counts = (torch.from_numpy(x) for x in np.unique(channel, return_counts=True))
+            total += float((rate_bits(symbols.double(), mu, sigma, 1.0) * counts).sum())
     return total

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import numba as nb
 import numpy as np
 import torch
 from torch import Tensor
@@ -12,6 +13,7 @@ from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.model.config import ModelConfig
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model, fresh_networks
+from pd4dgs_codec.render.simd import kernel
 from pd4dgs_codec.scene import LOCAL_HEADS, SceneInfo, Steps, Widths
 
 #: Voxels along the longest side of the scene's box.
@@ -166,16 +168,36 @@ def carved_points(dataset: Dataset, count: int, generator: torch.Generator) -> T
 
 
 def nearest_distances(points: Tensor, k: int = 3) -> Tensor:
-    """Root mean squared distance to the k nearest other points, [n]; exact, in blocks."""
+    """Root mean squared distance of points [n, 3] to their k nearest others, [n]; exact."""
     n = len(points)
     if n < 2:
         return torch.full((n,), 1.0)
-    k = min(k, n - 1)
-    out = []
-    for block in torch.split(points, max(1, 8_000_000 // n)):
-        nearest = torch.cdist(block, points).topk(k + 1, largest=False).values[:, 1:]
-        out.append(nearest.square().mean(1).sqrt())
-    return torch.cat(out)
+    squares, order = np.empty(n, np.float32), points[:, 0].argsort()
+    _nearest_squares(squares, points[order].numpy(), min(k, n - 1))
+    out = torch.empty(n)
+    out[order] = torch.from_numpy(squares).sqrt()
+    return out
+
+
+@kernel(parallel=True)
+def _nearest_squares(out: np.ndarray, points: np.ndarray, k: int) -> None:
+    """out [n] = mean squared distance to the k < n nearest others of points [n, 3], which ascend along the first axis:
+    the search stops where that axis alone is too far."""
+    for i in nb.prange(len(points)):
+        nearest = np.full(k, np.inf)
+        for way in (-1, 1):
+            j = i + way
+            while 0 <= j < len(points) and (points[j, 0] - points[i, 0]) ** 2 < nearest[k - 1]:
+                square, at = 0.0, k - 1
+                for axis in range(3):
+                    square += (points[j, axis] - points[i, axis]) ** 2
+                if square < nearest[at]:
+                    while at > 0 and nearest[at - 1] > square:
+                        nearest[at] = nearest[at - 1]
+                        at -= 1
+                    nearest[at] = square
+                j += way
+        out[i] = nearest.mean()
 
 
 def _binary32(value: float) -> float:

@@ -245,7 +245,7 @@ class Learner:
 
     def _shared_gradients(self, pictures: list[Picture] | None) -> list[Picture] | None:
         """Sums the gradients of all workers; None where any of them has met what is not finite."""
-        parameters = [p for group in self.optimiser.adam.param_groups for p in group["params"]]
+        parameters = self.optimiser.parameters
         met = torch.tensor([p.grad is not None for p in parameters], dtype=torch.float32, device=self.device)
         failed = torch.full((1,), float(pictures is None), device=self.device)
         for p in parameters:

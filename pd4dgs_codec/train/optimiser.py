@@ -1,4 +1,8 @@
-"""Adam over the model's named parameter groups, and its surgery when anchors come and go."""
+"""Adam over the model's named parameter groups, and its surgery when anchors come and go.
+
+The update is torch's own function. Its class `torch.optim.Adam` imports torch's compiler at its first use, a second of
+every start, and hides the moments that the surgery is about.
+"""
 
 from __future__ import annotations
 
@@ -6,16 +10,23 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.optim.adam import adam
 
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.train.config import LearningRates, learning_rate
 
 #: Parameters with one row per anchor.
 PER_ANCHOR = ("feature", "scaling_log", "offset", "mask_logits")
+#: Of a parameter that has had a gradient: its steps so far, and the running means of gradients and their squares.
+STEP, MEAN, SQUARE = "step", "exp_avg", "exp_avg_sq"
 
 
 class Optimiser:
-    """One Adam with a group per learning-rate schedule; groups are named after the fields of LearningRates."""
+    """One Adam with a group per learning-rate schedule.
+
+    groups: parameters by the field of LearningRates they follow. rate: that of each group's latest step. moments: of
+    each parameter that has had a gradient, by STEP, MEAN and SQUARE.
+    """
 
     def __init__(self, model: Model, rates: LearningRates, cooldown: float = 0.0):
         self.model, self.rates, self.cooldown = model, rates, cooldown
@@ -24,50 +35,60 @@ class Optimiser:
         fields = [f for f in (model.global_deformation, model.local_deformation) if f is not None]
         groups["planes"] = [p for f in fields for p in f.planes.parameters()]
         groups["deformation"] = [p for f in fields for part in (f.trunk, f.heads) for p in part.parameters()]
-        self.adam = torch.optim.Adam(
-            [{"params": params, "name": name} for name, params in groups.items() if params],
-            lr=0.0,
-            betas=(0.9, 0.99),
-            eps=1e-15,
-            fused=True,
-        )
+        self.groups = {name: params for name, params in groups.items() if params}
+        self.rate = dict.fromkeys(self.groups, 0.0)
+        self.moments: dict[Tensor, dict[str, Tensor]] = {}
 
+    @property
+    def parameters(self) -> list[nn.Parameter]:
+        """Of all groups, one behind the other."""
+        return [p for params in self.groups.values() for p in params]
+
+    @torch.no_grad()
     def step(self, progress: float) -> None:
         """One update at progress 0..1 of the schedule."""
-        for group in self.adam.param_groups:
-            group["lr"] = learning_rate(getattr(self.rates, group["name"]), progress, self.cooldown)
-        self.adam.step()
+        for name, params in self.groups.items():
+            self.rate[name] = learning_rate(getattr(self.rates, name), progress, self.cooldown)
+            self._update([p for p in params if p.grad is not None], self.rate[name])
+
+    def _update(self, params: list[Tensor], rate: float) -> None:
+        for p in params:
+            if p not in self.moments:
+                zero = torch.zeros((), device=p.device)
+                self.moments[p] = {STEP: zero, MEAN: torch.zeros_like(p), SQUARE: torch.zeros_like(p)}
+        means, squares, steps = ([self.moments[p][name] for p in params] for name in (MEAN, SQUARE, STEP))
+        gradients = [p.grad for p in params if p.grad is not None]
+        betas, switches = {"beta1": 0.9, "beta2": 0.99}, {"fused": True, "amsgrad": False, "maximize": False}
+        given: Any = betas | switches | {"lr": rate, "weight_decay": 0.0, "eps": 1e-15}
+        adam(params, gradients, means, squares, [], steps, **given)
 
     def gradient_norm(self) -> float:
         """Norm over all gradients; NaN or infinite if any is."""
-        gradients = [p.grad for group in self.adam.param_groups for p in group["params"] if p.grad is not None]
+        gradients = [p.grad for p in self.parameters if p.grad is not None]
         return float(torch.stack(torch._foreach_norm(gradients)).norm()) if gradients else 0.0
 
     def scale_gradients(self, factor: float) -> None:
         """All gradients times `factor`."""
-        for group in self.adam.param_groups:
-            for p in group["params"]:
-                if p.grad is not None:
-                    p.grad.mul_(factor)
+        for p in self.parameters:
+            if p.grad is not None:
+                p.grad.mul_(factor)
 
     def zero_grad(self) -> None:
         """Forgets all gradients."""
-        self.adam.zero_grad(set_to_none=True)
+        for p in self.parameters:
+            p.grad = None
 
     def replace_anchors(self, keep: Tensor, added: dict[str, Tensor]) -> None:
         """Keeps the anchors `keep` (int64) and appends the rows of `added`; the moments of new rows start at zero."""
-        for group in self.adam.param_groups:
-            name = group["name"]
-            if name not in PER_ANCHOR:
-                continue
-            old = group["params"][0]
+        for name in PER_ANCHOR:
+            (old,) = self.groups[name]
             new = nn.Parameter(torch.cat([old.detach()[keep], added[name]]))
-            state = self.adam.state.pop(old, None)
-            if state:
-                for moment in ("exp_avg", "exp_avg_sq"):
-                    state[moment] = torch.cat([state[moment][keep], torch.zeros_like(added[name])])
-                self.adam.state[new] = state
-            group["params"][0] = new
+            moments = self.moments.pop(old, None)
+            if moments:
+                for moment in (MEAN, SQUARE):
+                    moments[moment] = torch.cat([moments[moment][keep], torch.zeros_like(added[name])])
+                self.moments[new] = moments
+            self.groups[name] = [new]
             setattr(self.model, name, new)
         self.model.anchor_q = torch.cat([self.model.anchor_q[keep], added["anchor_q"]])
         graded = self.model.step_class
@@ -86,27 +107,35 @@ class Optimiser:
         columns were independent.
         """
         moment = torch.linalg.inv(right).T
-        state = self.adam.state.get(parameter, {})
-        changes = [(parameter, right)]
-        changes += [(state[name], by) for name, by in (("exp_avg", moment), ("exp_avg_sq", moment**2)) if name in state]
+        moments = self.moments.get(parameter, {})
+        changes: list[tuple[Tensor, Tensor]] = [(parameter, right)]
+        changes += [(moments[name], by) for name, by in ((MEAN, moment), (SQUARE, moment**2)) if name in moments]
         for tensor, by in changes:
             part = (tensor.T if transposed else tensor)[..., columns]
             part.copy_((part.double() @ by).to(part))
 
     def forget(self, module: nn.Module) -> None:
         """Takes the parameters of `module` out, and groups that hold no others."""
-        gone = {id(p) for p in module.parameters()}
-        for group in self.adam.param_groups:
-            for p in group["params"]:
-                if id(p) in gone:
-                    self.adam.state.pop(p, None)
-            group["params"] = [p for p in group["params"] if id(p) not in gone]
-        self.adam.param_groups = [group for group in self.adam.param_groups if group["params"]]
+        gone: set[Tensor] = set(module.parameters())
+        for name, params in list(self.groups.items()):
+            self.groups[name] = [p for p in params if p not in gone]
+            if not self.groups[name]:
+                del self.groups[name]
+        for p in gone:
+            self.moments.pop(p, None)
 
     def state(self) -> dict[str, Any]:
-        """What resuming needs."""
-        return self.adam.state_dict()
+        """What resuming needs: under "state" the moments of a parameter by its place among all."""
+        return {"state": {i: dict(self.moments[p]) for i, p in enumerate(self.parameters) if p in self.moments}}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Back to what `state` returned."""
-        self.adam.load_state_dict(state)
+        """Back to what `state` returned; a broken one raises whatever its first fault does."""
+        by_place = dict(enumerate(self.parameters))
+        self.moments = {}
+        for place, stored in state["state"].items():
+            p = by_place[int(place)]
+            moments = {name: stored[name].detach().clone() for name in (STEP, MEAN, SQUARE)}
+            shapes = [tuple(value.shape) for value in moments.values()]
+            if shapes != [(), tuple(p.shape), tuple(p.shape)]:
+                raise ValueError(f"steps and moments of shapes {shapes} of a parameter of shape {tuple(p.shape)}")
+            self.moments[p] = {name: value.to(p.device, torch.float32) for name, value in moments.items()}

@@ -53,7 +53,7 @@ def test_until_n_is_known_steps_stay_in_the_coarse_phase(dataset):
     assert all(r["level"] == 0 and "rate" not in r and "grown" not in r for r in records)
     assert [r["iteration"] for r in records if "active" in r] == [0]
     assert steps.densifier.anchor_visits.sum() == 0 and steps.state()["total"] == 0
-    assert {group["lr"] for group in steps.optimiser.adam.param_groups if group["name"] == "feature"} == {7.5e-3}
+    assert steps.optimiser.rate["feature"] == 7.5e-3
     steps.schedule = Schedule(60)
     assert "rate" in steps.step()
 

@@ -143,7 +143,7 @@ def test_a_time_limit_is_kept_and_the_schedule_completes(dataset, tmp_path, monk
     coarse = [r["seconds"] for r in records if r["level"] == 0 and "rate" not in r]
     assert {r["level"] for r in records} == {0, 1, 2} and any("grown" in r for r in records)
     assert max(coarse) < (0.5 if machine == "stopped" else 0.4) * LIMIT  # the rate term begins at a third
-    feature = trainer.learner.optimiser.adam.param_groups[0]["lr"]
+    feature = trainer.learner.optimiser.rate["feature"]
     assert feature < 0.5 * trainer.config.rates.feature[1]  # the cooldown, ten steps long, went on to its end
     assert len(trainer.curve) >= 0.75 * loop.CURVE_POINTS  # a pause passes some over
 
@@ -272,7 +272,7 @@ def test_the_log_is_json_even_of_a_step_that_is_not_finite(tmp_path):
 BROKEN_STATES = {
     "order": [0, 6],
     "generator": torch.zeros(3),
-    "optimiser": {"state": {}},
+    "optimiser": {"state": {0: {"step": torch.zeros(()), "exp_avg": torch.zeros(3), "exp_avg_sq": torch.zeros(3)}}},
     "densifier": None,
     "iteration": "many",
     "curve": "{",

@@ -68,16 +68,16 @@ def test_gradients_and_their_moments_change_alike(dataset):
     model, optimiser = trainer.model, trainer.learner.optimiser
     width = model.widths.feature
     layer = model.network("color").layers[0].weight
-    moments = {name: optimiser.adam.state[p]["exp_avg"].clone() for name, p in (("f", model.feature), ("w", layer))}
+    moments = {name: optimiser.moments[p]["exp_avg"].clone() for name, p in (("f", model.feature), ("w", layer))}
     product = (moments["f"] * model.feature.detach()).sum(), (moments["w"] * layer.detach()).sum()
     whitened(trainer)
-    after = {name: optimiser.adam.state[p]["exp_avg"] for name, p in (("f", model.feature), ("w", layer))}
+    after = {name: optimiser.moments[p]["exp_avg"] for name, p in (("f", model.feature), ("w", layer))}
     assert not torch.equal(after["f"], moments["f"])
     torch.testing.assert_close(after["w"][:, width:], moments["w"][:, width:])  # view directions are not mixed
     # <G, X> does not depend on the basis
     torch.testing.assert_close((after["f"] * model.feature.detach()).sum(), product[0], rtol=1e-3, atol=1e-9)
     torch.testing.assert_close((after["w"] * layer.detach()).sum(), product[1], rtol=1e-3, atol=1e-9)
-    assert all((optimiser.adam.state[p]["exp_avg_sq"] >= 0).all() for p in (model.feature, layer))
+    assert all((optimiser.moments[p]["exp_avg_sq"] >= 0).all() for p in (model.feature, layer))
 
 
 def test_files_are_smaller_at_the_same_error_of_rounding(dataset):
