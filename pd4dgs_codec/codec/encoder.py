@@ -62,8 +62,8 @@ class SliceReport:
 @dataclass(frozen=True)
 class LayerReport:
     """One layer. bytes: its chunks. slices: each of them. payload_bits and rate_bits: sums over attributes, planes and
-    weights (in mode lzma one stream codes these and the masks together, and payload_bits is all of it). streams: every
-    coded section.
+    weights (in mode lzma one stream codes these and the masks together, and payload_bits is all of it). symbols: those
+    of attributes count once, with their anchors, however many streams bring their bits. streams: every coded section.
     """
 
     layer: int
@@ -275,7 +275,7 @@ def _layer_report(layer: LayerSymbols, slices: list[Slice]) -> LayerReport:
         payload_bits=sum(s.payload_bits for s in counted),
         rate_bits=sum(s.rate_bits for s in counted),
         position_bits=positions.payload_bits,
-        symbols=sum(s.symbols for s in counted),
+        symbols=sum(s.symbols for s in counted if s.name != "low_bits"),  # of attributes that are counted already
         anchors=len(layer.anchor_q),
         slices=rows,
         streams=streams,

@@ -104,6 +104,7 @@ def test_slices_keep_to_their_size_and_the_report_has_the_low_bits():
     assert all(row.bytes <= 1200 and row.anchors == 0 for row in rows[-refining:])
     (streams,) = ([s for s in layer.streams if s.name == "low_bits"] for layer in report.layers[-1:])
     assert streams[0].symbols == scene().widths.channels * sum(layer.anchors for layer in report.layers)
+    assert [layer.symbols for layer in report.layers] == [layer.symbols for layer in low(0)[1].layers]
     assert 0 < streams[0].payload_bits < 8 * len(data) / 2
     assert [row["anchors"] for row in info(data)["layers"]] == [layer.anchors for layer in report.layers]
     assert len(data) < 1.15 * len(low(0)[0])
