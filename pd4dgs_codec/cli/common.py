@@ -205,6 +205,15 @@ def run(parser: Parser, action: Action, argv: Sequence[str] | None) -> int:
         return _fail(parser, error, message, as_json)
 
 
+def command(parser: Callable[[], Parser], action: Action) -> Callable[..., int]:
+    """The entry point of a program: takes its arguments, or those of the process, and returns the exit code."""
+
+    def main(argv: Sequence[str] | None = None) -> int:
+        return run(parser(), action, argv)
+
+    return main
+
+
 def _explain(error: BaseException, name: str) -> str | None:
     """One line for an error that the caller can do something about; None for a fault of this program."""
     if isinstance(error, (DecodeError, EncodeError)):  # the codec sees bytes and arrays, not the name of their file

@@ -5,13 +5,13 @@ from __future__ import annotations
 import argparse
 import io
 import time
-from collections.abc import Sequence
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.cli import values
-from pd4dgs_codec.cli.common import OK, PARTIAL, Console, Parser, UsageError, number, run, table
-from pd4dgs_codec.cli.files import STDIO, check_output, read_bytes, write_bytes
+from pd4dgs_codec.cli.common import OK, PARTIAL, Console, Parser, UsageError, command, number, table
+from pd4dgs_codec.cli.files import STDIO, check_output, read_bytes, write_bytes, write_checkpoint
 from pd4dgs_codec.errors import DeliveryError
 
 if TYPE_CHECKING:
@@ -49,11 +49,6 @@ def parser() -> Parser:
     return p
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    return run(parser(), _decode, argv)
-
-
 def _decode(args: argparse.Namespace, console: Console) -> int:
     kind = _output_kind(args)
     if args.output:
@@ -68,7 +63,7 @@ def _decode(args: argparse.Namespace, console: Console) -> int:
     seconds = time.perf_counter() - start
     console.detail(f"steps {scene.steps}")
     if kind == ".pt":
-        _write_checkpoint(scene, args)
+        write_checkpoint(args.output, scene, args.overwrite)
     elif kind == ".npz":
         write_bytes(args.output, _npz(scene, args.symbols), args.overwrite)
     if not complete:
@@ -76,6 +71,9 @@ def _decode(args: argparse.Namespace, console: Console) -> int:
     result = _summary(scene, data, complete, seconds, args)
     console.result(result, _text(result), on_stdout=not args.output)
     return OK if complete else PARTIAL
+
+
+main = command(parser, _decode)
 
 
 def _input(args: argparse.Namespace, console: Console) -> bytes:
@@ -87,16 +85,14 @@ def _input(args: argparse.Namespace, console: Console) -> bytes:
     from pd4dgs_codec.delivery.prefix import fetch
     from pd4dgs_codec.delivery.transfer import Transfer
 
-    transfer = Transfer(args.input)
-    try:
-        data = fetch(transfer, args.max_layer, args.max_bytes)
-    except DeliveryError as error:
-        if not (args.allow_partial and transfer.data):
-            raise
-        console.message(f"pd4dgs-decode: {error}")
-        data = bytes(transfer.data)
-    finally:
-        transfer.close()
+    with closing(Transfer(args.input)) as transfer:
+        try:
+            data = fetch(transfer, args.max_layer, args.max_bytes)
+        except DeliveryError as error:
+            if not (args.allow_partial and transfer.data):
+                raise
+            console.message(f"pd4dgs-decode: {error}")
+            data = bytes(transfer.data)
     console.detail(f"{len(transfer.data):,} bytes in {transfer.requests} requests, {transfer.cuts} cuts")
     return data
 
@@ -127,14 +123,6 @@ def _npz(scene: Scene, symbols: bool) -> bytes:
     stream = io.BytesIO()
     np.savez(stream, **to_npz_dict(scene, symbols))  # type: ignore[arg-type]
     return stream.getvalue()
-
-
-def _write_checkpoint(scene: Scene, args: argparse.Namespace) -> None:
-    from pd4dgs_codec.model import checkpoint
-    from pd4dgs_codec.model.convert import from_scene
-
-    check_output(args.output, args.overwrite)  # it may have appeared meanwhile
-    checkpoint.save(args.output, from_scene(scene))
 
 
 def _summary(scene: Scene, data: bytes, complete: bool, seconds: float, args: argparse.Namespace) -> dict[str, Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import math
-from collections.abc import Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
@@ -16,11 +15,11 @@ from pd4dgs_codec.cli.common import (
     Parser,
     UsageError,
     add_reading,
+    command,
     number,
-    run,
     table,
 )
-from pd4dgs_codec.cli.files import STDIO, Stdin, check_output, is_pd4, read_bytes, write_bytes
+from pd4dgs_codec.cli.files import STDIO, check_output, checkpoint_scene, is_pd4, read_bytes, read_dataset, write_bytes
 from pd4dgs_codec.cli.progress import progress_bar
 from pd4dgs_codec.codec.options import CHOICES, DEFAULTS, EncodeOptions
 from pd4dgs_codec.pack import MIN_GAIN_PER_MEGABYTE
@@ -109,11 +108,6 @@ def _add_choice(p: Parser, name: str, what: str, **settings: Any) -> None:
     p.add_argument(flag, choices=choices, default=default, help=f"{what} (default: {default})", **settings)
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    return run(parser(), _encode, argv)
-
-
 def _encode(args: argparse.Namespace, console: Console) -> int:
     if args.output == STDIO and args.json:
         raise UsageError("-o - and --json both want stdout; name an output file")
@@ -143,6 +137,9 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
     return OK
 
 
+main = command(parser, _encode)
+
+
 def _options(args: argparse.Namespace) -> EncodeOptions:
     return EncodeOptions(
         mode=args.mode,
@@ -159,19 +156,14 @@ def _options(args: argparse.Namespace) -> EncodeOptions:
 
 
 def _load(args: argparse.Namespace) -> tuple[Scene, bool, Metadata | None]:
-    """(scene, whether it holds a checkpoint's own floats: those of a .pd4 are gone, metadata). Only a checkpoint needs
-    torch."""
+    """(scene, whether it holds a checkpoint's own floats: those of a .pd4 are gone, metadata)."""
     data = read_bytes(args.input)
     if is_pd4(data):
         from pd4dgs_codec.codec.decoder import decode
         from pd4dgs_codec.codec.info import metadata_of
 
         return decode(data), False, _metadata(args, metadata_of(data))
-    from pd4dgs_codec.model import checkpoint
-    from pd4dgs_codec.model.convert import to_scene
-
-    model, _ = checkpoint.load(args.input if args.input != STDIO else Stdin(data))
-    return to_scene(model), True, _metadata(args, None)
+    return checkpoint_scene(args.input, data), True, _metadata(args, None)
 
 
 def _metadata(args: argparse.Namespace, had: Metadata | None) -> Metadata | None:
@@ -187,10 +179,9 @@ def _metadata(args: argparse.Namespace, had: Metadata | None) -> Metadata | None
 def _views(args: argparse.Namespace, console: Console) -> Views | None:
     if args.data is None:
         return None
-    from pd4dgs_codec.interchange.teacher import load_source
     from pd4dgs_codec.pack.packing import Views
 
-    dataset = load_source(args.data, downscale=args.downscale, holdout=args.holdout)
+    dataset = read_dataset(args.data, args)
     views = Views.of(dataset, args.data, args.views)
     console.detail(f"{args.data}: {len(views.fitting)} training views, {len(views.held_out)} to judge by")
     if not dataset.test:

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from typing import Any
 
-from pd4dgs_codec.cli.common import OK, SOURCES, Console, Parser, add_reading, number, run, table
-from pd4dgs_codec.cli.files import named_input
+from pd4dgs_codec.cli.common import OK, SOURCES, Console, Parser, add_reading, command, number, table
+from pd4dgs_codec.cli.files import named_input, read_dataset
 from pd4dgs_codec.cli.progress import progress_bar
 
 DETAILS = f"""\
@@ -36,18 +35,12 @@ def parser() -> Parser:
     return p
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    return run(parser(), _evaluate, argv)
-
-
 def _evaluate(args: argparse.Namespace, console: Console) -> int:
-    from pd4dgs_codec.interchange.teacher import load_source
     from pd4dgs_codec.metrics.perceptual import load_perceptual
     from pd4dgs_codec.view.evaluate import evaluate_file
 
     file = named_input(args.input)
-    dataset = load_source(args.source, downscale=args.downscale, holdout=args.holdout)
+    dataset = read_dataset(args.source, args)
     console.detail(f"{args.source}: {len(dataset.train)} training views, {len(dataset.test)} held out")
     if not dataset.test:
         console.message("no views are held out: measuring on the training views")
@@ -59,6 +52,9 @@ def _evaluate(args: argparse.Namespace, console: Console) -> int:
     result = {"input": args.input, "downscale": args.downscale, "holdout": args.holdout, **result}
     console.result(result, _text(result), on_stdout=True)
     return OK
+
+
+main = command(parser, _evaluate)
 
 
 def _text(result: dict[str, Any]) -> str:

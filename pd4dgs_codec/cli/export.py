@@ -5,14 +5,14 @@ from __future__ import annotations
 import argparse
 import math
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.atomic import whole_files
 from pd4dgs_codec.cli import values
-from pd4dgs_codec.cli.common import OK, SOURCES, Console, Parser, UsageError, add_reading, run
-from pd4dgs_codec.cli.files import STDIO, check_output, is_pd4, read_bytes, write_bytes
+from pd4dgs_codec.cli.common import OK, SOURCES, Console, Parser, UsageError, add_reading, command
+from pd4dgs_codec.cli.files import STDIO, check_output, is_pd4, read_bytes, read_dataset, write_bytes
 from pd4dgs_codec.cli.progress import progress_bar
 
 if TYPE_CHECKING:
@@ -74,11 +74,6 @@ def parser() -> Parser:
     return p
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    return run(parser(), _export, argv)
-
-
 def _export(args: argparse.Namespace, console: Console) -> int:
     _check_usage(args)
     if args.to == "ply-seq":
@@ -102,6 +97,9 @@ def _export(args: argparse.Namespace, console: Console) -> int:
         result["cost"] = _cost(args, export)
     console.result(result, _text(result), on_stdout=False)
     return OK
+
+
+main = command(parser, _export)
 
 
 def _check_usage(args: argparse.Namespace) -> None:
@@ -137,12 +135,10 @@ def _player(args: argparse.Namespace) -> Player:
 
 def _eyes(args: argparse.Namespace, player: Player) -> Eyes:
     from pd4dgs_codec.interchange.bake import eyes_of_cameras, eyes_of_scene
-    from pd4dgs_codec.interchange.teacher import load_source
 
     if args.data is None:
         return eyes_of_scene(player)
-    dataset = load_source(args.data, downscale=args.downscale, holdout=args.holdout)
-    return eyes_of_cameras([view.camera for view in dataset.train])
+    return eyes_of_cameras([view.camera for view in read_dataset(args.data, args).train])
 
 
 def _write_still(args: argparse.Namespace, export: Export, console: Console) -> dict[str, Any]:
@@ -237,9 +233,8 @@ def _write_folder(args: argparse.Namespace, count: int, frames: Iterator[bytes])
 def _cost(args: argparse.Namespace, export: Export) -> dict[str, Any]:
     from pd4dgs_codec.errors import DataError
     from pd4dgs_codec.interchange.export import cost
-    from pd4dgs_codec.interchange.teacher import load_source
 
-    views = load_source(args.compare, downscale=args.downscale, holdout=args.holdout).test
+    views = read_dataset(args.compare, args).test
     if not views:
         raise DataError(f"{args.compare}: has no held-out views; expected another --holdout")
     with progress_bar(len(views), "views", "comparing") as step:

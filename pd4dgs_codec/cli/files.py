@@ -5,8 +5,15 @@ from __future__ import annotations
 import io
 import sys
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 from pd4dgs_codec.cli.common import UsageError
+
+if TYPE_CHECKING:
+    import argparse
+
+    from pd4dgs_codec.data.view import Dataset
+    from pd4dgs_codec.scene import Scene
 
 STDIO = "-"
 
@@ -20,13 +27,6 @@ def read_bytes(path: str) -> bytes:
     return sys.stdin.buffer.read()
 
 
-class Stdin(io.BytesIO):
-    """What was read from stdin, for a reader of files that names its input in messages."""
-
-    def __str__(self) -> str:
-        return "stdin"
-
-
 def named_input(path: str) -> str | bytes:
     """What to hand to a reader that takes a path or bytes: the path itself, or all of stdin for `-`."""
     return read_bytes(path) if path == STDIO else path
@@ -37,6 +37,39 @@ def is_pd4(data: bytes) -> bool:
     from pd4dgs_codec.bitstream.container import SIGNATURE
 
     return data.startswith(SIGNATURE[:4])
+
+
+def checkpoint_scene(path: str, data: bytes) -> Scene:
+    """The scene of a checkpoint whose bytes `read_bytes` gave; it is this that needs torch."""
+    from pd4dgs_codec.model import checkpoint
+    from pd4dgs_codec.model.convert import to_scene
+
+    model, _ = checkpoint.load(path if path != STDIO else _Stdin(data))
+    return to_scene(model)
+
+
+class _Stdin(io.BytesIO):
+    """What was read from stdin, for a reader of files that names its input in messages."""
+
+    def __str__(self) -> str:
+        return "stdin"
+
+
+def write_checkpoint(path: str, scene: Scene, overwrite: bool) -> None:
+    """Writes a scene as a checkpoint, whole or not at all."""
+    from pd4dgs_codec.model import checkpoint
+    from pd4dgs_codec.model.convert import from_scene
+
+    model = from_scene(scene)
+    check_output(path, overwrite)  # it may have appeared meanwhile
+    checkpoint.save(path, model)
+
+
+def read_dataset(source: str, args: argparse.Namespace) -> Dataset:
+    """The dataset, read as the options of `add_reading` say."""
+    from pd4dgs_codec.interchange.teacher import load_source
+
+    return load_source(source, downscale=args.downscale, holdout=args.holdout)
 
 
 def check_output(path: str, overwrite: bool) -> None:

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 
 from pd4dgs_codec.cli import values
-from pd4dgs_codec.cli.common import OK, Console, Parser, UsageError, run
-from pd4dgs_codec.cli.files import STDIO, check_output
+from pd4dgs_codec.cli.common import OK, Console, Parser, UsageError, command
+from pd4dgs_codec.cli.files import STDIO, check_output, write_checkpoint
 
 DETAILS = """\
 FOLDER is a checkpoint of Scaffold-GS: the run's folder, or its point_cloud/iteration_N with point_cloud.ply and either
@@ -36,11 +35,6 @@ def parser() -> Parser:
     return p
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    return run(parser(), _import, argv)
-
-
 def _import(args: argparse.Namespace, console: Console) -> int:
     if args.output == STDIO:
         raise UsageError("found -o -, expected the name of a checkpoint to write")
@@ -48,12 +42,7 @@ def _import(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.interchange.scaffold_gs import Choices, read_scaffold_gs
 
     scene = read_scaffold_gs(Path(args.input), Choices(args.appearance, args.voxel_size, args.iteration))
-    from pd4dgs_codec.model import checkpoint
-    from pd4dgs_codec.model.convert import from_scene
-
-    model = from_scene(scene)
-    check_output(args.output, args.overwrite)  # it may have appeared meanwhile
-    checkpoint.save(args.output, model)
+    write_checkpoint(args.output, scene, args.overwrite)
     result = {
         "input": args.input,
         "output": args.output,
@@ -65,3 +54,6 @@ def _import(args: argparse.Namespace, console: Console) -> int:
     text = f"{args.output}: {result['anchors']:,} anchors of Scaffold-GS on a grid of {scene.info.voxel_size:g}"
     console.result(result, text, on_stdout=False)
     return OK
+
+
+main = command(parser, _import)

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from contextlib import closing
 from typing import Any
 
 from pd4dgs_codec.cli import values
-from pd4dgs_codec.cli.common import OK, Console, Parser, number, run, table
+from pd4dgs_codec.cli.common import OK, Console, Parser, command, number, table
 from pd4dgs_codec.cli.files import STDIO, read_bytes
 from pd4dgs_codec.errors import DataError
 
@@ -40,11 +40,6 @@ def parser() -> Parser:
     return p
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    return run(parser(), _info, argv)
-
-
 def _info(args: argparse.Namespace, console: Console) -> int:
     data, total = _input(args, console)
     from pd4dgs_codec.codec.info import hashes, info, nearest_bounds
@@ -66,6 +61,9 @@ def _info(args: argparse.Namespace, console: Console) -> int:
     return OK
 
 
+main = command(parser, _info)
+
+
 def _input(args: argparse.Namespace, console: Console) -> tuple[bytes, int]:
     """(bytes, length of the file): all of it, or of a URL the header alone where that suffices."""
     from pd4dgs_codec.delivery.urls import is_url
@@ -76,11 +74,8 @@ def _input(args: argparse.Namespace, console: Console) -> tuple[bytes, int]:
     from pd4dgs_codec.delivery.prefix import fetch, fetch_header
     from pd4dgs_codec.delivery.transfer import Transfer
 
-    transfer = Transfer(args.input)
-    try:
+    with closing(Transfer(args.input)) as transfer:
         data = fetch(transfer) if args.check or args.bytes or args.hashes else fetch_header(transfer)
-    finally:
-        transfer.close()
     console.detail(f"fetched {len(transfer.data):,} bytes in {transfer.requests} requests")
     return data, len(data) if transfer.total is None else transfer.total
 

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.atomic import whole_files
-from pd4dgs_codec.cli.common import OK, Console, Parser, number, run, table
+from pd4dgs_codec.cli.common import OK, Console, Parser, command, number, table
 from pd4dgs_codec.cli.files import STDIO, read_bytes
 from pd4dgs_codec.cli.progress import progress_bar
 from pd4dgs_codec.cli.values import positive_float
@@ -63,11 +63,6 @@ def parser() -> Parser:
     return p
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    return run(parser(), _package, argv)
-
-
 def _package(args: argparse.Namespace, console: Console) -> int:
     if args.input != STDIO and Path(args.input).is_dir():
         return _library(args, console)
@@ -88,6 +83,9 @@ def _package(args: argparse.Namespace, console: Console) -> int:
     result = {"input": args.input, "output": args.output, "files": rows, "video": why_not is None}
     console.result(result | {"why_no_video": why_not}, _text(result), on_stdout=False)
     return OK
+
+
+main = command(parser, _package)
 
 
 def _library(args: argparse.Namespace, console: Console) -> int:

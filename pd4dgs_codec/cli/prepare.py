@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from pd4dgs_codec.cli import values
-from pd4dgs_codec.cli.common import OK, Console, Parser, UsageError, run
+from pd4dgs_codec.cli.common import OK, Console, Parser, UsageError, command
 from pd4dgs_codec.cli.files import STDIO
 from pd4dgs_codec.cli.progress import progress_bar
 from pd4dgs_codec.errors import DataError
@@ -45,11 +44,6 @@ def parser() -> Parser:
     return p
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    return run(parser(), _prepare, argv)
-
-
 def _prepare(args: argparse.Namespace, console: Console) -> int:
     if STDIO in (args.input, args.output):
         raise UsageError("found -, expected the names of a recording and of a folder to make")
@@ -62,6 +56,9 @@ def _prepare(args: argparse.Namespace, console: Console) -> int:
         raise DataError(f"interrupted; the same command goes on from {args.output}.partial") from None
     console.result({"output": args.output, **report}, _text(args.output, report), on_stdout=False)
     return OK
+
+
+main = command(parser, _prepare)
 
 
 def _text(output: str, report: dict[str, Any]) -> str:

@@ -5,14 +5,14 @@ from __future__ import annotations
 import argparse
 import re
 import statistics
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.atomic import whole_file, whole_files
 from pd4dgs_codec.cli import values
-from pd4dgs_codec.cli.common import OK, SOURCES, Console, Parser, UsageError, add_reading, run
-from pd4dgs_codec.cli.files import STDIO, check_output, named_input
+from pd4dgs_codec.cli.common import OK, SOURCES, Console, Parser, UsageError, add_reading, command
+from pd4dgs_codec.cli.files import STDIO, check_output, named_input, read_dataset
 from pd4dgs_codec.cli.progress import progress_bar
 from pd4dgs_codec.threads import load_numba
 
@@ -60,11 +60,6 @@ def parser() -> Parser:
     return p
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    return run(parser(), _render, argv)
-
-
 def _render(args: argparse.Namespace, console: Console) -> int:
     kind = _check_usage(args)
     if kind in VIDEOS:
@@ -98,6 +93,9 @@ def _render(args: argparse.Namespace, console: Console) -> int:
     return OK
 
 
+main = command(parser, _render)
+
+
 def _check_usage(args: argparse.Namespace) -> str:
     """The kind of output: the lower-case suffix."""
     kind = Path(args.output).suffix.lower()
@@ -118,9 +116,7 @@ def _frames(args: argparse.Namespace, level: Level) -> list[Frame]:
 
     if args.data is None:
         return own_frames(level.model.info, args.frames or 60, args.orbit, args.downscale)
-    from pd4dgs_codec.interchange.teacher import load_source
-
-    dataset = load_source(args.data, downscale=args.downscale, holdout=args.holdout)
+    dataset = read_dataset(args.data, args)
     views = dataset.test if args.split == "test" else dataset.train
     if not views:
         raise DataError(f"{args.data}: has no held-out views; expected --split train or another --holdout")

@@ -5,9 +5,8 @@ from __future__ import annotations
 import argparse
 import signal
 import threading
-from collections.abc import Sequence
 
-from pd4dgs_codec.cli.common import OK, Console, Parser, run
+from pd4dgs_codec.cli.common import OK, Console, Parser, command
 from pd4dgs_codec.cli.values import duration, port, rate
 
 DETAILS = """\
@@ -71,11 +70,6 @@ def parser() -> Parser:
     return p
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    return run(parser(), _serve, argv)
-
-
 def _serve(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.delivery.link import Link
     from pd4dgs_codec.delivery.server import Server
@@ -88,6 +82,9 @@ def _serve(args: argparse.Namespace, console: Console) -> int:
             console.result(result, server.url, on_stdout=True)
             stop.wait()
     return OK
+
+
+main = command(parser, _serve)
 
 
 def set_by_signals() -> threading.Event:

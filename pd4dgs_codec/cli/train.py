@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,8 +16,8 @@ from pd4dgs_codec.cli.common import (
     Parser,
     UsageError,
     add_reading,
+    command,
     number,
-    run,
     table,
 )
 from pd4dgs_codec.cli.files import STDIO, check_output
@@ -115,11 +114,6 @@ def parser() -> Parser:
     return p
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    return run(parser(), _train, argv)
-
-
 def _train(args: argparse.Namespace, console: Console) -> int:
     if STDIO in (args.output, args.resume, args.log):
         raise UsageError("training reads and writes named files, not - (stdin, stdout)")
@@ -170,6 +164,9 @@ def _train(args: argparse.Namespace, console: Console) -> int:
         result = _summary(args, trainer)
         console.result(result, _text(result), on_stdout=False)
     return OK
+
+
+main = command(parser, _train)
 
 
 def _progress(args: argparse.Namespace, trainer: Trainer, console: Console) -> TrainingProgress:

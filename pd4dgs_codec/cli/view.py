@@ -5,13 +5,12 @@ from __future__ import annotations
 import argparse
 import contextlib
 import tempfile
-from collections.abc import Sequence
 from pathlib import Path
 from urllib.parse import quote
 
 from pd4dgs_codec.atomic import check_output, write_bytes
-from pd4dgs_codec.cli.common import OK, Console, Parser, run
-from pd4dgs_codec.cli.files import STDIO, Stdin, is_pd4, read_bytes
+from pd4dgs_codec.cli.common import OK, Console, Parser, command
+from pd4dgs_codec.cli.files import checkpoint_scene, is_pd4, read_bytes
 from pd4dgs_codec.cli.serve import set_by_signals
 from pd4dgs_codec.cli.values import duration, port, rate
 
@@ -45,11 +44,6 @@ def parser() -> Parser:
     return p
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Entry point; returns the exit code."""
-    return run(parser(), _view, argv)
-
-
 def _view(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.delivery.link import Link
     from pd4dgs_codec.delivery.page import PAGE, page
@@ -80,6 +74,9 @@ def _view(args: argparse.Namespace, console: Console) -> int:
     return OK
 
 
+main = command(parser, _view)
+
+
 def _packed(source: str, console: Console) -> bytes:
     """The bytes of a `.pd4`, whole and valid; of a checkpoint those that packing it gives."""
     from pd4dgs_codec.codec.decoder import decode
@@ -89,12 +86,10 @@ def _packed(source: str, console: Console) -> bytes:
         decode(data)  # a fault is better said here than in a page
         return data
     from pd4dgs_codec.codec.encoder import encode
-    from pd4dgs_codec.model import checkpoint
-    from pd4dgs_codec.model.convert import to_scene
 
-    model, _ = checkpoint.load(source if source != STDIO else Stdin(data))
+    scene = checkpoint_scene(source, data)
     console.message(f"{source}: packing the checkpoint")
-    return encode(to_scene(model), effort=PACKING_EFFORT, omit="nothing")
+    return encode(scene, effort=PACKING_EFFORT, omit="nothing")
 
 
 def _open(url: str) -> None:
