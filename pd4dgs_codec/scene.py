@@ -9,6 +9,7 @@ become active at level l, so the arrays of prefix l are the first rows of the ar
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -250,6 +251,12 @@ class Scene:
         """float32 [N, ...] by name of the attribute."""
         return {"feature": self.feature, "scaling_log": self.scaling_log, "offset": self.offset}
 
+    def of_anchors(self, rows: np.ndarray | slice) -> dict[str, Any]:
+        """The fields with a row for each anchor, without the masks, of the anchors `rows`; for `replace`."""
+        grading = None if self.grading is None else self.grading.take(rows)
+        attributes = {name: values[rows] for name, values in self.attributes.items()}
+        return {"anchor_q": self.anchor_q[rows], **attributes, "grading": grading}
+
     def deformation(self, layer: int) -> Deformation | None:
         """That of layer 1 or 2; None if it is left out, and for layer 0, which has none."""
         return (None, self.global_deformation, self.local_deformation)[layer]
@@ -285,12 +292,8 @@ class Scene:
             self,
             layers=self.layers[:n],
             rows=self.rows[:n],
-            anchor_q=self.anchor_q[:rows],
-            feature=self.feature[:rows],
-            scaling_log=self.scaling_log[:rows],
-            offset=self.offset[:rows],
             mask=self.mask[:n],
             global_deformation=self.global_deformation if 1 in self.layers[:n] else None,
             local_deformation=self.local_deformation if 2 in self.layers[:n] else None,
-            grading=None if self.grading is None else self.grading.take(slice(rows)),
+            **self.of_anchors(slice(rows)),
         )

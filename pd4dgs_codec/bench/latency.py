@@ -209,16 +209,10 @@ def with_anchors(data: bytes, count: int, seed: int = 5) -> bytes:
             copies.append(row)
             cells.append(cell)
     rows = np.concatenate([np.arange(len(scene.anchor_q)), np.array(copies, np.int64)])
-    larger = replace(
-        scene,
-        rows=(len(rows),) * len(scene.layers),
-        anchor_q=np.concatenate([scene.anchor_q, np.array(cells, np.int32).reshape(-1, 3)]),
-        feature=scene.feature[rows],
-        scaling_log=scene.scaling_log[rows],
-        offset=scene.offset[rows],
-        grading=None if scene.grading is None else scene.grading.take(rows),
-        mask=tuple(codes[rows] for codes in masks),
-    )
+    places = np.concatenate([scene.anchor_q, np.array(cells, np.int32).reshape(-1, 3)])
+    anchors = scene.of_anchors(rows) | {"anchor_q": places}
+    counts = (len(rows),) * len(scene.layers)
+    larger = replace(scene, rows=counts, mask=tuple(codes[rows] for codes in masks), **anchors)
     return encode(larger, effort=EFFORT)
 
 

@@ -61,12 +61,8 @@ def _cut(scene: Scene, highest: int) -> tuple[Scene, list[LeftOut]]:
     cut = replace(
         scene.prefix(highest),
         rows=(scene.rows[-1],) * kept,
-        anchor_q=scene.anchor_q,
-        feature=scene.feature,
-        scaling_log=scene.scaling_log,
-        offset=scene.offset,
         mask=tuple(scene.full_masks()[:kept]),
-        grading=scene.grading,
+        **scene.of_anchors(slice(None)),
     )
     return cut, left_out
 
@@ -81,17 +77,10 @@ def _arrange(scene: Scene, kept: tuple[int, ...]) -> tuple[Scene, int]:
     order = np.concatenate([group[morton_order(scene.anchor_q[group])] if group.size else group for group in groups])
     rows = tuple(int(n) for n in np.cumsum([group.size for group in groups]))
     _refuse_duplicates(scene.anchor_q[order])
-    arranged = replace(
-        scene,
-        layers=kept,
-        rows=rows,
-        anchor_q=np.ascontiguousarray(scene.anchor_q[order]),
-        feature=scene.feature[order],
-        scaling_log=scene.scaling_log[order],
-        offset=scene.offset[order],
-        mask=tuple(m[order][:n] for m, n in zip(masks, rows, strict=True)),
-        grading=scene.grading.take(order) if scene.grading is not None and scene.grading.classes[order].any() else None,
-    )
+    if scene.grading is not None and not scene.grading.classes[order].any():
+        scene = replace(scene, grading=None)
+    masks_of = tuple(m[order][:n] for m, n in zip(masks, rows, strict=True))
+    arranged = replace(scene, layers=kept, rows=rows, mask=masks_of, **scene.of_anchors(order))
     return arranged, scene.rows[-1] - order.size
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -174,11 +175,13 @@ def assemble(info: SceneInfo, grid: Grid, layers: Sequence[LayerSymbols]) -> Sce
     Steps of absent tensors keep Steps' defaults.
     """
     scene = outline(info, grid, layers)
-    values = {name: np.empty((scene.rows[-1], *x.shape[1:]), np.float32) for name, x in scene.attributes.items()}
+    values: dict[str, Any] = {
+        name: np.empty((scene.rows[-1], *x.shape[1:]), np.float32) for name, x in scene.attributes.items()
+    }
     for rows, block in attribute_blocks(grid, layers):
         for name, x in block.items():
             values[name][rows] = x
-    return replace(scene, feature=values["feature"], scaling_log=values["scaling_log"], offset=values["offset"])
+    return replace(scene, **values)
 
 
 def attribute_blocks(grid: Grid, layers: Sequence[LayerSymbols]) -> Iterator[tuple[slice, dict[str, np.ndarray]]]:
@@ -209,14 +212,12 @@ def outline(info: SceneInfo, grid: Grid, layers: Sequence[LayerSymbols]) -> Scen
         layers=tuple(layer.kind.layer for layer in layers),
         rows=tuple(m.size for m in masks),
         anchor_q=np.concatenate([layer.anchor_q for layer in layers]),
-        feature=values["feature"],
-        scaling_log=values["scaling_log"],
-        offset=values["offset"],
         mask=tuple(m.astype(np.uint8) for m in masks),
         networks=tensors[0].networks,
         global_deformation=tensors[1] if 1 in tensors and tensors[1].networks else None,
         local_deformation=tensors[2] if 2 in tensors and tensors[2].networks else None,
         grading=grading,
+        **values,
     )
 
 
@@ -292,10 +293,10 @@ def rounded(scene: Scene, raw_deformation: bool = False) -> Scene:
     """`scene` with the values that come back from its file. Raises EncodeError for one that has no symbol."""
     steps = scene.steps
     grid, classes = Grid.of(scene), classes_of(scene)
-    values = {
+    values: dict[str, Any] = {
         name: grid.values_of(name, grid.symbols_of(name, x, classes), classes) for name, x in scene.attributes.items()
     }
-    result = replace(scene, feature=values["feature"], scaling_log=values["scaling_log"], offset=values["offset"])
+    result = replace(scene, **values)
     for kind in LAYER_KINDS[:1] if raw_deformation else LAYER_KINDS:
         if kind.layer == 0 or scene.deformation(kind.layer) is not None:
             result = result.with_tensors(kind.layer, round_tensors(scene.tensors(kind.layer), kind, steps))

@@ -99,8 +99,8 @@ def mssim(pred: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) 
     return float((numerator / ((mu0 * mu0 + mu1 * mu1 + C1) * (var0 + var1 + C2))).mean())
 
 
-class Photograph(Protocol):
-    """A picture of a dataset: uint8 [H, W, 3], and bool [H, W] or None for all, the pixels that count."""
+class TrueView(Protocol):
+    """What a picture is scored against. image: uint8 [H, W, 3]; mask: bool [H, W], True = counts, or None for all."""
 
     @property
     def image(self) -> np.ndarray: ...
@@ -109,7 +109,7 @@ class Photograph(Protocol):
     def mask(self) -> np.ndarray | None: ...
 
 
-def mean_image_baseline(train: Sequence[Photograph], test: Sequence[Photograph]) -> float:
+def mean_image_baseline(train: Sequence[TrueView], test: Sequence[TrueView]) -> float:
     """Mean mPSNR in dB over the test views of always predicting the mean training image: what any model must beat."""
     if not train or not test:
         raise DataError(f"found {len(train)} training and {len(test)} test views, expected at least 1 of each")

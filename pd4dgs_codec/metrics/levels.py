@@ -3,24 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Protocol, TypeVar
+from typing import TypeVar
 
 import numpy as np
 
-from pd4dgs_codec.metrics.image import mpsnr
+from pd4dgs_codec.metrics.image import TrueView, mpsnr
 
 #: (picture, true image, mask) -> score
 Metric = Callable[[np.ndarray, np.ndarray, np.ndarray | None], float]
-
-
-class TrueView(Protocol):
-    """What a picture is scored against. image: uint8 [H, W, 3]; mask: bool [H, W], True = counts, or None for all."""
-
-    @property
-    def image(self) -> np.ndarray: ...
-
-    @property
-    def mask(self) -> np.ndarray | None: ...
 
 
 V = TypeVar("V", bound=TrueView)

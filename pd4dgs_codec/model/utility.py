@@ -81,12 +81,8 @@ def without(scene: Scene, rows: np.ndarray) -> Scene:
     return replace(
         scene,
         rows=tuple(int(kept[:n].sum()) for n in scene.rows),
-        anchor_q=scene.anchor_q[kept],
-        feature=scene.feature[kept],
-        scaling_log=scene.scaling_log[kept],
-        offset=scene.offset[kept],
-        grading=None if scene.grading is None else scene.grading.take(kept),
         mask=tuple(codes[kept[: len(codes)]] for codes in scene.mask),
+        **scene.of_anchors(kept),
     )
 
 

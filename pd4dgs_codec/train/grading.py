@@ -17,6 +17,7 @@ from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.rounding import Rounding
 from pd4dgs_codec.scene import MASK_THRESHOLD, MAX_CLASS
 from pd4dgs_codec.train import workers
+from pd4dgs_codec.train.pruning import relative_harm
 from pd4dgs_codec.train.shot import Shot
 
 #: Training views in which the harm of a step is measured.
@@ -28,27 +29,15 @@ HALVINGS = 40
 def grade(model: Model, shots: Sequence[Shot], levels: Sequence[int], share: float, rounding: Rounding) -> list[int]:
     """Gives every anchor the class at which quantisation adds `share` at most to the squared error of each of `levels`,
     beside what it adds at class 0, and the attributes their centres. Returns how many anchors each class has."""
-    harm = workers.alike(lambda: torch.stack([_relative_harm(model, level, shots, rounding) for level in levels]))
+    harm = workers.alike(
+        lambda: torch.stack([relative_harm(model, level, shots, rounding, step_harm).cpu() for level in levels])
+    )
     met = harm.isfinite()
     worst = torch.where(met, harm, 0.0).amax(0)  # a level that is far off anyway must not set the others' budget
     classes = classes_within(torch.where(met.any(0), worst, torch.inf), share)
     model.step_class.copy_(classes)
     model.centre.copy_(centre(model))
     return torch.bincount(classes.long(), minlength=MAX_CLASS + 1).tolist()
-
-
-def _relative_harm(model: Model, level: int, shots: Sequence[Shot], rounding: Rounding) -> Tensor:
-    """float64 [N]: the squared error that rounding each anchor to class 0 adds at `level`, over what there is. Infinite
-    where no shot comes near it."""
-    n, error, generator = len(model.anchor_q), 0.0, torch.Generator().manual_seed(0)
-    harm, met = torch.zeros(n, dtype=torch.float64), torch.zeros(n, dtype=torch.bool)
-    for shot in shots:
-        weights, place = shot.target.weights, (level, shot.view.time, shot.view.camera)
-        found, near, image = step_harm(model, *place, generator, weights=weights, rounding=rounding)
-        harm += found.cpu()
-        met |= near.cpu()
-        error += shot.squared_error(image)
-    return torch.where(met, harm / max(error, 1e-12), torch.inf)
 
 
 def classes_within(harm: Tensor, budget: float) -> Tensor:

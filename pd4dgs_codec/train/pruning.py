@@ -8,7 +8,7 @@ scattered over the scene, may leave, and what is left is measured anew.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import torch
@@ -24,6 +24,8 @@ from pd4dgs_codec.train.config import PRUNING_ROUNDS
 from pd4dgs_codec.train.optimiser import Optimiser
 from pd4dgs_codec.train.shot import Shot
 
+#: `anchor_harm` or `step_harm`.
+HarmOf = Callable[..., tuple[Tensor, Tensor, Tensor]]
 #: Training views in which it is measured, in each round others.
 VIEWS = 24
 #: Shorter runs have not learnt half way what they will need.
@@ -47,7 +49,10 @@ def prune(
     Returns int64 [n], the anchors that stayed, and how many of them left level 0. Anchors that no shot comes near stay,
     and all do where none would be left: better a needless model than none.
     """
-    harms = workers.alike(lambda: torch.stack([relative_harm(model, level, shots, rounding) for level in levels]))
+    calm = replace(rounding, noise=None)
+    harms = workers.alike(
+        lambda: torch.stack([relative_harm(model, level, shots, calm, anchor_harm) for level in levels])
+    )
     harms[:, turns(model.anchor_q) != turn] = torch.inf
     needless = least(harms.amax(0), share)
     keep = (~needless | needless.all()).nonzero()[:, 0]
@@ -60,18 +65,16 @@ def prune(
     return keep, int(later.sum())
 
 
-def relative_harm(model: Model, level: int, shots: Sequence[Shot], rounding: Rounding) -> Tensor:
-    """float64 [N]: the squared error that the absence of each anchor at `level` would add, about, over what there is.
-    Infinite where no shot comes near it."""
+def relative_harm(model: Model, level: int, shots: Sequence[Shot], rounding: Rounding, harm_of: HarmOf) -> Tensor:
+    """float64 [N]: the squared error that `harm_of` says each anchor adds at `level`, such as its absence would, over
+    what there is. Infinite where no shot comes near it."""
     n, device = len(model.anchor_q), model.feature.device
     total = torch.zeros(n, dtype=torch.float64, device=device)
     met = torch.zeros(n, dtype=torch.bool, device=device)
-    rounding, error = replace(rounding, noise=None), 0.0
-    generator = torch.Generator().manual_seed(0)
+    error, generator = 0.0, torch.Generator().manual_seed(0)
     for shot in shots:
-        weights = shot.target.weights
-        place = (level, shot.view.time, shot.view.camera)
-        harm, near, image = anchor_harm(model, *place, generator, weights=weights, rounding=rounding)
+        weights, place = shot.target.weights, (level, shot.view.time, shot.view.camera)
+        harm, near, image = harm_of(model, *place, generator, weights=weights, rounding=rounding)
         total += harm
         met |= near
         error += shot.squared_error(image)

@@ -55,7 +55,7 @@ def _error(trainer, level: int) -> float:
 
 def test_harm_is_the_error_that_an_absence_adds_about(trained):
     trainer, shots = trained
-    harm = pruning.relative_harm(trainer.model, 1, shots, EXACT).numpy()
+    harm = pruning.relative_harm(trainer.model, 1, shots, EXACT, pruning.anchor_harm).numpy()
     pictures = _pictures(trainer, 1)
     near = np.flatnonzero(np.isfinite(harm) & (harm > 0))
     chosen = near[np.argsort(harm[near])][:: max(1, len(near) // 12)]
