@@ -15,6 +15,8 @@ from pd4dgs_codec.errors import DataError
 
 #: Largest |R Rᵀ - I| of a pose that still counts as a rotation (files round to 3 or more decimals).
 ROTATION_TOLERANCE = 1e-3
+#: Quaternions are unit to this.
+UNIT_TOLERANCE = 1e-3
 #: Of binary32, in which files hold the first and the last time; and by what share of itself a span may change there.
 LARGEST_TIME, SPAN_TOLERANCE = float(np.finfo(np.float32).max), 1e-3
 #: Angles at which it is looked where a fisheye's polynomial turns back.
@@ -82,6 +84,14 @@ def rotation_matrix(wxyz: Sequence[float] | np.ndarray) -> np.ndarray:
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     ]  # fmt: skip
     return np.stack(rows, axis=-1).reshape(*w.shape, 3, 3)
+
+
+def checked_rotation(wxyz: Sequence[float] | np.ndarray, where: str) -> np.ndarray:
+    """float64 [3, 3] of a quaternion [4] as files hold them. Raises DataError unless it is about unit."""
+    length = float(np.linalg.norm(wxyz))
+    if abs(length - 1) > UNIT_TOLERANCE:
+        raise DataError(f"{where}: quaternion of length {length:.4g}, expected 1")
+    return rotation_matrix(np.asarray(wxyz) / length)
 
 
 def world_to_camera(rotation: np.ndarray, center: np.ndarray) -> np.ndarray:

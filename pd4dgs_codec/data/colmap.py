@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.data.cameras import LARGEST_TIME, Lens, UnreadView, rotation_matrix, world_to_camera
+from pd4dgs_codec.data.cameras import LARGEST_TIME, Lens, UnreadView, checked_rotation, world_to_camera
 from pd4dgs_codec.data.files import LARGEST, number, read_file
 from pd4dgs_codec.data.posed import held_out, posed_dataset
 from pd4dgs_codec.data.view import Dataset
@@ -32,8 +32,6 @@ MODELS = {
     5: ("OPENCV_FISHEYE", ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")),
 }
 PARAMETERS = dict(MODELS.values())
-#: Quaternions are unit to this.
-UNIT_TOLERANCE = 1e-3
 MAX_SIDE = 65535
 
 
@@ -94,12 +92,9 @@ def registered(
 
 def _viewmat(image: Image, where: str) -> np.ndarray:
     """float64 [4, 4] world to camera."""
-    w, x, y, z, *translation = (number(value, f"{where}: pose") for value in image.pose)
-    length = float(np.sqrt(w * w + x * x + y * y + z * z))
-    if abs(length - 1) > UNIT_TOLERANCE:
-        raise DataError(f"{where}: quaternion of length {length:.4g}, expected 1")
-    rotation = rotation_matrix([value / length for value in (w, x, y, z)])
-    return world_to_camera(rotation, -rotation.T @ np.array(translation))
+    pose = np.array([number(value, f"{where}: pose") for value in image.pose])
+    rotation = checked_rotation(pose[:4], where)
+    return world_to_camera(rotation, -rotation.T @ pose[4:])
 
 
 def _times(folder: Path, names: list[str]) -> list[float]:

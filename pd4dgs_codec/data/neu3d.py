@@ -14,7 +14,7 @@ import numpy as np
 
 from pd4dgs_codec.data.cameras import Lens, UnreadView, check_rotation, world_to_camera
 from pd4dgs_codec.data.files import LARGEST, read_file
-from pd4dgs_codec.data.ply import read_ply
+from pd4dgs_codec.data.ply import read_only_ply
 from pd4dgs_codec.data.synchronised import synchronised_dataset
 from pd4dgs_codec.data.videos import video_size
 from pd4dgs_codec.data.view import Dataset
@@ -36,9 +36,7 @@ def read_neu3d(folder: Path, downscale: int, holdout: int) -> Dataset:
         _camera(row, i, video_size(video), video) for i, (video, row) in enumerate(zip(videos, poses, strict=True))
     ]
     near, far = 0.5 * float(poses[:, 15].min()), float(poses[:, 16].max())
-    plys = sorted(folder.glob("*.ply"))
-    points, colors = read_ply(plys[0]) if len(plys) == 1 else (None, None)
-    return synchronised_dataset(folder, cameras, points, colors, downscale, holdout, (near, far))
+    return synchronised_dataset(folder, cameras, *read_only_ply(folder), downscale, holdout, (near, far))
 
 
 def _poses(path: Path) -> np.ndarray:

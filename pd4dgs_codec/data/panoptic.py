@@ -16,7 +16,7 @@ import numpy as np
 
 from pd4dgs_codec.data.cameras import Lens, UnreadView, check_rotation, world_to_camera
 from pd4dgs_codec.data.files import LARGEST, array, find_image, read_json, whole_number
-from pd4dgs_codec.data.posed import posed_dataset
+from pd4dgs_codec.data.posed import posed_dataset, without_first_camera
 from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.errors import DataError, one_line
 
@@ -33,11 +33,7 @@ def read_panoptic(folder: Path, downscale: int, holdout: int) -> Dataset:
     if (folder / TEST_META).is_file():
         test = _frames(folder, folder / TEST_META)
     else:
-        first = min(frame.camera_id for frame in train) if holdout else None
-        test = [frame for frame in train if frame.camera_id == first]
-        train = [frame for frame in train if frame.camera_id != first]
-        if not train:
-            raise DataError(f"{folder}: one camera, which is held out, expected others to train on or --holdout 0")
+        train, test = without_first_camera(folder, train, holdout)
     return posed_dataset(folder, train, test, *_points(folder / POINTS), downscale)
 
 

@@ -81,6 +81,12 @@ def read_vertices(path: Path, raw: bytes | None = None) -> np.ndarray:
     return _body(path, raw[start:], kind, count, np.dtype(fields))
 
 
+def read_only_ply(folder: Path) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """As `read_ply`, of the PLY file of a folder that holds one; (None, None) for others."""
+    found = list(folder.glob("*.ply"))
+    return read_ply(found[0]) if len(found) == 1 else (None, None)
+
+
 def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     """Points float32 [M, 3] and colours uint8 [M, 3] (None if absent).
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -19,16 +19,27 @@ from pd4dgs_codec.data.cameras import (
     seconds_range,
 )
 from pd4dgs_codec.data.view import Dataset, View
+from pd4dgs_codec.errors import DataError
 
 #: A border is one colour if this share of it lies within this many 8-bit levels of its median.
 BORDER_SHARE, BORDER_LEVELS = 0.99, 3
 T = TypeVar("T")
+Posed = TypeVar("Posed", UnreadView, View)
 
 
 def held_out(frames: Sequence[T], holdout: int) -> tuple[list[T], list[T]]:
     """(those to train on, those held out): the i-th is out if i % holdout == holdout // 2; none for holdout 0."""
     out = [holdout > 0 and i % holdout == holdout // 2 for i in range(len(frames))]
     return [f for f, o in zip(frames, out, strict=True) if not o], [f for f, o in zip(frames, out, strict=True) if o]
+
+
+def without_first_camera(folder: Path, frames: Sequence[Posed], holdout: int) -> tuple[list[Posed], list[Posed]]:
+    """(frames to train on, those of the first camera, which are held out; none for holdout 0)."""
+    first = min(frame.camera_id for frame in frames) if holdout else None
+    train = [frame for frame in frames if frame.camera_id != first]
+    if not train:
+        raise DataError(f"{folder}: one camera, which is held out, expected others to train on or --holdout 0")
+    return train, [frame for frame in frames if frame.camera_id == first]
 
 
 def posed_dataset(
@@ -45,26 +56,31 @@ def posed_dataset(
     folder tells them; background: that of the pictures' border if None."""
     frames = [*train, *test]
     times, start, stop = normalised_times([f.time for f in frames], str(folder))
-    if points is not None and not len(points):
-        points, colors = None, None
     views = [read_view(f, t, downscale, composite=True) for f, t in zip(frames, times, strict=True)]
-    box = cameras_box(frames, depth) if points is None else points_box(points)
-    near, far = depth or depth_range([f.viewmat for f in frames], box, points)
     return Dataset(
         name=folder.resolve().name,
         train=tuple(views[: len(train)]),
         test=tuple(views[len(train) :]),
-        points=points,
-        point_colors=colors,
-        box=box,
-        near=near,
-        far=far,
         background=background or border_color(views[: len(train)]),
         time_range=seconds_range(start, stop),
-        up=mean_up(frames),
-        unit=0.0,
-        masked=False,
+        **geometry(frames, points, colors, depth),
     )
+
+
+def geometry(
+    frames: Sequence[UnreadView],
+    points: np.ndarray | None,
+    colors: np.ndarray | None,
+    depth: tuple[float, float] | None,
+) -> dict[str, Any]:
+    """The fields of a Dataset that follow from its frames and points, see `posed_dataset`; its unit and masks are not
+    known."""
+    if points is not None and not len(points):
+        points, colors = None, None
+    box = cameras_box(frames, depth) if points is None else points_box(points)
+    near, far = depth or depth_range([f.viewmat for f in frames], box, points)
+    found = {"points": points, "point_colors": colors, "box": box, "near": near, "far": far, "up": mean_up(frames)}
+    return found | {"unit": 0.0, "masked": False}
 
 
 def border_color(views: Sequence[View]) -> tuple[float, float, float]:

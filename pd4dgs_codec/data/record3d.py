@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pd4dgs_codec.data.cameras import LARGEST_TIME, Lens, UnreadView, rotation_matrix, world_to_camera
+from pd4dgs_codec.data.cameras import LARGEST_TIME, Lens, UnreadView, checked_rotation, world_to_camera
 from pd4dgs_codec.data.files import array, find_image, number, read_json, whole_number
 from pd4dgs_codec.data.posed import held_out, posed_dataset
 from pd4dgs_codec.data.transforms import OPENGL_TO_OPENCV
@@ -18,8 +18,6 @@ from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.errors import DataError
 
 META, PICTURES = ("metadata", "metadata.json"), ("rgbd", "rgb")
-#: Quaternions are unit to this.
-UNIT_TOLERANCE = 1e-3
 MAX_FRAMES = 1_000_000
 
 
@@ -41,11 +39,7 @@ def read_record3d(folder: Path, downscale: int, holdout: int) -> Dataset:
     lenses, times = _lenses(meta, (size[0], size[1]), len(rows), path), _times(meta, len(rows), path)
     frames = []
     for i, (pose, lens, time) in enumerate(zip(poses, lenses, times, strict=True)):
-        x, y, z, w = pose[:4]
-        length = float(np.linalg.norm(pose[:4]))
-        if abs(length - 1) > UNIT_TOLERANCE:
-            raise DataError(f"{path}: pose {i}: quaternion of length {length:.4g}, expected 1")
-        rotation = rotation_matrix([w / length, x / length, y / length, z / length])
+        rotation = checked_rotation(pose[[3, 0, 1, 2]], f"{path}: pose {i}")
         viewmat = world_to_camera(OPENGL_TO_OPENCV @ rotation.T, pose[4:])
         frames.append(UnreadView(str(i), 0, time, viewmat, lens, find_image(pictures, str(i))))
     return posed_dataset(folder, *held_out(frames, holdout), None, None, downscale)

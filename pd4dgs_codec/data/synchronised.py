@@ -12,10 +12,11 @@ from pathlib import Path
 
 import numpy as np
 
-from pd4dgs_codec.data.cameras import UnreadView, cameras_box, depth_range, mean_up, points_box, rectify
+from pd4dgs_codec.data.cameras import UnreadView, rectify
 from pd4dgs_codec.data.colmap import registered
 from pd4dgs_codec.data.files import check_downscale, shrink_image, shrink_mask
 from pd4dgs_codec.data.frame_cache import StoredView, stored_frames
+from pd4dgs_codec.data.posed import geometry, without_first_camera
 from pd4dgs_codec.data.videos import video_size
 from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.errors import DataError
@@ -63,27 +64,14 @@ def synchronised_dataset(
         for k in range(count):
             time = k / (count - 1) if count > 1 else 0.0
             views.append(StoredView(frames, k, time=time, name=f"{path.stem}_{k:04d}", **fixed))
-    train = [view for view in views if not holdout or view.camera_id > 0]
-    if not train:
-        raise DataError(f"{folder}: one camera, which is held out, expected others to train on or --holdout 0")
-    if points is not None and not len(points):
-        points, colors = None, None
-    box = cameras_box(cameras, depth) if points is None else points_box(points)
-    near, far = depth or depth_range([camera.viewmat for camera in cameras], box, points)
+    train, test = without_first_camera(folder, views, holdout)
     return Dataset(
         name=folder.resolve().name,
         train=tuple(train),
-        test=tuple(view for view in views if holdout and view.camera_id == 0),
-        points=points,
-        point_colors=colors,
-        box=box,
-        near=near,
-        far=far,
+        test=tuple(test),
         background=(0.0, 0.0, 0.0),
         time_range=(0.0, (count - 1) / fps if count > 1 else 1.0),
-        up=mean_up(cameras),
-        unit=0.0,
-        masked=False,
+        **geometry(cameras, points, colors, depth),
     )
 
 

@@ -17,7 +17,7 @@ from pd4dgs_codec.data.cameras import (
     world_to_camera,
 )
 from pd4dgs_codec.data.files import array, find_image, image_info, number, read_json, whole_number
-from pd4dgs_codec.data.ply import read_ply
+from pd4dgs_codec.data.ply import read_only_ply, read_ply
 from pd4dgs_codec.data.posed import held_out, posed_dataset
 from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.errors import DataError
@@ -130,10 +130,7 @@ def _split(folder: Path, holdout: int) -> tuple[list[UnreadView], list[UnreadVie
 
 def _points(folder: Path, file: dict[str, Any]) -> tuple[np.ndarray | None, np.ndarray | None]:
     named = file.get("ply_file_path")
-    if isinstance(named, str):
-        return read_ply(folder / named)
-    found = sorted(folder.glob("*.ply"))
-    return read_ply(found[0]) if len(found) == 1 else (None, None)
+    return read_ply(folder / named) if isinstance(named, str) else read_only_ply(folder)
 
 
 def _stored_depth(folder: Path, file: dict[str, Any]) -> tuple[float, float] | None:
