@@ -14,7 +14,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
+from pd4dgs_codec.attributes.quantise import MAX_SYMBOL, magnitude
 from pd4dgs_codec.errors import Malformed
 
 Array = np.ndarray
@@ -89,7 +89,7 @@ def restore(planes: Sequence[tuple[int, Array]]) -> list[Array]:
         for i, k in zip(members, restored, strict=True):
             result[i] = k
     for (predictor, _), k in zip(planes, result, strict=True):
-        if k.size and max(int(k.max()), -int(k.min())) > MAX_SYMBOL:
+        if magnitude(k) > MAX_SYMBOL:
             name = PREDICTORS[predictor].name
             raise Malformed(f"plane sample over {MAX_SYMBOL} in magnitude after predictor {predictor} ({name})")
     return [k.astype(np.int32, copy=False) for k in result]
@@ -129,7 +129,7 @@ def _scan_together(planes: Sequence[Array], predictor: Predictor) -> list[Array]
     ends = np.cumsum([r.shape[1] + 1 for r in turned])
     zeros = ends - [r.shape[1] + 1 for r in turned]
     diagonals, channels = [sum(r.shape[1:]) - 1 for r in turned], len(turned[0])
-    largest = max(max(int(r.max()), -int(r.min())) * sum(r.shape[1:]) for r in turned)
+    largest = max(magnitude(r) * sum(r.shape[1:]) for r in turned)
     lane = next(t for t in (np.int16, np.int32, np.int64) if 4 * largest <= np.iinfo(t).max)
     table = np.zeros((diagonals[0], int(ends[-1]), channels), lane)
     down, right, deep = table.strides[0] + table.strides[1], table.strides[0], table.strides[2]

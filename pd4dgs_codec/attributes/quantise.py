@@ -25,6 +25,11 @@ def is_step(value: float) -> bool:
 Integers = np.ndarray | int
 
 
+def magnitude(k: np.ndarray) -> int:
+    """The largest |k| of an integer array of any shape, 0 of an empty one."""
+    return max(int(k.max()), -int(k.min())) if k.size else 0
+
+
 def quantise(
     x: np.ndarray, step: float, name: str = "tensor", centre: Integers = 0, spacing: Integers = 1
 ) -> np.ndarray:
@@ -54,7 +59,7 @@ def all_finite(k: np.ndarray, step: float) -> bool:
     """Whether dequantise(k, step) holds no infinity; |k| <= MAX_SYMBOL."""
     if MAX_SYMBOL * step < _TO_INFINITY:
         return True
-    return not k.size or max(int(k.max()), -int(k.min())) * step < _TO_INFINITY
+    return magnitude(k) * step < _TO_INFINITY
 
 
 def dequantise(k: np.ndarray, step: float, centre: Integers = 0, spacing: Integers = 1) -> np.ndarray:

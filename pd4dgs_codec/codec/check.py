@@ -6,7 +6,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from pd4dgs_codec.attributes.quantise import is_step
+from pd4dgs_codec.attributes.quantise import is_step, magnitude
 from pd4dgs_codec.codec.kinds import LAYER_KINDS, LayerKind
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.morton import MAX_VOXEL
@@ -47,9 +47,8 @@ def check_scene(scene: Scene) -> None:
     _expect(all(a <= b for a, b in pairwise((0, *rows))), f"rows {rows}, expected a non-decreasing sequence")
     n = rows[-1]
     _expect_array("anchor_q", scene.anchor_q, np.int32, (n, 3))
-    if n:
-        reach = max(int(scene.anchor_q.max()), -int(scene.anchor_q.min()))
-        _expect(reach <= MAX_VOXEL, f"anchor_q: voxel index of magnitude {reach}, expected at most {MAX_VOXEL}")
+    reach = magnitude(scene.anchor_q)
+    _expect(reach <= MAX_VOXEL, f"anchor_q: voxel index of magnitude {reach}, expected at most {MAX_VOXEL}")
     for name, axes in (("feature", 2), ("offset", 3)):
         found = scene.attributes[name].shape
         _expect(len(found) == axes, f"{name}: an array of {len(found)} axes, expected {axes}")

@@ -14,7 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pd4dgs_codec.attributes import planes as decorrelation
-from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
+from pd4dgs_codec.attributes.quantise import MAX_SYMBOL, magnitude
 from pd4dgs_codec.attributes.table import NO_CLASSES
 from pd4dgs_codec.bitstream.limits import MAX_PARAMETERS
 from pd4dgs_codec.codec.attribute_section import Past, by_class, check_classes, read_attributes, write_attributes
@@ -224,7 +224,7 @@ def read_layer(
     classes, attributes = channels[Section.ATTRIBUTES]
     check_classes(classes)
     for tensor in (attributes, *tensors):
-        if tensor.dtype.kind == "i" and tensor.size and max(int(tensor.max()), -int(tensor.min())) > MAX_SYMBOL:
+        if tensor.dtype.kind == "i" and magnitude(tensor) > MAX_SYMBOL:
             raise Malformed(f"layer {kind.layer}: a symbol over {MAX_SYMBOL} in magnitude")
     steps = meta.steps
     return LayerSymbols(

@@ -9,7 +9,7 @@ from types import ModuleType
 import numpy as np
 
 from pd4dgs_codec.attributes.planes import PREDICTORS, residual
-from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
+from pd4dgs_codec.attributes.quantise import MAX_SYMBOL, magnitude
 from pd4dgs_codec.entropy.bits import BIT, frequency_costs, symbol_counts
 
 #: A channel that spans more is too sparse for frequencies to tell anything.
@@ -22,10 +22,10 @@ def fill_plane(k: np.ndarray, given: np.ndarray) -> np.ndarray:
     best: tuple[float, np.ndarray] | None = None
     for predictor in PREDICTORS:
         filled = _fill(k, given, predictor)
-        if max(int(filled.max()), -int(filled.min())) > MAX_SYMBOL:
+        if magnitude(filled) > MAX_SYMBOL:
             continue
         r = residual(predictor, filled)
-        if max(int(r.max()), -int(r.min())) > MAX_SYMBOL:
+        if magnitude(r) > MAX_SYMBOL:
             continue
         bits = _estimated_bits(r)
         if best is None or bits < best[0]:
@@ -74,7 +74,7 @@ def choose_predictor(k: np.ndarray) -> tuple[int, np.ndarray]:
     best: tuple[float, int, np.ndarray] | None = None
     for predictor in PREDICTORS:
         r = residual(predictor, k)
-        if r.size and max(int(r.max()), -int(r.min())) > MAX_SYMBOL:
+        if magnitude(r) > MAX_SYMBOL:
             continue
         bits = _estimated_bits(r)
         if best is None or bits < best[0]:

@@ -14,7 +14,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
+from pd4dgs_codec.attributes.quantise import MAX_SYMBOL, magnitude
 from pd4dgs_codec.codec.options import EncodeOptions
 from pd4dgs_codec.codec.symbols import LayerSymbols
 from pd4dgs_codec.entropy.channels import CodedChannels, decode_channels, encode_channels
@@ -31,7 +31,7 @@ def coarse(layer: LayerSymbols, bits: int) -> LayerSymbols:
 def shifted(layer: LayerSymbols, bits: int) -> LayerSymbols:
     """The layer of coarse attributes as it is shown until they are refined. Raises Malformed."""
     k = layer.attributes
-    if k.size and max(int(k.max()), -int(k.min())) > MAX_SYMBOL >> bits:
+    if magnitude(k) > MAX_SYMBOL >> bits:
         raise Malformed(f"layer {layer.kind.layer}: a coarse symbol over {MAX_SYMBOL >> bits} in magnitude")
     return replace(layer, attributes=k << bits) if bits else layer
 
@@ -59,10 +59,10 @@ def read_refinement(section: bytes, parts: Sequence[LayerSymbols], bits: int) ->
     for row, own in zip(k, classes, strict=True):
         for chosen in own:
             rest = next(found)
-            if rest.size and max(int(rest.max()), -int(rest.min())) > 1 << bits >> 1:
+            if magnitude(rest) > 1 << bits >> 1:
                 raise Malformed(f"low bits over {1 << bits >> 1} in magnitude, of {bits} bits")
             row[chosen] += np.where(row[chosen] < 0, -rest, rest)
-    if k.size and max(int(k.max()), -int(k.min())) > MAX_SYMBOL:
+    if magnitude(k) > MAX_SYMBOL:
         raise Malformed(f"a refined symbol over {MAX_SYMBOL} in magnitude")
     ends = np.cumsum([part.attributes.shape[1] for part in parts])[:-1]
     return [replace(part, attributes=refined) for part, refined in zip(parts, np.split(k, ends, axis=1), strict=True)]

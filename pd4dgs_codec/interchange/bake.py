@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from pd4dgs_codec.data.cameras import rotation_matrix
-from pd4dgs_codec.interchange.splats import Splats, camera_eye, harmonics, looking, quaternions, sphere, unit
+from pd4dgs_codec.interchange.splats import Splats, camera_eye, harmonics, looking, quaternions, sphere, spread, unit
 from pd4dgs_codec.model.visibility import LEAST_NEAR, MIN_OPACITY
 from pd4dgs_codec.playback.player import Player
 from pd4dgs_codec.scene import Camera
@@ -54,8 +54,8 @@ class Eyes:
 
 def eyes_of_cameras(cameras: Sequence[Camera], count: int = EYES) -> Eyes:
     """`count` of the cameras, evenly spaced in their order; all of them if there are fewer."""
-    rows = np.unique(np.linspace(0, len(cameras) - 1, min(count, len(cameras))).round().astype(int))
-    return Eyes(tuple(cameras[i] for i in rows), np.ones(len(rows)))
+    chosen = spread(cameras, count)
+    return Eyes(chosen, np.ones(len(chosen)))
 
 
 def eyes_of_scene(player: Player, count: int = EYES) -> Eyes:

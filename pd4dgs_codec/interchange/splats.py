@@ -7,12 +7,16 @@ the unit vector from the eye to the mean.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import TypeVar
 
 import numpy as np
 
 from pd4dgs_codec.render.rasteriser import draw
 from pd4dgs_codec.scene import Camera
+
+T = TypeVar("T")
 
 MAX_DEGREE = 3
 #: Y_0, a constant: the factor between a colour and its first coefficient.
@@ -76,6 +80,12 @@ def looking(eye: np.ndarray, ahead: np.ndarray, up: np.ndarray, like: Camera) ->
     viewmat[:3, :3] = np.stack([right, np.cross(ahead, right), ahead])
     viewmat[:3, 3] = -viewmat[:3, :3] @ eye
     return replace(like, viewmat=viewmat.astype(np.float32))
+
+
+def spread(items: Sequence[T], count: int) -> tuple[T, ...]:
+    """`count` of the items, evenly spaced in their order; all of them if there are fewer."""
+    rows = np.unique(np.linspace(0, len(items) - 1, min(count, len(items))).round().astype(int))
+    return tuple(items[i] for i in rows)
 
 
 def sphere(count: int) -> np.ndarray:

@@ -23,11 +23,12 @@ import numpy as np
 
 from pd4dgs_codec.data.cameras import depth_range, points_box
 from pd4dgs_codec.data.dataset import load
+from pd4dgs_codec.data.posed import held_out
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.models import Teacher, read_model
 from pd4dgs_codec.interchange.scaffold_gs import read_cameras
-from pd4dgs_codec.interchange.splats import SH_C0, looking, picture, sphere
+from pd4dgs_codec.interchange.splats import SH_C0, looking, picture, sphere, spread
 from pd4dgs_codec.scene import Camera
 from pd4dgs_codec.view.frames import shrunk
 
@@ -93,16 +94,14 @@ def _around(source: str, place: Path, teacher: Teacher, options: Options, downsc
     still = teacher.times is not None and len(teacher.times) == 1
     shots = [(camera, 0.0 if still else i * GOLDEN % 1.0) for i, camera in enumerate(cameras)]
     times = teacher.times or tuple(np.linspace(0, 1, BOX_TIMES))
-    some = _spread(times, BOX_TIMES)
+    some = spread(times, BOX_TIMES)
     everywhere = np.concatenate([teacher.splats(t).means[_solid(source, teacher, t)] for t in some])
     box = points_box(everywhere)
     near, far = depth_range([c.viewmat.astype(np.float64) for c in cameras], box, everywhere)
     views = _pictures(teacher, shots, options.background, near)
-    held = [holdout > 0 and i % holdout == holdout // 2 for i in range(len(views))]
+    train, test = held_out(views, holdout)
     return Dataset(
-        name=source,
-        train=tuple(view for view, out in zip(views, held, strict=True) if not out),
-        test=tuple(view for view, out in zip(views, held, strict=True) if out),
+        name=source, train=tuple(train), test=tuple(test),
         box=box, near=near, far=far, background=options.background,
         time_range=(0.0, teacher.seconds), up=up, unit=0.0, masked=False,
         **_points(teacher, solid),
@@ -129,7 +128,7 @@ def _points(teacher: Teacher, solid: np.ndarray) -> dict[str, Any]:
 
 def _paths(teacher: Teacher, rows: np.ndarray, count: int) -> dict[str, Any]:
     """Where these rows of `count` are over the time; nothing if they do not stay the same Gaussians."""
-    times = _spread(teacher.times or tuple(np.linspace(0, 1, PATH_TIMES)), PATH_TIMES)
+    times = spread(teacher.times or tuple(np.linspace(0, 1, PATH_TIMES)), PATH_TIMES)
     others, places = np.random.default_rng(0).permutation(len(rows)), list[np.ndarray]()
     for t in times:
         means = teacher.splats(t).means
@@ -141,11 +140,6 @@ def _paths(teacher: Teacher, rows: np.ndarray, count: int) -> dict[str, Any]:
             if not near <= SAME * far:
                 return {}
     return {"paths": np.stack(places), "path_times": times} if len(times) > 1 else {}
-
-
-def _spread(times: Sequence[float], count: int) -> tuple[float, ...]:
-    """So many of the times at most, spread over all of them."""
-    return tuple(times[i] for i in np.unique(np.linspace(0, len(times) - 1, count).round().astype(int)))
 
 
 def _pictures(teacher: Teacher, shots: Sequence[tuple[Camera, float]], background: Triple, near: float) -> list[View]:
@@ -202,8 +196,7 @@ def _cameras(place: Path, points: np.ndarray, options: Options, downscale: int) 
     beside = next((p / "cameras.json" for p in (place, place.parent) if (p / "cameras.json").is_file()), None)
     if beside is not None:
         cameras, up = read_cameras(beside)
-        rows = np.unique(np.linspace(0, len(cameras) - 1, min(options.views, len(cameras))).round().astype(int))
-        some = [cameras[i] for i in rows]
+        some = spread(cameras, options.views)
         return [shrunk(c, downscale * math.ceil(max(c.width, c.height) / max(options.size))) for c in some], up
     middle = np.median(points, axis=0).astype(np.float64)
     radius = max(float(np.percentile(np.linalg.norm(points - middle, axis=1), 90)), 1e-6)

@@ -263,17 +263,18 @@ class Schedule:
 
     def separation(self, iteration: int) -> float:
         """How far the masks' separation has gone, 0..1: it begins with the mask terms and ends with exact rounding."""
-        if self.iterations is None:
-            return 0.0
-        begin, end = self.progressive, self.exact_rounding
-        return min(max((iteration - begin) / max(1, end - begin), 0.0), 1.0)
+        return self._since_progressive(iteration, self.exact_rounding)
 
     def pressure(self, iteration: int) -> float:
         """How much of the planes' rate weighs, 0..1: it begins with the rate term and is all there where planes are
         rounded. All of it at once empties planes before they have learnt anything."""
+        return self._since_progressive(iteration, self.rounding)
+
+    def _since_progressive(self, iteration: int, end: float) -> float:
+        """The share of the way from there to `end`, 0..1."""
         if self.iterations is None:
             return 0.0
-        begin, end = self.progressive, self.rounding
+        begin = self.progressive
         return min(max((iteration - begin) / max(1, end - begin), 0.0), 1.0)
 
     def phases_not_reached(self, iteration: int) -> list[str]:
