@@ -103,7 +103,8 @@ def _done_once(job: Job, command: Command) -> tuple[str, int, float]:
     with tempfile.TemporaryDirectory(prefix="pd4dgs-batch-") as name, _inside(Path(name)) as folder:
         sources = {key: _fetched(place, folder) for key, place in _places(job).items()}
         digests = {key: found for key, (_, found) in sources.items()}
-        key = key_of(job.verb, digests, _plain_options(job), __version__)
+        plain = {name: value for name, value in line.options.items() if name not in OPS[job.verb].inputs}
+        key = key_of(job.verb, digests, plain, __version__)
         if record and record.get("key") == key and root.holds(line.output, record["files"]):
             return ALREADY, 0, 0.0
         if record and record.get("key") != key and not job.overwrite:
@@ -127,10 +128,6 @@ def _places(job: Job) -> dict[str, str]:
     """Where the inputs are: "" for the source, else by the option that names it."""
     named = {name: job.line.options[name] for name in OPS[job.verb].inputs if name in job.line.options}
     return {"": job.line.source, **named}
-
-
-def _plain_options(job: Job) -> dict[str, Any]:
-    return {name: value for name, value in job.line.options.items() if name not in OPS[job.verb].inputs}
 
 
 def _stamps(job: Job) -> dict[str, str | None]:
@@ -175,17 +172,10 @@ def _run(
     if op.stdout:
         output.write_text(json.dumps(report, indent=1) + "\n")
     if output.is_dir():
-        return (
-            {p.relative_to(output).as_posix(): folder / p for p in sorted(output.rglob("*")) if p.is_file()},
-            {},
-            work,
-        )
-    return {"": folder / output}, {} if op.stdout else _short(report), work
-
-
-def _short(report: dict[str, Any]) -> dict[str, Any]:
-    """The scalars of a command's report: its tables are in its output."""
-    return {name: value for name, value in report.items() if isinstance(value, (bool, int, float))}
+        files = [path for path in sorted(output.rglob("*")) if path.is_file()]
+        return {path.relative_to(output).as_posix(): folder / path for path in files}, {}, work
+    scalars = {name: value for name, value in report.items() if isinstance(value, (bool, int, float))}
+    return {"": folder / output}, {} if op.stdout else scalars, work
 
 
 @contextmanager

@@ -56,7 +56,7 @@ class Manifest:
         count = 0
         for item in self._parsed():
             if isinstance(item, Line):
-                first = seen.setdefault(_hash(item.output), item.number)
+                first = seen.setdefault(hashlib.sha256(item.output.encode()).digest()[:16], item.number)
                 if first == item.number:
                     count += 1
                     continue
@@ -108,10 +108,6 @@ class Manifest:
 def absolute(place: str) -> str:
     """A source as workers in other folders find it."""
     return place if place.startswith(SPECIFICATIONS) else store.absolute(place)
-
-
-def _hash(text: str) -> bytes:
-    return hashlib.sha256(text.encode()).digest()[:16]
 
 
 def is_plain(name: str) -> bool:

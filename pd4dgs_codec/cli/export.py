@@ -143,6 +143,8 @@ def _eyes(args: argparse.Namespace, player: Player) -> Eyes:
 
 def _write_still(args: argparse.Namespace, export: Export, console: Console) -> dict[str, Any]:
     """One instant."""
+    import numpy as np
+
     from pd4dgs_codec.interchange.export import upright
     from pd4dgs_codec.interchange.glb import glb_bytes
     from pd4dgs_codec.interchange.libraries import SPZ_STEP, spz_bytes
@@ -152,7 +154,7 @@ def _write_still(args: argparse.Namespace, export: Export, console: Console) -> 
     with progress_bar(args.refine, "steps", "refining") as step:
         splats, _ = export.splats(args.time or 0.0, turn, step=step)
     splats = _scaled(splats, args)
-    if args.to == "spz" and (size := _median_size(splats)) < 4 * SPZ_STEP:
+    if args.to == "spz" and (size := float(np.median(splats.scales.max(axis=1)))) < 4 * SPZ_STEP:
         what = f"half of the Gaussians are smaller than {size:.2g} units"
         console.message(
             f"pd4dgs-export: {what}, and SPZ rounds positions to {SPZ_STEP:.2g}; --scale enlarges the scene"
@@ -168,12 +170,6 @@ def _scaled(splats: Splats, args: argparse.Namespace) -> Splats:
     if not len(splats.means):
         raise DataError(f"{args.input}: shows no Gaussian at this level and time, expected one at least to write")
     return splats.scaled(args.scale)
-
-
-def _median_size(splats: Splats) -> float:
-    import numpy as np
-
-    return float(np.median(splats.scales.max(axis=1)))
 
 
 def frame_times(info: SceneInfo, fps: float) -> list[float]:

@@ -74,7 +74,7 @@ class LayerReader:
             self._scene_id = scene_id_of(preamble.header)
         chunks = self.header.chunks
         while self._index < len(chunks):
-            if max_layer is not None and not _any_layer(chunks[self._index :], max_layer):
+            if max_layer is not None and all(layer > max_layer for layer in layers_of(chunks[self._index :])):
                 return False
             if max_bytes is not None and self.offset + CHUNK_OVERHEAD + chunks[self._index][1] > max_bytes:
                 return False
@@ -168,10 +168,6 @@ class LayerReader:
         self.slices = [*self.slices[:place], slices, *self.slices[place + 1 :]]
         self._merged = [*self._merged[:place], None, *self._merged[place + 1 :]]
         self._refined = [*self._refined[:layer], end, *self._refined[layer + 1 :]]
-
-
-def _any_layer(chunks: tuple[tuple[int, int], ...], max_layer: int) -> bool:
-    return any(layer <= max_layer for layer in layers_of(chunks))
 
 
 def _check_bounded(layer: LayerSymbols, header: Header) -> None:

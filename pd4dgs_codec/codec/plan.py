@@ -76,15 +76,10 @@ def _arrange(scene: Scene, kept: tuple[int, ...]) -> tuple[Scene, int]:
     groups = [np.flatnonzero(first == i) for i in range(len(kept))]
     order = np.concatenate([group[morton_order(scene.anchor_q[group])] if group.size else group for group in groups])
     rows = tuple(int(n) for n in np.cumsum([group.size for group in groups]))
-    _refuse_duplicates(scene.anchor_q[order])
+    if (row := first_duplicate(scene.anchor_q[order])) is not None:
+        raise EncodeError(f"anchor_q: voxel {row.tolist()} holds more than one anchor, expected one")
     if scene.grading is not None and not scene.grading.classes[order].any():
         scene = replace(scene, grading=None)
     masks_of = tuple(m[order][:n] for m, n in zip(masks, rows, strict=True))
     arranged = replace(scene, layers=kept, rows=rows, mask=masks_of, **scene.of_anchors(order))
     return arranged, scene.rows[-1] - order.size
-
-
-def _refuse_duplicates(anchor_q: np.ndarray) -> None:
-    row = first_duplicate(anchor_q)
-    if row is not None:
-        raise EncodeError(f"anchor_q: voxel {row.tolist()} holds more than one anchor, expected one")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -39,8 +40,4 @@ def level_psnr(
     step: Callable[[], None] = lambda: None,
 ) -> dict[int, float]:
     """Per level the mean over `views` of the mPSNR of draw(level, view), dB; infinite where nothing differs."""
-
-    def of_level(level: int) -> float:
-        return mean_scores(lambda view: draw(level, view), views, {"mpsnr": mpsnr}, step)["mpsnr"]
-
-    return {level: of_level(level) for level in levels}
+    return {level: mean_scores(partial(draw, level), views, {"mpsnr": mpsnr}, step)["mpsnr"] for level in levels}

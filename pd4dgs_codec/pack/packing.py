@@ -102,8 +102,11 @@ def pack(
     """
     if target_sizes and options.low_bits:
         raise EncodeError("target sizes with low bits: layer 1 brings those of layer 0 too, expected one or the other")
-    scene = source if isinstance(source, Scene) else _scene_of(source)
-    scene, options = options.apply_scale(scene)
+    if not isinstance(source, Scene):
+        from pd4dgs_codec.model.convert import to_scene
+
+        source = to_scene(source)
+    scene, options = options.apply_scale(source)
     left_out: list[LeftOut] = []
     if views is not None and views.held_out and options.layers == "auto" and min_gain:
         from pd4dgs_codec.pack.gains import leave_out_unpaid
@@ -177,12 +180,6 @@ def _frames(scene: Scene, views: Views | None, downscale: int) -> list[Frame]:
 
 def _cameras(views: Views | None) -> str:
     return "the file's own camera" if views is None else f"training views of {views.source}"
-
-
-def _scene_of(model: Model) -> Scene:
-    from pd4dgs_codec.model.convert import to_scene
-
-    return to_scene(model)
 
 
 def _fit(

@@ -81,11 +81,6 @@ class Field:
             values[:, columns] += head(hidden)
 
 
-def hidden_layers(network: Network) -> Layers:
-    """All but the last layer, with the ReLU behind them."""
-    return Layers(network[:-1], relu_last=True)
-
-
 def _with_padded_inputs(network: Network, channels: int, padded: int) -> Network:
     """The network for features of `padded` channels per scale, of which the first `channels` count."""
     (weight, bias), *rest = network

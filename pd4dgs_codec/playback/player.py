@@ -14,7 +14,7 @@ from pd4dgs_codec import threads
 from pd4dgs_codec.model import slot_kernels
 from pd4dgs_codec.model.slot_kernels import GAUSSIAN_WIDTH
 from pd4dgs_codec.model.visibility import FRUSTUM_MARGIN, LEAST_NEAR, MIN_OPACITY, OFFSET_REACH, SIGMA_REACH
-from pd4dgs_codec.playback.networks import Field, Layers, hidden_layers
+from pd4dgs_codec.playback.networks import Field, Layers
 from pd4dgs_codec.render.checks import check_time
 from pd4dgs_codec.render.rasteriser import draw
 from pd4dgs_codec.render.simd import LANES
@@ -197,7 +197,7 @@ class _SlotNetwork:
         weight, bias = network[-1]
         self._width = len(bias) // slots
         self._inputs = -(-weight.shape[1] // LANES) * LANES  # the kernel's rows; the padding is 0
-        self._hidden = hidden_layers(network) if len(network) > 1 else None
+        self._hidden = Layers(network[:-1], relu_last=True) if len(network) > 1 else None
         self._weight = np.zeros((len(bias), self._inputs), np.float32)
         self._weight[:, : weight.shape[1]] = weight
         self._bias = np.ascontiguousarray(bias)

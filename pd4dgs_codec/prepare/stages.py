@@ -129,7 +129,11 @@ def _poses(work: Path, times: dict[str, float], choices: Choices, progress: Prog
     with progress(None, "frames", "poses") as advance:
         first = _checked(poses.reconstruct(database, images, work / "first", choices.threads, advance), len(names))
     verdicts = poses.moving_features(database, first)
-    moving = {name: each.moving(first.image(key).camera.width) for key, name, each in _by_image(first, verdicts)}
+    moving = {
+        image.name: verdicts[image.name].moving(first.image(key).camera.width)
+        for key, image in first.images.items()
+        if image.name in verdicts
+    }
     model = first
     if any(each.any() for each in moving.values()):
         shutil.copyfile(database, still)
@@ -143,10 +147,6 @@ def _poses(work: Path, times: dict[str, float], choices: Choices, progress: Prog
     target.mkdir(parents=True, exist_ok=True)
     model.write(target)
     return Findings(model, verdicts, moving)
-
-
-def _by_image(model: Any, verdicts: dict[str, Any]) -> list[tuple[int, str, Any]]:
-    return [(key, image.name, verdicts[image.name]) for key, image in model.images.items() if image.name in verdicts]
 
 
 def _checked(model: Any | None, count: int) -> Any:

@@ -179,10 +179,14 @@ def _deformation() -> Iterator[Case]:
     row = partial(Case, "deformation")
     swing, still = np.linspace(0, 1, 31).tolist(), [0.0, 0.5, 1.0]
     exact, finite = "the residuals of float64, by model and encoder", "finite pictures"
+    rows = np.arange(12)[:, None]  # of time
+    tearing = partial(_field, xy=np.where(np.arange(36).reshape(6, 6) % 2, 3.0, -3.0))
+    teleporting = partial(_field, xt=np.where(rows > 5, 3.0, 0.0) * np.ones(6))
+    swinging = partial(_field, xt=np.where(rows % 2, 2.0, -2.0) * np.ones(6))
     fields: list[tuple[str, str, Callable[[], Deformation], Sequence[float]]] = [
-        ("tears", "neighbouring cells of xy at -3 and 3 scene units", _tearing, still),
-        ("teleports", "0 up to a time row, 3 scene units from the next on", _teleporting, _around(11, 5, 6)),
-        ("oscillates faster than the time grid", "+-2 scene units in alternate time rows, and between them", _swinging,
+        ("tears", "neighbouring cells of xy at -3 and 3 scene units", tearing, still),
+        ("teleports", "0 up to a time row, 3 scene units from the next on", teleporting, _around(11, 5, 6)),
+        ("oscillates faster than the time grid", "+-2 scene units in alternate time rows, and between them", swinging,
          swing),
         ("moves everything by 5e5", "every anchor leaves the view by 5e5 scene units", partial(_moved, 5e5), (0.5,)),
     ]  # fmt: skip
@@ -213,18 +217,6 @@ def _field(**values: np.ndarray) -> Deformation:
     head = np.array([[1, 0, -1, 0], [0, 1, 0, -1], [0, 0, 0, 0]], np.float32) / deformation_unit(BOX)
     trunk: Network = ((both, np.zeros(4, np.float32)),)
     return Deformation((planes,), {"trunk": trunk, "position": ((head, np.zeros(3, np.float32)),)})
-
-
-def _tearing() -> Deformation:
-    return _field(xy=np.where(np.arange(36).reshape(6, 6) % 2, 3.0, -3.0))
-
-
-def _teleporting() -> Deformation:
-    return _field(xt=np.where(np.arange(12)[:, None] > 5, 3.0, 0.0) * np.ones((1, 6)))
-
-
-def _swinging() -> Deformation:
-    return _field(xt=np.where(np.arange(12)[:, None] % 2, 2.0, -2.0) * np.ones((1, 6)))
 
 
 def _moved(by: float) -> Deformation:
