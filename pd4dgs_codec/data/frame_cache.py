@@ -115,42 +115,39 @@ def _store(video: Video, target: Path, treat: Callable[[np.ndarray], np.ndarray]
     limit = _limit()
     compress = zstandard.ZstdCompressor(level=LEVEL).compress
     offsets, shape = [0], (0, 0, 0)
-    temporary = None
     try:
         target.parent.mkdir(parents=True, exist_ok=True)
         others = sum(file.stat().st_size for file in target.parent.glob("*.frames"))
-        with tempfile.NamedTemporaryFile(dir=target.parent, prefix=".pd4dgs-", delete=False) as stream:
-            temporary = Path(stream.name)
-            for picture in video.pictures:
-                frame = np.ascontiguousarray(treat(picture))
-                shape = frame.shape
-                steps = frame.copy()
-                steps[:, 1:] -= frame[:, :-1]
-                data = compress(steps)
-                stream.write(data)
-                offsets.append(offsets[-1] + len(data))
-                if others + offsets[-1] > limit:
-                    others = _make_room(target.parent, limit - offsets[-1])
-                if others + offsets[-1] > limit:
-                    raise DataError(
-                        f"{video.path}: its first {len(offsets) - 1} frames take {limit / 2**30:g} GiB; expected "
-                        f"a larger {SIZE} or a larger --downscale"
-                    )
-        if len(offsets) == 1:
-            raise DataError(f"{video.path}: holds no frame, expected one at least")
-        table = np.array(offsets, np.int64)
-        with tempfile.NamedTemporaryFile(dir=target.parent, prefix=".pd4dgs-", delete=False) as stream:
-            np.savez(stream, offsets=table, shape=shape, fps=video.fps)
-        os.replace(stream.name, target.with_suffix(".npz"))
-        os.replace(temporary, target)
+        with tempfile.TemporaryDirectory(dir=target.parent, prefix=".pd4dgs-") as folder:
+            frames, index = Path(folder) / "frames", Path(folder) / "index.npz"
+            with frames.open("wb") as stream:
+                for picture in video.pictures:
+                    frame = np.ascontiguousarray(treat(picture))
+                    shape = frame.shape
+                    steps = frame.copy()
+                    steps[:, 1:] -= frame[:, :-1]
+                    data = compress(steps)
+                    stream.write(data)
+                    offsets.append(offsets[-1] + len(data))
+                    if others + offsets[-1] > limit:
+                        others = _make_room(target.parent, limit - offsets[-1])
+                    if others + offsets[-1] > limit:
+                        raise DataError(
+                            f"{video.path}: its first {len(offsets) - 1} frames take {limit / 2**30:g} GiB; expected "
+                            f"a larger {SIZE} or a larger --downscale"
+                        )
+            if len(offsets) == 1:
+                raise DataError(f"{video.path}: holds no frame, expected one at least")
+            table = np.array(offsets, np.int64)
+            np.savez(index, offsets=table, shape=shape, fps=video.fps)
+            os.replace(index, target.with_suffix(".npz"))
+            os.replace(frames, target)
     except OSError as error:
         full = error.errno == errno.ENOSPC
         what = "the disk is full" if full else error.strerror or str(error)
         raise DataError(f"{target.parent}: cannot keep the frames of {video.path.name}: {what}") from None
     finally:
         video.pictures.close()
-        if temporary is not None:
-            temporary.unlink(missing_ok=True)
     return StoredFrames(target, table, shape, video.fps)
 
 

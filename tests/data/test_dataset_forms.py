@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import json
 import zipfile
 from pathlib import Path
@@ -303,6 +304,15 @@ def test_the_cache_stays_within_its_size(scene, tmp_path, monkeypatch, cache):
     assert not list(cache.glob(".pd4dgs-*"))
     monkeypatch.setenv(frame_cache.SIZE, "much")
     refused(folder, "PD4DGS_CACHE_GIB is 'much', expected GiB > 0", downscale=3)
+
+
+def test_a_disk_that_fills_behind_the_frames_keeps_nothing_of_them(scene, tmp_path, monkeypatch, cache):
+    def full(*_: object, **__: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(frame_cache.np, "savez", full)
+    refused(write_synchronised(scene, tmp_path / "set"), "the disk is full")
+    assert not list(cache.iterdir())
 
 
 def test_a_cache_that_was_emptied_or_broken_is_one_line_and_made_anew(scene, tmp_path, cache):
