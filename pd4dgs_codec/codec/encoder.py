@@ -158,6 +158,7 @@ def encode_with_report(
     reports = [_layer_report(layer, slices) for layer, slices in zip(symbols, written, strict=True)]
     kept = sum(r.anchors for r in reports)
     kept_bits = sum(r.position_bits + s.payload_bits for r in reports for s in r.streams if s.name == "attributes")
+    kept_bits += sum(s.payload_bits for r in reports for s in r.streams if s.name == "low_bits")
     rows = [item.row(scene.steps, options, kept, kept_bits) for item in (*left_out, *omitted)]
     seconds = round(time.perf_counter() - started, 4)
     about_bytes = CHUNK_OVERHEAD + len(about) if about else 0

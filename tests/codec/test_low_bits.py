@@ -110,6 +110,11 @@ def test_slices_keep_to_their_size_and_the_report_has_the_low_bits():
     assert len(data) < 1.15 * len(low(0)[0])
 
 
+def test_what_is_left_out_would_have_cost_its_low_bits_too():
+    plain, late = ([row["bytes"] for row in low(bits)[1].left_out if "anchors" in row["what"]] for bits in (0, 2))
+    assert len(plain) == len(late) == 1 and plain[0] < late[0] < 1.3 * plain[0]
+
+
 def test_without_slices_each_layer_is_refined_at_once():
     data, report = low(1, 0)
     assert [len(layer.slices) for layer in report.layers] == [1, 3] and ends_of(data)[1] == 2
