@@ -22,12 +22,11 @@ def to_scene(model: Model) -> Scene:
     for name, tensor in model.state_dict().items():
         if tensor.is_floating_point() and not torch.isfinite(tensor).all():
             raise DataError(f"model tensor {name} holds a NaN or an infinity; expected finite numbers")
-    fields = (model.global_deformation, model.local_deformation)
-    layers = (0, *(i + 1 for i, deformation in enumerate(fields) if deformation is not None))
+    deformations = {layer: field.arrays() for layer, field in model.deformations.items()}
+    layers = (0, *deformations)
     n = len(model.anchor_q)
     with torch.no_grad():
         masks = tuple(mask_codes(model.masks(layer).cpu().numpy()) for layer in layers)
-    global_deformation, local_deformation = (None if f is None else f.arrays() for f in fields)
     return Scene(
         info=model.info,
         steps=model.steps,
@@ -39,8 +38,8 @@ def to_scene(model: Model) -> Scene:
         offset=_numpy(model.offset),
         mask=masks,
         networks={name: model.network(name).arrays() for name in SCAFFOLD_NETWORKS},
-        global_deformation=global_deformation,
-        local_deformation=local_deformation,
+        global_deformation=deformations.get(1),
+        local_deformation=deformations.get(2),
         grading=Grading(_numpy(model.step_class), _numpy(model.centre)) if model.step_class.any() else None,
     )
 

@@ -129,9 +129,15 @@ class Model(nn.Module):
         return {name: part.view(shape) for (name, shape), part in zip(shapes.items(), parts, strict=True)}
 
     @property
+    def deformations(self) -> dict[int, DeformationField]:
+        """By layer, 1 and 2, those that there are."""
+        fields = {1: self.global_deformation, 2: self.local_deformation}
+        return {layer: field for layer, field in fields.items() if field is not None}
+
+    @property
     def level(self) -> int:
         """The highest level that differs from the one below in more than its masks."""
-        return 2 if self.local_deformation is not None else 1 if self.global_deformation is not None else 0
+        return max(self.deformations, default=0)
 
     def network(self, name: str) -> MLP:
         """One of the scaffold's decoders."""
@@ -186,7 +192,7 @@ class Model(nn.Module):
             (centres["feature"], centres["offset"], centres["scaling_log"]),
         )
         if level >= 1 and (field := self.global_deformation) is not None and field.heads:
-            anchors = fused.moved(anchors, field, widths.global_heads, t, *self._field_steps("global", rounding), False)
+            anchors = fused.moved(anchors, field, widths.global_heads, t, *self._field_steps(1, rounding), False)
         step = steps.weights_scaffold if rounding.weights else None
         networks = [self.network(name) for name in SCAFFOLD_NETWORKS]
         mask = masks.index_select(0, rows)
@@ -195,7 +201,7 @@ class Model(nn.Module):
         )
         loose = level >= 2 and self.local_deformation is not None
         if (field := self.local_deformation) is not None and loose and field.heads:
-            found = fused.moved(found, field, LOCAL_HEADS, t, *self._field_steps("local", rounding), True)
+            found = fused.moved(found, field, LOCAL_HEADS, t, *self._field_steps(2, rounding), True)
         means, quats, scales, opacities, colors = fused.finish(found, gates, loose)
         owner = rows.index_select(0, torch.div(keep, widths.slots, rounding_mode="floor"))
         slots = owner * widths.slots + keep % widths.slots
@@ -211,7 +217,7 @@ class Model(nn.Module):
         position = self.anchor.index_select(0, rows)
         feature, scaling_log, offset = (self._attribute(name, rows, rounding) for name in ATTRIBUTES)
         if level >= 1 and self.global_deformation is not None:
-            residuals = self.global_deformation(position, t, *self._field_steps("global", rounding))
+            residuals = self.global_deformation(position, t, *self._field_steps(1, rounding))
             position = _moved(position, residuals, "position")
             feature = _moved(feature, residuals, "feature")
             offset = _moved(offset, residuals, "offset")
@@ -227,7 +233,7 @@ class Model(nn.Module):
             position, scaling_log.exp(), offset, raw_opacity, mask, shape, keep
         )
         if level >= 2 and self.local_deformation is not None:
-            residuals = self.local_deformation(means, t, *self._field_steps("local", rounding))
+            residuals = self.local_deformation(means, t, *self._field_steps(2, rounding))
             means = _moved(means, residuals, "mean")
             scales = F.relu(_moved(scales, residuals, "scale")) if "scale" in residuals else scales
             quats = F.normalize(_moved(quats, residuals, "quat"), dim=1) if "quat" in residuals else quats
@@ -254,12 +260,9 @@ class Model(nn.Module):
             step = getattr(steps, name) * self.spacing.view(-1, *(1,) * centre.dim())
             values.copy_(centre + torch.round((values - centre) / step) * step)
         parts: list[tuple[nn.Module, float]] = [(self.networks, steps.weights_scaffold)]
-        for field, planes, weights in (
-            (self.global_deformation, steps.planes_global, steps.weights_global),
-            (self.local_deformation, steps.planes_local, steps.weights_local),
-        ):
-            if field is not None:
-                parts += [(field.planes, planes), (field.trunk, weights), (field.heads, weights)]
+        for layer, field in self.deformations.items():
+            weights = steps.weights(layer)
+            parts += [(field.planes, steps.planes(layer)), (field.trunk, weights), (field.heads, weights)]
         for module, step in parts:
             for parameter in module.parameters():
                 parameter.copy_(torch.round(parameter / step) * step)
@@ -270,7 +273,7 @@ class Model(nn.Module):
 
     def _fusible(self) -> bool:
         """Whether `fused` can evaluate all of the model."""
-        fields = [field for field in (self.global_deformation, self.local_deformation) if field is not None]
+        fields = self.deformations.values()
         networks = [(self.network(name), 2) for name in SCAFFOLD_NETWORKS]
         networks += [(field.trunk, len(field.trunk.layers)) for field in fields]
         fits = all(fused.supports(*pair) for pair in networks) and all(map(fused.supports_field, fields))
@@ -287,11 +290,9 @@ class Model(nn.Module):
         parts = torch.split(hidden, [len(b) for _, b in first], dim=1)
         return [(part, *layers[1]) for part, layers in zip(parts, networks, strict=True)]
 
-    def _field_steps(self, field: str, rounding: Rounding) -> tuple[float | None, float | None]:
-        """Of planes and weights of the field global or local, if they are rounded."""
-        if not rounding.weights:
-            return None, None
-        return getattr(self.steps, f"planes_{field}"), getattr(self.steps, f"weights_{field}")
+    def _field_steps(self, layer: int, rounding: Rounding) -> tuple[float | None, float | None]:
+        """Of planes and weights of a layer's deformation, if they are rounded."""
+        return (self.steps.planes(layer), self.steps.weights(layer)) if rounding.weights else (None, None)
 
     def _attribute(self, name: str, rows: Tensor, rounding: Rounding) -> Tensor:
         picked: Tensor = getattr(self, name).index_select(0, rows)

@@ -28,7 +28,7 @@ from pd4dgs_codec.model.plane_rate import exact_bits
 from pd4dgs_codec.model.rounding import EXACT, Noise, Rounding
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train import grading, judge, losses, prefixes, pruning, whitening, workers
-from pd4dgs_codec.train.config import PlaneWeights, Schedule, TrainConfig
+from pd4dgs_codec.train.config import Schedule, TrainConfig
 from pd4dgs_codec.train.densify import Densifier
 from pd4dgs_codec.train.initialise import fresh_model
 from pd4dgs_codec.train.optimiser import Optimiser
@@ -140,8 +140,8 @@ class Learner:
         """The sum of R(a) of the planes of layers 1 and 2 as they would be coded now, in the groups of `--priors
         gauss`; 0 where there are none."""
         steps = self.model.steps.scaled(1.0)
-        fields = enumerate((self.model.global_deformation, self.model.local_deformation), 1)
-        return [0.0 if f is None else exact_bits(f.planes.plane_arrays(), steps.planes(i)) for i, f in fields]
+        found = {i: exact_bits(f.planes.plane_arrays(), steps.planes(i)) for i, f in self.model.deformations.items()}
+        return [found.get(1, 0.0), found.get(2, 0.0)]
 
     def level_psnr(self, views: Sequence[View]) -> list[float]:
         """Per level of the model the mean mPSNR over `views`, dB, rounded as the steps round by now, without noise."""
@@ -274,28 +274,22 @@ class Learner:
         if config.volume and len(picture.gaussians.scales):
             terms["volume"] = picture.gaussians.scales.prod(dim=1).mean()
             loss = loss + config.volume * terms["volume"]
-        fields = (
-            ("global", self.model.global_deformation, config.global_planes),
-            ("local", self.model.local_deformation, config.local_planes),
-        )
-        for name, field, weights in fields[:level]:
-            if field is not None:
-                loss = loss + self._plane_terms(name, field, weights, terms)
+        for layer, field in self.model.deformations.items():
+            if layer <= level:
+                loss = loss + self._plane_terms(layer, field, terms)
         if mask_terms:
             loss = loss + self._mask_terms(level, terms)
         return picture, terms, loss
 
-    def _plane_terms(
-        self, name: str, field: DeformationField, weights: PlaneWeights, terms: dict[str, Tensor]
-    ) -> Tensor:
+    def _plane_terms(self, layer: int, field: DeformationField, terms: dict[str, Tensor]) -> Tensor:
+        name, weights = {1: ("global", self.config.global_planes), 2: ("local", self.config.local_planes)}[layer]
         total = torch.zeros((), device=self.device)
         for term, value in field.planes.regularisers().items():
             terms[f"{name}_{term}"] = value
             total = total + getattr(weights, term) * value
         weight = self.config.plane_rate * self.schedule.pressure(self.place)
         if weight:
-            step = self.model.steps.planes({"global": 1, "local": 2}[name])
-            terms[f"{name}_rate_proxy"] = field.planes.proxy_bits(step)
+            terms[f"{name}_rate_proxy"] = field.planes.proxy_bits(self.model.steps.planes(layer))
             total = total + weight * terms[f"{name}_rate_proxy"]
         return total
 
@@ -365,9 +359,9 @@ class Learner:
         if not waiting:
             return []
         psnr = workers.alike(lambda: self.level_psnr([self.dataset.train[index] for index in waiting]))
-        fields = (self.model.global_deformation, self.model.local_deformation)
-        sizes = [0.0 if f is None else judge.field_bytes(f, b) for f, b in zip(fields, self.plane_bits(), strict=True)]
-        found = judge.levels_without_gain(psnr, [0.0, *sizes])
+        fields, bits = self.model.deformations, [0.0, *self.plane_bits()]
+        sizes = [judge.field_bytes(fields[i], bits[i]) if i in fields else 0.0 for i in range(3)]
+        found = judge.levels_without_gain(psnr, sizes)
         for level, _ in found:
             judge.drop_level(self.model, self.optimiser, level)
         self.left_out = [{"level": level, "gain": gain, "views": len(waiting)} for level, gain in found]
@@ -386,10 +380,11 @@ class Learner:
         order = [i for i in range(len(self.shots)) if i not in waiting]
         stride = -(-len(order) // pruning.VIEWS)
         shots = [self.shots[i] for i in order[turn % stride :: stride]]
-        levels = range(self.model.level if self.config.rollout == "top" else 0, self.model.level + 1)
         before, share = len(self.model.anchor_q), self.config.prune / len(self.schedule.prune)
         try:
-            keep, later = pruning.prune(self.model, self.optimiser, shots, levels, share, turn, self._rounding())
+            keep, later = pruning.prune(
+                self.model, self.optimiser, shots, self._levels(), share, turn, self._rounding()
+            )
         except NotFinite:  # as a step that diverged: passed over, with nothing changed
             return ()
         self.densifier.keep(keep)
@@ -403,7 +398,7 @@ class Learner:
         if not (self.config.noise and enough and self._reached(self.schedule.rounding)):
             return []
         stride = -(-len(self.shots) // grading.VIEWS)
-        levels = range(self.model.level if self.config.rollout == "top" else 0, self.model.level + 1)
+        levels = self._levels()
         rounding, shots, found = replace(self._rounding(), noise=None), self.shots[::stride], list[int]()
         try:
             if self.config.grading:
@@ -415,6 +410,10 @@ class Learner:
         except NotFinite:  # as a step that diverged: passed over
             return []
         return found
+
+    def _levels(self) -> range:
+        """Those that the run trains."""
+        return range(self.model.level if self.config.rollout == "top" else 0, self.model.level + 1)
 
     def _rank(self) -> None:
         """Where the last third begins, if prefixes are to be trained: the order of the anchors in a file."""

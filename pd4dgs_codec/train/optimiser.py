@@ -32,7 +32,7 @@ class Optimiser:
         self.model, self.rates, self.cooldown = model, rates, cooldown
         groups: dict[str, list[nn.Parameter]] = {name: [getattr(model, name)] for name in PER_ANCHOR}
         groups |= {name: list(net.parameters()) for name, net in model.networks.items()}
-        fields = [f for f in (model.global_deformation, model.local_deformation) if f is not None]
+        fields = model.deformations.values()
         groups["planes"] = [p for f in fields for p in f.planes.parameters()]
         groups["deformation"] = [p for f in fields for part in (f.trunk, f.heads) for p in part.parameters()]
         self.groups = {name: params for name, params in groups.items() if params}

@@ -107,13 +107,10 @@ def _of_checkpoint(path: str | Path, max_layer: int | None, device: str) -> list
     from pd4dgs_codec.model import checkpoint
 
     model, _ = checkpoint.load(path)
-    present = [0]
-    present += [1] if model.global_deformation is not None else []
-    present += [2] if model.local_deformation is not None else []
     model = model.to(device)
     with torch.no_grad():
         return [
             Level(level, model, int((model.masks(level) > MASK_THRESHOLD).sum()))
-            for level in present
+            for level in (0, *model.deformations)
             if max_layer is None or level <= max_layer
         ]

@@ -18,8 +18,10 @@ from pd4dgs_codec.codec.encoder import LayerReport, Report, encode, encode_with_
 from pd4dgs_codec.codec.options import EncodeOptions
 from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.data.dataset import load
+from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.jsonable import finite
 from pd4dgs_codec.model.convert import to_scene
+from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.pack.train_rate import train_rate_bits
 from pd4dgs_codec.scene import Scene
 from pd4dgs_codec.train.config import Schedule, TrainConfig
@@ -57,11 +59,8 @@ def run_job(job: Job, folder: Path, *, say: Callable[[str], None], progress: Any
     folder.mkdir(parents=True, exist_ok=True)
     config = job.config
     say(f"{job.name}: reading {config.source}")
-    dataset = load(config.source, downscale=config.downscale, holdout=config.holdout)
     path = folder / "model.pt"
-    model, training = ensure_trained(
-        config, dataset, path, say=lambda text: say(f"{job.name}: {text}"), progress=progress
-    )
+    dataset, model, training = _trained(config, path, job.name, say, progress)
     say(f"{job.name}: packing {len(model.anchor_q)} anchors in {len(VARIANTS)} ways")
     planned, left_out = plan(to_scene(model))
     files = {
@@ -106,14 +105,19 @@ def run_job(job: Job, folder: Path, *, say: Callable[[str], None], progress: Any
 
 def pack_seed(job: Job, folder: Path, *, say: Callable[[str], None], progress: Any = None) -> list[dict[str, Any]]:
     """Levels of the file of another seed, trained in folder/name/seed-N, as `run_job` measures them of seed 0."""
-    config = job.config
-    dataset = load(config.source, downscale=config.downscale, holdout=config.holdout)
-    path = folder / job.name / f"seed-{config.seed}" / "model.pt"
-    label = f"{job.name}, seed {config.seed}"
-    model, _ = ensure_trained(config, dataset, path, say=lambda text: say(f"{label}: {text}"), progress=progress)
+    path, label = folder / job.name / f"seed-{job.config.seed}" / "model.pt", f"{job.name}, seed {job.config.seed}"
+    dataset, model, _ = _trained(job.config, path, label, say, progress)
     say(f"{label}: packing")
     levels: list[dict[str, Any]] = evaluate_file(encode(to_scene(model)), dataset)["levels"]
     return levels
+
+
+def _trained(
+    config: TrainConfig, path: Path, label: str, say: Callable[[str], None], progress: Any
+) -> tuple[Dataset, Model, dict[str, Any]]:
+    """The data, and the model in `path` with its training state."""
+    dataset = load(config.source, downscale=config.downscale, holdout=config.holdout)
+    return dataset, *ensure_trained(config, dataset, path, say=lambda text: say(f"{label}: {text}"), progress=progress)
 
 
 def coding_rows(reports: dict[str, Report], planned: Scene) -> list[dict[str, Any]]:

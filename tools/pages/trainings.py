@@ -31,11 +31,10 @@ def ensure_trained(
     path.parent.mkdir(parents=True, exist_ok=True)
     say(f"training, preset {config.preset}, {len(dataset.train)} views")
     log = path.with_name("train.jsonl")
+    trainer = Trainer(config, dataset)
     if stored is None:
         log.unlink(missing_ok=True)
-        trainer = Trainer(config, dataset)
     else:
-        trainer = Trainer(config, dataset)
         trainer.resume(path)
         say(f"going on from step {trainer.iteration}")
     trainer.run(path, log=log, progress=progress)
