@@ -1,47 +1,70 @@
-"""What each lever on a file's size gains, alone and together, and the curve of the quality dial against that without.
+"""What makes files small: the quality dial against an earlier commit, and each lever alone. Writes docs/levers.md.
 
-    python tools/levers.py bouncing-balls [--preset tiny] [--iterations 1500] [--quality 20,50,80] [--scales 0.1,1]
+    python tools/levers.py --before FOLDER [--only NAME ...] [--out out] [--docs docs] [--render]
 
-Trains every variant with one seed and equal steps, packs it, and prints a Markdown table: cumulative bytes and held-out
-dB per level. "before" is the trainer without the levers, at each of --scales as its rate scale. Where both curves have
-two points and more, the last lines give Bjontegaard's difference per level: the mean difference of log bytes over the
-dB that both reach, piecewise linear (VCEG-M33 takes cubics). Trainings that ended in --out are kept.
+FOLDER is a checkout of another commit of this project whose own trainer left FOLDER/out/NAME/model.pt. Its own
+`pd4dgs-encode` packs that as it is, and with --target-size, every layer at the same share of what it takes then. Beside
+it stand trainings of this commit at some qualities, as long as tools/results.py has them, packed by default; and, of
+LEVER_STEPS steps, the trainer without its levers, with each alone, and with all. Trainings that ended in
+--out/NAME/quality-Q or --out/NAME/levers are kept; a scene takes some two hours of one processor else. Bjontegaard's
+difference is the mean difference of log bytes over the dB that both curves reach, piecewise linear (VCEG-M33 takes
+cubics).
 """
 
 from __future__ import annotations
 
-import argparse
+import json
+import os
+import subprocess
 import sys
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pages.scenes import SCENES
+from pages.page import Page, Row, make, options, paragraph, say
+from pages.scenes import SCENES, Scene, present
 from pages.trainings import ensure_trained
 
 from pd4dgs_codec.bench.report import markdown
-from pd4dgs_codec.codec.encoder import encode
-from pd4dgs_codec.model.convert import to_scene
+from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.scene import Steps
 from pd4dgs_codec.threads import configure
-from pd4dgs_codec.train.config import DEFAULT_QUALITY, TrainConfig, at_quality
-from pd4dgs_codec.view.evaluate import evaluate_file
+from pd4dgs_codec.train.config import DEFAULT_QUALITY, at_quality
 
-Changes = dict[str, Any]
-Points = Sequence[tuple[float, float]]  #: (bytes, dB)
+NAMES = ("shelf-hand", "bouncing-balls")
+QUALITIES = (30.0, 50.0, 65.0, DEFAULT_QUALITY, 95.0)
+#: Of the bytes that a layer of the file before takes as it is packed by default.
+SHARES = (1.0, 0.85, 0.7, 0.55, 0.42)
+LEVER_STEPS = 1_500
 
-#: The trainer without the levers: steps, pruning and rates of 9275c5f.
-BEFORE: Changes = {"steps": Steps(), "rate_scale": 0.1, "plane_rate": 0.0, "prune": 0.01, "step_scale": 1.0}
+#: The trainer without the levers: the steps, pruning and rates of 9275c5f.
+WITHOUT: dict[str, Any] = {
+    "steps": Steps(),
+    "rate_scale": 0.1,
+    "plane_rate": 0.0,
+    "prune": 0.01,
+    "step_scale": 1.0,
+    "grading": 0.0,
+    "whitening": False,
+}
+
+Points = Sequence[tuple[float, float]]  #: (bytes so far, held-out mPSNR in dB)
 
 
-def levers() -> dict[str, Changes]:
-    """Each lever alone, at its default."""
-    middle = at_quality(DEFAULT_QUALITY)
+def levers() -> dict[str, dict[str, Any]]:
+    """Changes of a training by the lever that they are, each alone at its default."""
+    default = at_quality(DEFAULT_QUALITY)
     return {
-        "planes' rate and steps": BEFORE | {"steps": None, "plane_rate": middle["plane_rate"]},
-        "coarser steps": BEFORE | {"step_scale": middle["step_scale"]},
-        "pruning": BEFORE | {"prune": middle["prune"]},
+        "none": WITHOUT,
+        "planes' rate and steps": WITHOUT | {"steps": None, "plane_rate": default["plane_rate"]},
+        "anchors' rate": WITHOUT | {"rate_scale": default["rate_scale"]},
+        "coarser steps": WITHOUT | {"step_scale": default["step_scale"]},
+        "pruning": WITHOUT | {"prune": default["prune"]},
+        "step classes": WITHOUT | {"grading": default["grading"]},
+        "step classes, mixed features": WITHOUT | {"grading": default["grading"], "whitening": True},
+        "all": {},
     }
 
 
@@ -55,59 +78,169 @@ def bjontegaard(curve: Points, reference: Points) -> float | None:
     return float(np.exp((np.interp(at, *ours) - np.interp(at, *theirs)).mean()) - 1)
 
 
-def measure(name: str, changes: Changes, args: argparse.Namespace) -> list[tuple[float, float]]:
-    """(cumulative bytes, held-out dB) per level of the variant's file."""
-    scene = SCENES[args.scene]
-    config = TrainConfig(
-        preset=args.preset,
-        source=scene.source,
-        downscale=scene.downscale,
-        iterations=args.iterations,
-        seed=args.seed,
-        **changes,
-    )
+def command(checkout: Path, name: str, *arguments: str) -> Row:
+    """What the command `name` of `checkout` prints with --json."""
+    program = f"import sys; from pd4dgs_codec.cli.{name} import main; sys.exit(main())"
+    environment = os.environ | {"PYTHONPATH": str(checkout)}
+    line = [sys.executable, "-c", program, *arguments, "--json"]
+    done = subprocess.run(line, env=environment, capture_output=True, text=True, cwd=checkout)
+    if done.returncode:
+        raise DataError(f"{name} of {checkout}: {(done.stderr.strip().splitlines() or ['it failed'])[-1]}")
+    row: Row = json.loads(done.stdout)
+    return row
+
+
+def curve_before(checkout: Path, scene: Scene) -> list[Points]:
+    """The levels of the checkout's file of a scene at each of SHARES."""
+    data = [scene.source, "--downscale", str(scene.downscale)]
+    model, found, whole = checkout / "out" / scene.name / "model.pt", list[Points](), list[int]()
+    with tempfile.TemporaryDirectory() as folder:
+        file = str(Path(folder) / "scene.pd4")
+        for share in SHARES:
+            targets = ",".join(f"L{layer}={round(share * size)}" for layer, size in enumerate(whole))
+            arguments = [str(model), "-o", file, "--overwrite", "--data", *data]
+            command(checkout, "encode", *arguments, *(["--target-size", targets] if whole else []))
+            levels = command(checkout, "eval", file, *data)["levels"]
+            found.append([(row["cumulative_bytes"], row["mpsnr"]) for row in levels])
+            ends = [0, *(size for size, _ in found[0])]
+            whole = [int(end - start) for start, end in zip(ends, ends[1:], strict=False)]
+            say(f"  {checkout.name}, {share:.0%}: {found[-1]}")
+    return found
+
+
+def trained(scene: Scene, path: Path, changes: dict[str, Any]) -> Points:
+    """The levels of a training of this commit, packed by default."""
+    from pd4dgs_codec.model.convert import to_scene
+    from pd4dgs_codec.pack.packing import pack
+    from pd4dgs_codec.view.evaluate import evaluate_file
+
     dataset = scene.load()
-    path = args.out / args.scene / f"{name}-{args.preset}-{args.iterations}-{args.seed}" / "model.pt"
-    model, _ = ensure_trained(config, dataset, path, say=lambda text: print(f"{name}: {text}", file=sys.stderr))
-    data = encode(to_scene(model), effort=args.effort, omit=args.omit)
-    return [(row["cumulative_bytes"], row["mpsnr"]) for row in evaluate_file(data, dataset)["levels"]]
+    model, _ = ensure_trained(scene.config(**changes), dataset, path, say=lambda text: say(f"  {text}"))
+    rows = evaluate_file(pack(to_scene(model)).data, dataset)["levels"]
+    found = [(row["cumulative_bytes"], row["mpsnr"]) for row in rows]
+    say(f"  {path.parent.name}: {found}")
+    return found
+
+
+def measure(scene: Scene, before: Path, out: Path) -> Row:
+    """Points of both curves and of the levers, all by level."""
+    head = ["git", "-C", str(before), "rev-parse", "--short=7", "HEAD"]
+    commit = subprocess.run(head, capture_output=True, text=True, check=True).stdout.strip()
+    folder = out / scene.name
+    places = {q: folder / f"quality-{q:g}" if q != DEFAULT_QUALITY else folder for q in QUALITIES}
+    after = [trained(scene, place / "model.pt", at_quality(q)) for q, place in places.items()]
+    short = {"iterations": LEVER_STEPS}
+    alone = {
+        name: trained(scene, folder / "levers" / name.replace(" ", "-") / "model.pt", short | changes)
+        for name, changes in levers().items()
+    }
+    return {"before_commit": commit, "before": curve_before(before, scene), "after": after, "levers": alone}
+
+
+def gains(row: Row) -> list[float | None]:
+    """Bjontegaard's difference at each level that both curves have in two points or more."""
+    found = []
+    for level in range(3):
+        curves = [[points[level] for points in row[side] if level < len(points)] for side in ("after", "before")]
+        if min(map(len, curves)) > 1:
+            found.append(bjontegaard(*curves))
+    return found
+
+
+def plot(rows: Sequence[Row], path: Path) -> None:
+    """One panel per scene; a line per level, before dashed."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+
+    figure, axes = pyplot.subplots(1, len(rows), figsize=(5.6 * len(rows), 4.2), squeeze=False)
+    for axis, row in zip(axes.flat, rows, strict=True):
+        for side, style, shade in (("before", "--", "0.6"), ("after", "-", "black")):
+            for level in range(3):
+                points = sorted(found[level] for found in row[side] if level < len(found))
+                if points:
+                    sizes, db = zip(*points, strict=True)
+                    name = f"level {level}, {row['before_commit'] if side == 'before' else 'now'}"
+                    kilo = [size / 1000 for size in sizes]
+                    axis.plot(kilo, db, style, color=shade, marker="os^"[level], ms=4, lw=1, label=name)
+        axis.set(title=row["name"], xlabel="kB up to the level", ylabel="held-out mPSNR, dB")
+        axis.grid(alpha=0.3)
+        axis.legend(fontsize=8)
+    figure.tight_layout()
+    figure.savefig(path, dpi=100)
+    pyplot.close(figure)
 
 
 def _cells(points: Points) -> tuple[str, str]:
-    return " / ".join(f"{db:.2f}" for _, db in points), " / ".join(f"{size / 1e3:.1f}" for size, _ in points)
+    return " / ".join(f"{size / 1e3:.1f}" for size, _ in points), " / ".join(f"{db:.2f}" for _, db in points)
 
 
-def _numbers(text: str) -> list[float]:
-    return [float(part) for part in text.split(",") if part]
+def render(rows: Sequence[Row]) -> str:
+    """The page."""
+    differences, each, alone = [], [], []
+    for row in rows:
+        found = [f"{gain:+.0%}" if gain is not None else "no dB in common" for gain in gains(row)]
+        differences.append((row["name"], *found, *[""] * (3 - len(found))))
+        for share, points in zip(SHARES, row["before"], strict=True):
+            each.append((row["name"], row["before_commit"], f"{share:.0%} of each layer", *_cells(points)))
+        for quality, points in zip(QUALITIES, row["after"], strict=True):
+            each.append((row["name"], "now", f"--quality {quality:g}", *_cells(points)))
+        alone += [(row["name"], name, *_cells(points)) for name, points in row["levers"].items()]
+    commits = ", ".join(sorted({row["before_commit"] for row in rows}))
+    lines = [
+        *paragraph(
+            "dB are held-out mPSNR of the packed file, bytes those of the file up to the level. One seed each: bytes "
+            "of trainings spread by a tenth, dB by some tenths ([results](results.md))."
+        ),
+        "",
+        "## The dial",
+        "",
+        *paragraph(
+            f"A training per `--quality` against one training of {commits}, packed by its own encoder with "
+            "`--target-size`, all layers at the same share of their bytes: the one dial that it had after training. "
+            "Bytes at equal dB, by Bjøntegaard's difference:"
+        ),
+        "",
+        markdown(("scene", "level 0", "level 1", "level 2"), differences),
+        "",
+        "![dB against bytes](img/levers.png)",
+        "",
+        markdown(("scene", "commit", "dial", "kB up to each level", "dB"), each),
+        "",
+        "## Each lever alone",
+        "",
+        *paragraph(
+            f"{LEVER_STEPS:,} steps of the same trainer and encoder, without the levers, with one of them as the "
+            "default quality sets it, and with all. A short run tells them apart and no more: its dB are far from "
+            "those of a whole one."
+        ),
+        "",
+        markdown(("scene", "levers", "kB up to each level", "dB"), alone),
+    ]
+    return "\n".join(lines)
+
+
+PAGE = Page("levers", "levers.py", render, "What makes files small")
 
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scene", choices=tuple(SCENES))
-    parser.add_argument("--preset", default="tiny")
-    parser.add_argument("--iterations", type=int, default=1_500)
-    parser.add_argument("--seed", type=int, default=0)
-    parser.add_argument("--quality", type=_numbers, default=[20.0, 50.0, 80.0])
-    parser.add_argument("--scales", type=_numbers, default=[0.1])
-    parser.add_argument("--effort", type=int, default=2)
-    parser.add_argument("--omit", default="nothing", help="as pd4dgs-encode has it; proving takes minutes")
-    parser.add_argument("--out", type=Path, default=Path("out/levers"))
+    parser = options(__doc__, NAMES)
+    parser.add_argument("--before", type=Path, metavar="FOLDER", help="a checkout of the commit to compare with")
     args = parser.parse_args(argv)
+    if args.before is None and not args.render:
+        parser.error("--before FOLDER is needed")
     configure()
-    variants = {f"before, rate scale {x:g}": BEFORE | {"rate_scale": x} for x in args.scales} | levers()
-    variants |= {f"quality {q:g}": at_quality(q) for q in args.quality}
-    found = {name: measure(name, changes, args) for name, changes in variants.items()}
-    print(markdown(("variant", "dB at levels", "kB so far"), [(name, *_cells(rows)) for name, rows in found.items()]))
-    for level in range(3):
-        curves = [
-            [rows[level] for name, rows in found.items() if name.startswith(start) and level < len(rows)]
-            for start in ("quality", "before")
-        ]
-        if min(map(len, curves)) > 1:
-            gain = bjontegaard(*curves)
-            print(f"level {level}: " + ("no dB in common" if gain is None else f"{100 * gain:+.1f} % bytes"))
-    return 0
+    images = args.docs / "img"
+    images.mkdir(parents=True, exist_ok=True)
+
+    def measured(name: str) -> Row:
+        say(f"{name}:")
+        return measure(SCENES[name], args.before.resolve(), args.out.resolve())
+
+    todo = [scene.name for scene in present(args, NAMES)]
+    return make(PAGE, NAMES, todo, args, measured, lambda rows: plot(rows, images / "levers.png"))
 
 
 if __name__ == "__main__":

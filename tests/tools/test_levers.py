@@ -1,9 +1,8 @@
 """What the page on levers is made with."""
 
 import pytest
-from levers import BEFORE, bjontegaard, levers
+from levers import WITHOUT, bjontegaard, gains, levers
 
-from pd4dgs_codec.scene import Steps
 from pd4dgs_codec.train.config import TrainConfig
 
 
@@ -16,9 +15,17 @@ def test_half_the_bytes_at_every_quality_are_minus_half():
     assert bjontegaard([(1.0, 20.0), (2.0, 21.0)], curve) is None
 
 
-def test_a_lever_alone_changes_what_it_is_called_after():
-    default = TrainConfig()
-    alone = levers()
-    planes, pruning = (TrainConfig(**alone[name]) for name in ("planes' rate and steps", "pruning"))
-    assert planes.plane_rate == default.plane_rate > 0 and planes.steps is None and planes.prune == BEFORE["prune"]
-    assert pruning.prune == default.prune > BEFORE["prune"] and not pruning.plane_rate and pruning.steps == Steps()
+def test_levels_that_one_curve_lacks_are_not_compared():
+    before = [[(100, 30.0), (200, 33.0)], [(200, 31.0), (400, 34.0)]]
+    after = [[(50, 30.0)], [(100, 31.0), (250, 34.5)]]  # the first was judged to have one level
+    assert gains({"before": before, "after": after}) == [pytest.approx(-0.5)]
+
+
+def test_every_lever_alone_is_at_its_default_and_all_others_are_off():
+    default, alone = TrainConfig(), {name: TrainConfig(**changes) for name, changes in levers().items()}
+    assert alone["all"] == default
+    moved = {name: {f for f in WITHOUT if getattr(c, f) != WITHOUT[f]} for name, c in alone.items()}
+    assert set.union(*(moved[name] for name in moved if name != "all")) == set(WITHOUT) == moved["all"]
+    assert not moved["none"]
+    for name, config in alone.items():
+        assert all(getattr(config, f) == getattr(default, f) for f in moved[name])
