@@ -3,7 +3,7 @@
 Byte 0 is the form. Form 0: the rest is one channels payload of all channels, plane by plane. Form 1: stages. Stage 0
 holds channels 0 and 1 of every plane, stage s >= 1 channels 2^s .. 2^(s+1) - 1, as far as there are such. A block of
 one varint C in 1..8 per stage from 1 on comes first: in that stage each channel is split into C classes of cells by the
-relative magnitudes (`stages.relative_magnitude`) of the plane's earlier channels, summed over the 3 x 3 cells around,
+relative magnitudes (`stages.Activity`) of the plane's earlier channels, summed over the 3 x 3 cells around,
 the border repeated. In a stage, planes come in order, then channels, then classes, each with its cells row by row.
 """
 

@@ -30,17 +30,6 @@ CLASS_COUNTS = (1, 2, 3, 4, 5, 6, 8)
 PRIOR_BITS = 40
 
 
-def relative_magnitude(residuals: np.ndarray, scale: Scale | None = None) -> np.ndarray:
-    """Integers float64 [n]: sum over channels of the magnitudes of residuals int [m, n] relative to their channel's
-    mean, in units of 1/256. Below 2^8 m n.
-
-    scale: of other residuals, if theirs are the means that count.
-    """
-    activity = Activity(residuals.shape[1], scale)
-    activity.add(residuals)
-    return activity.now
-
-
 @dataclass(frozen=True, eq=False)
 class Scale:
     """By what relative magnitudes are measured. places: n. sums: of the magnitudes of each channel so far. A magnitude
@@ -51,8 +40,9 @@ class Scale:
 
 
 class Activity:
-    """The running sum of relative magnitudes, of n places and a scale. It adds the sums of channels that the scale does
-    not have."""
+    """The running sum over channels of the magnitudes of residuals relative to their channel's mean, in units of 1/256,
+    at each of n places; below 2^8 m n after m channels. scale: of other residuals, if theirs are the means that count;
+    the sums of channels that it does not have are added to it."""
 
     def __init__(self, places: int, scale: Scale | None = None):
         self.scale = scale or Scale(places)

@@ -22,7 +22,6 @@ from pd4dgs_codec.entropy.ans import MAX_COUNT, AnsDecoder, Model, ans_encode, m
 from pd4dgs_codec.entropy.bits import BIT
 from pd4dgs_codec.entropy.fitting import Fitted, fit_best, histogram
 from pd4dgs_codec.entropy.priors import (
-    CONST,
     FIRST_REUSE,
     FREE_ENTRIES,
     K_MAX,
@@ -48,10 +47,13 @@ SMALL = 4096
 @dataclass(frozen=True)
 class CodedChannels:
     payload: bytes
-    payload_bits: int  #: 8 * len(payload): symbols, prior parameters, tables and exceptions
     rate_bits: float  #: the sum of R(a), whatever prior was chosen
-    prior_ids: list[int]  #: one per channel; an empty channel counts as const
     defined: list[Fitted] = field(default_factory=list)  #: the new priors, in the order of definition
+
+    @property
+    def payload_bits(self) -> int:
+        """Symbols, prior parameters, tables and exceptions."""
+        return 8 * len(self.payload)
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,24 +105,19 @@ def encode_channels(
     if richer and (len(best[0]) < SMALL or least < 1.005 * 8 * len(best[0])):
         other = _encode(arrays, plan_priors(histograms, lambda h: h.gauss, rounds, known, entries), known)
         best = min(best, other, key=lambda encoded: len(encoded[0]))
-    payload, prior_ids, defined = best
-    return CodedChannels(payload, 8 * len(payload), sum(h.rate_bits for h in histograms), prior_ids, defined)
+    payload, defined = best
+    return CodedChannels(payload, sum(h.rate_bits for h in histograms), defined)
 
 
 def _encode(
     arrays: Sequence[np.ndarray], plan: Sequence[Fitted], known: Sequence[Fitted]
-) -> tuple[bytes, list[int], list[Fitted]]:
-    out, prior_ids = bytearray(), []
+) -> tuple[bytes, list[Fitted]]:
+    """(the payload, the new priors)."""
+    out = bytearray()
     defined, fresh = [fitted.prior for fitted in known], list[Fitted]()
     symbols, cums = list[np.ndarray](), list[np.ndarray]()
-    remaining = iter(plan)
-    for array in arrays:
-        if len(array) == 0:
-            prior_ids.append(CONST)
-            continue
-        fitted = next(remaining)
+    for array, fitted in zip(filter(len, arrays), plan, strict=True):
         prior = fitted.prior
-        prior_ids.append(prior.id)
         inside, exceptions = _split(array, prior.window)
         if _write_channel(out, prior, exceptions, defined):
             fresh.append(fitted)
@@ -129,7 +126,7 @@ def _encode(
             cums.append(cum)
     tables = [f.prior for f in fresh if isinstance(f.prior, Hist)]
     words = ans_encode([*(p.class_symbols for p in tables), *symbols], [*(p.class_cum for p in tables), *cums])
-    return bytes(out) + words, prior_ids, fresh
+    return bytes(out) + words, fresh
 
 
 def _parts(inside: np.ndarray, prior: Prior) -> list[tuple[np.ndarray, np.ndarray]]:

@@ -28,7 +28,7 @@ _FLOAT: np.dtype = np.dtype("<f4")
 
 
 def encode_channels_lzma(channels: Sequence[np.ndarray], *, effort: int = 5) -> CodedChannels:
-    """Encode int32 channels (1-D, |k| <= 2**24 - 1) with LZMA; prior_ids is empty. effort 1..9 bounds the search."""
+    """Encode int32 channels (1-D, |k| <= 2**24 - 1) with LZMA; it defines no priors. effort 1..9 bounds the search."""
     arrays = check_channels(channels)
     head, numbers = bytearray(), list[np.ndarray]()
     for array in arrays:
@@ -37,7 +37,7 @@ def encode_channels_lzma(channels: Sequence[np.ndarray], *, effort: int = 5) -> 
             put_varint(head, (2 * base if base >= 0 else -2 * base - 1) << 2 | log_width)
             numbers.append((array - base).astype(_SIGNED[log_width]))
     payload = _compress(bytes(head), numbers, effort)
-    return CodedChannels(payload, 8 * len(payload), sum(gaussian_bits(a) for a in arrays), [])
+    return CodedChannels(payload, sum(gaussian_bits(a) for a in arrays))
 
 
 def decode_channels_lzma(payload: bytes | memoryview, counts: Sequence[int]) -> list[np.ndarray]:

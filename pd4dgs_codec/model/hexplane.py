@@ -166,11 +166,6 @@ class HexPlane(nn.Module):
         self.layout = PlaneLayout.build(resolutions)
         self.grid = nn.Parameter(torch.ones(self.layout.n_cells, channels))
 
-    @property
-    def out_features(self) -> int:
-        """C * scales."""
-        return self.grid.shape[1] * len(self.layout.reso)
-
     def forward(self, points: Tensor, t: float | Tensor, step: float | None = None) -> Tensor:
         """Features [N, C * scales].
 

@@ -28,7 +28,7 @@ def test_symbols_round_trip(lists, effort):
     coded = encode_channels_lzma(channels, effort=effort)
     decoded = decode_channels_lzma(coded.payload, [len(c) for c in channels])
     assert all(d.dtype == np.int32 and np.array_equal(d, c) for d, c in zip(decoded, channels, strict=True))
-    assert coded.payload_bits == 8 * len(coded.payload) and coded.prior_ids == []
+    assert coded.payload_bits == 8 * len(coded.payload) and coded.defined == []
 
 
 @settings(max_examples=40)

@@ -108,7 +108,7 @@ def test_every_prior_family():
     channels = [np.clip(np.rint(c), -K_MAX, K_MAX).astype(np.int32) for c in channels]
     counts = [len(c) for c in channels]
     coded = encode_channels(channels, effort=9)
-    assert set(coded.prior_ids) == {CONST, GAUSS, GMM2, HIST}
+    assert {fitted.prior.id for fitted in coded.defined} == {CONST, GAUSS, GMM2, HIST}
     assert refdec.decode_channels(coded.payload, counts) == [c.tolist() for c in channels]
     wide = encode_channels(channels[4:5], priors="gauss").payload
     assert wide[0] >> 1 == 4 and refdec.decode_channels(wide, [400]) == [channels[4].tolist()]
