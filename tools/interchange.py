@@ -87,11 +87,12 @@ def _run(command: list[str]) -> Row:
 
 def _psnr(splats: Splats, player: Any, view: Any, turned: bool = False) -> float:
     """Of the Gaussians as a reader found them, drawn from the view's camera, against the scene's own picture, dB."""
-    from pd4dgs_codec.interchange.export import near, turned_camera, upright
+    from pd4dgs_codec.interchange.export import turned_camera, upright
     from pd4dgs_codec.interchange.splats import picture
+    from pd4dgs_codec.model.visibility import near_plane
 
     camera = turned_camera(view.camera, upright(player.info.up) if turned else None)
-    image = picture(splats, camera, player.info.background, near(player))
+    image = picture(splats, camera, player.info.background, near_plane(player.info))
     error = float(np.square(image.astype(np.float64) - player.picture(view.camera, view.time)).mean())
     return float(-10 * np.log10(error))
 

@@ -10,6 +10,7 @@ import torch
 from torch import Tensor
 
 from pd4dgs_codec.bench.timing import clock
+from pd4dgs_codec.model.visibility import near_plane
 from pd4dgs_codec.playback.player import Player
 from pd4dgs_codec.render.autograd.rasterization import rasterization
 from pd4dgs_codec.render.autograd.reference import composite, project
@@ -62,7 +63,7 @@ def view(level: Level, frame: Frame) -> View:
         "K": K,
         "width": camera.width,
         "height": camera.height,
-        "near": max(float(info.near), 1e-6),
+        "near": near_plane(info),
         "background": np.array(info.background, np.float32),
     }
 

@@ -12,7 +12,7 @@ from pd4dgs_codec.interchange.bake import Eyes, bake
 from pd4dgs_codec.interchange.refine import Target, logits, refine
 from pd4dgs_codec.interchange.splats import Splats, picture, unit
 from pd4dgs_codec.metrics.image import mpsnr
-from pd4dgs_codec.model.visibility import LEAST_NEAR
+from pd4dgs_codec.model.visibility import near_plane
 from pd4dgs_codec.playback.player import Player
 from pd4dgs_codec.scene import Camera
 from pd4dgs_codec.view.frames import shrunk
@@ -58,7 +58,7 @@ class Export:
             camera = shrunk(camera, int(np.ceil(np.sqrt(camera.width * camera.height / TARGET_PIXELS))))
             targets[i] = Target(turned_camera(camera, turn), self.player.picture(camera, t))
         info = self.player.info
-        return refine(splats, targets, order.tolist(), info.background, near(self.player), step)
+        return refine(splats, targets, order.tolist(), info.background, near_plane(self.player.info), step)
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,11 +81,6 @@ class Learnt:
         parts["opacities"][here] = 1 / (1 + np.exp(-logits(parts["opacities"][here]) - gained))
         parts["sh"][here] += new.sh - old.sh
         return Splats(**parts)
-
-
-def near(player: Player) -> float:
-    """The near plane of the scene's pictures, scene units."""
-    return max(float(player.info.near), LEAST_NEAR)
 
 
 def upright(up: Sequence[float]) -> np.ndarray:
@@ -127,7 +122,7 @@ def cost(export: Export, views: Sequence[View], step: Callable[[], None] = lambd
     for view in views:
         direct = export.player.picture(view.camera, view.time)
         splats, _ = export.splats(view.time)
-        image = picture(splats, view.camera, background, near(export.player))
+        image = picture(splats, view.camera, background, near_plane(export.player.info))
         error = float(np.square(image.astype(np.float64) - direct).mean())
         to_direct = -10 * np.log10(max(error, np.finfo(float).tiny))
         rows.append((mpsnr(direct, view.image, view.mask), mpsnr(image, view.image, view.mask), to_direct))

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from pd4dgs_codec.model.model import Gaussians, Model, camera_tensors
 from pd4dgs_codec.model.rounding import EXACT, Rounding
-from pd4dgs_codec.model.visibility import LEAST_NEAR
+from pd4dgs_codec.model.visibility import near_plane
 from pd4dgs_codec.render.autograd.rasterization import rasterization
 from pd4dgs_codec.render.checks import check_time
 from pd4dgs_codec.scene import Camera, SceneInfo
@@ -55,7 +55,7 @@ def draw(info: SceneInfo, gaussians: Gaussians, camera: Camera) -> Picture:
         K[None],
         camera.width,
         camera.height,
-        near_plane=max(float(info.near), LEAST_NEAR),
+        near_plane=near_plane(info),
         backgrounds=torch.tensor([info.background], dtype=torch.float32, device=device),
     )
     return Picture(images[0], alphas[0, ..., 0], gaussians, meta)

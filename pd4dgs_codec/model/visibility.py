@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pd4dgs_codec.render.projection import ALPHA_MIN
+from pd4dgs_codec.scene import SceneInfo
 
 #: A Gaussian fainter than the rasteriser's threshold never reaches a pixel, so its networks are not evaluated.
 MIN_OPACITY = ALPHA_MIN
@@ -16,3 +17,8 @@ SIGMA_REACH = 3.33
 FRUSTUM_MARGIN = 0.15
 #: Nearer than this nothing is drawn, whatever a scene says, scene units: the rasteriser divides by depths.
 LEAST_NEAR = 1e-6
+
+
+def near_plane(info: SceneInfo) -> float:
+    """That of a scene's pictures, scene units."""
+    return max(float(info.near), LEAST_NEAR)

@@ -13,7 +13,7 @@ import numpy as np
 from pd4dgs_codec import threads
 from pd4dgs_codec.model import slot_kernels
 from pd4dgs_codec.model.slot_kernels import GAUSSIAN_WIDTH
-from pd4dgs_codec.model.visibility import FRUSTUM_MARGIN, LEAST_NEAR, MIN_OPACITY, OFFSET_REACH, SIGMA_REACH
+from pd4dgs_codec.model.visibility import FRUSTUM_MARGIN, MIN_OPACITY, OFFSET_REACH, SIGMA_REACH, near_plane
 from pd4dgs_codec.playback.networks import Field, Layers
 from pd4dgs_codec.render.checks import check_time
 from pd4dgs_codec.render.rasteriser import draw
@@ -87,7 +87,7 @@ class Player:
             np.nan_to_num(g.colors),
             camera,
             self.info.background,
-            near_plane=max(float(self.info.near), LEAST_NEAR),
+            near_plane=near_plane(self.info),
         )
         picture: np.ndarray = np.clip(image, 0, 1)
         return picture

@@ -24,6 +24,8 @@ TIED = -40.0
 #: Random candidates per initial point, and the training views that judge them, where a dataset has no points.
 CARVE_CANDIDATES = 20
 CARVE_VIEWS = 40
+#: Of the start values of global planes, in cells: few values, for places to differ at the start.
+GLOBAL_SPACING = 4
 #: Where a dataset knows its paths: steps that teach them, anchors in each, and the rates of planes and networks.
 PATH_STEPS, PATH_ANCHORS, PATH_RATES = 400, 4096, (0.02, 0.002)
 
@@ -42,12 +44,7 @@ def fresh_model(
     spacing = nearest_distances((anchor_q.double() * info.voxel_size).float()).clamp(min=info.voxel_size)
     fields: list[DeformationField | None] = []
     for field, heads, start_spacing, step in (
-        (
-            config.global_deformation,
-            widths.global_heads,
-            4,
-            steps.planes_global,
-        ),  # few cells: places differ at the start
+        (config.global_deformation, widths.global_heads, GLOBAL_SPACING, steps.planes_global),
         (config.local_deformation, LOCAL_HEADS, None, steps.planes_local),
     ):
         fields.append(None if field is None else DeformationField.fresh(field, info.box, heads, start_spacing, step))

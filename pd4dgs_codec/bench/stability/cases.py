@@ -16,6 +16,7 @@ from pd4dgs_codec.bench.report import markdown
 from pd4dgs_codec.errors import DataError, Pd4Error
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.picture import render
+from pd4dgs_codec.model.visibility import near_plane
 from pd4dgs_codec.render.autograd.rasterization import rasterization
 from pd4dgs_codec.scene import Camera, Deformation, Network, Scene, SceneInfo, Steps, Widths
 
@@ -165,7 +166,7 @@ def picture_error(model: Model, level: int, t: float, camera: Camera = CAMERA) -
     same Gaussians; NaN where the former is not finite."""
     viewmat, K = torch.from_numpy(camera.viewmat), torch.from_numpy(camera.K)
     picture = render(model, level, t, camera)
-    g, near = picture.gaussians, max(float(model.info.near), 1e-6)
+    g, near = picture.gaussians, near_plane(model.info)
     drawn, background = g.colors.isfinite().all(1), torch.tensor([model.info.background])
     means, quats, scales, opacities, colors = (a[drawn] for a in (g.means, g.quats, g.scales, g.opacities, g.colors))
     expected, _, _ = rasterization(
