@@ -49,8 +49,9 @@ class _Cut(Exception):
 
 @dataclass(frozen=True)
 class _Place:
-    """Where to send a request. target: path and query."""
+    """Where to send a request. target: path and query, quoted."""
 
+    url: str
     secure: bool
     host: str
     port: int | None
@@ -65,7 +66,7 @@ class _Place:
             target = quote(parts.path or "/", safe="/%:=&~+!$,;'@()*") + (
                 f"?{quote(parts.query, safe='/%:=&?~+!$,;@()*')}" if parts.query else ""
             )
-            return _Place(parts.scheme.lower() == "https", parts.hostname, parts.port, target)
+            return _Place(url, parts.scheme.lower() == "https", parts.hostname, parts.port, target)
         except ValueError:
             raise DeliveryError(f"found {url!r}, expected http://HOST/PATH or https://HOST/PATH") from None
 
@@ -182,11 +183,10 @@ class Transfer:
             response = self._send(headers, until)
             if response.status not in REDIRECTS:
                 break
-            place = response.headers.get("Location")
-            self.close()
+            here, place = self._place.url, response.headers.get("Location")
+            self.close()  # which goes back to where it all began
             if place is None:
                 raise DeliveryError(f"{self.url}: a redirect that leads nowhere")
-            here = f"http{'s' if self._place.secure else ''}://{_netloc(self._place)}{self._place.target}"
             try:
                 self._place = _Place.of(urljoin(here, place))
             except ValueError:
@@ -268,11 +268,6 @@ class Transfer:
             self.close()
             raise DeliveryError(f"{self.url}: began anew {self.changes} times while it was fetched")
         raise Changed
-
-
-def _netloc(place: _Place) -> str:
-    host = f"[{place.host}]" if ":" in place.host else place.host
-    return host if place.port is None else f"{host}:{place.port}"
 
 
 def _reason(error: BaseException) -> str:

@@ -133,6 +133,14 @@ def test_redirects_are_followed_but_not_in_circles(scene_bytes, levels):
                     list(client.scenes())
 
 
+def test_a_relative_redirect_starts_from_where_it_was_given(scene_bytes, levels):
+    with FaultyServer(scene_bytes, [Fault(status=302, headers={"Location": "scene.pd4"})]) as second:
+        with FaultyServer(b"", [Fault(status=301, headers={"Location": second.url})]) as first:
+            with SceneClient(first.url) as client:
+                check(list(client.scenes()), levels)
+    assert (len(first.requests), len(second.requests)) == (1, 2)
+
+
 LIES = {
     "a part from elsewhere": {"Content-Range": "bytes 0-9/99999"},
     "no Content-Range": {"Content-Range": None},
