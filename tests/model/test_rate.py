@@ -83,24 +83,24 @@ def test_gradient_through_the_moments_matches_finite_differences():
     assert torch.autograd.gradcheck(total, (x,), atol=1e-7)
 
 
-@pytest.mark.parametrize(("dtype", "bound"), [(torch.float64, 1e-8), (torch.float32, 3e-4)])
 @pytest.mark.parametrize("active", [1, 2, 5000])
-def test_the_kernels_give_the_plain_form_s_bits_and_gradients(dtype, bound, active):
-    """Columns from a thousandth of a step to a thousand steps wide, without spread, and with values far outside."""
+def test_the_kernels_give_the_plain_form_s_bits_and_gradients(active):
+    """Columns from a thousandth of a step to a thousand steps wide, without spread, and with values far outside. The
+    kernels compute in float64 and round what they return."""
     generator = torch.Generator().manual_seed(active)
-    width = torch.logspace(-3, 3, 7, dtype=torch.float64)
-    values = 2.0 + torch.randn(6000, 9, dtype=torch.float64, generator=generator) * torch.cat([width, torch.zeros(2)])
+    width = torch.logspace(-3, 3, 7)
+    values = 2.0 + torch.randn(6000, 9, generator=generator) * torch.cat([width, torch.zeros(2)])
     values[::50, 8] = 60.0
     chosen = torch.randperm(6000, generator=generator)[:active]
     classes = torch.full((6000,), -1, dtype=torch.int8)
     classes[chosen] = torch.randint(0, 3, (active,), generator=generator).to(torch.int8) * 2
     rows, weights = chosen[: (active + 9) // 10], torch.rand((active + 9) // 10, generator=generator) + 0.5
     results = []
-    for form in (row_bits, row_bits_reference):
-        leaf = values.to(dtype).requires_grad_()
+    for form, dtype in ((row_bits, torch.float32), (row_bits_reference, torch.float64)):
+        leaf = values.to(dtype, copy=True).requires_grad_()
         bits = form(leaf, classes, rows, 0.25)
         (bits * weights.to(dtype)).sum().backward()
-        results.append((bits.detach(), leaf.grad))
+        results.append((bits.detach().double(), leaf.grad.double()))
     for found, expected in zip(*results, strict=True):
         scale = expected.abs().clamp(min=1.0)
-        assert float(((found - expected).abs() / scale).max()) < bound
+        assert float(((found - expected).abs() / scale).max()) < 2e-6
