@@ -111,9 +111,8 @@ def oracle(one: View, dtype: torch.dtype = torch.float64, eps2d: float = 0.3) ->
     index = torch.nonzero((z > float(one["near"])) & (tensors[3] > ALPHA_MIN))[:, 0]
     index = index[torch.sort(z[index].to(torch.float32), stable=True).indices]
     means, quats, scales, opacities, colors = (a[index] for a in tensors[:5])
-    means2d, covariance, _ = project(means, quats, scales, viewmat, K, width, height, eps2d)
+    means2d, covariance, det, _ = project(means, quats, scales, viewmat, K, width, height, eps2d)
     p, q, r = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-    det = p * r - q * q
     conics = torch.stack([r, -q, p], -1) / det[:, None]
     extent = torch.sqrt(2 * torch.log(opacities / ALPHA_MIN))
     half = torch.ceil(extent[:, None] * torch.sqrt(torch.stack([p, r], -1)))

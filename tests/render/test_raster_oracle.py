@@ -192,3 +192,16 @@ def test_no_gradient_wanted():
     with torch.no_grad():
         again, _, meta = rasterization(*scene(50, 20), *camera(20, 20), 20, 20)
     assert torch.equal(out, again) and not meta["means2d"].requires_grad
+
+
+def test_a_line_of_any_length_is_drawn():
+    """Discs and lines up to 10^27 scene units long, some edge-on: in float64 p r - q^2 has no digit left of them."""
+    tensors = scene(6, 21, opacity=(0.6, 0.9))
+    with torch.no_grad():
+        tensors[2].copy_(
+            torch.tensor([[0, 1e27, 0], [1e-28, 2e14, 0], [1e12, 1e12, 0], [0, 0, 0], [5e17, 1e-9, 1], [1, 1e20, 1e20]])
+        )
+    with torch.no_grad():
+        found, expected = (rasterization(*tensors, *camera(40, 40), 40, 40, backend=b)[0] for b in ("cpu", "reference"))
+    torch.testing.assert_close(found.double(), expected, rtol=0, atol=1 / 255)
+    assert float(expected.max()) > 0.3

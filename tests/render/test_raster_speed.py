@@ -42,8 +42,7 @@ def test_two_threads_are_faster():
 
 def _tile_looped_torch(tensors, viewmat, K, width, height):
     """float32 torch, autograd, a Python loop over 16 x 16 tiles: the usual plain implementation."""
-    means2d, covariance, depths = reference.project(*tensors[:3], viewmat, K, width, height, 0.3)
-    det = torch.linalg.det(covariance)
+    means2d, covariance, det, depths = reference.project(*tensors[:3], viewmat, K, width, height, 0.3)
     p, q, r = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     conics = torch.stack([r, -q, p], -1) / det[:, None]
     order = torch.argsort(depths.detach())

@@ -1,11 +1,13 @@
 """A dense float64 torch oracle: every Gaussian against every pixel, gradients by autograd. Slow, for tests.
 
 Written from the formulas, in their textbook form (matrix products, an inverse by determinant), sharing nothing with the
-kernels but the thresholds, so that a common mistake is unlikely.
+kernels but the thresholds, so that a common mistake is unlikely. The determinant alone is not that of the textbook:
+p r - q^2 has no digit left where a Gaussian is 10^8 times as long as a pixel is wide.
 """
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -33,8 +35,9 @@ def _rotations(quats: Tensor) -> Tensor:
 
 def project(
     means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int, eps2d: float
-) -> tuple[Tensor, Tensor, Tensor]:
-    """Pixel means [N, 2], covariances [N, 2, 2] (eps2d included) and depths [N]; the caller keeps z > 0."""
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Pixel means [N, 2], covariances [N, 2, 2] (eps2d included), their determinants [N] and depths [N]; the caller
+    keeps z > 0."""
     x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(-1)
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
     margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
@@ -45,8 +48,11 @@ def project(
         [torch.stack([fx / z, zero, -fx * tx / z**2], -1), torch.stack([zero, fy / z, -fy * ty / z**2], -1)], -2
     )
     half = jacobian @ viewmat[:3, :3] @ _rotations(quats) @ torch.diag_embed(scales)
-    covariance = half @ half.mT + eps2d * torch.eye(2, dtype=means.dtype, device=means.device)
-    return torch.stack([fx * x / z + cx, fy * y / z + cy], -1), covariance, z
+    blur = math.sqrt(eps2d) * torch.eye(2, dtype=means.dtype, device=means.device)
+    root = torch.cat([half, blur.expand(len(half), 2, 2)], -1)
+    products = root[:, 0, :, None] * root[:, 1, None, :]
+    det = (products - products.mT).triu().square().sum((1, 2))  # of all minors of the root (Cauchy and Binet)
+    return torch.stack([fx * x / z + cx, fy * y / z + cy], -1), root @ root.mT, det, z
 
 
 def composite(
@@ -88,9 +94,8 @@ def _draw_view(
         index = index[torch.sort(z[index].to(torch.float32), stable=True).indices]
         n = len(means)
     means, quats, scales, opacities, colors = (a[index] for a in (means, quats, scales, opacities, colors))
-    means2d, covariance, depths = project(means, quats, scales, viewmat, K, width, height, settings.eps2d)
+    means2d, covariance, det, depths = project(means, quats, scales, viewmat, K, width, height, settings.eps2d)
     p, q, r = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
-    det = p * r - q * q
     extent = torch.sqrt(2 * torch.log(255.0 * opacities.detach()))
     radii = torch.ceil(extent[:, None] * torch.sqrt(torch.stack([p, r], -1).detach()))
     seen = ((means2d + radii > 0) & (means2d - radii < means2d.new_tensor([width, height]))).all(-1)
