@@ -206,7 +206,7 @@ def _add_train_rate(result: dict[str, Any], packed: Packed, options: EncodeOptio
 
 
 def _text(result: dict[str, Any], first_frame: float) -> str:
-    sections = ["attributes", "planes", "weights", "masks", "symbols", "floats"]
+    sections = ["attributes", "planes", "weights", "masks", "symbols", "floats", "low_bits"]
     spent = [{s["name"]: s["payload_bits"] / 8 for s in row["streams"]} for row in result["layers"]]
     shown = [name for name in sections if any(name in streams for streams in spent)]
     rows = [
@@ -220,7 +220,8 @@ def _text(result: dict[str, Any], first_frame: float) -> str:
         )
         for row, streams in zip(result["layers"], spent, strict=True)
     ]
-    lines = [table(("layer", "bytes", "anchors", "positions", *shown, "payload/ΣR"), rows)]
+    heads = (name.replace("_", " ") for name in shown)
+    lines = [table(("layer", "bytes", "anchors", "positions", *heads, "payload/ΣR"), rows)]
     for item in result["left_out"]:
         exactly = ", changes no picture" if item["lossless"] else ""
         lines.append(f"left out: {item['what']} ({item['bytes']:,} bytes{exactly}): {item['why']}")
