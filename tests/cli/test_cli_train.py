@@ -265,7 +265,7 @@ run, replace, saves = Trainer.run, os.replace, []
 def replace_or_die(*paths):
     if str(paths[1]).endswith(".pt"):  # numba puts its compiled kernels into place in the same way
         saves.append(paths)
-        if len(saves) == 10:
+        if len(saves) == 5:
             os.kill(os.getpid(), signal.SIGKILL)
     replace(*paths)
 
@@ -278,19 +278,19 @@ main(json.loads(sys.argv[1]))
 @pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
 def test_a_run_killed_while_it_saves_goes_on_as_if_nothing_had_happened(train, tmp_path, shared_dataset):
     whole, killed, log = tmp_path / "whole.pt", tmp_path / "killed.pt", tmp_path / "log.jsonl"
-    arguments = [shared_dataset, "-j", 1, "-o", killed, "--preset", "tiny", "--iterations", 20, "--log", log]
+    arguments = [shared_dataset, "-j", 1, "-o", killed, "--preset", "tiny", "--iterations", 10, "--log", log]
     command = [sys.executable, "-c", KILLED, json.dumps([str(a) for a in arguments])]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     done = subprocess.run(command, stderr=subprocess.DEVNULL, timeout=600, env=environment)
     assert done.returncode == -signal.SIGKILL
-    assert checkpoint.load(killed)[1]["iteration"] == 9 and len(log.read_text().splitlines()) == 10
+    assert checkpoint.load(killed)[1]["iteration"] == 4 and len(log.read_text().splitlines()) == 5
     assert len(list(tmp_path.glob(".pd4dgs-*/killed.pt"))) == 1  # what it was writing
     with log.open("a") as stream:
         stream.write('{"iteration": 2')  # a line cut in its middle
     assert train(killed, "--resume", killed, "--log", log, iterations=None).code == 0
-    assert train(whole, iterations=20).code == 0
+    assert train(whole, iterations=10).code == 0
     assert _same(_state(whole), _state(killed))
-    assert [json.loads(line)["iteration"] for line in log.read_text().splitlines()] == list(range(20))
+    assert [json.loads(line)["iteration"] for line in log.read_text().splitlines()] == list(range(10))
     assert not list(tmp_path.glob(".pd4dgs-*/killed.pt"))
 
 

@@ -8,11 +8,11 @@ import time
 import numpy as np
 import pytest
 import zstandard
+from tiny import TINY, disc
 
 from pd4dgs_codec.cli import watch
 from pd4dgs_codec.cli.train import main
 from pd4dgs_codec.cli.watch import RESTING_PIXELS, WatchedProgress, camera_of
-from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.errors import TrainError
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.train.config import TrainConfig
@@ -24,12 +24,12 @@ PATIENCE = 60.0
 
 @pytest.fixture(scope="module")
 def dataset():
-    return load("synthetic:local", downscale=8)
+    return disc()
 
 
 @pytest.fixture
 def trainer(dataset):
-    return Trainer(TrainConfig(source="synthetic:local", preset="tiny", iterations=6), dataset)
+    return Trainer(TrainConfig(preset="tiny", iterations=6), dataset, size=TINY)
 
 
 @pytest.fixture
@@ -143,7 +143,7 @@ def test_curves_grow_with_the_run(watched, trainer, dataset):
 
 
 def test_being_watched_changes_no_bit(dataset, trainer, watched):
-    other = Trainer(trainer.config, dataset)
+    other = Trainer(trainer.config, dataset, size=TINY)
     Browser(watched, dataset.train[0])
     for _ in range(6):
         _step(trainer, watched)
@@ -158,9 +158,9 @@ def test_without_viser_it_is_one_line(trainer, monkeypatch):
         WatchedProgress(trainer, 0)
 
 
-def test_the_command_says_where_to_look(tmp_path, capsys):
+def test_the_command_says_where_to_look(tmp_path, capsys, shared_dataset):
     pytest.importorskip("viser")
-    options = ["--preset", "tiny", "--iterations", "2", "--downscale", "8", "--view", "0"]
-    assert main(["synthetic:local", "-o", str(tmp_path / "m.pt"), *options]) == 0
+    options = ["--preset", "tiny", "--iterations", "2", "--view", "0"]
+    assert main([str(shared_dataset), "-o", str(tmp_path / "m.pt"), *options]) == 0
     told = capsys.readouterr()
     assert "the scene is at http://127.0.0.1:" in told.err and told.out == ""

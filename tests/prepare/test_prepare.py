@@ -14,7 +14,7 @@ from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.prepare import poses, stages
 
 pytest.importorskip("pycolmap")
-COUNT = 12
+COUNT = 9
 
 
 def write(folder, pictures):
