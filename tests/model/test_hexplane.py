@@ -172,26 +172,26 @@ def test_threads(multires):
 
 @pytest.mark.parametrize("shape", [*SHAPES, ((4, 3, 6, 3), 8, (1,))])
 def test_regularisers_equal_reference(shape):
-    plane = field(*shape)
+    plane = field(*shape, dtype=torch.float32)
     results = []
-    for form in (regularisers, regularisers_reference):
-        terms = form(plane.grid, plane.layout)
+    for form, grid in ((regularisers, plane.grid), (regularisers_reference, plane.grid.detach().double())):
+        terms = form(grid.requires_grad_(), plane.layout)
         total = sum(w * terms[name] for w, name in zip((0.3, 0.7, -0.2), TERMS, strict=True))
-        results.append((*(terms[name].detach() for name in TERMS), torch.autograd.grad(total, plane.grid)[0]))
+        results.append((*(terms[name].detach() for name in TERMS), torch.autograd.grad(total, grid)[0]))
     for found, expected in zip(*results, strict=True):
-        torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-13)
+        assert float((found - expected).abs().max()) <= 2e-6 * float(expected.abs().max())
 
 
 def test_regularisers_by_definition():
     """A parabola a i^2 along an axis has second difference 2 a; a ramp has none; time planes at 1 are free."""
-    plane = HexPlane(BOX, (6, 5, 4, 7), 8, (1,)).double()
+    plane = HexPlane(BOX, (6, 5, 4, 7), 8, (1,))
     (views,) = plane.layout.views(plane.grid.detach())
     for name in ("xy", "xz", "yz"):
-        views[name].copy_(3 * torch.arange(views[name].shape[1], dtype=torch.float64)[None, :, None])
+        views[name].copy_(3.0 * torch.arange(views[name].shape[1])[None, :, None])
     assert all(abs(float(v.detach())) < 1e-20 for v in plane.regularisers().values())
-    views["xy"].copy_(0.5 * torch.arange(6, dtype=torch.float64)[None, :, None] ** 2)
-    views["yz"].copy_(1.5 * torch.arange(4, dtype=torch.float64)[:, None, None] ** 2)
-    views["xt"].copy_(torch.arange(7, dtype=torch.float64)[:, None, None] ** 2)
+    views["xy"].copy_(0.5 * torch.arange(6)[None, :, None] ** 2)
+    views["yz"].copy_(1.5 * torch.arange(4)[:, None, None] ** 2)
+    views["xt"].copy_(torch.arange(7)[:, None, None] ** 2)
     terms = {name: term.detach() for name, term in plane.regularisers().items()}
     assert float(terms["plane_smooth"]) == pytest.approx(1.0 + 9.0)
     assert float(terms["time_smooth"]) == pytest.approx(4.0)

@@ -1,9 +1,12 @@
 """Where a fresh model's anchors stand."""
 
+import dataclasses
+
+import numpy as np
 import pytest
 import torch
 
-from pd4dgs_codec.train.initialise import nearest_distances
+from pd4dgs_codec.train.initialise import initial_cells, nearest_distances
 
 
 @pytest.mark.parametrize("n", [2, 3, 50, 2000])
@@ -17,3 +20,13 @@ def test_nearest_distances_are_those_of_all_pairs(n):
 
 def test_a_point_alone_has_a_distance_too():
     assert nearest_distances(torch.zeros(1, 3)).tolist() == [1.0] and not len(nearest_distances(torch.zeros(0, 3)))
+
+
+@pytest.mark.parametrize("count", [30, 40, 50])
+def test_as_many_cells_as_asked_start_at_fewer_as_many_or_more_points(dataset, count):
+    points = np.random.default_rng(0).uniform(*dataset.box / 2, (40, 3)).astype(np.float32)
+    given = dataclasses.replace(dataset, points=points)
+    cells = initial_cells(given, count, 1e-4, torch.Generator().manual_seed(0))
+    assert len(cells) == count
+    own = {tuple(cell) for cell in np.round(points / 1e-4).astype(int).tolist()}
+    assert sum(tuple(cell) in own for cell in cells.tolist()) >= min(count, 40) - 1  # one may round otherwise

@@ -17,7 +17,6 @@ from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.train import loop, pruning
 from pd4dgs_codec.train.config import ABLATIONS, PRUNING_ROUNDS, Schedule, TrainConfig
-from pd4dgs_codec.train.initialise import initial_cells
 from pd4dgs_codec.train.log import RecordLog
 from pd4dgs_codec.train.loop import Trainer
 
@@ -295,13 +294,3 @@ def test_broken_training_state_is_refused_in_one_line(dataset, tmp_path, name):
 def test_points_that_all_lie_far_outside_are_as_good_as_none(dataset):
     far = dataclasses.replace(dataset, points=np.full((20, 3), 1e4, np.float32))
     assert len(Trainer(TrainConfig(preset="tiny", iterations=5), far).model.anchor_q) > 100
-
-
-@pytest.mark.parametrize("count", [30, 40, 50])
-def test_as_many_cells_as_asked_start_at_fewer_as_many_or_more_points(dataset, count):
-    points = np.random.default_rng(0).uniform(*dataset.box / 2, (40, 3)).astype(np.float32)
-    given = dataclasses.replace(dataset, points=points)
-    cells = initial_cells(given, count, 1e-4, torch.Generator().manual_seed(0))
-    assert len(cells) == count
-    own = {tuple(cell) for cell in np.round(points / 1e-4).astype(int).tolist()}
-    assert sum(tuple(cell) in own for cell in cells.tolist()) >= min(count, 40) - 1  # one may round otherwise

@@ -13,7 +13,7 @@ from pd4dgs_codec.errors import TrainError
 from pd4dgs_codec.train.ssim import TargetStats, image_loss, image_loss_reference
 
 
-def pair(height, width, dtype=torch.float64, masked=False, seed=0):
+def pair(height, width, dtype=torch.float32, masked=False, seed=0):
     """(render that wants a gradient, training image, mask or None)."""
     generator = torch.Generator().manual_seed(seed)
     target = torch.rand(height, width, 3, generator=generator, dtype=dtype)
@@ -32,35 +32,27 @@ def terms_and_gradient(terms, image, weights=(0.8, 0.2)):
 @pytest.mark.parametrize("masked", [False, True])
 @pytest.mark.parametrize("size", [(37, 41), (1, 1), (3, 100), (24, 16)])
 def test_kernel_equals_reference(size, masked):
+    """float32 kernels, the one form that training has, and the reference in float64."""
     image, target, mask = pair(*size, masked=masked)
-    stats = TargetStats(target, mask)
+    stats, wide = TargetStats(target, mask), image.detach().double().requires_grad_()
     for weights in ((0.8, 0.2), (0.0, 1.0)):
         fast = terms_and_gradient(image_loss(image, stats), image, weights)
-        slow = terms_and_gradient(image_loss_reference(image, target, stats.weights), image, weights)
+        exact = image_loss_reference(wide, target.double(), stats.weights.double())
+        slow = terms_and_gradient(exact, wide, weights)
+        assert fast[0].dtype == fast[2].dtype == torch.float32
         for found, expected in zip(fast, slow, strict=True):
-            torch.testing.assert_close(found, expected, rtol=1e-10, atol=1e-12)
-
-
-def test_float32():
-    image, target, mask = pair(30, 20, torch.float32, masked=True)
-    stats = TargetStats(target, mask)
-    fast = terms_and_gradient(image_loss(image, stats), image)
-    wide = image.detach().double().requires_grad_()
-    exact = terms_and_gradient(image_loss(wide, TargetStats(target.double(), mask)), wide)
-    assert fast[0].dtype == fast[2].dtype == torch.float32
-    for found, expected in zip(fast, exact, strict=True):
-        assert (found - expected).abs().max() < 1e-5 * expected.abs().max()
+            assert (found - expected).abs().max() <= 1e-5 * expected.abs().max()
 
 
 def test_gradcheck():
-    image, target, mask = pair(4, 5, masked=True)
-    stats = TargetStats(target, mask)
-    torch.autograd.gradcheck(lambda x: image_loss(x, stats), (image,), eps=1e-6)
+    image, target, mask = pair(4, 5, torch.float64, masked=True)
+    weights = TargetStats(target, mask).weights
+    torch.autograd.gradcheck(lambda x: image_loss_reference(x, target, weights), (image,), eps=1e-6)
 
 
 def test_by_definition():
     """SSIM of one pixel at a time, each window written out with its zero padding."""
-    image, target, mask = pair(9, 13, masked=True)
+    image, target, mask = pair(9, 13, torch.float64, masked=True)
     x, y = (np.pad(a.detach().numpy(), ((5, 5), (5, 5), (0, 0))) for a in (image, target))
     taps = np.exp(-(np.arange(-5.0, 6.0) ** 2) / (2 * 1.5**2))
     window = np.outer(taps, taps) / taps.sum() ** 2
@@ -73,7 +65,7 @@ def test_by_definition():
             cov = (window * a * b).sum() - ma * mb
             ssim = (2 * ma * mb + 1e-4) * (2 * cov + 9e-4) / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4))
             l1, dissimilarity, count = l1 + abs(a[5, 5] - b[5, 5]), dissimilarity + 1 - ssim, count + 1
-    found = [float(term.detach()) for term in image_loss(image, TargetStats(target, mask))]
+    found = [float(term.detach()) for term in image_loss_reference(image, target, TargetStats(target, mask).weights)]
     assert found == pytest.approx([l1 / count, dissimilarity / count], rel=1e-9)
 
 
@@ -81,7 +73,7 @@ def test_equal_images_cost_nothing():
     _, target, _ = pair(20, 30)
     image = target.clone().requires_grad_()
     l1, dissimilarity, gradient = terms_and_gradient(image_loss(image, TargetStats(target)), image)
-    assert float(l1) == 0 and abs(float(dissimilarity)) < 1e-12 and gradient.abs().max() < 1e-12
+    assert float(l1) == 0 and abs(float(dissimilarity)) < 1e-6 and gradient.abs().max() < 1e-6
 
 
 def test_masked_pixels_out_of_reach_do_not_matter():
@@ -94,13 +86,13 @@ def test_masked_pixels_out_of_reach_do_not_matter():
     changed[:, 25:] += 1
     changed.requires_grad_()
     after = terms_and_gradient(image_loss(changed, stats), changed)
-    torch.testing.assert_close(after[:2], before[:2], rtol=0, atol=1e-14)
+    torch.testing.assert_close(after[:2], before[:2], rtol=0, atol=1e-6)
     assert after[2][:, 25:].eq(0).all() and not torch.equal(after[2][:, 20:25], torch.zeros(16, 5, 3))
 
 
 @pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="needs two threads")
 def test_threads_change_nothing():
-    image, target, mask = pair(33, 50, torch.float32, masked=True)
+    image, target, mask = pair(33, 50, masked=True)
     before = numba.get_num_threads()
     runs = []
     try:

@@ -25,7 +25,8 @@ from pd4dgs_codec.scene import MASK_THRESHOLD, Camera, Scene
 
 PLAYER = ROOT / "player"
 HARNESS = "player/test-browser/harness.html"
-BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome")
+#: The first draws the same pictures with a fifth less work: it is Chromium without windows.
+BROWSERS = ("chromium-headless-shell", "chromium", "chromium-browser", "google-chrome", "chrome")
 FLAGS = [
     "--no-sandbox",
     "--disable-background-networking",
