@@ -1,4 +1,4 @@
-"""Where the time of a training step goes: milliseconds per part and level, as a Markdown table.
+"""Where the time of a training step goes: processor milliseconds per part and level, as a Markdown table.
 
     python tools/profile_training.py out/*/model.pt [--steps 20] [--at 0.55] [--threads 1] [--write docs/training.md]
 
@@ -49,12 +49,12 @@ class Stopwatch:
         """`function`, timed as `part`."""
 
         def call(*args: Any, **kwargs: Any) -> Any:
-            start = time.perf_counter()
+            start = time.process_time()
             self._open.append(0.0)
             try:
                 return function(*args, **kwargs)
             finally:
-                spent = time.perf_counter() - start
+                spent = time.process_time() - start
                 self.seconds[part] += spent - self._open.pop()
                 if self._open:
                     self._open[-1] += spent
@@ -71,7 +71,7 @@ def watch(learner: Learner, stopwatch: Stopwatch) -> None:
     """Wraps the parts of a step, and the step itself as what is none of them."""
     import torch
 
-    from pd4dgs_codec.model import fused, plane_regularisers
+    from pd4dgs_codec.model import fused, plane_rate, plane_regularisers, rate
     from pd4dgs_codec.model.model import Model
     from pd4dgs_codec.render.autograd import cpu
     from pd4dgs_codec.train import learner as steps
@@ -96,6 +96,10 @@ def watch(learner: Learner, stopwatch: Stopwatch) -> None:
         (ssim._ImageLoss, "backward", "image loss, backward"),
         (plane_regularisers._Regularisers, "forward", "plane regularisers"),
         (plane_regularisers._Regularisers, "backward", "plane regularisers, backward"),
+        (rate._RowBits, "forward", "rate term"),
+        (rate._RowBits, "backward", "rate term, backward"),
+        (plane_rate._ProxyBits, "forward", "planes' rate"),
+        (plane_rate._ProxyBits, "backward", "planes' rate, backward"),
         (steps, "image_loss", "image loss"),
         (losses, "rate_term", "rate term"),
         (losses, "binary_term", "mask terms"),
@@ -163,7 +167,7 @@ def profile(path: Path, source: str | None, steps: int, at: float, threads: int)
     size = f"{dataset.train[0].width}x{dataset.train[0].height}"
     lines = [
         f"{dataset.name} {size}, {config.preset}, {len(trainer.model.anchor_q):,} anchors, {threads} thread(s), at "
-        f"{at:g} of the run, milliseconds:",
+        f"{at:g} of the run, processor milliseconds:",
         "",
         "".join(["| part |", *(f" level {level} |" for level in range(len(found)))]),
         "|---" * (len(found) + 1) + "|",
