@@ -295,7 +295,7 @@ def trained(once) -> bytes:
 @pytest.fixture(scope="module")
 def narrow() -> bytes:
     """Features of 16 numbers, and four Gaussians an anchor."""
-    return encode(lively_scene(1500, widths=Widths(16, 4)), layers=2, effort=1)
+    return encode(lively_scene(700, widths=Widths(16, 4)), layers=2, effort=1)
 
 
 @pytest.mark.parametrize("evaluator", ["gpu", "cpu"])
@@ -479,7 +479,7 @@ def test_the_first_picture_comes_before_layer_0_is_whole(harness, folder):
 @pytest.mark.parametrize("evaluator", ["gpu", "cpu"])
 def test_low_bits_that_come_last_are_an_upgrade_to_the_picture_of_the_whole(harness, folder, evaluator):
     """At every level, although they bring no anchor."""
-    data, whole = (encode(lively_scene(), layers=2, effort=1, low_bits=bits) for bits in (4, 0))
+    data, whole = (encode(lively_scene(200), layers=2, effort=1, low_bits=bits) for bits in (4, 0))
     coarse = info(data)["layers"][1]["slices"][0]["end"]  # low bits follow
     (folder / "coarse.pd4").write_bytes(data)
     (folder / "whole.pd4").write_bytes(whole)
