@@ -1,12 +1,14 @@
 """How long encoding, decoding and drawing take, before and after. Writes docs/performance.md.
 
-    python tools/performance.py --before FOLDER [--only NAME ...] [--repeats 9] [--out out] [--docs docs] [--render]
+    python tools/performance.py --before FOLDER [--only NAME ...] [--repeats 9] [--lines WHAT ...]
+                                [--out out] [--docs docs] [--render]
 
 FOLDER is a checkout of another commit of this project, measured by turns with this one: one process of each, then the
 next pair (of encodings and trainings a ninth as many). Each checkpoint in --out/NAME/model.pt that both can read is one
 scene; its data must be there for the lines on training. Figures are medians over the repeats; the page states the
 processors and the load. How cost grows, and what other coders take for the same symbols, is measured of this checkout
-alone, on the first scene. Two scenes and nine repeats take some ten minutes on two idle processors.
+alone, on the first scene. Two scenes and nine repeats take some ten minutes on two idle processors. --lines measures
+some lines anew and keeps the others.
 """
 
 from __future__ import annotations
@@ -20,7 +22,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from pages.page import ROOT, Page, Row, make, options, paragraph, say
+from pages.page import ROOT, Page, Row, commit, make, options, paragraph, say
 
 from pd4dgs_codec.bench.report import markdown
 from pd4dgs_codec.bench.timing import machine, machine_line
@@ -49,6 +51,29 @@ def run(checkout: Path, what: str, *arguments: str) -> Row:
     return row
 
 
+def by_turns(what: str, path: Path, both: dict[str, Path], files: dict[str, str], repeats: int) -> Row:
+    """The medians of one line of the page, before and after."""
+    found: dict[str, list[Row]] = {name: [] for name in both}
+    for _ in range(-(-repeats // 9) if what in SLOW else repeats):
+        for name, checkout in both.items():
+            found[name].append(run(checkout, what, str(path), files[name], "5"))
+    medians = {name: _medians(rows) for name, rows in found.items()}
+    say(f"{path.parent.name}: {what} {medians}")
+    return medians
+
+
+def measure_again(row: Row, path: Path, before: Path, repeats: int, lines: Sequence[str]) -> Row:
+    """The row with some of its lines as they are now."""
+    both = {"before": before, "after": ROOT}
+    with tempfile.TemporaryDirectory() as folder:
+        files = {name: str(Path(folder) / f"{name}.pd4") for name in both}
+        for name, checkout in both.items():
+            run(checkout, "encode", str(path), files[name], "5")
+        found = {what: by_turns(what, path, both, files, repeats) for what in lines}
+    later = row.get("later", {}) | dict.fromkeys(lines, commit())
+    return row | {"lines": row["lines"] | found, "later": later}
+
+
 def measure(path: Path, before: Path, repeats: int) -> Row:
     """Of one checkpoint: per line of the page the medians before and after, and what every effort takes."""
     both = {"before": before, "after": ROOT}
@@ -57,14 +82,7 @@ def measure(path: Path, before: Path, repeats: int) -> Row:
         for name, checkout in both.items():  # and warm caches
             run(checkout, "encode", str(path), files[name], "5")
             run(checkout, "start", str(path), files[name], "5")
-        lines: Row = {}
-        for what in LINES:
-            found: dict[str, list[Row]] = {name: [] for name in both}
-            for _ in range(-(-repeats // 9) if what in SLOW else repeats):
-                for name, checkout in both.items():
-                    found[name].append(run(checkout, what, str(path), files[name], "5"))
-            lines[what] = {name: _medians(rows) for name, rows in found.items()}
-            say(f"{path.parent.name}: {what} {lines[what]}")
+        lines = {what: by_turns(what, path, both, files, repeats) for what in LINES}
         efforts = []
         for effort in EFFORTS:
             row = run(ROOT, "encode", str(path), files["after"], str(effort))
@@ -126,9 +144,12 @@ def render(rows: Sequence[Row]) -> str:
         for row in rows
         for effort in row["efforts"]
     ]
+    later = sorted({(sha, LINES[what][0][0]) for row in rows for what, sha in row.get("later", {}).items()})
+    newer = "; ".join(f'"{text}" and what follows it: `{sha}`' for sha, text in later)
     parts = [
         "\n".join(sorted({row["machine"] for row in rows})),
         markdown(("scene", "what", "before", "after", "times"), table),
+        *(["\n".join(paragraph(f"Measured later than the rest: {newer}."))] if newer else []),
         "What each effort takes, all with warm caches and verified:",
         markdown(("scene", "effort", "s", "processor s", "bytes"), efforts),
     ]
@@ -182,14 +203,20 @@ def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     parser = options(__doc__, NAMES)
     parser.add_argument("--before", type=Path, metavar="FOLDER", help="a checkout to compare with")
+    parser.add_argument("--lines", nargs="+", choices=tuple(LINES), metavar="WHAT", help="these alone, of scenes there")
     parser.add_argument("--repeats", type=int, default=9, metavar="N", help="of each measurement (default: 9)")
     args = parser.parse_args(argv)
     if not args.render and (args.before is None or not (args.before / "pd4dgs_codec").is_dir()):
         parser.error("--before FOLDER: expected a checkout of this project")
     todo = [n for n in args.only or NAMES if (args.out / n / "model.pt").is_file()]  # needs no data
-    return make(
-        PAGE, NAMES, todo, args, lambda name: measure(args.out / name / "model.pt", args.before.resolve(), args.repeats)
-    )
+    there = {row["name"]: row for row in PAGE.read(args.docs)}
+    todo = [name for name in todo if not args.lines or name in there]
+
+    def measured(name: str) -> Row:
+        given = args.out / name / "model.pt", args.before.resolve(), args.repeats
+        return measure_again(there[name], *given, args.lines) if args.lines else measure(*given)
+
+    return make(PAGE, NAMES, todo, args, measured)
 
 
 if __name__ == "__main__":
