@@ -144,12 +144,12 @@ def measure(scene: Scene, before: Path, out: Path) -> Row:
 
 
 def gains(row: Row) -> list[float | None]:
-    """Bjontegaard's difference at each level that both curves have in two points or more."""
-    found = []
-    for level in range(3):
+    """Bjontegaard's difference at levels 0, 1, 2 and of whole files; None where a curve has not two points there, or
+    the two share no dB."""
+    found: list[float | None] = []
+    for level in (0, 1, 2, -1):
         curves = [[points[level] for points in row[side] if level < len(points)] for side in ("after", "before")]
-        if min(map(len, curves)) > 1:
-            found.append(bjontegaard(*curves))
+        found.append(bjontegaard(*curves) if min(map(len, curves)) > 1 else None)
     return found
 
 
@@ -186,8 +186,7 @@ def render(rows: Sequence[Row]) -> str:
     """The page."""
     differences, each, alone = [], [], []
     for row in rows:
-        found = [f"{gain:+.0%}" if gain is not None else "no dB in common" for gain in gains(row)]
-        differences.append((row["name"], *found, *[""] * (3 - len(found))))
+        differences.append((row["name"], *("" if gain is None else f"{gain:+.0%}" for gain in gains(row))))
         for share, points in zip(SHARES, row["before"], strict=True):
             each.append((row["name"], row["before_commit"], f"{share:.0%} of each layer", *_cells(points)))
         for quality, points in zip(QUALITIES, row["after"], strict=True):
@@ -205,10 +204,10 @@ def render(rows: Sequence[Row]) -> str:
         *paragraph(
             f"A training per `--quality` against one training of {commits}, packed by its own encoder with "
             "`--target-size`, all layers at the same share of their bytes: the one dial that it had after training. "
-            "Bytes at equal dB, by Bjøntegaard's difference:"
+            "Bytes at equal dB, by Bjøntegaard's difference; some trainings leave level 2 out:"
         ),
         "",
-        markdown(("scene", "level 0", "level 1", "level 2"), differences),
+        markdown(("scene", "level 0", "level 1", "level 2", "whole file"), differences),
         "",
         "![dB against bytes](img/levers.png)",
         "",
