@@ -18,7 +18,7 @@ def test_half_the_bytes_at_every_quality_are_minus_half():
 def test_levels_that_one_curve_lacks_are_not_compared():
     before = [[(100, 30.0), (200, 33.0)], [(200, 31.0), (400, 34.0)]]
     after = [[(50, 30.0)], [(100, 31.0), (200, 34.0)]]  # the first was judged to have one level
-    whole = bjontegaard([(50, 30.0), (200, 34.0)], [(200, 31.0), (400, 34.0)])
+    whole = bjontegaard([(50, 30.0), (200, 34.0)], [(200, 33.0), (400, 34.0)])
     assert gains({"before": before, "after": after}) == [pytest.approx(-0.5), None, None, whole]
 
 
