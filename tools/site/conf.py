@@ -80,6 +80,7 @@ CONTENTS = {
         "docs/slices",
         "docs/latency",
         "docs/stability",
+        "docs/levers",
         "docs/omissions",
         "docs/performance",
         "docs/long-captures",
