@@ -90,7 +90,7 @@ CONTENTS = {
 PAPER = ["comparison", "sampling", "components", "levels", "latency", "rates", "rho"]
 
 #: Rooms that are used as commands, not as a library.
-LEFT_OUT = {"cli", "bench", "report"}
+LEFT_OUT = {"cli", "bench"}
 
 
 def toctree(pages: list[str], caption: str = "") -> str:
