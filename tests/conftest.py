@@ -47,8 +47,6 @@ NEED_TRAIN = [
 ]
 NEED_TRAIN += ["fuzz/test_trained_file.py", "metrics/test_levels.py", "metrics/test_perceptual.py"]
 NEED_NO_KERNEL = ["bitstream", "spec"]
-#: Files with tests of ten seconds and more. Last, one would keep a worker busy when the others have nothing left.
-LONG = ["dial", "latency", "prepare", "raster_stiff", "reports", "simd", "stability", "workers"]
 collect_ignore = [] if find_spec("torch") and find_spec("numba") else NEED_TRAIN
 
 settings.register_profile("pd4dgs", deadline=None, suppress_health_check=[HealthCheck.too_slow])
@@ -57,12 +55,10 @@ settings.load_profile("pd4dgs")
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
     """Each worker begins with a run of the tests in their order. The first one's needs kernels, the others' begin with
-    rooms that need none: one worker compiles the kernels, which takes a minute, and the others find them compiled. What
-    takes long comes first."""
+    rooms that need none: one worker compiles the kernels, which takes a minute, and the others find them compiled."""
     rooms = [item.path.relative_to(ROOT / "tests").parts[0] for item in items]
     free = [item for item, room in zip(items, rooms, strict=True) if room in NEED_NO_KERNEL]
     others = [item for item, room in zip(items, rooms, strict=True) if room not in NEED_NO_KERNEL]
-    others.sort(key=lambda item: item.path.stem.removeprefix("test_") not in LONG)
     run = len(items) // int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
     items[:] = [*others[:run], *free, *others[run:]]
 
