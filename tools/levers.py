@@ -15,7 +15,6 @@ from __future__ import annotations
 
 import json
 import os
-import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -23,12 +22,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pages.page import Page, Row, make, options, paragraph, say
+from pages.child import printed
+from pages.page import Page, Row, commit, make, options, paragraph, say
 from pages.scenes import SCENES, Scene, present
 from pages.trainings import ensure_trained
 
 from pd4dgs_codec.bench.report import markdown
-from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.scene import Steps
 from pd4dgs_codec.threads import configure
 from pd4dgs_codec.train.config import DEFAULT_QUALITY, at_quality
@@ -82,12 +81,8 @@ def command(checkout: Path, name: str, *arguments: str) -> Row:
     """What the command `name` of `checkout` prints with --json."""
     program = f"import sys; from pd4dgs_codec.cli.{name} import main; sys.exit(main())"
     environment = os.environ | {"PYTHONPATH": str(checkout)}
-    line = [sys.executable, "-c", program, *arguments, "--json"]
-    done = subprocess.run(line, env=environment, capture_output=True, text=True, cwd=checkout)
-    if done.returncode:
-        raise DataError(f"{name} of {checkout}: {(done.stderr.strip().splitlines() or ['it failed'])[-1]}")
-    row: Row = json.loads(done.stdout)
-    return row
+    line = ["-c", program, *arguments, "--json"]
+    return printed(f"{name} of {checkout}", line, environment=environment, folder=checkout)
 
 
 def curve_before(checkout: Path, commit: str, scene: Scene, kept: Path) -> list[Points]:
@@ -129,9 +124,7 @@ def trained(scene: Scene, path: Path, changes: dict[str, Any]) -> Points:
 
 def measure(scene: Scene, before: Path, out: Path) -> Row:
     """Points of both curves and of the levers, all by level."""
-    head = ["git", "-C", str(before), "rev-parse", "--short=7", "HEAD"]
-    commit = subprocess.run(head, capture_output=True, text=True, check=True).stdout.strip()
-    folder = out / scene.name
+    folder, old = out / scene.name, commit(before)
     places = {q: folder / f"quality-{q:g}" if q != DEFAULT_QUALITY else folder for q in QUALITIES}
     after = [trained(scene, place / "model.pt", at_quality(q)) for q, place in places.items()]
     short = {"iterations": LEVER_STEPS}
@@ -139,8 +132,8 @@ def measure(scene: Scene, before: Path, out: Path) -> Row:
         name: trained(scene, folder / "levers" / name.replace(" ", "-") / "model.pt", short | changes)
         for name, changes in levers().items()
     }
-    old = curve_before(before, commit, scene, folder / "levers" / "before.json")
-    return {"before_commit": commit, "before": old, "after": after, "levers": alone}
+    curve = curve_before(before, old, scene, folder / "levers" / "before.json")
+    return {"before_commit": old, "before": curve, "after": after, "levers": alone}
 
 
 def gains(row: Row) -> list[float | None]:

@@ -13,20 +13,19 @@ some lines anew and keeps the others.
 
 from __future__ import annotations
 
-import json
 import os
 import statistics
-import subprocess
 import sys
 import tempfile
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
+from pages.child import printed
 from pages.page import ROOT, Page, Row, commit, make, options, paragraph, say
 
 from pd4dgs_codec.bench.report import markdown
 from pd4dgs_codec.bench.timing import machine, machine_line
-from pd4dgs_codec.errors import DataError
 
 NAMES = ("shelf-hand", "bouncing-balls", "synthetic-local")
 EFFORTS = (1, 3, 5, 7, 9)
@@ -43,54 +42,60 @@ def run(checkout: Path, what: str, *arguments: str) -> Row:
     environment = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
     environment |= {"PYTHONPATH": str(checkout), "PYTHONPYCACHEPREFIX": BYTECODE.name}
     environment |= {"OMP_NUM_THREADS": "1"} if what == "step" else {}
-    command = [sys.executable, str(PROGRAM), what, *arguments]
-    done = subprocess.run(command, env=environment, capture_output=True, text=True, cwd=checkout)
-    if done.returncode:
-        raise DataError(f"{what} of {checkout}: {(done.stderr.strip().splitlines() or ['it failed'])[-1]}")
-    row: Row = json.loads(done.stdout.splitlines()[-1])
-    return row
+    line = [str(PROGRAM), what, *arguments]
+    return printed(f"{what} of {checkout}", line, environment=environment, folder=checkout)
 
 
-def by_turns(what: str, path: Path, both: dict[str, Path], files: dict[str, str], repeats: int) -> Row:
-    """The medians of one line of the page, before and after."""
-    found: dict[str, list[Row]] = {name: [] for name in both}
-    for _ in range(-(-repeats // 9) if what in SLOW else repeats):
-        for name, checkout in both.items():
-            found[name].append(run(checkout, what, str(path), files[name], "5"))
-    medians = {name: _medians(rows) for name, rows in found.items()}
-    say(f"{path.parent.name}: {what} {medians}")
-    return medians
+@dataclass(frozen=True)
+class Pair:
+    """Both checkouts with one checkpoint and the file that each made of it, since each reads its own draft."""
+
+    checkpoint: Path
+    checkouts: dict[str, Path]
+    files: dict[str, str]
+
+    @classmethod
+    def of(cls, checkpoint: Path, before: Path, folder: Path) -> Pair:
+        """Encodes into `folder` and draws once, so that caches are warm."""
+        checkouts = {"before": before, "after": ROOT}
+        files = {name: str(folder / f"{name}.pd4") for name in checkouts}
+        for name, checkout in checkouts.items():
+            for what in ("encode", "start"):
+                run(checkout, what, str(checkpoint), files[name], "5")
+        return cls(checkpoint, checkouts, files)
+
+    def line(self, what: str, repeats: int) -> Row:
+        """The medians of one line of the page, before and after, measured by turns."""
+        found: dict[str, list[Row]] = {name: [] for name in self.checkouts}
+        for _ in range(-(-repeats // 9) if what in SLOW else repeats):
+            for name, checkout in self.checkouts.items():
+                found[name].append(run(checkout, what, str(self.checkpoint), self.files[name], "5"))
+        medians = {name: _medians(rows) for name, rows in found.items()}
+        say(f"{self.checkpoint.parent.name}: {what} {medians}")
+        return medians
 
 
 def measure_again(row: Row, path: Path, before: Path, repeats: int, lines: Sequence[str]) -> Row:
     """The row with some of its lines as they are now."""
-    both = {"before": before, "after": ROOT}
     with tempfile.TemporaryDirectory() as folder:
-        files = {name: str(Path(folder) / f"{name}.pd4") for name in both}
-        for name, checkout in both.items():
-            run(checkout, "encode", str(path), files[name], "5")
-        found = {what: by_turns(what, path, both, files, repeats) for what in lines}
+        pair = Pair.of(path, before, Path(folder))
+        found = {what: pair.line(what, repeats) for what in lines}
     later = row.get("later", {}) | dict.fromkeys(lines, commit())
     return row | {"lines": row["lines"] | found, "later": later}
 
 
 def measure(path: Path, before: Path, repeats: int) -> Row:
     """Of one checkpoint: per line of the page the medians before and after, and what every effort takes."""
-    both = {"before": before, "after": ROOT}
     with tempfile.TemporaryDirectory() as folder:
-        files = {name: str(Path(folder) / f"{name}.pd4") for name in both}  # each reads its own draft of the format
-        for name, checkout in both.items():  # and warm caches
-            run(checkout, "encode", str(path), files[name], "5")
-            run(checkout, "start", str(path), files[name], "5")
-        lines = {what: by_turns(what, path, both, files, repeats) for what in LINES}
-        efforts = []
+        pair = Pair.of(path, before, Path(folder))
+        lines = {what: pair.line(what, repeats) for what in LINES}
+        file, efforts = pair.files["after"], list[Row]()
         for effort in EFFORTS:
-            row = run(ROOT, "encode", str(path), files["after"], str(effort))
-            efforts.append({"effort": effort, **row})
+            efforts.append({"effort": effort, **run(ROOT, "encode", str(path), file, str(effort))})
         alone: Row = {}
         if path.parent.name == NAMES[0]:
             say("growth and other coders")
-            alone["beside"] = run(ROOT, "beside", str(path), files["after"], "5")
+            alone["beside"] = run(ROOT, "beside", str(path), file, "5")
             own = str(Path(folder) / "grown.pd4")
             alone["growth"] = [run(ROOT, "grow", str(path), own, str(anchors)) for anchors in GROWTH]
     return {"lines": lines, "efforts": efforts, **alone, "machine": machine_line(machine())}

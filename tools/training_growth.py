@@ -11,17 +11,16 @@ from __future__ import annotations
 import json
 import resource
 import statistics
-import subprocess
 import sys
 import time
 from collections.abc import Sequence
 from dataclasses import replace
 
+from pages.child import printed
 from pages.page import Page, Row, make, options, say
 from pages.scenes import SCENES, present
 
 from pd4dgs_codec.bench.report import markdown
-from pd4dgs_codec.errors import DataError
 
 #: Per scene (how many times smaller its pictures are, anchors): first pixels grow, then anchors.
 CASES: dict[str, tuple[tuple[int, int], ...]] = {
@@ -67,11 +66,7 @@ def measure(name: str, steps: int) -> Row:
     """All cases of one scene."""
     found = []
     for downscale, anchors in CASES[name]:
-        line = [sys.executable, __file__, "--one", name, str(downscale), str(anchors), str(steps)]
-        done = subprocess.run(line, capture_output=True, text=True)
-        if done.returncode:
-            raise DataError(f"{name}: {(done.stderr.strip().splitlines() or ['it failed'])[-1]}")
-        found.append(json.loads(done.stdout.splitlines()[-1]))
+        found.append(printed(name, [__file__, "--one", name, str(downscale), str(anchors), str(steps)]))
         say(f"{name}: {found[-1]}")
     return {"cases": found}
 

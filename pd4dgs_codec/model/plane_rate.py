@@ -85,6 +85,13 @@ def _magnitudes(
 
 
 @kernel(inline=True)
+def _signed(weight: Vector, r: Vector) -> Vector:
+    """The weight with the sign of r, 0 where r is."""
+    zero = r - r
+    return select_gt(r, zero, weight, select_gt(zero, r, zero - weight, zero))
+
+
+@kernel(inline=True)
 def _add(grad: np.ndarray, k: int, value: Vector) -> None:
     store(grad, k, load(grad, k) + value)
 
@@ -110,20 +117,22 @@ def _gradient(
                 own = splat(by_cell[cell])
                 for c in range(0, channels, LANES):
                     k = cell * channels + c
-                    r, weight = _residual(grid, k, before, up, left), load(by_channel, p * channels + c) + own
-                    g = select_gt(r, zero, weight, select_gt(zero, r, zero - weight, zero))
-                    _add(grad, k, g)
+                    weight = load(by_channel, p * channels + c) + own
                     if before:
+                        g = _signed(weight, load(grid, k) - load(grid, k - before))
+                        _add(grad, k, g)
                         _add(grad, k - before, zero - g)
                         continue
-                    # the gradient goes to those neighbours that the median is made of
                     w, n = load(grid, k - left), load(grid, k - up)
                     plane = w + n - load(grid, k - up - left)
                     median = _median(w, n, plane)
+                    g = _signed(weight, load(grid, k) - median)
+                    # it goes to those neighbours that the median is made of
                     west = select_gt(median, w, zero, select_gt(w, median, zero, g))
                     north = g - west
                     low, high = select_gt(w, n, n, w), select_gt(w, n, w, n)
                     corner = select_gt(plane, low, select_gt(high, plane, g, zero), zero)
+                    _add(grad, k, g)
                     _add(grad, k - up, zero - north)
                     _add(grad, k - left, zero - west - corner)
                     _add(grad, k - up - left, corner)

@@ -58,9 +58,22 @@ class Optimiser:
                 self.moments[p] = {STEP: zero, MEAN: torch.zeros_like(p), SQUARE: torch.zeros_like(p)}
         means, squares, steps = ([self.moments[p][name] for p in params] for name in (MEAN, SQUARE, STEP))
         gradients = [p.grad for p in params if p.grad is not None]
-        betas, switches = {"beta1": 0.9, "beta2": 0.99}, {"fused": True, "amsgrad": False, "maximize": False}
-        given: Any = betas | switches | {"lr": rate, "weight_decay": 0.0, "eps": 1e-15}
-        adam(params, gradients, means, squares, [], steps, **given)
+        adam(
+            params,
+            gradients,
+            means,
+            squares,
+            [],
+            steps,
+            fused=True,
+            amsgrad=False,
+            maximize=False,
+            beta1=0.9,
+            beta2=0.99,
+            lr=rate,
+            weight_decay=0.0,
+            eps=1e-15,
+        )
 
     def gradient_norm(self) -> float:
         """Norm over all gradients; NaN or infinite if any is."""

@@ -80,12 +80,12 @@ def stamp(command: str, rows: Sequence[Row], whole: bool) -> str:
     return f"{what} are of commit {told}; `{command}` makes them anew."
 
 
-def commit() -> str:
-    """The commit that is checked out, short, and whether it was changed since."""
+def commit(checkout: Path = ROOT) -> str:
+    """The commit that is checked out, short, and whether its package was changed since; "unknown" without git."""
     try:
-        head = ["git", "-C", str(ROOT), "rev-parse", "--short=7", "HEAD"]
+        head = ["git", "-C", str(checkout), "rev-parse", "--short=7", "HEAD"]
         name = subprocess.run(head, capture_output=True, text=True, check=True).stdout.strip()
-        tree = ["git", "-C", str(ROOT), "status", "--porcelain", "--", "pd4dgs_codec"]
+        tree = ["git", "-C", str(checkout), "status", "--porcelain", "--", "pd4dgs_codec"]
         changed = subprocess.run(tree, capture_output=True, text=True, check=True).stdout.strip()
     except (OSError, subprocess.CalledProcessError):
         return "unknown"
