@@ -15,7 +15,7 @@ from pathlib import Path
 
 import numpy as np
 from pages.page import Page, Row, make, options, say
-from pages.scenes import SCENES, present
+from pages.scenes import SMALL, present
 
 from pd4dgs_codec.bench.report import markdown
 from pd4dgs_codec.scene import Camera, Scene
@@ -23,7 +23,6 @@ from pd4dgs_codec.threads import configure
 
 SIDE = 64  #: of the pictures, pixels
 EFFORT = 5  #: of the encoder
-NAMES = tuple(name for name in SCENES if name != "shelf-hand-paper")
 
 
 def measure(path: Path, pictures: int) -> Row:
@@ -93,17 +92,17 @@ PAGE = Page("omissions", "omissions.py", render)
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    parser = options(__doc__, NAMES)
+    parser = options(__doc__, SMALL)
     parser.add_argument("--pictures", type=int, default=1000, metavar="N", help="to compare (default: 1000)")
     args = parser.parse_args(argv)
     configure(1)  # with more, the first picture of a process may differ from itself drawn again by 3e-8
-    todo = [scene.name for scene in present(args, NAMES)]
+    todo = [scene.name for scene in present(args, SMALL)]
 
     def measured(name: str) -> Row:
         say(f"{name}: packing it twice, comparing {args.pictures:,} pictures")
         return measure(args.out / name / "model.pt", args.pictures)
 
-    code = make(PAGE, NAMES, todo, args, measured)
+    code = make(PAGE, SMALL, todo, args, measured)
     return code or int(any(row["same"] != row["pictures"] for row in PAGE.read(args.docs)))
 
 

@@ -21,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 from pages.page import Page, Row, keep, make, options, say, unpadded
-from pages.scenes import SCENES, Scene, present
+from pages.scenes import SCENES, SMALL, Scene, present
 
 from pd4dgs_codec.threads import configure
 
@@ -38,7 +38,6 @@ WAYS = "oracle float64,textbook float32,kernels,gsplat"
 WAYS_ALL = f"{WAYS},tile 16x16,tile 8x16,alpha >= 1/64,T > 1e-3,T > 1e-2"
 #: Models whose training is drawn together.
 TRAINED = {"shelf-hand": ("shelf-hand", "shelf-hand-paper")}
-NAMES = tuple(name for name in SCENES if name != "shelf-hand-paper")
 
 
 def measure(scene: Scene, out: Path, docs: Path) -> Row:
@@ -47,7 +46,7 @@ def measure(scene: Scene, out: Path, docs: Path) -> Row:
 
     from pd4dgs_codec.bench import timing
 
-    model, first = out / scene.name / "model.pt", scene.name == NAMES[0]
+    model, first = out / scene.name / "model.pt", scene.name == SMALL[0]
     data = ["--data", scene.source, "--downscale", str(scene.downscale)]
     runs = [str(p) for n in TRAINED.get(scene.name, (scene.name,)) if (p := out / n / "model.pt").exists()]
     commands = {
@@ -202,14 +201,14 @@ PAGE = Page("precision", "precision.py", render)
 
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
-    args = options(__doc__, NAMES).parse_args(argv)
+    args = options(__doc__, SMALL).parse_args(argv)
     configure()
-    scenes = present(args, NAMES)
+    scenes = present(args, SMALL)
     for scene in scenes:
         if not (args.out / scene.name / "model.pt").exists():
             say(f"{scene.name}: {args.out / scene.name / 'model.pt'} is not there, left out")
     todo = [scene.name for scene in scenes if (args.out / scene.name / "model.pt").exists()]
-    return make(PAGE, NAMES, todo, args, lambda name: measure(SCENES[name], args.out, args.docs))
+    return make(PAGE, SMALL, todo, args, lambda name: measure(SCENES[name], args.out, args.docs))
 
 
 if __name__ == "__main__":

@@ -35,7 +35,8 @@ SOURCE is one of
   synthetic:global   large objects move slowly
   synthetic:local    the same, and small parts move on their own
   synthetic:fast     quick motion
-  (synthetic:NAME?seed=n gives another scene of that kind)
+  (synthetic:NAME?seed=n gives another scene of that kind; &size=WxH and &frames=N,
+  default 160x120 and 60, larger pictures and more of them)
   teacher:PATH       pictures of explicit Gaussians: a folder of .ply or .spz files, one per frame, one such file, a
                      .4dgs file, a checkpoint of gsplat, or module:function (time -> Gaussians)
   (teacher:PATH?cameras=SOURCE takes the cameras, times and held-out pictures of another source;

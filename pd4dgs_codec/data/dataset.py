@@ -20,7 +20,7 @@ from pd4dgs_codec.errors import DataError
 def load(source: str | Path, *, downscale: int = 1, holdout: int = 8) -> Dataset:
     """Read a dataset.
 
-    source: `synthetic:NAME[?seed=n]`, a folder in the iPhone/Nerfies layout, a folder with
+    source: `synthetic:NAME[?seed=n&size=WxH&frames=N]`, a folder in the iPhone/Nerfies layout, a folder with
         transforms*.json, one with poses_bounds.npy and videos, one of Panoptic Studio or Record3D, or one with a model
         of COLMAP and pictures or videos.
     downscale: images are averaged over downscale x downscale blocks (the remainder is cropped), intrinsics follow.

@@ -23,6 +23,7 @@ import numpy as np
 
 from pd4dgs_codec.data.cameras import depth_range, points_box
 from pd4dgs_codec.data.dataset import load
+from pd4dgs_codec.data.options import split_options
 from pd4dgs_codec.data.posed import held_out
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DataError
@@ -154,18 +155,7 @@ def _pictures(teacher: Teacher, shots: Sequence[tuple[Camera, float]], backgroun
 
 def _parsed(source: str) -> tuple[str, Options]:
     """The place and the options of `teacher:place?key=value&...`."""
-    place, _, query = source.removeprefix(PREFIX).partition("?")
-    values: dict[str, Any] = {}
-    for part in query.split("&") if query else []:
-        key, _, text = part.partition("=")
-        if key not in EXAMPLES or key in values:
-            raise DataError(
-                f"{source}: found {part!r}, expected each of {', '.join(EXAMPLES)} once at most, as key=value"
-            )
-        try:
-            values[key] = _value(key, text)
-        except ValueError:
-            raise DataError(f"{source}: {key} is {text!r}; expected for example {EXAMPLES[key]}") from None
+    place, values = split_options(source.removeprefix(PREFIX), source, _value, EXAMPLES)
     if not place:
         raise DataError(f"{source}: names no teacher; expected {PREFIX}FOLDER, {PREFIX}FILE or {PREFIX}module:function")
     return place, Options(**values)

@@ -113,11 +113,21 @@ def test_holdout_that_leaves_nothing(blender, k):
     refused(blender(), f"holdout {k} leaves no training frame", holdout=k)
 
 
-@pytest.mark.parametrize(
-    "name", ["", "nothing", "static?seed=-1", "static?seed=x", "static?", "Static", "local?seed=1&a"]
-)
+@pytest.mark.parametrize("name", ["", "nothing", "Static", "nothing?seed=1"])
 def test_unknown_synthetic(name):
-    refused(f"synthetic:{name}", "expected synthetic:static|global|local|fast[?seed=n]")
+    refused(f"synthetic:{name}", "expected synthetic:static|global|local|fast[?seed=n&size=WxH&frames=N]")
+
+
+@pytest.mark.parametrize(
+    "query", ["seed=-1", "seed=x", "size=160", "size=7x160", "size=9000x9000", "frames=2", "frames="]
+)
+def test_synthetic_option_of_another_value(query):
+    refused(f"synthetic:static?{query}", f"{query.split('=')[0]} is {query.split('=')[1]!r}; expected for example")
+
+
+@pytest.mark.parametrize("query", ["", "a", "seed=1&a", "seed=1&seed=1", "seed=1&"])
+def test_unknown_option_of_a_synthetic_scene(query):
+    refused(f"synthetic:static?{query}", "expected each of seed, size, frames once at most, as key=value")
 
 
 def test_synthetic_downscale_too_large():

@@ -34,10 +34,8 @@ def same_views(a, b):
             np.testing.assert_array_equal(x.mask, y.mask)
 
 
-def test_full_scene_round_trip(tmp_path, monkeypatch):
-    monkeypatch.setattr(synthetic, "TRAIN_FRAMES", 6)
-    monkeypatch.setattr(synthetic, "TEST_INSTANTS", (0, 2, 5))
-    a = synthetic._dataset.__wrapped__("local", 0)
+def test_full_scene_round_trip(tmp_path):
+    a = load("synthetic:local?frames=6")
     export_iphone(a, tmp_path / "out")
     b = load(tmp_path / "out")
     same_views(a.train + a.test, b.train + b.test)

@@ -72,7 +72,7 @@ def test_visibility_agrees_with_marching():
 def test_first_hit_is_the_nearest_of_all_bodies():
     placed = place(SceneBuilder("static", 3).bodies(), 0.0)
     eye = Eye(placed, syn.fixed_viewmats()[0])
-    xs, ys = syn._grid(1)
+    xs, ys = syn._grid(syn.LENS)
     depth, index = eye.first_hits(xs, ys)
     full = np.stack([eye.enter(b, xs[None, :], ys[:, None]) for b in placed])
     np.testing.assert_array_equal(depth, full.min(axis=0))
@@ -128,7 +128,7 @@ def test_points_lie_on_what_is_seen(local):
     c = v.viewmat[:3, :3] @ local.points.T + v.viewmat[:3, 3:]
     u, w = c[0] / c[2] * syn.LENS.fx + syn.LENS.cx, c[1] / c[2] * syn.LENS.fy + syn.LENS.cy
     ok = (c[2] > 0) & (u > 1) & (w > 1) & (u < 159) & (w < 119)
-    depth, _ = eye.first_hits(*syn._grid(1))
+    depth, _ = eye.first_hits(*syn._grid(syn.LENS))
     ok[ok] = np.abs(depth[w[ok].astype(int), u[ok].astype(int)] - c[2][ok]) < 0.08
     assert ok.sum() > 1500
     error = np.abs(v.image[w[ok].astype(int), u[ok].astype(int)].astype(float) - local.point_colors[ok])
@@ -142,14 +142,27 @@ def digest(d) -> str:
     return h.hexdigest()
 
 
-def test_content_depends_on_the_string_alone(local, monkeypatch):
+def test_content_depends_on_the_string_alone(local):
     assert load("synthetic:local?seed=0") is local
-    monkeypatch.setattr(syn, "TRAIN_FRAMES", 6)
-    monkeypatch.setattr(syn, "TEST_INSTANTS", (2,))
-    once = syn._dataset.__wrapped__("local", 0)
+    once = syn._dataset.__wrapped__(syn.parse("synthetic:local?frames=6"))
     np.random.seed(5)  # noqa: NPY002 - a global seed must not matter
-    assert digest(syn._dataset.__wrapped__("local", 0)) == digest(once)
-    assert digest(syn._dataset.__wrapped__("local", 1)) != digest(once)
+    assert digest(syn._dataset.__wrapped__(syn.parse("synthetic:local?seed=0&frames=6"))) == digest(once)
+    assert digest(syn._dataset.__wrapped__(syn.parse("synthetic:local?frames=6&seed=1"))) != digest(once)
+
+
+def test_size_and_frames_are_those_asked_for(local):
+    """As much from top to bottom, the same motion over the same seconds."""
+    other = load("synthetic:local?size=96x48&frames=7")
+    assert len(other.train) == 7 and [v.time for v in other.train] == [i / 6 for i in range(7)]
+    assert other.time_range == local.time_range and len(other.test) == 2 * 5
+    for v in (*other.train, *other.test):
+        assert v.image.shape == (48, 96, 3) and (v.mask is None or v.mask.shape == (48, 96))
+    wide, usual = other.train[0], local.train[0]
+    np.testing.assert_allclose(wide.K[1] / 48, usual.K[1] / 120, rtol=1e-6)
+    assert wide.K[0, 0] == wide.K[1, 1]
+    middle = wide.image[:, 16:80].astype(float)  # 64 of 96 columns show what 160 of 160 do
+    blocks = usual.image.astype(float).reshape(24, 5, 32, 5, 3).mean((1, 3))
+    assert np.abs(middle.reshape(24, 2, 32, 2, 3).mean((1, 3)) - blocks).mean() < 6  # the axis is .3 pixels off
 
 
 def test_seed_and_name_change_the_picture():

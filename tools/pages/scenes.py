@@ -19,13 +19,15 @@ SHARED = Path(os.environ.get("PD4DGS_SHARED") or Path(__file__).resolve().parent
 
 @dataclass(frozen=True)
 class Scene:
-    """One scene and how tools/results.py trains it. name: its folder in out/ and its rows."""
+    """One scene and how tools/results.py trains it. name: its folder in out/ and its rows; seconds: instead of
+    iterations."""
 
     name: str
     source: str
     downscale: int = 1
     preset: str = "small"
     iterations: int = 1_500
+    seconds: float | None = None
 
     @property
     def there(self) -> bool:
@@ -43,7 +45,8 @@ class Scene:
         from pd4dgs_codec.train.config import TrainConfig
 
         given = {"preset": self.preset, "source": self.source, "downscale": self.downscale}
-        return TrainConfig(**given | {"iterations": self.iterations} | changes)
+        length = {"max_seconds": self.seconds} if self.seconds else {"iterations": self.iterations}
+        return TrainConfig(**given | length | changes)
 
 
 SCENES = {
@@ -53,8 +56,13 @@ SCENES = {
         Scene("bouncing-balls", str(SHARED / "bouncing-balls"), 4, iterations=7_000),
         *(Scene(f"synthetic-{name}", f"synthetic:{name}") for name in ("static", "global", "local", "fast")),
         Scene("shelf-hand-paper", str(SHARED / "shelf-hand"), 2, "paper", 4_600),
+        Scene("shelf-hand-large", str(SHARED / "shelf-hand"), 1, seconds=1_800),
+        Scene("bouncing-balls-large", str(SHARED / "bouncing-balls"), 2, seconds=1_800),
+        Scene("synthetic-large", "synthetic:local?size=960x540&frames=300", 1, seconds=1_800),
     )
 }
+#: Those of the preset small with pictures of a fraction of their size.
+SMALL = tuple(name for name, scene in SCENES.items() if scene.preset == "small" and not scene.seconds)
 
 
 def present(args: argparse.Namespace, names: Sequence[str] = tuple(SCENES)) -> list[Scene]:
