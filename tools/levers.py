@@ -14,7 +14,6 @@ cubics).
 from __future__ import annotations
 
 import json
-import os
 import sys
 import tempfile
 from collections.abc import Sequence
@@ -22,7 +21,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pages.child import printed
+from pages.child import command
 from pages.page import Page, Row, commit, make, options, paragraph, say
 from pages.scenes import SCENES, Scene, present
 from pages.trainings import ensure_trained
@@ -75,14 +74,6 @@ def bjontegaard(curve: Points, reference: Points) -> float | None:
         return None
     at = np.linspace(low, high, 1001)
     return float(np.exp((np.interp(at, *ours) - np.interp(at, *theirs)).mean()) - 1)
-
-
-def command(checkout: Path, name: str, *arguments: str) -> Row:
-    """What the command `name` of `checkout` prints with --json."""
-    program = f"import sys; from pd4dgs_codec.cli.{name} import main; sys.exit(main())"
-    environment = os.environ | {"PYTHONPATH": str(checkout)}
-    line = ["-c", program, *arguments, "--json"]
-    return printed(f"{name} of {checkout}", line, environment=environment, folder=checkout)
 
 
 def curve_before(checkout: Path, commit: str, scene: Scene, kept: Path) -> list[Points]:

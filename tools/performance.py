@@ -8,7 +8,8 @@ next pair (of encodings and trainings a ninth as many). Each checkpoint in --out
 scene; its data must be there for the lines on training. Figures are medians over the repeats; the page states the
 processors and the load. How cost grows, and what other coders take for the same symbols, is measured of this checkout
 alone, on the first scene. Two scenes and nine repeats take some ten minutes on two idle processors. --lines measures
-some lines anew and keeps the others.
+some lines anew and keeps the others. The line `race` trains the real scenes with both at once, a thread each, in
+--out/NAME/race, which takes a quarter of an hour; it is measured only where it is asked for.
 """
 
 from __future__ import annotations
@@ -23,6 +24,8 @@ from pathlib import Path
 
 from pages.child import printed
 from pages.page import ROOT, Page, Row, commit, make, options, paragraph, say
+from pages.race import race, race_plot, race_table
+from pages.scenes import SCENES
 
 from pd4dgs_codec.bench.report import markdown
 from pd4dgs_codec.bench.timing import machine, machine_line
@@ -77,11 +80,18 @@ class Pair:
 
 def measure_again(row: Row, path: Path, before: Path, repeats: int, lines: Sequence[str]) -> Row:
     """The row with some of its lines as they are now."""
-    with tempfile.TemporaryDirectory() as folder:
-        pair = Pair.of(path, before, Path(folder))
-        found = {what: pair.line(what, repeats) for what in lines}
-    later = row.get("later", {}) | dict.fromkeys(lines, commit())
-    return row | {"lines": row["lines"] | found, "later": later}
+    timed = [what for what in lines if what in LINES]
+    found = {}
+    if timed:
+        with tempfile.TemporaryDirectory() as folder:
+            pair = Pair.of(path, before, Path(folder))
+            found = {what: pair.line(what, repeats) for what in timed}
+    alone: Row = {}
+    scene = SCENES[path.parent.name]
+    if RACE in lines and scene.there and not scene.source.startswith("synthetic:"):
+        alone["race"] = race(scene, {"before": before, "after": ROOT}, path.parent / "race")
+    later = row.get("later", {}) | dict.fromkeys([*found, *({RACE} & alone.keys())], commit())
+    return row | {"lines": row["lines"] | found, "later": later} | alone
 
 
 def measure(path: Path, before: Path, repeats: int) -> Row:
@@ -124,6 +134,7 @@ LINES = {
     "step": tuple((f"training step at level {n}, one thread, processor ms", f"level {n}", 1e3, 1) for n in range(3)),
 }
 SLOW = ("encode", "first", "step")
+RACE = "race"
 #: Lines whose figures are better when they are larger.
 RATES = ("rate",)
 
@@ -149,7 +160,8 @@ def render(rows: Sequence[Row]) -> str:
         for row in rows
         for effort in row["efforts"]
     ]
-    later = sorted({(sha, LINES[what][0][0]) for row in rows for what, sha in row.get("later", {}).items()})
+    heads = {what: texts[0][0] for what, texts in LINES.items()} | {RACE: "both trainers at once"}
+    later = sorted({(sha, heads[what]) for row in rows for what, sha in row.get("later", {}).items()})
     newer = "; ".join(f'"{text}" and what follows it: `{sha}`' for sha, text in later)
     parts = [
         "\n".join(sorted({row["machine"] for row in rows})),
@@ -160,6 +172,13 @@ def render(rows: Sequence[Row]) -> str:
     ]
     for row in rows:
         parts += [*_growth(row), *_beside(row)]
+    if raced := [row for row in rows if RACE in row]:
+        text = (
+            "Both trainers at once, a thread each: held-out dB at levels 0 / 1 / 2 at the same wall time, as training "
+            "draws a few held-out views, before anything is packed. Less is rounded before; what ends there is larger "
+            "([levers](levers.md))."
+        )
+        parts += ["\n".join(paragraph(text)), *race_table(raced), "![dB against time](img/race.png)"]
     return "\n\n".join(parts)
 
 
@@ -208,7 +227,9 @@ def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     parser = options(__doc__, NAMES)
     parser.add_argument("--before", type=Path, metavar="FOLDER", help="a checkout to compare with")
-    parser.add_argument("--lines", nargs="+", choices=tuple(LINES), metavar="WHAT", help="these alone, of scenes there")
+    parser.add_argument(
+        "--lines", nargs="+", choices=(*LINES, RACE), metavar="WHAT", help="these alone, of scenes there"
+    )
     parser.add_argument("--repeats", type=int, default=9, metavar="N", help="of each measurement (default: 9)")
     args = parser.parse_args(argv)
     if not args.render and (args.before is None or not (args.before / "pd4dgs_codec").is_dir()):
@@ -221,7 +242,11 @@ def main(argv: list[str] | None = None) -> int:
         given = args.out / name / "model.pt", args.before.resolve(), args.repeats
         return measure_again(there[name], *given, args.lines) if args.lines else measure(*given)
 
-    return make(PAGE, NAMES, todo, args, measured)
+    def finish(rows: list[Row]) -> None:
+        if raced := [row for row in rows if RACE in row]:
+            race_plot(raced, args.docs / "img" / "race.png")
+
+    return make(PAGE, NAMES, todo, args, measured, finish)
 
 
 if __name__ == "__main__":

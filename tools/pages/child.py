@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -24,3 +25,11 @@ def printed(
         raise DataError(f"{what}: {(done.stderr.strip().splitlines() or ['it failed'])[-1]}")
     row: Row = json.loads(done.stdout.splitlines()[-1])
     return row
+
+
+def command(checkout: Path, name: str, *arguments: str) -> Row:
+    """What the command `name` of another checkout of this project prints with --json."""
+    program = f"import sys; from pd4dgs_codec.cli.{name} import main; sys.exit(main())"
+    environment = os.environ | {"PYTHONPATH": str(checkout)}
+    line = ["-c", program, *arguments, "--json"]
+    return printed(f"{name} of {checkout}", line, environment=environment, folder=checkout)
