@@ -84,7 +84,7 @@ def parser() -> Parser:
     for name, what in (("title", "of the scene"), ("source", "what it was made of"), ("licence", "its terms of use")):
         about.add_argument(f"--{name}", metavar="TEXT", help=what)
     views = p.add_argument_group("judging by pictures")
-    what = "a dataset, see above: sizes are fitted on its training views, layers must pay on those held out"
+    what = "a dataset, see below: sizes are fitted on its training views, layers must pay on those held out"
     views.add_argument("--data", metavar="SOURCE", help=what)
     add_reading(views)
     what = "use about N of its views of either kind, evenly spread (default: 16)"

@@ -48,7 +48,7 @@ the first one writes. N must divide V. A run may be resumed with another N.
 {SOURCES}
 
 examples:
-  torchrun --nproc-per-node=2 -m pd4dgs_codec train synthetic:local -o local.pt --views-per-step 2
+  torchrun --nproc-per-node=2 -m -- pd4dgs_codec train synthetic:local -o local.pt --views-per-step 2
   pd4dgs-train synthetic:local -o local.pt --preset tiny --max-seconds 300
   pd4dgs-train recordings/kitchen -o kitchen.pt --downscale 2 --iterations 10000
   pd4dgs-train recordings/kitchen -o kitchen.pt --resume kitchen.pt"""

@@ -47,7 +47,7 @@ def race_table(rows: Sequence[Row]) -> list[str]:
             reached = [[point for point in curve if point[0] <= share * end] for share in MOMENTS]
             cells = [" / ".join(f"{db:.2f}" for db in points[-1][1:]) if points else "" for points in reached]
             table.append((row["name"], name, f"{curve[-1][0] / 60:.1f}", *cells))
-    moments = (f"{share:.0%} of the time before" for share in MOMENTS)
+    moments = (f"at {share:.0%} of that before, dB" for share in MOMENTS)
     return [markdown(("scene", "trainer", "whole run, min", *moments), table)]
 
 
