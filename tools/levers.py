@@ -26,7 +26,7 @@ from pages.page import Page, Row, commit, make, options, paragraph, say
 from pages.scenes import SCENES, Scene, present
 from pages.trainings import ensure_trained
 
-from pd4dgs_codec.bench.report import markdown
+from pd4dgs_codec.bench.report import drawing, markdown
 from pd4dgs_codec.scene import Steps
 from pd4dgs_codec.threads import configure
 from pd4dgs_codec.train.config import DEFAULT_QUALITY, at_quality
@@ -139,27 +139,18 @@ def gains(row: Row) -> list[float | None]:
 
 def plot(rows: Sequence[Row], path: Path) -> None:
     """One panel per scene; a line per level, before dashed."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(1, len(rows), figsize=(5.6 * len(rows), 4.2), squeeze=False)
-    for axis, row in zip(axes.flat, rows, strict=True):
-        for side, style, shade in (("before", "--", "0.6"), ("after", "-", "black")):
-            for level in range(3):
-                points = sorted(found[level] for found in row[side] if level < len(found))
-                if points:
-                    sizes, db = zip(*points, strict=True)
-                    name = f"level {level}, {row['before_commit'] if side == 'before' else 'now'}"
-                    kilo = [size / 1000 for size in sizes]
-                    axis.plot(kilo, db, style, color=shade, marker="os^"[level], ms=4, lw=1, label=name)
-        axis.set(title=row["name"], xlabel="kB up to the level", ylabel="held-out mPSNR, dB")
-        axis.grid(alpha=0.3)
-        axis.legend(fontsize=8)
-    figure.tight_layout()
-    figure.savefig(path, dpi=100)
-    pyplot.close(figure)
+    with drawing(path, [row["name"] for row in rows], "held-out mPSNR, dB", (5.6, 4.2)) as axes:
+        for axis, row in zip(axes, rows, strict=True):
+            for side, style, shade in (("before", "--", "0.6"), ("after", "-", "black")):
+                for level, mark in enumerate("os^"):
+                    points = sorted(found[level] for found in row[side] if level < len(found))
+                    if points:
+                        sizes, db = zip(*points, strict=True)
+                        name = f"level {level}, {row['before_commit'] if side == 'before' else 'now'}"
+                        kilo = [size / 1000 for size in sizes]
+                        axis.plot(kilo, db, style, color=shade, marker=mark, ms=4, lw=1, label=name)
+            axis.set_xlabel("kB up to the level")
+            axis.legend(fontsize=8)
 
 
 def _cells(points: Points) -> tuple[str, str]:

@@ -1,15 +1,16 @@
 """How long encoding, decoding and drawing take, before and after. Writes docs/performance.md.
 
-    python tools/performance.py --before FOLDER [--only NAME ...] [--repeats 9] [--lines WHAT ...]
+    python tools/performance.py --before FOLDER [--own FOLDER] [--only NAME ...] [--repeats 9] [--lines WHAT ...]
                                 [--out out] [--docs docs] [--render]
 
 FOLDER is a checkout of another commit of this project, measured by turns with this one: one process of each, then the
 next pair (of encodings and trainings a ninth as many). Each checkpoint in --out/NAME/model.pt that both can read is one
 scene; its data must be there for the lines on training. Figures are medians over the repeats; the page states the
-processors and the load. How cost grows, and what other coders take for the same symbols, is measured of this checkout
-alone, on the first scene. Two scenes and nine repeats take some ten minutes on two idle processors. --lines measures
-some lines anew and keeps the others. The line `race` trains the real scenes with both at once, a thread each, in
---out/NAME/race, which takes a quarter of an hour; it is measured only where it is asked for.
+processors and the load. Of this checkout alone: what --own holds, checkpoints of today, as users have them; and on the
+first scene how cost grows, and what other coders take for the same symbols. Two scenes and nine repeats take some ten
+minutes on two idle processors. --lines measures some lines anew and keeps the others. The line `race` trains the real
+scenes with both at once, a thread each, in --out/NAME/race, which takes a quarter of an hour; it is measured only where
+it is asked for.
 """
 
 from __future__ import annotations
@@ -18,7 +19,7 @@ import os
 import statistics
 import sys
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -50,17 +51,17 @@ def run(checkout: Path, what: str, *arguments: str) -> Row:
 
 
 @dataclass(frozen=True)
-class Pair:
-    """Both checkouts with one checkpoint and the file that each made of it, since each reads its own draft."""
+class Turns:
+    """Checkouts that are measured by turns with one checkpoint, and the file that each made of it, since each reads its
+    own draft."""
 
     checkpoint: Path
     checkouts: dict[str, Path]
     files: dict[str, str]
 
     @classmethod
-    def of(cls, checkpoint: Path, before: Path, folder: Path) -> Pair:
+    def of(cls, checkpoint: Path, checkouts: dict[str, Path], folder: Path) -> Turns:
         """Encodes into `folder` and draws once, so that caches are warm."""
-        checkouts = {"before": before, "after": ROOT}
         files = {name: str(folder / f"{name}.pd4") for name in checkouts}
         for name, checkout in checkouts.items():
             for what in ("encode", "start"):
@@ -68,7 +69,7 @@ class Pair:
         return cls(checkpoint, checkouts, files)
 
     def line(self, what: str, repeats: int) -> Row:
-        """The medians of one line of the page, before and after, measured by turns."""
+        """The medians of one line of the page, by checkout."""
         found: dict[str, list[Row]] = {name: [] for name in self.checkouts}
         for _ in range(-(-repeats // 9) if what in SLOW else repeats):
             for name, checkout in self.checkouts.items():
@@ -78,36 +79,40 @@ class Pair:
         return medians
 
 
-def measure_again(row: Row, path: Path, before: Path, repeats: int, lines: Sequence[str]) -> Row:
+def measure_again(row: Row, path: Path, both: dict[str, Path], repeats: int, lines: Sequence[str]) -> Row:
     """The row with some of its lines as they are now."""
     timed = [what for what in lines if what in LINES]
     found = {}
     if timed:
         with tempfile.TemporaryDirectory() as folder:
-            pair = Pair.of(path, before, Path(folder))
-            found = {what: pair.line(what, repeats) for what in timed}
-    alone: Row = {}
+            turns = Turns.of(path, both, Path(folder))
+            found = {what: turns.line(what, repeats) for what in timed}
+    raced: Row = {}
     scene = SCENES[path.parent.name]
     if RACE in lines and scene.there and not scene.source.startswith("synthetic:"):
-        alone["race"] = race(scene, {"before": before, "after": ROOT}, path.parent / "race")
-    later = row.get("later", {}) | dict.fromkeys([*found, *({RACE} & alone.keys())], commit())
-    return row | {"lines": row["lines"] | found, "later": later} | alone
+        raced[RACE] = race(scene, both, path.parent / "race")
+    later = row.get("later", {}) | dict.fromkeys([*found, *raced], commit())
+    return row | {"lines": row["lines"] | found, "later": later} | raced
 
 
-def measure(path: Path, before: Path, repeats: int) -> Row:
-    """Of one checkpoint: per line of the page the medians before and after, and what every effort takes."""
+def measure(path: Path, both: dict[str, Path], repeats: int, own: Path | None) -> Row:
+    """Of one checkpoint: per line of the page the medians before and after, and what every effort takes; of the
+    checkpoint `own` what its user waits for."""
     with tempfile.TemporaryDirectory() as folder:
-        pair = Pair.of(path, before, Path(folder))
-        lines = {what: pair.line(what, repeats) for what in LINES}
-        file, efforts = pair.files["after"], list[Row]()
+        turns = Turns.of(path, both, Path(folder))
+        lines = {what: turns.line(what, repeats) for what in LINES}
+        file, efforts = turns.files["after"], list[Row]()
         for effort in EFFORTS:
             efforts.append({"effort": effort, **run(ROOT, "encode", str(path), file, str(effort))})
         alone: Row = {}
         if path.parent.name == NAMES[0]:
             say("growth and other coders")
             alone["beside"] = run(ROOT, "beside", str(path), file, "5")
-            own = str(Path(folder) / "grown.pd4")
-            alone["growth"] = [run(ROOT, "grow", str(path), own, str(anchors)) for anchors in GROWTH]
+            grown = str(Path(folder) / "grown.pd4")
+            alone["growth"] = [run(ROOT, "grow", str(path), grown, str(anchors)) for anchors in GROWTH]
+        if own:
+            turns = Turns.of(own, {"after": ROOT}, Path(folder))
+            alone["own"] = {what: turns.line(what, repeats) for what in USED}
     return {"lines": lines, "efforts": efforts, **alone, "machine": machine_line(machine())}
 
 
@@ -134,6 +139,8 @@ LINES = {
     "step": tuple((f"training step at level {n}, one thread, processor ms", f"level {n}", 1e3, 1) for n in range(3)),
 }
 SLOW = ("encode", "first", "step")
+#: What a user of a file waits for.
+USED = ("encode", "decode", "command", "draw", "start")
 RACE = "race"
 #: Lines whose figures are better when they are larger.
 RATES = ("rate",)
@@ -143,16 +150,8 @@ def render(rows: Sequence[Row]) -> str:
     """One table of ratios, one of efforts."""
     table = []
     for row in rows:
-        for what, texts in LINES.items():
-            pair = row["lines"].get(what, {})
-            if not pair:
-                continue
-            for text, key, factor, decimals in texts:
-                if not all(key in side for side in pair.values()):  # a model of fewer levels
-                    continue
-                old, new = pair["before"][key], pair["after"][key]
-                figures = (f"{value * factor:,.{decimals}f}" for value in (old, new))
-                table.append((row["name"], text, *figures, f"{new / old if key in RATES else old / new:.1f}"))
+        for text, key, figures, (old, new) in _lines(row["lines"]):
+            table.append((row["name"], text, *figures, f"{new / old if key in RATES else old / new:.1f}"))
         old, new = (row["lines"]["encode"][name]["bytes"] for name in ("before", "after"))
         table.append((row["name"], "bytes at the default effort", f"{old:,.0f}", f"{new:,.0f}", f"{old / new:.4f}"))
     efforts = [
@@ -166,7 +165,8 @@ def render(rows: Sequence[Row]) -> str:
     parts = [
         "\n".join(sorted({row["machine"] for row in rows})),
         markdown(("scene", "what", "before", "after", "times"), table),
-        *(["\n".join(paragraph(f"Measured later than the rest: {newer}."))] if newer else []),
+        *(["\n".join(paragraph(f"Measured at another commit: {newer}."))] if newer else []),
+        *_own([row for row in rows if "own" in row]),
         "What each effort takes, all with warm caches and verified:",
         markdown(("scene", "effort", "s", "processor s", "bytes"), efforts),
     ]
@@ -180,6 +180,31 @@ def render(rows: Sequence[Row]) -> str:
         )
         parts += ["\n".join(paragraph(text)), *race_table(raced), "![dB against time](img/race.png)"]
     return "\n\n".join(parts)
+
+
+def _lines(found: Row) -> Iterator[tuple[str, str, list[str], list[float]]]:
+    """What each line says of what was measured: (text, key, what it shows and what was found by checkout)."""
+    for what in [what for what in LINES if what in found]:
+        sides = found[what].values()
+        for text, key, factor, decimals in LINES[what]:
+            if all(key in side for side in sides):  # else a model of fewer levels
+                yield (
+                    text,
+                    key,
+                    [f"{side[key] * factor:,.{decimals}f}" for side in sides],
+                    [side[key] for side in sides],
+                )
+
+
+def _own(rows: Sequence[Row]) -> list[str]:
+    """What a user of files of this commit waits for: a column per scene."""
+    if not rows:
+        return []
+    columns = [{text: figures[0] for text, _, figures, _ in _lines(row["own"])} for row in rows]
+    sizes = (f"{row['own']['encode']['after']['bytes']:,.0f}" for row in rows)
+    table = [(text, *(column[text] for column in columns)) for text in columns[0]]
+    head = ("what", *(row["name"] for row in rows))
+    return ["Today's own models:", markdown(head, [("bytes", *sizes), *table])]
 
 
 def _growth(row: Row) -> list[str]:
@@ -231,6 +256,7 @@ def main(argv: list[str] | None = None) -> int:
         "--lines", nargs="+", choices=(*LINES, RACE), metavar="WHAT", help="these alone, of scenes there"
     )
     parser.add_argument("--repeats", type=int, default=9, metavar="N", help="of each measurement (default: 9)")
+    parser.add_argument("--own", type=Path, metavar="FOLDER", help="checkpoints of this commit, FOLDER/NAME/model.pt")
     args = parser.parse_args(argv)
     if not args.render and (args.before is None or not (args.before / "pd4dgs_codec").is_dir()):
         parser.error("--before FOLDER: expected a checkout of this project")
@@ -239,8 +265,14 @@ def main(argv: list[str] | None = None) -> int:
     todo = [name for name in todo if not args.lines or name in there]
 
     def measured(name: str) -> Row:
-        given = args.out / name / "model.pt", args.before.resolve(), args.repeats
-        return measure_again(there[name], *given, args.lines) if args.lines else measure(*given)
+        both = {"before": args.before.resolve(), "after": ROOT}
+        given = args.out / name / "model.pt", both, args.repeats
+        if args.lines:
+            return measure_again(there[name], *given, args.lines)
+        old = there.get(name, {})
+        raced = {RACE: old[RACE], "later": {RACE: old["later"][RACE]}} if RACE in old else {}
+        own = args.own and args.own / name / "model.pt"
+        return measure(*given, own if own and own.is_file() else None) | raced
 
     def finish(rows: list[Row]) -> None:
         if raced := [row for row in rows if RACE in row]:

@@ -23,7 +23,7 @@ from pages.page import Page, Row, make, options, paragraph, say
 from pages.scenes import SCENES, present
 from pages.trainings import ensure_trained
 
-from pd4dgs_codec.bench.report import markdown
+from pd4dgs_codec.bench.report import drawing, markdown
 from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.scene import Scene
 from pd4dgs_codec.threads import configure
@@ -134,34 +134,20 @@ def draw_strip(data: bytes, dataset: Dataset, path: Path) -> None:
 
 def plot(rows: Sequence[Row], path: Path) -> None:
     """dB against bytes of all four files, one panel per scene, legible in black and white."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    across = min(COLUMNS, len(rows))
-    down = -(-len(rows) // across)
-    figure, axes = pyplot.subplots(down, across, figsize=(4.6 * across, 3.4 * down), squeeze=False)
     styles = {
         "slices": ("-o", "slices, by utility"),
         "low bits": ("-^", "the same, low bits last"),
         "random": (":x", "slices, random"),
         "layers": ("--s", "layers"),
     }
-    for axis in axes.flat[len(rows) :]:
-        axis.set_axis_off()
-    for axis, row in zip(axes.flat, rows, strict=False):
-        for name, (style, label) in styles.items():
-            sizes, db = zip(*row[name], strict=True)
-            where = "steps-post" if name == "layers" else "default"
-            axis.plot(np.array(sizes) / 1000, db, style, color="black", ms=4, lw=1, drawstyle=where, label=label)
-        axis.set(title=row["name"], xlabel="kB")
-        axis.grid(alpha=0.3)
-    axes[0][0].set_ylabel("held-out mPSNR, dB")
-    axes[0][0].legend()
-    figure.tight_layout()
-    figure.savefig(path, dpi=100)
-    pyplot.close(figure)
+    with drawing(path, [row["name"] for row in rows], "held-out mPSNR, dB", (4.6, 3.4), across=COLUMNS) as axes:
+        for axis, row in zip(axes, rows, strict=True):
+            for name, (style, label) in styles.items():
+                sizes, db = zip(*row[name], strict=True)
+                where = "steps-post" if name == "layers" else "default"
+                axis.plot(np.array(sizes) / 1000, db, style, color="black", ms=4, lw=1, drawstyle=where, label=label)
+            axis.set_xlabel("kB")
+        axes[0].legend()
 
 
 def render(rows: Sequence[Row]) -> str:

@@ -18,7 +18,7 @@ from typing import IO, Any
 
 import numpy as np
 
-from pd4dgs_codec.bench.report import markdown
+from pd4dgs_codec.bench.report import drawing, markdown
 from pd4dgs_codec.bench.viewer import pictures
 from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.codec.encoder import encode
@@ -276,33 +276,23 @@ Shown = dict[str, list[tuple[float, int]]]
 def draw(file: FileReport, path: Path, beside: tuple[str, Shown] | None = None) -> None:
     """Writes a picture of one file: per rate when each level's picture is there (warm process). Legible in black and
     white. y: mPSNR in dB, or the level without a dataset. beside: the title and the lines of a second panel."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
     levels = sorted({row.level for row in file.times})
     heights = dict(zip(levels, levels if file.quality is None else file.quality, strict=True))
     own: Shown = {}
     for row in file.times:
         own.setdefault(f"{row.rate / 1e6:g} Mbps", []).append((row.picture, row.level))
     panels = [(file.name, own), *([beside] if beside else [])]
-    figure, axes = pyplot.subplots(1, len(panels), figsize=(5.2 * len(panels), 3.8), squeeze=False, sharey=True)
-    for axis, (title, lines) in zip(axes[0], panels, strict=True):
-        until = 1.15 * max((x for points in lines.values() for x, _ in points), default=1.0)
-        for (label, points), (line, mark) in zip(lines.items(), cycle(STYLES), strict=False):
-            if points:  # each level is shown until the next one, the last for a while
-                x, y = zip(*((x, heights[level]) for x, level in (*points, (until, points[-1][1]))), strict=True)
-                look = {"linestyle": line, "marker": mark, "markevery": range(len(points)), "ms": 4, "lw": 1}
-                axis.step(x, y, where="post", color="black", label=label, **look)
-        axis.set_title(title, fontsize=10)
-        axis.set_xlabel("seconds since the request")
-        axis.set_xlim(left=0)
-        axis.grid(alpha=0.3)
-        axis.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2)
-    if file.quality is None:
-        axes[0][0].set_yticks(levels)
-    axes[0][0].set_ylabel("level" if file.quality is None else "held-out mPSNR, dB")
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-    pyplot.close(figure)
+    ylabel = "level" if file.quality is None else "held-out mPSNR, dB"
+    with drawing(path, [title for title, _ in panels], ylabel, (5.2, 3.8), sharey=True) as axes:
+        for axis, (_, lines) in zip(axes, panels, strict=True):
+            until = 1.15 * max((x for points in lines.values() for x, _ in points), default=1.0)
+            for (label, points), (line, mark) in zip(lines.items(), cycle(STYLES), strict=False):
+                if points:  # each level is shown until the next one, the last for a while
+                    x, y = zip(*((x, heights[level]) for x, level in (*points, (until, points[-1][1]))), strict=True)
+                    look = {"linestyle": line, "marker": mark, "markevery": range(len(points)), "ms": 4, "lw": 1}
+                    axis.step(x, y, where="post", color="black", label=label, **look)
+            axis.set_xlabel("seconds since the request")
+            axis.set_xlim(left=0)
+            axis.legend(fontsize=7, loc="upper center", bbox_to_anchor=(0.5, -0.2), ncols=2)
+        if file.quality is None:
+            axes[0].set_yticks(levels)

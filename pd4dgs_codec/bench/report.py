@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -46,13 +47,45 @@ def pareto_front(points: Points) -> list[tuple[float, float]]:
     return front
 
 
-def draw(panels: Sequence[Panel], ylabel: str, path: Path) -> None:
-    """Writes one PNG with the panels side by side over a shared error axis. Front points are ringed and joined by
-    steps; errors of 0 lie at the bottom, and the axis says so."""
+def pyplot() -> Any:
+    """matplotlib.pyplot, which draws into files. matplotlib is imported here, for not every command draws."""
     import matplotlib
 
     matplotlib.use("Agg")
     from matplotlib import pyplot
+
+    return pyplot
+
+
+@contextmanager
+def drawing(
+    path: Path, titles: Sequence[str], ylabel: str, size: tuple[float, float], *, across: int = 4, sharey: bool = False
+) -> Iterator[list[Any]]:
+    """Axes with a grid, one per title, at most `across` in a row; at the end they are the PNG `path`.
+
+    size: width and height of each, inches. ylabel: of the first in each row.
+    """
+    columns = min(len(titles), across)
+    rows = -(-len(titles) // columns)
+    shape = {"figsize": (size[0] * columns, size[1] * rows), "squeeze": False, "sharey": sharey}
+    figure, grid = pyplot().subplots(rows, columns, **shape)
+    for axis in grid.flat[len(titles) :]:
+        axis.remove()
+    shown = list(grid.flat[: len(titles)])
+    for axis, title in zip(shown, titles, strict=True):
+        axis.set_title(title)
+        axis.grid(alpha=0.3)
+    for first in grid[:, 0]:
+        first.set_ylabel(ylabel)
+    yield shown
+    figure.tight_layout()
+    figure.savefig(path, dpi=110, format="png")
+    pyplot().close(figure)
+
+
+def draw(panels: Sequence[Panel], ylabel: str, path: Path) -> None:
+    """Writes one PNG with the panels side by side over a shared error axis. Front points are ringed and joined by
+    steps; errors of 0 lie at the bottom, and the axis says so."""
     from matplotlib.lines import Line2D
 
     errors = [error for panel in panels for _, points in panel.series for _, error in points]
@@ -64,8 +97,8 @@ def draw(panels: Sequence[Panel], ylabel: str, path: Path) -> None:
     columns = max(1, int(width / (0.075 * max(map(len, names), default=0) + 1.0)))
     legend = 0.22 * -(-(len(names) + 1) // columns) + 0.2
     size = (width, 3.6 + legend)
-    figure, axes = pyplot.subplots(1, len(panels), figsize=size, sharey=True, squeeze=False)
-    for axis, panel in zip(axes[0], panels, strict=True):
+    figure, grid = pyplot().subplots(1, len(panels), figsize=size, sharey=True, squeeze=False)
+    for axis, panel in zip(grid[0], panels, strict=True):
         series = [(name, [(cost, max(error, floor)) for cost, error in points]) for name, points in panel.series]
         shown = [point for _, points in series for point in points]
         if front := pareto_front(shown):
@@ -84,8 +117,8 @@ def draw(panels: Sequence[Panel], ylabel: str, path: Path) -> None:
         axis.set_xlabel(panel.xlabel)
         axis.grid(alpha=0.3, which="both")
     if errors:
-        _number(axes[0][0].yaxis, *axes[0][0].get_ylim())
-    axes[0][0].set_ylabel(ylabel if len(positive) == len(errors) else f"{ylabel}\n(lowest marks: 0)")
+        _number(grid[0][0].yaxis, *grid[0][0].get_ylim())
+    grid[0][0].set_ylabel(ylabel if len(positive) == len(errors) else f"{ylabel}\n(lowest marks: 0)")
     marks = [(*style[name], "black", "white", 6, 1, name) for name in names]
     marks.append(("o", "-", "0.75", "none", 11, 4, "front"))
     handles = [
@@ -95,7 +128,7 @@ def draw(panels: Sequence[Panel], ylabel: str, path: Path) -> None:
     figure.tight_layout(rect=(0, legend / size[1], 1, 1))
     figure.legend(handles=handles, loc="lower center", ncol=columns, frameon=False, fontsize=9)
     figure.savefig(path, dpi=110, format="png")
-    pyplot.close(figure)
+    pyplot().close(figure)
 
 
 def _limit(axis: Any, costs: Sequence[float]) -> None:

@@ -10,7 +10,7 @@ from pathlib import Path
 from pages.child import command
 from pages.page import Row, say
 from pages.scenes import Scene
-from pd4dgs_codec.bench.report import markdown
+from pd4dgs_codec.bench.report import drawing, markdown
 
 #: Shares of the time of the trainer before at which both are compared.
 MOMENTS = (0.25, 0.5, 1.0)
@@ -53,23 +53,13 @@ def race_table(rows: Sequence[Row]) -> list[str]:
 
 def race_plot(rows: Sequence[Row], path: Path) -> None:
     """One panel per scene: a line per level, before dashed."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(1, len(rows), figsize=(5.2 * len(rows), 3.8), squeeze=False)
-    for axis, row in zip(axes[0], rows, strict=True):
-        for name, line in (("before", "--"), ("after", "-")):
-            for level, mark in enumerate("os^"):
-                points = [(p[0] / 60, p[1 + level]) for p in row["race"][name] if len(p) > 1 + level]
-                if points:
-                    label = f"level {level}, {name}"
-                    axis.plot(*zip(*points, strict=True), line + mark, color=f"C{level}", ms=4, lw=1, label=label)
-        axis.set(title=row["name"], xlabel="training wall time, min")
-        axis.grid(alpha=0.3)
-    axes[0][0].set_ylabel("held-out PSNR, dB")
-    axes[0][0].legend(fontsize="small")
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-    pyplot.close(figure)
+    with drawing(path, [row["name"] for row in rows], "held-out PSNR, dB", (5.2, 3.8)) as axes:
+        for axis, row in zip(axes, rows, strict=True):
+            for name, line in (("before", "--"), ("after", "-")):
+                for level, mark in enumerate("os^"):
+                    points = [(p[0] / 60, p[1 + level]) for p in row["race"][name] if len(p) > 1 + level]
+                    if points:
+                        label = f"level {level}, {name}"
+                        axis.plot(*zip(*points, strict=True), line + mark, color=f"C{level}", ms=4, lw=1, label=label)
+            axis.set_xlabel("training wall time, min")
+        axes[0].legend(fontsize="small")

@@ -7,7 +7,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from pd4dgs_codec.bench.report import markdown
+from pd4dgs_codec.bench.report import drawing, markdown
 
 #: A coding row's bytes in the modes that the table shows; None where a mode drops the layer.
 BYTES = ("ans_bytes", "lzma_bytes", "lzma_float32_bytes")
@@ -165,28 +165,13 @@ def _ratio(value: float | None, digits: int = 4) -> str:
 
 def time_plot(results: Sequence[dict[str, Any]], path: Path) -> None:
     """Held-out PSNR per level against training wall time, one panel per scene, legible in black and white."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    from matplotlib import pyplot
-
-    columns = min(len(results), 4)
-    lines = -(-len(results) // columns)
-    figure, axes = pyplot.subplots(lines, columns, figsize=(4.2 * columns, 3.4 * lines), squeeze=False)
     styles = ((":", "o"), ("--", "s"), ("-", "^"))
-    for axis in axes.flat[len(results) :]:
-        axis.remove()
-    for axis, result in zip(axes.flat, results, strict=False):
-        for level, (line, mark) in enumerate(styles):
-            points = [(p["seconds"], p["psnr"][level]) for p in result["curve"] if len(p["psnr"]) > level]
-            if points:
-                axis.plot(*zip(*points, strict=True), line + mark, color="black", ms=4, lw=1, label=f"level {level}")
-        axis.set_title(result["name"])
-        axis.set_xlabel("training wall time, s")
-        axis.grid(alpha=0.3)
-    for first in axes[:, 0]:
-        first.set_ylabel("held-out PSNR, dB")
-    axes[0][0].legend()
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-    pyplot.close(figure)
+    with drawing(path, [result["name"] for result in results], "held-out PSNR, dB", (4.2, 3.4)) as axes:
+        for axis, result in zip(axes, results, strict=True):
+            for level, (line, mark) in enumerate(styles):
+                points = [(p["seconds"], p["psnr"][level]) for p in result["curve"] if len(p["psnr"]) > level]
+                if points:
+                    look = {"color": "black", "ms": 4, "lw": 1, "label": f"level {level}"}
+                    axis.plot(*zip(*points, strict=True), line + mark, **look)
+            axis.set_xlabel("training wall time, s")
+        axes[0].legend()
