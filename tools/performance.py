@@ -222,7 +222,7 @@ def _growth(row: Row) -> list[str]:
     ]
     text = (
         f"Growth: {row['name']} and copies of its anchors some voxels off, with noise of two steps, at the default "
-        "effort. Processor seconds in process; memory beside the imports, the scene that is encoded included."
+        "effort. Processor seconds in process; memory is that of the scene's arrays and of encoding."
     )
     heads = ("anchors", "encode, s", "decode, s", "bytes per anchor", "float32 arrays, MiB", "encoder's memory, MiB")
     return ["\n".join(paragraph(text)), markdown(heads, table)]

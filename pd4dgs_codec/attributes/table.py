@@ -14,6 +14,10 @@ from pd4dgs_codec.scene import ATTRIBUTES, Scene, Widths
 NO_CLASSES = np.zeros(0, np.int32)  #: of anchors that are not graded
 
 
+#: Some channels of an attribute.
+Channels = slice | np.ndarray
+
+
 @dataclass(frozen=True, eq=False)
 class Grid:
     """The values that attributes can have: (m + k 2^c) Q, with a symbol k, the step Q of the attribute, the centre m of
@@ -62,30 +66,48 @@ class Grid:
             self._quantise(name, values[name], classes, own)
         return symbols
 
-    def symbols_of(self, name: str, x: np.ndarray, classes: np.ndarray) -> np.ndarray:
-        """int32 [scalars, n] of one attribute float32 [n, *shape]."""
-        symbols = np.empty((math.prod(self.widths.attributes[name]), len(x)), np.int32)
-        self._quantise(name, x, classes, symbols)
+    def symbols_of(self, name: str, x: np.ndarray, classes: np.ndarray, which: Channels = slice(None)) -> np.ndarray:
+        """int32 [scalars, n] of one attribute float32 [n, *shape], or of some of its channels float32 [n, scalars]."""
+        symbols = np.empty((math.prod(x.shape[1:]), len(x)), np.int32)
+        self._quantise(name, x, classes, symbols, which)
         return symbols
 
-    def _quantise(self, name: str, x: np.ndarray, classes: np.ndarray, symbols: np.ndarray) -> None:
-        centre = dict(attribute_rows(self.centre, self.widths))[name]
+    def _quantise(
+        self, name: str, x: np.ndarray, classes: np.ndarray, symbols: np.ndarray, which: Channels = slice(None)
+    ) -> None:
+        centre = self._centre(name)[which]
         for rows in row_blocks(len(x)):
             channels, spacing = x[rows].reshape(-1, len(centre)).T, self.spacing(classes[rows])
             symbols[:, rows] = quantise(channels, self.steps[name], name, centre[:, None], spacing)
+
+    def rounded(self, name: str, x: np.ndarray, classes: np.ndarray) -> np.ndarray:
+        """The values of one attribute float32 [n, *shape] that come back for those given."""
+        values = np.empty_like(x)
+        for rows in row_blocks(len(x)):
+            own = classes[rows]
+            values[rows] = self.values_of(name, self.symbols_of(name, x[rows], own), own)
+        return values
 
     def dequantise(self, symbols: np.ndarray, classes: np.ndarray) -> dict[str, np.ndarray]:
         """The inverse of `quantise`: float32 [n, *shape] per attribute name, C-contiguous."""
         return {name: self.values_of(name, rows, classes) for name, rows in attribute_rows(symbols, self.widths)}
 
     def values_of(self, name: str, symbols: np.ndarray, classes: np.ndarray) -> np.ndarray:
-        """The inverse of `symbols_of`."""
-        centre = dict(attribute_rows(self.centre, self.widths))[name]
-        values = np.empty(symbols.shape[::-1], np.float32)
+        """The inverse of `symbols_of`, for all channels of the attribute."""
+        centre, values = self._centre(name), np.empty(symbols.shape[::-1], np.float32)
         for rows in row_blocks(symbols.shape[1]):
             spacing = self.spacing(classes[rows])
             values[rows] = dequantise(symbols[:, rows], self.steps[name], centre[:, None], spacing).T
         return values.reshape(-1, *self.widths.attributes[name])
+
+    def value_of(self, name: str, symbol: int, channel: int, step_class: int) -> float:
+        """What one symbol of one channel of an attribute stands for at an anchor of that class."""
+        centre = int(self._centre(name)[channel])
+        (value,) = dequantise(np.array([symbol]), self.steps[name], centre, 1 << step_class).tolist()
+        return float(value)
+
+    def _centre(self, name: str) -> np.ndarray:
+        return dict(attribute_rows(self.centre, self.widths))[name]
 
 
 #: Anchors that are quantised and dequantised at a time: intermediate values are twice as wide.

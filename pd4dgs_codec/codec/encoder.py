@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import starmap
 from typing import Any
 
 import numpy as np
@@ -153,9 +155,11 @@ def encode_with_report(
     _check_limits(meant.info.voxel_size, grid, symbols, written, options.low_bits)
     about = write_metadata(metadata) if metadata is not None else b""
     data = _container(meant, grid, bounds, options, written, about)
-    if options.verify:
-        _verify(data, meant, grid, symbols, bounds)
     reports = [_layer_report(layer, slices) for layer, slices in zip(symbols, written, strict=True)]
+    if options.verify:
+        wanted = [_fingerprint(layer, grid) for layer in symbols]
+        del symbols, written  # as large as what is decoded
+        _verify(data, meant, wanted, bounds)
     kept = sum(r.anchors for r in reports)
     kept_bits = sum(r.position_bits + s.payload_bits for r in reports for s in r.streams if s.name == "attributes")
     kept_bits += sum(s.payload_bits for r in reports for s in r.streams if s.name == "low_bits")
@@ -240,9 +244,9 @@ def _container(
     return b"".join([write_preamble(packed), *chunks])
 
 
-def _verify(data: bytes, meant: Scene, grid: Grid, symbols: list[LayerSymbols], bounds: dict[str, float]) -> None:
-    """Decode `data`, compare all integers with `symbols`, all floats with those that the integers stand for, which
-    lie within `bounds` of those given, and the bounds themselves."""
+def _verify(data: bytes, meant: Scene, wanted: list[tuple[bytes, bytes]], bounds: dict[str, float]) -> None:
+    """Decode `data`, compare by layer all integers, and all floats that they stand for, with the `wanted` fingerprints,
+    and the bounds, within which these floats lie of those given."""
     try:
         header, decoded, _ = decode_layers(data)
         scene = outline(header.info, header.grid, decoded)
@@ -253,17 +257,25 @@ def _verify(data: bytes, meant: Scene, grid: Grid, symbols: list[LayerSymbols], 
     if scene.layers != meant.layers or scene.rows != meant.rows:
         meant_rows = f"{meant.layers}, {meant.rows}"
         raise EncodeError(f"verification: layers and rows {scene.layers}, {scene.rows}; meant {meant_rows}")
-    for index, (got, want) in enumerate(zip(decoded, symbols, strict=True)):
-        if got.steps != want.steps or not _same(got.arrays(), want.arrays()):
-            raise EncodeError(f"verification: layer {want.kind.layer} decodes to other symbols")
-        pairs = zip(attribute_blocks(header.grid, [got]), attribute_blocks(grid, [want]), strict=True)
-        same = all(_same(list(x.values()), list(y.values())) for (_, x), (_, y) in pairs)
-        if not same or not _same(float_tensors(scene, index), float_tensors(meant, index)):
-            raise EncodeError(f"verification: layer {want.kind.layer} decodes to other values")
+    for index, (layer, (symbols, values)) in enumerate(zip(decoded, wanted, strict=True)):
+        found = _fingerprint(layer, header.grid)
+        if found[0] != symbols:
+            raise EncodeError(f"verification: layer {layer.kind.layer} decodes to other symbols")
+        tensors = zip(float_tensors(scene, index), float_tensors(meant, index), strict=True)
+        if found[1] != values or not all(starmap(np.array_equal, tensors)):
+            raise EncodeError(f"verification: layer {layer.kind.layer} decodes to other values")
 
 
-def _same(a: list[np.ndarray], b: list[np.ndarray]) -> bool:
-    return len(a) == len(b) and all(map(np.array_equal, a, b))
+def _fingerprint(layer: LayerSymbols, grid: Grid) -> tuple[bytes, bytes]:
+    """SHA-256 of a layer's steps and integers, with their shapes, and of the attributes that these stand for."""
+    symbols, values = hashlib.sha256(repr(layer.steps).encode()), hashlib.sha256()
+    for array in layer.arrays():
+        symbols.update(f"{array.dtype} {array.shape}".encode())
+        symbols.update(np.ascontiguousarray(array).data)
+    for _, block in attribute_blocks(grid, [layer]):
+        for value in block.values():
+            values.update(value.data)
+    return symbols.digest(), values.digest()
 
 
 def _layer_report(layer: LayerSymbols, slices: list[Slice]) -> LayerReport:

@@ -8,7 +8,7 @@ that sums lose were zeros: the same arithmetic gives the same bits.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -68,7 +68,9 @@ class _Omissions:
                     largest = [np.prod([np.abs(s[n]).max((1, 2)) for n, _, _ in PLANES], axis=0) for s in planes]
                     hidden = _largest(networks[TRUNK], np.concatenate(largest))
                     sizes |= {f"{kind.layer} {n}": _largest(net, hidden) for n, net in networks.items() if n != TRUNK}
-            feature = np.abs(self.decoded.feature).max(axis=0, initial=0.0) + sizes.get("1 feature", 0.0)
+            own = self.decoded.feature
+            feature = np.maximum(own.max(axis=0, initial=0.0), -own.min(axis=0, initial=0.0))
+            feature = feature + sizes.get("1 feature", 0.0)
             inputs = np.concatenate([feature, np.ones(3)])
             sizes |= {name: _largest(network, inputs) for name, network in self.decoded.networks.items()}
         return all((size < LARGEST).all() for size in sizes.values())
@@ -101,8 +103,8 @@ class _Omissions:
         idle_value = dequantise(grid.centre[:width], grid.steps["feature"])  # which anchors of every class can have
         stale = unread & (self.decoded.feature != idle_value).any(axis=0)
         if stale.any():
-            symbols = grid.symbols_of("feature", self.decoded.feature, classes)
-            self._note(f"{int(stale.sum())} feature channels", "no network reads them", _bits(symbols[stale]))
+            symbols = grid.symbols_of("feature", self.decoded.feature[:, stale], classes, stale)
+            self._note(f"{int(stale.sum())} feature channels", "no network reads them", _bits(symbols))
             self._edit(lambda scene: replace(scene, feature=np.where(unread, idle_value, scene.feature)))
         if (unread & moved).any():
             self._zero_weights(LAYER_KINDS[1], "feature", -1, lambda w, b: _zero(w, b, rows=unread), "rows")
@@ -179,7 +181,8 @@ class _Omissions:
         bits an evaluation; in this order, for the offsets say where cells are read."""
         self._free_cells(LAYER_KINDS[1], global_cells(self.decoded))
         shown = shown_gaussians(
-            self.decoded, lambda certain, evaluations: self._without_offsets(certain)[1] > price * evaluations
+            self.decoded,
+            lambda certain, evaluations: sum(bits for *_, bits in self._cheaper(certain)) > price * evaluations,
         )
         self._free_offsets(shown)
         kind = LAYER_KINDS[2]
@@ -191,35 +194,37 @@ class _Omissions:
         if cells:
             self._free_cells(kind, cells)
 
-    def _without_offsets(self, shown: np.ndarray) -> tuple[np.ndarray, float]:
-        """(offset symbols [3 G, N], the commonest ones of a step class for Gaussians that are not `shown` bool [N, G]
-        where that takes fewer bits, bits saved)."""
-        classes = classes_of(self.decoded)
-        freed = Grid.of(self.decoded).symbols_of("offset", self.decoded.offset, classes)
-        groups = [np.flatnonzero(classes == k) for k in np.unique(classes)] or [np.arange(freed.shape[1])]
-        saved = 0.0
-        for channel, symbols in enumerate(freed):
-            for rows in groups:
+    def _cheaper(self, shown: np.ndarray) -> Iterator[tuple[int, np.ndarray, float, float]]:
+        """(channel of the offsets, rows of Gaussians that are not `shown` bool [N, G], value, bits saved) where these
+        take fewer bits with the commonest symbol of their step class, or of those shown if there are any."""
+        grid, classes = Grid.of(self.decoded), classes_of(self.decoded)
+        groups = [(int(k), np.flatnonzero(classes == k)) for k in np.unique(classes)]
+        offset = self.decoded.offset.reshape(len(shown), 3 * shown.shape[1])
+        for channel in range(offset.shape[1]):
+            one = slice(channel, channel + 1)
+            (symbols,) = grid.symbols_of("offset", offset[:, one], classes, one)
+            for step_class, rows in groups or [(0, np.arange(len(shown)))]:
                 own, before = shown[rows, channel // 3], symbols[rows]
                 if own.all():
                     continue
                 values, counts = symbol_counts(before[own]) if own.any() else (np.zeros(1, int), np.ones(1, int))
-                after = np.where(own, before, values[counts.argmax()])
-                bits = entropy_bits(before) - entropy_bits(after)
+                symbol = int(values[counts.argmax()])
+                bits = entropy_bits(before) - entropy_bits(np.where(own, before, symbol))
                 if bits > 0:
-                    symbols[rows] = after
-                    saved += bits
-        return freed, saved
+                    yield channel, rows[~own], grid.value_of("offset", symbol, channel, step_class), bits
 
     def _free_offsets(self, shown: np.ndarray) -> None:
         if shown.all():
             return
-        freed, bits = self._without_offsets(shown)
-        values = Grid.of(self.decoded).values_of("offset", freed, classes_of(self.decoded))
-        if (values == self.decoded.offset).all():
-            return
-        self._note(f"offsets of {int((~shown).sum())} Gaussians", "no view shows them at any time", bits)
-        self._edit(lambda scene: replace(scene, offset=np.where(shown[..., None], scene.offset, values)))
+        given, decoded, saved = self.scene.offset.copy(), self.decoded.offset.copy(), 0.0
+        for channel, rows, value, bits in self._cheaper(shown):
+            for offset in (given, decoded):
+                offset[rows, channel // 3, channel % 3] = value
+            saved += bits
+        if saved:
+            what = f"offsets of {int((~shown).sum())} Gaussians"
+            self._note(what, "no view shows them at any time", saved)
+            self.scene, self.decoded = replace(self.scene, offset=given), replace(self.decoded, offset=decoded)
 
     def _without_cells(self, kind: LayerKind, read: Reached) -> tuple[list[dict[str, np.ndarray]], float]:
         """(per scale, by name, the planes that may take other values in cells that are not `read`; bits saved)."""

@@ -293,9 +293,7 @@ def rounded(scene: Scene, raw_deformation: bool = False) -> Scene:
     """`scene` with the values that come back from its file. Raises EncodeError for one that has no symbol."""
     steps = scene.steps
     grid, classes = Grid.of(scene), classes_of(scene)
-    values: dict[str, Any] = {
-        name: grid.values_of(name, grid.symbols_of(name, x, classes), classes) for name, x in scene.attributes.items()
-    }
+    values: dict[str, Any] = {name: grid.rounded(name, x, classes) for name, x in scene.attributes.items()}
     result = replace(scene, **values)
     for kind in LAYER_KINDS[:1] if raw_deformation else LAYER_KINDS:
         if kind.layer == 0 or scene.deformation(kind.layer) is not None:

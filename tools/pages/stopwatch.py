@@ -3,6 +3,7 @@ it imports what both have. argv: what, a checkpoint, a .pd4 file, an effort."""
 
 from __future__ import annotations
 
+import ctypes
 import json
 import resource
 import statistics
@@ -141,8 +142,9 @@ def step(checkpoint: str, file: str, effort: str) -> dict[str, float]:
 
 
 def grow(checkpoint: str, file: str, anchors: str) -> dict[str, float]:
-    """So many anchors: the checkpoint's own, and copies of them some voxels off with noise of two steps. Memory is MiB
-    beside the imports, the scene itself included; arrays: MiB of the scene's float32 arrays."""
+    """So many anchors: the checkpoint's own, and copies of them some voxels off with noise of two steps. arrays: MiB of
+    the scene's float32 arrays; memory: MiB of these and of what encoding takes beside them and beside imports and
+    kernels."""
     import numpy as np
 
     from pd4dgs_codec import decode
@@ -154,7 +156,7 @@ def grow(checkpoint: str, file: str, anchors: str) -> dict[str, float]:
 
     given, rng, wanted = to_scene(load(checkpoint)[0]), np.random.default_rng(0), int(anchors)
     loops()
-    before = _resident()
+    encode_with_report(given)  # imports and compiles what it needs
     own = len(given.anchor_q)
     copies = -(-2 * wanted // own)
     places = np.concatenate([given.anchor_q + (rng.integers(-6, 7, (own, 3)) if i else 0) for i in range(copies)])
@@ -179,8 +181,12 @@ def grow(checkpoint: str, file: str, anchors: str) -> dict[str, float]:
     )
     del places, values
     arrays = sum(array.nbytes for i in range(len(scene.layers)) for array in float_tensors(scene, i)[1:])
+    arrays += scene.anchor.nbytes
+    ctypes.CDLL(None).malloc_trim(0)  # else encoding takes what making the scene has left, unseen
+    Path("/proc/self/clear_refs").write_text("5")  # the peak begins anew
+    before = _memory("VmRSS") - arrays / 2**20
     (data, _), coded = timed(lambda: encode_with_report(scene))
-    memory = (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024) - before
+    memory = _memory("VmHWM") - before
     Path(file).write_bytes(data)
     decoded = timed(lambda: decode(data))[1]
     return {
@@ -189,14 +195,14 @@ def grow(checkpoint: str, file: str, anchors: str) -> dict[str, float]:
         "encode": coded["cpu"],
         "decode": decoded["cpu"],
         "memory": memory,
-        "arrays": (arrays + scene.anchor.nbytes) / 2**20,
+        "arrays": arrays / 2**20,
     }
 
 
-def _resident() -> float:
-    """MiB that the process has in memory."""
+def _memory(what: str) -> float:
+    """MiB that the process has in memory: VmRSS now, VmHWM at the most."""
     for line in Path("/proc/self/status").read_text().splitlines():
-        if line.startswith("VmRSS"):
+        if line.startswith(what):
             return int(line.split()[1]) / 1024
     return 0.0
 
