@@ -19,8 +19,8 @@ class DeformationConfig:
     heads: tuple[str, ...]
 
 
-#: Of the presets. The planes' rate makes planes so flat that coarse steps cost them nothing. 1, where time planes
-#: start, is a multiple of both.
+#: Of the presets, before the dial of quality moves them. The planes' rate makes planes so flat that coarse steps cost
+#: them nothing.
 STEPS = Steps(planes_global=0.2, planes_local=1 / 3)
 
 

@@ -100,7 +100,7 @@ def short_table(results: Sequence[dict[str, Any]], shown: dict[str, tuple[int, .
             if level["level"] in shown[result["name"]]:
                 size, seconds = f"{level['cumulative_bytes']:,}", f"{level['first_frame_seconds']:.2f}"
                 rows.append((result["name"], ", ".join(layers), size, seconds, f"{level['mpsnr']:.2f}"))
-    return markdown(("scene", "layers read", "bytes so far", "seconds at 2 Mbps", "PSNR dB"), rows)
+    return markdown(("scene", "layers read", "bytes so far", "seconds at 2 Mbps", "mPSNR dB"), rows)
 
 
 def coding_table(results: Sequence[dict[str, Any]]) -> str:

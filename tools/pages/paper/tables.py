@@ -311,7 +311,11 @@ def rates(results: Sequence[Result]) -> list[str]:
                 weight = (f"{scale:g}", f"{figure(runs, lambda r: r['rho']).mean:.3f}") if level == 0 else ("", "")
                 rows.append((scene, *weight, str(level), *_cells(results, runs, level), f"{active:,.0f}"))
     head = ("scene", "rate scale", "rho", "level", *_heads(results), "bytes so far", "anchors")
-    return [markdown(head, rows), "", "Rate scale 1 is the paper's weight; 0.1 is our default."]
+    return [
+        markdown(head, rows),
+        "",
+        "Rate scale 1 is the paper's weight; `--quality 50` has 0.1, the default quality 0.044.",
+    ]
 
 
 def rho(results: Sequence[Result]) -> list[str]:
