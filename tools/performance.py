@@ -200,11 +200,11 @@ def _own(rows: Sequence[Row]) -> list[str]:
     """What a user of files of this commit waits for: a column per scene."""
     if not rows:
         return []
-    columns = [{text: figures[0] for text, _, figures, _ in _lines(row["own"])} for row in rows]
-    sizes = (f"{row['own']['encode']['after']['bytes']:,.0f}" for row in rows)
-    table = [(text, *(column[text] for column in columns)) for text in columns[0]]
+    columns = [[figures[0] for _, _, figures, _ in _lines(row["own"])] for row in rows]
+    texts = [text for text, *_ in _lines(rows[0]["own"])]
+    sizes = [f"{row['own']['encode']['after']['bytes']:,.0f}" for row in rows]
     head = ("what", *(row["name"] for row in rows))
-    return ["Today's own models:", markdown(head, [("bytes", *sizes), *table])]
+    return ["Today's own models:", markdown(head, [("bytes", *sizes), *zip(texts, *columns, strict=True)])]
 
 
 def _growth(row: Row) -> list[str]:
