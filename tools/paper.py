@@ -31,8 +31,8 @@ SYNTHETIC = ("tiny", 400, 3)
 #: name: scene, preset, iterations, seeds at most. Equal iterations for all variants of a scene.
 BUDGETS: dict[str, tuple[Scene, str, int, int]] = {
     **{name: (SCENES[f"synthetic-{name}"], *SYNTHETIC) for name in ("static", "global", "local", "fast")},
-    "shelf-hand": (SCENES["shelf-hand"], "small", 1_000, 1),
-    "bouncing-balls": (SCENES["bouncing-balls"], "small", 1_500, 1),
+    "shelf-hand": (SCENES["shelf-hand"], "small", 1_500, 3),
+    "bouncing-balls": (SCENES["bouncing-balls"], "small", 1_500, 3),
 }
 #: The same of a scene given by its source.
 OTHERS = ("small", 2_000, 1)

@@ -57,11 +57,12 @@ def comparison(results: Sequence[Result], path: Path) -> None:
 
 
 def seeds(results: Sequence[Result], path: Path) -> None:
-    """One point per seed (the mean over scenes) and row, with the row's mean as a bar: quality, bytes."""
+    """Per scene, one point per seed and row, with the row's mean as a bar: quality, bytes."""
     figures = (("mpsnr", "mPSNR of the highest level, dB"), ("cumulative_bytes", "bytes of all layers"))
-    with drawing(path, [""] * len(figures), "", (5.2, 3.6)) as axes:
-        groups = _by(results, "variant")
-        for axis, (key, label) in zip(axes, figures, strict=True):
+    panels = [(scene, rows, *shown) for scene, rows in _by(results, "scene").items() for shown in figures]
+    with drawing(path, [scene for scene, *_ in panels], "", (5.2, 3.2), across=len(figures)) as axes:
+        for axis, (_, rows, key, label) in zip(axes, panels, strict=True):
+            groups = _by(rows, "variant")
             for y, runs in enumerate(groups.values()):
                 value = figure(runs, top(key))
                 axis.plot(value.seeds, [y] * len(value.seeds), "o", color="black", mfc="white", ms=7)
