@@ -52,7 +52,7 @@ DEAR = sorted((ROOT / "spec" / "vectors" / "dear").glob("*.pd4"))
 )
 def test_the_dearest_files_that_were_found_stay_within_their_bounds(path):
     data = path.read_bytes()
-    assert len(data) < 2000 and check.declared(data)[0] > 3_000_000
+    assert len(data) < 2000 and check.declared(data)[0] > 2_900_000  # symbols
     check.examine(mutate.Case(data, True, "dear"), frozenset(), random.Random(1))  # within MAX_SECONDS, as all inputs
     assert check.check_memory(data) < 1
 
