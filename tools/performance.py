@@ -97,7 +97,7 @@ def measure_again(row: Row, path: Path, both: dict[str, Path], repeats: int, lin
 
 def measure(path: Path, both: dict[str, Path], repeats: int, own: Path | None) -> Row:
     """Of one checkpoint: per line of the page the medians before and after, and what every effort takes; of the
-    checkpoint `own` what its user waits for."""
+    checkpoint `own`, if it is there, what its user waits for."""
     with tempfile.TemporaryDirectory() as folder:
         turns = Turns.of(path, both, Path(folder))
         lines = {what: turns.line(what, repeats) for what in LINES}
@@ -110,7 +110,7 @@ def measure(path: Path, both: dict[str, Path], repeats: int, own: Path | None) -
             alone["beside"] = run(ROOT, "beside", str(path), file, "5")
             grown = str(Path(folder) / "grown.pd4")
             alone["growth"] = [run(ROOT, "grow", str(path), grown, str(anchors)) for anchors in GROWTH]
-        if own:
+        if own and own.is_file():
             turns = Turns.of(own, {"after": ROOT}, Path(folder))
             alone["own"] = {what: turns.line(what, repeats) for what in USED}
     return {"lines": lines, "efforts": efforts, **alone, "machine": machine_line(machine())}
@@ -271,8 +271,7 @@ def main(argv: list[str] | None = None) -> int:
             return measure_again(there[name], *given, args.lines)
         old = there.get(name, {})
         raced = {RACE: old[RACE], "later": {RACE: old["later"][RACE]}} if RACE in old else {}
-        own = args.own and args.own / name / "model.pt"
-        return measure(*given, own if own and own.is_file() else None) | raced
+        return measure(*given, args.own / name / "model.pt" if args.own else None) | raced
 
     def finish(rows: list[Row]) -> None:
         if raced := [row for row in rows if RACE in row]:

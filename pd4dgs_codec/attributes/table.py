@@ -103,8 +103,7 @@ class Grid:
     def value_of(self, name: str, symbol: int, channel: int, step_class: int) -> float:
         """What one symbol of one channel of an attribute stands for at an anchor of that class."""
         centre = int(self._centre(name)[channel])
-        (value,) = dequantise(np.array([symbol]), self.steps[name], centre, 1 << step_class).tolist()
-        return float(value)
+        return float(dequantise(np.array([symbol]), self.steps[name], centre, 1 << step_class)[0])
 
     def _centre(self, name: str) -> np.ndarray:
         return dict(attribute_rows(self.centre, self.widths))[name]

@@ -23,7 +23,7 @@ LAYER = ("layer", "ans_bytes", "lzma_bytes", "lzma_float32_bytes", "position_byt
 
 def figures(result: dict[str, Any]) -> dict[str, Any]:
     """What the tables and the plot show of what `run_job` returns, but for its name."""
-    names = ("preset", "iterations", "total", "phases_not_reached", "train_seconds", "skipped_steps", "rho")
+    names = ("preset", "iterations", "train_seconds", "skipped_steps", "rho")
     streams = [layer["streams"].get(name, 0.0) for layer in result["coding"][1:] for name in ("planes", "weights")]
     return {
         **{name: result[name] for name in names},

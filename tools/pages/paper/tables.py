@@ -184,13 +184,15 @@ def _promises(
 def _against(head_what: str, variants: Sequence[Variant], results: Sequence[Result]) -> str:
     """By scene, the highest levels of `variants`, each beside the full method."""
     metrics, rows = _metrics(results), []
+    keys = [*(key for _, key, _ in metrics), "cumulative_bytes"]
     for scene in scenes_of(results):
-        keys = [*(key for _, key, _ in metrics), "cumulative_bytes"]
         full = {key: figure(of(results, FULL, scene), top(key)) for key in keys}
         for variant in variants:
             runs = of(results, variant, scene)
             mine = {key: figure(runs, top(key)) for key in keys}
-            gains = [_gain(full, mine, "mpsnr", 2), _gain(full, mine, "cumulative_bytes", 0)]
+            gains = "", ""
+            if variant is not FULL:
+                gains = _gain(full, mine, "mpsnr", 2), _gain(full, mine, "cumulative_bytes", 0)
             rows.append(
                 (
                     scene,
@@ -199,7 +201,7 @@ def _against(head_what: str, variants: Sequence[Variant], results: Sequence[Resu
                     mine["cumulative_bytes"].text(0),
                     figure(runs, lambda r: r["levels"][0]["cumulative_bytes"]).text(0),
                     figure(runs, lambda r: r["rho"]).text(3),
-                    *(("", "") if variant is FULL else gains),
+                    *gains,
                 )
             )
     head = ("scene", head_what, *_heads(results), "bytes", "layer 0 bytes", "rho", "full gains dB", "full spends bytes")
