@@ -27,7 +27,7 @@ from pd4dgs_codec.model import slot_kernels as kernels
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.hexplane import sample, sample_gradient
 from pd4dgs_codec.model.mlp import MLP
-from pd4dgs_codec.render.simd import LANES
+from pd4dgs_codec.render.simd import LANES, WIDE
 from pd4dgs_codec.scene import LENGTH_HEADS, SCALING_DIM
 
 SCALING = slice(-SCALING_DIM, None)  #: the last columns of an anchor's row
@@ -223,6 +223,14 @@ def grown(
     return found
 
 
+def _by_slot(weight: Tensor, slots: int) -> Tensor:
+    """[G, H, LANES]: weight [G w, H] by slot and input, as whole vectors of outputs."""
+    rows = weight.view(slots, -1, weight.shape[1])
+    table = weight.new_zeros(slots, weight.shape[1], LANES)
+    table[:, :, : rows.shape[1]] = rows.transpose(1, 2)
+    return table
+
+
 class _Grown(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -248,7 +256,8 @@ class _Grown(torch.autograd.Function):
         shape, color = (anchors.new_empty(len(keep), len(b) // slots) for b in (b_shape, b_color))
         columns = (w_opacity.shape[1], w_opacity.shape[1] + w_shape.shape[1])
         for out, column, w, b in ((shape, columns[0], w_shape, b_shape), (color, columns[1], w_color, b_color)):
-            kernels.linear(out.numpy(), keep.numpy(), hidden.numpy(), column, w.numpy(), b.numpy())
+            table = (_by_slot(w, slots), _by_slot(b[:, None], slots))
+            kernels.linear(out.numpy(), keep.numpy(), hidden.numpy(), column, *_arrays(*table))
         relative, extent = torch.sigmoid(shape), torch.exp(anchors[:, SCALING])
         color.sigmoid_()
         gaussians, gates = anchors.new_empty(len(keep), kernels.GAUSSIAN_WIDTH), anchors.new_empty(len(keep))
@@ -279,7 +288,8 @@ class _Grown(torch.autograd.Function):
         last = []
         for slope, column, w in ((g_shape, ctx.columns[0], w_shape), (g_color, ctx.columns[1], w_color)):
             grads = g.new_zeros(parts, *w.shape), g.new_zeros(parts, len(w))
-            kernels.linear_backward(*[*_arrays(g_hidden, *grads, keep, slope, hidden), column, w.numpy()])
+            whole = torch.nn.functional.pad(w, (0, -w.shape[1] % WIDE))
+            kernels.linear_backward(*[*_arrays(g_hidden, *grads, keep, slope, hidden), column, whole.numpy()])
             last.append((grads[0][0], grads[1][0]))
         g_inputs, (first, opacity) = _run_back(g_raw, g_hidden, hidden, inputs, ctx.sizes, packed)
         kernels.inputs_backward(*_arrays(g_anchors, g_inputs, inputs, distance))

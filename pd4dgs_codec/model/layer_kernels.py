@@ -83,11 +83,11 @@ def _whole(count: int, step: int) -> int:
     return -(-count // step) * step
 
 
-_up = kernel(inline=True)(_whole)
+up = kernel(inline=True)(_whole)
 
 
 @kernel(inline=True)
-def _multiply(
+def multiply(
     y: np.ndarray, y_at: int, y_row: int, start: np.ndarray, start_at: int, start_row: int, a: np.ndarray, a_row: int,
     a_step: int, b: np.ndarray, b_at: int, b_row: int, count: int, rows: int, columns: int, relu: bool,
 ) -> None:  # fmt: skip
@@ -135,7 +135,7 @@ def forward(
 ) -> None:
     """out [n, at most the last outputs in whole vectors] += what the network makes of x; relu_last: after the last
     layer as well. hidden is filled, but if it has no rows."""
-    row, layers, columns = _up(_widest(sizes), WIDE), len(sizes), out.shape[1]
+    row, layers, columns = up(_widest(sizes), WIDE), len(sizes), out.shape[1]
     vectors = columns - columns % LANES
     for task in nb.prange((len(x) + POINTS * BLOCKS - 1) // (POINTS * BLOCKS)):
         a, b = aligned(POINTS * row, x.dtype.type), aligned(POINTS * row, x.dtype.type)
@@ -145,10 +145,10 @@ def forward(
             at = column = 0
             for layer in range(layers):
                 inputs, outputs = sizes[layer]
-                padded, relu = _up(outputs, WIDE), relu_last or layer < layers - 1
+                padded, relu = up(outputs, WIDE), relu_last or layer < layers - 1
                 bias = at + inputs * padded
-                _multiply(b, 0, row, weights, bias, 0, a, row, 1, weights, at, padded, inputs, POINTS, padded, relu)
-                at = bias + padded + outputs * _up(inputs, WIDE)
+                multiply(b, 0, row, weights, bias, 0, a, row, 1, weights, at, padded, inputs, POINTS, padded, relu)
+                at = bias + padded + outputs * up(inputs, WIDE)
                 if len(hidden) > 0 and layer < layers - 1:
                     _give(hidden, first, count, column, padded, b, row)
                     column += padded
@@ -178,7 +178,7 @@ def backward(
     g_x [n, inputs]; sums [parts, `sums_width`], given zeroed, added up in the first part: per layer the gradient by its
     weights and that by its bias, in whole blocks.
     """
-    row, layers, parts = _up(_widest(sizes), WIDE), len(sizes), len(sums)
+    row, layers, parts = up(_widest(sizes), WIDE), len(sizes), len(sums)
     blocks, real = (len(x) + POINTS - 1) // POINTS, x.dtype.type
     zero = wide_splat(real(0))
     for part in nb.prange(parts):
@@ -195,8 +195,8 @@ def backward(
             at, total, column = len(weights), len(own), hidden.shape[1]
             for layer in range(layers - 1, -1, -1):
                 inputs, outputs = sizes[layer]
-                columns, padded = _up(inputs, WIDE), _up(outputs, WIDE)
-                given = inputs if layer == 0 else _up(sizes[layer - 1, 1], WIDE)
+                columns, padded = up(inputs, WIDE), up(outputs, WIDE)
+                given = inputs if layer == 0 else up(sizes[layer - 1, 1], WIDE)
                 column -= 0 if layer == 0 else given
                 _take(taken, row, x if layer == 0 else hidden, first, count, 0 if layer == 0 else column, given)
                 total -= padded
@@ -205,13 +205,13 @@ def backward(
                     for p in range(count):
                         value = value + wide_load(slope, p * row + o)
                     store(own, total + o, value)
-                total -= _up(outputs, PRODUCT_ROWS) * columns
-                _multiply(
+                total -= up(outputs, PRODUCT_ROWS) * columns
+                multiply(
                     own, total, columns, own, total, columns, slope, 1, row, taken, 0, row, POINTS, outputs, columns,
                     False,
                 )  # fmt: skip
                 at -= outputs * columns
-                _multiply(
+                multiply(
                     before, 0, row, none, 0, 0, slope, row, 1, weights, at, columns, outputs, POINTS, columns, False
                 )
                 at -= (inputs + 1) * padded

@@ -17,7 +17,22 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from pd4dgs_codec.render.simd import LANES, fma, kernel, load, splat, store, total
+from pd4dgs_codec.model.layer_kernels import multiply, up
+from pd4dgs_codec.render.simd import (
+    LANES,
+    PRODUCT_ROWS,
+    WIDE,
+    aligned,
+    copy,
+    fma,
+    folded,
+    kernel,
+    load,
+    spread,
+    store,
+    wide_load,
+    wide_splat,
+)
 from pd4dgs_codec.scene import SCALING_DIM
 
 #: Below this a quaternion is divided by it instead of by its norm, as `torch.nn.functional.normalize` does.
@@ -25,6 +40,7 @@ MIN_NORM = 1e-12
 #: First columns of the parts of a Gaussian's row.
 SCALE, QUAT, OPACITY, COLOR = 3, 6, 10, 11
 GAUSSIAN_WIDTH = COLOR + 3
+KEPT = 1024  #: Gaussians that share scratch memory
 
 
 @kernel(inline=True)
@@ -117,17 +133,22 @@ def seen(keep: np.ndarray, opacity: np.ndarray, mask: np.ndarray, faintest: floa
 def linear(
     out: np.ndarray, keep: np.ndarray, hidden: np.ndarray, column: int, weight: np.ndarray, bias: np.ndarray
 ) -> None:
-    """out [K, w] = the outputs of a linear layer (weight [G w, H], bias [G w]) that belong to the kept slots."""
-    width, inputs, slots = out.shape[1], weight.shape[1], len(bias) // out.shape[1]
-    zero = splat(hidden.dtype.type(0))
-    for k in nb.prange(len(keep)):
-        row = keep[k] // slots * hidden.shape[1] + column
-        first = keep[k] % slots * width
-        for o in range(width):
-            value = zero
-            for c in range(0, inputs, LANES):
-                value = fma(load(hidden, row + c), load(weight, (first + o) * inputs + c), value)
-            out[k, o] = total(value) + bias[first + o]
+    """out [K, w] = the outputs of a linear layer that belong to the kept slots; weight [G, H, LANES] and bias
+    [G, LANES] of each slot's outputs, which are w at most."""
+    slots, inputs, width = weight.shape[0], weight.shape[1], out.shape[1]
+    zero, step = wide_splat(hidden.dtype.type(0)), WIDE // LANES
+    for block in nb.prange((len(keep) + KEPT - 1) // KEPT):
+        outputs = aligned(LANES, hidden.dtype.type)
+        for k in range(block * KEPT, min((block + 1) * KEPT, len(keep))):
+            slot, row = keep[k] % slots, keep[k] // slots * hidden.shape[1] + column
+            even = odd = zero
+            for c in range(0, inputs, 2 * step):
+                at = (slot * inputs + c) * LANES
+                even = fma(spread(hidden, row + c), wide_load(weight, at), even)
+                odd = fma(spread(hidden, row + c + step), wide_load(weight, at + WIDE), odd)
+            store(outputs, 0, folded(even + odd) + load(bias, slot * LANES))
+            for o in range(width):
+                out[k, o] = outputs[o]
 
 
 @kernel(parallel=True)
@@ -141,25 +162,46 @@ def linear_backward(
     column: int,
     weight: np.ndarray,
 ) -> None:
-    """The transpose of `linear`. Results, given zeroed: grad_hidden (as hidden), grad_weight [parts, G w, H] and
-    grad_bias [parts, G w], summed into their first part."""
-    width, inputs, parts, slots = g.shape[1], weight.shape[1], len(grad_weight), len(weight) // g.shape[1]
+    """The transpose of `linear`; weight [G w, H in whole vectors]. Results, given zeroed: grad_hidden (as hidden),
+    grad_weight [parts, G w, H] and grad_bias [parts, G w], summed into their first part."""
+    width, inputs, parts, slots = g.shape[1], grad_weight.shape[2], len(grad_weight), len(weight) // g.shape[1]
+    columns, rows, most, real = weight.shape[1], up(width, PRODUCT_ROWS), up(KEPT, PRODUCT_ROWS), hidden.dtype.type
     for part in nb.prange(parts):
         begin, end = _part(keep, slots, part, parts)
-        own = grad_weight[part]
-        for k in range(begin, end):
-            row = keep[k] // slots * hidden.shape[1] + column
-            first = keep[k] % slots * width
+        members, counts = np.empty((slots, KEPT), np.int64), np.empty(slots, np.int64)
+        slopes, taken, before = aligned(most * rows, real), aligned(KEPT * columns, real), aligned(most * columns, real)
+        sums, none = aligned(slots * rows * columns, real), aligned(columns, real)
+        for first in range(begin, end, KEPT):
+            # slot by slot: a product of many rows keeps its sums in registers
+            counts[:] = 0
+            for k in range(first, min(first + KEPT, end)):
+                slot = keep[k] % slots
+                members[slot, counts[slot]] = k
+                counts[slot] += 1
+            for slot in range(slots):
+                count, own, at = counts[slot], slot * rows * columns, slot * width * columns
+                for p in range(count):
+                    k = members[slot, p]
+                    copy(taken, p * columns, hidden, keep[k] // slots * hidden.shape[1] + column, inputs)
+                    for o in range(width):
+                        slopes[p * rows + o] = g[k, o]
+                        grad_bias[part, slot * width + o] += g[k, o]
+                multiply(
+                    sums, own, columns, sums, own, columns, slopes, 1, rows, taken, 0, columns, count, rows, columns,
+                    False,
+                )  # fmt: skip
+                multiply(
+                    before, 0, columns, none, 0, 0, slopes, rows, 1, weight, at, columns, width,
+                    up(count, PRODUCT_ROWS), columns, False,
+                )  # fmt: skip
+                for p in range(count):
+                    to = keep[members[slot, p]] // slots * hidden.shape[1] + column
+                    for c in range(0, inputs, LANES):
+                        store(grad_hidden, to + c, load(grad_hidden, to + c) + load(before, p * columns + c))
+        for slot in range(slots):
             for o in range(width):
-                grad_bias[part, first + o] += g[k, o]
-            for c in range(0, inputs, LANES):
-                h, value = load(hidden, row + c), load(grad_hidden, row + c)
-                for o in range(width):
-                    at = (first + o) * inputs + c
-                    slope = splat(g[k, o])
-                    value = fma(slope, load(weight, at), value)
-                    store(own, at, fma(slope, h, load(own, at)))
-                store(grad_hidden, row + c, value)
+                row = slot * width + o
+                copy(grad_weight, (part * slots * width + row) * inputs, sums, (slot * rows + o) * columns, inputs)
     for part in range(1, parts):
         for row in range(len(weight)):
             for c in range(inputs):

@@ -24,6 +24,8 @@ TIED = -40.0
 #: Random candidates per initial point, and the training views that judge them, where a dataset has no points.
 CARVE_CANDIDATES = 20
 CARVE_VIEWS = 40
+#: By how much of 255 a channel differs from the background where a view sees something.
+CARVE_CONTRAST = 8
 #: Of the start values of global planes, in cells: few values, for places to differ at the start.
 GLOBAL_SPACING = 4
 #: Where a dataset knows its paths: steps that teach them, anchors in each, and the rates of planes and networks.
@@ -148,18 +150,12 @@ def carved_points(dataset: Dataset, count: int, generator: torch.Generator) -> T
     """
     low, high = (torch.from_numpy(np.asarray(dataset.box[i], np.float32)) for i in (0, 1))
     points = low + (high - low) * torch.rand(CARVE_CANDIDATES * count, 3, generator=generator)
-    background = torch.tensor(dataset.background) * 255
+    background = np.array(dataset.background, np.float32) * 255
     seen, hits = torch.zeros(len(points)), torch.zeros(len(points))
-    views = dataset.train[:: max(1, len(dataset.train) // CARVE_VIEWS)]
-    for view in views:
-        viewmat, K = (torch.from_numpy(np.array(m, np.float32)) for m in (view.viewmat, view.K))
-        camera = points @ viewmat[:3, :3].T + viewmat[:3, 3]
-        pixel = (camera[:, :2] / camera[:, 2:].clamp(min=1e-6) * K[[0, 1], [0, 1]] + K[:2, 2]).floor().long()
-        inside = (camera[:, 2] > 0) & (pixel >= 0).all(1) & (pixel[:, 0] < view.width) & (pixel[:, 1] < view.height)
-        something = (torch.from_numpy(view.image).float() - background).abs().amax(2) > 8
-        x, y = pixel[inside].T
-        seen[inside] += 1
-        hits[inside] += something[y, x].float()
+    for view in dataset.train[:: max(1, len(dataset.train) // CARVE_VIEWS)]:
+        something = np.abs(view.image - background).max(2) > CARVE_CONTRAST
+        viewmat, K = (np.array(m, np.float32) for m in (view.viewmat, view.K))
+        _look(seen.numpy(), hits.numpy(), points.numpy(), viewmat, K, something)
     share = (hits + 1e-3) / (seen + 1)  # few views say little
     return points[torch.multinomial(share.square(), count, generator=generator)]
 
@@ -174,6 +170,26 @@ def nearest_distances(points: Tensor, k: int = 3) -> Tensor:
     out = torch.empty(n)
     out[order] = torch.from_numpy(squares).sqrt()
     return out
+
+
+@kernel(parallel=True)
+def _look(
+    seen: np.ndarray, hits: np.ndarray, points: np.ndarray, viewmat: np.ndarray, K: np.ndarray, something: np.ndarray
+) -> None:
+    """Counts in seen [n] the points [n, 3] that lie in a view's picture, in hits those of them where it shows
+    something, bool [height, width]. viewmat [4, 4]: world to camera; K [3, 3]: camera to pixels."""
+    height, width = something.shape
+    for i in nb.prange(len(points)):
+        x, y, z = viewmat[0, 3], viewmat[1, 3], viewmat[2, 3]
+        for axis in range(3):
+            x += viewmat[0, axis] * points[i, axis]
+            y += viewmat[1, axis] * points[i, axis]
+            z += viewmat[2, axis] * points[i, axis]
+        if z > 0:
+            column, row = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+            if 0 <= column < width and 0 <= row < height:
+                seen[i] += 1
+                hits[i] += something[int(row), int(column)]
 
 
 @kernel(parallel=True)
