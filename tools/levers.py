@@ -32,7 +32,7 @@ from pd4dgs_codec.threads import configure
 from pd4dgs_codec.train.config import DEFAULT_QUALITY, at_quality
 
 NAMES = ("shelf-hand", "bouncing-balls")
-QUALITIES = (30.0, 50.0, 65.0, DEFAULT_QUALITY, 95.0)
+QUALITIES = (20.0, 35.0, DEFAULT_QUALITY, 70.0, 90.0)
 #: Of the bytes that a layer of the file before takes as it is packed by default.
 SHARES = (1.0, 0.85, 0.7)
 LEVER_STEPS = 1_500

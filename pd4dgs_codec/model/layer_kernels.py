@@ -223,5 +223,6 @@ def backward(
                                 value = value + wide_load(g_hidden, (first + p) * g_hidden.shape[1] + column + i)
                             store(slope, p * row + i, select_gt(wide_load(taken, p * row + i), zero, value, zero))
             _give(g_x, first, count, 0, g_x.shape[1], before, row)
-    for part in range(1, parts):
-        sums[0] += sums[part]
+    for part in range(1, parts):  # by hand: numba takes seconds to compile a sum of rows
+        for i in range(0, sums.shape[1], WIDE):
+            store(sums, i, wide_load(sums, i) + wide_load(sums, part * sums.shape[1] + i))

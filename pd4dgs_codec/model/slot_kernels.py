@@ -173,7 +173,8 @@ def linear_backward(
         sums, none = aligned(slots * rows * columns, real), aligned(columns, real)
         for first in range(begin, end, KEPT):
             # slot by slot: a product of many rows keeps its sums in registers
-            counts[:] = 0
+            for slot in range(slots):
+                counts[slot] = 0
             for k in range(first, min(first + KEPT, end)):
                 slot = keep[k] % slots
                 members[slot, counts[slot]] = k

@@ -71,24 +71,25 @@ def at_quality(quality: float) -> dict[str, float]:
     return {name: middle * factor ** ((50 - quality) / 50) for name, (middle, factor) in DIAL.items()}
 
 
-#: Where files are a third smaller, and pictures hardly change; see docs/training.md.
-DEFAULT_QUALITY = 80.0
+#: Where files are half as large as at 80, and pictures lose some tenths of a dB; see docs/levers.md.
+DEFAULT_QUALITY = 50.0
 _DEFAULT = at_quality(DEFAULT_QUALITY)
 
 
 @dataclass(frozen=True)
 class LearningRates:
-    """(start, end) of a log-linear schedule over the run; Adam, eps 1e-15."""
+    """(start, end) of a log-linear schedule over the run, which `TrainConfig.cooldown` takes down to 0 besides; Adam,
+    eps 1e-15. The ends are high: what is learnt by then is learnt faster, and the cooldown settles it."""
 
-    feature: tuple[float, float] = (7.5e-3, 1.5e-3)
-    scaling_log: tuple[float, float] = (7e-3, 1.5e-3)
-    offset: tuple[float, float] = (1e-2, 2e-4)
-    mask_logits: tuple[float, float] = (5e-2, 2e-2)
-    opacity: tuple[float, float] = (2e-3, 1e-4)
-    covariance: tuple[float, float] = (4e-3, 4e-4)
-    color: tuple[float, float] = (8e-3, 2e-4)
-    planes: tuple[float, float] = (3e-2, 1e-3)
-    deformation: tuple[float, float] = (1.5e-3, 7e-5)
+    feature: tuple[float, float] = (7.5e-3, 1.2e-2)
+    scaling_log: tuple[float, float] = (7e-3, 1.2e-2)
+    offset: tuple[float, float] = (1e-2, 1.6e-3)
+    mask_logits: tuple[float, float] = (5e-2, 0.16)
+    opacity: tuple[float, float] = (2e-3, 8e-4)
+    covariance: tuple[float, float] = (4e-3, 3.2e-3)
+    color: tuple[float, float] = (8e-3, 1.6e-3)
+    planes: tuple[float, float] = (3e-2, 8e-3)
+    deformation: tuple[float, float] = (1.5e-3, 5.6e-4)
 
 
 @dataclass(frozen=True)
@@ -140,7 +141,7 @@ class TrainConfig:
     prefixes: float = 0.0
     #: share of the run, at its end, over which all learning rates fall to 0 besides: else the last steps carry weights
     #: over the edges of their rounding intervals, and pictures change by tenths of a dB from one step to the next
-    cooldown: float = 0.1
+    cooldown: float = 0.4
     ssim: float = 0.2
     volume: float = 0.01  #: weight of the mean product of scales (Scaffold-GS)
     noise: bool = True  #: imitate quantisation: noise on attributes, rounding of planes and weights, at last of all
