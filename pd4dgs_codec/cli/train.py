@@ -77,18 +77,18 @@ def parser() -> Parser:
     p.add_argument("--log", metavar="FILE.jsonl", help="write one JSON object per step")
     what = "0 (small) to 100 (good): weights of the bit rates, pruning and steps at once (default: 50)"
     p.add_argument("--quality", type=values.non_negative_float, metavar="Q", help=what)
-    what = "weight of the anchors' bit rate against quality, instead of the quality's (at 50: 0.1; 1: the paper's)"
+    what = "weight of the anchors' bit rate against quality, instead of the quality's (at 50: 0.08; 1: the paper's)"
     p.add_argument("--rate-scale", type=values.non_negative_float, metavar="X", help=what)
     p.add_argument(
         "--prune",
         type=values.non_negative_float,
         metavar="X",
         help="half way, take out anchors whose absence adds at most this share to the squared error, instead of the "
-        "quality's (at 50: 0.17; 0: none)",
+        "quality's (at 50: 0.14; 0: none)",
     )
     what = (
         "coarser steps for anchors that pictures hardly depend on, up to this share of the squared error, instead of "
-        "the quality's (at 50: 0.06; 0: none)"
+        "the quality's (at 50: 0.05; 0: none)"
     )
     p.add_argument("--grading", type=values.non_negative_float, metavar="X", help=what)
     what = (

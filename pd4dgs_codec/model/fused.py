@@ -223,14 +223,6 @@ def grown(
     return found
 
 
-def _by_slot(weight: Tensor, slots: int) -> Tensor:
-    """[G, H, LANES]: weight [G w, H] by slot and input, as whole vectors of outputs."""
-    rows = weight.view(slots, -1, weight.shape[1])
-    table = weight.new_zeros(slots, weight.shape[1], LANES)
-    table[:, :, : rows.shape[1]] = rows.transpose(1, 2)
-    return table
-
-
 class _Grown(torch.autograd.Function):
     @staticmethod
     def forward(
@@ -256,8 +248,8 @@ class _Grown(torch.autograd.Function):
         shape, color = (anchors.new_empty(len(keep), len(b) // slots) for b in (b_shape, b_color))
         columns = (w_opacity.shape[1], w_opacity.shape[1] + w_shape.shape[1])
         for out, column, w, b in ((shape, columns[0], w_shape, b_shape), (color, columns[1], w_color, b_color)):
-            table = (_by_slot(w, slots), _by_slot(b[:, None], slots))
-            kernels.linear(out.numpy(), keep.numpy(), hidden.numpy(), column, *_arrays(*table))
+            layer = kernels.by_slot(w.numpy(), b.numpy(), slots)
+            kernels.linear(*[*_arrays(out, keep, hidden), column, *layer])
         relative, extent = torch.sigmoid(shape), torch.exp(anchors[:, SCALING])
         color.sigmoid_()
         gaussians, gates = anchors.new_empty(len(keep), kernels.GAUSSIAN_WIDTH), anchors.new_empty(len(keep))

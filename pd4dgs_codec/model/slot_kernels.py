@@ -129,12 +129,21 @@ def seen(keep: np.ndarray, opacity: np.ndarray, mask: np.ndarray, faintest: floa
     return count
 
 
+def by_slot(weight: np.ndarray, bias: np.ndarray, slots: int) -> tuple[np.ndarray, np.ndarray]:
+    """(weight [G, H, LANES], bias [G, LANES]) for `linear` of a layer (weight [G w, any], bias [G w]), w LANES at most;
+    H is a multiple of LANES."""
+    width, inputs = len(bias) // slots, weight.shape[1]
+    table, start = np.zeros((slots, up(inputs, LANES), LANES), weight.dtype), np.zeros((slots, LANES), bias.dtype)
+    table[:, :inputs, :width] = weight.reshape(slots, width, inputs).swapaxes(1, 2)
+    start[:, :width] = bias.reshape(slots, width)
+    return table, start
+
+
 @kernel(parallel=True)
 def linear(
     out: np.ndarray, keep: np.ndarray, hidden: np.ndarray, column: int, weight: np.ndarray, bias: np.ndarray
 ) -> None:
-    """out [K, w] = the outputs of a linear layer that belong to the kept slots; weight [G, H, LANES] and bias
-    [G, LANES] of each slot's outputs, which are w at most."""
+    """out [K, w] = the outputs of a linear layer, as `by_slot` has it, that belong to the kept slots."""
     slots, inputs, width = weight.shape[0], weight.shape[1], out.shape[1]
     zero, step = wide_splat(hidden.dtype.type(0)), WIDE // LANES
     for block in nb.prange((len(keep) + KEPT - 1) // KEPT):

@@ -17,7 +17,6 @@ from pd4dgs_codec.model.visibility import FRUSTUM_MARGIN, MIN_OPACITY, OFFSET_RE
 from pd4dgs_codec.playback.networks import Field, Layers
 from pd4dgs_codec.render.checks import check_time
 from pd4dgs_codec.render.rasteriser import draw
-from pd4dgs_codec.render.simd import LANES
 from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS, MASK_STEP, MASK_THRESHOLD, Camera, Network, Scene
 
 
@@ -196,11 +195,9 @@ class _SlotNetwork:
     def __init__(self, network: Network, slots: int):
         weight, bias = network[-1]
         self._width = len(bias) // slots
-        self._inputs = -(-weight.shape[1] // LANES) * LANES  # the kernel's rows; the padding is 0
+        self._weight, self._bias = slot_kernels.by_slot(weight, bias, slots)
+        self._inputs = self._weight.shape[1]  # the kernel's rows; the padding is 0
         self._hidden = Layers(network[:-1], relu_last=True) if len(network) > 1 else None
-        self._weight = np.zeros((len(bias), self._inputs), np.float32)
-        self._weight[:, : weight.shape[1]] = weight
-        self._bias = np.ascontiguousarray(bias)
 
     def __call__(self, x: np.ndarray, keep: np.ndarray) -> np.ndarray:
         """float32 [K, width] of x float32 [n, inputs] for the slots keep int64 [K]."""

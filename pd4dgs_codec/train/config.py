@@ -38,11 +38,11 @@ ABLATIONS: dict[str, dict[str, Any]] = {
 #: What the dial moves, as (value at 50, factor from there to 0). From 100 to 50 it is the same factor, so that each is
 #: log-linear in the quality: fields of `TrainConfig`.
 DIAL: dict[str, tuple[float, float]] = {
-    "rate_scale": (0.1, 4.0),
-    "plane_rate": (5e-9, 4.0),
-    "prune": (0.17, 3.0),
-    "step_scale": (1.25, 1.6),
-    "grading": (0.06, 3.0),
+    "rate_scale": (0.08, 4.0),
+    "plane_rate": (4e-9, 4.0),
+    "prune": (0.14, 3.0),
+    "step_scale": (1.16, 1.6),
+    "grading": (0.05, 3.0),
 }
 
 #: The steps that `step_scale` multiplies. Offsets and weights cost more quality per byte than any of these.
@@ -71,7 +71,7 @@ def at_quality(quality: float) -> dict[str, float]:
     return {name: middle * factor ** ((50 - quality) / 50) for name, (middle, factor) in DIAL.items()}
 
 
-#: Where files are half as large as at 80, and pictures lose some tenths of a dB; see docs/levers.md.
+#: Above it bytes buy little; see docs/levers.md.
 DEFAULT_QUALITY = 50.0
 _DEFAULT = at_quality(DEFAULT_QUALITY)
 

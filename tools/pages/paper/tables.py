@@ -315,7 +315,7 @@ def rates(results: Sequence[Result]) -> list[str]:
     return [
         markdown(head, rows),
         "",
-        "Rate scale 1 is the paper's weight; the default quality has 0.1.",
+        "Rate scale 1 is the paper's weight; the default quality has 0.08.",
     ]
 
 
