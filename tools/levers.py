@@ -1,12 +1,13 @@
 """What makes files small: the quality dial against an earlier commit, and each lever alone. Writes docs/levers.md.
 
-    python tools/levers.py --before FOLDER [--only NAME ...] [--out out] [--docs docs] [--render]
+    python tools/levers.py --before FOLDER [--only NAME ...] [--dial] [--out out] [--docs docs] [--render]
 
 FOLDER is a checkout of another commit of this project whose own trainer left FOLDER/out/NAME/model.pt. Its own
 `pd4dgs-encode` packs that as it is, and with --target-size, every layer at the same share of what it takes then. Beside
 it stand trainings of this commit at some qualities, as long as tools/results.py has them, packed by default; and, of
 LEVER_STEPS steps, the trainer without its levers, with each alone, and with all. Trainings that ended in
---out/NAME/quality-Q or --out/NAME/levers are kept; a scene takes some two hours of one processor else. Bjontegaard's
+--out/NAME/quality-Q or --out/NAME/levers are kept; a scene takes some two hours of one processor else, and half an hour
+with --dial, which measures the trainings at some qualities alone and leaves the rest of the page. Bjontegaard's
 difference is the mean difference of log bytes over the dB that both curves reach, piecewise linear (VCEG-M33 takes
 cubics).
 """
@@ -113,18 +114,23 @@ def trained(scene: Scene, path: Path, changes: dict[str, Any]) -> Points:
     return found
 
 
+def measure_dial(scene: Scene, out: Path) -> list[Points]:
+    """Points of this commit's curve, by level."""
+    folder = out / scene.name
+    places = {q: folder / f"quality-{q:g}" if q != DEFAULT_QUALITY else folder for q in QUALITIES}
+    return [trained(scene, place / "model.pt", at_quality(q)) for q, place in places.items()]
+
+
 def measure(scene: Scene, before: Path, out: Path) -> Row:
     """Points of both curves and of the levers, all by level."""
     folder, old = out / scene.name, commit(before)
-    places = {q: folder / f"quality-{q:g}" if q != DEFAULT_QUALITY else folder for q in QUALITIES}
-    after = [trained(scene, place / "model.pt", at_quality(q)) for q, place in places.items()]
-    short = {"iterations": LEVER_STEPS}
+    after, short = measure_dial(scene, out), {"iterations": LEVER_STEPS}
     alone = {
         name: trained(scene, folder / "levers" / name.replace(" ", "-") / "model.pt", short | changes)
         for name, changes in levers().items()
     }
     curve = curve_before(before, old, scene, folder / "levers" / "before.json")
-    return {"before_commit": old, "before": curve, "after": after, "levers": alone}
+    return {"before_commit": old, "before": curve, "after": after, "levers": alone, "levers_commit": commit()}
 
 
 def gains(row: Row) -> list[float | None]:
@@ -167,7 +173,7 @@ def render(rows: Sequence[Row]) -> str:
         for quality, points in zip(QUALITIES, row["after"], strict=True):
             each.append((row["name"], "now", f"--quality {quality:g}", *_cells(points)))
         alone += [(row["name"], name, *_cells(points)) for name, points in row["levers"].items()]
-    commits = ", ".join(sorted({row["before_commit"] for row in rows}))
+    commits, short_of = (", ".join(sorted({row[key] for row in rows})) for key in ("before_commit", "levers_commit"))
     lines = [
         *paragraph(
             "dB are held-out mPSNR of the packed file, bytes those of the file up to the level. One seed each: bytes "
@@ -191,8 +197,8 @@ def render(rows: Sequence[Row]) -> str:
         "## Each lever alone",
         "",
         *paragraph(
-            f"{LEVER_STEPS:,} steps of the same trainer and encoder, without the levers, with one of them as the "
-            "default quality sets it, and with all. A short run tells them apart and no more: its dB are far from "
+            f"{LEVER_STEPS:,} steps of one trainer and encoder ({short_of}), without the levers, with one of them as "
+            "its default quality sets it, and with all. A short run tells them apart and no more: its dB are far from "
             "those of a whole one."
         ),
         "",
@@ -207,16 +213,20 @@ PAGE = Page("levers", "levers.py", render, "What makes files small")
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     parser = options(__doc__, NAMES)
+    parser.add_argument("--dial", action="store_true", help="measure the dial alone; what the page has besides stays")
     parser.add_argument("--before", type=Path, metavar="FOLDER", help="a checkout of the commit to compare with")
     args = parser.parse_args(argv)
-    if args.before is None and not args.render:
-        parser.error("--before FOLDER is needed")
+    if args.before is None and not (args.render or args.dial):
+        parser.error("--before FOLDER is needed, or --dial")
     configure()
     images = args.docs / "img"
     images.mkdir(parents=True, exist_ok=True)
 
     def measured(name: str) -> Row:
         say(f"{name}:")
+        if args.dial:
+            (row,) = (row for row in PAGE.read(args.docs) if row["name"] == name)
+            return row | {"commit": commit(), "after": measure_dial(SCENES[name], args.out.resolve())}
         return measure(SCENES[name], args.before.resolve(), args.out.resolve())
 
     todo = [scene.name for scene in present(args, NAMES)]
