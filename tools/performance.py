@@ -28,7 +28,7 @@ from pages.page import ROOT, Page, Row, commit, make, options, paragraph, say
 from pages.race import race, race_plot, race_table
 from pages.scenes import SCENES
 
-from pd4dgs_codec.bench.report import markdown
+from pd4dgs_codec.bench.report import drawing, markdown
 from pd4dgs_codec.bench.timing import machine, machine_line
 
 NAMES = ("shelf-hand", "bouncing-balls", "synthetic-local")
@@ -113,6 +113,7 @@ def measure(path: Path, both: dict[str, Path], repeats: int, own: Path | None) -
         if own and own.is_file():
             turns = Turns.of(own, {"after": ROOT}, Path(folder))
             alone["own"] = {what: turns.line(what, repeats) for what in USED}
+            alone["parts"] = turns.line("parts", repeats)["after"]
     return {"lines": lines, "efforts": efforts, **alone, "machine": machine_line(machine())}
 
 
@@ -167,6 +168,7 @@ def render(rows: Sequence[Row]) -> str:
         markdown(("scene", "what", "before", "after", "times"), table),
         *(["\n".join(paragraph(f"Measured at another commit: {newer}."))] if newer else []),
         *_own([row for row in rows if "own" in row]),
+        *_parts([row for row in rows if "parts" in row]),
         "What each effort takes, all with warm caches and verified:",
         markdown(("scene", "effort", "s", "processor s", "bytes"), efforts),
     ]
@@ -207,6 +209,33 @@ def _own(rows: Sequence[Row]) -> list[str]:
     return ["Today's own models:", markdown(head, [("bytes", *sizes), *zip(texts, *columns, strict=True)])]
 
 
+def _parts(rows: Sequence[Row]) -> list[str]:
+    """Where the time of what users wait for goes: a column per scene."""
+    if not rows:
+        return []
+    found = [row["parts"] for row in rows]
+    most = {name: max(parts.get(name, 0.0) for parts in found) for parts in found for name in parts}
+    names = sorted(most, key=lambda name: (name.split(": ")[0], -most[name]))
+    table = [(name, *(f"{1e3 * parts[name]:.1f}" if name in parts else "" for parts in found)) for name in names]
+    text = "Where the time of these goes, in process, processor ms:"
+    return [text, markdown(("part", *(row["name"] for row in rows)), table)]
+
+
+def growth_plot(row: Row, path: Path) -> None:
+    """Panels of time and memory over the number of anchors, both axes logarithmic."""
+    from matplotlib.ticker import LogLocator
+
+    anchors = [found["anchors"] for found in row["growth"]]
+    panels = (("encode", "encode, processor s"), ("decode", "decode, processor s"), ("memory", "encoder's memory, MiB"))
+    with drawing(path, [title for _, title in panels], "", (3.6, 3.0)) as axes:
+        for axis, (key, _) in zip(axes, panels, strict=True):
+            axis.loglog(anchors, [found[key] for found in row["growth"]], "o-", color="black", lw=1, ms=4)
+            axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+            axis.yaxis.set_major_formatter("{x:g}")
+            axis.yaxis.set_minor_formatter("")
+            axis.set_xlabel("anchors")
+
+
 def _growth(row: Row) -> list[str]:
     """How cost grows with the number of anchors, if it was measured of this scene."""
     if "growth" not in row:
@@ -225,7 +254,7 @@ def _growth(row: Row) -> list[str]:
         "effort. Processor seconds in process; memory is that of the scene's arrays and of encoding."
     )
     heads = ("anchors", "encode, s", "decode, s", "bytes per anchor", "float32 arrays, MiB", "encoder's memory, MiB")
-    return ["\n".join(paragraph(text)), markdown(heads, table)]
+    return ["\n".join(paragraph(text)), markdown(heads, table), "![time and memory against anchors](img/growth.png)"]
 
 
 def _beside(row: Row) -> list[str]:
@@ -276,6 +305,9 @@ def main(argv: list[str] | None = None) -> int:
     def finish(rows: list[Row]) -> None:
         if raced := [row for row in rows if RACE in row]:
             race_plot(raced, args.docs / "img" / "race.png")
+        for row in rows:
+            if "growth" in row:
+                growth_plot(row, args.docs / "img" / "growth.png")
 
     return make(PAGE, NAMES, todo, args, measured, finish)
 

@@ -2,10 +2,11 @@
 
 import time
 
-import profile_training
 import pytest
 import torch
-from profile_training import Stopwatch, measure, rows
+from pages import parts
+from pages.parts import Stopwatch
+from profile_training import measure, rows
 
 from pd4dgs_codec.train.config import Schedule, TrainConfig
 from pd4dgs_codec.train.learner import Learner
@@ -29,7 +30,7 @@ class Work:
 @pytest.fixture
 def clock(monkeypatch):
     """The stopwatch reads Work.now."""
-    monkeypatch.setattr(profile_training.time, "process_time", lambda: Work.now)
+    monkeypatch.setattr(parts.time, "process_time", lambda: Work.now)
 
 
 def test_what_a_part_spends_in_another_counts_there_alone(clock):
@@ -77,7 +78,7 @@ def test_each_column_is_of_its_level(learner, monkeypatch):
 def test_the_parts_add_up_to_the_step(learner, monkeypatch):
     """On a clock that ticks at each look: what the parts leave out would be missing from the sum."""
     ticks, whole = iter(range(10**9)), []
-    monkeypatch.setattr(profile_training.time, "process_time", lambda: float(next(ticks)))
+    monkeypatch.setattr(parts.time, "process_time", lambda: float(next(ticks)))
     step = learner.step
 
     def timed(levels):

@@ -141,6 +141,66 @@ def step(checkpoint: str, file: str, effort: str) -> dict[str, float]:
     return {f"level {level}": statistics.median(times) for level, times in enumerate(zip(*turns, strict=True))}
 
 
+def parts(checkpoint: str, file: str, effort: str) -> dict[str, float]:
+    """Processor seconds of encoding, of decoding and of a picture, kernels warm, by what they go to: "work: part"."""
+    from parts import Stopwatch
+
+    from pd4dgs_codec.codec import decoder, encoder, payload
+    from pd4dgs_codec.model.checkpoint import load
+    from pd4dgs_codec.model.convert import to_scene
+    from pd4dgs_codec.playback import player
+    from pd4dgs_codec.view.frames import own_frames
+    from pd4dgs_codec.view.levels import load_levels
+
+    stopwatch, scene = Stopwatch(), to_scene(load(checkpoint)[0])
+    level = load_levels(file)[-1]
+    frame = own_frames(level.model.info, 1, 20.0)[0]
+    works: dict[str, tuple[Callable[[], Any], tuple[tuple[Any, str, str], ...]]] = {
+        "encode": (
+            lambda: encoder.encode_with_report(scene, effort=int(effort)),
+            (
+                (encoder, "plan", "what no picture needs"),
+                (payload, "write_attributes", "attributes"),
+                (payload, "write_planes", "planes"),
+                (payload, "encode_positions", "positions"),
+                (payload, "encode_channels", "weights and masks"),
+                (encoder, "verify_errors", "verifying"),
+                (encoder, "_verify", "verifying"),
+                (encoder, "_fingerprint", "verifying"),
+                (encoder, "encode_with_report", "the rest"),
+            ),
+        ),
+        "decode": (
+            lambda: decoder.decode(Path(file).read_bytes()),
+            (
+                (payload, "read_attributes", "attributes"),
+                (payload, "read_planes", "planes"),
+                (payload, "decode_positions", "positions"),
+                (payload, "decode_channels", "weights and masks"),
+                (decoder, "decode", "the rest"),
+            ),
+        ),
+        "picture": (
+            lambda: level.picture(frame.camera, frame.time),
+            (
+                (player, "draw", "rasteriser"),
+                (player.Field, "move", "deformations"),
+                (player.Player, "picture", "scaffold networks and the rest"),
+            ),
+        ),
+    }
+    found = {}
+    for work, (run, wraps) in works.items():
+        run()
+        level.picture(frame.camera, 0.123)  # what the level keeps of one time is not of the next
+        for owner, name, part in wraps:
+            stopwatch.wrap(owner, name, part)
+        run()
+        stopwatch.unwrap()
+        found |= {f"{work}: {part}": seconds for part, seconds in stopwatch.take().items()}
+    return found
+
+
 def grow(checkpoint: str, file: str, anchors: str) -> dict[str, float]:
     """So many anchors: the checkpoint's own, and copies of them some voxels off with noise of two steps. arrays: MiB of
     the scene's float32 arrays; memory: MiB of these and of what encoding takes beside them and beside imports and
@@ -266,7 +326,7 @@ def main() -> None:
     configure(1 if what == "step" else None)
     works = {
         "encode": encode, "decode": decode, "command": command, "draw": draw, "start": start, "first": first,
-        "step": step, "grow": grow, "beside": beside,
+        "step": step, "parts": parts, "grow": grow, "beside": beside,
     }  # fmt: skip
     print(json.dumps(works[what](*arguments)))
 
