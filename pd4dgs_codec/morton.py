@@ -20,7 +20,8 @@ def spread_bits(values: np.ndarray) -> np.ndarray:
         (4, 0x10C30C30C30C30C3),
         (2, 0x1249249249249249),
     ):
-        v = (v | (v << shift)) & mask
+        v |= v << shift
+        v &= mask
     return v
 
 
@@ -47,11 +48,15 @@ def morton_codes(cells: np.ndarray) -> np.ndarray:
         raise EncodeError(f"positions: expected an integer array [N, 3], found {cells.dtype} {list(cells.shape)}")
     if len(cells) == 0:
         return np.zeros(0, dtype=np.int64)
-    offsets = cells.astype(np.int64) - cells.min(axis=0).astype(np.int64)
-    if int(offsets.max()) >> AXIS_BITS:
-        raise EncodeError(f"positions span {int(offsets.max()) + 1} voxels on one axis, limit {1 << AXIS_BITS}")
-    x, y, z = (spread_bits(offsets[:, axis]) for axis in range(3))
-    codes: np.ndarray = x | (y << 1) | (z << 2)
+    low, high = cells.min(axis=0).tolist(), cells.max(axis=0).tolist()
+    span = max(last - first for first, last in zip(low, high, strict=True))
+    if span >> AXIS_BITS:
+        raise EncodeError(f"positions span {span + 1} voxels on one axis, limit {1 << AXIS_BITS}")
+    codes = np.zeros(len(cells), np.int64)
+    for axis, first in enumerate(low):
+        offsets = cells[:, axis].astype(np.int64)
+        offsets -= first
+        codes |= spread_bits(offsets) << axis
     return codes
 
 

@@ -37,6 +37,7 @@ def leave_out_unseen(scene: Scene, raw_deformation: bool, effort: int) -> tuple[
     1..9, how little a proof may save that takes its time.
     """
     omissions = _Omissions(scene, raw_deformation)
+    del scene  # see `plan`
     while omissions.within_range() and omissions.simplify_networks():
         pass
     omissions.free_offsets_and_cells(PRICE * 10.0 ** ((USUAL_EFFORT - effort) / 2))

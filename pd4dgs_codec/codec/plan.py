@@ -44,7 +44,9 @@ def plan(scene: Scene, options: EncodeOptions = DEFAULTS) -> tuple[Scene, list[L
         why = f"mask at or below the threshold at level {scene.level}"
         left_out.append(LeftOut(f"{inactive} anchors", why, anchors=inactive))
     if options.omit != "nothing":
-        arranged, lossless = leave_out_unseen(arranged, options.raw_deformation, options.effort)
+        given = [arranged]
+        del arranged  # nobody keeps what takes other values: arrays as large as the scene's
+        arranged, lossless = leave_out_unseen(given.pop(), options.raw_deformation, options.effort)
         left_out += lossless
     return arranged, left_out
 

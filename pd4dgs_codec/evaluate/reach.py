@@ -248,18 +248,19 @@ def _read_local(
     """Marks the cells that the Gaussians `shown` bool [n, G] of the anchors `rows` read."""
     finest = np.array([max(sides[axis] for sides in marks.sides) - 1 for axis in range(3)], np.float32)
 
-    def boxes(span: Span, at: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Unit cube, float32 [m, G, 3]: (in the middle of the span, low, high)."""
+    def boxes(span: Span, at: np.ndarray, out: np.ndarray) -> None:
+        """Fills out [3, m, G, 3] in the unit cube: in the middle of the span, low, high."""
         ranges = enclosure.ranges(*span, ["position", "offset", "scaling"], at) if enclosure else {}
-        return _mean_ranges(scene, anchor[at], rows[at], ranges)
+        out[:] = _mean_ranges(scene, anchor[at], rows[at], ranges)
 
     pending = [(span, np.arange(len(rows))) for span in spans]
     for halving in range(HALVINGS + 1):
-        results = list(pool.map(lambda pair: boxes(*pair), pending))
         sizes = [at.size for _, at in pending]
         which = np.repeat(np.arange(len(pending)), sizes)  # the span of each anchor
         taken = np.concatenate([shown[at] for _, at in pending])  # bool [m, G]
-        middle, low, high = (np.concatenate([r[i] for r in results]) for i in range(3))
+        middle, low, high = found = np.empty((3, *taken.shape, 3), np.float32)
+        outs = np.split(found, np.cumsum(sizes)[:-1], axis=1)  # filled in place: the largest arrays of the encoder
+        list(pool.map(boxes, *zip(*pending, strict=True), outs))
         start, end = (np.array([span[i] for span, _ in pending])[which] for i in range(2))
         wide = ~((((high - low) * finest).max(axis=2) <= NARROW) | ~taken).all(axis=1)  # NaN is wide
         if halving == HALVINGS:
