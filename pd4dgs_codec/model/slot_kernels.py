@@ -133,7 +133,8 @@ def by_slot(weight: np.ndarray, bias: np.ndarray, slots: int) -> tuple[np.ndarra
     """(weight [G, H, LANES], bias [G, LANES]) for `linear` of a layer (weight [G w, any], bias [G w]), w LANES at most;
     H is a multiple of LANES."""
     width, inputs = len(bias) // slots, weight.shape[1]
-    table, start = np.zeros((slots, up(inputs, LANES), LANES), weight.dtype), np.zeros((slots, LANES), bias.dtype)
+    table = np.zeros((slots, -(-inputs // LANES) * LANES, LANES), weight.dtype)
+    start = np.zeros((slots, LANES), bias.dtype)
     table[:, :inputs, :width] = weight.reshape(slots, width, inputs).swapaxes(1, 2)
     start[:, :width] = bias.reshape(slots, width)
     return table, start
