@@ -34,7 +34,7 @@ from pd4dgs_codec.bench.timing import machine, machine_line
 NAMES = ("shelf-hand", "bouncing-balls", "synthetic-local")
 EFFORTS = (1, 3, 5, 7, 9)
 #: Anchors of the scenes that show how cost grows.
-GROWTH = (10_000, 100_000, 300_000, 1_000_000)
+ANCHORS = (10_000, 100_000, 300_000, 1_000_000)
 #: Runs in either checkout, so it keeps to what both have. argv: what to measure, a checkpoint, a file, options.
 PROGRAM = Path(__file__).parent / "pages" / "stopwatch.py"
 #: Of both checkouts, kept as that of an installed package is: else commands compile their modules anew each time.
@@ -79,7 +79,9 @@ class Turns:
         return medians
 
 
-def measure_again(row: Row, path: Path, both: dict[str, Path], repeats: int, lines: Sequence[str]) -> Row:
+def measure_again(
+    row: Row, path: Path, both: dict[str, Path], repeats: int, own: Path | None, lines: Sequence[str]
+) -> Row:
     """The row with some of its lines as they are now."""
     timed = [what for what in lines if what in LINES]
     found = {}
@@ -87,12 +89,35 @@ def measure_again(row: Row, path: Path, both: dict[str, Path], repeats: int, lin
         with tempfile.TemporaryDirectory() as folder:
             turns = Turns.of(path, both, Path(folder))
             found = {what: turns.line(what, repeats) for what in timed}
-    raced: Row = {}
+    parts: Row = {}
     scene = SCENES[path.parent.name]
     if RACE in lines and scene.there and not scene.source.startswith("synthetic:"):
-        raced[RACE] = race(scene, both, path.parent / "race")
-    later = row.get("later", {}) | dict.fromkeys([*found, *raced], commit())
-    return row | {"lines": row["lines"] | found, "later": later} | raced
+        parts[RACE] = race(scene, both, path.parent / "race")
+    if OWN in lines:
+        parts |= measure_own(own, repeats)
+    if GROWTH in lines:
+        parts |= measure_growth(path)
+    later = row.get("later", {}) | dict.fromkeys([*found, *(what for what in parts if what in HEADS)], commit())
+    return row | {"lines": row["lines"] | found, "later": later} | parts
+
+
+def measure_own(own: Path | None, repeats: int) -> Row:
+    """What users of this commit's checkpoint `own` wait for, if it is there, and where that time goes."""
+    if own is None or not own.is_file():
+        return {}
+    with tempfile.TemporaryDirectory() as folder:
+        turns = Turns.of(own, {"after": ROOT}, Path(folder))
+        return {OWN: {what: turns.line(what, repeats) for what in USED}, "parts": turns.line("parts", repeats)["after"]}
+
+
+def measure_growth(path: Path) -> Row:
+    """How cost grows with the number of anchors, of the first scene."""
+    if path.parent.name != NAMES[0]:
+        return {}
+    say("growth")
+    with tempfile.TemporaryDirectory() as folder:
+        grown = str(Path(folder) / "grown.pd4")
+        return {GROWTH: [run(ROOT, "grow", str(path), grown, str(anchors)) for anchors in ANCHORS]}
 
 
 def measure(path: Path, both: dict[str, Path], repeats: int, own: Path | None) -> Row:
@@ -106,14 +131,9 @@ def measure(path: Path, both: dict[str, Path], repeats: int, own: Path | None) -
             efforts.append({"effort": effort, **run(ROOT, "encode", str(path), file, str(effort))})
         alone: Row = {}
         if path.parent.name == NAMES[0]:
-            say("growth and other coders")
+            say("other coders")
             alone["beside"] = run(ROOT, "beside", str(path), file, "5")
-            grown = str(Path(folder) / "grown.pd4")
-            alone["growth"] = [run(ROOT, "grow", str(path), grown, str(anchors)) for anchors in GROWTH]
-        if own and own.is_file():
-            turns = Turns.of(own, {"after": ROOT}, Path(folder))
-            alone["own"] = {what: turns.line(what, repeats) for what in USED}
-            alone["parts"] = turns.line("parts", repeats)["after"]
+    alone |= measure_growth(path) | measure_own(own, repeats)
     return {"lines": lines, "efforts": efforts, **alone, "machine": machine_line(machine())}
 
 
@@ -139,10 +159,16 @@ LINES = {
     "first": (("pd4dgs-train, one step with its data, s", "wall", 1, 2), ("the same, processor s", "cpu", 1, 2)),
     "step": tuple((f"training step at level {n}, one thread, processor ms", f"level {n}", 1e3, 1) for n in range(3)),
 }
-SLOW = ("encode", "first", "step")
+SLOW = ("encode", "first", "step", "parts")
 #: What a user of a file waits for.
 USED = ("encode", "decode", "command", "draw", "start")
-RACE = "race"
+RACE, OWN, GROWTH = "race", "own", "growth"
+#: How a table that may be measured by itself begins, by what is measured.
+HEADS = {what: texts[0][0] for what, texts in LINES.items()} | {
+    RACE: "both trainers at once",
+    OWN: "today's own models",
+    GROWTH: "growth",
+}
 #: Lines whose figures are better when they are larger.
 RATES = ("rate",)
 
@@ -160,14 +186,13 @@ def render(rows: Sequence[Row]) -> str:
         for row in rows
         for effort in row["efforts"]
     ]
-    heads = {what: texts[0][0] for what, texts in LINES.items()} | {RACE: "both trainers at once"}
-    later = sorted({(sha, heads[what]) for row in rows for what, sha in row.get("later", {}).items()})
+    later = sorted({(sha, HEADS[what]) for row in rows for what, sha in row.get("later", {}).items()})
     newer = "; ".join(f'"{text}" and what follows it: `{sha}`' for sha, text in later)
     parts = [
         "\n".join(sorted({row["machine"] for row in rows})),
         markdown(("scene", "what", "before", "after", "times"), table),
         *(["\n".join(paragraph(f"Measured at another commit: {newer}."))] if newer else []),
-        *_own([row for row in rows if "own" in row]),
+        *_own([row for row in rows if OWN in row]),
         *_parts([row for row in rows if "parts" in row]),
         "What each effort takes, all with warm caches and verified:",
         markdown(("scene", "effort", "s", "processor s", "bytes"), efforts),
@@ -202,9 +227,9 @@ def _own(rows: Sequence[Row]) -> list[str]:
     """What a user of files of this commit waits for: a column per scene."""
     if not rows:
         return []
-    columns = [[figures[0] for _, _, figures, _ in _lines(row["own"])] for row in rows]
+    columns = [[figures[0] for _, _, figures, _ in _lines(row[OWN])] for row in rows]
     texts = [text for text, *_ in _lines(rows[0]["own"])]
-    sizes = [f"{row['own']['encode']['after']['bytes']:,.0f}" for row in rows]
+    sizes = [f"{row[OWN]['encode']['after']['bytes']:,.0f}" for row in rows]
     head = ("what", *(row["name"] for row in rows))
     return ["Today's own models:", markdown(head, [("bytes", *sizes), *zip(texts, *columns, strict=True)])]
 
@@ -225,11 +250,11 @@ def growth_plot(row: Row, path: Path) -> None:
     """Panels of time and memory over the number of anchors, both axes logarithmic."""
     from matplotlib.ticker import LogLocator
 
-    anchors = [found["anchors"] for found in row["growth"]]
+    anchors = [found["anchors"] for found in row[GROWTH]]
     panels = (("encode", "encode, processor s"), ("decode", "decode, processor s"), ("memory", "encoder's memory, MiB"))
     with drawing(path, [title for _, title in panels], "", (3.6, 3.0)) as axes:
         for axis, (key, _) in zip(axes, panels, strict=True):
-            axis.loglog(anchors, [found[key] for found in row["growth"]], "o-", color="black", lw=1, ms=4)
+            axis.loglog(anchors, [found[key] for found in row[GROWTH]], "o-", color="black", lw=1, ms=4)
             axis.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
             axis.yaxis.set_major_formatter("{x:g}")
             axis.yaxis.set_minor_formatter("")
@@ -238,7 +263,7 @@ def growth_plot(row: Row, path: Path) -> None:
 
 def _growth(row: Row) -> list[str]:
     """How cost grows with the number of anchors, if it was measured of this scene."""
-    if "growth" not in row:
+    if GROWTH not in row:
         return []
     table = [
         (
@@ -247,7 +272,7 @@ def _growth(row: Row) -> list[str]:
             f"{found['bytes'] / found['anchors']:.1f}",
             *(f"{found[key]:,.0f}" for key in ("arrays", "memory")),
         )
-        for found in row["growth"]
+        for found in row[GROWTH]
     ]
     text = (
         f"Growth: {row['name']} and copies of its anchors some voxels off, with noise of two steps, at the default "
@@ -281,9 +306,7 @@ def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     parser = options(__doc__, NAMES)
     parser.add_argument("--before", type=Path, metavar="FOLDER", help="a checkout to compare with")
-    parser.add_argument(
-        "--lines", nargs="+", choices=(*LINES, RACE), metavar="WHAT", help="these alone, of scenes there"
-    )
+    parser.add_argument("--lines", nargs="+", choices=tuple(HEADS), metavar="WHAT", help="these alone, of scenes there")
     parser.add_argument("--repeats", type=int, default=9, metavar="N", help="of each measurement (default: 9)")
     parser.add_argument("--own", type=Path, metavar="FOLDER", help="checkpoints of this commit, FOLDER/NAME/model.pt")
     args = parser.parse_args(argv)
@@ -295,18 +318,19 @@ def main(argv: list[str] | None = None) -> int:
 
     def measured(name: str) -> Row:
         both = {"before": args.before.resolve(), "after": ROOT}
-        given = args.out / name / "model.pt", both, args.repeats
+        own = args.own / name / "model.pt" if args.own else None
+        given = args.out / name / "model.pt", both, args.repeats, own
         if args.lines:
             return measure_again(there[name], *given, args.lines)
         old = there.get(name, {})
         raced = {RACE: old[RACE], "later": {RACE: old["later"][RACE]}} if RACE in old else {}
-        return measure(*given, args.own / name / "model.pt" if args.own else None) | raced
+        return measure(*given) | raced
 
     def finish(rows: list[Row]) -> None:
         if raced := [row for row in rows if RACE in row]:
             race_plot(raced, args.docs / "img" / "race.png")
         for row in rows:
-            if "growth" in row:
+            if GROWTH in row:
                 growth_plot(row, args.docs / "img" / "growth.png")
 
     return make(PAGE, NAMES, todo, args, measured, finish)
