@@ -228,7 +228,7 @@ def _own(rows: Sequence[Row]) -> list[str]:
     if not rows:
         return []
     columns = [[figures[0] for _, _, figures, _ in _lines(row[OWN])] for row in rows]
-    texts = [text for text, *_ in _lines(rows[0]["own"])]
+    texts = [text for text, *_ in _lines(rows[0][OWN])]
     sizes = [f"{row[OWN]['encode']['after']['bytes']:,.0f}" for row in rows]
     head = ("what", *(row["name"] for row in rows))
     return ["Today's own models:", markdown(head, [("bytes", *sizes), *zip(texts, *columns, strict=True)])]

@@ -44,9 +44,9 @@ def pack(layers: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, n
     parts = []
     for weight, bias in layers:
         outputs, inputs = weight.shape
-        table = np.zeros((inputs + 1, _whole(outputs, WIDE)), weight.dtype)
+        table = np.zeros((inputs + 1, whole(outputs, WIDE)), weight.dtype)
         table[:-1, :outputs], table[-1, :outputs] = weight.T, bias
-        back = np.zeros((outputs, _whole(inputs, WIDE)), weight.dtype)
+        back = np.zeros((outputs, whole(inputs, WIDE)), weight.dtype)
         back[:, :inputs] = weight
         parts += [table.ravel(), back.ravel()]
     sizes = np.array([weight.shape[::-1] for weight, _ in layers], np.int64)
@@ -56,14 +56,13 @@ def pack(layers: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, n
 
 def hidden_width(sizes: np.ndarray) -> int:
     """Columns of `hidden`."""
-    return sum(_whole(int(outputs), WIDE) for outputs in sizes[:-1, 1])
+    return sum(whole(int(outputs), WIDE) for outputs in sizes[:-1, 1])
 
 
 def sums_width(sizes: np.ndarray) -> int:
     """Columns of `sums` of `backward`."""
     return sum(
-        _whole(outputs, PRODUCT_ROWS) * _whole(inputs, WIDE) + _whole(outputs, WIDE)
-        for inputs, outputs in sizes.tolist()
+        whole(outputs, PRODUCT_ROWS) * whole(inputs, WIDE) + whole(outputs, WIDE) for inputs, outputs in sizes.tolist()
     )
 
 
@@ -71,19 +70,19 @@ def gradients(sums: np.ndarray, sizes: np.ndarray) -> list[tuple[np.ndarray, np.
     """Those by (weight, bias) of each layer in the first part of `sums`."""
     found, at = [], 0
     for inputs, outputs in sizes.tolist():
-        rows, columns = _whole(outputs, PRODUCT_ROWS), _whole(inputs, WIDE)
+        rows, columns = whole(outputs, PRODUCT_ROWS), whole(inputs, WIDE)
         weight = sums[0, at : at + rows * columns].reshape(rows, columns)[:outputs, :inputs]
         at += rows * columns
         found.append((weight, sums[0, at : at + outputs]))
-        at += _whole(outputs, WIDE)
+        at += whole(outputs, WIDE)
     return found
 
 
-def _whole(count: int, step: int) -> int:
+def whole(count: int, step: int) -> int:
     return -(-count // step) * step
 
 
-up = kernel(inline=True)(_whole)
+up = kernel(inline=True)(whole)
 
 
 @kernel(inline=True)

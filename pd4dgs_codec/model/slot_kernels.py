@@ -17,7 +17,7 @@ from typing import Any
 import numba as nb
 import numpy as np
 
-from pd4dgs_codec.model.layer_kernels import multiply, up
+from pd4dgs_codec.model.layer_kernels import multiply, up, whole
 from pd4dgs_codec.render.simd import (
     LANES,
     PRODUCT_ROWS,
@@ -133,7 +133,7 @@ def by_slot(weight: np.ndarray, bias: np.ndarray, slots: int) -> tuple[np.ndarra
     """(weight [G, H, LANES], bias [G, LANES]) for `linear` of a layer (weight [G w, any], bias [G w]), w LANES at most;
     H is a multiple of LANES."""
     width, inputs = len(bias) // slots, weight.shape[1]
-    table = np.zeros((slots, -(-inputs // LANES) * LANES, LANES), weight.dtype)
+    table = np.zeros((slots, whole(inputs, LANES), LANES), weight.dtype)
     start = np.zeros((slots, LANES), bias.dtype)
     table[:, :inputs, :width] = weight.reshape(slots, width, inputs).swapaxes(1, 2)
     start[:, :width] = bias.reshape(slots, width)

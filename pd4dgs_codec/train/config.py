@@ -71,7 +71,7 @@ def at_quality(quality: float) -> dict[str, float]:
     return {name: middle * factor ** ((50 - quality) / 50) for name, (middle, factor) in DIAL.items()}
 
 
-#: Above it bytes buy little; see docs/levers.md.
+#: The middle of the dial; docs/levers.md has what other points give.
 DEFAULT_QUALITY = 50.0
 _DEFAULT = at_quality(DEFAULT_QUALITY)
 
