@@ -114,23 +114,24 @@ def trained(scene: Scene, path: Path, changes: dict[str, Any]) -> Points:
     return found
 
 
-def measure_dial(scene: Scene, out: Path) -> list[Points]:
-    """Points of this commit's curve, by level."""
+def measure_dial(scene: Scene, out: Path) -> Row:
+    """This commit's curve: its qualities, and points of each by level."""
     folder = out / scene.name
     places = {q: folder / f"quality-{q:g}" if q != DEFAULT_QUALITY else folder for q in QUALITIES}
-    return [trained(scene, place / "model.pt", at_quality(q)) for q, place in places.items()]
+    after = [trained(scene, place / "model.pt", at_quality(q)) for q, place in places.items()]
+    return {"qualities": QUALITIES, "after": after}
 
 
 def measure(scene: Scene, before: Path, out: Path) -> Row:
     """Points of both curves and of the levers, all by level."""
     folder, old = out / scene.name, commit(before)
-    after, short = measure_dial(scene, out), {"iterations": LEVER_STEPS}
+    dial, short = measure_dial(scene, out), {"iterations": LEVER_STEPS}
     alone = {
         name: trained(scene, folder / "levers" / name.replace(" ", "-") / "model.pt", short | changes)
         for name, changes in levers().items()
     }
     curve = curve_before(before, old, scene, folder / "levers" / "before.json")
-    return {"before_commit": old, "before": curve, "after": after, "levers": alone, "levers_commit": commit()}
+    return {"before_commit": old, "before": curve, **dial, "levers": alone, "levers_commit": commit()}
 
 
 def gains(row: Row) -> list[float | None]:
@@ -170,7 +171,7 @@ def render(rows: Sequence[Row]) -> str:
         differences.append((row["name"], *("" if gain is None else f"{gain:+.0%}" for gain in gains(row))))
         for share, points in zip(SHARES, row["before"], strict=True):
             each.append((row["name"], row["before_commit"], f"{share:.0%} of each layer", *_cells(points)))
-        for quality, points in zip(QUALITIES, row["after"], strict=True):
+        for quality, points in zip(row["qualities"], row["after"], strict=True):
             each.append((row["name"], "now", f"--quality {quality:g}", *_cells(points)))
         alone += [(row["name"], name, *_cells(points)) for name, points in row["levers"].items()]
     commits, short_of = (", ".join(sorted({row[key] for row in rows})) for key in ("before_commit", "levers_commit"))
@@ -226,7 +227,7 @@ def main(argv: list[str] | None = None) -> int:
         say(f"{name}:")
         if args.dial:
             (row,) = (row for row in PAGE.read(args.docs) if row["name"] == name)
-            return row | {"commit": commit(), "after": measure_dial(SCENES[name], args.out.resolve())}
+            return row | {"commit": commit()} | measure_dial(SCENES[name], args.out.resolve())
         return measure(SCENES[name], args.before.resolve(), args.out.resolve())
 
     todo = [scene.name for scene in present(args, NAMES)]
