@@ -2,8 +2,8 @@
 
 | pool | threads | how they wait |
 |------|---------|---------------|
-| torch's operations (OpenMP) | as `configure` is told | asleep |
-| numba's kernels | the same | asleep, in the tbb layer |
+| the kernels (`Sharer`) | as `configure` is told | asleep |
+| torch's operations (OpenMP) | the same; 1 in training | asleep |
 | the BLAS of numpy | 1 | |
 
 Every command calls `configure` before anything else is imported. As a library, rendering and training call it at the
@@ -14,8 +14,8 @@ two to four times slower than one thread. OPENBLAS_NUM_THREADS is read when nump
 already `threadpoolctl` limits the BLAS, where it is installed.
 
 OpenMP threads that spin while they wait make a training step 5-20 times slower as soon as another process takes a
-core; `OMP_WAIT_POLICY=passive` (read when torch loads) and numba's `tbb` layer avoid that. The `tbb` package puts its
-library in the environment's lib folder, where the loader does not look, so it is loaded here by path.
+core; `OMP_WAIT_POLICY=passive` (read when torch loads) avoids that. In training the kernels are shared out, and torch's
+operations are short: its threads woke for them and pushed ours aside, which made steps of small scenes a tenth slower.
 """
 
 from __future__ import annotations
@@ -23,44 +23,16 @@ from __future__ import annotations
 import ctypes
 import os
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import cache
 from importlib import import_module
-from pathlib import Path
+from queue import SimpleQueue
+from threading import Thread
+from time import perf_counter
 from typing import Any
 
 from pd4dgs_codec.errors import RenderError
-
-_tbb: ctypes.CDLL | None = None
-
-
-def _tbb_candidates() -> list[str]:
-    names = ["libtbb.so.12", "libtbb.12.dylib"]
-    folders = [Path(sys.prefix) / "lib", Path(sys.base_prefix) / "lib"]
-    folders += [Path(p).parents[2] / "lib" for p in sys.path if Path(p).name == "site-packages"]
-    files = [str(folder / name) for folder in folders for name in names]
-    return [f for f in files if os.path.exists(f)] + names
-
-
-def load_tbb() -> bool:
-    """Make the tbb library findable for numba; False if it is not installed."""
-    global _tbb
-    for name in _tbb_candidates() if _tbb is None else []:
-        try:
-            _tbb = ctypes.CDLL(name, mode=ctypes.RTLD_GLOBAL)
-            break
-        except OSError:
-            continue
-    return _tbb is not None
-
-
-def choose_layer() -> None:
-    """numba's layer: tbb where it loads, else numba's own order (OpenMP, work queue). A user's choice stays."""
-    if not load_tbb() or "NUMBA_THREADING_LAYER" in os.environ:
-        return
-    os.environ["NUMBA_THREADING_LAYER"] = "tbb"
-    if "numba" in sys.modules:
-        sys.modules["numba"].config.THREADING_LAYER = "tbb"
 
 
 def available() -> int:
@@ -90,11 +62,11 @@ def _asked() -> int:
 
 
 def configure(threads: int | None = None) -> int:
-    """Set the wait policy, the threading layer and the number of threads; returns that number.
+    """Set the wait policy and the number of threads; returns that number.
 
-    threads: 1 .. available CPUs, or None for OMP_NUM_THREADS if set, else all. Best called before numpy, torch and
-    numba are imported; afterwards it still sets the threads of torch and numba and, with threadpoolctl, of numpy's
-    BLAS, but an OpenMP that is loaded already waits as it did.
+    threads: 1 .. available CPUs, or None for OMP_NUM_THREADS if set, else all. Best called before numpy and torch are
+    imported; afterwards it still sets the threads of torch and the kernels and, with threadpoolctl, of numpy's BLAS,
+    but an OpenMP that is loaded already waits as it did.
     Starting processes: spawn, never fork (OpenMP kills forked children).
     """
     if threads is None:
@@ -106,10 +78,7 @@ def configure(threads: int | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if "numpy" in sys.modules:
         _limit_blas()
-    choose_layer()
     keep_freed_memory()
-    if "numba" not in sys.modules:
-        os.environ.setdefault("NUMBA_NUM_THREADS", str(available()))
     if torch := sys.modules.get("torch"):
         torch.set_num_threads(threads)
     set_kernel_threads(threads)
@@ -134,6 +103,19 @@ def one_blas_thread() -> Iterator[None]:
     finally:
         if limits is not None:
             limits.restore_original_limits()
+
+
+@contextmanager
+def one_torch_thread() -> Iterator[None]:
+    """Keeps torch's operations to one thread meanwhile."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
 
 
 _kernel_threads: int | None = None
@@ -163,13 +145,6 @@ def load_numba() -> None:
             del sys.modules[name]
 
 
-def limit_numba() -> None:
-    """Gives numba's parallel kernels, in the calling thread, the number of threads that this module settled."""
-    import numba
-
-    numba.set_num_threads(min(kernel_threads(), numba.config.NUMBA_NUM_THREADS))  # type: ignore[attr-defined]
-
-
 def encoder_threads() -> int:
     """Threads that an encoder may start: as many as the kernels use. It settles nothing."""
     return _asked() if _kernel_threads is None else _kernel_threads
@@ -181,3 +156,75 @@ def kernel_threads() -> int:
         configure(None)
     assert _kernel_threads is not None
     return _kernel_threads
+
+
+#: Parts of a kernel's tasks for each thread, which takes one after the other: one that another process holds up, or
+#: whose tasks take longer, leaves the rest to the others.
+PARTS_PER_THREAD = 4
+#: Seconds that tasks must take together before helpers are woken, which takes about a tenth of it.
+WORTH_HELP = 4e-4
+
+Work = Callable[[tuple[int, int]], None]
+
+
+class Sharer:
+    """Does the tasks of one kernel on as many threads as kernels have, or alone where they took little of late.
+
+    Any thread may call it, several at once too. Nobody waits for a helper that has not begun: it may be busy elsewhere.
+    """
+
+    def __init__(self) -> None:
+        self._seconds = 0.0  # of a task; the first call, which may compile, is not shared
+
+    def share(self, tasks: int, work: Work) -> None:
+        """Calls work((first, end)) for ranges that make up 0..tasks; `work` lets the interpreter's lock go."""
+        threads, begin = min(kernel_threads(), tasks), perf_counter()
+        if self._seconds * tasks < WORTH_HELP:
+            threads = min(threads, 1)
+        if threads > 1:
+            _share(tasks, threads, work)
+        else:
+            work((0, tasks))
+        self._seconds = (perf_counter() - begin) * threads / max(tasks, 1)
+
+
+def _share(tasks: int, threads: int, work: Work) -> None:
+    count = min(tasks, PARTS_PER_THREAD * threads)
+    left = iter([(tasks * part // count, tasks * (part + 1) // count) for part in range(count)])
+    begun, ends = [], SimpleQueue[Exception | None]()
+
+    def help_out() -> None:
+        begun.append(True)
+        try:
+            for part in left:
+                work(part)
+        except Exception as error:
+            ends.put(error)
+        else:
+            ends.put(None)
+
+    for _ in range(threads - 1):
+        _waiting().put(help_out)
+    for part in left:
+        work(part)
+    for error in [ends.get() for _ in begun]:  # who begins now finds nothing left
+        if error:
+            raise error
+
+
+@cache
+def _waiting() -> SimpleQueue[Callable[[], None]]:
+    """What the helpers, which it starts, wait for."""
+    waiting = SimpleQueue[Callable[[], None]]()
+
+    def stand_by() -> None:
+        while True:
+            waiting.get()()
+
+    for _ in range(available() - 1):
+        Thread(target=stand_by, name="kernel", daemon=True).start()
+    return waiting
+
+
+if hasattr(os, "register_at_fork"):
+    os.register_at_fork(after_in_child=_waiting.cache_clear)  # a child has none of its parent's threads

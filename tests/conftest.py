@@ -83,9 +83,6 @@ def _kernels_are_compiled_once() -> Iterator[None]:
     if not find_spec("numba"):
         yield
         return
-    from pd4dgs_codec import threads
-
-    threads.choose_layer()  # before numba reads its environment
     from numba.core.compiler_lock import global_compiler_lock
     from numba.core.dispatcher import Dispatcher
 

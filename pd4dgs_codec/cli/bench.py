@@ -238,7 +238,7 @@ A row passes if its error is within its bound, or if input that has no answer wa
 computed by mpmath or in float64. The exit code is 1 if any row fails.
 
 groups: rate, fitting, quantiser, hexplane, deformation, masks, rasteriser, training
-The row that compares one thread with two is there only where numba has two.
+The row that compares one thread with two is there only where the process may use two CPUs.
 
 examples:
   pd4dgs-bench stability > table.md

@@ -16,7 +16,6 @@ from collections.abc import Sequence
 from itertools import accumulate
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 from torch import Tensor
@@ -29,6 +28,7 @@ from pd4dgs_codec.model.hexplane import sample, sample_gradient
 from pd4dgs_codec.model.mlp import MLP
 from pd4dgs_codec.render.simd import LANES, WIDE
 from pd4dgs_codec.scene import LENGTH_HEADS, SCALING_DIM
+from pd4dgs_codec.threads import kernel_threads
 
 SCALING = slice(-SCALING_DIM, None)  #: the last columns of an anchor's row
 
@@ -68,7 +68,7 @@ def _run_back(
 ) -> tuple[Tensor, list[Layer]]:
     """The gradients by x and by each layer, from that by what `_run` added, and by its activations, if they are used
     elsewhere."""
-    g_x, sums = torch.empty_like(x), x.new_zeros(numba.get_num_threads(), layer_kernels.sums_width(sizes))
+    g_x, sums = torch.empty_like(x), x.new_zeros(kernel_threads(), layer_kernels.sums_width(sizes))
     given = (g, hidden[:0] if g_hidden is None else g_hidden, hidden, x)
     layer_kernels.backward(*[*_arrays(g_x, sums, *given), sizes, weights.numpy()])
     found = layer_kernels.gradients(sums.numpy(), sizes)
@@ -268,7 +268,7 @@ class _Grown(torch.autograd.Function):
         (
             anchors, keep, inputs, distance, hidden, raw, shape, relative, extent, gaussians, packed, w_shape, w_color,
         ) = ctx.saved_tensors  # fmt: skip
-        parts = numba.get_num_threads()
+        parts = kernel_threads()
         g_anchors, g_raw = torch.zeros_like(anchors), torch.zeros_like(raw)
         g_mask, g_shape, g_color = anchors.new_zeros(len(anchors)), torch.empty_like(shape), g.new_empty(len(g), 3)
         results = (g_anchors, g_raw, g_mask, g_shape, g_color)
@@ -282,7 +282,7 @@ class _Grown(torch.autograd.Function):
             grads = g.new_zeros(parts, *w.shape), g.new_zeros(parts, len(w))
             whole = torch.nn.functional.pad(w, (0, -w.shape[1] % WIDE))
             kernels.linear_backward(*[*_arrays(g_hidden, *grads, keep, slope, hidden), column, whole.numpy()])
-            last.append((grads[0][0], grads[1][0]))
+            last.append(tuple(torch.from_numpy(parts_of.numpy().sum(0)) for parts_of in grads))
         g_inputs, (first, opacity) = _run_back(g_raw, g_hidden, hidden, inputs, ctx.sizes, packed)
         kernels.inputs_backward(*_arrays(g_anchors, g_inputs, inputs, distance))
         gradients = []

@@ -10,7 +10,6 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-import numba
 import numpy as np
 import torch
 import torch.nn.functional as F
@@ -25,6 +24,7 @@ from pd4dgs_codec.model.plane_regularisers import regularisers
 from pd4dgs_codec.model.rounding import round_straight_through
 from pd4dgs_codec.render.simd import LANES
 from pd4dgs_codec.scene import PLANES
+from pd4dgs_codec.threads import kernel_threads
 
 Corners = np.ndarray | Sequence[Sequence[float]]  #: [2, 3], lower and upper corner of a box, scene units
 
@@ -51,7 +51,7 @@ def sample_gradient(
     """Gradients by the grid [cells, C] and by the points [N, 3] from that of the features, g."""
     channels, tables = spatial.shape[1], (layout.reso, layout.start, layout.rows)
     # scales fill the threads first; only then are points split, which costs a buffer per part
-    parts = max(1, numba.get_num_threads() // len(layout.reso))
+    parts = max(1, kernel_threads() // len(layout.reso))
     grad = g.new_zeros(layout.n_cells, channels)
     extra = g.new_zeros(parts - 1, layout.n_spatial, channels)
     grad_rows = g.new_zeros(parts, layout.n_rows, channels)
@@ -59,7 +59,9 @@ def sample_gradient(
     results = [x.numpy() for x in (grad, extra, grad_rows, grad_points)]
     inputs = [x.numpy() for x in (g, spatial, rows)]
     kernels.sample_backward(*[*results, *inputs, *tables, points.numpy(), box.numpy()])
-    kernels.collapse_backward(grad.numpy(), grad_rows[0].numpy(), *tables, t)
+    for part in extra:
+        grad[: layout.n_spatial] += part
+    kernels.collapse_backward(grad.numpy(), grad_rows.numpy().sum(0), *tables, t)
     return grad, grad_points.sum(0)
 
 

@@ -2,7 +2,7 @@
 
 At one time t each time plane is a single row, the blend of two of its rows, so a point costs three bilinear and three
 linear lookups per scale. Channels lie innermost and are walked `LANES` at a time. The backward pass splits scales over
-threads first and points second, each part owning its gradient buffers, which are summed in a fixed order: results are
+threads first and points second, each part owning its gradient buffers, which the caller adds in order: results are
 bitwise reproducible for a fixed number of parts, and with one part for any number of threads.
 
 Arguments everywhere, all floats of one dtype: grid [cells, C] (of which only the spatial planes are read), C a
@@ -12,10 +12,9 @@ multiple of LANES; rows [n_rows, C], the time planes at the time wanted; reso [S
 
 from __future__ import annotations
 
-import numba as nb
 import numpy as np
 
-from pd4dgs_codec.render.simd import LANES, Vector, fma, fnma, kernel, load, splat, store, total
+from pd4dgs_codec.render.simd import LANES, Tasks, Vector, fma, fnma, kernel, load, parallel, splat, store, total
 
 XY, XZ, XT, YZ, YT, ZT = range(6)
 
@@ -100,8 +99,9 @@ def _address(
     return offsets, (dx, dy, dz, dy * nx, dz * nx, dz * ny), (fx, fy, fz), (sx, sy, sz)
 
 
-@kernel(parallel=True)
+@parallel(lambda out, *_: len(out))
 def sample(
+    tasks: Tasks,
     out: np.ndarray,
     grid: np.ndarray,
     rows: np.ndarray,
@@ -114,7 +114,7 @@ def sample(
     """out [N, S * C] = per scale the product of the six planes at `points`."""
     channels = grid.shape[1]
     real = grid.dtype.type
-    for n in nb.prange(len(points)):
+    for n in range(tasks[0], tasks[1]):
         for s in range(len(reso)):
             (xy, xz, yz, rx, ry, rz), (dx, dy, dz, xy_y, xz_z, yz_z), (fx, fy, fz), _ = _address(
                 s, points[n], reso, start, row_start, box, channels
@@ -185,8 +185,9 @@ def _point_gradient(
     out[out_offset + 2] = total(gz) * real(slopes[2])
 
 
-@kernel(parallel=True)
+@parallel(lambda grad, extra, grad_rows, grad_points, *_: len(grad_points) * len(grad_rows))
 def sample_backward(
+    tasks: Tasks,
     grad: np.ndarray,
     extra: np.ndarray,
     grad_rows: np.ndarray,
@@ -202,11 +203,11 @@ def sample_backward(
 ) -> None:
     """The transpose of `sample`. g: [N, S * C]. Results, to be given zeroed except grad_points:
 
-    grad [cells, C], of which the spatial planes are filled; extra [parts - 1, n_spatial, C], scratch; grad_rows
-    [parts, n_rows, C], summed into grad_rows[0]; grad_points [S, N, 3], per scale.
+    grad [cells, C], of which the spatial planes are filled by the first part; extra [parts - 1, n_spatial, C], of the
+    other parts; grad_rows [parts, n_rows, C]; grad_points [S, N, 3], per scale.
     """
     channels, parts, n_points = grid.shape[1], len(grad_rows), len(points)
-    for task in nb.prange(len(reso) * parts):
+    for task in range(tasks[0], tasks[1]):
         s, part = task // parts, task % parts
         own = grad if part == 0 else extra[part - 1]
         flat = grad_points[s].reshape(-1)
@@ -216,13 +217,6 @@ def sample_backward(
             _point_gradient(
                 own, grad_rows[part], g, at, grid, rows, channels, offsets, steps, fractions, slopes, flat, 3 * n
             )
-    for part in range(1, parts):
-        for row in range(grad_rows.shape[1]):
-            for c in range(channels):
-                grad_rows[0, row, c] += grad_rows[part, row, c]
-        for cell in nb.prange(extra.shape[1]):
-            for c in range(channels):
-                grad[cell, c] += extra[part - 1, cell, c]
 
 
 @kernel()  # exact arithmetic: the rounding must be that of the codec's quantiser

@@ -5,14 +5,13 @@ int64 [layers, 2], the inputs and outputs of each layer, no more inputs than the
 `pack` makes of the layers; hidden [n, `hidden_width`], the activations behind each layer but the last side by side,
 each padded with zeros to whole vectors.
 
-Each part of a backward pass owns its sums, which are added in order: bits repeat for a fixed number of parts.
+Each part of a backward pass owns its sums, which `gradients` adds in order: bits repeat for a fixed number of parts.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numba as nb
 import numpy as np
 
 from pd4dgs_codec.render.simd import (
@@ -20,11 +19,13 @@ from pd4dgs_codec.render.simd import (
     PRODUCT_ROWS,
     PRODUCT_VECTORS,
     WIDE,
+    Tasks,
     aligned,
     copy,
     kernel,
     load,
     narrow_product,
+    parallel,
     product,
     select_gt,
     store,
@@ -67,13 +68,13 @@ def sums_width(sizes: np.ndarray) -> int:
 
 
 def gradients(sums: np.ndarray, sizes: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Those by (weight, bias) of each layer in the first part of `sums`."""
-    found, at = [], 0
+    """Those by (weight, bias) of each layer, all parts of `sums` together."""
+    whole_sums, found, at = sums.sum(0), [], 0
     for inputs, outputs in sizes.tolist():
         rows, columns = whole(outputs, PRODUCT_ROWS), whole(inputs, WIDE)
-        weight = sums[0, at : at + rows * columns].reshape(rows, columns)[:outputs, :inputs]
+        weight = whole_sums[at : at + rows * columns].reshape(rows, columns)[:outputs, :inputs]
         at += rows * columns
-        found.append((weight, sums[0, at : at + outputs]))
+        found.append((weight, whole_sums[at : at + outputs]))
         at += whole(outputs, WIDE)
     return found
 
@@ -128,16 +129,22 @@ def _give(values: np.ndarray, first: int, count: int, column: int, columns: int,
         copy(values, (first + p) * values.shape[1] + column, block, p * row, columns)
 
 
-@kernel(parallel=True)
+@parallel(lambda out, *_: -(-len(out) // (POINTS * BLOCKS)))
 def forward(
-    out: np.ndarray, hidden: np.ndarray, x: np.ndarray, sizes: np.ndarray, weights: np.ndarray, relu_last: bool
+    tasks: Tasks,
+    out: np.ndarray,
+    hidden: np.ndarray,
+    x: np.ndarray,
+    sizes: np.ndarray,
+    weights: np.ndarray,
+    relu_last: bool,
 ) -> None:
     """out [n, at most the last outputs in whole vectors] += what the network makes of x; relu_last: after the last
     layer as well. hidden is filled, but if it has no rows."""
     row, layers, columns = up(_widest(sizes), WIDE), len(sizes), out.shape[1]
     vectors = columns - columns % LANES
-    for task in nb.prange((len(x) + POINTS * BLOCKS - 1) // (POINTS * BLOCKS)):
-        a, b = aligned(POINTS * row, x.dtype.type), aligned(POINTS * row, x.dtype.type)
+    a, b = aligned(POINTS * row, x.dtype.type), aligned(POINTS * row, x.dtype.type)
+    for task in range(tasks[0], tasks[1]):
         for first in range(task * POINTS * BLOCKS, min((task + 1) * POINTS * BLOCKS, len(x)), POINTS):
             count = min(POINTS, len(x) - first)
             _take(a, row, x, first, count, 0, x.shape[1])
@@ -160,8 +167,9 @@ def forward(
                     out[first + p, i] += a[p * row + i]
 
 
-@kernel(parallel=True)
+@parallel(lambda g_x, sums, *_: len(sums))
 def backward(
+    tasks: Tasks,
     g_x: np.ndarray,
     sums: np.ndarray,
     g: np.ndarray,
@@ -174,13 +182,13 @@ def backward(
     """The transpose of `forward` without relu_last, from g [n, last outputs] and, if it has rows, what reaches `hidden`
     from elsewhere besides, g_hidden.
 
-    g_x [n, inputs]; sums [parts, `sums_width`], given zeroed, added up in the first part: per layer the gradient by its
-    weights and that by its bias, in whole blocks.
+    g_x [n, inputs]; sums [parts, `sums_width`], given zeroed: of each part and per layer the gradient by its weights
+    and that by its bias, in whole blocks.
     """
     row, layers, parts = up(_widest(sizes), WIDE), len(sizes), len(sums)
     blocks, real = (len(x) + POINTS - 1) // POINTS, x.dtype.type
     zero = wide_splat(real(0))
-    for part in nb.prange(parts):
+    for part in range(tasks[0], tasks[1]):
         own, size = sums[part], POINTS * row + WIDE  # whole blocks read further than they mean
         slope, before, taken, none = aligned(size, real), aligned(size, real), aligned(size, real), aligned(row, real)
         for block in range(blocks * part // parts, blocks * (part + 1) // parts):
@@ -222,6 +230,3 @@ def backward(
                                 value = value + wide_load(g_hidden, (first + p) * g_hidden.shape[1] + column + i)
                             store(slope, p * row + i, select_gt(wide_load(taken, p * row + i), zero, value, zero))
             _give(g_x, first, count, 0, g_x.shape[1], before, row)
-    for part in range(1, parts):  # by hand: numba takes seconds to compile a sum of rows
-        for i in range(0, sums.shape[1], WIDE):
-            store(sums, i, wide_load(sums, i) + wide_load(sums, part * sums.shape[1] + i))

@@ -18,7 +18,6 @@ import math
 from collections.abc import Iterable
 from typing import Any
 
-import numba as nb
 import numpy as np
 import torch
 from torch import Tensor
@@ -28,7 +27,7 @@ from pd4dgs_codec.attributes.quantise import quantise
 from pd4dgs_codec.codec.plane_choice import choose_predictor
 from pd4dgs_codec.model.plane_layout import TIME_AXIS, PlaneLayout
 from pd4dgs_codec.model.rate import channel_moments, rate_bits
-from pd4dgs_codec.render.simd import LANES, Vector, kernel, load, select_gt, splat, store, total
+from pd4dgs_codec.render.simd import LANES, Tasks, Vector, kernel, load, parallel, select_gt, splat, store, total
 from pd4dgs_codec.scene import PLANES, Planes
 
 #: Of the planes in the order of `PLANES`: whether one axis is time.
@@ -61,13 +60,18 @@ def _residual(grid: np.ndarray, k: int, before: int, up: int, left: int) -> Vect
     return load(grid, k) - _median(w, n, w + n - load(grid, k - up - left))
 
 
-@kernel(parallel=True)
+@parallel(lambda channel_sums, *_: len(channel_sums))
 def _magnitudes(
-    channel_sums: np.ndarray, cell_sums: np.ndarray, grid: np.ndarray, starts: np.ndarray, sizes: np.ndarray
+    tasks: Tasks,
+    channel_sums: np.ndarray,
+    cell_sums: np.ndarray,
+    grid: np.ndarray,
+    starts: np.ndarray,
+    sizes: np.ndarray,
 ) -> None:
     """channel_sums [P, C], cell_sums [cells] += sums of |r|. starts [P], sizes [P, 3]: height, width, 1 if temporal."""
     channels, zero = grid.shape[1], splat(grid.dtype.type(0))
-    for p in nb.prange(len(starts)):
+    for p in range(tasks[0], tasks[1]):
         height, width, temporal = sizes[p]
         sums = np.zeros(channels, grid.dtype)
         for i in range(height):
@@ -96,8 +100,9 @@ def _add(grad: np.ndarray, k: int, value: Vector) -> None:
     store(grad, k, load(grad, k) + value)
 
 
-@kernel(parallel=True)
+@parallel(lambda grad, grid, by_channel, by_cell, starts, sizes: len(starts))
 def _gradient(
+    tasks: Tasks,
     grad: np.ndarray,
     grid: np.ndarray,
     by_channel: np.ndarray,
@@ -107,7 +112,7 @@ def _gradient(
 ) -> None:
     """grad [cells, C] += that of the sum of |r| weighted by by_channel [P, C] + by_cell [cells]."""
     channels, zero = grid.shape[1], splat(grid.dtype.type(0))
-    for p in nb.prange(len(starts)):
+    for p in range(tasks[0], tasks[1]):
         height, width, temporal = sizes[p]
         up, left = width * channels, channels
         for i in range(height):

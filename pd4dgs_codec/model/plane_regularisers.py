@@ -9,14 +9,26 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba as nb
 import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pd4dgs_codec.model.plane_layout import SPATIAL, TEMPORAL, PlaneLayout
-from pd4dgs_codec.render.simd import LANES, Vector, fma, fnma, kernel, load, select_gt, splat, store, total
+from pd4dgs_codec.render.simd import (
+    LANES,
+    Tasks,
+    Vector,
+    fma,
+    fnma,
+    kernel,
+    load,
+    parallel,
+    select_gt,
+    splat,
+    store,
+    total,
+)
 
 TERMS = ("plane_smooth", "time_smooth", "time_l1")
 
@@ -37,12 +49,12 @@ def _squares(grid: np.ndarray, start: int, stop: int, step: int) -> Any:
     return np.float64(total(value))
 
 
-@kernel(parallel=True)
-def _values(sums: np.ndarray, grid: np.ndarray, lines: np.ndarray) -> None:
+@parallel(lambda sums, *_: len(sums))
+def _values(tasks: Tasks, sums: np.ndarray, grid: np.ndarray, lines: np.ndarray) -> None:
     """sums [R, 3] = each line's part of the three terms."""
     channels = grid.shape[1]
     zero, one = splat(grid.dtype.type(0)), splat(grid.dtype.type(1))
-    for r in nb.prange(len(lines)):
+    for r in range(tasks[0], tasks[1]):
         first, height, width, j, spatial = lines[r]
         start, step = (first + j * width) * channels, width * channels
         smooth, distance = 0.0, zero
@@ -81,12 +93,12 @@ def _curve(grid: np.ndarray, k: int, i: int, n: int, step: int, band: Band, weig
     return fma(load(grid, k + min(n - 1 - i, 2) * step), splat(real(weight * band[4])), value)
 
 
-@kernel(parallel=True)
-def _gradient(grad: np.ndarray, grid: np.ndarray, lines: np.ndarray, factors: np.ndarray) -> None:
+@parallel(lambda grad, grid, lines, *_: len(lines))
+def _gradient(tasks: Tasks, grad: np.ndarray, grid: np.ndarray, lines: np.ndarray, factors: np.ndarray) -> None:
     """grad [cells, C] = that of sum(factors * terms)."""
     channels = grid.shape[1]
     zero, one = splat(grid.dtype.type(0)), splat(grid.dtype.type(1))
-    for r in nb.prange(len(lines)):
+    for r in range(tasks[0], tasks[1]):
         first, height, width, j, spatial = lines[r]
         start, step = (first + j * width) * channels, width * channels
         band_j = _band(j, height)

@@ -9,10 +9,9 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 
-from pd4dgs_codec.render.simd import kernel
+from pd4dgs_codec.render.simd import Tasks, kernel, parallel
 
 BLOCK = 1024  #: rows
 
@@ -50,12 +49,14 @@ def _probability(z: float, h: float, u: float, v: float, narrow_below: float) ->
     return math.log(mass) - 0.5 * u * u - _HALF_LN_2PI, 1.0 / mass
 
 
-@kernel(parallel=True)
-def sums(parts: np.ndarray, values: np.ndarray, classes: np.ndarray, centre: np.ndarray, power: int) -> None:
+@parallel(lambda parts, *_: len(parts))
+def sums(
+    tasks: Tasks, parts: np.ndarray, values: np.ndarray, classes: np.ndarray, centre: np.ndarray, power: int
+) -> None:
     """parts [blocks, K, c] += of each class the sum of values, or with power 2 that of their squared distances from
     centre [K, c]."""
     channels = values.shape[1]
-    for block in nb.prange(len(parts)):
+    for block in range(tasks[0], tasks[1]):
         for i in range(block * BLOCK, min(len(values), (block + 1) * BLOCK)):
             k = classes[i]
             if k < 0:
@@ -69,8 +70,9 @@ def sums(parts: np.ndarray, values: np.ndarray, classes: np.ndarray, centre: np.
                     parts[block, k, j] += distance * distance
 
 
-@kernel(parallel=True)
+@parallel(lambda bits, *_: len(bits))
 def row_bits(
+    tasks: Tasks,
     bits: np.ndarray,
     by_value: np.ndarray,
     by_sigma: np.ndarray,
@@ -86,7 +88,7 @@ def row_bits(
 ) -> None:
     """bits float64 [n]: the sum of R over each of `rows` int64 [n], a scalar's bits clipped to most_bits; by_value and
     by_sigma [n, c]: the gradients of each scalar's R, not clipped. sigma [K, c] is held above least_sigma steps."""
-    for r in nb.prange(len(rows)):
+    for r in range(tasks[0], tasks[1]):
         i = rows[r]
         k = classes[i]
         q, total = step * 2.0**k, 0.0
@@ -103,12 +105,18 @@ def row_bits(
         bits[r] = total
 
 
-@kernel(parallel=True)
+@parallel(lambda grad, *_: len(grad))
 def moments_gradient(
-    grad: np.ndarray, values: np.ndarray, classes: np.ndarray, by_mu: np.ndarray, mu: np.ndarray, by_square: np.ndarray
+    tasks: Tasks,
+    grad: np.ndarray,
+    values: np.ndarray,
+    classes: np.ndarray,
+    by_mu: np.ndarray,
+    mu: np.ndarray,
+    by_square: np.ndarray,
 ) -> None:
     """grad [N, c] = by_mu + (values - mu) by_square of each row's class, all [K, c] of the type of `values`."""
-    for i in nb.prange(len(values)):
+    for i in range(tasks[0], tasks[1]):
         k = classes[i]
         for j in range(values.shape[1]):
             grad[i, j] = by_mu[k, j] + (values[i, j] - mu[k, j]) * by_square[k, j] if k >= 0 else 0.0

@@ -5,8 +5,8 @@ Arguments everywhere, floats of one dtype: keep int64 [K], ascending, anchor * G
 [n, 9 + D + 3 G], a row of position, feature [D], offsets [G, 3] and log scalings [6]; gaussians [K, 14], a row of mean,
 scales, quaternion, opacity and colour; hidden [n, columns], of which H from `column` on are a layer's, H a multiple of
 LANES. The backward passes split the Gaussians over threads at anchors, each part owning its rows of the result; sums
-over all Gaussians are kept per part and added in order, so that results are bitwise reproducible for a fixed number of
-parts. What takes a fraction of a millisecond is not split: a parallel kernel takes numba thrice as long to compile.
+over all Gaussians are kept per part, for the caller to add in order, so that results are bitwise reproducible for a
+fixed number of parts. What takes a fraction of a millisecond is not split.
 """
 
 from __future__ import annotations
@@ -14,7 +14,6 @@ from __future__ import annotations
 import math
 from typing import Any
 
-import numba as nb
 import numpy as np
 
 from pd4dgs_codec.model.layer_kernels import multiply, up, whole
@@ -22,12 +21,14 @@ from pd4dgs_codec.render.simd import (
     LANES,
     PRODUCT_ROWS,
     WIDE,
+    Tasks,
     aligned,
     copy,
     fma,
     folded,
     kernel,
     load,
+    parallel,
     spread,
     store,
     wide_load,
@@ -140,15 +141,21 @@ def by_slot(weight: np.ndarray, bias: np.ndarray, slots: int) -> tuple[np.ndarra
     return table, start
 
 
-@kernel(parallel=True)
+@parallel(lambda out, *_: -(-len(out) // KEPT))
 def linear(
-    out: np.ndarray, keep: np.ndarray, hidden: np.ndarray, column: int, weight: np.ndarray, bias: np.ndarray
+    tasks: Tasks,
+    out: np.ndarray,
+    keep: np.ndarray,
+    hidden: np.ndarray,
+    column: int,
+    weight: np.ndarray,
+    bias: np.ndarray,
 ) -> None:
     """out [K, w] = the outputs of a linear layer, as `by_slot` has it, that belong to the kept slots."""
     slots, inputs, width = weight.shape[0], weight.shape[1], out.shape[1]
     zero, step = wide_splat(hidden.dtype.type(0)), WIDE // LANES
-    for block in nb.prange((len(keep) + KEPT - 1) // KEPT):
-        outputs = aligned(LANES, hidden.dtype.type)
+    outputs = aligned(LANES, hidden.dtype.type)
+    for block in range(tasks[0], tasks[1]):
         for k in range(block * KEPT, min((block + 1) * KEPT, len(keep))):
             slot, row = keep[k] % slots, keep[k] // slots * hidden.shape[1] + column
             even = odd = zero
@@ -161,8 +168,9 @@ def linear(
                 out[k, o] = outputs[o]
 
 
-@kernel(parallel=True)
+@parallel(lambda grad_hidden, grad_weight, *_: len(grad_weight))
 def linear_backward(
+    tasks: Tasks,
     grad_hidden: np.ndarray,
     grad_weight: np.ndarray,
     grad_bias: np.ndarray,
@@ -172,11 +180,11 @@ def linear_backward(
     column: int,
     weight: np.ndarray,
 ) -> None:
-    """The transpose of `linear`; weight [G w, H in whole vectors]. Results, given zeroed: grad_hidden (as hidden),
-    grad_weight [parts, G w, H] and grad_bias [parts, G w], summed into their first part."""
+    """The transpose of `linear`; weight [G w, H in whole vectors]. Results, given zeroed: grad_hidden (as hidden) and
+    of each part grad_weight [parts, G w, H] and grad_bias [parts, G w]."""
     width, inputs, parts, slots = g.shape[1], grad_weight.shape[2], len(grad_weight), len(weight) // g.shape[1]
     columns, rows, most, real = weight.shape[1], up(width, PRODUCT_ROWS), up(KEPT, PRODUCT_ROWS), hidden.dtype.type
-    for part in nb.prange(parts):
+    for part in range(tasks[0], tasks[1]):
         begin, end = _part(keep, slots, part, parts)
         members, counts = np.empty((slots, KEPT), np.int64), np.empty(slots, np.int64)
         slopes, taken, before = aligned(most * rows, real), aligned(KEPT * columns, real), aligned(most * columns, real)
@@ -213,15 +221,11 @@ def linear_backward(
             for o in range(width):
                 row = slot * width + o
                 copy(grad_weight, (part * slots * width + row) * inputs, sums, (slot * rows + o) * columns, inputs)
-    for part in range(1, parts):
-        for row in range(len(weight)):
-            for c in range(inputs):
-                grad_weight[0, row, c] += grad_weight[part, row, c]
-            grad_bias[0, row] += grad_bias[part, row]
 
 
-@kernel(parallel=True)
+@parallel(lambda gaussians, *_: len(gaussians))
 def assemble(
+    tasks: Tasks,
     gaussians: np.ndarray,
     gates: np.ndarray,
     keep: np.ndarray,
@@ -240,7 +244,7 @@ def assemble(
     """
     slots = opacity.shape[1]
     offset = anchors.shape[1] - SCALING_DIM - 3 * slots
-    for k in nb.prange(len(keep)):
+    for k in range(tasks[0], tasks[1]):
         n, o = keep[k] // slots, keep[k] % slots
         for i in range(3):
             gaussians[k, i] = anchors[n, i] + anchors[n, offset + 3 * o + i] * extent[n, i]
@@ -275,8 +279,9 @@ def _unit_backward(out: np.ndarray, values: np.ndarray, g: np.ndarray, k: int, t
         out[k, to + i] = (g[k, at + i] - along * values[k, of + i]) / norm
 
 
-@kernel(parallel=True)
+@parallel(lambda *given: given[-1])
 def assemble_backward(
+    tasks: Tasks,
     g_anchors: np.ndarray,
     g_opacity: np.ndarray,
     g_mask: np.ndarray,
@@ -296,7 +301,7 @@ def assemble_backward(
     sigmoids that gave `relative` and the colours; g_anchors by log scalings, and no features."""
     slots, scaling = g_opacity.shape[1], anchors.shape[1] - SCALING_DIM
     offset = scaling - 3 * slots
-    for part in nb.prange(parts):
+    for part in range(tasks[0], tasks[1]):
         begin, end = _part(keep, slots, part, parts)
         for k in range(begin, end):
             n, o = keep[k] // slots, keep[k] % slots

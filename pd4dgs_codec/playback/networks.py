@@ -6,7 +6,6 @@ from itertools import accumulate
 
 import numpy as np
 
-from pd4dgs_codec import threads
 from pd4dgs_codec.model import hexplane_kernels, layer_kernels
 from pd4dgs_codec.model.plane_layout import PlaneLayout
 from pd4dgs_codec.render.simd import LANES
@@ -28,7 +27,6 @@ class Layers:
 
     def add(self, out: np.ndarray, x: np.ndarray) -> None:
         """Adds what a call answers to out float32 [n, at most the last width], C-contiguous."""
-        threads.limit_numba()
         hidden = np.empty((0, 0), np.float32)
         layer_kernels.forward(out, hidden, np.ascontiguousarray(x), self._sizes, self._weights, self._relu_last)
 
@@ -64,7 +62,6 @@ class Field:
         C-contiguous; lengths in scene units."""
         layout = self._layout
         tables = layout.reso, layout.start, layout.rows
-        threads.limit_numba()
         if self._rows is None or self._rows[0] != t:  # what depends on time alone is kept
             rows = np.empty((layout.n_rows, self._channels), np.float32)
             hexplane_kernels.collapse(rows, self._grid, *tables, t, 0.0)

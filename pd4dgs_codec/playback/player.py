@@ -10,7 +10,6 @@ from itertools import pairwise
 
 import numpy as np
 
-from pd4dgs_codec import threads
 from pd4dgs_codec.model import slot_kernels
 from pd4dgs_codec.model.slot_kernels import GAUSSIAN_WIDTH
 from pd4dgs_codec.model.visibility import FRUSTUM_MARGIN, MIN_OPACITY, OFFSET_REACH, SIGMA_REACH, near_plane
@@ -158,7 +157,6 @@ class Player:
         colors = _sigmoid(self._color(inputs, keep))
         extent = np.exp(anchors[:, self._columns["scaling"]])
         made, gate = np.empty((len(keep), GAUSSIAN_WIDTH), np.float32), np.empty(len(keep), np.float32)
-        threads.limit_numba()
         slot_kernels.assemble(made, gate, keep, anchors, extent, raw_opacity, mask, shape, _sigmoid(shape), colors)
         loose = self._local is not None
         if self._local is not None:
@@ -207,7 +205,6 @@ class _SlotNetwork:
             hidden = np.zeros((len(x), self._inputs), np.float32)
             hidden[:, : x.shape[1]] = x
         out = np.empty((len(keep), self._width), np.float32)
-        threads.limit_numba()
         slot_kernels.linear(out, keep, hidden, 0, self._weight, self._bias)
         return out
 

@@ -7,9 +7,8 @@ result does not depend on the number of chunks or threads.
 from __future__ import annotations
 
 import numpy as np
-from numba import prange
 
-from pd4dgs_codec.render.simd import kernel
+from pd4dgs_codec.render.simd import Tasks, kernel, parallel
 
 
 @kernel()
@@ -43,11 +42,11 @@ def sort(visible: np.ndarray, depths: np.ndarray) -> np.ndarray:
     return order
 
 
-@kernel(parallel=True)
-def count_tiles(order: np.ndarray, rects: np.ndarray, columns: int, counts: np.ndarray) -> None:
+@parallel(lambda order, rects, columns, counts: len(counts))
+def count_tiles(tasks: Tasks, order: np.ndarray, rects: np.ndarray, columns: int, counts: np.ndarray) -> None:
     """counts int64 [chunks, tiles]: how many Gaussians of each equal chunk of `order` touch each tile."""
     chunks = counts.shape[0]
-    for chunk in prange(chunks):
+    for chunk in range(tasks[0], tasks[1]):
         counts[chunk, :] = 0
         for n in range(chunk * order.size // chunks, (chunk + 1) * order.size // chunks):
             i = order[n]
@@ -77,8 +76,9 @@ def offsets(rects: np.ndarray, counts: np.ndarray, starts: np.ndarray, first: np
     first[rects.shape[0]] = position
 
 
-@kernel(parallel=True)
+@parallel(lambda order, rects, columns, positions, *_: len(positions))
 def fill_tiles(
+    tasks: Tasks,
     order: np.ndarray,
     rects: np.ndarray,
     columns: int,
@@ -91,7 +91,7 @@ def fill_tiles(
 
     Gaussian i has the slots first[i] .. first[i + 1] - 1, so summing them later reads memory in order."""
     chunks = positions.shape[0]
-    for chunk in prange(chunks):
+    for chunk in range(tasks[0], tasks[1]):
         for n in range(chunk * order.size // chunks, (chunk + 1) * order.size // chunks):
             i = order[n]
             pair = first[i]

@@ -12,7 +12,6 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from numba import prange
 
 from pd4dgs_codec.render.projection import (
     ALPHA_MAX,
@@ -31,6 +30,7 @@ from pd4dgs_codec.render.projection import (
 from pd4dgs_codec.render.simd import (
     LANES,
     WIDE,
+    Tasks,
     aligned,
     exp2,
     fma,
@@ -41,6 +41,7 @@ from pd4dgs_codec.render.simd import (
     iota64,
     kernel,
     mask_gt,
+    parallel,
     prefetch,
     select_gt,
     single,
@@ -198,8 +199,9 @@ def _composite_tile(
                 alive &= ~(one << np.uint64(block))
 
 
-@kernel(parallel=True)
+@parallel(lambda items, starts, *_: starts.size - 1)
 def composite(
+    tasks: Tasks,
     items: np.ndarray,
     starts: np.ndarray,
     geom: np.ndarray,
@@ -218,7 +220,7 @@ def composite(
     columns = -(-width // TILE_WIDTH)
     stride = colors.shape[1]
     flat_geom, flat_colors = geom.reshape(-1), colors.reshape(-1)
-    for tile in prange(starts.size - 1):
+    for tile in range(tasks[0], tasks[1]):
         left, top = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
         state = aligned(_BLOCKS * _STATE * LANES, _F)
         _composite_tile(
@@ -317,8 +319,9 @@ def _composite_tile_backward(
         slots[slot + SLOT_GEOMETRY + channel + 2] = total(folded(sum_blue))
 
 
-@kernel(parallel=True)
+@parallel(lambda items, slot_of, starts, *_: starts.size - 1)
 def composite_backward(
+    tasks: Tasks,
     items: np.ndarray,
     slot_of: np.ndarray,
     starts: np.ndarray,
@@ -339,7 +342,7 @@ def composite_backward(
     columns = -(-width // TILE_WIDTH)
     stride, slot_stride = colors.shape[1], slots.shape[1]
     flat_geom, flat_colors, flat_slots = geom.reshape(-1), colors.reshape(-1), slots.reshape(-1)
-    for tile in prange(starts.size - 1):
+    for tile in range(tasks[0], tasks[1]):
         left, top = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
         state = aligned(_BLOCKS * _STATE * LANES, _F)
         for y in range(top, min(top + TILE_HEIGHT, height)):

@@ -13,9 +13,8 @@ import math
 from typing import Any
 
 import numpy as np
-from numba import prange
 
-from pd4dgs_codec.render.simd import kernel
+from pd4dgs_codec.render.simd import Tasks, kernel, parallel
 
 ALPHA_MAX = 0.999  #: alpha is clamped to this (gsplat 1.5.3)
 ALPHA_MIN = 1.0 / 255.0  #: fainter contributions are skipped
@@ -105,8 +104,9 @@ def _clip_index(value: float, limit: int) -> int:
     return int(min(max(value, 0.0), float(limit)))
 
 
-@kernel(parallel=True)
+@parallel(lambda means, *_: len(means))
 def project(
+    tasks: Tasks,
     means: np.ndarray,
     quats: np.ndarray,
     scales: np.ndarray,
@@ -131,7 +131,7 @@ def project(
     """
     width, height = size
     near, far, eps, clip = limits
-    for i in prange(means.shape[0]):
+    for i in range(tasks[0], tasks[1]):
         visible[i] = False
         rects[i, :] = 0
         radii[i, :] = 0
@@ -229,8 +229,9 @@ def _image_gradient(
     return gx, gy, mxx, mxy, myy
 
 
-@kernel(parallel=True)
+@parallel(lambda means, *_: len(means))
 def project_backward(
+    tasks: Tasks,
     means: np.ndarray,
     quats: np.ndarray,
     scales: np.ndarray,
@@ -253,7 +254,7 @@ def project_backward(
     depth_channel: slot column with the gradient of the depth drawn as a colour, or -1.
     """
     channels = g_colors.shape[1]
-    for i in prange(means.shape[0]):
+    for i in range(tasks[0], tasks[1]):
         begin, end = first[i], first[i + 1]
         if begin == end:
             continue

@@ -14,16 +14,11 @@ import numpy as np
 
 from pd4dgs_codec import threads
 from pd4dgs_codec.errors import RenderError
-
-threads.choose_layer()  # before numba reads its environment
-import numba  # noqa: E402
-
-from pd4dgs_codec.render import binning, kernels, projection  # noqa: E402
-from pd4dgs_codec.render.checks import check_camera, check_colours, check_limits, check_shape  # noqa: E402
-from pd4dgs_codec.scene import Camera  # noqa: E402
+from pd4dgs_codec.render import binning, kernels, projection
+from pd4dgs_codec.render.checks import check_camera, check_colours, check_limits, check_shape
+from pd4dgs_codec.scene import Camera
 
 CHANNELS = 3  #: colour channels drawn per pass
-TILES_PER_TASK = 2  #: small tasks, so that a thread with empty tiles helps the others
 CHUNKS_PER_THREAD = 4  #: of the depth order while binning
 MAX_COUNT = 2**31  #: of Gaussians, and of pairs of a Gaussian and a tile
 _TILE = (kernels.TILE_WIDTH, kernels.TILE_HEIGHT)
@@ -142,7 +137,6 @@ def project(geometry: Geometry, cameras: Sequence[Camera], settings: Settings) -
     n, count = len(geometry.means), len(cameras)
     if n >= MAX_COUNT:
         raise RenderError(f"{n} Gaussians, expected fewer than 2^31")
-    threads.limit_numba()
     width, height = cameras[0].width, cameras[0].height
     radii, means2d = np.empty((count, n, 2), np.int32), np.empty((count, n, 2), np.float32)
     depths, conics = np.empty((count, n), np.float32), np.empty((count, n, 3), np.float32)
@@ -163,7 +157,6 @@ def composite(
 
     colors: float32 [N, D] for all cameras or [C, N, D], contiguous; backgrounds: float32 [C, D], depth left out.
     """
-    threads.limit_numba()
     depth, count = projected.settings.depth, len(projected.views)
     channels = colors.shape[-1] + depth
     pictures = np.empty((count, projected.height, projected.width, channels), np.float32)
@@ -174,11 +167,9 @@ def composite(
         if backgrounds is not None:
             background[: backgrounds.shape[1]] = backgrounds[c]
         for channel in range(0, channels, CHANNELS):
-            with numba.parallel_chunksize(TILES_PER_TASK):
-                kernels.composite(
-                    view.items, view.starts, view.geom, view.colors, channel, background,
-                    pictures[c], transmittances[c],
-                )  # fmt: skip
+            kernels.composite(
+                view.items, view.starts, view.geom, view.colors, channel, background, pictures[c], transmittances[c]
+            )
     return pictures, transmittances
 
 
@@ -193,18 +184,16 @@ def backward(
 ) -> Gradients:
     """The gradient of a loss from g_pictures [C, H, W, D] and g_alphas [C, H, W], its derivatives by what `composite`
     gave, float32 and contiguous. Everything else as it was there."""
-    threads.limit_numba()
     zeros = Geometry(*(np.zeros_like(a) for a in geometry))
     result = Gradients(zeros, np.zeros_like(colors), np.zeros_like(projected.means2d))
     depth_column = projection.SLOT_GEOMETRY + colors.shape[-1] if projected.settings.depth else -1
     for c, view in enumerate(projected.views):
         slots = np.empty((view.items.size, projection.SLOT_GEOMETRY + view.colors.shape[1]), np.float32)
         for channel in range(0, pictures.shape[-1], CHANNELS):
-            with numba.parallel_chunksize(TILES_PER_TASK):
-                kernels.composite_backward(
-                    view.items, view.slot_of, view.starts, view.geom, view.colors, channel,
-                    pictures[c], transmittances[c], g_pictures[c], g_alphas[c], slots,
-                )  # fmt: skip
+            kernels.composite_backward(
+                view.items, view.slot_of, view.starts, view.geom, view.colors, channel,
+                pictures[c], transmittances[c], g_pictures[c], g_alphas[c], slots,
+            )  # fmt: skip
         projection.project_backward(
             *geometry, view.camera, view.geom, view.first, slots, depth_column,
             *result.geometry, _of_camera(result.colors, c), result.means2d[c],
@@ -236,7 +225,7 @@ def _bin(
     """(first, items, slot_of, starts) of `binning`: the Gaussians of each tile, front to back."""
     order = binning.sort(visible, depths)
     columns, rows = -(-width // _TILE[0]), -(-height // _TILE[1])
-    counts = np.empty((CHUNKS_PER_THREAD * numba.get_num_threads(), columns * rows), np.int64)
+    counts = np.empty((CHUNKS_PER_THREAD * threads.kernel_threads(), columns * rows), np.int64)
     starts, first = np.empty(columns * rows + 1, np.int64), np.empty(len(visible) + 1, np.int64)
     binning.count_tiles(order, rects, columns, counts)
     binning.offsets(rects, counts, starts, first)

@@ -6,8 +6,8 @@ loop is what is written: each operation is one LLVM instruction, which LLVM spli
 lookups in planes it was measured 2.6 to 4.5 times faster.
 
 No sum is reordered, and nothing is fused but what `fma` and `fnma` say: then the bits of a result do not depend on how
-often LLVM optimised a function. With numba's fast math they did: the process that compiles a parallel kernel runs its
-body as optimised once; linked into the kernel it is optimised again, and that is what the cache holds.
+often LLVM optimised a function. With numba's fast math they may: what a kernel calls is optimised on its own and again
+inside the kernel.
 
 Arrays are float32 or float64, C-contiguous, of any rank; an index is an offset into the flattened array, unchecked.
 
@@ -16,9 +16,10 @@ numba's cache watches only the file of the function it stores: after an edit her
 
 from __future__ import annotations
 
+import functools
 import operator
 from collections.abc import Callable, Sequence
-from typing import Any, TypeVar
+from typing import Any, Concatenate, ParamSpec, TypeVar
 
 import numba
 import numpy as np
@@ -27,6 +28,8 @@ from numba.core import cgutils, types
 from numba.core.registry import cpu_target
 from numba.extending import intrinsic as _numba_intrinsic
 from numba.extending import models, overload, register_model
+
+from pd4dgs_codec import threads
 
 LANES = 8
 #: Floats of the widest register of the CPU that numba compiles for, which is what its cache is keyed by.
@@ -37,23 +40,44 @@ PRODUCT_ROWS, PRODUCT_VECTORS = 12 if WIDE > LANES else 6, 2
 CACHE_LINE = 64  #: bytes
 
 Vector = Any  #: in annotations of kernels: a value of the numba type `Lanes`
+Tasks = tuple[int, int]  #: the first task and the one behind the last
 _Function = TypeVar("_Function", bound=Callable[..., Any])
+_Arguments = ParamSpec("_Arguments")
 _intrinsic: Callable[[Callable[..., Any]], Callable[..., Any]] = _numba_intrinsic
 
 
-def kernel(*, parallel: bool = False, inline: bool = False) -> Callable[[_Function], _Function]:
+def kernel(*, inline: bool = False) -> Callable[[_Function], _Function]:
     """Decorator of a function that numba compiles at its first call and caches beside its source.
 
-    parallel: `numba.prange` splits its loops over threads. inline: into the functions that call it. Divisions by zero
-    give what IEEE 754 says; the interpreter's lock is released.
+    inline: into the functions that call it. Divisions by zero give what IEEE 754 says; the interpreter's lock is
+    released.
     """
     options: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy"}
-    if parallel:
-        options["parallel"] = True
     if inline:
         options["forceinline"] = True
     compiled: Callable[[_Function], _Function] = numba.njit(**options)
     return compiled
+
+
+def parallel(
+    tasks: Callable[..., int],
+) -> Callable[[Callable[Concatenate[Tasks, _Arguments], None]], Callable[_Arguments, None]]:
+    """Decorator of a `kernel` of so many independent tasks, as `tasks` answers from its arguments; threads share them.
+
+    The kernel does those of its first argument, which callers leave out: all, or a part in each of several calls.
+    numba's own parallel loops take more than twice as long to compile and to load.
+    """
+
+    def decorate(function: Callable[Concatenate[Tasks, _Arguments], None]) -> Callable[_Arguments, None]:
+        compiled, sharer = kernel()(function), threads.Sharer()
+
+        @functools.wraps(compiled, updated=())  # which is `__wrapped__`
+        def call(*arguments: _Arguments.args, **named: _Arguments.kwargs) -> None:
+            sharer.share(tasks(*arguments, **named), lambda own: compiled(own, *arguments, **named))
+
+        return call
+
+    return decorate
 
 
 class Lanes(types.Type):

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 
-import numba as nb
 import numpy as np
 import torch
 from torch import Tensor
@@ -13,7 +12,7 @@ from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.model.config import ModelConfig
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model, fresh_networks
-from pd4dgs_codec.render.simd import kernel
+from pd4dgs_codec.render.simd import Tasks, parallel
 from pd4dgs_codec.scene import LOCAL_HEADS, SceneInfo, Steps, Widths
 
 #: Voxels along the longest side of the scene's box.
@@ -172,14 +171,20 @@ def nearest_distances(points: Tensor, k: int = 3) -> Tensor:
     return out
 
 
-@kernel(parallel=True)
+@parallel(lambda seen, *_: len(seen))
 def _look(
-    seen: np.ndarray, hits: np.ndarray, points: np.ndarray, viewmat: np.ndarray, K: np.ndarray, something: np.ndarray
+    tasks: Tasks,
+    seen: np.ndarray,
+    hits: np.ndarray,
+    points: np.ndarray,
+    viewmat: np.ndarray,
+    K: np.ndarray,
+    something: np.ndarray,
 ) -> None:
     """Counts in seen [n] the points [n, 3] that lie in a view's picture, in hits those of them where it shows
     something, bool [height, width]. viewmat [4, 4]: world to camera; K [3, 3]: camera to pixels."""
     height, width = something.shape
-    for i in nb.prange(len(points)):
+    for i in range(tasks[0], tasks[1]):
         x, y, z = viewmat[0, 3], viewmat[1, 3], viewmat[2, 3]
         for axis in range(3):
             x += viewmat[0, axis] * points[i, axis]
@@ -192,11 +197,11 @@ def _look(
                 hits[i] += something[int(row), int(column)]
 
 
-@kernel(parallel=True)
-def _nearest_squares(out: np.ndarray, points: np.ndarray, k: int) -> None:
+@parallel(lambda out, *_: len(out))
+def _nearest_squares(tasks: Tasks, out: np.ndarray, points: np.ndarray, k: int) -> None:
     """out [n] = mean squared distance to the k < n nearest others of points [n, 3], which ascend along the first axis:
     the search stops where that axis alone is too far."""
-    for i in nb.prange(len(points)):
+    for i in range(tasks[0], tasks[1]):
         nearest = np.full(k, np.inf)
         for way in (-1, 1):
             j = i + way

@@ -15,6 +15,7 @@ from pd4dgs_codec.errors import DataError, TrainError
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import ModelConfig
 from pd4dgs_codec.model.model import Model
+from pd4dgs_codec.threads import one_torch_thread
 from pd4dgs_codec.train import workers
 from pd4dgs_codec.train.config import COARSE_SHARE, DEFAULT_ITERATIONS, Schedule, TrainConfig
 from pd4dgs_codec.train.learner import Learner
@@ -97,7 +98,7 @@ class Trainer:
         DataError for a checkpoint that cannot be written, or for such a log, in which case the checkpoint is saved
         first.
         """
-        with StopRequest() as stop:
+        with StopRequest() as stop, one_torch_thread():
             records = RecordLog(log)
             try:
                 self._steps(output, stop, records, progress, save_every)

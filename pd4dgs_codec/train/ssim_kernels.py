@@ -11,10 +11,9 @@ from __future__ import annotations
 
 from typing import Any
 
-import numba as nb
 import numpy as np
 
-from pd4dgs_codec.render.simd import LANES, fma, fnma, kernel, load, splat, store
+from pd4dgs_codec.render.simd import LANES, Tasks, fma, fnma, kernel, load, parallel, splat, store
 
 C1, C2 = 0.01**2, 0.03**2
 TAPS = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
@@ -45,13 +44,13 @@ def _across(row: np.ndarray, k: int, taps: np.ndarray) -> Any:
     return value
 
 
-@kernel(parallel=True)
-def target_moments(mean: np.ndarray, variance: np.ndarray, image: np.ndarray, taps: np.ndarray) -> None:
+@parallel(lambda mean, *_: len(mean))
+def target_moments(tasks: Tasks, mean: np.ndarray, variance: np.ndarray, image: np.ndarray, taps: np.ndarray) -> None:
     """mean, variance [H, lanes] of a padded image under the window."""
-    height, stride = len(mean), image.shape[1]
+    stride = image.shape[1]
     zero = splat(image.dtype.type(0))
-    for j in nb.prange(height):
-        rows = np.empty((2, stride), image.dtype)
+    rows = np.empty((2, stride), image.dtype)
+    for j in range(tasks[0], tasks[1]):
         for k in range(0, stride, LANES):
             first = second = zero
             for o in range(len(taps)):
@@ -85,8 +84,9 @@ def _down(rows: np.ndarray, x: np.ndarray, y: np.ndarray, j: int, taps: np.ndarr
         store(rows, 2 * stride + k, cross)
 
 
-@kernel(parallel=True)
+@parallel(lambda slopes, sums, *_: len(sums))
 def loss(
+    tasks: Tasks,
     slopes: np.ndarray,
     sums: np.ndarray,
     x: np.ndarray,
@@ -105,10 +105,9 @@ def loss(
     stride, n = x.shape[1], mean_y.shape[1]
     real = x.dtype.type
     one, two, c1, c2 = splat(real(1)), splat(real(2)), splat(real(C1)), splat(real(C2))
-    for j in nb.prange(height):
-        rows = np.empty((3, stride), x.dtype)
-        weight = np.zeros(n, x.dtype)  # zero beyond the image, so that slopes stay zero there
-        part = np.empty(n, x.dtype)
+    rows, part = np.empty((3, stride), x.dtype), np.empty(n, x.dtype)
+    weight = np.zeros(n, x.dtype)  # zero beyond the image, so that slopes stay zero there
+    for j in range(tasks[0], tasks[1]):
         for i in range(3 * width):
             weight[i] = weights[j, i // 3]
         _down(rows, x, y, j, taps)
@@ -135,8 +134,9 @@ def loss(
         sums[j, 0], sums[j, 1] = absolute, dissimilarity
 
 
-@kernel(parallel=True)
+@parallel(lambda grad, *_: len(grad))
 def loss_backward(
+    tasks: Tasks,
     grad: np.ndarray,
     x: np.ndarray,
     y: np.ndarray,
@@ -151,9 +151,8 @@ def loss_backward(
     size = (height + 2 * REACH) * stride
     real = x.dtype.type
     zero, two, factor = splat(real(0)), splat(real(2)), splat(-factors[1])
-    for j in nb.prange(height):
-        rows = np.empty((3, stride), x.dtype)
-        result = np.empty(stride, x.dtype)
+    rows, result = np.empty((3, stride), x.dtype), np.empty(stride, x.dtype)
+    for j in range(tasks[0], tasks[1]):
         for k in range(0, stride, LANES):
             for q in range(3):
                 value = zero

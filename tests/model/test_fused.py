@@ -87,7 +87,7 @@ def test_one_anchor_is_left_as_it_is(level):
 
 @pytest.mark.parametrize("parts", [2, 5])
 def test_it_is_so_in_as_many_parts_as_there_are_threads(monkeypatch, parts):
-    monkeypatch.setattr("numba.get_num_threads", lambda: parts)
+    monkeypatch.setattr("pd4dgs_codec.model.fused.kernel_threads", lambda: parts)
     check(stir(small_model(opacity=-0.1), 0.3), 2)
 
 

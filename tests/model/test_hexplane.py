@@ -1,10 +1,10 @@
 """HexPlane: the kernels against plain torch, against the definition, and on hard input."""
 
-import numba
 import numpy as np
 import pytest
 import torch
 
+from pd4dgs_codec import threads
 from pd4dgs_codec.errors import DataError, TrainError
 from pd4dgs_codec.model.hexplane import HexPlane, _Sample, sample_reference
 from pd4dgs_codec.model.plane_layout import PlaneLayout
@@ -152,19 +152,19 @@ def test_no_points():
     assert plane.grid.grad.eq(0).all() and points.grad.shape == (0, 3)
 
 
-@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="needs two threads")
+@pytest.mark.skipif(threads.available() < 2, reason="needs two CPUs")
 @pytest.mark.parametrize("multires", [(1,), (1, 2)])
 def test_threads(multires):
     """Bitwise repeatable; one scale on two threads is split over points, two scales are not and so equal one thread."""
     plane, points = field(multires=multires, dtype=torch.float32), points_in(501, dtype=torch.float32)
-    before = numba.get_num_threads()
+    before = threads.kernel_threads()
     runs = {}
     try:
-        for name, threads in (("one", 1), ("two", 2), ("again", 2)):
-            numba.set_num_threads(threads)
+        for name, count in (("one", 1), ("two", 2), ("again", 2)):
+            threads.set_kernel_threads(count)
             runs[name] = value_and_gradients(plane, plane(points, 0.3), points)
     finally:
-        numba.set_num_threads(before)
+        threads.set_kernel_threads(before)
     for one, two, again in zip(*runs.values(), strict=True):
         assert torch.equal(two, again)
         assert torch.equal(one, two) if len(multires) == 2 else torch.allclose(one, two, rtol=1e-4, atol=1e-5)

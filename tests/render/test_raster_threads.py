@@ -1,19 +1,84 @@
-"""Threads: the same bits for any number, at once from two callers, and the layer chosen before numba starts."""
+"""Threads: how kernels share their tasks, the same bits for any number, at once from two callers."""
 
 import os
 import subprocess
 import sys
 import threading
-from ctypes.util import find_library
+import time
 
 import pytest
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
 from raster_scenes import camera, draw_with_gradients, scene
 
 from pd4dgs_codec import threads
 from pd4dgs_codec.errors import RenderError
 
 needs_two = pytest.mark.skipif(threads.available() < 2, reason="needs 2 CPUs")
+
+
+def _shared(tasks, work):
+    sharer = threads.Sharer()
+    sharer._seconds = 1.0
+    sharer.share(tasks, work)
+
+
+@given(tasks=st.integers(0, 100), count=st.integers(1, 9))
+def test_shares_make_up_the_whole(tasks, count):
+    before, done = threads.kernel_threads(), []
+    threads.set_kernel_threads(count)
+    try:
+        _shared(tasks, lambda own: done.extend(range(*own)))
+    finally:
+        threads.set_kernel_threads(before)
+    assert sorted(done) == list(range(tasks))
+
+
+def test_what_a_share_raises_reaches_the_caller():
+    def fail_elsewhere(own):
+        if threading.current_thread() is not threading.main_thread():
+            raise RenderError("a share failed")
+        time.sleep(0.05)  # long enough for the helper to take its part
+
+    threads.set_kernel_threads(2)
+    with pytest.raises(RenderError, match="a share failed"):
+        _shared(8, fail_elsewhere)
+
+
+def test_nobody_waits_for_helpers_that_are_busy():
+    go, done = threading.Event(), []
+    for _ in range(threads.available()):
+        threads._waiting().put(lambda: go.wait(60))
+    threads.set_kernel_threads(2)
+    try:
+        _shared(8, done.append)
+        assert len(done) == 8 and not go.is_set()
+    finally:
+        go.set()
+
+
+def test_what_takes_little_is_not_shared():
+    sharer, parts = threads.Sharer(), []
+    threads.set_kernel_threads(2)
+    for seconds in (0.0, 0.0, 1e-3, *[0.0] * 20):
+        parts.append(0)
+
+        def work(own, seconds=seconds):
+            parts[-1] += 1
+            if seconds:
+                time.sleep(seconds * (own[1] - own[0]))
+
+        sharer.share(8, work)
+    assert parts[:4] == [1, 1, 1, 8] and parts[-1] == 1  # by what the call before took
+
+
+@pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
+def test_a_forked_child_shares_with_helpers_of_its_own():
+    code = "import os, threading; from pd4dgs_codec import threads; threads.set_kernel_threads(2); "
+    code += "threads._share(8, 2, print); pid = os.fork(); threads._share(8, 2, lambda own: None); "
+    code += "print(threading.active_count() == threads.available()) if pid == 0 else os.waitpid(pid, 0)"
+    assert _run(code)[-1] == "True"
 
 
 def _draw(count, seed=0):
@@ -62,7 +127,7 @@ def test_configure_sets_torch_and_the_kernels():
 
 
 def _run(code, **variables):
-    environment = {k: v for k, v in os.environ.items() if not k.startswith(("OMP_", "NUMBA_"))} | variables
+    environment = {k: v for k, v in os.environ.items() if not k.startswith("OMP_")} | variables
     done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, timeout=120)
     assert done.returncode == 0, done.stderr
     return done.stdout.split()
@@ -80,15 +145,12 @@ camera = Camera(np.eye(4), np.array([[30.0, 0, 15], [0, 30, 15], [0, 0, 1]]), 30
 g = [np.random.default_rng(1).random((50, n) if n else 50) for n in (3, 4, 3, 0, 3)]
 g[0][:, 2] += 2
 draw(*g, camera)
-import numba
-print(numba.threading_layer(), numba.get_num_threads(), os.environ["OMP_WAIT_POLICY"])
+print(threads.kernel_threads(), os.environ["OMP_WAIT_POLICY"])
 """
 
 
 def test_before_torch_in_a_new_process():
-    layer, *rest = _run(_CHILD + "import torch; print(torch.get_num_threads())")
-    assert (layer == "tbb") == threads.load_tbb()
-    assert rest == ["1", "passive", "1"]
+    assert _run(_CHILD + "import torch; print(torch.get_num_threads())") == ["1", "passive", "1"]
 
 
 @pytest.mark.skipif(not os.path.isdir("/proc/self/task"), reason="needs Linux to count threads")
@@ -98,13 +160,8 @@ def test_numpy_imported_afterwards_starts_no_threads_of_its_own():
     assert _run(code) == ["1"]
 
 
-def test_without_tbb_another_layer_is_used():
-    child = _CHILD.replace("threads.configure(1)", "threads.load_tbb = lambda: False\nthreads.configure(1)")
-    assert _run(child)[0] in ("omp", "workqueue") or find_library("tbb") is not None
-
-
-def test_a_users_choice_of_layer_and_policy_stays():
-    assert _run(_CHILD, NUMBA_THREADING_LAYER="workqueue", OMP_WAIT_POLICY="active")[0::2] == ["workqueue", "active"]
+def test_a_users_choice_of_policy_stays():
+    assert _run(_CHILD, OMP_WAIT_POLICY="active") == ["1", "active"]
 
 
 @pytest.mark.slow

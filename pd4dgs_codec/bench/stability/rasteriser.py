@@ -76,7 +76,7 @@ def cases() -> Iterator[Case]:
     yield row("float16", "every tensor in float16", promised, 0.0, _half_error)
     fed, promised = "8 pictures with gradients by two threads of the caller", "the same, bit for bit"
     yield row("two callers at once", fed, f"{promised}, as one after the other", 0.0, _concurrent_error)
-    if _most_threads() >= 2:
+    if threads.available() >= 2:
         fed = "3,000 Gaussians, picture and gradients"
         yield row("one thread against two", fed, promised, 0.0, _threads_error)
     for value in (NAN, INF, -INF):
@@ -90,12 +90,6 @@ def cases() -> Iterator[Case]:
         yield refuse(f"{name} nan", f"NaN in {name}", RenderError, partial(_draw, _scene(5), view=view))
     for width in (0, -1, 65536):
         yield refuse(f"width {width}", "a size outside 1..65535", RenderError, partial(_draw, _scene(5), width))
-
-
-def _most_threads() -> int:
-    import numba
-
-    return int(numba.config.NUMBA_NUM_THREADS)  # type: ignore[attr-defined]
 
 
 # -- scenes ------------------------------------------------------------------------------------------------------------
