@@ -23,7 +23,7 @@ from pd4dgs_codec.train.loop import Trainer
         ([30, 31, 31 + 0.9 * judge.MIN_GAIN_DB[2]], [2]),
         ([30, 29, 29], [2, 1]),
         ([30, 30.38, 30.4], [2, 1]),  # a scene where nothing moves
-        ([30, 29, 29.5], []),  # level 2 gains, and rests on level 1
+        ([30, 29, 29.7], []),  # level 2 gains, and rests on level 1
         ([30], []),
     ],
 )
@@ -32,9 +32,9 @@ def test_levels_go_from_the_top_while_they_gain_nothing(psnr, levels):
 
 
 def test_a_level_must_pay_for_its_bytes():
-    megabyte = 0.5 / judge.MIN_GAIN_PER_MEGABYTE
-    assert not judge.levels_without_gain([30, 32, 32.5], [0, 0, 0.9e6 * megabyte])
-    assert [level for level, _ in judge.levels_without_gain([30, 32, 32.5], [0, 0, 1.1e6 * megabyte])] == [2]
+    megabyte = 1 / judge.MIN_GAIN_PER_MEGABYTE
+    assert not judge.levels_without_gain([30, 32, 33], [0, 0, 0.9e6 * megabyte])
+    assert [level for level, _ in judge.levels_without_gain([30, 32, 33], [0, 0, 1.1e6 * megabyte])] == [2]
 
 
 def test_what_a_level_costs_is_its_planes_and_a_byte_a_weight(dataset):
