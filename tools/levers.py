@@ -1,15 +1,15 @@
 """What makes files small: the quality dial against an earlier commit, and each lever alone. Writes docs/levers.md.
 
-    python tools/levers.py --before FOLDER [--only NAME ...] [--dial] [--out out] [--docs docs] [--render]
+    python tools/levers.py [--before FOLDER] [--dial] [--only NAME ...] [--out out] [--docs docs] [--render]
 
 FOLDER is a checkout of another commit of this project whose own trainer left FOLDER/out/NAME/model.pt. Its own
-`pd4dgs-encode` packs that as it is, and with --target-size, every layer at the same share of what it takes then. Beside
-it stand trainings of this commit at some qualities, as long as tools/results.py has them, packed by default; and, of
-LEVER_STEPS steps, the trainer without its levers, with each alone, and with all. Trainings that ended in
---out/NAME/quality-Q or --out/NAME/levers are kept; a scene takes some two hours of one processor else, and half an hour
-with --dial, which measures the trainings at some qualities alone and leaves the rest of the page. Bjontegaard's
-difference is the mean difference of log bytes over the dB that both curves reach, piecewise linear (VCEG-M33 takes
-cubics).
+`pd4dgs-encode` packs that as it is, and with --target-size, every layer at the same share of what it takes then;
+without FOLDER that part of the page stays. Beside it stand trainings of this commit at some qualities, as long as
+tools/results.py has them, packed by default. Of LEVER_STEPS steps there are the trainer without its levers, with each
+alone, and with all; --dial leaves them as they are. Trainings that ended in --out/NAME/quality-Q or --out/NAME/levers
+are kept. On one processor a scene takes half an hour for the qualities, a quarter for the levers, and more than an hour
+for the commit before. Bjontegaard's difference is the mean difference of log bytes over the dB that both curves reach,
+piecewise linear (VCEG-M33 takes cubics).
 """
 
 from __future__ import annotations
@@ -122,16 +122,20 @@ def measure_dial(scene: Scene, out: Path) -> Row:
     return {"qualities": QUALITIES, "after": after}
 
 
-def measure(scene: Scene, before: Path, out: Path) -> Row:
-    """Points of both curves and of the levers, all by level."""
-    folder, old = out / scene.name, commit(before)
-    dial, short = measure_dial(scene, out), {"iterations": LEVER_STEPS}
+def measure_levers(scene: Scene, out: Path) -> Row:
+    """Points of short runs, by lever and level."""
+    folder, short = out / scene.name / "levers", {"iterations": LEVER_STEPS}
     alone = {
-        name: trained(scene, folder / "levers" / name.replace(" ", "-") / "model.pt", short | changes)
+        name: trained(scene, folder / name.replace(" ", "-") / "model.pt", short | changes)
         for name, changes in levers().items()
     }
-    curve = curve_before(before, old, scene, folder / "levers" / "before.json")
-    return {"before_commit": old, "before": curve, **dial, "levers": alone, "levers_commit": commit()}
+    return {"levers": alone, "levers_commit": commit()}
+
+
+def measure_before(scene: Scene, before: Path, out: Path) -> Row:
+    """The curve of the commit before."""
+    old = commit(before)
+    return {"before_commit": old, "before": curve_before(before, old, scene, out / scene.name / "before.json")}
 
 
 def gains(row: Row) -> list[float | None]:
@@ -214,23 +218,24 @@ PAGE = Page("levers", "levers.py", render, "What makes files small")
 def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     parser = options(__doc__, NAMES)
-    parser.add_argument("--dial", action="store_true", help="measure the dial alone; what the page has besides stays")
+    parser.add_argument("--dial", action="store_true", help="leave the levers as the page has them")
     parser.add_argument("--before", type=Path, metavar="FOLDER", help="a checkout of the commit to compare with")
     args = parser.parse_args(argv)
-    if args.before is None and not (args.render or args.dial):
-        parser.error("--before FOLDER is needed, or --dial")
+    kept = {row["name"]: row for row in PAGE.read(args.docs)}
+    todo = [scene.name for scene in present(args, NAMES)]
+    if args.before is None and (new := [name for name in todo if name not in kept]):
+        parser.error(f"the page has no commit before for {', '.join(new)}, expected --before FOLDER")
     configure()
     images = args.docs / "img"
     images.mkdir(parents=True, exist_ok=True)
 
     def measured(name: str) -> Row:
         say(f"{name}:")
-        if args.dial:
-            (row,) = (row for row in PAGE.read(args.docs) if row["name"] == name)
-            return row | {"commit": commit()} | measure_dial(SCENES[name], args.out.resolve())
-        return measure(SCENES[name], args.before.resolve(), args.out.resolve())
+        given = SCENES[name], args.out.resolve()
+        row = kept.get(name, {}) | {"commit": commit()} | measure_dial(*given)
+        row |= {} if args.dial else measure_levers(*given)
+        return row | (measure_before(given[0], args.before.resolve(), given[1]) if args.before else {})
 
-    todo = [scene.name for scene in present(args, NAMES)]
     return make(PAGE, NAMES, todo, args, measured, lambda rows: plot(rows, images / "levers.png"))
 
 
