@@ -190,7 +190,8 @@ def render(rows: Sequence[Row]) -> str:
         *paragraph(
             f"A training per `--quality` against one training of {commits}, packed by its own encoder with "
             "`--target-size`, all layers at the same share of their bytes: the one dial that it had after training. "
-            "Bytes at equal dB, by Bjøntegaard's difference; some trainings leave level 2 out:"
+            "Bytes at equal dB, by Bjøntegaard's difference; nothing stands where trainings leave the level out, or "
+            "where ours are better at every point than all of the other:"
         ),
         "",
         markdown(("scene", "level 0", "level 1", "level 2", "whole file"), differences),
