@@ -35,6 +35,7 @@ def test_shares_make_up_the_whole(tasks, count):
     assert sorted(done) == list(range(tasks))
 
 
+@needs_two
 def test_what_a_share_raises_reaches_the_caller():
     def fail_elsewhere(own):
         if threading.current_thread() is not threading.main_thread():
