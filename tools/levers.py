@@ -1,15 +1,16 @@
 """What makes files small: the quality dial against an earlier commit, and each lever alone. Writes docs/levers.md.
 
-    python tools/levers.py [--before FOLDER] [--dial] [--only NAME ...] [--out out] [--docs docs] [--render]
+    python tools/levers.py [--before FOLDER] [--dial] [--seeds 1] [--only NAME ...] [--out out] [--docs docs]
+                           [--render]
 
 FOLDER is a checkout of another commit of this project whose own trainer left FOLDER/out/NAME/model.pt. Its own
 `pd4dgs-encode` packs that as it is, and with --target-size, every layer at the same share of what it takes then;
 without FOLDER that part of the page stays. Beside it stand trainings of this commit at some qualities, as long as
-tools/results.py has them, packed by default. Of LEVER_STEPS steps there are the trainer without its levers, with each
-alone, and with all; --dial leaves them as they are. Trainings that ended in --out/NAME/quality-Q or --out/NAME/levers
-are kept. On one processor a scene takes half an hour for the qualities, a quarter for the levers, and more than an hour
-for the commit before. Bjontegaard's difference is the mean difference of log bytes over the dB that both curves reach,
-piecewise linear (VCEG-M33 takes cubics).
+tools/results.py has them, packed by default; with --seeds N the medians of N seeds. Of LEVER_STEPS steps there are the
+trainer without its levers, with each alone, and with all; --dial leaves them as they are. Trainings that ended in
+--out/NAME/quality-Q or --out/NAME/levers are kept. On one processor a scene takes half an hour for a seed of the
+qualities, a quarter for the levers, and more than an hour for the commit before. Bjontegaard's difference is the mean
+difference of log bytes over the dB that both curves reach, piecewise linear (VCEG-M33 takes cubics).
 """
 
 from __future__ import annotations
@@ -19,6 +20,7 @@ import sys
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import numpy as np
@@ -114,12 +116,22 @@ def trained(scene: Scene, path: Path, changes: dict[str, Any]) -> Points:
     return found
 
 
-def measure_dial(scene: Scene, out: Path) -> Row:
-    """This commit's curve: its qualities, and points of each by level."""
+def medians(seeds: Sequence[Points]) -> Points:
+    """By level that all seeds have: the median of bytes and that of dB."""
+    return [tuple(map(median, zip(*points, strict=True))) for points in zip(*seeds, strict=False)]
+
+
+def measure_dial(scene: Scene, out: Path, seeds: int) -> Row:
+    """This commit's curve: its qualities, and points of each by level, medians of the seeds."""
     folder = out / scene.name
     places = {q: folder / f"quality-{q:g}" if q != DEFAULT_QUALITY else folder for q in QUALITIES}
-    after = [trained(scene, place / "model.pt", at_quality(q)) for q, place in places.items()]
-    return {"qualities": QUALITIES, "after": after}
+
+    def point(quality: float, seed: int) -> Points:
+        place = places[quality] / f"seed-{seed}" if seed else places[quality]
+        return trained(scene, place / "model.pt", at_quality(quality) | {"seed": seed})
+
+    after = [medians([point(quality, seed) for seed in range(seeds)]) for quality in QUALITIES]
+    return {"qualities": QUALITIES, "after": after, "seeds": seeds}
 
 
 def measure_levers(scene: Scene, out: Path) -> Row:
@@ -178,17 +190,18 @@ def render(rows: Sequence[Row]) -> str:
         for quality, points in zip(row["qualities"], row["after"], strict=True):
             each.append((row["name"], "now", f"--quality {quality:g}", *_cells(points)))
         alone += [(row["name"], name, *_cells(points)) for name, points in row["levers"].items()]
+    seeds = "one seed" if (of := min(row["seeds"] for row in rows)) == 1 else f"medians of {of} seeds"
     commits, short_of = (", ".join(sorted({row[key] for row in rows})) for key in ("before_commit", "levers_commit"))
     lines = [
         *paragraph(
-            "dB are held-out mPSNR of the packed file, bytes those of the file up to the level. One seed each: bytes "
-            "of trainings spread by a tenth, dB by some tenths ([results](results.md))."
+            "dB are held-out mPSNR of the packed file, bytes those of the file up to the level. Of one seed bytes "
+            "spread by a tenth, dB by some tenths ([results](results.md))."
         ),
         "",
         "## The dial",
         "",
         *paragraph(
-            f"A training per `--quality` against one training of {commits}, packed by its own encoder with "
+            f"Trainings by `--quality` ({seeds}) against one training of {commits}, packed by its own encoder with "
             "`--target-size`, all layers at the same share of their bytes: the one dial that it had after training. "
             "Bytes at equal dB, by Bjøntegaard's difference; nothing stands where trainings leave the level out, or "
             "where ours are better at every point than all of the other:"
@@ -204,8 +217,8 @@ def render(rows: Sequence[Row]) -> str:
         "",
         *paragraph(
             f"{LEVER_STEPS:,} steps of one trainer and encoder ({short_of}), without the levers, with one of them as "
-            "its default quality sets it, and with all. A short run tells them apart and no more: its dB are far from "
-            "those of a whole one."
+            "its default quality sets it, and with all; one seed. A short run tells them apart and no more: its dB are "
+            "far from those of a whole one."
         ),
         "",
         markdown(("scene", "levers", "kB up to each level", "dB"), alone),
@@ -220,6 +233,7 @@ def main(argv: list[str] | None = None) -> int:
     """Entry point; returns the exit code."""
     parser = options(__doc__, NAMES)
     parser.add_argument("--dial", action="store_true", help="leave the levers as the page has them")
+    parser.add_argument("--seeds", type=int, default=1, metavar="N", help="train with seeds 0 to N - 1 (1)")
     parser.add_argument("--before", type=Path, metavar="FOLDER", help="a checkout of the commit to compare with")
     args = parser.parse_args(argv)
     kept = {row["name"]: row for row in PAGE.read(args.docs)}
@@ -233,7 +247,7 @@ def main(argv: list[str] | None = None) -> int:
     def measured(name: str) -> Row:
         say(f"{name}:")
         given = SCENES[name], args.out.resolve()
-        row = kept.get(name, {}) | {"commit": commit()} | measure_dial(*given)
+        row = kept.get(name, {}) | {"commit": commit()} | measure_dial(*given, args.seeds)
         row |= {} if args.dial else measure_levers(*given)
         return row | (measure_before(given[0], args.before.resolve(), given[1]) if args.before else {})
 
