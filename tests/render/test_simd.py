@@ -1,5 +1,6 @@
 """Vectors as wide as the CPU's: the bits that narrower ones give, and no CPU reads what another one cached."""
 
+import gc
 import os
 import platform
 import subprocess
@@ -9,6 +10,7 @@ from pathlib import Path
 import numba
 import numpy as np
 import pytest
+from numba.core import event
 
 from pd4dgs_codec.render import simd
 from pd4dgs_codec.render.simd import PRODUCT_ROWS, PRODUCT_VECTORS, WIDE
@@ -98,3 +100,39 @@ def test_bits_do_not_depend_on_the_width_of_vectors():
         found.append(done.stdout.split())
     assert [int(width) for width, _ in found] == [WIDE, simd.LANES] * 2
     assert len({digest for _, digest in found}) == 1
+
+
+@simd.kernel()
+def _twice(value):
+    return value + value
+
+
+@simd.kernel()
+def _thrice_and_five_times(value):
+    return _twice(value) + value, _twice(2) + 1
+
+
+def test_a_kernel_is_not_compiled_anew_for_each_constant():
+    assert _thrice_and_five_times(7) == (21, 5)
+    assert _twice.signatures == [(numba.int64,)]
+
+
+def test_the_garbage_collector_is_as_it_was_after_compiling():
+    seen, states = [], (True, False)
+
+    class Watch(event.Listener):
+        def on_start(self, event):
+            seen.append(gc.isenabled())
+
+        on_end = on_start
+
+    with event.install_listener("numba:run_pass", Watch()):
+        for enabled in states:
+            compiled = simd.kernel()(lambda value: value + 1)
+            (gc.enable if enabled else gc.disable)()
+            try:
+                assert compiled(1) == 2
+                assert gc.isenabled() is enabled
+            finally:
+                gc.enable()
+    assert seen and not any(seen)
