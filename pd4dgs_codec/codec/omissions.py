@@ -25,9 +25,9 @@ from pd4dgs_codec.scene import PLANES, TRUNK, Deformation, Network, Planes, Scen
 
 #: Networks whose values may exceed this are left as they are; binary32 overflows at 3.4e38.
 LARGEST = 1e30
-#: Bits that an evaluation of the global networks at one anchor, over one stretch of time, may cost at the usual effort:
-#: some 5 kB for a second. Two levels of effort are a factor of ten.
-PRICE, USUAL_EFFORT = 0.3, 5
+#: Bits that must be in sight for an evaluation of the global networks at one anchor, over one stretch of time, at the
+#: usual effort: some 15 kB for a second. Two levels of effort are a factor of ten.
+PRICE, USUAL_EFFORT = 0.1, 5
 
 
 def leave_out_unseen(scene: Scene, raw_deformation: bool, effort: int) -> tuple[Scene, list[LeftOut]]:
@@ -46,6 +46,9 @@ def leave_out_unseen(scene: Scene, raw_deformation: bool, effort: int) -> tuple[
 
 #: (weight, bias) of a linear layer -> what takes its place.
 LinearEdit = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+#: Per scale, by name: the symbols of a plane int32 [C, H, W], and the bits that they take.
+CodedPlanes = list[dict[str, tuple[np.ndarray, float]]]
 
 
 class _Omissions:
@@ -180,20 +183,21 @@ class _Omissions:
     def free_offsets_and_cells(self, price: float) -> None:
         """Offsets of Gaussians never shown, and plane cells never read, as `reach` proves where that may save `price`
         bits an evaluation; in this order, for the offsets say where cells are read."""
-        self._free_cells(LAYER_KINDS[1], global_cells(self.decoded))
+        self._free_cells(LAYER_KINDS[1], self._coded_planes(LAYER_KINDS[1]), global_cells(self.decoded))
         shown = shown_gaussians(
             self.decoded,
             lambda certain, evaluations: sum(bits for *_, bits in self._cheaper(certain)) > price * evaluations,
         )
         self._free_offsets(shown)
         kind = LAYER_KINDS[2]
+        coded = self._coded_planes(kind)
         cells = local_cells(
             self.decoded,
             shown,
-            lambda read, evaluations: self._without_cells(kind, read)[1] > price * evaluations,
+            lambda read, evaluations: self._without_cells(kind, coded, read)[1] > price * evaluations,
         )
         if cells:
-            self._free_cells(kind, cells)
+            self._free_cells(kind, coded, cells)
 
     def _cheaper(self, shown: np.ndarray) -> Iterator[tuple[int, np.ndarray, float, float]]:
         """(channel of the offsets, rows of Gaussians that are not `shown` bool [N, G], value, bits saved) where these
@@ -227,14 +231,24 @@ class _Omissions:
             self._note(what, "no view shows them at any time", saved)
             self.scene, self.decoded = replace(self.scene, offset=given), replace(self.decoded, offset=decoded)
 
-    def _without_cells(self, kind: LayerKind, read: Reached) -> tuple[list[dict[str, np.ndarray]], float]:
+    def _coded_planes(self, kind: LayerKind) -> CodedPlanes:
+        scales = self.decoded.tensors(kind.layer).planes if self._networks(kind) else ()
+        symbols = [{name: self._plane_symbols(kind, scale[name]) for name, _, _ in PLANES} for scale in scales]
+        return [
+            {name: (own, 0.0 if self.raw_deformation else _plane_bits(own)) for name, own in scale.items()}
+            for scale in symbols
+        ]
+
+    def _without_cells(
+        self, kind: LayerKind, coded: CodedPlanes, read: Reached
+    ) -> tuple[list[dict[str, np.ndarray]], float]:
         """(per scale, by name, the planes that may take other values in cells that are not `read`; bits saved)."""
         planes: list[dict[str, np.ndarray]] = []
         saved = 0.0
-        for scale, marks in zip(self.decoded.tensors(kind.layer).planes, read, strict=True):
+        for scale, marks in zip(coded, read, strict=True):
             planes.append({})
             for name, mark in marks.items():
-                symbols = self._plane_symbols(kind, scale[name])
+                symbols, bits = scale[name]
                 cheap = np.where(mark, symbols, 0) if self.raw_deformation else fill_plane(symbols, mark)
                 if (cheap == symbols).all():
                     continue
@@ -243,11 +257,11 @@ class _Omissions:
                     saved += 32.0 * len(symbols) * int((~mark).sum())
                 else:
                     planes[-1][name] = dequantise(cheap, self.scene.steps.planes(kind.layer))
-                    saved += _plane_bits(symbols) - _plane_bits(cheap)
+                    saved += bits - _plane_bits(cheap)
         return planes, saved
 
-    def _free_cells(self, kind: LayerKind, read: Reached) -> None:
-        values, saved = self._without_cells(kind, read)
+    def _free_cells(self, kind: LayerKind, coded: CodedPlanes, read: Reached) -> None:
+        values, saved = self._without_cells(kind, coded, read)
         if not any(values):
             return
         marks = [mark for scale in read for mark in scale.values()]

@@ -20,7 +20,7 @@ import numpy as np
 
 from pd4dgs_codec import threads
 from pd4dgs_codec.evaluate.enclosure import Enclosure, Range, Ranges, instants, kernels
-from pd4dgs_codec.scene import PLANES, Deformation, Scene, plane_sides
+from pd4dgs_codec.scene import PLANES, SCALING_DIM, Deformation, Scene, plane_sides
 
 Reached = tuple[dict[str, np.ndarray], ...]  #: per scale, plane name -> bool [H, W]
 
@@ -59,40 +59,45 @@ class _Boxes:
     def __init__(self, low: np.ndarray, high: np.ndarray, start: np.ndarray, end: np.ndarray):
         self.low, self.high, self.start, self.end = low, high, start, end
 
-    def of(self, chosen: np.ndarray) -> _Boxes:
-        return _Boxes(self.low[chosen], self.high[chosen], self.start[chosen], self.end[chosen])
-
 
 class _Marks:
-    """The cells read so far of all planes of a deformation."""
+    """The cells read so far of all planes of a deformation; threads of `pool` share its scales."""
 
-    def __init__(self, planes: tuple[dict[str, np.ndarray], ...]):
-        self.sides = [plane_sides(scale) for scale in planes]
+    def __init__(self, planes: tuple[dict[str, np.ndarray], ...], pool: ThreadPoolExecutor):
+        self.sides, self.pool = [plane_sides(scale) for scale in planes], pool
         self.reached = tuple({n: np.zeros(scale[n].shape[1:], bool) for n, _, _ in PLANES} for scale in planes)
 
     def read(self, boxes: _Boxes) -> None:
         """Points in the boxes may be read."""
-        for marks, axes in zip(self.reached, self._axes(boxes), strict=True):
+
+        def read(marks: dict[str, np.ndarray], sides: Sequence[int]) -> None:
+            axes = _axes(boxes, sides)
             for name, a, b in PLANES:
                 change = _one_wider(marks[name])
                 _add_rectangles(change, axes[b], axes[a])
                 marks[name] |= change.cumsum(0).cumsum(1)[:-1, :-1] > 0
 
+        list(self.pool.map(read, self.reached, self.sides))
+
     def unread(self, boxes: _Boxes) -> np.ndarray:
         """bool [n]: the boxes that hold a cell not read so far."""
-        found = np.zeros(len(boxes.low), bool)
-        for marks, axes in zip(self.reached, self._axes(boxes), strict=True):
+
+        def unread(marks: dict[str, np.ndarray], sides: Sequence[int]) -> np.ndarray:
+            axes, found = _axes(boxes, sides), np.zeros(len(boxes.low), bool)
             for name, a, b in PLANES:
                 sums = _one_wider(marks[name])
                 np.cumsum(np.cumsum(~marks[name], axis=0), axis=1, out=sums[1:, 1:])
                 found |= _counted(sums, axes[b], axes[a])
+            return found
+
+        found: np.ndarray = np.any(list(self.pool.map(unread, self.reached, self.sides)), axis=0)
         return found
 
-    def _axes(self, boxes: _Boxes) -> Iterable[list[Cells]]:
-        """Per scale, the cells on the axes x, y, z, t."""
-        for sides in self.sides:
-            axes = [_cells(boxes.low[:, i], boxes.high[:, i], sides[i]) for i in range(3)]
-            yield [*axes, _cells(boxes.start, boxes.end, sides[3])]
+
+def _axes(boxes: _Boxes, sides: Sequence[int]) -> list[Cells]:
+    """The cells on the axes x, y, z, t of so many."""
+    axes = [_cells(boxes.low[:, i], boxes.high[:, i], sides[i]) for i in range(3)]
+    return [*axes, _cells(boxes.start, boxes.end, sides[3])]
 
 
 def _one_wider(marks: np.ndarray) -> np.ndarray:
@@ -103,6 +108,9 @@ def _one_wider(marks: np.ndarray) -> np.ndarray:
 
 def _cells(low: np.ndarray, high: np.ndarray, side: int) -> Cells:
     """(first, last) cell that a sample between low and high, 0..1, reads on an axis of `side` cells."""
+    if found := kernels():
+        own: Cells = found.cells(low, high, side, CELL_SLACK)
+        return own
     last = side - 1
     first = np.clip(np.floor(low * last - CELL_SLACK), 0, max(last - 1, 0)).astype(np.int64)
     return first, np.clip(np.floor(high * last + CELL_SLACK) + 1, 0, last).astype(np.int64)
@@ -133,13 +141,14 @@ def _counted(sums: np.ndarray, rows: Cells, columns: Cells) -> np.ndarray:
 def global_cells(scene: Scene) -> Reached:
     """The cells of the global planes that anchors read; () without such planes."""
     field = scene.global_deformation
-    cells = _Marks(field.planes if field else ())
     every = scene.anchor
-    for rows in _blocks(scene):
-        anchor = every[rows]
-        whole = np.zeros(len(anchor)), np.ones(len(anchor))
-        cells.read(_Boxes(*_unit(scene.info.box, anchor, anchor), *whole))
-    return cells.reached
+    with ThreadPoolExecutor(threads.encoder_threads()) as pool:
+        marks = _Marks(field.planes if field else (), pool)
+        for rows in _blocks(scene):
+            anchor = every[rows]
+            whole = np.zeros(len(anchor)), np.ones(len(anchor))
+            marks.read(_Boxes(*_unit(scene.info.box, anchor, anchor), *whole))
+    return marks.reached
 
 
 def shown_gaussians(scene: Scene, pays: Pays[np.ndarray] = _always) -> np.ndarray:
@@ -175,16 +184,17 @@ def local_cells(scene: Scene, shown: np.ndarray, pays: Pays[Reached] = _always) 
     field, local = scene.global_deformation, scene.local_deformation
     if local is None:
         return ()
-    marks, spans, anchor = _Marks(local.planes), _spans(field), scene.anchor
+    spans, anchor = _spans(field), scene.anchor
     asked, left = 0, len(anchor)
     with ThreadPoolExecutor(threads.encoder_threads()) as pool:
+        marks = _Marks(local.planes, pool)
         for index, rows in enumerate(_chunks(np.arange(left))):
             if index == 2 * asked or index == 1:  # asking costs as much as some thousand evaluations
                 if not pays(marks.reached, left * len(spans)):
                     return None
                 asked = index
             enclosure = Enclosure(field, scene.info.box, anchor[rows]) if field else None
-            _read_local(scene, anchor[rows], rows, shown[rows], marks, enclosure, spans, pool)
+            _read_local(scene, anchor[rows], rows, shown[rows], marks, enclosure, spans)
             left -= len(rows)
     return marks.reached
 
@@ -243,7 +253,6 @@ def _read_local(
     marks: _Marks,
     enclosure: Enclosure | None,
     spans: Sequence[Span],
-    pool: ThreadPoolExecutor,
 ) -> None:
     """Marks the cells that the Gaussians `shown` bool [n, G] of the anchors `rows` read."""
     finest = np.array([max(sides[axis] for sides in marks.sides) - 1 for axis in range(3)], np.float32)
@@ -251,24 +260,24 @@ def _read_local(
     def boxes(span: Span, at: np.ndarray, out: np.ndarray) -> None:
         """Fills out [3, m, G, 3] in the unit cube: in the middle of the span, low, high."""
         ranges = enclosure.ranges(*span, ["position", "offset", "scaling"], at) if enclosure else {}
-        out[:] = _mean_ranges(scene, anchor[at], rows[at], ranges)
+        _mean_ranges(out, scene, anchor[at], rows[at], ranges)
 
     pending = [(span, np.arange(len(rows))) for span in spans]
     for halving in range(HALVINGS + 1):
         sizes = [at.size for _, at in pending]
         which = np.repeat(np.arange(len(pending)), sizes)  # the span of each anchor
         taken = np.concatenate([shown[at] for _, at in pending])  # bool [m, G]
-        middle, low, high = found = np.empty((3, *taken.shape, 3), np.float32)
+        found = np.empty((3, *taken.shape, 3), np.float32)
         outs = np.split(found, np.cumsum(sizes)[:-1], axis=1)  # filled in place: the largest arrays of the encoder
-        list(pool.map(boxes, *zip(*pending, strict=True), outs))
+        list(marks.pool.map(boxes, *zip(*pending, strict=True), outs))
+        middle, low, high = found.reshape(3, -1, 3)
         start, end = (np.array([span[i] for span, _ in pending])[which] for i in range(2))
-        wide = ~((((high - low) * finest).max(axis=2) <= NARROW) | ~taken).all(axis=1)  # NaN is wide
-        if halving == HALVINGS:
-            wide[:] = False
-        slots, owner = taken & ~wide[:, None], np.repeat(np.arange(len(wide)), taken.shape[1]).reshape(taken.shape)
-        marks.read(_Boxes(low[slots], high[slots], start[owner[slots]], end[owner[slots]]))
-        slots = taken & wide[:, None]
-        of = owner[slots]
+        wide = np.zeros(len(taken), bool) if halving == HALVINGS else _wide(found[1], found[2], taken, finest)
+        slots = np.flatnonzero(taken & ~wide[:, None])
+        of = slots // taken.shape[1]
+        marks.read(_Boxes(low[slots], high[slots], start[of], end[of]))
+        slots = np.flatnonzero(taken & wide[:, None])
+        of = slots // taken.shape[1]
         time = (start[of] + end[of]) / 2
         marks.read(_Boxes(middle[slots], middle[slots], time, time))
         unread = marks.unread(_Boxes(low[slots], high[slots], start[of], end[of]))
@@ -285,6 +294,16 @@ def _read_local(
             return
 
 
+def _wide(low: np.ndarray, high: np.ndarray, taken: np.ndarray, finest: np.ndarray) -> np.ndarray:
+    """bool [m]: the anchors of which one of the boxes, low to high float32 [m, G, 3] in the unit cube, of the Gaussians
+    `taken` [m, G] is wider than NARROW cells, of which the cube has `finest` float32 [3] at most; NaN is wide."""
+    if found := kernels():
+        own: np.ndarray = found.wide(low, high, taken, finest, NARROW)
+        return own
+    wide: np.ndarray = ~((((high - low) * finest).max(axis=2) <= NARROW) | ~taken).all(axis=1)
+    return wide
+
+
 def _halves(span: Span) -> tuple[Span, Span]:
     middle = (span[0] + span[1]) / 2
     return (span[0], middle), (middle, span[1])
@@ -292,30 +311,37 @@ def _halves(span: Span) -> tuple[Span, Span]:
 
 def _unit(box: np.ndarray, low: np.ndarray, high: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """(low, high) float32 [..., 3] in the unit cube of points in scene units; NaN stands for anywhere."""
-    extent = np.maximum(box[1] - box[0], np.finfo(np.float32).tiny)
+    extent = _extent(box)
     low, high = (low - box[0]) / extent, (high - box[0]) / extent
     return np.fmin(np.fmax(low, 0), 1), np.fmax(np.fmin(high, 1), 0)
 
 
-def _mean_ranges(
-    scene: Scene, anchor: np.ndarray, rows: np.ndarray, ranges: Ranges
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """(in the middle, low, high) float32 [n, G, 3] of the Gaussians' means (13.4, step 3) before the local
-    deformation, in the unit cube."""
-    nothing = Range(*(np.zeros(1, np.float32),) * 3)
-    position, scaling, slots = ranges.get("position", nothing), ranges.get("scaling", nothing), scene.widths.slots
-    offset = [
-        scene.offset[rows] + (o.reshape(-1, slots, 3) if o.ndim > 1 else o) for o in ranges.get("offset", nothing)
-    ]
+def _extent(box: np.ndarray) -> np.ndarray:
+    extent: np.ndarray = np.maximum(box[1] - box[0], np.finfo(np.float32).tiny)
+    return extent
+
+
+def _mean_ranges(out: np.ndarray, scene: Scene, anchor: np.ndarray, rows: np.ndarray, ranges: Ranges) -> None:
+    """Fills out float32 [3, n, G, 3], in the middle, low, high, with where the Gaussians' means (13.4, step 3) of the
+    anchors [n, 3] at `rows` lie before the local deformation, in the unit cube."""
+    widths = {"position": 3, "offset": 3 * scene.widths.slots, "scaling": SCALING_DIM}
+    still = {name: Range(*[np.zeros((len(rows), width), np.float32)] * 3) for name, width in widths.items()}
+    position, offset, scaling = (ranges.get(name, still[name]) for name in widths)
     with np.errstate(all="ignore"):
-        spread = [np.exp((scene.scaling_log[rows] + s)[:, :3])[:, None] for s in scaling]
-        centre = [(anchor + p)[:, None] for p in position]
-        corners = [o * s for o in offset[1:] for s in spread[1:]]
+        spread = tuple(np.exp((scene.scaling_log[rows] + s)[:, :3]) for s in scaling)
+        centre = tuple(anchor + p for p in position)
+        box = scene.info.box
+        if found := kernels():
+            found.mean_ranges(out, scene.offset, rows, tuple(offset), spread, centre, box[0], _extent(box))
+            return
+        offsets = [scene.offset[rows] + o.reshape(-1, scene.widths.slots, 3) for o in offset]
+        corners = [o * s[:, None] for o in offsets[1:] for s in spread[1:]]
         low, high = np.minimum(corners[0], corners[1]), np.maximum(corners[0], corners[1])
         for corner in corners[2:]:  # NaN, of 0 times infinity, is kept
             low, high = np.minimum(low, corner), np.maximum(high, corner)
-        middle = offset[0] * spread[0] + centre[0]
-        return _unit(scene.info.box, middle, middle)[0], *_unit(scene.info.box, low + centre[1], high + centre[2])
+        middle = offsets[0] * spread[0][:, None] + centre[0][:, None]
+        out[0] = _unit(box, middle, middle)[0]
+        out[1:] = _unit(box, low + centre[1][:, None], high + centre[2][:, None])
 
 
 def _may_show(scene: Scene, rows: np.ndarray | slice, feature: Range | None) -> np.ndarray:

@@ -19,7 +19,7 @@ from pd4dgs_codec.entropy.bits import entropy_bits
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.evaluate import enclosure
 from pd4dgs_codec.evaluate import reach as reach_module
-from pd4dgs_codec.evaluate.enclosure import Enclosure, Stretch, instants
+from pd4dgs_codec.evaluate.enclosure import Enclosure, Range, Stretch, instants
 from pd4dgs_codec.evaluate.reach import global_cells, local_cells, shown_gaussians
 from pd4dgs_codec.evaluate.residuals import residuals
 from pd4dgs_codec.scene import DEFAULT_WIDTHS, PLANES, Camera, Deformation, Scene, Widths
@@ -272,6 +272,30 @@ def test_compiled_loops_prove_the_same(monkeypatch):
                 np.testing.assert_array_equal(scale[name], other[name])
                 assert 0 < scale[name].mean()
     np.testing.assert_array_equal(found[2], expected[2])
+
+
+def test_compiled_loops_see_overflows_as_numpy_does(monkeypatch):
+    """Products of 0 and infinity are NaN, which stands for anywhere; the log scalings of a thousand overflow."""
+    pytest.importorskip("numba")
+    scene, rng = lively_scene(), np.random.default_rng(6)
+    rows, widths = np.arange(0, 60, 2), {"position": 3, "offset": 30, "scaling": 6}
+    ranges = {}
+    for name, width in widths.items():
+        ends = np.sort(rng.choice(np.float32([-np.inf, -1e3, -1, 0, 0.1, 1e3, np.inf]), (3, len(rows), width)), axis=0)
+        ranges[name] = Range(ends[1], ends[0], ends[2])
+    taken, finest = rng.random((len(rows), 10)) < 0.2, np.float32([5, 4, 6])
+
+    def found(ranges):
+        out = np.full((3, len(rows), 10, 3), 7, np.float32)
+        reach_module._mean_ranges(out, scene, scene.anchor[rows], rows, ranges)
+        return out, reach_module._wide(out[1], out[2], taken, finest)
+
+    compiled = [found(given) for given in (ranges, {})]
+    monkeypatch.setattr(reach_module, "kernels", lambda: None)
+    for own, plain in zip(compiled, [found(given) for given in (ranges, {})], strict=True):
+        np.testing.assert_array_equal(own[0], plain[0])
+        np.testing.assert_array_equal(own[1], plain[1])
+        assert 0 < own[1].mean() < 1 or own is compiled[1]
 
 
 def test_a_filled_plane_keeps_what_is_given_and_costs_less():
