@@ -240,10 +240,14 @@ class Scene:
 
     @property
     def anchor(self) -> np.ndarray:
-        """float32 [N, 3] anchor positions, world, scene units."""
+        """float32 [N, 3] anchor positions, world, scene units, worked out at each access."""
+        return self.anchor_at(slice(None))
+
+    def anchor_at(self, rows: np.ndarray | slice) -> np.ndarray:
+        """float32 [n, 3] positions of the anchors `rows`."""
         voxel = np.float64(np.float32(self.info.voxel_size))
         with np.errstate(over="ignore"):  # an absurd voxel size gives infinities, which the decoder refuses
-            position: np.ndarray = (self.anchor_q.astype(np.float64) * voxel).astype(np.float32)
+            position: np.ndarray = (self.anchor_q[rows].astype(np.float64) * voxel).astype(np.float32)
         return position
 
     @property

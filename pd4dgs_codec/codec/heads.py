@@ -93,7 +93,7 @@ def _largest_residuals(
     rows = rows[:: max(1, -(-rows.size // per_time))]
     largest = {name: 0.0 for name in deformation.networks if name != TRUNK}
     for t in np.linspace(0.0, 1.0, n_times):
-        points = _deformed_means(scene, rows, t, per_time) if kind.layer == 2 else scene.anchor[rows]
+        points = _deformed_means(scene, rows, t, per_time) if kind.layer == 2 else scene.anchor_at(rows)
         with np.errstate(all="ignore"):
             found = residuals(deformation, scene.info.box, points, float(t)) if len(points) else {}
         for name, value in found.items():
@@ -105,7 +105,7 @@ def _largest_residuals(
 def _deformed_means(scene: Scene, rows: np.ndarray, t: float, most: int) -> np.ndarray:
     """float32 [n, 3] Gaussian means after the global deformation at t: where the local one is sampled. n <= `most`."""
     rows = rows[:: max(1, -(-rows.size * scene.offset.shape[1] // max(most, 1)))]
-    anchor, offset, scaling = scene.anchor[rows], scene.offset[rows], scene.scaling_log[rows]
+    anchor, offset, scaling = scene.anchor_at(rows), scene.offset[rows], scene.scaling_log[rows]
     if scene.global_deformation is not None and len(rows):
         moved = residuals(scene.global_deformation, scene.info.box, anchor, float(t))
         anchor = anchor + moved.get("position", 0)

@@ -308,7 +308,7 @@ def float_tensors(scene: Scene, index: int) -> list[np.ndarray]:
     tensors = scene.tensors(kind.layer)
     ordered = [tensors.networks[name] for name in kind.network_ids if name in tensors.networks]
     return [
-        scene.anchor[own],
+        scene.anchor_at(own),
         *(values[own] for values in scene.attributes.values()),
         *(scale[name] for scale in tensors.planes for name, _, _ in PLANES),
         *(array for network in ordered for pair in network for array in pair),

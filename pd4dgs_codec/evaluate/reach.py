@@ -141,11 +141,10 @@ def _counted(sums: np.ndarray, rows: Cells, columns: Cells) -> np.ndarray:
 def global_cells(scene: Scene) -> Reached:
     """The cells of the global planes that anchors read; () without such planes."""
     field = scene.global_deformation
-    every = scene.anchor
     with ThreadPoolExecutor(threads.encoder_threads()) as pool:
         marks = _Marks(field.planes if field else (), pool)
         for rows in _blocks(scene):
-            anchor = every[rows]
+            anchor = scene.anchor_at(rows)
             whole = np.zeros(len(anchor)), np.ones(len(anchor))
             marks.read(_Boxes(*_unit(scene.info.box, anchor, anchor), *whole))
     return marks.reached
@@ -162,7 +161,6 @@ def shown_gaussians(scene: Scene, pays: Pays[np.ndarray] = _always) -> np.ndarra
     open_, spans = np.flatnonzero(~shown.all(axis=1)), _spans(field)
     if not pays(shown, open_.size * len(spans)):
         return np.ones_like(shown)
-    anchor = scene.anchor  # worked out at each access
     certain, chunks, looked, hidden = shown.copy(), _chunks(open_), 0, 0
     with ThreadPoolExecutor(threads.encoder_threads()) as pool:
         for index, rows in enumerate(chunks):
@@ -172,7 +170,7 @@ def shown_gaussians(scene: Scene, pays: Pays[np.ndarray] = _always) -> np.ndarra
                     shown[np.concatenate(chunks[index:])] = True
                     break
             looked += int((~shown[rows]).sum())
-            enclosure = Enclosure(field, scene.info.box, anchor[rows])
+            enclosure = Enclosure(field, scene.info.box, scene.anchor_at(rows))
             shown[rows] = _shown(scene, rows, shown[rows], enclosure, spans, pool)
             hidden += int((~shown[rows]).sum())
     return shown
@@ -184,8 +182,7 @@ def local_cells(scene: Scene, shown: np.ndarray, pays: Pays[Reached] = _always) 
     field, local = scene.global_deformation, scene.local_deformation
     if local is None:
         return ()
-    spans, anchor = _spans(field), scene.anchor
-    asked, left = 0, len(anchor)
+    spans, asked, left = _spans(field), 0, len(scene.anchor_q)
     with ThreadPoolExecutor(threads.encoder_threads()) as pool:
         marks = _Marks(local.planes, pool)
         for index, rows in enumerate(_chunks(np.arange(left))):
@@ -193,8 +190,9 @@ def local_cells(scene: Scene, shown: np.ndarray, pays: Pays[Reached] = _always) 
                 if not pays(marks.reached, left * len(spans)):
                     return None
                 asked = index
-            enclosure = Enclosure(field, scene.info.box, anchor[rows]) if field else None
-            _read_local(scene, anchor[rows], rows, shown[rows], marks, enclosure, spans)
+            anchor = scene.anchor_at(rows)
+            enclosure = Enclosure(field, scene.info.box, anchor) if field else None
+            _read_local(scene, anchor, rows, shown[rows], marks, enclosure, spans)
             left -= len(rows)
     return marks.reached
 
