@@ -26,12 +26,10 @@ def apply(constants: dict[str, float]) -> None:
     if "alpha_min" in constants:
         projection.ALPHA_MIN = constants["alpha_min"]
         projection.REACH_LOG2 = -math.log2(constants["alpha_min"])
-    from pd4dgs_codec.render import kernels, simd
+    projection.TILE_WIDTH = int(constants.get("tile_width", projection.TILE_WIDTH))
+    from pd4dgs_codec.render import kernels
 
     kernels.T_MIN = constants.get("t_min", kernels.T_MIN)
-    kernels.TILE_WIDTH = int(constants.get("tile_width", kernels.TILE_WIDTH))
-    kernels._COLUMNS = kernels.TILE_WIDTH // simd.LANES
-    kernels._BLOCKS = kernels._COLUMNS * kernels.TILE_HEIGHT
 
 
 def main(source: str, target: str, constants: str, repeats: str) -> None:

@@ -22,6 +22,8 @@ from pd4dgs_codec.render.projection import (
     SA,
     SB,
     SLOT_GEOMETRY,
+    TILE_HEIGHT,
+    TILE_WIDTH,
     K,
     Q,
     X,
@@ -55,7 +57,6 @@ from pd4dgs_codec.render.simd import (
 from pd4dgs_codec.render.simd import wide_load as load
 from pd4dgs_codec.render.simd import wide_splat as splat
 
-TILE_WIDTH, TILE_HEIGHT = 32, 16  #: pixels
 T_MIN = 1e-4  #: a pixel is finished when its transmittance would fall to this
 _COLUMNS = TILE_WIDTH // LANES
 _ROWS = WIDE // LANES  #: of pixels in a block

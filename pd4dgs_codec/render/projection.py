@@ -14,8 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.render.simd import Tasks, kernel, parallel
+from pd4dgs_codec.render.simd import LANES, Tasks, double, kernel, load, parallel, splat, store
 
+TILE_WIDTH, TILE_HEIGHT = 32, 16  #: pixels
 ALPHA_MAX = 0.999  #: alpha is clamped to this (gsplat 1.5.3)
 ALPHA_MIN = 1.0 / 255.0  #: fainter contributions are skipped
 REACH_LOG2 = math.log2(255.0)  #: a Gaussian is drawn where log2(opacity) - t^2 - r^2 >= -REACH_LOG2
@@ -114,7 +115,6 @@ def project(
     camera: np.ndarray,
     size: tuple[int, int],
     limits: tuple[float, float, float, float],
-    tile: tuple[int, int],
     visible: np.ndarray,
     geom: np.ndarray,
     rects: np.ndarray,
@@ -125,19 +125,18 @@ def project(
 ) -> None:
     """Fill the per-Gaussian outputs; a culled Gaussian has visible = False and zeros elsewhere, but in geom.
 
-    size: (width, height); limits: (near, far, eps2d, radius_clip); tile: (width, height) of a tile, pixels. visible
-    bool [N]; geom [N, GEOM_COLUMNS]; rects int32 [N, 4] = tile columns x0, x1 and rows y0, y1, half open; the rest as
-    `rasteriser.Projected` has it for one camera. Comparisons are written so that NaN culls.
+    size: (width, height), pixels; limits: (near, far, eps2d, radius_clip). visible bool [N]; geom [N, GEOM_COLUMNS];
+    rects int32 [N, 4] = tile columns x0, x1 and rows y0, y1, half open; the rest as `rasteriser.Projected` has it for
+    one camera. Comparisons are written so that NaN culls.
     """
     width, height = size
     near, far, eps, clip = limits
     for i in range(tasks[0], tasks[1]):
-        visible[i] = False
-        rects[i, :] = 0
-        radii[i, :] = 0
-        means2d[i, :] = 0.0
-        depths[i] = 0.0
-        conics[i, :] = 0.0
+        visible[i], depths[i] = False, 0.0
+        for c in range(2):
+            rects[i, c], rects[i, 2 + c], radii[i, c], means2d[i, c] = 0, 0, 0, 0.0
+        for c in range(3):
+            conics[i, c] = 0.0
         opacity = np.float64(opacities[i])
         x, y, z = _to_camera(means, i, camera)
         if not (z > near and z <= far and opacity > ALPHA_MIN and opacity <= _F32_MAX):
@@ -174,10 +173,10 @@ def project(
         geom[i, SA], geom[i, SB], geom[i, Q] = sa, math.sqrt(0.5 / (_LN2 * r)), opacity_log2
         geom[i, INV_SA] = 1.0 / sa
         if right >= max(left, 0.0) and left <= width - 1 and bottom >= max(top, 0.0) and top <= height - 1:
-            rects[i, 0] = _clip_index(left, width - 1) // tile[0]
-            rects[i, 1] = _clip_index(right, width - 1) // tile[0] + 1
-            rects[i, 2] = _clip_index(top, height - 1) // tile[1]
-            rects[i, 3] = _clip_index(bottom, height - 1) // tile[1] + 1
+            rects[i, 0] = _clip_index(left, width - 1) // TILE_WIDTH
+            rects[i, 1] = _clip_index(right, width - 1) // TILE_WIDTH + 1
+            rects[i, 2] = _clip_index(top, height - 1) // TILE_HEIGHT
+            rects[i, 3] = _clip_index(bottom, height - 1) // TILE_HEIGHT + 1
         radii[i, 0] = int(min(radius_x, 1e9))
         radii[i, 1] = int(min(radius_y, 1e9))
         means2d[i, 0], means2d[i, 1], depths[i] = _saturate(mx), _saturate(my), np.float32(z)
@@ -253,22 +252,22 @@ def project_backward(
     slots[first[i] : first[i + 1]] belong to Gaussian i. g_colors [N, D]: slot columns 6 .. 6 + D - 1.
     depth_channel: slot column with the gradient of the depth drawn as a colour, or -1.
     """
-    channels = g_colors.shape[1]
+    channels, stride, sums = g_colors.shape[1], slots.shape[1], np.empty(LANES)
     for i in range(tasks[0], tasks[1]):
         begin, end = first[i], first[i + 1]
         if begin == end:
             continue
+        together = splat(0.0)
+        for n in range(begin, end):
+            together = together + double(load(slots, n * stride))
+        store(sums, 0, together)
         for c in range(channels):
-            g_colors[i, c] += _saturate(_sum_slots(slots, begin, end, SLOT_GEOMETRY + c))
-        g_opacities[i] += _saturate(_sum_slots(slots, begin, end, G) / np.float64(opacities[i]))
+            column = SLOT_GEOMETRY + c
+            g_colors[i, c] += _saturate(sums[column] if column < LANES else _sum_slots(slots, begin, end, column))
+        g_opacities[i] += _saturate(sums[G] / np.float64(opacities[i]))
         gx, gy, mxx, mxy, myy = _image_gradient(
-            _sum_slots(slots, begin, end, GT),
-            _sum_slots(slots, begin, end, GTT),
-            _sum_slots(slots, begin, end, GR),
-            _sum_slots(slots, begin, end, GRR),
-            _sum_slots(slots, begin, end, GTR),
-            geom[i, K], geom[i, SA], geom[i, SB],
-        )  # fmt: skip
+            sums[GT], sums[GTT], sums[GR], sums[GRR], sums[GTR], geom[i, K], geom[i, SA], geom[i, SB]
+        )
         g_means2d[i, 0] += _saturate(gx)
         g_means2d[i, 1] += _saturate(gy)
 

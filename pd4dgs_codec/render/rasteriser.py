@@ -21,7 +21,6 @@ from pd4dgs_codec.scene import Camera
 CHANNELS = 3  #: colour channels drawn per pass
 CHUNKS_PER_THREAD = 4  #: of the depth order while binning
 MAX_COUNT = 2**31  #: of Gaussians, and of pairs of a Gaussian and a tile
-_TILE = (kernels.TILE_WIDTH, kernels.TILE_HEIGHT)
 
 
 class Geometry(NamedTuple):
@@ -145,7 +144,7 @@ def project(geometry: Geometry, cameras: Sequence[Camera], settings: Settings) -
         packed, filled = _pack_camera(camera), (radii[c], means2d[c], depths[c], conics[c])
         visible, geom, rects = np.empty(n, np.bool_), np.empty((n, projection.GEOM_COLUMNS)), np.empty((n, 4), np.int32)
         limits = (settings.near, settings.far, settings.eps2d, settings.radius_clip)
-        projection.project(*geometry, packed, (width, height), limits, _TILE, visible, geom, rects, *filled)
+        projection.project(*geometry, packed, (width, height), limits, visible, geom, rects, *filled)
         result.views.append(_View(packed, geom, *_bin(visible, depths[c], rects, width, height)))
     return result
 
@@ -224,7 +223,7 @@ def _bin(
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """(first, items, slot_of, starts) of `binning`: the Gaussians of each tile, front to back."""
     order = binning.sort(visible, depths)
-    columns, rows = -(-width // _TILE[0]), -(-height // _TILE[1])
+    columns, rows = -(-width // projection.TILE_WIDTH), -(-height // projection.TILE_HEIGHT)
     counts = np.empty((CHUNKS_PER_THREAD * threads.kernel_threads(), columns * rows), np.int64)
     starts, first = np.empty(columns * rows + 1, np.int64), np.empty(len(visible) + 1, np.int64)
     binning.count_tiles(order, rects, columns, counts)

@@ -275,6 +275,15 @@ def single(typingctx: Any, a: Any) -> Any:
 
 
 @_intrinsic
+def double(typingctx: Any, a: Any) -> Any:
+    """float32 to float64."""
+    if not isinstance(a, Lanes) or a.scalar != types.float32:
+        return None
+    result = Lanes(types.float64, a.count)
+    return result(a), lambda context, builder, sig, args: builder.fpext(args[0], context.get_value_type(result))
+
+
+@_intrinsic
 def fma(typingctx: Any, a: Any, b: Any, c: Any) -> Any:
     """a * b + c, fused where the CPU can."""
     if not _same(a, b, c):
