@@ -28,11 +28,13 @@ from contextlib import contextmanager
 from functools import cache
 from importlib import import_module
 from queue import SimpleQueue
-from threading import Thread
+from threading import Lock, Thread
 from time import perf_counter
-from typing import Any
+from typing import Any, TypeVar, cast
 
 from pd4dgs_codec.errors import RenderError
+
+T = TypeVar("T")
 
 
 def available() -> int:
@@ -44,7 +46,8 @@ def keep_freed_memory() -> None:
     """Let glibc reuse large blocks instead of returning each to the system; elsewhere this does nothing.
 
     A training step frees and takes hundreds of megabytes, and the page faults of fresh blocks made element-wise
-    operations several times slower.
+    operations several times slower. What works once only takes more memory for it: a twentieth, encoding a million
+    anchors.
     """
     mmap_threshold, trim_threshold = -3, -1  # glibc's M_MMAP_THRESHOLD, M_TRIM_THRESHOLD
     try:
@@ -78,7 +81,6 @@ def configure(threads: int | None = None) -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
     if "numpy" in sys.modules:
         _limit_blas()
-    keep_freed_memory()
     if torch := sys.modules.get("torch"):
         torch.set_num_threads(threads)
     set_kernel_threads(threads)
@@ -160,9 +162,9 @@ def kernel_threads() -> int:
 
 #: Parts of a kernel's tasks for each thread, which takes one after the other: one that another process holds up, or
 #: whose tasks take longer, leaves the rest to the others.
-PARTS_PER_THREAD = 4
+PARTS_PER_THREAD = 3
 #: Seconds that tasks must take together before helpers are woken, which takes about a tenth of it.
-WORTH_HELP = 4e-4
+WORTH_HELP = 2e-4
 
 Work = Callable[[tuple[int, int]], None]
 
@@ -210,6 +212,34 @@ def _share(tasks: int, threads: int, work: Work) -> None:
     for error in [ends.get() for _ in begun]:  # who begins now finds nothing left
         if error:
             raise error
+
+
+def aside(work: Callable[[], T]) -> Callable[[], T]:
+    """Begins `work` on a thread beside the caller's, if kernels have more than one; what is returned waits for it and
+    answers what it did, or raises what it raised. Work that no thread has begun by then the caller does.
+
+    Both threads run Python in turns: it pays for work that mostly waits for kernels.
+    """
+    turn, ends = Lock(), SimpleQueue[tuple[T | None, BaseException | None]]()
+
+    def begin() -> None:
+        if turn.acquire(blocking=False):  # once
+            try:
+                ends.put((work(), None))
+            except BaseException as error:
+                ends.put((None, error))
+
+    if kernel_threads() > 1:
+        _waiting().put(begin)
+
+    def answer() -> T:
+        begin()
+        found, error = ends.get()
+        if error is not None:
+            raise error
+        return cast(T, found)
+
+    return answer
 
 
 @cache

@@ -1,11 +1,11 @@
 """Where the time of a training step goes: processor milliseconds per part and level, as a Markdown table.
 
-    python tools/profile_training.py out/*/model.pt [--steps 20] [--at 0.55] [--threads 1] [--write docs/training.md]
+    python tools/profile_training.py out/*/model.pt [--steps 20] [--at 0.55] [--write docs/training.md]
 
 Goes on from checkpoints of `pd4dgs-train`, on the data they were trained on, as if they stood at the share `--at` of
 their runs, with the levels in turn; the checkpoints stay as they are. Each part is timed by wrapping the functions that
-do it, and what a wrapped function spends in another one counts for the other alone. Columns are medians over the steps;
-a part's work in the backward pass that is not a kernel of its own is in "backward, the rest".
+do it, and what a wrapped function spends in another one counts for the other alone. All run on one thread. Columns are
+medians over the steps; a part's work in the backward pass that is not a kernel of its own is in "backward, the rest".
 """
 
 from __future__ import annotations
@@ -63,6 +63,7 @@ def watch(learner: Learner, stopwatch: Stopwatch) -> None:
         (losses, "smooth_term", "mask terms"),
         (losses.Neighbours, "draw", "mask terms"),
         (torch.autograd, "backward", "backward, the rest"),
+        (torch.autograd, "grad", "backward, the rest"),
         (learner.densifier, "observe", "growing: statistics"),
         (learner.optimiser, "gradient_norm", "gradient norm"),
         (learner.optimiser, "step", "Adam"),
@@ -107,7 +108,7 @@ def _median(values: Iterable[float]) -> float:
     return ordered[len(ordered) // 2]
 
 
-def profile(path: Path, source: str | None, steps: int, at: float, threads: int) -> str:
+def profile(path: Path, source: str | None, steps: int, at: float) -> str:
     """The table of one checkpoint under a line that says what was measured."""
     from pd4dgs_codec.cli.resume import parse_config
     from pd4dgs_codec.data.dataset import load
@@ -123,7 +124,7 @@ def profile(path: Path, source: str | None, steps: int, at: float, threads: int)
     found = measure(trainer.learner, steps, round(trainer.total * at))
     size = f"{dataset.train[0].width}x{dataset.train[0].height}"
     lines = [
-        f"{dataset.name} {size}, {config.preset}, {len(trainer.model.anchor_q):,} anchors, {threads} thread(s), at "
+        f"{dataset.name} {size}, {config.preset}, {len(trainer.model.anchor_q):,} anchors, one thread, at "
         f"{at:g} of the run, processor milliseconds:",
         "",
         "".join(["| part |", *(f" level {level} |" for level in range(len(found)))]),
@@ -141,14 +142,13 @@ def main() -> None:
     p.add_argument("--source", help="the data, where a checkpoint's own path does not lead to it")
     p.add_argument("--steps", type=int, default=20, help="steps timed per level (default: 20)")
     p.add_argument("--at", type=float, default=0.55, help="share of the run at which to stand (default: 0.55)")
-    p.add_argument("--threads", type=int, help="threads (default: OMP_NUM_THREADS, else all cores)")
     p.add_argument("--write", type=Path, metavar="PAGE.md", help="put the tables into this page, between its marks")
     args = p.parse_args()
 
     from pd4dgs_codec.threads import configure
 
-    threads = configure(args.threads)
-    tables = [profile(path, args.source, args.steps, args.at, threads) for path in args.checkpoints]
+    configure(1)
+    tables = [profile(path, args.source, args.steps, args.at) for path in args.checkpoints]
     text = "\n\n".join(tables)
     print(text)
     if args.write:

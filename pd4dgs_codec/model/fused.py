@@ -250,7 +250,7 @@ class _Grown(torch.autograd.Function):
         for out, column, w, b in ((shape, columns[0], w_shape, b_shape), (color, columns[1], w_color, b_color)):
             layer = kernels.by_slot(w.numpy(), b.numpy(), slots)
             kernels.linear(*[*_arrays(out, keep, hidden), column, *layer])
-        relative, extent = torch.sigmoid(shape), torch.exp(anchors[:, SCALING])
+        relative, extent = torch.sigmoid(shape), torch.exp(anchors[:, SCALING].contiguous())
         color.sigmoid_()
         gaussians, gates = anchors.new_empty(len(keep), kernels.GAUSSIAN_WIDTH), anchors.new_empty(len(keep))
         kernels.assemble(*_arrays(gaussians, gates, keep, anchors, extent, raw, mask, shape, relative, color))
@@ -274,7 +274,6 @@ class _Grown(torch.autograd.Function):
         results = (g_anchors, g_raw, g_mask, g_shape, g_color)
         given = (keep, anchors, extent, shape, relative, gaussians, g.contiguous(), g_gates.contiguous())
         kernels.assemble_backward(*[*_arrays(*results, *given), parts])
-        g_raw.mul_(1 - raw * raw)
 
         g_hidden = torch.zeros_like(hidden)
         last = []

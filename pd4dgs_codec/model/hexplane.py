@@ -19,8 +19,6 @@ from torch.autograd.function import once_differentiable
 from pd4dgs_codec.errors import DataError, TrainError
 from pd4dgs_codec.model import hexplane_kernels as kernels
 from pd4dgs_codec.model.plane_layout import TIME_AXIS, PlaneLayout
-from pd4dgs_codec.model.plane_rate import proxy_bits
-from pd4dgs_codec.model.plane_regularisers import regularisers
 from pd4dgs_codec.model.rounding import round_straight_through
 from pd4dgs_codec.render.simd import LANES
 from pd4dgs_codec.scene import PLANES
@@ -187,14 +185,6 @@ class HexPlane(nn.Module):
             features: Tensor = _Sample.apply(*arguments)  # type: ignore[no-untyped-call]
             return features
         return sample_reference(round_straight_through(self.grid, step), self.layout, self.box, points, t)
-
-    def regularisers(self) -> dict[str, Tensor]:
-        """Unweighted plane_smooth, time_smooth, time_l1: see `plane_regularisers`."""
-        return regularisers(self.grid, self.layout)
-
-    def proxy_bits(self, step: float) -> Tensor:
-        """What the planes cost at a quantisation step, about, in bits: see `plane_rate`."""
-        return proxy_bits(self.grid, self.layout, step)
 
     @torch.no_grad()
     def plane_arrays(self) -> tuple[dict[str, np.ndarray], ...]:

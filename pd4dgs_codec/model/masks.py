@@ -14,9 +14,10 @@ def level_mask(logits: Tensor, level: int) -> Tensor:
     The gradient reaches a_level alone. Were it to reach the logits below as well, whatever a higher level needs would
     be held in layer 0 too, and the levels' masks would stay together.
     """
-    total = logits[:, 0]
+    columns = logits.T.contiguous()  # torch has vectors only for what is
+    total = columns[0]
     for j in range(1, level + 1):
-        total = total.detach() + F.softplus(logits[:, j])
+        total = total.detach() + F.softplus(columns[j])
     return torch.sigmoid(total)
 
 

@@ -154,13 +154,12 @@ class Model(nn.Module):
     @torch.no_grad()
     def _visible(self, masks: Tensor, position: Tensor, camera: Camera, only: Tensor | None = None) -> Tensor:
         viewmat, K = camera_tensors(camera, self.feature.device)
-        position = position @ viewmat[:3, :3].T + viewmat[:3, 3]
-        extent = self.scaling_log.exp()
-        radius = OFFSET_REACH * extent[:, :3].amax(1) + SIGMA_REACH * extent[:, 3:].amax(1)
-        depth = position[:, 2]
+        across, down, depth = torch.unbind(viewmat[:3, :3] @ position.T + viewmat[:3, 3:])
+        offsets, sizes = (part.amax(1).exp() for part in torch.split(self.scaling_log, 3, dim=1))
+        radius = OFFSET_REACH * offsets + SIGMA_REACH * sizes
         z = depth.clamp(min=float(self.info.near))
-        x = K[0, 0] * position[:, 0] / z + K[0, 2]
-        y = K[1, 1] * position[:, 1] / z + K[1, 2]
+        x = K[0, 0] * across / z + K[0, 2]
+        y = K[1, 1] * down / z + K[1, 2]
         width, height = camera.width, camera.height
         margin = torch.maximum(K[0, 0], K[1, 1]) * radius / z + FRUSTUM_MARGIN * max(width, height)
         inside = (x > -margin) & (x < width + margin) & (y > -margin) & (y < height + margin)

@@ -22,6 +22,7 @@ from pd4dgs_codec.render.simd import (
     PRODUCT_ROWS,
     WIDE,
     Tasks,
+    Vector,
     aligned,
     copy,
     fma,
@@ -29,6 +30,7 @@ from pd4dgs_codec.render.simd import (
     kernel,
     load,
     parallel,
+    splat,
     spread,
     store,
     wide_load,
@@ -55,8 +57,15 @@ def _part(keep: np.ndarray, slots: int, part: int, parts: int) -> tuple[int, int
     return begin, end
 
 
-@kernel()
+@kernel(inline=True)
+def _noisy(out: np.ndarray, to: int, values: np.ndarray, at: int, noise: np.ndarray, first: int, size: Vector) -> None:
+    """LANES of `out` = those of `values` plus size times those of `noise`."""
+    store(out, to, load(values, at) + load(noise, first) * size)
+
+
+@parallel(lambda out, *_: len(out))
 def pick(
+    tasks: Tasks,
     out: np.ndarray,
     column: int,
     values: np.ndarray,
@@ -70,23 +79,30 @@ def pick(
     """The columns of `out` from `column` on = values [N, w] at rows int64 [n], rounded to centre [w] and multiples of
     `step` times spacing [N] beside it, or with noise [n, w] times as much; noise [0, w] is none."""
     real, width = values.dtype.type, values.shape[1]
-    for i in range(len(rows)):
-        size = real(step) * spacing[rows[i]]
-        for c in range(width):
-            value = values[rows[i], c]
-            if rounding:
-                value = centre[c] + np.rint((value - centre[c]) / size) * size
-            elif len(noise) > 0:
-                value = value + noise[i, c] * size
-            out[i, column + c] = value
+    for i in range(tasks[0], tasks[1]):
+        size, to, at = real(step) * spacing[rows[i]], i * out.shape[1] + column, rows[i] * width
+        if rounding:
+            for c in range(width):
+                value = values[rows[i], c]
+                out[i, column + c] = centre[c] + np.rint((value - centre[c]) / size) * size
+        elif len(noise) == 0:
+            copy(out, to, values, at, width)
+        elif width < LANES:
+            for c in range(width):
+                out[i, column + c] = values[rows[i], c] + noise[i, c] * size
+        else:
+            for c in range(0, width - LANES, LANES):
+                _noisy(out, to + c, values, at + c, noise, i * width + c, splat(size))
+            c = width - LANES
+            _noisy(out, to + c, values, at + c, noise, i * width + c, splat(size))
 
 
-@kernel()
-def pick_backward(grad: np.ndarray, g: np.ndarray, column: int, rows: np.ndarray) -> None:
+@parallel(lambda grad, g, column, rows: len(rows))
+def pick_backward(tasks: Tasks, grad: np.ndarray, g: np.ndarray, column: int, rows: np.ndarray) -> None:
     """The transpose of `pick`; grad [N, w] is given zeroed, no row comes twice."""
-    for i in range(len(rows)):
-        for c in range(grad.shape[1]):
-            grad[rows[i], c] = g[i, column + c]
+    width = grad.shape[1]
+    for i in range(tasks[0], tasks[1]):
+        copy(grad, rows[i] * width, g, i * g.shape[1] + column, width)
 
 
 @kernel()
@@ -297,8 +313,8 @@ def assemble_backward(
     g_gates: np.ndarray,
     parts: int,
 ) -> None:
-    """The transpose of `assemble`. Results, given zeroed but g_shape and g_color, whose gradients are those before the
-    sigmoids that gave `relative` and the colours; g_anchors by log scalings, and no features."""
+    """The transpose of `assemble`. Results, given zeroed but g_shape and g_color. Gradients are those before the tanh
+    of opacities and the sigmoids that gave `relative` and the colours; g_anchors by log scalings, and no features."""
     slots, scaling = g_opacity.shape[1], anchors.shape[1] - SCALING_DIM
     offset = scaling - 3 * slots
     for part in range(tasks[0], tasks[1]):
@@ -316,7 +332,8 @@ def assemble_backward(
                 value = gaussians[k, COLOR + i]
                 g_color[k, i] = g[k, COLOR + i] * value * (1 - value)
             _unit_backward(g_shape, shape, g, k, 3, 3, QUAT)
-            g_opacity[n, o] = g[k, OPACITY]
+            value = gaussians[k, OPACITY]
+            g_opacity[n, o] = g[k, OPACITY] * (1 - value * value)
             g_mask[n] += g_gates[k]
 
 

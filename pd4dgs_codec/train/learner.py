@@ -21,16 +21,17 @@ from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import NotFinite
 from pd4dgs_codec.metrics.levels import level_psnr
 from pd4dgs_codec.model.config import PRESETS, ModelConfig
-from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.picture import Picture, render, render_image
 from pd4dgs_codec.model.plane_rate import exact_bits
 from pd4dgs_codec.model.rounding import EXACT, Noise, Rounding
 from pd4dgs_codec.scene import MASK_THRESHOLD
-from pd4dgs_codec.train import grading, judge, losses, prefixes, pruning, whitening, workers
+from pd4dgs_codec.threads import keep_freed_memory
+from pd4dgs_codec.train import grading, judge, prefixes, pruning, whitening, workers
 from pd4dgs_codec.train.config import Schedule, TrainConfig
 from pd4dgs_codec.train.densify import Densifier
 from pd4dgs_codec.train.initialise import fresh_model
+from pd4dgs_codec.train.losses import ModelLoss
 from pd4dgs_codec.train.optimiser import Optimiser
 from pd4dgs_codec.train.rollout import CAPACITY_WEIGHTED, TOP, UNIFORM, rollout_probabilities, sample_level, updated_rho
 from pd4dgs_codec.train.shot import Shots
@@ -58,6 +59,7 @@ class Learner:
         size: ModelConfig | None = None,
     ):
         """A fresh model for `dataset`, of the preset's size if no other is given."""
+        keep_freed_memory()
         size = size or PRESETS[config.preset]
         self.config, self.dataset, self.schedule, self.device = config, dataset, schedule, device
         if device.type == "cuda":  # the variances of SSIM are differences of blurred images: no ten-bit factors
@@ -69,6 +71,7 @@ class Learner:
         self.densifier = Densifier(self.model, config.grow_threshold, size.max_anchors)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.noise = Noise(config.seed + 1, device)
+        self.model_loss = ModelLoss(config, self.generator)
         self.shots = Shots(dataset.train, device)
         self.iteration = 0
         self.share: float | None = None
@@ -78,7 +81,6 @@ class Learner:
         self.order: list[int] = []  #: training views drawn and not yet learnt from, the next one last
         self.left_out: list[dict[str, Any]] = []
         self.rank: Tensor | None = None  #: of the anchors in a file, float64 [N], once `prefixes` are trained
-        self._neighbours: losses.Neighbours | None = None  #: rebuilt when anchors come or go
 
     @property
     def place(self) -> int:
@@ -208,26 +210,41 @@ class Learner:
         self, drawn: list[tuple[int, int]], record: dict[str, Any], only: Tensor | None
     ) -> list[Picture] | None:
         """The pictures of this worker's share of the pairs, their gradients gathered; None if one is not finite."""
-        rounding, mask_terms = self._rounding(), self.place >= self.schedule.progressive
-        pictures, views = [], self.config.views_per_step
+        pictures = []
         seeds: list[int | None] = [None] * len(drawn)
-        if views > 1:
+        if self.config.views_per_step > 1:
             seeds = torch.randint(1 << 62, (len(drawn),), generator=self.generator).tolist()
         own = list(zip(drawn, seeds, strict=True))[workers.rank() :: workers.count()]
         for (index, level), seed in own:
+            earlier = self.optimiser.take_gradients()
             try:
                 with self._drawing_from(seed):
-                    picture, terms, loss = self.loss(index, level, rounding, mask_terms, only)
+                    pictures.append(self._follow(index, level, only, record))
+                self.optimiser.add_gradients(earlier)  # those of a view are summed first, as a worker's are
             except NotFinite as error:  # a diverged step may be passed over; any other refusal is here to stay
                 record["refused"] = str(error)
                 return None
-            record["loss"] = float(loss.detach())
-            record |= {name: float(value.detach()) for name, value in terms.items()}
-            torch.autograd.backward(loss / views)
-            pictures.append(picture)
             if not math.isfinite(record["loss"]):
                 return None
         return pictures
+
+    def _follow(self, index: int, level: int, only: Tensor | None, record: dict[str, Any]) -> Picture:
+        """The picture of training view `index` at `level`, the gradients of its loss gathered and the terms in the
+        record. Raises NotFinite where the model has diverged."""
+        rounding, share = self._rounding(), 1 / self.config.views_per_step
+        beside = self.model_loss.begin(self.model, level, self.schedule, self.place)
+        try:
+            picture, terms, loss = self.picture_loss(index, level, rounding, only)
+            torch.autograd.backward(loss * share)
+        finally:
+            rest = beside()
+        for parameter, gradient in rest.gradients:
+            if parameter.grad is None:
+                parameter.grad = torch.zeros_like(parameter)
+            parameter.grad.add_(gradient, alpha=share)
+        record["loss"] = float(loss.detach()) + rest.loss
+        record |= {name: float(value.detach()) for name, value in terms.items()} | rest.terms
+        return picture
 
     @contextmanager
     def _drawing_from(self, seed: int | None) -> Iterator[None]:
@@ -255,13 +272,12 @@ class Learner:
             p.grad = p.grad if anywhere else None
         return None if failed else pictures
 
-    def loss(
-        self, index: int, level: int, rounding: Rounding, mask_terms: bool, only: Tensor | None = None
+    def picture_loss(
+        self, index: int, level: int, rounding: Rounding, only: Tensor | None = None
     ) -> tuple[Picture, dict[str, Tensor], Tensor]:
         """(picture of training view `index` at `level`, terms unweighted and by name, their weighted sum).
 
-        mask_terms: whether rate and mask terms belong to it yet. only: the anchors to render, bool [N],
-        if not all. Raises NotFinite where the model has diverged.
+        only: the anchors to render, bool [N], if not all. Raises NotFinite where the model has diverged.
         """
         config, shot = self.config, self.shots[index]
         view = shot.view
@@ -272,46 +288,10 @@ class Learner:
         terms = {"l1": l1, "dssim": dissimilarity}
         loss = (1 - config.ssim) * l1 + config.ssim * dissimilarity
         if config.volume and len(picture.gaussians.scales):
-            terms["volume"] = picture.gaussians.scales.prod(dim=1).mean()
+            x, y, z = picture.gaussians.scales.unbind(1)  # the gradient of prod() looks for zeros
+            terms["volume"] = (x * y * z).mean()
             loss = loss + config.volume * terms["volume"]
-        for layer, field in self.model.deformations.items():
-            if layer <= level:
-                loss = loss + self._plane_terms(layer, field, terms)
-        if mask_terms:
-            loss = loss + self._mask_terms(level, terms)
         return picture, terms, loss
-
-    def _plane_terms(self, layer: int, field: DeformationField, terms: dict[str, Tensor]) -> Tensor:
-        name, weights = {1: ("global", self.config.global_planes), 2: ("local", self.config.local_planes)}[layer]
-        total = torch.zeros((), device=self.device)
-        for term, value in field.planes.regularisers().items():
-            terms[f"{name}_{term}"] = value
-            total = total + getattr(weights, term) * value
-        weight = self.config.plane_rate * self.schedule.pressure(self.place)
-        if weight:
-            terms[f"{name}_rate_proxy"] = field.planes.proxy_bits(self.model.steps.planes(layer))
-            total = total + weight * terms[f"{name}_rate_proxy"]
-        return total
-
-    def _mask_terms(self, level: int, terms: dict[str, Tensor]) -> Tensor:
-        """The rate and the two terms of temporal mask consistency."""
-        config = self.config
-        mask = self.model.masks(level)
-        total = torch.zeros((), device=self.device)
-        if config.rate_scale:
-            terms["rate"] = losses.rate_term(self.model, mask, config.rate_share, self.generator)
-            total = total + config.lambdas[level] * config.rate_scale * terms["rate"]
-        if config.tmc_binary:
-            terms["tmc_binary"] = losses.binary_term(mask)
-            weight = config.tmc * config.tmc_binary_growth ** self.schedule.separation(self.place)
-            total = total + weight * terms["tmc_binary"]
-        if config.tmc_smooth:
-            if self._neighbours is None:
-                self._neighbours = losses.Neighbours(self.model.anchor_q)
-            pairs, weights = self._neighbours.draw(config.tmc_tau, self.generator)
-            terms["tmc_smooth"] = losses.smooth_term(mask, pairs.to(self.device), weights.to(self.device))
-            total = total + config.tmc * terms["tmc_smooth"]
-        return total
 
     def _update(self, pictures: list[Picture], record: dict[str, Any]) -> None:
         """Adam; and while anchors grow, what growing goes by and the growing itself."""
@@ -335,7 +315,6 @@ class Learner:
                 grow=len(self.model.anchor_q) < self.densifier.max_anchors,
                 prune=self.place >= self.schedule.coarse_end,  # before, colours are random and opacities fall
             )
-            self._neighbours = None
             record |= {"pruned": pruned, "grown": grown}
 
     def _observe(self, picture: Picture) -> None:
@@ -388,7 +367,6 @@ class Learner:
         except NotFinite:  # as a step that diverged: passed over, with nothing changed
             return ()
         self.densifier.keep(keep)
-        self._neighbours = None
         return before - len(keep), later
 
     def _grade(self) -> list[int]:
@@ -453,7 +431,6 @@ class Learner:
     def restore(self, model: Model, state: dict[str, Any]) -> None:
         """Goes on with `model` from what `state` returned. A broken state raises whatever its first fault does."""
         self.model = model.to(self.device)
-        self._neighbours = None
         self.optimiser = Optimiser(self.model, self.config.rates, self.config.cooldown)
         self.optimiser.load_state(state["optimiser"])
         self.densifier.load_state(state["densifier"])

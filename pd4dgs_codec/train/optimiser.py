@@ -86,6 +86,18 @@ class Optimiser:
             if p.grad is not None:
                 p.grad.mul_(factor)
 
+    def take_gradients(self) -> list[Tensor | None]:
+        """Those of all parameters, which then have none."""
+        taken = [p.grad for p in self.parameters]
+        self.zero_grad()
+        return taken
+
+    def add_gradients(self, given: list[Tensor | None]) -> None:
+        """Adds what `take_gradients` gave."""
+        for p, g in zip(self.parameters, given, strict=True):
+            if g is not None:
+                p.grad = g if p.grad is None else p.grad.add_(g)
+
     def zero_grad(self) -> None:
         """Forgets all gradients."""
         for p in self.parameters:

@@ -54,7 +54,7 @@ def test_nobody_waits_for_helpers_that_are_busy():
     threads.set_kernel_threads(2)
     try:
         _shared(8, done.append)
-        assert len(done) == 8 and not go.is_set()
+        assert sorted(task for own in done for task in range(*own)) == list(range(8)) and not go.is_set()
     finally:
         go.set()
 
@@ -70,8 +70,41 @@ def test_what_takes_little_is_not_shared():
             if seconds:
                 time.sleep(seconds * (own[1] - own[0]))
 
-        sharer.share(8, work)
-    assert parts[:4] == [1, 1, 1, 8] and parts[-1] == 1  # by what the call before took
+        sharer.share(2 * threads.PARTS_PER_THREAD, work)
+    assert parts[:4] == [1, 1, 1, 2 * threads.PARTS_PER_THREAD] and parts[-1] == 1  # by what the call before took
+
+
+@pytest.mark.parametrize("count", [1, pytest.param(2, marks=needs_two)])
+def test_what_goes_aside_is_done_once_beside_the_caller_where_there_are_threads(count):
+    threads.set_kernel_threads(count)
+    started, done = threading.Event(), []
+
+    def work():
+        started.set()
+        done.append(threading.current_thread() is threading.main_thread())
+        return 7
+
+    answer = threads.aside(work)
+    assert count == 1 or started.wait(60)
+    assert answer() == 7 and done == [count == 1]
+
+
+def test_what_goes_aside_while_all_threads_are_busy_the_caller_does():
+    go = threading.Event()
+    for _ in range(threads.available()):
+        threads._waiting().put(lambda: go.wait(60))
+    threads.set_kernel_threads(2)
+    try:
+        assert threads.aside(threading.current_thread)() is threading.main_thread()
+    finally:
+        go.set()
+
+
+@pytest.mark.parametrize("count", [1, pytest.param(2, marks=needs_two)])
+def test_what_is_raised_aside_reaches_the_caller(count):
+    threads.set_kernel_threads(count)
+    with pytest.raises(ZeroDivisionError):
+        threads.aside(lambda: 1 // 0)()
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")

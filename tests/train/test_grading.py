@@ -9,7 +9,7 @@ from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.model.harm import step_harm
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.pack.train_rate import train_rate_bits
-from pd4dgs_codec.scene import MAX_CLASS
+from pd4dgs_codec.scene import ATTRIBUTES, MAX_CLASS
 from pd4dgs_codec.train import grading, losses, pruning
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.grading import classes_within
@@ -94,11 +94,11 @@ def test_the_rate_is_that_of_each_class_alone(dataset):
     with torch.no_grad():
         for values in (model.feature, model.scaling_log, model.offset):
             values.normal_(generator=torch.Generator().manual_seed(1))
-    rows = torch.arange(40)
-    plain = losses.anchor_bits(model, rows, rows)
+    rows, anchors = torch.arange(40), {name: getattr(model, name) for name in ATTRIBUTES}
+    plain = losses.anchor_bits(model, anchors, rows, rows)
     model.step_class[20:40] = 3
-    graded = losses.anchor_bits(model, rows.flip(0), rows).flip(0)
+    graded = losses.anchor_bits(model, anchors, rows.flip(0), rows).flip(0)
     first, second = rows[:20], rows[20:]
-    torch.testing.assert_close(graded[:20], losses.anchor_bits(model, first, first))
+    torch.testing.assert_close(graded[:20], losses.anchor_bits(model, anchors, first, first))
     assert float((plain[20:] - graded[20:]).detach().mean()) == pytest.approx(3, abs=0.4)
-    torch.testing.assert_close(graded[20:], losses.anchor_bits(model, second, second))
+    torch.testing.assert_close(graded[20:], losses.anchor_bits(model, anchors, second, second))

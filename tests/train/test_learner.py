@@ -6,9 +6,9 @@ import pytest
 import torch
 
 from pd4dgs_codec.errors import NotFinite, RenderError
-from pd4dgs_codec.model.rounding import EXACT
 from pd4dgs_codec.train.config import ABLATIONS, Schedule, TrainConfig
 from pd4dgs_codec.train.learner import Learner
+from pd4dgs_codec.train.optimiser import PER_ANCHOR
 
 
 def learner(dataset, iterations: int | None = 30, **config) -> Learner:
@@ -17,8 +17,8 @@ def learner(dataset, iterations: int | None = 30, **config) -> Learner:
 
 def spied(learner, monkeypatch) -> list[tuple[int, int]]:
     """The (view, level) pairs that the learner computes a loss of from now on."""
-    seen, loss = [], learner.loss
-    monkeypatch.setattr(learner, "loss", lambda *args, **kw: seen.append(args[:2]) or loss(*args, **kw))
+    seen, loss = [], learner.picture_loss
+    monkeypatch.setattr(learner, "picture_loss", lambda *args, **kw: seen.append(args[:2]) or loss(*args, **kw))
     return seen
 
 
@@ -39,7 +39,7 @@ def test_levels_given_on_purpose_are_trained_and_none_is_drawn(dataset, monkeypa
     steps.step()  # draws the views' order
     steps.iteration = iteration
     seen, state = spied(steps, monkeypatch), steps.generator.get_state()
-    monkeypatch.setattr(steps, "_mask_terms", lambda *_: torch.zeros(()))  # they draw too
+    monkeypatch.setattr(steps.model_loss, "_mask_terms", lambda *_: ())  # they draw too
     for levels in ((2,), (0,), (0, 1)):
         record = steps.step(levels)
         assert record["level"] == levels[-1] and record["pi"] == tuple(float(level in levels) for level in range(3))
@@ -76,21 +76,53 @@ def test_the_planes_rate_joins_with_the_rate_terms_and_grows(dataset):
     shares = []
     for iteration in (11, 15, 25):
         steps.iteration = iteration
-        steps.config = TrainConfig(preset="tiny", plane_rate=1e-3)
-        _, terms, loss = _loss(steps)
-        steps.config = TrainConfig(preset="tiny", plane_rate=0.0)
-        _, without, rest = _loss(steps)
-        assert set(terms) - set(without) == {"global_rate_proxy", "local_rate_proxy"}
-        bits = float(terms["global_rate_proxy"].detach() + terms["local_rate_proxy"].detach())
-        shares.append(float(loss.detach() - rest.detach()) / (1e-3 * bits))
+        steps.model_loss.config = TrainConfig(preset="tiny", plane_rate=1e-3)
+        found = _model_terms(steps)
+        steps.model_loss.config = TrainConfig(preset="tiny", plane_rate=0.0)
+        rest = _model_terms(steps)
+        assert set(found.terms) - set(rest.terms) == {"global_rate_proxy", "local_rate_proxy"}
+        bits = found.terms["global_rate_proxy"] + found.terms["local_rate_proxy"]
+        shares.append((found.loss - rest.loss) / (1e-3 * bits))
     assert shares == pytest.approx([0.1, 0.5, 1.0], rel=1e-2)
 
 
-def _loss(steps):
+def _model_terms(steps):
     state = steps.generator.get_state()
-    result = steps.loss(0, 2, EXACT, mask_terms=True)
+    found = steps.model_loss.begin(steps.model, 2, steps.schedule, steps.iteration)()
     steps.generator.set_state(state)
-    return result
+    return found
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_a_step_gathers_the_gradients_of_all_its_terms(dataset, level):
+    """As one graph over the model's own parameters has them, whichever thread found them."""
+    steps = learner(dataset, 30)
+    for _ in range(12):
+        steps.step()
+    index, state, noise = 0, steps.generator.get_state(), steps.noise.generator.get_state()
+    record: dict = {}
+    steps._follow(index, level, None, record)
+    found = [None if p.grad is None else p.grad.clone() for p in steps.optimiser.parameters]
+    steps.optimiser.zero_grad()
+    steps.generator.set_state(state)
+    steps.noise.generator.set_state(noise)
+
+    _, _, loss = steps.picture_loss(index, level, steps._rounding())
+    of_model, fields = steps.model_loss, steps.model.deformations
+    own, place = {name: getattr(steps.model, name) for name in PER_ANCHOR}, steps.place
+    terms = list(of_model._mask_terms(steps.model, level, own, steps.schedule.separation(place)))
+    for layer in range(1, level + 1):
+        planes, step = fields[layer].planes, steps.model.steps.planes(layer)
+        terms += of_model._plane_terms(layer, planes, planes.grid, step, steps.schedule.pressure(place))
+    (loss + sum(weight * value for _, weight, value in terms)).backward()
+    assert {name for name, _, _ in terms} <= set(record)
+    whole = float(loss.detach()) + sum(weight * float(value.detach()) for _, weight, value in terms)
+    assert record["loss"] == pytest.approx(whole)
+    for parameter, gradient in zip(steps.optimiser.parameters, found, strict=True):
+        expected = parameter.grad
+        assert (expected is None) == (gradient is None)
+        if expected is not None:
+            torch.testing.assert_close(gradient, expected, rtol=1e-4, atol=1e-9)
 
 
 def test_without_planes_they_have_no_rate_and_anchors_do(dataset):
@@ -114,7 +146,7 @@ def test_only_what_is_not_finite_is_skipped(dataset, monkeypatch):
     steps = learner(dataset, 8)
 
     def refuse(error):
-        monkeypatch.setattr(steps, "loss", lambda *_: (_ for _ in ()).throw(error))
+        monkeypatch.setattr(steps, "picture_loss", lambda *_: (_ for _ in ()).throw(error))
 
     refuse(NotFinite("colors"))
     assert steps.step()["refused"] == "colors"

@@ -65,8 +65,10 @@ def learner(dataset) -> Learner:
 
 
 def test_each_column_is_of_its_level(learner, monkeypatch):
-    seen, loss = [], learner.loss
-    monkeypatch.setattr(learner, "loss", lambda index, level, *rest: seen.append(level) or loss(index, level, *rest))
+    seen, loss = [], learner.picture_loss
+    monkeypatch.setattr(
+        learner, "picture_loss", lambda index, level, *rest: seen.append(level) or loss(index, level, *rest)
+    )
     found = measure(learner, 2, 55)
     assert seen == [0, 1, 2] * 3  # one turn warms up
     fields = [{part.split()[0] for part in step if "deformation" in part} for level in found for step in level]
