@@ -160,9 +160,12 @@ def kernel_threads() -> int:
     return _kernel_threads
 
 
-#: Parts of a kernel's tasks for each thread, which takes one after the other: one that another process holds up, or
-#: whose tasks take longer, leaves the rest to the others.
-PARTS_PER_THREAD = 3
+#: Parts of a kernel's tasks for each thread at most, which takes one after the other: one that another process holds
+#: up, or whose tasks take longer, leaves the rest to the others.
+PARTS_PER_THREAD = 4
+#: Seconds that tasks must take together for each part of a thread's beyond the first: who is done with one waits for
+#: the interpreter's lock.
+WORTH_PART = 2e-3
 #: Seconds that tasks must take together before helpers are woken, which takes about a tenth of it.
 WORTH_HELP = 2e-4
 
@@ -184,14 +187,14 @@ class Sharer:
         if self._seconds * tasks < WORTH_HELP:
             threads = min(threads, 1)
         if threads > 1:
-            _share(tasks, threads, work)
+            _share(tasks, threads, min(PARTS_PER_THREAD, 1 + int(self._seconds * tasks / WORTH_PART)), work)
         else:
             work((0, tasks))
         self._seconds = (perf_counter() - begin) * threads / max(tasks, 1)
 
 
-def _share(tasks: int, threads: int, work: Work) -> None:
-    count = min(tasks, PARTS_PER_THREAD * threads)
+def _share(tasks: int, threads: int, parts: int, work: Work) -> None:
+    count = min(tasks, parts * threads)
     left = iter([(tasks * part // count, tasks * (part + 1) // count) for part in range(count)])
     begun, ends = [], SimpleQueue[Exception | None]()
 

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-from typing import cast
-
 import numpy as np
 import torch
 from torch import Tensor, nn
@@ -18,15 +16,12 @@ class MLP(nn.Module):
 
     def __init__(self, widths: tuple[int, ...], *, zero_last: bool = False):
         super().__init__()
-        self.linears = nn.ModuleList(nn.Linear(a, b) for a, b in zip(widths[:-1], widths[1:], strict=True))
+        #: The linear layers, input side first.
+        self.layers = [nn.Linear(a, b) for a, b in zip(widths[:-1], widths[1:], strict=True)]
+        self.linears = nn.ModuleList(self.layers)  # a module's own lists are slow to read
         if zero_last:
             nn.init.zeros_(self.layers[-1].weight)
             nn.init.zeros_(self.layers[-1].bias)
-
-    @property
-    def layers(self) -> list[nn.Linear]:
-        """The linear layers, input side first."""
-        return [cast(nn.Linear, linear) for linear in self.linears]
 
     def rounded(self, step: float | None) -> list[tuple[Tensor, Tensor]]:
         """(weight, bias) per layer; with `step`, rounded straight-through."""
