@@ -153,15 +153,16 @@ class Model(nn.Module):
 
     @torch.no_grad()
     def _visible(self, masks: Tensor, position: Tensor, camera: Camera, only: Tensor | None = None) -> Tensor:
-        viewmat, K = camera_tensors(camera, self.feature.device)
+        viewmat, _ = camera_tensors(camera, self.feature.device)
+        fx, fy, cx, cy = (float(camera.K[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
         across, down, depth = torch.unbind(viewmat[:3, :3] @ position.T + viewmat[:3, 3:])
         offsets, sizes = (part.amax(1).exp() for part in torch.split(self.scaling_log, 3, dim=1))
         radius = OFFSET_REACH * offsets + SIGMA_REACH * sizes
         z = depth.clamp(min=float(self.info.near))
-        x = K[0, 0] * across / z + K[0, 2]
-        y = K[1, 1] * down / z + K[1, 2]
+        x = fx * across / z + cx
+        y = fy * down / z + cy
         width, height = camera.width, camera.height
-        margin = torch.maximum(K[0, 0], K[1, 1]) * radius / z + FRUSTUM_MARGIN * max(width, height)
+        margin = max(fx, fy) * radius / z + FRUSTUM_MARGIN * max(width, height)
         inside = (x > -margin) & (x < width + margin) & (y > -margin) & (y < height + margin)
         seen = inside & (depth + radius > 0) & (masks > MASK_THRESHOLD)
         return (seen if only is None else seen & only).nonzero()[:, 0]

@@ -9,9 +9,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 
 from pd4dgs_codec.model.hexplane import HexPlane
 from pd4dgs_codec.model.masks import level_mask
@@ -22,9 +24,11 @@ from pd4dgs_codec.model.rate import row_bits
 from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import ATTRIBUTES, MASK_THRESHOLD
 from pd4dgs_codec.threads import aside
+from pd4dgs_codec.train import mask_kernels as kernels
 from pd4dgs_codec.train.config import Schedule, TrainConfig
 from pd4dgs_codec.train.optimiser import PER_ANCHOR
 
+INSIDE = (1e-6, 1 - 1e-6)  #: masks are clamped to this inside logarithms
 Weighted = tuple[str, float, Tensor]  #: a term's name, weight and value
 
 
@@ -86,9 +90,9 @@ class ModelLoss:
             yield "tmc_binary", config.tmc * config.tmc_binary_growth**separation, binary_term(mask)
         if config.tmc_smooth:
             if self._neighbours is None or self._neighbours.anchor_q is not model.anchor_q:
-                self._neighbours = Neighbours(model.anchor_q)
-            pairs, weights = self._neighbours.draw(config.tmc_tau, self.generator)
-            yield "tmc_smooth", config.tmc, smooth_term(mask, pairs.to(mask.device), weights.to(mask.device))
+                self._neighbours = Neighbours(model.anchor_q, config.tmc_tau)
+            away = self._neighbours.draw(self.generator)
+            yield "tmc_smooth", config.tmc, smooth_term(mask, self._neighbours, away)
 
 
 def anchor_bits(model: Model, anchors: Mapping[str, Tensor], rows: Tensor, active: Tensor) -> Tensor:
@@ -117,34 +121,80 @@ def rate_term(
     return weighted.mean() * (len(active) / len(mask))
 
 
+class _Binary(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, mask: Tensor) -> Tensor:
+        m = mask.clamp(*INSIDE)
+        yes, no = m.log2(), (1 - m).log2()
+        ctx.save_for_backward(torch.where(mask == m, no - yes, 0.0))
+        return -torch.lerp(no, yes, m).mean()
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g: Tensor) -> Tensor:
+        (slope,) = ctx.saved_tensors
+        found: Tensor = slope * (g / len(slope))
+        return found
+
+
 def binary_term(mask: Tensor) -> Tensor:
-    """L_binary = -1/|V| sum (m log2 m + (1 - m) log2(1 - m)); m clamped inside the logarithms."""
-    m = mask.clamp(1e-6, 1 - 1e-6)
-    return -(m * m.log2() + (1 - m) * (1 - m).log2()).mean()
-
-
-def smooth_term(mask: Tensor, pairs: Tensor, weights: Tensor) -> Tensor:
-    """L_smooth = 1/|S| sum w_ij |m_i - m_j| over pairs int64 [2, S] with weights [S]."""
-    if pairs.shape[1] == 0:
-        return mask.sum() * 0.0
-    return (weights * (mask.index_select(0, pairs[0]) - mask.index_select(0, pairs[1])).abs()).mean()
+    """L_binary = -1/|V| sum (m log2 m + (1 - m) log2(1 - m)); m clamped to INSIDE in the logarithms."""
+    entropy: Tensor = _Binary.apply(mask)  # type: ignore[no-untyped-call]
+    return entropy
 
 
 class Neighbours:
-    """Draws pairs of near anchors: those that stand close along a space-filling (Morton) curve."""
+    """Pairs of near anchors: those that stand REACH places from each other at most along a space-filling (Morton)
+    curve. Of a pair i, j the weight is exp(-|x_i - x_j| / tau), distances in voxels."""
 
-    def __init__(self, anchor_q: Tensor):
+    REACH = 8
+
+    def __init__(self, anchor_q: Tensor, tau: float):
         self.anchor_q = anchor_q
-        self.order = torch.from_numpy(morton_order(anchor_q.cpu().numpy()))
-        self.places = anchor_q.cpu()[self.order].float().T.contiguous()  # [3, N], along the curve
+        self.order = torch.from_numpy(morton_order(anchor_q.cpu().numpy()))  #: int64 [N]: anchors along the curve
+        places = anchor_q.cpu()[self.order].double()
+        self.weights = torch.zeros(len(places), self.REACH)  #: of each place and the one so many behind it, less one
+        for away in range(1, min(self.REACH + 1, len(places))):
+            distance = (places[away:] - places[:-away]).norm(dim=1)
+            self.weights[:-away, away - 1] = torch.exp(distance / -tau)
 
-    def draw(self, tau: float, generator: torch.Generator) -> tuple[Tensor, Tensor]:
-        """Pairs int64 [2, S] and their weights exp(-|x_i - x_j| / tau) [S], distances in voxels."""
-        n = len(self.order)
-        if n < 2:
-            return torch.zeros(2, 0, dtype=torch.int64), torch.zeros(0)
-        second = torch.arange(n) + torch.randint(1, min(9, n), (n,), generator=generator)
-        first = (second < n).nonzero()[:, 0]
-        second = second[first]
-        distance = (self.places[:, first] - self.places[:, second]).square().sum(0).sqrt()
-        return torch.stack([self.order[first], self.order[second]]), torch.exp(distance / -tau)
+    def draw(self, generator: torch.Generator) -> Tensor:
+        """int64 [N]: for each place along the curve how far behind it the other of its pair stands, 1..REACH."""
+        return torch.randint(1, self.REACH + 1, (len(self.order),), generator=generator)
+
+
+class _Smooth(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, mask: Tensor, neighbours: Neighbours, away: Tensor) -> Tensor:
+        slope = torch.zeros_like(mask)
+        given = (mask, neighbours.order, neighbours.weights, away)
+        total, pairs = kernels.smooth(slope.numpy(), *(tensor.numpy() for tensor in given))
+        ctx.save_for_backward(slope)
+        ctx.pairs = max(pairs, 1)
+        return mask.new_tensor(total / ctx.pairs)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g: Tensor) -> tuple[Tensor, None, None]:
+        (slope,) = ctx.saved_tensors
+        return slope * (g / ctx.pairs), None, None
+
+
+def smooth_term(mask: Tensor, neighbours: Neighbours, away: Tensor) -> Tensor:
+    """L_smooth = 1/|S| sum w_ij |m_i - m_j| over the pairs S whose second is still on the curve; away: as `draw` gave
+    it. 0 if there are none."""
+    if mask.device.type == "cpu":
+        value: Tensor = _Smooth.apply(mask, neighbours, away)  # type: ignore[no-untyped-call]
+        return value
+    return smooth_term_reference(mask, neighbours, away)
+
+
+def smooth_term_reference(mask: Tensor, neighbours: Neighbours, away: Tensor) -> Tensor:
+    """The plain torch form of `smooth_term`."""
+    order, weights = neighbours.order, neighbours.weights
+    first = (torch.arange(len(order)) + away < len(order)).nonzero()[:, 0]
+    if not len(first):
+        return mask.sum() * 0.0
+    ends = (order[first].to(mask.device), order[first + away[first]].to(mask.device))
+    jump = mask.index_select(0, ends[0]) - mask.index_select(0, ends[1])
+    return (weights[first, away[first] - 1].to(mask) * jump.abs()).mean()

@@ -25,7 +25,7 @@ def test_bytes_rise_with_the_dial(dataset, tmp_path, monkeypatch):
         )
         sizes.append(len(encode(to_scene(model), effort=1, omit="nothing")))
         psnr.append(levels[2])
-    assert sizes[0] < 0.95 * sizes[1] and sizes[1] < 0.95 * sizes[2]
+    assert sizes[0] < 0.97 * sizes[1] and sizes[1] < 0.97 * sizes[2]
     assert max(psnr) - min(psnr) < 0.5, psnr  # so short a run learns little that the dial could take
 
 

@@ -42,27 +42,56 @@ def test_binary_term_has_finite_gradients_at_the_ends():
     assert torch.isfinite(mask.grad).all()
 
 
+def test_binary_term_is_differentiated_right():
+    mask = torch.rand(30, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    torch.autograd.gradcheck(losses.binary_term, mask)
+    outside = torch.tensor([0.0, 1.0, 1e-7], requires_grad=True)
+    losses.binary_term(outside).backward()
+    assert not outside.grad.any()
+
+
+def _curve(count: int, side: int = 12) -> losses.Neighbours:
+    grid = torch.stack(torch.meshgrid(*[torch.arange(side)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    cells = grid[torch.randperm(len(grid), generator=torch.Generator().manual_seed(0))[:count]].int()
+    return losses.Neighbours(cells, 4.0)
+
+
 def test_smooth_term_weighs_differences_by_distance():
-    pairs, weights = torch.tensor([[0, 1], [1, 2]]), torch.tensor([1.0, 0.5])
-    assert float(losses.smooth_term(torch.tensor([0.0, 1.0, 0.5]), pairs, weights)) == pytest.approx((1.0 + 0.25) / 2)
+    near = losses.Neighbours(torch.tensor([[0, 0, 0], [1, 0, 0], [3, 0, 0]]), 4.0)
+    assert near.order.tolist() == [0, 1, 2]
+    found = losses.smooth_term(torch.tensor([0.0, 1.0, 0.5]), near, torch.tensor([1, 1, 1]))
+    assert float(found) == pytest.approx((math.exp(-1 / 4) + 0.5 * math.exp(-2 / 4)) / 2)
+    found = losses.smooth_term(torch.tensor([0.0, 1.0, 0.5]), near, torch.tensor([2, 7, 1]))
+    assert float(found) == pytest.approx(0.5 * math.exp(-3 / 4))  # of the pairs that are on the curve
+
+
+def test_smooth_term_equals_its_plain_form():
+    near, generator = _curve(700), torch.Generator().manual_seed(1)
+    mask = torch.rand(700, dtype=torch.float64, generator=generator)
+    mask[:100] = mask[100:200]  # some do not differ
+    away, found = near.draw(generator), []
+    assert set(away.tolist()) == set(range(1, 9))
+    for form in (losses.smooth_term, losses.smooth_term_reference):
+        leaf = mask.clone().requires_grad_()
+        value = form(leaf, near, away)
+        found.append((value.detach(), *torch.autograd.grad(3 * value, leaf)))
+    torch.testing.assert_close(*found)
 
 
 def test_neighbours_are_near():
-    generator = torch.Generator().manual_seed(0)
-    grid = torch.stack(torch.meshgrid(*[torch.arange(12)] * 3, indexing="ij"), -1).reshape(-1, 3)
-    cells = grid[torch.randperm(len(grid), generator=generator)].int()
-    pairs, weights = losses.Neighbours(cells).draw(4.0, generator)
-    assert (pairs[0] != pairs[1]).all()
-    distance = (cells[pairs[0]] - cells[pairs[1]]).float().norm(dim=1)
+    near = _curve(12**3)
+    distance = -4 * near.weights[:-8].log()
     assert float(distance.mean()) < 4  # random pairs of this cube are 8 apart on average
-    assert torch.allclose(weights, torch.exp(-distance / 4.0))
+    cells = near.anchor_q[near.order].float()
+    torch.testing.assert_close(distance[:, 2], (cells[3:-5] - cells[:-8]).norm(dim=1), rtol=1e-5, atol=1e-5)
 
 
 @pytest.mark.parametrize("count", [0, 1])
 def test_no_pairs_without_two_anchors(count):
-    pairs, weights = losses.Neighbours(torch.zeros(count, 3, dtype=torch.int32)).draw(4.0, torch.Generator())
-    assert pairs.shape == (2, 0)
-    assert float(losses.smooth_term(torch.ones(count), pairs, weights)) == 0
+    near = losses.Neighbours(torch.zeros(count, 3, dtype=torch.int32), 4.0)
+    away = near.draw(torch.Generator())
+    for form in (losses.smooth_term, losses.smooth_term_reference):
+        assert away.shape == (count,) and float(form(torch.ones(count), near, away)) == 0
 
 
 def test_rollout_probabilities():
