@@ -4,13 +4,13 @@
                                 [--out out] [--docs docs] [--render]
 
 FOLDER is a checkout of another commit of this project, measured by turns with this one: one process of each, then the
-next pair (of encodings and trainings a ninth as many). Each checkpoint in --out/NAME/model.pt that both can read is one
-scene; its data must be there for the lines on training. Figures are medians over the repeats; the page states the
-processors and the load. Of this checkout alone: what --own holds, checkpoints of today, as users have them; and on the
-first scene how cost grows, and what other coders take for the same symbols. Two scenes and nine repeats take some ten
-minutes on two idle processors. --lines measures some lines anew and keeps the others. The line `race` trains the real
-scenes with both at once, a thread each, in --out/NAME/race, which takes a quarter of an hour; it is measured only where
-it is asked for.
+next pair (of encodings and first steps a ninth as many, of steps a third). Each checkpoint in --out/NAME/model.pt that
+both can read is one scene; its data must be there for the lines on training. Figures are medians over the repeats; the
+page states the processors and the load. Of this checkout alone: what --own holds, checkpoints of today, as users have
+them; and on the first scene how cost grows, and what other coders take for the same symbols. Two scenes and nine
+repeats take some ten minutes on two idle processors. --lines measures some lines anew and keeps the others. The line
+`race` trains the real scenes with both at once, a thread each, in --out/NAME/race, which takes a quarter of an hour; it
+is measured only where it is asked for.
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ class Turns:
     def line(self, what: str, repeats: int) -> Row:
         """The medians of one line of the page, by checkout."""
         found: dict[str, list[Row]] = {name: [] for name in self.checkouts}
-        for _ in range(-(-repeats // 9) if what in SLOW else repeats):
+        for _ in range(-(-repeats // SLOW.get(what, 1))):
             for name, checkout in self.checkouts.items():
                 found[name].append(run(checkout, what, str(self.checkpoint), self.files[name], "5"))
         medians = {name: _medians(rows) for name, rows in found.items()}
@@ -157,9 +157,11 @@ LINES = {
     "draw": (("picture of the top level, 480 x 360, ms", "wall", 1e3, 1), ("the same, processor ms", "cpu", 1e3, 1)),
     "start": (("pd4dgs-render, start to picture, s", "wall", 1, 2), ("the same, processor s", "cpu", 1, 2)),
     "first": (("pd4dgs-train, one step with its data, s", "wall", 1, 2), ("the same, processor s", "cpu", 1, 2)),
+    "steps": tuple((f"training step at level {n}, all threads, ms", f"level {n}", 1e3, 1) for n in range(3)),
     "step": tuple((f"training step at level {n}, one thread, processor ms", f"level {n}", 1e3, 1) for n in range(3)),
 }
-SLOW = ("encode", "first", "step", "parts")
+#: Repeats that one process of these takes the place of.
+SLOW = {"encode": 9, "first": 9, "parts": 9, "steps": 3, "step": 3}
 #: What a user of a file waits for.
 USED = ("encode", "decode", "command", "draw", "start")
 RACE, OWN, GROWTH = "race", "own", "growth"

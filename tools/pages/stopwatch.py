@@ -116,7 +116,22 @@ def _command(name: str, *arguments: str) -> dict[str, float]:
 
 
 def step(checkpoint: str, file: str, effort: str) -> dict[str, float]:
-    """Median processor seconds of a step at each level, the levels in turn, as if at SHARE of the run."""
+    """Median processor seconds of a step at each level, on one thread."""
+    return _steps(checkpoint, "cpu")
+
+
+def steps(checkpoint: str, file: str, effort: str) -> dict[str, float]:
+    """Median wall seconds of a step at each level, on all threads, as a run takes it."""
+    try:
+        from pd4dgs_codec.threads import one_torch_thread
+    except ImportError:  # the first commits' runs have all threads for torch too
+        return _steps(checkpoint, "wall")
+    with one_torch_thread():
+        return _steps(checkpoint, "wall")
+
+
+def _steps(checkpoint: str, clock: str) -> dict[str, float]:
+    """Of a step at each level, the levels in turn, as if at SHARE of the run."""
     from pd4dgs_codec.cli.resume import parse_config
     from pd4dgs_codec.data.dataset import load as load_data
     from pd4dgs_codec.model.checkpoint import load
@@ -132,8 +147,8 @@ def step(checkpoint: str, file: str, effort: str) -> dict[str, float]:
         learner.iteration = round(trainer.total * SHARE)
         if learner is trainer:  # as the first commits had it
             trainer._draw_levels = lambda schedule: ((level,), (1 / 3,) * 3)
-            return timed(trainer.step)[1]["cpu"]
-        return timed(lambda: learner.step((level,)))[1]["cpu"]
+            return timed(trainer.step)[1][clock]
+        return timed(lambda: learner.step((level,)))[1][clock]
 
     for level in levels:
         one(level)  # compiles
@@ -326,7 +341,7 @@ def main() -> None:
     configure(1 if what == "step" else None)
     works = {
         "encode": encode, "decode": decode, "command": command, "draw": draw, "start": start, "first": first,
-        "step": step, "parts": parts, "grow": grow, "beside": beside,
+        "steps": steps, "step": step, "parts": parts, "grow": grow, "beside": beside,
     }  # fmt: skip
     print(json.dumps(works[what](*arguments)))
 
