@@ -12,6 +12,7 @@ With d = |a - mu|, z = d/sigma, h = Q/(2 sigma), u = (d - Q/2)/sigma, v = (d + Q
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -124,33 +125,41 @@ class _RowBits(torch.autograd.Function):
     """`row_bits_reference` in numba, with one gradient for all of it."""
 
     @staticmethod
-    def forward(ctx: Any, values: Tensor, classes: Tensor, rows: Tensor, step: float) -> Tensor:
-        x, of, picked = values.numpy(), classes.numpy(), rows.numpy()
+    def forward(ctx: Any, classes: Tensor, rows: Tensor, steps: Sequence[float], *parts: Tensor) -> Tensor:
+        of, picked, total = classes.numpy(), rows.numpy(), np.zeros(len(rows))
         counts = np.bincount(of[of >= 0], minlength=1)
-        each = np.maximum(counts, 1)[:, None]
-        mu = _sums(x, of, np.zeros((len(counts), x.shape[1])), 1) / each
-        sigma = np.sqrt(_sums(x, of, mu, 2) / each + MIN_VARIANCE)
-        bits, by_value = np.empty(len(picked)), np.empty((len(picked), x.shape[1]))
-        by_sigma = np.empty_like(by_value)
-        limits = MIN_SIGMA_RATIO, MAX_BITS, NARROW[values.dtype]
-        kernels.row_bits(bits, by_value, by_sigma, x, picked, of, mu, sigma, step, *limits)
-        ctx.save_for_backward(values, classes, rows)
-        ctx.moments = each, mu, sigma, by_value, by_sigma
-        return torch.from_numpy(bits).to(values.dtype)
+        each, bits = np.maximum(counts, 1)[:, None], np.empty_like(total)
+        ctx.moments = []
+        for values, step in zip(parts, steps, strict=True):
+            x = values.numpy()
+            mu = _sums(x, of, np.zeros((len(counts), x.shape[1])), 1) / each
+            sigma = np.sqrt(_sums(x, of, mu, 2) / each + MIN_VARIANCE)
+            by_value, by_sigma = (np.empty((len(picked), x.shape[1])) for _ in range(2))
+            limits = MIN_SIGMA_RATIO, MAX_BITS, NARROW[values.dtype]
+            kernels.row_bits(bits, by_value, by_sigma, x, picked, of, mu, sigma, step, *limits)
+            total += bits
+            ctx.moments.append((mu, sigma, by_value, by_sigma))
+        ctx.each = each
+        ctx.save_for_backward(classes, rows, *parts)
+        return torch.from_numpy(total).to(parts[0].dtype)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor, None, None, None]:
-        values, classes, rows = ctx.saved_tensors
-        each, mu, sigma, by_value, by_sigma = ctx.moments
-        x, of, weight = values.detach().numpy(), classes.numpy(), grad.numpy().astype(np.float64)[:, None]
-        of_rows = of[rows.numpy()] == np.arange(len(mu))[:, None]  # [K, n]
-        by_mu = -(of_rows @ (weight * by_value)) / each
-        by_square = of_rows @ (weight * by_sigma) / (each * sigma)
-        found = np.empty_like(x)
-        kernels.moments_gradient(found, x, of, *(a.astype(x.dtype) for a in (by_mu, mu, by_square)))
-        found[rows.numpy()] += (weight * by_value).astype(x.dtype)
-        return torch.from_numpy(found), None, None, None
+    def backward(ctx: Any, grad: Tensor) -> tuple[Tensor | None, ...]:
+        classes, rows, *parts = ctx.saved_tensors
+        of, picked, weight = classes.numpy(), rows.numpy(), grad.numpy().astype(np.float64)[:, None]
+        of_rows = of[picked] == np.arange(len(ctx.each))[:, None]  # [K, n]
+        gradients = []
+        for values, (mu, sigma, by_value, by_sigma) in zip(parts, ctx.moments, strict=True):
+            x = values.detach().numpy()
+            slope = weight * by_value
+            by_mu = -(of_rows @ slope) / ctx.each
+            by_square = of_rows @ (weight * by_sigma) / (ctx.each * sigma)
+            found = np.empty_like(x)
+            kernels.moments_gradient(found, x, of, *(a.astype(x.dtype) for a in (by_mu, mu, by_square)))
+            found[picked] += slope.astype(x.dtype)
+            gradients.append(torch.from_numpy(found))
+        return None, None, None, *gradients
 
 
 def _sums(values: np.ndarray, classes: np.ndarray, centre: np.ndarray, power: int) -> np.ndarray:
@@ -161,26 +170,29 @@ def _sums(values: np.ndarray, classes: np.ndarray, centre: np.ndarray, power: in
     return total
 
 
-def row_bits(values: Tensor, classes: Tensor, rows: Tensor, step: float) -> Tensor:
-    """R summed over each of the rows `rows` (int64 [n], none twice) of values [N, c]: [n], gradient through all.
+def row_bits(parts: Sequence[tuple[Tensor, float]], classes: Tensor, rows: Tensor) -> Tensor:
+    """R summed over each of the rows `rows` (int64 [n], none twice) of all parts: [n], gradient through all.
 
-    classes: int8 [N], the step class of an active row and -1 of others; `rows` are active. A scalar's step is
-    step * 2^class, and its prior are mean and standard deviation of its column over the active rows of its class.
+    parts: values [N, c] and their step. classes: int8 [N], the step class of an active row and -1 of others; `rows` are
+    active. A scalar's step is step * 2^class, and its prior are mean and standard deviation of its column over the
+    active rows of its class.
     """
-    if values.device.type == "cpu":
-        bits: Tensor = _RowBits.apply(values, classes, rows, step)  # type: ignore[no-untyped-call]
+    if classes.device.type == "cpu":
+        values, steps = zip(*parts, strict=True)
+        bits: Tensor = _RowBits.apply(classes, rows, steps, *values)  # type: ignore[no-untyped-call]
         return bits
-    return row_bits_reference(values, classes, rows, step)
+    return row_bits_reference(parts, classes, rows)
 
 
-def row_bits_reference(values: Tensor, classes: Tensor, rows: Tensor, step: float) -> Tensor:
+def row_bits_reference(parts: Sequence[tuple[Tensor, float]], classes: Tensor, rows: Tensor) -> Tensor:
     """The plain torch form of `row_bits`."""
     of_rows = classes[rows]
-    bits = values.new_zeros(len(rows))
+    bits = parts[0][0].new_zeros(len(rows))
     for c in sorted(set(of_rows.tolist())):
-        mu, sigma = channel_moments(values[classes == c])
-        own = rate_bits(values[rows[of_rows == c]], mu, sigma, step * 2.0**c).sum(1)
-        bits = bits.index_put(((of_rows == c).nonzero()[:, 0],), own)
+        own = (of_rows == c).nonzero()[:, 0]
+        for values, step in parts:
+            mu, sigma = channel_moments(values[classes == c])
+            bits = bits.index_add(0, own, rate_bits(values[rows[own]], mu, sigma, step * 2.0**c).sum(1))
     return bits
 
 

@@ -6,7 +6,7 @@ Arguments everywhere, floats of one dtype: keep int64 [K], ascending, anchor * G
 scales, quaternion, opacity and colour; hidden [n, columns], of which H from `column` on are a layer's, H a multiple of
 LANES. The backward passes split the Gaussians over threads at anchors, each part owning its rows of the result; sums
 over all Gaussians are kept per part, for the caller to add in order, so that results are bitwise reproducible for a
-fixed number of parts. What takes a fraction of a millisecond is not split.
+fixed number of parts.
 """
 
 from __future__ import annotations
@@ -105,12 +105,12 @@ def pick_backward(tasks: Tasks, grad: np.ndarray, g: np.ndarray, column: int, ro
         copy(grad, rows[i] * width, g, i * g.shape[1] + column, width)
 
 
-@kernel()
-def inputs(out: np.ndarray, distance: np.ndarray, anchors: np.ndarray, centre: np.ndarray) -> None:
+@parallel(lambda out, *_: len(out))
+def inputs(tasks: Tasks, out: np.ndarray, distance: np.ndarray, anchors: np.ndarray, centre: np.ndarray) -> None:
     """out [n, D + 3] = the features and the direction from centre [3] of anchors; distance [n] from it, MIN_NORM at
     least."""
     width = out.shape[1] - 3
-    for n in range(len(anchors)):
+    for n in range(tasks[0], tasks[1]):
         x, y, z = anchors[n, 0] - centre[0], anchors[n, 1] - centre[1], anchors[n, 2] - centre[2]
         distance[n] = max(math.sqrt(x * x + y * y + z * z), anchors.dtype.type(MIN_NORM))
         for c in range(width):
@@ -120,11 +120,11 @@ def inputs(out: np.ndarray, distance: np.ndarray, anchors: np.ndarray, centre: n
         out[n, width + 2] = z / distance[n]
 
 
-@kernel()
-def inputs_backward(g_anchors: np.ndarray, g: np.ndarray, out: np.ndarray, distance: np.ndarray) -> None:
+@parallel(lambda g_anchors, *_: len(g_anchors))
+def inputs_backward(tasks: Tasks, g_anchors: np.ndarray, g: np.ndarray, out: np.ndarray, distance: np.ndarray) -> None:
     """The transpose of `inputs`, which gave `out` and `distance`; adds to g_anchors."""
     width = g.shape[1] - 3
-    for n in range(len(g)):
+    for n in range(tasks[0], tasks[1]):
         for c in range(width):
             g_anchors[n, 3 + c] += g[n, c]
         along = g.dtype.type(0)
@@ -343,8 +343,9 @@ def _clamped(value: float) -> Any:
     return value if value != value else min(max(value, 0), 1)
 
 
-@kernel()
+@parallel(lambda means, *_: len(means))
 def finish(
+    tasks: Tasks,
     means: np.ndarray,
     quats: np.ndarray,
     scales: np.ndarray,
@@ -356,7 +357,7 @@ def finish(
 ) -> None:
     """The parts of gaussians under gates [K]; loose: clamped and normalised first."""
     zero, one = gaussians.dtype.type(0), gaussians.dtype.type(1)
-    for k in range(len(gates)):
+    for k in range(tasks[0], tasks[1]):
         inverse = one / _norm(gaussians, k, QUAT) if loose else one
         for i in range(4):
             quats[k, i] = gaussians[k, QUAT + i] * inverse
@@ -369,8 +370,9 @@ def finish(
         opacities[k] = gates[k] * (_clamped(opacity) if loose else opacity)
 
 
-@kernel()
+@parallel(lambda g, *_: len(g))
 def finish_backward(
+    tasks: Tasks,
     g: np.ndarray,
     g_gates: np.ndarray,
     gaussians: np.ndarray,
@@ -384,7 +386,7 @@ def finish_backward(
 ) -> None:
     """The transpose of `finish`: g [K, 14], g_gates [K]."""
     zero, one = gaussians.dtype.type(0), gaussians.dtype.type(1)
-    for k in range(len(gates)):
+    for k in range(tasks[0], tasks[1]):
         opacity = gaussians[k, OPACITY]
         inside = not loose or (opacity >= zero and opacity <= one)
         g[k, OPACITY] = g_opacities[k] * gates[k] if inside else zero

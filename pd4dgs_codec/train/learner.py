@@ -219,7 +219,7 @@ class Learner:
             earlier = self.optimiser.take_gradients()
             try:
                 with self._drawing_from(seed):
-                    pictures.append(self._follow(index, level, only, record))
+                    pictures.append(self._gather(index, level, only, record))
                 self.optimiser.add_gradients(earlier)  # those of a view are summed first, as a worker's are
             except NotFinite as error:  # a diverged step may be passed over; any other refusal is here to stay
                 record["refused"] = str(error)
@@ -228,7 +228,7 @@ class Learner:
                 return None
         return pictures
 
-    def _follow(self, index: int, level: int, only: Tensor | None, record: dict[str, Any]) -> Picture:
+    def _gather(self, index: int, level: int, only: Tensor | None, record: dict[str, Any]) -> Picture:
         """The picture of training view `index` at `level`, the gradients of its loss gathered and the terms in the
         record. Raises NotFinite where the model has diverged."""
         rounding, share = self._rounding(), 1 / self.config.views_per_step

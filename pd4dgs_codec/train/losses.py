@@ -67,7 +67,7 @@ class ModelLoss:
             gradients = [(p, g) for p, g in zip(parameters, by_leaf, strict=False) if g is not None]
             return Terms(float(loss.detach()), {name: float(value.detach()) for name, _, value in found}, gradients)
 
-        return aside(find)
+        return aside(find) if model.feature.device.type == "cpu" else find  # CUDA's work waits in one queue anyway
 
     def _plane_terms(
         self, layer: int, planes: HexPlane, grid: Tensor, step: float, pressure: float
@@ -102,8 +102,7 @@ def anchor_bits(model: Model, anchors: Mapping[str, Tensor], rows: Tensor, activ
     classes = torch.full_like(model.step_class, -1, dtype=torch.int8)
     classes[active] = model.step_class[active].to(torch.int8)
     parts = [(anchors[name].flatten(1), getattr(model.steps, name)) for name in ATTRIBUTES]
-    total = torch.stack([row_bits(values, classes, rows, step) for values, step in parts]).sum(0)
-    return total / model.widths.channels
+    return row_bits(parts, classes, rows) / model.widths.channels
 
 
 def rate_term(

@@ -98,7 +98,7 @@ def test_the_kernels_give_the_plain_form_s_bits_and_gradients(active):
     results = []
     for form, dtype in ((row_bits, torch.float32), (row_bits_reference, torch.float64)):
         leaf = values.to(dtype, copy=True).requires_grad_()
-        bits = form(leaf, classes, rows, 0.25)
+        bits = form([(leaf[:, :4].contiguous(), 0.25), (leaf[:, 4:].contiguous(), 0.25)], classes, rows)
         (bits * weights.to(dtype)).sum().backward()
         results.append((bits.detach().double(), leaf.grad.double()))
     for found, expected in zip(*results, strict=True):
