@@ -125,6 +125,24 @@ def test_a_step_gathers_the_gradients_of_all_its_terms(dataset, level):
             torch.testing.assert_close(gradient, expected, rtol=1e-4, atol=1e-9)
 
 
+def test_the_graph_beside_the_picture_s_shares_no_leaf_with_it(dataset, monkeypatch):
+    """Two threads whose graphs share one can wait for each other for ever."""
+    steps, leaves, grad = learner(dataset, 3), [], torch.autograd.grad
+
+    def watched(loss, *args, **kw):
+        left = [loss.grad_fn]
+        while left:
+            node = left.pop()
+            leaves.extend([node.variable] if hasattr(node, "variable") else [])
+            left.extend(before for before, _ in node.next_functions if before is not None)
+        return grad(loss, *args, **kw)
+
+    monkeypatch.setattr(torch.autograd, "grad", watched)
+    steps.model_loss.begin(steps.model, 2, steps.schedule, 2)()
+    own = {id(parameter) for parameter in steps.model.parameters()}
+    assert leaves and not own & {id(leaf) for leaf in leaves}
+
+
 def test_without_planes_they_have_no_rate_and_anchors_do(dataset):
     steps = learner(dataset, 3, **ABLATIONS["planes"])
     names = [name for _ in range(3) for name in steps.step()]
