@@ -18,7 +18,7 @@ class MLP(nn.Module):
         super().__init__()
         #: The linear layers, input side first.
         self.layers = [nn.Linear(a, b) for a, b in zip(widths[:-1], widths[1:], strict=True)]
-        self.linears = nn.ModuleList(self.layers)  # a module's own lists are slow to read
+        self.linears = nn.ModuleList(self.layers)  # what names the parameters; slow to read
         if zero_last:
             nn.init.zeros_(self.layers[-1].weight)
             nn.init.zeros_(self.layers[-1].bias)
