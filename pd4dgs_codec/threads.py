@@ -24,7 +24,7 @@ import ctypes
 import os
 import sys
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import cache
 from importlib import import_module
 from queue import SimpleQueue
@@ -196,25 +196,15 @@ class Sharer:
 def _share(tasks: int, threads: int, parts: int, work: Work) -> None:
     count = min(tasks, parts * threads)
     left = iter([(tasks * part // count, tasks * (part + 1) // count) for part in range(count)])
-    begun, ends = [], SimpleQueue[Exception | None]()
 
-    def help_out() -> None:
-        begun.append(True)
-        try:
-            for part in left:
-                work(part)
-        except Exception as error:
-            ends.put(error)
-        else:
-            ends.put(None)
+    def take() -> None:
+        for part in left:
+            work(part)
 
-    for _ in range(threads - 1):
-        _waiting().put(help_out)
-    for part in left:
-        work(part)
-    for error in [ends.get() for _ in begun]:  # who begins now finds nothing left
-        if error:
-            raise error
+    with ExitStack() as helpers:  # all that have begun are waited for, whatever is raised
+        for _ in range(threads - 1):
+            helpers.callback(aside(take))
+        take()
 
 
 def aside(work: Callable[[], T]) -> Callable[[], T]:
