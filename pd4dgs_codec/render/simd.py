@@ -265,22 +265,23 @@ iota, iota64 = (_constant_of(kind, [float(i) for i in range(WIDE)]) for kind in 
 in_row = _constant_of(types.float32, [float(i % LANES) for i in range(WIDE)])
 
 
-@_intrinsic
-def single(typingctx: Any, a: Any) -> Any:
-    """float64 to float32."""
-    if not isinstance(a, Lanes) or a.scalar != types.float64:
-        return None
-    result = Lanes(types.float32, a.count)
-    return result(a), lambda context, builder, sig, args: builder.fptrunc(args[0], context.get_value_type(result))
+def _converted(scalar: types.Float, to: types.Float, instruction: str) -> Callable[..., Any]:
+    def function(typingctx: Any, a: Any) -> Any:
+        if not isinstance(a, Lanes) or a.scalar != scalar:
+            return None
+        result = Lanes(to, a.count)
+
+        def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
+            return getattr(builder, instruction)(args[0], context.get_value_type(result))
+
+        return result(a), codegen
+
+    return _intrinsic(function)
 
 
-@_intrinsic
-def double(typingctx: Any, a: Any) -> Any:
-    """float32 to float64."""
-    if not isinstance(a, Lanes) or a.scalar != types.float32:
-        return None
-    result = Lanes(types.float64, a.count)
-    return result(a), lambda context, builder, sig, args: builder.fpext(args[0], context.get_value_type(result))
+#: float64 to float32, and float32 to float64
+single = _converted(types.float64, types.float32, "fptrunc")
+double = _converted(types.float32, types.float64, "fpext")
 
 
 @_intrinsic
