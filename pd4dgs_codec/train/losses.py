@@ -53,18 +53,21 @@ class ModelLoss:
         draw from the generator or change the model."""
         planes = {layer: field.planes for layer, field in model.deformations.items() if layer <= level}
         parameters = [*(getattr(model, name) for name in PER_ANCHOR), *(own.grid for own in planes.values())]
-        leaves = [parameter.detach().requires_grad_() for parameter in parameters]
-        anchors, grids = dict(zip(PER_ANCHOR, leaves, strict=False)), leaves[len(PER_ANCHOR) :]
+        leaves = {parameter: parameter.detach().requires_grad_() for parameter in parameters}
 
         def find() -> Terms:
             found: list[Weighted] = []
-            for (layer, own), grid in zip(planes.items(), grids, strict=True):
-                found += self._plane_terms(layer, own, grid, model.steps.planes(layer), schedule.pressure(place))
+            for layer, own in planes.items():
+                step, pressure = model.steps.planes(layer), schedule.pressure(place)
+                found += self._plane_terms(layer, own, leaves[own.grid], step, pressure)
             if place >= schedule.progressive:
+                anchors = {name: leaves[getattr(model, name)] for name in PER_ANCHOR}
                 found += self._mask_terms(model, level, anchors, schedule.separation(place))
-            loss = sum((weight * value for _, weight, value in found), model.feature.new_zeros(()))
-            by_leaf = torch.autograd.grad(loss, leaves, allow_unused=True) if loss.requires_grad else ()
-            gradients = [(p, g) for p, g in zip(parameters, by_leaf, strict=False) if g is not None]
+            if not found:
+                return Terms(0.0, {}, [])
+            loss = torch.stack([weight * value for _, weight, value in found]).sum()
+            by_leaf = torch.autograd.grad(loss, list(leaves.values()), allow_unused=True)
+            gradients = [(p, g) for p, g in zip(leaves, by_leaf, strict=True) if g is not None]
             return Terms(float(loss.detach()), {name: float(value.detach()) for name, _, value in found}, gradients)
 
         return aside(find) if model.feature.device.type == "cpu" else find  # CUDA's work waits in one queue anyway
