@@ -14,21 +14,21 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from pd4dgs_codec.codec.decoder import decode
-    from pd4dgs_codec.codec.encoder import encode
-    from pd4dgs_codec.codec.info import FORMAT_VERSION
-    from pd4dgs_codec.codec.stream import open_stream
-    from pd4dgs_codec.delivery.page import show
+    from pd4dgs_codec.format.decoder import decode
+    from pd4dgs_codec.format.encoder import encode
+    from pd4dgs_codec.format.info import FORMAT_VERSION
+    from pd4dgs_codec.format.stream import open_stream
+    from pd4dgs_codec.web.page import show
 
 __version__ = "0.1.0"
 __all__ = ["FORMAT_VERSION", "decode", "encode", "open_stream", "show"]
 
 _HOMES = {
-    "FORMAT_VERSION": "pd4dgs_codec.codec.info",
-    "decode": "pd4dgs_codec.codec.decoder",
-    "encode": "pd4dgs_codec.codec.encoder",
-    "open_stream": "pd4dgs_codec.codec.stream",
-    "show": "pd4dgs_codec.delivery.page",
+    "FORMAT_VERSION": "pd4dgs_codec.format.info",
+    "decode": "pd4dgs_codec.format.decoder",
+    "encode": "pd4dgs_codec.format.encoder",
+    "open_stream": "pd4dgs_codec.format.stream",
+    "show": "pd4dgs_codec.web.page",
 }
 
 

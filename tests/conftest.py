@@ -38,15 +38,13 @@ NEED_TRAIN = [
     "data",
     "interchange",
     "model",
-    "pack",
-    "playback",
-    "render",
+    "draw",
+    "quality",
     "tools",
     "train",
-    "view",
 ]
-NEED_TRAIN += ["fuzz/test_trained_file.py", "metrics/test_levels.py", "metrics/test_perceptual.py"]
-NEED_NO_KERNEL = ["bitstream", "spec"]
+NEED_TRAIN += ["fuzz/test_trained_file.py"]
+NEED_NO_KERNEL = ["entropy", "spec"]
 collect_ignore = [] if find_spec("torch") and find_spec("numba") else NEED_TRAIN
 
 settings.register_profile("pd4dgs", deadline=None, suppress_health_check=[HealthCheck.too_slow])

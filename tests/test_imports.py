@@ -12,7 +12,7 @@ import pytest
 from strategies import make_scene
 
 import pd4dgs_codec
-from pd4dgs_codec.codec.encoder import encode
+from pd4dgs_codec.format.encoder import encode
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -38,7 +38,7 @@ ALLOWED = read_map()
 #: These may import every room but `cli`: what the package measures of itself, its commands, its entry points.
 ABOVE_ALL = {"bench", "cli", "__init__", "__main__"}
 #: Rooms that a decoder is made of, and the libraries that they may use.
-DECODER = ("errors", "scene", "bitstream", "entropy", "attributes", "evaluate", "codec", "delivery")
+DECODER = ("errors", "scene", "entropy", "evaluate", "format", "web")
 LIBRARIES = {"numpy", "constriction", "msgpack", "zstandard"}
 
 

@@ -43,7 +43,7 @@ sys.path.append("tests")
 import numpy
 from threadpoolctl import threadpool_info
 from strategies import make_scene
-from pd4dgs_codec.codec import encoder
+from pd4dgs_codec.format import encoder
 
 def threads():
     return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}

@@ -18,8 +18,8 @@ import numpy as np
 from pages.draco import draco_encode
 from pages.scenes import SHARED
 
-from pd4dgs_codec.codec.decoder import decode
 from pd4dgs_codec.entropy.positions import decode_positions, encode_positions
+from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.morton import morton_codes, morton_order
 
 SURFACES = ("sphere", "torus", "plane", "cylinder", "gyroid")

@@ -4,5 +4,5 @@
 set -euo pipefail
 cd "$(dirname "$0")/.."
 python=${PYTHON:-.venv-test/bin/python}
-"$python" -m coverage run -m pytest -q tests/bitstream tests/entropy tests/attributes tests/codec tests/spec tests/test_*.py "$@"
+"$python" -m coverage run -m pytest -q tests/entropy tests/format tests/spec tests/test_*.py "$@"
 exec "$python" -m coverage report

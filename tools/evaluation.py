@@ -22,7 +22,7 @@ TIMES = {"decode_seconds", "render_ms"}
 
 def render(rows: Sequence[Row]) -> str:
     """Scenes and levels by metrics; a metric that no file was measured with has no column."""
-    from pd4dgs_codec.view.evaluate import metric_columns
+    from pd4dgs_codec.quality.evaluate import metric_columns
 
     columns = list(dict.fromkeys(column for row in rows for column in metric_columns(row)))
     lines = []
@@ -43,8 +43,8 @@ def main(argv: list[str] | None = None) -> int:
     configure()
 
     from pd4dgs_codec.jsonable import finite
-    from pd4dgs_codec.metrics.perceptual import load_perceptual
-    from pd4dgs_codec.view.evaluate import evaluate_file
+    from pd4dgs_codec.quality.evaluate import evaluate_file
+    from pd4dgs_codec.quality.perceptual import load_perceptual
 
     todo = [scene.name for scene in present(args)]
     perceptual = load_perceptual() if todo else None

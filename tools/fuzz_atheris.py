@@ -22,8 +22,8 @@ with atheris.instrument_imports(include=[f"pd4dgs_codec.{p}" for p in ("bitstrea
 from fuzzing.files import put_together, take_apart  # noqa: E402
 from fuzzing.mutate import Case  # noqa: E402
 
-from pd4dgs_codec.bitstream import canonical  # noqa: E402
 from pd4dgs_codec.errors import Pd4Error  # noqa: E402
+from pd4dgs_codec.format import canonical  # noqa: E402
 
 
 def examine_one(data: bytes) -> None:

@@ -36,10 +36,10 @@ VARIANTS = (("data", 3, 0), ("data", 0, STEPS), ("data", 3, STEPS), ("file", 3, 
 
 def measure(name: str, out: Path) -> Row:
     """The rows of one scene."""
-    from pd4dgs_codec.codec.decoder import decode
+    from pd4dgs_codec.draw.player import Player
+    from pd4dgs_codec.format.decoder import decode
     from pd4dgs_codec.interchange.bake import eyes_of_cameras, eyes_of_scene
     from pd4dgs_codec.interchange.export import Export, cost
-    from pd4dgs_codec.playback.player import Player
 
     path, dataset = out / name / "scene.pd4", SCENES[name].load()
     player = Player(decode(path.read_bytes()))
@@ -87,9 +87,9 @@ def _run(command: list[str]) -> Row:
 
 def _psnr(splats: Splats, player: Any, view: Any, turned: bool = False) -> float:
     """Of the Gaussians as a reader found them, drawn from the view's camera, against the scene's own picture, dB."""
+    from pd4dgs_codec.draw.visibility import near_plane
     from pd4dgs_codec.interchange.export import turned_camera, upright
     from pd4dgs_codec.interchange.splats import picture
-    from pd4dgs_codec.model.visibility import near_plane
 
     camera = turned_camera(view.camera, upright(player.info.up) if turned else None)
     image = picture(splats, camera, player.info.background, near_plane(player.info))

@@ -3,7 +3,7 @@
     python tools/latency.py [--out out] [--docs docs] [--runs 9] [--render]
 
 Reads what tools/results.py trained, and the scene in PD4DGS_SHARED for the quality axis. About 12 minutes on two quiet
-cores; on busy ones the times are worthless. The faults are those of the tests (tests/delivery/fault_table.py). The exit
+cores; on busy ones the times are worthless. The faults are those of the tests (tests/web/fault_table.py). The exit
 code is 1 if a picture under faults is not the right one.
 """
 
@@ -40,7 +40,7 @@ def fault_table() -> Any:
 def measure(out: Path, docs: Path, runs: int) -> Row:
     """All that the page shows, from the files of NAMES in `out`."""
     from pd4dgs_codec.bench import latency
-    from pd4dgs_codec.playback.warm import warm_up
+    from pd4dgs_codec.draw.warm import warm_up
 
     contents = {name: (out / name / "scene.pd4").read_bytes() for name in NAMES}
     warm_up()

@@ -105,8 +105,8 @@ def curve_before(checkout: Path, commit: str, scene: Scene, kept: Path) -> list[
 def trained(scene: Scene, path: Path, changes: dict[str, Any]) -> Points:
     """The levels of a training of this commit, packed by default."""
     from pd4dgs_codec.model.convert import to_scene
-    from pd4dgs_codec.pack.packing import pack
-    from pd4dgs_codec.view.evaluate import evaluate_file
+    from pd4dgs_codec.quality.evaluate import evaluate_file
+    from pd4dgs_codec.quality.packing import pack
 
     dataset = scene.load()
     model, _ = ensure_trained(scene.config(**changes), dataset, path, say=lambda text: say(f"  {text}"))

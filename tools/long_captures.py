@@ -147,10 +147,10 @@ def measure(name: str, steps: int, out: Path) -> Row:
 def _row(way: str, home: Path, downscale: int, cuts: Sequence[int], truth: Truth | None) -> Row:
     """Bytes, dB on held-out frames, and steps of the pictures in time: across seams and elsewhere."""
     from pd4dgs_codec import decode
-    from pd4dgs_codec.codec.info import info
     from pd4dgs_codec.data.dataset import load
-    from pd4dgs_codec.metrics.image import to_uint8
-    from pd4dgs_codec.playback.player import Player
+    from pd4dgs_codec.draw.player import Player
+    from pd4dgs_codec.format.info import info
+    from pd4dgs_codec.quality.image import to_uint8
 
     kind = WAYS[way]
     labels = [f"{kind if i else 'own'}-{i}" for i in range(SEGMENTS)] if kind else ["whole"]

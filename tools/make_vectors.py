@@ -19,10 +19,10 @@ from pathlib import Path
 from vectors import dear, faulty, refining, slices, uncommon, valid
 from vectors.blocks import Vector
 
-from pd4dgs_codec.bitstream.container import read_preamble
-from pd4dgs_codec.codec.header import layers_of, unpack_header
-from pd4dgs_codec.codec.info import hashes
 from pd4dgs_codec.errors import DecodeError, UnsupportedFeature
+from pd4dgs_codec.format.container import read_preamble
+from pd4dgs_codec.format.header import layers_of, unpack_header
+from pd4dgs_codec.format.info import hashes
 
 VECTORS = Path(__file__).resolve().parents[1] / "spec" / "vectors"
 MANIFEST = "manifest.json"

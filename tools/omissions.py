@@ -27,8 +27,8 @@ EFFORT = 5  #: of the encoder
 
 def measure(path: Path, pictures: int) -> Row:
     """Packs the checkpoint both ways and compares `pictures` pictures. left_out: rows of the encoder's report."""
-    from pd4dgs_codec.codec.decoder import decode
-    from pd4dgs_codec.codec.encoder import encode_with_report
+    from pd4dgs_codec.format.decoder import decode
+    from pd4dgs_codec.format.encoder import encode_with_report
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.model.convert import to_scene
 
@@ -43,7 +43,7 @@ def measure(path: Path, pictures: int) -> Row:
 def compare(a: Scene, b: Scene, pictures: int) -> int:
     """How many of `pictures` random pictures of both scenes are the same bit for bit, at every level in turn."""
     from pd4dgs_codec.model.convert import from_scene
-    from pd4dgs_codec.view.levels import Level
+    from pd4dgs_codec.quality.levels import Level
 
     rng = np.random.default_rng(0)
     models = from_scene(a), from_scene(b)

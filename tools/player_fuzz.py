@@ -31,10 +31,10 @@ from fuzzing.files import Seed  # noqa: E402
 from fuzzing.mutate import make_case  # noqa: E402
 from player_speed import NodeDecoder  # noqa: E402
 
-from pd4dgs_codec.bitstream.container import read_preamble  # noqa: E402
-from pd4dgs_codec.codec.header import unpack_header  # noqa: E402
-from pd4dgs_codec.codec.info import hashes  # noqa: E402
 from pd4dgs_codec.errors import DecodeError  # noqa: E402
+from pd4dgs_codec.format.container import read_preamble  # noqa: E402
+from pd4dgs_codec.format.header import unpack_header  # noqa: E402
+from pd4dgs_codec.format.info import hashes  # noqa: E402
 
 DECODED = "decoded"
 UNSUPPORTED = "UnsupportedFeature"

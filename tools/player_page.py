@@ -33,14 +33,14 @@ from player_speed import row as speed_row
 
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.bench.report import markdown
-from pd4dgs_codec.codec.info import info
-from pd4dgs_codec.delivery.page import PAGE as INDEX
-from pd4dgs_codec.delivery.page import page as whole_page
-from pd4dgs_codec.delivery.server import Server
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.metrics.image import mpsnr
+from pd4dgs_codec.format.info import info
+from pd4dgs_codec.quality.image import mpsnr
 from pd4dgs_codec.scene import Camera
 from pd4dgs_codec.threads import configure
+from pd4dgs_codec.web.page import PAGE as INDEX
+from pd4dgs_codec.web.page import page as whole_page
+from pd4dgs_codec.web.server import Server
 
 NAMES = ("shelf-hand", "bouncing-balls")
 TIMES = (0.0, 0.37, 1.0)

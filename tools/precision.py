@@ -86,11 +86,11 @@ def beside(model: Path, scene: Scene, points: Sequence[dict[str, Any]]) -> dict[
     from pages import peers
 
     from pd4dgs_codec.bench.pictures import frames
-    from pd4dgs_codec.codec.decoder import decode_layers
-    from pd4dgs_codec.codec.encoder import encode
+    from pd4dgs_codec.format.decoder import decode_layers
+    from pd4dgs_codec.format.encoder import encode
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.model.convert import to_scene
-    from pd4dgs_codec.view.levels import load_levels
+    from pd4dgs_codec.quality.levels import load_levels
 
     # nearest to what pd4dgs-encode writes: the step scale nearest to 1, mode ans, the highest effort
     usual = min(points, key=lambda p: (abs(math.log(p["step_scale"])), p["mode"] != "ans", -p["effort"]))

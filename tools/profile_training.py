@@ -29,8 +29,8 @@ def watch(learner: Learner, stopwatch: Stopwatch) -> None:
     import torch
 
     from pd4dgs_codec.model import fused, plane_rate, plane_regularisers, rate
+    from pd4dgs_codec.model.autograd import cpu
     from pd4dgs_codec.model.model import Model
-    from pd4dgs_codec.render.autograd import cpu
     from pd4dgs_codec.train import learner as steps
     from pd4dgs_codec.train import losses, ssim
 

@@ -44,11 +44,11 @@ Points = list[tuple[int, float]]  #: (bytes, dB) after each slice
 
 def measure(path: Path, dataset: Dataset, size: int, strip: Path) -> Row:
     """Points of the four files, and what slices cost."""
-    from pd4dgs_codec.codec.encoder import encode
-    from pd4dgs_codec.codec.options import EncodeOptions
+    from pd4dgs_codec.format.encoder import encode
+    from pd4dgs_codec.format.options import EncodeOptions
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.model.convert import to_scene
-    from pd4dgs_codec.pack.packing import Views, pack
+    from pd4dgs_codec.quality.packing import Views, pack
 
     scene = to_scene(checkpoint.load(path)[0])
     views = Views.of(dataset, dataset.name, VIEWS)
@@ -69,8 +69,8 @@ def measure(path: Path, dataset: Dataset, size: int, strip: Path) -> Row:
 
 def prefixes(data: bytes) -> list[tuple[int, Scene]]:
     """(bytes, scene) of every prefix of slices."""
-    from pd4dgs_codec.codec.info import info
-    from pd4dgs_codec.codec.stream import every_prefix
+    from pd4dgs_codec.format.info import info
+    from pd4dgs_codec.format.stream import every_prefix
 
     ends = [part["end"] for layer in info(data)["layers"] for part in layer["slices"]]
     return list(zip(ends, every_prefix(data), strict=True))
@@ -78,7 +78,7 @@ def prefixes(data: bytes) -> list[tuple[int, Scene]]:
 
 def points(data: bytes, dataset: Dataset) -> Points:
     """What each prefix takes and shows."""
-    from pd4dgs_codec.pack.rendered import true_psnr
+    from pd4dgs_codec.quality.rendered import true_psnr
 
     views = dataset.test or dataset.train
     return [(end, true_psnr(scene, views, levels=[scene.level])[scene.level]) for end, scene in prefixes(data)]
@@ -86,7 +86,7 @@ def points(data: bytes, dataset: Dataset) -> Points:
 
 def decode_seconds(data: bytes) -> float:
     """Median of five."""
-    from pd4dgs_codec.codec.decoder import decode
+    from pd4dgs_codec.format.decoder import decode
 
     took = []
     for _ in range(5):
@@ -117,10 +117,10 @@ def draw_strip(data: bytes, dataset: Dataset, path: Path) -> None:
     """STRIP prefixes of one held-out view side by side, the truth last."""
     from PIL import Image
 
-    from pd4dgs_codec.metrics.image import to_uint8
     from pd4dgs_codec.model.convert import from_scene
     from pd4dgs_codec.model.picture import render_image
-    from pd4dgs_codec.view.panels import Panel, side_by_side
+    from pd4dgs_codec.quality.image import to_uint8
+    from pd4dgs_codec.quality.panels import Panel, side_by_side
 
     views = dataset.test or dataset.train
     view, found = views[len(views) // 2], prefixes(data)

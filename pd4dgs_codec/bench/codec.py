@@ -17,17 +17,17 @@ import numpy as np
 
 from pd4dgs_codec.bench.report import Panel, markdown, pareto_front
 from pd4dgs_codec.bench.timing import Cold, Timing, cold, measure
-from pd4dgs_codec.codec.decoder import decode
-from pd4dgs_codec.codec.encoder import Report, encode_with_report
-from pd4dgs_codec.codec.info import hashes, info
-from pd4dgs_codec.codec.kinds import LAYER_KINDS
-from pd4dgs_codec.codec.options import EncodeOptions
-from pd4dgs_codec.codec.plan import plan
-from pd4dgs_codec.codec.symbols import float_tensors
-from pd4dgs_codec.metrics.image import mssim
+from pd4dgs_codec.format.decoder import decode
+from pd4dgs_codec.format.encoder import Report, encode_with_report
+from pd4dgs_codec.format.info import hashes, info
+from pd4dgs_codec.format.kinds import LAYER_KINDS
+from pd4dgs_codec.format.options import EncodeOptions
+from pd4dgs_codec.format.plan import plan
+from pd4dgs_codec.format.symbols import float_tensors
+from pd4dgs_codec.quality.frames import Frame
+from pd4dgs_codec.quality.image import mssim
+from pd4dgs_codec.quality.levels import Level, load_levels
 from pd4dgs_codec.scene import ATTRIBUTES, MASK_STEP, Scene
-from pd4dgs_codec.view.frames import Frame
-from pd4dgs_codec.view.levels import Level, load_levels
 
 #: What an error of 1 is, per field of Steps; what is not here has no unit.
 UNITS = {"scaling_log": "ln(scene unit)", "offset": "exp(scaling_log)", "mask": "share of opacity and scale"}

@@ -20,13 +20,13 @@ import numpy as np
 
 from pd4dgs_codec.bench.report import drawing, markdown
 from pd4dgs_codec.bench.viewer import pictures
-from pd4dgs_codec.codec.decoder import decode
-from pd4dgs_codec.codec.encoder import encode
-from pd4dgs_codec.codec.info import info
 from pd4dgs_codec.data.view import Dataset
-from pd4dgs_codec.delivery.transfer import Transfer
 from pd4dgs_codec.errors import DataError, DeliveryError
-from pd4dgs_codec.view.evaluate import evaluate_file
+from pd4dgs_codec.format.decoder import decode
+from pd4dgs_codec.format.encoder import encode
+from pd4dgs_codec.format.info import info
+from pd4dgs_codec.quality.evaluate import evaluate_file
+from pd4dgs_codec.web.transfer import Transfer
 
 #: What the median over the paced link may be off from 8S/B: the larger of a share and of seconds.
 TOLERANCE, TOLERANCE_SECONDS = 0.03, 0.010

@@ -10,14 +10,14 @@ import torch
 from torch import Tensor
 
 from pd4dgs_codec.bench.timing import clock
-from pd4dgs_codec.model.visibility import near_plane
-from pd4dgs_codec.playback.player import Player
-from pd4dgs_codec.render.autograd.rasterization import rasterization
-from pd4dgs_codec.render.autograd.reference import composite, project
-from pd4dgs_codec.render.projection import ALPHA_MIN
+from pd4dgs_codec.draw.player import Player
+from pd4dgs_codec.draw.projection import ALPHA_MIN
+from pd4dgs_codec.draw.visibility import near_plane
+from pd4dgs_codec.model.autograd.rasterization import rasterization
+from pd4dgs_codec.model.autograd.reference import composite, project
+from pd4dgs_codec.quality.frames import Frame, dataset_frames, own_frames
+from pd4dgs_codec.quality.levels import Level
 from pd4dgs_codec.scene import SceneInfo
-from pd4dgs_codec.view.frames import Frame, dataset_frames, own_frames
-from pd4dgs_codec.view.levels import Level
 
 T = TypeVar("T")
 

@@ -21,13 +21,13 @@ def apply(constants: dict[str, float]) -> None:
     from pd4dgs_codec import threads
 
     threads.configure()
-    from pd4dgs_codec.render import projection
+    from pd4dgs_codec.draw import projection
 
     if "alpha_min" in constants:
         projection.ALPHA_MIN = constants["alpha_min"]
         projection.REACH_LOG2 = -math.log2(constants["alpha_min"])
     projection.TILE_WIDTH = int(constants.get("tile_width", projection.TILE_WIDTH))
-    from pd4dgs_codec.render import kernels
+    from pd4dgs_codec.draw import kernels
 
     kernels.T_MIN = constants.get("t_min", kernels.T_MIN)
 

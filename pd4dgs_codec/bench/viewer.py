@@ -17,10 +17,10 @@ from dataclasses import asdict, dataclass, replace
 import numpy as np
 
 from pd4dgs_codec import threads
-from pd4dgs_codec.delivery.client import SceneClient
+from pd4dgs_codec.draw.warm import warm_up
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.playback.warm import warm_up
 from pd4dgs_codec.scene import Camera, SceneInfo
+from pd4dgs_codec.web.client import SceneClient
 
 
 @dataclass(frozen=True)
@@ -41,7 +41,7 @@ def pictures(url: str, size: tuple[int, int], ready: Callable[[], object] = lamb
             last_byte = client.arrived_at
             camera = own_camera(scene.info, size)
             ready()
-            from pd4dgs_codec.view.levels import level_of
+            from pd4dgs_codec.quality.levels import level_of
 
             level_of(scene).picture(camera, 0.0)
             now = time.monotonic()

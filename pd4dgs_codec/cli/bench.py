@@ -24,8 +24,8 @@ if TYPE_CHECKING:
     from pd4dgs_codec.bench.codec import Deviation, Point, Sweep
     from pd4dgs_codec.bench.train import Run
     from pd4dgs_codec.data.view import Dataset
+    from pd4dgs_codec.quality.frames import Frame
     from pd4dgs_codec.scene import SceneInfo
-    from pd4dgs_codec.view.frames import Frame
 
 T = TypeVar("T")
 
@@ -104,7 +104,7 @@ examples:
 
 def _render(args: argparse.Namespace, console: Console) -> Outcome:
     from pd4dgs_codec.bench import pictures, render, timing
-    from pd4dgs_codec.view.levels import load_levels
+    from pd4dgs_codec.quality.levels import load_levels
 
     names = args.only or render.NAMES
     if unknown := [name for name in names if name not in render.NAMES]:
@@ -197,8 +197,8 @@ def _latency(args: argparse.Namespace, console: Console) -> Outcome:
     if args.data and len(args.data) != len(args.inputs):
         raise UsageError(f"found {len(args.data)} --data for {len(args.inputs)} files, expected one each or none")
     from pd4dgs_codec.bench import latency
+    from pd4dgs_codec.draw.warm import warm_up
     from pd4dgs_codec.interchange.teacher import load_source
-    from pd4dgs_codec.playback.warm import warm_up
 
     contents = [_with_camera(name, args.anchors) for name in args.inputs]
     sets: list[Dataset | None] = [load_source(source, downscale=args.downscale) for source in args.data]
@@ -220,7 +220,7 @@ def _latency(args: argparse.Namespace, console: Console) -> Outcome:
 def _with_camera(name: str, anchors: int | None) -> bytes:
     """The bytes of a valid file with a camera, enlarged if asked for."""
     from pd4dgs_codec.bench.latency import with_anchors
-    from pd4dgs_codec.codec.decoder import decode
+    from pd4dgs_codec.format.decoder import decode
 
     data = read_bytes(name)
     try:

@@ -54,7 +54,7 @@ def _decode(args: argparse.Namespace, console: Console) -> int:
     if args.output:
         check_output(args.output, args.overwrite)
     data = _input(args, console)
-    from pd4dgs_codec.codec.decoder import decode_partial
+    from pd4dgs_codec.format.decoder import decode_partial
 
     start = time.perf_counter()
     scene, complete = decode_partial(
@@ -78,12 +78,12 @@ main = command(parser, _decode)
 
 def _input(args: argparse.Namespace, console: Console) -> bytes:
     """The file's bytes; of a URL only those that --max-layer and --max-bytes need."""
-    from pd4dgs_codec.delivery.urls import is_url
+    from pd4dgs_codec.web.urls import is_url
 
     if not is_url(args.input):
         return read_bytes(args.input)
-    from pd4dgs_codec.delivery.prefix import fetch
-    from pd4dgs_codec.delivery.transfer import Transfer
+    from pd4dgs_codec.web.prefix import fetch
+    from pd4dgs_codec.web.transfer import Transfer
 
     with closing(Transfer(args.input)) as transfer:
         try:
@@ -118,7 +118,7 @@ def _output_kind(args: argparse.Namespace) -> str | None:
 def _npz(scene: Scene, symbols: bool) -> bytes:
     import numpy as np
 
-    from pd4dgs_codec.codec.npz import to_npz_dict
+    from pd4dgs_codec.format.npz import to_npz_dict
 
     stream = io.BytesIO()
     np.savez(stream, **to_npz_dict(scene, symbols))  # type: ignore[arg-type]
@@ -126,7 +126,7 @@ def _npz(scene: Scene, symbols: bool) -> bytes:
 
 
 def _summary(scene: Scene, data: bytes, complete: bool, seconds: float, args: argparse.Namespace) -> dict[str, Any]:
-    from pd4dgs_codec.codec.info import info
+    from pd4dgs_codec.format.info import info
 
     described = {row["layer"]: row for row in info(data)["layers"]}
     rows = []

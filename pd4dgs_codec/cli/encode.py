@@ -21,12 +21,12 @@ from pd4dgs_codec.cli.common import (
 )
 from pd4dgs_codec.cli.files import STDIO, check_output, checkpoint_scene, is_pd4, read_bytes, read_dataset, write_bytes
 from pd4dgs_codec.cli.progress import progress_bar
-from pd4dgs_codec.codec.options import CHOICES, DEFAULTS, EncodeOptions
-from pd4dgs_codec.pack import MIN_GAIN_PER_MEGABYTE
+from pd4dgs_codec.format.options import CHOICES, DEFAULTS, EncodeOptions
+from pd4dgs_codec.quality import MIN_GAIN_PER_MEGABYTE
 
 if TYPE_CHECKING:
-    from pd4dgs_codec.codec.metadata import Metadata
-    from pd4dgs_codec.pack.packing import Packed, Views
+    from pd4dgs_codec.format.metadata import Metadata
+    from pd4dgs_codec.quality.packing import Packed, Views
     from pd4dgs_codec.scene import Scene
 
 DETAILS = f"""\
@@ -117,7 +117,7 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
     options = _options(args)
     scene, trained, metadata = _load(args)
     console.detail(f"{args.input}: {len(scene.anchor_q)} anchors, layers {list(scene.layers)}, steps {scene.steps}")
-    from pd4dgs_codec.pack.packing import pack
+    from pd4dgs_codec.quality.packing import pack
 
     packed = pack(
         scene,
@@ -159,8 +159,8 @@ def _load(args: argparse.Namespace) -> tuple[Scene, bool, Metadata | None]:
     """(scene, whether it holds a checkpoint's own floats: those of a .pd4 are gone, metadata)."""
     data = read_bytes(args.input)
     if is_pd4(data):
-        from pd4dgs_codec.codec.decoder import decode
-        from pd4dgs_codec.codec.info import metadata_of
+        from pd4dgs_codec.format.decoder import decode
+        from pd4dgs_codec.format.info import metadata_of
 
         return decode(data), False, _metadata(args, metadata_of(data))
     return checkpoint_scene(args.input, data), True, _metadata(args, None)
@@ -171,7 +171,7 @@ def _metadata(args: argparse.Namespace, had: Metadata | None) -> Metadata | None
     given = {name: vars(args)[name] for name in ("title", "source", "licence") if vars(args)[name] is not None}
     if not given:
         return had
-    from pd4dgs_codec.codec.metadata import Metadata
+    from pd4dgs_codec.format.metadata import Metadata
 
     return replace(had or Metadata(), **given)
 
@@ -179,7 +179,7 @@ def _metadata(args: argparse.Namespace, had: Metadata | None) -> Metadata | None
 def _views(args: argparse.Namespace, console: Console) -> Views | None:
     if args.data is None:
         return None
-    from pd4dgs_codec.pack.packing import Views
+    from pd4dgs_codec.quality.packing import Views
 
     dataset = read_dataset(args.data, args)
     views = Views.of(dataset, args.data, args.views)
@@ -191,7 +191,7 @@ def _views(args: argparse.Namespace, console: Console) -> Views | None:
 
 def _add_train_rate(result: dict[str, Any], packed: Packed, options: EncodeOptions) -> None:
     """The trainer's own sum of R over the float values, at the steps and for the layers of this file."""
-    from pd4dgs_codec.pack.train_rate import train_rate_bits
+    from pd4dgs_codec.quality.train_rate import train_rate_bits
 
     coded = EncodeOptions(layers=options.layers, effort=options.effort, omit=options.omit)
     rows = train_rate_bits(packed.scene, coded)

@@ -36,8 +36,8 @@ def parser() -> Parser:
 
 
 def _evaluate(args: argparse.Namespace, console: Console) -> int:
-    from pd4dgs_codec.metrics.perceptual import load_perceptual
-    from pd4dgs_codec.view.evaluate import evaluate_file
+    from pd4dgs_codec.quality.evaluate import evaluate_file
+    from pd4dgs_codec.quality.perceptual import load_perceptual
 
     file = named_input(args.input)
     dataset = read_dataset(args.source, args)
@@ -58,7 +58,7 @@ main = command(parser, _evaluate)
 
 
 def _text(result: dict[str, Any]) -> str:
-    from pd4dgs_codec.view.evaluate import metric_columns
+    from pd4dgs_codec.quality.evaluate import metric_columns
 
     columns = [
         *metric_columns(result),

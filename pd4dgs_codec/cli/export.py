@@ -18,10 +18,10 @@ from pd4dgs_codec.cli.progress import progress_bar
 if TYPE_CHECKING:
     import numpy as np
 
+    from pd4dgs_codec.draw.player import Player
     from pd4dgs_codec.interchange.bake import Eyes
     from pd4dgs_codec.interchange.export import Export
     from pd4dgs_codec.interchange.splats import Splats
-    from pd4dgs_codec.playback.player import Player
     from pd4dgs_codec.scene import SceneInfo
 
 DETAILS = f"""\
@@ -123,9 +123,9 @@ def _check_folder(path: str, overwrite: bool) -> None:
 
 
 def _player(args: argparse.Namespace) -> Player:
-    from pd4dgs_codec.codec.decoder import decode
+    from pd4dgs_codec.draw.player import Player
     from pd4dgs_codec.errors import DataError
-    from pd4dgs_codec.playback.player import Player
+    from pd4dgs_codec.format.decoder import decode
 
     data = read_bytes(args.input)
     if not is_pd4(data):

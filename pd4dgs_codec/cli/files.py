@@ -34,7 +34,7 @@ def named_input(path: str) -> str | bytes:
 
 def is_pd4(data: bytes) -> bool:
     """Whether the bytes begin as a `.pd4` file does; four bytes decide, so that a damaged one still counts."""
-    from pd4dgs_codec.bitstream.container import SIGNATURE
+    from pd4dgs_codec.format.container import SIGNATURE
 
     return data.startswith(SIGNATURE[:4])
 

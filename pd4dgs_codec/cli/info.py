@@ -42,7 +42,7 @@ def parser() -> Parser:
 
 def _info(args: argparse.Namespace, console: Console) -> int:
     data, total = _input(args, console)
-    from pd4dgs_codec.codec.info import hashes, info, nearest_bounds
+    from pd4dgs_codec.format.info import hashes, info, nearest_bounds
 
     result = {"input": args.input, **info(data), "available": total}
     end = result["layers"][0]["slices"][0]["end"]
@@ -66,13 +66,13 @@ main = command(parser, _info)
 
 def _input(args: argparse.Namespace, console: Console) -> tuple[bytes, int]:
     """(bytes, length of the file): all of it, or of a URL the header alone where that suffices."""
-    from pd4dgs_codec.delivery.urls import is_url
+    from pd4dgs_codec.web.urls import is_url
 
     if not is_url(args.input):
         data = read_bytes(args.input)
         return data, len(data)
-    from pd4dgs_codec.delivery.prefix import fetch, fetch_header
-    from pd4dgs_codec.delivery.transfer import Transfer
+    from pd4dgs_codec.web.prefix import fetch, fetch_header
+    from pd4dgs_codec.web.transfer import Transfer
 
     with closing(Transfer(args.input)) as transfer:
         data = fetch(transfer) if args.check or args.bytes or args.hashes else fetch_header(transfer)
@@ -118,7 +118,7 @@ def _parts_table(result: dict[str, Any]) -> str:
 
 def _left_out(layers: list[dict[str, Any]]) -> list[dict[str, str]]:
     """Layers, deformations and residual heads that the format has room for and this file does without."""
-    from pd4dgs_codec.codec.kinds import LAYER_KINDS
+    from pd4dgs_codec.format.kinds import LAYER_KINDS
     from pd4dgs_codec.scene import TRUNK
 
     why = "the encoder found that it changes nothing visible, or was told to stop below"

@@ -16,8 +16,8 @@ from pd4dgs_codec.cli.values import positive_float
 if TYPE_CHECKING:
     import numpy as np
 
-    from pd4dgs_codec.delivery.package import Video
     from pd4dgs_codec.scene import Scene
+    from pd4dgs_codec.web.package import Video
 
 DETAILS = """\
 DIR then holds scene.pd4 and index.html: a page that plays it in a browser, from any web server that DIR is copied to.
@@ -67,7 +67,7 @@ def _package(args: argparse.Namespace, console: Console) -> int:
     if args.input != STDIO and Path(args.input).is_dir():
         return _library(args, console)
     data = read_bytes(args.input)
-    from pd4dgs_codec.delivery.package import package
+    from pd4dgs_codec.web.package import package
 
     why_not: str | None = "--no-video"
 
@@ -89,8 +89,8 @@ main = command(parser, _package)
 
 
 def _library(args: argparse.Namespace, console: Console) -> int:
-    from pd4dgs_codec.delivery.library import library
     from pd4dgs_codec.errors import DeliveryError
+    from pd4dgs_codec.web.library import library
 
     if Path(args.input).resolve() != Path(args.output).resolve():
         raise DeliveryError(f"-o {args.output}: expected {args.input}: the index of packages lies beside them")
@@ -125,11 +125,11 @@ def _video(scene: Scene, args: argparse.Namespace) -> tuple[Video | None, str | 
 def _render(scene: Scene, fps: float) -> Video:
     import tempfile
 
-    from pd4dgs_codec.delivery.package import Video
     from pd4dgs_codec.errors import RenderError
-    from pd4dgs_codec.view.frames import own_frames
-    from pd4dgs_codec.view.levels import level_of
-    from pd4dgs_codec.view.movie import check_mp4, write_mp4
+    from pd4dgs_codec.quality.frames import own_frames
+    from pd4dgs_codec.quality.levels import level_of
+    from pd4dgs_codec.quality.movie import check_mp4, write_mp4
+    from pd4dgs_codec.web.package import Video
 
     check_mp4()
     if scene.info.camera is None:  # said here, since no option can name another one
@@ -162,7 +162,7 @@ def _poster(picture: np.ndarray) -> bytes:
 
 
 def _pictures(frames: list[Any], level: Any, step: Callable[[], None] = lambda: None) -> Iterator[np.ndarray]:
-    from pd4dgs_codec.metrics.image import to_uint8
+    from pd4dgs_codec.quality.image import to_uint8
 
     for frame in frames:
         yield to_uint8(level.picture(frame.camera, frame.time))

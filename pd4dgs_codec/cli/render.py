@@ -19,8 +19,8 @@ from pd4dgs_codec.threads import load_numba
 if TYPE_CHECKING:
     import numpy as np
 
-    from pd4dgs_codec.view.frames import Frame
-    from pd4dgs_codec.view.levels import Level
+    from pd4dgs_codec.quality.frames import Frame
+    from pd4dgs_codec.quality.levels import Level
 
 DETAILS = f"""\
 Without --data the file's own camera is used, over its whole time; with --data the views of a dataset at their times.
@@ -65,10 +65,10 @@ def _render(args: argparse.Namespace, console: Console) -> int:
     if kind in VIDEOS:
         check_output(args.output, args.overwrite)
     load_numba()
-    from pd4dgs_codec.view.levels import load_levels
+    from pd4dgs_codec.quality.levels import load_levels
 
     if kind == ".mp4":
-        from pd4dgs_codec.view.movie import check_mp4
+        from pd4dgs_codec.quality.movie import check_mp4
 
         check_mp4()
     levels = load_levels(
@@ -112,7 +112,7 @@ def _check_usage(args: argparse.Namespace) -> str:
 
 def _frames(args: argparse.Namespace, level: Level) -> list[Frame]:
     from pd4dgs_codec.errors import DataError
-    from pd4dgs_codec.view.frames import dataset_frames, own_frames
+    from pd4dgs_codec.quality.frames import dataset_frames, own_frames
 
     if args.data is None:
         return own_frames(level.model.info, args.frames or 60, args.orbit, args.downscale)
@@ -127,7 +127,7 @@ def _pictures(
     frames: list[Frame], levels: list[Level], beside: bool, milliseconds: list[float], step: Callable[[], None]
 ) -> Iterator[np.ndarray]:
     """uint8 [H, W, 3] per frame: the one level, or all of them beside the true image. Times are noted per picture."""
-    from pd4dgs_codec.view.panels import Panel, level_panels, side_by_side
+    from pd4dgs_codec.quality.panels import Panel, level_panels, side_by_side
 
     for frame in frames:
         panels = level_panels(levels, frame)
@@ -140,7 +140,7 @@ def _pictures(
 
 def _write(args: argparse.Namespace, kind: str, pictures: Iterator[np.ndarray], count: int) -> int:
     """Writes all pictures; returns the number of files."""
-    from pd4dgs_codec.view.movie import write_gif, write_mp4, write_pictures
+    from pd4dgs_codec.quality.movie import write_gif, write_mp4, write_pictures
 
     if kind in VIDEOS:
         with whole_file(args.output, args.overwrite) as temporary:

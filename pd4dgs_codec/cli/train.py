@@ -213,7 +213,7 @@ def _device(name: str, console: Console) -> str:
         return "cpu"
     if not torch.cuda.is_available():
         raise TrainError("--device cuda: this PyTorch finds no CUDA device; expected one, or --device cpu")
-    from pd4dgs_codec.render.autograd import gsplat_backend
+    from pd4dgs_codec.model.autograd import gsplat_backend
 
     try:
         gsplat_backend.check()

@@ -45,10 +45,10 @@ def parser() -> Parser:
 
 
 def _view(args: argparse.Namespace, console: Console) -> int:
-    from pd4dgs_codec.delivery.link import Link
-    from pd4dgs_codec.delivery.page import PAGE, page
-    from pd4dgs_codec.delivery.server import Server
-    from pd4dgs_codec.delivery.urls import is_url
+    from pd4dgs_codec.web.link import Link
+    from pd4dgs_codec.web.page import PAGE, page
+    from pd4dgs_codec.web.server import Server
+    from pd4dgs_codec.web.urls import is_url
 
     if args.output:
         check_output(args.output, args.overwrite)
@@ -79,13 +79,13 @@ main = command(parser, _view)
 
 def _packed(source: str, console: Console) -> bytes:
     """The bytes of a `.pd4`, whole and valid; of a checkpoint those that packing it gives."""
-    from pd4dgs_codec.codec.decoder import decode
+    from pd4dgs_codec.format.decoder import decode
 
     data = read_bytes(source)
     if is_pd4(data):
         decode(data)  # a fault is better said here than in a page
         return data
-    from pd4dgs_codec.codec.encoder import encode
+    from pd4dgs_codec.format.encoder import encode
 
     scene = checkpoint_scene(source, data)
     console.message(f"{source}: packing the checkpoint")

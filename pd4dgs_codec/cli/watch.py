@@ -127,8 +127,8 @@ class WatchedProgress(TrainingProgress):
 
     def _show(self, trainer: Trainer, key: int, client: Any) -> None:
         """Draws for one browser, small at once where it moved, else in full now and then."""
-        from pd4dgs_codec.metrics.image import to_uint8
         from pd4dgs_codec.model.picture import render_image
+        from pd4dgs_codec.quality.image import to_uint8
 
         now = time.monotonic()
         if self.play.value:

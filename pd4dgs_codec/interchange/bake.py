@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from pd4dgs_codec.data.cameras import rotation_matrix
+from pd4dgs_codec.draw.player import Player
+from pd4dgs_codec.draw.visibility import LEAST_NEAR, MIN_OPACITY
 from pd4dgs_codec.interchange.splats import Splats, camera_eye, harmonics, looking, quaternions, sphere, spread, unit
-from pd4dgs_codec.model.visibility import LEAST_NEAR, MIN_OPACITY
-from pd4dgs_codec.playback.player import Player
 from pd4dgs_codec.scene import Camera
 
 #: Eyes that a bake asks: more change held-out PSNR by less than 0.01 dB.

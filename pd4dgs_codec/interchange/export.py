@@ -8,14 +8,14 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pd4dgs_codec.data.view import View
+from pd4dgs_codec.draw.player import Player
+from pd4dgs_codec.draw.visibility import near_plane
 from pd4dgs_codec.interchange.bake import Eyes, bake
 from pd4dgs_codec.interchange.refine import Target, logits, refine
 from pd4dgs_codec.interchange.splats import Splats, picture, unit
-from pd4dgs_codec.metrics.image import mpsnr
-from pd4dgs_codec.model.visibility import near_plane
-from pd4dgs_codec.playback.player import Player
+from pd4dgs_codec.quality.frames import shrunk
+from pd4dgs_codec.quality.image import mpsnr
 from pd4dgs_codec.scene import Camera
-from pd4dgs_codec.view.frames import shrunk
 
 #: Pictures to match are a whole share of the eyes' pictures' size, with no more pixels than this.
 TARGET_PIXELS = 1 << 17

@@ -11,8 +11,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from pd4dgs_codec.draw.rasteriser import Geometry, Settings, backward, composite, project
 from pd4dgs_codec.interchange.splats import Splats, camera_eye, harmonics, unit
-from pd4dgs_codec.render.rasteriser import Geometry, Settings, backward, composite, project
 from pd4dgs_codec.scene import Camera
 
 #: Steps of Adam per parameter, at the start; they end at LAST of that. Positions: in shares of a Gaussian's size.

@@ -13,7 +13,7 @@ from typing import TypeVar
 
 import numpy as np
 
-from pd4dgs_codec.render.rasteriser import draw
+from pd4dgs_codec.draw.rasteriser import draw
 from pd4dgs_codec.scene import Camera
 
 T = TypeVar("T")

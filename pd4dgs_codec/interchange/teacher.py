@@ -30,8 +30,8 @@ from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.models import Teacher, read_model
 from pd4dgs_codec.interchange.scaffold_gs import read_cameras
 from pd4dgs_codec.interchange.splats import SH_C0, looking, picture, sphere, spread
+from pd4dgs_codec.quality.frames import shrunk
 from pd4dgs_codec.scene import Camera
-from pd4dgs_codec.view.frames import shrunk
 
 PREFIX = "teacher:"
 #: Fainter Gaussians are no anchors, and do not count for where the scene is.

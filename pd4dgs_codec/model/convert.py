@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from pd4dgs_codec.attributes.quantise import mask_codes
 from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.format.quantise import mask_codes
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.masks import mask_logits
 from pd4dgs_codec.model.mlp import MLP

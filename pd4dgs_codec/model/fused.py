@@ -21,12 +21,12 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pd4dgs_codec.model import layer_kernels
-from pd4dgs_codec.model import slot_kernels as kernels
+from pd4dgs_codec.draw import layer_kernels
+from pd4dgs_codec.draw import slot_kernels as kernels
+from pd4dgs_codec.draw.simd import LANES, WIDE
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.hexplane import sample, sample_gradient
 from pd4dgs_codec.model.mlp import MLP
-from pd4dgs_codec.render.simd import LANES, WIDE
 from pd4dgs_codec.scene import LENGTH_HEADS, SCALING_DIM
 from pd4dgs_codec.threads import kernel_threads
 

@@ -16,11 +16,11 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
+from pd4dgs_codec.draw import hexplane_kernels as kernels
+from pd4dgs_codec.draw.plane_layout import TIME_AXIS, PlaneLayout
+from pd4dgs_codec.draw.simd import LANES
 from pd4dgs_codec.errors import DataError, TrainError
-from pd4dgs_codec.model import hexplane_kernels as kernels
-from pd4dgs_codec.model.plane_layout import TIME_AXIS, PlaneLayout
 from pd4dgs_codec.model.rounding import round_straight_through
-from pd4dgs_codec.render.simd import LANES
 from pd4dgs_codec.scene import PLANES
 from pd4dgs_codec.threads import kernel_threads
 

@@ -19,13 +19,13 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional as F
 
+from pd4dgs_codec.draw.visibility import FRUSTUM_MARGIN, MIN_OPACITY, OFFSET_REACH, SIGMA_REACH
 from pd4dgs_codec.model import fused
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.masks import level_mask
 from pd4dgs_codec.model.mlp import MLP
 from pd4dgs_codec.model.rounding import EXACT, Rounding, round_straight_through
 from pd4dgs_codec.model.slots import assemble, slot_linear
-from pd4dgs_codec.model.visibility import FRUSTUM_MARGIN, MIN_OPACITY, OFFSET_REACH, SIGMA_REACH
 from pd4dgs_codec.scene import (
     ATTRIBUTES,
     LOCAL_HEADS,

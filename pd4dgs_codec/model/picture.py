@@ -9,11 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pd4dgs_codec.draw.checks import check_time
+from pd4dgs_codec.draw.visibility import near_plane
+from pd4dgs_codec.model.autograd.rasterization import rasterization
 from pd4dgs_codec.model.model import Gaussians, Model, camera_tensors
 from pd4dgs_codec.model.rounding import EXACT, Rounding
-from pd4dgs_codec.model.visibility import near_plane
-from pd4dgs_codec.render.autograd.rasterization import rasterization
-from pd4dgs_codec.render.checks import check_time
 from pd4dgs_codec.scene import Camera, SceneInfo
 
 

@@ -23,11 +23,11 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pd4dgs_codec.attributes.quantise import quantise
-from pd4dgs_codec.codec.plane_choice import choose_predictor
-from pd4dgs_codec.model.plane_layout import TIME_AXIS, PlaneLayout
+from pd4dgs_codec.draw.plane_layout import TIME_AXIS, PlaneLayout
+from pd4dgs_codec.draw.simd import LANES, Tasks, Vector, kernel, load, parallel, select_gt, splat, store, total
+from pd4dgs_codec.format.plane_choice import choose_predictor
+from pd4dgs_codec.format.quantise import quantise
 from pd4dgs_codec.model.rate import channel_moments, rate_bits
-from pd4dgs_codec.render.simd import LANES, Tasks, Vector, kernel, load, parallel, select_gt, splat, store, total
 from pd4dgs_codec.scene import PLANES, Planes
 
 #: Of the planes in the order of `PLANES`: whether one axis is time.

@@ -14,8 +14,8 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pd4dgs_codec.model.plane_layout import SPATIAL, TEMPORAL, PlaneLayout
-from pd4dgs_codec.render.simd import (
+from pd4dgs_codec.draw.plane_layout import SPATIAL, TEMPORAL, PlaneLayout
+from pd4dgs_codec.draw.simd import (
     LANES,
     Tasks,
     Vector,

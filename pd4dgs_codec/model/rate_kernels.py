@@ -11,7 +11,7 @@ import math
 
 import numpy as np
 
-from pd4dgs_codec.render.simd import Tasks, kernel, parallel
+from pd4dgs_codec.draw.simd import Tasks, kernel, parallel
 
 BLOCK = 1024  #: rows
 

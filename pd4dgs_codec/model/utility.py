@@ -16,8 +16,8 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from pd4dgs_codec.codec.slicing import bits_per_row
-from pd4dgs_codec.codec.symbols import layer_symbols
+from pd4dgs_codec.format.slicing import bits_per_row
+from pd4dgs_codec.format.symbols import layer_symbols
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.harm import anchor_slopes
 from pd4dgs_codec.model.picture import render_image

@@ -9,10 +9,10 @@ import torch
 from torch import Tensor
 
 from pd4dgs_codec.data.view import Dataset
+from pd4dgs_codec.draw.simd import Tasks, parallel
 from pd4dgs_codec.model.config import ModelConfig
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model, fresh_networks
-from pd4dgs_codec.render.simd import Tasks, parallel
 from pd4dgs_codec.scene import LOCAL_HEADS, SceneInfo, Steps, Widths
 
 #: Voxels along the longest side of the scene's box.

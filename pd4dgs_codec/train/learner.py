@@ -19,12 +19,12 @@ from torch import Tensor
 
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import NotFinite
-from pd4dgs_codec.metrics.levels import level_psnr
 from pd4dgs_codec.model.config import PRESETS, ModelConfig
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.picture import Picture, render, render_image
 from pd4dgs_codec.model.plane_rate import exact_bits
 from pd4dgs_codec.model.rounding import EXACT, Noise, Rounding
+from pd4dgs_codec.quality.level_psnr import level_psnr
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.threads import keep_freed_memory
 from pd4dgs_codec.train import grading, judge, prefixes, pruning, whitening, workers

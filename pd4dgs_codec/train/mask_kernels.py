@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pd4dgs_codec.render.simd import kernel
+from pd4dgs_codec.draw.simd import kernel
 
 
 @kernel()

@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.render.simd import LANES, Tasks, fma, fnma, kernel, load, parallel, splat, store
+from pd4dgs_codec.draw.simd import LANES, Tasks, fma, fnma, kernel, load, parallel, splat, store
 
 C1, C2 = 0.01**2, 0.03**2
 TAPS = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)

@@ -13,9 +13,9 @@ import pytest
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.bench import latency, viewer
 from pd4dgs_codec.cli import bench
-from pd4dgs_codec.delivery.server import Server
+from pd4dgs_codec.draw.warm import warm_up
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.playback.warm import warm_up
+from pd4dgs_codec.web.server import Server
 
 SIZE = (24, 16)
 

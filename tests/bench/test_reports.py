@@ -16,13 +16,13 @@ from tiny import TINY, write_views
 
 from pd4dgs_codec.bench import codec, pictures, render, report, timing, train
 from pd4dgs_codec.cli import bench
-from pd4dgs_codec.codec.encoder import encode
-from pd4dgs_codec.codec.options import EncodeOptions
-from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.errors import DataError, Pd4Error
+from pd4dgs_codec.format.encoder import encode
+from pd4dgs_codec.format.options import EncodeOptions
+from pd4dgs_codec.format.plan import plan
+from pd4dgs_codec.model.autograd.rasterization import rasterization
 from pd4dgs_codec.model.config import PRESETS
-from pd4dgs_codec.render.autograd.rasterization import rasterization
-from pd4dgs_codec.view.frames import Frame
+from pd4dgs_codec.quality.frames import Frame
 
 RNG = np.random.default_rng(4)
 

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from pd4dgs_codec.attributes import quantise
 from pd4dgs_codec.bench.stability import cases, rasteriser, training
 from pd4dgs_codec.cli import bench
+from pd4dgs_codec.draw import projection
 from pd4dgs_codec.entropy import channels
 from pd4dgs_codec.errors import DataError, EncodeError
 from pd4dgs_codec.evaluate import residuals as evaluate
+from pd4dgs_codec.format import quantise
 from pd4dgs_codec.model import masks, rate
-from pd4dgs_codec.render import projection
 
 DOCS = Path(__file__).parents[2] / "docs" / "stability.md"
 KEYS = {"case", "group", "fed", "promised", "got", "error", "bound", "status"}
@@ -139,7 +139,7 @@ def test_a_near_plane_that_lets_through_fails(monkeypatch):
 
 
 def test_an_opacity_that_is_not_capped_fails(monkeypatch):
-    from pd4dgs_codec.render.autograd import reference
+    from pd4dgs_codec.model.autograd import reference
 
     monkeypatch.setattr(reference, "ALPHA_MAX", 0.99)
     assert projection.ALPHA_MAX == 0.999

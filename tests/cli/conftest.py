@@ -22,7 +22,7 @@ def model_pt(tmp_path_factory, scene) -> Path:
 
 @pytest.fixture(scope="session")
 def scene_pd4(tmp_path_factory, scene) -> Path:
-    from pd4dgs_codec.codec.encoder import encode
+    from pd4dgs_codec.format.encoder import encode
 
     path = tmp_path_factory.mktemp("file") / "scene.pd4"
     path.write_bytes(encode(scene, effort=1))

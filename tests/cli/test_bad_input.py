@@ -266,7 +266,7 @@ def test_folder_that_refuses_new_files(fails, scene_pd4, tmp_path, monkeypatch):
 def test_render_without_a_camera_says_what_to_do(fails, scene, tmp_path):
     from dataclasses import replace
 
-    from pd4dgs_codec.codec.encoder import encode
+    from pd4dgs_codec.format.encoder import encode
 
     (tmp_path / "s.pd4").write_bytes(encode(replace(scene, info=replace(scene.info, camera=None)), effort=1))
     fails("render", tmp_path / "s.pd4", "-o", tmp_path / "a.gif", says="--data")

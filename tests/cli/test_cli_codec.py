@@ -14,7 +14,7 @@ LAYER_KEYS = {"layer", "bytes", "payload_bits", "rate_bits", "position_bits", "s
 
 
 def test_encode_writes_what_the_codec_encodes(cli, model_pt, tmp_path):
-    from pd4dgs_codec.codec.encoder import encode
+    from pd4dgs_codec.format.encoder import encode
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.model.convert import to_scene
 
@@ -66,7 +66,7 @@ def test_pipes_and_repacking_give_the_same_file(cli, model_pt, scene_pd4):
 
 
 def test_decode_npz_holds_the_decoded_arrays(cli, scene_pd4, tmp_path):
-    from pd4dgs_codec.codec.decoder import decode
+    from pd4dgs_codec.format.decoder import decode
 
     output = tmp_path / "s.npz"
     assert cli("decode", scene_pd4, "-o", output, "--max-layer", 1, "--symbols").code == 0
@@ -148,7 +148,7 @@ def test_metadata_is_written_shown_and_kept(cli, scene_pd4, tmp_path):
 
 
 def test_info_compares_the_error_bounds_with_those_of_rounding(cli, scene_pd4, tmp_path, monkeypatch):
-    from pd4dgs_codec.codec import encoder
+    from pd4dgs_codec.format import encoder
 
     report = cli("info", scene_pd4, "--json", "--check").json
     assert report["nearest_bounds"] == report["error_bounds"] and report["error_bounds"]["feature"] > 0
@@ -197,7 +197,7 @@ def test_max_bytes_stops_at_a_slice(cli, tmp_path):
     from strategies import make_scene
 
     from pd4dgs_codec import decode, encode
-    from pd4dgs_codec.codec.info import info
+    from pd4dgs_codec.format.info import info
 
     data, path = encode(make_scene(3, anchors=200), slices=2000, effort=1), tmp_path / "scene.pd4"
     path.write_bytes(data)

@@ -135,7 +135,7 @@ def test_internal_error_is_one_line_and_verbose_shows_where(cli, scene_pd4, monk
     def broken(data):
         raise ZeroDivisionError("a fault of ours")
 
-    monkeypatch.setattr("pd4dgs_codec.codec.info.info", broken)
+    monkeypatch.setattr("pd4dgs_codec.format.info.info", broken)
     result = cli("info", scene_pd4)
     assert result.code == 1 and len(result.error_lines) == 1 and "internal error" in result.err
     with pytest.raises(ZeroDivisionError):

@@ -23,13 +23,13 @@ def test_eval_states_quality_and_bytes_per_level(cli, scene_pd4, shared_dataset)
 
 
 def test_eval_averages_the_views_of_each_levels_own_prefix(scene_pd4, shared_dataset):
-    from pd4dgs_codec.codec.decoder import decode
-    from pd4dgs_codec.codec.info import info
     from pd4dgs_codec.data.dataset import load
-    from pd4dgs_codec.metrics.image import mpsnr
+    from pd4dgs_codec.format.decoder import decode
+    from pd4dgs_codec.format.info import info
     from pd4dgs_codec.model.convert import from_scene
     from pd4dgs_codec.model.picture import render_image
-    from pd4dgs_codec.view.evaluate import evaluate_file
+    from pd4dgs_codec.quality.evaluate import evaluate_file
+    from pd4dgs_codec.quality.image import mpsnr
 
     data, dataset = scene_pd4.read_bytes(), load(str(shared_dataset), holdout=2)
     end = info(data)["layers"][1]["end"]
@@ -57,13 +57,13 @@ def test_eval_without_held_out_views_says_so(cli, scene_pd4, shared_dataset):
 
 def test_eval_adds_perceptual_distances_and_names_the_absent(cli, scene_pd4, shared_dataset, monkeypatch):
     from pd4dgs_codec.data.dataset import load
-    from pd4dgs_codec.metrics.perceptual import Distance, Perceptual
-    from pd4dgs_codec.view.evaluate import TEMPORAL_FRAMES
-    from pd4dgs_codec.view.levels import load_levels
+    from pd4dgs_codec.quality.evaluate import TEMPORAL_FRAMES
+    from pd4dgs_codec.quality.levels import load_levels
+    from pd4dgs_codec.quality.perceptual import Distance, Perceptual
 
     distance = Distance("MAE", "by hand", lambda a, b: np.abs(a - b).mean(axis=2))
     loaded = Perceptual({"mae": distance}, {"lpips": "it is not here"})
-    monkeypatch.setattr("pd4dgs_codec.metrics.perceptual.load_perceptual", lambda: loaded)
+    monkeypatch.setattr("pd4dgs_codec.quality.perceptual.load_perceptual", lambda: loaded)
     command = ("eval", scene_pd4, shared_dataset, "--max-layer", 1)
     result = cli(*command, "--perceptual", "--json")
     assert result.error_lines == ["no lpips: it is not here"]
@@ -84,8 +84,8 @@ def test_eval_adds_perceptual_distances_and_names_the_absent(cli, scene_pd4, sha
 
 def test_render_dataset_views_as_the_renderer_sees_them(cli, scene_pd4, shared_dataset, tmp_path):
     from pd4dgs_codec.data.dataset import load
-    from pd4dgs_codec.metrics.image import to_uint8
-    from pd4dgs_codec.view.levels import load_levels
+    from pd4dgs_codec.quality.image import to_uint8
+    from pd4dgs_codec.quality.levels import load_levels
 
     options = ("--data", shared_dataset, "--split", "train", "--max-layer", 1, "--json")
     result = cli("render", scene_pd4, "-o", tmp_path / "out" / "%02d.png", *options)

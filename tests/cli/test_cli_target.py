@@ -15,7 +15,7 @@ FAST = ("--mode", "lzma", "--effort", 1, "--json", "-f")
 @pytest.fixture(autouse=True)
 def _few_values(monkeypatch):
     """Each value costs an encode and its pictures: a few do here."""
-    from pd4dgs_codec.pack import packing, target
+    from pd4dgs_codec.quality import packing, target
 
     monkeypatch.setattr(target, "OCTAVES", (0.0, 1.5, 3.0))
     monkeypatch.setattr(target, "SHARES", (0.0, 0.1, 0.5))
@@ -44,7 +44,7 @@ def test_a_target_is_met_with_less_loss_than_one_factor_on_all_steps_makes(cli, 
 
 
 def unquantised(model_pt):
-    from pd4dgs_codec.codec.plan import plan
+    from pd4dgs_codec.format.plan import plan
     from pd4dgs_codec.model import checkpoint
     from pd4dgs_codec.model.convert import to_scene
 
@@ -52,18 +52,18 @@ def unquantised(model_pt):
 
 
 def scaled_size(model_pt, scale: float) -> int:
-    from pd4dgs_codec.codec.encoder import encode
-    from pd4dgs_codec.codec.info import info
+    from pd4dgs_codec.format.encoder import encode
+    from pd4dgs_codec.format.info import info
 
     data = encode(unquantised(model_pt), step_scale=scale, mode="lzma", effort=1, verify=False)
     return info(data)["layers"][0]["end"]
 
 
 def scaled_error(model_pt, scale: float) -> float:
-    from pd4dgs_codec.codec.plan import plan
-    from pd4dgs_codec.codec.symbols import rounded
-    from pd4dgs_codec.pack.rendered import RenderedLoss
-    from pd4dgs_codec.view.frames import own_frames
+    from pd4dgs_codec.format.plan import plan
+    from pd4dgs_codec.format.symbols import rounded
+    from pd4dgs_codec.quality.frames import own_frames
+    from pd4dgs_codec.quality.rendered import RenderedLoss
 
     scene = unquantised(model_pt)
     coarse = replace(scene, steps=scene.steps.scaled(scale))
@@ -105,14 +105,14 @@ def test_layers_that_do_not_pay_are_left_out_with_their_figures(cli, model_pt, s
 
 
 def test_a_layer_that_explains_the_pictures_is_kept(scene):
-    from pd4dgs_codec.codec.options import EncodeOptions
-    from pd4dgs_codec.codec.plan import plan
-    from pd4dgs_codec.codec.symbols import rounded
     from pd4dgs_codec.data.view import View
-    from pd4dgs_codec.metrics.image import to_uint8
+    from pd4dgs_codec.format.options import EncodeOptions
+    from pd4dgs_codec.format.plan import plan
+    from pd4dgs_codec.format.symbols import rounded
     from pd4dgs_codec.model.convert import from_scene
     from pd4dgs_codec.model.picture import render_image
-    from pd4dgs_codec.pack.gains import leave_out_unpaid
+    from pd4dgs_codec.quality.gains import leave_out_unpaid
+    from pd4dgs_codec.quality.image import to_uint8
 
     camera, model = scene.info.camera, from_scene(rounded(plan(scene)[0]))
     views = []
@@ -124,10 +124,10 @@ def test_a_layer_that_explains_the_pictures_is_kept(scene):
 
 
 def test_harm_is_about_the_error_that_leaving_an_anchor_out_makes(scene, monkeypatch):
-    from pd4dgs_codec.codec.plan import plan
+    from pd4dgs_codec.format.plan import plan
     from pd4dgs_codec.model import harm as harm_of
-    from pd4dgs_codec.pack.rendered import RenderedLoss
-    from pd4dgs_codec.view.frames import own_frames
+    from pd4dgs_codec.quality.frames import own_frames
+    from pd4dgs_codec.quality.rendered import RenderedLoss
 
     monkeypatch.setattr(harm_of, "PROBES", 64)  # the anchors differ less here than in a trained scene
     planned = plan(scene)[0]

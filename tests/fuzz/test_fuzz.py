@@ -18,14 +18,14 @@ from fuzzing import check, damage, files, mutate
 from strategies import assert_same_scene, make_scene
 
 from pd4dgs_codec import decode, encode
-from pd4dgs_codec.codec.attribute_section import CONTINUED
-from pd4dgs_codec.codec.decoder import decode_layers
-from pd4dgs_codec.codec.layer_meta import NETWORKS, ROWS, SCALES, Section
-from pd4dgs_codec.codec.metadata import CHUNK_TYPE
-from pd4dgs_codec.codec.stages import PLAIN, STAGED
 from pd4dgs_codec.entropy.priors import FIRST_REUSE, FREE_ENTRIES, GAUSS, MAX_WINDOW
 from pd4dgs_codec.entropy.varint import put_varint
 from pd4dgs_codec.errors import DecodeError, EncodeError, LimitExceeded
+from pd4dgs_codec.format.attribute_section import CONTINUED
+from pd4dgs_codec.format.decoder import decode_layers
+from pd4dgs_codec.format.layer_meta import NETWORKS, ROWS, SCALES, Section
+from pd4dgs_codec.format.metadata import CHUNK_TYPE
+from pd4dgs_codec.format.stages import PLAIN, STAGED
 
 
 @cache
@@ -433,9 +433,8 @@ def test_a_hundred_thousand_damages_of_real_files_are_caught():
 @pytest.mark.slow
 def test_checks_take_a_twelfth_of_decoding(monkeypatch):
     """Checksums, scene id, header, parameters, tables, ranges, duplicates, finiteness, timed where they are called."""
-    from pd4dgs_codec.bitstream import container
-    from pd4dgs_codec.codec import decoder, payload
     from pd4dgs_codec.entropy import ans
+    from pd4dgs_codec.format import container, decoder, payload
 
     options = {"channels": 16, "sides": (64, 64, 64, 40), "hidden": (32,), "width": 32}
     data = encode(make_scene(1, anchors=20_000, extent=60, kind="gaussian", **options), layers=2, effort=1)

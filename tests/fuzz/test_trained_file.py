@@ -4,8 +4,8 @@ import pytest
 from fuzzing import damage
 
 from pd4dgs_codec import decode
-from pd4dgs_codec.codec.encoder import encode
 from pd4dgs_codec.errors import DecodeError
+from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.scene import Steps
 
 

@@ -7,9 +7,9 @@ from dataclasses import replace
 import pytest
 from tiny import trained_like_scene
 
-from pd4dgs_codec.codec.decoder import decode
-from pd4dgs_codec.codec.encoder import encode
-from pd4dgs_codec.playback.player import Player
+from pd4dgs_codec.draw.player import Player
+from pd4dgs_codec.format.decoder import decode
+from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.scene import Scene
 
 

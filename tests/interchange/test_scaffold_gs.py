@@ -14,9 +14,9 @@ import torch
 from tiny import camera_ahead
 from torch import nn
 
-from pd4dgs_codec.codec.decoder import decode
-from pd4dgs_codec.codec.encoder import encode
 from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.format.decoder import decode
+from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.interchange.scaffold_gs import Choices, read_scaffold_gs
 from pd4dgs_codec.interchange.tensors import read_tensors
 from pd4dgs_codec.model import checkpoint

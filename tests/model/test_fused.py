@@ -6,11 +6,11 @@ import torch
 from test_model import ALL_HEADS, CAMERA, small_model, stir
 from torch.nn import functional as F
 
-from pd4dgs_codec.model import fused, layer_kernels
+from pd4dgs_codec.draw import layer_kernels, simd
+from pd4dgs_codec.model import fused
 from pd4dgs_codec.model.mlp import MLP
 from pd4dgs_codec.model.model import Gaussians, Model
 from pd4dgs_codec.model.rounding import EXACT, Noise, Rounding
-from pd4dgs_codec.render import simd
 from pd4dgs_codec.scene import Widths
 
 PARTS = ("means", "quats", "scales", "opacities", "colors")

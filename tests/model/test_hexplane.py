@@ -5,9 +5,9 @@ import pytest
 import torch
 
 from pd4dgs_codec import threads
+from pd4dgs_codec.draw.plane_layout import PlaneLayout
 from pd4dgs_codec.errors import DataError, TrainError
 from pd4dgs_codec.model.hexplane import HexPlane, _Sample, sample_reference
-from pd4dgs_codec.model.plane_layout import PlaneLayout
 from pd4dgs_codec.model.plane_regularisers import TERMS, regularisers, regularisers_reference
 from pd4dgs_codec.model.rounding import round_straight_through
 from pd4dgs_codec.scene import PLANES

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from pd4dgs_codec.codec.encoder import encode_with_report
-from pd4dgs_codec.model.plane_layout import PlaneLayout
+from pd4dgs_codec.draw.plane_layout import PlaneLayout
+from pd4dgs_codec.format.encoder import encode_with_report
 from pd4dgs_codec.model.plane_rate import exact_bits, proxy_bits, proxy_bits_reference
 from pd4dgs_codec.scene import PLANES
 

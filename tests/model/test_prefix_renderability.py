@@ -11,8 +11,8 @@ from hypothesis import strategies as st
 from strategies import LAYER_SETS, RANGES, make_scene, scenes
 
 from pd4dgs_codec import decode, encode
-from pd4dgs_codec.codec.info import info
 from pd4dgs_codec.errors import RenderError
+from pd4dgs_codec.format.info import info
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.scene import Camera, Deformation, Scene

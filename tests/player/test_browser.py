@@ -26,11 +26,8 @@ from strategies import make_scene
 from tiny import TINY, disc
 
 from pd4dgs_codec import decode, encode, show
-from pd4dgs_codec.codec.info import info
-from pd4dgs_codec.delivery.link import Link
-from pd4dgs_codec.delivery.page import page as packed_page
-from pd4dgs_codec.delivery.server import Server
 from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.format.info import info
 from pd4dgs_codec.scene import (
     DEFAULT_WIDTHS,
     LOCAL_HEADS,
@@ -43,6 +40,9 @@ from pd4dgs_codec.scene import (
     Steps,
     Widths,
 )
+from pd4dgs_codec.web.link import Link
+from pd4dgs_codec.web.page import page as packed_page
+from pd4dgs_codec.web.server import Server
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "tools"))

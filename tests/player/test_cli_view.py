@@ -14,9 +14,9 @@ import pytest
 from strategies import make_scene
 
 from pd4dgs_codec import decode, encode, show
-from pd4dgs_codec.delivery.page import page as whole_page
 from pd4dgs_codec.model.checkpoint import save
 from pd4dgs_codec.model.convert import from_scene
+from pd4dgs_codec.web.page import page as whole_page
 
 ROOT = Path(__file__).parents[2]
 

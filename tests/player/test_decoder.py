@@ -18,12 +18,11 @@ import pytest
 from strategies import make_scene, small_file
 
 from pd4dgs_codec import decode, encode
-from pd4dgs_codec.bitstream import canonical
-from pd4dgs_codec.bitstream.container import read_chunk, read_preamble, write_chunk, write_preamble
-from pd4dgs_codec.codec import header, layer_meta
-from pd4dgs_codec.codec.header import scene_id_of
-from pd4dgs_codec.codec.info import hashes, info
 from pd4dgs_codec.errors import DecodeError
+from pd4dgs_codec.format import canonical, header, layer_meta
+from pd4dgs_codec.format.container import read_chunk, read_preamble, write_chunk, write_preamble
+from pd4dgs_codec.format.header import scene_id_of
+from pd4dgs_codec.format.info import hashes, info
 from pd4dgs_codec.scene import Widths
 
 ROOT = Path(__file__).parents[2]

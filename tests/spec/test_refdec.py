@@ -17,17 +17,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from strategies import LAYER_SETS, make_scene, scenes
 
-from pd4dgs_codec.attributes.quantise import MAX_SYMBOL, dequantise
-from pd4dgs_codec.bitstream import canonical
-from pd4dgs_codec.bitstream.container import read_chunk, read_preamble, write_chunk, write_preamble
-from pd4dgs_codec.codec.attribute_section import read_attributes
-from pd4dgs_codec.codec.decoder import decode
-from pd4dgs_codec.codec.encoder import encode
-from pd4dgs_codec.codec.header import scene_id_of
-from pd4dgs_codec.codec.info import hashes
-from pd4dgs_codec.codec.layer_meta import Section
-from pd4dgs_codec.codec.plane_section import read_planes
-from pd4dgs_codec.codec.stages import PLAIN, STAGED
 from pd4dgs_codec.entropy.channels import encode_channels
 from pd4dgs_codec.entropy.lzma_mode import encode_channels_lzma
 from pd4dgs_codec.entropy.positions import encode_positions, position_channels
@@ -35,6 +24,17 @@ from pd4dgs_codec.entropy.priors import CONST, GAUSS, GMM2, HIST, K_MAX
 from pd4dgs_codec.entropy.tables import NORMAL, OCTAVE
 from pd4dgs_codec.entropy.varint import put_varint, put_zigzag
 from pd4dgs_codec.errors import DecodeError
+from pd4dgs_codec.format import canonical
+from pd4dgs_codec.format.attribute_section import read_attributes
+from pd4dgs_codec.format.container import read_chunk, read_preamble, write_chunk, write_preamble
+from pd4dgs_codec.format.decoder import decode
+from pd4dgs_codec.format.encoder import encode
+from pd4dgs_codec.format.header import scene_id_of
+from pd4dgs_codec.format.info import hashes
+from pd4dgs_codec.format.layer_meta import Section
+from pd4dgs_codec.format.plane_section import read_planes
+from pd4dgs_codec.format.quantise import MAX_SYMBOL, dequantise
+from pd4dgs_codec.format.stages import PLAIN, STAGED
 from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import Widths
 

@@ -11,12 +11,12 @@ from pathlib import Path
 import pytest
 from vectors.reference import Reference, reference_source
 
-from pd4dgs_codec.bitstream.container import read_preamble
-from pd4dgs_codec.codec.decoder import decode_partial
-from pd4dgs_codec.codec.header import unpack_header
-from pd4dgs_codec.codec.info import hashes
-from pd4dgs_codec.codec.stream import open_stream
 from pd4dgs_codec.errors import DecodeError
+from pd4dgs_codec.format.container import read_preamble
+from pd4dgs_codec.format.decoder import decode_partial
+from pd4dgs_codec.format.header import unpack_header
+from pd4dgs_codec.format.info import hashes
+from pd4dgs_codec.format.stream import open_stream
 
 ROOT = Path(__file__).parents[2]
 SPEC, VECTORS, TOOL = ROOT / "spec", ROOT / "spec" / "vectors", ROOT / "tools" / "make_vectors.py"

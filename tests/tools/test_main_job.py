@@ -17,9 +17,9 @@ from PIL import Image
 from tiny import HEIGHT, TINY, WIDTH, disc
 
 from pd4dgs_codec import decode
-from pd4dgs_codec.codec.encoder import encode_with_report
-from pd4dgs_codec.codec.info import info
 from pd4dgs_codec.errors import TrainError
+from pd4dgs_codec.format.encoder import encode_with_report
+from pd4dgs_codec.format.info import info
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import PRESETS
 from pd4dgs_codec.model.convert import to_scene

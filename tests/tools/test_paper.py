@@ -12,10 +12,10 @@ from pages.paper.published import FIRST_FRAME
 from pages.paper.runs import FULL, MONOLITHIC, SCAFFOLD, Run, Scene, at_rate, held_to, measure
 from tiny import TINY, disc, write_views
 
-from pd4dgs_codec.codec.options import EncodeOptions
+from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import PRESETS
-from pd4dgs_codec.pack import target
+from pd4dgs_codec.quality import target
 from pd4dgs_codec.train.config import TrainConfig
 
 TOOL = Path(__file__).resolve().parents[2] / "tools" / "paper.py"

@@ -10,8 +10,8 @@ from pages import peers
 from strategies import make_scene
 
 from pd4dgs_codec.bench import timing
-from pd4dgs_codec.codec.decoder import decode_layers
-from pd4dgs_codec.codec.encoder import encode
+from pd4dgs_codec.format.decoder import decode_layers
+from pd4dgs_codec.format.encoder import encode
 
 RNG = np.random.default_rng(4)
 

@@ -4,11 +4,11 @@ import numpy as np
 import pytest
 import torch
 
-from pd4dgs_codec.codec.encoder import encode_with_report
+from pd4dgs_codec.format.encoder import encode_with_report
 from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.model.harm import step_harm
 from pd4dgs_codec.model.picture import render_image
-from pd4dgs_codec.pack.train_rate import train_rate_bits
+from pd4dgs_codec.quality.train_rate import train_rate_bits
 from pd4dgs_codec.scene import ATTRIBUTES, MAX_CLASS
 from pd4dgs_codec.train import grading, losses, pruning
 from pd4dgs_codec.train.config import TrainConfig

@@ -6,8 +6,8 @@ from dataclasses import replace
 import pytest
 from runs import assert_same_weights, read_log
 
-from pd4dgs_codec.codec.decoder import decode
-from pd4dgs_codec.codec.encoder import encode
+from pd4dgs_codec.format.decoder import decode
+from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.train import judge

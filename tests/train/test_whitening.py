@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from pd4dgs_codec.codec.encoder import encode
+from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.model.rounding import EXACT

@@ -22,14 +22,14 @@ from typing import Any
 from fuzzing.files import digests
 from fuzzing.mutate import Case
 from pd4dgs_codec import decode, open_stream
-from pd4dgs_codec.bitstream.container import CHUNK_OVERHEAD, read_chunk, read_preamble
-from pd4dgs_codec.codec.decoder import decode_partial
-from pd4dgs_codec.codec.header import unpack_header
-from pd4dgs_codec.codec.info import hashes, info
-from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
-from pd4dgs_codec.codec.layer_meta import Declared, check_declared
-from pd4dgs_codec.codec.payload import read_meta
 from pd4dgs_codec.errors import DecodeError, Truncated
+from pd4dgs_codec.format.container import CHUNK_OVERHEAD, read_chunk, read_preamble
+from pd4dgs_codec.format.decoder import decode_partial
+from pd4dgs_codec.format.header import unpack_header
+from pd4dgs_codec.format.info import hashes, info
+from pd4dgs_codec.format.kinds import BY_CHUNK_TYPE
+from pd4dgs_codec.format.layer_meta import Declared, check_declared
+from pd4dgs_codec.format.payload import read_meta
 
 MAX_SECONDS = 2.0  #: of processor time, per input
 #: Peak memory of decoding is at most these times the symbols declared, the bytes given, and a constant, a larger one

@@ -18,12 +18,12 @@ import numpy as np
 
 from fuzzing.check import DECODED, Finding
 from fuzzing.mutate import CHANGES, truncate
-from pd4dgs_codec.bitstream.container import CHUNK_OVERHEAD, read_preamble
-from pd4dgs_codec.codec import decoder
-from pd4dgs_codec.codec.header import unpack_header
-from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
-from pd4dgs_codec.codec.symbols import LayerSymbols, merged
 from pd4dgs_codec.errors import DecodeError, Truncated
+from pd4dgs_codec.format import decoder
+from pd4dgs_codec.format.container import CHUNK_OVERHEAD, read_preamble
+from pd4dgs_codec.format.header import unpack_header
+from pd4dgs_codec.format.kinds import BY_CHUNK_TYPE
+from pd4dgs_codec.format.symbols import LayerSymbols, merged
 
 BOUNDARY = 8  #: bytes to each side of a boundary
 CUTS_PER_CHANGE = 0.02

@@ -18,17 +18,16 @@ from strategies import LAYER_SETS, RANGES, make_scene
 from vectors import blocks, refining, slices
 
 from pd4dgs_codec import encode
-from pd4dgs_codec.attributes.quantise import dequantise
-from pd4dgs_codec.bitstream import canonical
-from pd4dgs_codec.bitstream.container import read_chunk, read_preamble, write_chunk, write_preamble
-from pd4dgs_codec.codec import attribute_section, layer_meta, stages
-from pd4dgs_codec.codec import header as header_module
-from pd4dgs_codec.codec.decoder import LayerReader, decode_layers
-from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
-from pd4dgs_codec.codec.layer_meta import Section
-from pd4dgs_codec.codec.metadata import Metadata
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint
 from pd4dgs_codec.errors import DecodeError
+from pd4dgs_codec.format import attribute_section, canonical, layer_meta, stages
+from pd4dgs_codec.format import header as header_module
+from pd4dgs_codec.format.container import read_chunk, read_preamble, write_chunk, write_preamble
+from pd4dgs_codec.format.decoder import LayerReader, decode_layers
+from pd4dgs_codec.format.kinds import BY_CHUNK_TYPE
+from pd4dgs_codec.format.layer_meta import Section
+from pd4dgs_codec.format.metadata import Metadata
+from pd4dgs_codec.format.quantise import dequantise
 from pd4dgs_codec.scene import DEFAULT_WIDTHS, Scene, Widths
 
 

@@ -15,7 +15,9 @@ from dataclasses import dataclass
 from typing import Any
 
 from fuzzing.files import Chunk, Parts, Seed, put_together, take_apart, take_stages
-from pd4dgs_codec.bitstream.container import (
+from pd4dgs_codec.entropy.varint import put_varint
+from pd4dgs_codec.errors import EncodeError
+from pd4dgs_codec.format.container import (
     CHUNK_HEAD_SIZE,
     FLAG_MORE,
     SIGNATURE,
@@ -23,11 +25,9 @@ from pd4dgs_codec.bitstream.container import (
     read_preamble,
     slice_flags,
 )
-from pd4dgs_codec.codec.header import STEPS, VOXEL_SIZE
-from pd4dgs_codec.codec.kinds import BY_CHUNK_TYPE
-from pd4dgs_codec.codec.layer_meta import Section
-from pd4dgs_codec.entropy.varint import put_varint
-from pd4dgs_codec.errors import EncodeError
+from pd4dgs_codec.format.header import STEPS, VOXEL_SIZE
+from pd4dgs_codec.format.kinds import BY_CHUNK_TYPE
+from pd4dgs_codec.format.layer_meta import Section
 
 _POWERS = (7, 8, 12, 14, 15, 16, 20, 21, 22, 23, 24, 26, 28, 31, 32)
 #: Around every limit of the format and every width of an integer.

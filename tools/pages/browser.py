@@ -19,8 +19,8 @@ import numpy as np
 
 from pages.page import ROOT
 from pd4dgs_codec import decode
+from pd4dgs_codec.draw.player import Player
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.playback.player import Player
 from pd4dgs_codec.scene import MASK_THRESHOLD, Camera, Scene
 
 PLAYER = ROOT / "player"

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec import decode, encode
-from pd4dgs_codec.codec.plan import plan
+from pd4dgs_codec.format.plan import plan
 from pd4dgs_codec.scene import Scene
 
 try:

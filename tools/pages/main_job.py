@@ -14,18 +14,18 @@ from pages.draco import draco_encode
 from pages.pictures import draw_levels
 from pages.trainings import ensure_trained
 from pd4dgs_codec.atomic import whole_file, whole_files, write_bytes
-from pd4dgs_codec.codec.encoder import LayerReport, Report, encode, encode_with_report
-from pd4dgs_codec.codec.options import EncodeOptions
-from pd4dgs_codec.codec.plan import plan
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.data.view import Dataset
+from pd4dgs_codec.format.encoder import LayerReport, Report, encode, encode_with_report
+from pd4dgs_codec.format.options import EncodeOptions
+from pd4dgs_codec.format.plan import plan
 from pd4dgs_codec.jsonable import finite
 from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.model.model import Model
-from pd4dgs_codec.pack.train_rate import train_rate_bits
+from pd4dgs_codec.quality.evaluate import evaluate_file
+from pd4dgs_codec.quality.train_rate import train_rate_bits
 from pd4dgs_codec.scene import Scene
 from pd4dgs_codec.train.config import Schedule, TrainConfig
-from pd4dgs_codec.view.evaluate import evaluate_file
 
 #: Encodings whose sizes stand side by side; "ans" is the file that is evaluated and kept.
 VARIANTS: dict[str, dict[str, str]] = {

@@ -18,20 +18,20 @@ from pages.draco import draco_encode
 from pd4dgs_codec.bench.pictures import draw_all, view
 from pd4dgs_codec.bench.report import markdown
 from pd4dgs_codec.bench.timing import Timing, measure
-from pd4dgs_codec.codec.attribute_section import read_attributes, write_attributes
-from pd4dgs_codec.codec.layer_meta import Section
-from pd4dgs_codec.codec.payload import GROUPS, channel_groups
-from pd4dgs_codec.codec.plane_choice import choose_predictor
-from pd4dgs_codec.codec.plane_section import read_planes, write_planes
-from pd4dgs_codec.codec.symbols import LayerSymbols
 from pd4dgs_codec.entropy.bits import gaussian_bits
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
 from pd4dgs_codec.entropy.lzma_mode import decode_channels_lzma, encode_channels_lzma
 from pd4dgs_codec.entropy.positions import decode_positions, encode_positions
 from pd4dgs_codec.errors import Pd4Error
+from pd4dgs_codec.format.attribute_section import read_attributes, write_attributes
+from pd4dgs_codec.format.layer_meta import Section
+from pd4dgs_codec.format.payload import GROUPS, channel_groups
+from pd4dgs_codec.format.plane_choice import choose_predictor
+from pd4dgs_codec.format.plane_section import read_planes, write_planes
+from pd4dgs_codec.format.symbols import LayerSymbols
 from pd4dgs_codec.interchange.libraries import quiet
-from pd4dgs_codec.view.frames import Frame
-from pd4dgs_codec.view.levels import Level
+from pd4dgs_codec.quality.frames import Frame
+from pd4dgs_codec.quality.levels import Level
 
 #: What peers are made of.
 PACKAGES = ("zstandard", "torchac", "DracoPy", "gaussforge", "fourdgs")

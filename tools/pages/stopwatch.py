@@ -31,7 +31,7 @@ def timed(work: Callable[[], Any]) -> tuple[Any, dict[str, float]]:
 def encode(checkpoint: str, file: str, effort: str) -> dict[str, float]:
     """Of a loaded scene, kernels warm; writes `file`. memory: MiB at the most, beside the scene and the
     kernels."""
-    from pd4dgs_codec.codec.encoder import encode_with_report
+    from pd4dgs_codec.format.encoder import encode_with_report
     from pd4dgs_codec.model.checkpoint import load
     from pd4dgs_codec.model.convert import to_scene
 
@@ -68,8 +68,8 @@ def decode(checkpoint: str, file: str, effort: str) -> dict[str, float]:
 def draw(checkpoint: str, file: str, effort: str) -> dict[str, float]:
     """One picture of the top level, the mean of several at as many times, after a first that is not timed."""
     try:
-        from pd4dgs_codec.view.frames import own_frames
-        from pd4dgs_codec.view.levels import load_levels
+        from pd4dgs_codec.quality.frames import own_frames
+        from pd4dgs_codec.quality.levels import load_levels
     except ImportError:
         from pd4dgs_codec.report.frames import own_frames  # type: ignore[import-not-found,no-redef]
         from pd4dgs_codec.report.levels import load_levels  # type: ignore[import-not-found,no-redef]
@@ -160,12 +160,12 @@ def parts(checkpoint: str, file: str, effort: str) -> dict[str, float]:
     """Processor seconds of encoding, of decoding and of a picture, kernels warm, by what they go to: "work: part"."""
     from parts import Stopwatch
 
-    from pd4dgs_codec.codec import decoder, encoder, payload
+    from pd4dgs_codec.draw import player
+    from pd4dgs_codec.format import decoder, encoder, payload
     from pd4dgs_codec.model.checkpoint import load
     from pd4dgs_codec.model.convert import to_scene
-    from pd4dgs_codec.playback import player
-    from pd4dgs_codec.view.frames import own_frames
-    from pd4dgs_codec.view.levels import load_levels
+    from pd4dgs_codec.quality.frames import own_frames
+    from pd4dgs_codec.quality.levels import load_levels
 
     stopwatch, scene = Stopwatch(), to_scene(load(checkpoint)[0])
     level = load_levels(file)[-1]
@@ -223,9 +223,9 @@ def grow(checkpoint: str, file: str, anchors: str) -> dict[str, float]:
     import numpy as np
 
     from pd4dgs_codec import decode
-    from pd4dgs_codec.codec.encoder import encode_with_report
-    from pd4dgs_codec.codec.symbols import float_tensors
     from pd4dgs_codec.entropy.fitting import loops
+    from pd4dgs_codec.format.encoder import encode_with_report
+    from pd4dgs_codec.format.symbols import float_tensors
     from pd4dgs_codec.model.checkpoint import load
     from pd4dgs_codec.model.convert import to_scene
 
@@ -289,8 +289,8 @@ def beside(checkpoint: str, file: str, effort: str) -> dict[str, float]:
     import numpy as np
 
     from pd4dgs_codec import decode, encode
-    from pd4dgs_codec.codec.attribute_section import read_attributes, write_attributes
-    from pd4dgs_codec.codec.decoder import decode_layers
+    from pd4dgs_codec.format.attribute_section import read_attributes, write_attributes
+    from pd4dgs_codec.format.decoder import decode_layers
 
     data = Path(file).read_bytes()
     layer = decode_layers(data)[1][0]

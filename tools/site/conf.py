@@ -149,7 +149,7 @@ def write_api(app: Any) -> None:
 INDEX = """\
 What most programs need can be imported from the package itself. A decoded file is a
 :class:`~pd4dgs_codec.scene.Scene`, a refused one a :exc:`~pd4dgs_codec.errors.DecodeError`. Scenes from a web server
-come from a :class:`~pd4dgs_codec.delivery.client.SceneClient`.
+come from a :class:`~pd4dgs_codec.web.client.SceneClient`.
 
 .. autofunction:: pd4dgs_codec.decode
 .. autofunction:: pd4dgs_codec.open_stream

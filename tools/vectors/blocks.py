@@ -16,15 +16,6 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
-from pd4dgs_codec.attributes.planes import residual
-from pd4dgs_codec.attributes.quantise import dequantise
-from pd4dgs_codec.attributes.table import NO_CLASSES, Grid
-from pd4dgs_codec.bitstream import canonical
-from pd4dgs_codec.bitstream.container import MAJOR, SCENE_ID_SIZE, SIGNATURE, slice_flags
-from pd4dgs_codec.codec.header import payload_digest
-from pd4dgs_codec.codec.kinds import LAYER_KINDS
-from pd4dgs_codec.codec.layer_meta import Section
-from pd4dgs_codec.codec.symbols import LayerSymbols, merged
 from pd4dgs_codec.entropy.ans import ans_encode
 from pd4dgs_codec.entropy.positions import position_channels
 from pd4dgs_codec.entropy.priors import (
@@ -40,6 +31,15 @@ from pd4dgs_codec.entropy.priors import (
 )
 from pd4dgs_codec.entropy.tables import uniform_table
 from pd4dgs_codec.entropy.varint import put_varint, put_zigzag
+from pd4dgs_codec.format import canonical
+from pd4dgs_codec.format.container import MAJOR, SCENE_ID_SIZE, SIGNATURE, slice_flags
+from pd4dgs_codec.format.header import payload_digest
+from pd4dgs_codec.format.kinds import LAYER_KINDS
+from pd4dgs_codec.format.layer_meta import Section
+from pd4dgs_codec.format.planes import residual
+from pd4dgs_codec.format.quantise import dequantise
+from pd4dgs_codec.format.symbols import LayerSymbols, merged
+from pd4dgs_codec.format.table import NO_CLASSES, Grid
 from pd4dgs_codec.scene import ATTRIBUTES, DEFAULT_WIDTHS, PLANES, Widths
 
 from . import lzma2

@@ -9,9 +9,8 @@ from dataclasses import replace
 
 import numpy as np
 
-from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
-from pd4dgs_codec.bitstream import canonical
-from pd4dgs_codec.bitstream.limits import (
+from pd4dgs_codec.format import canonical
+from pd4dgs_codec.format.limits import (
     MAX_ANCHORS,
     MAX_CHUNKS,
     MAX_HEADER,
@@ -23,6 +22,7 @@ from pd4dgs_codec.bitstream.limits import (
     MAX_PLANE_SCALES,
     MAX_PLANE_SIDE,
 )
+from pd4dgs_codec.format.quantise import MAX_SYMBOL
 from pd4dgs_codec.scene import Widths
 
 from . import faulty_coding

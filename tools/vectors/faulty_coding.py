@@ -9,7 +9,6 @@ from dataclasses import replace
 
 import numpy as np
 
-from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
 from pd4dgs_codec.entropy.ans import MAX_COUNT, ans_encode
 from pd4dgs_codec.entropy.priors import (
     FIRST_REUSE,
@@ -25,6 +24,7 @@ from pd4dgs_codec.entropy.priors import (
     write_prior,
 )
 from pd4dgs_codec.entropy.varint import VARINT_MAX
+from pd4dgs_codec.format.quantise import MAX_SYMBOL
 from pd4dgs_codec.morton import MAX_VOXEL
 
 from . import lzma2

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.attributes.table import NO_CLASSES
 from pd4dgs_codec.entropy.priors import Gauss, Hist, Mixture, Normal, Prior, Window
+from pd4dgs_codec.format.table import NO_CLASSES
 from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import DEFAULT_WIDTHS, Widths
 

@@ -8,9 +8,9 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
-from pd4dgs_codec.bitstream.limits import MAX_CHUNKS
 from pd4dgs_codec.entropy.priors import CLASS_STEPS, MORE_ENTRIES, Hist, Prior, Window
+from pd4dgs_codec.format.limits import MAX_CHUNKS
+from pd4dgs_codec.format.quantise import MAX_SYMBOL
 from pd4dgs_codec.scene import Widths
 
 from .blocks import (

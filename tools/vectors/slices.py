@@ -8,9 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.bitstream.limits import MAX_CHUNKS
-from pd4dgs_codec.codec.layer_meta import FREE_ROWS, ROWS_PER_BYTE
-from pd4dgs_codec.codec.symbols import LayerSymbols
 from pd4dgs_codec.entropy.priors import (
     CLASS_STEPS,
     FIRST_REUSE,
@@ -20,6 +17,9 @@ from pd4dgs_codec.entropy.priors import (
     Hist,
     Window,
 )
+from pd4dgs_codec.format.layer_meta import FREE_ROWS, ROWS_PER_BYTE
+from pd4dgs_codec.format.limits import MAX_CHUNKS
+from pd4dgs_codec.format.symbols import LayerSymbols
 
 from .blocks import (
     ATTRIBUTE,

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import replace
 
-from pd4dgs_codec.bitstream import canonical
-from pd4dgs_codec.bitstream.limits import MAX_CHUNKS, MAX_HEADER, MAX_PARAMETERS
+from pd4dgs_codec.format import canonical
+from pd4dgs_codec.format.limits import MAX_CHUNKS, MAX_HEADER, MAX_PARAMETERS
 
 from .blocks import (
     CAMERA,

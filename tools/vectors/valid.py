@@ -8,10 +8,6 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from pd4dgs_codec.attributes.planes import restore
-from pd4dgs_codec.attributes.quantise import MAX_SYMBOL
-from pd4dgs_codec.bitstream.limits import MAX_NETWORK_LAYERS, MAX_NETWORK_WIDTH, MAX_PLANE_CHANNELS, MAX_PLANE_SIDE
-from pd4dgs_codec.codec.layer_meta import FREE_ROWS, FREE_SYMBOLS, ROWS_PER_BYTE, SYMBOLS_PER_BYTE
 from pd4dgs_codec.entropy.priors import (
     CLASS_STEPS,
     FREE_ENTRIES,
@@ -27,6 +23,10 @@ from pd4dgs_codec.entropy.priors import (
     top_limit,
 )
 from pd4dgs_codec.entropy.tables import SI_MAX, SI_MIN
+from pd4dgs_codec.format.layer_meta import FREE_ROWS, FREE_SYMBOLS, ROWS_PER_BYTE, SYMBOLS_PER_BYTE
+from pd4dgs_codec.format.limits import MAX_NETWORK_LAYERS, MAX_NETWORK_WIDTH, MAX_PLANE_CHANNELS, MAX_PLANE_SIDE
+from pd4dgs_codec.format.planes import restore
+from pd4dgs_codec.format.quantise import MAX_SYMBOL
 from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import Widths
 

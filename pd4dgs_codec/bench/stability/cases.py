@@ -13,11 +13,11 @@ import numpy as np
 import torch
 
 from pd4dgs_codec.bench.report import markdown
+from pd4dgs_codec.draw.visibility import near_plane
 from pd4dgs_codec.errors import DataError, Pd4Error
+from pd4dgs_codec.model.autograd.rasterization import rasterization
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.picture import render
-from pd4dgs_codec.model.visibility import near_plane
-from pd4dgs_codec.render.autograd.rasterization import rasterization
 from pd4dgs_codec.scene import Camera, Deformation, Network, Scene, SceneInfo, Steps, Widths
 
 PASS, REFUSED, FAIL = "pass", "refused", "fail"

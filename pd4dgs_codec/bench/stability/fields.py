@@ -12,17 +12,16 @@ from typing import Any
 import numpy as np
 import torch
 
-from pd4dgs_codec.attributes import quantise
 from pd4dgs_codec.bench.stability import cases as shared
 from pd4dgs_codec.bench.stability.cases import BOX, CAMERA, Case, Found, largest, picture_error, refusal, small_scene
-from pd4dgs_codec.codec import decoder, encoder
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.evaluate import residuals
+from pd4dgs_codec.format import decoder, encoder, quantise
 from pd4dgs_codec.model import hexplane, masks
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.deformation import DeformationField
+from pd4dgs_codec.quality.levels import level_of
 from pd4dgs_codec.scene import MASK_THRESHOLD, PLANES, Deformation, Network, deformation_unit
-from pd4dgs_codec.view.levels import level_of
 
 FLOAT32 = 1e-5  #: of the largest value: what float32 loses in six lookups, their product and two layers
 RESOLUTION = (7, 5, 9, 4)

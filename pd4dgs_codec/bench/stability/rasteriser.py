@@ -14,7 +14,7 @@ from torch import Tensor
 from pd4dgs_codec import threads
 from pd4dgs_codec.bench.stability.cases import Case, Found, refusal
 from pd4dgs_codec.errors import NotFinite, RenderError
-from pd4dgs_codec.render.autograd.rasterization import rasterization
+from pd4dgs_codec.model.autograd.rasterization import rasterization
 
 NAMES = ("means", "quats", "scales", "opacities", "colors")
 NEAR = 0.01

@@ -14,12 +14,12 @@ from functools import partial
 
 import numpy as np
 
-from pd4dgs_codec.attributes import quantise as q
 from pd4dgs_codec.bench.stability.cases import Case, Found, mpmath, refusal, small_scene
-from pd4dgs_codec.codec import decoder, encoder
 from pd4dgs_codec.entropy import bits, channels
 from pd4dgs_codec.entropy.priors import K_MAX
 from pd4dgs_codec.errors import EncodeError
+from pd4dgs_codec.format import decoder, encoder
+from pd4dgs_codec.format import quantise as q
 
 SETTINGS = (("best", 1), ("best", 5), ("gauss", 5))  #: (priors, effort)
 #: A channel may cost this share more than its plain binary form, and OVERHEAD bits.

@@ -13,8 +13,8 @@ import numpy as np
 import torch
 
 from pd4dgs_codec.bench.stability.cases import Case, Found, picture_error
-from pd4dgs_codec.codec import decoder, encoder
 from pd4dgs_codec.data.view import Dataset, View
+from pd4dgs_codec.format import decoder, encoder
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import DeformationConfig, ModelConfig
 from pd4dgs_codec.model.convert import from_scene, to_scene

@@ -14,17 +14,17 @@ import torch
 from pages.page import commit
 from pages.trainings import ensure_trained
 from pd4dgs_codec.atomic import whole_file, write_bytes
-from pd4dgs_codec.codec.encoder import encode_with_report
 from pd4dgs_codec.data.view import Dataset
+from pd4dgs_codec.format.encoder import encode_with_report
 from pd4dgs_codec.jsonable import finite
-from pd4dgs_codec.metrics.perceptual import load_perceptual
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.model.model import Model
-from pd4dgs_codec.pack.packing import Views, pack
+from pd4dgs_codec.quality.evaluate import evaluate_file
+from pd4dgs_codec.quality.packing import Views, pack
+from pd4dgs_codec.quality.perceptual import load_perceptual
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train.config import ABLATIONS, TrainConfig
-from pd4dgs_codec.view.evaluate import evaluate_file
 
 #: Training views whose pictures say what a smaller layer 0 costs.
 FITTING_VIEWS = 16

@@ -1,0 +1,269 @@
+"""Numba kernels of HexPlane at one time for all points: sampling, forward and backward.
+
+At one time t each time plane is a single row, the blend of two of its rows, so a point costs three bilinear and three
+linear lookups per scale. Channels lie innermost and are walked `LANES` at a time. The backward pass splits scales over
+threads first and points second, each part owning its gradient buffers, which the caller adds in order: results are
+bitwise reproducible for a fixed number of parts, and with one part for any number of threads.
+
+Arguments everywhere, all floats of one dtype: grid [cells, C] (of which only the spatial planes are read), C a
+multiple of LANES; rows [n_rows, C], the time planes at the time wanted; reso [S, 4], start [S, 6], row_start [S, 3] of
+`hexplane.PlaneLayout`; points [N, 3] and box [2, 3] in scene units.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pd4dgs_codec.draw.simd import LANES, Tasks, Vector, fma, fnma, kernel, load, parallel, splat, store, total
+
+XY, XZ, XT, YZ, YT, ZT = range(6)
+
+Six = tuple[int, int, int, int, int, int]
+Three = tuple[float, float, float]
+
+
+@kernel(inline=True)
+def _locate(p: float, lower: float, upper: float, n: int) -> tuple[int, float, float]:
+    """First cell, fraction and slope d(cell coordinate)/dp of p on an axis of n cells; slope 0 where clamped."""
+    unit = (np.float64(p) - lower) / (np.float64(upper) - lower)
+    if not (unit > 0):  # NaN too
+        return 0, 0.0, 0.0
+    first = max(n - 2, 0)
+    if unit >= 1:
+        return first, float(n - 1 - first), 0.0
+    at = unit * (n - 1)
+    cell = min(int(at), first)
+    return cell, at - cell, (n - 1) / (np.float64(upper) - lower)
+
+
+@kernel(inline=True)
+def _linear(table: np.ndarray, i: int, step: int, f: Vector) -> tuple[Vector, Vector]:
+    """(sample, d sample / df) of the lanes at flat offset i and its neighbour `step` further."""
+    a = load(table, i)
+    d = load(table, i + step) - a
+    return fma(d, f, a), d
+
+
+@kernel(inline=True)
+def _bilinear(
+    table: np.ndarray,
+    i: int,
+    step_u: int,
+    step_v: int,
+    fu: Vector,
+    fv: Vector,
+) -> tuple[Vector, Vector, Vector]:
+    """(sample, d sample / dfu, d sample / dfv)."""
+    a, da = _linear(table, i, step_u, fu)
+    b, db = _linear(table, i + step_v, step_u, fu)
+    return fma(b - a, fv, a), fma(db - da, fv, da), b - a
+
+
+@kernel(inline=True)
+def _add_linear(table: np.ndarray, i: int, step: int, f: Vector, g: Vector) -> None:
+    """The transpose of `_linear`: adds (1 - f) g and f g."""
+    store(table, i, load(table, i) + fnma(g, f, g))
+    store(table, i + step, fma(g, f, load(table, i + step)))
+
+
+@kernel(inline=True)
+def _add_bilinear(table: np.ndarray, i: int, step_u: int, step_v: int, fu: Vector, fv: Vector, g: Vector) -> None:
+    gv = g * fv
+    _add_linear(table, i, step_u, fu, g - gv)
+    _add_linear(table, i + step_v, step_u, fu, gv)
+
+
+@kernel(inline=True)
+def _address(
+    s: int,
+    point: np.ndarray,
+    reso: np.ndarray,
+    start: np.ndarray,
+    row_start: np.ndarray,
+    box: np.ndarray,
+    channels: int,
+) -> tuple[Six, Six, Three, Three]:
+    """Of one point and scale: flat offsets of its six lookups, the steps to its neighbours, fractions and slopes.
+
+    Offsets: xy, xz, yz in the grid and x, y, z in the rows. Steps: to the next cell along x, y, z (0 on an axis of one
+    cell) where it is the inner axis, then as the outer axis of xy, xz, yz.
+    """
+    nx, ny, nz = reso[s, 0], reso[s, 1], reso[s, 2]
+    x, fx, sx = _locate(point[0], box[0, 0], box[1, 0], nx)
+    y, fy, sy = _locate(point[1], box[0, 1], box[1, 1], ny)
+    z, fz, sz = _locate(point[2], box[0, 2], box[1, 2], nz)
+    xy, xz, yz = start[s, XY] + y * nx + x, start[s, XZ] + z * nx + x, start[s, YZ] + z * ny + y
+    rx, ry, rz = row_start[s, 0] + x, row_start[s, 1] + y, row_start[s, 2] + z
+    offsets = (xy * channels, xz * channels, yz * channels, rx * channels, ry * channels, rz * channels)
+    dx, dy, dz = min(nx - 1, 1) * channels, min(ny - 1, 1) * channels, min(nz - 1, 1) * channels
+    return offsets, (dx, dy, dz, dy * nx, dz * nx, dz * ny), (fx, fy, fz), (sx, sy, sz)
+
+
+@parallel(lambda out, *_: len(out))
+def sample(
+    tasks: Tasks,
+    out: np.ndarray,
+    grid: np.ndarray,
+    rows: np.ndarray,
+    reso: np.ndarray,
+    start: np.ndarray,
+    row_start: np.ndarray,
+    points: np.ndarray,
+    box: np.ndarray,
+) -> None:
+    """out [N, S * C] = per scale the product of the six planes at `points`."""
+    channels = grid.shape[1]
+    real = grid.dtype.type
+    for n in range(tasks[0], tasks[1]):
+        for s in range(len(reso)):
+            (xy, xz, yz, rx, ry, rz), (dx, dy, dz, xy_y, xz_z, yz_z), (fx, fy, fz), _ = _address(
+                s, points[n], reso, start, row_start, box, channels
+            )
+            u, v, w = splat(real(fx)), splat(real(fy)), splat(real(fz))
+            for c in range(0, channels, LANES):
+                a = _bilinear(grid, xy + c, dx, xy_y, u, v)[0]
+                b = _bilinear(grid, xz + c, dx, xz_z, u, w)[0]
+                d = _bilinear(grid, yz + c, dy, yz_z, v, w)[0]
+                e = _linear(rows, rx + c, dx, u)[0] * _linear(rows, ry + c, dy, v)[0] * _linear(rows, rz + c, dz, w)[0]
+                store(out, n * out.shape[1] + s * channels + c, a * b * d * e)
+
+
+@kernel(inline=True)
+def _point_gradient(
+    grad: np.ndarray,
+    grad_rows: np.ndarray,
+    g: np.ndarray,
+    g_offset: int,
+    grid: np.ndarray,
+    rows: np.ndarray,
+    channels: int,
+    offsets: Six,
+    steps: Six,
+    fractions: Three,
+    slopes: Three,
+    out: np.ndarray,
+    out_offset: int,
+) -> None:
+    """Adds one point's gradient at one scale to `grad` and `grad_rows`, and writes that of the point to flat `out`."""
+    xy, xz, yz, rx, ry, rz = offsets
+    dx, dy, dz, xy_y, xz_z, yz_z = steps
+    real = grid.dtype.type
+    u, v, w = splat(real(fractions[0])), splat(real(fractions[1])), splat(real(fractions[2]))
+    gx = gy = gz = splat(real(0))
+    for c in range(0, channels, LANES):
+        a, a_u, a_v = _bilinear(grid, xy + c, dx, xy_y, u, v)
+        b, b_u, b_w = _bilinear(grid, xz + c, dx, xz_z, u, w)
+        d, d_v, d_w = _bilinear(grid, yz + c, dy, yz_z, v, w)
+        e, e_u = _linear(rows, rx + c, dx, u)
+        f, f_v = _linear(rows, ry + c, dy, v)
+        h, h_w = _linear(rows, rz + c, dz, w)
+        # each factor's gradient is the product of the others: prefixes from the left times suffixes from the right
+        suffix_h = load(g, g_offset + c)
+        suffix_f = suffix_h * h
+        suffix_e = suffix_f * f
+        suffix_d = suffix_e * e
+        suffix_b = suffix_d * d
+        g_a, g_b = suffix_b * b, suffix_b * a
+        prefix = a * b
+        g_d = suffix_d * prefix
+        prefix = prefix * d
+        g_e = suffix_e * prefix
+        prefix = prefix * e
+        g_f = suffix_f * prefix
+        g_h = suffix_h * (prefix * f)
+        gx = fma(g_e, e_u, fma(g_b, b_u, fma(g_a, a_u, gx)))
+        gy = fma(g_f, f_v, fma(g_d, d_v, fma(g_a, a_v, gy)))
+        gz = fma(g_h, h_w, fma(g_d, d_w, fma(g_b, b_w, gz)))
+        _add_bilinear(grad, xy + c, dx, xy_y, u, v, g_a)
+        _add_bilinear(grad, xz + c, dx, xz_z, u, w, g_b)
+        _add_bilinear(grad, yz + c, dy, yz_z, v, w, g_d)
+        _add_linear(grad_rows, rx + c, dx, u, g_e)
+        _add_linear(grad_rows, ry + c, dy, v, g_f)
+        _add_linear(grad_rows, rz + c, dz, w, g_h)
+    out[out_offset] = total(gx) * real(slopes[0])
+    out[out_offset + 1] = total(gy) * real(slopes[1])
+    out[out_offset + 2] = total(gz) * real(slopes[2])
+
+
+@parallel(lambda grad, extra, grad_rows, grad_points, *_: len(grad_points) * len(grad_rows))
+def sample_backward(
+    tasks: Tasks,
+    grad: np.ndarray,
+    extra: np.ndarray,
+    grad_rows: np.ndarray,
+    grad_points: np.ndarray,
+    g: np.ndarray,
+    grid: np.ndarray,
+    rows: np.ndarray,
+    reso: np.ndarray,
+    start: np.ndarray,
+    row_start: np.ndarray,
+    points: np.ndarray,
+    box: np.ndarray,
+) -> None:
+    """The transpose of `sample`. g: [N, S * C]. Results, to be given zeroed except grad_points:
+
+    grad [cells, C], of which the spatial planes are filled by the first part; extra [parts - 1, n_spatial, C], of the
+    other parts; grad_rows [parts, n_rows, C]; grad_points [S, N, 3], per scale.
+    """
+    channels, parts, n_points = grid.shape[1], len(grad_rows), len(points)
+    for task in range(tasks[0], tasks[1]):
+        s, part = task // parts, task % parts
+        own = grad if part == 0 else extra[part - 1]
+        flat = grad_points[s].reshape(-1)
+        for n in range(n_points * part // parts, n_points * (part + 1) // parts):
+            offsets, steps, fractions, slopes = _address(s, points[n], reso, start, row_start, box, channels)
+            at = n * g.shape[1] + s * channels
+            _point_gradient(
+                own, grad_rows[part], g, at, grid, rows, channels, offsets, steps, fractions, slopes, flat, 3 * n
+            )
+
+
+@kernel()  # exact arithmetic: the rounding must be that of the codec's quantiser
+def collapse(
+    rows: np.ndarray,
+    grid: np.ndarray,
+    reso: np.ndarray,
+    start: np.ndarray,
+    row_start: np.ndarray,
+    t: float,
+    step: float,
+) -> None:
+    """rows [n_rows, C] = the time planes of `grid` at normalised time t, rounded to multiples of `step` if step > 0."""
+    real = grid.dtype.type
+    for s in range(len(reso)):
+        first, f, _ = _locate(t, 0.0, 1.0, reso[s, 3])
+        step_t = min(reso[s, 3] - 1, 1)
+        for axis, plane in enumerate((XT, YT, ZT)):
+            n = reso[s, axis]
+            for i in range(n):
+                cell = start[s, plane] + first * n + i
+                for c in range(grid.shape[1]):
+                    a, b = grid[cell, c], grid[cell + step_t * n, c]
+                    if step > 0:
+                        a, b = np.rint(a / real(step)) * real(step), np.rint(b / real(step)) * real(step)
+                    rows[row_start[s, axis] + i, c] = a + (b - a) * real(f)
+
+
+@kernel()
+def collapse_backward(
+    grad: np.ndarray,
+    grad_rows: np.ndarray,
+    reso: np.ndarray,
+    start: np.ndarray,
+    row_start: np.ndarray,
+    t: float,
+) -> None:
+    """The transpose of `collapse` (rounding passes the gradient): adds to the time planes of grad [cells, C]."""
+    real = grad.dtype.type
+    for s in range(len(reso)):
+        first, f, _ = _locate(t, 0.0, 1.0, reso[s, 3])
+        step_t = min(reso[s, 3] - 1, 1)
+        for axis, plane in enumerate((XT, YT, ZT)):
+            n = reso[s, axis]
+            for i in range(n):
+                cell = start[s, plane] + first * n + i
+                for c in range(grad.shape[1]):
+                    value = grad_rows[row_start[s, axis] + i, c]
+                    grad[cell, c] += value * real(1 - f)
+                    grad[cell + step_t * n, c] += value * real(f)

@@ -1,0 +1,362 @@
+"""Compositing of projected and binned Gaussians: numba kernels.
+
+`composite` draws, `composite_backward` returns one gradient slot per (Gaussian, tile) pair. No atomics: every result
+is the same for any number of threads. Inside a tile the loop is Gaussian-major over the blocks of 8 pixels in a row
+that its ellipse touches and that are not finished yet: a tile has 64 blocks, so both sets are one 64-bit word, and a
+small Gaussian costs few lanes. Where vectors have 16 lanes two rows are one block, named by the first; a picture has
+the same bits.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from pd4dgs_codec.draw.projection import (
+    ALPHA_MAX,
+    ALPHA_MIN,
+    GEOM_COLUMNS,
+    INV_SA,
+    REACH_LOG2,
+    SA,
+    SB,
+    SLOT_GEOMETRY,
+    TILE_HEIGHT,
+    TILE_WIDTH,
+    K,
+    Q,
+    X,
+    Y,
+)
+from pd4dgs_codec.draw.simd import (
+    LANES,
+    WIDE,
+    Tasks,
+    aligned,
+    exp2,
+    fma,
+    fnma,
+    folded,
+    in_row,
+    iota,
+    iota64,
+    kernel,
+    mask_gt,
+    parallel,
+    prefetch,
+    select_gt,
+    single,
+    spread,
+    sqrt,
+    store,
+    total,
+    totals,
+    trailing_zeros,
+)
+from pd4dgs_codec.draw.simd import wide_load as load
+from pd4dgs_codec.draw.simd import wide_splat as splat
+
+T_MIN = 1e-4  #: a pixel is finished when its transmittance would fall to this
+_COLUMNS = TILE_WIDTH // LANES
+_ROWS = WIDE // LANES  #: of pixels in a block
+_FIRST_ROWS = np.uint64(0xFFFFFFFFFFFFFFFF // (2**_ROWS - 1))  #: a bit for the first row of each block
+_BLOCKS = _COLUMNS * TILE_HEIGHT
+_STATE = 5  #: vectors of state per block
+_AHEAD = 4  #: Gaussians by which memory is fetched early
+_F = np.float32
+
+Bits = Any  #: a uint64 that has a bit for each block of a tile, column * TILE_HEIGHT + row
+
+
+@kernel()
+def _prefetch(items: np.ndarray, n: int, end: int, geom: np.ndarray, colors: np.ndarray, stride: int) -> None:
+    if n + _AHEAD < end:
+        ahead = np.int64(items[n + _AHEAD])
+        prefetch(geom, ahead * GEOM_COLUMNS)
+        prefetch(colors, ahead * stride)
+
+
+@kernel()
+def _coverage(geom: np.ndarray, g: int, left: int, top: int) -> Bits:
+    """Which blocks of the tile Gaussian g (offset into flat geom) may touch.
+
+    The chord of each pixel row, eight rows at a time, a little too wide where float32 rounds.
+    """
+    shear = geom[g + K]
+    dy = top + 0.5 - geom[g + Y]
+    zero, far = splat(_F(0.0)), splat(_F(1e9))
+    reach = splat(_F(geom[g + Q] + REACH_LOG2 + 1e-4))
+    width = splat(_F(min(geom[g + INV_SA], 1e30) * (1.0 + 1e-6)))
+    slack = splat(_F(1e-3 + 1e-5 * abs(shear)))
+    mask = np.uint64(0)
+    for top_row in range(0, TILE_HEIGHT, WIDE):
+        row = iota() + splat(_F(top_row))
+        r = fma(row, splat(_F(geom[g + SB])), splat(_F(geom[g + SB] * dy)))
+        rest = fnma(r, r, reach)
+        centre = fma(row, splat(_F(shear)), splat(_F(geom[g + X] - 0.5 - left + shear * dy)))
+        extent = fma(sqrt(select_gt(rest, zero, rest, zero)), width, slack)
+        begin, end = select_gt(zero, rest, far, centre - extent), centre + extent
+        for column in range(_COLUMNS):
+            x = column * LANES
+            hit = mask_gt(end, splat(_F(x))) & mask_gt(splat(_F(x + LANES - 1)), begin)
+            mask |= hit << np.uint64(column * TILE_HEIGHT + top_row)
+    for row_of_block in range(1, _ROWS):
+        mask |= mask >> np.uint64(row_of_block)
+    return mask & _FIRST_ROWS
+
+
+@kernel(inline=True)
+def _tabulate(ts: np.ndarray, rs: np.ndarray, rests: np.ndarray, geom: np.ndarray, g: int, left: int, top: int) -> None:
+    """Of Gaussian g, float32: ts = t at the first pixel of each block of 8 in a row, rs = r and rests = q - r^2 of each
+    row of the tile."""
+    dy, sa, sb = top + 0.5 - geom[g + Y], geom[g + SA], geom[g + SB]
+    start, step = splat(sa * (left + 0.5 - geom[g + X] - geom[g + K] * dy)), splat(-sa * geom[g + K])
+    for first in range(0, TILE_HEIGHT, WIDE):
+        row = iota64() + splat(float(first))
+        t, r = start + row * step, splat(sb * dy) + row * splat(sb)
+        store(rs, first, single(r))
+        store(rests, first, single(splat(geom[g + Q]) - r * r))
+        for column in range(_COLUMNS):
+            store(ts, column * TILE_HEIGHT + first, single(t + splat(float(column) * (sa * LANES))))
+
+
+@kernel()
+def _begin(state: np.ndarray, channel: int, left: int, top: int, width: int, height: int) -> Bits:
+    """Transmittance 1 inside the image, 0 outside; returns the blocks with a pixel inside, as bits."""
+    alive = np.uint64(0)
+    for block in range(_BLOCKS):
+        row, column = block % TILE_HEIGHT, block // TILE_HEIGHT * LANES
+        y, x, p = top + row, left + column, _place(column, row) + channel * WIDE
+        if y < height and x < width:
+            alive |= np.uint64(1) << np.uint64(block)
+        for lane in range(LANES):
+            state[p + lane] = _F(1.0) if y < height and x + lane < width else _F(0.0)
+    return alive & _FIRST_ROWS
+
+
+@kernel(inline=True)
+def _place(x: int, y: int) -> int:
+    """Offset in `state` of pixel (x, y) of the tile, in its block's first vector."""
+    block = x // LANES * TILE_HEIGHT + y
+    return block // _ROWS * _STATE * WIDE + block % _ROWS * LANES + x % LANES
+
+
+@kernel()
+def _composite_tile(
+    items: np.ndarray,
+    start: int,
+    end: int,
+    geom: np.ndarray,
+    colors: np.ndarray,
+    stride: int,
+    channel: int,
+    left: int,
+    top: int,
+    width: int,
+    height: int,
+    state: np.ndarray,
+) -> None:
+    """Blend the tile's Gaussians into `state`: per block transmittance (0 once finished), 3 colours, its last value."""
+    alive = _begin(state, 4, left, top, width, height)
+    alive = _begin(state, 0, left, top, width, height)
+    one = np.uint64(1)
+    zero, faintest = splat(_F(0.0)), splat(_F(ALPHA_MIN))
+    low, high, t_min = splat(_F(-9.0)), splat(_F(ALPHA_MAX)), splat(_F(T_MIN))
+    ts, rs, rests = aligned(_BLOCKS, _F), aligned(TILE_HEIGHT, _F), aligned(TILE_HEIGHT, _F)
+    for n in range(start, end):
+        if not alive:
+            break
+        _prefetch(items, n, end, geom, colors, stride)
+        g = np.int64(items[n]) * GEOM_COLUMNS
+        mask = _coverage(geom, g, left, top) & alive
+        if not mask:
+            continue
+        _tabulate(ts, rs, rests, geom, g, left, top)
+        step = splat(_F(geom[g + SA]))
+        c = np.int64(items[n]) * stride + channel
+        red, green, blue = splat(colors[c]), splat(colors[c + 1]), splat(colors[c + 2])
+        while mask:
+            block = trailing_zeros(mask)
+            mask &= mask - one
+            row = block % TILE_HEIGHT
+            t = fma(in_row(), step, spread(ts, block))
+            exponent = fnma(t, t, spread(rests, row))
+            alpha = exp2(select_gt(exponent, low, exponent, low))
+            alpha = select_gt(high, alpha, alpha, high)
+            alpha = select_gt(faintest, alpha, zero, alpha)
+            p = block * (_STATE * LANES)  # of whole blocks, so that of `_place`
+            before = load(state, p)
+            weight = alpha * before
+            after = before - weight
+            weight = select_gt(after, t_min, weight, zero)
+            store(state, p + 4 * WIDE, select_gt(after, t_min, after, load(state, p + 4 * WIDE)))
+            after = select_gt(after, t_min, after, zero)
+            store(state, p, after)
+            store(state, p + WIDE, fma(weight, red, load(state, p + WIDE)))
+            store(state, p + 2 * WIDE, fma(weight, green, load(state, p + 2 * WIDE)))
+            store(state, p + 3 * WIDE, fma(weight, blue, load(state, p + 3 * WIDE)))
+            if not mask_gt(after, zero):
+                alive &= ~(one << np.uint64(block))
+
+
+@parallel(lambda items, starts, *_: starts.size - 1)
+def composite(
+    tasks: Tasks,
+    items: np.ndarray,
+    starts: np.ndarray,
+    geom: np.ndarray,
+    colors: np.ndarray,
+    channel: int,
+    background: np.ndarray,
+    out_colors: np.ndarray,
+    transmittance: np.ndarray,
+) -> None:
+    """Draw 3 channels from `channel` on. colors float32 [N, D], D a multiple of 3; background float32 [D].
+
+    out_colors [H, W, D'], D' <= D, and transmittance = 1 - alpha [H, W], float32, are filled. (1 - alpha computed from
+    alpha would lose the digits that the gradient of a nearly hidden background needs.)
+    """
+    height, width, channels = out_colors.shape
+    columns = -(-width // TILE_WIDTH)
+    stride = colors.shape[1]
+    flat_geom, flat_colors = geom.reshape(-1), colors.reshape(-1)
+    for tile in range(tasks[0], tasks[1]):
+        left, top = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
+        state = aligned(_BLOCKS * _STATE * LANES, _F)
+        _composite_tile(
+            items, starts[tile], starts[tile + 1], flat_geom, flat_colors, stride, channel, left, top, width, height,
+            state,
+        )  # fmt: skip
+        for y in range(top, min(top + TILE_HEIGHT, height)):
+            for x in range(left, min(left + TILE_WIDTH, width)):
+                p = _place(x - left, y - top)
+                behind = state[p + 4 * WIDE]
+                transmittance[y, x] = behind
+                for c in range(min(3, channels - channel)):
+                    back = behind * background[channel + c]
+                    out_colors[y, x, channel + c] = state[p + (1 + c) * WIDE] + back
+
+
+@kernel()
+def _composite_tile_backward(
+    items: np.ndarray,
+    slot_of: np.ndarray,
+    start: int,
+    end: int,
+    geom: np.ndarray,
+    colors: np.ndarray,
+    stride: int,
+    channel: int,
+    left: int,
+    top: int,
+    width: int,
+    height: int,
+    state: np.ndarray,
+    slots: np.ndarray,
+    slot_stride: int,
+) -> None:
+    """Front to back again. Per block: transmittance, R (the gradient's share of what lies behind), dL/d(3 colours)."""
+    alive = _begin(state, 0, left, top, width, height)
+    one_bit = np.uint64(1)
+    scratch = np.empty(LANES, np.float32)
+    zero, one, faintest = splat(_F(0.0)), splat(_F(1.0)), splat(_F(ALPHA_MIN))
+    low, high, t_min = splat(_F(-9.0)), splat(_F(ALPHA_MAX)), splat(_F(T_MIN))
+    ts, rs, rests = aligned(_BLOCKS, _F), aligned(TILE_HEIGHT, _F), aligned(TILE_HEIGHT, _F)
+    for n in range(start, end):
+        _prefetch(items, n, end, geom, colors, stride)
+        g = np.int64(items[n]) * GEOM_COLUMNS
+        mask = _coverage(geom, g, left, top) & alive if alive else alive
+        if mask:
+            _tabulate(ts, rs, rests, geom, g, left, top)
+        step = splat(_F(geom[g + SA]))
+        c = np.int64(items[n]) * stride + channel
+        red, green, blue = splat(colors[c]), splat(colors[c + 1]), splat(colors[c + 2])
+        sum_g, sum_gt, sum_gtt, sum_gr, sum_grr, sum_gtr = zero, zero, zero, zero, zero, zero
+        sum_red, sum_green, sum_blue = zero, zero, zero
+        while mask:
+            block = trailing_zeros(mask)
+            mask &= mask - one_bit
+            row = block % TILE_HEIGHT
+            t = fma(in_row(), step, spread(ts, block))
+            exponent = fnma(t, t, spread(rests, row))
+            unclamped = exp2(select_gt(exponent, low, exponent, low))
+            alpha = select_gt(high, unclamped, unclamped, high)
+            alpha = select_gt(faintest, alpha, zero, alpha)
+            p = block * (_STATE * LANES)  # of whole blocks, so that of `_place`
+            before = load(state, p)
+            weight = alpha * before
+            after = before - weight
+            weight = select_gt(after, t_min, weight, zero)
+            after = select_gt(after, t_min, after, zero)
+            store(state, p, after)
+            v_red, v_green, v_blue = load(state, p + 2 * WIDE), load(state, p + 3 * WIDE), load(state, p + 4 * WIDE)
+            v = fma(v_red, red, fma(v_green, green, v_blue * blue))
+            behind = fnma(weight, v, load(state, p + WIDE))
+            store(state, p + WIDE, behind)
+            gradient = alpha * (before * v - behind / (one - alpha))
+            gradient = select_gt(weight, zero, select_gt(unclamped, high, zero, gradient), zero)
+            r = spread(rs, row)
+            gt, gr = gradient * t, gradient * r
+            sum_g, sum_gt, sum_gr = sum_g + gradient, sum_gt + gt, sum_gr + gr
+            sum_gtt, sum_grr, sum_gtr = fma(gt, t, sum_gtt), fma(gr, r, sum_grr), fma(gt, r, sum_gtr)
+            sum_red, sum_green = fma(weight, v_red, sum_red), fma(weight, v_green, sum_green)
+            sum_blue = fma(weight, v_blue, sum_blue)
+            if not mask_gt(after, zero):
+                alive &= ~(one_bit << np.uint64(block))
+        sums = totals(
+            folded(sum_g), folded(sum_gt), folded(sum_gtt), folded(sum_gr), folded(sum_grr), folded(sum_gtr),
+            folded(sum_red), folded(sum_green),
+        )  # fmt: skip
+        slot = np.int64(slot_of[n]) * slot_stride
+        if channel == 0:
+            store(slots, slot, sums)
+        else:
+            store(scratch, 0, sums)
+            for s in range(SLOT_GEOMETRY):
+                slots[slot + s] += scratch[s]
+            slots[slot + SLOT_GEOMETRY + channel] = scratch[SLOT_GEOMETRY]
+            slots[slot + SLOT_GEOMETRY + channel + 1] = scratch[SLOT_GEOMETRY + 1]
+        slots[slot + SLOT_GEOMETRY + channel + 2] = total(folded(sum_blue))
+
+
+@parallel(lambda items, slot_of, starts, *_: starts.size - 1)
+def composite_backward(
+    tasks: Tasks,
+    items: np.ndarray,
+    slot_of: np.ndarray,
+    starts: np.ndarray,
+    geom: np.ndarray,
+    colors: np.ndarray,
+    channel: int,
+    out_colors: np.ndarray,
+    transmittance: np.ndarray,
+    g_colors: np.ndarray,
+    g_alphas: np.ndarray,
+    slots: np.ndarray,
+) -> None:
+    """slots float32 [pairs, 6 + D]: gradient sums of each pair; geometry columns are added to when channel > 0.
+
+    g_colors [H, W, D'], g_alphas [H, W]: dL/d(out_colors), dL/d(1 - transmittance), which counts in the first pass.
+    """
+    height, width, channels = out_colors.shape
+    columns = -(-width // TILE_WIDTH)
+    stride, slot_stride = colors.shape[1], slots.shape[1]
+    flat_geom, flat_colors, flat_slots = geom.reshape(-1), colors.reshape(-1), slots.reshape(-1)
+    for tile in range(tasks[0], tasks[1]):
+        left, top = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
+        state = aligned(_BLOCKS * _STATE * LANES, _F)
+        for y in range(top, min(top + TILE_HEIGHT, height)):
+            for x in range(left, min(left + TILE_WIDTH, width)):
+                p = _place(x - left, y - top)
+                # What lies behind contributes v.C and, through alpha = 1 - T, -g_alpha T.
+                behind = -transmittance[y, x] * g_alphas[y, x] if channel == 0 else _F(0.0)
+                for c in range(min(3, channels - channel)):
+                    v = g_colors[y, x, channel + c]
+                    behind += v * out_colors[y, x, channel + c]
+                    state[p + (2 + c) * WIDE] = v
+                state[p + WIDE] = behind
+        _composite_tile_backward(
+            items, slot_of, starts[tile], starts[tile + 1], flat_geom, flat_colors, stride, channel, left, top, width,
+            height, state, flat_slots, slot_stride,
+        )  # fmt: skip

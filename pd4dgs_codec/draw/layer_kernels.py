@@ -1,0 +1,232 @@
+"""Numba kernels of networks for many points: linear layers with ReLU between them, in one pass, and the gradient.
+
+Points go through all layers in blocks that stay in the cache. Arguments, all floats of one dtype: x [n, inputs]; sizes
+int64 [layers, 2], the inputs and outputs of each layer, no more inputs than the layer before has outputs; weights, what
+`pack` makes of the layers; hidden [n, `hidden_width`], the activations behind each layer but the last side by side,
+each padded with zeros to whole vectors.
+
+Each part of a backward pass owns its sums, which `gradients` adds in order: bits repeat for a fixed number of parts.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from pd4dgs_codec.draw.simd import (
+    LANES,
+    PRODUCT_ROWS,
+    PRODUCT_VECTORS,
+    WIDE,
+    Tasks,
+    aligned,
+    copy,
+    kernel,
+    load,
+    narrow_product,
+    parallel,
+    product,
+    select_gt,
+    store,
+    wide_load,
+    wide_splat,
+)
+
+POINTS = 48  #: of a block: whole rows of `product`
+BLOCKS = 8  #: that share scratch memory
+
+
+def pack(layers: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """(sizes, weights) of layers (weight [outputs, inputs], bias [outputs]).
+
+    weights: per layer those by input [inputs, padded outputs], the bias, then those by output [outputs, padded inputs].
+    """
+    parts = []
+    for weight, bias in layers:
+        outputs, inputs = weight.shape
+        table = np.zeros((inputs + 1, whole(outputs, WIDE)), weight.dtype)
+        table[:-1, :outputs], table[-1, :outputs] = weight.T, bias
+        back = np.zeros((outputs, whole(inputs, WIDE)), weight.dtype)
+        back[:, :inputs] = weight
+        parts += [table.ravel(), back.ravel()]
+    sizes = np.array([weight.shape[::-1] for weight, _ in layers], np.int64)
+    weights: np.ndarray = np.concatenate(parts)
+    return sizes, weights
+
+
+def hidden_width(sizes: np.ndarray) -> int:
+    """Columns of `hidden`."""
+    return sum(whole(int(outputs), WIDE) for outputs in sizes[:-1, 1])
+
+
+def sums_width(sizes: np.ndarray) -> int:
+    """Columns of `sums` of `backward`."""
+    return sum(
+        whole(outputs, PRODUCT_ROWS) * whole(inputs, WIDE) + whole(outputs, WIDE) for inputs, outputs in sizes.tolist()
+    )
+
+
+def gradients(sums: np.ndarray, sizes: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Those by (weight, bias) of each layer, all parts of `sums` together."""
+    whole_sums, found, at = sums.sum(0), [], 0
+    for inputs, outputs in sizes.tolist():
+        rows, columns = whole(outputs, PRODUCT_ROWS), whole(inputs, WIDE)
+        weight = whole_sums[at : at + rows * columns].reshape(rows, columns)[:outputs, :inputs]
+        at += rows * columns
+        found.append((weight, whole_sums[at : at + outputs]))
+        at += whole(outputs, WIDE)
+    return found
+
+
+def whole(count: int, step: int) -> int:
+    return -(-count // step) * step
+
+
+up = kernel(inline=True)(whole)
+
+
+@kernel(inline=True)
+def multiply(
+    y: np.ndarray, y_at: int, y_row: int, start: np.ndarray, start_at: int, start_row: int, a: np.ndarray, a_row: int,
+    a_step: int, b: np.ndarray, b_at: int, b_row: int, count: int, rows: int, columns: int, relu: bool,
+) -> None:  # fmt: skip
+    """`product` of `rows` and `columns` numbers, both in whole blocks."""
+    wide = columns - columns % (PRODUCT_VECTORS * WIDE)
+    for r in range(0, rows, PRODUCT_ROWS):
+        for c in range(0, wide, PRODUCT_VECTORS * WIDE):
+            product(
+                y, y_at + r * y_row + c, y_row, start, start_at + r * start_row + c, start_row, a, r * a_row, a_row,
+                a_step, b, b_at + c, b_row, count, relu,
+            )  # fmt: skip
+        for c in range(wide, columns, WIDE):
+            narrow_product(
+                y, y_at + r * y_row + c, y_row, start, start_at + r * start_row + c, start_row, a, r * a_row, a_row,
+                a_step, b, b_at + c, b_row, count, relu,
+            )  # fmt: skip
+
+
+@kernel(inline=True)
+def _widest(sizes: np.ndarray) -> int:
+    """Its largest number; numba's own way takes seconds to compile."""
+    found = 0
+    for layer in range(len(sizes)):
+        found = max(found, sizes[layer, 0], sizes[layer, 1])
+    return found
+
+
+@kernel(inline=True)
+def _take(block: np.ndarray, row: int, values: np.ndarray, first: int, count: int, column: int, columns: int) -> None:
+    """The first columns of `block`, rows of `row` numbers, = `columns` of those of `values` from `first` on."""
+    for p in range(count):
+        copy(block, p * row, values, (first + p) * values.shape[1] + column, columns)
+
+
+@kernel(inline=True)
+def _give(values: np.ndarray, first: int, count: int, column: int, columns: int, block: np.ndarray, row: int) -> None:
+    """The opposite of `_take`."""
+    for p in range(count):
+        copy(values, (first + p) * values.shape[1] + column, block, p * row, columns)
+
+
+@parallel(lambda out, *_: -(-len(out) // (POINTS * BLOCKS)))
+def forward(
+    tasks: Tasks,
+    out: np.ndarray,
+    hidden: np.ndarray,
+    x: np.ndarray,
+    sizes: np.ndarray,
+    weights: np.ndarray,
+    relu_last: bool,
+) -> None:
+    """out [n, at most the last outputs in whole vectors] += what the network makes of x; relu_last: after the last
+    layer as well. hidden is filled, but if it has no rows."""
+    row, layers, columns = up(_widest(sizes), WIDE), len(sizes), out.shape[1]
+    vectors = columns - columns % LANES
+    a, b = aligned(POINTS * row, x.dtype.type), aligned(POINTS * row, x.dtype.type)
+    for task in range(tasks[0], tasks[1]):
+        for first in range(task * POINTS * BLOCKS, min((task + 1) * POINTS * BLOCKS, len(x)), POINTS):
+            count = min(POINTS, len(x) - first)
+            _take(a, row, x, first, count, 0, x.shape[1])
+            at = column = 0
+            for layer in range(layers):
+                inputs, outputs = sizes[layer]
+                padded, relu = up(outputs, WIDE), relu_last or layer < layers - 1
+                bias = at + inputs * padded
+                multiply(b, 0, row, weights, bias, 0, a, row, 1, weights, at, padded, inputs, POINTS, padded, relu)
+                at = bias + padded + outputs * up(inputs, WIDE)
+                if len(hidden) > 0 and layer < layers - 1:
+                    _give(hidden, first, count, column, padded, b, row)
+                    column += padded
+                a, b = b, a
+            for p in range(count):
+                at = (first + p) * columns
+                for i in range(0, vectors, LANES):
+                    store(out, at + i, load(out, at + i) + load(a, p * row + i))
+                for i in range(vectors, columns):
+                    out[first + p, i] += a[p * row + i]
+
+
+@parallel(lambda g_x, sums, *_: len(sums))
+def backward(
+    tasks: Tasks,
+    g_x: np.ndarray,
+    sums: np.ndarray,
+    g: np.ndarray,
+    g_hidden: np.ndarray,
+    hidden: np.ndarray,
+    x: np.ndarray,
+    sizes: np.ndarray,
+    weights: np.ndarray,
+) -> None:
+    """The transpose of `forward` without relu_last, from g [n, last outputs] and, if it has rows, what reaches `hidden`
+    from elsewhere besides, g_hidden.
+
+    g_x [n, inputs]; sums [parts, `sums_width`], given zeroed: of each part and per layer the gradient by its weights
+    and that by its bias, in whole blocks.
+    """
+    row, layers, parts = up(_widest(sizes), WIDE), len(sizes), len(sums)
+    blocks, real = (len(x) + POINTS - 1) // POINTS, x.dtype.type
+    zero = wide_splat(real(0))
+    for part in range(tasks[0], tasks[1]):
+        own, size = sums[part], POINTS * row + WIDE  # whole blocks read further than they mean
+        slope, before, taken, none = aligned(size, real), aligned(size, real), aligned(size, real), aligned(row, real)
+        for block in range(blocks * part // parts, blocks * (part + 1) // parts):
+            first = block * POINTS
+            count = min(POINTS, len(x) - first)
+            if count < POINTS:
+                for i in range(0, size, WIDE):
+                    store(slope, i, zero)
+                    store(taken, i, zero)
+            _take(slope, row, g, first, count, 0, g.shape[1])
+            at, total, column = len(weights), len(own), hidden.shape[1]
+            for layer in range(layers - 1, -1, -1):
+                inputs, outputs = sizes[layer]
+                columns, padded = up(inputs, WIDE), up(outputs, WIDE)
+                given = inputs if layer == 0 else up(sizes[layer - 1, 1], WIDE)
+                column -= 0 if layer == 0 else given
+                _take(taken, row, x if layer == 0 else hidden, first, count, 0 if layer == 0 else column, given)
+                total -= padded
+                for o in range(0, padded, WIDE):
+                    value = wide_load(own, total + o)
+                    for p in range(count):
+                        value = value + wide_load(slope, p * row + o)
+                    store(own, total + o, value)
+                total -= up(outputs, PRODUCT_ROWS) * columns
+                multiply(
+                    own, total, columns, own, total, columns, slope, 1, row, taken, 0, row, POINTS, outputs, columns,
+                    False,
+                )  # fmt: skip
+                at -= outputs * columns
+                multiply(
+                    before, 0, row, none, 0, 0, slope, row, 1, weights, at, columns, outputs, POINTS, columns, False
+                )
+                at -= (inputs + 1) * padded
+                if layer > 0:
+                    for p in range(count):
+                        for i in range(0, given, WIDE):
+                            value = wide_load(before, p * row + i) if i < columns else zero
+                            if len(g_hidden) > 0:
+                                value = value + wide_load(g_hidden, (first + p) * g_hidden.shape[1] + column + i)
+                            store(slope, p * row + i, select_gt(wide_load(taken, p * row + i), zero, value, zero))
+            _give(g_x, first, count, 0, g_x.shape[1], before, row)

@@ -1,0 +1,104 @@
+"""Networks and HexPlanes of a decoded scene in the form that the kernels take."""
+
+from __future__ import annotations
+
+from itertools import accumulate
+
+import numpy as np
+
+from pd4dgs_codec.draw import hexplane_kernels, layer_kernels
+from pd4dgs_codec.draw.plane_layout import PlaneLayout
+from pd4dgs_codec.draw.simd import LANES
+from pd4dgs_codec.scene import LENGTH_HEADS, PLANES, TRUNK, Deformation, Network, deformation_unit, plane_sides
+
+
+class Layers:
+    """Linear layers with ReLU between them, and after the last if `relu_last`."""
+
+    def __init__(self, layers: Network, relu_last: bool = False):
+        self.outputs, self._relu_last = len(layers[-1][1]), relu_last
+        self._sizes, self._weights = layer_kernels.pack(layers)
+
+    def __call__(self, x: np.ndarray, outputs: int | None = None) -> np.ndarray:
+        """float32 [n, outputs] of x float32 [n, inputs]; more outputs than there are come out as 0."""
+        out = np.zeros((len(x), self.outputs if outputs is None else outputs), np.float32)
+        self.add(out, x)
+        return out
+
+    def add(self, out: np.ndarray, x: np.ndarray) -> None:
+        """Adds what a call answers to out float32 [n, at most the last width], C-contiguous."""
+        hidden = np.empty((0, 0), np.float32)
+        layer_kernels.forward(out, hidden, np.ascontiguousarray(x), self._sizes, self._weights, self._relu_last)
+
+
+class Field:
+    """A deformation: it adds the residuals of its heads to rows whose columns are all heads of the registry."""
+
+    def __init__(self, deformation: Deformation, box: np.ndarray, widths: dict[str, int]):
+        """widths: of the heads that there may be, in the order of the columns."""
+        self._box = np.ascontiguousarray(box, np.float32)
+        self._layout = PlaneLayout.build([plane_sides(scale) for scale in deformation.planes])
+        channels = deformation.planes[0]["xy"].shape[0]
+        self._channels = -(-channels // LANES) * LANES  # the padding is 0, and so are its products
+        self._grid = np.zeros((self._layout.n_cells, self._channels), np.float32)
+        for start, scale in zip(self._layout.start, deformation.planes, strict=True):
+            for first, (name, _, _) in zip(start, PLANES, strict=True):
+                cells = scale[name].reshape(channels, -1).T
+                self._grid[first : first + len(cells), :channels] = cells
+        self._rows: tuple[float, np.ndarray] | None = None
+        trunk = _with_padded_inputs(deformation.networks[TRUNK], channels, self._channels)
+        unit, networks = deformation_unit(box), deformation.networks
+        heads = {n: _scaled(networks[n], unit if n in LENGTH_HEADS else np.float32(1)) for n in widths if n in networks}
+        self._trunk: Layers | None = None
+        if all(len(network) == 1 for network in heads.values()):  # one product for all heads
+            self._heads = [(slice(None), Layers((*trunk, _side_by_side(heads, widths, len(trunk[-1][1])))))]
+        else:
+            self._trunk = Layers(trunk, relu_last=True)
+            ends = dict(zip(widths, accumulate(widths.values()), strict=True))
+            self._heads = [(slice(ends[n] - widths[n], ends[n]), Layers(network)) for n, network in heads.items()]
+
+    def move(self, values: np.ndarray, points: np.ndarray, t: float) -> None:
+        """Adds the residuals at points float32 [n, 3] and normalised time t to values float32 [n, sum of widths],
+        C-contiguous; lengths in scene units."""
+        layout = self._layout
+        tables = layout.reso, layout.start, layout.rows
+        if self._rows is None or self._rows[0] != t:  # what depends on time alone is kept
+            rows = np.empty((layout.n_rows, self._channels), np.float32)
+            hexplane_kernels.collapse(rows, self._grid, *tables, t, 0.0)
+            self._rows = t, rows
+        features = np.empty((len(points), len(layout.reso) * self._channels), np.float32)
+        spatial = self._grid[: layout.n_spatial]
+        hexplane_kernels.sample(features, spatial, self._rows[1], *tables, np.ascontiguousarray(points), self._box)
+        if self._trunk is None:
+            ((_, together),) = self._heads
+            together.add(values, features)
+            return
+        hidden = self._trunk(features)
+        for columns, head in self._heads:
+            values[:, columns] += head(hidden)
+
+
+def _with_padded_inputs(network: Network, channels: int, padded: int) -> Network:
+    """The network for features of `padded` channels per scale, of which the first `channels` count."""
+    (weight, bias), *rest = network
+    scales = weight.shape[1] // channels
+    wide = np.zeros((len(weight), scales, padded), np.float32)
+    wide[:, :, :channels] = weight.reshape(len(weight), scales, channels)
+    return ((wide.reshape(len(weight), -1), bias), *rest)
+
+
+def _side_by_side(heads: dict[str, Network], widths: dict[str, int], inputs: int) -> tuple[np.ndarray, np.ndarray]:
+    """One layer for all heads, each of one layer; 0 for those that are not there."""
+    weight, bias = np.zeros((sum(widths.values()), inputs), np.float32), np.zeros(sum(widths.values()), np.float32)
+    first = 0
+    for name, width in widths.items():
+        if name in heads:
+            ((weight[first : first + width], bias[first : first + width]),) = heads[name]
+        first += width
+    return weight, bias
+
+
+def _scaled(network: Network, unit: np.float32) -> Network:
+    """The network with its outputs times `unit`."""
+    *rest, (weight, bias) = network
+    return (*rest, (weight * unit, bias * unit))

@@ -1,0 +1,256 @@
+"""The file header <-> canonical msgpack: chunk list, coding mode, attribute steps, and what shows the file alone."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from pd4dgs_codec.errors import Malformed
+from pd4dgs_codec.format import canonical
+from pd4dgs_codec.format.check import info_fault
+from pd4dgs_codec.format.container import SCENE_ID_SIZE
+from pd4dgs_codec.format.fields import Fields, as_integer, as_list
+from pd4dgs_codec.format.kinds import BY_CHUNK_TYPE, LAYER_KINDS
+from pd4dgs_codec.format.limits import MAX_CHUNKS, MAX_LOW_BITS, MAX_PAYLOAD
+from pd4dgs_codec.format.options import DEFORMATIONS, MODES, RAW_DEFORMATION
+from pd4dgs_codec.format.quantise import MAX_SYMBOL, is_step
+from pd4dgs_codec.format.table import Grid
+from pd4dgs_codec.scene import ATTRIBUTES, MAX_FEATURE, MAX_SLOTS, Camera, SceneInfo, Widths
+
+# Keys of the header map.
+CHUNKS, MODE, DEFORMATION, STEPS, VOXEL_SIZE, BOX, TIME_RANGE, BACKGROUND, NEAR_FAR, UP, UNIT = range(1, 12)
+CAMERA, ERROR_BOUNDS, DIGEST, WIDTHS, CENTRE, LOW_BITS = range(12, 18)
+# Keys of the camera map.
+VIEWMAT, INTRINSICS, WIDTH, HEIGHT = range(1, 5)
+
+#: Keys of the map of error bounds, by field of Steps.
+TENSOR_CLASSES = {
+    "feature": 0,
+    "scaling_log": 1,
+    "offset": 2,
+    "weights_scaffold": 3,
+    "planes_global": 4,
+    "weights_global": 5,
+    "planes_local": 6,
+    "weights_local": 7,
+}
+#: What every layer 0 has; the other classes belong to layers that a file may do without.
+ALWAYS_BOUNDED = (*ATTRIBUTES, LAYER_KINDS[0].weights_step)
+
+MAX_CAMERA_SIDE = 65535
+DIGEST_SIZE = 16  #: bytes
+
+
+@dataclass(frozen=True, eq=False)
+class Header:
+    """chunks: (type, payload length in bytes) in file order. attribute_steps: by name, in the table's order.
+
+    widths: of the anchors. centre: int32 [channels] in steps, if they are graded. error_bounds: by field of Steps, how
+    far a decoded value may lie from the one that the encoder was given, in the unit of the values; a binary32 value >=
+    0. digest: payload_digest of the layers that were encoded together. low_bits: how many of the attributes' symbols
+    come in slices of their own, 0 for none.
+    """
+
+    chunks: tuple[tuple[int, int], ...]
+    mode: str
+    deformation: str
+    attribute_steps: dict[str, float]
+    widths: Widths
+    centre: np.ndarray | None
+    info: SceneInfo
+    error_bounds: dict[str, float]
+    digest: bytes
+    low_bits: int = 0
+
+    @property
+    def grid(self) -> Grid:
+        """That of the attributes."""
+        centre = np.zeros(self.widths.channels, np.int32) if self.centre is None else self.centre
+        return Grid(self.attribute_steps, self.widths, centre)
+
+    @property
+    def raw_deformation(self) -> bool:
+        """Whether planes and networks of layers 1 and 2 are stored as float32 values."""
+        return self.deformation == RAW_DEFORMATION
+
+
+def _f32(values: ArrayLike) -> list[float]:
+    return [float(np.float32(v)) for v in np.ravel(values)]
+
+
+def pack_header(header: Header) -> bytes:
+    """The header's bytes. Raises EncodeError (from the packer) for a value canonical msgpack cannot hold."""
+    info = header.info
+    fields: dict[int, object] = {
+        CHUNKS: [list(chunk) for chunk in header.chunks],
+        MODE: MODES[header.mode],
+        DEFORMATION: DEFORMATIONS[header.deformation],
+        STEPS: _f32([header.attribute_steps[name] for name in ATTRIBUTES]),
+        VOXEL_SIZE: _f32(info.voxel_size)[0],
+        BOX: _f32(info.box),
+        TIME_RANGE: _f32(info.time_range),
+        BACKGROUND: _f32(info.background),
+        NEAR_FAR: _f32([info.near, info.far]),
+        UP: _f32(info.up),
+        UNIT: _f32(info.unit)[0],
+    }
+    if info.camera is not None:
+        camera = info.camera
+        fields[CAMERA] = {
+            VIEWMAT: _f32(camera.viewmat[:3]),
+            INTRINSICS: _f32(camera.K[[0, 1, 0, 1], [0, 1, 2, 2]]),
+            WIDTH: int(camera.width),
+            HEIGHT: int(camera.height),
+        }
+    bounds = header.error_bounds
+    fields[ERROR_BOUNDS] = {number: bounds[name] for name, number in TENSOR_CLASSES.items() if name in bounds}
+    fields |= {DIGEST: header.digest, WIDTHS: [header.widths.feature, header.widths.slots]}
+    if header.centre is not None:
+        fields[CENTRE] = header.centre.tolist()
+    if header.low_bits:
+        fields[LOW_BITS] = header.low_bits
+    return canonical.pack(fields)
+
+
+def unpack_header(data: bytes, offset: int = 0) -> Header:
+    """The inverse of pack_header (clause "header"); `offset` is that of the header's first byte, for messages."""
+    fields = Fields(canonical.unpack(data, offset=offset), "header", set(range(CHUNKS, LOW_BITS + 1)))
+    steps = fields.reals(STEPS, len(ATTRIBUTES))
+    voxel_size = fields.real(VOXEL_SIZE)
+    for name, step in zip(["voxel_size", *ATTRIBUTES], [voxel_size, *steps], strict=True):
+        if not is_step(step):
+            raise Malformed(f"header: step {step!r} of {name}, expected a positive normal binary32 value")
+    box = np.array(fields.reals(BOX, 6), dtype=np.float32).reshape(2, 3)
+    if (box[0] > box[1]).any():
+        raise Malformed("header: a lower corner of the box lies above the upper one")
+    near, far = fields.reals(NEAR_FAR, 2)
+    info = SceneInfo(
+        voxel_size=voxel_size,
+        box=box,
+        time_range=fields.reals(TIME_RANGE, 2),  # type: ignore[arg-type]
+        background=fields.reals(BACKGROUND, 3),  # type: ignore[arg-type]
+        near=near,
+        far=far,
+        up=fields.reals(UP, 3),  # type: ignore[arg-type]
+        unit=fields.real(UNIT),
+        camera=_unpack_camera(fields.get(CAMERA)) if CAMERA in fields else None,
+    )
+    fault = info_fault(info)
+    if fault is not None:
+        raise Malformed(f"header: {fault}")
+    widths = _unpack_widths(fields)
+    chunks, mode = _unpack_chunks(fields.sequence(CHUNKS)), fields.choice(MODE, MODES)
+    layers = layers_of(chunks)
+    if mode == "lzma" and len(set(layers)) < len(layers):
+        raise Malformed(f"header: layer chunks {layers} in mode lzma, expected each layer in one slice")
+    low_bits = fields.integer(LOW_BITS, MAX_LOW_BITS, low=1) if LOW_BITS in fields else 0
+    if low_bits and mode == "lzma":
+        raise Malformed(f"header: {low_bits} low bits in mode lzma, expected none")
+    return Header(
+        chunks=chunks,
+        mode=mode,
+        deformation=fields.choice(DEFORMATION, DEFORMATIONS),
+        attribute_steps=dict(zip(ATTRIBUTES, steps, strict=True)),
+        widths=widths,
+        centre=_unpack_centre(fields, widths),
+        info=info,
+        error_bounds=_unpack_error_bounds(fields),
+        digest=_unpack_digest(fields.get(DIGEST)),
+        low_bits=low_bits,
+    )
+
+
+def payload_digest(payloads: Iterable[bytes]) -> bytes:
+    """What the header says of the layers' payloads, all those that were encoded together, in file order."""
+    digest = hashlib.sha256()
+    for payload in payloads:
+        digest.update(payload)
+    return digest.digest()[:DIGEST_SIZE]
+
+
+def scene_id_of(header: bytes) -> bytes:
+    """The scene id of every chunk of a file: the first 8 bytes of the SHA-256 of the header's bytes behind its chunk
+    list. Chunks may come and go without another id; whatever decodes them may not.
+
+    header: canonical, with a chunk list.
+    """
+    fields = canonical.unpack(header)
+    map_head = 1 if len(fields) < 16 else 3
+    chunk_list = len(canonical.pack(CHUNKS)) + len(canonical.pack(fields[CHUNKS]))
+    return hashlib.sha256(header[map_head + chunk_list :]).digest()[:SCENE_ID_SIZE]
+
+
+def _unpack_digest(value: object) -> bytes:
+    if not isinstance(value, bytes) or len(value) != DIGEST_SIZE:
+        raise Malformed(f"header: digest of the layers, expected {DIGEST_SIZE} bytes")
+    return value
+
+
+def _unpack_chunks(rows: list[Any]) -> tuple[tuple[int, int], ...]:
+    as_integer(len(rows), MAX_CHUNKS, "header: number of chunks", low=1)
+    chunks = []
+    for i, row in enumerate(rows):
+        kind, length = as_list(row, f"header: chunk {i}", 2)
+        chunks.append(
+            (
+                as_integer(kind, 0xFFFF, f"header: type of chunk {i}"),
+                as_integer(length, MAX_PAYLOAD, f"header: length of chunk {i}"),
+            )
+        )
+    layers = layers_of(chunks)
+    if chunks[0][0] != 0 or layers != sorted(layers):
+        raise Malformed(f"header: layer chunks {layers}, expected layer 0 first and the layers ascending")
+    return tuple(chunks)
+
+
+def layers_of(chunks: Iterable[tuple[int, int]]) -> list[int]:
+    """The layer of each slice in a chunk list."""
+    return [kind for kind, _ in chunks if kind in BY_CHUNK_TYPE]
+
+
+def _unpack_widths(header: Fields) -> Widths:
+    feature, slots = header.sequence(WIDTHS, 2)
+    as_integer(feature, MAX_FEATURE, "header: feature width", low=1)
+    return Widths(feature, as_integer(slots, MAX_SLOTS, "header: slots", low=1), CENTRE in header)
+
+
+def _unpack_centre(header: Fields, widths: Widths) -> np.ndarray | None:
+    if not widths.graded:
+        return None
+    values = header.sequence(CENTRE, widths.channels)
+    return np.array(
+        [as_integer(m, MAX_SYMBOL, "header: a channel's centre", low=-MAX_SYMBOL) for m in values], np.int32
+    )
+
+
+def _unpack_error_bounds(header: Fields) -> dict[str, float]:
+    if ERROR_BOUNDS not in header:
+        raise Malformed(f"header: key {ERROR_BOUNDS}, error bounds, is missing, as in files of earlier drafts")
+    fields = Fields(header.get(ERROR_BOUNDS), "header error bounds", set(TENSOR_CLASSES.values()))
+    bounds = {
+        name: fields.real(number)
+        for name, number in TENSOR_CLASSES.items()
+        if number in fields or name in ALWAYS_BOUNDED
+    }
+    for name, bound in bounds.items():
+        if bound < 0:
+            raise Malformed(f"header: error bound {bound!r} of {name}, expected 0 or more")
+    return bounds
+
+
+def _unpack_camera(data: object) -> Camera:
+    fields = Fields(data, "header camera", {VIEWMAT, INTRINSICS, WIDTH, HEIGHT})
+    viewmat = np.eye(4, dtype=np.float32)
+    viewmat[:3] = np.array(fields.reals(VIEWMAT, 12), dtype=np.float32).reshape(3, 4)
+    fx, fy, cx, cy = fields.reals(INTRINSICS, 4)
+    return Camera(
+        viewmat=viewmat,
+        K=np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1]], np.float32),
+        width=fields.integer(WIDTH, MAX_CAMERA_SIDE, low=1),
+        height=fields.integer(HEIGHT, MAX_CAMERA_SIDE, low=1),
+    )

@@ -1,0 +1,157 @@
+"""What a file says about itself: from the header alone where possible; digests of its contents for conformance."""
+
+from __future__ import annotations
+
+import hashlib
+from typing import Any
+
+import numpy as np
+
+from pd4dgs_codec.errors import DecodeError
+from pd4dgs_codec.format.bounds import blocks_of, rounding_bounds
+from pd4dgs_codec.format.container import CHUNK_OVERHEAD, MAJOR, MINOR, PREAMBLE_SIZE, read_chunk, read_preamble
+from pd4dgs_codec.format.decoder import read_layers
+from pd4dgs_codec.format.header import unpack_header
+from pd4dgs_codec.format.kinds import BY_CHUNK_TYPE
+from pd4dgs_codec.format.layer_meta import Declared, Section
+from pd4dgs_codec.format.metadata import CHUNK_TYPE, TEXTS, Metadata, read_metadata
+from pd4dgs_codec.format.payload import read_meta
+from pd4dgs_codec.format.symbols import float_tensors
+
+FORMAT_VERSION = f"{MAJOR}.{MINOR}"
+
+
+def info(data: bytes) -> dict[str, Any]:
+    """Header and layers of a file, or of its first bytes: only the preamble and header must be there.
+
+    layers: {layer, offset, bytes, end, slices} (whole chunks; end = length of the prefix that holds layers 0 .. this
+    one) and, for layers that `data` holds whole, anchors, steps, planes ([C, x, y, z, t] per scale), networks (output
+    widths) and sections (bytes by name; what else the chunks hold is their frames and their parameters). slices:
+    {offset, bytes, end} and, of those that `data` holds whole, anchors, and where low bits come instead, refines:
+    {layer, slices}.
+    metadata: {title, source, licence, command, quality, slices, still_bytes} as far as given, {"fault"} if it cannot be
+    read, None where `data` holds no such chunk.
+    """
+    preamble = read_preamble(data)
+    header = unpack_header(preamble.header, offset=PREAMBLE_SIZE)
+    others, offset, declared = [], preamble.size, Declared()
+    layers: list[dict[str, Any]] = []
+    metadata: dict[str, Any] | None = None
+    for chunk_type, length in header.chunks:
+        size = CHUNK_OVERHEAD + length
+        kind = BY_CHUNK_TYPE.get(chunk_type)
+        place: dict[str, Any] = {"offset": offset, "bytes": size, "end": offset + size}
+        if kind is None:
+            others.append({"type": chunk_type, **place})
+            if chunk_type == CHUNK_TYPE and metadata is None and offset + size <= len(data):
+                metadata = _about(read_chunk(data, offset, type=chunk_type, length=length).payload)
+        else:
+            later = bool(layers) and layers[-1]["layer"] == kind.layer
+            if not later:
+                layers.append({"layer": kind.layer, **place, "bytes": 0, "slices": []})
+            row = layers[-1]
+            row["slices"].append(place)
+            row |= {"bytes": row["bytes"] + size, "end": place["end"]}
+            if offset + size <= len(data):
+                payload = read_chunk(data, offset, type=chunk_type, length=length).payload
+                meta, _, declared = read_meta(payload, kind, header.widths, declared, header.raw_deformation, later)
+                place["anchors"] = meta.rows
+                if meta.refines:
+                    place["refines"] = {"layer": meta.refines[0], "slices": meta.refines[1]}
+                row["anchors"] = row.get("anchors", 0) + meta.rows
+                if not later:
+                    row |= {
+                        "steps": meta.steps,
+                        "planes": [[s.channels, *s.sides] for s in meta.scales],
+                        "sections": {},
+                    }
+                    row["networks"] = {name: list(widths) for name, widths in meta.networks.items()}
+                for key, section_bytes in sorted(meta.sections.items()):
+                    name = Section(key).name.lower()
+                    row["sections"][name] = row["sections"].get(name, 0) + section_bytes
+            else:
+                for told in ("anchors", "steps", "planes", "sections", "networks"):
+                    row.pop(told, None)
+        offset += size
+    return {
+        "format_version": f"{preamble.major}.{preamble.minor}",
+        "bytes": offset,
+        "available": len(data),
+        "header_bytes": preamble.size,
+        "mode": header.mode,
+        "deformation": header.deformation,
+        "voxel_size": header.info.voxel_size,
+        "feature_width": header.widths.feature,
+        "slots": header.widths.slots,
+        "graded": header.widths.graded,
+        "low_bits": header.low_bits,
+        "steps": header.attribute_steps,
+        "error_bounds": header.error_bounds,
+        "anchors": declared.rows if all("anchors" in row for row in layers) else None,
+        "time_range": list(header.info.time_range),
+        "camera": header.info.camera is not None,
+        "metadata": metadata,
+        "layers": layers,
+        "chunks": others,
+    }
+
+
+def metadata_of(data: bytes) -> Metadata | None:
+    """The metadata of a complete file, None if it has none. Raises DecodeError if it cannot be read."""
+    preamble = read_preamble(data)
+    offset = preamble.size
+    for chunk_type, length in unpack_header(preamble.header, offset=PREAMBLE_SIZE).chunks:
+        if chunk_type == CHUNK_TYPE:
+            return read_metadata(read_chunk(data, offset, type=chunk_type, length=length).payload)
+        offset += CHUNK_OVERHEAD + length
+    return None
+
+
+def _about(payload: bytes) -> dict[str, Any]:
+    """Metadata as JSON can hold it. A fault in it is none of the file's layers, so it is told and not raised."""
+    try:
+        found = read_metadata(payload)
+    except DecodeError as error:
+        return {"fault": str(error)}
+    texts = {name: text for name in TEXTS if (text := getattr(found, name))}
+    quality = {"quality": {str(level): db for level, db in found.quality.items()}} if found.quality else {}
+    slices = {"slices": list(found.slices)} if found.slices else {}
+    return {**texts, **quality, **slices, **({"still_bytes": len(found.still)} if found.still else {})}
+
+
+def nearest_bounds(data: bytes) -> dict[str, float]:
+    """By field of Steps the error bounds that a complete file would have if its encoder rounded to the nearest symbol.
+
+    Decodes all of it. They can be held against the declared ones, where the errors themselves take the scene encoded.
+    """
+    reader, _ = read_layers(data)
+    assert reader.header is not None
+    scene = reader.scene()
+    return rounding_bounds(scene, blocks_of(scene), reader.header.raw_deformation)
+
+
+def hashes(data: bytes, max_layer: int | None = None) -> list[dict[str, Any]]:
+    """Per layer {layer, symbols, tensors}: SHA-256 in hex of a complete file's integers and float32 values, or of
+    those of its layers <= max_layer alone (bytes after those are not looked at).
+
+    symbols: int32 little-endian, C order, of anchor_q [n, 3], the rise of earlier rows' mask codes, the codes of own
+    rows, their step classes if there are any, attributes [channels, n], then planes [C, H, W] scale by scale in the
+    order xy xz xt yz yt zt, then weight [out, in] and bias [out] per linear layer, networks by ascending id; float32
+    planes and weights are left out. tensors: float32 little-endian of anchor [n, 3], feature [n, D], scaling_log [n,
+    6], offset [n, G, 3] of own rows, then planes and networks as above.
+    """
+    reader, _ = read_layers(data, max_layer=max_layer)
+    scene = reader.scene()
+    rows = []
+    for index, layer in enumerate(reader.layers):
+        integers = [a for a in layer.arrays() if a.dtype.kind == "i"]
+        symbols, tensors = _digest(integers, "<i4"), _digest(float_tensors(scene, index), "<f4")
+        rows.append({"layer": layer.kind.layer, "symbols": symbols, "tensors": tensors})
+    return rows
+
+
+def _digest(arrays: list[np.ndarray], dtype: str) -> str:
+    digest = hashlib.sha256()
+    for array in arrays:
+        digest.update(np.ascontiguousarray(array, dtype=dtype).tobytes())
+    return digest.hexdigest()

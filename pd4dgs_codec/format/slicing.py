@@ -1,0 +1,125 @@
+"""Encoder: a layer's payload in one piece, or in slices of about equal size, the anchors that matter most first.
+
+Nothing here is normative.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from pd4dgs_codec.entropy.fitting import Fitted
+from pd4dgs_codec.format.attribute_section import Past
+from pd4dgs_codec.format.container import CHUNK_OVERHEAD
+from pd4dgs_codec.format.options import EncodeOptions
+from pd4dgs_codec.format.payload import StreamReport, write_layer
+from pd4dgs_codec.format.refining import coarse, write_refinement
+from pd4dgs_codec.format.symbols import LayerSymbols, Refinement, sliced
+
+TRIES = 4  #: at most so many encodes of one slice to hit its size
+SLACK = 0.97  #: of the size wanted, what a slice is aimed at
+FULL = 0.92  #: of the size wanted, what is large enough
+
+
+@dataclass(frozen=True, eq=False)
+class Slice:
+    """A slice as it is written: its own symbols, low bits included, its payload, and what each section took."""
+
+    symbols: LayerSymbols
+    payload: bytes
+    streams: list[StreamReport]
+
+
+def whole_layer(layer: LayerSymbols, options: EncodeOptions) -> Slice:
+    """A layer in one slice."""
+    return Slice(layer, *write_layer(coarse(layer, options.low_bits), options))
+
+
+def write_slices(layer: LayerSymbols, options: EncodeOptions, utility: np.ndarray, reserved: int = 0) -> list[Slice]:
+    """The slices of a layer, in order, of about options.slices bytes at most.
+
+    utility: float [n], of the layer's anchors; the highest come first. reserved: bytes that stand before the first
+    slice and count as part of it. A first slice that is larger without anchors, for its planes and networks, is left
+    at that, but for layer 0: a picture needs anchors.
+    """
+    fine, layer = layer, coarse(layer, options.low_bits)
+    rows = np.argsort(-utility, kind="stable")
+    costs = np.cumsum(bits_per_row(layer)[rows]) / 8
+    done, found, past = 0, list[Slice](), Past[Fitted]()
+    scale = 1.0  # bytes that a slice takes per byte expected
+    while done < len(rows) or not found:
+        room = options.slices - CHUNK_OVERHEAD - (0 if found else reserved)
+        least = 1 if found or layer.kind.layer == 0 else 0
+        before = costs[done - 1] if done else 0.0
+        fixed = 0 if found else len(write_layer(sliced(layer, [rows[:0]])[0], options)[0])
+        if not found and layer.kind.layer == 0:
+            room = max(room, 2 * fixed)
+        tries: list[tuple[bool, int, Slice, Past[Fitted]]] = []  # fits, anchors, slice, what the next may reuse
+        for _ in range(TRIES):
+            expected = (costs[done:] - before) * scale + fixed
+            likely = int(np.searchsorted(expected, room * SLACK, side="right"))
+            count = min(max(likely, least), len(rows) - done)
+            part = rows[done : done + count]
+            symbols, own = (sliced(x, [rows[:0], part] if found else [part])[-1] for x in (layer, fine))
+            trial = past.copy()
+            payload, streams = write_layer(symbols, options, trial, layer)
+            if count:
+                scale *= max(len(payload) - fixed, 1) / max(expected[count - 1] - fixed, 1)
+            fits = len(payload) <= room or count <= least
+            tries.append((fits, count, Slice(own, payload, streams), trial))
+            if fits and (len(payload) >= room * FULL or count in (least, len(rows) - done)):
+                break
+        _, count, made, past = max(tries, key=lambda tried: (tried[0], tried[1] if tried[0] else -tried[1]))
+        found.append(made)
+        done += count
+    return found
+
+
+def with_low_bits(layers: Sequence[list[Slice]], options: EncodeOptions) -> list[list[Slice]]:
+    """The layers' slices, and behind them those that bring low bits. Those of layer 0 wait for layer 1: that things
+    move shows more than the last bits of where they are. Layer 2 waits for all of them."""
+    if len(layers) == 1:
+        return [[*layers[0], *_refining_slices(layers[0], layers, options)]]
+    base, first, *more = layers
+    first = [*first, *_refining_slices(first, (base, first), options)]
+    return [base, first, *([*parts, *_refining_slices(parts, (parts,), options)] for parts in more)]
+
+
+def _refining_slices(owner: Sequence[Slice], layers: Sequence[Sequence[Slice]], options: EncodeOptions) -> list[Slice]:
+    """Slices of the owner's layer that bring the low bits of these layers: each those of as many slices of one layer as
+    keep to options.slices."""
+    found: list[Slice] = []
+    bare = sliced(owner[0].symbols, [np.zeros(0, np.int64)] * 2)[-1]
+    for parts in layers:
+        done = 0
+        while any(len(part.symbols.anchor_q) for part in parts[done:]):
+            least = next(i + 1 for i, part in enumerate(parts[done:]) if len(part.symbols.anchor_q))
+            count, made = len(parts) - done, None
+            while made is None:
+                made = _refining(bare, [part.symbols for part in parts[done : done + count]], options)
+                if count > least and options.slices and len(made.payload) + CHUNK_OVERHEAD > options.slices:
+                    count, made = min(count - 1, max(least, count * options.slices // len(made.payload))), None
+            found.append(made)
+            done += count
+    return found
+
+
+def _refining(bare: LayerSymbols, parts: Sequence[LayerSymbols], options: EncodeOptions) -> Slice:
+    coded = write_refinement(parts, options.low_bits, options)
+    symbols = replace(bare, refines=Refinement(parts[0].kind.layer, len(parts), coded.payload))
+    size = sum(part.attributes.size for part in parts)
+    report = StreamReport("low_bits", coded.payload_bits, coded.rate_bits, size)
+    payload, (positions, *_) = write_layer(symbols, options)
+    return Slice(symbols, payload, [positions, report])
+
+
+def bits_per_row(layer: LayerSymbols) -> np.ndarray:
+    """float64 [n]: about what each anchor costs, by the frequencies of its symbols in their channels."""
+    n = len(layer.anchor_q)
+    bits = np.full(n, 3.0 * max(n, 2).bit_length())  # of a position
+    for channel in (layer.mask_own, *layer.attributes):
+        _, index, counts = np.unique(channel, return_inverse=True, return_counts=True)
+        bits += np.log2(n / counts)[index]
+    return bits

@@ -1,1 +1,0 @@
-"""Picture quality: `image` by the pixel, `perceptual` by networks."""

@@ -1,1 +1,0 @@
-"""Pictures of a decoded scene, without torch: networks and planes in compiled kernels, then the rasteriser."""

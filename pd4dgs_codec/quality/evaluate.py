@@ -1,0 +1,121 @@
+"""Quality and bytes per level of a file, on a dataset's held-out views."""
+
+from __future__ import annotations
+
+import statistics
+from collections.abc import Callable, Mapping
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import numpy as np
+
+from pd4dgs_codec.data.view import Dataset, View
+from pd4dgs_codec.quality.image import mean_image_baseline, mpsnr, mssim, to_uint8
+from pd4dgs_codec.quality.level_psnr import Metric, mean_scores
+from pd4dgs_codec.quality.levels import Level, load_levels
+from pd4dgs_codec.quality.perceptual import Distance, Perceptual
+from pd4dgs_codec.scene import Camera
+
+#: Pictures of the fixed camera over t = 0..1 that the temporal distances compare.
+TEMPORAL_FRAMES = 30
+NO_DISTANCES: Mapping[str, Distance] = MappingProxyType({})
+
+
+def evaluate_file(
+    path_or_bytes: str | Path | bytes,
+    dataset: Dataset,
+    max_layer: int | None = None,
+    *,
+    device: str = "cpu",
+    perceptual: Perceptual | None = None,
+    step: Callable[[], None] = lambda: None,
+) -> dict[str, Any]:
+    """What `pd4dgs-eval --json` prints: metrics are means over the views of the per-view values.
+
+    Without held-out views the training views are used and "split" says "train". mpsnr in dB, infinite where nothing
+    differs. perceptual: distances to add, see `evaluate_level`; what they are is then under "perceptual". step is
+    called after each picture of each level. Raises DecodeError, DataError.
+    """
+    views, split = (dataset.test, "test") if dataset.test else (dataset.train, "train")
+    levels = load_levels(path_or_bytes, max_layer, device)
+    distances = perceptual.distances if perceptual else NO_DISTANCES
+    result: dict[str, Any] = {
+        "source": dataset.name,
+        "split": split,
+        "views": len(views),
+        "width": views[0].width,
+        "height": views[0].height,
+        "masked": dataset.masked and split == "test",
+        "baseline_mean_image_psnr": _baseline(dataset, views),
+        "levels": [evaluate_level(level, views, distances, step) for level in levels],
+    }
+    if perceptual:
+        result["perceptual"] = {
+            "distances": {name: {"title": d.title, "source": d.source} for name, d in distances.items()},
+            "absent": perceptual.absent,
+            "temporal_frames": TEMPORAL_FRAMES,
+            "temporal_camera": views[0].name,
+        }
+    return result
+
+
+def metric_columns(result: dict[str, Any]) -> list[tuple[str, str, int]]:
+    """(heading, key of a level's row, decimals) of each metric that an evaluation holds."""
+    titles = {name: d["title"] for name, d in result.get("perceptual", {"distances": {}})["distances"].items()}
+    return [
+        ("mPSNR dB", "mpsnr", 2),
+        ("mSSIM", "mssim", 4),
+        *((f"m{title}", f"m{name}", 4) for name, title in titles.items()),
+        *((f"t-{title}", f"t_{name}", 5) for name, title in titles.items()),
+    ]
+
+
+def evaluate_level(
+    level: Level,
+    views: tuple[View, ...],
+    distances: Mapping[str, Distance] = NO_DISTANCES,
+    step: Callable[[], None] = lambda: None,
+) -> dict[str, Any]:
+    """The row of one level. render_ms: median milliseconds per picture, the networks included.
+
+    distances: name -> distance; adds m<name>, the mean over the views, and t_<name>, the mean between successive
+    pictures of the first view's camera at TEMPORAL_FRAMES equidistant times from 0 to 1.
+    """
+    metrics: dict[str, Metric] = {"mpsnr": mpsnr, "mssim": mssim}
+    metrics |= {f"m{name}": distance for name, distance in distances.items()}
+    milliseconds = []
+
+    def draw(view: View) -> np.ndarray:
+        image, took = level.timed_picture(view.camera, view.time)
+        milliseconds.append(took)
+        return image
+
+    level.picture(views[0].camera, views[0].time)  # compilation and caches are not the renderer's speed
+    return {
+        "level": level.level,
+        **mean_scores(draw, views, metrics, step),
+        **_temporal(level, views[0].camera, distances, step),
+        "cumulative_bytes": level.cumulative_bytes,
+        "anchors": level.anchors,
+        "decode_seconds": level.decode_seconds,
+        "render_ms": statistics.median(milliseconds),
+    }
+
+
+def _temporal(
+    level: Level, camera: Camera, distances: Mapping[str, Distance], step: Callable[[], None]
+) -> dict[str, float]:
+    if not distances:
+        return {}
+    frames = []
+    for t in np.linspace(0.0, 1.0, TEMPORAL_FRAMES):
+        frames.append(to_uint8(level.picture(camera, float(t))))
+        step()
+    return {f"t_{name}": distance.temporal(frames) for name, distance in distances.items()}
+
+
+def _baseline(dataset: Dataset, views: tuple[View, ...]) -> float | None:
+    """PSNR of always showing the mean training image; None where images differ in size and there is no such image."""
+    sizes = {view.image.shape for view in (*dataset.train, *views)}
+    return mean_image_baseline(dataset.train, views) if len(sizes) == 1 else None

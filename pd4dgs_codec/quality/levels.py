@@ -1,0 +1,116 @@
+"""A file's levels ready to render: each one from the bytes that a receiver would hold at that level.
+
+A decoded level is drawn without torch, by `playback`; a checkpoint, and a level on another device, by the torch model.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+from time import perf_counter
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from pd4dgs_codec.draw.player import Player
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.format.container import SIGNATURE
+from pd4dgs_codec.format.decoder import decode
+from pd4dgs_codec.format.info import info
+from pd4dgs_codec.scene import MASK_THRESHOLD, Camera, Scene
+
+if TYPE_CHECKING:
+    from pd4dgs_codec.model.model import Model
+
+
+@dataclass(frozen=True)
+class Level:
+    """One level of a file, drawn by `model`. anchors: active at it. cumulative_bytes: of its prefix, and decode_seconds
+    of decoding that; both None for a checkpoint."""
+
+    level: int
+    model: Player | Model
+    anchors: int
+    cumulative_bytes: int | None = None
+    decode_seconds: float | None = None
+
+    def picture(self, camera: Camera, time: float) -> np.ndarray:
+        """float32 [H, W, 3] in 0..1 at normalised time 0..1."""
+        if isinstance(self.model, Player):
+            return self.model.picture(camera, time)
+        from pd4dgs_codec.model.picture import render_image
+
+        return render_image(self.model, self.level, time, camera)
+
+    def timed_picture(self, camera: Camera, time: float) -> tuple[np.ndarray, float]:
+        """`picture`, and the milliseconds that it took, the networks included."""
+        start = perf_counter()
+        image = self.picture(camera, time)
+        return image, 1e3 * (perf_counter() - start)
+
+
+def level_of(scene: Scene, device: str = "cpu") -> Level:
+    """The highest level of a decoded scene."""
+    active = int((scene.mask[-1] > 0).sum())
+    if device == "cpu":
+        return Level(scene.level, Player(scene), active)
+    from pd4dgs_codec.model.convert import from_scene
+
+    return Level(scene.level, from_scene(scene).to(device), active)
+
+
+def load_levels(
+    file: str | Path | bytes,
+    max_layer: int | None = None,
+    device: str = "cpu",
+    *,
+    max_bytes: int | None = None,
+    last_only: bool = False,
+) -> list[Level]:
+    """The levels of a `.pd4` file (or its bytes) or of a checkpoint, ascending, up to max_layer; or only the
+    last of them. max_bytes: of a `.pd4`, only what the slices within so many bytes give.
+
+    Each level of a `.pd4` is decoded from its own prefix, so nothing of a later layer can leak into it.
+    """
+    if isinstance(file, bytes):
+        return _of_bytes(file, max_layer, device, max_bytes, last_only)
+    try:
+        data = Path(file).read_bytes()
+    except OSError as error:
+        raise DataError(f"{file}: cannot be read: {error.strerror}") from None
+    if data.startswith(SIGNATURE[:4]):
+        return _of_bytes(data, max_layer, device, max_bytes, last_only)
+    if max_bytes is not None:
+        raise DataError(f"{file}: a checkpoint has no slices; expected a .pd4 file")
+    return _of_checkpoint(file, max_layer, device)[-1 if last_only else 0 :]
+
+
+def _of_bytes(data: bytes, max_layer: int | None, device: str, max_bytes: int | None, last_only: bool) -> list[Level]:
+    levels, ends = [], dict[int, int]()
+    for row in info(data)["layers"]:
+        within = [part["end"] for part in row["slices"] if max_bytes is None or part["end"] <= max_bytes]
+        if within and (max_layer is None or row["layer"] <= max_layer):
+            ends[row["layer"]] = within[-1]
+    if not ends and max_bytes is not None:
+        decode(data, max_bytes=max_bytes)  # which says why there is none
+    for layer in list(ends)[-1:] if last_only else ends:
+        start = perf_counter()
+        scene = decode(data[: ends[layer]], max_layer=layer, max_bytes=ends[layer])
+        seconds = perf_counter() - start
+        levels.append(replace(level_of(scene, device), cumulative_bytes=ends[layer], decode_seconds=seconds))
+    return levels
+
+
+def _of_checkpoint(path: str | Path, max_layer: int | None, device: str) -> list[Level]:
+    import torch
+
+    from pd4dgs_codec.model import checkpoint
+
+    model, _ = checkpoint.load(path)
+    model = model.to(device)
+    with torch.no_grad():
+        return [
+            Level(level, model, int((model.masks(level) > MASK_THRESHOLD).sum()))
+            for level in (0, *model.deformations)
+            if max_layer is None or level <= max_layer
+        ]

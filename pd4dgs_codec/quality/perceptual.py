@@ -1,0 +1,156 @@
+"""LPIPS, ST-LPIPS and FLIP, each where its package and weights are present, with the mask; and their temporal forms.
+
+Nothing is downloaded. docs/evaluation.md gives the definitions and says where each package comes from.
+"""
+
+from __future__ import annotations
+
+import functools
+import sys
+import types
+import warnings
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass
+from importlib import metadata
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.quality.image import LEAST_WEIGHT, prepare
+
+#: What FLIP assumes of the viewer, its package's default: metres from the screen, its width in pixels and in metres.
+VIEWING = (0.7, 3840, 0.7)
+#: Smallest side, pixels, that the networks' strides and paddings leave something of.
+LPIPS_LEAST, STLPIPS_LEAST = 31, 21
+
+#: float32 [H, W] error per pixel, of two float32 [H, W, 3] in 0..1
+ErrorMap = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True)
+class Distance:
+    """One perceptual distance: 0 for equal pictures, larger is worse.
+
+    title: as tables name it. source: package, version and network. least: smallest side of a picture, pixels.
+    """
+
+    title: str
+    source: str
+    error_map: ErrorMap
+    least: int = 1
+
+    def __call__(self, pred: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) -> float:
+        """sum(map * m) / max(sum(m), 1e-6), where map compares pred * m with target * m: DyCheck's rule for mLPIPS.
+
+        pred, target: [H, W, 3] uint8 or floats in 0..1, brought to 8 bits first. mask: bool [H, W]; None = all.
+        Raises DataError if shapes differ or the picture is smaller than `least`.
+        """
+        a, b, m = prepare(pred, target, mask)
+        height, width = m.shape
+        if min(height, width) < self.least:
+            raise DataError(f"image is {width}x{height}, expected at least {self.least}x{self.least} for {self.title}")
+        masked = [np.ascontiguousarray(z * m[..., None], dtype=np.float32) for z in (a, b)]
+        return float((self.error_map(*masked) * m).sum() / max(m.sum(), LEAST_WEIGHT))
+
+    def temporal(self, frames: Iterable[np.ndarray]) -> float:
+        """Mean distance between successive frames [H, W, 3] of one camera, unmasked. DataError for fewer than two."""
+        distances = [self(later, earlier) for earlier, later in pairwise(frames)]
+        if not distances:
+            raise DataError(f"expected at least 2 frames for {self.title} over time")
+        return float(np.mean(distances))
+
+
+@dataclass(frozen=True)
+class Perceptual:
+    """The distances that can be computed here, by the name of their keys, and why each other one cannot."""
+
+    distances: dict[str, Distance]
+    absent: dict[str, str]
+
+
+class _Absent(Exception):
+    """Why a distance cannot be computed here."""
+
+
+def load_perceptual() -> Perceptual:
+    """Loads what is installed; takes a second or two."""
+    distances, absent = {}, {}
+    for name, loader in (("lpips", _lpips), ("stlpips", _stlpips), ("flip", _flip)):
+        try:
+            distances[name] = loader()
+        except _Absent as error:
+            absent[name] = str(error)
+        except ModuleNotFoundError as error:
+            absent[name] = f"the module {error.name} is not installed"
+        except Exception as error:  # a broken install fails in its own way, and must not take the other metrics along
+            absent[name] = " ".join(f"{type(error).__name__}: {error}".split())
+    return Perceptual(distances, absent)
+
+
+def _lpips() -> Distance:
+    import torch
+    from torchvision.models import AlexNet_Weights
+
+    # lpips asks torchvision for ImageNet's weights, which fetches them if they are not in this folder
+    weights = Path(torch.hub.get_dir()) / "checkpoints" / Path(AlexNet_Weights.IMAGENET1K_V1.url).name
+    if not weights.is_file():
+        raise _Absent(f"its AlexNet weights are not in {weights}")
+    import lpips
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # it names torchvision's weights in a deprecated way
+        network = lpips.LPIPS(net="alex", spatial=True, verbose=False)
+    return Distance("LPIPS", f"lpips {metadata.version('lpips')}, alex", _of_network(network), LPIPS_LEAST)
+
+
+def _stlpips() -> Distance:
+    # The package imports these on loading, each for something that the shift-tolerant AlexNet does not use. Afterwards
+    # sys.modules is as it was, so that nobody else meets the stand-ins, or the package loaded with them.
+    from unittest import mock  # a tenth of a second
+
+    unused = {"torchvision": "models", "IPython": "embed", "torchsummary": "summary"}
+    with mock.patch.dict(sys.modules, {name: _empty_module(name, part) for name, part in unused.items()}):
+        from stlpips_pytorch import stlpips
+    network = stlpips.LPIPS(net="alex", variant="shift_tolerant", spatial=True, verbose=False)
+    source = f"stlpips-pytorch {metadata.version('stlpips-pytorch')}, alex, shift tolerant"
+    return Distance("ST-LPIPS", source, _of_network(network), STLPIPS_LEAST)
+
+
+def _empty_module(name: str, part: str) -> types.ModuleType:
+    module = types.ModuleType(name)
+    setattr(module, part, None)
+    return module
+
+
+def _of_network(network: Any) -> ErrorMap:
+    """The spatial map of an LPIPS-like module, which takes [1, 3, H, W] in -1..1."""
+    import torch
+
+    @torch.inference_mode()
+    def error_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        x, y = (torch.from_numpy(z).permute(2, 0, 1)[None] * 2 - 1 for z in (a, b))
+        distances: np.ndarray = network(x, y)[0, 0].numpy()
+        return distances
+
+    return error_map
+
+
+def _flip() -> Distance:
+    import flip_evaluator
+
+    evaluate = functools.partial(
+        flip_evaluator.evaluate,
+        dynamicRangeString="LDR",
+        applyMagma=False,
+        computeMeanError=False,
+        parameters={"vc": list(VIEWING)},
+    )
+
+    def error_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        distances: np.ndarray = evaluate(b, a)[0][..., 0]
+        return distances
+
+    return Distance("FLIP", f"flip-evaluator {metadata.version('flip-evaluator')}", error_map)

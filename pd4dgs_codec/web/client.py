@@ -1,0 +1,181 @@
+"""A viewer's side of a `.pd4` file on a web server: slices as they arrive, upgrades later, cuts survived.
+
+Which slice next, and when to stop. Slices build on each other, so the next one is always the next in the file, and the
+only question is whether to take it. A layer is one slice or more. `next_end` answers after every slice:
+
+1. no slice of a layer beyond `max_layer`, and none that ends beyond `bytes`;
+2. the first slice always, as long as `seconds` last: without it there is no picture;
+3. a further slice only if the rest of it would arrive within `seconds` at the rate of the last second of transfer.
+
+What arrives of a slice before the seconds are over is kept, and a later call goes on from there.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+from pd4dgs_codec.errors import BadSignature, DecodeError, UnsupportedVersion
+from pd4dgs_codec.format.stream import open_stream
+from pd4dgs_codec.scene import Scene
+from pd4dgs_codec.web.prefix import HEADER_GUESS, LONGEST_HEADER, slice_ends, within
+from pd4dgs_codec.web.transfer import Changed, OutOfTime, Transfer
+
+RATE_SECONDS = 1.0
+
+
+@dataclass(frozen=True)
+class Budget:
+    """What a viewer will spend: layers, bytes of the file counted from its first, seconds counted from the call."""
+
+    max_layer: int | None = None
+    bytes: int | None = None
+    seconds: float = math.inf
+
+
+def next_end(
+    slices: list[tuple[int, int]], have: int, budget: Budget, seconds_left: float, rate: float | None
+) -> int | None:
+    """Where the next slice to fetch ends, in bytes of the file, or None to stop.
+
+    slices: (layer, end) in file order. have: bytes here. rate: bytes per second lately, None if not known yet.
+    """
+    wanted = within(slices, budget.max_layer, budget.bytes)
+    end = next((end for _, end in wanted if end > have), None)
+    if end is None or seconds_left <= 0:
+        return None
+    first = end == slices[0][1]
+    in_time = rate is None or seconds_left == math.inf or end - have <= rate * seconds_left
+    return end if first or in_time else None
+
+
+class RateMeter:
+    """Bytes per second over the last RATE_SECONDS of a transfer."""
+
+    def __init__(self) -> None:
+        self._marks: deque[tuple[float, int]] = deque()  # (when, bytes until then)
+
+    def start(self, now: float) -> None:
+        """A request begins; what was measured before a rest does not count."""
+        self._marks = deque([(now, 0)])
+
+    def note(self, now: float, size: int) -> None:
+        """`size` bytes arrived."""
+        self._marks.append((now, self._marks[-1][1] + size))
+        while len(self._marks) > 2 and now - self._marks[1][0] >= RATE_SECONDS:
+            self._marks.popleft()
+
+    @property
+    def latest(self) -> float:
+        """When the latest bytes arrived, or the request began."""
+        return self._marks[-1][0]
+
+    @property
+    def rate(self) -> float | None:
+        """None before anything arrived."""
+        (start, before), (end, after) = self._marks[0], self._marks[-1]
+        return (after - before) / max(end - start, 1e-6) if after > before else None
+
+
+class SceneClient:
+    """Scenes of one URL, best first picture first. Use it in a `with` block, or close it.
+
+    The first request is one open-ended GET, read as it arrives; after a cut, and for slices taken later, Range with
+    If-Range fetches what is missing and nothing twice. If the file is another one then, everything begins anew with its
+    layer 0. A damaged slice is fetched once more and never shown. Stopping leaves what is on its way, at most what the
+    sockets' buffers hold. transfer: bytes and counts, see Transfer.
+    """
+
+    def __init__(self, url: str, *, stall: float = 10.0, attempts: int = 5):
+        self.transfer = Transfer(url, stall=stall, attempts=attempts)
+        self._meter = RateMeter()
+        self._repaired_at = -1
+        self._begin()
+
+    def __enter__(self) -> SceneClient:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    def arrived_at(self) -> float:
+        """time.monotonic() of the latest bytes: when a scene is given, that of its slice's last one."""
+        return self._meter.latest
+
+    def due(self) -> list[tuple[int, int, float]]:
+        """(layer, end, seconds until it is there at the latest rate) of each slice that is still to come; nothing
+        before a rate is known."""
+        rate, have = self._meter.rate, len(self.transfer.data)
+        return [(layer, end, (end - have) / rate) for layer, end in self._slices if end > have] if rate else []
+
+    def close(self) -> None:
+        """Ends the connection; `scenes` may still be called and opens another."""
+        self.transfer.close()
+
+    def scenes(self, budget: Budget = Budget()) -> Iterator[Scene]:
+        """A scene whenever slices have arrived, holding all slices so far; ends where the budget says.
+
+        Called again, it goes on after the last slice given. Raises DeliveryError if the file cannot be had, DecodeError
+        if it is not a valid one; scenes given before stay valid.
+        """
+        until = time.monotonic() + budget.seconds
+        self._meter.start(time.monotonic())
+        while True:
+            while ready := self._ready(budget):  # until empty: a fault behind a slice shows at the next feed
+                yield from ready
+            left = until - time.monotonic()
+            end: int | None = HEADER_GUESS if len(self.transfer.data) < HEADER_GUESS else LONGEST_HEADER
+            reach = None
+            if self._slices:
+                end = next_end(self._slices, len(self.transfer.data), budget, left, self._meter.rate)
+                reach = within(self._slices, budget.max_layer, budget.bytes)[-1][1] if end is not None else None
+            if end is None:
+                break
+            try:
+                block = self.transfer.read(end, reach=reach, seconds=left)
+            except Changed:
+                self._repaired_at = -1
+                self._begin()
+                continue
+            except OutOfTime:
+                break
+            if not block:
+                self._stream.finish()  # the file ends within this slice: Truncated
+            self._meter.note(time.monotonic(), len(block))
+        self.close()
+
+    def _begin(self) -> None:
+        self._stream, self._fed, self._done = open_stream(), 0, 0
+        self._slices: list[tuple[int, int]] = []
+
+    def _ready(self, budget: Budget) -> list[Scene]:
+        """Feeds what is new to the decoder; a fault sends the transfer back to the end of the last good slice."""
+        try:
+            return self._feed(budget)
+        except (BadSignature, UnsupportedVersion):
+            raise  # not what damage on the way looks like
+        except DecodeError:
+            good = self._slices[self._done - 1][1] if self._done else 0
+            if self._repaired_at == good:
+                raise
+            self._repaired_at = good
+            self.transfer.rewind(good)
+            self._begin()
+            self._feed(Budget())  # the good slices once more; they were given already
+            return []
+
+    def _feed(self, budget: Budget) -> list[Scene]:
+        data, end = self.transfer.data, len(self.transfer.data)
+        if not self._slices:
+            self._slices = slice_ends(data)
+        if self._slices:  # the first bytes of a small file may hold more than was asked for
+            wanted = within(self._slices, budget.max_layer, budget.bytes)
+            end = min(end, wanted[-1][1] if wanted else 0)
+        block, self._fed = bytes(data[self._fed : end]), max(self._fed, end)
+        scenes = self._stream.feed(block)
+        self._done = self._stream.slices
+        return scenes

@@ -1,0 +1,154 @@
+"""Pictures without torch: those of the torch model, to rounding, and in a process where torch cannot be imported."""
+
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+from strategies import make_scene
+
+from pd4dgs_codec.draw.networks import Layers
+from pd4dgs_codec.draw.player import Player
+from pd4dgs_codec.errors import RenderError
+from pd4dgs_codec.format.decoder import decode
+from pd4dgs_codec.format.encoder import encode
+from pd4dgs_codec.model.convert import from_scene
+from pd4dgs_codec.model.picture import render_image
+from pd4dgs_codec.scene import Camera, Deformation, Scene, Widths
+
+ROOT = Path(__file__).parents[2]
+K = np.array([[40, 0, 24], [0, 40, 18], [0, 0, 1]], np.float32)
+
+
+def _camera(seed: int) -> Camera:
+    """48 x 36 pixels, somewhere around the scene."""
+    rng = np.random.default_rng(seed)
+    rotation, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    viewmat = np.eye(4, dtype=np.float32)
+    viewmat[:3, :3] = rotation * np.sign(np.linalg.det(rotation))
+    viewmat[2, 3] = 8
+    return Camera(viewmat, K, 48, 36)
+
+
+def _scene(**changes: object) -> Scene:
+    settings = {"hidden": (12,), "channels": 8, "scales": 2, "width": 8, "extent": 30}
+    scene = make_scene(5, anchors=60, kind="gaussian", **(settings | changes))
+    masks = tuple(np.maximum(codes, 77) for codes in scene.mask)
+    return decode(encode(replace(scene, mask=masks), layers=2, effort=1, omit="nothing"))
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [{}, {"hidden": (16, 8)}, {"channels": 5, "width": 7}, {"widths": Widths(16, 4)}, {"widths": Widths(3, 13)}],
+    ids=["usual", "deep", "odd", "narrow", "odd widths"],
+)
+def test_pictures_are_those_of_the_torch_model(changes):
+    scene = _scene(**changes)
+    seen = 0.0
+    for layers in (0, 1, 2):
+        level = scene.prefix(layers)
+        player, model = Player(level), from_scene(level)
+        for seed, t in ((0, 0.0), (1, 0.37), (2, 0.37), (2, 1.0)):
+            camera = _camera(seed)
+            expected = render_image(model, level.level, t, camera)
+            got = player.picture(camera, t)
+            assert got.dtype == np.float32 and got.shape == expected.shape
+            # sums in another order; a Gaussian next to the threshold of opacity may come or go at 1/255
+            assert np.abs(got - expected).max() < 5e-3 and np.abs(got - expected).mean() < 1e-5
+            seen += float(np.ptp(got))
+    assert seen > 2, "the pictures show something"
+
+
+@pytest.mark.parametrize("t", [float("nan"), float("inf")])
+def test_a_time_that_is_no_number_is_refused(t):
+    with pytest.raises(RenderError, match="time is"):
+        Player(_scene()).picture(_camera(0), t)
+
+
+def test_what_depends_on_time_alone_is_kept_and_changes_nothing():
+    player = Player(_scene())
+    one, other = _camera(0), _camera(1)
+    expected = [Player(_scene()).picture(camera, 0.4) for camera in (one, other)]
+    np.testing.assert_array_equal(player.picture(one, 0.4), expected[0])
+    np.testing.assert_array_equal(player.picture(other, 0.4), expected[1])
+    assert player._known.any()
+    np.testing.assert_array_equal(player.picture(one, 0.9), Player(_scene()).picture(one, 0.9))
+
+
+def test_scenes_without_gaussians_in_view_show_the_background():
+    scene = _scene()
+    away = Camera(np.diag([1, 1, 1, 1]).astype(np.float32), K, 48, 36)
+    away.viewmat[2, 3] = -1000
+    picture = Player(scene).picture(away, 0.5)
+    np.testing.assert_array_equal(picture, np.broadcast_to(np.float32(scene.info.background), picture.shape))
+
+
+def test_colours_that_overflow_hide_their_gaussian():
+    scene = _scene()
+    field = scene.local_deformation
+    heads = dict(field.networks)
+    ((weight, bias),) = heads["color"]
+    heads["color"] = ((weight, np.full_like(bias, np.inf)),)
+    scene = replace(scene, local_deformation=Deformation(field.planes, heads))
+    assert np.isfinite(Player(scene).picture(_camera(0), 0.5)).all()
+
+
+@pytest.mark.parametrize("count", [1, 31, 100])
+def test_layers_are_those_of_torch(count):
+    rng = np.random.default_rng(count)
+    layers = tuple(
+        (rng.normal(size=shape).astype(np.float32), rng.normal(size=shape[0]).astype(np.float32))
+        for shape in ((40, 13), (7, 40), (21, 7))
+    )
+    x = rng.normal(size=(count, 13)).astype(np.float32)
+    expected = torch.from_numpy(x)
+    for i, (weight, bias) in enumerate(layers):
+        expected = torch.nn.functional.linear(
+            expected.relu() if i else expected, *map(torch.from_numpy, (weight, bias))
+        )
+    np.testing.assert_allclose(Layers(layers)(x), expected, rtol=1e-4, atol=1e-4)
+    np.testing.assert_allclose(Layers(layers, relu_last=True)(x), expected.relu(), rtol=1e-4, atol=1e-4)
+    assert np.isnan(Layers(layers)(np.full_like(x, np.nan))).all()
+
+
+RENDER = """
+import sys
+sys.modules["torch"] = None
+from pd4dgs_codec.cli.render import main
+code = main([sys.argv[1], "-o", sys.argv[2], "--frames", "1"])
+late = "data.dataset", "interchange.teacher", "metrics.perceptual", "train", "delivery.client"
+loaded = {f"pd4dgs_codec.{name}" for name in late} & set(sys.modules)
+assert not loaded, f"a file of its own camera waits for {loaded}"
+sys.exit(code)
+"""
+
+
+def test_rendering_a_file_needs_no_torch_and_no_datasets(tmp_path):
+    file = tmp_path / "scene.pd4"
+    scene = _scene()
+    file.write_bytes(encode(replace(scene, info=replace(scene.info, camera=_camera(0))), layers=2, effort=1))
+    done = subprocess.run(
+        [sys.executable, "-c", RENDER, file, tmp_path / "out.png"], cwd=ROOT, capture_output=True, text=True
+    )
+    assert done.returncode == 0, done.stderr
+    assert Image.open(tmp_path / "out.png").size == (48, 36)
+
+
+DECODE = """
+import sys
+from pd4dgs_codec.cli.decode import main
+code = main([sys.argv[1]])
+assert not {"http", "ssl", "email", "numba", "torch"} & set(sys.modules), "a local file waits for no network"
+sys.exit(code)
+"""
+
+
+def test_decoding_a_local_file_imports_no_http(tmp_path):
+    file = tmp_path / "scene.pd4"
+    file.write_bytes(encode(_scene(), layers=2, effort=1))
+    done = subprocess.run([sys.executable, "-c", DECODE, file], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr

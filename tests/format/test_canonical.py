@@ -1,0 +1,101 @@
+"""Canonical msgpack: one value, one byte string, and nothing else is accepted."""
+
+import msgpack
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pd4dgs_codec.errors import EncodeError, Malformed
+from pd4dgs_codec.format.canonical import pack, unpack
+
+leaf = (
+    st.booleans()
+    | st.integers(-(2**63), 2**64 - 1)
+    | st.floats(width=32, allow_nan=False, allow_infinity=False)
+    | st.text(max_size=40)
+    | st.binary(max_size=40)
+)
+
+
+def nested(depth: int) -> st.SearchStrategy:
+    if depth == 0:
+        return leaf
+    inner = nested(depth - 1)
+    return leaf | st.lists(inner, max_size=4) | st.dictionaries(st.integers(0, 2**32 - 1), inner, max_size=4)
+
+
+@settings(max_examples=40)
+@given(nested(4))
+def test_round_trip(value):
+    assert unpack(pack(value)) == value
+
+
+@given(st.dictionaries(st.integers(0, 300), leaf, min_size=2))
+def test_the_order_of_insertion_does_not_matter(value):
+    assert pack(value) == pack(dict(reversed(value.items())))
+
+
+def test_known_bytes():
+    assert pack({2: 0.5, 1: [1, 300, -1], 64: b"a"}).hex() == "83019301cd012cff02ca3f00000040c40161"
+
+
+@pytest.mark.parametrize(
+    "value",
+    [None, 0.1, float("nan"), float("inf"), 1e39, -1e300, 2**64, -(2**63) - 1, {"a": 1}, {-1: 1}, {True: 1}, {2**32: 1},
+     [[[[[]]]]], {1: {1: {1: {1: {1: 1}}}}}, np.float32(1), np.int64(1), object(), "\ud800", msgpack.ExtType(1, b"a")],
+)  # fmt: skip
+def test_pack_refuses(value):
+    with pytest.raises(EncodeError):
+        pack(value)
+
+
+@pytest.mark.parametrize(
+    "data",
+    [
+        "",
+        "c0",  # nil
+        "cc01",  # not the shortest integer
+        "cd0001",
+        "d90161",  # not the shortest string
+        "dc000101",  # not the shortest list
+        "cb3fe0000000000000",  # float 64
+        "ca7fc00000",  # NaN
+        "ca7f800000",  # infinity
+        "82020101ff",  # keys out of order
+        "820101010101",  # a trailing value
+        "8201010101",  # a key twice
+        "81a16101",  # a string key
+        "81ff01",  # a negative key
+        "81c301",  # a boolean key
+        "81910101",  # a list as key
+        "d4017f",  # ext
+        "d6ff00000000",  # timestamp
+        "9191919191",  # too deep and cut
+        "919191919101",  # too deep
+        "a1ff",  # not UTF-8
+        "0101",  # trailing byte
+        "ddffffffff",  # a list longer than the data
+        "c1",
+    ],
+)
+def test_unpack_refuses(data):
+    with pytest.raises(Malformed) as caught:
+        unpack(bytes.fromhex(data), offset=20)
+    assert caught.value.offset is not None and caught.value.offset >= 20
+
+
+def test_very_deep_data_is_refused():
+    for depth in (5, 600, 100_000):
+        with pytest.raises(Malformed):
+            unpack(b"\x91" * depth + b"\1")
+
+
+@settings(max_examples=400)
+@given(st.binary(max_size=24))
+def test_what_unpacks_packs_to_the_same_bytes(data):
+    try:
+        value = unpack(data)
+    except Malformed:
+        return
+    assert pack(value) == data

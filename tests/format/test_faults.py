@@ -1,0 +1,181 @@
+"""Faulty files: every one raises the package's own error, in one clear line, and never anything else.
+
+What each rule refuses is in the conformance vectors and their test; here is what holds for all files.
+"""
+
+import tracemalloc
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import make_scene, small_file
+
+from pd4dgs_codec.errors import DecodeError, LimitExceeded, Pd4Error, Truncated
+from pd4dgs_codec.format import canonical
+from pd4dgs_codec.format.container import (
+    FLAG_ANCILLARY,
+    read_chunk,
+    read_preamble,
+    write_chunk,
+    write_preamble,
+)
+from pd4dgs_codec.format.decoder import decode
+from pd4dgs_codec.format.encoder import encode
+from pd4dgs_codec.format.header import CHUNKS, scene_id_of, unpack_header
+
+VECTORS = Path(__file__).parents[2] / "spec" / "vectors" / "faulty"
+
+
+@cache
+def tiny_file():
+    return encode(make_scene(1, layers=(0, 1), anchors=2, kind="constant", hidden=(), extent=1), layers=2, effort=1)
+
+
+def take_apart(data):
+    """(header map, [(type, flags, payload)])"""
+    preamble = read_preamble(data)
+    chunks, offset = [], preamble.size
+    while offset < len(data):
+        chunk = read_chunk(data, offset)
+        chunks.append((chunk.type, chunk.flags, chunk.payload))
+        offset = chunk.end
+    return canonical.unpack(preamble.header), chunks
+
+
+def put_together(header, chunks):
+    """A file with right lengths, ids and CRCs, whatever its payloads say."""
+    header = {**header, CHUNKS: [[t, len(p)] for t, _, p in chunks]}
+    packed = canonical.pack(header)
+    scene_id = scene_id_of(packed)
+    framed = [write_chunk(t, f, scene_id, p) for t, f, p in chunks]
+    return b"".join([write_preamble(packed), *framed])
+
+
+def test_putting_together_what_was_taken_apart_changes_nothing():
+    assert put_together(*take_apart(small_file())) == small_file()
+
+
+def test_every_single_bit_flip_is_caught():
+    for i in range(8 * len(tiny_file())):
+        data = bytearray(tiny_file())
+        data[i // 8] ^= 1 << i % 8
+        with pytest.raises(DecodeError):
+            decode(bytes(data))
+
+
+def test_every_cut_is_caught():
+    for size in range(len(tiny_file())):
+        with pytest.raises(Truncated):
+            decode(tiny_file()[:size])
+
+
+@given(st.integers(0, 2), st.integers(0, 10**6), st.integers(1, 255), st.booleans())
+@settings(max_examples=150)
+def test_changed_payloads_behind_right_checksums_raise_only_our_errors(which, place, mask, cut):
+    header, chunks = take_apart(small_file())
+    kind, flags, payload = chunks[which]
+    changed = bytearray(payload)
+    place %= len(changed)
+    if cut:
+        del changed[place:]
+    else:
+        changed[place] ^= mask
+    chunks[which] = (kind, flags, bytes(changed))
+    try:
+        scene = decode(put_together(header, chunks))
+    except DecodeError as error:
+        assert not isinstance(error, Truncated), "a payload is complete: no more bytes would help"
+    else:  # some changes only change symbols
+        assert np.isfinite(scene.feature).all()
+
+
+@given(st.binary(max_size=200))
+def test_arbitrary_bytes_raise_only_our_errors(junk):
+    for data in (junk, small_file()[:20] + junk, small_file()[:8] + junk):
+        with pytest.raises(Pd4Error):
+            decode(data)
+
+
+def test_a_scene_keeps_its_id_when_chunks_come_and_go():
+    header, chunks = take_apart(small_file())
+    extra = [(99, FLAG_ANCILLARY, b"x")] * 20  # a chunk list in its longer form
+    ids = {
+        read_chunk(data, read_preamble(data).size).scene_id
+        for data in (small_file(), put_together(header, chunks[:2]), put_together(header, [*chunks, *extra]))
+    }
+    assert len(ids) == 1
+    many = {**header, **{64 + i: i for i in range(10)}}  # a map in its longer form
+    assert decode(put_together(many, chunks)).layers == (0, 1, 2)
+
+
+#: What one reads of a broken file, by vector: what was found, what was expected, and where.
+MESSAGES = {
+    "signature-png": "not a .pd4 file: it begins with 89 50 4e 47 0d 0a 1a 0a, expected 89 50 44 34 0d 0a 1a 0a",
+    "header-length-over-limit": "a header of 16385 bytes, limit 16384",
+    "splice-layer-2": "the chunk belongs to scene .*, this file is",
+    "splice-header-steps": "the chunk belongs to scene .*, this file is .*",
+    "critical-unknown-last": "critical chunk of unknown type 6",
+    "layer-flagged-ancillary": "layer 1 is flagged ancillary, expected a critical chunk",
+    "chunk-list-descends": "layer chunks .0, 2, 1., expected layer 0 first and the layers ascending",
+    "header-key-63-unknown": "unknown key 63 below 64",
+    "header-key-02-missing": "key 2 is missing",
+    "header-list": "header: list, expected a map",
+    "header-box-upside-down": "lower corner",
+    "header-time-descends": r"time range 1.0..0.0",
+    "header-background-above": r"expected 0..1",
+    "header-near-is-far": r"near 1.0 and far 1.0",
+    "header-unit-negative": r"unit -1.0",
+    "camera-fx-zero": "focal lengths",
+    "bound-negative": "error bound -.* of feature, expected 0 or more",
+    "bound-6-missing": "no error bound of planes_local in the header",
+    "payload-three-bytes": "payload of 3 bytes, expected at least 4",
+    "payload-parameters-beyond": "parameters of 6 bytes in a payload of 9",
+    "payload-parameters-over-limit": "parameters of 4097 bytes, limit 4096",
+    "payload-byte-left": r"sections of \d+ bytes, expected \d+",
+    "layer-1-steps-alone": "key 3 is there without reason",
+    "layer-1-scales-missing": "key 4 is missing",
+    "scales-channels-differ": "1 channels, expected 2 as in scale 0",
+    "scales-predictor-of-floats": "predictor 1 on float32 planes, expected 0",
+    "networks-entry-empty": "an empty network entry, expected an id and widths",
+    "networks-two": "expected .'opacity', 'covariance', 'color'",
+    "networks-trunk-alone": "expected 'trunk' and at least one head",
+    "networks-outputs": "network opacity: 11 outputs, expected 10",
+    "section-symbols-missing": "section symbols is missing",
+    "section-floats-in-layer-0": "section 6 is there, but nothing is left for it to code",
+    "samples-over-limit": r"planes of \d+ cells, limit 268435456",
+    "positions-index-over-limit": "a cell of 1048577, limit 1048576",
+    "mask-code-2": "layer 0: mask code in 2..77, expected 3..255",
+    "mask-rise-negative": "rise of a mask code in -1..0",
+    "mask-sum-over-255-in-layer-2": "layer 2: mask code 256, expected at most 255",
+    "attribute-above": "a symbol over 8388608 in magnitude",
+    "overflow-attributes": "a reconstructed value is not finite",
+    "voxel-twice": "voxel .2, 0, 0. holds more than one anchor, expected one",
+}
+
+
+@pytest.mark.parametrize("name", MESSAGES)
+def test_a_fault_is_one_clear_line(name):
+    with pytest.raises(DecodeError, match=MESSAGES[name]) as caught:
+        decode((VECTORS / f"{name}.pd4").read_bytes())
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", sorted(p.stem for p in VECTORS.glob("bomb-*.pd4")))
+def test_a_few_bytes_cannot_ask_for_gigabytes(name):
+    """Constant channels cost nothing to code, so the declared sizes themselves are bounded by the payload."""
+    data = (VECTORS / f"{name}.pd4").read_bytes()
+    tracemalloc.start()
+    try:
+        with pytest.raises(LimitExceeded):
+            decode(data)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()
+
+
+def test_the_header_is_small():
+    assert len(read_preamble(small_file()).header) < 512
+    assert unpack_header(read_preamble(small_file()).header).mode == "ans"

@@ -1,0 +1,133 @@
+"""info from a file's first bytes, digests of its contents, and the npz keys."""
+
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+from strategies import make_scene, small_file
+
+from pd4dgs_codec import FORMAT_VERSION
+from pd4dgs_codec.errors import DecodeError, Truncated
+from pd4dgs_codec.format import canonical
+from pd4dgs_codec.format.container import FLAG_ANCILLARY, read_chunk, read_preamble, write_chunk, write_preamble
+from pd4dgs_codec.format.decoder import decode
+from pd4dgs_codec.format.encoder import encode, encode_with_report
+from pd4dgs_codec.format.info import hashes, info, metadata_of
+from pd4dgs_codec.format.metadata import Metadata
+from pd4dgs_codec.format.npz import to_npz_dict
+from pd4dgs_codec.scene import PLANES
+
+VECTORS = Path(__file__).parents[2] / "spec" / "vectors" / "uncommon"
+SCENE = make_scene(7, anchors=20)
+
+
+def test_info_needs_the_header_alone():
+    data = small_file(omit="nothing")
+    whole = info(data)
+    first = info(data[: whole["header_bytes"]])
+    with pytest.raises(Truncated):
+        info(data[: whole["header_bytes"] - 1])
+    assert whole["format_version"] == FORMAT_VERSION == "2.0"
+    assert whole["bytes"] == first["bytes"] == len(data)
+    place = ("layer", "offset", "bytes", "end")
+    assert [{k: row[k] for k in place} for row in whole["layers"]] == [
+        {k: row[k] for k in place} for row in first["layers"]
+    ]
+    assert [set(row) for row in first["layers"]] == [{*place, "slices"}] * len(whole["layers"])
+    ends = [whole["header_bytes"], *(row["end"] for row in whole["layers"])]
+    assert [row["offset"] for row in whole["layers"]] == ends[:-1] and ends[-1] == len(data)
+    decoded = decode(data)
+    assert [row["anchors"] for row in whole["layers"]] == np.diff([0, *decoded.rows]).tolist()
+    assert whole["anchors"] == len(decoded.anchor_q) and first["anchors"] is None
+    assert whole["steps"]["feature"] == SCENE.steps.feature
+    assert whole["layers"][2]["steps"] == {"planes_local": 0.5, "weights_local": SCENE.steps.weights_local}
+    assert whole["layers"][1]["planes"] == [[2, 3, 2, 4, 5]]
+
+
+def test_hashes_follow_the_documented_order():
+    data = small_file(omit="nothing")
+    scene, rows = decode(data), hashes(data)
+    first, last = scene.rows[0], scene.rows[1]
+    own = slice(first, last)
+    arrays = [scene.anchor[own], scene.feature[own], scene.scaling_log[own], scene.offset[own]]
+    arrays += [scene.global_deformation.planes[0][name] for name, _, _ in PLANES]
+    for name in ("trunk", "position", "feature", "offset", "scaling"):
+        arrays += [a for pair in scene.global_deformation.networks[name] for a in pair]
+    digest = hashlib.sha256(b"".join(a.astype("<f4").tobytes() for a in arrays)).hexdigest()
+    assert rows[1] == {"layer": 1, "symbols": rows[1]["symbols"], "tensors": digest}
+    steps = scene.steps
+    symbols = [scene.anchor_q[own], scene.mask[1][:first].astype(int) - scene.mask[0], scene.mask[1][own]]
+    symbols += [(scene.feature[own] / steps.feature).T, (scene.scaling_log[own] / steps.scaling_log).T]
+    symbols += [(scene.offset[own].reshape(-1, 30) / steps.offset).T]
+    symbols += [a / steps.planes_global for a in arrays[4:10]] + [a / steps.weights_global for a in arrays[10:]]
+    digest = hashlib.sha256(b"".join(np.ascontiguousarray(a).astype("<i4").tobytes() for a in symbols)).hexdigest()
+    assert rows[1]["symbols"] == digest
+
+
+def test_hashes_name_the_contents_not_the_coding():
+    data = small_file(omit="nothing")
+    lzma = encode(SCENE, layers=2, mode="lzma", effort=1, omit="nothing")
+    assert lzma != data and hashes(lzma) == hashes(data)
+    assert hashes(encode(SCENE, layers=1, effort=1, omit="nothing")) == hashes(data)[:2]
+    raw = hashes(encode(SCENE, layers=2, deformation="float32", effort=1, omit="nothing"))
+    assert [r["tensors"] for r in raw] == [r["tensors"] for r in hashes(data)]
+    assert raw[0] == hashes(data)[0] and raw[1]["symbols"] != hashes(data)[1]["symbols"]
+
+
+def test_npz_keys_and_symbols():
+    data = small_file(omit="nothing")
+    scene = decode(data)
+    arrays = to_npz_dict(scene, symbols=True)
+    plain = to_npz_dict(scene)
+    assert {"anchor", "feature", "scaling_log", "offset", "mask_0", "mask_1", "mask_2"} <= set(plain)
+    assert {"mlp.opacity.weight.0", "mlp.color.bias.1"} <= set(plain)
+    assert {"mlp.global.trunk.weight.0", "mlp.local.mean.bias.0"} <= set(plain)
+    assert {"planes.global.0.xy", "planes.local.0.zt"} <= set(plain)
+    assert not any(name.endswith(("_q", "_step")) for name in plain)
+    data = [name for name in plain if not name.startswith("meta_")]
+    for name in data:
+        k, step = arrays[f"{name}_q"], arrays[f"{name}_step"]
+        assert k.dtype == np.int32 and plain[name].dtype == np.float32 == step.dtype
+        value = (k.astype(np.float64) * np.float64(step)).astype(np.float32)
+        np.testing.assert_array_equal(value, plain[name], err_msg=name)
+    assert set(arrays) - set(plain) == {f"{name}_{end}" for name in data for end in ("q", "step")}
+    assert tuple(arrays["meta_rows"]) == scene.rows and arrays["meta_camera_K"].shape == (3, 3)
+
+
+def test_info_names_chunks_it_does_not_know():
+    data = small_file(omit="nothing")
+    preamble = read_preamble(data)
+    fields, extra = canonical.unpack(preamble.header), b"a preview"
+    fields[1].append([99, len(extra)])
+    chunk = write_chunk(99, FLAG_ANCILLARY, read_chunk(data, preamble.size).scene_id, extra)
+    front = write_preamble(canonical.pack(fields))
+    longer = front + data[preamble.size :] + chunk
+    assert info(longer)["chunks"] == [{"type": 99, "offset": len(longer) - 29, "bytes": 29, "end": len(longer)}]
+    assert [row["layer"] for row in info(longer)["layers"]] == [0, 1, 2] and hashes(longer) == hashes(data)
+
+
+def test_metadata_is_written_shown_and_skipped():
+    scene, about = make_scene(3, anchors=4), Metadata("Kitchen", licence="CC BY 4.0", quality={1: 24.5})
+    plain, (told, report) = encode(scene, effort=1), encode_with_report(scene, effort=1, metadata=about)
+    assert info(plain)["metadata"] is None and metadata_of(plain) is None
+    assert metadata_of(told) == about
+    assert info(told)["metadata"] == {"title": "Kitchen", "licence": "CC BY 4.0", "quality": {"1": 24.5}}
+    assert info(told[:-1])["metadata"] is None  # not all of it is here
+    assert hashes(told) == hashes(plain)
+    assert report.metadata_bytes == info(told)["chunks"][0]["bytes"]
+    assert sum(report.added_bytes().values()) == len(told) - report.metadata_bytes
+
+
+@pytest.mark.parametrize("name", ["metadata-cut", "metadata-bomb"])
+def test_a_fault_in_metadata_is_told_and_the_layers_decode(name):
+    data = (VECTORS / f"{name}.pd4").read_bytes()
+    assert [row["layer"] for row in hashes(data)] == [0, 1, 2]
+    assert set(info(data)["metadata"]) == {"fault"}
+    with pytest.raises(DecodeError):
+        metadata_of(data)
+
+
+def test_a_scene_without_a_camera_has_no_camera_keys():
+    scene = decode(encode(make_scene(7, anchors=2, with_camera=False), layers=2, effort=1))
+    assert not any("camera" in name for name in to_npz_dict(scene))

@@ -1,0 +1,162 @@
+"""What a file leaves out, and where the anchors of a layer that goes end up."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from strategies import make_scene
+
+from pd4dgs_codec.evaluate import residuals as evaluate
+from pd4dgs_codec.format import encoder
+from pd4dgs_codec.format.decoder import decode
+from pd4dgs_codec.format.heads import head_bounds
+from pd4dgs_codec.format.kinds import LAYER_KINDS
+from pd4dgs_codec.format.options import EncodeOptions
+from pd4dgs_codec.format.plan import plan
+from pd4dgs_codec.scene import LENGTH_HEADS, LOCAL_HEADS, PLANES, Deformation, Widths, deformation_unit
+
+VOXEL = 0.0078125
+encode, encode_with_report = (partial(f, effort=1) for f in (encoder.encode, encoder.encode_with_report))
+RAW = EncodeOptions(deformation="float32")
+
+
+def constant_deformation(heads, value, time_of=None):
+    """Residuals equal to `value` in every head at all points, or only near the time row `time_of` of 5."""
+    planes = {n: np.ones((1, 5 if b == 3 else 2, 2), np.float32) for n, _, b in PLANES}
+    if time_of is not None:
+        for name in ("xt", "yt", "zt"):
+            planes[name][:] = 0
+            planes[name][:, time_of] = 1
+    trunk = ((np.ones((1, 1), np.float32), np.zeros(1, np.float32)),)
+    networks = {"trunk": trunk}
+    for name, outputs in heads.items():
+        weight = np.full((outputs, 1), value if np.isscalar(value) else value[name], np.float32)
+        networks[name] = ((weight, np.zeros(outputs, np.float32)),)
+    return Deformation((planes,), networks)
+
+
+def scene_with(global_value=None, local_value=None, **options):
+    """Deformations as float32, so that tiny residuals survive to be judged."""
+    scene = make_scene(4, anchors=30, heads=({}, {}))
+    fields = {}
+    if global_value is not None:
+        fields["global_deformation"] = constant_deformation(Widths().global_heads, global_value, **options)
+    if local_value is not None:
+        fields["local_deformation"] = constant_deformation(LOCAL_HEADS, local_value, **options)
+    return replace(scene, **fields)
+
+
+def active_codes(scene, index):
+    full = np.zeros(len(scene.anchor_q), np.uint8)
+    full[: len(scene.mask[index])] = scene.mask[index]
+    return {tuple(c): int(m) for c, m in zip(scene.anchor_q.tolist(), full, strict=True) if m}
+
+
+@pytest.mark.parametrize(
+    "given_values,kept",
+    [((1.0, 1.0), (0, 1, 2)), ((1.0, 1e-7), (0, 1)), ((1e-7, 1.0), (0, 2)), ((1e-7, 1e-7), (0,)), ((None, None), (0,))],
+)
+def test_layers_go_with_their_deformation_and_the_highest_masks_stay(given_values, kept):
+    scene = scene_with(*given_values)
+    data, report = encode_with_report(scene, deformation="float32")
+    got = decode(data)
+    assert got.layers == kept
+    assert active_codes(got, -1) == active_codes(scene, 2), "the highest level shows the same anchors and masks"
+    for index, layer in enumerate(kept[:-1]):
+        assert active_codes(got, index) == active_codes(scene, layer)
+    gone = {row["what"]: row for row in report.left_out}
+    for layer, value in ((1, given_values[0]), (2, given_values[1])):
+        name = LAYER_KINDS[layer].name
+        assert (name in gone) == (value == 1e-7)
+        if name in gone:
+            assert gone[name]["bytes"] > 50 and "negligible" in gone[name]["why"]
+
+
+def test_inactive_anchors_are_dropped_and_reported():
+    scene = make_scene(4, anchors=30, layers=(0,))
+    inactive = int((scene.mask[0] == 0).sum())
+    data, report = encode_with_report(scene)
+    assert 0 < inactive < 30 and len(decode(data).anchor_q) == len(scene.anchor_q) - inactive
+    (row,) = [row for row in report.left_out if not row["lossless"]]
+    assert row["what"] == f"{inactive} anchors" and row["bytes"] > 0
+
+
+@pytest.mark.parametrize("layer", [1, 2])
+def test_each_head_is_judged_by_its_own_bound(layer):
+    kind = LAYER_KINDS[layer]
+    heads = kind.heads(Widths())
+    bounds = head_bounds(scene_with(), kind)
+    assert set(bounds) == set(heads) and bounds["position" if layer == 1 else "mean"] == 1e-3 * VOXEL
+    unit = float(deformation_unit(scene_with().info.box))
+    outputs = {name: bound / (unit if name in LENGTH_HEADS else 1.0) for name, bound in bounds.items()}
+    for alive in heads:
+        values = {name: (1.01 if name == alive else 0.99) * output for name, output in outputs.items()}
+        scene = scene_with(**{"global_value" if layer == 1 else "local_value": values})
+        planned, left_out = plan(scene, RAW)
+        networks = planned.tensors(layer).networks
+        assert set(networks) == {"trunk", alive}
+        gone = {item.what for item in left_out if item.kind}
+        assert gone == {f"{kind.name} head {h}" for h in heads if h != alive}
+
+
+def test_a_short_event_is_seen():
+    """A motion that lives in one of many time rows is found wherever it is."""
+    for row in range(5):
+        planned, _ = plan(scene_with(global_value=1.0, time_of=row), RAW)
+        assert planned.layers == (0, 1)
+
+
+def test_heads_that_quantise_to_zero_go_even_when_layers_are_asked_for():
+    scene = scene_with(global_value={"position": 1.0, "feature": 1e-4, "offset": 1.0, "scaling": 1.0})
+    got = decode(encode(scene, layers=2))
+    assert set(got.global_deformation.networks) == {"trunk", "position", "offset", "scaling"}
+    assert got.layers == (0, 1, 2) and got.local_deformation is None
+    assert encode(got, layers=2) == encode(scene, layers=2)
+
+
+def test_explicit_layers_cut_the_prefix_as_it_is():
+    scene = make_scene(4, anchors=30)
+    whole = decode(encode(scene, layers=2))
+    for highest in (0, 1):
+        data, report = encode_with_report(scene, layers=highest)
+        got = decode(data)
+        assert got.layers == tuple(range(highest + 1))
+        assert active_codes(got, -1) == active_codes(scene, highest)
+        np.testing.assert_array_equal(got.anchor_q, whole.prefix(highest).anchor_q)
+        np.testing.assert_array_equal(got.feature, whole.prefix(highest).feature)
+        named = [row["what"] for row in report.left_out]
+        assert [f"layer {layer}" for layer in range(highest + 1, 3)] == [n for n in named if n.startswith("layer")]
+
+
+def test_auto_is_stable():
+    """Encoding a decoded file again leaves out the same things and gives the same bytes."""
+    for values in ((1.0, 1.0), (1e-7, 1.0), (1.0, None)):
+        data = encode(scene_with(*values), deformation="float32")
+        assert encode(decode(data), deformation="float32") == data
+
+
+def test_numbers_that_overflow_are_not_called_negligible():
+    scene = scene_with(global_value=float(np.float32(3e38)))
+    trunk = ((np.full((1, 1), 3e38, np.float32), np.zeros(1, np.float32)),)
+    networks = {**scene.global_deformation.networks, "trunk": trunk}
+    scene = replace(scene, global_deformation=replace(scene.global_deformation, networks=networks))
+    assert plan(scene, RAW)[0].layers == (0, 1)
+
+
+def test_plane_sampling_agrees_with_grid_sample():
+    torch = pytest.importorskip("torch")
+    rng = np.random.default_rng(0)
+    box = np.array([[-1, -2, -3], [1, 2, 4]], np.float32)
+    points = rng.uniform(-4, 5, (50, 3)).astype(np.float32)
+    for sides in ((3, 4, 5, 6), (1, 2, 1, 1)):
+        planes = {n: rng.normal(size=(2, sides[b], sides[a])).astype(np.float32) for n, a, b in PLANES}
+        for t in (0.0, 0.37, 1.0):
+            unit = np.concatenate([2 * (points - box[0]) / (box[1] - box[0]) - 1, np.full((50, 1), 2 * t - 1)], axis=1)
+            expected = np.ones((50, 2))
+            for name, a, b in PLANES:
+                grid = torch.tensor(unit[None, None][..., [a, b]], dtype=torch.float32)
+                plane = torch.from_numpy(planes[name])[None]
+                sampled = torch.nn.functional.grid_sample(plane, grid, align_corners=True, padding_mode="border")
+                expected *= sampled[0, :, 0].T.numpy()
+            np.testing.assert_allclose(evaluate.sample_planes((planes,), box, points, t), expected, atol=1e-4)

@@ -1,0 +1,134 @@
+"""The planes section: both forms give back the residuals; classes pay where samples are large in some places."""
+
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pd4dgs_codec.entropy.channels import encode_channels
+from pd4dgs_codec.entropy.priors import K_MAX
+from pd4dgs_codec.errors import DecodeError, LimitExceeded, Malformed, UnsupportedFeature
+from pd4dgs_codec.format import plane_section
+from pd4dgs_codec.format.plane_section import read_planes, write_planes
+from pd4dgs_codec.format.stages import PLAIN, STAGED
+
+
+def busy(shape: tuple[int, int, int], seed: int = 0) -> np.ndarray:
+    """Residuals [C, H, W] that are large in some blocks of 5 by 5 cells, in all channels."""
+    rng = np.random.default_rng(seed)
+    _, h, w = shape
+    loudness = np.kron(np.exp(rng.normal(size=(h // 5 + 1, w // 5 + 1)) * 2), np.ones((5, 5)))[:h, :w]
+    return np.rint(rng.normal(size=shape) * loudness).astype(np.int32)
+
+
+def assert_same_planes(found, expected):
+    assert len(found) == len(expected)
+    for a, b in zip(found, expected, strict=True):
+        assert a.dtype == np.int32
+        np.testing.assert_array_equal(a, b)
+
+
+def written_in_stages(planes, class_count=None):
+    """The section in form 1, even where form 0 is shorter; class_count, if any, instead of the best."""
+    choose = plane_section.cheapest_class_count if class_count is None else lambda _: class_count
+    with patch.object(plane_section, "cheapest_class_count", choose):
+        return plane_section._write_staged(planes, 1).data
+
+
+@pytest.mark.parametrize("channels", [4, 7])
+def test_classes_pay_where_cells_are_busy(channels):
+    planes = [busy((channels, 40, 50)), busy((channels, 30, 45), 1)]
+    data, rate = write_planes(planes, "best", 5)
+    plain = encode_channels([channel.ravel() for plane in planes for channel in plane])
+    assert data[0] == STAGED and data[1] > 1
+    assert len(data) < 0.95 * len(plain.payload)
+    assert rate == plain.rate_bits
+    assert_same_planes(read_planes(data, [plane.shape for plane in planes]), planes)
+
+
+@pytest.mark.parametrize("option", [("gauss", 5), ("best", 1)])
+def test_the_rate_model_and_the_least_effort_stay_plain(option):
+    planes = [busy((4, 40, 50))]
+    data, _ = write_planes(planes, *option)
+    assert data[0] == PLAIN
+    assert_same_planes(read_planes(data, [(4, 40, 50)]), planes)
+
+
+def test_planes_that_are_alike_everywhere_stay_plain():
+    planes = [np.random.default_rng(0).integers(-9, 10, (4, 20, 20)).astype(np.int32)]
+    assert write_planes(planes, "best", 3)[0][0] == PLAIN
+
+
+@given(
+    st.integers(1, 9),
+    st.lists(st.tuples(st.integers(1, 8), st.integers(1, 8)), min_size=1, max_size=6),
+    st.integers(1, 8),
+    st.integers(0, 1000),
+)
+@settings(max_examples=40)
+def test_any_shapes_and_class_counts_come_back(channels, sides, class_count, seed):
+    planes = [busy((channels, h, w), seed + i) for i, (h, w) in enumerate(sides)]
+    shapes = [plane.shape for plane in planes]
+    assert_same_planes(read_planes(written_in_stages(planes, class_count), shapes), planes)
+    assert_same_planes(read_planes(write_planes(planes, "best", 1)[0], shapes), planes)
+
+
+@given(st.integers(0, 1000), st.sampled_from((1, 2, 5)))
+@settings(max_examples=8)
+def test_the_largest_residuals_come_back(seed, channels):
+    rng = np.random.default_rng(seed)
+    planes = [rng.choice([-K_MAX, -1, 0, K_MAX], (channels, 9, 9)).astype(np.int32)]
+    assert_same_planes(read_planes(written_in_stages(planes, 4), [planes[0].shape]), planes)
+
+
+def test_activity_is_the_sum_over_the_cells_around_with_the_border_repeated():
+    """Two classes, the activity of a lone 1 in the corner: the cells around it are class 1, all others class 0."""
+    planes = [np.zeros((3, 4, 5), np.int32)]
+    planes[0][0, 0, 0] = 1
+    planes[0][2, :3, :3] = 7
+    magnitude = np.zeros((4, 5), np.int64)
+    magnitude[0, 0] = 256 * 20 // 2
+    expected = 4 * magnitude
+    expected[0, 1] = expected[1, 0] = 2 * magnitude[0, 0]
+    expected[1, 1] = magnitude[0, 0]
+    with patch.object(plane_section, "activity_classes", wraps=plane_section.activity_classes) as classes:
+        written_in_stages(planes, 2)
+    np.testing.assert_array_equal(classes.call_args.args[0].reshape(4, 5), expected)
+
+
+SHAPES = [(5, 3, 4), (5, 1, 2)]
+
+
+@pytest.mark.parametrize(
+    ("begin", "error"),
+    [
+        (b"\2", UnsupportedFeature),
+        (b"", Malformed),
+        (b"\1\0", Malformed),  # class count 0
+        (b"\1\1\x09", LimitExceeded),  # class count 9
+        (b"\1\1\1\x7f", LimitExceeded),  # a stage of 127 bytes
+        (b"\1\1\1\1\1", Malformed),  # two stages of a byte, nothing left
+    ],
+)
+def test_a_faulty_block_is_refused(begin, error):
+    with pytest.raises(error):
+        read_planes(begin, SHAPES)
+
+
+def test_damage_raises_only_decode_errors():
+    planes = [busy(shape) for shape in ((5, 8, 9), (5, 10, 3))]
+    shapes = [plane.shape for plane in planes]
+    data = written_in_stages(planes, 3)
+    rng, refused = np.random.default_rng(2), 0
+    broken = [bytearray(data[:cut]) for cut in range(len(data))]
+    for _ in range(300):
+        broken.append(bytearray(data))
+        broken[-1][rng.integers(0, len(data))] ^= 1 << rng.integers(0, 8)
+    for section in broken:
+        try:
+            assert [plane.shape for plane in read_planes(bytes(section), shapes)] == shapes
+        except DecodeError:
+            refused += 1
+    assert refused > 0.9 * len(broken)  # a cut that leaves an empty ANS stream is a stream too

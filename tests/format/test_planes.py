@@ -1,0 +1,117 @@
+"""Plane predictors: exact inverses, and the definition itself against a scalar loop."""
+
+import tracemalloc
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pd4dgs_codec.errors import Malformed
+from pd4dgs_codec.format import plane_choice
+from pd4dgs_codec.format.plane_choice import choose_predictor
+from pd4dgs_codec.format.planes import PREDICTORS, residual, restore
+from pd4dgs_codec.format.quantise import MAX_SYMBOL
+
+shapes = st.tuples(st.integers(1, 3), st.integers(1, 9), st.integers(1, 9))
+
+
+def random_plane(shape, seed, top):
+    return np.random.default_rng(seed).integers(-top, top + 1, shape, dtype=np.int32)
+
+
+def scalar_prediction(predictor, k, i, j):
+    """The registry's definition for one sample, in Python integers."""
+    w = int(k[i, j - 1]) if j else None
+    n = int(k[i - 1, j]) if i else None
+    nw = int(k[i - 1, j - 1]) if i and j else None
+    if w is None and n is None:
+        w = n = nw = 0
+    elif i == 0:
+        n = nw = w
+    elif j == 0:
+        w = nw = n
+    return {0: 0, 1: w, 2: n, 3: sorted((w, n, w + n - nw))[1], 4: w + n - nw, 5: (w + n) // 2}[predictor]
+
+
+@given(shapes, st.integers(0, 1000), st.sampled_from((1, 50, MAX_SYMBOL // 4)))
+def test_every_predictor_is_undone_exactly(shape, seed, top):
+    k = random_plane(shape, seed, top)
+    for predictor in PREDICTORS:
+        np.testing.assert_array_equal(restore([(predictor, residual(predictor, k))])[0], k, err_msg=str(predictor))
+
+
+@given(shapes, st.integers(0, 1000))
+@settings(max_examples=30)
+def test_predictions_follow_their_definition(shape, seed):
+    k = random_plane(shape, seed, 100)
+    for predictor in PREDICTORS:
+        expected = [
+            [[int(c[i, j]) - scalar_prediction(predictor, c, i, j) for j in range(shape[2])] for i in range(shape[1])]
+            for c in k
+        ]
+        np.testing.assert_array_equal(residual(predictor, k), expected, err_msg=str(predictor))
+
+
+def test_planes_restored_together_equal_planes_restored_alone():
+    planes = [random_plane((2, 5, 7 if i % 2 else 4), i, 30) for i in range(14)]
+    coded = [(i % len(PREDICTORS), residual(i % len(PREDICTORS), k)) for i, k in enumerate(planes)]
+    for got, k in zip(restore(coded), planes, strict=True):
+        np.testing.assert_array_equal(got, k)
+        assert got.dtype == np.int32
+
+
+@pytest.mark.parametrize("shape", [(1, 1, 900), (1, 900, 1), (2, 900, 5), (1, 90, 90)])
+@pytest.mark.parametrize("predictor", list(PREDICTORS))
+def test_memory_is_linear_in_the_samples_of_any_shape(shape, predictor):
+    """A plane of one column took H * H cells once: 2 kB of a file asked for 47 GB."""
+    coded = [(predictor, np.ones(shape, np.int32))] * 6
+    samples = 6 * int(np.prod(shape))
+    tracemalloc.start()
+    try:
+        restore(coded)
+        assert tracemalloc.get_traced_memory()[1] < 40 * samples + (1 << 18)
+    finally:
+        tracemalloc.stop()
+
+
+@pytest.mark.parametrize("predictor", [p for p in PREDICTORS if p])
+def test_samples_over_the_limit_are_malformed(predictor):
+    with pytest.raises(Malformed, match="predictor"):
+        restore([(predictor, np.full((1, 3, 300), MAX_SYMBOL, np.int32))])
+
+
+def test_the_encoder_never_picks_residuals_over_the_limit():
+    k = np.where(np.indices((1, 6, 6)).sum(axis=0) % 2, MAX_SYMBOL, -MAX_SYMBOL).astype(np.int32)
+    predictor, r = choose_predictor(k)
+    assert np.abs(r.astype(np.int64)).max() <= MAX_SYMBOL
+    np.testing.assert_array_equal(restore([(predictor, r)])[0], k)
+
+
+def test_the_choice_suits_the_plane():
+    rng = np.random.default_rng(0)
+    rows = np.repeat(rng.integers(-50, 50, (4, 1, 40), dtype=np.int32), 30, axis=1)
+    assert PREDICTORS[choose_predictor(rows)[0]].name == "up"
+    columns = np.repeat(rng.integers(-50, 50, (4, 30, 1), dtype=np.int32), 40, axis=2)
+    assert PREDICTORS[choose_predictor(columns)[0]].name == "left"
+    assert PREDICTORS[choose_predictor(rng.integers(-50, 50, (4, 30, 40), dtype=np.int32))[0]].name == "none"
+    assert PREDICTORS[choose_predictor(rows + columns)[0]].name == "gradient"
+
+
+def test_compiled_loops_choose_and_fill_the_same(monkeypatch):
+    pytest.importorskip("numba")
+    rng = np.random.default_rng(8)
+    planes = [rng.integers(-9, 10, (3, 11, 9)), rng.integers(-(1 << 20), 1 << 20, (2, 5, 6)), np.zeros((1, 1, 4))]
+    planes = [np.cumsum(plane, axis=2).astype(np.int32) for plane in planes]
+    given = [rng.random(plane.shape[1:]) < 0.4 for plane in planes]
+    found = [plane_choice.fill_plane(k, g) for k, g in zip(planes, given, strict=True)]
+    fills = [plane_choice._fill(k, g, p) for k, g in zip(planes, given, strict=True) for p in PREDICTORS]
+    choices = [choose_predictor(k) for k in planes]
+    monkeypatch.setattr(plane_choice, "kernels", lambda: None)
+    for k, g, fill, (predictor, residuals) in zip(planes, given, found, choices, strict=True):
+        np.testing.assert_array_equal(plane_choice.fill_plane(k, g), fill)
+        assert choose_predictor(k)[0] == predictor
+        np.testing.assert_array_equal(choose_predictor(k)[1], residuals)
+    again = [plane_choice._fill(k, g, p) for k, g in zip(planes, given, strict=True) for p in PREDICTORS]
+    for one, other in zip(fills, again, strict=True):
+        np.testing.assert_array_equal(one, other)

@@ -1,0 +1,175 @@
+"""Layer prefixes, cut files and incremental decoding."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import LAYER_SETS, assert_same_scene, scenes, small_file
+
+from pd4dgs_codec import decode, encode, open_stream
+from pd4dgs_codec.errors import BadSignature, ChecksumMismatch, DecodeError, Malformed, Truncated
+from pd4dgs_codec.format.container import write_chunk, write_preamble
+from pd4dgs_codec.format.decoder import decode_layers, decode_partial
+from pd4dgs_codec.format.header import pack_header, scene_id_of
+from pd4dgs_codec.format.info import hashes, info
+from pd4dgs_codec.format.options import EncodeOptions
+from pd4dgs_codec.format.payload import write_layer
+
+
+@given(scenes())
+@settings(max_examples=8)
+def test_each_prefix_decodes_to_what_max_layer_gives(scene):
+    data = encode(scene, layers=2, effort=1, verify=False)
+    whole = decode(data)
+    for row in info(data)["layers"]:
+        prefix = data[: row["end"]]
+        got = decode(prefix, max_layer=row["layer"])
+        assert_same_scene(got, decode(data, max_layer=row["layer"]))
+        assert_same_scene(got, whole.prefix(row["layer"]))
+        if row["end"] < len(data):
+            with pytest.raises(Truncated):
+                decode(prefix)
+        partial, complete = decode_partial(prefix)
+        assert complete == (row["end"] == len(data))
+        assert_same_scene(partial, got)
+
+
+@pytest.mark.parametrize("layers", LAYER_SETS)
+def test_every_cut_yields_the_longest_valid_prefix_or_truncated(layers):
+    data = small_file(layers)
+    ends = [row["end"] for row in info(data)["layers"]]
+    for size in [*range(0, len(data), 101), *(e + d for e in ends for d in (-1, 0, 1) if e + d < len(data))]:
+        if size < len(data):
+            with pytest.raises(Truncated):
+                decode(data[:size])
+        whole_layers = sum(end <= size for end in ends)
+        if whole_layers == 0:
+            with pytest.raises(Truncated):
+                decode(data[:size], allow_partial=True)
+        else:
+            assert decode(data[:size], allow_partial=True).layers == layers[:whole_layers]
+
+
+def test_max_layer_does_not_look_beyond_its_prefix():
+    data = small_file()
+    end = info(data)["layers"][0]["end"]
+    assert decode(data[:end] + b"garbage", max_layer=0).layers == (0,)
+    assert decode(data, max_layer=7).layers == (0, 1, 2)
+    assert decode(small_file((0, 2)), max_layer=1).layers == (0,)
+    with pytest.raises(ValueError, match="max_layer"):
+        decode(data, max_layer=-1)
+
+
+def test_allow_partial_forgives_a_cut_and_nothing_else():
+    data = bytearray(small_file((0, 1)))
+    data[-10] ^= 1
+    with pytest.raises(ChecksumMismatch):
+        decode(bytes(data), allow_partial=True)
+    with pytest.raises(Malformed, match="bytes follow"):
+        decode(small_file((0, 1)) + b"\0", allow_partial=True)
+
+
+@given(st.sampled_from(LAYER_SETS), st.lists(st.integers(0, 4000), max_size=8))
+@settings(max_examples=15)
+def test_a_stream_does_not_depend_on_where_it_is_cut(layers, cuts):
+    data = small_file(layers)
+    places = [0, *sorted(min(c, len(data)) for c in cuts), len(data)]
+    stream, got = open_stream(), []
+    for a, b in zip(places[:-1], places[1:], strict=True):
+        got += stream.feed(data[a:b])
+        assert len(got) == sum(row["end"] <= b for row in info(data)["layers"])
+    assert stream.complete
+    stream.finish()
+    for layer, scene in zip(layers, got, strict=True):
+        assert_same_scene(scene, decode(data, max_layer=layer))
+
+
+def test_a_stream_fed_byte_by_byte():
+    data, stream, got = small_file((0, 2)), open_stream(), []
+    for i in range(len(data)):
+        got += stream.feed(data[i : i + 1])
+    assert [scene.layers for scene in got] == [(0,), (0, 2)]
+
+
+def test_a_fault_stays_and_earlier_layers_remain():
+    data = bytearray(small_file())
+    rows = info(bytes(data))["layers"]
+    data[rows[1]["end"] - 9] ^= 4
+    stream = open_stream()
+    scenes_before = stream.feed(bytes(data))
+    assert [s.layers for s in scenes_before] == [(0,)]
+    for call in (lambda: stream.feed(b""), lambda: stream.feed(b"x"), stream.finish):
+        with pytest.raises(ChecksumMismatch):
+            call()
+    assert not stream.complete
+
+
+def faults_by_every_door(data):
+    """(class, message, chunk, offset) of what each entry point raises."""
+
+    def streamed():
+        stream = open_stream()
+        stream.feed(data)
+        stream.finish()
+
+    doors = (
+        streamed,
+        lambda: decode(data),
+        lambda: decode(data, allow_partial=True),
+        lambda: decode_layers(data),
+        lambda: hashes(data),
+    )
+    for door in doors:
+        with pytest.raises(DecodeError) as caught:
+            door()
+        yield type(caught.value), str(caught.value), caught.value.chunk, caught.value.offset
+
+
+@pytest.mark.parametrize("later", ["damaged", "cut", "whole"])
+@pytest.mark.parametrize("first", ["value", "mask code", "voxel"])
+def test_of_two_faults_every_door_names_that_of_the_earlier_layer(first, later):
+    """Values that are not finite, sums of masks and voxels taken twice, which a payload alone does not show."""
+    header, layers, _ = decode_layers(small_file())
+    payloads = [write_layer(layer, EncodeOptions(effort=1))[0] for layer in layers]
+    steps, which = header.attribute_steps, 1
+    if first == "value":
+        steps, which = {**steps, "offset": 2.0**127}, 0
+    elif first == "mask code":
+        full = replace(layers[1], mask_increase=np.full_like(layers[1].mask_increase, 255))
+        payloads[1] = write_layer(full, EncodeOptions(effort=1))[0]
+    else:
+        taken = replace(layers[1], anchor_q=layers[0].anchor_q[: len(layers[1].anchor_q)])
+        payloads[1] = write_layer(taken, EncodeOptions(effort=1))[0]
+    chunks = tuple((i, len(payload)) for i, payload in enumerate(payloads))
+    packed = pack_header(replace(header, attribute_steps=steps, chunks=chunks))
+    scene_id = scene_id_of(packed)
+    framed = [write_chunk(i, 0, scene_id, payload) for i, payload in enumerate(payloads)]
+    front = write_preamble(packed)
+    data = bytearray(b"".join([front, *framed]))
+    if later == "damaged":
+        data[-9] ^= 1
+    elif later == "cut":
+        del data[-9:]
+    found = set(faults_by_every_door(bytes(data)))
+    assert len(found) == 1
+    error, _, chunk, offset = found.pop()
+    assert (error, chunk) == (Malformed, which)
+    assert offset == info(front)["layers"][which]["offset"]
+
+
+def test_a_stream_that_ends_early_says_so():
+    stream = open_stream()
+    assert stream.feed(small_file((0, 1))[:-1])[0].layers == (0,)
+    with pytest.raises(Truncated):
+        stream.finish()
+
+
+def test_a_stream_refuses_other_data_at_once_and_extra_bytes():
+    with pytest.raises(BadSignature):
+        open_stream().feed(b"PNG")
+    stream = open_stream()
+    assert len(stream.feed(small_file((0,)) + b"!")) == 1
+    with pytest.raises(Malformed, match="follow"):
+        stream.finish()

@@ -1,0 +1,288 @@
+"""Scene -> bytes -> Scene: every symbol, every row, every mode."""
+
+from dataclasses import replace
+from functools import partial
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import HUGE, RANGES, assert_same_networks, assert_same_scene, make_scene, scenes
+
+from pd4dgs_codec.errors import EncodeError
+from pd4dgs_codec.format import encoder, slicing
+from pd4dgs_codec.format.decoder import decode
+from pd4dgs_codec.morton import morton_codes
+from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS, Widths
+
+encode, encode_with_report = (partial(f, effort=1) for f in (encoder.encode, encoder.encode_with_report))
+MODES = [("ans", "coded"), ("lzma", "coded"), ("ans", "float32"), ("lzma", "float32")]
+
+
+def rows_by_voxel(scene):
+    """voxel -> (attributes, mask code per layer, 0 where a prefix does not hold the row)."""
+    table = {}
+    for i, cell in enumerate(scene.anchor_q.tolist()):
+        attributes = [scene.feature[i], scene.scaling_log[i], scene.offset[i].ravel()]
+        codes = tuple(int(m[i]) if i < len(m) else 0 for m in scene.mask)
+        table[tuple(cell)] = (np.concatenate(attributes).tobytes(), codes)
+    return table
+
+
+@given(scenes(), st.sampled_from(MODES), st.sampled_from(("best", "gauss")))
+@settings(max_examples=20)
+def test_everything_active_comes_back_and_encodes_to_the_same_bytes(scene, mode, priors):
+    options = {"mode": mode[0], "deformation": mode[1], "priors": priors, "layers": 2, "omit": "nothing"}
+    data = encode(scene, **options)
+    decoded = decode(data)
+    active = {cell: row for cell, row in rows_by_voxel(scene).items() if row[1][-1] > 0}
+    assert rows_by_voxel(decoded) == active
+    assert decoded.layers == scene.layers
+    assert_same_networks(decoded.networks, scene.networks)
+    for name in ("global_deformation", "local_deformation"):
+        given_one, got = getattr(scene, name), getattr(decoded, name)
+        assert (got is not None) == (given_one is not None)
+        if got is not None:
+            assert_same_networks(got.networks, given_one.networks)
+            for p, q in zip(got.planes, given_one.planes, strict=True):
+                assert all(np.array_equal(p[k], q[k]) for k in q)
+    assert encode(decoded, **options) == data
+
+
+@given(scenes())
+@settings(max_examples=8)
+def test_rows_are_sorted_by_layer_then_morton_order(scene):
+    decoded = decode(encode(scene, layers=2, verify=False))
+    first = 0
+    for index, last in enumerate(decoded.rows):
+        own = decoded.anchor_q[first:last]
+        assert (np.diff(morton_codes(own)) > 0).all() if len(own) > 1 else True
+        assert (decoded.mask[index][first:last] >= 3).all()
+        if index:
+            earlier = decoded.mask[index - 1]
+            assert (decoded.mask[index][: len(earlier)] >= earlier).all()
+        first = last
+
+
+@pytest.mark.parametrize("mode,deformation", MODES)
+def test_unquantised_values_come_back_within_half_a_step(mode, deformation):
+    scene = make_scene(3, kind="gaussian")
+    rng = np.random.default_rng(0)
+    noisy = replace(scene, feature=scene.feature + rng.uniform(-0.49, 0.49, scene.feature.shape).astype(np.float32))
+    got = decode(encode(noisy, mode=mode, deformation=deformation, step_scale=0.5, layers=2))
+    order = {tuple(c): i for i, c in enumerate(scene.anchor_q.tolist())}
+    index = [order[tuple(c)] for c in got.anchor_q.tolist()]
+    step = scene.steps.feature * 0.5
+    assert got.steps.feature == step and len(index) > 0
+    error = np.abs(got.feature - noisy.feature[index])
+    assert error.max() <= 0.5 * step * (1 + 1e-5) and error.max() > 0.1 * step
+
+
+@pytest.mark.parametrize("mode", ["ans", "lzma"])
+def test_symbols_over_the_whole_range(mode):
+    scene = make_scene(1, layers=(0,), anchors=3, kind="huge", hidden=())
+    got = decode(encode(scene, mode=mode, priors="gauss", omit="nothing"))
+    assert np.abs(got.feature).max() == HUGE * scene.steps.feature
+    assert_same_networks(got.networks, scene.networks)
+
+
+def test_float32_deformations_keep_every_bit():
+    scene = make_scene(1)
+    planes = tuple({k: v + np.float32(0.001) for k, v in s.items()} for s in scene.global_deformation.planes)
+    scene = replace(scene, global_deformation=replace(scene.global_deformation, planes=planes))
+    got = decode(encode(scene, deformation="float32", layers=2))
+    np.testing.assert_array_equal(got.global_deformation.planes[0]["xt"], planes[0]["xt"])
+    coded = decode(encode(scene, layers=2))
+    assert not np.array_equal(coded.global_deformation.planes[0]["xt"], planes[0]["xt"])
+
+
+def test_the_header_information_comes_back():
+    for with_camera in (True, False):
+        scene = make_scene(5, with_camera=with_camera)
+        got = decode(encode(scene, layers=2)).info
+        for name in ("voxel_size", "time_range", "background", "near", "far", "up", "unit"):
+            assert getattr(got, name) == getattr(scene.info, name), name
+        np.testing.assert_array_equal(got.box, scene.info.box)
+        assert (got.camera is not None) == with_camera
+        if with_camera:
+            np.testing.assert_array_equal(got.camera.viewmat, scene.info.camera.viewmat)
+            np.testing.assert_array_equal(got.camera.K, scene.info.camera.K)
+            assert (got.camera.width, got.camera.height) == (640, 480)
+
+
+@pytest.mark.parametrize("kind", RANGES[:3])
+def test_the_report_adds_up(kind):
+    data, report = encode_with_report(make_scene(2, anchors=40, kind=kind), layers=2)
+    report = report.json()
+    assert report["bytes"] == len(data) and report["verified"] and report["mode"] == "ans"
+    assert sum(row["bytes"] for row in report["layers"]) < len(data)
+    for row in report["layers"]:
+        streams = {s["name"]: s for s in row["streams"]}
+        counted = [streams[name] for name in ("attributes", "planes", "weights") if name in streams]
+        assert row["payload_bits"] == sum(s["payload_bits"] for s in counted) > 0
+        assert row["rate_bits"] == pytest.approx(sum(s["rate_bits"] for s in counted))
+        assert row["symbols"] == sum(s["symbols"] for s in counted)
+        assert 8 * row["bytes"] >= row["payload_bits"] + row["position_bits"] + streams["masks"]["payload_bits"]
+
+
+def test_steps_that_are_no_binary32_values_are_rounded_once():
+    scene = make_scene(0)
+    scene = replace(scene, steps=replace(scene.steps, feature=0.05))
+    data = encode(scene, layers=2)
+    assert decode(data).steps.feature == float(np.float32(0.05))
+    assert encode(decode(data), layers=2) == data
+
+
+def broken(name, value, **more):
+    return lambda scene: replace(scene, **{name: value(getattr(scene, name))}, **more)
+
+
+def poisoned(array):
+    array = array.copy()
+    array.flat[-1] = np.nan
+    return array
+
+
+FAULTS = {
+    "feature.*NaN": broken("feature", poisoned),
+    "offset.*NaN": broken("offset", poisoned),
+    "feature: float64": broken("feature", lambda a: a.astype(np.float64)),
+    "scaling_log:.*expected": broken("scaling_log", lambda a: a[:, :5]),
+    "anchor_q: voxel index": broken("anchor_q", lambda a: a + np.int32(1 << 22)),
+    "holds more than one anchor": broken(
+        "anchor_q", lambda a: np.zeros_like(a), mask=tuple(np.full(6, 9, np.uint8) for _ in range(3))
+    ),
+    "mask of layer 1: a code in 1..2": broken("mask", lambda m: (m[0], np.full_like(m[1], 2), m[2])),
+    "mask of layer 2 falls": broken("mask", lambda m: (np.full_like(m[0], 9),) * 2 + (np.full_like(m[0], 8),)),
+    "scaffold networks .'color'. are missing": broken("networks", lambda n: {k: n[k] for k in n if k != "color"}),
+    "layers": broken("layers", lambda _: (0, 2, 1)),
+    "step of feature": broken("steps", lambda s: replace(s, feature=0.0)),
+    "global_deformation network trunk": broken(
+        "global_deformation", lambda d: replace(d, networks={**d.networks, "trunk": d.networks["position"]})
+    ),
+    "planes.*expected six": broken(
+        "local_deformation", lambda d: replace(d, planes=({k: v for k, v in d.planes[0].items() if k != "xt"},))
+    ),
+    "voxel_size": broken("info", lambda i: replace(i, voxel_size=0.0)),
+    "info: a value": broken("info", lambda i: replace(i, near=float("inf"))),
+}
+
+
+@pytest.mark.parametrize("message", FAULTS)
+def test_scenes_that_cannot_be_written_are_refused_in_one_line(message):
+    scene = make_scene(0, anchors=6, extent=60)
+    assert len(scene.anchor_q) == 6
+    with pytest.raises(EncodeError, match=message) as caught:
+        encode(FAULTS[message](scene), layers=2)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {"mode": "zip"},
+        {"deformation": "x"},
+        {"priors": "x"},
+        {"layers": 3},
+        {"layers": "2"},
+        {"effort": 0},
+        {"step_scale": 0},
+    ],
+)
+def test_unknown_options_are_refused(options):
+    with pytest.raises(EncodeError, match="expected"):
+        encode(make_scene(0), **options)
+
+
+def test_sizes_over_the_format_limits_are_refused_without_verification():
+    scene = make_scene(0, channels=1, sides=(4097, 1, 1, 1))
+    with pytest.raises(EncodeError, match="limit"):
+        encode(scene, layers=2, verify=False)
+
+
+def test_verification_notices_a_changed_symbol(monkeypatch):
+    def write_wrong(symbols, coding):
+        changed = symbols.attributes.copy()
+        changed[5, 0] += 1
+        return original(replace(symbols, attributes=changed), coding)
+
+    original = slicing.write_layer
+    monkeypatch.setattr(slicing, "write_layer", write_wrong)
+    scene = make_scene(0, layers=(0,))
+    with pytest.raises(EncodeError, match="verification: layer 0"):
+        encode(scene)
+    assert encode(scene, verify=False)
+
+
+def test_verification_notices_a_file_that_does_not_decode(monkeypatch):
+    monkeypatch.setattr(encoder, "scene_id_of", lambda header: bytes(8))
+    with pytest.raises(EncodeError, match="verification: the file does not decode"):
+        encode(make_scene(0, layers=(0,)))
+
+
+def test_verification_notices_lost_rows_and_wrong_values(monkeypatch):
+    """What the decoder hands out is compared, not only what it reads."""
+    scene = make_scene(0, layers=(0,))
+
+    def changed(name, call, change):
+        """What the encoder imports as `name`, with the result of one call changed."""
+        original, calls = getattr(encoder, name), []
+
+        def run(*args):
+            calls.append(args)
+            return change(original(*args)) if len(calls) == call else original(*args)
+
+        return run
+
+    def louder(blocks):
+        return [(rows, {name: x + np.float32(1) for name, x in values.items()}) for rows, values in blocks]
+
+    for message, name, call, change in (
+        ("layers and rows", "outline", 2, lambda s: replace(s, rows=(s.rows[0] + 1,))),  # after the one that was meant
+        ("layer 0 decodes to other values", "attribute_blocks", 3, louder),  # after the bounds and the errors
+    ):
+        with monkeypatch.context() as patched:
+            patched.setattr(encoder, name, changed(name, call, change))
+            with pytest.raises(EncodeError, match=f"verification: .*{message}"):
+                encode(scene)
+
+
+@pytest.mark.parametrize("verify", [True, False])
+def test_positions_that_overflow_are_refused_verified_or_not(verify):
+    scene = make_scene(7, layers=(0,), anchors=20)
+    with pytest.raises(EncodeError, match="limit of the format: layer 0: a reconstructed value is not finite"):
+        encode(replace(scene, info=replace(scene.info, voxel_size=2.0**127)), verify=verify)
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from(("best", "gauss")), st.sampled_from(("ans", "lzma")))
+@settings(max_examples=10)
+def test_step_classes_and_centres_come_back(seed, priors, mode):
+    """Values off the grid of their class are rounded to it, those on it stay, and steps may be scaled meanwhile."""
+    given = make_scene(seed % 50, anchors=40, kind="gaussian", widths=Widths(4, 2, graded=True))
+    options = {"layers": 2, "effort": 1, "priors": priors, "mode": mode, "omit": "nothing"}
+    rng = np.random.default_rng(seed)
+    noisy = replace(given, feature=(given.feature + rng.normal(size=given.feature.shape) / 50).astype(np.float32))
+    scene, data = decode(encode(noisy, **options)), encode(noisy, **options)
+    assert scene.grading is not None and scene.grading.classes.max() > 0
+    assert encode(scene, **options) == data
+    scaled = decode(encode(noisy, step_scale=1.5, **options))
+    assert_same_scene(scaled, decode(encode(scaled, **options)))
+    for step, found in ((1.0, scene), (1.5, scaled)):
+        error = np.abs(np.sort(found.feature.ravel()) - np.sort(_sent(noisy).feature.ravel())).max()
+        assert error <= 2.0**6 * 0.0625 * step / 2 * 1.001
+
+
+def _sent(scene):
+    """Its anchors that are active at its highest level."""
+    return replace(scene, feature=scene.feature[scene.mask[-1] > 0])
+
+
+@given(st.sampled_from(sorted(GLOBAL_HEADS)), st.sampled_from(sorted(LOCAL_HEADS)))
+@settings(max_examples=3)
+def test_single_heads(global_head, local_head):
+    heads = ({global_head: Widths().global_heads[global_head]}, {local_head: LOCAL_HEADS[local_head]})
+    scene = make_scene(0, heads=heads)
+    decoded = decode(encode(scene, layers=2))
+    assert_same_scene(decoded, decode(encode(decoded, layers=2)))
+    assert set(decoded.global_deformation.networks) == {"trunk", global_head}
+    assert set(decoded.local_deformation.networks) == {"trunk", local_head}

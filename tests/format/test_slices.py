@@ -1,0 +1,200 @@
+"""Layers in slices: any prefix of slices is a scene, the whole is what one slice per layer holds, and slices that are
+not where they belong are refused."""
+
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from strategies import assert_same_scene, make_scene
+
+from pd4dgs_codec import decode, encode
+from pd4dgs_codec.errors import ChecksumMismatch, DecodeError, EncodeError, LimitExceeded, Malformed, Truncated
+from pd4dgs_codec.format import encoder
+from pd4dgs_codec.format.container import read_chunk, read_preamble, slice_flags, write_chunk, write_preamble
+from pd4dgs_codec.format.decoder import decode_partial
+from pd4dgs_codec.format.encoder import encode_with_report
+from pd4dgs_codec.format.header import CHUNKS, pack_header, scene_id_of, unpack_header
+from pd4dgs_codec.format.info import hashes, info
+from pd4dgs_codec.format.limits import MAX_CHUNKS
+from pd4dgs_codec.format.stream import every_prefix, open_stream
+from pd4dgs_codec.morton import morton_order
+
+
+@cache
+def scene():
+    return make_scene(3, anchors=300)
+
+
+@cache
+def one_slice():
+    return encode(scene(), effort=2)
+
+
+@cache
+def sliced():
+    return encode(scene(), effort=2, slices=1700)
+
+
+def chunks_of(data):
+    """(header, [(type, flags, payload)], [offset of each chunk's end])"""
+    preamble = read_preamble(data)
+    header, chunks, ends = unpack_header(preamble.header), [], [preamble.size]
+    while ends[-1] < len(data):
+        chunk = read_chunk(data, ends[-1])
+        chunks.append((chunk.type, chunk.flags, chunk.payload))
+        ends.append(chunk.end)
+    return header, chunks, ends[1:]
+
+
+def file_of(header, chunks):
+    """With a right chunk list, ids and CRCs."""
+    packed = pack_header(replace(header, chunks=tuple((kind, len(payload)) for kind, _, payload in chunks)))
+    return write_preamble(packed) + b"".join(write_chunk(k, f, scene_id_of(packed), p) for k, f, p in chunks)
+
+
+def test_all_slices_are_what_one_slice_per_layer_holds():
+    assert [kind for kind, *_ in chunks_of(sliced())[1]] == [0, 0, 0, 1, 1, 1, 2, 2]
+    assert hashes(sliced()) == hashes(one_slice())
+    assert_same_scene(decode(sliced()), decode(one_slice()))
+    assert len(sliced()) < 1.3 * len(one_slice())  # of 1 kB each; docs/slices.md has larger ones
+
+
+def test_every_prefix_of_slices_is_a_scene_by_every_door():
+    """Cut off, as a file of its own, from a stream: the same scene, of rows that the whole has too."""
+    whole, (header, chunks, ends) = decode(sliced()), chunks_of(sliced())
+    streamed = list(every_prefix(sliced()))
+    assert len(streamed) == len(ends)
+    rows = {tuple(q): i for i, q in enumerate(whole.anchor_q.tolist())}
+    for count, (end, from_stream) in enumerate(zip(ends, streamed, strict=True), start=1):
+        if count < len(ends):
+            with pytest.raises(Truncated):
+                decode(sliced()[:end])
+        prefix, complete = decode_partial(sliced()[:end])
+        assert complete == (count == len(ends))
+        assert_same_scene(prefix, from_stream)
+        assert_same_scene(prefix, decode(file_of(header, chunks[:count])))
+        at = [rows[tuple(q)] for q in prefix.anchor_q.tolist()]
+        np.testing.assert_array_equal(prefix.feature, whole.feature[at])
+        assert prefix.level == chunks[count - 1][0]
+        for first, last in zip((0, *prefix.rows[:-1]), prefix.rows, strict=True):
+            np.testing.assert_array_equal(morton_order(prefix.anchor_q[first:last]), np.arange(last - first))
+        for extra in (0, 1):
+            assert_same_scene(prefix, decode(sliced() + b"x", max_bytes=end + extra))
+        with pytest.raises(DecodeError):
+            decode(sliced()[: end - 1], max_bytes=end)
+    with pytest.raises(Truncated, match=f"{ends[0] - 1} bytes end before the first slice"):
+        decode(sliced(), max_bytes=ends[0] - 1)
+    for level in (0, 1):
+        assert_same_scene(decode(sliced(), max_layer=level), decode(one_slice(), max_layer=level))
+
+
+@pytest.mark.parametrize(
+    ("order", "at"),
+    [((0, 2, 1, 3, 4, 5, 6, 7), 1), ((0, 1, 1, 2, 3, 4, 5, 6, 7), 2), ((0, 2, 3, 4, 5, 6, 7), 1), ((1, 2, 3, 4, 5), 0),
+     ((0, 1, 3, 4, 5, 6, 7), 1), ((0, 1, 2, 3, 5, 6, 7), 4)],
+)  # fmt: skip
+def test_slices_swapped_doubled_or_left_out_are_refused(order, at):
+    header, chunks, _ = chunks_of(sliced())
+    with pytest.raises(Malformed, match="slice") as caught:
+        decode(file_of(header, [chunks[i] for i in order]))
+    assert caught.value.chunk == at
+
+
+def test_slices_of_another_encode_are_refused():
+    """Even where lengths, numbers and the scene's fields are the same."""
+    other = encode(scene(), effort=2, slices=2000, utility=lambda scene: -encoder.by_size(scene))
+    (header, mine, _), (_, others, _) = chunks_of(sliced()), chunks_of(other)
+    alien = read_chunk(other, read_preamble(other).size).scene_id
+    packed = pack_header(replace(header, chunks=tuple((k, len(p)) for k, _, p in [mine[0], others[1], *mine[2:]])))
+    framed = [write_chunk(k, f, scene_id_of(packed), p) for k, f, p in mine]
+    framed[1] = write_chunk(others[1][0], others[1][1], alien, others[1][2])
+    with pytest.raises(Malformed, match="belongs to scene"):
+        decode(write_preamble(packed) + b"".join(framed))
+
+
+@settings(max_examples=60, deadline=None)
+@given(st.integers(0, 10**6), st.integers(0, 7))
+def test_cuts_and_flips_are_refused(place, bit):
+    at = place % len(sliced())
+    with pytest.raises(Truncated):
+        decode(sliced()[:at])
+    flipped = bytearray(sliced())
+    flipped[at] ^= 1 << bit
+    with pytest.raises(DecodeError) as caught:
+        decode(bytes(flipped))
+    if at >= read_preamble(sliced()).size + 16:  # else a length or a signature may be what is wrong
+        assert isinstance(caught.value, (ChecksumMismatch, Malformed, LimitExceeded))
+
+
+def test_utility_decides_what_comes_first():
+    def utility(scene):
+        values = np.arange(len(scene.anchor_q), dtype=float)[::-1].copy()
+        values[7] = 1e9
+        return values
+
+    data = encode(scene(), effort=2, slices=2000, utility=utility)
+    whole, (_, _, ends) = decode(data), chunks_of(data)
+    first = decode_partial(data[: ends[0]])[0].anchor_q.tolist()
+    expected = sorted(range(whole.rows[0]), key=lambda i: -utility(whole)[i])[: len(first)]
+    assert sorted(first) == sorted(whole.anchor_q[expected].tolist())
+
+
+def test_slices_take_what_was_asked_and_the_report_says_so():
+    data, report = encode_with_report(scene(), effort=2, slices=1700)
+    rows = [row for layer in report.layers for row in layer.slices]
+    _, chunks, ends = chunks_of(data)
+    assert [row.bytes for row in rows] == [20 + len(payload) for *_, payload in chunks]
+    assert all(row.bytes <= 1700 for row in rows)
+    assert ends[0] <= 1700
+    assert [sum(s.anchors for s in layer.slices) for layer in report.layers] == [r.anchors for r in report.layers]
+    told = info(data)["layers"]
+    assert [s["end"] for row in told for s in row["slices"]] == ends
+    assert [s["anchors"] for row in told for s in row["slices"]] == [row.anchors for row in rows]
+    assert [(row["anchors"], row["bytes"]) for row in told] == [(r.anchors, r.bytes) for r in report.layers]
+    assert "anchors" not in info(data[: ends[1]])["layers"][0]
+
+
+def test_slices_that_cannot_be_are_refused(monkeypatch):
+    with pytest.raises(EncodeError, match="slices of 5 bytes, expected 0 or 1000 and more"):
+        encode(scene(), slices=5)
+    with pytest.raises(EncodeError, match="slices in mode lzma"):
+        encode(scene(), slices=5000, mode="lzma")
+    monkeypatch.setattr(encoder, "MAX_CHUNKS", 5)
+    with pytest.raises(EncodeError, match=r"\d slices, expected at most 5"):
+        encode(scene(), effort=1, slices=2000)
+
+
+def test_a_thousand_slices_at_once_make_one_scene():
+    """Else 10 kB with 8,192 rows in 60 slices ask a stream for 83 MB, and 131 kB in 1,000 slices for 17 times that."""
+    header, chunks, ends = chunks_of(sliced())
+    last = max(i for i, (layer, _, _) in enumerate(chunks) if layer == 0)
+    stream = open_stream()
+    scenes = stream.feed(sliced())
+    assert [scene.layers[-1] for scene in scenes] == sorted({layer for layer, *_ in chunks}) and stream.slices == len(
+        ends
+    )
+    assert_same_scene(scenes[0], decode(sliced(), max_bytes=ends[last]))
+    assert_same_scene(scenes[-1], decode(sliced()))
+
+
+def test_flags_number_as_many_slices_as_a_file_may_have_chunks():
+    assert slice_flags(MAX_CHUNKS - 1, MAX_CHUNKS) < 1 << 16
+    assert CHUNKS == 1
+
+
+def test_every_prefix_renders_finite_pictures():
+    from pd4dgs_codec.model.convert import from_scene
+    from pd4dgs_codec.model.picture import render_image
+    from pd4dgs_codec.scene import Camera
+
+    viewmat = np.eye(4, dtype=np.float32)
+    viewmat[2, 3] = 3.0
+    camera = Camera(viewmat, np.array([[20, 0, 12], [0, 20, 8], [0, 0, 1]], np.float32), 24, 16)
+    pictures = []
+    for prefix in every_prefix(sliced()):
+        pictures.append(render_image(from_scene(prefix), prefix.level, 0.3, camera))
+        assert np.isfinite(pictures[-1]).all()
+    assert (pictures[0] != pictures[-1]).any()

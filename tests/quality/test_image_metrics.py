@@ -1,0 +1,146 @@
+"""mPSNR and mSSIM against values by hand and a slow direct implementation."""
+
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.quality.image import mean_image_baseline, mpsnr, mssim, to_uint8
+
+
+def random_pair(h=15, w=17, seed=0):
+    rng = np.random.default_rng(seed)
+    a = rng.integers(0, 256, (h, w, 3)).astype(np.uint8)
+    b = np.clip(a.astype(int) + rng.integers(-60, 61, a.shape), 0, 255).astype(np.uint8)
+    return a, b
+
+
+def slow_pass(z, m, f, axis):
+    """One masked 1-D pass of one channel, window by window."""
+    if axis == 0:
+        out, mask = slow_pass(z.T, m.T, f, 1)
+        return out.T, mask.T
+    h, w = z.shape
+    out, mask = np.zeros((h, w - 10)), np.zeros((h, w - 10))
+    for y in range(h):
+        for x in range(w - 10):
+            window, count = m[y, x : x + 11], m[y, x : x + 11].sum()
+            if count:
+                out[y, x] = sum(z[y, x + i] * window[i] * f[i] for i in range(11)) * 11 / count
+                mask[y, x] = 1
+    return out, mask
+
+
+def slow_mssim(a, b, m):
+    f = np.exp(-((np.arange(11) - 5) ** 2) / (2 * 1.5**2))
+    f /= f.sum()
+
+    def blur(z):
+        return slow_pass(*slow_pass(z, m, f, 1), f, 0)[0]
+
+    maps = []
+    for c in range(3):
+        x, y = a[..., c] / 255, b[..., c] / 255
+        mx, my = blur(x), blur(y)
+        vx, vy = np.maximum(blur(x * x) - mx**2, 0), np.maximum(blur(y * y) - my**2, 0)
+        cov = blur(x * y) - mx * my
+        limit = np.sqrt(vx * vy)
+        cov = np.clip(cov, -limit, limit)
+        top = (2 * mx * my + 1e-4) * (2 * cov + 9e-4)
+        maps.append(top / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4)))
+    return np.mean(maps)
+
+
+@pytest.mark.parametrize("kind", ["all", "half", "scattered", "none"])
+def test_mssim_is_the_direct_one(kind):
+    a, b = random_pair()
+    m = np.ones((15, 17), bool)
+    if kind == "half":
+        m[:, 4:] = False
+    elif kind == "scattered":
+        m = np.random.default_rng(1).uniform(size=m.shape) < 0.05
+    elif kind == "none":
+        m[:] = False
+    assert mssim(a, b, m) == pytest.approx(slow_mssim(a, b, m.astype(float)), abs=1e-12)
+    if kind == "none":
+        assert mssim(a, b, m) == 1.0
+    if kind == "all":
+        assert mssim(a, b) == mssim(a, b, m)
+
+
+def test_mssim_by_hand():
+    a, b = np.full((11, 11, 3), 51, np.uint8), np.full((11, 11, 3), 102, np.uint8)  # 0.2 and 0.4, no variance
+    assert mssim(a, b) == pytest.approx((2 * 0.08 + 1e-4) / (0.04 + 0.16 + 1e-4))
+    assert mssim(a, a) == pytest.approx(1.0)
+
+
+def test_without_a_mask_they_are_scikit_image_s():
+    metrics = pytest.importorskip("skimage.metrics")
+    a, b = random_pair(40, 50)
+    options = {"gaussian_weights": True, "sigma": 1.5, "use_sample_covariance": False, "channel_axis": 2}
+    _, ssim = metrics.structural_similarity(a / 255, b / 255, data_range=1.0, full=True, **options)
+    assert mssim(a, b) == pytest.approx(ssim[5:-5, 5:-5].mean(), abs=1e-9)
+    assert mpsnr(a, b) == pytest.approx(metrics.peak_signal_noise_ratio(a, b), abs=1e-9)
+
+
+def test_mpsnr_by_hand():
+    a, b = np.zeros((2, 2, 3), np.uint8), np.zeros((2, 2, 3), np.uint8)
+    b[0, 0] = 51  # error .2 in one of four pixels
+    assert mpsnr(a, b) == pytest.approx(-10 * np.log10(0.04 / 4))
+    assert mpsnr(a, b, np.array([[1, 1], [0, 0]], bool)) == pytest.approx(-10 * np.log10(0.04 / 2))
+    assert mpsnr(a, b, np.array([[0, 1], [1, 1]], bool)) == float("inf")
+    b[0, 0] = 51, 0, 0
+    assert mpsnr(a, b) == pytest.approx(-10 * np.log10(0.04 / 12))
+
+
+def test_mask_hides_errors_anywhere():
+    a, b = random_pair()
+    m = np.random.default_rng(2).uniform(size=a.shape[:2]) < 0.5
+    c = b.copy()
+    c[~m] = 0
+    assert mpsnr(a, b, m) == mpsnr(a, c, m)
+    a2 = a.copy()
+    a2[~m] = 255
+    assert mssim(a, b, m) == mssim(a2, c, m)
+
+
+def test_eight_bits_first():
+    target = np.full((12, 12, 3), 100, np.uint8)
+    assert mpsnr(np.full((12, 12, 3), 100.4 / 255, np.float32), target) == float("inf")
+    assert to_uint8(np.array([-1.0, 0.0, 0.5, 1.0, 7.0, np.inf])).tolist() == [0, 0, 128, 255, 255, 255]
+
+
+def test_baseline_by_hand():
+    def view(level, mask=None):
+        return SimpleNamespace(image=np.full((4, 4, 3), level, np.uint8), mask=mask)
+
+    train = [view(0), view(102)]  # mean 51
+    expected = np.mean([-10 * np.log10(0.2**2), -10 * np.log10(0.4**2)])
+    assert mean_image_baseline(train, [view(102), view(153)]) == pytest.approx(expected)
+    half = view(102)
+    half.image[:2], half.mask = 255, np.arange(16).reshape(4, 4) >= 8
+    assert mean_image_baseline(train, [half]) == pytest.approx(-10 * np.log10(0.2**2))
+
+
+@pytest.mark.parametrize(
+    ("args", "text"),
+    [
+        ((np.zeros((12, 12, 3)), np.zeros((12, 13, 3))), "expected the same"),
+        ((np.zeros((12, 12)), np.zeros((12, 12))), "expected the same"),
+        ((np.zeros((12, 12, 3)), np.zeros((12, 12, 3)), np.ones((11, 12), bool)), "mask has shape"),
+        ((np.full((12, 12, 3), np.nan), np.zeros((12, 12, 3))), "holds NaN"),
+        ((np.zeros((12, 12, 3), int), np.zeros((12, 12, 3), int)), "dtype int64"),
+    ],
+)
+def test_bad_images(args, text):
+    for metric in (mpsnr, mssim):
+        with pytest.raises(DataError, match=text):
+            metric(*args)
+
+
+def test_too_small_and_empty():
+    with pytest.raises(DataError, match="at least 11x11"):
+        mssim(np.zeros((10, 20, 3)), np.zeros((10, 20, 3)))
+    with pytest.raises(DataError, match="0 test views"):
+        mean_image_baseline([SimpleNamespace(image=np.zeros((4, 4, 3)))], [])

@@ -1,0 +1,253 @@
+"""LPIPS, ST-LPIPS, FLIP: mask and mean by hand, error maps from their definitions, and what happens without them."""
+
+import sys
+from types import ModuleType, SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+import torch.nn.functional as F
+
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.quality.perceptual import Distance, load_perceptual
+
+MEAN_DIFFERENCE = Distance("mean difference", "by hand", lambda a, b: np.abs(a - b).mean(axis=2), least=2)
+
+
+@pytest.fixture(scope="module")
+def distance():
+    """distance(name) -> the installed Distance; skips where it is absent."""
+    loaded = load_perceptual()
+
+    def get(name):
+        if name in loaded.absent:
+            pytest.skip(f"{name}: {loaded.absent[name]}")
+        return loaded.distances[name]
+
+    return get
+
+
+def pair(height=40, width=50, seed=0):
+    rng = np.random.default_rng(seed)
+    coarse = rng.uniform(0, 1, (height // 5, width // 5, 3)).repeat(5, 0).repeat(5, 1)
+    a = np.rint(255 * coarse).astype(np.uint8)
+    b = np.clip(a.astype(int) + rng.integers(-40, 41, a.shape), 0, 255).astype(np.uint8)
+    return a, b, rng.uniform(size=(height, width)) < 0.7
+
+
+# -- mask, mean and time, with an error map by hand --------------------------------------------------------------------
+
+
+def test_masked_mean_by_hand():
+    a, b = np.zeros((2, 2, 3), np.uint8), np.zeros((2, 2, 3), np.uint8)
+    b[0, 0], b[1, 1] = 51, (153, 0, 0)  # errors .2 and .6 / 3
+    assert MEAN_DIFFERENCE(a, b) == pytest.approx((0.2 + 0.2) / 4)
+    assert MEAN_DIFFERENCE(a, b, np.array([[1, 1], [1, 0]], bool)) == pytest.approx(0.2 / 3)
+    assert MEAN_DIFFERENCE(a, b, np.array([[0, 1], [1, 0]], bool)) == 0
+    assert MEAN_DIFFERENCE(a, b, np.zeros((2, 2), bool)) == 0
+    assert MEAN_DIFFERENCE(np.full((2, 2, 3), 0.2 + 0.4 / 255), np.full((2, 2, 3), 51, np.uint8)) == 0  # 8 bits first
+
+
+def test_the_map_sees_masked_pictures():
+    seen = []
+    spy = Distance("spy", "", lambda a, b: seen.extend((a, b)) or np.ones(a.shape[:2]))
+    a, b, m = pair()
+    assert spy(a, b, m) == pytest.approx(1)
+    for picture, found in zip((a, b), seen, strict=True):
+        assert found.dtype == np.float32 and (found[~m] == 0).all()
+        assert np.array_equal(np.rint(255 * found[m]), picture[m])
+
+
+def test_temporal_by_hand():
+    frames = [np.full((2, 2, 3), value, np.uint8) for value in (0, 51, 51, 204)]
+    assert MEAN_DIFFERENCE.temporal(frames) == pytest.approx((0.2 + 0 + 0.6) / 3)
+    assert MEAN_DIFFERENCE.temporal(iter(frames[1:3])) == 0
+    with pytest.raises(DataError, match="at least 2 frames"):
+        MEAN_DIFFERENCE.temporal(frames[:1])
+
+
+def test_refusals():
+    with pytest.raises(DataError, match="image is 3x1, expected at least 2x2 for mean difference"):
+        MEAN_DIFFERENCE(np.zeros((1, 3, 3)), np.zeros((1, 3, 3)))
+    with pytest.raises(DataError, match="expected the same"):
+        MEAN_DIFFERENCE(np.zeros((4, 4, 3)), np.zeros((4, 5, 3)))
+    with pytest.raises(DataError, match="holds NaN"):
+        MEAN_DIFFERENCE(np.full((4, 4, 3), np.nan), np.zeros((4, 4, 3)))
+
+
+# -- the packages ------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["lpips", "stlpips", "flip"])
+def test_zero_for_equal_and_growing_with_flicker(name, distance):
+    metric = distance(name)
+    still, other, mask = pair()
+    assert metric(still, still) == metric(still, still, mask) == 0
+    assert metric.temporal([still] * 3) == 0
+    noise = other.astype(int) - still
+
+    def flicker(amount):
+        flash = np.clip(still + amount * noise, 0, 255).astype(np.uint8)
+        return metric.temporal([still, flash, still, flash])
+
+    assert 0 < flicker(0.25) < flicker(0.5) < flicker(1.0)
+
+
+@pytest.mark.parametrize("name", ["lpips", "stlpips", "flip"])
+def test_what_the_mask_hides_does_not_count(name, distance):
+    metric = distance(name)
+    a, b, mask = pair()
+    c = b.copy()
+    c[~mask] = 255 - c[~mask]
+    assert metric(a, b, mask) == metric(a, c, mask) > 0
+    assert metric(a, b) != metric(a, c)
+
+
+@pytest.mark.parametrize("name", ["lpips", "stlpips"])
+def test_least_size(name, distance):
+    metric = distance(name)
+    a, b, _ = (z[: metric.least, : metric.least] for z in pair())
+    assert np.isfinite(metric(a, b))
+    with pytest.raises(RuntimeError):  # the network's own refusal, which says nothing of the picture
+        metric.error_map(*(np.float32(z[1:]) for z in (a, b)))
+    with pytest.raises(DataError, match=f"expected at least {metric.least}x{metric.least}"):
+        metric(a[1:], b[1:])
+
+
+def test_lpips_is_the_package_s(monkeypatch, tmp_path):
+    """With random ImageNet weights, which stand where torchvision would put the true ones."""
+    try:
+        from torchvision.models import AlexNet_Weights, alexnet
+    except Exception as error:  # a torchvision built for another torch raises RuntimeError
+        pytest.skip(f"torchvision: {error}")
+    lpips = pytest.importorskip("lpips")
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    folder = tmp_path / "hub" / "checkpoints"
+    folder.mkdir(parents=True)
+    torch.save(alexnet().state_dict(), folder / AlexNet_Weights.IMAGENET1K_V1.url.split("/")[-1])
+    a, b, mask = pair()
+    inputs = [lpips.im2tensor(z / 255 * mask[..., None], factor=1 / 2) for z in (a, b)]
+    with torch.inference_mode():
+        error = lpips.LPIPS(net="alex", spatial=True, verbose=False)(*inputs)[0, 0].numpy()
+    assert load_perceptual().distances["lpips"](a, b, mask) == pytest.approx(error[mask].mean(), rel=1e-5)
+
+
+def stlpips_layers(weights, x):
+    """Features after the five ReLUs of the shift-tolerant AlexNet, from the paper's description; x [1, 3, H, W]."""
+
+    def conv(x, layer, padding):
+        return F.conv2d(x, weights[f"net.{layer}.weight"], weights[f"net.{layer}.bias"], padding=padding)
+
+    def halve(x):  # reflection by 2, then binomial blur at stride 2
+        kernel = torch.tensor([1.0, 2.0, 1.0])
+        kernel = (kernel[:, None] * kernel / 16).expand(x.shape[1], 1, 3, 3)
+        return F.conv2d(F.pad(x, (2, 2, 2, 2), mode="reflect"), kernel, stride=2, groups=x.shape[1])
+
+    x = F.relu(halve(conv(x, "slice1.0", 2)))
+    yield x
+    for layer in ("slice2.5", "slice3.9"):
+        x = F.relu(conv(halve(F.max_pool2d(x, 3, stride=1)), layer, 2 if layer == "slice2.5" else 1))
+        yield x
+    for layer in ("slice4.11", "slice5.13"):
+        x = F.relu(conv(x, layer, 1))
+        yield x
+
+
+def test_stlpips_from_its_definition(distance):
+    metric = distance("stlpips")
+    from importlib.metadata import distribution
+
+    path = distribution("stlpips-pytorch").locate_file("stlpips_pytorch/weights/vST0.0/alex_shift_tolerant.pth")
+    weights = torch.load(path, map_location="cpu", weights_only=True)
+    a, b, mask = pair()
+    shift, scale = (torch.tensor(v)[:, None, None] for v in ([-0.030, -0.088, -0.188], [0.458, 0.448, 0.450]))
+    features = []
+    for picture in (a, b):
+        x = torch.from_numpy(picture / 255 * mask[..., None]).float().permute(2, 0, 1)[None] * 2 - 1
+        features.append([F.normalize(f, dim=1) for f in stlpips_layers(weights, (x - shift) / scale)])
+    total = 0
+    for i, (f, g) in enumerate(zip(*features, strict=True)):
+        error = F.conv2d((f - g) ** 2, weights[f"lin{i}.model.1.weight"])
+        total = total + F.interpolate(error, size=mask.shape, mode="bilinear", align_corners=False)[0, 0]
+    assert metric(a, b, mask) == pytest.approx(float(total[torch.from_numpy(mask)].mean()), rel=1e-4)
+
+
+def flip_of_colours(a, b):
+    """FLIP between two plain pictures: no edges, no points, nothing to blur. Andersson et al. 2020, section 4.1."""
+    matrix = np.array(
+        [
+            [10135552 / 24577794, 8788810 / 24577794, 4435075 / 24577794],
+            [2613072 / 12288897, 8788810 / 12288897, 887015 / 12288897],
+            [1425312 / 73733382, 8788810 / 73733382, 70074185 / 73733382],
+        ]
+    )
+
+    def hunt_lab(rgb):
+        rgb = np.asarray(rgb, float)
+        linear = np.where(rgb <= 0.04045, rgb / 12.92, ((rgb + 0.055) / 1.055) ** 2.4)
+        xyz = matrix @ linear / matrix.sum(axis=1)
+        x, y, z = np.where(xyz > (6 / 29) ** 3, np.cbrt(xyz), xyz / (3 * (6 / 29) ** 2) + 4 / 29)
+        lightness = 116 * y - 16
+        return np.array([lightness, 0.01 * lightness * 500 * (x - y), 0.01 * lightness * 200 * (y - z)])
+
+    def hyab(p, q):
+        d = hunt_lab(p) - hunt_lab(q)
+        return (abs(d[0]) + np.hypot(d[1], d[2])) ** 0.7
+
+    largest = hyab((0, 1, 0), (0, 0, 1))
+    return float(np.interp(hyab(a, b), [0, 0.4 * largest, largest], [0, 0.95, 1]))
+
+
+@pytest.mark.parametrize(
+    ("a", "b"), [((0, 0, 0), (255, 255, 255)), ((200, 80, 30), (180, 90, 60)), ((9, 9, 9), (0, 40, 0))]
+)
+def test_flip_of_plain_pictures_from_its_definition(a, b, distance):
+    plain = [np.broadcast_to(np.uint8(colour), (24, 32, 3)) for colour in (a, b)]
+    expected = flip_of_colours(np.divide(a, 255), np.divide(b, 255))
+    assert distance("flip")(*plain) == pytest.approx(expected, abs=1e-4)
+
+
+def test_flip_is_the_package_s(distance):
+    metric = distance("flip")
+    import flip_evaluator
+
+    a, b, _ = pair()
+    expected = flip_evaluator.evaluate(np.float32(b / 255), np.float32(a / 255), "LDR")[1]
+    assert metric(a, b) == pytest.approx(expected, rel=1e-5)
+
+
+# -- where something is missing ----------------------------------------------------------------------------------------
+
+
+def test_missing_packages_are_named(monkeypatch):
+    for name in ("torchvision", "lpips", "stlpips_pytorch", "flip_evaluator"):
+        monkeypatch.setitem(sys.modules, name, None)
+    loaded = load_perceptual()
+    assert loaded.distances == {} and set(loaded.absent) == {"lpips", "stlpips", "flip"}
+    assert "stlpips_pytorch" in loaded.absent["stlpips"] and "flip_evaluator" in loaded.absent["flip"]
+
+
+def test_broken_package_is_one_line(monkeypatch):
+    def evaluate(name):
+        raise RuntimeError("built for\nanother machine")
+
+    broken = ModuleType("flip_evaluator")
+    broken.__getattr__ = evaluate
+    monkeypatch.setitem(sys.modules, "flip_evaluator", broken)
+    assert load_perceptual().absent["flip"] == "RuntimeError: built for another machine"
+
+
+def test_lpips_without_weights_fetches_nothing(monkeypatch, tmp_path):
+    models = ModuleType("torchvision.models")
+    models.AlexNet_Weights = SimpleNamespace(IMAGENET1K_V1=SimpleNamespace(url="https://example.org/alexnet-x.pth"))
+    monkeypatch.setitem(sys.modules, "torchvision", ModuleType("torchvision"))
+    monkeypatch.setitem(sys.modules, "torchvision.models", models)
+    monkeypatch.setitem(sys.modules, "lpips", None)  # not even loaded
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    assert load_perceptual().absent["lpips"].endswith(str(tmp_path / "hub" / "checkpoints" / "alexnet-x.pth"))
+
+
+def test_stand_ins_do_not_stay(distance):
+    distance("stlpips")
+    names = {"torchvision", "IPython", "torchsummary"} & set(sys.modules)
+    assert all(sys.modules[name].__spec__ is not None for name in names)

@@ -1,0 +1,180 @@
+"""What a server may answer instead of the file: the client ends in time, with scenes or in one line."""
+
+from __future__ import annotations
+
+import contextlib
+import random
+import socket
+import threading
+import time
+from collections.abc import Callable, Iterator
+
+import pytest
+
+from pd4dgs_codec.errors import DeliveryError, Pd4Error
+from pd4dgs_codec.web import transfer
+from pd4dgs_codec.web.client import Budget, SceneClient
+
+FILE = bytes(range(256)) * 4
+WHOLE = b'HTTP/1.1 200 OK\r\nContent-Length: %d\r\nETag: "a"\r\n\r\n' % len(FILE) + FILE
+
+
+@contextlib.contextmanager
+def answering(talk: Callable[[socket.socket], None]) -> Iterator[str]:
+    """The URL of a server that reads a request and then talks as told, on every connection."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        ended = threading.Event()
+
+        def serve() -> None:
+            while not ended.is_set():
+                with contextlib.suppress(OSError):
+                    connection, _ = server.accept()
+                    with connection, contextlib.suppress(OSError):
+                        connection.recv(1 << 16)
+                        talk(connection)
+
+        thread = threading.Thread(target=serve, daemon=True)
+        thread.start()
+        yield f"http://127.0.0.1:{server.getsockname()[1]}/scene.pd4"
+        ended.set()
+        with contextlib.suppress(OSError), socket.create_connection(server.getsockname()):
+            pass
+
+
+def drip(data: bytes) -> Callable[[socket.socket], None]:
+    """A byte every 20 ms: never silent, never done."""
+
+    def talk(connection: socket.socket) -> None:
+        for byte in data:
+            connection.sendall(bytes([byte]))
+            time.sleep(0.02)
+
+    return talk
+
+
+DRIPPED = {
+    "the header": b"HTTP/1.1 200 OK\r\n" + b"X-Filler: 1\r\n" * 1000,
+    "one endless line": b"HTTP/1.1 200 " + b"O" * 20_000,
+    "hundreds of provisional answers": b"HTTP/1.1 100 Continue\r\n\r\n" * 1000,
+    "the length of a chunk": b"HTTP/1.1 200 OK\r\nTransfer-Encoding: chunked\r\n\r\n" + b"0" * 20_000,
+}
+
+
+@pytest.mark.parametrize("what", DRIPPED)
+def test_a_server_that_drips_is_left_when_the_seconds_are_over(what):
+    with answering(drip(DRIPPED[what])) as url, SceneClient(url) as client:
+        start = time.monotonic()
+        assert list(client.scenes(Budget(seconds=0.3))) == []
+        assert time.monotonic() - start < 10  # the answer would take minutes
+
+
+@pytest.mark.parametrize("what", DRIPPED)
+def test_a_server_that_drips_counts_as_silent_without_a_budget(what):
+    with answering(drip(DRIPPED[what])) as url, SceneClient(url, stall=0.2, attempts=2) as client:
+        with pytest.raises(DeliveryError, match="no byte arrived for too long"):
+            list(client.scenes())
+
+
+LOCATIONS = {
+    "http://[::1": "which is no address",
+    "http://": "more than 5 redirects",
+    "ftp://a/b": "expected http://HOST/PATH",
+    "http://a:99999/": "expected http://HOST/PATH",
+    "http://user:password@a/": "expected http://HOST/PATH",
+}
+
+
+@pytest.mark.parametrize("location", LOCATIONS)
+def test_redirects_to_no_address(location):
+    reply = f"HTTP/1.1 302 Found\r\nLocation: {location}\r\nContent-Length: 0\r\n\r\n".encode()
+    with answering(lambda c: c.sendall(reply)) as url, SceneClient(url) as client:
+        with pytest.raises(DeliveryError) as caught:
+            list(client.scenes())
+    assert LOCATIONS[location] in str(caught.value) and "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("reply", [b"SSH-2.0\r\n", b"HTTP/1.1 404 \x1b[2Jgone\r\n\r\n", b"\x00" * 99, b"A" * 100_000])
+def test_answers_of_other_protocols_are_one_plain_line(reply):
+    with answering(lambda c: c.sendall(reply)) as url, SceneClient(url, attempts=1) as client:
+        with pytest.raises(DeliveryError) as caught:
+            list(client.scenes())
+    assert str(caught.value).isprintable() and len(str(caught.value)) < 250
+
+
+# -- replies at random -------------------------------------------------------------------------------------------------
+
+STATUS = [
+    *(b"HTTP/1.1 " + rest for rest in (b"200 OK", b"206 Partial Content", b"416 No", b"302 Found", b"503 Busy")),
+    *(b"HTTP/1.1 " + rest for rest in (b"-1 x", b"99999 x", b"204 None", b"100 Continue", b"304 Same")),
+    *(b"HTTP/1.0 200 OK", b"HTTP/9.9 200 OK", b"ICY 200 OK", b"", b"\xff\xfe"),
+]
+HEADERS = [
+    *(b"Content-Length: " + value for value in (b"%d" % len(FILE), b"-1", b"1e3", b"9" * 5000)),
+    *(b"Content-Range: bytes " + value for value in (b"0-1023/1024", b"5-1/1024", b"*/*", b"0-%s/9" % (b"9" * 300))),
+    *(b"Location: " + value for value in (b"http://[::1", b"/b", b"http://\xff", b"//", b"http://a:b/")),
+    *(b"Transfer-Encoding: chunked", b"Transfer-Encoding: gzip, chunked", b"Content-Encoding: gzip"),
+    *(b'ETag: "a"', b"ETag: W/a", b"ETag: \xe9\x00", b"Last-Modified: never", b"Connection: close"),
+    *(b": ", b"a" * 70_000, b" folded: x", b"X: \x00\x0b\x1c"),
+]
+BODIES = [FILE, b"", b"5\r\nabcde\r\n0\r\n\r\n", b"-5\r\n", b"fffffffffffffffff\r\nx", b"5;x=y\r\nabc", b"\x89PD4" * 9]
+
+
+def reply_at_random(rng: random.Random) -> bytes:
+    """An answer put together from odd parts, then perhaps cut, or with bytes of it changed."""
+    lines = [rng.choice(STATUS), *rng.choices(HEADERS, k=rng.randrange(5))]
+    data = bytearray(rng.choice([b"\r\n", b"\r\n", b"\n"]).join(lines) + b"\r\n\r\n" + rng.choice(BODIES))
+    if rng.random() < 0.3:
+        del data[rng.randrange(len(data) + 1) :]
+    for _ in range(rng.choice([0, 0, 1, 4])):
+        if data:
+            data[rng.randrange(len(data))] = rng.randrange(256)
+    return bytes(data)
+
+
+def check_replies(seed: int, count: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """`count` clients, each given three such answers and then silence: they end in a DeliveryError, a DecodeError or
+    the whole of what there is, never in a foreign exception, and say it in one printable line."""
+    rng = random.Random(seed)
+    replies: list[bytes] = []
+
+    def connect(place: object, until: float) -> socket.socket:
+        if not replies:
+            raise ConnectionRefusedError(111, "Connection refused")
+        ours, theirs = socket.socketpair()
+        theirs.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, 1 << 18)
+        theirs.setblocking(False)
+        theirs.send(replies.pop())
+        theirs.shutdown(socket.SHUT_WR)
+        sockets.append(theirs)
+        return ours
+
+    monkeypatch.setattr(transfer, "_connect", connect)
+    monkeypatch.setattr(transfer, "BACKOFF_SECONDS", 0.0)
+    for i in range(count):
+        sockets: list[socket.socket] = []
+        replies[:] = [reply_at_random(rng) for _ in range(3)]
+        given = list(replies)
+        with SceneClient("http://host/scene.pd4", attempts=3, stall=1.0) as client:
+            try:
+                list(client.scenes(Budget(seconds=5)))
+            except Pd4Error as error:
+                assert str(error).isprintable(), (seed, i, str(error))
+            except Exception as error:
+                raise AssertionError(f"seed {seed}, case {i}: {error!r} from {given}") from error
+        for theirs in sockets:
+            theirs.close()
+
+
+def test_replies_at_random(monkeypatch):
+    check_replies(1, 300, monkeypatch)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", range(2, 12))
+def test_ten_thousand_replies_at_random(seed, monkeypatch):
+    check_replies(seed, 1000, monkeypatch)
+
+
+def test_the_plain_answer_is_taken(monkeypatch):
+    with answering(lambda c: c.sendall(WHOLE)) as url:
+        assert transfer.Transfer(url).read(len(FILE)) == FILE

@@ -1,0 +1,288 @@
+"""The range server as HTTP clients see it."""
+
+from __future__ import annotations
+
+import contextlib
+import gzip
+import http.client
+import os
+import socket
+import threading
+import time
+from email.utils import formatdate
+from http import HTTPStatus
+
+import pytest
+from asking import ask
+
+from pd4dgs_codec.errors import DeliveryError
+from pd4dgs_codec.web.link import Link
+from pd4dgs_codec.web.server import Server
+
+CONTENT = bytes(i % 251 for i in range(1000))
+
+
+def test_the_whole_file_with_its_validators(server):
+    answer = ask(server, "/bytes.bin")
+    assert answer.status == 200 and answer.body == CONTENT
+    assert answer.headers["Content-Length"] == "1000" and answer.headers["Accept-Ranges"] == "bytes"
+    assert answer.headers["ETag"].startswith('"') and answer.headers["Last-Modified"].endswith("GMT")
+    assert ask(server, "/scene.pd4").headers["Content-Type"] == "application/octet-stream"
+
+
+@pytest.mark.parametrize(
+    ("header", "start", "end"),
+    [
+        ("bytes=0-0", 0, 1),
+        ("bytes=10-19", 10, 20),
+        ("bytes=990-", 990, 1000),
+        ("bytes=990-5000", 990, 1000),
+        ("bytes=-7", 993, 1000),
+        ("bytes=-5000", 0, 1000),
+        ("Bytes=3-4", 3, 5),
+    ],
+)
+def test_one_range(server, header, start, end):
+    answer = ask(server, "/bytes.bin", Range=header)
+    assert answer.status == 206 and answer.body == CONTENT[start:end]
+    assert answer.headers["Content-Range"] == f"bytes {start}-{end - 1}/1000"
+    assert answer.headers["Content-Length"] == str(end - start)
+
+
+@pytest.mark.parametrize("header", ["bytes=1000-", "bytes=5000-6000", "bytes=-0"])
+def test_ranges_without_a_byte_are_416(server, header):
+    answer = ask(server, "/bytes.bin", Range=header)
+    assert answer.status == 416 and answer.headers["Content-Range"] == "bytes */1000"
+
+
+@pytest.mark.parametrize(
+    "header", ["bytes=5-4", "bytes=a-b", "bytes=", "bytes=-", "lines=0-4", "bytes=0-1,5-6", "bytes=" + "9" * 5000 + "-"]
+)
+def test_what_is_no_single_range_gets_the_whole_file(server, header):
+    assert ask(server, "/bytes.bin", Range=header).status == 200
+
+
+def test_head_sends_no_body_and_ignores_ranges(server):
+    answer = ask(server, "/bytes.bin", "HEAD", Range="bytes=0-9")
+    assert answer.status == 200 and answer.body == b"" and answer.headers["Content-Length"] == "1000"
+
+
+def test_if_range_holds_for_the_same_file_only(server, folder):
+    etag = ask(server, "/bytes.bin", "HEAD").headers["ETag"]
+    assert ask(server, "/bytes.bin", Range="bytes=5-", If_Range=etag).status == 206
+    assert ask(server, "/bytes.bin", Range="bytes=5-", If_Range="W/" + etag).status == 200
+    (folder / "bytes.bin").write_bytes(CONTENT[::-1])  # the same length
+    changed = ask(server, "/bytes.bin", Range="bytes=5-", If_Range=etag)
+    assert changed.status == 200 and changed.body == CONTENT[::-1] and changed.headers["ETag"] != etag
+
+
+def test_if_range_with_a_date_needs_an_old_enough_file(server, folder):
+    old = time.time() - 100
+    os.utime(folder / "bytes.bin", (old, old))
+    assert ask(server, "/bytes.bin", Range="bytes=5-", If_Range=formatdate(old, usegmt=True)).status == 206
+    assert ask(server, "/bytes.bin", Range="bytes=5-", If_Range=formatdate(old - 1, usegmt=True)).status == 200
+    soon = time.time() + 100
+    os.utime(folder / "bytes.bin", (soon, soon))  # could change again within that second
+    assert ask(server, "/bytes.bin", Range="bytes=5-", If_Range=formatdate(soon, usegmt=True)).status == 200
+
+
+def test_not_modified(server):
+    first = ask(server, "/bytes.bin").headers
+    for header in (first["ETag"], f'"x", W/{first["ETag"]}', "*"):
+        answer = ask(server, "/bytes.bin", If_None_Match=header)
+        assert answer.status == 304 and answer.body == b"" and answer.headers["ETag"] == first["ETag"]
+    assert ask(server, "/bytes.bin", If_None_Match='"x"', If_Modified_Since=first["Last-Modified"]).status == 200
+    assert ask(server, "/bytes.bin", If_Modified_Since=first["Last-Modified"]).status == 304
+    assert ask(server, "/bytes.bin", If_Modified_Since=formatdate(0, usegmt=True)).status == 200
+    assert ask(server, "/bytes.bin", If_Modified_Since="yesterday").status == 200
+
+
+def test_pages_of_other_sites_may_read_and_resume(server):
+    assert ask(server, "/bytes.bin").headers["Access-Control-Allow-Origin"] == "*"
+    assert "Content-Range" in ask(server, "/nothing").headers["Access-Control-Expose-Headers"]
+    preflight = ask(server, "/bytes.bin", "OPTIONS", Origin="http://example.org", Access_Control_Request_Method="GET")
+    assert preflight.status == 204 and preflight.body == b""
+    assert {"Range", "If-Range"} <= set(preflight.headers["Access-Control-Allow-Headers"].split(", "))
+
+
+@pytest.mark.parametrize("method", ["POST", "PUT", "DELETE", "PATCH"])
+def test_other_methods_are_refused(server, method):
+    answer = ask(server, "/bytes.bin", method)
+    assert answer.status == 405 and "GET" in answer.headers["Allow"]
+
+
+@pytest.mark.parametrize(
+    "target",
+    [
+        "/../secret.txt",
+        "/%2e%2e/secret.txt",
+        "/..%2fsecret.txt",
+        "/%2E%2E%2Fsecret.txt",
+        "/sub/../../secret.txt",
+        "/sub/%2e%2e/%2e%2e/secret.txt",
+        "/..\\secret.txt",
+        "//secret.txt",
+        "/%00",
+        "/bytes.bin%00.txt",
+        "/%ff",
+        "/out.txt",
+        "/outside/secret.txt",
+        "/loop",
+        "/.hidden",
+        "/pipe",
+        "/sub",
+        "/",
+        "/bytes.bin/",
+        "/%5b",
+        "http://[/bytes.bin",
+        "*",
+    ],
+)
+def test_only_files_of_the_folder(server, folder, target):
+    (folder.parent / "secret.txt").write_text("secret")
+    (folder / ".hidden").write_text("secret")
+    (folder / "sub").mkdir()
+    (folder / "out.txt").symlink_to(folder.parent / "secret.txt")
+    (folder / "outside").symlink_to(folder.parent)
+    (folder / "loop").symlink_to(folder / "loop")
+    os.mkfifo(folder / "pipe")
+    answer = ask(server, target)
+    assert answer.status == 404 and b"secret" not in answer.body
+
+
+def test_a_folder_shows_its_page(server, folder):
+    (folder / "sub").mkdir()
+    for place in (folder, folder / "sub"):
+        (place / "index.html").write_text(f"page of {place.name}")
+    assert ask(server, "/").body == b"page of www" and ask(server, "/sub/?level=1").body == b"page of sub"
+    assert ask(server, "/").headers["Content-Type"].startswith("text/html")
+
+
+def test_pages_and_scripts_are_compressed_for_who_takes_that(server, folder):
+    text = b"let a = 1;\n" * 500
+    (folder / "a.js").write_bytes(text)
+    (folder / "long.js").write_bytes(text * 200)
+    plain = ask(server, "/a.js")
+    assert plain.body == text and plain.headers["Vary"] == "Accept-Encoding"
+    zipped = ask(server, "/a.js", Accept_Encoding="br, gzip")
+    assert zipped.headers["Content-Encoding"] == "gzip" and gzip.decompress(zipped.body) == text
+    assert zipped.headers["ETag"] != plain.headers["ETag"] and len(zipped.body) < 200
+    again = ask(server, "/a.js", Accept_Encoding="gzip", If_None_Match=zipped.headers["ETag"])
+    assert again.status == 304
+    assert ask(server, "/a.js", "HEAD", Accept_Encoding="gzip").headers["Content-Length"] == str(len(zipped.body))
+    assert ask(server, "/a.js", Accept_Encoding="gzip", Range="bytes=4-8").body == text[4:9]
+    for name in ("/long.js", "/bytes.bin"):
+        assert "Content-Encoding" not in ask(server, name, Accept_Encoding="gzip").headers
+
+
+def test_links_and_odd_names_inside_the_folder_are_served(server, folder):
+    (folder / "a b%ü.txt").write_text("here")
+    (folder / "link.txt").symlink_to("a b%ü.txt")
+    assert ask(server, server.url_of("a b%ü.txt").removeprefix(server.url.rstrip("/"))).body == b"here"
+    assert ask(server, "/link.txt?query#fragment").body == b"here"
+
+
+def test_a_connection_serves_several_requests(server):
+    connection = http.client.HTTPConnection(*server.server_address[:2], timeout=10)
+    for i in range(5):
+        connection.request("GET", "/bytes.bin", headers={"Range": f"bytes={i}-{i}"})
+        assert connection.getresponse().read() == CONTENT[i : i + 1]
+    connection.close()
+
+
+def test_a_body_on_get_is_not_the_next_request(server):
+    with socket.create_connection(server.server_address[:2], timeout=10) as raw:
+        smuggled = b"GET /scene.pd4 HTTP/1.1\r\nHost: x\r\n\r\n"
+        head = f"GET /bytes.bin HTTP/1.1\r\nHost: x\r\nContent-Length: {len(smuggled)}\r\n\r\n".encode()
+        raw.sendall(head + smuggled)
+        received = b""
+        while block := raw.recv(65536):
+            received += block
+    assert received.count(b"HTTP/1.1 ") == 1 and received.endswith(CONTENT)
+
+
+def test_a_file_that_shrinks_while_it_is_sent_cuts_the_answer(folder, monkeypatch):
+    link, changed, blocks = Link(1e6), threading.Event(), []
+
+    def cross(size):
+        blocks.append(size)
+        assert len(blocks) < 3 or changed.wait(10)
+
+    monkeypatch.setattr(link, "cross", cross)
+    (folder / "long.bin").write_bytes(bytes(40_000))
+    with Server(folder, link=link) as server, server.running():
+        connection = http.client.HTTPConnection(*server.server_address[:2], timeout=10)
+        connection.request("GET", "/long.bin")
+        response = connection.getresponse()
+        response.read(1000)
+        (folder / "long.bin").write_bytes(b"new")
+        changed.set()
+        with pytest.raises(http.client.IncompleteRead):
+            response.read()
+        connection.close()
+
+
+def test_64_clients_at_once_get_every_byte(folder):
+    content = os.urandom(200_000)
+    (folder / "long.bin").write_bytes(content)
+    results: list[bytes] = []
+    with Server(folder) as server, server.running():
+        barrier = threading.Barrier(64)
+
+        def client():
+            barrier.wait()
+            results.append(ask(server, "/long.bin").body)
+
+        threads = [threading.Thread(target=client) for _ in range(64)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert len(results) == 64 and all(result == content for result in results)
+
+
+def test_the_folder_and_the_address_must_be_usable(folder, server):
+    with pytest.raises(DeliveryError, match="no folder"):
+        Server(folder / "bytes.bin")
+    for host, port in (server.server_address[:2], ("203.0.113.77", 0), ("no such host", 0)):
+        with pytest.raises(DeliveryError, match="cannot listen"):
+            Server(folder, host, port)
+
+
+def test_request_lines_cannot_act_on_the_terminal(folder):
+    lines: list[str] = []
+    with Server(folder, log=lines.append) as server, server.running():
+        with socket.create_connection(server.server_address[:2], timeout=10) as raw:
+            raw.sendall(b"GET /\x1b[31m\x9b HTTP/1.1\r\nHost: x\r\nConnection: close\r\n\r\n")
+            raw.recv(65536)
+    assert len(lines) == 1 and lines[0].isprintable() and "404" in lines[0]
+
+
+@pytest.mark.parametrize(
+    ("request_line", "status"),
+    [
+        ("GET / HTTP/9.9", 505),
+        ("GET / HTTP/x", 400),
+        ("nonsense", 400),
+        ("BREW / HTTP/1.1", 501),
+        ("GET " + "/" * 70_000, 414),
+    ],
+)
+def test_what_is_no_request_is_refused_like_any_other(server, request_line, status):
+    host, port = server.server_address[:2]
+    with socket.create_connection((host, port), timeout=20) as client:
+        client.sendall(f"{request_line}\r\n\r\n".encode())
+        answer = client.makefile("rb").read().decode()
+    assert answer.startswith(f"HTTP/1.1 {status} ") and "Access-Control-Allow-Origin: *" in answer
+    assert answer.endswith(f"\r\n\r\n{status} {HTTPStatus(status).phrase}\n")
+
+
+def test_a_request_that_drips_is_left(folder, monkeypatch):
+    monkeypatch.setattr("pd4dgs_codec.web.server.IDLE_SECONDS", 0.2)
+    with Server(folder).running() as server:
+        with socket.create_connection(server.server_address[:2], timeout=20) as client:
+            with contextlib.suppress(OSError):
+                for _ in range(1000):  # 20 s of header, a byte at a time
+                    client.sendall(b"x")
+                    time.sleep(0.02)
+                pytest.fail("the server waits for the whole of it")
