@@ -42,7 +42,7 @@ def main(argv: list[str] | None = None) -> int:
     args = options(__doc__, list(SCENES)).parse_args(argv)
     configure()
 
-    from pd4dgs_codec.jsonable import finite
+    from pd4dgs_codec.io import finite
     from pd4dgs_codec.quality.evaluate import evaluate_file
     from pd4dgs_codec.quality.perceptual import load_perceptual
 

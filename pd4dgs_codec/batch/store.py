@@ -22,8 +22,8 @@ from typing import IO, Any, TypeVar
 import fsspec
 from fsspec.implementations.local import LocalFileSystem
 
-from pd4dgs_codec.atomic import whole_file
 from pd4dgs_codec.errors import DataError, one_line
+from pd4dgs_codec.io import whole_file
 
 RECORD = ".done.json"
 PROBE = ".pd4dgs-batch"

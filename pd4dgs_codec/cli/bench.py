@@ -12,13 +12,12 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
-from pd4dgs_codec.atomic import whole_file
 from pd4dgs_codec.cli import common, values
 from pd4dgs_codec.cli.common import FAILED, OK, SOURCES, Console, Parser, UsageError, add_reading
 from pd4dgs_codec.cli.files import STDIO, check_output, is_pd4, named_input, read_bytes, write_bytes
 from pd4dgs_codec.cli.progress import TrainingProgress, progress_bar
 from pd4dgs_codec.errors import DataError, DecodeError, TrainError
-from pd4dgs_codec.jsonable import finite
+from pd4dgs_codec.io import finite, whole_file
 
 if TYPE_CHECKING:
     from pd4dgs_codec.bench.codec import Deviation, Point, Sweep

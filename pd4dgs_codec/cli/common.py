@@ -17,7 +17,6 @@ from typing import Any, NoReturn, TextIO
 
 from pd4dgs_codec.cli.values import count, positive_int
 from pd4dgs_codec.errors import DecodeError, EncodeError, Pd4Error
-from pd4dgs_codec.jsonable import finite
 from pd4dgs_codec.threads import configure
 
 #: To look for garbage once more at the end of the process took a quarter of a cold picture's time.
@@ -134,6 +133,8 @@ class Console:
         """The outcome: `data` with --json, else `text`, on stdout where it is what was asked for, else on stderr."""
         if self.json:
             import json
+
+            from pd4dgs_codec.io import finite
 
             print(json.dumps(finite(data)), flush=True)
         elif on_stdout:

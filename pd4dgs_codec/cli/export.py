@@ -9,11 +9,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.atomic import whole_files
 from pd4dgs_codec.cli import values
 from pd4dgs_codec.cli.common import OK, SOURCES, Console, Parser, UsageError, add_reading, command
 from pd4dgs_codec.cli.files import STDIO, check_output, is_pd4, read_bytes, read_dataset, write_bytes
 from pd4dgs_codec.cli.progress import progress_bar
+from pd4dgs_codec.io import whole_files
 
 if TYPE_CHECKING:
     import numpy as np

@@ -75,17 +75,17 @@ def read_dataset(source: str, args: argparse.Namespace) -> Dataset:
 def check_output(path: str, overwrite: bool) -> None:
     """Refuses, before any work, an output that exists or a folder that cannot take it."""
     if path != STDIO:
-        from pd4dgs_codec import atomic  # where nothing is written, nothing waits for it
+        from pd4dgs_codec import io  # where nothing is written, nothing waits for it
 
-        atomic.check_output(path, overwrite)
+        io.check_output(path, overwrite)
 
 
 def write_bytes(path: str, data: bytes, overwrite: bool) -> None:
     """Writes all of `data`, to a file whole or not at all."""
     if path != STDIO:
-        from pd4dgs_codec import atomic
+        from pd4dgs_codec import io
 
-        atomic.write_bytes(path, data, overwrite)
+        io.write_bytes(path, data, overwrite)
         return
     sys.stdout.buffer.write(data)
     sys.stdout.buffer.flush()

@@ -7,11 +7,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.atomic import whole_files
 from pd4dgs_codec.cli.common import OK, Console, Parser, command, number, table
 from pd4dgs_codec.cli.files import STDIO, read_bytes
 from pd4dgs_codec.cli.progress import progress_bar
 from pd4dgs_codec.cli.values import positive_float
+from pd4dgs_codec.io import whole_files
 
 if TYPE_CHECKING:
     import numpy as np

@@ -9,11 +9,11 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.atomic import whole_file, whole_files
 from pd4dgs_codec.cli import values
 from pd4dgs_codec.cli.common import OK, SOURCES, Console, Parser, UsageError, add_reading, command
 from pd4dgs_codec.cli.files import STDIO, check_output, named_input, read_dataset
 from pd4dgs_codec.cli.progress import progress_bar
+from pd4dgs_codec.io import whole_file, whole_files
 from pd4dgs_codec.threads import load_numba
 
 if TYPE_CHECKING:

@@ -7,7 +7,6 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.atomic import remove_leftovers
 from pd4dgs_codec.cli import values
 from pd4dgs_codec.cli.common import (
     OK,
@@ -24,6 +23,7 @@ from pd4dgs_codec.cli.files import STDIO, check_output
 from pd4dgs_codec.cli.progress import TrainingProgress
 from pd4dgs_codec.cli.resume import FIXED, ablated, check_time_left, cut_log, stored_config
 from pd4dgs_codec.errors import RenderError, TrainError
+from pd4dgs_codec.io import remove_leftovers
 from pd4dgs_codec.train.config import ABLATIONS, ROLLOUTS
 
 if TYPE_CHECKING:

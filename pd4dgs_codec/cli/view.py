@@ -8,11 +8,11 @@ import tempfile
 from pathlib import Path
 from urllib.parse import quote
 
-from pd4dgs_codec.atomic import check_output, write_bytes
 from pd4dgs_codec.cli.common import OK, Console, Parser, command
 from pd4dgs_codec.cli.files import checkpoint_scene, is_pd4, read_bytes
 from pd4dgs_codec.cli.serve import set_by_signals
 from pd4dgs_codec.cli.values import duration, port, rate
+from pd4dgs_codec.io import check_output, write_bytes
 
 DETAILS = """\
 SCENE is a .pd4 file, a checkpoint, which is packed quickly first, or the URL of a .pd4. The first line on stdout is the

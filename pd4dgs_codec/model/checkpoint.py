@@ -20,9 +20,9 @@ from typing import Any, BinaryIO
 import numpy as np
 import torch
 
-from pd4dgs_codec.atomic import write_bytes
 from pd4dgs_codec.errors import DataError, Pd4Error
 from pd4dgs_codec.format.check import check_scene
+from pd4dgs_codec.io import write_bytes
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.scene import (

@@ -13,9 +13,8 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from pd4dgs_codec.atomic import write_bytes
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.jsonable import finite
+from pd4dgs_codec.io import finite, write_bytes
 from pd4dgs_codec.prepare import poses
 from pd4dgs_codec.prepare.frames import FEWEST_FRAMES, Choice, Look, choose, look, open_recording, write_frames
 from pd4dgs_codec.prepare.progress import Progress

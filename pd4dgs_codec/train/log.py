@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.jsonable import finite
+from pd4dgs_codec.io import finite
 
 
 class RecordLog:

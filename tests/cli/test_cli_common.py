@@ -9,7 +9,7 @@ from importlib import import_module
 
 import pytest
 
-from pd4dgs_codec import FORMAT_VERSION, jsonable
+from pd4dgs_codec import FORMAT_VERSION, io
 from pd4dgs_codec import __main__ as dispatcher
 from pd4dgs_codec.cli import common, values
 
@@ -128,7 +128,7 @@ def test_table_aligns_numbers_right():
 
 
 def test_infinite_and_nan_become_null():
-    assert jsonable.finite({"a": [float("inf"), 1.0], "b": (float("nan"), "x")}) == {"a": [None, 1.0], "b": [None, "x"]}
+    assert io.finite({"a": [float("inf"), 1.0], "b": (float("nan"), "x")}) == {"a": [None, 1.0], "b": [None, "x"]}
 
 
 def test_internal_error_is_one_line_and_verbose_shows_where(cli, scene_pd4, monkeypatch):

@@ -13,13 +13,12 @@ import numpy as np
 from pages.draco import draco_encode
 from pages.pictures import draw_levels
 from pages.trainings import ensure_trained
-from pd4dgs_codec.atomic import whole_file, whole_files, write_bytes
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.format.encoder import LayerReport, Report, encode, encode_with_report
 from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.plan import plan
-from pd4dgs_codec.jsonable import finite
+from pd4dgs_codec.io import finite, whole_file, whole_files, write_bytes
 from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.quality.evaluate import evaluate_file

@@ -178,7 +178,7 @@ def make(
 
 def keep(out: Path, name: str, whole: Any) -> None:
     """Leaves all that was measured in out/NAME.json."""
-    from pd4dgs_codec.jsonable import finite
+    from pd4dgs_codec.io import finite
 
     path = out / f"{name}.json"
     path.parent.mkdir(parents=True, exist_ok=True)

@@ -13,10 +13,9 @@ import torch
 
 from pages.page import commit
 from pages.trainings import ensure_trained
-from pd4dgs_codec.atomic import whole_file, write_bytes
 from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.format.encoder import encode_with_report
-from pd4dgs_codec.jsonable import finite
+from pd4dgs_codec.io import finite, whole_file, write_bytes
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.model.model import Model

@@ -9,13 +9,13 @@ from itertools import count
 
 import pytest
 
-from pd4dgs_codec import atomic
+from pd4dgs_codec import io
 from pd4dgs_codec.errors import DataError
 
 
 def test_a_file_that_appears_meanwhile_is_not_replaced(tmp_path):
     target = tmp_path / "x.bin"
-    with pytest.raises(DataError, match="exists already"), atomic.whole_file(target, False) as temporary:
+    with pytest.raises(DataError, match="exists already"), io.whole_file(target, False) as temporary:
         temporary.write_bytes(b"new")
         target.write_bytes(b"other")
     assert target.read_bytes() == b"other" and os.listdir(tmp_path) == ["x.bin"]
@@ -23,11 +23,11 @@ def test_a_file_that_appears_meanwhile_is_not_replaced(tmp_path):
 
 def test_files_appear_together_or_not_at_all(tmp_path):
     names = [str(tmp_path / "out" / f"{i}.png") for i in range(3)]
-    with pytest.raises(RuntimeError), atomic.whole_files(names[0], names, False) as temporaries:
+    with pytest.raises(RuntimeError), io.whole_files(names[0], names, False) as temporaries:
         temporaries[0].write_bytes(b"1")
         raise RuntimeError("in the middle")
     assert list(tmp_path.iterdir()) == []
-    with atomic.whole_files(names[0], names, False) as temporaries:
+    with io.whole_files(names[0], names, False) as temporaries:
         for temporary in temporaries:
             temporary.write_bytes(b"1")
     assert sorted(p.name for p in (tmp_path / "out").iterdir()) == ["0.png", "1.png", "2.png"]
@@ -40,7 +40,7 @@ def test_bytes_reach_the_disk_before_the_name(tmp_path, monkeypatch):
         os, "fsync", lambda descriptor: (events.append(os.fstat(descriptor).st_size), fsync(descriptor))
     )
     monkeypatch.setattr(os, "replace", lambda *paths: (events.append(paths[1].name), replace(*paths)))
-    atomic.write_bytes(tmp_path / "x.bin", b"12345", overwrite=False)
+    io.write_bytes(tmp_path / "x.bin", b"12345", overwrite=False)
     assert events == [5, "x.bin"] and (tmp_path / "x.bin").read_bytes() == b"12345"
 
 
@@ -48,9 +48,9 @@ def test_bytes_reach_the_disk_before_the_name(tmp_path, monkeypatch):
 def test_a_link_stays_one_and_a_device_is_written_to(tmp_path):
     (tmp_path / "x.bin").write_bytes(b"old")
     (tmp_path / "link").symlink_to("x.bin")
-    atomic.write_bytes(tmp_path / "link", b"new", overwrite=True)
+    io.write_bytes(tmp_path / "link", b"new", overwrite=True)
     assert (tmp_path / "link").is_symlink() and (tmp_path / "x.bin").read_bytes() == b"new"
-    atomic.write_bytes("/dev/null", b"gone", overwrite=False)
+    io.write_bytes("/dev/null", b"gone", overwrite=False)
     assert not os.path.isfile("/dev/null")
 
 
@@ -60,7 +60,7 @@ def test_leftovers_of_a_killed_process_are_found_by_the_file_they_hold(tmp_path)
     for file in (mine, *others):
         file.parent.mkdir(exist_ok=True)
         file.write_bytes(b"x")
-    atomic.remove_leftovers(tmp_path / "m.pt")
+    io.remove_leftovers(tmp_path / "m.pt")
     assert not mine.parent.exists() and all(file.exists() for file in others)
 
 
@@ -88,13 +88,13 @@ def test_a_process_killed_at_any_call_leaves_the_old_file_or_the_new_one(tmp_pat
     target, old, new = tmp_path / "x.bin", b"old" * 9000, b"new" * 9001
     left = set()
     for last in count(1):
-        atomic.write_bytes(target, old, overwrite=True)
+        io.write_bytes(target, old, overwrite=True)
         process = os.fork()
         if not process:  # the child: it ends by the signal or, if it is not killed, without pytest's clearing up
             kill = partial(os.kill, os.getpid(), signal.SIGKILL)
             _calls_of_the_system(
                 lambda number, last=last, kill=kill: kill() if number == last else None,
-                lambda: atomic.write_bytes(target, new, overwrite=True),
+                lambda: io.write_bytes(target, new, overwrite=True),
             )
             os._exit(0)
         _, status = os.waitpid(process, 0)
@@ -103,7 +103,7 @@ def test_a_process_killed_at_any_call_leaves_the_old_file_or_the_new_one(tmp_pat
         assert os.WTERMSIG(status) == signal.SIGKILL
         assert target.read_bytes() in (old, new)
         left.add(target.read_bytes())
-        atomic.remove_leftovers(target)
+        io.remove_leftovers(target)
     assert left == {old, new} and last > 8 and target.read_bytes() == new
 
 
@@ -118,7 +118,7 @@ def test_a_call_that_fails_leaves_the_old_file_and_nothing_else(tmp_path, monkey
 
     monkeypatch.setattr(os, name, fail)
     with pytest.raises(OSError, match=os.strerror(code)) as caught:
-        atomic.write_bytes(target, b"new", overwrite=True)
+        io.write_bytes(target, b"new", overwrite=True)
     monkeypatch.undo()
     assert caught.value.filename == str(target)
     assert target.read_bytes() == b"old" and os.listdir(tmp_path) == ["x.bin"]

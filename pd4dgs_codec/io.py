@@ -1,19 +1,21 @@
-"""Files that appear whole or not at all.
+"""Output files that appear whole or not at all, and values that JSON can hold.
 
-A writer gets a path in a temporary folder beside its target. Once it is done the file is flushed to the disk and takes
-the name of the target in one step; on any failure the folder goes. A killed process may leave its folder behind.
+A writer gets a path in a temporary folder beside its target. When it is done the file is flushed to the disk and
+renamed to the target in one step. The folder is removed after any failure; a killed process may leave it behind.
 """
 
 from __future__ import annotations
 
 import contextlib
 import errno
+import math
 import os
 import shutil
 import stat
 import tempfile
 from collections.abc import Iterator, Sequence
 from pathlib import Path
+from typing import Any
 
 from pd4dgs_codec.errors import DataError
 
@@ -21,7 +23,7 @@ PREFIX = ".pd4dgs-"
 
 
 def check_output(path: str | Path, overwrite: bool) -> None:
-    """Raises DataError, before any work, for an output that exists or a folder that cannot take it."""
+    """Raises DataError, before any work, if the output exists or its folder cannot be written to."""
     target = Path(path)
     if target.is_dir():
         raise DataError(f"{path}: is a folder, expected the name of an output file")
@@ -35,20 +37,20 @@ def check_output(path: str | Path, overwrite: bool) -> None:
 
 
 def write_bytes(path: str | Path, data: bytes | memoryview, overwrite: bool) -> None:
-    """Writes all of `data` or leaves what was there."""
+    """Writes all of `data`, or leaves the old file as it is."""
     with whole_file(path, overwrite) as temporary:
         temporary.write_bytes(data)
 
 
 @contextlib.contextmanager
 def whole_file(path: str | Path, overwrite: bool) -> Iterator[Path]:
-    """A temporary path to write to; on success it becomes `path`, on any failure it goes.
+    """A temporary path to write to. It becomes `path` on success and is removed after any failure.
 
     A symbolic link stays one, and a device or a pipe is written to directly. Raises DataError as check_output does,
-    OSError naming `path` if the system refuses.
+    and OSError naming `path` if the system refuses.
     """
     check_output(path, overwrite)
-    if is_device(Path(path)):  # /dev/null or a pipe: replacing it by a file would destroy it
+    if is_device(Path(path)):  # renaming a file to /dev/null or a pipe would destroy it
         yield Path(path)
         return
     target = Path(os.path.realpath(path))
@@ -60,9 +62,9 @@ def whole_file(path: str | Path, overwrite: bool) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def whole_files(pattern: str, names: Sequence[str], overwrite: bool) -> Iterator[list[Path]]:
-    """Temporary paths for outputs that appear together once all are written; their folder is made if missing.
+    """Temporary paths for outputs that appear together once all are written. Their folder is made if missing.
 
-    Errors of the system name `pattern`, in whose folder all of `names` lie.
+    All of `names` lie in the folder of `pattern`, which an OSError names.
     """
     parent = Path(pattern).parent
     for name in names:
@@ -80,7 +82,7 @@ def whole_files(pattern: str, names: Sequence[str], overwrite: bool) -> Iterator
 
 
 def remove_leftovers(path: str | Path) -> None:
-    """Removes what writing `path` left beside it when its process was killed. Nothing may be writing it now."""
+    """Removes the temporary folders of processes killed while writing `path`. No process may be writing it now."""
     target = Path(os.path.realpath(path))
     for folder in target.parent.glob(f"{PREFIX}*"):
         if (folder / target.name).is_file():
@@ -88,12 +90,21 @@ def remove_leftovers(path: str | Path) -> None:
 
 
 def is_device(path: Path) -> bool:
-    """Whether something is there that is neither a file nor a folder."""
+    """Whether `path` exists and is neither a file nor a folder."""
     try:
         mode = path.stat().st_mode
     except OSError:
         return False
     return not stat.S_ISREG(mode) and not stat.S_ISDIR(mode)
+
+
+def finite(value: Any) -> Any:
+    """`value` as JSON can hold it: infinities and NaN become None, tuples become lists."""
+    if isinstance(value, dict):
+        return {key: finite(item) for key, item in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [finite(item) for item in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 @contextlib.contextmanager
@@ -112,5 +123,5 @@ def _temporary_folder(parent: Path, path: str | Path) -> Iterator[Path]:
 
 def _move(temporary: Path, target: Path) -> None:
     with temporary.open("r+b") as stream:
-        os.fsync(stream.fileno())  # else the rename may outlive the bytes when the power fails
+        os.fsync(stream.fileno())  # otherwise a power failure may keep the rename and lose the bytes
     os.replace(temporary, target)
