@@ -110,12 +110,12 @@ def _median(values: Iterable[float]) -> float:
 
 def profile(path: Path, source: str | None, steps: int, at: float) -> str:
     """The table of one checkpoint under a line that says what was measured."""
-    from pd4dgs_codec.cli.resume import parse_config
     from pd4dgs_codec.data.dataset import load
     from pd4dgs_codec.model import checkpoint
+    from pd4dgs_codec.train.config import TrainConfig
     from pd4dgs_codec.train.loop import Trainer
 
-    config = parse_config(checkpoint.load(path)[1]["config"], str(path))
+    config = TrainConfig.from_json(checkpoint.load(path)[1]["config"], str(path))
     dataset = load(source or config.source, downscale=config.downscale, holdout=config.holdout)
     trainer = Trainer(config, dataset)
     trainer.resume(path)

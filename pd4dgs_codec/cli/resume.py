@@ -4,35 +4,17 @@ from __future__ import annotations
 
 import argparse
 import json
-from dataclasses import is_dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.cli.files import write_bytes
 from pd4dgs_codec.errors import TrainError
-from pd4dgs_codec.train.config import ABLATIONS, BEFORE, at_quality
+from pd4dgs_codec.train.config import ABLATIONS, FIXED, at_quality
 
 if TYPE_CHECKING:
     from pd4dgs_codec.train.config import TrainConfig
     from pd4dgs_codec.train.loop import Trainer
-
-#: Options that a resumed run takes from its checkpoint: naming another value there is an error.
-FIXED = (
-    "preset",
-    "feature_width",
-    "slots",
-    "seed",
-    "downscale",
-    "holdout",
-    "iterations",
-    "views_per_step",
-    "rate_scale",
-    "prune",
-    "grading",
-    "prefixes",
-    "rollout",
-    "max_layer",
-)
 
 
 def stored_config(args: argparse.Namespace) -> TrainConfig:
@@ -41,12 +23,13 @@ def stored_config(args: argparse.Namespace) -> TrainConfig:
     Raises TrainError where the call asks for something else than was stored.
     """
     from pd4dgs_codec.model import checkpoint
+    from pd4dgs_codec.train.config import TrainConfig
 
     _, training = checkpoint.load(args.resume)
     if "config" not in training:
         what = "no training state (it was decoded from a .pd4, or stripped)"
         raise TrainError(f"{args.resume}: holds {what}; expected a checkpoint of pd4dgs-train")
-    config = parse_config(training["config"], args.resume)
+    config = TrainConfig.from_json(training["config"], args.resume)
     for name in FIXED:
         asked = getattr(args, name)
         if asked is not None:
@@ -66,28 +49,6 @@ def stored_config(args: argparse.Namespace) -> TrainConfig:
 def ablated(args: argparse.Namespace) -> dict[str, Any]:
     """The fields of TrainConfig that --without sets."""
     return {name: value for part in args.without for name, value in ABLATIONS[part].items()}
-
-
-def parse_config(text: str, path: str) -> TrainConfig:
-    """The inverse of the JSON in a checkpoint; fields that it lacks have the values of BEFORE, else their defaults."""
-    from pd4dgs_codec.scene import Steps
-    from pd4dgs_codec.train.config import TrainConfig
-
-    try:
-        plain = {**BEFORE, **json.loads(text)}
-        if plain.get("steps") is not None:  # None by default, so that its type is not that of a default value
-            plain["steps"] = Steps(**plain["steps"])
-        config: TrainConfig = _rebuilt(plain, TrainConfig())
-        return config
-    except (ValueError, TypeError, AttributeError) as error:
-        raise TrainError(f"{path}: its stored configuration cannot be read: {error}") from None
-
-
-def _rebuilt(plain: Any, like: Any) -> Any:
-    """JSON data as a value of the same type as `like`: nested dataclasses, and tuples for lists."""
-    if is_dataclass(like) and not isinstance(like, type):
-        return type(like)(**{name: _rebuilt(value, getattr(like, name)) for name, value in plain.items()})
-    return tuple(plain) if isinstance(plain, list) else plain
 
 
 def _expect_same(path: str, what: str, stored: Any, asked: Any) -> None:

@@ -21,10 +21,10 @@ from pd4dgs_codec.cli.common import (
 )
 from pd4dgs_codec.cli.files import STDIO, check_output
 from pd4dgs_codec.cli.progress import TrainingProgress
-from pd4dgs_codec.cli.resume import FIXED, ablated, check_time_left, cut_log, stored_config
+from pd4dgs_codec.cli.resume import ablated, check_time_left, cut_log, stored_config
 from pd4dgs_codec.errors import RenderError, TrainError
 from pd4dgs_codec.io import remove_leftovers
-from pd4dgs_codec.train.config import ABLATIONS, ROLLOUTS
+from pd4dgs_codec.train.config import ABLATIONS, FIXED, ROLLOUTS
 
 if TYPE_CHECKING:
     from pd4dgs_codec.train.config import TrainConfig

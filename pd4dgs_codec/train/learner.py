@@ -28,12 +28,13 @@ from pd4dgs_codec.quality.level_psnr import level_psnr
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.threads import keep_freed_memory
 from pd4dgs_codec.train import grading, judge, prefixes, pruning, whitening, workers
-from pd4dgs_codec.train.config import Schedule, TrainConfig
+from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.densify import Densifier
 from pd4dgs_codec.train.initialise import fresh_model
 from pd4dgs_codec.train.losses import ModelLoss
 from pd4dgs_codec.train.optimiser import Optimiser
-from pd4dgs_codec.train.rollout import CAPACITY_WEIGHTED, TOP, UNIFORM, rollout_probabilities, sample_level, updated_rho
+from pd4dgs_codec.train.rollout import sample_level, updated_rho
+from pd4dgs_codec.train.schedule import CAPACITY_WEIGHTED, TOP, UNIFORM, Schedule, rollout_probabilities
 from pd4dgs_codec.train.shot import Shots
 from pd4dgs_codec.train.ssim import image_loss
 

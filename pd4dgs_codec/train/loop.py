@@ -17,9 +17,10 @@ from pd4dgs_codec.model.config import ModelConfig
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.threads import one_torch_thread
 from pd4dgs_codec.train import workers
-from pd4dgs_codec.train.config import COARSE_SHARE, DEFAULT_ITERATIONS, Schedule, TrainConfig
+from pd4dgs_codec.train.config import DEFAULT_ITERATIONS, TrainConfig
 from pd4dgs_codec.train.learner import Learner
 from pd4dgs_codec.train.log import RecordLog
+from pd4dgs_codec.train.schedule import COARSE_SHARE, Schedule
 from pd4dgs_codec.train.stop import StopRequest
 
 #: A timed run settles the N of its schedule after so many steps; a slow one once it has spent the share of the limit
@@ -179,7 +180,7 @@ class Trainer:
         if workers.rank():
             return
         training = {
-            "config": json.dumps(self.config, default=vars),
+            "config": self.config.to_json(),
             "source": self.dataset.name,
             "seconds": self.seconds,
             "curve": json.dumps(self.curve),

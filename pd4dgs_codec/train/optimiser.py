@@ -12,7 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from pd4dgs_codec.model.model import Model
-from pd4dgs_codec.train.config import LearningRates, learning_rate
+from pd4dgs_codec.train.config import LearningRates
+from pd4dgs_codec.train.schedule import learning_rate
 
 #: Parameters with one row per anchor.
 PER_ANCHOR = ("feature", "scaling_log", "offset", "mask_logits")

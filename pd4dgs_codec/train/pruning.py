@@ -20,8 +20,8 @@ from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.rounding import Rounding
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train import workers
-from pd4dgs_codec.train.config import PRUNING_ROUNDS
 from pd4dgs_codec.train.optimiser import Optimiser
+from pd4dgs_codec.train.schedule import PRUNING_ROUNDS
 from pd4dgs_codec.train.shot import Shot
 
 #: `anchor_harm` or `step_harm`.

@@ -4,16 +4,7 @@ from __future__ import annotations
 
 import torch
 
-UNIFORM = (1 / 3, 1 / 3, 1 / 3)
-CAPACITY_WEIGHTED = (0.15, 0.30, 0.55)
-TOP = (0.0, 0.0, 1.0)
 RHO_DECAY = 0.95
-
-
-def rollout_probabilities(rho: float) -> tuple[float, float, float]:
-    """pi(rho) = (1 - rho) (1/3, 1/3, 1/3) + rho (.15, .30, .55)."""
-    low, mid, high = ((1 - rho) * u + rho * c for u, c in zip(UNIFORM, CAPACITY_WEIGHTED, strict=True))
-    return low, mid, high
 
 
 def updated_rho(rho: float, mask_0: torch.Tensor, mask_2: torch.Tensor) -> float:

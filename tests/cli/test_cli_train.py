@@ -237,18 +237,17 @@ def test_links_and_devices_stay_what_they_are(train, tmp_path):
 def test_stored_steps_come_back_as_steps():
     from dataclasses import replace
 
-    from pd4dgs_codec.cli.resume import parse_config
     from pd4dgs_codec.scene import Steps
     from pd4dgs_codec.train.config import TrainConfig
 
     config = replace(TrainConfig(), steps=Steps(feature=0.25), iterations=7)
-    assert parse_config(json.dumps(config, default=lambda value: value.__dict__), "m.pt") == config
+    assert TrainConfig.from_json(json.dumps(config, default=lambda value: value.__dict__), "m.pt") == config
 
 
 def test_a_run_from_before_a_part_of_the_method_goes_on_without_it():
-    from pd4dgs_codec.cli.resume import parse_config
+    from pd4dgs_codec.train.config import TrainConfig
 
-    config = parse_config('{"preset": "tiny"}', "m.pt")
+    config = TrainConfig.from_json('{"preset": "tiny"}', "m.pt")
     assert (config.preset, config.judge, config.tmc_binary_growth, config.noise) == ("tiny", False, 1.0, True)
 
 

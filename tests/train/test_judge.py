@@ -11,8 +11,9 @@ from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.train import judge
-from pd4dgs_codec.train.config import Schedule, TrainConfig
+from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.loop import Trainer
+from pd4dgs_codec.train.schedule import Schedule
 
 
 @pytest.mark.parametrize(

@@ -16,9 +16,10 @@ from pd4dgs_codec.errors import DataError, TrainError
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.train import loop, pruning
-from pd4dgs_codec.train.config import ABLATIONS, PRUNING_ROUNDS, Schedule, TrainConfig
+from pd4dgs_codec.train.config import ABLATIONS, TrainConfig
 from pd4dgs_codec.train.log import RecordLog
 from pd4dgs_codec.train.loop import Trainer
+from pd4dgs_codec.train.schedule import PRUNING_ROUNDS, Schedule
 
 
 def test_it_learns_and_logs_every_term(dataset, tmp_path):

@@ -9,8 +9,9 @@ from pd4dgs_codec.errors import TrainError
 from pd4dgs_codec.model.masks import level_mask
 from pd4dgs_codec.scene import Steps
 from pd4dgs_codec.train import losses
-from pd4dgs_codec.train.config import COARSENED, DEFAULT_QUALITY, DIAL, Schedule, TrainConfig, at_quality, learning_rate
-from pd4dgs_codec.train.rollout import rollout_probabilities, sample_level, updated_rho
+from pd4dgs_codec.train.config import COARSENED, DEFAULT_QUALITY, DIAL, TrainConfig, at_quality
+from pd4dgs_codec.train.rollout import sample_level, updated_rho
+from pd4dgs_codec.train.schedule import Schedule, learning_rate, rollout_probabilities
 
 
 def test_masks_start_where_the_method_says():
@@ -149,7 +150,7 @@ def test_learning_rates_are_log_linear():
     ],
 )
 def test_bad_configurations_are_refused(bad):
-    with pytest.raises(TrainError, match="expected|must be"):
+    with pytest.raises(TrainError, match="must be"):
         TrainConfig(**bad)
 
 

@@ -8,8 +8,9 @@ from pages import parts
 from pages.parts import Stopwatch
 from profile_training import measure, rows
 
-from pd4dgs_codec.train.config import Schedule, TrainConfig
+from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.learner import Learner
+from pd4dgs_codec.train.schedule import Schedule
 
 
 class Work:

@@ -11,8 +11,9 @@ from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.model.rounding import EXACT
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train import pruning
-from pd4dgs_codec.train.config import PRUNING_ROUNDS, Schedule, TrainConfig
+from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.loop import Trainer
+from pd4dgs_codec.train.schedule import PRUNING_ROUNDS, Schedule
 
 
 def test_the_least_go_up_to_the_share():

@@ -24,7 +24,8 @@ from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.quality.evaluate import evaluate_file
 from pd4dgs_codec.quality.train_rate import train_rate_bits
 from pd4dgs_codec.scene import Scene
-from pd4dgs_codec.train.config import Schedule, TrainConfig
+from pd4dgs_codec.train.config import TrainConfig
+from pd4dgs_codec.train.schedule import Schedule
 
 #: Encodings whose sizes stand side by side; "ans" is the file that is evaluated and kept.
 VARIANTS: dict[str, dict[str, str]] = {

@@ -132,12 +132,12 @@ def steps(checkpoint: str, file: str, effort: str) -> dict[str, float]:
 
 def _steps(checkpoint: str, clock: str) -> dict[str, float]:
     """Of a step at each level, the levels in turn, as if at SHARE of the run."""
-    from pd4dgs_codec.cli.resume import parse_config
     from pd4dgs_codec.data.dataset import load as load_data
     from pd4dgs_codec.model.checkpoint import load
+    from pd4dgs_codec.train.config import TrainConfig
     from pd4dgs_codec.train.loop import Trainer
 
-    config = parse_config(load(checkpoint)[1]["config"], checkpoint)
+    config = TrainConfig.from_json(load(checkpoint)[1]["config"], checkpoint)
     trainer = Trainer(config, load_data(config.source, downscale=config.downscale, holdout=config.holdout))
     trainer.resume(Path(checkpoint))
     levels = range(trainer.model.level + 1)

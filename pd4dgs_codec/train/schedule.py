@@ -1,0 +1,128 @@
+"""The schedule of a training run: its phases, learning rates and probabilities of levels, after the PD-4DGS method."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+#: Probabilities of the levels 0, 1, 2.
+UNIFORM = (1 / 3, 1 / 3, 1 / 3)
+CAPACITY_WEIGHTED = (0.15, 0.30, 0.55)
+TOP = (0.0, 0.0, 1.0)
+#: Share of a run in which level 0 alone is trained.
+COARSE_SHARE = 1 / 10
+#: Rounds in which anchors of little use are pruned; each anchor can be pruned in one of them.
+PRUNING_ROUNDS = 4
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """The phases of a run of N iterations, as fractions of N (the paper's N is 30,000).
+
+    iterations: N; None as long as the time limit of a run has not settled it. Such a run stays in its coarse phase:
+    every later phase begins at infinity, and nothing is grown or pruned.
+    """
+
+    iterations: int | None
+
+    def _at(self, fraction: float) -> float:
+        return math.inf if self.iterations is None else round(self.iterations * fraction)
+
+    def progress(self, iteration: int) -> float:
+        """The share of the run, 0..1, that lies before `iteration`; 0 while N is not known."""
+        return iteration / self.iterations if self.iterations else 0.0
+
+    @property
+    def coarse_end(self) -> float:
+        """Before it only level 0 is trained; from it on, quantisation noise is added."""
+        return self._at(COARSE_SHARE)
+
+    @property
+    def warm(self) -> float:
+        """The method samples levels uniformly before it (T_warm). Here it ends within the coarse phase, and rho_start,
+        never earlier, takes its place."""
+        return self._at(1 / 15)
+
+    @property
+    def progressive(self) -> float:
+        """The rate term, TMC and the average rho start here (T_progressive)."""
+        return self._at(1 / 3)
+
+    @property
+    def rho_start(self) -> float:
+        """rho's moving average starts here."""
+        return max(self.warm, self.progressive)
+
+    @property
+    def rho_every(self) -> float:
+        """Iterations between updates of rho (K)."""
+        return max(1, self._at(1 / 150))
+
+    @property
+    def grow(self) -> range:
+        """Iterations after which anchors are grown and pruned."""
+        if self.iterations is None:
+            return range(0)
+        every = max(20, round(self.iterations * (1 / 100)))
+        return range(round(self.iterations * (1 / 60)) + every, round(self.iterations * (1 / 2)) + 1, every)
+
+    @property
+    def prune(self) -> range:
+        """Iterations before which anchors of little use are pruned; growing has ended."""
+        if self.iterations is None:
+            return range(0)
+        every = max(1, round(self.iterations * (1 / 50)))
+        return range(self.grow.stop, self.grow.stop + PRUNING_ROUNDS * every, every)
+
+    @property
+    def rounding(self) -> float:
+        """Planes and weights are rounded straight-through from here on."""
+        return self._at(2 / 3)
+
+    @property
+    def exact_rounding(self) -> float:
+        """The anchors' attributes are rounded straight-through from here on, where noise simulated it before."""
+        return self._at(9 / 10)
+
+    def separation(self, iteration: int) -> float:
+        """Progress of the masks' separation, 0..1, from the start of the mask terms to exact rounding."""
+        return self._since_progressive(iteration, self.exact_rounding)
+
+    def pressure(self, iteration: int) -> float:
+        """Weight of the planes' rate, 0..1: rises from the start of the rate term until planes are rounded. The full
+        weight at once would empty the planes before they have learnt anything."""
+        return self._since_progressive(iteration, self.rounding)
+
+    def _since_progressive(self, iteration: int, end: float) -> float:
+        if self.iterations is None:
+            return 0.0
+        begin = self.progressive
+        return min(max((iteration - begin) / max(1, end - begin), 0.0), 1.0)
+
+    def phases_not_reached(self, iteration: int) -> list[str]:
+        """Names of the phases that a run of `iteration` iterations never entered; none for a whole run."""
+        if self.iterations is not None and iteration >= self.iterations:
+            return []
+        starts = {
+            "levels 1 and 2": self.coarse_end,
+            "rate and mask terms": self.progressive,
+            "rounding of planes and weights": self.rounding,
+            "exact rounding of attributes": self.exact_rounding,
+            "the end of the learning-rate schedule": self._at(1) - 1,
+        }
+        return [name for name, start in starts.items() if iteration <= start]
+
+
+def learning_rate(bounds: tuple[float, float], progress: float, cooldown: float = 0.0) -> float:
+    """Log-linear between the bounds at progress 0..1; times a factor that falls from 1 to 0 over the last `cooldown`
+    of it."""
+    start, end = bounds
+    progress = min(max(progress, 0.0), 1.0)
+    left = min((1 - progress) / cooldown, 1.0) if cooldown else 1.0
+    return start * math.pow(end / start, progress) * left
+
+
+def rollout_probabilities(rho: float) -> tuple[float, float, float]:
+    """pi(rho) = (1 - rho) (1/3, 1/3, 1/3) + rho (.15, .30, .55), of the levels 0, 1, 2."""
+    low, mid, high = ((1 - rho) * u + rho * c for u, c in zip(UNIFORM, CAPACITY_WEIGHTED, strict=True))
+    return low, mid, high
