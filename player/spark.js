@@ -51,7 +51,7 @@ export const SPARK_SETTINGS = {
 /**
  * A scene as a mesh. Add `mesh` to a three.js scene, and call `update` before each frame.
  *
- * Events: `upgrade` {level, anchors, gaussians} when a higher level, or more or finer anchors of it, is in the mesh;
+ * Events: `upgrade` {level, anchors, gaussians} when a higher level, or more anchors of it, is in the mesh;
  * `loaded` {bytes, complete}; `error` {message, kind}, after which what was valid stays.
  */
 export class Pd4Splats extends EventTarget {
@@ -286,8 +286,8 @@ export class Pd4Splats extends EventTarget {
   /** @param {State} state which the mesh now holds */
   _tell({ scene, level }) {
     const had = this._shown;
-    const { rows: anchors, detail } = levelOf(scene, level);
-    if (had && level <= had.level && detail <= levelOf(had.scene, had.level).detail) return;
+    const { rows: anchors } = levelOf(scene, level);
+    if (had && level <= had.level && anchors <= levelOf(had.scene, had.level).rows) return;
     this._emit("upgrade", { level, anchors, gaussians: this._splats.numSplats });
   }
 

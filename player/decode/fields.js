@@ -77,11 +77,11 @@ function nameOf(value) {
 
 /** A map of registered keys, with a name for messages. */
 export class Fields {
-  /** @param {Value | undefined} value @param {string} where @param {number} first @param {number} last known keys */
-  constructor(value, where, first, last) {
+  /** @param {Value | undefined} value @param {string} where @param {number[]} known keys */
+  constructor(value, where, known) {
     if (!(value instanceof Map)) throw malformed(`${where}: ${nameOf(value)}, expected a map`);
     for (const key of value.keys()) {
-      if (key < FIRST_IGNORED_KEY && (key < first || key > last)) throw unsupported(`${where}: unknown key ${key}`);
+      if (key < FIRST_IGNORED_KEY && !known.includes(key)) throw unsupported(`${where}: unknown key ${key}`);
     }
     this.where = where;
     /** @type {Map<number, Value>} */

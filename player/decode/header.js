@@ -3,7 +3,7 @@
 import { sceneIdOf } from "./container.js";
 import { malformed, unsupported } from "./errors.js";
 import { Fields, asBytes, asInteger, asList, asRegistered, checkStep } from "./fields.js";
-import { MAX_CHUNKS, MAX_FEATURE, MAX_LOW_BITS, MAX_PAYLOAD, MAX_SLOTS, MAX_SYMBOL } from "./limits.js";
+import { MAX_CHUNKS, MAX_FEATURE, MAX_PAYLOAD, MAX_SLOTS, MAX_SYMBOL } from "./limits.js";
 import { unpack } from "./msgpack.js";
 
 /** @typedef {{type: number, length: number}} ListedChunk */
@@ -11,8 +11,7 @@ import { unpack } from "./msgpack.js";
 /** D and G of the text: scalars of a feature, and Gaussians of an anchor. @typedef {{feature: number, slots: number}} Widths */
 
 /**
- * size: in bytes. bounds: the classes of 5.4 that have an error bound, with it. lowBits: how many of the attributes'
- * symbols come late (11.6), 0 for none. sceneId: in hexadecimal (3.3).
+ * size: in bytes. bounds: the error bound of each class of 5.4 that has one. sceneId: in hexadecimal (3.3).
  *
  * @typedef {object} Header
  * @property {number} size
@@ -22,7 +21,6 @@ import { unpack } from "./msgpack.js";
  * @property {Map<number, number>} bounds
  * @property {Widths} widths
  * @property {number[] | null} centres of the attributes' channels; null if anchors have no step classes
- * @property {number} lowBits
  * @property {string} sceneId
  */
 
@@ -32,7 +30,10 @@ export const channelCount = ({ feature, slots }) => feature + 6 + 3 * slots;
 /** How many layer types there are: 0, 1 and 2. */
 export const LAYER_TYPES = 3;
 
-const CLASSES = 8;
+/** The keys of a header (5.1), and of a camera. */
+const KEYS = [1, 2, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16];
+const CAMERA_KEYS = [1, 2, 3, 4];
+const CLASSES = [0, 1, 2, 3, 4, 5, 6, 7];
 /** The error bounds that every file has: of the attributes and of layer 0's weights. */
 const REQUIRED_CLASSES = 4;
 const DIGEST_SIZE = 16;
@@ -44,10 +45,9 @@ const MAX_CAMERA_SIDE = 65535;
  */
 export function readHeader(bytes) {
   const { value, firstEntryEnd } = unpack(bytes, "header");
-  const fields = new Fields(value, "header", 1, 17);
+  const fields = new Fields(value, "header", KEYS);
   const chunks = readChunkList(fields);
   const mode = asRegistered(fields.get(2), 2, "header: mode");
-  const deformation = asRegistered(fields.get(3), 2, "header: deformation");
   const [feature, scalingLog, offset] = fields.reals(4, 3, "steps").map((step) => checkStep(step, "header: step"));
   const voxelSize = checkStep(fields.real(5, "voxel size"), "header: voxel size");
   const [x0, y0, z0, x1, y1, z1] = fields.reals(6, 6, "box");
@@ -74,11 +74,7 @@ export function readHeader(bytes) {
   const centres = fields.has(16) ? readCentres(fields.get(16), channelCount(widths)) : null;
   const layers = chunks.filter(({ type }) => type < LAYER_TYPES).map(({ type }) => type);
   if (mode === 1 && new Set(layers).size < layers.length) throw malformed("header: mode lzma, and a layer in slices");
-  const lowBits = fields.has(17) ? asInteger(fields.get(17), 1, MAX_LOW_BITS, "header: low bits") : 0;
-  if (mode === 1 && lowBits) throw malformed("header: mode lzma, and low bits");
-  // An ans-only decoder (clause 16).
-  if (mode === 1) throw unsupported("header: mode lzma, expected mode ans");
-  if (deformation === 1) throw unsupported("header: a deformation of float32 values, expected one of symbols");
+  if (mode === 1) throw unsupported("header: mode lzma, expected mode ans"); // an ans-only decoder (clause 16)
   return {
     size: bytes.length,
     chunks,
@@ -100,7 +96,6 @@ export function readHeader(bytes) {
     bounds,
     widths,
     centres,
-    lowBits,
     sceneId: sceneIdOf(bytes.subarray(firstEntryEnd)),
   };
 }
@@ -128,7 +123,7 @@ function readChunkList(header) {
 
 /** @param {import("./msgpack.js").Value} value @returns {import("./scene.js").Camera} */
 function readCamera(value) {
-  const fields = new Fields(value, "header: camera", 1, 4);
+  const fields = new Fields(value, "header: camera", CAMERA_KEYS);
   const rows = fields.reals(1, 12, "matrix");
   const [fx, fy, cx, cy] = fields.reals(2, 4, "intrinsics");
   if (!(fx > 0 && fy > 0)) throw malformed(`header: camera: focal lengths ${fx} and ${fy}, expected positive ones`);
@@ -148,10 +143,10 @@ function readCentres(value, count) {
 
 /** @param {import("./msgpack.js").Value} value @returns {Map<number, number>} */
 function readBounds(value) {
-  const fields = new Fields(value, "header: error bounds", 0, CLASSES - 1);
+  const fields = new Fields(value, "header: error bounds", CLASSES);
   /** @type {Map<number, number>} */
   const bounds = new Map();
-  for (let i = 0; i < CLASSES; i++) {
+  for (const i of CLASSES) {
     if (i >= REQUIRED_CLASSES && !fields.has(i)) continue;
     const bound = fields.real(i, `class ${i}`);
     if (bound < 0) throw malformed(`header: error bound ${bound} of class ${i}, expected 0 or more`);

@@ -1,7 +1,7 @@
 /**
  * A decoder of `.pd4` files: bytes in, typed arrays out. It follows the specification clause by clause and trusts no
- * byte; every fault is a DecodeError with the name that clause 15 gives it. It decodes mode ans with coded deformations
- * and answers UnsupportedFeature to mode lzma and to deformations as float32 values (clause 16).
+ * byte; every fault is a DecodeError with the name that clause 15 gives it. It decodes mode ans; mode lzma is
+ * UnsupportedFeature (clause 16).
  *
  * @module
  */

@@ -12,7 +12,7 @@ import { decodePositions } from "./positions.js";
 
 /**
  * What one slice with n own rows carries. voxels: [n, 3]. rises: of the earlier rows' mask codes. codes: of the own
- * rows. stepClasses: [n], empty if anchors have none. attributes: [D + 6 + 3·G, n], which a later slice may refine.
+ * rows. stepClasses: [n], empty if anchors have none. attributes: [D + 6 + 3·G, n].
  * planes: per scale six [C, H, W]. weights: weight, bias, weight, bias and so on, network by network.
  *
  * @typedef {object} LayerSymbols
@@ -55,9 +55,7 @@ export function decodeLayer(payload, kind, before, continuation, later) {
   checkRange(codes.subarray(earlierRows), LEAST_OWN_CODE, MOST_CODE, "a mask code");
   const none = { stepClasses: new Int32Array(0), attributes: new Int32Array(0) };
   const { stepClasses, attributes } = section ? decodeAttributes(section, rows, kind, continuation) : none;
-  const most = MAX_SYMBOL >> kind.lowBits;
-  checkRange(attributes, -most, most, "a symbol of an attribute");
-  if (kind.lowBits) for (let i = 0; i < attributes.length; i++) attributes[i] <<= kind.lowBits;
+  checkRange(attributes, -MAX_SYMBOL, MAX_SYMBOL, "a symbol of an attribute");
   return {
     kind,
     parameters,
@@ -82,7 +80,7 @@ function decodeWeights(bytes, networks) {
 }
 
 /** @param {Int32Array} symbols @param {number} least @param {number} most @param {string} what */
-export function checkRange(symbols, least, most, what) {
+function checkRange(symbols, least, most, what) {
   for (let i = 0; i < symbols.length; i++) {
     if (symbols[i] < least || symbols[i] > most) throw malformed(`${what}: ${symbols[i]}, expected ${least}..${most}`);
   }

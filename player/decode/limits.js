@@ -6,7 +6,6 @@ export const MAX_HEADER = 2 ** 14;
 /** Bytes of a slice's parameters. */
 export const MAX_FIELDS = 4096;
 export const MAX_CHUNKS = 1024;
-export const MAX_LOW_BITS = 4;
 /** Bytes of a payload or a section. */
 export const MAX_PAYLOAD = 2 ** 31 - 1;
 export const MAX_NESTING = 4;

@@ -5,7 +5,6 @@ import { Fields, asInteger, asList, asRegistered, checkStep } from "./fields.js"
 import { channelCount } from "./header.js";
 import {
   MAX_CHANNELS,
-  MAX_CHUNKS,
   MAX_FIELDS,
   MAX_LINEAR_LAYERS,
   MAX_PAYLOAD,
@@ -22,7 +21,7 @@ import { PLANES } from "./scene.js";
 /**
  * What a layer's number and the header's widths decide. networks: name and outputs by id, null for any number of outputs.
  * inputs: of layer 0's networks, feature and view direction. classes: of the error bounds of its steps, in their order
- * (5.4). stepClasses: whether anchors have them (11.2). lowBits: how many of their symbols' come late (11.6).
+ * (5.4). stepClasses: whether anchors have them (11.2).
  *
  * @typedef {object} LayerKind
  * @property {number} layer
@@ -31,11 +30,10 @@ import { PLANES } from "./scene.js";
  * @property {number[]} classes
  * @property {import("./header.js").Widths} widths
  * @property {boolean} stepClasses
- * @property {number} lowBits
  */
 
 /** @param {number} layer @param {import("./header.js").Header} header @returns {LayerKind} */
-export function layerKind(layer, { widths, centres, lowBits }) {
+export function layerKind(layer, { widths, centres }) {
   const { feature: D, slots: G } = widths;
   /** @type {[string, number | null][][]} */
   const networks = [
@@ -61,7 +59,7 @@ export function layerKind(layer, { widths, centres, lowBits }) {
     ],
   ];
   const classes = layer ? [2 + 2 * layer, 3 + 2 * layer] : [3];
-  return { layer, networks: networks[layer], inputs: D + 3, classes, widths, stepClasses: centres !== null, lowBits };
+  return { layer, networks: networks[layer], inputs: D + 3, classes, widths, stepClasses: centres !== null };
 }
 
 /** Section numbers of mode ans (6.4). */
@@ -70,27 +68,25 @@ export const MASKS = 1;
 export const ATTRIBUTES = 2;
 export const PLANE_SECTION = 3;
 export const WEIGHTS = 4;
-export const LOW_BITS = 7;
-const SECTIONS = ["positions", "masks", "attributes", "planes", "weights", "symbols", "floats", "low bits"];
+const SECTIONS = ["positions", "masks", "attributes", "planes", "weights", "symbols"];
+/** The keys of a layer's parameters (6.1). */
+const KEYS = [1, 2, 3, 4, 5];
 
 /** One plane of a scale. @typedef {{channels: number, height: number, width: number, predictor: number}} PlaneShape */
 /** Linear layers from the input side. @typedef {{name: string, layers: {inputs: number, outputs: number}[]}} NetworkShape */
 
 /**
  * planes: six per scale. steps: of the weights in layer 0, else of planes and weights, empty without a deformation.
- * refines: of a refining slice what it refines, else null. sections: by number.
+ * sections: by number.
  *
  * @typedef {object} Parameters
  * @property {number} rows
  * @property {number[]} steps
  * @property {PlaneShape[]} planes
  * @property {NetworkShape[]} networks
- * @property {Refinement | null} refines
  * @property {(Uint8Array | null)[]} sections
  * @property {Declared} declared by the slices so far, this one included
  */
-
-/** So many slices of a layer (11.6). @typedef {{layer: number, slices: number}} Refinement */
 
 /** What slices declare: rows, symbols, and the bytes of their payloads (6.5).
  * @typedef {{rows: number, symbols: number, bytes: number}} Declared */
@@ -111,9 +107,9 @@ export function readParameters(payload, kind, before, later) {
   if (length > payload.length - 4) {
     throw malformed(`${where}: parameters of ${length} bytes in a payload of ${payload.length}`);
   }
-  const fields = new Fields(unpack(payload.subarray(4, 4 + length), where).value, where, 1, 6);
+  const fields = new Fields(unpack(payload.subarray(4, 4 + length), where).value, where, KEYS);
   const rows = asInteger(fields.get(1), 0, MAX_ROWS - before.rows, `${where}: own rows`);
-  const lengths = new Fields(fields.get(2), `${where}: sections`, 0, SECTIONS.length - 1);
+  const lengths = new Fields(fields.get(2), `${where}: sections`, [...SECTIONS.keys()]);
   if (later) for (const key of [3, 4, 5]) if (fields.has(key)) throw malformed(`${where}: key ${key} in a later slice`);
   const scales = readScales(fields, kind, where);
   const networks = later ? [] : readNetworks(fields, kind, where, scales);
@@ -125,8 +121,6 @@ export function readParameters(payload, kind, before, later) {
     (sum, { layers }) => layers.reduce((all, { inputs, outputs }) => all + (inputs + 1) * outputs, sum),
     0,
   );
-  const refines = fields.has(6) ? readRefinement(fields, kind, where) : null;
-  if (refines && (rows || !later)) throw malformed(`${where}: key 6 in a slice ${later ? "with rows" : "that is the first"}`);
   const perRow = channelCount(kind.widths) + (kind.stepClasses ? 1 : 0);
   if (cells > MAX_PLANE_CELLS) throw limitExceeded(`${where}: ${cells} plane cells, limit ${MAX_PLANE_CELLS}`);
   const declared = checkDeclared(where, {
@@ -134,14 +128,14 @@ export function readParameters(payload, kind, before, later) {
     symbols: before.symbols + rises + (perRow + 4) * rows + cells + weights,
     bytes: before.bytes + payload.length,
   });
-  const counts = [rows, rises + rows, rows * perRow, cells, weights, 0, 0, refines ? 1 : 0];
+  const counts = [rows, rises + rows, rows * perRow, cells, weights, 0];
   counts.forEach((count, section) => {
     if ((sections[section] !== null) !== count > 0) {
       const found = sections[section] === null ? "missing" : "there";
       throw malformed(`${where}: section ${SECTIONS[section]} is ${found}, with ${count} symbols to code`);
     }
   });
-  return { rows, steps, planes, networks, refines, sections, declared };
+  return { rows, steps, planes, networks, sections, declared };
 }
 
 /** Clause 6.5. @param {string} where @param {Declared} declared with the latest slice @returns {Declared} the same */
@@ -164,15 +158,6 @@ function cutSections(payload, at, lengths, where) {
   });
   if (at !== payload.length) throw malformed(`${where}: sections up to byte ${at} of a payload of ${payload.length}`);
   return sections;
-}
-
-/** Key 6. @param {Fields} fields @param {LayerKind} kind @param {string} where @returns {Refinement} */
-function readRefinement(fields, kind, where) {
-  const [layer, slices] = asList(fields.get(6), `${where}: key 6`, 2);
-  return {
-    layer: asInteger(layer, 0, kind.layer, `${where}: the layer that it refines`),
-    slices: asInteger(slices, 1, MAX_CHUNKS, `${where}: slices that it refines`),
-  };
 }
 
 /** Key 3. @param {Fields} fields @param {LayerKind} kind @param {string} where @param {boolean} expected */

@@ -2,10 +2,9 @@
 
 import { CHUNK_OVERHEAD, PREAMBLE_SIZE, readChunk, readPreamble } from "./container.js";
 import { DecodeError, limitExceeded, malformed, unsupported } from "./errors.js";
-import { LAYER_TYPES, channelCount, readHeader } from "./header.js";
+import { LAYER_TYPES, readHeader } from "./header.js";
 import { MOST_CODE, decodeLayer, dequantise, transposed } from "./layer.js";
-import { LOW_BITS, checkDeclared, layerKind } from "./parameters.js";
-import { refined } from "./refining.js";
+import { layerKind } from "./parameters.js";
 import { PLANES } from "./scene.js";
 import { Continuation, joined, mortonOrder, reordered } from "./slices.js";
 import { VoxelTable } from "./voxels.js";
@@ -25,7 +24,7 @@ import { VoxelTable } from "./voxels.js";
  * @property {Float32Array[]} weights
  */
 
-/** later: whether slices of the same layer came before. A refining slice changes those that it names.
+/** later: whether slices of the same layer came before.
  * @typedef {{symbols: LayerSymbols, tensors: LayerTensors, later: boolean}} Slice */
 
 /**
@@ -176,51 +175,17 @@ export class LayerReader {
     }
     const { anchor, feature, scalingLog, offset } = tensors;
     const own = { voxels, codes: Uint8Array.from(symbols.codes), anchor, feature, scalingLog, offset };
-    if (parameters.refines) this._refine(parameters.refines, parameters, where);
     this._loose.push(voxels);
     if (!later) {
       const { steps, planes, networks } = parameters;
       const kept = { planes: tensors.planes, weights: tensors.weights };
-      const none = { slices: 0, refined: 0, parts: [], whole: null, waiting: [] };
+      const none = { slices: 0, parts: [] };
       this._layers.push({ layer: kind.layer, steps, planes, networks, tensors: kept, earlier, continuation, ...none });
     }
     const layer = this._layers[this._layers.length - 1];
     layer.slices++;
-    if (!parameters.refines) {
-      layer.parts.push(own);
-      layer.whole = null;
-    }
-    if (header.lowBits) layer.waiting.push({ symbols, tensors, own });
+    layer.parts.push(own);
     return tensors;
-  }
-
-  /** 11.6: gives slices that came before their low bits; if there is a fault, none of them.
-   * @param {import("./parameters.js").Refinement} refines @param {import("./parameters.js").Parameters} parameters of the
-   * refining slice @param {string} where */
-  _refine({ layer: number, slices }, parameters, where) {
-    const header = /** @type {import("./header.js").Header} */ (this.header);
-    const layer = this._layers.find((known) => known.layer === number);
-    const named = layer ? layer.waiting.slice(0, slices) : [];
-    if (!layer || named.length < slices || named.some(({ symbols }) => symbols.parameters.refines)) {
-      throw malformed(`${where}: low bits of ${slices} slices of layer ${number}, which has not so many that wait for them`);
-    }
-    const coarse = named.map(({ symbols }) => symbols.attributes);
-    const count = coarse.reduce((sum, { length }) => sum + length, 0);
-    if (!count) throw malformed(`${where}: low bits of slices without rows`);
-    const { declared, sections } = parameters;
-    parameters.declared = checkDeclared(where, { ...declared, symbols: declared.symbols + count });
-    const channels = channelCount(header.widths);
-    const section = /** @type {Uint8Array} */ (sections[LOW_BITS]);
-    const fine = refined(section, coarse, channels, header.lowBits);
-    const values = named.map(({ symbols }, i) => attributesOf({ ...symbols, attributes: fine[i] }, header));
-    named.forEach(({ symbols, tensors, own }, i) => {
-      symbols.attributes = fine[i];
-      Object.assign(tensors, values[i]);
-      Object.assign(own, values[i]); // arrays that were given out stay as they are
-    });
-    layer.waiting.splice(0, slices);
-    layer.refined += count / channels;
-    layer.whole = null;
   }
 
   /** Malformed if a voxel is one of the slices before. @param {Int32Array} voxels of a slice, distinct among themselves */
@@ -265,13 +230,11 @@ export class LayerReader {
     }
     const layers = this._layers;
     const owns = layers.map(ownOf);
-    let refinedRows = 0;
     return {
       info: header.info,
       steps,
       layers: layers.map(({ layer }) => layer),
       rows: layers.map(({ earlier }, i) => earlier.length + owns[i].codes.length),
-      refined: layers.map(({ refined }) => (refinedRows += refined)),
       anchorQ: joined(owns.map(({ voxels }) => voxels)),
       anchor: joined(owns.map(({ anchor }) => anchor)),
       feature: joined(owns.map(({ feature }) => feature)),
@@ -299,7 +262,7 @@ export class LayerReader {
 
 /**
  * What is kept of a layer. slices: read so far. tensors: of the layer's planes and networks. earlier: the mask codes of
- * earlier rows. refined: rows whose low bits have come. waiting: the slices whose low bits have not.
+ * earlier rows.
  *
  * @typedef {object} LayerParts
  * @property {number} layer
@@ -310,9 +273,6 @@ export class LayerReader {
  * @property {Pick<LayerTensors, "planes" | "weights">} tensors
  * @property {Uint8Array} earlier
  * @property {Own[]} parts that make up its rows
- * @property {Own | null} whole those parts as one, null until that is asked for
- * @property {number} refined
- * @property {{symbols: LayerSymbols, tensors: LayerTensors, own: Own}[]} waiting
  * @property {Continuation} continuation
  */
 
@@ -337,7 +297,6 @@ function attributesOf({ kind, parameters: { rows }, stepClasses, attributes }, h
 function ownOf(layer) {
   const { parts } = layer;
   if (parts.length === 1) return parts[0];
-  if (layer.whole) return layer.whole;
   const order = mortonOrder(joined(parts.map(({ voxels }) => voxels)));
   /** @template {Int32Array | Float32Array | Uint8Array} A @param {(part: Own) => A} get */
   const all = (get) => reordered(joined(parts.map(get)), order);
@@ -349,8 +308,7 @@ function ownOf(layer) {
     scalingLog: all(({ scalingLog }) => scalingLog),
     offset: all(({ offset }) => offset),
   };
-  layer.whole = own;
-  if (!layer.waiting.length) layer.parts = [own]; // else low bits will change some of them
+  layer.parts = [own];
   return own;
 }
 

@@ -61,8 +61,7 @@
 
 /**
  * A prefix of a scene, with N anchors. layers: the layer numbers that are there, ascending, 0 first. rows: rows[i] is
- * the number of anchors in the prefix that ends with layers[i]. refined: refined[i] is the number of those whose
- * attributes a later slice refined (11.6). anchorQ: [N, 3] voxel indices; anchor: [N, 3] positions, scene units.
+ * the number of anchors in the prefix that ends with layers[i]. anchorQ: [N, 3] voxel indices; anchor: [N, 3] positions, scene units.
  * feature: [N, D]. scalingLog: [N, 6]. offset: [N, G, 3]. mask: per layer the codes of its rows[i] rows, the gate times
  * 255; 0 is inactive. A deformation belongs to the layer of its name, 1 global or 2 local, and is null where that layer
  * has none or is not there.
@@ -72,7 +71,6 @@
  * @property {Steps} steps
  * @property {number[]} layers
  * @property {number[]} rows
- * @property {number[]} refined
  * @property {Int32Array} anchorQ
  * @property {Float32Array} anchor
  * @property {Float32Array} feature

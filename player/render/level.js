@@ -4,13 +4,11 @@
 /** @typedef {import("../decode/scene.js").Deformation} Deformation */
 
 /**
- * One level of a scene. rows: the anchors that it has, the first ones of the scene's. detail: what grows with each slice
- * that changes the level's picture, the anchors and those of them that were refined. codes: the anchors' gates times 255.
+ * One level of a scene. rows: the anchors that it has, the first ones of the scene's. codes: the anchors' gates times 255.
  *
  * @typedef {object} Level
  * @property {number} number the highest layer there is that is at most the level asked for
  * @property {number} rows
- * @property {number} detail
  * @property {Uint8Array} codes
  * @property {Deformation | null} global
  * @property {Deformation | null} local
@@ -28,7 +26,6 @@ export function levelOf(scene, level) {
   return {
     number,
     rows: scene.rows[i],
-    detail: scene.rows[i] + scene.refined[i],
     codes: scene.mask[i],
     global: number >= 1 ? scene.globalDeformation : null,
     local: number >= 2 ? scene.localDeformation : null,

@@ -109,8 +109,8 @@ export class Player extends EventTarget {
     this._dirty = true;
     /** @type {number | null} */
     this._shownLevel = null;
-    /** Of that level. */
-    this._shownDetail = 0;
+    /** Anchors of that level. */
+    this._shownRows = 0;
     this._frameRequest = 0;
     this._lastFrame = 0;
     this._lastMoved = -Infinity;
@@ -634,10 +634,10 @@ export class Player extends EventTarget {
   /** A picture of a state is on the screen. @param {State} state @param {number} now */
   _shown({ scene, level }, now) {
     const before = this._shownLevel;
-    const { detail } = levelOf(scene, level);
-    const more = before !== null && (level > before || (level === before && detail > this._shownDetail));
+    const { rows } = levelOf(scene, level);
+    const more = before !== null && (level > before || (level === before && rows > this._shownRows));
     this._shownLevel = level;
-    this._shownDetail = detail;
+    this._shownRows = rows;
     const seconds = (now - this._started) / 1000;
     const told = { level, bytes: this._status.bytes, seconds, ...this._came.get(scene) };
     if (before === null) this._emit("firstpicture", told);

@@ -12,7 +12,6 @@ import { Sha256, crc32, hex } from "../decode/digests.js";
 import { DecodeError } from "../decode/errors.js";
 import { dequantise, transposed } from "../decode/layer.js";
 import { Real, unpack } from "../decode/msgpack.js";
-import { refined } from "../decode/refining.js";
 import { activityBounds, addRelativeMagnitudes, classesByActivity, groupByClass } from "../decode/stages.js";
 import { M, T, Table, histogramTable, mixtureTable, normTable } from "../decode/tables.js";
 import { VoxelTable } from "../decode/voxels.js";
@@ -172,21 +171,6 @@ test("with step classes a value is its centre plus the symbol times 2^class, and
   assert.equal(kind(-(2 ** 17), 0, 6), null);
   assert.equal(kind(-(2 ** 17), -1, 6), "Malformed");
   assert.equal(kind(2 ** 23, 2 ** 23, 6), "Malformed");
-});
-
-test("low bits are those of 11.6, over slices of different lengths", () => {
-  // Constants with exceptions: -1 0 1 for the zeros, -1 for the odd one, -2 -1 for the others; then odd ones alone: 2.
-  const section = Uint8Array.of(1, 0, 1, 0, 1, 1, 0, 0, 1, 1, 3, 0, 1, 0, 0, 4);
-  const coarse = [[-8, 0, 4, 4], [0, 0, 4, 8, -4, 4, 4, -4]].map((symbols) => Int32Array.from(symbols));
-  const fine = refined(section, coarse, 2, 2);
-  assert.deepEqual(fine.map((symbols) => [...symbols]), [[-6, -1, 6, 6], [0, 1, 3, 7, -6, 6, 6, -6]]);
-  assert.deepEqual([...coarse[0]], [-8, 0, 4, 4]);
-  /** @param {number} symbol @param {number} rest @param {number} lowBits */
-  const kind = (symbol, rest, lowBits) =>
-    kindOf(() => refined(Uint8Array.of(0, 2 * rest), [Int32Array.of(symbol)], 1, lowBits));
-  assert.deepEqual([kind(0, 1, 1), kind(-4, 2, 2), kind(0, 8, 4)], [null, null, null]);
-  assert.deepEqual([kind(0, 2, 1), kind(-4, 3, 2), kind(0, 9, 4)], ["Malformed", "Malformed", "Malformed"]);
-  assert.deepEqual([kind(2 ** 23 - 2, 2, 2), kind(2 ** 23, 1, 2), kind(-(2 ** 23), 1, 2)], [null, "Malformed", "Malformed"]);
 });
 
 test("CRC-32 and SHA-256 agree with Node's, in pieces too", () => {

@@ -7,11 +7,10 @@ import { unpack } from "../decode/msgpack.js";
 
 const FOLDER = new URL("../../spec/vectors/", import.meta.url);
 const MODE = 2;
-const DEFORMATION = 3;
 
 /**
  * error: the kind that is due, null if the file decodes. layers: the hashes of all layers that decode. slices: the layer
- * of each slice that does. prefixes: by the highest layer of a prefix its hashes, where low bits come behind it.
+ * of each slice that does.
  *
  * @typedef {object} Vector
  * @property {string} file
@@ -21,7 +20,6 @@ const DEFORMATION = 3;
  * @property {number | null} offset null if it is not fixed
  * @property {import("../decode/hashes.js").LayerHashes[]} layers
  * @property {number[]} slices
- * @property {Record<string, import("../decode/hashes.js").LayerHashes[]>} prefixes
  */
 
 /** What the header has under a key, if it can be read. @param {Uint8Array} bytes @param {number} key */
@@ -40,12 +38,11 @@ export function readVectors() {
   return manifest.vectors.map((/** @type {any} */ row) => {
     const bytes = new Uint8Array(readFileSync(new URL(row.file, FOLDER)));
     // an ans-only decoder's answer, where the manifest does not name it
-    const asks = headerHas(bytes, MODE) === 1 || headerHas(bytes, DEFORMATION) === 1; // for lzma, or float32 values
-    const unsupported = row.ans_only ? row.ans_only === "UnsupportedFeature" : asks;
-    const { file, error = null, chunk = null, offset = null, layers, prefixes = {} } = row;
+    const unsupported = row.ans_only ? row.ans_only === "UnsupportedFeature" : headerHas(bytes, MODE) === 1;
+    const { file, error = null, chunk = null, offset = null, layers } = row;
     const slices = row.slices ?? layers.map((/** @type {{layer: number}} */ { layer }) => layer);
-    if (!unsupported) return { file, bytes, error, chunk, offset, layers, slices, prefixes };
-    return { file, bytes, error: "UnsupportedFeature", chunk: null, offset: null, layers: [], slices: [], prefixes };
+    if (!unsupported) return { file, bytes, error, chunk, offset, layers, slices };
+    return { file, bytes, error: "UnsupportedFeature", chunk: null, offset: null, layers: [], slices: [] };
   });
 }
 

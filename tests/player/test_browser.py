@@ -476,35 +476,6 @@ def test_the_first_picture_comes_before_layer_0_is_whole(harness, folder):
     assert decibels(shot.player, shot.expected) > LEAST_DB
 
 
-@pytest.mark.parametrize("evaluator", ["gpu", "cpu"])
-def test_low_bits_that_come_last_are_an_upgrade_to_the_picture_of_the_whole(harness, folder, evaluator):
-    """At every level, although they bring no anchor."""
-    data, whole = (encode(lively_scene(200), layers=2, effort=1, low_bits=bits) for bits in (4, 0))
-    coarse = info(data)["layers"][1]["slices"][0]["end"]  # low bits follow
-    (folder / "coarse.pd4").write_bytes(data)
-    (folder / "whole.pd4").write_bytes(whole)
-
-    def pictures() -> list[np.ndarray]:
-        return [pixels(call(harness, "harness.shoot", {"level": level, "seconds": 1.7})) for level in (0, 1, 2)]
-
-    options = {"evaluator": evaluator}
-    with Server(folder, link=Link(8 * len(data) / 5)) as slow, slow.running():
-        address = slow.url_of("coarse.pd4")
-        harness.evaluate("([url, options]) => void harness.open(url, 96, 72, options)", [address, options])
-        harness.wait_for_function("harness.events.some(([name]) => name === 'loaded')")
-        call(harness, "() => harness.player.settled()")
-    upgrades = [detail for name, detail in harness.evaluate("harness.events") if name == "upgrade"]
-    assert (upgrades[-1]["level"], upgrades[-1]["bytes"]) == (2, len(data)) and len(upgrades) > 2
-    refined = pictures()
-    with Server(folder) as server, server.running():
-        call(harness, "harness.open", server.url_of("whole.pd4"), WIDTH, HEIGHT, options)
-        expected = pictures()
-        call(harness, "harness.open", server.url_of("coarse.pd4"), WIDTH, HEIGHT, options | {"bytes": coarse})
-        rough = pictures()
-    assert all(decibels(refined[level], expected[level]) > 80 for level in (0, 1, 2))
-    assert all(decibels(rough[level], expected[level]) < 60 for level in (0, 1))
-
-
 def test_budgets_are_kept_and_may_be_raised(harness, server, lively):
     ends = [row["end"] for row in info(lively)["layers"]]
     events = call(harness, "harness.open", server.url_of("scene.pd4"), WIDTH, HEIGHT, {"bytes": ends[1] + 10})

@@ -6,24 +6,17 @@ Types are checked where `npm install --no-package-lock` was called in player/. T
 
 from __future__ import annotations
 
-import hashlib
 import json
 import re
 import shutil
-import struct
 import subprocess
 from pathlib import Path
 
 import pytest
-from strategies import make_scene, small_file
+from strategies import small_file
 
 from pd4dgs_codec import decode, encode
-from pd4dgs_codec.errors import DecodeError
-from pd4dgs_codec.format import canonical, header, layer_meta
-from pd4dgs_codec.format.container import read_chunk, read_preamble, write_chunk, write_preamble
-from pd4dgs_codec.format.header import scene_id_of
-from pd4dgs_codec.format.info import hashes, info
-from pd4dgs_codec.scene import Widths
+from pd4dgs_codec.format.info import hashes
 
 ROOT = Path(__file__).parents[2]
 PLAYER = ROOT / "player"
@@ -97,114 +90,6 @@ def test_the_command_refuses_a_damaged_file_in_one_line(tmp_path):
     done = run_node(PLAYER / "cli.mjs", "hashes", path)
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.count("\n") == 1 and "ChecksumMismatch" in done.stderr
-
-
-#: Of a file in pieces: per slice what its scene holds, and whether no scene has changed since it came.
-STREAMED = """
-import { createHash } from "node:crypto";
-import { readFileSync } from "node:fs";
-import { decode, hashes, openStream } from "./decode/index.js";
-import { same } from "./testing/vectors.mjs";
-const bytes = new Uint8Array(readFileSync(process.argv[1]));
-const digest = ({ feature, scalingLog, offset }) =>
-  [feature, scalingLog, offset].reduce((hash, array) => hash.update(array), createHash("sha256")).digest("hex");
-const stream = openStream();
-const scenes = [];
-for (let at = 0; at < bytes.length; at += 100) {
-  for (const scene of stream.feed(bytes.subarray(at, at + 100))) scenes.push([scene, structuredClone(scene)]);
-}
-stream.finish();
-const slices = scenes.map(([scene]) => ({ digest: digest(scene), rows: scene.rows, refined: scene.refined }));
-const still = scenes.every(([scene, copy]) => same(scene, copy)) && same(scenes[scenes.length - 1][0], decode(bytes));
-console.log(JSON.stringify({ hashes: hashes(bytes), slices, still }));
-"""
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        dict(low_bits=1),
-        dict(low_bits=2, slices=2000),
-        dict(low_bits=4, slices=4000, widths=Widths(5, 2, graded=True)),
-        dict(low_bits=3, slices=1500, layers=(0, 2)),
-    ],
-    ids=["whole layers", "slices", "step classes", "no layer 1"],
-)
-def test_slices_that_refine_earlier_ones_give_the_scenes_of_the_package(tmp_path, options):
-    scene = {name: options.pop(name) for name in ("widths", "layers") if name in options}
-    data = encode(make_scene(7, anchors=200, **scene), layers=2, effort=1, **options)
-    path = tmp_path / "scene.pd4"
-    path.write_bytes(data)
-    done = run_node("--input-type=module", "-e", STREAMED, path)
-    assert done.returncode == 0, done.stderr
-    found = json.loads(done.stdout)
-    assert found["hashes"] == hashes(data) and found["still"]
-    ends = [row["end"] for layer in info(data)["layers"] for row in layer["slices"]]
-    assert len(found["slices"]) == len(ends)
-    for got, end in zip(found["slices"], ends, strict=True):
-        expected = decode(data, max_bytes=end)
-        attributes = (expected.feature, expected.scaling_log, expected.offset)
-        assert got["digest"] == hashlib.sha256(b"".join(a.tobytes() for a in attributes)).hexdigest()
-        assert got["rows"] == list(expected.rows)
-    assert found["slices"][-1]["refined"] == found["slices"][-1]["rows"] and not any(found["slices"][0]["refined"])
-    assert len({got["digest"] for got in found["slices"]}) == len(ends)  # each of them is seen
-
-
-def refiled(data: bytes, fields: dict[int, object], parameters: dict[int, object]) -> bytes:
-    """A file whose header and last slice have other values under some keys, or, for None, none."""
-    preamble = read_preamble(data)
-    chunks, offset = [], preamble.size
-    while offset < len(data):
-        chunks.append(read_chunk(data, offset))
-        offset = chunks[-1].end
-
-    def other(packed: bytes, changes: dict[int, object]) -> bytes:
-        known = canonical.unpack(packed) | changes
-        return canonical.pack({key: known[key] for key in sorted(known) if known[key] is not None})
-
-    payloads = [bytes(chunk.payload) for chunk in chunks]
-    (size,) = struct.unpack_from("<I", payloads[-1])
-    meta = other(payloads[-1][4 : 4 + size], parameters)
-    payloads[-1] = struct.pack("<I", len(meta)) + meta + payloads[-1][4 + size :]
-    listed = [[chunk.type, len(own)] for chunk, own in zip(chunks, payloads, strict=True)]
-    packed = other(preamble.header, {header.CHUNKS: listed} | fields)
-    written = [write_chunk(c.type, c.flags, scene_id_of(packed), own) for c, own in zip(chunks, payloads, strict=True)]
-    return b"".join([write_preamble(packed), *written])
-
-
-@pytest.mark.parametrize(
-    ("expected", "fields", "parameters"),
-    [
-        (None, {}, {}),
-        ("Malformed", {header.LOW_BITS: 0}, {}),
-        ("LimitExceeded", {header.LOW_BITS: 5}, {}),
-        ("Malformed", {header.LOW_BITS: None}, {}),  # nothing waits for low bits
-        ("Malformed", {header.LOW_BITS: 1}, {}),  # rests of two bits
-        ("Malformed", {header.MODE: 1}, {}),
-        ("LimitExceeded", {}, {layer_meta.REFINES: [1, 1]}),
-        ("Malformed", {}, {layer_meta.REFINES: [-1, 1]}),
-        ("Malformed", {}, {layer_meta.REFINES: [0, 0]}),
-        ("Malformed", {}, {layer_meta.REFINES: [0, 2]}),
-        ("LimitExceeded", {}, {layer_meta.REFINES: [0, 1025]}),
-        ("Malformed", {}, {layer_meta.REFINES: [0]}),
-        ("Malformed", {}, {layer_meta.REFINES: None}),
-        ("Malformed", {}, {layer_meta.ROWS: 1}),
-        ("Malformed", {}, {layer_meta.SECTIONS: {}}),
-        ("UnsupportedFeature", {}, {7: 0}),
-    ],
-)
-def test_low_bits_that_break_a_rule_are_refused_as_in_the_package(tmp_path, expected, fields, parameters):
-    data = refiled(small_file((0,), low_bits=2), fields, parameters)
-    path = tmp_path / "scene.pd4"
-    path.write_bytes(data)
-    try:
-        hashes(data)
-        kind = None
-    except DecodeError as error:
-        kind = type(error).__name__
-    done = run_node(PLAYER / "cli.mjs", "hashes", path)
-    assert kind == expected and (done.returncode == 0) == (expected is None), done.stderr
-    assert expected is None or f": {expected}: " in done.stderr
 
 
 def test_what_was_changed_at_random_ends_as_in_the_package(tools):
