@@ -1,5 +1,5 @@
 #!/usr/bin/env python3
-"""The reference decoder of the `.pd4` format 2.0-draft, written from spec/format.md with the standard library alone.
+"""The reference decoder of the `.pd4` format 3.0-draft, written from spec/format.md with the standard library alone.
 
     python -I -S spec/refdec.py FILE
 
@@ -26,7 +26,7 @@ FREE_ENTRIES, MORE_ENTRIES = 1 << 18, 1 << 10
 VARINT_MAX = (1 << 35) - 1  # clause 7.1: five bytes of seven bits
 TOTAL = 1 << 24
 PLANES = (("xy", 0, 1), ("xz", 0, 2), ("xt", 0, 3), ("yz", 1, 2), ("yt", 1, 3), ("zt", 2, 3))
-POSITIONS, MASKS, ATTRIBUTE_SECTION, PLANE_SECTION, WEIGHTS, SYMBOLS, FLOATS, LOW_BITS = range(8)
+POSITIONS, MASKS, ATTRIBUTE_SECTION, PLANE_SECTION, WEIGHTS, SYMBOLS = range(6)
 
 
 class Fault(Exception):
@@ -51,7 +51,7 @@ def limited(value, high, what, low=0):
 
 
 # 15 Errors and security: "UnsupportedFeature is an integer of whatever size and sign that is not a registered mode,
-# deformation, form of a section, predictor, network or prior family"
+# form of a section, predictor, network or prior family"
 def registered(value, known, what):
     need(type(value) is int, f"{what} is no integer")
     need(value in known, f"{what} is {value}", "UnsupportedFeature")
@@ -81,7 +81,7 @@ class Reader:
     def byte(self, high=255):
         return limited(self.number("B"), high, "a byte")
 
-    # 2.3 Reserved and unused: "A reserved bit or value MUST be zero or absent in a 2.0 file"
+    # 2.3 Reserved and unused: "A reserved bit or value MUST be zero or absent in a 3.0 file"
     def bits(self, used):
         value = self.byte()
         need(value >> used == 0, f"a byte is {value:#x}, expected {used} bits")
@@ -232,7 +232,7 @@ def read_preamble(data):
     need(SIGNATURE.startswith(data[:8]), "not a .pd4 file", "BadSignature")
     need(len(data) >= 20, "the file ends in the preamble", "Truncated")
     major, _, size, crc = struct.unpack_from("<HHII", data, 8)
-    need(major == 2, f"major version {major}", "UnsupportedVersion")
+    need(major == 3, f"major version {major}", "UnsupportedVersion")
     limited(size, 1 << 14, "the header's length")
     need(len(data) >= 20 + size, "the file ends in the header", "Truncated")
     header = data[20 : 20 + size]
@@ -241,13 +241,11 @@ def read_preamble(data):
 
 
 # 5.1 Header map: "The time at 1 MUST NOT precede the time at 0, the background MUST lie in 0..1, 0 ≤ near < far and
-# unit ≥ 0 MUST hold." "coding mode: 0 ans, 1 lzma; others UnsupportedFeature" "deformation: 0 coded as symbols, 1
-# float32 (9.2); others UnsupportedFeature" "the number a of low bits (11.6); absent for none. In mode lzma it is
-# Malformed"
+# unit ≥ 0 MUST hold." "coding mode: 0 ans, 1 lzma; others UnsupportedFeature"
 # 5.2 Chunk list: "In mode lzma each occurs at most once."
 # 5.5 Digest: "The first 16 bytes of the SHA-256 of the payloads of all critical chunks that were encoded together"
 def read_header(data):
-    header = fields(unpack(data), range(1, 18), (*range(1, 12), 13, 14, 15), "header")
+    header = fields(unpack(data), (1, 2, *range(4, 17)), (1, 2, *range(4, 12), 13, 14, 15), "header")
     steps, box, (start, end), background, (near, far), _ = (
         reals(header[key], f"header key {key}", count)
         for key, count in ((4, 3), (6, 6), (7, 2), (8, 3), (9, 2), (10, 3))
@@ -268,14 +266,10 @@ def read_header(data):
         limited(value, most, "a width", 1)
     for centre in a_list(header[16], "the centres", channel_count(header)) if 16 in header else ():
         limited(centre, MAX_SYMBOL, "a centre", -MAX_SYMBOL)
-    if 17 in header:
-        limited(header[17], 4, "the number of low bits", 1)
     read_chunk_list(header[1])
-    for key in (2, 3):
-        registered(header[key], (0, 1), f"header key {key}")
+    registered(header[2], (0, 1), "the coding mode")
     layers = [kind for kind, _ in header[1] if kind < 3]
     need(header[2] == 0 or len(layers) == len(set(layers)), "a layer in several slices in mode lzma")
-    need(header[2] == 0 or 17 not in header, "low bits in mode lzma")
     return header
 
 
@@ -394,9 +388,8 @@ class Layer:
 
     def __init__(self, number, later, rows_before, header, past):
         self.number, self.later, self.rows_before, self.header, self.past = number, later, rows_before, header, past
-        self.rises, self.refines = 0 if later else rows_before, None
-        self.slices = [self]  # those of its layer, each with its own voxels, if it is the first
-        self.refined = 0  # how many of them have their low bits
+        self.rises = 0 if later else rows_before
+        self.slices = [self]  # those of its layer, if it is the first
         self.symbols = {}
         self.tensors = {}  # {name: [float]}, every one a binary32 value
 
@@ -410,42 +403,26 @@ def read_layer(payload, number, later, before, header, past):
     parts = {section: reader.take(layer.sections[section]) for section in sorted(layer.sections)}
     need(not reader.left, f"{reader.left} bytes behind the sections")
     check_sizes(layer, len(payload), before)
-    layer.low_bits = parts.pop(LOW_BITS, b"")
     read_sections(layer, parts)
-    layer.cells = list(zip(*[iter(layer.symbols["anchor"])] * 3))
     return layer
 
 
 # 6.2 Layer parameters: "In its first slice, layer 0 has keys 3 and 5 and not 4. Layers 1 and 2 have keys 3, 4 and 5 if
-# the layer has a deformation, else none of them. No later slice has any of the three." "without key 6 there is no
-# section 7"
+# the layer has a deformation, else none of them. No later slice has any of the three."
 def read_parameters(layer, value):
-    parameters = fields(value, range(1, 7), (1, 2), "layer parameters")
+    parameters = fields(value, range(1, 6), (1, 2), "layer parameters")
     layer.rows = limited(parameters[1], (1 << 24) - layer.rows_before, "own rows")
-    sections = fields(parameters[2], range(8), (), "sections")
+    sections = fields(parameters[2], range(6), (), "sections")
     layer.sections = {s: limited(sections[s], (1 << 31) - 1, "a section", 1) for s in sections if s < 64}
-    if 6 in parameters:
-        read_refines(layer, parameters[6])
-    need(6 in parameters or LOW_BITS not in layer.sections, "low bits without key 6")
     found = {3, 4, 5} & set(parameters)
     wanted = [set()] if layer.later else [{3, 4, 5}, set()] if layer.number else [{3, 5}]
     need(found in wanted, f"layer {layer.number} with keys {found}")
     layer.networks = read_networks(layer.number, layer.header, parameters[5]) if 5 in parameters else {}
     layer.deformed = bool(layer.networks) and layer.number > 0
-    layer.raw = layer.deformed and layer.header[3] == 1
     steps = reals(parameters[3], "steps", 1 + layer.deformed) if layer.networks else []
     layer.steps = [a_step(step) for step in steps]
-    layer.scales = read_scales(layer, parameters[4]) if layer.deformed else []
+    layer.scales = read_scales(parameters[4]) if layer.deformed else []
     check_bounded(layer)
-
-
-# 6.2 Layer parameters: "refining slices: a layer ℓ, 0..that of the slice, and a number m, 1..1024, of its slices" "A
-# slice with key 6 is not the first of its layer, its key 1 is 0, and its section map holds section 7 and no other"
-def read_refines(layer, value):
-    number, count = a_list(value, "the slices to refine", 2)
-    layer.refines = limited(number, layer.number, "the layer to refine"), limited(count, 1024, "slices to refine", 1)
-    bare = layer.later and not layer.rows and list(layer.sections) == [LOW_BITS]
-    need(bare, f"a refining slice with {layer.rows} rows and sections {list(layer.sections)}")
 
 
 # 5.4 Error bounds: "4 and 5 if layer 1 has a deformation, 6 and 7 if layer 2 has one, else the layer is Malformed."
@@ -455,8 +432,8 @@ def check_bounded(layer):
 
 
 # 6.3 Planes and networks: "channels 1..256, the same in every scale, resolutions 1..4096 along x, y, z, t, and one
-# predictor per plane (11.3; all 0 if the layer's deformation is float32)."
-def read_scales(layer, rows):
+# predictor per plane (11.3)."
+def read_scales(rows):
     limited(len(a_list(rows, "scales")), 8, "the number of scales", 1)
     for row in rows:
         a_list(row, "a scale", 11)
@@ -466,7 +443,6 @@ def read_scales(layer, rows):
             limited(side, 4096, "a plane's side", 1)
         for predictor in row[5:]:
             registered(predictor, range(6), "a predictor")
-            need(predictor == 0 or not layer.raw, "a predictor on float32 planes")
     return rows
 
 
@@ -516,7 +492,7 @@ def weight_shapes(layer):
 
 
 # 6.5 Declared sizes: "let N, S and L be sums over this slice and all slices before it in the file" "c MUST NOT exceed
-# 2^28"
+# 2^28, N MUST NOT exceed 2^13 + 2·L, and S MUST NOT exceed 2^22 + 256·L."
 def check_sizes(layer, payload_bytes, before):
     """before: N, S and L of the slices before it. Sets those with it."""
     samples = sum(c * h * w for _, _, (c, h, w) in plane_shapes(layer))
@@ -524,17 +500,13 @@ def check_sizes(layer, payload_bytes, before):
     row = channel_count(layer.header) + 4 + (16 in layer.header)
     symbols = layer.rises + row * layer.rows + samples + sum(size for _, size in weight_shapes(layer))
     layer.declared = [a + b for a, b in zip(before, (layer.rows, symbols, payload_bytes))]
-    check_declared(*layer.declared)
-
-
-# 6.5 Declared sizes: "N MUST NOT exceed 2^13 + 2·L, and S MUST NOT exceed 2^22 + 256·L."
-def check_declared(rows, symbols, size):
+    rows, symbols, size = layer.declared
     need(rows <= (1 << 13) + 2 * size, f"{rows} rows", "LimitExceeded")
     need(symbols <= (1 << 22) + 256 * size, f"{symbols} symbols", "LimitExceeded")
 
 
-# 6.4 Sections: "A section is present if and only if it has at least one symbol or value to code. Mode ans uses 0..4 and
-# 7, mode lzma 0 and 5."
+# 6.4 Sections: "A section is present if and only if it has at least one symbol to code. Mode ans uses 0..4, mode lzma 0
+# and 5."
 def read_sections(layer, parts):
     def part(section, count):
         need(section in parts or not count, f"section {section} is missing")
@@ -543,8 +515,8 @@ def read_sections(layer, parts):
     planes, weights, past = plane_shapes(layer), weight_shapes(layer), layer.past
     counts = {MASKS: [layer.rises, layer.rows], ATTRIBUTE_SECTION: []}
     counts[ATTRIBUTE_SECTION] = [layer.rows] * (channel_count(layer.header) + (16 in layer.header))
-    counts[PLANE_SECTION] = [] if layer.raw else [h * w for _, _, (c, h, w) in planes for _ in range(c)]
-    counts[WEIGHTS] = [] if layer.raw else [size for _, size in weights]
+    counts[PLANE_SECTION] = [h * w for _, _, (c, h, w) in planes for _ in range(c)]
+    counts[WEIGHTS] = [size for _, size in weights]
     positions = decode_positions(part(POSITIONS, layer.rows), layer.rows, past.of(POSITIONS))
     channels = {}
     if layer.header[2] == 1:
@@ -562,11 +534,6 @@ def read_sections(layer, parts):
                 channels[section] = decode_planes(data, [shape for _, _, shape in planes])
             else:
                 channels[section] = decode_channels(data, sizes, past.of(section))
-    layer.raw_values = {}
-    if layer.raw:
-        sizes = {name: c * h * w for name, _, (c, h, w) in planes} | dict(weights)
-        floats = decode_lzma_floats(part(FLOATS, 1), list(sizes.values()))
-        layer.raw_values = dict(zip(sizes, floats))
     need(not parts, f"sections {sorted(parts)} have nothing to code")
     keep_symbols(layer, positions, channels, planes, weights)
 
@@ -574,8 +541,6 @@ def read_sections(layer, parts):
 # 11.1 Masks: "Layer ℓ codes a rise 0..255 for each earlier row, added to that row's code in the layer before in the
 # file, and a code 3..255 for each own row."
 # 11.2 Attributes: "Symbols, here and in 11.3 and 11.4, MUST lie in −2^23..2^23, else Malformed."
-# 11.6 Low bits: "Once 8.5 to 8.7 have given a coarse symbol k, it is replaced by k·2^a, which MUST lie in −2^23..2^23,
-# else Malformed."
 def keep_symbols(layer, positions, channels, planes, weights):
     rise, own = channels[MASKS]
     need(all(v >= 0 for v in rise), "a mask code that falls")  # that neither is over 255 follows in finish_last
@@ -585,14 +550,12 @@ def keep_symbols(layer, positions, channels, planes, weights):
     if 16 in layer.header:
         layer.symbols["step_class"], first = channels[ATTRIBUTE_SECTION][0], 1
     for name, width in attribute_channels(layer.header).items():  # [width, n], channel by channel
-        coarse = [k for channel in channels[ATTRIBUTE_SECTION][first : first + width] for k in channel]
-        layer.symbols[name] = [k << layer.header.get(17, 0) for k in coarse]
+        layer.symbols[name] = [k for channel in channels[ATTRIBUTE_SECTION][first : first + width] for k in channel]
         first += width
-    if not layer.raw:
-        residuals = iter(channels[PLANE_SECTION])
-        for name, predictor, (c, h, w) in planes:
-            layer.symbols[name] = [k for _ in range(c) for k in restore(next(residuals), predictor, h, w)]
-        layer.symbols |= {name: channel for (name, _), channel in zip(weights, channels[WEIGHTS])}
+    residuals = iter(channels[PLANE_SECTION])
+    for name, predictor, (c, h, w) in planes:
+        layer.symbols[name] = [k for _ in range(c) for k in restore(next(residuals), predictor, h, w)]
+    layer.symbols |= {name: channel for (name, _), channel in zip(weights, channels[WEIGHTS])}
     valued = [name for name in layer.symbols if name not in ("anchor", "mask_rise", "mask_own", "step_class")]
     need(all(abs(k) <= MAX_SYMBOL for name in valued for k in layer.symbols[name]), "a symbol over 2^23")
 
@@ -785,11 +748,11 @@ def read_exceptions(reader, count, prior):
 # 8 Coded channels: "tokens ≥ 8 refer to priors of the same section, or stage, only, and the definitions of the slices
 # of the same layer before count, in their order."
 # 14 Limits: "entries of all windows that a section of coded channels defines" "one per symbol of its channels, and
-# 2^18, or 2^10 where slices before it defined some, and in section 7"
-def decode_channels(data, counts, known=None, few=False):
-    """known: the priors of the slices before, to which those defined here are added. few: as if there were some."""
+# 2^18, or 2^10 where slices before it defined some"
+def decode_channels(data, counts, known=None):
+    """known: the priors of the slices before, to which those defined here are added."""
     reader, defined, heads = Reader(data), [] if known is None else known, []
-    first, entries, most = len(defined), 0, sum(counts) + (MORE_ENTRIES if defined or few else FREE_ENTRIES)
+    first, entries, most = len(defined), 0, sum(counts) + (MORE_ENTRIES if defined else FREE_ENTRIES)
     for count in counts:
         if count == 0:
             continue
@@ -1176,7 +1139,7 @@ class Lzma:
             self.range, self.code = self.range << 8, self.code << 8 | self.reader.byte()
 
 
-# 9.1 Symbols: "With byte planes, each channel's data are all least significant bytes first, then the next, and so
+# 9.2 Byte planes: "With byte planes, each channel's data are all least significant bytes first, then the next, and so
 # on."
 def split_numbers(raw, forms, planar):
     arrays, at = [], 0
@@ -1208,19 +1171,6 @@ def decode_lzma_symbols(data, counts):
     channels = [[base + v for v in array] for base, array in zip(bases, arrays)]
     need(all(abs(k) <= K for channel in channels for k in channel), "a symbol over K")
     return channels
-
-
-# 9.2 Floats: "Section 6 is the same two bytes, no varints, and one LZMA2 stream of binary32 values, one array per
-# plane, weight and bias. Byte planes apply per array. Values MUST be finite."
-def decode_lzma_floats(data, counts):
-    for count in counts:
-        need(count <= MAX_COUNT, f"an array of {count} values", "LimitExceeded")
-    reader = Reader(data)
-    _, planar = reader.byte(224), reader.bits(1)
-    raw = unpack_lzma(reader.take(reader.left), 4 * sum(counts))
-    arrays = split_numbers(raw, [("f", count) for count in counts], planar)
-    need(all(math.isfinite(v) for array in arrays for v in array), "a float32 value is not finite")
-    return arrays
 
 
 # 10.3 Channels: "an index into the ascending list of the bytes in which k bits are 1"
@@ -1332,8 +1282,7 @@ def dequantise(symbols, step):
 
 
 # 11.5 Dequantisation: "In place of its symbol k, an attribute has m + k·2^c" "It MUST lie in −2^23..2^23, else
-# Malformed." "An anchor's position is dequantised from its voxel index with the voxel size as Q." "Values of
-# section 6 are taken as they are."
+# Malformed." "An anchor's position is dequantised from its voxel index with the voxel size as Q."
 def dequantise_layer(layer):
     attributes = attribute_channels(layer.header)
     steps = dict(zip(attributes, layer.header[4])) | {"anchor": layer.header[5]}
@@ -1348,7 +1297,6 @@ def dequantise_layer(layer):
         if name != "step_class" and not name.startswith("mask"):
             step = steps.get(name) or layer.steps[0 if name.startswith("planes") else -1]
             layer.tensors[name] = dequantise(symbols, step)
-    layer.tensors |= layer.raw_values
 
 
 # 12.2 Prefixes: "The rows of a layer are those of its slices, sorted by the code (10.1) of their voxel index less the
@@ -1370,61 +1318,13 @@ def add_slice(layer, part):
     layer.slices.append(part)
 
 
-# 11.6 Low bits: "A refining slice with key 6 [ℓ, m] names the next m slices of layer ℓ, in their order, that no
-# refining slice has named yet. They MUST have come, MUST NOT be refining slices and MUST have a row between them, and
-# header key 17 MUST be there, else Malformed." "and 11.5 holds for it anew."
-# 6.5 Declared sizes: "in a refining slice D + 3·G + 6 for each row of the slices that it names, 11.6"
-def refine(layers, part):
-    """Gives rows of `layers` the low bits that the slice `part` brings."""
-    number, count = part.refines
-    need(17 in part.header, "a refining slice of a file without low bits")
-    found = [layer for layer in layers if layer.number == number]
-    need(found, f"low bits of layer {number}, which is not there")
-    layer = found[0]
-    named = layer.slices[layer.refined : layer.refined + count]
-    need(len(named) == count, f"{len(named)} slices of layer {number} wait for low bits, expected {count}")
-    need(not any(own.refines for own in named), "low bits of a refining slice")
-    place = {cell: row for row, cell in enumerate(zip(*[iter(layer.symbols["anchor"])] * 3))}
-    rows = [place[cell] for own in named for cell in own.cells]
-    need(rows, "low bits of slices without rows")
-    part.declared[1] += channel_count(layer.header) * len(rows)
-    check_declared(*part.declared)
-    add_low_bits(layer, rows, part.low_bits)
-    layer.refined += count
-    dequantise_layer(layer)
-
-
-# 11.6 Low bits: "It holds for each channel of 11.2, in order, three channels of rests r: for the rows whose k is 0, for
-# those whose k is odd, and for the others, each in the order of the rows. Each r MUST lie in −2^(a−1)..2^(a−1), else
-# Malformed. The symbol s of the row, k·2^a, becomes s + r if s ≥ 0, else s − r. It MUST lie in −2^23..2^23"
-def add_low_bits(layer, rows, section):
-    most = 1 << layer.header[17] - 1
-    places = []  # of each channel: (name, index)
-    for name, width in attribute_channels(layer.header).items():
-        for c in range(width):
-            own = [(name, c * layer.rows + row) for row in rows]
-            kinds = [], [], []
-            for at in own:
-                k = layer.symbols[name][at[1]] >> layer.header[17]
-                kinds[0 if k == 0 else 1 if k & 1 else 2].append(at)
-            places += kinds
-    for channel, rests in zip(places, decode_channels(section, [len(channel) for channel in places], few=True)):
-        need(all(abs(r) <= most for r in rests), f"a rest over {most}")
-        for (name, at), r in zip(channel, rests):
-            s = layer.symbols[name][at]
-            s = s + r if s >= 0 else s - r
-            need(abs(s) <= MAX_SYMBOL, "a refined symbol over 2^23")
-            layer.symbols[name][at] = s
-
-
 # 10.1 Payload: "bit 3i of the code is bit i of x, 3i + 1 of y, 3i + 2 of z"
 def morton_code(offset):
     return sum((v >> i & 1) << 3 * i + axis for axis, v in enumerate(offset) for i in range(21))
 
 
 # 12.1 Order: "For each layer chunk, before the next chunk is looked at: parameters and their limits, sections, the
-# ranges of 11.1 and 11.2, sums of masks, each voxel at most once over the slices so far, dequantisation, and low bits
-# with all that 11.6 asks for."
+# ranges of 11.1 and 11.2, sums of masks, each voxel at most once over the slices so far, and dequantisation."
 # 11.1 Masks: "No sum may exceed 255."
 def finish_last(layers):
     codes = []
@@ -1460,8 +1360,6 @@ def decode(data, max_layer=None):
             else:
                 layers.append(read)
             finish_last(layers)
-            if read.refines:
-                refine(layers, read)
             declared = read.declared
     need(max_layer is not None or at == len(data), "bytes follow the last chunk")
     return layers

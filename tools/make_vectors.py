@@ -77,7 +77,7 @@ def _for_all(data: bytes) -> bool:
         header = unpack_header(read_preamble(data).header)
     except DecodeError:
         return True
-    return header.mode == "ans" and not header.raw_deformation
+    return header.mode == "ans"
 
 
 def files(found: list[Vector]) -> dict[str, bytes]:

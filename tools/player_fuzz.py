@@ -67,13 +67,13 @@ def ans_only(data: bytes) -> bool:
         header = unpack_header(read_preamble(data).header)
     except DecodeError:
         return False
-    return header.mode != "ans" or header.raw_deformation
+    return header.mode != "ans"
 
 
 def expected(data: bytes) -> tuple[str, Any]:
     """(DECODED or the name of the error, the hashes or its message) that an ans-only decoder owes."""
     if ans_only(data):
-        return UNSUPPORTED, "mode lzma, or float32 values"
+        return UNSUPPORTED, "mode lzma"
     try:
         return DECODED, hashes(data)
     except DecodeError as error:

@@ -2,10 +2,10 @@
 
     python tools/slices.py [--only NAME ...] [--size 50000] [--out out] [--docs docs] [--render]
 
-Each checkpoint that tools/results.py left in --out/NAME/model.pt is packed in one slice per layer, in slices of --size
-bytes ordered by what the training views show, in the same with the low bits of attributes last, and in slices of
-anchors in random order. Every prefix is decoded and scored on the held-out views. A scene of PREFIXED is trained first,
-with --prefixes. Writes docs/slices.md, its plot and a film strip per scene.
+Each checkpoint that tools/results.py left in --out/NAME/model.pt is packed in one slice per layer, in slices of
+--size bytes ordered by what the training views show, and in slices of anchors in random order. Every prefix is
+decoded and scored on the held-out views. A scene of PREFIXED is trained first, with --prefixes. Writes
+docs/slices.md, its plot and a film strip per scene.
 """
 
 from __future__ import annotations
@@ -33,7 +33,6 @@ PREFIXED, SHARE = {f"{name}-prefixes": name for name in ("shelf-hand", "bouncing
 NAMES = ("shelf-hand", "shelf-hand-prefixes", "bouncing-balls", "bouncing-balls-prefixes")
 NAMES += ("synthetic-local", "synthetic-global")
 VIEWS = 16  #: training views that order the anchors
-LOW_BITS = 1
 STEP, LEAST = 0.5, 20.0  #: dB between the qualities whose times are compared, and the lowest of them
 RATE = 2e6  #: bits per second
 STRIP = 6  #: pictures of a film strip
@@ -43,7 +42,7 @@ Points = list[tuple[int, float]]  #: (bytes, dB) after each slice
 
 
 def measure(path: Path, dataset: Dataset, size: int, strip: Path) -> Row:
-    """Points of the four files, and what slices cost."""
+    """Points of the three files, and what slices cost."""
     from pd4dgs_codec.format.encoder import encode
     from pd4dgs_codec.format.options import EncodeOptions
     from pd4dgs_codec.model import checkpoint
@@ -56,10 +55,10 @@ def measure(path: Path, dataset: Dataset, size: int, strip: Path) -> Row:
     one = pack(scene, views=views)
     say("  slices")
     fitting = Views(views.source, views.fitting)
-    packed, late = (pack(one.scene, EncodeOptions(slices=size, low_bits=n), views=fitting) for n in (0, LOW_BITS))
+    packed = pack(one.scene, EncodeOptions(slices=size), views=fitting)
     rng = np.random.default_rng(0)
     shuffled = encode(one.scene, slices=size, utility=lambda decoded: rng.random(len(decoded.anchor_q)))
-    files = {"layers": one.data, "slices": packed.data, "low bits": late.data, "random": shuffled}
+    files = {"layers": one.data, "slices": packed.data, "random": shuffled}
     row: Row = {name: points(data, dataset) for name, data in files.items()}
     row["seconds"] = {name: decode_seconds(data) for name, data in files.items() if name != "random"}
     row["size"] = size
@@ -133,10 +132,9 @@ def draw_strip(data: bytes, dataset: Dataset, path: Path) -> None:
 
 
 def plot(rows: Sequence[Row], path: Path) -> None:
-    """dB against bytes of all four files, one panel per scene, legible in black and white."""
+    """dB against bytes of all three files, one panel per scene, legible in black and white."""
     styles = {
         "slices": ("-o", "slices, by utility"),
-        "low bits": ("-^", "the same, low bits last"),
         "random": (":x", "slices, random"),
         "layers": ("--s", "layers"),
     }
@@ -155,36 +153,26 @@ def render(rows: Sequence[Row]) -> str:
     first, cost, each = [], [], []
     for row in rows:
         layers, seconds = row["layers"], row["seconds"]
-        for way in ("slices", "low bits"):
-            sliced = row[way]
-            size, db = sliced[0]
-            worst = max((a - b for (_, a), (_, b) in pairwise(sliced)), default=0.0)
-            name = row["name"] if way == "slices" else f"{row['name']}, low bits last"
-            first.append(
-                (
-                    name,
-                    f"{size:,}",
-                    f"{8 * size / RATE:.2f}",
-                    f"{db:.2f}",
-                    f"{row['random'][0][1]:.2f}" if way == "slices" else "",
-                    f"{layers[0][1]:.2f} in {layers[0][0]:,}",
-                    f"{max(worst, 0.0):.3f}",
-                    f"{time_ratio(sliced, layers):.2f}",
-                )
+        sliced, name = row["slices"], row["name"]
+        size, db = sliced[0]
+        worst = max((a - b for (_, a), (_, b) in pairwise(sliced)), default=0.0)
+        first.append(
+            (
+                name,
+                f"{size:,}",
+                f"{8 * size / RATE:.2f}",
+                f"{db:.2f}",
+                f"{row['random'][0][1]:.2f}",
+                f"{layers[0][1]:.2f} in {layers[0][0]:,}",
+                f"{max(worst, 0.0):.3f}",
+                f"{time_ratio(sliced, layers):.2f}",
             )
-            more, slower = sliced[-1][0] / layers[-1][0] - 1, seconds[way] / seconds["layers"] - 1
-            cost.append(
-                (
-                    name,
-                    f"{len(sliced)}",
-                    f"{sliced[-1][0]:,}",
-                    f"{more:+.2%}",
-                    f"{seconds[way]:.2f}",
-                    f"{slower:+.0%}",
-                )
-            )
-            steps = ", ".join(f"{size / 1000:.0f} kB {db:.2f}" for size, db in sliced)
-            each.append(f"**{name}**, dB after each slice: {steps}.")
+        )
+        more, slower = sliced[-1][0] / layers[-1][0] - 1, seconds["slices"] / seconds["layers"] - 1
+        took = f"{seconds['slices']:.2f}"
+        cost.append((name, f"{len(sliced)}", f"{sliced[-1][0]:,}", f"{more:+.2%}", took, f"{slower:+.0%}"))
+        steps = ", ".join(f"{size / 1000:.0f} kB {db:.2f}" for size, db in sliced)
+        each.append(f"**{name}**, dB after each slice: {steps}.")
     heads = ("scene", "first slice", "s at 2 Mbps", "dB", "random", "layer 0", "largest fall, dB", "time ratio")
     lines = [
         *paragraph(
@@ -193,8 +181,7 @@ def render(rows: Sequence[Row]) -> str:
             f"in random order. *{', '.join(PREFIXED)}*: trained with `--prefixes {SHARE}`. *layer 0*: the first "
             "picture of a file with one slice per layer. *time ratio*: the "
             f"median, over qualities {STEP} dB apart from {LEAST:g} dB up, of the time to that quality on a link of "
-            f"constant rate, relative to that file. *low bits last*: the same with `--low-bits {LOW_BITS}`: attributes "
-            "are coarse until the slices behind those of layer 1."
+            f"constant rate, relative to that file."
         ),
         "",
         markdown(heads, first),

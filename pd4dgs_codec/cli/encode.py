@@ -37,15 +37,14 @@ prefix that ends with a layer can be shown. What has no visible effect is left o
 2 Mbps. It takes a minute or more. Give --data, or only what the file's own camera shows is judged.
 
 --slices 50k lets a picture appear after the first 50 kB and improve with each further slice. It takes minutes as well,
-and the same pictures decide which anchors come first. --low-bits 1 makes earlier pictures better for some 4 % more
-bytes: all attributes come coarse, and their last bits behind layer 1.
+and the same pictures decide which anchors come first.
 
 {SOURCES}
 
 examples:
   pd4dgs-encode model.pt -o scene.pd4
   pd4dgs-encode model.pt -o small.pd4 --step-scale 2
-  pd4dgs-encode model.pt -o early.pd4 --slices 50k --low-bits 1 --data recordings/kitchen --downscale 2
+  pd4dgs-encode model.pt -o early.pd4 --slices 50k --data recordings/kitchen --downscale 2
   pd4dgs-encode model.pt -o fast.pd4 --target-size L0=350k --data recordings/kitchen --downscale 2
   pd4dgs-encode model.pt -o - | pd4dgs-decode -"""
 
@@ -60,7 +59,6 @@ def parser() -> Parser:
     p.add_argument("input", metavar="model.pt", help=what)
     p.add_argument("-o", "--output", required=True, metavar="FILE.pd4", help="file to write; - writes stdout")
     _add_choice(p, "mode", "entropy coder")
-    _add_choice(p, "deformation", "planes and networks of layers 1 and 2: coded integers, or float32 under LZMA")
     _add_choice(p, "priors", "distributions to choose from per channel")
     what = "multiply every quantisation step: above 1 smaller and coarser (default: %(default)g)"
     p.add_argument("--step-scale", type=values.positive_float, default=DEFAULTS.step_scale, metavar="X", help=what)
@@ -75,7 +73,6 @@ def parser() -> Parser:
         "cut layers into slices of SIZE bytes, where planes and networks allow it; what pictures need most comes first"
     )
     p.add_argument("--slices", type=values.size, default=DEFAULTS.slices, metavar="SIZE", help=what)
-    _add_choice(p, "low_bits", "bring so many bits of the attributes behind layer 1; not with --target-size", type=int)
     what = "most bytes that each layer may add to the file (layer 0 with the header): coarser steps, fewer anchors"
     p.add_argument("--target-size", type=values.layer_sizes, default={}, metavar="L0=425k,...", help=what)
     about = p.add_argument_group(
@@ -143,14 +140,12 @@ main = command(parser, _encode)
 def _options(args: argparse.Namespace) -> EncodeOptions:
     return EncodeOptions(
         mode=args.mode,
-        deformation=args.deformation,
         priors=args.priors,
         layers=args.layers if args.layers == "auto" else int(args.layers),
         effort=args.effort,
         omit=args.omit,
         step_scale=args.step_scale,
         slices=args.slices,
-        low_bits=args.low_bits,
         verify=not args.no_verify,
     )
 
@@ -201,12 +196,12 @@ def _add_train_rate(result: dict[str, Any], packed: Packed, options: EncodeOptio
     ]
     bits = {row["layer"]: row["bits"] for row in per_layer}
     result |= {"train_rate_bits": sum(bits.values()), "train_rate_bits_layers": per_layer}
-    for row in result["layers"]:  # float32 deformations may keep a layer that is zero once quantised
+    for row in result["layers"]:
         row["train_rate_bits"] = bits.get(row["layer"])
 
 
 def _text(result: dict[str, Any], first_frame: float) -> str:
-    sections = ["attributes", "planes", "weights", "masks", "symbols", "floats", "low_bits"]
+    sections = ["attributes", "planes", "weights", "masks", "symbols"]
     spent = [{s["name"]: s["payload_bits"] / 8 for s in row["streams"]} for row in result["layers"]]
     shown = [name for name in sections if any(name in streams for streams in spent)]
     rows = [

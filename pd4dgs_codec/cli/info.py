@@ -159,17 +159,14 @@ def _slice_lines(result: dict[str, Any]) -> list[str]:
     quality = (result["metadata"] or {}).get("slices", [])
     shown = quality if len(quality) == len(parts) else [None] * len(parts)
     rows = [
-        (i, layer, number(part["end"], 0), _brought(part, result["low_bits"]), number(db, 2))
+        (i, layer, number(part["end"], 0), _brought(part), number(db, 2))
         for i, ((layer, part), db) in enumerate(zip(parts, shown, strict=True))
     ]
     return [table(("slice", "layer", "prefix", "brings", "mPSNR dB"), rows)]
 
 
-def _brought(part: dict[str, Any], low_bits: int) -> str:
+def _brought(part: dict[str, Any]) -> str:
     """What a slice holds, as far as that is here."""
-    if "refines" in part:
-        slices = f"{number} slices" if (number := part["refines"]["slices"]) > 1 else "a slice"
-        return f"{low_bits} low bits of {slices} of layer {part['refines']['layer']}"
     return f"{part['anchors']:,} anchors" if "anchors" in part else "-"
 
 
@@ -189,7 +186,7 @@ def _text(result: dict[str, Any]) -> str:
     low, high = result["time_range"]
     lines = [
         f"{name}: .pd4 format {result['format_version']}, {result['bytes']:,} bytes{cut}",
-        f"mode {result['mode']}, deformation {result['deformation']}, header {result['header_bytes']} bytes, "
+        f"mode {result['mode']}, header {result['header_bytes']} bytes, "
         f"{number(result['anchors'], 0)} anchors on a grid of {result['voxel_size']:.6g} scene units, "
         f"time {low:g} to {high:g} s",
         table(

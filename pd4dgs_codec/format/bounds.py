@@ -25,8 +25,8 @@ _TIES = 2.0**-29
 
 @dataclass(frozen=True)
 class ErrorBound:
-    """Of all tensors that share a step. what: that field of Steps. step: Q, 0 where values are stored as they are.
-    bound: the error that the header declares; largest: the largest error there is. In the unit of the values."""
+    """Of all tensors that share a step. what: that field of Steps. step: Q. bound: the error that the header declares;
+    largest: the largest error there is. In the unit of the values."""
 
     what: str
     step: float
@@ -44,19 +44,17 @@ def blocks_of(scene: Scene) -> Blocks:
         yield rows, {name: values[rows] for name, values in scene.attributes.items()}
 
 
-def rounding_bounds(decoded: Scene, blocks: Blocks, raw_deformation: bool) -> dict[str, float]:
+def rounding_bounds(decoded: Scene, blocks: Blocks) -> dict[str, float]:
     """By field of Steps that the scene's tensors use: what bounds the error of them all if each value was rounded to
     the nearest symbol, rounded up to binary32. The attributes are those of `blocks`."""
     bounds: dict[str, float] = {}
-    for what, step, restored in _tensors(decoded, blocks, raw_deformation):
+    for what, step, restored in _tensors(decoded, blocks):
         largest = np.abs(restored).max(initial=np.float32(0))
         bounds[what] = max(bounds.get(what, 0.0), float(_bounds(largest, step)))
     return {what: _rounded_up(bound) for what, bound in bounds.items()}
 
 
-def verify_errors(
-    given: Scene, decoded: Scene, blocks: Blocks, declared: Mapping[str, float], raw_deformation: bool
-) -> list[ErrorBound]:
+def verify_errors(given: Scene, decoded: Scene, blocks: Blocks, declared: Mapping[str, float]) -> list[ErrorBound]:
     """One row per entry of `declared`, the bounds in the header of the file.
 
     given: the planned scene, its steps those of the file; decoded: what the file holds, of the same rows and shapes,
@@ -65,7 +63,7 @@ def verify_errors(
     """
     steps, largest = dict.fromkeys(declared, 0.0), dict.fromkeys(declared, 0.0)
     spacing = 2.0 ** classes_of(decoded)
-    for rows, what, step, x, restored in _pairs(given, decoded, blocks, raw_deformation):
+    for rows, what, step, x, restored in _pairs(given, decoded, blocks):
         errors = np.abs(x.astype(np.float64) - restored)
         if rows is not None and spacing.size:
             errors /= spacing[rows].reshape(-1, *(1,) * (x.ndim - 1))
@@ -79,9 +77,9 @@ def verify_errors(
 
 
 def _bounds(magnitude: np.ndarray, step: float) -> np.ndarray:
-    """float64 error bounds of decoded values of that float32 magnitude; step 0: stored as they are."""
+    """float64 error bounds of decoded values of that float32 magnitude."""
     last_place: np.ndarray = np.spacing(magnitude).astype(np.float64)
-    return (0.5 + _TIES) * step + 0.5 * last_place * (step > 0)
+    return (0.5 + _TIES) * step + 0.5 * last_place
 
 
 def _rounded_up(value: float) -> float:
@@ -91,26 +89,26 @@ def _rounded_up(value: float) -> float:
 
 
 def _pairs(
-    given: Scene, decoded: Scene, blocks: Blocks, raw_deformation: bool
+    given: Scene, decoded: Scene, blocks: Blocks
 ) -> Iterator[tuple[slice | None, str, float, np.ndarray, np.ndarray]]:
     """(rows of an attribute, field of Steps, step, values given, values decoded)."""
     for rows, values in blocks:
         for name, x in values.items():
             yield rows, name, given.steps.attributes[name], given.attributes[name][rows], x
-    both = zip(_tensors(given, (), raw_deformation), _tensors(decoded, (), raw_deformation), strict=True)
+    both = zip(_tensors(given, ()), _tensors(decoded, ()), strict=True)
     yield from ((None, what, step, x, restored) for (what, step, x), (_, _, restored) in both)
 
 
-def _tensors(scene: Scene, blocks: Blocks, raw_deformation: bool) -> Iterator[tuple[str, float, np.ndarray]]:
-    """(field of Steps, step or 0 for values that are stored as they are, float32 values); attributes of `blocks`."""
+def _tensors(scene: Scene, blocks: Blocks) -> Iterator[tuple[str, float, np.ndarray]]:
+    """(field of Steps, step, float32 values); attributes of `blocks`."""
     for _, values in blocks:
         yield from ((name, scene.steps.attributes[name], x) for name, x in values.items())
     for kind in LAYER_KINDS:
-        tensors, stored = scene.tensors(kind.layer), raw_deformation and kind.layer > 0
+        tensors = scene.tensors(kind.layer)
         for scale in tensors.planes:
-            step = 0.0 if stored else scene.steps.planes(kind.layer)
+            step = scene.steps.planes(kind.layer)
             yield from ((str(kind.planes_step), step, scale[name]) for name, _, _ in PLANES)
-        step = 0.0 if stored else scene.steps.weights(kind.layer)
+        step = scene.steps.weights(kind.layer)
         for name in kind.network_ids:
             for pair in tensors.networks.get(name, ()):
                 yield from ((kind.weights_step, step, array) for array in pair)

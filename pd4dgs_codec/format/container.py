@@ -25,7 +25,7 @@ from pd4dgs_codec.format.limits import MAX_HEADER, MAX_PAYLOAD
 
 # As in PNG: a high bit and both line ends, so that a text-mode transfer breaks it, and 0x1A to stop a DOS listing.
 SIGNATURE = bytes.fromhex("89504434 0D0A1A0A")
-MAJOR, MINOR = 2, 0
+MAJOR, MINOR = 3, 0
 PREAMBLE_SIZE = 20
 CHUNK_HEAD_SIZE = 16
 CHUNK_OVERHEAD = CHUNK_HEAD_SIZE + 4

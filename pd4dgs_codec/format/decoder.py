@@ -8,15 +8,12 @@ from pd4dgs_codec.format.attribute_section import Past
 from pd4dgs_codec.format.container import CHUNK_OVERHEAD, PREAMBLE_SIZE, Chunk, read_chunk, read_preamble
 from pd4dgs_codec.format.header import Header, layers_of, scene_id_of, unpack_header
 from pd4dgs_codec.format.kinds import BY_CHUNK_TYPE, LayerKind
-from pd4dgs_codec.format.layer_meta import Declared, check_declared
+from pd4dgs_codec.format.layer_meta import Declared
 from pd4dgs_codec.format.payload import read_layer
-from pd4dgs_codec.format.refining import read_refinement, shifted
 from pd4dgs_codec.format.symbols import (
     LayerSymbols,
-    Refinement,
     TakenVoxels,
     assemble,
-    check_attributes,
     check_last_layer,
     merged,
 )
@@ -32,7 +29,6 @@ class LayerReader:
         self.offset = 0  #: of the next chunk
         self.slices: list[list[LayerSymbols]] = []  #: of each layer
         self._merged: list[LayerSymbols | None] = []  # each layer, None until somebody asks for it as it is now
-        self._refined = [0] * len(BY_CHUNK_TYPE)  # by layer, how many of its slices
         self._index = 0
         self._scene_id = b""
         self._declared = Declared()
@@ -130,44 +126,16 @@ class LayerReader:
         later = self._goes_on(kind.layer)
         past = self._past if later else Past[Prior]() if chunk.more else None
         header = self.header
-        read = read_layer(
-            chunk.payload, kind, header.widths, self._declared, header.mode, header.raw_deformation, later, past
-        )
-        if header.low_bits:
-            read = shifted(read, header.low_bits)
+        read = read_layer(chunk.payload, kind, header.widths, self._declared, header.mode, later, past)
         before = self.layers if read.mask_increase.size else []
         check_last_layer([*before, read], self._taken, header.info.voxel_size, header.grid)
         _check_bounded(read, header)
         symbols = sum(a.size for a in read.arrays())
         self._declared = self._declared.and_slice(len(read.anchor_q), symbols, len(chunk.payload))
-        if read.refines is not None:
-            self._refine(read.refines, kind)
         self._past = past
         at = -1 if later else len(self.slices)
         self.slices = [*self.slices[:at], [*(self.slices[-1] if later else ()), read]]
         self._merged = [*self._merged[:at], None]
-
-    def _refine(self, refinement: Refinement, kind: LayerKind) -> None:
-        """Give earlier slices the low bits of their attributes (clause "low bits")."""
-        assert self.header is not None
-        header, layer = self.header, refinement.layer
-        place = next((i for i, parts in enumerate(self.slices) if parts[0].kind.layer == layer), None)
-        first, end = self._refined[layer], self._refined[layer] + refinement.slices
-        parts = [] if place is None else self.slices[place][first:end]
-        symbols = sum(part.attributes.size for part in parts)
-        if place is None or not header.low_bits or len(parts) < refinement.slices or any(p.refines for p in parts):
-            found = f"{len(parts)} slices of layer {layer} that wait for low bits"
-            raise Malformed(f"layer {kind.layer}: {found}, expected {refinement.slices}")
-        if not symbols:
-            raise Malformed(f"layer {kind.layer}: low bits of slices without anchors, expected some")
-        self._declared = check_declared(self._declared.and_slice(0, symbols, 0), kind)
-        refined = read_refinement(refinement.section, parts, header.low_bits)
-        for part in refined:
-            check_attributes(part, header.grid)
-        slices = [*self.slices[place][:first], *refined, *self.slices[place][end:]]
-        self.slices = [*self.slices[:place], slices, *self.slices[place + 1 :]]
-        self._merged = [*self._merged[:place], None, *self._merged[place + 1 :]]
-        self._refined = [*self._refined[:layer], end, *self._refined[layer + 1 :]]
 
 
 def _check_bounded(layer: LayerSymbols, header: Header) -> None:

@@ -32,14 +32,12 @@ from pd4dgs_codec.format.metadata import CHUNK_TYPE, Metadata, write_metadata
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.payload import StreamReport, read_meta
 from pd4dgs_codec.format.plan import plan
-from pd4dgs_codec.format.refining import unrefined
-from pd4dgs_codec.format.slicing import Slice, whole_layer, with_low_bits, write_slices
+from pd4dgs_codec.format.slicing import Slice, whole_layer, write_slices
 from pd4dgs_codec.format.symbols import (
     LayerSymbols,
     TakenVoxels,
     assemble,
     attribute_blocks,
-    check_attributes,
     check_last_layer,
     float_tensors,
     layer_symbols,
@@ -64,8 +62,8 @@ class SliceReport:
 @dataclass(frozen=True)
 class LayerReport:
     """One layer. bytes: its chunks. slices: each of them. payload_bits and rate_bits: sums over attributes, planes and
-    weights (in mode lzma one stream codes these and the masks together, and payload_bits is all of it). symbols: those
-    of attributes count once, with their anchors, however many streams bring their bits. streams: every coded section.
+    weights (in mode lzma one stream codes these and the masks together, and payload_bits is all of it).
+    streams: every coded section.
     """
 
     layer: int
@@ -135,24 +133,20 @@ def encode_with_report(
     scene, options = replace(options, **changes).apply_scale(scene)
     check_scene(scene)
     planned, omitted = plan(scene, options)
-    symbols = [layer_symbols(planned, i, options.raw_deformation) for i in range(len(planned.layers))]
+    symbols = [layer_symbols(planned, i) for i in range(len(planned.layers))]
     grid = Grid.of(planned)
     meant = outline(planned.info, grid, symbols)
-    bounds = rounding_bounds(meant, attribute_blocks(grid, symbols), options.raw_deformation)
+    bounds = rounding_bounds(meant, attribute_blocks(grid, symbols))
     errors = list[ErrorBound]()
     if options.verify:
-        errors = verify_errors(planned, meant, attribute_blocks(grid, symbols), bounds, options.raw_deformation)
+        errors = verify_errors(planned, meant, attribute_blocks(grid, symbols), bounds)
     del planned  # as large as the scene
     if options.slices:
-        first = [unrefined(layer, options.low_bits) for layer in symbols]
-        values = np.split((utility or by_size)(assemble(meant.info, grid, first)), meant.rows[:-1])
-        del first
+        values = np.split((utility or by_size)(assemble(meant.info, grid, symbols)), meant.rows[:-1])
         written = [write_slices(layer, options, u, HEADER) for layer, u in zip(symbols, values, strict=True)]
     else:
         written = [[whole_layer(layer, options)] for layer in symbols]
-    if options.low_bits:
-        written = with_low_bits(written, options)
-    _check_limits(meant.info.voxel_size, grid, symbols, written, options.low_bits)
+    _check_limits(meant.info.voxel_size, grid, symbols, written)
     about = write_metadata(metadata) if metadata is not None else b""
     data = _container(meant, grid, bounds, options, written, about)
     reports = [_layer_report(layer, slices) for layer, slices in zip(symbols, written, strict=True)]
@@ -162,7 +156,6 @@ def encode_with_report(
         _verify(data, meant, wanted, bounds)
     kept = sum(r.anchors for r in reports)
     kept_bits = sum(r.position_bits + s.payload_bits for r in reports for s in r.streams if s.name == "attributes")
-    kept_bits += sum(s.payload_bits for r in reports for s in r.streams if s.name == "low_bits")
     rows = [item.row(scene.steps, options, kept, kept_bits) for item in (*left_out, *omitted)]
     seconds = round(time.perf_counter() - started, 4)
     about_bytes = CHUNK_OVERHEAD + len(about) if about else 0
@@ -186,9 +179,7 @@ def with_metadata(data: bytes, metadata: Metadata) -> bytes:
     return write_preamble(packed) + data[preamble.size :] + chunk
 
 
-def _check_limits(
-    voxel_size: float, grid: Grid, symbols: list[LayerSymbols], written: list[list[Slice]], low_bits: int
-) -> None:
+def _check_limits(voxel_size: float, grid: Grid, symbols: list[LayerSymbols], written: list[list[Slice]]) -> None:
     """Hold declared sizes and ranges of values against the format's limits as a decoder will, verified or not."""
     declared, taken = Declared(), TakenVoxels()
     chunks = sum(map(len, written))
@@ -197,13 +188,9 @@ def _check_limits(
     for index, (layer, slices) in enumerate(zip(symbols, written, strict=True)):
         for number, part in enumerate(slices):
             try:
-                *_, declared = read_meta(
-                    part.payload, layer.kind, layer.widths, declared, layer.raw_deformation, number > 0
-                )
+                *_, declared = read_meta(part.payload, layer.kind, layer.widths, declared, number > 0)
                 layers = [*symbols[:index], part.symbols]
                 check_last_layer(layers, taken, voxel_size, grid)
-                if low_bits:
-                    check_attributes(unrefined(part.symbols, low_bits), grid)
             except DecodeError as error:
                 raise EncodeError(f"the scene is over a limit of the format: {error}") from None
 
@@ -229,14 +216,12 @@ def _container(
     header = Header(
         chunks=tuple((kind, len(payload)) for kind, _, payload in parts),
         mode=options.mode,
-        deformation=options.deformation,
         attribute_steps=meant.steps.attributes,
         widths=grid.widths,
         centre=grid.centre if grid.widths.graded else None,
         info=meant.info,
         error_bounds=bounds,
         digest=payload_digest(payloads),
-        low_bits=options.low_bits,
     )
     packed = pack_header(header)
     scene_id = scene_id_of(packed)
@@ -281,14 +266,14 @@ def _fingerprint(layer: LayerSymbols, grid: Grid) -> tuple[bytes, bytes]:
 def _layer_report(layer: LayerSymbols, slices: list[Slice]) -> LayerReport:
     positions, *streams = _added(slices)
     rows = [SliceReport(CHUNK_OVERHEAD + len(part.payload), len(part.symbols.anchor_q)) for part in slices]
-    counted = [s for s in streams if s.name not in ("masks", "floats")]
+    counted = [s for s in streams if s.name != "masks"]
     return LayerReport(
         layer=layer.kind.layer,
         bytes=sum(row.bytes for row in rows),
         payload_bits=sum(s.payload_bits for s in counted),
         rate_bits=sum(s.rate_bits for s in counted),
         position_bits=positions.payload_bits,
-        symbols=sum(s.symbols for s in counted if s.name != "low_bits"),  # of attributes that are counted already
+        symbols=sum(s.symbols for s in counted),
         anchors=len(layer.anchor_q),
         slices=rows,
         streams=streams,

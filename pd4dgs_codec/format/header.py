@@ -16,15 +16,17 @@ from pd4dgs_codec.format.check import info_fault
 from pd4dgs_codec.format.container import SCENE_ID_SIZE
 from pd4dgs_codec.format.fields import Fields, as_integer, as_list
 from pd4dgs_codec.format.kinds import BY_CHUNK_TYPE, LAYER_KINDS
-from pd4dgs_codec.format.limits import MAX_CHUNKS, MAX_LOW_BITS, MAX_PAYLOAD
-from pd4dgs_codec.format.options import DEFORMATIONS, MODES, RAW_DEFORMATION
+from pd4dgs_codec.format.limits import MAX_CHUNKS, MAX_PAYLOAD
+from pd4dgs_codec.format.options import MODES
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, is_step
 from pd4dgs_codec.format.table import Grid
 from pd4dgs_codec.scene import ATTRIBUTES, MAX_FEATURE, MAX_SLOTS, Camera, SceneInfo, Widths
 
 # Keys of the header map.
-CHUNKS, MODE, DEFORMATION, STEPS, VOXEL_SIZE, BOX, TIME_RANGE, BACKGROUND, NEAR_FAR, UP, UNIT = range(1, 12)
-CAMERA, ERROR_BOUNDS, DIGEST, WIDTHS, CENTRE, LOW_BITS = range(12, 18)
+CHUNKS, MODE = 1, 2
+STEPS, VOXEL_SIZE, BOX, TIME_RANGE, BACKGROUND, NEAR_FAR, UP, UNIT = range(4, 12)
+CAMERA, ERROR_BOUNDS, DIGEST, WIDTHS, CENTRE = range(12, 17)
+KEYS = {CHUNKS, MODE, *range(STEPS, CENTRE + 1)}
 # Keys of the camera map.
 VIEWMAT, INTRINSICS, WIDTH, HEIGHT = range(1, 5)
 
@@ -52,31 +54,23 @@ class Header:
 
     widths: of the anchors. centre: int32 [channels] in steps, if they are graded. error_bounds: by field of Steps, how
     far a decoded value may lie from the one that the encoder was given, in the unit of the values; a binary32 value >=
-    0. digest: payload_digest of the layers that were encoded together. low_bits: how many of the attributes' symbols
-    come in slices of their own, 0 for none.
+    0. digest: payload_digest of the layers that were encoded together.
     """
 
     chunks: tuple[tuple[int, int], ...]
     mode: str
-    deformation: str
     attribute_steps: dict[str, float]
     widths: Widths
     centre: np.ndarray | None
     info: SceneInfo
     error_bounds: dict[str, float]
     digest: bytes
-    low_bits: int = 0
 
     @property
     def grid(self) -> Grid:
         """That of the attributes."""
         centre = np.zeros(self.widths.channels, np.int32) if self.centre is None else self.centre
         return Grid(self.attribute_steps, self.widths, centre)
-
-    @property
-    def raw_deformation(self) -> bool:
-        """Whether planes and networks of layers 1 and 2 are stored as float32 values."""
-        return self.deformation == RAW_DEFORMATION
 
 
 def _f32(values: ArrayLike) -> list[float]:
@@ -89,7 +83,6 @@ def pack_header(header: Header) -> bytes:
     fields: dict[int, object] = {
         CHUNKS: [list(chunk) for chunk in header.chunks],
         MODE: MODES[header.mode],
-        DEFORMATION: DEFORMATIONS[header.deformation],
         STEPS: _f32([header.attribute_steps[name] for name in ATTRIBUTES]),
         VOXEL_SIZE: _f32(info.voxel_size)[0],
         BOX: _f32(info.box),
@@ -112,14 +105,12 @@ def pack_header(header: Header) -> bytes:
     fields |= {DIGEST: header.digest, WIDTHS: [header.widths.feature, header.widths.slots]}
     if header.centre is not None:
         fields[CENTRE] = header.centre.tolist()
-    if header.low_bits:
-        fields[LOW_BITS] = header.low_bits
     return canonical.pack(fields)
 
 
 def unpack_header(data: bytes, offset: int = 0) -> Header:
     """The inverse of pack_header (clause "header"); `offset` is that of the header's first byte, for messages."""
-    fields = Fields(canonical.unpack(data, offset=offset), "header", set(range(CHUNKS, LOW_BITS + 1)))
+    fields = Fields(canonical.unpack(data, offset=offset), "header", KEYS)
     steps = fields.reals(STEPS, len(ATTRIBUTES))
     voxel_size = fields.real(VOXEL_SIZE)
     for name, step in zip(["voxel_size", *ATTRIBUTES], [voxel_size, *steps], strict=True):
@@ -148,20 +139,15 @@ def unpack_header(data: bytes, offset: int = 0) -> Header:
     layers = layers_of(chunks)
     if mode == "lzma" and len(set(layers)) < len(layers):
         raise Malformed(f"header: layer chunks {layers} in mode lzma, expected each layer in one slice")
-    low_bits = fields.integer(LOW_BITS, MAX_LOW_BITS, low=1) if LOW_BITS in fields else 0
-    if low_bits and mode == "lzma":
-        raise Malformed(f"header: {low_bits} low bits in mode lzma, expected none")
     return Header(
         chunks=chunks,
         mode=mode,
-        deformation=fields.choice(DEFORMATION, DEFORMATIONS),
         attribute_steps=dict(zip(ATTRIBUTES, steps, strict=True)),
         widths=widths,
         centre=_unpack_centre(fields, widths),
         info=info,
         error_bounds=_unpack_error_bounds(fields),
         digest=_unpack_digest(fields.get(DIGEST)),
-        low_bits=low_bits,
     )
 
 

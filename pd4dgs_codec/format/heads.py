@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from pd4dgs_codec.evaluate.residuals import residuals
 from pd4dgs_codec.format.kinds import LayerKind
 from pd4dgs_codec.format.left_out import LeftOut
+from pd4dgs_codec.format.residuals import residuals
 from pd4dgs_codec.format.symbols import round_tensors
 from pd4dgs_codec.scene import TRUNK, Deformation, Scene
 
@@ -24,7 +24,7 @@ FULL_SAMPLES = 1 << 18
 MIN_TIMES = 17
 
 
-def drop_heads(scene: Scene, kind: LayerKind, judge: bool, raw_deformation: bool) -> tuple[Scene, list[LeftOut]]:
+def drop_heads(scene: Scene, kind: LayerKind, judge: bool) -> tuple[Scene, list[LeftOut]]:
     """(`scene` without the heads of kind's deformation that do nothing, or without it if none is left, what went).
 
     judge: nothing is also what stays within head_bounds, and not only what is exactly zero.
@@ -32,7 +32,7 @@ def drop_heads(scene: Scene, kind: LayerKind, judge: bool, raw_deformation: bool
     given = scene.deformation(kind.layer)
     if given is None:
         return scene, []
-    decoded = given if raw_deformation else round_tensors(given, kind, scene.steps)
+    decoded = round_tensors(given, kind, scene.steps)
     heads = {name: network for name, network in decoded.networks.items() if name != TRUNK}
     why = {name: "zero after quantisation" for name, network in heads.items() if not any(a.any() for a in network[-1])}
     if judge:

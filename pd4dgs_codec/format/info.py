@@ -27,8 +27,7 @@ def info(data: bytes) -> dict[str, Any]:
     layers: {layer, offset, bytes, end, slices} (whole chunks; end = length of the prefix that holds layers 0 .. this
     one) and, for layers that `data` holds whole, anchors, steps, planes ([C, x, y, z, t] per scale), networks (output
     widths) and sections (bytes by name; what else the chunks hold is their frames and their parameters). slices:
-    {offset, bytes, end} and, of those that `data` holds whole, anchors, and where low bits come instead, refines:
-    {layer, slices}.
+    {offset, bytes, end} and, of those that `data` holds whole, anchors.
     metadata: {title, source, licence, command, quality, slices, still_bytes} as far as given, {"fault"} if it cannot be
     read, None where `data` holds no such chunk.
     """
@@ -54,10 +53,8 @@ def info(data: bytes) -> dict[str, Any]:
             row |= {"bytes": row["bytes"] + size, "end": place["end"]}
             if offset + size <= len(data):
                 payload = read_chunk(data, offset, type=chunk_type, length=length).payload
-                meta, _, declared = read_meta(payload, kind, header.widths, declared, header.raw_deformation, later)
+                meta, _, declared = read_meta(payload, kind, header.widths, declared, later)
                 place["anchors"] = meta.rows
-                if meta.refines:
-                    place["refines"] = {"layer": meta.refines[0], "slices": meta.refines[1]}
                 row["anchors"] = row.get("anchors", 0) + meta.rows
                 if not later:
                     row |= {
@@ -79,12 +76,10 @@ def info(data: bytes) -> dict[str, Any]:
         "available": len(data),
         "header_bytes": preamble.size,
         "mode": header.mode,
-        "deformation": header.deformation,
         "voxel_size": header.info.voxel_size,
         "feature_width": header.widths.feature,
         "slots": header.widths.slots,
         "graded": header.widths.graded,
-        "low_bits": header.low_bits,
         "steps": header.attribute_steps,
         "error_bounds": header.error_bounds,
         "anchors": declared.rows if all("anchors" in row for row in layers) else None,
@@ -127,7 +122,7 @@ def nearest_bounds(data: bytes) -> dict[str, float]:
     reader, _ = read_layers(data)
     assert reader.header is not None
     scene = reader.scene()
-    return rounding_bounds(scene, blocks_of(scene), reader.header.raw_deformation)
+    return rounding_bounds(scene, blocks_of(scene))
 
 
 def hashes(data: bytes, max_layer: int | None = None) -> list[dict[str, Any]]:
@@ -136,16 +131,15 @@ def hashes(data: bytes, max_layer: int | None = None) -> list[dict[str, Any]]:
 
     symbols: int32 little-endian, C order, of anchor_q [n, 3], the rise of earlier rows' mask codes, the codes of own
     rows, their step classes if there are any, attributes [channels, n], then planes [C, H, W] scale by scale in the
-    order xy xz xt yz yt zt, then weight [out, in] and bias [out] per linear layer, networks by ascending id; float32
-    planes and weights are left out. tensors: float32 little-endian of anchor [n, 3], feature [n, D], scaling_log [n,
+    order xy xz xt yz yt zt, then weight [out, in] and bias [out] per linear layer, networks by ascending id.
+    tensors: float32 little-endian of anchor [n, 3], feature [n, D], scaling_log [n,
     6], offset [n, G, 3] of own rows, then planes and networks as above.
     """
     reader, _ = read_layers(data, max_layer=max_layer)
     scene = reader.scene()
     rows = []
     for index, layer in enumerate(reader.layers):
-        integers = [a for a in layer.arrays() if a.dtype.kind == "i"]
-        symbols, tensors = _digest(integers, "<i4"), _digest(float_tensors(scene, index), "<f4")
+        symbols, tensors = _digest(layer.arrays(), "<i4"), _digest(float_tensors(scene, index), "<f4")
         rows.append({"layer": layer.kind.layer, "symbols": symbols, "tensors": tensors})
     return rows
 

@@ -13,7 +13,6 @@ from pd4dgs_codec.format.fields import Fields, as_integer, as_list, as_registere
 from pd4dgs_codec.format.kinds import LayerKind
 from pd4dgs_codec.format.limits import (
     MAX_ANCHORS,
-    MAX_CHUNKS,
     MAX_NETWORK_LAYERS,
     MAX_NETWORK_WIDTH,
     MAX_PAYLOAD,
@@ -28,8 +27,7 @@ from pd4dgs_codec.scene import PLANES, TRUNK, Widths
 
 
 class Section(IntEnum):
-    """Parts of a payload, in order; one without symbols is absent. SYMBOLS (mode lzma) stands for 1..4 together,
-    LOW_BITS alone in a slice that refines earlier ones."""
+    """Parts of a payload, in order; one without symbols is absent. SYMBOLS (mode lzma) stands for 1..4 together."""
 
     POSITIONS = 0
     MASKS = 1
@@ -37,12 +35,10 @@ class Section(IntEnum):
     PLANES = 3
     WEIGHTS = 4
     SYMBOLS = 5
-    FLOATS = 6
-    LOW_BITS = 7
 
 
 # Keys of the map.
-ROWS, SECTIONS, STEPS, SCALES, NETWORKS, REFINES = range(1, 7)
+ROWS, SECTIONS, STEPS, SCALES, NETWORKS = range(1, 6)
 
 #: A file of S symbols has at least (S - FREE_SYMBOLS) / SYMBOLS_PER_BYTE bytes, so that a few bytes that declare
 #: constant channels cannot make a decoder allocate without end. Real scenes spend over 0.1 bit per symbol.
@@ -55,7 +51,7 @@ ROWS_PER_BYTE = 2
 
 @dataclass(frozen=True)
 class Declared:
-    """What the slices of a file declare so far: rows, symbols (or values), and the bytes of their payloads."""
+    """What the slices of a file declare so far: rows, symbols, and the bytes of their payloads."""
 
     rows: int = 0
     symbols: int = 0
@@ -84,7 +80,7 @@ class LayerMeta:
     """rows: the slice's own anchors. sections: length in bytes by Section. steps: by field of Steps.
 
     networks: per name the outputs of its linear layers; the first input follows from the layer (input_width). widths:
-    those of the scene's anchors. refines: of a slice that brings low bits, (layer, how many of its slices).
+    those of the scene's anchors.
     """
 
     rows: int
@@ -93,7 +89,6 @@ class LayerMeta:
     scales: tuple[ScaleMeta, ...]
     networks: dict[str, tuple[int, ...]]
     widths: Widths
-    refines: tuple[int, int] | None = None
 
     def input_width(self, name: str, kind: LayerKind) -> int:
         """Inputs of network `name`: the scaffold's fixed ones, the sampled planes' or the trunk's outputs."""
@@ -124,19 +119,15 @@ def pack_meta(meta: LayerMeta, kind: LayerKind) -> bytes:
         fields[SCALES] = [[s.channels, *s.sides, *s.predictors] for s in meta.scales]
     if meta.networks:
         fields[NETWORKS] = [[kind.network_ids[name], *widths] for name, widths in meta.networks.items()]
-    if meta.refines:
-        fields[REFINES] = list(meta.refines)
     return canonical.pack(fields)
 
 
-def unpack_meta(
-    data: bytes, kind: LayerKind, widths: Widths, rows_before: int, raw_deformation: bool, later: bool
-) -> LayerMeta:
+def unpack_meta(data: bytes, kind: LayerKind, widths: Widths, rows_before: int, later: bool) -> LayerMeta:
     """The inverse of pack_meta (clause "layer parameters"); every count is within its limit afterwards.
 
     later: whether it is a slice behind the layer's first."""
     where = f"layer {kind.layer}"
-    fields = Fields(canonical.unpack(data), where, set(range(ROWS, REFINES + 1)))
+    fields = Fields(canonical.unpack(data), where, set(range(ROWS, NETWORKS + 1)))
     known_sections = {int(s) for s in Section}
     sections = Fields(fields.get(SECTIONS), f"{where} sections", known_sections)
     networks = {} if later else _unpack_networks(fields, kind, widths, where)
@@ -144,33 +135,18 @@ def unpack_meta(
         rows=fields.integer(ROWS, MAX_ANCHORS - rows_before),
         sections={s: sections.integer(s, MAX_PAYLOAD, low=1) for s in known_sections if s in sections},
         steps=_unpack_steps(fields, kind, where) if networks else {},
-        scales=_unpack_scales(fields, raw_deformation, where) if networks and kind.layer > 0 else (),
+        scales=_unpack_scales(fields, where) if networks and kind.layer > 0 else (),
         networks=networks,
         widths=widths,
-        refines=_unpack_refines(fields, kind, where) if REFINES in fields else None,
     )
-    if meta.refines and not later:
-        raise Malformed(f"{where}: its first slice refines others, expected a later one")
-    if (Section.LOW_BITS in meta.sections) != bool(meta.refines) or (meta.refines and len(meta.sections) > 1):
-        raise Malformed(f"{where}: sections {sorted(meta.sections)}, expected {int(Section.LOW_BITS)} with key 6 alone")
-    if meta.refines and meta.rows:
-        raise Malformed(f"{where}: a slice that refines others has {meta.rows} anchors, expected none")
     for key, expected in ((STEPS, bool(networks)), (SCALES, bool(meta.scales)), (NETWORKS, bool(networks))):
         if (key in fields) != expected:
             raise Malformed(f"{where}: key {key} is {'missing' if expected else 'there'} without reason")
     return meta
 
 
-def _unpack_refines(fields: Fields, kind: LayerKind, where: str) -> tuple[int, int]:
-    layer, slices = fields.sequence(REFINES, 2)
-    return (
-        as_integer(layer, kind.layer, f"{where}: the layer that it refines"),
-        as_integer(slices, MAX_CHUNKS, f"{where}: number of slices that it refines", low=1),
-    )
-
-
 def declared_symbols(meta: LayerMeta, kind: LayerKind, rises: int) -> int:
-    """Symbols (or float32 values) that the parameters say the slice has, voxel indices and masks included."""
+    """Symbols that the parameters say the slice has, voxel indices and masks included."""
     cells = sum(math.prod(shape) for shape in meta.plane_shapes())
     weights = sum(math.prod(shape) for shape in meta.weight_shapes(kind)) if meta.networks else 0
     return rises + meta.rows * (meta.widths.channels + meta.widths.graded + 4) + cells + weights
@@ -205,7 +181,7 @@ def _unpack_steps(fields: Fields, kind: LayerKind, where: str) -> dict[str, floa
     return steps
 
 
-def _unpack_scales(fields: Fields, raw_deformation: bool, where: str) -> tuple[ScaleMeta, ...]:
+def _unpack_scales(fields: Fields, where: str) -> tuple[ScaleMeta, ...]:
     rows = fields.sequence(SCALES)
     as_integer(len(rows), MAX_PLANE_SCALES, f"{where}: number of scales", low=1)
     scales: list[ScaleMeta] = []
@@ -217,8 +193,7 @@ def _unpack_scales(fields: Fields, raw_deformation: bool, where: str) -> tuple[S
         for side in rest[:4]:
             as_integer(side, MAX_PLANE_SIDE, f"{where} scale {i} side", low=1)
         for predictor in rest[4:]:
-            if as_registered(predictor, PREDICTORS, f"{where} scale {i} predictor") != 0 and raw_deformation:
-                raise Malformed(f"{where} scale {i}: predictor {predictor} on float32 planes, expected 0")
+            as_registered(predictor, PREDICTORS, f"{where} scale {i} predictor")
         scales.append(ScaleMeta(channels, tuple(rest[:4]), tuple(rest[4:])))
     return tuple(scales)
 

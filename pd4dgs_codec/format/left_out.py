@@ -40,8 +40,7 @@ class LeftOut:
 
 def tensor_bytes(tensors: Deformation, kind: LayerKind, steps: Steps, options: EncodeOptions) -> int:
     """What planes and networks alone would take as the layer of `kind`."""
-    if not options.raw_deformation:
-        tensors = quantise_tensors(tensors, kind, steps)
+    tensors = quantise_tensors(tensors, kind, steps)
     empty = np.zeros(0, np.int32)
     alone = LayerSymbols(
         kind=kind,
@@ -54,6 +53,5 @@ def tensor_bytes(tensors: Deformation, kind: LayerKind, steps: Steps, options: E
         planes=tensors.planes,
         networks=tensors.networks,
         steps=layer_steps(steps, kind),
-        raw_deformation=options.raw_deformation,
     )
     return len(write_layer(alone, options)[0])

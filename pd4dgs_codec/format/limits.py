@@ -7,7 +7,6 @@ MAX_HEADER = 1 << 14  #: bytes; the longest chunk list takes two thirds of it
 MAX_PARAMETERS = 4096  #: bytes of a layer's parameters; msgpack takes up to 130 times its bytes in memory
 MAX_CHUNKS = 1024  #: slices of layers and ancillary chunks; a slice's number takes ten bits
 MAX_PAYLOAD = (1 << 31) - 1  #: bytes in one chunk; fits a signed 32-bit size on every platform
-MAX_LOW_BITS = 4  #: of an attribute's symbol; with more nothing would be left of most channels
 MAX_DEPTH = 4  #: nested maps and lists in canonical msgpack
 
 # Scene

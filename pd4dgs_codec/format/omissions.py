@@ -1,66 +1,55 @@
-"""The omissions that change no picture.
+"""Omissions that change no picture: dead units of networks, features nobody reads, plane cells no anchor reads.
 
-`leave_out_unseen` works on the values that the file will hold, so that what it proves holds for them: cells that no
-renderer reads take the cheapest values, offsets of Gaussians that no view shows the commonest ones, and inputs that
-nothing reads and the weights of units that are silent or unread become 0. No array changes its shape, and all terms
-that sums lose were zeros: the same arithmetic gives the same bits.
+All of it works on the values that the file will hold. No array changes its shape, and all terms that sums lose were
+zeros: the same arithmetic gives the same bits.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 
 import numpy as np
 
-from pd4dgs_codec.entropy.bits import entropy_bits, symbol_counts
-from pd4dgs_codec.evaluate.reach import Reached, global_cells, local_cells, shown_gaussians
+from pd4dgs_codec.entropy.bits import entropy_bits
 from pd4dgs_codec.format.kinds import LAYER_KINDS, LayerKind
 from pd4dgs_codec.format.left_out import LeftOut
 from pd4dgs_codec.format.plane_choice import choose_predictor, fill_plane
 from pd4dgs_codec.format.quantise import dequantise, quantise
 from pd4dgs_codec.format.symbols import rounded
 from pd4dgs_codec.format.table import Grid, classes_of
-from pd4dgs_codec.scene import PLANES, TRUNK, Deformation, Network, Planes, Scene
+from pd4dgs_codec.scene import PLANES, TRUNK, Deformation, Network, Planes, Scene, plane_sides
 
 #: Networks whose values may exceed this are left as they are; binary32 overflows at 3.4e38.
 LARGEST = 1e30
-#: Bits that must be in sight for an evaluation of the global networks at one anchor, over one stretch of time, at the
-#: usual effort: some 40 kB for a second. A proof finds a part of them. Two levels of effort are a factor of ten.
-PRICE, USUAL_EFFORT = 0.3, 5
-#: Planes with cheapest values in cells take so much less than their order-0 entropies differ: 2 to 3 times on trained
-#: scenes, for their neighbours are predicted better.
-CELLS_GAIN = 3
+#: Cells by which a position may be off: another renderer rounds its coordinates otherwise.
+CELL_SLACK = 0.02
 
 
-def leave_out_unseen(scene: Scene, raw_deformation: bool, effort: int) -> tuple[Scene, list[LeftOut]]:
+def leave_out_unseen(scene: Scene) -> tuple[Scene, list[LeftOut]]:
     """(`scene` without what no picture needs, what went). scene: as planned, all its rows active at its highest level.
 
-    Where nothing is left out the values stay those given; what takes another value takes one that has a symbol. effort:
-    1..9, how little a proof may save that takes its time.
+    Where nothing is left out the values stay those given; what takes another value takes one that has a symbol.
     """
-    omissions = _Omissions(scene, raw_deformation)
+    omissions = _Omissions(scene)
     del scene  # see `plan`
     while omissions.within_range() and omissions.simplify_networks():
         pass
-    omissions.free_offsets_and_cells(PRICE * 10.0 ** ((USUAL_EFFORT - effort) / 2))
+    omissions.free_cells()
     return omissions.scene, omissions.found
 
 
 #: (weight, bias) of a linear layer -> what takes its place.
 LinearEdit = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
-#: Per scale, by name: the symbols of a plane int32 [C, H, W], and the bits that they take.
-CodedPlanes = list[dict[str, tuple[np.ndarray, float]]]
-
 
 class _Omissions:
     """scene: as given, less what went so far. decoded: the same as a decoder will see it."""
 
-    def __init__(self, scene: Scene, raw_deformation: bool):
-        self.scene, self.raw_deformation = scene, raw_deformation
+    def __init__(self, scene: Scene):
+        self.scene = scene
         self.found: list[LeftOut] = []
-        self.decoded = rounded(scene, raw_deformation)
+        self.decoded = rounded(scene)
 
     # -- networks ----------------------------------------------------------------------------------------------------
 
@@ -182,101 +171,33 @@ class _Omissions:
         what = f"{kind.name} {name}: {int(dead.sum())} units of layer {index + 1}"
         self._note(what, "always 0, or read by nothing", bits)
 
-    # -- offsets and cells -------------------------------------------------------------------------------------------
+    # -- cells -----------------------------------------------------------------------------------------------------
 
-    def free_offsets_and_cells(self, price: float) -> None:
-        """Offsets of Gaussians never shown, and plane cells never read, as `reach` proves where that may save `price`
-        bits an evaluation; in this order, for the offsets say where cells are read."""
-        self._free_cells(LAYER_KINDS[1], self._coded_planes(LAYER_KINDS[1]), global_cells(self.decoded))
-        shown = shown_gaussians(
-            self.decoded,
-            lambda certain, evaluations: sum(bits for *_, bits in self._cheaper(certain)) > price * evaluations,
-        )
-        self._free_offsets(shown)
-        kind = LAYER_KINDS[2]
-        coded = self._coded_planes(kind)
-        cells = local_cells(
-            self.decoded,
-            shown,
-            lambda read, evaluations: CELLS_GAIN * self._without_cells(kind, coded, read)[1] > price * evaluations,
-        )
-        if cells:
-            self._free_cells(kind, coded, cells)
-
-    def _cheaper(self, shown: np.ndarray) -> Iterator[tuple[int, np.ndarray, float, float]]:
-        """(channel of the offsets, rows of Gaussians that are not `shown` bool [N, G], value, bits saved) where these
-        take fewer bits with the commonest symbol of their step class, or of those shown if there are any."""
-        grid, classes = Grid.of(self.decoded), classes_of(self.decoded)
-        groups = [(int(k), np.flatnonzero(classes == k)) for k in np.unique(classes)]
-        offset = self.decoded.offset.reshape(len(shown), 3 * shown.shape[1])
-        for channel in range(offset.shape[1]):
-            one = slice(channel, channel + 1)
-            (symbols,) = grid.symbols_of("offset", offset[:, one], classes, one)
-            for step_class, rows in groups or [(0, np.arange(len(shown)))]:
-                own, before = shown[rows, channel // 3], symbols[rows]
-                if own.all():
-                    continue
-                values, counts = symbol_counts(before[own]) if own.any() else (np.zeros(1, int), np.ones(1, int))
-                symbol = int(values[counts.argmax()])
-                bits = entropy_bits(before) - entropy_bits(np.where(own, before, symbol))
-                if bits > 0:
-                    yield channel, rows[~own], grid.value_of("offset", symbol, channel, step_class), bits
-
-    def _free_offsets(self, shown: np.ndarray) -> None:
-        if shown.all():
+    def free_cells(self) -> None:
+        """Cells of the global planes that no anchor reads take values that cost little."""
+        kind = LAYER_KINDS[1]
+        deformation, free, cells, saved = self.decoded.global_deformation, 0, 0, 0.0
+        if deformation is None:
             return
-        given, decoded, saved = self.scene.offset.copy(), self.decoded.offset.copy(), 0.0
-        for channel, rows, value, bits in self._cheaper(shown):
-            for offset in (given, decoded):
-                offset[rows, channel // 3, channel % 3] = value
-            saved += bits
-        if saved:
-            what = f"offsets of {int((~shown).sum())} Gaussians"
-            self._note(what, "no view shows them at any time", saved)
-            self.scene, self.decoded = replace(self.scene, offset=given), replace(self.decoded, offset=decoded)
-
-    def _coded_planes(self, kind: LayerKind) -> CodedPlanes:
-        scales = self.decoded.tensors(kind.layer).planes if self._networks(kind) else ()
-        symbols = [{name: self._plane_symbols(kind, scale[name]) for name, _, _ in PLANES} for scale in scales]
-        return [
-            {name: (own, 0.0 if self.raw_deformation else _plane_bits(own)) for name, own in scale.items()}
-            for scale in symbols
-        ]
-
-    def _without_cells(
-        self, kind: LayerKind, coded: CodedPlanes, read: Reached
-    ) -> tuple[list[dict[str, np.ndarray]], float]:
-        """(per scale, by name, the planes that may take other values in cells that are not `read`; bits saved)."""
-        planes: list[dict[str, np.ndarray]] = []
-        saved = 0.0
-        for scale, marks in zip(coded, read, strict=True):
-            planes.append({})
-            for name, mark in marks.items():
-                symbols, bits = scale[name]
-                cheap = np.where(mark, symbols, 0) if self.raw_deformation else fill_plane(symbols, mark)
-                if (cheap == symbols).all():
-                    continue
-                if self.raw_deformation:
-                    planes[-1][name] = cheap.view(np.float32)
-                    saved += 32.0 * len(symbols) * int((~mark).sum())
-                else:
-                    planes[-1][name] = dequantise(cheap, self.scene.steps.planes(kind.layer))
-                    saved += bits - _plane_bits(cheap)
-        return planes, saved
-
-    def _free_cells(self, kind: LayerKind, coded: CodedPlanes, read: Reached) -> None:
-        values, saved = self._without_cells(kind, coded, read)
-        if not any(values):
+        step, planes = self.scene.steps.planes(kind.layer), []
+        read = cells_read(self.decoded, deformation)
+        for scale, marks in zip(deformation.planes, read, strict=True):
+            filled = {}
+            for name, _, _ in PLANES:
+                symbols = quantise(scale[name], step, "plane")
+                cheap = fill_plane(symbols, marks[name])
+                filled[name] = np.where(marks[name] | (cheap == symbols), np.nan, dequantise(cheap, step))
+                free, cells = free + int((~marks[name]).sum()), cells + marks[name].size
+                saved += _plane_bits(symbols) - _plane_bits(cheap)
+            planes.append(filled)
+        if all(np.isnan(plane).all() for scale in planes for plane in scale.values()):
             return
-        marks = [mark for scale in read for mark in scale.values()]
-        free, cells = sum(int((~mark).sum()) for mark in marks), sum(mark.size for mark in marks)
-        why = "no anchor is ever there" if kind.layer == 1 else "no Gaussian shown is ever there"
-        self._note(f"{kind.name}: {free:,} of {cells:,} plane cells", why, saved)
+        self._note(f"{kind.name}: {free:,} of {cells:,} plane cells", "no anchor is ever there", saved)
         self._edit_planes(
             kind,
-            lambda planes: tuple(
-                scale | {name: np.where(marks[name], scale[name], cheap[name]) for name in cheap}
-                for scale, marks, cheap in zip(planes, read, values, strict=True)
+            lambda given: tuple(
+                {n: np.where(np.isnan(new[n]), old[n], new[n]) for n, _, _ in PLANES}
+                for old, new in zip(given, planes, strict=True)
             ),
         )
 
@@ -317,18 +238,39 @@ class _Omissions:
         self._note(f"{kind.name} {name}: {of} of weights", "read by nothing, or always times 0", saved)
 
     def _cost(self, kind: LayerKind, layers: list[tuple[str, int]]) -> float:
-        """Order-0 entropy of the weights and biases of linear layers (network, index); 0 if they are float32 values."""
-        if self.raw_deformation and kind.layer > 0:
-            return 0.0
+        """Order-0 entropy of the weights and biases of linear layers (network, index)."""
         step = self.scene.steps.weights(kind.layer)
         arrays = [a for name, index in layers for a in self._networks(kind)[name][index]]
         return _bits([quantise(a, step, "weight").ravel() for a in arrays])
 
     def _plane_symbols(self, kind: LayerKind, plane: np.ndarray) -> np.ndarray:
-        """int32 symbols, or of float32 values their bits."""
-        if self.raw_deformation:
-            return np.ascontiguousarray(plane).view(np.int32)
+        """int32 symbols."""
         return quantise(plane, self.scene.steps.planes(kind.layer), "plane")
+
+
+def cells_read(scene: Scene, deformation: Deformation) -> list[dict[str, np.ndarray]]:
+    """Per scale, by plane name, bool [H, W]: the cells of the global planes that an anchor reads at some time."""
+    low, high = scene.info.box
+    extent = np.maximum(high - low, np.finfo(np.float32).tiny)
+    unit = np.clip((scene.anchor - low) / extent, 0.0, 1.0)
+    read = []
+    for scale in deformation.planes:
+        cells = [_cells(unit[:, axis], side) for axis, side in enumerate(plane_sides(scale)[:3])]
+        marks = {}
+        for name, a, b in PLANES:
+            marks[name] = np.zeros(scale[name].shape[1:], bool)
+            for i in cells[a]:
+                for j in cells[b] if b < 3 else [slice(None)]:
+                    marks[name][j, i] = True
+        read.append(marks)
+    return read
+
+
+def _cells(unit: np.ndarray, side: int) -> list[np.ndarray]:
+    """int64 [n] each: the cells that samples at unit float32 [n], 0..1, may read on an axis of `side` cells."""
+    first = np.floor(unit * (side - 1) - CELL_SLACK)
+    last = np.floor(unit * (side - 1) + CELL_SLACK) + 1
+    return [np.clip(cell, 0, side - 1).astype(np.int64) for cell in (first, first + 1, last)]
 
 
 def _largest(network: Network, inputs: np.ndarray) -> np.ndarray:

@@ -12,25 +12,20 @@ from typing import TYPE_CHECKING
 
 from pd4dgs_codec.entropy import EFFORTS, PRIORS
 from pd4dgs_codec.errors import EncodeError
-from pd4dgs_codec.format.limits import MAX_LOW_BITS
 
 if TYPE_CHECKING:
     from pd4dgs_codec.scene import Scene
 
-#: How symbols are coded, and how planes and networks of layers 1 and 2 travel: the numbers are those of the header.
+#: How symbols are coded, with the numbers of the header.
 MODES = {"ans": 0, "lzma": 1}
-RAW_DEFORMATION = "float32"
-DEFORMATIONS = {"coded": 0, RAW_DEFORMATION: 1}
 
 #: What may be chosen, by field of EncodeOptions.
 CHOICES: Mapping[str, Sequence[str | int]] = {
     "mode": tuple(MODES),
-    "deformation": tuple(DEFORMATIONS),
     "priors": PRIORS,
     "layers": ("auto", 0, 1, 2),
     "effort": EFFORTS,
     "omit": ("bounded", "lossless", "nothing"),
-    "low_bits": tuple(range(MAX_LOW_BITS + 1)),
 }
 
 
@@ -42,28 +37,25 @@ LEAST_SLICE = 1000
 class EncodeOptions:
     """Options of the encoder. Raises EncodeError for a value that is none.
 
-    mode: "ans", or "lzma" for the same symbols under LZMA2. deformation: "coded", or "float32" for planes and networks
-    of layers 1 and 2 as they are, under LZMA2. priors: "best", or "gauss", the model of R(a). layers: "auto" leaves out
-    every head that is zero after quantisation or below the bounds of `heads`, then every layer without one; 0, 1 or 2
-    keeps the layers up to that number and only drops heads that are exactly zero. effort: 1 (fast) .. 9 (small). omit:
+    mode: "ans", or "lzma" for the same symbols under LZMA2. priors: "best", or "gauss", the model of R(a). layers:
+    "auto" leaves out every head that is zero after quantisation or below the bounds of `heads`, then every layer
+    without one; 0, 1 or 2 keeps the layers up to that number and only drops heads that are exactly zero. effort:
+    1 (fast) .. 9 (small). omit:
     "bounded" leaves out what those bounds allow and what changes no picture, "lossless" only the latter, "nothing" only
     heads that are exactly zero and anchors below the mask threshold. step_scale multiplies every quantisation step.
     slices: bytes that a slice of a layer takes at most where its planes and networks allow it, the header counted with
     the first; 0 for one slice per layer.
-    low_bits: so many bits of the attributes' symbols come behind those of layer 1, 0..4: earlier pictures, more bytes.
     verify: decode the result, compare every symbol and every float, and hold every float against the error bound in the
     header.
     """
 
     mode: str = "ans"
-    deformation: str = "coded"
     priors: str = "best"
     layers: str | int = "auto"
     effort: int = 5
     omit: str = "bounded"
     step_scale: float = 1.0
     slices: int = 0
-    low_bits: int = 0
     verify: bool = True
 
     def __post_init__(self) -> None:
@@ -75,15 +67,8 @@ class EncodeOptions:
             raise EncodeError(f"step_scale {self.step_scale!r}, expected a positive number")
         if self.slices and self.slices < LEAST_SLICE:
             raise EncodeError(f"slices of {self.slices} bytes, expected 0 or {LEAST_SLICE} and more")
-        if self.low_bits and self.mode != "ans":
-            raise EncodeError(f"low bits in mode {self.mode}, expected mode ans or none")
         if self.slices and self.mode != "ans":
             raise EncodeError(f"slices in mode {self.mode}, expected mode ans or one slice per layer")
-
-    @property
-    def raw_deformation(self) -> bool:
-        """Whether planes and networks of layers 1 and 2 are stored as float32 values."""
-        return self.deformation == RAW_DEFORMATION
 
     def apply_scale(self, scene: Scene) -> tuple[Scene, EncodeOptions]:
         """(`scene` at the steps of its file, binary32, and options that scale them no more)."""

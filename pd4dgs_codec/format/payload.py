@@ -16,12 +16,7 @@ import numpy as np
 from pd4dgs_codec.entropy.bits import entropy_bits, gaussian_bits
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
 from pd4dgs_codec.entropy.fitting import Fitted
-from pd4dgs_codec.entropy.lzma_mode import (
-    decode_channels_lzma,
-    decode_floats_lzma,
-    encode_channels_lzma,
-    encode_floats_lzma,
-)
+from pd4dgs_codec.entropy.lzma_mode import decode_channels_lzma, encode_channels_lzma
 from pd4dgs_codec.entropy.positions import decode_positions, encode_positions
 from pd4dgs_codec.entropy.priors import Prior
 from pd4dgs_codec.errors import LimitExceeded, Malformed
@@ -42,11 +37,11 @@ from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.plane_choice import choose_predictor
 from pd4dgs_codec.format.plane_section import read_planes, write_planes
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, magnitude
-from pd4dgs_codec.format.symbols import LayerSymbols, Refinement
+from pd4dgs_codec.format.symbols import LayerSymbols
 from pd4dgs_codec.format.table import NO_CLASSES
 from pd4dgs_codec.scene import MASK_MIN_CODE, PLANES, Network, Planes, Widths
 
-#: The groups of channels, by section, in coding order; FLOATS and POSITIONS are not channels.
+#: The groups of channels, by section, in coding order; POSITIONS are not channels.
 GROUPS = (Section.MASKS, Section.ATTRIBUTES, Section.PLANES, Section.WEIGHTS)
 
 
@@ -98,11 +93,6 @@ def write_layer(
         sections[section] = data
         count = sum(channel.size for channel in channels)
         reports.append(StreamReport(section.name.lower(), 8 * len(data), rate_bits, count))
-    if symbols.raw_deformation and symbols.networks:
-        sections[Section.FLOATS] = encode_floats_lzma([a.ravel() for a in symbols.tensors()], effort=options.effort)
-        reports.append(StreamReport("floats", 8 * len(sections[Section.FLOATS]), 0.0, 0))
-    if symbols.refines:
-        sections[Section.LOW_BITS] = symbols.refines.section
     meta = pack_meta(_meta(symbols, sections, predictors), symbols.kind)
     return b"".join([struct.pack("<I", len(meta)), meta, *sections.values()]), reports
 
@@ -123,10 +113,9 @@ def channel_groups(symbols: LayerSymbols) -> tuple[dict[Section, list[np.ndarray
     groups: dict[Section, list[np.ndarray]] = {section: [] for section in GROUPS}
     groups[Section.MASKS] = [symbols.mask_increase, symbols.mask_own]
     groups[Section.ATTRIBUTES] = [*([symbols.classes] if symbols.widths.graded else []), *symbols.attributes]
-    tensors = [] if symbols.raw_deformation else list(symbols.tensors())
     n_planes = len(PLANES) * len(symbols.planes)
     predictors = [0] * n_planes
-    for i, tensor in enumerate(tensors):
+    for i, tensor in enumerate(symbols.tensors()):
         if i < n_planes:
             predictors[i], residual = choose_predictor(tensor)
             groups[Section.PLANES] += list(residual.reshape(residual.shape[0], -1))
@@ -155,7 +144,6 @@ def _meta(symbols: LayerSymbols, sections: dict[Section, bytes], predictors: lis
         scales=tuple(scales),
         networks={name: tuple(w.shape[0] for w, _ in network) for name, network in symbols.networks.items()},
         widths=symbols.widths,
-        refines=(symbols.refines.layer, symbols.refines.slices) if symbols.refines else None,
     )
 
 
@@ -164,7 +152,6 @@ def read_meta(
     kind: LayerKind,
     widths: Widths,
     before: Declared,
-    raw_deformation: bool,
     later: bool = False,
 ) -> tuple[LayerMeta, int, Declared]:
     """(parameters, offset of the first section, what the file declares with this slice) of a payload, all lengths
@@ -177,7 +164,7 @@ def read_meta(
         raise LimitExceeded(f"layer {kind.layer}: parameters of {length} bytes, limit {MAX_PARAMETERS}")
     if length > len(payload) - 4:
         raise Malformed(f"layer {kind.layer}: parameters of {length} bytes in a payload of {len(payload)}")
-    meta = unpack_meta(bytes(payload[4 : 4 + length]), kind, widths, before.rows, raw_deformation, later)
+    meta = unpack_meta(bytes(payload[4 : 4 + length]), kind, widths, before.rows, later)
     start, declared = 4 + length, sum(meta.sections.values())
     if start + declared != len(payload):
         raise Malformed(f"layer {kind.layer}: sections of {declared} bytes, expected {len(payload) - start}")
@@ -190,7 +177,6 @@ def read_layer(
     widths: Widths,
     before: Declared,
     mode: str,
-    raw_deformation: bool,
     later: bool = False,
     past: Past[Prior] | None = None,
 ) -> LayerSymbols:
@@ -200,21 +186,13 @@ def read_layer(
 
     Raises DecodeError's subclasses; nothing is allocated for a count that the limits or the payload do not cover.
     """
-    meta, start, _ = read_meta(payload, kind, widths, before, raw_deformation, later)
+    meta, start, _ = read_meta(payload, kind, widths, before, later)
     parts: dict[int, bytes] = {}
     for section, length in sorted(meta.sections.items()):
         parts[section] = bytes(payload[start : start + length])
         start += length
-    refines = Refinement(*meta.refines, parts.pop(Section.LOW_BITS)) if meta.refines else None
-    raw_deformation = raw_deformation and bool(meta.networks) and kind.layer > 0
-    shapes = [*meta.plane_shapes(), *meta.weight_shapes(kind)]
-    counts = _channel_counts(meta, kind, 0 if later else before.rows, raw_deformation)
-    channels = _decode_groups(parts, counts, meta, mode, past)
-    if raw_deformation:
-        floats = decode_floats_lzma(_part(parts, Section.FLOATS, 1), [math.prod(shape) for shape in shapes])
-        tensors = [x.reshape(shape) for x, shape in zip(floats, shapes, strict=True)]
-    else:
-        tensors = _integer_tensors(meta, kind, channels)
+    channels = _decode_groups(parts, _channel_counts(meta, kind, 0 if later else before.rows), meta, mode, past)
+    tensors = _integer_tensors(meta, kind, channels)
     if parts:
         raise Malformed(f"layer {kind.layer}: section {min(parts)} is there, but nothing is left for it to code")
     anchor_q = channels[Section.POSITIONS][0]
@@ -224,12 +202,9 @@ def read_layer(
     classes, attributes = channels[Section.ATTRIBUTES]
     check_classes(classes)
     for tensor in (attributes, *tensors):
-        if tensor.dtype.kind == "i" and magnitude(tensor) > MAX_SYMBOL:
+        if magnitude(tensor) > MAX_SYMBOL:
             raise Malformed(f"layer {kind.layer}: a symbol over {MAX_SYMBOL} in magnitude")
-    steps = meta.steps
-    return LayerSymbols(
-        kind, widths, anchor_q, increase, own, classes, attributes, planes, networks, steps, raw_deformation, refines
-    )
+    return LayerSymbols(kind, widths, anchor_q, increase, own, classes, attributes, planes, networks, meta.steps)
 
 
 def _part(parts: dict[int, bytes], section: Section, symbols: int) -> bytes:
@@ -240,14 +215,12 @@ def _part(parts: dict[int, bytes], section: Section, symbols: int) -> bytes:
     return parts.pop(section, b"")
 
 
-def _channel_counts(meta: LayerMeta, kind: LayerKind, rises: int, raw_deformation: bool) -> dict[Section, list[int]]:
-    planes = [] if raw_deformation else [h * w for c, h, w in meta.plane_shapes() for _ in range(c)]
-    weights = [] if raw_deformation else [math.prod(shape) for shape in meta.weight_shapes(kind)]
+def _channel_counts(meta: LayerMeta, kind: LayerKind, rises: int) -> dict[Section, list[int]]:
     return {
         Section.MASKS: [rises, meta.rows],
         Section.ATTRIBUTES: [meta.rows] * (meta.widths.channels + meta.widths.graded),
-        Section.PLANES: planes,
-        Section.WEIGHTS: weights,
+        Section.PLANES: [h * w for c, h, w in meta.plane_shapes() for _ in range(c)],
+        Section.WEIGHTS: [math.prod(shape) for shape in meta.weight_shapes(kind)],
     }
 
 

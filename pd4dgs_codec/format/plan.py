@@ -35,7 +35,7 @@ def plan(scene: Scene, options: EncodeOptions = DEFAULTS) -> tuple[Scene, list[L
     kept = [0]
     for layer in scene.layers[1:]:
         kind = LAYER_KINDS[layer]
-        scene, dropped = drop_heads(scene, kind, judge and options.omit == "bounded", options.raw_deformation)
+        scene, dropped = drop_heads(scene, kind, judge and options.omit == "bounded")
         left_out += dropped
         if not judge or scene.deformation(layer) is not None:
             kept.append(layer)
@@ -46,7 +46,7 @@ def plan(scene: Scene, options: EncodeOptions = DEFAULTS) -> tuple[Scene, list[L
     if options.omit != "nothing":
         given = [arranged]
         del arranged  # nobody keeps what takes other values: arrays as large as the scene's
-        arranged, lossless = leave_out_unseen(given.pop(), options.raw_deformation, options.effort)
+        arranged, lossless = leave_out_unseen(given.pop())
         left_out += lossless
     return arranged, left_out
 

@@ -5,8 +5,7 @@ Nothing here is normative.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -15,8 +14,7 @@ from pd4dgs_codec.format.attribute_section import Past
 from pd4dgs_codec.format.container import CHUNK_OVERHEAD
 from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.payload import StreamReport, write_layer
-from pd4dgs_codec.format.refining import coarse, write_refinement
-from pd4dgs_codec.format.symbols import LayerSymbols, Refinement, sliced
+from pd4dgs_codec.format.symbols import LayerSymbols, sliced
 
 TRIES = 4  #: at most so many encodes of one slice to hit its size
 SLACK = 0.97  #: of the size wanted, what a slice is aimed at
@@ -25,7 +23,7 @@ FULL = 0.92  #: of the size wanted, what is large enough
 
 @dataclass(frozen=True, eq=False)
 class Slice:
-    """A slice as it is written: its own symbols, low bits included, its payload, and what each section took."""
+    """A slice as it is written: its own symbols, its payload, and what each section took."""
 
     symbols: LayerSymbols
     payload: bytes
@@ -34,7 +32,7 @@ class Slice:
 
 def whole_layer(layer: LayerSymbols, options: EncodeOptions) -> Slice:
     """A layer in one slice."""
-    return Slice(layer, *write_layer(coarse(layer, options.low_bits), options))
+    return Slice(layer, *write_layer(layer, options))
 
 
 def write_slices(layer: LayerSymbols, options: EncodeOptions, utility: np.ndarray, reserved: int = 0) -> list[Slice]:
@@ -44,7 +42,6 @@ def write_slices(layer: LayerSymbols, options: EncodeOptions, utility: np.ndarra
     slice and count as part of it. A first slice that is larger without anchors, for its planes and networks, is left
     at that, but for layer 0: a picture needs anchors.
     """
-    fine, layer = layer, coarse(layer, options.low_bits)
     rows = np.argsort(-utility, kind="stable")
     costs = np.cumsum(bits_per_row(layer)[rows]) / 8
     done, found, past = 0, list[Slice](), Past[Fitted]()
@@ -62,57 +59,19 @@ def write_slices(layer: LayerSymbols, options: EncodeOptions, utility: np.ndarra
             likely = int(np.searchsorted(expected, room * SLACK, side="right"))
             count = min(max(likely, least), len(rows) - done)
             part = rows[done : done + count]
-            symbols, own = (sliced(x, [rows[:0], part] if found else [part])[-1] for x in (layer, fine))
+            symbols = sliced(layer, [rows[:0], part] if found else [part])[-1]
             trial = past.copy()
             payload, streams = write_layer(symbols, options, trial, layer)
             if count:
                 scale *= max(len(payload) - fixed, 1) / max(expected[count - 1] - fixed, 1)
             fits = len(payload) <= room or count <= least
-            tries.append((fits, count, Slice(own, payload, streams), trial))
+            tries.append((fits, count, Slice(symbols, payload, streams), trial))
             if fits and (len(payload) >= room * FULL or count in (least, len(rows) - done)):
                 break
         _, count, made, past = max(tries, key=lambda tried: (tried[0], tried[1] if tried[0] else -tried[1]))
         found.append(made)
         done += count
     return found
-
-
-def with_low_bits(layers: Sequence[list[Slice]], options: EncodeOptions) -> list[list[Slice]]:
-    """The layers' slices, and behind them those that bring low bits. Those of layer 0 wait for layer 1: that things
-    move shows more than the last bits of where they are. Layer 2 waits for all of them."""
-    if len(layers) == 1:
-        return [[*layers[0], *_refining_slices(layers[0], layers, options)]]
-    base, first, *more = layers
-    first = [*first, *_refining_slices(first, (base, first), options)]
-    return [base, first, *([*parts, *_refining_slices(parts, (parts,), options)] for parts in more)]
-
-
-def _refining_slices(owner: Sequence[Slice], layers: Sequence[Sequence[Slice]], options: EncodeOptions) -> list[Slice]:
-    """Slices of the owner's layer that bring the low bits of these layers: each those of as many slices of one layer as
-    keep to options.slices."""
-    found: list[Slice] = []
-    bare = sliced(owner[0].symbols, [np.zeros(0, np.int64)] * 2)[-1]
-    for parts in layers:
-        done = 0
-        while any(len(part.symbols.anchor_q) for part in parts[done:]):
-            least = next(i + 1 for i, part in enumerate(parts[done:]) if len(part.symbols.anchor_q))
-            count, made = len(parts) - done, None
-            while made is None:
-                made = _refining(bare, [part.symbols for part in parts[done : done + count]], options)
-                if count > least and options.slices and len(made.payload) + CHUNK_OVERHEAD > options.slices:
-                    count, made = min(count - 1, max(least, count * options.slices // len(made.payload))), None
-            found.append(made)
-            done += count
-    return found
-
-
-def _refining(bare: LayerSymbols, parts: Sequence[LayerSymbols], options: EncodeOptions) -> Slice:
-    coded = write_refinement(parts, options.low_bits, options)
-    symbols = replace(bare, refines=Refinement(parts[0].kind.layer, len(parts), coded.payload))
-    size = sum(part.attributes.size for part in parts)
-    report = StreamReport("low_bits", coded.payload_bits, coded.rate_bits, size)
-    payload, (positions, *_) = write_layer(symbols, options)
-    return Slice(symbols, payload, [positions, report])
 
 
 def bits_per_row(layer: LayerSymbols) -> np.ndarray:

@@ -19,25 +19,15 @@ from pd4dgs_codec.scene import PLANES, Deformation, Grading, Network, Planes, Sc
 ArrayMap = Callable[[str, np.ndarray], np.ndarray]
 
 
-@dataclass(frozen=True)
-class Refinement:
-    """Low bits of the attributes of earlier rows, coded: those of the next `slices` slices of `layer` that have none
-    yet. See `refining`."""
-
-    layer: int
-    slices: int
-    section: bytes
-
-
 @dataclass(frozen=True, eq=False)
 class LayerSymbols:
     """What one layer carries, or one slice of it: later slices have anchors with their masks and attributes alone.
 
     widths: of the anchors. anchor_q: int32 [n, 3] voxel indices of its own anchors, in Morton order. mask_increase:
     int32 [rows before] rise of the earlier anchors' mask codes, mask_own: int32 [n] codes of its own. classes: int32
-    [n] step classes, or NO_CLASSES. attributes: int32 [channels, n]. planes, networks: int32 symbols, or float32 values
-    if raw_deformation; networks in the order of their registry ids. steps: quantisation steps of this layer by name, as
-    in LayerKind.step_names; empty if it has no networks. refines: of a slice without anchors, what it brings instead.
+    [n] step classes, or NO_CLASSES. attributes: int32 [channels, n]. planes, networks: int32 symbols;
+    networks in the order of their registry ids. steps: quantisation steps of this layer by name, as in
+    LayerKind.step_names; empty if it has no networks.
     """
 
     kind: LayerKind
@@ -50,8 +40,6 @@ class LayerSymbols:
     planes: Planes
     networks: dict[str, Network]
     steps: dict[str, float]
-    raw_deformation: bool = False
-    refines: Refinement | None = None
 
     def tensors(self) -> Iterator[np.ndarray]:
         """The planes (scale by scale, in PLANES' order), then weight and bias of each linear layer of each network."""
@@ -85,9 +73,7 @@ def merged(slices: Sequence[LayerSymbols]) -> LayerSymbols:
 def sliced(layer: LayerSymbols, parts: Sequence[np.ndarray]) -> list[LayerSymbols]:
     """The slices of a layer, of these rows int64 [n] each, all rows once. The inverse of `merged`."""
     ordered = [rows[morton_order(layer.anchor_q[rows])] for rows in parts]
-    bare = replace(
-        layer, mask_increase=layer.mask_increase[:0], planes=(), networks={}, steps={}, raw_deformation=False
-    )
+    bare = replace(layer, mask_increase=layer.mask_increase[:0], planes=(), networks={}, steps={})
     return [
         replace(
             bare if number else layer,
@@ -143,16 +129,13 @@ def layer_steps(steps: Steps, kind: LayerKind) -> dict[str, float]:
     return planes | {kind.weights_step: steps.weights(kind.layer)}
 
 
-def layer_symbols(scene: Scene, index: int, raw_deformation: bool = False) -> LayerSymbols:
+def layer_symbols(scene: Scene, index: int) -> LayerSymbols:
     """The symbols of scene.layers[index]. Raises EncodeError for a value that has no symbol."""
     kind = LAYER_KINDS[scene.layers[index]]
     first, last = (scene.rows[index - 1] if index else 0), scene.rows[index]
     codes = scene.mask[index].astype(np.int32)
     before = scene.mask[index - 1].astype(np.int32) if index else codes[:0]
-    tensors = scene.tensors(kind.layer)
-    raw_deformation = raw_deformation and kind.layer > 0 and bool(tensors.networks)
-    if not raw_deformation:
-        tensors = quantise_tensors(tensors, kind, scene.steps)
+    tensors = quantise_tensors(scene.tensors(kind.layer), kind, scene.steps)
     classes = classes_of(scene)[first:last]
     return LayerSymbols(
         kind=kind,
@@ -165,7 +148,6 @@ def layer_symbols(scene: Scene, index: int, raw_deformation: bool = False) -> La
         planes=tensors.planes,
         networks={name: tensors.networks[name] for name in kind.network_ids if name in tensors.networks},
         steps=layer_steps(scene.steps, kind) if tensors.networks else {},
-        raw_deformation=raw_deformation,
     )
 
 
@@ -279,23 +261,21 @@ def _check_finite(layer: LayerSymbols, multiples: Iterable[tuple[np.ndarray, flo
 def _with_steps(layer: LayerSymbols, voxel_size: float) -> Iterator[tuple[np.ndarray, float]]:
     """(multiples, their step) of everything in `layer` that is dequantised but the attributes."""
     yield layer.anchor_q, voxel_size
-    if not layer.raw_deformation:
-        planes, steps = len(PLANES) * len(layer.planes), list(layer.steps.values())
-        yield from ((k, steps[0 if i < planes else -1]) for i, k in enumerate(layer.tensors()))
+    planes, steps = len(PLANES) * len(layer.planes), list(layer.steps.values())
+    yield from ((k, steps[0 if i < planes else -1]) for i, k in enumerate(layer.tensors()))
 
 
 def _decoded_tensors(layer: LayerSymbols, steps: Steps) -> Deformation:
-    stored = Deformation(layer.planes, layer.networks)
-    return stored if layer.raw_deformation else dequantise_tensors(stored, layer.kind, steps)
+    return dequantise_tensors(Deformation(layer.planes, layer.networks), layer.kind, steps)
 
 
-def rounded(scene: Scene, raw_deformation: bool = False) -> Scene:
+def rounded(scene: Scene) -> Scene:
     """`scene` with the values that come back from its file. Raises EncodeError for one that has no symbol."""
     steps = scene.steps
     grid, classes = Grid.of(scene), classes_of(scene)
     values: dict[str, Any] = {name: grid.rounded(name, x, classes) for name, x in scene.attributes.items()}
     result = replace(scene, **values)
-    for kind in LAYER_KINDS[:1] if raw_deformation else LAYER_KINDS:
+    for kind in LAYER_KINDS:
         if kind.layer == 0 or scene.deformation(kind.layer) is not None:
             result = result.with_tensors(kind.layer, round_tensors(scene.tensors(kind.layer), kind, steps))
     return result

@@ -64,4 +64,4 @@ def _measure(scene: Scene, views: Sequence[View], options: EncodeOptions, step: 
     from pd4dgs_codec.quality.rendered import true_psnr
 
     planned, _ = plan(scene, replace(options, layers="auto", omit="nothing"))
-    return true_psnr(rounded(planned, options.raw_deformation), views, step)
+    return true_psnr(rounded(planned), views, step)

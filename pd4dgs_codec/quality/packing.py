@@ -7,7 +7,6 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
 from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format.encoder import Report, encode_with_report, with_metadata
 from pd4dgs_codec.format.left_out import LeftOut
 from pd4dgs_codec.format.metadata import Metadata
@@ -100,8 +99,6 @@ def pack(
     sizes are fitted on, or in what the file's own camera shows; a file without either has the largest first. Only
     views, target sizes and slices need torch. Raises EncodeError, RenderError for a file without a camera.
     """
-    if target_sizes and options.low_bits:
-        raise EncodeError("target sizes with low bits: layer 1 brings those of layer 0 too, expected one or the other")
     if not isinstance(source, Scene):
         from pd4dgs_codec.model.convert import to_scene
 
@@ -200,7 +197,7 @@ def _fit(
     with progress("fitting sizes") as step:
         loss = RenderedLoss(scene, frames, step)
         fitted, dropped, fits = fit(scene, target_sizes, loss.mean_mse, loss.harm, options)
-        packed = rounded(plan(fitted, replace(options, omit="nothing"))[0], options.raw_deformation)
+        packed = rounded(plan(fitted, replace(options, omit="nothing"))[0])
         errors = loss.mse(packed)
         before, after = (true_psnr(s, held_out, step) if held_out else {} for s in (scene, packed))
     levels = []

@@ -242,7 +242,7 @@ class _Layer:
         self.of_scene = loss
         self.options = replace(options, omit="nothing")  # what no picture needs went before
         steps = list(scene.attributes) if layer == 0 else []
-        if layer == 0 or (not options.raw_deformation and scene.deformation(layer) is not None):
+        if layer == 0 or scene.deformation(layer) is not None:
             steps += LAYER_KINDS[layer].step_names
         self.masks = scene.full_masks()
         active = self.masks[self.index] > 0
@@ -281,7 +281,7 @@ class _Layer:
         """What the given loss says of the decoded scene."""
         key = frozenset(setting.items())
         if key not in self._losses:
-            self._losses[key] = self.of_scene(rounded(self._planned(setting), self.options.raw_deformation))
+            self._losses[key] = self.of_scene(rounded(self._planned(setting)))
         return self._losses[key]
 
     def _planned(self, setting: Setting) -> Scene:
@@ -294,7 +294,7 @@ class _Layer:
             planned, size = self._planned(setting), 0
             if self.layer in planned.layers:
                 index = planned.layers.index(self.layer)
-                symbols = layer_symbols(planned, index, self.options.raw_deformation)
+                symbols = layer_symbols(planned, index)
                 payload, _ = write_layer(symbols, replace(self.options, effort=effort))
                 size = self.header + len(write_chunk(symbols.kind.chunk_type, 0, bytes(8), payload))
             self._sizes[key] = size

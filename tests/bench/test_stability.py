@@ -14,8 +14,8 @@ from pd4dgs_codec.cli import bench
 from pd4dgs_codec.draw import projection
 from pd4dgs_codec.entropy import channels
 from pd4dgs_codec.errors import DataError, EncodeError
-from pd4dgs_codec.evaluate import residuals as evaluate
 from pd4dgs_codec.format import quantise
+from pd4dgs_codec.format import residuals as evaluate
 from pd4dgs_codec.model import masks, rate
 
 DOCS = Path(__file__).parents[2] / "docs" / "stability.md"

@@ -45,7 +45,6 @@ def test_encode_options_reach_the_codec(cli, model_pt, tmp_path):
     plain, _ = size()
     assert size("--step-scale", 3)[0] < plain
     assert size("--mode", "ans")[1]["mode"] == "ans"
-    assert size("--deformation", "float32")[0] > plain
     assert [row["layer"] for row in size("--layers", 1)[1]["layers"]] == [0, 1]
     assert size("--no-verify")[1]["verified"] is False
 
@@ -112,7 +111,7 @@ def test_partial_input_exits_3_only_when_allowed(cli, scene_pd4, tmp_path):
 def test_info_states_layers_and_first_frame(cli, scene_pd4):
     result = cli("info", scene_pd4, "--json", "--check", "--at", "500k,2M,1e9")
     report, size = result.json, scene_pd4.stat().st_size
-    assert report["format_version"] == "2.0" and report["bytes"] == size and report["checked"] is True
+    assert report["format_version"] == "3.0" and report["bytes"] == size and report["checked"] is True
     assert report["layers"][-1]["end"] == size
     end = report["layers"][0]["end"]
     assert report["first_frame_seconds"] == {"500k": 8 * end / 5e5, "2M": 8 * end / 2e6, "1e9": 8 * end / 1e9}

@@ -41,14 +41,6 @@ def test_every_step_in_use_is_reported_with_an_error_within_its_bound():
     assert largest["weights_local"] == 0  # those lay on the grid
 
 
-def test_float32_deformations_are_exact():
-    scene = make_scene(2, anchors=5)
-    _, report = encode_with_report(scene, layers=2, effort=1, deformation="float32")
-    rows = {row.what: row for row in report.errors}
-    assert (rows["planes_local"].step, rows["planes_local"].bound, rows["planes_local"].largest) == (0, 0, 0)
-    assert rows["weights_scaffold"].step == scene.steps.weights_scaffold
-
-
 def test_only_what_a_file_holds_is_reported():
     _, report = encode_with_report(make_scene(2, anchors=5), layers=0, effort=1)
     assert [row.what for row in report.errors] == ["feature", "scaling_log", "offset", "weights_scaffold"]
@@ -59,7 +51,7 @@ def declared(data):
     return unpack_header(read_preamble(data).header).error_bounds
 
 
-@pytest.mark.parametrize("options", [{}, {"deformation": "float32"}, {"mode": "lzma"}, {"layers": 0}])
+@pytest.mark.parametrize("options", [{}, {"mode": "lzma"}, {"layers": 0}])
 def test_the_header_declares_what_is_verified(options):
     options = {"layers": 2, "effort": 1, **options}
     data, report = encode_with_report(scene_off_the_grid(), **options)

@@ -7,18 +7,17 @@ import numpy as np
 import pytest
 from strategies import make_scene
 
-from pd4dgs_codec.evaluate import residuals as evaluate
 from pd4dgs_codec.format import encoder
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.heads import head_bounds
 from pd4dgs_codec.format.kinds import LAYER_KINDS
-from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.plan import plan
+from pd4dgs_codec.format.residuals import sample_planes
 from pd4dgs_codec.scene import LENGTH_HEADS, LOCAL_HEADS, PLANES, Deformation, Widths, deformation_unit
 
 VOXEL = 0.0078125
 encode, encode_with_report = (partial(f, effort=1) for f in (encoder.encode, encoder.encode_with_report))
-RAW = EncodeOptions(deformation="float32")
+FINE = 2.0**-23  #: a step of weights that keeps 1e-7 and 1
 
 
 def constant_deformation(heads, value, time_of=None):
@@ -28,7 +27,8 @@ def constant_deformation(heads, value, time_of=None):
         for name in ("xt", "yt", "zt"):
             planes[name][:] = 0
             planes[name][:, time_of] = 1
-    trunk = ((np.ones((1, 1), np.float32), np.zeros(1, np.float32)),)
+    planes["xy"][:] *= 16
+    trunk = ((np.full((1, 1), 1 / 16, np.float32), np.zeros(1, np.float32)),)
     networks = {"trunk": trunk}
     for name, outputs in heads.items():
         weight = np.full((outputs, 1), value if np.isscalar(value) else value[name], np.float32)
@@ -36,10 +36,10 @@ def constant_deformation(heads, value, time_of=None):
     return Deformation((planes,), networks)
 
 
-def scene_with(global_value=None, local_value=None, **options):
-    """Deformations as float32, so that tiny residuals survive to be judged."""
+def scene_with(global_value=None, local_value=None, weights_step=FINE, **options):
+    """Deformations whose residuals are these values everywhere."""
     scene = make_scene(4, anchors=30, heads=({}, {}))
-    fields = {}
+    fields = {"steps": replace(scene.steps, weights_global=weights_step, weights_local=weights_step)}
     if global_value is not None:
         fields["global_deformation"] = constant_deformation(Widths().global_heads, global_value, **options)
     if local_value is not None:
@@ -59,7 +59,7 @@ def active_codes(scene, index):
 )
 def test_layers_go_with_their_deformation_and_the_highest_masks_stay(given_values, kept):
     scene = scene_with(*given_values)
-    data, report = encode_with_report(scene, deformation="float32")
+    data, report = encode_with_report(scene)
     got = decode(data)
     assert got.layers == kept
     assert active_codes(got, -1) == active_codes(scene, 2), "the highest level shows the same anchors and masks"
@@ -92,8 +92,8 @@ def test_each_head_is_judged_by_its_own_bound(layer):
     outputs = {name: bound / (unit if name in LENGTH_HEADS else 1.0) for name, bound in bounds.items()}
     for alive in heads:
         values = {name: (1.01 if name == alive else 0.99) * output for name, output in outputs.items()}
-        scene = scene_with(**{"global_value" if layer == 1 else "local_value": values})
-        planned, left_out = plan(scene, RAW)
+        scene = scene_with(weights_step=2.0**-26, **{"global_value" if layer == 1 else "local_value": values})
+        planned, left_out = plan(scene)
         networks = planned.tensors(layer).networks
         assert set(networks) == {"trunk", alive}
         gone = {item.what for item in left_out if item.kind}
@@ -103,12 +103,14 @@ def test_each_head_is_judged_by_its_own_bound(layer):
 def test_a_short_event_is_seen():
     """A motion that lives in one of many time rows is found wherever it is."""
     for row in range(5):
-        planned, _ = plan(scene_with(global_value=1.0, time_of=row), RAW)
+        planned, _ = plan(scene_with(global_value=1.0, time_of=row))
         assert planned.layers == (0, 1)
 
 
 def test_heads_that_quantise_to_zero_go_even_when_layers_are_asked_for():
-    scene = scene_with(global_value={"position": 1.0, "feature": 1e-4, "offset": 1.0, "scaling": 1.0})
+    scene = scene_with(
+        global_value={"position": 1.0, "feature": 1e-4, "offset": 1.0, "scaling": 1.0}, weights_step=2.0**-6
+    )
     got = decode(encode(scene, layers=2))
     assert set(got.global_deformation.networks) == {"trunk", "position", "offset", "scaling"}
     assert got.layers == (0, 1, 2) and got.local_deformation is None
@@ -132,16 +134,16 @@ def test_explicit_layers_cut_the_prefix_as_it_is():
 def test_auto_is_stable():
     """Encoding a decoded file again leaves out the same things and gives the same bytes."""
     for values in ((1.0, 1.0), (1e-7, 1.0), (1.0, None)):
-        data = encode(scene_with(*values), deformation="float32")
-        assert encode(decode(data), deformation="float32") == data
+        data = encode(scene_with(*values))
+        assert encode(decode(data)) == data
 
 
 def test_numbers_that_overflow_are_not_called_negligible():
-    scene = scene_with(global_value=float(np.float32(3e38)))
+    scene = scene_with(global_value=float(np.float32(3e38)), weights_step=2.0**110)
     trunk = ((np.full((1, 1), 3e38, np.float32), np.zeros(1, np.float32)),)
     networks = {**scene.global_deformation.networks, "trunk": trunk}
     scene = replace(scene, global_deformation=replace(scene.global_deformation, networks=networks))
-    assert plan(scene, RAW)[0].layers == (0, 1)
+    assert plan(scene)[0].layers == (0, 1)
 
 
 def test_plane_sampling_agrees_with_grid_sample():
@@ -159,4 +161,4 @@ def test_plane_sampling_agrees_with_grid_sample():
                 plane = torch.from_numpy(planes[name])[None]
                 sampled = torch.nn.functional.grid_sample(plane, grid, align_corners=True, padding_mode="border")
                 expected *= sampled[0, :, 0].T.numpy()
-            np.testing.assert_allclose(evaluate.sample_planes((planes,), box, points, t), expected, atol=1e-4)
+            np.testing.assert_allclose(sample_planes((planes,), box, points, t), expected, atol=1e-4)

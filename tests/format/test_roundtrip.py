@@ -16,7 +16,7 @@ from pd4dgs_codec.morton import morton_codes
 from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS, Widths
 
 encode, encode_with_report = (partial(f, effort=1) for f in (encoder.encode, encoder.encode_with_report))
-MODES = [("ans", "coded"), ("lzma", "coded"), ("ans", "float32"), ("lzma", "float32")]
+MODES = ("ans", "lzma")
 
 
 def rows_by_voxel(scene):
@@ -32,7 +32,7 @@ def rows_by_voxel(scene):
 @given(scenes(), st.sampled_from(MODES), st.sampled_from(("best", "gauss")))
 @settings(max_examples=20)
 def test_everything_active_comes_back_and_encodes_to_the_same_bytes(scene, mode, priors):
-    options = {"mode": mode[0], "deformation": mode[1], "priors": priors, "layers": 2, "omit": "nothing"}
+    options = {"mode": mode, "priors": priors, "layers": 2, "omit": "nothing"}
     data = encode(scene, **options)
     decoded = decode(data)
     active = {cell: row for cell, row in rows_by_voxel(scene).items() if row[1][-1] > 0}
@@ -64,12 +64,12 @@ def test_rows_are_sorted_by_layer_then_morton_order(scene):
         first = last
 
 
-@pytest.mark.parametrize("mode,deformation", MODES)
-def test_unquantised_values_come_back_within_half_a_step(mode, deformation):
+@pytest.mark.parametrize("mode", MODES)
+def test_unquantised_values_come_back_within_half_a_step(mode):
     scene = make_scene(3, kind="gaussian")
     rng = np.random.default_rng(0)
     noisy = replace(scene, feature=scene.feature + rng.uniform(-0.49, 0.49, scene.feature.shape).astype(np.float32))
-    got = decode(encode(noisy, mode=mode, deformation=deformation, step_scale=0.5, layers=2))
+    got = decode(encode(noisy, mode=mode, step_scale=0.5, layers=2))
     order = {tuple(c): i for i, c in enumerate(scene.anchor_q.tolist())}
     index = [order[tuple(c)] for c in got.anchor_q.tolist()]
     step = scene.steps.feature * 0.5
@@ -84,16 +84,6 @@ def test_symbols_over_the_whole_range(mode):
     got = decode(encode(scene, mode=mode, priors="gauss", omit="nothing"))
     assert np.abs(got.feature).max() == HUGE * scene.steps.feature
     assert_same_networks(got.networks, scene.networks)
-
-
-def test_float32_deformations_keep_every_bit():
-    scene = make_scene(1)
-    planes = tuple({k: v + np.float32(0.001) for k, v in s.items()} for s in scene.global_deformation.planes)
-    scene = replace(scene, global_deformation=replace(scene.global_deformation, planes=planes))
-    got = decode(encode(scene, deformation="float32", layers=2))
-    np.testing.assert_array_equal(got.global_deformation.planes[0]["xt"], planes[0]["xt"])
-    coded = decode(encode(scene, layers=2))
-    assert not np.array_equal(coded.global_deformation.planes[0]["xt"], planes[0]["xt"])
 
 
 def test_the_header_information_comes_back():
@@ -181,7 +171,6 @@ def test_scenes_that_cannot_be_written_are_refused_in_one_line(message):
     "options",
     [
         {"mode": "zip"},
-        {"deformation": "x"},
         {"priors": "x"},
         {"layers": 3},
         {"layers": "2"},

@@ -113,9 +113,9 @@ def most_wide_tables():
     return crafted("wide-planes", 1, {Section.PLANES: section}, planes_of_one_cell(64))
 
 
-def many_anchors(mode, low_bits=0):
+def many_anchors(mode):
     scene = make_scene(1, layers=(0, 1), anchors=12_000, extent=40, kind="gaussian")
-    return encode(scene, layers=2, effort=1, mode=mode, verify=False, low_bits=low_bits)
+    return encode(scene, layers=2, effort=1, mode=mode, verify=False)
 
 
 BIG = {
@@ -126,7 +126,6 @@ BIG = {
     "tables": most_wide_tables,
     "anchors": partial(many_anchors, "ans"),
     "anchors, lzma": partial(many_anchors, "lzma"),
-    "anchors, low bits": partial(many_anchors, "ans", 4),
 }
 
 

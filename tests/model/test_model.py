@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as hnp
 
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.evaluate.residuals import residuals
+from pd4dgs_codec.format.residuals import residuals
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model import model as graph
 from pd4dgs_codec.model.config import DeformationConfig

@@ -36,11 +36,6 @@ def test_a_choice_that_is_none_is_named(name):
         EncodeOptions(**{name: "other"})
 
 
-def test_target_sizes_and_low_bits_exclude_each_other():
-    with pytest.raises(EncodeError, match="target sizes with low bits"):
-        pack(make_scene(3, anchors=30), EncodeOptions(low_bits=1), target_sizes={0: 1000})
-
-
 @pytest.mark.parametrize("scale", [0.0, -1.0, float("inf"), float("nan")])
 def test_a_scale_that_is_none_is_named(scale):
     with pytest.raises(EncodeError, match="step_scale .*, expected a positive number"):

@@ -171,10 +171,3 @@ def test_a_layer_that_is_not_there_meets_any_target(scene):
     alone, _ = plan(scene, EncodeOptions(layers=0))
     fitted, left_out, (row,) = fit(alone, {2: 1}, coarseness(alone), harm, EncodeOptions(**FAST))
     assert fitted is alone and not left_out and (row.bytes, row.moved, row.factors) == (0, 0, {})
-
-
-def test_float32_deformations_have_no_steps_to_move(scene):
-    options = FAST | {"deformation": "float32"}
-    most = round(0.9 * added(encode(scene, **options))[2])
-    with pytest.raises(EncodeError, match="layer 2 takes at least"):
-        fit(scene, {2: most}, coarseness(scene), harm, EncodeOptions(**options))

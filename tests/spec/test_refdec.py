@@ -49,11 +49,8 @@ _module.loader.exec_module(refdec)
 CODINGS = {
     "ans best": {},
     "ans gauss": {"priors": "gauss"},
-    "low bits": {"low_bits": 2},
-    "low bits in slices": {"low_bits": 3, "slices": 1500},
     "lzma": {"mode": "lzma"},
-    "ans float32": {"deformation": "float32"},
-    "lzma float32": {"mode": "lzma", "deformation": "float32"},
+    "slices": {"slices": 1500},
 }
 SCENES = {
     "empty": {"anchors": 0},
@@ -446,7 +443,7 @@ def outcome(function, data, fault):
         return getattr(error, "name", type(error).__name__)
 
 
-@pytest.mark.parametrize("coding", ["ans best", "lzma float32"])
+@pytest.mark.parametrize("coding", ["ans best", "lzma"])
 def test_damage_behind_right_checksums_has_the_same_outcome(coding):
     """Both accept with the same contents, or both refuse with the same error's name."""
     header, chunks = take_apart(encode(make_scene(3, anchors=20), layers=2, effort=3, **CODINGS[coding]))

@@ -97,7 +97,7 @@ def test_it_writes_figures_file_and_pictures(finished):
         assert 5 < row["mpsnr"] < 60 and abs(row["loss_db"]) < 3
     for row in result["coding"]:
         assert row["best_over_gauss"] <= 1 and row["position_bytes"] > 0 or row["anchors"] == 0
-        assert row["lzma_float32_bytes"] > 0 and row["rate_bits"] > 0
+        assert row["lzma_bytes"] > 0 and row["rate_bits"] > 0
 
     assert result["pictures"] == ["levels.png", "levels.gif"]
     panels = 1 + len(layers)
@@ -170,9 +170,9 @@ def test_a_layer_that_one_encoding_drops_is_shown_as_absent(finished):
     scene = to_scene(checkpoint.load(finished[0] / "discs" / "model.pt")[0])
     reports = {name: encode_with_report(scene, **options)[1] for name, options in main_job.VARIANTS.items()}
     whole = main_job.coding_rows(reports, scene)
-    reports["lzma_float32"] = dataclasses.replace(reports["lzma_float32"], layers=reports["lzma_float32"].layers[1:])
+    reports["lzma"] = dataclasses.replace(reports["lzma"], layers=reports["lzma"].layers[1:])
     rows = main_job.coding_rows(reports, scene)
-    assert rows[0] == whole[0] | {"lzma_float32_bytes": None} and rows[1:] == whole[1:]
+    assert rows[1]["lzma_bytes"] is None and whole[1]["lzma_bytes"] and rows[2:] == whole[2:]
     assert "| - " in tables.coding_table([shown(finished[1] | {"coding": rows})])
 
 
@@ -215,12 +215,12 @@ def test_a_spread_is_that_of_the_levels_that_every_seed_has():
 
 
 def test_the_row_of_all_layers_holds_sums_and_ratios_of_sums():
-    row = {"ans_bytes": 10, "lzma_bytes": 20, "lzma_float32_bytes": 30, "position_bytes": 1.0}
+    row = {"ans_bytes": 10, "lzma_bytes": 20, "position_bytes": 1.0}
     row |= {"draco_position_bytes": 2.0, "rate_bits": 100.0, "payload_over_rate": 1.0, "train_over_rate": 1.0}
     row |= {"best_over_gauss": 0.5, "ans_over_lzma": 0.5, "lzma_symbol_bytes": 10.0}
     other = row | {"rate_bits": 300.0, "payload_over_rate": 2.0, "best_over_gauss": 1.0, "lzma_symbol_bytes": 30.0}
     total = tables.all_layers([row, other | {"ans_over_lzma": 0.9}])
-    assert (total["ans_bytes"], total["lzma_float32_bytes"], total["draco_position_bytes"]) == (20, 60, 4.0)
+    assert (total["ans_bytes"], total["lzma_bytes"], total["draco_position_bytes"]) == (20, 40, 4.0)
     assert total["payload_over_rate"] == (100 + 600) / 400
     assert total["best_over_gauss"] == (50 + 600) / 700
     assert total["ans_over_lzma"] == pytest.approx((5 + 27) / 40)

@@ -32,7 +32,6 @@ VARIANTS: dict[str, dict[str, str]] = {
     "ans": {},
     "gauss": {"priors": "gauss"},
     "lzma": {"mode": "lzma"},
-    "lzma_float32": {"mode": "lzma", "deformation": "float32"},
 }
 #: Pictures of the levels: stills and an animation.
 PICTURES = ("levels.png", "levels.gif")

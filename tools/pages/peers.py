@@ -87,8 +87,7 @@ def symbols_of(layers: Sequence[LayerSymbols]) -> Symbols:
     """The symbols of decoded layers."""
     planes = []
     for layer in layers:
-        count = 0 if layer.raw_deformation else 6 * len(layer.planes)
-        tensors = list(layer.tensors())[:count]
+        tensors = list(layer.tensors())[: 6 * len(layer.planes)]
         planes.append([choose_predictor(tensor)[1] for tensor in tensors])
     return Symbols(tuple(layers), tuple(planes), tuple(channel_groups(layer)[0] for layer in layers))
 

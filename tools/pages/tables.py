@@ -10,13 +10,13 @@ from typing import Any
 from pd4dgs_codec.bench.report import drawing, markdown
 
 #: A coding row's bytes in the modes that the table shows; None where a mode drops the layer.
-BYTES = ("ans_bytes", "lzma_bytes", "lzma_float32_bytes")
+BYTES = ("ans_bytes", "lzma_bytes")
 
 
 #: What the page shows of a level and of a coded layer.
 LEVEL = ("level", "mpsnr", "mssim", "loss_db", "cumulative_bytes", "first_frame_seconds", "decode_seconds", "render_ms",
          "anchors")  # fmt: skip
-LAYER = ("layer", "ans_bytes", "lzma_bytes", "lzma_float32_bytes", "position_bytes", "draco_position_bytes",
+LAYER = ("layer", "ans_bytes", "lzma_bytes", "position_bytes", "draco_position_bytes",
          "rate_bits", "payload_over_rate", "train_over_rate", "best_over_gauss", "ans_over_lzma",
          "lzma_symbol_bytes")  # fmt: skip
 

@@ -44,7 +44,8 @@ from pd4dgs_codec.scene import ATTRIBUTES, DEFAULT_WIDTHS, PLANES, Widths
 
 from . import lzma2
 
-POSITIONS, MASKS, ATTRIBUTE, PLANE, WEIGHTS, SYMBOLS, FLOATS, LOW_BITS = (int(s) for s in Section)
+POSITIONS, MASKS, ATTRIBUTE, PLANE, WEIGHTS, SYMBOLS = (int(s) for s in Section)
+FLOATS, LOW_BITS = 6, 7  # left with draft 3: the vectors that use them go next
 ANS, LZMA = 0, 1
 CODED, FLOAT32 = 0, 1
 WEIGHT_SHIFT, CLASSES_Y, CLASSES_Z = 10, 5, 7  # clause 8.7
@@ -62,7 +63,6 @@ ERROR_BOUNDS: dict[int, object] = {
 }
 HEADER: dict[int, object] = {
     2: ANS,
-    3: CODED,
     4: [0.0625, 0.03125, 0.125],
     5: 2.0**-7,
     6: [-1.0, -2.0, -3.0, 1.0, 2.0, 3.0],
@@ -500,7 +500,7 @@ class Layer:
     def channels(self) -> list[np.ndarray]:
         """The channels of sections 1 to 4 in their order, planes under predictor 0."""
         m = self.meant
-        tensors = [] if m.raw_deformation else list(m.tensors())
+        tensors = list(m.tensors())
         return [m.mask_increase, m.mask_own, *m.attributes, *(row for t in tensors for row in plane_channels(t))]
 
 
@@ -589,7 +589,6 @@ def make_layer(
         planes=planes,
         networks=networks,
         steps=dict(zip(kind.step_names, steps, strict=True)) if networks else {},
-        raw_deformation=raw,
     )
     meta: dict[int, object] = {1: n}
     if networks:
@@ -605,7 +604,7 @@ def make_layer(
 def _sections(meant: LayerSymbols, predictors: Sequence[int], mode: int) -> dict[int, bytes]:
     n = len(meant.anchor_q)
     sections = {POSITIONS: positions(meant.anchor_q)} if n else {}
-    tensors = [] if meant.raw_deformation else list(meant.tensors())
+    tensors = list(meant.tensors())
     planes = [residual(p, k) if k.size else k for p, k in zip(predictors, tensors, strict=False)]
     weights = [k.ravel() for k in tensors[len(planes) :]]
     flat = [row for r in planes for row in plane_channels(r)]
@@ -624,8 +623,6 @@ def _sections(meant: LayerSymbols, predictors: Sequence[int], mode: int) -> dict
             sections[PLANE] = plain_planes(flat)
         if weights:
             sections[WEIGHTS] = coded(weights)
-    if meant.raw_deformation:
-        sections[FLOATS] = lzma_floats(list(meant.tensors()))
     return sections
 
 
@@ -777,9 +774,7 @@ def _hashes(m: LayerSymbols, header: Mapping[int, object]) -> dict:
     tensors = [dequantise(m.anchor_q, header[5]), *(values[name] for name in ATTRIBUTES)]  # type: ignore[arg-type]
     own = list(m.tensors())
     count = len(PLANES) * len(m.planes)
-    if m.raw_deformation:
-        tensors += own
-    elif own:
+    if own:
         of_steps = list(m.steps.values())
         tensors += [dequantise(k, of_steps[0 if i < count else -1]) for i, k in enumerate(own)]
     integers = [a for a in m.arrays() if a.dtype.kind == "i"]
