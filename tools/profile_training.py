@@ -28,8 +28,7 @@ def watch(learner: Learner, stopwatch: Stopwatch) -> None:
     """Wraps the parts of a step, and the step itself as what is none of them."""
     import torch
 
-    from pd4dgs_codec.model import fused, plane_rate, plane_regularisers, rate
-    from pd4dgs_codec.model.autograd import cpu
+    from pd4dgs_codec.model import fused, plane_rate, plane_regularisers, rasterization, rate
     from pd4dgs_codec.model.model import Model
     from pd4dgs_codec.train import learner as steps
     from pd4dgs_codec.train import losses, ssim
@@ -47,8 +46,8 @@ def watch(learner: Learner, stopwatch: Stopwatch) -> None:
         (fused._Finish, "backward", "scaffold networks, backward"),
         (fused, "sample", "HexPlane kernels"),
         (fused, "sample_gradient", "HexPlane kernels, backward"),
-        (cpu, "rasterize", "rasteriser kernels"),
-        (cpu._Composite, "backward", "rasteriser kernels, backward"),
+        (rasterization, "rasterize_cpu", "rasteriser kernels"),
+        (rasterization._Composite, "backward", "rasteriser kernels, backward"),
         (ssim._ImageLoss, "forward", "image loss"),
         (ssim._ImageLoss, "backward", "image loss, backward"),
         (plane_regularisers._Regularisers, "forward", "plane regularisers"),

@@ -13,11 +13,11 @@ from pd4dgs_codec.bench.timing import clock
 from pd4dgs_codec.draw.player import Player
 from pd4dgs_codec.draw.projection import ALPHA_MIN
 from pd4dgs_codec.draw.visibility import near_plane
-from pd4dgs_codec.model.autograd.rasterization import rasterization
-from pd4dgs_codec.model.autograd.reference import composite, project
+from pd4dgs_codec.model.rasterization import rasterization
+from pd4dgs_codec.model.reference import composite, project
 from pd4dgs_codec.quality.frames import Frame, dataset_frames, own_frames
 from pd4dgs_codec.quality.levels import Level
-from pd4dgs_codec.scene import SceneInfo
+from pd4dgs_codec.scene import Camera, SceneInfo
 
 T = TypeVar("T")
 
@@ -83,22 +83,20 @@ def draw_all(views: Sequence[View], repeats: int, backend: str = "cpu") -> tuple
 
 def _inputs(one: View, device: str) -> dict[str, Any]:
     tensors = {name: torch.from_numpy(np.ascontiguousarray(one[name], np.float32)).to(device) for name in SPLATS}
-    for name, own in (("viewmats", "viewmat"), ("Ks", "K"), ("backgrounds", "background")):
-        tensors[name] = torch.from_numpy(one[own])[None].to(device)
-    sizes = {name: int(one[name]) for name in ("width", "height")}
-    return {**tensors, **sizes, "near_plane": float(one["near"])}
+    camera = Camera(one["viewmat"], one["K"], int(one["width"]), int(one["height"]))
+    return {**tensors, "camera": camera, "background": one["background"], "near_plane": float(one["near"])}
 
 
 def _draw(inputs: dict[str, Any], backend: str) -> Tensor:
     with torch.no_grad():
-        image = rasterization(**inputs, backend=backend)[0][0]
+        image = rasterization(**inputs, backend=backend)[0]
     if image.device.type == "cuda":
         torch.cuda.synchronize()
     return image
 
 
 @torch.no_grad()
-def oracle(one: View, dtype: torch.dtype = torch.float64, eps2d: float = 0.3) -> np.ndarray:
+def oracle(one: View, dtype: torch.dtype = torch.float64) -> np.ndarray:
     """[H, W, 3] in `dtype`: what `rasterization(backend="reference")` draws, for any number of Gaussians.
 
     The same formulas, a block of pixels at a time: a Gaussian contributes nothing where its alpha is below 1/255, so
@@ -111,7 +109,7 @@ def oracle(one: View, dtype: torch.dtype = torch.float64, eps2d: float = 0.3) ->
     index = torch.nonzero((z > float(one["near"])) & (tensors[3] > ALPHA_MIN))[:, 0]
     index = index[torch.sort(z[index].to(torch.float32), stable=True).indices]
     means, quats, scales, opacities, colors = (a[index] for a in tensors[:5])
-    means2d, covariance, det, _ = project(means, quats, scales, viewmat, K, width, height, eps2d)
+    means2d, covariance, det, _ = project(means, quats, scales, viewmat, K, width, height)
     p, q, r = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
     conics = torch.stack([r, -q, p], -1) / det[:, None]
     extent = torch.sqrt(2 * torch.log(opacities / ALPHA_MIN))

@@ -88,12 +88,12 @@ def _drawn(name: str, views: Sequence[View], repeats: int, cache: Path) -> Drawn
 
 def _without_gsplat() -> str | None:
     """Why gsplat cannot draw here, in one line; None if it can."""
-    from pd4dgs_codec.model.autograd import gsplat_backend
+    from pd4dgs_codec.model.rasterization import check_gsplat
 
     if not torch.cuda.is_available():
         return "there is no CUDA device"
     try:
-        gsplat_backend.check()
+        check_gsplat()
     except RenderError as error:
         return str(error)
     return None

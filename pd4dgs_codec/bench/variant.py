@@ -27,9 +27,9 @@ def apply(constants: dict[str, float]) -> None:
         projection.ALPHA_MIN = constants["alpha_min"]
         projection.REACH_LOG2 = -math.log2(constants["alpha_min"])
     projection.TILE_WIDTH = int(constants.get("tile_width", projection.TILE_WIDTH))
-    from pd4dgs_codec.draw import kernels
+    from pd4dgs_codec.draw import compositing
 
-    kernels.T_MIN = constants.get("t_min", kernels.T_MIN)
+    compositing.T_MIN = constants.get("t_min", compositing.T_MIN)
 
 
 def main(source: str, target: str, constants: str, repeats: str) -> None:

@@ -213,10 +213,10 @@ def _device(name: str, console: Console) -> str:
         return "cpu"
     if not torch.cuda.is_available():
         raise TrainError("--device cuda: this PyTorch finds no CUDA device; expected one, or --device cpu")
-    from pd4dgs_codec.model.autograd import gsplat_backend
+    from pd4dgs_codec.model.rasterization import check_gsplat
 
     try:
-        gsplat_backend.check()
+        check_gsplat()
     except RenderError as error:
         if name == "cuda":
             raise TrainError(f"--device cuda: {error}") from None

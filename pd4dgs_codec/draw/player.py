@@ -11,11 +11,10 @@ from itertools import pairwise
 import numpy as np
 
 from pd4dgs_codec.draw import slot_kernels
-from pd4dgs_codec.draw.checks import check_time
 from pd4dgs_codec.draw.networks import Field, Layers
 from pd4dgs_codec.draw.rasteriser import draw
 from pd4dgs_codec.draw.slot_kernels import GAUSSIAN_WIDTH
-from pd4dgs_codec.draw.visibility import FRUSTUM_MARGIN, MIN_OPACITY, OFFSET_REACH, SIGMA_REACH, near_plane
+from pd4dgs_codec.draw.visibility import FRUSTUM_MARGIN, MIN_OPACITY, OFFSET_REACH, SIGMA_REACH, check_time, near_plane
 from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS, MASK_STEP, MASK_THRESHOLD, Camera, Network, Scene
 
 

@@ -1,10 +1,10 @@
-"""World-space Gaussians to image-space ellipses, and the gradient back. numba, float64 inside, float32 outside.
+"""World-space Gaussians to image-space ellipses, and the gradient back: numba kernels, float64 inside, float32 outside.
 
-Per Gaussian: Sigma2 = U U^T + eps2d I with U = J W R S (2x3). Its determinant is |u0 x u1|^2 + eps2d tr + eps2d^2
-(Cauchy-Binet), which is never negative and does not cancel, as p r - q^2 does for needles.
+Sigma2 = U U^T + EPS2D I with U = J W R S (2x3). Its determinant |u0 x u1|^2 + EPS2D tr + EPS2D^2 (Cauchy-Binet) is
+never negative, and does not cancel for needles as p r - q^2 does.
 
-The compositing stage gets each Gaussian as log2(alpha) = q - t^2 - r^2 with t = sa (dx - k dy), r = sb dy: a
-completed square, so that a long thin Gaussian loses no digits in float32 and |t|, |r| stay below 3 where it is drawn.
+Compositing takes a Gaussian as log2(alpha) = q - t^2 - r^2 with t = sa (dx - k dy), r = sb dy. This completed square
+loses no digits in float32 for a long thin Gaussian, and |t|, |r| stay below 3 where it is drawn.
 """
 
 from __future__ import annotations
@@ -19,6 +19,8 @@ from pd4dgs_codec.draw.simd import LANES, Tasks, double, kernel, load, parallel,
 TILE_WIDTH, TILE_HEIGHT = 32, 16  #: pixels
 ALPHA_MAX = 0.999  #: alpha is clamped to this (gsplat 1.5.3)
 ALPHA_MIN = 1.0 / 255.0  #: fainter contributions are skipped
+EPS2D = 0.3  #: added to the diagonal of the covariance in the image, square pixels
+FAR = 1e10  #: Gaussians beyond this depth are skipped, scene units
 REACH_LOG2 = math.log2(255.0)  #: a Gaussian is drawn where log2(opacity) - t^2 - r^2 >= -REACH_LOG2
 _F32_MAX = float(np.finfo(np.float32).max)
 _LN2 = math.log(2.0)
@@ -34,7 +36,8 @@ GEOM_COLUMNS = 8
 #: Columns of the gradient slots before the colours: sums over pixels of g, g t, g t^2, g r, g r^2, g t r with
 #: g = dL / d(ln alpha).
 G, GT, GTT, GR, GRR, GTR = range(6)
-SLOT_GEOMETRY = 6
+SLOT_COLOR = 6  #: first of the three columns of colours
+SLOTS = SLOT_COLOR + 3
 
 
 @kernel()
@@ -114,32 +117,28 @@ def project(
     opacities: np.ndarray,
     camera: np.ndarray,
     size: tuple[int, int],
-    limits: tuple[float, float, float, float],
+    near: float,
     visible: np.ndarray,
     geom: np.ndarray,
     rects: np.ndarray,
     radii: np.ndarray,
     means2d: np.ndarray,
     depths: np.ndarray,
-    conics: np.ndarray,
 ) -> None:
-    """Fill the per-Gaussian outputs; a culled Gaussian has visible = False and zeros elsewhere, but in geom.
+    """Fills the outputs per Gaussian; a culled Gaussian has visible = False and zeros elsewhere, except in geom.
 
-    size: (width, height), pixels; limits: (near, far, eps2d, radius_clip). visible bool [N]; geom [N, GEOM_COLUMNS];
-    rects int32 [N, 4] = tile columns x0, x1 and rows y0, y1, half open; the rest as `rasteriser.Projected` has it for
-    one camera. Comparisons are written so that NaN culls.
+    size: (width, height), pixels. Outputs: visible bool [N]; geom [N, GEOM_COLUMNS]; rects int32 [N, 4], the tile
+    columns x0, x1 and rows y0, y1, half open; radii int32 [N, 2], half extents, and means2d [N, 2], pixels; depths [N].
+    Comparisons are written so that NaN culls.
     """
     width, height = size
-    near, far, eps, clip = limits
     for i in range(tasks[0], tasks[1]):
         visible[i], depths[i] = False, 0.0
         for c in range(2):
             rects[i, c], rects[i, 2 + c], radii[i, c], means2d[i, c] = 0, 0, 0, 0.0
-        for c in range(3):
-            conics[i, c] = 0.0
         opacity = np.float64(opacities[i])
         x, y, z = _to_camera(means, i, camera)
-        if not (z > near and z <= far and opacity > ALPHA_MIN and opacity <= _F32_MAX):
+        if not (z > near and z <= FAR and opacity > ALPHA_MIN and opacity <= _F32_MAX):
             continue
         _, _, rotation = _rotation(quats[i, 0], quats[i, 1], quats[i, 2], quats[i, 3])
         iz, _, _, jw = _jacobian(x, y, z, camera)
@@ -148,9 +147,9 @@ def project(
         u0, u1, u2, v0, v1, v2 = u[0] * s0, u[1] * s1, u[2] * s2, u[3] * s0, u[4] * s1, u[5] * s2
         p, q, r = u0 * u0 + u1 * u1 + u2 * u2, u0 * v0 + u1 * v1 + u2 * v2, v0 * v0 + v1 * v1 + v2 * v2
         c0, c1, c2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
-        det = c0 * c0 + c1 * c1 + c2 * c2 + eps * (p + r) + eps * eps
-        p += eps
-        r += eps
+        det = c0 * c0 + c1 * c1 + c2 * c2 + EPS2D * (p + r) + EPS2D * EPS2D
+        p += EPS2D
+        r += EPS2D
         if not (det > 0.0 and det < 1e300 and r > 0.0):
             continue
         opacity_log2 = min(math.log2(opacity), 100.0)  # exp2 stays finite
@@ -159,10 +158,8 @@ def project(
         half_width, half_height = extent * math.sqrt(p), extent * math.sqrt(r)
         mx, my = camera[12] * x * iz + camera[14], camera[13] * y * iz + camera[15]
         radius_x, radius_y = np.ceil(half_width), np.ceil(half_height)
-        seen = mx + radius_x > 0.0 and mx - radius_x < width
+        seen = radius_x > 0.0 and mx + radius_x > 0.0 and mx - radius_x < width
         if not (seen and my + radius_y > 0.0 and my - radius_y < height):
-            continue
-        if radius_x <= clip and radius_y <= clip:
             continue
         # Slightly too wide, so that only the alpha test itself decides about a pixel, whatever the tiles.
         half_width, half_height = half_width * (1.0 + 1e-5) + 1e-3, half_height * (1.0 + 1e-5) + 1e-3
@@ -180,7 +177,6 @@ def project(
         radii[i, 0] = int(min(radius_x, 1e9))
         radii[i, 1] = int(min(radius_y, 1e9))
         means2d[i, 0], means2d[i, 1], depths[i] = _saturate(mx), _saturate(my), np.float32(z)
-        conics[i, 0], conics[i, 1], conics[i, 2] = _saturate(r / det), _saturate(-q / det), _saturate(p / det)
         visible[i] = True
 
 
@@ -199,15 +195,6 @@ def _rotation_gradient(unit: Quaternion, inverse_norm: float, g: Matrix3) -> Qua
         (gy - along * y) * inverse_norm,
         (gz - along * z) * inverse_norm,
     )
-
-
-@kernel()
-def _sum_slots(slots: np.ndarray, begin: int, end: int, column: int) -> float:
-    """Sum of one slot column over a Gaussian's tiles, float64."""
-    result = 0.0
-    for n in range(begin, end):
-        result += slots[n, column]
-    return result
 
 
 @kernel()
@@ -239,7 +226,6 @@ def project_backward(
     geom: np.ndarray,
     first: np.ndarray,
     slots: np.ndarray,
-    depth_channel: int,
     g_means: np.ndarray,
     g_quats: np.ndarray,
     g_scales: np.ndarray,
@@ -247,29 +233,29 @@ def project_backward(
     g_colors: np.ndarray,
     g_means2d: np.ndarray,
 ) -> None:
-    """Sum each Gaussian's slots in float64, in a fixed order, and carry the gradient to the inputs (added to g_*).
-
-    slots[first[i] : first[i + 1]] belong to Gaussian i. g_colors [N, D]: slot columns 6 .. 6 + D - 1.
-    depth_channel: slot column with the gradient of the depth drawn as a colour, or -1.
+    """Sums each Gaussian's slots in float64, in a fixed order, and carries the gradient to the inputs: fills g_*, which
+    are given zeroed. slots[first[i] : first[i + 1]] belong to Gaussian i.
     """
-    channels, stride, sums = g_colors.shape[1], slots.shape[1], np.empty(LANES)
+    sums = np.empty(LANES)
     for i in range(tasks[0], tasks[1]):
         begin, end = first[i], first[i + 1]
         if begin == end:
             continue
         together = splat(0.0)
         for n in range(begin, end):
-            together = together + double(load(slots, n * stride))
+            together = together + double(load(slots, n * SLOTS))
         store(sums, 0, together)
-        for c in range(channels):
-            column = SLOT_GEOMETRY + c
-            g_colors[i, c] += _saturate(sums[column] if column < LANES else _sum_slots(slots, begin, end, column))
-        g_opacities[i] += _saturate(sums[G] / np.float64(opacities[i]))
+        blue = 0.0
+        for n in range(begin, end):
+            blue += slots[n, LANES]
+        g_colors[i, 0], g_colors[i, 1] = _saturate(sums[SLOT_COLOR]), _saturate(sums[SLOT_COLOR + 1])
+        g_colors[i, 2] = _saturate(blue)
+        g_opacities[i] = _saturate(sums[G] / np.float64(opacities[i]))
         gx, gy, mxx, mxy, myy = _image_gradient(
             sums[GT], sums[GTT], sums[GR], sums[GRR], sums[GTR], geom[i, K], geom[i, SA], geom[i, SB]
         )
-        g_means2d[i, 0] += _saturate(gx)
-        g_means2d[i, 1] += _saturate(gy)
+        g_means2d[i, 0] = _saturate(gx)
+        g_means2d[i, 1] = _saturate(gy)
 
         x, y, z = _to_camera(means, i, camera)
         iz, a, b, jw = _jacobian(x, y, z, camera)
@@ -279,9 +265,9 @@ def project_backward(
         # dL/dU = 2 M U with U = m diag(s); dL/dm = dL/dU diag(s).
         d0 = 2.0 * (mxx * m[0] + mxy * m[3]), 2.0 * (mxx * m[1] + mxy * m[4]), 2.0 * (mxx * m[2] + mxy * m[5])
         d1 = 2.0 * (mxy * m[0] + myy * m[3]), 2.0 * (mxy * m[1] + myy * m[4]), 2.0 * (mxy * m[2] + myy * m[5])
-        g_scales[i, 0] += _saturate(s0 * (d0[0] * m[0] + d1[0] * m[3]))
-        g_scales[i, 1] += _saturate(s1 * (d0[1] * m[1] + d1[1] * m[4]))
-        g_scales[i, 2] += _saturate(s2 * (d0[2] * m[2] + d1[2] * m[5]))
+        g_scales[i, 0] = _saturate(s0 * (d0[0] * m[0] + d1[0] * m[3]))
+        g_scales[i, 1] = _saturate(s1 * (d0[1] * m[1] + d1[1] * m[4]))
+        g_scales[i, 2] = _saturate(s2 * (d0[2] * m[2] + d1[2] * m[5]))
         e = s0 * s0, s1 * s1, s2 * s2
         p0, p1, p2 = d0[0] * e[0], d0[1] * e[1], d0[2] * e[2]
         p3, p4, p5 = d1[0] * e[0], d1[1] * e[1], d1[2] * e[2]
@@ -292,7 +278,7 @@ def project_backward(
         )  # fmt: skip
         gq = _rotation_gradient(unit, inverse_norm, g_rotation)
         for c in range(4):
-            g_quats[i, c] += _saturate(gq[c])
+            g_quats[i, c] = _saturate(gq[c])
         # dL/d(JW) = dL/dm R^T, row by row; J = [[fx/z, 0, -fx a/z], [0, fy/z, -fy b/z]].
         w0 = (
             p0 * rotation[0] + p1 * rotation[1] + p2 * rotation[2],
@@ -315,8 +301,6 @@ def project_backward(
         ga += camera[12] * gx
         gb += camera[13] * gy
         gz -= (ga * x + gb * y) * iz * iz
-        if depth_channel >= 0:
-            gz += _sum_slots(slots, begin, end, depth_channel)
         gx, gy = ga * iz, gb * iz
         for c in range(3):
-            g_means[i, c] += _saturate(camera[c] * gx + camera[3 + c] * gy + camera[6 + c] * gz)
+            g_means[i, c] = _saturate(camera[c] * gx + camera[3 + c] * gy + camera[6 + c] * gz)

@@ -1,30 +1,34 @@
 """Gaussians to pictures and the gradient back, on the CPU: plain functions over numpy arrays around the numba kernels.
 
-`draw` is for those who only look. Training takes the stages one by one: `project`, `composite`, `backward`; one set of
-kernels serves both. Conventions of arrays as in `draw`.
+`draw` draws one picture. Training calls the stages one by one: `project`, `composite`, `backward`. Gaussians are sorted
+into tiles here: depth order by a radix sort, then a stable counting sort, parallel over equal chunks of the depth
+order, whose result does not depend on the number of chunks or threads.
 """
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
 
 from pd4dgs_codec import threads
-from pd4dgs_codec.draw import binning, kernels, projection
-from pd4dgs_codec.draw.checks import check_camera, check_colours, check_limits, check_shape
-from pd4dgs_codec.errors import RenderError
+from pd4dgs_codec.draw import compositing, projection
+from pd4dgs_codec.draw.simd import Tasks, kernel, parallel
+from pd4dgs_codec.errors import NotFinite, RenderError
 from pd4dgs_codec.scene import Camera
 
-CHANNELS = 3  #: colour channels drawn per pass
 CHUNKS_PER_THREAD = 4  #: of the depth order while binning
 MAX_COUNT = 2**31  #: of Gaussians, and of pairs of a Gaussian and a tile
+MAX_SIDE = 65535  #: pixels
+#: Least volume of a viewmat's 3 x 3 part; that of a rotation is 1.
+LEAST_VOLUME = 1e-9
 
 
 class Geometry(NamedTuple):
-    """N Gaussians but for their colours, as `draw` takes them: float32, C-contiguous."""
+    """N Gaussians without their colours, as `draw` takes them: float32, C-contiguous."""
 
     means: np.ndarray  #: [N, 3]
     quats: np.ndarray  #: [N, 4]
@@ -32,47 +36,25 @@ class Geometry(NamedTuple):
     opacities: np.ndarray  #: [N]
 
 
-@dataclass(frozen=True)
-class Settings:
-    """What does not take part in differentiation; see `draw`. depth: append each Gaussian's depth as a last colour."""
-
-    near: float = 0.01
-    far: float = 1e10
-    eps2d: float = 0.3
-    radius_clip: float = 0.0
-    depth: bool = False
-
-
-@dataclass(eq=False)
-class _View:
-    """One camera's Gaussians, projected and binned; the shapes are those of the kernels."""
-
-    camera: np.ndarray
-    geom: np.ndarray
-    first: np.ndarray
-    items: np.ndarray
-    slot_of: np.ndarray
-    starts: np.ndarray
-    colors: np.ndarray = field(init=False)  #: [N, D padded to a multiple of CHANNELS]
-
-
 @dataclass(eq=False)
 class Projected:
-    """N Gaussians before C cameras of one size, zeros where a Gaussian is skipped; lengths in pixels."""
+    """N Gaussians in front of a camera and the tiles that they touch; radii and means2d are 0 where one is skipped."""
 
     width: int
     height: int
-    settings: Settings
-    radii: np.ndarray  #: int32 [C, N, 2] half extents
-    means2d: np.ndarray  #: float32 [C, N, 2]
-    depths: np.ndarray  #: float32 [C, N], scene units
-    conics: np.ndarray  #: float32 [C, N, 3], upper triangle of the inverse covariance
-    views: list[_View]
+    radii: np.ndarray  #: int32 [N, 2] half extents, pixels
+    means2d: np.ndarray  #: float32 [N, 2], pixels
+    camera: np.ndarray  #: float64 [20], see `_pack_camera`
+    geom: np.ndarray  #: float64 [N, GEOM_COLUMNS], see `projection`
+    first: np.ndarray  #: int64 [N + 1], first gradient slot of each Gaussian
+    items: np.ndarray  #: int32 [pairs], the Gaussians of each tile, front to back
+    slot_of: np.ndarray  #: int32 [pairs], the gradient slot of each pair
+    starts: np.ndarray  #: int64 [tiles + 1], first pair of each tile
 
 
 @dataclass(eq=False)
 class Gradients:
-    """Of a loss, float32, each of the shape of what `project` and `composite` took or gave."""
+    """Gradients of a loss, float32, in the shapes of the arguments of `project` and `composite`."""
 
     geometry: Geometry
     colors: np.ndarray
@@ -86,126 +68,87 @@ def draw(
     opacities: np.ndarray,
     colors: np.ndarray,
     camera: Camera,
-    background: Sequence[float] | np.ndarray | None = None,
+    background: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
     *,
     near_plane: float = 0.01,
-    far_plane: float = 1e10,
-    eps2d: float = 0.3,
-    radius_clip: float = 0.0,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The picture of N Gaussians, float32 [H, W, D], and its alpha, float32 [H, W] in 0..1.
+    """The picture of N Gaussians, float32 [H, W, 3], and its alpha, float32 [H, W] in 0..1.
 
     means      [N, 3] world, scene units.
     quats      [N, 4] rotations wxyz, not necessarily unit; a zero quaternion is the identity.
     scales     [N, 3] standard deviations, scene units (the sign does not matter).
-    opacities  [N] in 0..1; not above 1/255, or not finite: the Gaussian is skipped.
-    colors     [N, D], D >= 1. background: D numbers, None for black.
-    near_plane, far_plane: Gaussians with camera z outside (near, far] are skipped, scene units.
-    eps2d: added to the diagonal of the covariance in the image, square pixels.
-    radius_clip: Gaussians whose extent is at most this are skipped, pixels.
+    opacities  [N] in 0..1; a Gaussian whose opacity is not above 1/255, or not finite, is skipped.
+    colors     [N, 3]. background: 3 numbers.
+    near_plane: Gaussians with camera z outside (near_plane, FAR] are skipped, scene units.
 
-    Arrays are of any float type and drawn in float32. A Gaussian with NaN or infinity in its position, rotation or
-    scale is skipped. Raises RenderError for wrong shapes, its kind NotFinite for colours.
+    Arrays of any float type are drawn in float32. A Gaussian with NaN or infinity in its position, rotation or scale is
+    skipped. Raises RenderError for wrong shapes, NotFinite (a RenderError) for colours.
     """
     _check_floats("means", means, None, 3)
-    n = len(means)
-    _check_floats("quats", quats, n, 4)
-    _check_floats("scales", scales, n, 3)
-    _check_floats("opacities", opacities, n)
-    _check_floats("colors", colors, n, None)
-    channels = colors.shape[1]
-    if channels < 1:
-        raise RenderError("colors has 0 channels, expected at least 1")
-    behind = np.zeros((1, channels), np.float32) if background is None else np.array([background], np.float32)
-    check_shape("background", behind.shape[1:], (channels,))
-    _check_floats("viewmat", camera.viewmat, 4, 4)
-    _check_floats("K", camera.K, 3, 3)
-    check_camera(camera.viewmat.tolist(), camera.K.tolist(), camera.width, camera.height)
-    check_limits(near_plane, far_plane, eps2d, radius_clip)
+    for name, array, *width in (
+        ("quats", quats, 4),
+        ("scales", scales, 3),
+        ("opacities", opacities),
+        ("colors", colors, 3),
+    ):
+        _check_floats(name, array, len(means), *width)
+    behind = np.array(background, np.float32)
+    check_shape("background", behind.shape, 3)
+    check_camera(camera)
+    check_near_plane(near_plane)
     geometry = Geometry(*(np.ascontiguousarray(a, np.float32) for a in (means, quats, scales, opacities)))
     colors = np.ascontiguousarray(colors, np.float32)
-    check_colours("colors", float(colors.sum()))
-    check_colours("background", float(behind.sum()))
-    projected = project(geometry, [camera], Settings(near_plane, far_plane, eps2d, radius_clip))
-    pictures, transmittances = composite(projected, colors, behind)
-    return pictures[0], 1.0 - transmittances[0]
+    check_colors("colors", float(colors.sum()))
+    check_colors("background", float(behind.sum()))
+    picture, transmittance = composite(project(geometry, camera, near_plane), colors, behind)
+    return picture, 1.0 - transmittance
 
 
-def project(geometry: Geometry, cameras: Sequence[Camera], settings: Settings) -> Projected:
-    """Where the Gaussians lie in the pictures of `cameras`, at least one and all of one size, and in which tiles."""
-    n, count = len(geometry.means), len(cameras)
+def project(geometry: Geometry, camera: Camera, near_plane: float) -> Projected:
+    """Projects the Gaussians into the camera's picture and sorts them into its tiles."""
+    n, width, height = len(geometry.means), camera.width, camera.height
     if n >= MAX_COUNT:
         raise RenderError(f"{n} Gaussians, expected fewer than 2^31")
-    width, height = cameras[0].width, cameras[0].height
-    radii, means2d = np.empty((count, n, 2), np.int32), np.empty((count, n, 2), np.float32)
-    depths, conics = np.empty((count, n), np.float32), np.empty((count, n, 3), np.float32)
-    result = Projected(width, height, settings, radii, means2d, depths, conics, [])
-    for c, camera in enumerate(cameras):
-        packed, filled = _pack_camera(camera), (radii[c], means2d[c], depths[c], conics[c])
-        visible, geom, rects = np.empty(n, np.bool_), np.empty((n, projection.GEOM_COLUMNS)), np.empty((n, 4), np.int32)
-        limits = (settings.near, settings.far, settings.eps2d, settings.radius_clip)
-        projection.project(*geometry, packed, (width, height), limits, visible, geom, rects, *filled)
-        result.views.append(_View(packed, geom, *_bin(visible, depths[c], rects, width, height)))
-    return result
+    packed, visible, depths = _pack_camera(camera), np.empty(n, np.bool_), np.empty(n, np.float32)
+    radii, means2d = np.empty((n, 2), np.int32), np.empty((n, 2), np.float32)
+    geom, rects = np.empty((n, projection.GEOM_COLUMNS)), np.empty((n, 4), np.int32)
+    projection.project(*geometry, packed, (width, height), near_plane, visible, geom, rects, radii, means2d, depths)
+    return Projected(width, height, radii, means2d, packed, geom, *_bin(visible, depths, rects, width, height))
 
 
-def composite(
-    projected: Projected, colors: np.ndarray, backgrounds: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """(pictures float32 [C, H, W, D], transmittances float32 [C, H, W] = 1 - alpha); D counts the depth, if drawn.
-
-    colors: float32 [N, D] for all cameras or [C, N, D], contiguous; backgrounds: float32 [C, D], depth left out.
-    """
-    depth, count = projected.settings.depth, len(projected.views)
-    channels = colors.shape[-1] + depth
-    pictures = np.empty((count, projected.height, projected.width, channels), np.float32)
-    transmittances = np.empty((count, projected.height, projected.width), np.float32)
-    for c, view in enumerate(projected.views):
-        view.colors = _pad_channels(_of_camera(colors, c), projected.depths[c] if depth else None)
-        background = np.zeros(view.colors.shape[1], np.float32)
-        if backgrounds is not None:
-            background[: backgrounds.shape[1]] = backgrounds[c]
-        for channel in range(0, channels, CHANNELS):
-            kernels.composite(
-                view.items, view.starts, view.geom, view.colors, channel, background, pictures[c], transmittances[c]
-            )
-    return pictures, transmittances
+def composite(projected: Projected, colors: np.ndarray, background: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(picture float32 [H, W, 3], transmittance float32 [H, W] = 1 - alpha) of colors float32 [N, 3], contiguous, over
+    background float32 [3]."""
+    picture = np.empty((projected.height, projected.width, 3), np.float32)
+    transmittance = np.empty(picture.shape[:2], np.float32)
+    compositing.composite(projected.items, projected.starts, projected.geom, colors, background, picture, transmittance)
+    return picture, transmittance
 
 
 def backward(
     projected: Projected,
     geometry: Geometry,
     colors: np.ndarray,
-    pictures: np.ndarray,
-    transmittances: np.ndarray,
-    g_pictures: np.ndarray,
-    g_alphas: np.ndarray,
+    picture: np.ndarray,
+    transmittance: np.ndarray,
+    g_picture: np.ndarray,
+    g_alpha: np.ndarray,
 ) -> Gradients:
-    """The gradient of a loss from g_pictures [C, H, W, D] and g_alphas [C, H, W], its derivatives by what `composite`
-    gave, float32 and contiguous. Everything else as it was there."""
-    zeros = Geometry(*(np.zeros_like(a) for a in geometry))
-    result = Gradients(zeros, np.zeros_like(colors), np.zeros_like(projected.means2d))
-    depth_column = projection.SLOT_GEOMETRY + colors.shape[-1] if projected.settings.depth else -1
-    for c, view in enumerate(projected.views):
-        slots = np.empty((view.items.size, projection.SLOT_GEOMETRY + view.colors.shape[1]), np.float32)
-        for channel in range(0, pictures.shape[-1], CHANNELS):
-            kernels.composite_backward(
-                view.items, view.slot_of, view.starts, view.geom, view.colors, channel,
-                pictures[c], transmittances[c], g_pictures[c], g_alphas[c], slots,
-            )  # fmt: skip
-        projection.project_backward(
-            *geometry, view.camera, view.geom, view.first, slots, depth_column,
-            *result.geometry, _of_camera(result.colors, c), result.means2d[c],
-        )  # fmt: skip
+    """Gradients of a loss from g_picture [H, W, 3] and g_alpha [H, W], its derivatives by the results of `composite`,
+    float32 and contiguous. The other arguments are those of `project` and `composite` and their results."""
+    result = Gradients(
+        Geometry(*(np.zeros_like(a) for a in geometry)), np.zeros_like(colors), np.zeros_like(projected.means2d)
+    )
+    slots = np.empty((projected.items.size, projection.SLOTS), np.float32)
+    compositing.composite_backward(
+        projected.items, projected.slot_of, projected.starts, projected.geom, colors,
+        picture, transmittance, g_picture, g_alpha, slots,
+    )  # fmt: skip
+    projection.project_backward(
+        *geometry, projected.camera, projected.geom, projected.first, slots,
+        *result.geometry, result.colors, result.means2d,
+    )  # fmt: skip
     return result
-
-
-def _check_floats(name: str, array: np.ndarray, *shape: int | None) -> None:
-    """An array of floats whose shape is `shape`; None in it is any size."""
-    if not isinstance(array, np.ndarray) or array.dtype.kind != "f":
-        found = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
-        raise RenderError(f"{name} is {found}, expected an array of floats")
-    check_shape(name, array.shape, shape)
 
 
 def _pack_camera(camera: Camera) -> np.ndarray:
@@ -218,37 +161,164 @@ def _pack_camera(camera: Camera) -> np.ndarray:
     return np.array([*viewmat[:3, :3].ravel(), *viewmat[:3, 3], fx, fy, cx, cy, low_x, high_x, low_y, high_y])
 
 
+# -- tiles -------------------------------------------------------------------------------------------------------------
+
+
 def _bin(
     visible: np.ndarray, depths: np.ndarray, rects: np.ndarray, width: int, height: int
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-    """(first, items, slot_of, starts) of `binning`: the Gaussians of each tile, front to back."""
-    order = binning.sort(visible, depths)
+    """(first, items, slot_of, starts), see `Projected`."""
+    order = depth_order(visible, depths)
     columns, rows = -(-width // projection.TILE_WIDTH), -(-height // projection.TILE_HEIGHT)
     counts = np.empty((CHUNKS_PER_THREAD * threads.kernel_threads(), columns * rows), np.int64)
     starts, first = np.empty(columns * rows + 1, np.int64), np.empty(len(visible) + 1, np.int64)
-    binning.count_tiles(order, rects, columns, counts)
-    binning.offsets(rects, counts, starts, first)
+    count_tiles(order, rects, columns, counts)
+    offsets(rects, counts, starts, first)
     if starts[-1] >= MAX_COUNT:
         raise RenderError(f"{starts[-1]} pairs of a Gaussian and a tile, expected fewer than 2^31")
     items, slot_of = np.empty(starts[-1], np.int32), np.empty(starts[-1], np.int32)
-    binning.fill_tiles(order, rects, columns, counts, first, items, slot_of)
+    fill_tiles(order, rects, columns, counts, first, items, slot_of)
     return first, items, slot_of, starts
 
 
-def _pad_channels(colors: np.ndarray, depths: np.ndarray | None) -> np.ndarray:
-    """Colours (and depth) as float32 [N, D'], D' a multiple of CHANNELS; the input itself if nothing is to be added."""
-    n, channels = colors.shape
-    total = channels + (depths is not None)
-    padded = -(-total // CHANNELS) * CHANNELS
-    if padded == channels:
-        return colors
-    result = np.zeros((n, padded), np.float32)
-    result[:, :channels] = colors
-    if depths is not None:
-        result[:, channels] = depths
-    return result
+@kernel()
+def depth_order(visible: np.ndarray, depths: np.ndarray) -> np.ndarray:
+    """Indices int64 of the visible Gaussians, front to back; equal float32 depths in index order.
+
+    A stable radix sort of the depths' bits above the smallest, 12 bits a pass: two or three passes.
+    """
+    bits = depths.view(np.int32)
+    order, count = np.empty(visible.size, np.int64), 0
+    low, high = np.iinfo(np.int32).max, 0
+    for i in range(visible.size):
+        if visible[i]:
+            order[count] = i
+            count += 1
+            low, high = min(low, bits[i]), max(high, bits[i])
+    order, other = order[:count], np.empty(count, np.int64)
+    shift = 0
+    while count and (high - low) >> shift:
+        places = np.zeros(4097, np.int64)
+        for n in range(count):
+            places[(((bits[order[n]] - low) >> shift) & 4095) + 1] += 1
+        for digit in range(4096):
+            places[digit + 1] += places[digit]
+        for n in range(count):
+            digit = ((bits[order[n]] - low) >> shift) & 4095
+            other[places[digit]] = order[n]
+            places[digit] += 1
+        order, other = other, order
+        shift += 12
+    return order
 
 
-def _of_camera(array: np.ndarray, c: int) -> np.ndarray:
-    """Camera c's [N, D] of colours that are shared, [N, D], or per camera, [C, N, D]."""
-    return array if array.ndim == 2 else array[c]
+@parallel(lambda order, rects, columns, counts: len(counts))
+def count_tiles(tasks: Tasks, order: np.ndarray, rects: np.ndarray, columns: int, counts: np.ndarray) -> None:
+    """Fills counts int64 [chunks, tiles]: how many Gaussians of each equal chunk of `order` touch each tile."""
+    chunks = counts.shape[0]
+    for chunk in range(tasks[0], tasks[1]):
+        counts[chunk, :] = 0
+        for n in range(chunk * order.size // chunks, (chunk + 1) * order.size // chunks):
+            i = order[n]
+            for row in range(rects[i, 2], rects[i, 3]):
+                for column in range(rects[i, 0], rects[i, 1]):
+                    counts[chunk, row * columns + column] += 1
+
+
+@kernel()
+def offsets(rects: np.ndarray, counts: np.ndarray, starts: np.ndarray, first: np.ndarray) -> None:
+    """Fills the exclusive prefix sums: starts [tiles + 1] into items, first [N + 1] into the slots. counts becomes the
+    write positions of fill_tiles."""
+    position = 0
+    for tile in range(counts.shape[1]):
+        starts[tile] = position
+        for chunk in range(counts.shape[0]):
+            count = counts[chunk, tile]
+            counts[chunk, tile] = position
+            position += count
+    starts[counts.shape[1]] = position
+    position = 0
+    for i in range(rects.shape[0]):
+        first[i] = position
+        position += (rects[i, 1] - rects[i, 0]) * (rects[i, 3] - rects[i, 2])
+    first[rects.shape[0]] = position
+
+
+@parallel(lambda order, rects, columns, positions, *_: len(positions))
+def fill_tiles(
+    tasks: Tasks,
+    order: np.ndarray,
+    rects: np.ndarray,
+    columns: int,
+    positions: np.ndarray,
+    first: np.ndarray,
+    items: np.ndarray,
+    slot_of: np.ndarray,
+) -> None:
+    """Fills items int32 [pairs], the Gaussians of each tile, front to back, and slot_of int32 [pairs], the pair's
+    gradient slot. Gaussian i has the slots first[i] .. first[i + 1] - 1, so that summing them reads memory in order."""
+    chunks = positions.shape[0]
+    for chunk in range(tasks[0], tasks[1]):
+        for n in range(chunk * order.size // chunks, (chunk + 1) * order.size // chunks):
+            i = order[n]
+            pair = first[i]
+            for row in range(rects[i, 2], rects[i, 3]):
+                for column in range(rects[i, 0], rects[i, 1]):
+                    tile = row * columns + column
+                    place = positions[chunk, tile]
+                    positions[chunk, tile] = place + 1
+                    items[place] = i
+                    slot_of[place] = pair
+                    pair += 1
+
+
+# -- checks ------------------------------------------------------------------------------------------------------------
+
+
+def check_shape(name: str, found: Sequence[int], *expected: int | None) -> None:
+    """Raises RenderError unless the shape `found` is the expected one; None is any size."""
+    if len(found) != len(expected) or any(b is not None and a != b for a, b in zip(found, expected, strict=True)):
+        wanted = ", ".join("*" if size is None else str(size) for size in expected)
+        raise RenderError(f"{name} has shape {list(found)}, expected [{wanted}]")
+
+
+def check_camera(camera: Camera) -> None:
+    """Raises RenderError unless it is a pinhole without skew whose picture has 1 to MAX_SIDE pixels a side."""
+    for name, value in (("width", camera.width), ("height", camera.height)):
+        if isinstance(value, bool) or not isinstance(value, int) or not 1 <= value <= MAX_SIDE:
+            raise RenderError(f"{name} is {value!r}, expected an integer from 1 to {MAX_SIDE}")
+    _check_floats("viewmat", camera.viewmat, 4, 4)
+    _check_floats("K", camera.K, 3, 3)
+    viewmat, K = camera.viewmat.tolist(), camera.K.tolist()
+    if not all(math.isfinite(v) for row in [*viewmat, *K] for v in row):
+        raise RenderError("viewmat or K has a value that is not finite")
+    if viewmat[3] != [0.0, 0.0, 0.0, 1.0]:
+        raise RenderError(f"the last row of a viewmat is {viewmat[3]}, expected [0, 0, 0, 1]")
+    rows = [row[:3] for row in viewmat[:3]]
+    (a, b, c), (d, e, f), (g, h, i) = rows
+    if not abs(a * (e * i - f * h) - b * (d * i - f * g) + c * (d * h - e * g)) >= LEAST_VOLUME:
+        raise RenderError(f"the viewmat {rows} flattens the scene, expected a rotation")
+    if [K[0][1], K[1][0], *K[2]] != [0.0, 0.0, 0.0, 0.0, 1.0]:
+        raise RenderError(f"K is {K}, expected [[fx, 0, cx], [0, fy, cy], [0, 0, 1]] (no skew)")
+    if not (K[0][0] > 0 and K[1][1] > 0):
+        raise RenderError(f"focal lengths {K[0][0]} and {K[1][1]} in K, expected both positive")
+
+
+def check_near_plane(near_plane: float) -> None:
+    """Raises RenderError unless the near plane lies between the eye and FAR."""
+    if not 0 <= near_plane < projection.FAR:
+        raise RenderError(f"near_plane is {near_plane}, expected 0 <= near_plane < {projection.FAR:g}")
+
+
+def check_colors(name: str, total: float) -> None:
+    """Raises NotFinite if the sum of the colours `name` is not finite."""
+    if not math.isfinite(total):
+        raise NotFinite(f"{name} has a value that is not finite, or its sum overflows")
+
+
+def _check_floats(name: str, array: np.ndarray, *shape: int | None) -> None:
+    """Raises RenderError unless it is an array of floats of that shape; None is any size."""
+    if not isinstance(array, np.ndarray) or array.dtype.kind != "f":
+        found = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
+        raise RenderError(f"{name} is {found}, expected an array of floats")
+    check_shape(name, array.shape, *shape)

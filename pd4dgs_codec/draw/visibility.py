@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import math
+
 from pd4dgs_codec.draw.projection import ALPHA_MIN
+from pd4dgs_codec.errors import RenderError
 from pd4dgs_codec.scene import SceneInfo
 
 #: A Gaussian fainter than the rasteriser's threshold never reaches a pixel, so its networks are not evaluated.
@@ -22,3 +25,9 @@ LEAST_NEAR = 1e-6
 def near_plane(info: SceneInfo) -> float:
     """That of a scene's pictures, scene units."""
     return max(float(info.near), LEAST_NEAR)
+
+
+def check_time(t: float) -> None:
+    """Raises RenderError unless a normalised time is a number; outside 0..1 a scene stands as at its ends."""
+    if not math.isfinite(t):
+        raise RenderError(f"time is {t}, expected a number from 0 to 1")

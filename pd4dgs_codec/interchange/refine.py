@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pd4dgs_codec.draw.rasteriser import Geometry, Settings, backward, composite, project
+from pd4dgs_codec.draw.rasteriser import Geometry, backward, composite, project
 from pd4dgs_codec.interchange.splats import Splats, camera_eye, harmonics, unit
 from pd4dgs_codec.scene import Camera
 
@@ -51,10 +51,10 @@ def refine(
         "sh": splats.sh.copy(),
     }
     moments = {name: (np.zeros_like(value), np.zeros_like(value)) for name, value in values.items()}
-    behind, settings = np.array([background], np.float32), Settings(near=near)
+    behind = np.array(background, np.float32)
     for i, which in enumerate(order):
         target = targets[which]
-        gradients = _gradients(values, size, target, behind, settings)
+        gradients = _gradients(values, size, target, behind, near)
         rate = LAST ** (i / max(len(order) - 1, 1))
         for name, gradient in gradients.items():
             first, second = moments[name]
@@ -87,7 +87,7 @@ def _splats(values: dict[str, np.ndarray], size: np.ndarray) -> Splats:
 
 
 def _gradients(
-    values: dict[str, np.ndarray], size: np.ndarray, target: Target, behind: np.ndarray, settings: Settings
+    values: dict[str, np.ndarray], size: np.ndarray, target: Target, behind: np.ndarray, near: float
 ) -> dict[str, np.ndarray]:
     """Of the mean squared error of one picture, by each of the values."""
     splats = _splats(values, size)
@@ -95,10 +95,10 @@ def _gradients(
     raw = np.einsum("nj,njc->nc", basis, splats.sh) + np.float32(0.5)
     colors = np.maximum(raw, 0)
     geometry = Geometry(splats.means, splats.quats, splats.scales, splats.opacities)
-    projected = project(geometry, [target.camera], settings)
-    pictures, transmittances = composite(projected, colors, behind)
-    slope = (2 / pictures.size) * (pictures - target.image[None])
-    g = backward(projected, geometry, colors, pictures, transmittances, slope, np.zeros_like(transmittances))
+    projected = project(geometry, target.camera, near)
+    picture, transmittance = composite(projected, colors, behind)
+    slope = (2 / picture.size) * (picture - target.image)
+    g = backward(projected, geometry, colors, picture, transmittance, slope, np.zeros_like(transmittance))
     g_colors = g.colors * (raw > 0)
     g_quats = g.geometry.quats
     return {

@@ -9,10 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pd4dgs_codec.draw.checks import check_time
-from pd4dgs_codec.draw.visibility import near_plane
-from pd4dgs_codec.model.autograd.rasterization import rasterization
-from pd4dgs_codec.model.model import Gaussians, Model, camera_tensors
+from pd4dgs_codec.draw.visibility import check_time, near_plane
+from pd4dgs_codec.model.model import Gaussians, Model
+from pd4dgs_codec.model.rasterization import rasterization
 from pd4dgs_codec.model.rounding import EXACT, Rounding
 from pd4dgs_codec.scene import Camera, SceneInfo
 
@@ -43,22 +42,11 @@ def render(
 
 def draw(info: SceneInfo, gaussians: Gaussians, camera: Camera) -> Picture:
     """The picture of `gaussians` over the scene's background."""
-    device = gaussians.means.device
-    viewmat, K = camera_tensors(camera, device)
-    images, alphas, meta = rasterization(
-        gaussians.means,
-        gaussians.quats,
-        gaussians.scales,
-        gaussians.opacities,
-        gaussians.colors,
-        viewmat[None],
-        K[None],
-        camera.width,
-        camera.height,
-        near_plane=near_plane(info),
-        backgrounds=torch.tensor([info.background], dtype=torch.float32, device=device),
+    g = gaussians
+    image, alpha, meta = rasterization(
+        g.means, g.quats, g.scales, g.opacities, g.colors, camera, info.background, near_plane=near_plane(info)
     )
-    return Picture(images[0], alphas[0, ..., 0], gaussians, meta)
+    return Picture(image, alpha, gaussians, meta)
 
 
 @torch.no_grad()

@@ -20,9 +20,10 @@ from pd4dgs_codec.errors import DataError, Pd4Error
 from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.plan import plan
-from pd4dgs_codec.model.autograd.rasterization import rasterization
 from pd4dgs_codec.model.config import PRESETS
+from pd4dgs_codec.model.rasterization import rasterization
 from pd4dgs_codec.quality.frames import Frame
+from pd4dgs_codec.scene import Camera
 
 RNG = np.random.default_rng(4)
 
@@ -172,9 +173,9 @@ def test_the_oracle_in_blocks_is_the_dense_oracle():
     given = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in view.items()}
     names = ("means", "quats", "scales", "opacities", "colors")
     dense = rasterization(
-        *(given[name] for name in names), given["viewmat"][None], given["K"][None], view["width"], view["height"],
-        near_plane=0.1, backgrounds=given["background"][None], backend="reference",
-    )[0][0]  # fmt: skip
+        *(given[name] for name in names), Camera(view["viewmat"], view["K"], view["width"], view["height"]),
+        view["background"], near_plane=0.1, backend="reference",
+    )[0]  # fmt: skip
     np.testing.assert_allclose(pictures.oracle(view), dense.numpy(), rtol=0, atol=1e-12)
 
 

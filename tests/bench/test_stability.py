@@ -139,7 +139,7 @@ def test_a_near_plane_that_lets_through_fails(monkeypatch):
 
 
 def test_an_opacity_that_is_not_capped_fails(monkeypatch):
-    from pd4dgs_codec.model.autograd import reference
+    from pd4dgs_codec.model import reference
 
     monkeypatch.setattr(reference, "ALPHA_MAX", 0.99)
     assert projection.ALPHA_MAX == 0.999

@@ -117,7 +117,7 @@ def test_a_forked_child_shares_with_helpers_of_its_own():
 
 def _draw(count, seed=0):
     threads.set_kernel_threads(count)
-    return draw_with_gradients(scene(3000, seed, scale=0.04), *camera(150, 110), 150, 110, "cpu")
+    return draw_with_gradients(scene(3000, seed, scale=0.04), camera(150, 110), "cpu")
 
 
 def _same(a, b):

@@ -1,4 +1,4 @@
-"""Vectors as wide as the CPU's: the bits that narrower ones give, and no CPU reads what another one cached."""
+"""Vectors in kernels: their operations, the same bits for any width of the CPU's, and what is compiled and cached."""
 
 import gc
 import os
@@ -17,6 +17,62 @@ from pd4dgs_codec.draw import simd
 from pd4dgs_codec.draw.simd import PRODUCT_ROWS, PRODUCT_VECTORS, WIDE
 
 ROOT = Path(__file__).parents[2]
+
+
+@numba.njit
+def _apply_narrow(a, b, c, out):
+    x, y, z = simd.load(a, 0), simd.load(b, 0), simd.load(c, 0)
+    results = (
+        x + y, x - y, x * y, x / y, simd.fma(x, y, z), simd.fnma(x, y, z), simd.sqrt(y), simd.exp2(x),
+        simd.select_gt(x, z, x, y), simd.splat(a[3]), simd.totals(x, y, z, x, y, z, x + y, y + z),
+    )  # fmt: skip
+    for n in range(len(results)):
+        simd.store(out, n * 8, results[n])
+    return simd.mask_gt(x, z), simd.total(x)
+
+
+def test_vector_operations():
+    rng = np.random.default_rng(0)
+    a, b, c = (rng.uniform(lo, hi, 8).astype(np.float32) for lo, hi in ((-9, 3), (0.5, 2), (-4, 4)))
+    out = np.zeros(11 * 8, np.float32)
+    mask, total = _apply_narrow(a, b, c, out)
+    x, y, z = (v.astype(np.float64) for v in (a, b, c))
+    expected = [
+        x + y, x - y, x * y, x / y, x * y + z, z - x * y, np.sqrt(y), 2.0**x, np.where(x > z, x, y), np.full(8, x[3]),
+        [v.sum() for v in (x, y, z, x, y, z, x + y, y + z)],
+    ]  # fmt: skip
+    np.testing.assert_allclose(out.reshape(11, 8), expected, rtol=4e-7, atol=2e-6)
+    assert mask == sum(1 << i for i in range(8) if x[i] > z[i])
+    assert total == pytest.approx(x.sum(), rel=1e-6)
+
+
+@numba.njit
+def _exp2_all(values, out):
+    for i in range(0, values.size, 8):
+        simd.store(out, i, simd.exp2(simd.load(values, i)))
+
+
+def test_exp2_accuracy_over_the_range_in_use():
+    values = np.linspace(-9, 0, 80_000).astype(np.float32)
+    out = np.empty_like(values)
+    _exp2_all(values, out)
+    assert np.abs(out / np.exp2(values.astype(np.float64)) - 1).max() < 3e-7
+
+
+@numba.njit
+def _bits(mask):
+    count = 0
+    last = -1
+    while mask:
+        last = simd.trailing_zeros(mask)
+        mask &= mask - np.uint64(1)
+        count += 1
+    return count, last
+
+
+def test_bit_loop():
+    assert _bits(np.uint64(0b1011)) == (3, 3)
+    assert _bits(np.uint64(1) << np.uint64(63)) == (1, 63)
 
 
 @numba.njit

@@ -15,9 +15,9 @@ import torch
 from pd4dgs_codec.bench.report import markdown
 from pd4dgs_codec.draw.visibility import near_plane
 from pd4dgs_codec.errors import DataError, Pd4Error
-from pd4dgs_codec.model.autograd.rasterization import rasterization
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.picture import render
+from pd4dgs_codec.model.rasterization import rasterization
 from pd4dgs_codec.scene import Camera, Deformation, Network, Scene, SceneInfo, Steps, Widths
 
 PASS, REFUSED, FAIL = "pass", "refused", "fail"
@@ -164,13 +164,11 @@ def small_scene(deformation: Deformation | None = None, anchors: int = 40, mask:
 def picture_error(model: Model, level: int, t: float, camera: Camera = CAMERA) -> float:
     """Largest difference of a channel of a pixel between the float32 picture and the float64 oracle's picture of the
     same Gaussians; NaN where the former is not finite."""
-    viewmat, K = torch.from_numpy(camera.viewmat), torch.from_numpy(camera.K)
     picture = render(model, level, t, camera)
     g, near = picture.gaussians, near_plane(model.info)
-    drawn, background = g.colors.isfinite().all(1), torch.tensor([model.info.background])
+    drawn = g.colors.isfinite().all(1)
     means, quats, scales, opacities, colors = (a[drawn] for a in (g.means, g.quats, g.scales, g.opacities, g.colors))
     expected, _, _ = rasterization(
-        means, quats, scales, opacities, colors, viewmat[None], K[None], camera.width, camera.height,
-        near_plane=near, backgrounds=background, backend="reference",
-    )  # fmt: skip
-    return float((picture.image.double() - expected[0]).abs().max())
+        means, quats, scales, opacities, colors, camera, model.info.background, near_plane=near, backend="reference"
+    )
+    return float((picture.image.double() - expected).abs().max())

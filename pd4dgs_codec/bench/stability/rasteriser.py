@@ -8,13 +8,15 @@ from concurrent.futures import ThreadPoolExecutor
 from functools import partial
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from pd4dgs_codec import threads
 from pd4dgs_codec.bench.stability.cases import Case, Found, refusal
 from pd4dgs_codec.errors import NotFinite, RenderError
-from pd4dgs_codec.model.autograd.rasterization import rasterization
+from pd4dgs_codec.model.rasterization import rasterization
+from pd4dgs_codec.scene import Camera
 
 NAMES = ("means", "quats", "scales", "opacities", "colors")
 NEAR = 0.01
@@ -80,13 +82,13 @@ def cases() -> Iterator[Case]:
         fed = "3,000 Gaussians, picture and gradients"
         yield row("one thread against two", fed, promised, 0.0, _threads_error)
     for value in (NAN, INF, -INF):
-        bad, background = partial(_draw, _with("colors", value)), torch.tensor([[0.0, value, 0.0]])
+        bad, background = partial(_draw, _with("colors", value)), (0.0, value, 0.0)
         yield refuse(f"colors {value}", f"colors {value} in 3 of 30", NotFinite, bad)
         bad = partial(_draw, _scene(5), background=background)
         yield refuse(f"background {value}", f"a background of {value}", NotFinite, bad)
-    for name, index in (("viewmats", 0), ("Ks", 1)):
+    for name in ("viewmat", "K"):
         view = _camera(WIDTH, HEIGHT)
-        view[index][0, 0, 0] = NAN
+        getattr(view, name)[0, 0] = NAN
         yield refuse(f"{name} nan", f"NaN in {name}", RenderError, partial(_draw, _scene(5), view=view))
     for width in (0, -1, 65536):
         yield refuse(f"width {width}", "a size outside 1..65535", RenderError, partial(_draw, _scene(5), width))
@@ -95,11 +97,11 @@ def cases() -> Iterator[Case]:
 # -- scenes ------------------------------------------------------------------------------------------------------------
 
 
-def _camera(width: int, height: int, shift: Sequence[float] = (0.0, 0.0)) -> tuple[Tensor, Tensor]:
-    """(viewmats [1, 4, 4], Ks [1, 3, 3]) at the origin, looking along z."""
+def _camera(width: int, height: int, shift: Sequence[float] = (0.0, 0.0)) -> Camera:
+    """At the origin, looking along z."""
     f = 1.2 * width
-    K = torch.tensor([[f, 0.0, width / 2 + shift[0]], [0.0, 1.1 * f, height / 2 + shift[1]], [0.0, 0.0, 1.0]])
-    return torch.eye(4)[None], K[None]
+    K = np.array([[f, 0, width / 2 + shift[0]], [0, 1.1 * f, height / 2 + shift[1]], [0, 0, 1]], np.float32)
+    return Camera(np.eye(4, dtype=np.float32), K, width, height)
 
 
 def _scene(n: int, seed: int = 0, first: int | None = None, **changes: Any) -> list[Tensor]:
@@ -159,15 +161,14 @@ def _draw(
     height: int = HEIGHT,
     *,
     backend: str = "cpu",
-    background: Tensor | None = None,
-    view: tuple[Tensor, Tensor] | None = None,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    view: Camera | None = None,
 ) -> dict[str, Tensor]:
     """The picture, its alphas, and the gradients of a fixed weighting of both, float64."""
     means, quats, scales, opacities, colors = leaves = [t.detach().requires_grad_() for t in tensors]
-    viewmats, Ks = view or _camera(width, height)
     out, alphas, _ = rasterization(
-        means, quats, scales, opacities, colors, viewmats, Ks, width, height,
-        near_plane=NEAR, backgrounds=background, backend=backend,
+        means, quats, scales, opacities, colors, view or _camera(width, height), background,
+        near_plane=NEAR, backend=backend,
     )  # fmt: skip
     both = torch.cat([out.double().flatten(), alphas.double().flatten()])
     loss = (both * torch.randn(both.shape, generator=torch.Generator().manual_seed(0), dtype=torch.float64)).sum()

@@ -1,10 +1,10 @@
 """Compositing of projected and binned Gaussians: numba kernels.
 
-`composite` draws, `composite_backward` returns one gradient slot per (Gaussian, tile) pair. No atomics: every result
-is the same for any number of threads. Inside a tile the loop is Gaussian-major over the blocks of 8 pixels in a row
-that its ellipse touches and that are not finished yet: a tile has 64 blocks, so both sets are one 64-bit word, and a
-small Gaussian costs few lanes. Where vectors have 16 lanes two rows are one block, named by the first; a picture has
-the same bits.
+`composite` draws; `composite_backward` fills one gradient slot per pair of a Gaussian and a tile. There are no atomics:
+results do not depend on the number of threads. Inside a tile the outer loop walks the Gaussians, the inner loop the
+blocks of 8 pixels in a row that the Gaussian's ellipse touches and that are not finished. A tile has 64 blocks, so a
+set of blocks is one 64-bit word, and a small Gaussian costs few lanes. Where vectors have 16 lanes, a block is two
+rows, named by the first; the picture has the same bits.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from pd4dgs_codec.draw.projection import (
     REACH_LOG2,
     SA,
     SB,
-    SLOT_GEOMETRY,
+    SLOTS,
     TILE_HEIGHT,
     TILE_WIDTH,
     K,
@@ -65,23 +65,24 @@ _BLOCKS = _COLUMNS * TILE_HEIGHT
 _STATE = 5  #: vectors of state per block
 _AHEAD = 4  #: Gaussians by which memory is fetched early
 _F = np.float32
+_COLORS = 3  #: channels
 
-Bits = Any  #: a uint64 that has a bit for each block of a tile, column * TILE_HEIGHT + row
+Bits = Any  #: a uint64 with one bit per block of a tile, at column * TILE_HEIGHT + row
 
 
 @kernel()
-def _prefetch(items: np.ndarray, n: int, end: int, geom: np.ndarray, colors: np.ndarray, stride: int) -> None:
+def _prefetch(items: np.ndarray, n: int, end: int, geom: np.ndarray, colors: np.ndarray) -> None:
     if n + _AHEAD < end:
         ahead = np.int64(items[n + _AHEAD])
         prefetch(geom, ahead * GEOM_COLUMNS)
-        prefetch(colors, ahead * stride)
+        prefetch(colors, ahead * _COLORS)
 
 
 @kernel()
 def _coverage(geom: np.ndarray, g: int, left: int, top: int) -> Bits:
-    """Which blocks of the tile Gaussian g (offset into flat geom) may touch.
+    """The blocks of the tile that Gaussian g (an offset into flat geom) may touch.
 
-    The chord of each pixel row, eight rows at a time, a little too wide where float32 rounds.
+    From the chord of each pixel row, WIDE rows at a time, slightly too wide to cover float32 rounding.
     """
     shear = geom[g + K]
     dy = top + 0.5 - geom[g + Y]
@@ -108,8 +109,8 @@ def _coverage(geom: np.ndarray, g: int, left: int, top: int) -> Bits:
 
 @kernel(inline=True)
 def _tabulate(ts: np.ndarray, rs: np.ndarray, rests: np.ndarray, geom: np.ndarray, g: int, left: int, top: int) -> None:
-    """Of Gaussian g, float32: ts = t at the first pixel of each block of 8 in a row, rs = r and rests = q - r^2 of each
-    row of the tile."""
+    """Fills, for Gaussian g, float32 ts = t at the first pixel of each block of 8, and per row of the tile rs = r and
+    rests = q - r^2."""
     dy, sa, sb = top + 0.5 - geom[g + Y], geom[g + SA], geom[g + SB]
     start, step = splat(sa * (left + 0.5 - geom[g + X] - geom[g + K] * dy)), splat(-sa * geom[g + K])
     for first in range(0, TILE_HEIGHT, WIDE):
@@ -123,7 +124,7 @@ def _tabulate(ts: np.ndarray, rs: np.ndarray, rests: np.ndarray, geom: np.ndarra
 
 @kernel()
 def _begin(state: np.ndarray, channel: int, left: int, top: int, width: int, height: int) -> Bits:
-    """Transmittance 1 inside the image, 0 outside; returns the blocks with a pixel inside, as bits."""
+    """Sets `channel` of the state to 1 inside the image and 0 outside; returns the blocks with a pixel inside."""
     alive = np.uint64(0)
     for block in range(_BLOCKS):
         row, column = block % TILE_HEIGHT, block // TILE_HEIGHT * LANES
@@ -149,15 +150,14 @@ def _composite_tile(
     end: int,
     geom: np.ndarray,
     colors: np.ndarray,
-    stride: int,
-    channel: int,
     left: int,
     top: int,
     width: int,
     height: int,
     state: np.ndarray,
 ) -> None:
-    """Blend the tile's Gaussians into `state`: per block transmittance (0 once finished), 3 colours, its last value."""
+    """Blends the tile's Gaussians into `state`: per block the transmittance (0 once finished), 3 colours and the last
+    transmittance above T_MIN."""
     alive = _begin(state, 4, left, top, width, height)
     alive = _begin(state, 0, left, top, width, height)
     one = np.uint64(1)
@@ -167,14 +167,14 @@ def _composite_tile(
     for n in range(start, end):
         if not alive:
             break
-        _prefetch(items, n, end, geom, colors, stride)
+        _prefetch(items, n, end, geom, colors)
         g = np.int64(items[n]) * GEOM_COLUMNS
         mask = _coverage(geom, g, left, top) & alive
         if not mask:
             continue
         _tabulate(ts, rs, rests, geom, g, left, top)
         step = splat(_F(geom[g + SA]))
-        c = np.int64(items[n]) * stride + channel
+        c = np.int64(items[n]) * _COLORS
         red, green, blue = splat(colors[c]), splat(colors[c + 1]), splat(colors[c + 2])
         while mask:
             block = trailing_zeros(mask)
@@ -207,35 +207,29 @@ def composite(
     starts: np.ndarray,
     geom: np.ndarray,
     colors: np.ndarray,
-    channel: int,
     background: np.ndarray,
-    out_colors: np.ndarray,
+    picture: np.ndarray,
     transmittance: np.ndarray,
 ) -> None:
-    """Draw 3 channels from `channel` on. colors float32 [N, D], D a multiple of 3; background float32 [D].
+    """Fills picture [H, W, 3] and transmittance = 1 - alpha [H, W], float32, from colors [N, 3] and background [3].
 
-    out_colors [H, W, D'], D' <= D, and transmittance = 1 - alpha [H, W], float32, are filled. (1 - alpha computed from
-    alpha would lose the digits that the gradient of a nearly hidden background needs.)
+    Computing 1 - alpha from alpha would lose the digits that the gradient of a nearly hidden background needs.
     """
-    height, width, channels = out_colors.shape
+    height, width = transmittance.shape
     columns = -(-width // TILE_WIDTH)
-    stride = colors.shape[1]
     flat_geom, flat_colors = geom.reshape(-1), colors.reshape(-1)
     for tile in range(tasks[0], tasks[1]):
         left, top = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
         state = aligned(_BLOCKS * _STATE * LANES, _F)
-        _composite_tile(
-            items, starts[tile], starts[tile + 1], flat_geom, flat_colors, stride, channel, left, top, width, height,
-            state,
-        )  # fmt: skip
+        _composite_tile(items, starts[tile], starts[tile + 1], flat_geom, flat_colors, left, top, width, height, state)
         for y in range(top, min(top + TILE_HEIGHT, height)):
             for x in range(left, min(left + TILE_WIDTH, width)):
                 p = _place(x - left, y - top)
                 behind = state[p + 4 * WIDE]
                 transmittance[y, x] = behind
-                for c in range(min(3, channels - channel)):
-                    back = behind * background[channel + c]
-                    out_colors[y, x, channel + c] = state[p + (1 + c) * WIDE] + back
+                for c in range(_COLORS):
+                    back = behind * background[c]
+                    picture[y, x, c] = state[p + (1 + c) * WIDE] + back
 
 
 @kernel()
@@ -246,31 +240,28 @@ def _composite_tile_backward(
     end: int,
     geom: np.ndarray,
     colors: np.ndarray,
-    stride: int,
-    channel: int,
     left: int,
     top: int,
     width: int,
     height: int,
     state: np.ndarray,
     slots: np.ndarray,
-    slot_stride: int,
 ) -> None:
-    """Front to back again. Per block: transmittance, R (the gradient's share of what lies behind), dL/d(3 colours)."""
+    """Walks the Gaussians front to back again. The state holds per block the transmittance, the part of the gradient
+    that comes from behind the current Gaussian, and dL/d(3 colours)."""
     alive = _begin(state, 0, left, top, width, height)
     one_bit = np.uint64(1)
-    scratch = np.empty(LANES, np.float32)
     zero, one, faintest = splat(_F(0.0)), splat(_F(1.0)), splat(_F(ALPHA_MIN))
     low, high, t_min = splat(_F(-9.0)), splat(_F(ALPHA_MAX)), splat(_F(T_MIN))
     ts, rs, rests = aligned(_BLOCKS, _F), aligned(TILE_HEIGHT, _F), aligned(TILE_HEIGHT, _F)
     for n in range(start, end):
-        _prefetch(items, n, end, geom, colors, stride)
+        _prefetch(items, n, end, geom, colors)
         g = np.int64(items[n]) * GEOM_COLUMNS
         mask = _coverage(geom, g, left, top) & alive if alive else alive
         if mask:
             _tabulate(ts, rs, rests, geom, g, left, top)
         step = splat(_F(geom[g + SA]))
-        c = np.int64(items[n]) * stride + channel
+        c = np.int64(items[n]) * _COLORS
         red, green, blue = splat(colors[c]), splat(colors[c + 1]), splat(colors[c + 2])
         sum_g, sum_gt, sum_gtt, sum_gr, sum_grr, sum_gtr = zero, zero, zero, zero, zero, zero
         sum_red, sum_green, sum_blue = zero, zero, zero
@@ -308,16 +299,9 @@ def _composite_tile_backward(
             folded(sum_g), folded(sum_gt), folded(sum_gtt), folded(sum_gr), folded(sum_grr), folded(sum_gtr),
             folded(sum_red), folded(sum_green),
         )  # fmt: skip
-        slot = np.int64(slot_of[n]) * slot_stride
-        if channel == 0:
-            store(slots, slot, sums)
-        else:
-            store(scratch, 0, sums)
-            for s in range(SLOT_GEOMETRY):
-                slots[slot + s] += scratch[s]
-            slots[slot + SLOT_GEOMETRY + channel] = scratch[SLOT_GEOMETRY]
-            slots[slot + SLOT_GEOMETRY + channel + 1] = scratch[SLOT_GEOMETRY + 1]
-        slots[slot + SLOT_GEOMETRY + channel + 2] = total(folded(sum_blue))
+        slot = np.int64(slot_of[n]) * SLOTS
+        store(slots, slot, sums)
+        slots[slot + LANES] = total(folded(sum_blue))
 
 
 @parallel(lambda items, slot_of, starts, *_: starts.size - 1)
@@ -328,20 +312,18 @@ def composite_backward(
     starts: np.ndarray,
     geom: np.ndarray,
     colors: np.ndarray,
-    channel: int,
-    out_colors: np.ndarray,
+    picture: np.ndarray,
     transmittance: np.ndarray,
-    g_colors: np.ndarray,
-    g_alphas: np.ndarray,
+    g_picture: np.ndarray,
+    g_alpha: np.ndarray,
     slots: np.ndarray,
 ) -> None:
-    """slots float32 [pairs, 6 + D]: gradient sums of each pair; geometry columns are added to when channel > 0.
+    """Fills slots float32 [pairs, SLOTS] with each pair's sums of gradients.
 
-    g_colors [H, W, D'], g_alphas [H, W]: dL/d(out_colors), dL/d(1 - transmittance), which counts in the first pass.
+    g_picture [H, W, 3] and g_alpha [H, W]: dL/d(picture) and dL/d(1 - transmittance).
     """
-    height, width, channels = out_colors.shape
+    height, width = transmittance.shape
     columns = -(-width // TILE_WIDTH)
-    stride, slot_stride = colors.shape[1], slots.shape[1]
     flat_geom, flat_colors, flat_slots = geom.reshape(-1), colors.reshape(-1), slots.reshape(-1)
     for tile in range(tasks[0], tasks[1]):
         left, top = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
@@ -350,13 +332,13 @@ def composite_backward(
             for x in range(left, min(left + TILE_WIDTH, width)):
                 p = _place(x - left, y - top)
                 # What lies behind contributes v.C and, through alpha = 1 - T, -g_alpha T.
-                behind = -transmittance[y, x] * g_alphas[y, x] if channel == 0 else _F(0.0)
-                for c in range(min(3, channels - channel)):
-                    v = g_colors[y, x, channel + c]
-                    behind += v * out_colors[y, x, channel + c]
+                behind = -transmittance[y, x] * g_alpha[y, x]
+                for c in range(_COLORS):
+                    v = g_picture[y, x, c]
+                    behind += v * picture[y, x, c]
                     state[p + (2 + c) * WIDE] = v
                 state[p + WIDE] = behind
         _composite_tile_backward(
-            items, slot_of, starts[tile], starts[tile + 1], flat_geom, flat_colors, stride, channel, left, top, width,
-            height, state, flat_slots, slot_stride,
+            items, slot_of, starts[tile], starts[tile + 1], flat_geom, flat_colors, left, top, width, height, state,
+            flat_slots,
         )  # fmt: skip

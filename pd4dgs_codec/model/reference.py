@@ -1,0 +1,116 @@
+"""A dense float64 torch oracle: every Gaussian against every pixel, gradients by autograd. Slow, for tests.
+
+Written from the textbook formulas (matrix products, an inverse by determinant), sharing only thresholds with the
+kernels, so that a common mistake is unlikely. Only the determinant differs from the textbook: p r - q^2 has no digit
+left where a Gaussian is 10^8 times as long as a pixel is wide.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pd4dgs_codec.draw.projection import ALPHA_MAX, ALPHA_MIN, EPS2D, FAR
+from pd4dgs_codec.scene import Camera
+
+T_MIN = 1e-4
+
+
+def _rotations(quats: Tensor) -> Tensor:
+    """[N, 3, 3] from wxyz; a zero quaternion is the identity without gradient."""
+    norm = torch.linalg.vector_norm(quats, dim=-1, keepdim=True)
+    zero = norm == 0
+    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype, device=quats.device)
+    w, x, y, z = torch.where(zero, identity, quats / torch.where(zero, 1.0, norm)).unbind(-1)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return torch.stack([torch.stack(row, -1) for row in rows], -2)
+
+
+def project(
+    means: Tensor, quats: Tensor, scales: Tensor, viewmat: Tensor, K: Tensor, width: int, height: int
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Pixel means [N, 2], covariances [N, 2, 2] (EPS2D included), their determinants [N] and depths [N]; the caller
+    keeps z > 0."""
+    x, y, z = (means @ viewmat[:3, :3].T + viewmat[:3, 3]).unbind(-1)
+    fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
+    margin_x, margin_y = 0.15 * width / fx, 0.15 * height / fy
+    tx = z * torch.clamp(x / z, -cx / fx - margin_x, (width - cx) / fx + margin_x)
+    ty = z * torch.clamp(y / z, -cy / fy - margin_y, (height - cy) / fy + margin_y)
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack(
+        [torch.stack([fx / z, zero, -fx * tx / z**2], -1), torch.stack([zero, fy / z, -fy * ty / z**2], -1)], -2
+    )
+    half = jacobian @ viewmat[:3, :3] @ _rotations(quats) @ torch.diag_embed(scales)
+    blur = math.sqrt(EPS2D) * torch.eye(2, dtype=means.dtype, device=means.device)
+    root = torch.cat([half, blur.expand(len(half), 2, 2)], -1)
+    products = root[:, 0, :, None] * root[:, 1, None, :]
+    det = (products - products.mT).triu().square().sum((1, 2))  # of all minors of the root (Cauchy and Binet)
+    return torch.stack([fx * x / z + cx, fy * y / z + cy], -1), root @ root.mT, det, z
+
+
+def composite(
+    means2d: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, width: int, height: int
+) -> tuple[Tensor, Tensor]:
+    """Blends Gaussians that are sorted front to back. Returns (image [H, W, 3], alpha [H, W, 1])."""
+    ys, xs = (torch.arange(n, dtype=means2d.dtype, device=means2d.device) + 0.5 for n in (height, width))
+    ys, xs = torch.meshgrid(ys, xs, indexing="ij")
+    dx, dy = xs[..., None] - means2d[:, 0], ys[..., None] - means2d[:, 1]
+    sigma = 0.5 * (conics[:, 0] * dx * dx + conics[:, 2] * dy * dy) + conics[:, 1] * dx * dy
+    alpha = torch.clamp(opacities * torch.exp(-sigma), max=ALPHA_MAX)
+    alpha = torch.where(alpha >= ALPHA_MIN, alpha, 0.0)
+    after = torch.cumprod(1.0 - alpha, -1)
+    # Transmittance only falls, so a pixel that has finished stays finished under this test.
+    alpha = torch.where(after > T_MIN, alpha, 0.0)
+    before = torch.cat([torch.ones_like(after[..., :1]), torch.cumprod(1.0 - alpha, -1)[..., :-1]], -1)
+    weights = alpha * before
+    return weights @ colors, weights.sum(-1, keepdim=True)
+
+
+def rasterize(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    camera: Camera,
+    background: np.ndarray,
+    near_plane: float,
+) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+    """The oracle behind `rasterization(backend="reference")`, which checks the arguments. Float64 results."""
+    means, quats, scales, opacities, colors = (t.double() for t in (means, quats, scales, opacities, colors))
+    viewmat, K = (means.new_tensor(np.array(a)).double() for a in (camera.viewmat, camera.K))
+    n, width, height = len(means), camera.width, camera.height
+    index = _before_the_camera(means, quats, scales, opacities, viewmat, near_plane)
+    means, quats, scales, opacities, colors = (a[index] for a in (means, quats, scales, opacities, colors))
+    means2d, covariance, det, _ = project(means, quats, scales, viewmat, K, width, height)
+    p, q, r = covariance[:, 0, 0], covariance[:, 0, 1], covariance[:, 1, 1]
+    extent = torch.sqrt(2 * torch.log(255.0 * opacities.detach()))
+    radii = torch.ceil(extent[:, None] * torch.sqrt(torch.stack([p, r], -1).detach()))
+    seen = ((means2d + radii > 0) & (means2d - radii < means2d.new_tensor([width, height]))).all(-1)
+    seen &= (radii > 0).any(-1) & (det > 0)
+    index, conics = index[seen], torch.stack([r, -q, p], -1)[seen] / det[seen, None]
+    pixels = means.new_zeros((1, n, 2)).index_copy(1, index, means2d[None, seen].detach())
+    pixels.requires_grad_(torch.is_grad_enabled() and means2d.requires_grad)
+    moved = means2d[seen] + (pixels - pixels.detach())[0, index]  # 0, for the gradient by pixels
+    image, alpha = composite(moved, conics, opacities[seen], colors[seen], width, height)
+    image = image + (1.0 - alpha) * torch.from_numpy(background).to(means)
+    radii = means.new_zeros((1, n, 2)).index_copy(1, index, radii[None, seen]).to(torch.int32)
+    return image, alpha[..., 0], {"means2d": pixels, "radii": radii}
+
+
+def _before_the_camera(
+    means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor, viewmat: Tensor, near_plane: float
+) -> Tensor:
+    """int64 [M]: the Gaussians that are finite, visible and between the planes, front to back."""
+    z = (means @ viewmat[2, :3] + viewmat[2, 3]).detach()
+    keep = (z > near_plane) & (z <= FAR) & (opacities > ALPHA_MIN) & torch.isfinite(opacities)
+    keep &= torch.isfinite(means).all(-1) & torch.isfinite(quats).all(-1) & torch.isfinite(scales).all(-1)
+    index = torch.nonzero(keep)[:, 0]
+    return index[torch.sort(z[index].to(torch.float32), stable=True).indices]

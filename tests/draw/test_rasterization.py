@@ -1,0 +1,472 @@
+"""`rasterization`: both backends against the float64 oracle, the oracle by finite differences and by hand; refusals."""
+
+import importlib.metadata
+import math
+import sys
+import types
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from raster_scenes import (
+    NAMES,
+    camera,
+    draw_with_gradients,
+    oracle_errors,
+    relative_errors,
+    scene,
+    turned_camera,
+    with_values,
+)
+
+from pd4dgs_codec.errors import NotFinite, RenderError
+from pd4dgs_codec.model import reference
+from pd4dgs_codec.model.rasterization import check_gsplat, rasterization, rasterize_gsplat
+
+LIMIT = 1e-5
+
+CASES = {
+    "plain": (scene(300, 1), camera(50, 40)),
+    "turned": (scene(300, 2), turned_camera(50, 40)),
+    "one pixel": (scene(30, 3), camera(1, 1)),
+    "one row": (scene(60, 4), camera(70, 1)),
+    "tile edges": (scene(200, 5, scale=0.05), camera(64, 32)),
+    "small": (scene(2000, 6, scale=0.004), camera(48, 33)),
+    "huge": (scene(40, 7, scale=3.0, opacity=(0.02, 0.3)), camera(40, 40)),
+    "wide": (scene(300, 8, spread=4.0, scale=0.4), camera(33, 50, focal=0.5)),
+    "dense": (scene(1500, 9, scale=0.3, opacity=(0.3, 0.999)), camera(24, 24)),
+    "off centre": (scene(300, 10), camera(40, 40, shift=(17.0, -9.5))),
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_kernels_agree_with_the_oracle(name):
+    errors, found, expected = oracle_errors(*CASES[name], (0.2, -0.5, 0.9))
+    assert max(errors.values()) < LIMIT, errors
+    assert expected["alpha"].max() > 0.05  # something was drawn
+    for key in ("radii", "means2d"):
+        torch.testing.assert_close(found["meta"][key].double(), expected["meta"][key].double(), rtol=1e-5, atol=1e-5)
+
+
+def test_needles_keep_their_digits():
+    tensors = scene(200, 11, opacity=(0.3, 0.9))
+    with torch.no_grad():
+        tensors[2].copy_(torch.tensor([1.5, 1e-4, 1e-4]))
+    errors, *_ = oracle_errors(tensors, camera(64, 48))
+    assert max(errors.values()) < 2 * LIMIT, errors
+
+
+def test_oracle_gradients_by_finite_differences():
+    tensors = [t.detach().double().requires_grad_() for t in scene(6, 15, scale=0.25, opacity=(0.3, 0.7))]
+
+    def draw(*leaves):
+        # Far inside the extents, alpha stays clear of 1/255: the whole window is within 3.3 sigma of every Gaussian.
+        leaves = (leaves[0] * torch.tensor([0.2, 0.2, 1.0]), leaves[1], leaves[2] + 1.0, *leaves[3:])
+        return rasterization(*leaves, camera(6, 5), backend="reference")[:2]
+
+    assert torch.autograd.gradcheck(draw, tensors, eps=1e-6, atol=1e-7, rtol=1e-5)
+
+
+@pytest.mark.parametrize("backend", ["cpu", "reference"])
+def test_one_gaussian_by_hand(backend):
+    values = ((0.0, 0.0, 2.0), (1.0, 0.0, 0.0, 0.0), (0.2,) * 3, 0.6, (1.0, 0.5, 0.25))
+    tensors = [torch.tensor([v]) for v in values]
+    image, alphas, meta = rasterization(*tensors, camera(33, 33, focal=1.0), (0.0, 0.0, 1.0), backend=backend)
+    # On the optical axis J is diagonal: variance (f s / z)^2 + 0.3, fx = 33, fy = 36.3; the axis meets pixel (16, 16).
+    var_x, var_y = (33 * 0.2 / 2) ** 2 + 0.3, (36.3 * 0.2 / 2) ** 2 + 0.3
+    for dx, dy in ((0, 0), (2, 0), (0, -3), (-4, 5)):
+        alpha = 0.6 * math.exp(-0.5 * (dx * dx / var_x + dy * dy / var_y))
+        assert alphas[16 + dy, 16 + dx].item() == pytest.approx(alpha, rel=1e-6)
+        expected = [alpha, 0.5 * alpha, 0.25 * alpha + 1 - alpha]
+        assert image[16 + dy, 16 + dx].tolist() == pytest.approx(expected, rel=1e-6)
+    extent = math.sqrt(2 * math.log(255 * 0.6))
+    assert meta["radii"][0, 0].tolist() == [math.ceil(extent * math.sqrt(v)) for v in (var_x, var_y)]
+
+
+def test_side_clamp_of_the_jacobian_matters_and_agrees():
+    """A large Gaussian beside the frustum, where x/z passes 1.3 x the field of view."""
+    tensors = scene(3, 16, opacity=(0.9, 0.95))
+    with torch.no_grad():
+        tensors[0].copy_(torch.tensor([[1.9, 0.1, 1.0], [-1.2, 1.5, 1.1], [0.0, 0.0, 3.0]]))
+        tensors[2].copy_(torch.tensor([0.8, 0.4, 0.2]))
+    view = camera(40, 40)
+    errors, *_ = oracle_errors(tensors, view)
+    assert max(errors.values()) < LIMIT, errors
+    # A view wide enough for no clamp has another covariance: the clamp was active.
+    matrices = [t.detach().double() for t in tensors[:3]] + [
+        torch.from_numpy(m).double() for m in (view.viewmat, view.K)
+    ]
+    clamped, wide = (reference.project(*matrices, size, size)[1] for size in (40, 4000))
+    assert not torch.allclose(clamped[:2], wide[:2], rtol=0.1) and torch.equal(clamped[2], wide[2])
+
+
+def test_cropping_a_view_changes_no_pixel():
+    """Tiles lie elsewhere over the same Gaussians, so a pixel that depended on its tile would show."""
+    tensors, view = [t.detach() for t in scene(400, 17, scale=0.08, spread=0.4)], camera(96, 80)
+    whole, _, _ = rasterization(*tensors, view)
+    for left, top in ((8, 5), (24, 16), (13, 9)):
+        K = view.K - np.array([[0, 0, left], [0, 0, top], [0, 0, 0]], np.float32)
+        # The side clamp depends on the view's size, so all views are wider than the Gaussians' spread.
+        part, _, _ = rasterization(*tensors, replace(view, K=K, width=96 - left, height=80 - top))
+        torch.testing.assert_close(part, whole[top:, left:], rtol=0, atol=2e-5)
+
+
+def test_termination_stops_before_the_limit():
+    """T would fall to 1e-4 or less: that Gaussian is not drawn. 0.5^13 = 1.2e-4 stays, 0.5^14 = 6e-5 would not."""
+    n = 20
+    tensors = [t.detach().clone() for t in scene(n, 18)]
+    tensors[0][:] = torch.tensor([0.0, 0.0, 3.0])
+    tensors[0][:, 2] += torch.arange(n) * 1e-3
+    tensors[1][:] = torch.tensor([1.0, 0.0, 0.0, 0.0])
+    tensors[2][:], tensors[3][:] = 50.0, 0.5
+    for backend in ("cpu", "reference"):
+        _, alpha, _ = rasterization(*tensors, camera(3, 3), backend=backend)
+        assert alpha[1, 1].item() == pytest.approx(1 - 0.5**13, abs=2e-6)
+
+
+def test_front_hides_back_whatever_the_order():
+    front, back = (0.0, 0.0, 2.0), (0.0, 0.0, 4.0)
+    for means, first in (([front, back], 0), ([back, front], 1)):
+        tensors = (
+            torch.tensor(means),
+            torch.ones(2, 4),
+            torch.full((2, 3), 0.5),
+            torch.full((2,), 0.9),
+            torch.eye(3)[:2],
+        )
+        image, _, _ = rasterization(*tensors, camera(9, 9))
+        assert image[4, 4, first] > 0.85 and image[4, 4, 1 - first] < 0.1
+
+
+def test_float16_float64_and_strided_inputs():
+    tensors, view = scene(100, 19), camera(30, 20)
+    expected, _, _ = rasterization(*tensors, view)
+    double = [t.detach().double().requires_grad_() for t in tensors]
+    image, _, _ = rasterization(*double, view)
+    assert torch.equal(image, expected)
+    image.sum().backward()
+    assert all(t.grad.dtype == torch.float64 and t.grad.abs().sum() > 0 for t in double)
+    strided = [torch.stack([t.detach(), t.detach()], -1)[..., 0] for t in tensors]
+    assert not strided[0].is_contiguous()
+    assert torch.equal(rasterization(*strided, view)[0], expected)
+    half = [t.detach().half().requires_grad_() for t in tensors]
+    rounded, _, _ = rasterization(*[t.detach().float() for t in half], view)
+    assert torch.equal(rasterization(*half, view)[0], rounded)
+
+
+def test_no_gradient_wanted():
+    for tensors, enabled in (([t.detach() for t in scene(50, 20)], True), (scene(50, 20), False)):
+        with torch.set_grad_enabled(enabled):
+            image, alpha, meta = rasterization(*tensors, camera(20, 20))
+        assert not (image.requires_grad or alpha.requires_grad or meta["means2d"].requires_grad)
+
+
+def test_second_derivatives_are_refused():
+    tensors = scene(5)
+    image, _, _ = rasterization(*tensors, camera(8, 8))
+    (first,) = torch.autograd.grad(image.square().sum(), tensors[4], create_graph=True)
+    with pytest.raises(RuntimeError, match="differentiat"):
+        first.sum().backward()
+
+
+# -- degenerate and extreme input --------------------------------------------------------------------------------------
+
+NAN, INF = float("nan"), float("inf")
+NEAR = 0.01
+VIEW = camera(40, 30)
+
+#: (tensor, value put into Gaussians 0..2, must they be invisible)
+VALUES = [
+    *[("quats", (v, v, v, v), False) for v in (0.0, 1e-20, -1e20, 1e-45, 3e38)],
+    *[("scales", v, False) for v in ((0.0,) * 3, (1e-20,) * 3, (0.5, 0.5, 0.0), (5.0, 1e-6, 1e-6), (-0.1,) * 3)],
+    *[("scales", (v,) * 3, False) for v in (1e6, 1e18)],
+    *[("means", (0.1, 0.0, z), True) for z in (NEAR, 0.0, -0.0, -3.0, 2e10)],
+    *[("means", (0.1, 0.0, z), False) for z in (NEAR + 1e-7, 1e9, 1e10)],
+    ("means", (0.0, 0.0, 0.0), True),
+    ("means", (4.0, -3.0, NEAR + 1e-6), False),
+    ("means", (1e8, 1e8, 1e9), False),
+    ("means", (1e30, 0.0, 1.0), False),
+    *[("opacities", v, True) for v in (0.0, 1 / 256, -0.5, INF)],
+    *[("opacities", v, False) for v in (1 / 255, 1 / 255 + 1e-7, 1.0, 1.5, 1e30)],
+    *[(name, v, True) for name in ("means", "quats", "scales", "opacities") for v in (NAN, INF, -INF)],
+]
+
+
+def assert_finite(result):
+    for key, value in (result | {"means2d": result["meta"]["means2d"]}).items():
+        assert key == "meta" or torch.isfinite(value).all(), key
+
+
+@pytest.mark.parametrize("name, value, invisible", VALUES)
+def test_one_bad_value(name, value, invisible):
+    tensors = with_values(name, value)
+    found = draw_with_gradients(tensors, VIEW, "cpu", near_plane=NEAR)
+    assert_finite(found)
+    if not invisible:
+        return
+    assert (found["meta"]["radii"][0, :3] == 0).all()
+    assert all((found["d " + k][:3] == 0).all() for k in NAMES)
+    rest = draw_with_gradients([t[3:] for t in tensors], VIEW, "cpu", near_plane=NEAR)
+    assert torch.equal(found["picture"], rest["picture"])  # the others are drawn as if it were not there
+    assert all(torch.equal(found["d " + k][3:], rest["d " + k]) for k in NAMES)
+
+
+@pytest.mark.parametrize(
+    "name, value",
+    [
+        ("quats", (0.0,) * 4), ("quats", (1e-20,) * 4), ("quats", (1e20,) * 4), ("quats", (3e38,) * 4),
+        ("scales", (0.0,) * 3), ("scales", (5.0, 1e-6, 1e-6)), ("scales", (-0.1,) * 3),
+        ("scales", (1e6,) * 3), ("opacities", 1.0), ("opacities", 1.5), ("opacities", 0.0),
+        ("means", (0.1, 0.0, 1e9)), ("means", (0.05, 0.0, 0.02)),
+    ],
+)  # fmt: skip
+def test_extreme_values_agree_with_the_oracle(name, value):
+    errors, *_ = oracle_errors(with_values(name, value, seed=1), VIEW)
+    for k, error in errors.items():
+        if not (name == "quats" and k == "d quats"):  # 1e20 times larger than the others' gradients
+            assert error < 2e-5, (k, error)
+
+
+@pytest.mark.parametrize("scale", [1e6, 1e18, 3e37])
+def test_enormous_gaussians_cover_the_view(scale):
+    tensors = [t[:1] for t in with_values("scales", (scale,) * 3)]
+    _, alpha, meta = rasterization(*tensors, VIEW)
+    torch.testing.assert_close(alpha, tensors[3].expand(30, 40), rtol=1e-5, atol=0)
+    assert (meta["radii"] == 10**9).all() or scale == 1e6
+
+
+def test_a_line_of_any_length_is_drawn():
+    """Discs and lines up to 10^27 scene units long, some edge-on: in float64 p r - q^2 has no digit left of them."""
+    tensors = scene(6, 21, opacity=(0.6, 0.9))
+    with torch.no_grad():
+        tensors[2].copy_(
+            torch.tensor([[0, 1e27, 0], [1e-28, 2e14, 0], [1e12, 1e12, 0], [0, 0, 0], [5e17, 1e-9, 1], [1, 1e20, 1e20]])
+        )
+        found, expected = (rasterization(*tensors, camera(40, 40), backend=b)[0] for b in ("cpu", "reference"))
+    torch.testing.assert_close(found.double(), expected, rtol=0, atol=1 / 255)
+    assert float(expected.max()) > 0.3
+
+
+def test_a_zero_quaternion_is_the_identity_without_gradient():
+    zero, one = with_values("quats", (0.0,) * 4), with_values("quats", (1.0, 0.0, 0.0, 0.0))
+    a, b = (draw_with_gradients(t, VIEW, "cpu") for t in (zero, one))
+    assert torch.equal(a["picture"], b["picture"])
+    assert (a["d quats"][:3] == 0).all() and (b["d quats"][:3] != 0).any()
+
+
+@pytest.mark.parametrize("n, z", [(0, 1.0), (20, -1.0)])
+def test_nothing_to_draw(n, z):
+    tensors = scene(n)
+    with torch.no_grad():
+        tensors[0][:, 2] *= z
+    found = draw_with_gradients(tensors, camera(20, 10), "cpu", (0.25, 0.5, 0.75))
+    assert (found["alpha"] == 0).all() and (found["picture"] == torch.tensor([0.25, 0.5, 0.75])).all()
+    assert all((found["d " + k] == 0).all() for k in NAMES)
+
+
+@pytest.mark.parametrize("n, opacity", [(64, 1.0), (2000, 0.005)])
+def test_coincident_gaussians(n, opacity):
+    tensors = scene(n, 2)
+    with torch.no_grad():
+        tensors[0][:] = torch.tensor([0.1, -0.1, 3.0])
+        tensors[1][:] = tensors[1][0].clone()
+        tensors[2][:], tensors[3][:] = 0.4, opacity
+    errors, found, _ = oracle_errors(tensors, camera(16, 16))
+    assert_finite(found)
+    assert errors["picture"] < 1e-5 and errors["d colors"] < 1e-4, errors
+
+
+def test_opaque_centre_exactly_on_a_pixel():
+    """alpha is clamped to 0.999 there: no gradient to opacity or position from that pixel, and T = 1e-3 behind it."""
+    tensors = scene(2, 3)
+    with torch.no_grad():
+        tensors[0][:] = torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 3.0]])
+        tensors[2][:], tensors[3][:] = 0.001, 1.0
+    errors, found, _ = oracle_errors(tensors, camera(1, 1))
+    assert found["alpha"].item() == pytest.approx(0.999, abs=1e-6)
+    assert found["d opacities"][0] == 0 and (found["d means"][0] == 0).all()
+    assert max(errors.values()) < 1e-5
+
+
+def test_depth_ties_under_permutation():
+    tensors = scene(80, 4, opacity=(0.3, 0.8))
+    with torch.no_grad():
+        tensors[0][:, 2] = 3.0
+    image, _, _ = rasterization(*tensors, VIEW)
+    for backend in ("cpu", "reference"):  # ties break by index in both
+        again, _, _ = rasterization(*tensors, VIEW, backend=backend)
+        torch.testing.assert_close(again.float(), image, rtol=1e-5, atol=1e-6)
+    order = torch.randperm(80, generator=torch.Generator().manual_seed(1))
+    permuted, _, _ = rasterization(*[t[order] for t in tensors], VIEW)
+    assert torch.isfinite(permuted).all() and not torch.allclose(permuted, image)
+    tensors[0].data[:, 2] += torch.arange(80) * 1e-4
+    image, _, _ = rasterization(*tensors, VIEW)
+    permuted, _, _ = rasterization(*[t[order] for t in tensors], VIEW)
+    assert torch.equal(permuted, image)  # without ties the order of the input does not matter
+
+
+def test_the_near_plane_cuts_z_and_not_distance():
+    means = torch.tensor([[0.9, 0.0, 2.0], [0.9, 0.0, 1.9], [-1.0, 0.0, 4.0]])
+    tensors = [means, torch.ones(3, 4), torch.full((3, 3), 0.1), torch.full((3,), 0.5), torch.ones(3, 3)]
+    _, _, meta = rasterization(*tensors, camera(40, 30, focal=0.8), near_plane=1.95)
+    assert (meta["radii"][0, :, 0] > 0).tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize("gradient", [NAN, INF])
+def test_a_bad_upstream_gradient_does_not_hang(gradient):
+    tensors = scene(30, 6)
+    image, _, _ = rasterization(*tensors, camera(20, 20))
+    weights = torch.zeros_like(image)
+    weights[10, 10, 0] = gradient
+    image.backward(weights)  # passes on what is not finite; the trainer counts and skips the step
+    assert not torch.isfinite(tensors[4].grad).all()
+
+
+# -- refusals ----------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "options, word",
+    [
+        ({"backend": "opengl"}, "backend"),
+        ({"backend": "gsplat"}, "gsplat"),
+        ({"near_plane": -1.0}, "near_plane"),
+        ({"near_plane": NAN}, "near_plane"),
+        ({"near_plane": 1e11}, "near_plane"),
+        ({"background": (0.0,)}, "background"),
+    ],
+)
+def test_options_that_are_refused(options, word):
+    with pytest.raises(RenderError, match=word) as caught:
+        rasterization(*scene(5), camera(8, 8), **options)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_shapes_and_types_that_are_refused(name):
+    for change in (lambda t: t[:-1], lambda t: t[..., None], lambda t: t.int(), lambda t: t.tolist()):
+        tensors = [t.detach() for t in scene(5)]
+        tensors[NAMES.index(name)] = change(tensors[NAMES.index(name)])
+        with pytest.raises(RenderError, match="expected"):
+            rasterization(*tensors, camera(8, 8))
+
+
+@pytest.mark.parametrize("value", [NAN, INF, -INF])
+def test_colours_that_are_not_finite_are_refused(value):
+    with pytest.raises(NotFinite, match="colors"):
+        rasterization(*with_values("colors", value), camera(8, 8))
+    with pytest.raises(NotFinite, match="background"):
+        rasterization(*scene(5), camera(8, 8), (0.0, value, 0.0))
+
+
+@pytest.mark.parametrize(
+    "name, place, value, word",
+    [
+        ("viewmat", (slice(0, 3), slice(0, 3)), 0.0, "flattens the scene"),
+        ("viewmat", (3, 0), 0.5, "last row"),
+        ("viewmat", (0, 0), NAN, "not finite"),
+        ("K", (0, 1), 0.1, "skew"),
+        ("K", (2, 2), 2.0, "expected"),
+        ("K", (0, 0), 0.0, "positive"),
+        ("K", (1, 1), -5.0, "positive"),
+        ("K", (0, 2), INF, "not finite"),
+    ],
+)
+def test_cameras_that_are_refused(name, place, value, word):
+    view = camera(8, 8)
+    getattr(view, name)[place] = value
+    with pytest.raises(RenderError, match=word):
+        rasterization(*scene(5), view)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"width": 0},
+        {"height": -1},
+        {"width": 8.0},
+        {"width": True},
+        {"height": 70_000},
+        {"viewmat": np.eye(3)},
+        {"K": np.eye(4)},
+    ],
+)
+def test_sizes_and_shapes_of_cameras_that_are_refused(change):
+    with pytest.raises(RenderError, match="expected an integer from 1 to 65535|shape"):
+        rasterization(*scene(5), replace(camera(8, 8), **change))
+
+
+# -- gsplat: the adapter with a stand-in module; with CUDA, the real one against the CPU -------------------------------
+
+
+def install(monkeypatch, version):
+    """Makes a stand-in for gsplat importable; returns the list of its calls."""
+    calls = []
+
+    def fake(means, quats, scales, opacities, colors, viewmats, Ks, width, height, **options):
+        calls.append((means, quats, scales, opacities, viewmats, Ks, options))
+        meta = {"means2d": means[None, :, :2] * 2, "radii": 0, "depths": 1, "conics": 2}
+        return torch.zeros(1, height, width, 3), torch.zeros(1, height, width, 1), meta
+
+    monkeypatch.setitem(sys.modules, "gsplat", types.SimpleNamespace(rasterization=fake))
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: version)
+    return calls
+
+
+def rasterize_with_gsplat(tensors):
+    return rasterize_gsplat(*tensors, camera(8, 6), np.zeros(3, np.float32), NEAR)
+
+
+@pytest.mark.parametrize("version", ["1.6.0", "2.0.1", "1.4.0"])
+def test_other_versions_of_gsplat_are_refused(monkeypatch, version):
+    install(monkeypatch, version)
+    with pytest.raises(RenderError, match=version):
+        rasterize_with_gsplat(scene(4))
+
+
+def test_missing_gsplat_is_one_clear_line(monkeypatch):
+    monkeypatch.setitem(sys.modules, "gsplat", None)
+    monkeypatch.setattr(importlib.metadata, "version", lambda name: "1.5.3")
+    with pytest.raises(RenderError, match="install"):
+        rasterize_with_gsplat(scene(4))
+
+
+@pytest.mark.parametrize("kernels, says", [(object(), None), (None, "no CUDA kernels"), ("absent", "do not load")])
+def test_the_check_of_gsplat_wants_its_compiled_kernels(monkeypatch, kernels, says):
+    install(monkeypatch, "1.5.3")
+    monkeypatch.setitem(sys.modules, "gsplat.cuda", types.SimpleNamespace())
+    backend = None if kernels == "absent" else types.SimpleNamespace(_C=kernels)
+    monkeypatch.setitem(sys.modules, "gsplat.cuda._backend", backend)
+    if says is None:
+        check_gsplat()
+        return
+    with pytest.raises(RenderError, match=says) as caught:
+        check_gsplat()
+    assert "\n" not in str(caught.value)
+
+
+def test_arguments_that_gsplat_gets(monkeypatch):
+    calls, tensors = install(monkeypatch, "1.5.3+pt24cu124"), scene(4)
+    with torch.no_grad():
+        tensors[0][0, 0], tensors[3][1] = NAN, INF
+        tensors[1][2] = 0.0
+    image, alpha, meta = rasterize_with_gsplat(tensors)
+    means, quats, _, opacities, viewmats, Ks, options = calls[0]
+    assert options["packed"] is False and options["rasterize_mode"] == "classic"
+    assert options["eps2d"] == 0.3 and options["near_plane"] == NEAR and options["far_plane"] == 1e10
+    assert torch.isfinite(means).all() and opacities[:2].tolist() == [0.0, 0.0] and opacities[3] == tensors[3][3]
+    assert quats[2].tolist() == [1.0, 0.0, 0.0, 0.0] and viewmats.shape == (1, 4, 4) and Ks.shape == (1, 3, 3)
+    assert set(meta) == {"means2d", "radii"} and image.shape == (6, 8, 3) and alpha.shape == (6, 8)
+    meta["means2d"].sum().backward()
+    assert meta["means2d"].grad is not None and torch.isfinite(tensors[0].grad).all()
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs CUDA")
+def test_gsplat_draws_what_the_cpu_draws():
+    pytest.importorskip("gsplat")
+    tensors, background = scene(300, 1), (0.2, 0.4, 0.9)
+    expected = draw_with_gradients(tensors, camera(50, 40), "cpu", background)
+    found = draw_with_gradients([t.detach().cuda() for t in tensors], camera(50, 40), "gsplat", background)
+    errors = relative_errors({k: v.cpu() for k, v in found.items() if k != "meta"}, expected)
+    assert max(errors.values()) < 1e-3, errors
