@@ -89,7 +89,7 @@ def cases() -> Iterator[Case]:
     for name in ("viewmat", "K"):
         view = _camera(WIDTH, HEIGHT)
         getattr(view, name)[0, 0] = NAN
-        yield refuse(f"{name} nan", f"NaN in {name}", RenderError, partial(_draw, _scene(5), view=view))
+        yield refuse(f"{name}s nan", f"NaN in {name}", RenderError, partial(_draw, _scene(5), view=view))
     for width in (0, -1, 65536):
         yield refuse(f"width {width}", "a size outside 1..65535", RenderError, partial(_draw, _scene(5), width))
 
