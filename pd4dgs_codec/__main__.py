@@ -6,7 +6,8 @@ import sys
 from collections.abc import Sequence
 from importlib import import_module
 
-from pd4dgs_codec.cli.common import USAGE, open_streams, say, tell, version_line
+from pd4dgs_codec.cli.common import USAGE, open_streams, say, tell
+from pd4dgs_codec.cli.options import version_line
 
 VERBS = {
     "prepare": "find the camera's poses in a video or its frames",

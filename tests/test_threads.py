@@ -21,12 +21,12 @@ def _run(code: str, **variables: str) -> list[str]:
 
 COMMAND = """
 import os, sys
-from pd4dgs_codec.cli import common
+from pd4dgs_codec.cli import common, options
 def action(args, console):
     assert "numpy" not in sys.modules
     print(os.environ["OPENBLAS_NUM_THREADS"], os.environ["OMP_WAIT_POLICY"])
     return 0
-parser = common.Parser("encode", "", "", "")
+parser = options.Parser("encode", "", "", "")
 parser.add_common()
 common.run(parser, action, [])
 """

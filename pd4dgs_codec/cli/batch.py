@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.batch.ops import OPS, arguments
-from pd4dgs_codec.cli import values
-from pd4dgs_codec.cli.common import FAILED, OK, Console, Parser, UsageError, run, say
-from pd4dgs_codec.cli.files import STDIO, check_output, write_bytes
+from pd4dgs_codec.cli import options
+from pd4dgs_codec.cli.common import FAILED, OK, STDIO, Console, UsageError, check_output, run, say, write_bytes
 from pd4dgs_codec.cli.progress import progress_bar
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.threads import available
@@ -28,19 +27,18 @@ VERBS = tuple(OPS)
 ENGINES = ("local", "ray", "slurm")
 
 DETAILS = """\
-MANIFEST has a JSON object per line:
+MANIFEST has one JSON object per line:
   {"source": "s3://films/kitchen.pt", "output": "kitchen.pd4", "options": {"effort": 3}}
-source is what the command takes first, a path or a URI (s3, gs, https, ...). output is a path below -o; without it the
-source's name is taken. options are those of the command, without their dashes: true for a switch, a list for several.
-eval takes the dataset as the option data. `pd4dgs-batch scan FOLDER` writes a manifest of what is in a folder.
+source is the input of the command, a path or a URI (s3, gs, https, ...). output is a path below -o (default: the name
+of the source). options are those of the command without dashes: true for a switch, a list for several values.
+For eval the dataset is the option data. `pd4dgs-batch scan FOLDER` writes a manifest of the sources in a folder.
 
-Beside each output stands OUTPUT.done.json: what it was made of, by which version, and its digests. A scene whose record
-has the same input, options and version is not done again, so that a batch that was killed goes on where it was. Outputs
-appear whole or not at all. Lines that fail are tried again, then named with their logs; the others go on. The exit code
-is 1 if any line failed.
+OUTPUT.done.json beside each output records its input, options, version and digests. A scene whose record matches is not
+processed again, so that a killed batch resumes. Outputs appear whole or not at all. Lines that fail are retried, then
+reported with their logs, and the other lines continue. The exit code is 1 if any line failed.
 
---on local is a pool of processes, which share -j threads. --on ray takes the cluster at --address (or RAY_ADDRESS),
---on slurm submits array jobs; both need the extra [cluster]. docs/batch.md tells more.
+--on local is a pool of processes that share -j threads. --on ray uses the cluster at --address (or RAY_ADDRESS), --on
+slurm submits array jobs; both need the extra [cluster]. See docs/batch.md.
 
 examples:
   pd4dgs-batch scan models -o scenes.jsonl
@@ -49,45 +47,44 @@ examples:
 
 SCAN_DETAILS = """\
 Writes a line for each source below FOLDER: checkpoints for encode, .pd4 files for package, datasets for train, videos
-for prepare. Outputs keep the sources' paths.
+for prepare. The outputs keep the paths of the sources.
 
 examples:
   pd4dgs-batch scan models -o scenes.jsonl
   pd4dgs-batch scan s3://films/pd4 --op eval -o eval.jsonl"""
 
 
-def parser() -> Parser:
+def parser() -> options.Parser:
     """The options of `pd4dgs-batch`."""
-    p = Parser("batch", "MANIFEST --op OP -o URI", "Run a command on every scene of a library.", DETAILS)
-    p.add_argument("input", metavar="MANIFEST", help="JSON lines, see below")
-    p.add_argument("-o", "--output", required=True, metavar="URI", help="folder or URI to write below")
-    p.add_argument("--op", required=True, choices=VERBS, help="the command: pd4dgs-OP")
-    p.add_argument("--on", choices=ENGINES, default="local", help="what runs it (default: local)")
-    what = "scenes at a time (default: a core each; ray: what the cluster holds; 0: in this process, one by one)"
-    p.add_argument("--workers", type=values.count, metavar="N", help=what)
-    what = "threads of a scene (default: local: an equal share of -j; else 1)"
-    p.add_argument("--cpus", type=values.positive_int, metavar="N", help=what)
-    p.add_argument(
-        "--gpus", type=values.non_negative_float, default=0, metavar="N", help="GPUs of a scene (default: 0)"
-    )
-    what = "try a scene that failed so often again (default: %(default)s)"
-    p.add_argument("--retries", type=values.count, default=2, metavar="N", help=what)
-    what = "end a scene that takes longer, and try it again (default: never)"
-    p.add_argument("--timeout", type=values.duration, metavar="T", help=what)
-    what = "for the logs of scenes that fail, made when there is one (default: %(default)s)"
-    p.add_argument("--logs", default="batch-logs", metavar="DIR", help=what)
-    p.add_argument("--address", metavar="A", help="of the Ray cluster (default: RAY_ADDRESS, else one of this machine)")
-    what = "parameter of submitit, such as slurm_partition=gpu; cluster=local tries it on this machine"
-    p.add_argument("--slurm", type=_parameter, action="append", default=[], metavar="KEY=VALUE", help=what)
+    p = options.Parser("batch", "MANIFEST --op OP -o URI", "Run a command on every scene of a library.", DETAILS)
+    add = p.add_argument
+    add("input", metavar="MANIFEST", help="file of JSON lines, see below")
+    add("-o", "--output", required=True, metavar="URI", help="folder or URI to write below")
+    add("--op", required=True, choices=VERBS, help="the command: pd4dgs-OP")
+    add("--on", choices=ENGINES, default="local", help="engine that runs it (default: local)")
+    what = "scenes at a time (default: one per core; ray: as the cluster allows; 0: one by one in this process)"
+    add("--workers", type=options.count, metavar="N", help=what)
+    what = "threads per scene (default: with local an equal share of -j, else 1)"
+    add("--cpus", type=options.positive_int, metavar="N", help=what)
+    add("--gpus", type=options.non_negative_float, default=0, metavar="N", help="GPUs per scene (default: 0)")
+    what = "retry a failed scene up to N times (default: %(default)s)"
+    add("--retries", type=options.count, default=2, metavar="N", help=what)
+    what = "stop a scene after this time and retry it, such as 90s (default: never)"
+    add("--timeout", type=options.duration, metavar="T", help=what)
+    add("--logs", default="batch-logs", metavar="DIR", help="folder for logs of failed scenes (default: %(default)s)")
+    what = "address of the Ray cluster (default: RAY_ADDRESS, else one on this machine)"
+    add("--address", metavar="A", help=what)
+    what = "submitit parameter, such as slurm_partition=gpu; cluster=local runs on this machine"
+    add("--slurm", type=_parameter, action="append", default=[], metavar="KEY=VALUE", help=what)
     p.add_common()
     return p
 
 
-def scan_parser() -> Parser:
+def scan_parser() -> options.Parser:
     """The options of `pd4dgs-batch scan`."""
-    p = Parser("batch scan", "FOLDER", "Write a manifest of the sources in a folder.", SCAN_DETAILS)
+    p = options.Parser("batch scan", "FOLDER", "Write a manifest of the sources in a folder.", SCAN_DETAILS)
     p.add_argument("input", metavar="FOLDER", help="folder or URI")
-    p.add_argument("--op", choices=VERBS, help="the command that it is for (default: as there are sources)")
+    p.add_argument("--op", choices=VERBS, help="the command of the manifest (default: by the kind of sources found)")
     p.add_argument("-o", "--output", default=STDIO, metavar="FILE", help="file to write (default: stdout)")
     p.add_common()
     return p
@@ -118,13 +115,13 @@ def command(verb: str, argv: list[str]) -> tuple[int, str, str]:
 
 def _scan(args: argparse.Namespace, console: Console) -> int:
     if args.json and args.output == STDIO:
-        raise UsageError("the manifest and --json both want stdout; name a file with -o")
+        raise UsageError("the manifest and --json both write to stdout; name a file with -o")
     check_output(args.output, args.overwrite)
     from pd4dgs_codec.batch.manifest import scan
 
     lines = [json.dumps(line) + "\n" for line in scan(args.input, args.op)]
     write_bytes(args.output, "".join(lines).encode(), args.overwrite)
-    console.result({"output": args.output, "scenes": len(lines)}, f"{len(lines)} scenes", on_stdout=False)
+    console.result({"output": args.output, "scenes": len(lines)}, f"{len(lines)} scenes")
     return OK
 
 
@@ -162,12 +159,12 @@ def _batch(args: argparse.Namespace, console: Console) -> int:
         summary = run_jobs(jobs, command, engines.ENGINES[args.on], settings, args.retries, told)
     summary.failures = failures.rows
     result = {"output": args.output, "op": args.op, "on": args.on, **summary.json()}
-    console.result(result, _text(result), on_stdout=False)
+    console.result(result, _text(result))
     return FAILED if failures.rows else OK
 
 
 class _Failures:
-    """Lines that failed, each told as it happens, with its log in a file of its own."""
+    """Lines that failed, each reported at once, with its log in a file."""
 
     def __init__(self, args: argparse.Namespace, manifest: Manifest):
         self.prog, self.place, self.folder = "pd4dgs-batch", args.input, Path(args.logs)
@@ -176,7 +173,7 @@ class _Failures:
             self._add(fault.number, None, fault.message)
 
     def see(self, job: Job, outcome: Outcome, tries: int) -> None:
-        """Takes note of a job that is over."""
+        """Records a job that has ended."""
         if outcome.state != "failed":
             return
         log = None
@@ -197,5 +194,5 @@ class _Failures:
 
 
 def _text(result: dict[str, Any]) -> str:
-    parts = [f"{result['done']} done", f"{result['already']} were done before", f"{result['failed']} failed"]
+    parts = [f"{result['done']} done", f"{result['already']} done before", f"{result['failed']} failed"]
     return f"{result['output']}: {', '.join(parts)}; {result['bytes']:,} bytes in {result['seconds']:.0f} s"

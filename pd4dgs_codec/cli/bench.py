@@ -12,9 +12,19 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
 
-from pd4dgs_codec.cli import common, values
-from pd4dgs_codec.cli.common import FAILED, OK, SOURCES, Console, Parser, UsageError, add_reading
-from pd4dgs_codec.cli.files import STDIO, check_output, is_pd4, named_input, read_bytes, write_bytes
+from pd4dgs_codec.cli import common, options
+from pd4dgs_codec.cli.common import (
+    FAILED,
+    OK,
+    STDIO,
+    Console,
+    UsageError,
+    check_output,
+    is_pd4,
+    named_input,
+    read_bytes,
+    write_bytes,
+)
 from pd4dgs_codec.cli.progress import TrainingProgress, progress_bar
 from pd4dgs_codec.errors import DataError, DecodeError, TrainError
 from pd4dgs_codec.io import finite, whole_file
@@ -127,7 +137,7 @@ TRAIN = f"""\
 Each preset is trained for the same time; held-out quality is measured a dozen times on the way, on six views, as
 pd4dgs-train does. --from draws runs that exist instead, from their checkpoints or logs.
 
-{SOURCES}
+{options.SOURCES}
 
 examples:
   pd4dgs-bench train synthetic:local --presets tiny small --seconds 120 --plot train.png > train.md
@@ -184,7 +194,7 @@ the published sizes of monolithic models.
 
 A file takes about (8S/B + 2 s) x 3 x runs at each rate. Times need a quiet machine.
 
-{SOURCES}
+{options.SOURCES}
 
 examples:
   pd4dgs-bench latency scene.pd4 > latency.md
@@ -206,7 +216,7 @@ def _latency(args: argparse.Namespace, console: Console) -> Outcome:
     warm_up()
     with progress_bar(3 * args.runs * len(speeds) * len(contents), "runs", "times") as step:
         for name, data, dataset in zip(args.inputs, contents, sets, strict=True):
-            files.append(latency.report(name, data, speeds, args.runs, args.size, dataset, step))
+            files.append(latency.report(name, data, speeds, args.runs, None, dataset, step))
     result = {
         "runs": args.runs,
         "rates": args.rates,
@@ -267,44 +277,47 @@ def _stability(args: argparse.Namespace, console: Console) -> Outcome:
 # -- options -----------------------------------------------------------------------------------------------------------
 
 
-def _options(report: str, p: Parser) -> None:
+def _options(report: str, p: options.Parser) -> None:
     """What a report has beside the options that every command has."""
     add = p.add_argument
     if report == "codec":
-        kinds = (values.positive_float, values.one_of(*QUICK["modes"]), values.effort)
-        scales, modes, efforts = map(values.listed, kinds)
+        kinds = (
+            options.positive_float,
+            options.one_of(*QUICK["modes"]),
+            options.checked(int, lambda n: 1 <= n <= 9, "from 1 to 9"),
+        )
+        scales, modes, efforts = map(options.listed, kinds)
         add("input", metavar="FILE", help="checkpoint of pd4dgs-train, or a .pd4 file (- for stdin)")
         add("--step-scales", type=scales, metavar="X,...", help="factors on all steps (default: 0.5,1,2,4)")
         add("--modes", type=modes, metavar="M,...", help="entropy coders (default: ans,lzma)")
         add("--efforts", type=efforts, metavar="N,...", help="1 fast to 9 small (default: 1,5,9)")
-        add("--repeats", type=values.positive_int, metavar="N", help="runs per warm time (default: 5)")
-        add("--cold", type=values.count, metavar="N", help="fresh processes per cold time; 0: none (default: 1)")
+        add("--repeats", type=options.positive_int, metavar="N", help="runs per warm time (default: 5)")
+        add("--cold", type=options.count, metavar="N", help="fresh processes per cold time; 0: none (default: 1)")
         add("--quick", action="store_true", help="few points, one run each, no fresh processes")
         _add_views(p, "6; with --quick 2")
     elif report == "render":
         add("input", metavar="FILE", help=".pd4 file or .pt checkpoint; - reads a .pd4 from stdin")
-        add("--only", type=values.listed(str), metavar="NAME,...", help="these ways to draw alone")
-        add("--repeats", type=values.positive_int, default=15, metavar="N", help="drawings per picture (default: 15)")
+        add("--only", type=options.listed(str), metavar="NAME,...", help="these ways to draw alone")
+        add("--repeats", type=options.positive_int, default=15, metavar="N", help="drawings per picture (default: 15)")
         add("--cache", metavar="FOLDER", help="where to keep compiled kernels (default: nowhere)")
         _add_views(p, "2")
     elif report == "train":
         presets = ("tiny", "small", "paper")
         add("source", nargs="?", metavar="SOURCE", help="dataset to train on, see below")
         add("--presets", nargs="+", choices=presets, metavar="PRESET", help="model sizes (default: tiny small)")
-        add("--seconds", type=values.positive_float, metavar="S", help="time limit per preset (default: 120)")
-        add("--iterations", type=values.positive_int, metavar="N", help="so many steps instead of a time limit")
-        add_reading(p, defaults=False)
-        add("--seed", type=values.seed, metavar="N", help="seed of each run (default: 0)")
+        add("--seconds", type=options.positive_float, metavar="S", help="time limit per preset (default: 120)")
+        add("--iterations", type=options.positive_int, metavar="N", help="so many steps instead of a time limit")
+        options.add_reading(p, defaults=False)
+        add("--seed", type=options.seed, metavar="N", help="seed of each run (default: 0)")
         add("--from", dest="runs", nargs="+", metavar="FILE", help="instead of training: checkpoints or logs")
     elif report == "latency":
         larger = "measure a scene of N anchors in layer 0: those of FILE, and copies moved by up to 3 voxels"
         add("inputs", nargs="+", metavar="FILE", help=".pd4 files that hold a camera")
-        add("--rates", type=values.rates, default="2M,10M,50M", metavar="R", help="of the link (default: 2M,10M,50M)")
-        add("--runs", type=values.positive_int, default=9, metavar="N", help="runs per median (default: 9)")
-        add("--size", type=values.picture_size, metavar="WxH", help="of the pictures (default: the file's camera's)")
-        add("--anchors", type=values.positive_int, metavar="N", help=larger)
+        add("--rates", type=options.rates, default="2M,10M,50M", metavar="R", help="of the link (default: 2M,10M,50M)")
+        add("--runs", type=options.positive_int, default=9, metavar="N", help="runs per median (default: 9)")
+        add("--anchors", type=options.positive_int, metavar="N", help=larger)
         add("--data", action="append", default=[], metavar="SOURCE", help="dataset for quality, one per FILE")
-        add("--downscale", type=values.positive_int, default=1, metavar="K", help="images 1/K as large (default: 1)")
+        add("--downscale", type=options.positive_int, default=1, metavar="K", help="images 1/K as large (default: 1)")
     else:
         add("--only", metavar="NAME", help="the group NAME, or the cases with NAME in their name")
     if report in PLOTS:
@@ -312,13 +325,13 @@ def _options(report: str, p: Parser) -> None:
     p.add_common(json_file=True)
 
 
-def _add_views(p: Parser, views: str) -> None:
+def _add_views(p: options.Parser, views: str) -> None:
     """The options that say which pictures to take; views: how many are taken without --views, in words."""
     group = p.add_argument_group("pictures")
     what = "dataset whose held-out views give the cameras (default: the file's own camera over time)"
     group.add_argument("--data", metavar="SOURCE", help=what)
-    add_reading(group, defaults=False)
-    group.add_argument("--views", type=values.positive_int, metavar="N", help=f"how many pictures (default: {views})")
+    options.add_reading(group, defaults=False)
+    group.add_argument("--views", type=options.positive_int, metavar="N", help=f"how many pictures (default: {views})")
 
 
 def _frames(args: argparse.Namespace, info: SceneInfo, views: int) -> list[Frame]:
@@ -350,17 +363,17 @@ _FRONT = "error against cost, log-log, Pareto front marked"
 PLOTS = dict.fromkeys(("codec", "render", "train"), _FRONT) | {"latency": "quality over seconds since the request"}
 
 
-def parser(report: str | None = None) -> Parser:
+def parser(report: str | None = None) -> options.Parser:
     """The options of a report, or of `pd4dgs-bench` without one."""
     if report is not None:
         synopsis, summary, details, _ = REPORTS[report]
-        p = Parser(f"bench {report}", synopsis, summary, details)
+        p = options.Parser(f"bench {report}", synopsis, summary, details)
         _options(report, p)
         return p
     lines = [f"  {name:<11} {summary}" for name, (_, summary, _, _) in REPORTS.items()]
     examples = [f"  pd4dgs-bench {name} --help" for name in REPORTS]
     details = "\n".join(["REPORT is one of", *lines, "", "examples:", *examples])
-    p = Parser("bench", "REPORT", "Measure what the codec, the renderer and the trainer promise.", details)
+    p = options.Parser("bench", "REPORT", "Measure what the codec, the renderer and the trainer promise.", details)
     p.add_argument("report", metavar="REPORT", choices=tuple(REPORTS), help="what to measure, see below")
     p.add_common()
     return p

@@ -1,7 +1,7 @@
-"""What the commands share: options, exit codes, one-line errors, and what goes to stdout or stderr.
+"""Running a command: inputs, outputs, messages on stdout and stderr, one-line errors and exit codes.
 
-Of libraries only the standard one is imported here, so that `--help` and usage errors answer at once, and so that the
-number of threads is settled before torch and numba are loaded.
+At import only the standard library is loaded, so that `--help` and usage errors answer at once, and so that the number
+of threads is set before torch and numba are loaded.
 """
 
 from __future__ import annotations
@@ -10,108 +10,32 @@ import argparse
 import atexit
 import contextlib
 import gc
+import io
 import os
 import sys
 from collections.abc import Callable, Iterable, Sequence
-from typing import Any, NoReturn, TextIO
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TextIO
 
-from pd4dgs_codec.cli.values import count, positive_int
 from pd4dgs_codec.errors import DecodeError, EncodeError, Pd4Error
 from pd4dgs_codec.threads import configure
 
-#: To look for garbage once more at the end of the process took a quarter of a cold picture's time.
+if TYPE_CHECKING:
+    from pd4dgs_codec.data.view import Dataset
+    from pd4dgs_codec.scene import Scene
+
+#: A last garbage collection at exit took a quarter of the time of a cold start's first picture.
 atexit.register(gc.freeze)
 
 OK, FAILED, USAGE, PARTIAL = 0, 1, 2, 3
-
-EXIT_CODES = (
-    "exit codes: 0 done, 1 bad data or I/O, 2 wrong usage, 3 cut input decoded as far as possible (--allow-partial)"
-)
-SOURCES = """\
-SOURCE is one of
-  a folder in the iPhone/Nerfies layout (camera/, rgb/, splits/; its split files decide what is held out)
-  a folder with transforms*.json (Blender, D-NeRF, nerfstudio)
-  a folder with poses_bounds.npy and a video per camera, cam*.mp4 (Neu3D; the first camera is held out)
-  a folder with a model of COLMAP in sparse/0 and its pictures in images/; times.txt may say when they were taken
-  a folder with such a model and a synchronised video per picture in videos/ (the first camera is held out)
-  a folder of Panoptic Studio (train_meta.json, ims/) or an unpacked recording of Record3D (metadata, rgbd/)
-  synthetic:static   nothing moves
-  synthetic:global   large objects move slowly
-  synthetic:local    the same, and small parts move on their own
-  synthetic:fast     quick motion
-  (synthetic:NAME?seed=n gives another scene of that kind; &size=WxH and &frames=N,
-  default 160x120 and 60, larger pictures and more of them)
-  teacher:PATH       pictures of explicit Gaussians: a folder of .ply or .spz files, one per frame, one such file, a
-                     .4dgs file, a checkpoint of gsplat, or module:function (time -> Gaussians)
-  (teacher:PATH?cameras=SOURCE takes the cameras, times and held-out pictures of another source;
-  else ?views=N&size=WxH&fps=F&background=white&up=X,Y,Z)"""
+STDIO = "-"
 
 
 class UsageError(Exception):
     """The command line itself is wrong: exit 2."""
 
 
-class Parser(argparse.ArgumentParser):
-    """argparse with one-line usage errors, no abbreviated options, and the common options."""
-
-    def __init__(self, verb: str, usage: str, summary: str, details: str):
-        super().__init__(
-            prog=f"pd4dgs-{verb}",
-            usage=" ".join(part for part in (f"pd4dgs-{verb}", usage, "[options]") if part),
-            description=summary,
-            epilog=f"{details}\n\n{EXIT_CODES}",
-            formatter_class=argparse.RawDescriptionHelpFormatter,
-            allow_abbrev=False,
-            add_help=False,
-        )
-
-    def error(self, message: str) -> NoReturn:
-        raise UsageError(message)
-
-    def print_help(self, file: object = None) -> NoReturn:
-        """Prints the help on stdout and ends the program: with 0, or with 1 if stdout does not take it."""
-        self.exit(tell(self.prog, self.format_help().rstrip("\n")))
-
-    def add_common(self, *, json_file: bool = False) -> None:
-        """The options that every command has. json_file: --json may name a file; args.json is then its name, or "-"."""
-        group = self.add_argument_group("common options")
-        group.add_argument("-h", "--help", action="help", help="show this help and exit")
-        group.add_argument("--version", action=_Version, nargs=0, help="show the version and exit")
-        if json_file:
-            what = "write one JSON object to FILE; without FILE, to stdout and nothing else there"
-            group.add_argument("--json", nargs="?", const="-", metavar="FILE", help=what)
-        else:
-            what = "print one JSON object on stdout and nothing else there"
-            group.add_argument("--json", action="store_true", help=what)
-        group.add_argument("-v", "--verbose", action="store_true", help="say more on stderr")
-        group.add_argument("-j", "--threads", type=positive_int, metavar="N", help="CPU threads (default: all cores)")
-        group.add_argument("-f", "--overwrite", action="store_true", help="replace an output that exists")
-
-
-def add_reading(options: argparse._ActionsContainer, *, defaults: bool = True) -> None:
-    """How a dataset is read: --downscale and --holdout. defaults: False for None where an option is not given."""
-    add, (downscale, holdout) = options.add_argument, (1, 8) if defaults else (None, None)
-    what = "use images 1/K as wide and high (default: 1)"
-    add("--downscale", type=positive_int, default=downscale, metavar="K", help=what)
-    what = "without split files, hold out frames with i %% K == K/2 (default: 8; 0: none)"
-    add("--holdout", type=count, default=holdout, metavar="K", help=what)
-
-
-class _Version(argparse.Action):
-    """Prints the release and the format version; a plain "version" action would import the codec for every --help."""
-
-    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
-        parser.exit(tell(parser.prog, version_line(parser.prog)))
-
-
-def version_line(prog: str) -> str:
-    """The program's release and the version of the format it writes."""
-    from pd4dgs_codec import FORMAT_VERSION, __version__
-
-    return f"{prog} {__version__}, format {FORMAT_VERSION}"
-
-
-# -- talking to the caller ---------------------------------------------------------------------------------------------
+# -- messages ----------------------------------------------------------------------------------------------------------
 
 
 class Console:
@@ -129,8 +53,8 @@ class Console:
         if self.verbose:
             self.message(text)
 
-    def result(self, data: dict[str, Any], text: str, *, on_stdout: bool) -> None:
-        """The outcome: `data` with --json, else `text`, on stdout where it is what was asked for, else on stderr."""
+    def result(self, data: dict[str, Any], text: str, *, on_stdout: bool = False) -> None:
+        """Prints `data` as JSON on stdout with --json, else `text`: on stdout if it was asked for, else on stderr."""
         if self.json:
             import json
 
@@ -144,7 +68,7 @@ class Console:
 
 
 def say(text: str) -> None:
-    """A line on stderr. One that is full or gone takes nothing more, and the work goes on without its words."""
+    """A line on stderr. If stderr is full or closed, the line is lost and the work goes on."""
     try:
         print(text, file=sys.stderr, flush=True)
     except OSError:
@@ -152,7 +76,7 @@ def say(text: str) -> None:
 
 
 def tell(prog: str, text: str) -> int:
-    """Prints all there is to say on stdout; returns the exit code."""
+    """Prints `text` on stdout as a program's whole output; returns the exit code."""
     try:
         print(text, flush=True)
     except OSError as error:
@@ -176,8 +100,89 @@ def table(head: Sequence[str], rows: Iterable[Sequence[Any]]) -> str:
 
 
 def number(value: float | None, digits: int = 2) -> str:
-    """A number for a table, thousands separated; "-" for none."""
+    """A number for a table, with thousands separators; "-" for None."""
     return "-" if value is None else f"{value:,.{digits}f}"
+
+
+def shown_name(path: str, stream: str = "stdin") -> str:
+    """The name of a file in messages; `stream` for `-`."""
+    return stream if path == STDIO else path
+
+
+# -- inputs and outputs ------------------------------------------------------------------------------------------------
+
+
+def read_bytes(path: str) -> bytes:
+    """All bytes of a file, or of stdin for `-`. Raises OSError naming the path, UsageError if stdin is a terminal."""
+    if path != STDIO:
+        return Path(path).read_bytes()
+    if sys.stdin is None or sys.stdin.isatty():
+        raise UsageError("nothing is piped to stdin; name a file")
+    return sys.stdin.buffer.read()
+
+
+def named_input(path: str) -> str | bytes:
+    """The path, or all bytes of stdin for `-`, for readers that take either."""
+    return read_bytes(path) if path == STDIO else path
+
+
+def is_pd4(data: bytes) -> bool:
+    """Whether the first four bytes are those of a `.pd4` file; the rest may be damaged."""
+    from pd4dgs_codec.format.container import SIGNATURE
+
+    return data.startswith(SIGNATURE[:4])
+
+
+class _Stdin(io.BytesIO):
+    """The bytes of stdin, for a file reader that names its input in messages."""
+
+    def __str__(self) -> str:
+        return "stdin"
+
+
+def checkpoint_scene(path: str, data: bytes) -> Scene:
+    """The scene of a checkpoint that `read_bytes` read. Needs torch."""
+    from pd4dgs_codec.model import checkpoint
+    from pd4dgs_codec.model.convert import to_scene
+
+    model, _ = checkpoint.load(path if path != STDIO else _Stdin(data))
+    return to_scene(model)
+
+
+def write_checkpoint(path: str, scene: Scene, overwrite: bool) -> None:
+    """Writes a scene as a checkpoint, whole or not at all."""
+    from pd4dgs_codec.model import checkpoint
+    from pd4dgs_codec.model.convert import from_scene
+
+    model = from_scene(scene)
+    check_output(path, overwrite)  # it may have appeared meanwhile
+    checkpoint.save(path, model)
+
+
+def read_dataset(source: str, args: argparse.Namespace) -> Dataset:
+    """The dataset `source`, read with the options of `add_reading`."""
+    from pd4dgs_codec.interchange.teacher import load_source
+
+    return load_source(source, downscale=args.downscale, holdout=args.holdout)
+
+
+def check_output(path: str, overwrite: bool) -> None:
+    """`io.check_output`, before any work; `-` is always fine."""
+    if path != STDIO:
+        from pd4dgs_codec.io import check_output  # loaded only if something is written
+
+        check_output(path, overwrite)
+
+
+def write_bytes(path: str, data: bytes, overwrite: bool) -> None:
+    """Writes all of `data`, to stdout for `-`, otherwise to a file, whole or not at all."""
+    if path != STDIO:
+        from pd4dgs_codec.io import write_bytes
+
+        write_bytes(path, data, overwrite)
+        return
+    sys.stdout.buffer.write(data)
+    sys.stdout.buffer.flush()
 
 
 # -- running -----------------------------------------------------------------------------------------------------------
@@ -185,8 +190,8 @@ def number(value: float | None, digits: int = 2) -> str:
 Action = Callable[[argparse.Namespace, Console], int]
 
 
-def run(parser: Parser, action: Action, argv: Sequence[str] | None) -> int:
-    """Parses, acts, and turns every failure into one line on stderr and an exit code."""
+def run(parser: argparse.ArgumentParser, action: Action, argv: Sequence[str] | None) -> int:
+    """Parses the arguments and runs `action`; every failure becomes one line on stderr and an exit code."""
     open_streams()
     arguments = list(sys.argv[1:] if argv is None else argv)
     as_json, verbose = "--json" in arguments, not {"-v", "--verbose"}.isdisjoint(arguments)
@@ -199,20 +204,20 @@ def run(parser: Parser, action: Action, argv: Sequence[str] | None) -> int:
         sys.stdout.flush()
         return code
     except UsageError as error:
-        return _fail(parser, error, f"{error}; see {parser.prog} --help", as_json, USAGE)
-    except BrokenPipeError:  # the reader went away, as `| head` does
+        return _fail(parser.prog, error, f"{error}; see {parser.prog} --help", as_json, USAGE)
+    except BrokenPipeError:  # the reader closed the pipe, as `| head` does
         _point_at_nothing(sys.stdout)
         return FAILED
     except (Exception, KeyboardInterrupt) as error:
-        message = _explain(error, "stdin" if name == "-" else name)
+        message = _explain(error, shown_name(name))
         if message is None:
             if verbose:
                 raise
             message = f"internal error, please report it: {type(error).__name__}: {error} (-v shows where)"
-        return _fail(parser, error, message, as_json)
+        return _fail(parser.prog, error, message, as_json)
 
 
-def command(parser: Callable[[], Parser], action: Action) -> Callable[..., int]:
+def command(parser: Callable[[], argparse.ArgumentParser], action: Action) -> Callable[..., int]:
     """The entry point of a program: takes its arguments, or those of the process, and returns the exit code."""
 
     def main(argv: Sequence[str] | None = None) -> int:
@@ -239,9 +244,9 @@ def _explain(error: BaseException, name: str) -> str | None:
     return None
 
 
-def _fail(parser: Parser, error: BaseException, message: str, as_json: bool, code: int = FAILED) -> int:
+def _fail(prog: str, error: BaseException, message: str, as_json: bool, code: int = FAILED) -> int:
     line = " ".join(message.split())
-    say(f"{parser.prog}: error: {line}")
+    say(f"{prog}: error: {line}")
     if as_json:
         import json
 
@@ -258,10 +263,10 @@ def _fail(parser: Parser, error: BaseException, message: str, as_json: bool, cod
 
 
 def open_streams() -> None:
-    """Opens what the caller closed of descriptors 0 to 2, so that no file of ours takes their numbers.
+    """Opens those of descriptors 0 to 2 that the caller closed, so that no file of ours gets their numbers.
 
-    A closed stdin is empty, writing to a closed stdout is an error as it is of a full one, and a closed stderr takes
-    every word and keeps none.
+    A closed stdin reads as empty, writing to a closed stdout is an error like writing to a full one, and output to a
+    closed stderr is lost.
     """
     for descriptor, flags in ((0, os.O_RDONLY), (1, os.O_RDONLY), (2, os.O_WRONLY)):
         try:
@@ -275,7 +280,7 @@ def open_streams() -> None:
 
 
 def _point_at_nothing(stream: TextIO) -> None:
-    """So that the interpreter's own flush at exit cannot fail a second time."""
+    """Redirects a stream to /dev/null, so that the interpreter's flush at exit cannot fail again."""
     with contextlib.suppress(OSError, ValueError):
         nothing = os.open(os.devnull, os.O_WRONLY)
         os.dup2(nothing, stream.fileno())

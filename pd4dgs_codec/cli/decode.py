@@ -9,18 +9,32 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.cli import values
-from pd4dgs_codec.cli.common import OK, PARTIAL, Console, Parser, UsageError, command, number, table
-from pd4dgs_codec.cli.files import STDIO, check_output, read_bytes, write_bytes, write_checkpoint
+from pd4dgs_codec.cli import options
+from pd4dgs_codec.cli.common import (
+    OK,
+    PARTIAL,
+    STDIO,
+    Console,
+    UsageError,
+    check_output,
+    command,
+    number,
+    read_bytes,
+    shown_name,
+    table,
+    write_bytes,
+    write_checkpoint,
+)
 from pd4dgs_codec.errors import DeliveryError
 
 if TYPE_CHECKING:
     from pd4dgs_codec.scene import Scene
 
 DETAILS = """\
-Without -o the file is decoded and checked, and a summary printed. An .npz file holds the float32 arrays anchor,
-feature, scaling_log, offset, mask_L, mlp.*, planes.* and meta_*; a .pt file is a checkpoint that encode, render and
-eval accept. Of a URL (http, https) only the layers asked for are fetched; cut connections are taken up again.
+Without -o the file is decoded and checked, and a summary is printed.
+An .npz file holds the float32 arrays anchor, feature, scaling_log, offset, mask_L, mlp.*, planes.* and meta_*.
+A .pt file is a checkpoint that encode, render and eval accept.
+From a URL (http, https) only the layers asked for are fetched; interrupted transfers resume.
 
 examples:
   pd4dgs-decode scene.pd4
@@ -30,21 +44,16 @@ examples:
   head -c 300000 scene.pd4 | pd4dgs-decode - --allow-partial -o prefix.pt"""
 
 
-def parser() -> Parser:
+def parser() -> options.Parser:
     """The options of `pd4dgs-decode`."""
-    p = Parser("decode", "[scene.pd4] [-o FILE]", "Unpack a .pd4 file, or the first layers of one.", DETAILS)
-    what = "file or URL to read; - or nothing reads stdin"
-    p.add_argument("input", nargs="?", default=STDIO, metavar="scene.pd4", help=what)
-    what = "FILE.npz or FILE.pt; - writes npz to stdout; without it only check"
-    p.add_argument("-o", "--output", metavar="FILE", help=what)
-    p.add_argument("--max-layer", type=int, choices=(0, 1, 2), help="stop after this layer")
-    p.add_argument(
-        "--max-bytes", type=values.size, metavar="SIZE", help="stop after SIZE bytes, such as 50k, at a slice"
-    )
-    what = "with .npz: add the integers (NAME_q) and their steps (NAME_step)"
-    p.add_argument("--symbols", action="store_true", help=what)
-    what = "decode as many layers of a cut file as are whole; exit 3 then"
-    p.add_argument("--allow-partial", action="store_true", help=what)
+    p = options.Parser("decode", "[scene.pd4] [-o FILE]", "Unpack a .pd4 file, or its first layers.", DETAILS)
+    add = p.add_argument
+    add("input", nargs="?", default=STDIO, metavar="scene.pd4", help="file or URL; - or nothing reads stdin")
+    add("-o", "--output", metavar="FILE", help="FILE.npz or FILE.pt; - writes npz to stdout (default: only check)")
+    options.add_max_layer(p, "stop after this layer")
+    add("--max-bytes", type=options.size, metavar="SIZE", help="stop at the last slice within SIZE bytes, such as 50k")
+    add("--symbols", action="store_true", help="with .npz: add the integers (NAME_q) and their steps (NAME_step)")
+    add("--allow-partial", action="store_true", help="decode the whole layers of a cut file, and exit with 3")
     p.add_common()
     return p
 
@@ -77,7 +86,7 @@ main = command(parser, _decode)
 
 
 def _input(args: argparse.Namespace, console: Console) -> bytes:
-    """The file's bytes; of a URL only those that --max-layer and --max-bytes need."""
+    """The bytes of the file; of a URL only those that --max-layer and --max-bytes need."""
     from pd4dgs_codec.web.urls import is_url
 
     if not is_url(args.input):
@@ -99,19 +108,13 @@ def _input(args: argparse.Namespace, console: Console) -> bytes:
 
 def _output_kind(args: argparse.Namespace) -> str | None:
     """ ".npz", ".pt", or None without an output."""
-    if args.output is None:
-        if args.symbols:
-            raise UsageError("--symbols needs -o FILE.npz")
-        return None
-    if args.output == STDIO:
-        if args.json:
-            raise UsageError("-o - and --json both want stdout; name an output file")
-        return ".npz"
-    kind = Path(args.output).suffix
-    if kind not in (".npz", ".pt"):
+    kind = None if args.output is None else ".npz" if args.output == STDIO else Path(args.output).suffix
+    if args.output == STDIO and args.json:
+        raise UsageError("-o - and --json both write to stdout; name an output file")
+    if kind not in (None, ".npz", ".pt"):
         raise UsageError(f"found -o {args.output}, expected a name that ends in .npz or .pt")
-    if args.symbols and kind == ".pt":
-        raise UsageError("--symbols needs -o FILE.npz; a checkpoint holds no symbols")
+    if args.symbols and kind != ".npz":
+        raise UsageError("--symbols needs -o FILE.npz")
     return kind
 
 
@@ -131,20 +134,18 @@ def _summary(scene: Scene, data: bytes, complete: bool, seconds: float, args: ar
     described = {row["layer"]: row for row in info(data)["layers"]}
     rows = []
     for i, (layer, total) in enumerate(zip(scene.layers, scene.rows, strict=True)):
-        ends = [part["end"] for part in described[layer]["slices"]]
+        slices = described[layer]["slices"]
+        ends = [part["end"] for part in slices]
         end = max(end for end in ends if end == ends[0] or args.max_bytes is None or end <= args.max_bytes)
-        size = sum(part["bytes"] for part in described[layer]["slices"] if part["end"] <= end)
-        place = {"offset": described[layer]["offset"], "bytes": size, "end": end}
-        anchors = total - (scene.rows[i - 1] if i else 0)
-        rows.append({"layer": layer, **place, "anchors": anchors, "active": int((scene.mask[i] > 0).sum())})
+        size = sum(part["bytes"] for part in slices if part["end"] <= end)
+        anchors, active = total - (scene.rows[i - 1] if i else 0), int((scene.mask[i] > 0).sum())
+        about = {"layer": layer, "offset": described[layer]["offset"], "bytes": size, "end": end}
+        rows.append({**about, "anchors": anchors, "active": active})
     wanted = range(3 if args.max_layer is None else args.max_layer + 1)
     return {
-        "input": args.input,
-        "output": args.output,
+        **{name: getattr(args, name) for name in ("input", "output", "max_layer", "max_bytes")},
         "bytes": len(data),
         "complete": complete,
-        "max_layer": args.max_layer,
-        "max_bytes": args.max_bytes,
         "seconds": round(seconds, 4),
         "anchors": len(scene.anchor_q),
         "global_deformation": scene.global_deformation is not None,
@@ -155,27 +156,21 @@ def _summary(scene: Scene, data: bytes, complete: bool, seconds: float, args: ar
 
 
 def _text(result: dict[str, Any]) -> str:
-    rows = [
-        (row["layer"], *(number(row[key], 0) for key in ("bytes", "end", "anchors", "active")))
-        for row in result["layers"]
-    ]
+    layers = result["layers"]
     if not result["complete"]:
         state = "cut; valid so far"
     elif result["max_bytes"] is not None:
-        state = f"valid in the first {result['layers'][-1]['end']:,}"
-    elif result["max_layer"] is not None:  # what follows the prefix was not looked at
-        state = f"layers {', '.join(str(row['layer']) for row in result['layers'])} whole and valid"
+        state = f"valid in the first {layers[-1]['end']:,}"
+    elif result["max_layer"] is not None:  # nothing is known about the bytes behind the prefix
+        state = f"layers {', '.join(str(row['layer']) for row in layers)} whole and valid"
     else:
         state = "whole and valid"
-    name = "stdin" if result["input"] == STDIO else result["input"]
+    cells = [(row["layer"], *(number(row[k], 0) for k in ("bytes", "end", "anchors", "active"))) for row in layers]
     lines = [
-        f"{name}: {result['bytes']:,} bytes, {state}, decoded in {result['seconds']:.3f} s",
-        table(("layer", "bytes", "prefix", "new anchors", "active"), rows),
-    ]
-    lines += [
-        f"absent: layer {layer}, which this file does without; its level looks like the one below"
-        for layer in result["absent"]
+        f"{shown_name(result['input'])}: {result['bytes']:,} bytes, {state}, decoded in {result['seconds']:.3f} s",
+        table(("layer", "bytes", "prefix", "new anchors", "active"), cells),
+        *(f"absent: layer {layer}; its level equals the one below" for layer in result["absent"]),
     ]
     if result["output"]:
-        lines.append(f"wrote {'stdout' if result['output'] == STDIO else result['output']}")
+        lines.append(f"wrote {shown_name(result['output'], 'stdout')}")
     return "\n".join(lines)

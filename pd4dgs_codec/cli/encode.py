@@ -7,19 +7,22 @@ import math
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.cli import values
+from pd4dgs_codec.cli import options
 from pd4dgs_codec.cli.common import (
     OK,
-    SOURCES,
+    STDIO,
     Console,
-    Parser,
     UsageError,
-    add_reading,
+    check_output,
+    checkpoint_scene,
     command,
+    is_pd4,
     number,
+    read_bytes,
+    read_dataset,
     table,
+    write_bytes,
 )
-from pd4dgs_codec.cli.files import STDIO, check_output, checkpoint_scene, is_pd4, read_bytes, read_dataset, write_bytes
 from pd4dgs_codec.cli.progress import progress_bar
 from pd4dgs_codec.format.options import CHOICES, DEFAULTS, EncodeOptions
 from pd4dgs_codec.quality import MIN_GAIN_PER_MEGABYTE
@@ -39,7 +42,7 @@ prefix that ends with a layer can be shown. What has no visible effect is left o
 --slices 50k lets a picture appear after the first 50 kB and improve with each further slice. It takes minutes as well,
 and the same pictures decide which anchors come first.
 
-{SOURCES}
+{options.SOURCES}
 
 examples:
   pd4dgs-encode model.pt -o scene.pd4
@@ -52,16 +55,16 @@ examples:
 FIRST_FRAME_RATE = 2e6
 
 
-def parser() -> Parser:
+def parser() -> options.Parser:
     """The options of `pd4dgs-encode`."""
-    p = Parser("encode", "model.pt -o FILE.pd4", "Pack a trained scene into a layered .pd4 file.", DETAILS)
+    p = options.Parser("encode", "model.pt -o FILE.pd4", "Pack a trained scene into a layered .pd4 file.", DETAILS)
     what = "checkpoint of pd4dgs-train, or a .pd4 file to pack again; - reads stdin"
     p.add_argument("input", metavar="model.pt", help=what)
     p.add_argument("-o", "--output", required=True, metavar="FILE.pd4", help="file to write; - writes stdout")
     _add_choice(p, "mode", "entropy coder")
     _add_choice(p, "priors", "distributions to choose from per channel")
     what = "multiply every quantisation step: above 1 smaller and coarser (default: %(default)g)"
-    p.add_argument("--step-scale", type=values.positive_float, default=DEFAULTS.step_scale, metavar="X", help=what)
+    p.add_argument("--step-scale", type=options.positive_float, default=DEFAULTS.step_scale, metavar="X", help=what)
     _add_choice(p, "layers", "auto leaves out layers without effect; a number keeps the layers up to it")
     efforts = CHOICES["effort"]
     _add_choice(p, "effort", f"{efforts[0]} fast, {efforts[-1]} small", type=int, metavar=f"{efforts[0]}-{efforts[-1]}")
@@ -72,9 +75,9 @@ def parser() -> Parser:
     what = (
         "cut layers into slices of SIZE bytes, where planes and networks allow it; what pictures need most comes first"
     )
-    p.add_argument("--slices", type=values.size, default=DEFAULTS.slices, metavar="SIZE", help=what)
+    p.add_argument("--slices", type=options.size, default=DEFAULTS.slices, metavar="SIZE", help=what)
     what = "most bytes that each layer may add to the file (layer 0 with the header): coarser steps, fewer anchors"
-    p.add_argument("--target-size", type=values.layer_sizes, default={}, metavar="L0=425k,...", help=what)
+    p.add_argument("--target-size", type=options.layer_sizes, default={}, metavar="L0=425k,...", help=what)
     about = p.add_argument_group(
         "what the file says about itself", "shown by pd4dgs-info; a .pd4 that is packed again keeps it"
     )
@@ -83,12 +86,12 @@ def parser() -> Parser:
     views = p.add_argument_group("judging by pictures")
     what = "a dataset, see below: sizes are fitted on its training views, layers must pay on those held out"
     views.add_argument("--data", metavar="SOURCE", help=what)
-    add_reading(views)
+    options.add_reading(views)
     what = "use about N of its views of either kind, evenly spread (default: 16)"
-    views.add_argument("--views", type=values.positive_int, default=16, metavar="N", help=what)
+    views.add_argument("--views", type=options.positive_int, default=16, metavar="N", help=what)
     views.add_argument(
         "--min-gain",
-        type=values.non_negative_float,
+        type=options.non_negative_float,
         metavar="DB",
         help="with --data, leave out layers whose level gains less than DB dB mPSNR per megabyte "
         f"(default: {MIN_GAIN_PER_MEGABYTE:g}; 0: keep all)",
@@ -97,7 +100,7 @@ def parser() -> Parser:
     return p
 
 
-def _add_choice(p: Parser, name: str, what: str, **settings: Any) -> None:
+def _add_choice(p: options.Parser, name: str, what: str, **settings: Any) -> None:
     """--NAME with the choices and the default of that field of EncodeOptions."""
     default = vars(DEFAULTS)[name]
     choices = tuple(CHOICES[name]) if "type" in settings else tuple(map(str, CHOICES[name]))
@@ -130,7 +133,7 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
     if trained and args.json:  # shown nowhere else, and it takes its time
         _add_train_rate(result, packed, options)
     write_bytes(args.output, packed.data, args.overwrite)
-    console.result(result, _text(result, 8 * packed.report.first_bytes / FIRST_FRAME_RATE), on_stdout=False)
+    console.result(result, _text(result, 8 * packed.report.first_bytes / FIRST_FRAME_RATE))
     return OK
 
 

@@ -5,17 +5,17 @@ from __future__ import annotations
 import argparse
 from typing import Any
 
-from pd4dgs_codec.cli.common import OK, SOURCES, Console, Parser, add_reading, command, number, table
-from pd4dgs_codec.cli.files import named_input, read_dataset
+from pd4dgs_codec.cli import options
+from pd4dgs_codec.cli.common import OK, Console, command, named_input, number, read_dataset, table
 from pd4dgs_codec.cli.progress import progress_bar
 
 DETAILS = f"""\
-Each level of a .pd4 file is decoded from its own prefix and compared with the views that training never saw.
-mPSNR in dB and mSSIM as in the DyCheck protocol: 8-bit pictures, masked where the data has masks.
---perceptual adds LPIPS, ST-LPIPS and FLIP, those that are installed, masked too, and t-LPIPS and its like: the mean
-distance between successive pictures of a camera that stands still. docs/evaluation.md defines them all.
+Each level of a .pd4 file is decoded from its own prefix and compared with the held-out views.
+mPSNR in dB and mSSIM follow the DyCheck protocol: 8-bit images, masked if the dataset has covisibility masks.
+--perceptual adds LPIPS, ST-LPIPS and FLIP, as far as they are installed, masked too, and their temporal variants
+(t-LPIPS, ...): the mean distance between successive frames of a fixed camera. docs/evaluation.md defines them.
 
-{SOURCES}
+{options.SOURCES}
 
 examples:
   pd4dgs-eval scene.pd4 synthetic:local
@@ -23,13 +23,13 @@ examples:
   pd4dgs-eval model.pt recordings/kitchen --downscale 2 --json"""
 
 
-def parser() -> Parser:
+def parser() -> options.Parser:
     """The options of `pd4dgs-eval`."""
-    p = Parser("eval", "FILE SOURCE", "Measure each level of a file against a dataset: quality, bytes, time.", DETAILS)
+    p = options.Parser("eval", "FILE SOURCE", "Measure quality, bytes and time of each level on a dataset.", DETAILS)
     p.add_argument("input", metavar="FILE", help=".pd4 file or .pt checkpoint; - reads a .pd4 from stdin")
     p.add_argument("source", metavar="SOURCE", help="dataset to compare with, see below")
-    p.add_argument("--max-layer", type=int, choices=(0, 1, 2), help="leave out the layers above this one")
-    add_reading(p)
+    options.add_max_layer(p, "leave out the layers above this one")
+    options.add_reading(p)
     p.add_argument("--perceptual", action="store_true", help="add perceptual distances, which take longer")
     p.add_common()
     return p
@@ -75,7 +75,7 @@ def _text(result: dict[str, Any]) -> str:
         f"{result['source']}: {result['views']} {what} views, {result['width']}x{result['height']}, {masked}",
         table(head, rows),
         *_distance_lines(result.get("perceptual")),
-        f"always showing the mean training image: {number(result['baseline_mean_image_psnr'])} dB",
+        f"baseline, the mean training image: {number(result['baseline_mean_image_psnr'])} dB",
     ]
     return "\n".join(lines)
 
@@ -85,4 +85,4 @@ def _distance_lines(perceptual: dict[str, Any] | None) -> list[str]:
         return []
     sources = "; ".join(f"{d['title']}: {d['source']}" for d in perceptual["distances"].values())
     camera, frames = perceptual["temporal_camera"], perceptual["temporal_frames"]
-    return [sources, f"t-: between successive pictures of {frames} from the camera of view {camera}"]
+    return [sources, f"t-: between successive frames, {frames} from the camera of view {camera}"]

@@ -9,9 +9,19 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.cli import values
-from pd4dgs_codec.cli.common import OK, SOURCES, Console, Parser, UsageError, add_reading, command
-from pd4dgs_codec.cli.files import STDIO, check_output, is_pd4, read_bytes, read_dataset, write_bytes
+from pd4dgs_codec.cli import options
+from pd4dgs_codec.cli.common import (
+    OK,
+    STDIO,
+    Console,
+    UsageError,
+    check_output,
+    command,
+    is_pd4,
+    read_bytes,
+    read_dataset,
+    write_bytes,
+)
 from pd4dgs_codec.cli.progress import progress_bar
 from pd4dgs_codec.io import whole_files
 
@@ -25,19 +35,19 @@ if TYPE_CHECKING:
     from pd4dgs_codec.scene import SceneInfo
 
 DETAILS = f"""\
-What depends on the viewer's place becomes spherical harmonics (colour) and means over many places (opacity, size), and
-is then refined against the scene's own pictures. The places are the training cameras of --data, else around what the
-file's camera looks at. --compare measures what that costs.
+View-dependent colours become spherical harmonics, view-dependent opacities and sizes become means over many viewpoints;
+both are then refined against renderings of the scene. The viewpoints are the training cameras of --data, or else lie
+around the point that the file's camera looks at. --compare measures the loss of quality.
 
-  ply       one PLY as 3D Gaussian splatting writes it
-  ply-seq   a folder of them, one per frame
+  ply       one PLY file in the layout of 3D Gaussian splatting
+  ply-seq   a folder of such files, one per frame
   spz       one SPZ file (needs gaussforge)
   glb       one glTF file with KHR_gaussian_splatting
-  4dgs      the whole time in one .4dgs file (needs fourdgs)
+  4dgs      one .4dgs file for the whole time range (needs fourdgs)
 
-PLY and 4dgs keep the file's axes. In glTF and SPZ +y is up, and the scene is turned that way.
+PLY and 4dgs keep the file's axes. For glTF and SPZ the scene is rotated so that +y is up.
 
-{SOURCES}
+{options.SOURCES}
 
 examples:
   pd4dgs-export scene.pd4 -o scene.ply --to ply --time 0.5
@@ -49,27 +59,27 @@ KINDS = ("ply", "ply-seq", "spz", "glb", "4dgs")
 FPS, STEPS, MAX_FRAMES = 30.0, 300, 100_000
 
 
-def parser() -> Parser:
+def parser() -> options.Parser:
     """The options of `pd4dgs-export`."""
-    p = Parser("export", "FILE -o OUT --to KIND", "Write a scene as Gaussians that other viewers read.", DETAILS)
+    p = options.Parser("export", "FILE -o OUT --to KIND", "Write a scene as Gaussians for other viewers.", DETAILS)
     p.add_argument("input", metavar="FILE", help=".pd4 file; - reads it from stdin")
     p.add_argument("-o", "--output", required=True, metavar="OUT", help="file to write; with ply-seq a folder")
-    p.add_argument("--to", required=True, choices=KINDS, help="kind of file")
-    what = "instant of ply, spz and glb, 0..1 of the file's time (default: 0)"
-    p.add_argument("--time", type=values.share, metavar="T", help=what)
-    what = f"frames per second of ply-seq and 4dgs (default: {FPS:g})"
-    p.add_argument("--fps", type=values.positive_float, metavar="F", help=what)
+    p.add_argument("--to", required=True, choices=KINDS, help="file format, see below")
+    what = "time of ply, spz and glb, 0..1 of the file's time range (default: 0)"
+    p.add_argument("--time", type=options.share, metavar="T", help=what)
+    what = f"frame rate of ply-seq and 4dgs (default: {FPS:g})"
+    p.add_argument("--fps", type=options.positive_float, metavar="F", help=what)
     p.add_argument("--level", type=int, choices=(0, 1, 2), help="level to write (default: the file's highest)")
     what = "degree of the spherical harmonics (default: 3)"
     p.add_argument("--sh", type=int, choices=(0, 1, 2, 3), default=3, help=what)
-    what = f"steps of refinement; a sequence's later frames take a quarter (default: {STEPS}; 0: none)"
-    p.add_argument("--refine", type=values.count, default=STEPS, metavar="N", help=what)
-    what = "multiply all lengths, so that small scenes fit SPZ's fixed point (default: 1)"
-    p.add_argument("--scale", type=values.positive_float, default=1.0, metavar="X", help=what)
-    p.add_argument("--data", metavar="SOURCE", help="look from the training cameras of a dataset")
-    what = "measure dB of direct and of exported pictures on the held-out views of a dataset"
+    what = f"optimisation steps of the refinement, a quarter for later frames (default: {STEPS}; 0: none)"
+    p.add_argument("--refine", type=options.count, default=STEPS, metavar="N", help=what)
+    what = "multiply all lengths, so that small scenes suit SPZ's fixed-point numbers (default: 1)"
+    p.add_argument("--scale", type=options.positive_float, default=1.0, metavar="X", help=what)
+    p.add_argument("--data", metavar="SOURCE", help="use the training cameras of a dataset as viewpoints")
+    what = "measure PSNR before and after exporting on the held-out views of a dataset"
     p.add_argument("--compare", metavar="SOURCE", help=what)
-    add_reading(p)
+    options.add_reading(p)
     p.add_common()
     return p
 
@@ -95,7 +105,7 @@ def _export(args: argparse.Namespace, console: Console) -> int:
     result["seconds"] = time.perf_counter() - start
     if args.compare:
         result["cost"] = _cost(args, export)
-    console.result(result, _text(result), on_stdout=False)
+    console.result(result, _text(result))
     return OK
 
 
@@ -104,15 +114,15 @@ main = command(parser, _export)
 
 def _check_usage(args: argparse.Namespace) -> None:
     if args.to in SEQUENCES and args.time is not None:
-        raise UsageError(f"--time chooses one instant and --to {args.to} writes them all; leave one out")
+        raise UsageError(f"found --time with --to {args.to}, expected it with ply, spz or glb")
     if args.to not in SEQUENCES and args.fps is not None:
-        raise UsageError(f"--fps is of sequences and --to {args.to} writes one instant; expected --time")
+        raise UsageError(f"found --fps with --to {args.to}, expected it with ply-seq or 4dgs")
     if args.output == STDIO:
         raise UsageError("found -o -, expected the name of a file or folder")
 
 
 def _check_folder(path: str, overwrite: bool) -> None:
-    """Frames of another run must not mix with these."""
+    """Refuses a folder with frames of another run, which must not mix with the new ones."""
     from pd4dgs_codec.errors import DataError
 
     folder = Path(path)
@@ -129,7 +139,7 @@ def _player(args: argparse.Namespace) -> Player:
 
     data = read_bytes(args.input)
     if not is_pd4(data):
-        raise DataError(f"{args.input}: is not a .pd4 file; pd4dgs-encode makes one of a checkpoint")
+        raise DataError(f"{args.input}: is not a .pd4 file; pd4dgs-encode makes one from a checkpoint")
     return Player(decode(data, max_layer=args.level))
 
 
@@ -142,7 +152,7 @@ def _eyes(args: argparse.Namespace, player: Player) -> Eyes:
 
 
 def _write_still(args: argparse.Namespace, export: Export, console: Console) -> dict[str, Any]:
-    """One instant."""
+    """Writes one point in time."""
     import numpy as np
 
     from pd4dgs_codec.interchange.export import upright
@@ -168,12 +178,12 @@ def _scaled(splats: Splats, args: argparse.Namespace) -> Splats:
     from pd4dgs_codec.errors import DataError
 
     if not len(splats.means):
-        raise DataError(f"{args.input}: shows no Gaussian at this level and time, expected one at least to write")
+        raise DataError(f"{args.input}: has no visible Gaussian at this level and time, expected at least one")
     return splats.scaled(args.scale)
 
 
 def frame_times(info: SceneInfo, fps: float) -> list[float]:
-    """Seconds from the start of the frames of a scene at a rate; the last is no later than its end."""
+    """Times of the frames at a rate, in seconds from the scene's start; the last is no later than its end."""
     from pd4dgs_codec.errors import DataError
 
     start, stop = info.time_range
@@ -186,7 +196,7 @@ def frame_times(info: SceneInfo, fps: float) -> list[float]:
 
 
 def _write_sequence(args: argparse.Namespace, export: Export) -> dict[str, Any]:
-    """One frame after another over the whole time."""
+    """Writes frames over the whole time range."""
     from pd4dgs_codec.interchange.libraries import fourdgs_bytes
     from pd4dgs_codec.interchange.ply import ply_bytes
 
@@ -243,7 +253,7 @@ def _text(result: dict[str, Any]) -> str:
     if "cost" in result:
         c = result["cost"]
         text += (
-            f"\non {c['views']} held-out views: {c['direct_mpsnr']:.2f} dB drawn directly, "
-            f"{c['exported_mpsnr']:.2f} dB exported; the second against the first {c['exported_to_direct_psnr']:.2f} dB"
+            f"\non {c['views']} held-out views: {c['direct_mpsnr']:.2f} dB rendered directly, "
+            f"{c['exported_mpsnr']:.2f} dB exported; exported against direct {c['exported_to_direct_psnr']:.2f} dB"
         )
     return text

@@ -1,19 +1,19 @@
-"""`pd4dgs-import`: another trainer's checkpoint as one of ours."""
+"""`pd4dgs-import`: another trainer's checkpoint -> a checkpoint of ours."""
 
 from __future__ import annotations
 
 import argparse
 from pathlib import Path
 
-from pd4dgs_codec.cli import values
-from pd4dgs_codec.cli.common import OK, Console, Parser, UsageError, command
-from pd4dgs_codec.cli.files import STDIO, check_output, write_checkpoint
+from pd4dgs_codec.cli import options
+from pd4dgs_codec.cli.common import OK, STDIO, Console, UsageError, check_output, command, write_checkpoint
 
 DETAILS = """\
-FOLDER is a checkpoint of Scaffold-GS: the run's folder, or its point_cloud/iteration_N with point_cloud.ply and either
-opacity_mlp.pt, cov_mlp.pt and color_mlp.pt or checkpoints.pth. It becomes layer 0, a still scene, exactly; encoding it
-rounds as always. What cannot be taken over (distances as inputs, a bank of features) is refused by name. Nothing that
-the files hold is run.
+FOLDER is a Scaffold-GS checkpoint: the folder of the run, or its point_cloud/iteration_N with point_cloud.ply and
+either opacity_mlp.pt, cov_mlp.pt and color_mlp.pt or checkpoints.pth.
+It becomes layer 0, a static scene, without loss; encoding quantises it as usual.
+Models with features that layer 0 lacks (distances as inputs, a feature bank) are refused with the feature's name.
+No code in the files is run.
 
 examples:
   pd4dgs-import output/garden -o garden.pt
@@ -21,16 +21,16 @@ examples:
   pd4dgs-encode garden.pt -o garden.pd4"""
 
 
-def parser() -> Parser:
+def parser() -> options.Parser:
     """The options of `pd4dgs-import`."""
-    p = Parser("import", "FOLDER -o model.pt", "Take over a model that Scaffold-GS trained.", DETAILS)
+    p = options.Parser("import", "FOLDER -o model.pt", "Import a Scaffold-GS model.", DETAILS)
     p.add_argument("input", metavar="FOLDER", help="the checkpoint")
     p.add_argument("-o", "--output", required=True, metavar="model.pt", help="checkpoint to write")
-    what = "where colours depend on the picture: take the appearance of picture I"
-    p.add_argument("--appearance", type=values.count, metavar="I", help=what)
-    what = "anchors are multiples of V scene units (default: what cfg_args says, else found)"
-    p.add_argument("--voxel-size", type=values.positive_float, metavar="V", help=what)
-    p.add_argument("--iteration", type=values.count, metavar="N", help="of several iterations (default: the last)")
+    what = "use the appearance embedding of image I, if colours depend on one"
+    p.add_argument("--appearance", type=options.count, metavar="I", help=what)
+    what = "voxel size of the anchors' grid in scene units (default: from cfg_args, else from the anchors)"
+    p.add_argument("--voxel-size", type=options.positive_float, metavar="V", help=what)
+    p.add_argument("--iteration", type=options.count, metavar="N", help="iteration to read (default: the last)")
     p.add_common()
     return p
 
@@ -51,8 +51,8 @@ def _import(args: argparse.Namespace, console: Console) -> int:
         "voxel_size": scene.info.voxel_size,
         "camera": scene.info.camera is not None,
     }
-    text = f"{args.output}: {result['anchors']:,} anchors of Scaffold-GS on a grid of {scene.info.voxel_size:g}"
-    console.result(result, text, on_stdout=False)
+    text = f"{args.output}: {result['anchors']:,} Scaffold-GS anchors on a grid of {scene.info.voxel_size:g} units"
+    console.result(result, text)
     return OK
 
 

@@ -6,9 +6,8 @@ import argparse
 from contextlib import closing
 from typing import Any
 
-from pd4dgs_codec.cli import values
-from pd4dgs_codec.cli.common import OK, Console, Parser, command, number, table
-from pd4dgs_codec.cli.files import STDIO, read_bytes
+from pd4dgs_codec.cli import options
+from pd4dgs_codec.cli.common import OK, STDIO, Console, command, number, read_bytes, table
 from pd4dgs_codec.errors import DataError
 
 DETAILS = """\
@@ -27,15 +26,15 @@ examples:
 DETAIL_KEYS = ("steps", "planes", "networks")
 
 
-def parser() -> Parser:
+def parser() -> options.Parser:
     """The options of `pd4dgs-info`."""
-    p = Parser("info", "FILE", "Show the header and the layers of a .pd4 file.", DETAILS)
+    p = options.Parser("info", "FILE", "Show the header and the layers of a .pd4 file.", DETAILS)
     p.add_argument("input", metavar="FILE", help=".pd4 file or its URL; - reads stdin")
     p.add_argument("--check", action="store_true", help="decode everything, so that every checksum and rule is tested")
     p.add_argument("--bytes", action="store_true", help="show where the bytes are: sections by layer")
     p.add_argument("--hashes", action="store_true", help="SHA-256 per layer of its integers and of its float32 tensors")
     what = "link rates in bits per second for the first-frame times (default: 2M,10M,50M)"
-    p.add_argument("--at", type=values.rates, default="2M,10M,50M", metavar="RATES", help=what)
+    p.add_argument("--at", type=options.rates, default="2M,10M,50M", metavar="RATES", help=what)
     p.add_common()
     return p
 

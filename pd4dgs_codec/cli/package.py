@@ -7,10 +7,9 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.cli.common import OK, Console, Parser, command, number, table
-from pd4dgs_codec.cli.files import STDIO, read_bytes
+from pd4dgs_codec.cli import options
+from pd4dgs_codec.cli.common import OK, STDIO, Console, command, number, read_bytes, table
 from pd4dgs_codec.cli.progress import progress_bar
-from pd4dgs_codec.cli.values import positive_float
 from pd4dgs_codec.io import whole_files
 
 if TYPE_CHECKING:
@@ -20,20 +19,18 @@ if TYPE_CHECKING:
     from pd4dgs_codec.web.package import Video
 
 DETAILS = """\
-DIR then holds scene.pd4 and index.html: a page that plays it in a browser, from any web server that DIR is copied to.
-For other players there are index.json (byte ranges and SHA-256 of the layers), scene.mp4 and scene.mpd (DASH: each
-layer a fragment and an AdaptationSet of its own, with dependencyId) and scene.m3u8 (HLS, whose session data names
+DIR then holds scene.pd4 and index.html, a page that plays the scene from any web server that DIR is copied to.
+For other players it holds index.json (byte ranges and SHA-256 of the layers), scene.mp4 and scene.mpd (DASH: each layer
+is a fragment and an AdaptationSet of its own, with dependencyId) and scene.m3u8 (HLS: the session data name
 index.json).
 
-DASH clients that follow dependencyId deliver the layers; showing them takes a .pd4 decoder. Stock DASH and HLS players
-play the 2D video: fallback.mp4, rendered from the scene with its own camera over its whole time. It needs torch, numba
-and ffmpeg (the extra [train]) and a file with a camera; else the folder is made without it, and stock players find
-nothing to play.
+DASH clients that support dependencyId deliver the layers; showing them takes a .pd4 decoder. Other DASH and HLS players
+play a 2D video, fallback.mp4, rendered with the scene's own camera over its time range. The video needs torch, numba
+and ffmpeg (the extra [train]) and a file with a camera; otherwise the folder is made without it.
 
---immutable puts a digest into the names of what other files name: a CDN may keep these for ever, and a new version is
-a new name. index.json says which header Cache-Control each file should have. Where the first argument is a folder of
-packages, library.json and index.html are written beside them: what there is, with posters, sizes and times to the first
-picture.
+--immutable puts a digest into the names of referenced files, so that a CDN may cache them for ever: a new version has
+new names. index.json lists the Cache-Control header of each file. If the input is a folder of packages, library.json
+and index.html are written beside them: a list with posters, sizes and times to the first picture.
 
 examples:
   pd4dgs-package scene.pd4 -o out/scene
@@ -41,24 +38,22 @@ examples:
   pd4dgs-package out -o out
   pd4dgs-package scene.pd4 -o out/scene --no-video --json"""
 
-STILL_FRAMES = 60  #: for a scene whose time stands still
+STILL_FRAMES = 60  #: of the video of a static scene
 MAX_FRAMES = 3000
 FRAGMENT_SECONDS = 2
 
 
-def parser() -> Parser:
+def parser() -> options.Parser:
     """The options of `pd4dgs-package`."""
-    p = Parser(
-        "package",
-        "scene.pd4 -o DIR",
-        "Make a folder for web servers: a page that plays the scene, DASH, HLS.",
-        DETAILS,
-    )
-    p.add_argument("input", metavar="scene.pd4", help="file to package, - reads stdin; or a folder of packages")
+    summary = "Make a folder for web servers: a page that plays the scene, DASH, HLS."
+    p = options.Parser("package", "scene.pd4 -o DIR", summary, DETAILS)
+    p.add_argument("input", metavar="scene.pd4", help="file to package (- reads stdin), or a folder of packages")
     p.add_argument("-o", "--output", required=True, metavar="DIR", help="folder to write, made if missing")
-    p.add_argument("--immutable", action="store_true", help="names with digests, for caches that keep them")
-    p.add_argument("--no-video", action="store_true", help="do without the 2D video")
-    p.add_argument("--fps", type=positive_float, default=20.0, metavar="F", help="of the 2D video (default: 20)")
+    p.add_argument("--immutable", action="store_true", help="put digests into file names, for long-lived caches")
+    p.add_argument("--no-video", action="store_true", help="leave out the 2D video")
+    p.add_argument(
+        "--fps", type=options.positive_float, default=20.0, metavar="F", help="frame rate of the 2D video (default: 20)"
+    )
     p.add_common()
     return p
 
@@ -81,7 +76,7 @@ def _package(args: argparse.Namespace, console: Console) -> int:
     files = package(data, None if args.no_video else render, immutable=args.immutable)
     rows = _write(args, files)
     result = {"input": args.input, "output": args.output, "files": rows, "video": why_not is None}
-    console.result(result | {"why_no_video": why_not}, _text(result), on_stdout=False)
+    console.result(result | {"why_no_video": why_not}, _text(result))
     return OK
 
 
@@ -93,14 +88,14 @@ def _library(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.web.library import library
 
     if Path(args.input).resolve() != Path(args.output).resolve():
-        raise DeliveryError(f"-o {args.output}: expected {args.input}: the index of packages lies beside them")
+        raise DeliveryError(f"-o {args.output}: expected {args.input}: the index is written beside the packages")
     result = {"input": args.input, "output": args.output, "files": _write(args, library(Path(args.input)))}
-    console.result(result, _text(result), on_stdout=False)
+    console.result(result, _text(result))
     return OK
 
 
 def _write(args: argparse.Namespace, files: dict[str, bytes]) -> list[dict[str, Any]]:
-    """Writes them all or none; returns their names and sizes."""
+    """Writes all files or none; returns their names and sizes."""
     names = [str(Path(args.output) / name) for name in files]
     with whole_files(names[0], names, args.overwrite) as temporaries:
         for temporary, content in zip(temporaries, files.values(), strict=True):
@@ -132,7 +127,7 @@ def _render(scene: Scene, fps: float) -> Video:
     from pd4dgs_codec.web.package import Video
 
     check_mp4()
-    if scene.info.camera is None:  # said here, since no option can name another one
+    if scene.info.camera is None:
         raise RenderError("the file holds no camera of its own")
     low, high = scene.info.time_range
     count = max(2, round((high - low) * fps)) if high > low else STILL_FRAMES

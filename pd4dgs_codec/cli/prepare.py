@@ -6,21 +6,20 @@ import argparse
 from pathlib import Path
 from typing import Any
 
-from pd4dgs_codec.cli import values
-from pd4dgs_codec.cli.common import OK, Console, Parser, UsageError, command
-from pd4dgs_codec.cli.files import STDIO
+from pd4dgs_codec.cli import options
+from pd4dgs_codec.cli.common import OK, STDIO, Console, UsageError, command
 from pd4dgs_codec.cli.progress import progress_bar
 from pd4dgs_codec.errors import DataError
 
 CAMERAS = ("SIMPLE_RADIAL", "SIMPLE_PINHOLE", "PINHOLE", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
 DETAILS = """\
-INPUT is a video, or a folder of frames whose names end with their numbers. Frames are spread over its time; those that
-are blurred or repeat the one before are left out. pycolmap finds the camera's poses (pip install
-'pd4dgs-codec[prepare]'). Things that move are told apart by where their features should be if they stood still, and
-the poses are found again without them; nothing is masked for the training.
+INPUT is a video, or a folder of frames whose names end with their numbers.
+Frames are chosen evenly over time, without blurred frames and repetitions. pycolmap estimates the camera poses (pip
+install 'pd4dgs-codec[prepare]'). Features that move are found by comparing them with their predicted positions in a
+static scene; then the poses are estimated again without them. Training images are not masked.
 
-FOLDER then holds images/, times.txt, sparse/0 (a model of COLMAP), report.json and report.png. Until then the work lies
-in FOLDER.partial, and the same command goes on from it after Ctrl-C.
+FOLDER then holds images/, times.txt, sparse/0 (a COLMAP model), report.json and report.png. Intermediate results are
+kept in FOLDER.partial; after Ctrl-C the same command resumes from there.
 
 examples:
   pd4dgs-prepare kitchen.mp4 -o kitchen
@@ -28,18 +27,17 @@ examples:
   pd4dgs-train kitchen -o kitchen.pt"""
 
 
-def parser() -> Parser:
+def parser() -> options.Parser:
     """The options of `pd4dgs-prepare`."""
-    p = Parser("prepare", "INPUT -o FOLDER", "Find the camera's poses in a recording.", DETAILS)
-    p.add_argument("input", metavar="INPUT", help="a video, or a folder of frames")
-    p.add_argument("-o", "--output", required=True, metavar="FOLDER", help="folder to make")
-    p.add_argument("--frames", type=values.count, default=120, metavar="N", help="at most (default: 120; 0: all)")
-    what = "of a folder of frames: how many were taken per second (default: 30)"
-    p.add_argument("--fps", type=values.positive_float, default=30.0, metavar="F", help=what)
-    what = "write pictures 1/K as wide and high (default: 1)"
-    p.add_argument("--downscale", type=values.positive_int, default=1, metavar="K", help=what)
-    what = "how the lens bends: COLMAP's model (default: SIMPLE_RADIAL, of one coefficient)"
-    p.add_argument("--camera", choices=CAMERAS, default=CAMERAS[0], help=what)
+    p = options.Parser("prepare", "INPUT -o FOLDER", "Estimate the camera poses of a recording.", DETAILS)
+    add = p.add_argument
+    add("input", metavar="INPUT", help="a video, or a folder of frames")
+    add("-o", "--output", required=True, metavar="FOLDER", help="folder to make")
+    add("--frames", type=options.count, default=120, metavar="N", help="use at most N frames (default: 120; 0: all)")
+    what = "frame rate of a folder of frames (default: 30)"
+    add("--fps", type=options.positive_float, default=30.0, metavar="F", help=what)
+    add("--downscale", type=options.positive_int, default=1, metavar="K", help="write images at 1/K size (default: 1)")
+    add("--camera", choices=CAMERAS, default=CAMERAS[0], help=f"COLMAP camera model (default: {CAMERAS[0]})")
     p.add_common()
     return p
 
@@ -53,8 +51,8 @@ def _prepare(args: argparse.Namespace, console: Console) -> int:
     try:
         report = prepare(Path(args.input), Path(args.output), choices, progress_bar, args.overwrite)
     except KeyboardInterrupt:
-        raise DataError(f"interrupted; the same command goes on from {args.output}.partial") from None
-    console.result({"output": args.output, **report}, _text(args.output, report), on_stdout=False)
+        raise DataError(f"interrupted; the same command resumes from {args.output}.partial") from None
+    console.result({"output": args.output, **report}, _text(args.output, report))
     return OK
 
 

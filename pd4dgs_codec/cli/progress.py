@@ -1,4 +1,4 @@
-"""Progress on stderr: bars on a terminal, elsewhere a plain line now and then."""
+"""Progress on stderr: bars on a terminal, otherwise a plain line from time to time."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from pd4dgs_codec.cli.common import say
 if TYPE_CHECKING:
     from pd4dgs_codec.train.loop import Trainer
 
-#: Between two lines where stderr is not a terminal.
+#: Between two lines if stderr is not a terminal.
 LINE_SECONDS = 10.0
 
 
 @contextlib.contextmanager
 def progress_bar(total: int | None, unit: str, label: str) -> Iterator[Callable[[], None]]:
-    """A function to call after each item: a bar on a terminal, elsewhere a line every LINE_SECONDS."""
+    """A function to call after each item: a bar on a terminal, otherwise a line every LINE_SECONDS."""
     if sys.stderr.isatty():
         from tqdm import tqdm
 
@@ -43,7 +43,7 @@ def progress_bar(total: int | None, unit: str, label: str) -> Iterator[Callable[
 
 
 class TrainingProgress:
-    """A bar on a terminal; elsewhere a line whenever held-out quality was measured."""
+    """A bar on a terminal; otherwise a line after each evaluation."""
 
     def __init__(self) -> None:
         self.stream = sys.stderr
@@ -61,7 +61,7 @@ class TrainingProgress:
             say(f"{steps}, {trainer.seconds:.0f}{limit} s: {psnr} dB, {record['anchors']} anchors")
 
     def close(self) -> None:
-        """Takes the bar away."""
+        """Removes the bar."""
         if self.bar is not None:
             self.bar.close()
 

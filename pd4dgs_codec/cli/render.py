@@ -1,4 +1,4 @@
-"""`pd4dgs-render`: pictures of a `.pd4` file or a checkpoint."""
+"""`pd4dgs-render`: images of a `.pd4` file or a checkpoint."""
 
 from __future__ import annotations
 
@@ -9,9 +9,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.cli import values
-from pd4dgs_codec.cli.common import OK, SOURCES, Console, Parser, UsageError, add_reading, command
-from pd4dgs_codec.cli.files import STDIO, check_output, named_input, read_dataset
+from pd4dgs_codec.cli import options
+from pd4dgs_codec.cli.common import OK, STDIO, Console, UsageError, check_output, command, named_input, read_dataset
 from pd4dgs_codec.cli.progress import progress_bar
 from pd4dgs_codec.io import whole_file, whole_files
 from pd4dgs_codec.threads import load_numba
@@ -23,9 +22,9 @@ if TYPE_CHECKING:
     from pd4dgs_codec.quality.levels import Level
 
 DETAILS = f"""\
-Without --data the file's own camera is used, over its whole time; with --data the views of a dataset at their times.
+Without --data the file's own camera is used over its time range; with --data the views of a dataset at their times.
 
-{SOURCES}
+{options.SOURCES}
 
 examples:
   pd4dgs-render scene.pd4 -o scene.gif --orbit 20
@@ -36,25 +35,25 @@ PICTURES = (".png", ".jpg", ".jpeg", ".webp", ".bmp")
 VIDEOS = (".gif", ".mp4")
 
 
-def parser() -> Parser:
+def parser() -> options.Parser:
     """The options of `pd4dgs-render`."""
-    p = Parser("render", "FILE -o OUT", "Render a .pd4 file or a checkpoint to pictures or a video.", DETAILS)
+    p = options.Parser("render", "FILE -o OUT", "Render a .pd4 file or a checkpoint to images or a video.", DETAILS)
     p.add_argument("input", metavar="FILE", help=".pd4 file or .pt checkpoint; - reads a .pd4 from stdin")
-    what = "pictures such as out/%%04d.png, or a .gif or .mp4"
+    what = "images such as out/%%04d.png, or a .gif or .mp4"
     p.add_argument("-o", "--output", required=True, metavar="OUT", help=what)
-    p.add_argument("--max-layer", type=int, choices=(0, 1, 2), help="render what the layers up to this one give")
-    what = "render what the slices within the first SIZE bytes give, such as 50k"
-    p.add_argument("--max-bytes", type=values.size, metavar="SIZE", help=what)
-    p.add_argument("--data", metavar="SOURCE", help="take cameras, times and true images from a dataset")
-    p.add_argument("--split", choices=("test", "train"), default="test", help="which views of it (default: test)")
-    add_reading(p)
-    what = "pictures over the whole time (default: 60), or of --data the first N"
-    p.add_argument("--frames", type=values.positive_int, metavar="N", help=what)
-    what = "sway the file's camera through DEG degrees around what it looks at"
-    p.add_argument("--orbit", type=values.finite_float, default=0.0, metavar="DEG", help=what)
-    what = "frames per second of a video (default: 20)"
-    p.add_argument("--fps", type=values.positive_float, default=20.0, metavar="F", help=what)
-    what = "all levels next to each other, with the true image if --data is given"
+    options.add_max_layer(p, "render the layers up to this one")
+    what = "render the slices within the first SIZE bytes, such as 50k"
+    p.add_argument("--max-bytes", type=options.size, metavar="SIZE", help=what)
+    p.add_argument("--data", metavar="SOURCE", help="take cameras, times and ground-truth images from a dataset")
+    p.add_argument("--split", choices=("test", "train"), default="test", help="views of the dataset (default: test)")
+    options.add_reading(p)
+    what = "number of frames, evenly over the time range (default: 60); with --data the first N views"
+    p.add_argument("--frames", type=options.positive_int, metavar="N", help=what)
+    what = "swing the file's camera by DEG degrees around the point it looks at (default: 0)"
+    p.add_argument("--orbit", type=options.finite_float, default=0.0, metavar="DEG", help=what)
+    what = "frame rate of a video (default: 20)"
+    p.add_argument("--fps", type=options.positive_float, default=20.0, metavar="F", help=what)
+    what = "show all levels side by side, and the ground truth with --data"
     p.add_argument("--side-by-side", action="store_true", help=what)
     p.add_common()
     return p
@@ -89,7 +88,7 @@ def _render(args: argparse.Namespace, console: Console) -> int:
         "levels": [level.level for level in levels],
         "render_ms": statistics.median(milliseconds),
     }
-    console.result(result, _text(result), on_stdout=False)
+    console.result(result, _text(result))
     return OK
 
 
@@ -100,9 +99,9 @@ def _check_usage(args: argparse.Namespace) -> str:
     """The kind of output: the lower-case suffix."""
     kind = Path(args.output).suffix.lower()
     if args.output == STDIO or kind not in (*PICTURES, *VIDEOS):
-        raise UsageError(f"found -o {args.output}, expected pictures such as out/%04d.png, or a .gif or .mp4")
+        raise UsageError(f"found -o {args.output}, expected images such as out/%04d.png, or a .gif or .mp4")
     if args.data and args.orbit:
-        raise UsageError("--orbit moves the file's own camera; leave out --data or --orbit")
+        raise UsageError("--orbit moves the file's own camera; found --data too, expected one of them")
     if kind not in VIDEOS and "%" in args.output:
         name = Path(args.output).name
         if not re.fullmatch(r"[^%]*%0?\d*d[^%]*", name) or "%" in str(Path(args.output).parent):
@@ -126,7 +125,8 @@ def _frames(args: argparse.Namespace, level: Level) -> list[Frame]:
 def _pictures(
     frames: list[Frame], levels: list[Level], beside: bool, milliseconds: list[float], step: Callable[[], None]
 ) -> Iterator[np.ndarray]:
-    """uint8 [H, W, 3] per frame: the one level, or all of them beside the true image. Times are noted per picture."""
+    """uint8 [H, W, 3] per frame: one level, or all of them beside the ground truth. Appends the time of each picture to
+    `milliseconds`."""
     from pd4dgs_codec.quality.panels import Panel, level_panels, side_by_side
 
     for frame in frames:
@@ -149,7 +149,7 @@ def _write(args: argparse.Namespace, kind: str, pictures: Iterator[np.ndarray], 
     numbered = "%" in args.output
     if count > 1 and not numbered:
         raise UsageError(
-            f"found -o {args.output} for {count} pictures, expected a frame number in it, such as %04d, or --frames 1"
+            f"found -o {args.output} for {count} images, expected a frame number in it, such as %04d, or --frames 1"
         )
     names = [args.output % i if numbered else args.output for i in range(count)]
     with whole_files(args.output, names, args.overwrite) as temporaries:

@@ -1,4 +1,4 @@
-"""`pd4dgs-serve`: a folder over HTTP, on a slow link if wanted."""
+"""`pd4dgs-serve`: a folder over HTTP, at the rate of a slow link if asked for."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import argparse
 import signal
 import threading
 
-from pd4dgs_codec.cli.common import OK, Console, Parser, command
-from pd4dgs_codec.cli.values import duration, port, rate
+from pd4dgs_codec.cli import options
+from pd4dgs_codec.cli.common import OK, Console, command
 
 DETAILS = """\
-GET and HEAD with ranges, If-Range, ETag and CORS. Nothing outside DIR is served, nor names that begin with a dot.
-The first line on stdout is the URL, printed when the server listens; it ends on Ctrl-C or SIGTERM.
+Answers GET and HEAD with ranges, If-Range, ETag and CORS. Files outside DIR and names that begin with a dot are not
+served. The first line on stdout is the URL, printed when the server listens. Ctrl-C or SIGTERM ends it.
 
---rate is one link that all clients share; it carries bodies, headers cross for free. --latency is a round trip: a new
-connection waits for one, each request for another.
+--rate is the rate of one link that all clients share; headers are not counted. --latency is its round-trip time: a new
+connection takes one round trip, each request another.
 
 In production any server of static files will do. nginx:
   server {
@@ -58,16 +58,23 @@ examples:
   pd4dgs-serve out/scene --port 0 --rate 2M --latency 50ms"""
 
 
-def parser() -> Parser:
+def parser() -> options.Parser:
     """The options of `pd4dgs-serve`."""
-    p = Parser("serve", "DIR", "Serve a folder over HTTP, at the rate of a slow link if wanted.", DETAILS)
+    p = options.Parser("serve", "DIR", "Serve a folder over HTTP, at the rate of a slow link if asked for.", DETAILS)
     p.add_argument("input", metavar="DIR", help="folder to serve")
     p.add_argument("--host", default="127.0.0.1", metavar="H", help="address to listen on (default: 127.0.0.1)")
-    p.add_argument("--port", type=port, default=8000, metavar="N", help="port, 0 for any free one (default: 8000)")
-    p.add_argument("--rate", type=rate, metavar="BPS", help="rate of the link in bits per second, such as 2M")
-    p.add_argument("--latency", type=duration, default=0.0, metavar="T", help="round trip, such as 50ms (default: 0)")
+    p.add_argument("--port", type=options.port, default=8000, metavar="N", help="port; 0: any free one (default: 8000)")
+    add_link(p)
     p.add_common()
     return p
+
+
+def add_link(p: options.Parser) -> None:
+    """--rate and --latency of the link."""
+    what = "rate of the link in bits per second, such as 2M (default: unlimited)"
+    p.add_argument("--rate", type=options.rate, metavar="BPS", help=what)
+    what = "round-trip time of the link, such as 50ms (default: 0)"
+    p.add_argument("--latency", type=options.duration, default=0.0, metavar="T", help=what)
 
 
 def _serve(args: argparse.Namespace, console: Console) -> int:

@@ -3,49 +3,41 @@
 from __future__ import annotations
 
 import argparse
+import json
 import os
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.cli import values
-from pd4dgs_codec.cli.common import (
-    OK,
-    SOURCES,
-    Console,
-    Parser,
-    UsageError,
-    add_reading,
-    command,
-    number,
-    table,
-)
-from pd4dgs_codec.cli.files import STDIO, check_output
+from pd4dgs_codec.cli import options
+from pd4dgs_codec.cli.common import OK, STDIO, Console, UsageError, check_output, command, number, table, write_bytes
 from pd4dgs_codec.cli.progress import TrainingProgress
-from pd4dgs_codec.cli.resume import ablated, check_time_left, cut_log, stored_config
 from pd4dgs_codec.errors import RenderError, TrainError
 from pd4dgs_codec.io import remove_leftovers
-from pd4dgs_codec.train.config import ABLATIONS, FIXED, ROLLOUTS
+from pd4dgs_codec.train.config import ABLATIONS, FIXED, OPTIONS, TrainConfig, at_quality
 
 if TYPE_CHECKING:
-    from pd4dgs_codec.train.config import TrainConfig
     from pd4dgs_codec.train.loop import Trainer
 
 DETAILS = f"""\
-Training ends after --iterations; --max-seconds alone goes through the whole schedule by the clock, beside --iterations
-it cuts the run. Ctrl-C (or SIGTERM) ends it early, after the step in hand, with a whole checkpoint, which --resume goes
-on from. A second Ctrl-C ends it at once, and what was trained since the last save (one a minute) is lost.
+Training ends after --iterations steps. --max-seconds alone spreads the whole schedule over that time; with --iterations
+it stops the run early. Ctrl-C or SIGTERM ends the run after the current step with a complete checkpoint, from which
+--resume continues. A second Ctrl-C ends it at once and loses all steps since the last save (one a minute).
 
---rollout: adaptive draws a level, the higher ones more often the more the layers differ; uniform draws all alike; fixed
-draws them with chances of .15, .30, .55; top trains the highest level alone; all trains every level in every step, at
-about thrice the cost. Before a tenth of the run it is level 0 in any case.
---without: rate, the bit-rate terms; planes, that of the planes alone; binary and smooth, the two mask terms; tmc, both
-of them; noise, the imitation of quantisation; whitening, the mixing of the features' channels; judge, which leaves out
-levels that gain too little on training views kept back until then.
+--quality sets the weights of the bit rates, pruning and quantisation steps together; --rate-scale, --prune and
+--grading replace single ones.
 
-Several workers train one scene where torchrun starts them: V views a step are shared out, gradients are averaged, and
-the first one writes. N must divide V. A run may be resumed with another N.
+--rollout: adaptive samples levels, higher ones more often the more the layers differ; uniform samples all levels alike;
+fixed samples them with probabilities .15, .30, .55; top trains only the highest level; all trains every level in every
+step, at about three times the cost. The first tenth of a run trains level 0 in any case.
+--without: rate, the bit-rate terms; planes, the bit-rate term of the planes; binary and smooth, the two mask terms;
+tmc, both of them; noise, the simulated quantisation; whitening, the transform of the feature channels; judge, the
+removal of levels that gain too little on held-back training views.
 
-{SOURCES}
+torchrun starts several workers that train one scene: they share the V views of a step and average their gradients, and
+the first worker writes the files. Their number must divide V. A run may be resumed with another number of workers.
+
+{options.SOURCES}
 
 examples:
   torchrun --nproc-per-node=2 -m -- pd4dgs_codec train synthetic:local -o local.pt --views-per-step 2
@@ -53,74 +45,47 @@ examples:
   pd4dgs-train recordings/kitchen -o kitchen.pt --downscale 2 --iterations 10000
   pd4dgs-train recordings/kitchen -o kitchen.pt --resume kitchen.pt"""
 
+VIEW_PORT = 8080
 
-def parser() -> Parser:
-    """The options of `pd4dgs-train`. What a checkpoint fixes has no default here, so that a conflict can be told."""
-    p = Parser("train", "SOURCE -o FILE.pt", "Train a layered dynamic Gaussian scene from posed images.", DETAILS)
-    p.add_argument("source", metavar="SOURCE", help="dataset to train on, see below")
-    p.add_argument("-o", "--output", required=True, metavar="FILE.pt", help="checkpoint to write")
-    p.add_argument("--preset", choices=("tiny", "small", "paper"), help="model size (default: small)")
-    what = "numbers of an anchor's feature, 1..64 (default: 32)"
-    p.add_argument("--feature-width", type=values.positive_int, metavar="N", help=what)
-    what = "Gaussians of an anchor, 1..16 (default: 10)"
-    p.add_argument("--slots", type=values.positive_int, metavar="N", help=what)
-    what = "training steps (default: by preset, unless --max-seconds is given)"
-    p.add_argument("--iterations", type=values.positive_int, metavar="N", help=what)
-    what = "views that each step learns from (default: 1); several workers share them, see below"
-    p.add_argument("--views-per-step", type=values.positive_int, metavar="V", help=what)
-    what = "time to train; on --resume earlier time counts too"
-    p.add_argument("--max-seconds", type=values.positive_float, metavar="S", help=what)
-    add_reading(p, defaults=False)
-    p.add_argument("--seed", type=values.seed, metavar="N", help="seed of all that is random in training (default: 0)")
-    p.add_argument("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to train (default: auto)")
-    p.add_argument("--resume", metavar="FILE.pt", help="go on from this checkpoint, with the settings stored in it")
-    p.add_argument("--log", metavar="FILE.jsonl", help="write one JSON object per step")
-    what = "0 (small) to 100 (good): weights of the bit rates, pruning and steps at once (default: 50)"
-    p.add_argument("--quality", type=values.non_negative_float, metavar="Q", help=what)
-    what = "weight of the anchors' bit rate against quality, instead of the quality's (at 50: 0.08; 1: the paper's)"
-    p.add_argument("--rate-scale", type=values.non_negative_float, metavar="X", help=what)
-    p.add_argument(
-        "--prune",
-        type=values.non_negative_float,
-        metavar="X",
-        help="half way, take out anchors whose absence adds at most this share to the squared error, instead of the "
-        "quality's (at 50: 0.14; 0: none)",
-    )
-    what = (
-        "coarser steps for anchors that pictures hardly depend on, up to this share of the squared error, instead of "
-        "the quality's (at 50: 0.05; 0: none)"
-    )
-    p.add_argument("--grading", type=values.non_negative_float, metavar="X", help=what)
-    what = (
-        "share of the steps of the last third that see the most useful anchors of level 0 alone, for pictures from the "
-        "first slices of pd4dgs-encode --slices (default: 0; 0.3 is much)"
-    )
-    p.add_argument("--prefixes", type=values.non_negative_float, metavar="X", help=what)
-    p.add_argument("--max-layer", type=int, choices=(0, 1, 2), help="train without the layers above this one")
-    what = "show the scene in the browser while it trains, at this port of this machine (default: 8080; needs viser)"
-    p.add_argument("--view", type=values.port, nargs="?", const=8080, metavar="PORT", help=what)
-    what = "which level each step trains, see below (default: adaptive)"
-    p.add_argument("--rollout", choices=ROLLOUTS, help=what)
-    p.add_argument(
-        "--without",
-        action="append",
-        choices=tuple(ABLATIONS),
-        metavar="PART",
-        default=[],
-        help=f"leave out a part of the method, to see what it is worth: {', '.join(ABLATIONS)}, see below; may be "
-        "given several times",
-    )
+
+def parser() -> options.Parser:
+    """The options of `pd4dgs-train`. Those stored in a checkpoint default to None, so that conflicts are noticed."""
+    p = options.Parser("train", "SOURCE -o FILE.pt", "Train a layered dynamic Gaussian scene from images.", DETAILS)
+    add = p.add_argument
+    add("source", metavar="SOURCE", help="dataset to train on, see below")
+    add("-o", "--output", required=True, metavar="FILE.pt", help="checkpoint to write")
+    options.add_reading(p, defaults=False)
+    what = "0 (small files) to 100 (high quality), see below (default: 50)"
+    add("--quality", type=options.checked(float, lambda q: 0 <= q <= 100, "0 to 100"), metavar="Q", help=what)
+    _add_fields(p)
+    add("--device", choices=("auto", "cpu", "cuda"), default="auto", help="where to train (default: auto)")
+    add("--resume", metavar="FILE.pt", help="continue from this checkpoint with the settings stored in it")
+    add("--log", metavar="FILE.jsonl", help="write one JSON object per step")
+    what = f"show the scene in the browser while it trains, at this port (default: {VIEW_PORT}; needs viser)"
+    add("--view", type=options.port, nargs="?", const=VIEW_PORT, metavar="PORT", help=what)
+    what = f"turn off a part of the method, see below; may be repeated: {', '.join(ABLATIONS)}"
+    add("--without", action="append", choices=tuple(ABLATIONS), metavar="PART", default=[], help=what)
     p.add_common()
     return p
 
 
+def _add_fields(p: options.Parser) -> None:
+    """Adds an option for each field of TrainConfig whose declaration has a help text."""
+    for field in fields(TrainConfig):
+        about = OPTIONS.get(field.name)
+        if about is None or not about.help:
+            continue
+        kind = {"int": int, "float": float}.get(str(field.type).split(" ")[0], str)
+        at = " at quality 50" if about.dial else ""
+        what = about.help if field.default is None else f"{about.help} (default: {field.default}{at})"
+        settings: dict[str, Any] = {"type": kind, "choices": about.choices}
+        if not about.choices:
+            settings = {"type": options.checked(kind, about.contains, about.range), "metavar": about.metavar}
+        p.add_argument(f"--{field.name.replace('_', '-')}", help=what, **settings)
+
+
 def _train(args: argparse.Namespace, console: Console) -> int:
-    if STDIO in (args.output, args.resume, args.log):
-        raise UsageError("training reads and writes named files, not - (stdin, stdout)")
-    if args.rate_scale and "rate" in args.without:
-        raise UsageError(f"found --rate-scale {args.rate_scale:g} and --without rate, expected one of them")
-    if args.log and os.path.realpath(args.log) == os.path.realpath(args.output):
-        raise UsageError(f"--log and -o both name {args.output}; expected two files")
+    _check_usage(args)
     resuming_in_place = args.resume is not None and Path(args.resume).resolve() == Path(args.output).resolve()
     check_output(args.output, args.overwrite or resuming_in_place)
     if args.log:
@@ -132,28 +97,23 @@ def _train(args: argparse.Namespace, console: Console) -> int:
 
     checkpoint.target(args.output)  # refuses a device now, not after the first minute
     device = _device(args.device, console)
-    config = stored_config(args) if args.resume else _fresh_config(args)
+    config = _stored_config(args) if args.resume else _fresh_config(args)
     workers.start(device, config.views_per_step)
     first = workers.rank() == 0
-    dataset = load_source(args.source, downscale=config.downscale, holdout=config.holdout)
-    trainer = Trainer(config, dataset, device)
+    trainer = Trainer(config, load_source(args.source, downscale=config.downscale, holdout=config.holdout), device)
     if args.resume:
         trainer.resume(Path(args.resume))
-        check_time_left(trainer, args.resume)
-    if first and args.log and os.path.isfile(args.log):  # a device or a pipe has nothing to take back
-        if args.resume:
-            cut_log(args.log, trainer.iteration)
-        else:
-            open(args.log, "w").close()
+        _check_time_left(trainer, args.resume)
+    progress, log = None, None
     if first:
+        log = _prepare_log(args, trainer.iteration)
         remove_leftovers(args.output)
-        _announce(args, trainer, console)
-    log = Path(args.log) if args.log and first else None
-    progress = _progress(args, trainer, console) if first else None
+        _announce(trainer, console)
+        progress = _progress(args, trainer, console)
     try:
         trainer.run(Path(args.output), log=log, progress=progress)
     except KeyboardInterrupt:
-        raise TrainError("interrupted twice; what was trained since the last save is lost") from None
+        raise TrainError("interrupted twice; all steps since the last save are lost") from None
     workers.stop()
     if trainer.iteration and trainer.learner.skipped == trainer.iteration:
         raise TrainError(
@@ -162,11 +122,112 @@ def _train(args: argparse.Namespace, console: Console) -> int:
         )
     if first:
         result = _summary(args, trainer)
-        console.result(result, _text(result), on_stdout=False)
+        console.result(result, _text(result))
     return OK
 
 
 main = command(parser, _train)
+
+
+def _check_usage(args: argparse.Namespace) -> None:
+    if STDIO in (args.output, args.resume, args.log):
+        raise UsageError("found -, expected named files: training does not use stdin or stdout")
+    if args.rate_scale and "rate" in args.without:
+        raise UsageError(f"found --rate-scale {args.rate_scale:g} and --without rate, expected one of them")
+    if args.log and os.path.realpath(args.log) == os.path.realpath(args.output):
+        raise UsageError(f"--log and -o both name {args.output}; expected two files")
+
+
+# -- configuration -----------------------------------------------------------------------------------------------------
+
+
+def _ablated(args: argparse.Namespace) -> dict[str, Any]:
+    """The fields of TrainConfig that --without sets."""
+    return {name: value for part in args.without for name, value in ABLATIONS[part].items()}
+
+
+def _fresh_config(args: argparse.Namespace) -> TrainConfig:
+    dial = {} if args.quality is None else at_quality(args.quality)
+    named = dial | {name: getattr(args, name) for name in (*FIXED, "max_seconds") if getattr(args, name) is not None}
+    return TrainConfig(source=args.source, **named | _ablated(args))
+
+
+def _stored_config(args: argparse.Namespace) -> TrainConfig:
+    """The configuration in the checkpoint args.resume, with the time limit of this call if it has one.
+
+    Raises TrainError for options that differ from those stored.
+    """
+    from pd4dgs_codec.model import checkpoint
+
+    _, training = checkpoint.load(args.resume)
+    if "config" not in training:
+        what = "no training state (it was decoded from a .pd4, or stripped)"
+        raise TrainError(f"{args.resume}: holds {what}; expected a checkpoint of pd4dgs-train")
+    config = TrainConfig.from_json(training["config"], args.resume)
+    for name in FIXED:
+        asked = getattr(args, name)
+        if asked is not None:
+            _expect_same(args.resume, f"--{name.replace('_', '-')}", getattr(config, name), asked)
+    if args.quality is not None:
+        for name, value in at_quality(args.quality).items():
+            if getattr(args, name, None) is None and name not in _ablated(args):
+                _expect_same(args.resume, f"{name}, which --quality sets,", getattr(config, name), value)
+    for part in args.without:
+        if any(getattr(config, name) != value for name, value in ABLATIONS[part].items()):
+            raise TrainError(f"{args.resume}: was not trained --without {part}; expected the same to resume")
+    if _same_source(args.source) != _same_source(config.source):
+        _expect_same(args.resume, "SOURCE", config.source, args.source)
+    return replace(config, max_seconds=args.max_seconds or config.max_seconds)
+
+
+def _expect_same(path: str, what: str, stored: Any, asked: Any) -> None:
+    if stored != asked:
+        raise TrainError(f"{path}: was trained with {what} {stored}, found {asked}; expected the same to resume")
+
+
+def _same_source(source: str) -> str:
+    from pd4dgs_codec.data.synthetic import PREFIX
+
+    return source if source.startswith(PREFIX) else str(Path(source).resolve())
+
+
+def _check_time_left(trainer: Trainer, path: str) -> None:
+    """Raises TrainError if the run has used up its time limit without having finished."""
+    limit = trainer.config.max_seconds
+    if limit and not trainer.finished and trainer.seconds >= limit:
+        used = f"has trained {trainer.seconds:.0f} s of its limit of {limit:g} s"
+        raise TrainError(f"{path}: {used}; expected a larger --max-seconds to continue")
+
+
+# -- log and messages --------------------------------------------------------------------------------------------------
+
+
+def _prepare_log(args: argparse.Namespace, iteration: int) -> Path | None:
+    """The log to append to: empty for a fresh run, cut to the first `iteration` steps for a resumed one."""
+    if args.log and os.path.isfile(args.log):  # devices and pipes cannot be cut
+        if args.resume:
+            _cut_log(args.log, iteration)
+        else:
+            open(args.log, "w").close()
+    return Path(args.log) if args.log else None
+
+
+def _cut_log(path: str, iteration: int) -> None:
+    """Removes the records of steps from `iteration` on, which a killed run wrote after its last save and which will be
+    repeated, and an incomplete last line. Other lines stay. The file is replaced whole or not at all."""
+    with open(path, "rb") as stream:
+        lines = stream.read().splitlines(keepends=True)
+    kept = b"".join(line for line in lines if line.endswith(b"\n") and not _is_step_from(line, iteration))
+    if len(kept) < sum(map(len, lines)):
+        write_bytes(path, kept, overwrite=True)
+
+
+def _is_step_from(line: bytes, iteration: int) -> bool:
+    try:
+        record = json.loads(line)
+    except ValueError:
+        return False
+    return isinstance(record, dict) and isinstance(n := record.get("iteration"), int) and n >= iteration
 
 
 def _progress(args: argparse.Namespace, trainer: Trainer, console: Console) -> TrainingProgress:
@@ -179,8 +240,8 @@ def _progress(args: argparse.Namespace, trainer: Trainer, console: Console) -> T
     return progress
 
 
-def _announce(args: argparse.Namespace, trainer: Trainer, console: Console) -> None:
-    """What is about to be trained, on what."""
+def _announce(trainer: Trainer, console: Console) -> None:
+    """Says what is trained, on which views, where and how long."""
     from pd4dgs_codec.train import workers
 
     config, dataset = trainer.config, trainer.dataset
@@ -188,25 +249,17 @@ def _announce(args: argparse.Namespace, trainer: Trainer, console: Console) -> N
     held_out = f"{len(dataset.test)} held out" if dataset.test else "none held out"
     start = f", from step {trainer.iteration}" if trainer.iteration else ""
     several = f", {workers.count()} workers" if workers.count() > 1 else ""
+    device = trainer.learner.device
     console.message(
-        f"training {config.preset} on {len(dataset.train)} views ({held_out}), {trainer.learner.device}{several}{limit}"
-        f"{start}"
+        f"training {config.preset} on {len(dataset.train)} views ({held_out}), {device}{several}{limit}{start}"
     )
     for remark in dataset.remarks():
         console.message(f"note: {remark}")
     console.detail(f"{config}")
 
 
-def _fresh_config(args: argparse.Namespace) -> TrainConfig:
-    from pd4dgs_codec.train.config import TrainConfig, at_quality
-
-    dial = {} if args.quality is None else at_quality(args.quality)
-    named = dial | {name: getattr(args, name) for name in (*FIXED, "max_seconds") if getattr(args, name) is not None}
-    return TrainConfig(source=args.source, **named | ablated(args))
-
-
 def _device(name: str, console: Console) -> str:
-    """Where to train. auto is CUDA only where PyTorch finds a GPU and gsplat can draw on it."""
+    """Where to train. auto is CUDA if PyTorch finds a GPU and gsplat can render on it, else the CPU."""
     import torch
 
     if name == "cpu" or (name == "auto" and not torch.cuda.is_available()):
@@ -234,7 +287,7 @@ def _summary(args: argparse.Namespace, trainer: Trainer) -> dict[str, Any]:
         "preset": trainer.config.preset,
         "device": str(learner.device),
         "iterations": trainer.iteration,
-        "total": 0 if trainer.timed else trainer.total,  # 0: time ends the run, not a number of steps
+        "total": 0 if trainer.timed else trainer.total,  # 0: the run ends by time
         "finished": trainer.finished,
         "interrupted": trainer.interrupted,
         "seconds": round(trainer.seconds, 3),
@@ -253,13 +306,13 @@ def _text(result: dict[str, Any]) -> str:
     steps = f"{result['iterations']}{end} steps in {result['seconds']:.0f} s"
     lines = [f"{result['output']}: {steps}, {result['anchors']} anchors"]
     if result["phases_not_reached"]:
-        lines.append(f"never reached: {', '.join(result['phases_not_reached'])}")
+        lines.append(f"phases not reached: {', '.join(result['phases_not_reached'])}")
     if not result["finished"]:
-        lines.append(f"not finished: --resume {result['output']} goes on from here")
+        lines.append(f"not finished: --resume {result['output']} continues from here")
     if result["skipped"]:
         lines.append(f"{result['skipped']} steps skipped: their gradient was not finite")
     for row in result["left_out"]:
-        gain = f"{row['gain']:+.2f} dB over level {row['level'] - 1} on {row['views']} views kept back"
+        gain = f"{row['gain']:+.2f} dB over level {row['level'] - 1} on {row['views']} held-back views"
         lines.append(f"level {row['level']} left out: {gain}")
     if result["levels"]:
         split = "held-out" if result["split"] == "test" else "training-view"

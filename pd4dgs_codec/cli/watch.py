@@ -1,7 +1,7 @@
 """`pd4dgs-train --view`: the scene in the browser while it trains, served by viser.
 
-Pictures are drawn between two steps, in the trainer's own thread, so that none shows half an update. While nobody looks
-a step costs one look at an empty table.
+Frames are rendered between two steps, in the trainer's own thread, so that none shows half an update. Without a viewer
+a step costs one look-up in an empty table.
 """
 
 from __future__ import annotations
@@ -22,20 +22,20 @@ from pd4dgs_codec.scene import Camera
 if TYPE_CHECKING:
     from pd4dgs_codec.train.loop import Trainer
 
-#: On this machine alone: what trains is nobody else's business.
+#: Only this machine can see the page.
 HOST = "127.0.0.1"
-#: Pixels of the longer side of a picture, while the camera moves and once it rests.
+#: Pixels of the longer side of a frame, while the camera moves and when it rests.
 MOVING_PIXELS, RESTING_PIXELS = 320, 640
-#: Drawing takes at most this share of the time, however many look on.
+#: Rendering takes at most this share of the time, for any number of viewers.
 SHARE = 0.25
-#: Seconds between two pictures for an eye that rests.
+#: Seconds between two frames of a resting camera.
 REFRESH = 2.0
 LEVELS = 3
 
 
 @dataclass
 class _Shown:
-    """What a browser was sent last: the camera's numbers, level and time, whether in full size, and when."""
+    """The last frame sent to a browser: its camera, level and time; whether it had full size; when it was sent."""
 
     what: tuple[Any, ...] = ()
     full: bool = False
@@ -43,10 +43,10 @@ class _Shown:
 
 
 class WatchedProgress(TrainingProgress):
-    """The terminal's progress, and a page with pictures of the scene from wherever its viewers stand."""
+    """The terminal's progress, and a page that shows the scene from the cameras of its viewers."""
 
     def __init__(self, trainer: Trainer, port: int) -> None:
-        """Raises TrainError where viser is missing or the port cannot be had."""
+        """Raises TrainError if viser is not installed or the port cannot be used."""
         super().__init__()
         try:
             import viser
@@ -55,7 +55,7 @@ class WatchedProgress(TrainingProgress):
                 "--view needs the package viser, which is not installed: pip install 'pd4dgs-codec[watch]'"
             ) from None
         try:
-            with contextlib.redirect_stdout(io.StringIO()):  # its banner; stdout is for what was asked for
+            with contextlib.redirect_stdout(io.StringIO()):  # viser prints a banner; stdout is for results
                 self.server = viser.ViserServer(host=HOST, port=port, label="pd4dgs-train", verbose=False)
         except (OSError, RuntimeError) as error:
             raise TrainError(f"--view {port}: cannot listen on this port: {error}") from None
@@ -97,13 +97,13 @@ class WatchedProgress(TrainingProgress):
         self._shown = {key: shown for key, shown in self._shown.items() if key in clients}
 
     def close(self) -> None:
-        """Takes the bar away and the page down."""
+        """Removes the bar and closes the page."""
         super().close()
         with contextlib.redirect_stdout(io.StringIO()):
             self.server.stop()
 
     def _tell(self, trainer: Trainer, record: dict[str, Any]) -> None:
-        """How far it is, and the curve of quality where it has a new point."""
+        """Shows the progress, and the PSNR curve if it has a new point."""
         loss = record.get("loss", float("nan"))
         total = f" of {trainer.total}" if trainer.total and not trainer.timed else ""
         lines = (f"step {trainer.iteration}{total}, {trainer.seconds:.0f} s", f"loss {loss:.4f}")
@@ -126,7 +126,7 @@ class WatchedProgress(TrainingProgress):
             self.curve.data = (steps, *psnr)
 
     def _show(self, trainer: Trainer, key: int, client: Any) -> None:
-        """Draws for one browser, small at once where it moved, else in full now and then."""
+        """Renders for one browser: small at once if its camera moved, otherwise in full size every REFRESH seconds."""
         from pd4dgs_codec.model.picture import render_image
         from pd4dgs_codec.quality.image import to_uint8
 
@@ -146,8 +146,8 @@ class WatchedProgress(TrainingProgress):
 
 
 def camera_of(wxyz: Any, position: Any, fov: float, aspect: float, pixels: int) -> Camera:
-    """A browser's camera: rotation camera to world as a quaternion, OpenCV axes; fov: vertical, radians; aspect: width
-    over height; pixels: of the longer side."""
+    """A browser's camera. wxyz: camera-to-world rotation as a quaternion, OpenCV axes; fov: vertical, radians; aspect:
+    width over height; pixels: of the longer side."""
     rotation = rotation_matrix(np.asarray(wxyz) / max(float(np.linalg.norm(wxyz)), 1e-12))
     viewmat = world_to_camera(rotation.T, np.asarray(position, np.float64))
     width, height = (

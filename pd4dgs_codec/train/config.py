@@ -74,10 +74,11 @@ class Option:
         limited = self.choices or max(self.least, self.above) > -math.inf
         if value is None or not limited:
             return
-        if value not in self.choices if self.choices else not self._contains(value):
+        if value not in self.choices if self.choices else not self.contains(value):
             raise TrainError(f"{name} must be {self.range}, found {value}")
 
-    def _contains(self, value: float) -> bool:
+    def contains(self, value: float) -> bool:
+        """Whether a number is finite and within the range."""
         return self.least <= value <= self.most and value > self.above and math.isfinite(value)
 
 
@@ -120,9 +121,23 @@ class TrainConfig:
     preset: str = option("small", help="model size", choices=tuple(DEFAULT_ITERATIONS), fixed=True)
     source: str = ""  #: what `data.load` was given; stored so that a resumed run reads the same data
     feature_width: int = option(
-        32, help="numbers of an anchor's feature", metavar="N", least=1, most=MAX_FEATURE, before=32, fixed=True
+        32,
+        help=f"numbers of an anchor's feature, 1 to {MAX_FEATURE}",
+        metavar="N",
+        least=1,
+        most=MAX_FEATURE,
+        before=32,
+        fixed=True,
     )
-    slots: int = option(10, help="Gaussians of an anchor", metavar="N", least=1, most=MAX_SLOTS, before=10, fixed=True)
+    slots: int = option(
+        10,
+        help=f"Gaussians of an anchor, 1 to {MAX_SLOTS}",
+        metavar="N",
+        least=1,
+        most=MAX_SLOTS,
+        before=10,
+        fixed=True,
+    )
     downscale: int = option(1, fixed=True)
     holdout: int = option(8, fixed=True)
     #: None: the preset's default, or by the clock if there is a time limit

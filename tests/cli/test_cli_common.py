@@ -11,7 +11,7 @@ import pytest
 
 from pd4dgs_codec import FORMAT_VERSION, io
 from pd4dgs_codec import __main__ as dispatcher
-from pd4dgs_codec.cli import common, values
+from pd4dgs_codec.cli import common, options
 
 VERBS = (
     "prepare", "train", "encode", "decode", "info", "render", "eval", "bench", "package", "serve", "view", "batch",
@@ -120,7 +120,7 @@ def test_help_and_usage_errors_load_no_heavy_module():
 
 
 def test_rates_are_bits_per_second():
-    assert values.rates("500k,2M,1G,64") == {"500k": 5e5, "2M": 2e6, "1G": 1e9, "64": 64.0}
+    assert options.rates("500k,2M,1G,64") == {"500k": 5e5, "2M": 2e6, "1G": 1e9, "64": 64.0}
 
 
 def test_table_aligns_numbers_right():

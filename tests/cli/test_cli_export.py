@@ -50,7 +50,7 @@ def test_the_cost_is_printed(cli, scene_pd4, shared_dataset, tmp_path):
     cost = result.json["cost"]
     assert cost["views"] == 1 and all(0 < cost[key] < 100 for key in cost)
     told = cli(*command, "-o", tmp_path / "b.ply", "--compare", shared_dataset)
-    assert "1 held-out views" in told.err and "dB drawn directly" in told.err
+    assert "1 held-out views" in told.err and "dB rendered directly" in told.err
 
 
 @pytest.mark.parametrize("kind", ["glb", "spz", "4dgs"])
@@ -67,8 +67,8 @@ def test_other_kinds(cli, scene_pd4, tmp_path, kind):
 @pytest.mark.parametrize(
     "options, message",
     [
-        (("--to", "ply-seq", "--time", 0.5), "--time chooses one instant"),
-        (("--to", "ply", "--fps", 5), "--fps is of sequences"),
+        (("--to", "ply-seq", "--time", 0.5), "found --time with --to ply-seq"),
+        (("--to", "ply", "--fps", 5), "found --fps with --to ply"),
         (("--to", "ply", "--time", 1.5), "expected a number from 0 to 1"),
         (
             (

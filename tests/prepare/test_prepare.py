@@ -91,7 +91,7 @@ def test_the_report_says_what_was_found(prepared):
 def test_an_interruption_says_how_to_go_on(room, tmp_path, monkeypatch, capsys):
     monkeypatch.setattr(poses, "extract", _interrupted)
     assert main([str(room[0]), "-o", str(tmp_path / "out")]) == 1
-    line = f"interrupted; the same command goes on from {tmp_path / 'out'}.partial"
+    line = f"interrupted; the same command resumes from {tmp_path / 'out'}.partial"
     assert capsys.readouterr().err.splitlines()[-1].endswith(line)
 
 

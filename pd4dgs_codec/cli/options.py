@@ -1,0 +1,180 @@
+"""Options of the commands: the parser that they share, and types that turn text into values.
+
+A type returns the value or raises one line that says what was found and what was expected.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import math
+from collections.abc import Callable
+from typing import Any, NoReturn, TypeVar
+
+from pd4dgs_codec.cli.common import UsageError, tell
+
+T = TypeVar("T")
+
+EXIT_CODES = (
+    "exit codes: 0 done, 1 bad data or I/O, 2 wrong usage, 3 cut input decoded as far as possible (--allow-partial)"
+)
+SOURCES = """\
+SOURCE is one of
+  a folder in the iPhone/Nerfies layout: camera/, rgb/, splits/ (its split files list the held-out frames)
+  a folder with transforms*.json (Blender, D-NeRF, nerfstudio)
+  a folder with poses_bounds.npy and one video per camera, cam*.mp4 (Neu3D; the first camera is held out)
+  a folder with a COLMAP model in sparse/0 and its images in images/; times.txt may hold their times
+  a folder with such a model and one synchronised video per image in videos/ (the first camera is held out)
+  a folder of Panoptic Studio (train_meta.json, ims/) or an unpacked Record3D recording (metadata, rgbd/)
+  synthetic:static   nothing moves
+  synthetic:global   large objects move slowly
+  synthetic:local    the same, and small parts move on their own
+  synthetic:fast     quick motion
+  (synthetic:NAME?seed=n is another scene of that kind; &size=WxH and &frames=N set the size and number of its
+  images, by default 160x120 and 60)
+  teacher:PATH       images rendered from explicit Gaussians: a folder of .ply or .spz files, one per frame, one such
+                     file, a .4dgs file, a gsplat checkpoint, or module:function (time -> Gaussians)
+  (teacher:PATH?cameras=SOURCE takes the cameras, times and held-out images of another source;
+  otherwise ?views=N&size=WxH&fps=F&background=white&up=X,Y,Z)"""
+
+
+class Parser(argparse.ArgumentParser):
+    """argparse with one-line usage errors, no abbreviated options, and the common options."""
+
+    def __init__(self, verb: str, usage: str, summary: str, details: str):
+        super().__init__(
+            prog=f"pd4dgs-{verb}",
+            usage=" ".join(part for part in (f"pd4dgs-{verb}", usage, "[options]") if part),
+            description=summary,
+            epilog=f"{details}\n\n{EXIT_CODES}",
+            formatter_class=argparse.RawDescriptionHelpFormatter,
+            allow_abbrev=False,
+            add_help=False,
+        )
+
+    def error(self, message: str) -> NoReturn:
+        raise UsageError(message)
+
+    def print_help(self, file: object = None) -> NoReturn:
+        """Prints the help on stdout and exits: 0, or 1 if stdout cannot be written."""
+        self.exit(tell(self.prog, self.format_help().rstrip("\n")))
+
+    def add_common(self, *, json_file: bool = False) -> None:
+        """Adds the options of every command. json_file: --json may name a file; args.json is then its name or "-"."""
+        group = self.add_argument_group("common options")
+        add = group.add_argument
+        add("-h", "--help", action="help", help="show this help and exit")
+        add("--version", action=_Version, nargs=0, help="show the version and exit")
+        if json_file:
+            what = "write one JSON object to FILE; without FILE, to stdout and nothing else there"
+            add("--json", nargs="?", const="-", metavar="FILE", help=what)
+        else:
+            add("--json", action="store_true", help="print one JSON object on stdout and nothing else there")
+        add("-v", "--verbose", action="store_true", help="print more on stderr")
+        add("-j", "--threads", type=positive_int, metavar="N", help="CPU threads (default: all cores)")
+        add("-f", "--overwrite", action="store_true", help="replace existing outputs")
+
+
+def add_reading(options: argparse._ActionsContainer, *, defaults: bool = True) -> None:
+    """How a dataset is read: --downscale and --holdout. defaults: False for None where an option is not given."""
+    add, (downscale, holdout) = options.add_argument, (1, 8) if defaults else (None, None)
+    add("--downscale", type=positive_int, default=downscale, metavar="K", help="use images at 1/K size (default: 1)")
+    what = "hold out frames with i %% K == K/2 if there are no split files (default: 8; 0: none)"
+    add("--holdout", type=count, default=holdout, metavar="K", help=what)
+
+
+def add_max_layer(options: argparse._ActionsContainer, what: str) -> None:
+    """--max-layer, whose help is `what`."""
+    options.add_argument("--max-layer", type=int, choices=(0, 1, 2), help=what)
+
+
+class _Version(argparse.Action):
+    """Prints the release and the format version. A plain "version" action would import the codec for every --help."""
+
+    def __call__(self, parser: argparse.ArgumentParser, *_: Any) -> NoReturn:
+        parser.exit(tell(parser.prog, version_line(parser.prog)))
+
+
+def version_line(prog: str) -> str:
+    """The program's release and the version of the format that it writes."""
+    from pd4dgs_codec import FORMAT_VERSION, __version__
+
+    return f"{prog} {__version__}, format {FORMAT_VERSION}"
+
+
+# -- types -------------------------------------------------------------------------------------------------------------
+
+
+def checked(kind: Callable[[str], T], accept: Callable[[T], bool], expected: str) -> Callable[[str], T]:
+    """The type of an option whose text `kind` converts and whose value `accept` allows."""
+
+    def read(text: str) -> T:
+        with contextlib.suppress(ValueError):
+            if accept(value := kind(text)):
+                return value
+        raise argparse.ArgumentTypeError(f"found {text!r}, expected {expected}")
+
+    return read
+
+
+positive_int = checked(int, lambda value: value >= 1, "an integer >= 1")
+count = checked(int, lambda value: value >= 0, "an integer >= 0")
+port = checked(int, lambda value: 0 <= value < 65536, "an integer from 0 to 65535")
+#: Seeds that torch's generators take; the trainer also uses the next one.
+seed = checked(int, lambda value: 0 <= value <= 2**63 - 2, "an integer from 0 to 2^63 - 2")
+positive_float = checked(float, lambda value: 0 < value < math.inf, "a number > 0")
+non_negative_float = checked(float, lambda value: 0 <= value < math.inf, "a number >= 0")
+share = checked(float, lambda value: 0 <= value <= 1, "a number from 0 to 1")
+finite_float = checked(float, math.isfinite, "a number")
+
+
+def listed(kind: Callable[[str], T]) -> Callable[[str], tuple[T, ...]]:
+    """The type of comma-separated values of a kind: without repetitions, in the order given."""
+    return lambda text: tuple(dict.fromkeys(kind(part) for part in text.split(",")))
+
+
+def one_of(*names: str) -> Callable[[str], str]:
+    """The type of a name within a list; a single name uses argparse's choices."""
+    return checked(str, lambda text: text in names, f"one of {', '.join(names)}")
+
+
+def rate(text: str) -> float:
+    """A link rate in bits per second with k, M or G for 1e3, 1e6, 1e9: "2M" -> 2e6."""
+    return _scaled(text, {"k": 1e3, "M": 1e6, "G": 1e9}, "a rate in bits per second such as 2M or 500k")
+
+
+def rates(text: str) -> dict[str, float]:
+    """Comma-separated link rates: "2M,10M" -> {"2M": 2e6, "10M": 1e7}."""
+    return {name: rate(name) for name in text.split(",")}
+
+
+def duration(text: str) -> float:
+    """Seconds: "50ms", "1.5s" or "1.5"."""
+    return _scaled(text, {"ms": 1e-3, "s": 1.0}, "a time such as 50ms or 1.5s", low=0.0)
+
+
+def size(text: str, expected: str = "a size in bytes such as 50k") -> int:
+    """Bytes with k, M for 1e3, 1e6: "50k" -> 50000."""
+    return int(_scaled(text, {"k": 1e3, "M": 1e6}, expected, low=1.0))
+
+
+def layer_sizes(text: str) -> dict[int, int]:
+    """Bytes by layer with k, M for 1e3, 1e6: "L0=425k,L1=80000" -> {0: 425000, 1: 80000}."""
+    layers, expected = {"L0": 0, "L1": 1, "L2": 2}, "sizes in bytes such as L0=425k,L1=120000"
+    sizes: dict[int, int] = {}
+    for part in text.split(","):
+        name, _, number = part.partition("=")
+        if name not in layers or layers[name] in sizes:
+            raise argparse.ArgumentTypeError(f"found {text!r}, expected {expected}, each layer once")
+        sizes[layers[name]] = size(number, expected)
+    return sizes
+
+
+def _scaled(text: str, units: dict[str, float], expected: str, low: float = math.ulp(0.0)) -> float:
+    """A finite number >= low times its unit."""
+    unit = next((unit for unit in units if text.endswith(unit)), "")
+    with contextlib.suppress(ValueError):
+        value = float(text.removesuffix(unit)) * units.get(unit, 1.0)
+        if low <= value < math.inf:
+            return value
+    raise argparse.ArgumentTypeError(f"found {text!r}, expected {expected}")
