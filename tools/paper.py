@@ -46,8 +46,8 @@ def main(argv: list[str] | None = None) -> int:
     configure()
     from pages.paper.tables import TABLES
 
-    from pd4dgs_codec.cli.progress import TrainingProgress
     from pd4dgs_codec.cli.options import positive_int
+    from pd4dgs_codec.cli.progress import TrainingProgress
     from pd4dgs_codec.errors import Pd4Error
 
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
