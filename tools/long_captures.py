@@ -43,7 +43,7 @@ WAYS = {"whole": None, "segments, shared scaffold": "first", "segments, each on 
 def capture(name: str, folder: Path) -> tuple[dict[str, Any], list[dict[str, Any]], np.ndarray, Truth | None]:
     """(what holds for all frames, frames in their order, initial points) of a capture as a transforms.json has them,
     and the scene itself."""
-    from pd4dgs_codec.data.ply import read_ply
+    from pd4dgs_codec.data.files import read_ply
 
     if name == "synthetic-60s":
         return _synthetic(folder)
@@ -61,7 +61,7 @@ def _synthetic(folder: Path) -> tuple[dict[str, Any], list[dict[str, Any]], np.n
 
     from pd4dgs_codec.data import synthetic
     from pd4dgs_codec.data.dataset import load
-    from pd4dgs_codec.data.scenes import SceneBuilder
+    from pd4dgs_codec.data.synthetic import SceneBuilder
 
     bodies, frames, count = SceneBuilder("local", 0).bodies(), [], 180
     folder.mkdir(parents=True, exist_ok=True)

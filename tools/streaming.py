@@ -18,7 +18,7 @@ import numpy as np
 import torch
 from imageio_ffmpeg import get_ffmpeg_exe
 
-from pd4dgs_codec.data import frame_cache
+from pd4dgs_codec.data import videos
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.train.shot import Shots
 
@@ -35,8 +35,8 @@ def main(frames: int, size: str) -> None:
     width, height = map(int, size.split("x"))
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        os.environ[frame_cache.FOLDER] = str(folder / "cache")
-        os.environ[frame_cache.SIZE] = "2.5"
+        os.environ[videos.FOLDER] = str(folder / "cache")
+        os.environ[videos.SIZE] = "2.5"
         for camera in range(2):  # the first is held out and is short work: its frames are all the same
             source = f"testsrc2=size={size}:rate={FPS}" if camera else f"color=gray:size={size}:rate={FPS}"
             command = [get_ffmpeg_exe(), "-v", "error", "-f", "lavfi", "-i", source, "-frames:v", str(frames)]

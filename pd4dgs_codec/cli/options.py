@@ -12,20 +12,17 @@ from collections.abc import Callable
 from typing import Any, NoReturn, TypeVar
 
 from pd4dgs_codec.cli.common import UsageError, tell
+from pd4dgs_codec.data.dataset import FOLDERS
 
 T = TypeVar("T")
 
 EXIT_CODES = (
     "exit codes: 0 done, 1 bad data or I/O, 2 wrong usage, 3 cut input decoded as far as possible (--allow-partial)"
 )
-SOURCES = """\
-SOURCE is one of
-  a folder in the iPhone/Nerfies layout: camera/, rgb/, splits/ (its split files list the held-out frames)
-  a folder with transforms*.json (Blender, D-NeRF, nerfstudio)
-  a folder with poses_bounds.npy and one video per camera, cam*.mp4 (Neu3D; the first camera is held out)
-  a folder with a COLMAP model in sparse/0 and its images in images/; times.txt may hold their times
-  a folder with such a model and one synchronised video per image in videos/ (the first camera is held out)
-  a folder of Panoptic Studio (train_meta.json, ims/) or an unpacked Record3D recording (metadata, rgbd/)
+SOURCES = (
+    "SOURCE is one of\n  "
+    + "\n  ".join(FOLDERS)
+    + """
   synthetic:static   nothing moves
   synthetic:global   large objects move slowly
   synthetic:local    the same, and small parts move on their own
@@ -36,6 +33,7 @@ SOURCE is one of
                      file, a .4dgs file, a gsplat checkpoint, or module:function (time -> Gaussians)
   (teacher:PATH?cameras=SOURCE takes the cameras, times and held-out images of another source;
   otherwise ?views=N&size=WxH&fps=F&background=white&up=X,Y,Z)"""
+)
 
 
 class Parser(argparse.ArgumentParser):

@@ -186,9 +186,9 @@ def _expect_same(path: str, what: str, stored: Any, asked: Any) -> None:
 
 
 def _same_source(source: str) -> str:
-    from pd4dgs_codec.data.synthetic import PREFIX
+    from pd4dgs_codec.data.dataset import SYNTHETIC
 
-    return source if source.startswith(PREFIX) else str(Path(source).resolve())
+    return source if source.startswith(SYNTHETIC) else str(Path(source).resolve())
 
 
 def _check_time_left(trainer: Trainer, path: str) -> None:

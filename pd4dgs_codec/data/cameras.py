@@ -1,4 +1,4 @@
-"""Lenses and poses as files describe them, and the geometry every reader shares."""
+"""Lenses and poses as files describe them, removal of lens distortion, and a frame read as a View."""
 
 from __future__ import annotations
 
@@ -13,22 +13,20 @@ from pd4dgs_codec.data.files import check_downscale, read_image, shrink_image, s
 from pd4dgs_codec.data.view import View
 from pd4dgs_codec.errors import DataError
 
-#: Largest |R Rᵀ - I| of a pose that still counts as a rotation (files round to 3 or more decimals).
-ROTATION_TOLERANCE = 1e-3
-#: Quaternions are unit to this.
-UNIT_TOLERANCE = 1e-3
-#: Of binary32, in which files hold the first and the last time; and by what share of itself a span may change there.
-LARGEST_TIME, SPAN_TOLERANCE = float(np.finfo(np.float32).max), 1e-3
-#: Angles at which it is looked where a fisheye's polynomial turns back.
+#: Largest |R Rᵀ - I| of a rotation, and | |q| - 1 | of a quaternion: files round to 3 or more decimals.
+ROTATION_TOLERANCE = UNIT_TOLERANCE = 1e-3
+#: OpenGL's camera looks along -z with y up; OpenCV's along +z with y down.
+OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0])
+#: Samples of a fisheye's polynomial, to find the angle where it turns back.
 FISHEYE_STEPS = 1000
-#: Half side of D-NeRF's box of initial points (1.3) over the distance of its cameras (4).
-BOX_OVER_DISTANCE = 1.3 / 4.0
 
 
 @dataclass(frozen=True)
 class Lens:
-    """Intrinsics in pixels of the stored image; pixel centres at +0.5; OpenCV distortion k1 k2 k3 and p1 p2, or, if
-    fisheye is given, OpenCV's fisheye with its k1 k2 k3 k4."""
+    """Intrinsics in pixels of the stored image, pixel centres at +0.5.
+
+    radial, tangential: OpenCV's k1 k2 k3 and p1 p2. fisheye: k1 k2 k3 k4 of OpenCV's fisheye model instead.
+    """
 
     width: int
     height: int
@@ -47,9 +45,16 @@ class Lens:
         return not (self.skew or any(self.radial) or any(self.tangential) or self.fisheye is not None)
 
     def matrix(self, downscale: int = 1) -> np.ndarray:
-        """float32 [3, 3] of the undistorted, downscaled image. With centres at +0.5 all four numbers just divide."""
-        k = np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, downscale]], np.float64) / downscale
-        return k.astype(np.float32)
+        """float32 [3, 3] of the undistorted, downscaled image."""
+        return downscaled_matrix(np.array([[self.fx, 0, self.cx], [0, self.fy, self.cy], [0, 0, 1]]), downscale)
+
+
+def downscaled_matrix(K: np.ndarray, downscale: int) -> np.ndarray:
+    """float32 [3, 3]: the intrinsics of an image 1/downscale as wide and high. As pixel centres lie at +0.5, focal
+    lengths and principal point all divide."""
+    scaled = K.astype(np.float64)
+    scaled[:2] /= downscale
+    return scaled.astype(np.float32)
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,7 +70,7 @@ class UnreadView:
 
 
 def check_rotation(rotation: np.ndarray, where: str) -> None:
-    """Refuse a 3x3 that is not a rotation."""
+    """Raises DataError for a matrix [3, 3] that is not a rotation."""
     error = np.abs(rotation @ rotation.T - np.eye(3)).max()
     determinant = np.linalg.det(rotation)
     if not error <= ROTATION_TOLERANCE or determinant <= 0:
@@ -87,7 +92,7 @@ def rotation_matrix(wxyz: Sequence[float] | np.ndarray) -> np.ndarray:
 
 
 def checked_rotation(wxyz: Sequence[float] | np.ndarray, where: str) -> np.ndarray:
-    """float64 [3, 3] of a quaternion [4] as files hold them. Raises DataError unless it is about unit."""
+    """float64 [3, 3] of a quaternion wxyz [4] from a file. Raises DataError unless its length is about 1."""
     length = float(np.linalg.norm(wxyz))
     if abs(length - 1) > UNIT_TOLERANCE:
         raise DataError(f"{where}: quaternion of length {length:.4g}, expected 1")
@@ -103,8 +108,7 @@ def world_to_camera(rotation: np.ndarray, center: np.ndarray) -> np.ndarray:
 
 
 def distort(x: np.ndarray, y: np.ndarray, lens: Lens) -> tuple[np.ndarray, ...]:
-    """OpenCV's radial-tangential model on normalised coordinates: (xd, yd) and its symmetric
-    Jacobian (xx, xy, yy)."""
+    """OpenCV's radial-tangential model on normalised coordinates: (xd, yd) and its symmetric Jacobian (xx, xy, yy)."""
     (k1, k2, k3), (p1, p2) = lens.radial, lens.tangential
     r = x * x + y * y
     d = 1 + r * (k1 + r * (k2 + r * k3))
@@ -118,14 +122,13 @@ def distort(x: np.ndarray, y: np.ndarray, lens: Lens) -> tuple[np.ndarray, ...]:
 
 
 def distort_fisheye(x: np.ndarray, y: np.ndarray, k: tuple[float, float, float, float]) -> tuple[np.ndarray, ...]:
-    """OpenCV's fisheye on normalised pinhole coordinates: (xd, yd), and where no other point is as far out."""
+    """OpenCV's fisheye model on normalised pinhole coordinates: (xd, yd), and bool where the model is one to one."""
     r = np.hypot(x, y)
     angle = np.arctan(r)
 
     def bent(a: np.ndarray) -> np.ndarray:
         a2 = a * a
-        turned: np.ndarray = a * (1 + a2 * (k[0] + a2 * (k[1] + a2 * (k[2] + a2 * k[3]))))
-        return turned
+        return np.asarray(a * (1 + a2 * (k[0] + a2 * (k[1] + a2 * (k[2] + a2 * k[3])))))
 
     grid = np.linspace(0, np.pi / 2, FISHEYE_STEPS)
     falls = np.flatnonzero(np.diff(bent(grid)) <= 0)
@@ -147,7 +150,7 @@ def undistort(xd: np.ndarray, yd: np.ndarray, lens: Lens, iterations: int = 12) 
 
 @lru_cache(maxsize=8)
 def _warp(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Where each pixel of the ideal pinhole image lies in the stored one (u, v float64 [H, W]) and if it is there.
+    """The place of each ideal pinhole pixel in the stored image (u, v float64 [H, W]), and bool if it is there.
 
     Far off the axis the polynomial folds back and would show the image twice, so a pixel counts as seen only if the
     inverse leads back to it.
@@ -167,7 +170,7 @@ def _warp(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def rectify(image: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
-    """Resample uint8 [H, W, 3] bilinearly to the ideal pinhole; unseen pixels are black and False in the mask."""
+    """Resamples uint8 [H, W, 3] bilinearly to the ideal pinhole, and bool [H, W]: False for unseen pixels, black."""
     u, v, seen = _warp(lens)
     fu, fv = np.where(seen, u, 0.5) - 0.5, np.where(seen, v, 0.5) - 0.5
     u0, v0 = np.minimum(fu.astype(int), lens.width - 2), np.minimum(fv.astype(int), lens.height - 2)
@@ -178,7 +181,7 @@ def rectify(image: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
 
 
 def read_view(frame: UnreadView, time: float, downscale: int, *, composite: bool) -> View:
-    """Read the frame's pixels and make it a View at normalised time `time`."""
+    """The frame with its pixels, undistorted and downscaled. time: normalised."""
     lens, size = frame.lens, (frame.lens.width, frame.lens.height)
     mask = None
     if lens.is_pinhole:
@@ -190,80 +193,3 @@ def read_view(frame: UnreadView, time: float, downscale: int, *, composite: bool
     height, width = image.shape[:2]
     viewmat = frame.viewmat.astype(np.float32)
     return View(viewmat, lens.matrix(downscale), width, height, time, image, mask, frame.name, frame.camera_id)
-
-
-def centers(frames: Sequence[UnreadView]) -> np.ndarray:
-    """Camera centres float64 [n, 3], world."""
-    return np.stack([-f.viewmat[:3, :3].T @ f.viewmat[:3, 3] for f in frames])
-
-
-def mean_up(frames: Sequence[UnreadView]) -> tuple[float, float, float]:
-    """Unit mean of the cameras' up directions (minus OpenCV's y axis)."""
-    up = -np.mean([f.viewmat[1, :3] for f in frames], axis=0)
-    norm = np.linalg.norm(up)
-    x, y, z = up / norm if norm > 1e-6 else (0.0, 0.0, 1.0)
-    return float(x), float(y), float(z)
-
-
-def normalised_times(raw: Sequence[float], where: str) -> tuple[list[float], float, float]:
-    """Times mapped to 0..1 by their least and greatest (all 0 if equal), and those two."""
-    low, high = min(raw), max(raw)
-    if not max(abs(low), abs(high)) <= LARGEST_TIME:
-        raise DataError(f"{where}: times from {low:g} to {high:g}, expected at most {LARGEST_TIME:.2g} in magnitude")
-    return [(t - low) / (high - low) if high > low else 0.0 for t in raw], low, high
-
-
-def seconds_range(start: float, stop: float) -> tuple[float, float]:
-    """Seconds at normalised time 0 and 1 of a scene that spans start..stop; (0, 1) if it spans none.
-
-    A span that binary32, as files hold it, would lose behind a large start (the time of day, say) begins at 0 instead.
-    """
-    span = stop - start
-    with np.errstate(over="ignore"):
-        if not np.float32(span) > 0:
-            return 0.0, 1.0
-        kept = float(np.float32(stop)) - float(np.float32(start))
-    return (start, stop) if abs(kept - span) <= SPAN_TOLERANCE * span else (0.0, span)
-
-
-def points_box(points: np.ndarray) -> np.ndarray:
-    """float32 [2, 3]: the 0.5th to the 99.5th percentile of the points, padded by 10 % of the extent on each side.
-
-    The percentiles keep stray triangulations out; the padding makes room for what moves and was not triangulated.
-    """
-    low, high = np.percentile(points.astype(np.float64), [0.5, 99.5], axis=0)
-    pad = np.maximum(0.1 * (high - low), 0.01 * max(float((high - low).max()), 1e-6))
-    return np.stack([low - pad, high + pad]).astype(np.float32)
-
-
-def cameras_box(frames: Sequence[UnreadView], depth: tuple[float, float] | None = None) -> np.ndarray:
-    """float32 [2, 3]: a cube around the point nearest to all optical axes, in the proportion of D-NeRF's.
-
-    Its half side is 1.3/4 of the median distance, or half of far - near if `depth` is known. Nearly parallel axes have
-    no such point; then the cube lies straight ahead.
-    """
-    origins, axes = centers(frames), np.stack([f.viewmat[2, :3] for f in frames])
-    normal = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    total = normal.sum(axis=0)
-    if np.linalg.eigvalsh(total)[0] > 1e-3 * len(frames):
-        middle = np.linalg.solve(total, (normal @ origins[:, :, None]).sum(axis=0)[:, 0])
-    else:
-        ahead = sum(depth) / 2 if depth else max(4.0 * float(np.ptp(origins, axis=0).max()), 1.0)
-        middle = origins.mean(axis=0) + ahead * axes.mean(axis=0)
-    distance = float(np.median(np.linalg.norm(origins - middle, axis=1)))
-    half = (depth[1] - depth[0]) / 2 if depth else BOX_OVER_DISTANCE * distance
-    return np.stack([middle - half, middle + half]).astype(np.float32)
-
-
-def depth_range(views: Sequence[np.ndarray], box: np.ndarray, points: np.ndarray | None) -> tuple[float, float]:
-    """(near, far) of cameras, world-to-camera matrices [4, 4]: half the nearest and 1.5 times the farthest depth of the
-    points, else of the box's corners."""
-    if points is None or not len(points):
-        points = np.stack(np.meshgrid(*box.T.astype(np.float64)), axis=-1).reshape(-1, 3)
-    axes = np.stack([view[2] for view in views])
-    depths = points[:: max(1, len(points) // 2000)] @ axes[:, :3].T + axes[:, 3]
-    ahead = depths[depths > 0]
-    if not len(ahead):
-        return 0.01, 100.0
-    near, far = np.percentile(ahead, [0.5, 99.5])
-    return float(0.5 * near), float(1.5 * far)

@@ -1,136 +1,147 @@
-"""Folders with a model of COLMAP, binary or text: `sparse/0`, `sparse`, `colmap/sparse/0` or the folder itself.
+"""Folders with a COLMAP model, binary or text, and pictures or one synchronised video per picture.
 
-Poses are world to camera with OpenCV axes, pixel centres at +0.5, as ours. The pictures are in `images/`, else beside
-the model. `times.txt`, a line `NAME SECONDS` per picture, says when each was taken; without it the last number in a
-name does, and where none has one, their order.
+Poses are world to camera with OpenCV axes, pixel centres at +0.5. Pictures are in `images/`, else in the folder itself;
+videos, named as the pictures of the model (`cam00.png` and `cam00.mp4`), in `videos/`, else in the folder itself.
+`times.txt`, a line `NAME SECONDS` per picture, gives their times; without it the last number in a name does, else their
+order.
 """
 
 from __future__ import annotations
 
 import re
 import struct
-from dataclasses import dataclass
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.data.cameras import LARGEST_TIME, Lens, UnreadView, checked_rotation, world_to_camera
+from pd4dgs_codec.data.cameras import Lens, UnreadView, checked_rotation, world_to_camera
+from pd4dgs_codec.data.dataset import COLMAP
 from pd4dgs_codec.data.files import LARGEST, number, read_file
-from pd4dgs_codec.data.posed import held_out, posed_dataset
+from pd4dgs_codec.data.posed import LARGEST_TIME, held_out, posed_dataset
+from pd4dgs_codec.data.videos import synchronised_dataset, video_size
 from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.errors import DataError
 
-PLACES = ("sparse/0", "sparse", "colmap/sparse/0", ".")
-#: Number in binary files -> name, and the names of the parameters.
+#: Camera models in the order of their numbers in binary files, with the names of their parameters.
 MODELS = {
-    0: ("SIMPLE_PINHOLE", ("f", "cx", "cy")),
-    1: ("PINHOLE", ("fx", "fy", "cx", "cy")),
-    2: ("SIMPLE_RADIAL", ("f", "cx", "cy", "k1")),
-    3: ("RADIAL", ("f", "cx", "cy", "k1", "k2")),
-    4: ("OPENCV", ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
-    5: ("OPENCV_FISHEYE", ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")),
+    "SIMPLE_PINHOLE": ("f", "cx", "cy"),
+    "PINHOLE": ("fx", "fy", "cx", "cy"),
+    "SIMPLE_RADIAL": ("f", "cx", "cy", "k1"),
+    "RADIAL": ("f", "cx", "cy", "k1", "k2"),
+    "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
+    "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
-PARAMETERS = dict(MODELS.values())
 MAX_SIDE = 65535
+VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".MP4", ".MOV")
 
 
 @dataclass(frozen=True)
 class Image:
-    """A posed picture: quaternion wxyz and translation of world to camera."""
+    """A registered picture. pose: the quaternion wxyz and translation of world to camera."""
 
     name: str
     camera: int
     pose: tuple[float, ...]
 
 
-def find_model(folder: Path) -> tuple[Path, str] | None:
-    """(the model's folder, ".bin" or ".txt") of a folder that has one."""
-    for place in PLACES:
-        for suffix in (".bin", ".txt"):
-            if all((folder / place / f"{name}{suffix}").is_file() for name in ("cameras", "images")):
-                return folder / place, suffix
-    return None
-
-
-def read_colmap(folder: Path, model: Path, suffix: str, downscale: int, holdout: int) -> Dataset:
-    """Read a folder with a model of COLMAP, see `find_model` and `dataset.load`."""
-    listed, points, colors = registered(model, suffix)
+def read_colmap(folder: Path, downscale: int, holdout: int) -> Dataset:
+    """Reads a folder with a COLMAP model (see `dataset.load`). Of videos the first camera is held out."""
+    places = ((folder / place, kind) for place in COLMAP for kind in (".bin", ".txt"))
+    model, kind = next((p, k) for p, k in places if all((p / f"{n}{k}").exists() for n in ("cameras", "images")))
+    cameras, points, colors = _registered(model, kind)
+    if videos := _videos(folder):
+        rig = [_with_video(model, camera, videos, i) for i, camera in enumerate(cameras)]
+        twice = next((c.name for i, c in enumerate(rig) if any(c.image == d.image for d in rig[:i])), None)
+        if twice is not None:
+            raise DataError(f"{model}: two pictures are of the video {twice}, expected one per camera")
+        return synchronised_dataset(folder, rig, points, colors, downscale, holdout)
     pictures = folder / "images" if (folder / "images").is_dir() else folder
-    times = _times(folder, [image.name for image, _, _ in listed])
+    times = _times(folder, [camera.name for camera in cameras])
     frames = []
-    for (image, viewmat, lens), time in zip(listed, times, strict=True):
-        path = pictures / image.name
+    for camera, time in zip(cameras, times, strict=True):
+        path = pictures / camera.image
         if pictures.resolve() not in path.resolve().parents or not path.is_file():
-            raise DataError(f"{model / f'images{suffix}'}: {image.name}: there is no such picture in {pictures}")
-        frames.append(UnreadView(Path(image.name).stem, image.camera, time, viewmat, lens, path))
+            raise DataError(f"{model / f'images{kind}'}: {camera.name}: there is no such picture in {pictures}")
+        frames.append(replace(camera, name=camera.image.stem, time=time, image=path))
     return posed_dataset(folder, *held_out(frames, holdout), points, colors, downscale)
 
 
-def registered(
-    model: Path, suffix: str
-) -> tuple[list[tuple[Image, np.ndarray, Lens]], np.ndarray | None, np.ndarray | None]:
-    """The pictures of a model by name, each with its pose (float64 [4, 4] world to camera) and lens; points float32
-    [M, 3] and colours uint8 [M, 3], or None."""
-    read = _Binary if suffix == ".bin" else _Text
-    lenses = read(model / f"cameras{suffix}").cameras()
-    images = sorted(read(model / f"images{suffix}").images(), key=lambda image: image.name)
+def _videos(folder: Path) -> dict[str, Path]:
+    """Videos by name without suffix, in videos/ or in the folder itself; none if it has images/ instead."""
+    if (folder / "images").is_dir() and not (folder / "videos").is_dir():
+        return {}
+    place = folder / "videos" if (folder / "videos").is_dir() else folder
+    return {file.stem: file for file in sorted(place.iterdir()) if file.suffix in VIDEOS}
+
+
+def _with_video(model: Path, camera: UnreadView, videos: dict[str, Path], i: int) -> UnreadView:
+    video = videos.get(camera.image.stem) or videos.get(camera.image.parts[0])
+    if video is None:
+        where = f"{model}: {camera.name}"
+        raise DataError(f"{where}: there is no video of this name among {len(videos)}, expected one per picture")
+    size, lens = video_size(video), camera.lens
+    if size != (lens.width, lens.height):
+        found = f"is {size[0]}x{size[1]}, and its camera in {model} {lens.width}x{lens.height}"
+        raise DataError(f"{video}: {found}, expected the same size")
+    return replace(camera, name=video.stem, camera_id=i, image=video)
+
+
+def _registered(model: Path, kind: str) -> tuple[list[UnreadView], np.ndarray | None, np.ndarray | None]:
+    """The pictures of a model by name, each with its name in the model as `image` and time 0; points float32 [M, 3]
+    and colours uint8 [M, 3], or None."""
+    read = _Binary if kind == ".bin" else _Text
+    lenses = dict(read(model / f"cameras{kind}").cameras())
+    images = sorted(read(model / f"images{kind}").images(), key=lambda image: image.name)
     if not images:
         raise DataError(f"{model}: no picture is registered, expected one at least")
-    listed = []
+    frames = []
     for image in images:
-        where = f"{model / f'images{suffix}'}: {image.name}"
+        where = f"{model / f'images{kind}'}: {image.name}"
         if image.camera not in lenses:
-            raise DataError(f"{where}: taken by camera {image.camera}, which cameras{suffix} does not have")
-        listed.append((image, _viewmat(image, where), lenses[image.camera]))
-    if not (model / f"points3D{suffix}").is_file():
-        return listed, None, None
-    points, colors = read(model / f"points3D{suffix}").points()
-    keep = (np.abs(points) <= LARGEST).all(axis=1)  # also false of NaN
-    return listed, points[keep].astype(np.float32), colors[keep]
-
-
-def _viewmat(image: Image, where: str) -> np.ndarray:
-    """float64 [4, 4] world to camera."""
-    pose = np.array([number(value, f"{where}: pose") for value in image.pose])
-    rotation = checked_rotation(pose[:4], where)
-    return world_to_camera(rotation, -rotation.T @ pose[4:])
+            raise DataError(f"{where}: taken by camera {image.camera}, which cameras{kind} does not have")
+        pose = np.array([number(value, f"{where}: pose") for value in image.pose])
+        rotation = checked_rotation(pose[:4], where)
+        viewmat = world_to_camera(rotation, -rotation.T @ pose[4:])
+        frames.append(UnreadView(image.name, image.camera, 0.0, viewmat, lenses[image.camera], Path(image.name)))
+    if not (model / f"points3D{kind}").is_file():
+        return frames, None, None
+    table = np.array(list(read(model / f"points3D{kind}").points()), np.float64).reshape(-1, 6)
+    table = table[(np.abs(table[:, :3]) <= LARGEST).all(axis=1)]  # also false of NaN
+    colors = np.clip(np.nan_to_num(table[:, 3:]), 0, 255).astype(np.uint8)
+    return frames, table[:, :3].astype(np.float32), colors
 
 
 def _times(folder: Path, names: list[str]) -> list[float]:
-    """When each picture was taken: by times.txt, by the last number in its name, by its place."""
+    """The time of each picture: from times.txt, else the last number in its name, else its place."""
     path = folder / "times.txt"
     if path.is_file():
-        told: dict[str, float] = {}
+        known: dict[str, float] = {}
         for i, line in enumerate(read_file(path).decode("utf-8", "replace").splitlines(), 1):
             if not line.strip():
                 continue
             name, _, text = line.strip().rpartition(" ")
             try:
-                told[name.strip()] = number(float(text), f"{path}: line {i}", largest=LARGEST_TIME)
+                known[name.strip()] = number(float(text), f"{path}: line {i}", largest=LARGEST_TIME)
             except ValueError:
                 raise DataError(f"{path}: line {i} is {line.strip()[:60]!r}, expected NAME SECONDS") from None
-        missing = next((name for name in names if name not in told), None)
+        missing = next((name for name in names if name not in known), None)
         if missing is not None:
             raise DataError(f"{path}: has no line for {missing}, expected one for each picture of the model")
-        return [told[name] for name in names]
+        return [known[name] for name in names]
     numbers = [re.findall(r"\d{1,15}", Path(name).stem) for name in names]
-    if all(numbers):
-        return [float(found[-1]) for found in numbers]
-    return [float(i) for i in range(len(names))]
+    return [float(found[-1]) for found in numbers] if all(numbers) else [float(i) for i in range(len(names))]
 
 
 def _lens(model: str, width: int, height: int, values: list[float], where: str) -> Lens:
-    if model not in PARAMETERS:
-        raise DataError(f"{where}: camera model {model}, expected one of {', '.join(PARAMETERS)}")
-    keys = PARAMETERS[model]
+    keys = MODELS[model]
     if len(values) != len(keys) or not 1 <= min(width, height) <= max(width, height) <= MAX_SIDE:
         found = f"{width}x{height} pixels and {len(values)} parameters"
         raise DataError(f"{where}: {model} with {found}, expected 1..{MAX_SIDE} a side and {len(keys)} parameters")
-    p = {
-        key: number(value, f"{where}: {key}", positive=key.startswith("f"))
-        for key, value in zip(keys, values, strict=True)
-    }
+    pairs = zip(keys, values, strict=True)
+    p = {key: number(value, f"{where}: {key}", positive=key.startswith("f")) for key, value in pairs}
     fx, fy = p.get("fx", p.get("f", 0.0)), p.get("fy", p.get("f", 0.0))
     if model == "OPENCV_FISHEYE":
         return Lens(width, height, fx, fy, p["cx"], p["cy"], fisheye=(p["k1"], p["k2"], p["k3"], p["k4"]))
@@ -144,58 +155,45 @@ class _Binary:
     def __init__(self, path: Path):
         self.path, self.data, self.at = path, read_file(path), 0
 
-    def take(self, layout: str) -> tuple[Any, ...]:
-        """The next values of a little-endian layout."""
-        layout = f"<{layout}"
-        try:
-            values = struct.unpack_from(layout, self.data, self.at)
-        except struct.error:
-            raise DataError(f"{self.path}: ends at byte {len(self.data)}, in the middle of an entry") from None
-        self.at += struct.calcsize(layout)
-        return values
-
-    def skip(self, size: int) -> None:
-        """Passes over `size` bytes."""
-        if size > len(self.data) - self.at:
-            raise DataError(f"{self.path}: ends at byte {len(self.data)}, in the middle of an entry")
-        self.at += size
-
-    def cameras(self) -> dict[int, Lens]:
-        """Lenses by number."""
-        lenses = {}
-        for _ in range(self.take("Q")[0]):
-            key, model, width, height = self.take("iiQQ")
+    def cameras(self) -> Iterator[tuple[int, Lens]]:
+        """Lenses with their numbers."""
+        for _ in range(self._take("Q")[0]):
+            key, model, width, height = self._take("iiQQ")
             where = f"{self.path}: camera {key}"
-            if model not in MODELS:
-                names = ", ".join(name for name, _ in MODELS.values())
-                raise DataError(f"{where}: camera model number {model}, expected one of {names}")
-            name, keys = MODELS[model]
-            lenses[key] = _lens(name, width, height, list(self.take(f"{len(keys)}d")), where)
-        return lenses
+            if not 0 <= model < len(MODELS):
+                raise DataError(f"{where}: camera model number {model}, expected one of {', '.join(MODELS)}")
+            name, keys = list(MODELS.items())[model]
+            yield key, _lens(name, width, height, list(self._take(f"{len(keys)}d")), where)
 
-    def images(self) -> list[Image]:
+    def images(self) -> Iterator[Image]:
         """The registered pictures."""
-        images = []
-        for _ in range(self.take("Q")[0]):
-            _, *pose, camera = self.take("i7di")
+        for _ in range(self._take("Q")[0]):
+            _, *pose, camera = self._take("i7di")
             end = self.data.find(b"\0", self.at)
             if end < 0:
                 raise DataError(f"{self.path}: ends at byte {len(self.data)}, in the middle of a name")
             name = self.data[self.at : end].decode("utf-8", "replace")
             self.at = end + 1
-            self.skip(24 * self.take("Q")[0])
-            images.append(Image(name, camera, tuple(pose)))
-        return images
+            self._skip(24 * self._take("Q")[0])
+            yield Image(name, camera, tuple(pose))
 
-    def points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Positions float64 [M, 3] and colours uint8 [M, 3]."""
-        places, colors = [], []
-        for _ in range(self.take("Q")[0]):
-            _, x, y, z, r, g, b, _, track = self.take("Q3d3BdQ")
-            self.skip(8 * track)
-            places.append((x, y, z))
-            colors.append((r, g, b))
-        return np.array(places, np.float64).reshape(-1, 3), np.array(colors, np.uint8).reshape(-1, 3)
+    def points(self) -> Iterator[tuple[float, ...]]:
+        """Rows x y z r g b."""
+        for _ in range(self._take("Q")[0]):
+            _, *row, _, track = self._take("Q3d3BdQ")
+            self._skip(8 * track)
+            yield tuple(row)
+
+    def _take(self, layout: str) -> tuple[Any, ...]:
+        """The next values of a little-endian layout."""
+        start = self.at
+        self._skip(struct.calcsize(f"<{layout}"))
+        return struct.unpack_from(f"<{layout}", self.data, start)
+
+    def _skip(self, size: int) -> None:
+        if size > len(self.data) - self.at:
+            raise DataError(f"{self.path}: ends at byte {len(self.data)}, in the middle of an entry")
+        self.at += size
 
 
 class _Text:
@@ -206,29 +204,19 @@ class _Text:
         lines = read_file(path).decode("utf-8", "replace").splitlines()
         self.lines = [(i, line.strip()) for i, line in enumerate(lines, 1) if not line.startswith("#")]
 
-    def _values(self, i: int, words: list[str], count: int) -> list[float]:
-        try:
-            values = [float(word) for word in words]
-        except ValueError:
-            values = []
-        if len(values) < count:
-            raise DataError(f"{self.path}: line {i} is not what COLMAP writes, expected {count} numbers or more")
-        return values
-
-    def cameras(self) -> dict[int, Lens]:
-        """Lenses by number."""
-        lenses = {}
+    def cameras(self) -> Iterator[tuple[int, Lens]]:
+        """Lenses with their numbers."""
         for i, line in self.lines:
             if line:
                 key, model, *words = [*line.split(), "", ""][: max(2, len(line.split()))]
+                where = f"{self.path}: camera {key}"
+                if model not in MODELS:
+                    raise DataError(f"{where}: camera model {model}, expected one of {', '.join(MODELS)}")
                 width, height, *values = self._values(i, words, 2)
-                number_, *_ = self._values(i, [key], 1)
-                lenses[int(number_)] = _lens(model, int(width), int(height), values, f"{self.path}: camera {key}")
-        return lenses
+                yield int(self._values(i, [key], 1)[0]), _lens(model, int(width), int(height), values, where)
 
-    def images(self) -> list[Image]:
-        """The registered pictures: two lines each, the second of what was matched."""
-        images = []
+    def images(self) -> Iterator[Image]:
+        """The registered pictures: two lines each, the second with the matched features."""
         lines = self.lines
         while lines and not lines[0][1]:
             lines = lines[1:]
@@ -239,11 +227,17 @@ class _Text:
             values = self._values(i, words[:9], 9)
             if len(words) < 10:
                 raise DataError(f"{self.path}: line {i} names no picture")
-            images.append(Image(words[9], int(values[8]), tuple(values[1:8])))
-        return images
+            yield Image(words[9], int(values[8]), tuple(values[1:8]))
 
-    def points(self) -> tuple[np.ndarray, np.ndarray]:
-        """Positions float64 [M, 3] and colours uint8 [M, 3]."""
-        rows = [self._values(i, line.split()[1:7], 6) for i, line in self.lines if line]
-        table = np.array(rows, np.float64).reshape(-1, 6)
-        return table[:, :3], np.clip(np.nan_to_num(table[:, 3:]), 0, 255).astype(np.uint8)
+    def points(self) -> Iterator[tuple[float, ...]]:
+        """Rows x y z r g b."""
+        return (tuple(self._values(i, line.split()[1:7], 6)) for i, line in self.lines if line)
+
+    def _values(self, i: int, words: list[str], count: int) -> list[float]:
+        try:
+            values = [float(word) for word in words]
+        except ValueError:
+            values = []
+        if len(values) < count:
+            raise DataError(f"{self.path}: line {i} is not what COLMAP writes, expected {count} numbers or more")
+        return values

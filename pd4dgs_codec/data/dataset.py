@@ -1,28 +1,85 @@
-"""`load`: a dataset from its source, by the reader that knows its layout."""
+"""The table of dataset readers, and `load`, which picks one by the files in a folder.
+
+A new reader is a function `read_NAME(folder, downscale, holdout) -> Dataset` in a module of this package and a row of
+READERS. The help of the commands, `pd4dgs-batch scan` and the error for unknown folders follow from the row. This
+module imports the standard library alone, so that `--help` loads neither numpy nor a reader.
+"""
 
 from __future__ import annotations
 
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path, PurePosixPath
+from pkgutil import resolve_name
+from typing import TYPE_CHECKING
 
-from pd4dgs_codec.data.colmap import find_model, read_colmap
-from pd4dgs_codec.data.iphone import read_iphone
-from pd4dgs_codec.data.neu3d import POSES, read_neu3d
-from pd4dgs_codec.data.panoptic import META, read_panoptic
-from pd4dgs_codec.data.record3d import is_record3d, read_record3d
-from pd4dgs_codec.data.synchronised import find_videos, read_synchronised
-from pd4dgs_codec.data.synthetic import PREFIX, read_synthetic
-from pd4dgs_codec.data.transforms import read_transforms
-from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DataError
+
+if TYPE_CHECKING:
+    from pd4dgs_codec.data.view import Dataset, View
+
+SYNTHETIC = "synthetic:"
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A layout of dataset folders.
+
+    name: of the layout. function: MODULE:FUNCTION below `pd4dgs_codec.data`. marks: sets of glob patterns; a folder has
+    this layout if all patterns of one set match in it. contents, remark: for the help and for error messages.
+    """
+
+    name: str
+    function: str
+    marks: tuple[tuple[str, ...], ...]
+    contents: str
+    remark: str = ""
+
+    def recognises(self, folder: Path) -> bool:
+        """Whether the folder has this layout."""
+        return any(all(any(folder.glob(mark)) for mark in marks) for marks in self.marks)
+
+    @property
+    def read(self) -> Callable[[Path, int, int], Dataset]:
+        """The function, called with folder, downscale and holdout (see `load`)."""
+        function: Callable[[Path, int, int], Dataset] = resolve_name(f"pd4dgs_codec.data.{self.function}")
+        return function
+
+
+#: The places of a COLMAP model in a folder, in the order of the search.
+COLMAP = ("sparse/0", "sparse", "colmap/sparse/0", ".")
+READERS = (
+    Reader(
+        "iPhone/DyCheck, Nerfies, HyperNeRF", "iphone:read_iphone", (("camera",),), "camera/, rgb/ and splits/",
+        "the split files decide what is held out",
+    ),
+    Reader("Blender, D-NeRF, nerfstudio", "transforms:read_transforms", (("transforms*.json",),), "transforms*.json"),
+    Reader(
+        "Neu3D", "rigs:read_neu3d", (("poses_bounds.npy",),), "poses_bounds.npy and a video cam*.mp4 per camera",
+        "the first camera is held out",
+    ),
+    Reader("Panoptic Studio", "rigs:read_panoptic", (("train_meta.json",),), "train_meta.json and ims/"),
+    Reader(
+        "Record3D", "iphone:read_record3d",
+        tuple((meta, pictures) for meta in ("metadata", "metadata.json") for pictures in ("rgbd", "rgb")),
+        "metadata and rgbd/",
+    ),
+    Reader(
+        "COLMAP", "colmap:read_colmap",
+        tuple((f"{place}/cameras{kind}", f"{place}/images{kind}") for place in COLMAP for kind in (".bin", ".txt")),
+        "sparse/0 and images/ or videos/", "times.txt may give times; the first video is held out",
+    ),
+)  # fmt: skip
+#: A line of help for each layout.
+FOLDERS = tuple(
+    f"a folder with {reader.contents} ({reader.name}{'; ' * bool(reader.remark)}{reader.remark})" for reader in READERS
+)
 
 
 def load(source: str | Path, *, downscale: int = 1, holdout: int = 8) -> Dataset:
     """Read a dataset.
 
-    source: `synthetic:NAME[?seed=n&size=WxH&frames=N]`, a folder in the iPhone/Nerfies layout, a folder with
-        transforms*.json, one with poses_bounds.npy and videos, one of Panoptic Studio or Record3D, or one with a model
-        of COLMAP and pictures or videos.
+    source: a folder that one of READERS recognises, or `synthetic:NAME[?seed=n&size=WxH&frames=N]`.
     downscale: images are averaged over downscale x downscale blocks (the remainder is cropped), intrinsics follow.
     holdout: without split files, frames with i % holdout == holdout // 2 are the test frames; 0 = none.
     Views whose masks hold no valid pixel are left out, see `Dataset.left_out`.
@@ -31,8 +88,43 @@ def load(source: str | Path, *, downscale: int = 1, holdout: int = 8) -> Dataset
     return _without_blind_views(_read(source, downscale, holdout), source)
 
 
+def dataset_folders(names: Iterable[str]) -> list[str]:
+    """The folders that a reader recognises in a tree of files, except those inside another one.
+
+    names: the paths of all files, relative to the root of the tree, which itself does not count.
+    """
+    paths = {PurePosixPath(name) for name in names}
+    paths |= {folder for path in paths for folder in path.parents}
+    found: set[PurePosixPath] = set()
+    for marks in {marks for reader in READERS for marks in reader.marks}:
+        depths = [(mark, len(PurePosixPath(mark).parts)) for mark in marks]
+        found |= set.intersection(*({p.parents[n - 1] for p in paths if p.match(mark)} for mark, n in depths))
+    found.discard(PurePosixPath("."))
+    return sorted(str(folder) for folder in found if found.isdisjoint(folder.parents))
+
+
+def _read(source: str | Path, downscale: int, holdout: int) -> Dataset:
+    if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:
+        raise DataError(f"{source}: downscale is {downscale}, expected an integer >= 1")
+    if isinstance(holdout, bool) or not isinstance(holdout, int) or holdout < 0 or holdout == 1:
+        raise DataError(f"{source}: holdout {holdout} leaves no training frame, expected 0 (none) or an integer >= 2")
+    if str(source).startswith(SYNTHETIC):
+        synthetic: Dataset = resolve_name("pd4dgs_codec.data.synthetic:read_synthetic")(str(source), downscale)
+        return synthetic
+    folder = Path(source)
+    if not folder.is_dir():
+        found = "a file" if folder.exists() else "nothing"
+        raise DataError(f"{folder}: found {found}, expected a dataset folder or {SYNTHETIC}NAME")
+    for reader in READERS:
+        if reader.recognises(folder):
+            return reader.read(folder, downscale, holdout)
+    found = "other files" if any(folder.iterdir()) else "an empty folder"
+    expected = ", ".join(f"{reader.contents} ({reader.name})" for reader in READERS)
+    raise DataError(f"{folder}: found {found}, expected {expected}")
+
+
 def _without_blind_views(dataset: Dataset, source: str | Path) -> Dataset:
-    """Nothing can be learnt from a view without a valid pixel, and any picture would match it without error."""
+    """The dataset without views that have no valid pixel: they teach nothing, and any picture would match them."""
 
     def sees(view: View) -> bool:
         return view.mask is None or bool(view.mask.any())
@@ -43,35 +135,3 @@ def _without_blind_views(dataset: Dataset, source: str | Path) -> Dataset:
         count = len(dataset.train)
         raise DataError(f"{source}: the masks of all {count} training views hold no valid pixel, expected one at least")
     return replace(dataset, train=train, test=test, left_out=left_out) if left_out else dataset
-
-
-def _read(source: str | Path, downscale: int, holdout: int) -> Dataset:
-    if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:
-        raise DataError(f"{source}: downscale is {downscale}, expected an integer >= 1")
-    if isinstance(holdout, bool) or not isinstance(holdout, int) or holdout < 0 or holdout == 1:
-        raise DataError(f"{source}: holdout {holdout} leaves no training frame, expected 0 (none) or an integer >= 2")
-    if str(source).startswith(PREFIX):
-        return read_synthetic(str(source), downscale)
-    folder = Path(source)
-    if not folder.is_dir():
-        found = "a file" if folder.exists() else "nothing"
-        raise DataError(f"{folder}: found {found}, expected a dataset folder or {PREFIX}NAME")
-    if (folder / "camera").is_dir():
-        return read_iphone(folder, downscale)
-    if any(folder.glob("transforms*.json")):
-        return read_transforms(folder, downscale, holdout)
-    if (folder / POSES).is_file():
-        return read_neu3d(folder, downscale, holdout)
-    if (folder / META).is_file():
-        return read_panoptic(folder, downscale, holdout)
-    if is_record3d(folder):
-        return read_record3d(folder, downscale, holdout)
-    if (model := find_model(folder)) is not None:
-        if videos := find_videos(folder):
-            return read_synchronised(folder, videos, *model, downscale, holdout)
-        return read_colmap(folder, *model, downscale, holdout)
-    found = "other files" if any(folder.iterdir()) else "an empty folder"
-    raise DataError(
-        f"{folder}: found {found}, expected camera/ (iPhone, Nerfies), transforms*.json (Blender), {POSES} (Neu3D), "
-        f"{META} (Panoptic Studio), metadata with rgbd/ (Record3D) or sparse/0 (COLMAP)"
-    )

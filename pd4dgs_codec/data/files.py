@@ -1,10 +1,11 @@
-"""Reading JSON, images and points, with every failure turned into one clear DataError."""
+"""Checked reading of JSON, numbers, options, images, masks and PLY files: each failure is a DataError of one line."""
 
 from __future__ import annotations
 
 import contextlib
 import io
 import json
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -15,37 +16,49 @@ from pd4dgs_codec.errors import DataError, one_line
 if TYPE_CHECKING:
     from PIL.Image import Image as Picture
 
-IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
-WHITE = 255
-#: Of lengths in scene units and in pixels: their products and squares stay far from the end of binary32.
+#: Largest length in scene units or pixels: products and squares of such numbers stay finite in binary32.
 LARGEST = 1e9
-#: Pillow's names of pixels; of the others (CMYK, LAB, floats …) no conversion is the only right one.
+IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+#: Pillow's pixel modes with one obvious conversion to RGB; others (CMYK, LAB, floats) are refused.
 GREY16_MODES = {"I;16", "I;16L", "I;16B"}
 READABLE_MODES = {"1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX"} | GREY16_MODES
-ORIENTATION, UPRIGHT = 0x0112, 1  #: the EXIF flag, and its value for pixels stored as they are seen
-GAMMA = (0.40, 0.51)  #: exponents that PNG files give for sRGB: 1/2.2 and what encoders round it to
+ORIENTATION, UPRIGHT = 0x0112, 1  #: EXIF's orientation tag, and its value for pixels stored upright
+GAMMA = (0.40, 0.51)  #: exponents that PNG files give for sRGB: 1/2.2 as encoders round it
+
+
+def read_file(path: Path) -> bytes:
+    """All bytes of a regular file. Raises DataError; also for pipes and devices, whose end may never come."""
+    try:
+        if path.exists() and not path.is_file():
+            raise DataError(f"{path}: is not a regular file")
+        return path.read_bytes()
+    except (OSError, ValueError) as error:  # ValueError: a NUL or half a surrogate in the name
+        raise DataError(f"{path}: cannot be read: {getattr(error, 'strerror', error)}") from None
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """The JSON object in `path`."""
+    """The JSON object in a file."""
+    raw = read_file(path)
     try:
-        value = json.loads(read_file(path).decode("utf-8"))
-    except FileNotFoundError:
-        raise DataError(f"{path}: missing, expected a JSON file") from None
+        value = json.loads(raw.decode("utf-8"))
     except json.JSONDecodeError as e:
         raise DataError(f"{path}: line {e.lineno}, column {e.colno}: broken JSON: {e.msg}") from None
-    except (OSError, ValueError, RecursionError) as e:
+    except (ValueError, RecursionError) as e:
         raise DataError(f"{path}: cannot be read as JSON: {e}") from None
     if not isinstance(value, dict):
         raise DataError(f"{path}: found a JSON {type(value).__name__}, expected an object")
     return value
 
 
-def read_file(path: Path) -> bytes:
-    """All of a regular file; DataError for a pipe or a device, whose end may never come, OSError or ValueError else."""
-    if path.exists() and not path.is_file():
-        raise DataError(f"{path}: is not a regular file")
-    return path.read_bytes()
+def read_npy(raw: bytes, where: str) -> np.ndarray:
+    """The numbers in the bytes of a .npy file, of any shape."""
+    try:
+        found = np.load(io.BytesIO(raw), allow_pickle=False)
+    except Exception:  # numpy parses the header as Python, which raises errors of many kinds
+        raise DataError(f"{where}: not a .npy file of numbers") from None
+    if not isinstance(found, np.ndarray) or found.dtype.kind not in "fiu":
+        raise DataError(f"{where}: found {getattr(found, 'dtype', 'an archive')}, expected a .npy file of numbers")
+    return found
 
 
 def number(value: Any, where: str, *, positive: bool = False, largest: float = LARGEST) -> float:
@@ -80,6 +93,30 @@ def array(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
     return result
 
 
+def split_options(
+    text: str, source: str, value: Callable[[str, str], Any], examples: Mapping[str, str]
+) -> tuple[str, dict[str, Any]]:
+    """NAME and the options of `NAME?key=value&key=value`, whose keys are those of `examples`.
+
+    value: (key, text) -> value, or ValueError. Raises DataError that begins with `source` and shows the key's example.
+    """
+    name, _, query = text.partition("?")
+    values: dict[str, Any] = {}
+    for part in query.split("&") if "?" in text else []:
+        key, _, given = part.partition("=")
+        if key not in examples or key in values:
+            keys = ", ".join(examples)
+            raise DataError(f"{source}: found {part!r}, expected each of {keys} once at most, as key=value")
+        try:
+            values[key] = value(key, given)
+        except ValueError:
+            raise DataError(f"{source}: {key} is {given!r}; expected for example {examples[key]}") from None
+    return name, values
+
+
+# -- images and masks --------------------------------------------------------------------------------------------------
+
+
 def find_image(folder: Path, name: str) -> Path:
     """The image file of a `file_path` written with or without its extension."""
     for suffix in IMAGE_SUFFIXES:
@@ -91,7 +128,7 @@ def find_image(folder: Path, name: str) -> Path:
 
 
 def _open(path: Path, what: str = "image", size: tuple[int, int] | None = None) -> Picture:
-    """The file's picture, its pixels not read yet; `size` = (W, H) is what it must measure."""
+    """The picture in a file, its pixels not decoded yet. size: the (W, H) to expect."""
     try:
         from PIL import Image, UnidentifiedImageError
     except ImportError:
@@ -119,7 +156,7 @@ def _has_alpha(image: Picture) -> bool:
 
 
 def _check_readable(image: Picture, where: str) -> None:
-    """Refuses by name what would not be shown as its maker saw it."""
+    """Refuses pictures that Pillow would not show as their makers saw them."""
     found = None
     frames = getattr(image, "n_frames", 1)
     if frames > 1:
@@ -128,7 +165,7 @@ def _check_readable(image: Picture, where: str) -> None:
         found = f"has pixels of kind {image.mode}, expected grey of 8 or 16 bits, a palette, RGB or RGBA"
     elif image.mode in GREY16_MODES and _has_alpha(image):
         found = "has 16-bit grey with a transparent value, expected 8 bits or an alpha channel"
-    elif image.getexif().get(ORIENTATION, UPRIGHT) != UPRIGHT:  # some tools turn such pictures and others do not
+    elif image.getexif().get(ORIENTATION, UPRIGHT) != UPRIGHT:  # some tools rotate, some do not
         flag = image.getexif()[ORIENTATION]
         found = f"is stored turned (orientation flag {flag}), expected upright pixels that fit the camera"
     elif not GAMMA[0] <= image.info.get("gamma", GAMMA[0]) <= GAMMA[1]:
@@ -151,13 +188,13 @@ def _srgb(image: Picture, where: str) -> Picture:
             return image
         mode = image.mode if image.mode in ("L", "RGB", "RGBA") else "RGBA" if _has_alpha(image) else "RGB"
         target = "RGB" if mode == "L" else mode
-        turned = ImageCms.profileToProfile(
+        converted = ImageCms.profileToProfile(
             image.convert(mode), source, ImageCms.createProfile("sRGB"), outputMode=target
         )
     except (ImageCms.PyCMSError, OSError, ValueError) as e:
         raise DataError(f"{where}: its colour profile cannot be used: {e}") from None
-    assert turned is not None  # None is for changes in place
-    return turned
+    assert converted is not None  # None is for changes in place
+    return converted
 
 
 def _rgb(image: Picture, where: str, *, composite: bool) -> Picture:
@@ -170,14 +207,14 @@ def _rgb(image: Picture, where: str, *, composite: bool) -> Picture:
     image = _srgb(image, where)
     if composite and _has_alpha(image):
         image = image.convert("RGBA")
-        image = Image.alpha_composite(Image.new("RGBA", image.size, (WHITE,) * 4), image)
+        image = Image.alpha_composite(Image.new("RGBA", image.size, (255,) * 4), image)
     return image.convert("RGB")
 
 
 def read_image(path: Path, size: tuple[int, int], *, downscale: int = 1, composite: bool = True) -> np.ndarray:
     """uint8 [H // downscale, W // downscale, 3], the mean of each block; the file must measure `size` = (W, H).
 
-    composite: put a transparent image on white; otherwise its alpha is dropped (photographs).
+    composite: blend a transparent image with white; otherwise its alpha is dropped (photographs).
     """
     with _open(path, "image", size) as image:
         check_downscale(size, downscale, str(path))
@@ -221,3 +258,91 @@ def shrink_image(image: np.ndarray, k: int) -> np.ndarray:
 def shrink_mask(mask: np.ndarray, k: int) -> np.ndarray:
     """bool [H, W] -> bool [H // k, W // k], True where the whole block is."""
     return mask if k == 1 else np.asarray(_blocks(mask, k).all(axis=(1, 3)))
+
+
+# -- PLY files ---------------------------------------------------------------------------------------------------------
+
+SCALARS = {
+    "char": "i1", "int8": "i1", "uchar": "u1", "uint8": "u1", "short": "<i2", "int16": "<i2", "ushort": "<u2",
+    "uint16": "<u2", "int": "<i4", "int32": "<i4", "uint": "<u4", "uint32": "<u4", "float": "<f4", "float32": "<f4",
+    "double": "<f8", "float64": "<f8",
+}  # fmt: skip
+END = b"end_header"
+DIGITS = 12  #: of a count; Python itself refuses to read thousands
+
+
+def _header(path: Path, raw: bytes) -> tuple[str, int, list[tuple[str, str]], int]:
+    """Format, vertex count, vertex properties as (name, dtype), and where the body starts."""
+    stop = raw.find(END)
+    if not raw.startswith(b"ply") or stop < 0:
+        raise DataError(f"{path}: not a PLY file (expected it to start with 'ply' and hold an end_header line)")
+    newline = raw.find(b"\n", stop)
+    kind, count, fields, elements = "", -1, [], 0
+    for line in raw[:stop].decode("ascii", "replace").splitlines():
+        words = line.split()
+        if words[:1] == ["format"] and len(words) >= 2:
+            kind = words[1]
+        elif words[:1] == ["element"] and len(words) == 3:
+            elements += 1
+            if elements == 1 and words[1] == "vertex" and words[2].isdigit() and len(words[2]) <= DIGITS:
+                count = int(words[2])
+        elif words[:1] == ["property"] and elements == 1:
+            if len(words) != 3 or words[1] not in SCALARS:
+                raise DataError(f"{path}: vertex property {' '.join(words[1:])!r} is not a scalar this reader knows")
+            fields.append((words[2], SCALARS[words[1]]))
+    if kind not in ("ascii", "binary_little_endian") or count < 0 or newline < 0:
+        raise DataError(
+            f"{path}: found format {kind!r}, first element with {count} vertices; "
+            "expected ascii or binary_little_endian and the element vertex first"
+        )
+    return kind, count, fields, newline + 1
+
+
+def _body(path: Path, raw: bytes, kind: str, count: int, dtype: np.dtype) -> np.ndarray:
+    """Structured array [count] of the vertices."""
+    names = dtype.names or ()
+    if kind == "binary_little_endian":
+        if len(raw) < count * dtype.itemsize:
+            size = count * dtype.itemsize
+            raise DataError(f"{path}: {len(raw)} bytes of vertices, expected {size} for {count} of them")
+        return np.frombuffer(raw, dtype, count)
+    try:
+        rows = [tuple(map(float, line.split()[: len(names)])) for line in raw.decode("ascii").splitlines()[:count]]
+        if len(rows) == count:
+            table = np.asarray(rows, np.float64).reshape(count, len(names))
+            vertices = np.empty(count, dtype)
+            with np.errstate(over="ignore"):  # what a type cannot hold becomes infinite there
+                for i, name in enumerate(names):
+                    vertices[name] = table[:, i]
+            return vertices
+    except ValueError:
+        raise DataError(f"{path}: vertex lines are not {len(names)} numbers each") from None
+    raise DataError(f"{path}: {len(rows)} vertex lines, expected {count}")
+
+
+def read_vertices(path: Path, raw: bytes | None = None) -> np.ndarray:
+    """Structured array [count] of the vertex element, one field per property. raw: the file's bytes, if known."""
+    raw = read_file(path) if raw is None else raw
+    kind, count, fields, start = _header(path, raw)
+    names = [name for name, _ in fields]
+    if len(set(names)) != len(names) or not {"x", "y", "z"} <= set(names):
+        raise DataError(f"{path}: vertex properties are {', '.join(names)}, expected x, y, z once each")
+    return _body(path, raw[start:], kind, count, np.dtype(fields))
+
+
+def read_only_ply(folder: Path) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """`read_ply` of the PLY file of a folder that holds exactly one, else (None, None)."""
+    found = list(folder.glob("*.ply"))
+    return read_ply(found[0]) if len(found) == 1 else (None, None)
+
+
+def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
+    """Points float32 [M, 3] and colours uint8 [M, 3] (None if absent), without points that are not finite or beyond
+    LARGEST."""
+    vertices = read_vertices(path)
+    points = np.stack([vertices[c] for c in "xyz"], axis=1)
+    keep = (np.abs(points) <= LARGEST).all(axis=1)  # also false of NaN
+    names = vertices.dtype.names or ()
+    has_color = all(c in names and vertices.dtype[c] == np.uint8 for c in ("red", "green", "blue"))
+    colors = np.stack([vertices[c] for c in ("red", "green", "blue")], axis=1)[keep] if has_color else None
+    return points[keep].astype(np.float32), colors

@@ -1,4 +1,8 @@
-"""The iPhone (DyCheck), Nerfies and HyperNeRF layout: camera/*.json, rgb/{factor}x, splits/, scene.json and so on."""
+"""Recordings of phones: the iPhone (DyCheck), Nerfies and HyperNeRF layout, and unpacked Record3D recordings.
+
+The first has camera/*.json, rgb/{factor}x, splits/, scene.json, metadata.json and perhaps extra.json, points.npy and
+covisible/. Record3D has `metadata` or `metadata.json` beside `rgbd/` or `rgb/` with pictures 0.jpg, 1.jpg, ... .
+"""
 
 from __future__ import annotations
 
@@ -9,29 +13,47 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.data.cameras import (
-    LARGEST_TIME,
+    OPENGL_TO_OPENCV,
     Lens,
     UnreadView,
-    cameras_box,
     check_rotation,
+    checked_rotation,
+    read_view,
+    world_to_camera,
+)
+from pd4dgs_codec.data.files import (
+    LARGEST,
+    array,
+    find_image,
+    number,
+    read_file,
+    read_json,
+    read_mask,
+    read_npy,
+    whole_number,
+)
+from pd4dgs_codec.data.posed import (
+    LARGEST_TIME,
+    cameras_box,
     depth_range,
+    held_out,
     mean_up,
     normalised_times,
     points_box,
-    read_view,
+    posed_dataset,
     seconds_range,
-    world_to_camera,
 )
-from pd4dgs_codec.data.files import LARGEST, array, number, read_json, read_mask, whole_number
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DataError
+
+# -- iPhone, Nerfies, HyperNeRF ----------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)
 class CameraFiles:
-    """What the files say of the cameras. Poses are centred and scaled, lenses are those of rgb/{factor}x.
+    """The cameras of both splits, centred and scaled, with lenses in pixels of rgb/{factor}x and time ids as times.
 
-    A UnreadView's time is its time id. points: float32 [M, 3] of points.npy, centred and scaled, or None.
+    points: float32 [M, 3] of points.npy, centred and scaled, or None. scene, extra: the JSON files.
     """
 
     train: tuple[UnreadView, ...]
@@ -97,7 +119,7 @@ def _split_names(folder: Path) -> tuple[list[str], list[str]]:
 
 
 def _extra(folder: Path) -> tuple[dict[str, Any], int]:
-    """extra.json and the factor whose images are the dataset's own; HyperNeRF has none and is used at 2x."""
+    """extra.json and the factor of the dataset's own images. HyperNeRF has no extra.json and is used at 2x."""
     path = folder / "extra.json"
     if not path.is_file():
         return {}, 1 if (folder / "rgb" / "1x").is_dir() and not (folder / "rgb" / "2x").is_dir() else 2
@@ -109,19 +131,15 @@ def _points(folder: Path, center: np.ndarray, scale: float) -> np.ndarray | None
     path = folder / "points.npy"
     if not path.is_file():
         return None
-    try:  # mapped, so that a header which promises more than the file holds is refused before anything is allocated
-        points = np.load(path, allow_pickle=False, mmap_mode="r")
-    except Exception:  # numpy parses the header as Python and lets errors of many kinds out
-        raise DataError(f"{path}: not a .npy file of numbers") from None
-    if not isinstance(points, np.ndarray) or points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind != "f":
-        found = f"{points.dtype} {points.shape}" if isinstance(points, np.ndarray) else "an archive"
-        raise DataError(f"{path}: found {found}, expected floats [M, 3]")
+    points = read_npy(read_file(path), str(path))
+    if points.ndim != 2 or points.shape[1] != 3 or points.dtype.kind != "f":
+        raise DataError(f"{path}: found {points.dtype} {points.shape}, expected floats [M, 3]")
     points = (points[(np.abs(points) <= LARGEST).all(axis=1)].astype(np.float64) - center) * scale  # without NaN, too
     return points.astype(np.float32) if len(points) else None
 
 
 def read_cameras(folder: str | Path) -> CameraFiles:
-    """Read every camera of both splits; images need not exist."""
+    """Reads every camera of both splits; images need not exist."""
     folder = Path(folder)
     scene, (extra, factor) = read_json(folder / "scene.json"), _extra(folder)
     center = array(scene.get("center", [0.0] * 3), (3,), f"{folder / 'scene.json'}: center")
@@ -164,7 +182,7 @@ def _box(files: CameraFiles, frames: list[UnreadView], folder: Path) -> np.ndarr
 
 
 def _near_far(files: CameraFiles, frames: list[UnreadView], box: np.ndarray, folder: Path) -> tuple[float, float]:
-    """scene.json's near and far: already in scene units."""
+    """near and far of scene.json, which are in scene units."""
     where = folder / "scene.json"
     if files.scene.get("near") is None or files.scene.get("far") is None:
         return depth_range([f.viewmat for f in frames], box, files.points)
@@ -182,8 +200,8 @@ def _up(files: CameraFiles, frames: list[UnreadView], folder: Path) -> tuple[flo
     return float(x), float(y), float(z)
 
 
-def read_iphone(folder: Path, downscale: int) -> Dataset:
-    """Read the folder at rgb/{factor}x over `downscale` (see `dataset.load`)."""
+def read_iphone(folder: Path, downscale: int, holdout: int) -> Dataset:
+    """Reads rgb/{factor}x (see `dataset.load`). The split files decide, whatever `holdout` is."""
     files = read_cameras(folder)
     frames = [*files.train, *files.test]
     times, start, stop = normalised_times([f.time for f in frames], str(folder))
@@ -215,3 +233,56 @@ def read_iphone(folder: Path, downscale: int) -> Dataset:
         unit=0.0,
         masked=masked,
     )
+
+
+# -- Record3D ----------------------------------------------------------------------------------------------------------
+
+META, PICTURES = ("metadata", "metadata.json"), ("rgbd", "rgb")
+MAX_FRAMES = 1_000_000
+
+
+def read_record3d(folder: Path, downscale: int, holdout: int) -> Dataset:
+    """Reads an unpacked recording (see `dataset.load`).
+
+    `K` holds nine numbers by columns; `perFrameIntrinsicCoeffs`, if present, fx fy cx cy of each picture. `poses` are
+    rows qx qy qz qw x y z, camera to world with ARKit's axes: x right, y up, z backwards. `frameTimestamps` or `fps`
+    give the times.
+    """
+    path = next(folder / name for name in META if (folder / name).is_file())
+    pictures = next(folder / name for name in PICTURES if (folder / name).is_dir())
+    meta = read_json(path)
+    size = tuple(whole_number(meta.get(key), f"{path}: {key}", low=1) for key in ("w", "h"))
+    rows = meta.get("poses")
+    if not isinstance(rows, list) or not 1 <= len(rows) <= MAX_FRAMES:
+        raise DataError(f"{path}: found no poses, expected 1 to {MAX_FRAMES:,} rows of 7")
+    poses = array(rows, (len(rows), 7), f"{path}: poses")
+    lenses, times = _record3d_lenses(meta, (size[0], size[1]), len(rows), path), _record3d_times(meta, len(rows), path)
+    frames = []
+    for i, (pose, lens, time) in enumerate(zip(poses, lenses, times, strict=True)):
+        rotation = checked_rotation(pose[[3, 0, 1, 2]], f"{path}: pose {i}")
+        viewmat = world_to_camera(OPENGL_TO_OPENCV @ rotation.T, pose[4:])
+        frames.append(UnreadView(str(i), 0, time, viewmat, lens, find_image(pictures, str(i))))
+    return posed_dataset(folder, *held_out(frames, holdout), None, None, downscale)
+
+
+def _record3d_lenses(meta: dict[str, object], size: tuple[int, int], count: int, path: Path) -> list[Lens]:
+    if meta.get("perFrameIntrinsicCoeffs") is not None:
+        where = f"{path}: perFrameIntrinsicCoeffs"
+        table = array(meta["perFrameIntrinsicCoeffs"], (count, 4), where)
+    else:
+        where = f"{path}: K"
+        fx, _, _, _, fy, _, cx, cy, _ = array(meta.get("K"), (9,), where)
+        table = np.tile([fx, fy, cx, cy], (count, 1))
+    if not (table[:, :2] > 0).all():
+        raise DataError(f"{where}: a focal length is not above 0")
+    return [Lens(*size, float(fx), float(fy), float(cx), float(cy)) for fx, fy, cx, cy in table]
+
+
+def _record3d_times(meta: dict[str, object], count: int, path: Path) -> list[float]:
+    stamps = meta.get("frameTimestamps")
+    if stamps is None:
+        fps = number(meta.get("fps", 60), f"{path}: fps", positive=True)
+        return [i / fps for i in range(count)]
+    if not isinstance(stamps, list) or len(stamps) != count:
+        raise DataError(f"{path}: frameTimestamps are not {count} numbers, one per pose")
+    return [number(stamp, f"{path}: frameTimestamps", largest=LARGEST_TIME) for stamp in stamps]

@@ -26,9 +26,9 @@ PENUMBRA = (0.8, 1.25)
 class Paint:
     """A procedural albedo: two colours mixed by a wave pattern, with fine detail on top.
 
-    low, high: RGB 0..1. waves: [2, 4] rows (wave vector, phase) whose summed sines choose between the colours (two
-    crossed waves make a checkerboard). detail: [n, 4] rows of the same kind. Wave vectors are in radians per scene unit
-    of `size` (the half sizes [3]) times m. tint: colour factor over time, or None.
+    low, high: RGB 0..1. waves: [2, 4] rows (wave vector, phase); the sum of their sines mixes the colours, and two
+    crossed waves make a checkerboard. detail: [n, 4] such rows. Wave vectors are in radians per scene unit of `size`
+    (half sizes [3]) times m. tint: colour factor over time, or None.
     """
 
     low: np.ndarray

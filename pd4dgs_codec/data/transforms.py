@@ -9,23 +9,29 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.data.cameras import (
-    LARGEST_TIME,
+    OPENGL_TO_OPENCV,
     ROTATION_TOLERANCE,
     Lens,
     UnreadView,
     check_rotation,
     world_to_camera,
 )
-from pd4dgs_codec.data.files import array, find_image, image_info, number, read_json, whole_number
-from pd4dgs_codec.data.ply import read_only_ply, read_ply
-from pd4dgs_codec.data.posed import held_out, posed_dataset
+from pd4dgs_codec.data.files import (
+    array,
+    find_image,
+    image_info,
+    number,
+    read_json,
+    read_only_ply,
+    read_ply,
+    whole_number,
+)
+from pd4dgs_codec.data.posed import LARGEST_TIME, held_out, posed_dataset
 from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.errors import DataError
 
 PINHOLE_MODELS = {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
 FISHEYE_MODEL = "OPENCV_FISHEYE"
-#: OpenGL's camera looks along -z with y up; OpenCV's along +z with y down.
-OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0])
 
 
 def _choose(folder: Path) -> tuple[Path, Path | None]:
@@ -48,12 +54,11 @@ def _focal(get: Callable[[str], Any], axis: str, size: int, where: str) -> float
     angle = get("camera_angle_" + axis)
     if angle is None:
         return None
-    angle = number(angle, f"{where}: camera_angle_{axis}", positive=True)
+    where = f"{where}: camera_angle_{axis}"
+    angle = number(angle, where, positive=True)
     if angle >= np.pi:
-        raise DataError(f"{where}: camera_angle_{axis} is {angle}, expected radians below pi")
-    return number(
-        float(0.5 * size / np.tan(0.5 * angle)), f"{where}: the focal length by camera_angle_{axis}", positive=True
-    )
+        raise DataError(f"{where} is {angle}, expected radians below pi")
+    return number(float(0.5 * size / np.tan(0.5 * angle)), f"{where}: focal length", positive=True)
 
 
 def _lens(file: dict[str, Any], frame: dict[str, Any], image: Path, where: str) -> Lens:
@@ -110,27 +115,11 @@ def _frames(folder: Path, path: Path) -> tuple[list[UnreadView], dict[str, Any]]
             raise DataError(f"{where} has no file_path, expected an object with file_path and transform_matrix")
         viewmat = _viewmat(frame.get("transform_matrix"), f"{where}: transform_matrix")
         image = find_image(folder, frame["file_path"])
-        time = (
-            i / max(len(listed) - 1, 1)
-            if frame.get("time") is None
-            else number(frame["time"], f"{where}: time", largest=LARGEST_TIME)
-        )
+        time = i / max(len(listed) - 1, 1)
+        if frame.get("time") is not None:
+            time = number(frame["time"], f"{where}: time", largest=LARGEST_TIME)
         frames.append(UnreadView(image.stem, 0, time, viewmat, _lens(file, frame, image, where), image))
     return frames, file
-
-
-def _split(folder: Path, holdout: int) -> tuple[list[UnreadView], list[UnreadView], dict[str, Any]]:
-    """Train and test frames and the training file; split files decide, else every `holdout`-th frame is test."""
-    train_file, test_file = _choose(folder)
-    frames, file = _frames(folder, train_file)
-    if test_file is not None:
-        return frames, _frames(folder, test_file)[0], file
-    return *held_out(frames, holdout), file
-
-
-def _points(folder: Path, file: dict[str, Any]) -> tuple[np.ndarray | None, np.ndarray | None]:
-    named = file.get("ply_file_path")
-    return read_ply(folder / named) if isinstance(named, str) else read_only_ply(folder)
 
 
 def _stored_depth(folder: Path, file: dict[str, Any]) -> tuple[float, float] | None:
@@ -146,8 +135,11 @@ def _stored_depth(folder: Path, file: dict[str, Any]) -> tuple[float, float] | N
 
 
 def read_transforms(folder: Path, downscale: int, holdout: int) -> Dataset:
-    """Read a folder with transforms*.json (see `dataset.load`)."""
-    train, test, file = _split(folder, holdout)
-    points, colors = _points(folder, file)
+    """Reads a folder with transforms*.json (see `dataset.load`); a test or val file decides before `holdout`."""
+    train_file, test_file = _choose(folder)
+    frames, file = _frames(folder, train_file)
+    train, test = held_out(frames, holdout) if test_file is None else (frames, _frames(folder, test_file)[0])
+    named = file.get("ply_file_path")
+    points, colors = read_ply(folder / named) if isinstance(named, str) else read_only_ply(folder)
     background = (1.0, 1.0, 1.0) if image_info(train[0].image)[2] else None
     return posed_dataset(folder, train, test, points, colors, downscale, _stored_depth(folder, file), background)

@@ -1,36 +1,63 @@
-"""Pictures of a video, decoded one after another by the ffmpeg of imageio-ffmpeg."""
+"""Videos: decoding by the ffmpeg of imageio-ffmpeg, a cache of decoded frames, and datasets of synchronised videos.
+
+The cache keeps each frame without loss, readable without the others: differences between neighbours in a row,
+compressed by zstd. It lies in the folder that PD4DGS_CACHE names, else in ~/.cache/pd4dgs-frames, and holds up to
+PD4DGS_CACHE_GIB (default 20); the videos that were used least recently leave first.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Generator, Sequence
+import errno
+import hashlib
+import json
+import os
+import tempfile
+from collections.abc import Callable, Generator, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from pd4dgs_codec.data.cameras import Lens, UnreadView, rectify
+from pd4dgs_codec.data.files import check_downscale, shrink_image, shrink_mask
+from pd4dgs_codec.data.posed import geometry, without_first_camera
+from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DataError, one_line
 
-#: Of width and height, and of the rate: beyond, a header lies.
-MOST_SIDE, MOST_FPS = 16_384, 10_000.0
+#: Largest width or height, and frames per second: beyond them the header is wrong.
+MAX_SIDE, MAX_FPS = 16_384, 10_000.0
+FOLDER, SIZE, DEFAULT_GIB = "PD4DGS_CACHE", "PD4DGS_CACHE_GIB", 20.0
+#: Of the layout of cache files: frames, the index as JSON, and the length of the index in LENGTH bytes.
+VERSION, LENGTH = 2, 8
+ZSTD_LEVEL = 1  #: higher levels gain little on pictures
+#: Cache files that this process reads from; they are not removed.
+_IN_USE: set[Path] = set()
+
+
+# -- decoding ----------------------------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True)
 class Video:
-    """A video that opened. size: (width, height) as it is seen, turned as its maker says; fps: frames per second."""
+    """An open video.
+
+    size: (width, height) as displayed, after the rotation in its header. fps: frames per second. pictures: uint8
+    [height, width, 3], or [height, width] in grey, once.
+    """
 
     path: Path
     size: tuple[int, int]
     fps: float
-    pictures: Generator[
-        np.ndarray, None, None
-    ]  #: uint8 [height, width, 3], or [height, width] in grey; to be gone through once
+    pictures: Generator[np.ndarray, None, None]
 
 
 def open_video(path: Path, *, grey: bool = False, output: Sequence[str] = ()) -> Video:
-    """The video, its first frame not decoded yet. output: further options of ffmpeg, such as a filter.
+    """Opens a video without decoding a frame. output: further options of ffmpeg, such as a filter.
 
-    Raises DataError of one line for what cannot be opened, and so do the pictures for what cannot be decoded.
+    Raises DataError of one line if it cannot be opened, and so do the pictures if they cannot be decoded.
     """
     if not path.is_file():
         raise DataError(f"{path}: found {'no file' if not path.exists() else 'no regular file'}, expected a video")
@@ -41,18 +68,18 @@ def open_video(path: Path, *, grey: bool = False, output: Sequence[str] = ()) ->
     pixels: dict[str, Any] = {"pix_fmt": "gray", "bits_per_pixel": 8} if grey else {}
     reader = read_frames(str(path), output_params=list(output), **pixels)
     with _failures(path):
-        meta = next(reader)
+        meta: dict[str, Any] = next(reader, {})
         (width, height), fps = meta["size"], float(meta["fps"])
-    if not (1 <= min(width, height) <= max(width, height) <= MOST_SIDE and 0 < fps < MOST_FPS):
+    if not (1 <= min(width, height) <= max(width, height) <= MAX_SIDE and 0 < fps < MAX_FPS):
         reader.close()
         found = f"{width}x{height} at {fps:g} frames per second"
-        raise DataError(f"{path}: {found}, expected at most {MOST_SIDE} a side and {MOST_FPS:g}")
+        raise DataError(f"{path}: {found}, expected at most {MAX_SIDE} a side and {MAX_FPS:g}")
     shape = (height, width) if grey else (height, width, 3)
     return Video(path, (width, height), fps, _pictures(reader, path, shape))
 
 
 def video_size(path: Path) -> tuple[int, int]:
-    """(width, height) of a video as it is seen."""
+    """(width, height) of a video as displayed."""
     video = open_video(path)
     video.pictures.close()
     return video.size
@@ -63,25 +90,212 @@ def _pictures(reader: Any, path: Path, shape: tuple[int, ...]) -> Generator[np.n
         while True:
             with _failures(path):
                 data = next(reader, None)
-                if data is None:
-                    return
-                picture = np.frombuffer(data, np.uint8).reshape(shape)
+                picture = None if data is None else np.frombuffer(data, np.uint8).reshape(shape)
+            if picture is None:
+                return
             yield picture
     finally:
         reader.close()
 
 
-class _failures:  # noqa: N801 - used as a statement
-    """Turns what imageio-ffmpeg raises into a DataError that names the video."""
+@contextmanager
+def _failures(path: Path) -> Iterator[None]:
+    """Turns the exceptions of imageio-ffmpeg into a DataError that names the video."""
+    try:
+        yield
+    except (OSError, RuntimeError, ValueError, KeyError) as error:
+        # imageio-ffmpeg appends all output of ffmpeg, whose last line names the cause
+        said = str(error).strip().rpartition("\n")[2]
+        raise DataError(f"{path}: cannot be decoded: {one_line(said, 120)}") from None
 
-    def __init__(self, path: Path):
-        self.path = path
 
-    def __enter__(self) -> None:
-        """Nothing to begin."""
+# -- the cache ---------------------------------------------------------------------------------------------------------
 
-    def __exit__(self, kind: object, error: BaseException | None, trace: object) -> None:
-        if isinstance(error, (OSError, RuntimeError, StopIteration, ValueError, KeyError)):
-            # imageio-ffmpeg appends all that ffmpeg printed, whose last line says what is wrong
-            said = str(error).strip().rpartition("\n")[2]
-            raise DataError(f"{self.path}: cannot be decoded: {one_line(said, 120)}") from None
+
+@dataclass(frozen=True, eq=False)
+class StoredFrames:
+    """The frames of a video in the cache. offsets: n + 1 bytes in the file; shape: of each frame."""
+
+    path: Path
+    offsets: Sequence[int]
+    shape: tuple[int, ...]
+    fps: float
+
+    def __len__(self) -> int:
+        return len(self.offsets) - 1
+
+    def read(self, index: int) -> np.ndarray:
+        """uint8 [H, W, 3] of one frame. Raises DataError if its file has left the cache."""
+        import zstandard
+
+        start, stop = self.offsets[index : index + 2]
+        try:
+            with self.path.open("rb") as stream:
+                stream.seek(start)
+                data = zstandard.ZstdDecompressor().decompress(stream.read(stop - start), int(np.prod(self.shape)))
+            steps = np.frombuffer(data, np.uint8).reshape(self.shape)
+        except (OSError, ValueError, zstandard.ZstdError):
+            raise DataError(f"{self.path}: a cached frame is missing or broken; start again to decode anew") from None
+        return np.add.accumulate(steps, axis=1, dtype=np.uint8)
+
+
+class StoredView(View):
+    """A view whose picture is read from the cache at each access."""
+
+    def __init__(self, frames: StoredFrames, index: int, **fields: Any) -> None:
+        """fields: those of a View but `image`, `width` and `height`."""
+        height, width, _ = frames.shape
+        for name, value in {**fields, "width": width, "height": height, "_frames": frames, "_index": index}.items():
+            object.__setattr__(self, name, value)
+
+    @property
+    def image(self) -> np.ndarray:
+        """uint8 [H, W, 3]."""
+        frames: StoredFrames = self._frames  # type: ignore[attr-defined]
+        return frames.read(self._index)  # type: ignore[attr-defined]
+
+
+def stored_frames(path: Path, how: str, treat: Callable[[np.ndarray], np.ndarray]) -> StoredFrames:
+    """The frames of a video after `treat`, decoded now unless the cache has them.
+
+    how: tells different functions `treat` apart. Raises DataError for a video that cannot be decoded or holds no frame,
+    and if the cache has no room.
+    """
+    folder = Path(os.environ.get(FOLDER) or Path.home() / ".cache" / "pd4dgs-frames")
+    try:
+        stat = path.stat()
+    except OSError:
+        raise DataError(f"{path}: found no file, expected a video") from None
+    key = json.dumps([VERSION, str(path.resolve()), stat.st_size, stat.st_mtime_ns, how])
+    target = folder / f"{hashlib.sha256(key.encode()).hexdigest()[:32]}.frames"
+    found = _stored(target) or _store(open_video(path, output=["-fps_mode", "passthrough"]), target, treat)
+    _IN_USE.add(target)
+    return found
+
+
+def _stored(target: Path) -> StoredFrames | None:
+    try:
+        with target.open("rb") as stream:
+            end = stream.seek(-LENGTH, os.SEEK_END)
+            stream.seek(end - int.from_bytes(stream.read(LENGTH), "little"))
+            index = json.loads(stream.read()[:-LENGTH])
+        os.utime(target)  # now the most recently used
+        return StoredFrames(target, index["offsets"], tuple(index["shape"]), index["fps"])
+    except (OSError, ValueError, KeyError):
+        return None
+
+
+def _store(video: Video, target: Path, treat: Callable[[np.ndarray], np.ndarray]) -> StoredFrames:
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryDirectory(dir=target.parent, prefix=".pd4dgs-") as folder:
+            file = Path(folder) / "frames"
+            frames = _compress(video, file, target.parent, treat)
+            os.replace(file, target)
+    except OSError as error:
+        what = "the disk is full" if error.errno == errno.ENOSPC else error.strerror or str(error)
+        raise DataError(f"{target.parent}: cannot keep the frames of {video.path.name}: {what}") from None
+    finally:
+        video.pictures.close()
+    return StoredFrames(target, frames.offsets, frames.shape, frames.fps)
+
+
+def _compress(video: Video, file: Path, cache: Path, treat: Callable[[np.ndarray], np.ndarray]) -> StoredFrames:
+    """Writes a cache file, and makes room for it."""
+    import zstandard
+
+    compress, limit = zstandard.ZstdCompressor(level=ZSTD_LEVEL).compress, _limit()
+    offsets, shape = [0], list[int]()
+    others = sum(other.stat().st_size for other in cache.glob("*.frames"))
+    with file.open("wb") as stream:
+        for picture in video.pictures:
+            frame = np.ascontiguousarray(treat(picture))
+            shape, steps = list(frame.shape), frame.copy()
+            steps[:, 1:] -= frame[:, :-1]
+            offsets.append(offsets[-1] + stream.write(compress(steps)))
+            if others + offsets[-1] > limit:
+                others = _make_room(cache, limit - offsets[-1])
+            if others + offsets[-1] > limit:
+                found = f"its first {len(offsets) - 1} frames take {limit / 2**30:g} GiB"
+                raise DataError(f"{video.path}: {found}; expected a larger {SIZE} or a larger --downscale")
+        if not shape:
+            raise DataError(f"{video.path}: holds no frame, expected one at least")
+        index = json.dumps({"offsets": offsets, "shape": shape, "fps": video.fps}).encode()
+        stream.write(index + (len(index)).to_bytes(LENGTH, "little"))
+    return StoredFrames(file, offsets, tuple(shape), video.fps)
+
+
+def _limit() -> float:
+    text = os.environ.get(SIZE) or str(DEFAULT_GIB)
+    try:
+        gib = float(text)
+    except ValueError:
+        gib = -1.0
+    if not 0 < gib < 1e9:
+        raise DataError(f"{SIZE} is {text!r}, expected GiB > 0")
+    return gib * 2**30
+
+
+def _make_room(cache: Path, limit: float) -> int:
+    """Removes the least recently used files, until the others take `limit` bytes or are in use; bytes of the others."""
+    files = sorted(cache.glob("*.frames"), key=lambda file: file.stat().st_mtime)
+    total = sum(file.stat().st_size for file in files)
+    for file in files:
+        if total > limit and file not in _IN_USE:
+            total -= file.stat().st_size
+            file.unlink()
+    return total
+
+
+# -- datasets ----------------------------------------------------------------------------------------------------------
+
+
+def synchronised_dataset(
+    folder: Path,
+    cameras: Sequence[UnreadView],
+    points: np.ndarray | None,
+    colors: np.ndarray | None,
+    downscale: int,
+    holdout: int,
+    depth: tuple[float, float] | None = None,
+) -> Dataset:
+    """The dataset of cameras that stand still, each with its video as its image.
+
+    The first camera is held out, none for holdout 0. depth: near and far, if known.
+    """
+    views: list[StoredView] = []
+    count, fps = 0, 0.0
+    for i, camera in enumerate(cameras):
+        frames, mask = _frames_of(camera, downscale)
+        if i and (len(frames) != count or frames.fps != fps):
+            first = cameras[0].image.name
+            found = f"{len(frames)} frames at {frames.fps:g} per second and {first} {count} at {fps:g}"
+            raise DataError(f"{camera.image}: has {found}, expected synchronised videos")
+        count, fps = len(frames), frames.fps
+        fixed = {"viewmat": camera.viewmat.astype(np.float32), "K": camera.lens.matrix(downscale)}
+        for k in range(count):
+            time, name = k / max(count - 1, 1), f"{camera.image.stem}_{k:04d}"
+            views.append(StoredView(frames, k, time=time, name=name, camera_id=i, mask=mask, **fixed))
+    train, test = without_first_camera(folder, views, holdout)
+    return Dataset(
+        name=folder.resolve().name,
+        train=tuple(train),
+        test=tuple(test),
+        background=(0.0, 0.0, 0.0),
+        time_range=(0.0, (count - 1) / fps if count > 1 else 1.0),
+        **geometry(cameras, points, colors, depth),
+    )
+
+
+def _frames_of(camera: UnreadView, downscale: int) -> tuple[StoredFrames, np.ndarray | None]:
+    """The frames of a camera's video, undistorted and downscaled, and the mask of their seen pixels."""
+    lens, mask = camera.lens, None
+    check_downscale((lens.width, lens.height), downscale, str(camera.image))
+    if not lens.is_pinhole:
+        mask = shrink_mask(rectify(np.zeros((lens.height, lens.width, 3), np.uint8), lens)[1], downscale)
+    how = f"{downscale} {'' if lens.is_pinhole else lens}"
+    return stored_frames(camera.image, how, partial(_ideal, lens=lens, downscale=downscale)), mask
+
+
+def _ideal(picture: np.ndarray, lens: Lens, downscale: int) -> np.ndarray:
+    return shrink_image(picture if lens.is_pinhole else rectify(picture, lens)[0], downscale)

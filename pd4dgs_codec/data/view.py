@@ -1,4 +1,4 @@
-"""What the trainer and the evaluation see of any dataset: posed images, split, and what is known of the scene."""
+"""A dataset as training and evaluation use it: posed images, their split, and the geometry of the scene."""
 
 from __future__ import annotations
 
@@ -42,16 +42,16 @@ class View:
 
 @dataclass(frozen=True, eq=False)
 class Dataset:
-    """A scene's images, split, with what is known of its geometry.
+    """A scene's images, split into training and test views, with its geometry.
 
     points: float32 [M, 3], scene units, or None; point_colors: uint8 [M, 3] or None.
     box: float32 [2, 3], lower and upper corner of the content: normalisation box of the HexPlanes and the
         volume of random initial points.
     near, far: scene units along the optical axis. background: 0..1 per channel. time_range: seconds at normalised
         time 0 and 1, (0, 1) if unknown. up: unit vector, world. unit: metres per scene unit, 0 if unknown.
-    masked: True where the test masks are covisibility masks. left_out: names of views that are in neither split because
-        their masks hold no valid pixel.
-    paths: float32 [T, M, 3], where the points are at path_times, T normalised times; None if nobody knows.
+    masked: True if the test masks are covisibility masks. left_out: names of views in neither split, as their masks
+        hold no valid pixel.
+    paths: float32 [T, M, 3], the points at path_times, T normalised times; None if unknown.
     """
 
     name: str
@@ -77,7 +77,7 @@ class Dataset:
         return self.train[0].camera
 
     def remarks(self) -> list[str]:
-        """What this data cannot teach or score, a line each, for whoever starts a training on it."""
+        """Limits of this data for training and evaluation, a line each."""
         remarks = []
         if self.left_out:
             names = ", ".join(self.left_out[:REMARKED]) + (", ..." if len(self.left_out) > REMARKED else "")

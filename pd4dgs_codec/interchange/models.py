@@ -15,8 +15,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pd4dgs_codec.data.files import LARGEST, read_file
-from pd4dgs_codec.data.ply import read_vertices
+from pd4dgs_codec.data.files import LARGEST, read_file, read_vertices
 from pd4dgs_codec.errors import DataError, one_line
 from pd4dgs_codec.interchange.libraries import SH_SPAN, library, quiet
 from pd4dgs_codec.interchange.splats import MAX_DEGREE, SH_C0, Splats, unit

@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.data.cameras import ROTATION_TOLERANCE, points_box, world_to_camera
-from pd4dgs_codec.data.files import LARGEST, read_file
-from pd4dgs_codec.data.ply import read_vertices
+from pd4dgs_codec.data.cameras import ROTATION_TOLERANCE, world_to_camera
+from pd4dgs_codec.data.files import LARGEST, read_file, read_vertices
+from pd4dgs_codec.data.posed import points_box
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.tensors import Module, read_tensors
 from pd4dgs_codec.morton import MAX_VOXEL

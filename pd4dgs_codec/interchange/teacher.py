@@ -21,10 +21,9 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.data.cameras import depth_range, points_box
 from pd4dgs_codec.data.dataset import load
-from pd4dgs_codec.data.options import split_options
-from pd4dgs_codec.data.posed import held_out
+from pd4dgs_codec.data.files import split_options
+from pd4dgs_codec.data.posed import depth_range, held_out, points_box
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.models import Teacher, read_model

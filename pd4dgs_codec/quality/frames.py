@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from pd4dgs_codec.data.cameras import downscaled_matrix
 from pd4dgs_codec.data.view import View
 from pd4dgs_codec.errors import RenderError
 from pd4dgs_codec.scene import Camera, SceneInfo
@@ -56,10 +57,8 @@ def shrunk(camera: Camera, downscale: int) -> Camera:
     """The camera of an image 1/downscale as wide and high, the remainder cropped; pixel centres at +0.5."""
     if downscale == 1:
         return camera
-    K = camera.K.copy()
-    K[:2] /= downscale
     width, height = max(1, camera.width // downscale), max(1, camera.height // downscale)
-    return replace(camera, K=K, width=width, height=height)
+    return replace(camera, K=downscaled_matrix(camera.K, downscale), width=width, height=height)
 
 
 def look_at_point(info: SceneInfo) -> np.ndarray:

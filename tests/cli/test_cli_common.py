@@ -31,7 +31,7 @@ def test_help_has_a_summary_an_example_and_exits_0(verb, capsys):
 
 @pytest.mark.parametrize("verb", ("train", "render", "eval"))
 def test_help_lists_every_synthetic_scene(verb):
-    from pd4dgs_codec.data.scenes import MOTIONS
+    from pd4dgs_codec.data.synthetic import MOTIONS
 
     text = import_module(f"pd4dgs_codec.cli.{verb}").parser().format_help()
     for name in MOTIONS:

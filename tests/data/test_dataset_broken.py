@@ -58,7 +58,7 @@ def refused(source, text, **options):
     with pytest.raises(DataError) as caught:
         load(source, **options)
     message = str(caught.value)
-    assert text in message and "\n" not in message and len(message) < 400
+    assert text in message and "\n" not in message and len(message) < 500
     return message
 
 

@@ -5,17 +5,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pd4dgs_codec.data.cameras import (
-    Lens,
-    UnreadView,
-    cameras_box,
-    distort,
-    normalised_times,
-    points_box,
-    rectify,
-    seconds_range,
-    undistort,
-)
+from pd4dgs_codec.data.cameras import Lens, UnreadView, distort, rectify, undistort
+from pd4dgs_codec.data.posed import cameras_box, normalised_times, points_box, seconds_range
 from pd4dgs_codec.errors import DataError
 
 small = st.floats(-0.02, 0.02)  # in this range the polynomial does not fold within the tested square

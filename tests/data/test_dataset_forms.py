@@ -13,10 +13,10 @@ from PIL import Image
 from test_dataset_colmap import _quaternion
 from videos import write_video
 
-from pd4dgs_codec.data import frame_cache
+from pd4dgs_codec.data import videos as cached
+from pd4dgs_codec.data.cameras import OPENGL_TO_OPENCV
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.data.synthetic import read_synthetic
-from pd4dgs_codec.data.transforms import OPENGL_TO_OPENCV
 from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.train.shot import Shots
@@ -34,7 +34,7 @@ def scene() -> Dataset:
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch) -> Path:
-    monkeypatch.setenv(frame_cache.FOLDER, str(tmp_path / "cache"))
+    monkeypatch.setenv(cached.FOLDER, str(tmp_path / "cache"))
     return tmp_path / "cache"
 
 
@@ -155,13 +155,13 @@ def test_faults_of_panoptic_are_one_line(scene, tmp_path, monkeypatch):
         refused(folder, text)
     path.write_text(json.dumps(whole))
     with monkeypatch.context() as patch:
-        patch.setattr("pd4dgs_codec.data.panoptic.MOST_POINTS_BYTES", 1000)
+        patch.setattr("pd4dgs_codec.data.rigs.MAX_POINTS_BYTES", 1000)
         refused(folder, "unpacks to more than 1,000 bytes")
     with zipfile.ZipFile(folder / "init_pt_cld.npz", "w", zipfile.ZIP_DEFLATED) as bomb:
         bomb.writestr("data.npy", bytes(50_000_000))  # 50 kB on the disk
-    refused(folder, "data is not an array")
+    refused(folder, "data: not a .npy file")
     np.savez(folder / "init_pt_cld.npz", data=np.array([{}]))
-    refused(folder, "data is not an array")
+    refused(folder, "data: not a .npy file")
     np.savez(folder / "init_pt_cld.npz", data=np.zeros((4, 2)))
     refused(folder, "expected numbers [M, 6]")
     (folder / "init_pt_cld.npz").write_bytes(b"no archive")
@@ -283,7 +283,7 @@ def test_frames_are_decoded_once(scene, tmp_path, monkeypatch, cache):
     def never(*_: object) -> None:
         raise AssertionError("decoded twice")
 
-    monkeypatch.setattr(frame_cache, "_store", never)
+    monkeypatch.setattr(cached, "_store", never)
     again = load(folder)
     np.testing.assert_array_equal(first.train[3].image, again.train[3].image)
     with pytest.raises(AssertionError, match="decoded twice"):
@@ -294,15 +294,15 @@ def test_the_cache_stays_within_its_size(scene, tmp_path, monkeypatch, cache):
     folder = write_synchronised(scene, tmp_path / "set")
     load(folder)
     full = sum(file.stat().st_size for file in cache.glob("*.frames"))
-    monkeypatch.setattr(frame_cache, "_IN_USE", set())
-    monkeypatch.setenv(frame_cache.SIZE, str(1.01 * full / 2**30))
+    monkeypatch.setattr(cached, "_IN_USE", set())
+    monkeypatch.setenv(cached.SIZE, str(1.01 * full / 2**30))
     load(folder, downscale=2)  # another's frames leave for these
     assert sum(file.stat().st_size for file in cache.glob("*.frames")) <= 1.01 * full
-    monkeypatch.setattr(frame_cache, "_IN_USE", set())
-    monkeypatch.setenv(frame_cache.SIZE, str(0.4 * full / 2**30))
+    monkeypatch.setattr(cached, "_IN_USE", set())
+    monkeypatch.setenv(cached.SIZE, str(0.4 * full / 2**30))
     refused(folder, "expected a larger PD4DGS_CACHE_GIB or a larger --downscale")
     assert not list(cache.glob(".pd4dgs-*"))
-    monkeypatch.setenv(frame_cache.SIZE, "much")
+    monkeypatch.setenv(cached.SIZE, "much")
     refused(folder, "PD4DGS_CACHE_GIB is 'much', expected GiB > 0", downscale=3)
 
 
@@ -310,7 +310,7 @@ def test_a_disk_that_fills_behind_the_frames_keeps_nothing_of_them(scene, tmp_pa
     def full(*_: object, **__: object) -> None:
         raise OSError(errno.ENOSPC, "No space left on device")
 
-    monkeypatch.setattr(frame_cache.np, "savez", full)
+    monkeypatch.setattr(cached.os, "replace", full)
     refused(write_synchronised(scene, tmp_path / "set"), "the disk is full")
     assert not list(cache.iterdir())
 
@@ -321,11 +321,11 @@ def test_a_cache_that_was_emptied_or_broken_is_one_line_and_made_anew(scene, tmp
     expected = view.image
     for file in cache.glob("*.frames"):
         file.write_bytes(bytes(file.stat().st_size))
-    with pytest.raises(DataError, match="gone or broken"):
+    with pytest.raises(DataError, match="missing or broken"):
         _ = view.image
     for file in cache.glob("*.frames"):
         file.unlink()
-    with pytest.raises(DataError, match="gone or broken"):
+    with pytest.raises(DataError, match="missing or broken"):
         _ = view.image
     np.testing.assert_array_equal(load(folder).train[0].image, expected)
 

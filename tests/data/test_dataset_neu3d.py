@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from videos import write_video
 
-from pd4dgs_codec.data import frame_cache
+from pd4dgs_codec.data import videos as cached
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.data.synthetic import read_synthetic
 from pd4dgs_codec.data.view import Dataset
@@ -21,7 +21,7 @@ BOUNDS = (1.0, 9.0)
 
 @pytest.fixture(autouse=True)
 def cache(tmp_path, monkeypatch) -> None:
-    monkeypatch.setenv(frame_cache.FOLDER, str(tmp_path / "cache"))
+    monkeypatch.setenv(cached.FOLDER, str(tmp_path / "cache"))
 
 
 @pytest.fixture(scope="module")
@@ -97,10 +97,10 @@ def test_faults_are_one_line(scene, tmp_path, monkeypatch):
         np.save(folder / "poses_bounds.npy", poses)
         refused(message)
     np.save(folder / "poses_bounds.npy", np.array([{}]), allow_pickle=True)
-    refused("not a file of numpy")
+    refused("not a .npy file")
     np.save(folder / "poses_bounds.npy", whole)
     with monkeypatch.context() as patch:
-        patch.setenv(frame_cache.SIZE, "1e-6")
+        patch.setenv(cached.SIZE, "1e-6")
         refused("expected a larger PD4DGS_CACHE_GIB or a larger --downscale")
     write_video(folder / "cam01.mp4", [view.image for view in _views(scene, 1)[:3]], FPS)
     refused("cam01.mp4: has 3 frames at 12 per second and cam00.mp4 5")

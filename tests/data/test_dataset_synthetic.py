@@ -8,7 +8,7 @@ import pytest
 from pd4dgs_codec.data import synthetic as syn
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.data.raycast import NO_BODY, Eye, enter, place
-from pd4dgs_codec.data.scenes import MOTIONS, SceneBuilder
+from pd4dgs_codec.data.synthetic import MOTIONS, SceneBuilder
 
 INSIDE = {
     "sphere": lambda m: (m**2).sum(axis=0) <= 1,

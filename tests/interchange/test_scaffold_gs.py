@@ -225,7 +225,7 @@ def test_folders_that_are_none(tmp_path, cli):
     place = Checkpoint().write(tmp_path / "run")
     assert "has no iteration_7" in _fails(tmp_path, cli, "--iteration", 7)
     (place / "cov_mlp.pt").unlink()
-    assert "cov_mlp.pt: missing" in _fails(tmp_path, cli)
+    assert "cov_mlp.pt: cannot be read" in _fails(tmp_path, cli)
     (place / "cov_mlp.pt").write_bytes(b"no archive")
     assert "cov_mlp.pt: not a zip archive of tensors" in _fails(tmp_path, cli)
     torch.jit.trace(nn.Sequential(nn.Linear(35, F), nn.GELU(), nn.Linear(F, 7 * K)), torch.zeros(1, 35)).save(
