@@ -63,7 +63,7 @@ def watch(learner: Learner, stopwatch: Stopwatch) -> None:
         (losses.Neighbours, "draw", "mask terms"),
         (torch.autograd, "backward", "backward, the rest"),
         (torch.autograd, "grad", "backward, the rest"),
-        (learner.densifier, "observe", "growing: statistics"),
+        (learner.grow, "observe", "growing: statistics"),
         (learner.optimiser, "gradient_norm", "gradient norm"),
         (learner.optimiser, "step", "Adam"),
     ):

@@ -20,7 +20,7 @@ from imageio_ffmpeg import get_ffmpeg_exe
 
 from pd4dgs_codec.data import videos
 from pd4dgs_codec.data.dataset import load
-from pd4dgs_codec.train.shot import Shots
+from pd4dgs_codec.train.state import TrainingViews
 
 FPS = 30
 
@@ -48,7 +48,7 @@ def main(frames: int, size: str) -> None:
         begun, before = time.monotonic(), memory("VmRSS")
         data = load(folder)
         read = time.monotonic()
-        shots, marks = Shots(data.train, torch.device("cpu")), []
+        shots, marks = TrainingViews(data.train, torch.device("cpu")), []
         order = np.random.default_rng(0).permutation(len(shots))
         for k, index in enumerate(order):
             assert shots[int(index)].target.image.shape == (height, width, 3)

@@ -291,7 +291,7 @@ def _summary(args: argparse.Namespace, trainer: Trainer) -> dict[str, Any]:
         "finished": trainer.finished,
         "interrupted": trainer.interrupted,
         "seconds": round(trainer.seconds, 3),
-        "phases_not_reached": learner.schedule.phases_not_reached(learner.place),
+        "phases_not_reached": learner.schedule.phases_not_reached(learner.position),
         "skipped": learner.skipped,
         "left_out": learner.left_out,
         "anchors": len(trainer.model.anchor_q),

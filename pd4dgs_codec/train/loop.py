@@ -1,17 +1,22 @@
-"""The run of a training: steps until its end, its time limit or a signal; log, curve of quality, checkpoints."""
+"""A training run: steps until its end, its time limit or a signal; log, curve of quality, checkpoints."""
 
 from __future__ import annotations
 
+import contextlib
 import json
+import signal
+import threading
 import time
 from pathlib import Path
 from statistics import median
+from types import FrameType
 from typing import Any, Protocol
 
 import torch
 
 from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.errors import DataError, TrainError
+from pd4dgs_codec.io import finite
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import ModelConfig
 from pd4dgs_codec.model.model import Model
@@ -19,15 +24,13 @@ from pd4dgs_codec.threads import one_torch_thread
 from pd4dgs_codec.train import workers
 from pd4dgs_codec.train.config import DEFAULT_ITERATIONS, TrainConfig
 from pd4dgs_codec.train.learner import Learner
-from pd4dgs_codec.train.log import RecordLog
 from pd4dgs_codec.train.schedule import COARSE_SHARE, Schedule
-from pd4dgs_codec.train.stop import StopRequest
 
-#: A timed run settles the N of its schedule after so many steps; a slow one once it has spent the share of the limit
-#: that is the coarse phase's, but not before the fewer steps, of which the first ones compile.
+#: A timed run settles the N of its schedule after TIMED_STEPS; a slow one once it has spent the coarse phase's share of
+#: the limit, but not before FEWEST_TIMED_STEPS, of which the first ones compile.
 TIMED_STEPS = 50
 FEWEST_TIMED_STEPS = 5
-#: Mean cost of a step over a run against that of its first ones, which are all of level 0.
+#: Mean cost of a step over a run relative to its first steps, which are all of level 0.
 LATER_COST = 1.5
 #: Held-out evaluations over a run, for the curve of quality against wall time, and views in each.
 CURVE_POINTS = 12
@@ -35,22 +38,22 @@ CURVE_VIEWS = 6
 
 
 class Progress(Protocol):
-    """What a run tells of its steps to whoever watches."""
+    """An observer of a run."""
 
     def update(self, trainer: Trainer, record: dict[str, Any]) -> None:
         """Called after every step with its log record."""
 
     def close(self) -> None:
-        """Called once, after the last step or what ended the run."""
+        """Called once, when the run ends or raises."""
 
 
 class Trainer:
     """A run in progress; `run` carries it to its end.
 
-    A run with a number of steps goes through its schedule step by step; a time limit besides cuts it. A timed run, with
-    a limit alone, goes through it by the clock: each step takes it on by the share of what is left of the schedule that
-    the step took of what is left of the time. Its N is what it would take on a machine that stays as it was in the
-    first steps; it decides whether the run is long enough to prune and to judge, not when the run ends.
+    A run with a number of steps goes through its schedule step by step, and a time limit stops it early. A timed run,
+    with a limit only, goes through it by the clock: each step advances it by the share of the remaining schedule that
+    the step took of the remaining time. Its N, the steps it would take at the pace of its first ones, decides whether
+    the run is long enough to prune and to select levels, but not when it ends.
 
     learner: the model and its steps. seconds: of training, those before a resumption included. curve: quality against
     time, a row for each evaluation. interrupted: a signal ended the last `run`.
@@ -64,7 +67,7 @@ class Trainer:
         self.learner = Learner(config, dataset, Schedule(total), torch.device(device), size)
         self.learner.share = 0.0 if self.timed else None
         self._costs: list[float] = []  #: seconds of the steps from which a timed run settles N
-        self._step = self._evaluation = 0.0  #: seconds that the last step and the last evaluation took
+        self._step = self._evaluation = 0.0  #: seconds of the last step and of the last evaluation
         self.seconds = 0.0
         self.interrupted = False
         self.curve: list[dict[str, Any]] = []
@@ -81,23 +84,22 @@ class Trainer:
 
     @property
     def total(self) -> int | None:
-        """N of the schedule: the steps of the whole run, about those of a timed one; None where it is not settled."""
+        """N of the schedule: the steps of the whole run, approximate in a timed one; None until it is settled."""
         return self.learner.schedule.iterations
 
     @property
     def finished(self) -> bool:
         """Whether the whole schedule is done."""
-        return self.total is not None and self.learner.place >= self.total
+        return self.total is not None and self.learner.position >= self.total
 
     def run(
         self, output: Path, *, log: Path | None = None, progress: Progress | None = None, save_every: float = 60.0
     ) -> None:
-        """Trains to the end, to the time limit, or to Ctrl-C or SIGTERM, which end it after the step in hand and set
-        `interrupted`; `output` holds a whole checkpoint then.
+        """Trains to the end, to the time limit, or to Ctrl-C or SIGTERM, which end the run after the current step and
+        set `interrupted`; in each case `output` holds a complete checkpoint.
 
         A second signal raises KeyboardInterrupt at once: `output` stays as last saved. save_every: seconds. Raises
-        DataError for a checkpoint that cannot be written, or for such a log, in which case the checkpoint is saved
-        first.
+        DataError if the checkpoint cannot be written, or the log, in which case the checkpoint is saved first.
         """
         with StopRequest() as stop, one_torch_thread():
             records = RecordLog(log)
@@ -108,7 +110,7 @@ class Trainer:
                 if progress:
                     progress.close()
             if self.config.noise and self.finished:
-                self.model.round_to_steps()  # what the end of the run rendered, and what the file will hold
+                self.model.round_to_steps()  # as the end of the run rendered it and the file will hold it
             self.save(output)
         self.interrupted = stop.requested
         if records.failure:
@@ -117,21 +119,17 @@ class Trainer:
     def _steps(
         self, output: Path, stop: StopRequest, records: RecordLog, progress: Progress | None, save_every: float
     ) -> None:
-        """Steps until one of the ends of `run`; a record that cannot be logged is one too."""
-        saved = told = time.monotonic()
+        """Steps until the run ends; a record that cannot be logged ends it too."""
+        saved = now = time.monotonic()
         while not self.finished:
-            place = self.learner.place
+            position = self.learner.position
             record = self.learner.step()
-            told, begun = time.monotonic(), told
-            late = self._spend(*workers.largest(told - begun))  # one clock for all workers
-            if self._curve_due(place):
-                record["held_out_psnr"] = workers.alike(self._level_psnr)
-                self.curve.append(
-                    {"iteration": self.iteration, "seconds": self.seconds, "psnr": record["held_out_psnr"]}
-                )
-                record["plane_bits"] = self.learner.plane_bits()
-                told, begun = time.monotonic(), told
-                (self._evaluation,) = workers.largest(told - begun)
+            now, begun = time.monotonic(), now
+            late = self._spend(*workers.largest(now - begun))  # one clock for all workers
+            if self._curve_due(position):
+                self._evaluate(record)
+                now, begun = time.monotonic(), now
+                (self._evaluation,) = workers.largest(now - begun)
                 self.seconds += self._evaluation
             logged = records.write(record | {"seconds": round(self.seconds, 3)})
             if progress:
@@ -143,10 +141,10 @@ class Trainer:
                 break
 
     def _spend(self, seconds: float) -> bool:
-        """Counts the time of a step; a timed run moves on in its schedule. Returns whether the limit is reached."""
+        """Counts the time of a step; a timed run advances in its schedule. Returns whether the limit is reached."""
         begun, limit = self.seconds, self.config.max_seconds
         self.seconds += seconds
-        usual, self._step = min(seconds, self._step), seconds  # a pause is not taken for what the next step will cost
+        usual, self._step = min(seconds, self._step), seconds  # a pause does not predict the cost of the next step
         if not (self.timed and limit):
             return limit is not None and self.seconds >= limit
         if self.total is None:
@@ -159,24 +157,28 @@ class Trainer:
         if seconds < left:
             self.learner.share = share + (1 - share) * seconds / left
             return False
-        if self.learner.place >= self.learner.schedule.exact_rounding:  # else the run is cut, and says so
+        if self.learner.position >= self.learner.schedule.exact_rounding:  # else the run stops early and says so
             self.learner.share = 1.0
         return True
 
     def _curve_due(self, before: int) -> bool:
-        """Whether the step that began at place `before` ended at or past a point of the curve."""
+        """Whether the step that began at position `before` ended at or past a point of the curve."""
         if self.total is None:
             return False
         every = max(1, self.total // CURVE_POINTS)
-        return self.finished or self.learner.place // every > before // every
+        return self.finished or self.learner.position // every > before // every
 
-    def _level_psnr(self) -> list[float]:
-        """Mean PSNR per level on a few held-out views (training views if none are held out)."""
+    def _evaluate(self, record: dict[str, Any]) -> None:
+        """Adds a point to the curve: mean PSNR per level on a few held-out views, or training views if there are
+        none."""
         views = self.dataset.test or self.dataset.train
-        return self.learner.level_psnr(views[:: max(1, len(views) // CURVE_VIEWS)][:CURVE_VIEWS])
+        chosen = views[:: max(1, len(views) // CURVE_VIEWS)][:CURVE_VIEWS]
+        record["held_out_psnr"] = psnr = workers.alike(lambda: self.learner.level_psnr(chosen))
+        self.curve.append({"iteration": self.iteration, "seconds": self.seconds, "psnr": psnr})
+        record["plane_bits"] = self.learner.plane_bits()
 
     def save(self, path: Path) -> None:
-        """Writes the checkpoint with all that resuming needs; of several workers the first one does."""
+        """Writes the checkpoint with all that resuming needs; of several workers only the first one writes."""
         if workers.rank():
             return
         training = {
@@ -188,9 +190,9 @@ class Trainer:
         checkpoint.save(path, self.model, training | self.learner.state())
 
     def resume(self, path: Path) -> None:
-        """Goes on from a checkpoint of the same configuration and data.
+        """Continues from a checkpoint of the same configuration and data.
 
-        TrainError if it holds no training state, DataError if that state is broken or of other data.
+        Raises TrainError if it holds no training state, DataError if that state is broken or of other data.
         """
         model, training = checkpoint.load(path)
         if "optimiser" not in training:
@@ -199,10 +201,75 @@ class Trainer:
             self.learner.restore(model, training)
             self.seconds, self.curve = float(training["seconds"]), list(json.loads(training["curve"]))
         except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
-            reason = " ".join(f"{type(error).__name__}: {error}".split())  # torch explains itself over several lines
+            reason = " ".join(f"{type(error).__name__}: {error}".split())  # torch's messages have several lines
             raise DataError(f"{path}: its training state cannot be read: {reason}") from None
         order, count = self.learner.order, len(self.dataset.train)
         if not all(0 <= index < count for index in order):
             raise DataError(
                 f"{path}: its next views are {order[:8]}, found {count} training views; expected the same data"
             )
+
+
+class RecordLog:
+    """A log with a line of JSON per record, appended to the file `path`; none if it is None.
+
+    failure: why a record could not be written, or None; the run saves its checkpoint before it raises that.
+    """
+
+    def __init__(self, path: Path | None):
+        """Raises DataError if the file cannot be opened."""
+        self.path = path
+        self.failure: DataError | None = None
+        try:
+            # line-buffered, so that a failed write shows at its step
+            self._stream = open(path, "a", encoding="utf-8", buffering=1) if path else None
+        except OSError as error:
+            raise self._error(error) from None
+
+    def write(self, record: dict[str, Any]) -> bool:
+        """Whether the record is in the log, if there is one."""
+        try:
+            if self._stream:
+                self._stream.write(json.dumps(finite(record), allow_nan=False) + "\n")
+        except OSError as error:
+            self.failure = self._error(error)
+        return self.failure is None
+
+    def close(self) -> None:
+        """Closes the file; a failed write has been reported by `failure`."""
+        if self._stream:
+            with contextlib.suppress(OSError):
+                self._stream.close()
+
+    def _error(self, error: OSError) -> DataError:
+        return DataError(f"{self.path}: the log cannot be written: {error.strerror or error}")
+
+
+class StopRequest:
+    """A context in which the first Ctrl-C or SIGTERM sets `requested` and every further one raises KeyboardInterrupt.
+
+    Signals that the process ignores stay ignored. Outside the main thread, where Python allows no handlers, nothing
+    changes.
+    """
+
+    SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._before: dict[signal.Signals, Any] = {}
+
+    def __enter__(self) -> StopRequest:
+        if threading.current_thread() is threading.main_thread():
+            for number in self.SIGNALS:
+                if signal.getsignal(number) is not signal.SIG_IGN:
+                    self._before[number] = signal.signal(number, self._received)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)
+
+    def _received(self, number: int, frame: FrameType | None) -> None:
+        if self.requested:
+            raise KeyboardInterrupt
+        self.requested = True

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from typing import Any
 
 #: Probabilities of the levels 0, 1, 2.
 UNIFORM = (1 / 3, 1 / 3, 1 / 3)
 CAPACITY_WEIGHTED = (0.15, 0.30, 0.55)
 TOP = (0.0, 0.0, 1.0)
+#: Weight of the past in the moving average rho.
+RHO_DECAY = 0.95
 #: Share of a run in which level 0 alone is trained.
 COARSE_SHARE = 1 / 10
 #: Rounds in which anchors of little use are pruned; each anchor can be pruned in one of them.
@@ -126,3 +129,14 @@ def rollout_probabilities(rho: float) -> tuple[float, float, float]:
     """pi(rho) = (1 - rho) (1/3, 1/3, 1/3) + rho (.15, .30, .55), of the levels 0, 1, 2."""
     low, mid, high = ((1 - rho) * u + rho * c for u, c in zip(UNIFORM, CAPACITY_WEIGHTED, strict=True))
     return low, mid, high
+
+
+def sample_level(probabilities: tuple[float, float, float], draw: float) -> int:
+    """The level at `draw`, uniform in 0..1."""
+    return 0 if draw < probabilities[0] else 1 if draw < probabilities[0] + probabilities[1] else 2
+
+
+def updated_rho(rho: float, mask_0: Any, mask_2: Any) -> float:
+    """0.95 rho + 0.05 mean(m^(2) - m^(0)) of two tensors of masks, within [0, 1]."""
+    sample = float((mask_2 - mask_0).mean()) if len(mask_0) else 0.0
+    return min(max(RHO_DECAY * rho + (1 - RHO_DECAY) * sample, 0.0), 1.0)

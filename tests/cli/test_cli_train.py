@@ -234,23 +234,6 @@ def test_links_and_devices_stay_what_they_are(train, tmp_path):
     assert result.code == 1 and "not a regular file" in result.err and (tmp_path / "pipe").is_fifo()
 
 
-def test_stored_steps_come_back_as_steps():
-    from dataclasses import replace
-
-    from pd4dgs_codec.scene import Steps
-    from pd4dgs_codec.train.config import TrainConfig
-
-    config = replace(TrainConfig(), steps=Steps(feature=0.25), iterations=7)
-    assert TrainConfig.from_json(json.dumps(config, default=lambda value: value.__dict__), "m.pt") == config
-
-
-def test_a_run_from_before_a_part_of_the_method_goes_on_without_it():
-    from pd4dgs_codec.train.config import TrainConfig
-
-    config = TrainConfig.from_json('{"preset": "tiny"}', "m.pt")
-    assert (config.preset, config.judge, config.tmc_binary_growth, config.noise) == ("tiny", False, 1.0, True)
-
-
 KILLED = """
 import json, os, signal, sys
 from tiny import TINY

@@ -19,7 +19,7 @@ from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.data.synthetic import read_synthetic
 from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.train.shot import Shots
+from pd4dgs_codec.train.state import TrainingViews
 
 pytest.importorskip("imageio_ffmpeg")
 COUNT = 12
@@ -334,10 +334,10 @@ def test_shots_are_kept_within_their_bytes(scene, monkeypatch):
     import torch
 
     views = scene.train[:6]
-    whole = Shots(views, torch.device("cpu"))
+    whole = TrainingViews(views, torch.device("cpu"))
     size = whole[0].target.image.nbytes + whole[0].target.weights.nbytes
-    monkeypatch.setattr("pd4dgs_codec.train.shot.KEPT_BYTES", 2 * size)
-    few = Shots(views, torch.device("cpu"))
+    monkeypatch.setattr("pd4dgs_codec.train.state.KEPT_BYTES", 2 * size)
+    few = TrainingViews(views, torch.device("cpu"))
     for index in (0, 1, 0, 5, 0, 2):
         assert torch.equal(few[index].target.image, whole[index].target.image)
     assert set(few._kept) == {0, 2} and few._bytes == 2 * size

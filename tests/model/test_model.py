@@ -30,7 +30,7 @@ from pd4dgs_codec.scene import (
     SceneInfo,
     Steps,
 )
-from pd4dgs_codec.train.grading import centre
+from pd4dgs_codec.train.phases.quantisation import centre
 
 WIDTH, HEIGHT = 40, 30
 VOXEL = 2.0**-6

@@ -8,13 +8,13 @@ from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.quality.level_psnr import level_psnr
 from pd4dgs_codec.quality.train_rate import train_rate_bits
-from pd4dgs_codec.train import pruning
+from pd4dgs_codec.train import phases
 from pd4dgs_codec.train.config import TrainConfig, at_quality
 from pd4dgs_codec.train.loop import Trainer
 
 
 def test_bytes_rise_with_the_dial(dataset, tmp_path, monkeypatch):
-    monkeypatch.setattr(pruning, "MIN_ITERATIONS", 10)
+    monkeypatch.setattr(phases, "MIN_ITERATIONS", 10)
     files, sizes, psnr = [], [], []
     for quality in (0, 50, 100):
         trainer = Trainer(TrainConfig(preset="tiny", iterations=150, **at_quality(quality)), dataset)

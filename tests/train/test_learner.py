@@ -53,7 +53,7 @@ def test_until_n_is_known_steps_stay_in_the_coarse_phase(dataset):
     records = [steps.step() for _ in range(45)]
     assert all(r["level"] == 0 and "rate" not in r and "grown" not in r for r in records)
     assert [r["iteration"] for r in records if "active" in r] == [0]
-    assert steps.densifier.anchor_visits.sum() == 0 and steps.state()["total"] == 0
+    assert steps.statistics["anchor_visits"].sum() == 0 and steps.state()["total"] == 0
     assert steps.optimiser.rate["feature"] == 7.5e-3
     steps.schedule = Schedule(60)
     assert "rate" in steps.step()
@@ -108,9 +108,9 @@ def test_a_step_gathers_the_gradients_of_all_its_terms(dataset, level):
     steps.generator.set_state(state)
     steps.noise.generator.set_state(noise)
 
-    _, _, loss = steps.picture_loss(index, level, steps._rounding())
+    _, _, loss = steps.picture_loss(index, level, steps.rounding())
     of_model, fields = steps.model_loss, steps.model.deformations
-    own, place = {name: getattr(steps.model, name) for name in PER_ANCHOR}, steps.place
+    own, place = {name: getattr(steps.model, name) for name in PER_ANCHOR}, steps.position
     terms = list(of_model._mask_terms(steps.model, level, own, steps.schedule.separation(place)))
     for layer in range(1, level + 1):
         planes, step = fields[layer].planes, steps.model.steps.planes(layer)

@@ -15,10 +15,10 @@ from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import DataError, TrainError
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.convert import to_scene
-from pd4dgs_codec.train import loop, pruning
+from pd4dgs_codec.train import loop, phases
 from pd4dgs_codec.train.config import ABLATIONS, TrainConfig
-from pd4dgs_codec.train.log import RecordLog
-from pd4dgs_codec.train.loop import Trainer
+from pd4dgs_codec.train.loop import RecordLog, Trainer
+from pd4dgs_codec.train.phases.prune import Prune
 from pd4dgs_codec.train.schedule import PRUNING_ROUNDS, Schedule
 
 
@@ -110,7 +110,7 @@ MACHINES = {
 def timed(dataset, monkeypatch, clock, machine, limit: float = LIMIT) -> Trainer:
     """A timed run whose steps and evaluations take the clock's time, and which is never too short to prune."""
     monkeypatch.setattr(loop, "TIMED_STEPS", 6)
-    monkeypatch.setattr(pruning, "MIN_ITERATIONS", 0)
+    monkeypatch.setattr(phases, "MIN_ITERATIONS", 0)
     trainer = Trainer(TrainConfig(preset="tiny", max_seconds=limit), dataset)
     step, level_psnr, begun = trainer.learner.step, trainer.learner.level_psnr, clock.now
 
@@ -131,8 +131,8 @@ def timed(dataset, monkeypatch, clock, machine, limit: float = LIMIT) -> Trainer
 
 @pytest.mark.parametrize("machine", MACHINES)
 def test_a_time_limit_is_kept_and_the_schedule_completes(dataset, tmp_path, monkeypatch, clock, machine):
-    turns, prune = [], pruning.prune
-    monkeypatch.setattr(pruning, "prune", lambda *args: turns.append(args[5]) or prune(*args))
+    turns, apply = [], Prune.apply
+    monkeypatch.setattr(Prune, "apply", lambda self, *args: turns.append(self.turn) or apply(self, *args))
     trainer, begun = timed(dataset, monkeypatch, clock, machine), clock.now
     trainer.run(tmp_path / "m.pt", log=tmp_path / "log.jsonl")
     assert trainer.seconds == pytest.approx(clock.now - begun) == pytest.approx(LIMIT, rel=0.03)
@@ -171,7 +171,7 @@ def test_a_resumed_timed_run_spends_what_is_left(dataset, tmp_path, monkeypatch,
     assert second.finished and second.seconds == pytest.approx(limit, rel=0.03)
     assert second.seconds - first.seconds == pytest.approx(clock.now - begun)
     places = [r["place"] for r in read_log(tmp_path / "log.jsonl")]
-    assert places == sorted(places) and places[0] == first.learner.place
+    assert places == sorted(places) and places[0] == first.learner.position
 
 
 def test_a_pause_beyond_the_limit_leaves_a_cut_run_that_says_so(dataset, tmp_path, monkeypatch, clock):
@@ -185,7 +185,7 @@ def test_a_pause_beyond_the_limit_leaves_a_cut_run_that_says_so(dataset, tmp_pat
     monkeypatch.setattr(trainer.learner, "step", stopped)
     trainer.run(tmp_path / "m.pt")
     assert not trainer.finished
-    assert "exact rounding of attributes" in trainer.learner.schedule.phases_not_reached(trainer.learner.place)
+    assert "exact rounding of attributes" in trainer.learner.schedule.phases_not_reached(trainer.learner.position)
 
 
 def test_a_run_is_cut_at_its_limit(dataset, tmp_path, monkeypatch, clock):

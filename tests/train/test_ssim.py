@@ -10,7 +10,7 @@ import torch
 
 from pd4dgs_codec import threads
 from pd4dgs_codec.errors import TrainError
-from pd4dgs_codec.train.ssim import TargetStats, image_loss, image_loss_reference
+from pd4dgs_codec.train.ssim import Target, image_loss, image_loss_reference
 
 
 def pair(height, width, dtype=torch.float32, masked=False, seed=0):
@@ -34,7 +34,7 @@ def terms_and_gradient(terms, image, weights=(0.8, 0.2)):
 def test_kernel_equals_reference(size, masked):
     """float32 kernels, the one form that training has, and the reference in float64."""
     image, target, mask = pair(*size, masked=masked)
-    stats, wide = TargetStats(target, mask), image.detach().double().requires_grad_()
+    stats, wide = Target(target, mask), image.detach().double().requires_grad_()
     for weights in ((0.8, 0.2), (0.0, 1.0)):
         fast = terms_and_gradient(image_loss(image, stats), image, weights)
         exact = image_loss_reference(wide, target.double(), stats.weights.double())
@@ -46,7 +46,7 @@ def test_kernel_equals_reference(size, masked):
 
 def test_gradcheck():
     image, target, mask = pair(4, 5, torch.float64, masked=True)
-    weights = TargetStats(target, mask).weights
+    weights = Target(target, mask).weights
     torch.autograd.gradcheck(lambda x: image_loss_reference(x, target, weights), (image,), eps=1e-6)
 
 
@@ -65,14 +65,14 @@ def test_by_definition():
             cov = (window * a * b).sum() - ma * mb
             ssim = (2 * ma * mb + 1e-4) * (2 * cov + 9e-4) / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4))
             l1, dissimilarity, count = l1 + abs(a[5, 5] - b[5, 5]), dissimilarity + 1 - ssim, count + 1
-    found = [float(term.detach()) for term in image_loss_reference(image, target, TargetStats(target, mask).weights)]
+    found = [float(term.detach()) for term in image_loss_reference(image, target, Target(target, mask).weights)]
     assert found == pytest.approx([l1 / count, dissimilarity / count], rel=1e-9)
 
 
 def test_equal_images_cost_nothing():
     _, target, _ = pair(20, 30)
     image = target.clone().requires_grad_()
-    l1, dissimilarity, gradient = terms_and_gradient(image_loss(image, TargetStats(target)), image)
+    l1, dissimilarity, gradient = terms_and_gradient(image_loss(image, Target(target)), image)
     assert float(l1) == 0 and abs(float(dissimilarity)) < 1e-6 and gradient.abs().max() < 1e-6
 
 
@@ -80,7 +80,7 @@ def test_masked_pixels_out_of_reach_do_not_matter():
     image, target, _ = pair(16, 40)
     mask = torch.ones(16, 40)
     mask[:, 20:] = 0
-    stats = TargetStats(target, mask)
+    stats = Target(target, mask)
     before = terms_and_gradient(image_loss(image, stats), image)
     changed = image.detach().clone()
     changed[:, 25:] += 1
@@ -98,7 +98,7 @@ def test_threads_change_nothing():
     try:
         for count in (1, 2):
             threads.set_kernel_threads(count)
-            runs.append(terms_and_gradient(image_loss(image, TargetStats(target, mask)), image))
+            runs.append(terms_and_gradient(image_loss(image, Target(target, mask)), image))
     finally:
         threads.set_kernel_threads(before)
     assert all(torch.equal(a, b) for a, b in zip(*runs, strict=True))
@@ -106,24 +106,24 @@ def test_threads_change_nothing():
 
 def test_hard_input():
     image, target, _ = pair(12, 14)
-    nothing = terms_and_gradient(image_loss(image, TargetStats(target, torch.zeros(12, 14))), image)
+    nothing = terms_and_gradient(image_loss(image, Target(target, torch.zeros(12, 14))), image)
     assert all(term.eq(0).all() for term in nothing)
     with torch.no_grad():
         image[3, 4, 1] = torch.nan
-    broken = terms_and_gradient(image_loss(image, TargetStats(target)), image)
+    broken = terms_and_gradient(image_loss(image, Target(target)), image)
     assert broken[0].isnan() and broken[1].isnan() and broken[2][3, 4, 1].isnan()
-    transposed = image_loss(target.transpose(0, 1), TargetStats(target.transpose(0, 1)))
+    transposed = image_loss(target.transpose(0, 1), Target(target.transpose(0, 1)))
     assert float(transposed[0]) == 0
 
 
 def test_errors():
     _, target, _ = pair(12, 14)
     with pytest.raises(TrainError, match=r"\(5, 14, 3\)"):
-        image_loss(target[:5], TargetStats(target))
+        image_loss(target[:5], Target(target))
     with pytest.raises(TrainError, match="mask"):
-        TargetStats(target, torch.ones(14, 12))
+        Target(target, torch.ones(14, 12))
     with pytest.raises(TrainError, match="float"):
-        TargetStats((255 * target).to(torch.uint8))
+        Target((255 * target).to(torch.uint8))
 
 
 MOMENTS = """
@@ -131,7 +131,7 @@ from pd4dgs_codec import threads
 threads.configure(1)
 import hashlib
 import numpy as np
-from pd4dgs_codec.train import ssim_kernels as kernels
+from pd4dgs_codec.train import ssim as kernels
 image = kernels.pad(np.random.default_rng(0).random((24, 32, 3), dtype=np.float32))
 found = np.zeros((2, 24, kernels.lanes(32)), np.float32)
 kernels.target_moments(found[0], found[1], image, kernels.TAPS.astype(np.float32))

@@ -1,0 +1,35 @@
+"""The phases of a training run, one module each: what a run does to its model once or a few times, between steps."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+from pd4dgs_codec.train.state import TrainState
+
+#: Shorter runs have no phase that measures pictures: their models have not converged far enough half way.
+MIN_ITERATIONS = 500
+
+
+class Phase:
+    """One phase; Learner asks each in turn before a step (growing, after its update)."""
+
+    def due(self, state: TrainState) -> bool:
+        """Whether the phase acts at this step of the schedule."""
+        raise NotImplementedError
+
+    def apply(self, state: TrainState, record: dict[str, Any]) -> None:
+        """Changes the model and adds to the step's log record. Raises NotFinite if the model has diverged."""
+        raise NotImplementedError
+
+    def stored(self) -> dict[str, Any]:
+        """What a checkpoint holds of it, so that a resumed run continues the same."""
+        return {}
+
+    def restore(self, stored: Mapping[str, Any]) -> None:
+        """The inverse of `stored`; keys may be missing in checkpoints of earlier versions."""
+
+
+def long_enough(state: TrainState) -> bool:
+    """Whether the run has phases that measure pictures."""
+    return (state.schedule.iterations or 0) >= MIN_ITERATIONS

@@ -1,0 +1,161 @@
+"""Growing and pruning of anchors as in Scaffold-GS: grow where image gradients are large, prune what is transparent."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pd4dgs_codec.model.model import Model
+from pd4dgs_codec.model.picture import Picture
+from pd4dgs_codec.scene import MASK_THRESHOLD
+from pd4dgs_codec.train import workers
+from pd4dgs_codec.train.initialise import fresh_mask_logits
+from pd4dgs_codec.train.phases import Phase
+from pd4dgs_codec.train.state import TrainState, fresh_statistics
+
+#: Cell sizes of the growing levels, in voxels, coarse to fine; the gradient threshold doubles from one to the next.
+CELLS = (16, 4, 1)
+#: An anchor is pruned when its mean summed opacity per visit is below this ...
+MIN_MEAN_OPACITY = 0.005
+#: ... over at least this many visits; a Gaussian's gradient counts after at least so many.
+MIN_ANCHOR_VISITS = 40
+MIN_SLOT_VISITS = 10
+
+Cells = tuple[Tensor, Tensor]  #: int64 [n, 4] voxel cell and cell size; float [n, D] feature
+
+
+class Grow(Phase):
+    """Collects statistics from every picture of the first half of a run, and adjusts the anchors at intervals."""
+
+    def due(self, state: TrainState) -> bool:
+        """At the positions of `Schedule.grow`."""
+        return any(map(state.reached, state.schedule.grow))
+
+    @torch.no_grad()
+    def observe(self, state: TrainState, pictures: Sequence[Picture]) -> None:
+        """Adds the statistics of a step's pictures, after their backward passes; of all workers' pictures."""
+        if state.schedule.iterations is None or state.position > state.schedule.grow.stop:
+            return
+        found = state.statistics
+        if workers.count() > 1:
+            found = fresh_statistics(*found["pull"].shape)
+        for picture in pictures:
+            _add(found, picture, state.config.views_per_step)
+        if workers.count() > 1:
+            workers.add_up(list(found.values()))
+            state.statistics = {name: value + found[name] for name, value in state.statistics.items()}
+
+    @torch.no_grad()
+    def apply(self, state: TrainState, record: dict[str, Any]) -> None:
+        """Prunes and grows; resets the statistics that were used."""
+        model, statistics = state.model, state.statistics
+        most = state.size.max_anchors
+        visited = statistics["anchor_visits"] >= MIN_ANCHOR_VISITS
+        keep = torch.arange(len(model.anchor_q))
+        if state.position >= state.schedule.coarse_end:  # before, colours are random and opacities fall
+            keep = _opaque(model, statistics, visited)
+        cells = _none(model)
+        if len(model.anchor_q) < most:
+            cells = _new_cells(model, statistics, state.config.grow_threshold, state.generator)
+        record["pruned"] = len(model.anchor_q) - len(keep)
+        added = _anchors(model, *(part[: max(most - len(keep), 0)] for part in cells))
+        used = statistics["visits"] >= MIN_SLOT_VISITS
+        for names, where in ((("opacity", "anchor_visits"), visited), (("pull", "visits"), used)):
+            for name in names:
+                statistics[name][where] = 0
+        state.replace_anchors(keep.to(state.device), added)
+        record["grown"] = len(added["anchor_q"])
+
+
+def _add(statistics: dict[str, Tensor], picture: Picture, views: int) -> None:
+    """The statistics of one picture, whose loss was divided by `views`."""
+    gradient, gaussians = picture.meta["means2d"].grad, picture.gaussians
+    if gradient is None or not len(gaussians.slots):
+        return
+    drawn = (picture.meta["radii"][0] > 0).all(-1)
+    height, width = picture.alpha.shape
+    scale = gradient.new_tensor([0.5 * width, 0.5 * height])  # the threshold is in normalised image units
+    pull = (gradient[0] * views * scale).norm(dim=1)
+    slots = gaussians.slots[drawn].cpu()
+    statistics["pull"].view(-1).index_add_(0, slots, pull[drawn].cpu())
+    statistics["visits"].view(-1).index_add_(0, slots, torch.ones(len(slots)))
+    rows = gaussians.anchors.cpu()
+    statistics["opacity"].index_add_(0, rows, gaussians.raw_opacity.clamp(min=0).sum(1).cpu())
+    statistics["anchor_visits"].index_add_(0, rows, torch.ones(len(rows)))
+
+
+def _opaque(model: Model, statistics: dict[str, Tensor], visited: Tensor) -> Tensor:
+    """int64 [n]: the anchors that show; all if none does."""
+    faint = visited & (statistics["opacity"] < MIN_MEAN_OPACITY * statistics["anchor_visits"])
+    keep = (~faint & (model.masks(2).cpu() > MASK_THRESHOLD)).nonzero()[:, 0]
+    return keep if len(keep) else torch.arange(len(faint))
+
+
+def _anchors(model: Model, cells: Tensor, feature: Tensor) -> dict[str, Tensor]:
+    """The attributes of new anchors."""
+    device, n = model.feature.device, len(cells)
+    size = (cells[:, 3].double() * model.info.voxel_size).float()
+    found = {
+        "anchor_q": cells[:, :3].to(torch.int32),
+        "feature": feature,
+        "scaling_log": size.log()[:, None].repeat(1, 6),
+        "offset": torch.zeros(n, *model.offset.shape[1:]),
+        "mask_logits": fresh_mask_logits(n, model.level),
+    }
+    return {name: value.to(device) for name, value in found.items()}
+
+
+def _none(model: Model) -> Cells:
+    return torch.zeros(0, 4, dtype=torch.int64), torch.zeros(0, model.feature.shape[1])
+
+
+def _new_cells(model: Model, statistics: dict[str, Tensor], threshold: float, generator: torch.Generator) -> Cells:
+    """Free cells where Gaussians have large gradients, the largest first."""
+    mean_pull = (statistics["pull"] / statistics["visits"].clamp(min=1)).flatten()
+    seen = statistics["visits"].flatten() >= MIN_SLOT_VISITS
+    anchor_q, feature = model.anchor_q.cpu(), model.feature.detach().cpu()
+    taken = anchor_q.to(torch.int64)
+    found: list[tuple[Tensor, Tensor, Tensor]] = []
+    for i, size in enumerate(CELLS):
+        wanted = seen & (mean_pull >= threshold * 2**i)
+        wanted &= torch.rand(len(wanted), generator=generator) < 1 - 0.5 ** (i + 1)
+        slots, rows, position = _inside(model, wanted.nonzero()[:, 0])
+        if len(slots) == 0:
+            continue
+        cells = torch.round(position / size).to(torch.int64) * size
+        unique, where = torch.unique(cells, dim=0, return_inverse=True)
+        strength = torch.zeros(len(unique)).scatter_reduce_(0, where, mean_pull[slots], "amax")
+        grown = torch.full((len(unique), feature.shape[1]), -math.inf)
+        grown.scatter_reduce_(0, where[:, None].expand(-1, feature.shape[1]), feature[rows], "amax")
+        occupied = torch.div(taken + size // 2, size, rounding_mode="floor")
+        free = ~_contained(torch.div(unique, size, rounding_mode="floor"), occupied)
+        sized = torch.cat([unique[free], torch.full((int(free.sum()), 1), size)], dim=1)
+        found.append((sized, grown[free], strength[free]))
+        taken = torch.cat([taken, unique[free]])
+    if not found:
+        return _none(model)
+    cells, features, strengths = (torch.cat(parts) for parts in zip(*found, strict=True))
+    order = torch.argsort(strengths, descending=True, stable=True)
+    return cells[order], features[order]
+
+
+def _inside(model: Model, slots: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """(slots, their anchors, float64 [n, 3] their positions in voxels) of those Gaussians that lie near the box."""
+    anchor_q, scaling = model.anchor_q.cpu(), model.scaling_log.detach().cpu().exp()
+    low, high = (torch.from_numpy(model.info.box[i]).double() / model.info.voxel_size for i in (0, 1))
+    reach = 0.5 * (high - low).max()
+    rows = slots // model.widths.slots
+    shift = model.offset.detach().cpu().view(-1, 3)[slots] * scaling[rows, :3]
+    position = anchor_q[rows].double() + shift.double() / model.info.voxel_size
+    inside = ((position > low - reach) & (position < high + reach)).all(1)
+    return slots[inside], rows[inside], position[inside]
+
+
+def _contained(rows: Tensor, among: Tensor) -> Tensor:
+    """bool [n]: which int64 rows [n, 3] occur among `among` [m, 3]."""
+    _, index = torch.unique(torch.cat([rows, among]), dim=0, return_inverse=True)
+    return torch.isin(index[: len(rows)], index[len(rows) :])

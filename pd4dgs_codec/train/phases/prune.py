@@ -1,0 +1,120 @@
+"""Pruning of anchors that pictures depend on little, once growing has ended: they leave the model, or layer 0.
+
+Growing makes more anchors than a scene can use, and masks do not tell which: the rate term lowers all alike, and a
+small mask does not mean a small error. So the error of leaving an anchor out is measured in training views. Of many
+anchors in one place each is redundant, but not all are: in each of several rounds only a part of the anchors, scattered
+over the scene, can be pruned, and the rest is measured again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pd4dgs_codec.model.harm import anchor_harm
+from pd4dgs_codec.model.masks import mask_logits
+from pd4dgs_codec.model.model import Model
+from pd4dgs_codec.model.rounding import Rounding
+from pd4dgs_codec.scene import MASK_THRESHOLD
+from pd4dgs_codec.train import workers
+from pd4dgs_codec.train.phases import Phase, long_enough
+from pd4dgs_codec.train.phases.levels import held_back_views
+from pd4dgs_codec.train.schedule import PRUNING_ROUNDS
+from pd4dgs_codec.train.state import TrainingView, TrainState
+
+#: Training views in which an anchor is measured; in each round others.
+VIEWS = 24
+#: Mask of an anchor at a level that it has left: below the threshold, so that it is neither drawn there nor coded.
+ABSENT = 1e-3
+
+#: `anchor_harm` or `step_harm`.
+ErrorOf = Callable[..., tuple[Tensor, Tensor, Tensor]]
+
+
+class Prune(Phase):
+    """One round of PRUNING_ROUNDS.
+
+    Removes the anchors whose absence together adds at most a share of the squared error to any of the trained levels,
+    then removes from level 0 those whose absence adds as much there. Only anchors whose `round_of` is this round's are
+    concerned. Anchors that no view shows stay, and all do if none would be left.
+    """
+
+    def __init__(self, turn: int):
+        self.turn = turn
+
+    def due(self, state: TrainState) -> bool:
+        """At its position of `Schedule.prune`."""
+        starts = state.schedule.prune if state.config.prune and long_enough(state) else range(0)
+        return bool(starts) and state.reached(starts[self.turn])
+
+    def apply(self, state: TrainState, record: dict[str, Any]) -> None:
+        """Logs how many anchors left the model and how many left layer 0."""
+        model, levels = state.model, state.trained_levels()
+        share, before = state.config.prune / PRUNING_ROUNDS, len(state.model.anchor_q)
+        views, rounding = self._views(state), state.rounding(noisy=False)
+        errors = workers.alike(
+            lambda: torch.stack([added_error(model, level, views, rounding, anchor_harm) for level in levels])
+        )
+        errors[:, round_of(model.anchor_q) != self.turn] = torch.inf
+        redundant = least(errors.amax(0), share)
+        keep = (~redundant | redundant.all()).nonzero()[:, 0]
+        state.keep_anchors(keep)
+        later = least(errors[0, keep], share)
+        stays = (model.masks(0) > MASK_THRESHOLD) & ~later
+        if levels[0] > 0 or model.level == 0 or not stays.any():
+            later[:] = False
+        else:
+            _leave_level_0(model, later)
+        record["left_model"] = record.get("left_model", 0) + before - len(keep)
+        record["left_level_0"] = record.get("left_level_0", 0) + int(later.sum())
+
+    def _views(self, state: TrainState) -> list[TrainingView]:
+        held_back = held_back_views(state)
+        order = [i for i in range(len(state.views)) if i not in held_back]
+        stride = -(-len(order) // VIEWS)
+        return [state.views[i] for i in order[self.turn % stride :: stride]]
+
+
+def added_error(
+    model: Model, level: int, views: Sequence[TrainingView], rounding: Rounding, error_of: ErrorOf
+) -> Tensor:
+    """float64 [N]: the squared error over `views` that `error_of` says each anchor adds at `level`, relative to the
+    present error. Infinite where no view shows the anchor."""
+    n, device = len(model.anchor_q), model.feature.device
+    total = torch.zeros(n, dtype=torch.float64, device=device)
+    met = torch.zeros(n, dtype=torch.bool, device=device)
+    error, generator = 0.0, torch.Generator().manual_seed(0)
+    for view in views:
+        weights, place = view.target.weights, (level, view.view.time, view.view.camera)
+        added, near, image = error_of(model, *place, generator, weights=weights, rounding=rounding)
+        total += added
+        met |= near
+        error += view.squared_error(image)
+    return torch.where(met, total / max(error, 1e-12), torch.inf)
+
+
+def round_of(anchor_q: Tensor) -> Tensor:
+    """int64 [N], 0 .. PRUNING_ROUNDS - 1: the round in which each anchor can be pruned. A hash of its voxel, so that it
+    is the same in every round (Teschner et al., Optimized spatial hashing for collision detection, 2003)."""
+    x, y, z = anchor_q.to(torch.int64).unbind(1)
+    return (((x * 73856093) ^ (y * 19349663) ^ (z * 83492791)) >> 8) % PRUNING_ROUNDS
+
+
+def least(errors: Tensor, share: float) -> Tensor:
+    """bool [N]: the anchors of least error, at most `share` together. errors: float64 [N] >= 0, may be infinite."""
+    order = errors.argsort(stable=True)
+    found = torch.zeros(len(errors), dtype=torch.bool, device=errors.device)
+    found[order[errors[order].cumsum(0) <= share]] = True
+    return found
+
+
+@torch.no_grad()
+def _leave_level_0(model: Model, rows: Tensor) -> None:
+    """The anchors `rows` (bool [N]) begin at level 1; their masks at levels 1 and 2 stay."""
+    masks = torch.stack([model.masks(level) for level in range(3)], dim=1)[rows]
+    masks[:, 0] = ABSENT
+    logits = torch.from_numpy(mask_logits(masks.cpu().numpy()))
+    model.mask_logits[rows] = logits.to(model.mask_logits)

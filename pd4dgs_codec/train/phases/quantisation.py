@@ -1,0 +1,178 @@
+"""Fitting of the scene to its quantisation, where planes and weights begin to be rounded: whitening and step classes.
+
+Whitening transforms the features so that a quantisation step costs the same in every channel. The networks read a few
+directions of a feature, which are not its channels: a step harms pictures in those directions and takes bits in all.
+Only linear layers read or change a feature, so any invertible transform of its channels can be undone in them. With H
+the mean Gauss-Newton matrix of the pictures by an anchor's feature and C the features' covariance, the bits at a given
+error are least where H becomes the identity and C diagonal (Goyal, Theoretical foundations of transform coding, 2001).
+
+Step classes give anchors that pictures depend on little coarser steps. The error of a step differs a thousandfold
+between anchors, and neither position nor size predicts it, so it is measured. The classes of least bytes at a given
+error follow: the next class doubles the steps, which quadruples the squared error and saves the same bits everywhere.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pd4dgs_codec.model.harm import attribute_slopes, step_harm
+from pd4dgs_codec.model.model import Model
+from pd4dgs_codec.model.rounding import Rounding
+from pd4dgs_codec.scene import MASK_THRESHOLD, MAX_CLASS, SCAFFOLD_NETWORKS
+from pd4dgs_codec.train import phases, workers
+from pd4dgs_codec.train.optimiser import Optimiser
+from pd4dgs_codec.train.phases.prune import added_error
+from pd4dgs_codec.train.state import TrainingView, TrainState
+
+#: Training views in which the error of a step is measured.
+VIEWS = 16
+#: Halvings of the interval, at first 80 octaves wide, in which the threshold of the classes is searched.
+HALVINGS = 40
+#: Share of the mean error that every direction has at least: what no picture shows must not be scaled without bound.
+LEAST_ERROR = 0.01
+
+
+class FitQuantisation(phases.Phase):
+    """Whitens the features and assigns step classes, as far as the options ask for it."""
+
+    def due(self, state: TrainState) -> bool:
+        """At `Schedule.rounding`."""
+        return state.config.noise and phases.long_enough(state) and state.reached(state.schedule.rounding)
+
+    def apply(self, state: TrainState, record: dict[str, Any]) -> None:
+        """Logs how many anchors each step class has."""
+        model, config, levels = state.model, state.config, state.trained_levels()
+        views, rounding = state.views[:: -(-len(state.views) // VIEWS)], state.rounding(noisy=False)
+        found: list[int] = []
+        if config.grading:
+            found = grade(model, views, levels, config.grading, rounding)
+        if config.whitening:
+            whiten(model, state.optimiser, views, levels, rounding)
+            if config.grading:  # the features' steps have changed
+                found = grade(model, views, levels, config.grading, rounding)
+        if found:
+            record["step_classes"] = found
+
+
+# -- step classes ------------------------------------------------------------------------------------------------------
+
+
+def grade(
+    model: Model, views: Sequence[TrainingView], levels: Sequence[int], share: float, rounding: Rounding
+) -> list[int]:
+    """Gives every anchor the class at which quantisation adds at most `share` to the squared error of each of `levels`
+    beyond what it adds at class 0, and the attributes their centres. Returns how many anchors each class has."""
+    errors = workers.alike(
+        lambda: torch.stack([added_error(model, level, views, rounding, step_harm).cpu() for level in levels])
+    )
+    met = errors.isfinite()
+    worst = torch.where(met, errors, 0.0).amax(0)  # a level of large error must not set the budget of the others
+    classes = classes_within(torch.where(met.any(0), worst, torch.inf), share)
+    model.step_class.copy_(classes)
+    model.centre.copy_(centre(model))
+    return torch.bincount(classes.long(), minlength=MAX_CLASS + 1).tolist()
+
+
+def classes_within(errors: Tensor, budget: float) -> Tensor:
+    """uint8 [N]: the classes round(log2(T / error) / 2) of the largest T at which the sum of error (4^c - 1) stays
+    within the budget. errors: float64 [N] >= 0, at class 0; an infinite error has class 0."""
+    finite = errors[errors.isfinite() & (errors > 0)]
+    if not len(finite):
+        return torch.zeros(len(errors), dtype=torch.uint8)
+
+    def classes(log2_threshold: float) -> Tensor:
+        exact = 0.5 * (log2_threshold - errors.clamp(min=1e-300).log2())
+        return exact.round().clamp(0, MAX_CLASS)
+
+    low, high = float(finite.log2().min()), float(finite.log2().max()) + 2 * MAX_CLASS + 2
+    known = errors.isfinite()
+    for _ in range(HALVINGS):
+        middle = (low + high) / 2
+        added = (errors[known] * (4.0 ** classes(middle)[known] - 1)).sum()
+        low, high = (middle, high) if added <= budget else (low, middle)
+    return classes(low).to(torch.uint8)
+
+
+@torch.no_grad()
+def centre(model: Model) -> Tensor:
+    """[channels]: the means of features and log-scalings over the active anchors, as multiples of the steps, and 0 for
+    offsets, the value of Gaussians that were never seen."""
+    active = model.masks(2) > MASK_THRESHOLD
+    active = active if active.any() else torch.ones_like(active)
+    means = [model.feature[active].mean(0), model.scaling_log[active].mean(0)]
+    rounded = [
+        (mean / step).round() * step
+        for mean, step in zip(means, (model.steps.feature, model.steps.scaling_log), strict=True)
+    ]
+    return torch.cat([*rounded, model.offset.new_zeros(model.offset[0].numel())])
+
+
+# -- whitening ---------------------------------------------------------------------------------------------------------
+
+
+def whiten(
+    model: Model, optimiser: Optimiser, views: Sequence[TrainingView], levels: Sequence[int], rounding: Rounding
+) -> None:
+    """Transforms the features' channels in the anchors and in all that reads or moves them: pictures stay, to rounding.
+    The error of a step, summed over the channels, stays the same too."""
+    transform = workers.alike(lambda: _measured(model, views, levels, rounding))
+    if transform is not None:
+        _apply(model, optimiser, transform)
+
+
+def _measured(model: Model, views: Sequence[TrainingView], levels: Sequence[int], rounding: Rounding) -> Tensor | None:
+    """float64 [D, D]: the transform for the model; None where no picture shows a feature."""
+    errors = torch.stack([_feature_errors(model, level, views, rounding) for level in levels]).sum(0)
+    active = model.masks(2).detach() > MASK_THRESHOLD
+    if not errors.trace() > 0 or int(active.sum()) < 2:
+        return None
+    scaled = model.feature.detach()[active].double() / model.spacing[active, None]
+    return whitening_transform(errors, torch.cov(scaled.T))
+
+
+def whitening_transform(errors: Tensor, covariance: Tensor) -> Tensor:
+    """float64 [D, D]: A of features f' = A f for which A^-T errors A^-1, the errors in the new channels, is about a
+    multiple of the identity, its trace that of `errors`, and A covariance A^T is diagonal with falling entries. Both
+    arguments are [D, D], symmetric and positive semidefinite."""
+    floor = (
+        LEAST_ERROR * errors.trace() / len(errors) * torch.eye(len(errors), dtype=errors.dtype, device=errors.device)
+    )
+    root = torch.linalg.cholesky(errors + floor)
+    back = torch.linalg.inv(root)
+    root = root * ((back @ errors @ back.T).trace() / errors.trace()).sqrt()
+    _, axes = torch.linalg.eigh(root.T @ covariance @ root)
+    found: Tensor = axes.flip(1).T @ root.T
+    return found
+
+
+def _feature_errors(model: Model, level: int, views: Sequence[TrainingView], rounding: Rounding) -> Tensor:
+    """float64 [D, D]: the sum over all anchors and views of the Gauss-Newton matrices by the features, in units of the
+    anchors' steps, relative to the squared error."""
+    width = model.widths.feature
+    total, error = torch.zeros(width, width, dtype=torch.float64, device=model.feature.device), 0.0
+    generator = torch.Generator().manual_seed(0)
+    for view in views:
+        weights, place = view.target.weights, (level, view.view.time, view.view.camera)
+        slopes, _, image = attribute_slopes(model, *place, generator, weights=weights, rounding=rounding)
+        slope = (slopes["feature"] * model.spacing[:, None]).double()
+        total += slope.T @ slope
+        error += view.squared_error(image)
+    return total / max(error, 1e-12)
+
+
+@torch.no_grad()
+def _apply(model: Model, optimiser: Optimiser, transform: Tensor) -> None:
+    """Replaces features f by A f, A = `transform` [D, D], with the layers before and behind them and their moments."""
+    back, width = torch.linalg.inv(transform), model.widths.feature
+    optimiser.transform(model.feature, slice(None), transform.T)
+    for name in SCAFFOLD_NETWORKS:
+        optimiser.transform(model.network(name).layers[0].weight, slice(width), back)
+    field = model.global_deformation
+    if field is not None and "feature" in field.heads:
+        last = dict(field.named_heads())["feature"].layers[-1]
+        optimiser.transform(last.weight, slice(None), transform.T, transposed=True)
+        optimiser.transform(last.bias, slice(None), transform.T)

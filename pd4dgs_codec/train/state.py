@@ -1,0 +1,236 @@
+"""A model in training with all that its steps change: the steps and the phases of a run work on it."""
+
+from __future__ import annotations
+
+from collections import OrderedDict
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, overload
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pd4dgs_codec.data.view import Dataset, View
+from pd4dgs_codec.model.config import PRESETS, ModelConfig
+from pd4dgs_codec.model.model import Model
+from pd4dgs_codec.model.picture import render_image
+from pd4dgs_codec.model.plane_rate import exact_bits
+from pd4dgs_codec.model.rounding import EXACT, Noise, Rounding
+from pd4dgs_codec.quality.level_psnr import level_psnr
+from pd4dgs_codec.scene import MASK_THRESHOLD
+from pd4dgs_codec.train.config import TrainConfig
+from pd4dgs_codec.train.initialise import fresh_model
+from pd4dgs_codec.train.optimiser import Optimiser
+from pd4dgs_codec.train.schedule import Schedule
+from pd4dgs_codec.train.ssim import Target
+
+#: Bytes of images on the device, weights included, beyond which the least recently used are dropped.
+KEPT_BYTES = 1 << 30
+
+
+@dataclass(frozen=True, eq=False)
+class TrainingView:
+    """A view of the dataset with its image on the device."""
+
+    view: View
+    target: Target
+
+    @staticmethod
+    def of(view: View, device: torch.device) -> TrainingView:
+        """Copies the image to the device."""
+        image = torch.as_tensor(view.image, device=device).float() / 255
+        mask = None if view.mask is None else torch.as_tensor(view.mask, device=device).float()
+        return TrainingView(view, Target(image, mask))
+
+    @property
+    def nbytes(self) -> int:
+        """Of image and weights."""
+        return self.target.image.nbytes + self.target.weights.nbytes
+
+    def squared_error(self, image: Tensor) -> float:
+        """Of a picture [H, W, 3] of this view, summed over colours and weighted pixels."""
+        return float(((image - self.target.image).square().sum(-1) * self.target.weights).sum())
+
+
+class TrainingViews(Sequence[TrainingView]):
+    """A dataset's training views, copied to the device on demand; KEPT_BYTES of them stay there."""
+
+    def __init__(self, views: Sequence[View], device: torch.device):
+        self.views, self.device = views, device
+        self._kept: OrderedDict[int, TrainingView] = OrderedDict()
+        self._bytes = 0
+
+    def __len__(self) -> int:
+        return len(self.views)
+
+    @overload
+    def __getitem__(self, index: int) -> TrainingView: ...
+
+    @overload
+    def __getitem__(self, index: slice) -> list[TrainingView]: ...
+
+    def __getitem__(self, index: int | slice) -> TrainingView | list[TrainingView]:
+        if isinstance(index, slice):
+            return [self[i] for i in range(*index.indices(len(self)))]
+        found = self._kept.pop(index, None)
+        if found is None:
+            found = TrainingView.of(self.views[index], self.device)
+            self._bytes += found.nbytes
+        self._kept[index] = found
+        while self._bytes > KEPT_BYTES and len(self._kept) > 1:
+            self._bytes -= self._kept.popitem(last=False)[1].nbytes
+        return found
+
+
+class TrainState:
+    """A model in training.
+
+    Everything random comes from two generators whose states are saved, so that on the CPU a resumed run repeats the
+    uninterrupted one bit for bit at a fixed number of iterations and threads; on CUDA the order of sums varies.
+
+    schedule: of the run; replaced once where a time limit settles its length after some steps.
+    iteration: steps done, skipped ones included. skipped: those whose loss or gradient was not finite.
+    share: in a timed run the share of the schedule that is done, 0..1, set by Trainer; None otherwise.
+    statistics: [N] or [N, slots] per anchor, what growing is decided by.
+    order: training views drawn and not yet used, the next one last.
+    rho: moving average of how much the masks of levels 0 and 2 differ.
+    """
+
+    def __init__(
+        self,
+        config: TrainConfig,
+        dataset: Dataset,
+        schedule: Schedule,
+        device: torch.device,
+        size: ModelConfig | None = None,
+    ):
+        """A fresh model for `dataset`, of the preset's size by default."""
+        self.config, self.dataset, self.schedule, self.device = config, dataset, schedule, device
+        self.size = size or PRESETS[config.preset]
+        steps = config.model_steps(self.size.steps)
+        model = fresh_model(self.size, dataset, config.widths, steps, config.seed, config.max_layer)
+        self.model = model.to(device)
+        self.optimiser = Optimiser(self.model, config.rates, config.cooldown)
+        self.generator = torch.Generator().manual_seed(config.seed)
+        self.noise = Noise(config.seed + 1, device)
+        self.views = TrainingViews(dataset.train, device)
+        self.statistics = fresh_statistics(len(model.anchor_q), config.slots)
+        self.iteration = self.skipped = 0
+        self.share: float | None = None
+        self.rho = 0.0
+        self.order: list[int] = []
+        self._before = -1  #: the position of the step before; a timed run may advance by more than one
+
+    # -- where the run stands --------------------------------------------------------------------------------------
+
+    @property
+    def position(self) -> int:
+        """Of the next step in the schedule, 0..N: the steps done, or in a timed run the share of N."""
+        return self.iteration if self.share is None else int(self.share * (self.schedule.iterations or 0))
+
+    def reached(self, start: float) -> bool:
+        """Whether this step is the first at or past position `start`."""
+        return (self.position - 1 if self.share is None else self._before) < start <= self.position
+
+    def reached_multiple(self, every: float) -> bool:
+        """Whether this step is the first at or past some multiple of `every`."""
+        return self.reached(self.position - self.position % every)
+
+    def advance(self) -> None:
+        """Counts a step."""
+        self._before = self.position
+        self.iteration += 1
+
+    def rounding(self, *, noisy: bool = True) -> Rounding:
+        """How the steps at this position simulate quantisation; without its noise if not `noisy`."""
+        if not self.config.noise:
+            return EXACT
+        exact = self.position >= self.schedule.exact_rounding
+        noise = noisy and self.position >= self.schedule.coarse_end and not exact
+        weights = self.position >= self.schedule.rounding
+        return Rounding(self.noise if noise else None, attributes=exact, weights=weights)
+
+    def trained_levels(self) -> range:
+        """The levels that the run trains."""
+        return range(self.model.level if self.config.rollout == "top" else 0, self.model.level + 1)
+
+    # -- measures --------------------------------------------------------------------------------------------------
+
+    def active_anchors(self) -> list[int]:
+        """Anchors active per level 0, 1, 2."""
+        with torch.no_grad():
+            return [int((self.model.masks(level) > MASK_THRESHOLD).sum()) for level in range(3)]
+
+    def plane_bits(self) -> list[float]:
+        """The sum of R(a) of the planes of layers 1 and 2 as they would be coded now, in the groups of `--priors
+        gauss`; 0 for an absent layer."""
+        steps = self.model.steps.scaled(1.0)
+        found = {i: exact_bits(f.planes.plane_arrays(), steps.planes(i)) for i, f in self.model.deformations.items()}
+        return [found.get(1, 0.0), found.get(2, 0.0)]
+
+    def level_psnr(self, views: Sequence[View]) -> list[float]:
+        """Per level of the model the mean mPSNR over `views`, dB, rounded as at this position, without noise."""
+        rounding = self.rounding(noisy=False)
+
+        def draw(level: int, view: View) -> np.ndarray:
+            return render_image(self.model, level, view.time, view.camera, rounding)
+
+        return list(level_psnr(draw, range(self.model.level + 1), views).values())
+
+    # -- changes ---------------------------------------------------------------------------------------------------
+
+    def keep_anchors(self, rows: Tensor) -> None:
+        """Keeps only the anchors `rows` (int64)."""
+        self.optimiser.keep_anchors(rows)
+        self._follow(rows, 0)
+
+    def replace_anchors(self, rows: Tensor, added: dict[str, Tensor]) -> None:
+        """Keeps the anchors `rows` (int64) and appends those of `added`, by attribute."""
+        self.optimiser.replace_anchors(rows, added)
+        self._follow(rows, len(added["anchor_q"]))
+
+    def _follow(self, rows: Tensor, added: int) -> None:
+        for name, value in self.statistics.items():
+            self.statistics[name] = torch.cat([value[rows.cpu()], value.new_zeros(added, *value.shape[1:])])
+
+    # -- checkpoints -----------------------------------------------------------------------------------------------
+
+    def state(self) -> dict[str, Any]:
+        """What a checkpoint holds besides the model, so that the next steps are the same."""
+        return {
+            "iteration": self.iteration,
+            "total": self.schedule.iterations or 0,
+            "place": self.position,
+            "share": self.share or 0.0,
+            "passed": self._before,
+            "rho": self.rho,
+            "skipped": self.skipped,
+            "order": self.order,
+            "optimiser": self.optimiser.state(),
+            "densifier": self.statistics,
+            "generator": self.generator.get_state(),
+            "noise": self.noise.generator.get_state(),
+        }
+
+    def restore(self, model: Model, state: dict[str, Any]) -> None:
+        """Continues with `model` from a `state`. A broken state raises its first fault's own exception."""
+        self.model = model.to(self.device)
+        self.optimiser = Optimiser(self.model, self.config.rates, self.config.cooldown)
+        self.optimiser.load_state(state["optimiser"])
+        self.statistics = {name: state["densifier"][name] for name in self.statistics}
+        self.generator.set_state(state["generator"])
+        self.noise.generator.set_state(state["noise"])
+        self.iteration, self.skipped = int(state["iteration"]), int(state["skipped"])
+        self.schedule = Schedule(int(state["total"]) or None)
+        if self.share is not None:
+            self.share, self._before = float(state.get("share", 0.0)), int(state.get("passed", -1))
+        self.rho = float(state["rho"])
+        self.order = [int(index) for index in state["order"]]
+
+
+def fresh_statistics(anchors: int, slots: int) -> dict[str, Tensor]:
+    """Zeros. pull, visits [N, slots]: sum of the image gradients of each Gaussian and the pictures it was drawn in;
+    opacity, anchor_visits [N]: sum of the opacities of each anchor and the pictures it was evaluated for."""
+    shapes = {"pull": (anchors, slots), "visits": (anchors, slots), "opacity": (anchors,), "anchor_visits": (anchors,)}
+    return {name: torch.zeros(shape) for name, shape in shapes.items()}

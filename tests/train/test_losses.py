@@ -1,0 +1,90 @@
+"""Hand-computed cases of the mask terms."""
+
+import math
+
+import pytest
+import torch
+
+from pd4dgs_codec.model.masks import level_mask
+from pd4dgs_codec.train import losses
+
+
+def test_masks_start_where_the_method_says():
+    first, _, last = (level_mask(torch.tensor([[2.0, 0.0, 0.0]]), level) for level in range(3))
+    rho = float(last - first)
+    assert rho == pytest.approx(1 / (1 + math.exp(-2 - 2 * math.log(2))) - 1 / (1 + math.exp(-2)))
+    assert rho == pytest.approx(0.0866, abs=5e-4)
+
+
+@pytest.mark.parametrize("level", [0, 1, 2])
+def test_a_level_moves_its_own_masks_and_no_other_level_s(level):
+    logits = torch.tensor([[2.0, 0.0, 0.0], [-3.0, 1.0, 2.0]], requires_grad=True)
+    level_mask(logits, level).sum().backward()
+    assert logits.grad is not None
+    moved = (logits.grad != 0).all(0)
+    assert moved.tolist() == [j == level for j in range(3)]
+
+
+def test_binary_term_is_the_mean_entropy_in_bits():
+    assert float(losses.binary_term(torch.full((5,), 0.5))) == pytest.approx(1.0)
+    assert float(losses.binary_term(torch.tensor([0.0, 1.0]))) < 1e-4
+    quarter = -(0.25 * math.log2(0.25) + 0.75 * math.log2(0.75))
+    assert float(losses.binary_term(torch.tensor([0.25, 0.75]))) == pytest.approx(quarter, rel=1e-5)
+
+
+def test_binary_term_has_finite_gradients_at_the_ends():
+    mask = torch.tensor([0.0, 1.0, 0.5], requires_grad=True)
+    losses.binary_term(mask).backward()
+    assert torch.isfinite(mask.grad).all()
+
+
+def test_binary_term_is_differentiated_right():
+    mask = torch.rand(30, dtype=torch.float64, generator=torch.Generator().manual_seed(0)).requires_grad_()
+    torch.autograd.gradcheck(losses.binary_term, mask)
+    outside = torch.tensor([0.0, 1.0, 1e-7], requires_grad=True)
+    losses.binary_term(outside).backward()
+    assert not outside.grad.any()
+
+
+def _curve(count: int, side: int = 12) -> losses.Neighbours:
+    grid = torch.stack(torch.meshgrid(*[torch.arange(side)] * 3, indexing="ij"), -1).reshape(-1, 3)
+    cells = grid[torch.randperm(len(grid), generator=torch.Generator().manual_seed(0))[:count]].int()
+    return losses.Neighbours(cells, 4.0)
+
+
+def test_smooth_term_weighs_differences_by_distance():
+    near = losses.Neighbours(torch.tensor([[0, 0, 0], [1, 0, 0], [3, 0, 0]]), 4.0)
+    assert near.order.tolist() == [0, 1, 2]
+    found = losses.smooth_term(torch.tensor([0.0, 1.0, 0.5]), near, torch.tensor([1, 1, 1]))
+    assert float(found) == pytest.approx((math.exp(-1 / 4) + 0.5 * math.exp(-2 / 4)) / 2)
+    found = losses.smooth_term(torch.tensor([0.0, 1.0, 0.5]), near, torch.tensor([2, 7, 1]))
+    assert float(found) == pytest.approx(0.5 * math.exp(-3 / 4))  # of the pairs that are on the curve
+
+
+def test_smooth_term_equals_its_plain_form():
+    near, generator = _curve(700), torch.Generator().manual_seed(1)
+    mask = torch.rand(700, dtype=torch.float64, generator=generator)
+    mask[:100] = mask[100:200]  # some do not differ
+    away, found = near.draw(generator), []
+    assert set(away.tolist()) == set(range(1, 9))
+    for form in (losses.smooth_term, losses.smooth_term_reference):
+        leaf = mask.clone().requires_grad_()
+        value = form(leaf, near, away)
+        found.append((value.detach(), *torch.autograd.grad(3 * value, leaf)))
+    torch.testing.assert_close(*found)
+
+
+def test_neighbours_are_near():
+    near = _curve(12**3)
+    distance = -4 * near.weights[:-8].log()
+    assert float(distance.mean()) < 4  # random pairs of this cube are 8 apart on average
+    cells = near.anchor_q[near.order].float()
+    torch.testing.assert_close(distance[:, 2], (cells[3:-5] - cells[:-8]).norm(dim=1), rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("count", [0, 1])
+def test_no_pairs_without_two_anchors(count):
+    near = losses.Neighbours(torch.zeros(count, 3, dtype=torch.int32), 4.0)
+    away = near.draw(torch.Generator())
+    for form in (losses.smooth_term, losses.smooth_term_reference):
+        assert away.shape == (count,) and float(form(torch.ones(count), near, away)) == 0

@@ -1,0 +1,445 @@
+"""The phases of a run: pruning, selection of levels, step classes, whitening and prefixes."""
+
+import json
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from runs import assert_resumes_bit_for_bit, read_log
+from tiny import TINY, disc
+
+from pd4dgs_codec.errors import NotFinite
+from pd4dgs_codec.format.decoder import decode
+from pd4dgs_codec.format.encoder import encode, encode_with_report
+from pd4dgs_codec.model import checkpoint
+from pd4dgs_codec.model.convert import to_scene
+from pd4dgs_codec.model.harm import step_harm
+from pd4dgs_codec.model.picture import render, render_image
+from pd4dgs_codec.model.rounding import EXACT
+from pd4dgs_codec.quality.train_rate import train_rate_bits
+from pd4dgs_codec.scene import ATTRIBUTES, MASK_THRESHOLD, MAX_CLASS
+from pd4dgs_codec.train import losses, phases
+from pd4dgs_codec.train.config import TrainConfig
+from pd4dgs_codec.train.loop import Trainer
+from pd4dgs_codec.train.phases import levels, prefixes, prune, quantisation
+from pd4dgs_codec.train.phases.levels import MIN_GAIN_DB, MIN_GAIN_PER_MEGABYTE, held_back_views, levels_without_gain
+from pd4dgs_codec.train.phases.prefixes import OCTAVES, draw_prefix, rank_anchors
+from pd4dgs_codec.train.phases.prune import Prune, added_error, least, round_of
+from pd4dgs_codec.train.phases.quantisation import classes_within, whiten, whitening_transform
+from pd4dgs_codec.train.schedule import PRUNING_ROUNDS, Schedule
+
+
+@pytest.fixture
+def short_runs_have_phases(monkeypatch):
+    monkeypatch.setattr(phases, "MIN_ITERATIONS", 10)
+
+
+def trainer_of(dataset, iterations: int = 30, steps: int = 0, **options) -> Trainer:
+    """A run of the preset tiny after so many steps."""
+    trainer = Trainer(TrainConfig(preset="tiny", iterations=iterations, **options), dataset)
+    for _ in range(steps):
+        trainer.learner.step()
+    return trainer
+
+
+def records_of(trainer: Trainer, folder) -> list[dict]:
+    """Runs it to its end; its log."""
+    trainer.run(folder / "m.pt", log=folder / "log.jsonl")
+    return read_log(folder / "log.jsonl")
+
+
+@pytest.mark.usefixtures("short_runs_have_phases")
+@pytest.mark.parametrize(
+    "owner, name, options",
+    [(prune, "anchor_harm", {"prune": 0.5}), (quantisation, "grade", {"grading": 0.5}), (prefixes, "utility", {})],
+)
+def test_a_phase_that_meets_infinity_is_skipped(dataset, tmp_path, monkeypatch, owner, name, options):
+    def diverged(*_, **__):
+        raise NotFinite("colors: found inf")
+
+    monkeypatch.setattr(owner, name, diverged)
+    records = records_of(trainer_of(dataset, prefixes=0.5, **options), tmp_path)
+    logged = {prune: "left_model", quantisation: "step_classes", prefixes: "prefix"}[owner]
+    assert len(records) == 30 and not any(logged in record for record in records)
+
+
+def test_short_runs_and_few_views_have_no_measured_phases(dataset, tmp_path, monkeypatch):
+    views = replace(dataset, train=dataset.train * 12)
+    trainer = trainer_of(views, prune=0.5, grading=0.5)
+    assert not held_back_views(trainer.learner)
+    records = records_of(trainer, tmp_path)
+    assert not any({"left_model", "step_classes", "judged_psnr"} & set(record) for record in records)
+    monkeypatch.setattr(phases, "MIN_ITERATIONS", 10)
+    assert held_back_views(trainer.learner) == {8, 24, 40, 56}
+    for off in ({"judge": False}, {"max_layer": 0}, {"rollout": "top"}):
+        assert not held_back_views(trainer_of(views, **off).learner)
+    assert not held_back_views(trainer_of(replace(dataset, train=dataset.train * 8)).learner)
+
+
+# -- pruning -----------------------------------------------------------------------------------------------------------
+
+
+def test_the_least_errors_are_chosen_up_to_the_share():
+    errors = torch.tensor([0.5, 0.01, torch.inf, 0.0, 0.02, 0.03], dtype=torch.float64)
+    assert least(errors, 0.03).tolist() == [False, True, False, True, True, False]
+    assert least(errors, 0.0).tolist() == [False, False, False, True, False, False]
+    assert not least(torch.full((3,), torch.inf, dtype=torch.float64), 1.0).any()
+
+
+UNPRUNED = TrainConfig(preset="tiny", iterations=120, prune=0.0, noise=False)
+
+
+@pytest.fixture(scope="module")
+def finished(once):
+    """The checkpoint of a short run without pruning."""
+    return once("unpruned", lambda folder: Trainer(UNPRUNED, disc(), size=TINY).run(folder / "m.pt")) / "m.pt"
+
+
+@pytest.fixture
+def trained(dataset, finished) -> Trainer:
+    trainer = Trainer(UNPRUNED, dataset)
+    trainer.resume(finished)
+    return trainer
+
+
+def pictures_of(trainer, level: int) -> list[np.ndarray]:
+    """The training views."""
+    return [render_image(trainer.model, level, v.time, v.camera) for v in trainer.dataset.train]
+
+
+def difference(pictures, others) -> float:
+    return float(np.mean([np.square(a - b).mean() for a, b in zip(pictures, others, strict=True)]))
+
+
+def error_of(trainer, level: int) -> float:
+    """Mean squared error over the training views."""
+    return difference(pictures_of(trainer, level), [v.image / 255 for v in trainer.dataset.train])
+
+
+def test_the_added_error_is_about_that_of_leaving_an_anchor_out(trained):
+    errors = added_error(trained.model, 1, trained.learner.views, EXACT, prune.anchor_harm).numpy()
+    pictures = pictures_of(trained, 1)
+    near = np.flatnonzero(np.isfinite(errors) & (errors > 0))
+    chosen = near[np.argsort(errors[near])][:: max(1, len(near) // 12)]
+    logits = trained.model.mask_logits.detach().clone()
+    added = []
+    for row in chosen:
+        with torch.no_grad():
+            trained.model.mask_logits[row] = -30.0
+        added.append(difference(pictures_of(trained, 1), pictures))
+        with torch.no_grad():
+            trained.model.mask_logits.copy_(logits)
+    expected = errors[chosen] * error_of(trained, 1)
+    ranks = [np.argsort(np.argsort(x)) for x in (added, expected)]
+    assert np.corrcoef(*ranks)[0, 1] > 0.9
+    assert 1 / 3 < np.median(expected / added) < 3
+
+
+def test_pruning_adds_about_its_share_of_error_and_keeps_the_masks_above(trained, monkeypatch):
+    learner, model = trained.learner, trained.model
+    learner.config = replace(learner.config, prune=0.02)
+    before = [error_of(trained, level) for level in range(3)]
+    for turn in range(PRUNING_ROUNDS):
+        rounds, masks = round_of(model.anchor_q), [model.masks(level).detach() for level in range(3)]
+        kept, keep = [], learner.keep_anchors
+        monkeypatch.setattr(learner, "keep_anchors", lambda rows, keep=keep, kept=kept: kept.append(rows) or keep(rows))
+        record: dict = {}
+        Prune(turn).apply(learner, record)
+        monkeypatch.undo()
+        rows = kept[0]
+        assert 0 < len(model.anchor_q) == len(rows) == len(rounds) - record["left_model"]
+        assert len(learner.statistics["opacity"]) == len(rows)
+        assert torch.isin((rounds != turn).nonzero()[:, 0], rows).all()
+        for level in (1, 2):
+            torch.testing.assert_close(model.masks(level).detach(), masks[level][rows], atol=2e-6, rtol=0)
+        left = (model.masks(0) < MASK_THRESHOLD) & (masks[0][rows] >= MASK_THRESHOLD)
+        assert int(left.sum()) == record["left_level_0"]
+        torch.testing.assert_close(model.masks(0).detach()[~left], masks[0][rows][~left])
+    assert len(model.anchor_q) < 300  # of 600, most of them behind or beside others of the same grey
+    for level in range(3):  # estimates from single absences: together they weigh more, level 0 pays twice
+        assert error_of(trained, level) < 1.5 * before[level]
+
+
+def test_every_anchor_can_be_pruned_in_one_round():
+    cells = torch.cartesian_prod(*[torch.arange(-40, 40, 8)] * 3).int()
+    shares = torch.bincount(round_of(cells), minlength=PRUNING_ROUNDS) / len(cells)
+    assert len(shares) == PRUNING_ROUNDS and (shares - 1 / PRUNING_ROUNDS).abs().max() < 0.05
+
+
+@pytest.mark.usefixtures("short_runs_have_phases")
+def test_a_run_prunes_half_way_and_resumes_with_the_same_bits(dataset, tmp_path):
+    config = TrainConfig(preset="tiny", iterations=60, prune=0.05)
+    whole = Trainer(config, dataset)
+    whole.run(tmp_path / "whole.pt", log=tmp_path / "log.jsonl")
+    records = read_log(tmp_path / "log.jsonl")
+    pruned = [r for r in records if "left_model" in r]
+    rounds = list(Schedule(60).prune)
+    assert [r["iteration"] for r in pruned] == rounds and sum(r["left_model"] for r in pruned) > 0
+    assert records[rounds[0] - 1]["anchors"] - pruned[-1]["anchors"] == sum(r["left_model"] for r in pruned)
+    assert_resumes_bit_for_bit(config, dataset, tmp_path, rounds[1:3])
+
+
+@pytest.mark.usefixtures("short_runs_have_phases")
+@pytest.mark.parametrize("rollout", ["adaptive", "top"])
+def test_a_scene_that_needs_no_anchor_keeps_some(dataset, tmp_path, monkeypatch, rollout):
+    monkeypatch.setattr(prune, "added_error", lambda model, *_: torch.zeros(len(model.anchor_q)).double())
+    trainer = trainer_of(dataset, 40, rollout=rollout)
+    records = records_of(trainer, tmp_path)
+    assert 0 < trainer.learner.active_anchors()[0] <= len(trainer.model.anchor_q) < 300
+    left = sum(r.get("left_level_0", 0) for r in records)
+    assert left == 0 or rollout != "top", "a level that is not trained is not pruned"
+
+
+# -- selection of levels -----------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "psnr, megabytes, gone",
+    [
+        ([30, 31, 32], 0, []),
+        ([30, 31, 30.9], 0, [2]),
+        ([30, 31, 31 + 0.9 * MIN_GAIN_DB[2]], 0, [2]),
+        ([30, 29, 29], 0, [2, 1]),
+        ([30, 30.38, 30.4], 0, [2, 1]),  # a static scene
+        ([30, 29, 29.7], 0, []),  # level 2 gains, and depends on level 1
+        ([30], 0, []),
+        ([30, 32, 33], 0.9 / MIN_GAIN_PER_MEGABYTE, []),
+        ([30, 32, 33], 1.1 / MIN_GAIN_PER_MEGABYTE, [2]),
+    ],
+)
+def test_levels_go_from_the_top_while_they_gain_too_little(psnr, megabytes, gone):
+    assert [level for level, _ in levels_without_gain(psnr, [0.0, 0.0, 1e6 * megabytes])] == gone
+
+
+def test_a_level_costs_its_planes_and_a_byte_a_weight(dataset):
+    field = trainer_of(dataset).model.global_deformation
+    weights = 8 * 4 + 8 + 8 * 8 + 8 + (3 + 32 + 30 + 6) * (8 + 1)
+    assert levels.field_bytes(field, 800.0) == 100 + weights
+
+
+@pytest.mark.usefixtures("short_runs_have_phases")
+def test_a_removed_level_stays_away(dataset, tmp_path, monkeypatch):
+    """From the model, its optimiser, the log, the file and a resumed run."""
+    monkeypatch.setattr(levels, "levels_without_gain", lambda psnr, _: [(2, psnr[2] - psnr[1])])
+    views = replace(dataset, train=dataset.train * 12)
+    config = TrainConfig(preset="tiny", iterations=30)
+    trainer = Trainer(config, views)
+    held_back, seen, original = held_back_views(trainer.learner), [], trainer.learner._next_view
+    monkeypatch.setattr(trainer.learner, "_next_view", lambda: seen.append(original()) or seen[-1])
+    trainer.run(tmp_path / "whole.pt", log=tmp_path / "log.jsonl")
+    start = Schedule(30).rounding
+    assert len(held_back) == 4 and not set(seen[:start]) & held_back
+    records = read_log(tmp_path / "log.jsonl")
+    assert [r["iteration"] for r in records if "left_out" in r] == [start]
+    assert records[start]["left_out"][0]["level"] == 2 and max(r["level"] for r in records[start:]) == 1
+    model, training = checkpoint.load(tmp_path / "whole.pt")
+    assert model.local_deformation is None and model.global_deformation is not None
+    assert json.loads(training["left_out"]) == trainer.learner.left_out
+    assert decode(encode(to_scene(model), effort=1)).layers == (0, 1)
+    assert_resumes_bit_for_bit(config, views, tmp_path, [25])
+    assert checkpoint.load(tmp_path / "from-25.pt")[1]["left_out"] == training["left_out"]
+
+
+# -- step classes ------------------------------------------------------------------------------------------------------
+
+
+def test_classes_stay_within_their_budget_and_use_it():
+    errors = torch.from_numpy(np.random.default_rng(0).lognormal(0, 3, 4000))
+    for share in (0.01, 1.0, 30.0):
+        classes = classes_within(errors, share * float(errors.sum())).double()
+        added = float((errors * (4**classes - 1)).sum() / errors.sum())
+        assert 0.97 * share < added <= share
+        assert (classes[errors.argsort()].diff() <= 0).all(), "the larger the error of a step, the finer it is"
+
+
+def test_classes_at_the_edges():
+    errors = torch.tensor([0.0, 1.0, torch.inf, 1e-12], dtype=torch.float64)
+    assert classes_within(errors, 0.0).tolist() == [MAX_CLASS, 0, 0, 0]
+    assert classes_within(errors, 1e30).tolist() == [MAX_CLASS, MAX_CLASS, 0, MAX_CLASS]
+    assert classes_within(torch.full((3,), torch.inf, dtype=torch.float64), 1.0).tolist() == [0, 0, 0]
+
+
+def test_the_error_of_a_step_is_about_that_of_rounding(dataset):
+    """Against pictures of anchors whose attributes are moved at random by up to half a step."""
+    model = trainer_of(dataset).model
+    view, generator = dataset.train[2], torch.Generator().manual_seed(0)
+    with torch.no_grad():
+        model.feature.add_(0.3 * torch.randn(model.feature.shape, generator=generator))
+        model.offset.add_(2 * torch.randn(model.offset.shape, generator=generator))  # none in the same place
+    errors = [step_harm(model, 1, view.time, view.camera, generator) for _ in range(20)]
+    expected = float(sum(error.sum() for error, _, _ in errors) / len(errors))
+    assert (errors[0][0] >= 0).all() and not errors[0][0][~errors[0][1]].any()
+    still, found = render_image(model, 1, view.time, view.camera), []
+    values = {name: getattr(model, name).detach().clone() for name in ATTRIBUTES}
+    for _ in range(20):
+        with torch.no_grad():
+            for name, value in values.items():
+                noise = torch.rand(value.shape, generator=generator) - 0.5
+                getattr(model, name).copy_(value + noise * getattr(model.steps, name))
+        found.append(float(((render_image(model, 1, view.time, view.camera) - still) ** 2).sum()))
+    assert np.mean(found) == pytest.approx(expected, rel=0.35)
+
+
+@pytest.mark.usefixtures("short_runs_have_phases")
+def test_a_run_grades_its_anchors_once_and_codes_them(dataset):
+    trainer = trainer_of(dataset, grading=0.5)
+    records = [trainer.learner.step() for _ in range(30)]
+    (logged,) = [r["step_classes"] for r in records if "step_classes" in r]
+    model = trainer.model
+    assert sum(logged) == len(model.anchor_q)
+    assert torch.bincount(model.step_class.long(), minlength=7).tolist() == logged
+    assert len(set(model.step_class.tolist())) > 1
+    model.round_to_steps()
+    scene = to_scene(model)
+    _, report = encode_with_report(scene, priors="gauss", layers=2, omit="nothing", effort=1)
+    for own, row in zip(train_rate_bits(scene), report.layers, strict=True):
+        coded = {s.name: s.rate_bits for s in row.streams}
+        assert own["attributes"] == pytest.approx(coded.get("attributes", 0.0), rel=0.02)
+
+
+@pytest.mark.usefixtures("short_runs_have_phases")
+def test_without_grading_there_are_no_classes(dataset):
+    trainer = trainer_of(dataset, grading=0.0)
+    assert not any("step_classes" in trainer.learner.step() for _ in range(30))
+    assert to_scene(trainer.model).grading is None
+
+
+def test_the_rate_of_a_class_depends_on_its_own_anchors_only(dataset):
+    model = trainer_of(dataset).model
+    with torch.no_grad():
+        for name in ATTRIBUTES:
+            getattr(model, name).normal_(generator=torch.Generator().manual_seed(1))
+    rows, anchors = torch.arange(40), {name: getattr(model, name) for name in ATTRIBUTES}
+    plain = losses.anchor_bits(model, anchors, rows, rows)
+    model.step_class[20:40] = 3
+    graded = losses.anchor_bits(model, anchors, rows.flip(0), rows).flip(0)
+    first, second = rows[:20], rows[20:]
+    torch.testing.assert_close(graded[:20], losses.anchor_bits(model, anchors, first, first))
+    assert float((plain[20:] - graded[20:]).detach().mean()) == pytest.approx(3, abs=0.4)
+    torch.testing.assert_close(graded[20:], losses.anchor_bits(model, anchors, second, second))
+
+
+# -- whitening ---------------------------------------------------------------------------------------------------------
+
+
+def matrix(seed: int, width: int) -> torch.Tensor:
+    """float64 [width, width], symmetric, positive, with eigenvalues over three decades."""
+    rng = np.random.default_rng(seed)
+    axes, _ = np.linalg.qr(rng.normal(size=(width, width)))
+    return torch.from_numpy(axes @ np.diag(np.logspace(-1.5, 1.5, width)) @ axes.T)
+
+
+def test_whitened_channels_have_equal_errors_and_no_correlation():
+    errors, covariance = matrix(0, 12), matrix(1, 12)
+    transform = whitening_transform(errors, covariance)
+    back = torch.linalg.inv(transform)
+    after = back.T @ errors @ back
+    assert float(after.trace()) == pytest.approx(float(errors.trace()))
+    after = (after / after.trace() * 12).numpy()
+    np.testing.assert_allclose(after - np.diag(np.diag(after)), 0, atol=0.5)  # not quite: all have a least error
+    assert np.linalg.cond(after) < 0.2 * np.linalg.cond(errors)
+    spread = (transform @ covariance @ transform.T).numpy()
+    np.testing.assert_allclose(spread - np.diag(np.diag(spread)), 0, atol=1e-8 * spread.max())
+    assert (np.diff(np.diag(spread)) <= 0).all()
+
+
+def whitened(trainer: Trainer) -> None:
+    learner = trainer.learner
+    whiten(learner.model, learner.optimiser, learner.views[::4], range(learner.model.level + 1), EXACT)
+
+
+def test_whitening_keeps_pictures(dataset):
+    """Also through the global head that moves features, once it moves them."""
+    trainer = trainer_of(dataset, 60, 30)
+    model, view = trainer.model, dataset.test[0]
+    head = model.global_deformation.heads["feature"].layers[-1]
+    with torch.no_grad():
+        head.weight.normal_(0, 0.2, generator=torch.Generator().manual_seed(0))
+        head.bias.normal_(0, 0.2, generator=torch.Generator().manual_seed(1))
+    before, kept = [render_image(model, i, view.time, view.camera) for i in range(3)], model.feature.detach().clone()
+    whitened(trainer)
+    assert float((model.feature - kept).detach().abs().max()) > 0.1
+    for level, picture in enumerate(before):
+        np.testing.assert_allclose(render_image(model, level, view.time, view.camera), picture, atol=2e-3)
+
+
+def test_whitening_transforms_gradient_moments_with_the_parameters(dataset):
+    trainer = trainer_of(dataset, 60, 30)
+    model, optimiser = trainer.model, trainer.learner.optimiser
+    width = model.widths.feature
+    layer = model.network("color").layers[0].weight
+    moments = {name: optimiser.moments[p]["exp_avg"].clone() for name, p in (("f", model.feature), ("w", layer))}
+    product = (moments["f"] * model.feature.detach()).sum(), (moments["w"] * layer.detach()).sum()
+    whitened(trainer)
+    after = {name: optimiser.moments[p]["exp_avg"] for name, p in (("f", model.feature), ("w", layer))}
+    assert not torch.equal(after["f"], moments["f"])
+    torch.testing.assert_close(after["w"][:, width:], moments["w"][:, width:])  # view directions stay
+    # <G, X> does not depend on the basis
+    torch.testing.assert_close((after["f"] * model.feature.detach()).sum(), product[0], rtol=1e-3, atol=1e-9)
+    torch.testing.assert_close((after["w"] * layer.detach()).sum(), product[1], rtol=1e-3, atol=1e-9)
+    assert all((optimiser.moments[p]["exp_avg_sq"] >= 0).all() for p in (model.feature, layer))
+
+
+def test_whitening_makes_files_smaller(dataset):
+    trainer = trainer_of(dataset, 120, 60)
+    plain = len(encode(to_scene(trainer.model), effort=1, omit="nothing", layers=0))
+    whitened(trainer)
+    assert len(encode(to_scene(trainer.model), effort=1, omit="nothing", layers=0)) < plain
+
+
+@pytest.mark.usefixtures("short_runs_have_phases")
+def test_a_run_whitens_once_where_planes_begin_to_be_rounded(dataset, monkeypatch):
+    calls = []
+    trainer = trainer_of(dataset, grading=0.0)
+    monkeypatch.setattr(quantisation, "whiten", lambda *args: calls.append(trainer.iteration))
+    for _ in range(30):
+        trainer.learner.step()
+    assert calls == [20]
+
+
+# -- prefixes ----------------------------------------------------------------------------------------------------------
+
+
+def test_prefixes_are_nested_and_of_every_size():
+    rank = torch.tensor([0.5, -torch.inf, 3.0, 2.0, 0.0, 1.0] + [4.0 + i for i in range(58)], dtype=torch.float64)
+    generator = torch.Generator().manual_seed(0)
+    drawn = [draw_prefix(rank, generator) for _ in range(200)]
+    sizes = sorted({int(chosen.sum()) for chosen in drawn})
+    assert sizes[0] == round(63 / 2**OCTAVES) and sizes[-1] > 55 and len(sizes) > 20
+    for chosen in drawn:
+        assert not chosen[1]
+        assert rank[chosen].min() > rank[~chosen].max()
+
+
+def test_anchors_absent_at_level_0_have_no_rank(dataset):
+    model = trainer_of(dataset).model
+    with torch.no_grad():
+        model.mask_logits[::3, 0] = -20.0
+    rank = rank_anchors(model, dataset.train[:2])
+    assert torch.equal(rank.isfinite(), model.masks(0) > MASK_THRESHOLD)
+
+
+@pytest.mark.parametrize("fused", (True, False))
+def test_a_picture_of_some_anchors_is_that_of_a_model_without_the_others(dataset, monkeypatch, fused):
+    model = trainer_of(dataset).model
+    if not fused:
+        monkeypatch.setattr(type(model), "_fusible", lambda self: False)
+    view = dataset.test[0]
+    only = torch.arange(len(model.anchor_q)) % 2 == 0
+    part = render(model, 0, view.time, view.camera, only=only)
+    assert set(torch.unique(part.gaussians.anchors % 2).tolist()) == {0}
+    with torch.no_grad():
+        model.mask_logits[~only] = -20.0
+    torch.testing.assert_close(part.image, render(model, 0, view.time, view.camera).image)
+
+
+def test_a_run_trains_prefixes_in_its_last_third_and_resumes_bit_for_bit(dataset, tmp_path, monkeypatch):
+    monkeypatch.setattr(prefixes, "VIEWS", 2)
+    config = TrainConfig(preset="tiny", iterations=30, prefixes=0.5)
+    trainer = Trainer(config, dataset)
+    trainer.run(tmp_path / "whole.pt", log=tmp_path / "log.jsonl")
+    drawn = [r for r in read_log(tmp_path / "log.jsonl") if "prefix" in r]
+    assert 0 < len(drawn) < 10 and min(r["iteration"] for r in drawn) >= 20
+    assert all(r["level"] == 0 for r in drawn)
+    assert_resumes_bit_for_bit(config, dataset, tmp_path, [24])
