@@ -38,7 +38,7 @@ from pd4dgs_codec.format.info import info
 from pd4dgs_codec.quality.image import mpsnr
 from pd4dgs_codec.scene import Camera
 from pd4dgs_codec.threads import configure
-from pd4dgs_codec.web.page import PAGE as INDEX
+from pd4dgs_codec.web import PAGE as INDEX
 from pd4dgs_codec.web.page import page as whole_page
 from pd4dgs_codec.web.server import Server
 

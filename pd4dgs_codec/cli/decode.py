@@ -87,12 +87,11 @@ main = command(parser, _decode)
 
 def _input(args: argparse.Namespace, console: Console) -> bytes:
     """The bytes of the file; of a URL only those that --max-layer and --max-bytes need."""
-    from pd4dgs_codec.web.urls import is_url
+    from pd4dgs_codec.web import is_url
 
     if not is_url(args.input):
         return read_bytes(args.input)
-    from pd4dgs_codec.web.prefix import fetch
-    from pd4dgs_codec.web.transfer import Transfer
+    from pd4dgs_codec.web.transfer import Transfer, fetch
 
     with closing(Transfer(args.input)) as transfer:
         try:

@@ -65,13 +65,12 @@ main = command(parser, _info)
 
 def _input(args: argparse.Namespace, console: Console) -> tuple[bytes, int]:
     """(bytes, length of the file): all of it, or of a URL the header alone where that suffices."""
-    from pd4dgs_codec.web.urls import is_url
+    from pd4dgs_codec.web import is_url
 
     if not is_url(args.input):
         data = read_bytes(args.input)
         return data, len(data)
-    from pd4dgs_codec.web.prefix import fetch, fetch_header
-    from pd4dgs_codec.web.transfer import Transfer
+    from pd4dgs_codec.web.transfer import Transfer, fetch, fetch_header
 
     with closing(Transfer(args.input)) as transfer:
         data = fetch(transfer) if args.check or args.bytes or args.hashes else fetch_header(transfer)

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from pd4dgs_codec.scene import Scene
-    from pd4dgs_codec.web.package import Video
+    from pd4dgs_codec.web.manifests import Video
 
 DETAILS = """\
 DIR then holds scene.pd4 and index.html, a page that plays the scene from any web server that DIR is copied to.
@@ -85,7 +85,7 @@ main = command(parser, _package)
 
 def _library(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.errors import DeliveryError
-    from pd4dgs_codec.web.library import library
+    from pd4dgs_codec.web.package import library
 
     if Path(args.input).resolve() != Path(args.output).resolve():
         raise DeliveryError(f"-o {args.output}: expected {args.input}: the index is written beside the packages")
@@ -124,7 +124,7 @@ def _render(scene: Scene, fps: float) -> Video:
     from pd4dgs_codec.quality.frames import own_frames
     from pd4dgs_codec.quality.levels import level_of
     from pd4dgs_codec.quality.movie import check_mp4, write_mp4
-    from pd4dgs_codec.web.package import Video
+    from pd4dgs_codec.web.manifests import Video
 
     check_mp4()
     if scene.info.camera is None:

@@ -78,8 +78,7 @@ def add_link(p: options.Parser) -> None:
 
 
 def _serve(args: argparse.Namespace, console: Console) -> int:
-    from pd4dgs_codec.web.link import Link
-    from pd4dgs_codec.web.server import Server
+    from pd4dgs_codec.web.server import Link, Server
 
     log = console.message if console.verbose else None
     with Server(args.input, args.host, args.port, link=Link(args.rate), latency=args.latency, log=log) as server:

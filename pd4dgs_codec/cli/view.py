@@ -44,10 +44,9 @@ def parser() -> options.Parser:
 
 
 def _view(args: argparse.Namespace, console: Console) -> int:
-    from pd4dgs_codec.web.link import Link
-    from pd4dgs_codec.web.page import PAGE, page
-    from pd4dgs_codec.web.server import Server
-    from pd4dgs_codec.web.urls import is_url
+    from pd4dgs_codec.web import PAGE, is_url
+    from pd4dgs_codec.web.page import page
+    from pd4dgs_codec.web.server import Link, Server
 
     if args.output:
         check_output(args.output, args.overwrite)

@@ -1,1 +1,11 @@
-"""From a web server to the first picture: a range server with a paced link, a client that resumes, packages."""
+"""Scenes over the web: a range server, a resuming client, the one-file page, packages with DASH and HLS manifests."""
+
+from __future__ import annotations
+
+#: The page of a folder.
+PAGE = "index.html"
+
+
+def is_url(name: str) -> bool:
+    """Whether an input names a remote file. Imports no HTTP, so that local files do not wait for it."""
+    return name.lower().startswith(("http://", "https://"))

@@ -1,13 +1,13 @@
-"""A viewer's side of a `.pd4` file on a web server: slices as they arrive, upgrades later, cuts survived.
+"""The viewer's side of a `.pd4` file on a web server: slices as they arrive, upgrades later, interruptions survived.
 
-Which slice next, and when to stop. Slices build on each other, so the next one is always the next in the file, and the
-only question is whether to take it. A layer is one slice or more. `next_end` answers after every slice:
+Slices build on each other, so the next one is always the next in the file; `next_end` decides after every slice whether
+to fetch it:
 
-1. no slice of a layer beyond `max_layer`, and none that ends beyond `bytes`;
+1. no slice of a layer above `max_layer`, and none that ends beyond `bytes`;
 2. the first slice always, as long as `seconds` last: without it there is no picture;
-3. a further slice only if the rest of it would arrive within `seconds` at the rate of the last second of transfer.
+3. a further slice only if its missing bytes would arrive within `seconds` at the rate of the last second.
 
-What arrives of a slice before the seconds are over is kept, and a later call goes on from there.
+Bytes of an unfinished slice stay when the time is over, and a later call continues from there.
 """
 
 from __future__ import annotations
@@ -21,15 +21,14 @@ from dataclasses import dataclass
 from pd4dgs_codec.errors import BadSignature, DecodeError, UnsupportedVersion
 from pd4dgs_codec.format.stream import open_stream
 from pd4dgs_codec.scene import Scene
-from pd4dgs_codec.web.prefix import HEADER_GUESS, LONGEST_HEADER, slice_ends, within
-from pd4dgs_codec.web.transfer import Changed, OutOfTime, Transfer
+from pd4dgs_codec.web.transfer import HEADER_GUESS, LONGEST_HEADER, Changed, OutOfTime, Transfer, slice_ends, within
 
 RATE_SECONDS = 1.0
 
 
 @dataclass(frozen=True)
 class Budget:
-    """What a viewer will spend: layers, bytes of the file counted from its first, seconds counted from the call."""
+    """Limits of a download: highest layer, bytes counted from the first of the file, seconds counted from the call."""
 
     max_layer: int | None = None
     bytes: int | None = None
@@ -39,9 +38,9 @@ class Budget:
 def next_end(
     slices: list[tuple[int, int]], have: int, budget: Budget, seconds_left: float, rate: float | None
 ) -> int | None:
-    """Where the next slice to fetch ends, in bytes of the file, or None to stop.
+    """End offset of the next slice to fetch; None to stop.
 
-    slices: (layer, end) in file order. have: bytes here. rate: bytes per second lately, None if not known yet.
+    slices: (layer, end offset) in file order. have: bytes here. rate: recent bytes per second; None if unknown.
     """
     wanted = within(slices, budget.max_layer, budget.bytes)
     end = next((end for _, end in wanted if end > have), None)
@@ -56,10 +55,10 @@ class RateMeter:
     """Bytes per second over the last RATE_SECONDS of a transfer."""
 
     def __init__(self) -> None:
-        self._marks: deque[tuple[float, int]] = deque()  # (when, bytes until then)
+        self._marks: deque[tuple[float, int]] = deque()  # (time, bytes until then)
 
     def start(self, now: float) -> None:
-        """A request begins; what was measured before a rest does not count."""
+        """A request begins; earlier measurements are discarded."""
         self._marks = deque([(now, 0)])
 
     def note(self, now: float, size: int) -> None:
@@ -70,23 +69,22 @@ class RateMeter:
 
     @property
     def latest(self) -> float:
-        """When the latest bytes arrived, or the request began."""
+        """Time of the latest bytes, or of the request."""
         return self._marks[-1][0]
 
     @property
     def rate(self) -> float | None:
-        """None before anything arrived."""
+        """None before any bytes arrived."""
         (start, before), (end, after) = self._marks[0], self._marks[-1]
         return (after - before) / max(end - start, 1e-6) if after > before else None
 
 
 class SceneClient:
-    """Scenes of one URL, best first picture first. Use it in a `with` block, or close it.
+    """Scenes of one URL, as early as they can be decoded. Use it in a `with` block, or close it.
 
-    The first request is one open-ended GET, read as it arrives; after a cut, and for slices taken later, Range with
-    If-Range fetches what is missing and nothing twice. If the file is another one then, everything begins anew with its
-    layer 0. A damaged slice is fetched once more and never shown. Stopping leaves what is on its way, at most what the
-    sockets' buffers hold. transfer: bytes and counts, see Transfer.
+    The first request is one open-ended GET, read as it arrives. After an interruption, and for slices requested later,
+    Range with If-Range fetches the missing bytes only. If the file has changed, decoding restarts with its layer 0. A
+    damaged slice is fetched once more and never yielded. transfer: bytes and counts, see Transfer.
     """
 
     def __init__(self, url: str, *, stall: float = 10.0, attempts: int = 5):
@@ -103,29 +101,23 @@ class SceneClient:
 
     @property
     def arrived_at(self) -> float:
-        """time.monotonic() of the latest bytes: when a scene is given, that of its slice's last one."""
+        """time.monotonic() of the latest bytes; when a scene is yielded, of the last byte of its slice."""
         return self._meter.latest
 
-    def due(self) -> list[tuple[int, int, float]]:
-        """(layer, end, seconds until it is there at the latest rate) of each slice that is still to come; nothing
-        before a rate is known."""
-        rate, have = self._meter.rate, len(self.transfer.data)
-        return [(layer, end, (end - have) / rate) for layer, end in self._slices if end > have] if rate else []
-
     def close(self) -> None:
-        """Ends the connection; `scenes` may still be called and opens another."""
+        """Closes the connection; `scenes` may be called again and opens another."""
         self.transfer.close()
 
     def scenes(self, budget: Budget = Budget()) -> Iterator[Scene]:
-        """A scene whenever slices have arrived, holding all slices so far; ends where the budget says.
+        """A scene for each slice that arrives, with all slices so far, until the budget is spent.
 
-        Called again, it goes on after the last slice given. Raises DeliveryError if the file cannot be had, DecodeError
-        if it is not a valid one; scenes given before stay valid.
+        A further call continues after the last slice yielded. Raises DeliveryError if the file is not available,
+        DecodeError if it is invalid; scenes yielded before stay valid.
         """
         until = time.monotonic() + budget.seconds
         self._meter.start(time.monotonic())
         while True:
-            while ready := self._ready(budget):  # until empty: a fault behind a slice shows at the next feed
+            while ready := self._ready(budget):  # until empty: a fault behind a slice is raised by the next feed
                 yield from ready
             left = until - time.monotonic()
             end: int | None = HEADER_GUESS if len(self.transfer.data) < HEADER_GUESS else LONGEST_HEADER
@@ -144,7 +136,7 @@ class SceneClient:
             except OutOfTime:
                 break
             if not block:
-                self._stream.finish()  # the file ends within this slice: Truncated
+                self._stream.finish()  # raises Truncated: the file ends within this slice
             self._meter.note(time.monotonic(), len(block))
         self.close()
 
@@ -153,11 +145,11 @@ class SceneClient:
         self._slices: list[tuple[int, int]] = []
 
     def _ready(self, budget: Budget) -> list[Scene]:
-        """Feeds what is new to the decoder; a fault sends the transfer back to the end of the last good slice."""
+        """Feeds new bytes to the decoder. After a fault the transfer goes back to the end of the last valid slice."""
         try:
             return self._feed(budget)
         except (BadSignature, UnsupportedVersion):
-            raise  # not what damage on the way looks like
+            raise  # not a transmission error
         except DecodeError:
             good = self._slices[self._done - 1][1] if self._done else 0
             if self._repaired_at == good:
@@ -165,14 +157,14 @@ class SceneClient:
             self._repaired_at = good
             self.transfer.rewind(good)
             self._begin()
-            self._feed(Budget())  # the good slices once more; they were given already
+            self._feed(Budget())  # the valid slices, which were yielded before
             return []
 
     def _feed(self, budget: Budget) -> list[Scene]:
         data, end = self.transfer.data, len(self.transfer.data)
         if not self._slices:
             self._slices = slice_ends(data)
-        if self._slices:  # the first bytes of a small file may hold more than was asked for
+        if self._slices:  # the first bytes of a small file may hold more than the budget allows
             wanted = within(self._slices, budget.max_layer, budget.bytes)
             end = min(end, wanted[-1][1] if wanted else 0)
         block, self._fed = bytes(data[self._fed : end]), max(self._fed, end)

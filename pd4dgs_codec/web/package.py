@@ -1,65 +1,33 @@
-"""A `.pd4` file as a folder for any web server: a page that plays it, DASH, HLS and a JSON index beside it.
+"""A `.pd4` file as a folder for any web server: the player's page, DASH and HLS manifests, and a JSON index.
 
-DASH carries the layers themselves: `scene.mp4` holds each slice in a fragment of its own, and the manifest names the
-fragments with their dependencies. Concatenated, the samples are the `.pd4` file again. HLS has no layers that depend on
-each other: its playlist shows the 2D video and points to the index, which says where the layers lie in `scene.pd4`.
+`scene.mp4` holds each slice in an MP4 fragment of its own; concatenated, its samples are the `.pd4` file. A folder of
+packages gets an index of its own, the library.
 """
 
 from __future__ import annotations
 
 import hashlib
+import html
 import json
-import math
-import xml.etree.ElementTree as ElementTree
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
+from urllib.parse import quote
 
 from pd4dgs_codec.errors import DeliveryError
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.scene import Scene
-from pd4dgs_codec.web import mp4
-from pd4dgs_codec.web.names import addressed, cache_control
-from pd4dgs_codec.web.page import PAGE, page
+from pd4dgs_codec.web import PAGE, mp4
+from pd4dgs_codec.web.headers import cache_control
+from pd4dgs_codec.web.manifests import MAX_SECONDS, Part, Video, dash, hls, hls_video
+from pd4dgs_codec.web.page import page
 
 SCENE, SEGMENTS, MPD, PLAYLIST, INDEX = "scene.pd4", "scene.mp4", "scene.mpd", "scene.m3u8", "index.json"
 VIDEO, VIDEO_PLAYLIST, POSTER = "fallback.mp4", "fallback.m3u8", "poster.jpg"
-#: Link rates, bits per second, for which the index tells when the first picture is there.
+#: Link rates, bits per second, for which the index tells the time of the first picture.
 RATES = {"2M": 2e6, "10M": 1e7, "50M": 5e7}
-LAYER_SCHEME = "urn:pd4dgs:layer:2026"
-SESSION_DATA_ID = "org.pd4dgs.layers"
-MIN_BUFFER_SECONDS = 1  #: the time that the manifest's bandwidths are for
-STILL_SECONDS = 1.0  #: shown for a scene whose time stands still
-MAX_SECONDS = ((1 << 32) - 1) // mp4.TIMESCALE  #: a sample's duration has 32 bits
-
-
-@dataclass(frozen=True)
-class Video:
-    """A 2D rendition of the scene: fragmented MP4 of H.264. width, height: pixels. fps: frames per second. poster: a
-    JPEG of a frame, if there is one."""
-
-    data: bytes
-    width: int
-    height: int
-    fps: float
-    poster: bytes = b""
-
-
-@dataclass(frozen=True)
-class Part:
-    """A slice's share of the file: start..end, bytes of the `.pd4`; segment: its bytes in scene.mp4, end exclusive."""
-
-    layer: int
-    slice: int
-    start: int
-    end: int
-    segment: tuple[int, int]
-
-    @property
-    def id(self) -> str:
-        """Of its representation: L0 for layer 0, L0.1 for its second slice."""
-        return f"L{self.layer}.{self.slice}" if self.slice else f"L{self.layer}"
+STILL_SECONDS = 1.0  #: presentation time of a static scene
 
 
 def package(
@@ -67,37 +35,58 @@ def package(
 ) -> dict[str, bytes]:
     """Name -> content of every file of the folder.
 
-    render: makes the 2D rendition of the decoded scene, if it can. immutable: files that others name carry the digest
-    of their content in their names, so that caches may keep them forever. Raises DecodeError unless `data` is a whole,
-    valid `.pd4` file, DeliveryError for one too long or large to wrap, both before anything is rendered.
+    render: makes the 2D rendition of the decoded scene, or returns None. immutable: names of files to which others
+    refer contain a digest of their content, so that caches may keep them forever. Raises DecodeError unless `data` is a
+    complete, valid `.pd4` file, and DeliveryError if it is too long or too large for MP4, both before rendering.
     """
     scene = decode(data)
-    low, high = info(data)["time_range"]
+    about = info(data)
+    low, high = about["time_range"]
     seconds = high - low if high > low else STILL_SECONDS
     if seconds > MAX_SECONDS:
         raise DeliveryError(f"the scene lasts {seconds:g} s, DASH takes at most {MAX_SECONDS:,}")
-    segments, init, parts = _segments(data, seconds)
+    segments, init, parts = _segments(data, about, seconds)
     video = render(scene) if render is not None else None
     media = {SCENE: data, SEGMENTS: segments}
     if video is not None:
         media |= {VIDEO: video.data} | ({POSTER: video.poster} if video.poster else {})
     names = {name: addressed(name, content) if immutable else name for name, content in media.items()}
     files = {names[name]: content for name, content in media.items()}
-    files[MPD] = _manifest(init, parts, seconds, video, names)
+    files[MPD] = dash(init, parts, seconds, names[SEGMENTS], video, names.get(VIDEO, ""))
     if video is not None:
-        files[VIDEO_PLAYLIST] = _video_playlist(video, names[VIDEO])
-    files[PLAYLIST] = _playlist(video)
+        files[VIDEO_PLAYLIST] = hls_video(video, names[VIDEO])
+    files[PLAYLIST] = hls(INDEX, video, VIDEO_PLAYLIST)
     files[PAGE] = (page(names[SCENE]) if immutable else page()).encode()
-    cache = {name: cache_control(name) for name in (*files, INDEX)}
-    files[INDEX] = _index(data, init, parts, seconds, video, names, cache)
+    index = {
+        "file": names[SCENE],
+        "format_version": about["format_version"],
+        "bytes": len(data),
+        "sha256": hashlib.sha256(data).hexdigest(),
+        "time_range": about["time_range"],
+        "seconds": seconds,
+        "layers": _layers(data, init, parts, names[SEGMENTS]),
+        "dash": MPD,
+        "hls": PLAYLIST,
+        "video": video and {"file": names[VIDEO], "width": video.width, "height": video.height, "fps": video.fps},
+        "poster": names.get(POSTER),
+        "first_frame_seconds": {name: 8 * parts[0].end / rate for name, rate in RATES.items()},
+        "cache_control": {name: cache_control(name) for name in (*files, INDEX)},
+    }
+    files[INDEX] = _json(index)
     return files
 
 
-def _segments(data: bytes, seconds: float) -> tuple[bytes, int, list[Part]]:
-    """(scene.mp4, bytes of its initialisation, parts). What stands between slices travels with the slice after it."""
+def addressed(name: str, content: bytes) -> str:
+    """The name with the first 64 bits of the content's SHA-256: scene.pd4 -> scene-0123456789abcdef.pd4."""
+    stem, dot, suffix = name.rpartition(".")
+    return f"{stem}-{hashlib.sha256(content).hexdigest()[:16]}{dot}{suffix}"
+
+
+def _segments(data: bytes, about: dict[str, Any], seconds: float) -> tuple[bytes, int, list[Part]]:
+    """(scene.mp4, bytes of its initialisation, slices). Chunks between slices belong to the slice after them."""
     rows = [
         (layer["layer"], number, part["end"])
-        for layer in info(data)["layers"]
+        for layer in about["layers"]
         for number, part in enumerate(layer["slices"])
     ]
     ticks = max(1, round(seconds * mp4.TIMESCALE))
@@ -112,156 +101,74 @@ def _segments(data: bytes, seconds: float) -> tuple[bytes, int, list[Part]]:
     return content, init, parts
 
 
-# -- DASH --------------------------------------------------------------------------------------------------------------
-
-
-def _manifest(init: int, parts: list[Part], seconds: float, video: Video | None, names: dict[str, str]) -> bytes:
-    root = ElementTree.Element(
-        "MPD",
-        {
-            "xmlns": "urn:mpeg:dash:schema:mpd:2011",
-            "profiles": "urn:mpeg:dash:profile:full:2011",
-            "type": "static",
-            "mediaPresentationDuration": _duration(seconds),
-            "minBufferTime": _duration(MIN_BUFFER_SECONDS),
-        },
-    )
-    period = ElementTree.SubElement(root, "Period", id="0", start="PT0S")
-    if video is not None:
-        _video_set(period, video, names[VIDEO])
-    for i, part in enumerate(parts):
-        group = ElementTree.SubElement(
-            period, "AdaptationSet", contentType="application", mimeType="application/mp4", codecs="mett"
-        )
-        ElementTree.SubElement(group, "SupplementalProperty", schemeIdUri=LAYER_SCHEME, value=str(part.layer))
-        bandwidth = math.ceil(8 * part.segment[1] / MIN_BUFFER_SECONDS)
-        representation = ElementTree.SubElement(
-            group, "Representation", id=part.id, bandwidth=str(min(bandwidth, (1 << 32) - 1))
-        )
-        if i:
-            representation.set("dependencyId", " ".join(before.id for before in parts[:i]))
-        whole = max(1, round(seconds * mp4.TIMESCALE))
-        _segment_list(representation, names[SEGMENTS], init, mp4.TIMESCALE, whole, [part.segment])
-    ElementTree.indent(root)
-    text: bytes = ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
-    return text + b"\n"
-
-
-def _video_set(period: ElementTree.Element, video: Video, name: str) -> None:
-    init, pieces = mp4.fragments(video.data)
-    group = ElementTree.SubElement(
-        period, "AdaptationSet", contentType="video", mimeType="video/mp4", segmentAlignment="true", startWithSAP="1"
-    )
-    representation = ElementTree.SubElement(
-        group,
-        "Representation",
-        id="video",
-        bandwidth=str(_peak_rate(video)),
-        codecs=_codec(video.data[:init]),
-        width=str(video.width),
-        height=str(video.height),
-        frameRate=f"{round(video.fps * 1000)}/1000",
-    )
-    ticks = round(1000 * max(piece.samples for piece in pieces) / video.fps)
-    _segment_list(representation, name, init, 1000, ticks, [(piece.start, piece.end) for piece in pieces])
-
-
-def _segment_list(
-    parent: ElementTree.Element, url: str, init: int, timescale: int, ticks: int, ranges: list[tuple[int, int]]
-) -> None:
-    ElementTree.SubElement(parent, "BaseURL").text = url
-    segments = ElementTree.SubElement(parent, "SegmentList", timescale=str(timescale), duration=str(ticks))
-    ElementTree.SubElement(segments, "Initialization", range=f"0-{init - 1}")
-    for start, end in ranges:
-        ElementTree.SubElement(segments, "SegmentURL", mediaRange=f"{start}-{end - 1}")
-
-
-def _duration(seconds: float) -> str:
-    return f"PT{seconds:.3f}".rstrip("0").rstrip(".") + "S"
-
-
-# -- HLS ---------------------------------------------------------------------------------------------------------------
-
-
-def _playlist(video: Video | None) -> bytes:
-    lines = ["#EXTM3U", "#EXT-X-VERSION:7"]
-    lines.append(f'#EXT-X-SESSION-DATA:DATA-ID="{SESSION_DATA_ID}",URI="{INDEX}"')
-    if video is not None:
-        init, _ = mp4.fragments(video.data)
-        lines.append("#EXT-X-INDEPENDENT-SEGMENTS")
-        lines.append(
-            f'#EXT-X-STREAM-INF:BANDWIDTH={_peak_rate(video)},CODECS="{_codec(video.data[:init])}",'
-            f"RESOLUTION={video.width}x{video.height},FRAME-RATE={video.fps:.3f}"
-        )
-        lines.append(VIDEO_PLAYLIST)
-    return ("\n".join(lines) + "\n").encode()
-
-
-def _video_playlist(video: Video, name: str) -> bytes:
-    init, pieces = mp4.fragments(video.data)
-    seconds = [piece.samples / video.fps for piece in pieces]
-    lines = ["#EXTM3U", "#EXT-X-VERSION:7", "#EXT-X-PLAYLIST-TYPE:VOD", "#EXT-X-INDEPENDENT-SEGMENTS"]
-    lines.append(f"#EXT-X-TARGETDURATION:{max(1, math.ceil(max(seconds)))}")
-    lines.append(f'#EXT-X-MAP:URI="{name}",BYTERANGE="{init}@0"')
-    for piece, length in zip(pieces, seconds, strict=True):
-        lines += [f"#EXTINF:{length:.6f},", f"#EXT-X-BYTERANGE:{piece.end - piece.start}@{piece.start}", name]
-    return ("\n".join([*lines, "#EXT-X-ENDLIST"]) + "\n").encode()
-
-
-def _peak_rate(video: Video) -> int:
-    """Bits per second of the video's dearest fragment."""
-    _, pieces = mp4.fragments(video.data)
-    return math.ceil(max(8 * (piece.end - piece.start) * video.fps / piece.samples for piece in pieces))
-
-
-def _codec(init: bytes) -> str:
-    """`avc1.PPCCLL`: profile, constraints and level as the AVC configuration box has them."""
-    at = init.find(b"avcC")
-    if at < 0 or at + 8 > len(init):
-        raise DeliveryError("the 2D video is not H.264, expected an avcC box")
-    return f"avc1.{init[at + 5 : at + 8].hex()}"
-
-
-# -- the index ---------------------------------------------------------------------------------------------------------
-
-
-def _index(
-    data: bytes,
-    init: int,
-    parts: list[Part],
-    seconds: float,
-    video: Video | None,
-    names: dict[str, str],
-    cache: dict[str, str],
-) -> bytes:
-    """Where everything is. Byte ranges are [first, one past the last]; sha256 are of the `.pd4` file's bytes."""
-    about = info(data)
-    layers = [
+def _layers(data: bytes, init: int, parts: list[Part], segments: str) -> list[dict[str, Any]]:
+    """The slices as the index lists them. Byte ranges are [first, one past the last]; sha256: of the `.pd4` bytes."""
+    return [
         {
             "layer": part.layer,
             "slice": part.slice,
             "range": [part.start, part.end],
             "sha256": hashlib.sha256(data[part.start : part.end]).hexdigest(),
             "depends_on": sorted({before.layer for before in parts[:i]}),
-            "dash": {"file": names[SEGMENTS], "init": [0, init], "range": list(part.segment)},
+            "dash": {"file": segments, "init": [0, init], "range": list(part.segment)},
         }
         for i, part in enumerate(parts)
     ]
-    content: dict[str, Any] = {
-        "file": names[SCENE],
-        "format_version": about["format_version"],
-        "bytes": len(data),
-        "sha256": hashlib.sha256(data).hexdigest(),
-        "time_range": about["time_range"],
-        "seconds": seconds,
-        "layers": layers,
-        "dash": MPD,
-        "hls": PLAYLIST,
-        "video": None,
-        "poster": names.get(POSTER),
-        "first_frame_seconds": {name: 8 * parts[0].end / rate for name, rate in RATES.items()},
-        "cache_control": cache,
-    }
-    if video is not None:
-        content["video"] = {"file": names[VIDEO], "width": video.width, "height": video.height, "fps": video.fps}
+
+
+def _json(content: dict[str, Any]) -> bytes:
     return (json.dumps(content, indent=1) + "\n").encode()
+
+
+# -- the library -------------------------------------------------------------------------------------------------------
+
+LIBRARY = "library.json"
+#: Keys of a package's index that the library repeats.
+FIELDS = ("bytes", "sha256", "format_version", "seconds", "first_frame_seconds")
+STYLE = (
+    "body{font:16px system-ui;margin:2rem;background:#111;color:#eee}"
+    "main{display:grid;grid-template-columns:repeat(auto-fill,minmax(220px,1fr));gap:1rem}"
+    "a{color:inherit;text-decoration:none}img,.none{width:100%;aspect-ratio:4/3;object-fit:cover;background:#333}"
+    "small{color:#aaa}"
+)
+
+
+def library(folder: Path) -> dict[str, bytes]:
+    """Name -> content of the two files that list all packages below `folder`: a JSON index and a page of posters.
+
+    Raises DeliveryError if there are no packages, or one has an invalid index.
+    """
+    scenes = list(_scenes(folder))
+    if not scenes:
+        raise DeliveryError(f"{folder}: holds no packages, expected NAME/{INDEX} as pd4dgs-package writes it")
+    content = {"scenes": scenes, "bytes": sum(scene["bytes"] for scene in scenes)}
+    return {LIBRARY: _json(content), PAGE: _library_page(scenes).encode()}
+
+
+def _scenes(folder: Path) -> Iterator[dict[str, Any]]:
+    for path in sorted(folder.rglob(INDEX)):
+        if path.parent == folder:
+            continue
+        name = path.parent.relative_to(folder).as_posix()
+        base = quote(name)
+        try:
+            about = json.loads(path.read_bytes())
+            scene: dict[str, Any] = {"name": name, "page": f"{base}/{PAGE}", "file": f"{base}/{about['file']}"}
+            scene["poster"] = f"{base}/{about['poster']}" if about["poster"] else None
+            scene |= {field: about[field] for field in FIELDS}
+            scene["layers"] = [{"layer": part["layer"], "end": part["range"][1]} for part in about["layers"]]
+        except (ValueError, KeyError, TypeError) as error:
+            raise DeliveryError(f"{path}: invalid index of a package ({type(error).__name__}: {error})") from None
+        yield scene
+
+
+def _library_page(scenes: list[dict[str, Any]]) -> str:
+    cards = []
+    for scene in scenes:
+        poster = f'<img loading="lazy" alt="" src="{html.escape(scene["poster"])}">' if scene["poster"] else None
+        first = ", ".join(f"{seconds:.1f} s at {rate}bps" for rate, seconds in scene["first_frame_seconds"].items())
+        about = f"{scene['bytes'] / 1e6:.2f} MB; first picture after {first}"
+        link = f'<a href="{html.escape(scene["page"])}">{poster or "<div class=none></div>"}'
+        cards.append(f"{link}<br>{html.escape(scene['name'])}<br><small>{about}</small></a>")
+    head = f'<!doctype html><meta charset="utf-8"><title>{len(scenes)} scenes</title><style>{STYLE}</style>'
+    return f"{head}\n<main>\n" + "\n".join(cards) + "\n</main>\n"

@@ -1,9 +1,8 @@
 """The player as one HTML file: beside a scene on any web server, with the scene inside, or in a notebook.
 
-The player's modules run as they are. Packed, the page and its workers are one file without comments and indentation:
-half the bytes and, more important, one request instead of forty. Modules keep their names and bodies: each becomes a
-function that returns what it exports, in the order in which a browser would run them. That takes the few forms of
-import and export that the player uses, and refuses others.
+The file takes one request instead of one for each module, and browsers open it without a server. Workers of a page that
+is opened as a file cannot import modules, so each entry point becomes one script. A module in it is a function that
+returns its exports, in the order in which a browser would run the modules.
 """
 
 from __future__ import annotations
@@ -20,156 +19,67 @@ from pathlib import Path
 from pd4dgs_codec.errors import DataError, DeliveryError
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.scene import Scene
-from pd4dgs_codec.web.urls import is_url
+from pd4dgs_codec.web import PAGE, is_url
 
-PAGE = "index.html"
-MODULE = "page.js"
-#: Asks for the scene before the rest of the page is there.
-EARLY = "early.js"
+#: The page's script, and the one that requests the scene while the rest of the page arrives.
+SCRIPT, EARLY = "page.js", "early.js"
 WORKERS = ("loader-worker.js", "sort-worker.js", "evaluate-worker.js")
-#: Of packing a scene that is shown at once.
+#: Encoder effort for a scene that is shown immediately.
 EFFORT = 1
 
-#: How the player names what it starts a worker from.
 _WORKER_URL = re.compile(r'new URL\("\./([\w-]+-worker\.js)", import\.meta\.url\)')
-_NAMES = r"\{([^}]*)\}"
-_IMPORT = re.compile(rf'^import {_NAMES} from "([^"]+)";\n', re.MULTILINE)
-_REEXPORT = re.compile(rf'^export {_NAMES} from "([^"]+)";\n', re.MULTILINE)
+_COMMENTS = re.compile(r"/\*\*.*?\*/[ \t]*|^[ \t]*//[^\n]*", re.DOTALL | re.MULTILINE)
+_SPACE = re.compile(r"\s*\n\s*")
+_IMPORT = re.compile(r'^import \{([^}]*)\} from "([^"]+)";$', re.MULTILINE)
+_REEXPORT = re.compile(r'^export \{([^}]*)\} from "([^"]+)";$', re.MULTILINE)
 _EXPORT = re.compile(r"^export (?=(?:async )?(?:const|function\*?|class) (\w+))", re.MULTILINE)
-_LEFT = re.compile(r"^(?:import|export)\b.*", re.MULTILINE)
-#: A slash after one of these begins a regular expression, not a division.
-_BEFORE_REGEX = re.compile(r"(?:[(,=:\[!&|?{};+*%<>~^-]|\b(?:return|typeof|case|of|in))\s*$")
-
-
-def strip(source: str) -> str:
-    """JavaScript without comments, indentation and empty lines. Strings, templates and patterns stay as they are."""
-    out: list[str] = []
-    depths: list[int] = []  # of braces, one per template that is open
-    at = 0
-    while at < len(source):
-        two, one = source[at : at + 2], source[at]
-        if two == "//":
-            at = (source + "\n").index("\n", at)
-            continue
-        if two == "/*":
-            end = source.find("*/", at)
-            if end < 0:
-                raise DeliveryError(f"a comment without end: {source[at : at + 40]!r}")
-            at = end + 2
-            continue
-        if one == "/" and _BEFORE_REGEX.search("".join(out[-40:])):
-            end = _quoted(source, at)
-        elif one in "'\"":
-            end = _quoted(source, at)
-        elif one == "`" or (one == "}" and depths and depths[-1] == 0):
-            if one == "}":
-                depths.pop()
-            end, opened = _template(source, at + 1)
-            if opened:
-                depths.append(0)
-        else:
-            if depths:
-                depths[-1] += {"{": 1, "}": -1}.get(one, 0)
-            if one == "\n":
-                while out and out[-1] in " \t":
-                    out.pop()
-                at += len(source) - at - len(source[at:].lstrip())
-                if out and out[-1] != "\n":
-                    out.append("\n")
-                continue
-            end = at + 1
-            if one in " \t" and (not out or out[-1] == "\n"):
-                at = end
-                continue
-        out.append(source[at:end])
-        at = end
-    if depths:
-        raise DeliveryError("a template without end")
-    return "".join(out).rstrip() + "\n"
-
-
-def _quoted(source: str, at: int) -> int:
-    """Where the string or pattern that starts at `at` ends."""
-    quote, i, in_class = source[at], at + 1, False
-    while i < len(source) and source[i] != "\n":
-        if source[i] == "\\":
-            i += 1
-        elif quote == "/" and source[i] in "[]":
-            in_class = source[i] == "["
-        elif source[i] == quote and not in_class:
-            return i + 1
-        i += 1
-    raise DeliveryError(f"a string or pattern without end: {source[at : at + 40]!r}")
-
-
-def _template(source: str, at: int) -> tuple[int, bool]:
-    """Where the text of a template that goes on at `at` ends, and whether an expression follows."""
-    i = at
-    while i < len(source):
-        if source[i] == "\\":
-            i += 1
-        elif source[i] == "`":
-            return i + 1, False
-        elif source[i : i + 2] == "${":
-            return i + 2, True
-        i += 1
-    raise DeliveryError(f"a template without end: {source[at : at + 40]!r}")
 
 
 def bundle(root: Path, entry: str) -> str:
-    """The module `entry` of the folder `root` and all that it imports as one module with its exports."""
-    modules: dict[Path, str] = {}  # path -> packed, imported ones first
-    exports: dict[Path, list[str]] = {}
-    packing: list[Path] = []
+    """The module `entry` of the folder `root` and all that it imports as one script, without comments and indentation.
 
-    def pack(path: Path) -> str:
-        if path in packing:
-            raise DeliveryError(f"{path}: imports itself through {packing[-1]}")
+    It knows the forms of import and export that the player uses. Raises DeliveryError for any other.
+    """
+    modules: dict[Path, str] = {}  # imported ones first
+
+    def add(path: Path) -> str:
+        """The module's variable."""
         if path not in modules:
-            packing.append(path)
-            modules[path] = _wrapped(path, pack, exports)
-            packing.pop()
-        return f"m{list(modules).index(path)}"
+            modules[path] = _module(path, lambda name: add((path.parent / name).resolve()))
+            modules[path] = modules.pop(path)  # behind those that it imports
+        return "m_" + re.sub(r"\W", "_", path.relative_to(root.resolve()).as_posix())
 
-    start = (root / entry).resolve()
-    pack(start)
-    parts = [f"const m{i}=(()=>{{\n{body}}})();\n" for i, body in enumerate(modules.values())]
-    names = ",".join(exports[start])
-    return "".join(parts) + (f"const {{{names}}}=m{len(parts) - 1};\nexport{{{names}}};\n" if names else "")
+    add((root / entry).resolve())
+    return "".join(f"const {add(path)}=(()=>{{\n{body}}})();\n" for path, body in list(modules.items()))
 
 
-def _wrapped(path: Path, pack: Callable[[Path], str], exports: dict[Path, list[str]]) -> str:
-    body = strip(path.read_text(encoding="utf-8"))
-    names: list[str] = []
-    packed: dict[str, str] = {}
+def _module(path: Path, imported: Callable[[str], str]) -> str:
+    body = packed(path)
+    exports: list[str] = []
 
-    def target(relative: str) -> str:
-        # not twice: a module that is being packed has no number yet
-        if relative not in packed:
-            packed[relative] = pack((path.parent / relative).resolve())
-        return packed[relative]
+    def take(match: re.Match[str]) -> str:
+        return f"const {{{match[1].replace(' as ', ':')}}}={imported(match[2])};"
 
-    def imported(match: re.Match[str]) -> str:
-        listed = ",".join(name.strip().replace(" as ", ":") for name in match[1].split(",") if name.strip())
-        return f"const {{{listed}}}={target(match[2])};\n"
-
-    def passed_on(match: re.Match[str]) -> str:
-        given = [name.strip() for name in match[1].split(",") if name.strip()]
-        names.extend(f"{name}:{target(match[2])}.{name}" for name in given)
+    def pass_on(match: re.Match[str]) -> str:
+        exports.extend(f"{name.strip()}:{imported(match[2])}.{name.strip()}" for name in match[1].split(","))
         return ""
 
-    body = _REEXPORT.sub(passed_on, _IMPORT.sub(imported, body))
-    names += [match[1] for match in _EXPORT.finditer(body)]
+    body = _REEXPORT.sub(pass_on, _IMPORT.sub(take, body))
+    exports += [match[1] for match in _EXPORT.finditer(body)]
     body = _EXPORT.sub("", body)
-    left = _LEFT.search(body)
-    if left:
-        raise DeliveryError(f"{path}: the packer does not know {left[0]!r}")
-    exports[path] = [name.split(":")[0] for name in names]
-    return f"{body}return{{{','.join(names)}}};\n"
+    unknown = re.search(r"^(?:import|export)\b.*", body, re.MULTILINE)
+    if unknown:
+        raise DeliveryError(f"{path}: cannot bundle {unknown[0]!r}")
+    return f"{body}return{{{','.join(exports)}}};\n"
+
+
+def packed(path: Path) -> str:
+    """A script without its JSDoc, comment lines and indentation, of which the player's strings hold none."""
+    return _SPACE.sub("\n", _COMMENTS.sub("", path.read_text(encoding="utf-8"))).strip() + "\n"
 
 
 def player_folder() -> Path:
-    """Where the player lies: in the installed package, or beside it in a checkout. DataError if it is nowhere."""
+    """Folder of the player, in the installed package or beside it in a checkout. Raises DataError if it is missing."""
     package = Path(__file__).parents[1]
     for folder in (package / "player", package.parent / "player"):
         if (folder / PAGE).is_file():
@@ -178,14 +88,15 @@ def player_folder() -> Path:
 
 
 def page(source: bytes | str | None = None) -> str:
-    """The player as one HTML file. It needs no server for a scene that it holds, and no network.
+    """The player as one HTML file.
 
-    source: the bytes of a `.pd4`, or its URL; None: `scene.pd4` beside the page, or the page's `?src=address`.
+    source: the bytes of a `.pd4`, which the page then holds, or its URL; None: `scene.pd4` beside the page, or the
+    page's `?src=address`.
     """
     root = player_folder()
     workers = {name: bundle(root, f"render/{name}") for name in WORKERS}
-    code = _WORKER_URL.sub(r"new URL(workers['\1'])", bundle(root, MODULE))
-    # no module, so that the loader begins while the browser still reads the player
+    code = _WORKER_URL.sub(r"new URL(workers['\1'])", bundle(root, SCRIPT))
+    # the first script is not a module, so that the loader begins while the browser still reads the player
     script = f"""<script>
 const workers={_literal(workers)};
 for(const name in workers)workers[name]=URL.createObjectURL(new Blob([workers[name]],{{type:"text/javascript"}}));
@@ -196,8 +107,7 @@ globalThis.early?.begin(workers["{WORKERS[0]}"]);
 """
     text = re.sub(r"<!--.*?-->\s*", "", (root / PAGE).read_text(encoding="utf-8"), flags=re.DOTALL)
     head, body, _ = re.split(r'(?=<p id="note")|<script type="module".*', text, maxsplit=2)
-    first = strip((root / EARLY).read_text(encoding="utf-8"))
-    early = "" if isinstance(source, bytes) else f"<script>\n{first}</script>"
+    early = "" if isinstance(source, bytes) else f"<script>\n{packed(root / EARLY)}</script>"
     head = head.replace(f'<script src="./{EARLY}"></script>', early)
     if isinstance(source, str):
         head, body = head.replace("<html ", f'<html data-src="{html.escape(source)}" ', 1), "<body>\n"
@@ -207,13 +117,13 @@ globalThis.early?.begin(workers["{WORKERS[0]}"]);
 
 
 def _literal(value: object) -> str:
-    """As JavaScript inside a page, where `</script` and `<!--` would be the page's."""
+    """As JavaScript inside a page, where `</script` and `<!--` would end the script."""
     return json.dumps(value).replace("<", "\\u003c")
 
 
 @dataclass(frozen=True)
 class Shown:
-    """What a notebook shows as the result of a cell. page: the whole HTML file. width: CSS. height: pixels."""
+    """The result of a notebook cell. page: the whole HTML file. width: CSS. height: pixels."""
 
     page: str
     width: str
@@ -230,9 +140,9 @@ class Shown:
 def show(scene: Scene | bytes | str | os.PathLike[str], *, width: str = "100%", height: int = 480) -> Shown:
     """The player with a scene, for a notebook: the last line of a cell, or `display(show(scene))`.
 
-    scene: a decoded scene, the bytes of a `.pd4`, its path or its URL. The page holds all but the last; the server of
-    a URL must allow pages of other sites to read it, as pd4dgs-serve does. width: CSS. height: pixels. Raises
-    DecodeError for bytes that are no whole, valid `.pd4` file.
+    scene: a decoded scene, the bytes of a `.pd4`, its path or its URL. The page holds the scene unless it is a URL,
+    whose server must allow pages of other sites to read it, as pd4dgs-serve does. width: CSS. height: pixels. Raises
+    DecodeError for bytes that are not a complete, valid `.pd4` file.
     """
     if isinstance(scene, str) and is_url(scene):
         return Shown(page(scene), width, height)
@@ -242,5 +152,5 @@ def show(scene: Scene | bytes | str | os.PathLike[str], *, width: str = "100%", 
         data = encode(scene, effort=EFFORT)
     else:
         data = scene if isinstance(scene, bytes) else Path(scene).read_bytes()
-        decode(data)  # a fault is better said here than in a page
+        decode(data)  # an error here is clearer than one in the page
     return Shown(page(data), width, height)

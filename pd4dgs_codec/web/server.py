@@ -1,6 +1,7 @@
-"""A small web server for one folder: ranges, validators, CORS, and a slow link to try things over.
+"""A small web server for one folder: ranges, validators, CORS, and a simulated slow link.
 
-It is for trying, measuring and showing; `pd4dgs-serve --help` says how nginx or Caddy serve the same folder.
+It is meant for trials, measurements and demonstrations; `pd4dgs-serve --help` configures nginx or Caddy for the same
+folder.
 """
 
 from __future__ import annotations
@@ -10,6 +11,7 @@ import gzip
 import os
 import socket
 import stat
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -22,11 +24,8 @@ from typing import BinaryIO
 from urllib.parse import quote, unquote, urlsplit
 
 from pd4dgs_codec.errors import DeliveryError
-from pd4dgs_codec.web.link import Link
-from pd4dgs_codec.web.names import cache_control
-from pd4dgs_codec.web.page import PAGE
-from pd4dgs_codec.web.patience import Patient
-from pd4dgs_codec.web.ranges import Unsatisfiable, http_time, lists_etag, requested_range
+from pd4dgs_codec.web import PAGE
+from pd4dgs_codec.web.headers import Unsatisfiable, cache_control, http_time, lists_etag, requested_range
 
 MEDIA_TYPES = {
     ".html": "text/html; charset=utf-8",
@@ -40,7 +39,7 @@ MEDIA_TYPES = {
     ".png": "image/png",
     ".wasm": "application/wasm",
 }
-#: Sent compressed to who takes that, up to a size in bytes, as any server of pages does.
+#: Files up to MAX_ZIPPED bytes with these suffixes are sent with gzip to clients that accept it.
 ZIPPED, MAX_ZIPPED = {".html", ".js", ".json"}, 1 << 20
 METHODS = "GET, HEAD, OPTIONS"
 CORS = {
@@ -54,33 +53,67 @@ PREFLIGHT = {
     "Access-Control-Allow-Headers": "Range, If-Range, If-None-Match, If-Modified-Since",
     "Access-Control-Max-Age": "86400",
 }
-#: Within which a client must have sent its next request, all of it, and taken each block of the answer.
+#: Time limit for a client to send its next request, and to accept each block of the response.
 IDLE_SECONDS = 60.0
+#: Link time of a block: short against the milliseconds to be measured, long against waking a thread.
+QUANTUM_SECONDS = 0.005
+MIN_BLOCK, MAX_BLOCK = 64, 1 << 18
+#: A thread that wakes late catches up by this much; further capacity that a slow reader leaves unused is lost.
+CATCH_UP_SECONDS = 0.05
 
 
-def locate(root: Path, target: str) -> Path | None:
-    """The file under `root` that a request target names; None for all else: no such file, hidden names, ways out.
+class Link:
+    """A simulated link that all transfers share in turn, block by block.
 
-    A target that ends in a slash names the folder's page.
-    root: absolute and free of links. Links inside it count if what they lead to lies inside it as well.
+    rate: bits per second of payload (protocol headers are free), or None for no limit.
     """
-    try:
-        path = unquote(urlsplit(target).path, errors="strict")
-        names = path.split("/")[1:]
-        names[-1:] = [names[-1] or PAGE] if names else []
-        if not path.startswith("/") or any(n.startswith(".") or not n or "\\" in n or "\0" in n for n in names):
-            return None
-        found = root.joinpath(*names).resolve(strict=True)
-    except (OSError, ValueError, RuntimeError):  # RuntimeError: links in a circle, before Python 3.13
-        return None
-    return found if found.is_relative_to(root) else None
+
+    def __init__(self, rate: float | None = None):
+        self.rate = rate
+        #: Bytes to send at a time.
+        self.block = MAX_BLOCK if rate is None else int(min(max(rate * QUANTUM_SECONDS / 8, MIN_BLOCK), MAX_BLOCK))
+        self._lock = threading.Lock()
+        self._transfers = 0
+        self._free_at = 0.0  # when the last block granted will have crossed
+
+    @contextlib.contextmanager
+    def transfer(self) -> Iterator[None]:
+        """Surrounds one response. After a pause the link starts without saved capacity."""
+        with self._lock:
+            if not self._transfers:
+                self._free_at = max(self._free_at, time.monotonic())
+            self._transfers += 1
+        try:
+            yield
+        finally:
+            with self._lock:
+                self._transfers -= 1
+
+    def send(self, body: bytes, write: Callable[[bytes], object]) -> None:
+        """Passes `body` to `write` block by block, each when it has crossed."""
+        with self.transfer():
+            for start in range(0, len(body), self.block):
+                block = body[start : start + self.block]
+                self.cross(len(block))
+                write(block)
+
+    def cross(self, size: int) -> None:
+        """Returns when `size` more bytes have crossed. Deadlines are absolute, so that delays do not accumulate."""
+        if self.rate is None:
+            return
+        with self._lock:
+            start = max(self._free_at, time.monotonic() - CATCH_UP_SECONDS)
+            self._free_at = done_at = start + 8 * size / self.rate
+        wait = done_at - time.monotonic()
+        if wait > 0:
+            time.sleep(wait)
 
 
 class Server(ThreadingTCPServer):
-    """Serves `folder` on host:port (0: any free port) as soon as serve_forever runs.
+    """Serves `folder` on host:port (0: any free port) once serve_forever runs.
 
-    link: what all bodies cross. latency: seconds of a round trip; a new connection waits for one, each request for
-    another. log: called with one line per request. Raises DeliveryError for a folder or an address it cannot use.
+    link: carries all response bodies. latency: seconds of a round trip, for each new connection and each request.
+    log: called with one line per request. Raises DeliveryError for an unusable folder or address.
     """
 
     daemon_threads = True
@@ -109,18 +142,18 @@ class Server(ThreadingTCPServer):
 
     @property
     def url(self) -> str:
-        """Where the folder is, with a final slash."""
+        """Address of the folder, with a final slash."""
         host, port = self.server_address[:2]
         name = str(host)
         return f"http://{f'[{name}]' if ':' in name else name}:{port}/"
 
     def url_of(self, name: str) -> str:
-        """The URL of a file in the folder."""
+        """Address of a file in the folder."""
         return self.url + quote(name)
 
     @contextlib.contextmanager
     def running(self) -> Iterator[Server]:
-        """Serves from a thread of its own inside the `with` block."""
+        """Serves from another thread inside the `with` block."""
         thread = threading.Thread(target=self.serve_forever, kwargs={"poll_interval": 0.02}, daemon=True)
         thread.start()
         try:
@@ -131,11 +164,47 @@ class Server(ThreadingTCPServer):
             thread.join()
 
     def handle_error(self, request: object, client_address: object) -> None:
-        """Clients that go away in the middle are everyday life; anything else is a fault of ours and stays loud."""
-        import sys
-
+        """Reports errors of this program; clients that disconnect are normal."""
         if not isinstance(sys.exc_info()[1], OSError):
             super().handle_error(request, client_address)  # type: ignore[arg-type]
+
+
+def _locate(root: Path, target: str) -> Path | None:
+    """The file under `root` that a request target names; None for missing and hidden files and paths out of `root`.
+
+    A target that ends in a slash names the folder's page. Links inside `root`, itself absolute and free of links,
+    count if they lead to a place inside it.
+    """
+    try:
+        path = unquote(urlsplit(target).path, errors="strict")
+        names = path.split("/")[1:]
+        names[-1:] = [names[-1] or PAGE] if names else []
+        if not path.startswith("/") or any(n.startswith(".") or not n or "\\" in n or "\0" in n for n in names):
+            return None
+        found = root.joinpath(*names).resolve(strict=True)
+    except (OSError, ValueError, RuntimeError):  # RuntimeError: a cycle of links, before Python 3.13
+        return None
+    return found if found.is_relative_to(root) else None
+
+
+def _open_regular(path: Path) -> BinaryIO | None:
+    """The open file; None if it cannot be opened or is a folder, a pipe, or a link that has just been put there."""
+    try:
+        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
+    except OSError:
+        return None
+    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
+        os.close(descriptor)
+        return None
+    return os.fdopen(descriptor, "rb")
+
+
+def _etag(state: os.stat_result) -> str:
+    return f'"{state.st_ino:x}-{state.st_size:x}-{state.st_mtime_ns:x}"'
+
+
+#: Control characters of a request line would act on the terminal that shows it.
+_PRINTABLE = {code: "?" for code in [*range(32), *range(127, 160)]}
 
 
 class _Handler(BaseHTTPRequestHandler):
@@ -147,13 +216,26 @@ class _Handler(BaseHTTPRequestHandler):
 
     def setup(self) -> None:
         super().setup()
-        self._patient = Patient(self.connection)
-        self.rfile = self._patient.makefile()
         time.sleep(self.server.latency)
 
     def handle_one_request(self) -> None:
-        self._patient.until = time.monotonic() + IDLE_SECONDS
-        super().handle_one_request()
+        # a socket's time limit begins anew with every byte
+        self._limit = threading.Timer(IDLE_SECONDS, self._disconnect)
+        self._limit.daemon = True
+        self._limit.start()
+        try:
+            super().handle_one_request()
+        finally:
+            self._limit.cancel()
+
+    def parse_request(self) -> bool:
+        complete = super().parse_request()
+        self._limit.cancel()
+        return complete
+
+    def _disconnect(self) -> None:
+        with contextlib.suppress(OSError):
+            self.connection.shutdown(socket.SHUT_RDWR)
 
     def do_GET(self) -> None:
         self._answer(body=True)
@@ -165,15 +247,15 @@ class _Handler(BaseHTTPRequestHandler):
         self._begin(HTTPStatus.NO_CONTENT, {"Allow": METHODS, **PREFLIGHT})
 
     def _refuse(self) -> None:
-        self.close_connection = True  # a body may follow that nobody reads
+        self.close_connection = True  # a request body, which nobody reads, may follow
         self._fail(HTTPStatus.METHOD_NOT_ALLOWED, {"Allow": METHODS})
 
     do_POST = do_PUT = do_PATCH = do_DELETE = _refuse
 
     def _answer(self, body: bool) -> None:
         if "Content-Length" in self.headers or "Transfer-Encoding" in self.headers:
-            self.close_connection = True  # a body that nobody reads must not be taken for the next request
-        path = locate(self.server.root, self.path)
+            self.close_connection = True  # the request body must not be taken for the next request
+        path = _locate(self.server.root, self.path)
         file = None if path is None else _open_regular(path)
         if path is None or file is None:
             self._fail(HTTPStatus.NOT_FOUND)
@@ -186,7 +268,7 @@ class _Handler(BaseHTTPRequestHandler):
         state = os.fstat(file.fileno())
         size, etag = state.st_size, _etag(state)
         zipped = suffix in ZIPPED and size <= MAX_ZIPPED and self._takes_gzip()
-        if zipped:  # another representation: neither its ranges nor its ETag are those of the plain one
+        if zipped:  # another representation, with other ranges and another ETag
             etag = etag[:-1] + '-gzip"'
         headers = {"Accept-Ranges": "bytes", "Cache-Control": cache_control(path.name), "ETag": etag}
         headers["Last-Modified"] = formatdate(state.st_mtime, usegmt=True)
@@ -197,10 +279,13 @@ class _Handler(BaseHTTPRequestHandler):
             return
         headers["Content-Type"] = MEDIA_TYPES.get(suffix, "application/octet-stream")
         if zipped:
-            self._send_zipped(file, headers, body)
+            content = gzip.compress(file.read(MAX_ZIPPED), 9, mtime=0)
+            self._begin(HTTPStatus.OK, {**headers, "Content-Encoding": "gzip", "Content-Length": str(len(content))})
+            if body:
+                self.server.link.send(content, self.wfile.write)
             return
         try:
-            # HTTP defines ranges for GET alone
+            # HTTP defines ranges for GET only
             part = requested_range(self.headers.get("Range"), size) if body and self._range_holds(etag, state) else None
         except Unsatisfiable:
             self._fail(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, {**headers, "Content-Range": f"bytes */{size}"})
@@ -218,18 +303,12 @@ class _Handler(BaseHTTPRequestHandler):
         listed = self.headers.get("Accept-Encoding", "").lower().replace(" ", "").split(",")
         return "gzip" in listed and "Range" not in self.headers
 
-    def _send_zipped(self, file: BinaryIO, headers: dict[str, str], body: bool) -> None:
-        content = gzip.compress(file.read(MAX_ZIPPED), 9, mtime=0)
-        self._begin(HTTPStatus.OK, {**headers, "Content-Encoding": "gzip", "Content-Length": str(len(content))})
-        if body:
-            self.server.link.send(content, self.wfile.write)
-
     def _send_body(self, file: BinaryIO, left: int, etag: str) -> None:
         link = self.server.link
         with link.transfer():
             while left:
                 block = file.read(min(left, link.block))
-                # a file rewritten in place: what was promised no longer exists, and a cut makes the client ask again
+                # a file rewritten in place: after a disconnection the client asks for the new one
                 if not block or _etag(os.fstat(file.fileno())) != etag:
                     self.close_connection = True
                     return
@@ -245,7 +324,7 @@ class _Handler(BaseHTTPRequestHandler):
         return since is not None and int(modified) <= since
 
     def _range_holds(self, etag: str, state: os.stat_result) -> bool:
-        """Whether If-Range, where given, names this very file; a date counts only if nothing could follow within it."""
+        """Whether If-Range, if given, names this file. A date counts once its second is over."""
         condition = self.headers.get("If-Range")
         if condition is None or condition == etag:
             return True
@@ -259,7 +338,7 @@ class _Handler(BaseHTTPRequestHandler):
             self.wfile.write(text)
 
     def send_error(self, code: int, message: str | None = None, explain: str | None = None) -> None:
-        """Called for what is no request: answered like any other refusal, whatever version it spoke."""
+        """Refuses an invalid request, of whatever HTTP version, like any other."""
         self.request_version, self.close_connection = self.protocol_version, True
         self._fail(HTTPStatus(code))
 
@@ -273,25 +352,6 @@ class _Handler(BaseHTTPRequestHandler):
         self.end_headers()
 
     def log_message(self, format: str, *args: object) -> None:
+        """One line for each request."""
         if self.server.log:
             self.server.log(f"{self.client_address[0]} {format % args}".translate(_PRINTABLE))
-
-
-#: Control characters of a request line would act on the terminal that shows it.
-_PRINTABLE = {code: "?" for code in [*range(32), *range(127, 160)]}
-
-
-def _open_regular(path: Path) -> BinaryIO | None:
-    """The file opened, or None if it cannot be or is something else: a folder, a pipe, a link put there meanwhile."""
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-    except OSError:
-        return None
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        return None
-    return os.fdopen(descriptor, "rb")
-
-
-def _etag(state: os.stat_result) -> str:
-    return f'"{state.st_ino:x}-{state.st_size:x}-{state.st_mtime_ns:x}"'

@@ -1,83 +1,66 @@
-"""The beginning of one remote file, growing: what has arrived is never asked for again unless the file changes.
+"""The first bytes of one remote file. Bytes that have arrived are never requested again unless the file changes.
 
-HTTP itself comes from the standard library; connections are direct (no proxies), kept open between requests, and follow
+HTTP comes from the standard library. Connections are direct (no proxies), stay open between requests, and follow
 redirects.
 """
 
 from __future__ import annotations
 
+import contextlib
 import http.client
 import math
-import queue
 import socket
 import ssl
 import threading
 import time
-from dataclasses import dataclass
+from collections.abc import Callable
+from concurrent import futures
 from http import HTTPStatus
-from typing import Any
-from urllib.parse import quote, urljoin, urlsplit
+from typing import TypeVar
+from urllib.parse import SplitResult, quote, urljoin, urlsplit
 
-from pd4dgs_codec.errors import DeliveryError, one_line
-from pd4dgs_codec.web.patience import Patient
-from pd4dgs_codec.web.ranges import content_range, strong_etag
-from pd4dgs_codec.web.urls import is_url
+from pd4dgs_codec.errors import DeliveryError, Truncated, one_line
+from pd4dgs_codec.format.container import PREAMBLE_SIZE, read_preamble
+from pd4dgs_codec.format.info import info
+from pd4dgs_codec.format.limits import MAX_HEADER
+from pd4dgs_codec.web import is_url
+from pd4dgs_codec.web.headers import content_range, strong_etag
 
 BLOCK = 1 << 16
 MAX_REDIRECTS = 5
-#: Changes of the file during one transfer after which it counts as one that never holds still.
+#: After so many changes during one transfer the file counts as never stable.
 MAX_CHANGES = 4
 BACKOFF_SECONDS = 0.2
-#: Answers that may be another one a moment later; other errors are final.
-PASSING = {408, 425, 429, 500, 502, 503, 504}
-#: Of what a server says, at most so many characters are shown.
-SHOWN = 80
+#: Temporary errors; all others are final.
+TEMPORARY = {408, 425, 429, 500, 502, 503, 504}
 REDIRECTS = {301, 302, 303, 307, 308}
+#: Characters of a server's text that an error message quotes.
+SHOWN = 80
+#: Most headers have some 300 bytes; a longer one costs a second request.
+HEADER_GUESS = 512
+LONGEST_HEADER = PREAMBLE_SIZE + MAX_HEADER
+
+T = TypeVar("T")
 
 
 class Changed(Exception):
-    """The file is another one now: what had arrived is gone, and the transfer stands at byte 0."""
+    """The file has changed: its earlier bytes are discarded, and the transfer stands at byte 0."""
 
 
 class OutOfTime(Exception):
-    """The seconds allowed are over; what has arrived stays."""
+    """The time budget is spent; bytes that have arrived stay."""
 
 
 class _Cut(Exception):
-    """The connection ended before what it promised, or an answer makes no sense; asking again may help."""
-
-
-@dataclass(frozen=True)
-class _Place:
-    """Where to send a request. target: path and query, quoted."""
-
-    url: str
-    secure: bool
-    host: str
-    port: int | None
-    target: str
-
-    @staticmethod
-    def of(url: str) -> _Place:
-        try:
-            parts = urlsplit(url)
-            if not is_url(url) or not parts.hostname or "@" in parts.netloc:
-                raise ValueError
-            target = quote(parts.path or "/", safe="/%:=&~+!$,;'@()*") + (
-                f"?{quote(parts.query, safe='/%:=&?~+!$,;@()*')}" if parts.query else ""
-            )
-            return _Place(url, parts.scheme.lower() == "https", parts.hostname, parts.port, target)
-        except ValueError:
-            raise DeliveryError(f"found {url!r}, expected http://HOST/PATH or https://HOST/PATH") from None
+    """The connection ended early, or the response is invalid: a new request may help."""
 
 
 class Transfer:
-    """Fetches one URL front to back, as far as asked, and goes on after cuts.
+    """Fetches one URL front to back, as far as asked, and resumes after interruptions.
 
-    data: what has arrived, from byte 0. total: length of the file, None until told. stall: seconds within which a
-    connection must stand, an answer's whole header be here, and the next block of its body; else it counts as cut.
-    attempts: failures in a row, without a byte between them, before giving up. requests, cuts, changes: how often each
-    happened.
+    data: bytes that have arrived, from byte 0. total: length of the file, None until known. stall: seconds until a
+    connection without a complete response header, or without a further byte of the body, counts as interrupted.
+    attempts: consecutive failures, without a byte between them, before giving up. requests, cuts, changes: counts.
     """
 
     def __init__(self, url: str, *, stall: float = 10.0, attempts: int = 5):
@@ -85,26 +68,26 @@ class Transfer:
         self.data = bytearray()
         self.total: int | None = None
         self.requests = self.cuts = self.changes = 0
-        self._home = self._place = _Place.of(url)
+        self._home = self._place = _parsed(url)
         self._validator: str | None = None
         self._connection: http.client.HTTPConnection | None = None
-        self._socket: Patient | None = None  # http.client forgets it once an answer is the last
+        self._socket: socket.socket | None = None  # http.client forgets it before the last response is read
         self._response: http.client.HTTPResponse | None = None
-        self._response_end: int | None = None  # of the part in the answer being read; None: not told
-        self._skip = 0  # bytes of the answer that are here already
+        self._response_end: int | None = None  # offset in the file where the current response ends, if known
+        self._skip = 0  # bytes of the response that have arrived before
 
     def read(self, end: int | None = None, *, reach: int | None = None, seconds: float = math.inf) -> bytes:
         """The next bytes to arrive, none beyond `end` (None: the end of the file); empty if all are here.
 
-        reach: how far one request may go, so that later reads need no further one; None asks for the whole rest.
-        Raises Changed, OutOfTime after `seconds`, or DeliveryError if the file cannot be had.
+        reach: offset up to which one request may ask, so that later reads need no further request; None: the end.
+        Raises Changed, OutOfTime after `seconds`, or DeliveryError if the file is not available.
         """
         until, failures = time.monotonic() + seconds, 0
-        while not self._here(end):
+        while not self._is_here(end):
             try:
                 if self._response is None:
                     self._request(reach, until)
-                    continue  # an answer may also say that there is nothing to read
+                    continue  # the response may say that there is nothing to read
                 block = self._receive(end, until)
             except (OSError, http.client.HTTPException, _Cut) as error:
                 self.close()
@@ -123,12 +106,15 @@ class Transfer:
         return b""
 
     def rewind(self, size: int) -> None:
-        """Forgets all but the first `size` bytes."""
+        """Discards all but the first `size` bytes."""
         del self.data[size:]
         self.close()
 
     def close(self) -> None:
-        """Ends the connection; what has arrived stays, and a later read opens another."""
+        """Closes the connection. Bytes that have arrived stay; a later read connects again."""
+        if self._socket is not None:
+            with contextlib.suppress(OSError, ValueError):
+                self._socket.shutdown(socket.SHUT_RDWR)  # wakes a thread that still reads from it
         if self._response is not None:
             self._response.close()
         if self._connection is not None:
@@ -137,21 +123,23 @@ class Transfer:
         self._skip = 0
         self._place = self._home
 
-    def _here(self, end: int | None) -> bool:
+    def _is_here(self, end: int | None) -> bool:
         size = len(self.data)
         return (end is not None and size >= end) or (self.total is not None and size >= self.total)
 
     def _receive(self, end: int | None, until: float) -> bytes:
-        """One block of the answer, or b"" at its proper end or within what is skipped."""
-        assert self._response is not None
-        start = len(self.data) - self._skip
+        """One block of the response; b"" at its regular end and while bytes are skipped."""
+        response = self._response
+        assert response is not None and self._socket is not None
         limit = BLOCK if end is None or self._skip else min(BLOCK, end - len(self.data))
         if self._response_end is not None:
-            limit = min(limit, self._response_end - start)
+            limit = min(limit, self._response_end - (len(self.data) - self._skip))
         if self._skip:
             limit = min(limit, self._skip)
-        self._wait_at_most(until)
-        block = self._response.read1(limit) if limit else b""
+        seconds = self._patience(until)
+        self._socket.settimeout(seconds)
+        # a chunk's length takes several reads, each with a time limit of its own
+        block = _within(seconds, lambda: response.read1(limit)) if response.chunked else response.read1(limit)
         if self._skip:
             self._skip -= len(block)
             if not block:
@@ -159,20 +147,27 @@ class Transfer:
             return b""
         self.data += block
         if len(self.data) == self._response_end:
-            self._response.close()  # all of it was read, so the connection can be used again
+            response.close()  # it is read completely, so the connection can be used again
             self._response = None
         elif not block:
             if self._response_end is not None:
                 raise _Cut(f"the connection ended at byte {len(self.data):,} of {self._response_end:,}")
-            self._response, self.total = None, len(self.data)  # a length never told ends with the connection
+            self._response, self.total = None, len(self.data)  # of unknown length: it ends with the connection
         return block
+
+    def _patience(self, until: float) -> float:
+        """Seconds for the next operation."""
+        left = min(self.stall, until - time.monotonic())
+        if left <= 0:
+            raise TimeoutError
+        return left
 
     # -- requests ------------------------------------------------------------------------------------------------------
 
     def _request(self, reach: int | None, until: float) -> None:
         start = len(self.data)
         headers = {"Accept-Encoding": "identity", "User-Agent": "pd4dgs"}
-        if start and self._validator is None:  # the rest could be that of another file, so all of it once more
+        if start and self._validator is None:  # the rest may belong to another file: fetch all of it again
             headers["Cache-Control"] = "no-cache"
         elif start:
             headers["Range"] = f"bytes={start}-" + ("" if reach is None else str(reach - 1))
@@ -183,65 +178,69 @@ class Transfer:
             response = self._send(headers, until)
             if response.status not in REDIRECTS:
                 break
-            here, place = self._place.url, response.headers.get("Location")
-            self.close()  # which goes back to where it all began
-            if place is None:
-                raise DeliveryError(f"{self.url}: a redirect that leads nowhere")
+            here, target = self._place.geturl(), response.headers.get("Location")
+            self.close()
+            if target is None:
+                raise DeliveryError(f"{self.url}: a redirect without a Location")
             try:
-                self._place = _Place.of(urljoin(here, place))
+                self._place = _parsed(urljoin(here, target))
             except ValueError:
-                raise DeliveryError(
-                    f"{self.url}: a redirect to {one_line(place, SHOWN)!r}, which is no address"
-                ) from None
+                raise DeliveryError(f"{self.url}: invalid redirect to {one_line(target, SHOWN)!r}") from None
         else:
             raise DeliveryError(f"{self.url}: more than {MAX_REDIRECTS} redirects")
         self._response = response
         self._accept(response, start, "Range" in headers)
 
     def _send(self, headers: dict[str, str], until: float) -> http.client.HTTPResponse:
+        """The response with its headers. The time limit covers name resolution, connection, TLS and all headers."""
+        seconds = self._patience(until)
         if self._connection is None:
-            kind = http.client.HTTPSConnection if self._place.secure else http.client.HTTPConnection
-            self._connection = kind(self._place.host, self._place.port)
-        if self._connection.sock is None:  # new, or closed by the server after its last answer
-            self._socket = Patient(_connect(self._place, min(until, time.monotonic() + self.stall)))
-            self._connection.sock = self._socket
-        self._wait_at_most(until)
+            kind = http.client.HTTPSConnection if self._place.scheme == "https" else http.client.HTTPConnection
+            self._connection = kind(str(self._place.hostname), self._place.port, timeout=seconds)
+        connection, target = self._connection, _target(self._place)
         self.requests += 1
-        self._connection.request("GET", self._place.target, headers=headers)
-        return self._connection.getresponse()
 
-    def _wait_at_most(self, until: float) -> None:
-        """All that is read or written next must be done within the stall limit and before `until`."""
-        assert self._socket is not None
-        self._socket.until = min(until, time.monotonic() + self.stall)
+        def exchange() -> http.client.HTTPResponse:
+            if connection.sock is None:  # new, or closed by the server after its last response
+                try:
+                    connection.connect()
+                except UnicodeError:  # a label too long for a host name
+                    raise OSError(f"{connection.host} is not a host name") from None
+            if connection is not self._connection:
+                connection.close()
+                raise TimeoutError  # the caller has given up
+            self._socket = connection.sock
+            self._socket.settimeout(seconds)
+            connection.request("GET", target, headers=headers)
+            return connection.getresponse()
+
+        return _within(seconds, exchange)
 
     def _accept(self, response: http.client.HTTPResponse, start: int, asked_range: bool) -> None:
-        """Takes an answer for bytes from `start` on; raises Changed where it is about another file than before."""
+        """Checks a response for bytes from `start` on. Raises Changed if it is about another file than before."""
         status, part = response.status, content_range(response.headers.get("Content-Range"))
         if status == HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE and asked_range:
             if start == 0:
                 self.close()
                 self.total = 0
                 return
-            self._restart()  # the file has become shorter than what is here
+            self._restart()  # the file has become shorter than the bytes that are here
         if status not in (HTTPStatus.OK, HTTPStatus.PARTIAL_CONTENT):
             said = f"the server answers {status} {one_line(response.reason, SHOWN)}".rstrip()
-            if status in PASSING:
+            if status in TEMPORARY:
                 raise _Cut(said)
             self.close()
             raise DeliveryError(f"{self.url}: {said}")
-        if response.headers.get("Content-Encoding", "identity").lower() != "identity":
+        coding = response.headers.get("Content-Encoding", "identity")
+        if coding.lower() != "identity":
             self.close()
-            coding = one_line(response.headers["Content-Encoding"], SHOWN)
-            raise DeliveryError(f"{self.url}: sent as {coding}, expected the bytes as such")
+            raise DeliveryError(f"{self.url}: found Content-Encoding {one_line(coding, SHOWN)}, expected identity")
         tag = strong_etag(response.headers.get("ETag"))
         validator = tag or response.headers.get("Last-Modified")
         if status == HTTPStatus.PARTIAL_CONTENT:
             if not asked_range or part is None or part.start != start or part.total is None:
-                raise _Cut(
-                    f"found Content-Range {one_line(response.headers.get('Content-Range') or 'none', SHOWN)}, "
-                    f"expected bytes from {start}"
-                )
+                found = one_line(response.headers.get("Content-Range") or "none", SHOWN)
+                raise _Cut(f"found Content-Range {found}, expected bytes from {start}")
             other = start and validator is not None and validator != self._validator
             if other or (start and part.total != self.total):
                 self._restart()
@@ -251,70 +250,139 @@ class Transfer:
             if start and tag is not None and tag == self._validator:
                 self._skip = start  # the same file from a server without ranges
             elif start:
-                self._restart(keep_answer=True)
+                self._restart(keep_response=True, validator=validator)
         self._validator = validator or self._validator
 
-    def _restart(self, keep_answer: bool = False) -> None:
-        """Back to byte 0. keep_answer: the answer at hand begins there."""
+    def _restart(self, keep_response: bool = False, validator: str | None = None) -> None:
+        """Back to byte 0. keep_response: the current response, with this validator, begins there."""
         self.data.clear()
         self.changes += 1
-        if keep_answer and self._response is not None:
-            tag = strong_etag(self._response.headers.get("ETag"))
-            self._validator = tag or self._response.headers.get("Last-Modified")
-        else:
+        self._validator = validator
+        if not keep_response:
             self.close()
-            self._validator = self.total = None
+            self.total = None
         if self.changes > MAX_CHANGES:
             self.close()
-            raise DeliveryError(f"{self.url}: began anew {self.changes} times while it was fetched")
+            raise DeliveryError(f"{self.url}: changed {self.changes} times during the transfer")
         raise Changed
+
+
+def _within(seconds: float, work: Callable[[], T]) -> T:
+    """The result of `work` in a thread; TimeoutError after `seconds`. Sockets have a time limit for each operation
+    alone, the system's resolver has none."""
+    result: futures.Future[T] = futures.Future()
+
+    def run() -> None:
+        try:
+            result.set_result(work())
+        except BaseException as error:
+            result.set_exception(error)
+
+    threading.Thread(target=run, daemon=True).start()
+    try:
+        return result.result(timeout=seconds)
+    except futures.TimeoutError:
+        raise TimeoutError from None
+
+
+def _parsed(url: str) -> SplitResult:
+    """The parts of an address that can be fetched. Raises DeliveryError for any other."""
+    try:
+        parts = urlsplit(url)
+        if is_url(url) and parts.hostname and "@" not in parts.netloc and parts.port != 0:
+            return parts
+    except ValueError:
+        pass
+    raise DeliveryError(f"found {url!r}, expected http://HOST/PATH or https://HOST/PATH")
+
+
+def _target(place: SplitResult) -> str:
+    query = f"?{quote(place.query, safe='/%:=&?~+!$,;@()*')}" if place.query else ""
+    return quote(place.path or "/", safe="/%:=&~+!$,;'@()*") + query
 
 
 def _reason(error: BaseException) -> str:
     if isinstance(error, TimeoutError):
         return "no byte arrived for too long"
     if isinstance(error, OSError):
-        return error.strerror or str(error)
+        return error.strerror or one_line(str(error), SHOWN)
     if isinstance(error, _Cut):
         return str(error)
     return f"not an HTTP answer: {one_line(str(error), SHOWN)}".rstrip(": ")
 
 
-def _connect(place: _Place, until: float) -> socket.socket:
-    """A connection that stands before `until`, TLS included; OSError."""
-    found: queue.Queue[list[Any] | OSError] = queue.Queue()
+# -- prefixes of a .pd4 file -------------------------------------------------------------------------------------------
 
-    def resolve() -> None:
-        try:
-            port = place.port or (443 if place.secure else 80)
-            found.put(socket.getaddrinfo(place.host, port, type=socket.SOCK_STREAM))
-        except (OSError, UnicodeError) as error:  # a label too long for a name is a UnicodeError
-            found.put(error if isinstance(error, OSError) else OSError(f"{place.host} is no name of a host"))
 
-    threading.Thread(target=resolve, daemon=True).start()  # the system's resolver takes no time limit
+def header_size(data: bytes | bytearray) -> int | None:
+    """Bytes of preamble and header; None if `data`, the first bytes of a file, ends within them."""
     try:
-        addresses = found.get(timeout=max(0.0, until - time.monotonic()))
-    except queue.Empty:
-        raise TimeoutError from None
-    if isinstance(addresses, OSError):
-        raise addresses
-    failure: OSError = TimeoutError()
-    for family, kind, protocol, _, address in addresses:
-        left = until - time.monotonic()
-        if left <= 0:
-            raise TimeoutError
-        connection = socket.socket(family, kind, protocol)
+        return read_preamble(data).size
+    except Truncated:
+        return None
+
+
+def slice_ends(data: bytes | bytearray) -> list[tuple[int, int]]:
+    """(layer, end offset) of each slice, from a file's first bytes; empty if they end within the header."""
+    size = header_size(data)
+    layers = [] if size is None else info(bytes(data[:size]))["layers"]
+    return [(row["layer"], part["end"]) for row in layers for part in row["slices"]]
+
+
+def within(
+    slices: list[tuple[int, int]], max_layer: int | None = None, max_bytes: int | None = None
+) -> list[tuple[int, int]]:
+    """The slices (layer, end offset) of layers up to max_layer that end within max_bytes."""
+    return [
+        (layer, end)
+        for layer, end in slices
+        if (max_layer is None or layer <= max_layer) and (max_bytes is None or end <= max_bytes)
+    ]
+
+
+def fetch_header(transfer: Transfer) -> bytes:
+    """Preamble and header; fewer bytes if the remote file ends within them. Raises as Transfer.read does."""
+    while True:
         try:
-            connection.settimeout(left)
-            connection.connect(address)
-            connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-            if place.secure:
-                connection.settimeout(max(1e-3, until - time.monotonic()))
-                return ssl.create_default_context().wrap_socket(connection, server_hostname=place.host)
-            return connection
-        except OSError as error:
-            connection.close()
-            if isinstance(error, ssl.SSLError):
-                raise
-            failure = error
-    raise failure
+            for end in (HEADER_GUESS, LONGEST_HEADER):
+                _fill(transfer, end, end)
+                size = header_size(transfer.data)
+                if size is not None:
+                    return bytes(transfer.data[:size])
+            return bytes(transfer.data)
+        except Changed:
+            continue
+
+
+def fetch(transfer: Transfer, max_layer: int | None = None, max_bytes: int | None = None) -> bytes:
+    """The file, or its prefix of layers up to max_layer, or of slices within max_bytes; fewer bytes if the remote file
+    ends early.
+
+    A prefix takes two requests for exactly its bytes, the whole file one. One byte after the last chunk is fetched, so
+    that the decoder sees trailing data. Raises as Transfer.read does, and DecodeError for an invalid header.
+    """
+    while True:
+        try:
+            if max_layer is None and max_bytes is None:
+                return _fetch_whole(transfer)
+            header = fetch_header(transfer)
+            wanted = within(slice_ends(header), max_layer, max_bytes)
+            end = wanted[-1][1] if wanted else len(header)
+            _fill(transfer, end, end)
+            return bytes(transfer.data[:end])
+        except Changed:
+            continue
+
+
+def _fetch_whole(transfer: Transfer) -> bytes:
+    size = None
+    while size is None and transfer.read(LONGEST_HEADER):
+        size = header_size(transfer.data)
+    if size is not None:
+        _fill(transfer, info(bytes(transfer.data[:size]))["bytes"] + 1, None)
+    return bytes(transfer.data)
+
+
+def _fill(transfer: Transfer, end: int, reach: int | None) -> None:
+    while transfer.read(end, reach=reach):
+        pass

@@ -40,7 +40,7 @@ from pd4dgs_codec.scene import (
     Steps,
     Widths,
 )
-from pd4dgs_codec.web.link import Link
+from pd4dgs_codec.web.server import Link
 from pd4dgs_codec.web.page import page as packed_page
 from pd4dgs_codec.web.server import Server
 

@@ -25,7 +25,7 @@ from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.npz import to_npz_dict
 from pd4dgs_codec.scene import Scene
 from pd4dgs_codec.web.client import SceneClient
-from pd4dgs_codec.web.link import Link
+from pd4dgs_codec.web.server import Link
 from pd4dgs_codec.web.transfer import MAX_CHANGES, Transfer
 
 RATE = 10e6

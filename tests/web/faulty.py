@@ -15,8 +15,8 @@ from dataclasses import dataclass, field
 from http import HTTPStatus
 from socketserver import StreamRequestHandler, ThreadingTCPServer
 
-from pd4dgs_codec.web.link import Link
-from pd4dgs_codec.web.ranges import Unsatisfiable, requested_range
+from pd4dgs_codec.web.headers import Unsatisfiable, requested_range
+from pd4dgs_codec.web.server import Link
 
 
 @dataclass

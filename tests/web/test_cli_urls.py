@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 from faulty import Fault, FaultyServer
 
-from pd4dgs_codec.web.prefix import HEADER_GUESS, header_size, slice_ends
+from pd4dgs_codec.web.transfer import HEADER_GUESS, header_size, slice_ends
 
 
 def test_info_reads_the_header_alone(cli, folder, scene_bytes):

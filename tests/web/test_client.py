@@ -20,8 +20,8 @@ from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import BadSignature, ChecksumMismatch, DeliveryError, Truncated
 from pd4dgs_codec.web import client as client_module
 from pd4dgs_codec.web.client import Budget, RateMeter, SceneClient, next_end
-from pd4dgs_codec.web.prefix import slice_ends
 from pd4dgs_codec.web.server import Server
+from pd4dgs_codec.web.transfer import slice_ends
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +126,11 @@ def test_redirects_are_followed_but_not_in_circles(scene_bytes, levels):
         with FaultyServer(b"", [Fault(status=302, headers={"Location": server.url})]) as first:
             with SceneClient(first.url) as client:
                 check(list(client.scenes()), levels)
-        for target, says in (("/scene.pd4", "redirects"), ("file:///etc/passwd", "expected http"), (None, "nowhere")):
+        for target, says in (
+            ("/scene.pd4", "redirects"),
+            ("file:///etc/passwd", "expected http"),
+            (None, "without a Location"),
+        ):
             faults = [Fault(status=301, headers={"Location": target}) for _ in range(9)]
             with FaultyServer(b"", faults) as first, SceneClient(first.url) as client:
                 with pytest.raises(DeliveryError, match=says):

@@ -12,9 +12,8 @@ import pytest
 from test_package import fake_video
 
 from pd4dgs_codec.errors import DeliveryError
-from pd4dgs_codec.web.library import library
-from pd4dgs_codec.web.names import CHANGES, IMMUTABLE, addressed, cache_control
-from pd4dgs_codec.web.package import package
+from pd4dgs_codec.web.headers import CHANGES, IMMUTABLE, cache_control
+from pd4dgs_codec.web.package import addressed, library, package
 from pd4dgs_codec.web.server import Server
 
 VIDEO = replace(fake_video(), poster=b"\xff\xd8 a picture")

@@ -14,10 +14,9 @@ from types import SimpleNamespace
 import pytest
 from asking import ask
 
-from pd4dgs_codec.web import link as link_module
+from pd4dgs_codec.web import server as link_module
 from pd4dgs_codec.web import server as server_module
-from pd4dgs_codec.web.link import CATCH_UP_SECONDS, Link
-from pd4dgs_codec.web.server import Server
+from pd4dgs_codec.web.server import CATCH_UP_SECONDS, Link, Server
 
 RATES = [(2e6, 30_000), (10e6, 200_000), (50e6, 800_000)]
 

@@ -19,7 +19,8 @@ from pd4dgs_codec.errors import DeliveryError, Malformed, Truncated
 from pd4dgs_codec.format import decoder
 from pd4dgs_codec.format.container import write_chunk
 from pd4dgs_codec.web import mp4
-from pd4dgs_codec.web.package import MPD, PLAYLIST, Video, package
+from pd4dgs_codec.web.manifests import Video
+from pd4dgs_codec.web.package import MPD, PLAYLIST, package
 
 SCHEMA = Path(os.environ.get("PD4DGS_SHARED", "../shared/data")) / "dash-schema" / "DASH-MPD.xsd"
 NAMESPACE = {"d": "urn:mpeg:dash:schema:mpd:2011"}

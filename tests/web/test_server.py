@@ -16,8 +16,7 @@ import pytest
 from asking import ask
 
 from pd4dgs_codec.errors import DeliveryError
-from pd4dgs_codec.web.link import Link
-from pd4dgs_codec.web.server import Server
+from pd4dgs_codec.web.server import Link, Server
 
 CONTENT = bytes(i % 251 for i in range(1000))
 

@@ -1,4 +1,4 @@
-"""What HTTP says about parts of files (RFC 9110): validators, the Range request, the Content-Range answer."""
+"""HTTP headers of partial and cached content (RFC 9110, RFC 9111)."""
 
 from __future__ import annotations
 
@@ -6,20 +6,24 @@ import re
 from email.utils import parsedate_to_datetime
 from typing import NamedTuple
 
-#: Of digits in a byte position; longer ones belong to no file and int() takes quadratic time.
+#: Positions of more digits belong to no file, and int() takes quadratic time for them.
 _DIGITS = r"[0-9]{1,18}"
 _RANGE = re.compile(rf"bytes=(?:({_DIGITS})-({_DIGITS})?|-({_DIGITS}))", re.IGNORECASE)
 _CONTENT_RANGE = re.compile(rf"bytes (?:({_DIGITS})-({_DIGITS})|\*)/({_DIGITS}|\*)", re.IGNORECASE)
+#: A file whose name carries the digest of its content never changes.
+_ADDRESSED = re.compile(r"-[0-9a-f]{16}\.\w+$")
+#: Caches keep immutable files for a year, and revalidate all others on every use.
+IMMUTABLE, CHANGES = "public, max-age=31536000, immutable", "no-cache"
 
 
 class Unsatisfiable(Exception):
-    """The range asked for holds no byte of the file: 416."""
+    """The requested range holds no byte of the file: status 416."""
 
 
 def requested_range(header: str | None, size: int) -> tuple[int, int] | None:
-    """(start, end), end exclusive, of one requested range of a file of `size` bytes; None for the whole file.
+    """(start, end), end exclusive, of the Range header for a file of `size` bytes; None for the whole file.
 
-    Several ranges and anything that is no byte range count as none, as RFC 9110 (14.2) lets a server do.
+    A list of ranges and an invalid header are ignored, as RFC 9110 (14.2) permits. Raises Unsatisfiable.
     """
     match = _RANGE.fullmatch(header.strip()) if header else None
     if match is None:
@@ -28,9 +32,9 @@ def requested_range(header: str | None, size: int) -> tuple[int, int] | None:
     if first is None:
         assert suffix is not None
         start, end = max(0, size - suffix), size
+    elif last is not None and last < first:
+        return None
     else:
-        if last is not None and last < first:
-            return None
         start, end = first, size if last is None else min(last + 1, size)
     if start >= end:
         raise Unsatisfiable
@@ -38,7 +42,7 @@ def requested_range(header: str | None, size: int) -> tuple[int, int] | None:
 
 
 class ContentRange(NamedTuple):
-    """start, end: of the part sent, end exclusive, None in a 416. total: length of the file, None if not told."""
+    """start, end: the part sent, end exclusive, None in a 416. total: length of the file, None if unknown."""
 
     start: int | None
     end: int | None
@@ -46,7 +50,7 @@ class ContentRange(NamedTuple):
 
 
 def content_range(header: str | None) -> ContentRange | None:
-    """The parsed header, or None if it is missing or makes no sense."""
+    """The parsed Content-Range header; None if it is missing or invalid."""
     match = _CONTENT_RANGE.fullmatch(header.strip()) if header else None
     if match is None:
         return None
@@ -59,19 +63,23 @@ def content_range(header: str | None) -> ContentRange | None:
 
 
 def strong_etag(header: str | None) -> str | None:
-    """The entity tag if it is one that promises equal bytes."""
+    """The entity tag if it is a strong one, which promises equal bytes."""
     return header if header and header.startswith('"') and header.endswith('"') and len(header) > 2 else None
 
 
 def lists_etag(header: str, etag: str) -> bool:
     """Whether an If-None-Match header names the tag (weak comparison)."""
-    tags = re.findall(r'(?:W/)?("[^"]*")', header)
-    return header.strip() == "*" or etag in tags
+    return header.strip() == "*" or etag in re.findall(r'(?:W/)?("[^"]*")', header)
 
 
 def http_time(header: str | None) -> float | None:
-    """Seconds since 1970 of an HTTP date, or None if it is missing or makes no sense."""
+    """Seconds since 1970 of an HTTP date; None if it is missing or invalid."""
     try:
         return parsedate_to_datetime(header).timestamp() if header else None
     except (TypeError, ValueError, OverflowError):
         return None
+
+
+def cache_control(name: str) -> str:
+    """The Cache-Control header for a file of this name."""
+    return IMMUTABLE if _ADDRESSED.search(name) else CHANGES
