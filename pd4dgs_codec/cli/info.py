@@ -7,14 +7,14 @@ from contextlib import closing
 from typing import Any
 
 from pd4dgs_codec.cli import options
-from pd4dgs_codec.cli.common import OK, STDIO, Console, command, number, read_bytes, table
+from pd4dgs_codec.cli.common import OK, Console, command, number, read_bytes, shown_name, table
 from pd4dgs_codec.errors import DataError
 
 DETAILS = """\
-Times to the first frame are 8 * (bytes up to the end of layer 0) / rate: the network alone, no latency.
-Of a URL (http, https) only the header is fetched, unless --check, --bytes or --hashes need everything.
-Error bounds are the encoder's word on how far a decoded value lies at most from the one given to it. What they would
-be after rounding to the nearest symbol follows from the file, and --check compares: the errors themselves do not.
+Times to the first frame are 8 * (bytes to the end of the first slice) / rate: transfer alone, without latency.
+From a URL (http, https) only the header is fetched, unless --check, --bytes or --hashes need the whole file.
+Error bounds are declared by the encoder: the largest difference of a decoded value from the value it was given. --check
+compares them with the bounds of rounding to the nearest symbol, which follow from the file.
 
 examples:
   pd4dgs-info scene.pd4
@@ -22,18 +22,18 @@ examples:
   pd4dgs-info scene.pd4 --check --at 500k,2M,50M --json
   pd4dgs-info http://127.0.0.1:8000/scene.pd4"""
 
-#: What -v tells of each layer: quantisation steps, planes as [channels, x, y, z, t], widths of the networks' layers.
+#: Shown of each layer with -v: quantisation steps, planes as [channels, x, y, z, t], widths of the networks' layers.
 DETAIL_KEYS = ("steps", "planes", "networks")
 
 
 def parser() -> options.Parser:
     """The options of `pd4dgs-info`."""
-    p = options.Parser("info", "FILE", "Show the header and the layers of a .pd4 file.", DETAILS)
+    p = options.Parser("info", "FILE", "Show the header and layers of a .pd4 file.", DETAILS)
     p.add_argument("input", metavar="FILE", help=".pd4 file or its URL; - reads stdin")
-    p.add_argument("--check", action="store_true", help="decode everything, so that every checksum and rule is tested")
-    p.add_argument("--bytes", action="store_true", help="show where the bytes are: sections by layer")
-    p.add_argument("--hashes", action="store_true", help="SHA-256 per layer of its integers and of its float32 tensors")
-    what = "link rates in bits per second for the first-frame times (default: 2M,10M,50M)"
+    p.add_argument("--check", action="store_true", help="decode the whole file: check every checksum and rule")
+    p.add_argument("--bytes", action="store_true", help="show the bytes of each section by layer")
+    p.add_argument("--hashes", action="store_true", help="SHA-256 of each layer's integers and float32 tensors")
+    what = "link rates in bits per second for times to the first frame (default: 2M,10M,50M)"
     p.add_argument("--at", type=options.rates, default="2M,10M,50M", metavar="RATES", help=what)
     p.add_common()
     return p
@@ -64,7 +64,7 @@ main = command(parser, _info)
 
 
 def _input(args: argparse.Namespace, console: Console) -> tuple[bytes, int]:
-    """(bytes, length of the file): all of it, or of a URL the header alone where that suffices."""
+    """(bytes, length of the file): the whole file, or only the header from a URL if that suffices."""
     from pd4dgs_codec.web import is_url
 
     if not is_url(args.input):
@@ -79,14 +79,12 @@ def _input(args: argparse.Namespace, console: Console) -> tuple[bytes, int]:
 
 
 def _parts(result: dict[str, Any]) -> list[dict[str, Any]]:
-    """Where the bytes of a file are: a row for each kind of section and for all else, with the bytes of each layer. The
-    header counts with layer 0, chunks that are no layers with none."""
+    """The bytes of each kind of section by layer, and of all other parts. The header counts as part of layer 0; chunks
+    that are not layers count for none."""
     layers = result["layers"]
     missing = [row["layer"] for row in layers if "sections" not in row]
     if missing:
-        raise DataError(
-            f"{result['input']}: layer {missing[0]} is not all there; expected a whole file to tell its parts"
-        )
+        raise DataError(f"{result['input']}: layer {missing[0]} is incomplete; expected a whole file for --bytes")
     names = dict.fromkeys(name for row in layers for name in row["sections"])
     parts = [{"part": name, "layers": [row["sections"].get(name, 0) for row in layers]} for name in names]
     frames = [row["bytes"] - sum(row["sections"].values()) for row in layers]
@@ -115,18 +113,18 @@ def _parts_table(result: dict[str, Any]) -> str:
 
 
 def _left_out(layers: list[dict[str, Any]]) -> list[dict[str, str]]:
-    """Layers, deformations and residual heads that the format has room for and this file does without."""
+    """Layers, deformations and residual heads of the format that this file does not have."""
     from pd4dgs_codec.format.kinds import LAYER_KINDS
     from pd4dgs_codec.scene import TRUNK
 
-    why = "the encoder found that it changes nothing visible, or was told to stop below"
+    why = "without visible effect, or above --layers"
     rows = {row["layer"]: row for row in layers}
     missing = []
     for kind in LAYER_KINDS[1:]:
         row = rows.get(kind.layer)
         if row is None:
             missing.append(f"layer {kind.layer}")
-        elif "networks" in row:  # known only where the file holds the whole chunk
+        elif "networks" in row:  # known only if the whole chunk is present
             gone = [head for head in kind.network_ids if head not in (TRUNK, *row["networks"])]
             missing += (
                 [kind.name] if len(gone) == len(kind.network_ids) - 1 else [f"{kind.name} head {h}" for h in gone]
@@ -145,12 +143,12 @@ def _about_lines(metadata: dict[str, Any] | None) -> list[str]:
     quality = ", ".join(f"level {level} {db:.2f} dB" for level, db in metadata.get("quality", {}).items())
     lines = [*texts, *([f"quality on held-out views: {quality}"] if quality else [])]
     if "still_bytes" in metadata:
-        lines.append(f"still picture: {metadata['still_bytes']:,} bytes")
+        lines.append(f"preview image: {metadata['still_bytes']:,} bytes")
     return [*lines, *([f"metadata cannot be read: {metadata['fault']}"] if "fault" in metadata else [])]
 
 
 def _slice_lines(result: dict[str, Any]) -> list[str]:
-    """Where the slices of layers in several end, and what each shows if the file says so."""
+    """The ends of the slices if a layer has several, and the quality after each if the file states it."""
     parts = [(row["layer"], part) for row in result["layers"] for part in row["slices"]]
     if len(parts) == len(result["layers"]):
         return []
@@ -160,7 +158,7 @@ def _slice_lines(result: dict[str, Any]) -> list[str]:
         (i, layer, number(part["end"], 0), _brought(part), number(db, 2))
         for i, ((layer, part), db) in enumerate(zip(parts, shown, strict=True))
     ]
-    return [table(("slice", "layer", "prefix", "brings", "mPSNR dB"), rows)]
+    return [table(("slice", "layer", "prefix", "new anchors", "mPSNR dB"), rows)]
 
 
 def _brought(part: dict[str, Any]) -> str:
@@ -179,11 +177,10 @@ def _bound_lines(declared: dict[str, float], nearest: dict[str, float]) -> list[
 
 
 def _text(result: dict[str, Any]) -> str:
-    name = "stdin" if result["input"] == STDIO else result["input"]
-    cut = "" if result["available"] >= result["bytes"] else f", of which {result['available']:,} are here"
+    cut = "" if result["available"] >= result["bytes"] else f", of which {result['available']:,} are present"
     low, high = result["time_range"]
     lines = [
-        f"{name}: .pd4 format {result['format_version']}, {result['bytes']:,} bytes{cut}",
+        f"{shown_name(result['input'])}: .pd4 format {result['format_version']}, {result['bytes']:,} bytes{cut}",
         f"mode {result['mode']}, header {result['header_bytes']} bytes, "
         f"{number(result['anchors'], 0)} anchors on a grid of {result['voxel_size']:.6g} scene units, "
         f"time {low:g} to {high:g} s",
@@ -197,7 +194,7 @@ def _text(result: dict[str, Any]) -> str:
         *_slice_lines(result),
         *_about_lines(result["metadata"]),
         *_left_out_line(result["left_out"]),
-        "errors at most: " + ", ".join(f"{what} {bound:.4g}" for what, bound in result["error_bounds"].items()),
+        "error bounds: " + ", ".join(f"{what} {bound:.4g}" for what, bound in result["error_bounds"].items()),
         "first frame: " + ", ".join(f"{s:.2f} s at {rate}bps" for rate, s in result["first_frame_seconds"].items()),
     ]
     if "parts" in result:

@@ -132,7 +132,7 @@ def test_info_tells_where_the_bytes_are(cli, scene_pd4):
     assert f"{rows['attributes']['bytes']:,}" in text and "share" in text
     assert "parts" not in cli("info", scene_pd4, "--json").json
     cut = cli("info", "-", "--bytes", stdin=scene_pd4.read_bytes()[: report["layers"][1]["end"] - 1])
-    assert cut.code == 1 and "layer 1 is not all there" in cut.err
+    assert cut.code == 1 and "layer 1 is incomplete" in cut.err
 
 
 def test_metadata_is_written_shown_and_kept(cli, scene_pd4, tmp_path):
@@ -153,7 +153,7 @@ def test_info_compares_the_error_bounds_with_those_of_rounding(cli, scene_pd4, t
     assert report["nearest_bounds"] == report["error_bounds"] and report["error_bounds"]["feature"] > 0
     assert "nearest_bounds" not in cli("info", scene_pd4, "--json").json
     text = cli("info", scene_pd4, "--check").out.decode()
-    assert "errors at most: feature 0.0" in text and "error bounds are those of rounding" in text
+    assert "error bounds: feature 0.0" in text and "error bounds are those of rounding" in text
     bounds = encoder.rounding_bounds
     monkeypatch.setattr(encoder, "rounding_bounds", lambda *args: {**bounds(*args), "offset": 0.75})
     other = tmp_path / "other.pd4"

@@ -26,7 +26,7 @@ def test_info_reads_the_header_alone(cli, folder, scene_bytes):
 def test_info_tells_of_a_file_that_is_cut_on_the_server(cli, scene_bytes):
     with FaultyServer(scene_bytes[:1000]) as server:
         done = cli("info", server.url)
-    assert done.code == 0 and b"of which 1,000 are here" in done.out
+    assert done.code == 0 and b"of which 1,000 are present" in done.out
 
 
 def test_info_checks_and_hashes_the_whole_remote_file(cli, folder, scene_bytes):
