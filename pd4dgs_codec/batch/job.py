@@ -1,32 +1,33 @@
-"""The one function that every engine runs: a scene of a batch from its source to its finished output."""
+"""The one function that every engine runs: one scene from its source to its finished output."""
 
 from __future__ import annotations
 
-import hashlib
 import json
 import os
 import resource
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from pd4dgs_codec import __version__
 from pd4dgs_codec.batch import store
-from pd4dgs_codec.batch.manifest import SPECIFICATIONS, Line
-from pd4dgs_codec.batch.ops import OPS, Command, arguments
+from pd4dgs_codec.batch.manifest import OPS, Line, arguments
+from pd4dgs_codec.data.dataset import SYNTHETIC
 from pd4dgs_codec.errors import DataError, Pd4Error, one_line
 
 LOG_BYTES = 1 << 16  #: kept of a command's log
 DONE, ALREADY, FAILED = "done", "already", "failed"
+#: Runs a command: (verb, argv) -> (exit code, its stdout, its stderr).
+Command = Callable[[str, list[str]], tuple[int, str, str]]
 
 
 @dataclass(frozen=True)
 class Job:
-    """A line with what holds for the whole batch. version: of the package that began the batch."""
+    """A line with the settings of the batch. version: of the package that began the batch."""
 
     line: Line
     verb: str
@@ -38,11 +39,10 @@ class Job:
 
 @dataclass(frozen=True)
 class Outcome:
-    """What became of a job.
+    """The result of a job.
 
-    state: "done" now, "already" before, or "failed". final: trying again would end the same. log: the command's stderr.
-    result: what it reported. cpu: seconds of CPU time in all, work: those of the command alone. peak: of the worker's
-    memory so far, bytes.
+    state: "done" now, "already" before, or "failed". final: another try would end the same. log: the command's stderr.
+    cpu: CPU seconds in all, work: of the command alone. peak: memory of the worker so far, bytes.
     """
 
     state: str
@@ -50,113 +50,74 @@ class Outcome:
     final: bool = False
     log: str = ""
     bytes: int = 0
-    seconds: float = 0.0
     cpu: float = 0.0
     work: float = 0.0
     peak: int = 0
 
 
 class CommandFailed(Exception):
-    """The command's exit code was not 0."""
+    """The command failed. outcome: of the job."""
 
-    def __init__(self, code: int, message: str, log: str, work: float):
+    def __init__(self, message: str, **fields: Any):
         super().__init__(message)
-        self.code, self.log, self.work = code, log, work
+        self.outcome = Outcome(FAILED, message, **fields)
 
 
 def run_job(job: Job, command: Command) -> Outcome:
-    """Does a job unless its output is finished. It raises nothing: whatever goes wrong is the outcome."""
-    begun, cpu = time.monotonic(), time.process_time()
-
-    def outcome(state: str, message: str = "", **more: Any) -> Outcome:
-        peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        spent = time.process_time() - cpu
-        return Outcome(state, one_line(message), seconds=time.monotonic() - begun, cpu=spent, peak=peak, **more)
-
+    """Does a job unless its output is finished. Raises nothing: every failure is an outcome."""
+    cpu = time.process_time()
     try:
-        state, size, work = _done_once(job, command)
-        return outcome(state, bytes=size, work=work)
+        outcome = _done_once(job, command)
     except CommandFailed as error:
-        usage = error.code == 2
-        return outcome(FAILED, str(error), final=usage, log=error.log, work=error.work)
+        outcome = error.outcome
     except Pd4Error as error:
-        return outcome(FAILED, str(error), final=True)
+        outcome = Outcome(FAILED, str(error), final=True)
     except OSError as error:
         message = f"{error.filename}: {error.strerror}" if error.filename else str(error)
-        return outcome(FAILED, message, final=isinstance(error, store.FINAL))
-    except Exception as error:  # a fault of ours or of a library must not end the batch
-        return outcome(FAILED, f"{type(error).__name__}: {error}")
+        outcome = Outcome(FAILED, message, final=isinstance(error, store.FINAL))
+    except Exception as error:  # a fault in the package or a library must not end the batch
+        outcome = Outcome(FAILED, f"{type(error).__name__}: {error}")
+    peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return replace(outcome, message=one_line(outcome.message), cpu=time.process_time() - cpu, peak=peak)
 
 
-def _done_once(job: Job, command: Command) -> tuple[str, int, float]:
-    """(state, bytes of the output, CPU seconds of the command)."""
+def _done_once(job: Job, command: Command) -> Outcome:
     if job.version != __version__:
         raise DataError(f"the worker has pd4dgs-codec {__version__}, the batch began with {job.version}")
     line, root = job.line, store.Root(job.root)
     record = root.record(line.output, job.overwrite)
-    stamps = _stamps(job)
-    if record and _is_of(record, job, stamps) and root.holds(line.output, record["files"]):
-        return ALREADY, 0, 0.0
-    if record and record.get("version") != __version__ and not job.overwrite:
-        found = f"was made by pd4dgs-codec {record.get('version')}, this is {__version__}"
+    inputs = {"": line.source} | {name: line.options[name] for name in OPS[job.verb].inputs if name in line.options}
+    options = {name: value for name, value in line.options.items() if name not in inputs}
+    stamps = {name: place if place.startswith(SYNTHETIC) else store.stamp(place) for name, place in inputs.items()}
+    made_of = {"op": job.verb, "options": options, "inputs": stamps, "version": __version__}
+    same = record is not None and made_of.items() <= record.items()
+    if record and same and root.holds(line.output, record):
+        return Outcome(ALREADY)
+    if record and not same and not job.overwrite:
+        found = "holds what other input or options gave"
+        if record.get("version") != __version__:
+            found = f"was made by pd4dgs-codec {record.get('version')}, this is {__version__}"
         raise DataError(f"{found}; --overwrite makes it anew")
-    with tempfile.TemporaryDirectory(prefix="pd4dgs-batch-") as name, _inside(Path(name)) as folder:
-        sources = {key: _fetched(place, folder) for key, place in _places(job).items()}
-        digests = {key: found for key, (_, found) in sources.items()}
-        plain = {name: value for name, value in line.options.items() if name not in OPS[job.verb].inputs}
-        key = key_of(job.verb, digests, plain, __version__)
-        if record and record.get("key") == key and root.holds(line.output, record["files"]):
-            return ALREADY, 0, 0.0
-        if record and record.get("key") != key and not job.overwrite:
-            raise DataError("holds what other input or options gave; --overwrite makes it anew")
-        files, report, work = _run(job, command, {key: text for key, (text, _) in sources.items()}, folder)
-        about = {"key": key, "op": job.verb, "source": line.source, "options": line.options, "inputs": digests}
-        about |= {"stamps": stamps, "version": __version__, "report": report}
-        replace = job.overwrite or (record is not None and record.get("key") == key)
-        whole = root.publish(line.output, files, about, replace)
-    return DONE, sum(entry["bytes"] for entry in whole["files"].values()), work
+    with _temporary_folder() as folder:
+        files, report, work = _run(job, command, {name: _fetched(p, folder) for name, p in inputs.items()}, folder)
+        whole = made_of | {"source": line.source, "report": report}
+        return Outcome(DONE, bytes=root.publish(line.output, files, whole, job.overwrite or same), work=work)
 
 
-def key_of(verb: str, digests: dict[str, str], options: dict[str, Any], version: str) -> str:
-    """The address of an output: SHA-256 over what it depends on. digests: of the source ("") and of options that name
-    sources. options: the others."""
-    text = json.dumps([verb, digests, options, version], sort_keys=True)
-    return hashlib.sha256(text.encode()).hexdigest()
-
-
-def _places(job: Job) -> dict[str, str]:
-    """Where the inputs are: "" for the source, else by the option that names it."""
-    named = {name: job.line.options[name] for name in OPS[job.verb].inputs if name in job.line.options}
-    return {"": job.line.source, **named}
-
-
-def _stamps(job: Job) -> dict[str, str | None]:
-    return {
-        key: place if place.startswith(SPECIFICATIONS) else store.stamp(place) for key, place in _places(job).items()
-    }
-
-
-def _is_of(record: dict[str, Any], job: Job, stamps: dict[str, str | None]) -> bool:
-    """Whether a record is of this very job, as far as can be told without reading the sources."""
-    same = record.get("op") == job.verb and record.get("version") == __version__
-    same = same and record.get("source") == job.line.source and record.get("options") == job.line.options
-    return same and None not in stamps.values() and record.get("stamps") == stamps
-
-
-def _fetched(place: str, folder: Path) -> tuple[str, str]:
-    """(what to tell the command, digest) of a source. A copy is named relative to the folder, which leaves no trace."""
-    if place.startswith(SPECIFICATIONS):
-        return place, hashlib.sha256(place.encode()).hexdigest()
+def _fetched(place: str, folder: Path) -> str:
+    """The argument for the command. The path of a copy is relative to the folder, so that no temporary name gets into
+    outputs."""
+    if place.startswith(SYNTHETIC):
+        return place
     path = store.fetch(place, folder)
-    return str(path.relative_to(folder) if path.is_relative_to(folder) else path), store.digest(path)
+    return str(path.relative_to(folder) if path.is_relative_to(folder) else path)
 
 
 def _run(
     job: Job, command: Command, sources: dict[str, str], folder: Path
 ) -> tuple[dict[str, Path], dict[str, Any], float]:
-    """Runs the command: (its output's files by name, what it reported, CPU seconds)."""
-    op = OPS[job.verb]
-    output = Path("output") / ("result" + op.suffix)
+    """Runs the command: (its output's files by name, the numbers that it reported, CPU seconds)."""
+    op, output = OPS[job.verb], Path("output") / ("result" + OPS[job.verb].suffix)
     output.parent.mkdir()
     options = job.line.options | {name: text for name, text in sources.items() if name}
     argv = [*arguments(job.verb, sources[""], str(output), options), "--json", f"--threads={job.threads}"]
@@ -164,25 +125,27 @@ def _run(
     code, printed, log = command(job.verb, argv)
     work, log = time.process_time() - cpu, log[-LOG_BYTES:]
     if code != 0:
-        said = [line for line in log.splitlines() if line.strip()]
-        raise CommandFailed(code, said[-1] if said else f"pd4dgs-{job.verb} ended with {code}", log, work)
+        message = ([line for line in log.splitlines() if line.strip()] or [f"pd4dgs-{job.verb} ended with {code}"])[-1]
+        raise CommandFailed(message, final=code == 2, log=log, work=work)
     report = json.loads(printed)
     if report.get("interrupted"):
-        raise CommandFailed(1, "was interrupted before its end", log, work)
+        raise CommandFailed("was interrupted before its end", log=log, work=work)
     if op.stdout:
         output.write_text(json.dumps(report, indent=1) + "\n")
     if output.is_dir():
         files = [path for path in sorted(output.rglob("*")) if path.is_file()]
         return {path.relative_to(output).as_posix(): folder / path for path in files}, {}, work
-    scalars = {name: value for name, value in report.items() if isinstance(value, (bool, int, float))}
-    return {"": folder / output}, {} if op.stdout else scalars, work
+    numbers = {name: value for name, value in report.items() if isinstance(value, (bool, int, float))}
+    return {"": folder / output}, {} if op.stdout else numbers, work
 
 
 @contextmanager
-def _inside(folder: Path) -> Iterator[Path]:
+def _temporary_folder() -> Iterator[Path]:
+    """A new folder, the working folder meanwhile."""
     before = os.getcwd()
-    os.chdir(folder)
-    try:
-        yield folder
-    finally:
-        os.chdir(before)
+    with tempfile.TemporaryDirectory(prefix="pd4dgs-batch-") as name:
+        os.chdir(name)
+        try:
+            yield Path(name)
+        finally:
+            os.chdir(before)

@@ -1,39 +1,74 @@
-"""A batch: jobs from a manifest through an engine, tried again within a bound, and summed up."""
+"""A batch: jobs on an engine, failed ones tried again, and a summary.
+
+An engine runs jobs as tasks: a pool of processes on this machine, Ray, or Slurm through submitit. The loop, the
+retries and the time limit are the same for all.
+"""
 
 from __future__ import annotations
 
+import contextlib
+import multiprocessing
+import os
+import signal
+import socket
+import sys
+import threading
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterator
-from contextlib import closing
+from collections.abc import Callable, Iterable, Iterator
+from concurrent.futures import FIRST_COMPLETED, Future, ProcessPoolExecutor, wait
+from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass, field
 from functools import partial
+from pathlib import Path
 from typing import Any
 
-from pd4dgs_codec.batch.engines import Engine, EngineSettings
-from pd4dgs_codec.batch.job import ALREADY, DONE, FAILED, Job, Outcome, run_job
-from pd4dgs_codec.batch.ops import Command
+from pd4dgs_codec.batch.job import ALREADY, DONE, FAILED, Command, Job, Outcome, run_job
+from pd4dgs_codec.errors import DataError
+
+Work = Callable[[Job], Outcome]
+POLL_SECONDS = 1.0  #: between looks at Slurm's results
+MAX_ARRAY = 1000  #: jobs of a Slurm array; the usual limit (MaxArraySize) is 1001
 
 
-class JobFeed:
-    """Jobs in the order of their lines; those that failed come again once all others have begun."""
+@dataclass(frozen=True)
+class Settings:
+    """How an engine runs jobs.
 
-    def __init__(self, jobs: Iterator[Job]):
-        self._jobs, self._again = jobs, deque[Job]()
+    workers: jobs at a time; 0: locally in this process, on Ray as many as fit. threads: CPUs of a job. gpus: of a job.
+    timeout: seconds after which a job is ended, or None. address: of a Ray cluster. folder: for the logs of Slurm jobs.
+    slurm: parameters of submitit.
+    """
 
-    def take(self) -> Job | None:
-        """The next job, None if there is none now."""
-        job = next(self._jobs, None)
-        return job if job is not None else self._again.popleft() if self._again else None
+    workers: int
+    threads: int = 1
+    gpus: float = 0
+    timeout: float | None = None
+    address: str | None = None
+    folder: Path = Path("batch-logs")
+    slurm: dict[str, str] = field(default_factory=dict)
 
-    def again(self, job: Job) -> None:
-        """Puts a job that failed behind all others."""
-        self._again.append(job)
+
+class Engine:
+    """Runs jobs. room: how many at a time; timeout: seconds after which `run` ends a job, None if it never does."""
+
+    room = 1
+    timeout: float | None = None
+
+    def start(self, jobs: list[Job]) -> list[Future[Outcome]]:
+        """Begins jobs. A future with an exception is of a job whose worker was lost."""
+        raise NotImplementedError
+
+    def kill(self, future: Future[Outcome]) -> None:
+        """Ends a job."""
+
+    def close(self) -> None:
+        """Ends all jobs."""
 
 
 @dataclass
 class Summary:
-    """What became of a batch. cpu, work: as of an Outcome, over all tries. peak: of the largest worker."""
+    """The result of a batch. cpu, work: as in Outcome, over all tries. peak: memory of the largest worker, bytes."""
 
     done: int = 0
     already: int = 0
@@ -46,7 +81,7 @@ class Summary:
     failures: list[dict[str, Any]] = field(default_factory=list)
 
     def json(self) -> dict[str, Any]:
-        """Of builtins."""
+        """As JSON values."""
         return {
             "done": self.done, "already": self.already, "failed": len(self.failures), "retried": self.retried,
             "bytes": self.bytes, "seconds": round(self.seconds, 3), "cpu_seconds": round(self.cpu, 3),
@@ -55,31 +90,244 @@ class Summary:
         }  # fmt: skip
 
 
-#: Told of every job that is over: its last outcome, and how often it was tried.
-Told = Callable[[Job, Outcome, int], None]
-
-
 def run(
-    jobs: Iterator[Job], command: Command, engine: Engine, settings: EngineSettings, retries: int, told: Told
+    jobs: Iterable[Job],
+    command: Command,
+    on: str,
+    settings: Settings,
+    retries: int,
+    report: Callable[[Job, Outcome, int], None],
 ) -> Summary:
-    """Runs all jobs; one that fails is tried again `retries` times, unless that would end the same."""
+    """Runs all jobs on an engine: "local", "ray" or "slurm".
+
+    A job that fails is tried again `retries` times behind all others, unless that would end the same. report: called
+    with each job that is over, its last outcome and its tries. Raises DataError if the engine cannot run.
+    """
     summary, tries, begun = Summary(), Counter[int](), time.monotonic()
-    feed = JobFeed(jobs)
-    with closing(engine(partial(run_job, command=command), feed, settings)) as outcomes:
-        for job, outcome in outcomes:
+    waiting, engine = deque(jobs), ENGINES[on](partial(run_job, command=command), settings)
+    with contextlib.closing(engine):
+        for job, outcome in _outcomes(engine, waiting):
             summary.cpu += outcome.cpu
             summary.work += outcome.work
             summary.bytes += outcome.bytes
             summary.peak = max(summary.peak, outcome.peak)
             tries[job.line.number] += 1
-            count = tries[job.line.number]
-            if outcome.state == FAILED and not outcome.final and count <= retries:
+            if outcome.state == FAILED and not outcome.final and tries[job.line.number] <= retries:
                 summary.retried += 1
-                feed.again(job)
+                waiting.append(job)
                 continue
-            del tries[job.line.number]  # of a million, only those under way are remembered
             summary.done += outcome.state == DONE
             summary.already += outcome.state == ALREADY
-            told(job, outcome, count)
+            report(job, outcome, tries[job.line.number])
     summary.seconds = time.monotonic() - begun
     return summary
+
+
+def _outcomes(engine: Engine, waiting: deque[Job]) -> Iterator[tuple[Job, Outcome]]:
+    """Each job as it ends, until none waits or runs."""
+    running: dict[Future[Outcome], tuple[Job, float]] = {}
+    while True:
+        new = [waiting.popleft() for _ in range(min(len(waiting), engine.room - len(running)))]
+        running |= {future: (job, time.monotonic()) for future, job in zip(engine.start(new), new, strict=True)}
+        if not running:
+            return
+        patience, limit = None, engine.timeout
+        if limit:
+            patience = max(0.0, min(begun for _, begun in running.values()) + limit - time.monotonic())
+        for future in wait(running, patience, FIRST_COMPLETED).done:
+            error = future.exception()
+            why = f"its worker was lost: {type(error).__name__}: {error}"
+            yield running.pop(future)[0], future.result() if error is None else Outcome(FAILED, why)
+        for future, (job, begun) in list(running.items()):
+            if limit and time.monotonic() - begun >= limit:
+                engine.kill(future)
+                del running[future]
+                yield job, Outcome(FAILED, f"was ended after {limit:g} s, the most that --timeout allows")
+
+
+# -- this machine ------------------------------------------------------------------------------------------------------
+
+
+class Local(Engine):
+    """Pools of one process each, as a process that dies breaks its whole pool; without workers this process alone."""
+
+    def __init__(self, work: Work, settings: Settings):
+        self.work, self.inline, self.timeout = work, settings.workers == 0, settings.timeout
+        self.room = settings.workers or 1
+        self.pools: list[tuple[ProcessPoolExecutor, Future[int]]] = []
+        self.busy: dict[Future[Outcome], tuple[ProcessPoolExecutor, Future[int]]] = {}
+
+    def start(self, jobs: list[Job]) -> list[Future[Outcome]]:
+        """In this process, in pools that are free, or in new ones."""
+        self.busy = {future: pool for future, pool in self.busy.items() if not future.done()}
+        return [self._done(job) if self.inline else self._begun(job) for job in jobs]
+
+    def _done(self, job: Job) -> Future[Outcome]:
+        future = Future[Outcome]()
+        future.set_result(self.work(job))
+        return future
+
+    def _begun(self, job: Job) -> Future[Outcome]:
+        pool = next((pool for pool in self.pools if pool not in self.busy.values()), None) or self._pool()
+        try:
+            future = pool[0].submit(self.work, job)
+        except BrokenProcessPool:  # it died while it was free
+            self.pools.remove(pool)
+            return self._begun(job)
+        self.busy[future] = pool
+        return future
+
+    def _pool(self) -> tuple[ProcessPoolExecutor, Future[int]]:
+        executor = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _follow_parent)  # OpenMP forbids fork
+        self.pools.append((executor, executor.submit(os.getpid)))
+        return self.pools[-1]
+
+    def kill(self, future: Future[Outcome]) -> None:
+        """Kills the process."""
+        executor, pid = pool = self.busy.pop(future)
+        self.pools.remove(pool)
+        with contextlib.suppress(BrokenProcessPool, ProcessLookupError):
+            os.kill(pid.result(), signal.SIGKILL)
+        executor.shutdown(wait=False, cancel_futures=True)
+
+    def close(self) -> None:
+        """Kills the processes at work and dismisses the others."""
+        for future in [future for future in self.busy if not future.done()]:
+            self.kill(future)
+        for executor, _ in self.pools:
+            executor.shutdown(wait=False)
+
+
+def _follow_parent() -> None:
+    """Lets a process ignore Ctrl-C, which its parent handles, and end with its parent."""
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    parent = multiprocessing.parent_process()
+    assert parent is not None
+
+    def follow() -> None:
+        parent.join()
+        os._exit(1)
+
+    threading.Thread(target=follow, daemon=True).start()
+
+
+# -- Ray ---------------------------------------------------------------------------------------------------------------
+
+
+class Ray(Engine):
+    """Tasks of Ray Core on the cluster at `address` (RAY_ADDRESS if None, else a new one on this machine)."""
+
+    def __init__(self, work: Work, settings: Settings):
+        address = settings.address or os.environ.get("RAY_ADDRESS")
+        _check_listens(address)
+        import ray
+
+        self.ray, self.work, self.timeout = ray, work, settings.timeout
+        try:
+            ray.init(address=address, log_to_driver=False, logging_level="ERROR")
+        except Exception as error:  # of many kinds
+            raise DataError(f"Ray cannot be reached at {address or 'an address of its own'}: {error}") from None
+        needed = {"CPU": settings.threads, "GPU": settings.gpus}
+        nodes = [node["Resources"] for node in ray.nodes() if node["Alive"]]
+        if not any(all(node.get(kind, 0) >= count for kind, count in needed.items()) for node in nodes):
+            ray.shutdown()
+            wanted = " and ".join(f"{count:g} {kind}" for kind, count in needed.items() if count)
+            raise DataError(f"no node of the Ray cluster has the {wanted} that a scene takes")  # Ray would wait for one
+        self.room = settings.workers or int(ray.cluster_resources().get("CPU", 1) // settings.threads) or 1
+        # `run` tries lost jobs again: one bound for all retries
+        self.task = ray.remote(num_cpus=settings.threads, num_gpus=settings.gpus, max_retries=0)(_call)
+        self.references: dict[Future[Outcome], Any] = {}
+        self.quiet = contextlib.ExitStack()
+        self.quiet.enter_context(contextlib.redirect_stdout(sys.stderr))  # Ray prints of dead workers; stdout is JSON's
+
+    def start(self, jobs: list[Job]) -> list[Future[Outcome]]:
+        """As tasks."""
+        started = {(reference := self.task.remote(self.work, job)).future(): reference for job in jobs}
+        self.references |= started
+        return list(started)
+
+    def kill(self, future: Future[Outcome]) -> None:
+        """Kills the worker."""
+        self.ray.cancel(self.references[future], force=True)
+
+    def close(self) -> None:
+        """Leaves the cluster."""
+        self.ray.shutdown()
+        self.quiet.close()
+
+
+def _call(work: Work, job: Job) -> Outcome:
+    """A task of Ray is a function; `work` may be any callable."""
+    return work(job)
+
+
+def _check_listens(address: str | None) -> None:
+    """Raises DataError if nothing listens at HOST:PORT: Ray itself would try for a quarter of an hour."""
+    host, colon, port = (address or "").removeprefix("ray://").rpartition(":")
+    if not (colon and port.isdecimal()):
+        return  # auto, local, or none: Ray looks on this machine
+    os.environ.setdefault("RAY_gcs_server_port_wait_time_s", "1")  # tries of 40 s each at a listener that is not Ray
+    try:
+        socket.create_connection((host.strip("[]"), int(port)), timeout=10).close()
+    except (OSError, OverflowError) as error:
+        raise DataError(f"no Ray cluster answers at {address}: {error}") from None
+
+
+# -- Slurm -------------------------------------------------------------------------------------------------------------
+
+
+class Slurm(Engine):
+    """Array jobs of Slurm, through submitit, whose time limit is Slurm's own; `cluster=local` in `slurm` runs them as
+    processes of this machine."""
+
+    def __init__(self, work: Work, settings: Settings):
+        import submitit
+
+        parameters: dict[str, Any] = {"cpus_per_task": settings.threads, "name": "pd4dgs-batch", **settings.slurm}
+        cluster = parameters.pop("cluster", "slurm")
+        if settings.timeout:
+            parameters["timeout_min"] = max(1, round(settings.timeout / 60))
+        if settings.gpus:
+            parameters["gpus_per_node"] = int(settings.gpus)
+        if settings.workers and cluster == "slurm":
+            parameters["slurm_array_parallelism"] = settings.workers
+        try:
+            self.executor = submitit.AutoExecutor(folder=settings.folder, cluster=cluster)
+            self.executor.update_parameters(**parameters)
+        except (RuntimeError, ValueError, TypeError, NameError) as error:
+            raise DataError(f"submitit takes no such jobs: {error}") from None
+        self.work, self.room = work, MAX_ARRAY if cluster == "slurm" else settings.workers or 1
+        self.tasks: dict[Future[Outcome], Any] = {}
+        threading.Thread(target=self._watch, daemon=True).start()
+
+    def start(self, jobs: list[Job]) -> list[Future[Outcome]]:
+        """As one array."""
+        if not jobs:
+            return []
+        try:
+            with self.executor.batch():
+                tasks = [self.executor.submit(self.work, job) for job in jobs]
+        except RuntimeError as error:
+            raise DataError(f"Slurm takes no jobs: {error}") from None
+        started = {Future[Outcome](): task for task in tasks}
+        self.tasks |= started
+        return list(started)
+
+    def _watch(self) -> None:
+        """Gives each future its outcome, as soon as submitit finds one, or an exception."""
+        while True:
+            for future, task in [(f, t) for f, t in list(self.tasks.items()) if t.done()]:
+                del self.tasks[future]
+                try:
+                    future.set_result(task.result())
+                except Exception as error:  # submitit has several for jobs without a result
+                    future.set_exception(error)
+            time.sleep(POLL_SECONDS)
+
+    def close(self) -> None:
+        """Cancels all jobs."""
+        for task in list(self.tasks.values()):
+            task.cancel()
+
+
+ENGINES: dict[str, Callable[[Work, Settings], Engine]] = {"local": Local, "ray": Ray, "slurm": Slurm}

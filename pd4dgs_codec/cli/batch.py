@@ -12,7 +12,7 @@ from importlib import import_module
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.batch.ops import OPS, arguments
+from pd4dgs_codec.batch.manifest import OPS, arguments
 from pd4dgs_codec.cli import options
 from pd4dgs_codec.cli.common import FAILED, OK, STDIO, Console, UsageError, check_output, run, say, write_bytes
 from pd4dgs_codec.cli.progress import progress_bar
@@ -129,9 +129,10 @@ def _batch(args: argparse.Namespace, console: Console) -> int:
     cores = args.threads or available()
     workers = args.workers if args.workers is not None else {"local": cores, "ray": 0, "slurm": 0}[args.on]
     threads = args.cpus or (max(1, cores // max(1, workers)) if args.on == "local" else 1)
-    from pd4dgs_codec.batch import engines, store
+    from pd4dgs_codec.batch import store
     from pd4dgs_codec.batch.job import Job
     from pd4dgs_codec.batch.manifest import Manifest
+    from pd4dgs_codec.batch.run import Settings
     from pd4dgs_codec.batch.run import run as run_jobs
 
     takes = import_module(f"pd4dgs_codec.cli.{args.op}").parser()
@@ -146,17 +147,17 @@ def _batch(args: argparse.Namespace, console: Console) -> int:
     output = store.absolute(args.output)
     store.Root(output).check()
     failures = _Failures(args, manifest)
-    jobs = (Job(line, args.op, output, threads, args.overwrite) for line in manifest.lines())
-    settings = engines.EngineSettings(
+    jobs = (Job(line, args.op, output, threads, args.overwrite) for line in manifest.lines)
+    settings = Settings(
         workers, threads, args.gpus, args.timeout or None, args.address, Path(args.logs), dict(args.slurm)
     )
-    with progress_bar(manifest.count, "scenes", args.op) as step:
+    with progress_bar(len(manifest.lines), "scenes", args.op) as step:
 
         def told(job: Job, outcome: Outcome, tries: int) -> None:
             failures.see(job, outcome, tries)
             step()
 
-        summary = run_jobs(jobs, command, engines.ENGINES[args.on], settings, args.retries, told)
+        summary = run_jobs(jobs, command, args.on, settings, args.retries, told)
     summary.failures = failures.rows
     result = {"output": args.output, "op": args.op, "on": args.on, **summary.json()}
     console.result(result, _text(result))

@@ -9,11 +9,9 @@ from typing import Any
 import pytest
 from standin import upper
 
-from pd4dgs_codec.batch.engines import ENGINES, EngineSettings
 from pd4dgs_codec.batch.job import Job, Outcome
-from pd4dgs_codec.batch.manifest import Manifest
-from pd4dgs_codec.batch.ops import OPS
-from pd4dgs_codec.batch.run import Summary, run
+from pd4dgs_codec.batch.manifest import OPS, Manifest
+from pd4dgs_codec.batch.run import Settings, Summary, run
 
 
 class Library:
@@ -21,8 +19,8 @@ class Library:
 
     def __init__(self, folder: Path):
         self.folder, self.out, self.notes = folder, folder / "out", folder / "notes"
-        (folder / "in").mkdir()
-        self.notes.mkdir()
+        (folder / "in").mkdir(exist_ok=True)
+        self.notes.mkdir(exist_ok=True)
         self.lines: list[str] = []
         self.outcomes: dict[str, tuple[Outcome, int]] = {}
 
@@ -37,17 +35,17 @@ class Library:
         path.write_text("\n".join(self.lines) + "\n")
         return Manifest(str(path), OPS["encode"], lambda options: None)
 
-    def run(self, on: str = "local", root: str | None = None, retries: int = 2, **settings: Any) -> Summary:
+    def run(
+        self, on: str = "local", root: str | None = None, retries: int = 2, overwrite: bool = False, **settings: Any
+    ) -> Summary:
         """One batch over the lines so far; `outcomes` has the last outcome and the tries by output."""
-        overwrite, version = settings.pop("overwrite", False), settings.pop("version", None)
-        more = {"version": version} if version else {}
-        jobs = (Job(line, "encode", root or str(self.out), 1, overwrite, **more) for line in self.manifest().lines())
-        settings = {"workers": 0} | settings
+        more = {"version": settings.pop("version")} if "version" in settings else {}
+        jobs = (Job(line, "encode", root or str(self.out), 1, overwrite, **more) for line in self.manifest().lines)
 
-        def told(job: Job, outcome: Outcome, tries: int) -> None:
+        def report(job: Job, outcome: Outcome, tries: int) -> None:
             self.outcomes[job.line.output] = outcome, tries
 
-        return run(jobs, upper, ENGINES[on], EngineSettings(**settings), retries, told)
+        return run(jobs, upper, on, Settings(**{"workers": 0} | settings), retries, report)
 
     def made(self) -> list[str]:
         """The texts that the command has written, as often as it did."""
@@ -59,6 +57,4 @@ def library(tmp_path, monkeypatch) -> Library:
     monkeypatch.setenv("COUNT", str(tmp_path / "notes"))
     here = str(Path(__file__).parent)
     monkeypatch.setenv("PYTHONPATH", f"{here}:{Path(__file__).parents[2]}")  # of workers that are processes
-    monkeypatch.setattr("pd4dgs_codec.batch.store.PAUSES", (0.0, 0.0, 0.0))
-    made = Library(tmp_path)
-    return made
+    return Library(tmp_path)

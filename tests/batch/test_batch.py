@@ -1,4 +1,4 @@
-"""A batch in this process: records, what is not done twice, and what is named."""
+"""A batch in this process: records, finished work, broken lines, options and scans."""
 
 from __future__ import annotations
 
@@ -8,9 +8,7 @@ import pytest
 
 from pd4dgs_codec import __version__
 from pd4dgs_codec.batch import store
-from pd4dgs_codec.batch.job import key_of
-from pd4dgs_codec.batch.manifest import scan
-from pd4dgs_codec.batch.ops import arguments
+from pd4dgs_codec.batch.manifest import arguments, scan
 from pd4dgs_codec.errors import DataError
 
 
@@ -22,16 +20,9 @@ def test_outputs_have_a_record_and_are_not_done_twice(library):
     assert (library.out / "a.pd4").read_text() == "TEXT OF A.PT"
     record = json.loads((library.out / "a.pd4.done.json").read_text())
     assert record["version"] == __version__ and record["report"] == {"bytes": 12}
-    assert record["key"] == key_of("encode", record["inputs"], {"effort": 1}, __version__)
+    assert record["op"] == "encode" and record["options"] == {"effort": 1} and set(record["inputs"]) == {""}
     assert record["files"][""]["bytes"] == 12
     assert library.made() == ["text of a.pt", "text of b.pt"]
-
-
-def test_a_source_that_was_touched_and_is_the_same_is_not_done_again(library):
-    library.add("a.pt", "text")
-    library.run()
-    library.folder.joinpath("in/a.pt").write_text("text")
-    assert library.run().already == 1 and library.made() == ["text"]
 
 
 def test_a_killed_run_goes_on_after_its_last_record(library):
@@ -68,9 +59,7 @@ def test_what_another_input_made_is_named_and_the_others_go_on(library, change):
         library.lines[0] = library.lines[0].replace("}", ', "options": {"effort": 1}}')
     else:
         path = library.out / "a.pd4.done.json"
-        record = json.loads(path.read_text())
-        old = {"version": "0.0.1", "key": key_of("encode", record["inputs"], {}, "0.0.1")}
-        path.write_text(json.dumps(record | old))
+        path.write_text(json.dumps(json.loads(path.read_text()) | {"version": "0.0.1"}))
     library.add("b.pt", "more")
     assert library.run().done == 1
     outcome, tries = library.outcomes["a.pd4"]
@@ -147,17 +136,8 @@ def test_options_that_a_line_cannot_set_are_named(options):
 
 def test_options_become_a_command_line():
     options = {"effort": 3, "no-verify": True, "mode": "ans", "lossy": False, "without": ["rate", "noise"]}
-    said = arguments("encode", "a.pt", "a.pd4", options)
-    assert said == [
-        "a.pt",
-        "--output",
-        "a.pd4",
-        "--effort=3",
-        "--no-verify",
-        "--mode=ans",
-        "--without=rate",
-        "--without=noise",
-    ]
+    expected = "a.pt --output a.pd4 --effort=3 --no-verify --mode=ans --without=rate --without=noise"
+    assert arguments("encode", "a.pt", "a.pd4", options) == expected.split()
     assert arguments("eval", "a.pd4", "", {"data": "set"}) == ["a.pd4", "set"]
 
 
