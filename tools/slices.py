@@ -77,7 +77,7 @@ def prefixes(data: bytes) -> list[tuple[int, Scene]]:
 
 def points(data: bytes, dataset: Dataset) -> Points:
     """What each prefix takes and shows."""
-    from pd4dgs_codec.quality.rendered import true_psnr
+    from pd4dgs_codec.quality.measure import true_psnr
 
     views = dataset.test or dataset.train
     return [(end, true_psnr(scene, views, levels=[scene.level])[scene.level]) for end, scene in prefixes(data)]
@@ -119,7 +119,7 @@ def draw_strip(data: bytes, dataset: Dataset, path: Path) -> None:
     from pd4dgs_codec.model.convert import from_scene
     from pd4dgs_codec.model.picture import render_image
     from pd4dgs_codec.quality.image import to_uint8
-    from pd4dgs_codec.quality.panels import Panel, side_by_side
+    from pd4dgs_codec.quality.movie import Panel, side_by_side
 
     views = dataset.test or dataset.train
     view, found = views[len(views) // 2], prefixes(data)

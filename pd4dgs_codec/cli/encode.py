@@ -26,7 +26,7 @@ from pd4dgs_codec.cli.common import (
 )
 from pd4dgs_codec.cli.progress import progress_bar
 from pd4dgs_codec.format.options import CHOICES, DEFAULTS, EncodeOptions
-from pd4dgs_codec.quality import MIN_GAIN_PER_MEGABYTE
+from pd4dgs_codec.quality import ENCODE_MIN_DB_PER_MEGABYTE
 
 if TYPE_CHECKING:
     from pd4dgs_codec.format.metadata import Metadata
@@ -92,7 +92,7 @@ def parser() -> options.Parser:
     what = "use about N views of each split, evenly spread (default: 16)"
     views.add_argument("--views", type=options.positive_int, default=16, metavar="N", help=what)
     what = "with --data, leave out layers that gain less than DB dB mPSNR per megabyte"
-    what = f"{what} (default: {MIN_GAIN_PER_MEGABYTE:g}; 0: keep all)"
+    what = f"{what} (default: {ENCODE_MIN_DB_PER_MEGABYTE:g}; 0: keep all)"
     views.add_argument("--min-gain", type=options.non_negative_float, metavar="DB", help=what)
     p.add_common()
     return p
@@ -114,7 +114,7 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
         chosen,
         target_sizes=args.target_size,
         views=_views(args, console),
-        min_gain=MIN_GAIN_PER_MEGABYTE if args.min_gain is None else args.min_gain,
+        min_gain=ENCODE_MIN_DB_PER_MEGABYTE if args.min_gain is None else args.min_gain,
         downscale=args.downscale,
         metadata=metadata,
         progress=lambda what: progress_bar(None, "pictures", what),
@@ -172,7 +172,7 @@ def _views(args: argparse.Namespace, console: Console) -> Views | None:
 
 def _add_train_rate(result: dict[str, Any], packed: Packed, options: EncodeOptions) -> None:
     """Adds the trainer's sum of R over the unquantised values, at the steps and for the layers of this file."""
-    from pd4dgs_codec.quality.train_rate import train_rate_bits
+    from pd4dgs_codec.quality.measure import train_rate_bits
 
     coded = EncodeOptions(layers=options.layers, effort=options.effort, omit=options.omit)
     rows = train_rate_bits(packed.scene, coded)

@@ -127,7 +127,7 @@ def _pictures(
 ) -> Iterator[np.ndarray]:
     """uint8 [H, W, 3] per frame: one level, or all of them beside the ground truth. Appends the time of each picture to
     `milliseconds`."""
-    from pd4dgs_codec.quality.panels import Panel, level_panels, side_by_side
+    from pd4dgs_codec.quality.movie import Panel, level_panels, side_by_side
 
     for frame in frames:
         panels = level_panels(levels, frame)

@@ -11,8 +11,7 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.data.view import Dataset, View
-from pd4dgs_codec.quality.image import mean_image_baseline, mpsnr, mssim, to_uint8
-from pd4dgs_codec.quality.level_psnr import Metric, mean_scores
+from pd4dgs_codec.quality.image import Metric, mean_image_baseline, mean_scores, mpsnr, mssim, to_uint8
 from pd4dgs_codec.quality.levels import Level, load_levels
 from pd4dgs_codec.quality.perceptual import Distance, Perceptual
 from pd4dgs_codec.scene import Camera
@@ -31,11 +30,11 @@ def evaluate_file(
     perceptual: Perceptual | None = None,
     step: Callable[[], None] = lambda: None,
 ) -> dict[str, Any]:
-    """What `pd4dgs-eval --json` prints: metrics are means over the views of the per-view values.
+    """The result of `pd4dgs-eval --json`: metrics are means over the views.
 
-    Without held-out views the training views are used and "split" says "train". mpsnr in dB, infinite where nothing
-    differs. perceptual: distances to add, see `evaluate_level`; what they are is then under "perceptual". step is
-    called after each picture of each level. Raises DecodeError, DataError.
+    Without held-out views the training views are used and "split" is "train". mpsnr in dB, infinite for equal pictures.
+    perceptual: distances to add, see `evaluate_level`; the result describes them under "perceptual". step is called
+    after each picture of each level. Raises DecodeError, DataError.
     """
     views, split = (dataset.test, "test") if dataset.test else (dataset.train, "train")
     levels = load_levels(path_or_bytes, max_layer, device)
@@ -61,7 +60,7 @@ def evaluate_file(
 
 
 def metric_columns(result: dict[str, Any]) -> list[tuple[str, str, int]]:
-    """(heading, key of a level's row, decimals) of each metric that an evaluation holds."""
+    """(heading, key of a level's row, decimals) of each metric of an evaluation."""
     titles = {name: d["title"] for name, d in result.get("perceptual", {"distances": {}})["distances"].items()}
     return [
         ("mPSNR dB", "mpsnr", 2),
@@ -91,7 +90,7 @@ def evaluate_level(
         milliseconds.append(took)
         return image
 
-    level.picture(views[0].camera, views[0].time)  # compilation and caches are not the renderer's speed
+    level.picture(views[0].camera, views[0].time)  # warms up, so that render_ms counts no compilation
     return {
         "level": level.level,
         **mean_scores(draw, views, metrics, step),
@@ -116,6 +115,6 @@ def _temporal(
 
 
 def _baseline(dataset: Dataset, views: tuple[View, ...]) -> float | None:
-    """PSNR of always showing the mean training image; None where images differ in size and there is no such image."""
+    """PSNR of the mean training image; None if images differ in size."""
     sizes = {view.image.shape for view in (*dataset.train, *views)}
     return mean_image_baseline(dataset.train, views) if len(sizes) == 1 else None

@@ -1,4 +1,4 @@
-"""Which pictures to take of a file: a dataset's views, or the file's own camera over time."""
+"""The pictures to take of a file: a dataset's views, or the file's own camera over time."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from pd4dgs_codec.data.view import View
 from pd4dgs_codec.errors import RenderError
 from pd4dgs_codec.scene import Camera, SceneInfo
 
-#: Of a picture that a file alone asks for; a .pd4 of a few bytes may name a camera of 65,535 x 65,535.
+#: The most pixels of a picture by a file's own camera: a .pd4 of a few bytes may name one of 65,535 x 65,535.
 MAX_PIXELS = 1 << 25
 
 
@@ -31,7 +31,7 @@ def dataset_frames(views: Sequence[View]) -> list[Frame]:
 
 
 def own_frames(info: SceneInfo, count: int, orbit: float = 0.0, downscale: int = 1) -> list[Frame]:
-    """`count` pictures over the whole time from the file's camera, which sways `orbit` degrees around what it looks at.
+    """`count` pictures over the whole time from the file's camera, which orbits its look-at point by `orbit` degrees.
 
     Raises RenderError if the file has no camera, or one of pictures over MAX_PIXELS.
     """

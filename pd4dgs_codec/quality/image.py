@@ -1,12 +1,13 @@
-"""Masked PSNR and masked SSIM of the DyCheck protocol, in float64 numpy. Scores are per frame; average over frames.
+"""Masked PSNR and masked SSIM of the DyCheck protocol, in float64 numpy, and their means over views and levels.
 
-Images are brought to 8 bits first, as a written picture would be. Masks are bool [H, W], True = counts.
+Images are rounded to 8 bits first, as a written picture would be. Masks are bool [H, W], True = counts.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Protocol
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import partial
+from typing import Protocol, TypeVar
 
 import numpy as np
 
@@ -30,7 +31,7 @@ def to_uint8(image: np.ndarray) -> np.ndarray:
 
 
 def prepare(pred: np.ndarray, target: np.ndarray, mask: np.ndarray | None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Both images as float64 [H, W, 3] in 0..1 after 8 bits, and the mask as float64 [H, W]."""
+    """Both images rounded to 8 bits as float64 [H, W, 3] in 0..1, and the mask as float64 [H, W]."""
     a, b = np.asarray(pred), np.asarray(target)
     if a.shape != b.shape or a.ndim != 3 or a.shape[2] != 3:
         raise DataError(f"images have shapes {a.shape} and {b.shape}, expected the same [H, W, 3]")
@@ -41,7 +42,7 @@ def prepare(pred: np.ndarray, target: np.ndarray, mask: np.ndarray | None) -> tu
 
 
 def mpsnr(pred: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) -> float:
-    """-10 log10(sum(squared error * m) / max(sum(m), 1e-6)) in dB, m over 3 channels; infinite if nothing differs.
+    """-10 log10(sum(squared error * m) / max(sum(m), 1e-6)) in dB, m over 3 channels; infinite for equal images.
 
     pred, target: [H, W, 3] uint8 or floats in 0..1. mask: bool [H, W]; None = all.
     """
@@ -58,7 +59,7 @@ def _gaussian() -> np.ndarray:
 
 
 def _slide(z: np.ndarray, weights: np.ndarray, axis: int) -> np.ndarray:
-    """Correlation along an axis, only where all of `weights` fits."""
+    """Correlation along an axis where all of `weights` fits."""
     n = z.shape[axis] - len(weights) + 1
     part = [slice(None)] * z.ndim
     total = 0.0
@@ -100,7 +101,7 @@ def mssim(pred: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) 
 
 
 class TrueView(Protocol):
-    """What a picture is scored against. image: uint8 [H, W, 3]; mask: bool [H, W], True = counts, or None for all."""
+    """The reference of a picture. image: uint8 [H, W, 3]; mask: bool [H, W], True = counts, or None for all."""
 
     @property
     def image(self) -> np.ndarray: ...
@@ -110,7 +111,7 @@ class TrueView(Protocol):
 
 
 def mean_image_baseline(train: Sequence[TrueView], test: Sequence[TrueView]) -> float:
-    """Mean mPSNR in dB over the test views of always predicting the mean training image: what any model must beat."""
+    """Mean mPSNR in dB over the test views of the mean training image: a model should exceed it."""
     if not train or not test:
         raise DataError(f"found {len(train)} training and {len(test)} test views, expected at least 1 of each")
     shapes = {v.image.shape for v in (*train, *test)}
@@ -121,3 +122,34 @@ def mean_image_baseline(train: Sequence[TrueView], test: Sequence[TrueView]) -> 
         total += view.image
     mean = total / (255.0 * len(train))
     return float(np.mean([mpsnr(mean, v.image, v.mask) for v in test]))
+
+
+#: (picture, true image, mask) -> score
+Metric = Callable[[np.ndarray, np.ndarray, np.ndarray | None], float]
+V = TypeVar("V", bound=TrueView)
+
+
+def mean_scores(
+    draw: Callable[[V], np.ndarray],
+    views: Sequence[V],
+    metrics: Mapping[str, Metric],
+    step: Callable[[], None] = lambda: None,
+) -> dict[str, float]:
+    """Each metric's mean over `views` of its score of draw(view), [H, W, 3] in 0..1. step: called after each view."""
+    scores: dict[str, list[float]] = {name: [] for name in metrics}
+    for view in views:
+        picture = draw(view)
+        for name, metric in metrics.items():
+            scores[name].append(metric(picture, view.image, view.mask))
+        step()
+    return {name: float(np.mean(values)) for name, values in scores.items()}
+
+
+def level_psnr(
+    draw: Callable[[int, V], np.ndarray],
+    levels: Iterable[int],
+    views: Sequence[V],
+    step: Callable[[], None] = lambda: None,
+) -> dict[int, float]:
+    """Per level the mean over `views` of the mPSNR of draw(level, view), dB; infinite for equal pictures."""
+    return {level: mean_scores(partial(draw, level), views, {"mpsnr": mpsnr}, step)["mpsnr"] for level in levels}

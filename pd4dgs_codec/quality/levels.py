@@ -1,6 +1,6 @@
-"""A file's levels ready to render: each one from the bytes that a receiver would hold at that level.
+"""The levels of a file ready to render, each decoded from the bytes that a receiver would hold at that level.
 
-A decoded level is drawn without torch, by `playback`; a checkpoint, and a level on another device, by the torch model.
+`draw.player` renders a decoded level without torch; the torch model renders a checkpoint, or a level on another device.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Level:
-    """One level of a file, drawn by `model`. anchors: active at it. cumulative_bytes: of its prefix, and decode_seconds
-    of decoding that; both None for a checkpoint."""
+    """One level of a file, rendered by `model`. anchors: active at the level. cumulative_bytes: size of its prefix;
+    decode_seconds: time to decode it; both None for a checkpoint."""
 
     level: int
     model: Player | Model
@@ -43,7 +43,7 @@ class Level:
         return render_image(self.model, self.level, time, camera)
 
     def timed_picture(self, camera: Camera, time: float) -> tuple[np.ndarray, float]:
-        """`picture`, and the milliseconds that it took, the networks included."""
+        """`picture` and its milliseconds, the networks included."""
         start = perf_counter()
         image = self.picture(camera, time)
         return image, 1e3 * (perf_counter() - start)
@@ -67,10 +67,11 @@ def load_levels(
     max_bytes: int | None = None,
     last_only: bool = False,
 ) -> list[Level]:
-    """The levels of a `.pd4` file (or its bytes) or of a checkpoint, ascending, up to max_layer; or only the
-    last of them. max_bytes: of a `.pd4`, only what the slices within so many bytes give.
+    """The levels of a `.pd4` file (or its bytes) or of a checkpoint, ascending, up to max_layer; with last_only the
+    last one. max_bytes: of a `.pd4`, decode only the slices within so many bytes.
 
-    Each level of a `.pd4` is decoded from its own prefix, so nothing of a later layer can leak into it.
+    Each level of a `.pd4` is decoded from its own prefix, so nothing of a later layer can leak into it. Raises
+    DataError for a file that cannot be read, DecodeError.
     """
     if isinstance(file, bytes):
         return _of_bytes(file, max_layer, device, max_bytes, last_only)
@@ -92,7 +93,7 @@ def _of_bytes(data: bytes, max_layer: int | None, device: str, max_bytes: int | 
         if within and (max_layer is None or row["layer"] <= max_layer):
             ends[row["layer"]] = within[-1]
     if not ends and max_bytes is not None:
-        decode(data, max_bytes=max_bytes)  # which says why there is none
+        decode(data, max_bytes=max_bytes)  # raises the reason
     for layer in list(ends)[-1:] if last_only else ends:
         start = perf_counter()
         scene = decode(data[: ends[layer]], max_layer=layer, max_bytes=ends[layer])

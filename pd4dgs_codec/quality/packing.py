@@ -1,4 +1,4 @@
-"""One call from a scene to a `.pd4` file: layers that do not pay left out, layers made to fit, the rest encoded."""
+"""One call from a scene to a `.pd4` file: leaves out layers of too little gain, fits sizes, encodes the rest."""
 
 from __future__ import annotations
 
@@ -14,7 +14,8 @@ from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.plan import plan
 from pd4dgs_codec.format.stream import every_prefix
 from pd4dgs_codec.format.symbols import rounded
-from pd4dgs_codec.quality import MIN_GAIN_PER_MEGABYTE
+from pd4dgs_codec.quality import ENCODE_MIN_DB_PER_MEGABYTE
+from pd4dgs_codec.quality.frames import Frame, dataset_frames, own_frames
 from pd4dgs_codec.scene import Scene
 
 if TYPE_CHECKING:
@@ -22,24 +23,23 @@ if TYPE_CHECKING:
 
     from pd4dgs_codec.data.view import Dataset, View
     from pd4dgs_codec.model.model import Model
-    from pd4dgs_codec.quality.frames import Frame
 
-#: Pictures of the file's own camera, and how many degrees it sways, where there are no views.
+#: Without views: pictures of the file's own camera, and the degrees of its orbit.
 OWN_PICTURES, OWN_ORBIT = 16, 20.0
 
-#: What is being done, in two words -> a context with a function to call after each picture.
+#: The current task, in two words -> a context with a function to call after each picture.
 Progress = Callable[[str], AbstractContextManager[Callable[[], None]]]
 
 
 def no_progress(_: str) -> AbstractContextManager[Callable[[], None]]:
-    """Tells nothing."""
+    """Reports nothing."""
     return nullcontext(lambda: None)
 
 
 @dataclass(frozen=True)
 class Views:
-    """What packing looks at. source: where they are from, for the report. fitting: sizes are fitted on these. held_out:
-    layers must pay on these, for on what it was fitted to a useless one may still gain a lot."""
+    """The views that packing uses. source: their dataset, for the report. fitting: for target sizes and the order of
+    slices. held_out: for the gain of layers, which on the views of the fit would be too high."""
 
     source: str
     fitting: Sequence[View]
@@ -47,7 +47,7 @@ class Views:
 
     @classmethod
     def of(cls, dataset: Dataset, source: str, most: int) -> Views:
-        """About `most` training views and as many held out (training views if none are), evenly spread."""
+        """About `most` training views and as many held-out ones (training views if there are none), evenly spread."""
         fitting, held_out = (
             tuple(views[:: -(-len(views) // most)]) for views in (dataset.train, dataset.test or dataset.train)
         )
@@ -56,10 +56,13 @@ class Views:
 
 @dataclass(frozen=True)
 class Packed:
-    """A `.pd4` file. scene: what was encoded, at the steps of the file. target: how sizes were met, or None where none
-    were asked for: cameras, pictures, layers (as in target.Fit) and levels (level, error_psnr in dB against the
-    unquantised pictures, and with held-out views lost_db, their mPSNR). slices: of a sliced file, by what its anchors
-    are ordered, in how many pictures, and with held-out views the mPSNR in dB after each slice; else None."""
+    """A `.pd4` file. scene: what was encoded, at the steps of the file.
+
+    target: how target sizes were met, None without any: cameras, pictures, layers (the fields of target.Fit) and levels
+    (level, error_psnr in dB relative to the unquantised pictures, and with held-out views lost_db, their loss of
+    mPSNR). slices: of a sliced file, the criterion of the order of its anchors, its cameras, the number of pictures,
+    and with held-out views the mPSNR in dB after each slice; else None.
+    """
 
     data: bytes
     scene: Scene
@@ -69,11 +72,8 @@ class Packed:
 
     def json(self) -> dict[str, Any]:
         """The report, with the target and per layer the ratio of payload to R(a)."""
-        result = self.report.json()
-        if self.target is not None:
-            result["target"] = self.target
-        if self.slices is not None:
-            result["slices"] = self.slices
+        more = {"target": self.target, "slices": self.slices}
+        result = self.report.json() | {name: value for name, value in more.items() if value is not None}
         for row in result["layers"]:
             row["ratio"] = row["payload_bits"] / row["rate_bits"] if row["rate_bits"] else None
         return result
@@ -85,129 +85,120 @@ def pack(
     *,
     target_sizes: Mapping[int, int] | None = None,
     views: Views | None = None,
-    min_gain: float = MIN_GAIN_PER_MEGABYTE,
+    min_gain: float = ENCODE_MIN_DB_PER_MEGABYTE,
     downscale: int = 1,
     metadata: Metadata | None = None,
     progress: Progress = no_progress,
 ) -> Packed:
     """The file of a scene or a trained model.
 
-    target_sizes: most bytes that each layer may add to the file, by layer. views: pictures to judge by; without them
-    sizes are fitted on what the file's own camera shows, 1/downscale as wide and high, and no layer must pay. min_gain:
-    dB of mPSNR per megabyte under which a layer is left out, where all layers are asked for; 0 keeps all. metadata:
-    what the file says about itself. If options.slices, anchors come in the order of what they gain in the views that
-    sizes are fitted on, or in what the file's own camera shows; a file without either has the largest first. Only
-    views, target sizes and slices need torch. Raises EncodeError, RenderError for a file without a camera.
+    target_sizes: the most bytes that each layer may add to the file, by layer. views: for target sizes, the order of
+    slices and the gain of layers; without them the file's own camera takes the pictures, 1/downscale as wide and high,
+    and layers are kept whatever they gain. min_gain: dB of mPSNR per megabyte below which a layer is left out, if all
+    layers are asked for; 0 keeps all. metadata: stored in the file. With options.slices anchors are ordered by the gain
+    of the pictures per byte, in a file without views or a camera by size.
+
+    Only views, target sizes and slices need torch. Raises EncodeError, RenderError for a file without a camera.
     """
     if not isinstance(source, Scene):
         from pd4dgs_codec.model.convert import to_scene
 
         source = to_scene(source)
     scene, options = options.apply_scale(source)
+    pictures = _Pictures(views, downscale, progress)
     left_out: list[LeftOut] = []
-    if views is not None and views.held_out and options.layers == "auto" and min_gain:
-        from pd4dgs_codec.quality.gains import leave_out_unpaid
+    if pictures.held_out and options.layers == "auto" and min_gain:
+        from pd4dgs_codec.quality.measure import leave_out_low_gain
 
-        with progress("judging layers") as step:
-            scene, left_out = leave_out_unpaid(scene, views.held_out, min_gain=min_gain, options=options, step=step)
+        with progress("measuring layers") as step:
+            scene, left_out = leave_out_low_gain(
+                scene, pictures.held_out, min_gain=min_gain, options=options, step=step
+            )
     target = None
     if target_sizes:
-        scene, more, target = _fit(scene, options, target_sizes, views, downscale, progress)
+        scene, more, target = pictures.fit(scene, options, target_sizes)
         left_out += more
     if options.slices:
-        return _in_slices(scene, options, left_out, target, views, downscale, metadata, progress)
-    data, report = encode_with_report(scene, options, left_out=left_out, metadata=metadata)
-    _note_sizes(target, report)
-    return Packed(data, scene, report, target)
-
-
-def _note_sizes(target: dict[str, Any] | None, report: Report) -> None:
+        data, report, slices = pictures.in_slices(scene, options, left_out, metadata)
+    else:
+        slices = None
+        data, report = encode_with_report(scene, options, left_out=left_out, metadata=metadata)
     if target is not None:
         added = report.added_bytes()
         for row in target["layers"]:
             row["bytes"] = added.get(row["layer"], 0)
+    return Packed(data, scene, report, target, slices)
 
 
-def _in_slices(
-    scene: Scene,
-    options: EncodeOptions,
-    left_out: list[LeftOut],
-    target: dict[str, Any] | None,
-    views: Views | None,
-    downscale: int,
-    metadata: Metadata | None,
-    progress: Progress,
-) -> Packed:
-    from pd4dgs_codec.model.utility import utility
-    from pd4dgs_codec.quality.rendered import true_psnr
+@dataclass(frozen=True)
+class _Pictures:
+    """The pictures that packing measures, and the steps that need them."""
 
-    about: dict[str, Any] = {"order": "gate times area", "cameras": None, "pictures": 0}
-    order: Callable[[Scene], np.ndarray] | None = None
-    frames = _frames(scene, views, downscale) if views is not None or scene.info.camera is not None else []
-    if frames:
-        about = {"order": "rendered gain per byte", "cameras": _cameras(views), "pictures": len(frames)}
+    views: Views | None
+    downscale: int
+    progress: Progress
 
-        def order(decoded: Scene) -> np.ndarray:
-            with progress("ordering anchors") as step:
-                return utility(decoded, [(frame.camera, frame.time) for frame in frames], step)
+    @property
+    def held_out(self) -> Sequence[View]:
+        return () if self.views is None else self.views.held_out
 
-    data, report = encode_with_report(scene, options, left_out=left_out, utility=order)
-    _note_sizes(target, report)
-    if views is not None and views.held_out:
-        with progress("judging slices") as step:
-            about["psnr"] = [
-                true_psnr(prefix, views.held_out, step, levels=[prefix.level])[prefix.level]
-                for prefix in every_prefix(data)
-            ]
-        metadata = replace(metadata or Metadata(), slices=tuple(about["psnr"]))
-    if metadata is not None:
-        plain, data = len(data), with_metadata(data, metadata)
-        report = replace(report, bytes=len(data), metadata_bytes=len(data) - plain)
-    return Packed(data, scene, report, target, about)
+    @property
+    def cameras(self) -> str:
+        return "the file's own camera" if self.views is None else f"training views of {self.views.source}"
 
+    def frames(self, scene: Scene) -> list[Frame]:
+        if self.views is None:
+            return own_frames(scene.info, OWN_PICTURES, OWN_ORBIT, self.downscale)
+        return dataset_frames(self.views.fitting)
 
-def _frames(scene: Scene, views: Views | None, downscale: int) -> list[Frame]:
-    """The pictures to fit to."""
-    from pd4dgs_codec.quality.frames import dataset_frames, own_frames
+    def fit(
+        self, scene: Scene, options: EncodeOptions, target_sizes: Mapping[int, int]
+    ) -> tuple[Scene, list[LeftOut], dict[str, Any]]:
+        """(scene whose layers meet the sizes, what that leaves out, the target of the report)."""
+        from pd4dgs_codec.quality.measure import RenderedLoss, psnr_of, true_psnr
+        from pd4dgs_codec.quality.target import fit
 
-    if views is None:
-        return own_frames(scene.info, OWN_PICTURES, OWN_ORBIT, downscale)
-    return dataset_frames(views.fitting)
+        scene, left_out = plan(scene, options)
+        frames = self.frames(scene)
+        with self.progress("fitting sizes") as step:
+            loss = RenderedLoss(scene, frames, step)
+            fitted, dropped, fits = fit(scene, target_sizes, loss.mean_mse, loss.omission_error, options)
+            packed = rounded(plan(fitted, replace(options, omit="nothing"))[0])
+            errors = loss.mse(packed)
+            before, after = (true_psnr(s, self.held_out, step) if self.held_out else {} for s in (scene, packed))
+        levels = []
+        for level, mse in errors.items():
+            lost = {"lost_db": before[level] - after[level]} if before else {}
+            levels.append({"level": level, "error_psnr": psnr_of(mse), **lost})
+        layers = [asdict(row) for row in fits]
+        report = {"cameras": self.cameras, "pictures": len(frames), "layers": layers, "levels": levels}
+        return fitted, left_out + dropped, report
 
+    def in_slices(
+        self, scene: Scene, options: EncodeOptions, left_out: list[LeftOut], metadata: Metadata | None
+    ) -> tuple[bytes, Report, dict[str, Any]]:
+        """(sliced file, its report, the slices of the report)."""
+        from pd4dgs_codec.model.utility import utility
+        from pd4dgs_codec.quality.measure import true_psnr
 
-def _cameras(views: Views | None) -> str:
-    return "the file's own camera" if views is None else f"training views of {views.source}"
+        about: dict[str, Any] = {"order": "gate times area", "cameras": None, "pictures": 0}
+        order: Callable[[Scene], np.ndarray] | None = None
+        if frames := self.frames(scene) if self.views is not None or scene.info.camera is not None else []:
+            about = {"order": "rendered gain per byte", "cameras": self.cameras, "pictures": len(frames)}
 
+            def order(decoded: Scene) -> np.ndarray:
+                with self.progress("ordering anchors") as step:
+                    return utility(decoded, [(frame.camera, frame.time) for frame in frames], step)
 
-def _fit(
-    scene: Scene,
-    options: EncodeOptions,
-    target_sizes: Mapping[int, int],
-    views: Views | None,
-    downscale: int,
-    progress: Progress,
-) -> tuple[Scene, list[LeftOut], dict[str, Any]]:
-    """(scene whose layers meet the sizes, what that leaves out, the target of the report)."""
-    from pd4dgs_codec.quality.rendered import RenderedLoss, psnr_of, true_psnr
-    from pd4dgs_codec.quality.target import fit
-
-    scene, left_out = plan(scene, options)
-    frames = _frames(scene, views, downscale)
-    held_out = () if views is None else views.held_out
-    with progress("fitting sizes") as step:
-        loss = RenderedLoss(scene, frames, step)
-        fitted, dropped, fits = fit(scene, target_sizes, loss.mean_mse, loss.harm, options)
-        packed = rounded(plan(fitted, replace(options, omit="nothing"))[0])
-        errors = loss.mse(packed)
-        before, after = (true_psnr(s, held_out, step) if held_out else {} for s in (scene, packed))
-    levels = []
-    for level, mse in errors.items():
-        lost = {"lost_db": before[level] - after[level]} if held_out else {}
-        levels.append({"level": level, "error_psnr": psnr_of(mse), **lost})
-    report = {
-        "cameras": _cameras(views),
-        "pictures": len(frames),
-        "layers": [asdict(row) for row in fits],
-        "levels": levels,
-    }
-    return fitted, left_out + dropped, report
+        data, report = encode_with_report(scene, options, left_out=left_out, utility=order)
+        if self.held_out:
+            with self.progress("measuring slices") as step:
+                about["psnr"] = [
+                    true_psnr(prefix, self.held_out, step, levels=[prefix.level])[prefix.level]
+                    for prefix in every_prefix(data)
+                ]
+            metadata = replace(metadata or Metadata(), slices=tuple(about["psnr"]))
+        if metadata is not None:
+            plain, data = len(data), with_metadata(data, metadata)
+            report = replace(report, bytes=len(data), metadata_bytes=len(data) - plain)
+        return data, report, about

@@ -1,4 +1,4 @@
-"""LPIPS, ST-LPIPS and FLIP, each where its package and weights are present, with the mask; and their temporal forms.
+"""LPIPS, ST-LPIPS and FLIP, masked, each if its package and weights are installed; and their temporal forms.
 
 Nothing is downloaded. docs/evaluation.md gives the definitions and says where each package comes from.
 """
@@ -21,9 +21,9 @@ import numpy as np
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.quality.image import LEAST_WEIGHT, prepare
 
-#: What FLIP assumes of the viewer, its package's default: metres from the screen, its width in pixels and in metres.
+#: FLIP's viewing conditions, its package's default: metres from the screen, its width in pixels and in metres.
 VIEWING = (0.7, 3840, 0.7)
-#: Smallest side, pixels, that the networks' strides and paddings leave something of.
+#: Smallest side, pixels, for which the networks' strides and paddings leave an output.
 LPIPS_LEAST, STLPIPS_LEAST = 31, 21
 
 #: float32 [H, W] error per pixel, of two float32 [H, W, 3] in 0..1
@@ -34,7 +34,7 @@ ErrorMap = Callable[[np.ndarray, np.ndarray], np.ndarray]
 class Distance:
     """One perceptual distance: 0 for equal pictures, larger is worse.
 
-    title: as tables name it. source: package, version and network. least: smallest side of a picture, pixels.
+    title: for tables. source: package, version and network. least: smallest side of a picture, pixels.
     """
 
     title: str
@@ -65,7 +65,7 @@ class Distance:
 
 @dataclass(frozen=True)
 class Perceptual:
-    """The distances that can be computed here, by the name of their keys, and why each other one cannot."""
+    """distances: those that can be computed here, by the name of their keys. absent: why each other one cannot."""
 
     distances: dict[str, Distance]
     absent: dict[str, str]
@@ -76,7 +76,7 @@ class _Absent(Exception):
 
 
 def load_perceptual() -> Perceptual:
-    """Loads what is installed; takes a second or two."""
+    """Loads the installed distances; takes a second or two."""
     distances, absent = {}, {}
     for name, loader in (("lpips", _lpips), ("stlpips", _stlpips), ("flip", _flip)):
         try:
@@ -85,7 +85,7 @@ def load_perceptual() -> Perceptual:
             absent[name] = str(error)
         except ModuleNotFoundError as error:
             absent[name] = f"the module {error.name} is not installed"
-        except Exception as error:  # a broken install fails in its own way, and must not take the other metrics along
+        except Exception as error:  # a broken package must not disable the other distances
             absent[name] = " ".join(f"{type(error).__name__}: {error}".split())
     return Perceptual(distances, absent)
 
@@ -94,21 +94,21 @@ def _lpips() -> Distance:
     import torch
     from torchvision.models import AlexNet_Weights
 
-    # lpips asks torchvision for ImageNet's weights, which fetches them if they are not in this folder
+    # lpips makes torchvision download ImageNet's weights if they are not in this folder
     weights = Path(torch.hub.get_dir()) / "checkpoints" / Path(AlexNet_Weights.IMAGENET1K_V1.url).name
     if not weights.is_file():
         raise _Absent(f"its AlexNet weights are not in {weights}")
     import lpips
 
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # it names torchvision's weights in a deprecated way
+        warnings.simplefilter("ignore")  # a deprecation of torchvision
         network = lpips.LPIPS(net="alex", spatial=True, verbose=False)
     return Distance("LPIPS", f"lpips {metadata.version('lpips')}, alex", _of_network(network), LPIPS_LEAST)
 
 
 def _stlpips() -> Distance:
-    # The package imports these on loading, each for something that the shift-tolerant AlexNet does not use. Afterwards
-    # sys.modules is as it was, so that nobody else meets the stand-ins, or the package loaded with them.
+    # The package imports these modules without using them for the shift-tolerant AlexNet. sys.modules is restored, so
+    # that no other code gets the stand-ins.
     from unittest import mock  # a tenth of a second
 
     unused = {"torchvision": "models", "IPython": "embed", "torchsummary": "summary"}

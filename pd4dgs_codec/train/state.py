@@ -17,7 +17,7 @@ from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.model.plane_rate import exact_bits
 from pd4dgs_codec.model.rounding import EXACT, Noise, Rounding
-from pd4dgs_codec.quality.level_psnr import level_psnr
+from pd4dgs_codec.quality.image import level_psnr
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.initialise import fresh_model

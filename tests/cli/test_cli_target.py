@@ -63,7 +63,7 @@ def scaled_error(model_pt, scale: float) -> float:
     from pd4dgs_codec.format.plan import plan
     from pd4dgs_codec.format.symbols import rounded
     from pd4dgs_codec.quality.frames import own_frames
-    from pd4dgs_codec.quality.rendered import RenderedLoss
+    from pd4dgs_codec.quality.measure import RenderedLoss
 
     scene = unquantised(model_pt)
     coarse = replace(scene, steps=scene.steps.scaled(scale))
@@ -111,15 +111,15 @@ def test_a_layer_that_explains_the_pictures_is_kept(scene):
     from pd4dgs_codec.format.symbols import rounded
     from pd4dgs_codec.model.convert import from_scene
     from pd4dgs_codec.model.picture import render_image
-    from pd4dgs_codec.quality.gains import leave_out_unpaid
     from pd4dgs_codec.quality.image import to_uint8
+    from pd4dgs_codec.quality.measure import leave_out_low_gain
 
     camera, model = scene.info.camera, from_scene(rounded(plan(scene)[0]))
     views = []
     for time in (0.2, 0.9):
         picture = render_image(model, 1, time, camera)
         views.append(View(camera.viewmat, camera.K, camera.width, camera.height, time, to_uint8(picture), None, "", 0))
-    kept, (gone,) = leave_out_unpaid(scene, views, min_gain=0.5, options=EncodeOptions(mode="lzma", effort=1))
+    kept, (gone,) = leave_out_low_gain(scene, views, min_gain=0.5, options=EncodeOptions(mode="lzma", effort=1))
     assert gone.what == "local_deformation" and kept.global_deformation is not None
 
 
@@ -127,12 +127,12 @@ def test_harm_is_about_the_error_that_leaving_an_anchor_out_makes(scene, monkeyp
     from pd4dgs_codec.format.plan import plan
     from pd4dgs_codec.model import harm as harm_of
     from pd4dgs_codec.quality.frames import own_frames
-    from pd4dgs_codec.quality.rendered import RenderedLoss
+    from pd4dgs_codec.quality.measure import RenderedLoss
 
     monkeypatch.setattr(harm_of, "PROBES", 64)  # the anchors differ less here than in a trained scene
     planned = plan(scene)[0]
     loss = RenderedLoss(planned, own_frames(planned.info, 2, 20.0))
-    harm = loss.harm(planned, 0)
+    harm = loss.omission_error(planned, 0)
     anchors = range(planned.rows[0])
     measured = []
     for anchor in anchors:

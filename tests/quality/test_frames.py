@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from pd4dgs_codec.errors import RenderError
-from pd4dgs_codec.quality import frames, movie, panels
+from pd4dgs_codec.quality import frames, movie
 from pd4dgs_codec.scene import Camera, SceneInfo
 
 
@@ -77,18 +77,18 @@ def test_shrunk_camera_sees_the_same_rays():
 
 def test_panels_paste_images_unchanged_below_captions():
     a, b = np.full((40, 60, 3), 10, np.uint8), np.full((40, 30, 3), 200, np.uint8)
-    captioned = (panels.Panel(a, "level 0, 12 kB"), panels.Panel(b, "a caption far too long for its image"))
-    sheet = panels.side_by_side(captioned)
-    assert sheet.shape == (40 + 16, 60 + 30 + panels.GAP, 3)
+    captioned = (movie.Panel(a, "level 0, 12 kB"), movie.Panel(b, "a caption far too long for its image"))
+    sheet = movie.side_by_side(captioned)
+    assert sheet.shape == (40 + 16, 60 + 30 + movie.GAP, 3)
     assert np.array_equal(sheet[-40:, :60], a) and np.array_equal(sheet[-40:, -30:], b)
     band = sheet[:-40]
-    assert (band[:, :60] < 128).any() and (band[:, 60 : 60 + panels.GAP] == 255).all()
+    assert (band[:, :60] < 128).any() and (band[:, 60 : 60 + movie.GAP] == 255).all()
 
 
 def test_captions_state_the_size():
-    assert panels.level_caption(1, None) == "level 1"
-    assert panels.level_caption(0, 425_000) == "level 0, 425 kB"
-    assert panels.level_caption(2, 6_880_000) == "level 2, 6.88 MB"
+    assert movie.level_caption(1, None) == "level 1"
+    assert movie.level_caption(0, 425_000) == "level 0, 425 kB"
+    assert movie.level_caption(2, 6_880_000) == "level 2, 6.88 MB"
 
 
 def test_gif_keeps_order_count_and_speed(tmp_path):

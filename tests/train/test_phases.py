@@ -17,13 +17,14 @@ from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.model.harm import step_harm
 from pd4dgs_codec.model.picture import render, render_image
 from pd4dgs_codec.model.rounding import EXACT
-from pd4dgs_codec.quality.train_rate import train_rate_bits
+from pd4dgs_codec.quality import TRAIN_MIN_DB, TRAIN_MIN_DB_PER_MEGABYTE
+from pd4dgs_codec.quality.measure import train_rate_bits
 from pd4dgs_codec.scene import ATTRIBUTES, MASK_THRESHOLD, MAX_CLASS
 from pd4dgs_codec.train import losses, phases
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.loop import Trainer
 from pd4dgs_codec.train.phases import levels, prefixes, prune, quantisation
-from pd4dgs_codec.train.phases.levels import MIN_GAIN_DB, MIN_GAIN_PER_MEGABYTE, held_back_views, levels_without_gain
+from pd4dgs_codec.train.phases.levels import held_back_views, levels_without_gain
 from pd4dgs_codec.train.phases.prefixes import OCTAVES, draw_prefix, rank_anchors
 from pd4dgs_codec.train.phases.prune import Prune, added_error, least, round_of
 from pd4dgs_codec.train.phases.quantisation import classes_within, whiten, whitening_transform
@@ -199,13 +200,13 @@ def test_a_scene_that_needs_no_anchor_keeps_some(dataset, tmp_path, monkeypatch,
     [
         ([30, 31, 32], 0, []),
         ([30, 31, 30.9], 0, [2]),
-        ([30, 31, 31 + 0.9 * MIN_GAIN_DB[2]], 0, [2]),
+        ([30, 31, 31 + 0.9 * TRAIN_MIN_DB[2]], 0, [2]),
         ([30, 29, 29], 0, [2, 1]),
         ([30, 30.38, 30.4], 0, [2, 1]),  # a static scene
         ([30, 29, 29.7], 0, []),  # level 2 gains, and depends on level 1
         ([30], 0, []),
-        ([30, 32, 33], 0.9 / MIN_GAIN_PER_MEGABYTE, []),
-        ([30, 32, 33], 1.1 / MIN_GAIN_PER_MEGABYTE, [2]),
+        ([30, 32, 33], 0.9 / TRAIN_MIN_DB_PER_MEGABYTE, []),
+        ([30, 32, 33], 1.1 / TRAIN_MIN_DB_PER_MEGABYTE, [2]),
     ],
 )
 def test_levels_go_from_the_top_while_they_gain_too_little(psnr, megabytes, gone):

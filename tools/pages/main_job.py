@@ -22,7 +22,7 @@ from pd4dgs_codec.io import finite, whole_file, whole_files, write_bytes
 from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.quality.evaluate import evaluate_file
-from pd4dgs_codec.quality.train_rate import train_rate_bits
+from pd4dgs_codec.quality.measure import train_rate_bits
 from pd4dgs_codec.scene import Scene
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.schedule import Schedule

@@ -10,8 +10,7 @@ import numpy as np
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.quality.frames import dataset_frames
 from pd4dgs_codec.quality.levels import Level, load_levels
-from pd4dgs_codec.quality.movie import write_gif
-from pd4dgs_codec.quality.panels import Panel, level_panels, side_by_side
+from pd4dgs_codec.quality.movie import Panel, level_panels, side_by_side, write_gif
 
 
 def draw_levels(data: bytes, dataset: Dataset, still: Path, movie: Path, *, stills: int = 3, frames: int = 40) -> None:

@@ -13,6 +13,7 @@ import torch
 
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model
+from pd4dgs_codec.quality import TRAIN_MIN_DB, TRAIN_MIN_DB_PER_MEGABYTE
 from pd4dgs_codec.train import phases, workers
 from pd4dgs_codec.train.initialise import TIED
 from pd4dgs_codec.train.optimiser import Optimiser
@@ -21,13 +22,6 @@ from pd4dgs_codec.train.state import TrainState
 #: One training view in so many is held back until levels are selected, if there are enough of them.
 EVERY = 16
 MIN_VIEWS = 4
-#: dB that levels 1 and 2 must gain over the level below. Held-back views lie between training views, which favours a
-#: level: by 0.5 to 0.7 dB on a static scene, which cameras off the path do not confirm. In dynamic scenes level 1 gains
-#: 1.4 dB and more. Level 2 ends at a tenth to two thirds of its gain on them, for a tenth to a fifth of the file, and
-#: without it the levels below gain more; docs/design.md has the runs.
-MIN_GAIN_DB = {1: 0.9, 2: 0.6}
-#: dB per megabyte that a level's planes and networks must gain as well: other bytes of a file gain more.
-MIN_GAIN_PER_MEGABYTE = 4.0
 
 
 class SelectLevels(phases.Phase):
@@ -74,13 +68,13 @@ def held_back_views(state: TrainState) -> set[int]:
 
 
 def levels_without_gain(psnr: Sequence[float], sizes: Sequence[float]) -> list[tuple[int, float]]:
-    """(level, gain in dB over the level below) from the top down, as long as the gain is below that of MIN_GAIN_DB or
-    MIN_GAIN_PER_MEGABYTE. psnr: per level, over held-back views. sizes: about the bytes per level of its planes and
+    """(level, gain in dB over the level below) from the top down, as long as the gain is below TRAIN_MIN_DB or
+    TRAIN_MIN_DB_PER_MEGABYTE. psnr: per level, over held-back views. sizes: about the bytes per level of its planes and
     networks."""
     found = []
     for level in range(len(psnr) - 1, 0, -1):
         gain = psnr[level] - psnr[level - 1]
-        if gain >= max(MIN_GAIN_DB[level], MIN_GAIN_PER_MEGABYTE * sizes[level] / 1e6):
+        if gain >= max(TRAIN_MIN_DB[level], TRAIN_MIN_DB_PER_MEGABYTE * sizes[level] / 1e6):
             break
         found.append((level, gain))
     return found

@@ -1,0 +1,175 @@
+"""What packing does to a scene: the error of its pictures, the gain of its layers, the rate that training saw."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pd4dgs_codec.data.view import View
+from pd4dgs_codec.entropy.bits import entropy_bits
+from pd4dgs_codec.format.kinds import LAYER_KINDS
+from pd4dgs_codec.format.layer_meta import Section
+from pd4dgs_codec.format.left_out import LeftOut, tensor_bytes
+from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
+from pd4dgs_codec.format.payload import channel_groups
+from pd4dgs_codec.format.plan import plan
+from pd4dgs_codec.format.symbols import layer_symbols, rounded
+from pd4dgs_codec.format.table import classes_of
+from pd4dgs_codec.model.convert import from_scene
+from pd4dgs_codec.model.harm import anchor_harm
+from pd4dgs_codec.model.picture import render_image
+from pd4dgs_codec.model.plane_rate import gaussian_bits
+from pd4dgs_codec.model.rate import channel_moments, rate_bits
+from pd4dgs_codec.quality.frames import Frame
+from pd4dgs_codec.quality.image import level_psnr
+from pd4dgs_codec.scene import Scene
+
+
+class RenderedLoss:
+    """The error of decoded scenes in the pictures of `frames`, relative to `scene` before quantisation, at its levels.
+
+    step is called after each picture.
+    """
+
+    def __init__(self, scene: Scene, frames: Sequence[Frame], step: Callable[[], None] = lambda: None):
+        self.frames, self.levels, self.step = frames, scene.layers, step
+        self.references = self._pictures(scene)
+
+    def mse(self, scene: Scene) -> dict[int, float]:
+        """Per level the mean squared error over all pictures, colours in 0..1."""
+        pictures = self._pictures(scene)
+        return {
+            level: float(np.mean([np.square(a - b).mean() for a, b in zip(pictures[level], references, strict=True)]))
+            for level, references in self.references.items()
+        }
+
+    def mean_mse(self, scene: Scene) -> float:
+        """The mean of `mse` over the levels."""
+        return float(np.mean(list(self.mse(scene).values())))
+
+    def omission_error(self, scene: Scene, level: int) -> np.ndarray:
+        """float64 [N]: an estimate of the squared error, summed over pictures and colours, of leaving out each anchor
+        at `level`, see `anchor_harm`. Infinite, for unknown, if no picture shows the anchor."""
+        model = from_scene(scene)
+        total, met = np.zeros(len(scene.anchor_q)), np.zeros(len(scene.anchor_q), bool)
+        generator = torch.Generator().manual_seed(0)
+        for frame in self.frames:
+            error, near, _ = anchor_harm(model, level, frame.time, frame.camera, generator)
+            total += error.numpy()
+            met |= near.numpy()
+            self.step()
+        return np.where(met, total, np.inf)
+
+    def _pictures(self, scene: Scene) -> dict[int, list[np.ndarray]]:
+        model = from_scene(scene)
+        pictures: dict[int, list[np.ndarray]] = {}
+        for level in self.levels:
+            pictures[level] = []
+            for frame in self.frames:
+                pictures[level].append(render_image(model, level, frame.time, frame.camera))
+                self.step()
+        return pictures
+
+
+def psnr_of(mse: float) -> float:
+    """dB; infinite for an mse of 0."""
+    return -10.0 * math.log10(mse) if mse else math.inf
+
+
+def true_psnr(
+    scene: Scene,
+    views: Sequence[View],
+    step: Callable[[], None] = lambda: None,
+    *,
+    levels: Sequence[int] | None = None,
+) -> dict[int, float]:
+    """The mean mPSNR over views, dB, by level of a decoded scene; `levels` defaults to all."""
+    model = from_scene(scene)
+
+    def draw(level: int, view: View) -> np.ndarray:
+        return render_image(model, level, view.time, view.camera)
+
+    return level_psnr(draw, scene.layers if levels is None else levels, views, step)
+
+
+def leave_out_low_gain(
+    scene: Scene,
+    views: Sequence[View],
+    *,
+    min_gain: float,
+    options: EncodeOptions = DEFAULTS,
+    step: Callable[[], None] = lambda: None,
+) -> tuple[Scene, list[LeftOut]]:
+    """(scene without the deformations that gain less than min_gain dB per megabyte, each of them with its figures).
+
+    From the highest layer down, the scene is quantised with and without the layer's deformation. A layer's gain is the
+    largest increase of the mean mPSNR over `views` at its own level or one above. Only the deformation's own bytes
+    count: its anchors pass to a lower layer. The plan drops a layer without a deformation. The steps of `scene` are
+    binary32.
+    """
+    left_out: list[LeftOut] = []
+    present = None
+    for kind in reversed(LAYER_KINDS[1:]):
+        deformation = scene.deformation(kind.layer)
+        if deformation is None:
+            continue
+        if present is None:
+            present = _measure(scene, views, options, step)
+        if kind.layer not in present:  # without effect: the plan leaves it out and says why
+            continue
+        without = scene.with_tensors(kind.layer, None)
+        remaining = _measure(without, views, options, step)
+        gain = max(
+            present[level] - remaining[max(lower for lower in remaining if lower <= level)]
+            for level in present
+            if level >= kind.layer
+        )
+        size = tensor_bytes(deformation, kind, scene.steps, options)
+        if gain * 1e6 < min_gain * size:
+            why = (
+                f"level {kind.layer} gains {gain:.3f} dB for {size:,} bytes on {len(views)} views: "
+                f"{gain * 1e6 / size:.2f} dB per MB, expected at least {min_gain:,g}"
+            )
+            left_out.append(LeftOut(kind.name, why, kind, deformation))
+            scene, present = without, remaining
+    return scene, left_out
+
+
+def _measure(scene: Scene, views: Sequence[View], options: EncodeOptions, step: Callable[[], None]) -> dict[int, float]:
+    planned, _ = plan(scene, replace(options, layers="auto", omit="nothing"))
+    return true_psnr(rounded(planned), views, step)
+
+
+def train_rate_bits(scene: Scene, options: EncodeOptions = DEFAULTS) -> list[dict[str, float]]:
+    """Per layer of the file that `scene` becomes: bits of R(a) as the trainer computes them, in float64.
+
+    attributes: R of the unrounded values over the layer's anchors, by step class, priors their moments, and the entropy
+    of the classes. planes, weights: R of the rounded residuals and weights, as in the last third of training.
+    """
+    planned, _ = plan(scene, options)
+    rows = (0, *planned.rows)
+    result = []
+    for i, layer in enumerate(planned.layers):
+        own = slice(rows[i], rows[i + 1])
+        classes = np.zeros(rows[-1], np.int32) if planned.grading is None else classes_of(planned)
+        attributes = 0.0 if planned.grading is None else entropy_bits(classes[own])
+        for c in np.unique(classes[own]).tolist():
+            for name, rows_of in planned.attributes.items():
+                values = torch.from_numpy(rows_of[own][classes[own] == c]).double().flatten(1)
+                attributes += _bits(values, planned.steps.attributes[name] * 2.0**c)
+        groups, _ = channel_groups(layer_symbols(planned, i))
+        row = {"layer": float(layer), "attributes": attributes}
+        for section in (Section.PLANES, Section.WEIGHTS):
+            row[section.name.lower()] = gaussian_bits(groups[section])
+        result.append(row)
+    return result
+
+
+def _bits(values: Tensor, step: float) -> float:
+    mu, sigma = channel_moments(values)
+    return float(rate_bits(values, mu, sigma, step).sum())
