@@ -178,10 +178,10 @@ const detailOf = (target, name) =>
 
 /** What the mesh must hold. @param {number} level @param {number} t @param {number[]} eye */
 function expected(level, t, eye) {
-  const g = evaluate(decode(BYTES), level, t, eye);
-  return Array.from({ length: g.count }, (_, i) => {
-    const columns = /** @type {const} */ ([[g.mean, 3], [g.scale, 3], [g.quaternion, 4], [g.opacity, 1], [g.color, 3]]);
-    return columns.flatMap(([values, width]) => Array.from(values.subarray(width * i, width * (i + 1))));
+  const { count, records } = evaluate(decode(BYTES), level, t, eye);
+  return Array.from({ length: count }, (_, i) => {
+    const g = Array.from(records.subarray(16 * i, 16 * i + 16));
+    return [...g.slice(0, 3), ...g.slice(4, 7), ...g.slice(8, 12), g[3], ...g.slice(12, 15)];
   });
 }
 
