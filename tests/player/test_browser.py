@@ -241,9 +241,7 @@ def pixels(text: str) -> np.ndarray:
         {},
         dict(hidden=(5,), channels=2, scales=1, trunk=(3,)),
         dict(hidden=(7,), channels=5, scales=3, trunk=(6, 21)),
-        dict(
-            hidden=(40,), channels=33, scales=1, heads=({"position": 3, "scaling": 6}, {"mean": 3, "opacity": 1})
-        ),
+        dict(hidden=(40,), channels=33, scales=1, heads=({"position": 3, "scaling": 6}, {"mean": 3, "opacity": 1})),
         dict(hidden=(4,), channels=3, heads=({"feature": 32}, {})),
         dict(layers=(0, 2), heads=({}, {"quat": 4, "color": 3})),
         dict(widths=Widths(16, 4)),
