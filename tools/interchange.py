@@ -38,8 +38,7 @@ def measure(name: str, out: Path) -> Row:
     """The rows of one scene."""
     from pd4dgs_codec.draw.player import Player
     from pd4dgs_codec.format.decoder import decode
-    from pd4dgs_codec.interchange.bake import eyes_of_cameras, eyes_of_scene
-    from pd4dgs_codec.interchange.export import Export, cost
+    from pd4dgs_codec.interchange.export import Export, cost, eyes_of_cameras, eyes_of_scene
 
     path, dataset = out / name / "scene.pd4", SCENES[name].load()
     player = Player(decode(path.read_bytes()))
@@ -129,7 +128,7 @@ def _plyfile_sequence(path: Path, player: Any, view: Any) -> float:
 def _gaussforge(path: Path, player: Any, view: Any) -> float:
     import gaussforge
 
-    from pd4dgs_codec.interchange.libraries import quiet
+    from pd4dgs_codec.interchange.formats import quiet
 
     with quiet():
         found = gaussforge.GaussForge().read(path.read_bytes(), "spz")["data"]

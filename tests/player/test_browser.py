@@ -40,9 +40,8 @@ from pd4dgs_codec.scene import (
     Steps,
     Widths,
 )
-from pd4dgs_codec.web.server import Link
 from pd4dgs_codec.web.page import page as packed_page
-from pd4dgs_codec.web.server import Server
+from pd4dgs_codec.web.server import Link, Server
 
 ROOT = Path(__file__).parents[2]
 sys.path.insert(0, str(ROOT / "tools"))

@@ -29,7 +29,7 @@ from pd4dgs_codec.format.payload import GROUPS, channel_groups
 from pd4dgs_codec.format.plane_choice import choose_predictor
 from pd4dgs_codec.format.plane_section import read_planes, write_planes
 from pd4dgs_codec.format.symbols import LayerSymbols
-from pd4dgs_codec.interchange.libraries import quiet
+from pd4dgs_codec.interchange.formats import quiet
 from pd4dgs_codec.quality.frames import Frame
 from pd4dgs_codec.quality.levels import Level
 
