@@ -4,7 +4,7 @@ import { Pd4Player } from "./element.js";
 import { bench } from "./render/bench.js";
 
 const query = new URLSearchParams(location.search);
-/** @typedef {{early: import("./render/loader.js").Early}} Begun */
+/** @typedef {{early: import("./render/remote.js").Early}} Begun */
 /** A packed page may hold its scene; for all others early.js knows the address. */
 const held = document.getElementById("scene")?.textContent;
 const bytes = held ? Uint8Array.from(atob(held), (c) => c.charCodeAt(0)) : null;

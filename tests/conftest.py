@@ -27,20 +27,20 @@ from hypothesis import HealthCheck, settings
 os.environ.setdefault("OMP_NUM_THREADS", "1")  # read by numpy, torch and ours when they load
 
 ROOT = Path(__file__).parents[1]
-#: Neither is a package: `refdec` is one file that can be carried alone, and the tools put their folder on the path too.
-sys.path[:0] = [str(ROOT / "tools"), str(ROOT / "spec")]
+#: None is a package: `refdec` is one file that can be carried alone, and tools and benchmarks are commands.
+sys.path[:0] = [str(ROOT / name) for name in ("tools", "spec", "benchmarks")]
 
 #: Rooms that need the extra `train`; without it their tests are not even collected.
 NEED_TRAIN = [
     "batch",
     "bench",
+    "benchmarks",
     "cli",
     "data",
     "interchange",
     "model",
     "draw",
     "quality",
-    "tools",
     "train",
 ]
 NEED_TRAIN += ["fuzz/test_trained_file.py"]

@@ -1,6 +1,6 @@
 #!/usr/bin/env bash
-# Makes its own environment in .venv and runs the main job: train a synthetic dynamic scene, pack it, unpack every
-# prefix, render each level. Arguments go to tools/demo.py (see `bash tools/demo.sh --help`).
+# Makes its own environment in .venv, then trains a synthetic dynamic scene, packs it, and measures and draws every
+# prefix of the file. Arguments go to tools/demo.py (see `bash tools/demo.sh --help`).
 set -euo pipefail
 cd "$(dirname "$0")/.."
 source tools/environment.sh

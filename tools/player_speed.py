@@ -28,7 +28,7 @@ from pathlib import Path
 from statistics import median
 from typing import Any
 
-from pages.decoder_loop import grown
+from decoder_loop import grown
 
 ROOT = Path(__file__).resolve().parents[1]
 sys.path.insert(0, str(ROOT))
@@ -36,7 +36,7 @@ sys.path.insert(0, str(ROOT))
 from pd4dgs_codec import decode, encode  # noqa: E402
 
 LOOP = ROOT / "player" / "testing" / "decoder_loop.mjs"
-PYTHON_LOOP = ROOT / "tools" / "pages" / "decoder_loop.py"
+PYTHON_LOOP = ROOT / "tools" / "decoder_loop.py"
 WARM_UP = 8
 #: Anchors of the large file.
 MANY = 100_000

@@ -5,8 +5,8 @@ set -euo pipefail
 cd "$(dirname "$0")/.."
 source tools/environment.sh
 make_environment .venv-test train,eval,test
-.venv-test/bin/ruff check pd4dgs_codec spec tests tools
-.venv-test/bin/ruff format --check --quiet pd4dgs_codec spec tests tools
+.venv-test/bin/ruff check pd4dgs_codec spec tests tools benchmarks
+.venv-test/bin/ruff format --check --quiet pd4dgs_codec spec tests tools benchmarks
 .venv-test/bin/mypy & # beside the tests
 types=$!
 workers=$(.venv-test/bin/python -c "import os; print(min(os.cpu_count() + 1, 4))")

@@ -6,7 +6,7 @@ import sys
 
 import pytest
 
-from pd4dgs_codec.interchange.formats import properties
+from pd4dgs_codec.interchange.ply import properties
 
 
 def _count(path) -> int:

@@ -2,7 +2,7 @@
 
 import tracemalloc
 
-import bench_positions as bench
+import clouds
 import numpy as np
 import pytest
 import refdec
@@ -28,7 +28,7 @@ def round_trip(cells):
 
 @pytest.fixture(scope="module")
 def cases():
-    return bench.cases(8000)
+    return clouds.cases(8000)
 
 
 def test_morton_codes_interleave_the_bits():
@@ -91,8 +91,8 @@ def test_the_reference_decoder_agrees(shape):
     rng = np.random.default_rng(2)
     cells = ordered(
         {
-            "surface": lambda: bench.surface("gyroid", 500),
-            "dense": lambda: bench.surface("torus", 3000, 64),
+            "surface": lambda: clouds.surface("gyroid", 500),
+            "dense": lambda: clouds.surface("torus", 3000, 64),
             "corner": lambda: np.vstack([rng.integers(0, 30, (1200, 3)), rng.integers(0, 1 << 20, (40, 3))]),
             "sparse": lambda: rng.integers(-(1 << 20), 1 << 20, (200, 3)),
             "line": lambda: np.arange(600)[:, None] * [3, 1, 0] - 900,

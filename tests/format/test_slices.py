@@ -60,7 +60,7 @@ def test_all_slices_are_what_one_slice_per_layer_holds():
     assert kinds == sorted(kinds) and all(kinds.count(layer) > 1 for layer in (0, 1, 2))
     assert hashes(sliced()) == hashes(one_slice())
     assert_same_scene(decode(sliced()), decode(one_slice()))
-    assert len(sliced()) < 1.3 * len(one_slice())  # of 1 kB each; docs/slices.md has larger ones
+    assert len(sliced()) < 1.3 * len(one_slice())  # of 1 kB each
 
 
 def test_every_prefix_of_slices_is_a_scene_by_every_door():

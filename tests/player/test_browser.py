@@ -40,13 +40,14 @@ from pd4dgs_codec.scene import (
     Steps,
     Widths,
 )
+from pd4dgs_codec.web.server import Link
 from pd4dgs_codec.web.page import page as packed_page
-from pd4dgs_codec.web.server import Link, Server
+from pd4dgs_codec.web.server import Server
 
 ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT / "tools"))
-from pages.browser import PATIENCE_MS, PLAYER, call, cameras, copy_player, decibels, launched, resized, shots  # noqa: E402
-from pages.browser import pixels as pixels_of  # noqa: E402
+sys.path.insert(0, str(ROOT / "benchmarks"))
+from browser import PATIENCE_MS, PLAYER, call, cameras, copy_player, decibels, launched, resized, shots  # noqa: E402
+from browser import pixels as pixels_of  # noqa: E402
 
 WIDTH, HEIGHT = 96, 72
 #: Of pictures against the rasteriser. Eight bits alone leave 59.
@@ -238,9 +239,11 @@ def pixels(text: str) -> np.ndarray:
     "options",
     [
         {},
-        dict(hidden=(5,), channels=2, scales=1, trunk=(3,)),
-        dict(hidden=(7,), channels=5, scales=3, trunk=(6, 21)),
-        dict(hidden=(40,), channels=33, scales=1, heads=({"position": 3, "scaling": 6}, {"mean": 3, "opacity": 1})),
+        dict(hidden=(), channels=2, scales=1, trunk=(3,)),
+        dict(hidden=(7, 5), channels=5, scales=3, trunk=(6, 21)),
+        dict(
+            hidden=(9, 8, 40), channels=33, scales=1, heads=({"position": 3, "scaling": 6}, {"mean": 3, "opacity": 1})
+        ),
         dict(hidden=(4,), channels=3, heads=({"feature": 32}, {})),
         dict(layers=(0, 2), heads=({}, {"quat": 4, "color": 3})),
         dict(widths=Widths(16, 4)),
@@ -249,7 +252,7 @@ def pixels(text: str) -> np.ndarray:
     ],
     ids=[
         "usual",
-        "small",
+        "no hidden layers",
         "odd widths",
         "many channels",
         "global only",
@@ -348,9 +351,8 @@ def test_pictures_through_spark_are_those_of_the_rasteriser(page, server, folder
     call(page, "harness.close")
 
 
-@pytest.mark.parametrize("hidden", [(300,), (), (9, 8)])
-def test_networks_that_shaders_do_not_take_are_evaluated_on_the_cpu(harness, folder, server, hidden):
-    (folder / "wide.pd4").write_bytes(encode(lively_scene(60, hidden=hidden), layers=2, effort=1))
+def test_networks_that_shaders_cannot_hold_are_evaluated_without(harness, folder, server):
+    (folder / "wide.pd4").write_bytes(encode(lively_scene(60, hidden=(300,)), layers=2, effort=1))
     pictures = []
     for evaluator in ("gpu", "cpu"):
         call(harness, "harness.open", server.url_of("wide.pd4"), WIDTH, HEIGHT, {"evaluator": evaluator})

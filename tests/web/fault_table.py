@@ -1,5 +1,4 @@
-"""What the streaming client does when the link or the server fails, and whether all it shows is right; also the table
-of faults in docs/latency.md.
+"""What the streaming client does when the link or the server fails, and whether all it shows is right.
 
 Every row runs the client against a server on loopback behind a paced link. A picture counts as right if every array of
 its scene equals that of an uninterrupted decode of the same prefix.

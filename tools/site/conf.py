@@ -22,7 +22,7 @@ author = copyright = "the pd4dgs-codec authors"
 extensions = ["myst_parser", "sphinx.ext.autodoc"]
 root_doc = "README"
 include_patterns = ["*.md", "docs/**", "spec/*.md", "spec/vectors/README.md"]
-exclude_patterns = [".*", "out", "build", "dist", "tests", "tools", "pd4dgs_codec", "*.egg-info"]
+exclude_patterns = [".*", "out", "build", "dist", "tests", "tools", "benchmarks", "pd4dgs_codec", "*.egg-info"]
 
 # Markdown: headings are link targets as they are on a forge; a link that leads nowhere is a warning, hence an error.
 myst_heading_anchors = 4
@@ -73,38 +73,23 @@ CONTENTS = {
         "docs/api/index",
     ],
     "Format": ["spec/format", "spec/vectors/README", "docs/robustness"],
-    "Measured": [
-        "docs/results",
-        "docs/paper/README",
-        "docs/precision",
-        "docs/slices",
-        "docs/latency",
-        "docs/stability",
-        "docs/levers",
-        "docs/omissions",
-        "docs/performance",
-        "docs/long-captures",
-    ],
+    "Measured": ["docs/results", "docs/stability"],
     "Project": ["docs/design", "docs/dependencies", "CONTRIBUTING", "SECURITY", "CHANGELOG"],
 }
-PAPER = ["comparison", "sampling", "components", "levels", "latency", "rates", "rho"]
 
 #: Rooms that are used as commands, not as a library.
 LEFT_OUT = {"cli", "bench"}
 
 
-def toctree(pages: list[str], caption: str = "") -> str:
+def toctree(pages: list[str], caption: str) -> str:
     """A hidden table of contents in MyST's syntax."""
-    head = ["```{toctree}", ":hidden:", *([f":caption: {caption}"] if caption else []), ""]
-    return "\n".join(["", "", *head, *pages, "```", ""])
+    return "\n".join(["", "", "```{toctree}", ":hidden:", f":caption: {caption}", "", *pages, "```", ""])
 
 
 def add_contents(app: Any, docname: str, source: list[str]) -> None:
-    """Event source-read: the start page and the paper's page get their tables of contents."""
+    """Event source-read: the start page gets the table of contents."""
     if docname == root_doc:
         source[0] += "".join(toctree([f"/{page}" for page in pages], caption) for caption, pages in CONTENTS.items())
-    elif docname == "docs/paper/README":
-        source[0] += toctree(PAPER)
 
 
 def heading(text: str, line: str) -> list[str]:

@@ -1,0 +1,192 @@
+"""Seconds to the first pictures: over a paced link, slice by slice, and in a browser."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from itertools import pairwise
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from browser import PATIENCE_MS, launched
+from common import REAL, Benchmark, Row, Run, Scene, command, levels, number, seconds_at, table
+
+from pd4dgs_codec.bench.report import drawing
+from pd4dgs_codec.errors import DataError
+
+# -- latency -----------------------------------------------------------------------------------------------------------
+
+
+def measure_latency(run: Run, scene: Scene) -> list[Row]:
+    """What `pd4dgs-bench latency` measures: a row per rate and level."""
+    options = ("--rates", "50M", "--runs", "1") if run.quick else ("--runs", "5")
+    (found,) = command("bench", "latency", run.packed(scene), *options)["files"]
+    first = {"scene": scene.name, "first_start": found["first_start"]}
+    return [first | row for row in found["times"]]
+
+
+def latency_text(rows: Sequence[Row]) -> str:
+    """A row per scene, rate and level."""
+    cells = [
+        (r["scene"], f"{r['rate'] / 1e6:g}", r["level"], number(r["bytes"], 0), number(r["expected"], 3))
+        + tuple(number(r[key], 3) for key in ("network", "picture", "after_last_byte", "cold"))
+        for r in rows
+    ]
+    head = ("scene", "Mbps", "level", "bytes S", "8S/B", "last byte", "picture", "after the last byte", "cold process")
+    return (
+        "Seconds since the request, medians, over `pd4dgs-serve --rate`: until the last byte of the level has arrived, "
+        "until its picture is drawn on the CPU, and until then in a process that starts with the request "
+        f"(`pd4dgs-bench latency`). With empty kernel caches the first picture takes {rows[0]['first_start']:.1f} s."
+        f"\n\n{table(head, cells)}"
+    )
+
+
+# -- slices ------------------------------------------------------------------------------------------------------------
+
+
+def measure_slices(run: Run, scene: Scene) -> list[Row]:
+    """A row per slice of a file in slices, with the quality of the prefix that ends with it."""
+    size = "60k" if run.quick else "50k"
+    whole = run.packed(scene).stat().st_size
+    file = run.packed(scene, "--slices", size, *scene.data, name="slices")
+    rows = []
+    for layer in command("info", file)["layers"]:
+        for part in layer["slices"]:
+            prefix = file.with_name("prefix.pt")
+            command("decode", file, "-o", prefix, "-f", "--max-bytes", part["end"])
+            best = levels(scene, prefix)[-1]
+            rows.append({"scene": scene.name, "layer": layer["layer"], "mpsnr": best["mpsnr"], "bytes": part["end"]})
+    return [row | {"whole": whole} for row in rows]
+
+
+def slices_text(rows: Sequence[Row]) -> str:
+    """One row per scene: what the first slice and layer 0 show, and what slices cost."""
+    cells = []
+    for scene in dict.fromkeys(row["scene"] for row in rows):
+        own = [row for row in rows if row["scene"] == scene]
+        base = [row for row in own if row["layer"] == 0][-1]
+        fall = max((a["mpsnr"] - b["mpsnr"] for a, b in pairwise(own)), default=0.0)
+        cells.append(
+            (scene, len(own), number(own[0]["bytes"], 0), seconds_at(own[0]["bytes"]), number(own[0]["mpsnr"]))
+            + (f"{number(base['mpsnr'])} in {base['bytes']:,}", f"{number(own[-1]['mpsnr'])} in {own[-1]['bytes']:,}")
+            + (f"{own[-1]['bytes'] / own[-1]['whole'] - 1:+.1%}", number(max(fall, 0.0), 3))
+        )
+    head = ("scene", "slices", "first slice", "s at 2 Mbps", "mPSNR dB", "layer 0", "all", "cost", "largest fall dB")
+    return (
+        "`pd4dgs-encode --slices 50k --data SOURCE`; the quality of every prefix on held-out views. *cost*: bytes "
+        f"beyond those of the same layers in one slice each.\n\n{table(head, cells)}"
+    )
+
+
+def slices_pictures(rows: Sequence[Row], folder: Path) -> list[str]:
+    """Quality over bytes."""
+    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    with drawing(folder / "slices.png", scenes, "held-out mPSNR, dB", (4.6, 3.4)) as axes:
+        for axis, scene in zip(axes, scenes, strict=True):
+            points = [(row["bytes"] / 1e3, row["mpsnr"]) for row in rows if row["scene"] == scene]
+            axis.plot(*zip(*points, strict=True), "-o", color="black", mfc="white")
+            axis.set_xlabel("kB")
+    return ["slices.png"]
+
+
+# -- player ------------------------------------------------------------------------------------------------------------
+
+RATES, ROUND_TRIP = (2e6, 10e6), "50ms"
+SIZES = "320x240,640x480"
+#: What a page notes of each picture: its level, and seconds since the navigation began.
+NOTE = """window.noted = [];
+  for (const name of ["firstpicture", "upgrade"]) {
+    document.addEventListener(name, (event) => {
+      noted.push({ level: event.detail.level, shown: performance.now() / 1000 });
+    }, true);
+  }"""
+
+
+@contextmanager
+def served(folder: Path, *options: str) -> Iterator[str]:
+    """The URL of a folder served by `pd4dgs-serve`. Raises DataError if it does not start."""
+    words = [sys.executable, "-m", "pd4dgs_codec", "serve", str(folder), "--port", "0", *options]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        with process.stdout as lines:
+            url = lines.readline().strip()
+            if not url:
+                raise DataError("pd4dgs-serve did not start")
+            yield url
+    finally:
+        process.terminate()
+        process.wait()
+
+
+def measure_player(run: Run, scene: Scene) -> list[Row]:
+    """Rows of first pictures per rate and level, and of frame rates per level and size."""
+    rows: list[Row] = []
+    with tempfile.TemporaryDirectory() as name, launched() as browser:
+        folder = Path(name) / "package"
+        command("package", run.packed(scene), "-o", folder)
+        ends = {row["layer"]: row["end"] for row in command("info", run.packed(scene))["layers"]}
+        for rate in RATES:
+            with served(folder, "--rate", repr(rate), "--latency", ROUND_TRIP) as url:
+                visits = [first_pictures(browser, url, max(ends)) for _ in range(1 if run.quick else 5)]
+            for level, end in ends.items():
+                shown = median(next(n["shown"] for n in noted if n["level"] >= level) for noted in visits)
+                rows.append({"what": "picture", "rate": rate, "level": level, "bytes": end, "shown": shown})
+        with served(folder) as url:
+            page = opened(browser)
+            page.goto(f"{url}?bench&sizes={SIZES}")
+            page.wait_for_function("!!window.benchResult", timeout=5 * PATIENCE_MS)
+            rows += [{"what": "rate"} | row for row in page.evaluate("benchResult.rows")]
+            page.context.close()
+        version = f"Chromium {browser.version.split('.')[0]}"
+    return [{"scene": scene.name, "browser": version} | row for row in rows]
+
+
+def opened(browser: Any) -> Any:
+    """A page with nothing in its caches."""
+    context = browser.new_context(viewport={"width": 480, "height": 360})
+    context.set_default_timeout(PATIENCE_MS)
+    return context.new_page()
+
+
+def first_pictures(browser: Any, url: str, last: int) -> list[Row]:
+    """What a visit notes until level `last` is shown."""
+    page = opened(browser)
+    page.add_init_script(NOTE)
+    page.goto(f"{url}?autoplay=0")
+    page.wait_for_function(f"noted.some(({{ level }}) => level === {last})")
+    noted: list[Row] = page.evaluate("noted")
+    page.context.close()
+    return noted
+
+
+def player_text(rows: Sequence[Row]) -> str:
+    """Both tables."""
+    shown = [
+        (r["scene"], f"{r['rate'] / 1e6:g}", r["level"], number(r["bytes"], 0), seconds_at(r["bytes"], r["rate"]))
+        + (number(r["shown"]),)
+        for r in rows
+        if r["what"] == "picture"
+    ]
+    rates = [
+        (r["scene"], r["level"], f"{r['width']:.0f} x {r['height']:.0f}", number(r["gaussians"], 0))
+        + (number(r["moving"], 1), number(r["playing"] or None, 1))
+        for r in rows
+        if r["what"] == "rate"
+    ]
+    return (
+        f"{rows[0]['browser']}, which draws in software here; two cores. Seconds from navigation to the settled "
+        f"picture of a level, cold cache, round trip {ROUND_TRIP}; page and player arrive over the same link.\n\n"
+        f"{table(('scene', 'Mbps', 'level', 'bytes', '8S/B', 'picture'), shown)}\n\n"
+        "Pictures a second (`?bench`), with a moving camera and with running time:\n\n"
+        f"{table(('scene', 'level', 'size', 'Gaussians', 'moving', 'playing'), rates)}"
+    )
+
+
+LATENCY = Benchmark("latency", "First picture", REAL, 10, measure_latency, latency_text)
+SLICES = Benchmark("slices", "Slices", REAL, 8, measure_slices, slices_text, slices_pictures)
+PLAYER = Benchmark("player", "The player in a browser", REAL, 10, measure_player, player_text)

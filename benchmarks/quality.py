@@ -1,0 +1,136 @@
+"""Bytes and held-out quality of every level, beside a model of the same scene that is not layered."""
+
+from __future__ import annotations
+
+import lzma
+from collections.abc import Sequence
+from pathlib import Path
+from statistics import median
+from typing import Any
+
+from common import SCENES, Benchmark, Row, Run, Scene, command, levels, number, seconds_at, table
+
+from pd4dgs_codec.bench.report import drawing
+
+#: A model that is trained as a whole: the highest level in every step, nothing spent on bytes, levels or quantisation.
+MONOLITH = ("--rollout", "top", "--prune", "0", "--grading", "0")
+MONOLITH += tuple(word for part in ("rate", "tmc", "noise", "whitening", "judge") for word in ("--without", part))
+#: Bytes of a picture in git.
+LARGEST_PICTURE = 300_000
+
+
+def measure(run: Run, scene: Scene) -> list[Row]:
+    """A row per level of each seed's file, and one of the monolith."""
+    rows: list[Row] = []
+    for seed in range(run.seeds):
+        model, training = run.trained(scene, seed=seed)
+        file = run.folder(scene) / ("scene.pd4" if seed == 0 else f"scene-{seed}.pd4")
+        told = {"scene": scene.name, "seed": seed, "minutes": training["seconds"] / 60, "steps": training["iterations"]}
+        rows += [told | row for row in packed_levels(scene, model, file)]
+        if seed == 0:
+            rows[0]["curve"] = curve(model)
+            draw_levels(scene, file, run.images / f"{scene.name}.jpg")
+    return [*rows, monolith(run, scene)]
+
+
+def packed_levels(scene: Scene, model: Path, file: Path) -> list[Row]:
+    """Packs a checkpoint into `file`; see `common.levels`."""
+    command("encode", model, "-o", file, "-f")
+    return levels(scene, file)
+
+
+def monolith(run: Run, scene: Scene, longer: float = 1.0) -> Row:
+    """The monolith after as many steps as our model: every tensor float32, all of it under LZMA, in one piece."""
+    model, training = run.trained(scene, *MONOLITH, longer=longer)
+    best = levels(scene, model)[-1] | {"bytes": monolithic_bytes(model), "level": "monolith"}
+    return {"scene": scene.name, "seed": 0, "minutes": training["seconds"] / 60, "steps": training["iterations"]} | best
+
+
+def monolithic_bytes(path: Path) -> int:
+    """Bytes of a checkpoint's tensors as float32, one after another, under LZMA at its highest preset. Anchors count as
+    positions; masks are left out, for every anchor is always there."""
+    from pd4dgs_codec.model import checkpoint
+
+    model, _ = checkpoint.load(path)
+    tensors: dict[str, Any] = {"anchor": model.anchor}
+    tensors |= {name: t for name, t in model.state_dict().items() if name not in ("anchor_q", "mask_logits")}
+    return len(lzma.compress(b"".join(t.detach().float().numpy().tobytes() for t in tensors.values()), preset=9))
+
+
+def curve(model: Path) -> list[Row]:
+    """seconds and psnr per level of the evaluations during a training."""
+    (found,) = command("bench", "train", "--from", model)["runs"]
+    return [{"seconds": point["seconds"], "psnr": point["psnr"]} for point in found["curve"]]
+
+
+def draw_levels(scene: Scene, file: Path, picture: Path) -> None:
+    """The first held-out view as every level shows it, and the true image, as JPEG of at most LARGEST_PICTURE."""
+    from PIL import Image
+
+    still = file.with_name("levels.png")
+    command("render", file, "-o", still, "-f", *scene.data, "--frames", 1, "--side-by-side")
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    for quality in (95, 85, 75):
+        Image.open(still).convert("RGB").save(picture, quality=quality, subsampling=0)
+        if picture.stat().st_size <= LARGEST_PICTURE:
+            break
+
+
+def text(rows: Sequence[Row]) -> str:
+    """A row per scene and level: medians over the seeds and, of several, the least and the most."""
+    groups: dict[tuple[str, Any], list[Row]] = {}
+    for row in rows:
+        groups.setdefault((row["scene"], row["level"]), []).append(row)
+    cells = []
+    for (scene, level), found in groups.items():
+        size = median(row["bytes"] for row in found)
+        cells.append(
+            (
+                scene,
+                level,
+                spread([row["bytes"] for row in found], 0),
+                seconds_at(size),
+                spread([row["mpsnr"] for row in found], 2),
+                number(median(row["mssim"] for row in found), 4),
+                number(found[0]["anchors"], 0),
+                number(found[0]["steps"], 0),
+                number(found[0]["minutes"], 1),
+            )
+        )
+    head = ("scene", "level", "bytes so far", "s at 2 Mbps", "mPSNR dB", "mSSIM", "anchors", "steps", "training min")
+    seeds = 1 + max(row["seed"] for row in rows)
+    told = f" Medians of {seeds} seeds, with the least and the most." if seeds > 1 else ""
+    return (
+        "Quality is measured on held-out views, from the prefix of the file whose size is in the same row. *monolith*: "
+        "the same scene trained for the highest level alone, without a rate term, stored as float32 under LZMA." + told
+    ) + f"\n\n{table(head, cells)}"
+
+
+def spread(values: Sequence[float], digits: int) -> str:
+    """The median and, of several values, the least and the most."""
+    middle = number(median(values), digits)
+    return f"{middle} ({number(min(values), digits)} to {number(max(values), digits)})" if len(values) > 1 else middle
+
+
+def pictures(rows: Sequence[Row], folder: Path) -> list[str]:
+    """The levels of each scene, and quality over training time, one panel a scene, legible in black and white."""
+    shown = [row for row in rows if "curve" in row]
+    time_plot([(row["scene"], row["curve"]) for row in shown], folder / "quality-over-time.png")
+    return [f"{row['scene']}.jpg" for row in shown] + ["quality-over-time.png"]
+
+
+def time_plot(curves: Sequence[tuple[str, list[Row]]], path: Path) -> None:
+    """Held-out PSNR of each level over training wall time."""
+    styles = ((":", "o"), ("--", "s"), ("-", "^"))
+    with drawing(path, [name for name, _ in curves], "held-out PSNR, dB", (4.2, 3.4), across=3) as axes:
+        for axis, (_, points) in zip(axes, curves, strict=True):
+            for level, (line, mark) in enumerate(styles):
+                reached = [(p["seconds"], p["psnr"][level]) for p in points if len(p["psnr"]) > level]
+                if reached:
+                    look = {"color": "black", "ms": 4, "lw": 1, "label": f"level {level}"}
+                    axis.plot(*zip(*reached, strict=True), line + mark, **look)
+            axis.set_xlabel("training wall time, s")
+        axes[0].legend()
+
+
+BENCHMARK = Benchmark("quality", "Quality and bytes", tuple(SCENES), 45, measure, text, pictures)

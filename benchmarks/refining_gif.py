@@ -1,0 +1,108 @@
+"""A GIF of a scene that becomes better as its bytes arrive, while its time runs.
+
+    python benchmarks/refining_gif.py scene.pd4 -o docs/img/refining.gif
+
+Best with a file in slices (`pd4dgs-encode --slices 50k --data SOURCE`). The first picture is that of the first slice;
+then follow the other slices of layer 0, and the layers above it.
+"""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pd4dgs_codec.errors import Pd4Error
+from pd4dgs_codec.format.info import info
+from pd4dgs_codec.io import whole_file
+from pd4dgs_codec.quality.frames import own_frames
+from pd4dgs_codec.quality.image import to_uint8
+from pd4dgs_codec.quality.levels import load_levels
+from pd4dgs_codec.scene import Camera
+
+#: Bytes of the GIF at most, and what is tried in turn to stay below: (colours, pictures a second).
+LIMIT, TRIED = 1_500_000, ((192, 10), (96, 10), (64, 8), (32, 6), (16, 4))
+WIDTH = 480
+#: Seconds that each prefix is shown, and the whole file.
+PREFIX_SECONDS, LAST_SECONDS = 0.9, 3.0
+#: Seconds in which the scene's time runs from its start to its end; then it runs back.
+PERIOD = 2.5
+BAR = 26
+
+
+def draw(data: bytes, path: Path, width: int = WIDTH) -> int:
+    """Writes the GIF of the file `data`; returns its bytes. Raises Pd4Error if the file has no camera."""
+    ends = [(row["layer"], part["end"]) for row in info(data)["layers"] for part in row["slices"]]
+    shown = [load_levels(data, max_bytes=end, last_only=True)[-1] for _, end in ends]
+    camera = widened(own_frames(shown[-1].model.info, 1)[0].camera, width)
+    for colours, rate in TRIED:
+        pictures, second = [], 0.0
+        for (layer, end), level in zip(ends, shown, strict=True):
+            stays = LAST_SECONDS if end == ends[-1][1] else PREFIX_SECONDS
+            for _ in range(round(stays * rate)):
+                picture = to_uint8(level.picture(camera, 1 - abs(1 - second / PERIOD % 2)))
+                pictures.append(labelled(picture, layer, end, len(data)))
+                second += 1 / rate
+        with whole_file(path, overwrite=True) as temporary:
+            write(pictures, temporary, colours, rate)
+        if path.stat().st_size <= LIMIT:
+            break
+    return path.stat().st_size
+
+
+def widened(camera: Camera, width: int) -> Camera:
+    """The same view in a picture of another width."""
+    height = round(camera.height * width / camera.width)
+    scale = np.array([[width / camera.width], [height / camera.height], [1]], np.float32)
+    return replace(camera, width=width, height=height, K=camera.K * scale)
+
+
+def labelled(picture: np.ndarray, layer: int, end: int, size: int) -> np.ndarray:
+    """uint8 [H + BAR, W, 3]: the picture above a bar of what has arrived of the file."""
+    from PIL import Image, ImageDraw, ImageFont
+
+    height, width = picture.shape[:2]
+    sheet = Image.new("RGB", (width, height + BAR), (255, 255, 255))
+    sheet.paste(Image.fromarray(picture))
+    pen = ImageDraw.Draw(sheet)
+    pen.rectangle((0, height, width * end // size, height + BAR), fill=(190, 214, 240))
+    words = f"{end / 1000:,.0f} kB of {size / 1000:,.0f} kB: {('static', 'global motion', 'local motion')[layer]}"
+    pen.text((6, height + 4), words, fill=(0, 0, 0), font=ImageFont.load_default(15))
+    return np.asarray(sheet)
+
+
+def write(pictures: Sequence[np.ndarray], path: Path, colours: int, rate: float) -> None:
+    """A looping GIF of one palette, that of the first, middle and last picture. Equal pixels of successive pictures
+    stay equal, so nothing is dithered and what does not move costs nothing."""
+    from PIL import Image
+
+    images: list[Any] = [Image.fromarray(picture) for picture in pictures]
+    sample = np.concatenate([pictures[0], pictures[len(pictures) // 2], pictures[-1]])
+    palette = Image.fromarray(sample).quantize(colours, method=Image.Quantize.MEDIANCUT)
+    first, *rest = (image.quantize(palette=palette, dither=Image.Dither.NONE) for image in images)
+    first.save(path, format="GIF", save_all=True, append_images=rest, duration=round(1000 / rate), loop=0)
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Entry point; returns the exit code."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("file", type=Path, help="a .pd4 file with a camera of its own")
+    parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("--width", type=int, default=WIDTH, help="of the GIF, pixels (%(default)s)")
+    args = parser.parse_args(argv)
+    try:
+        size = draw(args.file.read_bytes(), args.output, args.width)
+    except (Pd4Error, OSError) as error:
+        print(f"refining_gif: error: {error}", file=sys.stderr)
+        return 1
+    print(f"{args.output}: {size:,} bytes")
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,179 @@
+"""All benchmarks on a tiny scene, and the page that they make."""
+
+from __future__ import annotations
+
+import json
+import re
+from pathlib import Path
+
+import codec
+import common
+import demo
+import numpy as np
+import page
+import pytest
+import quality
+import run
+from common import QUICK, ROOT, Run
+from PIL import Image
+from refining_gif import LIMIT
+from tiny import TINY
+
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.model.config import PRESETS
+
+#: They start processes or browsers and wait for them.
+SLOW = ("latency", "batch", "player")
+FAST = [benchmark.name for benchmark in run.ALL if benchmark.name not in SLOW]
+PICTURES = {".png", ".jpg", ".gif"}
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory) -> Path:
+    """The folder of a quick run; tests do not write into it."""
+    out = tmp_path_factory.mktemp("benchmarks")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setitem(PRESETS, "tiny", TINY)
+        assert run.main(["--quick", "-o", str(out), "--only", *FAST]) == 0
+    return out
+
+
+def sections(docs: Path) -> dict[str, dict]:
+    stored = json.loads((docs / "figures" / "results.json").read_text())
+    return {section["name"]: section for section in stored["sections"]}
+
+
+def shown(markdown: Path) -> set[Path]:
+    return {(markdown.parent / name).resolve() for name in re.findall(r"!\[[^]]*\]\(([^)]+)\)", markdown.read_text())}
+
+
+def check_page(text: str) -> None:
+    """Tables have rows, all of as many cells, and lines outside of them are short."""
+    for block in text.split("\n\n"):
+        if block.startswith("|"):
+            rows = [line.strip("|").split(" | ") for line in block.splitlines()]
+            assert len(rows) > 2 and len({len(row) for row in rows}) == 1, block
+        elif not block.startswith("!["):
+            assert all(len(line) <= 120 for line in block.splitlines())
+
+
+def test_every_benchmark_makes_a_section_with_its_pictures(made):
+    docs = made / "docs"
+    assert list(sections(docs)) == FAST and all(section["rows"] for section in sections(docs).values())
+    text = (docs / "results.md").read_text()
+    check_page(text)
+    assert [line[3:] for line in text.splitlines() if line.startswith("## ")] == [
+        benchmark.title for benchmark in run.ALL if benchmark.name in FAST
+    ]
+    assert shown(docs / "results.md") == {p for p in (docs / "img").iterdir() if p.name != "refining.gif"}
+
+
+def test_figures_are_of_the_files_that_were_packed(made):
+    found, folder = sections(made / "docs"), made / QUICK.name
+    *levels, monolith = found["quality"]["rows"]
+    assert [row["level"] for row in levels] == list(range(len(levels)))
+    assert monolith["level"] == "monolith" and monolith["bytes"] > 3 * levels[-1]["bytes"]
+    assert all(5 < row["mpsnr"] < 60 for row in (*levels, monolith))
+    slices = found["slices"]["rows"]
+    assert [row["bytes"] for row in slices] == sorted(row["bytes"] for row in slices)
+    assert 0.95 < slices[-1]["bytes"] / (folder / "slices.pd4").stat().st_size < 1  # the metadata comes last
+    rivals = {row["part"]: row for row in found["rivals"]["rows"]}
+    assert rivals["attributes"]["ours"] < rivals["attributes"]["gauss"] and rivals["positions"]["lzma"] > 0
+
+
+def test_the_animation_has_a_picture_for_every_prefix(made):
+    movie = Image.open(made / "docs" / "img" / "refining.gif")
+    assert movie.n_frames >= len(sections(made / "docs")["slices"]["rows"])
+    assert movie.width == 480 and (made / "docs" / "img" / "refining.gif").stat().st_size <= LIMIT
+
+
+def test_the_page_is_made_from_its_figures_alone(made, tmp_path):
+    (tmp_path / "figures").mkdir()
+    (tmp_path / "figures" / "results.json").write_text((made / "docs" / "figures" / "results.json").read_text())
+    assert run.main(["--render", "--docs", str(tmp_path)]) == 0
+    machine = re.compile("Machine: .*?\n\n", re.DOTALL)
+    again, first = ((docs / "results.md").read_text() for docs in (tmp_path, made / "docs"))
+    assert machine.sub("", again) == machine.sub("", first)
+
+
+def test_a_training_is_kept_for_the_same_command_and_package(made, monkeypatch, tmp_path):
+    here = Run(made, tmp_path, quick=True)
+    monkeypatch.setattr(common, "command", lambda *words: pytest.fail(f"ran {words}"))
+    path, training = here.trained(QUICK)
+    assert path.is_file() and training["finished"]
+    for options, tree in (((), "another package"), (("--quality", "40"), common.package_tree())):
+        monkeypatch.setattr(common, "package_tree", lambda tree=tree: tree)
+        with pytest.raises(pytest.fail.Exception, match="'train'"):
+            Run(tmp_path, tmp_path).trained(QUICK, *options)
+
+
+def test_a_run_stops_at_the_benchmark_that_fails(made, tmp_path, monkeypatch, capsys):
+    def fail(run, scene):
+        raise DataError("nothing to measure")
+
+    bad = common.Benchmark("bad", "Bad", (), 1, fail, str)
+    good = common.Benchmark("good", "Good", (), 1, lambda run, scene: [{"n": 1}], lambda rows: f"n is {rows[0]['n']}.")
+    monkeypatch.setattr(run, "ALL", (good, bad, good))
+    assert run.main(["--quick", "-o", str(tmp_path)]) == 1
+    assert "run: error: nothing to measure\n" in capsys.readouterr().err
+    assert "## Good\n\nn is 1." in (tmp_path / "docs" / "results.md").read_text()
+
+
+def test_a_command_that_fails_is_named():
+    with pytest.raises(DataError, match="pd4dgs-info nowhere.pd4 --json: exit code 1, expected 0"):
+        common.command("info", "nowhere.pd4")
+
+
+def test_several_seeds_are_shown_with_their_spread():
+    row = {"scene": "discs", "level": 0, "mssim": 0.9, "anchors": 7, "steps": 9, "minutes": 1.0}
+    rows = [
+        row | {"seed": i, "bytes": n, "mpsnr": db}
+        for i, (n, db) in enumerate([(1000, 20.0), (1200, 21.0), (900, 23.0)])
+    ]
+    cells = [cell.strip() for cell in quality.text(rows).splitlines()[-1].strip("|").split("|")]
+    assert cells[:5] == ["discs", "0", "1,000 (900 to 1,200)", "0.00", "21.00 (20.00 to 23.00)"]
+
+
+def test_other_coders_take_about_the_entropy_of_their_symbols():
+    rng = np.random.default_rng(0)
+    channel = rng.normal(0, 5, 50_000).round().astype(np.int32)
+    bits = 0.5 * np.log2(2 * np.pi * np.e * 25)
+    assert codec.gauss_bytes([channel]) == pytest.approx(50_000 * bits / 8, rel=0.01)
+    assert codec.gauss_bytes([np.full(100, 3, np.int32)]) == codec.GAUSS_PARAMETERS
+    assert codec.lzma_bytes([channel]) > 50_000 * bits / 8
+    pytest.importorskip("DracoPy")
+    cells = np.unique(rng.integers(-50, 50, (3000, 3), dtype=np.int32), axis=0)
+    assert 2 * len(cells) < 8 * codec.draco_bytes(cells) < 21 * len(cells)
+
+
+def test_the_demo_writes_all_that_it_names(tmp_path, capsys):
+    assert demo.main(["--source", QUICK.source, "--max-seconds", "4", "-o", str(tmp_path)]) == 0
+    names = re.findall(r"\S+demo/[\w.-]+", capsys.readouterr().out.replace(",", " "))
+    assert len(names) == 6 and all(Path(name).stat().st_size > 0 for name in names)
+    assert demo.main(["--source", str(tmp_path / "nowhere"), "-o", str(tmp_path)]) == 1
+    assert "demo: error:" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_the_benchmarks_that_wait_for_processes(made, tmp_path):
+    assert run.main(["--quick", "-o", str(made), "--docs", str(tmp_path), "--only", "latency", "batch"]) == 0
+    check_page((tmp_path / "results.md").read_text())
+
+
+# -- docs/ -------------------------------------------------------------------------------------------------------------
+
+
+def test_the_results_in_git_are_what_their_figures_make_them():
+    figures = ROOT / "docs" / "figures" / "results.json"
+    if not figures.is_file():
+        pytest.skip("there are no figures yet")
+    text = (ROOT / "docs" / "results.md").read_text()
+    assert page.text(run.ALL, json.loads(figures.read_text())) == text and len(text.splitlines()) <= 250
+    check_page(text)
+
+
+def test_pages_show_the_pictures_in_git_which_are_small():
+    pages = [ROOT / "README.md", *(ROOT / "docs").rglob("*.md")]
+    pictures = {path for path in (ROOT / "docs").rglob("*") if path.suffix in PICTURES}
+    assert set().union(*map(shown, pages)) == pictures
+    assert all(path.stat().st_size <= (LIMIT if path.suffix == ".gif" else 300_000) for path in pictures)
