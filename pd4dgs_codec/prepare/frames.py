@@ -1,9 +1,10 @@
-"""Which frames of a recording are worth a pose: spread over its time, sharp, and each different from the one before."""
+"""Choice of frames from a recording: spread over its time, sharp, and each different from the one before."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,24 +13,30 @@ import numpy as np
 from pd4dgs_codec.data.files import image_info, read_image, shrink_image
 from pd4dgs_codec.data.videos import open_video
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.prepare.progress import Advance
 
-#: Frames are judged at this width at most, pixels.
+#: Called after each item.
+Advance = Callable[[], None]
+#: (number of items or None, their name, the stage) -> an Advance for that stage.
+Progress = Callable[[int | None, str, str], AbstractContextManager[Advance]]
+
+#: Largest width at which sharpness and change are measured, pixels.
 LOOK_WIDTH = 640
-#: Blurred: less than this share of the median sharpness of the frames around it, this many on either side.
+#: A frame is blurred below this share of the median sharpness of this many frames on either side.
 BLURRED, AROUND = 0.4, 15
-#: Two frames are one if their mean difference is below this, 8-bit levels. Coding one picture twice costs less.
+#: A frame repeats the one before if their mean difference is below this, 8-bit levels. Video coding causes less.
 SAME = 0.3
-#: Frames that are looked at: an hour at 60 per second is as much. And the fewest that can be given poses.
+#: Most frames of a recording, an hour at 60 per second; and the fewest for a pose estimate.
 MOST_FRAMES, FEWEST_FRAMES = 216_000, 8
 PICTURES = {".png", ".jpg", ".jpeg"}
 
 
 @dataclass(frozen=True)
 class Look:
-    """What a first look says of a frame. index: its place in the recording; time: seconds; sharpness: variance of its
-    Laplacian, squared 8-bit levels; change: mean difference from the frame before, 8-bit levels, infinite for the
-    first."""
+    """Measurements of a frame.
+
+    index: in the recording. time: seconds. sharpness: variance of the Laplacian, squared 8-bit levels. change: mean
+    difference from the frame before, 8-bit levels, infinite for the first.
+    """
 
     index: int
     time: float
@@ -39,7 +46,7 @@ class Look:
 
 @dataclass(frozen=True)
 class Choice:
-    """Indices of frames, ascending: those to use, and those left out because they are blurred or repeat another."""
+    """Ascending indices of the chosen frames, and of those left out as blurred or repeated."""
 
     chosen: tuple[int, ...]
     blurred: tuple[int, ...]
@@ -47,8 +54,8 @@ class Choice:
 
 
 class VideoFile:
-    """A video. Its frames are taken at its mean rate, so that frame k is of time k / fps even where a phone's rate
-    varies; ffmpeg repeats or drops frames for that."""
+    """A video at its mean frame rate: frame k has time k / fps. Where a phone's rate varies, ffmpeg repeats or drops
+    frames."""
 
     def __init__(self, path: Path):
         video = open_video(path)
@@ -62,7 +69,7 @@ class VideoFile:
         return open_video(self.path, grey=True, output=["-vf", scale, *self._rate()]).pictures
 
     def pictures(self, indices: Sequence[int]) -> Iterator[np.ndarray]:
-        """uint8 [H, W, 3] of these frames, in this order, which is ascending."""
+        """uint8 [H, W, 3] of these frames. indices: ascending."""
         wanted = set(indices)
         for k, picture in enumerate(open_video(self.path, output=self._rate()).pictures):
             if k in wanted:
@@ -79,8 +86,7 @@ class VideoFile:
 
 
 class FrameFolder:
-    """A folder of pictures of one size, frames in the order of the last number in their names, which counts at `fps`
-    per second."""
+    """A folder of pictures of one size, in the order of the last number in their names, at `fps` numbers per second."""
 
     def __init__(self, path: Path, fps: float):
         files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in PICTURES]
@@ -118,7 +124,7 @@ Recording = VideoFile | FrameFolder
 
 
 def open_recording(path: Path, fps: float) -> Recording:
-    """A video, or a folder of frames taken `fps` times per second; DataError for what is neither."""
+    """A video, or a folder of frames at `fps` per second. Raises DataError for anything else."""
     if path.is_dir():
         return FrameFolder(path, fps)
     if not path.exists():
@@ -127,7 +133,7 @@ def open_recording(path: Path, fps: float) -> Recording:
 
 
 def look(recording: Recording, advance: Advance) -> list[Look]:
-    """A first look at every frame."""
+    """Measures every frame."""
     looks: list[Look] = []
     before: np.ndarray | None = None
     for index, small in enumerate(recording.looks()):
@@ -153,7 +159,7 @@ def sharpness(picture: np.ndarray) -> float:
 
 
 def choose(looks: Sequence[Look], count: int) -> Choice:
-    """At most `count` of the frames (0: no limit): of each of as many equal stretches of time the sharpest."""
+    """The sharpest frame of each of `count` equal stretches of time; all usable frames for count 0."""
     sharp = np.array([frame.sharpness for frame in looks])
     usual = np.array([np.median(sharp[max(0, i - AROUND) : i + AROUND + 1]) for i in range(len(sharp))])
     is_blurred = sharp < BLURRED * usual
@@ -169,8 +175,7 @@ def choose(looks: Sequence[Look], count: int) -> Choice:
 def write_frames(
     recording: Recording, indices: Sequence[int], folder: Path, downscale: int, advance: Advance
 ) -> dict[str, float]:
-    """Writes these frames as PNG into the folder, averaged over blocks of downscale x downscale; the names of the files
-    with their times in seconds."""
+    """Writes these frames as PNG, averaged over blocks of downscale x downscale. Returns seconds by file name."""
     from PIL import Image
 
     if min(recording.size) // downscale < 1:

@@ -1,11 +1,14 @@
-"""Camera poses of frames by COLMAP's incremental mapping (Schönberger and Frahm, CVPR 2016), through pycolmap.
+"""Camera poses by COLMAP's incremental mapping (Schönberger and Frahm, CVPR 2016), through pycolmap, and the features
+on moving things, found by epipolar residuals.
 
-Every step goes on from what its database holds, so that a run that was cut does not begin anew.
+Every step resumes from the contents of its database after an interruption. Residuals need no learnt weights, but miss
+motion along the epipolar line.
 """
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from importlib import import_module
 from itertools import combinations
 from pathlib import Path
@@ -14,24 +17,29 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.errors import DataError, one_line
-from pd4dgs_codec.prepare.moving import Verdicts, count_off
-from pd4dgs_codec.prepare.progress import Advance
+from pd4dgs_codec.prepare.frames import Advance
 
-#: Camera models that COLMAP fits and our reader takes. Phones need one coefficient.
+#: COLMAP's camera models that data.colmap reads. Phones need one coefficient.
 CAMERA_MODELS = ("SIMPLE_RADIAL", "SIMPLE_PINHOLE", "PINHOLE", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
-#: Pictures and pairs that are handed over at once, between two signs of progress.
+#: Pictures and pairs in a call of pycolmap, between two reports of progress.
 BATCH, PAIRS_BATCH = 4, 50
-#: Longest side that features are looked for at, and the most of them.
+#: Longest side of pictures for feature detection, and the most features.
 MOST_PIXELS, MOST_FEATURES = 1600, 4096
-#: Each frame is matched with the next ones, with those at powers of two, and some with each other over the whole time.
+#: Each frame is matched with the NEAR next ones and those at powers of two; every EVERY-th with all other such frames.
 NEAR, EVERY = 10, 5
 #: A model must hold this share of the frames.
 LEAST_SHARE = 0.5
 SEED = 0
+#: A match is off if its Sampson distance is above this, pixels of a picture 1000 wide. A wide margin.
+OFF = 4.0
+#: A feature moves if this share of its matches is off; it needs so many matches.
+LEAST_MATCHES, MOVING_SHARE = 3, 0.6
+#: Features within this share of the picture's width vote as well.
+REACH = 0.03
 
 
 def colmap() -> Any:
-    """pycolmap, which tells nothing but through its results; DataError if it is not there."""
+    """pycolmap, without its log and with a fixed seed. Raises DataError if it is not installed."""
     try:
         module = import_module("pycolmap")
     except ImportError:
@@ -44,7 +52,7 @@ def colmap() -> Any:
 
 
 def pairs(count: int) -> list[tuple[int, int]]:
-    """Which of `count` frames are matched, i < j, ascending."""
+    """The pairs (i, j) of `count` frames to match, i < j, ascending."""
     gaps = {*range(1, NEAR + 1), *(1 << k for k in range(4, 16))}
     near = {(i, i + gap) for gap in gaps for i in range(count - gap)}
     return sorted(near | set(combinations(range(0, count, EVERY), 2)))
@@ -66,20 +74,15 @@ def extract(database: Path, images: Path, names: Sequence[str], model: str, thre
             if cameras:
                 reader.existing_camera_id = cameras[0].camera_id
         pycolmap.extract_features(
-            database,
-            images,
-            image_names=batch,
-            camera_mode=pycolmap.CameraMode.SINGLE,
-            reader_options=reader,
-            extraction_options=options,
-            device=pycolmap.Device.cpu,
-        )
+            database, images, image_names=batch, camera_mode=pycolmap.CameraMode.SINGLE, reader_options=reader,
+            extraction_options=options, device=pycolmap.Device.cpu,
+        )  # fmt: skip
         for _ in batch:
             advance()
 
 
 def match(database: Path, names: Sequence[str], listed: Sequence[tuple[int, int]], threads: int, adv: Advance) -> None:
-    """Matches of these pairs of pictures, verified by robust estimation of their epipolar geometry."""
+    """Matches these pairs of pictures and verifies them by robust estimation of their epipolar geometry."""
     pycolmap = colmap()
     options = pycolmap.FeatureMatchingOptions()
     options.use_gpu, options.num_threads = False, threads
@@ -114,8 +117,8 @@ def reconstruct(database: Path, images: Path, folder: Path, threads: int, advanc
 
 
 def upright(model: Any) -> None:
-    """Turns the model so that the pictures' mean up direction is -y, as in each picture, and moves it so that the
-    median point lies at 0. Boxes and planes along the axes fit better, and numbers stay small."""
+    """Rotates the mean up direction of the model to -y and moves its median point to 0: boxes and planes along the axes
+    fit better, and numbers stay small."""
     pycolmap = colmap()
     views = [image.cam_from_world().rotation.matrix() for image in model.images.values() if image.has_pose]
     down = np.mean([view[1] for view in views], axis=0)
@@ -133,7 +136,7 @@ def upright(model: Any) -> None:
 
 
 def moving_features(database: Path, model: Any) -> dict[str, Verdicts]:
-    """By picture, what the poses of the model say of its features; see `moving`. Pictures without a pose are absent."""
+    """The counts of matches for the features of each picture with a pose."""
     pycolmap = colmap()
     verdicts, normalised, poses = {}, {}, {}
     camera = next(iter(model.cameras.values()))
@@ -150,7 +153,7 @@ def moving_features(database: Path, model: Any) -> dict[str, Verdicts]:
 
 
 def leave_out(database: Path, moving: Mapping[str, np.ndarray]) -> None:
-    """Takes the verified matches of these features, bool [n] by picture, out of the database."""
+    """Removes the verified matches of these features, bool [n] by picture, from the database."""
     pycolmap = colmap()
     with pycolmap.Database.open(database) as stored:
         keys = {image.image_id: moving.get(image.name) for image in stored.read_all_images()}
@@ -165,3 +168,78 @@ def leave_out(database: Path, moving: Mapping[str, np.ndarray]) -> None:
             if not keep.all():
                 geometry.inlier_matches = index[keep]
                 stored.update_two_view_geometry(first, second, geometry)
+
+
+# -- moving features ---------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Verdicts:
+    """The features of a picture: places float64 [n, 2], pixels; int64 [n] counts of matches, and of those off."""
+
+    places: np.ndarray
+    matched: np.ndarray = field(init=False)
+    off: np.ndarray = field(init=False)
+
+    def __post_init__(self) -> None:
+        self.matched = np.zeros(len(self.places), np.int64)
+        self.off = np.zeros(len(self.places), np.int64)
+
+    @property
+    def known(self) -> np.ndarray:
+        """bool [n]: the feature has enough matches."""
+        return np.asarray(self.matched >= LEAST_MATCHES)
+
+    def moving(self, width: int) -> np.ndarray:
+        """bool [n]: the majority of the known features within REACH moves."""
+        known = self.known
+        votes = np.where(self.off >= MOVING_SHARE * self.matched, 1, -1)[known]
+        result = np.zeros(len(self.places), bool)
+        if not (votes > 0).any():
+            return result
+        voters = self.places[known]
+        for start in range(0, len(self.places), 512):
+            part = slice(start, start + 512)
+            gaps = ((self.places[part, None] - voters) ** 2).sum(axis=2)
+            result[part] = ((gaps <= (REACH * width) ** 2) @ votes) > 0
+        return result
+
+
+def sampson(a: np.ndarray, b: np.ndarray, relative: np.ndarray) -> np.ndarray:
+    """Sampson distance float64 [n] of matches a, b [n, 2] in normalised coordinates (Hartley and Zisserman, 11.4.3).
+
+    relative: float64 [3, 4], from the first camera to the second. The unit is that of the coordinates.
+    """
+    t = relative[:, 3]
+    cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
+    essential = cross @ relative[:, :3]
+    ha, hb = (np.concatenate([p, np.ones((len(p), 1))], axis=1) for p in (a, b))
+    line_b, line_a = ha @ essential.T, hb @ essential
+    error = np.abs((hb * line_b).sum(axis=1))
+    slope = np.sqrt((line_b[:, :2] ** 2).sum(axis=1) + (line_a[:, :2] ** 2).sum(axis=1))
+    return np.asarray(np.where(slope > 1e-12, error / np.where(slope > 1e-12, slope, 1), 0.0))
+
+
+def count_off(
+    verdicts: dict[int, Verdicts],
+    normalised: dict[int, np.ndarray],
+    poses: dict[int, np.ndarray],
+    focal: float,
+    width: int,
+    matches: Iterable[tuple[int, int, np.ndarray]],
+) -> None:
+    """Counts the matches of each feature, and those that are off.
+
+    normalised: float64 [n, 2] per picture, undistorted; poses: float64 [3, 4] per picture, world to camera; focal and
+    width: pixels; matches: (picture, picture, int [m, 2] indices of features).
+    """
+    for first, second, index in matches:
+        if first not in poses or second not in poses or not len(index):
+            continue
+        rotation = poses[second][:, :3] @ poses[first][:, :3].T
+        shift = poses[second][:, 3] - rotation @ poses[first][:, 3]
+        a, b = normalised[first][index[:, 0]], normalised[second][index[:, 1]]
+        off = sampson(a, b, np.column_stack([rotation, shift])) * focal > OFF * width / 1000
+        for picture, column in ((first, 0), (second, 1)):
+            np.add.at(verdicts[picture].matched, index[:, column], 1)
+            np.add.at(verdicts[picture].off, index[:, column], off)

@@ -1,7 +1,7 @@
-"""`prepare`: from a recording to a folder with pictures, times and a model of COLMAP, stage by stage.
+"""`prepare`: from a recording to a folder with pictures, times, a COLMAP model and a report, stage by stage.
 
-The work is done in `FOLDER.partial`. It becomes FOLDER once all is there. A run that was cut leaves it, and the same
-run goes on from it; one that cannot end takes it away.
+Work is done in `FOLDER.partial`, which becomes FOLDER at the end. After an interruption the same call resumes from it;
+a failure removes it.
 """
 
 from __future__ import annotations
@@ -9,24 +9,43 @@ from __future__ import annotations
 import json
 import os
 import shutil
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.io import finite, write_bytes
 from pd4dgs_codec.prepare import poses
-from pd4dgs_codec.prepare.frames import FEWEST_FRAMES, Choice, Look, choose, look, open_recording, write_frames
-from pd4dgs_codec.prepare.progress import Progress
-from pd4dgs_codec.prepare.report import Findings, advice, draw, numbers
+from pd4dgs_codec.prepare.frames import (
+    FEWEST_FRAMES,
+    Choice,
+    Look,
+    Progress,
+    Recording,
+    choose,
+    look,
+    open_recording,
+    write_frames,
+)
+from pd4dgs_codec.prepare.poses import Verdicts
 
 STATE, REPORT = "prepare.json", "report.json"
+#: Thresholds of advice: share of frames, pixels of a picture 1000 wide, points a picture, degrees, share of features.
+MANY_BLURRED, MANY_LOST, LARGE_ERROR, FEW_POINTS, SMALL_ANGLE, MUCH_MOVES = 0.2, 0.05, 2.0, 50, 4.0, 0.4
+#: Points whose angles are measured, and pictures in report.png.
+POINTS, SHOWN = 2000, 6
 
 
 @dataclass(frozen=True)
 class Choices:
-    """What the caller chooses. frames: at most so many, 0 for all; fps: of a folder of frames; downscale: pictures are
-    averaged over blocks of so many pixels a side; camera: COLMAP's model; threads: -1 for all cores."""
+    """Options of `prepare`.
+
+    frames: the most, 0 for all. fps: of a folder of frames. downscale: side of the blocks that pictures are averaged
+    over, pixels. camera: COLMAP's model. threads: -1 for all cores.
+    """
 
     frames: int = 120
     fps: float = 30.0
@@ -38,9 +57,9 @@ class Choices:
 def prepare(
     source: Path, output: Path, choices: Choices, progress: Progress, overwrite: bool = False
 ) -> dict[str, Any]:
-    """Writes the folder `output`; the numbers of its report. Raises DataError, one line, and leaves nothing behind,
-    where no poses can be found."""
-    poses.colmap()  # refuses now what the third stage would miss
+    """Writes the folder `output`; returns its report. Raises DataError, one line, and leaves nothing behind, if it finds
+    no poses."""
+    poses.colmap()  # raises now if it is not installed
     check_folder(output, overwrite)
     recording = open_recording(source, choices.fps)
     work = output.with_name(f"{output.name}.partial")
@@ -60,7 +79,7 @@ def prepare(
 
 
 def check_folder(output: Path, overwrite: bool) -> None:
-    """Refuses, before any work, an output that exists, unless it may be replaced and was made here."""
+    """Raises DataError for an output that cannot be written, or exists and was not made by `prepare`."""
     if output.exists() and not (overwrite and (output / REPORT).is_file() and (output / "sparse").is_dir()):
         how = "expected a folder that pd4dgs-prepare made" if overwrite else "--overwrite replaces what was made here"
         raise DataError(f"{output}: exists already; {how}")
@@ -71,7 +90,7 @@ def check_folder(output: Path, overwrite: bool) -> None:
 
 
 def _begin(work: Path, source: Path, choices: Choices) -> None:
-    """Keeps what an earlier run of the same recording and choices left, else begins anew."""
+    """Keeps the work of an earlier run with the same recording and choices, else begins anew."""
     stat = source.stat()
     asked = {"source": str(source.resolve()), "size": stat.st_size, "changed": stat.st_mtime_ns}
     asked |= {name: value for name, value in asdict(choices).items() if name != "threads"}
@@ -90,9 +109,9 @@ def _begin(work: Path, source: Path, choices: Choices) -> None:
 
 
 def _frames(
-    work: Path, recording: Any, choices: Choices, progress: Progress
+    work: Path, recording: Recording, choices: Choices, progress: Progress
 ) -> tuple[list[Look], Choice, dict[str, float]]:
-    """What is seen in the frames, which are taken, and their names with times; their pictures lie in images/."""
+    """Measurements of all frames, the choice, and seconds by file name; the pictures are in images/."""
     done = work / "frames.json"
     if done.is_file():
         stored = json.loads(done.read_text())
@@ -117,7 +136,7 @@ def _frames(
 
 
 def _poses(work: Path, times: dict[str, float], choices: Choices, progress: Progress) -> Findings:
-    """The model, made a second time without what moves; it lies in sparse/0 then."""
+    """The model, estimated again without moving features, in sparse/0."""
     names, images, database = sorted(times), work / "images", work / "colmap.db"
     with progress(len(names), "frames", "features") as advance:
         poses.extract(database, images, names, choices.camera, choices.threads, advance)
@@ -149,7 +168,7 @@ def _poses(work: Path, times: dict[str, float], choices: Choices, progress: Prog
 
 
 def _checked(model: Any | None, count: int) -> Any:
-    """A model of enough of `count` frames."""
+    """The model. Raises DataError if it has too few of `count` frames."""
     found = 0 if model is None else model.num_reg_images()
     if model is None or found < max(FEWEST_FRAMES, poses.LEAST_SHARE * count):
         raise DataError(
@@ -162,7 +181,7 @@ def _checked(model: Any | None, count: int) -> Any:
 def _finish(
     work: Path, findings: Findings, looks: list[Look], choice: Choice, times: dict[str, float], source: Path
 ) -> dict[str, Any]:
-    """times.txt, the report with its picture; what was only for the way goes."""
+    """Writes times.txt and the report, and removes intermediate files."""
     named = {image.name for image in findings.model.images.values() if image.has_pose}
     (work / "times.txt").write_text("".join(f"{name} {times[name]:.6f}\n" for name in sorted(named)))
     result = numbers(findings, looks, choice, times)
@@ -177,3 +196,149 @@ def _finish(
     for name in ("colmap.db", "still.db", "frames.json", STATE):
         (work / name).unlink(missing_ok=True)
     return result
+
+
+# -- report ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Findings:
+    """A pycolmap.Reconstruction; and by name of the pictures with poses, the counts of their features and bool [n]: the
+    feature moves."""
+
+    model: Any
+    verdicts: Mapping[str, Verdicts]
+    moving: Mapping[str, np.ndarray]
+
+
+def numbers(findings: Findings, looks: Sequence[Look], choice: Choice, times: Mapping[str, float]) -> dict[str, Any]:
+    """The report for report.json. Errors are in pixels of the written pictures."""
+    model = findings.model
+    registered = {image.name: image for image in model.images.values() if image.has_pose}
+    errors = _errors(model)
+    camera = next(iter(model.cameras.values()))
+    features = sum(map(len, findings.moving.values()))
+    rows = []
+    for name in sorted(times):
+        row: dict[str, Any] = {"name": name, "seconds": times[name], "pose": name in registered}
+        if name in registered:
+            image = registered[name]
+            row |= {"points": image.num_points3D, "reprojection_error": errors.get(image.image_id)}
+            row["moving_features"] = int(findings.moving[name].sum()) if name in findings.moving else 0
+        rows.append(row)
+    counts = {"seen": looks, "blurred": choice.blurred, "repeated": choice.repeated, "chosen": choice.chosen}
+    parameters = dict(zip(camera.params_info.split(", "), camera.params.tolist(), strict=True))
+    size = {"model": camera.model.name, "width": camera.width, "height": camera.height}
+    return {
+        "frames": {name: len(frames) for name, frames in counts.items()} | {"registered": len(registered)},
+        "seconds": looks[-1].time - looks[0].time,
+        "camera": size | {"parameters": parameters},
+        "points": model.num_points3D(),
+        "reprojection_error": float(model.compute_mean_reprojection_error()),
+        "points_per_picture": float(np.median([image.num_points3D for image in registered.values()])),
+        "angle_degrees": _angle(model),
+        "moving_share": sum(int(each.sum()) for each in findings.moving.values()) / features if features else 0.0,
+        "pictures": rows,
+    }
+
+
+def _errors(model: Any) -> dict[int, float]:
+    """Mean reprojection error of each picture's points, pixels, by the picture's number."""
+    errors = {}
+    for image in model.images.values():
+        seen = [point for point in image.points2D if point.has_point3D()] if image.has_pose else []
+        if not seen:
+            continue
+        world = np.array([model.point3D(point.point3D_id).xyz for point in seen])
+        camera, pose = model.camera(image.camera_id), image.cam_from_world().matrix()
+        places = camera.img_from_cam(world @ pose[:, :3].T + pose[:, 3])
+        gaps = places - np.array([point.xy for point in seen])
+        errors[image.image_id] = float(np.nanmean(np.hypot(gaps[:, 0], gaps[:, 1])))
+    return errors
+
+
+def _angle(model: Any) -> float:
+    """Median over points of the widest angle between two of the rays that see them, degrees."""
+    centers = {key: model.image(key).projection_center() for key in model.reg_image_ids()}
+    angles = []
+    points = list(model.points3D.values())
+    for point in points[:: max(1, len(points) // POINTS)]:
+        rays = np.array([centers[each.image_id] for each in point.track.elements]) - point.xyz
+        rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
+        angles.append(float(np.degrees(np.arccos(np.clip(rays @ rays.T, -1, 1).min()))))
+    return float(np.median(angles)) if angles else 0.0
+
+
+def advice(report: Mapping[str, Any]) -> list[str]:
+    """Hints for a better recording, a line each."""
+    lines, frames = [], report["frames"]
+    if frames["blurred"] > MANY_BLURRED * frames["seen"]:
+        lines.append(f"{frames['blurred']} of {frames['seen']} frames are blurred: move slower, or with more light")
+    lost = [row for row in report["pictures"] if not row["pose"]]
+    if len(lost) > MANY_LOST * frames["chosen"]:
+        span = f"between {lost[0]['seconds']:.1f} and {lost[-1]['seconds']:.1f} s"
+        lines.append(f"{len(lost)} of {frames['chosen']} frames have no pose, {span}: turn and move slower there")
+    error = report["reprojection_error"]
+    if error * 1000 > LARGE_ERROR * report["camera"]["width"]:
+        lines.append(f"reprojection error {error:.2f} pixels: lock zoom and focus, and switch stabilisation off")
+    if report["points_per_picture"] < FEW_POINTS:
+        found = f"{report['points_per_picture']:.0f} points in a picture"
+        lines.append(f"{found}: have things with texture that stand still around what moves")
+    if report["angle_degrees"] < SMALL_ANGLE:
+        found = f"points are seen under {report['angle_degrees']:.1f} degrees"
+        lines.append(f"{found}: walk around the scene, turning on the spot shows no depth")
+    if report["moving_share"] > MUCH_MOVES:
+        found = f"{100 * report['moving_share']:.0f} % of the features move"
+        lines.append(f"{found}: stand back, so that more of the picture stands still")
+    return lines
+
+
+def draw(
+    findings: Findings, looks: Sequence[Look], choice: Choice, times: Mapping[str, float], images: Path, path: Path
+) -> None:
+    """Draws report.png: the camera's path from above, errors, sharpness, and pictures with static features in green and
+    moving ones in red."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    from matplotlib import pyplot
+    from PIL import Image
+
+    model = findings.model
+    images_by_name = {image.name: image for image in model.images.values() if image.has_pose}
+    order = sorted(images_by_name)
+    figure = pyplot.figure(figsize=(13, 11))
+    top = figure.add_subplot(3, 3, 1)
+    points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
+    centers = np.array([images_by_name[name].projection_center() for name in order])
+    low, high = np.percentile(np.concatenate([points, centers]), [1, 99], axis=0)
+    top.plot(points[:, 0], points[:, 2], ",", color="grey")
+    top.plot(centers[:, 0], centers[:, 2], ".-", color="tab:blue", markersize=3)
+    span = 0.6 * max((high - low)[[0, 2]])
+    middle = (low + high) / 2
+    top.set(xlim=(middle[0] - span, middle[0] + span), ylim=(middle[2] - span, middle[2] + span), aspect="equal")
+    top.set_title("camera path and points, from above")
+    errors = _errors(model)
+    left = figure.add_subplot(3, 3, 2)
+    left.plot([times[n] for n in order], [errors.get(images_by_name[n].image_id, np.nan) for n in order], ".-")
+    left.set(title="reprojection error, pixels", xlabel="seconds")
+    right = figure.add_subplot(3, 3, 3)
+    right.semilogy([each.time for each in looks], [each.sharpness for each in looks], color="grey")
+    right.semilogy([looks[i].time for i in choice.chosen], [looks[i].sharpness for i in choice.chosen], "g.")
+    right.semilogy([looks[i].time for i in choice.blurred], [looks[i].sharpness for i in choice.blurred], "rx")
+    right.set(title="sharpness; green: chosen, red: blurred", xlabel="seconds")
+    for k, at in enumerate(np.linspace(0, len(order) - 1, SHOWN).round().astype(int)):
+        name = order[at]
+        axis = figure.add_subplot(3, 3, 4 + k)
+        with Image.open(images / name) as picture:
+            axis.imshow(picture)
+        if name in findings.verdicts:
+            verdicts, moves = findings.verdicts[name], findings.moving[name]
+            places = verdicts.places
+            axis.plot(*places[~moves & verdicts.known].T, ",", color="lime")
+            axis.plot(*places[moves].T, ".", color="red", markersize=3)
+        axis.set_title(f"{times[name]:.2f} s", fontsize=8)
+        axis.axis("off")
+    figure.tight_layout()
+    figure.savefig(path, dpi=100)
+    pyplot.close(figure)

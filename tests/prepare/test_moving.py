@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from rooms import FOCAL, WIDTH, pose
 
-from pd4dgs_codec.prepare.moving import Verdicts, count_off, sampson
+from pd4dgs_codec.prepare.poses import Verdicts, count_off, sampson
 
 
 @pytest.fixture(scope="module")
