@@ -57,8 +57,7 @@ class Choices:
 def prepare(
     source: Path, output: Path, choices: Choices, progress: Progress, overwrite: bool = False
 ) -> dict[str, Any]:
-    """Writes the folder `output`; returns its report. Raises DataError, one line, and leaves nothing behind, if it finds
-    no poses."""
+    """Writes the folder `output`; returns its report. Raises DataError, one line, and leaves nothing, without poses."""
     poses.colmap()  # raises now if it is not installed
     check_folder(output, overwrite)
     recording = open_recording(source, choices.fps)
