@@ -1,4 +1,4 @@
-"""`pd4dgs-bench`: reports on the codec, the renderer, the trainer and the delivery themselves."""
+"""`pd4dgs-bench`: error against run time of codec, renderer and trainer; numerical stability; latency."""
 
 from __future__ import annotations
 
@@ -10,58 +10,83 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple, TypeVar
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from pd4dgs_codec.cli import common, options
-from pd4dgs_codec.cli.common import (
-    FAILED,
-    OK,
-    STDIO,
-    Console,
-    UsageError,
-    check_output,
-    is_pd4,
-    named_input,
-    read_bytes,
-    write_bytes,
-)
+from pd4dgs_codec.cli.common import FAILED, OK, STDIO, Console, UsageError, check_output, is_pd4, read_bytes
 from pd4dgs_codec.cli.progress import TrainingProgress, progress_bar
 from pd4dgs_codec.errors import DataError, DecodeError, TrainError
-from pd4dgs_codec.io import finite, whole_file
 
 if TYPE_CHECKING:
-    from pd4dgs_codec.bench.codec import Deviation, Point, Sweep
+    from pd4dgs_codec.bench.report import Panel
     from pd4dgs_codec.bench.train import Run
-    from pd4dgs_codec.data.view import Dataset
     from pd4dgs_codec.quality.frames import Frame
     from pd4dgs_codec.scene import SceneInfo
 
-T = TypeVar("T")
-
 
 class Outcome(NamedTuple):
-    """What a report found: JSON, Markdown, what draws its plot to a path, and a line per failure."""
+    """The results of a report: JSON, Markdown, the plot with the label of its error axis, and a line per failure."""
 
     result: dict[str, Any]
     text: str
-    draw: Callable[[Path], None] | None = None
+    panels: Sequence[Panel] = ()
+    error: str = ""
     failures: Sequence[str] = ()
+
+
+def _given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
+    """The options among `names` that were given."""
+    return {name: getattr(args, name) for name in names if getattr(args, name) is not None}
+
+
+def _add_views(p: options.Parser, views: int) -> None:
+    """The options that choose the images to render; views: their default number."""
+    add = p.add_argument
+    what = "dataset whose held-out views give the cameras (default: the file's own camera over time)"
+    add("--data", metavar="SOURCE", help=what)
+    options.add_reading(p)
+    add("--views", type=options.positive_int, default=views, metavar="N", help=f"number of images (default: {views})")
+
+
+def _frames(args: argparse.Namespace, info: SceneInfo) -> list[Frame]:
+    """Up to args.views frames: evenly spread held-out (or else training) views of --data, or the file's own camera."""
+    from pd4dgs_codec.quality.frames import dataset_frames, own_frames
+
+    if args.data is None:
+        return own_frames(info, args.views, downscale=args.downscale)
+    dataset = common.read_dataset(args.data, args)
+    views = dataset.test or dataset.train
+    count = min(args.views, len(views))
+    return dataset_frames([views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)])
 
 
 # -- codec -------------------------------------------------------------------------------------------------------------
 
 CODEC = """\
-A checkpoint is packed at every combination of step scale, mode and effort. Each file's error is measured on its values,
-and on pictures against those of the checkpoint; a file without its checkpoint has bytes and times alone. Times: warm,
-the median and quartiles of the repeats in one process (none begun after 5 s); cold, at the step scale nearest to 1,
-whole fresh processes, with the largest memory they held.
+Encodes a checkpoint at each combination of step scale, mode and effort. The error of each file is measured on its
+values and on rendered images, against those of the checkpoint. For a .pd4 file without its checkpoint only bytes and
+times are reported. Times are medians and quartiles of repetitions in one process, none begun after 5 s.
 
 examples:
   pd4dgs-bench codec model.pt --data recordings/kitchen --downscale 2 --plot codec.png > codec.md
-  pd4dgs-bench codec model.pt --quick
+  pd4dgs-bench codec model.pt --quick --views 2
   pd4dgs-bench codec scene.pd4 --json"""
-#: What --quick runs, where no option says otherwise.
-QUICK: dict[str, Any] = {"step_scales": (1.0, 2.0), "modes": ("ans", "lzma"), "efforts": (1,), "repeats": 1, "cold": 0}
+
+
+QUICK: dict[str, Any] = {"step_scales": (1.0, 2.0), "efforts": (1,), "repeats": 1}
+
+
+def _codec_options(p: options.Parser) -> None:
+    effort = options.checked(int, lambda value: 1 <= value <= 9, "an integer from 1 to 9")
+    scales, modes, efforts = map(options.listed, (options.positive_float, options.one_of("ans", "lzma"), effort))
+    add = p.add_argument
+    add("input", metavar="FILE", help="checkpoint of pd4dgs-train, or a .pd4 file (- for stdin)")
+    add("--step-scales", type=scales, metavar="X,...", help="factors on all quantisation steps (default: 0.5,1,2,4)")
+    add("--modes", type=modes, metavar="M,...", help="entropy coders (default: ans,lzma)")
+    add("--efforts", type=efforts, metavar="N,...", help="1 is fast, 9 makes the smallest files (default: 1,5,9)")
+    add("--repeats", type=options.positive_int, metavar="N", help="runs per time (default: 5)")
+    add("--quick", action="store_true", help="only --step-scales 1,2 --efforts 1 --repeats 1")
+    _add_views(p, 6)
 
 
 def _codec(args: argparse.Namespace, console: Console) -> Outcome:
@@ -69,97 +94,113 @@ def _codec(args: argparse.Namespace, console: Console) -> Outcome:
     from pd4dgs_codec.bench import codec, timing
 
     machine = timing.machine()
-    what = codec.Sweep(**(QUICK if args.quick else {}) | _given(args, *QUICK))
-    masks = None
+    what = codec.Sweep(**(QUICK if args.quick else {}) | _given(args, "step_scales", "modes", "efforts", "repeats"))
     if is_pd4(data):
         if args.plot is not None:
             raise UsageError("--plot: a file without its checkpoint has no error to plot; expected a checkpoint")
-        points = [codec.file_point(data, what.repeats, what.cold)]
+        points, masks = [codec.file_point(data, what.repeats)], None
+        tables = [codec.points_table(points)]
     else:
-        points, masks = _swept(args, what)
+        from pd4dgs_codec.model import checkpoint
+        from pd4dgs_codec.model.convert import to_scene
+
+        model, _ = checkpoint.load(args.input)
+        scene = to_scene(model)
+        masks = codec.mask_deviation([model.masks(i).detach().numpy() for i in scene.layers], scene.mask)
+        with progress_bar(len(what), "files", "codec") as step:
+            points = codec.sweep(args.input, scene, _frames(args, scene.info), what, step)
+        tables = [codec.points_table(points), codec.values_table(points, masks)]
     result = {"input": args.input, "machine": machine, "points": codec.as_json(points), "masks": masks and vars(masks)}
-    tables = [codec.points_table(points), *([codec.values_table(points, masks)] if masks else [])]
     text = "\n\n".join([*tables, timing.machine_line(machine)])
-    return Outcome(result, text, partial(_plot, codec.panels(points), "RMSE of pictures"))
-
-
-def _swept(args: argparse.Namespace, what: Sweep) -> tuple[list[Point], Deviation]:
-    """(points of a checkpoint, what its mask codes lose)."""
-    from pd4dgs_codec.bench import codec
-    from pd4dgs_codec.model import checkpoint
-    from pd4dgs_codec.model.convert import to_scene
-
-    model, _ = checkpoint.load(args.input)
-    scene = to_scene(model)
-    masks = codec.mask_deviation([model.masks(i).detach().numpy() for i in scene.layers], scene.mask)
-    frames = _frames(args, scene.info, 2 if args.quick else 6)
-    with progress_bar(len(what), "files", "codec") as step:
-        return codec.sweep(args.input, scene, frames, what, step), masks
+    return Outcome(result, text, codec.panels(points), "RMSE of images")
 
 
 # -- render ------------------------------------------------------------------------------------------------------------
 
 RENDER = """\
-The Gaussians of the highest level, as each camera meets them, are drawn in several ways, and each picture is compared
-with that of a float64 oracle written from the formulas: the same formulas in float32; the CPU kernels as they are, with
-other tiles, with other thresholds; gsplat where there is a CUDA device. Times are of rasterising alone.
-
-Kernels with other constants are compiled first, some 20 s each; --cache keeps them for the next run.
+Renders the Gaussians of the highest level with each rasteriser and compares the images with those of a float64
+reference written from the formulas: the CPU kernels, and gsplat if there is a CUDA device. Times are of rasterising
+alone.
 
 examples:
   pd4dgs-bench render scene.pd4 --plot render.png > render.md
-  pd4dgs-bench render model.pt --data synthetic:local --views 1 --only kernels,'T > 1e-2'"""
+  pd4dgs-bench render model.pt --data synthetic:local --views 1 --only kernels"""
+
+
+def _render_options(p: options.Parser) -> None:
+    add = p.add_argument
+    add("input", metavar="FILE", help=".pd4 file or .pt checkpoint; - reads a .pd4 from stdin")
+    what = "only these rasterisers: oracle float64, kernels, gsplat (default: all)"
+    add("--only", type=options.listed(str), metavar="NAME,...", help=what)
+    what = "repetitions per image (default: 15)"
+    add("--repeats", type=options.positive_int, default=15, metavar="N", help=what)
+    _add_views(p, 2)
 
 
 def _render(args: argparse.Namespace, console: Console) -> Outcome:
-    from pd4dgs_codec.bench import pictures, render, timing
+    from pd4dgs_codec.bench import render, timing
     from pd4dgs_codec.quality.levels import load_levels
 
-    names = args.only or render.NAMES
-    if unknown := [name for name in names if name not in render.NAMES]:
-        raise UsageError(f"--only: found {unknown[0]!r}, expected some of {', '.join(render.NAMES)}")
-    machine = timing.machine("gsplat")
-    level = load_levels(named_input(args.input))[-1]
-    views = [pictures.view(level, frame) for frame in _frames(args, level.model.info, 2)]
-    with tempfile.TemporaryDirectory() as folder, progress_bar(len(names), "ways to draw", "render") as step:
-        points = render.sweep(views, names, args.repeats, Path(args.cache or folder).resolve(), step)
-    sizes = [{"width": v["width"], "height": v["height"], "gaussians": len(v["means"])} for v in views]
+    names = args.only or tuple(render.BACKENDS)
+    if unknown := [name for name in names if name not in render.BACKENDS]:
+        raise UsageError(f"--only: found {unknown[0]!r}, expected some of {', '.join(render.BACKENDS)}")
+    machine = timing.machine()
+    level = load_levels(common.named_input(args.input))[-1]
+    frames = _frames(args, level.model.info)
+    views = [render.view(level, frame) for frame in frames]
+    with progress_bar(len(names), "rasterisers", "render") as step:
+        points = render.sweep(views, names, args.repeats, step)
+    sizes = [
+        {"width": f.camera.width, "height": f.camera.height, "gaussians": len(v["means"])}
+        for f, v in zip(frames, views, strict=True)
+    ]
+    shown = "; ".join(f"{v['width']}x{v['height']}, {v['gaussians']:,} Gaussians" for v in sizes)
+    text = "\n\n".join([render.table(points), f"Images: {shown}.", timing.machine_line(machine)])
     result = {"input": args.input, "machine": machine, "level": level.level, "pictures": sizes}
-    drawn = "; ".join(f"{v['width']}x{v['height']}, {v['gaussians']:,} Gaussians" for v in sizes)
-    text = "\n\n".join([render.table(points), f"Pictures: {drawn}.", timing.machine_line(machine)])
-    plot = partial(_plot, render.panels(points), "RMSE against the float64 oracle")
-    return Outcome(result | {"points": render.as_json(points)}, text, plot)
+    result |= {"points": render.as_json(points)}
+    return Outcome(result, text, render.panels(points), "RMSE from the float64 reference")
 
 
 # -- train -------------------------------------------------------------------------------------------------------------
 
 TRAIN = f"""\
-Each preset is trained for the same time; held-out quality is measured a dozen times on the way, on six views, as
-pd4dgs-train does. --from draws runs that exist instead, from their checkpoints or logs.
+Trains each preset for the same time. Held-out quality is measured about twelve times on the way, on six views, as
+pd4dgs-train does. --from reports existing runs, from their checkpoints, instead.
 
 {options.SOURCES}
 
 examples:
   pd4dgs-bench train synthetic:local --presets tiny small --seconds 120 --plot train.png > train.md
-  pd4dgs-bench train --from out/tiny.pt run.jsonl --plot train.png"""
+  pd4dgs-bench train --from out/tiny.pt out/small.pt --plot train.png"""
 #: Options that are fields of TrainConfig.
 TRAIN_FIELDS = ("downscale", "holdout", "seed", "iterations")
 
 
+def _train_options(p: options.Parser) -> None:
+    presets, add = ("tiny", "small", "paper"), p.add_argument
+    add("source", nargs="?", metavar="SOURCE", help="dataset to train on, see below")
+    add("--presets", nargs="+", choices=presets, metavar="PRESET", help="model sizes (default: tiny small)")
+    add("--seconds", type=options.positive_float, metavar="S", help="time limit per preset (default: 120)")
+    add("--iterations", type=options.positive_int, metavar="N", help="number of steps instead of a time limit")
+    options.add_reading(p, defaults=False)
+    add("--seed", type=options.seed, metavar="N", help="seed of each run (default: 0)")
+    add("--from", dest="runs", nargs="+", metavar="FILE", help="checkpoints of existing runs")
+
+
 def _train(args: argparse.Namespace, console: Console) -> Outcome:
     if args.runs and (args.source or _given(args, "presets", "seconds", *TRAIN_FIELDS)):
-        raise UsageError("--from takes runs that exist; expected no SOURCE and no option of a training beside it")
+        raise UsageError("--from reports existing runs; expected no SOURCE and no option of a training beside it")
     if not args.runs and not args.source:
         raise UsageError("found no SOURCE, expected a dataset to train on or --from FILE")
     if args.seconds and args.iterations:
         raise UsageError("found --seconds and --iterations, expected one of them")
     from pd4dgs_codec.bench import timing, train
 
-    machine = None if args.runs else timing.machine()  # where the runs that exist were made is not known
-    runs = [train.of_file(path) for path in args.runs] if args.runs else _trained(args, console)
+    machine = None if args.runs else timing.machine()  # the machine of existing runs is unknown
+    runs = [train.of_checkpoint(path) for path in args.runs] if args.runs else _trained(args, console)
     text = "\n\n".join([train.table(runs), *([timing.machine_line(machine)] if machine else [])])
-    plot = partial(_plot, train.panels(runs), "held-out RMSE of the highest level")
-    return Outcome({"source": args.source, "machine": machine, "runs": train.as_json(runs)}, text, plot)
+    result = {"source": args.source, "machine": machine, "runs": train.as_json(runs)}
+    return Outcome(result, text, train.panels(runs), "held-out RMSE of the highest level")
 
 
 def _trained(args: argparse.Namespace, console: Console) -> list[Run]:
@@ -172,82 +213,80 @@ def _trained(args: argparse.Namespace, console: Console) -> list[Run]:
     runs = []
     for preset in dict.fromkeys(args.presets or ("tiny", "small")):
         config = TrainConfig(preset=preset, source=args.source, max_seconds=limit, **_given(args, *TRAIN_FIELDS))
-        dataset = load_source(args.source, downscale=config.downscale, holdout=config.holdout)
-        trainer = Trainer(config, dataset)
-        console.message(f"training {preset} on {len(dataset.train)} views")
+        trainer = Trainer(config, load_source(args.source, downscale=config.downscale, holdout=config.holdout))
+        console.message(f"training {preset} on {len(trainer.dataset.train)} views")
         with tempfile.TemporaryDirectory() as folder:
             trainer.run(Path(folder) / "model.pt", progress=TrainingProgress())
         if trainer.interrupted:
             raise TrainError(f"interrupted while training {preset}; nothing was written")
         if not trainer.curve:
-            raise TrainError(f"{preset}: the limit ended the run before its first evaluation; expected a longer one")
+            raise TrainError(f"{preset}: the run ended before its first evaluation; expected a larger limit")
         runs.append(train.of_curve(preset, trainer.curve, len(trainer.model.anchor_q)))
     return runs
 
 
 # -- latency -----------------------------------------------------------------------------------------------------------
 
-LATENCY = f"""\
-Prints Markdown: per rate and level the bytes of the prefix S, 8S/B, the median time to their last byte over the paced
-link of pd4dgs-serve, and to a picture on the CPU in a warm and in a cold process, with the file's own camera; beside
-the published sizes of monolithic models.
-
-A file takes about (8S/B + 2 s) x 3 x runs at each rate. Times need a quiet machine.
-
-{options.SOURCES}
+LATENCY = """\
+Reports for each rate and level the bytes S of the prefix, 8S/B, the median time to their last byte over the paced link
+of pd4dgs-serve, and the time to the rendered image on the CPU in a warm and in a cold process, with the file's camera.
+A file takes about (8S/B + 2 s) x 3 x runs at each rate. Use a machine without other load.
 
 examples:
   pd4dgs-bench latency scene.pd4 > latency.md
-  pd4dgs-bench latency scene.pd4 --data recordings/kitchen --downscale 2 --plot latency.png --json latency.json
-  pd4dgs-bench latency scene.pd4 --anchors 25000 --size 480x360 --rates 10M"""
+  pd4dgs-bench latency scene.pd4 --rates 500k,10M --json latency.json"""
+
+
+def _latency_options(p: options.Parser) -> None:
+    add = p.add_argument
+    add("inputs", nargs="+", metavar="FILE", help=".pd4 files with a camera")
+    what = "rates of the link (default: 2M,10M,50M)"
+    add("--rates", type=options.rates, default="2M,10M,50M", metavar="R", help=what)
+    add("--runs", type=options.positive_int, default=9, metavar="N", help="runs per median (default: 9)")
 
 
 def _latency(args: argparse.Namespace, console: Console) -> Outcome:
-    if args.data and len(args.data) != len(args.inputs):
-        raise UsageError(f"found {len(args.data)} --data for {len(args.inputs)} files, expected one each or none")
-    from pd4dgs_codec.bench import latency
-    from pd4dgs_codec.draw.warm import warm_up
-    from pd4dgs_codec.interchange.teacher import load_source
+    contents = [_with_camera(name) for name in args.inputs]
+    from pd4dgs_codec.bench import latency, timing
 
-    contents = [_with_camera(name, args.anchors) for name in args.inputs]
-    sets: list[Dataset | None] = [load_source(source, downscale=args.downscale) for source in args.data]
-    sets = sets or [None] * len(contents)
-    speeds, files = list(args.rates.values()), []
-    warm_up()
-    with progress_bar(3 * args.runs * len(speeds) * len(contents), "runs", "times") as step:
-        for name, data, dataset in zip(args.inputs, contents, sets, strict=True):
-            files.append(latency.report(name, data, speeds, args.runs, None, dataset, step))
-    result = {
-        "runs": args.runs,
-        "rates": args.rates,
-        "files": [asdict(f) | {"times": [asdict(t) | {"within": t.within} for t in f.times]} for f in files],
-        "published_megabytes": latency.PUBLISHED_MEGABYTES,
-    }
-    return Outcome(result, latency.text(files, args.runs), partial(latency.draw, files[0]))
+    machine, speeds, rows, parts = timing.machine(), list(args.rates.values()), [], []
+    with progress_bar(3 * args.runs * len(speeds) * len(contents), "runs", "latency") as step:
+        for name, data in zip(args.inputs, contents, strict=True):
+            found = latency.times(data, speeds, args.runs, step)
+            times = [asdict(row) | {"within": row.within} for row in found]
+            start = latency.first_start(data, max(speeds))
+            rows.append({"name": name, "bytes": len(data), "times": times, "first_start": start})
+            parts += [
+                f"## {name}",
+                latency.table(found),
+                f"With empty kernel caches the first image takes {start:.1f} s.",
+            ]
+    parts.append(f"Seconds since the request (cold: since the start of the process), medians of {args.runs}.")
+    result = {"runs": args.runs, "rates": args.rates, "machine": machine, "files": rows}
+    return Outcome(result, "\n\n".join([*parts, timing.machine_line(machine)]))
 
 
-def _with_camera(name: str, anchors: int | None) -> bytes:
-    """The bytes of a valid file with a camera, enlarged if asked for."""
-    from pd4dgs_codec.bench.latency import with_anchors
+def _with_camera(name: str) -> bytes:
+    """The bytes of a valid file with a camera."""
     from pd4dgs_codec.format.decoder import decode
 
     data = read_bytes(name)
     try:
         if decode(data).info.camera is None:
-            raise DataError("holds no camera to draw pictures with")
-        return data if anchors is None else with_anchors(data, anchors)
+            raise DataError("holds no camera, expected one to render with")
     except (DecodeError, DataError) as error:
         raise DataError(f"{name}: {error}") from None
+    return data
 
 
 # -- stability ---------------------------------------------------------------------------------------------------------
 
 STABILITY = """\
-A row passes if its error is within its bound, or if input that has no answer was refused in one line. References are
-computed by mpmath or in float64. The exit code is 1 if any row fails.
+Feeds stiff and extreme cases to each numerical part. A row passes if its error is within its bound; it is refused if
+input without an answer raised the promised error in one line. References are computed by mpmath or in float64. The exit
+code is 1 if any row fails.
 
-groups: rate, fitting, quantiser, hexplane, deformation, masks, rasteriser, training
-The row that compares one thread with two is there only where the process may use two CPUs.
+groups: rate, fitting, quantiser, masks, hexplane, deformation, rasteriser, training
 
 examples:
   pd4dgs-bench stability > table.md
@@ -256,125 +295,72 @@ examples:
   pd4dgs-bench stability --json rows.json > table.md"""
 
 
-def _stability(args: argparse.Namespace, console: Console) -> Outcome:
-    from pd4dgs_codec.bench.stability import cases as table
+def _stability_options(p: options.Parser) -> None:
+    p.add_argument("--only", metavar="NAME", help="the group NAME, or the cases with NAME in their name")
 
-    table.mpmath()
-    cases = table.chosen(args.only)
+
+def _stability(args: argparse.Namespace, console: Console) -> Outcome:
+    from pd4dgs_codec.bench import stability
+
+    stability.mpmath()
+    cases = stability.chosen(args.only)
     if not cases:
         raise UsageError(f"--only: found {args.only!r}, expected a group or a part of a case's name")
     rows = []
     with progress_bar(len(cases), "cases", "stability") as step:
         for case in cases:
-            rows.append(table.judge(case))
+            rows.append(stability.judge(case))
             step()
-    failed = [row for row in rows if row.status == table.FAIL]
+    failed = [row for row in rows if row.status == stability.FAIL]
     failures = [f"fail: {row.group}: {row.case}: {row.got}, error {row.error}, bound {row.bound}" for row in failed]
-    result = {"rows": [asdict(row) for row in rows], "counts": table.counts(rows)}
-    return Outcome(result, table.text(rows), failures=failures)
+    result = {"rows": [asdict(row) for row in rows], "counts": stability.counts(rows)}
+    return Outcome(result, stability.text(rows), failures=failures)
 
 
-# -- options -----------------------------------------------------------------------------------------------------------
+# -- the command -------------------------------------------------------------------------------------------------------
 
 
-def _options(report: str, p: options.Parser) -> None:
-    """What a report has beside the options that every command has."""
-    add = p.add_argument
-    if report == "codec":
-        kinds = (
-            options.positive_float,
-            options.one_of(*QUICK["modes"]),
-            options.checked(int, lambda n: 1 <= n <= 9, "from 1 to 9"),
-        )
-        scales, modes, efforts = map(options.listed, kinds)
-        add("input", metavar="FILE", help="checkpoint of pd4dgs-train, or a .pd4 file (- for stdin)")
-        add("--step-scales", type=scales, metavar="X,...", help="factors on all steps (default: 0.5,1,2,4)")
-        add("--modes", type=modes, metavar="M,...", help="entropy coders (default: ans,lzma)")
-        add("--efforts", type=efforts, metavar="N,...", help="1 fast to 9 small (default: 1,5,9)")
-        add("--repeats", type=options.positive_int, metavar="N", help="runs per warm time (default: 5)")
-        add("--cold", type=options.count, metavar="N", help="fresh processes per cold time; 0: none (default: 1)")
-        add("--quick", action="store_true", help="few points, one run each, no fresh processes")
-        _add_views(p, "6; with --quick 2")
-    elif report == "render":
-        add("input", metavar="FILE", help=".pd4 file or .pt checkpoint; - reads a .pd4 from stdin")
-        add("--only", type=options.listed(str), metavar="NAME,...", help="these ways to draw alone")
-        add("--repeats", type=options.positive_int, default=15, metavar="N", help="drawings per picture (default: 15)")
-        add("--cache", metavar="FOLDER", help="where to keep compiled kernels (default: nowhere)")
-        _add_views(p, "2")
-    elif report == "train":
-        presets = ("tiny", "small", "paper")
-        add("source", nargs="?", metavar="SOURCE", help="dataset to train on, see below")
-        add("--presets", nargs="+", choices=presets, metavar="PRESET", help="model sizes (default: tiny small)")
-        add("--seconds", type=options.positive_float, metavar="S", help="time limit per preset (default: 120)")
-        add("--iterations", type=options.positive_int, metavar="N", help="so many steps instead of a time limit")
-        options.add_reading(p, defaults=False)
-        add("--seed", type=options.seed, metavar="N", help="seed of each run (default: 0)")
-        add("--from", dest="runs", nargs="+", metavar="FILE", help="instead of training: checkpoints or logs")
-    elif report == "latency":
-        larger = "measure a scene of N anchors in layer 0: those of FILE, and copies moved by up to 3 voxels"
-        add("inputs", nargs="+", metavar="FILE", help=".pd4 files that hold a camera")
-        add("--rates", type=options.rates, default="2M,10M,50M", metavar="R", help="of the link (default: 2M,10M,50M)")
-        add("--runs", type=options.positive_int, default=9, metavar="N", help="runs per median (default: 9)")
-        add("--anchors", type=options.positive_int, metavar="N", help=larger)
-        add("--data", action="append", default=[], metavar="SOURCE", help="dataset for quality, one per FILE")
-        add("--downscale", type=options.positive_int, default=1, metavar="K", help="images 1/K as large (default: 1)")
-    else:
-        add("--only", metavar="NAME", help="the group NAME, or the cases with NAME in their name")
-    if report in PLOTS:
-        add("--plot", metavar="FILE.png", help=f"write a plot: {PLOTS[report]}")
-    p.add_common(json_file=True)
+class Report(NamedTuple):
+    """A report: its arguments in the usage line, summary, details, options and function; whether it has a plot."""
+
+    usage: str
+    summary: str
+    details: str
+    add_options: Callable[[options.Parser], None]
+    execute: Callable[[argparse.Namespace, Console], Outcome]
+    plot: bool = True
 
 
-def _add_views(p: options.Parser, views: str) -> None:
-    """The options that say which pictures to take; views: how many are taken without --views, in words."""
-    group = p.add_argument_group("pictures")
-    what = "dataset whose held-out views give the cameras (default: the file's own camera over time)"
-    group.add_argument("--data", metavar="SOURCE", help=what)
-    options.add_reading(group, defaults=False)
-    group.add_argument("--views", type=options.positive_int, metavar="N", help=f"how many pictures (default: {views})")
-
-
-def _frames(args: argparse.Namespace, info: SceneInfo, views: int) -> list[Frame]:
-    from pd4dgs_codec.bench.pictures import frames
-
-    return frames(info, args.data, args.views or views, **_given(args, "downscale", "holdout"))
-
-
-def _given(args: argparse.Namespace, *names: str) -> dict[str, Any]:
-    """The options among `names` that were given a value."""
-    return {name: getattr(args, name) for name in names if getattr(args, name) is not None}
-
-
-def _plot(panels: Sequence[Any], ylabel: str, path: Path) -> None:
-    from pd4dgs_codec.bench.report import draw
-
-    draw(panels, ylabel, path)
-
-
-#: Report: its arguments, what it is, its details, what makes it.
-REPORTS: dict[str, tuple[str, str, str, Callable[[argparse.Namespace, Console], Outcome]]] = {
-    "codec": ("FILE", "Measure what the codec's error costs in bytes and seconds.", CODEC, _codec),
-    "render": ("FILE", "Measure the rasteriser against a float64 oracle: error against milliseconds.", RENDER, _render),
-    "train": ("[SOURCE]", "Measure held-out quality against training wall time.", TRAIN, _train),
-    "latency": ("FILE...", "Measure how long the first picture takes, and the next ones.", LATENCY, _latency),
-    "stability": ("", "Feed stiff and extreme cases, and print a table of what became of each.", STABILITY, _stability),
+REPORTS = {
+    "codec": Report("FILE", "Measure the codec's error against bytes and seconds.", CODEC, _codec_options, _codec),
+    "render": Report("FILE", "Measure the rasterisers' error against time.", RENDER, _render_options, _render),
+    "train": Report("[SOURCE]", "Measure held-out error against training time.", TRAIN, _train_options, _train),
+    "latency": Report(
+        "FILE...", "Measure the time to the first and later images.", LATENCY, _latency_options, _latency, False
+    ),
+    "stability": Report(
+        "", "Test stiff and extreme cases, and print a table.", STABILITY, _stability_options, _stability, False
+    ),
 }
-_FRONT = "error against cost, log-log, Pareto front marked"
-PLOTS = dict.fromkeys(("codec", "render", "train"), _FRONT) | {"latency": "quality over seconds since the request"}
 
 
-def parser(report: str | None = None) -> options.Parser:
+def parser(name: str | None = None) -> options.Parser:
     """The options of a report, or of `pd4dgs-bench` without one."""
-    if report is not None:
-        synopsis, summary, details, _ = REPORTS[report]
-        p = options.Parser(f"bench {report}", synopsis, summary, details)
-        _options(report, p)
+    if name is not None:
+        report = REPORTS[name]
+        p = options.Parser(f"bench {name}", report.usage, report.summary, report.details)
+        report.add_options(p)
+        if report.plot:
+            what = "write a log-log plot of error against cost, with the Pareto front"
+            p.add_argument("-o", "--plot", metavar="FILE.png", help=what)
+        p.add_common(json_file=True)
         return p
-    lines = [f"  {name:<11} {summary}" for name, (_, summary, _, _) in REPORTS.items()]
+    lines = [f"  {name:<11} {report.summary}" for name, report in REPORTS.items()]
     examples = [f"  pd4dgs-bench {name} --help" for name in REPORTS]
     details = "\n".join(["REPORT is one of", *lines, "", "examples:", *examples])
-    p = options.Parser("bench", "REPORT", "Measure what the codec, the renderer and the trainer promise.", details)
-    p.add_argument("report", metavar="REPORT", choices=tuple(REPORTS), help="what to measure, see below")
+    summary = "Measure error against run time, numerical stability and latency."
+    p = options.Parser("bench", "REPORT", summary, details)
+    p.add_argument("report", metavar="REPORT", choices=tuple(REPORTS), help="report to make, see below")
     p.add_common()
     return p
 
@@ -384,7 +370,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     arguments = list(sys.argv[1:] if argv is None else argv)
     if not arguments or arguments[0] not in REPORTS:
         return common.run(parser(), _misplaced, arguments)
-    return common.run(parser(arguments[0]), partial(_report, REPORTS[arguments[0]][3]), arguments[1:])
+    return common.run(parser(arguments[0]), partial(_report, REPORTS[arguments[0]].execute), arguments[1:])
 
 
 def _misplaced(args: argparse.Namespace, console: Console) -> int:
@@ -392,20 +378,25 @@ def _misplaced(args: argparse.Namespace, console: Console) -> int:
 
 
 def _report(execute: Callable[..., Outcome], args: argparse.Namespace, console: Console) -> int:
-    """Refuses outputs that cannot be written before any work, and writes them after it; FAILED if the report did."""
+    """Checks the outputs, makes the report and writes it; FAILED if a row of it failed."""
+    from pd4dgs_codec.io import finite, whole_file
+
     console.json = args.json == STDIO
     plot = getattr(args, "plot", None)
     if plot is not None and Path(plot).suffix.lower() != ".png":
         raise UsageError(f"found --plot {plot}, expected a name that ends in .png")
-    for path in (plot, None if args.json == STDIO else args.json):
+    for path in (plot, args.json):
         if path is not None:
             check_output(path, args.overwrite)
     found = execute(args, console)
-    if plot is not None and found.draw is not None:
+    if plot is not None:
+        from pd4dgs_codec.bench.report import draw
+
         with whole_file(plot, args.overwrite) as temporary:
-            found.draw(temporary)
+            draw(found.panels, found.error, temporary)
     if args.json not in (None, STDIO):
-        write_bytes(args.json, (json.dumps(finite(found.result), indent=1) + "\n").encode(), args.overwrite)
+        text = json.dumps(finite(found.result), indent=1) + "\n"
+        common.write_bytes(args.json, text.encode(), args.overwrite)
     for line in found.failures:
         console.message(line)
     console.result(found.result, found.text, on_stdout=True)

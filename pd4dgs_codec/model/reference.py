@@ -17,6 +17,8 @@ from pd4dgs_codec.draw.projection import ALPHA_MAX, ALPHA_MIN, EPS2D, FAR
 from pd4dgs_codec.scene import Camera
 
 T_MIN = 1e-4
+#: Pixels of the side of a block.
+BLOCK = 16
 
 
 def _rotations(quats: Tensor) -> Tensor:
@@ -73,6 +75,23 @@ def composite(
     return weights @ colors, weights.sum(-1, keepdim=True)
 
 
+def composite_blocks(
+    means2d: Tensor, radii: Tensor, conics: Tensor, opacities: Tensor, colors: Tensor, width: int, height: int
+) -> tuple[Tensor, Tensor]:
+    """`composite` in blocks of pixels, each with the Gaussians whose radii [N, 2] reach it: for any number of them."""
+    image, alpha = colors.new_zeros(height, width, 3), colors.new_zeros(height, width, 1)
+    for top in range(0, height, BLOCK):
+        for left in range(0, width, BLOCK):
+            corner, size = means2d.new_tensor([left, top]), (min(BLOCK, width - left), min(BLOCK, height - top))
+            reach = (means2d + radii > corner) & (means2d - radii < corner + BLOCK)
+            own = torch.nonzero(reach.all(-1))[:, 0]
+            block = slice(top, top + BLOCK), slice(left, left + BLOCK)
+            image[block], alpha[block] = composite(
+                means2d[own] - corner, conics[own], opacities[own], colors[own], *size
+            )
+    return image, alpha
+
+
 def rasterize(
     means: Tensor,
     quats: Tensor,
@@ -99,7 +118,10 @@ def rasterize(
     pixels = means.new_zeros((1, n, 2)).index_copy(1, index, means2d[None, seen].detach())
     pixels.requires_grad_(torch.is_grad_enabled() and means2d.requires_grad)
     moved = means2d[seen] + (pixels - pixels.detach())[0, index]  # 0, for the gradient by pixels
-    image, alpha = composite(moved, conics, opacities[seen], colors[seen], width, height)
+    if torch.is_grad_enabled():
+        image, alpha = composite(moved, conics, opacities[seen], colors[seen], width, height)
+    else:
+        image, alpha = composite_blocks(moved, radii[seen], conics, opacities[seen], colors[seen], width, height)
     image = image + (1.0 - alpha) * torch.from_numpy(background).to(means)
     radii = means.new_zeros((1, n, 2)).index_copy(1, index, radii[None, seen]).to(torch.int32)
     return image, alpha[..., 0], {"means2d": pixels, "radii": radii}

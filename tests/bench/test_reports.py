@@ -1,8 +1,7 @@
-"""The reports codec, render and train: fronts and tables by hand, the oracle in blocks, and a tiny model end to end."""
+"""The reports codec, render, train and latency: figures by hand, and a tiny model end to end."""
 
 from __future__ import annotations
 
-import importlib
 import json
 import math
 import platform
@@ -14,20 +13,25 @@ import torch
 from PIL import Image
 from tiny import TINY, write_views
 
-from pd4dgs_codec.bench import codec, pictures, render, report, timing, train
+from pd4dgs_codec import encode
+from pd4dgs_codec.bench import codec, latency, render, report, timing
 from pd4dgs_codec.cli import bench
-from pd4dgs_codec.errors import DataError, Pd4Error
-from pd4dgs_codec.format.encoder import encode
+from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.plan import plan
 from pd4dgs_codec.model.config import PRESETS
-from pd4dgs_codec.model.rasterization import rasterization
 from pd4dgs_codec.quality.frames import Frame
 from pd4dgs_codec.scene import Camera
+from pd4dgs_codec.web.server import Server
 
-RNG = np.random.default_rng(4)
 
-# -- fronts, times, plots ----------------------------------------------------------------------------------------------
+@pytest.fixture
+def scene_pd4(data, tmp_path):
+    (tmp_path / "scene.pd4").write_bytes(data)
+    return tmp_path / "scene.pd4"
+
+
+# -- common parts ------------------------------------------------------------------------------------------------------
 
 
 def test_pareto_front_by_hand():
@@ -36,46 +40,28 @@ def test_pareto_front_by_hand():
     assert report.pareto_front([]) == []
 
 
-def test_median_and_quartiles():
+def test_times_are_medians_with_quartiles_of_repetitions_within_the_budget():
     assert timing.summary([4.0, 1.0, 2.0, 3.0, 5.0]) == timing.Timing(3.0, 2.0, 4.0, 5)
     assert timing.summary([2.0]).text() == "2"
-
-
-def test_work_is_repeated_until_the_budget_is_spent():
     calls = []
-    _, found = timing.measure(lambda: calls.append(1), 4, budget=math.inf)
-    assert found.repeats == len(calls) == 4
-    assert timing.measure(lambda: None, 4, budget=0.0)[1].repeats == 1
-
-
-def test_a_cold_run_reports_its_own_memory(tmp_path, scene):
-    path = tmp_path / "scene.pd4"
-    path.write_bytes(encode(scene, effort=1))
-    ballast = np.ones(200 << 20, np.uint8)  # a child must not be charged for its parent's memory
-    found = timing.cold("decode", [str(path)], 1)
-    assert found.seconds.median > 0 and 10 << 20 < found.peak_bytes < ballast.nbytes
-    path.write_bytes(b"nothing")
-    with pytest.raises(Pd4Error, match=r"^pd4dgs-decode: error: .*scene.pd4"):
-        timing.cold("decode", [str(path)], 1)
+    assert len(timing.clock(lambda: calls.append(1), 4, budget=math.inf)[1]) == len(calls) == 4
+    assert len(timing.clock(lambda: None, 4, budget=0.0)[1]) == 1
 
 
 def test_the_machine_is_described_without_names_or_paths():
-    about = timing.machine("numpy", "no-such-package")
+    about = timing.machine()
     assert about["cpus"] >= 1 and about["versions"]["numpy"] == np.__version__
-    assert about["versions"]["no-such-package"] is None
     text = timing.machine_line(about)
     assert "Python" in text and "/" not in text.replace("n/a", "") and platform.node() not in text
 
 
-def test_plots_take_zeros_and_many_series(tmp_path):
+def test_plots_take_zeros_and_many_series_in_black_and_white(tmp_path):
     series = [(f"s{i}", [(1.0 + i, 0.1 / (i + 1)), (2.0 + i, 0.0)]) for i in range(9)]
     panels = [report.Panel("a", "x", series), report.Panel("b", "y", series[:1])]
     report.draw(panels, "error", tmp_path / "p.png")
     with Image.open(tmp_path / "p.png") as image:
         assert image.width > 800
-        pixels = np.asarray(image.convert("RGB")).astype(int)
-    assert len(set(report.STYLES)) == len(report.STYLES)
-    assert np.ptp(pixels, axis=2).max() == 0  # black and white, nothing told by colour
+        assert np.ptp(np.asarray(image.convert("RGB")).astype(int), axis=2).max() == 0
 
 
 # -- codec -------------------------------------------------------------------------------------------------------------
@@ -98,184 +84,173 @@ def test_picture_deviations_by_hand():
         def picture(self, camera, time):
             return np.full((16, 16, 3), 0.25 + time / 4, np.float32)
 
-    frames = [Frame(None, 0.0), Frame(None, 1.0)]
-    (found,) = codec.picture_deviations([Fake()], frames, {0: [np.full((16, 16, 3), 0.25, np.float32)] * 2})
-    assert found.rmse == pytest.approx(0.25 / math.sqrt(2)) and found.psnr == pytest.approx(15.0515, abs=1e-4)
     want = [np.full((16, 16, 3), 0.25, np.float32)]
-    same, above = codec.picture_deviations([Fake()], frames[:1], {0: want, 2: [want[0] + 0.5]})
+    (found,) = codec.picture_deviations([Fake()], [Frame(None, 0.0), Frame(None, 1.0)], {0: want * 2})
+    assert found.rmse == pytest.approx(0.25 / math.sqrt(2)) and found.psnr == pytest.approx(15.0515, abs=1e-4)
+    same, above = codec.picture_deviations([Fake()], [Frame(None, 0.0)], {0: want, 2: [want[0] + 0.5]})
     assert same.rmse == 0 and same.psnr == math.inf and same.ssim == 1
-    assert (above.level, above.rmse) == (2, 0.5)  # the file has no level 2: its picture is that of level 0
+    assert (above.level, above.rmse) == (2, 0.5)  # without level 2 the image is that of level 0
 
 
-def test_a_sweep_of_a_checkpoint(model_pt, tmp_path, capsys, monkeypatch):
-    fresh = []
-
-    def cold(verb, arguments, repeats):  # the same commands, but not in processes of their own
-        assert importlib.import_module(f"pd4dgs_codec.cli.{verb}").main(arguments) == 0
-        fresh.append(verb)
-        return timing.Cold(timing.summary([1.0] * repeats), 1 << 20)
-
-    monkeypatch.setattr(codec, "cold", cold)
-    options = ["--step-scales", "1,4", "--efforts", "1", "--repeats", "2", "--cold", "1", "--views", "2"]
+def test_a_sweep_of_a_checkpoint(model_pt, tmp_path, capsys):
+    options = ["--step-scales", "1,4", "--efforts", "1", "--repeats", "2", "--views", "2"]
     files = ["--json", str(tmp_path / "a.json"), "--plot", str(tmp_path / "a.png")]
     assert bench.main(["codec", str(model_pt), *options, *files]) == 0
-    result = json.loads((tmp_path / "a.json").read_text())
-    points = result["points"]
+    points = json.loads((tmp_path / "a.json").read_text())["points"]
     assert [(p["step_scale"], p["mode"]) for p in points] == [(1, "ans"), (1, "lzma"), (4, "ans"), (4, "lzma")]
     for p in points:
         assert sum(p["layer_bytes"]) < p["bytes"] and p["encode"]["repeats"] == p["decode"]["repeats"] == 2
-        assert (p["encode_cold"] is not None) == (p["decode_cold"] is not None) == (p["step_scale"] == 1)
         assert len(p["pictures"]) == 3 and p["coded_bits"] > 0
-    assert fresh == ["decode", "encode"] * 2
     exact, coarse = points[0], points[2]
     assert all(v["largest"] == 0 for v in exact["values"])  # the scene lies on its steps
     assert max(v["largest"] / v["step"] for v in coarse["values"]) == pytest.approx(0.5)
-    assert len(coarse["layer_bytes"]) == 1  # its deformations vanish, which its highest level must pay for
+    assert len(coarse["layer_bytes"]) == 1  # its deformations vanish, which increases the error of its highest level
     assert exact["error"] < coarse["error"] and "bytes" in points[3]["fronts"]
     assert points[0]["pictures"] == points[1]["pictures"]
     out = capsys.readouterr().out
-    assert out.count("\n| 1 ") == 2 + 8 and "share of opacity" in out and "CPUs" in out
-    assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
+    assert "| steps x " in out and "coded / ΣR" in out and (tmp_path / "a.png").exists()
 
 
-def test_a_file_alone_has_bytes_and_times(data, tmp_path, capsys):
-    path = tmp_path / "scene.pd4"
-    path.write_bytes(data)
-    assert bench.main(["codec", str(path), "--quick", "--json"]) == 0
+def test_a_file_alone_has_bytes_and_times_but_no_error(scene_pd4, tmp_path, capsys):
+    assert bench.main(["codec", str(scene_pd4), "--repeats", "1", "--json"]) == 0
     (point,) = json.loads(capsys.readouterr().out)["points"]
-    assert point["bytes"] == len(data) and point["values"] == [] and point["error"] is None
+    assert point["error"] is None and point["bytes"] == scene_pd4.stat().st_size
+    assert bench.main(["codec", str(scene_pd4), "--plot", str(tmp_path / "p.png")]) == 2
+    assert "no error to plot" in capsys.readouterr().err
 
 
 # -- render ------------------------------------------------------------------------------------------------------------
 
 
-def random_view(n=60, width=37, height=21):
-    viewmat = np.eye(4, dtype=np.float32)
-    viewmat[2, 3] = 3.0
-    K = np.array([[30, 0, width / 2], [0, 30, height / 2], [0, 0, 1]], np.float32)
-    return {
-        "means": RNG.uniform(-1.5, 1.5, (n, 3)).astype(np.float32),
-        "quats": RNG.normal(size=(n, 4)).astype(np.float32),
-        "scales": RNG.uniform(0.02, 0.6, (n, 3)).astype(np.float32),
-        "opacities": RNG.uniform(0.0, 1.0, n).astype(np.float32),
-        "colors": RNG.uniform(0, 1, (n, 3)).astype(np.float32),
-        "viewmat": viewmat,
-        "K": K,
-        "width": width,
-        "height": height,
-        "near": 0.1,
-        "background": np.array([0.2, 0.5, 0.9], np.float32),
+def random_view(n: int = 150) -> render.View:
+    rng = np.random.default_rng(4)
+    splats = {
+        "means": rng.uniform(-1.5, 1.5, (n, 3)),
+        "quats": rng.normal(size=(n, 4)),
+        "scales": rng.uniform(0.02, 0.6, (n, 3)),
+        "opacities": rng.uniform(0.0, 1.0, n),
+        "colors": rng.uniform(0, 1, (n, 3)),
     }
+    viewmat, K = np.eye(4, dtype=np.float32), np.array([[40, 0, 25], [0, 40, 17], [0, 0, 1]], np.float32)
+    viewmat[2, 3] = 2.0
+    tensors = {name: torch.from_numpy(value.astype(np.float32)) for name, value in splats.items()}
+    return {**tensors, "camera": Camera(viewmat, K, 50, 35), "background": (0.2, 0.5, 0.9), "near_plane": 0.1}
 
 
-def test_the_oracle_in_blocks_is_the_dense_oracle():
+def test_the_reference_in_blocks_is_the_dense_one():
+    from pd4dgs_codec.model.rasterization import rasterization
+
     view = random_view()
-    given = {k: torch.from_numpy(v) if isinstance(v, np.ndarray) else v for k, v in view.items()}
-    names = ("means", "quats", "scales", "opacities", "colors")
-    dense = rasterization(
-        *(given[name] for name in names), Camera(view["viewmat"], view["K"], view["width"], view["height"]),
-        view["background"], near_plane=0.1, backend="reference",
-    )[0]  # fmt: skip
-    np.testing.assert_allclose(pictures.oracle(view), dense.numpy(), rtol=0, atol=1e-12)
+    dense = rasterization(**view, backend="reference")[0]
+    with torch.no_grad():
+        blocks = rasterization(**view, backend="reference")[0]
+    np.testing.assert_allclose(blocks, dense, rtol=0, atol=1e-12)
 
 
-def test_ways_to_draw_against_the_oracle(tmp_path):
-    names = (render.ORACLE, render.TEXTBOOK, render.KERNELS, render.GSPLAT)
-    points = {p.name: p for p in render.sweep([random_view()], names, 3, tmp_path)}
+def test_rasterisers_are_compared_with_the_reference():
+    points = {p.name: p for p in render.sweep([random_view()], tuple(render.BACKENDS), 3)}
     assert points[render.ORACLE].rmse == 0
-    assert 0 < points[render.TEXTBOOK].rmse < 1e-5 and 0 < points[render.KERNELS].rmse < 1e-5
-    assert points[render.KERNELS].milliseconds.repeats == 3
+    assert 0 < points[render.KERNELS].rmse < 1e-5 and points[render.KERNELS].milliseconds.repeats == 3
     if not torch.cuda.is_available():
         assert points[render.GSPLAT].missing == "there is no CUDA device"
-    rows = render.table(list(points.values())).splitlines()
-    assert len(rows) == 2 + 4 and all(row.count("|") == 8 for row in rows)
+    assert len(render.table(list(points.values())).splitlines()) == 2 + 3
 
 
-@pytest.mark.slow
-def test_every_variant_of_the_kernels(tmp_path):
-    view = random_view(n=400)  # so dense that every threshold decides some pixel
-    points = {p.name: p for p in render.sweep([view], (render.KERNELS, *render.VARIANTS), 2, tmp_path)}
-    own = points[render.KERNELS].rmse
-    assert points["tile 16x16"].rmse == points["tile 8x16"].rmse == own  # tiles decide no pixel
-    assert own < points["T > 1e-3"].rmse < points["T > 1e-2"].rmse
-    assert own < points["alpha >= 1/128"].rmse < points["alpha >= 1/64"].rmse
+def test_render_report_of_file_and_checkpoint(scene_pd4, model_pt, capsys):
+    for path in (scene_pd4, model_pt):
+        assert bench.main(["render", str(path), "--only", "kernels", "--repeats", "1", "--views", "1", "--json"]) == 0
+        result = json.loads(capsys.readouterr().out)
+        assert result["points"][0]["rmse"] < 1e-5 and result["pictures"][0]["gaussians"] > 0
 
 
 # -- train -------------------------------------------------------------------------------------------------------------
 
 
-def test_runs_that_exist(model_pt, tmp_path, capsys):
-    log = tmp_path / "run.jsonl"
-    records = [{"seconds": 1.0}, {"seconds": 3.0, "held_out_psnr": [20.0], "anchors": 7}]
-    log.write_text("".join(json.dumps(r) + "\n" for r in records))
-    assert bench.main(["train", "--from", str(model_pt), str(log), "--json"]) == 0
-    first, second = json.loads(capsys.readouterr().out)["runs"]
-    assert first["name"].endswith("model.pt (tiny)") and second["anchors"] == 7
-    assert [p["rmse"] for p in first["curve"]] == pytest.approx([0.1, 0.01])
-    assert [p["front"] for p in first["curve"]] == [True, True] and second["curve"][0]["front"] is False
-
-
-def test_a_run_without_evaluations_or_records_is_refused(tmp_path):
-    log = tmp_path / "run.jsonl"
-    log.write_text('{"seconds": 1.0}\n')
-    with pytest.raises(DataError, match="no held-out quality"):
-        train.of_file(str(log))
-    log.write_text('{"seconds": 1.0}\nnothing\n')
-    with pytest.raises(DataError, match="line 2"):
-        train.of_file(str(log))
+def test_existing_runs_are_reported(model_pt, capsys):
+    assert bench.main(["train", "--from", str(model_pt), "--json"]) == 0
+    (run,) = json.loads(capsys.readouterr().out)["runs"]
+    assert run["name"] == "model.pt (tiny)" and [p["front"] for p in run["curve"]] == [True, True]
+    assert [p["rmse"] for p in run["curve"]] == pytest.approx([0.1, 0.01])
 
 
 def test_presets_are_trained_and_compared(tmp_path, capsys, monkeypatch):
     monkeypatch.setitem(PRESETS, "tiny", TINY)
     argv = ["train", str(write_views(tmp_path)), "--holdout", "2", "--presets", "tiny", "--iterations", "4"]
-    assert bench.main([*argv, "--plot", str(tmp_path / "t.png"), "--json"]) == 0
+    assert bench.main([*argv, "-o", str(tmp_path / "t.png"), "--json"]) == 0
     (run,) = json.loads(capsys.readouterr().out)["runs"]
     assert run["name"] == "tiny" and run["anchors"] > 0 and len(run["curve"]) >= 2
     assert all(p["rmse"] == pytest.approx(10 ** (-p["psnr"][-1] / 20)) for p in run["curve"])
     assert (tmp_path / "t.png").exists()
 
 
-# -- the commands ------------------------------------------------------------------------------------------------------
+# -- latency -----------------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("report", ["codec", "render", "train"])
+def test_latency_of_a_file(scene_pd4, data, capsys, monkeypatch):
+    monkeypatch.setattr(latency, "first_start", lambda data, rate: 12.3)  # takes seconds to compile the kernels
+    assert bench.main(["latency", str(scene_pd4), "--rates", "50M", "--runs", "1", "--json"]) == 0
+    (found,) = json.loads(capsys.readouterr().out)["files"]
+    assert [(row["level"], row["bytes"]) for row in found["times"]] == latency.layer_rows(data)
+    assert found["first_start"] == 12.3
+    for row in found["times"]:
+        assert row["expected"] == 8 * row["bytes"] / 50e6 and type(row["within"]) is bool
+        assert 0 < row["after_last_byte"] <= row["picture"] and 0 < row["network"] and 0 < row["cold"]
+
+
+@pytest.mark.parametrize(
+    "expected, off, within",
+    [(0.1, 0.0, True), (0.1, 0.0099, True), (0.1, -0.011, False), (10.0, 0.29, True), (10.0, 0.31, False)],
+)
+def test_the_tolerance_is_the_larger_of_a_share_and_of_seconds(expected, off, within):
+    assert latency.Times(1e6, 0, 12_500, expected, expected + off, 1, 1, 1).within == within
+
+
+def test_a_file_without_a_camera_cannot_be_rendered(scene, tmp_path):
+    blind = encode(replace(scene, info=replace(scene.info, camera=None)), layers=0, effort=1)
+    (tmp_path / "scene.pd4").write_bytes(blind)
+    with Server(tmp_path) as server, server.running(), pytest.raises(DataError, match="camera"):
+        list(latency.pictures(f"{server.url}scene.pd4"))
+    assert bench.main(["latency", str(tmp_path / "scene.pd4")]) == 1
+
+
+# -- the command -------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("report", bench.REPORTS)
 def test_help_has_examples(report, capsys):
     with pytest.raises(SystemExit):
         bench.main([report, "--help"])
     out = capsys.readouterr().out
-    assert f"pd4dgs-bench {report} " in out.split("examples:")[1]
+    assert out.startswith(f"usage: pd4dgs-bench {report} ") and f"pd4dgs-bench {report} " in out.split("examples:")[1]
     assert max(map(len, out.splitlines())) <= 120
 
 
 @pytest.mark.parametrize(
     "argv, code, word",
     [
-        (["codec", "none.pt"], 1, "none.pt"),
-        (["codec", "none.pt", "--efforts", "1,12"], 2, "from 1 to 9"),
-        (["codec", "none.pt", "--modes", "ans,zip"], 2, "ans, lzma"),
-        (["render", "none.pd4", "--only", "kernel"], 2, "kernels"),
-        (["train"], 2, "--from"),
-        (["train", "synthetic:static", "--from", "a.pt"], 2, "no SOURCE"),
-        (["train", "synthetic:static", "--seconds", "3", "--iterations", "3"], 2, "one of them"),
+        ("codec none.pt", 1, "none.pt"),
+        ("codec none.pt --efforts 1,12", 2, "from 1 to 9"),
+        ("codec none.pt --modes ans,zip", 2, "ans, lzma"),
+        ("codec none.pt --plot p.gif", 2, "ends in .png"),
+        ("render none.pd4 --only kernel", 2, "kernels"),
+        ("train", 2, "--from"),
+        ("train synthetic:static --from a.pt", 2, "no SOURCE"),
+        ("train synthetic:static --seconds 3 --iterations 3", 2, "one of them"),
+        ("latency none.pd4 --rates fast", 2, "expected a rate"),
+        ("stability --only nowhere", 2, "nowhere"),
+        ("--json stability", 2, "the report first"),
+        ("stabilty", 2, "stabilty"),
+        ("", 2, "REPORT"),
     ],
 )
-def test_usage_errors(argv, code, word, capsys):
-    assert bench.main(argv) == code
-    err = capsys.readouterr().err
-    assert word in err and len(err.splitlines()) == 1
+def test_bad_input_is_one_line(argv, code, word, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    assert bench.main(argv.split()) == code
+    out, err = capsys.readouterr()
+    assert word in err and len(err.splitlines()) == 1 and not list(tmp_path.iterdir())
 
 
 def test_outputs_that_exist_are_refused_before_any_work(tmp_path, capsys):
     (tmp_path / "p.png").write_bytes(b"kept")
     assert bench.main(["codec", "none.pt", "--plot", str(tmp_path / "p.png")]) == 1
     assert "exists already" in capsys.readouterr().err and (tmp_path / "p.png").read_bytes() == b"kept"
-
-
-def test_a_file_alone_has_nothing_to_plot(tmp_path, capsys, scene):
-    (tmp_path / "scene.pd4").write_bytes(encode(scene, effort=1))
-    assert bench.main(["codec", str(tmp_path / "scene.pd4"), "--plot", str(tmp_path / "p.png")]) == 2
-    assert "no error to plot" in capsys.readouterr().err
-
-
-def test_spread_takes_the_middle_of_each_share():
-    assert pictures.spread(range(10), 2) == [2, 7] and pictures.spread([1, 2], 5) == [1, 2]

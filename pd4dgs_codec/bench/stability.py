@@ -1,4 +1,4 @@
-"""The stability table: what a case and its row are, and what the rooms share."""
+"""The stability table: cases, their outcomes as rows, and the scene that the cases share."""
 
 from __future__ import annotations
 
@@ -10,27 +10,22 @@ from importlib import import_module
 from typing import Any
 
 import numpy as np
-import torch
 
-from pd4dgs_codec.bench.report import markdown
-from pd4dgs_codec.draw.visibility import near_plane
+from pd4dgs_codec.bench.report import markdown, optional
 from pd4dgs_codec.errors import DataError, Pd4Error
-from pd4dgs_codec.model.model import Model
-from pd4dgs_codec.model.picture import render
-from pd4dgs_codec.model.rasterization import rasterization
 from pd4dgs_codec.scene import Camera, Deformation, Network, Scene, SceneInfo, Steps, Widths
 
 PASS, REFUSED, FAIL = "pass", "refused", "fail"
-#: Modules of this folder, in the table's order.
-ROOMS = ("rate", "symbols", "fields", "rasteriser", "training")
-#: What came out, in words, and the error; NaN breaks every promise.
+#: Modules with cases, in the order of the table.
+MODULES = ("stable_symbols", "stable_scenes")
+#: The outcome in words, and the error; NaN fails every bound.
 Found = tuple[str, float]
 
 
 @dataclass(frozen=True)
 class Case:
-    """One stiff or extreme input. fed, promised: in words. bound: the largest error that keeps the promise. refuses:
-    the error that must be raised instead, for input that has no answer; bound is then unused."""
+    """One stiff or extreme input. fed, promised: in words. bound: the largest error that passes. refuses: the error
+    that must be raised instead, for input without an answer; bound is then unused."""
 
     group: str
     case: str
@@ -43,7 +38,7 @@ class Case:
 
 @dataclass(frozen=True)
 class Row:
-    """A case and its outcome. error and bound: None where there was nothing to measure. status: pass, refused, fail."""
+    """A case and its outcome. error and bound: None if nothing was measured. status: pass, refused or fail."""
 
     case: str
     group: str
@@ -56,7 +51,7 @@ class Row:
 
 
 def refusal(group: str, case: str, fed: str, error: type[Pd4Error], act: Callable[[], object]) -> Case:
-    """The case of an input that must be refused with `error` in one line; anything that `act` returns is a failure."""
+    """The case of an input that must be refused with `error` in one line; if `act` returns, the row fails."""
 
     def measure() -> Found:
         act()
@@ -66,8 +61,8 @@ def refusal(group: str, case: str, fed: str, error: type[Pd4Error], act: Callabl
 
 
 def judge(case: Case) -> Row:
-    """Runs a case. Whatever it raises is a failed row, but for the refusal that was promised; a module that is missing
-    is the caller's concern."""
+    """Runs a case. Every exception is a failed row, except the promised refusal and a missing module, which is
+    raised."""
     error: float | None = None
     try:
         got, error = case.measure()
@@ -84,8 +79,8 @@ def judge(case: Case) -> Row:
 
 def chosen(name: str | None) -> list[Case]:
     """The cases of the group `name`, else those with `name` in their own name; all for None. In the table's order."""
-    rooms = (import_module(f"{__package__}.{room}") for room in ROOMS)
-    cases: list[Case] = [case for room in rooms for case in room.cases()]
+    modules = (import_module(f"{__package__}.{module}") for module in MODULES)
+    cases: list[Case] = [case for module in modules for case in module.cases()]
     if name is None:
         return cases
     return [c for c in cases if c.group == name] or [c for c in cases if name.lower() in c.case.lower()]
@@ -98,26 +93,25 @@ def counts(rows: Sequence[Row]) -> dict[str, int]:
 
 
 def text(rows: Sequence[Row]) -> str:
-    """The rows as one Markdown table per group, and a line that counts them."""
+    """The rows as one Markdown table per group, and a line with the counts."""
     head, parts = ("case", "fed", "promised", "came out", "error", "bound", "status"), []
     for group in dict.fromkeys(row.group for row in rows):
-        own = [row for row in rows if row.group == group]
-        cells = [(r.case, r.fed, r.promised, r.got, _number(r.error), _number(r.bound), r.status) for r in own]
+        cells = [
+            (r.case, r.fed, r.promised, r.got, optional(r.error, ".2g"), optional(r.bound, ".2g"), r.status)
+            for r in rows
+            if r.group == group
+        ]
         parts.append(f"## {group}\n\n" + markdown(head, [[c.replace("|", "\\|") for c in line] for line in cells]))
     found = counts(rows)
     parts.append(f"{len(rows)} rows: {found[PASS]} pass, {found[REFUSED]} refused as promised, {found[FAIL]} fail")
     return "\n\n".join(parts)
 
 
-def _number(value: float | None) -> str:
-    return "-" if value is None else f"{value:.2g}"
-
-
-# -- what the rooms share ----------------------------------------------------------------------------------------------
+# -- shared by the cases -----------------------------------------------------------------------------------------------
 
 
 def mpmath() -> Any:
-    """The library of the high-precision references. Raises DataError where it is not installed."""
+    """The library of the high-precision references. Raises DataError if it is not installed."""
     try:
         return import_module("mpmath")
     except ModuleNotFoundError:
@@ -126,7 +120,7 @@ def mpmath() -> Any:
 
 
 def largest(errors: Iterable[float]) -> float:
-    """The largest of some numbers, NaN if one is."""
+    """The largest of some numbers, NaN if one is NaN."""
     return float(np.max(np.array(list(errors))))
 
 
@@ -136,11 +130,11 @@ _VIEWMAT = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]], np
 CAMERA = Camera(_VIEWMAT, np.array([[40, 0, WIDTH / 2], [0, 40, HEIGHT / 2], [0, 0, 1]], np.float32), WIDTH, HEIGHT)
 
 
-def small_scene(deformation: Deformation | None = None, anchors: int = 40, mask: int = 255) -> Scene:
-    """A few anchors in front of CAMERA: layer 0, or layers 0 and 1 with a global deformation. mask: of every anchor."""
-    rng = np.random.default_rng(3)
-    cells = rng.choice(21**3, anchors, replace=False)
+def small_scene(deformation: Deformation | None = None, mask: int = 255) -> Scene:
+    """40 anchors in front of CAMERA: layer 0, or layers 0 and 1 with a global deformation. mask: of every anchor."""
+    rng, anchors = np.random.default_rng(3), 40
     layers = (0,) if deformation is None else (0, 1)
+    cells = rng.choice(21**3, anchors, replace=False)
     networks: dict[str, Network] = {
         name: ((rng.normal(0, 0.3, (n, 35)).astype(np.float32), np.full(n, 0.2, np.float32)),)
         for name, n in Widths().networks.items()
@@ -158,17 +152,3 @@ def small_scene(deformation: Deformation | None = None, anchors: int = 40, mask:
         networks=networks,
         global_deformation=deformation,
     )
-
-
-@torch.no_grad()
-def picture_error(model: Model, level: int, t: float, camera: Camera = CAMERA) -> float:
-    """Largest difference of a channel of a pixel between the float32 picture and the float64 oracle's picture of the
-    same Gaussians; NaN where the former is not finite."""
-    picture = render(model, level, t, camera)
-    g, near = picture.gaussians, near_plane(model.info)
-    drawn = g.colors.isfinite().all(1)
-    means, quats, scales, opacities, colors = (a[drawn] for a in (g.means, g.quats, g.scales, g.opacities, g.colors))
-    expected, _, _ = rasterization(
-        means, quats, scales, opacities, colors, camera, model.info.background, near_plane=near, backend="reference"
-    )
-    return float((picture.image.double() - expected).abs().max())

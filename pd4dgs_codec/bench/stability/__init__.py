@@ -1,1 +1,0 @@
-"""Stiff and extreme cases, each with what was fed, promised and found."""
