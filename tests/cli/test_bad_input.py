@@ -1,70 +1,113 @@
-"""Bad input: one line on stderr, exit 1, no traceback, nothing left behind, and nothing in the input is run."""
+"""Bad input to every command: one line on stderr, exit 1 or 2, no traceback, nothing written, no code in it run."""
 
 from __future__ import annotations
 
 import errno
+import json
 import os
-import subprocess
-import sys
+import shlex
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
+from pd4dgs_codec import encode
+from pd4dgs_codec.__main__ import MODULES
 
-def _listing(folder: Path) -> dict[str, int]:
-    return {str(p.relative_to(folder)): p.stat().st_size for p in sorted(folder.rglob("*"))}
-
-
-@pytest.fixture
-def fails(cli, tmp_path):
-    """fails(verb, *argv, says=...): the command must fail cleanly, with and without --json."""
-
-    def check(verb: str, *argv: object, says: str = "", stdin: bytes | None = None):
-        before = _listing(tmp_path)
-        plain = cli(verb, *argv, stdin=stdin)
-        assert plain.code == 1 and plain.out == b""
-        assert len(plain.error_lines) == 1, plain.err
-        assert plain.err.startswith(f"pd4dgs-{verb}: error: ") and "internal error" not in plain.err
-        assert says in plain.err
-        told = cli(verb, *argv, "--json", stdin=stdin)
-        assert told.code == 1 and len(told.error_lines) == 1
-        error = told.json["error"]
-        assert error["message"] in told.err and error["type"]
-        assert _listing(tmp_path) == before
-        return error
-
-    return check
-
-
-# -- datasets ----------------------------------------------------------------------------------------------------------
-
-
-def test_train_on_a_broken_dataset(fails, dataset, tmp_path):
-    """All that can be broken is tested with the readers."""
-    (dataset / "001.png").unlink()
-    fails("train", dataset, "-o", tmp_path / "m.pt", "--iterations", 3, "--log", tmp_path / "log.jsonl", says="001")
-
-
-@pytest.mark.parametrize("verb", ["train", "eval", "render"])
-@pytest.mark.parametrize("source", ["missing", "empty", "file", "synthetic:nothing"])
-def test_sources_that_are_no_dataset(fails, scene_pd4, tmp_path, verb, source):
-    (tmp_path / "empty").mkdir()
-    (tmp_path / "file").write_text("not a folder")
-    place = source if ":" in source else tmp_path / source
-    argv = {
-        "train": [place, "-o", tmp_path / "m.pt"],
-        "eval": [scene_pd4, place],
-        "render": [scene_pd4, "-o", tmp_path / "a.gif", "--data", place],
-    }[verb]
-    fails(verb, *argv, says=source)
-
-
-# -- checkpoints -------------------------------------------------------------------------------------------------------
+#: Exit code, command line, and a part of the message. SCENE, MODEL and DATA are a .pd4, a checkpoint and a dataset;
+#: others are files of `folder`.
+CASES = [
+    # wrong usage
+    (2, "train synthetic:local", "-o"),
+    (2, "train synthetic:local -o m.pt --iterations 0", "at least 1"),
+    (2, "train synthetic:local -o m.pt --max-seconds nan", "more than 0"),
+    (2, "train synthetic:local -o m.pt --quality 101", "0 to 100"),
+    (2, "train synthetic:local -o m.pt --seed 9223372036854775807", "--seed"),
+    (2, "train synthetic:local -o m.pt --feature-width 65", "from 1 to 64"),
+    (2, "train synthetic:local -o -", "named files"),
+    (2, "train synthetic:local -o m.pt --log m.pt", "two files"),
+    (2, "train synthetic:local -o m.pt --without rate --rate-scale 0.5", "--without rate"),
+    (2, "encode m.pt", "-o"),
+    (2, "encode m.pt -o s.pd4 --effort 10", "--effort"),
+    (2, "encode m.pt -o s.pd4 --step-scale -1", "a number > 0"),
+    (2, "encode m.pt -o s.pd4 --lay 1", "--lay"),
+    (2, "encode m.pt -o s.pd4 --min-gain 1", "--min-gain needs --data"),
+    *(
+        (2, f"encode m.pt -o s.pd4 --target-size={text}", "expected sizes in bytes such as L0=425k")
+        for text in ("425k", "L3=1k", "L0=1k,L0=2k", "L0=", "L0=-5", "L0=0.5", "L0=1k,")
+    ),
+    (2, "decode s.pd4 -o s.txt", ".npz or .pt"),
+    (2, "decode s.pd4 --symbols", "FILE.npz"),
+    (2, "decode s.pd4 -o s.pt --symbols", "FILE.npz"),
+    (2, "decode s.pd4 --max-layer 3", "--max-layer"),
+    (2, "info", "FILE"),
+    (2, "info s.pd4 --at 2X", "2M or 500k"),
+    (2, "info s.pd4 --at 0M", "2M or 500k"),
+    (2, "render s.pd4 -o film.avi", ".gif or .mp4"),
+    (2, "render s.pd4 -o %s.png", "%04d"),
+    (2, "render s.pd4 -o %04d-%04d.png", "%04d"),
+    (2, "render s.pd4 -o a.gif --data set --orbit 3", "--orbit"),
+    (2, "render SCENE -o b.png --frames 2", "--frames 1"),
+    (2, "eval s.pd4", "SOURCE"),
+    (2, "eval s.pd4 set --downscale half", "an integer >= 1"),
+    (2, "export SCENE -o out --to obj", "invalid choice: 'obj'"),
+    (2, "export SCENE -o out --to ply --time 1.5", "expected a number from 0 to 1"),
+    (2, "export SCENE -o out --to ply-seq --time 0.5", "found --time with --to ply-seq"),
+    (2, "export SCENE -o out --to ply --fps 5", "found --fps with --to ply"),
+    (2, "batch m.jsonl -o out", "--op"),
+    (2, "batch m.jsonl -o out --op explode", "explode"),
+    (2, "batch m.jsonl -o out --op encode --slurm partition", "KEY=VALUE"),
+    # input that is missing or not what it should be
+    *((1, f"{verb} absent -o {out}", "absent") for verb, out in (("encode", "s.pd4"), ("decode", "s.npz"))),
+    *((1, f"{verb} absent", "absent") for verb in ("info", "view", "serve", "batch scan -o m.jsonl")),
+    (1, "eval absent DATA", "absent"),
+    (1, "render absent -o a.gif", "absent"),
+    (1, "export absent -o a.ply --to ply", "absent"),
+    (1, "import absent -o m.pt", "absent"),
+    (1, "package absent -o out", "absent"),
+    (1, "batch absent.jsonl --op encode -o out", "absent.jsonl"),
+    (1, "export MODEL -o a.ply --to ply", "is not a .pd4 file"),
+    (1, "export cut.pd4 -o a.ply --to ply", "cut.pd4"),
+    (1, "export SCENE -o a.4dgs --to 4dgs --fps 1e9", "frames per second are"),
+    (1, "render flipped.pd4 -o a.gif", "flipped.pd4"),
+    (1, "eval flipped.pd4 DATA", "flipped.pd4"),
+    (1, "render blind.pd4 -o a.gif", "--data"),
+    *(
+        (1, command.format(source), source)
+        for source in ("missing", "empty", "notes", "synthetic:nothing")
+        for command in ("train {} -o m.pt", "eval SCENE {}", "render SCENE -o a.gif --data {}")
+    ),
+    (1, "train hole -o m.pt --iterations 3 --log log.jsonl", "001"),
+    # checkpoints
+    *(
+        (1, command, "evil.pt")
+        for command in (
+            "encode evil.pt -o s.pd4", "render evil.pt -o a.gif", "eval evil.pt DATA",
+            "train DATA -o m.pt --resume evil.pt",
+        )
+    ),
+    (1, "encode cut.pt -o s.pd4", "cut.pt"),
+    (1, "encode nan.pt -o s.pd4", "feature"),
+    (1, "encode inf.pt -o s.pd4", "feature"),
+    (1, "encode huge.pt -o s.pd4", "feature"),
+    # outputs
+    *(
+        (1, command, "exists already")  # not that the input is absent: the output is checked first
+        for command in (
+            "encode absent -o kept.npz", "decode absent -o kept.npz", "render absent -o kept.gif",
+            "train absent -o kept.npz", "train DATA -o m.pt --log kept.npz",
+        )
+    ),
+    (1, "encode MODEL -o nowhere/s.pd4", "nowhere"),
+    (1, "encode MODEL -o empty", "is a folder"),
+    (1, "encode SCENE -o no.pd4 --effort 1 --source 'two\nlines'", "source"),
+    (1, "render SCENE -o a.gif --threads 100000", "100000"),
+]  # fmt: skip
 
 
 class _Payload:
-    """Pickles as a call that creates a file."""
+    """Pickles as a call that creates a folder."""
 
     def __init__(self, target: Path):
         self.target = target
@@ -73,69 +116,54 @@ class _Payload:
         return os.mkdir, (str(self.target),)
 
 
-def _poisoned(path: Path, model_pt: Path, value: float) -> None:
-    content = torch.load(model_pt, weights_only=True)
-    del content["digest"]  # as one of an older release
-    content["state"]["feature"][3, 2] = value
-    torch.save(content, path)
+@pytest.fixture(scope="module")
+def bad_files(tmp_path_factory, model_pt, scene_pd4, scene):
+    """The files that CASES name."""
+    from tiny import write_views
+
+    folder = tmp_path_factory.mktemp("bad")
+    data = scene_pd4.read_bytes()
+    (folder / "cut.pd4").write_bytes(data[:-10])
+    (folder / "flipped.pd4").write_bytes(_flip(data, 400))
+    (folder / "blind.pd4").write_bytes(encode(replace(scene, info=replace(scene.info, camera=None)), effort=1))
+    for name, value in (("nan", float("nan")), ("inf", float("inf")), ("huge", 1e20)):
+        content = torch.load(model_pt, weights_only=True)
+        del content["digest"]  # as in a checkpoint of an older release
+        content["state"]["feature"][3, 2] = value
+        torch.save(content, folder / f"{name}.pt")
+    torch.save({"format": "pd4dgs-checkpoint", "version": 1, "state": _Payload(folder / "ran")}, folder / "evil.pt")
+    (folder / "cut.pt").write_bytes(model_pt.read_bytes()[:-200])
+    for name in ("kept.npz", "kept.gif", "notes"):
+        (folder / name).write_text("precious")
+    (folder / "empty").mkdir()
+    (write_views(folder / "hole") / "001.png").unlink()
+    return folder
 
 
-CHECKPOINT_USERS = {
-    "encode": lambda path, out: [path, "-o", out / "s.pd4"],
-    "render": lambda path, out: [path, "-o", out / "a.gif"],
-    "eval": lambda path, out: [path, "synthetic:static"],
-    "train": lambda path, out: ["synthetic:static", "-o", out / "m.pt", "--resume", path],
-}
+def _listing(folder: Path) -> dict[str, int]:
+    return {str(p.relative_to(folder)): p.stat().st_size for p in sorted(folder.rglob("*"))}
 
 
-@pytest.fixture(autouse=True)
-def _quick_dataset(monkeypatch, shared_dataset):
-    """`synthetic:static` takes seconds to make; the faults here lie elsewhere."""
-    from pd4dgs_codec.data import dataset
-    from pd4dgs_codec.interchange import teacher
-
-    real = dataset.load
-
-    def load(source, **options):
-        return real(shared_dataset if source == "synthetic:static" else source, **options)
-
-    for module in (dataset, teacher):  # the second has a name of its own for it
-        monkeypatch.setattr(module, "load", load)
+def _check(result, verb: str, code: int, says: str) -> None:
+    assert result.code == code and result.out == b""
+    assert len(result.error_lines) == 1, result.err
+    assert result.err.startswith(f"pd4dgs-{verb}: error: ") and "internal error" not in result.err
+    assert says in result.err and (code == 1 or "--help" in result.err)
 
 
-@pytest.mark.parametrize("verb", CHECKPOINT_USERS)
-def test_a_pickle_that_wants_to_run_code_is_refused_unrun(fails, tmp_path, verb):
-    trap = tmp_path / "ran"
-    path = tmp_path / "evil.pt"
-    torch.save({"format": "pd4dgs-checkpoint", "version": 1, "state": _Payload(trap)}, path)
-    fails(verb, *CHECKPOINT_USERS[verb](path, tmp_path), says="evil.pt")
-    assert not trap.exists()
-
-
-@pytest.mark.parametrize("value", [float("nan"), float("inf")])
-def test_checkpoint_with_a_number_that_is_not_finite(fails, model_pt, tmp_path, value):
-    _poisoned(tmp_path / "bad.pt", model_pt, value)
-    fails("encode", tmp_path / "bad.pt", "-o", tmp_path / "s.pd4", says="feature")
-
-
-def test_a_cut_checkpoint(fails, model_pt, tmp_path):
-    (tmp_path / "bad.pt").write_bytes(model_pt.read_bytes()[:-200])
-    fails("encode", tmp_path / "bad.pt", "-o", tmp_path / "s.pd4", says="bad.pt")
-
-
-@pytest.mark.parametrize("verb", ["encode", "decode", "info", "render", "eval"])
-def test_missing_input_is_named(fails, tmp_path, verb):
-    argv = {
-        "encode": ["-o", tmp_path / "s.pd4"],
-        "decode": ["-o", tmp_path / "s.npz"],
-        "info": [],
-        "render": ["-o", tmp_path / "a.gif"],
-        "eval": ["synthetic:static"],
-    }[verb]
-    fails(verb, tmp_path / "absent", *argv, says="absent")
-
-
-# -- .pd4 files --------------------------------------------------------------------------------------------------------
+@pytest.mark.parametrize("code, line, says", CASES, ids=[line for _, line, _ in CASES])
+def test_bad_input(cli, bad_files, model_pt, scene_pd4, shared_dataset, monkeypatch, code, line, says):
+    monkeypatch.chdir(bad_files)
+    before = _listing(bad_files)
+    for word, path in (("SCENE", scene_pd4), ("MODEL", model_pt), ("DATA", shared_dataset)):
+        line = line.replace(word, str(path))
+    verb, *argv = shlex.split(line)
+    shown, module = "batch scan" if argv[:1] == ["scan"] else verb, MODULES.get(verb, verb)
+    _check(cli(module, *argv), shown, code, says)
+    told = cli(module, *argv, "--json")
+    assert told.code == code and len(told.error_lines) == 1
+    assert told.json["error"]["message"] in told.err and told.json["error"]["type"]
+    assert _listing(bad_files) == before
 
 
 def _flip(data: bytes, at: int) -> bytes:
@@ -154,131 +182,81 @@ PD4_FAULTS = {
 
 
 @pytest.mark.parametrize("fault", PD4_FAULTS)
-def test_damaged_pd4(fails, scene_pd4, tmp_path, fault):
+def test_a_damaged_pd4(cli, scene_pd4, tmp_path, fault):
     damage, kind = PD4_FAULTS[fault]
-    path = tmp_path / "bad.pd4"
-    path.write_bytes(damage(scene_pd4.read_bytes()))
-    error = fails("decode", path, "-o", tmp_path / "s.npz", says="bad.pd4")
-    assert error["type"] == kind
-    assert fails("info", path, "--check", says="bad.pd4")["type"] == kind
-    assert fails("decode", "-", says="stdin", stdin=path.read_bytes())["type"] == kind
+    data, path = damage(scene_pd4.read_bytes()), tmp_path / "bad.pd4"
+    path.write_bytes(data)
+    for name, argv, stdin in (
+        ("bad.pd4", ("decode", path, "-o", tmp_path / "s.npz"), None),
+        ("bad.pd4", ("info", path, "--check"), None),
+        ("stdin", ("decode", "-"), data),
+    ):
+        _check(cli(*argv, stdin=stdin), argv[0], 1, name)
+        error = cli(*argv, "--json", stdin=stdin).json["error"]
+        assert error["type"] == kind and (fault != "more behind" or error["offset"] == len(data) - 1)
+    assert list(tmp_path.iterdir()) == [path]
 
 
-def test_decode_error_states_its_offset(fails, scene_pd4, tmp_path):
-    data = scene_pd4.read_bytes()
-    (tmp_path / "bad.pd4").write_bytes(data + b"x")
-    assert fails("decode", tmp_path / "bad.pd4")["offset"] == len(data)
+WRITERS = (
+    "encode MODEL -o out.pd4 --effort 1",
+    "decode SCENE -o out.npz",
+    "decode SCENE -o out.pt",
+    "render SCENE -o out.gif --frames 2",
+    "render SCENE -o p/%02d.png --frames 1",
+)
 
 
-@pytest.mark.parametrize("verb", ["render", "eval"])
-def test_viewers_refuse_a_damaged_pd4(fails, scene_pd4, tmp_path, verb):
-    (tmp_path / "bad.pd4").write_bytes(_flip(scene_pd4.read_bytes(), 400))
-    argv = ["-o", tmp_path / "a.gif"] if verb == "render" else ["synthetic:static"]
-    fails(verb, tmp_path / "bad.pd4", *argv, says="bad.pd4")
+@pytest.mark.parametrize("command", WRITERS)
+@pytest.mark.parametrize("call", ["os.replace", "tempfile.mkdtemp", "write"])
+def test_a_disk_that_refuses_leaves_nothing(cli, model_pt, scene_pd4, tmp_path, monkeypatch, command, call):
+    original = os.replace
+
+    def full(*paths, **options):
+        if call == "os.replace" and str(tmp_path) not in str(paths[1]):  # numba caches its kernels in the same way
+            return original(*paths, **options)
+        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC), "/some/temporary/name")
+
+    if call == "write" and "out.gif" in command:
+        pytest.skip("imageio writes the file")
+    for name in ("pathlib.Path.write_bytes", "PIL.Image.Image.save") if call == "write" else (call,):
+        monkeypatch.setattr(name, full)
+    verb, *argv = command.replace("MODEL", str(model_pt)).replace("SCENE", str(scene_pd4)).split()
+    argv[2] = str(tmp_path / argv[2])
+    result = cli(verb, *argv)
+    _check(result, verb, 1, "No space left")
+    assert f"error: {argv[2]}: " in result.err
+    assert not [p for p in tmp_path.rglob("*") if p.is_file()]
 
 
-# -- outputs -----------------------------------------------------------------------------------------------------------
-
-WRITERS = {
-    "encode": lambda model, scene, out: [model, "-o", out, "--effort", 1],
-    "decode": lambda model, scene, out: [scene, "-o", out.with_suffix(".npz")],
-    "render": lambda model, scene, out: [scene, "-o", out.with_suffix(".gif"), "--frames", 2],
-}
-
-
-@pytest.mark.parametrize("verb", [*WRITERS, "train"])
-def test_an_output_that_exists_is_refused_before_any_work(fails, tmp_path, monkeypatch, verb):
-    output = tmp_path / "out.npz"
-    if verb in ("render", "train"):
-        output = tmp_path / ("out.gif" if verb == "render" else "out.pt")
-    output.write_bytes(b"precious")
-    argv = ["synthetic:static", "-o", output] if verb == "train" else ["absent.pt", "-o", output]
-    fails(verb, *argv, says="exists already")  # and not "absent.pt": the output was looked at first
-    assert output.read_bytes() == b"precious"
-
-
-@pytest.mark.parametrize("verb", WRITERS)
-def test_full_disk_leaves_nothing(fails, model_pt, scene_pd4, tmp_path, monkeypatch, verb):
-    replace = os.replace
-
-    def full(source, target, **options):
-        if str(tmp_path) in str(target):  # numba puts its compiled kernels into place in the same way
-            raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-        replace(source, target, **options)
-
-    monkeypatch.setattr("os.replace", full)
-    argv = WRITERS[verb](model_pt, scene_pd4, tmp_path / "out.pd4")
-    error = fails(verb, *argv, says="No space left")
-    assert str(argv[2]) in error["message"]
-
-
-@pytest.mark.parametrize("kind", ["npz", "pt"])
-def test_disk_full_while_writing_leaves_nothing(fails, scene_pd4, tmp_path, monkeypatch, kind):
-    def full(*_args, **_kwargs):
-        raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-
-    monkeypatch.setattr("pathlib.Path.write_bytes", full)
-    monkeypatch.setattr("torch.save", full)
-    error = fails("decode", scene_pd4, "-o", tmp_path / f"out.{kind}", says="No space left")
-    assert error["message"].startswith(str(tmp_path / f"out.{kind}"))
-
-
-@pytest.mark.skipif(not os.path.exists("/dev/full"), reason="this system has no /dev/full")
-@pytest.mark.parametrize("verb", ["info", "encode"])
-def test_full_stdout(scene_pd4, verb):
-    argv = [verb, str(scene_pd4)] + (["-o", "-", "--effort", "1"] if verb == "encode" else [])
-    with open("/dev/full", "wb") as full:
-        done = subprocess.run(
-            [sys.executable, "-m", "pd4dgs_codec", *argv], stdout=full, stderr=subprocess.PIPE, text=True, timeout=60
-        )
-    assert done.returncode == 1
-    assert len(done.stderr.splitlines()) == 1 and "No space left" in done.stderr
-
-
-def test_reader_that_goes_away(scene_pd4):
-    read, write = os.pipe()
-    os.close(read)
-    done = subprocess.run(
-        [sys.executable, "-m", "pd4dgs_codec", "info", str(scene_pd4)], stdout=write, stderr=subprocess.PIPE, timeout=60
-    )
-    os.close(write)
-    assert done.returncode == 1 and done.stderr == b""
-
-
-def test_output_folder_is_missing_or_not_writable(fails, model_pt, tmp_path, monkeypatch):
-    fails("encode", model_pt, "-o", tmp_path / "nowhere" / "s.pd4", says="nowhere")
-    fails("encode", model_pt, "-o", tmp_path, says="is a folder")
+def test_a_folder_without_write_permission(cli, model_pt, tmp_path, monkeypatch):
     monkeypatch.setattr("os.access", lambda path, mode: False)
-    fails("encode", model_pt, "-o", tmp_path / "s.pd4", says="no permission")
+    _check(cli("encode", model_pt, "-o", tmp_path / "s.pd4"), "encode", 1, "no permission")
 
 
-def test_folder_that_refuses_new_files(fails, scene_pd4, tmp_path, monkeypatch):
-    def refuse(**_kwargs):
-        raise PermissionError(errno.EACCES, "Permission denied", "/some/temporary/name")
-
-    monkeypatch.setattr("tempfile.mkdtemp", refuse)
-    error = fails("decode", scene_pd4, "-o", tmp_path / "s.npz", says="Permission denied")
-    assert "temporary" not in error["message"]
-    error = fails("render", scene_pd4, "-o", tmp_path / "p" / "%02d.png", "--frames", 1, says="Permission denied")
-    assert "temporary" not in error["message"]
+@pytest.mark.parametrize("kind, package", [("spz", "gaussforge"), ("4dgs", "fourdgs")])
+def test_a_missing_package_is_named(cli, scene_pd4, tmp_path, monkeypatch, kind, package):
+    monkeypatch.setitem(__import__("sys").modules, package, None)
+    result = cli("export", scene_pd4, "-o", tmp_path / "out", "--to", kind)
+    _check(result, "export", 1, f"need the package {package}")
+    assert "pip install 'pd4dgs-codec[interchange]'" in result.err
 
 
-def test_render_without_a_camera_says_what_to_do(fails, scene, tmp_path):
-    from dataclasses import replace
+def test_missing_torch_and_faults_of_ours_are_one_line(cli, model_pt, scene_pd4, tmp_path, monkeypatch):
+    def gone(path):
+        raise ModuleNotFoundError("No module named 'torch'", name="torch")
 
-    from pd4dgs_codec.format.encoder import encode
+    def broken(data):
+        raise ZeroDivisionError("a fault of ours")
 
-    (tmp_path / "s.pd4").write_bytes(encode(replace(scene, info=replace(scene.info, camera=None)), effort=1))
-    fails("render", tmp_path / "s.pd4", "-o", tmp_path / "a.gif", says="--data")
+    monkeypatch.setattr("pd4dgs_codec.model.checkpoint.load", gone)
+    _check(cli("encode", model_pt, "-o", tmp_path / "s.pd4"), "encode", 1, "pip install 'pd4dgs-codec[train]'")
+    monkeypatch.setattr("pd4dgs_codec.format.info.info", broken)
+    result = cli("info", scene_pd4)
+    assert result.code == 1 and len(result.error_lines) == 1 and "internal error" in result.err
+    with pytest.raises(ZeroDivisionError):
+        cli("info", scene_pd4, "-v")
 
 
-def test_too_many_threads(fails, scene_pd4, tmp_path):
-    fails("render", scene_pd4, "-o", tmp_path / "a.gif", "--threads", 100_000, says="100000")
-
-
-def test_scene_that_is_too_large_for_its_symbols(fails, model_pt, tmp_path):
-    content = torch.load(model_pt, weights_only=True)
-    del content["digest"]  # as one of an older release
-    content["state"]["feature"][0, 0] = 1e20
-    torch.save(content, tmp_path / "big.pt")
-    fails("encode", tmp_path / "big.pt", "-o", tmp_path / "s.pd4", says="feature")
+def test_usage_errors_as_json(cli):
+    result = cli("info", "--json", "--nothing")
+    assert result.code == 2 and json.loads(result.out)["error"]["type"] == "UsageError"
