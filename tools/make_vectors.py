@@ -1,10 +1,10 @@
-"""Writes the conformance vectors and their manifest, or checks those that are there.
+"""Writes the conformance vectors and their manifest, or checks the present ones.
 
     python tools/make_vectors.py           # (re)writes spec/vectors/
-    python tools/make_vectors.py --check   # one line per difference and exit code 1 if anything is not as it would be
+    python tools/make_vectors.py --check   # one line per difference, and exit code 1 if there is any
 
-Nothing is written that the package decodes to something else than was meant; a test asks the same of what is there.
-The bytes are the same on every machine: `tools/vectors/` says what each file holds and searches for nothing.
+`tools/vectors/table.txt` says what each vector holds; the bytes are the same on every machine. Vectors that the package
+decodes to anything else than the manifest says are not written.
 """
 
 from __future__ import annotations
@@ -15,35 +15,25 @@ import json
 import sys
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
-from vectors import dear, faulty, refining, slices, uncommon, valid
 from vectors.blocks import Vector
+from vectors.cases import vectors
 
-from pd4dgs_codec.errors import DecodeError, UnsupportedFeature
-from pd4dgs_codec.format.container import read_preamble
+from pd4dgs_codec.errors import DecodeError
+from pd4dgs_codec.format.container import MAJOR, read_preamble
 from pd4dgs_codec.format.header import layers_of, unpack_header
 from pd4dgs_codec.format.info import hashes
 
 VECTORS = Path(__file__).resolve().parents[1] / "spec" / "vectors"
-MANIFEST = "manifest.json"
-SUFFIX = ".pd4"
+MANIFEST, SUFFIX = "manifest.json", ".pd4"
 
 
-def vectors() -> list[Vector]:
-    """All vectors, in the manifest's order."""
-    found = [*valid.cases(), *uncommon.cases(), *faulty.cases(), *slices.cases(), *refining.cases(), *dear.cases()]
-    names = [v.name for v in found]
-    doubled = {name for name in names if names.count(name) > 1}
-    if doubled:
-        raise SystemExit(f"make_vectors: names used twice: {sorted(doubled)}")
-    return found
-
-
-def entry(vector: Vector) -> dict:
+def entry(vector: Vector) -> dict[str, Any]:
     """A vector's entry in the manifest."""
-    row: dict = {
+    row: dict[str, Any] = {
         "file": vector.name + SUFFIX,
-        "what": vector.sentence,
+        "what": vector.what,
         "clauses": list(vector.clauses),
         "size": len(vector.data),
         "sha256": hashlib.sha256(vector.data).hexdigest(),
@@ -52,56 +42,40 @@ def entry(vector: Vector) -> dict:
         row["error"], row["clause"] = vector.error, vector.clauses[0]
         row |= {key: value for key, value in (("chunk", vector.chunk), ("offset", vector.offset)) if value is not None}
         row["prefix"] = vector.layers[-1]["layer"] if vector.layers else None
-    row["ans_only"] = "same" if _for_all(vector.data) else UnsupportedFeature.__name__
-    listed = _listed(vector.data)
+    try:
+        header = unpack_header(read_preamble(vector.data).header)
+        mode, listed = header.mode, layers_of(header.chunks)
+    except DecodeError:
+        mode, listed = "ans", []
+    row["ans_only"] = "same" if mode == "ans" else "UnsupportedFeature"
     if len(listed) > len(set(listed)):
-        row["slices"] = list(vector.slices)
-    if vector.prefixes:
-        row["prefixes"] = {str(layer): rows for layer, rows in vector.prefixes.items()}
-    row["layers"] = vector.layers
-    return row
-
-
-def _listed(data: bytes) -> list[int]:
-    """The layer of each slice in the header's list, none of a header that cannot be read."""
-    try:
-        return layers_of(unpack_header(read_preamble(data).header).chunks)
-    except DecodeError:
-        return []
-
-
-def _for_all(data: bytes) -> bool:
-    """Whether a decoder of mode ans only gives the answer of any other: mode and deformation are those that it knows,
-    or it gets no further than the header."""
-    try:
-        header = unpack_header(read_preamble(data).header)
-    except DecodeError:
-        return True
-    return header.mode == "ans"
+        row["slices"] = vector.slices
+    return {**row, "layers": vector.layers}
 
 
 def files(found: list[Vector]) -> dict[str, bytes]:
     """Path below spec/vectors -> content."""
     rows = ",\n".join(json.dumps(entry(v), ensure_ascii=False) for v in found)
-    manifest = f'{{"format": "2.0-draft", "vectors": [\n{rows}\n]}}\n'
+    manifest = f'{{"format": "{MAJOR}.0-draft", "vectors": [\n{rows}\n]}}\n'
     return {MANIFEST: manifest.encode(), **{v.name + SUFFIX: v.data for v in found}}
 
 
 def surprises(found: list[Vector]) -> Iterator[str]:
-    """One line per vector that the package decodes to something else than was meant."""
+    """One line per vector that the package does not decode as its table says."""
+    names = [v.name for v in found]
+    yield from (f"{name}: two vectors of this name" for name in sorted(set(names)) if names.count(name) > 1)
     for vector in found:
-        expected: object = vector.error or vector.layers
         try:
-            outcome: object = hashes(vector.data)
+            outcome: Any = hashes(vector.data)
         except DecodeError as error:
             outcome = type(error).__name__
-        if outcome != expected:
-            yield f"{vector.name}: the package gives {outcome}, meant was {expected}"
+        if outcome != (vector.error or vector.layers):
+            yield f"{vector.name}: the package gives {outcome}, expected {vector.error or vector.layers}"
 
 
 def differences(wanted: dict[str, bytes], folder: Path) -> Iterator[str]:
-    """One line per file that is missing, different or not wanted."""
-    there = {str(p.relative_to(folder)) for p in folder.rglob("*") if p.suffix in (SUFFIX, ".json")}
+    """One line per file that is missing, different or not a vector."""
+    there = {p.relative_to(folder).as_posix() for p in folder.rglob("*") if p.suffix in (SUFFIX, ".json")}
     for name in sorted(there - set(wanted)):
         yield f"{name}: not a vector"
     for name, content in wanted.items():
@@ -114,19 +88,19 @@ def differences(wanted: dict[str, bytes], folder: Path) -> Iterator[str]:
 def write(wanted: dict[str, bytes], folder: Path) -> None:
     """Make `folder` hold these files and no other vectors."""
     for path in folder.rglob("*" + SUFFIX):
-        if str(path.relative_to(folder)) not in wanted:
+        if path.relative_to(folder).as_posix() not in wanted:
             path.unlink()
     for name, content in wanted.items():
-        path = folder / name
-        path.parent.mkdir(parents=True, exist_ok=True)
-        path.write_bytes(content)
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        (folder / name).write_bytes(content)
 
 
 def main() -> int:
+    """Entry point; returns the exit code."""
     parser = argparse.ArgumentParser(description="Write or check the conformance vectors.")
-    parser.add_argument("--check", action="store_true", help="compare with what is there, write nothing")
+    parser.add_argument("--check", action="store_true", help="compare with the present files, write nothing")
     arguments = parser.parse_args()
-    found = vectors()
+    found = list(vectors())
     wanted = files(found)
     lines = list(differences(wanted, VECTORS) if arguments.check else surprises(found))
     for line in lines:
@@ -135,8 +109,7 @@ def main() -> int:
         return 1
     if not arguments.check:
         write(wanted, VECTORS)
-    verb = "are as they should be" if arguments.check else "written"
-    print(f"{len(found)} vectors, {sum(map(len, wanted.values()))} bytes {verb}")
+    print(f"{len(found)} vectors, {sum(map(len, wanted.values()))} bytes {'checked' if arguments.check else 'written'}")
     return 0
 
 

@@ -1,8 +1,8 @@
-"""Writes `.pd4` structures from explicit choices, right or wrong ones.
+"""Writes `.pd4` structures from explicit choices, right or wrong.
 
-Nothing here searches, fits or rounds: every prior, form, predictor and field is named by the caller or follows from
-the symbols by a rule on integers, so the bytes are the same on every machine. Lengths, scene ids and CRCs are right
-unless a caller asks for others.
+Nothing here searches, fits or rounds: the caller names every prior, form, predictor and field, or it follows from the
+symbols by a rule on integers, so the bytes are the same on every machine. Lengths, scene ids and CRCs are right unless
+the caller asks for others.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import struct
 import zlib
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from typing import Any
 
 import numpy as np
 
@@ -32,37 +33,18 @@ from pd4dgs_codec.entropy.priors import (
 from pd4dgs_codec.entropy.tables import uniform_table
 from pd4dgs_codec.entropy.varint import put_varint, put_zigzag
 from pd4dgs_codec.format import canonical
-from pd4dgs_codec.format.container import MAJOR, SCENE_ID_SIZE, SIGNATURE, slice_flags
-from pd4dgs_codec.format.header import payload_digest
-from pd4dgs_codec.format.kinds import LAYER_KINDS
-from pd4dgs_codec.format.layer_meta import Section
+from pd4dgs_codec.format.container import MAJOR, SIGNATURE
 from pd4dgs_codec.format.planes import residual
-from pd4dgs_codec.format.quantise import dequantise
-from pd4dgs_codec.format.symbols import LayerSymbols, merged
-from pd4dgs_codec.format.table import NO_CLASSES, Grid
-from pd4dgs_codec.scene import ATTRIBUTES, DEFAULT_WIDTHS, PLANES, Widths
+from pd4dgs_codec.morton import morton_order
+from pd4dgs_codec.scene import DEFAULT_WIDTHS, PLANES, Widths
 
 from . import lzma2
 
-POSITIONS, MASKS, ATTRIBUTE, PLANE, WEIGHTS, SYMBOLS = (int(s) for s in Section)
-FLOATS, LOW_BITS = 6, 7  # left with draft 3: the vectors that use them go next
+POSITIONS, MASKS, ATTRIBUTES, PLANE, WEIGHTS, SYMBOLS = range(6)  # sections (clause 6.4)
 ANS, LZMA = 0, 1
-CODED, FLOAT32 = 0, 1
-WEIGHT_SHIFT, CLASSES_Y, CLASSES_Z = 10, 5, 7  # clause 8.7
-
-#: Clause 5.4, of all classes: a file may declare bounds of what it does not hold.
-ERROR_BOUNDS: dict[int, object] = {
-    0: 0.03125,
-    1: 0.015625,
-    2: 0.0625,
-    3: 2.0**-8,
-    4: 0.25,
-    5: 2.0**-9,
-    6: 0.5,
-    7: 2.0**-10,
-}
-HEADER: dict[int, object] = {
+HEADER: dict[int, Any] = {
     2: ANS,
+    3: 0,
     4: [0.0625, 0.03125, 0.125],
     5: 2.0**-7,
     6: [-1.0, -2.0, -3.0, 1.0, 2.0, 3.0],
@@ -71,31 +53,35 @@ HEADER: dict[int, object] = {
     9: [0.125, 64.0],
     10: [0.0, -1.0, 0.0],
     11: 1.5,
-    13: ERROR_BOUNDS,
+    # of all classes: a file may declare bounds for tensors that it does not have
+    13: dict(enumerate([0.03125, 0.015625, 0.0625, 2.0**-8, 0.25, 2.0**-9, 0.5, 2.0**-10])),
     15: [32, 10],
 }
-CAMERA: dict[int, object] = {
+CAMERA: dict[int, Any] = {
     1: [1.0, 0.0, 0.0, 0.25, 0.0, 0.0, -1.0, 0.5, 0.0, 1.0, 0.0, 4.0],
     2: [500.0, 501.0, 320.0, 240.0],
     3: 640,
     4: 480,
 }
+NO_CLASSES = np.zeros(0, np.int32)
 
 
 # -- primitives --------------------------------------------------------------------------------------------------------
 
 
-def varint(value: int) -> bytes:
+def varint(*values: int) -> bytes:
     """Clause 7.1."""
     out = bytearray()
-    put_varint(out, value)
+    for value in values:
+        put_varint(out, value)
     return bytes(out)
 
 
-def zigzag(value: int) -> bytes:
+def zigzag(*values: int) -> bytes:
     """Clause 7.1."""
     out = bytearray()
-    put_zigzag(out, value)
+    for value in values:
+        put_zigzag(out, value)
     return bytes(out)
 
 
@@ -105,7 +91,7 @@ def words(*values: int) -> bytes:
 
 
 def pattern(*shape: int, low: int = -3, high: int = 3, seed: int = 0) -> np.ndarray:
-    """int32 of `shape` in low..high that look irregular: a Lehmer generator's upper bits."""
+    """int32 of `shape` in low..high that look irregular: upper bits of a Lehmer generator."""
     state, values = seed * 7919 + 12345, []
     for _ in range(int(np.prod(shape))):
         state = state * 48271 % (2**31 - 1)
@@ -117,7 +103,7 @@ def pattern(*shape: int, low: int = -3, high: int = 3, seed: int = 0) -> np.ndar
 
 
 def gauss(low: int, n: int, *, si: int = 64, offset: int = 0, floor: int = 1, shift: int = 0) -> Gauss:
-    """A Gaussian prior over the window; its mean lies `offset` / 256 entries above the window's middle."""
+    """A Gaussian prior over n entries from `low`. offset: of its mean from the middle of the window, entries / 256."""
     return Gauss(Window(low, n, shift), Normal(offset + 128 * (n - 1), si), floor)
 
 
@@ -125,7 +111,7 @@ SMALL = gauss(-3, 7)
 
 
 def default_prior(symbols: np.ndarray) -> Prior:
-    """The prior that stands where a vector is about something else: by range, on integers."""
+    """The prior of a channel for which the caller names none, by the range of its symbols."""
     low, high = int(symbols.min()), int(symbols.max())
     if low == high:
         return Const(Window(low, 1))
@@ -136,11 +122,14 @@ def default_prior(symbols: np.ndarray) -> Prior:
     return gauss(low, n, si=64 * n.bit_length() - 128, shift=shift)
 
 
-Known = list[tuple[bytes, bytes]]
+Known = list[tuple[bytes, bytes]]  # definitions of priors, with the classes of histograms
 
 
 class Channels:
-    """A section of coded channels, one `add` per channel. known: the priors of slices before, which it adds to."""
+    """Writes a section of coded channels, one `add` per channel.
+
+    known: definitions of the slices before, to which those of this section are appended.
+    """
 
     def __init__(self, known: Known | None = None) -> None:
         self.block = bytearray()
@@ -149,7 +138,7 @@ class Channels:
         self._parts: list[tuple[np.ndarray, np.ndarray]] = []
 
     def add(self, symbols: Iterable[int], prior: Prior | None = None) -> Channels:
-        """Symbols outside the prior's window become exceptions; a prior defined before is referred to."""
+        """Symbols outside the prior's window become exceptions. A prior that is defined already is referred to."""
         k = np.asarray(symbols, np.int64)
         if not k.size:
             return self
@@ -184,8 +173,8 @@ class Channels:
         self.block += varint(len(places) - 1)
         for last, at in zip([-1, *places], places, strict=False):
             value = int(k[at])
-            self.block += varint(at - last - 1)
-            self.block += varint(2 * (window.kmin - 1 - value) + 1 if value < window.kmin else 2 * (value - window.end))
+            below = 2 * (window.kmin - 1 - value) + 1
+            self.block += varint(at - last - 1, below if value < window.kmin else 2 * (value - window.end))
 
     def done(self) -> bytes:
         """The parameter block and the ANS stream."""
@@ -196,7 +185,7 @@ class Channels:
 def coded(
     channels: Iterable[Iterable[int]], priors: Mapping[int, Prior] | None = None, known: Known | None = None
 ) -> bytes:
-    """A section of coded channels; `priors` names those of some channels by their number."""
+    """A section of coded channels. priors: of some channels, by their number."""
     section = Channels(known)
     for number, channel in enumerate(channels):
         section.add(channel, (priors or {}).get(number))
@@ -204,9 +193,17 @@ def coded(
 
 
 def positions(cells: np.ndarray, known: Known | None = None) -> bytes:
-    """Section POSITIONS of cells int32 [n, 3] in Morton order (clause 10)."""
+    """Section POSITIONS of int32 [n, 3] in Morton order (clause 10)."""
     head, channels = position_channels(cells)
     return head + coded(channels, known=known)
+
+
+def graded_part(classes: np.ndarray, length: int | None = None) -> bytes:
+    """The step classes of the rows as the attributes section has them. length: stated instead of the true one."""
+    if not classes.size:
+        return b""
+    section = coded([classes])
+    return varint(len(section) if length is None else length) + section
 
 
 def plain_attributes(
@@ -217,19 +214,8 @@ def plain_attributes(
     classes: np.ndarray = NO_CLASSES,
 ) -> bytes:
     """Section ATTRIBUTES of int32 [channels, n], form 0 (clause 8.5)."""
-    if not classes.size:
-        return b"\0" + coded(k, priors, known)
-    by_class = [channel[classes == c] for channel in k for c in range(7)]
-    return b"\0" + graded_part(classes) + coded(by_class, priors, known)
-
-
-def graded_part(classes: np.ndarray, length: int | None = None) -> bytes:
-    """What says the step classes of the rows; nothing where there are none. length: what is said instead of the true
-    one."""
-    if not classes.size:
-        return b""
-    section = coded([classes])
-    return varint(len(section) if length is None else length) + section
+    channels = [c[classes == q] for c in k for q in range(7)] if classes.size else k
+    return b"\0" + graded_part(classes) + coded(channels, priors, known)
 
 
 def plain_planes(residuals: Iterable[Iterable[int]], priors: Mapping[int, Prior] | None = None) -> bytes:
@@ -238,7 +224,7 @@ def plain_planes(residuals: Iterable[Iterable[int]], priors: Mapping[int, Prior]
 
 
 def relative_magnitude(e: np.ndarray, of: np.ndarray | None = None) -> np.ndarray:
-    """int64 [n] of residuals int64 [m, n], N and s_c those of the residuals `of` if given (clause 8.9)."""
+    """int64 [n] of residuals int64 [m, n]. of: the residuals that N and s_c are taken from (clause 8.9)."""
     of = e if of is None else of
     sums = [int(abs(c).sum()) for c in of]
     parts = (np.minimum(abs(c), s) * 256 * of.shape[1] // (1 + s) for c, s in zip(e, sums, strict=True))
@@ -246,53 +232,42 @@ def relative_magnitude(e: np.ndarray, of: np.ndarray | None = None) -> np.ndarra
 
 
 def classes_by_activity(activity: np.ndarray, count: int, of: np.ndarray | None = None) -> np.ndarray:
-    """The class of each place, 0 .. count − 1, by the bounds of the activity `of` if given (clause 8.9)."""
+    """Class 0 .. count − 1 of each place. of: the activity that the bounds are taken from (clause 8.9)."""
     of = activity if of is None else of
     return np.searchsorted(np.sort(of)[[i * len(of) // count for i in range(1, count)]], activity, side="right")
 
 
-def split_by_activity(
-    channel: np.ndarray, activity: np.ndarray, count: int, of: np.ndarray | None = None
-) -> list[np.ndarray]:
-    """The symbols of each of `count` classes (clause 8.9)."""
-    classes = classes_by_activity(activity, count, of)
-    return [channel[classes == q] for q in range(count)]
-
-
-def plane_activity(e: np.ndarray) -> np.ndarray:
-    """int64 [H, W] from residuals int64 [m, H, W] of the stages before (clause 8.8)."""
+def classes_of_plane(e: np.ndarray, count: int) -> np.ndarray:
+    """Class [H·W] of each cell, by residuals int64 [m, H, W] of the stages before (clause 8.8)."""
     _, height, width = e.shape
     size = relative_magnitude(e.reshape(len(e), -1)).reshape(height, width)
     i, j = np.indices((height, width))
-    near = [(a, b) for a in (-1, 0, 1) for b in (-1, 0, 1)]
-    return sum(
-        (size[np.clip(i + a, 0, height - 1), np.clip(j + b, 0, width - 1)] for a, b in near), np.zeros_like(size)
-    )
+    near = itertools.product((-1, 0, 1), repeat=2)
+    parts = (size[np.clip(i + a, 0, height - 1), np.clip(j + b, 0, width - 1)] for a, b in near)
+    return classes_by_activity(sum(parts, np.zeros_like(size)).ravel(), count)
 
 
-def classes_of_plane(e: np.ndarray, count: int) -> np.ndarray:
-    """The class [H, W] of each cell, given the residuals int64 [m, H, W] of the stages before."""
-    return classes_by_activity(plane_activity(e).ravel(), count).reshape(e.shape[1:])
+def _split(channel: np.ndarray, classes: np.ndarray, count: int) -> list[np.ndarray]:
+    return [channel[classes == q] for q in range(count)]
 
 
 Lengths = Callable[[list[int]], list[int]]
+StagePriors = Mapping[int, Mapping[int, Prior]]  # by stage, then by channel of the stage
 
 
 def staged(
     stages: Iterable[Iterable[np.ndarray]],
     lengths: Lengths = lambda sizes: sizes,
     tail: bytes = b"",
-    priors: Mapping[int, Mapping[int, Prior]] | None = None,
+    priors: StagePriors | None = None,
     known: Sequence[Known] | None = None,
 ) -> bytes:
-    """The lengths of all stages but the last, then the stages. lengths: what is said, from the true lengths. priors: by
-    stage, then by channel of the stage. known: by stage."""
+    """The lengths of all stages but the last, then the stages. lengths: the stated ones, from the true ones."""
     payloads = [
         coded(stage, (priors or {}).get(number), known[number] if known else None)
         for number, stage in enumerate(stages)
     ]
-    said = lengths([len(p) for p in payloads[:-1]])
-    return b"".join(map(varint, said)) + b"".join(payloads) + tail
+    return varint(*lengths([len(p) for p in payloads[:-1]])) + b"".join(payloads) + tail
 
 
 def staged_planes(
@@ -300,133 +275,99 @@ def staged_planes(
     counts: Sequence[int],
     lengths: Lengths = lambda sizes: sizes,
     tail: bytes = b"",
-    priors: Mapping[int, Mapping[int, Prior]] | None = None,
+    priors: StagePriors | None = None,
 ) -> bytes:
-    """Section PLANES of residuals int32 [C, H, W] per plane, form 1 (clause 8.8). counts: classes of stages 1 on."""
+    """Section PLANES of residuals int32 [C, H, W], form 1 (clause 8.8). counts: classes of the stages from 1 on."""
     stages = []
     for stage in range(max(1, (len(planes[0]) - 1).bit_length())):
-        first, end = (1 << stage if stage else 0), 2 << stage
-        channels: list[np.ndarray] = []
+        first, end, channels = (1 << stage if stage else 0), 2 << stage, list[np.ndarray]()
         for plane in planes:
-            e = plane.astype(np.int64)
-            if stage == 0:
-                channels += [channel.ravel() for channel in e[:end]]
-                continue
-            activity = plane_activity(e[:first]).ravel()
+            e, count = plane.astype(np.int64), counts[stage - 1] if stage else 1
+            classes = classes_of_plane(e[:first], count) if stage else np.zeros(e[0].size)
             for channel in e[first:end]:
-                channels += split_by_activity(channel.ravel(), activity, counts[stage - 1])
+                channels += _split(channel.ravel(), classes, count)
         stages.append(channels)
-    return b"\1" + b"".join(map(varint, counts)) + staged(stages, lengths, tail, priors)
+    return b"\1" + varint(*counts) + staged(stages, lengths, tail, priors)
 
 
-Terms = Mapping[int, Sequence[tuple[int, int]]]
-Splits = Mapping[int, tuple[int, int, int]]
-ONE_CLASS = (1,) * 5  # in each of the stages 1 to 5
+@dataclass(frozen=True)
+class Block:
+    """A prediction block (clause 8.6). terms: channel -> (channel, weight) ascending. splits: Gaussian -> (f, a, b).
+    classes: class counts of the stages that are split by activity."""
+
+    terms: Mapping[int, Sequence[tuple[int, int]]] = field(default_factory=dict)
+    splits: Mapping[int, tuple[int, int, int]] = field(default_factory=dict)
+    classes: Sequence[int] = (1,) * 5
+
+    def data(self, widths: Widths = DEFAULT_WIDTHS, counts: Mapping[int, int] | None = None) -> bytes:
+        """Items 1 to 3 of clause 8.6. counts: stated numbers of terms instead of the true ones."""
+        out = b""
+        for c in range(1, widths.predicted):
+            own = self.terms.get(c, ())
+            out += varint((counts or {}).get(c, len(own)))
+            for last, (j, w) in zip([-1, *(j for j, _ in own)], own, strict=False):
+                out += varint(j - last - 1) + zigzag(w)
+        out += varint(*self.classes)
+        for i in range(widths.slots):
+            flags, a, b = self.splits.get(i, (0, 0, 0))
+            out += varint(flags) + (zigzag(a) if flags else b"") + (zigzag(b) if flags & 2 else b"")
+        return out
+
+    def residuals(self, k: np.ndarray, widths: Widths = DEFAULT_WIDTHS) -> np.ndarray:
+        """int64 [channels, n] of attributes int32 [channels, n]: the predicted ones less their prediction (8.7)."""
+        e = k.astype(np.int64)
+        for c in range(1, widths.predicted):
+            total = sum((w * k[j].astype(np.int64) for j, w in self.terms.get(c, ())), np.zeros_like(e[c]))
+            e[c] -= total + 512 >> 10
+        return e
 
 
-def prediction_block(
-    terms: Terms,
-    splits: Splits,
-    counts: Mapping[int, int],
-    classes: Sequence[int] = ONE_CLASS,
-    widths: Widths = DEFAULT_WIDTHS,
-) -> bytes:
-    """Items 1 to 3 of clause 8.6. terms: channel -> (g, w) as they are stored; counts: other numbers of terms."""
-    out = b""
-    for c in range(1, widths.predicted):
-        own = terms.get(c, ())
-        out += varint(counts.get(c, len(own))) + b"".join(varint(g) + zigzag(w) for g, w in own)
-    out += b"".join(map(varint, classes))
-    for i in range(widths.slots):
-        flags, a, b = splits.get(i, (0, 0, 0))
-        out += varint(flags) + (zigzag(a) if flags else b"") + (zigzag(b) if flags & 2 else b"")
-    return out
+Slice = tuple[np.ndarray, np.ndarray]  # attributes or residuals, and step classes
 
 
-def gaps(terms: Sequence[tuple[int, int]]) -> list[tuple[int, int]]:
-    """(channel, weight), channels ascending -> (g, weight)."""
-    return [(j - last - 1, w) for last, (j, w) in zip([-1, *(j for j, _ in terms)], terms, strict=False)]
-
-
-def attribute_stages(
-    e: np.ndarray,
-    splits: Splits,
-    classes: Sequence[int],
-    widths: Widths = DEFAULT_WIDTHS,
-    of: np.ndarray | None = None,
-    grades: tuple[np.ndarray, np.ndarray] = (NO_CLASSES, NO_CLASSES),
-) -> list[list[np.ndarray]]:
-    """The channels of the eight stages of clause 8.7, of residuals and offsets int64 [channels, n]. of: those of the
-    slice that the block stands in, if it is another one. grades: step classes of both."""
-    of, p, stages = e if of is None else of, widths.predicted, list[list[np.ndarray]]()
-    graded = bool(grades[0].size)
+def attribute_stages(own: Slice, of: Slice, block: Block, widths: Widths) -> list[list[np.ndarray]]:
+    """The channels of the eight stages of clause 8.7. own: residuals of this slice. of: of the block's slice."""
+    e, p, graded, stages = own[0], widths.predicted, bool(own[1].size), list[list[np.ndarray]]()
     bounds = [p * a // 38 for a in (0, 6, 12, 20, 29, 38)]
-    for stage, count in enumerate(classes if graded else (1, *classes)):
+    for stage, count in enumerate(block.classes if graded else (1, *block.classes)):
         first = bounds[stage]
-        channels = e[first : bounds[stage + 1]] if stage < 5 else e[p::3]
         measured, by = (
             np.concatenate([*[(64 >> g.astype(np.int64))[None]] * 4, x[:first]]) if graded else x[:first]
-            for x, g in zip((e, of), grades, strict=True)
+            for x, g in (own, of)
         )
-        activity, measure = relative_magnitude(measured, by), relative_magnitude(by, by)
-        stages.append([part for channel in channels for part in split_by_activity(channel, activity, count, measure)])
+        activity, measure = relative_magnitude(measured, by), relative_magnitude(by)
+        classes = classes_by_activity(activity, count, measure)
+        channels = e[first : bounds[stage + 1]] if stage < 5 else e[p::3]
+        stages.append([part for channel in channels for part in _split(channel, classes, count)])
     ys, zs = list[np.ndarray](), list[np.ndarray]()
     for i in range(widths.slots):
         x, y, z = e[p + 3 * i : p + 3 * i + 3]
-        flags, a, b = splits.get(i, (0, 0, 0))
-        near_x, near_xy = np.minimum(abs(x - a), CLASSES_Y - 1), np.minimum(abs(x - a) + abs(y - b), CLASSES_Z - 1)
-        ys += [y[near_x == q] for q in range(CLASSES_Y)] if flags & 1 else [y]
-        zs += [z[near_xy == q] for q in range(CLASSES_Z)] if flags & 2 else [z]
+        flags, a, b = block.splits.get(i, (0, 0, 0))
+        ys += _split(y, np.minimum(abs(x - a), 4), 5) if flags & 1 else [y]
+        zs += _split(z, np.minimum(abs(x - a) + abs(y - b), 6), 7) if flags & 2 else [z]
     return [*stages, ys, zs]
 
 
 def predicted_attributes(
     k: np.ndarray,
-    terms: Terms,
-    splits: Splits,
-    classes: Sequence[int] = ONE_CLASS,
+    block: Block,
     *,
     widths: Widths = DEFAULT_WIDTHS,
-    grades: np.ndarray = NO_CLASSES,
+    classes: np.ndarray = NO_CLASSES,
     lengths: Lengths = lambda sizes: sizes,
     tail: bytes = b"",
     known: Sequence[Known] | None = None,
-    of: np.ndarray | None = None,
-    of_grades: np.ndarray = NO_CLASSES,
+    of: Slice | None = None,
 ) -> bytes:
-    """Section ATTRIBUTES of int32 [channels, n], form 1 (clauses 8.5 to 8.9).
-
-    terms: channel -> (channel, weight) ascending. classes: of stages 1 to 5. lengths: what the block says of stages 0
-    to 6, from the true lengths. tail: after the last stage. of, of_grades: the attributes and step classes of the slice
-    that the block stands in, if it is another one: form 2.
-    """
-    e = residuals(k, terms, widths)
-    before = None if of is None else residuals(of, terms, widths)
-    stages = attribute_stages(e, splits, classes, widths, before, (grades, grades if of is None else of_grades))
-    block = prediction_block({c: gaps(own) for c, own in terms.items()}, splits, {}, classes, widths)
-    front = b"\1" + graded_part(grades) + block if of is None else b"\2" + graded_part(grades)
-    return front + staged(stages, lengths, tail, known=known)
-
-
-def residuals(k: np.ndarray, terms: Terms, widths: Widths = DEFAULT_WIDTHS) -> np.ndarray:
-    """int64 [channels, n]: attributes int32 [channels, n], the predicted ones without their prediction (clause 8.7)."""
-    e = k.astype(np.int64)
-    for c in range(1, widths.predicted):
-        total = sum((w * k[j].astype(np.int64) for j, w in terms.get(c, ())), np.zeros_like(e[c]))
-        e[c] -= total + 512 >> WEIGHT_SHIFT
-    return e
+    """Section ATTRIBUTES of int32 [channels, n], form 1, or form 2 with the attributes and step classes of the slice
+    that the block stands in as `of` (clauses 8.5 to 8.9). lengths, tail: see `staged`."""
+    own = block.residuals(k, widths), classes
+    before = own if of is None else (block.residuals(of[0], widths), of[1])
+    front = b"\2" + graded_part(classes) if of else b"\1" + graded_part(classes) + block.data(widths)
+    return front + staged(attribute_stages(own, before, block, widths), lengths, tail, known=known)
 
 
 # -- LZMA sections (clause 9) ------------------------------------------------------------------------------------------
-
-Stream = Callable[[bytes], bytes]
-
-
-def lzma_layout(numbers: Sequence[np.ndarray], planar: bool) -> bytes:
-    """The bytes under an LZMA2 stream, of arrays of the dtypes that are stored."""
-    if not planar:
-        return b"".join(n.tobytes() for n in numbers)
-    return b"".join(n.view(np.uint8).reshape(-1, n.itemsize).T.tobytes() for n in numbers)
 
 
 def lzma_symbols(
@@ -435,30 +376,21 @@ def lzma_symbols(
     base: int | None = 0,
     width: int | None = None,
     planar: bool = False,
-    stream: Stream = lzma2.stored,
+    stream: Callable[[bytes], bytes] = lzma2.stored,
 ) -> bytes:
-    """Section SYMBOLS. base: of all channels; None takes each channel's first symbol. width: log2 of the bytes of every
+    """Section SYMBOLS. base: of all channels; None takes the first symbol of each. width: log2 of the bytes of every
     number; None takes the narrowest."""
-    out, numbers, common = bytes([lzma2.PROPERTIES, planar]), [], base
+    out, data = bytes([lzma2.PROPERTIES, planar]), b""
     for channel in channels:
         if channel.size:
-            base = int(channel[0]) if common is None else common
-            v = channel.astype(np.int64) - base
+            own = int(channel[0]) if base is None else base
+            v = channel.astype(np.int64) - own
             reach = max(int(v.max()) + 1, -int(v.min()))
-            w = (
-                next(w for w, high in enumerate((1 << 7, 1 << 15, 1 << 31)) if reach <= high)
-                if width is None
-                else width
-            )
-            out += varint(4 * (2 * base if base >= 0 else -2 * base - 1) + w)
-            numbers.append(v.astype(("<i1", "<i2", "<i4")[w]))
-    return out + stream(lzma_layout(numbers, planar))
-
-
-def lzma_floats(arrays: Sequence[np.ndarray], *, planar: bool = False, stream: Stream = lzma2.stored) -> bytes:
-    """Section FLOATS."""
-    data = lzma_layout([a.astype("<f4").ravel() for a in arrays], planar)
-    return bytes([lzma2.PROPERTIES, planar]) + stream(data)
+            w = (reach > 1 << 7) + (reach > 1 << 15) if width is None else width
+            out += varint(4 * (2 * own if own >= 0 else -2 * own - 1) + w)
+            numbers = v.astype(("<i1", "<i2", "<i4")[w])
+            data += numbers.view(np.uint8).reshape(-1, numbers.itemsize).T.tobytes() if planar else numbers.tobytes()
+    return out + stream(data)
 
 
 # -- layers (clause 6) -------------------------------------------------------------------------------------------------
@@ -466,61 +398,54 @@ def lzma_floats(arrays: Sequence[np.ndarray], *, planar: bool = False, stream: S
 
 @dataclass(frozen=True, eq=False)
 class Layer:
-    """A layer as it is meant and as it is written. meta: the layer parameters without the lengths of the sections.
-    brings: of a refining slice, the layer and the attributes of the slices that it names, as they are then."""
+    """A slice of a layer: what it means, and its parameters and sections as they are written.
 
-    meant: LayerSymbols
-    meta: dict[int, object]
-    sections: dict[int, bytes]
-    brings: tuple[int, Sequence[np.ndarray]] | None = None
+    planes, weights: symbols. residuals: of the planes. meta: the layer parameters without the lengths of the sections.
+    """
 
-    def payload(self, meta: Callable[[dict], dict] = lambda m: m, pack: Callable[[object], bytes] = canonical.pack):
-        """Its bytes, the parameters changed by `meta` and written by `pack`."""
-        lengths = {s: len(self.sections[s]) for s in sorted(self.sections)}
-        packed = pack(meta({**self.meta, 2: lengths}))
-        body = b"".join(self.sections[s] for s in sorted(self.sections))
-        return struct.pack("<I", len(packed)) + packed + body
+    number: int
+    widths: Widths
+    cells: np.ndarray
+    rises: np.ndarray
+    codes: np.ndarray
+    classes: np.ndarray
+    attributes: np.ndarray
+    planes: list[np.ndarray]
+    residuals: list[np.ndarray]
+    weights: list[np.ndarray]
+    meta: dict[int, Any]
+    sections: dict[int, bytes] = field(default_factory=dict)
 
-    def padded(self, parameters: int) -> bytes:
-        """Its bytes, an ignored key among the parameters filling them up to so many bytes."""
-        bare = struct.unpack_from("<I", self.payload())[0]
-        form, size = next(
-            (form, parameters - bare - 1 - form)
-            for form in (2, 3)
-            if parameters - bare - 1 - form < 1 << 8 * (form - 1)
-        )
-        return self.payload(lambda m: {**m, 64: bytes(size)})
+    def parameters(self) -> dict[int, Any]:
+        """The layer parameters."""
+        return {**self.meta, 2: {s: len(self.sections[s]) for s in sorted(self.sections)}}
+
+    def payload(self, packed: bytes | None = None) -> bytes:
+        """Its bytes. packed: instead of its parameters."""
+        packed = canonical.pack(self.parameters()) if packed is None else packed
+        return struct.pack("<I", len(packed)) + packed + b"".join(self.sections[s] for s in sorted(self.sections))
+
+    def padded(self, size: int) -> bytes:
+        """Its bytes, with parameters of `size` bytes due to an ignored key."""
+        bare = len(canonical.pack(self.parameters()))
+        form = 2 if size - bare - 3 < 1 << 8 else 3
+        return self.payload(canonical.pack({**self.parameters(), 64: bytes(size - bare - 1 - form)}))
 
     def with_sections(self, sections: Mapping[int, bytes | None]) -> Layer:
         """With other bytes in some sections; None takes one out."""
-        merged = {**self.sections, **sections}
-        return replace(self, sections={s: data for s, data in merged.items() if data is not None})
+        both = {**self.sections, **sections}
+        return replace(self, sections={s: data for s, data in both.items() if data is not None})
+
+    @property
+    def flat(self) -> list[np.ndarray]:
+        """The channels of section PLANES."""
+        return [channel.ravel() for plane in self.residuals for channel in plane]
 
     @property
     def channels(self) -> list[np.ndarray]:
-        """The channels of sections 1 to 4 in their order, planes under predictor 0."""
-        m = self.meant
-        tensors = list(m.tensors())
-        return [m.mask_increase, m.mask_own, *m.attributes, *(row for t in tensors for row in plane_channels(t))]
-
-
-def plane_channels(tensor: np.ndarray) -> list[np.ndarray]:
-    """Channels of a plane [C, H, W]; a weight or bias is one."""
-    return [channel.ravel() for channel in tensor] if tensor.ndim == 3 else [tensor.ravel()]
-
-
-def constant_networks(number: int, widths: Mapping[int, Sequence[int]], inputs: int) -> dict:
-    """Networks by name, every tensor of one symbol of its own. widths: id -> outputs; inputs: of the first of them."""
-    names = {i: name for name, i in LAYER_KINDS[number].network_ids.items()}
-    networks, symbol = {}, 2
-    for i, outputs in widths.items():
-        wide = inputs if number == 0 or i == 0 else widths[0][-1]
-        layers = []
-        for out in outputs:
-            layers.append((np.full((out, wide), symbol, np.int32), np.full(out, symbol - 5, np.int32)))
-            wide, symbol = out, symbol + 1
-        networks[names[i]] = tuple(layers)
-    return networks
+        """The channels of section SYMBOLS."""
+        grades = [self.classes] if self.widths.graded else []
+        return [self.rises, self.codes, *grades, *self.attributes, *self.flat, *(w.ravel() for w in self.weights)]
 
 
 @dataclass(frozen=True)
@@ -532,9 +457,37 @@ class Scale:
     predictors: tuple[int, ...] = (0,) * 6
     fill: Callable[[str, tuple[int, ...]], np.ndarray] = lambda name, shape: pattern(*shape, seed=ord(name[0]))
 
-    def planes(self) -> dict[str, np.ndarray]:
-        """int32 [C, H, W] by name."""
-        return {n: self.fill(n, (self.channels, self.sides[b], self.sides[a])) for n, a, b in PLANES}
+    def planes(self) -> list[np.ndarray]:
+        """int32 [C, H, W] each, in the order of the format."""
+        return [self.fill(n, (self.channels, self.sides[b], self.sides[a])) for n, a, b in PLANES]
+
+
+def constant(value: int) -> Callable[[str, tuple[int, ...]], np.ndarray]:
+    """A `fill` of one symbol."""
+    return lambda name, shape: np.full(shape, value, np.int32)
+
+
+def constant_networks(widths: Mapping[int, Sequence[int]], inputs: int, of_trunk: bool) -> dict[int, list[np.ndarray]]:
+    """id -> weight, bias, weight, ..; each of one symbol of its own. widths: id -> outputs."""
+    networks, symbol = {}, 2
+    for number, outputs in widths.items():
+        wide, layers = widths[0][-1] if of_trunk and number else inputs, list[np.ndarray]()
+        for out in outputs:
+            layers += [np.full((out, wide), symbol, np.int32), np.full(out, symbol - 5, np.int32)]
+            wide, symbol = out, symbol + 1
+        networks[number] = layers
+    return networks
+
+
+def line(n: int, z: int = 0) -> list[list[int]]:
+    """n cells in a row."""
+    return [[i, 0, z] for i in range(n)]
+
+
+def ordered(cells: Any) -> list[list[int]]:
+    """Cells in Morton order."""
+    array = np.array(cells, np.int32).reshape(-1, 3)
+    return array[morton_order(array)].tolist() if len(array) else []
 
 
 def make_layer(
@@ -546,84 +499,95 @@ def make_layer(
     codes: Sequence[int] | None = None,
     attributes: np.ndarray | None = None,
     scales: Sequence[Scale] = (),
-    networks: Mapping[int, Sequence[int]] | dict | None = None,
+    networks: Mapping[int, Sequence[int]] | dict[int, list[np.ndarray]] | None = None,
     steps: Sequence[float] | None = None,
     mode: int = ANS,
-    raw: bool = False,
     widths: Widths = DEFAULT_WIDTHS,
     classes: Sequence[int] | None = None,
 ) -> Layer:
     """A layer of `cells` (in Morton order) after `before` earlier rows.
 
-    Without further words: every rise 0, every code 77, attributes all 2, in layer 0 the networks without hidden layers,
-    elsewhere no deformation unless `scales` are given, then with a trunk and the head 1. networks: outputs by id,
-    or the tensors by name. raw: planes and weights are those symbols times their step, as float32 values.
+    Defaults: every rise 0, every code 77, attributes all 2; in layer 0 the networks without hidden layers, elsewhere a
+    trunk and the head 1 if there are `scales`. networks: outputs by id, or their weights and biases.
     """
-    n, kind = len(cells), LAYER_KINDS[number]
+    n = len(cells)
     if networks is None:
-        networks = (
-            {i: (n,) for i, n in enumerate(widths.networks.values())}
-            if number == 0
-            else {0: (3,), 1: (3,)}
-            if scales
-            else {}
-        )
-    if not any(isinstance(key, str) for key in networks):
-        inputs = widths.inputs if number == 0 else sum(s.channels for s in scales)
-        networks = constant_networks(number, networks, inputs)
-    steps = list(steps or ([2.0**-7] if number == 0 else [2.0**-4, 2.0**-6]))
-    planes = tuple(s.planes() for s in scales)
-    if raw:
-        planes = tuple({name: dequantise(p, steps[0]) for name, p in scale.items()} for scale in planes)
-        networks = {
-            k: tuple((dequantise(w, steps[1]), dequantise(b, steps[1])) for w, b in v) for k, v in networks.items()
-        }
-    meant = LayerSymbols(
-        kind=kind,
-        widths=replace(widths, graded=classes is not None),
-        anchor_q=np.array(cells, np.int32).reshape(-1, 3),
-        mask_increase=np.array([0] * before if rises is None else rises, np.int32),
-        mask_own=np.array([77] * n if codes is None else codes, np.int32),
-        classes=NO_CLASSES if classes is None else np.array(classes, np.int32),
-        attributes=np.full((widths.channels, n), 2, np.int32) if attributes is None else attributes,
-        planes=planes,
-        networks=networks,
-        steps=dict(zip(kind.step_names, steps, strict=True)) if networks else {},
-    )
-    meta: dict[int, object] = {1: n}
+        least = {0: (widths.slots,), 1: (7 * widths.slots,), 2: (3 * widths.slots,)} if number == 0 else {}
+        networks = {0: (3,), 1: (3,)} if scales else least
+    if not any(isinstance(x, np.ndarray) for own in networks.values() for x in own):
+        inputs = widths.feature + 3 if number == 0 else sum(s.channels for s in scales)
+        networks = constant_networks(networks, inputs, number > 0)  # type: ignore[arg-type]
+    planes = [plane for scale in scales for plane in scale.planes()]
+    predictors = [p for s in scales for p in s.predictors]
+    meta: dict[int, Any] = {1: n}
     if networks:
-        meta[3] = steps
+        meta[3] = list(steps or ([2.0**-7] if number == 0 else [2.0**-4, 2.0**-6]))
     if scales:
         meta[4] = [[s.channels, *s.sides, *s.predictors] for s in scales]
     if networks:
-        own = networks.items()
-        meta[5] = [[kind.network_ids[name], *(len(bias) for _, bias in layers)] for name, layers in own]
-    return Layer(meant, meta, _sections(meant, [p for s in scales for p in s.predictors], mode))
+        meta[5] = [[i, *(len(bias) for bias in own[1::2])] for i, own in networks.items()]
+    layer = Layer(
+        number=number,
+        widths=replace(widths, graded=classes is not None),
+        cells=np.array(cells, np.int32).reshape(-1, 3),
+        rises=np.array([0] * before if rises is None else rises, np.int32),
+        codes=np.array([77] * n if codes is None else codes, np.int32),
+        classes=NO_CLASSES if classes is None else np.array(classes, np.int32),
+        attributes=np.full((widths.channels, n), 2, np.int32) if attributes is None else attributes,
+        planes=planes,
+        residuals=[residual(p, k) if k.size else k for p, k in zip(predictors, planes, strict=True)],
+        weights=[w for own in networks.values() for w in own],  # type: ignore[misc]
+        meta=meta,
+    )
+    return layer.with_sections(_sections(layer, mode))
 
 
-def _sections(meant: LayerSymbols, predictors: Sequence[int], mode: int) -> dict[int, bytes]:
-    n = len(meant.anchor_q)
-    sections = {POSITIONS: positions(meant.anchor_q)} if n else {}
-    tensors = list(meant.tensors())
-    planes = [residual(p, k) if k.size else k for p, k in zip(predictors, tensors, strict=False)]
-    weights = [k.ravel() for k in tensors[len(planes) :]]
-    flat = [row for r in planes for row in plane_channels(r)]
-    masks = [meant.mask_increase, meant.mask_own]
+def _sections(layer: Layer, mode: int) -> dict[int, bytes | None]:
+    n, channels = len(layer.cells), layer.channels
+    some = any(c.size for c in channels)
+    sections: dict[int, bytes | None] = {POSITIONS: positions(layer.cells) if n else None}
     if mode == LZMA:
-        grades = [meant.classes] if meant.widths.graded else []
-        channels = [*masks, *grades, *meant.attributes, *flat, *weights]
-        if any(c.size for c in channels):
-            sections[SYMBOLS] = lzma_symbols(channels, stream=lzma2.packed)
-    else:
-        if meant.mask_increase.size or n:
-            sections[MASKS] = coded(masks)
-        if n:
-            sections[ATTRIBUTE] = plain_attributes(meant.attributes, classes=meant.classes)
-        if flat:
-            sections[PLANE] = plain_planes(flat)
-        if weights:
-            sections[WEIGHTS] = coded(weights)
-    return sections
+        return sections | {SYMBOLS: lzma_symbols(channels, stream=lzma2.packed) if some else None}
+    return sections | {
+        MASKS: coded([layer.rises, layer.codes]) if layer.rises.size or n else None,
+        ATTRIBUTES: plain_attributes(layer.attributes, classes=layer.classes) if n else None,
+        PLANE: plain_planes(layer.flat) if layer.flat else None,
+        WEIGHTS: coded(w.ravel() for w in layer.weights) if layer.weights else None,
+    }
+
+
+def later(number: int, cells: Sequence[Sequence[int]], **fields: Any) -> Layer:
+    """A slice after the first of its layer."""
+    return make_layer(number, ordered(cells), networks={}, **fields)
+
+
+@dataclass
+class Slices:
+    """Writes the slices of a layer in turn, each with what those before defined."""
+
+    positions: Known = field(default_factory=list)
+    masks: Known = field(default_factory=list)
+    plain: Known = field(default_factory=list)
+    stages: list[Known] = field(default_factory=lambda: [[] for _ in range(8)])
+    block: Block = field(default_factory=Block)
+    of: Slice | None = None  #: attributes and step classes of the slice that the block stands in
+
+    def add(self, layer: Layer, block: Block | None = None, go_on: bool = False) -> Layer:
+        """The slice as it is written: with a block in form 1, with go_on in form 2, else in form 0."""
+        k, classes, sections = layer.attributes, layer.classes, dict[int, bytes | None]()
+        if layer.rises.size or layer.codes.size:
+            sections[MASKS] = coded([layer.rises, layer.codes], known=self.masks)
+        if layer.codes.size:
+            sections[POSITIONS] = positions(layer.cells, self.positions)
+            if block or go_on:
+                of = self.of if go_on else None
+                self.block, self.of = block or self.block, of or (k, classes)
+                sections[ATTRIBUTES] = predicted_attributes(
+                    k, self.block, widths=layer.widths, classes=classes, known=self.stages, of=of
+                )
+            else:
+                sections[ATTRIBUTES] = plain_attributes(k, known=self.plain, classes=classes)
+        return layer.with_sections(sections)
 
 
 # -- files (clause 3) --------------------------------------------------------------------------------------------------
@@ -631,8 +595,8 @@ def _sections(meant: LayerSymbols, predictors: Sequence[int], mode: int) -> dict
 
 @dataclass(frozen=True, eq=False)
 class Chunk:
-    """A chunk. What is None follows from the payload: the type and length that the header lists, the length and the
-    scene id in the frame. crc: xored to the right CRC-32. layer: what a layer's payload means."""
+    """A chunk. None: the value that follows from the payload, for the type and length in the header's list, and the
+    length and scene id in the frame. crc: xored to the right CRC-32. layer: what the payload means."""
 
     type: int
     payload: bytes
@@ -647,24 +611,24 @@ class Chunk:
         """Its bytes in a file with that scene id."""
         length = len(self.payload) if self.length is None else self.length
         head = struct.pack("<HHI8s", self.type, self.flags, length, self.scene_id or scene_id)
-        body = head + self.payload
-        return body + struct.pack("<I", zlib.crc32(body) ^ self.crc)
+        return head + self.payload + struct.pack("<I", zlib.crc32(head + self.payload) ^ self.crc)
 
 
-def ancillary(type: int, payload: bytes = b"", **fields: object) -> Chunk:
+def ancillary(type: int, payload: bytes = b"", **fields: Any) -> Chunk:
     """An ancillary chunk."""
-    return Chunk(type, payload, flags=1, **fields)  # type: ignore[arg-type]
+    return Chunk(type, payload, **{"flags": 1, **fields})
 
 
 @dataclass(frozen=True, eq=False)
 class File:
-    """A file. header: without the chunk list and the digest, which follow from the chunks unless they are there; what
-    is None is taken out. packed: the header's
-    bytes if they are not the canonical ones. declared: the header length in the preamble. crc: xored to the right
-    CRC-32. tail: after the last chunk."""
+    """A file. header: its fields; those of value None are left out, the chunk list and the digest follow from the chunks.
+
+    packed: bytes instead of the header's. declared: the stated length of the header. crc: xored to the right CRC-32.
+    tail: bytes after the last chunk.
+    """
 
     chunks: tuple[Chunk, ...]
-    header: dict[int, object] = field(default_factory=lambda: HEADER)
+    header: dict[int, Any] = field(default_factory=lambda: HEADER)
     packed: bytes | None = None
     signature: bytes = SIGNATURE
     major: int = MAJOR
@@ -673,115 +637,97 @@ class File:
     crc: int = 0
     tail: bytes = b""
 
-    def fields(self) -> dict[int, object]:
+    def fields(self) -> dict[int, Any]:
         """The header map."""
         chunk_list = [list(c.listed or (c.type, len(c.payload))) for c in self.chunks]
-        own = {k: v for k, v in self.header.items() if v is not None}
-        fields = {1: chunk_list, 14: payload_digest(c.payload for c in self.chunks if not c.flags & 1), **own}
-        return {k: fields[k] for k in sorted(fields) if k not in self.header or self.header[k] is not None}
+        payloads = b"".join(c.payload for c in self.chunks if not c.flags & 1)
+        fields = {1: chunk_list, 14: hashlib.sha256(payloads).digest()[:16], **self.header}
+        return {k: fields[k] for k in sorted(fields) if fields[k] is not None}
 
     def header_bytes(self) -> bytes:
         """The header."""
         return canonical.pack(self.fields()) if self.packed is None else self.packed
 
     def start(self, index: int) -> int:
-        """Offset of a chunk; that of the file's end for the number of chunks."""
+        """Offset of a chunk; that of the end of the file for the number of chunks."""
         return 20 + len(self.header_bytes()) + sum(20 + len(c.payload) for c in self.chunks[:index])
 
     @property
     def scene_id(self) -> bytes:
-        """Clause 3.3, of the header as it is written; a header without its chunk list counts as a whole."""
-        header, chunk_list = self.header_bytes(), canonical.pack(1) + canonical.pack(self.fields()[1])
+        """Clause 3.3, of the header as it is written. Where its chunk list is not there, of all its bytes."""
+        header, fields = self.header_bytes(), self.fields()
+        chunk_list = canonical.pack(1) + canonical.pack(fields[1]) if 1 in fields else header
         described = header[header.find(chunk_list) + len(chunk_list) :] if chunk_list in header else header
-        return hashlib.sha256(described).digest()[:SCENE_ID_SIZE]
+        return hashlib.sha256(described).digest()[:8]
 
     def data(self) -> bytes:
         """Its bytes."""
-        header = self.header_bytes()
+        header, scene_id = self.header_bytes(), self.scene_id
         declared = len(header) if self.declared is None else self.declared
         front = struct.pack("<8sHHI", self.signature, self.major, self.minor, declared)
         crc = zlib.crc32(header, zlib.crc32(front)) ^ self.crc
-        scene_id = self.scene_id  # once: it takes the whole header, of up to thousands of chunks
         frames = b"".join(c.frame(scene_id) for c in self.chunks)
         return front + struct.pack("<I", crc) + header + frames + self.tail
 
-    def with_header(self, fields: Mapping[int, object]) -> File:
+    def with_header(self, fields: Mapping[int, Any]) -> File:
         """With other fields in the header; the value None takes one out."""
         return replace(self, header={**self.header, **fields})
 
-    def with_chunk(self, index: int, **fields: object) -> File:
+    def with_chunk(self, index: int, **fields: Any) -> File:
         """With other fields in one chunk."""
         chunks = list(self.chunks)
-        chunks[index] = replace(chunks[index], **fields)  # type: ignore[arg-type]
+        chunks[index] = replace(chunks[index], **fields)
         return replace(self, chunks=tuple(chunks))
 
-    def with_payload(self, index: int, payload: bytes) -> File:
-        """With another payload in one chunk."""
-        return self.with_chunk(index, payload=payload)
-
     def layer(self, index: int) -> Layer:
-        """What the payload of a layer's chunk means."""
+        """The meaning of a layer's chunk."""
         layer = self.chunks[index].layer
         assert layer is not None
         return layer
 
-    def slices(self, chunks: int | None = None) -> tuple[int, ...]:
+    def slices(self, chunks: int | None = None) -> list[int]:
         """The layer of each slice among the first `chunks` chunks."""
-        return tuple(c.layer.meant.kind.layer for c in self.chunks[:chunks] if c.layer is not None)
+        return [c.layer.number for c in self.chunks[:chunks] if c.layer is not None]
 
-    def hashes(self, chunks: int | None = None) -> list[dict]:
+    def hashes(self, chunks: int | None = None) -> list[dict[str, Any]]:
         """Clause 12.4 of the layers among the first `chunks` chunks, from what they mean."""
-        meant, refined = list[LayerSymbols](), set[int]()
-        for layer in (c.layer for c in self.chunks[:chunks] if c.layer is not None):
-            meant.append(layer.meant)
-            number, brought = layer.brings or (0, ())
-            waiting = [i for i, m in enumerate(meant) if m.kind.layer == number and i not in refined]
-            for i, attributes in zip(waiting, brought, strict=False):
-                meant[i] = replace(meant[i], attributes=attributes)
-                refined.add(i)
-        layers = [merged(list(slices)) for _, slices in itertools.groupby(meant, key=lambda m: m.kind)]
-        return [_hashes(m, self.header) for m in layers]
-
-    def prefixes(self, chunks: int | None = None) -> dict[int, list[dict]]:
-        """By their highest layer, the hashes of those prefixes of layers whose low bits come behind them."""
-        whole, found = self.hashes(chunks), {}
-        for count, row in enumerate(whole[:-1], start=1):
-            numbers = [c.layer.meant.kind.layer if c.layer else -1 for c in self.chunks[:chunks]]
-            end = max(i for i, number in enumerate(numbers) if number == row["layer"])
-            prefix = self.hashes(end + 1)
-            if prefix != whole[:count]:
-                found[row["layer"]] = prefix
-        return found
+        layers = [c.layer for c in self.chunks[:chunks] if c.layer is not None]
+        return [_hashes(list(own), self.header) for _, own in itertools.groupby(layers, key=lambda x: x.number)]
 
 
-def make_file(*layers: Layer, header: Mapping[int, object] | None = None) -> File:
-    """A file of these layers in their chunks. Layers of one kind are its slices, numbered as they come."""
+def make_file(*layers: Layer, header: Mapping[int, Any] | None = None) -> File:
+    """A file of these layers. Those of one number are the slices of a layer, numbered as they come."""
     chunks = []
-    for kind, slices in itertools.groupby(layers, key=lambda x: x.meant.kind):
+    for number, slices in itertools.groupby(layers, key=lambda x: x.number):
         own = list(slices)
-        chunks += [
-            Chunk(kind.chunk_type, x.payload(), slice_flags(number, len(own)), layer=x) for number, x in enumerate(own)
-        ]
-    widths = layers[0].meant.widths
+        flags = [i << 6 | 2 * (i + 1 < len(own)) for i in range(len(own))]
+        chunks += [Chunk(number, x.payload(), f, x) for f, x in zip(flags, own, strict=True)]
+    widths = layers[0].widths
     centres = {16: [i % 5 - 2 for i in range(widths.channels)]} if widths.graded else {}
     return File(tuple(chunks)).with_header({15: [widths.feature, widths.slots], **centres, **(header or {})})
 
 
-def _hashes(m: LayerSymbols, header: Mapping[int, object]) -> dict:
-    steps = dict(zip(ATTRIBUTES, header[4], strict=True))  # type: ignore[call-overload]
-    centre = np.array(header.get(16, [0] * m.widths.channels), np.int32)
-    values = Grid(steps, m.widths, centre).dequantise(m.attributes, m.classes)
-    tensors = [dequantise(m.anchor_q, header[5]), *(values[name] for name in ATTRIBUTES)]  # type: ignore[arg-type]
-    own = list(m.tensors())
-    count = len(PLANES) * len(m.planes)
-    if own:
-        of_steps = list(m.steps.values())
-        tensors += [dequantise(k, of_steps[0 if i < count else -1]) for i, k in enumerate(own)]
-    integers = [a for a in m.arrays() if a.dtype.kind == "i"]
-    digests = [
-        hashlib.sha256(b"".join(a.astype(t).tobytes() for a in x)) for x, t in ((integers, "<i4"), (tensors, "<f4"))
-    ]
-    return {"layer": m.kind.layer, "symbols": digests[0].hexdigest(), "tensors": digests[1].hexdigest()}
+def _hashes(slices: list[Layer], header: Mapping[int, Any]) -> dict[str, Any]:
+    first, d, slots = slices[0], slices[0].widths.feature, slices[0].widths.slots
+    cells = np.concatenate([x.cells for x in slices])
+    order = morton_order(cells) if len(cells) else slice(None)
+    codes, classes = (np.concatenate([getattr(x, name) for x in slices]) for name in ("codes", "classes"))
+    k = np.concatenate([x.attributes for x in slices], axis=1)[:, order]
+    classes = classes[order] if classes.size else classes
+    values = k.astype(np.int64) << (classes if classes.size else 0)
+    values += np.array(header.get(16, [0] * len(k)), np.int64)[:, None]
+
+    def dequantised(symbols: np.ndarray, step: Any) -> np.ndarray:
+        return (symbols.astype(np.float64) * np.asarray(step, np.float64)).astype("<f4")
+
+    x = dequantised(values, np.repeat(header[4], [d, 6, 3 * slots])[:, None])
+    tensors = [dequantised(cells[order], header[5]), x[:d].T, x[d : d + 6].T, x[d + 6 :].T]
+    tensors += [dequantised(p, first.meta[3][0]) for p in first.planes]
+    tensors += [dequantised(w, first.meta[3][-1]) for w in first.weights]
+    symbols = [cells[order], first.rises, codes[order], classes, k, *first.planes, *first.weights]
+    digests = [hashlib.sha256(b"".join(a.tobytes() for a in own)).hexdigest() for own in (
+        [a.astype("<i4") for a in symbols], tensors)]  # fmt: skip
+    return {"layer": first.number, "symbols": digests[0], "tensors": digests[1]}
 
 
 # -- vectors -----------------------------------------------------------------------------------------------------------
@@ -789,64 +735,16 @@ def _hashes(m: LayerSymbols, header: Mapping[int, object]) -> dict:
 
 @dataclass(frozen=True)
 class Vector:
-    """One file of spec/vectors. layers: the hashes of what decodes, of all of a valid file or of the layers before a
-    fault. error: its name (clause 15), None for a valid file. chunk, offset: where the fault lies, if in a chunk and
-    if at a field that the frame fixes. slices: the layer of each slice that decodes. prefixes: the hashes of those
-    prefixes that are not the first of `layers`, by their highest layer."""
+    """One file of spec/vectors. layers: the hashes of all layers that decode. error: a name of clause 15, None for a
+    valid file. chunk, offset: of the fault, if it lies in a chunk and at a field that the frame fixes. slices: the
+    layer of each slice that decodes."""
 
     name: str
-    sentence: str
+    what: str
     clauses: tuple[str, ...]
     data: bytes
-    layers: list[dict]
+    layers: list[dict[str, Any]]
+    slices: list[int]
     error: str | None = None
     chunk: int | None = None
     offset: int | None = None
-    slices: tuple[int, ...] = ()
-    prefixes: Mapping[int, list[dict]] = field(default_factory=dict)
-
-
-def good(name: str, sentence: str, clauses: str, file: File) -> Vector:
-    """A file that decodes."""
-    return Vector(
-        name,
-        sentence,
-        tuple(clauses.split()),
-        file.data(),
-        file.hashes(),
-        slices=file.slices(),
-        prefixes=file.prefixes(),
-    )
-
-
-def bad(
-    name: str,
-    sentence: str,
-    clauses: str,
-    error: str,
-    file: File,
-    *,
-    chunk: int | None = None,
-    at: int | None = None,
-    size: int | None = None,
-    whole: bool = False,
-) -> Vector:
-    """A file with one fault: in `chunk`; before all chunks if None; behind them if `whole`.
-
-    at: byte of the chunk's frame, or of the file outside chunks, where the field at fault begins. size: cut to so many
-    bytes, which is then where the fault lies.
-    """
-    data = file.data()[:size]
-    offset = size if at is None else at + (0 if chunk is None else file.start(chunk))
-    count = None if whole else chunk or 0
-    layers, slices, prefixes = file.hashes(count), file.slices(count), file.prefixes(count)
-    clauses_of = tuple(clauses.split())
-    return Vector("faulty/" + name, sentence, clauses_of, data, layers, error, chunk, offset, slices, prefixes)
-
-
-MALFORMED, LIMIT, FEATURE = "Malformed", "LimitExceeded", "UnsupportedFeature"
-
-
-def in_layer(layer: int, name: str, what: str, clauses: str, error: str, payload: bytes, file: File) -> Vector:
-    """A vector whose fault lies in the payload of one layer of `file`."""
-    return bad(name, what, clauses, error, file.with_payload(layer, payload), chunk=layer)
