@@ -44,7 +44,6 @@ POSITIONS, MASKS, ATTRIBUTES, PLANE, WEIGHTS, SYMBOLS = range(6)  # sections (cl
 ANS, LZMA = 0, 1
 HEADER: dict[int, Any] = {
     2: ANS,
-    3: 0,
     4: [0.0625, 0.03125, 0.125],
     5: 2.0**-7,
     6: [-1.0, -2.0, -3.0, 1.0, 2.0, 3.0],
