@@ -43,7 +43,6 @@ NEED_TRAIN = [
     "quality",
     "train",
 ]
-NEED_TRAIN += ["fuzz/test_trained_file.py"]
 NEED_NO_KERNEL = ["entropy", "spec"]
 collect_ignore = [] if find_spec("torch") and find_spec("numba") else NEED_TRAIN
 

@@ -1,7 +1,6 @@
-"""The player's decoder, in Node: its own tests, its command, and a sample of its fuzzer against the package.
+"""The player's decoder, in Node: its own tests and its command. tests/fuzz holds it against the package.
 
-Types are checked where `npm install --no-package-lock` was called in player/. The long form of the sample is
-`python tools/player_fuzz.py`.
+Types are checked where `npm install --no-package-lock` was called in player/.
 """
 
 from __future__ import annotations
@@ -16,7 +15,6 @@ import pytest
 from strategies import small_file
 
 from pd4dgs_codec import decode, encode
-from pd4dgs_codec.format.info import hashes
 
 ROOT = Path(__file__).parents[2]
 PLAYER = ROOT / "player"
@@ -90,46 +88,6 @@ def test_the_command_refuses_a_damaged_file_in_one_line(tmp_path):
     done = run_node(PLAYER / "cli.mjs", "hashes", path)
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.count("\n") == 1 and "ChecksumMismatch" in done.stderr
-
-
-def test_what_was_changed_at_random_ends_as_in_the_package(tools):
-    import player_fuzz
-    from fuzz import VECTORS
-    from fuzzing.files import given_seeds
-    from player_speed import NodeDecoder
-
-    seeds = given_seeds(sorted((VECTORS / "valid").glob("*.pd4"))[::4])
-    with NodeDecoder(str(NODE)) as node:
-        figures = player_fuzz.run_inputs(node, seeds, 1, range(100))
-    assert figures.inputs == 100 and not figures.findings
-    assert figures.sealed > 30 and figures.outcomes["decoded"] > 0 and len(figures.outcomes) > 4
-
-
-def test_the_fuzzer_tells_a_decoder_that_is_wrong(tools):
-    import player_fuzz
-
-    data = small_file()
-
-    class Wrong:
-        def __init__(self, answer):
-            self.answer = answer
-
-        def ask(self, question):
-            return self.answer
-
-    def findings(answer, data=data):
-        figures = player_fuzz.Figures()
-        player_fuzz.compare(Wrong(answer), data, "it", figures)
-        return figures
-
-    right = {"hashes": hashes(data)}
-    assert not findings(right).findings
-    assert findings({"hashes": right["hashes"][:-1]}).findings
-    assert findings({"crash": "TypeError"}).findings
-    assert findings({"error": "Malformed", "message": ""}).findings
-    assert findings(right, data[:-1]).findings
-    other = findings({"error": "Malformed", "message": ""}, data[:-1])
-    assert not other.findings and other.differences.total() == 1
 
 
 def test_the_speed_tool_copies_anchors_side_by_side(tools):

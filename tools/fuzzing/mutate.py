@@ -1,6 +1,6 @@
-"""Mutations of `.pd4` files: of bytes as they lie, and of parts, with lengths, ids and checksums repaired afterwards.
+"""Mutations of `.pd4` files, of bytes and of parts. Lengths, the chunk list, scene ids and CRCs are then made right.
 
-Everything is drawn from the given random.Random, so an input is named by its seed and index.
+Everything is drawn from the given random.Random, so an input is named by its run and its number.
 """
 
 from __future__ import annotations
@@ -9,52 +9,46 @@ import copy
 import itertools
 import random
 import struct
-import zlib
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from fuzzing.files import Chunk, Parts, Seed, put_together, take_apart, take_stages
-from pd4dgs_codec.entropy.varint import put_varint
-from pd4dgs_codec.errors import EncodeError
-from pd4dgs_codec.format.container import (
-    CHUNK_HEAD_SIZE,
-    FLAG_MORE,
-    SIGNATURE,
-    read_chunk,
-    read_preamble,
-    slice_flags,
-)
-from pd4dgs_codec.format.header import STEPS, VOXEL_SIZE
-from pd4dgs_codec.format.kinds import BY_CHUNK_TYPE
-from pd4dgs_codec.format.layer_meta import Section
+from vectors.blocks import varint
 
+from pd4dgs_codec.errors import DecodeError, EncodeError
+from pd4dgs_codec.format import canonical
+from pd4dgs_codec.format.container import read_chunk, read_preamble, write_chunk, write_preamble
+from pd4dgs_codec.format.header import scene_id_of
+
+from .legal import Seed
+
+ATTRIBUTES, PLANES = 2, 3  # sections in stages
+SECTIONS = 2  # key of the layer parameters
 _POWERS = (7, 8, 12, 14, 15, 16, 20, 21, 22, 23, 24, 26, 28, 31, 32)
 #: Around every limit of the format and every width of an integer.
 INTEGERS = (0, 1, 2, 3, 4, 5, 10, 30, 68, 70, *(v for p in _POWERS for v in ((1 << p) - 1, 1 << p, (1 << p) + 1)))
 REALS = (0.0, -0.0, 1.0, -1.0, 0.5, 2.0**-149, 2.0**-126, 2.0**-20, 2.0**20, 2.0**127, -(2.0**127))
-OVERFLOWING = 2.0**127  #: a step of which two are not finite
 LONGEST_BURST = 64
-REPAIRED_SHARE = 0.6  #: of the inputs
+SEALED_SHARE = 0.6  #: of the inputs
 
 
 @dataclass(frozen=True)
 class Case:
-    """One input. repaired: whether checksums were made right after the mutation; recipe: what was done."""
+    """One input. sealed: whether lengths, ids and CRCs were made right after the mutation. recipe: what was done.
+    origins: the files that it was made from."""
 
     data: bytes
-    repaired: bool
+    sealed: bool
     recipe: str
+    origins: tuple[bytes, ...] = ()
 
 
 # -- bytes -------------------------------------------------------------------------------------------------------------
 
-Change = Callable[[random.Random, bytearray, bytes], None]
-
 
 def _place(rng: random.Random, data: bytearray) -> int:
-    """An offset. In a section, half of them are near the beginning, where parameters lie."""
-    near = len(data) if data[:4] == SIGNATURE[:4] or rng.random() < 0.5 else min(len(data), 40)
+    """An offset; half of them near the beginning, where parameters lie."""
+    near = len(data) if rng.random() < 0.5 else min(len(data), 40)
     return rng.randrange(near) if near else 0
 
 
@@ -67,28 +61,23 @@ def flip(rng: random.Random, data: bytearray, other: bytes) -> None:
 
 def burst(rng: random.Random, data: bytearray, other: bytes) -> None:
     """A run of other bytes: random, all 0 or all 255."""
-    at, size = _place(rng, data), rng.randint(1, LONGEST_BURST)
-    size = min(size, len(data) - at)
+    at = _place(rng, data)
+    size = min(rng.randint(1, LONGEST_BURST), len(data) - at)
     data[at : at + size] = rng.choice((rng.randbytes(size), bytes(size), b"\xff" * size))
 
 
 def swap(rng: random.Random, data: bytearray, other: bytes) -> None:
     """Two runs of equal length change places."""
-    a, b, size = _place(rng, data), _place(rng, data), rng.choice((1, 1, 2, 4, 16))
-    a, b = min(a, b), max(a, b)
-    size = min(size, b - a, len(data) - b)
+    a, b = sorted((_place(rng, data), _place(rng, data)))
+    size = min(rng.choice((1, 1, 2, 4, 16)), b - a, len(data) - b)
     data[a : a + size], data[b : b + size] = data[b : b + size], data[a : a + size]
 
 
 def splice(rng: random.Random, data: bytearray, other: bytes) -> None:
-    """A part of another file: its tail from some place on, or a run of it over one of ours."""
-    if not other:
-        return
-    at, start = _place(rng, data), rng.randrange(len(other))
-    if rng.random() < 0.5:
-        data[at:] = other[at if rng.random() < 0.5 else start :]
-    else:
-        run = other[start : start + rng.randint(1, LONGEST_BURST)]
+    """A run of another file over one of ours, or its tail."""
+    if other:
+        at, start = _place(rng, data), rng.randrange(len(other))
+        run = other[start : start + rng.choice((LONGEST_BURST, len(other)))]
         data[at : at + len(run)] = run
 
 
@@ -99,14 +88,9 @@ def insert(rng: random.Random, data: bytearray, other: bytes) -> None:
 
 
 def delete(rng: random.Random, data: bytearray, other: bytes) -> None:
-    """A run is gone."""
+    """A run is gone, or all to the end."""
     at = _place(rng, data)
-    del data[at : at + rng.choice((1, 1, 2, 4, LONGEST_BURST))]
-
-
-def truncate(rng: random.Random, data: bytearray, other: bytes) -> None:
-    """The end is gone."""
-    del data[_place(rng, data) :]
+    del data[at : at + rng.choice((1, 1, 2, 4, LONGEST_BURST, len(data)))]
 
 
 def set_integer(rng: random.Random, data: bytearray, other: bytes) -> None:
@@ -117,19 +101,14 @@ def set_integer(rng: random.Random, data: bytearray, other: bytes) -> None:
 
 
 def set_varint(rng: random.Random, data: bytearray, other: bytes) -> None:
-    """The variable-length integer at some place becomes another one."""
-    at = _place(rng, data)
-    end = at
+    """The variable-length integer (a token, a count, a parameter) at some place becomes another one."""
+    at = end = _place(rng, data)
     while end < len(data) and data[end] & 0x80:
         end += 1
-    coded = bytearray()
-    put_varint(coded, min(rng.choice(INTEGERS) << rng.randrange(2), (1 << 35) - 1))
-    data[at : end + 1] = coded
+    data[at : end + 1] = varint(min(rng.choice(INTEGERS) << rng.randrange(2), (1 << 35) - 1))
 
 
-CHANGES: tuple[Change, ...] = (
-    flip, flip, burst, swap, splice, insert, delete, truncate, set_integer, set_varint, set_varint
-)  # fmt: skip
+CHANGES = (flip, flip, burst, swap, splice, insert, delete, set_integer, set_varint, set_varint)
 
 
 def change_bytes(rng: random.Random, data: bytes, other: bytes, names: list[str]) -> bytes:
@@ -142,7 +121,7 @@ def change_bytes(rng: random.Random, data: bytes, other: bytes, names: list[str]
     return bytes(changed)
 
 
-# -- values of canonical msgpack ---------------------------------------------------------------------------------------
+# -- fields ------------------------------------------------------------------------------------------------------------
 
 
 def _containers(value: Any) -> list[Any]:
@@ -165,19 +144,19 @@ def _other_value(rng: random.Random, value: Any) -> Any:
 
 
 def change_value(rng: random.Random, tree: dict[int, Any]) -> None:
-    """In place, one number or text in `tree` becomes another, or a random list or map gains or loses an entry."""
+    """In place, one leaf of `tree` becomes another, or a random list or map gains or loses an entry."""
     containers = _containers(tree)
     places = [(c, key) for c in containers for key in (list(c) if isinstance(c, dict) else range(len(c)))]
+    leaves = [(c, key) for c, key in places if not isinstance(c[key], (list, dict))]
+    container, key = rng.choice(leaves or places) if places else (tree, None)
     if places and rng.random() < 0.85:
-        leaves = [(c, key) for c, key in places if not isinstance(c[key], (list, dict))]
-        container, key = rng.choice(leaves or places)
         container[key] = _other_value(rng, container[key])
         return
     container = rng.choice(containers)
     if len(container) and rng.random() < 0.5:
         del container[rng.choice(list(container) if isinstance(container, dict) else range(len(container)))]
     elif isinstance(container, dict):
-        container[rng.choice((0, 6, 13, 63, 64, 1000, (1 << 32) - 1))] = rng.choice((0, 1.0, "later", [[[[0]]]]))
+        container[rng.choice((0, 3, 6, 13, 63, 64, 1000, (1 << 32) - 1))] = rng.choice((0, 1.0, "later", [[[[0]]]]))
     else:
         again = copy.deepcopy(rng.choice(container)) if container else rng.choice(INTEGERS)
         container.insert(rng.randint(0, len(container)), again)
@@ -186,36 +165,136 @@ def change_value(rng: random.Random, tree: dict[int, Any]) -> None:
 # -- parts -------------------------------------------------------------------------------------------------------------
 
 
+@dataclass
+class Chunk:
+    """A chunk. meta, sections: parameters (the section map only with keys that stand for no bytes) and sections of a
+    layer, None for other chunks."""
+
+    type: int
+    flags: int
+    payload: bytes
+    meta: dict[int, Any] | None = None
+    sections: dict[int, bytes] | None = None
+
+    def packed(self) -> bytes:
+        """The payload, written anew if it was taken apart."""
+        if self.meta is None or self.sections is None:
+            return self.payload
+        lengths = {number: len(data) for number, data in sorted(self.sections.items()) if data}
+        others = self.meta.get(SECTIONS)
+        meta = canonical.pack({**self.meta, SECTIONS: {**(others if isinstance(others, dict) else {}), **lengths}})
+        return b"".join([struct.pack("<I", len(meta)), meta, *(self.sections[number] for number in lengths)])
+
+
+@dataclass
+class Parts:
+    """A file taken apart."""
+
+    header: dict[int, Any]
+    chunks: list[Chunk]
+
+
+def take_apart(data: bytes) -> Parts:
+    """The parts of a valid file, each a copy."""
+    preamble = read_preamble(data)
+    header, chunks, offset = canonical.unpack(preamble.header), list[Chunk](), preamble.size
+    while offset < len(data):
+        chunk = read_chunk(data, offset)
+        part = Chunk(chunk.type, chunk.flags, chunk.payload)
+        if chunk.type < 3:
+            (length,) = struct.unpack_from("<I", chunk.payload)
+            part.meta, at, part.sections = canonical.unpack(chunk.payload[4 : 4 + length]), 4 + length, {}
+            for number in sorted(n for n in part.meta[SECTIONS] if n < 64):
+                size = part.meta[SECTIONS].pop(number)
+                part.sections[number], at = chunk.payload[at : at + size], at + size
+        chunks.append(part)
+        offset = chunk.end
+    return Parts(header, chunks)
+
+
+def put_together(parts: Parts, header: bytes | None = None) -> bytes:
+    """The file of `parts`, or with other bytes for a header, which may be none. EncodeError if a value has no canonical
+    form."""
+    payloads = [chunk.packed() for chunk in parts.chunks]
+    if header is None:
+        rows = [[chunk.type, len(payload)] for chunk, payload in zip(parts.chunks, payloads, strict=True)]
+        header = canonical.pack({**parts.header, 1: rows})
+    try:
+        scene_id = scene_id_of(header)
+    except (DecodeError, LookupError, TypeError):  # no header, or no chunk
+        scene_id = bytes(8)
+    framed = [write_chunk(c.type, c.flags, scene_id, p) for c, p in zip(parts.chunks, payloads, strict=True)]
+    return b"".join([write_preamble(header), *framed])
+
+
+def stages_of(section: bytes, number: int, header: dict[int, Any], meta: dict[int, Any]) -> tuple[bytes, list[bytes]]:
+    """(all before the lengths of the stages, the stages) of a valid section of form 1 or 2, else (the section, [])."""
+    at = 1
+
+    def number_at() -> int:
+        nonlocal at
+        value, shift = 0, 0
+        while True:
+            byte = section[at]
+            value, shift, at = value | (byte & 127) << shift, shift + 7, at + 1
+            if byte < 128:
+                return value
+
+    graded, (feature, slots) = 16 in header, header[15]
+    if number == ATTRIBUTES and section[0] in (1, 2):
+        count = 8
+        if graded:
+            length = number_at()
+            at += length
+        if section[0] == 1:
+            for _ in range(1, feature + 6):
+                for _ in range(2 * number_at()):
+                    number_at()
+            for _ in range(5 + graded):
+                number_at()
+            for _ in range(slots):
+                split = number_at()
+                for _ in range((split > 0) + (split > 1)):
+                    number_at()
+    elif number == PLANES and section[0] == 1:
+        count = max(1, (meta[4][0][0] - 1).bit_length())
+        for _ in range(count - 1):
+            number_at()
+    else:
+        return section, []
+    block = section[:at]
+    lengths = [number_at() for _ in range(count - 1)]
+    bounds = [*itertools.accumulate(lengths, initial=at), len(section)]
+    return block, [section[start:end] for start, end in itertools.pairwise(bounds)]
+
+
 def _layer(rng: random.Random, parts: Parts) -> Chunk | None:
-    layers = [chunk for chunk in parts.chunks if chunk.sections is not None]
+    layers = [chunk for chunk in parts.chunks if chunk.sections]
     return rng.choice(layers) if layers else None
 
 
 def section_bytes(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:
-    """Bytes of one section; the lengths follow."""
+    """Bytes of a section, or of one of its stages or the block before them; lengths follow."""
     chunk = _layer(rng, parts)
-    if chunk is None or not chunk.sections:
+    if chunk is None or chunk.sections is None or chunk.meta is None:
         return
     number = rng.choice(list(chunk.sections))
-    chunk.sections[number] = change_bytes(rng, chunk.sections[number], chunk.sections[number], names)
-    names.append(f"in section {number}")
-
-
-def stage_bytes(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:
-    """Bytes of one stage of a section in stages, or of the block before them; the stages' lengths follow."""
-    places = [(chunk, number) for chunk in parts.chunks for number in chunk.sections or ()]
-    found = [(c, number, staged) for c, number in places if (staged := take_stages(c, number)) is not None]
-    if not found:
-        return section_bytes(rng, parts, other, names)
-    chunk, number, staged = rng.choice(found)
-    at = rng.randrange(-1, len(staged.stages))
+    section = chunk.sections[number]
+    try:
+        block, stages = stages_of(section, number, parts.header, chunk.meta)
+    except (LookupError, TypeError, ValueError):  # changed before
+        block, stages = section, []
+    names.append(f"section {number}")
+    if not stages:
+        chunk.sections[number] = change_bytes(rng, section, section, names)
+        return
+    at = rng.randrange(-1, len(stages))
     if at < 0:
-        staged.block = staged.block[:1] + change_bytes(rng, staged.block[1:], staged.block, names)
+        block = block[:1] + change_bytes(rng, block[1:], block, names)
     else:
-        staged.stages[at] = change_bytes(rng, staged.stages[at], rng.choice(staged.stages), names)
-    assert chunk.sections is not None
-    chunk.sections[number] = staged.packed()
-    names.append(f"in section {number}, {f'stage {at}' if at >= 0 else 'the block'}")
+        stages[at] = change_bytes(rng, stages[at], rng.choice(stages), names)
+    names.append(f"stage {at}" if at >= 0 else "block")
+    chunk.sections[number] = block + varint(*(len(s) for s in stages[:-1])) + b"".join(stages)
 
 
 def section_swap(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:
@@ -223,15 +302,14 @@ def section_swap(rng: random.Random, parts: Parts, other: Parts, names: list[str
     chunk, donor = _layer(rng, parts), _layer(rng, other if rng.random() < 0.6 else parts)
     if chunk is None or chunk.sections is None or donor is None:
         return
-    number = rng.choice([*chunk.sections, rng.randrange(len(Section))])
+    number, size = rng.choice([*chunk.sections, rng.randrange(8)]), rng.randint(1, 200)
     given = (donor.sections or {}).get(number, b"")
-    size = rng.randint(1, 200)
     chunk.sections[number] = rng.choice((given, given, b"", rng.randbytes(size), bytes(size), b"\x10" * size))
     names.append(f"section {number} from elsewhere")
 
 
 def parameters(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:
-    """A value in a layer's parameters."""
+    """A value in the parameters of a layer."""
     chunk = _layer(rng, parts)
     if chunk is not None and chunk.meta is not None:
         change_value(rng, chunk.meta)
@@ -244,14 +322,6 @@ def header_value(rng: random.Random, parts: Parts, other: Parts, names: list[str
     names.append("a header value")
 
 
-def overflow(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:
-    """Values that are not finite, which no payload shows, and a layer parameter: of two faults one is to be named."""
-    key, value = rng.choice(((STEPS, [OVERFLOWING] * 3), (VOXEL_SIZE, OVERFLOWING)))
-    parts.header[key] = value
-    names.append("values that overflow")
-    parameters(rng, parts, other, names)
-
-
 def payload_bytes(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:
     """Bytes of a whole payload, its parameters included."""
     chunk = rng.choice(parts.chunks)
@@ -261,7 +331,7 @@ def payload_bytes(rng: random.Random, parts: Parts, other: Parts, names: list[st
 
 
 def chunks(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> None:
-    """Chunks are dropped, doubled, swapped, of another type, flagged, or come from another file."""
+    """Chunks are dropped, doubled, swapped, of another type, flagged, or from another file; then numbered, or not."""
     i, j = rng.randrange(len(parts.chunks)), rng.randrange(len(parts.chunks))
     act = rng.randrange(6)
     if act == 0 and len(parts.chunks) > 1:
@@ -273,27 +343,29 @@ def chunks(rng: random.Random, parts: Parts, other: Parts, names: list[str]) -> 
     elif act == 3:
         parts.chunks[i].type = rng.choice((0, 1, 2, 3, 99, 65535))
     elif act == 4:
-        parts.chunks[i].flags ^= rng.choice((1, FLAG_MORE, slice_flags(1, 1), slice_flags(512, 1)))
+        parts.chunks[i].flags ^= 1 << rng.choice((0, 1, 2, 6, 15))
     else:
         parts.chunks[i] = copy.deepcopy(rng.choice(other.chunks))
     names.append("chunks")
-    if act != 4 and rng.random() < 0.7:  # else hardly a changed order of slices gets past the flags
+    if act != 4 and rng.random() < 0.7:  # else a changed order of slices hardly gets past the flags
         for kind, run in itertools.groupby(parts.chunks, key=lambda chunk: chunk.type):
             own = list(run)
-            for number, chunk in enumerate(own if kind in BY_CHUNK_TYPE else ()):
-                chunk.flags = slice_flags(number, len(own))
+            for number, chunk in enumerate(own if kind < 3 else ()):
+                chunk.flags = number << 6 | 2 * (number + 1 < len(own))
         names.append("renumbered")
 
 
-PART_CHANGES = (section_bytes, stage_bytes, section_swap, parameters, header_value, overflow, payload_bytes, chunks)
-PART_WEIGHTS = (30, 15, 10, 20, 8, 3, 12, 5)
+PartChange = Callable[[random.Random, Parts, Parts, list[str]], None]
+PART_CHANGES: dict[PartChange, int] = {
+    section_bytes: 45, section_swap: 10, parameters: 20, header_value: 8, payload_bytes: 12, chunks: 5
+}  # fmt: skip
 
 
 def change_parts(rng: random.Random, data: bytes, other: bytes, names: list[str]) -> bytes:
-    """A file whose parts were changed, with lengths, chunk list, scene ids and checksums right again."""
+    """A file whose parts were changed, with lengths, chunk list, scene ids and CRCs right again."""
     parts, donor = take_apart(data), take_apart(other)
     try:
-        for change in rng.choices(PART_CHANGES, PART_WEIGHTS, k=rng.choice((1, 1, 1, 2))):
+        for change in rng.choices([*PART_CHANGES], [*PART_CHANGES.values()], k=rng.choice((1, 1, 1, 2))):
             change(rng, parts, donor, names)
         return put_together(parts)
     except EncodeError:  # a value that has no canonical form, such as one nested too deep
@@ -301,42 +373,20 @@ def change_parts(rng: random.Random, data: bytes, other: bytes, names: list[str]
 
 
 def change_header_bytes(rng: random.Random, data: bytes, other: bytes, names: list[str]) -> bytes:
-    """The header's bytes changed as they lie, ids and checksums right again: msgpack in forms that nobody writes."""
+    """The bytes of the header changed, ids and CRCs right again: msgpack in forms that nobody writes."""
     (size,) = struct.unpack_from("<I", data, 12)
     header = change_bytes(rng, data[20 : 20 + size], other[20:200], names)[:4096]
     names.append("in the header")
     return put_together(take_apart(data), header)
 
 
-def change_frame(rng: random.Random, data: bytes, other: bytes, names: list[str]) -> bytes:
-    """A field of a chunk's frame changed, with the checksum right again: type, flags, length or scene id that lie."""
-    frames, offset = [], read_preamble(data).size
-    while offset < len(data):
-        end = read_chunk(data, offset).end
-        frames.append((offset, end))
-        offset = end
-    offset, end = rng.choice(frames)
-    head = bytearray(data[offset : offset + CHUNK_HEAD_SIZE])
-    at = rng.randrange(len(head))
-    head[at] ^= 1 << rng.randrange(8)
-    names.append(f"byte {at} of a frame")
-    body = bytes(head) + data[offset + CHUNK_HEAD_SIZE : end - 4]
-    return data[:offset] + body + struct.pack("<I", zlib.crc32(body)) + data[end:]
-
-
-def make_case(seeds: Sequence[Seed], seed: int, index: int) -> Case:
-    """Input number `index` of the run `seed` over these files."""
-    rng = random.Random(seed << 40 | index)
-    chosen, donor = rng.choices(seeds, [s.weight for s in seeds], k=2)
+def make_case(seeds: Sequence[Seed], run: int, index: int) -> Case:
+    """Input number `index` of a run over these files."""
+    rng = random.Random(run << 40 | index)
+    chosen, donor = rng.choice(seeds), rng.choice(seeds)
     names: list[str] = []
     act = rng.random()
-    if act < 0.04:
-        data = change_header_bytes(rng, chosen.data, donor.data, names)
-    elif act < 0.06:
-        data = change_frame(rng, chosen.data, donor.data, names)
-    elif act < REPAIRED_SHARE:
-        data = change_parts(rng, chosen.data, donor.data, names)
-    else:
-        data = change_bytes(rng, chosen.data, donor.data, names)
-        return Case(data, False, f"{chosen.name}: {', '.join(names)}")
-    return Case(data, True, f"{chosen.name}, repaired: {', '.join(names)}")
+    change = change_header_bytes if act < 0.05 else change_parts if act < SEALED_SHARE else change_bytes
+    data, sealed = change(rng, chosen.data, donor.data, names), act < SEALED_SHARE
+    recipe = f"{chosen.name}{', sealed' if sealed else ''}: {', '.join(names)}"
+    return Case(data, sealed, recipe, (chosen.data, donor.data))

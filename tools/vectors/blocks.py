@@ -620,7 +620,7 @@ def ancillary(type: int, payload: bytes = b"", **fields: Any) -> Chunk:
 
 @dataclass(frozen=True, eq=False)
 class File:
-    """A file. header: its fields; those of value None are left out, the chunk list and the digest follow from the chunks.
+    """A file. header: fields; those of value None are left out, chunk list and digest follow from the chunks.
 
     packed: bytes instead of the header's. declared: the stated length of the header. crc: xored to the right CRC-32.
     tail: bytes after the last chunk.

@@ -21,9 +21,9 @@ separated by ` ; `, edits one thing of it; lengths, CRCs, digest and scene ids a
     := make_file(...)    another file
 
 Values are Python expressions over the names of blocks.py and of this file. `it` is the value before, `base` the file,
-n(i) the length of the payload of chunk i. Options: `!Error` and other clauses than those of the group, `@2` the chunk
-at fault (`@end` behind all chunks) where it does not follow from the first patch. `for a: x | b: y` writes the line once
-for each name and value, in the places of {i} and {x}. Without a sentence the patch is the description.
+n(i) the length of the payload of chunk i. Options: `!Error` and clauses in place of those of the group, `@2` the
+chunk at fault (`@end` behind all chunks) where it does not follow from the first patch. `for a: x | b: y` writes the
+line once for each name and value, in the places of {i} and {x}. Without a sentence the patch is the description.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.entropy.ans import ans_encode
-from pd4dgs_codec.entropy.priors import Const, Gauss, Hist, Mixture, Normal, Prior, Window, write_prior
+from pd4dgs_codec.entropy.priors import Const, Hist, Prior, Window, write_prior
 from pd4dgs_codec.format import canonical
 from pd4dgs_codec.format.planes import restore
 from pd4dgs_codec.scene import Widths
@@ -111,11 +111,11 @@ def _lines() -> Iterator[str]:
     """One line for each vector: continuations are joined, and lines with `for` are written out."""
     text = re.sub(r"\n +(?=[#!@]|\d[\d. ]*(?:  |\n))", "  ", TABLE.read_text(encoding="utf-8"))
     text = re.sub(r"\n +", " ", text)
-    for line in text.splitlines():
-        head, found, values = line.partition("  for ")
+    for row in text.splitlines():
+        head, found, values = row.partition("  for ")
         for value in values.split(" | ") if found else [""]:
             name, _, patch = value.partition(": ")
-            if line and not line.startswith("#"):
+            if row and not row.startswith("#"):
                 yield head.replace("{i}", name).replace("{x}", patch)
 
 
@@ -168,7 +168,10 @@ def _patched(file: File, patch: str, edits: list[Any], names: dict[str, Any]) ->
         return file, (chunk, "end")
     if target == "file":
         at = PREAMBLE.get(keys[0])
-        return replace(file, **{keys[0]: value(getattr(file, keys[0]))}), (None, file.start(len(file.chunks)) if keys[0] == "tail" else at)
+        return replace(file, **{keys[0]: value(getattr(file, keys[0]))}), (
+            None,
+            file.start(len(file.chunks)) if keys[0] == "tail" else at,
+        )
     if target == "chunks":
         return replace(file, chunks=tuple(value())), None
     if target == "header":
@@ -281,13 +284,11 @@ def of_highs(*highs: int) -> np.ndarray:
     return k
 
 
-def predicted(k: np.ndarray, block: Block = Block(), grades: Any = None, widths: Widths = blocks.DEFAULT_WIDTHS) -> File:  # noqa: B008
-    """A layer 0 of form 1."""
-    layer = make_layer(0, line(k.shape[1]), attributes=k, classes=grades, widths=widths)
-    widths = layer.widths
-    return with_section(
-        ATTRIBUTES, blocks.predicted_attributes(k, block, widths=widths, classes=layer.classes), make_file(layer)
-    )
+def predicted(k: np.ndarray, block: Block | None = None, **fields: Any) -> File:
+    """Layer 0 in form 1."""
+    layer = make_layer(0, line(k.shape[1]), attributes=k, **fields)
+    section = blocks.predicted_attributes(k, block or Block(), widths=layer.widths, classes=layer.classes)
+    return with_section(ATTRIBUTES, section, make_file(layer))
 
 
 def ladder(p: int = 38) -> dict[int, list[tuple[int, int]]]:
@@ -318,8 +319,16 @@ def histograms(differences: bool) -> dict[int, Hist]:
     """Histograms of every class step, from 1 to the most classes."""
     steps = [(d, top) for d in (8, 16, 32, 64) for top in (1, 5, 1 + 1984 // d)]
     return {
-        i: histogram(d, top, 7 + 2 * (i % 3), differences, 24 + 8 * (i % 3), 8 * top) for i, (d, top) in enumerate(steps)
+        i: histogram(d, top, 7 + 2 * (i % 3), differences, 24 + 8 * (i % 3), 8 * top)
+        for i, (d, top) in enumerate(steps)
     }
+
+
+def many_classes() -> np.ndarray:
+    """Classes of 2^14 entries, most of them 9."""
+    classes = np.full(1 << 14, 9)
+    classes[::37], classes[5::1001] = 12, 1
+    return classes
 
 
 def tables_at_limit(more: bool = False) -> File:
@@ -551,8 +560,8 @@ def graded_slices() -> File:
 
 
 def slices_with_classes(go_on: bool) -> File:
-    """Two slices with step classes; those of the second under the prior of the first one's, which is wrong, or under one
-    of its own of more entries than a section may define that goes on."""
+    """Two slices with step classes; those of the second under the prior of the first one's, which is wrong, or under
+    one of its own of more entries than a section may define that goes on."""
     known = blocks.Known()
     coded([[0, 3, 6]], known=known)
     part = coded([[6, 0, 3]], {} if go_on else {0: gauss(0, 2 << 10)}, known if go_on else None)
@@ -595,15 +604,13 @@ def of_widths(widths: Widths, staged: bool = False) -> File:
     if staged:
         block = Block(ladder(p) | {p - 1: [(p - 2, 512)]}, splits(widths.slots), (8, 3, 2, 6, 4))
         return predicted(k, block, widths=widths)
-    moves = make_layer(
-        1, (), before=ROWS, scales=[Scale(1, (1, 3, 2, 4))], networks=heads(widths), widths=widths
-    )
+    moves = make_layer(1, (), before=ROWS, scales=[Scale(1, (1, 3, 2, 4))], networks=heads(widths), widths=widths)
     return make_file(make_layer(0, line(ROWS), attributes=k, widths=widths), moves)
 
 
 def graded(k: np.ndarray, block: Block | None = None) -> File:
     """40 anchors of all step classes."""
-    return predicted(k, block, GRADES) if block else rows(ROWS, attributes=k, classes=GRADES)
+    return predicted(k, block, classes=GRADES) if block else rows(ROWS, attributes=k, classes=GRADES)
 
 
 def edge_classes() -> File:
@@ -716,16 +723,18 @@ def same_slices(*order: int) -> File:
     return replace(file, chunks=tuple(file.chunks[i] for i in order)).with_header({14: file.fields()[14]})
 
 
-def ended_layer() -> File:
-    """Layer 0 without its last slice, which has no anchors, then layer 1."""
+def empty_slices(*order: int) -> File:
+    """Layer 0 in three slices, of which the later ones have no anchors, then layer 1; in another order."""
     file = make_file(make_layer(), *[later(0, ())] * 2, make_layer(1, line(1, z=5), before=1))
-    return replace(file, chunks=(*file.chunks[:2], file.chunks[3])).with_header({14: file.fields()[14]})
+    return replace(file, chunks=tuple(file.chunks[i] for i in order)).with_header({14: file.fields()[14]})
 
 
 def beyond_payload() -> File:
     """Parameters a byte longer than their payload."""
     file = make_file(make_layer(cells=()), make_layer(1, ()))
-    return file.with_chunk(1, payload=(len(file.chunks[1].payload) - 3).to_bytes(4, "little") + file.chunks[1].payload[4:])
+    return file.with_chunk(
+        1, payload=(len(file.chunks[1].payload) - 3).to_bytes(4, "little") + file.chunks[1].payload[4:]
+    )
 
 
 def without_networks(*keys: int, empty: bool = False) -> File:
