@@ -138,13 +138,12 @@ MESSAGES = {
     "layer-1-steps-alone": "key 3 is there without reason",
     "layer-1-scales-missing": "key 4 is missing",
     "scales-channels-differ": "1 channels, expected 2 as in scale 0",
-    "scales-predictor-of-floats": "predictor 1 on float32 planes, expected 0",
     "networks-entry-empty": "an empty network entry, expected an id and widths",
     "networks-two": "expected .'opacity', 'covariance', 'color'",
     "networks-trunk-alone": "expected 'trunk' and at least one head",
     "networks-outputs": "network opacity: 11 outputs, expected 10",
     "section-symbols-missing": "section symbols is missing",
-    "section-floats-in-layer-0": "section 6 is there, but nothing is left for it to code",
+    "section-symbols-in-mode-ans": "section 5 is there, but nothing is left for it to code",
     "samples-over-limit": r"planes of \d+ cells, limit 268435456",
     "positions-index-over-limit": "a cell of 1048577, limit 1048576",
     "mask-code-2": "layer 0: mask code in 2..77, expected 3..255",
@@ -152,7 +151,7 @@ MESSAGES = {
     "mask-sum-over-255-in-layer-2": "layer 2: mask code 256, expected at most 255",
     "attribute-above": "a symbol over 8388608 in magnitude",
     "overflow-attributes": "a reconstructed value is not finite",
-    "voxel-twice": "voxel .2, 0, 0. holds more than one anchor, expected one",
+    "voxel-twice": "voxel .1, 0, 0. holds more than one anchor, expected one",
 }
 
 

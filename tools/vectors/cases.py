@@ -39,6 +39,7 @@ from typing import Any
 
 import numpy as np
 
+import pd4dgs_codec.entropy.priors
 from pd4dgs_codec.entropy.ans import ans_encode
 from pd4dgs_codec.entropy.priors import Const, Hist, Prior, Window, write_prior
 from pd4dgs_codec.format import canonical
@@ -90,7 +91,7 @@ PREAMBLE = {"signature": 0, "major": 8, "declared": 12, "crc": 16}
 
 def vectors() -> Iterator[Vector]:
     """All vectors, in the order of the table."""
-    names: dict[str, Any] = {k: v for k, v in {**vars(blocks), **globals()}.items() if not k.startswith("_")}
+    names: dict[str, Any] = {**vars(pd4dgs_codec.entropy.priors), **vars(blocks), **globals()}
     bases: dict[str, File] = {}
     group = ("", "", "", "")
     for text in _lines():
