@@ -17,7 +17,7 @@ from torch import Tensor
 
 from pd4dgs_codec.bench.stability import BOX, CAMERA, Case, Found, largest, refusal, small_scene
 from pd4dgs_codec.data.view import Dataset, View
-from pd4dgs_codec.draw.visibility import near_plane
+from pd4dgs_codec.draw.gaussians import near_plane
 from pd4dgs_codec.errors import EncodeError, NotFinite, RenderError
 from pd4dgs_codec.format import decoder, encoder, residuals
 from pd4dgs_codec.model import checkpoint, hexplane
@@ -138,7 +138,7 @@ def _sampling_error(
             if name == "encoder":
                 found = residuals.sample_planes(planes, box, points, t)
             else:
-                module = hexplane.HexPlane.from_plane_arrays(box, planes)
+                module = hexplane.HexPlane.from_arrays(box, planes)
                 found = module(torch.from_numpy(points), t).detach().numpy()
             expected = exact_samples(planes, box, points, t)
             worst[name] = largest([worst[name], float(np.abs(found - expected).max() / np.abs(expected).max())])
@@ -151,7 +151,7 @@ def _bad_points_error() -> Found:
     border = np.where(np.isnan(bad) | np.isneginf(bad), low, np.where(np.isposinf(bad), high, bad)).astype(np.float32)
     errors = []
     for channels in (8, 5):  # sampled by the kernel and by torch
-        module = hexplane.HexPlane.from_plane_arrays(BOX, _planes(RESOLUTION, channels))
+        module = hexplane.HexPlane.from_arrays(BOX, _planes(RESOLUTION, channels))
         x = torch.from_numpy(bad).requires_grad_()
         found, expected = module(x, 0.4), module(torch.from_numpy(border), 0.4)
         (slope,) = torch.autograd.grad(found.sum(), x)

@@ -15,8 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from pd4dgs_codec.data.cameras import rotation_matrix
+from pd4dgs_codec.draw.gaussians import LEAST_NEAR, MIN_OPACITY
 from pd4dgs_codec.draw.player import Player
-from pd4dgs_codec.draw.visibility import LEAST_NEAR, MIN_OPACITY
 from pd4dgs_codec.interchange.splats import Splats, camera_eye, harmonics, looking, quaternions, sphere, spread, unit
 from pd4dgs_codec.scene import Camera
 

@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from pd4dgs_codec.data.view import View
+from pd4dgs_codec.draw.gaussians import near_plane
 from pd4dgs_codec.draw.player import Player
-from pd4dgs_codec.draw.visibility import near_plane
 from pd4dgs_codec.interchange.bake import Eyes, bake
 from pd4dgs_codec.interchange.refine import Target, logits, refine
 from pd4dgs_codec.interchange.splats import Splats, picture, unit

@@ -24,20 +24,10 @@ from pd4dgs_codec.errors import DataError, Pd4Error
 from pd4dgs_codec.format.check import check_scene
 from pd4dgs_codec.io import write_bytes
 from pd4dgs_codec.model.convert import from_scene
+from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model
-from pd4dgs_codec.scene import (
-    GLOBAL_HEADS,
-    LOCAL_HEADS,
-    PLANES,
-    SCAFFOLD_NETWORKS,
-    Camera,
-    Deformation,
-    Grading,
-    Network,
-    Scene,
-    SceneInfo,
-    Steps,
-)
+from pd4dgs_codec.model.networks import MLP
+from pd4dgs_codec.scene import SCAFFOLD_NETWORKS, Camera, Deformation, Grading, Scene, SceneInfo, Steps
 
 FORMAT = "pd4dgs-checkpoint"
 VERSION = 1
@@ -52,7 +42,7 @@ def save(path: str | Path, model: Model, training: dict[str, Any] | None = None)
         "info": _info_to_plain(model.info),
         "steps": asdict(model.steps),
         "deformations": {
-            name: None if field is None else field.planes.layout.reso.tolist()
+            name: None if field is None else field.shape()
             for name, field in (("global", model.global_deformation), ("local", model.local_deformation))
         },
         "state": {name: tensor.detach().cpu() for name, tensor in model.state_dict().items()},
@@ -163,26 +153,10 @@ def _build(content: dict[str, Any]) -> Model:
     state = {name: tensor.numpy() for name, tensor in content["state"].items()}
     n = len(state["anchor_q"])
 
-    def network(prefix: str) -> Network:
-        count = sum(k.startswith(f"{prefix}.linears.") and k.endswith(".weight") for k in state)
-        names = [f"{prefix}.linears.{i}" for i in range(count)]
-        return tuple((state[f"{name}.weight"], state[f"{name}.bias"]) for name in names)
-
     def deformation(name: str) -> Deformation | None:
-        reso = content["deformations"][name]
-        if reso is None:
-            return None
-        prefix = f"{name}_deformation"
-        n_cells, channels = state[f"{prefix}.planes.grid"].shape
-        needed = sum(r[a] * r[b] for r in reso for _, a, b in PLANES)
-        if needed != n_cells:  # before anything of that size is made
-            raise ValueError(f"{name} planes of {n_cells} cells, expected {needed} for the resolutions {reso}")
-        planes = tuple({plane: np.zeros((channels, r[b], r[a]), np.float32) for plane, a, b in PLANES} for r in reso)
-        # the registry's order, not the dictionary's: optimiser states are matched to parameters by order
-        present = {k.split(".")[2] for k in state if k.startswith(f"{prefix}.heads.")}
-        heads = [head for head in (*GLOBAL_HEADS, *LOCAL_HEADS) if head in present]
-        networks = {"trunk": network(f"{prefix}.trunk")} | {h: network(f"{prefix}.heads.{h}") for h in heads}
-        return Deformation(planes, networks)
+        shape, prefix = content["deformations"][name], f"{name}_deformation."
+        own = {key.removeprefix(prefix): value for key, value in state.items() if key.startswith(prefix)}
+        return None if shape is None else DeformationField.arrays_of_state(shape, own)
 
     scene = Scene(
         info=_info_from_plain(content["info"]),
@@ -194,7 +168,7 @@ def _build(content: dict[str, Any]) -> Model:
         scaling_log=np.zeros(state["scaling_log"].shape, np.float32),
         offset=np.zeros(state["offset"].shape, np.float32),
         mask=(np.full(n, 255, np.uint8),) * 3,
-        networks={name: network(f"networks.{name}") for name in SCAFFOLD_NETWORKS},
+        networks={name: MLP.arrays_of_state(state, f"networks.{name}") for name in SCAFFOLD_NETWORKS},
         global_deformation=deformation("global"),
         local_deformation=deformation("local"),
         grading=Grading(state["step_class"], state["centre"]) if "step_class" in state else None,

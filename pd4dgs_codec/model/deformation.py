@@ -1,75 +1,207 @@
-"""Global and local deformation: a HexPlane, a shared trunk and one linear head per residual."""
+"""A deformation as a torch module: residuals with gradients, start values, rate and regularisers, arrays both ways.
+
+The rest of `model` and `train` know a deformation by `DeformationField` alone. This one is a HexPlane, a shared trunk
+and one network per residual head; another kind is another body of the class.
+"""
 
 from __future__ import annotations
 
-from typing import cast
+from collections.abc import Mapping, Sequence
+from itertools import accumulate
+from typing import Any, cast
 
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.autograd.function import once_differentiable
 from torch.nn import functional as F
 
 from pd4dgs_codec import scene
+from pd4dgs_codec.draw.layers import Layers
+from pd4dgs_codec.format.plane_choice import choose_predictor
+from pd4dgs_codec.format.quantise import quantise
+from pd4dgs_codec.model import plane_terms
 from pd4dgs_codec.model.config import DeformationConfig
 from pd4dgs_codec.model.hexplane import HexPlane
-from pd4dgs_codec.model.mlp import MLP
+from pd4dgs_codec.model.networks import MLP
+from pd4dgs_codec.model.rate import gaussian_bits
 
 
 class DeformationField(nn.Module):
     """Residuals at points and a time. The heads start at zero, so a fresh field changes nothing."""
 
-    def __init__(self, planes: HexPlane, trunk: MLP, heads: dict[str, MLP]):
+    def __init__(self, planes: HexPlane, trunk: MLP, heads: Mapping[str, MLP]):
         super().__init__()
-        self.planes = planes
-        self.unit = float(scene.deformation_unit(planes.box.numpy()))
-        self.trunk = trunk
-        self.heads = nn.ModuleDict(heads)
+        self.planes, self.trunk, self.heads = planes, trunk, nn.ModuleDict(heads)
+        self.unit = float(scene.deformation_unit(planes.box.numpy()))  #: of heads that are lengths, scene units
+
+    # -- start values and arrays ---------------------------------------------------------------------------------------
 
     @staticmethod
     def fresh(
-        config: DeformationConfig, box: np.ndarray, head_widths: dict[str, int], spacing: int | None, plane_step: float
+        config: DeformationConfig, box: np.ndarray, head_widths: dict[str, int], spacing: int | None, step: float
     ) -> DeformationField:
-        """A new field with the heads that `config` names, `head_widths` giving each one's output width. spacing: of the
-        planes' start values, see HexPlane."""
-        resolution = (config.resolution,) * 3 + (config.time_resolution,)
-        planes = HexPlane(box, resolution, config.channels, config.multires, spacing=spacing, step=plane_step)
-        trunk = MLP((config.channels * len(config.multires), config.width, config.width))
-        return DeformationField(
-            planes, trunk, {name: MLP((config.width, head_widths[name]), zero_last=True) for name in config.heads}
-        )
+        """A new field with the heads that `config` names. head_widths: the output width of each; spacing and the
+        quantisation step of the planes: see `HexPlane.start`."""
+        side, scales = config.resolution, config.multires
+        planes = HexPlane(box, [(side * m,) * 3 + (config.time_resolution,) for m in scales], config.channels)
+        planes.start(spacing, step)
+        trunk = MLP((config.channels * len(scales), config.width, config.width))
+        heads = {name: MLP((config.width, head_widths[name]), zero_last=True) for name in config.heads}
+        return DeformationField(planes, trunk, heads)
 
     @staticmethod
     def from_arrays(deformation: scene.Deformation, box: np.ndarray) -> DeformationField:
-        """The field that a decoded scene holds."""
+        """The field of a decoded scene."""
         networks = {name: MLP.from_arrays(net) for name, net in deformation.networks.items()}
-        trunk = networks.pop("trunk")
-        return DeformationField(HexPlane.from_plane_arrays(box, deformation.planes), trunk, networks)
+        trunk = networks.pop(scene.TRUNK)
+        return DeformationField(HexPlane.from_arrays(box, deformation.planes), trunk, networks)
 
     def arrays(self) -> scene.Deformation:
-        """Planes and weights as numpy arrays."""
-        networks = {"trunk": self.trunk.arrays()} | {name: head.arrays() for name, head in self.named_heads()}
-        return scene.Deformation(self.planes.plane_arrays(), networks)
+        """The inverse of `from_arrays`."""
+        networks = {scene.TRUNK: self.trunk.arrays()} | {name: head.arrays() for name, head in self._named_heads()}
+        return scene.Deformation(self.planes.arrays(), networks)
+
+    def shape(self) -> list[list[int]]:
+        """What a checkpoint needs beside the state to rebuild the field: see `arrays_of_state`."""
+        resolutions: list[list[int]] = self.planes.layout.reso.tolist()
+        return resolutions
+
+    @staticmethod
+    def arrays_of_state(shape: list[list[int]], state: Mapping[str, np.ndarray]) -> scene.Deformation:
+        """Arrays of a field's shapes, from its `shape` and state dictionary; the planes are 0. ValueError if the two do
+        not fit."""
+        n_cells, channels = state["planes.grid"].shape
+        needed = sum(r[a] * r[b] for r in shape for _, a, b in scene.PLANES)
+        if needed != n_cells:  # before anything of that size is made
+            raise ValueError(f"planes of {n_cells} cells, expected {needed} for the resolutions {shape}")
+        planes = tuple(
+            {plane: np.zeros((channels, r[b], r[a]), np.float32) for plane, a, b in scene.PLANES} for r in shape
+        )
+        # the registry's order, not the dictionary's: optimiser states are matched to parameters by order
+        present = {key.split(".")[1] for key in state if key.startswith("heads.")}
+        heads = [head for head in (*scene.GLOBAL_HEADS, *scene.LOCAL_HEADS) if head in present]
+        names = {scene.TRUNK: scene.TRUNK} | {head: f"heads.{head}" for head in heads}
+        return scene.Deformation(planes, {name: MLP.arrays_of_state(state, key) for name, key in names.items()})
+
+    # -- parameters, regularisers and rate -----------------------------------------------------------------------------
+
+    @property
+    def features(self) -> list[nn.Parameter]:
+        """The parameters in the step of planes, on which `regularisers` and `rate` depend."""
+        return [self.planes.grid]
+
+    @property
+    def weights(self) -> list[nn.Parameter]:
+        """The other parameters, in the step of weights."""
+        return [*self.trunk.parameters(), *self.heads.parameters()]
+
+    def head_layer(self, head: str) -> nn.Linear | None:
+        """The linear layer whose output is the residual `head`; None if the field lacks it."""
+        return cast(MLP, self.heads[head]).layers[-1] if head in self.heads else None
+
+    def regularisers(self, features: Sequence[Tensor]) -> dict[str, Tensor]:
+        """The regularisers, unweighted, by name. features: those of the field, or others of their shapes."""
+        return plane_terms.regularisers(features[0], self.planes.layout)
+
+    def rate(self, features: Sequence[Tensor], step: float) -> Tensor:
+        """A differentiable proxy for the bits of `features`, as in `regularisers`, at a quantisation step."""
+        return plane_terms.proxy_bits(features[0], self.planes.layout, step)
+
+    def bits(self, step: float) -> float:
+        """The sum of R(a) of the coded residuals of the features at a quantisation step: one Gaussian per channel of a
+        plane, as with `--priors gauss`, under the predictor that the codec picks."""
+        total = 0.0
+        for planes in self.planes.arrays():
+            for name, plane in planes.items():
+                _, residual = choose_predictor(quantise(plane, step, name))
+                total += gaussian_bits(residual.reshape(len(residual), -1))
+        return total
+
+    # -- residuals -----------------------------------------------------------------------------------------------------
 
     def forward(
         self, points: Tensor, t: float, plane_step: float | None = None, weight_step: float | None = None
     ) -> dict[str, Tensor]:
-        """points [n, 3] world, t in 0..1 -> residual [n, width] per head present, lengths in scene units."""
+        """points [n, 3] world, t in 0..1 -> residual [n, width] per head present, lengths in scene units. Steps: planes
+        and weights are rounded to multiples of them, straight through."""
         if not self.heads:
             return {}
-        outputs = self._outputs(points, t, plane_step, weight_step)
-        return {name: out * self.unit if name in scene.LENGTH_HEADS else out for name, out in outputs.items()}
+        hidden = F.relu(self.trunk(self.planes(points, t, plane_step), weight_step))
+        return {name: head(hidden, weight_step) * self._unit_of(name) for name, head in self._named_heads()}
 
-    def _outputs(
-        self, points: Tensor, t: float, plane_step: float | None, weight_step: float | None
-    ) -> dict[str, Tensor]:
-        hidden = F.relu(self.trunk(self.planes(points, t, step=plane_step), weight_step))
-        layers = {name: head.rounded(weight_step) for name, head in self.named_heads()}
-        if any(len(head) > 1 for head in layers.values()):
-            return {name: head(hidden, weight_step) for name, head in self.named_heads()}
-        firsts = [head[0] for head in layers.values()]  # one product for all heads
-        out = F.linear(hidden, torch.cat([w for w, _ in firsts]), torch.cat([b for _, b in firsts]))
-        return dict(zip(layers, torch.split(out, [len(b) for _, b in firsts], dim=1), strict=True))
+    def moved_reference(
+        self, rows: Tensor, widths: Mapping[str, int], t: float, plane_step: float | None, weight_step: float | None
+    ) -> Tensor:
+        """rows [n, sum of widths] plus the residuals at their points, the first three columns. widths: of all heads of
+        the registry, in the order of the columns; the columns of absent heads stay. Plain torch."""
+        found = self(rows[:, :3], t, plane_step, weight_step)
+        parts = [found[name] if name in found else rows.new_zeros(len(rows), width) for name, width in widths.items()]
+        return rows + torch.cat(parts, dim=1)
 
-    def named_heads(self) -> list[tuple[str, MLP]]:
+    @property
+    def fusible(self) -> bool:
+        """Whether `moved` can evaluate the field by the kernels."""
+        return self.planes.fusible and all(len(head.layers) == 1 for _, head in self._named_heads())
+
+    def moved(
+        self,
+        rows: Tensor,
+        widths: Mapping[str, int],
+        t: float,
+        plane_step: float | None,
+        weight_step: float | None,
+        follows: bool,
+    ) -> Tensor:
+        """`moved_reference` by the kernels. follows: whether the gradient by the points is wanted."""
+        if not self.heads:
+            return rows
+        points = rows[:, :3] if follows else rows[:, :3].detach()
+        features = self.planes(points, t, plane_step)
+        ends = dict(zip(widths, accumulate(widths.values()), strict=True))
+        columns = [
+            (slice(ends[name] - widths[name], ends[name]), self._unit_of(name)) for name, _ in self._named_heads()
+        ]
+        networks = [self.trunk, *(head for _, head in self._named_heads())]
+        parameters = [p for network in networks for layer in network.layers for p in (layer.weight, layer.bias)]
+        settings = (columns, 2 * len(self.trunk.layers), weight_step)
+        out: Tensor = _AddNetworks.apply(rows, features, settings, *parameters)  # type: ignore[no-untyped-call]
+        return out
+
+    def _named_heads(self) -> list[tuple[str, MLP]]:
         """The heads present, in the registry's order."""
         return [(name, cast(MLP, head)) for name, head in self.heads.items()]
+
+    def _unit_of(self, head: str) -> float:
+        return self.unit if head in scene.LENGTH_HEADS else 1.0
+
+
+class _AddNetworks(torch.autograd.Function):
+    """(rows, features) -> rows plus the outputs of the trunk and all heads, each in its columns and times its unit."""
+
+    @staticmethod
+    def forward(ctx: Any, rows: Tensor, features: Tensor, settings: tuple[Any, ...], *parameters: Tensor) -> Tensor:
+        columns, trunk, step = settings
+        used = [p if step is None else torch.div(p, step).round_().mul_(step) for p in parameters]
+        weight, bias = rows.new_zeros(rows.shape[1], used[trunk].shape[1]), rows.new_zeros(rows.shape[1])
+        for (own, unit), w, b in zip(columns, used[trunk::2], used[trunk + 1 :: 2], strict=True):
+            torch.mul(w, unit, out=weight[own])
+            torch.mul(b, unit, out=bias[own])
+        pairs = [*zip(used[:trunk:2], used[1:trunk:2], strict=True), (weight, bias)]
+        ctx.layers, ctx.columns = Layers([(w.numpy(), b.numpy()) for w, b in pairs]), columns
+        out = rows.clone()
+        ctx.hidden = ctx.layers.add(out.numpy(), features.numpy(), keep=True)
+        ctx.save_for_backward(features)
+        return out
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g: Tensor) -> tuple[Tensor | None, ...]:
+        (features,) = ctx.saved_tensors
+        g = g.contiguous()
+        g_features, grads = ctx.layers.backward(g.numpy(), features.numpy(), ctx.hidden)
+        weight, bias = map(torch.from_numpy, grads.pop())
+        found = [torch.from_numpy(part) for layer in grads for part in layer]
+        for own, unit in ctx.columns:
+            found += [weight[own] * unit, bias[own] * unit]
+        return g, torch.from_numpy(g_features), None, *found

@@ -11,8 +11,8 @@ import torch
 from torch import Tensor
 
 from pd4dgs_codec.model.model import Model
+from pd4dgs_codec.model.networks import EXACT, Rounding
 from pd4dgs_codec.model.picture import draw
-from pd4dgs_codec.model.rounding import EXACT, Rounding
 from pd4dgs_codec.scene import ATTRIBUTES, Camera
 
 #: Random pictures of signs per view from which an anchor's weight is estimated.

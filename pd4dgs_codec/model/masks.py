@@ -11,10 +11,10 @@ from torch.nn import functional as F
 def level_mask(logits: Tensor, level: int) -> Tensor:
     """m^(level) [N] of logits [N, 3]: sigmoid(a0 + sum_{1<=j<=level} softplus(a_j)), so never falling with level.
 
-    The gradient reaches a_level alone. Were it to reach the logits below as well, whatever a higher level needs would
-    be held in layer 0 too, and the levels' masks would stay together.
+    The gradient reaches a_level alone. If it reached the logits below as well, layer 0 would hold the anchors of higher
+    levels too, and the levels' masks would stay together.
     """
-    columns = logits.T.contiguous()  # torch has vectors only for what is
+    columns = logits.T.contiguous()  # torch vectorises contiguous tensors only
     total = columns[0]
     for j in range(1, level + 1):
         total = total.detach() + F.softplus(columns[j])

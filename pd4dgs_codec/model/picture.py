@@ -9,16 +9,17 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pd4dgs_codec.draw.visibility import check_time, near_plane
+from pd4dgs_codec.draw.gaussians import check_time, near_plane
 from pd4dgs_codec.model.model import Gaussians, Model
+from pd4dgs_codec.model.networks import EXACT, Rounding
 from pd4dgs_codec.model.rasterization import rasterization
-from pd4dgs_codec.model.rounding import EXACT, Rounding
 from pd4dgs_codec.scene import Camera, SceneInfo
 
 
 @dataclass
 class Picture:
-    """image [H, W, 3] (may exceed 1 slightly where Gaussians overlap numerically), alpha [H, W], and what made them."""
+    """image [H, W, 3] (may exceed 1 slightly where Gaussians overlap numerically), alpha [H, W], the Gaussians, and the
+    meta of `rasterization`."""
 
     image: Tensor
     alpha: Tensor
@@ -29,7 +30,7 @@ class Picture:
 def render(
     model: Model, level: int, t: float, camera: Camera, rounding: Rounding = EXACT, only: Tensor | None = None
 ) -> Picture:
-    """Render_level at normalised time t in 0..1, of the anchors `only` (bool [N]) where it is given."""
+    """Render_level at normalised time t in 0..1, of the anchors `only` (bool [N]) if given."""
     check_time(t)
     gaussians = model.gaussians(level, t, camera, rounding, only)
     if torch.is_grad_enabled():

@@ -1,20 +1,27 @@
-"""A dense float64 torch oracle: every Gaussian against every pixel, gradients by autograd. Slow, for tests.
+"""Plain torch forms of the kernels, with gradients by autograd: a rasteriser, and the stages of `Model.gaussians`.
 
-Written from the textbook formulas (matrix products, an inverse by determinant), sharing only thresholds with the
-kernels, so that a common mistake is unlikely. Only the determinant differs from the textbook: p r - q^2 has no digit
-left where a Gaussian is 10^8 times as long as a pixel is wide.
+The rasteriser is a dense float64 oracle, every Gaussian against every pixel; slow, for tests. It is written from the
+textbook formulas (matrix products, an inverse by determinant) and shares only thresholds with the kernels, so that a
+common mistake is unlikely. Only the determinant differs from the textbook: p r - q^2 has no digit left where a Gaussian
+is 10^8 times as long as a pixel is wide.
+
+The stages are the oracle of `fused`, and the path on CUDA and for networks that the kernels do not take.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.nn import functional as F
 
+from pd4dgs_codec.draw.gaussians import MIN_OPACITY
 from pd4dgs_codec.draw.projection import ALPHA_MAX, ALPHA_MIN, EPS2D, FAR
-from pd4dgs_codec.scene import Camera
+from pd4dgs_codec.model.networks import MLP, round_straight_through
+from pd4dgs_codec.scene import SCALING_DIM, Camera
 
 T_MIN = 1e-4
 #: Pixels of the side of a block.
@@ -136,3 +143,59 @@ def _before_the_camera(
     keep &= torch.isfinite(means).all(-1) & torch.isfinite(quats).all(-1) & torch.isfinite(scales).all(-1)
     index = torch.nonzero(keep)[:, 0]
     return index[torch.sort(z[index].to(torch.float32), stable=True).indices]
+
+
+# -- the stages of `Model.gaussians`, as `fused` has them --------------------------------------------------------------
+
+
+def pick(
+    attributes: Sequence[Tensor],
+    position: Tensor,
+    rows: Tensor,
+    steps: Sequence[float],
+    noise: Sequence[Tensor] | None,
+    rounding: bool,
+    spacing: Tensor,
+    centres: Sequence[Tensor],
+) -> Tensor:
+    """See `fused.pick`."""
+    parts, factor = [position.index_select(0, rows)], spacing.index_select(0, rows)[:, None]
+    for i, (values, step, centre) in enumerate(zip(attributes, steps, centres, strict=True)):
+        picked, middle = values.flatten(1).index_select(0, rows), centre.flatten()
+        if rounding:
+            picked = middle + round_straight_through(picked - middle, step * factor)
+        elif noise is not None:
+            picked = picked + noise[i] * step * factor
+        parts.append(picked)
+    return torch.cat(parts, dim=1)
+
+
+def grow(
+    anchors: Tensor, mask: Tensor, eye: Tensor, networks: Sequence[MLP], step: float | None
+) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """See `fused.grow`."""
+    slots = len(networks[0].layers[-1].bias)
+    position, feature, offset, scaling = torch.split(
+        anchors, [3, anchors.shape[1] - 3 - 3 * slots - SCALING_DIM, 3 * slots, SCALING_DIM], dim=1
+    )
+    inputs = torch.cat([feature, F.normalize(position - eye, dim=1)], dim=1)
+    opacity, shape, color = (network(inputs, step) for network in networks)
+    opacity = torch.tanh(opacity)
+    keep = (opacity.detach() * mask.detach()[:, None] >= MIN_OPACITY).flatten().nonzero()[:, 0]
+    shape, color = (values.reshape(-1, values.shape[1] // slots).index_select(0, keep) for values in (shape, color))
+    owner = torch.div(keep, slots, rounding_mode="floor")
+    spread, size = torch.split(scaling.exp().index_select(0, owner), 3, dim=1)
+    means = position.index_select(0, owner) + offset.reshape(-1, 3).index_select(0, keep) * spread
+    scales, quats = size * torch.sigmoid(shape[:, :3]), F.normalize(shape[:, 3:], dim=1)
+    kept = opacity.flatten().index_select(0, keep)[:, None]
+    gaussians = torch.cat([means, scales, quats, kept, torch.sigmoid(color)], dim=1)
+    return gaussians, mask.index_select(0, owner), opacity.detach(), keep
+
+
+def finish(gaussians: Tensor, gates: Tensor, loose: bool) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+    """See `fused.finish`."""
+    means, scales, quats, opacities, colors = torch.split(gaussians, [3, 3, 4, 1, 3], dim=1)
+    if loose:
+        scales, quats = F.relu(scales), F.normalize(quats, dim=1)
+        opacities, colors = opacities.clamp(0, 1), colors.clamp(0, 1)
+    return means, quats, scales * gates[:, None], opacities[:, 0] * gates, colors

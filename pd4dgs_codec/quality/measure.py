@@ -23,8 +23,7 @@ from pd4dgs_codec.format.table import classes_of
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.harm import anchor_harm
 from pd4dgs_codec.model.picture import render_image
-from pd4dgs_codec.model.plane_rate import gaussian_bits
-from pd4dgs_codec.model.rate import channel_moments, rate_bits
+from pd4dgs_codec.model.rate import channel_moments, gaussian_bits, rate_bits
 from pd4dgs_codec.quality.frames import Frame
 from pd4dgs_codec.quality.image import level_psnr
 from pd4dgs_codec.scene import Scene

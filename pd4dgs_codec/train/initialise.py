@@ -73,7 +73,7 @@ def fresh_model(
 def learn_paths(model: Model, dataset: Dataset, generator: torch.Generator) -> None:
     """Teaches the global deformation to move each anchor as the dataset's point next to it moves."""
     field = model.global_deformation
-    if field is None or "position" not in field.heads or dataset.points is None or dataset.paths is None:
+    if field is None or field.head_layer("position") is None or dataset.points is None or dataset.paths is None:
         return
     anchors, points = model.anchor, torch.from_numpy(dataset.points)
     blocks = torch.split(anchors, max(1, 8_000_000 // len(points)))
@@ -81,8 +81,7 @@ def learn_paths(model: Model, dataset: Dataset, generator: torch.Generator) -> N
     moves = (torch.from_numpy(dataset.paths) - points)[:, nearest] / field.unit
     if not moves.any():
         return
-    networks = [*field.trunk.parameters(), *field.heads["position"].parameters()]
-    groups = zip((list(field.planes.parameters()), networks), PATH_RATES, strict=True)
+    groups = zip((field.features, field.weights), PATH_RATES, strict=True)
     adam = torch.optim.Adam([{"params": params, "lr": rate} for params, rate in groups])
     for _ in range(PATH_STEPS):
         k = int(torch.randint(len(moves), (), generator=generator))

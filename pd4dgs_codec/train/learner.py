@@ -14,8 +14,8 @@ from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.errors import NotFinite
 from pd4dgs_codec.model.config import ModelConfig
 from pd4dgs_codec.model.model import Model
+from pd4dgs_codec.model.networks import Rounding
 from pd4dgs_codec.model.picture import Picture, render
-from pd4dgs_codec.model.rounding import Rounding
 from pd4dgs_codec.threads import keep_freed_memory
 from pd4dgs_codec.train import workers
 from pd4dgs_codec.train.config import TrainConfig

@@ -15,11 +15,9 @@ import torch
 from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
-from pd4dgs_codec.model.hexplane import HexPlane
+from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.masks import level_mask
 from pd4dgs_codec.model.model import Model
-from pd4dgs_codec.model.plane_rate import proxy_bits
-from pd4dgs_codec.model.plane_regularisers import regularisers
 from pd4dgs_codec.model.rate import row_bits
 from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import ATTRIBUTES, MASK_THRESHOLD
@@ -52,15 +50,16 @@ class ModelLoss:
     def begin(self, model: Model, level: int, schedule: Schedule, place: int) -> Callable[[], Terms]:
         """Begins to find the terms of a step at `place`; what is returned waits for them. Meanwhile nobody else may
         draw from the generator or change the model."""
-        planes = {layer: field.planes for layer, field in model.deformations.items() if layer <= level}
-        parameters = [*(getattr(model, name) for name in PER_ANCHOR), *(own.grid for own in planes.values())]
+        fields = {layer: field for layer, field in model.deformations.items() if layer <= level}
+        parameters = [getattr(model, name) for name in PER_ANCHOR]
+        parameters += [feature for field in fields.values() for feature in field.features]
         leaves = {parameter: parameter.detach().requires_grad_() for parameter in parameters}
 
         def find() -> Terms:
             found: list[Weighted] = []
-            for layer, own in planes.items():
-                step, pressure = model.steps.planes(layer), schedule.pressure(place)
-                found += self._plane_terms(layer, own, leaves[own.grid], step, pressure)
+            for layer, field in fields.items():
+                features, step = [leaves[feature] for feature in field.features], model.steps.planes(layer)
+                found += self._field_terms(layer, field, features, step, schedule.pressure(place))
             if place >= schedule.progressive:
                 anchors = {name: leaves[getattr(model, name)] for name in PER_ANCHOR}
                 found += self._mask_terms(model, level, anchors, schedule.separation(place))
@@ -73,14 +72,15 @@ class ModelLoss:
 
         return aside(find) if model.feature.device.type == "cpu" else find  # CUDA's work waits in one queue anyway
 
-    def _plane_terms(
-        self, layer: int, planes: HexPlane, grid: Tensor, step: float, pressure: float
+    def _field_terms(
+        self, layer: int, field: DeformationField, features: list[Tensor], step: float, pressure: float
     ) -> Iterator[Weighted]:
+        """The regularisers and the rate of a layer's deformation."""
         name, weights = {1: ("global", self.config.global_planes), 2: ("local", self.config.local_planes)}[layer]
-        for term, value in regularisers(grid, planes.layout).items():
+        for term, value in field.regularisers(features).items():
             yield f"{name}_{term}", getattr(weights, term), value
         if weight := self.config.plane_rate * pressure:
-            yield f"{name}_rate_proxy", weight, proxy_bits(grid, planes.layout, step)
+            yield f"{name}_rate_proxy", weight, field.rate(features, step)
 
     def _mask_terms(
         self, model: Model, level: int, anchors: Mapping[str, Tensor], separation: float

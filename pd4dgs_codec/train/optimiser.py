@@ -33,8 +33,8 @@ class Optimiser:
         groups: dict[str, list[nn.Parameter]] = {name: [getattr(model, name)] for name in PER_ANCHOR}
         groups |= {name: list(net.parameters()) for name, net in model.networks.items()}
         fields = model.deformations.values()
-        groups["planes"] = [p for f in fields for p in f.planes.parameters()]
-        groups["deformation"] = [p for f in fields for part in (f.trunk, f.heads) for p in part.parameters()]
+        groups["planes"] = [p for f in fields for p in f.features]
+        groups["deformation"] = [p for f in fields for p in f.weights]
         self.groups = {name: params for name, params in groups.items() if params}
         self.rate = dict.fromkeys(self.groups, 0.0)
         self.moments: dict[Tensor, dict[str, Tensor]] = {}

@@ -14,9 +14,8 @@ from torch import Tensor
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.model.config import PRESETS, ModelConfig
 from pd4dgs_codec.model.model import Model
+from pd4dgs_codec.model.networks import EXACT, Noise, Rounding
 from pd4dgs_codec.model.picture import render_image
-from pd4dgs_codec.model.plane_rate import exact_bits
-from pd4dgs_codec.model.rounding import EXACT, Noise, Rounding
 from pd4dgs_codec.quality.image import level_psnr
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train.config import TrainConfig
@@ -166,7 +165,7 @@ class TrainState:
         """The sum of R(a) of the planes of layers 1 and 2 as they would be coded now, in the groups of `--priors
         gauss`; 0 for an absent layer."""
         steps = self.model.steps.scaled(1.0)
-        found = {i: exact_bits(f.planes.plane_arrays(), steps.planes(i)) for i, f in self.model.deformations.items()}
+        found = {i: f.bits(steps.planes(i)) for i, f in self.model.deformations.items()}
         return [found.get(1, 0.0), found.get(2, 0.0)]
 
     def level_psnr(self, views: Sequence[View]) -> list[float]:

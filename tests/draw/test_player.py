@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 from strategies import make_scene
 
-from pd4dgs_codec.draw.networks import Layers
+from pd4dgs_codec.draw.layers import Layers
 from pd4dgs_codec.draw.player import Player
 from pd4dgs_codec.errors import RenderError
 from pd4dgs_codec.format.decoder import decode
@@ -120,7 +120,7 @@ import sys
 sys.modules["torch"] = None
 from pd4dgs_codec.cli.render import main
 code = main([sys.argv[1], "-o", sys.argv[2], "--frames", "1"])
-late = "data.dataset", "interchange.teacher", "metrics.perceptual", "train", "delivery.client"
+late = "data.transforms", "data.posed", "interchange.teacher", "quality.perceptual", "train", "web.client"
 loaded = {f"pd4dgs_codec.{name}" for name in late} & set(sys.modules)
 assert not loaded, f"a file of its own camera waits for {loaded}"
 sys.exit(code)

@@ -129,7 +129,7 @@ def test_a_product_is_that_of_numpy(dtype):
 PICTURE = """
 import hashlib
 import numpy as np
-from pd4dgs_codec.draw.networks import Layers
+from pd4dgs_codec.draw.layers import Layers
 from pd4dgs_codec.draw.rasteriser import draw
 from pd4dgs_codec.draw.simd import WIDE
 from pd4dgs_codec.scene import Camera

@@ -4,13 +4,12 @@ import numpy as np
 import pytest
 import torch
 from test_model import ALL_HEADS, CAMERA, small_model, stir
-from torch.nn import functional as F
 
-from pd4dgs_codec.draw import layer_kernels, simd
-from pd4dgs_codec.model import fused
-from pd4dgs_codec.model.mlp import MLP
+from pd4dgs_codec.draw import simd
+from pd4dgs_codec.draw.layers import Layers
+from pd4dgs_codec.model import fused, reference
 from pd4dgs_codec.model.model import Gaussians, Model
-from pd4dgs_codec.model.rounding import EXACT, Noise, Rounding
+from pd4dgs_codec.model.networks import EXACT, MLP, Noise, Rounding
 from pd4dgs_codec.scene import Widths
 
 PARTS = ("means", "quats", "scales", "opacities", "colors")
@@ -87,15 +86,17 @@ def test_one_anchor_is_left_as_it_is(level):
 
 @pytest.mark.parametrize("parts", [2, 5])
 def test_it_is_so_in_as_many_parts_as_there_are_threads(monkeypatch, parts):
-    monkeypatch.setattr("pd4dgs_codec.model.fused.kernel_threads", lambda: parts)
+    for module in ("draw.gaussians", "draw.layers", "model.hexplane"):
+        monkeypatch.setattr(f"pd4dgs_codec.{module}.kernel_threads", lambda: parts)
     check(stir(small_model(opacity=-0.1), 0.3), 2)
 
 
 @pytest.mark.parametrize("count", [0, 1, 47, 48, 400])
 @pytest.mark.parametrize("parts", [1, 3])
-def test_layers_and_their_gradients_are_those_of_torch(count, parts):
+def test_layers_and_their_gradients_are_those_of_torch(count, parts, monkeypatch):
     """The last layer takes some of what it is given, and what the others give is used elsewhere too. Of small whole
     numbers, whose sums float32 holds in any order: bit for bit."""
+    monkeypatch.setattr("pd4dgs_codec.draw.layers.kernel_threads", lambda: parts)
     shapes = ((40, 13), (24, 40), (21, 8))
     layers = [(whole(*shape).requires_grad_(), whole(shape[0]).requires_grad_()) for shape in shapes]
     x, base = (whole(count, width).requires_grad_() for width in (13, 21))
@@ -103,10 +104,9 @@ def test_layers_and_their_gradients_are_those_of_torch(count, parts):
     hidden.append(torch.relu(hidden[0] @ layers[1][0].T + layers[1][1]))
     out = base + hidden[1][:, :8] @ layers[2][0].T + layers[2][1]
 
-    sizes, weights = layer_kernels.pack([(w.detach().numpy(), b.detach().numpy()) for w, b in layers])
-    kept = np.full((count, layer_kernels.hidden_width(sizes)), np.nan, np.float32)
+    packed = Layers([(w.detach().numpy(), b.detach().numpy()) for w, b in layers])
     found = base.detach().numpy().copy()
-    layer_kernels.forward(found, kept, x.detach().numpy(), sizes, weights, False)
+    kept = packed.add(found, x.detach().numpy(), keep=True)
     np.testing.assert_array_equal(found, out.detach())
     ends = np.cumsum([0, *(-(-w // simd.WIDE) * simd.WIDE for w in (40, 24))])
     for values, first, end in zip(hidden, ends, ends[1:], strict=False):
@@ -118,11 +118,9 @@ def test_layers_and_their_gradients_are_those_of_torch(count, parts):
     g_hidden = np.zeros_like(kept)
     for values, first in zip(elsewhere, ends, strict=False):
         g_hidden[:, first : first + values.shape[1]] = values
-    g_x = np.empty((count, 13), np.float32)
-    sums = np.zeros((parts, layer_kernels.sums_width(sizes)), np.float32)
-    layer_kernels.backward(g_x, sums, g.numpy(), g_hidden, kept, x.detach().numpy(), sizes, weights)
+    g_x, gradients = packed.backward(g.numpy(), x.detach().numpy(), kept, g_hidden)
     np.testing.assert_array_equal(g_x, x.grad)
-    for pair, own in zip(layers, layer_kernels.gradients(sums, sizes), strict=True):
+    for pair, own in zip(layers, gradients, strict=True):
         for parameter, gradient in zip(pair, own, strict=True):
             np.testing.assert_array_equal(gradient, parameter.grad)
             assert gradient.size == 0 or np.abs(gradient).max() < 2**20  # no sum on the way left the whole numbers
@@ -146,18 +144,10 @@ def test_finished_gaussians_and_their_gradients(loose):
     rows, gates = drawn(200, 14) * 2, drawn(200).sigmoid()
     rows[:5, 3:6], rows[5:10, 10:] = 0.0, torch.tensor([0.0, 1.0, -1.0, 2.0])
     rows[10:13, 6:10] = 0.0
-
-    def plain(rows, gates):
-        means, scales, quats, opacities, colors = torch.split(rows, [3, 3, 4, 1, 3], dim=1)
-        if loose:
-            quats, colors = F.normalize(quats, dim=1), colors.clamp(0, 1)
-            scales, opacities = F.relu(scales), opacities.clamp(0, 1)
-        return means, quats, scales * gates[:, None], opacities[:, 0] * gates, colors
-
     results = []
-    for form in (lambda *x: fused.finish(*x, loose), plain):
+    for form in (fused.finish, reference.finish):
         leaves = [x.clone().requires_grad_() for x in (rows, gates)]
-        outputs = form(*leaves)
+        outputs = form(*leaves, loose)
         sum((x * drawn(*x.shape)).sum() for x in outputs).backward()
         results.append([*outputs, *(x.grad for x in leaves)])
     for found, expected in zip(*results, strict=True):

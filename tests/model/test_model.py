@@ -12,8 +12,7 @@ from hypothesis.extra import numpy as hnp
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.format.residuals import residuals
-from pd4dgs_codec.model import checkpoint
-from pd4dgs_codec.model import model as graph
+from pd4dgs_codec.model import checkpoint, fused
 from pd4dgs_codec.model.config import DeformationConfig
 from pd4dgs_codec.model.convert import from_scene, to_scene
 from pd4dgs_codec.model.deformation import DeformationField
@@ -278,7 +277,7 @@ def test_faint_gaussians_left_out_change_no_pixel(level, monkeypatch):
     with torch.no_grad():  # from clearly negative over just visible to opaque
         model.networks["opacity"].linears[-1].bias.copy_(torch.linspace(-0.3, 0.4, 10))
     image, kept = picture(model, level), len(gaussians(model, level).slots)
-    monkeypatch.setattr(graph, "MIN_OPACITY", -2.0)
+    monkeypatch.setattr(fused, "MIN_OPACITY", -2.0)
     assert 0.2 * 800 < kept < 0.8 * len(gaussians(model, level).slots)
     np.testing.assert_allclose(picture(model, level), image, atol=1e-5)
 

@@ -15,8 +15,8 @@ from pd4dgs_codec.format.encoder import encode, encode_with_report
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.convert import to_scene
 from pd4dgs_codec.model.harm import step_harm
+from pd4dgs_codec.model.networks import EXACT
 from pd4dgs_codec.model.picture import render, render_image
-from pd4dgs_codec.model.rounding import EXACT
 from pd4dgs_codec.quality import TRAIN_MIN_DB, TRAIN_MIN_DB_PER_MEGABYTE
 from pd4dgs_codec.quality.measure import train_rate_bits
 from pd4dgs_codec.scene import ATTRIBUTES, MASK_THRESHOLD, MAX_CLASS
@@ -122,7 +122,7 @@ def test_the_added_error_is_about_that_of_leaving_an_anchor_out(trained):
     errors = added_error(trained.model, 1, trained.learner.views, EXACT, prune.anchor_harm).numpy()
     pictures = pictures_of(trained, 1)
     near = np.flatnonzero(np.isfinite(errors) & (errors > 0))
-    chosen = near[np.argsort(errors[near])][:: max(1, len(near) // 12)]
+    chosen = near[np.argsort(errors[near])][:: max(1, len(near) // 40)]
     logits = trained.model.mask_logits.detach().clone()
     added = []
     for row in chosen:
@@ -134,7 +134,7 @@ def test_the_added_error_is_about_that_of_leaving_an_anchor_out(trained):
     expected = errors[chosen] * error_of(trained, 1)
     ranks = [np.argsort(np.argsort(x)) for x in (added, expected)]
     assert np.corrcoef(*ranks)[0, 1] > 0.9
-    assert 1 / 3 < np.median(expected / added) < 3
+    assert 1 / 4 < np.median(expected / added) < 4
 
 
 def test_pruning_adds_about_its_share_of_error_and_keeps_the_masks_above(trained, monkeypatch):

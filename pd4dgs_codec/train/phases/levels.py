@@ -81,8 +81,8 @@ def levels_without_gain(psnr: Sequence[float], sizes: Sequence[float]) -> list[t
 
 
 def field_bytes(field: DeformationField, plane_bits: float) -> float:
-    """About the bytes of a deformation whose planes take `plane_bits`: one for each weight besides."""
-    return plane_bits / 8 + sum(p.numel() for part in (field.trunk, field.heads) for p in part.parameters())
+    """About the bytes of a deformation whose features take `plane_bits`: one for each weight besides."""
+    return plane_bits / 8 + sum(p.numel() for p in field.weights)
 
 
 def drop_level(model: Model, optimiser: Optimiser, level: int) -> None:

@@ -17,7 +17,7 @@ from torch import Tensor
 from pd4dgs_codec.model.harm import anchor_harm
 from pd4dgs_codec.model.masks import mask_logits
 from pd4dgs_codec.model.model import Model
-from pd4dgs_codec.model.rounding import Rounding
+from pd4dgs_codec.model.networks import Rounding
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train import workers
 from pd4dgs_codec.train.phases import Phase, long_enough

@@ -21,7 +21,7 @@ from torch import Tensor
 
 from pd4dgs_codec.model.harm import attribute_slopes, step_harm
 from pd4dgs_codec.model.model import Model
-from pd4dgs_codec.model.rounding import Rounding
+from pd4dgs_codec.model.networks import Rounding
 from pd4dgs_codec.scene import MASK_THRESHOLD, MAX_CLASS, SCAFFOLD_NETWORKS
 from pd4dgs_codec.train import phases, workers
 from pd4dgs_codec.train.optimiser import Optimiser
@@ -172,7 +172,7 @@ def _apply(model: Model, optimiser: Optimiser, transform: Tensor) -> None:
     for name in SCAFFOLD_NETWORKS:
         optimiser.transform(model.network(name).layers[0].weight, slice(width), back)
     field = model.global_deformation
-    if field is not None and "feature" in field.heads:
-        last = dict(field.named_heads())["feature"].layers[-1]
+    last = None if field is None else field.head_layer("feature")
+    if last is not None:
         optimiser.transform(last.weight, slice(None), transform.T, transposed=True)
         optimiser.transform(last.bias, slice(None), transform.T)

@@ -1,11 +1,11 @@
-"""Numba kernels of networks for many points: linear layers with ReLU between them, in one pass, and the gradient.
+"""Networks for many points: linear layers with ReLU between them, in one pass, and the gradient. Numba kernels.
 
-Points go through all layers in blocks that stay in the cache. Arguments, all floats of one dtype: x [n, inputs]; sizes
-int64 [layers, 2], the inputs and outputs of each layer, no more inputs than the layer before has outputs; weights, what
-`pack` makes of the layers; hidden [n, `hidden_width`], the activations behind each layer but the last side by side,
-each padded with zeros to whole vectors.
+Points go through all layers in blocks that stay in the cache. Arguments of the kernels, all floats of one dtype: x
+[n, inputs]; sizes int64 [layers, 2], the inputs and outputs of each layer, no more inputs than the layer before has
+outputs; weights, the layers packed by `_pack`; hidden [n, `_hidden_width`], the activations behind each layer but the
+last side by side, each padded with zeros to whole vectors.
 
-Each part of a backward pass owns its sums, which `gradients` adds in order: bits repeat for a fixed number of parts.
+Each part of a backward pass owns its sums, which are added in order: bits repeat for a fixed number of parts.
 """
 
 from __future__ import annotations
@@ -32,13 +32,47 @@ from pd4dgs_codec.draw.simd import (
     wide_load,
     wide_splat,
 )
+from pd4dgs_codec.threads import kernel_threads
 
-POINTS = 48  #: of a block: whole rows of `product`
-BLOCKS = 8  #: that share scratch memory
+POINTS = 48  #: points per block: whole rows of `product`
+BLOCKS = 8  #: blocks that share scratch memory
+
+Layer = tuple[np.ndarray, np.ndarray]  #: weight [outputs, inputs] and bias [outputs]
 
 
-def pack(layers: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
-    """(sizes, weights) of layers (weight [outputs, inputs], bias [outputs]).
+class Layers:
+    """Linear layers with ReLU between them, and after the last if `relu_last`, packed for the kernels."""
+
+    def __init__(self, layers: Sequence[Layer], relu_last: bool = False):
+        self.outputs, self._relu_last = len(layers[-1][1]), relu_last
+        self._sizes, self._weights = _pack(layers)
+
+    def __call__(self, x: np.ndarray, outputs: int | None = None) -> np.ndarray:
+        """float32 [n, outputs] of x float32 [n, inputs]; outputs beyond the last layer's are 0."""
+        out = np.zeros((len(x), self.outputs if outputs is None else outputs), np.float32)
+        self.add(out, x)
+        return out
+
+    def add(self, out: np.ndarray, x: np.ndarray, keep: bool = False) -> np.ndarray:
+        """Adds the outputs for x [n, inputs] to out [n, at most the last width], C-contiguous; returns the hidden
+        activations for `backward` if `keep`, else an empty array."""
+        hidden = np.empty((len(x), _hidden_width(self._sizes)) if keep else (0, 0), x.dtype)
+        forward(out, hidden, np.ascontiguousarray(x), self._sizes, self._weights, self._relu_last)
+        return hidden
+
+    def backward(
+        self, g: np.ndarray, x: np.ndarray, hidden: np.ndarray, g_hidden: np.ndarray | None = None
+    ) -> tuple[np.ndarray, list[Layer]]:
+        """The gradients by x and by each layer, from g [n, outputs] and, where the activations are used elsewhere too,
+        g_hidden, as hidden. Without relu_last."""
+        g_x, sums = np.empty_like(x), np.zeros((kernel_threads(), _sums_width(self._sizes)), x.dtype)
+        elsewhere = hidden[:0] if g_hidden is None else g_hidden
+        backward(g_x, sums, g, elsewhere, hidden, x, self._sizes, self._weights)
+        return g_x, _gradients(sums, self._sizes)
+
+
+def _pack(layers: Sequence[Layer]) -> tuple[np.ndarray, np.ndarray]:
+    """(sizes, weights) of the layers.
 
     weights: per layer those by input [inputs, padded outputs], the bias, then those by output [outputs, padded inputs].
     """
@@ -55,20 +89,20 @@ def pack(layers: Sequence[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, n
     return sizes, weights
 
 
-def hidden_width(sizes: np.ndarray) -> int:
+def _hidden_width(sizes: np.ndarray) -> int:
     """Columns of `hidden`."""
     return sum(whole(int(outputs), WIDE) for outputs in sizes[:-1, 1])
 
 
-def sums_width(sizes: np.ndarray) -> int:
+def _sums_width(sizes: np.ndarray) -> int:
     """Columns of `sums` of `backward`."""
     return sum(
         whole(outputs, PRODUCT_ROWS) * whole(inputs, WIDE) + whole(outputs, WIDE) for inputs, outputs in sizes.tolist()
     )
 
 
-def gradients(sums: np.ndarray, sizes: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Those by (weight, bias) of each layer, all parts of `sums` together."""
+def _gradients(sums: np.ndarray, sizes: np.ndarray) -> list[Layer]:
+    """The gradients by each layer: the sum of all parts of `sums`."""
     whole_sums, found, at = sums.sum(0), [], 0
     for inputs, outputs in sizes.tolist():
         rows, columns = whole(outputs, PRODUCT_ROWS), whole(inputs, WIDE)
@@ -80,6 +114,7 @@ def gradients(sums: np.ndarray, sizes: np.ndarray) -> list[tuple[np.ndarray, np.
 
 
 def whole(count: int, step: int) -> int:
+    """count rounded up to a multiple of step."""
     return -(-count // step) * step
 
 
@@ -108,7 +143,7 @@ def multiply(
 
 @kernel(inline=True)
 def _widest(sizes: np.ndarray) -> int:
-    """Its largest number; numba's own way takes seconds to compile."""
+    """The largest number in sizes; numba's own maximum takes seconds to compile."""
     found = 0
     for layer in range(len(sizes)):
         found = max(found, sizes[layer, 0], sizes[layer, 1])
@@ -117,7 +152,8 @@ def _widest(sizes: np.ndarray) -> int:
 
 @kernel(inline=True)
 def _take(block: np.ndarray, row: int, values: np.ndarray, first: int, count: int, column: int, columns: int) -> None:
-    """The first columns of `block`, rows of `row` numbers, = `columns` of those of `values` from `first` on."""
+    """Copies `columns` columns, from `column` on, of `count` rows of `values`, from `first` on, to the first columns of
+    `block`, whose rows have `row` numbers."""
     for p in range(count):
         copy(block, p * row, values, (first + p) * values.shape[1] + column, columns)
 
@@ -139,8 +175,8 @@ def forward(
     weights: np.ndarray,
     relu_last: bool,
 ) -> None:
-    """out [n, at most the last outputs in whole vectors] += what the network makes of x; relu_last: after the last
-    layer as well. hidden is filled, but if it has no rows."""
+    """Adds the network's outputs to out [n, at most the last outputs in whole vectors]; relu_last: ReLU after the last
+    layer as well. Fills hidden unless it has no rows."""
     row, layers, columns = up(_widest(sizes), WIDE), len(sizes), out.shape[1]
     vectors = columns - columns % LANES
     a, b = aligned(POINTS * row, x.dtype.type), aligned(POINTS * row, x.dtype.type)
@@ -179,11 +215,11 @@ def backward(
     sizes: np.ndarray,
     weights: np.ndarray,
 ) -> None:
-    """The transpose of `forward` without relu_last, from g [n, last outputs] and, if it has rows, what reaches `hidden`
-    from elsewhere besides, g_hidden.
+    """The transpose of `forward` without relu_last, from g [n, last outputs] and, if it has rows, g_hidden, the part of
+    the gradient by `hidden` that comes from elsewhere.
 
-    g_x [n, inputs]; sums [parts, `sums_width`], given zeroed: of each part and per layer the gradient by its weights
-    and that by its bias, in whole blocks.
+    Fills g_x [n, inputs] and sums [parts, `_sums_width`], given zeroed: per part and layer the gradient by its weights,
+    then by its bias, in whole blocks.
     """
     row, layers, parts = up(_widest(sizes), WIDE), len(sizes), len(sums)
     blocks, real = (len(x) + POINTS - 1) // POINTS, x.dtype.type

@@ -1,22 +1,27 @@
-"""Numba kernels between anchors and the Gaussians that are seen: rows of attributes, the last layers' outputs and what
-Gaussians are made of, for the kept slots alone. A slot is one of an anchor's G Gaussians; about one in six is drawn.
+"""From anchors to the Gaussians that a camera meets: what is evaluated, the scaffold's networks, and their kernels.
+
+Playback and training on the CPU call the same functions here; `model.reference` has the plain torch form. An anchor has
+G slots, one Gaussian each, of which about one in six is drawn; only the kept slots are evaluated past their opacity.
 
 Arguments everywhere, floats of one dtype: keep int64 [K], ascending, anchor * G + offset of each kept Gaussian; anchors
 [n, 9 + D + 3 G], a row of position, feature [D], offsets [G, 3] and log scalings [6]; gaussians [K, 14], a row of mean,
-scales, quaternion, opacity and colour; hidden [n, columns], of which H from `column` on are a layer's, H a multiple of
-LANES. The backward passes split the Gaussians over threads at anchors, each part owning its rows of the result; sums
-over all Gaussians are kept per part, for the caller to add in order, so that results are bitwise reproducible for a
-fixed number of parts.
+scales, quaternion, opacity and colour; hidden [n, columns], of which H from `column` on belong to a layer, H a multiple
+of LANES. The columns of both rows are the heads of the global and the local deformation in the registry's order. The
+backward passes split the Gaussians over threads at anchors, and each part owns its rows of the result; sums over all
+Gaussians are kept per part and added in order, so that results are bitwise reproducible for a fixed number of parts.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from pd4dgs_codec.draw.layer_kernels import multiply, up, whole
+from pd4dgs_codec.draw.layers import Layer, Layers, multiply, up, whole
+from pd4dgs_codec.draw.projection import ALPHA_MIN
 from pd4dgs_codec.draw.simd import (
     LANES,
     PRODUCT_ROWS,
@@ -36,14 +41,197 @@ from pd4dgs_codec.draw.simd import (
     wide_load,
     wide_splat,
 )
-from pd4dgs_codec.scene import SCALING_DIM
+from pd4dgs_codec.errors import RenderError
+from pd4dgs_codec.scene import SCALING_DIM, Camera, Network, SceneInfo
+from pd4dgs_codec.threads import kernel_threads
 
+#: A Gaussian fainter than the rasteriser's threshold never reaches a pixel, so its networks are not evaluated.
+MIN_OPACITY = ALPHA_MIN
+#: How far an anchor's Gaussians are taken to lie from it, in its largest extent: in trained scenes one anchor in 7,000
+#: has one farther away.
+OFFSET_REACH = 2.0
+#: How far a Gaussian of opacity 1 reaches, in its largest standard deviation: to where alpha is ALPHA_MIN, at
+#: sqrt(2 ln 255) = 3.3290.
+SIGMA_REACH = 3.33
+#: Anchors farther outside the image than this share of its size (plus the reach of their Gaussians) are not evaluated.
+FRUSTUM_MARGIN = 0.15
+#: Least distance of the near plane, scene units: the rasteriser divides by depths.
+LEAST_NEAR = 1e-6
 #: Below this a quaternion is divided by it instead of by its norm, as `torch.nn.functional.normalize` does.
 MIN_NORM = 1e-12
 #: First columns of the parts of a Gaussian's row.
 SCALE, QUAT, OPACITY, COLOR = 3, 6, 10, 11
 GAUSSIAN_WIDTH = COLOR + 3
 KEPT = 1024  #: Gaussians that share scratch memory
+SCALING = slice(-SCALING_DIM, None)  #: columns of an anchor's row
+
+
+def near_plane(info: SceneInfo) -> float:
+    """The near plane of a scene's pictures, scene units."""
+    return max(float(info.near), LEAST_NEAR)
+
+
+def check_time(t: float) -> None:
+    """Raises RenderError unless a normalised time is a number; outside 0..1 a scene stands as at its ends."""
+    if not math.isfinite(t):
+        raise RenderError(f"time is {t}, expected a number from 0 to 1")
+
+
+def in_view(camera: Camera, viewmat: Any, position: Any, radius: Any, near: float) -> Any:
+    """bool [N]: anchors at position [N, 3], world, whose Gaussians, within radius [N], may reach the image. Arrays and
+    viewmat [4, 4], that of the camera, are all float32 numpy arrays or all torch tensors."""
+    across, down, depth = viewmat[:3, :3] @ position.T + viewmat[:3, 3:]
+    fx, fy, cx, cy = (float(camera.K[place]) for place in ((0, 0), (1, 1), (0, 2), (1, 2)))
+    z = depth.clip(min=float(near))
+    x, y = fx * across / z + cx, fy * down / z + cy
+    width, height = camera.width, camera.height
+    margin = max(fx, fy) * radius / z + FRUSTUM_MARGIN * max(width, height)
+    inside = (x > -margin) & (x < width + margin) & (y > -margin) & (y < height + margin)
+    return inside & (depth + radius > 0)
+
+
+@dataclass(frozen=True, eq=False)
+class Gaussians:
+    """The input of the rasteriser, float32: K Gaussians, activated and gated."""
+
+    means: np.ndarray  #: [K, 3] world
+    quats: np.ndarray  #: [K, 4] wxyz, unit
+    scales: np.ndarray  #: [K, 3] scene units
+    opacities: np.ndarray  #: [K] 0..1
+    colors: np.ndarray  #: [K, 3] 0..1
+    slots: np.ndarray  #: int64 [K], anchor * G + offset, of G slots
+
+
+class Functions(NamedTuple):
+    """The activations, array to array. Training passes torch's, which differ in the last bit."""
+
+    tanh: Callable[[np.ndarray], np.ndarray]
+    sigmoid: Callable[[np.ndarray], np.ndarray]
+    exp: Callable[[np.ndarray], np.ndarray]
+
+
+NUMPY = Functions(np.tanh, lambda x: 1 / (1 + np.exp(-x)), np.exp)
+
+
+class Look(NamedTuple):
+    """Anchors as an eye sees them: of n anchors the opacities of all slots, and what the other networks go on from."""
+
+    inputs: np.ndarray  #: [n, D + 3], features and directions from the eye
+    distance: np.ndarray  #: [n] from the eye
+    opacity: np.ndarray  #: [n, G], before the gate
+    hidden: tuple[tuple[np.ndarray, int], ...]  #: of covariance and colour: hidden activations and their first column
+
+
+class Made(NamedTuple):
+    """The kept Gaussians before the local deformation, and what their gradient takes."""
+
+    gaussians: np.ndarray  #: [K, 14]
+    gates: np.ndarray  #: [K]
+    shape: np.ndarray  #: [K, 7], logits of the scales relative to the extents, quaternion
+    relative: np.ndarray  #: [K, 7], sigmoid of shape
+    extent: np.ndarray  #: [n, 6], of the offsets, then of the Gaussians, scene units
+
+
+def fusible(networks: Sequence[Sequence[tuple[Any, Any]]]) -> bool:
+    """Whether one product evaluates the first layers of all networks, as `Decoders.backward` needs."""
+    return all(len(layers) == 2 and len(layers[0][1]) % LANES == 0 for layers in networks)
+
+
+class Decoders:
+    """The scaffold's networks, opacity, covariance and colour, packed for the kernels."""
+
+    def __init__(self, networks: Sequence[Network | Sequence[Layer]], functions: Functions = NUMPY):
+        self.slots = len(networks[0][-1][1])  #: Gaussians of an anchor
+        self._functions = functions
+        self._last = [network[-1] for network in networks[1:]]
+        self._by_slot = [by_slot(*layer, self.slots) for layer in self._last]
+        self._fused = fusible(networks)
+        if self._fused:
+            self._widths = [len(network[0][1]) for network in networks]
+            first = tuple(np.concatenate(parts) for parts in zip(*(network[0] for network in networks), strict=True))
+            self._opacity, self._hidden = Layers([(first[0], first[1]), networks[0][1]]), []
+        else:
+            self._opacity = Layers(networks[0])
+            self._hidden = [Layers(n[:-1], relu_last=True) if len(n) > 1 else None for n in networks[1:]]
+
+    def look(self, anchors: np.ndarray, eye: np.ndarray) -> Look:
+        """The anchors as an eye at [3], world, sees them."""
+        n, features = len(anchors), anchors.shape[1] - 3 - 3 * self.slots - SCALING_DIM
+        x, distance = np.empty((n, features + 3), anchors.dtype), np.empty(n, anchors.dtype)
+        inputs(x, distance, anchors, eye)
+        opacity = np.zeros((n, self.slots), anchors.dtype)
+        hidden = self._opacity.add(opacity, x, keep=self._fused)
+        if self._fused:
+            parts = [(hidden, self._widths[0]), (hidden, self._widths[0] + self._widths[1])]
+        else:
+            parts = [
+                (_padded(x, before, table), 0) for before, (table, _) in zip(self._hidden, self._by_slot, strict=True)
+            ]
+        return Look(x, distance, self._functions.tanh(opacity), tuple(parts))
+
+    def make(self, anchors: np.ndarray, mask: np.ndarray, look: Look, keep: np.ndarray) -> Made:
+        """The Gaussians of the kept slots of anchors under mask [n]."""
+        shape, color = (np.empty((len(keep), len(bias) // self.slots), anchors.dtype) for _, bias in self._last)
+        for out, (hidden, column), (weight, bias) in zip((shape, color), look.hidden, self._by_slot, strict=True):
+            linear(out, keep, hidden, column, weight, bias)
+        _, sigmoid, exp = self._functions
+        relative, extent = sigmoid(shape), exp(np.ascontiguousarray(anchors[:, SCALING]))
+        gaussians, gates = np.empty((len(keep), GAUSSIAN_WIDTH), anchors.dtype), np.empty(len(keep), anchors.dtype)
+        assemble(gaussians, gates, keep, anchors, extent, look.opacity, mask, shape, relative, sigmoid(color))
+        return Made(gaussians, gates, shape, relative, extent)
+
+    def backward(
+        self, anchors: np.ndarray, look: Look, keep: np.ndarray, made: Made, g: np.ndarray, g_gates: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, list[Layer]]:
+        """The gradients by anchors, by mask [n] and by each layer of each network, from those by the Gaussians and
+        their gates. Of fused networks alone."""
+        parts = kernel_threads()
+        g_anchors, g_opacity, g_mask = np.zeros_like(anchors), np.zeros_like(look.opacity), np.zeros_like(look.distance)
+        g_shape, g_color = np.empty_like(made.shape), np.empty((len(g), 3), g.dtype)
+        assemble_backward(
+            g_anchors, g_opacity, g_mask, g_shape, g_color, keep, anchors, made.extent, made.shape, made.relative,
+            made.gaussians, g, g_gates, parts,
+        )  # fmt: skip
+        ((hidden, _), _), last = look.hidden, []
+        g_hidden = np.zeros_like(hidden)
+        for slope, (_, column), (weight, bias) in zip((g_shape, g_color), look.hidden, self._last, strict=True):
+            g_weight, g_bias = np.zeros((parts, *weight.shape), g.dtype), np.zeros((parts, len(bias)), g.dtype)
+            padded = np.pad(weight, ((0, 0), (0, -weight.shape[1] % WIDE)))
+            linear_backward(g_hidden, g_weight, g_bias, keep, slope, hidden, column, padded)
+            last.append((g_weight.sum(0), g_bias.sum(0)))
+        g_inputs, (first, opacity) = self._opacity.backward(g_opacity, look.inputs, hidden, g_hidden)
+        inputs_backward(g_anchors, g_inputs, look.inputs, look.distance)
+        ends = np.cumsum(self._widths[:-1])
+        firsts = zip(*(np.split(part, ends) for part in first), strict=True)
+        return g_anchors, g_mask, [layer for pair in zip(firsts, [opacity, *last], strict=True) for layer in pair]
+
+
+def _padded(x: np.ndarray, before: Layers | None, table: np.ndarray) -> np.ndarray:
+    """The inputs of a network's last layer in as many columns as its table of `by_slot` has rows; the padding is 0."""
+    if before is not None:
+        return before(x, table.shape[1])
+    out = np.zeros((len(x), table.shape[1]), x.dtype)
+    out[:, : x.shape[1]] = x
+    return out
+
+
+def seen(opacity: np.ndarray, mask: np.ndarray, faintest: float) -> np.ndarray:
+    """int64 [K]: the slots whose opacity [n, G], gated by mask [n], is `faintest` at least."""
+    keep = np.empty(opacity.size + 1, np.int64)  # a place past the last, which is always written
+    found: np.ndarray = keep[: _seen(keep, opacity, mask, faintest)].copy()
+    return found
+
+
+def finished(gaussians: np.ndarray, gates: np.ndarray, loose: bool) -> tuple[np.ndarray, ...]:
+    """means, quats, scales, opacities and colors of gaussians under gates [K]. loose: residuals were added, so values
+    return to their range: scales >= 0, opacities and colours 0..1, unit quaternions."""
+    shapes: tuple[tuple[int, ...], ...] = ((3,), (4,), (3,), (), (3,))
+    means, quats, scales, opacities, colors = (np.empty((len(gates), *s), gaussians.dtype) for s in shapes)
+    finish(means, quats, scales, opacities, colors, gaussians, gates, loose)
+    return means, quats, scales, opacities, colors
+
+
+# -- kernels -----------------------------------------------------------------------------------------------------------
 
 
 @kernel(inline=True)
@@ -136,7 +324,7 @@ def inputs_backward(tasks: Tasks, g_anchors: np.ndarray, g: np.ndarray, out: np.
 
 
 @kernel()
-def seen(keep: np.ndarray, opacity: np.ndarray, mask: np.ndarray, faintest: float) -> int:
+def _seen(keep: np.ndarray, opacity: np.ndarray, mask: np.ndarray, faintest: float) -> int:
     """Writes to `keep` the slots whose opacity [n, G] times mask [n] is `faintest` at least; returns how many."""
     count, slots = 0, opacity.shape[1]
     for n in range(len(mask)):

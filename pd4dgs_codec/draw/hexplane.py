@@ -1,20 +1,81 @@
-"""Numba kernels of HexPlane at one time for all points: sampling, forward and backward.
+"""HexPlanes: the layout of planes in one table, and numba kernels that sample them at one time for all points.
 
 At one time t each time plane is a single row, the blend of two of its rows, so a point costs three bilinear and three
 linear lookups per scale. Channels lie innermost and are walked `LANES` at a time. The backward pass splits scales over
-threads first and points second, each part owning its gradient buffers, which the caller adds in order: results are
+threads first and points second; each part owns its gradient buffers, which the caller adds in order. Results are
 bitwise reproducible for a fixed number of parts, and with one part for any number of threads.
 
-Arguments everywhere, all floats of one dtype: grid [cells, C] (of which only the spatial planes are read), C a
-multiple of LANES; rows [n_rows, C], the time planes at the time wanted; reso [S, 4], start [S, 6], row_start [S, 3] of
-`hexplane.PlaneLayout`; points [N, 3] and box [2, 3] in scene units.
+Arguments of the kernels, all floats of one dtype: grid [cells, C] (only the spatial planes are read), C a multiple of
+LANES; rows [n_rows, C], the time planes at the time wanted; reso [S, 4], start [S, 6], row_start [S, 3] of
+`PlaneLayout`; points [N, 3] and box [2, 3] in scene units.
 """
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 
 from pd4dgs_codec.draw.simd import LANES, Tasks, Vector, fma, fnma, kernel, load, parallel, splat, store, total
+from pd4dgs_codec.scene import PLANES
+
+TIME_AXIS = 3
+SPATIAL = tuple(p for p in PLANES if TIME_AXIS not in p[1:])
+TEMPORAL = tuple(p for p in PLANES if TIME_AXIS in p[1:])
+
+
+@dataclass(frozen=True, eq=False)
+class PlaneLayout:
+    """Where each plane lies in one table [cells, C]: the spatial planes of all scales, then the time planes.
+
+    The optimiser, the rounding and the kernels make one pass over one table instead of twelve.
+
+    reso: int64 [S, 4] cells along x, y, z, t.
+    start: int64 [S, 6] first cell of each plane, in the order of `PLANES`; cell (j, i) of plane (a, b) is
+    start + j * reso[a] + i.
+    rows: int64 [S, 3] first row of xt, yt, zt in the [n_rows, C] table of the time planes at one time.
+    lines: int64 [R, 5], each row of each plane: first cell of the plane, height, width, row, 1 if spatial.
+    """
+
+    reso: np.ndarray
+    start: np.ndarray
+    rows: np.ndarray
+    lines: np.ndarray
+    n_spatial: int
+    n_cells: int
+    n_rows: int
+
+    @classmethod
+    def build(cls, resolutions: Sequence[Sequence[int]]) -> PlaneLayout:
+        """resolutions: per scale, cells along x, y, z, t."""
+        reso = np.array(resolutions, np.int64)
+        start = np.zeros((len(reso), len(PLANES)), np.int64)
+        lines = []
+        cell = 0
+        for temporal in (False, True):
+            for s in range(len(reso)):
+                for k, (_, a, b) in enumerate(PLANES):
+                    if (b == TIME_AXIS) == temporal:
+                        start[s, k] = cell
+                        lines += [(cell, reso[s, b], reso[s, a], j, not temporal) for j in range(reso[s, b])]
+                        cell += int(reso[s, a] * reso[s, b])
+            if not temporal:
+                n_spatial = cell
+        rows = (np.cumsum(reso[:, :3]) - reso[:, :3].ravel()).reshape(-1, 3)
+        return cls(reso, start, rows, np.array(lines, np.int64), n_spatial, cell, int(reso[:, :3].sum()))
+
+    def views(self, grid: Any) -> tuple[dict[str, Any], ...]:
+        """Per scale, plane name -> view [reso[b], reso[a], C] of `grid` [cells, C], an array or a tensor."""
+        return tuple(
+            {
+                name: grid[first : first + r[a] * r[b]].reshape(r[b], r[a], -1)
+                for first, (name, a, b) in zip(starts, PLANES, strict=True)
+            }
+            for r, starts in zip(self.reso.tolist(), self.start.tolist(), strict=True)
+        )
+
 
 XY, XZ, XT, YZ, YT, ZT = range(6)
 

@@ -1,4 +1,7 @@
-"""Networks and HexPlanes of a decoded scene in the form that the kernels take."""
+"""A decoded deformation's residuals at a time, without torch.
+
+Another kind of deformation is another body of `Field`, behind the same two methods.
+"""
 
 from __future__ import annotations
 
@@ -6,45 +9,26 @@ from itertools import accumulate
 
 import numpy as np
 
-from pd4dgs_codec.draw import hexplane_kernels, layer_kernels
-from pd4dgs_codec.draw.plane_layout import PlaneLayout
+from pd4dgs_codec.draw import hexplane
+from pd4dgs_codec.draw.hexplane import PlaneLayout
+from pd4dgs_codec.draw.layers import Layers
 from pd4dgs_codec.draw.simd import LANES
 from pd4dgs_codec.scene import LENGTH_HEADS, PLANES, TRUNK, Deformation, Network, deformation_unit, plane_sides
 
 
-class Layers:
-    """Linear layers with ReLU between them, and after the last if `relu_last`."""
-
-    def __init__(self, layers: Network, relu_last: bool = False):
-        self.outputs, self._relu_last = len(layers[-1][1]), relu_last
-        self._sizes, self._weights = layer_kernels.pack(layers)
-
-    def __call__(self, x: np.ndarray, outputs: int | None = None) -> np.ndarray:
-        """float32 [n, outputs] of x float32 [n, inputs]; more outputs than there are come out as 0."""
-        out = np.zeros((len(x), self.outputs if outputs is None else outputs), np.float32)
-        self.add(out, x)
-        return out
-
-    def add(self, out: np.ndarray, x: np.ndarray) -> None:
-        """Adds what a call answers to out float32 [n, at most the last width], C-contiguous."""
-        hidden = np.empty((0, 0), np.float32)
-        layer_kernels.forward(out, hidden, np.ascontiguousarray(x), self._sizes, self._weights, self._relu_last)
-
-
 class Field:
-    """A deformation: it adds the residuals of its heads to rows whose columns are all heads of the registry."""
+    """A deformation: adds the residuals of its heads to rows, whose columns are all heads of the registry."""
 
     def __init__(self, deformation: Deformation, box: np.ndarray, widths: dict[str, int]):
-        """widths: of the heads that there may be, in the order of the columns."""
+        """box: float32 [2, 3], see SceneInfo. widths: of all heads of the registry, in the order of the columns."""
         self._box = np.ascontiguousarray(box, np.float32)
         self._layout = PlaneLayout.build([plane_sides(scale) for scale in deformation.planes])
         channels = deformation.planes[0]["xy"].shape[0]
         self._channels = -(-channels // LANES) * LANES  # the padding is 0, and so are its products
         self._grid = np.zeros((self._layout.n_cells, self._channels), np.float32)
-        for start, scale in zip(self._layout.start, deformation.planes, strict=True):
-            for first, (name, _, _) in zip(start, PLANES, strict=True):
-                cells = scale[name].reshape(channels, -1).T
-                self._grid[first : first + len(cells), :channels] = cells
+        for views, scale in zip(self._layout.views(self._grid), deformation.planes, strict=True):
+            for name, _, _ in PLANES:
+                views[name][:, :, :channels] = scale[name].transpose(1, 2, 0)
         self._rows: tuple[float, np.ndarray] | None = None
         trunk = _with_padded_inputs(deformation.networks[TRUNK], channels, self._channels)
         unit, networks = deformation_unit(box), deformation.networks
@@ -62,13 +46,13 @@ class Field:
         C-contiguous; lengths in scene units."""
         layout = self._layout
         tables = layout.reso, layout.start, layout.rows
-        if self._rows is None or self._rows[0] != t:  # what depends on time alone is kept
+        if self._rows is None or self._rows[0] != t:
             rows = np.empty((layout.n_rows, self._channels), np.float32)
-            hexplane_kernels.collapse(rows, self._grid, *tables, t, 0.0)
+            hexplane.collapse(rows, self._grid, *tables, t, 0.0)
             self._rows = t, rows
         features = np.empty((len(points), len(layout.reso) * self._channels), np.float32)
         spatial = self._grid[: layout.n_spatial]
-        hexplane_kernels.sample(features, spatial, self._rows[1], *tables, np.ascontiguousarray(points), self._box)
+        hexplane.sample(features, spatial, self._rows[1], *tables, np.ascontiguousarray(points), self._box)
         if self._trunk is None:
             ((_, together),) = self._heads
             together.add(values, features)

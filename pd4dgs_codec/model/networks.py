@@ -1,0 +1,105 @@
+"""Imitation of quantisation in training, and multi-layer perceptrons whose weights can be rounded."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor, nn
+from torch.nn import functional as F
+
+from pd4dgs_codec.scene import Network
+
+
+class Noise:
+    """Uniform noise in -0.5..0.5, cut at random places from one long pool: drawing it anew would cost 5 ms a step."""
+
+    def __init__(self, seed: int, device: torch.device | str = "cpu", size: int = 1 << 23):
+        generator = torch.Generator().manual_seed(seed)
+        self.pool = (torch.rand(size, generator=generator) - 0.5).to(device)
+        self.generator = generator
+
+    def draw(self, shape: torch.Size) -> Tensor:
+        """A tensor of `shape`."""
+        n = shape.numel()
+        if n > len(self.pool):
+            return torch.rand(shape, generator=self.generator).to(self.pool.device) - 0.5
+        start = int(torch.randint(len(self.pool) - n + 1, (), generator=self.generator))
+        return self.pool[start : start + n].view(shape)
+
+
+@dataclass(frozen=True)
+class Rounding:
+    """How a training step imitates quantisation: noise on the anchors' attributes, or rounding of them; and rounding of
+    the other parameters. Rounding is straight-through."""
+
+    noise: Noise | None = None
+    attributes: bool = False
+    weights: bool = False
+
+
+EXACT = Rounding()
+
+
+class _Round(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, x: Tensor, step: float | Tensor) -> Tensor:
+        return torch.div(x, step).round_().mul_(step)
+
+    @staticmethod
+    def backward(ctx: Any, g: Tensor) -> tuple[Tensor, None]:
+        return g, None
+
+
+def round_straight_through(x: Tensor, step: float | Tensor | None) -> Tensor:
+    """round(x / step) * step with the identity's gradient; x itself if step is None."""
+    if step is None:
+        return x
+    rounded: Tensor = _Round.apply(x, step)  # type: ignore[no-untyped-call]
+    return rounded
+
+
+class MLP(nn.Module):
+    """Linear layers with ReLU between them. widths: input, hidden..., output."""
+
+    def __init__(self, widths: tuple[int, ...], *, zero_last: bool = False):
+        super().__init__()
+        #: The linear layers, input side first.
+        self.layers = [nn.Linear(a, b) for a, b in zip(widths[:-1], widths[1:], strict=True)]
+        self.linears = nn.ModuleList(self.layers)  # registers the parameters; slow to read
+        if zero_last:
+            nn.init.zeros_(self.layers[-1].weight)
+            nn.init.zeros_(self.layers[-1].bias)
+
+    def forward(self, x: Tensor, step: float | None = None) -> Tensor:
+        """x [n, in] -> [n, out]; with `step`, weights and biases are rounded straight-through first."""
+        for i, layer in enumerate(self.layers):
+            weight, bias = (round_straight_through(p, step) for p in (layer.weight, layer.bias))
+            x = F.linear(F.relu(x) if i else x, weight, bias)
+        return x
+
+    def arrays(self) -> Network:
+        """The weights as numpy arrays, input side first."""
+        return tuple(
+            (lin.weight.detach().cpu().numpy().copy(), lin.bias.detach().cpu().numpy().copy()) for lin in self.layers
+        )
+
+    @staticmethod
+    def from_arrays(network: Network) -> MLP:
+        """The inverse of `arrays`."""
+        mlp = MLP((network[0][0].shape[1], *(w.shape[0] for w, _ in network)))
+        with torch.no_grad():
+            for linear, (w, b) in zip(mlp.layers, network, strict=True):
+                linear.weight.copy_(torch.from_numpy(np.array(w)))
+                linear.bias.copy_(torch.from_numpy(np.array(b)))
+        return mlp
+
+    @staticmethod
+    def arrays_of_state(state: Mapping[str, np.ndarray], prefix: str) -> Network:
+        """The arrays of the network whose parameters are named `prefix` in a state dictionary of arrays."""
+        count = sum(key.startswith(f"{prefix}.linears.") and key.endswith(".weight") for key in state)
+        names = [f"{prefix}.linears.{i}" for i in range(count)]
+        return tuple((state[f"{name}.weight"], state[f"{name}.bias"]) for name in names)

@@ -1,0 +1,353 @@
+"""Terms of the loss of a HexPlane's planes, each with its gradient in numba, beside the plain torch form.
+
+Regularisers, unweighted, each a sum over scales and planes. plane_smooth: mean squared second difference of the spatial
+planes along each of their two axes. time_smooth: mean squared second difference of the time planes along time. time_l1:
+mean |1 - g| of the time planes. (4DGaussians takes the spatial planes along one axis only.)
+
+The rate is a smooth proxy for the bits of the planes' residuals r under one fixed predictor of the codec, before
+rounding: the median on spatial planes, the previous instant on time planes. A Laplacian of mean magnitude m in steps Q
+takes about log2(2 e m / Q) bits; 1 is added inside, so that only a residual of 0 is free. Half of the proxy is of the
+mean over a channel's cells, half of the mean over a cell's channels:
+
+    sum over values of 1/2 log2(1 + 2 e mean_channel|r| / Q) + 1/2 log2(1 + 2 e mean_cell|r| / Q)
+
+The first half makes channels small; the second empties whole cells, as the codec's classes of activity need. The first
+value of a plane has no neighbour and is free. Weighting |r| by its cost follows Candes, Wakin and Boyd, Enhancing
+sparsity by reweighted l1 minimization (2008).
+"""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+from torch.autograd.function import once_differentiable
+
+from pd4dgs_codec.draw.hexplane import SPATIAL, TEMPORAL, TIME_AXIS, PlaneLayout
+from pd4dgs_codec.draw.simd import (
+    LANES,
+    Tasks,
+    Vector,
+    fma,
+    fnma,
+    kernel,
+    load,
+    parallel,
+    select_gt,
+    splat,
+    store,
+    total,
+)
+from pd4dgs_codec.scene import PLANES
+
+TERMS = ("plane_smooth", "time_smooth", "time_l1")
+
+Band = tuple[float, float, float, float, float]  #: five numbers in the middle of a row of a matrix
+
+# The kernels walk lines, the rows of all planes (`PlaneLayout.lines`). Sums are kept per line: results do not depend on
+# the number of threads.
+
+
+@kernel(inline=True)
+def _squares(grid: np.ndarray, start: int, stop: int, step: int) -> Any:
+    """Sum of the squared second differences, over `step`, of the flat range start..stop."""
+    two = splat(grid.dtype.type(2))
+    value = splat(grid.dtype.type(0))
+    for k in range(start, stop, LANES):
+        d = fnma(two, load(grid, k), load(grid, k - step) + load(grid, k + step))
+        value = fma(d, d, value)
+    return np.float64(total(value))
+
+
+@parallel(lambda sums, *_: len(sums))
+def _values(tasks: Tasks, sums: np.ndarray, grid: np.ndarray, lines: np.ndarray) -> None:
+    """Fills sums [R, 3] with each line's part of the three terms."""
+    channels = grid.shape[1]
+    zero, one = splat(grid.dtype.type(0)), splat(grid.dtype.type(1))
+    for r in range(tasks[0], tasks[1]):
+        first, height, width, j, spatial = lines[r]
+        start, step = (first + j * width) * channels, width * channels
+        smooth, distance = 0.0, zero
+        if 0 < j < height - 1:
+            smooth += _squares(grid, start, start + step, step) / ((height - 2) * step)
+        if spatial and width > 2:
+            inner = _squares(grid, start + channels, start + step - channels, channels)
+            smooth += inner / (height * (width - 2) * channels)
+        if not spatial:
+            for k in range(start, start + step, LANES):
+                d = one - load(grid, k)
+                distance = distance + select_gt(d, zero, d, zero - d)
+        sums[r, 0], sums[r, 1] = (smooth, 0.0) if spatial else (0.0, smooth)
+        sums[r, 2] = np.float64(total(distance)) / (height * step)
+
+
+@kernel(inline=True)
+def _band(i: int, n: int) -> Band:
+    """Row i, from column i - 2, of D^T D, where D takes the n - 2 second differences of n values."""
+    if 2 <= i < n - 2:
+        return 1.0, -4.0, 6.0, -4.0, 1.0
+    before = 1.0 if i >= 2 else 0.0  # the difference centred at i - 1 exists
+    here = 1.0 if 1 <= i < n - 1 else 0.0
+    after = 1.0 if i < n - 2 else 0.0
+    return before, -2 * (before + here), before + 4 * here + after, -2 * (here + after), after
+
+
+@kernel(inline=True)
+def _curve(grid: np.ndarray, k: int, i: int, n: int, step: int, band: Band, weight: float) -> Vector:
+    """weight times the band's row applied around flat offset k, which is value i of n."""
+    real = grid.dtype.type
+    value = load(grid, k) * splat(real(weight * band[2]))
+    value = fma(load(grid, k - min(i, 2) * step), splat(real(weight * band[0])), value)
+    value = fma(load(grid, k - min(i, 1) * step), splat(real(weight * band[1])), value)
+    value = fma(load(grid, k + min(n - 1 - i, 1) * step), splat(real(weight * band[3])), value)
+    return fma(load(grid, k + min(n - 1 - i, 2) * step), splat(real(weight * band[4])), value)
+
+
+@parallel(lambda grad, grid, lines, *_: len(lines))
+def _gradient(tasks: Tasks, grad: np.ndarray, grid: np.ndarray, lines: np.ndarray, factors: np.ndarray) -> None:
+    """Fills grad [cells, C] with the gradient of sum(factors * terms)."""
+    channels = grid.shape[1]
+    zero, one = splat(grid.dtype.type(0)), splat(grid.dtype.type(1))
+    for r in range(tasks[0], tasks[1]):
+        first, height, width, j, spatial = lines[r]
+        start, step = (first + j * width) * channels, width * channels
+        band_j = _band(j, height)
+        weight_j = 2 * factors[0 if spatial else 1] / (max(height - 2, 1) * step)
+        weight_i = 2 * factors[0] / (height * max(width - 2, 1) * channels)
+        if spatial:
+            for i in range(width):
+                band_i = _band(i, width)
+                for k in range(start + i * channels, start + (i + 1) * channels, LANES):
+                    value = _curve(grid, k, j, height, step, band_j, weight_j)
+                    store(grad, k, value + _curve(grid, k, i, width, channels, band_i, weight_i))
+        else:
+            weight = splat(grid.dtype.type(factors[2] / (height * step)))
+            for k in range(start, start + step, LANES):
+                value = load(grid, k)
+                sign = select_gt(value, one, weight, select_gt(one, value, zero - weight, zero))
+                store(grad, k, sign + _curve(grid, k, j, height, step, band_j, weight_j))
+
+
+class _Regularisers(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, grid: Tensor, lines: np.ndarray) -> tuple[Tensor, ...]:
+        sums = np.empty((len(lines), len(TERMS)))
+        _values(sums, grid.numpy(), lines)
+        ctx.lines = lines
+        ctx.save_for_backward(grid)
+        return tuple(grid.new_tensor(x) for x in sums.sum(0))
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, *factors: Tensor) -> tuple[Tensor, None]:
+        (grid,) = ctx.saved_tensors
+        grad = torch.empty_like(grid)
+        _gradient(grad.numpy(), grid.detach().numpy(), ctx.lines, np.array([f.item() for f in factors]))
+        return grad, None
+
+
+def regularisers(grid: Tensor, layout: PlaneLayout) -> dict[str, Tensor]:
+    """The three terms of the planes in grid [cells, C], by name."""
+    if grid.device.type == "cpu" and grid.shape[1] % LANES == 0:
+        values = _Regularisers.apply(grid, layout.lines)  # type: ignore[no-untyped-call]
+        return dict(zip(TERMS, values, strict=True))
+    return regularisers_reference(grid, layout)
+
+
+def regularisers_reference(grid: Tensor, layout: PlaneLayout) -> dict[str, Tensor]:
+    """The plain torch form of `regularisers`."""
+
+    def bend(plane: Tensor, axis: int) -> Tensor:
+        n = plane.shape[axis]
+        if n < 3:
+            return plane.new_zeros(())
+        before, here, after = (plane.narrow(axis, first, n - 2) for first in range(3))
+        return (before - 2 * here + after).square().mean()
+
+    terms = {name: grid.new_zeros(()) for name in TERMS}
+    for scale in layout.views(grid):
+        for name, _, _ in SPATIAL:
+            terms["plane_smooth"] = terms["plane_smooth"] + bend(scale[name], 0) + bend(scale[name], 1)
+        for name, _, _ in TEMPORAL:
+            terms["time_smooth"] = terms["time_smooth"] + bend(scale[name], 0)
+            terms["time_l1"] = terms["time_l1"] + (1 - scale[name]).abs().mean()
+    return terms
+
+
+# -- rate --------------------------------------------------------------------------------------------------------------
+
+_LN2 = math.log(2.0)
+
+
+@kernel(inline=True)
+def _neighbour(i: int, j: int, up: int, left: int, temporal: int) -> int:
+    """The distance back to the only neighbour of the value at row i, column j (not both 0); 0: it has three."""
+    if i == 0:
+        return left
+    return up if temporal or j == 0 else 0
+
+
+@kernel(inline=True)
+def _median(w: Vector, n: Vector, plane: Vector) -> Vector:
+    low, high = select_gt(w, n, n, w), select_gt(w, n, w, n)
+    value = select_gt(plane, high, high, plane)
+    return select_gt(value, low, value, low)
+
+
+@kernel(inline=True)
+def _residual(grid: np.ndarray, k: int, before: int, up: int, left: int) -> Vector:
+    """Residuals at flat offset k; the only neighbours lie `before`, or, if that is 0, one `up` and one `left`."""
+    if before:
+        return load(grid, k) - load(grid, k - before)
+    w, n = load(grid, k - left), load(grid, k - up)
+    return load(grid, k) - _median(w, n, w + n - load(grid, k - up - left))
+
+
+@parallel(lambda channel_sums, *_: len(channel_sums))
+def _magnitudes(
+    tasks: Tasks,
+    channel_sums: np.ndarray,
+    cell_sums: np.ndarray,
+    grid: np.ndarray,
+    starts: np.ndarray,
+    sizes: np.ndarray,
+) -> None:
+    """Adds sums of |r| to channel_sums [P, C] and cell_sums [cells]. starts, sizes: see `_tables`."""
+    channels, zero = grid.shape[1], splat(grid.dtype.type(0))
+    for p in range(tasks[0], tasks[1]):
+        height, width, temporal = sizes[p]
+        sums = np.zeros(channels, grid.dtype)
+        for i in range(height):
+            for j in range(0 if i else 1, width):
+                cell = starts[p] + i * width + j
+                before = _neighbour(i, j, width * channels, channels, temporal)
+                whole = zero
+                for c in range(0, channels, LANES):
+                    r = _residual(grid, cell * channels + c, before, width * channels, channels)
+                    magnitude = select_gt(r, zero, r, zero - r)
+                    store(sums, c, load(sums, c) + magnitude)
+                    whole = whole + magnitude
+                cell_sums[cell] = total(whole)
+        channel_sums[p] = sums
+
+
+@kernel(inline=True)
+def _signed(weight: Vector, r: Vector) -> Vector:
+    """The weight with the sign of r, 0 where r is 0."""
+    zero = r - r
+    return select_gt(r, zero, weight, select_gt(zero, r, zero - weight, zero))
+
+
+@kernel(inline=True)
+def _add(grad: np.ndarray, k: int, value: Vector) -> None:
+    store(grad, k, load(grad, k) + value)
+
+
+@parallel(lambda grad, grid, by_channel, by_cell, starts, sizes: len(starts))
+def _proxy_gradient(
+    tasks: Tasks,
+    grad: np.ndarray,
+    grid: np.ndarray,
+    by_channel: np.ndarray,
+    by_cell: np.ndarray,
+    starts: np.ndarray,
+    sizes: np.ndarray,
+) -> None:
+    """Adds the gradient of the sum of |r|, weighted by by_channel [P, C] + by_cell [cells], to grad [cells, C]."""
+    channels, zero = grid.shape[1], splat(grid.dtype.type(0))
+    for p in range(tasks[0], tasks[1]):
+        height, width, temporal = sizes[p]
+        up, left = width * channels, channels
+        for i in range(height):
+            for j in range(0 if i else 1, width):
+                cell = starts[p] + i * width + j
+                before = _neighbour(i, j, up, left, temporal)
+                own = splat(by_cell[cell])
+                for c in range(0, channels, LANES):
+                    k = cell * channels + c
+                    weight = load(by_channel, p * channels + c) + own
+                    if before:
+                        g = _signed(weight, load(grid, k) - load(grid, k - before))
+                        _add(grad, k, g)
+                        _add(grad, k - before, zero - g)
+                        continue
+                    w, n = load(grid, k - left), load(grid, k - up)
+                    plane = w + n - load(grid, k - up - left)
+                    median = _median(w, n, plane)
+                    g = _signed(weight, load(grid, k) - median)
+                    # it goes to the neighbours that make the median
+                    west = select_gt(median, w, zero, select_gt(w, median, zero, g))
+                    north = g - west
+                    low, high = select_gt(w, n, n, w), select_gt(w, n, w, n)
+                    corner = select_gt(plane, low, select_gt(high, plane, g, zero), zero)
+                    _add(grad, k, g)
+                    _add(grad, k - up, zero - north)
+                    _add(grad, k - left, zero - west - corner)
+                    _add(grad, k - up - left, corner)
+
+
+class _Proxy(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, grid: Tensor, layout: PlaneLayout, step: float) -> Tensor:
+        starts, sizes = _tables(layout)
+        channel_sums = np.zeros((len(starts), grid.shape[1]), grid.numpy().dtype)
+        cell_sums = np.zeros(len(grid), grid.numpy().dtype)
+        _magnitudes(channel_sums, cell_sums, grid.numpy(), starts, sizes)
+        scale, cells = 2 * math.e / step, sizes[:, 0] * sizes[:, 1]
+        by_channel = 1 + scale * channel_sums / cells[:, None]
+        by_cell = 1 + scale * cell_sums / grid.shape[1]
+        bits = 0.5 * float((cells[:, None] * np.log2(by_channel)).sum() + grid.shape[1] * np.log2(by_cell).sum())
+        ctx.weights = 0.5 * scale / _LN2 / by_channel, 0.5 * scale / _LN2 / by_cell
+        ctx.layout = layout
+        ctx.save_for_backward(grid)
+        return grid.new_tensor(bits)
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, factor: Tensor) -> tuple[Tensor, None, None]:
+        (grid,) = ctx.saved_tensors
+        grad = torch.zeros_like(grid)
+        by_channel, by_cell = ((factor.item() * w).astype(grad.numpy().dtype) for w in ctx.weights)
+        _proxy_gradient(grad.numpy(), grid.detach().numpy(), by_channel, by_cell, *_tables(ctx.layout))
+        return grad, None, None
+
+
+def _tables(layout: PlaneLayout) -> tuple[np.ndarray, np.ndarray]:
+    """(first cells int64 [P], height, width and 1 if temporal int64 [P, 3]) of all planes of all scales."""
+    sizes = [(r[b], r[a], b == TIME_AXIS) for r in layout.reso for _, a, b in PLANES]
+    return layout.start.ravel(), np.array(sizes, np.int64)
+
+
+def proxy_bits(grid: Tensor, layout: PlaneLayout, step: float) -> Tensor:
+    """The proxy, in bits, of planes grid [cells, C] at a quantisation step; its gradient reaches every value."""
+    if grid.device.type == "cpu" and grid.shape[1] % LANES == 0:
+        bits: Tensor = _Proxy.apply(grid, layout, step)  # type: ignore[no-untyped-call]
+        return bits
+    return proxy_bits_reference(grid, layout, step)
+
+
+def proxy_bits_reference(grid: Tensor, layout: PlaneLayout, step: float) -> Tensor:
+    """The plain torch form of `proxy_bits`."""
+    scale, total = 2 * math.e / step, grid.new_zeros(())
+    for planes in layout.views(grid):
+        for name, _, b in PLANES:
+            r = _residuals(planes[name], b == TIME_AXIS).abs()
+            cells, channels = r.shape[0] * r.shape[1], r.shape[2]
+            by_channel = torch.log2(1 + scale * r.mean((0, 1))).sum() * cells
+            by_cell = torch.log2(1 + scale * r.mean(2)).sum() * channels
+            total = total + 0.5 * (by_channel + by_cell)
+    return total
+
+
+def _residuals(x: Tensor, temporal: bool) -> Tensor:
+    """Of a plane [H, W, C]; 0 for its first value."""
+    first_row = torch.cat([torch.zeros_like(x[:1, :1]), x[:1, 1:] - x[:1, :-1]], dim=1)
+    if temporal:
+        return torch.cat([first_row, x[1:] - x[:-1]])
+    w, n, nw = x[1:, :-1], x[:-1, 1:], x[:-1, :-1]
+    low, high = torch.minimum(w, n), torch.maximum(w, n)
+    inner = x[1:, 1:] - torch.maximum(low, torch.minimum(high, w + n - nw))
+    return torch.cat([first_row, torch.cat([x[1:, :1] - x[:-1, :1], inner], dim=1)])
