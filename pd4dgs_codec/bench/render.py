@@ -12,8 +12,8 @@ import torch
 
 from pd4dgs_codec.bench.report import Panel, markdown, pareto_front
 from pd4dgs_codec.bench.timing import Timing, clock, summary
-from pd4dgs_codec.draw.player import Player
 from pd4dgs_codec.draw.gaussians import near_plane
+from pd4dgs_codec.draw.player import Player
 from pd4dgs_codec.errors import RenderError
 from pd4dgs_codec.model.rasterization import rasterization
 from pd4dgs_codec.quality.frames import Frame
