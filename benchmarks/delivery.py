@@ -128,7 +128,7 @@ def measure_player(run: Run, scene: Scene) -> list[Row]:
     rows: list[Row] = []
     with tempfile.TemporaryDirectory() as name, launched() as browser:
         folder = Path(name) / "package"
-        command("package", run.packed(scene), "-o", folder)
+        command("package", run.packed(scene), "-o", folder, "--no-video")
         ends = {row["layer"]: row["end"] for row in command("info", run.packed(scene))["layers"]}
         for rate in RATES:
             with served(folder, "--rate", repr(rate), "--latency", ROUND_TRIP) as url:

@@ -22,6 +22,9 @@ from urllib.parse import urlsplit
 
 import numpy as np
 import pytest
+from browser import PATIENCE_MS, launched
+from pictures import PLAYER, call, cameras, copy_player, decibels, resized, shots
+from pictures import pixels as pixels_of
 from strategies import make_scene
 from tiny import TINY, disc
 
@@ -45,9 +48,6 @@ from pd4dgs_codec.web.page import page as packed_page
 from pd4dgs_codec.web.server import Server
 
 ROOT = Path(__file__).parents[2]
-sys.path.insert(0, str(ROOT / "benchmarks"))
-from browser import PATIENCE_MS, PLAYER, call, cameras, copy_player, decibels, launched, resized, shots  # noqa: E402
-from browser import pixels as pixels_of  # noqa: E402
 
 WIDTH, HEIGHT = 96, 72
 #: Of pictures against the rasteriser. Eight bits alone leave 59.

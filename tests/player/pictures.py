@@ -1,0 +1,106 @@
+"""Pictures of the player in the browser tests' page, beside those of the package's rasteriser."""
+
+from __future__ import annotations
+
+import base64
+import math
+import shutil
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pd4dgs_codec import decode
+from pd4dgs_codec.draw.player import Player
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.scene import MASK_THRESHOLD, Camera, Scene
+
+PLAYER = Path(__file__).parents[2] / "player"
+
+
+def copy_player(folder: Path) -> None:
+    """The player's modules and the tests' page as folder/player."""
+    shutil.copytree(PLAYER, folder / "player", ignore=shutil.ignore_patterns("node_modules", "test"))
+
+
+def call(page: Any, script: str, *args: Any) -> Any:
+    """The result of a function, given as JavaScript, in a page."""
+    return page.evaluate(f"(args) => ({script})(...args)", list(args))
+
+
+def pixels(text: str, width: int, height: int) -> np.ndarray:
+    """A picture of the harness as float [H, W, 3] in 0..1."""
+    return np.frombuffer(base64.b64decode(text), np.uint8).reshape(height, width, 4)[..., :3] / 255
+
+
+def decibels(a: np.ndarray, b: np.ndarray) -> float:
+    """PSNR of pictures in 0..1."""
+    return -10 * math.log10(max(float(((a - b) ** 2).mean()), 1e-12))
+
+
+class Rasterised(Player):
+    """The package's pictures, of every anchor: clause 13.4 knows no frustum, but `Player` leaves out anchors by where
+    they stand before they are deformed."""
+
+    def _visible(self, camera: Camera) -> np.ndarray:
+        return np.flatnonzero(self._mask > MASK_THRESHOLD)
+
+
+def resized(camera: Camera, width: int, height: int) -> Camera:
+    """The same view in a picture of another size."""
+    K = camera.K * np.array([[width / camera.width], [height / camera.height], [1]], np.float32)
+    return replace(camera, width=width, height=height, K=K)
+
+
+def cameras(scene: Scene, turns: Sequence[tuple[float, float]]) -> Iterator[Camera]:
+    """The scene's own camera, then for each (angle, nearer) that camera turned about the middle of the anchors by
+    `angle`, around its vertical, and brought nearer by the share `nearer`."""
+    own = scene.info.camera
+    if own is None:
+        raise DataError("the scene has no camera of its own")
+    yield own
+    R, t = own.viewmat[:3, :3].astype(np.float64), own.viewmat[:3, 3]
+    x, y, z = axis = R[1]
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    middle = np.median(scene.anchor, axis=0)
+    for angle, nearer in turns:
+        turn = np.cos(angle) * np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * np.outer(axis, axis)
+        viewmat = np.eye(4)
+        viewmat[:3, :3] = R @ turn.T
+        viewmat[:3, 3] = -viewmat[:3, :3] @ (middle + (1 - nearer) * turn @ (-R.T @ t - middle))
+        yield replace(own, viewmat=viewmat.astype(np.float32))
+
+
+@dataclass(frozen=True, eq=False)
+class Shot:
+    """A picture of the player and that of the rasteriser, float [H, W, 3]. camera: its number. t: normalised time."""
+
+    level: int
+    t: float
+    camera: int
+    player: np.ndarray
+    expected: np.ndarray
+
+
+def shots(
+    page: Any, data: bytes, views: Sequence[Camera], times: Sequence[float], levels: Sequence[int] | None = None
+) -> Iterator[Shot]:
+    """Of what the page's harness has open, the file `data`: each level at each time through each camera, all of one
+    size."""
+    scenes = [decode(data, max_layer=level) for level in levels or decode(data).layers]
+    players = [Rasterised(scene) for scene in scenes]
+    low, high = scenes[0].info.time_range
+    for number, camera in enumerate(views):
+        for t in times:
+            for scene, player in zip(scenes, players, strict=True):
+                got = shoot(page, camera, scene.level, low + t * (high - low))
+                yield Shot(scene.level, t, number, got, player.picture(camera, t))
+
+
+def shoot(page: Any, camera: Camera, level: int, seconds: float) -> np.ndarray:
+    """The player's settled picture, float [H, W, 3]."""
+    state: dict[str, Any] = dict(level=level, seconds=seconds, width=camera.width, height=camera.height)
+    state |= dict(viewmat=camera.viewmat.ravel().tolist(), K=camera.K.ravel().tolist())
+    return pixels(call(page, "harness.shoot", state), camera.width, camera.height)
