@@ -1,64 +1,44 @@
-// The page that measures itself: frame rates per level and size, on the machine that opens it.
+// The page that measures frame rates per level and size on the machine that opens it.
 
 import { centreOf, dot, downOf, forwardOf, lookAlong, plus, turn } from "./camera.js";
 import { Player } from "./player.js";
 
-/** CSS pixels. */
+/** CSS pixels, smallest first. */
 const SIZES = "320x240,640x480,1280x720,1920x1080";
-/** Of one measurement, milliseconds; slow machines do at least one picture. */
-const SPAN_MS = 2000;
-/** Where moving pictures come more slowly, larger ones are left out. */
+/** Length of one measurement, milliseconds; slow machines draw at least one picture. */
+const SPAN_MS = 1000;
+/** Below this rate, larger pictures are not measured. */
 const SLOWEST = 1;
-/** Radians to and fro that the camera turns while it is measured, and the length of that. */
+/** Radians that the camera turns to each side, and the period, milliseconds. */
 const SWING = 0.1;
 const SWING_MS = 2000;
 
 /**
- * One row of the result. moving: pictures a second while the camera moves and the time stands still. playing: the same
- * while time moves; where nothing depends on time, level 0, that is 0.
+ * Measures a scene; the result is shown and is `window.benchResult`. moving: pictures per second while the camera moves
+ * and time stands still. playing: evaluations per second while time advances; 0 for level 0, which is static.
  *
- * @typedef {object} Row
- * @property {number} level
- * @property {number} width
- * @property {number} height
- * @property {number} gaussians
- * @property {number} moving
- * @property {number} playing
- */
-
-/**
- * Measures a scene and writes a table into `place`. The result is also `window.benchResult`.
- *
- * @param {string | Blob} source @param {HTMLElement} place @param {string} [sizes] to measure, smallest first
+ * @param {string | Blob} source @param {HTMLElement} place @param {string} [sizes]
  */
 export async function bench(source, place, sizes = SIZES) {
-  const output = document.createElement("div");
-  output.id = "bench";
-  const state = document.createElement("p");
+  const output = Object.assign(document.createElement("pre"), { id: "bench", textContent: "loading" });
   const canvas = document.createElement("canvas");
-  output.append(state);
   place.append(output, canvas);
   const player = new Player(canvas, { degrade: false, pixelRatio: 1 });
   /** @type {{seconds: number, bytes: number} | null} */
   let first = null;
   player.addEventListener("firstpicture", (event) => (first = /** @type {CustomEvent} */ (event).detail));
-  player.addEventListener("error", (event) => {
-    state.textContent = /** @type {CustomEvent} */ (event).detail.message;
-  });
+  player.addEventListener("error", (event) => (output.textContent = /** @type {CustomEvent} */ (event).detail.message));
   Object.assign(canvas.style, { width: "640px", height: "480px" });
-  const name = source instanceof Blob ? "the scene" : source;
-  state.textContent = `loading ${name}`;
   const started = performance.now();
   await player.load(source);
   const loaded = (performance.now() - started) / 1000;
   if (!player.scene) return;
-  /** @type {Row[]} */
   const rows = [];
   for (const level of player.status.levels) {
     player.level = level;
     for (const [width, height] of sizes.split(",").map((size) => size.split("x").map(Number))) {
       Object.assign(canvas.style, { width: `${width}px`, height: `${height}px` });
-      state.textContent = `level ${level}, ${width} × ${height}`;
+      output.textContent = `level ${level}, ${width} × ${height}`;
       await player.settled();
       const moving = await perSecond(() => player.counts.drawn, swing(player));
       await player.settled();
@@ -67,18 +47,16 @@ export async function bench(source, place, sizes = SIZES) {
       if (moving < SLOWEST) break;
     }
   }
+  const name = source instanceof Blob ? "the scene" : source;
   const result = { renderer: player.renderer, agent: navigator.userAgent, source: name, loaded, first, rows };
   player.close();
   canvas.remove();
-  output.append(table(rows));
-  state.textContent =
-    `${name}: ${player.status.bytes.toLocaleString()} bytes in ${loaded.toFixed(2)} s. ` +
-    `Drawn by ${result.renderer}. Pictures per second:`;
+  output.textContent = JSON.stringify(result, null, 1);
   Object.assign(window, { benchResult: result });
 }
 
 /**
- * How much `count` grows in a second while `step` is called with the milliseconds since the start.
+ * Increase of `count` per second while `step` is called with the milliseconds since the start.
  *
  * @param {() => number} count @param {(ms: number) => void} step
  */
@@ -97,8 +75,7 @@ async function perSecond(count, step) {
 
 /** Turns the camera to and fro about a point before it. @param {Player} player @returns {(ms: number) => void} */
 function swing(player) {
-  const camera = player.camera;
-  const info = player.info;
+  const { camera, info } = player;
   if (!camera || !info) return () => {};
   const middle = plus(plus([0, 0, 0], info.box[0], 0.5), info.box[1], 0.5);
   const depth = Math.max(dot(plus(middle, centreOf(camera), -1), forwardOf(camera)), 2 * info.near);
@@ -110,28 +87,9 @@ function swing(player) {
   };
 }
 
-/** Goes through the scene's time. @param {Player} player @returns {(ms: number) => void} */
+/** Advances the scene's time. @param {Player} player @returns {(ms: number) => void} */
 function play(player) {
   const [start, end] = player.timeRange;
   const length = end - start || 1;
-  return (ms) => {
-    player.seek(start + ((ms / 1000) % length));
-  };
-}
-
-/** @param {Row[]} rows */
-function table(rows) {
-  const names = ["level", "width", "height", "gaussians", "moving", "playing"];
-  const element = document.createElement("table");
-  const head = element.createTHead().insertRow();
-  for (const name of names) head.append(Object.assign(document.createElement("th"), { textContent: name }));
-  const body = element.createTBody();
-  for (const row of rows) {
-    const line = body.insertRow();
-    for (const [name, value] of Object.entries(row)) {
-      const rate = name === "moving" || name === "playing";
-      line.insertCell().textContent = rate ? value.toFixed(1) : value.toLocaleString();
-    }
-  }
-  return element;
+  return (ms) => player.seek(start + ((ms / 1000) % length));
 }

@@ -5,8 +5,7 @@ import { Player } from "../element.js";
 import { evaluate } from "../render/evaluate.js";
 import { GpuEvaluator, NO_ENTRY } from "../render/evaluator.js";
 import { Gpu } from "../render/gl.js";
-import { Pace, SCALES } from "../render/pace.js";
-import { DepthSort, listGaussians } from "../render/sort.js";
+import { listGaussians } from "../render/sort.js";
 
 /** @param {string} url */
 async function sceneOf(url) {
@@ -150,9 +149,5 @@ Object.assign(window, {
     get events() {
       return events;
     },
-    DepthSort,
-    listGaussians,
-    Pace,
-    SCALES,
   },
 });

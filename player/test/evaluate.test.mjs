@@ -1,4 +1,4 @@
-// Evaluating without a GPU: the kernel in WebAssembly against its reference in JavaScript.
+// What is drawn, without a GPU: the evaluator and its kernel in WebAssembly against plain JavaScript, lists, order, pace.
 
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
@@ -7,6 +7,8 @@ import { test } from "node:test";
 import { decode } from "../decode/index.js";
 import { evaluate } from "../render/evaluate.js";
 import { Arena } from "../render/kernel.js";
+import { Pace, SCALES } from "../render/pace.js";
+import { DepthSort, listGaussians } from "../render/sort.js";
 
 /** Numbers in -1..1 that are the same in every run. @param {number} count */
 function numbers(count) {
@@ -68,4 +70,52 @@ test("both evaluate a scene alike, at every level", () => {
       assert.ok(farthest(fast[name], plain[name]) < 1e-4 * size, name);
     }
   }
+});
+
+test("Gaussians are sorted back to front; of equal depths the later ones come first", () => {
+  const means = numbers(2000).map((v, i) => (i % 4 === 2 ? Math.round(10 * v) / 10 : v));
+  const order = [...new DepthSort().sort(means, [0, 0, 1, 0.5], 0.1)];
+  const depth = (/** @type {number} */ i) => Math.fround(means[4 * i + 2] + 0.5);
+  const shown = Array.from({ length: 500 }, (_, i) => i).filter((i) => depth(i) > 0.1 && means[4 * i + 3] >= 0);
+  assert.deepEqual(order.slice().sort((a, b) => a - b), shown);
+  for (let i = 1; i < order.length; i++) {
+    const [a, b] = [order[i - 1], order[i]];
+    assert.ok(depth(a) > depth(b) || (depth(a) === depth(b) && a > b));
+  }
+});
+
+test("a list holds the visible Gaussians slot by slot, and those of the list before", () => {
+  const opacities = new Float32Array(3 * 40 * 4);
+  for (const [anchor, slot] of [[3, 0], [5, 0], [39, 9]]) opacities[((slot >> 2) * 40 + anchor) * 4 + (slot & 3)] = 0.5;
+  /** @param {Float32Array} from @param {import("../render/evaluator.js").List | null} previous */
+  const list = (from, previous) => listGaussians(from, 10, 40, previous);
+  const entries = (/** @type {import("../render/evaluator.js").List | null} */ found) =>
+    [...(found?.entries ?? [])].filter((e) => e !== 0xffffffff).map((e) => [e >>> 24, e & 0xffffff]);
+  const first = list(opacities, null);
+  assert.deepEqual(entries(first), [[0, 3], [0, 5], [9, 39]]);
+  first?.entries.forEach((e, i) => assert.ok(e === 0xffffffff || i / first.width >= first.starts[e >>> 24]));
+  assert.equal(list(opacities, first), null);
+  const other = new Float32Array(opacities.length);
+  other[4 * 7] = 1;
+  assert.deepEqual(entries(list(other, first)), [[0, 3], [0, 5], [0, 7], [9, 39]]);
+});
+
+test("the pace slows down where the machine is slow, and recovers", () => {
+  const pace = new Pace();
+  const scales = Array.from({ length: 120 }, (_, i) => (pace.drew(i < 40 ? 200 : 2), pace.scale));
+  assert.equal(scales[0], 1);
+  assert.equal(scales[119], 1);
+  assert.ok(scales.includes(SCALES[SCALES.length - 1]));
+  for (let i = 1; i < 40; i++) assert.ok(scales[i] <= scales[i - 1]);
+  /** @type {number[]} */
+  const levels = [];
+  let now = 0;
+  for (const [costs, seconds] of /** @type {[number[], number][]} */ ([[[1, 100, 300], 4], [[1, 500, 900], 8], [[1, 10, 20], 300]])) {
+    for (const end = now + 1000 * seconds; now < end; levels.push(pace.level)) {
+      now += costs[pace.level];
+      pace.evaluated(pace.level, costs[pace.level], now);
+    }
+  }
+  assert.deepEqual([levels[0], levels[levels.length - 1]], [2, 2]);
+  assert.ok(levels.includes(1) && levels.includes(0));
 });

@@ -1,12 +1,10 @@
-"""A web server that misbehaves as told: it cuts, resets, stalls, lies, or changes its file between requests.
-
-The one that behaves is pd4dgs_codec.web.server.
-"""
+"""A web server that cuts, resets, stalls, lies or changes its file as told; and one plain HTTP request."""
 
 from __future__ import annotations
 
 import contextlib
 import hashlib
+import http.client
 import socket
 import struct
 import threading
@@ -16,7 +14,7 @@ from http import HTTPStatus
 from socketserver import StreamRequestHandler, ThreadingTCPServer
 
 from pd4dgs_codec.web.headers import Unsatisfiable, requested_range
-from pd4dgs_codec.web.server import Link
+from pd4dgs_codec.web.server import Link, Server
 
 
 @dataclass
@@ -131,3 +129,26 @@ class _Handler(StreamRequestHandler):
                 self.request.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
                 self.request.close()
         return False
+
+
+@dataclass(frozen=True)
+class Answer:
+    status: int
+    headers: http.client.HTTPMessage
+    body: bytes
+
+
+def ask(server: Server, target: str, method: str = "GET", **headers: str) -> Answer:
+    """One request on a connection of its own; If_Range="..." sends If-Range."""
+    host, port = server.server_address[:2]
+    connection = http.client.HTTPConnection(host, port, timeout=10)
+    try:
+        connection.putrequest(method, target, skip_host=True, skip_accept_encoding=True)
+        connection.putheader("Host", f"{host}:{port}")
+        for name, value in headers.items():
+            connection.putheader(name.replace("_", "-"), value)
+        connection.endheaders()
+        response = connection.getresponse()
+        return Answer(response.status, response.headers, response.read())
+    finally:
+        connection.close()

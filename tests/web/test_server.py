@@ -13,7 +13,7 @@ from email.utils import formatdate
 from http import HTTPStatus
 
 import pytest
-from asking import ask
+from faulty import ask
 
 from pd4dgs_codec.errors import DeliveryError
 from pd4dgs_codec.web.server import Link, Server
