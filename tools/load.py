@@ -1,7 +1,7 @@
-"""How a server bears many clients: python tools/load.py URL [--clients 1 100 1000] [--bytes N] [--seconds 20]
+"""Load test of a server: python tools/load.py URL [--clients 1 100 1000] [--bytes N] [--seconds 20]
 
-Each client opens a connection, asks for the first bytes of the file, as a player does, and goes. So many requests are
-made as there are clients, at least 200; no row takes longer than --seconds. One process asks: both share the machine.
+Each client connects, requests the first bytes of the file, as a player does, and disconnects. There are as many
+requests as clients, at least 200; no row takes longer than --seconds. All clients share one process.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from urllib.parse import urlsplit
 
 
 async def ask(host: str, port: int, path: str, size: int) -> float:
-    """Seconds until `size` bytes of the body are here."""
+    """Seconds until `size` bytes of the body have arrived."""
     begun = time.perf_counter()
     reader, writer = await asyncio.open_connection(host, port)
     try:
@@ -31,7 +31,7 @@ async def ask(host: str, port: int, path: str, size: int) -> float:
 
 
 async def row(url: str, clients: int, size: int, limit: float) -> str:
-    """A line of the table for so many clients at a time."""
+    """A line of the table for this number of concurrent clients."""
     parts, requests = urlsplit(url), max(200, clients)
     turns, failed = asyncio.Semaphore(clients), 0
     times: list[float] = []
