@@ -1,6 +1,6 @@
 """The streaming client: whatever the server does, only whole layers of one file are shown.
 
-Cuts at random, silence, a slump of the link and files that change are rows of fault_table.py.
+Cuts at random, silence, a slump of the link and files that change are cases of test_client_faults.py.
 """
 
 from __future__ import annotations
