@@ -20,7 +20,7 @@ import numpy as np
 from pd4dgs_codec.entropy import EFFORTS, PRIORS
 from pd4dgs_codec.entropy.ans import MAX_COUNT, AnsDecoder, Model, ans_encode, model_of
 from pd4dgs_codec.entropy.bits import BIT
-from pd4dgs_codec.entropy.fitting import Fitted, fit_best, histogram
+from pd4dgs_codec.entropy.fitting import Fit, Fitted, fit_best, histogram, plan_priors
 from pd4dgs_codec.entropy.priors import (
     FIRST_REUSE,
     FREE_ENTRIES,
@@ -35,7 +35,6 @@ from pd4dgs_codec.entropy.priors import (
     with_class_symbols,
     write_prior,
 )
-from pd4dgs_codec.entropy.sharing import Fit, plan_priors
 from pd4dgs_codec.entropy.tables import uniform_table
 from pd4dgs_codec.entropy.varint import VARINT_MAX, ByteReader, put_varint
 from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed

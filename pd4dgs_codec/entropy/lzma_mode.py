@@ -1,8 +1,8 @@
-"""The same symbols under LZMA, in the layout that suits LZMA best; and float32 arrays, for comparisons.
+"""The same symbols under LZMA, in the layout that suits LZMA best.
 
 Payload: one byte of lc + 9 * (lp + 5 * pb), one byte of flags (bit 0: the bytes of wide numbers lie in separate
-planes), then for symbols, per non-empty channel, a varint of (zigzag(base) << 2 | log2(width)); then one raw LZMA2
-stream of the channels in order, each as little-endian signed integers k - base of the narrowest width, or as float32.
+planes), then per non-empty channel a varint of (zigzag(base) << 2 | log2(width)); then one raw LZMA2 stream of the
+channels in order, each as little-endian signed integers k - base of the narrowest width.
 """
 
 from __future__ import annotations
@@ -24,7 +24,6 @@ MAX_RAW = 1 << 31  #: bytes before compression, per payload
 _DICT_MAX = 1 << 26  #: a decoder never needs more memory than this plus the data
 _SAMPLE = 1 << 19  #: bytes on which the search compares settings
 _SIGNED: list[np.dtype] = [np.dtype("<i1"), np.dtype("<i2"), np.dtype("<i4")]
-_FLOAT: np.dtype = np.dtype("<f4")
 
 
 def encode_channels_lzma(channels: Sequence[np.ndarray], *, effort: int = 5) -> CodedChannels:
@@ -58,25 +57,6 @@ def decode_channels_lzma(payload: bytes | memoryview, counts: Sequence[int]) -> 
         if len(symbols) and int(np.abs(symbols).max()) > K_MAX:
             raise Malformed(f"symbols {symbols.min()}..{symbols.max()}, limit |k| <= {K_MAX}")
         arrays.append(symbols.astype(np.int32))
-    return arrays
-
-
-def encode_floats_lzma(arrays: Sequence[np.ndarray], *, effort: int = 5) -> bytes:
-    """Compress float32 arrays (any shape, flattened in C order). EncodeError for NaN, infinity or another dtype."""
-    for index, array in enumerate(arrays):
-        if array.dtype != np.float32 or not np.isfinite(array).all():
-            raise EncodeError(f"array {index}: expected finite float32, found {array.dtype}, NaN or infinity")
-    return _compress(b"", [np.ascontiguousarray(a, dtype=_FLOAT).ravel() for a in arrays], effort)
-
-
-def decode_floats_lzma(payload: bytes | memoryview, counts: Sequence[int]) -> list[np.ndarray]:
-    """Inverse of encode_floats_lzma: one float32 [count] array per count. Raises Malformed or LimitExceeded."""
-    _check_counts(counts)
-    reader = ByteReader(payload)
-    planar = _read_layout(reader)
-    arrays = [a.astype(np.float32) for a in _decompress(reader, [_FLOAT] * len(counts), counts, planar)]
-    if any(not np.isfinite(a).all() for a in arrays):
-        raise Malformed("a float32 array holds NaN or infinity")
     return arrays
 
 
