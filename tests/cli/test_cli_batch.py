@@ -77,10 +77,3 @@ def test_a_store_that_refuses_ends_it_before_any_work(cli, tmp_path, manifest):
     (tmp_path / "taken").touch()
     done = cli("batch", manifest({"source": "models/a.pt"}), "--op", "encode", "-o", "taken", "--workers", "0")
     assert done.code == 1 and len(done.error_lines) == 1 and "taken" in done.err
-
-
-def test_manifests_and_folders_that_are_not_there_are_named(cli, manifest):
-    done = cli("batch", "nowhere.jsonl", "--op", "encode", "-o", "out")
-    assert done.code == 1 and "nowhere.jsonl" in done.err and len(done.error_lines) == 1
-    done = cli("batch", "scan", "nowhere")
-    assert done.code == 1 and "nowhere" in done.err

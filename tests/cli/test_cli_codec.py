@@ -49,12 +49,6 @@ def test_encode_options_reach_the_codec(cli, model_pt, tmp_path):
     assert size("--no-verify")[1]["verified"] is False
 
 
-def test_encode_table_goes_to_stderr(cli, model_pt, tmp_path):
-    result = cli("encode", model_pt, "-o", tmp_path / "s.pd4", "--effort", 1)
-    assert result.code == 0 and result.out == b""
-    assert "first frame after" in result.err and "payload/ΣR" in result.err
-
-
 def test_pipes_and_repacking_give_the_same_file(cli, model_pt, scene_pd4):
     piped = cli("encode", "-", "-o", "-", "--effort", 1, stdin=model_pt.read_bytes())
     assert piped.code == 0 and piped.out == scene_pd4.read_bytes()
@@ -62,6 +56,13 @@ def test_pipes_and_repacking_give_the_same_file(cli, model_pt, scene_pd4):
     assert again.code == 0 and again.out == piped.out
     summary = cli("decode", "-", "--json", stdin=piped.out)
     assert summary.json["complete"] is True and summary.json["bytes"] == len(piped.out)
+
+
+def test_tables_without_json(cli, model_pt, scene_pd4, tmp_path):
+    result = cli("encode", model_pt, "-o", tmp_path / "s.pd4", "--effort", 1)
+    assert result.code == 0 and result.out == b"" and "first frame after" in result.err and "payload/ΣR" in result.err
+    result = cli("decode", scene_pd4)
+    assert result.code == 0 and result.err == "" and b"whole and valid" in result.out
 
 
 def test_decode_npz_holds_the_decoded_arrays(cli, scene_pd4, tmp_path):
@@ -85,12 +86,6 @@ def test_decoded_checkpoint_encodes_to_the_same_symbols(cli, scene_pd4, tmp_path
     assert cli("encode", checkpoint, "-o", again, "--effort", 1).code == 0
     first, second = (cli("info", path, "--hashes", "--json").json["hashes"] for path in (scene_pd4, again))
     assert [row["symbols"] for row in first] == [row["symbols"] for row in second]
-
-
-def test_decode_without_output_prints_a_summary(cli, scene_pd4):
-    result = cli("decode", scene_pd4)
-    assert result.code == 0 and result.err == ""
-    assert b"whole and valid" in result.out
 
 
 def test_partial_input_exits_3_only_when_allowed(cli, scene_pd4, tmp_path):
@@ -170,15 +165,6 @@ def test_info_names_what_is_left_out(cli, model_pt, tmp_path):
     decoded = cli("decode", output, "--max-layer", 2)
     assert decoded.code == 0 and b"absent: layer 2" in decoded.out
     assert cli("decode", output, "--max-layer", 1, "--json").json["absent"] == []
-
-
-def test_existing_output_needs_overwrite(cli, scene_pd4, tmp_path):
-    output = tmp_path / "s.npz"
-    output.write_bytes(b"precious")
-    refused = cli("decode", scene_pd4, "-o", output)
-    assert refused.code == 1 and output.read_bytes() == b"precious"
-    assert cli("decode", scene_pd4, "-o", output, "-f").code == 0
-    assert output.read_bytes() != b"precious"
 
 
 def test_decoding_runs_where_torch_and_numba_cannot_be_imported(scene_pd4):

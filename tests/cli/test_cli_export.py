@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import sys
-
 import pytest
 
 from pd4dgs_codec.interchange.ply import properties
@@ -62,45 +60,3 @@ def test_other_kinds(cli, scene_pd4, tmp_path, kind):
     result = cli("export", scene_pd4, "-o", out, "--to", kind, "--refine", 0, "--json", *options)
     assert result.code == 0, result.err
     assert result.json["bytes"] == out.stat().st_size > 100
-
-
-@pytest.mark.parametrize(
-    "options, message",
-    [
-        (("--to", "ply-seq", "--time", 0.5), "found --time with --to ply-seq"),
-        (("--to", "ply", "--fps", 5), "found --fps with --to ply"),
-        (("--to", "ply", "--time", 1.5), "expected a number from 0 to 1"),
-        (
-            (
-                "--to",
-                "obj",
-            ),
-            "invalid choice: 'obj'",
-        ),
-    ],
-)
-def test_wrong_usage(cli, scene_pd4, tmp_path, options, message):
-    result = cli("export", scene_pd4, "-o", tmp_path / "out", *options)
-    assert result.code == 2 and message in result.err and len(result.error_lines) == 1
-
-
-def test_bad_input_is_one_line_and_writes_nothing(cli, scene_pd4, tmp_path, model_pt, monkeypatch):
-    out = tmp_path / "out" / "scene.ply"
-    out.parent.mkdir()
-
-    def line(*argv):
-        result = cli("export", *argv, "-o", out, "--refine", 0)
-        assert result.code == 1 and len(result.error_lines) == 1 and not any(out.parent.iterdir())
-        return result.err
-
-    assert "is not a .pd4 file" in line(model_pt, "--to", "ply")
-    assert "No such file" in line(tmp_path / "no.pd4", "--to", "ply")
-    cut = tmp_path / "cut.pd4"
-    cut.write_bytes(scene_pd4.read_bytes()[:-10])
-    assert "cut.pd4" in line(cut, "--to", "ply")
-    assert "frames per second are" in line(scene_pd4, "--to", "4dgs", "--fps", 1e9)
-    monkeypatch.setitem(sys.modules, "gaussforge", None)
-    monkeypatch.setitem(sys.modules, "fourdgs", None)
-    for kind, name in (("spz", "gaussforge"), ("4dgs", "fourdgs")):
-        assert f"need the package {name}" in line(scene_pd4, "--to", kind)
-        assert "pip install 'pd4dgs-codec[interchange]'" in line(scene_pd4, "--to", kind)

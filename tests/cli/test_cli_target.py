@@ -78,17 +78,6 @@ def test_a_target_out_of_reach_writes_nothing(cli, model_pt, tmp_path):
     assert "layer 2 takes at least" in line and "expected at most 10" in line
 
 
-@pytest.mark.parametrize("text", ["425k", "L3=1k", "L0=1k,L0=2k", "L0=", "L0=-5", "L0=0.5", "L0=1k,"])
-def test_sizes_that_are_none_are_wrong_usage(cli, model_pt, tmp_path, text):
-    result = cli("encode", model_pt, "-o", tmp_path / "s.pd4", f"--target-size={text}")
-    assert result.code == 2 and "expected sizes in bytes such as L0=425k" in result.err
-
-
-def test_a_least_gain_without_views_to_measure_it_on_is_wrong_usage(cli, model_pt, tmp_path):
-    result = cli("encode", model_pt, "-o", tmp_path / "s.pd4", "--min-gain", 1)
-    assert result.code == 2 and "--min-gain needs --data" in result.err and not (tmp_path / "s.pd4").exists()
-
-
 def test_layers_that_do_not_pay_are_left_out_with_their_figures(cli, model_pt, shared_dataset, tmp_path):
     judged = ("encode", model_pt, "-o", tmp_path / "s.pd4", "--data", shared_dataset, "--holdout", 3, *FAST)
     dear = cli(*judged, "--min-gain", 1e5).json

@@ -84,11 +84,6 @@ def test_the_quality_sets_the_dial_and_single_options_replace_parts_of_it(train,
     assert train(tmp_path / "n.pt", "--quality", 101).code == 2 and not (tmp_path / "n.pt").exists()
 
 
-def test_a_rate_weight_for_a_run_without_rate_is_wrong_usage(train, tmp_path):
-    result = train(tmp_path / "m.pt", "--without", "rate", "--rate-scale", 0.5)
-    assert result.code == 2 and "--without rate" in result.err and not (tmp_path / "m.pt").exists()
-
-
 def test_interrupted_and_resumed_run_repeats_the_uninterrupted_one(train, tmp_path, monkeypatch):
     from pd4dgs_codec.train.learner import Learner
 
@@ -167,15 +162,6 @@ def test_time_limit_ends_cleanly_and_must_grow_on_resume(cli, train, tmp_path, s
     assert "rate and mask terms" in report["phases_not_reached"]
     refused = cli("train", shared_dataset, "-o", first, "--resume", first)
     assert refused.code == 1 and "larger --max-seconds" in refused.err
-
-
-def test_existing_log_is_kept_unless_overwritten(train, tmp_path):
-    log = tmp_path / "run.jsonl"
-    log.write_text("precious\n")
-    assert train(tmp_path / "m.pt", "--log", log).code == 1
-    assert log.read_text() == "precious\n" and not (tmp_path / "m.pt").exists()
-    assert train(tmp_path / "m.pt", "--log", log, "-f", iterations=2).code == 0
-    assert len(log.read_text().splitlines()) == 2
 
 
 def test_no_held_out_frames_is_said(train, tmp_path):
