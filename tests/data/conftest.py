@@ -1,10 +1,14 @@
-import json
 import os
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
-from dataset_pictures import gradient, pose
-from PIL import Image
+from folders import gradient, pose, save
+
+from pd4dgs_codec.data import videos
+from pd4dgs_codec.data.dataset import load
+from pd4dgs_codec.data.view import Dataset
+from pd4dgs_codec.errors import DataError
 
 SHARED = Path(os.environ.get("PD4DGS_SHARED", Path(__file__).resolve().parents[2] / ".." / "shared" / "data"))
 
@@ -22,6 +26,19 @@ def shared():
     return find
 
 
+@pytest.fixture(scope="session")
+def scene() -> Dataset:
+    """A small synthetic scene, for writers."""
+    return load("synthetic:local?frames=13", downscale=4)
+
+
+@pytest.fixture(autouse=True)
+def cache(tmp_path, monkeypatch) -> Path:
+    """The cache of video frames."""
+    monkeypatch.setenv(videos.FOLDER, str(tmp_path / "cache"))
+    return tmp_path / "cache"
+
+
 @pytest.fixture
 def blender(tmp_path):
     """Writes a small Blender folder; keyword arguments replace keys of the file or of frame 0."""
@@ -29,11 +46,24 @@ def blender(tmp_path):
     def make(n: int = 9, size=(12, 8), frame0: dict | None = None, name="transforms.json", **top) -> Path:
         frames = []
         for i in range(n):
-            Image.fromarray(gradient(*size, i)).save(tmp_path / f"r_{i:03d}.png")
+            save(tmp_path / f"r_{i:03d}.png", gradient(*size, i))
             frames.append({"file_path": f"r_{i:03d}", "time": i / 10, "transform_matrix": pose(0.2 * i)})
         if n:
             frames[0].update(frame0 or {})
-        (tmp_path / name).write_text(json.dumps({"camera_angle_x": 0.8, "frames": frames, **top}))
+        save(tmp_path / name, {"camera_angle_x": 0.8, "frames": frames, **top})
         return tmp_path
 
     return make
+
+
+@pytest.fixture
+def refused() -> Callable[..., None]:
+    """Checks that a source is refused in one line that holds `text` and names the source."""
+
+    def check(source: str | Path, text: str, **options) -> None:
+        with pytest.raises(DataError) as caught:
+            load(source, **options)
+        message = str(caught.value)
+        assert text in message and str(source) in message and message.isprintable() and len(message) < 500, message
+
+    return check

@@ -1,216 +1,284 @@
-"""Every broken input is one DataError of one line that says what and where."""
+"""Every broken input of every reader is one DataError of one line that says what and where."""
 
+from __future__ import annotations
+
+import io
 import json
+import struct
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
 
+import folders
 import numpy as np
 import pytest
-from dataset_pictures import pose
-from PIL import Image
-
-from pd4dgs_codec.data.dataset import load
-from pd4dgs_codec.errors import DataError
+from folders import CAMERAS, COUNT, INSTANTS, pose, save
 
 NAN = float("nan")
-
-
-def stretched():
-    p = pose()
-    p[0][0] *= 1.1
-    return p
-
-
-def mirrored():
-    p = pose()
-    p[1][1] = -1
-    return p
-
-
-def with_nan():
-    p = pose()
-    p[0][3] = NAN
-    return p
-
-
-TABLE = {
-    "nan focal": (dict(fl_x=NAN), "fl_x is nan"),
-    "zero focal": (dict(fl_x=0), "fl_x is 0, expected a number > 0"),
-    "huge focal": (dict(fl_x=10**400), "fl_x is 1000"),
-    "text focal": (dict(fl_x="wide"), "fl_x is 'wide'"),
-    "no focal": (dict(camera_angle_x=None), "no focal length"),
-    "angle over pi": (dict(camera_angle_x=3.5), "expected radians below pi"),
-    "stretched pose": (dict(frame0={"transform_matrix": stretched()}), "frame 0: transform_matrix is not a rotation"),
-    "mirrored pose": (dict(frame0={"transform_matrix": mirrored()}), "determinant -1"),
-    "nan pose": (dict(frame0={"transform_matrix": with_nan()}), "frame 0: transform_matrix holds NaN"),
-    "short pose": (dict(frame0={"transform_matrix": [[1, 0], [0, 1]]}), "has shape"),
-    "no pose": (dict(frame0={"transform_matrix": None}), "transform_matrix"),
-    "no file path": (dict(frame0={"file_path": None}), "frame 0 has no file_path"),
-    "missing image": (dict(frame0={"file_path": "gone/r_000"}), "gone/r_000: image is missing"),
-    "wrong size": (dict(w=16, h=8), "r_000.png: image is 12x8, expected 16x8"),
-    "nan time": (dict(frame0={"time": NAN}), "frame 0: time is nan"),
-    "no frames": (dict(n=0), "found no frames, expected a list of at least 1"),
-    "missing points": (dict(ply_file_path="gone.ply"), "gone.ply: cannot be read"),
-    "near over far": (dict(near_far_per_frame=[[3, 1]] * 9), "expected 0 < near < far"),
-    "short near far": (dict(near_far_per_frame=[[1, 3]]), "near_far_per_frame has shape (1, 2), expected (9, 2)"),
-}
-
-
-def refused(source, text, **options):
-    with pytest.raises(DataError) as caught:
-        load(source, **options)
-    message = str(caught.value)
-    assert text in message and "\n" not in message and len(message) < 500
-    return message
-
-
-@pytest.mark.parametrize("case", TABLE)
-def test_broken_blender_folders(blender, case):
-    keys, text = TABLE[case]
-    folder = blender(**keys)
-    assert str(folder) in refused(folder, text)
-
-
-def test_missing_and_empty_folders(tmp_path):
-    refused(tmp_path / "gone", "gone: found nothing, expected a dataset folder")
-    refused(tmp_path, "found an empty folder, expected camera/")
-    (tmp_path / "readme.txt").write_text("x")
-    refused(tmp_path, "found other files")
-    refused(tmp_path / "readme.txt", "found a file")
-
-
-def test_broken_json_names_the_line(blender):
-    folder = blender()
-    (folder / "transforms.json").write_text('{\n "w": 3,\n "h": ]\n}')
-    refused(folder, "transforms.json: line 3, column 7: broken JSON")
-    (folder / "transforms.json").write_text("[1]")
-    refused(folder, "found a JSON list, expected an object")
-    (folder / "transforms.json").write_bytes(b"\xff\xfe\x00")
-    refused(folder, "cannot be read as JSON")
-    (folder / "transforms.json").write_text('{"fl_x": 1' + "0" * 5000 + "}")
-    refused(folder, "transforms.json")
-
-
-def test_several_files_without_a_rule(blender):
-    folder = blender(name="transforms_a.json")
-    (folder / "transforms_b.json").write_text("{}")
-    refused(folder, "found transforms_a.json, transforms_b.json; expected")
-
-
-@pytest.mark.parametrize("content", [b"", b"not a png", None], ids=["empty", "text", "cut"])
-def test_broken_image(blender, content):
-    folder = blender()
-    whole = (folder / "r_002.png").read_bytes()
-    (folder / "r_002.png").write_bytes(whole[: len(whole) // 2] if content is None else content)
-    refused(folder, "r_002.png")
-
-
-@pytest.mark.parametrize("k", [0, -1, 2.0, True, 9])
-def test_downscale(blender, k):
-    refused(blender(), f"downscale {k}" if k == 9 else f"downscale is {k}", downscale=k)
-
-
-@pytest.mark.parametrize("k", [1, -2])
-def test_holdout_that_leaves_nothing(blender, k):
-    refused(blender(), f"holdout {k} leaves no training frame", holdout=k)
-
-
-@pytest.mark.parametrize("name", ["", "nothing", "Static", "nothing?seed=1"])
-def test_unknown_synthetic(name):
-    refused(f"synthetic:{name}", "expected synthetic:static|global|local|fast[?seed=n&size=WxH&frames=N]")
-
-
-@pytest.mark.parametrize(
-    "query", ["seed=-1", "seed=x", "size=160", "size=7x160", "size=9000x9000", "frames=2", "frames="]
-)
-def test_synthetic_option_of_another_value(query):
-    refused(f"synthetic:static?{query}", f"{query.split('=')[0]} is {query.split('=')[1]!r}; expected for example")
-
-
-@pytest.mark.parametrize("query", ["", "a", "seed=1&a", "seed=1&seed=1", "seed=1&"])
-def test_unknown_option_of_a_synthetic_scene(query):
-    refused(f"synthetic:static?{query}", "expected each of seed, size, frames once at most, as key=value")
-
-
-def test_synthetic_downscale_too_large():
-    refused("synthetic:static", "downscale 200 leaves nothing of 160x120", downscale=200)
-
-
 HEAD = "ply\nformat {} 1.0\nelement vertex 2\n{}end_header\n"
 XYZ = "property float x\nproperty float y\nproperty float z\n"
 
 
-@pytest.mark.parametrize(
-    ("content", "text"),
-    [
-        (b"", "not a PLY file"),
-        (b"ply\nformat ascii 1.0\n", "not a PLY file"),
-        (HEAD.format("binary_big_endian", XYZ).encode(), "expected ascii or binary_little_endian"),
-        (HEAD.format("binary_little_endian", XYZ).encode() + b"\0" * 23, "23 bytes of vertices, expected 24"),
-        (HEAD.format("ascii", XYZ).encode() + b"1 2 3\n", "1 vertex lines, expected 2"),
-        (HEAD.format("ascii", XYZ).encode() + b"1 2 3\n1 2\n", "vertex lines are not 3 numbers"),
-        (HEAD.format("ascii", "property float x\n").encode() + b"1\n2\n", "expected x, y, z once each"),
-        (HEAD.format("ascii", "property list uchar int i\n").encode(), "not a scalar"),
-        (HEAD.format("ascii", XYZ).replace("2\n", "99999999999\n", 1).encode(), "0 vertex lines"),
-    ],
-)
-def test_broken_points(blender, content, text):
-    folder = blender()
-    (folder / "p.ply").write_bytes(content)
-    assert "p.ply" in refused(folder, text)
+def write_blender(_: object, folder: Path) -> Path:
+    """Three frames."""
+    frames = [{"file_path": f"r_{i}", "time": i / 10, "transform_matrix": pose(0.2 * i)} for i in range(3)]
+    save(folder / "transforms.json", {"camera_angle_x": 0.8, "frames": frames})
+    for i in range(3):
+        save(folder / f"r_{i}.png", folders.gradient(12, 8, i))
+    return folder
 
 
-def camera_folder(tmp_path, camera=None, metadata=None, scene=None, extra=None, names=("0_00000",)):
+def write_iphone(_: object, folder: Path) -> Path:
+    """One training frame."""
     eye = np.eye(3).tolist()
-    base = dict(orientation=eye, position=[0, 0, 0], focal_length=10, principal_point=[6, 4], image_size=[12, 8])
-    files = {
-        "camera/0_00000.json": {**base, **(camera or {})},
-        "metadata.json": {"0_00000": {"warp_id": 0, "camera_id": 0}} if metadata is None else metadata,
-        "scene.json": {"center": [0, 0, 0], "scale": 1, "near": 1, "far": 2, **(scene or {})},
-        "extra.json": {"factor": 1, "fps": 30, "bbox": [[0, 0, 0], [1, 1, 1]], **(extra or {})},
-        "splits/train.json": {"frame_names": list(names)},
-    }
-    for name, value in files.items():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(json.dumps(value))
-    (tmp_path / "rgb" / "1x").mkdir(parents=True)
-    Image.fromarray(np.zeros((8, 12, 3), np.uint8)).save(tmp_path / "rgb" / "1x" / "0_00000.png")
-    return tmp_path
+    camera = dict(orientation=eye, position=[0, 0, 0], focal_length=10, principal_point=[6, 4], image_size=[12, 8])
+    save(folder / "camera/0_00000.json", camera)
+    save(folder / "metadata.json", {"0_00000": {"warp_id": 0, "camera_id": 0}})
+    save(folder / "scene.json", {"center": [0, 0, 0], "scale": 1, "near": 1, "far": 2})
+    save(folder / "extra.json", {"factor": 1, "fps": 30, "bbox": [[0, 0, 0], [1, 1, 1]]})
+    save(folder / "splits/train.json", {"frame_names": ["0_00000"]})
+    save(folder / "rgb/1x/0_00000.png", np.zeros((8, 12, 3), np.uint8))
+    return folder
 
 
-def test_the_unbroken_camera_folder_loads(tmp_path):
-    d = load(camera_folder(tmp_path))
-    assert len(d.train) == 1 and d.test == () and d.time_range == (0, 1)
+LAYOUTS: dict[str, Callable[[Any, Path], Path]] = {
+    "blender": write_blender,
+    "iphone": write_iphone,
+    "record3d": folders.write_record3d,
+    "panoptic": folders.write_panoptic,
+    "neu3d": folders.write_neu3d,
+    "colmap": folders.write_binary,
+    "text": folders.write_text,
+    "videos": folders.write_synchronised,
+}
+
+
+def frame(**keys: Any) -> Callable[[dict], dict]:
+    """A change of frame 0 of transforms.json."""
+    return lambda value: value | {"frames": [value["frames"][0] | keys, *value["frames"][1:]]}
+
+
+def entry(i: int, j: int, value: float) -> list:
+    """A pose with another number."""
+    matrix = np.array(pose())
+    matrix[i, j] = value
+    return matrix.tolist()
+
+
+def npy(array: np.ndarray, **archive: bool) -> bytes:
+    """A .npy file, or with archive=True a .npz file with `data`."""
+    stream = io.BytesIO()
+    np.savez(stream, data=array) if archive else np.save(stream, array)
+    return stream.getvalue()
+
+
+def bomb() -> bytes:
+    """An archive of 50 kB that unpacks to 50 MB."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+        archive.writestr("data.npy", bytes(50_000_000))
+    return stream.getvalue()
+
+
+def times(factors: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Columns of poses_bounds.npy times factors."""
+    return lambda poses: poses * factors
+
+
+COLUMN = np.arange(17)
+CAMERA, MODEL = "camera/0_00000.json", "sparse/0/"
+#: Layout, file, and its change: keys of its JSON, new bytes, a function of its content, or None to remove it.
+CASES: list[tuple[str, str, Any, str]] = [
+    ("blender", "transforms.json", dict(fl_x=NAN), "fl_x is nan"),
+    ("blender", "transforms.json", dict(fl_x=0), "fl_x is 0, expected a number > 0"),
+    ("blender", "transforms.json", dict(fl_x=10**400), "fl_x is 1000"),
+    ("blender", "transforms.json", dict(fl_x="wide"), "fl_x is 'wide'"),
+    ("blender", "transforms.json", dict(camera_angle_x=None), "no focal length"),
+    ("blender", "transforms.json", dict(camera_angle_x=3.5), "expected radians below pi"),
+    ("blender", "transforms.json", dict(camera_model="THIN_PRISM_FISHEYE"), "THIN_PRISM_FISHEYE"),
+    ("blender", "transforms.json", frame(transform_matrix=entry(0, 0, 1.1)), "frame 0: transform_matrix is not a rot"),
+    ("blender", "transforms.json", frame(transform_matrix=entry(1, 1, -1)), "determinant -1"),
+    ("blender", "transforms.json", frame(transform_matrix=entry(0, 3, NAN)), "frame 0: transform_matrix holds NaN"),
+    ("blender", "transforms.json", frame(transform_matrix=[[1, 0], [0, 1]]), "has shape"),
+    ("blender", "transforms.json", frame(transform_matrix=None), "transform_matrix"),
+    ("blender", "transforms.json", frame(file_path=None), "frame 0 has no file_path"),
+    ("blender", "transforms.json", frame(file_path="gone/r_0"), "gone/r_0: image is missing"),
+    ("blender", "transforms.json", dict(w=16, h=8), "r_0.png: image is 12x8, expected 16x8"),
+    ("blender", "transforms.json", frame(time=NAN), "frame 0: time is nan"),
+    ("blender", "transforms.json", dict(frames=[]), "found no frames, expected a list of at least 1"),
+    ("blender", "transforms.json", dict(ply_file_path="gone.ply"), "gone.ply: cannot be read"),
+    ("blender", "transforms.json", dict(near_far_per_frame=[[3, 1]] * 3), "expected 0 < near < far"),
+    ("blender", "transforms.json", dict(near_far_per_frame=[[1, 3]]), "has shape (1, 2), expected (3, 2)"),
+    ("blender", "transforms.json", b'{\n "w": 3,\n "h": ]\n}', "transforms.json: line 3, column 7: broken JSON"),
+    ("blender", "transforms.json", b"[1]", "found a JSON list, expected an object"),
+    ("blender", "transforms.json", b"\xff\xfe\x00", "cannot be read as JSON"),
+    ("blender", "transforms.json", b'{"fl_x": 1' + b"0" * 5000 + b"}", "transforms.json"),
+    ("blender", "r_1.png", b"", "r_1.png"),
+    ("blender", "r_1.png", b"not a png", "r_1.png"),
+    ("blender", "r_1.png", lambda data: data[: len(data) // 2], "r_1.png"),
+    ("blender", "p.ply", b"", "p.ply: not a PLY file"),
+    ("blender", "p.ply", b"ply\nformat ascii 1.0\n", "not a PLY file"),
+    ("blender", "p.ply", HEAD.format("binary_big_endian", XYZ).encode(), "expected ascii or binary_little_endian"),
+    ("blender", "p.ply", HEAD.format("binary_little_endian", XYZ).encode() + bytes(23), "23 bytes of vertices, exp"),
+    ("blender", "p.ply", HEAD.format("ascii", XYZ).encode() + b"1 2 3\n", "1 vertex lines, expected 2"),
+    ("blender", "p.ply", HEAD.format("ascii", XYZ).encode() + b"1 2 3\n1 2\n", "vertex lines are not 3 numbers"),
+    ("blender", "p.ply", HEAD.format("ascii", "property float x\n").encode() + b"1\n2\n", "expected x, y, z once each"),
+    ("blender", "p.ply", HEAD.format("ascii", "property list uchar int i\n").encode(), "not a scalar"),
+    ("blender", "p.ply", HEAD.format("ascii", XYZ).replace("2\n", "99999999999\n", 1).encode(), "0 vertex lines"),
+    ("iphone", CAMERA, {"focal_length": NAN}, "0_00000.json: focal_length is nan"),
+    ("iphone", CAMERA, {"focal_length": None}, "0_00000.json: no focal_length"),
+    ("iphone", CAMERA, {"orientation": (2 * np.eye(3)).tolist()}, "orientation is not a rotation: determinant 8"),
+    ("iphone", CAMERA, {"position": [0, 0]}, "position has shape (2,), expected (3,)"),
+    ("iphone", CAMERA, {"image_size": [1, 1]}, "expected at least 2x2"),
+    ("iphone", CAMERA, {"image_size": [14, 8]}, "image is 12x8, expected 14x8"),
+    ("iphone", "metadata.json", b"{}", "no entry for frame '0_00000'"),
+    ("iphone", "metadata.json", {"0_00000": {}}, "warp_id is None"),
+    ("iphone", "splits/train.json", {"frame_names": []}, "0 training frames, expected at least 1"),
+    ("iphone", "splits/train.json", {"frame_names": [3]}, "not a list of frame names"),
+    ("iphone", "scene.json", {"scale": 0}, "scale is 0"),
+    ("iphone", "scene.json", {"near": 5}, "near 5 and far 2"),
+    ("iphone", "scene.json", None, "scene.json: cannot be read"),
+    ("iphone", "extra.json", {"factor": 1.5}, "factor is 1.5"),
+    ("iphone", "extra.json", {"bbox": [[1, 1, 1], [0, 0, 0]]}, "expected a lower and an upper corner"),
+    ("iphone", "extra.json", {"fps": 0}, "fps is 0"),
+    ("iphone", "points.npy", b"junk", "points.npy: not a .npy file"),
+    ("iphone", "points.npy", npy(np.zeros((3, 2))), "found float64 (3, 2), expected floats [M, 3]"),
+    ("iphone", "points.npy", npy(np.array([{}], dtype=object)), "points.npy: not a .npy file"),
+    ("record3d", "metadata", {"poses": []}, "found no poses"),
+    ("record3d", "metadata", lambda m: m | {"poses": [row[:6] for row in m["poses"]]}, "expected (12, 7)"),
+    ("record3d", "metadata", {"poses": [[0, 0, 0, 2, 0, 0, 0]] * COUNT}, "pose 0: quaternion of length 2, expected 1"),
+    ("record3d", "metadata", {"frameTimestamps": [0.0]}, "frameTimestamps are not 12 numbers"),
+    ("record3d", "metadata", {"perFrameIntrinsicCoeffs": [[0, 1, 2, 3]] * COUNT}, "a focal length is not above 0"),
+    ("record3d", "metadata", {"perFrameIntrinsicCoeffs": None, "K": None}, "K"),
+    ("record3d", "metadata", {"w": 8}, "expected 8x"),
+    ("record3d", "rgbd/3.png", None, "image is missing"),
+    ("panoptic", "train_meta.json", lambda m: m | {"k": m["k"][:1]}, "lists of as many instants"),
+    ("panoptic", "train_meta.json", lambda m: m | {"fn": [row[:1] for row in m["fn"]]}, "instant 0: expected k, w2c"),
+    ("panoptic", "train_meta.json", {"fn": [["../x.png"] * CAMERAS] * INSTANTS}, "is not the name of a picture"),
+    ("panoptic", "train_meta.json", {"fn": [["9/a.png"] * CAMERAS] * INSTANTS}, "image is missing"),
+    (
+        "panoptic", "train_meta.json", {"w2c": [[(2 * np.eye(4)).tolist()] * CAMERAS] * INSTANTS},
+        "instant 0: 0/000000.png: w2c is not a rotation",
+    ),
+    ("panoptic", "train_meta.json", {"k": [[np.zeros((3, 3)).tolist()] * CAMERAS] * INSTANTS}, "with fx, fy > 0"),
+    ("panoptic", "train_meta.json", {"w": 7}, "expected 7x"),
+    ("panoptic", "train_meta.json", {"h": 0}, "h is 0"),
+    ("panoptic", "init_pt_cld.npz", bomb(), "unpacks to more than 1,000,000 bytes"),
+    ("panoptic", "init_pt_cld.npz", npy(np.array([{}]), archive=True), "data: not a .npy file"),
+    ("panoptic", "init_pt_cld.npz", npy(np.zeros((4, 2)), archive=True), "expected numbers [M, 6]"),
+    ("panoptic", "init_pt_cld.npz", b"no archive", "not an archive of numpy"),
+    ("neu3d", "poses_bounds.npy", lambda poses: poses[:2], "2 poses in poses_bounds.npy and 3 videos"),
+    ("neu3d", "poses_bounds.npy", lambda poses: poses[:, :16], "rows of 17"),
+    ("neu3d", "poses_bounds.npy", times(COLUMN * NAN), "expected finite numbers"),
+    ("neu3d", "poses_bounds.npy", times(np.where(COLUMN < 3, 1.5, 1)), "is not a rotation"),
+    ("neu3d", "poses_bounds.npy", times(np.where(COLUMN == 4, 2, 1)), "expected the same shape"),
+    ("neu3d", "poses_bounds.npy", times(np.where(COLUMN == 15, 20, 1)), "0 < nearest < farthest"),
+    ("neu3d", "poses_bounds.npy", npy(np.array([{}])), "not a .npy file"),
+    ("neu3d", "cam1.mp4", b"no video", "cam1.mp4: cannot be decoded"),
+    ("neu3d", "cam1.mp4", None, "3 poses in poses_bounds.npy and 2 videos"),
+    ("colmap", MODEL + "cameras.bin", lambda data: data[:4], "cameras.bin: ends at byte 4"),
+    ("colmap", MODEL + "images.bin", lambda data: data[:-1], "images.bin: ends at byte"),
+    ("colmap", MODEL + "points3D.bin", lambda data: data[:100], "points3D.bin: ends at byte 100"),
+    ("colmap", MODEL + "images.bin", lambda data: b"\xff" * 8 + data[8:], "images.bin: ends at byte"),
+    (
+        "colmap", MODEL + "cameras.bin", lambda data: data.replace(struct.pack("<ii", 7, 1), struct.pack("<ii", 7, 9)),
+        "camera model number 9, expected one of",
+    ),
+    ("colmap", MODEL + "images.bin", lambda data: data.replace(b"cam/frame_0002", b"../frame_00002"), "no such pic"),
+    ("colmap", MODEL + "images.bin", bytes(8), "no picture is registered"),
+    ("colmap", "times.txt", b"cam/frame_0000.png 1\n", "has no line for cam/frame_0002.png"),
+    ("colmap", "times.txt", b"cam/frame soon\n", "line 1 is 'cam/frame soon', expected NAME SECONDS"),
+    ("text", MODEL + "cameras.txt", b"7 THIN_PRISM 40 30 1 1 1 1", "model THIN_PRISM, expected one of SIMPLE_PINHOLE"),
+    ("text", MODEL + "cameras.txt", b"7 PINHOLE 40 30 1 1 1", "PINHOLE with 40x30 pixels and 3 parameters"),
+    ("text", MODEL + "cameras.txt", b"7 PINHOLE 40 30 -1 1 1 1", "camera 7: fx"),
+    ("text", MODEL + "cameras.txt", b"7 PINHOLE 40", "is not what COLMAP writes"),
+    ("text", MODEL + "cameras.txt", b"x PINHOLE 40 30 1 1 1 1", "is not what COLMAP writes"),
+    ("text", MODEL + "cameras.txt", b"7 PINHOLE 40 1e9 1 1 1 1", "expected 1..65535 a side"),
+    ("text", MODEL + "cameras.txt", b"8 PINHOLE 40 30 30 30 20 15", "taken by camera 7, which cameras.txt does not h"),
+    ("text", MODEL + "cameras.txt", b"7 PINHOLE 41 30 30 30 20 15", "image is 40x30, expected 41x30"),
+    ("videos", "videos/cam1.mp4", b"no video", "cam1.mp4: cannot be decoded"),
+    ("videos", "videos/cam1.mp4", None, "cam1.png: there is no video of this name among 2"),
+    ("videos", MODEL + "cameras.txt", b"1 PINHOLE 42 30 30 30 20 15", "expected the same size"),
+    ("videos", MODEL + "images.txt", lambda data: data.replace(b"cam1", b"cam0"), "two pictures are of the video cam0"),
+]  # fmt: skip
+
+
+def changed(path: Path, change: Any) -> None:
+    """Applies a change of CASES."""
+    if change is None:
+        path.unlink()
+    elif isinstance(change, bytes):
+        path.write_bytes(change)
+    elif path.suffix == ".npy":
+        np.save(path, change(np.load(path)))
+    elif path.suffix in ("", ".json"):
+        content = json.loads(path.read_text())
+        path.write_text(json.dumps(change(content) if callable(change) else content | change))
+    else:
+        path.write_bytes(change(path.read_bytes()))
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_broken_folders(layout, scene, tmp_path, monkeypatch, refused):
+    if layout in ("neu3d", "videos"):
+        pytest.importorskip("imageio_ffmpeg")
+    monkeypatch.setattr("pd4dgs_codec.data.rigs.MAX_POINTS_BYTES", 1_000_000)
+    folder = LAYOUTS[layout](scene, tmp_path / "set")
+    for name, change, text in [case[1:] for case in CASES if case[0] == layout]:
+        path = folder / name
+        whole = path.read_bytes() if path.exists() else None
+        changed(path, change)
+        refused(folder, text)
+        path.unlink(missing_ok=True)
+        if whole is not None:
+            path.write_bytes(whole)
+
+
+def test_other_faults_of_folders(tmp_path, blender, refused):
+    refused(tmp_path / "gone", "gone: found nothing, expected a dataset folder")
+    refused(tmp_path, "found an empty folder, expected camera/, rgb/ and splits/ (iPhone")
+    (tmp_path / "readme.txt").write_text("x")
+    refused(tmp_path, "found other files")
+    refused(tmp_path / "readme.txt", "found a file")
+    blender(name="transforms_a.json")
+    (tmp_path / "transforms_b.json").write_text("{}")
+    refused(tmp_path, "found transforms_a.json, transforms_b.json; expected")
+
+
+def test_a_time_beyond_binary32_is_refused(tmp_path, refused):
+    folder = write_iphone(None, tmp_path)
+    save(folder / "metadata.json", {"0_00000": {"warp_id": 9}})
+    save(folder / "extra.json", {"factor": 1, "fps": 1e-300})
+    refused(folder, "with which the last frame is at 9e+300 s")
 
 
 @pytest.mark.parametrize(
-    ("broken", "text"),
-    [
-        (dict(camera={"focal_length": NAN}), "0_00000.json: focal_length is nan"),
-        (dict(camera={"focal_length": None}), "0_00000.json: no focal_length"),
-        (dict(camera={"orientation": (2 * np.eye(3)).tolist()}), "orientation is not a rotation: determinant 8"),
-        (dict(camera={"position": [0, 0]}), "position has shape (2,), expected (3,)"),
-        (dict(camera={"image_size": [1, 1]}), "expected at least 2x2"),
-        (dict(camera={"image_size": [14, 8]}), "image is 12x8, expected 14x8"),
-        (dict(metadata={}), "no entry for frame '0_00000'"),
-        (dict(metadata={"0_00000": {}}), "warp_id is None"),
-        (dict(names=()), "0 training frames, expected at least 1"),
-        (dict(names=(3,)), "not a list of frame names"),
-        (dict(scene={"scale": 0}), "scale is 0"),
-        (dict(scene={"near": 5}), "near 5 and far 2"),
-        (dict(extra={"factor": 1.5}), "factor is 1.5"),
-        (dict(extra={"bbox": [[1, 1, 1], [0, 0, 0]]}), "expected a lower and an upper corner"),
-        (dict(extra={"fps": 0}), "fps is 0"),
-        (dict(extra={"fps": 1e-300}, metadata={"0_00000": {"warp_id": 9}}), "with which the last frame is at 9e+300 s"),
-    ],
+    "name, value", [*(("downscale", k) for k in (0, -1, 2.0, True, 9)), ("holdout", 1), ("holdout", -2)]
 )
-def test_broken_camera_folders(tmp_path, broken, text):
-    refused(camera_folder(tmp_path, **broken), text)
+def test_options_that_leave_nothing(blender, refused, name, value):
+    refused(blender(), f"{name} {'is ' if name == 'downscale' and value != 9 else ''}{value}", **{name: value})
 
 
-def test_points_that_are_not_numbers(tmp_path):
-    folder = camera_folder(tmp_path)
-    (folder / "points.npy").write_bytes(b"junk")
-    refused(folder, "points.npy: not a .npy file")
-    np.save(folder / "points.npy", np.zeros((3, 2)))
-    refused(folder, "found float64 (3, 2), expected floats [M, 3]")
-    np.save(folder / "points.npy", np.array([{}], dtype=object), allow_pickle=True)
-    refused(folder, "points.npy")
+SYNTHETIC = {
+    "": "expected synthetic:static|global|local|fast[?seed=n&size=WxH&frames=N]",
+    "Static": "expected synthetic:static",
+    "nothing?seed=1": "expected synthetic:static",
+    **{
+        f"static?{query}": f"{query.split('=')[0]} is {query.split('=')[1]!r}; expected for example"
+        for query in ("seed=-1", "seed=x", "size=160", "size=7x160", "size=9000x9000", "frames=2", "frames=")
+    },
+    **{
+        f"static?{query}": "expected each of seed, size, frames once at most, as key=value"
+        for query in ("", "a", "seed=1&a", "seed=1&seed=1", "seed=1&")
+    },
+}
+
+
+@pytest.mark.parametrize("name", SYNTHETIC)
+def test_broken_synthetic_sources(name, refused):
+    refused(f"synthetic:{name}", SYNTHETIC[name])
+
+
+def test_synthetic_downscale_too_large(refused):
+    refused("synthetic:static", "downscale 200 leaves nothing of 160x120", downscale=200)

@@ -4,7 +4,7 @@ import json
 
 import numpy as np
 import pytest
-from dataset_pictures import pose
+from folders import pose
 from PIL import Image
 
 from pd4dgs_codec.data.dataset import load

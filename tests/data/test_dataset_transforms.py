@@ -5,7 +5,7 @@ import struct
 
 import numpy as np
 import pytest
-from dataset_pictures import gradient, pose
+from folders import gradient, pose
 from PIL import Image
 
 from pd4dgs_codec.data.dataset import load

@@ -1,0 +1,95 @@
+"""The cache of video frames: decoded once, bounded, and made anew when it is lost."""
+
+from __future__ import annotations
+
+import errno
+
+import numpy as np
+import pytest
+from folders import CAMERAS, FPS, rig_views, write_synchronised
+from videos import write_video
+
+from pd4dgs_codec.data import videos as cached
+from pd4dgs_codec.data.dataset import load
+from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.train.state import TrainingViews
+
+pytest.importorskip("imageio_ffmpeg")
+
+
+@pytest.fixture
+def folder(scene, tmp_path):
+    return write_synchronised(scene, tmp_path / "set")
+
+
+def test_frames_are_decoded_once(folder, monkeypatch, cache):
+    first = load(folder)
+    assert sum(file.suffix == ".frames" for file in cache.iterdir()) == CAMERAS
+
+    def never(*_: object) -> None:
+        raise AssertionError("decoded twice")
+
+    monkeypatch.setattr(cached, "_store", never)
+    np.testing.assert_array_equal(first.train[3].image, load(folder).train[3].image)
+    with pytest.raises(AssertionError, match="decoded twice"):
+        load(folder, downscale=2)
+
+
+def test_videos_of_other_lengths_are_refused(scene, folder, refused):
+    write_video(folder / "videos" / "cam1.mp4", [view.image for view in rig_views(scene, 1)[:3]], FPS)
+    refused(folder, "cam1.mp4: has 3 frames at 10 per second and cam0.mp4 4")
+
+
+def test_the_cache_stays_within_its_size(folder, monkeypatch, cache, refused):
+    load(folder)
+    full = sum(file.stat().st_size for file in cache.glob("*.frames"))
+    monkeypatch.setattr(cached, "_IN_USE", set())
+    monkeypatch.setenv(cached.SIZE, str(1.01 * full / 2**30))
+    load(folder, downscale=2)  # others leave for these
+    assert sum(file.stat().st_size for file in cache.glob("*.frames")) <= 1.01 * full
+    monkeypatch.setattr(cached, "_IN_USE", set())
+    monkeypatch.setenv(cached.SIZE, str(0.4 * full / 2**30))
+    refused(folder, "expected a larger PD4DGS_CACHE_GIB or a larger --downscale")
+    assert not list(cache.glob(".pd4dgs-*"))
+    monkeypatch.setenv(cached.SIZE, "much")
+    with pytest.raises(DataError, match="PD4DGS_CACHE_GIB is 'much', expected GiB > 0"):
+        load(folder, downscale=3)
+
+
+def test_a_full_disk_keeps_no_part_of_a_video(folder, monkeypatch, cache):
+    def full(*_: object) -> None:
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(cached.os, "replace", full)
+    with pytest.raises(DataError, match="cannot keep the frames of cam0.mp4: the disk is full"):
+        load(folder)
+    assert not list(cache.iterdir())
+
+
+def test_a_cache_that_is_lost_or_broken_is_reported_and_made_anew(folder, cache):
+    view = load(folder).train[0]
+    expected = view.image
+    for file in cache.glob("*.frames"):
+        file.write_bytes(bytes(file.stat().st_size))
+    with pytest.raises(DataError, match="missing or broken"):
+        _ = view.image
+    np.testing.assert_array_equal(load(folder).train[0].image, expected)
+    for file in cache.glob("*.frames"):
+        file.unlink()
+    with pytest.raises(DataError, match="missing or broken"):
+        _ = view.image
+    np.testing.assert_array_equal(load(folder).train[0].image, expected)
+
+
+def test_shots_are_kept_within_their_bytes(scene, monkeypatch):
+    import torch
+
+    views = scene.train[:6]
+    whole = TrainingViews(views, torch.device("cpu"))
+    size = whole[0].target.image.nbytes + whole[0].target.weights.nbytes
+    monkeypatch.setattr("pd4dgs_codec.train.state.KEPT_BYTES", 2 * size)
+    few = TrainingViews(views, torch.device("cpu"))
+    for index in (0, 1, 0, 5, 0, 2):
+        assert torch.equal(few[index].target.image, whole[index].target.image)
+    assert set(few._kept) == {0, 2} and few._bytes == 2 * size
+    assert few[0] is few[0] and len(few) == 6
