@@ -63,18 +63,17 @@ pygments_style = "friendly"
 CONTENTS = {
     "Use": [
         "docs/README",
+        "docs/tutorial",
         "docs/training",
-        "docs/target-size",
-        "docs/delivery",
-        "docs/player",
+        "docs/encoding",
+        "docs/player-and-delivery",
         "docs/interchange",
         "docs/batch",
         "docs/evaluation",
         "docs/api/index",
     ],
     "Format": ["spec/format", "spec/vectors/README", "docs/robustness"],
-    "Measured": ["docs/results", "docs/stability"],
-    "Project": ["docs/design", "docs/dependencies", "CONTRIBUTING", "SECURITY", "CHANGELOG"],
+    "Project": ["docs/results", "docs/design", "CONTRIBUTING", "SECURITY", "CHANGELOG"],
 }
 
 #: Rooms that are used as commands, not as a library.
