@@ -4,11 +4,11 @@ import { Pd4Player } from "./element.js";
 import { bench } from "./render/bench.js";
 
 const query = new URLSearchParams(location.search);
-/** @typedef {{early: import("./render/remote.js").Early}} Begun */
+/** @typedef {{early: import("./render/loader.js").Early}} Begun */
 /** A packed page may hold its scene; for all others early.js knows the address. */
 const held = document.getElementById("scene")?.textContent;
 const bytes = held ? Uint8Array.from(atob(held), (c) => c.charCodeAt(0)) : null;
-const source = bytes ? new Blob([bytes]) : /** @type {Begun} */ (globalThis).early.url;
+const source = bytes ? new Blob([bytes]) : /** @type {Begun} */ (/** @type {unknown} */ (globalThis)).early.url;
 
 if (query.has("bench")) {
   bench(source, document.body, query.get("sizes") ?? undefined);

@@ -6,7 +6,7 @@
 import { centreOf, defaultCamera, fitted, unit } from "./render/camera.js";
 import { startWorker } from "./render/cpu.js";
 import { levelOf, sameState, stateOf, timeAfter } from "./render/level.js";
-import { startLoader } from "./render/remote.js";
+import { startLoader } from "./render/loader.js";
 
 /** @typedef {import("./decode/scene.js").Scene} Scene */
 /** @typedef {import("./decode/scene.js").Camera} Camera */

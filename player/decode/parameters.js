@@ -3,6 +3,7 @@
 import { limitExceeded, malformed } from "./errors.js";
 import { Fields, asInteger, asList, asRegistered, checkStep } from "./fields.js";
 import { channelCount } from "./header.js";
+import { LOCAL_HEADS, globalHeads } from "./heads.js";
 import {
   MAX_CHANNELS,
   MAX_FIELDS,
@@ -42,25 +43,18 @@ export function layerKind(layer, { widths, centres }) {
       ["covariance", 7 * G],
       ["color", 3 * G],
     ],
-    [
-      ["trunk", null],
-      ["position", 3],
-      ["feature", D],
-      ["offset", 3 * G],
-      ["scaling", 6],
-    ],
-    [
-      ["trunk", null],
-      ["mean", 3],
-      ["scale", 3],
-      ["quat", 4],
-      ["opacity", 1],
-      ["color", 3],
-    ],
+    deformationNetworks(globalHeads(widths)),
+    deformationNetworks(LOCAL_HEADS),
   ];
   const classes = layer ? [2 + 2 * layer, 3 + 2 * layer] : [3];
   return { layer, networks: networks[layer], inputs: D + 3, classes, widths, stepClasses: centres !== null };
 }
+
+/** @param {import("./heads.js").Head[]} heads @returns {[string, number | null][]} */
+const deformationNetworks = (heads) => [["trunk", null], ...heads.map(named)];
+
+/** @param {import("./heads.js").Head} head @returns {[string, number]} */
+const named = ({ name, outputs }) => [name, outputs];
 
 /** Section numbers of mode ans (6.4). */
 export const POSITIONS = 0;

@@ -2,7 +2,7 @@
 // networks that shaders cannot hold.
 
 import { SPLAT_BLOCKS } from "./evaluator.js";
-import { Remote } from "./remote.js";
+import { Remote } from "../decode/remote.js";
 
 /** @typedef {import("./gl.js").Gpu} Gpu */
 

@@ -1,7 +1,7 @@
-// The worker of the evaluator in JavaScript.
+// The worker of the evaluator without a GPU.
 
 import { evaluate } from "./evaluate.js";
-import { serve } from "./serve.js";
+import { serve } from "../decode/remote.js";
 
 /** @type {import("../decode/scene.js").Scene} */
 let scene;
@@ -13,27 +13,21 @@ serve({
   },
   /** @param {number} level @param {number} t @param {number[]} eye */
   evaluate(level, t, eye) {
-    const result = packed(evaluate(scene, level, t, eye));
+    const result = texels(evaluate(scene, level, t, eye));
     return { result, transfer: [result.data.buffer] };
   },
 });
 
-/** @param {import("./evaluate.js").Gaussians} gaussians @returns {import("./cpu.js").Packed} */
-function packed({ count, mean, opacity, scale, quaternion, color }) {
+/** Records as texels, block after block; a texel without a Gaussian has opacity −1.
+ * @param {import("./evaluate.js").Gaussians} gaussians @returns {import("./cpu.js").Packed} */
+function texels({ count, records }) {
   const width = 2 ** Math.max(4, Math.ceil(Math.log2(Math.sqrt(count + 1))));
   const height = Math.max(1, Math.ceil(count / width));
-  const texels = width * height;
-  const data = new Float32Array(16 * texels);
-  for (let i = 0; i < texels; i++) {
-    const at = 4 * i;
-    data[at + 3] = i < count ? opacity[i] : -1;
-    if (i >= count) continue;
-    for (let k = 0; k < 3; k++) {
-      data[at + k] = mean[3 * i + k];
-      data[4 * texels + at + k] = scale[3 * i + k];
-      data[12 * texels + at + k] = color[3 * i + k];
-    }
-    for (let k = 0; k < 4; k++) data[8 * texels + at + k] = quaternion[4 * i + k];
+  const block = 4 * width * height;
+  const data = new Float32Array(4 * block);
+  for (let i = 0; i < count; i++) {
+    for (let k = 0; k < 16; k++) data[(k >> 2) * block + 4 * i + (k & 3)] = records[16 * i + k];
   }
+  for (let i = count; i < width * height; i++) data[4 * i + 3] = -1;
   return { data, width, height };
 }

@@ -1,13 +1,14 @@
 // Clauses 13.2 to 13.4 on the GPU, as fragment passes into float textures.
 //
-// Per anchor, when time moves: global deformation; first layers of the scaffold's networks, as far as features go.
-// Per anchor, when the camera's centre moves: opacities. They say which Gaussians are kept, some fifth of all, and only
-// those are evaluated further. Per Gaussian, when time moves: mean and local deformation. Per Gaussian, when the
-// camera's centre moves: shape and colour.
+// Per anchor, when time changes: global deformation; the features' share of the scaffold's first layers. Per anchor, when
+// the camera's centre changes: opacities. They tell which Gaussians are visible, about a fifth of all, and only these are
+// evaluated further. Per Gaussian, when time changes: mean and local deformation. Per Gaussian, when the camera's centre
+// changes: shape and colour.
 
-import { FieldPass, runLinear } from "./field.js";
+import { GAUSSIAN_COLUMNS, LOCAL_HEADS, anchorColumns, globalHeads } from "../decode/heads.js";
+import { FieldPass } from "./field.js";
 import { blocksOf, Linear, pack, repeat, targets, TooLarge } from "./layers.js";
-import { deformationUnit, levelOf, widthsOf } from "./level.js";
+import { eachAttribute, levelOf, widthsOf } from "./level.js";
 
 /** @typedef {import("./gl.js").Gpu} Gpu */
 /** @typedef {import("./gl.js").Field} Field */
@@ -15,25 +16,25 @@ import { deformationUnit, levelOf, widthsOf } from "./level.js";
 /** @typedef {import("../decode/scene.js").Network} Network */
 
 /**
- * Kept Gaussians, as the renderer takes them: texels of four blocks, (mean, opacity), (scale, 0), quaternion w x y z,
- * (colour, 0). Opacity and scale are gated. A texel that holds none has opacity −1.
+ * Visible Gaussians for the renderer: the records of heads.js, in texels of four blocks. A texel without a Gaussian has
+ * opacity −1.
  *
  * @typedef {{field: Field, texels: number}} Splats
  */
 
 /**
- * What an evaluation gives. means: [texels, 4], mean and opacity; null if means and list are those of the call before.
+ * The result of an evaluation. means: [texels, 4], mean and opacity; null if means and list are unchanged.
  *
  * @typedef {{splats: Splats, means: Float32Array | null}} Evaluated
  */
 
-/** Blocks of an anchor's attributes before its features: position, then log-scalings of the offsets, of the base. */
+/** Block of an anchor's record where its features begin. */
 const FEATURE_BLOCK = 3;
-/** Blocks of a Gaussian. */
-export const SPLAT_BLOCKS = 4;
-/** What the textures of all anchors may take, bytes: beyond it devices fail in ways that cannot be told apart. */
+/** Blocks of a Gaussian's record. */
+export const SPLAT_BLOCKS = GAUSSIAN_COLUMNS / 4;
+/** Limit of the textures of all anchors, bytes: beyond it devices fail in ways that cannot be distinguished. */
 const MAX_BYTES = 2 ** 30;
-/** A list's texel that names no Gaussian. */
+/** A list's texel without a Gaussian. */
 export const NO_ENTRY = 0xffffffff;
 /** Bits of an anchor's number in an entry of a list; the slot lies above. */
 export const ANCHOR_BITS = 24;
@@ -41,49 +42,37 @@ export const ANCHOR_BITS = 24;
 /** A texture's width for `n` texels. @param {number} n */
 const widthFor = (n) => 2 ** Math.max(4, Math.ceil(Math.log2(Math.sqrt(n))));
 
-/** The scaffold's network `name` cut into what depends on features, on the direction, and the rest. */
+/** A network of the scaffold: one hidden layer, cut into the shares of features and of direction, and the last layer. */
 class Scaffold {
-  /** @param {Gpu} gpu @param {Network} network @param {number} features */
-  constructor(gpu, network, features) {
-    this._gpu = gpu;
-    const single = network.length === 1;
-    const first = single ? identity(features + 3) : network[0];
-    /** Whether ReLU follows the first layer. */
-    this.relu = !single;
+  /** @param {Gpu} gpu @param {Network} network @param {number} features @param {number} firstBlock of its hidden layer */
+  constructor(gpu, network, features, firstBlock) {
+    if (network.length !== 2) throw new TooLarge(`a network of ${network.length} layers, expected 2`);
+    const [first, last] = network;
     this.features = columns(first, 0, features);
-    const blocks = blocksOf(first.outputs);
-    this.blocks = blocks;
+    this.firstBlock = firstBlock;
+    this.blocks = blocksOf(first.outputs);
     const direction = columns(first, features, 3);
-    this.direction = new Float32Array(12 * blocks);
+    const data = new Float32Array(12 * this.blocks);
     for (let o = 0; o < first.outputs; o++) {
-      for (let k = 0; k < 3; k++) {
-        this.direction[((o >> 2) * 3 + k) * 4 + (o & 3)] = direction.weight[3 * o + k];
-      }
+      for (let k = 0; k < 3; k++) data[((o >> 2) * 3 + k) * 4 + (o & 3)] = direction.weight[3 * o + k];
     }
-    this.middle = network.slice(1, -1).map((layer) => new Linear(gpu, layer));
-    this.last = network[network.length - 1];
-    /** Of the networks' first layers, where this one's outputs begin. */
-    this.firstBlock = 0;
-    /** @type {Field | null} what the last layer takes, where there are layers in between */
-    this.hidden = null;
+    this.direction = gpu.uniforms(data);
+    this.last = last;
   }
 
-  /** Blocks that the last layer takes. */
-  get hiddenBlocks() {
-    return blocksOf(this.last.inputs);
+  /** Source that declares the weights of the direction. @param {number} index of the uniform block */
+  declare(index) {
+    return `layout(std140) uniform U${index} { vec4 v${index}[${3 * this.blocks}]; };\n`;
   }
 
-  free() {
-    this._gpu.free(this.hidden);
-    for (const linear of this.middle) linear.free();
+  /** Source of the hidden activations at anchor p, seen in direction d. @param {number} index @param {string} to */
+  compute(index, to) {
+    return repeat(
+      this.blocks,
+      (k) => `vec4 ${to}${k} = max(texelFetch(before, ivec3(p, ${this.firstBlock + k}), 0)
+  + v${index}[${3 * k}] * d.x + v${index}[${3 * k + 1}] * d.y + v${index}[${3 * k + 2}] * d.z, 0.);`,
+    );
   }
-}
-
-/** @param {number} n @returns {Network[number]} */
-function identity(n) {
-  const weight = new Float32Array(n * n);
-  for (let i = 0; i < n; i++) weight[i * n + i] = 1;
-  return { weight, bias: new Float32Array(n), inputs: n, outputs: n };
 }
 
 /** The layer for some of its inputs. @param {Network[number]} layer @param {number} start @param {number} count */
@@ -119,28 +108,28 @@ export class GpuEvaluator {
   constructor(gpu, scene) {
     this._gpu = gpu;
     this._scene = scene;
-    const { anchors, feature, slots } = widthsOf(scene);
-    this._features = feature;
+    const widths = widthsOf(scene);
+    const { anchors, feature, slots } = widths;
     this._slots = slots;
-    this._featureBlocks = blocksOf(feature);
-    this._offsetBlock = FEATURE_BLOCK + this._featureBlocks;
-    this._blocks = this._offsetBlock + slots;
+    this._blocks = anchorColumns(widths) / 4;
+    this._offsetBlock = this._blocks - slots;
     this._width = widthFor(anchors);
     this._height = Math.ceil(anchors / this._width);
     if (this._width > gpu.maxSide) throw new TooLarge(`${anchors} anchors`);
     if (this._blocks > gpu.maxLayers) throw new TooLarge(`${slots} Gaussians of an anchor`);
 
-    const networks = [scene.networks.opacity, scene.networks.covariance, scene.networks.color];
-    const scaffolds = networks.map((network) => new Scaffold(gpu, network, feature));
-    this._opacity = scaffolds[0];
-    this._covariance = scaffolds[1];
-    this._color = scaffolds[2];
-    this._scaffolds = scaffolds;
-    scaffolds.reduce((at, scaffold) => {
-      scaffold.firstBlock = at;
-      return at + scaffold.blocks;
-    }, 0);
-    this._first = new Linear(gpu, stack(scaffolds.map((scaffold) => scaffold.features)));
+    let firstBlock = 0;
+    const { opacity, covariance, color } = scene.networks;
+    const [forOpacity, forShape, forColor] = [opacity, covariance, color].map((network) => {
+      const scaffold = new Scaffold(gpu, network, feature, firstBlock);
+      firstBlock += scaffold.blocks;
+      return scaffold;
+    });
+    this._opacity = forOpacity;
+    this._covariance = forShape;
+    this._color = forColor;
+    this._scaffolds = [forOpacity, forShape, forColor];
+    this._first = new Linear(gpu, stack(this._scaffolds.map((scaffold) => scaffold.features)));
     if (this._first.paddedBlocks > gpu.maxLayers) throw new TooLarge("the networks' first layers");
     const blocks = this._blocks * (scene.globalDeformation ? 2 : 1) + this._first.paddedBlocks + blocksOf(slots);
     if (16 * this._width * this._height * blocks > MAX_BYTES) throw new TooLarge(`${anchors} anchors`);
@@ -148,31 +137,12 @@ export class GpuEvaluator {
     this._before = gpu.field(this._width, this._height, this._first.paddedBlocks);
     this._opacityLast = new Linear(gpu, this._opacity.last);
     this._opacities = gpu.field(this._width, this._height, this._opacityLast.paddedBlocks);
-    this._directions = scaffolds.map((scaffold) => gpu.uniforms(scaffold.direction));
     this._shapes = this._uploadShapes();
 
-    const unit = deformationUnit(scene);
     const { global, local } = levelOf(scene, 2);
-    this._global =
-      global &&
-      new FieldPass(
-        gpu,
-        global,
-        scene.info.box,
-        unit,
-        {
-          position: 0,
-          scaling: 4,
-          scalingRun: 3,
-          feature: 4 * FEATURE_BLOCK,
-          offset: 4 * this._offsetBlock,
-          offsetRun: 3,
-        },
-        this._blocks,
-      );
+    this._global = global && new FieldPass(gpu, global, scene, globalHeads(widths), 4 * this._blocks);
     this._residual = this._global && gpu.field(this._width, this._height, this._global.outputBlocks);
-    const places = { mean: 0, opacity: 3, scale: 4, quat: 8, color: 12 };
-    this._local = local && new FieldPass(gpu, local, scene.info.box, unit, places, SPLAT_BLOCKS);
+    this._local = local && new FieldPass(gpu, local, scene, LOCAL_HEADS, GAUSSIAN_COLUMNS);
 
     /** @type {WebGLTexture | null} */
     this._codes = null;
@@ -194,24 +164,16 @@ export class GpuEvaluator {
     this._current = false;
   }
 
-  /** Anchors' attributes, [blocks, height, width, 4]. */
+  /** The anchors' records, [blocks, height, width, 4]. */
   _attributes() {
-    const { anchor, feature, scalingLog, offset } = this._scene;
-    const { _features: F, _slots: S } = this;
     const plane = this._width * this._height * 4;
     const out = new Float32Array(plane * this._blocks);
-    const n = anchor.length / 3;
-    /** @param {Float32Array} from @param {number} width @param {number} run @param {number} block */
-    const put = (from, width, run, block) => {
-      for (let k = 0; k < width; k++) {
-        const to = (block + Math.floor(k / run) * blocksOf(run) + ((k % run) >> 2)) * plane + ((k % run) & 3);
-        for (let a = 0; a < n; a++) out[to + 4 * a] = from[width * a + k];
-      }
-    };
-    put(anchor, 3, 3, 0);
-    put(scalingLog, 6, 3, 1);
-    put(feature, F, F, FEATURE_BLOCK);
-    put(offset, 3 * S, 3, this._offsetBlock);
+    eachAttribute(this._scene, (values, width, columns) => {
+      columns.forEach((column, k) => {
+        const to = (column >> 2) * plane + (column & 3);
+        for (let a = 0; width * a < values.length; a++) out[to + 4 * a] = values[width * a + k];
+      });
+    });
     return out;
   }
 
@@ -322,112 +284,39 @@ ${repeat(linear.chunkBlocks, (i) => `out${i} = y${i};`)}}`,
   /** @param {Field | null} residual @param {number[]} eye @param {number} lines */
   _runOpacities(residual, eye, lines) {
     const gpu = this._gpu;
-    for (const scaffold of this._scaffolds) {
-      if (scaffold.middle.length) this._runMiddle(scaffold, residual, eye, lines);
-    }
     const linear = this._opacityLast;
-    const front = this._front(this._opacity, 1);
     const program = gpu.program(
       linear.declare(0) +
-        front.declare +
+        this._opacity.declare(1) +
         targets(linear.chunkBlocks) +
         anchorSource(residual) +
-        `uniform sampler2D codes;
+        `uniform sampler2DArray before;
+uniform sampler2D codes;
 uniform vec3 eye;
 void main() {
 ivec2 p = ivec2(gl_FragCoord.xy);
 vec3 d = anchorBlock(p, 0).xyz - eye;
 d /= max(length(d), 1e-30);
-${front.compute("x")}
+${this._opacity.compute(1, "x")}
 ${linear.apply(0, "x", "y", false)}
 float gate = texelFetch(codes, p, 0).r;
 ${repeat(linear.chunkBlocks, (i) => `y${i} = tanh(clamp(y${i}, -15., 15.));`)}
 ${repeat(linear.chunkBlocks, (i) => `out${i} = y${i} * vec4(greaterThanEqual(y${i} * gate, vec4(1. / 255.)));`)}}`,
     );
-    gpu.use(program, {
-      ...this._anchorTextures(residual),
-      ...front.textures,
-      codes: /** @type {WebGLTexture} */ (this._codes),
-    });
+    const codes = /** @type {WebGLTexture} */ (this._codes);
+    gpu.use(program, { ...this._anchorTextures(residual), before: this._before, codes });
     gpu.gl.uniform3fv(program.uniform("eye"), eye);
-    front.bind();
+    this._bindDirection(1, this._opacity);
     for (let c = 0; c < linear.chunks; c++) {
       linear.bind(0, c);
       gpu.cover(this._opacities, c * linear.chunkBlocks, linear.chunkBlocks, 0, lines);
     }
   }
 
-  /** Layers between first and last. @param {Scaffold} scaffold @param {Field | null} residual
-   * @param {number[]} eye @param {number} lines */
-  _runMiddle(scaffold, residual, eye, lines) {
-    const gpu = this._gpu;
-    const most = Math.max(...scaffold.middle.map((linear) => linear.paddedBlocks));
-    if (most > gpu.maxLayers) throw new TooLarge("a network's layers");
-    const front = this._front(scaffold, 1, true);
-    let from = gpu.field(this._width, this._height, scaffold.blocks);
-    const count = Math.min(gpu.maxTargets, scaffold.blocks);
-    // the first layer, block by block: it is a copy with the direction's share added
-    for (let b = 0; b < scaffold.blocks; b += count) {
-      const some = Math.min(count, scaffold.blocks - b);
-      const program = gpu.program(
-        front.declare +
-          targets(some) +
-          anchorSource(residual) +
-          `uniform vec3 eye;
-void main() {
-ivec2 p = ivec2(gl_FragCoord.xy);
-vec3 d = anchorBlock(p, 0).xyz - eye;
-d /= max(length(d), 1e-30);
-${front.compute("x")}
-${repeat(some, (i) => `out${i} = x${b + i};`)}}`,
-      );
-      gpu.use(program, { ...this._anchorTextures(residual), ...front.textures });
-      gpu.gl.uniform3fv(program.uniform("eye"), eye);
-      front.bind();
-      gpu.cover(from, b, some, 0, lines);
-    }
-    for (const linear of scaffold.middle) {
-      const to = gpu.field(this._width, this._height, linear.paddedBlocks);
-      runLinear(gpu, linear, from, to, 0, lines, 0, true);
-      gpu.free(from);
-      from = to;
-    }
-    gpu.free(scaffold.hidden);
-    scaffold.hidden = from;
-  }
-
-  /**
-   * How a shader gets at what the last layer of a network takes, at anchor p seen in direction d.
-   *
-   * @param {Scaffold} scaffold @param {number} index of the uniform block with the direction's weights
-   * @param {boolean} [first] what the layer behind the first one takes, where that is not the last
-   * @returns {{declare: string, compute: (to: string) => string, textures: Record<string, Field>, bind: () => void}}
-   */
-  _front(scaffold, index, first = false) {
+  /** @param {number} index of the uniform block @param {Scaffold} scaffold */
+  _bindDirection(index, { direction }) {
     const { gl } = this._gpu;
-    if (scaffold.hidden && !first) {
-      const name = `hidden${index}`;
-      return {
-        declare: `uniform sampler2DArray ${name};\n`,
-        compute: (to) =>
-          repeat(scaffold.hiddenBlocks, (k) => `vec4 ${to}${k} = texelFetch(${name}, ivec3(p, ${k}), 0);`),
-        textures: { [name]: scaffold.hidden },
-        bind: () => {},
-      };
-    }
-    const which = this._scaffolds.indexOf(scaffold);
-    return {
-      declare: `${index === 1 ? "uniform sampler2DArray before;\n" : ""}
-layout(std140) uniform U${index} { vec4 v${index}[${3 * scaffold.blocks}]; };\n`,
-      compute: (to) =>
-        repeat(scaffold.blocks, (k) => {
-          const sum = `texelFetch(before, ivec3(p, ${scaffold.firstBlock + k}), 0)
-  + v${index}[${3 * k}] * d.x + v${index}[${3 * k + 1}] * d.y + v${index}[${3 * k + 2}] * d.z`;
-          return `vec4 ${to}${k} = ${scaffold.relu ? `max(${sum}, 0.)` : sum};`;
-        }),
-      textures: { before: this._before },
-      bind: () => gl.bindBufferBase(gl.UNIFORM_BUFFER, index, this._directions[which]),
-    };
+    gl.bindBufferBase(gl.UNIFORM_BUFFER, index, direction);
   }
 
   /** @param {List} list */
@@ -484,20 +373,18 @@ layout(std140) uniform U${index} { vec4 v${index}[${3 * scaffold.blocks}]; };\n`
     }
     const splats = { field, texels: rows * width };
     if (!rows || !this._means || !this._list || !this._codes) return splats;
-    const covariance = this._front(this._covariance, 1);
-    const color = this._front(this._color, 2);
     const shapes = this._shapes;
-    const K = this._covariance.hiddenBlocks;
-    const L = this._color.hiddenBlocks;
+    const K = this._covariance.blocks;
+    const L = this._color.blocks;
     const program = gpu.program(
       targets(SPLAT_BLOCKS) +
         anchorSource(residual) +
         entrySource(this._width) +
-        covariance.declare +
-        (color.textures.before && !covariance.textures.before ? "uniform sampler2DArray before;\n" : "") +
-        color.declare +
+        this._covariance.declare(1) +
+        this._color.declare(2) +
         `layout(std140) uniform U3 { vec4 b3[2]; mat4 w3[${2 * K}]; };
 layout(std140) uniform U4 { vec4 b4; mat4 w4[${L}]; };
+uniform sampler2DArray before;
 uniform sampler2DArray means, opacities${changes ? ", changes" : ""};
 uniform sampler2D codes;
 uniform vec3 eye;
@@ -519,36 +406,27 @@ void main() {
   if (!(opacity > 0.)) return;
   vec3 d = anchorBlock(p, 0).xyz - eye;
   d /= max(length(d), 1e-30);
-${covariance.compute("x")}
+${this._covariance.compute(1, "x")}
   vec4 v = b3[0], q = b3[1], w = b4;
 ${repeat(K, (k) => `v += w3[${k}] * x${k}; q += w3[${K + k}] * x${k};`)}
-${color.compute("c")}
+${this._color.compute(2, "c")}
 ${repeat(L, (k) => `w += w4[${k}] * c${k};`)}
-  vec3 scale = exp(anchorBlock(p, 2).xyz) / (1. + exp(-v.xyz));
-  vec3 color = 1. / (1. + exp(-w.xyz));
-  q = unit(q);
-${
-  changes
-    ? `  vec4 first = texelFetch(changes, ivec3(g, 0), 0), second = texelFetch(changes, ivec3(g, 1), 0);
-  mean += first.xyz;
-  opacity = clamp(opacity + first.w, 0., 1.);
-  scale = max(scale + second.xyz, 0.);
-  q = unit(q + texelFetch(changes, ivec3(g, 2), 0));
-  color = clamp(color + texelFetch(changes, ivec3(g, 3), 0).xyz, 0., 1.);`
-    : ""
-}
+  vec4 g0 = vec4(mean, opacity);
+  vec4 g1 = vec4(exp(anchorBlock(p, 2).xyz) / (1. + exp(-v.xyz)), 0);
+  vec4 g2 = unit(q);
+  vec4 g3 = vec4(1. / (1. + exp(-w.xyz)), 0);
+${changes ? localSource() : ""}
   float gate = texelFetch(codes, p, 0).r;
-  out0 = vec4(mean, opacity * gate);
-  out1 = vec4(scale * gate, 0);
-  out2 = q;
-  out3 = vec4(color, 0);
+  out0 = vec4(g0.xyz, g0.w * gate);
+  out1 = vec4(g1.xyz * gate, 0);
+  out2 = g2;
+  out3 = g3;
 }`,
     );
     /** @type {Record<string, Field | WebGLTexture>} */
     const textures = {
       ...this._anchorTextures(residual),
-      ...covariance.textures,
-      ...color.textures,
+      before: this._before,
       list: this._list,
       means: this._means,
       opacities: this._opacities,
@@ -557,8 +435,8 @@ ${
     if (changes) textures.changes = changes;
     gpu.use(program, textures);
     gl.uniform3fv(program.uniform("eye"), eye);
-    covariance.bind();
-    color.bind();
+    this._bindDirection(1, this._covariance);
+    this._bindDirection(2, this._color);
     for (let i = 0; i < this._slots; i++) {
       if (starts[i + 1] === starts[i]) continue;
       gl.bindBufferRange(gl.UNIFORM_BUFFER, 3, shapes.buffer, shapes.stride * i, shapes.shapeBytes);
@@ -572,13 +450,12 @@ ${
     const { gl } = this._gpu;
     this._gpu.free(this._anchors, this._before, this._opacities, this._residual, this._codes);
     this._gpu.free(this._list, this._means, this._changes);
-    for (const buffer of this._directions) gl.deleteBuffer(buffer);
+    for (const { direction } of this._scaffolds) gl.deleteBuffer(direction);
     gl.deleteBuffer(this._shapes.buffer);
     this._global?.free();
     this._local?.free();
     this._first.free();
     this._opacityLast.free();
-    for (const scaffold of this._scaffolds) scaffold.free();
   }
 }
 
@@ -590,6 +467,18 @@ function rowsOf({ weight, bias, inputs }, first, count) {
     inputs,
     outputs: count,
   };
+}
+
+/** Source that adds the changes of the local deformation to a Gaussian's record, and brings each sum into its range. */
+function localSource() {
+  const blocks = repeat(SPLAT_BLOCKS, (b) => `g${b} += texelFetch(changes, ivec3(g, ${b}), 0);`);
+  const ranges = LOCAL_HEADS.map(({ at, outputs, then }) => {
+    const part = `g${at >> 2}.${"xyzw".slice(at & 3, (at & 3) + outputs)}`;
+    if (then === "unit") return `${part} = unit(${part});`;
+    if (then === "positive") return `${part} = max(${part}, 0.);`;
+    return then === "clip" ? `${part} = clamp(${part}, 0., 1.);` : "";
+  });
+  return blocks + ranges.join("\n");
 }
 
 /** Source that reads anchors' attributes, deformed if there is a residual. @param {Field | null} residual */

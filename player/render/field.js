@@ -1,30 +1,31 @@
 // A deformation on the GPU: HexPlane, trunk and heads at points that lie in a texture.
 
+import { columnsOf } from "../decode/heads.js";
 import { blocksOf, Linear, repeat, targets, TooLarge } from "./layers.js";
-import { LENGTH_HEADS, sliceAt, SPATIAL, TEMPORAL } from "./planes.js";
+import { deformationUnit, sliceAt, SPATIAL, TEMPORAL } from "./level.js";
 
 /** @typedef {import("./gl.js").Gpu} Gpu */
 /** @typedef {import("./gl.js").Field} Field */
 /** @typedef {import("../decode/scene.js").Deformation} Deformation */
 /** @typedef {import("../decode/scene.js").Network} Network */
+/** @typedef {import("../decode/heads.js").Head} Head */
 
 export class FieldPass {
   /**
-   * @param {Gpu} gpu @param {Deformation} deformation @param {import("../decode/scene.js").Info["box"]} box
-   * @param {number} unit of length heads, scene units
-   * @param {Record<string, number>} places how the outputs are laid out, see `joinHeads` @param {number} blocks of them
+   * @param {Gpu} gpu @param {Deformation} deformation @param {import("../decode/scene.js").Scene} scene
+   * @param {Head[]} heads @param {number} columns of the record to which they add
    */
-  constructor(gpu, deformation, box, unit, places, blocks) {
+  constructor(gpu, deformation, scene, heads, columns) {
     this._gpu = gpu;
     this._deformation = deformation;
-    this._box = box;
+    this._box = scene.info.box;
     const { channels } = deformation.planes[0].xy;
     this._scales = deformation.planes.length;
     this._channelBlocks = blocksOf(channels);
-    const { trunk, ...heads } = deformation.networks;
+    const { trunk } = deformation.networks;
     // a scale's channels are padded to whole blocks; so are the columns that take them
     const first = padInputs(trunk[0], channels, this._scales);
-    const layers = [first, ...trunk.slice(1), joinHeads(heads, unit, places, 4 * blocks)];
+    const layers = [first, ...trunk.slice(1), joinHeads(deformation.networks, heads, deformationUnit(scene), columns)];
     this._linears = layers.map((layer) => new Linear(gpu, layer));
     this._scratchBlocks = Math.max(
       this._scales * this._channelBlocks,
@@ -232,26 +233,25 @@ function padInputs(layer, channels, scales) {
 }
 
 /**
- * All heads as one layer. `places` says where each output goes: head name to the first of its outputs, which follow
- * each other in runs of `${name}Run` (default: all) that start on whole blocks.
+ * All heads as one layer, whose outputs are the columns of a record.
  *
- * @param {Record<string, Network>} heads @param {number} unit @param {Record<string, number>} places
+ * @param {Record<string, Network>} networks @param {Head[]} heads @param {number} unit of lengths, scene units
  * @param {number} outputs
  * @returns {Network[number]}
  */
-function joinHeads(heads, unit, places, outputs) {
-  const inputs = Object.values(heads)[0][0].inputs;
+function joinHeads(networks, heads, unit, outputs) {
+  const present = heads.filter(({ name }) => networks[name]);
+  const { inputs } = networks[present[0].name][0];
   const weight = new Float32Array(inputs * outputs);
   const bias = new Float32Array(outputs);
-  for (const [name, network] of Object.entries(heads)) {
-    if (network.length > 1) throw new TooLarge("a head of several layers");
-    const factor = LENGTH_HEADS.includes(name) ? unit : 1;
-    const run = places[`${name}Run`] ?? network[0].outputs;
-    for (let o = 0; o < network[0].outputs; o++) {
-      const to = places[name] + Math.floor(o / run) * 4 * blocksOf(run) + (o % run);
-      bias[to] = factor * network[0].bias[o];
-      for (let i = 0; i < inputs; i++) weight[to * inputs + i] = factor * network[0].weight[o * inputs + i];
-    }
+  for (const head of present) {
+    const [layer, second] = networks[head.name];
+    if (second) throw new TooLarge("a head of several layers");
+    const factor = head.length ? unit : 1;
+    columnsOf(head).forEach((to, o) => {
+      bias[to] = factor * layer.bias[o];
+      for (let i = 0; i < inputs; i++) weight[to * inputs + i] = factor * layer.weight[o * inputs + i];
+    });
   }
   return { weight, bias, inputs, outputs };
 }

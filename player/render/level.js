@@ -1,4 +1,6 @@
-// What of a scene a level shows (clause 13.4).
+// The parts of a scene that a level shows (clause 13.4), in the forms that both evaluators take.
+
+import { columnsOf, globalHeads } from "../decode/heads.js";
 
 /** @typedef {import("../decode/scene.js").Scene} Scene */
 /** @typedef {import("../decode/scene.js").Deformation} Deformation */
@@ -14,9 +16,7 @@
  * @property {Deformation | null} local
  */
 
-/**
- * Opacities below this never reach a pixel: a picture has 255 steps.
- */
+/** Lower opacities never reach a pixel: a picture has 255 steps. */
 export const MIN_OPACITY = 1 / 255;
 
 /** @param {Scene} scene @param {number} level 0, 1 or 2 @returns {Level} */
@@ -52,7 +52,55 @@ export function deformationUnit({ info: { box } }) {
 }
 
 /**
- * What Gaussians depend on. t: normalised time. eye: the camera's centre, scene units.
+ * Calls `put` for each attribute of the anchors.
+ *
+ * @param {Scene} scene @param {(values: Float32Array, width: number, columns: number[]) => void} put values: [anchors,
+ * width]. columns: those of an anchor's record that take them
+ */
+export function eachAttribute(scene, put) {
+  const sources = { position: scene.anchor, feature: scene.feature, offset: scene.offset, scaling: scene.scalingLog };
+  for (const head of globalHeads(widthsOf(scene))) {
+    const values = sources[/** @type {keyof typeof sources} */ (head.name)];
+    if (values) put(values, head.outputs, columnsOf(head));
+  }
+}
+
+/** Planes without time, and their two axes. @type {[import("../decode/scene.js").PlaneName, number, number][]} */
+export const SPATIAL = [
+  ["xy", 0, 1],
+  ["xz", 0, 2],
+  ["yz", 1, 2],
+];
+
+/** Planes with time, and their other axis. @type {[import("../decode/scene.js").PlaneName, number][]} */
+export const TEMPORAL = [
+  ["xt", 0],
+  ["yt", 1],
+  ["zt", 2],
+];
+
+/**
+ * A plane with time at time t.
+ *
+ * @param {import("../decode/scene.js").Plane} plane @param {number} t 0..1
+ * @param {(channel: number, cell: number, value: number) => void} put takes each sample
+ */
+export function sliceAt({ data, channels, height, width }, t, put) {
+  const at = t * (height - 1);
+  const low = Math.floor(at);
+  const high = Math.min(low + 1, height - 1);
+  const f = at - low;
+  for (let c = 0; c < channels; c++) {
+    const start = c * height * width;
+    for (let i = 0; i < width; i++) {
+      const a = data[start + low * width + i];
+      put(c, i, a + f * (data[start + high * width + i] - a));
+    }
+  }
+}
+
+/**
+ * The state on which Gaussians depend. t: normalised time. eye: the camera's centre, scene units.
  *
  * @typedef {{scene: Scene, level: number, t: number, eye: number[]}} State
  */

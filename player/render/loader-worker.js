@@ -1,8 +1,8 @@
 // The worker that fetches and decodes: bytes in, one scene per completed slice out.
 
 import { SceneSource } from "../decode/fetch.js";
+import { serve, tell } from "../decode/remote.js";
 import { Stream } from "../decode/stream.js";
-import { serve, tell } from "./serve.js";
 
 /** Between two messages about progress, milliseconds. */
 const PROGRESS_MS = 100;

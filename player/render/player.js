@@ -7,7 +7,8 @@ import { ContextLost, Gpu } from "./gl.js";
 import { levelOf, sameState, stateOf, timeAfter } from "./level.js";
 import { Pace } from "./pace.js";
 import { Painter } from "./painter.js";
-import { Remote, startLoader } from "./remote.js";
+import { Remote } from "../decode/remote.js";
+import { startLoader } from "./loader.js";
 
 /** @typedef {import("../decode/scene.js").Scene} Scene */
 /** @typedef {import("../decode/scene.js").Camera} Camera */

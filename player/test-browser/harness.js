@@ -12,10 +12,13 @@ async function sceneOf(url) {
   return decode(await (await fetch(url)).arrayBuffer());
 }
 
+/** Columns of a Gaussian's record. */
+const QUANTITIES = { mean: [0, 1, 2], opacity: [3], scale: [4, 5, 6], quaternion: [8, 9, 10, 11], color: [12, 13, 14] };
+
 /**
- * The two evaluators over some levels, times and cameras' centres, in this order on one GPU evaluator: the largest
- * difference of each quantity, relative to its largest magnitude, and how many Gaussians only one of them has although
- * its opacity is clear of the threshold.
+ * Both evaluators at some levels, times and cameras' centres, in this order on one GPU evaluator. worst: the largest
+ * difference of each quantity, relative to its largest magnitude. lonely: how many Gaussians only one of them has
+ * although their opacity is clear of the threshold.
  *
  * @param {string} url @param {{level: number, t: number, eye: number[]}[]} cases @param {number} bandPoints
  */
@@ -27,45 +30,35 @@ async function compare(url, cases, bandPoints) {
   gpu.bandPoints = bandPoints;
   const evaluator = new GpuEvaluator(gpu, scene);
   const lister = { list: async (/** @type {Parameters<typeof listGaussians>} */ ...args) => listGaussians(...args) };
-  const slots = scene.offset.length / scene.anchor.length;
   const out = [];
   let splats = null;
   for (const { level, t, eye } of cases) {
     ({ splats } = await evaluator.evaluate(level, t, eye, splats, lister));
     const n = splats.texels;
     const texels = n ? await gpu.read(splats.field, 0, 4, n / splats.field.width) : new Float32Array(0);
-    const reference = evaluate(scene, level, t, eye);
+    const { count, slot: slots, records } = evaluate(scene, level, t, eye);
+    /** @type {Map<number, number>} texels by their slot */
     const at = new Map();
     evaluator.slotsOfTexels().forEach((slot, i) => slot !== NO_ENTRY && i < n && at.set(slot, i));
-    /** @type {Record<string, [Float32Array, number, number, number]>} values, width, block, first component */
-    const quantities = {
-      mean: [reference.mean, 3, 0, 0],
-      opacity: [reference.opacity, 1, 0, 3],
-      scale: [reference.scale, 3, 1, 0],
-      quaternion: [reference.quaternion, 4, 2, 0],
-      color: [reference.color, 3, 3, 0],
-    };
-    const worst = Object.fromEntries(
-      Object.entries(quantities).map(([name, [values, width, block, first]]) => {
-        const size = values.reduce((most, v) => Math.max(most, Math.abs(v)), 1e-30);
-        let difference = 0;
-        reference.slot.forEach((slot, i) => {
-          const g = at.get(slot);
-          if (g === undefined) return;
-          for (let k = 0; k < width; k++) {
-            const d = Math.abs(values[i * width + k] - texels[4 * (block * n + g) + first + k]) / size;
-            if (!(d <= difference)) difference = d;
-          }
-        });
-        return [name, difference];
-      }),
-    );
+    /** @param {number} i @param {number} g @param {number} k */
+    const difference = (i, g, k) => Math.abs(records[16 * i + k] - texels[4 * ((k >> 2) * n + g) + (k & 3)]);
+    const worst = Object.entries(QUANTITIES).map(([name, columns]) => {
+      let [size, most] = [1e-30, 0];
+      slots.forEach((slot, i) => {
+        const g = at.get(slot);
+        for (const k of columns) {
+          size = Math.max(size, Math.abs(records[16 * i + k]));
+          if (g !== undefined && !(difference(i, g, k) <= most)) most = difference(i, g, k);
+        }
+      });
+      return [name, most / size];
+    });
     const clear = 1.01 / 255;
-    const known = new Set(reference.slot);
+    const known = new Set(slots);
     let lonely = 0;
-    reference.slot.forEach((slot, i) => (lonely += Number(reference.opacity[i] > clear && !at.has(slot))));
+    slots.forEach((slot, i) => (lonely += Number(records[16 * i + 3] > clear && !at.has(slot))));
     for (const [slot, g] of at) lonely += Number(texels[4 * g + 3] > clear && !known.has(slot));
-    out.push({ worst, lonely, count: reference.count, slots });
+    out.push({ worst: Object.fromEntries(worst), lonely, count });
   }
   const error = gl.getError();
   evaluator.free();

@@ -1,9 +1,9 @@
 // The adapter to Spark, with real workers in threads, and doubles for what it uses of Spark and three.js.
 
 import assert from "node:assert/strict";
-import { after, test } from "node:test";
-import { Worker as Thread } from "node:worker_threads";
+import { test } from "node:test";
 
+import "../testing/threads.mjs";
 import { decode } from "../decode/index.js";
 import { evaluate } from "../render/evaluate.js";
 import { Pd4Splats } from "../spark.js";
@@ -16,44 +16,6 @@ const ADDRESS = addressOf(BYTES);
 function addressOf(bytes) {
   return `data:application/octet-stream;base64,${Buffer.from(bytes).toString("base64")}`;
 }
-
-/** What workers expect around them, in a thread. */
-const AROUND = `
-const { parentPort, workerData } = require("node:worker_threads");
-globalThis.addEventListener = (_, take) => parentPort.on("message", (data) => take({ data }));
-globalThis.postMessage = (message, { transfer }) => parentPort.postMessage(message, transfer);
-import(workerData);`;
-
-let threads = 0;
-
-/** A browser's Worker as far as the player uses it. */
-class Worker {
-  /** @param {URL} url */
-  constructor(url) {
-    threads++;
-    this._thread = new Thread(AROUND, { eval: true, workerData: url.href });
-    this._thread.on("message", (data) => this.onmessage({ data }));
-    this._thread.on("exit", () => threads--);
-  }
-
-  /** @param {{data: any}} _event */
-  onmessage(_event) {}
-
-  /** @param {any} message @param {any[]} transfer */
-  postMessage(message, transfer) {
-    this._thread.postMessage(message, transfer);
-  }
-
-  terminate() {
-    this._thread.terminate();
-  }
-}
-
-Object.assign(globalThis, { Worker, location: { origin: "null" }, document: { baseURI: "http://localhost/" } });
-after(async () => {
-  for (let i = 0; threads && i < 500; i++) await new Promise((resolve) => setTimeout(resolve, 20));
-  assert.equal(threads, 0, "threads are left");
-});
 
 class Vector {
   x = 0;
@@ -178,10 +140,10 @@ const detailOf = (target, name) =>
 
 /** What the mesh must hold. @param {number} level @param {number} t @param {number[]} eye */
 function expected(level, t, eye) {
-  const g = evaluate(decode(BYTES), level, t, eye);
-  return Array.from({ length: g.count }, (_, i) => {
-    const columns = /** @type {const} */ ([[g.mean, 3], [g.scale, 3], [g.quaternion, 4], [g.opacity, 1], [g.color, 3]]);
-    return columns.flatMap(([values, width]) => Array.from(values.subarray(width * i, width * (i + 1))));
+  const { count, records } = evaluate(decode(BYTES), level, t, eye);
+  return Array.from({ length: count }, (_, i) => {
+    const g = Array.from(records.subarray(16 * i, 16 * i + 16));
+    return [...g.slice(0, 3), ...g.slice(4, 7), ...g.slice(8, 12), g[3], ...g.slice(12, 15)];
   });
 }
 

@@ -237,11 +237,9 @@ def pixels(text: str) -> np.ndarray:
     "options",
     [
         {},
-        dict(hidden=(), channels=2, scales=1, trunk=(3,)),
-        dict(hidden=(7, 5), channels=5, scales=3, trunk=(6, 21)),
-        dict(
-            hidden=(9, 8, 40), channels=33, scales=1, heads=({"position": 3, "scaling": 6}, {"mean": 3, "opacity": 1})
-        ),
+        dict(hidden=(5,), channels=2, scales=1, trunk=(3,)),
+        dict(hidden=(7,), channels=5, scales=3, trunk=(6, 21)),
+        dict(hidden=(40,), channels=33, scales=1, heads=({"position": 3, "scaling": 6}, {"mean": 3, "opacity": 1})),
         dict(hidden=(4,), channels=3, heads=({"feature": 32}, {})),
         dict(layers=(0, 2), heads=({}, {"quat": 4, "color": 3})),
         dict(widths=Widths(16, 4)),
@@ -250,7 +248,7 @@ def pixels(text: str) -> np.ndarray:
     ],
     ids=[
         "usual",
-        "no hidden layers",
+        "small",
         "odd widths",
         "many channels",
         "global only",
@@ -330,8 +328,9 @@ def test_pictures_through_spark_are_those_of_the_rasteriser(page, server, folder
     call(page, "harness.close")
 
 
-def test_networks_that_shaders_cannot_hold_are_evaluated_without(harness, folder, server):
-    (folder / "wide.pd4").write_bytes(encode(lively_scene(60, hidden=(300,)), layers=2, effort=1))
+@pytest.mark.parametrize("hidden", [(300,), (), (9, 8)])
+def test_networks_that_shaders_do_not_take_are_evaluated_on_the_cpu(harness, folder, server, hidden):
+    (folder / "wide.pd4").write_bytes(encode(lively_scene(60, hidden=hidden), layers=2, effort=1))
     pictures = []
     for evaluator in ("gpu", "cpu"):
         call(harness, "harness.open", server.url_of("wide.pd4"), WIDTH, HEIGHT, {"evaluator": evaluator})

@@ -1,0 +1,24 @@
+// The worker that fetches and decodes, from the page's side.
+
+import { Remote } from "../decode/remote.js";
+
+/**
+ * What early.js began: a worker that requests `url`, null if it could not. begin: gives it the address of the loader's
+ * code; only the first call counts.
+ *
+ * @typedef {{url: string, worker: Worker | null, begin: (code: string) => void}} Early
+ */
+
+/**
+ * @param {(news: import("./loader-worker.js").News) => void} told
+ * @param {string | Blob} [from] what it will be asked to open
+ */
+export function startLoader(told, from) {
+  const code = new URL("./loader-worker.js", import.meta.url);
+  const { early } = /** @type {{early?: Early}} */ (globalThis);
+  const worker = early?.worker;
+  if (!worker || early.url !== from) return new Remote(code, told);
+  early.worker = null; // its response serves once
+  early.begin(code.href);
+  return new Remote(worker, told);
+}
