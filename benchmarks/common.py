@@ -64,6 +64,8 @@ SCENES = {
     )
 }
 REAL = ("shelf-hand", "bouncing-balls")
+#: Where a second scene would say little more.
+ONE = REAL[:1]
 #: The scene of --quick.
 QUICK = Scene("quick", "synthetic:local?size=48x36&frames=4", preset="tiny", iterations=10)
 

@@ -43,7 +43,8 @@ def text(benchmarks: Sequence[Benchmark], figures: Row) -> str:
     for found, by in zip(sections, made, strict=True):
         title = known[found["name"]].title
         shown = [f"![{title}: {name.rsplit('.', 1)[0]}](img/{name})" for name in found["pictures"]]
-        parts += [f"## {title}", wrapped(known[found["name"]].text(found["rows"])), *shown]
+        parts += [f"## {title}", wrapped(known[found["name"]].text(found["rows"]))]
+        parts += ["\n".join(shown)] if shown else []
         parts += [] if by == usual else [f"Made at {by}."]
     return "\n\n".join(parts) + "\n"
 

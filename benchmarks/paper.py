@@ -42,19 +42,18 @@ def measure(run: Run, scene: Scene) -> list[Row]:
     """A row per level of our models and of those made for one purpose, and one per changed method."""
     rows: list[Row] = []
 
-    def train(table: str, name: str, *options: str, longer: float = SHORT) -> None:
+    def train(table: str, name: str, *options: str, longer: float = SHORT, top: bool = True) -> None:
         model, training = run.trained(scene, *options, longer=longer)
         told = {"scene": scene.name, "table": table, "model": name, "minutes": training["seconds"] / 60}
         found = packed_levels(scene, model, model.with_suffix(".pd4"))
-        chosen = found[-1:] if "--max-layer" in options or table == "parts" else found
-        rows.extend(told | row | {"layer0": found[0]["bytes"]} for row in chosen)
+        rows.extend(told | row | {"layer0": found[0]["bytes"]} for row in (found[-1:] if top else found))
 
     train("models", "layer 0 alone", "--max-layer", "0")
     train("models", "layers 0 and 1 alone", "--max-layer", "1")
     whole = monolith(run, scene, SHORT)
     rows.append(whole | {"table": "models", "model": "monolith", "level": 2, "layer0": whole["bytes"]})
-    train("models", "ours")
-    train("models", "ours, 3 x the steps", longer=3 * SHORT)
+    train("models", "ours", top=False)
+    train("models", "ours, 3 x the steps", longer=3 * SHORT, top=False)
     train("models", "ours, every level in every step", "--rollout", "all")
     parts = {FULL: (), **COMPONENTS, **ROLLOUTS}
     for name in list(parts)[: 2 if run.quick else None]:
