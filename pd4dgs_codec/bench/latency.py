@@ -22,7 +22,6 @@ from pathlib import Path
 from typing import IO
 
 from pd4dgs_codec import threads
-from pd4dgs_codec.draw.warm import warm_up
 from pd4dgs_codec.errors import DataError, DeliveryError
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.web.client import SceneClient
@@ -137,7 +136,7 @@ def cold_start(url: str, **environment: str) -> list[float]:
 
 def times(data: bytes, rates: Sequence[float], runs: int, step: Callable[[], None] = lambda: None) -> list[Times]:
     """A row per rate and level of a file, medians of `runs`. `step` is called after each run, 3 per rate and run."""
-    warm_up()
+    _warm_up()
     rows, layers = [], layer_rows(data)
     for rate in rates:
         network, warm, cold = [], [], []
@@ -186,11 +185,18 @@ def table(rows: Sequence[Times]) -> str:
     return markdown(head, cells)
 
 
+def _warm_up() -> None:
+    """Imports the player and loads its kernels."""
+    from pd4dgs_codec.draw.player import warm_up
+
+    warm_up()
+
+
 def main(url: str) -> None:
     """The cold viewer: imports and kernels load in a thread while the bytes arrive."""
     threads.configure()
     threads.load_numba()
-    warming = threading.Thread(target=warm_up)
+    warming = threading.Thread(target=_warm_up)
     warming.start()
     for shown in pictures(url, ready=warming.join):
         print(json.dumps(asdict(shown)), flush=True)

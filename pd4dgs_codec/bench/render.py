@@ -15,7 +15,7 @@ from pd4dgs_codec.bench.timing import Timing, clock, summary
 from pd4dgs_codec.draw.gaussians import near_plane
 from pd4dgs_codec.draw.player import Player
 from pd4dgs_codec.errors import RenderError
-from pd4dgs_codec.model.rasterization import rasterization
+from pd4dgs_codec.model.picture import rasterization
 from pd4dgs_codec.quality.frames import Frame
 from pd4dgs_codec.quality.levels import Level
 
@@ -95,7 +95,7 @@ def _rendered(views: Sequence[View], name: str, repeats: int) -> tuple[list[np.n
 
 def _without_gsplat() -> str | None:
     """Why gsplat cannot render here, in one line; None if it can."""
-    from pd4dgs_codec.model.rasterization import check_gsplat
+    from pd4dgs_codec.model.picture import check_gsplat
 
     if not torch.cuda.is_available():
         return "there is no CUDA device"

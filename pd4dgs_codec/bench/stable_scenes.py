@@ -25,8 +25,7 @@ from pd4dgs_codec.model.config import DeformationConfig, ModelConfig
 from pd4dgs_codec.model.convert import from_scene, to_scene
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model
-from pd4dgs_codec.model.picture import render
-from pd4dgs_codec.model.rasterization import rasterization
+from pd4dgs_codec.model.picture import rasterization, render
 from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS, PLANES, Camera, Deformation, Network, deformation_unit
 from pd4dgs_codec.train.config import LearningRates, TrainConfig
 from pd4dgs_codec.train.loop import Trainer

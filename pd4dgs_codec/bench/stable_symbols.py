@@ -19,7 +19,7 @@ from pd4dgs_codec.entropy.priors import K_MAX
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format import decoder, encoder
 from pd4dgs_codec.format import quantise as q
-from pd4dgs_codec.model import masks, rate
+from pd4dgs_codec.model import networks, rate
 from pd4dgs_codec.scene import MASK_THRESHOLD
 
 
@@ -394,7 +394,7 @@ def _masks() -> Iterator[Case]:
 def _level_mask_error(values: Sequence[float]) -> Found:
     mp = mpmath()
     logits = torch.tensor(list(itertools.product(values, repeat=3))).requires_grad_()
-    levels = [masks.level_mask(logits, level) for level in range(3)]
+    levels = [networks.level_mask(logits, level) for level in range(3)]
     slopes = [torch.autograd.grad(mask.sum(), logits)[0] for mask in levels]
     worst = 0.0
     with mp.workdps(40):

@@ -266,7 +266,7 @@ def _device(name: str, console: Console) -> str:
         return "cpu"
     if not torch.cuda.is_available():
         raise TrainError("--device cuda: this PyTorch finds no CUDA device; expected one, or --device cpu")
-    from pd4dgs_codec.model.rasterization import check_gsplat
+    from pd4dgs_codec.model.picture import check_gsplat
 
     try:
         check_gsplat()

@@ -86,3 +86,14 @@ def _scaled(network: Network, unit: np.float32) -> Network:
     """The network with its outputs times `unit`."""
     *rest, (weight, bias) = network
     return (*rest, (weight * unit, bias * unit))
+
+
+def still(head: str, width: int) -> Deformation:
+    """The smallest deformation that the kernels take, with one head of that width; its residuals are 0."""
+    planes = {name: np.ones((LANES, 2, 2), np.float32) for name, _, _ in PLANES}
+    return Deformation((planes,), {TRUNK: constant_network(LANES, LANES), head: constant_network(LANES, width)})
+
+
+def constant_network(inputs: int, outputs: int, value: float = 0.0) -> Network:
+    """One layer whose outputs are all `value`."""
+    return ((np.zeros((outputs, inputs), np.float32), np.full(outputs, value, np.float32)),)

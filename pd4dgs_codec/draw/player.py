@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from pd4dgs_codec.draw.deformation import Field
+from pd4dgs_codec.draw.deformation import Field, constant_network, still
 from pd4dgs_codec.draw.gaussians import (
     MIN_OPACITY,
     OFFSET_REACH,
@@ -21,7 +21,17 @@ from pd4dgs_codec.draw.gaussians import (
     seen,
 )
 from pd4dgs_codec.draw.rasteriser import draw
-from pd4dgs_codec.scene import LOCAL_HEADS, MASK_STEP, MASK_THRESHOLD, SCAFFOLD_NETWORKS, Camera, Scene
+from pd4dgs_codec.scene import (
+    LOCAL_HEADS,
+    MASK_STEP,
+    MASK_THRESHOLD,
+    SCAFFOLD_NETWORKS,
+    Camera,
+    Scene,
+    SceneInfo,
+    Steps,
+    Widths,
+)
 
 
 class Player:
@@ -124,3 +134,36 @@ class Player:
                 self._known[missing] = True
         found: np.ndarray = self._moved.take(rows, axis=0)
         return found
+
+
+# -- warming up --------------------------------------------------------------------------------------------------------
+
+
+def warm_up() -> None:
+    """Loads the kernels (where none are cached: compiles them) by drawing one anchor with both deformations. A viewer
+    calls it in a thread, with the import of this module, while the first layer is on its way."""
+    scene = _one_anchor()
+    assert scene.info.camera is not None
+    Player(scene).picture(scene.info.camera, 0.5)
+
+
+def _one_anchor(side: int = 16) -> Scene:
+    """One anchor in front of a camera of side x side pixels."""
+    widths, box = Widths(), np.array([[-1, -1, 1], [1, 1, 3]], np.float32)
+    K = np.array([[side, 0, side / 2], [0, side, side / 2], [0, 0, 1]], np.float32)
+    camera = Camera(np.eye(4, dtype=np.float32), K, side, side)
+
+    return Scene(
+        info=SceneInfo(1.0, box, (0.0, 1.0), (0.0, 0.0, 0.0), 0.1, 100.0, (0.0, -1.0, 0.0), 0.0, camera),
+        steps=Steps(),
+        layers=(0, 1, 2),
+        rows=(1, 1, 1),
+        anchor_q=np.array([[0, 0, 2]], np.int32),
+        feature=np.zeros((1, widths.feature), np.float32),
+        scaling_log=np.full((1, *widths.attributes["scaling_log"]), -2, np.float32),
+        offset=np.zeros((1, widths.slots, 3), np.float32),
+        mask=(np.full(1, 255, np.uint8),) * 3,
+        networks={name: constant_network(widths.inputs, n, 0.5) for name, n in widths.networks.items()},
+        global_deformation=still("position", 3),
+        local_deformation=still("mean", 3),
+    )

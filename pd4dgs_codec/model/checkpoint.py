@@ -1,8 +1,8 @@
 """Checkpoints: versioned, self-describing, and loaded with `weights_only=True`, so that a file cannot run code.
 
 A checkpoint is a dict {"format", "version", "digest", "info", "steps", "deformations", "state": tensors, "training"}.
-Shapes are read from the tensors; nothing needs the configuration that made the model. "training" holds what resuming
-needs and may be empty. "digest" is that of all the others, for torch reads damaged archives without a word.
+Shapes come from the tensors; loading does not need the configuration that made the model. "training" is the state for
+resuming and may be empty. "digest" covers all other entries, since torch reads damaged archives without an error.
 """
 
 from __future__ import annotations
@@ -11,7 +11,6 @@ import hashlib
 import io
 import os
 import pickle
-import zipfile
 from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -49,7 +48,7 @@ def save(path: str | Path, model: Model, training: dict[str, Any] | None = None)
         "training": training or {},
     }
     content["digest"] = _digest(content)
-    buffer = io.BytesIO()  # of a disk that fills, torch would say "unexpected pos" and nothing more
+    buffer = io.BytesIO()  # writing to a full disk itself, torch would only report "unexpected pos"
     try:
         torch.save(content, buffer)
         write_bytes(real, buffer.getbuffer(), overwrite=True)
@@ -58,7 +57,7 @@ def save(path: str | Path, model: Model, training: dict[str, Any] | None = None)
 
 
 def target(path: str | Path) -> Path:
-    """The file that `save` replaces: a symbolic link stays one. DataError if a device, a pipe or a folder is there."""
+    """The file that `save` replaces; a symbolic link stays. DataError if a device, a pipe or a folder is there."""
     real = Path(os.path.realpath(path))
     if real.exists() and not real.is_file():
         raise DataError(f"{path}: is not a regular file; expected the name of a checkpoint to write")
@@ -66,7 +65,7 @@ def target(path: str | Path) -> Path:
 
 
 def load(path: str | Path | BinaryIO) -> tuple[Model, dict[str, Any]]:
-    """(model, training) from a checkpoint; DataError in one line for anything that is not a whole one of ours."""
+    """(model, training) of a checkpoint. DataError, of one line, for any other or damaged file."""
     try:
         content = torch.load(path, map_location="cpu", weights_only=True)
     except FileNotFoundError:
@@ -83,26 +82,27 @@ def load(path: str | Path | BinaryIO) -> tuple[Model, dict[str, Any]]:
     version = content.get("version")
     if type(version) is not int or version != VERSION:  # True is an int too, and equal to 1
         raise DataError(f"{path}: {FORMAT} version {version!r}, expected {VERSION}")
-    _refuse_damaged(path, content)
+    if content.get("digest") != _digest(content):
+        raise DataError(f"{path}: damaged: its digest does not match its content")
     try:
         _refuse_not_finite(content["state"])
         return _build(content), dict(content["training"])
     except (
         KeyError, TypeError, ValueError, IndexError, RuntimeError, AttributeError, MemoryError, Pd4Error
     ) as error:  # fmt: skip
-        reason = " ".join(str(error).split())  # torch explains itself over several lines
+        reason = " ".join(str(error).split())  # torch's messages have several lines
         raise DataError(f"{path}: a {FORMAT} with missing or misshapen content: {reason}") from None
 
 
 def _begins_as_torch_files(path: str | Path | BinaryIO) -> bool:
-    """Whether it is a zip archive or a binary pickle; torch's refusal of pickled objects and of any text are one."""
+    """Whether it is a zip archive or a binary pickle: torch refuses pickled objects and any text by the same error."""
     with open(path, "rb") if isinstance(path, (str, Path)) else nullcontext(path) as stream:
         stream.seek(0)
         return stream.read(2).startswith((b"PK", b"\x80"))
 
 
 def _digest(content: dict[str, Any]) -> str:
-    """SHA-256, in hexadecimal, of a content but its "digest": nested dicts, lists and tuples of tensors and scalars."""
+    """SHA-256, in hexadecimal, of all but "digest": nested dicts, lists and tuples of tensors and scalars."""
     hasher = hashlib.sha256()
 
     def walk(value: Any) -> None:
@@ -125,21 +125,6 @@ def _digest(content: dict[str, Any]) -> str:
 
     walk({key: item for key, item in content.items() if key != "digest"})
     return hasher.hexdigest()
-
-
-def _refuse_damaged(path: str | Path | BinaryIO, content: dict[str, Any]) -> None:
-    """By the digest; a file from before there was one, by the check sums of its archive."""
-    if "digest" in content:
-        if content["digest"] != _digest(content):
-            raise DataError(f"{path}: damaged: its digest is not that of its content")
-        return
-    try:
-        with zipfile.ZipFile(path) as archive:
-            damaged = archive.testzip()
-    except (zipfile.BadZipFile, NotImplementedError, OSError, RuntimeError, EOFError, ValueError):
-        raise DataError(f"{path}: damaged: expected a whole zip archive") from None
-    if damaged is not None:
-        raise DataError(f"{path}: damaged: the check sum of {damaged!r} in its archive is wrong")
 
 
 def _refuse_not_finite(state: dict[str, torch.Tensor]) -> None:
@@ -171,12 +156,11 @@ def _build(content: dict[str, Any]) -> Model:
         networks={name: MLP.arrays_of_state(state, f"networks.{name}") for name in SCAFFOLD_NETWORKS},
         global_deformation=deformation("global"),
         local_deformation=deformation("local"),
-        grading=Grading(state["step_class"], state["centre"]) if "step_class" in state else None,
+        grading=Grading(state["step_class"], state["centre"]),
     )
     check_scene(replace(scene, steps=scene.steps.scaled(1.0)))
     model = from_scene(scene)
-    without = {name: tensor for name, tensor in model.state_dict().items() if name in ("step_class", "centre")}
-    model.load_state_dict(without | content["state"])  # checkpoints from before there were classes have none
+    model.load_state_dict(content["state"])
     return model
 
 

@@ -8,9 +8,8 @@ import torch
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.format.quantise import mask_codes
 from pd4dgs_codec.model.deformation import DeformationField
-from pd4dgs_codec.model.masks import mask_logits
 from pd4dgs_codec.model.model import Model
-from pd4dgs_codec.model.networks import MLP
+from pd4dgs_codec.model.networks import MLP, mask_logits
 from pd4dgs_codec.scene import MASK_STEP, SCAFFOLD_NETWORKS, Grading, Scene
 
 

@@ -21,8 +21,7 @@ from torch import Tensor, nn
 from pd4dgs_codec.draw.gaussians import OFFSET_REACH, SIGMA_REACH, in_view
 from pd4dgs_codec.model import fused, reference
 from pd4dgs_codec.model.deformation import DeformationField
-from pd4dgs_codec.model.masks import level_mask
-from pd4dgs_codec.model.networks import EXACT, MLP, Rounding
+from pd4dgs_codec.model.networks import EXACT, MLP, Rounding, level_mask
 from pd4dgs_codec.scene import (
     LOCAL_HEADS,
     MASK_THRESHOLD,

@@ -1,19 +1,36 @@
-"""Render_level(t) of a model through a camera: the model's graph, then the rasteriser."""
+"""Pictures with gradients: Render_level of a model, and `rasterization` of any Gaussians by one of three backends.
+
+`cpu` is numba (`draw.rasteriser`), `gsplat` is CUDA, `reference` (`reference.py`) is a dense float64 torch oracle.
+"""
 
 from __future__ import annotations
 
+import importlib
+import importlib.metadata
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
+from torch.autograd.function import once_differentiable
 
+from pd4dgs_codec.draw import rasteriser
 from pd4dgs_codec.draw.gaussians import check_time, near_plane
+from pd4dgs_codec.draw.projection import ALPHA_MAX, EPS2D, FAR
+from pd4dgs_codec.draw.rasteriser import Geometry, Projected, check_camera, check_colors, check_near_plane, check_shape
+from pd4dgs_codec.errors import RenderError
+from pd4dgs_codec.model import reference
 from pd4dgs_codec.model.model import Gaussians, Model
 from pd4dgs_codec.model.networks import EXACT, Rounding
-from pd4dgs_codec.model.rasterization import rasterization
 from pd4dgs_codec.scene import Camera, SceneInfo
+
+BACKENDS = ("auto", "cpu", "gsplat", "reference")
+#: The clamp on alpha is compiled into gsplat and changed between versions; only a version with ours is accepted.
+ALPHA_MAX_OF_VERSION = {"1.5": 0.999, "1.6": 0.99}
+
+Drawn = tuple[Tensor, Tensor, dict[str, Tensor]]
 
 
 @dataclass
@@ -55,3 +72,210 @@ def render_image(model: Model, level: int, t: float, camera: Camera, rounding: R
     """Render_level at normalised time t in 0..1 as float32 [H, W, 3] in 0..1."""
     image: np.ndarray = render(model, level, t, camera, rounding).image.clamp(0, 1).cpu().numpy()
     return image
+
+
+# -- rasterising tensors -----------------------------------------------------------------------------------------------
+
+
+def rasterization(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    camera: Camera,
+    background: Sequence[float] = (0.0, 0.0, 0.0),
+    *,
+    near_plane: float = 0.01,
+    backend: str = "auto",
+) -> Drawn:
+    """Draws N Gaussians with a pinhole camera (OpenCV axes, pixel centres at +0.5).
+
+    means      [N, 3] world, scene units.
+    quats      [N, 4] rotations wxyz, not necessarily unit; a zero quaternion is the identity and gets no gradient.
+    scales     [N, 3] standard deviations, scene units (activated; the sign does not matter).
+    opacities  [N] in 0..1 (activated); a Gaussian whose opacity is not above 1/255, or not finite, is skipped.
+    colors     [N, 3]. background: 3 numbers.
+    near_plane: Gaussians with camera z outside (near_plane, FAR] are skipped, scene units.
+    backend: "cpu", "gsplat" (CUDA), "reference" (dense float64, slow) or "auto", by the device of `means`.
+
+    float16 and float64 inputs are drawn in float32; gradients come back in the input's type. A Gaussian with NaN or
+    infinity in its position, rotation, scale or opacity is skipped and gets zero gradients; in its colour, refused.
+
+    Returns (image [H, W, 3], alpha [H, W], meta), float32 (`reference`: float64). meta, as gsplat has it, is zero where
+    a Gaussian is skipped: radii [1, N, 2] int32 pixels; means2d [1, N, 2] pixels, whose `.grad` holds dL/d(pixel
+    position) after backward, for densification (except with gsplat it is a leaf: a loss on it does not reach `means`).
+
+    Raises RenderError for wrong shapes, devices and cameras, NotFinite (a RenderError) for colours.
+    Formulas: Zwicker et al., "EWA splatting"; Kerbl et al., "3D Gaussian Splatting"; conventions of gsplat 1.5.3.
+    """
+    if backend not in BACKENDS:
+        raise RenderError(f"backend is {backend!r}, expected one of {', '.join(BACKENDS)}")
+    check_near_plane(near_plane)
+    check_camera(camera)
+    _check("means", means, None, 3)
+    n = len(means)
+    for name, tensor, *width in (
+        ("quats", quats, 4),
+        ("scales", scales, 3),
+        ("opacities", opacities),
+        ("colors", colors, 3),
+    ):
+        _check(name, tensor, n, *width)
+    tensors = [means, quats, scales, opacities, colors]
+    if any(t.device != means.device for t in tensors):
+        raise RenderError(f"tensors are on different devices: {sorted({str(t.device) for t in tensors})}")
+    behind = np.array(background, np.float32)
+    check_shape("background", behind.shape, 3)
+    check_colors("colors", float(colors.detach().float().sum()))
+    check_colors("background", float(behind.sum()))
+    return _choose(backend, means.device)(*tensors, camera, behind, near_plane)
+
+
+def _check(name: str, tensor: Any, *shape: int | None) -> None:
+    """Raises RenderError unless it is a floating-point tensor of that shape; None is any size."""
+    if not isinstance(tensor, Tensor) or not tensor.is_floating_point():
+        found = tensor.dtype if isinstance(tensor, Tensor) else type(tensor).__name__
+        raise RenderError(f"{name} is {found}, expected a floating-point tensor")
+    check_shape(name, tensor.shape, *shape)
+
+
+def _choose(backend: str, device: torch.device) -> Callable[..., Drawn]:
+    """The function of a backend for tensors on `device`: (means, ..., colors, camera, background, near_plane)."""
+    if device.type not in ("cpu", "cuda"):
+        raise RenderError(f"tensors are on {device.type}, expected cpu or cuda")
+    if backend == "reference":
+        return reference.rasterize
+    own = "gsplat" if device.type == "cuda" else "cpu"
+    if backend not in ("auto", own):
+        raise RenderError(f"backend {backend!r} cannot draw tensors on {device.type}")
+    return rasterize_gsplat if own == "gsplat" else rasterize_cpu
+
+
+# -- CPU ---------------------------------------------------------------------------------------------------------------
+
+
+class _Composite(torch.autograd.Function):
+    """(..., projected) -> (image, alpha); all tensors float32, contiguous and on the CPU, where arrays are views."""
+
+    @staticmethod
+    def forward(
+        ctx: Any,
+        means: Tensor,
+        quats: Tensor,
+        scales: Tensor,
+        opacities: Tensor,
+        colors: Tensor,
+        means2d: Tensor,
+        background: np.ndarray,
+        projected: Projected,
+    ) -> tuple[Tensor, Tensor]:
+        drawn = rasteriser.composite(projected, colors.detach().numpy(), background)
+        picture, transmittance = map(torch.from_numpy, drawn)
+        ctx.projected = projected
+        ctx.save_for_backward(means, quats, scales, opacities, colors, picture, transmittance)
+        return picture, 1.0 - transmittance
+
+    @staticmethod
+    @once_differentiable
+    def backward(ctx: Any, g_picture: Tensor, g_alpha: Tensor) -> tuple[Tensor | None, ...]:
+        arrays = [t.detach().numpy() for t in (*ctx.saved_tensors, g_picture.contiguous(), g_alpha.contiguous())]
+        found = rasteriser.backward(ctx.projected, Geometry(*arrays[:4]), *arrays[4:])
+        gradients = [torch.from_numpy(a) for a in (*found.geometry, found.colors, found.means2d[None])]
+        return *gradients, None, None
+
+
+def rasterize_cpu(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    camera: Camera,
+    background: np.ndarray,
+    near_plane: float,
+) -> Drawn:
+    """The CPU backend of `rasterization`, which checks the arguments."""
+    tensors = [t.to(torch.float32).contiguous() for t in (means, quats, scales, opacities, colors)]
+    projected = rasteriser.project(Geometry(*(t.detach().numpy() for t in tensors[:4])), camera, near_plane)
+    means2d, radii = torch.from_numpy(projected.means2d)[None], torch.from_numpy(projected.radii)[None]
+    means2d.requires_grad_(torch.is_grad_enabled() and any(t.requires_grad for t in tensors))
+    image, alpha = _Composite.apply(*tensors, means2d, background, projected)  # type: ignore[no-untyped-call]
+    return image, alpha, {"means2d": means2d, "radii": radii}
+
+
+# -- CUDA through gsplat (an extra, Apache-2.0), held to the contract of `rasterization` -------------------------------
+
+
+def check_gsplat() -> None:
+    """RenderError in one line unless gsplat can draw here: the right version, with its CUDA kernels.
+
+    Without a CUDA compiler gsplat imports all the same and fails at the first picture. With one it may build its
+    kernels now, which takes minutes.
+    """
+    _gsplat()
+    try:
+        from gsplat.cuda._backend import _C
+    except (ImportError, RuntimeError, OSError) as error:
+        reason = (str(error).splitlines() or [type(error).__name__])[0]
+        raise RenderError(f"gsplat's CUDA kernels do not load ({reason}): use the CPU") from error
+    if _C is None:
+        raise RenderError("gsplat has no CUDA kernels here, nor a compiler (nvcc) to build them: use the CPU")
+
+
+def _gsplat() -> Any:
+    """The gsplat module, if its version has the CPU backend's limits."""
+    try:
+        version = importlib.metadata.version("gsplat")
+        module = importlib.import_module("gsplat")
+    except (ImportError, RuntimeError, OSError) as error:  # it may load or build its CUDA part at once
+        raise RenderError(f"gsplat cannot be imported ({error}): install pd4dgs-codec[gpu] or use the CPU") from error
+    alpha_max = ALPHA_MAX_OF_VERSION.get(".".join(version.split(".")[:2]))
+    if alpha_max != ALPHA_MAX:
+        found = "an unknown alpha limit" if alpha_max is None else f"alpha limit {alpha_max}"
+        raise RenderError(f"gsplat {version} has {found}, expected {ALPHA_MAX} (gsplat 1.5)")
+    return module
+
+
+def _drawable(means: Tensor, quats: Tensor, scales: Tensor, opacities: Tensor) -> list[Tensor]:
+    """Gaussians that are not finite become faint (skipped, no gradient); a zero quaternion becomes the identity."""
+    finite = torch.isfinite(torch.cat([means, quats, scales, opacities[:, None]], -1)).all(-1)
+    identity = quats.new_tensor([1.0, 0.0, 0.0, 0.0])
+    rotated = finite & (quats != 0).any(-1)
+    return [
+        torch.where(finite[:, None], means, 0.0),
+        torch.where(rotated[:, None], quats, identity),
+        torch.where(finite[:, None], scales, 0.0),
+        torch.where(finite, opacities, 0.0),
+    ]
+
+
+def rasterize_gsplat(
+    means: Tensor,
+    quats: Tensor,
+    scales: Tensor,
+    opacities: Tensor,
+    colors: Tensor,
+    camera: Camera,
+    background: np.ndarray,
+    near_plane: float,
+) -> Drawn:
+    """gsplat behind `rasterization`, which checks the arguments. float32, dense layout."""
+    viewmat, K = (means.new_tensor(np.array(a), dtype=torch.float32)[None] for a in (camera.viewmat, camera.K))
+    images, alphas, meta = _gsplat().rasterization(
+        *_drawable(*(t.to(torch.float32) for t in (means, quats, scales, opacities))),
+        colors.to(torch.float32),
+        viewmat,
+        K,
+        camera.width,
+        camera.height,
+        near_plane=near_plane,
+        far_plane=FAR,
+        eps2d=EPS2D,
+        backgrounds=torch.from_numpy(background)[None].to(means.device),
+        rasterize_mode="classic",
+        packed=False,
+    )
+    if meta["means2d"].requires_grad:
+        meta["means2d"].retain_grad()
+    return images[0], alphas[0, ..., 0], {name: meta[name] for name in ("means2d", "radii")}

@@ -21,9 +21,9 @@ from pd4dgs_codec.format.plan import plan
 from pd4dgs_codec.format.symbols import layer_symbols, rounded
 from pd4dgs_codec.format.table import classes_of
 from pd4dgs_codec.model.convert import from_scene
-from pd4dgs_codec.model.harm import anchor_harm
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.model.rate import channel_moments, gaussian_bits, rate_bits
+from pd4dgs_codec.model.sensitivity import omission_error
 from pd4dgs_codec.quality.frames import Frame
 from pd4dgs_codec.quality.image import level_psnr
 from pd4dgs_codec.scene import Scene
@@ -53,12 +53,12 @@ class RenderedLoss:
 
     def omission_error(self, scene: Scene, level: int) -> np.ndarray:
         """float64 [N]: an estimate of the squared error, summed over pictures and colours, of leaving out each anchor
-        at `level`, see `anchor_harm`. Infinite, for unknown, if no picture shows the anchor."""
+        at `level`, see `omission_error`. Infinite, for unknown, if no picture shows the anchor."""
         model = from_scene(scene)
         total, met = np.zeros(len(scene.anchor_q)), np.zeros(len(scene.anchor_q), bool)
         generator = torch.Generator().manual_seed(0)
         for frame in self.frames:
-            error, near, _ = anchor_harm(model, level, frame.time, frame.camera, generator)
+            error, near, _ = omission_error(model, level, frame.time, frame.camera, generator)
             total += error.numpy()
             met |= near.numpy()
             self.step()

@@ -178,7 +178,7 @@ class _Pictures:
         self, scene: Scene, options: EncodeOptions, left_out: list[LeftOut], metadata: Metadata | None
     ) -> tuple[bytes, Report, dict[str, Any]]:
         """(sliced file, its report, the slices of the report)."""
-        from pd4dgs_codec.model.utility import utility
+        from pd4dgs_codec.model.sensitivity import utility
         from pd4dgs_codec.quality.measure import true_psnr
 
         about: dict[str, Any] = {"order": "gate times area", "cameras": None, "pictures": 0}

@@ -16,8 +16,8 @@ from torch import Tensor, nn
 from torch.autograd.function import once_differentiable
 
 from pd4dgs_codec.model.deformation import DeformationField
-from pd4dgs_codec.model.masks import level_mask
 from pd4dgs_codec.model.model import Model
+from pd4dgs_codec.model.networks import level_mask
 from pd4dgs_codec.model.rate import row_bits
 from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import ATTRIBUTES, MASK_THRESHOLD

@@ -138,7 +138,7 @@ def random_view(n: int = 150) -> render.View:
 
 
 def test_the_reference_in_blocks_is_the_dense_one():
-    from pd4dgs_codec.model.rasterization import rasterization
+    from pd4dgs_codec.model.picture import rasterization
 
     view = random_view()
     dense = rasterization(**view, backend="reference")[0]

@@ -13,7 +13,7 @@ from pd4dgs_codec.cli import bench
 from pd4dgs_codec.entropy import channels
 from pd4dgs_codec.errors import DataError, EncodeError
 from pd4dgs_codec.format import quantise, residuals
-from pd4dgs_codec.model import masks, rate, reference
+from pd4dgs_codec.model import networks, rate, reference
 
 KEYS = {"case", "group", "fed", "promised", "got", "error", "bound", "status"}
 GROUPS = ("rate", "fitting", "quantiser", "masks", "hexplane", "deformation", "rasteriser", "training")
@@ -66,7 +66,7 @@ def floor(x, step, name=""):
     return np.zeros(x.shape, np.int32)
 
 
-bits, decode, sample, mask = rate.rate_bits, channels.decode_channels, residuals.sample_planes, masks.level_mask
+bits, decode, sample, mask = rate.rate_bits, channels.decode_channels, residuals.sample_planes, networks.level_mask
 draw = stable_scenes.rasterization
 #: What is broken: (module, name, broken, rows to run, rows that must fail, a row that must not).
 FAULTS = {
@@ -92,7 +92,7 @@ FAULTS = {
         {"time after the range"}, "time before the range",
     ),
     "masks that fall with the level": (
-        masks, "level_mask", lambda logits, level: mask(logits, level) * (1 - 1e-6 * level), "masks",
+        networks, "level_mask", lambda logits, level: mask(logits, level) * (1 - 1e-6 * level), "masks",
         {"masks of logits -100..100"}, "codes at 0, 1 and the threshold",
     ),
     "a mask threshold that moved": (

@@ -114,11 +114,11 @@ def test_a_layer_that_explains_the_pictures_is_kept(scene):
 
 def test_harm_is_about_the_error_that_leaving_an_anchor_out_makes(scene, monkeypatch):
     from pd4dgs_codec.format.plan import plan
-    from pd4dgs_codec.model import harm as harm_of
+    from pd4dgs_codec.model import sensitivity
     from pd4dgs_codec.quality.frames import own_frames
     from pd4dgs_codec.quality.measure import RenderedLoss
 
-    monkeypatch.setattr(harm_of, "PROBES", 64)  # the anchors differ less here than in a trained scene
+    monkeypatch.setattr(sensitivity, "PROBES", 64)  # the anchors differ less here than in a trained scene
     planned = plan(scene)[0]
     loss = RenderedLoss(planned, own_frames(planned.info, 2, 20.0))
     harm = loss.omission_error(planned, 0)

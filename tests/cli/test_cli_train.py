@@ -188,7 +188,7 @@ def test_a_gpu_that_gsplat_cannot_use_is_left_alone(monkeypatch, capsys):
     assert _device("auto", console) == "cpu" and "GPU is not used: gsplat" in capsys.readouterr().err
     with pytest.raises(TrainError, match="--device cuda: gsplat"):
         _device("cuda", console)
-    monkeypatch.setattr("pd4dgs_codec.model.rasterization.check_gsplat", lambda: None)
+    monkeypatch.setattr("pd4dgs_codec.model.picture.check_gsplat", lambda: None)
     assert _device("auto", console) == _device("cuda", console) == "cuda"
 
 

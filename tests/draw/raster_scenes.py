@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from pd4dgs_codec.model.rasterization import rasterization
+from pd4dgs_codec.model.picture import rasterization
 from pd4dgs_codec.scene import Camera
 
 NAMES = ("means", "quats", "scales", "opacities", "colors")

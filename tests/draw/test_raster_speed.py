@@ -8,7 +8,7 @@ from raster_scenes import camera, scene
 
 from pd4dgs_codec import threads
 from pd4dgs_codec.model import reference
-from pd4dgs_codec.model.rasterization import rasterization
+from pd4dgs_codec.model.picture import rasterization
 
 pytestmark = pytest.mark.slow
 TILE = 16

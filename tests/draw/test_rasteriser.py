@@ -31,7 +31,7 @@ def gaussians(n=300, seed=5, scale=0.1):
 @pytest.mark.parametrize("near_plane", [0.01, 3.0])
 def test_the_picture_is_that_of_rasterization(near_plane):
     torch = pytest.importorskip("torch")
-    from pd4dgs_codec.model.rasterization import rasterization
+    from pd4dgs_codec.model.picture import rasterization
 
     arrays, background = gaussians(), (0.1, 0.4, 0.9)
     image, alpha = rasteriser.draw(*arrays, CAMERA, background, near_plane=near_plane)

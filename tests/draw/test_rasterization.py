@@ -22,7 +22,7 @@ from raster_scenes import (
 
 from pd4dgs_codec.errors import NotFinite, RenderError
 from pd4dgs_codec.model import reference
-from pd4dgs_codec.model.rasterization import check_gsplat, rasterization, rasterize_gsplat
+from pd4dgs_codec.model.picture import check_gsplat, rasterization, rasterize_gsplat
 
 LIMIT = 1e-5
 

@@ -31,9 +31,8 @@ def path(tmp_path) -> Path:
 
 
 def rewrite(content: dict, path: Path) -> None:
-    """Saves a changed content as older releases did, without a digest."""
-    content.pop("digest")
-    torch.save(content, path)
+    """Saves a changed content with the digest that it then has."""
+    torch.save(content | {"digest": checkpoint._digest(content)}, path)
 
 
 def refusal(path: Path, *says: str) -> str:
@@ -128,10 +127,7 @@ def same(a, b) -> bool:
     return training == other and list(left) == list(right) and all(torch.equal(left[k], right[k]) for k in left)
 
 
-@pytest.mark.parametrize("digest", [True, False])
-def test_no_flipped_bit_changes_what_is_loaded(path, digest):
-    if not digest:
-        rewrite(torch.load(path, weights_only=True), path)
+def test_no_flipped_bit_changes_what_is_loaded(path):
     data, whole = path.read_bytes(), checkpoint.load(path)
     refused = 0
     places = np.random.default_rng(5).integers(0, 8 * len(data), 60)
@@ -149,10 +145,7 @@ def test_no_flipped_bit_changes_what_is_loaded(path, digest):
     assert refused > 5
 
 
-@pytest.mark.parametrize("digest", [True, False])
-def test_a_flipped_bit_of_a_tensor_is_named_damage(path, digest):
-    if not digest:
-        rewrite(torch.load(path, weights_only=True), path)
+def test_a_flipped_bit_of_a_tensor_is_named_damage(path):
     feature = checkpoint.load(path)[0].state_dict()["feature"].numpy().tobytes()
     data = bytearray(path.read_bytes())
     data[data.index(feature) + 2] ^= 4

@@ -13,7 +13,7 @@ from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.info import hashes, info, metadata_of
 from pd4dgs_codec.format.options import CHOICES, EncodeOptions
-from pd4dgs_codec.model.utility import utility, without
+from pd4dgs_codec.model.sensitivity import utility, without
 from pd4dgs_codec.quality.packing import Views, pack
 
 FAST = EncodeOptions(mode="lzma", effort=1)

@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from pd4dgs_codec.model.masks import level_mask
+from pd4dgs_codec.model.networks import level_mask
 from pd4dgs_codec.train import losses
 
 

@@ -14,9 +14,9 @@ from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode, encode_with_report
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.convert import to_scene
-from pd4dgs_codec.model.harm import step_harm
 from pd4dgs_codec.model.networks import EXACT
 from pd4dgs_codec.model.picture import render, render_image
+from pd4dgs_codec.model.sensitivity import rounding_error
 from pd4dgs_codec.quality import TRAIN_MIN_DB, TRAIN_MIN_DB_PER_MEGABYTE
 from pd4dgs_codec.quality.measure import train_rate_bits
 from pd4dgs_codec.scene import ATTRIBUTES, MASK_THRESHOLD, MAX_CLASS
@@ -53,7 +53,7 @@ def records_of(trainer: Trainer, folder) -> list[dict]:
 @pytest.mark.usefixtures("short_runs_have_phases")
 @pytest.mark.parametrize(
     "owner, name, options",
-    [(prune, "anchor_harm", {"prune": 0.5}), (quantisation, "grade", {"grading": 0.5}), (prefixes, "utility", {})],
+    [(prune, "omission_error", {"prune": 0.5}), (quantisation, "grade", {"grading": 0.5}), (prefixes, "utility", {})],
 )
 def test_a_phase_that_meets_infinity_is_skipped(dataset, tmp_path, monkeypatch, owner, name, options):
     def diverged(*_, **__):
@@ -119,7 +119,7 @@ def error_of(trainer, level: int) -> float:
 
 
 def test_the_added_error_is_about_that_of_leaving_an_anchor_out(trained):
-    errors = added_error(trained.model, 1, trained.learner.views, EXACT, prune.anchor_harm).numpy()
+    errors = added_error(trained.model, 1, trained.learner.views, EXACT, prune.omission_error).numpy()
     pictures = pictures_of(trained, 1)
     near = np.flatnonzero(np.isfinite(errors) & (errors > 0))
     chosen = near[np.argsort(errors[near])][:: max(1, len(near) // 40)]
@@ -268,7 +268,7 @@ def test_the_error_of_a_step_is_about_that_of_rounding(dataset):
     with torch.no_grad():
         model.feature.add_(0.3 * torch.randn(model.feature.shape, generator=generator))
         model.offset.add_(2 * torch.randn(model.offset.shape, generator=generator))  # none in the same place
-    errors = [step_harm(model, 1, view.time, view.camera, generator) for _ in range(20)]
+    errors = [rounding_error(model, 1, view.time, view.camera, generator) for _ in range(20)]
     expected = float(sum(error.sum() for error, _, _ in errors) / len(errors))
     assert (errors[0][0] >= 0).all() and not errors[0][0][~errors[0][1]].any()
     still, found = render_image(model, 1, view.time, view.camera), []

@@ -14,10 +14,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pd4dgs_codec.model.harm import anchor_harm
-from pd4dgs_codec.model.masks import mask_logits
 from pd4dgs_codec.model.model import Model
-from pd4dgs_codec.model.networks import Rounding
+from pd4dgs_codec.model.networks import Rounding, mask_logits
+from pd4dgs_codec.model.sensitivity import omission_error
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train import workers
 from pd4dgs_codec.train.phases import Phase, long_enough
@@ -30,7 +29,7 @@ VIEWS = 24
 #: Mask of an anchor at a level that it has left: below the threshold, so that it is neither drawn there nor coded.
 ABSENT = 1e-3
 
-#: `anchor_harm` or `step_harm`.
+#: `omission_error` or `rounding_error`.
 ErrorOf = Callable[..., tuple[Tensor, Tensor, Tensor]]
 
 
@@ -56,7 +55,7 @@ class Prune(Phase):
         share, before = state.config.prune / PRUNING_ROUNDS, len(state.model.anchor_q)
         views, rounding = self._views(state), state.rounding(noisy=False)
         errors = workers.alike(
-            lambda: torch.stack([added_error(model, level, views, rounding, anchor_harm) for level in levels])
+            lambda: torch.stack([added_error(model, level, views, rounding, omission_error) for level in levels])
         )
         errors[:, round_of(model.anchor_q) != self.turn] = torch.inf
         redundant = least(errors.amax(0), share)

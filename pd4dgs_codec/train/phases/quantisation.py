@@ -19,9 +19,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pd4dgs_codec.model.harm import attribute_slopes, step_harm
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.networks import Rounding
+from pd4dgs_codec.model.sensitivity import attribute_slopes, rounding_error
 from pd4dgs_codec.scene import MASK_THRESHOLD, MAX_CLASS, SCAFFOLD_NETWORKS
 from pd4dgs_codec.train import phases, workers
 from pd4dgs_codec.train.optimiser import Optimiser
@@ -67,7 +67,7 @@ def grade(
     """Gives every anchor the class at which quantisation adds at most `share` to the squared error of each of `levels`
     beyond what it adds at class 0, and the attributes their centres. Returns how many anchors each class has."""
     errors = workers.alike(
-        lambda: torch.stack([added_error(model, level, views, rounding, step_harm).cpu() for level in levels])
+        lambda: torch.stack([added_error(model, level, views, rounding, rounding_error).cpu() for level in levels])
     )
     met = errors.isfinite()
     worst = torch.where(met, errors, 0.0).amax(0)  # a level of large error must not set the budget of the others

@@ -1,0 +1,214 @@
+"""How pictures depend on single anchors: the error of omitting one, or of rounding its attributes, and their order.
+
+By these measures anchors leave a layer or a model and get their step classes, and slices bring the anchors that matter
+most first.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pd4dgs_codec.format.slicing import bits_per_row
+from pd4dgs_codec.format.symbols import layer_symbols
+from pd4dgs_codec.model.convert import from_scene
+from pd4dgs_codec.model.model import Model
+from pd4dgs_codec.model.networks import EXACT, Rounding
+from pd4dgs_codec.model.picture import draw, render_image
+from pd4dgs_codec.scene import ATTRIBUTES, Camera, Scene
+
+Place = tuple[Camera, float]  #: a camera and a normalised time
+
+#: Random pictures of signs per view from which an anchor's weight is estimated.
+PROBES = 2
+
+
+def omission_error(
+    model: Model,
+    level: int,
+    t: float,
+    camera: Camera,
+    generator: torch.Generator,
+    *,
+    weights: Tensor | None = None,
+    rounding: Rounding = EXACT,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """(float64 [N] the approximate squared error, summed over pixels and colours, of omitting each anchor at `level`;
+    bool [N] whether the anchor may reach the picture; the picture [H, W, 3]). Arguments as for `render`; weights
+    [H, W]: of the pixels' squares.
+
+    The error is ||dI/dg||^2, the picture's derivative by a gate g on the anchor's opacities and scales times its change
+    from 1 to 0: the diagonal of the Gauss-Newton matrix, from products with random signs (Bekas, Kokiopoulou and Saad,
+    An estimator for the diagonal of a matrix, 2007).
+    """
+    image, gate, met = _gated(model, level, t, camera, rounding)
+    return _squared(image, gate, generator, weights), met, image.detach()
+
+
+def anchor_slopes(
+    model: Model, level: int, t: float, camera: Camera, generator: torch.Generator, reference: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """(float64 [N] <I - J, dI/dg> of each anchor, I the picture, J the reference [H, W, 3]; float64 [N] ||dI/dg||^2 as
+    in `omission_error`; bool [N] whether the anchor may reach the picture)."""
+    image, gate, met = _gated(model, level, t, camera, EXACT)
+    (slope,) = torch.autograd.grad((image * (image.detach() - reference)).sum(), gate, retain_graph=True)
+    return slope.double(), _squared(image, gate, generator), met
+
+
+def _gated(model: Model, level: int, t: float, camera: Camera, rounding: Rounding) -> tuple[Tensor, Tensor, Tensor]:
+    """(picture [H, W, 3], the gates of the anchors [N], all 1, bool [N] whether an anchor may reach it)."""
+    with torch.no_grad():
+        g = model.gaussians(level, t, camera, rounding)
+    n, device = len(model.anchor_q), g.means.device
+    met = torch.zeros(n, dtype=torch.bool, device=device)
+    met[g.anchors] = True
+    gate = torch.ones(n, device=device, requires_grad=True)
+    shown = gate[torch.div(g.slots, model.widths.slots, rounding_mode="floor")]
+    gated = replace(g, scales=g.scales * shown[:, None], opacities=g.opacities * shown)
+    return draw(model.info, gated, camera).image, gate, met
+
+
+def _squared(image: Tensor, gate: Tensor, generator: torch.Generator, weights: Tensor | None = None) -> Tensor:
+    """float64 [N]: the squared norm of the picture's derivative by each gate, estimated."""
+    total = torch.zeros(len(gate), dtype=torch.float64, device=gate.device)
+    for _ in range(PROBES):
+        signs = _signs(image, generator, weights)
+        (slope,) = torch.autograd.grad((image * signs).sum(), gate, retain_graph=True)
+        total += slope.double().square() / PROBES
+    return total
+
+
+def rounding_error(
+    model: Model,
+    level: int,
+    t: float,
+    camera: Camera,
+    generator: torch.Generator,
+    *,
+    weights: Tensor | None = None,
+    rounding: Rounding = EXACT,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """(float64 [N] the approximate squared error, summed over pixels and colours, of rounding each anchor's attributes
+    to the model's steps; bool [N] whether the anchor may reach the picture; the picture [H, W, 3]). Arguments and
+    method as for `omission_error`, by the derivative by each scalar; the squared error of a step Q is Q^2 / 12 on
+    average.
+    """
+    slopes, met, image = attribute_slopes(model, level, t, camera, generator, weights=weights, rounding=rounding)
+    total = torch.zeros(len(met), dtype=torch.float64, device=image.device)
+    for name, slope in slopes.items():
+        total += slope.double().square().flatten(1).sum(1) * (getattr(model.steps, name) ** 2 / 12)
+    return total, met, image
+
+
+def attribute_slopes(
+    model: Model,
+    level: int,
+    t: float,
+    camera: Camera,
+    generator: torch.Generator,
+    *,
+    weights: Tensor | None = None,
+    rounding: Rounding = EXACT,
+) -> tuple[dict[str, Tensor], Tensor, Tensor]:
+    """(by attribute, in its shape, the derivative by it of the picture's product with random signs; bool [N] whether
+    an anchor may reach the picture; the picture [H, W, 3]). Arguments as for `omission_error`.
+
+    On average over the signs, products of two derivatives by scalars of one anchor are the entries of its Gauss-Newton
+    matrix.
+    """
+    values = [getattr(model, name) for name in ATTRIBUTES]
+    with torch.enable_grad():
+        g = model.gaussians(level, t, camera, rounding)
+        image = draw(model.info, g, camera).image
+        met = torch.zeros(len(model.anchor_q), dtype=torch.bool, device=image.device)
+        met[g.anchors] = True
+        slopes = [torch.zeros_like(value) for value in values]
+        if len(g.scales):
+            slopes = list(torch.autograd.grad((image * _signs(image, generator, weights)).sum(), values))
+    return dict(zip(ATTRIBUTES, slopes, strict=True)), met, image.detach()
+
+
+def _signs(image: Tensor, generator: torch.Generator, weights: Tensor | None) -> Tensor:
+    """Random signs [H, W, 3] times the roots of the pixels' weights [H, W]."""
+    signs = (torch.randint(0, 2, image.shape, generator=generator).float() * 2 - 1).to(image.device)
+    return signs if weights is None else signs * weights.sqrt()[:, :, None]
+
+
+# -- the order of anchors ----------------------------------------------------------------------------------------------
+
+#: Pixels along the longer side of the pictures for `utility`: holes are larger than such a pixel.
+SIDE = 128
+#: The share of a layer's anchors that stay after each round, and the count below which all leave in one round.
+STAY, FEW = 0.8, 64
+
+
+def utility(scene: Scene, places: Sequence[Place], step: Callable[[], None] = lambda: None) -> np.ndarray:
+    """float64 [N]: the order in which the anchors of each layer should come, the highest first: by the gain of the
+    pictures at `places` (times 0..1) per byte, at the layer's level with all earlier layers present. Anchors that reach
+    no picture have 0, the least. step is called after each round.
+
+    Anchors leave one after another, the least first, as in a backward elimination, since the gain of an anchor depends
+    on the others: what stands behind it shows when it is gone. Omitting anchor i changes the squared error of a picture
+    I against that of the whole level by about -2 <I - J, dI/dg_i> + ||dI/dg_i||^2, g_i a gate on its opacities and
+    scales that goes from 1 to 0: the first term tells anchors that make up for absent ones from anchors that have
+    become wrong.
+    """
+    places = [(_smaller(camera), time) for camera, time in places]
+    rank, first = np.zeros(len(scene.anchor_q)), 0
+    for index, (layer, end) in enumerate(zip(scene.layers, scene.rows, strict=True)):
+        bits = bits_per_row(layer_symbols(scene, index))
+        rank[first:end] = _layer_utility(scene.prefix(layer), layer, first, bits, places, step)
+        first = end
+    return rank
+
+
+def _layer_utility(
+    scene: Scene, level: int, first: int, bits: np.ndarray, places: Sequence[Place], step: Callable[[], None]
+) -> np.ndarray:
+    """float64 [rows of the highest layer]: the round in which each anchor leaves, and its rank within the round."""
+    own = scene.rows[-1] - first
+    rank, alive = np.zeros(own), np.ones(own, bool)
+    whole = from_scene(scene)
+    references = [torch.from_numpy(render_image(whole, level, time, camera)) for camera, time in places]
+    generator, rounds = torch.Generator().manual_seed(0), 0
+    while alive.any():
+        rows = np.flatnonzero(alive)
+        model = from_scene(without(scene, first + np.flatnonzero(~alive)))
+        gain, met = np.zeros(len(rows)), np.zeros(len(rows), bool)
+        for (camera, time), reference in zip(places, references, strict=True):
+            linear, square, near = anchor_slopes(model, level, time, camera, generator, reference)
+            gain += (square - 2 * linear).numpy()[first:]
+            met |= near.numpy()[first:]
+        step()
+        rounds += 1
+        order = np.argsort(np.where(met, gain / bits[rows], -np.inf), kind="stable")
+        leaving = len(rows) if len(rows) <= FEW else math.ceil((1 - STAY) * len(rows))
+        out = rows[order[:leaving]]
+        rank[out] = np.where(met[order[:leaving]], rounds + np.arange(leaving) / leaving, 0.0)
+        alive[out] = False
+    return rank
+
+
+def without(scene: Scene, rows: np.ndarray) -> Scene:
+    """The scene without the anchors `rows`, int64 [M]."""
+    kept = np.ones(len(scene.anchor_q), bool)
+    kept[rows] = False
+    return replace(
+        scene,
+        rows=tuple(int(kept[:n].sum()) for n in scene.rows),
+        mask=tuple(codes[kept[: len(codes)]] for codes in scene.mask),
+        **scene.of_anchors(kept),
+    )
+
+
+def _smaller(camera: Camera) -> Camera:
+    """The same view with about SIDE pixels along the longer side."""
+    factor = min(1.0, SIDE / max(camera.width, camera.height))
+    width, height = (max(1, round(side * factor)) for side in (camera.width, camera.height))
+    scale = np.array([[width / camera.width], [height / camera.height], [1.0]], np.float32)
+    return Camera(camera.viewmat, (camera.K * scale).astype(np.float32), width, height)
