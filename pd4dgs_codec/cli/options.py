@@ -12,17 +12,15 @@ from collections.abc import Callable
 from typing import Any, NoReturn, TypeVar
 
 from pd4dgs_codec.cli.common import UsageError, tell
-from pd4dgs_codec.data.dataset import FOLDERS
 
 T = TypeVar("T")
 
 EXIT_CODES = (
     "exit codes: 0 done, 1 bad data or I/O, 2 wrong usage, 3 cut input decoded as far as possible (--allow-partial)"
 )
-SOURCES = (
-    "SOURCE is one of\n  "
-    + "\n  ".join(FOLDERS)
-    + """
+#: Stands for the list of sources in the details of a command; `Parser.format_help` fills it in.
+SOURCES = "<the list of sources>"
+SCENES = """\
   synthetic:static   nothing moves
   synthetic:global   large objects move slowly
   synthetic:local    the same, and small parts move on their own
@@ -33,7 +31,6 @@ SOURCES = (
                      file, a .4dgs file, a gsplat checkpoint, or module:function (time -> Gaussians)
   (teacher:PATH?cameras=SOURCE takes the cameras, times and held-out images of another source;
   otherwise ?views=N&size=WxH&fps=F&background=white&up=X,Y,Z)"""
-)
 
 
 class Parser(argparse.ArgumentParser):
@@ -52,6 +49,15 @@ class Parser(argparse.ArgumentParser):
 
     def error(self, message: str) -> NoReturn:
         raise UsageError(message)
+
+    def format_help(self) -> str:
+        """The help text, with the list of sources if the details name it."""
+        text = super().format_help()
+        if SOURCES in text:
+            from pd4dgs_codec.data.dataset import FOLDERS
+
+            text = text.replace(SOURCES, "\n".join(["SOURCE is one of", *(f"  {line}" for line in FOLDERS), SCENES]))
+        return text
 
     def print_help(self, file: object = None) -> NoReturn:
         """Prints the help on stdout and exits: 0, or 1 if stdout cannot be written."""
