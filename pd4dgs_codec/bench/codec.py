@@ -1,6 +1,7 @@
 """The codec's error against bytes and seconds, for each quantisation step x mode x effort.
 
-The error is measured on values, against those of the checkpoint, and on images, against those rendered from it.
+The error is that of rendered images against those of the checkpoint. The error of values is at most half a step;
+`pd4dgs-info` shows its bounds.
 """
 
 from __future__ import annotations
@@ -18,17 +19,10 @@ from pd4dgs_codec.bench.timing import Timing, clock, summary
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import Report, encode_with_report
 from pd4dgs_codec.format.info import hashes, info
-from pd4dgs_codec.format.kinds import LAYER_KINDS
-from pd4dgs_codec.format.options import EncodeOptions
-from pd4dgs_codec.format.plan import plan
-from pd4dgs_codec.format.symbols import float_tensors
 from pd4dgs_codec.quality.frames import Frame
 from pd4dgs_codec.quality.image import mssim
 from pd4dgs_codec.quality.levels import Level, load_levels
-from pd4dgs_codec.scene import ATTRIBUTES, MASK_STEP, Scene
-
-#: Units of the values by field of Steps; others have no unit.
-UNITS = {"scaling_log": "ln(scene unit)", "offset": "exp(scaling_log)", "mask": "share of opacity and scale"}
+from pd4dgs_codec.scene import Scene
 
 
 @dataclass(frozen=True)
@@ -42,17 +36,6 @@ class Sweep:
 
     def __len__(self) -> int:
         return len(self.step_scales) * len(self.modes) * len(self.efforts)
-
-
-@dataclass(frozen=True)
-class Deviation:
-    """Errors of all tensors that share a step. what: a field of Steps, or mask. In the unit of the values."""
-
-    what: str
-    unit: str
-    step: float
-    largest: float
-    rms: float
 
 
 @dataclass(frozen=True)
@@ -80,7 +63,6 @@ class Point:
     rate_bits: float | None
     decode: Timing
     encode: Timing | None = None
-    values: tuple[Deviation, ...] = ()
     pictures: tuple[PictureDeviation, ...] = ()
 
     @property
@@ -99,16 +81,13 @@ def sweep(
     pictures: dict[str, tuple[PictureDeviation, ...]] = {}
     points = []
     for scale in what.step_scales:
-        scaled = replace(scene, steps=scene.steps.scaled(scale))
         for mode in what.modes:
             for effort in what.efforts:
                 point, data = _point(scene, scale, mode, effort, what.repeats)
                 key = json.dumps(hashes(data))  # modes change no value, so that their images are equal
                 if key not in pictures:
                     pictures[key] = picture_deviations(load_levels(data), frames, reference)
-                planned, _ = plan(scaled, EncodeOptions(effort=effort))  # parts without effect have other values
-                values = tuple(deviations(planned, decode(data)))
-                points.append(replace(point, values=values, pictures=pictures[key]))
+                points.append(replace(point, pictures=pictures[key]))
                 step()
     return points
 
@@ -135,32 +114,6 @@ def file_point(data: bytes, repeats: int, report: Report | None = None) -> Point
         rate_bits=sum(layer.rate_bits for layer in layers) if report else None,
         decode=summary(seconds),
     )
-
-
-def deviations(given: Scene, decoded: Scene) -> list[Deviation]:
-    """One per step that the scenes' tensors use, in the order of Steps. given: planned, with the steps of the file."""
-    errors: dict[str, list[np.ndarray]] = {}
-    for index, layer in enumerate(given.layers):
-        kind = LAYER_KINDS[layer]
-        before, after = float_tensors(given, index), float_tensors(decoded, index)
-        names = ["anchor", *ATTRIBUTES]
-        names += [str(kind.planes_step) if x.ndim == 3 else kind.weights_step for x in before[len(names) :]]
-        for name, x, y in zip(names, before, after, strict=True):
-            errors.setdefault(name, []).append(np.abs(x.astype(np.float64) - y))
-    return [_deviation(name, step, errors[name]) for name, step in vars(given.steps).items() if name in errors]
-
-
-def mask_deviation(masks: Sequence[np.ndarray], codes: Sequence[np.ndarray]) -> Deviation:
-    """Of the masks 0..1 of each level from the values of their codes (uint8, same shapes)."""
-    step = np.float64(MASK_STEP)
-    errors = [np.abs(m.astype(np.float64) - c * step) for m, c in zip(masks, codes, strict=True)]
-    return _deviation("mask", float(step), errors)
-
-
-def _deviation(what: str, step: float, errors: Sequence[np.ndarray]) -> Deviation:
-    square, count = sum(float(np.square(e).sum()) for e in errors), sum(e.size for e in errors)
-    largest = max(float(e.max(initial=0.0)) for e in errors)
-    return Deviation(what, UNITS.get(what, ""), step, largest, math.sqrt(square / max(count, 1)))
 
 
 def picture_deviations(
@@ -217,17 +170,6 @@ def points_table(points: Sequence[Point]) -> str:
         what = (optional(p.step_scale, "g"), p.mode, optional(p.effort, "d"))
         rows.append((*what, *sizes, coded, *error, *seconds, ", ".join(on) or "-"))
     return markdown(head, rows)
-
-
-def values_table(points: Sequence[Point], masks: Deviation) -> str:
-    """A row per step scale and group of tensors: the largest error and the root mean square."""
-    head = ("steps x", "what", "unit", "step Q", "largest error", "RMS error", "largest / Q")
-    by_scale = {p.step_scale: p.values for p in reversed(points)}
-    rows = [(f"{scale:g}", v) for scale, values in reversed(by_scale.items()) for v in values] + [("any", masks)]
-    return markdown(head, [
-        (scale, v.what, v.unit or "1", f"{v.step:.4g}", f"{v.largest:.3g}", f"{v.rms:.3g}", f"{v.largest / v.step:.3f}")
-        for scale, v in rows
-    ])  # fmt: skip
 
 
 def panels(points: Sequence[Point]) -> list[Panel]:

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from pd4dgs_codec.bench.stability import Case, Found, largest, mpmath, refusal, small_scene
-from pd4dgs_codec.entropy import bits, channels
+from pd4dgs_codec.entropy import channels
 from pd4dgs_codec.entropy.priors import K_MAX
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format import decoder, encoder
@@ -181,8 +181,6 @@ def _without_spread() -> Found:
 SETTINGS = (("best", 1), ("best", 5), ("gauss", 5))  #: (priors, effort)
 #: The size of a channel may be this multiple of its plain binary form, and OVERHEAD bits more.
 SLACK, OVERHEAD = 1.01, 256
-#: Channels whose sum of R is compared with mpmath.
-SUMMED = ("constant", "two values, far apart", "one rare outlier", "the whole range", "heavy tails")
 
 
 def _channels() -> dict[str, tuple[str, np.ndarray]]:
@@ -216,9 +214,6 @@ def _fitting() -> Iterator[Case]:
         yield row(f"size: {name}", fed, small, SLACK, partial(_against_plain_binary, symbols))
     together = partial(_lost_symbols, [symbols for _, symbols in data.values()])
     yield row("lossless: all of these in one payload", "the channels above, side by side", lossless, 0.0, together)
-    for name in SUMMED:
-        fed, symbols = data[name]
-        yield row(f"sum of R: {name}", fed, "relative error at most 1e-9", 1e-9, partial(_rate_error, symbols))
     for value in (2**31 - 1, -(2**31)):
         act = partial(channels.encode_channels, [np.array([0, value], np.int32)])
         fed = "an int32 extreme; the limit is 2^24 - 1"
@@ -240,23 +235,6 @@ def _against_plain_binary(symbols: np.ndarray) -> Found:
     spread = int(symbols.max()) - int(symbols.min()) if symbols.size else 0
     plain = symbols.size * math.log2(spread + 1)
     return f"{coded:,} bits, plain binary {plain:,.0f}", max(coded - OVERHEAD, 0) / max(plain, 1.0)
-
-
-def _rate_error(symbols: np.ndarray) -> Found:
-    mp = mpmath()
-    with mp.workdps(50):
-        values, counts = np.unique(symbols, return_counts=True)
-        pairs = [(mp.mpf(v), mp.mpf(c)) for v, c in zip(values.tolist(), counts.tolist(), strict=True)]
-        n = mp.mpf(symbols.size)
-        mu = sum(v * c for v, c in pairs) / n
-        sigma = max(mp.sqrt(sum((v - mu) ** 2 * c for v, c in pairs) / n), mp.mpf(bits.SIGMA_MIN))
-        scale, expected = 1 / (sigma * mp.sqrt(2)), mp.mpf(0)
-        for v, c in pairs:
-            d = abs(v - mu)
-            p = (mp.erfc((d - 0.5) * scale) - mp.erfc((d + 0.5) * scale)) / 2
-            expected -= c * mp.log(max(p, mp.mpf(bits.P_MIN)), 2)
-        found = bits.gaussian_bits(symbols)
-        return f"{found:,.3f} bits", float(abs(mp.mpf(found) - expected) / max(expected, mp.mpf(1)))
 
 
 # -- quantiser: |x - x_hat| <= Q/2 and one float32 rounding, from the smallest step to the largest ---------------------

@@ -63,9 +63,9 @@ def _frames(args: argparse.Namespace, info: SceneInfo) -> list[Frame]:
 # -- codec -------------------------------------------------------------------------------------------------------------
 
 CODEC = """\
-Encodes a checkpoint at each combination of step scale, mode and effort. The error of each file is measured on its
-values and on rendered images, against those of the checkpoint. For a .pd4 file without its checkpoint only bytes and
-times are reported. Times are medians and quartiles of repetitions in one process, none begun after 5 s.
+Encodes a checkpoint at each combination of step scale, mode and effort. The error of each file is that of rendered
+images against those of the checkpoint. For a .pd4 file without its checkpoint only bytes and times are reported. Times
+are medians and quartiles of repetitions in one process, none begun after 5 s.
 
 examples:
   pd4dgs-bench codec model.pt --data recordings/kitchen --downscale 2 --plot codec.png > codec.md
@@ -98,20 +98,17 @@ def _codec(args: argparse.Namespace, console: Console) -> Outcome:
     if is_pd4(data):
         if args.plot is not None:
             raise UsageError("--plot: a file without its checkpoint has no error to plot; expected a checkpoint")
-        points, masks = [codec.file_point(data, what.repeats)], None
-        tables = [codec.points_table(points)]
+        points = [codec.file_point(data, what.repeats)]
     else:
         from pd4dgs_codec.model import checkpoint
         from pd4dgs_codec.model.convert import to_scene
 
         model, _ = checkpoint.load(args.input)
         scene = to_scene(model)
-        masks = codec.mask_deviation([model.masks(i).detach().numpy() for i in scene.layers], scene.mask)
         with progress_bar(len(what), "files", "codec") as step:
             points = codec.sweep(args.input, scene, _frames(args, scene.info), what, step)
-        tables = [codec.points_table(points), codec.values_table(points, masks)]
-    result = {"input": args.input, "machine": machine, "points": codec.as_json(points), "masks": masks and vars(masks)}
-    text = "\n\n".join([*tables, timing.machine_line(machine)])
+    result = {"input": args.input, "machine": machine, "points": codec.as_json(points)}
+    text = "\n\n".join([codec.points_table(points), timing.machine_line(machine)])
     return Outcome(result, text, codec.panels(points), "RMSE of images")
 
 
