@@ -29,8 +29,7 @@ if TYPE_CHECKING:
     import numpy as np
 
     from pd4dgs_codec.draw.player import Player
-    from pd4dgs_codec.interchange.bake import Eyes
-    from pd4dgs_codec.interchange.export import Export
+    from pd4dgs_codec.interchange.export import Export, Eyes
     from pd4dgs_codec.interchange.splats import Splats
     from pd4dgs_codec.scene import SceneInfo
 
@@ -91,7 +90,7 @@ def _export(args: argparse.Namespace, console: Console) -> int:
     else:
         check_output(args.output, args.overwrite)
     from pd4dgs_codec.interchange.export import Export
-    from pd4dgs_codec.interchange.libraries import library
+    from pd4dgs_codec.interchange.formats import library
 
     if args.to == "spz":
         library("gaussforge", "SPZ files")
@@ -144,7 +143,7 @@ def _player(args: argparse.Namespace) -> Player:
 
 
 def _eyes(args: argparse.Namespace, player: Player) -> Eyes:
-    from pd4dgs_codec.interchange.bake import eyes_of_cameras, eyes_of_scene
+    from pd4dgs_codec.interchange.export import eyes_of_cameras, eyes_of_scene
 
     if args.data is None:
         return eyes_of_scene(player)
@@ -156,9 +155,7 @@ def _write_still(args: argparse.Namespace, export: Export, console: Console) -> 
     import numpy as np
 
     from pd4dgs_codec.interchange.export import upright
-    from pd4dgs_codec.interchange.glb import glb_bytes
-    from pd4dgs_codec.interchange.libraries import SPZ_STEP, spz_bytes
-    from pd4dgs_codec.interchange.ply import ply_bytes
+    from pd4dgs_codec.interchange.formats import SPZ_STEP, glb_bytes, ply_bytes, spz_bytes
 
     turn = upright(export.player.info.up) if args.to in ("glb", "spz") else None
     with progress_bar(args.refine, "steps", "refining") as step:
@@ -197,8 +194,7 @@ def frame_times(info: SceneInfo, fps: float) -> list[float]:
 
 def _write_sequence(args: argparse.Namespace, export: Export) -> dict[str, Any]:
     """Writes frames over the whole time range."""
-    from pd4dgs_codec.interchange.libraries import fourdgs_bytes
-    from pd4dgs_codec.interchange.ply import ply_bytes
+    from pd4dgs_codec.interchange.formats import fourdgs_bytes, ply_bytes
 
     info, fps = export.player.info, args.fps or FPS
     seconds = info.time_range[1] - info.time_range[0]

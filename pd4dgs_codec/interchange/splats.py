@@ -1,4 +1,4 @@
-"""Explicit Gaussians as 3D Gaussian splatting has them: colours in spherical harmonics, nothing else seen from a side.
+"""Explicit Gaussians as in 3D Gaussian splatting: only the colour depends on the direction, in spherical harmonics.
 
 The real spherical harmonics and their signs are those of the reference implementation of 3D Gaussian splatting (Kerbl
 et al. 2023), which PLY, SPZ and KHR_gaussian_splatting share: a colour is 0.5 + sum c_j Y_j(d), cut off below at 0, d
@@ -41,8 +41,7 @@ class Splats:
     def colors(self, eye: np.ndarray) -> np.ndarray:
         """float32 [N, 3] >= 0 as an eye at [3], world, sees them."""
         basis = harmonics(unit(self.means - eye.astype(np.float32)), self.degree)
-        colors: np.ndarray = np.maximum(np.einsum("nj,njc->nc", basis, self.sh) + np.float32(0.5), 0)
-        return colors
+        return np.asarray(np.maximum(np.einsum("nj,njc->nc", basis, self.sh) + np.float32(0.5), 0))
 
     def taken(self, rows: np.ndarray) -> Splats:
         """The Gaussians `rows`."""
@@ -59,15 +58,13 @@ def picture(splats: Splats, camera: Camera, background: tuple[float, float, floa
     image, _ = draw(
         splats.means, splats.quats, splats.scales, splats.opacities, colors, camera, background, near_plane=near
     )
-    clipped: np.ndarray = np.clip(image, 0, 1)
-    return clipped
+    return np.asarray(np.clip(image, 0, 1))
 
 
 def camera_eye(camera: Camera) -> np.ndarray:
-    """float64 [3] where a camera stands, world."""
+    """float64 [3]: the centre of a camera, world."""
     viewmat = camera.viewmat.astype(np.float64)
-    eye: np.ndarray = -viewmat[:3, :3].T @ viewmat[:3, 3]
-    return eye
+    return np.asarray(-viewmat[:3, :3].T @ viewmat[:3, 3])
 
 
 def looking(eye: np.ndarray, ahead: np.ndarray, up: np.ndarray, like: Camera) -> Camera:
@@ -98,8 +95,7 @@ def sphere(count: int) -> np.ndarray:
 def unit(vectors: np.ndarray) -> np.ndarray:
     """Vectors [..., d] divided by their length; a zero stays one."""
     length = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    result: np.ndarray = vectors / np.maximum(length, np.finfo(vectors.dtype).tiny)
-    return result
+    return np.asarray(vectors / np.maximum(length, np.finfo(vectors.dtype).tiny))
 
 
 def harmonics(directions: np.ndarray, degree: int) -> np.ndarray:

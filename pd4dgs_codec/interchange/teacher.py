@@ -1,52 +1,60 @@
-"""Models that can say their Gaussians at a time, as a dataset: pictures of them from cameras around them.
+"""Pictures of other programs' Gaussians over time as a dataset: the source `teacher:PATH[?key=value&...]`.
 
-The source is `teacher:PATH[?key=value&...]`. PATH is a folder of PLY or SPZ files, one per frame, in the order of the
-last number in their names, or one such file; a `.4dgs` file; a checkpoint of gsplat (`.pt`, `.ckpt`), which stands
-still; or `module:function`, called with t in 0..1: it returns means, quats (wxyz), scales, opacities and either colors
-or sh, as a mapping or as attributes, numpy arrays or tensors.
+PATH is a folder of PLY or SPZ files, one per frame, in the order of the last number in their names, or one such file; a
+`.4dgs` file; a static gsplat checkpoint (`.pt`, `.ckpt`); or `module:function`, called with t in 0..1. The function
+returns means, quats (wxyz), scales, opacities and either colors or sh, as a mapping or as attributes, numpy arrays or
+tensors.
 
-Keys: cameras=SOURCE looks from the training cameras of a dataset at their times; else views=N cameras (200) of
-size=WxH (400x400) stand around the Gaussians, or where a `cameras.json` beside them says. fps=F (30) tells how long a
-folder of frames takes, background=black|white|R,G,B what is behind them, up=X,Y,Z (0,-1,0) where up is.
+Keys: cameras=SOURCE takes the training cameras of a dataset and their times; otherwise views=N cameras (200) of
+size=WxH (400x400) stand around the Gaussians, or as a `cameras.json` beside them says. fps=F (30) is the frame rate of
+a folder, background=black|white|R,G,B the background, up=X,Y,Z (0,-1,0) the direction up.
 """
 
 from __future__ import annotations
 
+import contextlib
+import importlib
 import math
+import os
 import re
-from collections.abc import Sequence
+import sys
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from pd4dgs_codec.data.dataset import load
-from pd4dgs_codec.data.files import split_options
+from pd4dgs_codec.data.files import read_file, split_options
 from pd4dgs_codec.data.posed import depth_range, held_out, points_box
 from pd4dgs_codec.data.view import Dataset, View
-from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.interchange.models import Teacher, read_model
+from pd4dgs_codec.errors import DataError, one_line
+from pd4dgs_codec.interchange.formats import SH_SPAN, checked, library, read_gsplat, read_splats
 from pd4dgs_codec.interchange.scaffold_gs import read_cameras
-from pd4dgs_codec.interchange.splats import SH_C0, looking, picture, sphere, spread
+from pd4dgs_codec.interchange.splats import SH_C0, Splats, looking, picture, sphere, spread
 from pd4dgs_codec.quality.frames import shrunk
 from pd4dgs_codec.scene import Camera
 
 PREFIX = "teacher:"
-#: Fainter Gaussians are no anchors, and do not count for where the scene is.
+FRAME_SUFFIXES = (".ply", ".spz")
+#: The results of a function, with colors instead of sh if it has no harmonics.
+PARTS = ("means", "quats", "scales", "opacities", "sh")
+#: Fainter Gaussians give no anchors, and do not count for the extent of the scene.
 SOLID = 0.1
-POINTS = 100_000  #: of which the initial anchors are drawn, at most
+POINTS = 100_000  #: most points that the initial anchors are drawn from
 FIELD_OF_VIEW = math.radians(50)
-#: Cameras stand so far from the middle, in radii of the sphere around 90 of 100 Gaussians, and no lower than this sine
-#: below it.
+#: Distance of the cameras from the middle, in radii of the sphere around 90 % of the Gaussians, and the lowest sine of
+#: their elevation.
 DISTANCE, LOWEST = 2.6, -0.35
-MIDDLE = 0.5  #: the instant whose Gaussians the anchors start at
-BOX_TIMES = 5  #: instants at which it is looked how far the Gaussians reach
-PATH_TIMES = 17  #: instants of their paths, at most
-#: Rows of two instants are the same Gaussians if the median distance from one to the other is below this share of the
-#: median distance between rows drawn at random.
+MIDDLE = 0.5  #: the time of the initial anchors
+BOX_TIMES = 5  #: times that the box covers
+PATH_TIMES = 17  #: most times of the Gaussians' paths
+#: Rows of two times are the same Gaussians if the median distance between them is below this share of the median
+#: distance between random rows.
 SAME = 0.25
-#: Of the times of cameras that have none: any stretch of them is spread over the whole time.
+#: Times of cameras without any advance by this share, so that each stretch of cameras covers the whole time.
 GOLDEN = (5**0.5 - 1) / 2
 EXAMPLES = {
     "cameras": "cameras=FOLDER", "views": "views=200", "size": "size=400x400", "fps": "fps=30", "up": "up=0,-1,0",
@@ -58,7 +66,7 @@ Triple = tuple[float, float, float]
 
 @dataclass(frozen=True)
 class Options:
-    """See the module."""
+    """The options of a source, see the module."""
 
     cameras: str | None = None
     views: int = 200
@@ -69,7 +77,7 @@ class Options:
 
 
 def load_source(source: str, *, downscale: int = 1, holdout: int = 8) -> Dataset:
-    """`data.dataset.load` for every source, teachers included. Raises DataError."""
+    """`data.dataset.load` for every source, including `teacher:`. Raises DataError."""
     if not source.startswith(PREFIX):
         return load(source, downscale=downscale, holdout=holdout)
     place, options = _parsed(source)
@@ -80,10 +88,10 @@ def load_source(source: str, *, downscale: int = 1, holdout: int = 8) -> Dataset
 
 
 def _like(source: str, teacher: Teacher, data: Dataset) -> Dataset:
-    """The dataset with the teacher's pictures in the place of its training pictures; held-out ones stay true."""
+    """The dataset with the teacher's pictures as training pictures; its held-out ones stay."""
     solid = _solid(source, teacher, MIDDLE)
-    shots = [(view.camera, view.time) for view in data.train]
-    train = _pictures(teacher, shots, data.background, data.near)
+    poses = [(view.camera, view.time) for view in data.train]
+    train = _pictures(teacher, poses, data.background, data.near)
     return replace(data, name=source, train=tuple(train), **_points(teacher, solid))
 
 
@@ -92,13 +100,13 @@ def _around(source: str, place: Path, teacher: Teacher, options: Options, downsc
     solid = _solid(source, teacher, MIDDLE)
     cameras, up = _cameras(place, teacher.splats(teacher.nearest(MIDDLE)).means[solid], options, downscale)
     still = teacher.times is not None and len(teacher.times) == 1
-    shots = [(camera, 0.0 if still else i * GOLDEN % 1.0) for i, camera in enumerate(cameras)]
+    poses = [(camera, 0.0 if still else i * GOLDEN % 1.0) for i, camera in enumerate(cameras)]
     times = teacher.times or tuple(np.linspace(0, 1, BOX_TIMES))
     some = spread(times, BOX_TIMES)
     everywhere = np.concatenate([teacher.splats(t).means[_solid(source, teacher, t)] for t in some])
     box = points_box(everywhere)
     near, far = depth_range([c.viewmat.astype(np.float64) for c in cameras], box, everywhere)
-    views = _pictures(teacher, shots, options.background, near)
+    views = _pictures(teacher, poses, options.background, near)
     train, test = held_out(views, holdout)
     return Dataset(
         name=source, train=tuple(train), test=tuple(test),
@@ -109,7 +117,7 @@ def _around(source: str, place: Path, teacher: Teacher, options: Options, downsc
 
 
 def _solid(source: str, teacher: Teacher, t: float) -> np.ndarray:
-    """Rows of the Gaussians at an instant that are not faint."""
+    """Rows of the Gaussians at a time that are not faint."""
     rows = np.flatnonzero(teacher.splats(teacher.nearest(t)).opacities >= SOLID)
     if not len(rows):
         raise DataError(f"{source}: no Gaussian is as opaque as {SOLID:g} at {t:g}, expected one at least")
@@ -117,7 +125,7 @@ def _solid(source: str, teacher: Teacher, t: float) -> np.ndarray:
 
 
 def _points(teacher: Teacher, solid: np.ndarray) -> dict[str, Any]:
-    """The fields of a Dataset on its points: POINTS of these rows at most, with their paths where rows stay the same
+    """The fields of a Dataset on its points: at most POINTS of these rows, with paths if rows stay the same
     Gaussians."""
     rows = solid if len(solid) <= POINTS else solid[np.random.default_rng(0).permutation(len(solid))[:POINTS]]
     splats = teacher.splats(teacher.nearest(MIDDLE))
@@ -127,7 +135,7 @@ def _points(teacher: Teacher, solid: np.ndarray) -> dict[str, Any]:
 
 
 def _paths(teacher: Teacher, rows: np.ndarray, count: int) -> dict[str, Any]:
-    """Where these rows of `count` are over the time; nothing if they do not stay the same Gaussians."""
+    """The places of these rows of `count` over time; nothing if rows do not stay the same Gaussians."""
     times = spread(teacher.times or tuple(np.linspace(0, 1, PATH_TIMES)), PATH_TIMES)
     others, places = np.random.default_rng(0).permutation(len(rows)), list[np.ndarray]()
     for t in times:
@@ -142,14 +150,14 @@ def _paths(teacher: Teacher, rows: np.ndarray, count: int) -> dict[str, Any]:
     return {"paths": np.stack(places), "path_times": times} if len(times) > 1 else {}
 
 
-def _pictures(teacher: Teacher, shots: Sequence[tuple[Camera, float]], background: Triple, near: float) -> list[View]:
-    """The teacher seen by each camera at its time, or at the instant known next to it; each instant is read once."""
+def _pictures(teacher: Teacher, poses: Sequence[tuple[Camera, float]], background: Triple, near: float) -> list[View]:
+    """The teacher seen by each camera at the known time next to its own; each time is read once."""
     views: dict[int, View] = {}
-    for i in sorted(range(len(shots)), key=lambda i: shots[i][1]):
-        camera, t = shots[i][0], teacher.nearest(shots[i][1])
+    for i in sorted(range(len(poses)), key=lambda i: poses[i][1]):
+        camera, t = poses[i][0], teacher.nearest(poses[i][1])
         image = np.rint(picture(teacher.splats(t), camera, background, near) * 255).astype(np.uint8)
         views[i] = View(camera.viewmat, camera.K, camera.width, camera.height, t, image, None, f"{i:05d}", i)
-    return [views[i] for i in range(len(shots))]
+    return [views[i] for i in range(len(poses))]
 
 
 def _parsed(source: str) -> tuple[str, Options]:
@@ -161,7 +169,7 @@ def _parsed(source: str) -> tuple[str, Options]:
 
 
 def _value(key: str, text: str) -> Any:
-    """The value of a key; ValueError for what is none."""
+    """The value of a key. Raises ValueError for an invalid one."""
     if key == "cameras" and text:
         return text
     if key == "views" and 2 <= int(text) <= 100_000:
@@ -181,7 +189,7 @@ def _value(key: str, text: str) -> Any:
 
 
 def _cameras(place: Path, points: np.ndarray, options: Options, downscale: int) -> tuple[list[Camera], Triple]:
-    """Cameras of a cameras.json beside the Gaussians, else around them, and the direction up."""
+    """The cameras of a cameras.json beside the Gaussians, else cameras around them, and the direction up."""
     beside = next((p / "cameras.json" for p in (place, place.parent) if (p / "cameras.json").is_file()), None)
     if beside is not None:
         cameras, up = read_cameras(beside)
@@ -198,3 +206,125 @@ def _cameras(place: Path, points: np.ndarray, options: Options, downscale: int) 
     K = np.array([[focal, 0, width / 2], [0, focal, height / 2], [0, 0, 1]], np.float32)
     like = shrunk(Camera(np.eye(4, dtype=np.float32), K, width, height), downscale)
     return [looking(middle + DISTANCE * radius * d, -d, axis, like) for d in places], options.up
+
+
+# -- models ------------------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True)
+class Teacher:
+    """A model that gives Gaussians at a time.
+
+    splats: normalised time -> Gaussians. times: the times that it knows, None for all. seconds: from the first to the
+    last.
+    """
+
+    splats: Callable[[float], Splats]
+    times: tuple[float, ...] | None
+    seconds: float
+
+    def nearest(self, t: float) -> float:
+        """The known time next to t."""
+        return t if self.times is None else min(self.times, key=lambda known: abs(known - t))
+
+
+def read_model(place: str, fps: float) -> Teacher:
+    """The teacher at a path, or `module:function`. fps: frames per second of a folder. Raises DataError."""
+    path = Path(place)
+    if path.is_dir():
+        return _folder(path, fps)
+    if path.is_file():
+        name = path.name.lower()
+        if name.endswith(".4dgs"):
+            return _fourdgs(path)
+        read = read_gsplat if name.endswith((".pt", ".pth", ".ckpt")) else read_splats
+        splats = read(path)
+        return Teacher(lambda t: splats, (0.0,), 1.0)
+    if match := re.fullmatch(r"([A-Za-z_][\w.]*):([A-Za-z_]\w*)", place):
+        return Teacher(_function(*match.groups()), None, 1.0)
+    raise DataError(f"{place}: found nothing, expected a folder of PLY or SPZ files, a file, or module:function")
+
+
+def _folder(folder: Path, fps: float) -> Teacher:
+    """One file per frame."""
+    kinds = {suffix: [p for p in folder.iterdir() if p.suffix.lower() == suffix] for suffix in FRAME_SUFFIXES}
+    paths = max(kinds.values(), key=len)
+    if not paths:
+        raise DataError(f"{folder}: holds no file that ends in {' or '.join(FRAME_SUFFIXES)}, expected one per frame")
+
+    def place(path: Path) -> tuple[int, str]:
+        digits = re.findall(r"\d{1,18}", path.stem)
+        return int(digits[-1]) if digits else 0, path.name
+
+    paths.sort(key=place)
+    times = tuple(i / max(len(paths) - 1, 1) for i in range(len(paths)))
+
+    @lru_cache(maxsize=2)
+    def frame(i: int) -> Splats:
+        return read_splats(paths[i])
+
+    def splats(t: float) -> Splats:
+        return frame(round(t * (len(paths) - 1)))
+
+    return Teacher(splats, times, max(len(paths) - 1, 1) / fps)
+
+
+def _fourdgs(path: Path) -> Teacher:
+    """A .4dgs file over its whole time."""
+    fourdgs = library("fourdgs", ".4dgs files")
+    try:
+        scene = fourdgs.read(read_file(path))
+    except (fourdgs.FourdgsError, ValueError, MemoryError, OSError) as error:
+        raise DataError(f"{path}: fourdgs cannot read it: {one_line(str(error), 160)}") from None
+    g, seconds, cutoff = scene.gaussians, float(scene.header.duration_sec), float(scene.header.cutoff)
+
+    def splats(t: float) -> Splats:
+        state = g.state_at(min(t, 1 - 1e-6) * seconds, cutoff)  # the end itself is no longer shown
+        rows = state["indices"]
+        sh = [(g.colors[rows, None, :3] - 0.5) / SH_C0]
+        if g.sh is not None and g.sh_degree:
+            flat = g.sh[rows].astype(np.float32) * (2 * SH_SPAN / 255) - SH_SPAN
+            sh.append(flat.reshape(len(rows), 3, flat.shape[1] // 3).transpose(0, 2, 1))
+        return checked(
+            f"{path} at {t:g}",
+            means=state["centers"],
+            quats=g.rotations[rows][:, [3, 0, 1, 2]],
+            scales=g.scales[rows],
+            opacities=state["opacity"],
+            sh=np.concatenate(sh, axis=1),
+        )
+
+    return Teacher(splats, None, seconds)
+
+
+def _function(module: str, name: str) -> Callable[[float], Splats]:
+    """The user's own function. Its module is searched in the working folder first."""
+    with contextlib.ExitStack() as stack:
+        if (here := os.getcwd()) not in sys.path:
+            sys.path.insert(0, here)
+            stack.callback(sys.path.remove, here)
+        try:
+            function = getattr(importlib.import_module(module), name)
+        except (ImportError, AttributeError, SyntaxError) as error:
+            raise DataError(f"{module}:{name}: cannot be imported: {error}") from None
+
+    def splats(t: float) -> Splats:
+        where = f"{module}:{name} at {t:g}"
+        try:
+            answer = function(t)
+        except Exception as error:
+            raise DataError(f"{where}: raised {type(error).__name__}: {error}") from error
+        found = answer if isinstance(answer, Mapping) else {k: getattr(answer, k, None) for k in (*PARTS, "colors")}
+
+        def part(key: str) -> np.ndarray:
+            value = found.get(key)
+            if value is not None and hasattr(value, "detach"):
+                value = value.detach().cpu().numpy()
+            if not isinstance(value, np.ndarray) or value.dtype.kind not in "fiu":
+                raise DataError(f"{where}: {key} is {type(value).__name__}, expected an array of numbers")
+            return value.astype(np.float32)
+
+        sh = part("sh") if found.get("sh") is not None else ((part("colors") - 0.5) / SH_C0)[:, None]
+        return checked(where, sh=sh, **{key: part(key) for key in PARTS[:4]})
+
+    return splats

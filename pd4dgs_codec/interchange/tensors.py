@@ -1,8 +1,8 @@
-"""Tensors out of files that torch wrote, TorchScript or pickles, without torch and without running what they hold.
+"""Tensors from files of torch, pickles and TorchScript, without running any code of theirs.
 
-Both are zip archives with a pickle `data.pkl` that names tensors, and one member per storage. The pickle is read by an
-unpickler that knows a handful of names; any other is refused. TorchScript's classes become `Module`, the names of
-their members and nothing else; its code is not looked at.
+Both are zip archives with a pickle `data.pkl` and one member per storage. The unpickler knows a handful of names and
+refuses all others. Classes of TorchScript become `Module` with their members; their code is not read.
+`torch.load(weights_only=True)` refuses TorchScript.
 """
 
 from __future__ import annotations
@@ -42,12 +42,7 @@ class Refused(Exception):
 
 def read_tensors(path: Path) -> Any:
     """What the file holds: dicts, lists, scalars, modules, and tensors as numpy arrays. Raises DataError."""
-    try:
-        raw = read_file(path)
-    except FileNotFoundError:
-        raise DataError(f"{path}: missing, expected a file of tensors") from None
-    except OSError as error:
-        raise DataError(f"{path}: cannot be read: {error.strerror}") from None
+    raw = read_file(path)
     try:
         with zipfile.ZipFile(io.BytesIO(raw)) as archive:
             return _content(archive)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pd4dgs_codec.interchange.ply import properties
+from pd4dgs_codec.interchange.formats import properties
 
 
 def _count(path) -> int:

@@ -7,8 +7,16 @@ import pytest
 from tiny import camera_ahead
 
 from pd4dgs_codec.draw.player import Player
-from pd4dgs_codec.interchange.bake import _fitted, bake, eyes_of_cameras, eyes_of_scene
-from pd4dgs_codec.interchange.export import Export, cost, turned_camera, upright
+from pd4dgs_codec.interchange.export import (
+    Export,
+    _fitted,
+    bake,
+    cost,
+    eyes_of_cameras,
+    eyes_of_scene,
+    turned_camera,
+    upright,
+)
 from pd4dgs_codec.interchange.splats import harmonics, picture, unit
 from pd4dgs_codec.scene import Camera
 

@@ -12,9 +12,9 @@ import torch
 from test_formats import make_splats
 
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.interchange.models import read_model, read_splats
-from pd4dgs_codec.interchange.ply import ply_bytes
+from pd4dgs_codec.interchange.formats import ply_bytes, read_splats
 from pd4dgs_codec.interchange.scaffold_gs import read_cameras
+from pd4dgs_codec.interchange.teacher import read_model
 from pd4dgs_codec.interchange.tensors import read_tensors
 
 CASES = 150

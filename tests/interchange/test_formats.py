@@ -6,9 +6,7 @@ import numpy as np
 import pytest
 
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.interchange.glb import glb_bytes
-from pd4dgs_codec.interchange.libraries import fourdgs_bytes, spz_bytes
-from pd4dgs_codec.interchange.ply import ply_bytes
+from pd4dgs_codec.interchange.formats import fourdgs_bytes, glb_bytes, ply_bytes, spz_bytes
 from pd4dgs_codec.interchange.splats import Splats, unit
 
 

@@ -15,9 +15,7 @@ import numpy as np
 import pytest
 from test_formats import make_splats
 
-from pd4dgs_codec.interchange.glb import glb_bytes
-from pd4dgs_codec.interchange.libraries import spz_bytes
-from pd4dgs_codec.interchange.ply import ply_bytes
+from pd4dgs_codec.interchange.formats import glb_bytes, ply_bytes, spz_bytes
 from pd4dgs_codec.interchange.splats import Splats, harmonics, unit
 
 MODULES = Path(os.environ.get("PD4DGS_NODE_MODULES", Path(__file__).parents[2] / "node_modules"))

@@ -14,11 +14,9 @@ import torch
 from test_formats import make_splats
 
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.interchange.libraries import fourdgs_bytes, spz_bytes
-from pd4dgs_codec.interchange.models import read_model, read_splats
-from pd4dgs_codec.interchange.ply import ply_bytes
+from pd4dgs_codec.interchange.formats import fourdgs_bytes, ply_bytes, read_splats, spz_bytes
 from pd4dgs_codec.interchange.splats import Splats, camera_eye, picture
-from pd4dgs_codec.interchange.teacher import load_source
+from pd4dgs_codec.interchange.teacher import load_source, read_model
 from pd4dgs_codec.model.config import PRESETS
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.initialise import fresh_model

@@ -1,0 +1,334 @@
+"""Files of explicit Gaussians: PLY, SPZ and gsplat checkpoints read; PLY, glTF, SPZ and 4dgs written.
+
+SPZ, compressed PLY and 4dgs go through gaussforge and fourdgs, which are in the extra `interchange`.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import io
+import json
+import os
+import re
+import struct
+import sys
+import zlib
+from collections.abc import Iterator, Sequence
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pd4dgs_codec.data.files import LARGEST, read_file, read_vertices
+from pd4dgs_codec.errors import DataError, one_line
+from pd4dgs_codec.interchange.splats import MAX_DEGREE, SH_C0, Splats, unit
+from pd4dgs_codec.interchange.tensors import read_tensors
+
+#: Coefficients of the harmonics without the constant, by degree.
+REST = {(degree + 1) ** 2 - 1: degree for degree in range(MAX_DEGREE + 1)}
+#: PLY files store opacities as logits and scales as logarithms, of values within these bounds.
+LEAST_OPACITY, LEAST_SCALE = 1e-6, 1e-12
+#: KHR_gaussian_splatting: linear scales and opacities, quaternions xyzw.
+#: https://github.com/KhronosGroup/glTF/tree/main/extensions/2.0/Khronos/KHR_gaussian_splatting
+EXTENSION = "KHR_gaussian_splatting"
+FLOAT, POINTS = 5126, 0  #: glTF's numbers of a component type and of a primitive's mode
+TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
+JSON, BINARY = 0x4E4F534A, 0x004E4942  #: types of chunks
+#: SPZ rounds positions to SPZ_STEP and holds them up to SPZ_REACH from 0, scene units: 24 bits, 12 of them fractional.
+SPZ_STEP, SPZ_REACH = 1 / 4096, 2048.0
+#: SPZ's first bytes, and bounds: Gaussians, and unpacked bytes of each (65 with all harmonics, and extensions).
+SPZ_MAGIC, SPZ_MOST, SPZ_BYTES = b"NGSP", 10_000_000, 128
+#: 4dgs files store harmonics but the constant as bytes, from -SH_SPAN to SH_SPAN.
+SH_SPAN = 4.0
+
+
+def checked(
+    where: str, means: np.ndarray, quats: np.ndarray, scales: np.ndarray, opacities: np.ndarray, sh: np.ndarray
+) -> Splats:
+    """Splats of these arrays with unit rotations, without those that are not finite or huge. Raises DataError for wrong
+    shapes, and if none is left."""
+    n = len(means) if means.ndim else 0
+    harmonics = sh.shape[-2] if sh.ndim == 3 else 1
+    shapes = {"means": (n, 3), "quats": (n, 4), "scales": (n, 3), "opacities": (n,), "sh": (n, harmonics, 3)}
+    parts = {"means": means, "quats": quats, "scales": scales, "opacities": opacities, "sh": sh}
+    for name, array in parts.items():
+        if array.shape != shapes[name]:
+            raise DataError(f"{where}: {name} has shape {array.shape}, expected {shapes[name]}")
+    if sh.shape[1] - 1 not in REST:
+        raise DataError(
+            f"{where}: {sh.shape[1]} coefficients per colour, expected {', '.join(str(k + 1) for k in REST)}"
+        )
+    good = np.ones(n, bool)
+    for array in parts.values():
+        good &= (np.abs(array) <= LARGEST).all(axis=tuple(range(1, array.ndim)))  # also false of NaN
+    good &= (np.linalg.norm(quats, axis=1) > 0) & (scales >= 0).all(axis=1) & (opacities >= 0) & (opacities <= 1)
+    if not good.any():
+        raise DataError(f"{where}: none of {n} Gaussians is finite with a rotation, expected one at least")
+    kept = {name: np.ascontiguousarray(array[good], np.float32) for name, array in parts.items()}
+    return Splats(**kept | {"quats": unit(kept["quats"])})
+
+
+def library(name: str, what: str) -> Any:
+    """A module of the extra; DataError that names it if it is not there."""
+    try:
+        return import_module(name)
+    except ImportError:
+        raise DataError(
+            f"{what} need the package {name}, which is not installed: pip install 'pd4dgs-codec[interchange]'"
+        ) from None
+
+
+@contextlib.contextmanager
+def quiet() -> Iterator[None]:
+    """Drops the output of libraries, from C too."""
+    sys.stdout.flush()
+    sys.stderr.flush()
+    kept = [os.dup(stream) for stream in (1, 2)]
+    with open(os.devnull, "w") as nowhere:
+        try:
+            for stream in (1, 2):
+                os.dup2(nowhere.fileno(), stream)
+            yield
+        finally:
+            with contextlib.suppress(TypeError):  # Windows finds no C library by this name
+                ctypes.CDLL(None).fflush(None)  # before C's buffers are written later
+            for stream, old in zip((1, 2), kept, strict=True):
+                os.dup2(old, stream)
+                os.close(old)
+
+
+# -- reading -----------------------------------------------------------------------------------------------------------
+
+
+def read_splats(path: Path) -> Splats:
+    """The Gaussians of a PLY file of 3D Gaussian splatting, a compressed PLY or an SPZ file. Raises DataError."""
+    compressed = path.name.lower().endswith(".compressed.ply")
+    if path.suffix.lower() == ".spz" or compressed:
+        rows = read_vertices(path, _unpacked(path, "compressed.ply" if compressed else "spz"))
+    else:
+        rows = read_vertices(path)
+    names = set(rows.dtype.names or ())
+
+    def stack(*wanted: str) -> np.ndarray:
+        missing = [name for name in wanted if name not in names]
+        if missing:
+            raise DataError(f"{path}: has no property {missing[0]}, expected those of 3D Gaussian splatting")
+        return np.stack([rows[name] for name in wanted], axis=1).astype(np.float32)
+
+    rest = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in names)
+    if rest % 3 or rest // 3 not in REST:
+        raise DataError(f"{path}: has {rest} properties f_rest_*, expected {', '.join(str(3 * n) for n in REST)}")
+    sh = [stack("f_dc_0", "f_dc_1", "f_dc_2")[:, None]]
+    if rest:
+        columns = stack(*(f"f_rest_{i}" for i in range(rest)))
+        sh.append(columns.reshape(len(rows), 3, rest // 3).transpose(0, 2, 1))
+    with np.errstate(over="ignore"):
+        return checked(
+            str(path),
+            means=stack("x", "y", "z"),
+            quats=stack("rot_0", "rot_1", "rot_2", "rot_3"),
+            scales=np.exp(stack("scale_0", "scale_1", "scale_2")),
+            opacities=1 / (1 + np.exp(-stack("opacity")[:, 0])),
+            sh=np.concatenate(sh, axis=1),
+        )
+
+
+def _unpacked(path: Path, kind: str) -> bytes:
+    """The PLY that gaussforge makes of an SPZ file or a compressed PLY."""
+    forge = library("gaussforge", "SPZ files and compressed PLYs").GaussForge()
+    data = read_file(path)
+    if kind == "spz":
+        _check_spz(path, data)
+    with quiet():
+        found = forge.convert(data, kind, "ply")
+    if "error" in found or not found["data"]:
+        why = one_line(str(found.get("error", "no Gaussians were found")), 120)
+        raise DataError(f"{path}: gaussforge cannot read it: {why}")
+    return bytes(found["data"])
+
+
+def _check_spz(path: Path, data: bytes) -> None:
+    """Raises DataError for other files, and if more is unpacked than the Gaussians take: gaussforge has no bound."""
+    unpacker, zipped = zlib.decompressobj(wbits=31), data[:4] != SPZ_MAGIC  # from version 4 on the header is bare
+    try:
+        head = unpacker.decompress(data, 20) if zipped else data[:20]
+        if head[:4] != SPZ_MAGIC or len(head) < 16:
+            raise DataError(f"{path}: is no SPZ file, expected one that begins with {SPZ_MAGIC.decode()}")
+        count = int.from_bytes(head[8:12], "little")
+        if count > SPZ_MOST:
+            raise DataError(f"{path}: says it has {count:,} Gaussians, expected {SPZ_MOST:,} at most")
+        size, most = len(head), len(head) + SPZ_BYTES * count
+        while zipped and not unpacker.eof and size <= most:
+            part = unpacker.decompress(unpacker.unconsumed_tail, 1 << 20)
+            if not part:
+                break
+            size += len(part)
+    except zlib.error as error:
+        raise DataError(f"{path}: is no SPZ file: {error}") from None
+    if not zipped:  # a table of streams: packed and unpacked bytes of each
+        table = data[int.from_bytes(head[16:20], "little") :][: 16 * head[15]]
+        size = sum(int.from_bytes(table[i + 8 : i + 16], "little") for i in range(0, len(table), 16))
+    if size > most:
+        raise DataError(f"{path}: unpacks to more than its {count:,} Gaussians take")
+
+
+def read_gsplat(path: Path) -> Splats:
+    """A checkpoint of gsplat's trainers: {"splats": state dict}."""
+    content = read_tensors(path)
+    state = content.get("splats") if isinstance(content, dict) else None
+    wanted = ("means", "quats", "scales", "opacities", "sh0", "shN")
+    missing = [name for name in wanted if not isinstance(state, dict) or not isinstance(state.get(name), np.ndarray)]
+    if missing or not isinstance(state, dict):
+        raise DataError(f"{path}: has no splats.{missing[0]}; expected a checkpoint of gsplat with spherical harmonics")
+    parts = {name: state[name].astype(np.float32) for name in wanted}
+    with np.errstate(over="ignore"):
+        return checked(
+            str(path),
+            means=parts["means"],
+            quats=parts["quats"],
+            scales=np.exp(parts["scales"]),
+            opacities=1 / (1 + np.exp(-parts["opacities"])),
+            sh=np.concatenate([parts["sh0"], parts["shN"]], axis=1) if parts["sh0"].ndim == 3 else parts["sh0"],
+        )
+
+
+# -- writing -----------------------------------------------------------------------------------------------------------
+
+
+def properties(degree: int) -> list[str]:
+    """Names of the vertex properties in order, as 3D Gaussian splatting writes them; all are float."""
+    rest = 3 * ((degree + 1) ** 2 - 1)
+    return [
+        "x", "y", "z", "nx", "ny", "nz", *(f"f_dc_{i}" for i in range(3)), *(f"f_rest_{i}" for i in range(rest)),
+        "opacity", *(f"scale_{i}" for i in range(3)), *(f"rot_{i}" for i in range(4)),
+    ]  # fmt: skip
+
+
+def ply_bytes(splats: Splats) -> bytes:
+    """A binary PLY: normals 0, f_rest channel by channel, logits of opacities, logarithms of scales, quaternions
+    wxyz."""
+    n = len(splats.means)
+    p = np.clip(splats.opacities.astype(np.float64), LEAST_OPACITY, 1 - LEAST_OPACITY)
+    columns = (
+        splats.means,
+        np.zeros((n, 3)),
+        splats.sh[:, 0],
+        splats.sh[:, 1:].transpose(0, 2, 1).reshape(n, 3 * (splats.sh.shape[1] - 1)),
+        np.log(p / (1 - p))[:, None],
+        np.log(np.maximum(splats.scales, LEAST_SCALE)),
+        splats.quats,
+    )
+    head = ["ply", "format binary_little_endian 1.0", f"element vertex {n}"]
+    head += [*(f"property float {name}" for name in properties(splats.degree)), "end_header", ""]
+    return "\n".join(head).encode() + np.concatenate(columns, axis=1).astype("<f4").tobytes()
+
+
+def glb_bytes(splats: Splats) -> bytes:
+    """A binary glTF 2.0 file. Viewers without the extension show coloured points. glTF's +y is up: rotate first."""
+    colors = np.clip(splats.sh[:, 0] * np.float32(SH_C0) + np.float32(0.5), 0, 1)
+    attributes = {
+        "POSITION": splats.means,
+        "COLOR_0": np.concatenate([_linear(colors), splats.opacities[:, None]], axis=1),
+        f"{EXTENSION}:ROTATION": splats.quats[:, [1, 2, 3, 0]],
+        f"{EXTENSION}:SCALE": splats.scales,
+        f"{EXTENSION}:OPACITY": splats.opacities[:, None],
+    }
+    for degree in range(splats.degree + 1):
+        for i in range(2 * degree + 1):
+            attributes[f"{EXTENSION}:SH_DEGREE_{degree}_COEF_{i}"] = splats.sh[:, degree * degree + i]
+    arrays = [np.ascontiguousarray(values, "<f4") for values in attributes.values()]
+    views, at = [], 0
+    for array in arrays:
+        views.append({"buffer": 0, "byteOffset": at, "byteLength": array.nbytes})
+        at += array.nbytes
+    accessors: list[dict[str, Any]] = [
+        {"bufferView": i, "componentType": FLOAT, "count": len(array), "type": TYPES[array.shape[1]]}
+        for i, array in enumerate(arrays)
+    ]
+    low, high = arrays[0].min(axis=0), arrays[0].max(axis=0)
+    accessors[0] |= {"min": [float(v) for v in low], "max": [float(v) for v in high]}
+    primitive = {
+        "attributes": {name: i for i, name in enumerate(attributes)},
+        "mode": POINTS,
+        "extensions": {EXTENSION: {"kernel": "ellipse", "colorSpace": "srgb_rec709_display"}},
+    }
+    document = {
+        "asset": {"version": "2.0", "generator": "pd4dgs-codec"},
+        "extensionsUsed": [EXTENSION],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": views,
+        "buffers": [{"byteLength": at}],
+    }
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    head = struct.pack("<4sIIII", b"glTF", 2, 28 + len(text) + at, len(text), JSON)
+    return b"".join([head, text, struct.pack("<II", at, BINARY), *(array.tobytes() for array in arrays)])
+
+
+def _linear(colors: np.ndarray) -> np.ndarray:
+    """Light of sRGB values 0..1 (IEC 61966-2-1): COLOR_0 is linear in glTF."""
+    light: np.ndarray = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
+    return light
+
+
+def spz_bytes(splats: Splats) -> bytes:
+    """An SPZ 3 file. Raises DataError for Gaussians beyond the range of its fixed point."""
+    reach = float(np.abs(splats.means).max(initial=0))
+    if reach >= SPZ_REACH:
+        raise DataError(
+            f"a Gaussian lies {reach:.4g} units from 0, SPZ holds {SPZ_REACH:g} at most: --scale less than 1"
+        )
+    with quiet():
+        result = library("gaussforge", "SPZ files").GaussForge().convert(ply_bytes(splats), "ply", "spz", spz_version=3)
+    if "error" in result:
+        raise DataError(f"gaussforge cannot write this SPZ file: {result['error']}")
+    return bytes(result["data"])
+
+
+def fourdgs_bytes(frames: Sequence[tuple[float, Splats, np.ndarray]], seconds: float) -> bytes:
+    """A .4dgs file of `seconds` in all. Each Gaussian is shown during its frame and moves towards its slot in the next.
+
+    frames: (start in seconds, Gaussians, their slots int64 [N]), ascending from 0.
+    """
+    fourdgs = library("fourdgs", ".4dgs files")
+    starts = [start for start, _, _ in frames]
+    ends = [*starts[1:], seconds]
+    parts: dict[str, list[np.ndarray]] = {}
+    for i, (start, splats, slots) in enumerate(frames):
+        n, middle = len(slots), (start + ends[i]) / 2
+        speed = np.zeros((n, 3), np.float32)
+        if i + 1 < len(frames):
+            _, later, later_slots = frames[i + 1]
+            _, here, there = np.intersect1d(slots, later_slots, assume_unique=True, return_indices=True)
+            speed[here] = (later.means[there] - splats.means[here]) / np.float32(ends[i] - start)
+        rest = splats.sh[:, 1:].transpose(0, 2, 1).reshape(n, 3 * (splats.sh.shape[1] - 1))
+        rgb = np.clip(splats.sh[:, 0] * np.float32(SH_C0) + np.float32(0.5), 0, 1)
+        for name, values in {
+            "positions": splats.means + speed * np.float32(middle - start),
+            "scales": splats.scales,
+            "rotations": splats.quats[:, [1, 2, 3, 0]],
+            "colors": np.concatenate([rgb, splats.opacities[:, None]], axis=1),
+            "motions": speed,
+            "mu_t": np.full(n, middle, np.float32),
+            "sigma_t": np.full(n, np.inf, np.float32),
+            "win_lo": np.full(n, start),
+            "win_hi": np.full(n, ends[i]),
+            "sh": np.clip(np.rint((rest + SH_SPAN) * (255 / (2 * SH_SPAN))), 0, 255).astype(np.uint8),
+        }.items():
+            parts.setdefault(name, []).append(values)
+    columns: dict[str, Any] = {name: np.concatenate(values) for name, values in parts.items()}
+    degree = frames[0][1].degree
+    if degree == 0:
+        columns["sh"] = None
+    stream = io.BytesIO()
+    try:
+        fourdgs.write(stream, fourdgs.GaussianSet(**columns, sh_degree=degree), seconds)
+    except (fourdgs.FourdgsError, ValueError) as error:
+        raise DataError(f"fourdgs cannot write this file: {error}") from None
+    return stream.getvalue()
