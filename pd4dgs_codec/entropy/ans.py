@@ -8,7 +8,7 @@ The stream is u32 words, little-endian, in the order in which the decoder consum
     end:    x == 0 and no words left
 
 constriction panics with a BaseException on a bad table, leaves half a channel encoded on a bad symbol, and aborts the
-process on a count it cannot allocate. So everything is checked before it sees it.
+process on a count that it cannot allocate. So everything is checked first.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ _U32 = np.dtype("<u4")
 
 
 def _frequencies(cum: np.ndarray, error: type[Pd4Error], where: str = "") -> np.ndarray:
-    """int64 [n] of a table int64 [n + 1] that constriction can take; raises `error` for any other."""
+    """int64 [n] of a table int64 [n + 1]; raises `error` for a table that constriction cannot take."""
     if cum.ndim != 1 or len(cum) < 2 or cum[0] != 0 or cum[-1] != TOTAL:
         raise error(f"{where}a frequency table must run from 0 to {TOTAL}")
     frequencies: np.ndarray = cum[1:] - cum[:-1]
-    if frequencies[frequencies.argmin()] < 1:  # a tenth of the time that min() takes on short tables
+    if frequencies[frequencies.argmin()] < 1:  # ten times faster than min() on short tables
         raise error(f"{where}a frequency table has a symbol of zero frequency")
     return frequencies
 
@@ -45,20 +45,20 @@ def _model(frequencies: np.ndarray) -> Model:
 
 
 def model_of(cum: np.ndarray) -> Model | None:
-    """What a stream decodes with, of a table int64 [n + 1]; None where it has one symbol. Raises Malformed for what is
-    no table."""
+    """The model that decodes with a table int64 [n + 1]; None for a table of one symbol. Raises Malformed for an
+    invalid table."""
     frequencies = _frequencies(cum, Malformed)
     return _model(frequencies) if len(frequencies) > 1 else None
 
 
 def models_of_each(cums: np.ndarray, sizes: np.ndarray) -> list[Model | None]:
-    """`model_of` of tables one behind the other, int64 [sum of sizes + 1], in one pass."""
+    """`model_of` of concatenated tables, int64 [sum of sizes + 1], in one pass."""
     ends = np.cumsum(sizes + 1)
     firsts = ends - sizes - 1
     frequencies = np.empty(len(cums))
     np.subtract(cums[1:], cums[:-1], out=frequencies[:-1])
     frequencies -= 1
-    frequencies[ends - 1] = 0  # what lies between two tables
+    frequencies[ends - 1] = 0  # the difference between two tables
     if cums[firsts].any() or np.any(cums[ends - 1] != TOTAL) or frequencies.min(initial=0) < 0:
         raise Malformed(f"a frequency table does not ascend from 0 to {TOTAL}")
     pairs = zip(firsts.tolist(), sizes.tolist(), strict=True)
@@ -73,7 +73,7 @@ def ans_encode(channels: Sequence[np.ndarray], cums: Sequence[np.ndarray]) -> by
     if len(channels) != len(cums):
         raise EncodeError(f"{len(channels)} channels need as many frequency tables, found {len(cums)}")
     coder = constriction.stream.stack.AnsCoder()
-    for index in range(len(channels) - 1, -1, -1):  # last in, first out
+    for index in range(len(channels) - 1, -1, -1):  # a stack: last in, first out
         symbols, cum = np.asarray(channels[index]), np.asarray(cums[index], dtype=np.int64)
         frequencies = _frequencies(cum, EncodeError, f"channel {index}: ")
         if symbols.size == 0:

@@ -1,4 +1,4 @@
-"""What a channel of symbols costs under two simple models: its own frequencies (order-0 entropy), and R(a)."""
+"""The bits of a channel of symbols under two simple models: its own frequencies (order-0 entropy), and R(a)."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 P_MIN = 1e-6  #: the clip of R(a)
 SIGMA_MIN = 2.0**-10  #: in units of Q
 
-BIT = 1 << 20  #: one bit, where costs are integers: the same whatever the order of their sums
-#: log2(1 + i / 4096) in those units, and once more the last. Between entries a line is off by less than 2e-8 bits.
+BIT = 1 << 20  #: one bit, where costs are integers, whose sums do not depend on their order
+#: log2(1 + i / 4096) in these units, the last one twice. Linear interpolation is off by less than 2e-8 bits.
 LOG2 = np.rint(np.log2(1 + np.minimum(np.arange(4098), 4096) / 4096) * BIT).astype(np.int64)
 
 
@@ -28,20 +28,20 @@ def symbol_counts(symbols: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     if high - low > 4 * symbols.size + 1024:
         values, counts = np.unique(symbols, return_counts=True)
         return values.astype(np.int64), counts.astype(np.int64)
-    counts = np.bincount(symbols.astype(np.int64) - low)  # beats sorting unless the range is far wider than the channel
+    counts = np.bincount(symbols.astype(np.int64) - low)  # faster than sorting, unless the range is wide
     present = np.flatnonzero(counts)
     return present + low, counts[present]
 
 
 def order0_bits(counts: np.ndarray) -> float:
-    """Order-0 entropy of symbols that occur counts [U] times, all positive, in bits for all of them together."""
+    """Order-0 entropy of symbols that occur counts [U] times, all positive, in bits for all symbols together."""
     each = counts.astype(np.float64)
     total = each.sum()
     return float(total * np.log2(total) - (each * np.log2(each)).sum())
 
 
 def entropy_bits(symbols: np.ndarray) -> float:
-    """Order-0 entropy of integer symbols, in bits for all of them together."""
+    """Order-0 entropy of integer symbols, in bits for all symbols together."""
     return order0_bits(symbol_counts(symbols)[1]) if symbols.size else 0.0
 
 

@@ -1,9 +1,9 @@
-"""The public door of entropy coding: channels of int32 symbols <-> one self-contained payload.
+"""Entropy coding of channels: int32 symbols <-> one self-contained payload.
 
 Payload: for each non-empty channel a varint token, (family << 1 | has_exceptions), then, if the family is below 8, a
 new prior's parameters, else the prior defined (family - 8) definitions before the latest; then the channel's
 exceptions, if any: their number, and for each the gap to the previous position and the distance outside the window.
-Definitions of payloads before count too, where a caller hands them on.
+Definitions of earlier payloads count too if the caller passes them on.
 After the last channel the ANS words: the classes of each histogram prior in order of definition, then each channel's
 symbols, those of a scaled prior as all table entries followed by all low bits.
 """
@@ -39,7 +39,7 @@ from pd4dgs_codec.entropy.tables import uniform_table
 from pd4dgs_codec.entropy.varint import VARINT_MAX, ByteReader, put_varint
 from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
 
-#: Bytes of a payload that is so soon coded again that nobody estimates whether Gaussians alone might take fewer.
+#: Payloads of fewer bytes are always coded with Gaussians alone too: that is faster than estimating the result.
 SMALL = 4096
 
 
@@ -88,8 +88,8 @@ def encode_channels(
 
     priors: "gauss" allows const and gauss only, the model of R(a); "best" every prior. It is never larger in payloads
     under 4 kB, and in longer ones where Gaussians alone come near.
-    effort: 1..9, time spent on fitting. known: what the payloads before defined, in order; a decoder must have it too.
-    entries: of all tables, beyond one per symbol, where nothing is known.
+    effort: 1..9, time spent on fitting. known: priors of earlier payloads, in order; a decoder must have them too.
+    entries: most entries of all tables, beyond one per symbol, if nothing is known.
     Raises EncodeError.
     """
     if priors not in PRIORS or effort not in EFFORTS:
@@ -100,7 +100,7 @@ def encode_channels(
     richer = priors == "best" and effort > 1
     fit: Fit = (lambda h: fit_best(h, effort)) if richer else (lambda h: h.gauss)
     best = _encode(arrays, plan_priors(histograms, fit, rounds, known, entries), known)
-    least = sum(h.gauss.own for h in histograms) / BIT  # what Gaussians take, nearly: sharing can save more
+    least = sum(h.gauss.own for h in histograms) / BIT  # about the bits of Gaussians: sharing can save more
     if richer and (len(best[0]) < SMALL or least < 1.005 * 8 * len(best[0])):
         other = _encode(arrays, plan_priors(histograms, lambda h: h.gauss, rounds, known, entries), known)
         best = min(best, other, key=lambda encoded: len(encoded[0]))
@@ -129,7 +129,7 @@ def _encode(
 
 
 def _parts(inside: np.ndarray, prior: Prior) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Table entries, and the low bits of a scaled prior, each with its table."""
+    """The table entries, and the low bits of a scaled prior, each with their table."""
     entry = inside - prior.window.kmin
     shift = prior.window.shift
     if not shift:
@@ -147,7 +147,7 @@ def _split(array: np.ndarray, window: Window) -> tuple[np.ndarray, _Exceptions]:
 
 
 def _write_channel(out: bytearray, prior: Prior, exceptions: _Exceptions, defined: list[Prior]) -> bool:
-    """Whether it defines its prior, which then joins `defined`."""
+    """Returns whether the channel defines its prior, which is then appended to `defined`."""
     back = next((i for i, known in enumerate(reversed(defined)) if known is prior), None)
     family = family_code(prior) if back is None else FIRST_REUSE + back
     put_varint(out, 2 * family + (len(exceptions.positions) > 0))
@@ -203,10 +203,10 @@ def decode_joined(
     known: list[Prior] | None = None,
     entries: int = FREE_ENTRIES,
 ) -> np.ndarray:
-    """int32 [sum of counts]: the channels of a payload one behind the other.
+    """int32 [sum of counts]: the channels of a payload, concatenated.
 
-    known: what the payloads before defined, in order; this one's definitions are appended. entries: as in
-    encode_channels. The caller has held the counts against its limits. Raises Malformed (cut, trailing or corrupt
+    known: priors of earlier payloads, in order; this payload's definitions are appended. entries: as in
+    encode_channels. The caller has checked the counts against its limits. Raises Malformed (cut, trailing or corrupt
     bytes), LimitExceeded, or UnsupportedFeature (a prior outside the registry).
     """
     for index, count in enumerate(counts):
@@ -238,7 +238,7 @@ def decode_joined(
 
 
 def _complete(defined: list[Prior], first: int, stream: AnsDecoder) -> None:
-    """Makes the models of the priors from `first` on, and takes the classes of the histograms among them."""
+    """Makes the models of the priors from `first` on, and decodes the classes of the histograms among them."""
     make_models(defined[first:])
     places = [at for at in range(first, len(defined)) if isinstance(defined[at], Hist)]
     histograms = [prior for prior in defined[first:] if isinstance(prior, Hist)]
@@ -247,12 +247,12 @@ def _complete(defined: list[Prior], first: int, stream: AnsDecoder) -> None:
         defined[at] = prior
 
 
-#: Of a channel: the index of its prior among those defined, its symbols, and which of them are exceptions.
+#: Of a channel: the index of its prior, the number of its symbols, and its exceptions.
 _Head = tuple[int, int, _Exceptions | None]
 
 
 def _joined(one: _Head, next: _Head, defined: list[Prior]) -> _Head | None:
-    """The head of two channels of one prior as one, if their symbols follow each other under its table."""
+    """One head for two channels of one prior, if their symbols follow each other under its table."""
     (index, some, exceptions), (_, more, others) = one, next
     apart = exceptions or others or defined[index].window.shift or some + more > MAX_COUNT
     return None if apart else (index, some + more, None)

@@ -61,14 +61,14 @@ class Histogram:
 
     @cached_property
     def gauss(self) -> Fitted:
-        """Kept, because both policies start from it."""
+        """Cached, because fits with and without richer priors start from it."""
         return fit_gauss(self)
 
 
 @dataclass(frozen=True, eq=False)
 class Fitted:
-    """A prior, and what it costs. costs: int64 [n], of its table's entries, low bits included. price: of its
-    description. own: of the symbols that it was fitted to."""
+    """A prior and its costs. costs: int64 [n], of its table's entries, low bits included. price: of its description.
+    own: of the symbols that it was fitted to."""
 
     prior: Prior
     costs: np.ndarray
@@ -77,16 +77,16 @@ class Fitted:
 
 
 def histogram(symbols: np.ndarray) -> Histogram:
-    """Of a non-empty channel."""
+    """The histogram of a non-empty channel."""
     return Histogram(*symbol_counts(symbols))
 
 
 def pool(histograms: Sequence[Histogram]) -> Histogram:
-    """Of several channels together."""
+    """The histogram of several channels together."""
     values = np.concatenate([h.values for h in histograms])
     counts = np.concatenate([h.counts for h in histograms])
     low, high = int(values.min()), int(values.max())
-    if high - low > 4 * values.size + 1024:  # too wide to count in place
+    if high - low > 4 * values.size + 1024:  # the range is too wide for an array of counts
         values, index = np.unique(values, return_inverse=True)
         return Histogram(values, np.bincount(index, weights=counts).astype(np.int64))
     dense = np.bincount(values - low, weights=counts).astype(np.int64)
@@ -95,7 +95,7 @@ def pool(histograms: Sequence[Histogram]) -> Histogram:
 
 
 def split_bits(channels: np.ndarray, classes: np.ndarray, count: int) -> float:
-    """Order-0 entropy in bits of channels int64 [m, n], each split into the `count` classes int64 [n] of its places."""
+    """Order-0 entropy in bits of channels int64 [m, n], each split by the `count` classes int64 [n] of its elements."""
     return float(loops().split_cost(channels, classes, count)) / BIT
 
 
@@ -115,7 +115,7 @@ def costs_of(histograms: Sequence[Histogram], priors: Sequence[Fitted]) -> np.nd
 
 
 def fit_gauss(h: Histogram) -> Fitted:
-    """The cheapest of const and gauss, the window chosen along with it."""
+    """The cheapest of const and gauss, over several windows."""
     if len(h.values) == 1:
         return _const(h, 0)
     candidates = [_fit_gauss_in(h, w) for w in _windows(h)]
@@ -126,7 +126,7 @@ def fit_gauss(h: Histogram) -> Fitted:
 
 
 def fit_best(h: Histogram, effort: int) -> Fitted:
-    """The cheapest of all priors, on the window that suits the Gaussian best."""
+    """The cheapest of all priors, on the Gaussian's best window."""
     found = h.gauss
     if found.prior.window.n == 1:
         return found
@@ -155,13 +155,13 @@ def _fitted(prior: Prior, costs: np.ndarray, own: int, classes: int = 0) -> Fitt
 
 
 def _richer_priors(h: Histogram, found: Fitted, effort: int) -> list[Fitted]:
-    """Mixture and histogram on the window found, unless the empirical entropy leaves them nothing to gain."""
+    """Mixture and histogram on the window found, unless the empirical entropy shows that they cannot gain."""
     window = found.prior.window
     dense, beside = _dense(h, window), _beside(h, window)
     seen = dense[dense > 0]
     spare = (found.own - beside) / BIT - order0_bits(seen)
     priors: list[Fitted] = []
-    if spare > 40 + 0.72 * len(seen):  # a mixture's five more bytes; the entropy of a sample is low by log2(e) / 2 each
+    if spare > 40 + 0.72 * len(seen):  # a mixture's five extra bytes; a sample's entropy is low by log2(e) / 2 each
         mu1, si1, mu2, si2, weight, floor, cost, costs = loops().mixture(dense, effort)
         mixture = Mixture(window, Normal(mu1, si1), Normal(mu2, si2), weight, FLOORS[floor])
         priors.append(_fitted(mixture, costs, cost + beside))
@@ -188,7 +188,7 @@ def _dense(h: Histogram, window: Window) -> np.ndarray:
 
 
 def _beside(h: Histogram, window: Window) -> int:
-    """Cost of what the table does not hold: low bits and exceptions."""
+    """Cost of low bits and exceptions, which the table does not include."""
     if not window.shift and window.kmin <= h.values[0] and h.values[-1] < window.end:
         return 0
     free = Fitted(Const(window), np.full(window.n, BIT * window.shift), 0, 0)
@@ -196,9 +196,9 @@ def _beside(h: Histogram, window: Window) -> int:
 
 
 def _windows(h: Histogram) -> list[Window]:
-    """The full range, and narrower ones where far outliers stretch it.
+    """The full range, and narrower windows without its outliers.
 
-    Inside the window an outlier costs 20 bits, as an exception 24 or more: trimming pays only for wide windows.
+    An outlier costs 20 bits inside the window and at least 24 as an exception: trimming gains only for wide windows.
     """
     windows = [_window(int(h.values[0]), int(h.values[-1]))]
     if h.values[-1] - h.values[0] < 512:
@@ -209,7 +209,7 @@ def _windows(h: Histogram) -> list[Window]:
     trimmed = np.cumsum(h.counts[order])
     m = 1
     while m <= h.total // 16:
-        cut = int(np.searchsorted(trimmed, m, side="right"))  # at most m symbols leave
+        cut = int(np.searchsorted(trimmed, m, side="right"))  # at most m symbols are trimmed
         if cut:
             kept = h.values[order[cut:]]
             narrower = _window(int(kept.min()), int(kept.max()))
@@ -221,7 +221,7 @@ def _windows(h: Histogram) -> list[Window]:
 
 def _window(low: int, high: int) -> Window:
     shift = max(0, (high - low).bit_length() - (MAX_WINDOW.bit_length() - 1))
-    if low == high:  # a table has two entries at least, and both must be symbols
+    if low == high:  # a table has at least two entries, and both must be symbols
         return Window(min(low, K_MAX - 1), 2)
     return Window(low, ((high - low) >> shift) + 1, shift)
 
@@ -234,9 +234,9 @@ Fit = Callable[[Histogram], Fitted]
 def plan_priors(
     histograms: Sequence[Histogram], fit: Fit, rounds: int, known: Sequence[Fitted] = (), entries: int = FREE_ENTRIES
 ) -> list[Fitted]:
-    """The prior of each channel; channels that share one hold the same object. known: priors that need no description
-    any more. entries: of all tables, beyond one per symbol, where nothing is known; fewer than MAX_WINDOW only if no
-    channel's range takes more."""
+    """The prior of each channel; channels that share one hold the same object. known: priors that were described
+    earlier. entries: most entries of all tables, beyond one per symbol, if nothing is known; fewer than MAX_WINDOW only
+    if no channel's range takes more."""
     plan = [fit(h) for h in histograms]
     free = [replace(fitted, price=0) for fitted in known]
     if free and plan:
@@ -257,8 +257,8 @@ def plan_priors(
 def _within_limit(
     histograms: Sequence[Histogram], plan: list[Fitted], free: list[Fitted], fit: Fit, entries: int
 ) -> list[Fitted]:
-    """The plan, its widest new priors replaced by one for all their channels where the tables would be larger
-    than a section may define, or by known ones where there is no room for it."""
+    """The plan. If its tables are larger than a section may define, one prior for all their channels replaces the
+    widest new ones, or known priors do if there is no room for one."""
     known = {id(p.prior) for p in free}
     distinct = {id(p.prior): p for p in plan if id(p.prior) not in known}.values()
     ordered = sorted(distinct, key=lambda p: p.prior.window.n)
@@ -283,7 +283,7 @@ def _plan_block(
     if rounds == 0 or len(histograms) < 2:
         return plan
     pooled = pool(histograms)
-    if len(pooled.values) <= 4 * max(len(h.values) for h in histograms):  # else they have nothing in common
+    if len(pooled.values) <= 4 * max(len(h.values) for h in histograms):  # otherwise they have nothing in common
         priors.append(fit(pooled))
     best, costs = 1 << 62, costs_of(histograms, priors)
     for last in range(rounds - 1, -1, -1):
@@ -302,6 +302,6 @@ def _plan_block(
 
 
 def _refit(histograms: Sequence[Histogram], owner: np.ndarray, fit: Fit) -> list[Fitted]:
-    """For each prior that serves several channels the one fitted to all of them."""
+    """A prior fitted to all of its channels, for each prior that serves several."""
     members = [np.flatnonzero(owner == p).tolist() for p in np.unique(owner)]
     return [fit(pool([histograms[c] for c in shared])) for shared in members if len(shared) > 1]

@@ -83,7 +83,7 @@ def _layout(numbers: Sequence[np.ndarray], planar: bool) -> bytes:
 
 
 def _filters(size: int, lc: int, lp: int, pb: int) -> list[dict[str, int]]:
-    # The dictionary's size follows from the data's, so it is not stored: the power of two that holds all of it.
+    # The dictionary's size is not stored: it is the power of two that holds all data.
     dict_size = min(max(4096, 1 << (size - 1).bit_length() if size else 0), _DICT_MAX)
     preset = 9 | lzma.PRESET_EXTREME
     return [{"id": lzma.FILTER_LZMA2, "preset": preset, "dict_size": dict_size, "lc": lc, "lp": lp, "pb": pb}]
@@ -128,7 +128,7 @@ def _compress(head: bytes, numbers: Sequence[np.ndarray], effort: int) -> bytes:
 
 
 def _read_layout(reader: ByteReader) -> bool:
-    """Whether bytes lie in planes. lc, lp and pb are recorded for the reader of a comparison: LZMA2 holds its own."""
+    """Whether bytes lie in planes. lc, lp and pb are informative: LZMA2 stores its own."""
     reader.byte("lc, lp and pb", 9 * 5 * 5 - 1)
     return bool(reader.bits("the layout's flags", 1))
 
@@ -151,7 +151,7 @@ def _decompress(
 
 
 def _inflate(packed: bytes, size: int) -> bytes:
-    """Exactly `size` bytes: one more is asked for, so that a longer stream shows, and never more than that."""
+    """Exactly `size` bytes. Asks for at most one more, which detects a longer stream."""
     decoder = lzma.LZMADecompressor(lzma.FORMAT_RAW, filters=_filters(size, 3, 0, 0))
     try:
         data = decoder.decompress(packed, max_length=size + 1)

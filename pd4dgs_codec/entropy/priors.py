@@ -1,4 +1,4 @@
-"""The registry of priors: parameters <-> bytes, and the integer table each one stands for.
+"""The registry of priors: parameters <-> bytes, and the integer table of each.
 
 A prior covers a window of symbols kmin .. kmin + (n << shift) - 1. With shift > 0 the table codes (k - kmin) >> shift
 and the low bits follow with equal probabilities, so a wide channel needs no table of more than 2**14 entries. Symbols
@@ -33,8 +33,8 @@ from pd4dgs_codec.errors import Malformed, UnsupportedFeature
 
 K_MAX = (1 << 24) - 1  #: |k| of any symbol
 MAX_WINDOW = 1 << 14
-#: Entries of all tables that a section defines, over one for each of its symbols: where nothing is defined before, and
-#: where something is. Eight bytes can define a table of 2**14 entries, 128 KiB, and anew in each section of each slice.
+#: Most entries of all tables that a section defines, beyond one per symbol: without earlier definitions, and with them.
+#: Eight bytes can define a table of 2**14 entries, 128 KiB, in each section of each slice.
 FREE_ENTRIES, MORE_ENTRIES = 1 << 18, 1 << 10
 MAX_SHIFT = 12
 MU8_MAX = 1 << 31
@@ -43,7 +43,7 @@ CLASS_STEPS = (8, 16, 32, 64)  #: histogram classes per prior, in 1/64 octave
 
 CONST, GAUSS, GMM2, HIST = 0, 1, 2, 3
 SCALED = 4  #: a prefix: shift, then the family; never a prior's own id
-FIRST_REUSE = 8  #: family codes from here on name an earlier prior
+FIRST_REUSE = 8  #: family codes from here on refer to an earlier prior
 
 
 @dataclass(frozen=True)
@@ -198,7 +198,7 @@ class Hist:
 
     @property
     def class_normal(self) -> tuple[int, Normal]:
-        """Entries and Gaussian of the table of the classes."""
+        """Number of entries and Gaussian of the classes' table."""
         n, mu8 = (2 * self.top + 1, 256 * self.top) if self.differences else (self.top + 1, 16 * self.class_mean16)
         return n, Normal(mu8, 16 * self.class_si16 - 160)
 
@@ -255,7 +255,7 @@ _FAMILIES: dict[int, type[Const] | type[Gauss] | type[Mixture] | type[Hist]] = {
 }
 
 
-#: Entries of the tables that are made at a time: enough to spare numpy's calls, too few to matter as memory.
+#: Table entries made at a time: enough to save numpy's calls, few enough to save memory.
 BATCH = 1 << 14
 
 
@@ -281,7 +281,7 @@ def _batches(priors: Sequence[AnyPrior]) -> Iterator[list[AnyPrior]]:
 
 
 def normal_tables(priors: Sequence[Prior]) -> tuple[np.ndarray, np.ndarray]:
-    """(tables int64 one behind the other, their entries int64 [m]) of Gaussians, mixtures and histograms' classes."""
+    """(concatenated tables int64, their sizes int64 [m]) of Gaussians, mixtures and histograms' classes."""
     rows, seconds, weights, mixed = list[tuple[int, Normal, int]](), list[Normal](), list[int](), list[int]()
     for at, prior in enumerate(priors):
         if isinstance(prior, Hist):
@@ -306,9 +306,9 @@ def normal_tables(priors: Sequence[Prior]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def with_class_symbols(priors: Sequence[Hist], symbols: Sequence[np.ndarray]) -> list[Hist]:
-    """The histograms, at least one, with the classes of these symbols of class_cum, int32 [n] each, and with `model`.
+    """The histograms, at least one, with the classes of their symbols of class_cum, int32 [n] each, and with `model`.
 
-    Raises Malformed for classes that none can have."""
+    Raises Malformed for classes out of range."""
     whole = list[Hist]()
     rest = iter(symbols)
     for batch in _batches(priors):
@@ -346,7 +346,7 @@ def top_limit(step: int) -> int:
 
 
 def family_code(prior: Prior) -> int:
-    """What introduces a new prior in the parameter block."""
+    """The code that introduces a new prior in the parameter block."""
     return SCALED if prior.window.shift else prior.id
 
 

@@ -43,17 +43,18 @@ def _mass(t: np.ndarray, si: np.ndarray) -> np.ndarray:
 
 
 def norm_cdf28_of_each(sizes: np.ndarray, mu8: np.ndarray, si: np.ndarray) -> np.ndarray:
-    """`norm_cdf28` of many Gaussians, int64 [m] each, in one pass: C(-1) .. C(n - 1) of each, one behind the other.
+    """`norm_cdf28` of many Gaussians, int64 [m] each, in one pass: C(-1) .. C(n - 1) of each, concatenated.
 
-    Decoding a short table costs less than calling numpy for it. A table takes neither the first nor the last value.
+    Calling numpy for each short table would take longer than decoding it. A table uses neither the first nor the last
+    value.
     """
     lengths = sizes + 1
     return _mass(_counted(lengths) * 256 - np.repeat(128 + mu8, lengths), np.repeat(si, lengths))
 
 
 def tables_of_each(cdf: np.ndarray, sizes: np.ndarray, floor: np.ndarray) -> np.ndarray:
-    """`table_from_cdf28` of what norm_cdf28_of_each gives for tables of `sizes`, with a floor int64 [m] each; one
-    behind the other."""
+    """`table_from_cdf28` of a result of norm_cdf28_of_each for tables of `sizes`, with a floor int64 [m] each;
+    concatenated."""
     lengths = sizes + 1
     ends = np.cumsum(lengths)
     cum: np.ndarray = (cdf * np.repeat(TOTAL - sizes * floor, lengths)) >> 28
@@ -63,7 +64,7 @@ def tables_of_each(cdf: np.ndarray, sizes: np.ndarray, floor: np.ndarray) -> np.
 
 
 def _counted(lengths: np.ndarray) -> np.ndarray:
-    """0 .. length - 1 of each of `lengths`, one behind the other."""
+    """0 .. length - 1 of each of `lengths`, concatenated."""
     counted: np.ndarray = np.arange(int(lengths.sum())) - np.repeat(np.cumsum(lengths) - lengths, lengths)
     return counted
 
@@ -107,7 +108,7 @@ def histogram_table(freqs: np.ndarray) -> np.ndarray:
 
 
 def histogram_tables_of_each(freqs: np.ndarray, sizes: np.ndarray) -> np.ndarray:
-    """`histogram_table` of weights int64 [sum of sizes] that stand one behind the other, as do the tables."""
+    """`histogram_table` of concatenated weights int64 [sum of sizes]; the tables are concatenated too."""
     lengths, running = sizes + 1, np.zeros(len(freqs) + 1, np.int64)
     np.cumsum(freqs, out=running[1:])
     bounds = np.cumsum(np.concatenate([[0], sizes]))

@@ -1,4 +1,4 @@
-"""A fresh model for a dataset: where the first anchors stand and how large they are."""
+"""A fresh model for a dataset: positions and sizes of the first anchors."""
 
 from __future__ import annotations
 
@@ -18,25 +18,27 @@ from pd4dgs_codec.scene import LOCAL_HEADS, SceneInfo, Steps, Widths
 #: Voxels along the longest side of the scene's box.
 GRID = 1024
 MASK_START = 2.0
-#: a_j of levels that a model does not have: softplus of it is 4e-18, so their masks are those of its highest level.
+#: a_j of absent levels: its softplus is 4e-18, so their masks are those of the highest level present.
 TIED = -40.0
-#: Random candidates per initial point, and the training views that judge them, where a dataset has no points.
+#: For a dataset without points: random candidates per initial point, and training views that score them.
 CARVE_CANDIDATES = 20
 CARVE_VIEWS = 40
-#: By how much of 255 a channel differs from the background where a view sees something.
+#: The difference of a channel from the background, of 255, that counts as an object.
 CARVE_CONTRAST = 8
-#: Of the start values of global planes, in cells: few values, for places to differ at the start.
+#: Spacing of the start values of global planes, in cells: few values, so that positions differ at the start.
 GLOBAL_SPACING = 4
-#: Where a dataset knows its paths: steps that teach them, anchors in each, and the rates of planes and networks.
+#: For a dataset with paths: steps that learn them, anchors in each, and learning rates of planes and networks.
 PATH_STEPS, PATH_ANCHORS, PATH_RATES = 400, 4096, (0.02, 0.002)
 
 
 def fresh_model(
     config: ModelConfig, dataset: Dataset, widths: Widths, steps: Steps, seed: int, max_layer: int = 2
 ) -> Model:
-    """An untrained model without the deformations of the layers above max_layer: anchors on the dataset's points
-    (topped up near them), or spread over its box; they move along the points' paths where the dataset knows them. What
-    it has starts the same whatever max_layer is."""
+    """An untrained model without the deformations of the layers above max_layer.
+
+    Anchors start on the dataset's points (with more of them near by if there are few), or all over its box, and move
+    along the points' paths if the dataset has them. The start of a layer does not depend on max_layer.
+    """
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)  # nn.Linear and HexPlane draw their start values from the global generator
     info = scene_info(dataset)
@@ -71,7 +73,7 @@ def fresh_model(
 
 
 def learn_paths(model: Model, dataset: Dataset, generator: torch.Generator) -> None:
-    """Teaches the global deformation to move each anchor as the dataset's point next to it moves."""
+    """Trains the global deformation to move each anchor like the dataset's point nearest to it."""
     field = model.global_deformation
     if field is None or field.head_layer("position") is None or dataset.points is None or dataset.paths is None:
         return
@@ -101,7 +103,7 @@ def fresh_mask_logits(n: int, level: int) -> Tensor:
 
 
 def scene_info(dataset: Dataset) -> SceneInfo:
-    """The header's facts of a dataset; the voxel is 1/1024 of the box's longest side."""
+    """The header of a file for the dataset; the voxel is 1/GRID of the box's longest side."""
     box = np.asarray(dataset.box, np.float32)
     return SceneInfo(
         voxel_size=_binary32(float((box[1] - box[0]).max()) / GRID),
@@ -133,7 +135,7 @@ def initial_cells(dataset: Dataset, count: int, voxel_size: float, generator: to
 
 
 def _points_near_box(dataset: Dataset) -> Tensor:
-    """float32 [n, 3] the dataset's points, but for those so far from its box that they would stretch the grid."""
+    """float32 [n, 3] the dataset's points without those so far from its box that they would stretch the grid."""
     points = torch.from_numpy(np.array(() if dataset.points is None else dataset.points, np.float32).reshape(-1, 3))
     low, high = (torch.from_numpy(np.asarray(dataset.box[i], np.float32)) for i in (0, 1))
     reach = 0.5 * (high - low).max()
@@ -141,20 +143,20 @@ def _points_near_box(dataset: Dataset) -> Tensor:
 
 
 def carved_points(dataset: Dataset, count: int, generator: torch.Generator) -> Tensor:
-    """float32 [count, 3] random points of the box, the more likely the more training views see something there.
+    """float32 [count, 3] random points of the box, more likely where more training views show an object.
 
-    A view sees something where its pixel differs from the constant background; without such a background, or outside
-    every view, all points are alike.
+    A view shows an object where its pixel differs from the constant background; without such a background, or outside
+    every view, all points are equally likely.
     """
     low, high = (torch.from_numpy(np.asarray(dataset.box[i], np.float32)) for i in (0, 1))
     points = low + (high - low) * torch.rand(CARVE_CANDIDATES * count, 3, generator=generator)
     background = np.array(dataset.background, np.float32) * 255
     seen, hits = torch.zeros(len(points)), torch.zeros(len(points))
     for view in dataset.train[:: max(1, len(dataset.train) // CARVE_VIEWS)]:
-        something = np.abs(view.image - background).max(2) > CARVE_CONTRAST
+        shown = np.abs(view.image - background).max(2) > CARVE_CONTRAST
         viewmat, K = (np.array(m, np.float32) for m in (view.viewmat, view.K))
-        _look(seen.numpy(), hits.numpy(), points.numpy(), viewmat, K, something)
-    share = (hits + 1e-3) / (seen + 1)  # few views say little
+        _look(seen.numpy(), hits.numpy(), points.numpy(), viewmat, K, shown)
+    share = (hits + 1e-3) / (seen + 1)  # little evidence from few views
     return points[torch.multinomial(share.square(), count, generator=generator)]
 
 
@@ -178,11 +180,11 @@ def _look(
     points: np.ndarray,
     viewmat: np.ndarray,
     K: np.ndarray,
-    something: np.ndarray,
+    shown: np.ndarray,
 ) -> None:
-    """Counts in seen [n] the points [n, 3] that lie in a view's picture, in hits those of them where it shows
-    something, bool [height, width]. viewmat [4, 4]: world to camera; K [3, 3]: camera to pixels."""
-    height, width = something.shape
+    """Counts in seen [n] the points [n, 3] that lie in a view's picture, in hits those on an object, `shown` bool
+    [height, width]. viewmat [4, 4]: world to camera; K [3, 3]: camera to pixels."""
+    height, width = shown.shape
     for i in range(tasks[0], tasks[1]):
         x, y, z = viewmat[0, 3], viewmat[1, 3], viewmat[2, 3]
         for axis in range(3):
@@ -193,7 +195,7 @@ def _look(
             column, row = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
             if 0 <= column < width and 0 <= row < height:
                 seen[i] += 1
-                hits[i] += something[int(row), int(column)]
+                hits[i] += shown[int(row), int(column)]
 
 
 @parallel(lambda out, *_: len(out))

@@ -1,7 +1,7 @@
-"""Adam over the model's named parameter groups, and its surgery when anchors come and go.
+"""Adam over named groups of the model's parameters, whose moments follow anchors that come and go.
 
-The update is torch's own fused kernel. Its class `torch.optim.Adam` imports torch's compiler at its first use, a second
-of every start, and hides the moments that the surgery is about; its function `adam` takes as long again as the kernel.
+The update is torch's fused kernel. The class `torch.optim.Adam` would import torch's compiler at its first use, which
+takes a second of every start.
 """
 
 from __future__ import annotations
@@ -24,8 +24,8 @@ STEP, MEAN, SQUARE = "step", "exp_avg", "exp_avg_sq"
 class Optimiser:
     """One Adam with a group per learning-rate schedule.
 
-    groups: parameters by the field of LearningRates they follow. rate: that of each group's latest step. moments: of
-    each parameter that has had a gradient, by STEP, MEAN and SQUARE.
+    groups: parameters by the field of LearningRates they follow. rate: of each group's latest step. moments: of each
+    parameter that has had a gradient, by STEP, MEAN and SQUARE.
     """
 
     def __init__(self, model: Model, rates: LearningRates, cooldown: float = 0.0):
@@ -41,7 +41,7 @@ class Optimiser:
 
     @property
     def parameters(self) -> list[nn.Parameter]:
-        """Of all groups, one behind the other."""
+        """Of all groups, in their order."""
         return [p for params in self.groups.values() for p in params]
 
     @torch.no_grad()
@@ -67,7 +67,7 @@ class Optimiser:
         )  # fmt: skip
 
     def gradient_norm(self) -> float:
-        """Norm over all gradients; NaN or infinite if any is."""
+        """Norm over all gradients; not finite if one of them is not."""
         gradients = [p.grad for p in self.parameters if p.grad is not None]
         return float(torch.stack(torch._foreach_norm(gradients)).norm()) if gradients else 0.0
 
@@ -78,19 +78,19 @@ class Optimiser:
                 p.grad.mul_(factor)
 
     def take_gradients(self) -> list[Tensor | None]:
-        """Those of all parameters, which then have none."""
+        """The gradients of all parameters, which then have none."""
         taken = [p.grad for p in self.parameters]
         self.zero_grad()
         return taken
 
     def add_gradients(self, given: list[Tensor | None]) -> None:
-        """Adds what `take_gradients` gave."""
+        """Adds gradients from `take_gradients`."""
         for p, g in zip(self.parameters, given, strict=True):
             if g is not None:
                 p.grad = g if p.grad is None else p.grad.add_(g)
 
     def zero_grad(self) -> None:
-        """Forgets all gradients."""
+        """Drops all gradients."""
         for p in self.parameters:
             p.grad = None
 
@@ -111,16 +111,16 @@ class Optimiser:
         self.model.step_class = torch.cat([graded[keep], graded.new_zeros(len(added["anchor_q"]))])
 
     def keep_anchors(self, keep: Tensor) -> None:
-        """Keeps the anchors `keep` (int64) alone."""
+        """Keeps only the anchors `keep` (int64)."""
         names = (*PER_ANCHOR, "anchor_q")
         self.replace_anchors(keep, {name: getattr(self.model, name).detach()[:0] for name in names})
 
     @torch.no_grad()
     def transform(self, parameter: Tensor, columns: slice, right: Tensor, *, transposed: bool = False) -> None:
-        """The parameter's `columns` X become X M, M = `right` [d, d]; of a transposed one its rows, as columns.
+        """Replaces the parameter's `columns` X by X M, M = `right` [d, d]; if transposed, its rows.
 
-        Its gradients then come as G M^-T, and so do their means. Their mean squares follow as if the gradients of the
-        columns were independent.
+        Its gradients become G M^-T, and so do their means. Their mean squares follow as if the gradients of the columns
+        were independent.
         """
         moment = torch.linalg.inv(right).T
         moments = self.moments.get(parameter, {})
@@ -131,7 +131,7 @@ class Optimiser:
             part.copy_((part.double() @ by).to(part))
 
     def forget(self, module: nn.Module) -> None:
-        """Takes the parameters of `module` out, and groups that hold no others."""
+        """Removes the parameters of `module`, and groups that are empty without them."""
         gone: set[Tensor] = set(module.parameters())
         for name, params in list(self.groups.items()):
             self.groups[name] = [p for p in params if p not in gone]
@@ -141,15 +141,15 @@ class Optimiser:
             self.moments.pop(p, None)
 
     def state(self) -> dict[str, Any]:
-        """What resuming needs: under "state" the moments of a parameter by its place among all."""
+        """What resuming needs: under "state" the moments of each parameter by its index."""
         return {"state": {i: dict(self.moments[p]) for i, p in enumerate(self.parameters) if p in self.moments}}
 
     def load_state(self, state: dict[str, Any]) -> None:
-        """Back to what `state` returned; a broken one raises whatever its first fault does."""
-        by_place = dict(enumerate(self.parameters))
+        """Restores a `state`; a broken one raises its first fault's own exception."""
+        by_index = dict(enumerate(self.parameters))
         self.moments = {}
-        for place, stored in state["state"].items():
-            p = by_place[int(place)]
+        for index, stored in state["state"].items():
+            p = by_index[int(index)]
             moments = {name: stored[name].detach().clone() for name in (STEP, MEAN, SQUARE)}
             shapes = [tuple(value.shape) for value in moments.values()]
             if shapes != [(), tuple(p.shape), tuple(p.shape)]:

@@ -1,7 +1,7 @@
-"""Several workers on one scene, as torchrun starts them: each learns from its share of a step's views.
+"""Several workers on one scene, started by torchrun: each trains on its share of a step's views.
 
-All hold the same model. Gradients are summed, so that all take the same step; what is measured now and then, such as
-what pruning goes by, the first one measures for all. One process alone communicates nothing.
+All hold the same model. Gradients are summed, so that all take the same step. Occasional measurements, such as those of
+pruning, are made by the first worker for all. A single process communicates nothing.
 """
 
 from __future__ import annotations
@@ -20,13 +20,13 @@ T = TypeVar("T")
 
 
 def start(device: str, views: int) -> None:
-    """Joins the others if torchrun started this process. TrainError unless `views` of a step can be shared evenly."""
+    """Joins the other workers if torchrun started this process. TrainError if they cannot share `views` evenly."""
     workers = int(os.environ.get("WORLD_SIZE", "1"))
     if views % workers:
         raise TrainError(f"found {workers} workers, expected a number that divides --views-per-step {views}")
     if workers > 1:
-        # Its functions have the group of all workers as a default, taken when it is loaded. Adam loads it. Loaded later
-        # than the group it would keep the group's threads beyond stop(), to abort the process now and then at its end.
+        # Its functions take the group of all workers as a default when it is loaded. Loaded after the group is made, it
+        # would keep the group's threads beyond stop(), which sometimes aborts the process at its end.
         import_module("torch.distributed.nn.functional")
         if device == "cuda":
             torch.cuda.set_device(int(os.environ["LOCAL_RANK"]))
@@ -34,7 +34,7 @@ def start(device: str, views: int) -> None:
 
 
 def stop() -> None:
-    """Leaves the others, where there are any."""
+    """Leaves the other workers, if there are any."""
     if count() > 1:
         distributed.destroy_process_group()
 
@@ -45,13 +45,13 @@ def count() -> int:
 
 
 def rank() -> int:
-    """Which of them this is, from 0 on; the first one writes."""
+    """The index of this worker; worker 0 writes the files."""
     return distributed.get_rank() if count() > 1 else 0
 
 
 def alike(measure: Callable[[], T]) -> T:
-    """What the first worker measures, for all: rounding on another machine must not decide otherwise there. NotFinite
-    is raised on all of them."""
+    """measure() of the first worker, for all: rounding on another machine must not lead to another decision. NotFinite
+    is raised on all workers."""
     if count() == 1:
         return measure()
     found: list[Any] = [None, None, None]
@@ -80,7 +80,7 @@ def largest(*values: float) -> tuple[float, ...]:
 
 
 def add_up(tensors: Sequence[Tensor]) -> None:
-    """Gives each tensor its sum over all workers. All on one device, of one type."""
+    """Replaces each tensor by its sum over all workers. All are on one device, of one type."""
     flat = torch.cat([tensor.flatten() for tensor in tensors])
     distributed.all_reduce(flat)
     start = 0
