@@ -23,13 +23,13 @@ separated by ` ; `, edits one thing of it; lengths, CRCs, digest and scene ids a
 Values are Python expressions over the names of blocks.py and of this file. `it` is the value before, `base` the file,
 n(i) the length of the payload of chunk i. Options: `!Error` and clauses in place of those of the group, `@2` the
 chunk at fault (`@end` behind all chunks) where it does not follow from the first patch. `for a: x | b: y` writes the
-line once for each name and value, in the places of {i} and {x}. Without a sentence the patch is the description.
+line once for each name and value, in the places of {i} and {x}. Without a sentence the patch is the description. A line
+`let name = value` defines a name for later lines.
 """
 
 from __future__ import annotations
 
 import copy
-import hashlib
 import itertools
 import re
 from collections.abc import Iterator
@@ -44,7 +44,6 @@ from pd4dgs_codec.entropy.ans import ans_encode
 from pd4dgs_codec.entropy.priors import Const, Hist, Prior, Window, write_prior
 from pd4dgs_codec.format import canonical
 from pd4dgs_codec.format.planes import restore
-from pd4dgs_codec.scene import Widths
 
 from . import blocks, lzma2
 from .blocks import (
@@ -73,10 +72,8 @@ from .blocks import (
     pattern,
     plain_attributes,
     plain_planes,
-    staged,
     staged_planes,
     varint,
-    zigzag,
 )
 
 TABLE = Path(__file__).with_name("table.txt")
@@ -96,6 +93,10 @@ def vectors() -> Iterator[Vector]:
     group = ("", "", "", "")
     for text in _lines():
         try:
+            if text.startswith("let "):
+                name, _, value = text.removeprefix("let ").partition(" = ")
+                names[name] = eval(value, names)
+                continue
             if text.startswith("["):
                 folder, base, clauses, error = re.fullmatch(r"\[(\w+) (.+?) \| ([\d. ]*\d)(?: (\w+))?\]", text).groups()  # type: ignore[union-attr]
                 group = folder, base, clauses, error
@@ -110,7 +111,7 @@ def vectors() -> Iterator[Vector]:
 
 def _lines() -> Iterator[str]:
     """One line for each vector: continuations are joined, and lines with `for` are written out."""
-    text = re.sub(r"\n +(?=[#!@]|\d[\d. ]*(?:  |\n))", "  ", TABLE.read_text(encoding="utf-8"))
+    text = re.sub(r"\n +(?=[#!@]|for [\w-]+: |\d[\d. ]*(?:  |\n))", "  ", TABLE.read_text(encoding="utf-8"))
     text = re.sub(r"\n +", " ", text)
     for row in text.splitlines():
         head, found, values = row.partition("  for ")
@@ -260,9 +261,27 @@ def deformed(*scales: Scale, number: int = 1, **fields: Any) -> File:
     return make_file(make_layer(), make_layer(number, (), before=1, scales=scales, **fields))
 
 
-def heads(widths: Widths) -> dict[int, tuple[int, ...]]:
-    """The outputs of all networks of layer 1 by id."""
-    return {0: (4, 3), 1: (3,), 2: (5, widths.feature), 3: (3 * widths.slots,), 4: (6,)}
+def slices_of(*parts: Any) -> File:
+    """A file of slices that go on with those before. A part: a slice of form 0; (slice, block), of form 1; or (slice,
+    None), of form 2."""
+    written, layers = dict[int, Slices](), list[Layer]()
+    for part in parts:
+        layer, *block = part if isinstance(part, tuple) else (part,)
+        slices = written.setdefault(layer.number, Slices())
+        layers.append(slices.add(layer, *block, go_on=block == [None]))
+    return make_file(*layers)
+
+
+def with_meta(file: File, chunk: int, fields: dict[int, Any], sections: Any = None) -> File:
+    """With other parameters (None takes one out) and sections in one layer."""
+    layer = file.layer(chunk).with_sections(sections or {})
+    meta = {k: v for k, v in sorted({**layer.meta, **fields}.items()) if v is not None}
+    return file.with_chunk(chunk, payload=replace(layer, meta=meta).payload())
+
+
+def take(file: File, *order: int) -> File:
+    """Some chunks of a file in some order, with the header's digest of the whole file."""
+    return replace(file, chunks=tuple(file.chunks[i] for i in order)).with_header({14: file.fields()[14]})
 
 
 def with_section(number: int, data: bytes, file: File, chunk: int = 0) -> File:
@@ -292,44 +311,11 @@ def predicted(k: np.ndarray, block: Block | None = None, **fields: Any) -> File:
     return with_section(ATTRIBUTES, section, make_file(layer))
 
 
-def ladder(p: int = 38) -> dict[int, list[tuple[int, int]]]:
-    """Terms in nearly every channel, of both signs."""
-    return {c: [(j, 97 * c - 1800 + 31 * j) for j in range(c % 7, c, 5)] for c in range(1, p)}
-
-
-def splits(slots: int = 10) -> dict[int, tuple[int, int, int]]:
-    """Every kind of split."""
-    return {i: (i % 4, i - 4, 5 - i) for i in range(slots)}
-
-
-def attributes_of(channel: int, *symbols: int, fill: int = 2) -> np.ndarray:
-    """Attributes of as many anchors as there are symbols, which are those of one channel."""
-    k = np.full((68, len(symbols)), fill, np.int32)
-    k[channel] = symbols
-    return k
-
-
 def histogram(d: int, top: int, count: int, differences: bool, si16: int = 20, m: int = 0, shift: int = 0) -> Hist:
     """A histogram from -3 on (scaled: from -5000 on), the extreme classes at its edges."""
     classes = pattern(count, low=0, high=top, seed=top)
     classes[0], classes[1], classes[-1] = 0, min(1, top), top
     return Hist(Window(-5000 if shift else -3, count, shift), d, top, differences, si16, m, classes)
-
-
-def histograms(differences: bool) -> dict[int, Hist]:
-    """Histograms of every class step, from 1 to the most classes."""
-    steps = [(d, top) for d in (8, 16, 32, 64) for top in (1, 5, 1 + 1984 // d)]
-    return {
-        i: histogram(d, top, 7 + 2 * (i % 3), differences, 24 + 8 * (i % 3), 8 * top)
-        for i, (d, top) in enumerate(steps)
-    }
-
-
-def many_classes() -> np.ndarray:
-    """Classes of 2^14 entries, most of them 9."""
-    classes = np.full(1 << 14, 9)
-    classes[::37], classes[5::1001] = 12, 1
-    return classes
 
 
 def tables_at_limit(more: bool = False) -> File:
@@ -361,13 +347,6 @@ def tables_of_slices(over: int) -> File:
         priors = {c: gauss(min(c, count - 1) - 20, n) for c in range(68)}
         layers.append(layer.with_sections({ATTRIBUTES: plain_attributes(k, priors, known)}))
     return make_file(*layers)
-
-
-def staged_deformation(channels: int, counts: tuple[int, ...]) -> File:
-    """Planes of form 1 whose cells differ in activity."""
-    fill = lambda name, s: pattern(*s) * (np.arange(np.prod(s)).reshape(s) % 4)  # noqa: E731
-    file = deformed(Scale(channels, (5, 4, 1, 3), fill=fill))
-    return with_section(PLANE, staged_planes(file.layer(1).planes, counts), file, 1)
 
 
 def large_products() -> File:
@@ -427,13 +406,6 @@ def rows_at_limit(over: int = 0) -> File:
     return make_file(layer).with_chunk(0, payload=layer.padded(size))
 
 
-def lzma_layers() -> list[Layer]:
-    """Two layers in mode lzma."""
-    first = make_layer(0, line(3), mode=LZMA, attributes=pattern(68, 3))
-    k = pattern(68, 3)
-    return [first, make_layer(1, line(3, z=2), before=3, scales=[Scale()], mode=LZMA, attributes=k)]
-
-
 def lzma_file(*layers: Layer, **how: Any) -> File:
     """These layers with section SYMBOLS written in another way."""
     none = dict.fromkeys((MASKS, ATTRIBUTES, PLANE, WEIGHTS))
@@ -464,11 +436,6 @@ def lzma_narrow() -> bytes:
     return narrow + lzma_symbols(channels, base=None, width=2)[len(wide) :]
 
 
-def octree(depth: int, counts: Any = (), sizes: Any = (), channels: Any = (), low: Any = (0, 0, 0)) -> bytes:
-    """A section POSITIONS of these fields. counts: s and e of each level. sizes: of nodes with 2 .. 7 children."""
-    return zigzag(*low) + bytes([depth]) + varint(*counts, *sizes) + coded(channels)
-
-
 def steep_plane(mode: int = 0, sign: int = 1) -> Layer:
     """Layer 1 with a plane whose samples are within 2^23, while its second residual is K + 1, or −K − 1."""
     ends = np.array([-M, M], np.int32) * sign
@@ -495,71 +462,6 @@ def hist_codes(prior: Hist, block: bytes | None = None, classes: list[int] | Non
     return (bytes(out) if block is None else block) + stream
 
 
-def flat_hist(differences: bool) -> Hist:
-    """A histogram of ten entries from 3 on, all of class 5."""
-    return Hist(Window(3, 10), 8, 5, differences, 30, 0 if differences else 8, np.array([5] * 10))
-
-
-def three_slices() -> File:
-    """Layer 0 in three slices, then layer 1 in two; attributes and codes that differ."""
-    zero, one = Slices(), Slices()
-    rises = [0, 1, 5, 0, 7, 0, 0, 0, 0, 9, 0]
-    return make_file(
-        zero.add(make_layer(0, line(4), codes=[3, 77, 200, 9], attributes=pattern(68, 4))),
-        zero.add(later(0, line(3, z=2), codes=[5, 77, 5], attributes=pattern(68, 3, seed=1))),
-        zero.add(later(0, line(4, z=5), codes=[80, 7, 3, 255], attributes=pattern(68, 4, seed=2))),
-        one.add(make_layer(1, line(1, z=9), before=11, rises=rises, scales=[Scale()])),
-        one.add(later(1, line(2, z=12), attributes=pattern(68, 2, seed=4))),
-    )
-
-
-def two_slices() -> File:
-    """Layer 0 in two slices of form 0."""
-    both = Slices()
-    first = both.add(make_layer(0, line(3), attributes=pattern(68, 3)))
-    return make_file(first, both.add(later(0, line(3, z=2), attributes=pattern(68, 3, seed=1))))
-
-
-def two_staged_slices() -> File:
-    """Layer 0 in a slice of form 1 and one of form 2."""
-    both = Slices()
-    first = both.add(make_layer(0, line(5), attributes=pattern(68, 5)), Block())
-    return make_file(first, both.add(later(0, line(4, z=3), attributes=pattern(68, 4, seed=2)), go_on=True))
-
-
-def continued_slices() -> File:
-    """Four slices under one block and two under another. Among the rows of the second slice are some whose residuals
-    are larger than all of the first slice together, and in the first slice some channels are 0."""
-    slices, k = Slices(), pattern(68, 24, low=-9, high=9)
-    k[[5, 11, 25]] = 0
-    loud, quiet = pattern(68, 9, low=-40, high=40, seed=5), pattern(68, 5, low=0, high=1, seed=6)
-    terms = {3: [(0, 512), (2, -700)], 20: [(7, 1024)], 37: [(0, 90), (36, 300)]}
-    block = Block(terms, {0: (3, 1, -1), 4: (1, 0, 0), 9: (2, 0, 2)}, (2, 3, 4, 8, 5))
-    other = Block({1: [(0, -1024)]}, {2: (3, 0, 0)}, (3, 1, 2, 1, 2))
-    return make_file(
-        slices.add(make_layer(0, line(24), attributes=k), block),
-        slices.add(later(0, line(9, z=2), attributes=loud), go_on=True),
-        slices.add(later(0, line(5, z=3), attributes=quiet), go_on=True),
-        slices.add(later(0, line(4, z=4), attributes=pattern(68, 4, seed=8))),
-        slices.add(later(0, line(1, z=5), attributes=loud[:, 3:4]), go_on=True),
-        slices.add(later(0, line(7, z=6), attributes=pattern(68, 7, low=-5, high=5, seed=9)), other),
-        slices.add(later(0, line(6, z=7), attributes=k[:, 4:10]), go_on=True),
-    )
-
-
-def graded_slices() -> File:
-    """Slices with step classes in all forms."""
-    slices, block = Slices(), Block({5: [(0, 700), (3, -300)]}, {0: (3, 1, 0)}, (3, 4, 2, 1, 5, 2))
-    first = make_layer(0, line(9), attributes=pattern(68, 9), classes=[0, 6, 3, 1, 0, 2, 5, 4, 6])
-    k = [pattern(68, n, seed=i) for i, n in enumerate((1, 4, 3, 3))]
-    return make_file(
-        slices.add(first, block),
-        slices.add(later(0, line(4, z=2), attributes=k[1], classes=[6, 0, 0, 1]), go_on=True),
-        slices.add(later(0, line(3, z=4), attributes=k[2], classes=[2, 2, 5])),
-        slices.add(later(0, line(3, z=-4), attributes=k[3], classes=[0, 1, 0])),
-    )
-
-
 def slices_with_classes(go_on: bool) -> File:
     """Two slices with step classes; those of the second under the prior of the first one's, which is wrong, or under
     one of its own of more entries than a section may define that goes on."""
@@ -583,71 +485,6 @@ def costly(which: int) -> File:
     return with_section(PLANE, staged_planes(file.layer(1).planes, (8,)), file, 1)
 
 
-# -- shorter ones ------------------------------------------------------------------------------------------------------
-
-GRADES = np.resize([0, 6, 3, 1, 0, 2, 5, 4, 6, 1, 0], ROWS).tolist()
-#: A value of every form that canonical msgpack has, nested as deep as a value in the header may be.
-EVERY_FORM: list[Any] = [
-    [0, 127, 128, 255, 256, 65535, 65536, 2**32 - 1, 2**32, 2**64 - 1],
-    [-1, -32, -33, -128, -129, -32768, -32769, -(2**31), -(2**31) - 1, -(2**63)],
-    [True, False, 0.5, -0.0, 2.0**-149],
-    ["", "é" * 15, "x" * 31, "x" * 32, "x" * 255, "x" * 256, b"", b"\xff" * 255, b"\0" * 256],
-    [[], {}, {0: 1, 2**32 - 1: 2}, [0] * 15, [0] * 16, {i: i for i in range(15)}, {i: i for i in range(16)}],
-]
-WINDOW, NORMAL, HIST = zigzag(3) + varint(8), varint(0, 1400), varint(6) + zigzag(3) + varint(8)
-ALIKE = coded([[2] * 3] * 68)
-ONE, NONE = (1, 0, 0, 0, 0, 0), (0,) * 6  # numbers of nodes with 2 .. 7 children
-
-
-def of_widths(widths: Widths, staged: bool = False) -> File:
-    """A file of these widths, or one of form 1."""
-    k, p = pattern(widths.channels, ROWS) * (1 + np.arange(ROWS, dtype=np.int32) % 4), widths.predicted
-    if staged:
-        block = Block(ladder(p) | {p - 1: [(p - 2, 512)]}, splits(widths.slots), (8, 3, 2, 6, 4))
-        return predicted(k, block, widths=widths)
-    moves = make_layer(1, (), before=ROWS, scales=[Scale(1, (1, 3, 2, 4))], networks=heads(widths), widths=widths)
-    return make_file(make_layer(0, line(ROWS), attributes=k, widths=widths), moves)
-
-
-def graded(k: np.ndarray, block: Block | None = None) -> File:
-    """40 anchors of all step classes."""
-    return predicted(k, block, classes=GRADES) if block else rows(ROWS, attributes=k, classes=GRADES)
-
-
-def edge_classes() -> File:
-    """The largest values that step classes and centres give."""
-    k = np.full((68, 2), 2, np.int32)
-    k[:4] = [[M >> 6] * 2, [-M >> 6] * 2, [0, M], [0, -M]]
-    return rows(2, attributes=k, classes=[6, 0]).with_header({16: [0, 0, -M, M, *[0] * 64]})
-
-
-def centred(symbol: int, step_class: int, centre: int) -> File:
-    """An anchor with one symbol, step class and centre of channel 5."""
-    file = rows(1, attributes=attributes_of(5, symbol), classes=[step_class])
-    return file.with_header({16: [*[0] * 5, centre, *[0] * 62]})
-
-
-def at(cells: Any) -> File:
-    """Anchors in these cells."""
-    return make_file(make_layer(0, blocks.ordered(cells)))
-
-
-def of_largest(count: int) -> np.ndarray:
-    """Attributes of all sizes."""
-    k = pattern(68, count, low=-M, high=M)
-    k[0] = M
-    return k
-
-
-def rounded(steps: list[float]) -> File:
-    """Steps whose multiples are rounded to binary32."""
-    k = pattern(68, 3, low=-M, high=M, seed=9)
-    cells = blocks.ordered([[-99991, 7, 1 << 20], [3, 3, 3], [1, 2, 77777]])
-    file = make_file(make_layer(0, cells, attributes=k, steps=steps[4:]), header={4: steps[:3], 5: steps[3]})
-    prior = gauss(-M, (1 << 13) + 1, si=900, shift=11)
-    return with_section(ATTRIBUTES, plain_attributes(k, dict.fromkeys(range(68), prior)), file)
-
-
 def exceptions() -> File:
     """Exceptions at many places."""
     k = pattern(68, ROWS)
@@ -657,166 +494,6 @@ def exceptions() -> File:
     return with_priors({0: SMALL, 1: SMALL, 2: gauss(-3, 20, si=100), **ends}, k)
 
 
-def exception_ends() -> File:
-    """Residuals of K and −K, as exceptions."""
-    ends = np.array([M, 1 - M], np.int32)
-    fill = lambda name, shape: np.resize(ends[:: -1 if name == "xz" else 1], shape)  # noqa: E731
-    file = deformed(Scale(1, (2, 1, 1, 1), (1, 1, 0, 0, 0, 0), fill))
-    return with_section(PLANE, plain_planes(file.layer(1).flat, dict.fromkeys(range(6), SMALL)), file, 1)
-
-
-def smooth(predictor: int) -> File:
-    """Planes under one predictor."""
-    fill = lambda name, shape: pattern(*shape, low=-50, high=50, seed=len(name))  # noqa: E731
-    return deformed(Scale(2, (5, 4, 3, 6), (predictor,) * 6, fill))
-
-
-def falling(predictor: int) -> File:
-    """A plane whose second sample is −2^23 − 1."""
-    fill = lambda name, shape: np.resize([-9, -M - 1], shape).astype(np.int32)  # noqa: E731
-    return deformed(Scale(1, (2, 1, 1, 1), (predictor, 0, 0, 0, 0, 0), fill))
-
-
-def spiky_slices() -> File:
-    """A histogram that slice 1 takes from slice 0."""
-    hist, known = Hist(Window(-3, 7), 8, 3, False, 20, 2, np.array([1, 2, 3, 3, 3, 2, 1])), blocks.Known()
-    k = [pattern(68, n, seed=i) for i, n in enumerate((3, 2))]
-    parts = make_layer(0, line(3), attributes=k[0]), later(0, line(2, z=3), attributes=k[1])
-    sections = [{ATTRIBUTES: plain_attributes(a, {0: hist}, known)} for a in k]
-    return make_file(*(part.with_sections(own) for part, own in zip(parts, sections, strict=True)))
-
-
-def twice_defined() -> File:
-    """Weights whose channels define one prior each, all alike."""
-    networks = {i: [np.full((o, 35), 2, np.int32), np.full(o, 2, np.int32)] for i, o in enumerate((10, 70, 30))}
-    file = make_file(make_layer(0, [[0, 0, 0]], networks=networks))
-    return with_section(WEIGHTS, b"".join(b"\0" + varint(4) for _ in range(6)), file)
-
-
-def metadata() -> bytes:
-    """A title and a licence, in a zstandard frame of one raw block."""
-    about = canonical.pack({1: "Kitchen", 3: "CC BY 4.0"})
-    return b"\x28\xb5\x2f\xfd\x20" + bytes([len(about)]) + (8 * len(about) + 1).to_bytes(3, "little") + about
-
-
-def skipping_layer_1() -> File:
-    """Layers 0 and 2, an ancillary chunk between them."""
-    file = make_file(three_layers().layer(0), make_layer(2, (), before=3, scales=[Scale()]))
-    return replace(file, chunks=(file.chunks[0], blocks.ancillary(1 << 15, b"private"), file.chunks[1]))
-
-
-def with_id(chunks: Any, scene_id: bytes) -> list[blocks.Chunk]:
-    """The chunks, all of another scene."""
-    return [replace(c, scene_id=scene_id) for c in chunks]
-
-
-def sha256(data: bytes) -> bytes:
-    """The first 8 bytes of a digest."""
-    return hashlib.sha256(data).digest()[:8]
-
-
-def same_slices(*order: int) -> File:
-    """Slices of one length in another order, so that the chunk list shows nothing."""
-    zero = Slices()
-    layers = [zero.add(make_layer(0, line(2))), *(zero.add(later(0, line(2, z=z))) for z in (4, 5, 6))]
-    file = make_file(*layers)
-    assert len({len(c.payload) for c in file.chunks[1:]}) == 1
-    return replace(file, chunks=tuple(file.chunks[i] for i in order)).with_header({14: file.fields()[14]})
-
-
-def empty_slices(*order: int) -> File:
-    """Layer 0 in three slices, of which the later ones have no anchors, then layer 1; in another order."""
-    file = make_file(make_layer(), *[later(0, ())] * 2, make_layer(1, line(1, z=5), before=1))
-    return replace(file, chunks=tuple(file.chunks[i] for i in order)).with_header({14: file.fields()[14]})
-
-
-def beyond_payload() -> File:
-    """Parameters a byte longer than their payload."""
-    file = make_file(make_layer(cells=()), make_layer(1, ()))
-    return file.with_chunk(
-        1, payload=(len(file.chunks[1].payload) - 3).to_bytes(4, "little") + file.chunks[1].payload[4:]
-    )
-
-
-def without_networks(*keys: int, empty: bool = False) -> File:
-    """One anchor, without some parameters and without weights."""
-    layer = make_layer().with_sections({WEIGHTS: None})
-    meta = {k: v for k, v in layer.meta.items() if k not in keys} | ({5: []} if empty else {})
-    return make_file(replace(layer, meta=meta))
-
-
-def bare_layer_1(file: File, empty: bool = False) -> File:
-    """Layer 1 with steps and scales, without networks, planes and weights."""
-    layer = file.layer(1).with_sections({PLANE: None, WEIGHTS: None})
-    meta = {k: v for k, v in layer.meta.items() if k != 5} | ({5: []} if empty else {})
-    return file.with_chunk(1, payload=replace(layer, meta=meta).payload())
-
-
-def with_parameters(fields: dict[int, Any]) -> File:
-    """Layer 1 without a deformation, with further parameters."""
-    layer = make_layer(1, line(2, z=5), before=3)
-    return three_layers().with_chunk(1, payload=replace(layer, meta=layer.meta | fields).payload())
-
-
-def five_planes() -> File:
-    """A scale of ten numbers, and five planes."""
-    file = deformed(Scale())
-    layer = file.layer(1)
-    layer = replace(layer, meta={**layer.meta, 4: [layer.meta[4][0][:-1]]}, residuals=layer.residuals[:5])
-    return file.with_chunk(1, payload=layer.with_sections({PLANE: plain_planes(layer.flat)}).payload())
-
-
-def gauss_codes() -> bytes:
-    """Section MASKS of the codes 5, 9, 7, with a stream of one word."""
-    return coded([[5, 9, 7]], {0: gauss(3, 10, si=60)})
-
-
-def long_stream() -> bytes:
-    """Section ATTRIBUTES of three anchors."""
-    return plain_attributes(pattern(68, 3), {0: SMALL})
-
-
-def new(family: int, parameters: bytes) -> bytes:
-    """The token and parameters of a new prior."""
-    return varint(2 * family) + parameters
-
-
-def all_below(kmin: int) -> bytes:
-    """The codes 5, 9, 7 as exceptions of a window that begins at kmin."""
-    return varint(2, *(v for code in (5, 9, 7) for v in (0, 2 * (kmin - 1 - code) + 1)))
-
-
-def form_1(block: Block = Block(), lengths: Any = lambda sizes: sizes, tail: bytes = b"") -> bytes:  # noqa: B008
-    """Three anchors, all symbols 3, in stages that are right for a block without terms and splits."""
-    k, none = np.full((68, 3), 3, np.int32), np.zeros(0, np.int32)
-    stages = blocks.attribute_stages((k.astype(np.int64), none), (k.astype(np.int64), none), Block(), Widths())
-    return b"\1" + block.data() + staged(stages, lengths, tail)
-
-
-def reused_stage() -> bytes:
-    """Stage 1 refers to the prior of stage 0."""
-    k, none = np.full((68, 3), 3, np.int64), np.zeros(0, np.int32)
-    stages = [coded(stage) for stage in blocks.attribute_stages((k, none), (k, none), Block(), Widths())]
-    stages[1] = varint(16) * 6
-    return b"\1" + Block().data() + varint(*map(len, stages[:-1])) + b"".join(stages)
-
-
-def over_k() -> bytes:
-    """Form 1 with every residual just over K / 2, and channel 3 predicted as channel 0."""
-    e, none = np.full((68, 3), (K >> 1) + 1), np.zeros(0, np.int32)
-    stages = blocks.attribute_stages((e, none), (e, none), Block(), Widths())
-    return b"\1" + Block({3: [(0, 1 << 10)]}).data() + staged(stages)
-
-
-def other_grades(classes: list[int], staged: bool = False) -> bytes:
-    """Form 0, or 1, with the step classes 0, 6, 2, and others in their place."""
-    own, k = np.array([0, 6, 2], np.int32), np.full((68, 3), 3, np.int32)
-    section = plain_attributes(k, classes=own)
-    if staged:
-        section = blocks.predicted_attributes(k, Block(classes=(1,) * 6), widths=Widths(graded=True), classes=own)
-    return section.replace(graded_part(own), graded_part(np.array(classes, np.int32)), 1)
-
-
 def stage_of_rest(file: File, more: int) -> bytes:
     """Stage 0 stated as long as all that its length and the rest take, or longer."""
     said, section = 0, b""
@@ -824,56 +501,3 @@ def stage_of_rest(file: File, more: int) -> bytes:
         section = staged_planes(file.layer(1).planes, (3, 2), lambda s: [said + more, s[1]])  # noqa: B023
         said = len(section) - 3
     return section
-
-
-def stage_reuse() -> File:
-    """A stage of planes refers to a prior of the stage before."""
-    file = deformed(Scale(3, (1, 1, 1, 1), fill=constant(4)))
-    first = coded([[4]] * 12)
-    return with_section(PLANE, b"\1\1" + varint(len(first)) + first + varint(16) * 6, file, 1)
-
-
-def base_known() -> blocks.Known:
-    """The definitions of form 0 in the first of `two_slices`."""
-    known = blocks.Known()
-    plain_attributes(two_slices().layer(0).attributes, known=known)
-    return known
-
-
-def many_in_slices() -> File:
-    """An anchor more than two slices may declare."""
-    first = make_layer()
-    least = (1 << 13) + 2 * len(first.payload())
-    second = later(0, line(least, z=3))
-    packed = canonical.pack({**second.parameters(), 1: least + 2 * len(second.payload())})
-    return make_file(first, second).with_chunk(1, payload=second.payload(packed))
-
-
-def block_of_layer_0(file: File) -> File:
-    """Form 2 in layer 1, the block in layer 0."""
-    second = file.layer(1)
-    upper = make_layer(1, line(4, z=7), before=5, attributes=second.attributes)
-    return make_file(file.layer(0), upper.with_sections({ATTRIBUTES: second.sections[ATTRIBUTES]}))
-
-
-def large_bias() -> Layer:
-    """A bias of 2^23 + 1."""
-    layer = make_layer()
-    layer.weights[-1][:] = M + 1
-    return layer.with_sections({WEIGHTS: coded(w.ravel() for w in layer.weights)})
-
-
-def lzma_stream(file: File, stream: Any) -> bytes:
-    """The section of the first layer under another stream."""
-    return lzma_symbols(file.layer(0).channels, width=0, stream=stream)
-
-
-def lzma_body(file: File, change: Any) -> bytes:
-    """One compressed chunk with other packed bytes."""
-    return lzma_stream(file, lambda d: lzma2.packed(d, body=change))
-
-
-def two_chunks(first: int, second: int, **how: Any) -> Any:
-    """A stream of two chunks of these control bytes."""
-    plain = [lzma2.Properties()] * 2
-    return lambda d: lzma2.chunks(d, [(first, 1000), (second, len(d) - 1000)], plain, **how)
