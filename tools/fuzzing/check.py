@@ -197,11 +197,6 @@ class JavaScript:
             return f"crash, {found['crash']}", None
         return (found["error"], found["message"]) if "error" in found else (DECODED, found["hashes"])
 
-    def close(self) -> None:
-        """End the process."""
-        self._process.stdin.close()  # type: ignore[union-attr]
-        self._process.wait()
-
 
 Decoder = Callable[[bytes], tuple[str, Any] | None]
 

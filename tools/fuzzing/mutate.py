@@ -66,13 +66,6 @@ def burst(rng: random.Random, data: bytearray, other: bytes) -> None:
     data[at : at + size] = rng.choice((rng.randbytes(size), bytes(size), b"\xff" * size))
 
 
-def swap(rng: random.Random, data: bytearray, other: bytes) -> None:
-    """Two runs of equal length change places."""
-    a, b = sorted((_place(rng, data), _place(rng, data)))
-    size = min(rng.choice((1, 1, 2, 4, 16)), b - a, len(data) - b)
-    data[a : a + size], data[b : b + size] = data[b : b + size], data[a : a + size]
-
-
 def splice(rng: random.Random, data: bytearray, other: bytes) -> None:
     """A run of another file over one of ours, or its tail."""
     if other:
@@ -108,7 +101,7 @@ def set_varint(rng: random.Random, data: bytearray, other: bytes) -> None:
     data[at : end + 1] = varint(min(rng.choice(INTEGERS) << rng.randrange(2), (1 << 35) - 1))
 
 
-CHANGES = (flip, flip, burst, swap, splice, insert, delete, set_integer, set_varint, set_varint)
+CHANGES = (flip, flip, burst, splice, splice, insert, delete, set_integer, set_varint, set_varint)
 
 
 def change_bytes(rng: random.Random, data: bytes, other: bytes, names: list[str]) -> bytes:

@@ -124,71 +124,49 @@ def default_prior(symbols: np.ndarray) -> Prior:
 Known = list[tuple[bytes, bytes]]  # definitions of priors, with the classes of histograms
 
 
-class Channels:
-    """Writes a section of coded channels, one `add` per channel.
-
-    known: definitions of the slices before, to which those of this section are appended.
-    """
-
-    def __init__(self, known: Known | None = None) -> None:
-        self.block = bytearray()
-        self._defined = [] if known is None else known
-        self._tables: list[Hist] = []
-        self._parts: list[tuple[np.ndarray, np.ndarray]] = []
-
-    def add(self, symbols: Iterable[int], prior: Prior | None = None) -> Channels:
-        """Symbols outside the prior's window become exceptions. A prior that is defined already is referred to."""
-        k = np.asarray(symbols, np.int64)
-        if not k.size:
-            return self
-        prior = prior or default_prior(k)
-        window = prior.window
-        inside = (k >= window.kmin) & (k < window.end)
-        self._write_prior(prior, listed=not inside.all())
-        if not inside.all():
-            self._write_exceptions(k, inside, window)
-        entries = k[inside] - window.kmin
-        self._parts.append((entries >> window.shift, prior.cum))
-        if window.shift:
-            self._parts.append((entries & ((1 << window.shift) - 1), uniform_table(window.shift)))
-        return self
-
-    def _write_prior(self, prior: Prior, listed: bool) -> None:
-        parameters = bytearray()
-        write_prior(parameters, prior)
-        classes = np.asarray(prior.classes).tobytes() if isinstance(prior, Hist) else b""
-        key = (bytes([family_code(prior)]) + parameters, classes)
-        if key in self._defined:
-            back = self._defined[::-1].index(key)
-            self.block += varint(2 * (FIRST_REUSE + back) + listed)
-            return
-        self.block += varint(2 * family_code(prior) + listed) + parameters
-        self._defined.append(key)
-        if isinstance(prior, Hist):
-            self._tables.append(prior)
-
-    def _write_exceptions(self, k: np.ndarray, inside: np.ndarray, window: Window) -> None:
-        places = np.flatnonzero(~inside).tolist()
-        self.block += varint(len(places) - 1)
-        for last, at in zip([-1, *places], places, strict=False):
-            value = int(k[at])
-            below = 2 * (window.kmin - 1 - value) + 1
-            self.block += varint(at - last - 1, below if value < window.kmin else 2 * (value - window.end))
-
-    def done(self) -> bytes:
-        """The parameter block and the ANS stream."""
-        parts = [(table.class_symbols, table.class_cum) for table in self._tables] + self._parts
-        return bytes(self.block) + ans_encode([symbols for symbols, _ in parts], [cum for _, cum in parts])
-
-
 def coded(
     channels: Iterable[Iterable[int]], priors: Mapping[int, Prior] | None = None, known: Known | None = None
 ) -> bytes:
-    """A section of coded channels. priors: of some channels, by their number."""
-    section = Channels(known)
+    """A section of coded channels: its parameter block and its ANS stream.
+
+    Symbols outside the window of a prior become exceptions. A prior that is defined already is referred to. priors: of
+    some channels, by their number. known: definitions of the slices before, to which those of this section are added.
+    """
+    block, defined = b"", [] if known is None else known
+    tables, parts = list[tuple[np.ndarray, np.ndarray]](), list[tuple[np.ndarray, np.ndarray]]()
     for number, channel in enumerate(channels):
-        section.add(channel, (priors or {}).get(number))
-    return section.done()
+        k = np.asarray(channel, np.int64)
+        if not k.size:
+            continue
+        prior = (priors or {}).get(number) or default_prior(k)
+        window = prior.window
+        inside = (k >= window.kmin) & (k < window.end)
+        parameters = bytearray()
+        write_prior(parameters, prior)
+        key = bytes([family_code(prior)]) + parameters, np.asarray(getattr(prior, "classes", ())).tobytes()
+        if key in defined:
+            block += varint(2 * (FIRST_REUSE + defined[::-1].index(key)) + (not inside.all()))
+        else:
+            block += varint(2 * family_code(prior) + (not inside.all())) + parameters
+            defined.append(key)
+            if isinstance(prior, Hist):
+                tables.append((prior.class_symbols, prior.class_cum))
+        if not inside.all():
+            block += _exceptions(k, inside, window)
+        entries = k[inside] - window.kmin
+        parts.append((entries >> window.shift, prior.cum))
+        if window.shift:
+            parts.append((entries & ((1 << window.shift) - 1), uniform_table(window.shift)))
+    return block + ans_encode([symbols for symbols, _ in tables + parts], [cum for _, cum in tables + parts])
+
+
+def _exceptions(k: np.ndarray, inside: np.ndarray, window: Window) -> bytes:
+    places = np.flatnonzero(~inside).tolist()
+    out = varint(len(places) - 1)
+    for last, at in zip([-1, *places], places, strict=False):
+        below = 2 * (window.kmin - 1 - int(k[at])) + 1
+        out += varint(at - last - 1, below if below > 0 else 2 * (int(k[at]) - window.end))
+    return out
 
 
 def positions(cells: np.ndarray, known: Known | None = None) -> bytes:

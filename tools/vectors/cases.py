@@ -23,8 +23,8 @@ separated by ` ; `, edits one thing of it; lengths, CRCs, digest and scene ids a
 Values are Python expressions over the names of blocks.py and of this file. `it` is the value before, `base` the file,
 n(i) the length of the payload of chunk i. Options: `!Error` and clauses in place of those of the group, `@2` the
 chunk at fault (`@end` behind all chunks) where it does not follow from the first patch. `for a: x | b: y` writes the
-line once for each name and value, in the places of {i} and {x}. Without a sentence the patch is the description. A line
-`let name = value` defines a name for later lines.
+line once for each name and value, in the places of {i} and {x}. `let name = value` defines a name for later lines.
+Without a sentence the name and the patch are the description.
 """
 
 from __future__ import annotations
@@ -145,7 +145,7 @@ def _vector(text: str, folder: str, base: File, clauses: str, error: str | None,
     elif at is not None and chunk is not None:
         at += file.start(chunk)
     count = None if error is None or target == "end" else chunk or 0
-    sentence = what or f"{patches}."
+    sentence = what or f"{name.replace('-', ' ').capitalize()}: {patches}"
     layers, slices = file.hashes(count), file.slices(count)
     place = (chunk, at) if error else (None, None)
     return Vector(f"{folder}/{name}", sentence, tuple(clauses.split()), data, layers, slices, error, *place)
