@@ -324,9 +324,9 @@ def batch_text(rows: Sequence[Row]) -> str:
     return f"{what}: {'; '.join(told)} beside the encoding itself."
 
 
-ERROR = Benchmark("error-time", "Error against run time", ONE, 6, measure_error, error_text, error_pictures)
-STABILITY = Benchmark("stability", "Extreme cases", (), 1, measure_stability, stability_text)
-SPEED = Benchmark("speed", "Speed", REAL, 2, measure_speed, speed_text)
-RIVALS = Benchmark("rivals", "Other coders", REAL, 1, measure_rivals, rivals_text)
-EXPORT = Benchmark("export", "Exported files", REAL, 30, measure_export, export_text)
-BATCH = Benchmark("batch", "Batches", ONE, 2, measure_batch, batch_text)
+ERROR = Benchmark("error-time", "Error against run time", ONE, measure_error, error_text, error_pictures)
+STABILITY = Benchmark("stability", "Extreme cases", (), measure_stability, stability_text)
+SPEED = Benchmark("speed", "Speed", REAL, measure_speed, speed_text)
+RIVALS = Benchmark("rivals", "Other coders", REAL, measure_rivals, rivals_text)
+EXPORT = Benchmark("export", "Exported files", REAL, measure_export, export_text)
+BATCH = Benchmark("batch", "Batches", ONE, measure_batch, batch_text)

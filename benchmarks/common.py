@@ -121,12 +121,11 @@ class Run:
 class Benchmark:
     """scenes: names in SCENES; none where no scene is measured. measure: the rows of one scene (of None without
     scenes). text: the rows of all scenes as Markdown, without a heading. pictures: draws them into a folder and returns
-    the file names. minutes: on two cores, after the trainings of `quality`."""
+    the file names."""
 
     name: str
     title: str
     scenes: tuple[str, ...]
-    minutes: int
     measure: Callable[[Run, Any], list[Row]]
     text: Callable[[Sequence[Row]], str]
     pictures: Callable[[Sequence[Row], Path], list[str]] = lambda rows, folder: []

@@ -21,10 +21,7 @@ may share; sizes and qualities repeat for the same package and machine. 1 MB is 
 
 def write(docs: Path, benchmarks: Sequence[Benchmark], sections: Mapping[str, Row]) -> None:
     """The figures as JSON, and the page as they make it. sections: by the name of their benchmark."""
-    from pd4dgs_codec.bench.timing import machine, machine_line
-
-    kept = [sections[b.name] for b in benchmarks if b.name in sections]
-    figures = {"machine": machine_line(machine()), "sections": shortened(finite(kept))}
+    figures = {"sections": shortened(finite([sections[b.name] for b in benchmarks if b.name in sections]))}
     path = docs / "figures" / "results.json"
     path.parent.mkdir(parents=True, exist_ok=True)
     with whole_file(path, overwrite=True) as temporary:
@@ -34,18 +31,17 @@ def write(docs: Path, benchmarks: Sequence[Benchmark], sections: Mapping[str, Ro
 
 
 def text(benchmarks: Sequence[Benchmark], figures: Row) -> str:
-    """The page. What made most sections is said once, and with the others."""
+    """The page. What made most sections is said once; a section that was made otherwise says so itself."""
     sections, known = figures["sections"], {b.name: b for b in benchmarks}
-    made = [f"commit `{s['commit']}`, {s['date']}, `{s['command']}`" for s in sections]
+    made = [f"commit `{s['commit']}`, {s['date']}, `{s['command']}`, {s['machine']}" for s in sections]
     usual = max(made, key=made.count)
-    told = f"Where nothing else is said: {usual}. Machine: {figures['machine']}."
-    parts = ["# Results", wrapped(INTRODUCTION), wrapped(told)]
+    parts = ["# Results", wrapped(INTRODUCTION), wrapped(f"Where nothing else is said: {usual}.")]
     for found, by in zip(sections, made, strict=True):
         title = known[found["name"]].title
         shown = [f"![{title}: {name.rsplit('.', 1)[0]}](img/{name})" for name in found["pictures"]]
         parts += [f"## {title}", wrapped(known[found["name"]].text(found["rows"]))]
         parts += ["\n".join(shown)] if shown else []
-        parts += [] if by == usual else [f"Made at {by}."]
+        parts += [] if by == usual else [wrapped(f"Made at {by}.")]
     return "\n\n".join(parts) + "\n"
 
 
@@ -71,4 +67,4 @@ def lines(figures: Row) -> str:
         head = json.dumps(found | {"rows": []})[:-1]
         rows = ",\n".join(json.dumps(row) for row in found["rows"])
         sections.append(head.replace('"rows": []', f'"rows": [\n{rows}\n]') + "}")
-    return f'{{"machine": {json.dumps(figures["machine"])}, "sections": [\n' + ",\n".join(sections) + "\n]}\n"
+    return '{"sections": [\n' + ",\n".join(sections) + "\n]}\n"

@@ -137,5 +137,5 @@ def dial_pictures(rows: Sequence[Row], folder: Path) -> list[str]:
     return ["dial.png"]
 
 
-PAPER = Benchmark("paper", "The paper's tables", REAL, 60, measure, text)
-DIAL = Benchmark("dial", "The quality dial", REAL, 25, measure_dial, dial_text, dial_pictures)
+PAPER = Benchmark("paper", "The paper's tables", REAL, measure, text)
+DIAL = Benchmark("dial", "The quality dial", REAL, measure_dial, dial_text, dial_pictures)

@@ -133,4 +133,4 @@ def time_plot(curves: Sequence[tuple[str, list[Row]]], path: Path) -> None:
         axes[0].legend()
 
 
-BENCHMARK = Benchmark("quality", "Quality and bytes", tuple(SCENES), 45, measure, text, pictures)
+BENCHMARK = Benchmark("quality", "Quality and bytes", tuple(SCENES), measure, text, pictures)

@@ -28,6 +28,7 @@ import refining_gif
 from common import QUICK, ROOT, SCENES, Benchmark, Row, Run, commit, present, say
 from page import write
 
+from pd4dgs_codec.bench.timing import machine, machine_line
 from pd4dgs_codec.errors import DataError, Pd4Error
 
 ALL = (
@@ -64,6 +65,7 @@ def section(benchmark: Benchmark, run: Run, names: Sequence[str], line: str) -> 
         "commit": commit(),
         "date": datetime.date.today().isoformat(),
         "command": line,
+        "machine": machine_line(machine() | {"load_average": None}),
         "minutes": (time.monotonic() - start) / 60,
         "rows": rows,
         "pictures": benchmark.pictures(rows, run.images),
