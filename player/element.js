@@ -195,7 +195,7 @@ export class Pd4Player extends HTMLElement {
 
   // --- for scripts
 
-  /** What plays, null while the element is in no document. */
+  /** The player, null while the element is in no document. */
   get player() {
     return this._player;
   }

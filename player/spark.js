@@ -1,5 +1,5 @@
-// A mesh that plays a .pd4 in Spark (sparkjs.dev), a splat renderer for three.js. Both are the page's own and handed in:
-// nothing is imported from them.
+// A mesh that plays a .pd4 in Spark (sparkjs.dev), a splat renderer for three.js. The page imports both and passes them
+// in.
 //
 // three.js owns the drawing context, so Gaussians are evaluated in a worker and handed over as Spark's ExtSplats.
 
@@ -13,7 +13,7 @@ import { startLoader } from "./render/loader.js";
 /** @typedef {import("./render/level.js").State} State */
 
 /**
- * What is used of three.js (r180 or later) and of Spark (2.2 or later).
+ * The parts of three.js (r180 or later) and of Spark (2.2 or later) in use.
  *
  * @typedef {Record<"Vector3" | "Quaternion" | "Color" | "Matrix4", new (...args: any[]) => any>
  *   & {SRGBColorSpace: string}} Three
@@ -121,7 +121,7 @@ export class Pd4Splats extends EventTarget {
     this._begun();
   }
 
-  /** What every level needs (clause 5.1). */
+  /** The scene's global properties (clause 5.1). */
   get info() {
     return this._sceneThere().info;
   }
@@ -161,8 +161,7 @@ export class Pd4Splats extends EventTarget {
   }
 
   /**
-   * Gives a camera the place, lens and depths of a view: the scene's own for want of another. The camera stands in no
-   * other object.
+   * Gives a camera the pose, lens and depth range of a view, by default the scene's own. The camera has no parent.
    *
    * @param {any} camera a PerspectiveCamera @param {number} width @param {number} height of what is drawn, pixels
    * @param {Camera} [view]
@@ -190,8 +189,8 @@ export class Pd4Splats extends EventTarget {
   }
 
   /**
-   * Moves time on if it plays, and brings the mesh to time, level and camera as soon as they are evaluated. What takes
-   * longer than a frame leaves out frames, not time.
+   * Advances time while playing, and updates the mesh to time, level and camera as soon as they are evaluated. A slow
+   * evaluation skips frames, not time.
    *
    * @param {any} camera that the scene is seen through
    */
@@ -213,7 +212,7 @@ export class Pd4Splats extends EventTarget {
     this._evaluate();
   }
 
-  /** Whether the mesh holds what the last `update` asked for. */
+  /** Whether the mesh shows the state of the last `update`. */
   get settled() {
     return !!this._wanted && !!this._shown && sameState(this._shown, this._wanted);
   }
@@ -233,7 +232,7 @@ export class Pd4Splats extends EventTarget {
     return this._scene;
   }
 
-  /** Evaluates until the mesh holds what is wanted; only the last wish counts. */
+  /** Evaluates until the mesh shows the wanted state; intermediate ones are skipped. */
   async _evaluate() {
     if (this._evaluating) return;
     this._evaluating = true;

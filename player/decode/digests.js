@@ -1,35 +1,20 @@
 // Clause 2.1: CRC-32 of zlib, and SHA-256 of FIPS 180-4, both over bytes that may come in several runs.
 
-/** Eight tables of 256: table t, entry b is the CRC-32 of byte b followed by t zero bytes, without the complements. */
-const CRC_TABLES = /* @__PURE__ */ (() => {
-  const tables = new Uint32Array(8 * 256);
-  for (let b = 0; b < 256; b++) {
-    let c = b;
-    for (let i = 0; i < 8; i++) c = c & 1 ? (c >>> 1) ^ 0xedb88320 : c >>> 1;
-    tables[b] = c;
-  }
-  for (let i = 256; i < tables.length; i++) tables[i] = (tables[i - 256] >>> 8) ^ tables[tables[i - 256] & 255];
-  return tables;
-})();
+/** Entry b is the CRC-32 of byte b, without the complements. */
+const CRC_TABLE = /* @__PURE__ */ Uint32Array.from({ length: 256 }, (_, c) => {
+  for (let i = 0; i < 8; i++) c = c & 1 ? (c >>> 1) ^ 0xedb88320 : c >>> 1;
+  return c;
+});
 
 /**
- * CRC-32 of `bytes`, or of what `before` is the CRC-32 of followed by `bytes`.
+ * CRC-32 of `bytes`, which follow bytes whose CRC-32 is `before`.
  *
  * @param {Uint8Array} bytes @param {number} [before]
  * @returns {number} 0..2^32 - 1
  */
 export function crc32(bytes, before = 0) {
-  const t = CRC_TABLES;
-  const n = bytes.length;
   let c = ~before;
-  let i = 0;
-  for (; i + 8 <= n; i += 8) {
-    c ^= bytes[i] | (bytes[i + 1] << 8) | (bytes[i + 2] << 16) | (bytes[i + 3] << 24);
-    c =
-      t[1792 + (c & 255)] ^ t[1536 + ((c >>> 8) & 255)] ^ t[1280 + ((c >>> 16) & 255)] ^ t[1024 + (c >>> 24)] ^
-      t[768 + bytes[i + 4]] ^ t[512 + bytes[i + 5]] ^ t[256 + bytes[i + 6]] ^ t[bytes[i + 7]];
-  }
-  for (; i < n; i++) c = (c >>> 8) ^ t[(c ^ bytes[i]) & 255];
+  for (let i = 0; i < bytes.length; i++) c = (c >>> 8) ^ CRC_TABLE[(c ^ bytes[i]) & 255];
   return ~c >>> 0;
 }
 

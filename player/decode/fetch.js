@@ -1,4 +1,4 @@
-// A file on a web server, layer by layer: what arrives is decoded, a cut is survived, nothing is fetched twice.
+// A file on a web server, slice by slice: bytes are decoded as they arrive, and a download that is cut resumes.
 
 import { LONGEST_HEADER, PREAMBLE_SIZE, headerLength } from "./container.js";
 import { DecodeError } from "./errors.js";
@@ -7,7 +7,7 @@ import { Stream } from "./stream.js";
 /** @typedef {import("./scene.js").Scene} Scene */
 /** @typedef {{layer: number, end: number}} LayerEnd */
 
-/** The file cannot be had, as opposed to one that cannot be decoded. */
+/** The file is not available, as opposed to one that cannot be decoded. */
 export class FetchError extends Error {
   /** @param {string} message */
   constructor(message) {
@@ -17,8 +17,8 @@ export class FetchError extends Error {
 }
 
 /**
- * What a viewer will spend: layers, bytes of the file counted from its first, seconds counted from the call. The first
- * layer is taken if it ends within `bytes`, a later one also only if it would arrive in time at the rate of late.
+ * Limits of a download: highest layer, bytes from the first of the file, seconds from the call. The first slice is
+ * fetched if it ends within `bytes`, a later one only if it would also arrive in time at the recent rate.
  *
  * @typedef {{maxLayer?: number, bytes?: number, seconds?: number}} Budget
  */
@@ -35,8 +35,8 @@ export class FetchError extends Error {
  */
 
 /**
- * makeDecoder: called for each file that the server gives; it must not stop at a layer of its own. stall: seconds without
- * a byte after which a connection counts as cut. attempts: failures in a row, without a byte between them, before giving
+ * makeDecoder: called once, and again if the file changes; its decoder has no limit of layers. stall: seconds without a
+ * byte after which a connection counts as cut. attempts: consecutive failures, without a byte between them, before giving
  * up. pause: seconds before the second attempt, doubled for each further one. progress: called as bytes arrive.
  *
  * @typedef {object} SourceOptions
@@ -49,24 +49,24 @@ export class FetchError extends Error {
  * @property {typeof globalThis.fetch} [fetch]
  */
 
-/** Bytes that a file may have if the budget does not say: what arrives is held until its layer is whole. */
+/** Limit of layer 0 without a budget of bytes: bytes are held until their slice is complete. */
 const MOST_BYTES = 2 ** 28;
 const RATE_SECONDS = 1;
-/** Answers that may be another one a moment later. */
-const PASSING = [408, 425, 429, 500, 502, 503, 504];
-/** Changes of the file after which it counts as one that never holds still. */
+/** Temporary errors. */
+const TEMPORARY = [408, 425, 429, 500, 502, 503, 504];
+/** After so many changes the file counts as never stable. */
 const MOST_CHANGES = 4;
 
-/** A cut connection, or an answer that makes no sense: asking again may help. */
+/** The connection ended early, or the response is invalid: a new request may help. */
 class Cut extends Error {}
-/** The file is another one now: nothing of it is here yet. */
+/** The file has changed, and none of its bytes are here yet. */
 class Changed extends Error {}
-/** The seconds of the budget are over. */
+/** The time budget is spent. */
 class OutOfTime extends Error {}
 
 /**
- * The scenes of one URL. `scenes()` gives one per layer that completes; called again it goes on after the last one given,
- * with other budgets. A damaged layer is fetched once more and never given.
+ * The scenes of one URL. `scenes()` yields one per slice; called again, with another budget, it continues after the last
+ * one. A damaged slice is fetched once more and never yielded.
  */
 export class SceneSource {
   /** @param {string | URL} url @param {SourceOptions} [options] */
@@ -108,11 +108,11 @@ export class SceneSource {
   }
 
   /**
-   * One scene per layer that completes, each with all layers so far, until the budget or the file ends.
+   * One scene per slice that completes, each with all slices so far, until the budget or the file ends.
    *
-   * Raises FetchError if the file cannot be had, DecodeError if it is not a valid one, and the signal's reason if it is
-   * aborted; scenes given before stay valid. If the file changes on the way, its scenes begin anew with layer 0. Without
-   * a budget in bytes, a layer 0 that ends behind 2^28 of them is LimitExceeded.
+   * Raises FetchError if the file is not available, DecodeError if it is invalid, and the signal's reason if it is
+   * aborted; scenes yielded before stay valid. If the file changes, its scenes restart with layer 0. Without a budget in
+   * bytes, a layer 0 that ends behind byte 2^28 is LimitExceeded.
    *
    * @param {Budget} [budget]
    * @returns {AsyncGenerator<Scene, void, void>}
@@ -148,13 +148,13 @@ export class SceneSource {
     }
   }
 
-  /** Where preamble or header ends, so that nothing behind them is decoded before the budget is held against it. */
+  /** The end of preamble or header: nothing behind them is decoded before the budget is checked. */
   _headerEnd() {
     if (this.received < PREAMBLE_SIZE) return PREAMBLE_SIZE;
     return Math.min(PREAMBLE_SIZE + headerLength(this._head), LONGEST_HEADER);
   }
 
-  /** Where the next layer to take ends, or null to stop. @param {LayerEnd[]} wanted @param {number} until */
+  /** The end of the next slice to fetch, or null to stop. @param {LayerEnd[]} wanted @param {number} until */
   _nextEnd(wanted, until) {
     const next = wanted.find(({ end }) => end > this._decoder.consumed);
     const left = until - now();
@@ -172,7 +172,7 @@ export class SceneSource {
     return this._marks.length > 1 && last[1] > first[1] ? (last[1] - first[1]) / Math.max(last[0] - first[0], 1e-6) : null;
   }
 
-  /** The scenes that a block completes; damage sends the fetch back to the end of the last good chunk, once.
+  /** The scenes that a block completes. After damage the download goes back to the last valid chunk, once.
    * @param {Uint8Array} block @returns {Promise<Scene[]>} */
   async _feed(block) {
     try {
@@ -247,7 +247,7 @@ export class SceneSource {
     this._progress?.(this.received, this.total);
   }
 
-  /** Asks for what is missing. @param {number} until @returns {Promise<Answer>} */
+  /** Requests the missing bytes. @param {number} until @returns {Promise<Answer>} */
   async _request(until) {
     const start = this.received;
     const resumes = start > 0 && this._validator !== null;
@@ -263,7 +263,7 @@ export class SceneSource {
     this.requests++;
     this._marks = [[now(), 0]];
     try {
-      // What is fetched anew, after a cut or damage, does not come out of a cache.
+      // a request after a cut or damage bypasses caches
       const asked = this._fetch(this.url, { headers, signal: controller.signal, cache: start ? "no-store" : "default" });
       const response = await within(asked, this._waiting(until));
       const skip = this._accept(response, start, resumes);
@@ -276,7 +276,7 @@ export class SceneSource {
   }
 
   /**
-   * Holds an answer against what is here; a file that changed is begun anew. Returns the bytes of it that are here.
+   * Checks a response; restarts if the file has changed. Returns how many of its bytes are here already.
    *
    * @param {Response} response @param {number} start @param {boolean} resumes
    */
@@ -288,7 +288,7 @@ export class SceneSource {
     }
     if (status !== 200 && status !== 206) {
       const said = `the server answers ${status} ${response.statusText}`.trimEnd();
-      if (PASSING.includes(status)) throw new Cut(said);
+      if (TEMPORARY.includes(status)) throw new Cut(said);
       throw new FetchError(`${this.url}: ${said}`);
     }
     const tag = headers.get("ETag");
@@ -297,7 +297,7 @@ export class SceneSource {
     if (status === 206) {
       const part = /^bytes (\d{1,15})-(\d{1,15})\/(\d{1,15})$/.exec(headers.get("Content-Range") ?? "");
       const known = this.total;
-      if (!resumes || !part || Number(part[1]) !== start) throw new Cut("an answer of another part than was asked for");
+      if (!resumes || !part || Number(part[1]) !== start) throw new Cut("the response is another part than requested");
       if ((validator !== null && validator !== this._validator) || (known !== null && Number(part[3]) !== known)) {
         this._restart();
         throw new Changed("an answer about another file");
@@ -307,17 +307,17 @@ export class SceneSource {
     }
     const same = strong !== null && strong === this._validator;
     if (start && !same) this._restart();
-    // Of a compressed answer the length is not that of the file.
+    // the length of a compressed response is not that of the file
     const length = headers.get("Content-Encoding") ? null : headers.get("Content-Length");
     this.total = length !== null && /^\d{1,15}$/.test(length) ? Number(length) : null;
     this._validator = validator;
     return this.received; // the same file, from a server without ranges
   }
 
-  /** The file is another one than before. */
+  /** The file has changed. */
   _restart() {
     this.changes++;
-    if (this.changes > MOST_CHANGES) throw new FetchError(`${this.url}: changed ${this.changes} times while it was fetched`);
+    if (this.changes > MOST_CHANGES) throw new FetchError(`${this.url}: changed ${this.changes} times during the download`);
     const { _decoder: old } = this;
     if ("close" in old && typeof old.close === "function") old.close();
     this._decoder = this._makeDecoder();
@@ -328,7 +328,7 @@ export class SceneSource {
   }
 }
 
-/** The body of one answer. */
+/** The body of one response. */
 class Answer {
   /** @param {Response} response @param {AbortController} controller @param {number} skip bytes that are here already
    * @param {() => void} ended */
@@ -340,7 +340,7 @@ class Answer {
     this._rest = new Uint8Array(0);
   }
 
-  /** The next bytes, at most `limit`, none of them if they are skipped; null at the end.
+  /** The next bytes, at most `limit`, empty while bytes are skipped; null at the end.
    * @param {number} limit @param {number} milliseconds to wait for them @returns {Promise<Uint8Array | null>} */
   async take(limit, milliseconds) {
     if (!this._rest.length) {
@@ -362,7 +362,7 @@ class Answer {
 
 const now = () => performance.now() / 1000;
 
-/** What `promise` gives, or a Cut if that takes longer. @template T @param {Promise<T>} promise
+/** The value of `promise`, or a Cut if that takes longer. @template T @param {Promise<T>} promise
  * @param {number} milliseconds @returns {Promise<T>} */
 function within(promise, milliseconds) {
   return new Promise((resolve, reject) => {

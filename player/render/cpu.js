@@ -1,5 +1,5 @@
-// The evaluator without a GPU, in a worker of its own: for machines that cannot render to float textures, and for
-// networks that shaders cannot hold.
+// The evaluator without a GPU, in a worker: for machines that cannot render to float textures, and for networks that
+// shaders do not take.
 
 import { SPLAT_BLOCKS } from "./evaluator.js";
 import { Remote } from "../decode/remote.js";

@@ -1,4 +1,4 @@
-// WebGL2 without its ceremony: array textures of float blocks, passes over them, reading back behind a fence.
+// WebGL2: array textures of float blocks, passes over them, asynchronous read-back.
 
 const HEADER = `#version 300 es
 precision highp float;
@@ -15,7 +15,7 @@ void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4. - 
 /** Between two looks at a fence, milliseconds. */
 const POLL_MS = 1;
 
-/** The context is gone: whoever waits starts again when it is back. */
+/** The WebGL context is lost; work restarts when it is restored. */
 export class ContextLost extends Error {
   constructor() {
     super("the WebGL context is lost");
@@ -44,9 +44,9 @@ export class Gpu {
     this.floats = !!gl.getExtension("EXT_color_buffer_float");
     const halves = this.floats || !!gl.getExtension("EXT_color_buffer_half_float");
     const names = gl.getExtension("WEBGL_debug_renderer_info");
-    /** What draws, in the driver's words. */
+    /** The renderer as the driver names it. */
     this.renderer = String(gl.getParameter(names ? names.UNMASKED_RENDERER_WEBGL : gl.RENDERER));
-    /** Whether the processor draws. */
+    /** Whether it is a software renderer. */
     this.software = /swiftshader|llvmpipe|software/i.test(this.renderer);
     /** What pictures are blended in, 0 where there are no floats for it. Half floats are slow in software. */
     this.pictureFormat =

@@ -1,4 +1,4 @@
-// What a machine can keep up with: fewer pixels where drawing is slow, a lower level where evaluating is.
+// Adapts to slow machines: fewer pixels if drawing is slow, a lower level if evaluation is.
 
 /** Sizes of the picture relative to the element's, each side. */
 export const SCALES = [1, 0.75, 0.5, 0.35];
@@ -37,7 +37,7 @@ export class Pace {
     return this._cap;
   }
 
-  /** Takes note of a draw at the current scale. @param {number} ms from its start to its end on the GPU */
+  /** Records a draw at the current scale. @param {number} ms from its start to its end on the GPU */
   drew(ms) {
     this._drawMs = this._draws ? this._drawMs + WEIGHT * (ms - this._drawMs) : ms;
     if (++this._draws < SETTLE) return;
@@ -50,7 +50,7 @@ export class Pace {
   }
 
   /**
-   * Takes note of an evaluation while the scene plays.
+   * Records an evaluation while the scene plays.
    *
    * @param {number} level @param {number} ms @param {number} now milliseconds
    */

@@ -1,4 +1,4 @@
-// A player on a canvas: loads, evaluates, sorts, draws, and does each only when what it depends on has changed.
+// A player on a canvas. It loads, evaluates, sorts and draws, each step only when its inputs have changed.
 
 import { centreOf, defaultCamera, fitted } from "./camera.js";
 import { CpuEvaluator, startWorker } from "./cpu.js";
@@ -50,12 +50,12 @@ import { startLoader } from "./loader.js";
  * @property {number} gaussians
  */
 
-/** So long after the last movement a picture is drawn as well as it can be, milliseconds. */
+/** After so many milliseconds without movement the picture is drawn at full quality. */
 const REST_MS = 250;
-/** Up to so many anchors a machine without a GPU evaluates in JavaScript: it would take seconds to compile shaders, which
- * then are hardly faster. */
+/** Up to so many anchors a machine without a GPU uses the CPU evaluator: its shaders take seconds to compile and are
+ * hardly faster. */
 const SOFTWARE_ANCHORS = 30_000;
-/** Where no GPU draws, pictures begin with this step of SCALES. */
+/** The first step of SCALES without a GPU. */
 const SOFTWARE_STEP = 2;
 
 /**
@@ -96,7 +96,7 @@ export class Player extends EventTarget {
     this._useCpu = options.evaluator === "cpu";
     /** For the first picture. @type {Remote | null} */
     this._cpuWorker = null;
-    /** What is on show, and for which state. @type {{splats: Splats, state: State} | null} */
+    /** The Gaussians on show, and their state. @type {{splats: Splats, state: State} | null} */
     this._front = null;
     /** @type {Splats | null} */
     this._spare = null;
@@ -146,7 +146,7 @@ export class Player extends EventTarget {
     this._loaded = false;
   }
 
-  // --- what users see
+  // --- public
 
   /**
    * Loads a scene in place of what is shown: an address, or a file.
@@ -204,14 +204,14 @@ export class Player extends EventTarget {
     }
   }
 
-  /** Stops loading; what has arrived stays. */
+  /** Stops loading; layers that have arrived stay. */
   stopLoading() {
     this._loader?.close();
     this._loader = null;
     this._status.loading = false;
   }
 
-  /** What every level needs, null before the first layer. */
+  /** The scene's global properties, null before the first layer. */
   get info() {
     return this._scene?.info ?? null;
   }
@@ -295,12 +295,12 @@ export class Player extends EventTarget {
     };
   }
 
-  /** What draws, in the driver's words; empty without WebGL2. */
+  /** The renderer as the driver names it; empty without WebGL2. */
   get renderer() {
     return this._gpu?.renderer ?? "";
   }
 
-  /** Waits until what is shown is what was asked for, as well as it can be. */
+  /** Waits until the picture is complete and at full quality. */
   async settled() {
     while (!this._closed && !(this._scene && this._isSettled())) {
       await new Promise((resolve) => setTimeout(resolve, 5));
@@ -402,7 +402,7 @@ export class Player extends EventTarget {
 
   // --- the loop
 
-  /** Something that is seen has changed. */
+  /** The picture has to change. */
   _touch() {
     this._dirty = true;
     this._lastMoved = performance.now();
@@ -452,7 +452,7 @@ export class Player extends EventTarget {
     this._emit("timeupdate", { time });
   }
 
-  /** What is to be seen. @returns {State} */
+  /** The state to show. @returns {State} */
   _state() {
     const scene = /** @type {Scene} */ (this._scene);
     const camera = /** @type {Camera} */ (this.camera);
@@ -490,7 +490,7 @@ export class Player extends EventTarget {
     return !!this._sortedRow && row.every((value, k) => value === this._sortedRow?.[k]);
   }
 
-  /** Brings the Gaussians to what is to be seen, then shows them. */
+  /** Evaluates the Gaussians of the state to show. */
   async _evaluate() {
     const gpu = /** @type {Gpu} */ (this._gpu);
     const state = this._state();
@@ -593,7 +593,7 @@ export class Player extends EventTarget {
     return [side(clientWidth), side(clientHeight)];
   }
 
-  /** Draws, and takes note when that is done. @param {[number, number]} size */
+  /** Draws, and records when that is done. @param {[number, number]} size */
   async _show([width, height]) {
     const gpu = /** @type {Gpu} */ (this._gpu);
     if (this.canvas.width !== width || this.canvas.height !== height) {
@@ -623,7 +623,7 @@ export class Player extends EventTarget {
     }
   }
 
-  /** Draws at once what there is. @returns {boolean} whether there was something */
+  /** Draws immediately. @returns {boolean} whether there were Gaussians */
   _draw() {
     const { camera, _painter: painter, _front: front } = this;
     if (!camera || !painter || !front) return false;

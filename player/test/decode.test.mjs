@@ -122,24 +122,6 @@ test("a scene has the arrays that scene.js describes", () => {
   assert.equal(typeof scene.steps.planesLocal, "number");
 });
 
-test("masks never fall from layer to layer, and earlier rows stay", () => {
-  const bytes = readVector("valid/layers-0-1-2");
-  const [first, last] = [decode(bytes, { maxLayer: 0 }), decode(bytes)];
-  const rows = first.rows[0];
-  assert.ok(same(first.feature, last.feature.slice(0, 32 * rows)));
-  assert.ok(same(first.mask[0], last.mask[0]));
-  last.mask[2].slice(0, rows).forEach((code, i) => assert.ok(code >= last.mask[0][i]));
-  assert.equal(first.globalDeformation, null);
-});
-
-test("the camera has four rows and a matrix of intrinsics", () => {
-  const { camera } = decode(readVector("valid/camera")).info;
-  assert.ok(camera);
-  assert.deepEqual([...camera.viewmat.slice(12)], [0, 0, 0, 1]);
-  assert.deepEqual([camera.K[1], camera.K[3], ...camera.K.slice(6)], [0, 0, 0, 0, 1]);
-  assert.equal(decode(readVector("valid/one-anchor")).info.camera, null);
-});
-
 test("a cut file raises Truncated, or gives its longest prefix if asked", () => {
   const bytes = readVector("faulty/cut-layer-2-payload-middle");
   assert.equal(faultOf(() => decode(bytes))?.kind, "Truncated");

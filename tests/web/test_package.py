@@ -161,6 +161,14 @@ def test_only_whole_files_of_a_time_that_dash_can_tell(scene_bytes):
         package(encode(replace(scene, info=replace(scene.info, time_range=(0.0, 1e10))), effort=1))
 
 
+def test_another_reader_of_boxes_finds_the_layers(scene_bytes):
+    parser, construct = pytest.importorskip("pymp4.parser"), pytest.importorskip("construct")
+    boxes = construct.GreedyRange(parser.Box).parse(package(scene_bytes)["scene.mp4"])
+    assert [box.type for box in boxes] == [b"ftyp", b"moov", *[b"moof", b"mdat"] * 3]
+    assert b"".join(box.data for box in boxes if box.type == b"mdat") == scene_bytes
+    assert len([box for box in boxes[1].children if box.type == b"trak"]) == 3
+
+
 @pytest.mark.parametrize(
     "data", [b"\0\0\0\x09ftyp", b"abc", b"\0\0\0\x07ftyp", b"\0\0\0\x01mdat\0\0\0\0\0\0\0\x09", mp4.box(b"ftyp", b"x")]
 )
