@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec import decode
+from pd4dgs_codec.draw.gaussians import Gaussians
 from pd4dgs_codec.draw.player import Player
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.scene import MASK_THRESHOLD, Camera, Scene
+from pd4dgs_codec.scene import Camera, Scene
 
 PLAYER = Path(__file__).parents[2] / "player"
 
@@ -41,11 +42,13 @@ def decibels(a: np.ndarray, b: np.ndarray) -> float:
 
 
 class Rasterised(Player):
-    """The package's pictures, of every anchor: clause 13.4 knows no frustum, but `Player` leaves out anchors by where
-    they stand before they are deformed."""
+    """The package's pictures of all anchors: clause 13.4 has no frustum, but `Player` omits anchors by their position
+    before the deformation."""
 
-    def _visible(self, camera: Camera) -> np.ndarray:
-        return np.flatnonzero(self._mask > MASK_THRESHOLD)
+    def gaussians(self, camera: Camera, t: float) -> Gaussians:
+        """Without a test of the frustum."""
+        eye = -camera.viewmat[:3, :3].T @ camera.viewmat[:3, 3]
+        return self.gaussians_of_eyes(self.active, t, eye[None].astype(np.float32))
 
 
 def resized(camera: Camera, width: int, height: int) -> Camera:
@@ -87,8 +90,7 @@ class Shot:
 def shots(
     page: Any, data: bytes, views: Sequence[Camera], times: Sequence[float], levels: Sequence[int] | None = None
 ) -> Iterator[Shot]:
-    """Of what the page's harness has open, the file `data`: each level at each time through each camera, all of one
-    size."""
+    """Pictures of the file `data`, which the harness has open: each level, time and camera; cameras of one size."""
     scenes = [decode(data, max_layer=level) for level in levels or decode(data).layers]
     players = [Rasterised(scene) for scene in scenes]
     low, high = scenes[0].info.time_range
