@@ -16,29 +16,38 @@ import pytest
 from folders import CAMERAS, COUNT, INSTANTS, pose, save
 
 NAN = float("nan")
-HEAD = "ply\nformat {} 1.0\nelement vertex 2\n{}end_header\n"
 XYZ = "property float x\nproperty float y\nproperty float z\n"
 
 
+def ply(form: str, body: bytes = b"", properties: str = XYZ) -> bytes:
+    """A PLY file of two vertices."""
+    return f"ply\nformat {form} 1.0\nelement vertex 2\n{properties}end_header\n".encode() + body
+
+
 def write_blender(_: object, folder: Path) -> Path:
-    """Three frames."""
+    """Three frames, points, depths and a distorting lens."""
     frames = [{"file_path": f"r_{i}", "time": i / 10, "transform_matrix": pose(0.2 * i)} for i in range(3)]
-    save(folder / "transforms.json", {"camera_angle_x": 0.8, "frames": frames})
+    file = {"camera_angle_x": 0.8, "w": 12, "h": 8, "k1": 0.01, "near_far_per_frame": [[1, 9]] * 3, "frames": frames}
+    save(folder / "transforms.json", file | {"ply_file_path": "points.ply"})
+    save(folder / "points.ply", ply("ascii", b"0 0 0\n1 1 1\n"))
     for i in range(3):
         save(folder / f"r_{i}.png", folders.gradient(12, 8, i))
     return folder
 
 
 def write_iphone(_: object, folder: Path) -> Path:
-    """One training frame."""
+    """A training and a test frame, points and a covisibility mask."""
     eye = np.eye(3).tolist()
     camera = dict(orientation=eye, position=[0, 0, 0], focal_length=10, principal_point=[6, 4], image_size=[12, 8])
-    save(folder / "camera/0_00000.json", camera)
-    save(folder / "metadata.json", {"0_00000": {"warp_id": 0, "camera_id": 0}})
+    for i, split in enumerate(("train", "val")):
+        save(folder / f"camera/{i}_00000.json", camera)
+        save(folder / f"rgb/1x/{i}_00000.png", folders.gradient(12, 8))
+        save(folder / f"splits/{split}.json", {"frame_names": [f"{i}_00000"]})
+    save(folder / "covisible/1x/val/1_00000.png", np.full((8, 12), 255, np.uint8))
+    save(folder / "points.npy", npy(np.arange(12.0).reshape(4, 3)))
+    save(folder / "metadata.json", {f"{i}_00000": {"warp_id": i, "camera_id": i} for i in range(2)})
     save(folder / "scene.json", {"center": [0, 0, 0], "scale": 1, "near": 1, "far": 2})
     save(folder / "extra.json", {"factor": 1, "fps": 30, "bbox": [[0, 0, 0], [1, 1, 1]]})
-    save(folder / "splits/train.json", {"frame_names": ["0_00000"]})
-    save(folder / "rgb/1x/0_00000.png", np.zeros((8, 12, 3), np.uint8))
     return folder
 
 
@@ -117,15 +126,15 @@ CASES: list[tuple[str, str, Any, str]] = [
     ("blender", "r_1.png", b"", "r_1.png"),
     ("blender", "r_1.png", b"not a png", "r_1.png"),
     ("blender", "r_1.png", lambda data: data[: len(data) // 2], "r_1.png"),
-    ("blender", "p.ply", b"", "p.ply: not a PLY file"),
-    ("blender", "p.ply", b"ply\nformat ascii 1.0\n", "not a PLY file"),
-    ("blender", "p.ply", HEAD.format("binary_big_endian", XYZ).encode(), "expected ascii or binary_little_endian"),
-    ("blender", "p.ply", HEAD.format("binary_little_endian", XYZ).encode() + bytes(23), "23 bytes of vertices, exp"),
-    ("blender", "p.ply", HEAD.format("ascii", XYZ).encode() + b"1 2 3\n", "1 vertex lines, expected 2"),
-    ("blender", "p.ply", HEAD.format("ascii", XYZ).encode() + b"1 2 3\n1 2\n", "vertex lines are not 3 numbers"),
-    ("blender", "p.ply", HEAD.format("ascii", "property float x\n").encode() + b"1\n2\n", "expected x, y, z once each"),
-    ("blender", "p.ply", HEAD.format("ascii", "property list uchar int i\n").encode(), "not a scalar"),
-    ("blender", "p.ply", HEAD.format("ascii", XYZ).replace("2\n", "99999999999\n", 1).encode(), "0 vertex lines"),
+    ("blender", "points.ply", b"", "points.ply: not a PLY file"),
+    ("blender", "points.ply", b"ply\nformat ascii 1.0\n", "not a PLY file"),
+    ("blender", "points.ply", ply("binary_big_endian"), "expected ascii or binary_little_endian"),
+    ("blender", "points.ply", ply("binary_little_endian", bytes(23)), "23 bytes of vertices, expected 24"),
+    ("blender", "points.ply", ply("ascii", b"1 2 3\n"), "1 vertex lines, expected 2"),
+    ("blender", "points.ply", ply("ascii", b"1 2 3\n1 2\n"), "vertex lines are not 3 numbers"),
+    ("blender", "points.ply", ply("ascii", b"1\n2\n", "property float x\n"), "expected x, y, z once each"),
+    ("blender", "points.ply", ply("ascii", b"", "property list uchar int i\n"), "not a scalar"),
+    ("blender", "points.ply", ply("ascii").replace(b"2\n", b"99999999999\n", 1), "0 vertex lines"),
     ("iphone", CAMERA, {"focal_length": NAN}, "0_00000.json: focal_length is nan"),
     ("iphone", CAMERA, {"focal_length": None}, "0_00000.json: no focal_length"),
     ("iphone", CAMERA, {"orientation": (2 * np.eye(3)).tolist()}, "orientation is not a rotation: determinant 8"),
@@ -248,7 +257,7 @@ def test_other_faults_of_folders(tmp_path, blender, refused):
 
 def test_a_time_beyond_binary32_is_refused(tmp_path, refused):
     folder = write_iphone(None, tmp_path)
-    save(folder / "metadata.json", {"0_00000": {"warp_id": 9}})
+    save(folder / "metadata.json", {"0_00000": {"warp_id": 0}, "1_00000": {"warp_id": 9}})
     save(folder / "extra.json", {"factor": 1, "fps": 1e-300})
     refused(folder, "with which the last frame is at 9e+300 s")
 

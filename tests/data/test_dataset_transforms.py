@@ -9,7 +9,6 @@ from folders import gradient, pose
 from PIL import Image
 
 from pd4dgs_codec.data.dataset import load
-from pd4dgs_codec.errors import DataError
 
 
 def test_axes_become_opencv(blender):
@@ -99,30 +98,6 @@ def test_busy_border_means_black(blender):
     assert load(blender()).background == (0, 0, 0)
 
 
-def test_distortion_is_removed(blender):
-    """A radially distorted picture of a known pattern comes back as the pinhole picture; its unseen rim is masked."""
-    w, h, f, k1 = 96, 64, 80.0, 0.18
-    folder = blender(n=1, size=(w, h), fl_x=f, fl_y=f, k1=k1)
-    u, v = np.meshgrid(np.arange(w) + 0.5, np.arange(h) + 0.5)
-
-    def pattern(x, y):
-        return np.stack([128 + 90 * np.sin(9 * x), 128 + 90 * np.cos(8 * y), 128 + 90 * np.sin(6 * x + 5 * y)], axis=2)
-
-    xd, yd = (u - w / 2) / f, (v - h / 2) / f
-    rd = np.hypot(xd, yd)
-    r = rd.copy()
-    for _ in range(60):  # plain fixed point, independent of the reader's Newton iteration
-        r = rd / (1 + k1 * r * r)
-    x, y = xd * r / rd, yd * r / rd
-    Image.fromarray(np.rint(pattern(x, y)).astype(np.uint8)).save(folder / "r_000.png")
-    view = load(folder, holdout=0).train[0]
-    expected = pattern(xd, yd)
-    assert view.mask is not None and 0.75 < view.mask.mean() < 1.0
-    assert not view.mask[0, 0] and view.mask[h // 2, w // 2]
-    assert np.abs(view.image - expected)[view.mask].max() < 3.0
-    assert (view.image[~view.mask] == 0).all()
-
-
 def test_binary_and_ascii_points_agree(blender):
     folder = blender()
     xyz = np.random.default_rng(0).normal(size=(50, 3)).astype(np.float32)
@@ -194,11 +169,6 @@ def test_bouncing_balls(shared):
     np.testing.assert_allclose(d.box, [[-1.3] * 3, [1.3] * 3], atol=1e-4)
     assert d.up == pytest.approx((0, 0, 1), abs=1e-6) and d.points is None
     assert d.train[0].K[0, 0] == pytest.approx(1111.111 / 8, rel=1e-5)
-
-
-def test_unsupported_lens(blender):
-    with pytest.raises(DataError, match="THIN_PRISM_FISHEYE"):
-        load(blender(camera_model="THIN_PRISM_FISHEYE"))
 
 
 LENSES = {
