@@ -103,13 +103,12 @@ def _parts_table(result: dict[str, Any]) -> str:
     rows = [
         (
             row["part"].replace("_", " "),
-            *(number(size, 0) for size in row["layers"]),
-            number(row["bytes"], 0),
-            row["bytes"],
+            *(number(size, 0) for size in (*row["layers"], row["bytes"])),
+            f"{100 * row['bytes'] / result['bytes']:.1f} %",
         )
         for row in result["parts"]
     ]
-    return table(heads, [(*row[:-1], f"{100 * row[-1] / result['bytes']:.1f} %") for row in rows])
+    return table(heads, rows)
 
 
 def _left_out(layers: list[dict[str, Any]]) -> list[dict[str, str]]:

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from pd4dgs_codec.cli import options
 from pd4dgs_codec.cli.common import OK, STDIO, Console, command, number, read_bytes, table
 from pd4dgs_codec.cli.progress import progress_bar
+from pd4dgs_codec.errors import DeliveryError, RenderError
 from pd4dgs_codec.io import whole_files
 
 if TYPE_CHECKING:
@@ -64,19 +65,19 @@ def _package(args: argparse.Namespace, console: Console) -> int:
     data = read_bytes(args.input)
     from pd4dgs_codec.web.package import package
 
-    why_not: str | None = "--no-video"
+    missing = ["--no-video"] if args.no_video else []
 
     def render(scene: Scene) -> Video | None:
-        nonlocal why_not
-        video, why_not = _video(scene, args)
-        if why_not:
-            console.message(f"pd4dgs-package: no 2D video: {why_not}")
-        return video
+        try:
+            return _render(scene, args.fps)
+        except (RenderError, ModuleNotFoundError) as error:
+            missing.append(_reason(error))
+            console.message(f"pd4dgs-package: no 2D video: {missing[0]}")
+            return None
 
     files = package(data, None if args.no_video else render, immutable=args.immutable)
-    rows = _write(args, files)
-    result = {"input": args.input, "output": args.output, "files": rows, "video": why_not is None}
-    console.result(result | {"why_no_video": why_not}, _text(result))
+    result = {"input": args.input, "output": args.output, "files": _write(args, files), "video": not missing}
+    console.result(result | {"why_no_video": missing[0] if missing else None}, _text(result))
     return OK
 
 
@@ -84,7 +85,6 @@ main = command(parser, _package)
 
 
 def _library(args: argparse.Namespace, console: Console) -> int:
-    from pd4dgs_codec.errors import DeliveryError
     from pd4dgs_codec.web.package import library
 
     if Path(args.input).resolve() != Path(args.output).resolve():
@@ -103,24 +103,18 @@ def _write(args: argparse.Namespace, files: dict[str, bytes]) -> list[dict[str, 
     return [{"name": name, "bytes": len(content)} for name, content in files.items()]
 
 
-def _video(scene: Scene, args: argparse.Namespace) -> tuple[Video | None, str | None]:
-    """(video, None), or (None, why there is none)."""
-    from pd4dgs_codec.errors import RenderError
-
-    try:
-        return _render(scene, args.fps), None
-    except ModuleNotFoundError as error:
-        if (error.name or "").startswith("pd4dgs_codec"):
-            raise
-        return None, f"needs the module {error.name}, which is not installed"
-    except RenderError as error:
-        return None, str(error)
+def _reason(error: RenderError | ModuleNotFoundError) -> str:
+    """The reason why there is no video. Raises the error if a module of ours is missing."""
+    if isinstance(error, RenderError):
+        return str(error)
+    if (error.name or "").startswith("pd4dgs_codec"):
+        raise error
+    return f"needs the module {error.name}, which is not installed"
 
 
 def _render(scene: Scene, fps: float) -> Video:
     import tempfile
 
-    from pd4dgs_codec.errors import RenderError
     from pd4dgs_codec.quality.frames import own_frames
     from pd4dgs_codec.quality.levels import level_of
     from pd4dgs_codec.quality.movie import check_mp4, write_mp4

@@ -1,4 +1,4 @@
-"""encode by pictures: layers made to fit, layers that do not pay, and how much each anchor shows."""
+"""encode with quality in renderings: target sizes, layers with too little gain, the effect of single anchors."""
 
 from __future__ import annotations
 
@@ -78,12 +78,12 @@ def test_a_target_out_of_reach_writes_nothing(cli, model_pt, tmp_path):
     assert "layer 2 takes at least" in line and "expected at most 10" in line
 
 
-def test_layers_that_do_not_pay_are_left_out_with_their_figures(cli, model_pt, shared_dataset, tmp_path):
+def test_layers_with_too_little_gain_are_left_out_with_their_figures(cli, model_pt, shared_dataset, tmp_path):
     judged = ("encode", model_pt, "-o", tmp_path / "s.pd4", "--data", shared_dataset, "--holdout", 3, *FAST)
-    dear = cli(*judged, "--min-gain", 1e5).json
-    assert [row["layer"] for row in dear["layers"]] == [0]
-    assert dear["layers"][0]["anchors"] == 60, "the anchors of layers left out stay"
-    gone = {row["what"]: row for row in dear["left_out"]}
+    costly = cli(*judged, "--min-gain", 1e5).json
+    assert [row["layer"] for row in costly["layers"]] == [0]
+    assert costly["layers"][0]["anchors"] == 60, "the anchors of layers left out stay"
+    gone = {row["what"]: row for row in costly["left_out"]}
     for layer, what in ((1, "global_deformation"), (2, "local_deformation")):
         assert (
             f"level {layer} gains" in gone[what]["why"] and "dB per MB, expected at least 100,000" in gone[what]["why"]
@@ -112,7 +112,7 @@ def test_a_layer_that_explains_the_pictures_is_kept(scene):
     assert gone.what == "local_deformation" and kept.global_deformation is not None
 
 
-def test_harm_is_about_the_error_that_leaving_an_anchor_out_makes(scene, monkeypatch):
+def test_the_estimated_omission_error_is_close_to_the_measured_one(scene, monkeypatch):
     from pd4dgs_codec.format.plan import plan
     from pd4dgs_codec.model import sensitivity
     from pd4dgs_codec.quality.frames import own_frames

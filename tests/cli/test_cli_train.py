@@ -81,7 +81,6 @@ def test_the_quality_sets_the_dial_and_single_options_replace_parts_of_it(train,
     assert train(first, *resumed, "--quality", 80, "--prune", 0.03, iterations=None).code == 0
     other = train(first, *resumed, "--quality", 20, "--prune", 0.03, iterations=None)
     assert other.code == 1 and "which --quality sets" in other.err
-    assert train(tmp_path / "n.pt", "--quality", 101).code == 2 and not (tmp_path / "n.pt").exists()
 
 
 def test_interrupted_and_resumed_run_repeats_the_uninterrupted_one(train, tmp_path, monkeypatch):
@@ -164,7 +163,7 @@ def test_time_limit_ends_cleanly_and_must_grow_on_resume(cli, train, tmp_path, s
     assert refused.code == 1 and "larger --max-seconds" in refused.err
 
 
-def test_no_held_out_frames_is_said(train, tmp_path):
+def test_missing_held_out_frames_are_noted(train, tmp_path):
     result = train(tmp_path / "m.pt", "--holdout", 0, iterations=2)
     assert result.code == 0 and "none held out" in result.err and "training-view PSNR" in result.err
 
@@ -244,7 +243,7 @@ main(json.loads(sys.argv[1]))
 
 
 @pytest.mark.skipif(os.name != "posix", reason="needs SIGKILL")
-def test_a_run_killed_while_it_saves_goes_on_as_if_nothing_had_happened(train, tmp_path, shared_dataset):
+def test_a_run_killed_while_saving_resumes_to_the_same_result(train, tmp_path, shared_dataset):
     whole, killed, log = tmp_path / "whole.pt", tmp_path / "killed.pt", tmp_path / "log.jsonl"
     arguments = [shared_dataset, "-j", 1, "-o", killed, "--preset", "tiny", "--iterations", 10, "--log", log]
     command = [sys.executable, "-c", KILLED, json.dumps([str(a) for a in arguments])]
@@ -262,7 +261,7 @@ def test_a_run_killed_while_it_saves_goes_on_as_if_nothing_had_happened(train, t
     assert not list(tmp_path.glob(".pd4dgs-*/killed.pt"))
 
 
-def test_scarce_data_is_said_to_be_so(cli, dataset, tmp_path):
+def test_scarce_data_are_noted(cli, dataset, tmp_path):
     path = dataset / "transforms.json"
     content = json.loads(path.read_text())
     content["frames"] = content["frames"][:1]
