@@ -44,8 +44,8 @@ _CODED = range(2, 8)  # numbers of children with more than one pattern; nodes wi
 def encode_positions(cells: np.ndarray, effort: int = 5, known: list[Fitted] | None = None) -> bytes:
     """The payload of cells int32 [N, 3] (voxels), which must be distinct and in Morton order (`morton_order`).
 
-    effort: 1..9, time spent on fitting tables, of which there are few. known: priors of payloads before, to which new
-    ones are appended. Raises EncodeError as position_channels does.
+    effort: 1..9, time spent on fitting tables, of which there are few. known: priors of earlier payloads, to which
+    new ones are appended. Raises EncodeError as position_channels does.
     """
     head, channels = position_channels(cells)
     if not head:
@@ -57,7 +57,7 @@ def encode_positions(cells: np.ndarray, effort: int = 5, known: list[Fitted] | N
 
 
 def position_channels(cells: np.ndarray) -> tuple[bytes, list[np.ndarray]]:
-    """What stands before the section of coded channels, and the channels. No bytes for no cells.
+    """(bytes before the section of coded channels, the channels); no bytes for no cells.
 
     Raises EncodeError unless the cells are distinct, in Morton order and within -2**20 .. 2**20.
     """
@@ -112,7 +112,7 @@ def _occupancies(codes: np.ndarray, depth: int) -> list[np.ndarray]:
 def decode_positions(payload: bytes | memoryview, count: int, known: list[Prior] | None = None) -> np.ndarray:
     """The cells int32 [count, 3] of a payload, in Morton order. Memory is O(count), whatever the bytes say.
 
-    known: priors of payloads before, to which this one's are appended.
+    known: priors of earlier payloads, to which this payload's are appended.
     Raises Malformed or LimitExceeded if the payload is not one that encode_positions could make for them.
     """
     if count <= 0:
@@ -143,7 +143,7 @@ def decode_positions(payload: bytes | memoryview, count: int, known: list[Prior]
 
 
 def _read_counts(reader: ByteReader, depth: int, count: int) -> tuple[list[int], list[int]]:
-    """Per level, the root's first: how many nodes there are, and how many of them have one child."""
+    """Per level from the root: the number of nodes, and of those with one child."""
     nodes, single, have = list[int](), list[int](), 1
     for _ in range(depth):
         nodes.append(have)
@@ -198,7 +198,7 @@ def _grow(channels: list[np.ndarray], nodes: list[int], single: list[int], sizes
 
 
 def _within(symbols: np.ndarray, size: int) -> np.ndarray:
-    """The symbols, each of which must be in 0 .. size - 1."""
+    """The symbols; Malformed unless all are in 0 .. size - 1."""
     if symbols.size and not (int(symbols.min()) >= 0 and int(symbols.max()) < size):
         found = f"{int(symbols.min())}..{int(symbols.max())}"
         raise Malformed(f"positions: symbols in {found}, expected 0..{size - 1}")

@@ -22,7 +22,7 @@ def put_zigzag(out: bytearray, value: int) -> None:
 
 
 class ByteReader:
-    """Reads a parameter block front to back; every fault is Malformed or LimitExceeded with the byte offset in it."""
+    """Reads a parameter block front to back. Faults raise Malformed or LimitExceeded with their byte offset."""
 
     def __init__(self, data: bytes | memoryview):
         self._data = memoryview(data)
@@ -54,7 +54,7 @@ class ByteReader:
         raise Malformed(f"{what} is longer than {_MAX_BYTES} bytes", offset=start)
 
     def take(self, size: int) -> bytes:
-        """The next `size` bytes, which are there."""
+        """The next `size` bytes; the caller has checked that they exist."""
         self.offset += size
         return bytes(self._data[self.offset - size : self.offset])
 

@@ -1,19 +1,17 @@
-"""The terms of the loss that ask for no picture, with their gradients: planes, rate, temporal mask consistency.
+"""The terms of the loss that need no picture, with their gradients: planes, rate, temporal mask consistency.
 
-A step finds them on a thread beside the one that draws its picture. Their graph has leaves of its own: torch (2.13)
-holds a leaf's lock while it asks for the interpreter's, so two threads whose graphs share a leaf can wait for each
-other for ever.
+A step computes them on a second thread while it renders, which makes steps of levels 1 and 2 a tenth faster. Their
+graph has leaves of its own: torch (2.13) holds a leaf's lock while it waits for the interpreter's, so two threads whose
+graphs share a leaf can deadlock.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.autograd.function import once_differentiable
 
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model
@@ -22,7 +20,6 @@ from pd4dgs_codec.model.rate import row_bits
 from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import ATTRIBUTES, MASK_THRESHOLD
 from pd4dgs_codec.threads import aside
-from pd4dgs_codec.train import mask_kernels as kernels
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.optimiser import PER_ANCHOR
 from pd4dgs_codec.train.schedule import Schedule
@@ -33,7 +30,7 @@ Weighted = tuple[str, float, Tensor]  #: a term's name, weight and value
 
 @dataclass
 class Terms:
-    """loss: their weighted sum. terms: unweighted, by name. gradients: of the loss by each parameter that it moves."""
+    """loss: the weighted sum. terms: unweighted, by name. gradients: of the loss by each parameter it depends on."""
 
     loss: float
     terms: dict[str, float]
@@ -41,15 +38,15 @@ class Terms:
 
 
 class ModelLoss:
-    """What of the loss depends on the model alone."""
+    """The part of the loss that depends on the model only."""
 
     def __init__(self, config: TrainConfig, generator: torch.Generator):
         self.config, self.generator = config, generator
         self._neighbours: Neighbours | None = None
 
-    def begin(self, model: Model, level: int, schedule: Schedule, place: int) -> Callable[[], Terms]:
-        """Begins to find the terms of a step at `place`; what is returned waits for them. Meanwhile nobody else may
-        draw from the generator or change the model."""
+    def begin(self, model: Model, level: int, schedule: Schedule, position: int) -> Callable[[], Terms]:
+        """Starts to compute the terms of a step at `position`; the function returned waits for them. Until then nothing
+        else may draw from the generator or change the model."""
         fields = {layer: field for layer, field in model.deformations.items() if layer <= level}
         parameters = [getattr(model, name) for name in PER_ANCHOR]
         parameters += [feature for field in fields.values() for feature in field.features]
@@ -59,10 +56,10 @@ class ModelLoss:
             found: list[Weighted] = []
             for layer, field in fields.items():
                 features, step = [leaves[feature] for feature in field.features], model.steps.planes(layer)
-                found += self._field_terms(layer, field, features, step, schedule.pressure(place))
-            if place >= schedule.progressive:
+                found += self._field_terms(layer, field, features, step, schedule.pressure(position))
+            if position >= schedule.progressive:
                 anchors = {name: leaves[getattr(model, name)] for name in PER_ANCHOR}
-                found += self._mask_terms(model, level, anchors, schedule.separation(place))
+                found += self._mask_terms(model, level, anchors, schedule.separation(position))
             if not found:
                 return Terms(0.0, {}, [])
             loss = torch.stack([weight * value for _, weight, value in found]).sum()
@@ -70,7 +67,7 @@ class ModelLoss:
             gradients = [(p, g) for p, g in zip(leaves, by_leaf, strict=True) if g is not None]
             return Terms(float(loss.detach()), {name: float(value.detach()) for name, _, value in found}, gradients)
 
-        return aside(find) if model.feature.device.type == "cpu" else find  # CUDA's work waits in one queue anyway
+        return aside(find) if model.feature.device.type == "cpu" else find  # CUDA runs in one queue anyway
 
     def _field_terms(
         self, layer: int, field: DeformationField, features: list[Tensor], step: float, pressure: float
@@ -100,9 +97,9 @@ class ModelLoss:
 
 
 def anchor_bits(model: Model, anchors: Mapping[str, Tensor], rows: Tensor, active: Tensor) -> Tensor:
-    """Rbar [n]: the mean R over the scalars of each of the anchors `rows` (int64 [n], none twice, all active); priors
-    are the moments over the anchors `active` (int64) of the same step class. anchors: the model's attributes by name,
-    or others of their shapes."""
+    """Rbar [n]: the mean R over the scalars of each of the anchors `rows` (int64 [n], distinct, all active); priors are
+    the moments over the anchors `active` (int64) of the same step class. anchors: attributes by name, in the model's
+    shapes."""
     classes = torch.full_like(model.step_class, -1, dtype=torch.int8)
     classes[active] = model.step_class[active].to(torch.int8)
     parts = [(anchors[name].flatten(1), getattr(model.steps, name)) for name in ATTRIBUTES]
@@ -124,76 +121,38 @@ def rate_term(
     return weighted.mean() * (len(active) / len(mask))
 
 
-class _Binary(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, mask: Tensor) -> Tensor:
-        m = mask.clamp(*INSIDE)
-        yes, no = m.log2(), (1 - m).log2()
-        ctx.save_for_backward(torch.where(mask == m, no - yes, 0.0))
-        return -torch.lerp(no, yes, m).mean()
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, g: Tensor) -> Tensor:
-        (slope,) = ctx.saved_tensors
-        found: Tensor = slope * (g / len(slope))
-        return found
-
-
 def binary_term(mask: Tensor) -> Tensor:
     """L_binary = -1/|V| sum (m log2 m + (1 - m) log2(1 - m)); m clamped to INSIDE in the logarithms."""
-    entropy: Tensor = _Binary.apply(mask)  # type: ignore[no-untyped-call]
-    return entropy
+    m = mask.clamp(*INSIDE)
+    return -torch.lerp((1 - m).log2(), m.log2(), m).mean()
 
 
 class Neighbours:
-    """Pairs of near anchors: those that stand REACH places from each other at most along a space-filling (Morton)
-    curve. Of a pair i, j the weight is exp(-|x_i - x_j| / tau), distances in voxels."""
+    """Pairs of anchors that are at most REACH apart on a space-filling (Morton) curve. A pair i, j has the weight
+    exp(-|x_i - x_j| / tau), distances in voxels.
+
+    order: int64 [N], the anchors along the curve. weights: [N, REACH], of each and the one 1..REACH behind it.
+    """
 
     REACH = 8
 
     def __init__(self, anchor_q: Tensor, tau: float):
         self.anchor_q = anchor_q
-        self.order = torch.from_numpy(morton_order(anchor_q.cpu().numpy()))  #: int64 [N]: anchors along the curve
+        self.order = torch.from_numpy(morton_order(anchor_q.cpu().numpy()))
         places = anchor_q.cpu()[self.order].double()
-        self.weights = torch.zeros(len(places), self.REACH)  #: of each place and the one so many behind it, less one
+        self.weights = torch.zeros(len(places), self.REACH)
         for away in range(1, min(self.REACH + 1, len(places))):
             distance = (places[away:] - places[:-away]).norm(dim=1)
             self.weights[:-away, away - 1] = torch.exp(distance / -tau)
 
     def draw(self, generator: torch.Generator) -> Tensor:
-        """int64 [N]: for each place along the curve how far behind it the other of its pair stands, 1..REACH."""
+        """int64 [N]: for each anchor along the curve how far behind it its partner is, 1..REACH."""
         return torch.randint(1, self.REACH + 1, (len(self.order),), generator=generator)
 
 
-class _Smooth(torch.autograd.Function):
-    @staticmethod
-    def forward(ctx: Any, mask: Tensor, neighbours: Neighbours, away: Tensor) -> Tensor:
-        slope = torch.zeros_like(mask)
-        given = (mask, neighbours.order, neighbours.weights, away)
-        total, pairs = kernels.smooth(slope.numpy(), *(tensor.numpy() for tensor in given))
-        ctx.save_for_backward(slope)
-        ctx.pairs = max(pairs, 1)
-        return mask.new_tensor(total / ctx.pairs)
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, g: Tensor) -> tuple[Tensor, None, None]:
-        (slope,) = ctx.saved_tensors
-        return slope * (g / ctx.pairs), None, None
-
-
 def smooth_term(mask: Tensor, neighbours: Neighbours, away: Tensor) -> Tensor:
-    """L_smooth = 1/|S| sum w_ij |m_i - m_j| over the pairs S whose second is still on the curve; away: as `draw` gave
-    it. 0 if there are none."""
-    if mask.device.type == "cpu":
-        value: Tensor = _Smooth.apply(mask, neighbours, away)  # type: ignore[no-untyped-call]
-        return value
-    return smooth_term_reference(mask, neighbours, away)
-
-
-def smooth_term_reference(mask: Tensor, neighbours: Neighbours, away: Tensor) -> Tensor:
-    """The plain torch form of `smooth_term`."""
+    """L_smooth = 1/|S| sum w_ij |m_i - m_j| over the pairs S whose second anchor is on the curve, 0 if there are none;
+    away: from `Neighbours.draw`."""
     order, weights = neighbours.order, neighbours.weights
     first = (torch.arange(len(order)) + away < len(order)).nonzero()[:, 0]
     if not len(first):

@@ -61,17 +61,12 @@ def test_smooth_term_weighs_differences_by_distance():
     assert float(found) == pytest.approx(0.5 * math.exp(-3 / 4))  # of the pairs that are on the curve
 
 
-def test_smooth_term_equals_its_plain_form():
-    near, generator = _curve(700), torch.Generator().manual_seed(1)
-    mask = torch.rand(700, dtype=torch.float64, generator=generator)
-    mask[:100] = mask[100:200]  # some do not differ
-    away, found = near.draw(generator), []
-    assert set(away.tolist()) == set(range(1, 9))
-    for form in (losses.smooth_term, losses.smooth_term_reference):
-        leaf = mask.clone().requires_grad_()
-        value = form(leaf, near, away)
-        found.append((value.detach(), *torch.autograd.grad(3 * value, leaf)))
-    torch.testing.assert_close(*found)
+def test_smooth_term_is_differentiated_right():
+    near, generator = _curve(40, 4), torch.Generator().manual_seed(1)
+    mask = torch.rand(40, dtype=torch.float64, generator=generator).requires_grad_()
+    away = near.draw(generator)
+    assert set(near.draw(torch.Generator().manual_seed(0)).tolist()) <= set(range(1, 9))
+    torch.autograd.gradcheck(lambda m: losses.smooth_term(m, near, away), mask)
 
 
 def test_neighbours_are_near():
@@ -86,5 +81,4 @@ def test_neighbours_are_near():
 def test_no_pairs_without_two_anchors(count):
     near = losses.Neighbours(torch.zeros(count, 3, dtype=torch.int32), 4.0)
     away = near.draw(torch.Generator())
-    for form in (losses.smooth_term, losses.smooth_term_reference):
-        assert away.shape == (count,) and float(form(torch.ones(count), near, away)) == 0
+    assert away.shape == (count,) and float(losses.smooth_term(torch.ones(count), near, away)) == 0
