@@ -316,12 +316,14 @@ class Slurm(Engine):
     def _watch(self) -> None:
         """Gives each future its outcome, as soon as submitit finds one, or an exception."""
         while True:
-            for future, task in [(f, t) for f, t in list(self.tasks.items()) if t.done()]:
-                del self.tasks[future]
+            for future, task in list(self.tasks.items()):
                 try:
+                    if not task.done():
+                        continue
                     future.set_result(task.result())
                 except Exception as error:  # submitit has several for jobs without a result
                     future.set_exception(error)
+                del self.tasks[future]
             time.sleep(POLL_SECONDS)
 
     def close(self) -> None:

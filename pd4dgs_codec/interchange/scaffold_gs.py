@@ -1,10 +1,10 @@
 """Checkpoints of Scaffold-GS (Lu et al. 2024) as a scene with layer 0 alone.
 
-A folder `point_cloud/iteration_N` holds `point_cloud.ply`, the anchors, and the decoders: either `opacity_mlp.pt`,
-`cov_mlp.pt` and `color_mlp.pt` (TorchScript), or `checkpoints.pth` (a dict of state dicts). Its formulas are those of
-clause 13.4 if no decoder takes the distance and there is no bank of features. An appearance embedding enters the colour
-decoder's first layer linearly, so that for one picture it is a part of the bias. Two folders up, `cfg_args` and
-`cameras.json` say the voxel size, the background and the cameras; nothing of them is evaluated.
+A folder `point_cloud/iteration_N` holds the anchors in `point_cloud.ply` and the decoders in `opacity_mlp.pt`,
+`cov_mlp.pt` and `color_mlp.pt` (TorchScript) or in `checkpoints.pth` (a dict of state dicts). Its formulas equal clause
+13.4 if no decoder takes the distance and there is no feature bank. An appearance embedding enters the first layer of
+the colour decoder linearly, so for one picture it is part of the bias. Two folders up, `cfg_args` and `cameras.json`
+give the voxel size, the background and the cameras; they are parsed as text.
 """
 
 from __future__ import annotations
@@ -35,24 +35,27 @@ from pd4dgs_codec.scene import (
     Widths,
 )
 
-#: Our names of the decoders and theirs.
+#: The decoders' names here and in Scaffold-GS.
 DECODERS = {"opacity": "opacity_mlp", "covariance": "cov_mlp", "color": "color_mlp"}
-#: Files and keys of what our format cannot hold, or of what goes into the colours.
+#: Files and keys of feature banks, which the format cannot hold, and of the appearance embedding.
 BANKS = ("feature_bank_mlp.pt", "mlp_feature_bank", "feature_bank_mlp")
 EMBEDDING = "embedding_appearance.pt"
-#: Their rasteriser skips what is nearer; and the far plane of their cameras.
+#: The near plane of its rasteriser, and the far plane of its cameras.
 NEAR, FAR = 0.2, 100.0
-UP = (0.0, -1.0, 0.0)  #: of a run that does not keep its cameras
-#: An anchor may lie this share of a voxel off the grid, and as many units in the last place of its coordinate.
+UP = (0.0, -1.0, 0.0)  #: of a run without cameras.json
+#: Tolerance of anchors off the grid: this share of a voxel, plus units in the last place of the coordinate.
 OFF_GRID, ULPS = 1e-3, 8
-#: The activation behind each decoder, by TorchScript's names.
+#: The last activation of each decoder, as TorchScript names it.
 ENDS: dict[str, str | None] = {"opacity": "Tanh", "covariance": None, "color": "Sigmoid"}
 
 
 @dataclass(frozen=True)
 class Choices:
-    """appearance: the picture whose embedding is folded in, or None; voxel_size: scene units, None to find it;
-    iteration: of several in the folder, None for the last."""
+    """Options of the import.
+
+    appearance: the picture with the embedding to use, or None. voxel_size: scene units, None to find it. iteration:
+    None for the last.
+    """
 
     appearance: int | None = None
     voxel_size: float | None = None
@@ -60,7 +63,7 @@ class Choices:
 
 
 def read_scaffold_gs(folder: Path, choices: Choices) -> Scene:
-    """The scene, unquantised but for its anchors, which lie on the grid. Raises DataError naming what is not taken."""
+    """The scene, unquantised but for its anchors, which lie on the grid. Raises DataError for unsupported models."""
     place = _iteration(folder, choices.iteration)
     run = place.parent.parent if place.parent.name == "point_cloud" else place
     config = _config(run / "cfg_args")
@@ -174,7 +177,7 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
 
 
 def _decoders(place: Path) -> tuple[dict[str, Any], np.ndarray | None]:
-    """(what each decoder's file or key holds, the appearance embedding [pictures, A] or None)."""
+    """(the content of each decoder's file or key, the appearance embedding [pictures, A] or None)."""
     united = place / "checkpoints.pth"
     if united.is_file():
         content = read_tensors(united)
@@ -220,7 +223,7 @@ def _flat(content: Any, prefix: str = "") -> dict[str, Any]:
 def _network(
     name: str, decoder: Any, path: Path, widths: Widths, embedding: np.ndarray | None, choices: Choices
 ) -> Network:
-    """Two linear layers with a ReLU between them, the embedding of the chosen picture in the first one's bias."""
+    """Two linear layers with a ReLU between them, and the embedding of the chosen picture in the first bias."""
     _check_activations(name, decoder, path)
     tensors = {key: value for key, value in _flat(decoder).items() if isinstance(value, np.ndarray)}
     expected = {"0.weight", "0.bias", "2.weight", "2.bias"}
@@ -260,7 +263,7 @@ def _network(
 
 
 def _check_activations(name: str, decoder: Any, path: Path) -> None:
-    """What TorchScript says of the layers' kinds; state dicts say nothing."""
+    """Raises DataError for other kinds of layers in TorchScript; state dicts do not name them."""
     if not isinstance(decoder, Module):
         return
     found = [type(part).__name__ for key, part in vars(decoder).items() if key.isdigit() and isinstance(part, Module)]
@@ -271,7 +274,7 @@ def _check_activations(name: str, decoder: Any, path: Path) -> None:
 
 
 def _grid(anchor: np.ndarray, path: Path) -> float:
-    """The largest voxel that all coordinates are multiples of, found from the smallest up."""
+    """The largest voxel size that divides all coordinates."""
     values = np.unique(np.abs(anchor.astype(np.float64)))
     tolerance = ULPS * np.spacing(np.abs(anchor).max()).astype(np.float64)
     gaps = np.diff(np.concatenate([[0.0], values]))
@@ -288,7 +291,7 @@ def _grid(anchor: np.ndarray, path: Path) -> float:
 
 
 def _cells(anchor: np.ndarray, voxel: float, path: Path) -> np.ndarray:
-    """int32 [N, 3]: the anchors in voxels."""
+    """int32 [N, 3]: the anchors in voxels. Raises DataError if they are not multiples of `voxel`."""
     exact = anchor.astype(np.float64) / voxel
     cells = np.round(exact)
     if np.abs(cells).max() > MAX_VOXEL:

@@ -33,15 +33,15 @@ MAX_PICKLE = 1 << 24  #: bytes of data.pkl
 
 
 class Module:
-    """A module of a TorchScript file: its class has the name that the file gives, its attributes are its members."""
+    """A module of a TorchScript file, with its members as attributes; the class has the name in the file."""
 
 
 class Refused(Exception):
-    """A pickle names what is not allowed."""
+    """A pickle names something else than tensors."""
 
 
 def read_tensors(path: Path) -> Any:
-    """What the file holds: dicts, lists, scalars, modules, and tensors as numpy arrays. Raises DataError."""
+    """The content of a file: dicts, lists, scalars, modules, and tensors as numpy arrays. Raises DataError."""
     raw = read_file(path)
     try:
         with zipfile.ZipFile(io.BytesIO(raw)) as archive:
@@ -68,7 +68,7 @@ def _content(archive: zipfile.ZipFile) -> Any:
 
 
 def _read(archive: zipfile.ZipFile, name: str) -> bytes:
-    """A member's bytes; torch stores these as they are, so that nothing grows when it is read."""
+    """The bytes of a member. torch does not compress them, so none may grow when read."""
     if archive.getinfo(name).compress_type != zipfile.ZIP_STORED:
         raise Refused(f"member {name!r} is compressed")
     return archive.read(name)
@@ -80,7 +80,7 @@ class _Unpickler(pickle.Unpickler):
         self._storage = lru_cache(maxsize=None)(storage)
 
     def find_class(self, module: str, name: str) -> Any:
-        """The few names that files of tensors need."""
+        """The names that files of tensors need; all others are refused."""
         if module.startswith("__torch__."):
             return type(name, (Module,), {})
         if module == "torch" and name in STORAGES:
@@ -106,7 +106,7 @@ class _Unpickler(pickle.Unpickler):
 
 
 def _tensor(storage: np.ndarray, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_: Any) -> np.ndarray:
-    """The elements of a storage that a tensor is made of, as a view: what shares a storage takes no more memory."""
+    """A tensor as a view of its storage, so that tensors that share one take no more memory."""
     whole = all(type(v) is int and v >= 0 for v in (offset, *size, *stride)) and len(size) == len(stride)
     count = int(np.prod([int(v) for v in size], dtype=object)) if whole else -1
     last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True)) if whole and count > 0 else offset
