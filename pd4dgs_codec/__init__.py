@@ -14,10 +14,9 @@ from importlib import import_module
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
-    from pd4dgs_codec.format.decoder import decode
+    from pd4dgs_codec.format.decoder import decode, open_stream
     from pd4dgs_codec.format.encoder import encode
     from pd4dgs_codec.format.info import FORMAT_VERSION
-    from pd4dgs_codec.format.stream import open_stream
     from pd4dgs_codec.web.page import show
 
 __version__ = "0.1.0"
@@ -27,7 +26,7 @@ _HOMES = {
     "FORMAT_VERSION": "pd4dgs_codec.format.info",
     "decode": "pd4dgs_codec.format.decoder",
     "encode": "pd4dgs_codec.format.encoder",
-    "open_stream": "pd4dgs_codec.format.stream",
+    "open_stream": "pd4dgs_codec.format.decoder",
     "show": "pd4dgs_codec.web.page",
 }
 

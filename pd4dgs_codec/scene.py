@@ -1,13 +1,14 @@
-"""The decoded scene: numpy arrays with shape, dtype, unit and axes, and which layers are present.
+"""The decoded scene: numpy arrays with shape, dtype, unit and axes, and the layers that are present.
 
-This is what the decoder yields and the encoder takes; it knows nothing of torch, of bytes or of files.
+The decoder returns a `Scene` and the encoder takes one. This module knows nothing of torch, bytes or files.
 
-Words: a *layer* is a transmitted increment, a *level* (0, 1, 2) is a render mode. Layer l carries the anchors that
-become active at level l, so the arrays of prefix l are the first rows of the arrays of prefix l + 1.
+A *layer* is a transmitted increment, a *level* (0, 1, 2) is a render mode. Layer l carries the anchors that become
+active at level l, so the arrays of prefix l are the first rows of the arrays of prefix l + 1.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -15,7 +16,7 @@ import numpy as np
 
 SCALING_DIM = 6
 
-#: Limits of `Widths`: a feature twice as wide as Scaffold-GS has it.
+#: Limits of `Widths`: the feature may be twice as wide as in Scaffold-GS.
 MAX_FEATURE, MAX_SLOTS = 64, 16
 #: Step classes of anchors are 0 .. MAX_CLASS.
 MAX_CLASS = 6
@@ -30,37 +31,21 @@ PLANES: tuple[tuple[str, int, int], ...] = (
     ("zt", 2, 3),
 )
 
-#: A mask m is stored as a code 0..255, m = code * MASK_STEP; an anchor is active at a level iff its code is > 0.
+#: A mask m is stored as a code 0..255 with m = code * MASK_STEP. An anchor is active at a level if its code is > 0.
 MASK_STEP = np.float32(1.0 / 255.0)
 MASK_THRESHOLD = 0.01
 MASK_MIN_CODE = 3
 
 #: Attributes of an anchor, in coding order: fields of Scene and of Steps.
 ATTRIBUTES = ("feature", "scaling_log", "offset")
-#: The decoders of the scaffold, and the residual heads that the global deformation may have; widths in `Widths`.
+#: The decoders of the scaffold, in the order of their numbers in the bitstream; output widths in `Widths.networks`.
 SCAFFOLD_NETWORKS = ("opacity", "covariance", "color")
-GLOBAL_HEADS = ("position", "feature", "offset", "scaling")
-#: Residual heads that the local deformation may have, with their output width.
-LOCAL_HEADS: dict[str, int] = {"mean": 3, "scale": 3, "quat": 4, "opacity": 1, "color": 3}
-
-#: Heads whose output is a length, in units of `deformation_unit`; the others add to what they name as they are.
-LENGTH_HEADS = ("position", "mean", "scale")
-
-
-def deformation_unit(box: np.ndarray) -> np.float32:
-    """The unit of LENGTH_HEADS: a quarter of the longest side of the HexPlanes' box, scene units.
-
-    In scene units a rounded weight would shift a small scene by whole pixels.
-    """
-    unit: np.float32 = np.float32(0.25) * (box[1] - box[0]).astype(np.float32).max()
-    return unit
 
 
 @dataclass(frozen=True)
 class Widths:
-    """What an anchor holds: `feature` numbers D for the networks, and `slots` G, the Gaussians that it spawns. Every
-    other width of a scene's anchors and of the networks at them follows from these two. graded: whether each anchor has
-    a step class."""
+    """Sizes of an anchor: `feature` numbers D for the networks, and `slots` G, the Gaussians that it spawns. All other
+    widths of anchors and networks follow from these two. graded: whether each anchor has a step class."""
 
     feature: int = 32
     slots: int = 10
@@ -83,25 +68,67 @@ class Widths:
 
     @property
     def inputs(self) -> int:
-        """Of the scaffold's decoders: the feature and the view direction."""
+        """Input width of the scaffold's decoders: the feature and the view direction."""
         return self.feature + 3
 
     @property
     def networks(self) -> dict[str, int]:
-        """The scaffold's decoders with their outputs."""
+        """Output width of each of the scaffold's decoders."""
         return dict(zip(SCAFFOLD_NETWORKS, (self.slots, 7 * self.slots, 3 * self.slots), strict=True))
 
     @property
     def global_heads(self) -> dict[str, int]:
-        """GLOBAL_HEADS with their outputs."""
-        return dict(zip(GLOBAL_HEADS, (3, self.feature, 3 * self.slots, SCALING_DIM), strict=True))
+        """Output width of each head of the global deformation."""
+        return {name: head.outputs(self) for name, head in HEADS[1].items()}
 
 
-#: Those of Scaffold-GS.
+#: The widths of Scaffold-GS.
 DEFAULT_WIDTHS = Widths()
 
 
-#: Name of the network, in each deformation, that turns plane features into what the heads read.
+@dataclass(frozen=True)
+class Head:
+    """A residual head. outputs: its output width at given widths of the anchors. unit: what its output is added to and
+    measured in: "length" (in units of `deformation_unit`), an attribute, "quaternion" or "color" (0..1)."""
+
+    outputs: Callable[[Widths], int]
+    unit: str
+
+
+#: By layer, the residual heads that its deformation may have. Their order is that of the numbers 1, 2, .. in the
+#: bitstream, where the trunk has number 0.
+HEADS: dict[int, dict[str, Head]] = {
+    1: {
+        "position": Head(lambda widths: 3, "length"),
+        "feature": Head(lambda widths: widths.feature, "feature"),
+        "offset": Head(lambda widths: 3 * widths.slots, "offset"),
+        "scaling": Head(lambda widths: SCALING_DIM, "scaling_log"),
+    },
+    2: {
+        "mean": Head(lambda widths: 3, "length"),
+        "scale": Head(lambda widths: 3, "length"),
+        "quat": Head(lambda widths: 4, "quaternion"),
+        "opacity": Head(lambda widths: 1, "color"),
+        "color": Head(lambda widths: 3, "color"),
+    },
+}
+GLOBAL_HEADS = tuple(HEADS[1])
+#: The heads of layer 2 with their output widths, which are those of a Gaussian.
+LOCAL_HEADS: dict[str, int] = {name: head.outputs(DEFAULT_WIDTHS) for name, head in HEADS[2].items()}
+#: Heads whose output is a length, in units of `deformation_unit`.
+LENGTH_HEADS = tuple(name for heads in HEADS.values() for name, head in heads.items() if head.unit == "length")
+
+
+def deformation_unit(box: np.ndarray) -> np.float32:
+    """The unit of LENGTH_HEADS: a quarter of the longest side of the HexPlanes' box, scene units.
+
+    In scene units a rounded weight would shift a small scene by whole pixels.
+    """
+    unit: np.float32 = np.float32(0.25) * (box[1] - box[0]).astype(np.float32).max()
+    return unit
+
+
+#: The network of each deformation whose outputs the heads read.
 TRUNK = "trunk"
 
 #: A network: per linear layer (weight float32 [out, in], bias float32 [out]); ReLU between layers, none at the end.
@@ -122,7 +149,7 @@ class Camera:
 
 @dataclass(frozen=True, eq=False)
 class SceneInfo:
-    """What every layer needs and what a player needs to show the file alone. All reals are exact binary32 values."""
+    """Values that every layer and a player need. All reals are exact binary32 values."""
 
     voxel_size: float  #: scene units; anchors are integer multiples of it
     box: np.ndarray  #: float32 [2, 3], lower and upper corner; the HexPlanes' normalisation box, scene units
@@ -167,36 +194,36 @@ class Steps:
 
     @property
     def attributes(self) -> dict[str, float]:
-        """By name of the attribute."""
+        """Step by name of the attribute."""
         return {"feature": self.feature, "scaling_log": self.scaling_log, "offset": self.offset}
 
     def planes(self, layer: int) -> float:
-        """Of the planes of layer 1 or 2."""
+        """Step of the planes of layer 1 or 2."""
         return {1: self.planes_global, 2: self.planes_local}[layer]
 
     def weights(self, layer: int) -> float:
-        """Of the networks of layer 0, 1 or 2."""
+        """Step of the networks of layer 0, 1 or 2."""
         return (self.weights_scaffold, self.weights_global, self.weights_local)[layer]
 
     def scaled(self, factor: float) -> Steps:
         """Every step times `factor`, rounded to binary32."""
-        with np.errstate(over="ignore"):  # an infinite step is the encoder's to refuse
+        with np.errstate(over="ignore"):  # the encoder refuses infinite steps
             return Steps(**{k: float(np.float32(v * factor)) for k, v in self.__dict__.items()})
 
 
 @dataclass(frozen=True, eq=False)
 class Grading:
-    """Steps of the attributes that differ from anchor to anchor.
+    """Step classes: quantisation steps of the attributes that differ between anchors.
 
     classes: uint8 [N], 0 .. MAX_CLASS; an anchor of class c has 2^c times the steps. centre: float32 [channels], in
-    each channel a value that anchors of every class can have; that of what is decoded is a multiple of the step.
+    each channel a value that anchors of every class can have; in decoded scenes it is a multiple of the step.
     """
 
     classes: np.ndarray
     centre: np.ndarray
 
     def take(self, rows: np.ndarray | slice) -> Grading:
-        """Of these anchors, in this order."""
+        """The step classes of these anchors, in this order."""
         return replace(self, classes=self.classes[rows])
 
 
@@ -230,7 +257,7 @@ class Scene:
 
     @property
     def widths(self) -> Widths:
-        """D and G, as its arrays have them."""
+        """D and G, read off the arrays."""
         return Widths(self.feature.shape[1], self.offset.shape[1], self.grading is not None)
 
     @property
@@ -240,13 +267,13 @@ class Scene:
 
     @property
     def anchor(self) -> np.ndarray:
-        """float32 [N, 3] anchor positions, world, scene units, worked out at each access."""
+        """float32 [N, 3] anchor positions, world, scene units, computed at each access."""
         return self.anchor_at(slice(None))
 
     def anchor_at(self, rows: np.ndarray | slice) -> np.ndarray:
         """float32 [n, 3] positions of the anchors `rows`."""
         voxel = np.float64(np.float32(self.info.voxel_size))
-        with np.errstate(over="ignore"):  # an absurd voxel size gives infinities, which the decoder refuses
+        with np.errstate(over="ignore"):  # a huge voxel size gives infinities, which the decoder refuses
             position: np.ndarray = (self.anchor_q[rows].astype(np.float64) * voxel).astype(np.float32)
         return position
 
@@ -256,27 +283,28 @@ class Scene:
         return {"feature": self.feature, "scaling_log": self.scaling_log, "offset": self.offset}
 
     def of_anchors(self, rows: np.ndarray | slice) -> dict[str, Any]:
-        """The fields with a row for each anchor, without the masks, of the anchors `rows`; for `replace`."""
+        """The per-anchor fields (without the masks) of the anchors `rows`, as arguments for `dataclasses.replace`."""
         grading = None if self.grading is None else self.grading.take(rows)
         attributes = {name: values[rows] for name, values in self.attributes.items()}
         return {"anchor_q": self.anchor_q[rows], **attributes, "grading": grading}
 
     def deformation(self, layer: int) -> Deformation | None:
-        """That of layer 1 or 2; None if it is left out, and for layer 0, which has none."""
+        """The deformation of layer 1 or 2; None if it is left out, and for layer 0, which has none."""
         return (None, self.global_deformation, self.local_deformation)[layer]
 
     def full_masks(self) -> list[np.ndarray]:
-        """uint8 [N] codes per layer present: an anchor that a layer's prefix does not hold is inactive there."""
+        """uint8 [N] codes per layer present; an anchor that a layer's prefix lacks is inactive there."""
         return [np.concatenate([codes, np.zeros(self.rows[-1] - codes.size, np.uint8)]) for codes in self.mask]
 
     def tensors(self, layer: int) -> Deformation:
-        """Planes and networks of layer 0, 1 or 2: layer 0 has its decoders and no planes, a layer left out neither."""
+        """Planes and networks of layer 0, 1 or 2. Layer 0 has its decoders and no planes; a layer without a deformation
+        has neither."""
         if layer == 0:
             return Deformation((), self.networks)
         return self.deformation(layer) or Deformation((), {})
 
     def with_tensors(self, layer: int, tensors: Deformation | None) -> Scene:
-        """The scene with others in their place; None leaves the deformation of layer 1 or 2 out."""
+        """The scene with other planes and networks in a layer; None leaves out the deformation of layer 1 or 2."""
         if layer == 1:
             return replace(self, global_deformation=tensors)
         if layer == 2:
@@ -285,7 +313,7 @@ class Scene:
         return replace(self, networks=tensors.networks)
 
     def prefix(self, max_layer: int) -> Scene:
-        """The scene that a decoder yields from the layers <= max_layer; `self` if nothing is cut."""
+        """The scene that a decoder returns for the layers <= max_layer; `self` if nothing is cut."""
         n = sum(layer <= max_layer for layer in self.layers)
         if n == len(self.layers):
             return self

@@ -14,8 +14,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from pd4dgs_codec import encode
-from pd4dgs_codec.format.quantise import dequantise
-from pd4dgs_codec.format.table import NO_CLASSES, Grid, attribute_rows
+from pd4dgs_codec.format.quantise import NO_CLASSES, Grid, attribute_rows, dequantise
 from pd4dgs_codec.scene import (
     DEFAULT_WIDTHS,
     LOCAL_HEADS,

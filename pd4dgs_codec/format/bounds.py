@@ -1,32 +1,33 @@
-"""Error bounds of a file: how far a decoded value may lie from the one that was given, and how far the farthest does.
+"""Error bounds of a file: how far a decoded value may lie from the given one, and how far the farthest does.
 
-By clause 11.5 and half-to-even rounding |x - x_hat| <= Q/2, plus half a unit in the last place of x_hat: the product
-k Q is rounded to binary32 once. Voxel indices and mask codes are integers and come back as they are.
+By clause 11.5 and rounding half to even, |x - x_hat| <= Q/2 plus half a unit in the last place of x_hat, because the
+product k Q is rounded to binary32. Voxel indices and mask codes are integers and come back exactly.
 
-The header declares one bound per class of tensors (clause "error bounds"), the classes being the fields of Steps. An
-anchor of step class c has 2^c times the steps, and 2^c times the bounds.
+The header declares one bound per class of tensors (clause 5.4), the classes being the fields of Steps. An anchor of
+step class c has 2^c times the steps and the bounds.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from pd4dgs_codec.errors import EncodeError
-from pd4dgs_codec.format.kinds import LAYER_KINDS
-from pd4dgs_codec.format.table import classes_of, row_blocks
-from pd4dgs_codec.scene import PLANES, Scene
+from pd4dgs_codec.format.deformation import arrays_of
+from pd4dgs_codec.format.quantise import dequantise, magnitude
+from pd4dgs_codec.format.symbols import SceneSymbols
+from pd4dgs_codec.scene import Scene
 
-#: |x| / Q <= 2^23 is computed in binary64, which is off by 2^-30 at most and may turn a tie: so much of Q more.
+#: |x| / Q <= 2^23 is computed in binary64, off by at most 2^-30, which may turn a tie: allow this share of Q more.
 _TIES = 2.0**-29
 
 
 @dataclass(frozen=True)
 class ErrorBound:
-    """Of all tensors that share a step. what: that field of Steps. step: Q. bound: the error that the header declares;
-    largest: the largest error there is. In the unit of the values."""
+    """Errors of all tensors that share a step, in the unit of the values. what: the field of Steps. step: Q. bound: the
+    error that the header declares. largest: the largest error."""
 
     what: str
     step: float
@@ -34,51 +35,55 @@ class ErrorBound:
     largest: float
 
 
-#: Attributes float32 [rows, ...] by name, some rows of a scene at a time, together all of them.
-Blocks = Iterable[tuple[slice, Mapping[str, np.ndarray]]]
+def rounding_bounds(symbols: SceneSymbols) -> dict[str, float]:
+    """By field of Steps that the symbols use: the largest error of rounding to the nearest symbol, rounded up to
+    binary32. The symbol farthest from 0 has the largest bound."""
+    farthest: dict[str, int] = {}
+    for layer in symbols.layers:
+        found = list(symbols.grid.farthest(layer.attributes, layer.classes).items())
+        found += [(what, magnitude(k)) for what, k in arrays_of(layer.tensors, layer.kind)]
+        for what, k in found:
+            farthest[what] = max(farthest.get(what, 0), k)
+    steps = vars(symbols.steps)
+    return {
+        what: _rounded_up(float(_bounds(dequantise(np.array([k]), steps[what]), steps[what])[0]))
+        for what, k in farthest.items()
+    }
 
 
-def blocks_of(scene: Scene) -> Blocks:
-    """Those of a scene that is there."""
-    for rows in row_blocks(scene.rows[-1]):
-        yield rows, {name: values[rows] for name, values in scene.attributes.items()}
+def verify_errors(given: Scene, symbols: SceneSymbols, declared: Mapping[str, float]) -> list[ErrorBound]:
+    """A row per entry of `declared`, the bounds in the header. given: the planned scene that was quantised.
 
-
-def rounding_bounds(decoded: Scene, blocks: Blocks) -> dict[str, float]:
-    """By field of Steps that the scene's tensors use: what bounds the error of them all if each value was rounded to
-    the nearest symbol, rounded up to binary32. The attributes are those of `blocks`."""
-    bounds: dict[str, float] = {}
-    for what, step, restored in _tensors(decoded, blocks):
-        largest = np.abs(restored).max(initial=np.float32(0))
-        bounds[what] = max(bounds.get(what, 0.0), float(_bounds(largest, step)))
-    return {what: _rounded_up(bound) for what, bound in bounds.items()}
-
-
-def verify_errors(given: Scene, decoded: Scene, blocks: Blocks, declared: Mapping[str, float]) -> list[ErrorBound]:
-    """One row per entry of `declared`, the bounds in the header of the file.
-
-    given: the planned scene, its steps those of the file; decoded: what the file holds, of the same rows and shapes,
-    its attributes those of `blocks`. Raises EncodeError naming the field if any value lies farther off than declared,
-    or than rounding takes it.
+    Raises EncodeError naming the field if a dequantised value lies farther from the given one than declared, or than
+    rounding takes it.
     """
-    steps, largest = dict.fromkeys(declared, 0.0), dict.fromkeys(declared, 0.0)
-    spacing = 2.0 ** classes_of(decoded)
-    for rows, what, step, x, restored in _pairs(given, decoded, blocks):
-        errors = np.abs(x.astype(np.float64) - restored)
-        if rows is not None and spacing.size:
-            errors /= spacing[rows].reshape(-1, *(1,) * (x.ndim - 1))
-        bounds = np.minimum(_bounds(np.abs(restored), step), declared[what])
+    steps, largest = vars(symbols.steps), dict.fromkeys(declared, 0.0)
+    for what, x, restored, spacing in _pairs(given, symbols):
+        errors = np.abs(x.astype(np.float64) - restored) / spacing
+        bounds = np.minimum(_bounds(np.abs(restored), steps[what]), declared[what])
         if not (errors <= bounds).all():
             place = np.unravel_index(int((errors - bounds).argmax()), errors.shape)
-            row = f"{what}: {x[place]} comes back as {restored[place]} at step {step:g}"
+            row = f"{what}: {x[place]} comes back as {restored[place]} at step {steps[what]:g}"
             raise EncodeError(f"verification: {row}, expected at most {bounds[place]:.9g} between them")
-        steps[what], largest[what] = step, max(largest[what], float(errors.max(initial=0.0)))
+        largest[what] = max(largest[what], float(errors.max(initial=0.0)))
     return [ErrorBound(what, steps[what], bound, largest[what]) for what, bound in declared.items()]
 
 
-def _bounds(magnitude: np.ndarray, step: float) -> np.ndarray:
-    """float64 error bounds of decoded values of that float32 magnitude."""
-    last_place: np.ndarray = np.spacing(magnitude).astype(np.float64)
+def _pairs(given: Scene, symbols: SceneSymbols) -> Iterator[tuple[str, np.ndarray, np.ndarray, np.ndarray | float]]:
+    """(field of Steps, values given, values dequantised, 2^step class of each)."""
+    for rows, classes, values in symbols.blocks():
+        for name, x in values.items():
+            spacing = 2.0 ** classes.reshape(-1, *(1,) * (x.ndim - 1)) if classes.size else 1.0
+            yield name, given.attributes[name][rows], x, spacing
+    for layer in symbols.layers:
+        both = (arrays_of(given.tensors(layer.kind.layer), layer.kind), arrays_of(layer.tensors, layer.kind))
+        for (what, x), (_, k) in zip(*both, strict=True):
+            yield what, x, dequantise(k, layer.steps[what]), 1.0
+
+
+def _bounds(magnitudes: np.ndarray, step: float) -> np.ndarray:
+    """float64 error bounds of dequantised values of these float32 magnitudes."""
+    last_place: np.ndarray = np.spacing(magnitudes).astype(np.float64)
     return (0.5 + _TIES) * step + 0.5 * last_place
 
 
@@ -86,29 +91,3 @@ def _rounded_up(value: float) -> float:
     """The least binary32 value that is not below."""
     nearest = np.float32(value)
     return float(nearest if nearest >= value else np.nextafter(nearest, np.float32(np.inf)))
-
-
-def _pairs(
-    given: Scene, decoded: Scene, blocks: Blocks
-) -> Iterator[tuple[slice | None, str, float, np.ndarray, np.ndarray]]:
-    """(rows of an attribute, field of Steps, step, values given, values decoded)."""
-    for rows, values in blocks:
-        for name, x in values.items():
-            yield rows, name, given.steps.attributes[name], given.attributes[name][rows], x
-    both = zip(_tensors(given, ()), _tensors(decoded, ()), strict=True)
-    yield from ((None, what, step, x, restored) for (what, step, x), (_, _, restored) in both)
-
-
-def _tensors(scene: Scene, blocks: Blocks) -> Iterator[tuple[str, float, np.ndarray]]:
-    """(field of Steps, step, float32 values); attributes of `blocks`."""
-    for _, values in blocks:
-        yield from ((name, scene.steps.attributes[name], x) for name, x in values.items())
-    for kind in LAYER_KINDS:
-        tensors = scene.tensors(kind.layer)
-        for scale in tensors.planes:
-            step = scene.steps.planes(kind.layer)
-            yield from ((str(kind.planes_step), step, scale[name]) for name, _, _ in PLANES)
-        step = scene.steps.weights(kind.layer)
-        for name in kind.network_ids:
-            for pair in tensors.networks.get(name, ()):
-                yield from ((kind.weights_step, step, array) for array in pair)

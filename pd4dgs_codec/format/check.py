@@ -1,4 +1,4 @@
-"""Checks of a Scene before it is encoded: shapes, dtypes, finiteness, row counts. One clear line each."""
+"""Checks of a Scene before it is encoded: shapes, dtypes, finiteness, row counts."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 
 from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format.kinds import LAYER_KINDS, LayerKind
-from pd4dgs_codec.format.quantise import is_step, magnitude
+from pd4dgs_codec.format.quantise import all_finite, is_step, magnitude
 from pd4dgs_codec.morton import MAX_VOXEL
 from pd4dgs_codec.scene import (
     MASK_MIN_CODE,
@@ -49,6 +49,9 @@ def check_scene(scene: Scene) -> None:
     _expect_array("anchor_q", scene.anchor_q, np.int32, (n, 3))
     reach = magnitude(scene.anchor_q)
     _expect(reach <= MAX_VOXEL, f"anchor_q: voxel index of magnitude {reach}, expected at most {MAX_VOXEL}")
+    size = scene.info.voxel_size
+    finite = not is_step(size) or all_finite(scene.anchor_q, size)
+    _expect(finite, f"anchor_q: a position is infinite at voxel size {size:g}, expected finite ones")
     for name, axes in (("feature", 2), ("offset", 3)):
         found = scene.attributes[name].shape
         _expect(len(found) == axes, f"{name}: an array of {len(found)} axes, expected {axes}")
@@ -106,7 +109,7 @@ def _check_info(scene: Scene) -> None:
 
 
 def info_fault(info: SceneInfo) -> str | None:
-    """What is wrong with finite header values that a player could not work with, or None; encoder and decoder agree."""
+    """The first rule that finite header values break, or None; for the encoder and the decoder."""
     start, end = info.time_range
     rules = [
         (start <= end, f"time range {start}..{end}, expected it to ascend"),

@@ -1,34 +1,30 @@
-"""Bytes of a `.pd4` file -> Scene. Takes bytes and nothing else; needs numpy, constriction and the standard library."""
+"""Bytes of a `.pd4` file -> Scene, at once or as they arrive. Needs numpy, constriction, msgpack and nothing else."""
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from copy import copy
+
 from pd4dgs_codec.entropy.priors import Prior
 from pd4dgs_codec.errors import DecodeError, Malformed, Truncated, UnsupportedFeature
-from pd4dgs_codec.format.attribute_section import Past
+from pd4dgs_codec.format.attributes import Past
 from pd4dgs_codec.format.container import CHUNK_OVERHEAD, PREAMBLE_SIZE, Chunk, read_chunk, read_preamble
 from pd4dgs_codec.format.header import Header, layers_of, scene_id_of, unpack_header
 from pd4dgs_codec.format.kinds import BY_CHUNK_TYPE, LayerKind
-from pd4dgs_codec.format.layer_meta import Declared
-from pd4dgs_codec.format.payload import read_layer
-from pd4dgs_codec.format.symbols import (
-    LayerSymbols,
-    TakenVoxels,
-    assemble,
-    check_last_layer,
-    merged,
-)
+from pd4dgs_codec.format.payload import Declared, read_layer
+from pd4dgs_codec.format.symbols import LayerSymbols, SceneSymbols, TakenVoxels, check_slice, merged
 from pd4dgs_codec.scene import Scene
 
 
 class LayerReader:
-    """Walks a file's chunks in order. It holds no bytes: every call gets all that has arrived. Its lists are replaced
-    and never changed, so that a copy stays what it is."""
+    """Reads a file's chunks in order. It holds no bytes: each call gets all that have arrived. Its lists are replaced
+    and never changed, so a copy keeps its state."""
 
     def __init__(self) -> None:
         self.header: Header | None = None
         self.offset = 0  #: of the next chunk
-        self.slices: list[list[LayerSymbols]] = []  #: of each layer
-        self._merged: list[LayerSymbols | None] = []  # each layer, None until somebody asks for it as it is now
+        self.slices: list[list[LayerSymbols]] = []  #: by layer
+        self._merged: list[LayerSymbols | None] = []  # by layer, None until it is asked for
         self._index = 0
         self._scene_id = b""
         self._declared = Declared()
@@ -37,7 +33,7 @@ class LayerReader:
 
     @property
     def layers(self) -> list[LayerSymbols]:
-        """The layers read so far; slices of the last one may be missing."""
+        """The layers read so far; the last one may lack slices."""
         layers = [layer or merged(parts) for layer, parts in zip(self._merged, self.slices, strict=True)]
         self._merged = [*layers]
         return layers
@@ -49,20 +45,25 @@ class LayerReader:
 
     @property
     def complete(self) -> bool:
-        """Whether every chunk that the header lists has been read."""
+        """Whether every chunk in the header's list has been read."""
         return self.header is not None and self._index == len(self.header.chunks)
+
+    @property
+    def symbols(self) -> SceneSymbols:
+        """The symbols of the layers read so far, at least one."""
+        assert self.header is not None
+        return SceneSymbols(self.header.info, self.header.grid, self.layers)
 
     def scene(self) -> Scene:
         """The scene of the layers read so far, at least one."""
-        assert self.header is not None
-        return assemble(self.header.info, self.header.grid, self.layers)
+        return self.symbols.scene()
 
     def next_slice(self, data: bytes | bytearray, max_layer: int | None = None, max_bytes: int | None = None) -> bool:
-        """Read on to the end of one more slice of a layer <= max_layer that ends within the first max_bytes; whether
-        the file has one more (clause "decoding process").
+        """Read one more slice of a layer <= max_layer that ends within the first max_bytes (clause 12); whether there
+        was one.
 
-        Raises Truncated, with nothing consumed that a later call would miss, if `data` ends before; Malformed if
-        bytes follow the last chunk of a file that is read whole (neither limit).
+        Raises Truncated, with nothing consumed that a later call would miss, if `data` ends before its end. Raises
+        Malformed if bytes follow the last chunk of a file that is read whole (without either limit).
         """
         if self.header is None:
             preamble = read_preamble(data)
@@ -81,7 +82,7 @@ class LayerReader:
         return False
 
     def _read_chunk(self, data: bytes | bytearray) -> bool:
-        """Whether the next chunk is a slice, not an ancillary chunk."""
+        """Read the next chunk; whether it is a slice, not an ancillary chunk."""
         assert self.header is not None
         expected_type, length = self.header.chunks[self._index]
         chunk = read_chunk(
@@ -97,19 +98,21 @@ class LayerReader:
         if kind is not None:
             self._check_place(chunk, kind.layer)
             try:
-                self._read_slice(chunk, kind)
+                self._read_slice(chunk, kind, self.header)
             except DecodeError as error:
-                raise _located(error, self._index, self.offset) from None
+                # A payload is whole, so a fault inside it is not Truncated.
+                of = Malformed if isinstance(error, Truncated) else type(error)
+                raise of(error.message, offset=self.offset, chunk=self._index) from None
         self._index += 1
         self.offset = chunk.end
         return kind is not None
 
     def _goes_on(self, layer: int) -> bool:
-        """Whether a slice of `layer` before was read."""
+        """Whether a slice of `layer` was read before."""
         return bool(self.slices) and self.slices[-1][0].kind.layer == layer
 
     def _check_place(self, chunk: Chunk, layer: int) -> None:
-        """Raise Malformed unless the slice's flags fit its place (clause "slices")."""
+        """Raise Malformed unless the slice's flags fit its place (clause 3.6)."""
         assert self.header is not None
         expected, message = len(self.slices[-1]) if self._goes_on(layer) else 0, ""
         following = layers_of(self.header.chunks[self._index + 1 :])[:1]
@@ -121,34 +124,20 @@ class LayerReader:
         if message:
             raise Malformed(message, offset=self.offset + 2, chunk=self._index)
 
-    def _read_slice(self, chunk: Chunk, kind: LayerKind) -> None:
-        assert self.header is not None
+    def _read_slice(self, chunk: Chunk, kind: LayerKind, header: Header) -> None:
         later = self._goes_on(kind.layer)
         past = self._past if later else Past[Prior]() if chunk.more else None
-        header = self.header
-        read = read_layer(chunk.payload, kind, header.widths, self._declared, header.mode, later, past)
+        read, declared = read_layer(chunk.payload, kind, header.grid.widths, self._declared, header.mode, later, past)
         before = self.layers if read.mask_increase.size else []
-        check_last_layer([*before, read], self._taken, header.info.voxel_size, header.grid)
-        _check_bounded(read, header)
-        symbols = sum(a.size for a in read.arrays())
-        self._declared = self._declared.and_slice(len(read.anchor_q), symbols, len(chunk.payload))
-        self._past = past
+        check_slice([*before, read], header.info.voxel_size, header.grid)
+        missing = [name for name in read.steps if name not in header.error_bounds]
+        if missing:
+            raise Malformed(f"layer {kind.layer}: no error bound of {missing[0]} in the header, expected one")
+        self._taken.take(read.anchor_q)
+        self._declared, self._past = declared, past
         at = -1 if later else len(self.slices)
         self.slices = [*self.slices[:at], [*(self.slices[-1] if later else ()), read]]
         self._merged = [*self._merged[:at], None]
-
-
-def _check_bounded(layer: LayerSymbols, header: Header) -> None:
-    """Raise Malformed unless the header has an error bound for every class of tensors in `layer`."""
-    missing = [name for name in layer.steps if name not in header.error_bounds]
-    if missing:
-        raise Malformed(f"layer {layer.kind.layer}: no error bound of {missing[0]} in the header, expected one")
-
-
-def _located(error: DecodeError, chunk: int, offset: int) -> DecodeError:
-    """`error` from inside a payload, placed in the file. A payload is complete, so it cannot be Truncated."""
-    kind = Malformed if isinstance(error, Truncated) else type(error)
-    return kind(error.message, offset=offset, chunk=chunk)
 
 
 def read_layers(
@@ -161,10 +150,10 @@ def read_layers(
     try:
         while reader.next_slice(data, max_layer, max_bytes):
             pass
-        if not reader.layers:
+        if not reader.slices:
             raise Truncated(f"{max_bytes} bytes end before the first slice does", offset=max_bytes)
     except Truncated:
-        if not (allow_partial and reader.layers):
+        if not (allow_partial and reader.slices):
             raise
         return reader, False
     return reader, True
@@ -173,7 +162,7 @@ def read_layers(
 def decode_layers(
     data: bytes, *, max_layer: int | None = None, max_bytes: int | None = None, allow_partial: bool = False
 ) -> tuple[Header, list[LayerSymbols], bool]:
-    """(header, symbols per layer, whether nothing asked for is missing)."""
+    """(header, symbols per layer, complete); arguments as in `decode`."""
     reader, complete = read_layers(data, max_layer=max_layer, max_bytes=max_bytes, allow_partial=allow_partial)
     assert reader.header is not None
     return reader.header, reader.layers, complete
@@ -182,11 +171,11 @@ def decode_layers(
 def decode(
     data: bytes, *, max_layer: int | None = None, max_bytes: int | None = None, allow_partial: bool = False
 ) -> Scene:
-    """The scene of a file, or of its layers <= max_layer, or of the slices within its first max_bytes bytes, at least
-    one (bytes after those are not looked at).
+    """The scene of a file, of its layers <= max_layer, or of the slices within its first max_bytes bytes, at least one.
+    Bytes after those are not looked at.
 
-    A cut file raises Truncated, or yields its longest valid prefix of slices if allow_partial, which still needs the
-    first one. Other faults raise the other DecodeErrors.
+    A cut file raises Truncated; with allow_partial it returns the longest valid prefix of slices, at least one. Other
+    faults raise the other DecodeErrors.
     """
     return decode_partial(data, max_layer=max_layer, max_bytes=max_bytes, allow_partial=allow_partial)[0]
 
@@ -194,6 +183,67 @@ def decode(
 def decode_partial(
     data: bytes, *, max_layer: int | None = None, max_bytes: int | None = None, allow_partial: bool = True
 ) -> tuple[Scene, bool]:
-    """(scene, complete): as decode, and whether every slice asked for was there."""
+    """(scene, complete): as `decode`, and whether every slice asked for was there."""
     reader, complete = read_layers(data, max_layer=max_layer, max_bytes=max_bytes, allow_partial=allow_partial)
     return reader.scene(), complete
+
+
+# -- incremental decoding ----------------------------------------------------------------------------------------------
+
+
+class Stream:
+    """Decodes a file fed in pieces of any size. The scenes do not depend on where the pieces are cut."""
+
+    def __init__(self) -> None:
+        self._reader = LayerReader()
+        self._buffer = bytearray()
+        self._error: DecodeError | None = None
+        self.slices = 0  #: completed so far
+
+    @property
+    def complete(self) -> bool:
+        """Whether every chunk in the header's list has arrived."""
+        return self._reader.complete
+
+    def feed(self, data: bytes) -> list[Scene]:
+        """The newest scene of each layer that `data` completes a slice of, with all slices up to there.
+
+        Slices that arrive together give one scene: a small file may have a thousand slices, and each scene takes memory
+        and time for all of its rows. `every_prefix` has a scene for each slice.
+
+        A fault raises its DecodeError now, or at the next call if this one completes a slice before it, and at every
+        later call. Scenes returned before stay valid.
+        """
+        if self._error is not None:
+            raise self._error
+        self._buffer += data
+        newest: dict[int, LayerReader] = {}
+        try:
+            while self._reader.next_slice(self._buffer):
+                self.slices += 1
+                newest[self._reader.latest.kind.layer] = copy(self._reader)
+        except Truncated:
+            pass
+        except DecodeError as error:
+            self._error = error
+            if not newest:
+                raise
+        return [reader.scene() for reader in newest.values()]
+
+    def finish(self) -> None:
+        """End the stream: raises the pending fault, or Truncated if a chunk is missing."""
+        if self._error is not None:
+            raise self._error
+        self._reader.next_slice(self._buffer)
+
+
+def every_prefix(data: bytes) -> Iterator[Scene]:
+    """The scene after each slice of a whole file. Raises DecodeError."""
+    reader = LayerReader()
+    while reader.next_slice(data):
+        yield reader.scene()
+
+
+def open_stream() -> Stream:
+    """An empty stream, ready to be fed."""
+    return Stream()

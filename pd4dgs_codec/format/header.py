@@ -1,4 +1,4 @@
-"""The file header <-> canonical msgpack: chunk list, coding mode, attribute steps, and what shows the file alone."""
+"""The file header <-> canonical msgpack (clause 5): chunk list, coding mode, attribute steps, SceneInfo."""
 
 from __future__ import annotations
 
@@ -12,14 +12,13 @@ from numpy.typing import ArrayLike
 
 from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.format import canonical
+from pd4dgs_codec.format.canonical import Fields, as_integer, as_list
 from pd4dgs_codec.format.check import info_fault
 from pd4dgs_codec.format.container import SCENE_ID_SIZE
-from pd4dgs_codec.format.fields import Fields, as_integer, as_list
 from pd4dgs_codec.format.kinds import BY_CHUNK_TYPE, LAYER_KINDS
 from pd4dgs_codec.format.limits import MAX_CHUNKS, MAX_PAYLOAD
 from pd4dgs_codec.format.options import MODES
-from pd4dgs_codec.format.quantise import MAX_SYMBOL, is_step
-from pd4dgs_codec.format.table import Grid
+from pd4dgs_codec.format.quantise import MAX_SYMBOL, Grid, is_step
 from pd4dgs_codec.scene import ATTRIBUTES, MAX_FEATURE, MAX_SLOTS, Camera, SceneInfo, Widths
 
 # Keys of the header map.
@@ -41,7 +40,7 @@ TENSOR_CLASSES = {
     "planes_local": 6,
     "weights_local": 7,
 }
-#: What every layer 0 has; the other classes belong to layers that a file may do without.
+#: The classes of layer 0; the others belong to layers that a file may lack.
 ALWAYS_BOUNDED = (*ATTRIBUTES, LAYER_KINDS[0].weights_step)
 
 MAX_CAMERA_SIDE = 65535
@@ -50,27 +49,19 @@ DIGEST_SIZE = 16  #: bytes
 
 @dataclass(frozen=True, eq=False)
 class Header:
-    """chunks: (type, payload length in bytes) in file order. attribute_steps: by name, in the table's order.
+    """chunks: (type, payload length in bytes) in file order.
 
-    widths: of the anchors. centre: int32 [channels] in steps, if they are graded. error_bounds: by field of Steps, how
-    far a decoded value may lie from the one that the encoder was given, in the unit of the values; a binary32 value >=
-    0. digest: payload_digest of the layers that were encoded together.
+    grid: of the attributes. error_bounds: by field of Steps, how far a decoded value may lie from the value given to
+    the encoder, in the unit of the values; a binary32 value >= 0. digest: payload_digest of the layers that were
+    encoded together.
     """
 
     chunks: tuple[tuple[int, int], ...]
     mode: str
-    attribute_steps: dict[str, float]
-    widths: Widths
-    centre: np.ndarray | None
+    grid: Grid
     info: SceneInfo
     error_bounds: dict[str, float]
     digest: bytes
-
-    @property
-    def grid(self) -> Grid:
-        """That of the attributes."""
-        centre = np.zeros(self.widths.channels, np.int32) if self.centre is None else self.centre
-        return Grid(self.attribute_steps, self.widths, centre)
 
 
 def _f32(values: ArrayLike) -> list[float]:
@@ -78,12 +69,12 @@ def _f32(values: ArrayLike) -> list[float]:
 
 
 def pack_header(header: Header) -> bytes:
-    """The header's bytes. Raises EncodeError (from the packer) for a value canonical msgpack cannot hold."""
-    info = header.info
+    """The header's bytes. Raises EncodeError for a value that canonical msgpack cannot hold."""
+    info, grid = header.info, header.grid
     fields: dict[int, object] = {
         CHUNKS: [list(chunk) for chunk in header.chunks],
         MODE: MODES[header.mode],
-        STEPS: _f32([header.attribute_steps[name] for name in ATTRIBUTES]),
+        STEPS: _f32([grid.steps[name] for name in ATTRIBUTES]),
         VOXEL_SIZE: _f32(info.voxel_size)[0],
         BOX: _f32(info.box),
         TIME_RANGE: _f32(info.time_range),
@@ -102,14 +93,14 @@ def pack_header(header: Header) -> bytes:
         }
     bounds = header.error_bounds
     fields[ERROR_BOUNDS] = {number: bounds[name] for name, number in TENSOR_CLASSES.items() if name in bounds}
-    fields |= {DIGEST: header.digest, WIDTHS: [header.widths.feature, header.widths.slots]}
-    if header.centre is not None:
-        fields[CENTRE] = header.centre.tolist()
+    fields |= {DIGEST: header.digest, WIDTHS: [grid.widths.feature, grid.widths.slots]}
+    if grid.widths.graded:
+        fields[CENTRE] = grid.centre.tolist()
     return canonical.pack(fields)
 
 
 def unpack_header(data: bytes, offset: int = 0) -> Header:
-    """The inverse of pack_header (clause "header"); `offset` is that of the header's first byte, for messages."""
+    """The inverse of pack_header. offset: of the header's first byte, for messages. Raises DecodeError's subclasses."""
     fields = Fields(canonical.unpack(data, offset=offset), "header", KEYS)
     steps = fields.reals(STEPS, len(ATTRIBUTES))
     voxel_size = fields.real(VOXEL_SIZE)
@@ -142,9 +133,7 @@ def unpack_header(data: bytes, offset: int = 0) -> Header:
     return Header(
         chunks=chunks,
         mode=mode,
-        attribute_steps=dict(zip(ATTRIBUTES, steps, strict=True)),
-        widths=widths,
-        centre=_unpack_centre(fields, widths),
+        grid=Grid(dict(zip(ATTRIBUTES, steps, strict=True)), widths, _unpack_centre(fields, widths)),
         info=info,
         error_bounds=_unpack_error_bounds(fields),
         digest=_unpack_digest(fields.get(DIGEST)),
@@ -152,7 +141,7 @@ def unpack_header(data: bytes, offset: int = 0) -> Header:
 
 
 def payload_digest(payloads: Iterable[bytes]) -> bytes:
-    """What the header says of the layers' payloads, all those that were encoded together, in file order."""
+    """The digest in the header: of the payloads of all layers that were encoded together, in file order."""
     digest = hashlib.sha256()
     for payload in payloads:
         digest.update(payload)
@@ -161,9 +150,7 @@ def payload_digest(payloads: Iterable[bytes]) -> bytes:
 
 def scene_id_of(header: bytes) -> bytes:
     """The scene id of every chunk of a file: the first 8 bytes of the SHA-256 of the header's bytes behind its chunk
-    list. Chunks may come and go without another id; whatever decodes them may not.
-
-    header: canonical, with a chunk list.
+    list, so that chunks can be added and removed under the same id. header: canonical, with a chunk list.
     """
     fields = canonical.unpack(header)
     map_head = 1 if len(fields) < 16 else 3
@@ -205,9 +192,9 @@ def _unpack_widths(header: Fields) -> Widths:
     return Widths(feature, as_integer(slots, MAX_SLOTS, "header: slots", low=1), CENTRE in header)
 
 
-def _unpack_centre(header: Fields, widths: Widths) -> np.ndarray | None:
+def _unpack_centre(header: Fields, widths: Widths) -> np.ndarray:
     if not widths.graded:
-        return None
+        return np.zeros(widths.channels, np.int32)
     values = header.sequence(CENTRE, widths.channels)
     return np.array(
         [as_integer(m, MAX_SYMBOL, "header: a channel's centre", low=-MAX_SYMBOL) for m in values], np.int32
@@ -216,7 +203,7 @@ def _unpack_centre(header: Fields, widths: Widths) -> np.ndarray | None:
 
 def _unpack_error_bounds(header: Fields) -> dict[str, float]:
     if ERROR_BOUNDS not in header:
-        raise Malformed(f"header: key {ERROR_BOUNDS}, error bounds, is missing, as in files of earlier drafts")
+        raise Malformed(f"header: key {ERROR_BOUNDS}, the error bounds, is missing")
     fields = Fields(header.get(ERROR_BOUNDS), "header error bounds", set(TENSOR_CLASSES.values()))
     bounds = {
         name: fields.real(number)

@@ -1,14 +1,14 @@
-"""Residual heads that do nothing visible, and deformations of which none is left."""
+"""Encoder: residual heads without visible effect."""
 
 from __future__ import annotations
 
 import numpy as np
 
+from pd4dgs_codec.format.deformation import dequantise_tensors, quantise_tensors
 from pd4dgs_codec.format.kinds import LayerKind
 from pd4dgs_codec.format.left_out import LeftOut
 from pd4dgs_codec.format.residuals import residuals
-from pd4dgs_codec.format.symbols import round_tensors
-from pd4dgs_codec.scene import TRUNK, Deformation, Scene
+from pd4dgs_codec.scene import HEADS, TRUNK, Deformation, Scene
 
 #: A head is left out if it moves no position (or local scale) by more than this many voxels ...
 NEGLIGIBLE_VOXELS = 1e-3
@@ -18,24 +18,22 @@ NEGLIGIBLE_COLOR = 0.5 / 255
 #: ... and no quaternion component (before normalisation) by more than this.
 NEGLIGIBLE_QUAT = 1e-3
 
-#: A quick look that usually finds a head at work, and the most samples (points x times) before one is left out.
+#: Samples (points x times) of a first look, which usually finds a head at work, and of the look before one is left out.
 QUICK_SAMPLES = 1 << 12
 FULL_SAMPLES = 1 << 18
 MIN_TIMES = 17
 
 
-def drop_heads(scene: Scene, kind: LayerKind, judge: bool) -> tuple[Scene, list[LeftOut]]:
-    """(`scene` without the heads of kind's deformation that do nothing, or without it if none is left, what went).
-
-    judge: nothing is also what stays within head_bounds, and not only what is exactly zero.
-    """
+def drop_heads(scene: Scene, kind: LayerKind, bounded: bool) -> tuple[Scene, list[LeftOut]]:
+    """(`scene` without the heads of a layer that have no effect, or without its deformation if none is left; the heads
+    left out). bounded: also leave out heads within head_bounds, not only those that are exactly zero."""
     given = scene.deformation(kind.layer)
     if given is None:
         return scene, []
-    decoded = round_tensors(given, kind, scene.steps)
+    decoded = dequantise_tensors(quantise_tensors(given, kind, scene.steps), kind, scene.steps)
     heads = {name: network for name, network in decoded.networks.items() if name != TRUNK}
     why = {name: "zero after quantisation" for name, network in heads.items() if not any(a.any() for a in network[-1])}
-    if judge:
+    if bounded:
         alive = Deformation(decoded.planes, {k: v for k, v in decoded.networks.items() if k not in why})
         why |= _negligible(scene, kind, alive)
     if not why and heads:
@@ -52,22 +50,18 @@ def drop_heads(scene: Scene, kind: LayerKind, judge: bool) -> tuple[Scene, list[
 
 
 def head_bounds(scene: Scene, kind: LayerKind) -> dict[str, float]:
-    """Per head of kind's deformation, the largest residual that counts as nothing, in that head's unit."""
-    voxel, steps = NEGLIGIBLE_VOXELS * scene.info.voxel_size, scene.steps
-    if kind.layer == 1:
-        attribute = {"feature": steps.feature, "offset": steps.offset, "scaling": steps.scaling_log}
-        return {"position": voxel, **{name: NEGLIGIBLE_STEPS * step for name, step in attribute.items()}}
-    return {
-        "mean": voxel,
-        "scale": voxel,
-        "quat": NEGLIGIBLE_QUAT,
-        "opacity": NEGLIGIBLE_COLOR,
+    """By head of a layer, the largest negligible residual, in the head's unit; lengths in scene units."""
+    of_unit = {
+        "length": NEGLIGIBLE_VOXELS * scene.info.voxel_size,
+        **{name: NEGLIGIBLE_STEPS * step for name, step in scene.steps.attributes.items()},
+        "quaternion": NEGLIGIBLE_QUAT,
         "color": NEGLIGIBLE_COLOR,
     }
+    return {name: of_unit[head.unit] for name, head in HEADS[kind.layer].items()}
 
 
 def _negligible(scene: Scene, kind: LayerKind, deformation: Deformation) -> dict[str, str]:
-    """Heads whose residuals stay within head_bounds wherever sampled, each with the reason in words."""
+    """The heads whose residuals stay within head_bounds at all samples, each with the reason."""
     times = max([MIN_TIMES, *(s["zt"].shape[1] for s in deformation.planes)])
     bounds = head_bounds(scene, kind)
     largest: dict[str, float] = {}
@@ -87,7 +81,7 @@ def _negligible(scene: Scene, kind: LayerKind, deformation: Deformation) -> dict
 def _largest_residuals(
     scene: Scene, kind: LayerKind, deformation: Deformation, n_times: int, samples: int
 ) -> dict[str, float]:
-    """Per head the largest |residual| (NaN counts as infinite) over times and evenly chosen anchors or Gaussians."""
+    """By head, the largest |residual| (NaN counts as infinite) over times and evenly chosen anchors or Gaussians."""
     per_time = max(1, samples // n_times)
     rows = np.flatnonzero(scene.full_masks()[-1] > 0)
     rows = rows[:: max(1, -(-rows.size // per_time))]
@@ -103,7 +97,8 @@ def _largest_residuals(
 
 
 def _deformed_means(scene: Scene, rows: np.ndarray, t: float, most: int) -> np.ndarray:
-    """float32 [n, 3] Gaussian means after the global deformation at t: where the local one is sampled. n <= `most`."""
+    """float32 [n, 3], n <= `most`: means of Gaussians after the global deformation at t, where the local deformation is
+    sampled."""
     rows = rows[:: max(1, -(-rows.size * scene.offset.shape[1] // max(most, 1)))]
     anchor, offset, scaling = scene.anchor_at(rows), scene.offset[rows], scene.scaling_log[rows]
     if scene.global_deformation is not None and len(rows):

@@ -1,4 +1,4 @@
-"""What a file says about itself: from the header alone where possible; digests of its contents for conformance."""
+"""Facts about a file, from the header alone where possible, and digests of its contents for conformance."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.errors import DecodeError
-from pd4dgs_codec.format.bounds import blocks_of, rounding_bounds
+from pd4dgs_codec.format.bounds import rounding_bounds
 from pd4dgs_codec.format.container import CHUNK_OVERHEAD, MAJOR, MINOR, PREAMBLE_SIZE, read_chunk, read_preamble
 from pd4dgs_codec.format.decoder import read_layers
 from pd4dgs_codec.format.header import unpack_header
-from pd4dgs_codec.format.kinds import BY_CHUNK_TYPE
-from pd4dgs_codec.format.layer_meta import Declared, Section
+from pd4dgs_codec.format.kinds import BY_CHUNK_TYPE, Section
 from pd4dgs_codec.format.metadata import CHUNK_TYPE, TEXTS, Metadata, read_metadata
-from pd4dgs_codec.format.payload import read_meta
+from pd4dgs_codec.format.payload import Declared, read_parameters
 from pd4dgs_codec.format.symbols import float_tensors
 
 FORMAT_VERSION = f"{MAJOR}.{MINOR}"
@@ -53,22 +52,17 @@ def info(data: bytes) -> dict[str, Any]:
             row |= {"bytes": row["bytes"] + size, "end": place["end"]}
             if offset + size <= len(data):
                 payload = read_chunk(data, offset, type=chunk_type, length=length).payload
-                meta, _, declared = read_meta(payload, kind, header.widths, declared, later)
+                meta, _, declared = read_parameters(payload, kind, header.grid.widths, declared, later)
                 place["anchors"] = meta.rows
                 row["anchors"] = row.get("anchors", 0) + meta.rows
                 if not later:
-                    row |= {
-                        "steps": meta.steps,
-                        "planes": [[s.channels, *s.sides] for s in meta.scales],
-                        "sections": {},
-                    }
-                    row["networks"] = {name: list(widths) for name, widths in meta.networks.items()}
+                    row |= {"steps": meta.steps, **meta.shape.json(), "sections": {}}
                 for key, section_bytes in sorted(meta.sections.items()):
                     name = Section(key).name.lower()
                     row["sections"][name] = row["sections"].get(name, 0) + section_bytes
             else:
-                for told in ("anchors", "steps", "planes", "sections", "networks"):
-                    row.pop(told, None)
+                for known in ("anchors", "steps", "planes", "sections", "networks"):
+                    row.pop(known, None)
         offset += size
     return {
         "format_version": f"{preamble.major}.{preamble.minor}",
@@ -77,10 +71,10 @@ def info(data: bytes) -> dict[str, Any]:
         "header_bytes": preamble.size,
         "mode": header.mode,
         "voxel_size": header.info.voxel_size,
-        "feature_width": header.widths.feature,
-        "slots": header.widths.slots,
-        "graded": header.widths.graded,
-        "steps": header.attribute_steps,
+        "feature_width": header.grid.widths.feature,
+        "slots": header.grid.widths.slots,
+        "graded": header.grid.widths.graded,
+        "steps": header.grid.steps,
         "error_bounds": header.error_bounds,
         "anchors": declared.rows if all("anchors" in row for row in layers) else None,
         "time_range": list(header.info.time_range),
@@ -103,7 +97,7 @@ def metadata_of(data: bytes) -> Metadata | None:
 
 
 def _about(payload: bytes) -> dict[str, Any]:
-    """Metadata as JSON can hold it. A fault in it is none of the file's layers, so it is told and not raised."""
+    """Metadata as JSON can hold it. A fault in it leaves the layers valid, so it is reported and not raised."""
     try:
         found = read_metadata(payload)
     except DecodeError as error:
@@ -115,19 +109,14 @@ def _about(payload: bytes) -> dict[str, Any]:
 
 
 def nearest_bounds(data: bytes) -> dict[str, float]:
-    """By field of Steps the error bounds that a complete file would have if its encoder rounded to the nearest symbol.
-
-    Decodes all of it. They can be held against the declared ones, where the errors themselves take the scene encoded.
-    """
-    reader, _ = read_layers(data)
-    assert reader.header is not None
-    scene = reader.scene()
-    return rounding_bounds(scene, blocks_of(scene))
+    """By field of Steps the error bounds of an encoder that rounds to the nearest symbol, for a complete file, which is
+    decoded. They can be compared with the declared bounds without the scene that was encoded."""
+    return rounding_bounds(read_layers(data)[0].symbols)
 
 
 def hashes(data: bytes, max_layer: int | None = None) -> list[dict[str, Any]]:
-    """Per layer {layer, symbols, tensors}: SHA-256 in hex of a complete file's integers and float32 values, or of
-    those of its layers <= max_layer alone (bytes after those are not looked at).
+    """Per layer {layer, symbols, tensors}: SHA-256 in hex of the integers and the float32 values of a complete file, or
+    of its layers <= max_layer alone (bytes after those are not looked at). Clause 12.4.
 
     symbols: int32 little-endian, C order, of anchor_q [n, 3], the rise of earlier rows' mask codes, the codes of own
     rows, their step classes if there are any, attributes [channels, n], then planes [C, H, W] scale by scale in the

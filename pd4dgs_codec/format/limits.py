@@ -1,4 +1,4 @@
-"""The format's limits, in one place. A reader holds every declared count against them before it allocates anything."""
+"""Limits of the format (clause 14). A reader checks every declared count against them before it allocates."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""What a file may say about itself beyond its scene: the content of an ancillary chunk, which decoders may skip.
+"""Metadata of a file (clause 3.5), in an ancillary chunk that decoders may skip.
 
-The content is canonical msgpack, one map of registered integer keys, in one zstd frame that declares its content's
-size (clause "metadata" of the format). Only the two functions that pack and unpack it import zstandard.
+The content is a canonical msgpack map in one zstd frame that declares its size. Only the two functions that pack and
+unpack it import zstandard.
 """
 
 from __future__ import annotations
@@ -13,12 +13,12 @@ import numpy as np
 
 from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
 from pd4dgs_codec.format import canonical
-from pd4dgs_codec.format.fields import Fields, as_integer
+from pd4dgs_codec.format.canonical import Fields, as_integer
 from pd4dgs_codec.format.limits import MAX_CHUNKS
 
 CHUNK_TYPE = 3  #: ancillary
 
-# Keys of the map; what is empty is absent.
+# Keys of the map; empty values are absent.
 TITLE, SOURCE, LICENCE, COMMAND, QUALITY, STILL, SLICES = range(1, 8)
 TEXTS = {"title": TITLE, "source": SOURCE, "licence": LICENCE, "command": COMMAND}
 
@@ -26,17 +26,17 @@ MAX_COMPRESSED = MAX_CONTENT = 1 << 18  #: bytes; a reader allocates no more tha
 MAX_TEXT = 4096  #: bytes of UTF-8 in one text
 MAX_STILL = 1 << 17  #: bytes of the picture's file
 MAX_LEVEL = 2
-#: A picture is a PNG, JPEG or WebP file; this is how the first two begin, and the last with its size left out.
+#: First bytes of PNG, JPEG and WebP files.
 STILL_SIGNATURES = (b"\x89PNG\r\n\x1a\n", b"\xff\xd8\xff", b"RIFF")
 COMPRESSION_LEVEL = 19
 
 
 @dataclass(frozen=True)
 class Metadata:
-    """title, source (what the scene was made of), licence, command (that made the file): one line of printable text
-    each, "" if not given. quality: mPSNR in dB on held-out views by level, binary32 values. still: a small picture of
-    the scene, the bytes of a PNG, JPEG or WebP file, b"" if there is none. slices: mPSNR in dB on held-out views after
-    each slice, in file order."""
+    """title, source (of the scene), licence, command (that made the file): one line of printable text each, "" if not
+    given. quality: mPSNR in dB on held-out views by level, binary32 values. still: a small picture of the scene, the
+    bytes of a PNG, JPEG or WebP file, b"" for none. slices: mPSNR in dB on held-out views after each slice, in file
+    order."""
 
     title: str = ""
     source: str = ""
@@ -71,7 +71,7 @@ def write_metadata(metadata: Metadata) -> bytes:
 
 def read_metadata(data: bytes) -> Metadata:
     """The inverse of write_metadata. Raises LimitExceeded, before anything is decompressed, for a declared size over
-    its limit, UnsupportedFeature for an unknown critical key and Malformed for what is none."""
+    its limit, UnsupportedFeature for an unknown critical key and Malformed for any other fault."""
     import zstandard
 
     _check_size("compressed", len(data), MAX_COMPRESSED, LimitExceeded)

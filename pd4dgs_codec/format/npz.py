@@ -1,14 +1,13 @@
-"""Scene -> a flat dict of arrays under stable names, for numpy.savez and for readers that know nothing of ours."""
+"""Scene -> a flat dict of arrays under stable names, for numpy.savez and readers without this package."""
 
 from __future__ import annotations
 
 import numpy as np
 
-from pd4dgs_codec.format.quantise import quantise
-from pd4dgs_codec.format.table import Grid, attribute_rows, classes_of
+from pd4dgs_codec.format.quantise import Grid, attribute_rows, classes_of, quantise
 from pd4dgs_codec.scene import MASK_STEP, Scene
 
-#: First part of the names of each layer's networks and planes.
+#: Prefix in the names of each layer's networks and planes.
 PREFIXES = {0: "", 1: "global", 2: "local"}
 
 
@@ -17,8 +16,8 @@ def to_npz_dict(scene: Scene, symbols: bool = False) -> dict[str, np.ndarray]:
     (float32 masks of the first rows); mlp.NAME.weight.i and .bias.i with NAME opacity, covariance, color, global.trunk,
     global.position ... local.mean ...; planes.{global,local}.SCALE.PLANE; meta_* for the rest.
 
-    Where anchors are graded also step_class (uint8) and NAME_centre (float32) per attribute: its values are the centre
-    and multiples of 2^step_class steps beside it.
+    With step classes also step_class (uint8) and NAME_centre (float32) per attribute: its values are the centre plus
+    multiples of 2^step_class steps.
 
     symbols: also NAME_q (int32) and NAME_step (float32) for every quantised array; anchor_step is the voxel size.
     """

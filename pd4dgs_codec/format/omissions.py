@@ -1,260 +1,260 @@
-"""Omissions that change no picture: dead units of networks, features nobody reads, plane cells no anchor reads.
+"""Encoder: omissions that change no picture, found and made on the symbols of a scene.
 
-All of it works on the values that the file will hold. No array changes its shape, and all terms that sums lose were
-zeros: the same arithmetic gives the same bits.
+Dead units of networks, features and plane channels that nothing reads, and plane cells that no anchor ever touches. No
+array changes its shape, and sums lose only zeros: the same arithmetic gives the same bits.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
 from pd4dgs_codec.entropy.bits import entropy_bits
+from pd4dgs_codec.format.deformation import arrays_of, mapped
 from pd4dgs_codec.format.kinds import LAYER_KINDS, LayerKind
 from pd4dgs_codec.format.left_out import LeftOut
-from pd4dgs_codec.format.plane_choice import choose_predictor, fill_plane
-from pd4dgs_codec.format.quantise import dequantise, quantise
-from pd4dgs_codec.format.symbols import rounded
-from pd4dgs_codec.format.table import Grid, classes_of
-from pd4dgs_codec.scene import PLANES, TRUNK, Deformation, Network, Planes, Scene, plane_sides
+from pd4dgs_codec.format.planes import choose_predictor, fill_plane
+from pd4dgs_codec.format.quantise import Grid, dequantise
+from pd4dgs_codec.format.symbols import LayerSymbols, SceneSymbols
+from pd4dgs_codec.scene import PLANES, TRUNK, Deformation, Network, Scene, plane_sides
 
-#: Networks whose values may exceed this are left as they are; binary32 overflows at 3.4e38.
+#: Nothing is left out of networks whose values may exceed this: 0 times infinity is not 0. Binary32 ends at 3.4e38.
 LARGEST = 1e30
-#: Cells by which a position may be off: another renderer rounds its coordinates otherwise.
+#: Cells by which a position may be off in another renderer, which rounds its coordinates otherwise.
 CELL_SLACK = 0.02
 
 
-def leave_out_unseen(scene: Scene) -> tuple[Scene, list[LeftOut]]:
-    """(`scene` without what no picture needs, what went). scene: as planned, all its rows active at its highest level.
+def leave_out_unseen(symbols: SceneSymbols) -> tuple[SceneSymbols, list[LeftOut]]:
+    """(`symbols` with 0 or values of little cost in parts that no picture depends on, these parts).
 
-    Where nothing is left out the values stay those given; what takes another value takes one that has a symbol.
+    symbols: of a planned scene, all rows active at its highest level.
     """
-    omissions = _Omissions(scene)
-    del scene  # see `plan`
+    omissions = _Omissions(symbols)
     while omissions.within_range() and omissions.simplify_networks():
         pass
     omissions.free_cells()
-    return omissions.scene, omissions.found
+    return omissions.symbols(), omissions.found
 
 
-#: (weight, bias) of a linear layer -> what takes its place.
-LinearEdit = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+def with_omissions(scene: Scene, before: SceneSymbols, after: SceneSymbols) -> Scene:
+    """`scene` with dequantised values wherever its symbols `before` were replaced by those `after`."""
+    feature, first = scene.feature, 0
+    for old, new in zip(before.layers, after.layers, strict=True):
+        rows = slice(first, first + len(old.anchor_q))
+        if new.attributes is not old.attributes:
+            feature = feature.copy() if feature is scene.feature else feature
+            same = (old.attributes == new.attributes)[: feature.shape[1]].T
+            values = after.grid.dequantise(new.attributes, new.classes)["feature"]
+            feature[rows] = np.where(same, feature[rows], values)
+        first = rows.stop
+        if new.tensors is not old.tensors:
+            layer = old.kind.layer
+            scene = scene.with_tensors(layer, _edited(scene.tensors(layer), old, new))
+    return replace(scene, feature=feature)
+
+
+def _edited(given: Deformation, old: LayerSymbols, new: LayerSymbols) -> Deformation:
+    both = zip(arrays_of(old.tensors, old.kind), arrays_of(new.tensors, new.kind), strict=True)
+
+    def edited(step: str, _: str, x: np.ndarray) -> np.ndarray:
+        (_, before), (_, after) = next(both)
+        values: np.ndarray = np.where(before == after, x, dequantise(after, new.steps[step]))
+        return values
+
+    return mapped(given, new.kind, edited)
 
 
 class _Omissions:
-    """scene: as given, less what went so far. decoded: the same as a decoder will see it."""
+    """The symbols of a scene, edited in place of copies. found: what was left out so far."""
 
-    def __init__(self, scene: Scene):
-        self.scene = scene
-        self.found: list[LeftOut] = []
-        self.decoded = rounded(scene)
+    def __init__(self, given: SceneSymbols):
+        self.given, self.found = given, list[LeftOut]()
+        self.kinds = {layer.kind.layer: layer.kind for layer in given.layers if layer.tensors.networks}
+        self.tensors = {layer.kind.layer: layer.tensors for layer in given.layers if layer.tensors.networks}
+        self.steps = vars(given.steps)
+        self.unread = np.zeros(given.grid.widths.feature, bool)  # feature channels that were set to their centre
+
+    def symbols(self) -> SceneSymbols:
+        """The symbols with all edits."""
+        layers = []
+        for layer in self.given.layers:
+            changes: dict[str, Any] = {}
+            if self.tensors.get(layer.kind.layer, layer.tensors) is not layer.tensors:
+                changes["tensors"] = self.tensors[layer.kind.layer]
+            if self.unread.any():
+                changes["attributes"] = layer.attributes.copy()
+                changes["attributes"][: len(self.unread)][self.unread] = 0
+            layers.append(replace(layer, **changes) if changes else layer)
+        return replace(self.given, layers=layers)
 
     # -- networks ----------------------------------------------------------------------------------------------------
 
     def within_range(self) -> bool:
-        """Whether no network can overflow: a term that is 0 times infinity is not nothing."""
-        sizes: dict[str, np.ndarray] = {}  # the scaffold's networks and the heads share some names
+        """Whether no value in a network can come near overflow, for any input."""
+        moved: dict[str, np.ndarray] = {}
+        sizes: list[np.ndarray] = []
+        for layer in (1, 2):
+            if layer in self.tensors:
+                step, planes = self.steps[str(self.kinds[layer].planes_step)], self.tensors[layer].planes
+                largest = [
+                    np.prod([np.abs(s[n]).max((1, 2)).astype(np.float64) * step for n, _, _ in PLANES], axis=0)
+                    for s in planes
+                ]
+                hidden = self._largest(layer, TRUNK, np.concatenate(largest))
+                heads = [name for name in self.tensors[layer].networks if name != TRUNK]
+                found = {name: self._largest(layer, name, hidden) for name in heads}
+                moved |= found if layer == 1 else {}
+                sizes += found.values()
+        inputs = np.concatenate([_largest_feature(self.given) + moved.get("feature", 0.0), np.ones(3)])
+        sizes += [self._largest(0, name, inputs) for name in self.tensors[0].networks]
+        return all((size < LARGEST).all() for size in sizes)
+
+    def _largest(self, layer: int, name: str, inputs: np.ndarray) -> np.ndarray:
+        """float64 [outputs], no less than the magnitude of any output or hidden value of a network for inputs up to
+        `inputs` in magnitude; infinite from LARGEST on."""
+        size, step = inputs, self.steps[self.kinds[layer].weights_step]
+        network = self.tensors[layer].networks[name]
         with np.errstate(all="ignore"):
-            for kind in LAYER_KINDS[1:]:
-                networks = self._networks(kind)
-                if networks:
-                    planes = self.decoded.tensors(kind.layer).planes
-                    largest = [np.prod([np.abs(s[n]).max((1, 2)) for n, _, _ in PLANES], axis=0) for s in planes]
-                    hidden = _largest(networks[TRUNK], np.concatenate(largest))
-                    sizes |= {f"{kind.layer} {n}": _largest(net, hidden) for n, net in networks.items() if n != TRUNK}
-            own = self.decoded.feature
-            feature = np.maximum(own.max(axis=0, initial=0.0), -own.min(axis=0, initial=0.0))
-            feature = feature + sizes.get("1 feature", 0.0)
-            inputs = np.concatenate([feature, np.ones(3)])
-            sizes |= {name: _largest(network, inputs) for name, network in self.decoded.networks.items()}
-        return all((size < LARGEST).all() for size in sizes.values())
+            for weight, bias in network:
+                size = (np.abs(weight.astype(np.float64)) @ size + np.abs(bias)) * step
+                if not (size < LARGEST).all():
+                    return np.full(len(network[-1][1]), np.inf)
+        return size
 
     def simplify_networks(self) -> bool:
-        """One pass over all networks and their inputs; whether anything went."""
+        """One pass over all networks and their inputs; whether anything was left out."""
         before = len(self.found)
         self._zero_unread_features()
-        for kind in LAYER_KINDS[1:]:
-            if self._networks(kind):
-                self._zero_unread_channels(kind)
-        for kind in LAYER_KINDS:
+        for layer in self.tensors:
+            if layer:
+                self._zero_unread_channels(self.kinds[layer])
+        for kind in self.kinds.values():
             self._zero_dead_units(kind)
         return len(self.found) > before
 
-    def _networks(self, kind: LayerKind) -> dict[str, Network]:
-        """The decoded networks of a layer, none if it has none."""
-        return self.decoded.tensors(kind.layer).networks
-
     def _zero_unread_features(self) -> None:
-        """Feature channels that no network reads: 0 in all anchors, and no residual; and the reverse, weights of
-        channels that are 0 in all anchors and have no residual."""
-        width = self.scene.widths.feature
-        firsts = {name: self.decoded.networks[name][0][0] for name in self.decoded.networks}
-        unread = ~np.any([w[:, :width].any(axis=0) for w in firsts.values()], axis=0)
-        head = self._networks(LAYER_KINDS[1]).get("feature")
+        """Zero feature channels that no network reads, in all anchors, and their residuals; and weights of channels
+        that are 0 in all anchors and have no residual."""
+        width, scaffold = len(self.unread), self.tensors[0].networks
+        unread = ~np.any([network[0][0][:, :width].any(axis=0) for network in scaffold.values()], axis=0)
+        head = self.tensors[1].networks.get("feature") if 1 in self.tensors else None
         moved = np.zeros(width, bool) if head is None else np.any([head[-1][0].any(1), head[-1][1] != 0], axis=0)
-        zero = ~self.decoded.feature.any(axis=0)
-        grid, classes = Grid.of(self.decoded), classes_of(self.decoded)
-        idle_value = dequantise(grid.centre[:width], grid.steps["feature"])  # which anchors of every class can have
-        stale = unread.copy()
-        stale[unread] = (self.decoded.feature[:, unread] != idle_value[unread]).any(axis=0)
+        stale = unread & ~self.unread
         if stale.any():
-            symbols = grid.symbols_of("feature", self.decoded.feature[:, stale], classes, stale)
-            self._note(f"{int(stale.sum())} feature channels", "no network reads them", _bits(symbols))
-            self._edit(lambda scene: replace(scene, feature=np.where(unread, idle_value, scene.feature)))
+            features = np.concatenate([layer.attributes[:width][stale] for layer in self.given.layers], axis=1)
+            stale[stale] = features.any(axis=1)
+            features = features[features.any(axis=1)]
+        if stale.any():
+            self._note(f"{int(stale.sum())} feature channels", "no network reads them", _bits(features))
+            self.unread |= stale
         if (unread & moved).any():
-            self._zero_weights(LAYER_KINDS[1], "feature", -1, lambda w, b: _zero(w, b, rows=unread), "rows")
+            self._zero_weights(self.kinds[1], "feature", -1, "rows", unread)
+        zero = np.logical_and.reduce([~_set_features(layer, self.given.grid) for layer in self.given.layers])
         idle = np.concatenate([zero & ~moved, np.zeros(3, bool)])
-        for name, weight in firsts.items():
-            if weight[:, idle].any():
-                self._zero_weights(LAYER_KINDS[0], name, 0, lambda w, b: _zero(w, b, columns=idle), "columns")
+        for name, network in scaffold.items():
+            if network[0][0][:, idle].any():
+                self._zero_weights(self.kinds[0], name, 0, "columns", idle)
 
     def _zero_unread_channels(self, kind: LayerKind) -> None:
-        """Plane channels that the trunk does not read, or whose product is 0 because one plane is 0."""
-        deformation = self.decoded.tensors(kind.layer)
-        alive = [np.all([scale[n].any(axis=(1, 2)) for n, _, _ in PLANES], axis=0) for scale in deformation.planes]
+        """Zero plane channels that the trunk does not read, and weights of those whose product is 0."""
+        planes = self.tensors[kind.layer].planes
+        alive = [np.all([scale[n].any(axis=(1, 2)) for n, _, _ in PLANES], axis=0) for scale in planes]
         silent = ~np.concatenate(alive)
-        weight = deformation.networks[TRUNK][0][0]
-        if weight[:, silent].any():
-            self._zero_weights(kind, TRUNK, 0, lambda w, b: _zero(w, b, columns=silent), "columns")
-            weight = self._networks(kind)[TRUNK][0][0]
-        unread = np.split(~weight.any(axis=0), len(deformation.planes))
-        stale = [
-            [n for n, _, _ in PLANES if s[n][dead].any()] for s, dead in zip(deformation.planes, unread, strict=True)
-        ]
-        if not any(stale):
-            return
-        bits = sum(
-            _bits(self._plane_symbols(kind, scale[n])[dead].reshape(int(dead.sum()), -1))
-            for scale, dead, names in zip(deformation.planes, unread, stale, strict=True)
-            for n in names
-        )
-        count = sum(int(dead.sum()) for dead, names in zip(unread, stale, strict=True) if names)
-        self._note(f"{kind.name}: {count} plane channels", "the trunk does not read them", bits)
-        self._edit_planes(
-            kind,
-            lambda planes: tuple(
-                {n: np.where(dead[:, None, None], np.float32(0), scale[n]) for n, _, _ in PLANES}
-                for scale, dead in zip(planes, unread, strict=True)
-            ),
-        )
+        if self.tensors[kind.layer].networks[TRUNK][0][0][:, silent].any():
+            self._zero_weights(kind, TRUNK, 0, "columns", silent)
+        weight = self.tensors[kind.layer].networks[TRUNK][0][0]
+        edited, count, bits = [], 0, 0.0
+        for scale, dead in zip(planes, np.split(~weight.any(axis=0), len(planes)), strict=True):
+            stale = [n for n, _, _ in PLANES if scale[n][dead].any()]
+            count += int(dead.sum()) if stale else 0
+            bits += sum(_bits(scale[n][dead].reshape(int(dead.sum()), -1)) for n in stale)
+            edited.append(scale | {n: np.where(dead[:, None, None], np.int32(0), scale[n]) for n in stale})
+        if count:
+            self._note(f"{kind.name}: {count} plane channels", "the trunk does not read them", bits)
+            self.tensors[kind.layer] = replace(self.tensors[kind.layer], planes=tuple(edited))
 
     def _zero_dead_units(self, kind: LayerKind) -> None:
-        """Hidden units whose input weights are all 0 and whose bias is not positive, or whose output nothing reads.
+        """Zero hidden units whose input weights are 0 and whose bias is not positive, or whose output nothing reads.
 
-        Their weights become 0 and stay where they are: smaller matrices would cost less, but BLAS sums those in another
-        order, and pictures would change in their last bits.
+        Smaller matrices would cost less, but BLAS sums those in another order, so pictures would change in their last
+        bits.
         """
-        for name in list(self._networks(kind)):
-            network = self._networks(kind)[name]
-            for i in range(len(network) - (name != TRUNK)):
-                networks = self._networks(kind)
+        for name in list(self.tensors[kind.layer].networks):
+            depth = len(self.tensors[kind.layer].networks[name])
+            for i in range(depth - (name != TRUNK)):
+                networks = self.tensors[kind.layer].networks
                 weight, bias = networks[name][i]
-                last = i == len(network) - 1
-                readers = [(h, 0) for h in networks if h != TRUNK] if last else [(name, i + 1)]
+                readers = [(head, 0) for head in networks if head != TRUNK] if i == depth - 1 else [(name, i + 1)]
                 read = np.any([networks[h][j][0].any(axis=0) for h, j in readers], axis=0)
                 dead = ~(read & (weight.any(axis=1) | (bias > 0)))
                 stale = dead & (read | weight.any(axis=1) | (bias != 0))
                 if stale.any():
-                    self._zero_units(kind, name, i, stale, readers)
+                    bits = self._cost(kind, [(name, i), *readers])
+                    self._zero(kind, name, i, "rows", stale)
+                    for reader, j in readers:
+                        self._zero(kind, reader, j, "columns", stale)
+                    bits -= self._cost(kind, [(name, i), *readers])
+                    what = f"{kind.name} {name}: {int(stale.sum())} units of layer {i + 1}"
+                    self._note(what, "always 0, or read by nothing", bits)
 
-    def _zero_units(
-        self, kind: LayerKind, name: str, index: int, dead: np.ndarray, readers: list[tuple[str, int]]
-    ) -> None:
-        """Zeroes the outputs `dead` (bool) of a linear layer, and those inputs of the linear layers that read it."""
-        bits = self._cost(kind, [(name, index), *readers])
-        self._edit_linear(kind, name, index, lambda w, b: _zero(w, b, rows=dead))
-        for reader, j in readers:
-            self._edit_linear(kind, reader, j, lambda w, b: _zero(w, b, columns=dead))
-        bits -= self._cost(kind, [(name, index), *readers])
-        what = f"{kind.name} {name}: {int(dead.sum())} units of layer {index + 1}"
-        self._note(what, "always 0, or read by nothing", bits)
+    def _zero_weights(self, kind: LayerKind, name: str, index: int, of: str, dead: np.ndarray) -> None:
+        before = self._cost(kind, [(name, index)])
+        self._zero(kind, name, index, of, dead)
+        saved = before - self._cost(kind, [(name, index)])
+        self._note(f"{kind.name} {name}: {of} of weights", "read by nothing, or always times 0", saved)
 
-    # -- cells -----------------------------------------------------------------------------------------------------
+    def _zero(self, kind: LayerKind, name: str, index: int, of: str, dead: np.ndarray) -> None:
+        """Zero the rows (outputs, with their biases) or columns (inputs) `dead` bool of a linear layer."""
+        tensors = self.tensors[kind.layer]
+        network = list(tensors.networks[name])
+        weight, bias = (array.copy() for array in network[index])
+        if of == "rows":
+            weight[dead], bias[dead] = 0, 0
+        else:
+            weight[:, dead] = 0
+        network[index] = weight, bias
+        networks: dict[str, Network] = {**tensors.networks, name: tuple(network)}
+        self.tensors[kind.layer] = replace(tensors, networks=networks)
+
+    # -- cells -------------------------------------------------------------------------------------------------------
 
     def free_cells(self) -> None:
-        """Cells of the global planes that no anchor reads take values that cost little."""
-        kind = LAYER_KINDS[1]
-        deformation, free, cells, saved = self.decoded.global_deformation, 0, 0, 0.0
-        if deformation is None:
+        """Give cells of the global planes that no anchor reads values of little cost."""
+        if 1 not in self.tensors:
             return
-        step, planes = self.scene.steps.planes(kind.layer), []
-        read = cells_read(self.decoded, deformation)
-        for scale, marks in zip(deformation.planes, read, strict=True):
-            filled = {}
-            for name, _, _ in PLANES:
-                symbols = quantise(scale[name], step, "plane")
-                cheap = fill_plane(symbols, marks[name])
-                filled[name] = np.where(marks[name] | (cheap == symbols), np.nan, dequantise(cheap, step))
-                free, cells = free + int((~marks[name]).sum()), cells + marks[name].size
-                saved += _plane_bits(symbols) - _plane_bits(cheap)
-            planes.append(filled)
-        if all(np.isnan(plane).all() for scale in planes for plane in scale.values()):
-            return
-        self._note(f"{kind.name}: {free:,} of {cells:,} plane cells", "no anchor is ever there", saved)
-        self._edit_planes(
-            kind,
-            lambda given: tuple(
-                {n: np.where(np.isnan(new[n]), old[n], new[n]) for n, _, _ in PLANES}
-                for old, new in zip(given, planes, strict=True)
-            ),
-        )
+        kind, planes = self.kinds[1], self.tensors[1].planes
+        filled, free, cells, saved = [], 0, 0, 0.0
+        for scale, marks in zip(planes, cells_read(self.given), strict=True):
+            filled.append({name: fill_plane(scale[name], marks[name]) for name, _, _ in PLANES})
+            free += sum(int((~mark).sum()) for mark in marks.values())
+            cells += sum(mark.size for mark in marks.values())
+            saved += sum(_plane_bits(scale[name]) - _plane_bits(filled[-1][name]) for name, _, _ in PLANES)
+        if any((new[n] != old[n]).any() for new, old in zip(filled, planes, strict=True) for n, _, _ in PLANES):
+            self._note(f"{kind.name}: {free:,} of {cells:,} plane cells", "no anchor is ever there", saved)
+            self.tensors[1] = replace(self.tensors[1], planes=tuple(filled))
 
-    # -- bookkeeping -------------------------------------------------------------------------------------------------
+    # -- report ------------------------------------------------------------------------------------------------------
 
     def _note(self, what: str, why: str, bits: float) -> None:
         self.found.append(LeftOut(what, why, bits=max(bits, 0.0), lossless=True))
 
-    def _edit(self, edit: Callable[[Scene], Scene]) -> None:
-        """Every edit puts in values that come back as they are: what holds for the scene holds for the decoded one."""
-        self.scene, self.decoded = edit(self.scene), edit(self.decoded)
-
-    def _edit_planes(self, kind: LayerKind, edit: Callable[[Planes], Planes]) -> None:
-        def edited(scene: Scene) -> Scene:
-            tensors = scene.tensors(kind.layer)
-            return scene.with_tensors(kind.layer, Deformation(edit(tensors.planes), tensors.networks))
-
-        self._edit(edited)
-
-    def _edit_linear(self, kind: LayerKind, name: str, index: int, edit: LinearEdit) -> None:
-        """Puts edit(weight, bias) in place of one linear layer of the network `name`."""
-
-        def edited(scene: Scene) -> Scene:
-            tensors = scene.tensors(kind.layer)
-            layers = list(tensors.networks[name])
-            weight, bias = edit(*layers[index])
-            layers[index] = np.ascontiguousarray(weight), np.ascontiguousarray(bias)
-            return scene.with_tensors(
-                kind.layer, Deformation(tensors.planes, {**tensors.networks, name: tuple(layers)})
-            )
-
-        self._edit(edited)
-
-    def _zero_weights(self, kind: LayerKind, name: str, index: int, edit: LinearEdit, of: str) -> None:
-        before = self._cost(kind, [(name, index)])
-        self._edit_linear(kind, name, index, edit)
-        saved = before - self._cost(kind, [(name, index)])
-        self._note(f"{kind.name} {name}: {of} of weights", "read by nothing, or always times 0", saved)
-
     def _cost(self, kind: LayerKind, layers: list[tuple[str, int]]) -> float:
         """Order-0 entropy of the weights and biases of linear layers (network, index)."""
-        step = self.scene.steps.weights(kind.layer)
-        arrays = [a for name, index in layers for a in self._networks(kind)[name][index]]
-        return _bits([quantise(a, step, "weight").ravel() for a in arrays])
-
-    def _plane_symbols(self, kind: LayerKind, plane: np.ndarray) -> np.ndarray:
-        """int32 symbols."""
-        return quantise(plane, self.scene.steps.planes(kind.layer), "plane")
+        return _bits(a.ravel() for name, i in layers for a in self.tensors[kind.layer].networks[name][i])
 
 
-def cells_read(scene: Scene, deformation: Deformation) -> list[dict[str, np.ndarray]]:
+def cells_read(symbols: SceneSymbols) -> list[dict[str, np.ndarray]]:
     """Per scale, by plane name, bool [H, W]: the cells of the global planes that an anchor reads at some time."""
-    low, high = scene.info.box
+    low, high = symbols.info.box
     extent = np.maximum(high - low, np.finfo(np.float32).tiny)
-    unit = np.clip((scene.anchor - low) / extent, 0.0, 1.0)
+    positions = [dequantise(layer.anchor_q, symbols.info.voxel_size) for layer in symbols.layers]
+    unit = np.clip((np.concatenate(positions) - low) / extent, 0.0, 1.0)
+    (planes,) = (layer.tensors.planes for layer in symbols.layers if layer.kind is LAYER_KINDS[1])
     read = []
-    for scale in deformation.planes:
+    for scale in planes:
         cells = [_cells(unit[:, axis], side) for axis, side in enumerate(plane_sides(scale)[:3])]
         marks = {}
         for name, a, b in PLANES:
@@ -273,30 +273,29 @@ def _cells(unit: np.ndarray, side: int) -> list[np.ndarray]:
     return [np.clip(cell, 0, side - 1).astype(np.int64) for cell in (first, first + 1, last)]
 
 
-def _largest(network: Network, inputs: np.ndarray) -> np.ndarray:
-    """float64 [outputs], no less than the magnitude of any output or of anything on the way, inputs being up to
-    `inputs` in magnitude."""
-    size = np.asarray(inputs, np.float64)
-    for weight, bias in network:
-        size = np.abs(weight.astype(np.float64)) @ size + np.abs(bias)
-        if not (size < LARGEST).all():
-            return np.full(len(network[-1][1]), np.inf)
-    return size
+def _set_features(layer: LayerSymbols, grid: Grid) -> np.ndarray:
+    """bool [D]: the feature channels in which some anchor of the layer is not 0."""
+    symbols = layer.attributes[: grid.widths.feature]
+    if not grid.widths.graded:
+        return np.array(symbols.any(axis=1))
+    return np.array(
+        [(m + (k.astype(np.int64) << layer.classes)).any() for m, k in zip(grid.centre, symbols, strict=False)]
+    )
 
 
-def _zero(
-    weight: np.ndarray, bias: np.ndarray, rows: np.ndarray | None = None, columns: np.ndarray | None = None
-) -> tuple[np.ndarray, np.ndarray]:
-    """The layer with its rows (outputs) or columns (inputs) `rows`, `columns` bool set to 0."""
-    if columns is not None:
-        weight = np.where(columns[None, :], np.float32(0), weight)
-    if rows is not None:
-        weight, bias = np.where(rows[:, None], np.float32(0), weight), np.where(rows, np.float32(0), bias)
-    return weight, bias
+def _largest_feature(symbols: SceneSymbols) -> np.ndarray:
+    """float64 [D]: no less than the magnitude of each feature channel."""
+    grid, width = symbols.grid, symbols.grid.widths.feature
+    centre, largest = np.abs(grid.centre[:width]), np.zeros(width)
+    for layer in symbols.layers:
+        spacing = 1 << int(layer.classes.max(initial=0))
+        symbol = np.abs(layer.attributes[:width]).max(axis=1, initial=0).astype(np.float64)
+        largest = np.maximum(largest, (centre + symbol * spacing) * grid.steps["feature"])
+    return largest
 
 
 def _bits(channels: Iterable[np.ndarray]) -> float:
-    """Order-0 entropy of channels, each under a distribution of its own."""
+    """Order-0 entropy of channels, each under its own distribution."""
     return sum(entropy_bits(channel) for channel in channels)
 
 

@@ -1,6 +1,6 @@
-"""How a scene becomes a file: every choice with its default and its check. The commands read theirs from here.
+"""Options of the encoder with their defaults and checks; the commands take them from here.
 
-Of libraries only the standard one is imported here, so that `--help` answers at once.
+Only the standard library is imported, so that `--help` answers at once.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
 #: How symbols are coded, with the numbers of the header.
 MODES = {"ans": 0, "lzma": 1}
 
-#: What may be chosen, by field of EncodeOptions.
+#: Allowed values by field of EncodeOptions.
 CHOICES: Mapping[str, Sequence[str | int]] = {
     "mode": tuple(MODES),
     "priors": PRIORS,
@@ -28,25 +28,22 @@ CHOICES: Mapping[str, Sequence[str | int]] = {
     "omit": ("bounded", "lossless", "nothing"),
 }
 
-
-#: A slice's frame and parameters take some 50 bytes, and its channels name a prior each.
+#: Least bytes of a slice: its frame and parameters take some 50 bytes, and its channels name a prior each.
 LEAST_SLICE = 1000
 
 
 @dataclass(frozen=True)
 class EncodeOptions:
-    """Options of the encoder. Raises EncodeError for a value that is none.
+    """Options of the encoder. Raises EncodeError for an invalid value.
 
     mode: "ans", or "lzma" for the same symbols under LZMA2. priors: "best", or "gauss", the model of R(a). layers:
-    "auto" leaves out every head that is zero after quantisation or below the bounds of `heads`, then every layer
-    without one; 0, 1 or 2 keeps the layers up to that number and only drops heads that are exactly zero. effort:
-    1 (fast) .. 9 (small). omit:
-    "bounded" leaves out what those bounds allow and what changes no picture, "lossless" only the latter, "nothing" only
-    heads that are exactly zero and anchors below the mask threshold. step_scale multiplies every quantisation step.
-    slices: bytes that a slice of a layer takes at most where its planes and networks allow it, the header counted with
-    the first; 0 for one slice per layer.
-    verify: decode the result, compare every symbol and every float, and hold every float against the error bound in the
-    header.
+    "auto" leaves out every head that is zero after quantisation or below the bounds of `heads`, and every layer without
+    a head; 0, 1 or 2 keeps the layers up to that number and drops only heads that are exactly zero. effort: 1 (fast) ..
+    9 (small). omit: "bounded" leaves out heads below those bounds and parts that change no picture, "lossless" the
+    latter alone, "nothing" only heads that are exactly zero and anchors below the mask threshold. step_scale: factor on
+    every quantisation step. slices: most bytes of a slice, where planes and networks allow it, the header counted with
+    the first slice; 0 for one slice per layer. verify: decode the result, compare every symbol, and check every value
+    against the error bound in the header.
     """
 
     mode: str = "ans"
@@ -71,7 +68,7 @@ class EncodeOptions:
             raise EncodeError(f"slices in mode {self.mode}, expected mode ans or one slice per layer")
 
     def apply_scale(self, scene: Scene) -> tuple[Scene, EncodeOptions]:
-        """(`scene` at the steps of its file, binary32, and options that scale them no more)."""
+        """(`scene` with its steps scaled and rounded to binary32, these options with step_scale 1)."""
         return replace(scene, steps=scene.steps.scaled(self.step_scale)), replace(self, step_scale=1.0)
 
 

@@ -1,13 +1,13 @@
-"""What a file of this scene needs: which anchors, in which layer and order, which deformations and which heads.
+"""Encoder: the anchors of each layer in their order, and the deformations and heads that a file needs.
 
 Layer l carries the anchors that become active at level l. Anchors inactive at the highest level kept are dropped. When
-a layer goes because its deformation is left out, its anchors and masks pass to the highest layer kept, so that the
-highest level's picture stays what it was, within the bounds below.
+a layer is left out because it has no deformation, its anchors and masks pass to the highest layer kept, so that the
+picture of the highest level stays the same, within the bounds of `heads`.
 """
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -15,44 +15,60 @@ from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format.heads import drop_heads
 from pd4dgs_codec.format.kinds import LAYER_KINDS
 from pd4dgs_codec.format.left_out import LeftOut
-from pd4dgs_codec.format.omissions import leave_out_unseen
+from pd4dgs_codec.format.omissions import leave_out_unseen, with_omissions
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
-from pd4dgs_codec.format.symbols import first_duplicate
+from pd4dgs_codec.format.symbols import SceneSymbols, first_duplicate
 from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import Scene
 
 
-def plan(scene: Scene, options: EncodeOptions = DEFAULTS) -> tuple[Scene, list[LeftOut]]:
-    """(the scene that the file will hold, what it leaves out) by options.layers and omit; steps are not scaled.
+@dataclass(frozen=True, eq=False)
+class Plan:
+    """scene: as given, as far as the file holds it, with other values where an omission changed the symbols. symbols:
+    of that scene, what the file will hold. left_out: the parts of the given scene that it lacks."""
 
-    Steps come out as binary32, rows sorted by (layer, Morton order).
+    scene: Scene
+    symbols: SceneSymbols
+    left_out: list[LeftOut]
+
+
+def plan(scene: Scene, options: EncodeOptions = DEFAULTS) -> tuple[Scene, list[LeftOut]]:
+    """(the scene of Plan, its left_out)."""
+    planned = make_plan(scene, options)
+    return planned.scene, planned.left_out
+
+
+def make_plan(scene: Scene, options: EncodeOptions = DEFAULTS) -> Plan:
+    """What a file of `scene` holds, by options.layers and options.omit; steps are not scaled.
+
+    Steps are rounded to binary32, and rows sorted by (layer, Morton order). Raises EncodeError for a value that has no
+    symbol, and for voxels with two anchors.
     """
     left_out: list[LeftOut] = []
     scene = replace(scene, steps=scene.steps.scaled(1.0))
-    judge = options.layers == "auto"
-    if not judge:
+    auto = options.layers == "auto"
+    if not auto:
         scene, left_out = _cut(scene, int(options.layers))
     kept = [0]
     for layer in scene.layers[1:]:
-        kind = LAYER_KINDS[layer]
-        scene, dropped = drop_heads(scene, kind, judge and options.omit == "bounded")
+        scene, dropped = drop_heads(scene, LAYER_KINDS[layer], auto and options.omit == "bounded")
         left_out += dropped
-        if not judge or scene.deformation(layer) is not None:
+        if not auto or scene.deformation(layer) is not None:
             kept.append(layer)
-    arranged, inactive = _arrange(scene, tuple(kept))
+    arranged, inactive = _arranged(scene, tuple(kept))
     if inactive:
         why = f"mask at or below the threshold at level {scene.level}"
         left_out.append(LeftOut(f"{inactive} anchors", why, anchors=inactive))
+    symbols = SceneSymbols.of(arranged)
     if options.omit != "nothing":
-        given = [arranged]
-        del arranged  # nobody keeps what takes other values: arrays as large as the scene's
-        arranged, lossless = leave_out_unseen(given.pop())
+        less, lossless = leave_out_unseen(symbols)
+        arranged, symbols = with_omissions(arranged, symbols, less), less
         left_out += lossless
-    return arranged, left_out
+    return Plan(arranged, symbols, left_out)
 
 
 def _cut(scene: Scene, highest: int) -> tuple[Scene, list[LeftOut]]:
-    """The layers <= highest as they are, and a note for each one above."""
+    """(the layers <= highest as they are, a row for each layer above)."""
     why = f"layers up to {highest} were asked for"
     left_out = [
         LeftOut(f"layer {layer}", why, LAYER_KINDS[layer], scene.deformation(layer))
@@ -69,8 +85,8 @@ def _cut(scene: Scene, highest: int) -> tuple[Scene, list[LeftOut]]:
     return cut, left_out
 
 
-def _arrange(scene: Scene, kept: tuple[int, ...]) -> tuple[Scene, int]:
-    """(scene with rows sorted by (layer, Morton) and the layers `kept`, number of anchors dropped)."""
+def _arranged(scene: Scene, kept: tuple[int, ...]) -> tuple[Scene, int]:
+    """(scene with the layers `kept` and rows sorted by (layer, Morton order), number of anchors dropped)."""
     codes = scene.full_masks()
     by_layer = dict(zip(scene.layers, codes, strict=True))
     masks = np.stack([*(by_layer[layer] for layer in kept[:-1]), codes[-1]])
@@ -78,8 +94,8 @@ def _arrange(scene: Scene, kept: tuple[int, ...]) -> tuple[Scene, int]:
     groups = [np.flatnonzero(first == i) for i in range(len(kept))]
     order = np.concatenate([group[morton_order(scene.anchor_q[group])] if group.size else group for group in groups])
     rows = tuple(int(n) for n in np.cumsum([group.size for group in groups]))
-    if (row := first_duplicate(scene.anchor_q[order])) is not None:
-        raise EncodeError(f"anchor_q: voxel {row.tolist()} holds more than one anchor, expected one")
+    if (voxel := first_duplicate(scene.anchor_q[order])) is not None:
+        raise EncodeError(f"anchor_q: voxel {voxel} holds more than one anchor, expected one")
     if scene.grading is not None and not scene.grading.classes[order].any():
         scene = replace(scene, grading=None)
     masks_of = tuple(m[order][:n] for m, n in zip(masks, rows, strict=True))

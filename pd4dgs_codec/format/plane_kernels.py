@@ -1,4 +1,4 @@
-"""The loops of `plane_choice` over single cells, compiled by numba: the same integers as those in numpy."""
+"""Loops of `planes` over single cells, compiled by numba, with the same results as in numpy."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ KNOWN = (0, 1, 2, 3, 4, 5)
 
 @_compiled
 def fill(k: np.ndarray, given: np.ndarray, predictor: int) -> np.ndarray:
-    """`plane_choice._fill` before it is clipped: int64 [C, H, W]."""
+    """`planes._fill` before it is clipped: int64 [C, H, W]."""
     channels, height, width = k.shape
     x = k.astype(np.int64)
     for c in range(channels):
@@ -50,7 +50,7 @@ def fill(k: np.ndarray, given: np.ndarray, predictor: int) -> np.ndarray:
 
 @_compiled
 def order0(channels: np.ndarray, widest: int) -> tuple[np.ndarray, np.ndarray]:
-    """`plane_choice._order0` of int32 [C, n]."""
+    """`planes._order0` of int32 [C, n]."""
     costs, distinct = np.zeros(len(channels), np.int64), np.zeros(len(channels), np.int64)
     counts = np.zeros(widest + 1, np.int64)
     for c in range(len(channels)):

@@ -1,33 +1,39 @@
-"""Integer decorrelation of quantised HexPlane planes: a registry of causal predictors with exact inverses.
+"""Prediction of plane samples from their neighbours: predictors, their exact inverses, and the encoder's choice.
 
-A plane is int32 [C, H, W]. A sample at row i, column j of a channel is predicted from its neighbours
-W = k[i, j-1], N = k[i-1, j], NW = k[i-1, j-1]; the residual k - prediction is what is coded. In row 0 the neighbours N
-and NW are taken equal to W, in column 0 W and NW are taken equal to N, and at (0, 0) all three are 0.
-All arithmetic is on integers; >> rounds towards minus infinity.
+A plane is int32 [C, H, W]. A sample at row i, column j of a channel is predicted from its neighbours W = k[i, j-1],
+N = k[i-1, j] and NW = k[i-1, j-1], and the residual k - prediction is coded. In row 0 N and NW are taken equal to W, in
+column 0 W and NW are taken equal to N, and at (0, 0) all three are 0 (clause 11.3). All arithmetic is on integers.
 """
 
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
+from importlib import import_module
+from types import ModuleType
 
 import numpy as np
 
+from pd4dgs_codec.entropy.bits import BIT, frequency_costs, symbol_counts
 from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, magnitude
 
 Array = np.ndarray
 
+#: A channel that spans more values is too sparse for its frequencies to be an estimate.
+WIDEST = 1 << 16
+
 
 @dataclass(frozen=True)
 class Predictor:
-    """One registry entry. `restore` undoes the prediction by running sums; None means that a sequential scan is due."""
+    """A predictor. `restore` undoes it by running sums; None if that takes a scan of the samples in order."""
 
     name: str
     predict: Callable[[Array, Array, Array], Array]  #: (W, N, NW) -> prediction
     restore: Callable[[Array], Array] | None = None  #: int64 residuals [C, H, W] -> samples
-    of_one: bool = False  #: whether predict(W, 0, 0) is W, as at a border
+    of_one: bool = False  #: whether predict(W, 0, 0) is W, as a border needs
 
 
 def _median(w: Array, n: Array, nw: Array) -> Array:
@@ -153,3 +159,92 @@ def _scan_together(planes: Sequence[Array], predictor: Predictor) -> list[Array]
         table[d, zeros] = 0
     upright = (k if k.shape == r.shape else k.swapaxes(1, 2) for k, r in zip(views, planes, strict=True))
     return [np.ascontiguousarray(k).astype(np.int32) for k in upright]
+
+
+# -- the encoder's choice ----------------------------------------------------------------------------------------------
+
+
+def choose_predictor(k: Array) -> tuple[int, Array]:
+    """(id, int32 residuals) of the predictor with the smallest estimated cost among those within MAX_SYMBOL."""
+    _, predictor, _, r = min(_candidates((predictor, k) for predictor in PREDICTORS), key=lambda found: found[0])
+    return predictor, r
+
+
+def fill_plane(k: Array, given: Array) -> Array:
+    """Samples int32 [C, H, W] equal to `k` where `given` bool [H, W], with values elsewhere that cost little: under the
+    predictor that codes the plane cheapest, the residuals of all free samples are 0."""
+    filled = ((predictor, _fill(k, given, predictor)) for predictor in PREDICTORS)
+    return min(_candidates(filled), key=lambda found: found[0])[2]
+
+
+def _candidates(planes: Iterable[tuple[int, Array]]) -> Iterator[tuple[float, int, Array, Array]]:
+    """(estimated bits, predictor, samples, residuals) of the (predictor, samples) within MAX_SYMBOL. Predictor 0 always
+    is: its residuals are the samples."""
+    for predictor, k in planes:
+        if magnitude(k) <= MAX_SYMBOL:
+            r = residual(predictor, k)
+            if magnitude(r) <= MAX_SYMBOL:
+                yield _estimated_bits(r), predictor, k, r
+
+
+@cache
+def kernels() -> ModuleType | None:
+    """The compiled loops, with the same results as those in numpy; None where numba is not installed."""
+    try:
+        return import_module("pd4dgs_codec.format.plane_kernels")
+    except ImportError:
+        return None
+
+
+def _fill(k: np.ndarray, given: np.ndarray, predictor: int) -> np.ndarray:
+    """`k` with predictions in place of the samples that are not given."""
+    found = kernels()
+    x = found.fill(k, given, predictor) if found and predictor in found.KNOWN else _filled(k, given, predictor)
+    clipped: np.ndarray = np.clip(x, -1 - MAX_SYMBOL, 1 + MAX_SYMBOL).astype(np.int32)
+    return clipped
+
+
+def _filled(k: np.ndarray, given: np.ndarray, predictor: int) -> np.ndarray:
+    """int64 [C, H, W] of `_fill`, by anti-diagonals."""
+    _, h, w = k.shape
+    x = k.astype(np.int64)
+    for d in range(h + w - 1):
+        i = np.arange(max(0, d - w + 1), min(h, d + 1))
+        i = i[~given[i, d - i]]
+        if not i.size:
+            continue
+        j = d - i
+        left, up = x[:, i, np.maximum(j - 1, 0)], x[:, np.maximum(i - 1, 0), j]
+        corner = x[:, np.maximum(i - 1, 0), np.maximum(j - 1, 0)]
+        west, north = np.where(j > 0, left, up), np.where(i > 0, up, left)
+        northwest = np.where((i > 0) & (j > 0), corner, np.where(i > 0, up, left))
+        x[:, i, j] = PREDICTORS[predictor].predict(west, north, northwest) if d else 0
+    return x
+
+
+def _estimated_bits(residuals: np.ndarray) -> float:
+    """Cost of residuals int32 [C, H, W]: per channel its order-0 entropy, and log2(n) / 2 per distinct value for the
+    description of the distribution."""
+    if residuals.size == 0:
+        return 0.0
+    channels = np.ascontiguousarray(residuals.reshape(len(residuals), -1))
+    found = kernels()
+    costs, distinct = found.order0(channels, WIDEST) if found else _order0(channels, WIDEST)
+    described = int(np.maximum(distinct - 1, 0).sum())
+    bits = float(costs.sum()) / BIT + 0.5 * described * float(np.log2(channels.shape[1]))
+    for channel in channels[distinct == 0]:
+        size = np.abs(channel.astype(np.int64) - np.median(channel)).mean() + 1
+        bits += float(channel.size * np.log2(size) + 2 * channel.size)
+    return bits
+
+
+def _order0(channels: np.ndarray, widest: int) -> tuple[np.ndarray, np.ndarray]:
+    """(order-0 entropy int64 [C] in units of 2^-20 bits, number of distinct values int64 [C]) of channels int32 [C, n];
+    both are 0 for a channel over more than `widest`."""
+    costs, distinct = np.zeros(len(channels), np.int64), np.zeros(len(channels), np.int64)
+    for c, channel in enumerate(channels):
+        if int(channel.max()) - int(channel.min()) <= widest:
+            counts = symbol_counts(channel)[1]
+            whole = channel.size * int(frequency_costs(np.array(channel.size)))
+            costs[c], distinct[c] = int(counts @ frequency_costs(counts)) - whole, counts.size
+    return costs, distinct

@@ -1,18 +1,25 @@
-"""HexPlane and residual MLP evaluated in numpy: what the plan needs to know how far a deformation moves anything.
+"""HexPlane and residual networks evaluated in numpy, in float32: how far a deformation moves a scene.
 
-The same function as the trained model's, in float32; not normative.
+The encoder decides by it which heads to leave out. It is the function of the trained model; it is not normative.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from pd4dgs_codec.scene import LENGTH_HEADS, PLANES, TRUNK, Deformation, Network, deformation_unit, plane_sides
+from pd4dgs_codec.scene import (
+    LENGTH_HEADS,
+    PLANES,
+    TRUNK,
+    Deformation,
+    Network,
+    Planes,
+    deformation_unit,
+    plane_sides,
+)
 
 
-def sample_planes(
-    planes: tuple[dict[str, np.ndarray], ...], box: np.ndarray, points: np.ndarray, t: float
-) -> np.ndarray:
+def sample_planes(planes: Planes, box: np.ndarray, points: np.ndarray, t: float) -> np.ndarray:
     """float32 [n, sum of C]: bilinear samples, multiplied over a scale's six planes, concatenated over scales.
 
     points: float32 [n, 3], scene units; box float32 [2, 3] maps to the planes' corners (align corners), clamped at the

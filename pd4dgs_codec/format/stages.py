@@ -1,8 +1,8 @@
-"""Stages: channels payloads decoded one after another, so that a later one may be split by what an earlier one held.
+"""Stages (clause 8.9): coded channels decoded one after another, each split by the contents of those before it.
 
-What the sections of attributes and of planes share. Residuals that belong to one place (an anchor, a plane's cell)
-tend to be large together; a channel is split into classes of places by the *activity* of the channels before it, and
-each class has a prior of its own. All arithmetic is on integers.
+The sections of attributes and of planes share this. Residuals of one place (an anchor, a cell of a plane) tend to be
+large together, so a channel is split into classes of places by the *activity* of the channels before it, and each class
+has its own prior. All arithmetic is on integers.
 """
 
 from __future__ import annotations
@@ -20,29 +20,29 @@ from pd4dgs_codec.entropy.priors import Prior
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint
 from pd4dgs_codec.errors import Malformed
 
-#: The two forms of a section: one payload of all its channels as they are, or a block and stages.
+#: The two forms of a section: all channels as they are, or a block and stages.
 PLAIN, STAGED = 0, 1
 MAX_CLASSES = 8
 EXACT = 1 << 53  #: binary64 holds every integer up to here
-SHARES = 1 << 16  #: of an activity, worked out at a time: many channels of small planes, one of many anchors
-#: Encoder: numbers of classes to try, and about what each further prior costs.
+SHARES = 1 << 16  #: values of an activity computed at a time: many channels of small planes, or one of many anchors
+#: Encoder: numbers of classes to try, and about the bits that a further prior costs.
 CLASS_COUNTS = (1, 2, 3, 4, 5, 6, 8)
 PRIOR_BITS = 40
 
 
 @dataclass(frozen=True, eq=False)
 class Scale:
-    """By what relative magnitudes are measured. places: n. sums: of the magnitudes of each channel so far. A magnitude
-    counts as no more than its channel's sum."""
+    """The scale of relative magnitudes. places: n. sums: of the magnitudes of each channel so far; a magnitude counts
+    as no more than its channel's sum."""
 
     places: int
     sums: list[int] = field(default_factory=list)
 
 
 class Activity:
-    """The running sum over channels of the magnitudes of residuals relative to their channel's mean, in units of 1/256,
-    at each of n places; below 2^8 m n after m channels. scale: of other residuals, if theirs are the means that count;
-    the sums of channels that it does not have are added to it."""
+    """Running sum over channels, at each of n places, of the magnitudes of residuals relative to their channel's mean,
+    in units of 1/256; below 2^8 m n after m channels. scale: means to use, of an earlier slice; sums of channels that
+    it lacks are added to it."""
 
     def __init__(self, places: int, scale: Scale | None = None):
         self.scale = scale or Scale(places)
@@ -55,7 +55,7 @@ class Activity:
         return self._total
 
     def add(self, residuals: np.ndarray, times: int = 1) -> None:
-        """Further channels, int [m, n], each as if it stood there so many times."""
+        """Add channels int [m, n], each `times` times."""
         step = max(1, SHARES // max(1, residuals.shape[1]))
         for first in range(0, len(residuals), step):
             self._add(residuals[first : first + step], times)
@@ -70,7 +70,7 @@ class Activity:
         np.minimum(shares, of_each, out=shares)
         unit = self.scale.places << 8
         if (int(of_each.max()) + 1) * unit <= EXACT or int(shares.max(initial=0)) * unit < EXACT:
-            # of integers below 2^53 the rounded quotient has the floor of the true one: processors divide reals faster
+            # for integers below 2^53 the rounded quotient has the right floor, and reals divide faster
             shares *= unit
             shares /= of_each + 1
             np.floor(shares, out=shares)
@@ -82,31 +82,31 @@ class Activity:
 
 
 def activity_bounds(activity: np.ndarray, count: int) -> np.ndarray:
-    """[count - 1]: the activity at which each class but the first begins, so that places of this activity [n] fall into
-    classes of about equal size."""
+    """[count - 1]: the activities at which all classes but the first begin, for classes of about equal size of places
+    with this activity [n]."""
     at = np.arange(1, count) * len(activity) // count
     bounds: np.ndarray = np.sort(activity)[at]  # a tenth of the time of np.partition
     return bounds
 
 
 def classes_within(activity: np.ndarray, bounds: np.ndarray) -> np.ndarray:
-    """uint8 [n]: the class of places by their activity [n] and where each class but the first begins."""
+    """uint8 [n]: classes of places by their activity [n] and the bounds of `activity_bounds`."""
     classes = np.zeros(len(activity), np.uint8)
-    for bound in bounds:  # at most 7 of them, which a search would take several times as long for
+    for bound in bounds:  # at most 7: a search would take several times as long
         classes += (activity >= bound).view(np.uint8)
     return classes
 
 
 def activity_classes(activity: np.ndarray, count: int) -> np.ndarray:
-    """uint8 [n] in 0..count-1: places by their activity [n], in classes of about equal size."""
+    """uint8 [n] in 0..count-1: classes of about equal size of places by their activity [n]."""
     return classes_within(activity, activity_bounds(activity, count))
 
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Where the symbols of a channel belong, in the order in which they are coded: by class, then ascending.
+    """The places of a channel's symbols in coding order: by class, then ascending.
 
-    order: int64 [n], or slice(None) for all of them as they stand. sizes: how many each class has.
+    order: int64 [n], or slice(None) for the order as it is. sizes: number of places in each class.
     """
 
     order: np.ndarray | slice
@@ -119,13 +119,13 @@ class Places:
 
     @staticmethod
     def by(classes: np.ndarray, count: int) -> Places:
-        """Of classes int [n] in 0..count-1, of which there are few; some may be empty."""
+        """Places by classes int [n] in 0..count-1, with count below 256; classes may be empty."""
         classes = classes.astype(np.uint8, copy=False)  # bytes are sorted by counting
         sizes = tuple(np.bincount(classes, minlength=count).tolist())
         return Places(np.argsort(classes, kind="stable"), sizes)
 
     def parts(self, channels: np.ndarray) -> Iterator[np.ndarray]:
-        """What is coded of channels [m, n]: of each in turn, each class."""
+        """The coded parts of channels [m, n]: of each channel in turn, each class."""
         for channel in channels:
             ordered, end = channel[self.order], 0
             for size in self.sizes:
@@ -133,7 +133,7 @@ class Places:
                 end += size
 
     def put(self, coded: np.ndarray, channels: np.ndarray) -> None:
-        """Puts the `parts` of channels [m, n], one behind the other, into them."""
+        """Put the concatenated `parts` of channels [m, n] into them."""
         rows = coded.reshape(len(channels), -1)
         if isinstance(self.order, slice):
             channels[:, self.order] = rows
@@ -154,7 +154,7 @@ def parts_of(groups: Iterable[Group]) -> list[np.ndarray]:
 
 
 def cheapest_class_count(groups: Sequence[tuple[np.ndarray, np.ndarray]]) -> int:
-    """Encoder: how many classes cost the (residuals int32 [m, n], activity [n]) of a stage least."""
+    """Encoder: the number of classes that takes the fewest bits, for (residuals int32 [m, n], activity [n])."""
     costs = []
     for count in CLASS_COUNTS:
         bits = 0.0
@@ -167,7 +167,7 @@ def cheapest_class_count(groups: Sequence[tuple[np.ndarray, np.ndarray]]) -> int
 
 @dataclass(frozen=True, eq=False)
 class CodedSection:
-    """Bytes of a section with its form in front, and the priors that each of its stages defined; one stage if plain."""
+    """Bytes of a section, its form first, and the priors that each of its stages defines; one stage if plain."""
 
     data: bytes
     defined: list[list[Fitted]]
@@ -180,16 +180,17 @@ def smaller_form(
     effort: int,
     known: Sequence[Fitted] = (),
 ) -> tuple[CodedSection, float]:
-    """(section, sum of R(a) over all channels) of the int32 channels that `channels` gives anew at each call: plain, or
-    what `staged` makes if it is shorter.
+    """(section, sum of R(a) over all channels): plain, or the result of `staged` if that is shorter.
 
-    The form is plain with priors "gauss", the model of R(a), at effort 1, and without `staged`. known: priors that the
-    plain form may refer to.
+    channels: returns the int32 channels at each call. The form is plain with priors "gauss", the model of R(a), at
+    effort 1, and without `staged`. known: priors that the plain form may refer to.
     """
     found = list[CodedSection]()
     if staged is not None and priors == "best" and effort > 1:
         found.append(staged())
-        if 8 * (len(found[0].data) - 1) <= sum(entropy_bits(channel) for channel in channels()):  # no plain is shorter
+        if 8 * (len(found[0].data) - 1) <= sum(
+            entropy_bits(channel) for channel in channels()
+        ):  # the plain form is not shorter
             return found[0], sum(histogram(channel).rate_bits for channel in channels() if channel.size)
     plain = encode_channels(list(channels()), priors=priors, effort=effort, known=known)
     found.insert(0, CodedSection(bytes([PLAIN]) + plain.payload, [plain.defined]))
@@ -202,8 +203,8 @@ def coded_stages(
     effort: int,
     known: Iterable[Sequence[Fitted]] | None = None,
 ) -> CodedSection:
-    """`front`, the lengths of all stages but the last, then their payloads. stages: taken one by one. known: by stage
-    what it may refer to."""
+    """`front`, the lengths of all stages but the last, and their payloads. stages: taken one by one. known: by stage
+    the priors that it may refer to."""
     out = bytearray(front)
     pairs = zip(stages, repeat(()) if known is None else known, strict=known is not None)
     coded = [encode_channels(stage, effort=effort, known=k) for stage, k in pairs]
@@ -226,8 +227,8 @@ def read_stages(
     groups: Iterator[list[Group]],
     known: Sequence[list[Prior]] | None = None,
 ) -> None:
-    """Decodes `number` stages. `groups` yields per stage, after those before are decoded, what to decode into. known:
-    by stage the priors of payloads before, to which its own are appended."""
+    """Decode `number` stages. groups: yields the targets of each stage once those before are decoded. known: by stage
+    the priors of the slices before, to which its own are appended."""
     lengths = [reader.varint(reader.remaining, f"the length of stage {stage}") for stage in range(number - 1)]
     rest = reader.rest()
     if sum(lengths) > len(rest):

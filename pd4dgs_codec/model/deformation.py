@@ -18,7 +18,7 @@ from torch.nn import functional as F
 
 from pd4dgs_codec import scene
 from pd4dgs_codec.draw.layers import Layers
-from pd4dgs_codec.format.plane_choice import choose_predictor
+from pd4dgs_codec.format.planes import choose_predictor
 from pd4dgs_codec.format.quantise import quantise
 from pd4dgs_codec.model import plane_terms
 from pd4dgs_codec.model.config import DeformationConfig

@@ -12,14 +12,13 @@ from torch import Tensor
 
 from pd4dgs_codec.data.view import View
 from pd4dgs_codec.entropy.bits import entropy_bits
+from pd4dgs_codec.format.deformation import decorrelate
 from pd4dgs_codec.format.kinds import LAYER_KINDS
-from pd4dgs_codec.format.layer_meta import Section
 from pd4dgs_codec.format.left_out import LeftOut, tensor_bytes
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
-from pd4dgs_codec.format.payload import channel_groups
 from pd4dgs_codec.format.plan import plan
+from pd4dgs_codec.format.quantise import classes_of
 from pd4dgs_codec.format.symbols import layer_symbols, rounded
-from pd4dgs_codec.format.table import classes_of
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.model.rate import channel_moments, gaussian_bits, rate_bits
@@ -161,10 +160,10 @@ def train_rate_bits(scene: Scene, options: EncodeOptions = DEFAULTS) -> list[dic
             for name, rows_of in planned.attributes.items():
                 values = torch.from_numpy(rows_of[own][classes[own] == c]).double().flatten(1)
                 attributes += _bits(values, planned.steps.attributes[name] * 2.0**c)
-        groups, _ = channel_groups(layer_symbols(planned, i))
+        symbols = layer_symbols(planned, i)
+        coded = decorrelate(symbols.tensors, symbols.kind)
         row = {"layer": float(layer), "attributes": attributes}
-        for section in (Section.PLANES, Section.WEIGHTS):
-            row[section.name.lower()] = gaussian_bits(groups[section])
+        row |= {"planes": gaussian_bits(coded.plane_channels), "weights": gaussian_bits(coded.weights)}
         result.append(row)
     return result
 

@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 
 from pd4dgs_codec.errors import BadSignature, DecodeError, UnsupportedVersion
-from pd4dgs_codec.format.stream import open_stream
+from pd4dgs_codec.format.decoder import open_stream
 from pd4dgs_codec.scene import Scene
 from pd4dgs_codec.web.transfer import HEADER_GUESS, LONGEST_HEADER, Changed, OutOfTime, Transfer, slice_ends, within
 

@@ -7,7 +7,7 @@ import pytest
 from strategies import make_scene
 
 from pd4dgs_codec.errors import EncodeError, Malformed
-from pd4dgs_codec.format import bounds, encoder, symbols, table
+from pd4dgs_codec.format import bounds, deformation, encoder, quantise
 from pd4dgs_codec.format.container import read_preamble
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode, encode_with_report
@@ -98,7 +98,7 @@ def test_a_deformation_without_a_bound_is_refused_and_the_layers_before_it_decod
         assert decode(data, max_layer=layer - 1).level == layer - 1
 
 
-@pytest.mark.parametrize("module, what", [(table, "feature"), (symbols, "weights_scaffold")])
+@pytest.mark.parametrize("module, what", [(quantise, "feature"), (deformation, "weights_scaffold")])
 def test_a_quantiser_that_rounds_wrongly_is_found(monkeypatch, module, what):
     """The file decodes to the symbols that were meant: only the given values show that these are not the nearest."""
     right = module.quantise

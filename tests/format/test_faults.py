@@ -135,7 +135,7 @@ MESSAGES = {
     "payload-parameters-beyond": "parameters of 6 bytes in a payload of 9",
     "payload-parameters-over-limit": "parameters of 4097 bytes, limit 4096",
     "payload-byte-left": r"sections of \d+ bytes, expected \d+",
-    "layer-1-steps-alone": "key 3 is there without reason",
+    "layer-1-steps-alone": "key 3 is there, expected no such key",
     "layer-1-scales-missing": "key 4 is missing",
     "scales-channels-differ": "1 channels, expected 2 as in scale 0",
     "networks-entry-empty": "an empty network entry, expected an id and widths",
@@ -149,8 +149,8 @@ MESSAGES = {
     "mask-code-2": "layer 0: mask code in 2..77, expected 3..255",
     "mask-rise-negative": "rise of a mask code in -1..0",
     "mask-sum-over-255-in-layer-2": "layer 2: mask code 256, expected at most 255",
-    "attribute-above": "a symbol over 8388608 in magnitude",
-    "overflow-attributes": "a reconstructed value is not finite",
+    "attribute-above": "an attribute's symbol over 8388608 in magnitude",
+    "overflow-attributes": "a dequantised value is not finite",
     "voxel-twice": "voxel .1, 0, 0. holds more than one anchor, expected one",
 }
 

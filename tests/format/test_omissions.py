@@ -10,11 +10,11 @@ from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format import planes as decorrelation
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode, encode_with_report
-from pd4dgs_codec.format.omissions import _Omissions, cells_read
+from pd4dgs_codec.format.omissions import cells_read
 from pd4dgs_codec.format.options import EncodeOptions
-from pd4dgs_codec.format.plan import plan
-from pd4dgs_codec.format.plane_choice import fill_plane
-from pd4dgs_codec.format.symbols import rounded
+from pd4dgs_codec.format.plan import make_plan, plan
+from pd4dgs_codec.format.planes import fill_plane
+from pd4dgs_codec.format.symbols import SceneSymbols, rounded
 from pd4dgs_codec.scene import DEFAULT_WIDTHS, PLANES, Camera, Deformation, Scene, Widths
 
 SIDES = (6, 5, 7, 5)
@@ -69,14 +69,11 @@ def dead_scene(widths: Widths = DEFAULT_WIDTHS) -> Scene:
     )
 
 
-def test_edits_of_the_scene_and_of_its_decoded_twin_are_alike():
-    planned, _ = plan(dead_scene(), EncodeOptions(layers=2, omit="nothing"))
-    omissions = _Omissions(planned)
-    while omissions.simplify_networks():
-        pass
-    omissions.free_cells()
-    assert len(omissions.found) > 8
-    assert_same_scene(omissions.decoded, rounded(omissions.scene))
+@pytest.mark.parametrize("graded", [False, True])
+def test_the_planned_scene_is_rounded_to_the_planned_symbols(graded):
+    planned = make_plan(dead_scene(replace(DEFAULT_WIDTHS, graded=graded)), EncodeOptions(layers=2))
+    assert len(planned.left_out) > 8
+    assert_same_scene(planned.symbols.scene(), rounded(planned.scene))
 
 
 def test_every_dead_part_is_found_and_costs_less():
@@ -137,7 +134,7 @@ def test_nothing_that_matters_goes():
     _, left_out = plan(scene, EncodeOptions(layers=2))
     assert all("cells" in item.what for item in left_out)
     untouched = decode(encode(scene, layers=2, effort=1, omit="nothing"))
-    read = cells_read(untouched, untouched.global_deformation)
+    read = cells_read(SceneSymbols.of(untouched))
     free = 0
     for marks, given, got in zip(
         read, untouched.global_deformation.planes, planned.global_deformation.planes, strict=True

@@ -8,9 +8,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pd4dgs_codec.errors import Malformed
-from pd4dgs_codec.format import plane_choice
-from pd4dgs_codec.format.plane_choice import choose_predictor
-from pd4dgs_codec.format.planes import PREDICTORS, residual, restore
+from pd4dgs_codec.format import planes as module
+from pd4dgs_codec.format.planes import PREDICTORS, choose_predictor, residual, restore
 from pd4dgs_codec.format.quantise import MAX_SYMBOL
 
 shapes = st.tuples(st.integers(1, 3), st.integers(1, 9), st.integers(1, 9))
@@ -104,14 +103,14 @@ def test_compiled_loops_choose_and_fill_the_same(monkeypatch):
     planes = [rng.integers(-9, 10, (3, 11, 9)), rng.integers(-(1 << 20), 1 << 20, (2, 5, 6)), np.zeros((1, 1, 4))]
     planes = [np.cumsum(plane, axis=2).astype(np.int32) for plane in planes]
     given = [rng.random(plane.shape[1:]) < 0.4 for plane in planes]
-    found = [plane_choice.fill_plane(k, g) for k, g in zip(planes, given, strict=True)]
-    fills = [plane_choice._fill(k, g, p) for k, g in zip(planes, given, strict=True) for p in PREDICTORS]
+    found = [module.fill_plane(k, g) for k, g in zip(planes, given, strict=True)]
+    fills = [module._fill(k, g, p) for k, g in zip(planes, given, strict=True) for p in PREDICTORS]
     choices = [choose_predictor(k) for k in planes]
-    monkeypatch.setattr(plane_choice, "kernels", lambda: None)
+    monkeypatch.setattr(module, "kernels", lambda: None)
     for k, g, fill, (predictor, residuals) in zip(planes, given, found, choices, strict=True):
-        np.testing.assert_array_equal(plane_choice.fill_plane(k, g), fill)
+        np.testing.assert_array_equal(module.fill_plane(k, g), fill)
         assert choose_predictor(k)[0] == predictor
         np.testing.assert_array_equal(choose_predictor(k)[1], residuals)
-    again = [plane_choice._fill(k, g, p) for k, g in zip(planes, given, strict=True) for p in PREDICTORS]
+    again = [module._fill(k, g, p) for k, g in zip(planes, given, strict=True) for p in PREDICTORS]
     for one, other in zip(fills, again, strict=True):
         np.testing.assert_array_equal(one, other)

@@ -133,7 +133,7 @@ def test_of_two_faults_every_door_names_that_of_the_earlier_layer(first, later):
     """Values that are not finite, sums of masks and voxels taken twice, which a payload alone does not show."""
     header, layers, _ = decode_layers(small_file())
     payloads = [write_layer(layer, EncodeOptions(effort=1))[0] for layer in layers]
-    steps, which = header.attribute_steps, 1
+    steps, which = header.grid.steps, 1
     if first == "value":
         steps, which = {**steps, "offset": 2.0**127}, 0
     elif first == "mask code":
@@ -143,7 +143,7 @@ def test_of_two_faults_every_door_names_that_of_the_earlier_layer(first, later):
         taken = replace(layers[1], anchor_q=layers[0].anchor_q[: len(layers[1].anchor_q)])
         payloads[1] = write_layer(taken, EncodeOptions(effort=1))[0]
     chunks = tuple((i, len(payload)) for i, payload in enumerate(payloads))
-    packed = pack_header(replace(header, attribute_steps=steps, chunks=chunks))
+    packed = pack_header(replace(header, grid=replace(header.grid, steps=steps), chunks=chunks))
     scene_id = scene_id_of(packed)
     framed = [write_chunk(i, 0, scene_id, payload) for i, payload in enumerate(payloads)]
     front = write_preamble(packed)

@@ -6,8 +6,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from pd4dgs_codec.errors import EncodeError
-from pd4dgs_codec.format.quantise import MAX_SYMBOL, dequantise, is_step, mask_codes, quantise
-from pd4dgs_codec.format.table import NO_CLASSES, Grid
+from pd4dgs_codec.format.quantise import MAX_SYMBOL, NO_CLASSES, Grid, dequantise, is_step, mask_codes, quantise
 from pd4dgs_codec.scene import ATTRIBUTES, MAX_CLASS, Widths
 
 steps = st.floats(2.0**-100, 2.0**90, width=32)
@@ -99,7 +98,8 @@ def test_symbols_of_any_class_survive_their_float32_values(indices, step, seed):
     grid = Grid(dict.fromkeys(ATTRIBUTES, step), widths, centre)
     values = grid.dequantise(k, classes)
     np.testing.assert_array_equal(grid.quantise(values, classes), k)
-    expected = (grid.indices(k, classes)[0].astype(np.float64) * step).astype(np.float32)
+    at = centre[0] + k[0].astype(np.int64) * 2 ** classes.astype(np.int64)
+    expected = (at * np.float64(step)).astype(np.float32)
     np.testing.assert_array_equal(values["feature"][:, 0], expected)
 
 

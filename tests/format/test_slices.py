@@ -14,12 +14,11 @@ from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import ChecksumMismatch, DecodeError, EncodeError, LimitExceeded, Malformed, Truncated
 from pd4dgs_codec.format import encoder
 from pd4dgs_codec.format.container import read_chunk, read_preamble, slice_flags, write_chunk, write_preamble
-from pd4dgs_codec.format.decoder import decode_partial
+from pd4dgs_codec.format.decoder import decode_partial, every_prefix, open_stream
 from pd4dgs_codec.format.encoder import encode_with_report
 from pd4dgs_codec.format.header import CHUNKS, pack_header, scene_id_of, unpack_header
 from pd4dgs_codec.format.info import hashes, info
 from pd4dgs_codec.format.limits import MAX_CHUNKS
-from pd4dgs_codec.format.stream import every_prefix, open_stream
 from pd4dgs_codec.morton import morton_order
 
 

@@ -13,10 +13,9 @@ import pytest
 
 from pd4dgs_codec.errors import DecodeError
 from pd4dgs_codec.format.container import read_preamble
-from pd4dgs_codec.format.decoder import decode_partial
+from pd4dgs_codec.format.decoder import decode_partial, open_stream
 from pd4dgs_codec.format.header import unpack_header
 from pd4dgs_codec.format.info import hashes
-from pd4dgs_codec.format.stream import open_stream
 
 SPEC = Path(__file__).parents[2] / "spec"
 VECTORS, TEXT = SPEC / "vectors", (SPEC / "format.md").read_text(encoding="utf-8")

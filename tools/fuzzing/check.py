@@ -25,8 +25,7 @@ from pd4dgs_codec.format.decoder import decode_partial
 from pd4dgs_codec.format.header import unpack_header
 from pd4dgs_codec.format.info import hashes, info
 from pd4dgs_codec.format.kinds import BY_CHUNK_TYPE
-from pd4dgs_codec.format.layer_meta import Declared
-from pd4dgs_codec.format.payload import read_meta
+from pd4dgs_codec.format.payload import Declared, read_parameters
 
 from .mutate import Case
 
@@ -76,7 +75,7 @@ def declared(data: bytes) -> tuple[int, bool]:
             kind = BY_CHUNK_TYPE.get(number)
             if kind is not None:
                 payload = read_chunk(data, offset, length=length).payload
-                _, _, total = read_meta(payload, kind, header.widths, total, number in layers)
+                _, _, total = read_parameters(payload, kind, header.grid.widths, total, number in layers)
                 layers.append(number)
             offset += CHUNK_OVERHEAD + length
     except DecodeError:

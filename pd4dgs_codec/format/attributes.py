@@ -1,33 +1,15 @@
-"""The attributes section of mode ans: the channels as they are, or with what one tells of another taken out.
+"""The attributes section of mode ans (clauses 8.5 to 8.7): channels as they are, or predicted from each other.
 
-Byte 0 is the form. Where anchors are graded, a varint follows, the length of one channels payload, and that: the step
-class of each row. Form 0: the rest is one channels payload of all channels. Form 1: a block of varints, then eight
-channels payloads, the *stages*, each decoded before the next. All arithmetic is on integers. With D feature numbers and
-G Gaussians, the first P = D + 6 channels are features and log-scalings, the others G offsets x, y, z.
+With D feature numbers and G Gaussians, the first P = D + 6 channels are features and log-scalings, the others G offsets
+x, y, z. Form 0 codes all channels at once, by step class if anchors are graded. Form 1 states a prediction block and
+then codes eight *stages*, each decoded before the next:
 
-*Step classes*. In form 0 each channel is split into the step classes 0..6 of its rows. In form 1 an anchor's activity
-(below) begins with GRADE_WEIGHT times the relative magnitude of a channel that holds 2^(6 - class), and stage 0 is
-split by it as well.
+- Stages 0..4 hold residuals of the P channels, each predicted linearly from channels before it (`Terms`).
+- Stage 5 holds the offsets x. Stages 1..5 are split into classes of rows by how large the residuals of the stages
+  before are (`stages.Activity`), because the residuals of an anchor tend to be large together.
+- Stages 6 and 7 hold the offsets y and z, split by how far x and y lie from a centre (`Split`).
 
-*Linear prediction*, channels 1 .. P - 1: for channel c a varint m <= c, then m terms in ascending
-order of the channel j they refer to: a varint j - (previous j) - 1, starting from previous j = -1, and a zigzag weight
-w, |w| <= 2^15. Coded is the residual e_c = k_c - ((sum_j w_j k_j + 512) >> 10), the shift rounding down.
-
-*Activity*. The residuals of an anchor tend to be large together. Stages 0..4 hold the residuals of channels 0 .. P - 1
-in the runs that `stage_bounds` names, stage 5 the offsets x. For each of stages 1..5 the block has a varint C in 1..8:
-each channel of the stage is split into C classes of rows by how large the residuals of the earlier stages are
-(`activity`).
-
-*Distance*, the offsets y and z: per Gaussian a varint f in 0..3: bit 0, y is split by x; bit 1, z is
-split by x and y. If f > 0 follow a zigzag centre of x and, if bit 1 is set, one of y, each |.| <= 2^24 - 1. The symbols
-of a split y go to class min(|x - centre_x|, 4), those of a split z to class min(|x - centre_x| + |y - centre_y|, 6).
-Stage 6 holds the y, stage 7 the z.
-
-Form 2, of a slice behind another one of its layer: the lengths and the stages alone. Terms, splits and classes are
-those of the latest block before (`Past`), the classes with the bounds that they had in the slice of that block.
-
-The block ends with the varint lengths of stages 0..6. In a stage, channels come in ascending order, a split one as its
-classes in order, each with its rows in order.
+Form 2, in a slice behind another of its layer, uses the block of that slice (`Past`). All arithmetic is on integers.
 """
 
 from __future__ import annotations
@@ -45,6 +27,7 @@ from pd4dgs_codec.entropy.fitting import Fitted
 from pd4dgs_codec.entropy.priors import K_MAX, Prior
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
 from pd4dgs_codec.errors import Malformed, UnsupportedFeature
+from pd4dgs_codec.format.quantise import NO_CLASSES
 from pd4dgs_codec.format.stages import (
     PLAIN,
     PRIOR_BITS,
@@ -63,27 +46,26 @@ from pd4dgs_codec.format.stages import (
     read_stages,
     smaller_form,
 )
-from pd4dgs_codec.format.table import NO_CLASSES
 from pd4dgs_codec.scene import MAX_CLASS, Widths
 
-CONTINUED = 2  #: the form that goes on with an earlier block
+CONTINUED = 2  #: the form that uses the block of an earlier slice
 WEIGHT_SHIFT = 10
 MAX_WEIGHT = 1 << 15
-#: Where the stages of residuals begin and end, of 38 predicted channels; those of another number in proportion.
+#: Where the stages of residuals begin and end for 38 predicted channels; in proportion for other numbers.
 STAGES = (0, 6, 12, 20, 29, 38)
 N_STAGES = len(STAGES) + 2
 Y_CLASSES, Z_CLASSES = 5, 7
 SPLIT_Y, SPLIT_Z = 1, 2
-#: Rows that are predicted at a time.
+#: Rows predicted at a time.
 BLOCK_ROWS = 2048
-#: How much an anchor's step class counts for its activity, beside the channels' residuals, which count 1 each.
+#: Weight of an anchor's step class in its activity; a channel's residual has weight 1.
 GRADE_WEIGHT = 4
 
-#: Encoder: a term must explain this share of its channel's spread; a term costs about so many bits.
+#: Encoder: the least share of its channel's spread that a term must explain, and about the bits that a term costs.
 MIN_SHARE = 0.03
 TERM_BITS = 24
-#: Encoder: added to each channel's variance when terms are fitted, about the 1/12 that rounding to integers puts there.
-#: It keeps the equations solvable where channels are constant or alike. Another value means other files.
+#: Encoder: added to each channel's variance when terms are fitted, about the 1/12 that comes from rounding to integers.
+#: It keeps the equations solvable where channels are constant or alike. Files depend on this value.
 ROUNDING_VARIANCE = 0.08
 
 
@@ -102,13 +84,13 @@ class Terms:
 
     @cached_property
     def reach(self) -> int:
-        """How often the largest magnitude the sum of products can be, in its units of 2^-10."""
+        """The largest sum of products for symbols of magnitude 1, in units of 2^-10."""
         return int(np.abs(self.weights).sum())
 
     def prediction(self, symbols: np.ndarray) -> np.ndarray:
-        """Integers [n] from integers [>= max channel + 1, n] of magnitude <= K_MAX, all in binary64, where their sums
-        of products, below 2^45, are exact; or in binary32, where they are as long as they stay below 2^14. einsum
-        starts no threads."""
+        """Predictions [n] from symbols [>= max channel + 1, n] of magnitude <= K_MAX. All are integers, in binary64,
+        where sums of products, below 2^45, are exact, or in binary32, where sums below 2^14 are. einsum starts no
+        threads."""
         dense = self._dense.astype(symbols.dtype, copy=False)
         predicted: np.ndarray = np.einsum("i,ij->j", dense, symbols[: len(dense)])
         predicted += 0.5
@@ -118,7 +100,7 @@ class Terms:
 
 @dataclass(frozen=True)
 class Split:
-    """How one Gaussian's offsets are split into classes: flags and the centres of x and y."""
+    """The classes of one Gaussian's offsets y and z: flags, and the centres of x and y that distances refer to."""
 
     flags: int
     centre_x: int = 0
@@ -137,12 +119,12 @@ class Split:
 
 
 def stage_bounds(widths: Widths) -> list[int]:
-    """First channel of each stage of residuals, and the end of the last."""
+    """The first channel of each stage of residuals, and the end of the last stage."""
     return [widths.predicted * bound // STAGES[-1] for bound in STAGES]
 
 
 def stage_channels(widths: Widths, stage: int) -> range:
-    """The channels of stages 0..5; those of the last are the offsets x."""
+    """The channels of stage 0..5; stage 5 has the offsets x."""
     if stage == len(STAGES) - 1:
         return range(widths.predicted, widths.channels, 3)
     return range(*stage_bounds(widths)[stage : stage + 2])
@@ -152,9 +134,9 @@ def stage_channels(widths: Widths, stage: int) -> range:
 class Block:
     """The prediction block.
 
-    widths: of the anchors. counts: of classes, of stages 1 to 5, with step classes 0 to 5. scale, and by stage the
-    activity [classes - 1] at which each class but the first begins: of the slice that the block stands in; known
-    once that slice has been coded so far.
+    widths: of the anchors. counts: numbers of classes of stages 1 to 5, of 0 to 5 with step classes. scale, bounds:
+    of the slice that holds the block, set while it is coded: the scale of activities, and by stage the activity
+    [classes - 1] at which each class but the first begins.
     """
 
     widths: Widths
@@ -165,7 +147,7 @@ class Block:
     bounds: dict[int, np.ndarray] = field(default_factory=dict)
 
     def classes(self, activity: np.ndarray, stage: int, count: int) -> np.ndarray:
-        """uint8 [n] of rows with this activity in the stages before."""
+        """uint8 [n] classes of rows with this activity in the stages before."""
         bounds = self.bounds.get(stage)
         if bounds is None:
             bounds = self.bounds[stage] = activity_bounds(activity, count)
@@ -177,8 +159,8 @@ AnyPrior = TypeVar("AnyPrior", Prior, Fitted)
 
 @dataclass(eq=False)
 class Past(Generic[AnyPrior]):
-    """What a slice may refer to of its layer's slices before it: the latest block, and in order of definition the
-    priors of each section, of which the attributes have one list for the plain form and one per stage."""
+    """State of the slices of a layer so far that a later slice may refer to: the latest block, and the priors of each
+    section in order of definition. Attributes have one list of priors for the plain form and one per stage."""
 
     block: Block | None = None
     positions: list[AnyPrior] = field(default_factory=list)
@@ -187,7 +169,7 @@ class Past(Generic[AnyPrior]):
     stages: list[list[AnyPrior]] = field(default_factory=lambda: [[] for _ in range(N_STAGES)])
 
     def copy(self) -> Past[AnyPrior]:
-        """One that grows without this one."""
+        """A copy that grows independently."""
         stages = [list(known) for known in self.stages]
         return Past(self.block, list(self.positions), list(self.masks), list(self.plain), stages)
 
@@ -204,16 +186,15 @@ def write_attributes(
     past: Past[Fitted] | None = None,
     population: tuple[np.ndarray, np.ndarray] | None = None,
 ) -> tuple[bytes, float]:
-    """(section bytes, sum of R(a) over all channels, by step class, and the classes' entropy) of attributes int32
-    [channels, n] and classes int32 [n], or NO_CLASSES, in the smallest form.
+    """(section bytes, bits of R(a) over all channels by step class and of the classes) in the smallest form.
 
-    past: of the layer's slices before, to which this one is added. population: (attributes, classes) that a
-    block is fitted to: of this slice and of those that may refer to it; these alone if None.
+    attributes: int32 [channels, n]. classes: int32 [n], or NO_CLASSES. past: of the layer's slices before, to which
+    this one is added. population: (attributes, classes) of all slices that will use the block, to which it is fitted;
+    None for this slice alone.
     """
     past = past or Past()
     everything, grades = (attributes, classes) if population is None else population
-    one_row = everything.shape[1] < 2  # has no spread to predict
-    staged = not one_row and priors == "best" and effort > 1
+    staged = everything.shape[1] > 1 and priors == "best" and effort > 1
     block = past.block or (_fit_block(everything, grades, widths) if staged else None)
     section, rate_bits = smaller_form(
         lambda: by_class(attributes, classes),
@@ -236,7 +217,7 @@ def write_attributes(
 
 
 def by_class(attributes: np.ndarray, classes: np.ndarray) -> Iterator[np.ndarray]:
-    """The channels of form 0: each channel int [n] as its rows of class 0, 1 .. MAX_CLASS; as it is without classes."""
+    """The channels of form 0: of each channel int [n] its rows of class 0, 1 .. MAX_CLASS, or all without classes."""
     if not classes.size:
         yield from attributes
         return
@@ -258,8 +239,8 @@ def _fit_block(symbols: np.ndarray, grades: np.ndarray, widths: Widths) -> Block
 
 
 def _residuals(symbols: np.ndarray, terms: Sequence[Terms], channels: Sequence[int]) -> np.ndarray:
-    """int32 [len(channels), n]: the residuals of these channels, ascending, of symbols int32 [channels, n]; the offsets
-    are their own."""
+    """int32 [len(channels), n]: the residuals of these channels, ascending, of symbols int32 [channels, n]. Offsets are
+    not predicted."""
     coded: np.ndarray = symbols[list(channels)]
     for rows in _row_blocks(symbols):
         block = symbols[: min(channels[-1], len(terms)) + 1, rows].astype(np.float64)
@@ -270,12 +251,12 @@ def _residuals(symbols: np.ndarray, terms: Sequence[Terms], channels: Sequence[i
 
 
 def _row_blocks(symbols: np.ndarray) -> Iterator[slice]:
-    """So many rows of symbols [channels, n] at a time as fit a processor's cache."""
+    """Slices of the rows of symbols [channels, n], small enough for a processor's cache."""
     yield from (slice(first, first + BLOCK_ROWS) for first in range(0, symbols.shape[1], BLOCK_ROWS))
 
 
 def _activity(rows: int, grades: np.ndarray, scale: Scale | None = None) -> Activity:
-    """That of rows before stage 0: of those step classes, GRADE_WEIGHT times that of a channel of 2^(6 - class)."""
+    """The activity before stage 0: of step classes, GRADE_WEIGHT times that of a channel that holds 2^(6 - class)."""
     activity = Activity(rows, scale)
     if grades.size:
         activity.add(1 << (MAX_CLASS - grades[None]), GRADE_WEIGHT)
@@ -312,8 +293,8 @@ def _put_block(out: bytearray, block: Block) -> None:
 def _groups(
     symbols: np.ndarray, residuals: Iterator[np.ndarray], grades: np.ndarray, block: Block
 ) -> Iterator[list[Group]]:
-    """Per stage, what it codes. residuals: int32 [channels, n] of each of `_measured_stages`. They and `symbols` int32
-    [channels, n], of which the offsets are read here, are read only as far as the stages before reach."""
+    """The groups that each stage codes. residuals: int32 [channels, n] of each of `_measured_stages`. symbols: int32
+    [channels, n], read for the offsets. Both are read only as far as the stages before have filled them."""
     counts = block.counts if block.widths.graded else [1, *block.counts]
     activity, whole = _activity(symbols.shape[1], grades, block.scale), Places.whole(symbols.shape[1])
     block.scale = activity.scale
@@ -337,7 +318,7 @@ def _groups(
 
 
 def _measured_stages(widths: Widths) -> list[range]:
-    """The channels of the stages of residuals, of which later stages have their classes."""
+    """The channels of the stages of residuals, which later stages are split by."""
     return [stage_channels(widths, stage) for stage in range(len(STAGES) - 1)]
 
 
@@ -347,7 +328,7 @@ def _split_stages(widths: Widths) -> range:
 
 
 def _covariance(symbols: np.ndarray) -> np.ndarray:
-    """float64 [channels, channels] of symbols int32 [channels, n], and of their rounding."""
+    """float64 [channels, channels] covariance of symbols int32 [channels, n], with ROUNDING_VARIANCE."""
     mean, products = symbols.mean(axis=1, keepdims=True), np.zeros((len(symbols), len(symbols)))
     for rows in _row_blocks(symbols):
         centred = symbols[:, rows] - mean
@@ -357,8 +338,8 @@ def _covariance(symbols: np.ndarray) -> np.ndarray:
 
 
 def _fit_terms(symbols: np.ndarray, covariance: np.ndarray) -> Terms:
-    """Least squares of channel c on those before it, by their covariance float64 [c + 1, c + 1], weak terms dropped; no
-    terms unless the entropy gains by them."""
+    """Least squares of channel c on the channels before it, from their covariance float64 [c + 1, c + 1], without weak
+    terms; no terms unless they lower the entropy."""
     nothing, c = Terms(np.zeros(0, np.int64), np.zeros(0, np.int64)), len(covariance) - 1
     spread = np.sqrt(np.diag(covariance))
     chosen = np.arange(c)
@@ -392,7 +373,7 @@ def _fit_split(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> Split:
 
 
 def _gains(symbols: np.ndarray, classes: np.ndarray) -> bool:
-    """Whether a prior per class pays."""
+    """Whether a prior per class costs less than one prior."""
     parts = [symbols[classes == k] for k in range(int(classes.max()) + 1)]
     return sum(entropy_bits(part) + PRIOR_BITS for part in parts) < entropy_bits(symbols) + PRIOR_BITS
 
@@ -409,7 +390,7 @@ def read_attributes(
     data: bytes, widths: Widths, rows: int, past: Past[Prior] | None = None
 ) -> tuple[np.ndarray, np.ndarray]:
     """(classes int32 [rows] or NO_CLASSES, attributes int32 [channels, rows]); the inverse of write_attributes.
-    rows was checked against the limits before. past: of the layer's slices before, to which this one is added."""
+    rows: checked against the limits already. past: of the layer's slices before, to which this one is added."""
     reader, block = ByteReader(data), past.block if past else None
     form = reader.byte("the form of the attributes")
     if form not in (PLAIN, STAGED, CONTINUED):
@@ -431,12 +412,12 @@ def read_attributes(
 
 
 def _restore(symbols: np.ndarray, terms: Sequence[Terms]) -> None:
-    """Residuals int32 [channels, n] become the symbols, in place. Raises Malformed if one is over K_MAX."""
+    """Turn residuals int32 [channels, n] into symbols in place. Raises Malformed if one is over K_MAX."""
     predicted = [(c, term) for c, term in enumerate(terms, start=1) if term.channels.size]
     reach = max([term.reach for _, term in predicted], default=0)
     for rows in _row_blocks(symbols) if predicted else ():
         block, largest = _predicted(symbols[:, rows].astype(np.float32), predicted)
-        # so far sums of products and 1/2 are multiples of 2^-10 below 2^14, and binary32 has them all
+        # sums of products and 1/2 are multiples of 2^-10; below 2^14 binary32 holds them exactly
         if not largest * reach + 512 < 1 << 24:
             block, largest = _predicted(symbols[:, rows].astype(np.float64), predicted)
         if largest > K_MAX:
@@ -445,8 +426,8 @@ def _restore(symbols: np.ndarray, terms: Sequence[Terms]) -> None:
 
 
 def _predicted(block: np.ndarray, terms: Sequence[tuple[int, Terms]]) -> tuple[np.ndarray, float]:
-    """(symbols [channels, n], made in place of their residuals, the largest magnitude among them)."""
-    with np.errstate(all="ignore"):  # what overflows in binary32 is done again
+    """(symbols [channels, n], computed in place of their residuals, the largest magnitude among them)."""
+    with np.errstate(all="ignore"):  # if binary32 overflows, the caller repeats it in binary64
         for c, term in terms:
             block[c] += term.prediction(block)
     return block, max(float(block.max()), -float(block.min()))

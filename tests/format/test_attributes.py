@@ -12,11 +12,10 @@ from pd4dgs_codec.entropy.channels import encode_channels
 from pd4dgs_codec.entropy.priors import K_MAX
 from pd4dgs_codec.entropy.varint import put_varint, put_zigzag
 from pd4dgs_codec.errors import DecodeError, LimitExceeded, Malformed
-from pd4dgs_codec.format import attribute_section
-from pd4dgs_codec.format.attribute_section import MAX_WEIGHT, read_attributes, write_attributes
-from pd4dgs_codec.format.quantise import MAX_SYMBOL
+from pd4dgs_codec.format import attributes as section
+from pd4dgs_codec.format.attributes import MAX_WEIGHT, read_attributes, write_attributes
+from pd4dgs_codec.format.quantise import MAX_SYMBOL, NO_CLASSES
 from pd4dgs_codec.format.stages import PLAIN, STAGED
-from pd4dgs_codec.format.table import NO_CLASSES
 from pd4dgs_codec.scene import Widths
 
 WIDTHS = Widths()
@@ -55,11 +54,11 @@ def test_independent_channels_stay_plain():
 
 def written_in_stages(attributes, class_count=None, widths=WIDTHS):
     """The section in form 1, even where form 0 is shorter; class_count, if any, instead of the best."""
-    choose = attribute_section.cheapest_class_count if class_count is None else lambda _: class_count
-    with patch.object(attribute_section, "cheapest_class_count", choose):
-        symbols, past = attributes.astype(np.int64), attribute_section.Past()
-        block = attribute_section._fit_block(symbols, NO_CLASSES, widths)
-        return attribute_section._write_staged(symbols, NO_CLASSES, block, past, 1).data
+    choose = section.cheapest_class_count if class_count is None else lambda _: class_count
+    with patch.object(section, "cheapest_class_count", choose):
+        symbols, past = attributes.astype(np.int64), section.Past()
+        block = section._fit_block(symbols, NO_CLASSES, widths)
+        return section._write_staged(symbols, NO_CLASSES, block, past, 1).data
 
 
 @settings(max_examples=10)
@@ -203,7 +202,7 @@ def test_restored_symbols_are_those_of_integers(top, weight):
     terms = []
     for c in range(1, 6):
         chosen = np.flatnonzero(rng.random(c) < 0.7)
-        terms.append(attribute_section.Terms(chosen, rng.integers(-weight, weight + 1, len(chosen)) // c))
+        terms.append(section.Terms(chosen, rng.integers(-weight, weight + 1, len(chosen)) // c))
     expected = residuals.astype(object)
     for c, term in enumerate(terms, start=1):
         sums = sum(
@@ -212,7 +211,7 @@ def test_restored_symbols_are_those_of_integers(top, weight):
         expected[c] = expected[c] + ((sums + 512) >> 10)
     if np.abs(expected).max() > K_MAX:
         with pytest.raises(Malformed, match="a predicted attribute over"):
-            attribute_section._restore(residuals, terms)
+            section._restore(residuals, terms)
         return
-    attribute_section._restore(residuals, terms)
+    section._restore(residuals, terms)
     np.testing.assert_array_equal(residuals, expected.astype(np.int64))
