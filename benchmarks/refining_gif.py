@@ -33,6 +33,10 @@ PREFIX_SECONDS, LAST_SECONDS = 0.9, 3.0
 #: Seconds in which the scene's time runs from its start to its end; then it runs back.
 PERIOD = 2.5
 BAR = 26
+#: Thresholds of ordered dithering, -0.5 to 0.5, and their weight in levels of 8 bits. Unlike diffused errors they are
+#: the same in every picture, so that what stands still stays equal.
+BAYER = np.array([[0, 8, 2, 10], [12, 4, 14, 6], [3, 11, 1, 9], [15, 7, 13, 5]]) / 16 - 15 / 32
+DITHER = 8
 
 
 def draw(data: bytes, path: Path, width: int = WIDTH) -> int:
@@ -45,8 +49,8 @@ def draw(data: bytes, path: Path, width: int = WIDTH) -> int:
         for (layer, end), level in zip(ends, shown, strict=True):
             stays = LAST_SECONDS if end == ends[-1][1] else PREFIX_SECONDS
             for _ in range(round(stays * rate)):
-                picture = to_uint8(level.picture(camera, 1 - abs(1 - second / PERIOD % 2)))
-                pictures.append(labelled(picture, layer, end, len(data)))
+                picture = level.picture(camera, 1 - abs(1 - second / PERIOD % 2))
+                pictures.append(labelled(dithered(picture), layer, end, len(data)))
                 second += 1 / rate
         with whole_file(path, overwrite=True) as temporary:
             write(pictures, temporary, colours, rate)
@@ -60,6 +64,13 @@ def widened(camera: Camera, width: int) -> Camera:
     height = round(camera.height * width / camera.width)
     scale = np.array([[width / camera.width], [height / camera.height], [1]], np.float32)
     return replace(camera, width=width, height=height, K=camera.K * scale)
+
+
+def dithered(picture: np.ndarray) -> np.ndarray:
+    """uint8 [H, W, 3] of a picture in 0..1, with the noise that hides the steps of a small palette."""
+    height, width = picture.shape[:2]
+    noise = np.tile(BAYER, (-(-height // 4), -(-width // 4)))[:height, :width, None]
+    return to_uint8(picture + noise * DITHER / 255)
 
 
 def labelled(picture: np.ndarray, layer: int, end: int, size: int) -> np.ndarray:
@@ -78,7 +89,7 @@ def labelled(picture: np.ndarray, layer: int, end: int, size: int) -> np.ndarray
 
 def write(pictures: Sequence[np.ndarray], path: Path, colours: int, rate: float) -> None:
     """A looping GIF of one palette, that of the first, middle and last picture. Equal pixels of successive pictures
-    stay equal, so nothing is dithered and what does not move costs nothing."""
+    stay equal and cost nothing."""
     from PIL import Image
 
     images: list[Any] = [Image.fromarray(picture) for picture in pictures]
