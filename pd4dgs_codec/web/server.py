@@ -134,6 +134,8 @@ class Server(ThreadingTCPServer):
         if not self.root.is_dir():
             raise DeliveryError(f"{folder}: is no folder, expected one to serve")
         self.link, self.latency, self.log = link or Link(), latency, log
+        #: Connections that owe a request, with the time.monotonic() of its deadline.
+        self.waiting: dict[socket.socket, float] = {}
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:
             super().__init__((host, port), _Handler)
@@ -162,6 +164,14 @@ class Server(ThreadingTCPServer):
             self.shutdown()
             self.server_close()
             thread.join()
+
+    def service_actions(self) -> None:
+        """Disconnects clients whose request is overdue: a socket's own time limit begins anew with every byte."""
+        now = time.monotonic()
+        for connection, until in list(self.waiting.items()):
+            if now > until and self.waiting.pop(connection, 0.0):
+                with contextlib.suppress(OSError):
+                    connection.shutdown(socket.SHUT_RDWR)
 
     def handle_error(self, request: object, client_address: object) -> None:
         """Reports errors of this program; clients that disconnect are normal."""
@@ -219,23 +229,16 @@ class _Handler(BaseHTTPRequestHandler):
         time.sleep(self.server.latency)
 
     def handle_one_request(self) -> None:
-        # a socket's time limit begins anew with every byte
-        self._limit = threading.Timer(IDLE_SECONDS, self._disconnect)
-        self._limit.daemon = True
-        self._limit.start()
+        self.server.waiting[self.connection] = time.monotonic() + IDLE_SECONDS
         try:
             super().handle_one_request()
         finally:
-            self._limit.cancel()
+            self.server.waiting.pop(self.connection, None)
 
     def parse_request(self) -> bool:
         complete = super().parse_request()
-        self._limit.cancel()
+        self.server.waiting.pop(self.connection, None)
         return complete
-
-    def _disconnect(self) -> None:
-        with contextlib.suppress(OSError):
-            self.connection.shutdown(socket.SHUT_RDWR)
 
     def do_GET(self) -> None:
         self._answer(body=True)
