@@ -74,7 +74,7 @@ function readStepClasses(reader, rows) {
 }
 
 /** Form 0. @param {Uint8Array} bytes @param {Int32Array} stepClasses @param {number} rows @param {Int32Array} out
- * @param {import("./channels.js").Definitions} known */
+ * @param {import("./channels.js").Prior[]} known */
 function decodePlain(bytes, stepClasses, rows, out, known) {
   const groups = stepClasses.length ? groupByClass(stepClasses, STEP_CLASSES) : null;
   const sizes = groups ? [...groups.sizes] : [rows];

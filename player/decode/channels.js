@@ -26,27 +26,17 @@ const FIRST_REUSE = 8;
 
 /** positions ascend. @typedef {{positions: number[], values: number[]}} Exceptions */
 
-/** The priors that tokens of one section may refer to, in the order of their definition. */
-export class Definitions {
-  constructor() {
-    /** @type {Prior[]} */
-    this.priors = [];
-  }
-}
-
 /**
  * Decodes a section of coded channels of these lengths, one behind the other into `out`, which they fill.
  *
  * @param {Uint8Array} bytes @param {ArrayLike<number>} counts @param {Int32Array} out
- * @param {Definitions} [known] of the slices before; what this section defines is added
- * @param {number} [free] entries of all tables, beyond one per symbol, where nothing is known
+ * @param {Prior[]} [priors] defined by the slices before, in order; those of this section are added
  */
-export function decodeChannels(bytes, counts, out, known = new Definitions(), free = FREE_ENTRIES) {
+export function decodeChannels(bytes, counts, out, priors = []) {
   const reader = new ByteReader(bytes);
-  const { priors } = known;
   const before = priors.length;
   let entries = 0;
-  let most = before ? MORE_ENTRIES : free;
+  let most = before ? MORE_ENTRIES : FREE_ENTRIES;
   for (let i = 0; i < counts.length; i++) most += counts[i];
   /** @type {{count: number, prior: Prior, exceptions: Exceptions | null}[]} */
   const channels = [];

@@ -133,7 +133,7 @@ export function readParameters(payload, kind, before, later) {
 }
 
 /** Clause 6.5. @param {string} where @param {Declared} declared with the latest slice @returns {Declared} the same */
-export function checkDeclared(where, declared) {
+function checkDeclared(where, declared) {
   const { rows, symbols, bytes } = declared;
   const mostRows = 2 ** 13 + 2 * bytes;
   if (rows > mostRows) throw limitExceeded(`${where}: ${rows} rows in ${bytes} bytes, limit ${mostRows}`);

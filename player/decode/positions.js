@@ -21,7 +21,7 @@ for (let byte = 0; byte < 256; byte++) {
 
 /**
  * @param {Uint8Array} bytes the section @param {number} rows at least 1
- * @param {import("./channels.js").Definitions} known see decodeChannels
+ * @param {import("./channels.js").Prior[]} known see decodeChannels
  * @returns {Int32Array} [rows, 3] voxel indices, in Morton order of their offsets from the minimum
  */
 export function decodePositions(bytes, rows, known) {

@@ -276,12 +276,7 @@ export class LayerReader {
  * @property {Continuation} continuation
  */
 
-/**
- * The attributes of a slice's rows.
- *
- * @param {Pick<LayerSymbols, "kind" | "parameters" | "stepClasses" | "attributes">} symbols
- * @param {import("./header.js").Header} header
- */
+/** The attributes of a slice's rows. @param {LayerSymbols} symbols @param {import("./header.js").Header} header */
 function attributesOf({ kind, parameters: { rows }, stepClasses, attributes }, header) {
   const { feature: D, slots: G } = kind.widths;
   let first = 0;

@@ -1,14 +1,12 @@
 // Clauses 3.6, 8 and 12.2: what the slices of a layer go on with, and the order of their rows.
 
-import { Definitions } from "./channels.js";
-
 /**
  * What later slices of a layer may refer to: the priors of each section, by its name or the number of a stage, and the
  * latest prediction block.
  */
 export class Continuation {
   constructor() {
-    /** @type {Map<string | number, Definitions>} */
+    /** @type {Map<string | number, import("./channels.js").Prior[]>} */
     this._sections = new Map();
     /** @type {import("./attributes.js").Block | null} */
     this.block = null;
@@ -17,19 +15,17 @@ export class Continuation {
   /** @param {string | number} section */
   definitions(section) {
     let known = this._sections.get(section);
-    if (!known) this._sections.set(section, (known = new Definitions()));
+    if (!known) this._sections.set(section, (known = []));
     return known;
   }
 
   /** A function that forgets what a slice added from now on: a fault in it may be mended by fetching it again. */
   mark() {
     const { block } = this;
-    const sizes = new Map([...this._sections].map(([name, { priors }]) => [name, priors.length]));
+    const sizes = new Map([...this._sections].map(([name, priors]) => [name, priors.length]));
     return () => {
       this.block = block;
-      for (const [name, known] of this._sections) {
-        known.priors.length = sizes.get(name) ?? 0;
-      }
+      for (const [name, priors] of this._sections) priors.length = sizes.get(name) ?? 0;
     };
   }
 }

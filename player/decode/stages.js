@@ -118,7 +118,7 @@ export function groupByClass(classes, count) {
  * Decodes one stage into its channels. groups: per channel how its rows are split, null if they are not.
  *
  * @param {Uint8Array} bytes @param {Int32Array[]} targets
- * @param {(Groups | null)[]} groups @param {import("./channels.js").Definitions} [known] see decodeChannels
+ * @param {(Groups | null)[]} groups @param {import("./channels.js").Prior[]} [known] see decodeChannels
  */
 export function decodeStage(bytes, targets, groups, known) {
   /** @type {number[]} */
