@@ -1,6 +1,6 @@
-"""ISO base media files (ISO/IEC 14496-12) around opaque payloads: one metadata track per layer, one fragment each.
+"""ISO base media files (ISO/IEC 14496-12) with opaque payloads: one metadata track per slice, of one fragment.
 
-Writing takes the few boxes that a reader insists on. Reading walks boxes, for the fragments of a file made elsewhere.
+The writer makes the few boxes that readers require; the reader finds the fragments of other files.
 """
 
 from __future__ import annotations
@@ -16,13 +16,13 @@ MIME_FORMAT = b"application/x-pd4"
 MAX_BOX = (1 << 32) - 1
 
 _IDENTITY = struct.pack(">9I", 1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30)
-_SYNC = 0x02000000  # sample flags speak of samples of the same track, and each track has one
+_SYNC = 0x02000000  # the sample depends on no other of its track
 _DEFAULT_BASE_IS_MOOF = 0x020000
 _CONTAINERS = {b"moov", b"trak", b"mdia", b"minf", b"stbl", b"mvex", b"moof", b"traf"}
 
 
 def box(kind: bytes, *parts: bytes) -> bytes:
-    """One box. Raises DeliveryError if it is larger than 32 bits can tell."""
+    """One box. Raises DeliveryError if its size exceeds 32 bits."""
     size = 8 + sum(map(len, parts))
     if size > MAX_BOX:
         raise DeliveryError(f"a layer of {size:,} bytes, an MP4 box holds at most {MAX_BOX:,}")
@@ -85,7 +85,7 @@ def fragment(number: int, track: int, payload: bytes, ticks: int) -> bytes:
 
 
 class Box(NamedTuple):
-    """kind, and the places of its first byte, of its content and of the byte after it."""
+    """kind, and the offsets of its first byte, of its content and of its end (exclusive)."""
 
     kind: bytes
     start: int
@@ -94,7 +94,7 @@ class Box(NamedTuple):
 
 
 def boxes(data: bytes, start: int = 0, end: int | None = None) -> Iterator[Box]:
-    """The boxes side by side in data[start:end]. Raises DeliveryError where they do not fill it."""
+    """The sequence of boxes in data[start:end]. Raises DeliveryError if they do not fill it."""
     end = len(data) if end is None else end
     while start < end:
         size, kind = struct.unpack_from(">I4s", data, start) if end - start >= 8 else (0, b"")
@@ -108,7 +108,7 @@ def boxes(data: bytes, start: int = 0, end: int | None = None) -> Iterator[Box]:
 
 
 def find(data: bytes, kind: bytes, inside: Sequence[Box]) -> Iterator[Box]:
-    """All boxes of a kind within others, at any depth that containers reach."""
+    """All boxes of a kind inside others, at any depth."""
     for parent in inside:
         for child in boxes(data, parent.content, parent.end):
             if child.kind == kind:
@@ -118,7 +118,7 @@ def find(data: bytes, kind: bytes, inside: Sequence[Box]) -> Iterator[Box]:
 
 
 class Fragment(NamedTuple):
-    """Places of a `moof` and the `mdat` behind it, and how many samples they hold."""
+    """Offsets of a `moof` and the `mdat` after it, and their number of samples."""
 
     start: int
     end: int

@@ -1,4 +1,4 @@
-"""The streaming client: whatever the server does, only whole layers of one file are shown.
+"""The resuming client: whatever the server does, only complete slices of one file are yielded.
 
 Cuts at random, silence, a slump of the link and files that change are cases of test_client_faults.py.
 """
