@@ -1,5 +1,5 @@
-"""Cameras to pictures, without torch: Gaussians as numpy arrays in, a picture out (`rasteriser.draw`).
+"""Scenes to pictures, without torch: numpy arrays in, Gaussians and pictures out, by numba kernels on the CPU.
 
-`autograd` is the same with gradients, for torch tensors, and alone imports torch. Import `pd4dgs_codec.threads`
-first where the number of threads matters.
+`player.Player` draws a decoded scene, `rasteriser.draw` any Gaussians. Import `pd4dgs_codec.threads` first where the
+number of threads matters.
 """

@@ -57,7 +57,7 @@ SIGMA_REACH = 3.33
 FRUSTUM_MARGIN = 0.15
 #: Least distance of the near plane, scene units: the rasteriser divides by depths.
 LEAST_NEAR = 1e-6
-#: Below this a quaternion is divided by it instead of by its norm, as `torch.nn.functional.normalize` does.
+#: Least divisor of a quaternion or direction, as in `torch.nn.functional.normalize`.
 MIN_NORM = 1e-12
 #: First columns of the parts of a Gaussian's row.
 SCALE, QUAT, OPACITY, COLOR = 3, 6, 10, 11
@@ -236,7 +236,7 @@ def finished(gaussians: np.ndarray, gates: np.ndarray, loose: bool) -> tuple[np.
 
 @kernel(inline=True)
 def _part(keep: np.ndarray, slots: int, part: int, parts: int) -> tuple[int, int]:
-    """The range of `keep` that is part's own: no anchor is in two parts."""
+    """The range of `keep` of one part: no anchor is in two parts."""
     begin, end = len(keep) * part // parts, len(keep) * (part + 1) // parts
     while 0 < begin < len(keep) and keep[begin] // slots == keep[begin - 1] // slots:
         begin += 1
@@ -247,7 +247,7 @@ def _part(keep: np.ndarray, slots: int, part: int, parts: int) -> tuple[int, int
 
 @kernel(inline=True)
 def _noisy(out: np.ndarray, to: int, values: np.ndarray, at: int, noise: np.ndarray, first: int, size: Vector) -> None:
-    """LANES of `out` = those of `values` plus size times those of `noise`."""
+    """Stores LANES of `values` plus `size` times `noise` to `out`."""
     store(out, to, load(values, at) + load(noise, first) * size)
 
 
@@ -264,8 +264,8 @@ def pick(
     spacing: np.ndarray,
     centre: np.ndarray,
 ) -> None:
-    """The columns of `out` from `column` on = values [N, w] at rows int64 [n], rounded to centre [w] and multiples of
-    `step` times spacing [N] beside it, or with noise [n, w] times as much; noise [0, w] is none."""
+    """Fills the columns of `out` from `column` on with values [N, w] at rows int64 [n]. rounding: to centre [w] plus
+    multiples of `step` times spacing [N]; else noise [n, w], in those steps, is added; noise [0, w] is none."""
     real, width = values.dtype.type, values.shape[1]
     for i in range(tasks[0], tasks[1]):
         size, to, at = real(step) * spacing[rows[i]], i * out.shape[1] + column, rows[i] * width
@@ -287,7 +287,7 @@ def pick(
 
 @parallel(lambda grad, g, column, rows: len(rows))
 def pick_backward(tasks: Tasks, grad: np.ndarray, g: np.ndarray, column: int, rows: np.ndarray) -> None:
-    """The transpose of `pick`; grad [N, w] is given zeroed, no row comes twice."""
+    """The transpose of `pick`: fills grad [N, w], given zeroed, at `rows`, of which none comes twice."""
     width = grad.shape[1]
     for i in range(tasks[0], tasks[1]):
         copy(grad, rows[i] * width, g, i * g.shape[1] + column, width)
@@ -310,7 +310,7 @@ def inputs(tasks: Tasks, out: np.ndarray, distance: np.ndarray, anchors: np.ndar
 
 @parallel(lambda g_anchors, *_: len(g_anchors))
 def inputs_backward(tasks: Tasks, g_anchors: np.ndarray, g: np.ndarray, out: np.ndarray, distance: np.ndarray) -> None:
-    """The transpose of `inputs`, which gave `out` and `distance`; adds to g_anchors."""
+    """The transpose of `inputs`, whose results are `out` and `distance`: adds to g_anchors."""
     width = g.shape[1] - 3
     for n in range(tasks[0], tasks[1]):
         for c in range(width):
@@ -355,7 +355,7 @@ def linear(
     weight: np.ndarray,
     bias: np.ndarray,
 ) -> None:
-    """out [K, w] = the outputs of a linear layer, as `by_slot` has it, that belong to the kept slots."""
+    """Fills out [K, w] with the outputs of a linear layer, packed by `by_slot`, that belong to the kept slots."""
     slots, inputs, width = weight.shape[0], weight.shape[1], out.shape[1]
     zero, step = wide_splat(hidden.dtype.type(0)), WIDE // LANES
     outputs = aligned(LANES, hidden.dtype.type)
@@ -384,8 +384,8 @@ def linear_backward(
     column: int,
     weight: np.ndarray,
 ) -> None:
-    """The transpose of `linear`; weight [G w, H in whole vectors]. Results, given zeroed: grad_hidden (as hidden) and
-    of each part grad_weight [parts, G w, H] and grad_bias [parts, G w]."""
+    """The transpose of `linear`; weight [G w, H in whole vectors]. Fills, given zeroed, grad_hidden (as hidden) and per
+    part grad_weight [parts, G w, H] and grad_bias [parts, G w]."""
     width, inputs, parts, slots = g.shape[1], grad_weight.shape[2], len(grad_weight), len(weight) // g.shape[1]
     columns, rows, most, real = weight.shape[1], up(width, PRODUCT_ROWS), up(KEPT, PRODUCT_ROWS), hidden.dtype.type
     for part in range(tasks[0], tasks[1]):
@@ -441,7 +441,7 @@ def assemble(
     relative: np.ndarray,
     color: np.ndarray,
 ) -> None:
-    """gaussians and gates [K] of the kept slots.
+    """Fills gaussians and gates [K] of the kept slots.
 
     extent [n, 6]: the exponentials of log scalings, of the offsets, then of the Gaussians; opacity [n, G]; mask [n];
     shape [K, 7], its last four the quaternion; relative [K, 7], its first three the sizes within 0..1; color [K, 3].
@@ -463,7 +463,7 @@ def assemble(
 
 @kernel(inline=True)
 def _norm(values: np.ndarray, k: int, first: int) -> Any:
-    """That of the four values of row k from column `first` on, and no less than MIN_NORM."""
+    """The norm of the four values of row k from column `first` on, at least MIN_NORM."""
     square = values[k, first] * values[k, first] + values[k, first + 1] * values[k, first + 1]
     square += values[k, first + 2] * values[k, first + 2] + values[k, first + 3] * values[k, first + 3]
     return max(math.sqrt(square), values.dtype.type(MIN_NORM))
@@ -471,8 +471,8 @@ def _norm(values: np.ndarray, k: int, first: int) -> Any:
 
 @kernel(inline=True)
 def _unit_backward(out: np.ndarray, values: np.ndarray, g: np.ndarray, k: int, to: int, of: int, at: int) -> None:
-    """Row k of `out` from column `to` on = the gradient by the four values from `of` on of what `_norm` divides, from
-    that of the quotients, in g from `at` on."""
+    """Stores to row k of `out`, from column `to` on, the gradient by the four values from `of` on, from the gradient by
+    their quotients by `_norm`, in g from `at` on."""
     norm = _norm(values, k, of)
     along = values.dtype.type(0)
     if norm > values.dtype.type(MIN_NORM):
@@ -501,8 +501,8 @@ def assemble_backward(
     g_gates: np.ndarray,
     parts: int,
 ) -> None:
-    """The transpose of `assemble`. Results, given zeroed but g_shape and g_color. Gradients are those before the tanh
-    of opacities and the sigmoids that gave `relative` and the colours; g_anchors by log scalings, and no features."""
+    """The transpose of `assemble`: fills g_anchors, g_opacity and g_mask, given zeroed, and g_shape and g_color: the
+    gradients before the tanh of opacities and the sigmoids of sizes and colours, and by log scalings."""
     slots, scaling = g_opacity.shape[1], anchors.shape[1] - SCALING_DIM
     offset = scaling - 3 * slots
     for part in range(tasks[0], tasks[1]):
@@ -543,7 +543,7 @@ def finish(
     gates: np.ndarray,
     loose: bool,
 ) -> None:
-    """The parts of gaussians under gates [K]; loose: clamped and normalised first."""
+    """Fills the parts of gaussians under gates [K]; loose: clamped and normalised first."""
     zero, one = gaussians.dtype.type(0), gaussians.dtype.type(1)
     for k in range(tasks[0], tasks[1]):
         inverse = one / _norm(gaussians, k, QUAT) if loose else one
@@ -572,7 +572,7 @@ def finish_backward(
     g_colors: np.ndarray,
     loose: bool,
 ) -> None:
-    """The transpose of `finish`: g [K, 14], g_gates [K]."""
+    """The transpose of `finish`: fills g [K, 14] and g_gates [K]."""
     zero, one = gaussians.dtype.type(0), gaussians.dtype.type(1)
     for k in range(tasks[0], tasks[1]):
         opacity = gaussians[k, OPACITY]

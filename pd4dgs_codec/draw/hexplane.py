@@ -144,7 +144,7 @@ def _address(
     box: np.ndarray,
     channels: int,
 ) -> tuple[Six, Six, Three, Three]:
-    """Of one point and scale: flat offsets of its six lookups, the steps to its neighbours, fractions and slopes.
+    """The flat offsets of one point's six lookups at one scale, the steps to its neighbours, fractions and slopes.
 
     Offsets: xy, xz, yz in the grid and x, y, z in the rows. Steps: to the next cell along x, y, z (0 on an axis of one
     cell) where it is the inner axis, then as the outer axis of xy, xz, yz.
@@ -172,7 +172,7 @@ def sample(
     points: np.ndarray,
     box: np.ndarray,
 ) -> None:
-    """out [N, S * C] = per scale the product of the six planes at `points`."""
+    """Fills out [N, S * C] with the product of the six planes at `points`, per scale."""
     channels = grid.shape[1]
     real = grid.dtype.type
     for n in range(tasks[0], tasks[1]):
@@ -205,7 +205,7 @@ def _point_gradient(
     out: np.ndarray,
     out_offset: int,
 ) -> None:
-    """Adds one point's gradient at one scale to `grad` and `grad_rows`, and writes that of the point to flat `out`."""
+    """Adds one point's gradient at one scale to `grad` and `grad_rows`; stores that by the point to flat `out`."""
     xy, xz, yz, rx, ry, rz = offsets
     dx, dy, dz, xy_y, xz_z, yz_z = steps
     real = grid.dtype.type
@@ -290,7 +290,7 @@ def collapse(
     t: float,
     step: float,
 ) -> None:
-    """rows [n_rows, C] = the time planes of `grid` at normalised time t, rounded to multiples of `step` if step > 0."""
+    """Fills rows [n_rows, C] with the time planes of `grid` at time t, rounded to multiples of `step` if step > 0."""
     real = grid.dtype.type
     for s in range(len(reso)):
         first, f, _ = _locate(t, 0.0, 1.0, reso[s, 3])

@@ -1,13 +1,13 @@
-"""How numba kernels are compiled, and explicit vectors for them: `LANES` floats, or `WIDE`, as one value.
+"""The decorators of numba kernels, and explicit vectors for them: `LANES` floats, or `WIDE`, as one value.
 
 LLVM's loop vectoriser gives up on a loop that reads a dozen rows and writes others, since it cannot prove that they do
-not overlap (numba has no `noalias`), and on short rows it stores every sum back to memory. With a vector type the inner
-loop is what is written: each operation is one LLVM instruction, which LLVM splits where registers are narrower. On
-lookups in planes it was measured 2.6 to 4.5 times faster.
+not overlap (numba has no `noalias`), and on short rows it stores every sum back to memory. With a vector type each
+operation of the inner loop is one LLVM instruction, which LLVM splits where registers are narrower. Lookups in planes
+are 2.6 to 4.5 times faster so.
 
-No sum is reordered, and nothing is fused but what `fma` and `fnma` say: then the bits of a result do not depend on how
-often LLVM optimised a function. With numba's fast math they may: what a kernel calls is optimised on its own and again
-inside the kernel.
+Sums are never reordered, and only `fma` and `fnma` fuse operations, so that the bits of a result do not depend on how
+often LLVM optimised a function. With numba's fast math they may: a function is optimised on its own and again inside
+the kernel that calls it.
 
 Arrays are float32 or float64, C-contiguous, of any rank; an index is an offset into the flattened array, unchecked.
 
@@ -33,22 +33,22 @@ from numba.extending import models, overload, register_model
 from pd4dgs_codec import threads
 
 LANES = 8
-#: Floats of the widest register of the CPU that numba compiles for, which is what its cache is keyed by.
+#: Floats in the widest register of the CPU that numba compiles for (its cache is keyed by that CPU).
 WIDE = 16 if "+avx512f" in cpu_target.target_context.codegen().magic_tuple()[2] else LANES
-#: Rows and vectors of WIDE floats of a `product`: their sums leave registers for the rows that are read.
+#: Rows and vectors of WIDE floats of a `product`: as many sums as leave registers for the rows that are read.
 PRODUCT_ROWS, PRODUCT_VECTORS = 12 if WIDE > LANES else 6, 2
 
 CACHE_LINE = 64  #: bytes
 
 Vector = Any  #: in annotations of kernels: a value of the numba type `Lanes`
-Tasks = tuple[int, int]  #: the first task and the one behind the last
+Tasks = tuple[int, int]  #: a range of tasks: the first, and the end
 _Function = TypeVar("_Function", bound=Callable[..., Any])
 _Arguments = ParamSpec("_Arguments")
 _intrinsic: Callable[[Callable[..., Any]], Callable[..., Any]] = _numba_intrinsic
 
 
 class _Uncollected(event.Listener):
-    """While numba compiles, Python does not look for garbage: a sixth of the time went there."""
+    """Turns Python's garbage collection off while numba compiles: it took a sixth of the time."""
 
     depth, was_enabled = 0, False  #: under numba's lock of all compiling
 
@@ -82,8 +82,8 @@ def kernel(*, inline: bool = False) -> Callable[[_Function], _Function]:
         template = compiled.get_call_template
 
         def get_call_template(args: Sequence[Any], named: dict[str, Any]) -> Any:
-            """Of a call from another kernel. A constant is a type of its own to numba, which would compile the function
-            anew for each; LLVM knows the constants of what it inlines all the same."""
+            """For calls from other kernels. To numba a constant is a type of its own, for which it would compile the
+            function again; LLVM propagates constants into inlined functions all the same."""
             return template(tuple(map(types.unliteral, args)), named)
 
         compiled.get_call_template = get_call_template
@@ -96,10 +96,10 @@ def kernel(*, inline: bool = False) -> Callable[[_Function], _Function]:
 def parallel(
     tasks: Callable[..., int],
 ) -> Callable[[Callable[Concatenate[Tasks, _Arguments], None]], Callable[_Arguments, None]]:
-    """Decorator of a `kernel` of so many independent tasks, as `tasks` answers from its arguments; threads share them.
+    """Decorator of a `kernel` whose independent tasks threads share; `tasks` gives their number from its arguments.
 
-    The kernel does those of its first argument, which callers leave out: all, or a part in each of several calls.
-    numba's own parallel loops take more than twice as long to compile and to load.
+    The kernel's first argument, which callers leave out, is the range of tasks to do: all, or a part in each of several
+    calls. numba's own parallel loops take more than twice as long to compile and to load.
     """
 
     def decorate(function: Callable[Concatenate[Tasks, _Arguments], None]) -> Callable[_Arguments, None]:
@@ -130,14 +130,14 @@ class _LanesModel(models.PrimitiveModel):
 
 
 def _define(op: Callable[..., Any], instruction: str) -> None:
-    """Gives `vector op vector` its LLVM instruction; numba compiles it with the options of the function it is in."""
+    """Makes `vector op vector` one LLVM instruction, compiled with the options of the function around it."""
 
     @_intrinsic
     def apply(typingctx: Any, a: Any, b: Any) -> Any:
         return a(a, b), lambda context, builder, sig, args: getattr(builder, instruction)(*args)
 
     @overload(op)
-    def _operator(a, b):  # type: ignore[no-untyped-def]  # numba compares the annotations of it and of what it returns
+    def _operator(a, b):  # type: ignore[no-untyped-def]  # numba compares its annotations with those of the function it returns
         return (lambda a, b: apply(a, b)) if isinstance(a, Lanes) and a == b else None
 
 
@@ -172,7 +172,7 @@ def _splat(builder: Any, scalar: Any, kind: Any) -> Any:
 
 
 def _call(builder: Any, name: str, arguments: Sequence[Any]) -> Any:
-    """The LLVM intrinsic `name` of vectors, which gives one of their type."""
+    """The LLVM intrinsic `name` of vectors of one type, which is also that of the result."""
     kind = arguments[0].type
     width = 32 if isinstance(kind.element, ir.FloatType) else 64
     function_type = ir.FunctionType(kind, [kind] * len(arguments))
@@ -235,7 +235,7 @@ splat, wide_splat = _splat_of(LANES), _splat_of(WIDE)
 
 @_intrinsic
 def spread(typingctx: Any, array: Any, index: Any) -> Any:
-    """WIDE lanes: flat array[index] in the first LANES of them, and what comes next in the others, if there are any."""
+    """WIDE lanes: flat array[index] in the first LANES, and flat array[index + 1] in the others, if there are any."""
     if not _readable(array):
         return None
     result = Lanes(array.dtype, WIDE)
@@ -319,7 +319,7 @@ def _product(rows: int, vectors: int) -> Callable[..., Any]:
             align, index, whole = y.dtype.bitwidth // 8, ir.IntType(64), range(vectors)
 
             def place(first: int, step: Any, row: int) -> Any:
-                """Of row number `row` of the array that is argument `first`, and whose rows are `step` apart."""
+                """Pointer to row number `row` of the array at argument `first`, whose rows are `step` apart."""
                 at = builder.add(args[first + 1], builder.mul(step, index(row)))
                 return _address(context, builder, sig.args[first], args[first], at)
 
@@ -355,11 +355,12 @@ def _product(rows: int, vectors: int) -> Callable[..., Any]:
     return _intrinsic(function)
 
 
-#: y = start + a b, what is negative 0 if `relu` (NaN passes), of PRODUCT_ROWS rows and PRODUCT_VECTORS * WIDE columns.
+#: y = start + a b, of PRODUCT_ROWS rows and PRODUCT_VECTORS * WIDE columns; with `relu` negative values become 0 (NaN
+#: passes).
 #:
-#: Each array comes with the offset of its first number and the distance between its rows: 0 where they are one row.
-#: a's columns are `a_step` apart; it has `count` of them, and b as many rows. Sums are in the order of the columns,
-#: fused where the CPU can, so the bits do not depend on how the whole is cut into blocks.
+#: Each array comes with the offset of its first number and the distance between its rows, 0 for a single row. The
+#: `count` columns of a, `a_step` apart, meet as many rows of b. Sums are in the order of the columns, fused where the
+#: CPU can, so that the bits do not depend on the blocks that a product is cut into.
 product = _product(PRODUCT_ROWS, PRODUCT_VECTORS)
 #: The same of WIDE columns.
 narrow_product = _product(PRODUCT_ROWS, 1)
@@ -375,7 +376,7 @@ def sqrt(typingctx: Any, a: Any) -> Any:
 
 #: Minimax fit of 2**f, |f| <= 1/2, lowest power first: relative error 7.5e-8 before rounding.
 _EXP2 = (1.00000012, 0.693146944, 0.240221202, 0.0555071309, 0.00967554096, 0.00132764701)
-#: Added to a float32 of magnitude below 2**22 it rounds it to an integer, which its lowest bits then hold.
+#: Added to a float32 of magnitude below 2**22 it rounds to an integer, held by the lowest bits of the sum.
 _ROUND = 1.5 * 2.0**23
 
 
@@ -412,7 +413,7 @@ def select_gt(typingctx: Any, a: Any, b: Any, yes: Any, no: Any) -> Any:
 
 @_intrinsic
 def mask_gt(typingctx: Any, a: Any, b: Any) -> Any:
-    """uint64 whose bit i says a > b in lane i (NaN gives 0)."""
+    """uint64 whose bit i is 1 where a > b in lane i (NaN gives 0)."""
     if not _same(a, b):
         return None
 
@@ -442,7 +443,7 @@ def _sum_of(builder: Any, a: Any, b: Any, even: Sequence[int], odd: Sequence[int
 
 @_intrinsic
 def folded(typingctx: Any, a: Any) -> Any:
-    """LANES lanes of WIDE: the first plus the others, if there are others."""
+    """LANES lanes from WIDE: the first LANES plus the others, if there are any."""
     if not isinstance(a, Lanes) or a.count != WIDE:
         return None
 
@@ -505,7 +506,7 @@ def copy(typingctx: Any, to: Any, to_at: Any, array: Any, at: Any, count: Any) -
 
 @kernel()
 def aligned(size: int, dtype: Any) -> np.ndarray:
-    """`size` zeros that start where a cache line does: a WIDE vector that lies in two lines takes twice as long."""
+    """`size` zeros from the start of a cache line: loading a WIDE vector that spans two lines takes twice as long."""
     array = np.zeros(size + CACHE_LINE, dtype)
     first = -array.ctypes.data % CACHE_LINE // array.itemsize
     return array[first : first + size]

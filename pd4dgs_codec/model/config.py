@@ -1,4 +1,4 @@
-"""Sizes of the model, as frozen data, and the three presets."""
+"""Sizes of a model, and the three presets."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS, Steps
 
 @dataclass(frozen=True)
 class DeformationConfig:
-    """A HexPlane and its MLP. `multires` multiplies `resolution`, that of x, y and z, not time."""
+    """A HexPlane and its networks. multires: a factor per scale on `resolution`, that of x, y and z."""
 
     resolution: int
     time_resolution: int
@@ -19,14 +19,14 @@ class DeformationConfig:
     heads: tuple[str, ...]
 
 
-#: Of the presets, before the dial of quality moves them. The planes' rate makes planes so flat that coarse steps cost
-#: them nothing.
+#: Quantisation steps of the presets, before the quality dial scales them. The rate of the planes makes them so flat
+#: that coarse steps lose nothing.
 STEPS = Steps(planes_global=0.2, planes_local=1 / 3)
 
 
 @dataclass(frozen=True)
 class ModelConfig:
-    """Both deformations (None: the level adds none) and how many anchors training starts from and stays below."""
+    """Both deformations (None: absent), and the counts of anchors that training starts from and stays below."""
 
     global_deformation: DeformationConfig | None
     local_deformation: DeformationConfig | None
@@ -54,7 +54,7 @@ PRESETS: dict[str, ModelConfig] = {
         DeformationConfig(32, 24, 16, (1, 2), 64, _GLOBAL),
         DeformationConfig(48, 50, 16, (1, 2), 32, _LOCAL),
     ),
-    # grids of the paper's backbone: planes alone are 291,840 and 1,904,640 values; its MLPs are 128 wide, these 64
+    # the grids of the paper: 291,840 and 1,904,640 values; its networks are 128 wide, these 64
     "paper": ModelConfig(
         DeformationConfig(32, 10, 16, (1, 2), 64, _GLOBAL),
         DeformationConfig(64, 100, 16, (1, 2), 64, _LOCAL),

@@ -39,8 +39,8 @@ _SQRT_HALF = math.sqrt(0.5)
 
 
 def _log_ratio(z: Tensor, h: Tensor, u: Tensor, v: Tensor) -> Tensor:
-    """ln(phi(u) / P): what the gradients need, and ln P = ln phi(u) - it. In the tails both grow like z^2 and their
-    difference does not, so this one is computed and the other derived."""
+    """ln(phi(u) / P), for the gradients and for ln P. In the tails ln P and ln phi(u) grow like z^2, their difference
+    does not, so the difference is computed."""
     narrow = h * z.clamp(min=1.0) < NARROW[z.dtype]
     tail = ~narrow & (u >= 0)
     centre = ~(narrow | tail)
@@ -102,7 +102,7 @@ def log_probability(a: Tensor, mu: Tensor, sigma: Tensor, q: Tensor | float) -> 
 
 
 class _ClipValue(torch.autograd.Function):
-    """The clipped bits forward; the unclipped log's gradient backward, so that outliers still feel the rate."""
+    """The clipped bits forward; the gradient of the unclipped bits backward, so that it still reaches outliers."""
 
     @staticmethod
     def forward(ctx: Any, bits: Tensor) -> Tensor:
@@ -232,7 +232,7 @@ def _moments_gradient(
 
 
 class _RowBits(torch.autograd.Function):
-    """`row_bits_reference` in numba, with one gradient for all of it."""
+    """`row_bits_reference` in numba, with its gradient."""
 
     @staticmethod
     def forward(ctx: Any, classes: Tensor, rows: Tensor, steps: Sequence[float], *parts: Tensor) -> Tensor:

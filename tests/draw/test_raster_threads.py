@@ -198,14 +198,6 @@ def test_a_users_choice_of_policy_stays():
     assert _run(_CHILD, OMP_WAIT_POLICY="active") == ["1", "active"]
 
 
-@pytest.mark.slow
-def test_first_call_of_a_warm_cache_is_quick():
-    code = _CHILD.replace("draw(*g", "import time; start = time.perf_counter(); draw(*g")
-    code += "print(time.perf_counter() - start)"
-    _run(code)
-    assert float(_run(code)[-1]) < 1.0
-
-
 def test_numba_loads_without_its_companions_where_a_command_asks():
     code = "import sys; before = set(sys.modules); from pd4dgs_codec.threads import load_numba; load_numba(); "
     code += "load_numba(); new = set(sys.modules) - before; print('numba' in new, {'scipy', 'coverage'} & new, "

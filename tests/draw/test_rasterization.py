@@ -176,56 +176,21 @@ NAN, INF = float("nan"), float("inf")
 NEAR = 0.01
 VIEW = camera(40, 30)
 
-#: (tensor, value put into Gaussians 0..2, must they be invisible)
-VALUES = [
-    *[("quats", (v, v, v, v), False) for v in (0.0, 1e-20, -1e20, 1e-45, 3e38)],
-    *[("scales", v, False) for v in ((0.0,) * 3, (1e-20,) * 3, (0.5, 0.5, 0.0), (5.0, 1e-6, 1e-6), (-0.1,) * 3)],
-    *[("scales", (v,) * 3, False) for v in (1e6, 1e18)],
-    *[("means", (0.1, 0.0, z), True) for z in (NEAR, 0.0, -0.0, -3.0, 2e10)],
-    *[("means", (0.1, 0.0, z), False) for z in (NEAR + 1e-7, 1e9, 1e10)],
-    ("means", (0.0, 0.0, 0.0), True),
-    ("means", (4.0, -3.0, NEAR + 1e-6), False),
-    ("means", (1e8, 1e8, 1e9), False),
-    ("means", (1e30, 0.0, 1.0), False),
-    *[("opacities", v, True) for v in (0.0, 1 / 256, -0.5, INF)],
-    *[("opacities", v, False) for v in (1 / 255, 1 / 255 + 1e-7, 1.0, 1.5, 1e30)],
-    *[(name, v, True) for name in ("means", "quats", "scales", "opacities") for v in (NAN, INF, -INF)],
-]
-
-
-def assert_finite(result):
-    for key, value in (result | {"means2d": result["meta"]["means2d"]}).items():
-        assert key == "meta" or torch.isfinite(value).all(), key
-
-
-@pytest.mark.parametrize("name, value, invisible", VALUES)
-def test_one_bad_value(name, value, invisible):
-    tensors = with_values(name, value)
-    found = draw_with_gradients(tensors, VIEW, "cpu", near_plane=NEAR)
-    assert_finite(found)
-    if not invisible:
-        return
-    assert (found["meta"]["radii"][0, :3] == 0).all()
-    assert all((found["d " + k][:3] == 0).all() for k in NAMES)
-    rest = draw_with_gradients([t[3:] for t in tensors], VIEW, "cpu", near_plane=NEAR)
-    assert torch.equal(found["picture"], rest["picture"])  # the others are drawn as if it were not there
-    assert all(torch.equal(found["d " + k][3:], rest["d " + k]) for k in NAMES)
-
 
 @pytest.mark.parametrize(
     "name, value",
     [
-        ("quats", (0.0,) * 4), ("quats", (1e-20,) * 4), ("quats", (1e20,) * 4), ("quats", (3e38,) * 4),
-        ("scales", (0.0,) * 3), ("scales", (5.0, 1e-6, 1e-6)), ("scales", (-0.1,) * 3),
-        ("scales", (1e6,) * 3), ("opacities", 1.0), ("opacities", 1.5), ("opacities", 0.0),
-        ("means", (0.1, 0.0, 1e9)), ("means", (0.05, 0.0, 0.02)),
+        *[("quats", (v,) * 4) for v in (-1e20, 1e-45)],
+        *[("scales", (v,) * 3) for v in (1e6, 1e18)],
+        *[("means", v) for v in ((0.1, 0.0, 1e10), (4.0, -3.0, NEAR + 1e-6), (1e8, 1e8, 1e9), (1e30, 0.0, 1.0))],
+        *[("opacities", v) for v in (1 / 256, 1.0, 1e30, INF)],
     ],
-)  # fmt: skip
-def test_extreme_values_agree_with_the_oracle(name, value):
-    errors, *_ = oracle_errors(with_values(name, value, seed=1), VIEW)
-    for k, error in errors.items():
-        if not (name == "quats" and k == "d quats"):  # 1e20 times larger than the others' gradients
-            assert error < 2e-5, (k, error)
+)
+def test_extreme_values_give_finite_pictures_and_gradients(name, value):
+    """Beside the values that `pd4dgs-bench stability` holds against the oracle."""
+    found = draw_with_gradients(with_values(name, value), VIEW, "cpu", near_plane=NEAR)
+    assert all(torch.isfinite(tensor).all() for key, tensor in found.items() if key != "meta")
+    assert torch.isfinite(found["meta"]["means2d"]).all()
 
 
 @pytest.mark.parametrize("scale", [1e6, 1e18, 3e37])
@@ -253,40 +218,6 @@ def test_a_zero_quaternion_is_the_identity_without_gradient():
     a, b = (draw_with_gradients(t, VIEW, "cpu") for t in (zero, one))
     assert torch.equal(a["picture"], b["picture"])
     assert (a["d quats"][:3] == 0).all() and (b["d quats"][:3] != 0).any()
-
-
-@pytest.mark.parametrize("n, z", [(0, 1.0), (20, -1.0)])
-def test_nothing_to_draw(n, z):
-    tensors = scene(n)
-    with torch.no_grad():
-        tensors[0][:, 2] *= z
-    found = draw_with_gradients(tensors, camera(20, 10), "cpu", (0.25, 0.5, 0.75))
-    assert (found["alpha"] == 0).all() and (found["picture"] == torch.tensor([0.25, 0.5, 0.75])).all()
-    assert all((found["d " + k] == 0).all() for k in NAMES)
-
-
-@pytest.mark.parametrize("n, opacity", [(64, 1.0), (2000, 0.005)])
-def test_coincident_gaussians(n, opacity):
-    tensors = scene(n, 2)
-    with torch.no_grad():
-        tensors[0][:] = torch.tensor([0.1, -0.1, 3.0])
-        tensors[1][:] = tensors[1][0].clone()
-        tensors[2][:], tensors[3][:] = 0.4, opacity
-    errors, found, _ = oracle_errors(tensors, camera(16, 16))
-    assert_finite(found)
-    assert errors["picture"] < 1e-5 and errors["d colors"] < 1e-4, errors
-
-
-def test_opaque_centre_exactly_on_a_pixel():
-    """alpha is clamped to 0.999 there: no gradient to opacity or position from that pixel, and T = 1e-3 behind it."""
-    tensors = scene(2, 3)
-    with torch.no_grad():
-        tensors[0][:] = torch.tensor([[0.0, 0.0, 2.0], [0.0, 0.0, 3.0]])
-        tensors[2][:], tensors[3][:] = 0.001, 1.0
-    errors, found, _ = oracle_errors(tensors, camera(1, 1))
-    assert found["alpha"].item() == pytest.approx(0.999, abs=1e-6)
-    assert found["d opacities"][0] == 0 and (found["d means"][0] == 0).all()
-    assert max(errors.values()) < 1e-5
 
 
 def test_depth_ties_under_permutation():
