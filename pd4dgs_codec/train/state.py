@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, overload
+from typing import Any
 
 import numpy as np
 import torch
@@ -52,7 +52,7 @@ class TrainingView:
         return float(((image - self.target.image).square().sum(-1) * self.target.weights).sum())
 
 
-class TrainingViews(Sequence[TrainingView]):
+class TrainingViews:
     """A dataset's training views, copied to the device on demand; KEPT_BYTES of them stay there."""
 
     def __init__(self, views: Sequence[View], device: torch.device):
@@ -63,15 +63,11 @@ class TrainingViews(Sequence[TrainingView]):
     def __len__(self) -> int:
         return len(self.views)
 
-    @overload
-    def __getitem__(self, index: int) -> TrainingView: ...
+    def spread(self, most: int) -> list[TrainingView]:
+        """At most `most` views, evenly spread."""
+        return [self[i] for i in range(0, len(self), -(-len(self) // most))]
 
-    @overload
-    def __getitem__(self, index: slice) -> list[TrainingView]: ...
-
-    def __getitem__(self, index: int | slice) -> TrainingView | list[TrainingView]:
-        if isinstance(index, slice):
-            return [self[i] for i in range(*index.indices(len(self)))]
+    def __getitem__(self, index: int) -> TrainingView:
         found = self._kept.pop(index, None)
         if found is None:
             found = TrainingView.of(self.views[index], self.device)

@@ -119,7 +119,7 @@ def error_of(trainer, level: int) -> float:
 
 
 def test_the_added_error_is_about_that_of_leaving_an_anchor_out(trained):
-    errors = added_error(trained.model, 1, trained.learner.views, EXACT, prune.omission_error).numpy()
+    errors = added_error(trained.model, 1, trained.learner.views.spread(6), EXACT, prune.omission_error).numpy()
     pictures = pictures_of(trained, 1)
     near = np.flatnonzero(np.isfinite(errors) & (errors > 0))
     chosen = near[np.argsort(errors[near])][:: max(1, len(near) // 40)]
@@ -347,7 +347,7 @@ def test_whitened_channels_have_equal_errors_and_no_correlation():
 
 def whitened(trainer: Trainer) -> None:
     learner = trainer.learner
-    whiten(learner.model, learner.optimiser, learner.views[::4], range(learner.model.level + 1), EXACT)
+    whiten(learner.model, learner.optimiser, learner.views.spread(2), range(learner.model.level + 1), EXACT)
 
 
 def test_whitening_keeps_pictures(dataset):

@@ -46,7 +46,7 @@ class FitQuantisation(phases.Phase):
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
         """Logs how many anchors each step class has."""
         model, config, levels = state.model, state.config, state.trained_levels()
-        views, rounding = state.views[:: -(-len(state.views) // VIEWS)], state.rounding(noisy=False)
+        views, rounding = state.views.spread(VIEWS), state.rounding(noisy=False)
         found: list[int] = []
         if config.grading:
             found = grade(model, views, levels, config.grading, rounding)
