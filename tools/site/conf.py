@@ -162,7 +162,7 @@ def escaped(text: str) -> str:
 def from_plain_text(app: Any, what: str, name: str, obj: object, options: object, lines: list[str]) -> None:
     """Event autodoc-process-docstring: docstrings here are plain text.
 
-    Paragraphs stay paragraphs, indented ones are shown as they are, and a line `name: ...` begins a line of its own.
+    Paragraphs and lists stay, indented paragraphs are shown as they are, and `name: ...` begins a line of its own.
     """
     out: list[str] = []
     for block in re.split(r"\n\s*\n", "\n".join(lines).strip("\n")):
@@ -173,7 +173,7 @@ def from_plain_text(app: Any, what: str, name: str, obj: object, options: object
             starts = [i == 0 or NAMED.match(row) for i, row in enumerate(rows)]
             out += [("| " if start else "  ") + escaped(row.strip()) for start, row in zip(starts, rows, strict=True)]
         else:
-            out += [escaped(row.strip()) for row in rows]
+            out += [row[: len(row) - len(row.lstrip())] + escaped(row.strip()) for row in rows]
         out.append("")
     lines[:] = out
 
