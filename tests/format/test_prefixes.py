@@ -86,13 +86,6 @@ def test_a_stream_does_not_depend_on_where_it_is_cut(layers, cuts):
         assert_same_scene(scene, decode(data, max_layer=layer))
 
 
-def test_a_stream_fed_byte_by_byte():
-    data, stream, got = small_file((0, 2)), open_stream(), []
-    for i in range(len(data)):
-        got += stream.feed(data[i : i + 1])
-    assert [scene.layers for scene in got] == [(0,), (0, 2)]
-
-
 def test_a_fault_stays_and_earlier_layers_remain():
     data = bytearray(small_file())
     rows = info(bytes(data))["layers"]

@@ -13,12 +13,11 @@ from strategies import assert_same_scene, make_scene
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import ChecksumMismatch, DecodeError, EncodeError, LimitExceeded, Malformed, Truncated
 from pd4dgs_codec.format import encoder
-from pd4dgs_codec.format.container import read_chunk, read_preamble, slice_flags, write_chunk, write_preamble
+from pd4dgs_codec.format.container import read_chunk, read_preamble, write_chunk, write_preamble
 from pd4dgs_codec.format.decoder import decode_partial, every_prefix, open_stream
 from pd4dgs_codec.format.encoder import encode_with_report
-from pd4dgs_codec.format.header import CHUNKS, pack_header, scene_id_of, unpack_header
+from pd4dgs_codec.format.header import pack_header, scene_id_of, unpack_header
 from pd4dgs_codec.format.info import hashes, info
-from pd4dgs_codec.format.limits import MAX_CHUNKS
 from pd4dgs_codec.morton import morton_order
 
 
@@ -178,11 +177,6 @@ def test_a_thousand_slices_at_once_make_one_scene():
     )
     assert_same_scene(scenes[0], decode(sliced(), max_bytes=ends[last]))
     assert_same_scene(scenes[-1], decode(sliced()))
-
-
-def test_flags_number_as_many_slices_as_a_file_may_have_chunks():
-    assert slice_flags(MAX_CHUNKS - 1, MAX_CHUNKS) < 1 << 16
-    assert CHUNKS == 1
 
 
 def test_every_prefix_renders_finite_pictures():

@@ -5,7 +5,6 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pd4dgs_codec.entropy.bits import entropy_bits
 from pd4dgs_codec.entropy.priors import K_MAX
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint
 from pd4dgs_codec.errors import DecodeError, LimitExceeded, Malformed
@@ -18,7 +17,6 @@ from pd4dgs_codec.format.stages import (
     cheapest_class_count,
     coded_stages,
     parts_of,
-    read_class_count,
     read_stages,
 )
 
@@ -69,13 +67,6 @@ def test_relative_magnitudes_of_many_places_are_exact():
     assert relative_magnitude(residuals)[:3].tolist() == [939180038, (2403768 << 30) // total, 0]
 
 
-def test_entropy():
-    assert entropy_bits(np.zeros(0, np.int64)) == 0
-    assert entropy_bits(np.full(9, 7)) == 0
-    narrow, wide = np.array([3, 5] * 8), np.array([-K_MAX, K_MAX] * 8)
-    assert entropy_bits(narrow) == entropy_bits(wide) == pytest.approx(16)
-
-
 def test_classes_are_chosen_where_they_pay():
     rng = np.random.default_rng(1)
     activity = rng.integers(0, 1000, 2000)
@@ -83,16 +74,6 @@ def test_classes_are_chosen_where_they_pay():
     louder = np.rint(rng.normal(size=(3, 2000)) * (1 + activity / 20)).astype(np.int64)
     assert cheapest_class_count([(alike, activity)]) == 1
     assert cheapest_class_count([(louder, activity), (louder, activity)]) in CLASS_COUNTS[1:]
-
-
-def test_class_counts_at_and_over_their_limits():
-    assert [read_class_count(ByteReader(bytes([count])), 2) for count in (1, 8)] == [1, 8]
-    with pytest.raises(Malformed, match="stage 2 has 0 classes"):
-        read_class_count(ByteReader(b"\0"), 2)
-    with pytest.raises(LimitExceeded, match="classes of stage 2 is 9, limit 8"):
-        read_class_count(ByteReader(b"\x09"), 2)
-    with pytest.raises(Malformed, match="stage 2"):
-        read_class_count(ByteReader(b""), 2)
 
 
 def halves(target):
