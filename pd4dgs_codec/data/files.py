@@ -81,6 +81,8 @@ def whole_number(value: Any, where: str, low: int = 0) -> int:
 
 def array(value: Any, shape: tuple[int, ...], where: str) -> np.ndarray:
     """`value` as a float64 array of the given shape, its numbers at most LARGEST in magnitude."""
+    if value is None:
+        raise DataError(f"{where} is missing, expected an array of shape {shape}")
     try:
         result = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError, OverflowError):

@@ -18,7 +18,6 @@ from pd4dgs_codec.data.cameras import (
     UnreadView,
     check_rotation,
     checked_rotation,
-    read_view,
     world_to_camera,
 )
 from pd4dgs_codec.data.files import (
@@ -35,10 +34,7 @@ from pd4dgs_codec.data.files import (
 from pd4dgs_codec.data.posed import (
     LARGEST_TIME,
     cameras_box,
-    depth_range,
     held_out,
-    mean_up,
-    normalised_times,
     points_box,
     posed_dataset,
     seconds_range,
@@ -64,38 +60,26 @@ class CameraFiles:
     points: np.ndarray | None
 
 
-def _pair(value: Any, where: str) -> tuple[float, float]:
-    a, b = array(value, (2,), where)
-    return float(a), float(b)
-
-
-def read_camera(path: Path, factor: int) -> tuple[Lens, np.ndarray, np.ndarray]:
+def _camera(path: Path, factor: int) -> tuple[Lens, np.ndarray, np.ndarray]:
     """Lens in pixels of rgb/{factor}x, world-to-camera rotation float64 [3, 3] and camera centre [3], as stored."""
     camera = read_json(path)
 
-    def field(key: str, default: Any = None) -> Any:
-        value = camera.get(key, default)
-        if value is None:
-            raise DataError(f"{path}: no {key}, expected it in a camera file")
-        return value
+    def numbers(key: str, shape: tuple[int, ...], default: Any = None) -> np.ndarray:
+        return array(camera.get(key, default), shape, f"{path}: {key}")
 
-    rotation = array(field("orientation"), (3, 3), f"{path}: orientation")
+    rotation = numbers("orientation", (3, 3))
     check_rotation(rotation, f"{path}: orientation")
-    center = array(field("position"), (3,), f"{path}: position")
-    focal = number(field("focal_length"), f"{path}: focal_length", positive=True)
-    aspect = number(field("pixel_aspect_ratio", 1.0), f"{path}: pixel_aspect_ratio", positive=True)
-    cx, cy = _pair(field("principal_point"), f"{path}: principal_point")
-    width, height = (int(v) // factor for v in _pair(field("image_size"), f"{path}: image_size"))
+    fx = number(camera.get("focal_length"), f"{path}: focal_length", positive=True)
+    aspect = number(camera.get("pixel_aspect_ratio", 1.0), f"{path}: pixel_aspect_ratio", positive=True)
+    width, height = (int(v) // factor for v in numbers("image_size", (2,)))
     if min(width, height) < 2:
-        raise DataError(f"{path}: image_size {field('image_size')} over factor {factor}, expected at least 2x2")
-    k1, k2, k3 = array(field("radial_distortion", [0.0] * 3), (3,), f"{path}: radial_distortion").tolist()
-    stored = camera.get("tangential_distortion", camera.get("tangential", [0.0, 0.0]))
-    tangential = _pair(stored, f"{path}: tangential_distortion")
-    skew = number(field("skew", 0.0), f"{path}: skew") / factor
-    lens = Lens(
-        width, height, focal / factor, focal * aspect / factor, cx / factor, cy / factor, skew, (k1, k2, k3), tangential
-    )
-    return lens, rotation, center
+        raise DataError(f"{path}: image_size {camera['image_size']} over factor {factor}, expected at least 2x2")
+    cx, cy = numbers("principal_point", (2,)).tolist()
+    k1, k2, k3 = numbers("radial_distortion", (3,), [0.0] * 3).tolist()
+    p1, p2 = numbers("tangential_distortion", (2,), camera.get("tangential", [0.0, 0.0])).tolist()
+    skew = number(camera.get("skew", 0.0), f"{path}: skew") / factor
+    focal, middle = (fx / factor, fx * aspect / factor), (cx / factor, cy / factor)
+    return Lens(width, height, *focal, *middle, skew, (k1, k2, k3), (p1, p2)), rotation, numbers("position", (3,))
 
 
 def _strings(value: Any, where: str) -> list[str]:
@@ -152,7 +136,7 @@ def read_cameras(folder: str | Path) -> CameraFiles:
         if not isinstance(entry, dict):
             raise DataError(f"{path}: no entry for frame {name!r}, which the split lists")
         time = number(entry.get("warp_id", entry.get("time_id")), f"{path}: {name}: warp_id", largest=LARGEST_TIME)
-        lens, rotation, position = read_camera(folder / "camera" / f"{name}.json", factor)
+        lens, rotation, position = _camera(folder / "camera" / f"{name}.json", factor)
         viewmat = world_to_camera(rotation, (position - center) * scale)
         camera_id = whole_number(entry.get("camera_id", 0), f"{path}: {name}: camera_id")
         return UnreadView(name, camera_id, time, viewmat, lens, folder / "rgb" / f"{factor}x" / f"{name}.png")
@@ -163,76 +147,60 @@ def read_cameras(folder: str | Path) -> CameraFiles:
     return CameraFiles(train, test, factor, scene, extra, _points(folder, center, scale))
 
 
-def _with_covisible(view: View, frame: UnreadView, folder: Path, factor: int, downscale: int) -> View:
-    path = folder / "covisible" / f"{factor}x" / "val" / f"{frame.name}.png"
-    if not path.is_file():
-        raise DataError(f"{path}: covisibility mask is missing, though others of its folder are there")
-    mask = read_mask(path, (frame.lens.width, frame.lens.height), downscale=downscale)
-    return replace(view, mask=mask if view.mask is None else mask & view.mask)
+def read_iphone(folder: Path, downscale: int, holdout: int) -> Dataset:
+    """Reads rgb/{factor}x (see `dataset.load`). The split files decide, whatever `holdout` is."""
+    files = read_cameras(folder)
+    frames = [*files.train, *files.test]
+    box, depth = _box_and_depth(files, frames, folder)
+    where, (start, stop) = f"{folder / 'extra.json'}: ", (pick(f.time for f in frames) for pick in (min, max))
+    r, g, b = array(files.extra.get("background", [0.0] * 3), (3,), f"{where}background").tolist()
+    dataset = posed_dataset(
+        folder, files.train, files.test, files.points, None, downscale, depth, (r, g, b), box, composite=False
+    )
+    test, covisible = dataset.test, folder / "covisible" / f"{files.factor}x" / "val"
+    masked = bool(test) and covisible.is_dir()
+    if masked:
+        test = tuple(_covisible(v, f, covisible, downscale) for v, f in zip(test, files.test, strict=True))
+    time_range, up = (0.0, 1.0), dataset.up
+    if files.extra.get("fps") is not None:
+        fps = number(files.extra["fps"], f"{where}fps", positive=True)
+        if not stop / fps <= LARGEST_TIME:
+            found = f"{fps:g}, with which the last frame is at {stop / fps:g} s"
+            raise DataError(f"{where}fps is {found}, expected {LARGEST_TIME:.2g} s at most")
+        time_range = seconds_range(start / fps, stop / fps)
+    if files.extra.get("up") is not None:
+        x, y, z = array(files.extra["up"], (3,), f"{where}up")
+        norm = max(np.linalg.norm((x, y, z)), 1e-12)
+        up = (float(x / norm), float(y / norm), float(z / norm))
+    return replace(dataset, test=test, masked=masked, time_range=time_range, up=up)
 
 
-def _box(files: CameraFiles, frames: list[UnreadView], folder: Path) -> np.ndarray:
+def _box_and_depth(
+    files: CameraFiles, frames: list[UnreadView], folder: Path
+) -> tuple[np.ndarray, tuple[float, float] | None]:
+    """The scene box, and near and far of scene.json, which are in scene units."""
+    box = cameras_box(frames) if files.points is None else points_box(files.points)
     if files.extra.get("bbox") is not None:
         where = f"{folder / 'extra.json'}: bbox"
         box = array(files.extra["bbox"], (2, 3), where).astype(np.float32)
         if not (box[0] < box[1]).all():
             raise DataError(f"{where} is {box.tolist()}, expected a lower and an upper corner")
-        return box
-    return cameras_box(frames) if files.points is None else points_box(files.points)
-
-
-def _near_far(files: CameraFiles, frames: list[UnreadView], box: np.ndarray, folder: Path) -> tuple[float, float]:
-    """near and far of scene.json, which are in scene units."""
-    where = folder / "scene.json"
     if files.scene.get("near") is None or files.scene.get("far") is None:
-        return depth_range([f.viewmat for f in frames], box, files.points)
-    near, far = (number(files.scene[k], f"{where}: {k}", positive=True) for k in ("near", "far"))
+        return box, None
+    path = folder / "scene.json"
+    near, far = (number(files.scene[key], f"{path}: {key}", positive=True) for key in ("near", "far"))
     if near >= far:
-        raise DataError(f"{where}: near {near:g} and far {far:g}, expected near < far")
-    return near, far
+        raise DataError(f"{path}: near {near:g} and far {far:g}, expected near < far")
+    return box, (near, far)
 
 
-def _up(files: CameraFiles, frames: list[UnreadView], folder: Path) -> tuple[float, float, float]:
-    if files.extra.get("up") is None:
-        return mean_up(frames)
-    up = array(files.extra["up"], (3,), f"{folder / 'extra.json'}: up")
-    x, y, z = up / max(np.linalg.norm(up), 1e-12)
-    return float(x), float(y), float(z)
-
-
-def read_iphone(folder: Path, downscale: int, holdout: int) -> Dataset:
-    """Reads rgb/{factor}x (see `dataset.load`). The split files decide, whatever `holdout` is."""
-    files = read_cameras(folder)
-    frames = [*files.train, *files.test]
-    times, start, stop = normalised_times([f.time for f in frames], str(folder))
-    views = [read_view(f, t, downscale, composite=False) for f, t in zip(frames, times, strict=True)]
-    train, test = views[: len(files.train)], views[len(files.train) :]
-    masked = bool(test) and (folder / "covisible" / f"{files.factor}x" / "val").is_dir()
-    if masked:
-        test = [_with_covisible(v, f, folder, files.factor, downscale) for v, f in zip(test, files.test, strict=True)]
-    box = _box(files, frames, folder)
-    near, far = _near_far(files, frames, box, folder)
-    fps = files.extra.get("fps")
-    fps = None if fps is None else number(fps, f"{folder / 'extra.json'}: fps", positive=True)
-    if fps and not stop / fps <= LARGEST_TIME:
-        found = f"{fps:g}, with which the last frame is at {stop / fps:g} s"
-        raise DataError(f"{folder / 'extra.json'}: fps is {found}, expected {LARGEST_TIME:.2g} s at most")
-    r, g, b = array(files.extra.get("background", [0.0] * 3), (3,), f"{folder / 'extra.json'}: background").tolist()
-    return Dataset(
-        name=folder.resolve().name,
-        train=tuple(train),
-        test=tuple(test),
-        points=files.points,
-        point_colors=None,
-        box=box,
-        near=near,
-        far=far,
-        background=(r, g, b),
-        time_range=seconds_range(start / fps, stop / fps) if fps else (0.0, 1.0),
-        up=_up(files, frames, folder),
-        unit=0.0,
-        masked=masked,
-    )
+def _covisible(view: View, frame: UnreadView, folder: Path, downscale: int) -> View:
+    """The view with its covisibility mask."""
+    path = folder / f"{frame.name}.png"
+    if not path.is_file():
+        raise DataError(f"{path}: covisibility mask is missing, though others of its folder are there")
+    mask = read_mask(path, (frame.lens.width, frame.lens.height), downscale=downscale)
+    return replace(view, mask=mask if view.mask is None else mask & view.mask)
 
 
 # -- Record3D ----------------------------------------------------------------------------------------------------------

@@ -46,22 +46,25 @@ def posed_dataset(
     downscale: int,
     depth: tuple[float, float] | None = None,
     background: tuple[float, float, float] | None = None,
+    box: np.ndarray | None = None,
+    *,
+    composite: bool = True,
 ) -> Dataset:
     """The dataset of these frames.
 
     points: float32 [M, 3] and colors uint8 [M, 3], or None. depth: near and far, if known. background: None for the
-    colour of the images' border.
+    colour of the images' border. box: float32 [2, 3], if known. composite: as in `read_image`.
     """
     frames = [*train, *test]
     times, start, stop = normalised_times([f.time for f in frames], str(folder))
-    views = [read_view(f, t, downscale, composite=True) for f, t in zip(frames, times, strict=True)]
+    views = [read_view(f, t, downscale, composite=composite) for f, t in zip(frames, times, strict=True)]
     return Dataset(
         name=folder.resolve().name,
         train=tuple(views[: len(train)]),
         test=tuple(views[len(train) :]),
         background=background or border_color(views[: len(train)]),
         time_range=seconds_range(start, stop),
-        **geometry(frames, points, colors, depth),
+        **geometry(frames, points, colors, depth, box),
     )
 
 
@@ -70,11 +73,13 @@ def geometry(
     points: np.ndarray | None,
     colors: np.ndarray | None,
     depth: tuple[float, float] | None,
+    box: np.ndarray | None = None,
 ) -> dict[str, Any]:
     """The fields of a Dataset that follow from its frames and points (see `posed_dataset`), without unit and masks."""
     if points is not None and not len(points):
         points, colors = None, None
-    box = cameras_box(frames, depth) if points is None else points_box(points)
+    if box is None:
+        box = cameras_box(frames, depth) if points is None else points_box(points)
     near, far = depth or depth_range([f.viewmat for f in frames], box, points)
     found = {"points": points, "point_colors": colors, "box": box, "near": near, "far": far, "up": mean_up(frames)}
     return found | {"unit": 0.0, "masked": False}

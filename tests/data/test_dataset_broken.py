@@ -136,7 +136,7 @@ CASES: list[tuple[str, str, Any, str]] = [
     ("blender", "points.ply", ply("ascii", b"", "property list uchar int i\n"), "not a scalar"),
     ("blender", "points.ply", ply("ascii").replace(b"2\n", b"99999999999\n", 1), "0 vertex lines"),
     ("iphone", CAMERA, {"focal_length": NAN}, "0_00000.json: focal_length is nan"),
-    ("iphone", CAMERA, {"focal_length": None}, "0_00000.json: no focal_length"),
+    ("iphone", CAMERA, {"focal_length": None}, "0_00000.json: focal_length is None"),
     ("iphone", CAMERA, {"orientation": (2 * np.eye(3)).tolist()}, "orientation is not a rotation: determinant 8"),
     ("iphone", CAMERA, {"position": [0, 0]}, "position has shape (2,), expected (3,)"),
     ("iphone", CAMERA, {"image_size": [1, 1]}, "expected at least 2x2"),
