@@ -11,7 +11,7 @@ from __future__ import annotations
 import re
 import struct
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -38,13 +38,8 @@ MAX_SIDE = 65535
 VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".MP4", ".MOV")
 
 
-@dataclass(frozen=True)
-class Image:
-    """A registered picture. pose: the quaternion wxyz and translation of world to camera."""
-
-    name: str
-    camera: int
-    pose: tuple[float, ...]
+#: A registered picture: its name, the number of its camera, and quaternion wxyz and translation of world to camera.
+Image = tuple[str, int, list[float]]
 
 
 def read_colmap(folder: Path, downscale: int, holdout: int) -> Dataset:
@@ -71,9 +66,11 @@ def read_colmap(folder: Path, downscale: int, holdout: int) -> Dataset:
 
 def _videos(folder: Path) -> dict[str, Path]:
     """Videos by name without suffix, in videos/ or in the folder itself; none if it has images/ instead."""
-    if (folder / "images").is_dir() and not (folder / "videos").is_dir():
-        return {}
-    place = folder / "videos" if (folder / "videos").is_dir() else folder
+    place = folder / "videos"
+    if not place.is_dir():
+        if (folder / "images").is_dir():
+            return {}
+        place = folder
     return {file.stem: file for file in sorted(place.iterdir()) if file.suffix in VIDEOS}
 
 
@@ -94,18 +91,18 @@ def _registered(model: Path, kind: str) -> tuple[list[UnreadView], np.ndarray | 
     and colours uint8 [M, 3], or None."""
     read = _Binary if kind == ".bin" else _Text
     lenses = dict(read(model / f"cameras{kind}").cameras())
-    images = sorted(read(model / f"images{kind}").images(), key=lambda image: image.name)
+    images = sorted(read(model / f"images{kind}").images())
     if not images:
         raise DataError(f"{model}: no picture is registered, expected one at least")
     frames = []
-    for image in images:
-        where = f"{model / f'images{kind}'}: {image.name}"
-        if image.camera not in lenses:
-            raise DataError(f"{where}: taken by camera {image.camera}, which cameras{kind} does not have")
-        pose = np.array([number(value, f"{where}: pose") for value in image.pose])
+    for name, camera, values in images:
+        where = f"{model / f'images{kind}'}: {name}"
+        if camera not in lenses:
+            raise DataError(f"{where}: taken by camera {camera}, which cameras{kind} does not have")
+        pose = np.array([number(value, f"{where}: pose") for value in values])
         rotation = checked_rotation(pose[:4], where)
         viewmat = world_to_camera(rotation, -rotation.T @ pose[4:])
-        frames.append(UnreadView(image.name, image.camera, 0.0, viewmat, lenses[image.camera], Path(image.name)))
+        frames.append(UnreadView(name, camera, 0.0, viewmat, lenses[camera], Path(name)))
     if not (model / f"points3D{kind}").is_file():
         return frames, None, None
     table = np.array(list(read(model / f"points3D{kind}").points()), np.float64).reshape(-1, 6)
@@ -117,22 +114,20 @@ def _registered(model: Path, kind: str) -> tuple[list[UnreadView], np.ndarray | 
 def _times(folder: Path, names: list[str]) -> list[float]:
     """The time of each picture: from times.txt, else the last number in its name, else its place."""
     path = folder / "times.txt"
-    if path.is_file():
-        known: dict[str, float] = {}
-        for i, line in enumerate(read_file(path).decode("utf-8", "replace").splitlines(), 1):
-            if not line.strip():
-                continue
-            name, _, text = line.strip().rpartition(" ")
-            try:
+    if not path.is_file():
+        numbers = [re.findall(r"\d{1,15}", Path(name).stem) for name in names]
+        return [float(found[-1]) if all(numbers) else float(i) for i, found in enumerate(numbers)]
+    known: dict[str, float] = {}
+    for i, line in enumerate(map(str.strip, read_file(path).decode("utf-8", "replace").splitlines()), 1):
+        name, _, text = line.rpartition(" ")
+        try:
+            if line:
                 known[name.strip()] = number(float(text), f"{path}: line {i}", largest=LARGEST_TIME)
-            except ValueError:
-                raise DataError(f"{path}: line {i} is {line.strip()[:60]!r}, expected NAME SECONDS") from None
-        missing = next((name for name in names if name not in known), None)
-        if missing is not None:
-            raise DataError(f"{path}: has no line for {missing}, expected one for each picture of the model")
-        return [known[name] for name in names]
-    numbers = [re.findall(r"\d{1,15}", Path(name).stem) for name in names]
-    return [float(found[-1]) for found in numbers] if all(numbers) else [float(i) for i in range(len(names))]
+        except ValueError:
+            raise DataError(f"{path}: line {i} is {line[:60]!r}, expected NAME SECONDS") from None
+    if missing := [name for name in names if name not in known]:
+        raise DataError(f"{path}: has no line for {missing[0]}, expected one for each picture of the model")
+    return [known[name] for name in names]
 
 
 def _lens(model: str, width: int, height: int, values: list[float], where: str) -> Lens:
@@ -175,7 +170,7 @@ class _Binary:
             name = self.data[self.at : end].decode("utf-8", "replace")
             self.at = end + 1
             self._skip(24 * self._take("Q")[0])
-            yield Image(name, camera, tuple(pose))
+            yield name, camera, pose
 
     def points(self) -> Iterator[tuple[float, ...]]:
         """Rows x y z r g b."""
@@ -227,7 +222,7 @@ class _Text:
             values = self._values(i, words[:9], 9)
             if len(words) < 10:
                 raise DataError(f"{self.path}: line {i} names no picture")
-            yield Image(words[9], int(values[8]), tuple(values[1:8]))
+            yield words[9], int(values[8]), values[1:8]
 
     def points(self) -> Iterator[tuple[float, ...]]:
         """Rows x y z r g b."""

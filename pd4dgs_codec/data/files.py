@@ -189,10 +189,8 @@ def _srgb(image: Picture, where: str) -> Picture:
         if "sRGB" in name:
             return image
         mode = image.mode if image.mode in ("L", "RGB", "RGBA") else "RGBA" if _has_alpha(image) else "RGB"
-        target = "RGB" if mode == "L" else mode
-        converted = ImageCms.profileToProfile(
-            image.convert(mode), source, ImageCms.createProfile("sRGB"), outputMode=target
-        )
+        target, srgb = "RGB" if mode == "L" else mode, ImageCms.createProfile("sRGB")
+        converted = ImageCms.profileToProfile(image.convert(mode), source, srgb, outputMode=target)
     except (ImageCms.PyCMSError, OSError, ValueError) as e:
         raise DataError(f"{where}: its colour profile cannot be used: {e}") from None
     assert converted is not None  # None is for changes in place
@@ -273,8 +271,8 @@ END = b"end_header"
 DIGITS = 12  #: of a count; Python itself refuses to read thousands
 
 
-def _header(path: Path, raw: bytes) -> tuple[str, int, list[tuple[str, str]], int]:
-    """Format, vertex count, vertex properties as (name, dtype), and where the body starts."""
+def _header(path: Path, raw: bytes) -> tuple[str, int, np.dtype, int]:
+    """Format, vertex count, vertex properties, and the place of the body."""
     stop = raw.find(END)
     if not raw.startswith(b"ply") or stop < 0:
         raise DataError(f"{path}: not a PLY file (expected it to start with 'ply' and hold an end_header line)")
@@ -293,11 +291,12 @@ def _header(path: Path, raw: bytes) -> tuple[str, int, list[tuple[str, str]], in
                 raise DataError(f"{path}: vertex property {' '.join(words[1:])!r} is not a scalar this reader knows")
             fields.append((words[2], SCALARS[words[1]]))
     if kind not in ("ascii", "binary_little_endian") or count < 0 or newline < 0:
-        raise DataError(
-            f"{path}: found format {kind!r}, first element with {count} vertices; "
-            "expected ascii or binary_little_endian and the element vertex first"
-        )
-    return kind, count, fields, newline + 1
+        found = f"format {kind!r}, first element with {count} vertices"
+        raise DataError(f"{path}: found {found}; expected ascii or binary_little_endian and the element vertex first")
+    names = [name for name, _ in fields]
+    if len(set(names)) != len(names) or not {"x", "y", "z"} <= set(names):
+        raise DataError(f"{path}: vertex properties are {', '.join(names)}, expected x, y, z once each")
+    return kind, count, np.dtype(fields), newline + 1
 
 
 def _body(path: Path, raw: bytes, kind: str, count: int, dtype: np.dtype) -> np.ndarray:
@@ -308,28 +307,25 @@ def _body(path: Path, raw: bytes, kind: str, count: int, dtype: np.dtype) -> np.
             size = count * dtype.itemsize
             raise DataError(f"{path}: {len(raw)} bytes of vertices, expected {size} for {count} of them")
         return np.frombuffer(raw, dtype, count)
+    lines = raw.decode("ascii", "replace").splitlines()[:count]
+    if len(lines) < count:
+        raise DataError(f"{path}: {len(lines)} vertex lines, expected {count}")
     try:
-        rows = [tuple(map(float, line.split()[: len(names)])) for line in raw.decode("ascii").splitlines()[:count]]
-        if len(rows) == count:
-            table = np.asarray(rows, np.float64).reshape(count, len(names))
-            vertices = np.empty(count, dtype)
-            with np.errstate(over="ignore"):  # what a type cannot hold becomes infinite there
-                for i, name in enumerate(names):
-                    vertices[name] = table[:, i]
-            return vertices
+        table = np.array([line.split()[: len(names)] for line in lines], np.float64).reshape(count, len(names))
     except ValueError:
         raise DataError(f"{path}: vertex lines are not {len(names)} numbers each") from None
-    raise DataError(f"{path}: {len(rows)} vertex lines, expected {count}")
+    vertices = np.empty(count, dtype)
+    with np.errstate(over="ignore"):  # numbers beyond a type's range become infinite
+        for name, column in zip(names, table.T, strict=True):
+            vertices[name] = column
+    return vertices
 
 
 def read_vertices(path: Path, raw: bytes | None = None) -> np.ndarray:
     """Structured array [count] of the vertex element, one field per property. raw: the file's bytes, if known."""
     raw = read_file(path) if raw is None else raw
-    kind, count, fields, start = _header(path, raw)
-    names = [name for name, _ in fields]
-    if len(set(names)) != len(names) or not {"x", "y", "z"} <= set(names):
-        raise DataError(f"{path}: vertex properties are {', '.join(names)}, expected x, y, z once each")
-    return _body(path, raw[start:], kind, count, np.dtype(fields))
+    kind, count, dtype, start = _header(path, raw)
+    return _body(path, raw[start:], kind, count, dtype)
 
 
 def read_only_ply(folder: Path) -> tuple[np.ndarray | None, np.ndarray | None]:
@@ -345,6 +341,5 @@ def read_ply(path: Path) -> tuple[np.ndarray, np.ndarray | None]:
     points = np.stack([vertices[c] for c in "xyz"], axis=1)
     keep = (np.abs(points) <= LARGEST).all(axis=1)  # also false of NaN
     names = vertices.dtype.names or ()
-    has_color = all(c in names and vertices.dtype[c] == np.uint8 for c in ("red", "green", "blue"))
-    colors = np.stack([vertices[c] for c in ("red", "green", "blue")], axis=1)[keep] if has_color else None
-    return points[keep].astype(np.float32), colors
+    rgb = [vertices[c] for c in ("red", "green", "blue") if c in names and vertices.dtype[c] == np.uint8]
+    return points[keep].astype(np.float32), np.stack(rgb, axis=1)[keep] if len(rgb) == 3 else None

@@ -34,7 +34,7 @@ EXAMPLES = {"seed": "seed=1", "size": "size=960x540", "frames": "frames=300"}
 #: The camera sweeps its arc so many times. If it passed each place once, place and time would be the same, and a static
 #: scene with a view-dependent look would explain every motion.
 SWEEPS = 2.5
-SKY = np.array([0.71, 0.80, 0.90])
+SKY = (0.71, 0.80, 0.90)
 TARGET = np.array([0.0, 0.1, 0.5])
 BOX = np.array([[-2.7, -2.7, -0.1], [2.7, 2.5, 2.6]], np.float32)
 NEAR, FAR = 0.5, 12.0
@@ -57,6 +57,7 @@ class Motion:
     orbit: float = 0.0  #: turns of the runner around the platform
 
 
+Size = Sequence[float]  #: of three axes
 #: Rotation [3, 3], shift [3] and stretch per axis [3] of a body at an instant, on top of its place.
 Local = tuple[np.ndarray, np.ndarray, np.ndarray]
 
@@ -85,7 +86,7 @@ class SceneBuilder:
         self.hue = self.rng.uniform()
 
     def paint(
-        self, hue: float, size: Sequence[float], wave: float, axes: tuple[int, int] = (0, 2), strength: float = 0.45
+        self, size: Size, hue: float, wave: float, axes: tuple[int, int] = (0, 2), strength: float = 0.45
     ) -> Paint:
         """Two shades of a hue in checks along two axes, `wave` radians per unit."""
         rng = self.rng
@@ -99,38 +100,19 @@ class SceneBuilder:
         high = np.clip(base + 0.25, 0, 1)
         return Paint(base * (1 - strength), high, waves, detail, np.asarray(size, float))
 
-    def group(self, t: float) -> tuple[np.ndarray, np.ndarray]:
+    def group(self, t: float) -> Pose:
         """Rotation and position of the platform."""
         m = self.motion
         angle = m.sway * np.sin(2 * np.pi * 0.75 * t)
         return _turn(2, angle), np.array([0, 0, m.heave * np.sin(np.pi * t) ** 2])
 
-    def fixed(
-        self,
-        shape: str,
-        size: Sequence[float],
-        at: Sequence[float],
-        hue: float,
-        wave: float,
-        *,
-        axes: tuple[int, int] = (0, 2),
-        strength: float = 0.45,
-        casts: bool = False,
-    ) -> Body:
-        """A body that never moves and throws no shadow (floor, wall) or stands beside the platform."""
-        A, c = np.diag(np.asarray(size, float)), np.asarray(at, float)
-        return Body(shape, lambda t: (A, c), self.paint(hue, size, wave, axes, strength), casts)
+    def fixed(self, shape: str, size: Size, at: Size, *look: Any, casts: bool = False, **more: Any) -> Body:
+        """A body that never moves. look, more: of its paint. casts: False for floor and wall."""
+        pose = np.diag(np.asarray(size, float)), np.asarray(at, float)
+        return Body(shape, lambda t: pose, self.paint(size, *look, **more), casts)
 
     def riding(
-        self,
-        shape: str,
-        size: Sequence[float],
-        at: Sequence[float],
-        hue: float,
-        wave: float,
-        local: Callable[[float], Local] | None = None,
-        *,
-        axes: tuple[int, int] = (0, 2),
+        self, shape: str, size: Size, at: Size, *look: Any, local: Callable[[float], Local] | None = None, **more: Any
     ) -> Body:
         """A body on the platform; `local` is its motion there."""
         half = np.asarray(size, float)
@@ -142,19 +124,14 @@ class SceneBuilder:
             turn, shift, stretch = local(t) if local else (np.eye(3), np.zeros(3), np.ones(3))
             return R @ turn @ yaw @ np.diag(half * stretch), R @ (place + shift) + p
 
-        return Body(shape, pose, self.paint(hue, size, wave, axes))
-
-    def hop(self, phase: float, height: float) -> Callable[[float], np.ndarray]:
-        """Bouncing on the spot."""
-        rate = self.motion.hops
-        return lambda t: np.array([0, 0, height * abs(np.sin(np.pi * (rate * t + phase)))]) if rate else np.zeros(3)
+        return Body(shape, pose, self.paint(size, *look, **more))
 
     def arm(self) -> list[Body]:
         """A rod that swings about the top of the column, with a bob at its end."""
         m, pivot, reach = self.motion, np.array([0.15, 0.35, 1.17]), 0.36
         rest = self.rng.uniform(0.4, 0.9)
 
-        def part(size: Sequence[float], along: float) -> Callable[[float], Pose]:
+        def part(size: Size, along: float) -> Callable[[float], Pose]:
             def pose(t: float) -> Pose:
                 R, p = self.group(t)
                 turn = R @ _turn(1, rest + m.swing * np.sin(2 * np.pi * m.swing_rate * t))
@@ -164,19 +141,28 @@ class SceneBuilder:
 
         rod, bob = (reach, 0.05, 0.05), (0.15, 0.15, 0.15)
         return [
-            Body("box", part(rod, 0.6 * reach), self.paint(0.1, rod, 9.0)),
-            Body("sphere", part(bob, 1.7 * reach), self.paint(0.75, bob, 14.0)),
+            Body("box", part(rod, 0.6 * reach), self.paint(rod, 0.1, 9.0)),
+            Body("sphere", part(bob, 1.7 * reach), self.paint(bob, 0.75, 14.0)),
         ]
 
     def bodies(self) -> list[Body]:
         """All bodies, the still ones first."""
         m = self.motion
         one, still = np.ones(3), np.eye(3)
-        ball_hop, small_hop = self.hop(0.0, 0.55), self.hop(0.4, 0.8)
+
+        def hop(t: float, phase: float, height: float) -> np.ndarray:
+            bounce = height * abs(np.sin(np.pi * (m.hops * t + phase))) if m.hops else 0.0
+            return np.array([0, 0, bounce])
 
         def ball(t: float) -> Local:
             s = m.pulse * np.sin(2 * np.pi * 3 * t)
-            return still, ball_hop(t) + [0, 0, 0.3 * s], np.array([1 - 0.5 * s, 1 - 0.5 * s, 1 + s])
+            return still, hop(t, 0.0, 0.55) + [0, 0, 0.3 * s], np.array([1 - 0.5 * s, 1 - 0.5 * s, 1 + s])
+
+        def small(t: float) -> Local:
+            return still, hop(t, 0.4, 0.8), one
+
+        def crate(t: float) -> Local:
+            return _turn(2, 2 * np.pi * m.spin * t), np.zeros(3), one
 
         def runner(t: float) -> Local:
             angle = 2 * np.pi * m.orbit * t
@@ -195,17 +181,12 @@ class SceneBuilder:
             self.riding("cylinder", (1.15, 1.15, 0.05), (0, 0, 0.05), 0.15, 6.0, axes=(0, 1)),
             self.riding("cylinder", (0.12, 0.12, 0.55), (0.15, 0.42, 0.65), 0.45, 10.0),
             replace(plank, paint=replace(plank.paint, tint=tint if m.tint else None)),
-            self.riding(
-                "box", (0.26, 0.26, 0.26), (-0.42, -0.3, 0.36), 0.0, 9.0,
-                lambda t: (_turn(2, 2 * np.pi * m.spin * t), np.zeros(3), one),
-            ),
-            self.riding("sphere", (0.3, 0.3, 0.3), (0.5, -0.3, 0.4), 0.33, 9.0, ball),
-            self.riding(
-                "sphere", (0.16, 0.16, 0.16), (-0.42, -0.3, 0.78), 0.7, 12.0, lambda t: (still, small_hop(t), one)
-            ),
-            self.riding("sphere", (0.14, 0.14, 0.14), (1.5, 0, 0.14), 0.2, 14.0, runner),
+            self.riding("box", (0.26, 0.26, 0.26), (-0.42, -0.3, 0.36), 0.0, 9.0, local=crate),
+            self.riding("sphere", (0.3, 0.3, 0.3), (0.5, -0.3, 0.4), 0.33, 9.0, local=ball),
+            self.riding("sphere", (0.16, 0.16, 0.16), (-0.42, -0.3, 0.78), 0.7, 12.0, local=small),
+            self.riding("sphere", (0.14, 0.14, 0.14), (1.5, 0, 0.14), 0.2, 14.0, local=runner),
             *self.arm(),
-        ]  # fmt: skip
+        ]
 
 
 # -- a dataset of a scene ----------------------------------------------------------------------------------------------
@@ -225,11 +206,6 @@ class Take:
         """`LENS` for pictures of this size."""
         (width, height), scale = self.size, self.size[1] / LENS.height
         return Lens(width, height, LENS.fx * scale, LENS.fy * scale, LENS.cx * width / LENS.width, LENS.cy * scale)
-
-    @property
-    def test_instants(self) -> range:
-        """The frames at whose times the fixed cameras take test views."""
-        return range(2, self.frames, max(1, self.frames // TEST_INSTANTS))
 
 
 def parse(source: str) -> Take:
@@ -262,7 +238,8 @@ def _look(azimuth: float, radius: float, height: float) -> np.ndarray:
     return world_to_camera(np.stack([x, np.cross(z, x), z]), center)
 
 
-def _train_viewmat(t: float) -> np.ndarray:
+def train_viewmat(t: float) -> np.ndarray:
+    """The moving camera."""
     azimuth = 40 * np.sin(2 * np.pi * SWEEPS * t - np.pi / 2)
     return _look(np.radians(azimuth), 3.9 + 0.15 * np.cos(7 * t), 1.15 + 0.2 * np.sin(9 * t))
 
@@ -284,7 +261,7 @@ def _render(bodies: list[Body], viewmat: np.ndarray, t: float, lens: Lens = LENS
     eye = Eye(placed, viewmat)
     xs, ys = _grid(lens, SUPERSAMPLING, np.float32)
     depth, index = eye.first_hits(xs, ys)
-    color = np.tile(SKY.astype(np.float32)[:, None, None], (1, *depth.shape))
+    color = np.tile(np.asarray(SKY, np.float32)[:, None, None], (1, *depth.shape))
     for i in range(len(placed)):
         row, col = np.nonzero(index == i)
         if len(row):
@@ -294,29 +271,20 @@ def _render(bodies: list[Body], viewmat: np.ndarray, t: float, lens: Lens = LENS
     return np.asarray(mean.transpose(1, 2, 0) * 255 + 0.5).astype(np.uint8)
 
 
-@dataclass(frozen=True, eq=False)
-class _Surface:
-    """The surface behind each pixel centre: body index [n], material point [3, n] (for the sky its direction)."""
-
-    body: np.ndarray
-    point: np.ndarray
-
-
-def _surface(bodies: list[Body], viewmat: np.ndarray, t: float, lens: Lens = LENS) -> _Surface:
-    placed = place(bodies, t)
-    eye = Eye(placed, viewmat)
-    xs, ys = _grid(lens)
+def _surface(bodies: list[Body], viewmat: np.ndarray, t: float, lens: Lens = LENS) -> tuple[np.ndarray, np.ndarray]:
+    """Of the surface behind each pixel centre: body index [n], and material point [3, n], for the sky its direction."""
+    eye, (xs, ys) = Eye(place(bodies, t), viewmat), _grid(lens)
     depth, index = (a.ravel() for a in eye.first_hits(xs, ys))
     x, y = (a.ravel() for a in np.meshgrid(xs, ys))
     point = viewmat[:3, :3].T @ np.stack([x, y, np.ones_like(x)])
-    for i, body in enumerate(placed):
+    for i, body in enumerate(eye.placed):
         mine = index == i
         point[:, mine] = material(body, eye.world(x[mine], y[mine], depth[mine]))
-    return _Surface(index, point)
+    return index, point
 
 
 def _seen(eye: Eye, body: np.ndarray, point: np.ndarray, lens: Lens = LENS) -> np.ndarray:
-    """bool [n]: at the time of `eye` the points (see _Surface) are in its picture, face it and are not hidden."""
+    """bool [n]: at the time of `eye` the points (see _surface) are in its picture, face it and are not hidden."""
     rotation = eye.viewmat[:3, :3]
     camera, facing = rotation @ point, np.ones(len(body), bool)
     for i, placed in enumerate(eye.placed):
@@ -339,15 +307,15 @@ def _seen(eye: Eye, body: np.ndarray, point: np.ndarray, lens: Lens = LENS) -> n
 
 def _covisible(bodies: list[Body], eyes: list[Eye], viewmat: np.ndarray, t: float, lens: Lens) -> np.ndarray:
     """bool [H, W]: COVISIBLE_SHARE of the training cameras `eyes` saw the surface point of a pixel's centre."""
-    surface, needed = _surface(bodies, viewmat, t, lens), max(1, int(np.ceil(COVISIBLE_SHARE * len(eyes))))
-    count = np.zeros(len(surface.body), np.int32)
+    (body, point), needed = _surface(bodies, viewmat, t, lens), max(1, int(np.ceil(COVISIBLE_SHARE * len(eyes))))
+    count = np.zeros(len(body), np.int32)
     # Strided order: most points are settled after a few distant frames and drop out.
     order = [i for start in range(8) for i in range(start, len(eyes), 8)]
     for i in order:
         open_ = np.flatnonzero(count < needed)
         if not len(open_):
             break
-        count[open_] += _seen(eyes[i], surface.body[open_], surface.point[:, open_], lens)
+        count[open_] += _seen(eyes[i], body[open_], point[:, open_], lens)
     return (count >= needed).reshape(lens.height, lens.width)
 
 
@@ -380,27 +348,24 @@ def _initial_points(
 def _dataset(take: Take) -> Dataset:
     bodies, lens = SceneBuilder(take.name, take.seed).bodies(), take.lens
     times = [i / (take.frames - 1) for i in range(take.frames)]
-    viewmats = [_train_viewmat(t) for t in times]
+    viewmats = [train_viewmat(t) for t in times]
     eyes = [Eye(place(bodies, t), v) for t, v in zip(times, viewmats, strict=True)]
 
     def view(viewmat: np.ndarray, camera: int, i: int) -> View:
-        image = _render(bodies, viewmat, times[i], lens)
+        image, matrices = _render(bodies, viewmat, times[i], lens), (viewmat.astype(np.float32), lens.matrix())
         mask = _covisible(bodies, eyes, viewmat, times[i], lens) if camera else None
-        matrices, name = (viewmat.astype(np.float32), lens.matrix()), f"{camera}_{i:05d}"
-        return View(*matrices, lens.width, lens.height, times[i], image, mask, name, camera)
+        return View(*matrices, *take.size, times[i], image, mask, f"{camera}_{i:05d}", camera)
 
     train = tuple(view(v, 0, i) for i, v in enumerate(viewmats))
-    fixed = enumerate(fixed_viewmats(), start=1)
-    test = tuple(view(v, camera, i) for camera, v in fixed for i in take.test_instants)
+    instants = range(2, take.frames, max(1, take.frames // TEST_INSTANTS))
+    test = tuple(view(v, camera, i) for camera, v in enumerate(fixed_viewmats(), start=1) for i in instants)
     points, colors = _initial_points(bodies, viewmats, lens, np.random.default_rng([take.seed, 1]))
-    sky, up = (float(SKY[0]), float(SKY[1]), float(SKY[2])), (0.0, 0.0, 1.0)
-    name, span = f"synthetic-{take.name}", (0.0, SECONDS)
-    return Dataset(name, train, test, points, colors, BOX, NEAR, FAR, sky, span, up, 0.0, True)
+    fields = SKY, (0.0, SECONDS), (0.0, 0.0, 1.0), 0.0, True
+    return Dataset(f"synthetic-{take.name}", train, test, points, colors, BOX, NEAR, FAR, *fields)
 
 
 def _shrink(view: View, k: int, lens: Lens = LENS) -> View:
-    image = shrink_image(view.image, k)
-    mask = None if view.mask is None else shrink_mask(view.mask, k)
+    image, mask = shrink_image(view.image, k), None if view.mask is None else shrink_mask(view.mask, k)
     return replace(view, K=lens.matrix(k), width=image.shape[1], height=image.shape[0], image=image, mask=mask)
 
 

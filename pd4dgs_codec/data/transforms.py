@@ -40,12 +40,12 @@ def _choose(folder: Path) -> tuple[Path, Path | None]:
     if train.is_file():
         others = (folder / "transforms_test.json", folder / "transforms_val.json")
         return train, next((p for p in others if p.is_file()), None)
-    found = sorted(folder.glob("transforms*.json"))
-    for path in found:
-        if path.name == "transforms.json" or len(found) == 1:
-            return path, None
-    names = ", ".join(p.name for p in found)
-    raise DataError(f"{folder}: found {names}; expected transforms.json, transforms_train.json or a single file")
+    found = {path.name: path for path in sorted(folder.glob("transforms*.json"))}
+    if "transforms.json" in found or len(found) == 1:
+        return found.get("transforms.json") or next(iter(found.values())), None
+    raise DataError(
+        f"{folder}: found {', '.join(found)}; expected transforms.json, transforms_train.json or a single file"
+    )
 
 
 def _focal(get: Callable[[str], Any], axis: str, size: int, where: str) -> float | None:
@@ -79,12 +79,11 @@ def _lens(file: dict[str, Any], frame: dict[str, Any], image: Path, where: str) 
     if (model is not None and model not in PINHOLE_MODELS and not fisheye) or (value("k4") and not fisheye):
         expected = f"a pinhole or {FISHEYE_MODEL}"
         raise DataError(f"{where}: camera_model {model!r} (k4 {value('k4'):g}) is not supported, expected {expected}")
-    fx = _focal(get, "x", width, where)
-    fy = _focal(get, "y", height, where)
-    if fx is None and fy is None:
+    focal = [_focal(get, axis, size, where) for axis, size in (("x", width), ("y", height))]
+    known = [f for f in focal if f is not None]
+    if not known:
         raise DataError(f"{where}: no focal length, expected fl_x or camera_angle_x")
-    fx, fy = fx or fy, fy or fx
-    assert fx is not None and fy is not None
+    fx, fy = known[0], known[-1]
     cx, cy = value("cx", width / 2), value("cy", height / 2)
     radial, tangential = (value("k1"), value("k2"), value("k3")), (value("p1"), value("p2"))
     if fisheye:

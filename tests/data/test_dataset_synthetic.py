@@ -46,14 +46,14 @@ def marched_hidden(placed, origin, target, own):
 def test_visibility_agrees_with_marching():
     """_seen, on surface points that moved with their bodies, against sampling the segment to the camera."""
     bodies = SceneBuilder("fast", 0).bodies()
-    surface = syn._surface(bodies, syn.fixed_viewmats()[1], 0.6)
+    body, point = syn._surface(bodies, syn.fixed_viewmats()[1], 0.6)
     rng = np.random.default_rng(1)
-    chosen = rng.choice(np.flatnonzero(surface.body > 1), 60, replace=False)  # not floor and wall: mostly visible
-    body, point = surface.body[chosen], surface.point[:, chosen]
+    chosen = rng.choice(np.flatnonzero(body > 1), 60, replace=False)  # not floor and wall: mostly visible
+    body, point = body[chosen], point[:, chosen]
     verdicts = []
     for t in (0.0, 0.37, 0.9):
         placed = place(bodies, t)
-        eye = Eye(placed, syn._train_viewmat(t))
+        eye = Eye(placed, syn.train_viewmat(t))
         for k, seen in enumerate(syn._seen(eye, body, point)):
             at = placed[body[k]]
             world = at.A @ point[:, k] + at.c
@@ -86,7 +86,7 @@ def test_pictures_are_antialiased(monkeypatch):
     default = syn.SUPERSAMPLING
     for n in (default, 1, 6):
         monkeypatch.setattr(syn, "SUPERSAMPLING", n)
-        pictures[n] = syn._render(bodies, syn._train_viewmat(0.5), 0.5).astype(float)
+        pictures[n] = syn._render(bodies, syn.train_viewmat(0.5), 0.5).astype(float)
     error = {n: np.square(p - pictures[6]).mean() for n, p in pictures.items()}
     assert error[default] < 0.6 * error[1]
 
@@ -167,7 +167,7 @@ def test_size_and_frames_are_those_asked_for(local):
 
 def test_seed_and_name_change_the_picture():
     def first(name, seed):
-        return syn._render(SceneBuilder(name, seed).bodies(), syn._train_viewmat(0.5), 0.5)
+        return syn._render(SceneBuilder(name, seed).bodies(), syn.train_viewmat(0.5), 0.5)
 
     pictures = [first("static", 0), first("static", 1), first("global", 0), first("local", 0), first("fast", 0)]
     for i, a in enumerate(pictures):
