@@ -21,7 +21,7 @@ from dataclasses import dataclass
 from pd4dgs_codec.errors import BadSignature, DecodeError, UnsupportedVersion
 from pd4dgs_codec.format.decoder import open_stream
 from pd4dgs_codec.scene import Scene
-from pd4dgs_codec.web.transfer import HEADER_GUESS, LONGEST_HEADER, Changed, OutOfTime, Transfer, slice_ends, within
+from pd4dgs_codec.web.transfer import HEADER_GUESS, LONGEST_HEADER, Changed, OutOfTime, Transfer, prefix_end, slice_ends
 
 RATE_SECONDS = 1.0
 
@@ -42,8 +42,8 @@ def next_end(
 
     slices: (layer, end offset) in file order. have: bytes here. rate: recent bytes per second; None if unknown.
     """
-    wanted = within(slices, budget.max_layer, budget.bytes)
-    end = next((end for _, end in wanted if end > have), None)
+    limit = prefix_end(slices, budget.max_layer, budget.bytes)
+    end = next((end for _, end in slices if have < end <= limit), None)
     if end is None or seconds_left <= 0:
         return None
     first = end == slices[0][1]
@@ -51,32 +51,13 @@ def next_end(
     return end if first or in_time else None
 
 
-class RateMeter:
-    """Bytes per second over the last RATE_SECONDS of a transfer."""
-
-    def __init__(self) -> None:
-        self._marks: deque[tuple[float, int]] = deque()  # (time, bytes until then)
-
-    def start(self, now: float) -> None:
-        """A request begins; earlier measurements are discarded."""
-        self._marks = deque([(now, 0)])
-
-    def note(self, now: float, size: int) -> None:
-        """`size` bytes arrived."""
-        self._marks.append((now, self._marks[-1][1] + size))
-        while len(self._marks) > 2 and now - self._marks[1][0] >= RATE_SECONDS:
-            self._marks.popleft()
-
-    @property
-    def latest(self) -> float:
-        """Time of the latest bytes, or of the request."""
-        return self._marks[-1][0]
-
-    @property
-    def rate(self) -> float | None:
-        """None before any bytes arrived."""
-        (start, before), (end, after) = self._marks[0], self._marks[-1]
-        return (after - before) / max(end - start, 1e-6) if after > before else None
+def recent_rate(arrivals: deque[tuple[float, int]]) -> float | None:
+    """Bytes per second over the last RATE_SECONDS of (time, bytes here), before which entries are dropped; None before
+    any bytes arrived."""
+    while len(arrivals) > 2 and arrivals[-1][0] - arrivals[1][0] >= RATE_SECONDS:
+        arrivals.popleft()
+    (start, before), (end, after) = arrivals[0], arrivals[-1]
+    return (after - before) / max(end - start, 1e-6) if after > before else None
 
 
 class SceneClient:
@@ -89,7 +70,6 @@ class SceneClient:
 
     def __init__(self, url: str, *, stall: float = 10.0, attempts: int = 5):
         self.transfer = Transfer(url, stall=stall, attempts=attempts)
-        self._meter = RateMeter()
         self._repaired_at = -1
         self._begin()
 
@@ -102,7 +82,7 @@ class SceneClient:
     @property
     def arrived_at(self) -> float:
         """time.monotonic() of the latest bytes; when a scene is yielded, of the last byte of its slice."""
-        return self._meter.latest
+        return self._arrivals[-1][0]
 
     def close(self) -> None:
         """Closes the connection; `scenes` may be called again and opens another."""
@@ -115,7 +95,7 @@ class SceneClient:
         DecodeError if it is invalid; scenes yielded before stay valid.
         """
         until = time.monotonic() + budget.seconds
-        self._meter.start(time.monotonic())
+        self._arrivals = self._now()
         while True:
             while ready := self._ready(budget):  # until empty: a fault behind a slice is raised by the next feed
                 yield from ready
@@ -123,8 +103,8 @@ class SceneClient:
             end: int | None = HEADER_GUESS if len(self.transfer.data) < HEADER_GUESS else LONGEST_HEADER
             reach = None
             if self._slices:
-                end = next_end(self._slices, len(self.transfer.data), budget, left, self._meter.rate)
-                reach = within(self._slices, budget.max_layer, budget.bytes)[-1][1] if end is not None else None
+                end = next_end(self._slices, len(self.transfer.data), budget, left, recent_rate(self._arrivals))
+                reach = prefix_end(self._slices, budget.max_layer, budget.bytes)
             if end is None:
                 break
             try:
@@ -137,12 +117,16 @@ class SceneClient:
                 break
             if not block:
                 self._stream.finish()  # raises Truncated: the file ends within this slice
-            self._meter.note(time.monotonic(), len(block))
+            self._arrivals += self._now()
         self.close()
 
     def _begin(self) -> None:
         self._stream, self._fed, self._done = open_stream(), 0, 0
         self._slices: list[tuple[int, int]] = []
+        self._arrivals = self._now()
+
+    def _now(self) -> deque[tuple[float, int]]:
+        return deque([(time.monotonic(), len(self.transfer.data))])
 
     def _ready(self, budget: Budget) -> list[Scene]:
         """Feeds new bytes to the decoder. After a fault the transfer goes back to the end of the last valid slice."""
@@ -165,8 +149,7 @@ class SceneClient:
         if not self._slices:
             self._slices = slice_ends(data)
         if self._slices:  # the first bytes of a small file may hold more than the budget allows
-            wanted = within(self._slices, budget.max_layer, budget.bytes)
-            end = min(end, wanted[-1][1] if wanted else 0)
+            end = min(end, prefix_end(self._slices, budget.max_layer, budget.bytes))
         block, self._fed = bytes(data[self._fed : end]), max(self._fed, end)
         scenes = self._stream.feed(block)
         self._done = self._stream.slices

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 import re
 from email.utils import parsedate_to_datetime
-from typing import NamedTuple
 
 #: Positions of more digits belong to no file, and int() takes quadratic time for them.
 _DIGITS = r"[0-9]{1,18}"
 _RANGE = re.compile(rf"bytes=(?:({_DIGITS})-({_DIGITS})?|-({_DIGITS}))", re.IGNORECASE)
-_CONTENT_RANGE = re.compile(rf"bytes (?:({_DIGITS})-({_DIGITS})|\*)/({_DIGITS}|\*)", re.IGNORECASE)
+_CONTENT_RANGE = re.compile(rf"bytes ({_DIGITS})-({_DIGITS})/({_DIGITS})", re.IGNORECASE)
 #: A file whose name carries the digest of its content never changes.
 _ADDRESSED = re.compile(r"-[0-9a-f]{16}\.\w+$")
 #: Caches keep immutable files for a year, and revalidate all others on every use.
@@ -41,25 +40,11 @@ def requested_range(header: str | None, size: int) -> tuple[int, int] | None:
     return start, end
 
 
-class ContentRange(NamedTuple):
-    """start, end: the part sent, end exclusive, None in a 416. total: length of the file, None if unknown."""
-
-    start: int | None
-    end: int | None
-    total: int | None
-
-
-def content_range(header: str | None) -> ContentRange | None:
-    """The parsed Content-Range header; None if it is missing or invalid."""
+def content_range(header: str | None) -> tuple[int, int, int] | None:
+    """(start, end, length of the file) of a Content-Range header, end exclusive; None unless it tells all three."""
     match = _CONTENT_RANGE.fullmatch(header.strip()) if header else None
-    if match is None:
-        return None
-    first, last, total = match.groups()
-    start, end = (None, None) if first is None else (int(first), int(last) + 1)
-    size = None if total == "*" else int(total)
-    if start is not None and end is not None and (start >= end or (size is not None and end > size)):
-        return None
-    return ContentRange(start, end, size)
+    first, last, size = map(int, match.groups()) if match else (0, 0, 0)
+    return (first, last + 1, size) if first <= last < size else None
 
 
 def strong_etag(header: str | None) -> str | None:

@@ -7,8 +7,10 @@ no dependent layers: its playlist shows the 2D video and refers to the JSON inde
 from __future__ import annotations
 
 import math
-import xml.etree.ElementTree as ElementTree
+from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
+from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 from pd4dgs_codec.errors import DeliveryError
 from pd4dgs_codec.web import mp4
@@ -31,83 +33,57 @@ class Video:
     poster: bytes = b""
 
 
-@dataclass(frozen=True)
-class Part:
-    """A slice. start, end: bytes of the `.pd4`; segment: bytes of the MP4 file; ends are exclusive."""
-
-    layer: int
-    slice: int
-    start: int
-    end: int
-    segment: tuple[int, int]
-
-    @property
-    def id(self) -> str:
-        """Of its Representation: L0 for layer 0, L0.1 for its second slice."""
-        return f"L{self.layer}.{self.slice}" if self.slice else f"L{self.layer}"
-
-
-def dash(
-    init: int, parts: list[Part], seconds: float, segments: str, video: Video | None = None, video_name: str = ""
-) -> bytes:
-    """The MPD. init: bytes of the MP4 file `segments` before its first fragment. video, video_name: the 2D rendition
-    and its file."""
-    root = ElementTree.Element(
-        "MPD",
-        {
-            "xmlns": "urn:mpeg:dash:schema:mpd:2011",
-            "profiles": "urn:mpeg:dash:profile:full:2011",
-            "type": "static",
-            "mediaPresentationDuration": _duration(seconds),
-            "minBufferTime": _duration(MIN_BUFFER_SECONDS),
-        },
-    )
-    period = ElementTree.SubElement(root, "Period", id="0", start="PT0S")
+def dash(slices: list[dict[str, Any]], seconds: float, video: Video | None = None, video_name: str = "") -> bytes:
+    """The MPD. slices: as the index of the package lists them. video, video_name: the 2D rendition and its file."""
+    root = Element("MPD", xmlns="urn:mpeg:dash:schema:mpd:2011", profiles="urn:mpeg:dash:profile:full:2011")
+    root.attrib |= {"type": "static", "mediaPresentationDuration": _duration(seconds)}
+    root.set("minBufferTime", _duration(MIN_BUFFER_SECONDS))
+    period = SubElement(root, "Period", id="0", start="PT0S")
     if video is not None:
         _video_set(period, video, video_name)
-    ticks = max(1, round(seconds * mp4.TIMESCALE))
-    for i, part in enumerate(parts):
-        group = ElementTree.SubElement(
+    ids: list[str] = []
+    for row in slices:
+        where = row["dash"]
+        group = SubElement(
             period, "AdaptationSet", contentType="application", mimeType="application/mp4", codecs="mett"
         )
-        ElementTree.SubElement(group, "SupplementalProperty", schemeIdUri=LAYER_SCHEME, value=str(part.layer))
-        bandwidth = min(math.ceil(8 * part.segment[1] / MIN_BUFFER_SECONDS), (1 << 32) - 1)
-        representation = ElementTree.SubElement(group, "Representation", id=part.id, bandwidth=str(bandwidth))
-        if i:
-            representation.set("dependencyId", " ".join(before.id for before in parts[:i]))
-        _segment_list(representation, segments, init, mp4.TIMESCALE, ticks, [part.segment])
-    ElementTree.indent(root)
-    text: bytes = ElementTree.tostring(root, encoding="utf-8", xml_declaration=True)
+        SubElement(group, "SupplementalProperty", schemeIdUri=LAYER_SCHEME, value=str(row["layer"]))
+        bandwidth = min(math.ceil(8 * where["range"][1] / MIN_BUFFER_SECONDS), (1 << 32) - 1)
+        name = f"L{row['layer']}.{row['slice']}" if row["slice"] else f"L{row['layer']}"
+        representation = SubElement(group, "Representation", id=name, bandwidth=str(bandwidth))
+        if ids:
+            representation.set("dependencyId", " ".join(ids))
+        _segment_list(representation, where["file"], where["init"][1], seconds, [where["range"]])
+        ids.append(name)
+    indent(root)
+    text: bytes = tostring(root, encoding="utf-8", xml_declaration=True)
     return text + b"\n"
 
 
-def _video_set(period: ElementTree.Element, video: Video, name: str) -> None:
+def _video_set(period: Element, video: Video, name: str) -> None:
     init, pieces = mp4.fragments(video.data)
-    group = ElementTree.SubElement(
-        period, "AdaptationSet", contentType="video", mimeType="video/mp4", segmentAlignment="true", startWithSAP="1"
-    )
-    representation = ElementTree.SubElement(
-        group,
+    kind = {"contentType": "video", "mimeType": "video/mp4", "segmentAlignment": "true", "startWithSAP": "1"}
+    representation = SubElement(
+        SubElement(period, "AdaptationSet", kind),
         "Representation",
         id="video",
-        bandwidth=str(_peak_rate(video)),
+        bandwidth=str(_peak_rate(video, pieces)),
         codecs=_codec(video.data[:init]),
         width=str(video.width),
         height=str(video.height),
         frameRate=f"{round(video.fps * 1000)}/1000",
     )
-    ticks = round(1000 * max(piece.samples for piece in pieces) / video.fps)
-    _segment_list(representation, name, init, 1000, ticks, [(piece.start, piece.end) for piece in pieces])
+    seconds = max(piece.samples for piece in pieces) / video.fps
+    _segment_list(representation, name, init, seconds, [(piece.start, piece.end) for piece in pieces])
 
 
-def _segment_list(
-    parent: ElementTree.Element, url: str, init: int, timescale: int, ticks: int, ranges: list[tuple[int, int]]
-) -> None:
-    ElementTree.SubElement(parent, "BaseURL").text = url
-    segments = ElementTree.SubElement(parent, "SegmentList", timescale=str(timescale), duration=str(ticks))
-    ElementTree.SubElement(segments, "Initialization", range=f"0-{init - 1}")
+def _segment_list(parent: Element, url: str, init: int, seconds: float, ranges: Iterable[tuple[int, int]]) -> None:
+    """ranges: bytes of segments that last `seconds` each, ends exclusive."""
+    SubElement(parent, "BaseURL").text = url
+    segments = SubElement(parent, "SegmentList", timescale=str(mp4.TIMESCALE), duration=str(mp4.ticks(seconds)))
+    SubElement(segments, "Initialization", range=f"0-{init - 1}")
     for start, end in ranges:
-        ElementTree.SubElement(segments, "SegmentURL", mediaRange=f"{start}-{end - 1}")
+        SubElement(segments, "SegmentURL", mediaRange=f"{start}-{end - 1}")
 
 
 def _duration(seconds: float) -> str:
@@ -118,13 +94,10 @@ def hls(index: str, video: Video | None = None, playlist: str = "") -> bytes:
     """The multivariant playlist. index: the JSON index. video, playlist: the 2D rendition and its media playlist."""
     lines = ["#EXTM3U", "#EXT-X-VERSION:7", f'#EXT-X-SESSION-DATA:DATA-ID="{SESSION_DATA_ID}",URI="{index}"']
     if video is not None:
-        init, _ = mp4.fragments(video.data)
-        lines.append("#EXT-X-INDEPENDENT-SEGMENTS")
-        lines.append(
-            f'#EXT-X-STREAM-INF:BANDWIDTH={_peak_rate(video)},CODECS="{_codec(video.data[:init])}",'
-            f"RESOLUTION={video.width}x{video.height},FRAME-RATE={video.fps:.3f}"
-        )
-        lines.append(playlist)
+        init, pieces = mp4.fragments(video.data)
+        stream = f'BANDWIDTH={_peak_rate(video, pieces)},CODECS="{_codec(video.data[:init])}",'
+        stream += f"RESOLUTION={video.width}x{video.height},FRAME-RATE={video.fps:.3f}"
+        lines += ["#EXT-X-INDEPENDENT-SEGMENTS", f"#EXT-X-STREAM-INF:{stream}", playlist]
     return ("\n".join(lines) + "\n").encode()
 
 
@@ -140,9 +113,8 @@ def hls_video(video: Video, name: str) -> bytes:
     return ("\n".join([*lines, "#EXT-X-ENDLIST"]) + "\n").encode()
 
 
-def _peak_rate(video: Video) -> int:
+def _peak_rate(video: Video, pieces: list[mp4.Fragment]) -> int:
     """Bits per second of the fragment with the highest rate."""
-    _, pieces = mp4.fragments(video.data)
     return math.ceil(max(8 * (piece.end - piece.start) * video.fps / piece.samples for piece in pieces))
 
 

@@ -21,6 +21,11 @@ _DEFAULT_BASE_IS_MOOF = 0x020000
 _CONTAINERS = {b"moov", b"trak", b"mdia", b"minf", b"stbl", b"mvex", b"moof", b"traf"}
 
 
+def ticks(seconds: float) -> int:
+    """A duration in units of TIMESCALE, at least 1."""
+    return max(1, round(seconds * TIMESCALE))
+
+
 def box(kind: bytes, *parts: bytes) -> bytes:
     """One box. Raises DeliveryError if its size exceeds 32 bits."""
     size = 8 + sum(map(len, parts))

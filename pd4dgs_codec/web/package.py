@@ -20,7 +20,7 @@ from pd4dgs_codec.format.info import info
 from pd4dgs_codec.scene import Scene
 from pd4dgs_codec.web import PAGE, mp4
 from pd4dgs_codec.web.headers import cache_control
-from pd4dgs_codec.web.manifests import MAX_SECONDS, Part, Video, dash, hls, hls_video
+from pd4dgs_codec.web.manifests import MAX_SECONDS, Video, dash, hls, hls_video
 from pd4dgs_codec.web.page import page
 
 SCENE, SEGMENTS, MPD, PLAYLIST, INDEX = "scene.pd4", "scene.mp4", "scene.mpd", "scene.m3u8", "index.json"
@@ -45,14 +45,16 @@ def package(
     seconds = high - low if high > low else STILL_SECONDS
     if seconds > MAX_SECONDS:
         raise DeliveryError(f"the scene lasts {seconds:g} s, DASH takes at most {MAX_SECONDS:,}")
-    segments, init, parts = _segments(data, about, seconds)
+    segments, slices = _segments(data, about, seconds)
     video = render(scene) if render is not None else None
     media = {SCENE: data, SEGMENTS: segments}
     if video is not None:
         media |= {VIDEO: video.data} | ({POSTER: video.poster} if video.poster else {})
     names = {name: addressed(name, content) if immutable else name for name, content in media.items()}
     files = {names[name]: content for name, content in media.items()}
-    files[MPD] = dash(init, parts, seconds, names[SEGMENTS], video, names.get(VIDEO, ""))
+    for row in slices:
+        row["dash"]["file"] = names[SEGMENTS]
+    files[MPD] = dash(slices, seconds, video, names.get(VIDEO, ""))
     if video is not None:
         files[VIDEO_PLAYLIST] = hls_video(video, names[VIDEO])
     files[PLAYLIST] = hls(INDEX, video, VIDEO_PLAYLIST)
@@ -64,12 +66,12 @@ def package(
         "sha256": hashlib.sha256(data).hexdigest(),
         "time_range": about["time_range"],
         "seconds": seconds,
-        "layers": _layers(data, init, parts, names[SEGMENTS]),
+        "layers": slices,
         "dash": MPD,
         "hls": PLAYLIST,
         "video": video and {"file": names[VIDEO], "width": video.width, "height": video.height, "fps": video.fps},
         "poster": names.get(POSTER),
-        "first_frame_seconds": {name: 8 * parts[0].end / rate for name, rate in RATES.items()},
+        "first_frame_seconds": {name: 8 * slices[0]["range"][1] / rate for name, rate in RATES.items()},
         "cache_control": {name: cache_control(name) for name in (*files, INDEX)},
     }
     files[INDEX] = _json(index)
@@ -82,38 +84,25 @@ def addressed(name: str, content: bytes) -> str:
     return f"{stem}-{hashlib.sha256(content).hexdigest()[:16]}{dot}{suffix}"
 
 
-def _segments(data: bytes, about: dict[str, Any], seconds: float) -> tuple[bytes, int, list[Part]]:
-    """(scene.mp4, bytes of its initialisation, slices). Chunks between slices belong to the slice after them."""
-    rows = [
-        (layer["layer"], number, part["end"])
-        for layer in about["layers"]
-        for number, part in enumerate(layer["slices"])
-    ]
-    ticks = max(1, round(seconds * mp4.TIMESCALE))
-    content = mp4.initialisation(len(rows), ticks)
-    init, start, parts = len(content), 0, []
+def _segments(data: bytes, about: dict[str, Any], seconds: float) -> tuple[bytes, list[dict[str, Any]]]:
+    """(scene.mp4, the slices as the index lists them). Chunks between slices belong to the slice after them.
+
+    Byte ranges are [first, one past the last]; sha256: of the `.pd4` bytes.
+    """
+    rows = [(row["layer"], i, part["end"]) for row in about["layers"] for i, part in enumerate(row["slices"])]
+    content = mp4.initialisation(len(rows), mp4.ticks(seconds))
+    init, start, slices = len(content), 0, list[dict[str, Any]]()
     for number, (layer, place, end) in enumerate(rows, 1):
-        end = len(data) if number == len(rows) else end
-        piece = mp4.fragment(number, number, data[start:end], ticks)
-        parts.append(Part(layer, place, start, end, (len(content), len(content) + len(piece))))
+        part = data[start : len(data) if number == len(rows) else end]
+        piece = mp4.fragment(number, number, part, mp4.ticks(seconds))
+        row = {"layer": layer, "slice": place, "range": [start, start + len(part)]}
+        row["sha256"] = hashlib.sha256(part).hexdigest()
+        row["depends_on"] = sorted({before for before, *_ in rows[: number - 1]})
+        row["dash"] = {"file": SEGMENTS, "init": [0, init], "range": [len(content), len(content) + len(piece)]}
+        slices.append(row)
         content += piece
-        start = end
-    return content, init, parts
-
-
-def _layers(data: bytes, init: int, parts: list[Part], segments: str) -> list[dict[str, Any]]:
-    """The slices as the index lists them. Byte ranges are [first, one past the last]; sha256: of the `.pd4` bytes."""
-    return [
-        {
-            "layer": part.layer,
-            "slice": part.slice,
-            "range": [part.start, part.end],
-            "sha256": hashlib.sha256(data[part.start : part.end]).hexdigest(),
-            "depends_on": sorted({before.layer for before in parts[:i]}),
-            "dash": {"file": segments, "init": [0, init], "range": list(part.segment)},
-        }
-        for i, part in enumerate(parts)
-    ]
+        start += len(part)
+    return content, slices
 
 
 def _json(content: dict[str, Any]) -> bytes:

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import gzip
+import io
 import os
 import socket
 import stat
@@ -88,14 +89,6 @@ class Link:
         finally:
             with self._lock:
                 self._transfers -= 1
-
-    def send(self, body: bytes, write: Callable[[bytes], object]) -> None:
-        """Passes `body` to `write` block by block, each when it has crossed."""
-        with self.transfer():
-            for start in range(0, len(body), self.block):
-                block = body[start : start + self.block]
-                self.cross(len(block))
-                write(block)
 
     def cross(self, size: int) -> None:
         """Returns when `size` more bytes have crossed. Deadlines are absolute, so that delays do not accumulate."""
@@ -179,8 +172,9 @@ class Server(ThreadingTCPServer):
             super().handle_error(request, client_address)  # type: ignore[arg-type]
 
 
-def _locate(root: Path, target: str) -> Path | None:
-    """The file under `root` that a request target names; None for missing and hidden files and paths out of `root`.
+def _opened(root: Path, target: str) -> BinaryIO | None:
+    """The file under `root` that a request target names; None for missing and hidden files, folders, pipes, and paths
+    out of `root`.
 
     A target that ends in a slash names the folder's page. Links inside `root`, itself absolute and free of links,
     count if they lead to a place inside it.
@@ -192,24 +186,20 @@ def _locate(root: Path, target: str) -> Path | None:
         if not path.startswith("/") or any(n.startswith(".") or not n or "\\" in n or "\0" in n for n in names):
             return None
         found = root.joinpath(*names).resolve(strict=True)
+        if not found.is_relative_to(root):
+            return None
+        # neither a link nor a pipe that has just been put there
+        file = open(found, "rb", opener=lambda name, flags: os.open(name, flags | os.O_NOFOLLOW | os.O_NONBLOCK))
     except (OSError, ValueError, RuntimeError):  # RuntimeError: a cycle of links, before Python 3.13
         return None
-    return found if found.is_relative_to(root) else None
+    if stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+        return file
+    file.close()
+    return None
 
 
-def _open_regular(path: Path) -> BinaryIO | None:
-    """The open file; None if it cannot be opened or is a folder, a pipe, or a link that has just been put there."""
-    try:
-        descriptor = os.open(path, os.O_RDONLY | os.O_NOFOLLOW | os.O_NONBLOCK)
-    except OSError:
-        return None
-    if not stat.S_ISREG(os.fstat(descriptor).st_mode):
-        os.close(descriptor)
-        return None
-    return os.fdopen(descriptor, "rb")
-
-
-def _etag(state: os.stat_result) -> str:
+def _etag(file: BinaryIO) -> str:
+    state = os.fstat(file.fileno())
     return f'"{state.st_ino:x}-{state.st_size:x}-{state.st_mtime_ns:x}"'
 
 
@@ -240,12 +230,6 @@ class _Handler(BaseHTTPRequestHandler):
         self.server.waiting.pop(self.connection, None)
         return complete
 
-    def do_GET(self) -> None:
-        self._answer(body=True)
-
-    def do_HEAD(self) -> None:
-        self._answer(body=False)
-
     def do_OPTIONS(self) -> None:
         self._begin(HTTPStatus.NO_CONTENT, {"Allow": METHODS, **PREFLIGHT})
 
@@ -255,41 +239,39 @@ class _Handler(BaseHTTPRequestHandler):
 
     do_POST = do_PUT = do_PATCH = do_DELETE = _refuse
 
-    def _answer(self, body: bool) -> None:
+    def do_GET(self) -> None:
         if "Content-Length" in self.headers or "Transfer-Encoding" in self.headers:
             self.close_connection = True  # the request body must not be taken for the next request
-        path = _locate(self.server.root, self.path)
-        file = None if path is None else _open_regular(path)
-        if path is None or file is None:
+        file = _opened(self.server.root, self.path)
+        if file is None:
             self._fail(HTTPStatus.NOT_FOUND)
             return
         with file:
-            self._send_file(file, path, body)
+            self._send_file(file)
 
-    def _send_file(self, file: BinaryIO, path: Path, body: bool) -> None:
-        suffix = path.suffix.lower()
-        state = os.fstat(file.fileno())
-        size, etag = state.st_size, _etag(state)
-        zipped = suffix in ZIPPED and size <= MAX_ZIPPED and self._takes_gzip()
-        if zipped:  # another representation, with other ranges and another ETag
-            etag = etag[:-1] + '-gzip"'
-        headers = {"Accept-Ranges": "bytes", "Cache-Control": cache_control(path.name), "ETag": etag}
+    do_HEAD = do_GET
+
+    def _send_file(self, file: BinaryIO) -> None:
+        path, etag, state = Path(file.name), _etag(file), os.fstat(file.fileno())
+        suffix, body, size = path.suffix.lower(), file, state.st_size
+        headers = {"Accept-Ranges": "bytes", "Cache-Control": cache_control(path.name)}
         headers["Last-Modified"] = formatdate(state.st_mtime, usegmt=True)
         if suffix in ZIPPED:
             headers["Vary"] = "Accept-Encoding"
-        if self._unchanged(etag, state.st_mtime):
+        zipped = suffix in ZIPPED and size <= MAX_ZIPPED and self._takes_gzip()
+        # another representation, with other ranges and another ETag
+        headers["ETag"] = etag[:-1] + '-gzip"' if zipped else etag
+        if self._unchanged(headers["ETag"], state.st_mtime):
             self._begin(HTTPStatus.NOT_MODIFIED, headers)
             return
         headers["Content-Type"] = MEDIA_TYPES.get(suffix, "application/octet-stream")
         if zipped:
-            content = gzip.compress(file.read(MAX_ZIPPED), 9, mtime=0)
-            self._begin(HTTPStatus.OK, {**headers, "Content-Encoding": "gzip", "Content-Length": str(len(content))})
-            if body:
-                self.server.link.send(content, self.wfile.write)
-            return
+            body = io.BytesIO(gzip.compress(file.read(MAX_ZIPPED), 9, mtime=0))
+            size, headers["Content-Encoding"] = body.getbuffer().nbytes, "gzip"
+        part = None
         try:
-            # HTTP defines ranges for GET only
-            part = requested_range(self.headers.get("Range"), size) if body and self._range_holds(etag, state) else None
+            if self.command == "GET" and self._range_holds(etag, state):  # HTTP defines ranges for GET only
+                part = requested_range(self.headers.get("Range"), size)
         except Unsatisfiable:
             self._fail(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, {**headers, "Content-Range": f"bytes */{size}"})
             return
@@ -298,21 +280,21 @@ class _Handler(BaseHTTPRequestHandler):
         if part:
             headers["Content-Range"] = f"bytes {start}-{end - 1}/{size}"
         self._begin(HTTPStatus.PARTIAL_CONTENT if part else HTTPStatus.OK, headers)
-        if body:
-            file.seek(start)
-            self._send_body(file, end - start, etag)
+        if self.command == "GET":
+            body.seek(start)
+            self._send_body(body, end - start, lambda: _etag(file) == etag)
 
     def _takes_gzip(self) -> bool:
         listed = self.headers.get("Accept-Encoding", "").lower().replace(" ", "").split(",")
         return "gzip" in listed and "Range" not in self.headers
 
-    def _send_body(self, file: BinaryIO, left: int, etag: str) -> None:
+    def _send_body(self, body: BinaryIO, left: int, unchanged: Callable[[], bool]) -> None:
         link = self.server.link
         with link.transfer():
             while left:
-                block = file.read(min(left, link.block))
+                block = body.read(min(left, link.block))
                 # a file rewritten in place: after a disconnection the client asks for the new one
-                if not block or _etag(os.fstat(file.fileno())) != etag:
+                if not block or not unchanged():
                     self.close_connection = True
                     return
                 link.cross(len(block))

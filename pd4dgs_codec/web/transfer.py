@@ -15,6 +15,7 @@ import threading
 import time
 from collections.abc import Callable
 from concurrent import futures
+from functools import partial
 from http import HTTPStatus
 from typing import TypeVar
 from urllib.parse import SplitResult, quote, urljoin, urlsplit
@@ -73,8 +74,8 @@ class Transfer:
         self._connection: http.client.HTTPConnection | None = None
         self._socket: socket.socket | None = None  # http.client forgets it before the last response is read
         self._response: http.client.HTTPResponse | None = None
-        self._response_end: int | None = None  # offset in the file where the current response ends, if known
-        self._skip = 0  # bytes of the response that have arrived before
+        self._at = 0  # offset in the file of the next byte of the response; bytes that are here are skipped
+        self._response_end: int | None = None  # offset in the file where the response ends, if known
 
     def read(self, end: int | None = None, *, reach: int | None = None, seconds: float = math.inf) -> bytes:
         """The next bytes to arrive, none beyond `end` (None: the end of the file); empty if all are here.
@@ -101,6 +102,9 @@ class Transfer:
                 if failures > 1:
                     time.sleep(max(0.0, min(BACKOFF_SECONDS * 2 ** (failures - 2), until - time.monotonic())))
                 continue
+            except DeliveryError as error:
+                self.close()
+                raise DeliveryError(f"{self.url}: {error}") from None
             if block:
                 return block
         return b""
@@ -120,7 +124,6 @@ class Transfer:
         if self._connection is not None:
             self._connection.close()
         self._connection = self._socket = self._response = None
-        self._skip = 0
         self._place = self._home
 
     def _is_here(self, end: int | None) -> bool:
@@ -129,31 +132,31 @@ class Transfer:
 
     def _receive(self, end: int | None, until: float) -> bytes:
         """One block of the response; b"" at its regular end and while bytes are skipped."""
-        response = self._response
+        response, skipped = self._response, len(self.data) - self._at
         assert response is not None and self._socket is not None
-        limit = BLOCK if end is None or self._skip else min(BLOCK, end - len(self.data))
+        limits = [BLOCK]
+        if skipped:
+            limits.append(skipped)
+        elif end is not None:
+            limits.append(end - self._at)
         if self._response_end is not None:
-            limit = min(limit, self._response_end - (len(self.data) - self._skip))
-        if self._skip:
-            limit = min(limit, self._skip)
+            limits.append(self._response_end - self._at)
         seconds = self._patience(until)
         self._socket.settimeout(seconds)
         # a chunk's length takes several reads, each with a time limit of its own
-        block = _within(seconds, lambda: response.read1(limit)) if response.chunked else response.read1(limit)
-        if self._skip:
-            self._skip -= len(block)
-            if not block:
-                raise _Cut("the connection ended early")
-            return b""
-        self.data += block
-        if len(self.data) == self._response_end:
+        read = partial(response.read1, min(limits))
+        block = _within(seconds, read) if response.chunked else read()
+        self._at += len(block)
+        if not skipped:
+            self.data += block
+        if self._at == self._response_end:
             response.close()  # it is read completely, so the connection can be used again
             self._response = None
         elif not block:
-            if self._response_end is not None:
-                raise _Cut(f"the connection ended at byte {len(self.data):,} of {self._response_end:,}")
-            self._response, self.total = None, len(self.data)  # of unknown length: it ends with the connection
-        return block
+            if skipped or self._response_end is not None:
+                raise _Cut(f"the connection ended early, at byte {self._at:,}")
+            self._response, self.total = None, self._at  # of unknown length: it ends with the connection
+        return b"" if skipped else block
 
     def _patience(self, until: float) -> float:
         """Seconds for the next operation."""
@@ -177,19 +180,14 @@ class Transfer:
         for _ in range(MAX_REDIRECTS + 1):
             response = self._send(headers, until)
             if response.status not in REDIRECTS:
-                break
+                self._accept(response, start, "Range" in headers)
+                return
             here, target = self._place.geturl(), response.headers.get("Location")
             self.close()
             if target is None:
-                raise DeliveryError(f"{self.url}: a redirect without a Location")
-            try:
-                self._place = _parsed(urljoin(here, target))
-            except ValueError:
-                raise DeliveryError(f"{self.url}: invalid redirect to {one_line(target, SHOWN)!r}") from None
-        else:
-            raise DeliveryError(f"{self.url}: more than {MAX_REDIRECTS} redirects")
-        self._response = response
-        self._accept(response, start, "Range" in headers)
+                raise DeliveryError("a redirect without a Location")
+            self._place = _parsed(target, here)
+        raise DeliveryError(f"more than {MAX_REDIRECTS} redirects")
 
     def _send(self, headers: dict[str, str], until: float) -> http.client.HTTPResponse:
         """The response with its headers. The time limit covers name resolution, connection, TLS and all headers."""
@@ -220,36 +218,32 @@ class Transfer:
         """Checks a response for bytes from `start` on. Raises Changed if it is about another file than before."""
         status, part = response.status, content_range(response.headers.get("Content-Range"))
         if status == HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE and asked_range:
-            if start == 0:
-                self.close()
-                self.total = 0
-                return
-            self._restart()  # the file has become shorter than the bytes that are here
+            if start:
+                self._restart()  # the file has become shorter than the bytes that are here
+            self.close()
+            self.total = 0
+            return
         if status not in (HTTPStatus.OK, HTTPStatus.PARTIAL_CONTENT):
             said = f"the server answers {status} {one_line(response.reason, SHOWN)}".rstrip()
-            if status in TEMPORARY:
-                raise _Cut(said)
-            self.close()
-            raise DeliveryError(f"{self.url}: {said}")
+            raise (_Cut if status in TEMPORARY else DeliveryError)(said)
         coding = response.headers.get("Content-Encoding", "identity")
         if coding.lower() != "identity":
-            self.close()
-            raise DeliveryError(f"{self.url}: found Content-Encoding {one_line(coding, SHOWN)}, expected identity")
+            raise DeliveryError(f"found Content-Encoding {one_line(coding, SHOWN)}, expected identity")
         tag = strong_etag(response.headers.get("ETag"))
         validator = tag or response.headers.get("Last-Modified")
+        self._response, self._at = response, start
         if status == HTTPStatus.PARTIAL_CONTENT:
-            if not asked_range or part is None or part.start != start or part.total is None:
+            if not asked_range or part is None or part[0] != start:
                 found = one_line(response.headers.get("Content-Range") or "none", SHOWN)
                 raise _Cut(f"found Content-Range {found}, expected bytes from {start}")
-            other = start and validator is not None and validator != self._validator
-            if other or (start and part.total != self.total):
+            other = validator is not None and validator != self._validator
+            if start and (other or part[2] != self.total):
                 self._restart()
-            self.total, self._response_end = part.total, part.end
+            _, self._response_end, self.total = part
         else:
             self._response_end = self.total = response.length
-            if start and tag is not None and tag == self._validator:
-                self._skip = start  # the same file from a server without ranges
-            elif start:
+            self._at = 0
+            if start and (tag is None or tag != self._validator):  # else a server without ranges sends the same file
                 self._restart(keep_response=True, validator=validator)
         self._validator = validator or self._validator
 
@@ -262,8 +256,7 @@ class Transfer:
             self.close()
             self.total = None
         if self.changes > MAX_CHANGES:
-            self.close()
-            raise DeliveryError(f"{self.url}: changed {self.changes} times during the transfer")
+            raise DeliveryError(f"changed {self.changes} times during the transfer")
         raise Changed
 
 
@@ -285,14 +278,12 @@ def _within(seconds: float, work: Callable[[], T]) -> T:
         raise TimeoutError from None
 
 
-def _parsed(url: str) -> SplitResult:
-    """The parts of an address that can be fetched. Raises DeliveryError for any other."""
-    try:
-        parts = urlsplit(url)
-        if is_url(url) and parts.hostname and "@" not in parts.netloc and parts.port != 0:
+def _parsed(url: str, base: str = "") -> SplitResult:
+    """The parts of an address that can be fetched, if relative from `base` on. Raises DeliveryError for any other."""
+    with contextlib.suppress(ValueError):
+        parts = urlsplit(urljoin(base, url))
+        if is_url(parts.geturl()) and parts.hostname and "@" not in parts.netloc and parts.port != 0:
             return parts
-    except ValueError:
-        pass
     raise DeliveryError(f"found {url!r}, expected http://HOST/PATH or https://HOST/PATH")
 
 
@@ -314,44 +305,23 @@ def _reason(error: BaseException) -> str:
 # -- prefixes of a .pd4 file -------------------------------------------------------------------------------------------
 
 
-def header_size(data: bytes | bytearray) -> int | None:
-    """Bytes of preamble and header; None if `data`, the first bytes of a file, ends within them."""
-    try:
-        return read_preamble(data).size
-    except Truncated:
-        return None
-
-
 def slice_ends(data: bytes | bytearray) -> list[tuple[int, int]]:
-    """(layer, end offset) of each slice, from a file's first bytes; empty if they end within the header."""
-    size = header_size(data)
+    """(layer, end offset) of each slice in file order, from a file's first bytes; empty if they end within the
+    header."""
+    size = _header_size(data)
     layers = [] if size is None else info(bytes(data[:size]))["layers"]
     return [(row["layer"], part["end"]) for row in layers for part in row["slices"]]
 
 
-def within(
-    slices: list[tuple[int, int]], max_layer: int | None = None, max_bytes: int | None = None
-) -> list[tuple[int, int]]:
-    """The slices (layer, end offset) of layers up to max_layer that end within max_bytes."""
-    return [
-        (layer, end)
-        for layer, end in slices
-        if (max_layer is None or layer <= max_layer) and (max_bytes is None or end <= max_bytes)
-    ]
+def prefix_end(slices: list[tuple[int, int]], max_layer: int | None = None, max_bytes: int | None = None) -> int:
+    """End of the last slice of a layer up to max_layer that ends within max_bytes; 0 if there is none."""
+    layer_limit, limit = (math.inf if most is None else most for most in (max_layer, max_bytes))
+    return max((end for layer, end in slices if layer <= layer_limit and end <= limit), default=0)
 
 
 def fetch_header(transfer: Transfer) -> bytes:
-    """Preamble and header; fewer bytes if the remote file ends within them. Raises as Transfer.read does."""
-    while True:
-        try:
-            for end in (HEADER_GUESS, LONGEST_HEADER):
-                _fill(transfer, end, end)
-                size = header_size(transfer.data)
-                if size is not None:
-                    return bytes(transfer.data[:size])
-            return bytes(transfer.data)
-        except Changed:
-            continue
+    """Preamble and header; fewer bytes if the remote file ends within them. Raises as `fetch` does."""
+    return fetch(transfer, max_bytes=0)
 
 
 def fetch(transfer: Transfer, max_layer: int | None = None, max_bytes: int | None = None) -> bytes:
@@ -361,28 +331,26 @@ def fetch(transfer: Transfer, max_layer: int | None = None, max_bytes: int | Non
     A prefix takes two requests for exactly its bytes, the whole file one. One byte after the last chunk is fetched, so
     that the decoder sees trailing data. Raises as Transfer.read does, and DecodeError for an invalid header.
     """
+    whole = max_layer is None and max_bytes is None
+
+    def fill(end: int) -> bytes:
+        while transfer.read(end, reach=None if whole else end):
+            pass
+        return bytes(transfer.data[:end])
+
     while True:
-        try:
-            if max_layer is None and max_bytes is None:
-                return _fetch_whole(transfer)
-            header = fetch_header(transfer)
-            wanted = within(slice_ends(header), max_layer, max_bytes)
-            end = wanted[-1][1] if wanted else len(header)
-            _fill(transfer, end, end)
-            return bytes(transfer.data[:end])
-        except Changed:
-            continue
+        with contextlib.suppress(Changed):
+            size = _header_size(fill(HEADER_GUESS)) or _header_size(fill(LONGEST_HEADER))
+            if size is None:
+                return bytes(transfer.data)
+            header = bytes(transfer.data[:size])
+            end = info(header)["bytes"] + 1 if whole else prefix_end(slice_ends(header), max_layer, max_bytes)
+            return fill(max(end, size))
 
 
-def _fetch_whole(transfer: Transfer) -> bytes:
-    size = None
-    while size is None and transfer.read(LONGEST_HEADER):
-        size = header_size(transfer.data)
-    if size is not None:
-        _fill(transfer, info(bytes(transfer.data[:size]))["bytes"] + 1, None)
-    return bytes(transfer.data)
-
-
-def _fill(transfer: Transfer, end: int, reach: int | None) -> None:
-    while transfer.read(end, reach=reach):
-        pass
+def _header_size(data: bytes | bytearray) -> int | None:
+    """Bytes of preamble and header; None if `data`, the first bytes of a file, ends within them."""
+    try:
+        return read_preamble(data).size
+    except Truncated:
+        return None

@@ -10,8 +10,8 @@ import struct
 import threading
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from http import HTTPStatus
-from socketserver import StreamRequestHandler, ThreadingTCPServer
+from http.server import BaseHTTPRequestHandler
+from socketserver import ThreadingTCPServer
 
 from pd4dgs_codec.web.headers import Unsatisfiable, requested_range
 from pd4dgs_codec.web.server import Link, Server
@@ -79,56 +79,56 @@ class FaultyServer(ThreadingTCPServer):
         """Clients that go away are what it is for."""
 
 
-class _Handler(StreamRequestHandler):
+class _Handler(BaseHTTPRequestHandler):
     server: FaultyServer
+    protocol_version = "HTTP/1.1"
     disable_nagle_algorithm = True
 
-    def handle(self) -> None:
-        while self._request():
-            pass
-
-    def _request(self) -> bool:
-        if not self.rfile.readline().strip():
-            return False
-        asked = {}
-        while line := self.rfile.readline().strip().decode():
-            name, _, value = line.partition(":")
-            asked[name.lower()] = value.strip()
+    def do_GET(self) -> None:
         server = self.server
+        asked = {name.lower(): value for name, value in self.headers.items()}
         server.requests.append(asked)
         fault = server.faults.pop(0) if server.faults else Fault()
-        content = server.content
-        tag = f'"{hashlib.sha256(content).hexdigest()[:16]}"'
+        tag = f'"{hashlib.sha256(server.content).hexdigest()[:16]}"'
         same = asked.get("if-range") in ((None, tag) if server.etag else (None,)) or not server.heeds_if_range
-        holds = server.ranges and same
+        size, part = len(server.content), None
         try:
-            part = requested_range(asked.get("range"), len(content)) if holds else None
+            part = requested_range(asked.get("range"), size) if server.ranges and same else None
         except Unsatisfiable:
-            part, fault = None, Fault(status=416)
-        start, end = part or (0, len(content))
-        body, status = content[start:end], fault.status if fault.status != 200 else 206 if part else 200
+            fault = Fault(status=416)
+        start, end = part or (0, size)
+        body, status = server.content[start:end], 206 if part else 200
         if fault.status != 200:
-            body = b"no\n"
-        headers: dict[str, str | None] = {"Content-Length": str(len(body))}
-        if server.etag:
-            headers["ETag"] = tag
+            body, status = b"no\n", fault.status
+        headers: dict[str, str | None] = {"Content-Length": str(len(body)), "ETag": tag if server.etag else None}
         if part:
-            headers["Content-Range"] = f"bytes {start}-{end - 1}/{len(content)}"
-        lines = [f"{name}: {value}" for name, value in {**headers, **fault.headers}.items() if value is not None]
-        self.wfile.write("\r\n".join([f"HTTP/1.1 {status} {HTTPStatus(status).phrase}", *lines, "", ""]).encode())
+            headers["Content-Range"] = f"bytes {start}-{end - 1}/{size}"
+        self.send_response(status)
+        for name, value in (headers | fault.headers).items():
+            if value is not None:
+                self.send_header(name, value)
+        self.end_headers()
         sent = body[: fault.after]
         server.sent += len(sent)
         fault.then(server)  # not after the body: the client may ask again before it is through
-        self.server.link.send(sent, self.wfile.write)
-        if fault.after is None:
-            return fault.headers.get("Connection") != "close"
-        if fault.how == "stall":
-            server.stopped.wait(20)
-        elif fault.how == "reset":
+        with server.link.transfer():
+            for at in range(0, len(sent), server.link.block):
+                server.link.cross(server.link.block)
+                self.wfile.write(sent[at : at + server.link.block])
+        if fault.after is not None:
+            self._end(fault.how)
+
+    def _end(self, how: str) -> None:
+        self.close_connection = True
+        if how == "stall":
+            self.server.stopped.wait(20)
+        elif how == "reset":
             with contextlib.suppress(OSError):
                 self.request.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
                 self.request.close()
-        return False
+
+    def log_message(self, *_: object) -> None:
+        """The server is silent."""
 
 
 @dataclass(frozen=True)
@@ -141,8 +141,7 @@ class Answer:
 def ask(server: Server, target: str, method: str = "GET", **headers: str) -> Answer:
     """One request on a connection of its own; If_Range="..." sends If-Range."""
     host, port = server.server_address[:2]
-    connection = http.client.HTTPConnection(host, port, timeout=10)
-    try:
+    with contextlib.closing(http.client.HTTPConnection(host, port, timeout=10)) as connection:
         connection.putrequest(method, target, skip_host=True, skip_accept_encoding=True)
         connection.putheader("Host", f"{host}:{port}")
         for name, value in headers.items():
@@ -150,5 +149,3 @@ def ask(server: Server, target: str, method: str = "GET", **headers: str) -> Ans
         connection.endheaders()
         response = connection.getresponse()
         return Answer(response.status, response.headers, response.read())
-    finally:
-        connection.close()

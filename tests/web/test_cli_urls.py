@@ -5,7 +5,8 @@ from __future__ import annotations
 import pytest
 from faulty import Fault, FaultyServer
 
-from pd4dgs_codec.web.transfer import HEADER_GUESS, header_size, slice_ends
+from pd4dgs_codec.format.container import read_preamble
+from pd4dgs_codec.web.transfer import HEADER_GUESS, slice_ends
 
 
 def test_info_reads_the_header_alone(cli, folder, scene_bytes):
@@ -95,6 +96,6 @@ def test_bad_urls_and_missing_files_are_one_line(cli, scene_bytes, verb):
 
 
 def test_the_header_is_found_where_it_ends(scene_bytes):
-    size = header_size(scene_bytes)
-    assert size is not None and header_size(scene_bytes[: size - 1]) is None
-    assert [layer for layer, _ in slice_ends(scene_bytes[:size])] == [0, 1, 2] and slice_ends(scene_bytes[:9]) == []
+    size = read_preamble(scene_bytes).size
+    assert [layer for layer, _ in slice_ends(scene_bytes[:size])] == [0, 1, 2]
+    assert slice_ends(scene_bytes[: size - 1]) == []

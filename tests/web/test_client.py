@@ -10,6 +10,7 @@ import shutil
 import ssl
 import subprocess
 import time
+from collections import deque
 from types import SimpleNamespace
 
 import pytest
@@ -19,7 +20,7 @@ from strategies import assert_same_scene, make_scene
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import BadSignature, ChecksumMismatch, DeliveryError, Truncated
 from pd4dgs_codec.web import client as client_module
-from pd4dgs_codec.web.client import Budget, RateMeter, SceneClient, next_end
+from pd4dgs_codec.web.client import Budget, SceneClient, next_end, recent_rate
 from pd4dgs_codec.web.server import Server
 from pd4dgs_codec.web.transfer import slice_ends
 
@@ -283,12 +284,9 @@ def test_which_layer_next(have, budget, left, rate, expected):
 
 
 def test_the_rate_is_that_of_the_last_second():
-    meter = RateMeter()
-    meter.start(10.0)
-    assert meter.rate is None
-    for i in range(10):
-        meter.note(10.1 + i / 10, 100)
-    assert meter.rate == pytest.approx(1000)
-    for i in range(20):
-        meter.note(11.1 + i / 10, 10)
-    assert meter.rate == pytest.approx(100)
+    arrivals = deque([(10.0, 0)])
+    assert recent_rate(arrivals) is None
+    arrivals += [(10.1 + i / 10, 100 * (i + 1)) for i in range(10)]
+    assert recent_rate(arrivals) == pytest.approx(1000)
+    arrivals += [(11.1 + i / 10, 1010 + 10 * i) for i in range(20)]
+    assert recent_rate(arrivals) == pytest.approx(100)

@@ -76,7 +76,7 @@ def test_a_server_that_drips_counts_as_silent_without_a_budget(what):
 
 
 LOCATIONS = {
-    "http://[::1": "invalid redirect",
+    "http://[::1": "expected http://HOST/PATH",
     "http://": "more than 5 redirects",
     "ftp://a/b": "expected http://HOST/PATH",
     "http://a:99999/": "expected http://HOST/PATH",
