@@ -1,8 +1,7 @@
-"""The stability table: cases, their outcomes as rows, and the scene that the cases share."""
+"""The stability table: promises, their inputs, outcomes as rows, and a scene that some inputs share."""
 
 from __future__ import annotations
 
-import math
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
@@ -16,98 +15,94 @@ from pd4dgs_codec.errors import DataError, Pd4Error
 from pd4dgs_codec.scene import Camera, Deformation, Network, Scene, SceneInfo, Steps, Widths
 
 PASS, REFUSED, FAIL = "pass", "refused", "fail"
-#: Modules with cases, in the order of the table.
+#: Modules with PROMISES, in the order of the table.
 MODULES = ("stable_symbols", "stable_scenes")
-#: The outcome in words, and the error; NaN fails every bound.
+#: The outcome in words, and the error; NaN exceeds every bound.
 Found = tuple[str, float]
 
 
 @dataclass(frozen=True)
-class Case:
-    """One stiff or extreme input. fed, promised: in words. bound: the largest error that passes. refuses: the error
-    that must be raised instead, for input without an answer; bound is then unused."""
+class Promise:
+    """A promise about stiff or extreme inputs. inputs: (case, description, *arguments of `measure`), a row each.
+    bound: the largest error that passes. refuses: `measure` must raise this error, in one line, instead of returning
+    an error within `bound`."""
 
     group: str
-    case: str
-    fed: str
     promised: str
-    bound: float
-    measure: Callable[[], Found]
+    measure: Callable[..., Any]
+    inputs: Sequence[tuple[Any, ...]]
+    bound: float = 0.0
     refuses: type[Pd4Error] | None = None
 
 
-@dataclass(frozen=True)
-class Row:
-    """A case and its outcome. error and bound: None if nothing was measured. status: pass, refused or fail."""
-
-    case: str
-    group: str
-    fed: str
-    promised: str
-    got: str
-    error: float | None
-    bound: float | None
-    status: str
+#: A promise and one of its inputs.
+Case = tuple[Promise, tuple[Any, ...]]
 
 
-def refusal(group: str, case: str, fed: str, error: type[Pd4Error], act: Callable[[], object]) -> Case:
-    """The case of an input that must be refused with `error` in one line; if `act` returns, the row fails."""
-
-    def measure() -> Found:
-        act()
-        return "accepted", math.nan
-
-    return Case(group, case, fed, f"refused in one line ({error.__name__})", math.nan, measure, error)
+#: A case and its outcome: case, group, fed, promised, got, error, bound (None if nothing was measured), status.
+Row = dict[str, Any]
 
 
-def judge(case: Case) -> Row:
-    """Runs a case. Every exception is a failed row, except the promised refusal and a missing module, which is
+def refusal(group: str, error: type[Pd4Error], act: Callable[..., object], *inputs: tuple[Any, ...]) -> Promise:
+    """The promise that `act` refuses each input with `error` in one line."""
+    return Promise(group, f"refused in one line ({error.__name__})", act, inputs, refuses=error)
+
+
+def judge(promise: Promise, given: tuple[Any, ...]) -> Row:
+    """Tests one input. Every exception is a failed row, except the promised refusal and a missing module, which is
     raised."""
-    error: float | None = None
+    case, fed, *arguments = given
+    bound = error = None
     try:
-        got, error = case.measure()
-        status = PASS if case.refuses is None and error <= case.bound else FAIL
+        if promise.refuses is None:
+            bound = promise.bound
+            got, error = promise.measure(*arguments)
+            status = PASS if error <= bound else FAIL
+        else:
+            promise.measure(*arguments)
+            got, status = "accepted", FAIL
     except ModuleNotFoundError:
         raise
     except Exception as problem:
-        kept = case.refuses is not None and isinstance(problem, case.refuses) and "\n" not in str(problem)
+        kept = promise.refuses is not None and isinstance(problem, promise.refuses) and "\n" not in str(problem)
         status = REFUSED if kept else FAIL
         got = " ".join(f"{type(problem).__name__}: {problem}".split())
-    bound = None if case.refuses else case.bound
-    return Row(case.case, case.group, case.fed, case.promised, got, error, bound, status)
+    row: Row = {"case": case, "group": promise.group, "fed": fed, "promised": promise.promised}
+    return row | {"got": got, "error": error, "bound": bound, "status": status}
 
 
 def chosen(name: str | None) -> list[Case]:
     """The cases of the group `name`, else those with `name` in their own name; all for None. In the table's order."""
     modules = (import_module(f"{__package__}.{module}") for module in MODULES)
-    cases: list[Case] = [case for module in modules for case in module.cases()]
+    cases = [(promise, given) for module in modules for promise in module.PROMISES for given in promise.inputs]
     if name is None:
         return cases
-    return [c for c in cases if c.group == name] or [c for c in cases if name.lower() in c.case.lower()]
+    return [c for c in cases if c[0].group == name] or [c for c in cases if name.lower() in c[1][0].lower()]
 
 
 def counts(rows: Sequence[Row]) -> dict[str, int]:
     """Rows per status."""
-    found = Counter(row.status for row in rows)
+    found = Counter(row["status"] for row in rows)
     return {status: found[status] for status in (PASS, REFUSED, FAIL)}
 
 
 def text(rows: Sequence[Row]) -> str:
     """The rows as one Markdown table per group, and a line with the counts."""
     head, parts = ("case", "fed", "promised", "came out", "error", "bound", "status"), []
-    for group in dict.fromkeys(row.group for row in rows):
+    for group in dict.fromkeys(row["group"] for row in rows):
         cells = [
-            (r.case, r.fed, r.promised, r.got, optional(r.error, ".2g"), optional(r.bound, ".2g"), r.status)
+            [*(r[key].replace("|", "\\|") for key in ("case", "fed", "promised", "got"))]
+            + [optional(r["error"], ".2g"), optional(r["bound"], ".2g"), r["status"]]
             for r in rows
-            if r.group == group
+            if r["group"] == group
         ]
-        parts.append(f"## {group}\n\n" + markdown(head, [[c.replace("|", "\\|") for c in line] for line in cells]))
+        parts.append(f"## {group}\n\n{markdown(head, cells)}")
     found = counts(rows)
     parts.append(f"{len(rows)} rows: {found[PASS]} pass, {found[REFUSED]} refused as promised, {found[FAIL]} fail")
     return "\n\n".join(parts)
 
 
-# -- shared by the cases -----------------------------------------------------------------------------------------------
+# -- shared by the promises --------------------------------------------------------------------------------------------
 
 
 def mpmath() -> Any:
@@ -130,8 +125,8 @@ _VIEWMAT = np.array([[1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 3], [0, 0, 0, 1]], np
 CAMERA = Camera(_VIEWMAT, np.array([[40, 0, WIDTH / 2], [0, 40, HEIGHT / 2], [0, 0, 1]], np.float32), WIDTH, HEIGHT)
 
 
-def small_scene(deformation: Deformation | None = None, mask: int = 255) -> Scene:
-    """40 anchors in front of CAMERA: layer 0, or layers 0 and 1 with a global deformation. mask: of every anchor."""
+def small_scene(deformation: Deformation | None = None) -> Scene:
+    """40 anchors in front of CAMERA: layer 0, or layers 0 and 1 with a global deformation."""
     rng, anchors = np.random.default_rng(3), 40
     layers = (0,) if deformation is None else (0, 1)
     cells = rng.choice(21**3, anchors, replace=False)
@@ -148,7 +143,7 @@ def small_scene(deformation: Deformation | None = None, mask: int = 255) -> Scen
         feature=rng.normal(0, 1, (anchors, 32)).astype(np.float32),
         scaling_log=rng.normal(-2.5, 0.3, (anchors, 6)).astype(np.float32),
         offset=rng.normal(0, 1, (anchors, 10, 3)).astype(np.float32),
-        mask=(np.full(anchors, mask, np.uint8),) * len(layers),
+        mask=(np.full(anchors, 255, np.uint8),) * len(layers),
         networks=networks,
         global_deformation=deformation,
     )

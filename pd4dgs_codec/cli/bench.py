@@ -306,11 +306,14 @@ def _stability(args: argparse.Namespace, console: Console) -> Outcome:
     rows = []
     with progress_bar(len(cases), "cases", "stability") as step:
         for case in cases:
-            rows.append(stability.judge(case))
+            rows.append(stability.judge(*case))
             step()
-    failed = [row for row in rows if row.status == stability.FAIL]
-    failures = [f"fail: {row.group}: {row.case}: {row.got}, error {row.error}, bound {row.bound}" for row in failed]
-    result = {"rows": [asdict(row) for row in rows], "counts": stability.counts(rows)}
+    failures = [
+        "fail: {group}: {case}: {got}, error {error}, bound {bound}".format(**row)
+        for row in rows
+        if row["status"] == stability.FAIL
+    ]
+    result = {"rows": rows, "counts": stability.counts(rows)}
     return Outcome(result, stability.text(rows), failures=failures)
 
 

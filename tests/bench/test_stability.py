@@ -29,19 +29,17 @@ def _one_torch_thread():
 
 def failed(name):
     """Names of the failed rows."""
-    rows = map(stability.judge, stability.chosen(name))
-    return {row.case for row in rows if row.status == stability.FAIL}
+    rows = [stability.judge(*case) for case in stability.chosen(name)]
+    return {row["case"] for row in rows if row["status"] == stability.FAIL}
 
 
 def test_the_table_has_all_groups_and_no_two_rows_of_one_name():
-    every = stability.chosen(None)
-    names = [(c.group, c.case) for c in every]
-    assert len(every) >= 180 and len(set(names)) == len(names)
-    assert tuple(dict.fromkeys(c.group for c in every)) == GROUPS
-    assert all(c.fed and c.promised for c in every)
+    names = [(promise.group, case) for promise, (case, *_) in stability.chosen(None)]
+    assert len(names) >= 120 and len(set(names)) == len(names)
+    assert tuple(dict.fromkeys(group for group, _ in names)) == GROUPS
 
 
-@pytest.mark.parametrize("name", [*GROUPS[:-1], "learning rates times 100", "a single Gaussian", "not a number"])
+@pytest.mark.parametrize("name", [*GROUPS[:-1], "learning rates", "a single Gaussian", "not a number"])
 def test_every_row_holds(name):
     assert failed(name) == set()
 
@@ -72,20 +70,19 @@ draw = stable_scenes.rasterization
 FAULTS = {
     "the plain formula of the rate": (
         rate, "log_probability", naive, "rate",
-        {"finite, float32", "gradient beyond the clip, float64", "ln P, sigma/Q 1e6..1e8, float64"},
-        "a channel without spread",
+        {"finite, float32", "ln P and gradients, float64", "clipped bits, float64"}, "a channel without spread",
     ),
     "a clip without gradient": (
         rate, "rate_bits", lambda *x: bits(*x).clamp(max=19.9), "float64",
-        {"gradient beyond the clip, float64", "clipped bits, float64"}, "ln P, sigma/Q 1e-2..1e2, float64",
+        {"clipped bits, float64"}, "ln P and gradients, float64",
     ),
     "a coder that loses an outlier": (
         channels, "decode_channels", lambda *a: [np.clip(x, -(1 << 23), 1 << 23) for x in decode(*a)], "lossless",
-        {"lossless: one rare outlier"}, "lossless: constant",
+        {"lossless: one rare outlier"}, "lossless: heavy tails",
     ),
     "a quantiser that rounds down and refuses nothing": (
         quantise, "quantise", floor, "quantiser",
-        {"step 1", "halves", "negative zero", "step 0", "value nan at step 1"}, "",
+        {"step 1", "halves", "negative zero", "step 0", "value nan"}, "",
     ),
     "time that is not clamped": (
         residuals, "sample_planes", lambda p, b, x, t: sample(p, b, x, t) * (1 + max(t - 1, 0)), "hexplane",
@@ -144,8 +141,8 @@ def refuse(error):
     ],
 )
 def test_judgement(measure, refuses, status):
-    case = stability.Case("group", "name", "fed", "promised", 1.0, measure, refuses)
-    assert stability.judge(case).status == status
+    promise = stability.Promise("group", "promised", measure, (), 1.0, refuses)
+    assert stability.judge(promise, ("name", "fed"))["status"] == status
 
 
 # -- the command -------------------------------------------------------------------------------------------------------
