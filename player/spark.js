@@ -7,10 +7,8 @@ import { centreOf, defaultCamera, fitted, unit } from "./render/camera.js";
 import { startWorker } from "./render/cpu.js";
 import { levelOf, sameState, stateOf, timeAfter } from "./render/level.js";
 import { startLoader } from "./render/loader.js";
-
-/** @typedef {import("./decode/scene.js").Scene} Scene */
-/** @typedef {import("./decode/scene.js").Camera} Camera */
-/** @typedef {import("./render/level.js").State} State */
+/** @import { Camera, Scene } from "./decode/scene.js" */
+/** @import { State } from "./render/level.js" */
 
 /**
  * The parts of three.js (r180 or later) and of Spark (2.2 or later) in use.

@@ -3,8 +3,8 @@
 import { LONGEST_HEADER, PREAMBLE_SIZE, headerLength } from "./container.js";
 import { DecodeError } from "./errors.js";
 import { Stream } from "./stream.js";
+/** @import { Scene } from "./scene.js" */
 
-/** @typedef {import("./scene.js").Scene} Scene */
 /** @typedef {{layer: number, end: number}} LayerEnd */
 
 /** The file is not available, as opposed to one that cannot be decoded. */

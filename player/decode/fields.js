@@ -2,8 +2,7 @@
 
 import { limitExceeded, malformed, unsupported } from "./errors.js";
 import { Real } from "./msgpack.js";
-
-/** @typedef {import("./msgpack.js").Value} Value */
+/** @import { Value } from "./msgpack.js" */
 
 /** Unknown keys from here on are ignored; unknown ones below change what the file means. */
 const FIRST_IGNORED_KEY = 64;

@@ -5,6 +5,7 @@ import { malformed, unsupported } from "./errors.js";
 import { Fields, asBytes, asInteger, asList, asRegistered, checkStep } from "./fields.js";
 import { MAX_CHUNKS, MAX_FEATURE, MAX_PAYLOAD, MAX_SLOTS, MAX_SYMBOL } from "./limits.js";
 import { unpack } from "./msgpack.js";
+/** @import { Value } from "./msgpack.js" */
 
 /** @typedef {{type: number, length: number}} ListedChunk */
 
@@ -121,7 +122,7 @@ function readChunkList(header) {
   return chunks;
 }
 
-/** @param {import("./msgpack.js").Value} value @returns {import("./scene.js").Camera} */
+/** @param {Value} value @returns {import("./scene.js").Camera} */
 function readCamera(value) {
   const fields = new Fields(value, "header: camera", CAMERA_KEYS);
   const rows = fields.reals(1, 12, "matrix");
@@ -135,13 +136,13 @@ function readCamera(value) {
   };
 }
 
-/** @param {import("./msgpack.js").Value} value @param {number} count */
+/** @param {Value} value @param {number} count */
 function readCentres(value, count) {
   const centres = asList(value, "header: centres", count);
   return centres.map((m) => asInteger(m, -MAX_SYMBOL, MAX_SYMBOL, "header: a channel's centre"));
 }
 
-/** @param {import("./msgpack.js").Value} value @returns {Map<number, number>} */
+/** @param {Value} value @returns {Map<number, number>} */
 function readBounds(value) {
   const fields = new Fields(value, "header: error bounds", CLASSES);
   /** @type {Map<number, number>} */

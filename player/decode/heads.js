@@ -1,6 +1,6 @@
 // The residual heads of both deformations (6.3, 13.3), and the records to which they add. A further head is one row here.
 
-/** @typedef {import("./header.js").Widths} Widths */
+/** @import { Widths } from "./header.js" */
 
 /**
  * A record is an anchor or a Gaussian as floats in blocks of four, the texels of the evaluator on the GPU. A quantity

@@ -7,8 +7,7 @@ import { MAX_SYMBOL } from "./limits.js";
 import { ATTRIBUTES, MASKS, PLANE_SECTION, POSITIONS, WEIGHTS, readParameters } from "./parameters.js";
 import { decodePlanes } from "./planes.js";
 import { decodePositions } from "./positions.js";
-
-/** @typedef {import("./parameters.js").Parameters} Parameters */
+/** @import { Declared, LayerKind, NetworkShape, Parameters } from "./parameters.js" */
 
 /**
  * What one slice with n own rows carries. voxels: [n, 3]. rises: of the earlier rows' mask codes. codes: of the own
@@ -16,7 +15,7 @@ import { decodePositions } from "./positions.js";
  * planes: per scale six [C, H, W]. weights: weight, bias, weight, bias and so on, network by network.
  *
  * @typedef {object} LayerSymbols
- * @property {import("./parameters.js").LayerKind} kind
+ * @property {LayerKind} kind
  * @property {Parameters} parameters
  * @property {Int32Array} voxels
  * @property {Int32Array} rises
@@ -33,8 +32,8 @@ export const MOST_CODE = 255;
 /**
  * The symbols of a slice's payload, each in the range that 11.1 and 11.2 allow.
  *
- * @param {Uint8Array} payload @param {import("./parameters.js").LayerKind} kind
- * @param {import("./parameters.js").Declared} before by the slices before
+ * @param {Uint8Array} payload @param {LayerKind} kind
+ * @param {Declared} before by the slices before
  * @param {import("./slices.js").Continuation} continuation what the slices of the layer before left
  * @param {boolean} later whether there are such
  * @returns {LayerSymbols}
@@ -69,7 +68,7 @@ export function decodeLayer(payload, kind, before, continuation, later) {
   };
 }
 
-/** @param {Uint8Array} bytes @param {import("./parameters.js").NetworkShape[]} networks */
+/** @param {Uint8Array} bytes @param {NetworkShape[]} networks */
 function decodeWeights(bytes, networks) {
   const counts = networks.flatMap(({ layers }) => layers.flatMap(({ inputs, outputs }) => [inputs * outputs, outputs]));
   const all = new Int32Array(counts.reduce((sum, count) => sum + count, 0));

@@ -12,8 +12,7 @@ import {
   readClassCount,
   readStages,
 } from "./stages.js";
-
-/** @typedef {import("./parameters.js").PlaneShape} PlaneShape */
+/** @import { PlaneShape } from "./parameters.js" */
 
 /** How many predictors 11.3 has. */
 export const PREDICTORS = 6;

@@ -8,9 +8,10 @@ import { layerKind } from "./parameters.js";
 import { PLANES } from "./scene.js";
 import { Continuation, joined, mortonOrder, reordered } from "./slices.js";
 import { VoxelTable } from "./voxels.js";
-
-/** @typedef {import("./layer.js").LayerSymbols} LayerSymbols */
-/** @typedef {import("./scene.js").Scene} Scene */
+/** @import { Header, ListedChunk } from "./header.js" */
+/** @import { LayerSymbols } from "./layer.js" */
+/** @import { Declared, NetworkShape, PlaneShape } from "./parameters.js" */
+/** @import { Deformation, Network, Plane, PlaneName, Scene, Steps } from "./scene.js" */
 
 /**
  * The float32 values of one slice's own rows and networks, in the order of 12.4.
@@ -48,7 +49,7 @@ export function readAll(bytes, maxLayer, allowPartial, take) {
 /** Reads a file slice by slice. It keeps no bytes but the header's: every call gets what follows those it consumed. */
 export class LayerReader {
   constructor() {
-    /** @type {import("./header.js").Header | null} */
+    /** @type {Header | null} */
     this.header = null;
     /** Of the next chunk, or of the header before it is read. */
     this.offset = 0;
@@ -57,7 +58,7 @@ export class LayerReader {
     this._index = 0;
     /** How many slices have been read. */
     this.count = 0;
-    /** By those slices. @type {import("./parameters.js").Declared} */
+    /** By those slices. @type {Declared} */
     this._declared = { rows: 0, symbols: 0, bytes: 0 };
     this._voxels = new VoxelTable();
     /** Voxels that are not in the table yet: of one slice nothing is looked up. @type {Int32Array[]} */
@@ -73,7 +74,7 @@ export class LayerReader {
    * Reads the header, unless it has been read. Raises Truncated, with nothing consumed, if `bytes` end before.
    *
    * @param {Uint8Array} bytes from offset on
-   * @returns {import("./header.js").Header}
+   * @returns {Header}
    */
   readHeader(bytes) {
     if (this.header) return this.header;
@@ -110,7 +111,7 @@ export class LayerReader {
     return null;
   }
 
-  /** @param {Uint8Array} bytes from the chunk on @param {import("./header.js").ListedChunk} listed */
+  /** @param {Uint8Array} bytes from the chunk on @param {ListedChunk} listed */
   _readChunk(bytes, listed) {
     const { header, offset } = this;
     const index = this._index;
@@ -156,7 +157,7 @@ export class LayerReader {
    * @param {LayerSymbols} symbols @param {Continuation} continuation @param {boolean} later */
   _accept(symbols, continuation, later) {
     const { kind, parameters, voxels, rises } = symbols;
-    const header = /** @type {import("./header.js").Header} */ (this.header);
+    const header = /** @type {Header} */ (this.header);
     const where = `layer ${kind.layer}`;
     const latest = this._layers[this._layers.length - 1];
     const before = rises.length ? joined([latest.earlier, ownOf(latest).codes]) : rises;
@@ -199,7 +200,7 @@ export class LayerReader {
     }
   }
 
-  /** @param {LayerSymbols} symbols @param {import("./header.js").Header} header @returns {LayerTensors} */
+  /** @param {LayerSymbols} symbols @param {Header} header @returns {LayerTensors} */
   _tensorsOf(symbols, header) {
     const { parameters: { steps }, voxels, planes, weights } = symbols;
     return {
@@ -217,9 +218,9 @@ export class LayerReader {
     const [first, ...later] = this._layers;
     const networks = networksOf(first);
     const [feature, scalingLog, offset] = header.steps;
-    /** @type {import("./scene.js").Steps} */
+    /** @type {Steps} */
     const steps = { feature, scalingLog, offset, weightsScaffold: first.steps[0] };
-    /** @type {(import("./scene.js").Deformation | null)[]} */
+    /** @type {(Deformation | null)[]} */
     const deformations = [null, null];
     for (const layer of later) {
       const [ofPlanes, ofWeights] = layer.steps;
@@ -268,15 +269,15 @@ export class LayerReader {
  * @property {number} layer
  * @property {number} slices
  * @property {number[]} steps
- * @property {import("./parameters.js").PlaneShape[]} planes
- * @property {import("./parameters.js").NetworkShape[]} networks
+ * @property {PlaneShape[]} planes
+ * @property {NetworkShape[]} networks
  * @property {Pick<LayerTensors, "planes" | "weights">} tensors
  * @property {Uint8Array} earlier
  * @property {Own[]} parts that make up its rows
  * @property {Continuation} continuation
  */
 
-/** The attributes of a slice's rows. @param {LayerSymbols} symbols @param {import("./header.js").Header} header */
+/** The attributes of a slice's rows. @param {LayerSymbols} symbols @param {Header} header */
 function attributesOf({ kind, parameters: { rows }, stepClasses, attributes }, header) {
   const { feature: D, slots: G } = kind.widths;
   let first = 0;
@@ -310,7 +311,7 @@ function ownOf(layer) {
 /** @param {LayerParts} layer */
 function networksOf({ networks, tensors }) {
   let at = 0;
-  /** @type {Record<string, import("./scene.js").Network>} */
+  /** @type {Record<string, Network>} */
   const named = {};
   for (const { name, layers } of networks) {
     named[name] = layers.map((shape) => ({ ...shape, weight: tensors.weights[at++], bias: tensors.weights[at++] }));
@@ -318,7 +319,7 @@ function networksOf({ networks, tensors }) {
   return named;
 }
 
-/** @param {LayerParts} layer @returns {Record<import("./scene.js").PlaneName, import("./scene.js").Plane>[]} */
+/** @param {LayerParts} layer @returns {Record<PlaneName, Plane>[]} */
 function planesOf({ planes, tensors }) {
   const scales = [];
   for (let i = 0; i < planes.length; i += PLANES.length) {

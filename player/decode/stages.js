@@ -3,8 +3,7 @@
 import { decodeChannels } from "./channels.js";
 import { malformed } from "./errors.js";
 import { MAX_CLASSES } from "./limits.js";
-
-/** @typedef {import("./bytes.js").ByteReader} ByteReader */
+/** @import { ByteReader } from "./bytes.js" */
 
 /** @param {ByteReader} reader */
 export function readClassCount(reader) {

@@ -4,8 +4,7 @@ import { CHUNK_OVERHEAD, PREAMBLE_SIZE } from "./container.js";
 import { DecodeError } from "./errors.js";
 import { LAYER_TYPES } from "./header.js";
 import { LayerReader } from "./reader.js";
-
-/** @typedef {import("./scene.js").Scene} Scene */
+/** @import { Scene } from "./scene.js" */
 
 const SMALLEST_BUFFER = 1 << 16;
 

@@ -2,8 +2,7 @@
 
 import { DecodeError } from "./errors.js";
 import { Remote } from "./remote.js";
-
-/** @typedef {import("./scene.js").Scene} Scene */
+/** @import { Scene } from "./scene.js" */
 
 /**
  * A `Stream` off the main thread: its methods return promises, answered in the order of the calls. One decoder decodes

@@ -1,7 +1,7 @@
 // Cameras: pinhole, axes x right, y down, z forward, as the format has them.
 
-/** @typedef {import("../decode/scene.js").Camera} Camera */
-/** @typedef {import("../decode/scene.js").Info} Info */
+/** @import { Camera, Info } from "../decode/scene.js" */
+
 /** @typedef {[number, number, number]} Vector */
 
 /** @param {ArrayLike<number>} a @param {ArrayLike<number>} b */

@@ -3,8 +3,7 @@
 
 import { SPLAT_BLOCKS } from "./evaluator.js";
 import { Remote } from "../decode/remote.js";
-
-/** @typedef {import("./gl.js").Gpu} Gpu */
+/** @import { Gpu } from "./gl.js" */
 
 /** Gaussians in the layout of `Splats`. @typedef {{data: Float32Array, width: number, height: number}} Packed */
 

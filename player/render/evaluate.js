@@ -4,11 +4,8 @@
 import { GAUSSIAN_COLUMNS, LOCAL_HEADS, anchorColumns, columnsOf, globalHeads } from "../decode/heads.js";
 import { Arena } from "./kernel.js";
 import { deformationUnit, eachAttribute, levelOf, MIN_OPACITY, SPATIAL, sliceAt, TEMPORAL, widthsOf } from "./level.js";
-
-/** @typedef {import("../decode/scene.js").Scene} Scene */
-/** @typedef {import("../decode/scene.js").Network} Network */
-/** @typedef {import("../decode/scene.js").Deformation} Deformation */
-/** @typedef {import("../decode/heads.js").Head} Head */
+/** @import { Head } from "../decode/heads.js" */
+/** @import { Deformation, Network, Scene } from "../decode/scene.js" */
 
 /**
  * The visible Gaussians in ascending order of their slot, anchor · slots + i. records: [count, 16], mean and opacity,

@@ -9,11 +9,8 @@ import { GAUSSIAN_COLUMNS, LOCAL_HEADS, anchorColumns, globalHeads } from "../de
 import { FieldPass } from "./field.js";
 import { blocksOf, Linear, pack, repeat, targets, TooLarge } from "./layers.js";
 import { eachAttribute, levelOf, widthsOf } from "./level.js";
-
-/** @typedef {import("./gl.js").Gpu} Gpu */
-/** @typedef {import("./gl.js").Field} Field */
-/** @typedef {import("../decode/scene.js").Scene} Scene */
-/** @typedef {import("../decode/scene.js").Network} Network */
+/** @import { Network, Scene } from "../decode/scene.js" */
+/** @import { Field, Gpu } from "./gl.js" */
 
 /**
  * Visible Gaussians for the renderer: the records of heads.js, in texels of four blocks. A texel without a Gaussian has

@@ -3,16 +3,13 @@
 import { columnsOf } from "../decode/heads.js";
 import { blocksOf, Linear, repeat, targets, TooLarge } from "./layers.js";
 import { deformationUnit, sliceAt, SPATIAL, TEMPORAL } from "./level.js";
-
-/** @typedef {import("./gl.js").Gpu} Gpu */
-/** @typedef {import("./gl.js").Field} Field */
-/** @typedef {import("../decode/scene.js").Deformation} Deformation */
-/** @typedef {import("../decode/scene.js").Network} Network */
-/** @typedef {import("../decode/heads.js").Head} Head */
+/** @import { Head } from "../decode/heads.js" */
+/** @import { Deformation, Network, Scene } from "../decode/scene.js" */
+/** @import { Field, Gpu } from "./gl.js" */
 
 export class FieldPass {
   /**
-   * @param {Gpu} gpu @param {Deformation} deformation @param {import("../decode/scene.js").Scene} scene
+   * @param {Gpu} gpu @param {Deformation} deformation @param {Scene} scene
    * @param {Head[]} heads @param {number} columns of the record to which they add
    */
   constructor(gpu, deformation, scene, heads, columns) {

@@ -1,8 +1,8 @@
 // Linear layers as shader source and uniform blocks. A fragment computes four outputs per target, so weights are stored
 // as 4 × 4 matrices: block b of the outputs takes block k of the inputs through matrix b · K + k.
 
-/** @typedef {import("./gl.js").Gpu} Gpu */
-/** @typedef {import("../decode/scene.js").Network} Network */
+/** @import { Network } from "../decode/scene.js" */
+/** @import { Gpu } from "./gl.js" */
 
 /** Matrices of one shader, about: compilers unroll them, and take longer than in proportion. */
 const MAX_MATRICES = 64;

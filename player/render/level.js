@@ -1,9 +1,7 @@
 // The parts of a scene that a level shows (clause 13.4), in the forms that both evaluators take.
 
 import { columnsOf, globalHeads } from "../decode/heads.js";
-
-/** @typedef {import("../decode/scene.js").Scene} Scene */
-/** @typedef {import("../decode/scene.js").Deformation} Deformation */
+/** @import { Deformation, Plane, PlaneName, Scene } from "../decode/scene.js" */
 
 /**
  * One level of a scene. rows: the anchors that it has, the first ones of the scene's. codes: the anchors' gates times 255.
@@ -65,14 +63,14 @@ export function eachAttribute(scene, put) {
   }
 }
 
-/** Planes without time, and their two axes. @type {[import("../decode/scene.js").PlaneName, number, number][]} */
+/** Planes without time, and their two axes. @type {[PlaneName, number, number][]} */
 export const SPATIAL = [
   ["xy", 0, 1],
   ["xz", 0, 2],
   ["yz", 1, 2],
 ];
 
-/** Planes with time, and their other axis. @type {[import("../decode/scene.js").PlaneName, number][]} */
+/** Planes with time, and their other axis. @type {[PlaneName, number][]} */
 export const TEMPORAL = [
   ["xt", 0],
   ["yt", 1],
@@ -82,7 +80,7 @@ export const TEMPORAL = [
 /**
  * A plane with time at time t.
  *
- * @param {import("../decode/scene.js").Plane} plane @param {number} t 0..1
+ * @param {Plane} plane @param {number} t 0..1
  * @param {(channel: number, cell: number, value: number) => void} put takes each sample
  */
 export function sliceAt({ data, channels, height, width }, t, put) {

@@ -1,9 +1,8 @@
 // Moving the camera: about a point of the scene, along the picture, towards it.
 
 import { centreOf, cross, downOf, dot, forwardOf, lookAlong, plus, turn, unit } from "./camera.js";
-
-/** @typedef {import("./player.js").Player} Player */
-/** @typedef {import("./camera.js").Vector} Vector */
+/** @import { Vector } from "./camera.js" */
+/** @import { Player } from "./player.js" */
 
 /** Radians that a drag across the picture's shorter side turns. */
 const TURN = 2.5;

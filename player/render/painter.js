@@ -1,10 +1,9 @@
 // Clause 13.5: Gaussians as quads, blended back to front in display space.
 
 import { MIN_OPACITY } from "./level.js";
-
-/** @typedef {import("./gl.js").Gpu} Gpu */
-/** @typedef {import("./evaluator.js").Splats} Splats */
-/** @typedef {import("../decode/scene.js").Camera} Camera */
+/** @import { Camera } from "../decode/scene.js" */
+/** @import { Splats } from "./evaluator.js" */
+/** @import { Field, Gpu } from "./gl.js" */
 
 /** Variance that every Gaussian gets on top, pixels squared. */
 const BLUR = 0.3;
@@ -105,7 +104,7 @@ export class Painter {
     this._order = null;
     this._orderRows = 0;
     this._count = 0;
-    /** Of floats: eight bits would round at every blending. @type {import("./gl.js").Field | null} */
+    /** Of floats: eight bits would round at every blending. @type {Field | null} */
     this._picture = null;
     this._warm();
   }

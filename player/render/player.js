@@ -9,11 +9,9 @@ import { Pace } from "./pace.js";
 import { Painter } from "./painter.js";
 import { Remote } from "../decode/remote.js";
 import { startLoader } from "./loader.js";
-
-/** @typedef {import("../decode/scene.js").Scene} Scene */
-/** @typedef {import("../decode/scene.js").Camera} Camera */
-/** @typedef {import("./evaluator.js").Splats} Splats */
-/** @typedef {import("./level.js").State} State */
+/** @import { Camera, Scene } from "../decode/scene.js" */
+/** @import { Splats } from "./evaluator.js" */
+/** @import { State } from "./level.js" */
 
 /**
  * How to play. level: the highest to load and show, default all. time: seconds of the scene's time to start at. bytes,

@@ -1,6 +1,6 @@
 // Lists and orders of Gaussians: plain loops that run in a worker.
 
-/** @typedef {import("./evaluator.js").List} List */
+/** @import { List } from "./evaluator.js" */
 
 // as in evaluator.js, which a worker has no need to load
 const NO_ENTRY = 0xffffffff;

@@ -3,8 +3,7 @@ import { test } from "node:test";
 
 import { DecodeError, decode, hashes, openStream } from "../decode/index.js";
 import { readVector, readVectors, same } from "../testing/vectors.mjs";
-
-/** @typedef {import("../decode/index.js").Scene} Scene */
+/** @import { Scene } from "../decode/index.js" */
 
 const VECTORS = readVectors();
 
