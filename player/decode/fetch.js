@@ -18,7 +18,7 @@ export class FetchError extends Error {
 
 /**
  * Limits of a download: highest layer, bytes from the first of the file, seconds from the call. The first slice is
- * fetched if it ends within `bytes`, a later one only if it would also arrive in time at the recent rate.
+ * fetched if it ends within `bytes`, a later one only if it would also arrive in time at the connection's rate so far.
  *
  * @typedef {{maxLayer?: number, bytes?: number, seconds?: number}} Budget
  */
@@ -32,37 +32,29 @@ export class FetchError extends Error {
  * @property {() => void | Promise<void>} finish
  * @property {LayerEnd[]} layerEnds
  * @property {number} consumed
+ * @property {() => void} [close]
  */
 
 /**
- * makeDecoder: called once, and again if the file changes; its decoder has no limit of layers. stall: seconds without a
- * byte after which a connection counts as cut. attempts: consecutive failures, without a byte between them, before giving
- * up. pause: seconds before the second attempt, doubled for each further one. progress: called as bytes arrive.
- *
  * @typedef {object} SourceOptions
  * @property {AbortSignal} [signal]
- * @property {() => Decoder} [makeDecoder]
- * @property {number} [stall]
- * @property {number} [attempts]
- * @property {number} [pause]
- * @property {(received: number, total: number | null) => void} [progress]
+ * @property {() => Decoder} [makeDecoder] called once, and again if the file changes; its decoder has no limit of layers
+ * @property {number} [stall] seconds without a byte after which a connection counts as cut
+ * @property {number} [attempts] consecutive failures, without a byte between them, before giving up
+ * @property {number} [pause] seconds before the second attempt, doubled for each further one
+ * @property {(received: number, total: number | null) => void} [progress] called as bytes arrive
  * @property {typeof globalThis.fetch} [fetch]
  */
 
 /** Limit of layer 0 without a budget of bytes: bytes are held until their slice is complete. */
 const MOST_BYTES = 2 ** 28;
-const RATE_SECONDS = 1;
-/** Temporary errors. */
+/** HTTP status codes of temporary errors. */
 const TEMPORARY = [408, 425, 429, 500, 502, 503, 504];
 /** After so many changes the file counts as never stable. */
 const MOST_CHANGES = 4;
 
 /** The connection ended early, or the response is invalid: a new request may help. */
 class Cut extends Error {}
-/** The file has changed, and none of its bytes are here yet. */
-class Changed extends Error {}
-/** The time budget is spent. */
-class OutOfTime extends Error {}
 
 /**
  * The scenes of one URL. `scenes()` yields one per slice; called again, with another budget, it continues after the last
@@ -73,38 +65,41 @@ export class SceneSource {
   constructor(url, options = {}) {
     const { signal, makeDecoder = () => new Stream(), stall = 10, attempts = 5, pause = 0.2, progress } = options;
     this.url = String(url);
-    /** How often each happened. */
-    this.requests = 0;
+    /** Connections that ended early, and changes of the file, so far. */
     this.cuts = 0;
     this.changes = 0;
-    /** Bytes of the file that have arrived from its first one on, and its length, null until it is told. */
+    /** Bytes of the file that have arrived from its first one on, and its length, null while it is unknown. */
     this.received = 0;
     /** @type {number | null} */
     this.total = null;
     this._signal = signal;
     this._makeDecoder = makeDecoder;
+    /** @type {Decoder} */
     this._decoder = makeDecoder();
     this._stall = stall;
     this._attempts = attempts;
     this._pause = pause;
     this._progress = progress;
     this._fetch = options.fetch ?? globalThis.fetch.bind(globalThis);
-    /** @type {string | null} */
+    /** The file's strong ETag, or its date. @type {string | null} */
     this._validator = null;
-    /** @type {Answer | null} */
-    this._answer = null;
+    /** The open connection. @type {AbortController | null} */
+    this._controller = null;
+    /** Its response. skip: bytes that are here already. @type {{reader: Reader, skip: number, rest: Uint8Array} | null} */
+    this._body = null;
+    /** When the request was sent, and how many bytes were here then. */
+    this._requested = { at: 0, received: 0 };
     /** Where the file was fetched anew after damage. */
     this._repairedAt = -1;
     /** Preamble of the file. */
     this._head = new Uint8Array(PREAMBLE_SIZE);
-    /** When bytes came, and how many had come since the request. @type {[number, number][]} */
-    this._marks = [];
+    signal?.addEventListener("abort", () => this._controller?.abort(signal.reason), { once: true });
   }
 
   /** Ends the connection. `scenes` may be called again. */
   close() {
-    this._answer?.controller.abort();
-    this._answer = null;
+    this._controller?.abort();
+    this._controller = this._body = null;
   }
 
   /**
@@ -119,57 +114,60 @@ export class SceneSource {
    */
   async *scenes({ maxLayer = Infinity, bytes, seconds = Infinity } = {}) {
     const until = now() + seconds;
+    let failures = 0;
     try {
       for (;;) {
-        const ends = this._decoder.layerEnds;
-        const wanted = ends.filter(({ layer, end }) => layer <= maxLayer && end <= (bytes ?? MOST_BYTES));
-        if (ends.length && !wanted.length && bytes === undefined && maxLayer >= 0) {
-          throw new DecodeError("LimitExceeded", `layer 0 ends at byte ${ends[0].end}, limit ${MOST_BYTES}`);
-        }
-        const end = ends.length ? this._nextEnd(wanted, until) : this._headerEnd();
-        if (end === null) return;
+        this._signal?.throwIfAborted();
+        const end = this._end(maxLayer, bytes, until);
+        if (end === null || now() >= until) return;
         let block;
         try {
-          block = await this._read(end, until);
+          block = await this._read(end, 1000 * Math.min(this._stall, until - now()));
         } catch (error) {
-          if (error instanceof Changed) continue;
-          throw error;
+          this.close();
+          this._signal?.throwIfAborted();
+          if (now() >= until) return;
+          // fetch raises TypeError where there is no connection, or it ends
+          if (!(error instanceof Cut || error instanceof TypeError || error instanceof DOMException)) throw error;
+          this.cuts++;
+          if (++failures >= this._attempts) {
+            throw new FetchError(`${this.url}: ${error.message} (${this.received} bytes are here)`);
+          }
+          if (failures > 1) await sleep(1000 * Math.min(this._pause * 2 ** (failures - 2), until - now()));
+          continue;
         }
         if (block === null) {
           await this._decoder.finish(); // the file ends within this layer: Truncated
           return;
         }
+        if (!block.length) continue;
+        failures = 0;
         yield* await this._feed(block);
       }
-    } catch (error) {
-      if (!(error instanceof OutOfTime)) throw error;
     } finally {
       this.close();
     }
   }
 
-  /** The end of preamble or header: nothing behind them is decoded before the budget is checked. */
-  _headerEnd() {
-    if (this.received < PREAMBLE_SIZE) return PREAMBLE_SIZE;
-    return Math.min(PREAMBLE_SIZE + headerLength(this._head), LONGEST_HEADER);
-  }
-
-  /** The end of the next slice to fetch, or null to stop. @param {LayerEnd[]} wanted @param {number} until */
-  _nextEnd(wanted, until) {
-    const next = wanted.find(({ end }) => end > this._decoder.consumed);
-    const left = until - now();
-    if (!next || left <= 0) return null;
-    const rate = this._rate();
-    const first = next.end === wanted[0].end;
-    const inTime = left === Infinity || rate === null || next.end - this.received <= rate * left;
-    return first || inTime ? next.end : null;
-  }
-
-  /** Bytes per second over the last second of transfer, null before any came. */
-  _rate() {
-    const first = this._marks[0];
-    const last = this._marks[this._marks.length - 1];
-    return this._marks.length > 1 && last[1] > first[1] ? (last[1] - first[1]) / Math.max(last[0] - first[0], 1e-6) : null;
+  /** Where to stop next: behind preamble, header or a slice; null where the budget ends.
+   * @param {number} maxLayer @param {number | undefined} bytes @param {number} until */
+  _end(maxLayer, bytes, until) {
+    const { layerEnds: ends, consumed } = this._decoder;
+    if (!ends.length) {
+      // nothing behind the header is decoded before the budget is checked
+      if (this.received < PREAMBLE_SIZE) return PREAMBLE_SIZE;
+      return Math.min(PREAMBLE_SIZE + headerLength(this._head), LONGEST_HEADER);
+    }
+    const wanted = ends.filter(({ layer, end }) => layer <= maxLayer && end <= (bytes ?? MOST_BYTES));
+    if (!wanted.length && bytes === undefined && maxLayer >= 0) {
+      throw new DecodeError("LimitExceeded", `layer 0 ends at byte ${ends[0].end}, limit ${MOST_BYTES}`);
+    }
+    const end = wanted.find((slice) => slice.end > consumed)?.end;
+    if (end === undefined) return null;
+    const { at, received } = this._requested;
+    const rate = (this.received - received) / (now() - at);
+    const late = until < Infinity && rate > 0 && end - this.received > rate * (until - now());
+    return late && end !== wanted[0].end ? null : end;
   }
 
   /** The scenes that a block completes. After damage the download goes back to the last valid chunk, once.
@@ -190,104 +188,69 @@ export class SceneSource {
   }
 
   /**
-   * The next bytes to arrive, none beyond `end`; null if the file ends. Raises Changed, OutOfTime, FetchError or the
-   * signal's reason.
+   * The next bytes to arrive, none beyond `end`, perhaps none at all; null if the file ends. Raises Cut, FetchError or
+   * an error of fetch.
    *
-   * @param {number} end @param {number} until
+   * @param {number} end @param {number} patience milliseconds to wait
    * @returns {Promise<Uint8Array | null>}
    */
-  async _read(end, until) {
-    for (let failures = 0; ; ) {
-      this._signal?.throwIfAborted();
-      if (now() >= until) throw new OutOfTime();
-      if (this.total !== null && this.received >= this.total) return null;
-      try {
-        const { changes } = this;
-        this._answer ??= await this._request(until);
-        if (this.changes !== changes) throw new Changed();
-        const block = await this._answer.take(end - this.received, this._waiting(until));
-        if (block === null) {
-          const { total } = this;
-          this._answer = null;
-          if (total !== null && this.received < total) throw new Cut(`ended at byte ${this.received} of ${total}`);
-          this.total = this.received; // a length that was never told ends with the answer
-        } else if (block.length) {
-          if (this.received < PREAMBLE_SIZE) this._head.set(block, this.received);
-          this._note(block.length);
-          return block;
-        }
-      } catch (error) {
-        if (error instanceof Changed) throw error;
+  async _read(end, patience) {
+    if (this.total !== null && this.received >= this.total) return null;
+    if (!this._body) {
+      await this._request(patience);
+      return NOTHING; // if the file has changed, it begins anew
+    }
+    const body = this._body;
+    if (!body.rest.length) {
+      const { done, value } = await within(body.reader.read(), patience);
+      if (done) {
         this.close();
-        this._signal?.throwIfAborted();
-        if (now() >= until) throw new OutOfTime();
-        // fetch raises TypeError where there is no connection, or it ends
-        if (!(error instanceof Cut || error instanceof TypeError || error instanceof DOMException)) throw error;
-        this.cuts++;
-        failures++;
-        if (failures >= this._attempts) {
-          throw new FetchError(`${this.url}: ${error.message} (${this.received} bytes are here)`);
-        }
-        if (failures > 1) await sleep(Math.min(this._pause * 2 ** (failures - 2), until - now()), this._signal);
+        if (this.total !== null) throw new Cut(`ended at byte ${this.received} of ${this.total}`);
+        this.total = this.received; // a length that was never told ends with the response
+        return null;
       }
+      const skipped = Math.min(body.skip, value.length);
+      body.skip -= skipped;
+      body.rest = value.subarray(skipped);
     }
+    const block = body.rest.subarray(0, end - this.received);
+    body.rest = body.rest.subarray(block.length);
+    if (block.length) {
+      if (this.received < PREAMBLE_SIZE) this._head.set(block, this.received);
+      this.received += block.length;
+      this._progress?.(this.received, this.total);
+    }
+    return block;
   }
 
-  /** Milliseconds to wait for a byte. @param {number} until */
-  _waiting(until) {
-    return Math.max(0, Math.min(this._stall, until - now())) * 1000;
-  }
-
-  /** @param {number} size */
-  _note(size) {
-    this.received += size;
-    const marks = this._marks;
-    marks.push([now(), marks[marks.length - 1][1] + size]);
-    while (marks.length > 2 && marks[marks.length - 1][0] - marks[1][0] >= RATE_SECONDS) marks.shift();
-    this._progress?.(this.received, this.total);
-  }
-
-  /** Requests the missing bytes. @param {number} until @returns {Promise<Answer>} */
-  async _request(until) {
+  /** Requests the missing bytes. @param {number} patience milliseconds to wait for the response */
+  async _request(patience) {
     const start = this.received;
-    const resumes = start > 0 && this._validator !== null;
     /** @type {Record<string, string>} */
-    const headers = {};
-    if (resumes) {
-      headers["Range"] = `bytes=${start}-`;
-      headers["If-Range"] = /** @type {string} */ (this._validator);
-    }
-    const controller = new AbortController();
-    const onAbort = () => controller.abort(this._signal?.reason);
-    this._signal?.addEventListener("abort", onAbort, { once: true });
-    this.requests++;
-    this._marks = [[now(), 0]];
-    try {
-      // a request after a cut or damage bypasses caches
-      const asked = this._fetch(this.url, { headers, signal: controller.signal, cache: start ? "no-store" : "default" });
-      const response = await within(asked, this._waiting(until));
-      const skip = this._accept(response, start, resumes);
-      return new Answer(response, controller, skip, () => this._signal?.removeEventListener("abort", onAbort));
-    } catch (error) {
-      controller.abort();
-      this._signal?.removeEventListener("abort", onAbort);
-      throw error;
+    const headers = start && this._validator ? { Range: `bytes=${start}-`, "If-Range": this._validator } : {};
+    const { signal } = (this._controller = new AbortController());
+    this._requested = { at: now(), received: start };
+    // a request after a cut or damage bypasses caches
+    const cache = start ? "no-store" : "default";
+    const response = await within(this._fetch(this.url, { headers, signal, cache }), patience);
+    const skip = this._accept(response, "Range" in headers);
+    if (skip === null) this.close();
+    else {
+      const reader = (response.body ?? new Blob().stream()).getReader();
+      this._body = { reader, skip, rest: NOTHING };
     }
   }
 
   /**
-   * Checks a response; restarts if the file has changed. Returns how many of its bytes are here already.
+   * Checks a response; restarts if the file has changed. Returns how many of its bytes are here already, null if it is
+   * of no use.
    *
-   * @param {Response} response @param {number} start @param {boolean} resumes
+   * @param {Response} response @param {boolean} resumes whether a range was requested
    */
-  _accept(response, start, resumes) {
-    const { status, headers } = response;
-    if (status === 416 && resumes) {
-      this._restart();
-      throw new Changed("the file has become shorter");
-    }
+  _accept({ status, statusText, headers }, resumes) {
+    if (status === 416 && resumes) return this._restart(); // the file has become shorter
     if (status !== 200 && status !== 206) {
-      const said = `the server answers ${status} ${response.statusText}`.trimEnd();
+      const said = `the server answers ${status} ${statusText}`.trimEnd();
       if (TEMPORARY.includes(status)) throw new Cut(said);
       throw new FetchError(`${this.url}: ${said}`);
     }
@@ -295,18 +258,16 @@ export class SceneSource {
     const strong = tag && !tag.startsWith("W/") ? tag : null;
     const validator = strong ?? headers.get("Last-Modified");
     if (status === 206) {
-      const part = /^bytes (\d{1,15})-(\d{1,15})\/(\d{1,15})$/.exec(headers.get("Content-Range") ?? "");
-      const known = this.total;
-      if (!resumes || !part || Number(part[1]) !== start) throw new Cut("the response is another part than requested");
-      if ((validator !== null && validator !== this._validator) || (known !== null && Number(part[3]) !== known)) {
-        this._restart();
-        throw new Changed("an answer about another file");
+      const part = /^bytes (\d{1,15})-\d{1,15}\/(\d{1,15})$/.exec(headers.get("Content-Range") ?? "");
+      if (!resumes || !part || Number(part[1]) !== this.received) {
+        throw new Cut("the response is another part than requested");
       }
-      this.total = Number(part[3]);
+      const total = Number(part[2]);
+      if ((validator ?? this._validator) !== this._validator || (this.total ?? total) !== total) return this._restart();
+      this.total = total;
       return 0;
     }
-    const same = strong !== null && strong === this._validator;
-    if (start && !same) this._restart();
+    if (this.received && (strong === null || strong !== this._validator)) this._restart();
     // the length of a compressed response is not that of the file
     const length = headers.get("Content-Encoding") ? null : headers.get("Content-Length");
     this.total = length !== null && /^\d{1,15}$/.test(length) ? Number(length) : null;
@@ -314,53 +275,28 @@ export class SceneSource {
     return this.received; // the same file, from a server without ranges
   }
 
-  /** The file has changed. */
+  /** The file has changed. @returns {null} */
   _restart() {
     this.changes++;
     if (this.changes > MOST_CHANGES) throw new FetchError(`${this.url}: changed ${this.changes} times during the download`);
-    const { _decoder: old } = this;
-    if ("close" in old && typeof old.close === "function") old.close();
+    this._decoder.close?.();
     this._decoder = this._makeDecoder();
     this._repairedAt = -1;
     this.received = 0;
+    this._requested.received = 0;
     this.total = null;
     this._validator = null;
+    return null;
   }
 }
 
-/** The body of one response. */
-class Answer {
-  /** @param {Response} response @param {AbortController} controller @param {number} skip bytes that are here already
-   * @param {() => void} ended */
-  constructor(response, controller, skip, ended) {
-    this.controller = controller;
-    this._reader = response.body?.getReader();
-    this._skip = skip;
-    this._ended = ended;
-    this._rest = new Uint8Array(0);
-  }
+/** @typedef {ReadableStreamDefaultReader<Uint8Array>} Reader */
 
-  /** The next bytes, at most `limit`, empty while bytes are skipped; null at the end.
-   * @param {number} limit @param {number} milliseconds to wait for them @returns {Promise<Uint8Array | null>} */
-  async take(limit, milliseconds) {
-    if (!this._rest.length) {
-      if (!this._reader) return null;
-      const { done, value } = await within(this._reader.read(), milliseconds);
-      if (done) {
-        this._ended();
-        return null;
-      }
-      this._rest = value;
-    }
-    const skipped = Math.min(this._skip, this._rest.length);
-    this._skip -= skipped;
-    const block = this._skip ? new Uint8Array(0) : this._rest.subarray(skipped, skipped + limit);
-    this._rest = this._rest.subarray(skipped + block.length);
-    return block;
-  }
-}
-
+const NOTHING = new Uint8Array(0);
 const now = () => performance.now() / 1000;
+
+/** @param {number} milliseconds @returns {Promise<void>} */
+const sleep = (milliseconds) => new Promise((resolve) => setTimeout(resolve, milliseconds));
 
 /** The value of `promise`, or a Cut if that takes longer. @template T @param {Promise<T>} promise
  * @param {number} milliseconds @returns {Promise<T>} */
@@ -369,20 +305,5 @@ function within(promise, milliseconds) {
     const patience = Math.min(Math.ceil(milliseconds) + 1, 2 ** 31 - 1); // more would fire at once
     const timer = setTimeout(() => reject(new Cut("no byte arrived for too long")), patience);
     promise.then(resolve, reject).finally(() => clearTimeout(timer));
-  });
-}
-
-/** @param {number} seconds @param {AbortSignal | undefined} signal @returns {Promise<void>} */
-function sleep(seconds, signal) {
-  return new Promise((resolve, reject) => {
-    const end = () => {
-      clearTimeout(timer);
-      reject(signal?.reason);
-    };
-    const timer = setTimeout(() => {
-      signal?.removeEventListener("abort", end);
-      resolve();
-    }, seconds * 1000);
-    signal?.addEventListener("abort", end, { once: true });
   });
 }
