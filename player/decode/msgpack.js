@@ -1,9 +1,9 @@
-// Clause 4: canonical msgpack. The one form that it allows is checked while it is read.
+// Clause 4: canonical msgpack, in which each value has one valid form.
 
 import { malformed } from "./errors.js";
 import { MAX_NESTING } from "./limits.js";
 
-/** A float 32, so that a real is told from an integer of the same value. */
+/** A float 32, which differs in type from an integer of the same value. */
 export class Real {
   /** @param {number} value */
   constructor(value) {
@@ -12,7 +12,7 @@ export class Real {
 }
 
 /**
- * An integer is a number; one beyond ±2^53 is only near it, which is over every limit all the same.
+ * An integer is a number. Beyond ±2^53 it is rounded, which is above every limit.
  *
  * @typedef {number | boolean | string | Real | Uint8Array | Value[] | Map<number, any>} Value
  */
@@ -38,7 +38,6 @@ class Reader {
   /** @param {Uint8Array} bytes @param {string} where */
   constructor(bytes, where) {
     this.bytes = bytes;
-    this.view = new DataView(bytes.buffer, bytes.byteOffset, bytes.byteLength);
     this.where = where;
     this.at = 0;
     this.firstEntryEnd = 0;
@@ -49,109 +48,74 @@ class Reader {
     return malformed(`${this.where}: ${reason}, at byte ${this.at}`);
   }
 
-  /** The offset of the next `size` bytes, which are passed. @param {number} size */
+  /** The next `size` bytes. @param {number} size */
   take(size) {
-    const at = this.at;
-    if (size > this.bytes.length - at) throw this.fault("the value is cut");
-    this.at += size;
-    return at;
+    if (size > this.bytes.length - this.at) throw this.fault("the value is cut");
+    return this.bytes.subarray(this.at, (this.at += size));
   }
 
-  /** A big-endian unsigned integer of 1, 2 or 4 bytes. @param {number} size */
-  unsigned(size) {
-    const at = this.take(size);
-    return size === 1 ? this.bytes[at] : size === 2 ? this.view.getUint16(at) : this.view.getUint32(at);
+  /** A big-endian integer of `size` bytes. @param {number} size @param {boolean} [signed] */
+  integer(size, signed = false) {
+    const [first, ...rest] = this.take(size);
+    return rest.reduce((n, byte) => 256 * n + byte, signed && first > 127 ? first - 256 : first);
   }
 
-  /** An unsigned integer that would not fit in fewer bytes. @param {number} size @param {number} least */
-  shortest(size, least) {
-    const n = this.unsigned(size);
-    if (n < least) throw this.fault("a number or length that is not in its shortest form");
+  /**
+   * An unsigned integer that would not fit in a shorter form.
+   *
+   * @param {number} size bytes: `smallest`, or twice or four times or eight times as many
+   * @param {number} least integer that does not fit in a form without a size @param {number} [smallest]
+   */
+  shortest(size, least, smallest = 1) {
+    const n = this.integer(size);
+    if (n < (size > smallest ? 2 ** (4 * size) : least)) {
+      throw this.fault("a number or length that is not in its shortest form");
+    }
     return n;
   }
 
-  /** @param {number} depth lists and maps around the value @returns {Value} */
+  /** @param {number} depth number of lists and maps around the value @returns {Value} */
   value(depth) {
-    const b = this.unsigned(1);
+    const b = this.integer(1);
     if (b < 0x80) return b;
-    if (b >= 0xe0) return b - 256;
     if (b < 0x90) return this.map(b & 15, depth);
     if (b < 0xa0) return this.list(b & 15, depth);
     if (b < 0xc0) return this.text(b & 31);
-    switch (b) {
-      case 0xc2:
-        return false;
-      case 0xc3:
-        return true;
-      case 0xc4:
-        return this.binary(this.unsigned(1));
-      case 0xc5:
-        return this.binary(this.shortest(2, 256));
-      case 0xc6:
-        return this.binary(this.shortest(4, 65536));
-      case 0xca: {
-        const real = this.view.getFloat32(this.take(4));
-        if (!Number.isFinite(real)) throw this.fault(`${real}, expected a finite real`);
-        return new Real(real);
-      }
-      case 0xcc:
-        return this.shortest(1, 128);
-      case 0xcd:
-        return this.shortest(2, 256);
-      case 0xce:
-        return this.shortest(4, 65536);
-      case 0xcf: {
-        const high = this.shortest(4, 1);
-        return high * 2 ** 32 + this.unsigned(4);
-      }
-      case 0xd0:
-        return this.negative(this.view.getInt8(this.take(1)), -32);
-      case 0xd1:
-        return this.negative(this.view.getInt16(this.take(2)), -128);
-      case 0xd2:
-        return this.negative(this.view.getInt32(this.take(4)), -32768);
-      case 0xd3: {
-        const high = this.view.getInt32(this.take(4));
-        return this.negative(high * 2 ** 32 + this.unsigned(4), -(2 ** 31));
-      }
-      case 0xd9:
-        return this.text(this.shortest(1, 32));
-      case 0xda:
-        return this.text(this.shortest(2, 256));
-      case 0xdb:
-        return this.text(this.shortest(4, 65536));
-      case 0xdc:
-        return this.list(this.shortest(2, 16), depth);
-      case 0xdd:
-        return this.list(this.shortest(4, 65536), depth);
-      case 0xde:
-        return this.map(this.shortest(2, 16), depth);
-      case 0xdf:
-        return this.map(this.shortest(4, 65536), depth);
-    }
+    if (b >= 0xe0) return b - 256;
+    if (b === 0xc2 || b === 0xc3) return b === 0xc3;
+    if (b >= 0xc4 && b <= 0xc6) return this.take(this.shortest(1 << (b - 0xc4), 0)).slice();
+    if (b === 0xca) return this.real();
+    if (b >= 0xcc && b <= 0xcf) return this.shortest(1 << (b - 0xcc), 128);
+    if (b >= 0xd0 && b <= 0xd3) return this.negative(1 << (b - 0xd0));
+    if (b >= 0xd9 && b <= 0xdb) return this.text(this.shortest(1 << (b - 0xd9), 32));
+    if (b === 0xdc || b === 0xdd) return this.list(this.shortest(2 << (b - 0xdc), 16, 2), depth);
+    if (b >= 0xde) return this.map(this.shortest(2 << (b - 0xde), 16, 2), depth);
     throw this.fault(`type byte 0x${b.toString(16)}, which canonical msgpack does not have`);
   }
 
-  /** @param {number} value @param {number} above what shorter forms hold */
-  negative(value, above) {
-    if (value >= above) throw this.fault("an integer that is not in its shortest form");
-    return value;
+  real() {
+    const { buffer, byteOffset } = this.take(4);
+    const real = new DataView(buffer, byteOffset).getFloat32(0);
+    if (!Number.isFinite(real)) throw this.fault(`${real}, expected a finite real`);
+    return new Real(real);
   }
 
-  /** @param {number} size */
+  /** A negative integer that would not fit in a shorter form. @param {number} size bytes */
+  negative(size) {
+    const n = this.integer(size, true);
+    const least = size > 1 ? -(2 ** (4 * size - 1)) : -32; // of a shorter form
+    if (n >= least) throw this.fault("an integer that is not in its shortest form");
+    return n;
+  }
+
+  /** @param {number} size bytes */
   text(size) {
-    const at = this.take(size);
+    const bytes = this.take(size);
     try {
-      return UTF8.decode(this.bytes.subarray(at, at + size));
+      return UTF8.decode(bytes);
     } catch {
       throw this.fault("a string that is not UTF-8");
     }
-  }
-
-  /** @param {number} size */
-  binary(size) {
-    const at = this.take(size);
-    return this.bytes.slice(at, at + size);
   }
 
   /** @param {number} depth */
@@ -164,7 +128,7 @@ class Reader {
     this.enter(depth);
     /** @type {Value[]} */
     const list = [];
-    for (let i = 0; i < size; i++) list.push(this.value(depth + 1)); // it is cut before it grows beyond the bytes
+    for (let i = 0; i < size; i++) list.push(this.value(depth + 1)); // raises at the end of the bytes
     return list;
   }
 
