@@ -4,26 +4,24 @@ import { decodeAttributes } from "./attributes.js";
 import { decodeChannels } from "./channels.js";
 import { malformed } from "./errors.js";
 import { MAX_SYMBOL } from "./limits.js";
-import { ATTRIBUTES, MASKS, PLANE_SECTION, POSITIONS, WEIGHTS, readParameters } from "./parameters.js";
+import { readParameters } from "./parameters.js";
 import { decodePlanes } from "./planes.js";
 import { decodePositions } from "./positions.js";
 /** @import { Declared, LayerKind, NetworkShape, Parameters } from "./parameters.js" */
 
 /**
- * What one slice with n own rows carries. voxels: [n, 3]. rises: of the earlier rows' mask codes. codes: of the own
- * rows. stepClasses: [n], empty if anchors have none. attributes: [D + 6 + 3·G, n].
- * planes: per scale six [C, H, W]. weights: weight, bias, weight, bias and so on, network by network.
+ * The symbols of a slice with n rows of its own.
  *
  * @typedef {object} LayerSymbols
  * @property {LayerKind} kind
  * @property {Parameters} parameters
- * @property {Int32Array} voxels
- * @property {Int32Array} rises
- * @property {Int32Array} codes
- * @property {Int32Array} stepClasses
- * @property {Int32Array} attributes
- * @property {Int32Array[]} planes
- * @property {Int32Array[]} weights
+ * @property {Int32Array} voxels [n, 3]
+ * @property {Int32Array} rises of the earlier rows' mask codes
+ * @property {Int32Array} codes [n] of the mask
+ * @property {Int32Array} stepClasses [n], empty if anchors have none
+ * @property {Int32Array} attributes [D + 6 + 3·G, n]
+ * @property {Int32Array[]} planes per scale six [C, H, W]
+ * @property {Int32Array[]} weights weight, bias, weight, bias and so on, network by network
  */
 
 const LEAST_OWN_CODE = 3;
@@ -42,11 +40,7 @@ export function decodeLayer(payload, kind, before, continuation, later) {
   const earlierRows = later ? 0 : before.rows;
   const parameters = readParameters(payload, kind, before, later);
   const { rows, sections, planes: shapes, networks } = parameters;
-  const positions = sections[POSITIONS];
-  const masks = sections[MASKS];
-  const section = sections[ATTRIBUTES];
-  const planes = sections[PLANE_SECTION];
-  const weights = sections[WEIGHTS];
+  const { positions, masks, attributes: section, planes, weights } = sections;
   const voxels = positions ? decodePositions(positions, rows, continuation.definitions("positions")) : new Int32Array(0);
   const codes = new Int32Array(earlierRows + rows);
   if (masks) decodeChannels(masks, [earlierRows, rows], codes, continuation.definitions("masks"));

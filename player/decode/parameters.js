@@ -20,49 +20,30 @@ import { PREDICTORS } from "./planes.js";
 import { PLANES } from "./scene.js";
 
 /**
- * What a layer's number and the header's widths decide. networks: name and outputs by id, null for any number of outputs.
- * inputs: of layer 0's networks, feature and view direction. classes: of the error bounds of its steps, in their order
- * (5.4). stepClasses: whether anchors have them (11.2).
+ * The properties of a layer that follow from its number and the header.
  *
  * @typedef {object} LayerKind
  * @property {number} layer
- * @property {[string, number | null][]} networks
- * @property {number} inputs
- * @property {number[]} classes
+ * @property {[string, number | null][]} networks name and outputs by id; null: any number of outputs
+ * @property {number} inputs of layer 0's networks: feature and view direction
+ * @property {number[]} classes of the error bounds of its steps, in their order (5.4)
  * @property {import("./header.js").Widths} widths
- * @property {boolean} stepClasses
+ * @property {boolean} stepClasses whether anchors have step classes (11.2)
  */
 
 /** @param {number} layer @param {import("./header.js").Header} header @returns {LayerKind} */
 export function layerKind(layer, { widths, centres }) {
   const { feature: D, slots: G } = widths;
-  /** @type {[string, number | null][][]} */
-  const networks = [
-    [
-      ["opacity", G],
-      ["covariance", 7 * G],
-      ["color", 3 * G],
-    ],
-    deformationNetworks(globalHeads(widths)),
-    deformationNetworks(LOCAL_HEADS),
-  ];
+  /** @type {[string, number | null][]} */
+  const networks = [["trunk", null]];
+  if (layer === 0) networks.splice(0, 1, ["opacity", G], ["covariance", 7 * G], ["color", 3 * G]);
+  else for (const { name, outputs } of layer === 1 ? globalHeads(widths) : LOCAL_HEADS) networks.push([name, outputs]);
   const classes = layer ? [2 + 2 * layer, 3 + 2 * layer] : [3];
-  return { layer, networks: networks[layer], inputs: D + 3, classes, widths, stepClasses: centres !== null };
+  return { layer, networks, inputs: D + 3, classes, widths, stepClasses: centres !== null };
 }
 
-/** @param {import("./heads.js").Head[]} heads @returns {[string, number | null][]} */
-const deformationNetworks = (heads) => [["trunk", null], ...heads.map(named)];
-
-/** @param {import("./heads.js").Head} head @returns {[string, number]} */
-const named = ({ name, outputs }) => [name, outputs];
-
-/** Section numbers of mode ans (6.4). */
-export const POSITIONS = 0;
-export const MASKS = 1;
-export const ATTRIBUTES = 2;
-export const PLANE_SECTION = 3;
-export const WEIGHTS = 4;
-const SECTIONS = ["positions", "masks", "attributes", "planes", "weights", "symbols"];
+/** Sections of mode ans by number (6.4). */
+const SECTIONS = /** @type {const} */ (["positions", "masks", "attributes", "planes", "weights", "symbols"]);
 /** The keys of a layer's parameters (6.1). */
 const KEYS = [1, 2, 3, 4, 5];
 
@@ -70,19 +51,16 @@ const KEYS = [1, 2, 3, 4, 5];
 /** Linear layers from the input side. @typedef {{name: string, layers: {inputs: number, outputs: number}[]}} NetworkShape */
 
 /**
- * planes: six per scale. steps: of the weights in layer 0, else of planes and weights, empty without a deformation.
- * sections: by number.
- *
  * @typedef {object} Parameters
  * @property {number} rows
- * @property {number[]} steps
- * @property {PlaneShape[]} planes
+ * @property {number[]} steps of the weights in layer 0, else of planes and weights; empty without a deformation
+ * @property {PlaneShape[]} planes six per scale
  * @property {NetworkShape[]} networks
- * @property {(Uint8Array | null)[]} sections
+ * @property {Partial<Record<(typeof SECTIONS)[number], Uint8Array>>} sections
  * @property {Declared} declared by the slices so far, this one included
  */
 
-/** What slices declare: rows, symbols, and the bytes of their payloads (6.5).
+/** Totals of slices: rows, symbols, bytes of payloads (6.5).
  * @typedef {{rows: number, symbols: number, bytes: number}} Declared */
 
 /**
@@ -117,38 +95,39 @@ export function readParameters(payload, kind, before, later) {
   );
   const perRow = channelCount(kind.widths) + (kind.stepClasses ? 1 : 0);
   if (cells > MAX_PLANE_CELLS) throw limitExceeded(`${where}: ${cells} plane cells, limit ${MAX_PLANE_CELLS}`);
-  const declared = checkDeclared(where, {
+  const declared = {
     rows: before.rows + rows,
     symbols: before.symbols + rises + (perRow + 4) * rows + cells + weights,
     bytes: before.bytes + payload.length,
-  });
+  };
+  checkDeclared(where, "rows", declared.rows, 2 ** 13, 2, declared.bytes);
+  checkDeclared(where, "symbols", declared.symbols, 2 ** 22, 256, declared.bytes);
   const counts = [rows, rises + rows, rows * perRow, cells, weights, 0];
-  counts.forEach((count, section) => {
-    if ((sections[section] !== null) !== count > 0) {
-      const found = sections[section] === null ? "missing" : "there";
-      throw malformed(`${where}: section ${SECTIONS[section]} is ${found}, with ${count} symbols to code`);
+  SECTIONS.forEach((name, i) => {
+    if (name in sections !== counts[i] > 0) {
+      const found = name in sections ? "there" : "missing";
+      throw malformed(`${where}: section ${name} is ${found}, with ${counts[i]} symbols to code`);
     }
   });
   return { rows, steps, planes, networks, sections, declared };
 }
 
-/** Clause 6.5. @param {string} where @param {Declared} declared with the latest slice @returns {Declared} the same */
-function checkDeclared(where, declared) {
-  const { rows, symbols, bytes } = declared;
-  const mostRows = 2 ** 13 + 2 * bytes;
-  if (rows > mostRows) throw limitExceeded(`${where}: ${rows} rows in ${bytes} bytes, limit ${mostRows}`);
-  const mostSymbols = 2 ** 22 + 256 * bytes;
-  if (symbols > mostSymbols) throw limitExceeded(`${where}: ${symbols} symbols in ${bytes} bytes, limit ${mostSymbols}`);
-  return declared;
+/** Clause 6.5. @param {string} where @param {string} what @param {number} count @param {number} free @param {number} each
+ * @param {number} bytes */
+function checkDeclared(where, what, count, free, each, bytes) {
+  const most = free + each * bytes;
+  if (count > most) throw limitExceeded(`${where}: ${count} ${what} in ${bytes} bytes, limit ${most}`);
 }
 
 /** @param {Uint8Array} payload @param {number} at @param {Fields} lengths @param {string} where */
 function cutSections(payload, at, lengths, where) {
-  const sections = SECTIONS.map((name, number) => {
-    if (!lengths.has(number)) return null;
+  /** @type {Parameters["sections"]} */
+  const sections = {};
+  SECTIONS.forEach((name, number) => {
+    if (!lengths.has(number)) return;
     const start = at;
     at += asInteger(lengths.get(number), 1, MAX_PAYLOAD, `${where}: length of section ${name}`);
-    return payload.subarray(start, at); // cut short where it lies: the sum is checked below
+    sections[name] = payload.subarray(start, at); // shorter if the payload ends: the sum is checked below
   });
   if (at !== payload.length) throw malformed(`${where}: sections up to byte ${at} of a payload of ${payload.length}`);
   return sections;

@@ -13,17 +13,8 @@ import { VoxelTable } from "./voxels.js";
 /** @import { Declared, NetworkShape, PlaneShape } from "./parameters.js" */
 /** @import { Deformation, Network, Plane, PlaneName, Scene, Steps } from "./scene.js" */
 
-/**
- * The float32 values of one slice's own rows and networks, in the order of 12.4.
- *
- * @typedef {object} LayerTensors
- * @property {Float32Array} anchor
- * @property {Float32Array} feature
- * @property {Float32Array} scalingLog
- * @property {Float32Array} offset
- * @property {Float32Array[]} planes
- * @property {Float32Array[]} weights
- */
+/** The float32 values of one slice's own rows and networks.
+ * @typedef {Omit<Own, "voxels" | "codes"> & {planes: Float32Array[], weights: Float32Array[]}} LayerTensors */
 
 /** later: whether slices of the same layer came before.
  * @typedef {{symbols: LayerSymbols, tensors: LayerTensors, later: boolean}} Slice */
@@ -154,9 +145,10 @@ export class LayerReader {
   }
 
   /** The rules of 12.1 that need header and earlier slices, then dequantisation.
-   * @param {LayerSymbols} symbols @param {Continuation} continuation @param {boolean} later */
+   * @param {LayerSymbols} symbols @param {Continuation} continuation @param {boolean} later @returns {LayerTensors} */
   _accept(symbols, continuation, later) {
     const { kind, parameters, voxels, rises } = symbols;
+    const { steps, planes, networks } = parameters;
     const header = /** @type {Header} */ (this.header);
     const where = `layer ${kind.layer}`;
     const latest = this._layers[this._layers.length - 1];
@@ -168,25 +160,23 @@ export class LayerReader {
       earlier[i] = code;
     }
     this._checkVoxels(voxels);
-    const tensors = this._tensorsOf(symbols, header);
-    if (parameters.steps.length) {
-      for (const number of kind.classes) {
-        if (!header.bounds.has(number)) throw malformed(`${where}: the header has no error bound of class ${number}`);
-      }
+    const anchor = dequantise(voxels, header.info.voxelSize);
+    const attributes = attributesOf(symbols, header);
+    const tensors = {
+      planes: symbols.planes.map((plane) => dequantise(plane, steps[0])),
+      weights: symbols.weights.map((weight) => dequantise(weight, steps[steps.length - 1])),
+    };
+    for (const number of steps.length ? kind.classes : []) {
+      if (!header.bounds.has(number)) throw malformed(`${where}: the header has no error bound of class ${number}`);
     }
-    const { anchor, feature, scalingLog, offset } = tensors;
-    const own = { voxels, codes: Uint8Array.from(symbols.codes), anchor, feature, scalingLog, offset };
     this._loose.push(voxels);
     if (!later) {
-      const { steps, planes, networks } = parameters;
-      const kept = { planes: tensors.planes, weights: tensors.weights };
-      const none = { slices: 0, parts: [] };
-      this._layers.push({ layer: kind.layer, steps, planes, networks, tensors: kept, earlier, continuation, ...none });
+      this._layers.push({ layer: kind.layer, slices: 0, steps, planes, networks, tensors, earlier, parts: [], continuation });
     }
     const layer = this._layers[this._layers.length - 1];
     layer.slices++;
-    layer.parts.push(own);
-    return tensors;
+    layer.parts.push({ voxels, codes: Uint8Array.from(symbols.codes), anchor, ...attributes });
+    return { anchor, ...attributes, ...tensors };
   }
 
   /** Malformed if a voxel is one of the slices before. @param {Int32Array} voxels of a slice, distinct among themselves */
@@ -198,17 +188,6 @@ export class LayerReader {
       const x = voxels[i], y = voxels[i + 1], z = voxels[i + 2];
       if (this._voxels.has(x, y, z)) throw malformed(`voxel ${x} ${y} ${z} holds more than one anchor`);
     }
-  }
-
-  /** @param {LayerSymbols} symbols @param {Header} header @returns {LayerTensors} */
-  _tensorsOf(symbols, header) {
-    const { parameters: { steps }, voxels, planes, weights } = symbols;
-    return {
-      anchor: dequantise(voxels, header.info.voxelSize),
-      ...attributesOf(symbols, header),
-      planes: planes.map((plane) => dequantise(plane, steps[0])),
-      weights: weights.map((weight) => dequantise(weight, steps[steps.length - 1])),
-    };
   }
 
   /** The scene of the layers read so far, at least one. @returns {Scene} */
@@ -231,16 +210,17 @@ export class LayerReader {
     }
     const layers = this._layers;
     const owns = layers.map(ownOf);
+    const { voxels, anchor, ...attributes } = gathered(owns);
     return {
       info: header.info,
       steps,
       layers: layers.map(({ layer }) => layer),
       rows: layers.map(({ earlier }, i) => earlier.length + owns[i].codes.length),
-      anchorQ: joined(owns.map(({ voxels }) => voxels)),
-      anchor: joined(owns.map(({ anchor }) => anchor)),
-      feature: joined(owns.map(({ feature }) => feature)),
-      scalingLog: joined(owns.map(({ scalingLog }) => scalingLog)),
-      offset: joined(owns.map(({ offset }) => offset)),
+      anchorQ: voxels,
+      anchor,
+      feature: attributes.feature,
+      scalingLog: attributes.scalingLog,
+      offset: attributes.offset,
       mask: layers.map(({ earlier }, i) => joined([earlier, owns[i].codes])),
       networks: { opacity: networks.opacity, covariance: networks.covariance, color: networks.color },
       globalDeformation: deformations[0],
@@ -249,8 +229,11 @@ export class LayerReader {
   }
 }
 
+/** The arrays of `Own`. */
+const COLUMNS = /** @type {const} */ (["voxels", "codes", "anchor", "feature", "scalingLog", "offset"]);
+
 /**
- * What is kept of a slice's own rows, or of a layer's, then in the order of 12.2.
+ * The rows that a slice adds, or a layer, then in the order of 12.2.
  *
  * @typedef {object} Own
  * @property {Int32Array} voxels
@@ -262,17 +245,16 @@ export class LayerReader {
  */
 
 /**
- * What is kept of a layer. slices: read so far. tensors: of the layer's planes and networks. earlier: the mask codes of
- * earlier rows.
+ * A layer as far as it has been read.
  *
  * @typedef {object} LayerParts
  * @property {number} layer
- * @property {number} slices
+ * @property {number} slices read so far
  * @property {number[]} steps
  * @property {PlaneShape[]} planes
  * @property {NetworkShape[]} networks
  * @property {Pick<LayerTensors, "planes" | "weights">} tensors
- * @property {Uint8Array} earlier
+ * @property {Uint8Array} earlier mask codes of earlier rows
  * @property {Own[]} parts that make up its rows
  * @property {Continuation} continuation
  */
@@ -293,19 +275,16 @@ function attributesOf({ kind, parameters: { rows }, stepClasses, attributes }, h
 function ownOf(layer) {
   const { parts } = layer;
   if (parts.length === 1) return parts[0];
-  const order = mortonOrder(joined(parts.map(({ voxels }) => voxels)));
-  /** @template {Int32Array | Float32Array | Uint8Array} A @param {(part: Own) => A} get */
-  const all = (get) => reordered(joined(parts.map(get)), order);
-  const own = {
-    voxels: all(({ voxels }) => voxels),
-    codes: all(({ codes }) => codes),
-    anchor: all(({ anchor }) => anchor),
-    feature: all(({ feature }) => feature),
-    scalingLog: all(({ scalingLog }) => scalingLog),
-    offset: all(({ offset }) => offset),
-  };
+  const own = gathered(parts);
+  const order = mortonOrder(own.voxels);
+  for (const name of COLUMNS) Object.assign(own, { [name]: reordered(own[name], order) });
   layer.parts = [own];
   return own;
+}
+
+/** The rows of several parts, in their order. @param {Own[]} parts at least one @returns {Own} */
+function gathered(parts) {
+  return /** @type {any} */ (Object.fromEntries(COLUMNS.map((name) => [name, joined(parts.map((part) => part[name]))])));
 }
 
 /** @param {LayerParts} layer */
