@@ -36,7 +36,7 @@ class Fault:
 class FaultyServer(ThreadingTCPServer):
     """Serves `content` at `url` on loopback inside a `with` block, one of `faults` per request, then without.
 
-    etag, ranges: whether it sends the one and heeds the other. link: what all bodies cross.
+    etag, ranges, heeds_if_range: whether it sends the first and heeds the others. link: what all bodies cross.
     """
 
     daemon_threads = True
@@ -49,12 +49,13 @@ class FaultyServer(ThreadingTCPServer):
         *,
         etag: bool = True,
         ranges: bool = True,
+        heeds_if_range: bool = True,
         link: Link | None = None,
     ):
         super().__init__(("127.0.0.1", 0), _Handler)
         self.content, self.faults, self.etag, self.ranges = content, list(faults or []), etag, ranges
         self.link = link or Link()
-        self.heeds_if_range = True
+        self.heeds_if_range = heeds_if_range
         self.requests: list[dict[str, str]] = []  # their headers, names in lower case
         self.sent = 0  # bytes of bodies
         self.stopped = threading.Event()

@@ -1,16 +1,17 @@
-"""The resuming client: whatever the server does, only complete slices of one file are yielded.
-
-Cuts at random, silence, a slump of the link and files that change are cases of test_client_faults.py.
-"""
+"""The resuming client: whatever the server does, only complete slices of one file are yielded."""
 
 from __future__ import annotations
 
 import math
+import random
 import shutil
 import ssl
 import subprocess
+import threading
 import time
 from collections import deque
+from collections.abc import Callable
+from dataclasses import dataclass, field
 from types import SimpleNamespace
 
 import pytest
@@ -18,23 +19,174 @@ from faulty import Fault, FaultyServer
 from strategies import assert_same_scene, make_scene
 
 from pd4dgs_codec import decode, encode
-from pd4dgs_codec.errors import BadSignature, ChecksumMismatch, DeliveryError, Truncated
+from pd4dgs_codec.errors import BadSignature, ChecksumMismatch, DeliveryError, Pd4Error, Truncated
+from pd4dgs_codec.scene import Scene
 from pd4dgs_codec.web import client as client_module
 from pd4dgs_codec.web.client import Budget, SceneClient, next_end, recent_rate
-from pd4dgs_codec.web.server import Server
-from pd4dgs_codec.web.transfer import slice_ends
+from pd4dgs_codec.web.server import Link, Server
+from pd4dgs_codec.web.transfer import MAX_CHANGES, Transfer, slice_ends
+
+SAME = {"ETag": '"same"'}
+
+
+class File:
+    """A file of three layers; `other` is the same scene with coarser steps, which may replace it on the server."""
+
+    def __init__(self, data: bytes):
+        self.data = data
+        self.other = encode(decode(data), effort=1, step_scale=1.25, verify=False)
+        self.ends = [end for _, end in slice_ends(data)]
+        self.middle = (self.ends[0] + self.ends[1]) // 2
+
+    def levels(self, data: bytes | None = None, size: float = math.inf) -> list[Scene]:
+        """The scenes of the prefixes that end within `size` bytes."""
+        data = self.data if data is None else data
+        return [decode(data, max_layer=layer) for layer, end in slice_ends(data) if end <= size]
+
+    def damaged(self, layer: int) -> bytes:
+        """One bit of the layer differs."""
+        data = bytearray(self.data)
+        data[self.ends[layer] - 30] ^= 1
+        return bytes(data)
 
 
 @pytest.fixture(scope="module")
-def levels(scene_bytes):
-    """The scene of each prefix."""
-    return [decode(scene_bytes, max_layer=layer) for layer in range(3)]
+def file(scene_bytes) -> File:
+    return File(scene_bytes)
+
+
+@pytest.fixture(scope="module")
+def levels(file):
+    return file.levels()
 
 
 def check(scenes, levels):
     assert [scene.layers for scene in scenes] == [level.layers for level in levels]
     for scene, level in zip(scenes, levels, strict=True):
         assert_same_scene(scene, level)
+
+
+# -- a table of faults -------------------------------------------------------------------------------------------------
+
+
+@dataclass
+class Case:
+    """The server's faults, one per request, and its content and options; what the client yields, and the error that
+    ends it, the changes of the file and the requests that it counts."""
+
+    faults: Callable[[File], list[Fault]] = lambda f: []
+    shown: Callable[[File], list[Scene]] = File.levels
+    content: Callable[[File], bytes] = lambda f: f.data
+    server: dict[str, bool] = field(default_factory=dict)
+    error: type[Pd4Error] | None = None
+    says: str = ""
+    changes: int = 0
+    requests: int | None = None
+
+
+def becomes(content: bytes) -> Callable[[FaultyServer], None]:
+    return lambda server: setattr(server, "content", content)
+
+
+def each_in_turn(f: File) -> list[Scene]:
+    contents = [(f.data, f.other)[i % 2] for i in range(MAX_CHANGES + 1)]
+    return [scene for content in contents for scene in f.levels(content, f.middle)]
+
+
+def alternate(f: File) -> Callable[[FaultyServer], None]:
+    return lambda server: setattr(server, "content", f.other if server.content == f.data else f.data)
+
+
+NONE: Callable[[File], list[Scene]] = lambda f: []  # noqa: E731
+BEFORE: Callable[[File], list[Scene]] = lambda f: f.levels(size=f.middle)  # noqa: E731
+BOTH: Callable[[File], list[Scene]] = lambda f: BEFORE(f) + f.levels(f.other)  # noqa: E731
+NO_CONDITION = {"heeds_if_range": False}
+CASES = {
+    "nothing": Case(requests=1),
+    "bytes behind the file": Case(content=lambda f: f.data + b"more", requests=1),
+    "silence": Case(lambda f: [Fault(f.middle, "stall")], requests=2),
+    "closed": Case(lambda f: [Fault(f.middle)], requests=2),
+    "reset": Case(lambda f: [Fault(f.middle, "reset")], requests=2),
+    "three resets and a silence": Case(lambda f: [*[Fault(999, "reset")] * 3, Fault(9, "stall")], requests=5),
+    "no ranges": Case(lambda f: [Fault(f.middle), Fault(10)], server={"ranges": False}, requests=3),
+    "no ranges, no validator": Case(
+        lambda f: [Fault(f.middle), Fault(10)],
+        lambda f: BEFORE(f) + f.levels(),
+        server={"ranges": False, "etag": False},
+        changes=2,
+        requests=3,
+    ),
+    "another file": Case(lambda f: [Fault(f.middle, then=becomes(f.other))], BOTH, changes=1, requests=2),
+    "another file, no ranges": Case(
+        lambda f: [Fault(f.middle, then=becomes(f.other))], BOTH, server={"ranges": False}, changes=1
+    ),
+    "a shorter file": Case(
+        lambda f: [Fault(len(f.data) - 5, headers=SAME, then=becomes(f.other))],
+        lambda f: f.levels()[:2] + f.levels(f.other),
+        server=NO_CONDITION,
+        changes=1,
+        requests=3,  # cut, 416, the new file
+    ),
+    "a part of another file": Case(lambda f: [Fault(600), Fault(headers={"ETag": '"other"'})], changes=1),
+    "another file every time": Case(
+        lambda f: [Fault(f.middle, then=alternate(f))] * (MAX_CHANGES + 2),
+        each_in_turn,
+        error=DeliveryError,
+        says="changed 5 times",
+        changes=MAX_CHANGES + 1,
+    ),
+    "compressed": Case(lambda f: [Fault(headers={"Content-Encoding": "gzip"})], NONE, error=DeliveryError, says="gzip"),
+    "a page": Case(shown=NONE, content=lambda f: b"<html>not found</html>", error=BadSignature, requests=1),
+    "a short file": Case(shown=BEFORE, content=lambda f: f.data[: f.middle], error=Truncated),
+    **{f"{n} bytes": Case(shown=NONE, content=lambda f, n=n: f.data[:n], error=Truncated) for n in (0, 5, 100)},
+    **{
+        f"layer {n} damaged on the way": Case(
+            lambda f: [Fault(headers=SAME, then=becomes(f.data)), Fault(headers=SAME)],
+            content=lambda f, n=n: f.damaged(n),
+            server=NO_CONDITION,
+            requests=2,
+        )
+        for n in range(3)
+    },
+    **{
+        f"layer {n} damaged in the file": Case(
+            shown=lambda f, n=n: f.levels()[:n], content=lambda f, n=n: f.damaged(n), error=ChecksumMismatch, requests=2
+        )
+        for n in range(3)
+    },
+    **{
+        f"Content-Range {value}": Case(
+            lambda f, value=value: [Fault(600), Fault(headers={"Content-Range": value, "Connection": "close"})],
+            requests=3,
+        )
+        for value in ("bytes 0-9/99999", None, "bytes 9-5/3", "bytes 600-700/*")
+    },
+    **{f"{n} once": Case(lambda f, n=n: [Fault(status=n)], requests=2) for n in (408, 429, 500, 502, 503, 504)},
+    **{
+        f"{n}": Case(lambda f, n=n: [Fault(status=n)], NONE, error=DeliveryError, says=f"answers {n}", requests=1)
+        for n in (400, 401, 403, 404, 410, 501)
+    },
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_scenes_are_those_of_the_file_whatever_the_server_does(file, name):
+    case = CASES[name]
+    error: Pd4Error | None = None
+    shown: list[Scene] = []
+    with FaultyServer(case.content(file), case.faults(file), **case.server) as server:
+        with SceneClient(server.url, stall=0.3) as client:
+            try:
+                shown.extend(client.scenes())
+            except Pd4Error as caught:
+                error = caught
+    assert type(error) is (case.error or type(None)) and case.says in str(error), error
+    check(shown, case.shown(file))
+    assert client.transfer.changes == case.changes
+    assert case.requests in (None, len(server.requests))
+
+
+# -- requests ----------------------------------------------------------------------------------------------------------
 
 
 def test_one_open_get_gives_every_layer(scene_bytes, levels):
@@ -67,33 +219,6 @@ def test_upgrades_fetch_the_missing_layers_only(scene_bytes, levels):
     assert [r.get("range") for r in server.requests] == [None, f"bytes={ends[0]}-{ends[2] - 1}"]
 
 
-@pytest.mark.parametrize("etag", [True, False])
-def test_servers_without_ranges_or_validators(scene_bytes, levels, etag):
-    faults = [Fault(len(scene_bytes) // 2), Fault(10)]
-    with FaultyServer(scene_bytes, faults, ranges=False, etag=etag) as server, SceneClient(server.url) as client:
-        scenes = list(client.scenes())
-    check(scenes[-3:], levels)
-    assert len(server.requests) == 3 and client.transfer.changes == (0 if etag else 2)
-
-
-def test_a_damaged_layer_is_fetched_again_and_never_shown(scene_bytes, levels):
-    ends = [end for _, end in slice_ends(scene_bytes)]
-    for layer in range(3):
-        damaged = bytearray(scene_bytes)
-        damaged[ends[layer] - 30] ^= 1
-        fault = Fault(headers={"ETag": '"same"'}, then=lambda server: setattr(server, "content", scene_bytes))
-        faults = [fault, Fault(headers={"ETag": '"same"'})]
-        with FaultyServer(bytes(damaged), faults) as server, SceneClient(server.url) as client:
-            server.heeds_if_range = False
-            check(list(client.scenes()), levels)
-        with FaultyServer(bytes(damaged)) as server, SceneClient(server.url) as client:
-            shown = []
-            with pytest.raises(ChecksumMismatch):
-                shown.extend(client.scenes())
-            check(shown, levels[:layer])
-            assert len(server.requests) == 2
-
-
 def test_a_damaged_layer_within_the_first_block():
     data = encode(make_scene(7, anchors=6), layers=2, effort=1)
     ends = [end for _, end in slice_ends(data)]
@@ -108,37 +233,8 @@ def test_a_damaged_layer_within_the_first_block():
     assert server.requests[1]["range"] == f"bytes={ends[0]}-{ends[2] - 1}"
 
 
-@pytest.mark.parametrize("status", [500, 502, 503, 504, 429, 408])
-def test_passing_errors_are_asked_again(scene_bytes, levels, status):
-    with FaultyServer(scene_bytes, [Fault(status=status)]) as server, SceneClient(server.url) as client:
-        check(list(client.scenes()), levels)
-
-
-@pytest.mark.parametrize("status", [400, 401, 403, 404, 410, 501])
-def test_final_errors_are_final(scene_bytes, status):
-    with FaultyServer(scene_bytes, [Fault(status=status)]) as server, SceneClient(server.url) as client:
-        with pytest.raises(DeliveryError, match=f"answers {status}"):
-            list(client.scenes())
-    assert len(server.requests) == 1
-
-
-def test_redirects_are_followed_but_not_in_circles(scene_bytes, levels):
-    with FaultyServer(scene_bytes) as server:
-        with FaultyServer(b"", [Fault(status=302, headers={"Location": server.url})]) as first:
-            with SceneClient(first.url) as client:
-                check(list(client.scenes()), levels)
-        for target, says in (
-            ("/scene.pd4", "redirects"),
-            ("file:///etc/passwd", "expected http"),
-            (None, "without a Location"),
-        ):
-            faults = [Fault(status=301, headers={"Location": target}) for _ in range(9)]
-            with FaultyServer(b"", faults) as first, SceneClient(first.url) as client:
-                with pytest.raises(DeliveryError, match=says):
-                    list(client.scenes())
-
-
-def test_a_relative_redirect_starts_from_where_it_was_given(scene_bytes, levels):
+def test_redirects_are_followed(scene_bytes, levels):
+    """A relative one starts from the server that gave it."""
     with FaultyServer(scene_bytes, [Fault(status=302, headers={"Location": "scene.pd4"})]) as second:
         with FaultyServer(b"", [Fault(status=301, headers={"Location": second.url})]) as first:
             with SceneClient(first.url) as client:
@@ -146,61 +242,24 @@ def test_a_relative_redirect_starts_from_where_it_was_given(scene_bytes, levels)
     assert (len(first.requests), len(second.requests)) == (1, 2)
 
 
-LIES = {
-    "a part from elsewhere": {"Content-Range": "bytes 0-9/99999"},
-    "no Content-Range": {"Content-Range": None},
-    "a Content-Range without sense": {"Content-Range": "bytes 9-5/3"},
-    "no length": {"Content-Range": "bytes 600-700/*"},
-}
-
-
-@pytest.mark.parametrize("lie", LIES)
-def test_answers_that_make_no_sense_are_asked_again(scene_bytes, levels, lie):
-    faults = [Fault(600), Fault(headers={**LIES[lie], "Connection": "close"})]
-    with FaultyServer(scene_bytes, faults) as server, SceneClient(server.url) as client:
-        check(list(client.scenes()), levels)
-    assert len(server.requests) == 3
-
-
-def test_a_part_of_another_file_is_not_appended(scene_bytes, levels):
-    faults = [Fault(600), Fault(headers={"ETag": '"other"'})]
-    with FaultyServer(scene_bytes, faults) as server, SceneClient(server.url) as client:
-        check(list(client.scenes()), levels)
-        assert client.transfer.changes == 1
-
-
-def test_a_file_that_is_shorter_now_begins_anew(scene_bytes, other_bytes):
-    others = [decode(other_bytes, max_layer=layer) for layer in range(3)]
-    size = slice_ends(scene_bytes)[1][1]
-    assert len(other_bytes) < size
-    fault = Fault(size, headers={"ETag": '"same"'}, then=lambda server: setattr(server, "content", other_bytes))
-    with FaultyServer(scene_bytes, [fault]) as server, SceneClient(server.url) as client:
-        server.heeds_if_range = False
-        shown = list(client.scenes())
-    check(shown[-3:], others)
-    assert len(server.requests) == 3  # cut, 416, anew
-
-
-def test_compressed_bytes_are_refused(scene_bytes):
-    with FaultyServer(scene_bytes, [Fault(headers={"Content-Encoding": "gzip"})]) as server:
-        with SceneClient(server.url) as client, pytest.raises(DeliveryError, match="gzip"):
+@pytest.mark.parametrize(
+    ("location", "says"),
+    [
+        ("/scene.pd4", "more than 5 redirects"),
+        ("http://", "more than 5 redirects"),
+        (None, "without a Location"),
+        ("http://[::1", "expected http"),
+        ("file:///etc/passwd", "expected http"),
+        ("http://a:99999/", "expected http"),
+        ("http://user:password@a/", "expected http"),
+    ],
+)
+def test_redirects_to_no_file(location, says):
+    faults = [Fault(status=301, headers={"Location": location})] * 9
+    with FaultyServer(b"", faults) as server, SceneClient(server.url) as client:
+        with pytest.raises(DeliveryError) as caught:
             list(client.scenes())
-
-
-def test_other_data_and_short_files(scene_bytes, levels):
-    with FaultyServer(b"<html>not found</html>") as server, SceneClient(server.url) as client:
-        with pytest.raises(BadSignature):
-            list(client.scenes())
-    ends = [end for _, end in slice_ends(scene_bytes)]
-    for size in (0, 5, 100, ends[1] + 3):
-        with FaultyServer(scene_bytes[:size]) as server, SceneClient(server.url) as client:
-            shown = []
-            with pytest.raises(Truncated):
-                for scene in client.scenes():
-                    shown.append(scene)
-            check(shown, levels[:2] if size > ends[1] else [])
-    with FaultyServer(scene_bytes + b"more") as server, SceneClient(server.url) as client:
-        check(list(client.scenes()), levels)  # a viewer does not look beyond the last layer
+    assert says in str(caught.value) and server.url in str(caught.value)
 
 
 def test_nobody_there_is_one_clear_line():
@@ -290,3 +349,34 @@ def test_the_rate_is_that_of_the_last_second():
     assert recent_rate(arrivals) == pytest.approx(1000)
     arrivals += [(11.1 + i / 10, 1010 + 10 * i) for i in range(20)]
     assert recent_rate(arrivals) == pytest.approx(100)
+
+
+@pytest.mark.parametrize("cuts", [20, pytest.param(1000, marks=pytest.mark.slow)])
+def test_random_cuts_give_the_same_scenes(file, cuts):
+    rng, made, expected = random.Random(4), 0, file.levels()
+    while made < cuts:
+        faults = [Fault(rng.randint(1, len(file.data) // 11), rng.choice(("close", "reset"))) for _ in range(10)]
+        with FaultyServer(file.data, faults) as server, SceneClient(server.url) as client:
+            shown = list(client.scenes())
+        check(shown, expected)
+        made += client.transfer.cuts
+
+
+@pytest.mark.parametrize("clients", [4, pytest.param(64, marks=pytest.mark.slow)])
+def test_many_clients_at_once_get_every_byte(folder, scene_bytes, clients):
+    results: list[tuple[bytes, int]] = []
+    with Server(folder, link=Link(200e6)) as server, server.running():
+
+        def fetch() -> None:
+            transfer = Transfer(server.url_of("scene.pd4"))
+            while transfer.read():
+                pass
+            results.append((bytes(transfer.data), transfer.cuts))
+            transfer.close()
+
+        threads = [threading.Thread(target=fetch) for _ in range(clients)]
+        for thread in threads:
+            thread.start()
+        for thread in threads:
+            thread.join()
+    assert results == [(scene_bytes, 0)] * clients
