@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-import http.client
 import json
 import re
 from dataclasses import replace
 
 import pytest
+from faulty import ask
 from test_package import fake_video
 
 from pd4dgs_codec.errors import DeliveryError
@@ -74,9 +74,7 @@ def test_a_server_tells_caches_what_never_changes(shelf):
     first = json.loads(library(shelf)["library.json"])["scenes"][0]
     with Server(shelf) as server, server.running():
         for target, wanted in ((first["file"], IMMUTABLE), (first["page"], CHANGES), ("c/scene.pd4", CHANGES)):
-            connection = http.client.HTTPConnection("127.0.0.1", server.server_address[1], timeout=10)
-            connection.request("HEAD", f"/{target}")
-            answer = connection.getresponse()
+            answer = ask(server, f"/{target}", "HEAD")
             assert answer.status == 200 and answer.headers["Cache-Control"] == wanted
 
 
