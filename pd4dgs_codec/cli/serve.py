@@ -16,42 +16,7 @@ served. The first line on stdout is the URL, printed when the server listens. Ct
 --rate is the rate of one link that all clients share; headers are not counted. --latency is its round-trip time: a new
 connection takes one round trip, each request another.
 
-In production any server of static files will do. nginx:
-  server {
-    listen 80;
-    root /srv/scenes;
-    include mime.types;
-    types { application/octet-stream pd4; application/dash+xml mpd; }
-    gzip off;
-    set $kept no-cache;
-    if ($uri ~ "-[0-9a-f]{16}[.]") { set $kept "public, max-age=31536000, immutable"; }
-    location / {
-      add_header Cache-Control $kept;
-      add_header Access-Control-Allow-Origin * always;
-      add_header Access-Control-Expose-Headers "Accept-Ranges, Content-Length, Content-Range, ETag" always;
-      if ($request_method = OPTIONS) {
-        add_header Access-Control-Allow-Origin *;
-        add_header Access-Control-Allow-Headers "Range, If-Range";
-        return 204;
-      }
-    }
-  }
-Caddy:
-  :80
-  root * /srv/scenes
-  header Access-Control-Allow-Origin *
-  header Cache-Control no-cache
-  @kept path_regexp -[0-9a-f]{16}[.]
-  header @kept Cache-Control "public, max-age=31536000, immutable"
-  header Access-Control-Allow-Headers "Range, If-Range"
-  header Access-Control-Expose-Headers "Accept-Ranges, Content-Length, Content-Range, ETag"
-  @preflight method OPTIONS
-  respond @preflight 204
-  @pd4 path *.pd4
-  header @pd4 Content-Type application/octet-stream
-  @mpd path *.mpd
-  header @mpd Content-Type application/dash+xml
-  file_server
+In production use any server of static files; docs/player-and-delivery.md has configurations for nginx and Caddy.
 
 examples:
   pd4dgs-serve out/scene

@@ -1,9 +1,10 @@
-"""The configurations that `pd4dgs-serve --help` gives, run by a real nginx and a real Caddy where there are any."""
+"""The configurations in docs/player-and-delivery.md, run by a real nginx and a real Caddy where there are any."""
 
 from __future__ import annotations
 
 import http.client
 import os
+import re
 import shutil
 import socket
 import subprocess
@@ -14,9 +15,9 @@ import pytest
 from strategies import assert_same_scene
 
 from pd4dgs_codec import decode
-from pd4dgs_codec.cli.serve import DETAILS
 from pd4dgs_codec.web.client import Budget, SceneClient
 
+PAGE = Path(__file__).parents[2] / "docs/player-and-delivery.md"
 PROGRAMS = {name: shutil.which(name) or shutil.which(name, path="/usr/sbin") for name in ("nginx", "caddy")}
 
 
@@ -26,9 +27,9 @@ def _free_port() -> int:
         return probe.getsockname()[1]
 
 
-def _configuration(begin: str, end: str, changes: dict[str, str]) -> str:
-    """The part of the help between two lines, with an address and a folder of this test."""
-    block = DETAILS[DETAILS.index(begin) : DETAILS.index(end)]
+def _configuration(language: str, changes: dict[str, str]) -> str:
+    """The code block of this language in the page, with an address and a folder of this test."""
+    (block,) = re.findall(rf"```{language}\n(.*?)```", PAGE.read_text(), re.DOTALL)
     for given, here in changes.items():
         assert given in block
         block = block.replace(given, here)
@@ -37,7 +38,7 @@ def _configuration(begin: str, end: str, changes: dict[str, str]) -> str:
 
 def _nginx(program: str, number: int, folder: Path, tmp_path: Path) -> list[str]:
     changes = {"listen 80": f"listen 127.0.0.1:{number}", "/srv/scenes": str(folder)}
-    block = _configuration("  server {", "Caddy", changes)
+    block = _configuration("nginx", changes)
     shutil.copy(Path(program).resolve().parents[2] / "etc/nginx/mime.types", tmp_path / "mime.types")
     (tmp_path / "tmp").mkdir()
     temporary = "".join(
@@ -51,7 +52,7 @@ def _nginx(program: str, number: int, folder: Path, tmp_path: Path) -> list[str]
 
 
 def _caddy(program: str, number: int, folder: Path, tmp_path: Path) -> list[str]:
-    block = _configuration("  :80", "examples:", {":80": f"http://127.0.0.1:{number}", "/srv/scenes": str(folder)})
+    block = _configuration("caddy", {":80": f"http://127.0.0.1:{number}", "/srv/scenes": str(folder)})
     (tmp_path / "Caddyfile").write_text(f"{{\n  admin off\n}}\n{block}")
     return [program, "run", "--config", str(tmp_path / "Caddyfile"), "--adapter", "caddyfile"]
 
