@@ -44,10 +44,9 @@ def pareto_front(points: Points) -> list[tuple[float, float]]:
 
 @dataclass(frozen=True)
 class Panel:
-    """One plot of error against a cost. xlabel: with the unit; series: (name, points)."""
+    """One plot of error against a cost. cost: its name and unit; series: (name, points)."""
 
-    title: str
-    xlabel: str
+    cost: str
     series: Sequence[tuple[str, Points]]
 
 
@@ -97,23 +96,22 @@ def draw(panels: Sequence[Panel], ylabel: str, path: Path) -> None:
     errors = [error for panel in panels for _, points in panel.series for _, error in points]
     floor = min((error for error in errors if error > 0), default=1.0) / ZERO_BELOW
     names = list(dict.fromkeys(name for panel in panels for name, _ in panel.series))
-    looks = {name: _look(i) for i, name in enumerate(names)}
+    looks = {
+        name: {"marker": MARKERS[i % len(MARKERS)], "ls": LINES[(i + i // len(MARKERS)) % len(LINES)]}
+        for i, name in enumerate(names)
+    }
     zero = f" (0 is drawn at {floor:.2g})" if 0 in errors else ""
-    size, titles = (4.5, 3.9 + 0.2 * len(names) / 3), [panel.title for panel in panels]
+    size, titles = (4.5, 3.9 + 0.2 * len(names) / 3), [f"error against {panel.cost}" for panel in panels]
     with drawing(path, titles, ylabel + zero, size, sharey=True, legend=True) as axes:
         for axis, panel in zip(axes, panels, strict=True):
             _draw_panel(axis, panel, looks, floor)
 
 
-def _look(i: int) -> dict[str, Any]:
-    line = LINES[(i + i // len(MARKERS)) % len(LINES)]
-    return {"marker": MARKERS[i % len(MARKERS)], "ls": line, "lw": 1, "ms": 6, "zorder": 3}
-
-
 def _draw_panel(axis: Any, panel: Panel, looks: dict[str, dict[str, Any]], floor: float) -> None:
     series = [(name, [(cost, max(error, floor)) for cost, error in points]) for name, points in panel.series if points]
     for name, points in series:
-        axis.plot(*zip(*points, strict=True), color="black", mfc="white", label=name, **looks[name])
+        style = {"color": "black", "mfc": "white", "lw": 1, "ms": 6, "zorder": 3}
+        axis.plot(*zip(*points, strict=True), label=name, **style, **looks[name])
     if shown := [point for _, points in series for point in points]:
         front, costs = pareto_front(shown), [cost for cost, _ in shown]
         label = "Pareto front"
@@ -121,4 +119,4 @@ def _draw_panel(axis: Any, panel: Panel, looks: dict[str, dict[str, Any]], floor
         axis.plot(*zip(*front, strict=True), "o", color="black", mfc="none", ms=13, lw=0, zorder=2, label=label)
         margin = max(1.44, LEAST_SPAN * min(costs) / max(costs)) ** 0.5
         axis.set_xlim(min(costs) / margin, max(costs) * margin)
-    axis.set(xscale="log", yscale="log", xlabel=panel.xlabel)
+    axis.set(xscale="log", yscale="log", xlabel=panel.cost)

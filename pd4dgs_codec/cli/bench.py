@@ -7,7 +7,6 @@ import json
 import sys
 import tempfile
 from collections.abc import Callable, Sequence
-from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -19,7 +18,7 @@ from pd4dgs_codec.errors import DataError, DecodeError, TrainError
 
 if TYPE_CHECKING:
     from pd4dgs_codec.bench.report import Panel
-    from pd4dgs_codec.bench.train import Run
+    from pd4dgs_codec.bench.runtime import Point
     from pd4dgs_codec.quality.frames import Frame
     from pd4dgs_codec.scene import SceneInfo
 
@@ -72,7 +71,12 @@ examples:
   pd4dgs-bench codec model.pt --quick --views 2
   pd4dgs-bench codec scene.pd4 --json"""
 
-
+SWEEP: dict[str, Any] = {
+    "step_scales": (0.5, 1.0, 2.0, 4.0),
+    "modes": ("ans", "lzma"),
+    "efforts": (1, 5, 9),
+    "repeats": 5,
+}
 QUICK: dict[str, Any] = {"step_scales": (1.0, 2.0), "efforts": (1,), "repeats": 1}
 
 
@@ -91,25 +95,22 @@ def _codec_options(p: options.Parser) -> None:
 
 def _codec(args: argparse.Namespace, console: Console) -> Outcome:
     data = read_bytes(args.input)
-    from pd4dgs_codec.bench import codec, timing
+    from pd4dgs_codec.bench import runtime, timing
 
     machine = timing.machine()
-    what = codec.Sweep(**(QUICK if args.quick else {}) | _given(args, "step_scales", "modes", "efforts", "repeats"))
+    scales, modes, efforts, repeats = (SWEEP | (QUICK if args.quick else {}) | _given(args, *SWEEP)).values()
     if is_pd4(data):
         if args.plot is not None:
             raise UsageError("--plot: a file without its checkpoint has no error to plot; expected a checkpoint")
-        points = [codec.file_point(data, what.repeats)]
+        points, panels = [runtime.file_point(data, repeats)], []
     else:
-        from pd4dgs_codec.model import checkpoint
-        from pd4dgs_codec.model.convert import to_scene
-
-        model, _ = checkpoint.load(args.input)
-        scene = to_scene(model)
-        with progress_bar(len(what), "files", "codec") as step:
-            points = codec.sweep(args.input, scene, _frames(args, scene.info), what, step)
-    result = {"input": args.input, "machine": machine, "points": codec.as_json(points)}
-    text = "\n\n".join([codec.points_table(points), timing.machine_line(machine)])
-    return Outcome(result, text, codec.panels(points), "RMSE of images")
+        scene = common.checkpoint_scene(args.input, data)
+        frames = _frames(args, scene.info)
+        with progress_bar(len(scales) * len(modes) * len(efforts), "files", "codec") as step:
+            points = runtime.codec_points(args.input, scene, frames, scales, modes, efforts, repeats, step)
+        panels = runtime.codec_panels(points)
+    text = f"{runtime.codec_table(points)}\n\n{timing.machine_line(machine)}"
+    return Outcome({"input": args.input, "machine": machine, "points": points}, text, panels, "RMSE of images")
 
 
 # -- render ------------------------------------------------------------------------------------------------------------
@@ -135,27 +136,26 @@ def _render_options(p: options.Parser) -> None:
 
 
 def _render(args: argparse.Namespace, console: Console) -> Outcome:
-    from pd4dgs_codec.bench import render, timing
+    from pd4dgs_codec.bench import runtime, timing
     from pd4dgs_codec.quality.levels import load_levels
 
-    names = args.only or tuple(render.BACKENDS)
-    if unknown := [name for name in names if name not in render.BACKENDS]:
-        raise UsageError(f"--only: found {unknown[0]!r}, expected some of {', '.join(render.BACKENDS)}")
+    names = args.only or tuple(runtime.BACKENDS)
+    if unknown := [name for name in names if name not in runtime.BACKENDS]:
+        raise UsageError(f"--only: found {unknown[0]!r}, expected some of {', '.join(runtime.BACKENDS)}")
     machine = timing.machine()
-    level = load_levels(common.named_input(args.input))[-1]
+    level = load_levels(common.named_input(args.input), last_only=True)[-1]
     frames = _frames(args, level.model.info)
-    views = [render.view(level, frame) for frame in frames]
+    views = [runtime.view(level, frame) for frame in frames]
     with progress_bar(len(names), "rasterisers", "render") as step:
-        points = render.sweep(views, names, args.repeats, step)
+        points = runtime.render_points(views, names, args.repeats, step)
     sizes = [
         {"width": f.camera.width, "height": f.camera.height, "gaussians": len(v["means"])}
         for f, v in zip(frames, views, strict=True)
     ]
     shown = "; ".join(f"{v['width']}x{v['height']}, {v['gaussians']:,} Gaussians" for v in sizes)
-    text = "\n\n".join([render.table(points), f"Images: {shown}.", timing.machine_line(machine)])
-    result = {"input": args.input, "machine": machine, "level": level.level, "pictures": sizes}
-    result |= {"points": render.as_json(points)}
-    return Outcome(result, text, render.panels(points), "RMSE from the float64 reference")
+    text = f"{runtime.render_table(points)}\n\nImages: {shown}.\n\n{timing.machine_line(machine)}"
+    result = {"input": args.input, "machine": machine, "level": level.level, "pictures": sizes, "points": points}
+    return Outcome(result, text, runtime.render_panels(points), "RMSE from the float64 reference")
 
 
 # -- train -------------------------------------------------------------------------------------------------------------
@@ -191,17 +191,17 @@ def _train(args: argparse.Namespace, console: Console) -> Outcome:
         raise UsageError("found no SOURCE, expected a dataset to train on or --from FILE")
     if args.seconds and args.iterations:
         raise UsageError("found --seconds and --iterations, expected one of them")
-    from pd4dgs_codec.bench import timing, train
+    from pd4dgs_codec.bench import runtime, timing
 
     machine = None if args.runs else timing.machine()  # the machine of existing runs is unknown
-    runs = [train.of_checkpoint(path) for path in args.runs] if args.runs else _trained(args, console)
-    text = "\n\n".join([train.table(runs), *([timing.machine_line(machine)] if machine else [])])
-    result = {"source": args.source, "machine": machine, "runs": train.as_json(runs)}
-    return Outcome(result, text, train.panels(runs), "held-out RMSE of the highest level")
+    runs = [runtime.recorded_run(path) for path in args.runs] if args.runs else _trained(args, console)
+    text = "\n\n".join([runtime.train_table(runs), *([timing.machine_line(machine)] if machine else [])])
+    result = {"source": args.source, "machine": machine, "runs": runs}
+    return Outcome(result, text, runtime.train_panels(runs), "held-out RMSE of the highest level")
 
 
-def _trained(args: argparse.Namespace, console: Console) -> list[Run]:
-    from pd4dgs_codec.bench import train
+def _trained(args: argparse.Namespace, console: Console) -> list[Point]:
+    from pd4dgs_codec.bench import runtime
     from pd4dgs_codec.interchange.teacher import load_source
     from pd4dgs_codec.train.config import TrainConfig
     from pd4dgs_codec.train.loop import Trainer
@@ -218,7 +218,7 @@ def _trained(args: argparse.Namespace, console: Console) -> list[Run]:
             raise TrainError(f"interrupted while training {preset}; nothing was written")
         if not trainer.curve:
             raise TrainError(f"{preset}: the run ended before its first evaluation; expected a larger limit")
-        runs.append(train.of_curve(preset, trainer.curve, len(trainer.model.anchor_q)))
+        runs.append(runtime.run_of(preset, trainer.curve, len(trainer.model.anchor_q)))
     return runs
 
 
@@ -246,20 +246,16 @@ def _latency(args: argparse.Namespace, console: Console) -> Outcome:
     contents = [_with_camera(name) for name in args.inputs]
     from pd4dgs_codec.bench import latency, timing
 
-    machine, speeds, rows, parts = timing.machine(), list(args.rates.values()), [], []
+    machine, speeds, files, parts = timing.machine(), args.rates.values(), [], []
     with progress_bar(3 * args.runs * len(speeds) * len(contents), "runs", "latency") as step:
         for name, data in zip(args.inputs, contents, strict=True):
-            found = latency.times(data, speeds, args.runs, step)
-            times = [asdict(row) | {"within": row.within} for row in found]
+            rows = [row for rate in speeds for row in latency.times(data, rate, args.runs, step)]
             start = latency.first_start(data, max(speeds))
-            rows.append({"name": name, "bytes": len(data), "times": times, "first_start": start})
-            parts += [
-                f"## {name}",
-                latency.table(found),
-                f"With empty kernel caches the first image takes {start:.1f} s.",
-            ]
+            files.append({"name": name, "bytes": len(data), "times": rows, "first_start": start})
+            cold = f"With empty kernel caches the first image takes {start:.1f} s."
+            parts += [f"## {name}", latency.table(rows), cold]
     parts.append(f"Seconds since the request (cold: since the start of the process), medians of {args.runs}.")
-    result = {"runs": args.runs, "rates": args.rates, "machine": machine, "files": rows}
+    result = {"runs": args.runs, "rates": args.rates, "machine": machine, "files": files}
     return Outcome(result, "\n\n".join([*parts, timing.machine_line(machine)]))
 
 
@@ -313,8 +309,7 @@ def _stability(args: argparse.Namespace, console: Console) -> Outcome:
         for row in rows
         if row["status"] == stability.FAIL
     ]
-    result = {"rows": rows, "counts": stability.counts(rows)}
-    return Outcome(result, stability.text(rows), failures=failures)
+    return Outcome({"rows": rows, "counts": stability.counts(rows)}, stability.text(rows), failures=failures)
 
 
 # -- the command -------------------------------------------------------------------------------------------------------

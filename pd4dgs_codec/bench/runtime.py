@@ -1,0 +1,250 @@
+"""Error against run time of the codec, the rasterisers and the trainer. Errors are RMSE of images, 0..1, not rounded to
+8 bits. A point or run is a dict, as in the report's JSON."""
+
+from __future__ import annotations
+
+import itertools
+import json
+import math
+from collections.abc import Callable, Iterable, Sequence
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pd4dgs_codec.bench.report import Panel, markdown, optional
+from pd4dgs_codec.bench.timing import clock, spread, summary
+from pd4dgs_codec.errors import DataError, RenderError
+from pd4dgs_codec.format.decoder import decode
+from pd4dgs_codec.format.encoder import encode
+from pd4dgs_codec.format.info import hashes, info
+from pd4dgs_codec.quality.frames import Frame
+from pd4dgs_codec.quality.levels import Level, load_levels
+from pd4dgs_codec.scene import Scene
+
+Point = dict[str, Any]
+Step = Callable[[], None]
+
+
+def rmse(found: Iterable[np.ndarray], expected: Iterable[np.ndarray]) -> float:
+    """Over all pixels of images of one size."""
+    pairs = zip(found, expected, strict=True)
+    return math.sqrt(np.mean([np.square(got.astype(np.float64) - want).mean() for got, want in pairs]))
+
+
+def _psnr(error: float | None) -> str:
+    return "-" if error is None else f"{-20 * math.log10(error):.2f}" if error else "inf"
+
+
+# -- codec -------------------------------------------------------------------------------------------------------------
+
+
+def codec_points(
+    model: str,
+    scene: Scene,
+    frames: Sequence[Frame],
+    scales: Sequence[float],
+    modes: Sequence[str],
+    efforts: Sequence[int],
+    repeats: int,
+    step: Step = lambda: None,
+) -> list[Point]:
+    """A point per step scale, mode and effort of the checkpoint `model`, whose scene is `scene`. error: of the images
+    of the highest level from those of the checkpoint. `step` is called after each. Encoding is timed without
+    verification, which takes one decoding more. Raises EncodeError, Pd4Error."""
+
+    def images(level: Level) -> list[np.ndarray]:
+        return [level.picture(frame.camera, frame.time) for frame in frames]
+
+    expected = images(load_levels(model, last_only=True)[-1])
+    encode(scene, effort=1, verify=False)  # loads the libraries, before any timing
+    errors: dict[str, float] = {}
+    points = []
+    for scale, mode, effort in itertools.product(scales, modes, efforts):
+        options: dict[str, Any] = {"mode": mode, "effort": effort, "step_scale": scale, "verify": False}
+        data, seconds = clock(partial(encode, scene, **options), repeats)
+        key = json.dumps(hashes(data))  # modes change no value, so that their images are equal
+        if key not in errors:
+            errors[key] = rmse(images(load_levels(data, last_only=True)[-1]), expected)
+        given = {"step_scale": scale, "effort": effort, "error": errors[key], "encode": summary(seconds)}
+        points.append(file_point(data, repeats) | given)
+        step()
+    return points
+
+
+def file_point(data: bytes, repeats: int) -> Point:
+    """The point of a file whose error and time of encoding are unknown."""
+    decode(data)  # loads the libraries
+    seconds = clock(lambda: decode(data), repeats)[1]
+    unknown = dict.fromkeys(("step_scale", "effort", "error", "encode"))
+    return {"mode": info(data)["mode"], "bytes": len(data), "decode": summary(seconds), **unknown}
+
+
+def codec_table(points: Sequence[Point]) -> str:
+    """A row per point."""
+    head = ("steps x", "mode", "effort", "bytes", "PSNR dB", "encode s", "decode s")
+    return markdown(
+        head,
+        [
+            (optional(p["step_scale"], "g"), p["mode"], optional(p["effort"], "d"), f"{p['bytes']:,}")
+            + (_psnr(p["error"]), spread(p["encode"]), spread(p["decode"]))
+            for p in points
+        ],
+    )
+
+
+def codec_panels(points: Sequence[Point]) -> list[Panel]:
+    """Error against bytes, encoding and decoding seconds; a series per mode and effort."""
+    costs: dict[str, Callable[[Point], float]] = {
+        "bytes": lambda p: p["bytes"],
+        "encoding, s": lambda p: p["encode"]["median"],
+        "decoding, s": lambda p: p["decode"]["median"],
+    }
+    series: dict[str, list[Point]] = {}
+    for p in points:
+        series.setdefault(f"{p['mode']}, effort {p['effort']}", []).append(p)
+    return [
+        Panel(label, [(name, [(cost(p), p["error"]) for p in own]) for name, own in series.items()])
+        for label, cost in costs.items()
+    ]
+
+
+# -- rasterisers -------------------------------------------------------------------------------------------------------
+
+ORACLE, KERNELS, GSPLAT = "oracle float64", "kernels", "gsplat"
+#: Name -> backend of `rasterization`.
+BACKENDS = {ORACLE: "reference", KERNELS: "cpu", GSPLAT: "gsplat"}
+#: Arguments of `rasterization` for one view.
+View = dict[str, Any]
+
+
+def view(level: Level, frame: Frame) -> View:
+    """The Gaussians that the camera of `frame` meets at its time, with their colours in this view."""
+    import torch
+
+    from pd4dgs_codec.draw.gaussians import near_plane
+    from pd4dgs_codec.draw.player import Player
+
+    model, camera = level.model, frame.camera
+    gaussians: Any
+    if isinstance(model, Player):
+        gaussians = model.gaussians(camera, frame.time)
+    else:
+        with torch.no_grad():
+            gaussians = model.gaussians(level.level, frame.time, camera)
+    names = ("means", "quats", "scales", "opacities", "colors")
+    splats = {name: torch.as_tensor(np.ascontiguousarray(getattr(gaussians, name))) for name in names}
+    return {**splats, "camera": camera, "background": model.info.background, "near_plane": near_plane(model.info)}
+
+
+def render_points(views: Sequence[View], names: Sequence[str], repeats: int, step: Step = lambda: None) -> list[Point]:
+    """A point per name of BACKENDS: milliseconds per image over all images and repeats (the reference renders each
+    once), rmse from the reference, or `missing`, the reason if there are no figures. `step` is called after each."""
+    exact = _rendered(views, ORACLE, 1)
+    points: list[Point] = []
+    for name in names:
+        missing = _without_gsplat() if name == GSPLAT else None
+        point: Point = {"name": name, "milliseconds": None, "rmse": None, "missing": missing}
+        if not missing:
+            images, seconds = exact if name == ORACLE else _rendered(views, name, repeats)
+            point |= {"milliseconds": summary([1e3 * s for s in seconds]), "rmse": rmse(images, exact[0])}
+        points.append(point)
+        step()
+    return points
+
+
+def _rendered(views: Sequence[View], name: str, repeats: int) -> tuple[list[np.ndarray], list[float]]:
+    """(image of each view [H, W, 3], seconds of each repetition); a first rendering for warming up is not timed."""
+    import torch
+
+    from pd4dgs_codec.model.picture import rasterization
+
+    images, seconds = [], []
+    for given in views:
+        device = "cuda" if name == GSPLAT else "cpu"
+        inputs = {key: v.to(device) if isinstance(v, torch.Tensor) else v for key, v in given.items()}
+
+        def render(inputs: View = inputs) -> torch.Tensor:
+            with torch.no_grad():
+                image = rasterization(**inputs, backend=BACKENDS[name])[0]
+            if image.device.type == "cuda":
+                torch.cuda.synchronize()
+            return image
+
+        if name != ORACLE:
+            render()
+        image, own = clock(render, repeats)
+        images.append(image.cpu().numpy())
+        seconds += own
+    return images, seconds
+
+
+def _without_gsplat() -> str | None:
+    """Why gsplat cannot render here, in one line; None if it can."""
+    import torch
+
+    from pd4dgs_codec.model.picture import check_gsplat
+
+    if not torch.cuda.is_available():
+        return "there is no CUDA device"
+    try:
+        check_gsplat()
+    except RenderError as error:
+        return str(error)
+    return None
+
+
+def render_table(points: Sequence[Point]) -> str:
+    """A row per rasteriser."""
+    rows = [(p["name"], p["missing"] or spread(p["milliseconds"]), optional(p["rmse"], ".2g")) for p in points]
+    return markdown(("rendered by", "ms per image", "RMSE"), rows)
+
+
+def render_panels(points: Sequence[Point]) -> list[Panel]:
+    """One panel, a series per rasteriser."""
+    drawn = [p for p in points if not p["missing"]]
+    return [
+        Panel("rasterising, ms per image", [(p["name"], [(p["milliseconds"]["median"], p["rmse"])]) for p in drawn])
+    ]
+
+
+# -- trainer -----------------------------------------------------------------------------------------------------------
+
+
+def run_of(name: str, curve: Sequence[Point], anchors: int) -> Point:
+    """A training run by its evaluations (dicts with seconds of wall time so far and psnr per level in dB). rmse: of the
+    highest level."""
+    points = [{"seconds": p["seconds"], "psnr": p["psnr"], "rmse": 10 ** (-p["psnr"][-1] / 20)} for p in curve]
+    return {"name": name, "curve": points, "anchors": anchors}
+
+
+def recorded_run(path: str) -> Point:
+    """The run that a checkpoint records. Raises DataError if it was never evaluated."""
+    from pd4dgs_codec.model import checkpoint
+
+    model, training = checkpoint.load(path)
+    preset = json.loads(training.get("config", "{}")).get("preset", "")
+    curve = json.loads(training.get("curve", "[]"))
+    if not curve:
+        raise DataError(f"{path}: found no held-out quality, expected a run that was evaluated at least once")
+    return run_of(f"{Path(path).name} ({preset})" if preset else Path(path).name, curve, len(model.anchor_q))
+
+
+def train_table(runs: Sequence[Point]) -> str:
+    """A row per evaluation of each run."""
+    levels = range(max(len(p["psnr"]) for run in runs for p in run["curve"]))
+    rows = [
+        [run["name"], f"{p['seconds']:.1f}"]
+        + [f"{p['psnr'][i]:.2f}" if i < len(p["psnr"]) else "-" for i in levels]
+        + [f"{p['rmse']:.4f}"]
+        for run in runs
+        for p in run["curve"]
+    ]
+    return markdown(("run", "seconds", *(f"level {i} PSNR dB" for i in levels), "RMSE"), rows)
+
+
+def train_panels(runs: Sequence[Point]) -> list[Panel]:
+    """One panel, a series per run."""
+    series = [(run["name"], [(p["seconds"], p["rmse"]) for p in run["curve"]]) for run in runs]
+    return [Panel("training wall time, s", series)]
