@@ -154,10 +154,10 @@ def _write_still(args: argparse.Namespace, export: Export, console: Console) -> 
     """Writes one point in time."""
     import numpy as np
 
-    from pd4dgs_codec.interchange.export import upright
+    from pd4dgs_codec.interchange.export import UNTURNED, upright
     from pd4dgs_codec.interchange.formats import SPZ_STEP, glb_bytes, ply_bytes, spz_bytes
 
-    turn = upright(export.player.info.up) if args.to in ("glb", "spz") else None
+    turn = upright(export.player.info.up) if args.to in ("glb", "spz") else UNTURNED
     with progress_bar(args.refine, "steps", "refining") as step:
         splats, _ = export.splats(args.time or 0.0, turn, step=step)
     splats = _scaled(splats, args)

@@ -35,6 +35,8 @@ from pd4dgs_codec.quality.frames import shrunk
 from pd4dgs_codec.quality.image import mpsnr
 from pd4dgs_codec.scene import Camera
 
+Step = Callable[[], None]
+UNTURNED = np.eye(3)
 #: Eyes of a bake: more change held-out PSNR by less than 0.01 dB.
 EYES = 48
 #: Anchors at a time, to bound memory: EYES times their Gaussians.
@@ -110,18 +112,15 @@ def eyes_of_scene(player: Player, count: int = EYES) -> Eyes:
     return Eyes(tuple(looking(middle + distance * d, -d, up, like) for d in places), weights)
 
 
-def bake(
-    player: Player, t: float, eyes: Eyes, degree: int, turn: np.ndarray | None = None
-) -> tuple[Splats, np.ndarray]:
+def bake(player: Player, t: float, eyes: Eyes, degree: int, turn: np.ndarray = UNTURNED) -> tuple[Splats, np.ndarray]:
     """(Gaussians at normalised time t in 0..1, their slots int64 [N]), without those too faint for any pixel.
 
     degree: of the harmonics, 0 to 3. turn: rotates the world, [3, 3].
     """
-    turned = np.eye(3) if turn is None else np.asarray(turn, np.float64)
     rows, parts, slots = player.active, [], []
     for start in range(0, len(rows), CHUNK):
         chunk = rows[start : start + CHUNK]
-        splats, found = _bake(player, chunk, t, eyes, degree, turned)
+        splats, found = _bake(player, chunk, t, eyes, degree, turn)
         keep = np.flatnonzero(splats.opacities >= MIN_OPACITY)
         parts.append(splats.taken(keep))
         slots.append(found[keep])
@@ -196,12 +195,8 @@ def _fitted(basis: np.ndarray, colors: np.ndarray, weights: np.ndarray) -> np.nd
 # -- refinement --------------------------------------------------------------------------------------------------------
 
 
-@dataclass(frozen=True, eq=False)
-class Target:
-    """A picture to match: float32 [H, W, 3]."""
-
-    camera: Camera
-    image: np.ndarray
+#: A camera, and the picture to match, float32 [H, W, 3].
+Target = tuple[Camera, np.ndarray]
 
 
 def refine(
@@ -210,7 +205,7 @@ def refine(
     order: Sequence[int],
     background: tuple[float, float, float],
     near: float,
-    step: Callable[[], None] = lambda: None,
+    step: Step = lambda: None,
 ) -> Splats:
     """The Gaussians after steps of Adam (Kingma and Ba 2015) on the squared error of the targets, in `order`."""
     size = np.maximum(splats.scales.max(axis=1, keepdims=True), SMALLEST)
@@ -224,8 +219,7 @@ def refine(
     moments = {name: (np.zeros_like(value), np.zeros_like(value)) for name, value in values.items()}
     behind = np.array(background, np.float32)
     for i, which in enumerate(order):
-        target = targets[which]
-        gradients = _gradients(values, size, target, behind, near)
+        gradients = _gradients(values, size, *targets[which], behind, near)
         rate = LAST ** (i / max(len(order) - 1, 1))
         for name, gradient in gradients.items():
             first, second = moments[name]
@@ -257,26 +251,25 @@ def _splats(values: dict[str, np.ndarray], size: np.ndarray) -> Splats:
 
 
 def _gradients(
-    values: dict[str, np.ndarray], size: np.ndarray, target: Target, behind: np.ndarray, near: float
+    values: dict[str, np.ndarray], size: np.ndarray, camera: Camera, image: np.ndarray, behind: np.ndarray, near: float
 ) -> dict[str, np.ndarray]:
     """Gradients of the mean squared error of one picture."""
     splats = _splats(values, size)
-    basis = harmonics(unit(splats.means - camera_eye(target.camera).astype(np.float32)), splats.degree)
+    basis = harmonics(unit(splats.means - camera_eye(camera).astype(np.float32)), splats.degree)
     raw = np.einsum("nj,njc->nc", basis, splats.sh) + np.float32(0.5)
     colors = np.maximum(raw, 0)
     geometry = Geometry(splats.means, splats.quats, splats.scales, splats.opacities)
-    projected = project(geometry, target.camera, near)
+    projected = project(geometry, camera, near)
     picture, transmittance = composite(projected, colors, behind)
-    slope = (2 / picture.size) * (picture - target.image)
+    slope = (2 / picture.size) * (picture - image)
     g = backward(projected, geometry, colors, picture, transmittance, slope, np.zeros_like(transmittance))
-    g_colors = g.colors * (raw > 0)
     g_quats = g.geometry.quats
     return {
         "means": g.geometry.means * size,
         "quats": g_quats - splats.quats * np.einsum("nd,nd->n", g_quats, splats.quats)[:, None],
         "log_scales": g.geometry.scales * splats.scales,
         "logits": g.geometry.opacities * splats.opacities * (1 - splats.opacities),
-        "sh": basis[:, :, None] * g_colors[:, None, :],
+        "sh": basis[:, :, None] * (g.colors * (raw > 0))[:, None, :],
     }
 
 
@@ -293,32 +286,24 @@ class Export:
     steps: int
 
     def splats(
-        self,
-        t: float,
-        turn: np.ndarray | None = None,
-        before: Learnt | None = None,
-        step: Callable[[], None] = lambda: None,
+        self, t: float, turn: np.ndarray = UNTURNED, before: Learnt | None = None, step: Step = lambda: None
     ) -> tuple[Splats, Learnt]:
         """The Gaussians at normalised time t, and their changes by refinement. turn: rotates the world, [3, 3]. before:
-        the changes at another time, to start from."""
+        the changes at another time, to start from. step: called after each step."""
         baked, slots = bake(self.player, t, self.eyes, self.degree, turn)
         started = baked if before is None else before.applied(baked, slots)
         steps = self.steps if before is None else int(np.ceil(LATER * self.steps))
-        refined = self._refined(started, t, turn, steps, step) if steps and len(slots) else started
-        return refined, Learnt(slots, baked, refined)
-
-    def _refined(
-        self, splats: Splats, t: float, turn: np.ndarray | None, steps: int, step: Callable[[], None]
-    ) -> Splats:
-        weights = self.eyes.weights / self.eyes.weights.sum()
-        order = np.random.default_rng(0).choice(len(weights), steps, p=weights)
+        if not (steps and len(slots)):
+            return started, Learnt(slots, baked, started)
+        weights, info = self.eyes.weights / self.eyes.weights.sum(), self.player.info
+        order = np.random.default_rng(0).choice(len(weights), steps, p=weights).tolist()
         targets = {}
-        for i in set(order.tolist()):
+        for i in set(order):
             camera = self.eyes.cameras[i]
             camera = shrunk(camera, int(np.ceil(np.sqrt(camera.width * camera.height / TARGET_PIXELS))))
-            targets[i] = Target(turned_camera(camera, turn), self.player.picture(camera, t))
-        info = self.player.info
-        return refine(splats, targets, order.tolist(), info.background, near_plane(self.player.info), step)
+            targets[i] = turned_camera(camera, turn), self.player.picture(camera, t)
+        refined = refine(started, targets, order, info.background, near_plane(info), step)
+        return refined, Learnt(slots, baked, refined)
 
 
 @dataclass(frozen=True, eq=False)
@@ -353,10 +338,8 @@ def upright(up: Sequence[float]) -> np.ndarray:
     return np.asarray(np.eye(3) + skew + skew @ skew / (1 + cosine))  # Rodrigues
 
 
-def turned_camera(camera: Camera, turn: np.ndarray | None) -> Camera:
+def turned_camera(camera: Camera, turn: np.ndarray) -> Camera:
     """The camera that sees the turned world as this one sees the world."""
-    if turn is None:
-        return camera
     viewmat = camera.viewmat.astype(np.float64)
     viewmat[:3, :3] = viewmat[:3, :3] @ turn.T
     return replace(camera, viewmat=viewmat.astype(np.float32))
@@ -373,17 +356,15 @@ class Cost:
     exported_to_direct_psnr: float
 
 
-def cost(export: Export, views: Sequence[View], step: Callable[[], None] = lambda: None) -> Cost:
+def cost(export: Export, views: Sequence[View], step: Step = lambda: None) -> Cost:
     """The cost of exporting: the time of each view is exported by itself and drawn from the view's camera."""
-    rows = []
-    background = export.player.info.background
+    rows, info = [], export.player.info
     for view in views:
         direct = export.player.picture(view.camera, view.time)
         splats, _ = export.splats(view.time)
-        image = picture(splats, view.camera, background, near_plane(export.player.info))
+        image = picture(splats, view.camera, info.background, near_plane(info))
         error = float(np.square(image.astype(np.float64) - direct).mean())
         to_direct = -10 * np.log10(max(error, np.finfo(float).tiny))
         rows.append((mpsnr(direct, view.image, view.mask), mpsnr(image, view.image, view.mask), to_direct))
         step()
-    direct_mean, exported_mean, to_direct_mean = np.mean(rows, axis=0)
-    return Cost(len(views), float(direct_mean), float(exported_mean), float(to_direct_mean))
+    return Cost(len(views), *np.mean(rows, axis=0).tolist())

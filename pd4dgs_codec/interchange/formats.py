@@ -57,9 +57,8 @@ def checked(
         if array.shape != shapes[name]:
             raise DataError(f"{where}: {name} has shape {array.shape}, expected {shapes[name]}")
     if sh.shape[1] - 1 not in REST:
-        raise DataError(
-            f"{where}: {sh.shape[1]} coefficients per colour, expected {', '.join(str(k + 1) for k in REST)}"
-        )
+        expected = ", ".join(str(k + 1) for k in REST)
+        raise DataError(f"{where}: {sh.shape[1]} coefficients per colour, expected {expected}")
     good = np.ones(n, bool)
     for array in parts.values():
         good &= (np.abs(array) <= LARGEST).all(axis=tuple(range(1, array.ndim)))  # also false of NaN
@@ -75,9 +74,8 @@ def library(name: str, what: str) -> Any:
     try:
         return import_module(name)
     except ImportError:
-        raise DataError(
-            f"{what} need the package {name}, which is not installed: pip install 'pd4dgs-codec[interchange]'"
-        ) from None
+        how = "pip install 'pd4dgs-codec[interchange]'"
+        raise DataError(f"{what} need the package {name}, which is not installed: {how}") from None
 
 
 @contextlib.contextmanager
@@ -120,19 +118,18 @@ def read_splats(path: Path) -> Splats:
     rest = sum(re.fullmatch(r"f_rest_\d+", name) is not None for name in names)
     if rest % 3 or rest // 3 not in REST:
         raise DataError(f"{path}: has {rest} properties f_rest_*, expected {', '.join(str(3 * n) for n in REST)}")
-    sh = [stack("f_dc_0", "f_dc_1", "f_dc_2")[:, None]]
-    if rest:
-        columns = stack(*(f"f_rest_{i}" for i in range(rest)))
-        sh.append(columns.reshape(len(rows), 3, rest // 3).transpose(0, 2, 1))
+    # channel by channel
+    sh = [stack(f"f_dc_{c}", *(f"f_rest_{c * rest // 3 + i}" for i in range(rest // 3))) for c in range(3)]
+    quats, scales = stack("rot_0", "rot_1", "rot_2", "rot_3"), stack("scale_0", "scale_1", "scale_2")
+    return _activated(path, stack("x", "y", "z"), quats, scales, stack("opacity")[:, 0], np.stack(sh, axis=2))
+
+
+def _activated(
+    path: Path, means: np.ndarray, quats: np.ndarray, scales: np.ndarray, opacities: np.ndarray, sh: np.ndarray
+) -> Splats:
+    """`checked` of logarithms of scales and logits of opacities."""
     with np.errstate(over="ignore"):
-        return checked(
-            str(path),
-            means=stack("x", "y", "z"),
-            quats=stack("rot_0", "rot_1", "rot_2", "rot_3"),
-            scales=np.exp(stack("scale_0", "scale_1", "scale_2")),
-            opacities=1 / (1 + np.exp(-stack("opacity")[:, 0])),
-            sh=np.concatenate(sh, axis=1),
-        )
+        return checked(str(path), means, quats, np.exp(scales), 1 / (1 + np.exp(-opacities)), sh)
 
 
 def _unpacked(path: Path, kind: str) -> bytes:
@@ -182,16 +179,8 @@ def read_gsplat(path: Path) -> Splats:
     missing = [name for name in wanted if not isinstance(state, dict) or not isinstance(state.get(name), np.ndarray)]
     if missing or not isinstance(state, dict):
         raise DataError(f"{path}: has no splats.{missing[0]}; expected a checkpoint of gsplat with spherical harmonics")
-    parts = {name: state[name].astype(np.float32) for name in wanted}
-    with np.errstate(over="ignore"):
-        return checked(
-            str(path),
-            means=parts["means"],
-            quats=parts["quats"],
-            scales=np.exp(parts["scales"]),
-            opacities=1 / (1 + np.exp(-parts["opacities"])),
-            sh=np.concatenate([parts["sh0"], parts["shN"]], axis=1) if parts["sh0"].ndim == 3 else parts["sh0"],
-        )
+    *parts, base, rest = (state[name].astype(np.float32) for name in wanted)
+    return _activated(path, *parts, np.concatenate([base, rest], axis=1) if base.ndim == 3 else base)
 
 
 # -- writing -----------------------------------------------------------------------------------------------------------
@@ -281,9 +270,8 @@ def spz_bytes(splats: Splats) -> bytes:
     """An SPZ 3 file. Raises DataError for Gaussians beyond the range of its fixed point."""
     reach = float(np.abs(splats.means).max(initial=0))
     if reach >= SPZ_REACH:
-        raise DataError(
-            f"a Gaussian lies {reach:.4g} units from 0, SPZ holds {SPZ_REACH:g} at most: --scale less than 1"
-        )
+        found = f"a Gaussian lies {reach:.4g} units from 0"
+        raise DataError(f"{found}, SPZ holds {SPZ_REACH:g} at most: --scale less than 1")
     with quiet():
         result = library("gaussforge", "SPZ files").GaussForge().convert(ply_bytes(splats), "ply", "spz", spz_version=3)
     if "error" in result:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import json
 import re
+from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -45,8 +46,11 @@ NEAR, FAR = 0.2, 100.0
 UP = (0.0, -1.0, 0.0)  #: of a run without cameras.json
 #: Tolerance of anchors off the grid: this share of a voxel, plus units in the last place of the coordinate.
 OFF_GRID, ULPS = 1e-3, 8
-#: The last activation of each decoder, as TorchScript names it.
-ENDS: dict[str, str | None] = {"opacity": "Tanh", "covariance": None, "color": "Sigmoid"}
+#: The layers of each decoder, as TorchScript names them.
+LAYERS = {
+    name: ("Linear", "ReLU", "Linear", *end)
+    for name, end in (("opacity", ("Tanh",)), ("covariance", ()), ("color", ("Sigmoid",)))
+}
 
 
 @dataclass(frozen=True)
@@ -81,18 +85,10 @@ def read_scaffold_gs(folder: Path, choices: Choices) -> Scene:
     camera, up = None, UP
     if (run / "cameras.json").is_file():
         (camera, *_), up = read_cameras(run / "cameras.json")
+    background = (1.0, 1.0, 1.0) if config.get("white_background") else (0.0, 0.0, 0.0)
+    depth = float(np.float32(NEAR)), FAR
     return Scene(
-        info=SceneInfo(
-            voxel,
-            points_box(anchor),
-            (0.0, 1.0),
-            (1.0, 1.0, 1.0) if config.get("white_background") else (0.0, 0.0, 0.0),
-            float(np.float32(NEAR)),
-            FAR,
-            up,
-            0.0,
-            camera,
-        ),
+        info=SceneInfo(voxel, points_box(anchor), (0.0, 1.0), background, *depth, up, 0.0, camera),
         steps=Steps().scaled(1.0),
         layers=(0,),
         rows=(len(anchor),),
@@ -142,37 +138,30 @@ def _columns(path: Path) -> dict[str, np.ndarray]:
     vertices = read_vertices(path)
     names = set(vertices.dtype.names or ())
 
-    def stack(prefix: str, count: int | None = None) -> np.ndarray:
-        n = sum(re.fullmatch(rf"{prefix}\d+", name) is not None for name in names) if count is None else count
-        wanted = [f"{prefix}{i}" for i in range(n)]
-        missing = [name for name in wanted if name not in names]
-        if missing or not n:
-            raise DataError(
-                f"{path}: has no property {missing[0] if missing else prefix + '0'}; expected Scaffold-GS's"
-            )
+    def stack(prefix: str, places: Iterable[object]) -> np.ndarray:
+        wanted = [f"{prefix}{place}" for place in places] or [f"{prefix}0"]
+        if missing := [name for name in wanted if name not in names]:
+            raise DataError(f"{path}: has no property {missing[0]}; expected those of Scaffold-GS")
         columns = np.stack([vertices[name] for name in wanted], axis=1).astype(np.float32)
         if not (np.abs(columns) <= LARGEST).all():  # also true of NaN
-            raise DataError(f"{path}: {prefix}* holds a NaN or a number over {LARGEST:g}")
+            raise DataError(f"{path}: {prefix or 'xyz'}* holds a NaN or a number over {LARGEST:g}")
         return columns
 
-    n = len(vertices)
-    if not n:
+    def numbered(prefix: str) -> np.ndarray:
+        return stack(prefix, range(sum(re.fullmatch(rf"{prefix}\d+", name) is not None for name in names)))
+
+    if not len(vertices):
         raise DataError(f"{path}: holds no anchor, expected one at least")
-    anchor = np.stack([vertices[c] for c in "xyz"], axis=1).astype(np.float32)
-    if not (np.abs(anchor) <= LARGEST).all():
-        raise DataError(f"{path}: x, y, z hold a NaN or a number over {LARGEST:g}")
-    offsets, feature = stack("f_offset_"), stack("f_anchor_feat_")
+    offsets, feature = numbered("f_offset_"), numbered("f_anchor_feat_")
     slots, rest = divmod(offsets.shape[1], 3)
     if rest or slots > MAX_SLOTS or feature.shape[1] > MAX_FEATURE:
-        what = f"{feature.shape[1]} features and {offsets.shape[1]} coordinates of offsets per anchor"
-        raise DataError(
-            f"{path}: has {what}, expected at most {MAX_FEATURE} and {MAX_SLOTS} times 3, as many as .pd4 holds"
-        )
+        found = f"{feature.shape[1]} features and {offsets.shape[1]} coordinates of offsets per anchor"
+        raise DataError(f"{path}: has {found}, expected at most {MAX_FEATURE} and {MAX_SLOTS} times 3")
     return {
-        "anchor": anchor,
+        "anchor": stack("", "xyz"),
         "feature": feature,
-        "scaling_log": stack("scale_", SCALING_DIM),
-        "offset": np.ascontiguousarray(offsets.reshape(n, 3, -1).transpose(0, 2, 1)),  # stored axis by axis
+        "scaling_log": stack("scale_", range(SCALING_DIM)),
+        "offset": np.ascontiguousarray(offsets.reshape(-1, 3, slots).transpose(0, 2, 1)),  # stored axis by axis
     }
 
 
@@ -191,12 +180,9 @@ def _decoders(place: Path) -> tuple[dict[str, Any], np.ndarray | None]:
         where = place / EMBEDDING
         embedding = read_tensors(where) if where.exists() else None
     if bank:
-        raise DataError(
-            f"{place}: has a bank of features ({bank}), which .pd4 cannot hold; expected a model without one"
-        )
-    for name, decoder in found.items():
-        if decoder is None:
-            raise DataError(f"{united}: has no {DECODERS[name]}, expected Scaffold-GS's three decoders")
+        raise DataError(f"{place}: has a bank of features ({bank}), expected a model without one")
+    if missing := [DECODERS[name] for name, decoder in found.items() if decoder is None]:
+        raise DataError(f"{united}: has no {missing[0]}, expected Scaffold-GS's three decoders")
     if embedding is None:
         return found, None
     tables = [value for value in _flat(embedding).values() if isinstance(value, np.ndarray)]
@@ -224,53 +210,34 @@ def _network(
     name: str, decoder: Any, path: Path, widths: Widths, embedding: np.ndarray | None, choices: Choices
 ) -> Network:
     """Two linear layers with a ReLU between them, and the embedding of the chosen picture in the first bias."""
-    _check_activations(name, decoder, path)
+    if isinstance(decoder, Module):  # state dicts do not name the kinds of layers
+        parts = [part for key, part in vars(decoder).items() if key.isdigit() and isinstance(part, Module)]
+        kinds, usual_kinds = ", ".join(type(part).__name__ for part in parts), ", ".join(LAYERS[name])
+        if kinds != usual_kinds:
+            raise DataError(f"{path}: layers are {kinds[:120]}; expected {usual_kinds}")
     tensors = {key: value for key, value in _flat(decoder).items() if isinstance(value, np.ndarray)}
-    expected = {"0.weight", "0.bias", "2.weight", "2.bias"}
-    if set(tensors) != expected:
-        raise DataError(
-            f"{path}: has tensors {', '.join(sorted(tensors))[:120]}, expected {', '.join(sorted(expected))}"
-        )
-    first, second = (
-        (tensors[f"{i}.weight"].astype(np.float64), tensors[f"{i}.bias"].astype(np.float64)) for i in (0, 2)
-    )
-    outputs, hidden = widths.networks[name], len(first[0])
-    fits = first[0].ndim == 2 and first[1].shape == (hidden,) and second[0].shape == (outputs, hidden)
-    if not fits or second[1].shape != (outputs,):
-        shapes = ", ".join(f"{key} {tensors[key].shape}" for key in sorted(tensors))
+    expected = ("0.bias", "0.weight", "2.bias", "2.weight")
+    if tuple(sorted(tensors)) != expected:
+        raise DataError(f"{path}: has tensors {', '.join(sorted(tensors))[:120]}, expected {', '.join(expected)}")
+    b1, w1, b2, w2 = (tensors[key].astype(np.float64) for key in expected)
+    outputs, hidden = widths.networks[name], len(b1) if b1.ndim else 0
+    if w1.ndim != 2 or [len(w1), b1.ndim, b2.shape, w2.shape] != [hidden, 1, (outputs,), (outputs, hidden)]:
+        shapes = ", ".join(f"{key} {tensors[key].shape}" for key in expected)
         raise DataError(f"{path}: found {shapes}; expected two layers with {outputs} outputs")
-    if not all(np.isfinite(part).all() for part in (*first, *second)):
+    if not all(np.isfinite(part).all() for part in (b1, w1, b2, w2)):
         raise DataError(f"{path}: holds a NaN or an infinity; expected finite numbers")
-    inputs, usual = first[0].shape[1], widths.inputs
+    inputs, usual = w1.shape[1], widths.inputs
     taken = 0 if embedding is None or name != "color" else embedding.shape[1]
-    if inputs == usual + 1 + taken:
-        raise DataError(
-            f"{path}: takes the distance as well ({inputs} inputs), expected {usual + taken}: features, direction"
-        )
     if inputs != usual + taken:
-        raise DataError(
-            f"{path}: takes {inputs} inputs, expected {usual + taken}: {widths.feature} features and a direction"
-        )
-    if taken:
-        assert embedding is not None
+        found = f"{inputs} inputs" if inputs != usual + taken + 1 else f"the distance as well ({inputs} inputs)"
+        expects = f"{usual + taken}: {widths.feature} features and a direction"
+        raise DataError(f"{path}: takes {found}, expected {expects}")
+    if embedding is not None and taken:
         if choices.appearance is None or not 0 <= choices.appearance < len(embedding):
-            raise DataError(
-                f"{path.parent}: colours depend on the picture; choose the appearance of one of {len(embedding)} with "
-                f"--appearance 0..{len(embedding) - 1}"
-            )
-        first = first[0][:, :usual], first[1] + first[0][:, usual:] @ embedding[choices.appearance]
-    return tuple((weight.astype(np.float32), bias.astype(np.float32)) for weight, bias in (first, second))
-
-
-def _check_activations(name: str, decoder: Any, path: Path) -> None:
-    """Raises DataError for other kinds of layers in TorchScript; state dicts do not name them."""
-    if not isinstance(decoder, Module):
-        return
-    found = [type(part).__name__ for key, part in vars(decoder).items() if key.isdigit() and isinstance(part, Module)]
-    end = ENDS[name]
-    expected = ["Linear", "ReLU", "Linear", *([end] if end else [])]
-    if found != expected:
-        raise DataError(f"{path}: layers are {', '.join(found)[:120]}; expected {', '.join(expected)}")
+            how = f"choose the appearance of one of {len(embedding)} with --appearance 0..{len(embedding) - 1}"
+            raise DataError(f"{path.parent}: colours depend on the picture; {how}")
+        w1, b1 = w1[:, :usual], b1 + w1[:, usual:] @ embedding[choices.appearance]
+    return (w1.astype(np.float32), b1.astype(np.float32)), (w2.astype(np.float32), b2.astype(np.float32))
 
 
 def _grid(anchor: np.ndarray, path: Path) -> float:
@@ -294,16 +261,12 @@ def _cells(anchor: np.ndarray, voxel: float, path: Path) -> np.ndarray:
     """int32 [N, 3]: the anchors in voxels. Raises DataError if they are not multiples of `voxel`."""
     exact = anchor.astype(np.float64) / voxel
     cells = np.round(exact)
-    if np.abs(cells).max() > MAX_VOXEL:
-        raise DataError(
-            f"{path}: an anchor lies {np.abs(cells).max():.3g} voxels of {voxel:g} away, expected {MAX_VOXEL} at most"
-        )
+    if (most := np.abs(cells).max()) > MAX_VOXEL:
+        raise DataError(f"{path}: an anchor lies {most:.3g} voxels of {voxel:g} away, expected {MAX_VOXEL} at most")
     off = np.abs(exact - cells) - ULPS * np.spacing(np.abs(anchor)).astype(np.float64) / voxel
     if off.max() > OFF_GRID:
-        raise DataError(
-            f"{path}: anchors lie up to {off.max():.3g} voxels off the grid of {voxel:g}, expected multiples of it; "
-            "--voxel-size names another"
-        )
+        found = f"anchors lie up to {off.max():.3g} voxels off the grid of {voxel:g}"
+        raise DataError(f"{path}: {found}, expected multiples of it; --voxel-size names another")
     return cells.astype(np.int32)
 
 

@@ -131,14 +131,6 @@ def quaternions(matrices: np.ndarray) -> np.ndarray:
     squares[:, 0] = 1 + trace
     a, b, c = m[:, 2, 1] - m[:, 1, 2], m[:, 0, 2] - m[:, 2, 0], m[:, 1, 0] - m[:, 0, 1]  # 4wx, 4wy, 4wz
     d, e, f = m[:, 0, 1] + m[:, 1, 0], m[:, 0, 2] + m[:, 2, 0], m[:, 1, 2] + m[:, 2, 1]  # 4xy, 4xz, 4yz
-    products = np.stack(
-        [
-            np.stack([squares[:, 0], a, b, c], axis=1),
-            np.stack([a, squares[:, 1], d, e], axis=1),
-            np.stack([b, d, squares[:, 2], f], axis=1),
-            np.stack([c, e, f, squares[:, 3]], axis=1),
-        ],
-        axis=1,
-    )
-    best = products[np.arange(len(m)), squares.argmax(axis=1)]
-    return unit(best)
+    ww, xx, yy, zz = squares.T
+    products = np.array([[ww, a, b, c], [a, xx, d, e], [b, d, yy, f], [c, e, f, zz]])
+    return unit(products[squares.argmax(axis=1), :, np.arange(len(m))])

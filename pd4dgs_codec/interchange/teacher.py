@@ -89,10 +89,9 @@ def load_source(source: str, *, downscale: int = 1, holdout: int = 8) -> Dataset
 
 def _like(source: str, teacher: Teacher, data: Dataset) -> Dataset:
     """The dataset with the teacher's pictures as training pictures; its held-out ones stay."""
-    solid = _solid(source, teacher, MIDDLE)
     poses = [(view.camera, view.time) for view in data.train]
     train = _pictures(teacher, poses, data.background, data.near)
-    return replace(data, name=source, train=tuple(train), **_points(teacher, solid))
+    return replace(data, name=source, train=tuple(train), **_points(teacher, _solid(source, teacher, MIDDLE)))
 
 
 def _around(source: str, place: Path, teacher: Teacher, options: Options, downscale: int, holdout: int) -> Dataset:

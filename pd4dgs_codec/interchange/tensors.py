@@ -22,13 +22,7 @@ from pd4dgs_codec.data.files import read_file
 from pd4dgs_codec.errors import DataError, one_line
 
 #: Torch's names of storages and what they hold.
-STORAGES = {
-    "FloatStorage": "<f4",
-    "DoubleStorage": "<f8",
-    "HalfStorage": "<f2",
-    "LongStorage": "<i8",
-    "IntStorage": "<i4",
-}
+STORAGES = dict(FloatStorage="<f4", DoubleStorage="<f8", HalfStorage="<f2", LongStorage="<i8", IntStorage="<i4")
 MAX_PICKLE = 1 << 24  #: bytes of data.pkl
 
 
@@ -88,7 +82,7 @@ class _Unpickler(pickle.Unpickler):
         known = {
             ("collections", "OrderedDict"): OrderedDict,
             ("torch._utils", "_rebuild_tensor_v2"): _tensor,
-            ("torch._utils", "_rebuild_parameter"): _parameter,
+            ("torch._utils", "_rebuild_parameter"): lambda data, *_: data,
         }
         if (module, name) not in known:
             raise Refused(f"the pickle asks for {one_line(f'{module}.{name}', 80)}")
@@ -114,7 +108,3 @@ def _tensor(storage: np.ndarray, offset: int, size: tuple[int, ...], stride: tup
         raise Refused("a tensor that reaches beyond its storage")
     strides = tuple(step * storage.itemsize for step in stride)
     return np.lib.stride_tricks.as_strided(storage[offset:], tuple(size), strides, writeable=False)
-
-
-def _parameter(data: np.ndarray, *_: Any) -> np.ndarray:
-    return data
