@@ -103,7 +103,8 @@ def _line(number: int, raw: bytes, op: Op, check: Callable[[dict[str, Any]], Non
     if not isinstance(options, dict):
         raise DataError(f"options are {options!r}, expected an object")
     output = content.get("output", default_output(source, op))
-    if not isinstance(output, str) or not _is_plain(output) or output.endswith(store.RECORD):
+    plain = isinstance(output, str) and output.isprintable() and "\\" not in output
+    if not plain or {"", ".", ".."} & set(output.split("/")) or output.endswith(store.RECORD):
         raise DataError(f"output is {output!r}, expected a path below -o, which does not end in {store.RECORD}")
     check(options)
     inputs = {name: _absolute(options[name]) for name in op.inputs if name in options}
@@ -112,11 +113,6 @@ def _line(number: int, raw: bytes, op: Op, check: Callable[[dict[str, Any]], Non
 
 def _absolute(place: str) -> str:
     return place if place.startswith(SYNTHETIC) else store.absolute(place)
-
-
-def _is_plain(name: str) -> bool:
-    """Whether it is a relative path of ordinary parts."""
-    return name.isprintable() and "\\" not in name and not {"", ".", ".."} & set(name.split("/"))
 
 
 def default_output(source: str, op: Op) -> str:
@@ -152,7 +148,13 @@ def scan(folder: str, verb: str | None) -> Iterator[dict[str, str]]:
     several kinds.
     """
     names = store.names(folder)
-    found = {name: _sources(names, op) for name, op in OPS.items()}
+
+    def sources(op: Op) -> list[str]:
+        if not op.finds:
+            return dataset_folders(names)
+        return sorted(name for name in names if PurePosixPath(name).suffix.lower() in op.finds)
+
+    found = {name: sources(op) for name, op in OPS.items()}
     kinds = [verb] if verb else [name for name in ("prepare", "train", "encode", "package") if found[name]]
     if len(kinds) > 1:
         raise DataError(f"{folder}: holds sources for {' and '.join(kinds)}; expected --op with one of them")
@@ -162,9 +164,3 @@ def scan(folder: str, verb: str | None) -> Iterator[dict[str, str]]:
     for name in found[kinds[0]]:
         output = posixpath.join(posixpath.dirname(name), default_output(name, OPS[kinds[0]]))
         yield {"source": posixpath.join(folder, name), "output": output}
-
-
-def _sources(names: list[str], op: Op) -> list[str]:
-    if not op.finds:
-        return dataset_folders(names)
-    return sorted(name for name in names if PurePosixPath(name).suffix.lower() in op.finds)

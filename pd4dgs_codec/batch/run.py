@@ -82,12 +82,10 @@ class Summary:
 
     def json(self) -> dict[str, Any]:
         """As JSON values."""
-        return {
-            "done": self.done, "already": self.already, "failed": len(self.failures), "retried": self.retried,
-            "bytes": self.bytes, "seconds": round(self.seconds, 3), "cpu_seconds": round(self.cpu, 3),
-            "work_cpu_seconds": round(self.work, 3), "peak_memory": self.peak,
-            "failures": self.failures,
-        }  # fmt: skip
+        counts = {"done": self.done, "already": self.already, "failed": len(self.failures), "retried": self.retried}
+        times = {"seconds": self.seconds, "cpu_seconds": self.cpu, "work_cpu_seconds": self.work}
+        times = {name: round(seconds, 3) for name, seconds in times.items()}
+        return counts | {"bytes": self.bytes, **times, "peak_memory": self.peak, "failures": self.failures}
 
 
 def run(
@@ -160,15 +158,17 @@ class Local(Engine):
     def start(self, jobs: list[Job]) -> list[Future[Outcome]]:
         """In this process, in pools that are free, or in new ones."""
         self.busy = {future: pool for future, pool in self.busy.items() if not future.done()}
-        return [self._done(job) if self.inline else self._begun(job) for job in jobs]
-
-    def _done(self, job: Job) -> Future[Outcome]:
-        future = Future[Outcome]()
-        future.set_result(self.work(job))
-        return future
+        return [self._begun(job) for job in jobs]
 
     def _begun(self, job: Job) -> Future[Outcome]:
-        pool = next((pool for pool in self.pools if pool not in self.busy.values()), None) or self._pool()
+        if self.inline:
+            future = Future[Outcome]()
+            future.set_result(self.work(job))
+            return future
+        pool = next((pool for pool in self.pools if pool not in self.busy.values()), None)
+        if pool is None:  # OpenMP forbids fork
+            executor = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _follow_parent)
+            self.pools.append(pool := (executor, executor.submit(os.getpid)))
         try:
             future = pool[0].submit(self.work, job)
         except BrokenProcessPool:  # it died while it was free
@@ -176,11 +176,6 @@ class Local(Engine):
             return self._begun(job)
         self.busy[future] = pool
         return future
-
-    def _pool(self) -> tuple[ProcessPoolExecutor, Future[int]]:
-        executor = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _follow_parent)  # OpenMP forbids fork
-        self.pools.append((executor, executor.submit(os.getpid)))
-        return self.pools[-1]
 
     def kill(self, future: Future[Outcome]) -> None:
         """Kills the process."""

@@ -19,8 +19,6 @@ import numpy as np
 from pd4dgs_codec.errors import DataError, one_line
 from pd4dgs_codec.prepare.frames import Advance
 
-#: COLMAP's camera models that data.colmap reads. Phones need one coefficient.
-CAMERA_MODELS = ("SIMPLE_RADIAL", "SIMPLE_PINHOLE", "PINHOLE", "RADIAL", "OPENCV", "OPENCV_FISHEYE")
 #: Pictures and pairs in a call of pycolmap, between two reports of progress.
 BATCH, PAIRS_BATCH = 4, 50
 #: Longest side of pictures for feature detection, and the most features.
@@ -43,9 +41,8 @@ def colmap() -> Any:
     try:
         module = import_module("pycolmap")
     except ImportError:
-        raise DataError(
-            "camera poses need the package pycolmap, which is not installed: pip install 'pd4dgs-codec[prepare]'"
-        ) from None
+        how = "pip install 'pd4dgs-codec[prepare]'"
+        raise DataError(f"camera poses need the package pycolmap, which is not installed: {how}") from None
     module.logging.minloglevel = int(module.logging.Level.FATAL)
     module.set_random_seed(SEED)
     return module
@@ -193,11 +190,8 @@ class Verdicts:
     def moving(self, width: int) -> np.ndarray:
         """bool [n]: the majority of the known features within REACH moves."""
         known = self.known
-        votes = np.where(self.off >= MOVING_SHARE * self.matched, 1, -1)[known]
+        votes, voters = np.where(self.off >= MOVING_SHARE * self.matched, 1, -1)[known], self.places[known]
         result = np.zeros(len(self.places), bool)
-        if not (votes > 0).any():
-            return result
-        voters = self.places[known]
         for start in range(0, len(self.places), 512):
             part = slice(start, start + 512)
             gaps = ((self.places[part, None] - voters) ** 2).sum(axis=2)
@@ -213,7 +207,7 @@ def sampson(a: np.ndarray, b: np.ndarray, relative: np.ndarray) -> np.ndarray:
     t = relative[:, 3]
     cross = np.array([[0, -t[2], t[1]], [t[2], 0, -t[0]], [-t[1], t[0], 0]])
     essential = cross @ relative[:, :3]
-    ha, hb = (np.concatenate([p, np.ones((len(p), 1))], axis=1) for p in (a, b))
+    ha, hb = (np.column_stack([p, np.ones(len(p))]) for p in (a, b))
     line_b, line_a = ha @ essential.T, hb @ essential
     error = np.abs((hb * line_b).sum(axis=1))
     slope = np.sqrt((line_b[:, :2] ** 2).sum(axis=1) + (line_a[:, :2] ** 2).sum(axis=1))

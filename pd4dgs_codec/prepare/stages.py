@@ -50,7 +50,7 @@ class Choices:
     frames: int = 120
     fps: float = 30.0
     downscale: int = 1
-    camera: str = poses.CAMERA_MODELS[0]
+    camera: str = "SIMPLE_RADIAL"
     threads: int = -1
 
 
@@ -121,9 +121,8 @@ def _frames(
     choice = choose(looks, choices.frames)
     if len(choice.chosen) < FEWEST_FRAMES:
         found = f"{len(choice.blurred)} blurred and {len(choice.repeated)} repeated of {len(looks)} frames"
-        raise DataError(
-            f"{recording.path}: {found} leave {len(choice.chosen)}, expected {FEWEST_FRAMES} that differ at least"
-        )
+        left = f"leave {len(choice.chosen)}, expected {FEWEST_FRAMES} that differ at least"
+        raise DataError(f"{recording.path}: {found} {left}")
     shutil.rmtree(work / "images", ignore_errors=True)
     (work / "images").mkdir()
     with progress(len(choice.chosen), "frames", "writing") as advance:
@@ -146,11 +145,8 @@ def _poses(work: Path, times: dict[str, float], choices: Choices, progress: Prog
     with progress(None, "frames", "poses") as advance:
         first = _checked(poses.reconstruct(database, images, work / "first", choices.threads, advance), len(names))
     verdicts = poses.moving_features(database, first)
-    moving = {
-        image.name: verdicts[image.name].moving(first.image(key).camera.width)
-        for key, image in first.images.items()
-        if image.name in verdicts
-    }
+    named = [image for image in first.images.values() if image.name in verdicts]
+    moving = {image.name: verdicts[image.name].moving(image.camera.width) for image in named}
     model = first
     if any(each.any() for each in moving.values()):
         shutil.copyfile(database, still)
@@ -214,16 +210,14 @@ def numbers(findings: Findings, looks: Sequence[Look], choice: Choice, times: Ma
     """The report for report.json. Errors are in pixels of the written pictures."""
     model = findings.model
     registered = {image.name: image for image in model.images.values() if image.has_pose}
-    errors = _errors(model)
-    camera = next(iter(model.cameras.values()))
-    features = sum(map(len, findings.moving.values()))
+    errors, camera = _errors(model), next(iter(model.cameras.values()))
+    moving = {name: int(each.sum()) for name, each in findings.moving.items()}
     rows = []
     for name in sorted(times):
         row: dict[str, Any] = {"name": name, "seconds": times[name], "pose": name in registered}
-        if name in registered:
-            image = registered[name]
+        if image := registered.get(name):
             row |= {"points": image.num_points3D, "reprojection_error": errors.get(image.image_id)}
-            row["moving_features"] = int(findings.moving[name].sum()) if name in findings.moving else 0
+            row["moving_features"] = moving.get(name, 0)
         rows.append(row)
     counts = {"seen": looks, "blurred": choice.blurred, "repeated": choice.repeated, "chosen": choice.chosen}
     parameters = dict(zip(camera.params_info.split(", "), camera.params.tolist(), strict=True))
@@ -236,7 +230,7 @@ def numbers(findings: Findings, looks: Sequence[Look], choice: Choice, times: Ma
         "reprojection_error": float(model.compute_mean_reprojection_error()),
         "points_per_picture": float(np.median([image.num_points3D for image in registered.values()])),
         "angle_degrees": _angle(model),
-        "moving_share": sum(int(each.sum()) for each in findings.moving.values()) / features if features else 0.0,
+        "moving_share": sum(moving.values()) / max(sum(map(len, findings.moving.values())), 1),
         "pictures": rows,
     }
 
@@ -270,25 +264,22 @@ def _angle(model: Any) -> float:
 
 def advice(report: Mapping[str, Any]) -> list[str]:
     """Hints for a better recording, a line each."""
-    lines, frames = [], report["frames"]
+    lines, frames, error = [], report["frames"], report["reprojection_error"]
+    points, angle, moving = (report[key] for key in ("points_per_picture", "angle_degrees", "moving_share"))
     if frames["blurred"] > MANY_BLURRED * frames["seen"]:
         lines.append(f"{frames['blurred']} of {frames['seen']} frames are blurred: move slower, or with more light")
-    lost = [row for row in report["pictures"] if not row["pose"]]
+    lost = [row["seconds"] for row in report["pictures"] if not row["pose"]]
     if len(lost) > MANY_LOST * frames["chosen"]:
-        span = f"between {lost[0]['seconds']:.1f} and {lost[-1]['seconds']:.1f} s"
-        lines.append(f"{len(lost)} of {frames['chosen']} frames have no pose, {span}: turn and move slower there")
-    error = report["reprojection_error"]
+        found = f"{len(lost)} of {frames['chosen']} frames have no pose, between {lost[0]:.1f} and {lost[-1]:.1f} s"
+        lines.append(f"{found}: turn and move slower there")
     if error * 1000 > LARGE_ERROR * report["camera"]["width"]:
         lines.append(f"reprojection error {error:.2f} pixels: lock zoom and focus, and switch stabilisation off")
-    if report["points_per_picture"] < FEW_POINTS:
-        found = f"{report['points_per_picture']:.0f} points in a picture"
-        lines.append(f"{found}: have things with texture that stand still around what moves")
-    if report["angle_degrees"] < SMALL_ANGLE:
-        found = f"points are seen under {report['angle_degrees']:.1f} degrees"
-        lines.append(f"{found}: walk around the scene, turning on the spot shows no depth")
-    if report["moving_share"] > MUCH_MOVES:
-        found = f"{100 * report['moving_share']:.0f} % of the features move"
-        lines.append(f"{found}: stand back, so that more of the picture stands still")
+    if points < FEW_POINTS:
+        lines.append(f"{points:.0f} points in a picture: have textured static things around the moving ones")
+    if angle < SMALL_ANGLE:
+        lines.append(f"points are seen under {angle:.1f} degrees: walk around the scene, turning shows no depth")
+    if moving > MUCH_MOVES:
+        lines.append(f"{100 * moving:.0f} % of the features move: stand back, so that more of the picture is static")
     return lines
 
 
@@ -303,40 +294,36 @@ def draw(
     from matplotlib import pyplot
     from PIL import Image
 
-    model = findings.model
-    images_by_name = {image.name: image for image in model.images.values() if image.has_pose}
-    order = sorted(images_by_name)
+    model, errors = findings.model, _errors(findings.model)
+    posed = sorted((image for image in model.images.values() if image.has_pose), key=lambda image: image.name)
+    seconds = [times[image.name] for image in posed]
     figure = pyplot.figure(figsize=(13, 11))
     top = figure.add_subplot(3, 3, 1)
     points = np.array([point.xyz for point in model.points3D.values()]).reshape(-1, 3)
-    centers = np.array([images_by_name[name].projection_center() for name in order])
+    centers = np.array([image.projection_center() for image in posed])
     low, high = np.percentile(np.concatenate([points, centers]), [1, 99], axis=0)
     top.plot(points[:, 0], points[:, 2], ",", color="grey")
     top.plot(centers[:, 0], centers[:, 2], ".-", color="tab:blue", markersize=3)
-    span = 0.6 * max((high - low)[[0, 2]])
-    middle = (low + high) / 2
-    top.set(xlim=(middle[0] - span, middle[0] + span), ylim=(middle[2] - span, middle[2] + span), aspect="equal")
-    top.set_title("camera path and points, from above")
-    errors = _errors(model)
+    span, middle = 0.6 * max((high - low)[[0, 2]]), (low + high) / 2
+    x, z = ((middle[axis] - span, middle[axis] + span) for axis in (0, 2))
+    top.set(xlim=x, ylim=z, aspect="equal", title="camera path and points, from above")
     left = figure.add_subplot(3, 3, 2)
-    left.plot([times[n] for n in order], [errors.get(images_by_name[n].image_id, np.nan) for n in order], ".-")
+    left.plot(seconds, [errors.get(image.image_id, np.nan) for image in posed], ".-")
     left.set(title="reprojection error, pixels", xlabel="seconds")
     right = figure.add_subplot(3, 3, 3)
-    right.semilogy([each.time for each in looks], [each.sharpness for each in looks], color="grey")
-    right.semilogy([looks[i].time for i in choice.chosen], [looks[i].sharpness for i in choice.chosen], "g.")
-    right.semilogy([looks[i].time for i in choice.blurred], [looks[i].sharpness for i in choice.blurred], "rx")
+    for which, style in ((range(len(looks)), "-"), (choice.chosen, "g."), (choice.blurred, "rx")):
+        right.semilogy([looks[i].time for i in which], [looks[i].sharpness for i in which], style)
     right.set(title="sharpness; green: chosen, red: blurred", xlabel="seconds")
-    for k, at in enumerate(np.linspace(0, len(order) - 1, SHOWN).round().astype(int)):
-        name = order[at]
+    for k, at in enumerate(np.linspace(0, len(posed) - 1, SHOWN).round().astype(int)):
+        name = posed[at].name
         axis = figure.add_subplot(3, 3, 4 + k)
         with Image.open(images / name) as picture:
             axis.imshow(picture)
         if name in findings.verdicts:
             verdicts, moves = findings.verdicts[name], findings.moving[name]
-            places = verdicts.places
-            axis.plot(*places[~moves & verdicts.known].T, ",", color="lime")
-            axis.plot(*places[moves].T, ".", color="red", markersize=3)
-        axis.set_title(f"{times[name]:.2f} s", fontsize=8)
+            axis.plot(*verdicts.places[~moves & verdicts.known].T, ",", color="lime")
+            axis.plot(*verdicts.places[moves].T, ".", color="red", markersize=3)
+        axis.set_title(f"{seconds[at]:.2f} s", fontsize=8)
         axis.axis("off")
     figure.tight_layout()
     figure.savefig(path, dpi=100)

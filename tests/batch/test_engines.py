@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import json
+import random
 import subprocess
 import sys
 import time
 from pathlib import Path
 
-import flaky
 import pytest
 
 from pd4dgs_codec.batch.store import Root
@@ -97,21 +97,33 @@ def test_workers_end_with_a_parent_that_was_killed(filled, tmp_path):
 
 
 def test_a_store_that_fails_now_and_then_gets_every_output_once(filled, monkeypatch):
-    import fsspec
+    """A tenth of the calls fail, before they do anything or after, as if the answer was lost."""
+    from fsspec.implementations.memory import MemoryFileSystem
 
-    fsspec.register_implementation("flaky", flaky.FlakyFileSystem, clobber=True)
-    monkeypatch.setattr(flaky, "SHARE", 0.1)
-    flaky.random.seed(1)
-    summary = filled.run(root=f"flaky://{filled.out}", retries=5)
-    assert summary.done + summary.already == 8 and _outputs(filled) == WANTED
-    assert filled.run(root=f"flaky://{filled.out}", retries=5).already == 8
+    rng = random.Random(1)
 
+    def flaky(name: str):
+        whole = getattr(MemoryFileSystem, name)
 
-def test_a_pool_finds_schemes_of_other_packages(filled, tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(flaky.python_path(tmp_path / "path"))  # spawned processes have the path of their parent
-    monkeypatch.setenv("PD4DGS_FLAKY", "0")
-    assert filled.run(root=f"flaky://{filled.out}", workers=1).done == 8
-    assert _outputs(filled) == WANTED
+        def call(*args, **named):
+            fails, before = rng.random() < 0.1, rng.random() < 0.5
+            if fails and before:
+                raise OSError("the store is busy")
+            result = whole(*args, **named)
+            if fails:
+                raise OSError("the store gave no answer")
+            return result
+
+        return call
+
+    for name in ("info", "cat_file", "pipe_file"):
+        monkeypatch.setattr(MemoryFileSystem, name, flaky(name))
+    summary = filled.run(root="memory://flaky", retries=5)
+    assert summary.done + summary.already == 8 and summary.retried > 0
+    assert filled.run(root="memory://flaky", retries=5).already == 8
+    monkeypatch.undo()
+    store = MemoryFileSystem()
+    assert {name: store.cat_file(f"/flaky/{name}").decode() for name in WANTED} == WANTED
 
 
 def test_slurm_jobs_by_the_local_executor_of_submitit(library):

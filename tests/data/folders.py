@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import json
-import struct
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -174,69 +172,27 @@ def colmap_name(i: int) -> str:
     return f"cam/frame_{2 * i:04d}.png"
 
 
-def _entries(scene: Dataset) -> Iterator[tuple[int, list[float], list[float], str]]:
-    for i, view in enumerate(scene.train[:COUNT]):
-        viewmat = view.viewmat.astype(np.float64)
-        yield i + 1, quaternion(viewmat[:3, :3]).tolist(), viewmat[:3, 3].tolist(), colmap_name(i)
+def write_colmap(
+    scene: Dataset, folder: Path, form: str = "binary", camera: str = "PINHOLE", extra: tuple[float, ...] = ()
+) -> Path:
+    """A model with camera 7, as pycolmap writes it. form: "binary" or "text". extra: parameters after fx fy cx cy."""
+    import pycolmap  # of an extra
 
-
-def _pictures(scene: Dataset, folder: Path) -> tuple[Path, View, list[float]]:
-    """The folder of the model; a view, and its fx fy cx cy."""
+    first, K = scene.train[0], scene.train[0].K.astype(float)
+    parameters = [K[0, 0], K[1, 1], K[0, 2], K[1, 2], *extra]
+    size, model = {"width": first.width, "height": first.height}, pycolmap.Reconstruction()
+    model.add_camera_with_trivial_rig(pycolmap.Camera(model=camera, params=parameters, camera_id=7, **size))
     for i, view in enumerate(scene.train[:COUNT]):
         save(folder / "images" / colmap_name(i), view.image)
-    (folder / "sparse" / "0").mkdir(parents=True)
-    K = scene.train[0].K.astype(float)
-    return folder / "sparse" / "0", scene.train[0], [K[0, 0], K[1, 1], K[0, 2], K[1, 2]]
-
-
-def _points(scene: Dataset) -> Iterator[tuple[int, list[float], list[int]]]:
-    for i in range(POINTS):
-        yield i, scene.points[i].astype(float).tolist(), scene.point_colors[i].tolist()
-
-
-def write_binary(scene: Dataset, folder: Path, model: int = 1, extra: tuple[float, ...] = ()) -> Path:
-    """A binary model of camera 7. extra: parameters of the camera model after fx fy cx cy."""
-    place, view, lens = _pictures(scene, folder)
-    parameters = (*lens, *extra)
-    camera = struct.pack("<QiiQQ", 1, 7, model, view.width, view.height)
-    (place / "cameras.bin").write_bytes(camera + struct.pack(f"<{len(parameters)}d", *parameters))
-    images = [
-        struct.pack("<i7di", i, *q, *t, 7) + name.encode() + b"\0" + struct.pack("<Qddq", 1, 3.0, 4.0, -1)
-        for i, q, t, name in _entries(scene)
-    ]
-    (place / "images.bin").write_bytes(struct.pack("<Q", len(images)) + b"".join(images))
-    points = [struct.pack("<Q3d3BdQii", i, *p, *c, 0.5, 1, 1, 0) for i, p, c in _points(scene)]
-    (place / "points3D.bin").write_bytes(struct.pack("<Q", len(points)) + b"".join(points))
-    return folder
-
-
-def write_text(scene: Dataset, folder: Path) -> Path:
-    """The same model as text."""
-    place, view, lens = _pictures(scene, folder)
-    camera = " ".join(map(str, ["7 PINHOLE", view.width, view.height, *lens]))
-    (place / "cameras.txt").write_text(f"# Camera list\n{camera}\n")
-    lines = ["# Image list"]
-    for i, q, t, name in _entries(scene):
-        lines += [" ".join(map(str, [i, *q, *t, 7, name])), "3.0 4.0 -1" if i % 2 else ""]
-    (place / "images.txt").write_text("\n".join(lines) + "\n")
-    points = [" ".join(map(str, [i, *p, *c, 0.5, 1, 0])) for i, p, c in _points(scene)]
-    (place / "points3D.txt").write_text("\n".join(points) + "\n")
-    return folder
-
-
-def write_pycolmap(scene: Dataset, folder: Path, form: str) -> Path:
-    """The same model as pycolmap writes it."""
-    import pycolmap
-
-    place, view, lens = _pictures(scene, folder)
-    model = pycolmap.Reconstruction()
-    camera = pycolmap.Camera(model="PINHOLE", width=view.width, height=view.height, params=lens, camera_id=7)
-    model.add_camera_with_trivial_rig(camera)
-    for i, (w, x, y, z), t, name in _entries(scene):
-        rigid = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([x, y, z, w])), np.array(t))
-        model.add_image_with_trivial_frame(pycolmap.Image(name=name, camera_id=7, image_id=i), rigid)
-    for _, p, c in _points(scene):
-        model.add_point3D(np.array(p), pycolmap.Track(), np.array(c, np.uint8))
+        image = pycolmap.Image(name=colmap_name(i), camera_id=7, image_id=i + 1)
+        image.points2D = [pycolmap.Point2D(np.array([3.0, 4.0]))] * (i % 2)
+        (w, x, y, z), shift = quaternion(eye(view)[0]), view.viewmat[:3, 3].astype(float)
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(np.array([x, y, z, w])), shift)
+        model.add_image_with_trivial_frame(image, pose)
+    for point, color in zip(scene.points[:POINTS].astype(float), scene.point_colors, strict=False):
+        model.add_point3D(point, pycolmap.Track(), color)
+    place = folder / "sparse" / "0"
+    place.mkdir(parents=True)
     getattr(model, f"write_{form}")(str(place))
     return folder
 

@@ -61,9 +61,8 @@ def damage_bytes(data: bytes, rng: random.Random) -> bytes:
         return b" ".join(words)
     if kind == 2:  # four bytes of a header, which count or measure something there
         place = rng.randrange(min(len(data), 64) or 1)
-        return (
-            data[:place] + rng.choice([b"\xff" * 4, bytes(4), b"\0\0\xff\xff", b"\x7f\xff\xff\xff"]) + data[place + 4 :]
-        )
+        four = rng.choice([b"\xff" * 4, bytes(4), b"\0\0\xff\xff", b"\x7f\xff\xff\xff"])
+        return data[:place] + four + data[place + 4 :]
     changed = bytearray(data)
     for _ in range(rng.choice([1, 1, 3])):
         if changed:

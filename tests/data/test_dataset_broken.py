@@ -57,8 +57,8 @@ LAYOUTS: dict[str, Callable[[Any, Path], Path]] = {
     "record3d": folders.write_record3d,
     "panoptic": folders.write_panoptic,
     "neu3d": folders.write_neu3d,
-    "colmap": folders.write_binary,
-    "text": folders.write_text,
+    "colmap": folders.write_colmap,
+    "text": lambda scene, folder: folders.write_colmap(scene, folder, "text"),
     "videos": folders.write_synchronised,
 }
 

@@ -1,11 +1,11 @@
 """Data that is whole but teaches little: one frame, one place, one instant, views without a valid pixel."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
-from folders import pose
-from PIL import Image
+from folders import pose, write_iphone
 
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.errors import DataError
@@ -73,29 +73,12 @@ def test_no_valid_pixel_in_any_training_view_is_refused(blender):
 
 
 def test_test_views_that_were_never_covisible_do_not_count(tmp_path):
-    names = ["0_00000", "1_00000", "1_00001"]
-    files = {
-        "metadata.json": {name: {"warp_id": i, "camera_id": 0} for i, name in enumerate(names)},
-        "scene.json": {"near": 1, "far": 2},
-        "extra.json": {"factor": 1, "fps": 30, "bbox": [[0, 0, 0], [1, 1, 1]]},
-        "splits/train.json": {"frame_names": names[:1]},
-        "splits/val.json": {"frame_names": names[1:]},
-    }
-    eye = np.eye(3).tolist()
-    camera = dict(orientation=eye, position=[0, 0, 0], focal_length=10, principal_point=[6, 4], image_size=[12, 8])
-    files |= {f"camera/{name}.json": camera for name in names}
-    for name, value in files.items():
-        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        (tmp_path / name).write_text(json.dumps(value))
-    for name in names:
-        for path, value in ((f"rgb/1x/{name}.png", 9), (f"covisible/1x/val/{name}.png", 255 * (name == "1_00001"))):
-            (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
-            Image.fromarray(np.full((8, 12), value, np.uint8)).convert("L" if "cov" in path else "RGB").save(
-                tmp_path / path
-            )
-    dataset = load(tmp_path)
-    assert [view.name for view in dataset.test] == ["1_00001"] and dataset.left_out == ("1_00000",)
-    assert dataset.masked
+    scene = load("synthetic:local?frames=4&size=16x12")
+    blind, *others = scene.test
+    scene = replace(scene, test=(replace(blind, mask=np.zeros_like(blind.mask)), *others))
+    dataset = load(write_iphone(scene, tmp_path))
+    assert dataset.left_out == (blind.name,) and dataset.masked
+    assert [view.name for view in dataset.test] == [view.name for view in others]
 
 
 def test_a_dataset_is_read_only(blender):
