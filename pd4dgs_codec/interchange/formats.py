@@ -179,8 +179,9 @@ def read_gsplat(path: Path) -> Splats:
     missing = [name for name in wanted if not isinstance(state, dict) or not isinstance(state.get(name), np.ndarray)]
     if missing or not isinstance(state, dict):
         raise DataError(f"{path}: has no splats.{missing[0]}; expected a checkpoint of gsplat with spherical harmonics")
-    *parts, base, rest = (state[name].astype(np.float32) for name in wanted)
-    return _activated(path, *parts, np.concatenate([base, rest], axis=1) if base.ndim == 3 else base)
+    means, quats, scales, opacities, base, rest = (state[name].astype(np.float32) for name in wanted)
+    sh = np.concatenate([base, rest], axis=1) if base.ndim == 3 else base
+    return _activated(path, means, quats, scales, opacities, sh)
 
 
 # -- writing -----------------------------------------------------------------------------------------------------------
