@@ -46,7 +46,7 @@ def evaluate_file(
         "width": views[0].width,
         "height": views[0].height,
         "masked": dataset.masked and split == "test",
-        "baseline_mean_image_psnr": _baseline(dataset, views),
+        "baseline_mean_image_psnr": mean_image_baseline(dataset.train, views),
         "levels": [evaluate_level(level, views, distances, step) for level in levels],
     }
     if perceptual:
@@ -81,8 +81,7 @@ def evaluate_level(
     distances: name -> distance; adds m<name>, the mean over the views, and t_<name>, the mean between successive
     pictures of the first view's camera at TEMPORAL_FRAMES equidistant times from 0 to 1.
     """
-    metrics: dict[str, Metric] = {"mpsnr": mpsnr, "mssim": mssim}
-    metrics |= {f"m{name}": distance for name, distance in distances.items()}
+    metrics: dict[str, Metric] = {"mpsnr": mpsnr, "mssim": mssim, **{f"m{name}": d for name, d in distances.items()}}
     milliseconds = []
 
     def draw(view: View) -> np.ndarray:
@@ -112,9 +111,3 @@ def _temporal(
         frames.append(to_uint8(level.picture(camera, float(t))))
         step()
     return {f"t_{name}": distance.temporal(frames) for name, distance in distances.items()}
-
-
-def _baseline(dataset: Dataset, views: tuple[View, ...]) -> float | None:
-    """PSNR of the mean training image; None if images differ in size."""
-    sizes = {view.image.shape for view in (*dataset.train, *views)}
-    return mean_image_baseline(dataset.train, views) if len(sizes) == 1 else None

@@ -7,11 +7,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
-from typing import Protocol, TypeVar
+from typing import TYPE_CHECKING
 
 import numpy as np
 
 from pd4dgs_codec.errors import DataError
+
+if TYPE_CHECKING:
+    from pd4dgs_codec.data.view import View
 
 TAPS, SIGMA = 11, 1.5
 C1, C2 = 0.01**2, 0.03**2
@@ -51,13 +54,6 @@ def mpsnr(pred: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) 
     return float("inf") if mse == 0 else float(-10.0 * np.log10(mse))
 
 
-def _gaussian() -> np.ndarray:
-    x = np.arange(TAPS) - TAPS // 2
-    f: np.ndarray = np.exp(-0.5 * (x / SIGMA) ** 2)
-    f /= f.sum()
-    return f
-
-
 def _slide(z: np.ndarray, weights: np.ndarray, axis: int) -> np.ndarray:
     """Correlation along an axis where all of `weights` fits."""
     n = z.shape[axis] - len(weights) + 1
@@ -74,7 +70,8 @@ def _blur(z: np.ndarray, m: np.ndarray) -> np.ndarray:
 
     Each pass is conv(z m, f) * taps / conv(m, 1), or 0 where no pixel counts; the mask becomes (count != 0).
     """
-    f = _gaussian()
+    f: np.ndarray = np.exp(-0.5 * ((np.arange(TAPS) - TAPS // 2) / SIGMA) ** 2)
+    f /= f.sum()
     for axis in (1, 0):
         count = _slide(m, np.ones(TAPS), axis)
         z = np.where(count != 0, _slide(z * m, f, axis) * TAPS / np.maximum(count, 1.0), 0.0)
@@ -100,38 +97,24 @@ def mssim(pred: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) 
     return float((numerator / ((mu0 * mu0 + mu1 * mu1 + C1) * (var0 + var1 + C2))).mean())
 
 
-class TrueView(Protocol):
-    """The reference of a picture. image: uint8 [H, W, 3]; mask: bool [H, W], True = counts, or None for all."""
-
-    @property
-    def image(self) -> np.ndarray: ...
-
-    @property
-    def mask(self) -> np.ndarray | None: ...
-
-
-def mean_image_baseline(train: Sequence[TrueView], test: Sequence[TrueView]) -> float:
-    """Mean mPSNR in dB over the test views of the mean training image: a model should exceed it."""
+def mean_image_baseline(train: Sequence[View], test: Sequence[View]) -> float | None:
+    """Mean mPSNR in dB over the test views of the mean training image: a model should exceed it. None if images differ
+    in size."""
     if not train or not test:
         raise DataError(f"found {len(train)} training and {len(test)} test views, expected at least 1 of each")
-    shapes = {v.image.shape for v in (*train, *test)}
-    if len(shapes) > 1:
-        raise DataError(f"images have {len(shapes)} sizes, expected one for the mean image: {sorted(shapes)}")
-    total = np.zeros(train[0].image.shape, np.float64)
-    for view in train:
-        total += view.image
-    mean = total / (255.0 * len(train))
-    return float(np.mean([mpsnr(mean, v.image, v.mask) for v in test]))
+    if len({view.image.shape for view in (*train, *test)}) > 1:
+        return None
+    mean = np.asarray(sum(view.image.astype(np.float64) for view in train)) / (255.0 * len(train))
+    return float(np.mean([mpsnr(mean, view.image, view.mask) for view in test]))
 
 
 #: (picture, true image, mask) -> score
 Metric = Callable[[np.ndarray, np.ndarray, np.ndarray | None], float]
-V = TypeVar("V", bound=TrueView)
 
 
 def mean_scores(
-    draw: Callable[[V], np.ndarray],
-    views: Sequence[V],
+    draw: Callable[[View], np.ndarray],
+    views: Sequence[View],
     metrics: Mapping[str, Metric],
     step: Callable[[], None] = lambda: None,
 ) -> dict[str, float]:
@@ -146,9 +129,9 @@ def mean_scores(
 
 
 def level_psnr(
-    draw: Callable[[int, V], np.ndarray],
+    draw: Callable[[int, View], np.ndarray],
     levels: Iterable[int],
-    views: Sequence[V],
+    views: Sequence[View],
     step: Callable[[], None] = lambda: None,
 ) -> dict[int, float]:
     """Per level the mean over `views` of the mPSNR of draw(level, view), dB; infinite for equal pictures."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import contextlib
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -98,33 +100,21 @@ def write_mp4(frames: Iterator[np.ndarray], path: Path, fps: float, *, fragment:
     check_mp4()
     import imageio_ffmpeg
 
-    writer = None
     movflags = "+frag_keyframe+empty_moov+default_base_moof"
     options = ["-g", str(fragment), "-sc_threshold", "0", "-bf", "0", "-movflags", movflags] if fragment else []
+    first = next(frames, None)
+    if first is None:
+        return
+    height, width = (size // 2 * 2 for size in first.shape[:2])
+    quality = {"quality": 8, "macro_block_size": 2, "ffmpeg_log_level": "error", "output_params": options}
+    writer = imageio_ffmpeg.write_frames(str(path), (width, height), fps=fps, **quality)
     try:
-        for frame in frames:
-            even = np.ascontiguousarray(frame[: frame.shape[0] // 2 * 2, : frame.shape[1] // 2 * 2])
-            if writer is None:
-                size = (even.shape[1], even.shape[0])
-                writer = imageio_ffmpeg.write_frames(
-                    str(path),
-                    size,
-                    fps=fps,
-                    quality=8,
-                    macro_block_size=2,
-                    ffmpeg_log_level="error",
-                    output_params=options,
-                )
-                writer.send(None)
-            writer.send(even)
-        if writer is not None:
-            writer.close()
-            writer = None
+        with contextlib.closing(writer):
+            writer.send(None)
+            for frame in itertools.chain([first], frames):
+                writer.send(np.ascontiguousarray(frame[:height, :width]))
     except OSError as error:
         raise RenderError(f"ffmpeg stopped: {' '.join(str(error).split())[:300]}") from None
-    finally:
-        if writer is not None:
-            writer.close()
 
 
 def check_mp4() -> None:

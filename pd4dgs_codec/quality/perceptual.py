@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import functools
 import sys
-import types
 import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from importlib import metadata
 from itertools import pairwise
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -111,18 +111,13 @@ def _stlpips() -> Distance:
     # that no other code gets the stand-ins.
     from unittest import mock  # a tenth of a second
 
-    unused = {"torchvision": "models", "IPython": "embed", "torchsummary": "summary"}
-    with mock.patch.dict(sys.modules, {name: _empty_module(name, part) for name, part in unused.items()}):
+    names = {"torchvision": "models", "IPython": "embed", "torchsummary": "summary"}
+    unused = {module: SimpleNamespace(**{name: None}) for module, name in names.items()}
+    with mock.patch.dict(sys.modules, unused):
         from stlpips_pytorch import stlpips
     network = stlpips.LPIPS(net="alex", variant="shift_tolerant", spatial=True, verbose=False)
     source = f"stlpips-pytorch {metadata.version('stlpips-pytorch')}, alex, shift tolerant"
     return Distance("ST-LPIPS", source, _of_network(network), STLPIPS_LEAST)
-
-
-def _empty_module(name: str, part: str) -> types.ModuleType:
-    module = types.ModuleType(name)
-    setattr(module, part, None)
-    return module
 
 
 def _of_network(network: Any) -> ErrorMap:

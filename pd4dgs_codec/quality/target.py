@@ -249,7 +249,8 @@ class _Layer:
         if layer == 0:
             first = encode(scene, self.options, effort=SEARCH_EFFORT, verify=False)
             self.header = info(first)["layers"][0]["offset"] + HEADER_MARGIN
-        self._known: dict[tuple[int, frozenset[tuple[str, float]]], float] = {}
+        self._sizes: dict[tuple[int, frozenset[tuple[str, float]]], int] = {}
+        self._losses: dict[frozenset[tuple[str, float]], float] = {}
 
     def apply(self, setting: Setting) -> Scene:
         """The scene at a setting, not planned: steps not rounded, rows with the anchors that left."""
@@ -260,37 +261,28 @@ class _Layer:
         rows = (len(self.scene.anchor_q),) * len(masks)
         return replace(self.scene, steps=steps, mask=tuple(masks), rows=rows)
 
-    def size(self, setting: Setting) -> int:
-        """Bytes at SEARCH_EFFORT."""
-        return self._size(setting, SEARCH_EFFORT)
+    def size(self, setting: Setting, effort: int = SEARCH_EFFORT) -> int:
+        """Bytes that the layer adds to the file; 0 if the plan leaves it out."""
+        key = effort, frozenset(setting.items())
+        if key not in self._sizes:
+            planned = self._planned(setting)
+            self._sizes[key] = 0
+            if self.layer in planned.layers:
+                symbols = layer_symbols(planned, planned.layers.index(self.layer))
+                payload, _ = write_layer(symbols, replace(self.options, effort=effort))
+                self._sizes[key] = self.header + len(write_chunk(symbols.kind.chunk_type, 0, bytes(8), payload))
+        return self._sizes[key]
 
     def final_size(self, setting: Setting) -> int:
-        """Bytes at the effort of the file."""
-        return self._size(setting, self.options.effort)
+        """`size` at the effort of the file."""
+        return self.size(setting, self.options.effort)
 
     def loss(self, setting: Setting) -> float:
         """The given loss of the decoded scene."""
-        return self._once(setting, -1, lambda: self.of_scene(rounded(self._planned(setting))))
-
-    def _size(self, setting: Setting, effort: int) -> int:
-        """Bytes that the layer adds to the file; 0 if the plan leaves it out."""
-
-        def measure() -> int:
-            planned = self._planned(setting)
-            if self.layer not in planned.layers:
-                return 0
-            symbols = layer_symbols(planned, planned.layers.index(self.layer))
-            payload, _ = write_layer(symbols, replace(self.options, effort=effort))
-            return self.header + len(write_chunk(symbols.kind.chunk_type, 0, bytes(8), payload))
-
-        return int(self._once(setting, effort, measure))
-
-    def _once(self, setting: Setting, what: int, measure: Callable[[], float]) -> float:
-        """measure(), computed once for each setting. what: the effort of a size, -1 for a loss."""
-        key = what, frozenset(setting.items())
-        if key not in self._known:
-            self._known[key] = measure()
-        return self._known[key]
+        key = frozenset(setting.items())
+        if key not in self._losses:
+            self._losses[key] = self.of_scene(rounded(self._planned(setting)))
+        return self._losses[key]
 
     def _planned(self, setting: Setting) -> Scene:
         return plan(self.apply(setting), self.options)[0]

@@ -121,6 +121,7 @@ def test_baseline_by_hand():
     half = view(102)
     half.image[:2], half.mask = 255, np.arange(16).reshape(4, 4) >= 8
     assert mean_image_baseline(train, [half]) == pytest.approx(-10 * np.log10(0.2**2))
+    assert mean_image_baseline(train, [SimpleNamespace(image=np.zeros((5, 4, 3), np.uint8))]) is None
 
 
 @pytest.mark.parametrize(
