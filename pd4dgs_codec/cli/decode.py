@@ -9,22 +9,8 @@ from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.cli import options
-from pd4dgs_codec.cli.common import (
-    OK,
-    PARTIAL,
-    STDIO,
-    Console,
-    UsageError,
-    check_output,
-    command,
-    number,
-    read_bytes,
-    shown_name,
-    table,
-    write_bytes,
-    write_checkpoint,
-)
+from pd4dgs_codec.cli import common, options
+from pd4dgs_codec.cli.common import OK, PARTIAL, STDIO, Console, UsageError, number, shown_name, table
 from pd4dgs_codec.errors import DeliveryError
 
 if TYPE_CHECKING:
@@ -61,7 +47,7 @@ def parser() -> options.Parser:
 def _decode(args: argparse.Namespace, console: Console) -> int:
     kind = _output_kind(args)
     if args.output:
-        check_output(args.output, args.overwrite)
+        common.check_output(args.output, args.overwrite)
     data = _input(args, console)
     from pd4dgs_codec.format.decoder import decode_partial
 
@@ -72,9 +58,9 @@ def _decode(args: argparse.Namespace, console: Console) -> int:
     seconds = time.perf_counter() - start
     console.detail(f"steps {scene.steps}")
     if kind == ".pt":
-        write_checkpoint(args.output, scene, args.overwrite)
+        common.write_checkpoint(args.output, scene, args.overwrite)
     elif kind == ".npz":
-        write_bytes(args.output, _npz(scene, args.symbols), args.overwrite)
+        common.write_bytes(args.output, _npz(scene, args.symbols), args.overwrite)
     if not complete:
         console.message(f"pd4dgs-decode: the input is cut; decoded the layers {list(scene.layers)}")
     result = _summary(scene, data, complete, seconds, args)
@@ -82,7 +68,7 @@ def _decode(args: argparse.Namespace, console: Console) -> int:
     return OK if complete else PARTIAL
 
 
-main = command(parser, _decode)
+main = common.command(parser, _decode)
 
 
 def _input(args: argparse.Namespace, console: Console) -> bytes:
@@ -90,7 +76,7 @@ def _input(args: argparse.Namespace, console: Console) -> bytes:
     from pd4dgs_codec.web import is_url
 
     if not is_url(args.input):
-        return read_bytes(args.input)
+        return common.read_bytes(args.input)
     from pd4dgs_codec.web.transfer import Transfer, fetch
 
     with closing(Transfer(args.input)) as transfer:

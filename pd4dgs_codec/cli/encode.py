@@ -7,23 +7,8 @@ import math
 from dataclasses import fields, replace
 from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.cli import options
-from pd4dgs_codec.cli.common import (
-    OK,
-    STDIO,
-    Console,
-    UsageError,
-    check_output,
-    checkpoint_scene,
-    command,
-    is_pd4,
-    number,
-    read_bytes,
-    read_dataset,
-    shown_name,
-    table,
-    write_bytes,
-)
+from pd4dgs_codec.cli import common, options
+from pd4dgs_codec.cli.common import OK, STDIO, Console, UsageError, number, shown_name, table
 from pd4dgs_codec.cli.progress import progress_bar
 from pd4dgs_codec.format.options import CHOICES, DEFAULTS, EncodeOptions
 from pd4dgs_codec.quality import ENCODE_MIN_DB_PER_MEGABYTE
@@ -103,7 +88,7 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
         raise UsageError("-o - and --json both write to stdout; name an output file")
     if args.min_gain is not None and args.data is None:
         raise UsageError("--min-gain needs --data SOURCE: gains are measured on its views")
-    check_output(args.output, args.overwrite)
+    common.check_output(args.output, args.overwrite)
     chosen = _options(args)
     scene, trained, metadata = _load(args)
     console.detail(f"{args.input}: {len(scene.anchor_q)} anchors, layers {list(scene.layers)}, steps {scene.steps}")
@@ -122,12 +107,12 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
     result = {"input": args.input, "output": args.output, **packed.json()}
     if trained and args.json:  # it takes time, and only the JSON shows it
         _add_train_rate(result, packed, chosen)
-    write_bytes(args.output, packed.data, args.overwrite)
+    common.write_bytes(args.output, packed.data, args.overwrite)
     console.result(result, _text(result, 8 * packed.report.first_bytes / FIRST_FRAME_RATE))
     return OK
 
 
-main = command(parser, _encode)
+main = common.command(parser, _encode)
 
 
 def _options(args: argparse.Namespace) -> EncodeOptions:
@@ -138,13 +123,13 @@ def _options(args: argparse.Namespace) -> EncodeOptions:
 
 def _load(args: argparse.Namespace) -> tuple[Scene, bool, Metadata | None]:
     """(scene, whether it has the unquantised values of a checkpoint, metadata)."""
-    data = read_bytes(args.input)
-    if is_pd4(data):
+    data = common.read_bytes(args.input)
+    if common.is_pd4(data):
         from pd4dgs_codec.format.decoder import decode
         from pd4dgs_codec.format.info import metadata_of
 
         return decode(data), False, _metadata(args, metadata_of(data))
-    return checkpoint_scene(args.input, data), True, _metadata(args, None)
+    return common.checkpoint_scene(args.input, data), True, _metadata(args, None)
 
 
 def _metadata(args: argparse.Namespace, had: Metadata | None) -> Metadata | None:
@@ -162,7 +147,7 @@ def _views(args: argparse.Namespace, console: Console) -> Views | None:
         return None
     from pd4dgs_codec.quality.packing import Views
 
-    dataset = read_dataset(args.data, args)
+    dataset = common.read_dataset(args.data, args)
     views = Views.of(dataset, args.data, args.views)
     console.detail(f"{args.data}: {len(views.fitting)} training views, {len(views.held_out)} held out")
     if not dataset.test:

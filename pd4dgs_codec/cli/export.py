@@ -9,20 +9,10 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from pd4dgs_codec.cli import options
-from pd4dgs_codec.cli.common import (
-    OK,
-    STDIO,
-    Console,
-    UsageError,
-    check_output,
-    command,
-    is_pd4,
-    read_bytes,
-    read_dataset,
-    write_bytes,
-)
+from pd4dgs_codec.cli import common, options
+from pd4dgs_codec.cli.common import OK, STDIO, Console, UsageError
 from pd4dgs_codec.cli.progress import progress_bar
+from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.io import whole_files
 
 if TYPE_CHECKING:
@@ -88,7 +78,7 @@ def _export(args: argparse.Namespace, console: Console) -> int:
     if args.to == "ply-seq":
         _check_folder(args.output, args.overwrite)
     else:
-        check_output(args.output, args.overwrite)
+        common.check_output(args.output, args.overwrite)
     from pd4dgs_codec.interchange.export import Export
     from pd4dgs_codec.interchange.formats import library
 
@@ -108,7 +98,7 @@ def _export(args: argparse.Namespace, console: Console) -> int:
     return OK
 
 
-main = command(parser, _export)
+main = common.command(parser, _export)
 
 
 def _check_usage(args: argparse.Namespace) -> None:
@@ -122,8 +112,6 @@ def _check_usage(args: argparse.Namespace) -> None:
 
 def _check_folder(path: str, overwrite: bool) -> None:
     """Refuses a folder with frames of another run, which must not mix with the new ones."""
-    from pd4dgs_codec.errors import DataError
-
     folder = Path(path)
     if folder.exists() and not folder.is_dir():
         raise DataError(f"{path}: is a file, expected the name of a folder")
@@ -133,11 +121,10 @@ def _check_folder(path: str, overwrite: bool) -> None:
 
 def _player(args: argparse.Namespace) -> Player:
     from pd4dgs_codec.draw.player import Player
-    from pd4dgs_codec.errors import DataError
     from pd4dgs_codec.format.decoder import decode
 
-    data = read_bytes(args.input)
-    if not is_pd4(data):
+    data = common.read_bytes(args.input)
+    if not common.is_pd4(data):
         raise DataError(f"{args.input}: is not a .pd4 file; pd4dgs-encode makes one from a checkpoint")
     return Player(decode(data, max_layer=args.level))
 
@@ -147,7 +134,7 @@ def _eyes(args: argparse.Namespace, player: Player) -> Eyes:
 
     if args.data is None:
         return eyes_of_scene(player)
-    return eyes_of_cameras([view.camera for view in read_dataset(args.data, args).train])
+    return eyes_of_cameras([view.camera for view in common.read_dataset(args.data, args).train])
 
 
 def _write_still(args: argparse.Namespace, export: Export, console: Console) -> dict[str, Any]:
@@ -167,13 +154,11 @@ def _write_still(args: argparse.Namespace, export: Export, console: Console) -> 
             f"pd4dgs-export: {what}, and SPZ rounds positions to {SPZ_STEP:.2g}; --scale enlarges the scene"
         )
     data = {"ply": ply_bytes, "spz": spz_bytes, "glb": glb_bytes}[args.to](splats)
-    write_bytes(args.output, data, args.overwrite)
+    common.write_bytes(args.output, data, args.overwrite)
     return {"frames": 1, "gaussians": len(splats.means), "bytes": len(data), "time": args.time or 0.0}
 
 
 def _scaled(splats: Splats, args: argparse.Namespace) -> Splats:
-    from pd4dgs_codec.errors import DataError
-
     if not len(splats.means):
         raise DataError(f"{args.input}: has no visible Gaussian at this level and time, expected at least one")
     return splats.scaled(args.scale)
@@ -181,8 +166,6 @@ def _scaled(splats: Splats, args: argparse.Namespace) -> Splats:
 
 def frame_times(info: SceneInfo, fps: float) -> list[float]:
     """Times of the frames at a rate, in seconds from the scene's start; the last is no later than its end."""
-    from pd4dgs_codec.errors import DataError
-
     start, stop = info.time_range
     count = math.floor((stop - start) * fps * (1 + 1e-6)) + 1
     if count > MAX_FRAMES:
@@ -204,7 +187,7 @@ def _write_sequence(args: argparse.Namespace, export: Export) -> dict[str, Any]:
         if args.to == "4dgs":
             kept = [(s, splats, slots) for s, (splats, slots) in zip(starts, frames, strict=True)]
             data = fourdgs_bytes(kept, starts[-1] + 1 / fps)
-            write_bytes(args.output, data, args.overwrite)
+            common.write_bytes(args.output, data, args.overwrite)
             return {"frames": len(starts), "gaussians": max(len(g.means) for _, g, _ in kept), "bytes": len(data)}
         return _write_folder(args, len(starts), (ply_bytes(splats) for splats, _ in frames))
 
@@ -233,10 +216,9 @@ def _write_folder(args: argparse.Namespace, count: int, frames: Iterator[bytes])
 
 
 def _cost(args: argparse.Namespace, export: Export) -> dict[str, Any]:
-    from pd4dgs_codec.errors import DataError
     from pd4dgs_codec.interchange.export import cost
 
-    views = read_dataset(args.compare, args).test
+    views = common.read_dataset(args.compare, args).test
     if not views:
         raise DataError(f"{args.compare}: has no held-out views; expected another --holdout")
     with progress_bar(len(views), "views", "comparing") as step:

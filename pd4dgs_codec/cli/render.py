@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any
 from pd4dgs_codec.cli import options
 from pd4dgs_codec.cli.common import OK, STDIO, Console, UsageError, check_output, command, named_input, read_dataset
 from pd4dgs_codec.cli.progress import progress_bar
+from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.io import whole_file, whole_files
 from pd4dgs_codec.threads import load_numba
 
@@ -110,7 +111,6 @@ def _check_usage(args: argparse.Namespace) -> str:
 
 
 def _frames(args: argparse.Namespace, level: Level) -> list[Frame]:
-    from pd4dgs_codec.errors import DataError
     from pd4dgs_codec.quality.frames import dataset_frames, own_frames
 
     if args.data is None:
