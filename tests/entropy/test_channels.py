@@ -1,15 +1,31 @@
 """Channels <-> payload: round trips, size against the model rate, and damaged payloads."""
 
 import math
+from dataclasses import dataclass, replace
+from typing import ClassVar
 
 import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pd4dgs_codec.entropy.ans import ans_encode
+from pd4dgs_codec.entropy import channels as coding
+from pd4dgs_codec.entropy import priors as registry
+from pd4dgs_codec.entropy.ans import ans_encode, model_of
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
-from pd4dgs_codec.entropy.priors import CONST, FREE_ENTRIES, GAUSS, GMM2, HIST, K_MAX, MAX_WINDOW
+from pd4dgs_codec.entropy.fitting import Fitted
+from pd4dgs_codec.entropy.priors import (
+    CONST,
+    FREE_ENTRIES,
+    GAUSS,
+    GMM2,
+    HIST,
+    K_MAX,
+    MAX_WINDOW,
+    Gauss,
+    Normal,
+    Window,
+)
 from pd4dgs_codec.entropy.tables import norm_table, uniform_table
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
 from pd4dgs_codec.errors import DecodeError, EncodeError, LimitExceeded, Malformed, UnsupportedFeature
@@ -281,3 +297,40 @@ def test_low_bits_past_the_last_symbol_are_malformed():
         decode_channels(head + words, [1])
     words = ans_encode([symbols[0], np.array([1])], [norm_table(2, 128, 0, 1), uniform_table(2)])
     assert decode_channels(head + words, [1])[0].tolist() == [K_MAX]
+
+
+@dataclass(frozen=True, eq=False)
+class Flat:
+    """A family of a later version: a window and nothing else."""
+
+    id: ClassVar[int] = 5
+    window: Window
+
+    @property
+    def cum(self):
+        return uniform_table((self.window.n - 1).bit_length())
+
+    @property
+    def model(self):
+        return model_of(self.cum)
+
+    def write(self, out):
+        self.window.write(out)
+
+    @classmethod
+    def read(cls, reader, shift):
+        return cls(Window.read(reader, shift))
+
+
+def test_a_further_family_is_one_class_in_the_registry(monkeypatch):
+    """Between Gaussians, whose tables are made together."""
+    rng = np.random.default_rng(0)
+    channels = [rng.integers(-8, 8, 50).astype(np.int32) for _ in range(3)]
+    gauss = Gauss(Window(-8, 16), Normal(2048, 100), 1)
+    plan = [Fitted(prior, np.zeros(16, np.int64), 0, 0) for prior in (gauss, Flat(Window(-8, 16)), replace(gauss))]
+    monkeypatch.setattr(coding, "plan_priors", lambda *_: plan)
+    payload = encode_channels(channels, priors="gauss").payload
+    with pytest.raises(UnsupportedFeature, match="prior 5"):
+        decode_channels(payload, [50] * 3)
+    monkeypatch.setitem(registry._FAMILIES, Flat.id, Flat)
+    assert_same(decode_channels(payload, [50] * 3), channels)

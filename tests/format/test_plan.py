@@ -13,7 +13,7 @@ from pd4dgs_codec.format.heads import head_bounds
 from pd4dgs_codec.format.kinds import LAYER_KINDS
 from pd4dgs_codec.format.plan import plan
 from pd4dgs_codec.format.residuals import sample_planes
-from pd4dgs_codec.scene import LENGTH_HEADS, LOCAL_HEADS, PLANES, Deformation, Widths, deformation_unit
+from pd4dgs_codec.scene import GLOBAL_HEADS, LENGTH_HEADS, LOCAL_HEADS, PLANES, Deformation, Widths, deformation_unit
 
 VOXEL = 0.0078125
 encode, encode_with_report = (partial(f, effort=1) for f in (encoder.encode, encoder.encode_with_report))
@@ -21,7 +21,7 @@ FINE = 2.0**-23  #: a step of weights that keeps 1e-7 and 1
 
 
 def constant_deformation(heads, value, time_of=None):
-    """Residuals equal to `value` in every head at all points, or only near the time row `time_of` of 5."""
+    """Residuals equal to `value` (of some heads, else 1) at all points, or only near the time row `time_of` of 5."""
     planes = {n: np.ones((1, 5 if b == 3 else 2, 2), np.float32) for n, _, b in PLANES}
     if time_of is not None:
         for name in ("xt", "yt", "zt"):
@@ -31,7 +31,7 @@ def constant_deformation(heads, value, time_of=None):
     trunk = ((np.full((1, 1), 1 / 16, np.float32), np.zeros(1, np.float32)),)
     networks = {"trunk": trunk}
     for name, outputs in heads.items():
-        weight = np.full((outputs, 1), value if np.isscalar(value) else value[name], np.float32)
+        weight = np.full((outputs, 1), value if np.isscalar(value) else value.get(name, 1.0), np.float32)
         networks[name] = ((weight, np.zeros(outputs, np.float32)),)
     return Deformation((planes,), networks)
 
@@ -108,11 +108,9 @@ def test_a_short_event_is_seen():
 
 
 def test_heads_that_quantise_to_zero_go_even_when_layers_are_asked_for():
-    scene = scene_with(
-        global_value={"position": 1.0, "feature": 1e-4, "offset": 1.0, "scaling": 1.0}, weights_step=2.0**-6
-    )
+    scene = scene_with(global_value={"feature": 1e-4}, weights_step=2.0**-6)
     got = decode(encode(scene, layers=2))
-    assert set(got.global_deformation.networks) == {"trunk", "position", "offset", "scaling"}
+    assert set(got.global_deformation.networks) == {"trunk", *GLOBAL_HEADS} - {"feature"}
     assert got.layers == (0, 1, 2) and got.local_deformation is None
     assert encode(got, layers=2) == encode(scene, layers=2)
 
