@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import re
-from email.utils import parsedate_to_datetime
 
 #: Positions of more digits belong to no file, and int() takes quadratic time for them.
 _DIGITS = r"[0-9]{1,18}"
@@ -55,14 +54,6 @@ def strong_etag(header: str | None) -> str | None:
 def lists_etag(header: str, etag: str) -> bool:
     """Whether an If-None-Match header names the tag (weak comparison)."""
     return header.strip() == "*" or etag in re.findall(r'(?:W/)?("[^"]*")', header)
-
-
-def http_time(header: str | None) -> float | None:
-    """Seconds since 1970 of an HTTP date; None if it is missing or invalid."""
-    try:
-        return parsedate_to_datetime(header).timestamp() if header else None
-    except (TypeError, ValueError, OverflowError):
-        return None
 
 
 def cache_control(name: str) -> str:

@@ -16,7 +16,6 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from email.utils import formatdate
 from http import HTTPStatus
 from http.server import BaseHTTPRequestHandler
 from pathlib import Path
@@ -26,7 +25,7 @@ from urllib.parse import quote, unquote, urlsplit
 
 from pd4dgs_codec.errors import DeliveryError
 from pd4dgs_codec.web import PAGE
-from pd4dgs_codec.web.headers import Unsatisfiable, cache_control, http_time, lists_etag, requested_range
+from pd4dgs_codec.web.headers import Unsatisfiable, cache_control, lists_etag, requested_range
 
 MEDIA_TYPES = {
     ".html": "text/html; charset=utf-8",
@@ -255,13 +254,14 @@ class _Handler(BaseHTTPRequestHandler):
         path, etag, state = Path(file.name), _etag(file), os.fstat(file.fileno())
         suffix, body, size = path.suffix.lower(), file, state.st_size
         headers = {"Accept-Ranges": "bytes", "Cache-Control": cache_control(path.name)}
-        headers["Last-Modified"] = formatdate(state.st_mtime, usegmt=True)
+        headers["Last-Modified"] = self.date_time_string(state.st_mtime)
         if suffix in ZIPPED:
             headers["Vary"] = "Accept-Encoding"
-        zipped = suffix in ZIPPED and size <= MAX_ZIPPED and self._takes_gzip()
+        codings = self.headers.get("Accept-Encoding", "").lower().replace(" ", "").split(",")
+        zipped = suffix in ZIPPED and size <= MAX_ZIPPED and "gzip" in codings and "Range" not in self.headers
         # another representation, with other ranges and another ETag
         headers["ETag"] = etag[:-1] + '-gzip"' if zipped else etag
-        if self._unchanged(headers["ETag"], state.st_mtime):
+        if lists_etag(self.headers.get("If-None-Match", ""), headers["ETag"]):
             self._begin(HTTPStatus.NOT_MODIFIED, headers)
             return
         headers["Content-Type"] = MEDIA_TYPES.get(suffix, "application/octet-stream")
@@ -270,7 +270,7 @@ class _Handler(BaseHTTPRequestHandler):
             size, headers["Content-Encoding"] = body.getbuffer().nbytes, "gzip"
         part = None
         try:
-            if self.command == "GET" and self._range_holds(etag, state):  # HTTP defines ranges for GET only
+            if self.command == "GET" and self.headers.get("If-Range") in (None, etag):  # HEAD has no ranges
                 part = requested_range(self.headers.get("Range"), size)
         except Unsatisfiable:
             self._fail(HTTPStatus.REQUESTED_RANGE_NOT_SATISFIABLE, {**headers, "Content-Range": f"bytes */{size}"})
@@ -284,10 +284,6 @@ class _Handler(BaseHTTPRequestHandler):
             body.seek(start)
             self._send_body(body, end - start, lambda: _etag(file) == etag)
 
-    def _takes_gzip(self) -> bool:
-        listed = self.headers.get("Accept-Encoding", "").lower().replace(" ", "").split(",")
-        return "gzip" in listed and "Range" not in self.headers
-
     def _send_body(self, body: BinaryIO, left: int, unchanged: Callable[[], bool]) -> None:
         link = self.server.link
         with link.transfer():
@@ -300,20 +296,6 @@ class _Handler(BaseHTTPRequestHandler):
                 link.cross(len(block))
                 self.wfile.write(block)
                 left -= len(block)
-
-    def _unchanged(self, etag: str, modified: float) -> bool:
-        tags = self.headers.get("If-None-Match")
-        if tags is not None:
-            return lists_etag(tags, etag)
-        since = http_time(self.headers.get("If-Modified-Since"))
-        return since is not None and int(modified) <= since
-
-    def _range_holds(self, etag: str, state: os.stat_result) -> bool:
-        """Whether If-Range, if given, names this file. A date counts once its second is over."""
-        condition = self.headers.get("If-Range")
-        if condition is None or condition == etag:
-            return True
-        return http_time(condition) == int(state.st_mtime) and time.time() - state.st_mtime > 2
 
     def _fail(self, status: HTTPStatus, headers: dict[str, str] | None = None) -> None:
         text = f"{status.value} {status.phrase}\n".encode()

@@ -12,6 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler
 from socketserver import ThreadingTCPServer
+from types import SimpleNamespace
 
 from pd4dgs_codec.web.headers import Unsatisfiable, requested_range
 from pd4dgs_codec.web.server import Link, Server
@@ -132,21 +133,11 @@ class _Handler(BaseHTTPRequestHandler):
         """The server is silent."""
 
 
-@dataclass(frozen=True)
-class Answer:
-    status: int
-    headers: http.client.HTTPMessage
-    body: bytes
-
-
-def ask(server: Server, target: str, method: str = "GET", **headers: str) -> Answer:
-    """One request on a connection of its own; If_Range="..." sends If-Range."""
+def ask(server: Server, target: str, method: str = "GET", **headers: str) -> SimpleNamespace:
+    """status, headers and body of one request on a connection of its own; If_Range="..." sends If-Range."""
     host, port = server.server_address[:2]
+    given = {"Host": f"{host}:{port}", **{name.replace("_", "-"): value for name, value in headers.items()}}
     with contextlib.closing(http.client.HTTPConnection(host, port, timeout=10)) as connection:
-        connection.putrequest(method, target, skip_host=True, skip_accept_encoding=True)
-        connection.putheader("Host", f"{host}:{port}")
-        for name, value in headers.items():
-            connection.putheader(name.replace("_", "-"), value)
-        connection.endheaders()
+        connection.request(method, target, headers=given)
         response = connection.getresponse()
-        return Answer(response.status, response.headers, response.read())
+        return SimpleNamespace(status=response.status, headers=response.headers, body=response.read())
