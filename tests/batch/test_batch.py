@@ -33,14 +33,14 @@ def test_a_killed_run_goes_on_after_its_last_record(library):
     assert (library.out / "a.pd4.done.json").exists()
 
 
-def test_an_output_that_vanished_or_was_cut_is_made_again(library):
+def test_missing_or_truncated_output_is_made_again(library):
     library.add("a.pt", "text")
     library.run()
     (library.out / "a.pd4").write_text("TE")
     assert library.run().done == 1 and (library.out / "a.pd4").read_text() == "TEXT"
 
 
-def test_files_of_others_stay_unless_told_otherwise(library):
+def test_foreign_files_stay_without_overwrite(library):
     library.add("a.pt", "text")
     library.out.mkdir()
     (library.out / "a.pd4").write_text("mine")
@@ -50,7 +50,7 @@ def test_files_of_others_stay_unless_told_otherwise(library):
 
 
 @pytest.mark.parametrize("change", ["source", "options", "version"])
-def test_what_another_input_made_is_named_and_the_others_go_on(library, change):
+def test_output_of_other_input_is_refused_and_the_others_go_on(library, change):
     library.add("a.pt", "text")
     library.run()
     if change == "source":
@@ -173,7 +173,7 @@ def test_uris_of_fsspec_are_sources_and_outputs(library):
     assert library.made() == ["text"]
 
 
-def test_a_store_that_refuses_is_named_before_any_work(tmp_path):
+def test_read_only_store_is_named_before_any_work(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(DataError, match="file: takes no output: File exists"):
         store.Root(str(tmp_path / "file")).check()

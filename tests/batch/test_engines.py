@@ -1,4 +1,4 @@
-"""The engines: workers that die or dawdle, stores that fail, and the same bytes whoever runs the jobs."""
+"""The engines: dying and slow workers, failing stores, equal outputs."""
 
 from __future__ import annotations
 
@@ -51,13 +51,13 @@ def test_a_job_that_always_kills_its_worker_is_named(filled):
     assert outcome.state == "failed" and tries == 1 and "no-such-folder" in outcome.message
 
 
-def test_a_straggler_is_ended_and_tried_again(filled):
+def test_slow_job_is_ended_and_tried_again(filled):
     filled.add("z.pt", f"dawdle {filled.folder}/flag")
     summary = filled.run(workers=2, timeout=5.0)
     assert summary.done == 9 and summary.retried >= 1
 
 
-def test_a_late_job_is_named_by_its_limit(library):
+def test_timed_out_job_names_its_limit(library):
     for n in range(2):
         library.add(f"{n}.pt", f"dawdle {library.folder}/flag{n}")
     summary = library.run(workers=2, timeout=0.5, retries=0)

@@ -265,7 +265,7 @@ def test_a_time_beyond_binary32_is_refused(tmp_path, refused):
 @pytest.mark.parametrize(
     "name, value", [*(("downscale", k) for k in (0, -1, 2.0, True, 9)), ("holdout", 1), ("holdout", -2)]
 )
-def test_options_that_leave_nothing(blender, refused, name, value):
+def test_bad_options(blender, refused, name, value):
     refused(blender(), f"{name} {'is ' if name == 'downscale' and value != 9 else ''}{value}", **{name: value})
 
 

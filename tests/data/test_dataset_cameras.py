@@ -39,7 +39,7 @@ def test_matches_opencv_formula():
     np.testing.assert_allclose([xd, yd], [1.5 + 0.04 + 0.02 * 7, 3.0 + 0.08 + 0.01 * 13])
 
 
-def test_what_folds_back_is_not_seen():
+def test_folded_pixels_are_masked():
     """With k1 = -.5 the image is folded beyond r = sqrt(2/3), where the stored picture would be shown a second time."""
     lens = Lens(96, 64, 40.0, 40.0, 48.0, 32.0, 0.0, (-0.5, 0.0, 0.0))
     _, seen = rectify(np.full((64, 96, 3), 200, np.uint8), lens)
@@ -90,7 +90,7 @@ def test_times():
         ((-3e38, 3e38), (-3e38, 3e38)),
     ],
 )
-def test_the_range_in_seconds_outlives_binary32(span, expected):
+def test_seconds_range_survives_binary32(span, expected):
     assert seconds_range(*span) == expected
 
 

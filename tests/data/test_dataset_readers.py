@@ -233,7 +233,7 @@ def test_colmap_is_read_back(scene, tmp_path, form):
     np.testing.assert_array_equal(data.point_colors[order[0]], scene.point_colors[:POINTS][order[1]])
 
 
-def test_times_come_from_a_list_if_there_is_one(scene, tmp_path):
+def test_times_come_from_times_txt(scene, tmp_path):
     folder = folders.write_colmap(scene, tmp_path / "set")
     (folder / "times.txt").write_text("".join(f"{colmap_name(i)} {3 + i * i}\n" for i in range(COUNT)))
     data = load(folder, holdout=0)

@@ -1,4 +1,4 @@
-"""Data that is whole but teaches little: one frame, one place, one instant, views without a valid pixel."""
+"""Valid datasets that hold little: one frame, one place, one instant, views without a valid pixel."""
 
 import json
 from dataclasses import replace
@@ -10,7 +10,7 @@ from folders import pose, write_iphone
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.errors import DataError
 
-#: A lens that sees nothing: its picture lies thousands of pixels off the axis.
+#: A lens without a valid pixel: its picture lies thousands of pixels off the axis.
 BLIND = {"cx": 4000, "k1": 0.5}
 
 
@@ -37,7 +37,7 @@ def test_one_frame(blender):
     ]
 
 
-def test_one_place_and_one_instant_are_said(blender):
+def test_one_place_and_one_instant_are_remarked(blender):
     folder = blender()
     change(folder, lambda i: {"transform_matrix": pose(0.3)})
     assert ["one place" in r for r in load(folder).remarks()] == [True]

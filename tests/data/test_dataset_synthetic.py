@@ -1,4 +1,4 @@
-"""The ray caster against a marching one, and the scenes' promises."""
+"""The ray caster against ray marching, and the documented properties of the scenes."""
 
 import hashlib
 
@@ -120,7 +120,7 @@ def test_masks_are_covisibility(local):
     assert ((share > 0.8) & (share < 1)).all()
 
 
-def test_points_lie_on_what_is_seen(local):
+def test_points_lie_on_visible_surfaces(local):
     """Points project onto pixels of their own colour in the first frame, where nothing hides them."""
     v = local.train[0]
     placed = place(SceneBuilder("local", 0).bodies(), 0.0)
@@ -150,7 +150,7 @@ def test_content_depends_on_the_string_alone(local):
     assert digest(syn._dataset.__wrapped__(syn.parse("synthetic:local?frames=6&seed=1"))) != digest(once)
 
 
-def test_size_and_frames_are_those_asked_for(local):
+def test_size_and_frames_options(local):
     """As much from top to bottom, the same motion over the same seconds."""
     other = load("synthetic:local?size=96x48&frames=7")
     assert len(other.train) == 7 and [v.time for v in other.train] == [i / 6 for i in range(7)]
@@ -176,7 +176,7 @@ def test_seed_and_name_change_the_picture():
 
 
 @pytest.mark.parametrize("name", MOTIONS)
-def test_motion_is_what_the_name_says(name):
+def test_motion_of_each_scene(name):
     """From a fixed camera: static never changes; the others do, fast more per frame than global."""
     bodies = SceneBuilder(name, 0).bodies()
     camera = syn.fixed_viewmats()[0]

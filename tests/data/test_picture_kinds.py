@@ -1,4 +1,4 @@
-"""Every kind of pixel that a picture file may hold is read as its maker saw it, or refused by name."""
+"""Every pixel format of picture files is converted to sRGB or refused."""
 
 from __future__ import annotations
 
@@ -64,7 +64,7 @@ def from_linear(levels: np.ndarray) -> np.ndarray:
     return 255 * np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 
 
-#: What is written, what is read, and by how many levels they may differ.
+#: Writer, expected pixels, and the tolerance in levels.
 READ = {
     "grey.png": (lambda p: Image.fromarray(RAMP).save(p), grey(RAMP), 0),
     "one-bit.png": (lambda p: Image.fromarray(RAMP > 99).save(p), grey(255 * (RAMP > 99)), 0),
@@ -126,7 +126,7 @@ REFUSED = {
 
 
 @pytest.mark.parametrize("name", READ)
-def test_read_as_seen(tmp_path, name):
+def test_readable_kinds(tmp_path, name):
     write, expected, tolerance = READ[name]
     write(tmp_path / name)
     got = read_image(tmp_path / name, (16, 16))
@@ -135,7 +135,7 @@ def test_read_as_seen(tmp_path, name):
 
 
 @pytest.mark.parametrize("name", REFUSED)
-def test_refused_by_name(tmp_path, name):
+def test_refused_kinds(tmp_path, name):
     write, says = REFUSED[name]
     write(tmp_path / name)
     with pytest.raises(DataError, match=f"{name}: .*{says}") as caught:

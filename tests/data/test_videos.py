@@ -81,7 +81,7 @@ def test_a_cache_that_is_lost_or_broken_is_reported_and_made_anew(folder, cache)
     np.testing.assert_array_equal(load(folder).train[0].image, expected)
 
 
-def test_shots_are_kept_within_their_bytes(scene, monkeypatch):
+def test_training_views_are_kept_within_a_budget(scene, monkeypatch):
     import torch
 
     views = scene.train[:6]

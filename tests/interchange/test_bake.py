@@ -1,4 +1,4 @@
-"""Baking: exact where nothing depends on the eye, least squares where something does."""
+"""Baking: exact for scenes without view dependence, least squares otherwise."""
 
 from dataclasses import replace
 
@@ -78,7 +78,7 @@ def test_least_squares_find_the_harmonics_that_colours_were_made_of():
     np.testing.assert_array_equal(_fitted(basis, colors, weights)[2], 0)
 
 
-def test_what_eyes_see_is_what_their_cameras_see(player):
+def test_gaussians_of_eyes_equal_those_of_cameras(player):
     cameras = _cameras(3)
     eyes = eyes_of_cameras(cameras)
     for rows in (player.active, player.active[5:9]):

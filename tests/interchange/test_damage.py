@@ -1,4 +1,4 @@
-"""Files of others with bytes changed, cut out or repeated: what is read is a DataError or a value, and nothing else."""
+"""Imported files with bytes changed, cut out or repeated are read or raise DataError."""
 
 from __future__ import annotations
 

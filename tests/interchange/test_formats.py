@@ -1,4 +1,4 @@
-"""Exported files as independent readers find them."""
+"""Exported files through independent readers."""
 
 import io
 
@@ -22,7 +22,7 @@ def make_splats(n: int = 40, degree: int = 3, seed: int = 0) -> Splats:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_plyfile_reads_what_3d_gaussian_splatting_would_have_written(degree):
+def test_plyfile_reads_the_layout_of_3d_gaussian_splatting(degree):
     plyfile = pytest.importorskip("plyfile")
     splats = make_splats(degree=degree)
     vertices = plyfile.PlyData.read(io.BytesIO(ply_bytes(splats)))["vertex"].data
@@ -104,13 +104,13 @@ def test_gaussforge_reads_the_spz_back(capfdbinary):
     np.testing.assert_allclose(fields["sh"].reshape(-1, 15, 3), splats.sh[:, 1:], atol=0.07)
 
 
-def test_spz_refuses_what_its_fixed_point_cannot_hold():
+def test_spz_refuses_positions_out_of_range():
     pytest.importorskip("gaussforge")
     with pytest.raises(DataError, match="a Gaussian lies .* units from 0, SPZ holds 2048 at most"):
         spz_bytes(make_splats().scaled(1e4))
 
 
-def test_fourdgs_reads_frames_whose_gaussians_move_to_their_next_places():
+def test_fourdgs_reads_moving_gaussians():
     fourdgs = pytest.importorskip("fourdgs")
     first, second = make_splats(30, 1, 1), make_splats(20, 1, 1)
     second = Splats(first.means[:20] + np.float32(0.1), *list(vars(second).values())[1:])

@@ -121,7 +121,7 @@ def _same(model, theirs: Checkpoint, picture: int | None = None) -> None:
 
 @pytest.mark.parametrize("script", [True, False])
 @pytest.mark.parametrize("appearance", [False, True])
-def test_the_model_is_theirs_to_1e_4(tmp_path, cli, script, appearance):
+def test_imported_gaussians_follow_the_published_formulas(tmp_path, cli, script, appearance):
     theirs = Checkpoint(appearance=appearance)
     theirs.write(tmp_path / "run", script=script)
     out = tmp_path / "model.pt"
@@ -133,7 +133,7 @@ def test_the_model_is_theirs_to_1e_4(tmp_path, cli, script, appearance):
     _same(model, theirs, 3 if appearance else None)
 
 
-def test_what_is_imported_encodes_and_keeps_its_anchors(tmp_path):
+def test_imported_scene_encodes_and_keeps_its_anchors(tmp_path):
     theirs = Checkpoint(1)
     scene = read_scaffold_gs(theirs.write(tmp_path), Choices())
     back = decode(encode(to_scene(from_scene(scene)), layers=0, effort=1))
@@ -142,7 +142,7 @@ def test_what_is_imported_encodes_and_keeps_its_anchors(tmp_path):
     np.testing.assert_allclose(back.anchor[order[0]], theirs.anchor[order[1]], atol=1e-6)
 
 
-def test_the_runs_files_tell_voxel_background_and_camera(tmp_path):
+def test_run_files_give_voxel_background_and_camera(tmp_path):
     theirs = Checkpoint(voxel=0.02)
     theirs.write(tmp_path)
     text = "Namespace(feat_dim=32, voxel_size=0.005, white_background=True, __import__('os').mkdir('x'))"
@@ -174,7 +174,7 @@ def _fails(tmp_path: Path, cli, *options: object) -> str:
     return result.err
 
 
-def test_what_cannot_be_taken_over_is_refused_by_name(tmp_path, cli):
+def test_unsupported_models_are_refused(tmp_path, cli):
     place = Checkpoint(distance=True).write(tmp_path / "run")
     assert "takes the distance as well (36 inputs), expected 35" in _fails(tmp_path, cli)
     (place / "feature_bank_mlp.pt").touch()
@@ -218,7 +218,7 @@ def test_plys_with_bad_numbers(tmp_path, cli):
     assert "holds no anchor" in _fails(tmp_path, cli)
 
 
-def test_folders_that_are_none(tmp_path, cli):
+def test_broken_folders(tmp_path, cli):
     assert "found nothing" in _fails(tmp_path, cli)
     (tmp_path / "run").mkdir()
     assert "has no point_cloud.ply" in _fails(tmp_path, cli)
@@ -253,7 +253,7 @@ def test_pickled_code_is_refused_and_not_run(tmp_path, capfdbinary):
     assert capfdbinary.readouterr().out == b""
 
 
-def test_tensors_are_those_that_torch_wrote(tmp_path):
+def test_tensors_equal_those_written_by_torch(tmp_path):
     base = torch.arange(24.0).reshape(4, 6)
     tensors = {"whole": base, "turned": base.T, "part": base[1:3, 2:4], "long": torch.tensor([3, 4]), "none": base[:0]}
     tensors |= {"double": base.double(), "half": base.half(), "parameter": nn.Parameter(base), "scalar": base[2, 3]}

@@ -1,4 +1,4 @@
-"""Explicit Gaussians of others as datasets: read, checked, seen from around, and learnt."""
+"""Gaussians of other programs as datasets for training."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ def test_spz_and_4dgs_come_back_rounded(tmp_path):
 
 
 @pytest.mark.parametrize("name, count", [("guitar.compressed.ply", 90_854), ("biker.spz", 152_746)])
-def test_splats_of_others(name, count):
+def test_splat_files_of_other_programs(name, count):
     pytest.importorskip("gaussforge")
     path = Path(os.environ.get("PD4DGS_SHARED", Path(__file__).parents[3] / "shared" / "data")) / "splats" / name
     if not path.is_file():
@@ -118,7 +118,7 @@ def nothing(t):
 """
 
 
-def test_a_function_is_asked_at_any_time(tmp_path, monkeypatch):
+def test_function_source(tmp_path, monkeypatch):
     (tmp_path / "my_model.py").write_text(FUNCTION)
     monkeypatch.chdir(tmp_path)
     monkeypatch.delitem(sys.modules, "my_model", raising=False)
@@ -168,7 +168,7 @@ def test_cameras_of_a_dataset_keep_its_held_out_pictures(tmp_path):
         assert mine.image.tobytes() != theirs.image.tobytes()
 
 
-def test_a_cameras_json_beside_the_frames_is_heeded(tmp_path):
+def test_cameras_json_beside_the_frames_is_used(tmp_path):
     import json
 
     folder = _sequence(tmp_path / "seq", 1)
@@ -246,7 +246,7 @@ def _header(version: int, count: int, streams: int = 0) -> bytes:
     ],
     ids=["empty", "junk", "other bytes", "a bomb", "a count", "a bomb of version 4", "no Gaussians"],
 )
-def test_bad_spz_files_are_one_line_before_they_fill_the_memory(tmp_path, capfd, data, message):
+def test_bad_spz_files_are_refused_before_they_fill_memory(tmp_path, capfd, data, message):
     pytest.importorskip("gaussforge")
     path = tmp_path / "a.spz"
     path.write_bytes(data)

@@ -1,4 +1,4 @@
-"""Which frames are taken: sharp ones, spread over the time, none twice."""
+"""Choice of frames: sharp, spread over time, without repetitions."""
 
 from __future__ import annotations
 

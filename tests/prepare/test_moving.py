@@ -1,4 +1,4 @@
-"""Epipolar residuals, and the verdict that they give on features."""
+"""Epipolar residuals, and moving features found by them."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def scene():
     return poses, places
 
 
-def test_still_points_have_no_residual_and_others_have_that_of_the_nearest_match(scene):
+def test_static_points_have_no_residual_and_moving_ones_the_sampson_distance(scene):
     poses, places = scene
     rotation = poses[3][:, :3] @ poses[0][:, :3].T
     relative = np.column_stack([rotation, poses[3][:, 3] - rotation @ poses[0][:, 3]])
@@ -42,7 +42,7 @@ def _inverse(relative: np.ndarray) -> np.ndarray:
     return np.column_stack([relative[:, :3].T, -relative[:, :3].T @ relative[:, 3]])
 
 
-def test_what_moves_is_told_from_what_stands_still(scene):
+def test_moving_features_are_found(scene):
     poses, places = scene
     rng = np.random.default_rng(2)
     verdicts = {k: Verdicts(p * FOCAL + WIDTH / 2) for k, p in places.items()}
@@ -56,7 +56,7 @@ def test_what_moves_is_told_from_what_stands_still(scene):
         assert moving[150:].all() and moving[:150].sum() <= 3
 
 
-def test_pictures_without_a_pose_and_features_without_matches_have_no_say(scene):
+def test_pictures_without_pose_and_features_without_matches_do_not_count(scene):
     poses, places = scene
     verdicts = {k: Verdicts(p * FOCAL) for k, p in places.items()}
     index = np.stack([np.arange(200)] * 2, axis=1)

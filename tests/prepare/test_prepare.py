@@ -76,7 +76,7 @@ def test_the_model_stands_upright_around_0(prepared):
     assert np.abs(np.median(data.points, axis=0)).max() < 1e-3
 
 
-def test_the_report_says_what_was_found(prepared):
+def test_report(prepared):
     report = json.loads((prepared / "report.json").read_text())
     assert report["frames"] == {"seen": COUNT, "blurred": 0, "repeated": 0, "chosen": COUNT, "registered": COUNT}
     assert 0 < report["reprojection_error"] < 1.5 and report["points"] > 200
@@ -95,7 +95,7 @@ def test_an_interruption_says_how_to_go_on(room, tmp_path, monkeypatch, capsys):
     assert capsys.readouterr().err.splitlines()[-1].endswith(line)
 
 
-def test_what_cannot_be_registered_is_one_line_and_leaves_nothing(tmp_path, capsys):
+def test_unregistrable_recording_is_refused_and_leaves_nothing(tmp_path, capsys):
     rng = np.random.default_rng(0)
     frames = write(tmp_path / "noise", [rng.integers(0, 255, (96, 128, 3), np.uint8) for _ in range(10)])
     assert main([str(frames), "-o", str(tmp_path / "out"), "-j", "2"]) == 1
@@ -104,7 +104,7 @@ def test_what_cannot_be_registered_is_one_line_and_leaves_nothing(tmp_path, caps
     assert sorted(path.name for path in tmp_path.iterdir()) == ["noise"]
 
 
-def test_a_folder_of_someone_else_is_not_replaced(room, tmp_path, capsys):
+def test_foreign_folder_is_not_replaced(room, tmp_path, capsys):
     (tmp_path / "out").mkdir()
     assert main([str(room[0]), "-o", str(tmp_path / "out")]) == 1
     assert "exists already; --overwrite replaces" in capsys.readouterr().err
