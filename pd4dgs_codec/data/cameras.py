@@ -137,10 +137,10 @@ def distort_fisheye(x: np.ndarray, y: np.ndarray, k: tuple[float, float, float, 
     return x * scale, y * scale, angle < last
 
 
-def undistort(xd: np.ndarray, yd: np.ndarray, lens: Lens, iterations: int = 12) -> tuple[np.ndarray, np.ndarray]:
-    """Inverse of `distort` by Newton's method on all points at once, started at the distorted point."""
+def undistort(xd: np.ndarray, yd: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
+    """Inverse of `distort` by 12 steps of Newton's method on all points at once, from the distorted points."""
     x, y = np.array(xd, np.float64), np.array(yd, np.float64)
-    for _ in range(iterations):
+    for _ in range(12):
         fx, fy, xx, xy, yy = distort(x, y, lens)
         fx, fy, det = fx - xd, fy - yd, xx * yy - xy * xy
         det = np.where(np.abs(det) < 1e-9, np.inf, det)
@@ -150,10 +150,10 @@ def undistort(xd: np.ndarray, yd: np.ndarray, lens: Lens, iterations: int = 12) 
 
 @lru_cache(maxsize=8)
 def _warp(lens: Lens) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """The place of each ideal pinhole pixel in the stored image (u, v float64 [H, W]), and bool if it is there.
+    """Coordinates in the stored image of each ideal pinhole pixel (u, v float64 [H, W]), and bool: it is inside.
 
-    Far off the axis the polynomial folds back and would show the image twice, so a pixel counts as seen only if the
-    inverse leads back to it.
+    Far off the axis the polynomial folds back and would show the image twice, so a pixel is valid only if the inverse
+    leads back to it.
     """
     u, v = np.meshgrid(np.arange(lens.width) + 0.5, np.arange(lens.height) + 0.5)
     x, y = (u - lens.cx) / lens.fx, (v - lens.cy) / lens.fy

@@ -131,15 +131,13 @@ def find_image(folder: Path, name: str) -> Path:
 
 def _open(path: Path, what: str = "image", size: tuple[int, int] | None = None) -> Picture:
     """The picture in a file, its pixels not decoded yet. size: the (W, H) to expect."""
-    try:
-        from PIL import Image, UnidentifiedImageError
-    except ImportError:
-        raise DataError(f"{path}: reading images needs pillow (pip install 'pd4dgs-codec[train]')") from None
+    from PIL import Image  # of the extra `train`
+
     try:
         picture = Image.open(path)
     except FileNotFoundError:
         raise DataError(f"{path}: image is missing") from None
-    except (UnidentifiedImageError, OSError, ValueError, SyntaxError, Image.DecompressionBombError):
+    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
         raise DataError(f"{path}: not an image that can be read") from None
     if size is not None and picture.size != tuple(size):
         picture.close()

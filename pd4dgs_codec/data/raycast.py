@@ -1,8 +1,8 @@
 """An analytic ray caster for moving convex bodies, in numpy.
 
 Every body is a unit shape (sphere |m| <= 1, box |m_i| <= 1, cylinder m_x² + m_y² <= 1, |m_z| <= 1) in its own material
-coordinates m, placed by an affine map that depends on time: x = A(t) m + c(t). So a point of the surface is followed
-through any motion, stretching included, by keeping its m.
+coordinates m, placed by an affine map that depends on time: x = A(t) m + c(t). The material coordinates of a surface
+point stay constant in any motion, including stretching.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ LIGHT = np.array([0.42, -0.58, 0.70]) / np.linalg.norm([0.42, -0.58, 0.70])  #: 
 AMBIENT, DIFFUSE = 0.42, 0.68
 NO_BODY = -1
 CORNERS = np.array([[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)]).T
-#: A shadow goes from full to none where the light passes between these distances of the body's inscribed ellipsoid.
+#: Shadows fade between these distances of the light ray from a body's centre, in radii of its inscribed ellipsoid.
 PENUMBRA = (0.8, 1.25)
 
 
@@ -53,7 +53,7 @@ class Paint:
 
 @dataclass(frozen=True, eq=False)
 class Body:
-    """shape: "sphere", "box" or "cylinder"; pose: A(t), c(t); casts: whether it throws a shadow."""
+    """shape: "sphere", "box" or "cylinder"; pose: A(t), c(t); casts: whether it casts a shadow."""
 
     shape: str
     pose: Callable[[float], Pose]
@@ -95,7 +95,7 @@ def _round(o: np.ndarray, d: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 
 def enter(shape: str, o: np.ndarray, d: list[np.ndarray]) -> np.ndarray:
-    """Least s > 0 at which the ray o + s d enters the unit shape from outside; inf on a miss.
+    """Smallest s > 0 at which the ray o + s d enters the unit shape from outside; inf on a miss.
 
     o: [3] material origin (one for all rays); d: three arrays of material directions.
     """
@@ -123,7 +123,7 @@ def normal(shape: str, m: np.ndarray) -> np.ndarray:
 
 
 class Eye:
-    """A pinhole looking at placed bodies. Rays are x, y at depth 1 (camera axes), so distance along them is depth."""
+    """A pinhole camera and placed bodies. Rays are x, y at depth 1 (camera axes), so distance along them is depth."""
 
     def __init__(self, placed: Sequence[Placed], viewmat: np.ndarray):
         self.placed, self.viewmat = placed, viewmat
@@ -156,9 +156,9 @@ class Eye:
         return depth, index
 
     def hidden(self, x: np.ndarray, y: np.ndarray, depth: np.ndarray, own: np.ndarray) -> np.ndarray:
-        """bool [n]: a body other than `own` [n] lies before `depth` [n] on the ray (x, y).
+        """bool [n]: a body other than `own` [n] is closer than `depth` [n] on the ray (x, y).
 
-        A body never hides its own front: the shapes are convex. The caller sorts out backs.
+        The shapes are convex, so a body never hides its own front; the caller excludes backs.
         """
         result = np.zeros(len(x), bool)
         for i, body in enumerate(self.placed):
@@ -180,7 +180,7 @@ def material(body: Placed, world: np.ndarray) -> np.ndarray:
 
 
 def light_reaching(placed: Sequence[Placed], own: int, world: np.ndarray) -> np.ndarray:
-    """Share of the light, 0..1 [n], that the ellipsoids inscribed in the other bodies let through to `world`."""
+    """Share of the light, 0..1 [n], that reaches `world` [3, n] past the ellipsoids inscribed in the other bodies."""
     low, high = PENUMBRA
     result = np.ones(world.shape[1], world.dtype)
     for i, body in enumerate(placed):
@@ -192,7 +192,7 @@ def light_reaching(placed: Sequence[Placed], own: int, world: np.ndarray) -> np.
         along = towards @ m
         miss = np.sqrt(np.maximum((m * m).sum(axis=0) - along * along, 0))
         s = np.clip((miss - low) / (high - low), 0, 1)
-        # Past the body's middle (along > 0) the light is already clear; fade so that no edge shows.
+        # Points past the body's centre towards the light (along > 0) are lit; the fade avoids a visible edge.
         s = np.maximum(s * s * (3 - 2 * s), np.clip(along + 1, 0, 1))
         result *= s
     return result

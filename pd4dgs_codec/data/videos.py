@@ -61,10 +61,8 @@ def open_video(path: Path, *, grey: bool = False, output: Sequence[str] = ()) ->
     """
     if not path.is_file():
         raise DataError(f"{path}: found {'no file' if not path.exists() else 'no regular file'}, expected a video")
-    try:
-        from imageio_ffmpeg import read_frames
-    except ImportError:
-        raise DataError(f"{path}: videos need imageio-ffmpeg (pip install 'pd4dgs-codec[train]')") from None
+    from imageio_ffmpeg import read_frames  # of the extra `train`
+
     pixels: dict[str, Any] = {"pix_fmt": "gray", "bits_per_pixel": 8} if grey else {}
     reader = read_frames(str(path), output_params=list(output), **pixels)
     with _failures(path):

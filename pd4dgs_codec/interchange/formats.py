@@ -38,7 +38,7 @@ TYPES = {1: "SCALAR", 3: "VEC3", 4: "VEC4"}
 JSON, BINARY = 0x4E4F534A, 0x004E4942  #: types of chunks
 #: SPZ rounds positions to SPZ_STEP and holds them up to SPZ_REACH from 0, scene units: 24 bits, 12 of them fractional.
 SPZ_STEP, SPZ_REACH = 1 / 4096, 2048.0
-#: SPZ's first bytes, and bounds: Gaussians, and unpacked bytes of each (65 with all harmonics, and extensions).
+#: SPZ's first bytes; the most Gaussians, and unpacked bytes of each: 65 with all harmonics, the rest for extensions.
 SPZ_MAGIC, SPZ_MOST, SPZ_BYTES = b"NGSP", 10_000_000, 128
 #: 4dgs files store harmonics but the constant as bytes, from -SH_SPAN to SH_SPAN.
 SH_SPAN = 4.0
@@ -70,7 +70,7 @@ def checked(
 
 
 def library(name: str, what: str) -> Any:
-    """A module of the extra; DataError that names it if it is not there."""
+    """A module of the extra `interchange`. Raises DataError if it is not installed."""
     try:
         return import_module(name)
     except ImportError:
@@ -80,7 +80,7 @@ def library(name: str, what: str) -> Any:
 
 @contextlib.contextmanager
 def quiet() -> Iterator[None]:
-    """Drops the output of libraries, from C too."""
+    """Discards what libraries print, including from C."""
     sys.stdout.flush()
     sys.stderr.flush()
     kept = [os.dup(stream) for stream in (1, 2)]
@@ -133,7 +133,7 @@ def _activated(
 
 
 def _unpacked(path: Path, kind: str) -> bytes:
-    """The PLY that gaussforge makes of an SPZ file or a compressed PLY."""
+    """An SPZ file or a compressed PLY converted to PLY by gaussforge."""
     forge = library("gaussforge", "SPZ files and compressed PLYs").GaussForge()
     data = read_file(path)
     if kind == "spz":
@@ -147,7 +147,8 @@ def _unpacked(path: Path, kind: str) -> bytes:
 
 
 def _check_spz(path: Path, data: bytes) -> None:
-    """Raises DataError for other files, and if more is unpacked than the Gaussians take: gaussforge has no bound."""
+    """Raises DataError for other files, and for one that unpacks to more than its Gaussians need, as gaussforge has no
+    such limit."""
     unpacker, zipped = zlib.decompressobj(wbits=31), data[:4] != SPZ_MAGIC  # from version 4 on the header is bare
     try:
         head = unpacker.decompress(data, 20) if zipped else data[:20]
@@ -262,7 +263,7 @@ def glb_bytes(splats: Splats) -> bytes:
 
 
 def _linear(colors: np.ndarray) -> np.ndarray:
-    """Light of sRGB values 0..1 (IEC 61966-2-1): COLOR_0 is linear in glTF."""
+    """Linear values of sRGB values 0..1 (IEC 61966-2-1): COLOR_0 is linear in glTF."""
     light: np.ndarray = np.where(colors <= 0.04045, colors / 12.92, ((colors + 0.055) / 1.055) ** 2.4)
     return light
 

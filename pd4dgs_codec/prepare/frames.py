@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pd4dgs_codec.data.files import image_info, read_image, shrink_image
+from pd4dgs_codec.data.files import check_downscale, image_info, read_image, shrink_image
 from pd4dgs_codec.data.videos import open_video
 from pd4dgs_codec.errors import DataError
 
@@ -92,17 +92,13 @@ class FrameFolder:
         files = [file for file in sorted(path.iterdir()) if file.suffix.lower() in PICTURES]
         if not files:
             raise DataError(f"{path}: found no picture, expected frames as {', '.join(sorted(PICTURES))}")
-        numbers = [re.findall(r"\d{1,15}", file.stem) for file in files]
-        if all(numbers):
-            order = sorted(range(len(files)), key=lambda i: (int(numbers[i][-1]), files[i].name))
-            self.places = [int(numbers[i][-1]) for i in order]
-            files = [files[i] for i in order]
-        else:
-            self.places = list(range(len(files)))
-        if len(set(self.places)) < len(self.places):
+        found = [re.findall(r"\d{1,15}", file.stem) for file in files]
+        numbered = {int(each[-1]) if all(found) else i: files[i] for i, each in enumerate(found)}
+        if len(numbered) < len(files):
             raise DataError(f"{path}: two pictures have the same number, expected one per frame")
-        self.path, self.files, self.fps = path, files, fps
-        self.size = image_info(files[0])[:2]
+        self.places = sorted(numbered)
+        self.path, self.files, self.fps = path, [numbered[place] for place in self.places], fps
+        self.size = image_info(self.files[0])[:2]
 
     def looks(self) -> Iterator[np.ndarray]:
         """Every frame, small and grey, uint8 [h, w]."""
@@ -178,8 +174,7 @@ def write_frames(
     """Writes these frames as PNG, averaged over blocks of downscale x downscale. Returns seconds by file name."""
     from PIL import Image
 
-    if min(recording.size) // downscale < 1:
-        raise DataError(f"{recording.path}: downscale {downscale} leaves nothing of {recording.size} pixels")
+    check_downscale(recording.size, downscale, str(recording.path))
     times: dict[str, float] = {}
     for index, picture in zip(indices, recording.pictures(indices), strict=False):
         name = f"frame_{index:06d}.png"
