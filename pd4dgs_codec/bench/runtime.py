@@ -3,7 +3,6 @@
 
 from __future__ import annotations
 
-import itertools
 import json
 import math
 from collections.abc import Callable, Iterable, Sequence
@@ -25,6 +24,7 @@ from pd4dgs_codec.scene import Scene
 
 Point = dict[str, Any]
 Step = Callable[[], None]
+Setting = tuple[float, str, int]  #: step scale, mode, effort
 
 
 def rmse(found: Iterable[np.ndarray], expected: Iterable[np.ndarray]) -> float:
@@ -41,18 +41,11 @@ def _psnr(error: float | None) -> str:
 
 
 def codec_points(
-    model: str,
-    scene: Scene,
-    frames: Sequence[Frame],
-    scales: Sequence[float],
-    modes: Sequence[str],
-    efforts: Sequence[int],
-    repeats: int,
-    step: Step = lambda: None,
+    model: str, scene: Scene, frames: Sequence[Frame], settings: Iterable[Setting], repeats: int, step: Step
 ) -> list[Point]:
-    """A point per step scale, mode and effort of the checkpoint `model`, whose scene is `scene`. error: of the images
-    of the highest level from those of the checkpoint. `step` is called after each. Encoding is timed without
-    verification, which takes one decoding more. Raises EncodeError, Pd4Error."""
+    """A point per setting of the checkpoint `model`, whose scene is `scene`. error: of the images of the highest level
+    from those of the checkpoint. `step` is called after each. Encoding is timed without verification, which takes one
+    decoding more. Raises EncodeError, Pd4Error."""
 
     def images(level: Level) -> list[np.ndarray]:
         return [level.picture(frame.camera, frame.time) for frame in frames]
@@ -61,7 +54,7 @@ def codec_points(
     encode(scene, effort=1, verify=False)  # loads the libraries, before any timing
     errors: dict[str, float] = {}
     points = []
-    for scale, mode, effort in itertools.product(scales, modes, efforts):
+    for scale, mode, effort in settings:
         options: dict[str, Any] = {"mode": mode, "effort": effort, "step_scale": scale, "verify": False}
         data, seconds = clock(partial(encode, scene, **options), repeats)
         key = json.dumps(hashes(data))  # modes change no value, so that their images are equal
@@ -83,31 +76,24 @@ def file_point(data: bytes, repeats: int) -> Point:
 
 def codec_table(points: Sequence[Point]) -> str:
     """A row per point."""
-    head = ("steps x", "mode", "effort", "bytes", "PSNR dB", "encode s", "decode s")
-    return markdown(
-        head,
-        [
-            (optional(p["step_scale"], "g"), p["mode"], optional(p["effort"], "d"), f"{p['bytes']:,}")
-            + (_psnr(p["error"]), spread(p["encode"]), spread(p["decode"]))
-            for p in points
-        ],
-    )
+    rows = [
+        (optional(p["step_scale"], "g"), p["mode"], optional(p["effort"], "d"), f"{p['bytes']:,}")
+        + (_psnr(p["error"]), spread(p["encode"]), spread(p["decode"]))
+        for p in points
+    ]
+    return markdown(("steps x", "mode", "effort", "bytes", "PSNR dB", "encode s", "decode s"), rows)
 
 
 def codec_panels(points: Sequence[Point]) -> list[Panel]:
     """Error against bytes, encoding and decoding seconds; a series per mode and effort."""
-    costs: dict[str, Callable[[Point], float]] = {
-        "bytes": lambda p: p["bytes"],
-        "encoding, s": lambda p: p["encode"]["median"],
-        "decoding, s": lambda p: p["decode"]["median"],
-    }
-    series: dict[str, list[Point]] = {}
-    for p in points:
-        series.setdefault(f"{p['mode']}, effort {p['effort']}", []).append(p)
-    return [
-        Panel(label, [(name, [(cost(p), p["error"]) for p in own]) for name, own in series.items()])
-        for label, cost in costs.items()
-    ]
+    panels = []
+    for label, cost in (("bytes", None), ("encoding, s", "encode"), ("decoding, s", "decode")):
+        series: dict[str, list[tuple[float, float]]] = {}
+        for p in points:
+            x = p[cost]["median"] if cost else p["bytes"]
+            series.setdefault(f"{p['mode']}, effort {p['effort']}", []).append((x, p["error"]))
+        panels.append(Panel(label, list(series.items())))
+    return panels
 
 
 # -- rasterisers -------------------------------------------------------------------------------------------------------

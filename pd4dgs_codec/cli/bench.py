@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import itertools
 import json
 import sys
 import tempfile
@@ -71,13 +72,9 @@ examples:
   pd4dgs-bench codec model.pt --quick --views 2
   pd4dgs-bench codec scene.pd4 --json"""
 
-SWEEP: dict[str, Any] = {
-    "step_scales": (0.5, 1.0, 2.0, 4.0),
-    "modes": ("ans", "lzma"),
-    "efforts": (1, 5, 9),
-    "repeats": 5,
-}
-QUICK: dict[str, Any] = {"step_scales": (1.0, 2.0), "efforts": (1,), "repeats": 1}
+Options = dict[str, Any]
+SWEEP: Options = {"step_scales": (0.5, 1.0, 2.0, 4.0), "modes": ("ans", "lzma"), "efforts": (1, 5, 9), "repeats": 5}
+QUICK: Options = {"step_scales": (1.0, 2.0), "efforts": (1,), "repeats": 1}
 
 
 def _codec_options(p: options.Parser) -> None:
@@ -106,8 +103,9 @@ def _codec(args: argparse.Namespace, console: Console) -> Outcome:
     else:
         scene = common.checkpoint_scene(args.input, data)
         frames = _frames(args, scene.info)
-        with progress_bar(len(scales) * len(modes) * len(efforts), "files", "codec") as step:
-            points = runtime.codec_points(args.input, scene, frames, scales, modes, efforts, repeats, step)
+        settings = list(itertools.product(scales, modes, efforts))
+        with progress_bar(len(settings), "files", "codec") as step:
+            points = runtime.codec_points(args.input, scene, frames, settings, repeats, step)
         panels = runtime.codec_panels(points)
     text = f"{runtime.codec_table(points)}\n\n{timing.machine_line(machine)}"
     return Outcome({"input": args.input, "machine": machine, "points": points}, text, panels, "RMSE of images")
@@ -330,12 +328,8 @@ REPORTS = {
     "codec": Report("FILE", "Measure the codec's error against bytes and seconds.", CODEC, _codec_options, _codec),
     "render": Report("FILE", "Measure the rasterisers' error against time.", RENDER, _render_options, _render),
     "train": Report("[SOURCE]", "Measure held-out error against training time.", TRAIN, _train_options, _train),
-    "latency": Report(
-        "FILE...", "Measure the time to the first and later images.", LATENCY, _latency_options, _latency, False
-    ),
-    "stability": Report(
-        "", "Test stiff and extreme cases, and print a table.", STABILITY, _stability_options, _stability, False
-    ),
+    "latency": Report("FILE...", "Measure seconds to each level's image.", LATENCY, _latency_options, _latency, False),
+    "stability": Report("", "Test stiff and extreme cases.", STABILITY, _stability_options, _stability, False),
 }
 
 
