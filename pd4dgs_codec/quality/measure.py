@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
 import torch
-from torch import Tensor
 
 from pd4dgs_codec.data.view import View
 from pd4dgs_codec.entropy.bits import entropy_bits
@@ -72,11 +70,6 @@ class RenderedLoss:
                 pictures[level].append(render_image(model, level, frame.time, frame.camera))
                 self.step()
         return pictures
-
-
-def psnr_of(mse: float) -> float:
-    """dB; infinite for an mse of 0."""
-    return -10.0 * math.log10(mse) if mse else math.inf
 
 
 def true_psnr(
@@ -159,15 +152,11 @@ def train_rate_bits(scene: Scene, options: EncodeOptions = DEFAULTS) -> list[dic
         for c in np.unique(classes[own]).tolist():
             for name, rows_of in planned.attributes.items():
                 values = torch.from_numpy(rows_of[own][classes[own] == c]).double().flatten(1)
-                attributes += _bits(values, planned.steps.attributes[name] * 2.0**c)
+                step = planned.steps.attributes[name] * 2.0**c
+                attributes += float(rate_bits(values, *channel_moments(values), step).sum())
         symbols = layer_symbols(planned, i)
         coded = decorrelate(symbols.tensors, symbols.kind)
         row = {"layer": float(layer), "attributes": attributes}
         row |= {"planes": gaussian_bits(coded.plane_channels), "weights": gaussian_bits(coded.weights)}
         result.append(row)
     return result
-
-
-def _bits(values: Tensor, step: float) -> float:
-    mu, sigma = channel_moments(values)
-    return float(rate_bits(values, mu, sigma, step).sum())

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from dataclasses import asdict, dataclass, replace
@@ -29,11 +30,6 @@ OWN_PICTURES, OWN_ORBIT = 16, 20.0
 
 #: The current task, in two words -> a context with a function to call after each picture.
 Progress = Callable[[str], AbstractContextManager[Callable[[], None]]]
-
-
-def no_progress(_: str) -> AbstractContextManager[Callable[[], None]]:
-    """Reports nothing."""
-    return nullcontext(lambda: None)
 
 
 @dataclass(frozen=True)
@@ -88,7 +84,7 @@ def pack(
     min_gain: float = ENCODE_MIN_DB_PER_MEGABYTE,
     downscale: int = 1,
     metadata: Metadata | None = None,
-    progress: Progress = no_progress,
+    progress: Progress = lambda _: nullcontext(lambda: None),
 ) -> Packed:
     """The file of a scene or a trained model.
 
@@ -155,7 +151,7 @@ class _Pictures:
         self, scene: Scene, options: EncodeOptions, target_sizes: Mapping[int, int]
     ) -> tuple[Scene, list[LeftOut], dict[str, Any]]:
         """(scene whose layers meet the sizes, what that leaves out, the target of the report)."""
-        from pd4dgs_codec.quality.measure import RenderedLoss, psnr_of, true_psnr
+        from pd4dgs_codec.quality.measure import RenderedLoss, true_psnr
         from pd4dgs_codec.quality.target import fit
 
         scene, left_out = plan(scene, options)
@@ -169,7 +165,7 @@ class _Pictures:
         levels = []
         for level, mse in errors.items():
             lost = {"lost_db": before[level] - after[level]} if before else {}
-            levels.append({"level": level, "error_psnr": psnr_of(mse), **lost})
+            levels.append({"level": level, "error_psnr": -10.0 * math.log10(mse) if mse else math.inf, **lost})
         layers = [asdict(row) for row in fits]
         report = {"cameras": self.cameras, "pictures": len(frames), "layers": layers, "levels": levels}
         return fitted, left_out + dropped, report
