@@ -175,17 +175,10 @@ def _text(result: dict[str, Any], first_frame: float) -> str:
     sections = ["attributes", "planes", "weights", "masks", "symbols"]
     spent = [{s["name"]: s["payload_bits"] / 8 for s in row["streams"]} for row in result["layers"]]
     shown = [name for name in sections if any(name in streams for streams in spent)]
-    rows = [
-        (
-            row["layer"],
-            number(row["bytes"], 0),
-            number(row["anchors"], 0),
-            number(row["position_bits"] / 8, 0),
-            *(number(streams.get(name), 0) for name in shown),
-            number(row["ratio"], 4),
-        )
-        for row, streams in zip(result["layers"], spent, strict=True)
-    ]
+    rows = []
+    for row, streams in zip(result["layers"], spent, strict=True):
+        sizes = (row["bytes"], row["anchors"], row["position_bits"] / 8, *(streams.get(name) for name in shown))
+        rows.append((row["layer"], *(number(size, 0) for size in sizes), number(row["ratio"], 4)))
     heads = (name.replace("_", " ") for name in shown)
     lines = [table(("layer", "bytes", "anchors", "positions", *heads, "payload/ΣR"), rows)]
     for item in result["left_out"]:

@@ -100,14 +100,10 @@ def _parts(result: dict[str, Any]) -> list[dict[str, Any]]:
 
 def _parts_table(result: dict[str, Any]) -> str:
     heads = ("part", *(f"layer {row['layer']}" for row in result["layers"]), "all", "share")
-    rows = [
-        (
-            row["part"].replace("_", " "),
-            *(number(size, 0) for size in (*row["layers"], row["bytes"])),
-            f"{100 * row['bytes'] / result['bytes']:.1f} %",
-        )
-        for row in result["parts"]
-    ]
+    rows = []
+    for row in result["parts"]:
+        sizes = [number(size, 0) for size in (*row["layers"], row["bytes"])]
+        rows.append((row["part"].replace("_", " "), *sizes, f"{100 * row['bytes'] / result['bytes']:.1f} %"))
     return table(heads, rows)
 
 
@@ -125,9 +121,8 @@ def _left_out(layers: list[dict[str, Any]]) -> list[dict[str, str]]:
             missing.append(f"layer {kind.layer}")
         elif "networks" in row:  # known only if the whole chunk is present
             gone = [head for head in kind.network_ids if head not in (TRUNK, *row["networks"])]
-            missing += (
-                [kind.name] if len(gone) == len(kind.network_ids) - 1 else [f"{kind.name} head {h}" for h in gone]
-            )
+            whole = len(gone) == len(kind.network_ids) - 1
+            missing += [kind.name] if whole else [f"{kind.name} head {head}" for head in gone]
     return [{"what": what, "why": why} for what in missing]
 
 
@@ -154,25 +149,18 @@ def _slice_lines(result: dict[str, Any]) -> list[str]:
     quality = (result["metadata"] or {}).get("slices", [])
     shown = quality if len(quality) == len(parts) else [None] * len(parts)
     rows = [
-        (i, layer, number(part["end"], 0), _brought(part), number(db, 2))
+        (i, layer, number(part["end"], 0), number(part.get("anchors"), 0), number(db, 2))
         for i, ((layer, part), db) in enumerate(zip(parts, shown, strict=True))
     ]
     return [table(("slice", "layer", "prefix", "new anchors", "mPSNR dB"), rows)]
 
 
-def _brought(part: dict[str, Any]) -> str:
-    """What a slice holds, as far as that is here."""
-    return f"{part['anchors']:,} anchors" if "anchors" in part else "-"
-
-
 def _bound_lines(declared: dict[str, float], nearest: dict[str, float]) -> list[str]:
-    other = [what for what, bound in nearest.items() if declared[what] != bound]
-    if not other:
-        return ["checked: error bounds are those of rounding to the nearest symbol"]
     return [
-        f"error bound of {what}: {declared[what]:.9g} declared, {nearest[what]:.9g} by rounding to the nearest symbol"
-        for what in other
-    ]
+        f"error bound of {what}: {declared[what]:.9g} declared, {bound:.9g} by rounding to the nearest symbol"
+        for what, bound in nearest.items()
+        if declared[what] != bound
+    ] or ["checked: error bounds are those of rounding to the nearest symbol"]
 
 
 def _text(result: dict[str, Any]) -> str:

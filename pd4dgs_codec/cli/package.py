@@ -52,9 +52,8 @@ def parser() -> options.Parser:
     p.add_argument("-o", "--output", required=True, metavar="DIR", help="folder to write, made if missing")
     p.add_argument("--immutable", action="store_true", help="put digests into file names, for long-lived caches")
     p.add_argument("--no-video", action="store_true", help="leave out the 2D video")
-    p.add_argument(
-        "--fps", type=options.positive_float, default=20.0, metavar="F", help="frame rate of the 2D video (default: 20)"
-    )
+    what = "frame rate of the 2D video (default: 20)"
+    p.add_argument("--fps", type=options.positive_float, default=20.0, metavar="F", help=what)
     p.add_common()
     return p
 
@@ -135,9 +134,8 @@ def _render(scene: Scene, fps: float) -> Video:
         path = Path(folder) / "video.mp4"
         write_mp4(_pictures(frames, level_of(scene), step), path, fps, fragment=max(1, round(FRAGMENT_SECONDS * fps)))
         size = camera.width // 2 * 2, camera.height // 2 * 2
-        return Video(
-            path.read_bytes(), *size, fps, _poster(next(_pictures(frames[len(frames) // 2 :], level_of(scene))))
-        )
+        poster = _poster(next(_pictures(frames[len(frames) // 2 :], level_of(scene))))
+        return Video(path.read_bytes(), *size, fps, poster)
 
 
 def _poster(picture: np.ndarray) -> bytes:
