@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import gzip
+import json
 import os
 import struct
 import sys
@@ -169,13 +170,9 @@ def test_cameras_of_a_dataset_keep_its_held_out_pictures(tmp_path):
 
 
 def test_cameras_json_beside_the_frames_is_used(tmp_path):
-    import json
-
     folder = _sequence(tmp_path / "seq", 1)
-    rows = []
-    for i in range(3):
-        row = {"position": [0.1 * i, 0, -4], "rotation": np.eye(3).tolist(), "width": 80, "height": 60}
-        rows.append(row | {"fx": 70, "fy": 70})
+    row = {"rotation": np.eye(3).tolist(), "width": 80, "height": 60, "fx": 70, "fy": 70}
+    rows = [row | {"position": [0.1 * i, 0, -4]} for i in range(3)]
     (folder / "cameras.json").write_text(json.dumps(rows))
     data = load_source(f"teacher:{folder}?size=40x30", holdout=0)
     assert len(data.train) == 3 and data.up == (0.0, -1.0, 0.0) and data.train[0].width == 40

@@ -52,14 +52,10 @@ def picture(view: np.ndarray, textures: list[np.ndarray], patch: float | None = 
         place = eye + depth[..., None] * rays - np.array(point)
         s, t = place @ np.array(a, float), place @ np.array(b, float)
         hit = (depth > 0.1) & (depth < nearest) & (np.abs(s) <= half[0]) & (np.abs(t) <= half[1])
-        size = image.shape[0]
-        x, y = (s * 80) % size, (t * 80) % size
-        x0, y0 = x.astype(int), y.astype(int)
-        fx, fy = (x - x0)[..., None], (y - y0)[..., None]
-        x1, y1 = (x0 + 1) % size, (y0 + 1) % size
-        x0, y0 = x0 % size, y0 % size
-        color = (image[y0, x0] * (1 - fx) + image[y0, x1] * fx) * (1 - fy)
-        color += (image[y1, x0] * (1 - fx) + image[y1, x1] * fx) * fy
+        color, (fx, fy) = 0.0, ((80 * place) % 1 for place in (s, t))
+        x, y = np.floor(80 * s).astype(int), np.floor(80 * t).astype(int)
+        for i, j, share in ((0, 0, (1 - fx) * (1 - fy)), (1, 0, fx * (1 - fy)), (0, 1, (1 - fx) * fy), (1, 1, fx * fy)):
+            color += image[(y + j) % len(image), (x + i) % len(image)] * share[..., None]
         result[hit], nearest[hit] = color[hit], depth[hit]
     return np.clip(result + 0.5, 0, 255).astype(np.uint8)
 
