@@ -126,7 +126,7 @@ class Root:
 
     def record(self, output: str, overwrite: bool) -> dict[str, Any] | None:
         """The record of a finished output, else None. Raises DataError for another file, unless it may be replaced."""
-        raw = self._read(output + RECORD)
+        raw = self._ask("cat_file", output + RECORD)
         if raw is None:
             return None
         try:
@@ -141,7 +141,8 @@ class Root:
 
     def holds(self, output: str, record: dict[str, Any]) -> bool:
         """Whether all files of a record are there, with their sizes."""
-        return all(self._size(_file(output, name)) == int(file["bytes"]) for name, file in record["files"].items())
+        found = {name: self._ask("info", _file(output, name)) for name in record["files"]}
+        return all(found[name] and found[name]["size"] == file["bytes"] for name, file in record["files"].items())
 
     def publish(self, output: str, files: dict[str, Path], record: dict[str, Any], replace: bool) -> int:
         """Writes the files of an output (name -> local path; "" is the output itself), then its record with their sizes
@@ -155,21 +156,17 @@ class Root:
             place = _file(output, name)
             content = path.read_bytes()
             # a killed run may have left this very file, without its record
-            if not replace and self._read(place) not in (None, content):
+            if not replace and self._ask("cat_file", place) not in (None, content):
                 raise DataError(f"{self.place}/{place}: exists already, with no record of it; --overwrite replaces it")
             self._put(place, content)
             entries[name] = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
         self._put(output + RECORD, (json.dumps(record | {"files": entries}, indent=1, sort_keys=True) + "\n").encode())
         return sum(entry["bytes"] for entry in entries.values())
 
-    def _read(self, name: str) -> bytes | None:
+    def _ask(self, question: str, name: str) -> Any:
+        """The answer of a method of the file system on a file, None if the file does not exist."""
         with suppress(FileNotFoundError), _naming(f"{self.place}/{name}"):
-            return bytes(self.system.cat_file(self._at(name)))
-        return None
-
-    def _size(self, name: str) -> int | None:
-        with suppress(FileNotFoundError), _naming(f"{self.place}/{name}"):
-            return int(self.system.info(self._at(name))["size"])
+            return getattr(self.system, question)(self._at(name))
         return None
 
     def _put(self, name: str, content: bytes) -> None:

@@ -108,7 +108,9 @@ def _panoptic_frames(folder: Path, path: Path) -> list[UnreadView]:
             if not isinstance(name, str) or ".." in Path(name).parts or Path(name).is_absolute():
                 raise DataError(f"{path}: instant {t}: fn {one_line(repr(name), 60)} is not the name of a picture")
             where = f"{path}: instant {t}: {name}"
-            lens, viewmat = _panoptic_lens(k, (width, height), where), _panoptic_viewmat(w2c, where)
+            lens, pose = _panoptic_lens(k, (width, height), where), array(w2c, (4, 4), f"{where}: w2c")
+            check_rotation(pose[:3, :3], f"{where}: w2c")
+            viewmat = world_to_camera(pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3])
             camera, image = whole_number(key, f"{where}: cam_id"), find_image(folder / PICTURES, name)
             stem = str(Path(name).with_suffix("")).replace("/", "_")
             frames.append(UnreadView(stem, camera, t / FPS, viewmat, lens, image))
@@ -120,12 +122,6 @@ def _panoptic_lens(k: Any, size: tuple[int, int], where: str) -> Lens:
     if not (K[0, 0] > 0 and K[1, 1] > 0 and np.allclose(K[2], (0, 0, 1)) and K[1, 0] == 0):
         raise DataError(f"{where}: k is {K.tolist()}, expected fx 0 cx, 0 fy cy, 0 0 1 with fx, fy > 0")
     return Lens(*size, K[0, 0], K[1, 1], K[0, 2], K[1, 2], K[0, 1])
-
-
-def _panoptic_viewmat(w2c: Any, where: str) -> np.ndarray:
-    pose = array(w2c, (4, 4), f"{where}: w2c")
-    check_rotation(pose[:3, :3], f"{where}: w2c")
-    return world_to_camera(pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3])
 
 
 def _panoptic_points(path: Path) -> tuple[np.ndarray | None, np.ndarray | None]:

@@ -246,8 +246,7 @@ def read_model(place: str, fps: float) -> Teacher:
 
 def _folder(folder: Path, fps: float) -> Teacher:
     """One file per frame."""
-    kinds = {suffix: [p for p in folder.iterdir() if p.suffix.lower() == suffix] for suffix in FRAME_SUFFIXES}
-    paths = max(kinds.values(), key=len)
+    paths = max(([p for p in folder.iterdir() if p.suffix.lower() == suffix] for suffix in FRAME_SUFFIXES), key=len)
     if not paths:
         raise DataError(f"{folder}: holds no file that ends in {' or '.join(FRAME_SUFFIXES)}, expected one per frame")
 
@@ -258,14 +257,8 @@ def _folder(folder: Path, fps: float) -> Teacher:
     paths.sort(key=place)
     times = tuple(i / max(len(paths) - 1, 1) for i in range(len(paths)))
 
-    @lru_cache(maxsize=2)
-    def frame(i: int) -> Splats:
-        return read_splats(paths[i])
-
-    def splats(t: float) -> Splats:
-        return frame(round(t * (len(paths) - 1)))
-
-    return Teacher(splats, times, max(len(paths) - 1, 1) / fps)
+    frame = lru_cache(maxsize=2)(read_splats)
+    return Teacher(lambda t: frame(paths[round(t * (len(paths) - 1))]), times, max(len(paths) - 1, 1) / fps)
 
 
 def _fourdgs(path: Path) -> Teacher:
