@@ -17,7 +17,8 @@ from torch import Tensor
 from pd4dgs_codec.bench.stability import BOX, CAMERA, HEIGHT, WIDTH, Found, Promise, largest, refusal, small_scene
 from pd4dgs_codec.draw.gaussians import near_plane
 from pd4dgs_codec.errors import EncodeError, NotFinite, RenderError
-from pd4dgs_codec.format import decoder, encoder, residuals
+from pd4dgs_codec.format import decoder, encoder
+from pd4dgs_codec.format import deformation as coded
 from pd4dgs_codec.interchange.teacher import load_source
 from pd4dgs_codec.model import checkpoint, hexplane
 from pd4dgs_codec.model.config import DeformationConfig, ModelConfig
@@ -95,7 +96,7 @@ def _sampling_error(
     for t, (name, channels) in itertools.product(times, (("kernel", 8), ("torch", 5), ("encoder", 5))):
         planes = _planes(resolution, channels)  # the kernel takes multiples of eight
         if name == "encoder":
-            found = residuals.sample_planes(planes, box, points, t)
+            found = coded.sample_planes(planes, box, points, t)
         else:
             found = hexplane.HexPlane.from_arrays(box, planes)(torch.from_numpy(points), t).detach().numpy()
         expected = _exact_samples(planes, box, points, t)
@@ -144,7 +145,7 @@ def _residual_error(field: Deformation, times: Sequence[float]) -> Found:
         hidden = np.maximum(_exact_samples(field.planes, BOX, places, t) @ trunk.T.astype(np.float64), 0)
         expected = hidden @ head.T.astype(np.float64) * float(deformation_unit(BOX))
         model = module(torch.from_numpy(places), t)["position"].detach().numpy()
-        for found in (model, residuals.residuals(field, BOX, places, t)["position"]):
+        for found in (model, coded.residuals(field, BOX, places, t)["position"]):
             worst = largest([worst, float(np.abs(found - expected).max()) / scale])
     return f"{len(times)} instants", worst
 

@@ -109,7 +109,7 @@ def _parts_table(result: dict[str, Any]) -> str:
 
 def _left_out(layers: list[dict[str, Any]]) -> list[dict[str, str]]:
     """Layers, deformations and residual heads of the format that this file does not have."""
-    from pd4dgs_codec.format.kinds import LAYER_KINDS
+    from pd4dgs_codec.format.registry import LAYER_KINDS
     from pd4dgs_codec.scene import TRUNK
 
     why = "without visible effect, or above --layers"

@@ -15,7 +15,7 @@ from typing import Any
 import msgpack
 
 from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed, UnsupportedFeature
-from pd4dgs_codec.format.limits import MAX_DEPTH
+from pd4dgs_codec.format.registry import MAX_DEPTH
 
 #: Unknown keys from here on are ignored; unknown ones below change what the file means.
 FIRST_IGNORABLE_KEY = 64

@@ -21,7 +21,7 @@ from pd4dgs_codec.errors import (
     Truncated,
     UnsupportedVersion,
 )
-from pd4dgs_codec.format.limits import MAX_HEADER, MAX_PAYLOAD
+from pd4dgs_codec.format.registry import MAX_HEADER, MAX_PAYLOAD
 
 # As in PNG: a high bit and both line ends, so that a text-mode transfer breaks it, and 0x1A to stop a DOS listing.
 SIGNATURE = bytes.fromhex("89504434 0D0A1A0A")

@@ -10,8 +10,8 @@ from pd4dgs_codec.errors import DecodeError, Malformed, Truncated, UnsupportedFe
 from pd4dgs_codec.format.attributes import Past
 from pd4dgs_codec.format.container import CHUNK_OVERHEAD, PREAMBLE_SIZE, Chunk, read_chunk, read_preamble
 from pd4dgs_codec.format.header import Header, layers_of, scene_id_of, unpack_header
-from pd4dgs_codec.format.kinds import BY_CHUNK_TYPE, LayerKind
 from pd4dgs_codec.format.payload import Declared, read_layer
+from pd4dgs_codec.format.registry import BY_CHUNK_TYPE, LayerKind
 from pd4dgs_codec.format.symbols import LayerSymbols, SceneSymbols, TakenVoxels, check_slice, merged
 from pd4dgs_codec.scene import Scene
 

@@ -1,57 +1,53 @@
-"""A layer's planes and networks: their symbols, their parameters in the layer's chunk, and their sections.
+"""A layer's planes and networks for the rest of the codec: symbols, checks, parameters, sections, residuals.
 
-This module alone reads and writes what a deformation is made of; `heads` and `omissions` know it too, for the encoder.
-The rest of the codec passes a `Deformation` on, of float32 values in a scene and of int32 symbols in a layer. Layer 0
-has networks and no planes.
+Only this module and its parts `planes` and `omissions`, which nothing else imports, know what a deformation is made of:
+planes, and a trunk with a network per residual head. The codec passes a `Deformation` on, of float32 values in a scene
+and of int32 symbols in a layer. Layer 0 has networks and no planes.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
 from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.entropy.channels import decode_channels, decode_joined, encode_channels
-from pd4dgs_codec.entropy.varint import ByteReader, put_varint
-from pd4dgs_codec.errors import LimitExceeded, Malformed, UnsupportedFeature
+from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
+from pd4dgs_codec.errors import LimitExceeded, Malformed
 from pd4dgs_codec.format.canonical import Fields, as_integer, as_list, as_registered
-from pd4dgs_codec.format.kinds import LayerKind, Section
-from pd4dgs_codec.format.limits import (
-    MAX_NETWORK_LAYERS,
-    MAX_NETWORK_WIDTH,
-    MAX_PLANE_CELLS,
-    MAX_PLANE_CHANNELS,
-    MAX_PLANE_SCALES,
-    MAX_PLANE_SIDE,
-)
+from pd4dgs_codec.format.omissions import Anchors as Anchors
+from pd4dgs_codec.format.omissions import Omissions as Omissions
 from pd4dgs_codec.format.options import EncodeOptions
-from pd4dgs_codec.format.planes import PREDICTORS, choose_predictor, restore
-from pd4dgs_codec.format.quantise import MAX_SYMBOL, dequantise, is_step, magnitude, quantise
-from pd4dgs_codec.format.stages import (
-    PLAIN,
-    STAGED,
-    Activity,
-    CodedSection,
-    Group,
-    Places,
-    activity_classes,
-    cheapest_class_count,
-    coded_stages,
-    parts_of,
-    read_class_count,
-    read_stages,
-    smaller_form,
+from pd4dgs_codec.format.planes import PREDICTORS, PlaneShape, read_planes, restore, write_planes
+from pd4dgs_codec.format.planes import choose_predictor as choose_predictor
+from pd4dgs_codec.format.planes import sample_planes as sample_planes
+from pd4dgs_codec.format.quantise import MAX_SYMBOL, dequantise, expect, expect_array, is_step, magnitude, quantise
+from pd4dgs_codec.format.registry import LayerKind, Section
+from pd4dgs_codec.scene import (
+    LENGTH_HEADS,
+    PLANES,
+    TRUNK,
+    Deformation,
+    Network,
+    Steps,
+    Widths,
+    deformation_unit,
+    plane_sides,
 )
-from pd4dgs_codec.scene import PLANES, TRUNK, Deformation, Steps, Widths, plane_sides
 
 # Keys of the layer parameters.
 STEPS, SCALES, NETWORKS = 3, 4, 5
 
-PlaneShape = tuple[int, int, int]  #: channels, rows, columns
+# Limits (clause 14).
+MAX_PLANE_SIDE = 4096  #: cells; eight times the paper's finest plane
+MAX_PLANE_CHANNELS = 256
+MAX_PLANE_SCALES = 8
+MAX_PLANE_CELLS = 1 << 28  #: cells times channels over all planes of one chunk: 1 GiB of float32
+MAX_NETWORK_WIDTH = 4096  #: inputs or outputs of one linear layer
+MAX_NETWORK_LAYERS = 16
 
 NOTHING = Deformation((), {})  #: neither planes nor networks
 
@@ -59,48 +55,110 @@ NOTHING = Deformation((), {})  #: neither planes nor networks
 # -- symbols -----------------------------------------------------------------------------------------------------------
 
 
-def mapped(
-    tensors: Deformation, kind: LayerKind, function: Callable[[str, str, np.ndarray], np.ndarray]
-) -> Deformation:
-    """`tensors` with function(name of its step, name for messages, array) in place of every array; networks in the
-    order of their numbers."""
-    planes = tuple(
-        {name: function(str(kind.planes_step), f"plane {name}", scale[name]) for name, _, _ in PLANES}
-        for scale in tensors.planes
-    )
-    step = kind.weights_step
-    networks = {
-        name: tuple(
-            (function(step, f"{name} weight", w), function(step, f"{name} bias", b)) for w, b in tensors.networks[name]
-        )
-        for name in kind.network_ids
-        if name in tensors.networks
-    }
+def arrays_of(tensors: Deformation, kind: LayerKind) -> Iterator[tuple[str, str, np.ndarray]]:
+    """(name of its step, its own name, array) in coding order: the planes, scale by scale, then weight and bias of each
+    linear layer of each network, by ascending number. Names are as "planes.0.xy" and "mlp.trunk.weight.0"."""
+    for s, scale in enumerate(tensors.planes):
+        yield from ((str(kind.planes_step), f"planes.{s}.{name}", scale[name]) for name, _, _ in PLANES)
+    for name in (name for name in kind.network_ids if name in tensors.networks):
+        for i, (weight, bias) in enumerate(tensors.networks[name]):
+            yield kind.weights_step, f"mlp.{name}.weight.{i}", weight
+            yield kind.weights_step, f"mlp.{name}.bias.{i}", bias
+
+
+def with_arrays(tensors: Deformation, kind: LayerKind, arrays: Iterable[np.ndarray]) -> Deformation:
+    """A deformation of the structure of `tensors` with these arrays, in the order of `arrays_of`."""
+    depths = {name: len(tensors.networks[name]) for name in kind.network_ids if name in tensors.networks}
+    return _assembled(len(tensors.planes), depths, iter(arrays))
+
+
+def _assembled(scales: int, depths: dict[str, int], arrays: Iterator[np.ndarray]) -> Deformation:
+    planes = tuple({name: next(arrays) for name, _, _ in PLANES} for _ in range(scales))
+    networks = {name: tuple((next(arrays), next(arrays)) for _ in range(depth)) for name, depth in depths.items()}
     return Deformation(planes, networks)
 
 
 def quantise_tensors(tensors: Deformation, kind: LayerKind, steps: Steps) -> Deformation:
     """int32 symbols of a layer's planes and networks. Raises EncodeError for a value that has none."""
-    return mapped(tensors, kind, lambda of, name, x: quantise(x, getattr(steps, of), f"{kind.name} {name}"))
+    rows = arrays_of(tensors, kind)
+    return with_arrays(tensors, kind, [quantise(x, vars(steps)[of], f"{kind.name} {name}") for of, name, x in rows])
 
 
 def dequantise_tensors(symbols: Deformation, kind: LayerKind, steps: Steps) -> Deformation:
     """The float32 planes and networks that the symbols stand for."""
-    return mapped(symbols, kind, lambda of, _, k: dequantise(k, getattr(steps, of)))
-
-
-def arrays_of(tensors: Deformation, kind: LayerKind) -> Iterator[tuple[str, np.ndarray]]:
-    """(name of its step, array) in coding order: the planes, scale by scale, then weight and bias of each linear layer
-    of each network."""
-    for scale in tensors.planes:
-        yield from ((str(kind.planes_step), scale[name]) for name, _, _ in PLANES)
-    for network in (tensors.networks[name] for name in kind.network_ids if name in tensors.networks):
-        yield from ((kind.weights_step, array) for pair in network for array in pair)
+    return with_arrays(symbols, kind, [dequantise(k, vars(steps)[of]) for of, _, k in arrays_of(symbols, kind)])
 
 
 def layer_steps(steps: Steps, kind: LayerKind, tensors: Deformation) -> dict[str, float]:
     """The steps in a layer's chunk by name; none if it has no networks."""
     return {name: float(getattr(steps, name)) for name in kind.step_names} if tensors.networks else {}
+
+
+def check_tensors(tensors: Deformation, kind: LayerKind, widths: Widths) -> None:
+    """Raise EncodeError unless planes and networks of a layer have the shapes and dtypes that scene.Deformation and
+    Widths document, and finite values."""
+    own, required = kind.name, (TRUNK,) if kind.layer else tuple(kind.network_ids)
+    unknown = [name for name in tensors.networks if name not in kind.network_ids]
+    expect(not unknown, f"{own}: networks {unknown}, expected some of {list(kind.network_ids)}")
+    missing = [name for name in required if name not in tensors.networks]
+    expect(not missing, f"{own} networks {missing} are missing")
+    expect(bool(tensors.planes) == bool(kind.layer), f"{own}: planes of {len(tensors.planes)} scales")
+    for s, planes in enumerate(tensors.planes):
+        expect(set(planes) == {p for p, _, _ in PLANES}, f"{own} scale {s}: planes {sorted(planes)}, expected six")
+        channels, first = len(planes["xy"]), len(tensors.planes[0]["xy"])
+        expect(channels == first, f"{own} scale {s}: {channels} channels, expected {first} as in scale 0")
+        expect(min(channels, *plane_sides(planes)) >= 1, f"{own} scale {s}: an empty plane")
+    for name, network in tensors.networks.items():
+        expect(len(network) > 0, f"{own} network {name}: no layers")
+    shape = Shape.of(tensors, kind, widths)
+    for (_, name, array), expected in zip(arrays_of(tensors, kind), shape.planes + shape.weights, strict=True):
+        expect_array(f"{own} {name}", array, np.float32, expected)
+    for name, outputs in (shape.networks or {}).items():
+        wanted = kind.heads(widths).get(name, outputs[-1])
+        expect(outputs[-1] == wanted, f"{own} network {name}: {outputs[-1]} outputs, expected {wanted}")
+
+
+# -- heads -------------------------------------------------------------------------------------------------------------
+
+
+def heads_of(tensors: Deformation) -> list[str]:
+    """The residual heads that a deformation has."""
+    return [name for name in tensors.networks if name != TRUNK]
+
+
+def with_heads(tensors: Deformation, heads: Iterable[str]) -> Deformation:
+    """The deformation with these of its heads alone."""
+    return Deformation(tensors.planes, {k: v for k, v in tensors.networks.items() if k == TRUNK or k in [*heads]})
+
+
+def head_alone(tensors: Deformation, head: str) -> Deformation:
+    """The part of the deformation that belongs to one head."""
+    return Deformation((), {head: tensors.networks[head]})
+
+
+def is_zero(tensors: Deformation, head: str) -> bool:
+    """Whether a head's residuals are 0 everywhere, by its last weights."""
+    return not any(array.any() for array in tensors.networks[head][-1])
+
+
+def time_rows(tensors: Deformation) -> int:
+    """The number of instants at which a deformation has values of its own."""
+    return max(plane_sides(scale)[3] for scale in tensors.planes)
+
+
+def residuals(deformation: Deformation, box: np.ndarray, points: np.ndarray, t: float) -> dict[str, np.ndarray]:
+    """head -> float32 [n, width] residuals at `points` [n, 3] (scene units) and normalised time t; lengths in scene
+    units. The function of the trained model, in numpy; it is not normative."""
+    hidden = np.maximum(_run(deformation.networks[TRUNK], sample_planes(deformation.planes, box, points, t)), 0)
+    outputs = {name: _run(deformation.networks[name], hidden) for name in heads_of(deformation)}
+    unit = deformation_unit(box)
+    return {name: out * unit if name in LENGTH_HEADS else out for name, out in outputs.items()}
+
+
+def _run(network: Network, x: np.ndarray) -> np.ndarray:
+    for i, (weight, bias) in enumerate(network):
+        x = (np.maximum(x, 0) if i else x) @ weight.T + bias
+    return x
 
 
 # -- parameters --------------------------------------------------------------------------------------------------------
@@ -123,6 +181,14 @@ class Shape:
     scales: tuple[Scale, ...] = ()
     networks: dict[str, tuple[int, ...]] | None = None
     inputs: int = 0
+
+    @staticmethod
+    def of(tensors: Deformation, kind: LayerKind, widths: Widths) -> Shape:
+        """The shape of a deformation, without predictors."""
+        scales = tuple(Scale(len(scale["xy"]), plane_sides(scale), ()) for scale in tensors.planes)
+        names = [name for name in kind.network_ids if name in tensors.networks]
+        networks = {name: tuple(len(bias) for _, bias in tensors.networks[name]) for name in names}
+        return Shape(scales, networks, 0 if kind.layer else widths.inputs)
 
     @property
     def planes(self) -> list[PlaneShape]:
@@ -260,10 +326,11 @@ class Decorrelated:
 
 def decorrelate(symbols: Deformation, kind: LayerKind) -> Decorrelated:
     """Each plane under the predictor that is likely to code it for the fewest bits."""
-    tensors = [array for _, array in arrays_of(symbols, kind)]
+    tensors = [array for *_, array in arrays_of(symbols, kind)]
     count = len(PLANES) * len(symbols.planes)
     chosen = [choose_predictor(plane) for plane in tensors[:count]]
-    return Decorrelated([p for p, _ in chosen], [r for _, r in chosen], [array.ravel() for array in tensors[count:]])
+    weights = [array.ravel() for array in tensors[count:]]
+    return Decorrelated([p for p, *_ in chosen], [r for _, r, _ in chosen], weights)
 
 
 def write_sections(coded: Decorrelated, options: EncodeOptions) -> dict[Section, tuple[bytes, float]]:
@@ -305,103 +372,7 @@ def _restored(shape: Shape, residuals: Sequence[np.ndarray], weights: Sequence[n
     if any(magnitude(weight) > MAX_SYMBOL for weight in weights):
         raise Malformed(f"a weight over {MAX_SYMBOL} steps in magnitude")
     predictors = [predictor for scale in shape.scales for predictor in scale.predictors]
-    samples = iter(restore(list(zip(predictors, residuals, strict=True))))
-    planes = tuple({name: next(samples) for name, _, _ in PLANES} for _ in shape.scales)
-    rest = iter(weight.reshape(one) for weight, one in zip(weights, shape.weights, strict=True))
-    networks = {
-        name: tuple((next(rest), next(rest)) for _ in widths) for name, widths in (shape.networks or {}).items()
-    }
-    return Deformation(planes, networks)
-
-
-# -- the planes section of mode ans (clause 8.8) -----------------------------------------------------------------------
-
-
-def write_planes(residuals: Sequence[np.ndarray], priors: str, effort: int) -> tuple[bytes, float]:
-    """(section bytes, sum of R(a) over all channels) of residuals int32 [C, H, W] per plane, in the smaller form."""
-    channels = [channel.ravel() for plane in residuals for channel in plane]
-    section, rate_bits = smaller_form(lambda: channels, lambda: _write_staged(residuals, effort), priors, effort)
-    return section.data, rate_bits
-
-
-def read_planes(data: bytes, shapes: Sequence[PlaneShape]) -> list[np.ndarray]:
-    """Residuals int32 [C, H, W] per plane; the inverse of write_planes. shapes were checked against the limits."""
-    reader = ByteReader(data)
-    form = reader.byte("the form of the planes")
-    if form == PLAIN:
-        symbols = decode_joined(reader.rest(), [h * w for c, h, w in shapes for _ in range(c)])
-        ends = accumulate(c * h * w for c, h, w in shapes)
-        return [symbols[end - c * h * w : end].reshape(c, h, w) for (c, h, w), end in zip(shapes, ends, strict=True)]
-    if form != STAGED:
-        raise UnsupportedFeature(f"form {form} of the planes, expected {PLAIN} or {STAGED}")
-    number = _stage_count(shapes)
-    counts = [read_class_count(reader, stage) for stage in range(1, number)]
-    planes = [np.zeros((c, h * w), np.int32) for c, h, w in shapes]
-    read_stages(reader, number, _groups(planes, shapes, counts))
-    return [plane.reshape(shape) for plane, shape in zip(planes, shapes, strict=True)]
-
-
-def _write_staged(residuals: Sequence[np.ndarray], effort: int) -> CodedSection:
-    shapes: list[PlaneShape] = [plane.shape for plane in residuals]
-    planes = [plane.reshape(len(plane), -1) for plane in residuals]
-    counts, activities = [], [Activity(plane.shape[1]) for plane in planes]
-    for stage in range(_stage_count(shapes)):
-        first, end = _bounds(stage)
-        if stage:
-            groups = [
-                (plane[first:end], _around(activity.now, shape))
-                for plane, activity, shape in zip(planes, activities, shapes, strict=True)
-            ]
-            counts.append(cheapest_class_count(groups))
-        for plane, activity in zip(planes, activities, strict=True):
-            activity.add(plane[first:end])
-    out = bytearray([STAGED])
-    for count in counts:
-        put_varint(out, count)
-    return coded_stages(out, map(parts_of, _groups(planes, shapes, counts)), effort)
-
-
-def _stage_count(shapes: Sequence[PlaneShape]) -> int:
-    """All planes of a layer have the same number of channels."""
-    return max(1, (shapes[0][0] - 1).bit_length())
-
-
-def _bounds(stage: int) -> tuple[int, int]:
-    """Its first channel, and that of the next stage."""
-    return (1 << stage if stage else 0), 2 << stage
-
-
-def _groups(planes: Sequence[np.ndarray], shapes: Sequence[PlaneShape], counts: Sequence[int]) -> Iterator[list[Group]]:
-    """Per stage, what it codes of each plane. `planes` int32 [C, H * W] are read only as far as the stages before
-    reach."""
-    activities = [Activity(plane.shape[1]) for plane in planes]
-    for stage, count in enumerate((1, *counts)):
-        first, end = _bounds(stage)
-        groups: list[Group] = []
-        for plane, activity, shape in zip(planes, activities, shapes, strict=True):
-            places = Places.whole(plane.shape[1])
-            if count > 1:
-                places = Places.by(activity_classes(_around(activity.now, shape), count), count)
-            groups.append((plane[first:end], places))
-        yield groups
-        if any(later > 1 for later in counts[stage:]):
-            for plane, activity in zip(planes, activities, strict=True):
-                activity.add(plane[first:end])
-
-
-def _around(activity: np.ndarray, shape: PlaneShape) -> np.ndarray:
-    """[H * W]: activity [H * W] summed over 3 x 3 cells, the border repeated."""
-    _, height, width = shape
-    cells = activity.reshape(height, width)
-    around: np.ndarray = _of_three(_of_three(cells).T).T.ravel()
-    return around
-
-
-def _of_three(cells: np.ndarray) -> np.ndarray:
-    """[H, W]: each cell with the one before and the one behind it in its row, the first and the last repeated."""
-    sums: np.ndarray = cells.copy(order="K")
-    sums[:, 1:] += cells[:, :-1]
-    sums[:, :-1] += cells[:, 1:]
-    sums[:, 0] += cells[:, 0]
-    sums[:, -1] += cells[:, -1]
-    return sums
+    samples = restore(list(zip(predictors, residuals, strict=True)))
+    reshaped = [weight.reshape(one) for weight, one in zip(weights, shape.weights, strict=True)]
+    depths = {name: len(widths) for name, widths in (shape.networks or {}).items()}
+    return _assembled(len(shape.scales), depths, iter([*samples, *reshaped]))

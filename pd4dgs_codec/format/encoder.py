@@ -10,9 +10,10 @@ from typing import Any
 
 import numpy as np
 
+from pd4dgs_codec.entropy.fitting import Fitted
 from pd4dgs_codec.errors import DecodeError, EncodeError, LimitExceeded
-from pd4dgs_codec.format.bounds import ErrorBound, rounding_bounds, verify_errors
-from pd4dgs_codec.format.check import check_scene
+from pd4dgs_codec.format.attributes import Past
+from pd4dgs_codec.format.check import ErrorBound, check_scene, rounding_bounds, verify_errors
 from pd4dgs_codec.format.container import (
     CHUNK_OVERHEAD,
     FLAG_ANCILLARY,
@@ -24,19 +25,29 @@ from pd4dgs_codec.format.container import (
 from pd4dgs_codec.format.decoder import read_layers
 from pd4dgs_codec.format.header import Header, pack_header, payload_digest, scene_id_of, unpack_header
 from pd4dgs_codec.format.info import info
-from pd4dgs_codec.format.left_out import LeftOut
-from pd4dgs_codec.format.limits import MAX_CHUNKS
 from pd4dgs_codec.format.metadata import CHUNK_TYPE, Metadata, write_metadata
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
-from pd4dgs_codec.format.payload import StreamReport
-from pd4dgs_codec.format.plan import make_plan
-from pd4dgs_codec.format.slicing import Slice, whole_layer, write_slices
-from pd4dgs_codec.format.symbols import LayerSymbols, SceneSymbols
+from pd4dgs_codec.format.payload import StreamReport, write_layer
+from pd4dgs_codec.format.plan import LeftOut, make_plan
+from pd4dgs_codec.format.registry import MAX_CHUNKS
+from pd4dgs_codec.format.symbols import LayerSymbols, SceneSymbols, sliced
 from pd4dgs_codec.scene import Scene
 from pd4dgs_codec.threads import one_blas_thread
 
 #: Most bytes of preamble, header and chunk list of a sliced file, which count with the first slice.
 HEADER = 1000
+TRIES = 4  #: most encodes of one slice to reach its size
+SLACK = 0.97  #: share of the size that a slice aims at
+FULL = 0.92  #: share of the size that is large enough
+
+
+@dataclass(frozen=True, eq=False)
+class _Slice:
+    """A slice as written. anchors: its number of anchors."""
+
+    anchors: int
+    payload: bytes
+    streams: list[StreamReport]
 
 
 @dataclass(frozen=True)
@@ -158,20 +169,62 @@ def with_metadata(data: bytes, metadata: Metadata) -> bytes:
 
 def _write_layers(
     symbols: SceneSymbols, options: EncodeOptions, utility: Callable[[Scene], np.ndarray]
-) -> list[list[Slice]]:
+) -> list[list[_Slice]]:
     """The slices of each layer."""
     if not options.slices:
-        return [[whole_layer(layer, options)] for layer in symbols.layers]
+        return [[_whole_layer(layer, options)] for layer in symbols.layers]
     ends = np.cumsum([len(layer.anchor_q) for layer in symbols.layers])[:-1]
     values = np.split(utility(symbols.scene()), ends)
-    written = [write_slices(layer, options, u, HEADER) for layer, u in zip(symbols.layers, values, strict=True)]
+    written = [_write_slices(layer, options, u, HEADER) for layer, u in zip(symbols.layers, values, strict=True)]
     if (chunks := sum(map(len, written))) > MAX_CHUNKS:
         raise EncodeError(f"{chunks} slices, expected at most {MAX_CHUNKS}: let slices take more bytes")
     return written
 
 
+def _whole_layer(layer: LayerSymbols, options: EncodeOptions) -> _Slice:
+    """A layer in one slice."""
+    return _Slice(len(layer.anchor_q), *write_layer(layer, options))
+
+
+def _write_slices(layer: LayerSymbols, options: EncodeOptions, utility: np.ndarray, reserved: int = 0) -> list[_Slice]:
+    """The slices of a layer, in order, of about options.slices bytes at most.
+
+    utility: float [n], of the layer's anchors; the highest come first. reserved: bytes before the first slice that
+    count as part of it. A first slice that planes and networks alone make larger has no anchors, except in layer 0,
+    where a picture needs some.
+    """
+    rows = np.argsort(-utility, kind="stable")
+    costs = np.cumsum(layer.bits_per_row()[rows]) / 8
+    done, found, past = 0, list[_Slice](), Past[Fitted]()
+    scale = 1.0  # bytes that a slice takes per byte expected
+    while done < len(rows) or not found:
+        room = options.slices - CHUNK_OVERHEAD - (0 if found else reserved)
+        least = 1 if found or layer.kind.layer == 0 else 0
+        before = costs[done - 1] if done else 0.0
+        fixed = 0 if found else len(write_layer(sliced(layer, rows[:0], True), options)[0])
+        if not found and layer.kind.layer == 0:
+            room = max(room, 2 * fixed)
+        tries: list[tuple[bool, int, _Slice, Past[Fitted]]] = []  # fits, anchors, slice, state for the next slice
+        for _ in range(TRIES):
+            expected = (costs[done:] - before) * scale + fixed
+            likely = int(np.searchsorted(expected, room * SLACK, side="right"))
+            count = min(max(likely, least), len(rows) - done)
+            trial = past.copy()
+            payload, streams = write_layer(sliced(layer, rows[done : done + count], not found), options, trial, layer)
+            if count:
+                scale *= max(len(payload) - fixed, 1) / max(expected[count - 1] - fixed, 1)
+            fits = len(payload) <= room or count <= least
+            tries.append((fits, count, _Slice(count, payload, streams), trial))
+            if fits and (len(payload) >= room * FULL or count in (least, len(rows) - done)):
+                break
+        _, count, made, past = max(tries, key=lambda tried: (tried[0], tried[1] if tried[0] else -tried[1]))
+        found.append(made)
+        done += count
+    return found
+
+
 def _container(
-    symbols: SceneSymbols, bounds: dict[str, float], mode: str, written: list[list[Slice]], metadata: bytes
+    symbols: SceneSymbols, bounds: dict[str, float], mode: str, written: list[list[_Slice]], metadata: bytes
 ) -> bytes:
     """The file of these slices. Metadata, if there is any, comes last: a picture does not wait for it."""
     parts = [
@@ -220,7 +273,7 @@ def _fingerprint(layer: LayerSymbols) -> bytes:
     return digest.digest()
 
 
-def _layer_report(layer: LayerSymbols, slices: list[Slice]) -> LayerReport:
+def _layer_report(layer: LayerSymbols, slices: list[_Slice]) -> LayerReport:
     positions, *streams = _added(slices)
     rows = [SliceReport(CHUNK_OVERHEAD + len(part.payload), part.anchors) for part in slices]
     counted = [s for s in streams if s.name != "masks"]
@@ -237,7 +290,7 @@ def _layer_report(layer: LayerSymbols, slices: list[Slice]) -> LayerReport:
     )
 
 
-def _added(slices: list[Slice]) -> list[StreamReport]:
+def _added(slices: list[_Slice]) -> list[StreamReport]:
     """Sums over the slices by section; the positions come first."""
     found: dict[str, StreamReport] = {}
     for row in (row for part in slices for row in part.streams):

@@ -13,12 +13,10 @@ from numpy.typing import ArrayLike
 from pd4dgs_codec.errors import Malformed
 from pd4dgs_codec.format import canonical
 from pd4dgs_codec.format.canonical import Fields, as_integer, as_list
-from pd4dgs_codec.format.check import info_fault
 from pd4dgs_codec.format.container import SCENE_ID_SIZE
-from pd4dgs_codec.format.kinds import BY_CHUNK_TYPE, LAYER_KINDS
-from pd4dgs_codec.format.limits import MAX_CHUNKS, MAX_PAYLOAD
 from pd4dgs_codec.format.options import MODES
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, Grid, is_step
+from pd4dgs_codec.format.registry import BY_CHUNK_TYPE, LAYER_KINDS, MAX_CHUNKS, MAX_PAYLOAD
 from pd4dgs_codec.scene import ATTRIBUTES, MAX_FEATURE, MAX_SLOTS, Camera, SceneInfo, Widths
 
 # Keys of the header map.
@@ -138,6 +136,21 @@ def unpack_header(data: bytes, offset: int = 0) -> Header:
         error_bounds=_unpack_error_bounds(fields),
         digest=_unpack_digest(fields.get(DIGEST)),
     )
+
+
+def info_fault(info: SceneInfo) -> str | None:
+    """The first rule that finite header values break, or None; for the encoder and the decoder."""
+    start, end = info.time_range
+    rules = [
+        (start <= end, f"time range {start}..{end}, expected it to ascend"),
+        (all(0 <= c <= 1 for c in info.background), f"background {info.background}, expected 0..1"),
+        (0 <= info.near < info.far, f"near {info.near} and far {info.far}, expected 0 <= near < far"),
+        (info.unit >= 0, f"unit {info.unit}, expected 0 or more"),
+    ]
+    if info.camera is not None:
+        fx, fy = float(info.camera.K[0, 0]), float(info.camera.K[1, 1])
+        rules.append((fx > 0 and fy > 0, f"camera with focal lengths {fx} and {fy}, expected both positive"))
+    return next((fault for holds, fault in rules if not holds), None)
 
 
 def payload_digest(payloads: Iterable[bytes]) -> bytes:

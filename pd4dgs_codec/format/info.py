@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.errors import DecodeError
-from pd4dgs_codec.format.bounds import rounding_bounds
+from pd4dgs_codec.format.check import rounding_bounds
 from pd4dgs_codec.format.container import CHUNK_OVERHEAD, MAJOR, MINOR, PREAMBLE_SIZE, read_chunk, read_preamble
 from pd4dgs_codec.format.decoder import read_layers
 from pd4dgs_codec.format.header import unpack_header
-from pd4dgs_codec.format.kinds import BY_CHUNK_TYPE, Section
 from pd4dgs_codec.format.metadata import CHUNK_TYPE, TEXTS, Metadata, read_metadata
 from pd4dgs_codec.format.payload import Declared, read_parameters
+from pd4dgs_codec.format.registry import BY_CHUNK_TYPE, Section
 from pd4dgs_codec.format.symbols import float_tensors
 
 FORMAT_VERSION = f"{MAJOR}.{MINOR}"

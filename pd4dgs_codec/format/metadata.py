@@ -14,7 +14,7 @@ import numpy as np
 from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
 from pd4dgs_codec.format import canonical
 from pd4dgs_codec.format.canonical import Fields, as_integer
-from pd4dgs_codec.format.limits import MAX_CHUNKS
+from pd4dgs_codec.format.registry import MAX_CHUNKS
 
 CHUNK_TYPE = 3  #: ancillary
 

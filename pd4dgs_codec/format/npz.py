@@ -4,11 +4,13 @@ from __future__ import annotations
 
 import numpy as np
 
+from pd4dgs_codec.format.deformation import arrays_of
 from pd4dgs_codec.format.quantise import Grid, attribute_rows, classes_of, quantise
+from pd4dgs_codec.format.registry import LAYER_KINDS
 from pd4dgs_codec.scene import MASK_STEP, Scene
 
-#: Prefix in the names of each layer's networks and planes.
-PREFIXES = {0: "", 1: "global", 2: "local"}
+#: Part of the names of each layer's networks and planes.
+OWNERS = {0: "", 1: "global", 2: "local"}
 
 
 def to_npz_dict(scene: Scene, symbols: bool = False) -> dict[str, np.ndarray]:
@@ -26,17 +28,11 @@ def to_npz_dict(scene: Scene, symbols: bool = False) -> dict[str, np.ndarray]:
         arrays["step_class"] = scene.grading.classes
         for name, centre in attribute_rows(scene.grading.centre, scene.widths):
             arrays[f"{name}_centre"] = centre.reshape(scene.widths.attributes[name])
-    for layer, owner in PREFIXES.items():
-        tensors = scene.tensors(layer)
-        for name, network in tensors.networks.items():
-            stem = f"mlp.{owner}.{name}" if owner else f"mlp.{name}"
-            for i, (weight, bias) in enumerate(network):
-                arrays[f"{stem}.weight.{i}"], arrays[f"{stem}.bias.{i}"] = weight, bias
-                steps[f"{stem}.weight.{i}"] = steps[f"{stem}.bias.{i}"] = scene.steps.weights(layer)
-        for s, planes in enumerate(tensors.planes):
-            for name, plane in planes.items():
-                arrays[f"planes.{owner}.{s}.{name}"] = plane
-                steps[f"planes.{owner}.{s}.{name}"] = scene.steps.planes(layer)
+    for kind in LAYER_KINDS:
+        for step, name, array in arrays_of(scene.tensors(kind.layer), kind):
+            family, rest = name.split(".", 1)
+            name = ".".join(filter(None, (family, OWNERS[kind.layer], rest)))
+            arrays[name], steps[name] = array, vars(scene.steps)[step]
     if symbols:
         quantised = {name: quantise(arrays[name], step, name) for name, step in steps.items()}
         channels = Grid.of(scene).quantise(scene.attributes, classes_of(scene))

@@ -23,10 +23,9 @@ from pd4dgs_codec.format import canonical, deformation
 from pd4dgs_codec.format.attributes import Past, by_class, check_classes, read_attributes, write_attributes
 from pd4dgs_codec.format.canonical import Fields
 from pd4dgs_codec.format.deformation import Shape
-from pd4dgs_codec.format.kinds import LayerKind, Section
-from pd4dgs_codec.format.limits import MAX_ANCHORS, MAX_PARAMETERS, MAX_PAYLOAD
 from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, NO_CLASSES, magnitude
+from pd4dgs_codec.format.registry import MAX_ANCHORS, MAX_PARAMETERS, MAX_PAYLOAD, LayerKind, Section
 from pd4dgs_codec.format.symbols import LayerSymbols
 from pd4dgs_codec.scene import MASK_MIN_CODE, Deformation, Widths
 

@@ -1,4 +1,4 @@
-"""Prediction of plane samples from their neighbours: predictors, their exact inverses, and the encoder's choice.
+"""The planes of a HexPlane, for `deformation`: prediction, the coded section, samples, and cells that nothing samples.
 
 A plane is int32 [C, H, W]. A sample at row i, column j of a channel is predicted from its neighbours W = k[i, j-1],
 N = k[i-1, j] and NW = k[i-1, j-1], and the residual k - prediction is coded. In row 0 N and NW are taken equal to W, in
@@ -10,20 +10,39 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
-from functools import cache
-from importlib import import_module
-from types import ModuleType
+from itertools import accumulate
 
 import numpy as np
 
-from pd4dgs_codec.entropy.bits import BIT, frequency_costs, symbol_counts
-from pd4dgs_codec.errors import Malformed
+from pd4dgs_codec.entropy.bits import BIT, frequency_costs
+from pd4dgs_codec.entropy.channels import decode_joined
+from pd4dgs_codec.entropy.varint import ByteReader, put_varint
+from pd4dgs_codec.errors import Malformed, UnsupportedFeature
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, magnitude
+from pd4dgs_codec.format.stages import (
+    PLAIN,
+    STAGED,
+    Activity,
+    CodedSection,
+    Group,
+    Places,
+    activity_classes,
+    cheapest_class_count,
+    coded_stages,
+    parts_of,
+    read_class_count,
+    read_stages,
+    smaller_form,
+)
+from pd4dgs_codec.scene import PLANES, Planes, plane_sides
 
+PlaneShape = tuple[int, int, int]  #: of a plane: channels, rows, columns
 Array = np.ndarray
 
 #: A channel that spans more values is too sparse for its frequencies to be an estimate.
 WIDEST = 1 << 16
+#: Cells by which a position may be off in another renderer, which rounds its coordinates otherwise.
+CELL_SLACK = 0.02
 
 
 @dataclass(frozen=True)
@@ -164,17 +183,11 @@ def _scan_together(planes: Sequence[Array], predictor: Predictor) -> list[Array]
 # -- the encoder's choice ----------------------------------------------------------------------------------------------
 
 
-def choose_predictor(k: Array) -> tuple[int, Array]:
-    """(id, int32 residuals) of the predictor with the smallest estimated cost among those within MAX_SYMBOL."""
-    _, predictor, _, r = min(_candidates((predictor, k) for predictor in PREDICTORS), key=lambda found: found[0])
-    return predictor, r
-
-
-def fill_plane(k: Array, given: Array) -> Array:
-    """Samples int32 [C, H, W] equal to `k` where `given` bool [H, W], with values elsewhere that cost little: under the
-    predictor that codes the plane cheapest, the residuals of all free samples are 0."""
-    filled = ((predictor, _fill(k, given, predictor)) for predictor in PREDICTORS)
-    return min(_candidates(filled), key=lambda found: found[0])[2]
+def choose_predictor(k: Array) -> tuple[int, Array, float]:
+    """(id, int32 residuals, estimated bits) of the predictor with the smallest estimate among those within
+    MAX_SYMBOL."""
+    bits, predictor, _, r = min(_candidates((predictor, k) for predictor in PREDICTORS), key=lambda found: found[0])
+    return predictor, r, bits
 
 
 def _candidates(planes: Iterable[tuple[int, Array]]) -> Iterator[tuple[float, int, Array, Array]]:
@@ -187,64 +200,209 @@ def _candidates(planes: Iterable[tuple[int, Array]]) -> Iterator[tuple[float, in
                 yield _estimated_bits(r), predictor, k, r
 
 
-@cache
-def kernels() -> ModuleType | None:
-    """The compiled loops, with the same results as those in numpy; None where numba is not installed."""
-    try:
-        return import_module("pd4dgs_codec.format.plane_kernels")
-    except ImportError:
-        return None
-
-
-def _fill(k: np.ndarray, given: np.ndarray, predictor: int) -> np.ndarray:
-    """`k` with predictions in place of the samples that are not given."""
-    found = kernels()
-    x = found.fill(k, given, predictor) if found and predictor in found.KNOWN else _filled(k, given, predictor)
-    clipped: np.ndarray = np.clip(x, -1 - MAX_SYMBOL, 1 + MAX_SYMBOL).astype(np.int32)
-    return clipped
-
-
-def _filled(k: np.ndarray, given: np.ndarray, predictor: int) -> np.ndarray:
-    """int64 [C, H, W] of `_fill`, by anti-diagonals."""
-    _, h, w = k.shape
-    x = k.astype(np.int64)
-    for d in range(h + w - 1):
-        i = np.arange(max(0, d - w + 1), min(h, d + 1))
-        i = i[~given[i, d - i]]
-        if not i.size:
-            continue
-        j = d - i
-        left, up = x[:, i, np.maximum(j - 1, 0)], x[:, np.maximum(i - 1, 0), j]
-        corner = x[:, np.maximum(i - 1, 0), np.maximum(j - 1, 0)]
-        west, north = np.where(j > 0, left, up), np.where(i > 0, up, left)
-        northwest = np.where((i > 0) & (j > 0), corner, np.where(i > 0, up, left))
-        x[:, i, j] = PREDICTORS[predictor].predict(west, north, northwest) if d else 0
-    return x
-
-
-def _estimated_bits(residuals: np.ndarray) -> float:
+def _estimated_bits(residuals: Array) -> float:
     """Cost of residuals int32 [C, H, W]: per channel its order-0 entropy, and log2(n) / 2 per distinct value for the
-    description of the distribution."""
+    description of the distribution. The entropies are sums of integers, so the choice is the same on every machine."""
     if residuals.size == 0:
         return 0.0
-    channels = np.ascontiguousarray(residuals.reshape(len(residuals), -1))
-    found = kernels()
-    costs, distinct = found.order0(channels, WIDEST) if found else _order0(channels, WIDEST)
-    described = int(np.maximum(distinct - 1, 0).sum())
-    bits = float(costs.sum()) / BIT + 0.5 * described * float(np.log2(channels.shape[1]))
-    for channel in channels[distinct == 0]:
-        size = np.abs(channel.astype(np.int64) - np.median(channel)).mean() + 1
-        bits += float(channel.size * np.log2(size) + 2 * channel.size)
+    channels = residuals.reshape(len(residuals), -1)
+    size, low = channels.shape[1], channels.min(axis=1).astype(np.int64)
+    span = channels.max(axis=1) - low
+    narrow = span <= WIDEST
+    ends = np.cumsum(np.where(narrow, span + 1, 0))  # of each channel's counts
+    bits = 0.0
+    if narrow.any():
+        places = channels + (ends - span - 1 - low)[:, None]
+        counts = np.bincount((places if narrow.all() else places[narrow]).ravel())
+        counts = counts[counts > 0]
+        costs = int(counts @ frequency_costs(counts)) - int(narrow.sum()) * size * int(frequency_costs(np.array(size)))
+        bits = costs / BIT + 0.5 * (counts.size - int(narrow.sum())) * float(np.log2(size))
+    for channel in channels[~narrow]:
+        mean = np.abs(channel.astype(np.int64) - np.median(channel)).mean() + 1
+        bits += float(size * np.log2(mean) + 2 * size)
     return bits
 
 
-def _order0(channels: np.ndarray, widest: int) -> tuple[np.ndarray, np.ndarray]:
-    """(order-0 entropy int64 [C] in units of 2^-20 bits, number of distinct values int64 [C]) of channels int32 [C, n];
-    both are 0 for a channel over more than `widest`."""
-    costs, distinct = np.zeros(len(channels), np.int64), np.zeros(len(channels), np.int64)
-    for c, channel in enumerate(channels):
-        if int(channel.max()) - int(channel.min()) <= widest:
-            counts = symbol_counts(channel)[1]
-            whole = channel.size * int(frequency_costs(np.array(channel.size)))
-            costs[c], distinct[c] = int(counts @ frequency_costs(counts)) - whole, counts.size
-    return costs, distinct
+# -- samples -----------------------------------------------------------------------------------------------------------
+
+
+def sample_planes(planes: Planes, box: np.ndarray, points: np.ndarray, t: float) -> np.ndarray:
+    """float32 [n, sum of C]: bilinear samples, multiplied over a scale's six planes, concatenated over scales.
+
+    points: float32 [n, 3], scene units; box float32 [2, 3] maps to the planes' corners (align corners), clamped at the
+    border; t in 0..1 to the first and last time row.
+    """
+    extent = np.maximum(box[1] - box[0], np.finfo(np.float32).tiny)
+    unit = np.empty((len(points), 4), dtype=np.float32)
+    unit[:, :3] = np.clip((points - box[0]) / extent, 0.0, 1.0)
+    unit[:, 3] = np.clip(t, 0.0, 1.0)
+    features = []
+    for scale in planes:
+        position = unit * (np.array(plane_sides(scale), dtype=np.float32) - 1)
+        product: np.ndarray | float = 1.0
+        for name, a, b in PLANES:
+            product = product * bilinear(scale[name], position[:, a], position[:, b])
+        features.append(product)
+    return np.concatenate(features, axis=1) if features else np.zeros((len(points), 0), np.float32)
+
+
+def bilinear(plane: np.ndarray, u: np.ndarray, v: np.ndarray) -> np.ndarray:
+    """[n, C] samples of plane [C, H, W] at column u in 0..W-1 and row v in 0..H-1."""
+    _, h, w = plane.shape
+    rows_last = np.ascontiguousarray(plane.transpose(1, 2, 0))
+    j, i = np.minimum(u.astype(np.intp), max(w - 2, 0)), np.minimum(v.astype(np.intp), max(h - 2, 0))
+    j1, i1 = np.minimum(j + 1, w - 1), np.minimum(i + 1, h - 1)
+    fu, fv = (u - j)[:, None], (v - i)[:, None]
+    top = rows_last[i, j] * (1 - fu) + rows_last[i, j1] * fu
+    bottom = rows_last[i1, j] * (1 - fu) + rows_last[i1, j1] * fu
+    samples: np.ndarray = top * (1 - fv) + bottom * fv
+    return samples
+
+
+# -- cells that nothing samples ----------------------------------------------------------------------------------------
+
+
+def cells_read(planes: Planes, unit: Array) -> list[dict[str, Array]]:
+    """Per scale, by plane name, bool [H, W]: the cells that points unit float32 [n, 3], 0..1 in the box, read at some
+    time."""
+    read = []
+    for scale in planes:
+        cells = [_cells(unit[:, axis], side) for axis, side in enumerate(plane_sides(scale)[:3])]
+        marks = {}
+        for name, a, b in PLANES:
+            marks[name] = np.zeros(scale[name].shape[1:], bool)
+            for i in cells[a]:
+                for j in cells[b] if b < 3 else [slice(None)]:
+                    marks[name][j, i] = True
+        read.append(marks)
+    return read
+
+
+def _cells(unit: Array, side: int) -> list[Array]:
+    """int64 [n] each: the cells that samples at unit float32 [n], 0..1, may read on an axis of `side` cells."""
+    first = np.floor(unit * (side - 1) - CELL_SLACK)
+    last = np.floor(unit * (side - 1) + CELL_SLACK) + 1
+    return [np.clip(cell, 0, side - 1).astype(np.int64) for cell in (first, first + 1, last)]
+
+
+def fill_plane(k: Array, given: Array) -> tuple[Array, float]:
+    """(samples int32 [C, H, W], estimated bits that they save): equal to `k` where `given` bool [H, W], with values
+    elsewhere that cost little. Under the predictor that codes the plane cheapest the residuals of all free samples are
+    0."""
+    if given.all():
+        return k, 0.0
+    filled = _candidates((predictor, _filled(k, given, predictor)) for predictor in PREDICTORS)
+    bits, _, samples, _ = min(filled, key=lambda found: found[0])
+    return samples, choose_predictor(k)[2] - bits
+
+
+def _filled(k: Array, given: Array, predictor: int) -> Array:
+    """`k` with predictions in place of the samples that are not given, by anti-diagonals."""
+    channels, height, width = k.shape
+    x = k.reshape(channels, -1).T.astype(np.int64)
+    i, j = np.nonzero(~given)
+    order = np.argsort(i + j, kind="stable")
+    i, j = i[order], j[order]
+    cell, left, up = i * width + j, i * width + j - 1, (i - 1) * width + j
+    west, north = np.where(j > 0, left, up), np.where(i > 0, up, left)
+    corner = np.where((i > 0) & (j > 0), up - 1, north)
+    ends = np.cumsum(np.bincount(i + j, minlength=1)).tolist()
+    for first, end in zip([0, *ends], ends, strict=False):
+        if end > first:
+            at = slice(first, end)
+            x[cell[at]] = PREDICTORS[predictor].predict(x[west[at]], x[north[at]], x[corner[at]]) if cell[first] else 0
+    filled: Array = np.clip(x, -1 - MAX_SYMBOL, 1 + MAX_SYMBOL).astype(np.int32)
+    return np.ascontiguousarray(filled.T).reshape(k.shape)
+
+
+# -- the planes section of mode ans (clause 8.8) -----------------------------------------------------------------------
+
+
+def write_planes(residuals: Sequence[np.ndarray], priors: str, effort: int) -> tuple[bytes, float]:
+    """(section bytes, sum of R(a) over all channels) of residuals int32 [C, H, W] per plane, in the smaller form."""
+    channels = [channel.ravel() for plane in residuals for channel in plane]
+    section, rate_bits = smaller_form(lambda: channels, lambda: _write_staged(residuals, effort), priors, effort)
+    return section.data, rate_bits
+
+
+def read_planes(data: bytes, shapes: Sequence[PlaneShape]) -> list[np.ndarray]:
+    """Residuals int32 [C, H, W] per plane; the inverse of write_planes. shapes were checked against the limits."""
+    reader = ByteReader(data)
+    form = reader.byte("the form of the planes")
+    if form == PLAIN:
+        symbols = decode_joined(reader.rest(), [h * w for c, h, w in shapes for _ in range(c)])
+        ends = accumulate(c * h * w for c, h, w in shapes)
+        return [symbols[end - c * h * w : end].reshape(c, h, w) for (c, h, w), end in zip(shapes, ends, strict=True)]
+    if form != STAGED:
+        raise UnsupportedFeature(f"form {form} of the planes, expected {PLAIN} or {STAGED}")
+    number = _stage_count(shapes)
+    counts = [read_class_count(reader, stage) for stage in range(1, number)]
+    planes = [np.zeros((c, h * w), np.int32) for c, h, w in shapes]
+    read_stages(reader, number, _groups(planes, shapes, counts))
+    return [plane.reshape(shape) for plane, shape in zip(planes, shapes, strict=True)]
+
+
+def _write_staged(residuals: Sequence[np.ndarray], effort: int) -> CodedSection:
+    shapes: list[PlaneShape] = [plane.shape for plane in residuals]
+    planes = [plane.reshape(len(plane), -1) for plane in residuals]
+    counts, activities = [], [Activity(plane.shape[1]) for plane in planes]
+    for stage in range(_stage_count(shapes)):
+        first, end = _bounds(stage)
+        if stage:
+            groups = [
+                (plane[first:end], _around(activity.now, shape))
+                for plane, activity, shape in zip(planes, activities, shapes, strict=True)
+            ]
+            counts.append(cheapest_class_count(groups))
+        for plane, activity in zip(planes, activities, strict=True):
+            activity.add(plane[first:end])
+    out = bytearray([STAGED])
+    for count in counts:
+        put_varint(out, count)
+    return coded_stages(out, map(parts_of, _groups(planes, shapes, counts)), effort)
+
+
+def _stage_count(shapes: Sequence[PlaneShape]) -> int:
+    """All planes of a layer have the same number of channels."""
+    return max(1, (shapes[0][0] - 1).bit_length())
+
+
+def _bounds(stage: int) -> tuple[int, int]:
+    """Its first channel, and that of the next stage."""
+    return (1 << stage if stage else 0), 2 << stage
+
+
+def _groups(planes: Sequence[np.ndarray], shapes: Sequence[PlaneShape], counts: Sequence[int]) -> Iterator[list[Group]]:
+    """Per stage, what it codes of each plane. `planes` int32 [C, H * W] are read only as far as the stages before
+    reach."""
+    activities = [Activity(plane.shape[1]) for plane in planes]
+    for stage, count in enumerate((1, *counts)):
+        first, end = _bounds(stage)
+        groups: list[Group] = []
+        for plane, activity, shape in zip(planes, activities, shapes, strict=True):
+            places = Places.whole(plane.shape[1])
+            if count > 1:
+                places = Places.by(activity_classes(_around(activity.now, shape), count), count)
+            groups.append((plane[first:end], places))
+        yield groups
+        if any(later > 1 for later in counts[stage:]):
+            for plane, activity in zip(planes, activities, strict=True):
+                activity.add(plane[first:end])
+
+
+def _around(activity: np.ndarray, shape: PlaneShape) -> np.ndarray:
+    """[H * W]: activity [H * W] summed over 3 x 3 cells, the border repeated."""
+    _, height, width = shape
+    cells = activity.reshape(height, width)
+    around: np.ndarray = _of_three(_of_three(cells).T).T.ravel()
+    return around
+
+
+def _of_three(cells: np.ndarray) -> np.ndarray:
+    """[H, W]: each cell with the one before and the one behind it in its row, the first and the last repeated."""
+    sums: np.ndarray = cells.copy(order="K")
+    sums[:, 1:] += cells[:, :-1]
+    sums[:, :-1] += cells[:, 1:]
+    sums[:, 0] += cells[:, 0]
+    sums[:, -1] += cells[:, -1]
+    return sums

@@ -25,6 +25,19 @@ NO_CLASSES = np.zeros(0, np.int32)  #: the step classes of anchors that are not 
 Integers = np.ndarray | int
 
 
+def expect(ok: bool, message: str) -> None:
+    """Raise EncodeError with this message unless `ok`."""
+    if not ok:
+        raise EncodeError(message)
+
+
+def expect_array(name: str, a: np.ndarray, dtype: type, shape: tuple[int, ...]) -> None:
+    """Raise EncodeError unless an array has this dtype and shape, and finite values."""
+    expect(a.dtype == dtype and a.shape == shape, f"{name}: {a.dtype} {a.shape}, expected {np.dtype(dtype)} {shape}")
+    if a.dtype.kind == "f":
+        expect(bool(np.isfinite(a).all()), f"{name}: a value is NaN or infinite")
+
+
 def is_step(value: float) -> bool:
     """Whether `value` may be a quantisation step or a voxel size: a positive normal binary32."""
     return bool(_SMALLEST_STEP <= value <= _LARGEST_STEP and float(np.float32(value)) == value)

@@ -16,8 +16,8 @@ from pd4dgs_codec.format.deformation import (
     layer_steps,
     quantise_tensors,
 )
-from pd4dgs_codec.format.kinds import LAYER_KINDS, LayerKind
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, Grid, all_finite, classes_of, row_blocks
+from pd4dgs_codec.format.registry import LAYER_KINDS, LayerKind
 from pd4dgs_codec.morton import MAX_VOXEL, morton_order
 from pd4dgs_codec.scene import Deformation, Grading, Scene, SceneInfo, Steps, Widths
 
@@ -45,7 +45,16 @@ class LayerSymbols:
     def arrays(self) -> list[np.ndarray]:
         """All arrays, in the order in which info --hashes digests them."""
         own = [self.anchor_q, self.mask_increase, self.mask_own, self.classes, self.attributes]
-        return own + [array for _, array in arrays_of(self.tensors, self.kind)]
+        return own + [array for *_, array in arrays_of(self.tensors, self.kind)]
+
+    def bits_per_row(self) -> np.ndarray:
+        """float64 [n]: about the bits that each anchor takes, by the frequencies of its symbols in their channels."""
+        n = len(self.anchor_q)
+        bits = np.full(n, 3.0 * max(n, 2).bit_length())  # of a position
+        for channel in (self.mask_own, *self.attributes):
+            _, index, counts = np.unique(channel, return_inverse=True, return_counts=True)
+            bits += np.log2(n / counts)[index]
+        return bits
 
 
 def layer_symbols(scene: Scene, index: int) -> LayerSymbols:
@@ -159,7 +168,7 @@ def float_tensors(scene: Scene, index: int) -> list[np.ndarray]:
     kind = LAYER_KINDS[scene.layers[index]]
     own = slice(scene.rows[index - 1] if index else 0, scene.rows[index])
     attributes = [values[own] for values in scene.attributes.values()]
-    return [scene.anchor_at(own), *attributes, *(x for _, x in arrays_of(scene.tensors(kind.layer), kind))]
+    return [scene.anchor_at(own), *attributes, *(x for *_, x in arrays_of(scene.tensors(kind.layer), kind))]
 
 
 def _mask_codes(layers: Sequence[LayerSymbols]) -> list[np.ndarray]:
@@ -190,7 +199,7 @@ def check_slice(layers: Sequence[LayerSymbols], voxel_size: float, grid: Grid) -
     if max(farthest.values()) > MAX_SYMBOL:
         raise Malformed(f"{where}: an attribute more than {MAX_SYMBOL} steps from 0")
     stored = [(layer.anchor_q, voxel_size), *((np.array(k), grid.steps[name]) for name, k in farthest.items())]
-    stored += [(k, layer.steps[name]) for name, k in arrays_of(layer.tensors, layer.kind)]
+    stored += [(k, layer.steps[name]) for name, _, k in arrays_of(layer.tensors, layer.kind)]
     if not all(all_finite(k, step) for k, step in stored):
         raise Malformed(f"{where}: a dequantised value is not finite")
 

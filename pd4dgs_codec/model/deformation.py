@@ -18,7 +18,7 @@ from torch.nn import functional as F
 
 from pd4dgs_codec import scene
 from pd4dgs_codec.draw.layers import Layers
-from pd4dgs_codec.format.planes import choose_predictor
+from pd4dgs_codec.format.deformation import choose_predictor
 from pd4dgs_codec.format.quantise import quantise
 from pd4dgs_codec.model import plane_terms
 from pd4dgs_codec.model.config import DeformationConfig
@@ -114,7 +114,7 @@ class DeformationField(nn.Module):
         total = 0.0
         for planes in self.planes.arrays():
             for name, plane in planes.items():
-                _, residual = choose_predictor(quantise(plane, step, name))
+                _, residual, _ = choose_predictor(quantise(plane, step, name))
                 total += gaussian_bits(residual.reshape(len(residual), -1))
         return total
 

@@ -14,7 +14,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pd4dgs_codec.format.slicing import bits_per_row
 from pd4dgs_codec.format.symbols import layer_symbols
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.model import Model
@@ -161,7 +160,7 @@ def utility(scene: Scene, places: Sequence[Place], step: Callable[[], None] = la
     places = [(_smaller(camera), time) for camera, time in places]
     rank, first = np.zeros(len(scene.anchor_q)), 0
     for index, (layer, end) in enumerate(zip(scene.layers, scene.rows, strict=True)):
-        bits = bits_per_row(layer_symbols(scene, index))
+        bits = layer_symbols(scene, index).bits_per_row()
         rank[first:end] = _layer_utility(scene.prefix(layer), layer, first, bits, places, step)
         first = end
     return rank

@@ -11,11 +11,10 @@ import torch
 from pd4dgs_codec.data.view import View
 from pd4dgs_codec.entropy.bits import entropy_bits
 from pd4dgs_codec.format.deformation import decorrelate
-from pd4dgs_codec.format.kinds import LAYER_KINDS
-from pd4dgs_codec.format.left_out import LeftOut, tensor_bytes
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
-from pd4dgs_codec.format.plan import plan
+from pd4dgs_codec.format.plan import LeftOut, plan, tensor_bytes
 from pd4dgs_codec.format.quantise import classes_of
+from pd4dgs_codec.format.registry import LAYER_KINDS
 from pd4dgs_codec.format.symbols import layer_symbols, rounded
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.picture import render_image

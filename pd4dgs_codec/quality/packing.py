@@ -10,10 +10,9 @@ from typing import TYPE_CHECKING, Any
 
 from pd4dgs_codec.format.decoder import every_prefix
 from pd4dgs_codec.format.encoder import Report, encode_with_report, with_metadata
-from pd4dgs_codec.format.left_out import LeftOut
 from pd4dgs_codec.format.metadata import Metadata
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
-from pd4dgs_codec.format.plan import plan
+from pd4dgs_codec.format.plan import LeftOut, plan
 from pd4dgs_codec.format.symbols import rounded
 from pd4dgs_codec.quality import ENCODE_MIN_DB_PER_MEGABYTE
 from pd4dgs_codec.quality.frames import Frame, dataset_frames, own_frames

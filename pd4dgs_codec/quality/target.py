@@ -22,11 +22,10 @@ from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format.container import write_chunk
 from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.info import info
-from pd4dgs_codec.format.kinds import LAYER_KINDS
-from pd4dgs_codec.format.left_out import LeftOut
 from pd4dgs_codec.format.options import DEFAULTS, EncodeOptions
 from pd4dgs_codec.format.payload import write_layer
-from pd4dgs_codec.format.plan import plan
+from pd4dgs_codec.format.plan import LeftOut, plan
+from pd4dgs_codec.format.registry import LAYER_KINDS
 from pd4dgs_codec.format.symbols import layer_symbols, rounded
 from pd4dgs_codec.scene import Scene
 

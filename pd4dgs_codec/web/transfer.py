@@ -23,7 +23,7 @@ from urllib.parse import SplitResult, quote, urljoin, urlsplit
 from pd4dgs_codec.errors import DeliveryError, Truncated, one_line
 from pd4dgs_codec.format.container import PREAMBLE_SIZE, read_preamble
 from pd4dgs_codec.format.info import info
-from pd4dgs_codec.format.limits import MAX_HEADER
+from pd4dgs_codec.format.registry import MAX_HEADER
 from pd4dgs_codec.web import is_url
 from pd4dgs_codec.web.headers import content_range, strong_etag
 

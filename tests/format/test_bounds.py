@@ -7,13 +7,14 @@ import pytest
 from strategies import make_scene
 
 from pd4dgs_codec.errors import EncodeError, Malformed
-from pd4dgs_codec.format import bounds, deformation, encoder, quantise
+from pd4dgs_codec.format import deformation, encoder, quantise
+from pd4dgs_codec.format.check import ErrorBound
 from pd4dgs_codec.format.container import read_preamble
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode, encode_with_report
 from pd4dgs_codec.format.header import TENSOR_CLASSES, unpack_header
 from pd4dgs_codec.format.info import info, nearest_bounds
-from pd4dgs_codec.format.kinds import LAYER_KINDS
+from pd4dgs_codec.format.registry import LAYER_KINDS
 
 
 def scene_off_the_grid():
@@ -109,4 +110,4 @@ def test_a_quantiser_that_rounds_wrongly_is_found(monkeypatch, module, what):
 
 def test_an_empty_scene_has_bounds_too():
     _, report = encode_with_report(make_scene(0, anchors=0), layers=0, effort=1)
-    assert report.errors[0] == bounds.ErrorBound("feature", 0.0625, report.errors[0].bound, 0.0)
+    assert report.errors[0] == ErrorBound("feature", 0.0625, report.errors[0].bound, 0.0)

@@ -30,7 +30,7 @@ from pd4dgs_codec.format.container import (
     write_chunk,
     write_preamble,
 )
-from pd4dgs_codec.format.limits import MAX_HEADER, MAX_PAYLOAD
+from pd4dgs_codec.format.registry import MAX_HEADER, MAX_PAYLOAD
 
 PAYLOADS = [b"layer zero", b"", b"layer two, a little longer"]
 FLAGS = [0, FLAG_ANCILLARY, 0]

@@ -7,14 +7,12 @@ import pytest
 from strategies import assert_same_scene, make_scene
 
 from pd4dgs_codec.errors import EncodeError
-from pd4dgs_codec.format import planes as decorrelation
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode, encode_with_report
-from pd4dgs_codec.format.omissions import cells_read
 from pd4dgs_codec.format.options import EncodeOptions
 from pd4dgs_codec.format.plan import make_plan, plan
-from pd4dgs_codec.format.planes import fill_plane
-from pd4dgs_codec.format.symbols import SceneSymbols, rounded
+from pd4dgs_codec.format.planes import PREDICTORS, cells_read, fill_plane, residual
+from pd4dgs_codec.format.symbols import rounded
 from pd4dgs_codec.scene import DEFAULT_WIDTHS, PLANES, Camera, Deformation, Scene, Widths
 
 SIDES = (6, 5, 7, 5)
@@ -134,7 +132,8 @@ def test_nothing_that_matters_goes():
     _, left_out = plan(scene, EncodeOptions(layers=2))
     assert all("cells" in item.what for item in left_out)
     untouched = decode(encode(scene, layers=2, effort=1, omit="nothing"))
-    read = cells_read(SceneSymbols.of(untouched))
+    low, high = untouched.info.box
+    read = cells_read(untouched.global_deformation.planes, np.clip((untouched.anchor - low) / (high - low), 0, 1))
     free = 0
     for marks, given, got in zip(
         read, untouched.global_deformation.planes, planned.global_deformation.planes, strict=True
@@ -150,13 +149,14 @@ def test_a_filled_plane_keeps_what_is_given_and_costs_less():
     rng = np.random.default_rng(2)
     plane = rng.integers(-9, 10, (3, 12, 10), dtype=np.int32)
     given = rng.random((12, 10)) < 0.5
-    filled = fill_plane(plane, given)
+    filled, saved = fill_plane(plane, given)
+    assert saved > 0
     assert np.array_equal(filled[:, given], plane[:, given])
-    assert np.array_equal(fill_plane(filled, given), filled)
-    zeros = [(decorrelation.residual(p, filled)[:, ~given] == 0).all() for p in decorrelation.PREDICTORS]
+    assert np.array_equal(fill_plane(filled, given)[0], filled)
+    zeros = [(residual(p, filled)[:, ~given] == 0).all() for p in PREDICTORS]
     assert any(zeros)
-    assert np.array_equal(fill_plane(plane, np.ones_like(given)), plane)
-    assert not fill_plane(plane, np.zeros_like(given)).any()
+    assert np.array_equal(fill_plane(plane, np.ones_like(given))[0], plane)
+    assert not fill_plane(plane, np.zeros_like(given))[0].any()
 
 
 def test_an_unknown_wish_is_refused():

@@ -9,10 +9,9 @@ from strategies import make_scene
 
 from pd4dgs_codec.format import encoder
 from pd4dgs_codec.format.decoder import decode
-from pd4dgs_codec.format.heads import head_bounds
-from pd4dgs_codec.format.kinds import LAYER_KINDS
-from pd4dgs_codec.format.plan import plan
-from pd4dgs_codec.format.residuals import sample_planes
+from pd4dgs_codec.format.deformation import sample_planes
+from pd4dgs_codec.format.plan import head_bounds, plan
+from pd4dgs_codec.format.registry import LAYER_KINDS
 from pd4dgs_codec.scene import GLOBAL_HEADS, LENGTH_HEADS, LOCAL_HEADS, PLANES, Deformation, Widths, deformation_unit
 
 VOXEL = 0.0078125

@@ -10,8 +10,8 @@ from hypothesis import strategies as st
 from pd4dgs_codec.entropy.channels import encode_channels
 from pd4dgs_codec.entropy.priors import K_MAX
 from pd4dgs_codec.errors import DecodeError, LimitExceeded, Malformed, UnsupportedFeature
-from pd4dgs_codec.format import deformation
-from pd4dgs_codec.format.deformation import read_planes, write_planes
+from pd4dgs_codec.format import planes as module
+from pd4dgs_codec.format.planes import read_planes, write_planes
 from pd4dgs_codec.format.stages import PLAIN, STAGED
 
 
@@ -32,9 +32,9 @@ def assert_same_planes(found, expected):
 
 def written_in_stages(planes, class_count=None):
     """The section in form 1, even where form 0 is shorter; class_count, if any, instead of the best."""
-    choose = deformation.cheapest_class_count if class_count is None else lambda _: class_count
-    with patch.object(deformation, "cheapest_class_count", choose):
-        return deformation._write_staged(planes, 1).data
+    choose = module.cheapest_class_count if class_count is None else lambda _: class_count
+    with patch.object(module, "cheapest_class_count", choose):
+        return module._write_staged(planes, 1).data
 
 
 @pytest.mark.parametrize("channels", [4, 7])
@@ -93,7 +93,7 @@ def test_activity_is_the_sum_over_the_cells_around_with_the_border_repeated():
     expected = 4 * magnitude
     expected[0, 1] = expected[1, 0] = 2 * magnitude[0, 0]
     expected[1, 1] = magnitude[0, 0]
-    with patch.object(deformation, "activity_classes", wraps=deformation.activity_classes) as classes:
+    with patch.object(module, "activity_classes", wraps=module.activity_classes) as classes:
         written_in_stages(planes, 2)
     np.testing.assert_array_equal(classes.call_args.args[0].reshape(4, 5), expected)
 

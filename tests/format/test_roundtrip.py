@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 from strategies import HUGE, RANGES, assert_same_networks, assert_same_scene, make_scene, scenes
 
 from pd4dgs_codec.errors import EncodeError
-from pd4dgs_codec.format import encoder, slicing
+from pd4dgs_codec.format import encoder
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.morton import morton_codes
 from pd4dgs_codec.scene import GLOBAL_HEADS, LOCAL_HEADS, Widths
@@ -147,7 +147,7 @@ FAULTS = {
     "scaffold networks .'color'. are missing": broken("networks", lambda n: {k: n[k] for k in n if k != "color"}),
     "layers": broken("layers", lambda _: (0, 2, 1)),
     "step of feature": broken("steps", lambda s: replace(s, feature=0.0)),
-    "global_deformation network trunk": broken(
+    "global_deformation mlp.trunk.weight.0": broken(
         "global_deformation", lambda d: replace(d, networks={**d.networks, "trunk": d.networks["position"]})
     ),
     "planes.*expected six": broken(
@@ -195,8 +195,8 @@ def test_verification_notices_a_changed_symbol(monkeypatch):
         changed[5, 0] += 1
         return original(replace(symbols, attributes=changed), coding)
 
-    original = slicing.write_layer
-    monkeypatch.setattr(slicing, "write_layer", write_wrong)
+    original = encoder.write_layer
+    monkeypatch.setattr(encoder, "write_layer", write_wrong)
     scene = make_scene(0, layers=(0,))
     with pytest.raises(EncodeError, match="verification: layer 0"):
         encode(scene)

@@ -11,7 +11,7 @@ from hypothesis.extra import numpy as hnp
 
 from pd4dgs_codec import decode, encode
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.format.residuals import residuals
+from pd4dgs_codec.format.deformation import residuals
 from pd4dgs_codec.model import checkpoint, fused
 from pd4dgs_codec.model.config import DeformationConfig
 from pd4dgs_codec.model.convert import from_scene, to_scene

@@ -28,12 +28,12 @@ from pd4dgs_codec.format import canonical
 from pd4dgs_codec.format.attributes import read_attributes
 from pd4dgs_codec.format.container import read_chunk, read_preamble, write_chunk, write_preamble
 from pd4dgs_codec.format.decoder import decode
-from pd4dgs_codec.format.deformation import read_planes
 from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.format.header import scene_id_of
 from pd4dgs_codec.format.info import hashes
-from pd4dgs_codec.format.kinds import Section
+from pd4dgs_codec.format.planes import read_planes
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, dequantise
+from pd4dgs_codec.format.registry import Section
 from pd4dgs_codec.format.stages import PLAIN, STAGED
 from pd4dgs_codec.morton import morton_order
 from pd4dgs_codec.scene import Widths

@@ -24,8 +24,8 @@ from pd4dgs_codec.format.container import CHUNK_OVERHEAD, read_chunk, read_pream
 from pd4dgs_codec.format.decoder import decode_partial
 from pd4dgs_codec.format.header import unpack_header
 from pd4dgs_codec.format.info import hashes, info
-from pd4dgs_codec.format.kinds import BY_CHUNK_TYPE
 from pd4dgs_codec.format.payload import Declared, read_parameters
+from pd4dgs_codec.format.registry import BY_CHUNK_TYPE
 
 from .mutate import Case
 

@@ -1,4 +1,4 @@
-"""Registries of the bitstream: a row per layer, with its networks and the names of its steps, and the sections."""
+"""Registries of the bitstream, a row per layer and the sections, and its limits."""
 
 from __future__ import annotations
 
@@ -61,3 +61,13 @@ class Section(IntEnum):
     PLANES = 3
     WEIGHTS = 4
     SYMBOLS = 5
+
+
+# Limits (clause 14). A reader checks every declared count against them before it allocates.
+
+MAX_HEADER = 1 << 14  #: bytes; the longest chunk list takes two thirds of it
+MAX_PARAMETERS = 4096  #: bytes of a layer's parameters; msgpack takes up to 130 times its bytes in memory
+MAX_CHUNKS = 1024  #: slices of layers and ancillary chunks; a slice's number takes ten bits
+MAX_PAYLOAD = (1 << 31) - 1  #: bytes in one chunk; fits a signed 32-bit size on every platform
+MAX_DEPTH = 4  #: nested maps and lists in canonical msgpack
+MAX_ANCHORS = 1 << 24  #: rows over all layers; 68 int32 columns of them are 4.6 GB
