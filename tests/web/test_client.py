@@ -191,13 +191,6 @@ def test_scenes_are_those_of_the_file_whatever_the_server_does(file, name):
 # -- requests ----------------------------------------------------------------------------------------------------------
 
 
-def test_one_open_get_gives_every_layer(scene_bytes, levels):
-    with FaultyServer(scene_bytes) as server, SceneClient(server.url) as client:
-        check(list(client.scenes()), levels)
-    assert len(server.requests) == 1 and "range" not in server.requests[0]
-    assert server.requests[0]["accept-encoding"] == "identity"
-
-
 def test_layers_appear_before_the_file_is_whole_and_each_end_is_a_cut(scene_bytes, levels):
     ends = [end for _, end in slice_ends(scene_bytes)]
     faults = [Fault(ends[0], "stall"), Fault(ends[1] - ends[0], "stall", then=lambda server: server.stopped.clear())]
@@ -219,6 +212,7 @@ def test_upgrades_fetch_the_missing_layers_only(scene_bytes, levels):
         check(list(client.scenes(Budget(max_layer=2))), levels[1:])
     ends = [end for _, end in slice_ends(scene_bytes)]
     assert [r.get("range") for r in server.requests] == [None, f"bytes={ends[0]}-{ends[2] - 1}"]
+    assert server.requests[0]["accept-encoding"] == "identity"
 
 
 def test_redirects_are_followed(scene_bytes, levels):
