@@ -114,26 +114,17 @@ export class Pd4Player extends HTMLElement {
     style.replaceSync(STYLE);
     root.adoptedStyleSheets = [style];
     root.innerHTML = BODY;
-    /** @template {Element} E @param {string} selector @returns {E} */
-    const part = (selector) => /** @type {E} */ (root.querySelector(selector));
-    /** @type {HTMLImageElement} */
-    this._poster = part("img");
-    /** @type {HTMLElement} */
-    this._error = part(".error");
-    /** @type {HTMLElement} */
-    this._statusLine = part(".status");
-    /** @type {HTMLElement} */
-    this._bar = part(".bar");
-    /** @type {HTMLElement} */
-    this._levels = part(".levels");
-    /** @type {HTMLElement} */
-    this._clock = part(".clock");
-    /** @type {HTMLButtonElement} */
-    this._play = part(".play");
-    /** @type {HTMLInputElement} */
-    this._slider = part("input");
-    /** @type {HTMLSelectElement} */
-    this._select = part("select");
+    /** @param {string} selector */
+    const part = (selector) => /** @type {HTMLElement} */ (root.querySelector(selector));
+    this._poster = /** @type {HTMLImageElement} */ (part("img"));
+    this._error = /** @type {HTMLElement} */ (part(".error"));
+    this._statusLine = /** @type {HTMLElement} */ (part(".status"));
+    this._bar = /** @type {HTMLElement} */ (part(".bar"));
+    this._levels = /** @type {HTMLElement} */ (part(".levels"));
+    this._clock = /** @type {HTMLElement} */ (part(".clock"));
+    this._play = /** @type {HTMLButtonElement} */ (part(".play"));
+    this._slider = /** @type {HTMLInputElement} */ (part("input"));
+    this._select = /** @type {HTMLSelectElement} */ (part("select"));
     /** @type {Player | null} */
     this._player = null;
     /** @type {Orbit | null} */

@@ -19,17 +19,14 @@ import { startLoader } from "./render/loader.js";
  */
 
 /**
- * level: the highest to load, default all. time: seconds of the scene's time to start at. bytes, seconds: how much of
- * the file to load at most, and how long beyond the first layer. loop: whether playing begins anew, default true.
- *
  * @typedef {object} SplatsOptions
  * @property {Three} THREE
  * @property {Spark} spark
- * @property {number} [level]
- * @property {number} [time]
- * @property {number} [bytes]
- * @property {number} [seconds]
- * @property {boolean} [loop]
+ * @property {number} [level] the highest to load, default all
+ * @property {number} [time] seconds of the scene's time to start at
+ * @property {number} [bytes] how much of the file to load at most
+ * @property {number} [seconds] how long to load beyond the first layer
+ * @property {boolean} [loop] whether playing begins anew at the end, default true
  */
 
 /**

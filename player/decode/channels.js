@@ -4,7 +4,7 @@ import { AnsDecoder } from "./ans.js";
 import { ByteReader, MAX_VARINT } from "./bytes.js";
 import { limitExceeded, malformed, unsupported } from "./errors.js";
 import { FREE_ENTRIES, MAX_CODED, MAX_COUNT, MAX_WINDOW, MORE_ENTRIES } from "./limits.js";
-import { Table, histogramTable, mixtureTable, normTable } from "./tables.js";
+import { CONSTANT, Table, histogramTable, mixtureTable, normTable } from "./tables.js";
 
 const CONST = 0;
 const GAUSS = 1;
@@ -15,16 +15,14 @@ const FIRST_REUSE = 8;
 /** The symbols kmin .. kmin + n·2^shift - 1. @typedef {{kmin: number, n: number, shift: number}} Window */
 
 /**
- * table: made by makeTable when it is first used. readClasses: takes a histogram's classes out of the stream.
- *
  * @typedef {object} Prior
  * @property {Window} window
- * @property {Table | null} table
  * @property {() => Int32Array} makeTable
- * @property {((stream: AnsDecoder) => void) | null} readClasses
+ * @property {Table} [table] made from makeTable's frequencies when it is first used
+ * @property {(stream: AnsDecoder) => void} [readClasses] reads a histogram's classes from the stream
  */
 
-/** positions ascend. @typedef {{positions: number[], values: number[]}} Exceptions */
+/** Symbols outside the window, at ascending positions. @typedef {{positions: number[], values: number[]}} Exceptions */
 
 /**
  * Decodes a section of coded channels of these lengths, one behind the other into `out`, which they fill.
@@ -83,7 +81,7 @@ function takeChannel(stream, prior, exceptions, out, at, count) {
   }
   if (kmin) for (let i = at; i < at + coded; i++) out[i] += kmin;
   if (!exceptions) return;
-  // From the back on, the symbols move up to make room for the exceptions.
+  // From the last one on, symbols move up to make room for the exceptions.
   const { positions, values } = exceptions;
   let from = at + coded;
   let to = at + count;
@@ -103,7 +101,7 @@ function readExceptions(reader, count, window) {
   const values = [];
   let position = -1;
   for (let i = 0; i < number; i++) {
-    position += 1 + reader.varint(MAX_VARINT, "an exception's place");
+    position += 1 + reader.varint(MAX_VARINT, "an exception's position");
     const code = reader.varint(4 * MAX_CODED + 2, "an exception's value");
     const value = code & 1 ? window.kmin - 1 - (code >> 1) : end + (code >> 1);
     if (position >= count || value > MAX_CODED || value < -MAX_CODED) {
@@ -119,7 +117,7 @@ function readExceptions(reader, count, window) {
 function readPrior(reader, family) {
   if (family === CONST) {
     const kmin = reader.zigzag(MAX_CODED, "a constant");
-    return { window: { kmin, n: 1, shift: 0 }, table: Table.CONSTANT, makeTable: () => Table.CONSTANT.cum, readClasses: null };
+    return { window: { kmin, n: 1, shift: 0 }, table: CONSTANT, makeTable: () => CONSTANT.cum };
   }
   let shift = 0;
   if (family === SCALED) {
@@ -134,15 +132,12 @@ function readPrior(reader, family) {
   const window = readWindow(reader, shift);
   if (family === HISTOGRAM) return readHistogram(reader, window);
   const first = readNormal(reader, window.n);
-  if (family === GAUSS) {
-    const makeTable = () => normTable(window.n, first.mu8, first.si, first.floor);
-    return { window, table: null, makeTable, readClasses: null };
-  }
+  if (family === GAUSS) return { window, makeTable: () => normTable(window.n, first.mu8, first.si, first.floor) };
   const second = readNormal(reader, window.n);
   if (second.floor !== 1) throw malformed("the second normal of a mixture has a floor bit, which is reserved");
   const weight = reader.byte("the weight of a mixture");
   if (!weight) throw malformed("a mixture of weight 0");
-  return { window, table: null, makeTable: () => mixtureTable(window.n, first, second, weight), readClasses: null };
+  return { window, makeTable: () => mixtureTable(window.n, first, second, weight) };
 }
 
 /** @param {ByteReader} reader @param {number} shift @returns {Window} */
@@ -176,7 +171,6 @@ function readHistogram(reader, window) {
   const classes = new Int32Array(n);
   return {
     window,
-    table: null,
     makeTable: () => histogramTable(classes, top, step),
     readClasses(stream) {
       const table = normTable((differences ? 2 * top : top) + 1, mu8, 16 * width - 160, 1);

@@ -58,22 +58,12 @@ export function readPreamble(bytes) {
 }
 
 /**
- * more: whether the layer has further slices. number: of the slice (3.6).
- *
- * @typedef {object} Chunk
- * @property {boolean} ancillary
- * @property {boolean} more
- * @property {number} number
- * @property {Uint8Array} payload not copied
- */
-
-/**
  * The chunk that `bytes` begin with, of the listed type and length; what follows is not looked at. sceneId: that of the
  * file. offset and index: of the chunk in the file.
  *
  * @param {Uint8Array} bytes
  * @param {{listed: import("./header.js").ListedChunk, sceneId: string, offset: number, index: number}} expected
- * @returns {Chunk}
+ * @returns more: whether the layer has further slices; number: of the slice (3.6); payload: not copied
  */
 export function readChunk(bytes, { listed, sceneId, offset, index }) {
   /** @param {import("./errors.js").ErrorKind} kind @param {string} message @param {number} at */
@@ -104,11 +94,7 @@ export function readChunk(bytes, { listed, sceneId, offset, index }) {
   };
 }
 
-/**
- * The scene id of clause 3.3, in hexadecimal.
- *
- * @param {Uint8Array} described the header's bytes behind its chunk list
- */
+/** The scene id of clause 3.3, in hexadecimal. @param {Uint8Array} described the header's bytes behind its chunk list */
 export function sceneIdOf(described) {
   return hex(new Sha256().update(described).digest().subarray(0, SCENE_ID_SIZE));
 }
@@ -117,10 +103,8 @@ export function sceneIdOf(described) {
 function need(bytes, size, what, offset, chunk) {
   if (bytes.length >= size) return;
   const end = offset + bytes.length;
-  throw new DecodeError("Truncated", `${end} bytes end inside ${what}, which needs ${offset + size}`, {
-    offset: end,
-    chunk,
-  });
+  const message = `${end} bytes end inside ${what}, which needs ${offset + size}`;
+  throw new DecodeError("Truncated", message, { offset: end, chunk });
 }
 
 /** @param {DataView} view @param {number} at @param {number} computed @param {number} offset @param {number | null} chunk */

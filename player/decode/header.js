@@ -12,17 +12,15 @@ import { unpack } from "./msgpack.js";
 /** D and G of the text: scalars of a feature, and Gaussians of an anchor. @typedef {{feature: number, slots: number}} Widths */
 
 /**
- * size: in bytes. bounds: the error bound of each class of 5.4 that has one. sceneId: in hexadecimal (3.3).
- *
  * @typedef {object} Header
- * @property {number} size
+ * @property {number} size bytes
  * @property {ListedChunk[]} chunks
  * @property {[number, number, number]} steps of feature, scaling_log and offset
  * @property {import("./scene.js").Info} info
- * @property {Map<number, number>} bounds
+ * @property {Map<number, number>} bounds the error bound of each class of 5.4 that has one
  * @property {Widths} widths
  * @property {number[] | null} centres of the attributes' channels; null if anchors have no step classes
- * @property {string} sceneId
+ * @property {string} sceneId hexadecimal (3.3)
  */
 
 /** The channels of an anchor (11.2). @param {Widths} widths */
@@ -82,10 +80,7 @@ export function readHeader(bytes) {
     steps: [feature, scalingLog, offset],
     info: {
       voxelSize,
-      box: [
-        [x0, y0, z0],
-        [x1, y1, z1],
-      ],
+      box: [[x0, y0, z0], [x1, y1, z1]],
       timeRange: [start, end],
       background: [red, green, blue],
       near,

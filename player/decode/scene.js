@@ -29,19 +29,17 @@
  */
 
 /**
- * What every layer needs and a player shows the file with (clause 5.1). voxelSize: scene units. box: lower and upper
- * corner. timeRange: seconds at normalised time 0 and 1. background: RGB, 0..1. unit: metres per scene unit, 0 if
- * unknown.
+ * The properties of the whole scene (clause 5.1).
  *
  * @typedef {object} Info
- * @property {number} voxelSize
- * @property {[[number, number, number], [number, number, number]]} box
- * @property {[number, number]} timeRange
- * @property {[number, number, number]} background
+ * @property {number} voxelSize scene units
+ * @property {[[number, number, number], [number, number, number]]} box lower and upper corner
+ * @property {[number, number]} timeRange seconds at normalised time 0 and 1
+ * @property {[number, number, number]} background RGB, 0..1
  * @property {number} near
  * @property {number} far
  * @property {[number, number, number]} up
- * @property {number} unit
+ * @property {number} unit metres per scene unit, 0 if unknown
  * @property {Camera | null} camera
  */
 
@@ -60,26 +58,22 @@
  */
 
 /**
- * A prefix of a scene, with N anchors. layers: the layer numbers that are there, ascending, 0 first. rows: rows[i] is
- * the number of anchors in the prefix that ends with layers[i]. anchorQ: [N, 3] voxel indices; anchor: [N, 3] positions, scene units.
- * feature: [N, D]. scalingLog: [N, 6]. offset: [N, G, 3]. mask: per layer the codes of its rows[i] rows, the gate times
- * 255; 0 is inactive. A deformation belongs to the layer of its name, 1 global or 2 local, and is null where that layer
- * has none or is not there.
+ * A prefix of a scene, with N anchors.
  *
  * @typedef {object} Scene
  * @property {Info} info
  * @property {Steps} steps
- * @property {number[]} layers
- * @property {number[]} rows
- * @property {Int32Array} anchorQ
- * @property {Float32Array} anchor
- * @property {Float32Array} feature
- * @property {Float32Array} scalingLog
- * @property {Float32Array} offset
- * @property {Uint8Array[]} mask
+ * @property {number[]} layers numbers of the layers that are there, ascending, 0 first
+ * @property {number[]} rows rows[i]: number of anchors in the prefix that ends with layers[i]
+ * @property {Int32Array} anchorQ [N, 3] voxel indices
+ * @property {Float32Array} anchor [N, 3] positions, scene units
+ * @property {Float32Array} feature [N, D]
+ * @property {Float32Array} scalingLog [N, 6]
+ * @property {Float32Array} offset [N, G, 3]
+ * @property {Uint8Array[]} mask per layer the codes of its rows[i] rows: the gate times 255; 0 is inactive
  * @property {{opacity: Network, covariance: Network, color: Network}} networks
- * @property {Deformation | null} globalDeformation
- * @property {Deformation | null} localDeformation
+ * @property {Deformation | null} globalDeformation of layer 1; null where it has none or is not there
+ * @property {Deformation | null} localDeformation of layer 2, likewise
  */
 
 /** The planes of a scale in the order of the file. @type {PlaneName[]} */

@@ -91,11 +91,11 @@ export function histogramTable(classes, top, step) {
   return cum;
 }
 
-/** Tables are entered at the upper bits of a place. */
+/** Bits of the state that select an entry of a table's index. */
 const INDEX_BITS = 9;
 export const INDEX_SHIFT = 24 - INDEX_BITS;
 
-/** A frequency table, with for each value of a place's upper bits the symbol of the least such place. */
+/** A frequency table. index: the symbol at the first state of each value of the upper INDEX_BITS bits. */
 export class Table {
   /** @param {Int32Array} cum [n + 1], 7.2 */
   constructor(cum) {
@@ -108,7 +108,7 @@ export class Table {
     index[1 << INDEX_BITS] = cum.length - 2;
     this.index = index;
   }
-
-  /** The table of one symbol. */
-  static CONSTANT = new Table(Int32Array.of(0, TOTAL));
 }
+
+/** The table of one symbol. */
+export const CONSTANT = /* @__PURE__ */ new Table(Int32Array.of(0, TOTAL));

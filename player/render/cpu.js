@@ -20,6 +20,7 @@ export class CpuEvaluator {
 
   /** @param {import("../decode/scene.js").Scene} scene that is evaluated from now on */
   setScene(scene) {
+    this.scene = scene;
     this._ready = this._remote.call("setScene", [scene]);
     this._ready.catch(() => {}); // a worker that fails says so to the next call as well
   }

@@ -53,8 +53,18 @@ class Scaffold {
     for (let o = 0; o < first.outputs; o++) {
       for (let k = 0; k < 3; k++) data[((o >> 2) * 3 + k) * 4 + (o & 3)] = direction.weight[3 * o + k];
     }
-    this.direction = gpu.uniforms(data);
+    this._gl = gpu.gl;
+    this._direction = gpu.uniforms(data);
     this.last = last;
+  }
+
+  /** Makes the weights of the direction a uniform block. @param {number} index */
+  bind(index) {
+    this._gl.bindBufferBase(this._gl.UNIFORM_BUFFER, index, this._direction);
+  }
+
+  free() {
+    this._gl.deleteBuffer(this._direction);
   }
 
   /** Source that declares the weights of the direction. @param {number} index of the uniform block */
@@ -104,7 +114,7 @@ export class GpuEvaluator {
    */
   constructor(gpu, scene) {
     this._gpu = gpu;
-    this._scene = scene;
+    this.scene = scene;
     const widths = widthsOf(scene);
     const { anchors, feature, slots } = widths;
     this._slots = slots;
@@ -117,15 +127,16 @@ export class GpuEvaluator {
 
     let firstBlock = 0;
     const { opacity, covariance, color } = scene.networks;
-    const [forOpacity, forShape, forColor] = [opacity, covariance, color].map((network) => {
-      const scaffold = new Scaffold(gpu, network, feature, firstBlock);
-      firstBlock += scaffold.blocks;
-      return scaffold;
-    });
-    this._opacity = forOpacity;
-    this._covariance = forShape;
-    this._color = forColor;
-    this._scaffolds = [forOpacity, forShape, forColor];
+    /** @param {Network} network */
+    const scaffold = (network) => {
+      const made = new Scaffold(gpu, network, feature, firstBlock);
+      firstBlock += made.blocks;
+      return made;
+    };
+    this._opacity = scaffold(opacity);
+    this._covariance = scaffold(covariance);
+    this._color = scaffold(color);
+    this._scaffolds = [this._opacity, this._covariance, this._color];
     this._first = new Linear(gpu, stack(this._scaffolds.map((scaffold) => scaffold.features)));
     if (this._first.paddedBlocks > gpu.maxLayers) throw new TooLarge("the networks' first layers");
     const blocks = this._blocks * (scene.globalDeformation ? 2 : 1) + this._first.paddedBlocks + blocksOf(slots);
@@ -165,7 +176,7 @@ export class GpuEvaluator {
   _attributes() {
     const plane = this._width * this._height * 4;
     const out = new Float32Array(plane * this._blocks);
-    eachAttribute(this._scene, (values, width, columns) => {
+    eachAttribute(this.scene, (values, width, columns) => {
       columns.forEach((column, k) => {
         const to = (column >> 2) * plane + (column & 3);
         for (let a = 0; width * a < values.length; a++) out[to + 4 * a] = values[width * a + k];
@@ -201,12 +212,12 @@ export class GpuEvaluator {
    *
    * @param {number} level 0, 1 or 2 @param {number} t normalised time @param {number[]} eye
    * @param {Splats | null} into what may be overwritten
-   * @param {Lister} lister makes the list of kept Gaussians
+   * @param {Lister} lister
    * @returns {Promise<Evaluated>}
    */
   async evaluate(level, t, eye, into, lister) {
     const gpu = this._gpu;
-    const { number, rows, codes, global, local } = levelOf(this._scene, level);
+    const { number, rows, codes, global, local } = levelOf(this.scene, level);
     const lines = Math.ceil(rows / this._width);
     const levelMoved = number !== this._level;
     const timeMoved = levelMoved || (t !== this._time && !!(global || local));
@@ -229,7 +240,7 @@ export class GpuEvaluator {
       this._runOpacities(residual, eye, lines);
       const opacities = await gpu.read(this._opacities, 0, blocksOf(this._slots), lines);
       const previous = timeMoved ? null : this._listed;
-      const list = await lister.list(opacities, this._slots, lines * this._width, previous);
+      const list = await lister(opacities, this._slots, lines * this._width, previous);
       if (list) this._setList(list);
     }
     const moved = !this._current;
@@ -257,20 +268,16 @@ export class GpuEvaluator {
     const gpu = this._gpu;
     const linear = this._first;
     const program = gpu.program(
-      linear.declare(0) +
-        targets(linear.chunkBlocks) +
+      linear.declare() +
         anchorSource(residual) +
         `void main() {
 ivec2 p = ivec2(gl_FragCoord.xy);
 ${repeat(linear.inputBlocks, (k) => `vec4 x${k} = anchorBlock(p, ${FEATURE_BLOCK + k});`)}
-${linear.apply(0, "x", "y", false)}
+${linear.apply(false)}
 ${repeat(linear.chunkBlocks, (i) => `out${i} = y${i};`)}}`,
     );
     gpu.use(program, this._anchorTextures(residual));
-    for (let c = 0; c < linear.chunks; c++) {
-      linear.bind(0, c);
-      gpu.cover(this._before, c * linear.chunkBlocks, linear.chunkBlocks, 0, lines);
-    }
+    linear.cover(this._before, 0, lines);
   }
 
   /** @param {Field | null} residual @returns {Record<string, Field>} */
@@ -283,9 +290,8 @@ ${repeat(linear.chunkBlocks, (i) => `out${i} = y${i};`)}}`,
     const gpu = this._gpu;
     const linear = this._opacityLast;
     const program = gpu.program(
-      linear.declare(0) +
+      linear.declare() +
         this._opacity.declare(1) +
-        targets(linear.chunkBlocks) +
         anchorSource(residual) +
         `uniform sampler2DArray before;
 uniform sampler2D codes;
@@ -295,7 +301,7 @@ ivec2 p = ivec2(gl_FragCoord.xy);
 vec3 d = anchorBlock(p, 0).xyz - eye;
 d /= max(length(d), 1e-30);
 ${this._opacity.compute(1, "x")}
-${linear.apply(0, "x", "y", false)}
+${linear.apply(false)}
 float gate = texelFetch(codes, p, 0).r;
 ${repeat(linear.chunkBlocks, (i) => `y${i} = tanh(clamp(y${i}, -15., 15.));`)}
 ${repeat(linear.chunkBlocks, (i) => `out${i} = y${i} * vec4(greaterThanEqual(y${i} * gate, vec4(1. / 255.)));`)}}`,
@@ -303,17 +309,8 @@ ${repeat(linear.chunkBlocks, (i) => `out${i} = y${i} * vec4(greaterThanEqual(y${
     const codes = /** @type {WebGLTexture} */ (this._codes);
     gpu.use(program, { ...this._anchorTextures(residual), before: this._before, codes });
     gpu.gl.uniform3fv(program.uniform("eye"), eye);
-    this._bindDirection(1, this._opacity);
-    for (let c = 0; c < linear.chunks; c++) {
-      linear.bind(0, c);
-      gpu.cover(this._opacities, c * linear.chunkBlocks, linear.chunkBlocks, 0, lines);
-    }
-  }
-
-  /** @param {number} index of the uniform block @param {Scaffold} scaffold */
-  _bindDirection(index, { direction }) {
-    const { gl } = this._gpu;
-    gl.bindBufferBase(gl.UNIFORM_BUFFER, index, direction);
+    this._opacity.bind(1);
+    linear.cover(this._opacities, 0, lines);
   }
 
   /** @param {List} list */
@@ -432,8 +429,8 @@ ${changes ? localSource() : ""}
     if (changes) textures.changes = changes;
     gpu.use(program, textures);
     gl.uniform3fv(program.uniform("eye"), eye);
-    this._bindDirection(1, this._covariance);
-    this._bindDirection(2, this._color);
+    this._covariance.bind(1);
+    this._color.bind(2);
     for (let i = 0; i < this._slots; i++) {
       if (starts[i + 1] === starts[i]) continue;
       gl.bindBufferRange(gl.UNIFORM_BUFFER, 3, shapes.buffer, shapes.stride * i, shapes.shapeBytes);
@@ -444,11 +441,10 @@ ${changes ? localSource() : ""}
   }
 
   free() {
-    const { gl } = this._gpu;
     this._gpu.free(this._anchors, this._before, this._opacities, this._residual, this._codes);
     this._gpu.free(this._list, this._means, this._changes);
-    for (const { direction } of this._scaffolds) gl.deleteBuffer(direction);
-    gl.deleteBuffer(this._shapes.buffer);
+    for (const scaffold of this._scaffolds) scaffold.free();
+    this._gpu.gl.deleteBuffer(this._shapes.buffer);
     this._global?.free();
     this._local?.free();
     this._first.free();
@@ -505,10 +501,7 @@ ivec2 anchorOf(uint entry) {
  */
 
 /**
- * Makes the list of Gaussians with an opacity. With a list before, the new one has its Gaussians as well, and is null
- * if it would be the same.
+ * Calls listGaussians of sort.js, in a worker.
  *
- * @typedef {object} Lister
- * @property {(...args: [opacities: Float32Array, slots: number, anchors: number, previous: List | null])
- *   => Promise<List | null>} list
+ * @typedef {(...args: Parameters<typeof import("./sort.js").listGaussians>) => Promise<List | null>} Lister
  */

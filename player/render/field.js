@@ -190,24 +190,20 @@ ${repeat(blocks, (c) => {
  * @param {number} row @param {number} rows of texels, in `to` @param {number} shift from there to the rows of `from`
  * @param {boolean} relu
  */
-export function runLinear(gpu, linear, from, to, row, rows, shift, relu) {
+function runLinear(gpu, linear, from, to, row, rows, shift, relu) {
   const program = gpu.program(
-    linear.declare(0) +
-      targets(linear.chunkBlocks) +
+    linear.declare() +
       `uniform sampler2DArray source;
 uniform int shift;
 void main() {
 ivec2 p = ivec2(gl_FragCoord.xy) + ivec2(0, shift);
 ${repeat(linear.inputBlocks, (k) => `vec4 x${k} = texelFetch(source, ivec3(p, ${k}), 0);`)}
-${linear.apply(0, "x", "y", relu)}
+${linear.apply(relu)}
 ${repeat(linear.chunkBlocks, (i) => `out${i} = y${i};`)}}`,
   );
   gpu.use(program, { source: from });
   gpu.gl.uniform1i(program.uniform("shift"), shift);
-  for (let c = 0; c < linear.chunks; c++) {
-    linear.bind(0, c);
-    gpu.cover(to, c * linear.chunkBlocks, linear.chunkBlocks, row, rows);
-  }
+  linear.cover(to, row, rows);
 }
 
 /**

@@ -202,15 +202,12 @@ export class Gpu {
     let framebuffers = this._framebuffers.get(field.texture);
     if (!framebuffers) this._framebuffers.set(field.texture, (framebuffers = new Map()));
     const key = `${first} ${count}`;
-    let framebuffer = framebuffers.get(key);
-    if (framebuffer) {
-      gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
-      return;
-    }
-    framebuffer = gl.createFramebuffer() ?? undefined;
+    const known = framebuffers.get(key);
+    const framebuffer = known ?? gl.createFramebuffer();
     if (!framebuffer) throw new ContextLost();
-    framebuffers.set(key, framebuffer);
     gl.bindFramebuffer(gl.FRAMEBUFFER, framebuffer);
+    if (known) return;
+    framebuffers.set(key, framebuffer);
     const buffers = [];
     for (let i = 0; i < count; i++) {
       gl.framebufferTextureLayer(gl.FRAMEBUFFER, gl.COLOR_ATTACHMENT0 + i, field.texture, 0, first + i);
@@ -273,31 +270,19 @@ export class Gpu {
     }
   }
 
-  /** Waits until the GPU has done what it was told so far. Throws ContextLost. */
+  /** Waits until the GPU has run all commands so far. Throws ContextLost. */
   async finished() {
-    const fence = this.fence();
-    while (!fence()) await new Promise((resolve) => setTimeout(resolve, POLL_MS));
-  }
-
-  /**
-   * A function that says whether the GPU has done what it was told so far. It throws ContextLost.
-   *
-   * @returns {() => boolean}
-   */
-  fence() {
     const { gl } = this;
     const sync = gl.fenceSync(gl.SYNC_GPU_COMMANDS_COMPLETE, 0);
     gl.flush();
-    let done = false;
-    return () => {
-      if (done) return true;
+    for (;;) {
       if (!sync || gl.isContextLost()) throw new ContextLost();
       const status = gl.clientWaitSync(sync, 0, 0);
       if (status === gl.WAIT_FAILED) throw new ContextLost();
-      done = status !== gl.TIMEOUT_EXPIRED;
-      if (done) gl.deleteSync(sync);
-      return done;
-    };
+      if (status !== gl.TIMEOUT_EXPIRED) break;
+      await new Promise((resolve) => setTimeout(resolve, POLL_MS));
+    }
+    gl.deleteSync(sync);
   }
 
   /** A uniform buffer. @param {Float32Array} data */

@@ -2,7 +2,7 @@
 // as 4 × 4 matrices: block b of the outputs takes block k of the inputs through matrix b · K + k.
 
 /** @import { Network } from "../decode/scene.js" */
-/** @import { Gpu } from "./gl.js" */
+/** @import { Field, Gpu } from "./gl.js" */
 
 /** Matrices of one shader, about: compilers unroll them, and take longer than in proportion. */
 const MAX_MATRICES = 64;
@@ -13,9 +13,7 @@ const VECTOR_BYTES = 16;
 /** @param {number} n */
 export const blocksOf = (n) => Math.ceil(n / 4);
 
-/**
- * A linear layer on the GPU. Its outputs are cut into chunks of `chunkBlocks` blocks, one draw call each.
- */
+/** A linear layer on the GPU. Its outputs are cut into chunks of `chunkBlocks` blocks, one draw call each. */
 export class Linear {
   /** @param {Gpu} gpu @param {Network[number]} layer */
   constructor(gpu, layer) {
@@ -42,34 +40,28 @@ export class Linear {
     return this.chunks * this.chunkBlocks;
   }
 
-  /** Makes the weights of a chunk uniform block `index`. @param {number} index @param {number} chunk */
-  bind(index, chunk) {
+  /** Runs the current program, whose uniform block 0 has the weights, on rows of a field. @param {Field} field
+   * @param {number} row @param {number} rows */
+  cover(field, row, rows) {
     const { gl } = this._gpu;
-    gl.bindBufferRange(gl.UNIFORM_BUFFER, index, this._buffer, this._stride * chunk, this._bytes);
-  }
-
-  /** Source that declares uniform block `index`. @param {number} index */
-  declare(index) {
-    const { inputBlocks: K, chunkBlocks: B } = this;
-    return `layout(std140) uniform U${index} { vec4 b${index}[${B}]; mat4 w${index}[${B * K}]; };\n`;
-  }
-
-  /**
-   * Source that computes `to`0, `to`1, .. from `from`0, `from`1, ..
-   *
-   * @param {number} index of the uniform block @param {string} from @param {string} to
-   * @param {boolean} relu whether ReLU follows
-   */
-  apply(index, from, to, relu) {
-    let source = "";
-    for (let b = 0; b < this.chunkBlocks; b++) {
-      source += `vec4 ${to}${b} = b${index}[${b}];\n`;
-      for (let k = 0; k < this.inputBlocks; k++) {
-        source += `${to}${b} += w${index}[${b * this.inputBlocks + k}] * ${from}${k};\n`;
-      }
-      if (relu) source += `${to}${b} = max(${to}${b}, 0.);\n`;
+    for (let c = 0; c < this.chunks; c++) {
+      gl.bindBufferRange(gl.UNIFORM_BUFFER, 0, this._buffer, this._stride * c, this._bytes);
+      this._gpu.cover(field, c * this.chunkBlocks, this.chunkBlocks, row, rows);
     }
-    return source;
+  }
+
+  /** Source that declares uniform block 0 and the targets out0, out1, .. */
+  declare() {
+    const { inputBlocks: K, chunkBlocks: B } = this;
+    return `layout(std140) uniform U0 { vec4 b0[${B}]; mat4 w0[${B * K}]; };\n` + targets(B);
+  }
+
+  /** Source that computes y0, y1, .. from x0, x1, .. @param {boolean} relu whether ReLU follows */
+  apply(relu) {
+    return repeat(this.chunkBlocks, (b) => {
+      const terms = repeat(this.inputBlocks, (k) => `y${b} += w0[${b * this.inputBlocks + k}] * x${k};`);
+      return `vec4 y${b} = b0[${b}];\n${terms}${relu ? `y${b} = max(y${b}, 0.);` : ""}`;
+    });
   }
 
   free() {
@@ -100,16 +92,8 @@ export function pack({ weight, bias, inputs, outputs }, first, blocks, out) {
   }
 }
 
-/** Source that declares out0, out1, .. as targets. @param {number} count */
-export function targets(count) {
-  let source = "";
-  for (let i = 0; i < count; i++) source += `layout(location = ${i}) out vec4 out${i};\n`;
-  return source;
-}
+/** Lines of source. @param {number} count @param {(i: number) => string} line */
+export const repeat = (count, line) => Array.from({ length: count }, (_, i) => `${line(i)}\n`).join("");
 
-/** @param {number} count @param {(i: number) => string} line */
-export function repeat(count, line) {
-  let source = "";
-  for (let i = 0; i < count; i++) source += line(i) + "\n";
-  return source;
-}
+/** Source that declares out0, out1, .. as targets. @param {number} count */
+export const targets = (count) => repeat(count, (i) => `layout(location = ${i}) out vec4 out${i};`);

@@ -4,14 +4,10 @@ import { columnsOf, globalHeads } from "../decode/heads.js";
 /** @import { Deformation, Plane, PlaneName, Scene } from "../decode/scene.js" */
 
 /**
- * One level of a scene. rows: the anchors that it has, the first ones of the scene's. codes: the anchors' gates times 255.
+ * One level of a scene: the highest layer that is there and at most the requested one. It has the first `rows` anchors.
+ * codes: their gates times 255.
  *
- * @typedef {object} Level
- * @property {number} number the highest layer there is that is at most the level asked for
- * @property {number} rows
- * @property {Uint8Array} codes
- * @property {Deformation | null} global
- * @property {Deformation | null} local
+ * @typedef {{number: number, rows: number, codes: Uint8Array, global: Deformation | null, local: Deformation | null}} Level
  */
 
 /** Lower opacities never reach a pixel: a picture has 255 steps. */
@@ -137,7 +133,7 @@ export function timeAfter(time, elapsed, [start, end], loop) {
 }
 
 /** Normalised time of `seconds` (clause 13.1). @param {Scene["info"]} info @param {number} seconds */
-export function normalisedTime({ timeRange: [start, end] }, seconds) {
+function normalisedTime({ timeRange: [start, end] }, seconds) {
   const t = (seconds - start) / (end - start);
   return t > 0 ? Math.min(t, 1) : 0; // also where the range is empty
 }

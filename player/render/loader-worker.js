@@ -8,16 +8,15 @@ import { Stream } from "../decode/stream.js";
 const PROGRESS_MS = 100;
 
 /**
- * What is told while a scene loads. ends: where in the file each slice ends, empty until the header is there. arrived,
- * decoded: when the last byte of the scene came and when it was decoded, milliseconds since the epoch.
+ * A message while a scene loads. arrived and decoded: milliseconds since the epoch.
  *
  * @typedef {object} News
  * @property {import("../decode/scene.js").Scene} [scene]
- * @property {number} arrived
- * @property {number} decoded
+ * @property {number} arrived when the last byte of the scene came
+ * @property {number} decoded when it was decoded
  * @property {number} bytes
  * @property {number | null} total
- * @property {{layer: number, end: number}[]} ends
+ * @property {{layer: number, end: number}[]} ends where in the file each slice ends, empty until the header is there
  */
 
 /** The answer that early.js asked for, which serves once. */

@@ -14,38 +14,31 @@ import { startLoader } from "./loader.js";
 /** @import { State } from "./level.js" */
 
 /**
- * How to play. level: the highest to load and show, default all. time: seconds of the scene's time to start at. bytes,
- * seconds: how much of the file to load at most, and how long beyond the first layer. evaluator: "gpu" or "cpu",
- * default what the machine can do. degrade: whether a slow machine gets fewer pixels and lower levels, default true.
- * pixelRatio: device pixels per CSS pixel, default the window's, at most 2.
- *
  * @typedef {object} Options
- * @property {number | null} [level]
- * @property {number | null} [time]
+ * @property {number | null} [level] the highest to load and show, default all
+ * @property {number | null} [time] seconds of the scene's time to start at
  * @property {boolean} [autoplay]
  * @property {boolean} [loop]
- * @property {number | null} [bytes]
- * @property {number | null} [seconds]
- * @property {"gpu" | "cpu" | null} [evaluator]
- * @property {boolean} [degrade]
- * @property {number | null} [pixelRatio]
+ * @property {number | null} [bytes] how much of the file to load at most
+ * @property {number | null} [seconds] how long to load beyond the first layer
+ * @property {"gpu" | "cpu" | null} [evaluator] default: the faster one of the machine
+ * @property {boolean} [degrade] whether a slow machine gets fewer pixels and lower levels, default true
+ * @property {number | null} [pixelRatio] device pixels per CSS pixel, default the window's, at most 2
  */
 
 /**
- * The state of a player, for a status line. bytes: arrived so far, of total (null: unknown). ends: where in the file
- * each slice ends, empty while that is unknown. level: shown, null before the first picture. levels: that are there.
- * fps: pictures drawn in the last second. scale: of the picture's sides. gaussians: drawn.
+ * The state of a player, for a status line.
  *
  * @typedef {object} Status
- * @property {number} bytes
- * @property {number | null} total
+ * @property {number} bytes arrived so far
+ * @property {number | null} total length of the file, null while it is unknown
  * @property {boolean} loading
- * @property {{layer: number, end: number}[]} ends
- * @property {number | null} level
- * @property {number[]} levels
- * @property {number} fps
- * @property {number} scale
- * @property {number} gaussians
+ * @property {{layer: number, end: number}[]} ends where in the file each slice ends, empty while it is unknown
+ * @property {number | null} level shown, null before the first picture
+ * @property {number[]} levels that have arrived
+ * @property {number} fps pictures drawn in the last second
+ * @property {number} scale of the picture's sides
+ * @property {number} gaussians drawn
  */
 
 /** After so many milliseconds without movement the picture is drawn at full quality. */
@@ -89,7 +82,7 @@ export class Player extends EventTarget {
     this._gpu = null;
     /** @type {Painter | null} */
     this._painter = null;
-    /** @type {{evaluator: GpuEvaluator | CpuEvaluator, scene: Scene} | null} */
+    /** @type {GpuEvaluator | CpuEvaluator | null} */
     this._evaluator = null;
     this._useCpu = options.evaluator === "cpu";
     /** For the first picture. @type {Remote | null} */
@@ -122,16 +115,18 @@ export class Player extends EventTarget {
     this.counts = { drawn: 0, evaluated: 0 };
     this._closed = false;
 
-    this._onLost = (/** @type {Event} */ event) => {
+    this._listening = new AbortController();
+    const { signal } = this._listening;
+    const lost = (/** @type {Event} */ event) => {
       event.preventDefault(); // else it never comes back
       this._dropGpu();
     };
-    this._onRestored = () => {
+    const restored = () => {
       this._startGpu();
       this._wake();
     };
-    canvas.addEventListener("webglcontextlost", this._onLost);
-    canvas.addEventListener("webglcontextrestored", this._onRestored);
+    canvas.addEventListener("webglcontextlost", lost, { signal });
+    canvas.addEventListener("webglcontextrestored", restored, { signal });
     this._resize = new ResizeObserver(() => this._touch());
     this._resize.observe(canvas);
     this._visible = true;
@@ -328,8 +323,7 @@ export class Player extends EventTarget {
     cancelAnimationFrame(this._frameRequest);
     this._resize.disconnect();
     this._seen.disconnect();
-    this.canvas.removeEventListener("webglcontextlost", this._onLost);
-    this.canvas.removeEventListener("webglcontextrestored", this._onRestored);
+    this._listening.abort();
     this.stopLoading();
     this._sorter.close();
     this._cpuWorker?.close();
@@ -393,7 +387,7 @@ export class Player extends EventTarget {
 
   _dropGpu() {
     this._painter?.free();
-    this._evaluator?.evaluator.free();
+    this._evaluator?.free();
     this._gpu?.free(this._front?.splats.field, this._spare?.field);
     this._gpu = this._painter = this._evaluator = this._front = this._spare = null;
   }
@@ -499,21 +493,15 @@ export class Player extends EventTarget {
       const evaluator = this._evaluatorFor(gpu, state.scene);
       const spare = this._spare;
       this._spare = null;
-      const { splats, means } = await evaluator.evaluate(state.level, state.t, state.eye, spare, {
-        list: (opacities, ...rest) => this._sorter.call("list", [opacities, ...rest], [opacities.buffer]),
-      });
+      /** @type {import("./evaluator.js").Lister} */
+      const lister = (opacities, ...rest) => this._sorter.call("list", [opacities, ...rest], [opacities.buffer]);
+      const { splats, means } = await evaluator.evaluate(state.level, state.t, state.eye, spare, lister);
       this._spare = splats;
       this._swapping = true;
       while (this._sorting) await new Promise((resolve) => setTimeout(resolve, 1));
       if (means) await this._sorter.call("setMeans", [means], [means.buffer]);
       if (gpu !== this._gpu) return;
-      const row = this._row();
-      if (means || !this._isSorted()) {
-        const order = await this._sorter.call("sort", [row, state.scene.info.near]);
-        if (gpu !== this._gpu) return;
-        this._painter?.setOrder(order);
-        this._sortedRow = row;
-      }
+      if ((means || !this._isSorted()) && !(await this._order(state.scene))) return;
       this._spare = this._front?.splats ?? null;
       this._front = { splats, state };
       this.counts.evaluated++;
@@ -527,7 +515,7 @@ export class Player extends EventTarget {
         return;
       }
       this._useCpu = true; // networks that shaders cannot hold, or a driver that cannot compile them
-      this._evaluator?.evaluator.free();
+      this._evaluator?.free();
       this._evaluator = null;
     } finally {
       this._evaluating = false;
@@ -541,43 +529,45 @@ export class Player extends EventTarget {
     const few = gpu.software && scene.anchor.length <= 3 * SOFTWARE_ANCHORS;
     const onCpu = this._useCpu || (few && this._options.evaluator !== "gpu");
     const had = this._evaluator;
-    if (had?.scene === scene && had.evaluator instanceof CpuEvaluator === onCpu) return had.evaluator;
-    if (onCpu && had?.evaluator instanceof CpuEvaluator) {
-      had.evaluator.setScene(scene);
-      had.scene = scene;
-      return had.evaluator;
+    if (had && had instanceof CpuEvaluator === onCpu) {
+      if (had.scene === scene) return had;
+      if (had instanceof CpuEvaluator) {
+        had.setScene(scene);
+        return had;
+      }
     }
-    had?.evaluator.free();
+    had?.free();
     this._evaluator = null;
-    this._evaluator = { evaluator: onCpu ? this._onCpu(gpu, scene) : new GpuEvaluator(gpu, scene), scene };
-    return this._evaluator.evaluator;
-  }
-
-  /** @param {Gpu} gpu @param {Scene} scene */
-  _onCpu(gpu, scene) {
-    const evaluator = new CpuEvaluator(gpu, scene, this._cpuWorker ?? undefined);
-    this._cpuWorker = null;
-    return evaluator;
+    if (onCpu) {
+      this._evaluator = new CpuEvaluator(gpu, scene, this._cpuWorker ?? undefined);
+      this._cpuWorker = null;
+    } else this._evaluator = new GpuEvaluator(gpu, scene);
+    return this._evaluator;
   }
 
   /** Brings the order to the camera, if the Gaussians on show are the sorter's. */
   async _sort() {
     if (!this._front || this._swapping || this._sorting || this._isSorted()) return;
-    const gpu = this._gpu;
-    const row = this._row();
     this._sorting = true;
     try {
-      const order = await this._sorter.call("sort", [row, this._front.state.scene.info.near]);
-      if (gpu !== this._gpu) return;
-      this._painter?.setOrder(order);
-      this._sortedRow = row;
-      this._dirty = true;
+      if (await this._order(this._front.state.scene)) this._dirty = true;
     } catch (error) {
       if (!this._closed) this._fail(error);
     } finally {
       this._sorting = false;
       this._wake();
     }
+  }
+
+  /** Sorts the sorter's Gaussians for the camera. @param {Scene} scene @returns whether the GPU is still the same one */
+  async _order({ info }) {
+    const gpu = this._gpu;
+    const row = this._row();
+    const order = await this._sorter.call("sort", [row, info.near]);
+    if (gpu !== this._gpu) return false;
+    this._painter?.setOrder(order);
+    this._sortedRow = row;
+    return true;
   }
 
   /** Width and height to draw, pixels. @param {number} now @returns {[number, number]} */

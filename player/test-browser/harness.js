@@ -29,7 +29,7 @@ async function compare(url, cases, bandPoints) {
   const gpu = new Gpu(gl);
   gpu.bandPoints = bandPoints;
   const evaluator = new GpuEvaluator(gpu, scene);
-  const lister = { list: async (/** @type {Parameters<typeof listGaussians>} */ ...args) => listGaussians(...args) };
+  const lister = async (/** @type {Parameters<typeof listGaussians>} */ ...args) => listGaussians(...args);
   const out = [];
   let splats = null;
   for (const { level, t, eye } of cases) {

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import base64
 import math
-import shutil
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -19,11 +18,6 @@ from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.scene import Camera, Scene
 
 PLAYER = Path(__file__).parents[2] / "player"
-
-
-def copy_player(folder: Path) -> None:
-    """The player's modules and the tests' page as folder/player."""
-    shutil.copytree(PLAYER, folder / "player", ignore=shutil.ignore_patterns("node_modules", "test"))
 
 
 def call(page: Any, script: str, *args: Any) -> Any:

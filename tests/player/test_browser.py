@@ -23,25 +23,14 @@ from urllib.parse import urlsplit
 import numpy as np
 import pytest
 from browser import PATIENCE_MS, launched
-from pictures import PLAYER, call, cameras, copy_player, decibels, resized, shots
-from pictures import pixels as pixels_of
+from pictures import PLAYER, call, cameras, decibels, pixels, resized, shots
 from strategies import make_scene
 
 from pd4dgs_codec import decode, encode, show
+from pd4dgs_codec import scene as scene_module
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.format.info import info
-from pd4dgs_codec.scene import (
-    DEFAULT_WIDTHS,
-    LOCAL_HEADS,
-    PLANES,
-    Camera,
-    Deformation,
-    Network,
-    Scene,
-    SceneInfo,
-    Steps,
-    Widths,
-)
+from pd4dgs_codec.scene import PLANES, Camera, Deformation, Network, Scene, SceneInfo, Steps, Widths
 from pd4dgs_codec.web.page import page as packed_page
 from pd4dgs_codec.web.server import Link, Server
 
@@ -107,7 +96,7 @@ def lively_scene(
     trunk: tuple[int, ...] = (16, 12),
     heads: tuple[dict[str, int], dict[str, int]] | None = None,
     layers: tuple[int, ...] = (0, 1, 2),
-    widths: Widths = DEFAULT_WIDTHS,
+    widths: Widths = scene_module.DEFAULT_WIDTHS,
 ) -> Scene:
     """Layers that differ, some thousand Gaussians of all shapes in front of the scene's camera."""
     rng = np.random.default_rng(seed)
@@ -116,18 +105,16 @@ def lively_scene(
     viewmat = np.eye(4, dtype=np.float32)
     viewmat[2, 3] = 4
     K = np.array([[80, 0, WIDTH / 2 + 3], [0, 84, HEIGHT / 2 - 2], [0, 0, 1]], np.float32)
-    box = np.array([[-1.4, -1.6, -1.5], [1.5, 1.3, 1.4]], np.float32)
     codes = np.sort(rng.choice(np.array([0, 60, 180, 255], np.uint8), (anchors, 3)), axis=1)
     codes[: anchors // 2] = [140, 200, 255]
-    fields = [
-        _deformation(rng, names, channels, scales, trunk) for names in heads or (widths.global_heads, LOCAL_HEADS)
-    ]
+    named = heads or (widths.global_heads, scene_module.LOCAL_HEADS)
+    fields = [_deformation(rng, names, channels, scales, trunk) for names in named]
     return Scene(
         info=SceneInfo(
             voxel_size=float(np.float32(1 / 40)),
-            box=box,
+            box=np.array([[-1.4, -1.6, -1.5], [1.5, 1.3, 1.4]], np.float32),
             time_range=(1.0, 3.0),
-            background=(float(np.float32(0.2)), 0.5, float(np.float32(0.7))),
+            background=(0.25, 0.5, 0.75),
             near=0.125,
             far=64.0,
             up=(0.0, -1.0, 0.0),
@@ -157,9 +144,9 @@ def lively() -> bytes:
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory, lively: bytes) -> Path:
-    """The player as it is installed, and scenes beside it."""
+    """The player and scenes beside it."""
     root = tmp_path_factory.mktemp("www")
-    copy_player(root)
+    shutil.copytree(PLAYER, root / "player", ignore=shutil.ignore_patterns("node_modules", "test"))
     (root / "scene.pd4").write_bytes(lively)
     shutil.copy(root / "scene.pd4", root / "player" / "scene.pd4")
     return root
@@ -202,12 +189,6 @@ def page(context: Any) -> Iterator[Any]:
     assert not errors
 
 
-@pytest.fixture
-def new_harness(page: Any, server: Server) -> Any:
-    """The harness on a page of its own."""
-    return _load_harness(page, server)
-
-
 @pytest.fixture(scope="module")
 def _shared_harness(context: Any, server: Server) -> Iterator[tuple[Any, list[str]]]:
     opened, errors = _opened(context)
@@ -225,39 +206,44 @@ def harness(_shared_harness: tuple[Any, list[str]]) -> Iterator[Any]:
     assert not errors
 
 
-def pixels(text: str) -> np.ndarray:
-    """A picture of the harness as float [H, W, 3]."""
-    return pixels_of(text, WIDTH, HEIGHT)
+def opened(page: Any, url: str, **options: Any) -> list[tuple[str, Any]]:
+    """The events of the harness, which has loaded a scene."""
+    events: list[tuple[str, Any]] = call(page, "harness.open", url, WIDTH, HEIGHT, options)
+    return events
+
+
+def shoot(page: Any, **state: Any) -> np.ndarray:
+    """The harness's settled picture, float [H, W, 3]."""
+    return pixels(call(page, "harness.shoot", state), WIDTH, HEIGHT)
+
+
+#: The element, and whether it shows a level.
+ELEMENT = "document.querySelector('pd4-player')"
+
+
+def wait_for_level(page: Any, level: int) -> None:
+    page.wait_for_function(f"{ELEMENT}?.player?.status.level === {level}")
 
 
 # -- evaluation and pictures -------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        dict(hidden=(5,), channels=2, scales=1, trunk=(3,)),
-        dict(hidden=(7,), channels=5, scales=3, trunk=(6, 21)),
-        dict(hidden=(40,), channels=33, scales=1, heads=({"position": 3, "scaling": 6}, {"mean": 3, "opacity": 1})),
-        dict(hidden=(4,), channels=3, heads=({"feature": 32}, {})),
-        dict(layers=(0, 2), heads=({}, {"quat": 4, "color": 3})),
-        dict(widths=Widths(16, 4)),
-        dict(widths=Widths(64, 16), hidden=(7,)),
-        dict(widths=Widths(1, 1), anchors=700, seed=6),
-    ],
-    ids=[
-        "usual",
-        "small",
-        "odd widths",
-        "many channels",
-        "global only",
-        "no layer 1",
-        "16 and 4",
-        "most",
-        "least",
-    ],
-)
+SHAPES: dict[str, dict[str, Any]] = {
+    "usual": {},
+    "small": dict(hidden=(5,), channels=2, scales=1, trunk=(3,)),
+    "odd widths": dict(hidden=(7,), channels=5, scales=3, trunk=(6, 21)),
+    "many channels": dict(
+        hidden=(40,), channels=33, scales=1, heads=({"position": 3, "scaling": 6}, {"mean": 3, "opacity": 1})
+    ),
+    "global only": dict(hidden=(4,), channels=3, heads=({"feature": 32}, {})),
+    "no layer 1": dict(layers=(0, 2), heads=({}, {"quat": 4, "color": 3})),
+    "16 and 4": dict(widths=Widths(16, 4)),
+    "most": dict(widths=Widths(64, 16), hidden=(7,)),
+    "least": dict(widths=Widths(1, 1), anchors=700, seed=6),
+}
+
+
+@pytest.mark.parametrize("options", SHAPES.values(), ids=SHAPES)
 def test_both_evaluators_agree(harness, folder, server, options):
     scene = lively_scene(**{"anchors": 150, **options})
     (folder / "agree.pd4").write_bytes(encode(scene, layers=2, effort=1))
@@ -287,7 +273,7 @@ def test_pictures_are_those_of_the_rasteriser(harness, server, folder, kind, eva
     # the scene's own camera, one from the side, and one from nearby that looks past much of the scene
     turns = ((0.9, 0.1), (-2.1, 0.7)) if (evaluator, kind) == ("gpu", "lively") else ()
     views = [resized(camera, WIDTH, HEIGHT) for camera in cameras(scene, turns)]
-    call(harness, "harness.open", server.url_of(f"{kind}.pd4"), WIDTH, HEIGHT, {"evaluator": evaluator})
+    opened(harness, server.url_of(f"{kind}.pd4"), evaluator=evaluator)
     seen = []
     for shot in (*shots(harness, data, views[:1], (0.0, 0.37, 1.0)), *shots(harness, data, views[1:], (0.37,))):
         assert np.abs(shot.expected - scene.info.background).max() > 0.2
@@ -315,7 +301,7 @@ def test_pictures_through_spark_are_those_of_the_rasteriser(page, server, folder
         shutil.copy(PLAYER / "node_modules" / name, folder / "packages" / name)
     page.goto(server.url_of("player/test-browser/spark.html"))
     page.wait_for_function("!!window.harness")
-    call(page, "harness.open", server.url_of("scene.pd4"), WIDTH, HEIGHT)
+    opened(page, server.url_of("scene.pd4"))
     scene = decode(lively)
     views = [resized(camera, WIDTH, HEIGHT) for camera in cameras(scene, [(0.3, 0.1)])]
     seen = []
@@ -333,8 +319,8 @@ def test_networks_that_shaders_do_not_take_are_evaluated_on_the_cpu(harness, fol
     (folder / "wide.pd4").write_bytes(encode(lively_scene(60, hidden=hidden), layers=2, effort=1))
     pictures = []
     for evaluator in ("gpu", "cpu"):
-        call(harness, "harness.open", server.url_of("wide.pd4"), WIDTH, HEIGHT, {"evaluator": evaluator})
-        pictures.append(pixels(call(harness, "harness.shoot", {})))
+        opened(harness, server.url_of("wide.pd4"), evaluator=evaluator)
+        pictures.append(shoot(harness))
         assert harness.evaluate("harness.player.status.level") == 2
     assert decibels(*pictures) > 60 and np.ptp(pictures[0]) > 0.3
 
@@ -342,14 +328,14 @@ def test_networks_that_shaders_do_not_take_are_evaluated_on_the_cpu(harness, fol
 @pytest.mark.parametrize("kind", ["constant", "huge"])
 def test_absurd_values_leave_a_picture(harness, folder, server, kind):
     (folder / "absurd.pd4").write_bytes(encode(make_scene(2, anchors=40, kind=kind), layers=2, effort=1))
-    events = call(harness, "harness.open", server.url_of("absurd.pd4"), WIDTH, HEIGHT)
+    events = opened(harness, server.url_of("absurd.pd4"))
     assert "error" not in dict(events)
     for level in (0, 1, 2):
-        assert pixels(call(harness, "harness.shoot", {"level": level, "seconds": 1.1})).shape == (HEIGHT, WIDTH, 3)
+        assert shoot(harness, level=level, seconds=1.1).shape == (HEIGHT, WIDTH, 3)
 
 
 def test_nothing_is_evaluated_in_vain(harness, server):
-    call(harness, "harness.open", server.url_of("scene.pd4"), WIDTH, HEIGHT)
+    opened(harness, server.url_of("scene.pd4"))
 
     def after(change: str) -> dict[str, int]:
         return call(
@@ -387,11 +373,8 @@ def test_the_first_picture_comes_before_the_last_layer(harness, folder, lively):
         harness.evaluate("(url) => void harness.open(url, 96, 72)", slow.url_of("scene.pd4"))
         harness.wait_for_function("harness.events.some(([name]) => name === 'firstpicture')")
         name, first = harness.evaluate("harness.events[0]")
-        assert (
-            name == "firstpicture"
-            and first["level"] == 0
-            and 0 < first["arrived"] < first["decoded"] < first["seconds"]
-        )
+        assert (name, first["level"]) == ("firstpicture", 0)
+        assert 0 < first["arrived"] < first["decoded"] < first["seconds"]
         assert ends[0] <= first["bytes"] < ends[2]
         harness.wait_for_function("harness.player.status.level === 2")
     names = [(name, detail.get("level")) for name, detail in harness.evaluate("harness.events")]
@@ -417,12 +400,12 @@ def test_the_first_picture_comes_before_layer_0_is_whole(harness, folder):
 
 def test_budgets_are_kept_and_may_be_raised(harness, server, lively):
     ends = [row["end"] for row in info(lively)["layers"]]
-    events = call(harness, "harness.open", server.url_of("scene.pd4"), WIDTH, HEIGHT, {"bytes": ends[1] + 10})
+    events = opened(harness, server.url_of("scene.pd4"), bytes=ends[1] + 10)
     assert dict(events)["loaded"] == {"bytes": ends[1], "complete": False}
     call(harness, "() => harness.player.settled()")
     assert harness.evaluate("harness.player.status.levels") == [0, 1]
 
-    call(harness, "harness.open", server.url_of("scene.pd4"), WIDTH, HEIGHT, {"level": 0})
+    opened(harness, server.url_of("scene.pd4"), level=0)
     call(harness, "() => harness.player.settled()")
     assert harness.evaluate("harness.player.status.levels") == [0]
     harness.evaluate("harness.player.level = null")
@@ -449,27 +432,20 @@ def damaged(data: bytes, at: int) -> bytes:
     return data[:at] + bytes([data[at] ^ 4]) + data[at + 1 :]
 
 
-@pytest.mark.parametrize(
-    ("fault", "shown", "words"),
-    [
-        ("damaged in layer 1", 0, "CRC-32"),
-        ("cut in layer 2", 1, "needs"),
-        ("damaged in layer 0", None, "CRC-32"),
-        ("foreign", None, "pd4"),
-        ("absent", None, "404"),
-        ("hostile", None, "limit"),
-    ],
-)
-def test_bad_input_is_one_line_and_keeps_what_was_valid(page, server, folder, lively, fault, shown, words):
-    ends = [row["end"] for row in info(lively)["layers"]]
-    data = {
-        "damaged in layer 1": damaged(lively, ends[1] - 50),
-        "cut in layer 2": lively[: ends[2] - 20],
-        "damaged in layer 0": damaged(lively, ends[0] - 50),
-        "foreign": b"<!doctype html><p>no such scene" * 20,
-        "absent": None,
-        "hostile": (ROOT / "spec" / "vectors" / "faulty" / "bomb-most-rows.pd4").read_bytes(),
-    }[fault]
+FAULTS: dict[str, tuple[Any, int | None, str]] = {
+    "damaged in layer 1": (lambda data, ends: damaged(data, ends[1] - 50), 0, "CRC-32"),
+    "cut in layer 2": (lambda data, ends: data[: ends[2] - 20], 1, "needs"),
+    "damaged in layer 0": (lambda data, ends: damaged(data, ends[0] - 50), None, "CRC-32"),
+    "foreign": (lambda *_: b"<!doctype html><p>no such scene" * 20, None, "pd4"),
+    "absent": (lambda *_: None, None, "404"),
+    "hostile": (lambda *_: (ROOT / "spec" / "vectors" / "faulty" / "bomb-most-rows.pd4").read_bytes(), None, "limit"),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_bad_input_is_one_line_and_keeps_what_was_valid(page, server, folder, lively, fault):
+    make, shown, words = FAULTS[fault]
+    data = make(lively, [row["end"] for row in info(lively)["layers"]])
     name = fault.replace(" ", "-") + ".pd4"
     if data is not None:
         (folder / name).write_bytes(data)
@@ -482,30 +458,32 @@ def test_bad_input_is_one_line_and_keeps_what_was_valid(page, server, folder, li
     (error,) = (detail for name, detail in page.evaluate("seen") if name == "error")
     assert error["message"] == text and error["kind"]
     if shown is not None:
-        page.wait_for_function(f"document.querySelector('pd4-player').player.status.level === {shown}")
+        wait_for_level(page, shown)
     else:
         assert page.evaluate("document.querySelector('pd4-player').player.status.level") is None
     page.evaluate("(url) => { document.querySelector('pd4-player').src = url }", server.url_of("scene.pd4"))
-    page.wait_for_function("document.querySelector('pd4-player').player.status.level === 2")
+    wait_for_level(page, 2)
     assert alert.is_hidden()
 
 
 # -- robustness --------------------------------------------------------------------------------------------------------
 
 
-def test_a_lost_context_comes_back(new_harness, server):
-    call(new_harness, "harness.open", server.url_of("scene.pd4"), WIDTH, HEIGHT, {"evaluator": "gpu"})
-    before = pixels(call(new_harness, "harness.shoot", {"seconds": 1.8}))
-    call(new_harness, "harness.loseContext")
-    after = pixels(call(new_harness, "harness.shoot", {}))
+def test_a_lost_context_comes_back(page, server):
+    _load_harness(page, server)
+    opened(page, server.url_of("scene.pd4"), evaluator="gpu")
+    before = shoot(page, seconds=1.8)
+    call(page, "harness.loseContext")
+    after = shoot(page)
     assert decibels(before, after) > 60  # the order of equal depths may be another one
-    assert "error" not in dict(new_harness.evaluate("harness.events"))
+    assert "error" not in dict(page.evaluate("harness.events"))
 
 
-def test_scenes_opened_and_closed_leave_nothing(new_harness, server):
-    pages = len(new_harness.context.pages)
+def test_scenes_opened_and_closed_leave_nothing(page, server):
+    _load_harness(page, server)
+    pages = len(page.context.pages)
     sizes = call(
-        new_harness,
+        page,
         """async (url) => {
           const sizes = [];
           for (let i = 0; i < 12; i++) {
@@ -520,10 +498,10 @@ def test_scenes_opened_and_closed_leave_nothing(new_harness, server):
         }""",
         server.url_of("scene.pd4"),
     )
-    assert new_harness.evaluate("document.querySelectorAll('canvas').length") == 0
+    assert page.evaluate("document.querySelectorAll('canvas').length") == 0
     held = 700 * (72 + 3) * 4  # the arrays of one scene
     assert min(sizes[9:]) < min(sizes[2:5]) + held, sizes  # every fourth is loaded in full
-    assert len(new_harness.context.pages) == pages and len(new_harness.workers) == 0
+    assert len(page.context.pages) == pages and len(page.workers) == 0
 
 
 def test_a_scene_that_replaces_another_while_it_loads(harness, server):
@@ -550,21 +528,21 @@ def test_a_scene_that_replaces_another_while_it_loads(harness, server):
 
 def test_controls(page, server):
     player = element(page, server, f'controls src="{server.url_of("scene.pd4")}"')
-    page.wait_for_function("document.querySelector('pd4-player').player.status.level === 2")
+    wait_for_level(page, 2)
     state = "(() => { const p = document.querySelector('pd4-player'); return [...p.camera.viewmat] })()"
 
     slider = player.get_by_role("slider", name="Time")
     slider.fill("2.5")
-    assert page.evaluate("document.querySelector('pd4-player').time") == pytest.approx(2.5, abs=1e-6)
+    assert page.evaluate(f"{ELEMENT}.time") == pytest.approx(2.5, abs=1e-6)
     assert slider.get_attribute("aria-valuetext") == "1.5 / 2.0 s"
     player.get_by_role("button", name="Play").click()
     player.get_by_role("button", name="Pause").wait_for()
     player.get_by_role("button", name="Play").wait_for()  # at the end it stops
-    assert page.evaluate("document.querySelector('pd4-player').time") == 3
+    assert page.evaluate(f"{ELEMENT}.time") == 3
 
     box = player.get_by_role("combobox", name="Highest level")
     box.select_option("1")
-    page.wait_for_function("document.querySelector('pd4-player').player.status.level === 1")
+    wait_for_level(page, 1)
     assert player.get_attribute("level") == "1"
     box.select_option("")
     assert player.get_attribute("level") is None
@@ -580,7 +558,7 @@ def test_controls(page, server):
     page.keyboard.press("Home")
     assert page.evaluate(state) == home
     page.keyboard.press(",")
-    assert page.evaluate("document.querySelector('pd4-player').time") == pytest.approx(3 - 1 / 30)
+    assert page.evaluate(f"{ELEMENT}.time") == pytest.approx(3 - 1 / 30)
     changes = "seen.filter(([name]) => name === 'statechange').length"
     before = page.evaluate(changes)
     page.keyboard.press("Space")
@@ -617,13 +595,11 @@ def test_controls(page, server):
 
 def test_every_control_has_a_name_and_is_reached_by_key(page, server):
     player = element(page, server, f'controls src="{server.url_of("scene.pd4")}"')
-    page.wait_for_function("document.querySelector('pd4-player').player.status.level === 2")
+    wait_for_level(page, 2)
     names = []
     for _ in range(6):
         page.keyboard.press("Tab")
-        names.append(
-            page.evaluate("document.querySelector('pd4-player').shadowRoot.activeElement?.getAttribute('aria-label')")
-        )
+        names.append(page.evaluate(f"{ELEMENT}.shadowRoot.activeElement?.getAttribute('aria-label')"))
     assert names == ["Dynamic scene", "Play", "Time", "Highest level", "Reset the view", "Full screen"]
     assert player.locator("[part=status]").inner_text().startswith("level 2 of 2 · ")
 
@@ -632,14 +608,13 @@ def test_attributes_and_removal(page, server):
     attributes = f'src="{server.url_of("scene.pd4")}" time="2" level="1" autoplay loop poster="data:,"'
     player = element(page, server, attributes)
     assert player.locator("img").count() == 1
-    page.wait_for_function("document.querySelector('pd4-player').player.status.level === 1")
+    wait_for_level(page, 1)
     assert player.locator("img").is_hidden() and player.get_by_role("group").is_hidden()
     page.wait_for_function("document.querySelector('pd4-player').time < 2")  # it plays, and begins anew
     names = [name for name, _ in page.evaluate("seen")]
     assert names.count("firstpicture") == 1 and names.count("upgrade") <= 1 and "progress" in names
-    page.evaluate("window.player = document.querySelector('pd4-player'); player.remove()")
+    page.evaluate(f"window.player = {ELEMENT}; player.remove()")
     assert page.evaluate("player.player") is None
-    page.wait_for_function("true")
     page.evaluate("document.body.append(player)")
     page.wait_for_function("player.player.status.level === 1")
 
@@ -647,7 +622,7 @@ def test_attributes_and_removal(page, server):
 def test_code_and_scene_may_come_from_other_servers(page, server, folder):
     with Server(folder) as other, other.running():
         element(page, server, f'src="{other.url_of("scene.pd4")}"', other)
-        page.wait_for_function("document.querySelector('pd4-player').player?.status.level === 2")
+        wait_for_level(page, 2)
 
 
 @pytest.fixture(scope="module")
@@ -681,7 +656,7 @@ def test_a_package_by_the_installed_wheel_plays_from_any_web_server(page, instal
     with http.server.ThreadingHTTPServer(("127.0.0.1", 0), handler) as plain:
         threading.Thread(target=plain.serve_forever, daemon=True).start()
         page.goto(f"http://127.0.0.1:{plain.server_port}/moved/?autoplay=0")
-        page.wait_for_function("document.querySelector('pd4-player')?.player.status.level === 2")
+        wait_for_level(page, 2)
         plain.shutdown()
     assert [Path(urlsplit(url).path).name for url in asked if url.startswith("http")] == ["moved", "scene.pd4"]
 
@@ -695,7 +670,7 @@ def test_the_scene_is_asked_for_while_the_page_arrives(page, folder, lively):
     log = lambda line: asked.append(time.time()) if "scene.pd4" in line else None  # noqa: E731
     with Server(folder, link=Link(2e5), log=log) as slow, slow.running():
         page.goto(slow.url_of("packed/index.html"))
-        page.wait_for_function("document.querySelector('pd4-player')?.player.status.level === 2")
+        wait_for_level(page, 2)
     arrived = page.evaluate("performance.timeOrigin + performance.getEntriesByType('navigation')[0].responseEnd")
     assert len(asked) == 1 and asked[0] < arrived / 1000
 
@@ -714,7 +689,7 @@ def test_one_page_holds_player_and_scene(page, server, lively, place):
         (server.root / "alone.html").write_text(shown.page)
         page.goto((server.root / "alone.html").as_uri())
         frame = page
-    frame.wait_for_function("document.querySelector('pd4-player')?.player?.status.level === 2")
+    wait_for_level(frame, 2)
     assert asked[1:].count("http") + asked[1:].count("https") + asked[1:].count("file") == 0
 
 
@@ -722,7 +697,7 @@ def test_the_page_asks_nobody_else_and_measures_itself(page, server):
     hosts: set[str] = set()
     page.on("request", lambda request: hosts.add(request.url.split("/player/")[0]))
     page.goto(server.url_of("player/index.html"))
-    page.wait_for_function("document.querySelector('pd4-player')?.player.status.level === 2")
+    wait_for_level(page, 2)
     assert not page.evaluate("document.querySelector('pd4-player').paused")
     page.goto(server.url_of("player/index.html") + "?bench&src=scene.pd4&sizes=48x36")
     started = time.monotonic()
