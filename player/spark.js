@@ -6,7 +6,7 @@
 import { centreOf, defaultCamera, fitted, unit } from "./render/camera.js";
 import { startWorker } from "./render/cpu.js";
 import { levelOf, sameState, stateOf, timeAfter } from "./render/level.js";
-import { startLoader } from "./render/loader.js";
+import { Emitter, startLoader } from "./render/loader.js";
 /** @import { Camera, Scene } from "./decode/scene.js" */
 /** @import { State } from "./render/level.js" */
 
@@ -49,7 +49,7 @@ export const SPARK_SETTINGS = {
  * Events: `upgrade` {level, anchors, gaussians} when a higher level, or more anchors of it, is in the mesh;
  * `loaded` {bytes, complete}; `error` {message, kind}, after which what was valid stays.
  */
-export class Pd4Splats extends EventTarget {
+export class Pd4Splats extends Emitter {
   /**
    * Begins to load.
    *
@@ -283,16 +283,5 @@ export class Pd4Splats extends EventTarget {
     const { rows: anchors } = levelOf(scene, level);
     if (had && level <= had.level && anchors <= levelOf(had.scene, had.level).rows) return;
     this._emit("upgrade", { level, anchors, gaussians: this._splats.numSplats });
-  }
-
-  /** @param {unknown} error */
-  _fail(error) {
-    const { message, name, kind = name } = /** @type {Error & {kind?: string}} */ (error);
-    this._emit("error", { message, kind });
-  }
-
-  /** @param {string} name @param {object} detail */
-  _emit(name, detail) {
-    this.dispatchEvent(new CustomEvent(name, { detail }));
   }
 }

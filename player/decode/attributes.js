@@ -1,5 +1,4 @@
-// Clauses 8.5 to 8.7: the attributes section. Its result is the step classes and the channels of 11.2, the latter still
-// unchecked against 11.2.
+// Clauses 8.5 to 8.7: the attributes section, to step classes and the channels of 11.2. layer.js checks their range.
 
 import { ByteReader } from "./bytes.js";
 import { decodeChannels } from "./channels.js";
@@ -17,27 +16,27 @@ import {
   referenceOf,
 } from "./stages.js";
 
-/** Where the channels of stages 0..4 begin, and those of stage 4 end, in parts of the predicted ones; stage 5 is split by
- * the activity of all of them. */
+/** Bounds of stages 0 to 4, in 38ths of the predicted channels. */
 const STAGE_BOUNDS = [0, 6, 12, 20, 29, 38];
+/** The stage of the offsets' x. */
 const X_STAGE = 5;
 const STEP_CLASSES = 7;
 const STAGES = 8;
-/** Classes by distance of a Gaussian's second and third coordinate. */
+/** Number of distance classes of a Gaussian's y and z. */
 const DISTANCES = [5, 7];
 
-/** terms: channel and weight. @typedef {{channel: number, weight: number}[]} Terms */
+/** A linear prediction. @typedef {{channel: number, weight: number}[]} Terms */
 /** split: bit 0 for y, bit 1 for z. @typedef {{split: number, a: number, b: number}} Split */
 
 /**
- * A prediction block (8.6), with what its slice was classed by: per channel that counts, and per stage.
+ * A prediction block (8.6).
  *
  * @typedef {object} Block
- * @property {Terms[]} terms
- * @property {number[]} classCounts
- * @property {Split[]} splits
- * @property {Map<number | "step classes", import("./stages.js").Reference>} references
- * @property {number[][]} bounds
+ * @property {Terms[]} terms of each predicted channel
+ * @property {number[]} classCounts number of activity classes of stages 0 to 5
+ * @property {Split[]} splits of each slot
+ * @property {Map<number | "step classes", import("./stages.js").Reference>} references of the block's slice, by channel
+ * @property {number[][]} bounds of the block's slice, by stage
  */
 
 /**
@@ -56,13 +55,13 @@ export function decodeAttributes(bytes, rows, kind, continuation) {
     decodeStaged(reader, stepClasses, rows, kind.widths, block, true, continuation, attributes);
     continuation.block = block;
   } else if (form === 2) {
-    if (!continuation.block) throw malformed("attributes that go on with a block, and none before in the layer");
+    if (!continuation.block) throw malformed("attributes that continue a prediction block, and the layer has none before");
     decodeStaged(reader, stepClasses, rows, kind.widths, continuation.block, false, continuation, attributes);
   } else throw unsupported(`form ${form} of the attributes`);
   return { stepClasses, attributes };
 }
 
-/** Of each row; no slice goes on with its priors. @param {ByteReader} reader @param {number} rows */
+/** The step class of each row. Later slices do not use its priors. @param {ByteReader} reader @param {number} rows */
 function readStepClasses(reader, rows) {
   const length = reader.varint(reader.remaining, "the length of the step classes");
   const classes = new Int32Array(rows);
@@ -100,11 +99,11 @@ function readBlock(reader, { widths: { feature, slots }, stepClasses }) {
 
 /** 8.7. @param {ByteReader} reader @param {Int32Array} stepClasses @param {number} rows
  * @param {import("./header.js").Widths} widths @param {Block} block
- * @param {boolean} own whether the block stands in this slice, and takes down what it is classed by
+ * @param {boolean} own whether the block stands in this slice, which then sets its references and bounds
  * @param {import("./slices.js").Continuation} continuation @param {Int32Array} out */
 function decodeStaged(reader, stepClasses, rows, { feature, slots }, block, own, continuation, out) {
   const { terms, classCounts, splits, references } = block;
-  const predicted = feature + 6; // features and log-scalings, from each other
+  const predicted = feature + 6; // features and log-scalings are predicted from each other
   const firsts = STAGE_BOUNDS.map((part) => Math.floor((predicted * part) / 38));
   const stages = readStages(reader, STAGES);
   /** @param {number} c */
@@ -112,7 +111,7 @@ function decodeStaged(reader, stepClasses, rows, { feature, slots }, block, own,
 
   const activity = new Float64Array(rows);
   if (stepClasses.length) {
-    // A row of finer steps has larger symbols.
+    // a row with finer steps has larger symbols
     const fineness = stepClasses.map((c) => 1 << (STEP_CLASSES - 1 - c));
     if (own) references.set("step classes", referenceOf(fineness));
     addRelativeMagnitudes(fineness, activity, references.get("step classes"));
@@ -181,7 +180,7 @@ function classesByDistance(x, a, y, b) {
   return classes;
 }
 
-/** The sum of 8.7, in place: residuals become symbols. @param {Int32Array} symbols @param {Terms} terms
+/** Residuals to symbols by the sum of 8.7, in place. @param {Int32Array} symbols @param {Terms} terms
  * @param {(c: number) => Int32Array} channel */
 function predict(symbols, terms, channel) {
   if (!terms.length) return;

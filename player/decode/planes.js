@@ -109,7 +109,7 @@ function restore(plane, { channels, height, width, predictor }) {
  * @param {number} from @param {number} end @param {number} width @param {number} predictor 1..5 */
 function restoreChannel(plane, from, end, width, predictor) {
   check(plane[from]);
-  // Whatever the predictor, in row 0 it gives W and in column 0 N.
+  // every predictor gives W in row 0 and N in column 0
   for (let at = from + 1; at < from + width; at++) check((plane[at] += plane[at - 1]));
   for (let row = from + width; row < end; row += width) {
     check((plane[row] += plane[row - width]));
@@ -130,7 +130,7 @@ function restoreChannel(plane, from, end, width, predictor) {
   }
 }
 
-/** The middle one of three numbers below 2^30 in magnitude, without branches: which one it is cannot be foreseen.
+/** The median of three numbers below 2^30 in magnitude, without branches, which a processor would mispredict.
  * @param {number} a @param {number} b @param {number} c */
 function median(a, b, c) {
   let step = (a - b) & ((a - b) >> 31);

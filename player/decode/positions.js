@@ -1,4 +1,4 @@
-// Clause 10: the positions section, an octree whose levels stand one behind the other.
+// Clause 10: the positions section, an octree, level by level.
 
 import { ByteReader } from "./bytes.js";
 import { decodeChannels } from "./channels.js";
@@ -6,10 +6,10 @@ import { limitExceeded, malformed } from "./errors.js";
 import { MAX_COUNT, MAX_VOXEL } from "./limits.js";
 
 const MAX_DEPTH = 21;
-/** A node with eight children has all of them: one pattern, no symbol. */
+/** Children of a full node, whose pattern needs no symbol. */
 const ALL = 8;
 
-/** Of k: the bytes in which k bits are 1, ascending. @type {number[][]} */
+/** PATTERNS[k]: the bytes with k bits set, ascending. @type {number[][]} */
 const PATTERNS = Array.from({ length: 9 }, () => []);
 for (let byte = 0; byte < 256; byte++) {
   let bits = 0;
@@ -17,7 +17,7 @@ for (let byte = 0; byte < 256; byte++) {
   PATTERNS[bits].push(byte);
 }
 
-/** How many nodes a level begins with, and how many of them have one child. @typedef {{nodes: number, single: number}} Level */
+/** Nodes of a level, and those of them with one child. @typedef {{nodes: number, single: number}} Level */
 
 /**
  * @param {Uint8Array} bytes the section @param {number} rows at least 1
@@ -84,9 +84,9 @@ function readPatternCounts(reader, levels) {
 function grow(levels, patterns, symbols, rows) {
   let parents = [0, 1, 2].map(() => new Int32Array(rows));
   let children = [0, 1, 2].map(() => new Int32Array(rows));
-  let parentAlone = new Uint8Array(rows); // of a node: whether its parent has one child
+  let parentAlone = new Uint8Array(rows); // 1 where a node is its parent's only child
   let childAlone = new Uint8Array(rows);
-  // Where the next pattern of k children stands in symbols, and where the last one ends.
+  // index in `symbols` of the next pattern of k children, and the end of these patterns
   const next = new Array(ALL).fill(0);
   const ends = new Array(ALL).fill(symbols.length);
   let at = symbols.length;

@@ -1,4 +1,4 @@
-// Clauses 3.6, 8 and 12.2: what the slices of a layer go on with, and the order of their rows.
+// Clauses 3.6, 8 and 12.2: state from slice to slice of a layer, and the order of their rows.
 
 /**
  * What later slices of a layer may refer to: the priors of each section, by its name or the number of a stage, and the
@@ -19,7 +19,7 @@ export class Continuation {
     return known;
   }
 
-  /** A function that forgets what a slice added from now on: a fault in it may be mended by fetching it again. */
+  /** Returns a function that undoes later additions: a damaged slice may be fetched again. */
   mark() {
     const { block } = this;
     const sizes = new Map([...this._sections].map(([name, priors]) => [name, priors.length]));

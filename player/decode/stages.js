@@ -1,4 +1,4 @@
-// Clause 8.9 and what 8.7 and 8.8 share: stages, class counts, relative magnitudes and classes by activity.
+// Clauses 8.7 to 8.9: stages, class counts, relative magnitudes and classes by activity.
 
 import { decodeChannels } from "./channels.js";
 import { malformed } from "./errors.js";
@@ -33,10 +33,10 @@ export function readStages(reader, count) {
   return [...stages, rest.subarray(at)];
 }
 
-/** Magnitudes below it are looked up. */
+/** Relative magnitudes below this one come from a table. */
 const LOOKED_UP = 256;
 
-/** What magnitudes are relative to: so many places, whose magnitudes have this sum. @typedef {{places: number, sum: number}} Reference */
+/** Number of places and sum of their magnitudes, to which magnitudes are relative. @typedef {{places: number, sum: number}} Reference */
 
 /** @param {Int32Array} residuals one per place @returns {Reference} */
 export function referenceOf(residuals) {
@@ -75,7 +75,7 @@ export function addRelativeMagnitudes(residuals, sums, reference = referenceOf(r
   }
 }
 
-/** Between classes of about equally many places. @param {Float64Array} activity @param {number} count of classes, 1..8 */
+/** Bounds between classes of about equally many places. @param {Float64Array} activity @param {number} count of classes, 1..8 */
 export function activityBounds(activity, count) {
   if (count === 1) return [];
   const n = activity.length;

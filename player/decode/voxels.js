@@ -1,19 +1,19 @@
 // A hash table of voxels that hold an anchor.
 
-/** Random, so that nobody can prepare voxels that all fall into one place. */
+/** Random, so that no file can be made whose voxels all collide. */
 const SEEDS = Int32Array.from({ length: 3 }, () => (Math.random() * 2 ** 32) | 1);
 
 /** A set of voxels. */
 export class VoxelTable {
   constructor() {
-    /** x, y, z of each voxel; after the last one anything. */
+    /** [n, 3], with unused room at the end. */
     this._voxels = new Int32Array(0);
     this._count = 0;
-    /** Numbers of voxels, -1 where there is none. */
+    /** Index of the voxel of each slot, -1 where it is empty. */
     this._slots = new Int32Array(0);
   }
 
-  /** Where this voxel stands in the table, or would stand. @param {number} x @param {number} y @param {number} z */
+  /** The slot that has this voxel, or would take it. @param {number} x @param {number} y @param {number} z */
   _slot(x, y, z) {
     const slots = this._slots;
     const voxels = this._voxels;

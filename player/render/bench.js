@@ -1,6 +1,6 @@
 // The page that measures frame rates per level and size on the machine that opens it.
 
-import { centreOf, dot, downOf, forwardOf, lookAlong, plus, turn } from "./camera.js";
+import { Orbit } from "./orbit.js";
 import { Player } from "./player.js";
 
 /** CSS pixels, smallest first. */
@@ -24,6 +24,7 @@ export async function bench(source, place, sizes = SIZES) {
   const canvas = document.createElement("canvas");
   place.append(output, canvas);
   const player = new Player(canvas, { degrade: false, pixelRatio: 1 });
+  const orbit = new Orbit(player, canvas);
   /** @type {{seconds: number, bytes: number} | null} */
   let first = null;
   player.addEventListener("firstpicture", (event) => (first = /** @type {CustomEvent} */ (event).detail));
@@ -40,7 +41,7 @@ export async function bench(source, place, sizes = SIZES) {
       Object.assign(canvas.style, { width: `${width}px`, height: `${height}px` });
       output.textContent = `level ${level}, ${width} × ${height}`;
       await player.settled();
-      const moving = await perSecond(() => player.counts.drawn, swing(player));
+      const moving = await perSecond(() => player.counts.drawn, swing(orbit));
       await player.settled();
       const playing = level ? await perSecond(() => player.counts.evaluated, play(player)) : 0;
       rows.push({ level, width, height, gaussians: player.status.gaussians, moving, playing });
@@ -73,17 +74,13 @@ async function perSecond(count, step) {
   return (1000 * (count() - before)) / (last - start);
 }
 
-/** Turns the camera to and fro about a point before it. @param {Player} player @returns {(ms: number) => void} */
-function swing(player) {
-  const { camera, info } = player;
-  if (!camera || !info) return () => {};
-  const middle = plus(plus([0, 0, 0], info.box[0], 0.5), info.box[1], 0.5);
-  const depth = Math.max(dot(plus(middle, centreOf(camera), -1), forwardOf(camera)), 2 * info.near);
-  const pivot = plus(centreOf(camera), forwardOf(camera), depth);
+/** Turns the camera to and fro. @param {Orbit} orbit @returns {(ms: number) => void} */
+function swing(orbit) {
+  let turned = 0;
   return (ms) => {
     const angle = SWING * Math.sin((2 * Math.PI * ms) / SWING_MS);
-    const [forward, down] = [forwardOf(camera), downOf(camera)].map((v) => turn(v, downOf(camera), angle));
-    player.camera = lookAlong(plus(pivot, forward, -depth), forward, down, camera);
+    orbit.turn(angle - turned, 0);
+    turned = angle;
   };
 }
 

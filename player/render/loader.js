@@ -1,4 +1,4 @@
-// The worker that fetches and decodes, from the page's side.
+// What Player and Pd4Splats share: events, and the worker that fetches and decodes.
 
 import { Remote } from "../decode/remote.js";
 
@@ -21,4 +21,18 @@ export function startLoader(told, from) {
   early.worker = null; // its response serves once
   early.begin(code.href);
   return new Remote(worker, told);
+}
+
+/** An EventTarget whose events have a detail. */
+export class Emitter extends EventTarget {
+  /** @param {string} name @param {object} detail */
+  _emit(name, detail) {
+    this.dispatchEvent(new CustomEvent(name, { detail }));
+  }
+
+  /** Emits `error`. @param {unknown} error */
+  _fail(error) {
+    const { message, name, kind = name } = /** @type {Error & {kind?: string}} */ (error);
+    this._emit("error", { message, kind });
+  }
 }

@@ -5,7 +5,7 @@ import { MIN_OPACITY } from "./level.js";
 /** @import { Splats } from "./evaluator.js" */
 /** @import { Field, Gpu } from "./gl.js" */
 
-/** Variance that every Gaussian gets on top, pixels squared. */
+/** Variance added to every Gaussian, pixels squared. */
 const BLUR = 0.3;
 /** Share of the picture beyond its sides to which the projection's slope is clamped. */
 const MARGIN = 0.15;
@@ -16,7 +16,7 @@ const BATCH = 128;
 /** Width of the texture of the order. */
 const ORDER_WIDTH = 1024;
 
-/** One quad per Gaussian, as wide as alpha reaches 1/255 along the ellipse's axes. The covariance is U·Uᵀ + blur with U
+/** One quad per Gaussian, which ends where alpha falls to 1/255 along the ellipse's axes. The covariance is U·Uᵀ + blur with U
  * = J·W·R·S, and its determinant |u0 × u1|² + blur·trace + blur²: without cancellation for needles. */
 const VERTEX = `
 uniform sampler2DArray splats;
@@ -81,7 +81,7 @@ void main() {
   color = vec4(paint.rgb * alpha, alpha);
 }`;
 
-/** The picture of floats onto the canvas. */
+/** Copies the float picture onto the canvas. */
 const SHOW = `
 uniform sampler2DArray picture;
 out vec4 color;
@@ -103,13 +103,14 @@ export class Painter {
     /** @type {WebGLTexture | null} */
     this._order = null;
     this._orderRows = 0;
-    this._count = 0;
-    /** Of floats: eight bits would round at every blending. @type {Field | null} */
+    /** Gaussians that are drawn. */
+    this.count = 0;
+    /** The picture in floats, as eight bits would round at every blend. @type {Field | null} */
     this._picture = null;
     this._warm();
   }
 
-  /** Draws nothing, so that shaders are compiled before there is something to draw. */
+  /** Draws an empty picture, which compiles the shaders before the first Gaussians arrive. */
   _warm() {
     const gpu = this._gpu;
     const { gl } = gpu;
@@ -117,17 +118,12 @@ export class Painter {
     this.setOrder(new Uint32Array(1));
     const K = new Float32Array([1, 0, 1, 0, 1, 1, 0, 0, 1]);
     this.draw({ field: nothing, texels: 1 }, { viewmat: new Float32Array(16), K, width: 2, height: 2 }, [0, 0, 0], 1);
-    this._count = 0;
+    this.count = 0;
     gpu.free(nothing);
     gl.flush();
   }
 
-  /** How many Gaussians are drawn. */
-  get count() {
-    return this._count;
-  }
-
-  /** Takes the order in which to draw, back to front. @param {Uint32Array} order texels of the splats */
+  /** Sets the drawing order, back to front. @param {Uint32Array} order texels of the splats */
   setOrder(order) {
     const { gl } = this._gpu;
     const rows = Math.ceil(order.length / ORDER_WIDTH);
@@ -145,7 +141,7 @@ export class Painter {
     const whole = Math.floor(order.length / ORDER_WIDTH);
     if (whole) put(0, whole, ORDER_WIDTH);
     if (whole < rows) put(whole, 1, order.length - whole * ORDER_WIDTH);
-    this._count = order.length;
+    this.count = order.length;
   }
 
   /**
@@ -169,10 +165,10 @@ export class Painter {
     gl.viewport(0, 0, width, height);
     gl.clearColor(background[0], background[1], background[2], 1);
     gl.clear(gl.COLOR_BUFFER_BIT);
-    if (splats && this._order && this._count) {
+    if (splats && this._order && this.count) {
       const program = gpu.program(FRAGMENT, VERTEX);
       gpu.use(program, { splats: splats.field, order: this._order });
-      gl.uniform1i(program.uniform("count"), this._count);
+      gl.uniform1i(program.uniform("count"), this.count);
       gl.uniform4fv(program.uniform("view"), viewmat.subarray(0, 12));
       gl.uniform4f(program.uniform("lens"), K[0], K[4], K[2], K[5]);
       gl.uniform4f(
@@ -187,7 +183,7 @@ export class Painter {
       gl.enable(gl.BLEND);
       gl.blendFunc(gl.ONE, gl.ONE_MINUS_SRC_ALPHA);
       gl.bindVertexArray(this._array);
-      gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(this._count / BATCH));
+      gl.drawElementsInstanced(gl.TRIANGLES, 6 * BATCH, gl.UNSIGNED_SHORT, 0, Math.ceil(this.count / BATCH));
       gl.bindVertexArray(null);
       gl.disable(gl.BLEND);
     }

@@ -8,7 +8,7 @@ import { levelOf, sameState, stateOf, timeAfter } from "./level.js";
 import { Pace } from "./pace.js";
 import { Painter } from "./painter.js";
 import { Remote } from "../decode/remote.js";
-import { startLoader } from "./loader.js";
+import { Emitter, startLoader } from "./loader.js";
 /** @import { Camera, Scene } from "../decode/scene.js" */
 /** @import { Splats } from "./evaluator.js" */
 /** @import { State } from "./level.js" */
@@ -54,7 +54,7 @@ const SOFTWARE_STEP = 2;
  * `loaded` {bytes, complete}, `timeupdate` {time}, `statechange` (play or pause), `error` {message, kind}. Seconds
  * count from `load`: to the picture, to the last byte that it is made of, and to the end of their decoding.
  */
-export class Player extends EventTarget {
+export class Player extends Emitter {
   /** @param {HTMLCanvasElement} canvas @param {Options} [options] */
   constructor(canvas, options = {}) {
     super();
@@ -353,16 +353,6 @@ export class Player extends EventTarget {
     this._touch();
   }
 
-  /** @param {unknown} error */
-  _fail(error) {
-    const { message, name, kind = name } = /** @type {Error & {kind?: string}} */ (error);
-    this._emit("error", { message, kind });
-  }
-
-  /** @param {string} name @param {object} detail */
-  _emit(name, detail) {
-    this.dispatchEvent(new CustomEvent(name, { detail }));
-  }
 
   // --- the GPU
 
