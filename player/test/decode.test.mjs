@@ -145,16 +145,10 @@ test("maxLayer is a number of 0 or more", () => {
   }
 });
 
-test("a stream raises its fault again at every call, and goes on after rewind", () => {
+test("a stream raises its fault again at every call, and continues after rewind", () => {
   const bytes = readVector("valid/layers-0-1-2");
   const stream = openStream();
-  const ends = (() => {
-    const whole = openStream();
-    whole.feed(bytes);
-    assert.ok(whole.complete);
-    assert.equal(whole.consumed, bytes.length);
-    return whole.layerEnds;
-  })();
+  const ends = openEnds(bytes);
   assert.deepEqual(ends.map(({ layer }) => layer), [0, 1, 2]);
   assert.equal(ends[2].end, bytes.length);
   const damaged = bytes.slice();
@@ -170,12 +164,13 @@ test("a stream raises its fault again at every call, and goes on after rewind", 
   stream.finish();
 });
 
-test("scenes given before do not change as later layers come", () => {
+test("earlier scenes do not change as later layers arrive", () => {
   const bytes = readVector("valid/layers-0-1-2");
+  const [{ end }] = openEnds(bytes);
   const stream = openStream();
-  const [first] = stream.feed(bytes.subarray(0, openEnds(bytes)[0].end));
+  const [first] = stream.feed(bytes.subarray(0, end));
   const kept = structuredClone(first);
-  stream.feed(bytes.subarray(openEnds(bytes)[0].end));
+  stream.feed(bytes.subarray(end));
   assert.ok(same(first, kept));
 });
 
@@ -183,10 +178,11 @@ test("scenes given before do not change as later layers come", () => {
 function openEnds(bytes) {
   const stream = openStream();
   stream.feed(bytes);
+  assert.ok(stream.complete && stream.consumed === bytes.length);
   return stream.layerEnds;
 }
 
-test("bytes behind the last layer asked for are not looked at", () => {
+test("bytes behind the last requested layer are not read", () => {
   const bytes = readVector("valid/layers-0-1-2");
   const end = openEnds(bytes)[0].end;
   const damaged = bytes.slice();

@@ -68,26 +68,40 @@ async function all(source, budget) {
   return scenes;
 }
 
+/** The layers of the scenes before an error. @param {SceneSource} source @param {object} error */
+async function before(source, error) {
+  /** @type {number[][]} */
+  const seen = [];
+  const run = async () => {
+    for await (const { layers } of source.scenes()) seen.push(layers);
+  };
+  await assert.rejects(run(), error);
+  return seen;
+}
+
+/** @param {import("../decode/index.js").Scene[]} scenes */
+const layersOf = (scenes) => scenes.map(({ layers }) => layers);
+
 const OPTIONS = { pause: 0.01, stall: 5 };
 
 test("one request gives every layer", async () => {
   const { url, asked } = await serving(() => ({}));
   const source = new SceneSource(url, OPTIONS);
   const scenes = await all(source);
-  assert.deepEqual(scenes.map(({ layers }) => layers), [[0], [0, 1], [0, 1, 2]]);
+  assert.deepEqual(layersOf(scenes), [[0], [0, 1], [0, 1, 2]]);
   assert.ok(same(scenes[2], decode(BYTES)));
   assert.deepEqual(asked, [{ range: undefined, ifRange: undefined }]);
   assert.equal(source.received, BYTES.length);
 });
 
-test("a budget of layers or bytes stops, and a later call goes on where it stopped", async () => {
+test("a budget of layers or bytes stops, and a later call continues", async () => {
   for (const budget of [{ maxLayer: 0 }, { bytes: ENDS[0] }, { bytes: ENDS[1] - 1 }]) {
     const { url, asked } = await serving(() => ({}));
     const source = new SceneSource(url, OPTIONS);
-    assert.deepEqual((await all(source, budget)).map(({ layers }) => layers), [[0]]);
+    assert.deepEqual(layersOf(await all(source, budget)), [[0]]);
     assert.equal(source.received, ENDS[0], "nothing behind the layer is decoded or counted");
     const rest = await all(source);
-    assert.deepEqual(rest.map(({ layers }) => layers), [[0, 1], [0, 1, 2]]);
+    assert.deepEqual(layersOf(rest), [[0, 1], [0, 1, 2]]);
     assert.ok(same(rest[1], decode(BYTES)));
     assert.deepEqual(asked[1], { range: `bytes=${ENDS[0]}-`, ifRange: '"a"' });
     assert.deepEqual(await all(source), []);
@@ -95,13 +109,13 @@ test("a budget of layers or bytes stops, and a later call goes on where it stopp
   }
 });
 
-test("a budget too small for layer 0 gives nothing", async () => {
+test("a budget too small for layer 0 yields nothing", async () => {
   const { url } = await serving(() => ({}));
   assert.deepEqual(await all(new SceneSource(url, OPTIONS), { bytes: ENDS[0] - 1 }), []);
   assert.deepEqual(await all(new SceneSource(url, OPTIONS), { seconds: 0 }), []);
 });
 
-test("cuts anywhere are survived, and nothing is asked for twice", async () => {
+test("a download resumes after a cut anywhere, and requests no byte twice", async () => {
   for (const cut of [5, 30, 300, ENDS[0], ENDS[1] + 3]) {
     const { url, asked } = await serving((i) => (i < 2 ? { cut } : {}));
     const source = new SceneSource(url, OPTIONS);
@@ -121,19 +135,19 @@ test("a stalled connection counts as cut", async () => {
   assert.deepEqual([asked.length, source.cuts], [2, 1]);
 });
 
-test("a server without ranges sends the same file again, and what is here is passed over", async () => {
+test("a server without ranges sends the same file again, whose known bytes are skipped", async () => {
   const { url, asked } = await serving((i) => (i === 0 ? { cut: ENDS[0] + 5, ranges: false } : { ranges: false }));
   const source = new SceneSource(url, OPTIONS);
-  assert.deepEqual((await all(source)).map(({ layers }) => layers), [[0], [0, 1], [0, 1, 2]]);
+  assert.deepEqual(layersOf(await all(source)), [[0], [0, 1], [0, 1, 2]]);
   assert.deepEqual([asked.length, source.changes], [2, 0]);
 });
 
-test("another file begins anew with its layer 0", async () => {
+test("a changed file restarts with its layer 0", async () => {
   for (const ranges of [true, false]) {
     const { url } = await serving((i) => (i === 0 ? { cut: ENDS[0] + 5 } : { bytes: OTHER, tag: '"b"', ranges }));
     const source = new SceneSource(url, OPTIONS);
     const scenes = await all(source);
-    assert.deepEqual(scenes.map(({ layers }) => layers), [[0], [0], [0, 1]]);
+    assert.deepEqual(layersOf(scenes), [[0], [0], [0, 1]]);
     assert.ok(same(scenes[2], decode(OTHER)));
     assert.equal(source.changes, 1);
   }
@@ -145,7 +159,7 @@ test("without a validator a cut file is fetched anew", async () => {
   assert.equal(asked[1].range, undefined);
 });
 
-test("a file that never holds still is given up", async () => {
+test("a file that changes at every request is given up", async () => {
   const { url } = await serving((i) => ({ cut: 400, tag: `"${i}"` }));
   await assert.rejects(all(new SceneSource(url, OPTIONS)), (error) => error instanceof FetchError && /changed/.test(error.message));
 });
@@ -155,22 +169,16 @@ test("a damaged layer is fetched once more, and is an error the second time", as
   damaged[ENDS[1] - 30] ^= 1;
   const { url, asked } = await serving((i) => (i === 0 ? { bytes: damaged } : {}));
   const scenes = await all(new SceneSource(url, OPTIONS));
-  assert.deepEqual(scenes.map(({ layers }) => layers), [[0], [0, 1], [0, 1, 2]]);
+  assert.deepEqual(layersOf(scenes), [[0], [0, 1], [0, 1, 2]]);
   assert.ok(same(scenes[2], decode(BYTES)));
   assert.equal(asked[1].range, `bytes=${ENDS[0]}-`);
   const always = await serving(() => ({ bytes: damaged }));
-  const source = new SceneSource(always.url, OPTIONS);
-  /** @type {number[][]} */
-  const seen = [];
-  const run = async () => {
-    for await (const { layers } of source.scenes()) seen.push(layers);
-  };
-  await assert.rejects(run(), { kind: "ChecksumMismatch", chunk: 1 });
-  assert.deepEqual(seen, [[0]]);
+  const fault = { kind: "ChecksumMismatch", chunk: 1 };
+  assert.deepEqual(await before(new SceneSource(always.url, OPTIONS), fault), [[0]]);
   assert.equal(always.asked.length, 2);
 });
 
-test("what is not a .pd4 file is refused at its first bytes", async () => {
+test("a file of another type is refused at its first bytes", async () => {
   const { url, asked } = await serving(() => ({ bytes: new TextEncoder().encode("<!doctype html>" + "x".repeat(1 << 16)) }));
   await assert.rejects(all(new SceneSource(url, OPTIONS)), { kind: "BadSignature" });
   assert.equal(asked.length, 1);
@@ -179,16 +187,10 @@ test("what is not a .pd4 file is refused at its first bytes", async () => {
 test("a file that ends within a layer is Truncated", async () => {
   const short = BYTES.subarray(0, ENDS[1] - 7);
   const { url } = await serving(() => ({ bytes: short }));
-  /** @type {number[][]} */
-  const seen = [];
-  const run = async () => {
-    for await (const { layers } of new SceneSource(url, OPTIONS).scenes()) seen.push(layers);
-  };
-  await assert.rejects(run(), { kind: "Truncated" });
-  assert.deepEqual(seen, [[0]]);
+  assert.deepEqual(await before(new SceneSource(url, OPTIONS), { kind: "Truncated" }), [[0]]);
 });
 
-test("answers that pass are waited for, others are final, and a dead server is given up", async () => {
+test("temporary status codes are tried again, others are final, and a dead server is given up", async () => {
   const passing = await serving((i) => (i < 2 ? { status: 503 } : {}));
   assert.equal((await all(new SceneSource(passing.url, OPTIONS))).length, 3);
   const gone = await serving(() => ({ status: 404 }));
@@ -199,7 +201,7 @@ test("answers that pass are waited for, others are final, and a dead server is g
   assert.equal(dead.asked.length, 3);
 });
 
-test("an abort ends it with the signal's reason, before and on the way", async () => {
+test("an abort raises the signal's reason, before and during the download", async () => {
   const { url } = await serving(() => ({ cut: ENDS[0] + 5, hang: true }));
   const controller = new AbortController();
   const source = new SceneSource(url, { ...OPTIONS, signal: controller.signal });
@@ -214,10 +216,10 @@ test("an abort ends it with the signal's reason, before and on the way", async (
   await assert.rejects(all(source), reason);
 });
 
-test("when the seconds are over, what is here stays and a later call goes on", async () => {
+test("after the seconds of a budget, a later call continues", async () => {
   const { url, asked } = await serving((i) => (i === 0 ? { cut: ENDS[0] + 5, hang: true } : {}));
   const source = new SceneSource(url, OPTIONS);
-  assert.deepEqual((await all(source, { seconds: 0.5 })).map(({ layers }) => layers), [[0]]);
+  assert.deepEqual(layersOf(await all(source, { seconds: 0.5 })), [[0]]);
   assert.equal(source.received, ENDS[0] + 5);
   assert.equal((await all(source)).length, 2);
   assert.equal(asked[1].range, `bytes=${ENDS[0] + 5}-`);

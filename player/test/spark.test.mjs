@@ -21,14 +21,12 @@ class Vector {
   x = 0;
   y = 0;
   z = 0;
-  r = 0;
-  g = 0;
-  b = 0;
+  applyMatrix4 = () => this;
 
   /** @param {ArrayLike<number>} array @param {number} at */
   fromArray(array, at) {
-    [this.x, this.y, this.z] = [this.r, this.g, this.b] = Array.from(array).slice(at, at + 3);
-    return this;
+    [this.x, this.y, this.z] = Array.from(array).slice(at, at + 3);
+    return Object.assign(this, { r: this.x, g: this.y, b: this.z });
   }
 
   /** @param {number} x @param {number} y @param {number} z @param {number} w */
@@ -41,10 +39,6 @@ class Vector {
     return this;
   }
 
-  applyMatrix4() {
-    return this;
-  }
-
   /** @param {any[]} values */
   setRGB(...values) {
     return Object.assign(this, { values });
@@ -53,13 +47,8 @@ class Vector {
 
 /** The identity. */
 class Matrix4 {
-  copy() {
-    return this;
-  }
-
-  invert() {
-    return this;
-  }
+  copy = () => this;
+  invert = () => this;
 }
 
 const THREE = { Vector3: Vector, Quaternion: Vector, Color: Vector, Matrix4, SRGBColorSpace: "srgb" };
@@ -82,17 +71,11 @@ class ExtSplats {
     this.extArrays = [new Uint32Array(4 * this.maxSplats), new Uint32Array(4 * this.maxSplats)];
   }
 
-  /**
-   * @param {number} index @param {any} centre @param {any} scales @param {any} q @param {number} opacity
-   * @param {any} color
-   */
-  setSplat(index, centre, scales, q, opacity, color) {
+  /** @param {number} index @param {any[]} values centre, scales, quaternion, opacity, colour */
+  setSplat(index, ...[c, s, q, opacity, { r, g, b }]) {
     assert.ok(index < this.maxSplats);
     this.numSplats = Math.max(this.numSplats, index + 1);
-    this.content[index] = [
-      ...[centre.x, centre.y, centre.z, scales.x, scales.y, scales.z, q.w, q.x, q.y, q.z],
-      ...[opacity, color.r, color.g, color.b],
-    ];
+    this.content[index] = [c.x, c.y, c.z, s.x, s.y, s.z, q.w, q.x, q.y, q.z, opacity, r, g, b];
   }
 
   /** @param {{extArrays: Uint32Array[], numSplats: number}} options */
@@ -147,7 +130,7 @@ function expected(level, t, eye) {
   });
 }
 
-test("the mesh holds the Gaussians of a level at a time before a camera", async () => {
+test("the mesh holds the Gaussians of a level, a time and a camera", async () => {
   const splats = await Pd4Splats.open(ADDRESS, modules);
   /** @type {any[]} */
   const upgrades = [];
@@ -183,7 +166,7 @@ test("the mesh holds the Gaussians of a level at a time before a camera", async 
   assert.throws(() => splats.update(cameraAt([0, 0, 0])), /closed/);
 });
 
-test("time passes while it plays, and begins anew or stops", async () => {
+test("time advances while the mesh plays, and loops or stops at the end", async () => {
   const splats = await Pd4Splats.open(ADDRESS, { ...modules, time: 1e9, level: 0 });
   const [start, end] = splats.info.timeRange;
   assert.deepEqual([splats.time, splats.levels], [end, [0]]);
@@ -211,7 +194,7 @@ test("time passes while it plays, and begins anew or stops", async () => {
   }
 });
 
-test("a file that is none is refused, one that ends badly keeps its layers", async () => {
+test("a file of another type is refused, a damaged one keeps its valid layers", async () => {
   await assert.rejects(Pd4Splats.open(addressOf(new Uint8Array(64)), modules), { kind: "BadSignature" });
   const damaged = BYTES.slice();
   damaged[damaged.length - 20] ^= 4;
