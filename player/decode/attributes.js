@@ -40,7 +40,8 @@ const DISTANCES = [5, 7];
  */
 
 /**
- * @param {Uint8Array} bytes the section @param {number} rows at least 1 @param {import("./parameters.js").LayerKind} kind
+ * @param {Uint8Array} bytes the section @param {number} rows at least 1
+ * @param {import("./parameters.js").LayerKind} kind
  * @param {import("./slices.js").Continuation} continuation of the layer
  * @returns {{stepClasses: Int32Array, attributes: Int32Array}} [rows], empty without step classes; [D + 6 + 3·G, rows]
  */
@@ -55,7 +56,7 @@ export function decodeAttributes(bytes, rows, kind, continuation) {
     decodeStaged(reader, stepClasses, rows, kind.widths, block, true, continuation, attributes);
     continuation.block = block;
   } else if (form === 2) {
-    if (!continuation.block) throw malformed("attributes that continue a prediction block, and the layer has none before");
+    if (!continuation.block) throw malformed("attributes that continue a block, and the layer has none before");
     decodeStaged(reader, stepClasses, rows, kind.widths, continuation.block, false, continuation, attributes);
   } else throw unsupported(`form ${form} of the attributes`);
   return { stepClasses, attributes };

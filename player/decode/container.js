@@ -79,7 +79,8 @@ export function readChunk(bytes, { listed, sceneId, offset, index }) {
   need(bytes, end + 4, "a chunk", offset, index);
   checkCrc(view, end, crc32(bytes.subarray(0, end)), offset, index);
   const flags = view.getUint16(2, true);
-  if (flags & (flags & ANCILLARY ? ~ANCILLARY : RESERVED)) throw fault("Malformed", `flags ${flags}, reserved bits must be zero`, 2);
+  const reserved = flags & ANCILLARY ? ~ANCILLARY : RESERVED;
+  if (flags & reserved) throw fault("Malformed", `flags ${flags}, reserved bits must be zero`, 2);
   const type = view.getUint16(0, true);
   if (type !== listed.type) throw fault("Malformed", `chunk type ${type}, the header says ${listed.type}`, 0);
   const found = hex(bytes.subarray(8, 8 + SCENE_ID_SIZE));
@@ -94,12 +95,13 @@ export function readChunk(bytes, { listed, sceneId, offset, index }) {
   };
 }
 
-/** The scene id of clause 3.3, in hexadecimal. @param {Uint8Array} described the header's bytes behind its chunk list */
+/** The scene id (3.3) in hexadecimal. @param {Uint8Array} described the header's bytes behind its chunk list */
 export function sceneIdOf(described) {
   return hex(new Sha256().update(described).digest().subarray(0, SCENE_ID_SIZE));
 }
 
-/** @param {Uint8Array} bytes @param {number} size @param {string} what @param {number} offset @param {number | null} chunk */
+/** @param {Uint8Array} bytes @param {number} size @param {string} what @param {number} offset
+ * @param {number | null} chunk */
 function need(bytes, size, what, offset, chunk) {
   if (bytes.length >= size) return;
   const end = offset + bytes.length;
@@ -107,7 +109,8 @@ function need(bytes, size, what, offset, chunk) {
   throw new DecodeError("Truncated", message, { offset: end, chunk });
 }
 
-/** @param {DataView} view @param {number} at @param {number} computed @param {number} offset @param {number | null} chunk */
+/** @param {DataView} view @param {number} at @param {number} computed @param {number} offset
+ * @param {number | null} chunk */
 function checkCrc(view, at, computed, offset, chunk) {
   const stored = view.getUint32(at, true);
   if (stored === computed) return;

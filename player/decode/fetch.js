@@ -38,7 +38,7 @@ export class FetchError extends Error {
 /**
  * @typedef {object} SourceOptions
  * @property {AbortSignal} [signal]
- * @property {() => Decoder} [makeDecoder] called once, and again if the file changes; its decoder has no limit of layers
+ * @property {() => Decoder} [makeDecoder] called once, and again if the file changes; without a limit of layers
  * @property {number} [stall] seconds without a byte after which a connection counts as cut
  * @property {number} [attempts] consecutive failures, without a byte between them, before giving up
  * @property {number} [pause] seconds before the second attempt, doubled for each further one
@@ -57,8 +57,8 @@ const MOST_CHANGES = 4;
 class Cut extends Error {}
 
 /**
- * The scenes of one URL. `scenes()` yields one per slice; called again, with another budget, it continues after the last
- * one. A damaged slice is fetched once more and never yielded.
+ * The scenes of one URL. `scenes()` yields one per slice; called again, with another budget, it continues after the
+ * last one. A damaged slice is fetched once more and never yielded.
  */
 export class SceneSource {
   /** @param {string | URL} url @param {SourceOptions} [options] */
@@ -85,7 +85,8 @@ export class SceneSource {
     this._validator = null;
     /** The open connection. @type {AbortController | null} */
     this._controller = null;
-    /** Its response. skip: bytes that are here already. @type {{reader: Reader, skip: number, rest: Uint8Array} | null} */
+    /** Its response. skip: bytes that are here already.
+     * @type {{reader: Reader, skip: number, rest: Uint8Array} | null} */
     this._body = null;
     /** When the request was sent, and how many bytes were here then. */
     this._requested = { at: 0, received: 0 };
@@ -106,8 +107,8 @@ export class SceneSource {
    * One scene per slice that completes, each with all slices so far, until the budget or the file ends.
    *
    * Raises FetchError if the file is not available, DecodeError if it is invalid, and the signal's reason if it is
-   * aborted; scenes yielded before stay valid. If the file changes, its scenes restart with layer 0. Without a budget in
-   * bytes, a layer 0 that ends behind byte 2^28 is LimitExceeded.
+   * aborted; scenes yielded before stay valid. If the file changes, its scenes restart with layer 0. Without a budget
+   * in bytes, a layer 0 that ends behind byte 2^28 is LimitExceeded.
    *
    * @param {Budget} [budget]
    * @returns {AsyncGenerator<Scene, void, void>}
@@ -176,7 +177,7 @@ export class SceneSource {
     try {
       return await this._decoder.feed(block);
     } catch (error) {
-      const damaged = error instanceof DecodeError && error.kind !== "BadSignature" && error.kind !== "UnsupportedVersion";
+      const damaged = error instanceof DecodeError && !["BadSignature", "UnsupportedVersion"].includes(error.kind);
       const good = this._decoder.consumed;
       if (!damaged || this._repairedAt === good) throw error;
       this._repairedAt = good;
@@ -278,7 +279,7 @@ export class SceneSource {
   /** The file has changed. @returns {null} */
   _restart() {
     this.changes++;
-    if (this.changes > MOST_CHANGES) throw new FetchError(`${this.url}: changed ${this.changes} times during the download`);
+    if (this.changes > MOST_CHANGES) throw new FetchError(`${this.url}: changed ${this.changes} times while it loaded`);
     this._decoder.close?.();
     this._decoder = this._makeDecoder();
     this._repairedAt = -1;

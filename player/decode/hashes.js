@@ -24,8 +24,8 @@ function digest(arrays) {
 }
 
 /**
- * Per layer the SHA-256 of its integers and of its float32 values, of a complete file, of its layers up to maxLayer, or,
- * if allowPartial, of the slices that a cut file has. Raises as `decode` does.
+ * Per layer the SHA-256 of its integers and of its float32 values, of a complete file, of its layers up to maxLayer,
+ * or, if allowPartial, of the slices that a cut file has. Raises as `decode` does.
  *
  * @param {Uint8Array} bytes @param {{maxLayer?: number | null, allowPartial?: boolean}} [options]
  * @returns {LayerHashes[]}

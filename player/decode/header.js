@@ -9,7 +9,7 @@ import { unpack } from "./msgpack.js";
 
 /** @typedef {{type: number, length: number}} ListedChunk */
 
-/** D and G of the text: scalars of a feature, and Gaussians of an anchor. @typedef {{feature: number, slots: number}} Widths */
+/** D, scalars of a feature, and G, Gaussians of an anchor. @typedef {{feature: number, slots: number}} Widths */
 
 /**
  * @typedef {object} Header

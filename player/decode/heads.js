@@ -1,4 +1,4 @@
-// The residual heads of both deformations (6.3, 13.3), and the records to which they add. A further head is one row here.
+// The residual heads of both deformations (6.3, 13.3), and the records to which they add: one row a head.
 
 /** @import { Widths } from "./header.js" */
 
@@ -35,7 +35,7 @@ export const globalHeads = ({ feature: D, slots: G }) => [
 export const anchorColumns = ({ feature, slots }) => 12 + 4 * Math.ceil(feature / 4) + 4 * slots;
 
 /**
- * Heads of the local deformation by id. The record of a Gaussian is mean and opacity, scale, quaternion w x y z, colour.
+ * Heads of the local deformation by id. A Gaussian's record: mean and opacity, scale, quaternion w x y z, colour.
  *
  * @type {Head[]}
  */

@@ -41,7 +41,8 @@ export function decodeLayer(payload, kind, before, continuation, later) {
   const parameters = readParameters(payload, kind, before, later);
   const { rows, sections, planes: shapes, networks } = parameters;
   const { positions, masks, attributes: section, planes, weights } = sections;
-  const voxels = positions ? decodePositions(positions, rows, continuation.definitions("positions")) : new Int32Array(0);
+  const known = continuation.definitions("positions");
+  const voxels = positions ? decodePositions(positions, rows, known) : new Int32Array(0);
   const codes = new Int32Array(earlierRows + rows);
   if (masks) decodeChannels(masks, [earlierRows, rows], codes, continuation.definitions("masks"));
   checkRange(codes.subarray(0, earlierRows), 0, MOST_CODE, "a rise of a mask code");

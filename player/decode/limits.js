@@ -1,5 +1,5 @@
-// Clause 14: what a file may declare. Two limits are this decoder's own, lower than the format's, and above the least that
-// the clause asks of a decoder: so that what a page allocates stays near a gigabyte.
+// Clause 14: limits of what a file declares. Two are lower than the format's, so that a page allocates about a gigabyte
+// at most, and higher than the least that the clause demands of a decoder.
 
 /** Bytes of a header. */
 export const MAX_HEADER = 2 ** 14;
@@ -21,8 +21,7 @@ export const MAX_SYMBOL = 2 ** 23;
 /** Symbols of one channel. */
 export const MAX_COUNT = 2 ** 26;
 export const MAX_WINDOW = 2 ** 14;
-/** Entries of all windows that a section of coded channels defines, over one per symbol: where nothing is defined before,
- * and where something is. */
+/** Entries of all windows of a section of coded channels beyond one per symbol: without and with earlier priors. */
 export const FREE_ENTRIES = 2 ** 18;
 export const MORE_ENTRIES = 2 ** 10;
 export const MAX_CLASSES = 8;

@@ -48,7 +48,7 @@ const SECTIONS = /** @type {const} */ (["positions", "masks", "attributes", "pla
 const KEYS = [1, 2, 3, 4, 5];
 
 /** One plane of a scale. @typedef {{channels: number, height: number, width: number, predictor: number}} PlaneShape */
-/** Linear layers from the input side. @typedef {{name: string, layers: {inputs: number, outputs: number}[]}} NetworkShape */
+/** Layers from the input side. @typedef {{name: string, layers: {inputs: number, outputs: number}[]}} NetworkShape */
 
 /**
  * @typedef {object} Parameters
@@ -112,8 +112,8 @@ export function readParameters(payload, kind, before, later) {
   return { rows, steps, planes, networks, sections, declared };
 }
 
-/** Clause 6.5. @param {string} where @param {string} what @param {number} count @param {number} free @param {number} each
- * @param {number} bytes */
+/** Clause 6.5. @param {string} where @param {string} what @param {number} count @param {number} free
+ * @param {number} each @param {number} bytes */
 function checkDeclared(where, what, count, free, each, bytes) {
   const most = free + each * bytes;
   if (count > most) throw limitExceeded(`${where}: ${count} ${what} in ${bytes} bytes, limit ${most}`);
@@ -191,8 +191,8 @@ function readNetworks(fields, kind, where, scales) {
       width = layer.outputs;
       return layer;
     });
-    if (outputs !== null && width !== outputs) throw malformed(`${where}: ${width} outputs of ${name}, expected ${outputs}`);
     if (outputs === null) inputs = width; // the heads take the trunk's outputs
+    else if (width !== outputs) throw malformed(`${where}: ${width} outputs of ${name}, expected ${outputs}`);
     return { name, layers };
   });
   const least = deformation ? 2 : kind.networks.length;

@@ -40,7 +40,8 @@ function decodePlain(bytes, shapes, planes) {
   decodeStage(bytes, targets, new Array(targets.length).fill(null));
 }
 
-/** Plane channels from..end - 1. @param {Int32Array} plane @param {number} channels @param {number} from @param {number} end */
+/** Plane channels from..end - 1. @param {Int32Array} plane @param {number} channels @param {number} from
+ * @param {number} end */
 function channelsOf(plane, channels, from, end) {
   const cells = plane.length / channels;
   return Array.from({ length: end - from }, (_, i) => plane.subarray((from + i) * cells, (from + i + 1) * cells));
@@ -64,7 +65,8 @@ function decodeStaged(reader, shapes, planes) {
     const groups = [];
     shapes.forEach(({ height, width }, i) => {
       const activity = classCount > 1 ? sumOfNine(magnitudes[i], height, width) : null;
-      const own = activity && groupByClass(classesByActivity(activity, activityBounds(activity, classCount)), classCount);
+      const classes = activity && classesByActivity(activity, activityBounds(activity, classCount));
+      const own = classes && groupByClass(classes, classCount);
       for (const target of channelsOf(planes[i], channels, first, end)) {
         targets.push(target);
         groups.push(own);
@@ -144,5 +146,5 @@ function median(a, b, c) {
 
 /** @param {number} k */
 function check(k) {
-  if ((k + MAX_SYMBOL) >>> 0 > 2 * MAX_SYMBOL) throw malformed(`a plane sample of ${k}, limit ${MAX_SYMBOL} in magnitude`);
+  if ((k + MAX_SYMBOL) >>> 0 > 2 * MAX_SYMBOL) throw malformed(`a plane sample of ${k}, limit ±${MAX_SYMBOL}`);
 }

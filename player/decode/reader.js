@@ -81,7 +81,8 @@ export class LayerReader {
    * Raises Truncated if the bytes end before: what was consumed until then stays so. Of a file that is read whole
    * (maxLayer null), bytes behind the last chunk are Malformed.
    *
-   * @param {Uint8Array} bytes the file from byte `offset` of it on, where this reader stands @param {number | null} maxLayer
+   * @param {Uint8Array} bytes the file from byte `offset` of it on, where this reader stands
+   * @param {number | null} maxLayer
    * @returns {Slice | null}
    */
   next(bytes, maxLayer) {
@@ -171,7 +172,8 @@ export class LayerReader {
     }
     this._loose.push(voxels);
     if (!later) {
-      this._layers.push({ layer: kind.layer, slices: 0, steps, planes, networks, tensors, earlier, parts: [], continuation });
+      const none = { slices: 0, parts: [] };
+      this._layers.push({ layer: kind.layer, ...none, steps, planes, networks, tensors, earlier, continuation });
     }
     const layer = this._layers[this._layers.length - 1];
     layer.slices++;
@@ -179,7 +181,7 @@ export class LayerReader {
     return { anchor, ...attributes, ...tensors };
   }
 
-  /** Malformed if a voxel is one of the slices before. @param {Int32Array} voxels of a slice, distinct among themselves */
+  /** Malformed if an earlier slice has one of these voxels. @param {Int32Array} voxels of a slice, distinct */
   _checkVoxels(voxels) {
     if (!voxels.length) return;
     for (const part of this._loose) this._voxels.add(part);
@@ -284,7 +286,8 @@ function ownOf(layer) {
 
 /** The rows of several parts, in their order. @param {Own[]} parts at least one @returns {Own} */
 function gathered(parts) {
-  return /** @type {any} */ (Object.fromEntries(COLUMNS.map((name) => [name, joined(parts.map((part) => part[name]))])));
+  const columns = COLUMNS.map((name) => [name, joined(parts.map((part) => part[name]))]);
+  return Object.fromEntries(columns);
 }
 
 /** @param {LayerParts} layer */

@@ -36,7 +36,7 @@ export function readStages(reader, count) {
 /** Relative magnitudes below this one come from a table. */
 const LOOKED_UP = 256;
 
-/** Number of places and sum of their magnitudes, to which magnitudes are relative. @typedef {{places: number, sum: number}} Reference */
+/** Number of places and sum of their magnitudes. @typedef {{places: number, sum: number}} Reference */
 
 /** @param {Int32Array} residuals one per place @returns {Reference} */
 export function referenceOf(residuals) {
@@ -75,7 +75,7 @@ export function addRelativeMagnitudes(residuals, sums, reference = referenceOf(r
   }
 }
 
-/** Bounds between classes of about equally many places. @param {Float64Array} activity @param {number} count of classes, 1..8 */
+/** Bounds of equally large classes, about. @param {Float64Array} activity @param {number} count of classes, 1..8 */
 export function activityBounds(activity, count) {
   if (count === 1) return [];
   const n = activity.length;

@@ -84,7 +84,7 @@ export class Stream {
     if (!this._done) this._next();
   }
 
-  /** Forgets a fault and the bytes that are not decoded yet: the next ones fed are those of the file from `consumed` on. */
+  /** Forgets a fault and the bytes that are not decoded: feed the file from byte `consumed` on next. */
   rewind() {
     this._error = null;
     this._filled = 0;
@@ -107,7 +107,8 @@ export class Stream {
   _append(bytes) {
     const size = this._filled + bytes.length;
     if (size > this._buffer.length) {
-      const grown = new Uint8Array(Math.max(SMALLEST_BUFFER, size, Math.min(2 * this._buffer.length, size + (1 << 26))));
+      const doubled = Math.min(2 * this._buffer.length, size + (1 << 26));
+      const grown = new Uint8Array(Math.max(SMALLEST_BUFFER, size, doubled));
       grown.set(this._buffer.subarray(0, this._filled));
       this._buffer = grown;
     }

@@ -1,5 +1,5 @@
-// Clauses 13.2 to 13.4 without a GPU: the Gaussians of a level at a time, for a camera's centre. For Spark, for machines
-// whose GPU is missing or slow, and the reference of the evaluator on the GPU.
+// Clauses 13.2 to 13.4 without a GPU: the Gaussians of a level at a time, for a camera's centre. For Spark, for
+// machines whose GPU is missing or slow, and the reference of the evaluator on the GPU.
 
 import { GAUSSIAN_COLUMNS, LOCAL_HEADS, anchorColumns, columnsOf, globalHeads } from "../decode/heads.js";
 import { Arena } from "./kernel.js";
@@ -44,7 +44,7 @@ class Chain {
   }
 }
 
-/** A spatial plane, or a temporal plane at one time (of height 1), with its channels last: [height, width, channels]. */
+/** A spatial plane, or a temporal one at a time, of height 1. data: [height, width, channels]. */
 class Sampler {
   /** @param {Float32Array} data @param {number} width @param {number} height @param {number} channels */
   constructor(data, width, height, channels) {
@@ -196,8 +196,9 @@ class Field {
 
 /** @param {Float32Array} values in place @param {number} at @param {Head} head */
 function bringIntoRange(values, at, { outputs, then }) {
+  const most = then === "clip" ? 1 : Infinity;
   if (then === "unit") normaliseQuaternion(values, at);
-  else for (let k = at; k < at + outputs; k++) values[k] = Math.min(Math.max(values[k], 0), then === "clip" ? 1 : Infinity);
+  else for (let k = at; k < at + outputs; k++) values[k] = Math.min(Math.max(values[k], 0), most);
 }
 
 /** @param {Float32Array} q normalised in place from `at` on; the identity if 0 @param {number} at */

@@ -1,9 +1,9 @@
 // Clauses 13.2 to 13.4 on the GPU, as fragment passes into float textures.
 //
-// Per anchor, when time changes: global deformation; the features' share of the scaffold's first layers. Per anchor, when
-// the camera's centre changes: opacities. They tell which Gaussians are visible, about a fifth of all, and only these are
-// evaluated further. Per Gaussian, when time changes: mean and local deformation. Per Gaussian, when the camera's centre
-// changes: shape and colour.
+// Per anchor, when time changes: global deformation; the features' share of the scaffold's first layers. Per anchor,
+// when the camera's centre changes: opacities. They tell which Gaussians are visible, about a fifth of all, and only
+// these are evaluated further. Per Gaussian, when time changes: mean and local deformation. Per Gaussian, when the
+// camera's centre changes: shape and colour.
 
 import { GAUSSIAN_COLUMNS, LOCAL_HEADS, anchorColumns, globalHeads } from "../decode/heads.js";
 import { FieldPass } from "./field.js";
@@ -39,9 +39,9 @@ export const ANCHOR_BITS = 24;
 /** A texture's width for `n` texels. @param {number} n */
 const widthFor = (n) => 2 ** Math.max(4, Math.ceil(Math.log2(Math.sqrt(n))));
 
-/** A network of the scaffold: one hidden layer, cut into the shares of features and of direction, and the last layer. */
+/** A network of the scaffold: a hidden layer, split by its inputs into features and direction, and the last layer. */
 class Scaffold {
-  /** @param {Gpu} gpu @param {Network} network @param {number} features @param {number} firstBlock of its hidden layer */
+  /** @param {Gpu} gpu @param {Network} network @param {number} features @param {number} firstBlock in `before` */
   constructor(gpu, network, features, firstBlock) {
     if (network.length !== 2) throw new TooLarge(`a network of ${network.length} layers, expected 2`);
     const [first, last] = network;

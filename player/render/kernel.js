@@ -1,5 +1,5 @@
-// Linear layers over many rows, for evaluating without a GPU: in WebAssembly with vectors of four, and the same in plain
-// JavaScript for where a page's policy forbids the former.
+// Linear layers over many rows, for evaluating without a GPU: in WebAssembly with vectors of four, and the same in
+// plain JavaScript for where a page's policy forbids the former.
 
 /** @import { Network } from "../decode/scene.js" */
 

@@ -7,7 +7,8 @@ import { columnsOf, globalHeads } from "../decode/heads.js";
  * One level of a scene: the highest layer that is there and at most the requested one. It has the first `rows` anchors.
  * codes: their gates times 255.
  *
- * @typedef {{number: number, rows: number, codes: Uint8Array, global: Deformation | null, local: Deformation | null}} Level
+ * @typedef {{number: number, rows: number, codes: Uint8Array, global: Deformation | null, local: Deformation | null}}
+ * Level
  */
 
 /** Lower opacities never reach a pixel: a picture has 255 steps. */

@@ -20,7 +20,8 @@ const PROGRESS_MS = 100;
  */
 
 /** The answer that early.js asked for, which serves once. */
-let { early } = /** @type {{early?: {url: string, answer: Promise<Response>, controller: AbortController}}} */ (globalThis);
+/** @typedef {{url: string, answer: Promise<Response>, controller: AbortController}} Early */
+let { early } = /** @type {{early?: Early}} */ (globalThis);
 
 /** As fetch. @param {RequestInfo | URL} url @param {RequestInit} [options] */
 function ask(url, options) {

@@ -16,8 +16,8 @@ const BATCH = 128;
 /** Width of the texture of the order. */
 const ORDER_WIDTH = 1024;
 
-/** One quad per Gaussian, which ends where alpha falls to 1/255 along the ellipse's axes. The covariance is U·Uᵀ + blur with U
- * = J·W·R·S, and its determinant |u0 × u1|² + blur·trace + blur²: without cancellation for needles. */
+/** One quad per Gaussian, which ends where alpha falls to 1/255 along the ellipse's axes. The covariance is U·Uᵀ + blur
+ * with U = J·W·R·S, and its determinant |u0 × u1|² + blur·trace + blur²: without cancellation for needles. */
 const VERTEX = `
 uniform sampler2DArray splats;
 uniform usampler2D order;

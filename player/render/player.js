@@ -549,7 +549,7 @@ export class Player extends Emitter {
     }
   }
 
-  /** Sorts the sorter's Gaussians for the camera. @param {Scene} scene @returns whether the GPU is still the same one */
+  /** Sorts the sorter's Gaussians for the camera. @param {Scene} scene @returns whether the GPU is still there */
   async _order({ info }) {
     const gpu = this._gpu;
     const row = this._row();

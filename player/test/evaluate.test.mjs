@@ -1,4 +1,4 @@
-// What is drawn, without a GPU: the evaluator and its kernel in WebAssembly against plain JavaScript, lists, order, pace.
+// Drawing without a GPU: the evaluator's kernel in WebAssembly against plain JavaScript, lists, order, pace.
 
 import assert from "node:assert/strict";
 import { readFileSync } from "node:fs";
@@ -51,7 +51,8 @@ for (const [inputs, outputs, rows, relu] of /** @type {[number, number, number, 
 
 test("a value that is no number stays none", () => {
   for (const arena of [new Arena(), new Arena(false)]) {
-    const packed = arena.pack({ inputs: 1, outputs: 1, weight: new Float32Array([1]), bias: new Float32Array([0]) }, true);
+    const layer = { inputs: 1, outputs: 1, weight: Float32Array.of(1), bias: Float32Array.of(0) };
+    const packed = arena.pack(layer, true);
     const [x, out] = [arena.take(1), arena.take(16)];
     arena.floats[x] = NaN;
     arena.linear(packed, 1, x, 1, out);
@@ -65,7 +66,8 @@ test("both evaluate a scene alike, at every level", () => {
     const [fast, plain] = [true, false].map((wasm) => evaluate(scene, level, 0.4, [0, 0, -3], new Arena(wasm)));
     assert.ok(fast.count > 0);
     assert.deepEqual(fast.slot, plain.slot);
-    assert.ok(farthest(fast.records, plain.records) < 1e-4 * plain.records.reduce((most, v) => Math.max(most, Math.abs(v)), 1));
+    const most = plain.records.reduce((largest, v) => Math.max(largest, Math.abs(v)), 1);
+    assert.ok(farthest(fast.records, plain.records) < 1e-4 * most);
   }
 });
 
@@ -107,7 +109,11 @@ test("the pace slows down where the machine is slow, and recovers", () => {
   /** @type {number[]} */
   const levels = [];
   let now = 0;
-  for (const [costs, seconds] of /** @type {[number[], number][]} */ ([[[1, 100, 300], 4], [[1, 500, 900], 8], [[1, 10, 20], 300]])) {
+  for (const { costs, seconds } of [
+    { costs: [1, 100, 300], seconds: 4 },
+    { costs: [1, 500, 900], seconds: 8 },
+    { costs: [1, 10, 20], seconds: 300 },
+  ]) {
     for (const end = now + 1000 * seconds; now < end; levels.push(pace.level)) {
       now += costs[pace.level];
       pace.evaluated(pace.level, costs[pace.level], now);

@@ -5,8 +5,8 @@ import { readFileSync } from "node:fs";
 const FOLDER = new URL("../../spec/vectors/", import.meta.url);
 
 /**
- * error: the expected kind, null if the file decodes. layers: the hashes of all layers that decode. slices: the layer of
- * each slice that decodes.
+ * error: the expected kind, null if the file decodes. layers: the hashes of all layers that decode. slices: the layer
+ * of each slice that decodes.
  *
  * @typedef {object} Vector
  * @property {string} file
