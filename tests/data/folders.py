@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +39,14 @@ def save(path: Path, content: Any) -> None:
         Image.fromarray(content).save(path)
     else:
         path.write_bytes(content if isinstance(content, bytes) else json.dumps(content).encode())
+
+
+def change_frames(folder: Path, change: Callable[[int], dict[str, Any]]) -> None:
+    """Updates every frame i of transforms.json by the keys of change(i)."""
+    content = json.loads((folder / "transforms.json").read_text())
+    for i, entry in enumerate(content["frames"]):
+        entry.update(change(i))
+    save(folder / "transforms.json", content)
 
 
 def eye(view: View) -> tuple[np.ndarray, np.ndarray]:

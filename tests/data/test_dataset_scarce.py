@@ -1,26 +1,16 @@
 """Valid datasets that hold little: one frame, one place, one instant, views without a valid pixel."""
 
-import json
 from dataclasses import replace
 
 import numpy as np
 import pytest
-from folders import pose, write_iphone
+from folders import change_frames, pose, write_iphone
 
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.errors import DataError
 
 #: A lens without a valid pixel: its picture lies thousands of pixels off the axis.
 BLIND = {"cx": 4000, "k1": 0.5}
-
-
-def change(folder, frame) -> None:
-    """Every frame of transforms.json updated by frame(i)."""
-    path = folder / "transforms.json"
-    content = json.loads(path.read_text())
-    for i, entry in enumerate(content["frames"]):
-        entry.update(frame(i))
-    path.write_text(json.dumps(content))
 
 
 def test_ordinary_data_has_no_remarks(blender):
@@ -39,9 +29,9 @@ def test_one_frame(blender):
 
 def test_one_place_and_one_instant_are_remarked(blender):
     folder = blender()
-    change(folder, lambda i: {"transform_matrix": pose(0.3)})
+    change_frames(folder, lambda i: {"transform_matrix": pose(0.3)})
     assert ["one place" in r for r in load(folder).remarks()] == [True]
-    change(folder, lambda i: {"transform_matrix": pose(0.2 * i), "time": 7.5})
+    change_frames(folder, lambda i: {"transform_matrix": pose(0.2 * i), "time": 7.5})
     dataset = load(folder)
     assert ["one instant" in r for r in dataset.remarks()] == [True] and dataset.time_range == (0.0, 1.0)
 
@@ -50,7 +40,7 @@ def test_one_place_and_one_instant_are_remarked(blender):
 def test_times_may_start_anywhere_repeat_and_come_in_any_order(blender, start):
     folder = blender(n=5)
     times = [3.0, 0.0, 3.0, 4.0, 1.0]
-    change(folder, lambda i: {"time": start + times[i]})
+    change_frames(folder, lambda i: {"time": start + times[i]})
     dataset = load(folder, holdout=0)
     assert [view.time for view in dataset.train] == pytest.approx([t / 4 for t in times])
     assert np.diff(np.float32(dataset.time_range)) == 4
@@ -58,7 +48,7 @@ def test_times_may_start_anywhere_repeat_and_come_in_any_order(blender, start):
 
 def test_views_without_a_valid_pixel_are_left_out(blender):
     folder = blender(n=9)
-    change(folder, lambda i: BLIND if i in (1, 4) else {})
+    change_frames(folder, lambda i: BLIND if i in (1, 4) else {})
     dataset = load(folder)
     assert dataset.left_out == ("r_001", "r_004") and [len(dataset.train), len(dataset.test)] == [7, 0]
     assert dataset.remarks() == ["2 of 9 views left out, no valid pixel in the mask: r_001, r_004"]

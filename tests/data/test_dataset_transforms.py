@@ -5,7 +5,7 @@ import struct
 
 import numpy as np
 import pytest
-from folders import gradient, pose
+from folders import change_frames, gradient, pose
 from PIL import Image
 
 from pd4dgs_codec.data.dataset import load
@@ -54,10 +54,7 @@ def test_holdout_and_times(blender):
 
 def test_missing_times_go_by_index(blender):
     folder = blender(n=5)
-    file = json.loads((folder / "transforms.json").read_text())
-    for frame in file["frames"]:
-        del frame["time"]
-    (folder / "transforms.json").write_text(json.dumps(file))
+    change_frames(folder, lambda i: {"time": None})
     assert [v.time for v in load(folder, holdout=0).train] == [0, 0.25, 0.5, 0.75, 1]
 
 
@@ -138,11 +135,7 @@ def test_stored_depth(blender):
 
 def test_parallel_cameras_get_a_box_ahead(blender):
     folder = blender(n=2)
-    file = json.loads((folder / "transforms.json").read_text())
-    for i, frame in enumerate(file["frames"]):
-        frame["transform_matrix"] = np.array(pose()).tolist()
-        frame["transform_matrix"][0][3] = float(i)
-    (folder / "transforms.json").write_text(json.dumps(file))
+    change_frames(folder, lambda i: {"transform_matrix": [[1, 0, 0, i], *pose()[1:]]})
     d = load(folder, holdout=0)
     assert np.isfinite(d.box).all() and (d.box[1] > d.box[0]).all() and d.box.mean(axis=0)[2] < 4
 
