@@ -259,7 +259,7 @@ RATES = "sigma/Q 1e-8..1e8, |a - mu|/sigma up to 1e6"
 #: (name, dtype, bound, where it holds)
 TYPES = (("float64", torch.float64, 1e-9, ""), ("float32", torch.float32, 1e-4, " where P >= 1e-30"))
 LOSSLESS = "every symbol decoded, with any priors and effort"
-NO_STEP, HIDDEN_NAN = "a step that is no positive normal binary32", "among the offsets of a scene"
+NO_STEP, IN_OFFSETS = "a step that is no positive normal binary32", "among the offsets of a scene"
 
 PROMISES = [
     *(Promise("rate", f"within {bound:g} of mpmath relative to max(1, |x|){where}", _value_and_gradients,
@@ -305,8 +305,8 @@ PROMISES = [
             ("a whole file at steps times 1e-06", "weights of more than 2^23 steps; the limit is 2^23", 1e-6),
             ("a whole file at steps times 1e-38", "steps below binary32's normal range", 1e-38),
             ("a whole file at steps times 1e+40", "steps above binary32's range", 1e40)),
-    refusal("quantiser", EncodeError, _encode_with, ("NaN in a scene", f"a NaN {HIDDEN_NAN}", math.nan),
-            ("infinity in a scene", f"an infinity {HIDDEN_NAN}", math.inf)),
+    refusal("quantiser", EncodeError, _encode_with, ("NaN in a scene", f"a NaN {IN_OFFSETS}", math.nan),
+            ("infinity in a scene", f"an infinity {IN_OFFSETS}", math.inf)),
     Promise("masks", "the exact masks within 1e-5, never falling with the level, finite gradients", _level_mask_error,
             [(f"masks of logits -{far:g}..{far:g}", "triples of logits at all three levels",
               (-far, -4.59512, 0.0, 4.0, far)) for far in (10.0, 100.0)], 1e-5),
