@@ -32,19 +32,16 @@ from pd4dgs_codec.draw.projection import (
 from pd4dgs_codec.draw.simd import (
     LANES,
     WIDE,
+    Array,
     Tasks,
     aligned,
     exp2,
     fma,
     fnma,
     folded,
-    in_row,
-    iota,
-    iota64,
     kernel,
     mask_gt,
     parallel,
-    prefetch,
     select_gt,
     single,
     spread,
@@ -63,23 +60,16 @@ _ROWS = WIDE // LANES  #: of pixels in a block
 _FIRST_ROWS = np.uint64(0xFFFFFFFFFFFFFFFF // (2**_ROWS - 1))  #: a bit for the first row of each block
 _BLOCKS = _COLUMNS * TILE_HEIGHT
 _STATE = 5  #: vectors of state per block
-_AHEAD = 4  #: Gaussians by which memory is fetched early
 _F = np.float32
+_ROW, _ROW64 = np.arange(WIDE, dtype=_F), np.arange(WIDE, dtype=np.float64)  #: constants of kernels
+_LANE = _ROW % LANES
 _COLORS = 3  #: channels
 
 Bits = Any  #: a uint64 with one bit per block of a tile, at column * TILE_HEIGHT + row
 
 
 @kernel()
-def _prefetch(items: np.ndarray, n: int, end: int, geom: np.ndarray, colors: np.ndarray) -> None:
-    if n + _AHEAD < end:
-        ahead = np.int64(items[n + _AHEAD])
-        prefetch(geom, ahead * GEOM_COLUMNS)
-        prefetch(colors, ahead * _COLORS)
-
-
-@kernel()
-def _coverage(geom: np.ndarray, g: int, left: int, top: int) -> Bits:
+def _coverage(geom: Array, g: int, left: int, top: int) -> Bits:
     """The blocks of the tile that Gaussian g (an offset into flat geom) may touch.
 
     From the chord of each pixel row, WIDE rows at a time, slightly too wide to cover float32 rounding.
@@ -92,7 +82,7 @@ def _coverage(geom: np.ndarray, g: int, left: int, top: int) -> Bits:
     slack = splat(_F(1e-3 + 1e-5 * abs(shear)))
     mask = np.uint64(0)
     for top_row in range(0, TILE_HEIGHT, WIDE):
-        row = iota() + splat(_F(top_row))
+        row = load(_ROW, 0) + splat(_F(top_row))
         r = fma(row, splat(_F(geom[g + SB])), splat(_F(geom[g + SB] * dy)))
         rest = fnma(r, r, reach)
         centre = fma(row, splat(_F(shear)), splat(_F(geom[g + X] - 0.5 - left + shear * dy)))
@@ -108,13 +98,13 @@ def _coverage(geom: np.ndarray, g: int, left: int, top: int) -> Bits:
 
 
 @kernel(inline=True)
-def _tabulate(ts: np.ndarray, rs: np.ndarray, rests: np.ndarray, geom: np.ndarray, g: int, left: int, top: int) -> None:
+def _tabulate(ts: Array, rs: Array, rests: Array, geom: Array, g: int, left: int, top: int) -> None:
     """Fills, for Gaussian g, float32 ts = t at the first pixel of each block of 8, and per row of the tile rs = r and
     rests = q - r^2."""
     dy, sa, sb = top + 0.5 - geom[g + Y], geom[g + SA], geom[g + SB]
     start, step = splat(sa * (left + 0.5 - geom[g + X] - geom[g + K] * dy)), splat(-sa * geom[g + K])
     for first in range(0, TILE_HEIGHT, WIDE):
-        row = iota64() + splat(float(first))
+        row = load(_ROW64, 0) + splat(float(first))
         t, r = start + row * step, splat(sb * dy) + row * splat(sb)
         store(rs, first, single(r))
         store(rests, first, single(splat(geom[g + Q]) - r * r))
@@ -123,7 +113,7 @@ def _tabulate(ts: np.ndarray, rs: np.ndarray, rests: np.ndarray, geom: np.ndarra
 
 
 @kernel()
-def _begin(state: np.ndarray, channel: int, left: int, top: int, width: int, height: int) -> Bits:
+def _begin(state: Array, channel: int, left: int, top: int, width: int, height: int) -> Bits:
     """Sets `channel` of the state to 1 inside the image and 0 outside; returns the blocks with a pixel inside."""
     alive = np.uint64(0)
     for block in range(_BLOCKS):
@@ -145,16 +135,16 @@ def _place(x: int, y: int) -> int:
 
 @kernel()
 def _composite_tile(
-    items: np.ndarray,
+    items: Array,
     start: int,
     end: int,
-    geom: np.ndarray,
-    colors: np.ndarray,
+    geom: Array,
+    colors: Array,
     left: int,
     top: int,
     width: int,
     height: int,
-    state: np.ndarray,
+    state: Array,
 ) -> None:
     """Blends the tile's Gaussians into `state`: per block the transmittance (0 once finished), 3 colours and the last
     transmittance above T_MIN."""
@@ -162,12 +152,11 @@ def _composite_tile(
     alive = _begin(state, 0, left, top, width, height)
     one = np.uint64(1)
     zero, faintest = splat(_F(0.0)), splat(_F(ALPHA_MIN))
-    low, high, t_min = splat(_F(-9.0)), splat(_F(ALPHA_MAX)), splat(_F(T_MIN))
+    low, high, t_min, lanes = splat(_F(-9.0)), splat(_F(ALPHA_MAX)), splat(_F(T_MIN)), load(_LANE, 0)
     ts, rs, rests = aligned(_BLOCKS, _F), aligned(TILE_HEIGHT, _F), aligned(TILE_HEIGHT, _F)
     for n in range(start, end):
         if not alive:
             break
-        _prefetch(items, n, end, geom, colors)
         g = np.int64(items[n]) * GEOM_COLUMNS
         mask = _coverage(geom, g, left, top) & alive
         if not mask:
@@ -180,7 +169,7 @@ def _composite_tile(
             block = trailing_zeros(mask)
             mask &= mask - one
             row = block % TILE_HEIGHT
-            t = fma(in_row(), step, spread(ts, block))
+            t = fma(lanes, step, spread(ts, block))
             exponent = fnma(t, t, spread(rests, row))
             alpha = exp2(select_gt(exponent, low, exponent, low))
             alpha = select_gt(high, alpha, alpha, high)
@@ -203,13 +192,13 @@ def _composite_tile(
 @parallel(lambda items, starts, *_: starts.size - 1)
 def composite(
     tasks: Tasks,
-    items: np.ndarray,
-    starts: np.ndarray,
-    geom: np.ndarray,
-    colors: np.ndarray,
-    background: np.ndarray,
-    picture: np.ndarray,
-    transmittance: np.ndarray,
+    items: Array,
+    starts: Array,
+    geom: Array,
+    colors: Array,
+    background: Array,
+    picture: Array,
+    transmittance: Array,
 ) -> None:
     """Fills picture [H, W, 3] and transmittance = 1 - alpha [H, W], float32, from colors [N, 3] and background [3].
 
@@ -234,28 +223,27 @@ def composite(
 
 @kernel()
 def _composite_tile_backward(
-    items: np.ndarray,
-    slot_of: np.ndarray,
+    items: Array,
+    slot_of: Array,
     start: int,
     end: int,
-    geom: np.ndarray,
-    colors: np.ndarray,
+    geom: Array,
+    colors: Array,
     left: int,
     top: int,
     width: int,
     height: int,
-    state: np.ndarray,
-    slots: np.ndarray,
+    state: Array,
+    slots: Array,
 ) -> None:
     """Walks the Gaussians front to back again. The state holds per block the transmittance, the part of the gradient
     that comes from behind the current Gaussian, and dL/d(3 colours)."""
     alive = _begin(state, 0, left, top, width, height)
     one_bit = np.uint64(1)
     zero, one, faintest = splat(_F(0.0)), splat(_F(1.0)), splat(_F(ALPHA_MIN))
-    low, high, t_min = splat(_F(-9.0)), splat(_F(ALPHA_MAX)), splat(_F(T_MIN))
+    low, high, t_min, lanes = splat(_F(-9.0)), splat(_F(ALPHA_MAX)), splat(_F(T_MIN)), load(_LANE, 0)
     ts, rs, rests = aligned(_BLOCKS, _F), aligned(TILE_HEIGHT, _F), aligned(TILE_HEIGHT, _F)
     for n in range(start, end):
-        _prefetch(items, n, end, geom, colors)
         g = np.int64(items[n]) * GEOM_COLUMNS
         mask = _coverage(geom, g, left, top) & alive if alive else alive
         if mask:
@@ -269,7 +257,7 @@ def _composite_tile_backward(
             block = trailing_zeros(mask)
             mask &= mask - one_bit
             row = block % TILE_HEIGHT
-            t = fma(in_row(), step, spread(ts, block))
+            t = fma(lanes, step, spread(ts, block))
             exponent = fnma(t, t, spread(rests, row))
             unclamped = exp2(select_gt(exponent, low, exponent, low))
             alpha = select_gt(high, unclamped, unclamped, high)
@@ -307,16 +295,16 @@ def _composite_tile_backward(
 @parallel(lambda items, slot_of, starts, *_: starts.size - 1)
 def composite_backward(
     tasks: Tasks,
-    items: np.ndarray,
-    slot_of: np.ndarray,
-    starts: np.ndarray,
-    geom: np.ndarray,
-    colors: np.ndarray,
-    picture: np.ndarray,
-    transmittance: np.ndarray,
-    g_picture: np.ndarray,
-    g_alpha: np.ndarray,
-    slots: np.ndarray,
+    items: Array,
+    slot_of: Array,
+    starts: Array,
+    geom: Array,
+    colors: Array,
+    picture: Array,
+    transmittance: Array,
+    g_picture: Array,
+    g_alpha: Array,
+    slots: Array,
 ) -> None:
     """Fills slots float32 [pairs, SLOTS] with each pair's sums of gradients.
 

@@ -26,8 +26,8 @@ from pd4dgs_codec.draw.simd import (
     LANES,
     PRODUCT_ROWS,
     WIDE,
+    Array,
     Tasks,
-    Vector,
     aligned,
     copy,
     fma,
@@ -35,7 +35,6 @@ from pd4dgs_codec.draw.simd import (
     kernel,
     load,
     parallel,
-    splat,
     spread,
     store,
     wide_load,
@@ -94,20 +93,20 @@ def in_view(camera: Camera, viewmat: Any, position: Any, radius: Any, near: floa
 class Gaussians:
     """The input of the rasteriser, float32: K Gaussians, activated and gated."""
 
-    means: np.ndarray  #: [K, 3] world
-    quats: np.ndarray  #: [K, 4] wxyz, unit
-    scales: np.ndarray  #: [K, 3] scene units
-    opacities: np.ndarray  #: [K] 0..1
-    colors: np.ndarray  #: [K, 3] 0..1
-    slots: np.ndarray  #: int64 [K], anchor * G + offset, of G slots
+    means: Array  #: [K, 3] world
+    quats: Array  #: [K, 4] wxyz, unit
+    scales: Array  #: [K, 3] scene units
+    opacities: Array  #: [K] 0..1
+    colors: Array  #: [K, 3] 0..1
+    slots: Array  #: int64 [K], anchor * G + offset, of G slots
 
 
 class Functions(NamedTuple):
     """The activations, array to array. Training passes torch's, which differ in the last bit."""
 
-    tanh: Callable[[np.ndarray], np.ndarray]
-    sigmoid: Callable[[np.ndarray], np.ndarray]
-    exp: Callable[[np.ndarray], np.ndarray]
+    tanh: Callable[[Array], Array]
+    sigmoid: Callable[[Array], Array]
+    exp: Callable[[Array], Array]
 
 
 NUMPY = Functions(np.tanh, lambda x: 1 / (1 + np.exp(-x)), np.exp)
@@ -116,20 +115,20 @@ NUMPY = Functions(np.tanh, lambda x: 1 / (1 + np.exp(-x)), np.exp)
 class Look(NamedTuple):
     """Anchors as an eye sees them: of n anchors the opacities of all slots, and what the other networks go on from."""
 
-    inputs: np.ndarray  #: [n, D + 3], features and directions from the eye
-    distance: np.ndarray  #: [n] from the eye
-    opacity: np.ndarray  #: [n, G], before the gate
-    hidden: tuple[tuple[np.ndarray, int], ...]  #: of covariance and colour: hidden activations and their first column
+    inputs: Array  #: [n, D + 3], features and directions from the eye
+    distance: Array  #: [n] from the eye
+    opacity: Array  #: [n, G], before the gate
+    hidden: tuple[tuple[Array, int], ...]  #: of covariance and colour: hidden activations and their first column
 
 
 class Made(NamedTuple):
     """The kept Gaussians before the local deformation, and what their gradient takes."""
 
-    gaussians: np.ndarray  #: [K, 14]
-    gates: np.ndarray  #: [K]
-    shape: np.ndarray  #: [K, 7], logits of the scales relative to the extents, quaternion
-    relative: np.ndarray  #: [K, 7], sigmoid of shape
-    extent: np.ndarray  #: [n, 6], of the offsets, then of the Gaussians, scene units
+    gaussians: Array  #: [K, 14]
+    gates: Array  #: [K]
+    shape: Array  #: [K, 7], logits of the scales relative to the extents, quaternion
+    relative: Array  #: [K, 7], sigmoid of shape
+    extent: Array  #: [n, 6], of the offsets, then of the Gaussians, scene units
 
 
 def fusible(networks: Sequence[Sequence[tuple[Any, Any]]]) -> bool:
@@ -154,7 +153,7 @@ class Decoders:
             self._opacity = Layers(networks[0])
             self._hidden = [Layers(n[:-1], relu_last=True) if len(n) > 1 else None for n in networks[1:]]
 
-    def look(self, anchors: np.ndarray, eye: np.ndarray) -> Look:
+    def look(self, anchors: Array, eye: Array) -> Look:
         """The anchors as an eye at [3], world, sees them."""
         n, features = len(anchors), anchors.shape[1] - 3 - 3 * self.slots - SCALING_DIM
         x, distance = np.empty((n, features + 3), anchors.dtype), np.empty(n, anchors.dtype)
@@ -169,7 +168,7 @@ class Decoders:
             ]
         return Look(x, distance, self._functions.tanh(opacity), tuple(parts))
 
-    def make(self, anchors: np.ndarray, mask: np.ndarray, look: Look, keep: np.ndarray) -> Made:
+    def make(self, anchors: Array, mask: Array, look: Look, keep: Array) -> Made:
         """The Gaussians of the kept slots of anchors under mask [n]."""
         shape, color = (np.empty((len(keep), len(bias) // self.slots), anchors.dtype) for _, bias in self._last)
         for out, (hidden, column), (weight, bias) in zip((shape, color), look.hidden, self._by_slot, strict=True):
@@ -181,8 +180,8 @@ class Decoders:
         return Made(gaussians, gates, shape, relative, extent)
 
     def backward(
-        self, anchors: np.ndarray, look: Look, keep: np.ndarray, made: Made, g: np.ndarray, g_gates: np.ndarray
-    ) -> tuple[np.ndarray, np.ndarray, list[Layer]]:
+        self, anchors: Array, look: Look, keep: Array, made: Made, g: Array, g_gates: Array
+    ) -> tuple[Array, Array, list[Layer]]:
         """The gradients by anchors, by mask [n] and by each layer of each network, from those by the Gaussians and
         their gates. Of fused networks alone."""
         parts = kernel_threads()
@@ -206,7 +205,7 @@ class Decoders:
         return g_anchors, g_mask, [layer for pair in zip(firsts, [opacity, *last], strict=True) for layer in pair]
 
 
-def _padded(x: np.ndarray, before: Layers | None, table: np.ndarray) -> np.ndarray:
+def _padded(x: Array, before: Layers | None, table: Array) -> Array:
     """The inputs of a network's last layer in as many columns as its table of `by_slot` has rows; the padding is 0."""
     if before is not None:
         return before(x, table.shape[1])
@@ -215,14 +214,14 @@ def _padded(x: np.ndarray, before: Layers | None, table: np.ndarray) -> np.ndarr
     return out
 
 
-def seen(opacity: np.ndarray, mask: np.ndarray, faintest: float) -> np.ndarray:
+def seen(opacity: Array, mask: Array, faintest: float) -> Array:
     """int64 [K]: the slots whose opacity [n, G], gated by mask [n], is `faintest` at least."""
     keep = np.empty(opacity.size + 1, np.int64)  # a place past the last, which is always written
-    found: np.ndarray = keep[: _seen(keep, opacity, mask, faintest)].copy()
+    found: Array = keep[: _seen(keep, opacity, mask, faintest)].copy()
     return found
 
 
-def finished(gaussians: np.ndarray, gates: np.ndarray, loose: bool) -> tuple[np.ndarray, ...]:
+def finished(gaussians: Array, gates: Array, loose: bool) -> tuple[Array, ...]:
     """means, quats, scales, opacities and colors of gaussians under gates [K]. loose: residuals were added, so values
     return to their range: scales >= 0, opacities and colours 0..1, unit quaternions."""
     shapes: tuple[tuple[int, ...], ...] = ((3,), (4,), (3,), (), (3,))
@@ -235,7 +234,7 @@ def finished(gaussians: np.ndarray, gates: np.ndarray, loose: bool) -> tuple[np.
 
 
 @kernel(inline=True)
-def _part(keep: np.ndarray, slots: int, part: int, parts: int) -> tuple[int, int]:
+def _part(keep: Array, slots: int, part: int, parts: int) -> tuple[int, int]:
     """The range of `keep` of one part: no anchor is in two parts."""
     begin, end = len(keep) * part // parts, len(keep) * (part + 1) // parts
     while 0 < begin < len(keep) and keep[begin] // slots == keep[begin - 1] // slots:
@@ -245,48 +244,37 @@ def _part(keep: np.ndarray, slots: int, part: int, parts: int) -> tuple[int, int
     return begin, end
 
 
-@kernel(inline=True)
-def _noisy(out: np.ndarray, to: int, values: np.ndarray, at: int, noise: np.ndarray, first: int, size: Vector) -> None:
-    """Stores LANES of `values` plus `size` times `noise` to `out`."""
-    store(out, to, load(values, at) + load(noise, first) * size)
-
-
 @parallel(lambda out, *_: len(out))
 def pick(
     tasks: Tasks,
-    out: np.ndarray,
+    out: Array,
     column: int,
-    values: np.ndarray,
-    rows: np.ndarray,
-    noise: np.ndarray,
+    values: Array,
+    rows: Array,
+    noise: Array,
     step: float,
     rounding: bool,
-    spacing: np.ndarray,
-    centre: np.ndarray,
+    spacing: Array,
+    centre: Array,
 ) -> None:
     """Fills the columns of `out` from `column` on with values [N, w] at rows int64 [n]. rounding: to centre [w] plus
     multiples of `step` times spacing [N]; else noise [n, w], in those steps, is added; noise [0, w] is none."""
     real, width = values.dtype.type, values.shape[1]
     for i in range(tasks[0], tasks[1]):
-        size, to, at = real(step) * spacing[rows[i]], i * out.shape[1] + column, rows[i] * width
+        size = real(step) * spacing[rows[i]]
         if rounding:
             for c in range(width):
                 value = values[rows[i], c]
                 out[i, column + c] = centre[c] + np.rint((value - centre[c]) / size) * size
         elif len(noise) == 0:
-            copy(out, to, values, at, width)
-        elif width < LANES:
+            copy(out, i * out.shape[1] + column, values, rows[i] * width, width)
+        else:
             for c in range(width):
                 out[i, column + c] = values[rows[i], c] + noise[i, c] * size
-        else:
-            for c in range(0, width - LANES, LANES):
-                _noisy(out, to + c, values, at + c, noise, i * width + c, splat(size))
-            c = width - LANES
-            _noisy(out, to + c, values, at + c, noise, i * width + c, splat(size))
 
 
 @parallel(lambda grad, g, column, rows: len(rows))
-def pick_backward(tasks: Tasks, grad: np.ndarray, g: np.ndarray, column: int, rows: np.ndarray) -> None:
+def pick_backward(tasks: Tasks, grad: Array, g: Array, column: int, rows: Array) -> None:
     """The transpose of `pick`: fills grad [N, w], given zeroed, at `rows`, of which none comes twice."""
     width = grad.shape[1]
     for i in range(tasks[0], tasks[1]):
@@ -294,7 +282,7 @@ def pick_backward(tasks: Tasks, grad: np.ndarray, g: np.ndarray, column: int, ro
 
 
 @parallel(lambda out, *_: len(out))
-def inputs(tasks: Tasks, out: np.ndarray, distance: np.ndarray, anchors: np.ndarray, centre: np.ndarray) -> None:
+def inputs(tasks: Tasks, out: Array, distance: Array, anchors: Array, centre: Array) -> None:
     """out [n, D + 3] = the features and the direction from centre [3] of anchors; distance [n] from it, MIN_NORM at
     least."""
     width = out.shape[1] - 3
@@ -309,7 +297,7 @@ def inputs(tasks: Tasks, out: np.ndarray, distance: np.ndarray, anchors: np.ndar
 
 
 @parallel(lambda g_anchors, *_: len(g_anchors))
-def inputs_backward(tasks: Tasks, g_anchors: np.ndarray, g: np.ndarray, out: np.ndarray, distance: np.ndarray) -> None:
+def inputs_backward(tasks: Tasks, g_anchors: Array, g: Array, out: Array, distance: Array) -> None:
     """The transpose of `inputs`, whose results are `out` and `distance`: adds to g_anchors."""
     width = g.shape[1] - 3
     for n in range(tasks[0], tasks[1]):
@@ -324,7 +312,7 @@ def inputs_backward(tasks: Tasks, g_anchors: np.ndarray, g: np.ndarray, out: np.
 
 
 @kernel()
-def _seen(keep: np.ndarray, opacity: np.ndarray, mask: np.ndarray, faintest: float) -> int:
+def _seen(keep: Array, opacity: Array, mask: Array, faintest: float) -> int:
     """Writes to `keep` the slots whose opacity [n, G] times mask [n] is `faintest` at least; returns how many."""
     count, slots = 0, opacity.shape[1]
     for n in range(len(mask)):
@@ -334,7 +322,7 @@ def _seen(keep: np.ndarray, opacity: np.ndarray, mask: np.ndarray, faintest: flo
     return count
 
 
-def by_slot(weight: np.ndarray, bias: np.ndarray, slots: int) -> tuple[np.ndarray, np.ndarray]:
+def by_slot(weight: Array, bias: Array, slots: int) -> tuple[Array, Array]:
     """(weight [G, H, LANES], bias [G, LANES]) for `linear` of a layer (weight [G w, any], bias [G w]), w LANES at most;
     H is a multiple of LANES."""
     width, inputs = len(bias) // slots, weight.shape[1]
@@ -346,15 +334,7 @@ def by_slot(weight: np.ndarray, bias: np.ndarray, slots: int) -> tuple[np.ndarra
 
 
 @parallel(lambda out, *_: -(-len(out) // KEPT))
-def linear(
-    tasks: Tasks,
-    out: np.ndarray,
-    keep: np.ndarray,
-    hidden: np.ndarray,
-    column: int,
-    weight: np.ndarray,
-    bias: np.ndarray,
-) -> None:
+def linear(tasks: Tasks, out: Array, keep: Array, hidden: Array, column: int, weight: Array, bias: Array) -> None:
     """Fills out [K, w] with the outputs of a linear layer, packed by `by_slot`, that belong to the kept slots."""
     slots, inputs, width = weight.shape[0], weight.shape[1], out.shape[1]
     zero, step = wide_splat(hidden.dtype.type(0)), WIDE // LANES
@@ -375,14 +355,14 @@ def linear(
 @parallel(lambda grad_hidden, grad_weight, *_: len(grad_weight))
 def linear_backward(
     tasks: Tasks,
-    grad_hidden: np.ndarray,
-    grad_weight: np.ndarray,
-    grad_bias: np.ndarray,
-    keep: np.ndarray,
-    g: np.ndarray,
-    hidden: np.ndarray,
+    grad_hidden: Array,
+    grad_weight: Array,
+    grad_bias: Array,
+    keep: Array,
+    g: Array,
+    hidden: Array,
     column: int,
-    weight: np.ndarray,
+    weight: Array,
 ) -> None:
     """The transpose of `linear`; weight [G w, H in whole vectors]. Fills, given zeroed, grad_hidden (as hidden) and per
     part grad_weight [parts, G w, H] and grad_bias [parts, G w]."""
@@ -430,16 +410,16 @@ def linear_backward(
 @parallel(lambda gaussians, *_: len(gaussians))
 def assemble(
     tasks: Tasks,
-    gaussians: np.ndarray,
-    gates: np.ndarray,
-    keep: np.ndarray,
-    anchors: np.ndarray,
-    extent: np.ndarray,
-    opacity: np.ndarray,
-    mask: np.ndarray,
-    shape: np.ndarray,
-    relative: np.ndarray,
-    color: np.ndarray,
+    gaussians: Array,
+    gates: Array,
+    keep: Array,
+    anchors: Array,
+    extent: Array,
+    opacity: Array,
+    mask: Array,
+    shape: Array,
+    relative: Array,
+    color: Array,
 ) -> None:
     """Fills gaussians and gates [K] of the kept slots.
 
@@ -462,7 +442,7 @@ def assemble(
 
 
 @kernel(inline=True)
-def _norm(values: np.ndarray, k: int, first: int) -> Any:
+def _norm(values: Array, k: int, first: int) -> Any:
     """The norm of the four values of row k from column `first` on, at least MIN_NORM."""
     square = values[k, first] * values[k, first] + values[k, first + 1] * values[k, first + 1]
     square += values[k, first + 2] * values[k, first + 2] + values[k, first + 3] * values[k, first + 3]
@@ -470,7 +450,7 @@ def _norm(values: np.ndarray, k: int, first: int) -> Any:
 
 
 @kernel(inline=True)
-def _unit_backward(out: np.ndarray, values: np.ndarray, g: np.ndarray, k: int, to: int, of: int, at: int) -> None:
+def _unit_backward(out: Array, values: Array, g: Array, k: int, to: int, of: int, at: int) -> None:
     """Stores to row k of `out`, from column `to` on, the gradient by the four values from `of` on, from the gradient by
     their quotients by `_norm`, in g from `at` on."""
     norm = _norm(values, k, of)
@@ -486,19 +466,19 @@ def _unit_backward(out: np.ndarray, values: np.ndarray, g: np.ndarray, k: int, t
 @parallel(lambda *given: given[-1])
 def assemble_backward(
     tasks: Tasks,
-    g_anchors: np.ndarray,
-    g_opacity: np.ndarray,
-    g_mask: np.ndarray,
-    g_shape: np.ndarray,
-    g_color: np.ndarray,
-    keep: np.ndarray,
-    anchors: np.ndarray,
-    extent: np.ndarray,
-    shape: np.ndarray,
-    relative: np.ndarray,
-    gaussians: np.ndarray,
-    g: np.ndarray,
-    g_gates: np.ndarray,
+    g_anchors: Array,
+    g_opacity: Array,
+    g_mask: Array,
+    g_shape: Array,
+    g_color: Array,
+    keep: Array,
+    anchors: Array,
+    extent: Array,
+    shape: Array,
+    relative: Array,
+    gaussians: Array,
+    g: Array,
+    g_gates: Array,
     parts: int,
 ) -> None:
     """The transpose of `assemble`: fills g_anchors, g_opacity and g_mask, given zeroed, and g_shape and g_color: the
@@ -534,13 +514,13 @@ def _clamped(value: float) -> Any:
 @parallel(lambda means, *_: len(means))
 def finish(
     tasks: Tasks,
-    means: np.ndarray,
-    quats: np.ndarray,
-    scales: np.ndarray,
-    opacities: np.ndarray,
-    colors: np.ndarray,
-    gaussians: np.ndarray,
-    gates: np.ndarray,
+    means: Array,
+    quats: Array,
+    scales: Array,
+    opacities: Array,
+    colors: Array,
+    gaussians: Array,
+    gates: Array,
     loose: bool,
 ) -> None:
     """Fills the parts of gaussians under gates [K]; loose: clamped and normalised first."""
@@ -561,15 +541,15 @@ def finish(
 @parallel(lambda g, *_: len(g))
 def finish_backward(
     tasks: Tasks,
-    g: np.ndarray,
-    g_gates: np.ndarray,
-    gaussians: np.ndarray,
-    gates: np.ndarray,
-    g_means: np.ndarray,
-    g_quats: np.ndarray,
-    g_scales: np.ndarray,
-    g_opacities: np.ndarray,
-    g_colors: np.ndarray,
+    g: Array,
+    g_gates: Array,
+    gaussians: Array,
+    gates: Array,
+    g_means: Array,
+    g_quats: Array,
+    g_scales: Array,
+    g_opacities: Array,
+    g_colors: Array,
     loose: bool,
 ) -> None:
     """The transpose of `finish`: fills g [K, 14] and g_gates [K]."""

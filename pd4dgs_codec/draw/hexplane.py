@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.draw.simd import LANES, Tasks, Vector, fma, fnma, kernel, load, parallel, splat, store, total
+from pd4dgs_codec.draw.simd import LANES, Array, Tasks, Vector, fma, fnma, kernel, load, parallel, splat, store, total
 from pd4dgs_codec.scene import PLANES
 
 TIME_AXIS = 3
@@ -39,10 +39,10 @@ class PlaneLayout:
     lines: int64 [R, 5], each row of each plane: first cell of the plane, height, width, row, 1 if spatial.
     """
 
-    reso: np.ndarray
-    start: np.ndarray
-    rows: np.ndarray
-    lines: np.ndarray
+    reso: Array
+    start: Array
+    rows: Array
+    lines: Array
     n_spatial: int
     n_cells: int
     n_rows: int
@@ -98,7 +98,7 @@ def _locate(p: float, lower: float, upper: float, n: int) -> tuple[int, float, f
 
 
 @kernel(inline=True)
-def _linear(table: np.ndarray, i: int, step: int, f: Vector) -> tuple[Vector, Vector]:
+def _linear(table: Array, i: int, step: int, f: Vector) -> tuple[Vector, Vector]:
     """(sample, d sample / df) of the lanes at flat offset i and its neighbour `step` further."""
     a = load(table, i)
     d = load(table, i + step) - a
@@ -106,14 +106,7 @@ def _linear(table: np.ndarray, i: int, step: int, f: Vector) -> tuple[Vector, Ve
 
 
 @kernel(inline=True)
-def _bilinear(
-    table: np.ndarray,
-    i: int,
-    step_u: int,
-    step_v: int,
-    fu: Vector,
-    fv: Vector,
-) -> tuple[Vector, Vector, Vector]:
+def _bilinear(table: Array, i: int, step_u: int, step_v: int, fu: Vector, fv: Vector) -> tuple[Vector, Vector, Vector]:
     """(sample, d sample / dfu, d sample / dfv)."""
     a, da = _linear(table, i, step_u, fu)
     b, db = _linear(table, i + step_v, step_u, fu)
@@ -121,14 +114,14 @@ def _bilinear(
 
 
 @kernel(inline=True)
-def _add_linear(table: np.ndarray, i: int, step: int, f: Vector, g: Vector) -> None:
+def _add_linear(table: Array, i: int, step: int, f: Vector, g: Vector) -> None:
     """The transpose of `_linear`: adds (1 - f) g and f g."""
     store(table, i, load(table, i) + fnma(g, f, g))
     store(table, i + step, fma(g, f, load(table, i + step)))
 
 
 @kernel(inline=True)
-def _add_bilinear(table: np.ndarray, i: int, step_u: int, step_v: int, fu: Vector, fv: Vector, g: Vector) -> None:
+def _add_bilinear(table: Array, i: int, step_u: int, step_v: int, fu: Vector, fv: Vector, g: Vector) -> None:
     gv = g * fv
     _add_linear(table, i, step_u, fu, g - gv)
     _add_linear(table, i + step_v, step_u, fu, gv)
@@ -136,13 +129,7 @@ def _add_bilinear(table: np.ndarray, i: int, step_u: int, step_v: int, fu: Vecto
 
 @kernel(inline=True)
 def _address(
-    s: int,
-    point: np.ndarray,
-    reso: np.ndarray,
-    start: np.ndarray,
-    row_start: np.ndarray,
-    box: np.ndarray,
-    channels: int,
+    s: int, point: Array, reso: Array, start: Array, row_start: Array, box: Array, channels: int
 ) -> tuple[Six, Six, Three, Three]:
     """The flat offsets of one point's six lookups at one scale, the steps to its neighbours, fractions and slopes.
 
@@ -163,14 +150,14 @@ def _address(
 @parallel(lambda out, *_: len(out))
 def sample(
     tasks: Tasks,
-    out: np.ndarray,
-    grid: np.ndarray,
-    rows: np.ndarray,
-    reso: np.ndarray,
-    start: np.ndarray,
-    row_start: np.ndarray,
-    points: np.ndarray,
-    box: np.ndarray,
+    out: Array,
+    grid: Array,
+    rows: Array,
+    reso: Array,
+    start: Array,
+    row_start: Array,
+    points: Array,
+    box: Array,
 ) -> None:
     """Fills out [N, S * C] with the product of the six planes at `points`, per scale."""
     channels = grid.shape[1]
@@ -191,18 +178,18 @@ def sample(
 
 @kernel(inline=True)
 def _point_gradient(
-    grad: np.ndarray,
-    grad_rows: np.ndarray,
-    g: np.ndarray,
+    grad: Array,
+    grad_rows: Array,
+    g: Array,
     g_offset: int,
-    grid: np.ndarray,
-    rows: np.ndarray,
+    grid: Array,
+    rows: Array,
     channels: int,
     offsets: Six,
     steps: Six,
     fractions: Three,
     slopes: Three,
-    out: np.ndarray,
+    out: Array,
     out_offset: int,
 ) -> None:
     """Adds one point's gradient at one scale to `grad` and `grad_rows`; stores that by the point to flat `out`."""
@@ -249,18 +236,18 @@ def _point_gradient(
 @parallel(lambda grad, extra, grad_rows, grad_points, *_: len(grad_points) * len(grad_rows))
 def sample_backward(
     tasks: Tasks,
-    grad: np.ndarray,
-    extra: np.ndarray,
-    grad_rows: np.ndarray,
-    grad_points: np.ndarray,
-    g: np.ndarray,
-    grid: np.ndarray,
-    rows: np.ndarray,
-    reso: np.ndarray,
-    start: np.ndarray,
-    row_start: np.ndarray,
-    points: np.ndarray,
-    box: np.ndarray,
+    grad: Array,
+    extra: Array,
+    grad_rows: Array,
+    grad_points: Array,
+    g: Array,
+    grid: Array,
+    rows: Array,
+    reso: Array,
+    start: Array,
+    row_start: Array,
+    points: Array,
+    box: Array,
 ) -> None:
     """The transpose of `sample`. g: [N, S * C]. Results, to be given zeroed except grad_points:
 
@@ -281,15 +268,7 @@ def sample_backward(
 
 
 @kernel()  # exact arithmetic: the rounding must be that of the codec's quantiser
-def collapse(
-    rows: np.ndarray,
-    grid: np.ndarray,
-    reso: np.ndarray,
-    start: np.ndarray,
-    row_start: np.ndarray,
-    t: float,
-    step: float,
-) -> None:
+def collapse(rows: Array, grid: Array, reso: Array, start: Array, row_start: Array, t: float, step: float) -> None:
     """Fills rows [n_rows, C] with the time planes of `grid` at time t, rounded to multiples of `step` if step > 0."""
     real = grid.dtype.type
     for s in range(len(reso)):
@@ -307,14 +286,7 @@ def collapse(
 
 
 @kernel()
-def collapse_backward(
-    grad: np.ndarray,
-    grad_rows: np.ndarray,
-    reso: np.ndarray,
-    start: np.ndarray,
-    row_start: np.ndarray,
-    t: float,
-) -> None:
+def collapse_backward(grad: Array, grad_rows: Array, reso: Array, start: Array, row_start: Array, t: float) -> None:
     """The transpose of `collapse` (rounding passes the gradient): adds to the time planes of grad [cells, C]."""
     real = grad.dtype.type
     for s in range(len(reso)):

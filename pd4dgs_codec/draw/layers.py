@@ -19,6 +19,7 @@ from pd4dgs_codec.draw.simd import (
     PRODUCT_ROWS,
     PRODUCT_VECTORS,
     WIDE,
+    Array,
     Tasks,
     aligned,
     copy,
@@ -37,7 +38,7 @@ from pd4dgs_codec.threads import kernel_threads
 POINTS = 48  #: points per block: whole rows of `product`
 BLOCKS = 8  #: blocks that share scratch memory
 
-Layer = tuple[np.ndarray, np.ndarray]  #: weight [outputs, inputs] and bias [outputs]
+Layer = tuple[Array, Array]  #: weight [outputs, inputs] and bias [outputs]
 
 
 class Layers:
@@ -47,22 +48,20 @@ class Layers:
         self.outputs, self._relu_last = len(layers[-1][1]), relu_last
         self._sizes, self._weights = _pack(layers)
 
-    def __call__(self, x: np.ndarray, outputs: int | None = None) -> np.ndarray:
+    def __call__(self, x: Array, outputs: int | None = None) -> Array:
         """float32 [n, outputs] of x float32 [n, inputs]; outputs beyond the last layer's are 0."""
         out = np.zeros((len(x), self.outputs if outputs is None else outputs), np.float32)
         self.add(out, x)
         return out
 
-    def add(self, out: np.ndarray, x: np.ndarray, keep: bool = False) -> np.ndarray:
+    def add(self, out: Array, x: Array, keep: bool = False) -> Array:
         """Adds the outputs for x [n, inputs] to out [n, at most the last width], C-contiguous; returns the hidden
         activations for `backward` if `keep`, else an empty array."""
         hidden = np.empty((len(x), _hidden_width(self._sizes)) if keep else (0, 0), x.dtype)
         forward(out, hidden, np.ascontiguousarray(x), self._sizes, self._weights, self._relu_last)
         return hidden
 
-    def backward(
-        self, g: np.ndarray, x: np.ndarray, hidden: np.ndarray, g_hidden: np.ndarray | None = None
-    ) -> tuple[np.ndarray, list[Layer]]:
+    def backward(self, g: Array, x: Array, hidden: Array, g_hidden: Array | None = None) -> tuple[Array, list[Layer]]:
         """The gradients by x and by each layer, from g [n, outputs] and, where the activations are used elsewhere too,
         g_hidden, as hidden. Without relu_last."""
         g_x, sums = np.empty_like(x), np.zeros((kernel_threads(), _sums_width(self._sizes)), x.dtype)
@@ -71,7 +70,7 @@ class Layers:
         return g_x, _gradients(sums, self._sizes)
 
 
-def _pack(layers: Sequence[Layer]) -> tuple[np.ndarray, np.ndarray]:
+def _pack(layers: Sequence[Layer]) -> tuple[Array, Array]:
     """(sizes, weights) of the layers.
 
     weights: per layer those by input [inputs, padded outputs], the bias, then those by output [outputs, padded inputs].
@@ -85,23 +84,23 @@ def _pack(layers: Sequence[Layer]) -> tuple[np.ndarray, np.ndarray]:
         back[:, :inputs] = weight
         parts += [table.ravel(), back.ravel()]
     sizes = np.array([weight.shape[::-1] for weight, _ in layers], np.int64)
-    weights: np.ndarray = np.concatenate(parts)
+    weights: Array = np.concatenate(parts)
     return sizes, weights
 
 
-def _hidden_width(sizes: np.ndarray) -> int:
+def _hidden_width(sizes: Array) -> int:
     """Columns of `hidden`."""
     return sum(whole(int(outputs), WIDE) for outputs in sizes[:-1, 1])
 
 
-def _sums_width(sizes: np.ndarray) -> int:
+def _sums_width(sizes: Array) -> int:
     """Columns of `sums` of `backward`."""
     return sum(
         whole(outputs, PRODUCT_ROWS) * whole(inputs, WIDE) + whole(outputs, WIDE) for inputs, outputs in sizes.tolist()
     )
 
 
-def _gradients(sums: np.ndarray, sizes: np.ndarray) -> list[Layer]:
+def _gradients(sums: Array, sizes: Array) -> list[Layer]:
     """The gradients by each layer: the sum of all parts of `sums`."""
     whole_sums, found, at = sums.sum(0), [], 0
     for inputs, outputs in sizes.tolist():
@@ -123,8 +122,8 @@ up = kernel(inline=True)(whole)
 
 @kernel(inline=True)
 def multiply(
-    y: np.ndarray, y_at: int, y_row: int, start: np.ndarray, start_at: int, start_row: int, a: np.ndarray, a_row: int,
-    a_step: int, b: np.ndarray, b_at: int, b_row: int, count: int, rows: int, columns: int, relu: bool,
+    y: Array, y_at: int, y_row: int, start: Array, start_at: int, start_row: int, a: Array, a_row: int,
+    a_step: int, b: Array, b_at: int, b_row: int, count: int, rows: int, columns: int, relu: bool,
 ) -> None:  # fmt: skip
     """`product` of `rows` and `columns` numbers, both in whole blocks."""
     wide = columns - columns % (PRODUCT_VECTORS * WIDE)
@@ -142,7 +141,7 @@ def multiply(
 
 
 @kernel(inline=True)
-def _widest(sizes: np.ndarray) -> int:
+def _widest(sizes: Array) -> int:
     """The largest number in sizes; numba's own maximum takes seconds to compile."""
     found = 0
     for layer in range(len(sizes)):
@@ -151,7 +150,7 @@ def _widest(sizes: np.ndarray) -> int:
 
 
 @kernel(inline=True)
-def _take(block: np.ndarray, row: int, values: np.ndarray, first: int, count: int, column: int, columns: int) -> None:
+def _take(block: Array, row: int, values: Array, first: int, count: int, column: int, columns: int) -> None:
     """Copies `columns` columns, from `column` on, of `count` rows of `values`, from `first` on, to the first columns of
     `block`, whose rows have `row` numbers."""
     for p in range(count):
@@ -159,22 +158,14 @@ def _take(block: np.ndarray, row: int, values: np.ndarray, first: int, count: in
 
 
 @kernel(inline=True)
-def _give(values: np.ndarray, first: int, count: int, column: int, columns: int, block: np.ndarray, row: int) -> None:
+def _give(values: Array, first: int, count: int, column: int, columns: int, block: Array, row: int) -> None:
     """The opposite of `_take`."""
     for p in range(count):
         copy(values, (first + p) * values.shape[1] + column, block, p * row, columns)
 
 
 @parallel(lambda out, *_: -(-len(out) // (POINTS * BLOCKS)))
-def forward(
-    tasks: Tasks,
-    out: np.ndarray,
-    hidden: np.ndarray,
-    x: np.ndarray,
-    sizes: np.ndarray,
-    weights: np.ndarray,
-    relu_last: bool,
-) -> None:
+def forward(tasks: Tasks, out: Array, hidden: Array, x: Array, sizes: Array, weights: Array, relu_last: bool) -> None:
     """Adds the network's outputs to out [n, at most the last outputs in whole vectors]; relu_last: ReLU after the last
     layer as well. Fills hidden unless it has no rows."""
     row, layers, columns = up(_widest(sizes), WIDE), len(sizes), out.shape[1]
@@ -206,14 +197,14 @@ def forward(
 @parallel(lambda g_x, sums, *_: len(sums))
 def backward(
     tasks: Tasks,
-    g_x: np.ndarray,
-    sums: np.ndarray,
-    g: np.ndarray,
-    g_hidden: np.ndarray,
-    hidden: np.ndarray,
-    x: np.ndarray,
-    sizes: np.ndarray,
-    weights: np.ndarray,
+    g_x: Array,
+    sums: Array,
+    g: Array,
+    g_hidden: Array,
+    hidden: Array,
+    x: Array,
+    sizes: Array,
+    weights: Array,
 ) -> None:
     """The transpose of `forward` without relu_last, from g [n, last outputs] and, if it has rows, g_hidden, the part of
     the gradient by `hidden` that comes from elsewhere.

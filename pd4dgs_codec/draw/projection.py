@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.draw.simd import LANES, Tasks, double, kernel, load, parallel, splat, store
+from pd4dgs_codec.draw.simd import LANES, Array, Tasks, double, kernel, load, parallel, splat, store
 
 TILE_WIDTH, TILE_HEIGHT = 32, 16  #: pixels
 ALPHA_MAX = 0.999  #: alpha is clamped to this (gsplat 1.5.3)
@@ -65,7 +65,7 @@ def _rotation(w: float, x: float, y: float, z: float) -> tuple[Quaternion, float
 
 
 @kernel()
-def _to_camera(means: np.ndarray, i: int, camera: np.ndarray) -> tuple[float, float, float]:
+def _to_camera(means: Array, i: int, camera: Array) -> tuple[float, float, float]:
     """Point i in camera axes. camera: float64 [20] = R (9, row-major), t (3), fx, fy, cx, cy, then the limits of J."""
     a, b, c = np.float64(means[i, 0]), np.float64(means[i, 1]), np.float64(means[i, 2])
     return (
@@ -76,7 +76,7 @@ def _to_camera(means: np.ndarray, i: int, camera: np.ndarray) -> tuple[float, fl
 
 
 @kernel()
-def _jacobian(x: float, y: float, z: float, camera: np.ndarray) -> tuple[float, float, float, Matrix23]:
+def _jacobian(x: float, y: float, z: float, camera: Array) -> tuple[float, float, float, Matrix23]:
     """1/z, the ratios x/z and y/z clamped to 1.3 x the field of view (as gsplat), and M = J W, 2x3 row-major."""
     iz = 1.0 / z
     a = min(max(x * iz, camera[16]), camera[17])
@@ -111,19 +111,19 @@ def _clip_index(value: float, limit: int) -> int:
 @parallel(lambda means, *_: len(means))
 def project(
     tasks: Tasks,
-    means: np.ndarray,
-    quats: np.ndarray,
-    scales: np.ndarray,
-    opacities: np.ndarray,
-    camera: np.ndarray,
+    means: Array,
+    quats: Array,
+    scales: Array,
+    opacities: Array,
+    camera: Array,
     size: tuple[int, int],
     near: float,
-    visible: np.ndarray,
-    geom: np.ndarray,
-    rects: np.ndarray,
-    radii: np.ndarray,
-    means2d: np.ndarray,
-    depths: np.ndarray,
+    visible: Array,
+    geom: Array,
+    rects: Array,
+    radii: Array,
+    means2d: Array,
+    depths: Array,
 ) -> None:
     """Fills the outputs per Gaussian; a culled Gaussian has visible = False and zeros elsewhere, except in geom.
 
@@ -218,38 +218,37 @@ def _image_gradient(
 @parallel(lambda means, *_: len(means))
 def project_backward(
     tasks: Tasks,
-    means: np.ndarray,
-    quats: np.ndarray,
-    scales: np.ndarray,
-    opacities: np.ndarray,
-    camera: np.ndarray,
-    geom: np.ndarray,
-    first: np.ndarray,
-    slots: np.ndarray,
-    g_means: np.ndarray,
-    g_quats: np.ndarray,
-    g_scales: np.ndarray,
-    g_opacities: np.ndarray,
-    g_colors: np.ndarray,
-    g_means2d: np.ndarray,
+    means: Array,
+    quats: Array,
+    scales: Array,
+    opacities: Array,
+    camera: Array,
+    geom: Array,
+    first: Array,
+    slots: Array,
+    g_means: Array,
+    g_quats: Array,
+    g_scales: Array,
+    g_opacities: Array,
+    g_colors: Array,
+    g_means2d: Array,
 ) -> None:
     """Sums each Gaussian's slots in float64, in a fixed order, and carries the gradient to the inputs: fills g_*, which
     are given zeroed. slots[first[i] : first[i + 1]] belong to Gaussian i.
     """
-    sums = np.empty(LANES)
+    sums = np.empty(SLOTS)
     for i in range(tasks[0], tasks[1]):
         begin, end = first[i], first[i + 1]
         if begin == end:
             continue
-        together = splat(0.0)
+        together, last = splat(0.0), 0.0
         for n in range(begin, end):
             together = together + double(load(slots, n * SLOTS))
+            last += slots[n, LANES]
         store(sums, 0, together)
-        blue = 0.0
-        for n in range(begin, end):
-            blue += slots[n, LANES]
-        g_colors[i, 0], g_colors[i, 1] = _saturate(sums[SLOT_COLOR]), _saturate(sums[SLOT_COLOR + 1])
-        g_colors[i, 2] = _saturate(blue)
+        sums[LANES] = last
+        for c in range(3):
+            g_colors[i, c] = _saturate(sums[SLOT_COLOR + c])
         g_opacities[i] = _saturate(sums[G] / np.float64(opacities[i]))
         gx, gy, mxx, mxy, myy = _image_gradient(
             sums[GT], sums[GTT], sums[GR], sums[GRR], sums[GTR], geom[i, K], geom[i, SA], geom[i, SB]

@@ -16,7 +16,7 @@ import numpy as np
 
 from pd4dgs_codec import threads
 from pd4dgs_codec.draw import compositing, projection
-from pd4dgs_codec.draw.simd import Tasks, kernel, parallel
+from pd4dgs_codec.draw.simd import Array, Tasks, kernel, parallel
 from pd4dgs_codec.errors import NotFinite, RenderError
 from pd4dgs_codec.scene import Camera
 
@@ -30,10 +30,10 @@ LEAST_VOLUME = 1e-9
 class Geometry(NamedTuple):
     """N Gaussians without their colours, as `draw` takes them: float32, C-contiguous."""
 
-    means: np.ndarray  #: [N, 3]
-    quats: np.ndarray  #: [N, 4]
-    scales: np.ndarray  #: [N, 3]
-    opacities: np.ndarray  #: [N]
+    means: Array  #: [N, 3]
+    quats: Array  #: [N, 4]
+    scales: Array  #: [N, 3]
+    opacities: Array  #: [N]
 
 
 @dataclass(eq=False)
@@ -42,14 +42,14 @@ class Projected:
 
     width: int
     height: int
-    radii: np.ndarray  #: int32 [N, 2] half extents, pixels
-    means2d: np.ndarray  #: float32 [N, 2], pixels
-    camera: np.ndarray  #: float64 [20], see `_pack_camera`
-    geom: np.ndarray  #: float64 [N, GEOM_COLUMNS], see `projection`
-    first: np.ndarray  #: int64 [N + 1], first gradient slot of each Gaussian
-    items: np.ndarray  #: int32 [pairs], the Gaussians of each tile, front to back
-    slot_of: np.ndarray  #: int32 [pairs], the gradient slot of each pair
-    starts: np.ndarray  #: int64 [tiles + 1], first pair of each tile
+    radii: Array  #: int32 [N, 2] half extents, pixels
+    means2d: Array  #: float32 [N, 2], pixels
+    camera: Array  #: float64 [20], see `_pack_camera`
+    geom: Array  #: float64 [N, GEOM_COLUMNS], see `projection`
+    first: Array  #: int64 [N + 1], first gradient slot of each Gaussian
+    items: Array  #: int32 [pairs], the Gaussians of each tile, front to back
+    slot_of: Array  #: int32 [pairs], the gradient slot of each pair
+    starts: Array  #: int64 [tiles + 1], first pair of each tile
 
 
 @dataclass(eq=False)
@@ -57,21 +57,21 @@ class Gradients:
     """Gradients of a loss, float32, in the shapes of the arguments of `project` and `composite`."""
 
     geometry: Geometry
-    colors: np.ndarray
-    means2d: np.ndarray
+    colors: Array
+    means2d: Array
 
 
 def draw(
-    means: np.ndarray,
-    quats: np.ndarray,
-    scales: np.ndarray,
-    opacities: np.ndarray,
-    colors: np.ndarray,
+    means: Array,
+    quats: Array,
+    scales: Array,
+    opacities: Array,
+    colors: Array,
     camera: Camera,
-    background: Sequence[float] | np.ndarray = (0.0, 0.0, 0.0),
+    background: Sequence[float] | Array = (0.0, 0.0, 0.0),
     *,
     near_plane: float = 0.01,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[Array, Array]:
     """The picture of N Gaussians, float32 [H, W, 3], and its alpha, float32 [H, W] in 0..1.
 
     means      [N, 3] world, scene units.
@@ -116,7 +116,7 @@ def project(geometry: Geometry, camera: Camera, near_plane: float) -> Projected:
     return Projected(width, height, radii, means2d, packed, geom, *_bin(visible, depths, rects, width, height))
 
 
-def composite(projected: Projected, colors: np.ndarray, background: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def composite(projected: Projected, colors: Array, background: Array) -> tuple[Array, Array]:
     """(picture float32 [H, W, 3], transmittance float32 [H, W] = 1 - alpha) of colors float32 [N, 3], contiguous, over
     background float32 [3]."""
     picture = np.empty((projected.height, projected.width, 3), np.float32)
@@ -128,11 +128,11 @@ def composite(projected: Projected, colors: np.ndarray, background: np.ndarray) 
 def backward(
     projected: Projected,
     geometry: Geometry,
-    colors: np.ndarray,
-    picture: np.ndarray,
-    transmittance: np.ndarray,
-    g_picture: np.ndarray,
-    g_alpha: np.ndarray,
+    colors: Array,
+    picture: Array,
+    transmittance: Array,
+    g_picture: Array,
+    g_alpha: Array,
 ) -> Gradients:
     """Gradients of a loss from g_picture [H, W, 3] and g_alpha [H, W], its derivatives by the results of `composite`,
     float32 and contiguous. The other arguments are those of `project` and `composite` and their results."""
@@ -151,7 +151,7 @@ def backward(
     return result
 
 
-def _pack_camera(camera: Camera) -> np.ndarray:
+def _pack_camera(camera: Camera) -> Array:
     """float64 [20]: R, t, fx, fy, cx, cy and the range of x/z, y/z inside J (gsplat: 1.3 x the field of view)."""
     viewmat, K = (np.asarray(a, np.float64) for a in (camera.viewmat, camera.K))
     fx, fy, cx, cy = K[0, 0], K[1, 1], K[0, 2], K[1, 2]
@@ -164,9 +164,7 @@ def _pack_camera(camera: Camera) -> np.ndarray:
 # -- tiles -------------------------------------------------------------------------------------------------------------
 
 
-def _bin(
-    visible: np.ndarray, depths: np.ndarray, rects: np.ndarray, width: int, height: int
-) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+def _bin(visible: Array, depths: Array, rects: Array, width: int, height: int) -> tuple[Array, Array, Array, Array]:
     """(first, items, slot_of, starts), see `Projected`."""
     order = depth_order(visible, depths)
     columns, rows = -(-width // projection.TILE_WIDTH), -(-height // projection.TILE_HEIGHT)
@@ -182,7 +180,7 @@ def _bin(
 
 
 @kernel()
-def depth_order(visible: np.ndarray, depths: np.ndarray) -> np.ndarray:
+def depth_order(visible: Array, depths: Array) -> Array:
     """Indices int64 of the visible Gaussians, front to back; equal float32 depths in index order.
 
     A stable radix sort of the depths' bits above the smallest, 12 bits a pass: two or three passes.
@@ -213,7 +211,7 @@ def depth_order(visible: np.ndarray, depths: np.ndarray) -> np.ndarray:
 
 
 @parallel(lambda order, rects, columns, counts: len(counts))
-def count_tiles(tasks: Tasks, order: np.ndarray, rects: np.ndarray, columns: int, counts: np.ndarray) -> None:
+def count_tiles(tasks: Tasks, order: Array, rects: Array, columns: int, counts: Array) -> None:
     """Fills counts int64 [chunks, tiles]: how many Gaussians of each equal chunk of `order` touch each tile."""
     chunks = counts.shape[0]
     for chunk in range(tasks[0], tasks[1]):
@@ -226,7 +224,7 @@ def count_tiles(tasks: Tasks, order: np.ndarray, rects: np.ndarray, columns: int
 
 
 @kernel()
-def offsets(rects: np.ndarray, counts: np.ndarray, starts: np.ndarray, first: np.ndarray) -> None:
+def offsets(rects: Array, counts: Array, starts: Array, first: Array) -> None:
     """Fills the exclusive prefix sums: starts [tiles + 1] into items, first [N + 1] into the slots. counts becomes the
     write positions of fill_tiles."""
     position = 0
@@ -246,14 +244,7 @@ def offsets(rects: np.ndarray, counts: np.ndarray, starts: np.ndarray, first: np
 
 @parallel(lambda order, rects, columns, positions, *_: len(positions))
 def fill_tiles(
-    tasks: Tasks,
-    order: np.ndarray,
-    rects: np.ndarray,
-    columns: int,
-    positions: np.ndarray,
-    first: np.ndarray,
-    items: np.ndarray,
-    slot_of: np.ndarray,
+    tasks: Tasks, order: Array, rects: Array, columns: int, positions: Array, first: Array, items: Array, slot_of: Array
 ) -> None:
     """Fills items int32 [pairs], the Gaussians of each tile, front to back, and slot_of int32 [pairs], the pair's
     gradient slot. Gaussian i has the slots first[i] .. first[i + 1] - 1, so that summing them reads memory in order."""
@@ -316,7 +307,7 @@ def check_colors(name: str, total: float) -> None:
         raise NotFinite(f"{name} has a value that is not finite, or its sum overflows")
 
 
-def _check_floats(name: str, array: np.ndarray, *shape: int | None) -> None:
+def _check_floats(name: str, array: Array, *shape: int | None) -> None:
     """Raises RenderError unless it is an array of floats of that shape; None is any size."""
     if not isinstance(array, np.ndarray) or array.dtype.kind != "f":
         found = array.dtype if isinstance(array, np.ndarray) else type(array).__name__

@@ -27,6 +27,7 @@ import numpy as np
 from llvmlite import ir
 from numba.core import cgutils, event, types
 from numba.core.registry import cpu_target
+from numba.cpython.unsafe import numbers
 from numba.extending import intrinsic as _numba_intrinsic
 from numba.extending import models, overload, register_model
 
@@ -40,6 +41,7 @@ PRODUCT_ROWS, PRODUCT_VECTORS = 12 if WIDE > LANES else 6, 2
 
 CACHE_LINE = 64  #: bytes
 
+Array = np.ndarray  #: in annotations of kernels
 Vector = Any  #: in annotations of kernels: a value of the numba type `Lanes`
 Tasks = tuple[int, int]  #: a range of tasks: the first, and the end
 _Function = TypeVar("_Function", bound=Callable[..., Any])
@@ -251,20 +253,6 @@ def spread(typingctx: Any, array: Any, index: Any) -> Any:
     return result(array, types.intp), codegen
 
 
-def _constant_of(scalar: types.Float, values: Sequence[float]) -> Callable[..., Any]:
-    def function(typingctx: Any) -> Any:
-        result = Lanes(scalar, len(values))
-        return result(), lambda context, builder, sig, args: ir.Constant(context.get_value_type(result), list(values))
-
-    return _intrinsic(function)
-
-
-#: WIDE lanes, float32 and float64: 0, 1, 2, ...
-iota, iota64 = (_constant_of(kind, [float(i) for i in range(WIDE)]) for kind in (types.float32, types.float64))
-#: WIDE lanes, float32: 0, 1, ..., LANES - 1, and again, if there are more
-in_row = _constant_of(types.float32, [float(i % LANES) for i in range(WIDE)])
-
-
 def _converted(scalar: types.Float, to: types.Float, instruction: str) -> Callable[..., Any]:
     def function(typingctx: Any, a: Any) -> Any:
         if not isinstance(a, Lanes) or a.scalar != scalar:
@@ -424,14 +412,8 @@ def mask_gt(typingctx: Any, a: Any, b: Any) -> Any:
     return types.uint64(a, b), codegen
 
 
-@_intrinsic
-def trailing_zeros(typingctx: Any, mask: Any) -> Any:
-    """Index of the lowest set bit of a uint64 that is not 0."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        return builder.cttz(args[0], ir.Constant(ir.IntType(1), 1))
-
-    return types.intp(types.uint64), codegen
+#: Index of the lowest set bit of a uint64 that is not 0.
+trailing_zeros: Any = numbers.trailing_zeros
 
 
 def _sum_of(builder: Any, a: Any, b: Any, even: Sequence[int], odd: Sequence[int]) -> Any:
@@ -510,19 +492,3 @@ def aligned(size: int, dtype: Any) -> np.ndarray:
     array = np.zeros(size + CACHE_LINE, dtype)
     first = -array.ctypes.data % CACHE_LINE // array.itemsize
     return array[first : first + size]
-
-
-@_intrinsic
-def prefetch(typingctx: Any, array: Any, index: Any) -> Any:
-    """Ask for the cache line of flat array[index] ahead of its use."""
-
-    def codegen(context: Any, builder: Any, sig: Any, args: Any) -> Any:
-        i32 = ir.IntType(32)
-        pointer = _address(context, builder, sig.args[0], *args)
-        pointer = builder.bitcast(pointer, ir.IntType(8).as_pointer())
-        kind = ir.FunctionType(ir.VoidType(), [pointer.type, i32, i32, i32])
-        function = builder.module.declare_intrinsic("llvm.prefetch", [pointer.type], kind)
-        builder.call(function, [pointer, i32(0), i32(3), i32(1)])
-        return context.get_dummy_value()
-
-    return types.void(array, types.intp), codegen

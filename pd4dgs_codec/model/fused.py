@@ -78,7 +78,7 @@ class _Pick(torch.autograd.Function):
         column = 0
         drawn = (None, *(noise or (None,) * 3))
         for part, step, own, centre in zip(parts, (0.0, *steps), drawn, (position[:1], *centres), strict=True):
-            given = part[:0] if own is None else own.reshape(len(rows), -1)
+            given = part[:0] if own is None else own
             kernels.pick(
                 out.numpy(), column, part.numpy(), rows.numpy(), given.numpy(), step, rounding and step > 0,
                 spacing.numpy(), centre.flatten().numpy(),

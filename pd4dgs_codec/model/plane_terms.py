@@ -29,6 +29,7 @@ from torch.autograd.function import once_differentiable
 from pd4dgs_codec.draw.hexplane import SPATIAL, TEMPORAL, TIME_AXIS, PlaneLayout
 from pd4dgs_codec.draw.simd import (
     LANES,
+    Array,
     Tasks,
     Vector,
     fma,
@@ -52,7 +53,7 @@ Band = tuple[float, float, float, float, float]  #: five numbers in the middle o
 
 
 @kernel(inline=True)
-def _squares(grid: np.ndarray, start: int, stop: int, step: int) -> Any:
+def _squares(grid: Array, start: int, stop: int, step: int) -> Any:
     """Sum of the squared second differences, over `step`, of the flat range start..stop."""
     two = splat(grid.dtype.type(2))
     value = splat(grid.dtype.type(0))
@@ -63,7 +64,7 @@ def _squares(grid: np.ndarray, start: int, stop: int, step: int) -> Any:
 
 
 @parallel(lambda sums, *_: len(sums))
-def _values(tasks: Tasks, sums: np.ndarray, grid: np.ndarray, lines: np.ndarray) -> None:
+def _values(tasks: Tasks, sums: Array, grid: Array, lines: Array) -> None:
     """Fills sums [R, 3] with each line's part of the three terms."""
     channels = grid.shape[1]
     zero, one = splat(grid.dtype.type(0)), splat(grid.dtype.type(1))
@@ -96,7 +97,7 @@ def _band(i: int, n: int) -> Band:
 
 
 @kernel(inline=True)
-def _curve(grid: np.ndarray, k: int, i: int, n: int, step: int, band: Band, weight: float) -> Vector:
+def _curve(grid: Array, k: int, i: int, n: int, step: int, band: Band, weight: float) -> Vector:
     """weight times the band's row applied around flat offset k, which is value i of n."""
     real = grid.dtype.type
     value = load(grid, k) * splat(real(weight * band[2]))
@@ -107,7 +108,7 @@ def _curve(grid: np.ndarray, k: int, i: int, n: int, step: int, band: Band, weig
 
 
 @parallel(lambda grad, grid, lines, *_: len(lines))
-def _gradient(tasks: Tasks, grad: np.ndarray, grid: np.ndarray, lines: np.ndarray, factors: np.ndarray) -> None:
+def _gradient(tasks: Tasks, grad: Array, grid: Array, lines: Array, factors: Array) -> None:
     """Fills grad [cells, C] with the gradient of sum(factors * terms)."""
     channels = grid.shape[1]
     zero, one = splat(grid.dtype.type(0)), splat(grid.dtype.type(1))
@@ -133,7 +134,7 @@ def _gradient(tasks: Tasks, grad: np.ndarray, grid: np.ndarray, lines: np.ndarra
 
 class _Regularisers(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, grid: Tensor, lines: np.ndarray) -> tuple[Tensor, ...]:
+    def forward(ctx: Any, grid: Tensor, lines: Array) -> tuple[Tensor, ...]:
         sums = np.empty((len(lines), len(TERMS)))
         _values(sums, grid.numpy(), lines)
         ctx.lines = lines
@@ -198,7 +199,7 @@ def _median(w: Vector, n: Vector, plane: Vector) -> Vector:
 
 
 @kernel(inline=True)
-def _residual(grid: np.ndarray, k: int, before: int, up: int, left: int) -> Vector:
+def _residual(grid: Array, k: int, before: int, up: int, left: int) -> Vector:
     """Residuals at flat offset k; the only neighbours lie `before`, or, if that is 0, one `up` and one `left`."""
     if before:
         return load(grid, k) - load(grid, k - before)
@@ -207,14 +208,7 @@ def _residual(grid: np.ndarray, k: int, before: int, up: int, left: int) -> Vect
 
 
 @parallel(lambda channel_sums, *_: len(channel_sums))
-def _magnitudes(
-    tasks: Tasks,
-    channel_sums: np.ndarray,
-    cell_sums: np.ndarray,
-    grid: np.ndarray,
-    starts: np.ndarray,
-    sizes: np.ndarray,
-) -> None:
+def _magnitudes(tasks: Tasks, channel_sums: Array, cell_sums: Array, grid: Array, starts: Array, sizes: Array) -> None:
     """Adds sums of |r| to channel_sums [P, C] and cell_sums [cells]. starts, sizes: see `_tables`."""
     channels, zero = grid.shape[1], splat(grid.dtype.type(0))
     for p in range(tasks[0], tasks[1]):
@@ -242,19 +236,13 @@ def _signed(weight: Vector, r: Vector) -> Vector:
 
 
 @kernel(inline=True)
-def _add(grad: np.ndarray, k: int, value: Vector) -> None:
+def _add(grad: Array, k: int, value: Vector) -> None:
     store(grad, k, load(grad, k) + value)
 
 
 @parallel(lambda grad, grid, by_channel, by_cell, starts, sizes: len(starts))
 def _proxy_gradient(
-    tasks: Tasks,
-    grad: np.ndarray,
-    grid: np.ndarray,
-    by_channel: np.ndarray,
-    by_cell: np.ndarray,
-    starts: np.ndarray,
-    sizes: np.ndarray,
+    tasks: Tasks, grad: Array, grid: Array, by_channel: Array, by_cell: Array, starts: Array, sizes: Array
 ) -> None:
     """Adds the gradient of the sum of |r|, weighted by by_channel [P, C] + by_cell [cells], to grad [cells, C]."""
     channels, zero = grid.shape[1], splat(grid.dtype.type(0))
@@ -315,7 +303,7 @@ class _Proxy(torch.autograd.Function):
         return grad, None, None
 
 
-def _tables(layout: PlaneLayout) -> tuple[np.ndarray, np.ndarray]:
+def _tables(layout: PlaneLayout) -> tuple[Array, Array]:
     """(first cells int64 [P], height, width and 1 if temporal int64 [P, 3]) of all planes of all scales."""
     sizes = [(r[b], r[a], b == TIME_AXIS) for r in layout.reso for _, a, b in PLANES]
     return layout.start.ravel(), np.array(sizes, np.int64)

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from pd4dgs_codec.draw.simd import Tasks, kernel, parallel
+from pd4dgs_codec.draw.simd import Array, Tasks, kernel, parallel
 
 #: The clip of the training rate: no scalar costs more than log2(1e6) = 19.93 bits.
 MIN_PROBABILITY = 1e-6
@@ -159,9 +159,7 @@ def _probability(z: float, h: float, u: float, v: float, narrow_below: float) ->
 
 
 @parallel(lambda parts, *_: len(parts))
-def _class_sums(
-    tasks: Tasks, parts: np.ndarray, values: np.ndarray, classes: np.ndarray, centre: np.ndarray, power: int
-) -> None:
+def _class_sums(tasks: Tasks, parts: Array, values: Array, classes: Array, centre: Array, power: int) -> None:
     """parts [blocks, K, c] += of each class the sum of values, or with power 2 that of their squared distances from
     centre [K, c]."""
     channels = values.shape[1]
@@ -182,14 +180,14 @@ def _class_sums(
 @parallel(lambda bits, *_: len(bits))
 def _scalar_bits(
     tasks: Tasks,
-    bits: np.ndarray,
-    by_value: np.ndarray,
-    by_sigma: np.ndarray,
-    values: np.ndarray,
-    rows: np.ndarray,
-    classes: np.ndarray,
-    mu: np.ndarray,
-    sigma: np.ndarray,
+    bits: Array,
+    by_value: Array,
+    by_sigma: Array,
+    values: Array,
+    rows: Array,
+    classes: Array,
+    mu: Array,
+    sigma: Array,
     step: float,
     least_sigma: float,
     most_bits: float,
@@ -216,13 +214,7 @@ def _scalar_bits(
 
 @parallel(lambda grad, *_: len(grad))
 def _moments_gradient(
-    tasks: Tasks,
-    grad: np.ndarray,
-    values: np.ndarray,
-    classes: np.ndarray,
-    by_mu: np.ndarray,
-    mu: np.ndarray,
-    by_square: np.ndarray,
+    tasks: Tasks, grad: Array, values: Array, classes: Array, by_mu: Array, mu: Array, by_square: Array
 ) -> None:
     """grad [N, c] = by_mu + (values - mu) by_square of each row's class, all [K, c] of the type of `values`."""
     for i in range(tasks[0], tasks[1]):
@@ -272,11 +264,11 @@ class _RowBits(torch.autograd.Function):
         return None, None, None, *gradients
 
 
-def _sums(values: np.ndarray, classes: np.ndarray, centre: np.ndarray, power: int) -> np.ndarray:
+def _sums(values: Array, classes: Array, centre: Array, power: int) -> Array:
     """float64 [K, c]: those of `rate__class_sums`."""
     parts = np.zeros((-(-len(values) // _BLOCK), *centre.shape))
     _class_sums(parts, values, classes, centre, power)
-    total: np.ndarray = parts.sum(0)
+    total: Array = parts.sum(0)
     return total
 
 
@@ -312,7 +304,7 @@ def channel_moments(x: Tensor) -> tuple[Tensor, Tensor]:
     return mu, ((x - mu).square().mean(0) + MIN_VARIANCE).sqrt()
 
 
-def gaussian_bits(channels: Iterable[np.ndarray]) -> float:
+def gaussian_bits(channels: Iterable[Array]) -> float:
     """The sum of R(a) over integer channels, as the trainer computes it in float64: priors are a channel's moments."""
     total = 0.0
     for channel in channels:

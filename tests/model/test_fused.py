@@ -1,5 +1,7 @@
 """The fused functions of the CPU against the plain torch graph: the same Gaussians and the same gradients."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -10,6 +12,7 @@ from pd4dgs_codec.draw.layers import Layers
 from pd4dgs_codec.model import fused, reference
 from pd4dgs_codec.model.model import Gaussians, Model
 from pd4dgs_codec.model.networks import EXACT, MLP, Noise, Rounding
+from pd4dgs_codec.model.picture import render
 from pd4dgs_codec.scene import Widths
 
 PARTS = ("means", "quats", "scales", "opacities", "colors")
@@ -136,6 +139,20 @@ def test_heads_and_fields_may_be_absent(heads):
 @pytest.mark.parametrize(("opacity", "kept"), [(-3.0, 0), (3.0, 800)])
 def test_no_gaussian_or_every_one_is_seen(opacity, kept):
     assert len(check(small_model(opacity=opacity), 2).slots) == kept
+
+
+@pytest.mark.parametrize("rounding", roundings())
+@pytest.mark.parametrize("channels", [8, 4])  # by the kernels, and in plain torch
+def test_a_view_without_anchors_shows_the_background_and_gives_zero_gradients(rounding, channels):
+    model = stir(small_model(channels=channels), 0.3)
+    away = replace(CAMERA, viewmat=np.diag([-1, 1, -1, 1]).astype(np.float32) @ CAMERA.viewmat)
+    for level in range(3):
+        picture = render(model, level, 0.37, away, roundings()[rounding])
+        assert len(picture.gaussians.anchors) == 0
+        assert torch.equal(picture.image, torch.tensor(model.info.background).expand_as(picture.image))
+        model.zero_grad(set_to_none=True)
+        (picture.image * drawn(*picture.image.shape)).sum().backward()
+        assert not any(p.grad.any() for p in model.parameters() if p.grad is not None)
 
 
 @pytest.mark.parametrize("loose", [False, True])
