@@ -110,7 +110,7 @@ def _parts_table(result: dict[str, Any]) -> str:
 def _left_out(layers: list[dict[str, Any]]) -> list[dict[str, str]]:
     """Layers, deformations and residual heads of the format that this file does not have."""
     from pd4dgs_codec.format.registry import LAYER_KINDS
-    from pd4dgs_codec.scene import TRUNK
+    from pd4dgs_codec.scene import HEADS
 
     why = "without visible effect, or above --layers"
     rows = {row["layer"]: row for row in layers}
@@ -120,9 +120,9 @@ def _left_out(layers: list[dict[str, Any]]) -> list[dict[str, str]]:
         if row is None:
             missing.append(f"layer {kind.layer}")
         elif "networks" in row:  # known only if the whole chunk is present
-            gone = [head for head in kind.network_ids if head not in (TRUNK, *row["networks"])]
-            whole = len(gone) == len(kind.network_ids) - 1
-            missing += [kind.name] if whole else [f"{kind.name} head {head}" for head in gone]
+            heads = HEADS[kind.layer]
+            gone = [f"{kind.name} head {head}" for head in heads if head not in row["networks"]]
+            missing += [kind.name] if len(gone) == len(heads) else gone
     return [{"what": what, "why": why} for what in missing]
 
 
