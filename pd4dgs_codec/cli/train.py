@@ -293,7 +293,7 @@ def _summary(args: argparse.Namespace, trainer: Trainer) -> dict[str, Any]:
         "seconds": round(trainer.seconds, 3),
         "phases_not_reached": learner.schedule.phases_not_reached(learner.position),
         "skipped": learner.skipped,
-        "left_out": learner.left_out,
+        "left_out": learner.levels.left_out,
         "anchors": len(trainer.model.anchor_q),
         "active_anchors": learner.active_anchors(),
         "split": "test" if trainer.dataset.test else "train",

@@ -1,7 +1,7 @@
 """The options of a training run. Constants are those of the PD-4DGS method.
 
-A field of `TrainConfig` is declared once, by `option`: default, help, range, its part in the quality dial and what
-checkpoints without it were trained with. The command line, the checks and resuming read these declarations.
+A field of `TrainConfig` is declared once, by `option`: default, help, range and its part in the quality dial. The
+command line, the checks and resuming read these declarations.
 """
 
 from __future__ import annotations
@@ -46,7 +46,6 @@ class Option:
     least, most: the range of numbers, both ends included; above: a lower end that is not included.
     choices: the values allowed, if they are few.
     dial: the value at quality 0 over the default, which is the value at quality 50; None if the dial leaves it alone.
-    before: the value of checkpoints that lack the field, where that is not the default; see `BEFORE`.
     fixed: a resumed run takes the value from its checkpoint, and the command line may not contradict it.
     """
 
@@ -57,8 +56,7 @@ class Option:
     above: float = -math.inf
     choices: tuple[Any, ...] = ()
     dial: float | None = None
-    before: Any = None
-    fixed: bool = False
+    fixed: bool = True
 
     @property
     def range(self) -> str:
@@ -71,10 +69,8 @@ class Option:
 
     def check(self, name: str, value: Any) -> None:
         """Raises TrainError for a value out of range; None is the default of optional fields and passes."""
-        limited = self.choices or max(self.least, self.above) > -math.inf
-        if value is None or not limited:
-            return
-        if value not in self.choices if self.choices else not self.contains(value):
+        allowed = value in self.choices if self.choices else value is None or self.contains(value)
+        if not allowed:
             raise TrainError(f"{name} must be {self.range}, found {value}")
 
     def contains(self, value: float) -> bool:
@@ -118,98 +114,77 @@ class PlaneWeights:
 class TrainConfig:
     """All that decides a run besides the data. Raises TrainError for a value out of its option's range."""
 
-    preset: str = option("small", help="model size", choices=tuple(DEFAULT_ITERATIONS), fixed=True)
+    preset: str = option("small", help="model size", choices=tuple(DEFAULT_ITERATIONS))
     source: str = ""  #: what `data.load` was given; stored so that a resumed run reads the same data
     feature_width: int = option(
-        32,
-        help=f"numbers of an anchor's feature, 1 to {MAX_FEATURE}",
-        metavar="N",
-        least=1,
-        most=MAX_FEATURE,
-        before=32,
-        fixed=True,
+        32, help=f"numbers of an anchor's feature, 1 to {MAX_FEATURE}", metavar="N", least=1, most=MAX_FEATURE
     )
-    slots: int = option(
-        10,
-        help=f"Gaussians of an anchor, 1 to {MAX_SLOTS}",
-        metavar="N",
-        least=1,
-        most=MAX_SLOTS,
-        before=10,
-        fixed=True,
-    )
-    downscale: int = option(1, fixed=True)
-    holdout: int = option(8, fixed=True)
+    slots: int = option(10, help=f"Gaussians of an anchor, 1 to {MAX_SLOTS}", metavar="N", least=1, most=MAX_SLOTS)
+    downscale: int = option(1)
+    holdout: int = option(8)
     #: None: the preset's default, or by the clock if there is a time limit
     iterations: int | None = option(
-        None,
-        help="training steps (default: by preset, unless --max-seconds is given)",
-        metavar="N",
-        least=1,
-        fixed=True,
+        None, help="training steps (default: by preset, unless --max-seconds is given)", metavar="N", least=1
     )
     #: without `iterations` the whole schedule is spread over the time, with them it stops the run early
     max_seconds: float | None = option(
-        None, help="time to train; a resumed run counts the time before it too", metavar="S", above=0
+        None, help="time to train; a resumed run counts the time before it too", metavar="S", above=0, fixed=False
     )
-    seed: int = option(0, help="seed of all randomness in training", metavar="N", least=0, most=2**63 - 2, fixed=True)
+    seed: int = option(0, help="seed of all randomness in training", metavar="N", least=0, most=2**63 - 2)
     lambdas: tuple[float, float, float] = (0.04, 0.01, 0.00025)  #: rate weight per level
     #: multiplies every lambda; 1 is the paper's operating point
-    rate_scale: float = option(
-        0.08, help="weight of the anchors' bit rate; 1 is the paper's", least=0, dial=4.0, fixed=True
-    )
+    rate_scale: float = option(0.08, help="weight of the anchors' bit rate; 1 is the paper's", least=0, dial=4.0)
     rate_share: float = 0.05  #: share of the anchors from which a step estimates the rate
-    plane_rate: float = option(4e-9, least=0, dial=4.0, before=0.0)  #: weight of a bit of the planes, ramped up
+    plane_rate: float = option(4e-9, least=0, dial=4.0, fixed=False)  #: weight of a bit of the planes, ramped up
     tmc: float = 0.01
     tmc_binary: bool = True
     #: the binary term's weight grows to this multiple of its start, so that masks end near 0 or 1: an anchor that is
     #: half visible at a level takes all its bytes there
-    tmc_binary_growth: float = option(20.0, before=1.0)
+    tmc_binary_growth: float = 20.0
     tmc_smooth: bool = True
     tmc_tau: float = 4.0  #: voxels
     #: the gradients of a step's views are averaged; workers share the views
     views_per_step: int = option(
-        1,
-        help="views of each level per step; torchrun's workers share them",
-        metavar="V",
-        least=1,
-        before=1,
-        fixed=True,
+        1, help="views of each level per step; torchrun's workers share them", metavar="V", least=1
     )
-    rollout: str = option("adaptive", help="which level each step trains", choices=ROLLOUTS, fixed=True)
+    rollout: str = option("adaptive", help="which level each step trains", choices=ROLLOUTS)
     #: 0 is a static scaffold, 1 a scaffold with its global deformation
-    max_layer: int = option(2, help="train without the layers above this one", choices=(0, 1, 2), fixed=True)
+    max_layer: int = option(2, help="train without the layers above this one", choices=(0, 1, 2))
     #: leave out levels that gain too little on held-back training views, see `phases.levels`
-    judge: bool = option(True, before=False)
+    judge: bool = True
     prune: float = option(
         0.14,
         help="prune anchors half way through the run, as long as together they add at most this share to the squared "
         "error; 0 prunes none",
-        least=0, most=1, dial=3.0, before=0.0, fixed=True,
-    )  # fmt: skip
+        least=0,
+        most=1,
+        dial=3.0,
+    )
     grading: float = option(
         0.05,
         help="coarser steps for anchors that pictures depend on little, adding at most this share to the squared "
         "error; 0 grades none",
-        least=0, most=1, dial=3.0, before=0.0, fixed=True,
-    )  # fmt: skip
-    whitening: bool = option(True, before=False)  #: transform the channels of the features, see `phases.quantisation`
+        least=0,
+        most=1,
+        dial=3.0,
+    )
+    whitening: bool = True  #: transform the channels of the features, see `phases.quantisation`
     prefixes: float = option(
         0.0,
         help="share of the steps of the last third that render only the most useful anchors of level 0, for pictures "
         "from the first slices of pd4dgs-encode --slices; 0.3 is a high value",
-        least=0, most=1, fixed=True,
-    )  # fmt: skip
+        least=0,
+        most=1,
+    )
     #: share of the run, at its end, over which all learning rates fall to 0: otherwise the last steps carry weights
     #: over the edges of their rounding intervals, and the PSNR jumps by tenths of a dB from one step to the next
-    cooldown: float = option(0.4, least=0, most=1, before=0.0)
+    cooldown: float = option(0.4, least=0, most=1, fixed=False)
     ssim: float = 0.2
     volume: float = 0.01  #: weight of the mean product of scales (Scaffold-GS)
     noise: bool = True  #: simulate quantisation: noise on attributes, rounding of planes and weights, finally of all
     grow_threshold: float = 2e-4
-    steps: Steps | None = None  #: None: the preset's
     #: multiplies the steps of features, log-scalings and planes
-    step_scale: float = option(1.16, above=0, dial=1.6, before=1.0)
+    step_scale: float = option(1.16, above=0, dial=1.6, fixed=False)
     rates: LearningRates = field(default_factory=LearningRates)
     global_planes: PlaneWeights = PlaneWeights(1e-4, 5e-4, 5e-5)
     local_planes: PlaneWeights = PlaneWeights(2e-4, 1e-3, 1e-4)
@@ -224,9 +199,8 @@ class TrainConfig:
         """Of a fresh model's anchors."""
         return Widths(self.feature_width, self.slots)
 
-    def model_steps(self, preset: Steps) -> Steps:
+    def model_steps(self, steps: Steps) -> Steps:
         """The steps of a fresh model whose preset has the given ones."""
-        steps = self.steps or preset
         return replace(steps, **{name: getattr(steps, name) * self.step_scale for name in COARSENED})
 
     def to_json(self) -> str:
@@ -235,15 +209,9 @@ class TrainConfig:
 
     @classmethod
     def from_json(cls, text: str, path: str) -> TrainConfig:
-        """The inverse of `to_json`; fields that the text lacks have their values of `BEFORE`, else their defaults.
-
-        Raises TrainError naming the checkpoint `path` for a text that holds no configuration.
-        """
+        """The inverse of `to_json`. Raises TrainError naming the checkpoint `path` if `text` holds no configuration."""
         try:
-            plain = BEFORE | json.loads(text)
-            if plain.get("steps") is not None:  # None by default, so that the default does not tell the type
-                plain["steps"] = Steps(**plain["steps"])
-            config: TrainConfig = _rebuilt(plain, TrainConfig())
+            config: TrainConfig = _rebuilt(json.loads(text), TrainConfig())
             return config
         except (ValueError, TypeError, AttributeError) as error:
             raise TrainError(f"{path}: its stored configuration cannot be read: {error}") from None
@@ -251,16 +219,10 @@ class TrainConfig:
 
 #: The declared fields of `TrainConfig`.
 OPTIONS: dict[str, Option] = {f.name: f.metadata["option"] for f in fields(TrainConfig) if "option" in f.metadata}
-#: Fields that checkpoints of earlier versions lack, with the values they were trained with.
-BEFORE: dict[str, Any] = {name: about.before for name, about in OPTIONS.items() if about.before is not None}
 #: Fields that a resumed run takes from its checkpoint and the command line may not contradict.
 FIXED = tuple(name for name, about in OPTIONS.items() if about.fixed)
 #: What the quality dial moves, as (value at 50, value at 0 over it).
-DIAL: dict[str, tuple[float, float]] = {
-    f.name: (f.default, OPTIONS[f.name].dial)  # type: ignore[misc]
-    for f in fields(TrainConfig)
-    if f.name in OPTIONS and OPTIONS[f.name].dial
-}
+DIAL = {name: (getattr(TrainConfig, name), about.dial) for name, about in OPTIONS.items() if about.dial is not None}
 DEFAULT_QUALITY = 50.0
 
 

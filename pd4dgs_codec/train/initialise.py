@@ -45,12 +45,13 @@ def fresh_model(
     anchor_q = initial_cells(dataset, config.initial_anchors, info.voxel_size, generator)
     n = len(anchor_q)
     spacing = nearest_distances((anchor_q.double() * info.voxel_size).float()).clamp(min=info.voxel_size)
-    fields: list[DeformationField | None] = []
-    for field, heads, start_spacing, step in (
-        (config.global_deformation, widths.global_heads, GLOBAL_SPACING, steps.planes_global),
-        (config.local_deformation, LOCAL_HEADS, None, steps.planes_local),
-    ):
-        fields.append(None if field is None else DeformationField.fresh(field, info.box, heads, start_spacing, step))
+    fields: list[DeformationField | None] = [
+        None if field is None else DeformationField.fresh(field, info.box, heads, start_spacing, step)
+        for field, heads, start_spacing, step in (
+            (config.global_deformation, widths.global_heads, GLOBAL_SPACING, steps.planes_global),
+            (config.local_deformation, LOCAL_HEADS, None, steps.planes_local),
+        )
+    ]
     model = Model(
         info,
         steps,
@@ -60,8 +61,7 @@ def fresh_model(
         torch.zeros(n, widths.slots, 3),
         fresh_mask_logits(n, min(config.level, max_layer)),
         fresh_networks(widths, config.hidden),
-        fields[0],
-        fields[1],
+        *fields,  # type: ignore[arg-type]
     )
     if max_layer < 2:
         model.local_deformation = None
@@ -151,12 +151,19 @@ def carved_points(dataset: Dataset, count: int, generator: torch.Generator) -> T
     low, high = (torch.from_numpy(np.asarray(dataset.box[i], np.float32)) for i in (0, 1))
     points = low + (high - low) * torch.rand(CARVE_CANDIDATES * count, 3, generator=generator)
     background = np.array(dataset.background, np.float32) * 255
-    seen, hits = torch.zeros(len(points)), torch.zeros(len(points))
+    px, py, pz = points.numpy().T.copy()
+    seen, hits = np.zeros(len(points), np.float32), np.zeros(len(points), np.float32)
     for view in dataset.train[:: max(1, len(dataset.train) // CARVE_VIEWS)]:
         shown = np.abs(view.image - background).max(2) > CARVE_CONTRAST
         viewmat, K = (np.array(m, np.float32) for m in (view.viewmat, view.K))
-        _look(seen.numpy(), hits.numpy(), points.numpy(), viewmat, K, shown)
-    share = (hits + 1e-3) / (seen + 1)  # little evidence from few views
+        x, y, z = (row[3] + row[0] * px + row[1] * py + row[2] * pz for row in viewmat[:3])
+        with np.errstate(divide="ignore", invalid="ignore"):
+            column, line = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
+        height, width = shown.shape
+        inside = (z > 0) & (column >= 0) & (column < width) & (line >= 0) & (line < height)
+        seen[inside] += 1
+        hits[inside] += shown[line[inside].astype(int), column[inside].astype(int)]
+    share = torch.from_numpy((hits + np.float32(1e-3)) / (seen + 1))  # little evidence from few views
     return points[torch.multinomial(share.square(), count, generator=generator)]
 
 
@@ -170,32 +177,6 @@ def nearest_distances(points: Tensor, k: int = 3) -> Tensor:
     out = torch.empty(n)
     out[order] = torch.from_numpy(squares).sqrt()
     return out
-
-
-@parallel(lambda seen, *_: len(seen))
-def _look(
-    tasks: Tasks,
-    seen: np.ndarray,
-    hits: np.ndarray,
-    points: np.ndarray,
-    viewmat: np.ndarray,
-    K: np.ndarray,
-    shown: np.ndarray,
-) -> None:
-    """Counts in seen [n] the points [n, 3] that lie in a view's picture, in hits those on an object, `shown` bool
-    [height, width]. viewmat [4, 4]: world to camera; K [3, 3]: camera to pixels."""
-    height, width = shown.shape
-    for i in range(tasks[0], tasks[1]):
-        x, y, z = viewmat[0, 3], viewmat[1, 3], viewmat[2, 3]
-        for axis in range(3):
-            x += viewmat[0, axis] * points[i, axis]
-            y += viewmat[1, axis] * points[i, axis]
-            z += viewmat[2, axis] * points[i, axis]
-        if z > 0:
-            column, row = K[0, 0] * x / z + K[0, 2], K[1, 1] * y / z + K[1, 2]
-            if 0 <= column < width and 0 <= row < height:
-                seen[i] += 1
-                hits[i] += shown[int(row), int(column)]
 
 
 @parallel(lambda out, *_: len(out))

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -14,7 +13,6 @@ from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.errors import NotFinite
 from pd4dgs_codec.model.config import ModelConfig
 from pd4dgs_codec.model.model import Model
-from pd4dgs_codec.model.networks import Rounding
 from pd4dgs_codec.model.picture import Picture, render
 from pd4dgs_codec.threads import keep_freed_memory
 from pd4dgs_codec.train import workers
@@ -28,12 +26,12 @@ from pd4dgs_codec.train.phases.prune import Prune
 from pd4dgs_codec.train.phases.quantisation import FitQuantisation
 from pd4dgs_codec.train.schedule import (
     CAPACITY_WEIGHTED,
+    LOWEST,
     PRUNING_ROUNDS,
     TOP,
     UNIFORM,
     Schedule,
     rollout_probabilities,
-    sample_level,
     updated_rho,
 )
 from pd4dgs_codec.train.ssim import image_loss
@@ -66,27 +64,21 @@ class Learner(TrainState):
         pruning = (Prune(turn) for turn in range(PRUNING_ROUNDS))
         self.before_step: list[Phase] = [self.levels, FitQuantisation(), *pruning, self.prefixes]
 
-    @property
-    def left_out(self) -> list[dict[str, Any]]:
-        """The levels removed because they gain too little: level, gain in dB, number of views."""
-        return self.levels.left_out
-
-    def step(self, levels: Sequence[int] | None = None) -> dict[str, Any]:
-        """One training step; returns its log record with every term unweighted. levels: those to train, ascending, each
-        on views of its own; by default drawn as the rollout says."""
+    def step(self) -> dict[str, Any]:
+        """One training step; returns its log record with every term unweighted."""
         record: dict[str, Any] = {"iteration": self.iteration}
         self._apply(self.before_step, record)
-        only = self.prefixes.draw(self) if levels is None else None
-        if only is not None:
-            levels, record["prefix"] = (0,), int(only.sum())
-        chosen, probabilities = self._draw_levels() if levels is None else _given(levels)
-        record["level"] = chosen[-1]
-        drawn = [(self._next_view(), level) for level in chosen for _ in range(self.config.views_per_step)]
+        only = self.prefixes.draw(self)
+        if only is None:
+            levels, record["pi"] = self._draw_levels()
+        else:
+            levels, record["pi"], record["prefix"] = (0,), LOWEST, int(only.sum())
+        record["level"] = levels[-1]
+        drawn = [(self._next_view(), level) for level in levels for _ in range(self.config.views_per_step)]
         if not self._learn(drawn, record, only):
             self.skipped += 1
             record["skipped"] = self.skipped
         self.optimiser.zero_grad()
-        record["pi"] = probabilities
         self._measure(record)
         return record
 
@@ -102,19 +94,20 @@ class Learner(TrainState):
 
     def _draw_levels(self) -> tuple[tuple[int, ...], Probabilities]:
         """The levels of this step, ascending, and the probabilities that they were drawn with."""
-        rollout, started = self.config.rollout, self.position >= self.schedule.rho_start
+        rollout = self.config.rollout
         if self.position < self.schedule.coarse_end:
-            return _given((0,))
+            return (0,), LOWEST
         if rollout == "all":
             return tuple(range(self.model.level + 1)), (1.0, 1.0, 1.0)
         if rollout == "top":
             probabilities = TOP
-        elif rollout == "uniform" or not started:
+        elif rollout == "uniform" or self.position < self.schedule.progressive:
             probabilities = UNIFORM
         else:
             probabilities = CAPACITY_WEIGHTED if rollout == "fixed" else rollout_probabilities(self.rho)
         draw = float(torch.rand((), generator=self.generator))
-        return (min(sample_level(probabilities, draw), self.model.level),), probabilities
+        level = int(draw >= probabilities[0]) + int(draw >= probabilities[0] + probabilities[1])
+        return (min(level, self.model.level),), probabilities
 
     def _next_view(self) -> int:
         if not self.order:
@@ -134,12 +127,12 @@ class Learner(TrainState):
             pictures = self._shared_gradients(pictures)
         if pictures is None:
             return False
-        record["gradient_norm"] = norm = self.optimiser.gradient_norm()
+        record["gradient_norm"] = norm = self.optimiser.clip_gradients(self.config.max_gradient_norm)
         if not math.isfinite(norm):
             return False
-        if norm > self.config.max_gradient_norm:
-            self.optimiser.scale_gradients(self.config.max_gradient_norm / norm)
-        self._update(pictures, record)
+        self.grow.observe(self, pictures)
+        self.optimiser.step(self.schedule.progress(self.position))
+        self._apply([self.grow], record)
         return True
 
     def _pictures(
@@ -152,14 +145,19 @@ class Learner(TrainState):
             seeds = torch.randint(1 << 62, (len(drawn),), generator=self.generator).tolist()
         own = list(zip(drawn, seeds, strict=True))[workers.rank() :: workers.count()]
         for (index, level), seed in own:
-            earlier = self.optimiser.take_gradients()
+            earlier, state = self.optimiser.take_gradients(), self.generator.get_state()
+            if seed is not None:  # a view's random numbers must not depend on its worker
+                self.generator.manual_seed(seed)
+                self.noise.generator.manual_seed(seed + 1)
             try:
-                with self._drawing_from(seed):
-                    pictures.append(self._gather(index, level, only, record))
-                self.optimiser.add_gradients(earlier)  # sums a view's gradients first, as they are of another worker
+                pictures.append(self._gather(index, level, only, record))
             except NotFinite as error:  # a diverged step can be skipped; any other error would come again
                 record["refused"] = str(error)
                 return None
+            finally:
+                if seed is not None:
+                    self.generator.set_state(state)
+            self.optimiser.add_gradients(earlier)  # sums a view's gradients first, as they are of another worker
             if not math.isfinite(record["loss"]):
                 return None
         return pictures
@@ -167,10 +165,10 @@ class Learner(TrainState):
     def _gather(self, index: int, level: int, only: Tensor | None, record: dict[str, Any]) -> Picture:
         """The picture of training view `index` at `level`, the gradients of its loss summed and its terms in the
         record. Raises NotFinite where the model has diverged."""
-        rounding, share = self.rounding(), 1 / self.config.views_per_step
+        share = 1 / self.config.views_per_step
         finish = self.model_loss.begin(self.model, level, self.schedule, self.position)
         try:
-            picture, terms, loss = self.picture_loss(index, level, rounding, only)
+            picture, terms, loss = self.picture_loss(index, level, only)
             torch.autograd.backward(loss * share)
         finally:
             rest = finish()
@@ -181,20 +179,6 @@ class Learner(TrainState):
         record["loss"] = float(loss.detach()) + rest.loss
         record |= {name: float(value.detach()) for name, value in terms.items()} | rest.terms
         return picture
-
-    @contextmanager
-    def _drawing_from(self, seed: int | None) -> Iterator[None]:
-        """Draws the random numbers of one of several views from its seed, so that they do not depend on its worker."""
-        if seed is None:
-            yield
-            return
-        state = self.generator.get_state()
-        self.generator.manual_seed(seed)
-        self.noise.generator.manual_seed(seed + 1)
-        try:
-            yield
-        finally:
-            self.generator.set_state(state)
 
     def _shared_gradients(self, pictures: list[Picture] | None) -> list[Picture] | None:
         """Sums the gradients of all workers; None if any of them was not finite."""
@@ -209,17 +193,17 @@ class Learner(TrainState):
         return None if failed else pictures
 
     def picture_loss(
-        self, index: int, level: int, rounding: Rounding, only: Tensor | None = None
+        self, index: int, level: int, only: Tensor | None = None
     ) -> tuple[Picture, dict[str, Tensor], Tensor]:
         """(picture of training view `index` at `level`, unweighted terms by name, their weighted sum).
 
         only: bool [N], the anchors to render, if not all. Raises NotFinite where the model has diverged.
         """
         config, shown = self.config, self.views[index]
-        picture = render(self.model, level, shown.view.time, shown.view.camera, rounding, only)
+        picture = render(self.model, level, shown.view.time, shown.view.camera, self.rounding(), only)
         if picture.meta["means2d"].requires_grad:
             picture.meta["means2d"].retain_grad()
-        l1, dissimilarity = image_loss(picture.image, shown.target)
+        l1, dissimilarity = image_loss(picture.image, shown.image, shown.weights)
         terms = {"l1": l1, "dssim": dissimilarity}
         loss = (1 - config.ssim) * l1 + config.ssim * dissimilarity
         if config.volume and len(picture.gaussians.scales):
@@ -228,16 +212,10 @@ class Learner(TrainState):
             loss = loss + config.volume * terms["volume"]
         return picture, terms, loss
 
-    def _update(self, pictures: list[Picture], record: dict[str, Any]) -> None:
-        """Adam, then growing."""
-        self.grow.observe(self, pictures)
-        self.optimiser.step(self.schedule.progress(self.position))
-        self._apply([self.grow], record)
-
     def _measure(self, record: dict[str, Any]) -> None:
         """Updates rho at its intervals, completes the record and counts the step."""
-        measured = self.reached_multiple(self.schedule.rho_every)
-        if measured and self.position >= self.schedule.rho_start:
+        measured = self.reached(self.position - self.position % self.schedule.rho_every)
+        if measured and self.position >= self.schedule.progressive:
             with torch.no_grad():
                 self.rho = updated_rho(self.rho, self.model.masks(0), self.model.masks(2))
         record |= {"rho": self.rho, "anchors": len(self.model.anchor_q)}
@@ -245,7 +223,8 @@ class Learner(TrainState):
             record["active"] = self.active_anchors()
         if self.share is not None:
             record["place"] = self.position
-        self.advance()
+        self._before = self.position
+        self.iteration += 1
 
     # -- checkpoints -----------------------------------------------------------------------------------------------
 
@@ -261,9 +240,3 @@ class Learner(TrainState):
         super().restore(model, state)
         for phase in self.before_step:
             phase.restore(state)
-
-
-def _given(levels: Sequence[int]) -> tuple[tuple[int, ...], Probabilities]:
-    """Levels that are not drawn, and their probabilities."""
-    first, second, third = (float(level in levels) for level in range(3))
-    return tuple(levels), (first, second, third)

@@ -6,6 +6,7 @@ takes a second of every start.
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
@@ -24,11 +25,11 @@ STEP, MEAN, SQUARE = "step", "exp_avg", "exp_avg_sq"
 class Optimiser:
     """One Adam with a group per learning-rate schedule.
 
-    groups: parameters by the field of LearningRates they follow. rate: of each group's latest step. moments: of each
-    parameter that has had a gradient, by STEP, MEAN and SQUARE.
+    groups: parameters by the field of LearningRates they follow. moments: of each parameter that has had a gradient, by
+    STEP, MEAN and SQUARE.
     """
 
-    def __init__(self, model: Model, rates: LearningRates, cooldown: float = 0.0):
+    def __init__(self, model: Model, rates: LearningRates, cooldown: float):
         self.model, self.rates, self.cooldown = model, rates, cooldown
         groups: dict[str, list[nn.Parameter]] = {name: [getattr(model, name)] for name in PER_ANCHOR}
         groups |= {name: list(net.parameters()) for name, net in model.networks.items()}
@@ -36,7 +37,6 @@ class Optimiser:
         groups["planes"] = [p for f in fields for p in f.features]
         groups["deformation"] = [p for f in fields for p in f.weights]
         self.groups = {name: params for name, params in groups.items() if params}
-        self.rate = dict.fromkeys(self.groups, 0.0)
         self.moments: dict[Tensor, dict[str, Tensor]] = {}
 
     @property
@@ -48,34 +48,28 @@ class Optimiser:
     def step(self, progress: float) -> None:
         """One update at progress 0..1 of the schedule."""
         for name, params in self.groups.items():
-            self.rate[name] = learning_rate(getattr(self.rates, name), progress, self.cooldown)
+            rate = learning_rate(getattr(self.rates, name), progress, self.cooldown)
             moved: list[Tensor] = [p for p in params if p.grad is not None]
+            for p in moved:
+                if p not in self.moments:
+                    zero = torch.zeros((), device=p.device)
+                    self.moments[p] = {STEP: zero, MEAN: torch.zeros_like(p), SQUARE: torch.zeros_like(p)}
+            means, squares, steps = ([self.moments[p][name] for p in moved] for name in (MEAN, SQUARE, STEP))
+            gradients = [p.grad for p in moved if p.grad is not None]
             if moved:
-                self._update(moved, self.rate[name])
+                torch._foreach_add_(steps, 1)
+                torch._fused_adam_(
+                    moved, gradients, means, squares, [], steps, amsgrad=False, maximize=False, beta1=0.9, beta2=0.99,
+                    lr=rate, weight_decay=0.0, eps=1e-15,
+                )  # fmt: skip
 
-    def _update(self, params: list[Tensor], rate: float) -> None:
-        for p in params:
-            if p not in self.moments:
-                zero = torch.zeros((), device=p.device)
-                self.moments[p] = {STEP: zero, MEAN: torch.zeros_like(p), SQUARE: torch.zeros_like(p)}
-        means, squares, steps = ([self.moments[p][name] for p in params] for name in (MEAN, SQUARE, STEP))
-        gradients = [p.grad for p in params if p.grad is not None]
-        torch._foreach_add_(steps, 1)
-        torch._fused_adam_(
-            params, gradients, means, squares, [], steps, amsgrad=False, maximize=False, beta1=0.9, beta2=0.99,
-            lr=rate, weight_decay=0.0, eps=1e-15,
-        )  # fmt: skip
-
-    def gradient_norm(self) -> float:
-        """Norm over all gradients; not finite if one of them is not."""
+    def clip_gradients(self, most: float) -> float:
+        """Norm over all gradients, which are scaled down to `most`; not finite if one of them is not."""
         gradients = [p.grad for p in self.parameters if p.grad is not None]
-        return float(torch.stack(torch._foreach_norm(gradients)).norm()) if gradients else 0.0
-
-    def scale_gradients(self, factor: float) -> None:
-        """All gradients times `factor`."""
-        for p in self.parameters:
-            if p.grad is not None:
-                p.grad.mul_(factor)
+        norm = float(torch.stack(torch._foreach_norm(gradients)).norm()) if gradients else 0.0
+        if most < norm < math.inf:
+            torch._foreach_mul_(gradients, most / norm)
+        return norm
 
     def take_gradients(self) -> list[Tensor | None]:
         """The gradients of all parameters, which then have none."""
@@ -109,11 +103,6 @@ class Optimiser:
         self.model.anchor_q = torch.cat([self.model.anchor_q[keep], added["anchor_q"]])
         graded = self.model.step_class
         self.model.step_class = torch.cat([graded[keep], graded.new_zeros(len(added["anchor_q"]))])
-
-    def keep_anchors(self, keep: Tensor) -> None:
-        """Keeps only the anchors `keep` (int64)."""
-        names = (*PER_ANCHOR, "anchor_q")
-        self.replace_anchors(keep, {name: getattr(self.model, name).detach()[:0] for name in names})
 
     @torch.no_grad()
     def transform(self, parameter: Tensor, columns: slice, right: Tensor, *, transposed: bool = False) -> None:

@@ -3,13 +3,12 @@
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
 from typing import Any
 
 #: Probabilities of the levels 0, 1, 2.
 UNIFORM = (1 / 3, 1 / 3, 1 / 3)
 CAPACITY_WEIGHTED = (0.15, 0.30, 0.55)
-TOP = (0.0, 0.0, 1.0)
+TOP, LOWEST = (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
 #: Weight of the past in the moving average rho.
 RHO_DECAY = 0.95
 #: Share of a run in which level 0 alone is trained.
@@ -18,74 +17,37 @@ COARSE_SHARE = 1 / 10
 PRUNING_ROUNDS = 4
 
 
-@dataclass(frozen=True)
 class Schedule:
     """The phases of a run of N iterations, as fractions of N (the paper's N is 30,000).
 
     iterations: N; None as long as the time limit of a run has not settled it. Such a run stays in its coarse phase:
     every later phase begins at infinity, and nothing is grown or pruned.
+    coarse_end: before it only level 0 is trained; from it on, quantisation noise is added.
+    progressive: the rate term, TMC and the average rho start here (T_progressive; T_warm is within the coarse phase).
+    rho_every: iterations between updates of rho (K).
+    rounding: planes and weights are rounded straight-through from here on.
+    exact_rounding: the anchors' attributes are rounded straight-through from here on, where noise simulated it before.
+    grow: iterations after which anchors are grown and pruned.
+    prune: iterations before which anchors of little use are pruned; growing has ended.
     """
 
-    iterations: int | None
+    def __init__(self, iterations: int | None):
+        def at(fraction: float) -> float:
+            return math.inf if iterations is None else round(iterations * fraction)
 
-    def _at(self, fraction: float) -> float:
-        return math.inf if self.iterations is None else round(self.iterations * fraction)
+        self.iterations = iterations
+        self.coarse_end, self.progressive, self.rho_every = at(COARSE_SHARE), at(1 / 3), max(1, at(1 / 150))
+        self.rounding, self.exact_rounding = at(2 / 3), at(9 / 10)
+        self.grow = self.prune = range(0)
+        if iterations is not None:
+            every = max(20, round(iterations * (1 / 100)))
+            self.grow = range(round(iterations * (1 / 60)) + every, round(iterations * (1 / 2)) + 1, every)
+            every = max(1, round(iterations * (1 / 50)))
+            self.prune = range(self.grow.stop, self.grow.stop + PRUNING_ROUNDS * every, every)
 
     def progress(self, iteration: int) -> float:
         """The share of the run, 0..1, that lies before `iteration`; 0 while N is not known."""
         return iteration / self.iterations if self.iterations else 0.0
-
-    @property
-    def coarse_end(self) -> float:
-        """Before it only level 0 is trained; from it on, quantisation noise is added."""
-        return self._at(COARSE_SHARE)
-
-    @property
-    def warm(self) -> float:
-        """The method samples levels uniformly before it (T_warm). Here it ends within the coarse phase, and rho_start,
-        never earlier, takes its place."""
-        return self._at(1 / 15)
-
-    @property
-    def progressive(self) -> float:
-        """The rate term, TMC and the average rho start here (T_progressive)."""
-        return self._at(1 / 3)
-
-    @property
-    def rho_start(self) -> float:
-        """rho's moving average starts here."""
-        return max(self.warm, self.progressive)
-
-    @property
-    def rho_every(self) -> float:
-        """Iterations between updates of rho (K)."""
-        return max(1, self._at(1 / 150))
-
-    @property
-    def grow(self) -> range:
-        """Iterations after which anchors are grown and pruned."""
-        if self.iterations is None:
-            return range(0)
-        every = max(20, round(self.iterations * (1 / 100)))
-        return range(round(self.iterations * (1 / 60)) + every, round(self.iterations * (1 / 2)) + 1, every)
-
-    @property
-    def prune(self) -> range:
-        """Iterations before which anchors of little use are pruned; growing has ended."""
-        if self.iterations is None:
-            return range(0)
-        every = max(1, round(self.iterations * (1 / 50)))
-        return range(self.grow.stop, self.grow.stop + PRUNING_ROUNDS * every, every)
-
-    @property
-    def rounding(self) -> float:
-        """Planes and weights are rounded straight-through from here on."""
-        return self._at(2 / 3)
-
-    @property
-    def exact_rounding(self) -> float:
-        """The anchors' attributes are rounded straight-through from here on, where noise simulated it before."""
-        return self._at(9 / 10)
 
     def separation(self, iteration: int) -> float:
         """Progress of the masks' separation, 0..1, from the start of the mask terms to exact rounding."""
@@ -111,7 +73,7 @@ class Schedule:
             "rate and mask terms": self.progressive,
             "rounding of planes and weights": self.rounding,
             "exact rounding of attributes": self.exact_rounding,
-            "the end of the learning-rate schedule": self._at(1) - 1,
+            "the end of the learning-rate schedule": math.inf if self.iterations is None else self.iterations - 1,
         }
         return [name for name, start in starts.items() if iteration <= start]
 
@@ -120,7 +82,6 @@ def learning_rate(bounds: tuple[float, float], progress: float, cooldown: float 
     """Log-linear between the bounds at progress 0..1; times a factor that falls from 1 to 0 over the last `cooldown`
     of it."""
     start, end = bounds
-    progress = min(max(progress, 0.0), 1.0)
     left = min((1 - progress) / cooldown, 1.0) if cooldown else 1.0
     return start * math.pow(end / start, progress) * left
 
@@ -129,11 +90,6 @@ def rollout_probabilities(rho: float) -> tuple[float, float, float]:
     """pi(rho) = (1 - rho) (1/3, 1/3, 1/3) + rho (.15, .30, .55), of the levels 0, 1, 2."""
     low, mid, high = ((1 - rho) * u + rho * c for u, c in zip(UNIFORM, CAPACITY_WEIGHTED, strict=True))
     return low, mid, high
-
-
-def sample_level(probabilities: tuple[float, float, float], draw: float) -> int:
-    """The level at `draw`, uniform in 0..1."""
-    return 0 if draw < probabilities[0] else 1 if draw < probabilities[0] + probabilities[1] else 2
 
 
 def updated_rho(rho: float, mask_0: Any, mask_2: Any) -> float:

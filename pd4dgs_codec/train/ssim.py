@@ -21,73 +21,53 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pd4dgs_codec.draw.simd import LANES, Tasks, fma, fnma, kernel, load, parallel, splat, store
-from pd4dgs_codec.errors import TrainError
 
 C1, C2 = 0.01**2, 0.03**2
-TAPS = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
-TAPS /= TAPS.sum()
+EXACT_TAPS = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
+EXACT_TAPS /= EXACT_TAPS.sum()
+TAPS = EXACT_TAPS.astype(np.float32)
 REACH = 5
 SIDE = 3 * REACH
 
 
-class Target:
-    """A training image and what SSIM needs of it alone.
-
-    image: [H, W, 3] float, 0..1. mask: [H, W] weights >= 0 (bool or float), None for all ones. The image's blurred
-    statistics are computed anew for each loss, a fifth of its time: kept, they were 8 bytes per value.
-    """
-
-    def __init__(self, image: Tensor, mask: Tensor | None = None):
-        if image.dim() != 3 or image.shape[2] != 3 or not image.is_floating_point() or not image.numel():
-            raise TrainError(f"training image must be float [H, W, 3], found {image.dtype} {tuple(image.shape)}")
-        if mask is not None and mask.shape != image.shape[:2]:
-            raise TrainError(f"mask must be {tuple(image.shape[:2])}, found {tuple(mask.shape)}")
-        self.image = image.detach().contiguous()
-        weights = image.new_ones(image.shape[:2]) if mask is None else mask.detach().to(image)
-        total = 3 * weights.sum(dtype=torch.float64)
-        #: [H, W], sums to 1 over the pixels and channels; all zero if the mask is.
-        self.weights = (weights / total.clamp_min(1e-6)).to(image.dtype).contiguous()
+def pixel_weights(mask: Tensor) -> Tensor:
+    """float32 [H, W]: the mask, scaled so that it sums to 1 over pixels and channels; all zero if the mask is."""
+    total = 3 * mask.sum(dtype=torch.float64)
+    return (mask / total.clamp_min(1e-6)).float()
 
 
 class _ImageLoss(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Target) -> tuple[Tensor, Tensor]:
-        x, y = pad(image.numpy()), pad(target.image.numpy())
-        weights, taps = target.weights.numpy(), TAPS.astype(x.dtype)
-        height, width = weights.shape
-        mean, variance = (np.empty((height, lanes(width)), y.dtype) for _ in range(2))
-        target_moments(mean, variance, y, taps)
-        slopes = np.zeros((3, *x.shape), x.dtype)
-        sums = np.empty((height, 2))
-        loss(slopes, sums, x, y, mean, variance, weights, taps)
-        ctx.saved = x, y, weights, slopes
+    def forward(ctx: Any, image: Tensor, target: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+        x, y, w = pad(image.numpy()), pad(target.numpy()), weights.numpy()
+        slopes, sums = np.zeros((3, *x.shape), x.dtype), np.empty((len(w), 2))
+        loss(slopes, sums, x, y, w, TAPS)
+        ctx.saved = x, y, w, slopes
         l1, dissimilarity = sums.sum(0)
         return image.new_tensor(l1), image.new_tensor(dissimilarity)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, g_l1: Tensor, g_dissimilarity: Tensor) -> tuple[Tensor, None]:
+    def backward(ctx: Any, g_l1: Tensor, g_dissimilarity: Tensor) -> tuple[Tensor, None, None]:
         x, y, weights, slopes = ctx.saved
         grad = np.empty((*weights.shape, 3), x.dtype)
         factors = np.array([g_l1.item(), g_dissimilarity.item()], x.dtype)
-        loss_backward(grad, x, y, weights, slopes, factors, TAPS.astype(x.dtype))
-        return torch.from_numpy(grad), None
+        loss_backward(grad, x, y, weights, slopes, factors, TAPS)
+        return torch.from_numpy(grad), None, None
 
 
-def image_loss(image: Tensor, target: Target) -> tuple[Tensor, Tensor]:
-    """(weighted mean of |image - target|, weighted mean of 1 - SSIM), scalars. image: [H, W, 3], linear 0..1."""
-    if image.shape != target.image.shape:
-        raise TrainError(f"render is {tuple(image.shape)}, its training image {tuple(target.image.shape)}")
-    image = image.to(target.image.dtype)
-    if image.device.type == "cpu":
-        l1, dissimilarity = _ImageLoss.apply(image.contiguous(), target)  # type: ignore[no-untyped-call]
-        return l1, dissimilarity
-    return image_loss_reference(image, target.image, target.weights)
+def image_loss(image: Tensor, target: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+    """(weighted mean of |image - target|, weighted mean of 1 - SSIM), scalars. image, target: float32 [H, W, 3], linear
+    0..1. weights: [H, W], from `pixel_weights`."""
+    if image.device.type != "cpu":
+        return image_loss_reference(image, target, weights)
+    l1, dissimilarity = _ImageLoss.apply(image.contiguous(), target, weights)  # type: ignore[no-untyped-call]
+    return l1, dissimilarity
 
 
 def image_loss_reference(image: Tensor, target: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-    """The plain torch form of `image_loss`; target [H, W, 3], weights [H, W] as in `Target`."""
-    taps = torch.from_numpy(TAPS).to(image).view(1, 1, -1, 1)
+    """The plain torch form of `image_loss`."""
+    taps = torch.from_numpy(EXACT_TAPS).to(image).view(1, 1, -1, 1)
 
     def blur(channels: Tensor) -> Tensor:
         return F.conv2d(F.conv2d(channels, taps, padding=(5, 0)), taps.mT, padding=(0, 5))
@@ -123,44 +103,23 @@ def _across(row: np.ndarray, k: int, taps: np.ndarray) -> Any:
     return value
 
 
-@parallel(lambda mean, *_: len(mean))
-def target_moments(tasks: Tasks, mean: np.ndarray, variance: np.ndarray, image: np.ndarray, taps: np.ndarray) -> None:
-    """mean, variance [H, lanes] of a padded image under the window."""
-    stride = image.shape[1]
-    zero = splat(image.dtype.type(0))
-    rows = np.empty((2, stride), image.dtype)
-    for j in range(tasks[0], tasks[1]):
-        for k in range(0, stride, LANES):
-            first = second = zero
-            for o in range(len(taps)):
-                a = load(image, (j + o) * stride + k)
-                weighted = a * splat(taps[o])
-                first = first + weighted
-                second = fma(weighted, a, second)
-            store(rows, k, first)
-            store(rows, stride + k, second)
-        for k in range(0, mean.shape[1], LANES):
-            m = _across(rows, k, taps)
-            store(mean, j * mean.shape[1] + k, m)
-            store(variance, j * mean.shape[1] + k, fnma(m, m, _across(rows, stride + k, taps)))
-
-
 @kernel(inline=True)
 def _down(rows: np.ndarray, x: np.ndarray, y: np.ndarray, j: int, taps: np.ndarray) -> None:
-    """rows [3, stride] = the vertical window of x, x^2 and x y at image row j."""
+    """rows [5, stride] = the vertical window of x, x^2, x y, y and y^2 at image row j."""
     stride = x.shape[1]
     zero = splat(x.dtype.type(0))
     for k in range(0, stride, LANES):
-        first = second = cross = zero
+        x1 = x2 = xy = y1 = y2 = zero
         for o in range(len(taps)):
-            a = load(x, (j + o) * stride + k)
-            weighted = a * splat(taps[o])
-            first = first + weighted
-            second = fma(weighted, a, second)
-            cross = fma(weighted, load(y, (j + o) * stride + k), cross)
-        store(rows, k, first)
-        store(rows, stride + k, second)
-        store(rows, 2 * stride + k, cross)
+            a, b = load(x, (j + o) * stride + k), load(y, (j + o) * stride + k)
+            weighted_a, weighted_b = a * splat(taps[o]), b * splat(taps[o])
+            x1, y1 = x1 + weighted_a, y1 + weighted_b
+            x2, xy, y2 = fma(weighted_a, a, x2), fma(weighted_a, b, xy), fma(weighted_b, b, y2)
+        store(rows, k, x1)
+        store(rows, stride + k, x2)
+        store(rows, 2 * stride + k, xy)
+        store(rows, 3 * stride + k, y1)
+        store(rows, 4 * stride + k, y2)
 
 
 @parallel(lambda slopes, sums, *_: len(sums))
@@ -170,8 +129,6 @@ def loss(
     sums: np.ndarray,
     x: np.ndarray,
     y: np.ndarray,
-    mean_y: np.ndarray,
-    var_y: np.ndarray,
     weights: np.ndarray,
     taps: np.ndarray,
 ) -> None:
@@ -181,21 +138,22 @@ def loss(
     layout of a padded image.
     """
     height, width = weights.shape
-    stride, n = x.shape[1], mean_y.shape[1]
+    stride, n = x.shape[1], (3 * width + LANES - 1) // LANES * LANES
     real = x.dtype.type
     one, two, c1, c2 = splat(real(1)), splat(real(2)), splat(real(C1)), splat(real(C2))
-    rows, part = np.empty((3, stride), x.dtype), np.empty(n, x.dtype)
+    rows, part = np.empty((5, stride), x.dtype), np.empty(n, x.dtype)
     weight = np.zeros(n, x.dtype)  # zero beyond the image, so that slopes stay zero there
     for j in range(tasks[0], tasks[1]):
         for i in range(3 * width):
             weight[i] = weights[j, i // 3]
         _down(rows, x, y, j, taps)
         for k in range(0, n, LANES):
-            mx, my, w = _across(rows, k, taps), load(mean_y, j * n + k), load(weight, k)
+            mx, my, w = _across(rows, k, taps), _across(rows, 3 * stride + k, taps), load(weight, k)
             var_x = fnma(mx, mx, _across(rows, stride + k, taps))
+            var_y = fnma(my, my, _across(rows, 4 * stride + k, taps))
             cov = fnma(mx, my, _across(rows, 2 * stride + k, taps))
             a1, a2 = two * mx * my + c1, two * cov + c2
-            b1, b2 = mx * mx + my * my + c1, var_x + load(var_y, j * n + k) + c2
+            b1, b2 = mx * mx + my * my + c1, var_x + var_y + c2
             inverse1, inverse2 = one / b1, one / b2
             w_inverse = w * inverse1 * inverse2
             w_ssim = w_inverse * a1 * a2

@@ -20,9 +20,9 @@ from pd4dgs_codec.quality.image import level_psnr
 from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.initialise import fresh_model
-from pd4dgs_codec.train.optimiser import Optimiser
+from pd4dgs_codec.train.optimiser import PER_ANCHOR, Optimiser
 from pd4dgs_codec.train.schedule import Schedule
-from pd4dgs_codec.train.ssim import Target
+from pd4dgs_codec.train.ssim import pixel_weights
 
 #: Bytes of images on the device, weights included, beyond which the least recently used are dropped.
 KEPT_BYTES = 1 << 30
@@ -30,26 +30,29 @@ KEPT_BYTES = 1 << 30
 
 @dataclass(frozen=True, eq=False)
 class TrainingView:
-    """A view of the dataset with its image on the device."""
+    """A view of the dataset on the device. image: float32 [H, W, 3], 0..1; weights: [H, W], see `pixel_weights`."""
 
     view: View
-    target: Target
+    image: Tensor
+    weights: Tensor
 
     @staticmethod
     def of(view: View, device: torch.device) -> TrainingView:
         """Copies the image to the device."""
         image = torch.as_tensor(view.image, device=device).float() / 255
-        mask = None if view.mask is None else torch.as_tensor(view.mask, device=device).float()
-        return TrainingView(view, Target(image, mask))
+        mask = image.new_ones(image.shape[:2])
+        if view.mask is not None:
+            mask = torch.as_tensor(view.mask, device=device).float()
+        return TrainingView(view, image, pixel_weights(mask))
 
     @property
     def nbytes(self) -> int:
-        """Of image and weights."""
-        return self.target.image.nbytes + self.target.weights.nbytes
+        """Bytes on the device."""
+        return self.image.nbytes + self.weights.nbytes
 
     def squared_error(self, image: Tensor) -> float:
         """Of a picture [H, W, 3] of this view, summed over colours and weighted pixels."""
-        return float(((image - self.target.image).square().sum(-1) * self.target.weights).sum())
+        return float(((image - self.image).square().sum(-1) * self.weights).sum())
 
 
 class TrainingViews:
@@ -128,15 +131,6 @@ class TrainState:
         """Whether this step is the first at or past position `start`."""
         return (self.position - 1 if self.share is None else self._before) < start <= self.position
 
-    def reached_multiple(self, every: float) -> bool:
-        """Whether this step is the first at or past some multiple of `every`."""
-        return self.reached(self.position - self.position % every)
-
-    def advance(self) -> None:
-        """Counts a step."""
-        self._before = self.position
-        self.iteration += 1
-
     def rounding(self, *, noisy: bool = True) -> Rounding:
         """How the steps at this position simulate quantisation; without its noise if not `noisy`."""
         if not self.config.noise:
@@ -177,17 +171,15 @@ class TrainState:
 
     def keep_anchors(self, rows: Tensor) -> None:
         """Keeps only the anchors `rows` (int64)."""
-        self.optimiser.keep_anchors(rows)
-        self._follow(rows, 0)
+        names = (*PER_ANCHOR, "anchor_q")
+        self.replace_anchors(rows, {name: getattr(self.model, name).detach()[:0] for name in names})
 
     def replace_anchors(self, rows: Tensor, added: dict[str, Tensor]) -> None:
         """Keeps the anchors `rows` (int64) and appends those of `added`, by attribute."""
         self.optimiser.replace_anchors(rows, added)
-        self._follow(rows, len(added["anchor_q"]))
-
-    def _follow(self, rows: Tensor, added: int) -> None:
         for name, value in self.statistics.items():
-            self.statistics[name] = torch.cat([value[rows.cpu()], value.new_zeros(added, *value.shape[1:])])
+            new = value.new_zeros(len(added["anchor_q"]), *value.shape[1:])
+            self.statistics[name] = torch.cat([value[rows.cpu()], new])
 
     # -- checkpoints -----------------------------------------------------------------------------------------------
 
@@ -196,7 +188,6 @@ class TrainState:
         return {
             "iteration": self.iteration,
             "total": self.schedule.iterations or 0,
-            "place": self.position,
             "share": self.share or 0.0,
             "passed": self._before,
             "rho": self.rho,
@@ -219,7 +210,7 @@ class TrainState:
         self.iteration, self.skipped = int(state["iteration"]), int(state["skipped"])
         self.schedule = Schedule(int(state["total"]) or None)
         if self.share is not None:
-            self.share, self._before = float(state.get("share", 0.0)), int(state.get("passed", -1))
+            self.share, self._before = float(state["share"]), int(state["passed"])
         self.rho = float(state["rho"])
         self.order = [int(index) for index in state["order"]]
 

@@ -51,22 +51,20 @@ def rank() -> int:
 
 def alike(measure: Callable[[], T]) -> T:
     """measure() of the first worker, for all: rounding on another machine must not lead to another decision. NotFinite
-    is raised on all workers."""
+    is raised on all workers. Tensors are on the CPU: each worker has a device of its own."""
     if count() == 1:
         return measure()
-    found: list[Any] = [None, None, None]
+    found: list[Any] = [None, None]
     if rank() == 0:
         try:
-            value = measure()
-            device = value.device.type if isinstance(value, Tensor) else None
-            found = [None, value.cpu() if isinstance(value, Tensor) else value, device]
+            found[1] = measure()
         except NotFinite as error:
             found[0] = str(error)
     distributed.broadcast_object_list(found)
-    diverged, value, device = found
+    diverged, value = found
     if diverged is not None:
         raise NotFinite(diverged)
-    result: T = value.to(device) if device else value  # each worker has a device of its own
+    result: T = value
     return result
 
 

@@ -86,10 +86,10 @@ def test_training_views_are_kept_within_a_budget(scene, monkeypatch):
 
     views = scene.train[:6]
     whole = TrainingViews(views, torch.device("cpu"))
-    size = whole[0].target.image.nbytes + whole[0].target.weights.nbytes
+    size = whole[0].image.nbytes + whole[0].weights.nbytes
     monkeypatch.setattr("pd4dgs_codec.train.state.KEPT_BYTES", 2 * size)
     few = TrainingViews(views, torch.device("cpu"))
     for index in (0, 1, 0, 5, 0, 2):
-        assert torch.equal(few[index].target.image, whole[index].target.image)
+        assert torch.equal(few[index].image, whole[index].image)
     assert set(few._kept) == {0, 2} and few._bytes == 2 * size
     assert few[0] is few[0] and len(few) == 6

@@ -16,8 +16,8 @@ from pd4dgs_codec.train.loop import Trainer
 def test_bytes_rise_with_the_dial(dataset, tmp_path, monkeypatch):
     monkeypatch.setattr(phases, "MIN_ITERATIONS", 10)
     files, sizes, psnr = [], [], []
-    for quality in (0, 50, 100):
-        trainer = Trainer(TrainConfig(preset="tiny", iterations=150, **at_quality(quality)), dataset)
+    for quality in (0, 100):
+        trainer = Trainer(TrainConfig(preset="tiny", iterations=90, **at_quality(quality)), dataset)
         trainer.run(tmp_path / "m.pt")
         model = trainer.model
         levels = level_psnr(
@@ -28,7 +28,7 @@ def test_bytes_rise_with_the_dial(dataset, tmp_path, monkeypatch):
         files.append(len(data))
         sizes.append(sum(stream.payload_bits for stream in streams if stream.name != "weights"))
         psnr.append(levels[2])
-    assert sizes[0] < 0.95 * sizes[1] and sizes[1] < 0.95 * sizes[2]
+    assert sizes[0] < 0.9 * sizes[1]
     assert files == sorted(files)  # of which weights, that the dial leaves alone, are more than half
     assert max(psnr) - min(psnr) < 0.5, psnr  # so short a run learns little that the dial could take
 

@@ -34,38 +34,29 @@ def test_every_level_is_trained_in_every_step_on_a_view_of_its_own_if_asked(data
     assert levels == (0, 1, 2) and len(set(views)) == 3
 
 
-@pytest.mark.parametrize("iteration", [0, 15])
-def test_levels_given_on_purpose_are_trained_and_none_is_drawn(dataset, monkeypatch, iteration):
-    steps = learner(dataset)
-    steps.step()  # draws the views' order
-    steps.iteration = iteration
-    seen, state = spied(steps, monkeypatch), steps.generator.get_state()
-    monkeypatch.setattr(steps.model_loss, "_mask_terms", lambda *_: ())  # they draw too
-    for levels in ((2,), (0,), (0, 1)):
-        record = steps.step(levels)
-        assert record["level"] == levels[-1] and record["pi"] == tuple(float(level in levels) for level in range(3))
-    assert [level for _, level in seen] == [2, 0, 0, 1]
-    assert torch.equal(state, steps.generator.get_state())
-
-
 def test_until_n_is_known_steps_stay_in_the_coarse_phase(dataset):
     steps = learner(dataset, None, max_seconds=100.0)
     records = [steps.step() for _ in range(45)]
     assert all(r["level"] == 0 and "rate" not in r and "grown" not in r for r in records)
     assert [r["iteration"] for r in records if "active" in r] == [0]
     assert steps.statistics["anchor_visits"].sum() == 0 and steps.state()["total"] == 0
-    assert steps.optimiser.rate["feature"] == 7.5e-3
     steps.schedule = Schedule(60)
     assert "rate" in steps.step()
 
 
 @pytest.mark.parametrize(
     "part, gone",
-    [("rate", {"rate"}), ("binary", {"tmc_binary"}), ("smooth", {"tmc_smooth"}), ("tmc", {"tmc_binary", "tmc_smooth"})],
+    [
+        ("rate", {"rate", "global_rate_proxy"}),
+        ("planes", {"global_rate_proxy"}),
+        ("binary", {"tmc_binary"}),
+        ("smooth", {"tmc_smooth"}),
+        ("tmc", {"tmc_binary", "tmc_smooth"}),
+    ],
 )
 def test_an_ablation_takes_out_its_terms_alone(dataset, part, gone):
-    terms = {"rate", "tmc_binary", "tmc_smooth"}
-    steps = learner(dataset, 3, **ABLATIONS[part])
+    terms = {"rate", "tmc_binary", "tmc_smooth", "global_rate_proxy"}
+    steps = learner(dataset, 3, rollout="all", **ABLATIONS[part])
     records = [steps.step() for _ in range(3)]
     assert terms & set(records[-1]) == terms - gone
 
@@ -108,7 +99,7 @@ def test_a_step_gathers_the_gradients_of_all_its_terms(dataset, level):
     steps.generator.set_state(state)
     steps.noise.generator.set_state(noise)
 
-    _, _, loss = steps.picture_loss(index, level, steps.rounding())
+    _, _, loss = steps.picture_loss(index, level)
     of_model, fields = steps.model_loss, steps.model.deformations
     own, place = {name: getattr(steps.model, name) for name in PER_ANCHOR}, steps.position
     terms = list(of_model._mask_terms(steps.model, level, own, steps.schedule.separation(place)))
@@ -142,12 +133,6 @@ def test_the_graph_beside_the_picture_s_shares_no_leaf_with_it(dataset, monkeypa
     steps.model_loss.begin(steps.model, 2, steps.schedule, 2)()
     own = {id(parameter) for parameter in steps.model.parameters()}
     assert leaves and not own & {id(leaf) for leaf in leaves}
-
-
-def test_without_planes_they_have_no_rate_and_anchors_do(dataset):
-    steps = learner(dataset, 3, **ABLATIONS["planes"])
-    names = [name for _ in range(3) for name in steps.step()]
-    assert "rate" in names and not any("proxy" in name for name in names)
 
 
 def test_a_non_finite_step_is_skipped_and_counted(dataset):

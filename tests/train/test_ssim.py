@@ -5,19 +5,18 @@ import pytest
 import torch
 
 from pd4dgs_codec import threads
-from pd4dgs_codec.errors import TrainError
-from pd4dgs_codec.train.ssim import Target, image_loss, image_loss_reference
+from pd4dgs_codec.train.ssim import image_loss, image_loss_reference, pixel_weights
 
 
 def pair(height, width, dtype=torch.float32, masked=False, seed=0):
-    """(render that wants a gradient, training image, mask or None)."""
+    """(render that wants a gradient, training image, weights)."""
     generator = torch.Generator().manual_seed(seed)
     target = torch.rand(height, width, 3, generator=generator, dtype=dtype)
     noise = torch.randn(height, width, 3, generator=generator, dtype=dtype)
-    mask = torch.rand(height, width, generator=generator) > 0.4 if masked else None
-    if mask is not None:
-        mask[0, 0] = True
-    return (target + 0.2 * noise).requires_grad_(), target, mask
+    mask = torch.rand(height, width, generator=generator) > 0.4
+    mask[0, 0] = True
+    weights = pixel_weights((mask if masked else torch.ones(height, width)).to(dtype))
+    return (target + 0.2 * noise).requires_grad_(), target, weights
 
 
 def terms_and_gradient(terms, image, weights=(0.8, 0.2)):
@@ -29,11 +28,11 @@ def terms_and_gradient(terms, image, weights=(0.8, 0.2)):
 @pytest.mark.parametrize("size", [(37, 41), (1, 1), (3, 100), (24, 16)])
 def test_kernel_equals_reference(size, masked):
     """float32 kernels, the one form that training has, and the reference in float64."""
-    image, target, mask = pair(*size, masked=masked)
-    stats, wide = Target(target, mask), image.detach().double().requires_grad_()
+    image, target, per_pixel = pair(*size, masked=masked)
+    wide = image.detach().double().requires_grad_()
     for weights in ((0.8, 0.2), (0.0, 1.0)):
-        fast = terms_and_gradient(image_loss(image, stats), image, weights)
-        exact = image_loss_reference(wide, target.double(), stats.weights.double())
+        fast = terms_and_gradient(image_loss(image, target, per_pixel), image, weights)
+        exact = image_loss_reference(wide, target.double(), per_pixel.double())
         slow = terms_and_gradient(exact, wide, weights)
         assert fast[0].dtype == fast[2].dtype == torch.float32
         for found, expected in zip(fast, slow, strict=True):
@@ -41,19 +40,19 @@ def test_kernel_equals_reference(size, masked):
 
 
 def test_gradcheck():
-    image, target, mask = pair(4, 5, torch.float64, masked=True)
-    weights = Target(target, mask).weights
+    image, target, weights = pair(4, 5, torch.float64, masked=True)
+    weights = weights.double()
     torch.autograd.gradcheck(lambda x: image_loss_reference(x, target, weights), (image,), eps=1e-6)
 
 
 def test_the_reference_is_ssim_by_definition():
     """SSIM of one pixel at a time, each window written out with its zero padding."""
-    image, target, mask = pair(9, 13, torch.float64, masked=True)
+    image, target, weights = pair(9, 13, torch.float64, masked=True)
     x, y = (np.pad(a.detach().numpy(), ((5, 5), (5, 5), (0, 0))) for a in (image, target))
     taps = np.exp(-(np.arange(-5.0, 6.0) ** 2) / (2 * 1.5**2))
     window = np.outer(taps, taps) / taps.sum() ** 2
     l1, dissimilarity, count = 0.0, 0.0, 0
-    for j, i in zip(*np.nonzero(mask.numpy()), strict=True):
+    for j, i in zip(*np.nonzero(weights.numpy()), strict=True):
         for c in range(3):
             a, b = x[j : j + 11, i : i + 11, c], y[j : j + 11, i : i + 11, c]
             ma, mb = (window * a).sum(), (window * b).sum()
@@ -61,62 +60,45 @@ def test_the_reference_is_ssim_by_definition():
             cov = (window * a * b).sum() - ma * mb
             ssim = (2 * ma * mb + 1e-4) * (2 * cov + 9e-4) / ((ma**2 + mb**2 + 1e-4) * (va + vb + 9e-4))
             l1, dissimilarity, count = l1 + abs(a[5, 5] - b[5, 5]), dissimilarity + 1 - ssim, count + 1
-    found = [float(term.detach()) for term in image_loss_reference(image, target, Target(target, mask).weights)]
-    assert found == pytest.approx([l1 / count, dissimilarity / count], rel=1e-9)
-
-
-def test_equal_images_cost_nothing():
-    _, target, _ = pair(20, 30)
-    image = target.clone().requires_grad_()
-    l1, dissimilarity, gradient = terms_and_gradient(image_loss(image, Target(target)), image)
-    assert float(l1) == 0 and abs(float(dissimilarity)) < 1e-6 and gradient.abs().max() < 1e-6
+    found = [float(term.detach()) for term in image_loss_reference(image, target, weights)]
+    assert found == pytest.approx([l1 / count, dissimilarity / count], rel=1e-6)
 
 
 def test_masked_pixels_out_of_reach_do_not_matter():
     image, target, _ = pair(16, 40)
     mask = torch.ones(16, 40)
     mask[:, 20:] = 0
-    stats = Target(target, mask)
-    before = terms_and_gradient(image_loss(image, stats), image)
+    weights = pixel_weights(mask)
+    before = terms_and_gradient(image_loss(image, target, weights), image)
     changed = image.detach().clone()
     changed[:, 25:] += 1
     changed.requires_grad_()
-    after = terms_and_gradient(image_loss(changed, stats), changed)
+    after = terms_and_gradient(image_loss(changed, target, weights), changed)
     torch.testing.assert_close(after[:2], before[:2], rtol=0, atol=1e-6)
     assert after[2][:, 25:].eq(0).all() and not torch.equal(after[2][:, 20:25], torch.zeros(16, 5, 3))
 
 
 @pytest.mark.skipif(threads.available() < 2, reason="needs two CPUs")
 def test_threads_change_nothing():
-    image, target, mask = pair(33, 50, masked=True)
+    image, target, weights = pair(33, 50, masked=True)
     before = threads.kernel_threads()
     runs = []
     try:
         for count in (1, 2):
             threads.set_kernel_threads(count)
-            runs.append(terms_and_gradient(image_loss(image, Target(target, mask)), image))
+            runs.append(terms_and_gradient(image_loss(image, target, weights), image))
     finally:
         threads.set_kernel_threads(before)
     assert all(torch.equal(a, b) for a, b in zip(*runs, strict=True))
 
 
-def test_empty_masks_nan_and_transposed_images():
-    image, target, _ = pair(12, 14)
-    nothing = terms_and_gradient(image_loss(image, Target(target, torch.zeros(12, 14))), image)
+def test_empty_masks_nan_and_equal_images():
+    image, target, weights = pair(12, 14)
+    nothing = terms_and_gradient(image_loss(image, target, pixel_weights(torch.zeros(12, 14))), image)
     assert all(term.eq(0).all() for term in nothing)
     with torch.no_grad():
         image[3, 4, 1] = torch.nan
-    broken = terms_and_gradient(image_loss(image, Target(target)), image)
+    broken = terms_and_gradient(image_loss(image, target, weights), image)
     assert broken[0].isnan() and broken[1].isnan() and broken[2][3, 4, 1].isnan()
-    transposed = image_loss(target.transpose(0, 1), Target(target.transpose(0, 1)))
-    assert float(transposed[0]) == 0
-
-
-def test_images_of_other_shapes_or_types_are_refused():
-    _, target, _ = pair(12, 14)
-    with pytest.raises(TrainError, match=r"\(5, 14, 3\)"):
-        image_loss(target[:5], Target(target))
-    with pytest.raises(TrainError, match="mask"):
-        Target(target, torch.ones(14, 12))
-    with pytest.raises(TrainError, match="float"):
-        Target((255 * target).to(torch.uint8))
+    l1, dissimilarity = image_loss(target, target, weights)
+    assert float(l1) == 0 and abs(float(dissimilarity)) < 1e-6, "equal images cost nothing"

@@ -27,7 +27,7 @@ class Phase:
         return {}
 
     def restore(self, stored: Mapping[str, Any]) -> None:
-        """The inverse of `stored`; keys may be missing in checkpoints of earlier versions."""
+        """The inverse of `stored`."""
 
 
 def long_enough(state: TrainState) -> bool:

@@ -25,8 +25,6 @@ MIN_MEAN_OPACITY = 0.005
 MIN_ANCHOR_VISITS = 40
 MIN_SLOT_VISITS = 10
 
-Cells = tuple[Tensor, Tensor]  #: int64 [n, 4] voxel cell and cell size; float [n, D] feature
-
 
 class Grow(Phase):
     """Collects statistics from every picture of the first half of a run, and adjusts the anchors at intervals."""
@@ -58,9 +56,8 @@ class Grow(Phase):
         keep = torch.arange(len(model.anchor_q))
         if state.position >= state.schedule.coarse_end:  # before, colours are random and opacities fall
             keep = _opaque(model, statistics, visited)
-        cells = _none(model)
-        if len(model.anchor_q) < most:
-            cells = _new_cells(model, statistics, state.config.grow_threshold, state.generator)
+        sizes = CELLS if len(model.anchor_q) < most else ()
+        cells = _new_cells(model, statistics, sizes, state.config.grow_threshold, state.generator)
         record["pruned"] = len(model.anchor_q) - len(keep)
         added = _anchors(model, *(part[: max(most - len(keep), 0)] for part in cells))
         used = statistics["visits"] >= MIN_SLOT_VISITS
@@ -109,18 +106,17 @@ def _anchors(model: Model, cells: Tensor, feature: Tensor) -> dict[str, Tensor]:
     return {name: value.to(device) for name, value in found.items()}
 
 
-def _none(model: Model) -> Cells:
-    return torch.zeros(0, 4, dtype=torch.int64), torch.zeros(0, model.feature.shape[1])
-
-
-def _new_cells(model: Model, statistics: dict[str, Tensor], threshold: float, generator: torch.Generator) -> Cells:
-    """Free cells where Gaussians have large gradients, the largest first."""
+def _new_cells(
+    model: Model, statistics: dict[str, Tensor], sizes: Sequence[int], threshold: float, generator: torch.Generator
+) -> tuple[Tensor, Tensor]:
+    """Free cells of `sizes` where Gaussians have large gradients, the largest first: int64 [n, 4] voxel cell and cell
+    size; float [n, D] feature."""
     mean_pull = (statistics["pull"] / statistics["visits"].clamp(min=1)).flatten()
     seen = statistics["visits"].flatten() >= MIN_SLOT_VISITS
     anchor_q, feature = model.anchor_q.cpu(), model.feature.detach().cpu()
     taken = anchor_q.to(torch.int64)
-    found: list[tuple[Tensor, Tensor, Tensor]] = []
-    for i, size in enumerate(CELLS):
+    found = [(torch.zeros(0, 4, dtype=torch.int64), feature[:0], torch.zeros(0))]
+    for i, size in enumerate(sizes):
         wanted = seen & (mean_pull >= threshold * 2**i)
         wanted &= torch.rand(len(wanted), generator=generator) < 1 - 0.5 ** (i + 1)
         slots, rows, position = _inside(model, wanted.nonzero()[:, 0])
@@ -136,8 +132,6 @@ def _new_cells(model: Model, statistics: dict[str, Tensor], threshold: float, ge
         sized = torch.cat([unique[free], torch.full((int(free.sum()), 1), size)], dim=1)
         found.append((sized, grown[free], strength[free]))
         taken = torch.cat([taken, unique[free]])
-    if not found:
-        return _none(model)
     cells, features, strengths = (torch.cat(parts) for parts in zip(*found, strict=True))
     order = torch.argsort(strengths, descending=True, stable=True)
     return cells[order], features[order]

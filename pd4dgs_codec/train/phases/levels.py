@@ -11,7 +11,6 @@ from typing import Any
 
 import torch
 
-from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.quality import TRAIN_MIN_DB, TRAIN_MIN_DB_PER_MEGABYTE
 from pd4dgs_codec.train import phases, workers
@@ -42,7 +41,8 @@ class SelectLevels(phases.Phase):
         views = [state.dataset.train[index] for index in sorted(held_back_views(state))]
         psnr = workers.alike(lambda: state.level_psnr(views))
         fields, bits = state.model.deformations, [0.0, *state.plane_bits()]
-        sizes = [field_bytes(fields[i], bits[i]) if i in fields else 0.0 for i in range(3)]
+        weights = [sum(p.numel() for p in fields[i].weights) if i in fields else 0 for i in range(3)]  # a byte for each
+        sizes = [count / 8 + number for count, number in zip(bits, weights, strict=True)]
         found = levels_without_gain(psnr, sizes)
         for level, _ in found:
             drop_level(state.model, state.optimiser, level)
@@ -55,7 +55,7 @@ class SelectLevels(phases.Phase):
 
     def restore(self, stored: Mapping[str, Any]) -> None:
         """The inverse of `stored`."""
-        self.left_out = list(json.loads(stored.get("left_out", "[]")))
+        self.left_out = list(json.loads(stored["left_out"]))
 
 
 def held_back_views(state: TrainState) -> set[int]:
@@ -78,11 +78,6 @@ def levels_without_gain(psnr: Sequence[float], sizes: Sequence[float]) -> list[t
             break
         found.append((level, gain))
     return found
-
-
-def field_bytes(field: DeformationField, plane_bits: float) -> float:
-    """About the bytes of a deformation whose features take `plane_bits`: one for each weight besides."""
-    return plane_bits / 8 + sum(p.numel() for p in field.weights)
 
 
 def drop_level(model: Model, optimiser: Optimiser, level: int) -> None:

@@ -59,8 +59,7 @@ class Prefixes(Phase):
 
     def restore(self, stored: Mapping[str, Any]) -> None:
         """The inverse of `stored`."""
-        rank = stored.get("rank")
-        self.rank = rank if rank is not None and len(rank) else None
+        self.rank = stored["rank"] if len(stored["rank"]) else None
 
 
 def rank_anchors(model: Model, views: Sequence[View]) -> Tensor:

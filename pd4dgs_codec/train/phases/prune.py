@@ -29,7 +29,7 @@ VIEWS = 24
 #: Mask of an anchor at a level that it has left: below the threshold, so that it is neither drawn there nor coded.
 ABSENT = 1e-3
 
-#: `omission_error` or `rounding_error`.
+#: `omission_error` or one of the same arguments: (errors, bool [N] whether an anchor may reach the picture, picture).
 ErrorOf = Callable[..., tuple[Tensor, Tensor, Tensor]]
 
 
@@ -52,11 +52,11 @@ class Prune(Phase):
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
         """Logs how many anchors left the model and how many left layer 0."""
         model, levels = state.model, state.trained_levels()
-        share, before = state.config.prune / PRUNING_ROUNDS, len(state.model.anchor_q)
-        views, rounding = self._views(state), state.rounding(noisy=False)
-        errors = workers.alike(
-            lambda: torch.stack([added_error(model, level, views, rounding, omission_error) for level in levels])
-        )
+        share, before, held_back = state.config.prune / PRUNING_ROUNDS, len(model.anchor_q), held_back_views(state)
+        order = [i for i in range(len(state.views)) if i not in held_back]
+        stride = -(-len(order) // VIEWS)
+        views = [state.views[i] for i in order[self.turn % stride :: stride]]
+        errors = added_error(model, levels, views, state.rounding(noisy=False), omission_error).to(state.device)
         errors[:, round_of(model.anchor_q) != self.turn] = torch.inf
         redundant = least(errors.amax(0), share)
         keep = (~redundant | redundant.all()).nonzero()[:, 0]
@@ -70,29 +70,33 @@ class Prune(Phase):
         record["left_model"] = record.get("left_model", 0) + before - len(keep)
         record["left_level_0"] = record.get("left_level_0", 0) + int(later.sum())
 
-    def _views(self, state: TrainState) -> list[TrainingView]:
-        held_back = held_back_views(state)
-        order = [i for i in range(len(state.views)) if i not in held_back]
-        stride = -(-len(order) // VIEWS)
-        return [state.views[i] for i in order[self.turn % stride :: stride]]
-
 
 def added_error(
-    model: Model, level: int, views: Sequence[TrainingView], rounding: Rounding, error_of: ErrorOf
+    model: Model, levels: Sequence[int], views: Sequence[TrainingView], rounding: Rounding, error_of: ErrorOf
 ) -> Tensor:
-    """float64 [N]: the squared error over `views` that `error_of` says each anchor adds at `level`, relative to the
-    present error. Infinite where no view shows the anchor."""
-    n, device = len(model.anchor_q), model.feature.device
-    total = torch.zeros(n, dtype=torch.float64, device=device)
-    met = torch.zeros(n, dtype=torch.bool, device=device)
-    error, generator = 0.0, torch.Generator().manual_seed(0)
+    """float64 [levels, N], on the CPU and alike in all workers: the squared error over `views` that `error_of` says
+    each anchor adds at each level, relative to the present error. Infinite where no view shows the anchor."""
+
+    def measure() -> Tensor:
+        found = [relative_error(model, level, views, rounding, error_of) for level in levels]
+        return torch.stack([torch.where(met, error, torch.inf).cpu() for error, met in found])
+
+    return workers.alike(measure)
+
+
+def relative_error(
+    model: Model, level: int, views: Sequence[TrainingView], rounding: Rounding, error_of: ErrorOf
+) -> tuple[Tensor, Tensor]:
+    """(the sum over `views` of the float64 errors that `error_of` finds at `level`, relative to the present squared
+    error; bool [N]: whether a view shows the anchor)."""
+    generator = torch.Generator().manual_seed(0)
+    total, met, error = torch.zeros((), dtype=torch.float64), torch.zeros((), dtype=torch.bool), 0.0
     for view in views:
-        weights, place = view.target.weights, (level, view.view.time, view.view.camera)
-        added, near, image = error_of(model, *place, generator, weights=weights, rounding=rounding)
-        total += added
-        met |= near
+        place = (level, view.view.time, view.view.camera)
+        added, near, image = error_of(model, *place, generator, weights=view.weights, rounding=rounding)
+        total, met = total + added, met | near
         error += view.squared_error(image)
-    return torch.where(met, total / max(error, 1e-12), torch.inf)
+    return total / max(error, 1e-12), met
 
 
 def round_of(anchor_q: Tensor) -> Tensor:

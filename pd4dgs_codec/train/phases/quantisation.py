@@ -25,7 +25,7 @@ from pd4dgs_codec.model.sensitivity import attribute_slopes, rounding_error
 from pd4dgs_codec.scene import MASK_THRESHOLD, MAX_CLASS, SCAFFOLD_NETWORKS
 from pd4dgs_codec.train import phases, workers
 from pd4dgs_codec.train.optimiser import Optimiser
-from pd4dgs_codec.train.phases.prune import added_error
+from pd4dgs_codec.train.phases.prune import added_error, relative_error
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
 #: Training views in which the error of a step is measured.
@@ -66,9 +66,7 @@ def grade(
 ) -> list[int]:
     """Gives every anchor the class at which quantisation adds at most `share` to the squared error of each of `levels`
     beyond what it adds at class 0, and the attributes their centres. Returns how many anchors each class has."""
-    errors = workers.alike(
-        lambda: torch.stack([added_error(model, level, views, rounding, rounding_error).cpu() for level in levels])
-    )
+    errors = added_error(model, levels, views, rounding, rounding_error)
     met = errors.isfinite()
     worst = torch.where(met, errors, 0.0).amax(0)  # a level of large error must not set the budget of the others
     classes = classes_within(torch.where(met.any(0), worst, torch.inf), share)
@@ -104,10 +102,8 @@ def centre(model: Model) -> Tensor:
     active = model.masks(2) > MASK_THRESHOLD
     active = active if active.any() else torch.ones_like(active)
     means = [model.feature[active].mean(0), model.scaling_log[active].mean(0)]
-    rounded = [
-        (mean / step).round() * step
-        for mean, step in zip(means, (model.steps.feature, model.steps.scaling_log), strict=True)
-    ]
+    steps = (model.steps.feature, model.steps.scaling_log)
+    rounded = [(mean / step).round() * step for mean, step in zip(means, steps, strict=True)]
     return torch.cat([*rounded, model.offset.new_zeros(model.offset[0].numel())])
 
 
@@ -121,26 +117,24 @@ def whiten(
     The error of a step, summed over the channels, stays the same too."""
     transform = workers.alike(lambda: _measured(model, views, levels, rounding))
     if transform is not None:
-        _apply(model, optimiser, transform)
+        _apply(model, optimiser, transform.to(model.feature.device))
 
 
 def _measured(model: Model, views: Sequence[TrainingView], levels: Sequence[int], rounding: Rounding) -> Tensor | None:
     """float64 [D, D]: the transform for the model; None where no picture shows a feature."""
-    errors = torch.stack([_feature_errors(model, level, views, rounding) for level in levels]).sum(0)
+    errors = torch.stack([relative_error(model, i, views, rounding, _feature_error)[0] for i in levels]).sum(0)
     active = model.masks(2).detach() > MASK_THRESHOLD
     if not errors.trace() > 0 or int(active.sum()) < 2:
         return None
     scaled = model.feature.detach()[active].double() / model.spacing[active, None]
-    return whitening_transform(errors, torch.cov(scaled.T))
+    return whitening_transform(errors, torch.cov(scaled.T)).cpu()
 
 
 def whitening_transform(errors: Tensor, covariance: Tensor) -> Tensor:
     """float64 [D, D]: A of features f' = A f for which A^-T errors A^-1, the errors in the new channels, is about a
     multiple of the identity, its trace that of `errors`, and A covariance A^T is diagonal with falling entries. Both
     arguments are [D, D], symmetric and positive semidefinite."""
-    floor = (
-        LEAST_ERROR * errors.trace() / len(errors) * torch.eye(len(errors), dtype=errors.dtype, device=errors.device)
-    )
+    floor = LEAST_ERROR * errors.trace() / len(errors) * torch.eye(len(errors)).to(errors)
     root = torch.linalg.cholesky(errors + floor)
     back = torch.linalg.inv(root)
     root = root * ((back @ errors @ back.T).trace() / errors.trace()).sqrt()
@@ -149,19 +143,12 @@ def whitening_transform(errors: Tensor, covariance: Tensor) -> Tensor:
     return found
 
 
-def _feature_errors(model: Model, level: int, views: Sequence[TrainingView], rounding: Rounding) -> Tensor:
-    """float64 [D, D]: the sum over all anchors and views of the Gauss-Newton matrices by the features, in units of the
-    anchors' steps, relative to the squared error."""
-    width = model.widths.feature
-    total, error = torch.zeros(width, width, dtype=torch.float64, device=model.feature.device), 0.0
-    generator = torch.Generator().manual_seed(0)
-    for view in views:
-        weights, place = view.target.weights, (level, view.view.time, view.view.camera)
-        slopes, _, image = attribute_slopes(model, *place, generator, weights=weights, rounding=rounding)
-        slope = (slopes["feature"] * model.spacing[:, None]).double()
-        total += slope.T @ slope
-        error += view.squared_error(image)
-    return total / max(error, 1e-12)
+def _feature_error(model: Model, *place: Any, **about: Any) -> tuple[Tensor, Tensor, Tensor]:
+    """As `rounding_error`, but float64 [D, D]: the sum of the anchors' Gauss-Newton matrices by the features, in
+    units of their steps."""
+    slopes, met, image = attribute_slopes(model, *place, **about)
+    slope = (slopes["feature"] * model.spacing[:, None]).double()
+    return slope.T @ slope, met, image
 
 
 @torch.no_grad()
