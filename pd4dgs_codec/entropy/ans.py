@@ -20,35 +20,19 @@ import constriction
 import numpy as np
 
 from pd4dgs_codec.entropy.tables import TOTAL
-from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed, Pd4Error
+from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
 
 MAX_COUNT = 1 << 26  #: symbols in one channel; decoding allocates four bytes for each
 _U32 = np.dtype("<u4")
-
-
-def _frequencies(cum: np.ndarray, error: type[Pd4Error], where: str = "") -> np.ndarray:
-    """int64 [n] of a table int64 [n + 1]; raises `error` for a table that constriction cannot take."""
-    if cum.ndim != 1 or len(cum) < 2 or cum[0] != 0 or cum[-1] != TOTAL:
-        raise error(f"{where}a frequency table must run from 0 to {TOTAL}")
-    frequencies: np.ndarray = cum[1:] - cum[:-1]
-    if frequencies[frequencies.argmin()] < 1:  # ten times faster than min() on short tables
-        raise error(f"{where}a frequency table has a symbol of zero frequency")
-    return frequencies
 
 
 #: A table as constriction has it. Passed less one, its own rounding has scale exactly 1 and reproduces the integers.
 Model: TypeAlias = constriction.stream.model.Categorical
 
 
-def _model(frequencies: np.ndarray) -> Model:
-    return Model((frequencies - 1).astype(np.float64), perfect=False)
-
-
 def model_of(cum: np.ndarray) -> Model | None:
-    """The model that decodes with a table int64 [n + 1]; None for a table of one symbol. Raises Malformed for an
-    invalid table."""
-    frequencies = _frequencies(cum, Malformed)
-    return _model(frequencies) if len(frequencies) > 1 else None
+    """The model of a table int64 [n + 1]; None for a table of one symbol. Raises Malformed for an invalid table."""
+    return models_of_each(cum, np.array([len(cum) - 1]))[0]
 
 
 def models_of_each(cums: np.ndarray, sizes: np.ndarray) -> list[Model | None]:
@@ -68,14 +52,14 @@ def models_of_each(cums: np.ndarray, sizes: np.ndarray) -> list[Model | None]:
 def ans_encode(channels: Sequence[np.ndarray], cums: Sequence[np.ndarray]) -> bytes:
     """Encode channels (int, 1-D, symbols 0 .. n - 1) in order, each under its own table cum [n + 1].
 
-    A channel whose table has one symbol costs nothing. Raises EncodeError for a bad table or symbol.
+    A channel whose table has one symbol costs nothing. Raises EncodeError for a bad symbol, Malformed for a bad table.
     """
     if len(channels) != len(cums):
         raise EncodeError(f"{len(channels)} channels need as many frequency tables, found {len(cums)}")
     coder = constriction.stream.stack.AnsCoder()
     for index in range(len(channels) - 1, -1, -1):  # a stack: last in, first out
         symbols, cum = np.asarray(channels[index]), np.asarray(cums[index], dtype=np.int64)
-        frequencies = _frequencies(cum, EncodeError, f"channel {index}: ")
+        model = model_of(cum)
         if symbols.size == 0:
             continue
         if symbols.ndim != 1 or symbols.dtype.kind not in "iu":
@@ -83,8 +67,8 @@ def ans_encode(channels: Sequence[np.ndarray], cums: Sequence[np.ndarray]) -> by
         low, high = int(symbols.min()), int(symbols.max())
         if low < 0 or high > len(cum) - 2:
             raise EncodeError(f"channel {index}: symbols {low}..{high} outside the table's 0..{len(cum) - 2}")
-        if len(cum) > 2:
-            coder.encode_reverse(np.ascontiguousarray(symbols, dtype=np.int32), _model(frequencies))
+        if model is not None:
+            coder.encode_reverse(np.ascontiguousarray(symbols, dtype=np.int32), model)
     words: np.ndarray = coder.get_compressed()
     return words[::-1].astype(_U32).tobytes()
 

@@ -17,9 +17,9 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.entropy.bits import BIT, LOG2, P_MIN, SIGMA_MIN, frequency_costs
+from pd4dgs_codec.entropy.bits import BIT, LOG2, frequency_costs
 from pd4dgs_codec.entropy.priors import CLASS_STEPS, FLOORS
-from pd4dgs_codec.entropy.tables import NORMAL, OCTAVE, SI_MAX, SI_MIN, TOTAL, norm_cdf28, table_from_cdf28
+from pd4dgs_codec.entropy.tables import NORMAL, OCTAVE, SI_MAX, SI_MIN, TOTAL, norm_cdf28_of_each
 
 try:
     from numba import njit
@@ -39,6 +39,8 @@ GAUSS_ROUNDS = 12
 ENOUGH = BIT // 8
 #: Widths of the Gaussian of a histogram's classes.
 CLASS_WIDTHS = 64
+#: Of R(a): the clip of probabilities, and the least standard deviation, in units of Q.
+P_MIN, SIGMA_MIN = 1e-6, 2.0**-10
 
 _STEPS, _FLOORS = np.array(CLASS_STEPS), np.array(FLOORS)
 _LOW, _HIGH = FLOORS  # the higher floor keeps outliers from steering the fit
@@ -55,7 +57,7 @@ def frequency_cost(frequency: int) -> Any:
 
 @_compiled
 def _cdf28(mu8: int, si: int, cdf: np.ndarray) -> None:
-    """`tables.norm_cdf28` into cdf int64 [n - 1]."""
+    """`tables.norm_cdf28_of_each` of one Gaussian into cdf int64 [n - 1]."""
     e, octave = si >> 6, OCTAVE[si & 63]
     nb = max(0, e - 8)
     shift, t = 23 + e - nb, 128 - mu8
@@ -104,13 +106,15 @@ def _entry_costs(cdf: np.ndarray, floor: int) -> np.ndarray:
 if not NUMBA:  # the loops over a table in numpy
 
     def _cdf28(mu8: int, si: int, cdf: np.ndarray) -> None:
-        cdf[:] = norm_cdf28(len(cdf) + 1, mu8, si)
+        cdf[:] = norm_cdf28_of_each(*(np.array([v]) for v in (len(cdf) + 1, mu8, si)))[1:-1]
 
     def _mixed(first: np.ndarray, second: np.ndarray, weight: int, cdf: np.ndarray) -> None:
         cdf[:] = ((256 - weight) * first + weight * second) >> 8
 
     def _entry_costs(cdf: np.ndarray, floor: int) -> np.ndarray:
-        return frequency_costs(np.diff(table_from_cdf28(cdf, floor)))
+        n = len(cdf) + 1
+        cum = ((cdf * (TOTAL - n * floor)) >> 28) + floor * np.arange(1, n)
+        return frequency_costs(np.diff(cum, prepend=0, append=TOTAL))
 
     def _table_cost(cdf: np.ndarray, floor: int, counts: np.ndarray) -> Any:
         return _entry_costs(cdf, floor) @ counts
@@ -140,6 +144,23 @@ def _coarsen(dense: np.ndarray, bits: int) -> tuple[np.ndarray, int]:
 
 
 @_compiled
+def _cost_at(probe: np.ndarray, x: np.ndarray, kept: np.ndarray, scratch: np.ndarray, counts: np.ndarray) -> Any:
+    """Of counts under the Gaussians of `probe`. kept int64 [2, n - 1]: the cdfs of those of x, which are not made anew;
+    scratch: int64 [3, n - 1]."""
+    first, second, mixed = kept[0], kept[1], scratch[2]
+    if probe[0] != x[0] or probe[1] != x[1]:
+        first = scratch[0]
+        _cdf28(probe[0], probe[1], first)
+    if len(probe) == 2:
+        return _table_cost(first, _HIGH, counts)
+    if probe[2] != x[2] or probe[3] != x[3]:
+        second = scratch[1]
+        _cdf28(probe[2], probe[3], second)
+    _mixed(first, second, probe[4], mixed)
+    return _table_cost(mixed, _HIGH, counts)
+
+
+@_compiled
 def _descend(
     counts: np.ndarray, x: np.ndarray, steps: np.ndarray, low: np.ndarray, high: np.ndarray, rounds: int
 ) -> np.ndarray:
@@ -147,47 +168,25 @@ def _descend(
     ways, then the joint parabola step; halve steps that no longer gain."""
     dims, n = len(x), len(counts)
     x, steps = x.copy(), steps.copy()
-    first, second, other, cdf = np.empty((4, n - 1), np.int64)
+    kept, scratch = np.empty((2, n - 1), np.int64), np.empty((3, n - 1), np.int64)
     up, down = np.empty(dims, np.int64), np.empty(dims, np.int64)
     probe, best = x.copy(), x.copy()
-    _cdf28(x[0], x[1], first)
-    if dims == 5:
-        _cdf28(x[2], x[3], second)
-        _mixed(first, second, x[4], cdf)
-        fx = _table_cost(cdf, _HIGH, counts)
-    else:
-        fx = _table_cost(first, _HIGH, counts)
+    for c in range(dims // 2):
+        _cdf28(x[2 * c], x[2 * c + 1], kept[c])
+    fx = _cost_at(x, x, kept, scratch, counts)
     for _ in range(rounds):
         least, at = np.int64(1) << 62, -1
         for number in range(2 * dims + 1):
             for axis in range(dims):
-                probe[axis] = x[axis]
-            if number == 2 * dims:
-                for axis in range(dims):
+                move = 0
+                if number == 2 * dims:
                     curvature = up[axis] + down[axis] - 2 * fx
                     newton = steps[axis] * (down[axis] - up[axis]) / (2.0 * curvature) if curvature > 0 else 0.0
                     move = np.int64(np.rint(min(max(newton, -2.0 * steps[axis]), 2.0 * steps[axis])))
-                    probe[axis] = min(max(x[axis] + move, low[axis]), high[axis])
-                if dims == 2:
-                    _cdf28(probe[0], probe[1], cdf)
-                else:
-                    _cdf28(probe[0], probe[1], cdf)
-                    _cdf28(probe[2], probe[3], other)
-                    _mixed(cdf, other, probe[4], cdf)
-            else:
-                axis, sign = number % dims, 1 if number < dims else -1
-                probe[axis] = min(max(x[axis] + sign * steps[axis], low[axis]), high[axis])
-                if dims == 2:
-                    _cdf28(probe[0], probe[1], cdf)
-                elif axis < 2:
-                    _cdf28(probe[0], probe[1], other)
-                    _mixed(other, second, x[4], cdf)
-                elif axis < 4:
-                    _cdf28(probe[2], probe[3], other)
-                    _mixed(first, other, x[4], cdf)
-                else:
-                    _mixed(first, second, probe[4], cdf)
-            f = _table_cost(cdf, _HIGH, counts)
+                elif number % dims == axis:
+                    move = steps[axis] if number < dims else -steps[axis]
+                probe[axis] = min(max(x[axis] + move, low[axis]), high[axis])
+            f = _cost_at(probe, x, kept, scratch, counts)
             if number < dims:
                 up[number] = f
             elif number < 2 * dims:
@@ -205,9 +204,8 @@ def _descend(
             fx = least
             if gain < ENOUGH:
                 break
-            _cdf28(x[0], x[1], first)
-            if dims == 5:
-                _cdf28(x[2], x[3], second)
+            for c in range(dims // 2):
+                _cdf28(x[2 * c], x[2 * c + 1], kept[c])
         if at == 2 * dims or gain <= 0:
             for axis in range(dims):
                 steps[axis] = max(steps[axis] // 2, 1)
@@ -561,7 +559,12 @@ def split_cost(channels: np.ndarray, classes: np.ndarray, count: int) -> Any:
 
 @_compiled
 def gaussian_bits(values: np.ndarray, counts: np.ndarray) -> Any:
-    """`bits.gaussian_bits` of int64 values and their counts."""
+    """Sum of R(a) = -log2(Phi((k + 1/2 - mu) / sigma) - Phi((k - 1/2 - mu) / sigma)) over values k int64 [U] that occur
+    counts [U] times, in bits.
+
+    mu and sigma are the symbols' mean and standard deviation (units of Q, sigma >= 2**-10), each probability is
+    clipped at 1e-6. Written with the upper tail of |k - mu|, so nothing above the clip loses more than 1e-9 of itself.
+    """
     total, mu, spread, bits = counts.sum(), 0.0, 0.0, 0.0
     for i in range(len(values)):
         mu += values[i] * (counts[i] / total)

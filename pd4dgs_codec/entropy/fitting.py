@@ -56,7 +56,7 @@ class Histogram:
 
     @property
     def rate_bits(self) -> float:
-        """The sum of R(a), see `bits.gaussian_bits`."""
+        """The sum of R(a), see `fit_kernels.gaussian_bits`."""
         return float(loops().gaussian_bits(self.values, self.counts))
 
     @cached_property

@@ -14,8 +14,8 @@ from collections.abc import Sequence
 import numpy as np
 
 from pd4dgs_codec.entropy.ans import MAX_COUNT
-from pd4dgs_codec.entropy.bits import gaussian_bits
 from pd4dgs_codec.entropy.channels import CodedChannels, check_channels
+from pd4dgs_codec.entropy.fitting import histogram
 from pd4dgs_codec.entropy.priors import K_MAX
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint
 from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
@@ -36,14 +36,17 @@ def encode_channels_lzma(channels: Sequence[np.ndarray], *, effort: int = 5) -> 
             put_varint(head, (2 * base if base >= 0 else -2 * base - 1) << 2 | log_width)
             numbers.append((array - base).astype(_SIGNED[log_width]))
     payload = _compress(bytes(head), numbers, effort)
-    return CodedChannels(payload, sum(gaussian_bits(a) for a in arrays))
+    return CodedChannels(payload, sum(histogram(a).rate_bits for a in arrays if len(a)))
 
 
 def decode_channels_lzma(payload: bytes | memoryview, counts: Sequence[int]) -> list[np.ndarray]:
     """Inverse of encode_channels_lzma: one int32 [count] array per count. Raises Malformed or LimitExceeded."""
-    _check_counts(counts)
+    for index, count in enumerate(counts):
+        if not 0 <= count <= MAX_COUNT:
+            raise LimitExceeded(f"array {index}: {count} numbers, limit {MAX_COUNT}")
     reader = ByteReader(payload)
-    planar = _read_layout(reader)
+    reader.byte("lc, lp and pb", 9 * 5 * 5 - 1)  # informative: LZMA2 stores its own
+    planar = bool(reader.bits("the layout's flags", 1))
     bases, dtypes = list[int](), list[np.dtype]()
     for count in counts:
         code = reader.varint(8 * K_MAX + 3, "a channel's base and width") if count else 0
@@ -68,12 +71,6 @@ def _narrowest(low: int, high: int) -> tuple[int, int]:
         if high - low < 2 * limit:
             return min(low + limit, K_MAX), log_width
     return 0, 2
-
-
-def _check_counts(counts: Sequence[int]) -> None:
-    for index, count in enumerate(counts):
-        if not 0 <= count <= MAX_COUNT:
-            raise LimitExceeded(f"array {index}: {count} numbers, limit {MAX_COUNT}")
 
 
 def _layout(numbers: Sequence[np.ndarray], planar: bool) -> bytes:
@@ -125,12 +122,6 @@ def _compress(head: bytes, numbers: Sequence[np.ndarray], effort: int) -> bytes:
         trials.sort(key=lambda trial: len(_packed(samples[trial[0]], trial[1])))
     planar, (lc, lp, pb) = trials[0]
     return bytes((lc + 9 * (lp + 5 * pb), planar)) + head + _packed(layouts[planar], (lc, lp, pb))
-
-
-def _read_layout(reader: ByteReader) -> bool:
-    """Whether bytes lie in planes. lc, lp and pb are informative: LZMA2 stores its own."""
-    reader.byte("lc, lp and pb", 9 * 5 * 5 - 1)
-    return bool(reader.bits("the layout's flags", 1))
 
 
 def _decompress(

@@ -4,8 +4,8 @@ A prior covers a window of symbols kmin .. kmin + (n << shift) - 1. With shift >
 and the low bits follow with equal probabilities, so a wide channel needs no table of more than 2**14 entries. Symbols
 outside the window are exceptions, listed beside the prior.
 
-Adding a prior: a class with an id, `cum`, `model`, `write` and `read`, and its name in `Prior`. `make_models` is only
-faster: a family that it does not list makes its tables one by one.
+Adding a prior: a subclass of `_Tabled` with an id, `cum`, `write` and `read`, and its name in `Prior`. `make_models` is
+only faster: a family that it does not list makes its tables one by one.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import ClassVar, TypeVar, get_args
+from typing import Any, ClassVar, TypeVar, get_args
 
 import numpy as np
 
@@ -24,9 +24,7 @@ from pd4dgs_codec.entropy.tables import (
     SI_MIN,
     histogram_table,
     histogram_tables_of_each,
-    mixture_table,
     norm_cdf28_of_each,
-    norm_table,
     tables_of_each,
 )
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
@@ -90,23 +88,24 @@ class Normal:
         return cls(mu8, (code >> 1) + SI_MIN), code & 1
 
 
-_ONE_SYMBOL = norm_table(1, 0, 0, 1)
+class _Tabled:
+    """What priors have in common: the table cum int64 [n + 1] and its model, which `make_models` sets for many."""
+
+    @cached_property
+    def cum(self: Any) -> np.ndarray:
+        return normal_tables([self])[0]
+
+    @cached_property
+    def model(self) -> Model | None:
+        return model_of(self.cum)
 
 
 @dataclass(frozen=True, eq=False)
-class Const:
+class Const(_Tabled):
     """Every symbol is kmin; costs nothing per symbol."""
 
     id: ClassVar[int] = CONST
     window: Window
-
-    @property
-    def cum(self) -> np.ndarray:
-        return _ONE_SYMBOL
-
-    @property
-    def model(self) -> None:
-        return None
 
     def write(self, out: bytearray) -> None:
         put_zigzag(out, self.window.kmin)
@@ -117,21 +116,13 @@ class Const:
 
 
 @dataclass(frozen=True, eq=False)
-class Gauss:
+class Gauss(_Tabled):
     """A quantised Gaussian, the model of R(a)."""
 
     id: ClassVar[int] = GAUSS
     window: Window
     normal: Normal
     floor: int
-
-    @cached_property
-    def cum(self) -> np.ndarray:
-        return norm_table(self.window.n, self.normal.mu8, self.normal.si, self.floor)
-
-    @cached_property
-    def model(self) -> Model | None:
-        return model_of(self.cum)
 
     def write(self, out: bytearray) -> None:
         self.window.write(out)
@@ -145,7 +136,7 @@ class Gauss:
 
 
 @dataclass(frozen=True, eq=False)
-class Mixture:
+class Mixture(_Tabled):
     """Two quantised Gaussians; `weight` 1..255 is the second one's share in 1/256."""
 
     id: ClassVar[int] = GMM2
@@ -154,15 +145,6 @@ class Mixture:
     second: Normal
     weight: int
     floor: int
-
-    @cached_property
-    def cum(self) -> np.ndarray:
-        first, second = (self.first.mu8, self.first.si), (self.second.mu8, self.second.si)
-        return mixture_table(self.window.n, first, second, self.weight, self.floor)
-
-    @cached_property
-    def model(self) -> Model | None:
-        return model_of(self.cum)
 
     def write(self, out: bytearray) -> None:
         self.window.write(out)
@@ -182,7 +164,7 @@ class Mixture:
 
 
 @dataclass(frozen=True, eq=False)
-class Hist:
+class Hist(_Tabled):
     """A histogram: frequencies rounded to `top` classes of `step` / 64 octaves, counted up to the largest; 0 is absent.
 
     The classes (or their differences) are coded in the ANS stream, before all channels, under a Gaussian of their own.
@@ -205,8 +187,7 @@ class Hist:
 
     @cached_property
     def class_cum(self) -> np.ndarray:
-        n, normal = self.class_normal
-        return norm_table(n, normal.mu8, normal.si, 1)
+        return normal_tables([self])[0]
 
     @cached_property
     def class_model(self) -> Model | None:
@@ -223,10 +204,6 @@ class Hist:
         classes = np.asarray(self.classes, dtype=np.int64)
         below = (self.top - classes) * self.step
         return histogram_table(np.where(classes > 0, OCTAVE[below & 63] >> (below >> 6), 0))
-
-    @cached_property
-    def model(self) -> Model | None:
-        return model_of(self.cum)
 
     def write(self, out: bytearray) -> None:
         self.window.write(out)
@@ -280,26 +257,23 @@ def _batches(priors: Sequence[AnyPrior]) -> Iterator[list[AnyPrior]]:
 
 
 def normal_tables(priors: Sequence[Prior]) -> tuple[np.ndarray, np.ndarray]:
-    """(concatenated tables int64, their sizes int64 [m]) of Gaussians, mixtures and histograms' classes."""
-    rows, seconds, weights, mixed = list[tuple[int, Normal, int]](), list[Normal](), list[int](), list[int]()
-    for at, prior in enumerate(priors):
+    """(concatenated tables int64, their sizes int64 [m]): of histograms, the tables of their classes."""
+    rows = list[tuple[int, Normal, int]]()
+    for prior in priors:
         if isinstance(prior, Hist):
             rows.append((*prior.class_normal, 1))
-        elif isinstance(prior, Mixture):
-            rows.append((prior.window.n, prior.first, prior.floor))
-            seconds.append(prior.second)
-            weights.append(prior.weight)
-            mixed.append(at)
-        elif isinstance(prior, Gauss):
-            rows.append((prior.window.n, prior.normal, prior.floor))
+        elif isinstance(prior, Const):
+            rows.append((1, Normal(0, 0), 1))
+        else:
+            normal = prior.first if isinstance(prior, Mixture) else prior.normal
+            rows.append((prior.window.n, normal, prior.floor))
     sizes, floors = (np.array([row[i] for row in rows], dtype=np.int64) for i in (0, 2))
     cdf = norm_cdf28_of_each(sizes, *_columns([normal for _, normal, _ in rows]))
-    if mixed:
-        second = norm_cdf28_of_each(sizes[mixed], *_columns(seconds))
-        weight = np.repeat(np.array(weights, dtype=np.int64), sizes[mixed] + 1)
-        inside = np.zeros(len(rows), bool)
-        inside[mixed] = True
-        inside = np.repeat(inside, sizes + 1)
+    if mixtures := [prior for prior in priors if isinstance(prior, Mixture)]:
+        mixed = np.array([isinstance(prior, Mixture) for prior in priors])
+        second = norm_cdf28_of_each(sizes[mixed], *_columns([prior.second for prior in mixtures]))
+        weight = np.repeat(np.array([prior.weight for prior in mixtures]), sizes[mixed] + 1)
+        inside = np.repeat(mixed, sizes + 1)
         cdf[inside] = ((256 - weight) * cdf[inside] + weight * second) >> 8
     return tables_of_each(cdf, sizes, floors), sizes
 

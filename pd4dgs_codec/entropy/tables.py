@@ -22,15 +22,6 @@ NORMAL = np.array([*_T, _T[-1]], dtype=np.int64)  #: T[i] = round(2**28 (Phi(i /
 OCTAVE = np.array([round(2.0 ** (31 - j / 64)) for j in range(64)], dtype=np.int64)  #: M[j]
 
 
-def norm_cdf28(n: int, mu8: int | np.ndarray, si: int | np.ndarray) -> np.ndarray:
-    """C(k) for k = 0 .. n - 2, int64 [..., n - 1] in units of 2**-28: the Gaussian's mass up to k + 1/2.
-
-    mu8: 256 * (mean - kmin), in symbols; si: 64 * log2(sigma / Q). Arrays broadcast as leading axes.
-    """
-    mu8, si = np.asarray(mu8, dtype=np.int64)[..., None], np.asarray(si, dtype=np.int64)[..., None]
-    return _mass(np.arange(n - 1, dtype=np.int64) * 256 + 128 - mu8, si)
-
-
 def _mass(t: np.ndarray, si: np.ndarray) -> np.ndarray:
     """The Gaussian's mass up to t / 256 from its mean, in units of 2**-28; si broadcasts against t."""
     e, nb = si >> 6, np.maximum(0, (si >> 6) - 8)
@@ -43,18 +34,19 @@ def _mass(t: np.ndarray, si: np.ndarray) -> np.ndarray:
 
 
 def norm_cdf28_of_each(sizes: np.ndarray, mu8: np.ndarray, si: np.ndarray) -> np.ndarray:
-    """`norm_cdf28` of many Gaussians, int64 [m] each, in one pass: C(-1) .. C(n - 1) of each, concatenated.
+    """C(k) for k = -1 .. n - 1 of many Gaussians, int64 [m] each, concatenated, in units of 2**-28: the mass up to
+    k + 1/2. A table uses neither the first nor the last value.
 
-    Calling numpy for each short table would take longer than decoding it. A table uses neither the first nor the last
-    value.
+    mu8: 256 * (mean - kmin), in symbols; si: 64 * log2(sigma / Q). Calling numpy for each short table would take longer
+    than decoding it.
     """
     lengths = sizes + 1
     return _mass(_counted(lengths) * 256 - np.repeat(128 + mu8, lengths), np.repeat(si, lengths))
 
 
 def tables_of_each(cdf: np.ndarray, sizes: np.ndarray, floor: np.ndarray) -> np.ndarray:
-    """`table_from_cdf28` of a result of norm_cdf28_of_each for tables of `sizes`, with a floor int64 [m] each;
-    concatenated."""
+    """The tables of `sizes` from a result of norm_cdf28_of_each, with a floor int64 [m] each; concatenated. Each symbol
+    gets the floor plus its share of the rest."""
     lengths = sizes + 1
     ends = np.cumsum(lengths)
     cum: np.ndarray = (cdf * np.repeat(TOTAL - sizes * floor, lengths)) >> 28
@@ -69,29 +61,14 @@ def _counted(lengths: np.ndarray) -> np.ndarray:
     return counted
 
 
-def table_from_cdf28(cdf: np.ndarray, floor: int) -> np.ndarray:
-    """cum int64 [..., n + 1] from C int64 [..., n - 1]: each symbol gets `floor` plus its share of the rest."""
-    n = cdf.shape[-1] + 1
-    cum = np.empty((*cdf.shape[:-1], n + 1), dtype=np.int64)
-    cum[..., 0] = 0
-    cum[..., 1:-1] = ((cdf * (TOTAL - n * floor)) >> 28) + floor * np.arange(1, n)
-    cum[..., -1] = TOTAL
-    return cum
-
-
 def norm_table(n: int, mu8: int, si: int, floor: int) -> np.ndarray:
     """NormTable v1: cum int64 [n + 1] of a quantised Gaussian over symbols 0 .. n - 1.
 
     The first symbol carries the mass below the window, the last the mass above it. The caller has checked
     n >= 1, SI_MIN <= si <= SI_MAX, |mu8| < 2**40 and n * floor <= MAX_FLOOR_MASS.
     """
-    return table_from_cdf28(norm_cdf28(n, mu8, si), floor)
-
-
-def mixture_table(n: int, first: tuple[int, int], second: tuple[int, int], weight: int, floor: int) -> np.ndarray:
-    """cum int64 [n + 1] of two Gaussians (mu8, si); `weight` 0..256 is the second one's share in 1/256."""
-    c1, c2 = norm_cdf28(n, *first), norm_cdf28(n, *second)
-    return table_from_cdf28(((256 - weight) * c1 + weight * c2) >> 8, floor)
+    sizes = np.array([n])
+    return tables_of_each(norm_cdf28_of_each(sizes, np.array([mu8]), np.array([si])), sizes, np.array([floor]))
 
 
 def histogram_table(freqs: np.ndarray) -> np.ndarray:
@@ -100,11 +77,7 @@ def histogram_table(freqs: np.ndarray) -> np.ndarray:
     With W(q) the sum of the first q weights and s = max(0, bits(W(n)) - 28):
     cum[q] = ((W(q) >> s) * (2**24 - n)) // (W(n) >> s) + q, so that an absent symbol keeps 2**-24.
     """
-    total = np.cumsum(np.asarray(freqs, dtype=np.int64))
-    n, shift = len(total), max(0, int(total[-1]).bit_length() - 28)
-    cum = np.zeros(n + 1, dtype=np.int64)
-    cum[1:] = (total >> shift) * (TOTAL - n) // (int(total[-1]) >> shift) + np.arange(1, n + 1)
-    return cum
+    return histogram_tables_of_each(freqs, np.array([len(freqs)]))
 
 
 def histogram_tables_of_each(freqs: np.ndarray, sizes: np.ndarray) -> np.ndarray:

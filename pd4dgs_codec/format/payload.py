@@ -12,9 +12,9 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pd4dgs_codec.entropy.bits import entropy_bits, gaussian_bits
+from pd4dgs_codec.entropy.bits import entropy_bits
 from pd4dgs_codec.entropy.channels import decode_channels, encode_channels
-from pd4dgs_codec.entropy.fitting import Fitted
+from pd4dgs_codec.entropy.fitting import Fitted, histogram
 from pd4dgs_codec.entropy.lzma_mode import decode_channels_lzma, encode_channels_lzma
 from pd4dgs_codec.entropy.positions import decode_positions, encode_positions
 from pd4dgs_codec.entropy.priors import Prior
@@ -208,7 +208,7 @@ def _write_lzma(
         return {}
     data = encode_channels_lzma(channels, effort=options.effort).payload
     counted = [*by_class(symbols.attributes, symbols.classes), *rest]
-    rate_bits = sum(gaussian_bits(channel) for channel in counted if channel.size)
+    rate_bits = sum(histogram(channel).rate_bits for channel in counted if channel.size)
     return {Section.SYMBOLS: (data, rate_bits + entropy_bits(symbols.classes))}
 
 

@@ -27,7 +27,7 @@ from pd4dgs_codec.entropy.priors import (
     Window,
 )
 from pd4dgs_codec.entropy.tables import norm_table, uniform_table
-from pd4dgs_codec.entropy.varint import ByteReader, put_varint, put_zigzag
+from pd4dgs_codec.entropy.varint import put_varint
 from pd4dgs_codec.errors import DecodeError, EncodeError, LimitExceeded, Malformed, UnsupportedFeature
 
 symbol = st.integers(-3, 3) | st.integers(-100, 100) | st.integers(-K_MAX, K_MAX) | st.sampled_from([-K_MAX, K_MAX])
@@ -68,12 +68,6 @@ def test_round_trip_and_best_is_never_larger(channels, effort):
         assert priors == "best" or prior_ids(coded) <= {CONST, GAUSS}
         sizes.append(len(coded.payload))
     assert sizes[1] <= sizes[0]
-
-
-def test_nothing_is_an_empty_payload():
-    assert encode_channels([]).payload == b"" and decode_channels(b"", []) == []
-    empty = np.zeros(0, np.int32)
-    assert encode_channels([empty, empty]).payload == b"" and len(decode_channels(b"", [0, 0])) == 2
 
 
 @pytest.mark.parametrize(
@@ -125,15 +119,6 @@ def test_mixed_data_costs_less_than_its_model_rate():
     assert {GMM2, HIST} <= prior_ids(coded)
 
 
-def test_best_stays_close_to_the_empirical_entropy():
-    channels = mixed_channels()
-    entropy = 0.0
-    for c in channels:
-        _, counts = np.unique(c, return_counts=True)
-        entropy += float(counts @ np.log2(counts.sum() / counts))
-    assert encode_channels(channels).payload_bits <= 1.005 * entropy
-
-
 def test_small_similar_channels_share_a_prior():
     rng = np.random.default_rng(2)
     channels = [np.rint(rng.laplace(0, 1.5, 300)).astype(np.int32) for _ in range(40)]
@@ -157,9 +142,6 @@ def test_outliers_are_listed_rather_than_widening_the_table():
 def test_the_encoder_refuses(bad):
     with pytest.raises(EncodeError):
         encode_channels([bad])
-
-
-def test_the_encoder_refuses_unknown_options():
     for options in ({"priors": "laplace"}, {"effort": 0}, {"effort": 10}):
         with pytest.raises(EncodeError):
             encode_channels([], **options)
@@ -178,15 +160,11 @@ def small_case():
     return [spiky, np.rint(tails).astype(np.int32), wide, listed, bell, bell[::-1].copy(), const, const[:0]]
 
 
-def test_small_case_uses_everything():
-    coded = encode_channels(small_case())
-    assert prior_ids(coded) == {CONST, GAUSS, GMM2, HIST}
-
-
 def test_every_cut_and_every_flip_gives_our_errors_only():
     channels = small_case()
-    counts, payload = [len(c) for c in channels], encode_channels(channels).payload
-    survived = 0
+    coded = encode_channels(channels)
+    assert prior_ids(coded) == {CONST, GAUSS, GMM2, HIST}
+    counts, payload, survived = [len(c) for c in channels], coded.payload, 0
     for size in range(len(payload)):
         try:
             decoded = decode_channels(payload[:size], counts)
@@ -254,12 +232,6 @@ def test_bad_parameters_are_named(payload, error):
         decode_channels(payload, [5])
 
 
-@pytest.mark.parametrize("count", [-1, (1 << 26) + 1, 10**11])
-def test_counts_are_bounded(count):
-    with pytest.raises(LimitExceeded):
-        decode_channels(b"\0\0", [count])
-
-
 def test_tables_of_a_section_are_bounded():
     """Eight bytes define a table of 128 KiB: 86 kB of them took 1.6 GB."""
     wide = payload_of(2, 0, MAX_WINDOW - 2, 0, 1280)
@@ -267,6 +239,9 @@ def test_tables_of_a_section_are_bounded():
     assert len(decode_channels(wide * most, [1] * most)) == most
     with pytest.raises(LimitExceeded, match="entries"):
         decode_channels(wide * (most + 1), [1] * (most + 1))
+    for count in (-1, (1 << 26) + 1, 10**11):
+        with pytest.raises(LimitExceeded):
+            decode_channels(b"\0\0", [count])
 
 
 def test_wide_channels_share_a_table_rather_than_pass_the_limit():
@@ -276,15 +251,6 @@ def test_wide_channels_share_a_table_rather_than_pass_the_limit():
     channels = [narrow, *((c + rng.integers(-8000, 8000, 40)).astype(np.int32) for c in centres)]
     coded = encode_channels(channels, effort=1)
     assert_same(decode_channels(coded.payload, [len(c) for c in channels]), channels)
-
-
-@given(st.integers(-(2**31), 2**31), st.integers(0, 2**33))
-def test_varints_round_trip(signed, unsigned):
-    out = bytearray()
-    put_zigzag(out, signed)
-    put_varint(out, unsigned)
-    reader = ByteReader(bytes(out))
-    assert (reader.zigzag(2**31, "x"), reader.varint(2**33, "y"), reader.remaining) == (signed, unsigned, 0)
 
 
 def test_low_bits_past_the_last_symbol_are_malformed():

@@ -11,10 +11,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pd4dgs_codec.entropy import fit_kernels, fitting
-from pd4dgs_codec.entropy.bits import BIT, entropy_bits, frequency_costs, gaussian_bits
+from pd4dgs_codec.entropy.bits import BIT, entropy_bits
 from pd4dgs_codec.entropy.channels import encode_channels
 from pd4dgs_codec.entropy.fitting import fit_best, histogram, pool
-from pd4dgs_codec.entropy.tables import TOTAL
 
 
 def _channel(seed: int) -> np.ndarray:
@@ -53,12 +52,6 @@ def interpreted():
 def _assert_same(found, expected):
     for one, other in zip(found, expected, strict=True):
         np.testing.assert_array_equal(one, other)
-
-
-def test_costs_of_frequencies_are_their_logarithms():
-    frequencies = np.unique(np.concatenate([np.arange(1, 5000), np.geomspace(1, TOTAL, 5000).astype(np.int64)]))
-    assert np.abs(frequency_costs(frequencies) / BIT - (24 - np.log2(frequencies))).max() < 2e-6
-    assert frequency_costs(np.array([1, 1 << 12, TOTAL])).tolist() == [24 * BIT, 12 * BIT, 0]
 
 
 def test_fits_are_the_same_without_numba(interpreted):
@@ -148,18 +141,13 @@ def exact_bits(symbols: list[int]) -> float:
 @settings(max_examples=40)
 @given(st.lists(st.integers(-200, 200) | st.integers(-(2**24) + 1, 2**24 - 1), min_size=1, max_size=30))
 def test_agrees_with_mpmath(symbols):
-    assert gaussian_bits(np.array(symbols, dtype=np.int32)) == pytest.approx(exact_bits(symbols), rel=1e-8, abs=1e-8)
+    rate = histogram(np.array(symbols, dtype=np.int32)).rate_bits
+    assert rate == pytest.approx(exact_bits(symbols), rel=1e-8, abs=1e-8)
 
 
 def test_known_values():
-    assert gaussian_bits(np.zeros(0, np.int32)) == 0
-    assert gaussian_bits(np.full(100, 7, np.int32)) == 0  # sigma is floored, the whole mass is in the interval
+    assert histogram(np.full(100, 7, np.int32)).rate_bits == 0  # sigma is floored, the whole mass is in the interval
     rare = np.zeros(100_000, np.int32)
     rare[0] = 1000
     zero = math.log2(math.erf(0.5 / (math.sqrt(2) * rare.std())))
-    assert gaussian_bits(rare) == pytest.approx(-math.log2(1e-6) - 99_999 * zero, rel=1e-3)
-
-
-def test_the_rate_of_a_histogram_is_that_of_its_symbols():
-    for symbols in CHANNELS:
-        assert histogram(symbols).rate_bits == pytest.approx(gaussian_bits(symbols), rel=1e-12)
+    assert histogram(rare).rate_bits == pytest.approx(-math.log2(1e-6) - 99_999 * zero, rel=1e-3)

@@ -10,7 +10,7 @@ from hypothesis import strategies as st
 
 from pd4dgs_codec.entropy.positions import decode_positions, encode_positions
 from pd4dgs_codec.errors import DecodeError, EncodeError, LimitExceeded, Malformed
-from pd4dgs_codec.morton import MAX_VOXEL, join_bits, morton_codes, morton_order, spread_bits
+from pd4dgs_codec.morton import MAX_VOXEL, morton_codes, morton_order
 
 
 def ordered(cells):
@@ -57,19 +57,6 @@ def test_smallest_inputs():
     assert decode_positions(b"", 0).shape == (0, 3)
     assert len(round_trip(np.array([[-3, 0, 7]], dtype=np.int32))) == 4
     assert len(round_trip(np.array([[-MAX_VOXEL, 0, MAX_VOXEL]], dtype=np.int32))) == 9
-
-
-def test_join_bits_undoes_spread_bits():
-    values = np.array([0, 1, 5, 1 << 20, (1 << 21) - 1])
-    for axis in range(3):
-        assert join_bits(spread_bits(values) << axis >> axis).tolist() == values.tolist()
-    assert join_bits(np.array([(1 << 63) - 1])).tolist() == [(1 << 21) - 1]
-
-
-@pytest.mark.parametrize("effort", [1, 9])
-def test_every_effort_is_lossless(effort):
-    cells = ordered(sphere(8000, 40))
-    assert np.array_equal(decode_positions(encode_positions(cells, effort), len(cells)), cells)
 
 
 def test_uniform_cells_cost_their_entropy():
