@@ -17,13 +17,14 @@ def frequency_costs(frequencies: np.ndarray) -> np.ndarray:
     return 24 * BIT - log2
 
 
-def symbol_counts(symbols: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(values int64 [U], ascending, counts int64 [U]) of integer symbols, at least one."""
+def symbol_counts(symbols: np.ndarray, times: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """(values int64 [U], ascending, counts int64 [U]) of integer symbols, at least one. times: int [N], how often each
+    counts, if not once."""
     low, high = int(symbols.min()), int(symbols.max())
-    if high - low > 4 * symbols.size + 1024:
-        values, counts = np.unique(symbols, return_counts=True)
-        return values.astype(np.int64), counts.astype(np.int64)
-    counts = np.bincount(symbols.astype(np.int64) - low)  # faster than sorting, unless the range is wide
+    if high - low > 4 * symbols.size + 1024:  # too wide for an array of counts, which is faster than sorting
+        values, index = np.unique(symbols, return_inverse=True)
+        return values.astype(np.int64), np.bincount(index, weights=times).astype(np.int64)
+    counts = np.bincount(symbols.astype(np.int64) - low, weights=times).astype(np.int64)
     present = np.flatnonzero(counts)
     return present + low, counts[present]
 

@@ -120,27 +120,18 @@ def _encode(
         inside, exceptions = _split(array, prior.window)
         if _write_channel(out, prior, exceptions, defined):
             fresh.append(fitted)
-        for part, cum in _parts(inside, prior):
-            symbols.append(part)
-            cums.append(cum)
+        entries, shift = inside - prior.window.kmin, prior.window.shift
+        symbols.append(entries >> shift)
+        cums.append(prior.cum)
+        if shift:
+            symbols.append(entries & ((1 << shift) - 1))
+            cums.append(uniform_table(shift))
     tables = [f.prior for f in fresh if isinstance(f.prior, Hist)]
     words = ans_encode([*(p.class_symbols for p in tables), *symbols], [*(p.class_cum for p in tables), *cums])
     return bytes(out) + words, fresh
 
 
-def _parts(inside: np.ndarray, prior: Prior) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The table entries, and the low bits of a scaled prior, each with their table."""
-    entry = inside - prior.window.kmin
-    shift = prior.window.shift
-    if not shift:
-        return [(entry, prior.cum)]
-    return [(entry >> shift, prior.cum), (entry & ((1 << shift) - 1), uniform_table(shift))]
-
-
 def _split(array: np.ndarray, window: Window) -> tuple[np.ndarray, _Exceptions]:
-    if window.kmin <= int(array.min()) and int(array.max()) < window.end:
-        nothing = np.zeros(0, np.int64)
-        return array, _Exceptions(nothing, nothing)
     out = (array < window.kmin) | (array >= window.end)
     positions = np.flatnonzero(out)
     return array[~out], _Exceptions(positions, array[positions])
@@ -155,16 +146,13 @@ def _write_channel(out: bytearray, prior: Prior, exceptions: _Exceptions, define
         write_prior(out, prior)
         defined.append(prior)
     if len(exceptions.positions):
-        _write_exceptions(out, exceptions, prior.window)
-    return back is None
-
-
-def _write_exceptions(out: bytearray, exceptions: _Exceptions, window: Window) -> None:
-    put_varint(out, len(exceptions.positions) - 1)
+        put_varint(out, len(exceptions.positions) - 1)
+    kmin, end = prior.window.kmin, prior.window.end
     gaps = np.diff(exceptions.positions, prepend=-1) - 1
     for gap, value in zip(gaps.tolist(), exceptions.values.tolist(), strict=True):
         put_varint(out, gap)
-        put_varint(out, 2 * (window.kmin - 1 - value) + 1 if value < window.kmin else 2 * (value - window.end))
+        put_varint(out, 2 * (kmin - 1 - value) + 1 if value < kmin else 2 * (value - end))
+    return back is None
 
 
 def _read_exceptions(reader: ByteReader, count: int, window: Window) -> _Exceptions:

@@ -83,15 +83,8 @@ def histogram(symbols: np.ndarray) -> Histogram:
 
 def pool(histograms: Sequence[Histogram]) -> Histogram:
     """The histogram of several channels together."""
-    values = np.concatenate([h.values for h in histograms])
-    counts = np.concatenate([h.counts for h in histograms])
-    low, high = int(values.min()), int(values.max())
-    if high - low > 4 * values.size + 1024:  # the range is too wide for an array of counts
-        values, index = np.unique(values, return_inverse=True)
-        return Histogram(values, np.bincount(index, weights=counts).astype(np.int64))
-    dense = np.bincount(values - low, weights=counts).astype(np.int64)
-    present = np.flatnonzero(dense)
-    return Histogram(present + low, dense[present])
+    values, counts = ([getattr(h, name) for h in histograms] for name in ("values", "counts"))
+    return Histogram(*symbol_counts(np.concatenate(values), np.concatenate(counts)))
 
 
 def split_bits(channels: np.ndarray, classes: np.ndarray, count: int) -> float:
@@ -175,16 +168,9 @@ def _richer_priors(h: Histogram, found: Fitted, effort: int) -> list[Fitted]:
 
 def _dense(h: Histogram, window: Window) -> np.ndarray:
     """Counts per table entry, int64 [n]."""
-    values, counts = h.values, h.counts
-    if values[0] < window.kmin or values[-1] >= window.end:
-        inside = (values >= window.kmin) & (values < window.end)
-        values, counts = values[inside], counts[inside]
-    entries = (values - window.kmin) >> window.shift
-    if not window.shift:
-        dense = np.zeros(window.n, np.int64)
-        dense[entries] = counts
-        return dense
-    return np.bincount(entries, weights=counts, minlength=window.n).astype(np.int64)
+    inside = (h.values >= window.kmin) & (h.values < window.end)
+    entries = (h.values[inside] - window.kmin) >> window.shift
+    return np.bincount(entries, weights=h.counts[inside], minlength=window.n).astype(np.int64)
 
 
 def _beside(h: Histogram, window: Window) -> int:

@@ -59,17 +59,15 @@ def test_constants_match_high_precision_and_stay_clear_of_rounding_boundaries():
     assert (2**21 - 1) * int(OCTAVE.max()) < 2**53, "the largest product of the rule fits a double"
 
 
-@given(st.integers(2, 300), st.integers(-(2**31), 2**31), st.integers(SI_MIN, SI_MAX), st.sampled_from([1, 16]))
+@given(
+    st.integers(2, 300) | st.just(1 << 14),
+    st.integers(-(2**31), 2**31),
+    st.integers(SI_MIN, SI_MAX) | st.sampled_from([SI_MIN, SI_MAX]),
+    st.sampled_from([1, 16]),
+)
 def test_equals_the_rule_in_python_integers(n, mu8, si, floor):
     cum = norm_table(n, mu8, si, floor)
     assert cum.tolist() == refdec.table_of(refdec.norm_cdf(n, mu8, si), floor) and is_table(cum, n)
-
-
-@pytest.mark.parametrize("si", [SI_MIN, -1, 0, 577, SI_MAX])
-@pytest.mark.parametrize("n, floor", [(2, 1), (2, 16), (1 << 14, 16)])
-def test_extreme_parameters_give_tables(n, floor, si):
-    for mu8 in (0, 128 * n, -(2**31), 2**31):
-        assert is_table(norm_table(n, mu8, si, floor), n)
 
 
 @pytest.mark.parametrize("sigma", [0.05, 0.3, 1.0, 7.3, 200.0])

@@ -34,6 +34,11 @@ def test_every_level_is_trained_in_every_step_on_a_view_of_its_own_if_asked(data
     assert levels == (0, 1, 2) and len(set(views)) == 3
 
 
+def test_the_top_rollout_trains_the_highest_level_alone(dataset):
+    steps = learner(dataset, 40, rollout="top")
+    assert [steps.step()["level"] for _ in range(8)] == [0] * 4 + [2] * 4
+
+
 def test_until_n_is_known_steps_stay_in_the_coarse_phase(dataset):
     steps = learner(dataset, None, max_seconds=100.0)
     records = [steps.step() for _ in range(45)]
