@@ -108,6 +108,12 @@ def test_no_two_modules_need_each_other():
         pytest.fail(f"a circle of imports: {' -> '.join(error.args[1])}")
 
 
+@pytest.mark.parametrize("part", ["planes", "omissions"])
+def test_parts_of_the_deformation_are_used_by_the_deformation_alone(part):
+    users = {name for name in MODULES if f"pd4dgs_codec.format.{part}" in imports()[name]}
+    assert users <= {"pd4dgs_codec.format.deformation", "pd4dgs_codec.format.omissions"}
+
+
 @pytest.mark.parametrize("room", DECODER)
 def test_the_decoder_uses_numpy_and_two_coders_beside_the_standard_library(room):
     for name in (n for n in MODULES if room_of(n) == room):

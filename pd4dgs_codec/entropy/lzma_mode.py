@@ -14,8 +14,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from pd4dgs_codec.entropy.ans import MAX_COUNT
-from pd4dgs_codec.entropy.channels import CodedChannels, check_channels
-from pd4dgs_codec.entropy.fitting import histogram
+from pd4dgs_codec.entropy.channels import check_channels
 from pd4dgs_codec.entropy.priors import K_MAX
 from pd4dgs_codec.entropy.varint import ByteReader, put_varint
 from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
@@ -26,17 +25,15 @@ _SAMPLE = 1 << 19  #: bytes on which the search compares settings
 _SIGNED: list[np.dtype] = [np.dtype("<i1"), np.dtype("<i2"), np.dtype("<i4")]
 
 
-def encode_channels_lzma(channels: Sequence[np.ndarray], *, effort: int = 5) -> CodedChannels:
-    """Encode int32 channels (1-D, |k| <= 2**24 - 1) with LZMA; it defines no priors. effort 1..9 bounds the search."""
-    arrays = check_channels(channels)
+def encode_channels_lzma(channels: Sequence[np.ndarray], *, effort: int = 5) -> bytes:
+    """The payload of int32 channels (1-D, |k| <= 2**24 - 1). effort 1..9 bounds the search for settings."""
     head, numbers = bytearray(), list[np.ndarray]()
-    for array in arrays:
+    for array in check_channels(channels):
         if len(array):
             base, log_width = _narrowest(int(array.min()), int(array.max()))
             put_varint(head, (2 * base if base >= 0 else -2 * base - 1) << 2 | log_width)
             numbers.append((array - base).astype(_SIGNED[log_width]))
-    payload = _compress(bytes(head), numbers, effort)
-    return CodedChannels(payload, sum(histogram(a).rate_bits for a in arrays if len(a)))
+    return _compress(bytes(head), numbers, effort)
 
 
 def decode_channels_lzma(payload: bytes | memoryview, counts: Sequence[int]) -> list[np.ndarray]:

@@ -159,15 +159,6 @@ def read_layers(
     return reader, True
 
 
-def decode_layers(
-    data: bytes, *, max_layer: int | None = None, max_bytes: int | None = None, allow_partial: bool = False
-) -> tuple[Header, list[LayerSymbols], bool]:
-    """(header, symbols per layer, complete); arguments as in `decode`."""
-    reader, complete = read_layers(data, max_layer=max_layer, max_bytes=max_bytes, allow_partial=allow_partial)
-    assert reader.header is not None
-    return reader.header, reader.layers, complete
-
-
 def decode(
     data: bytes, *, max_layer: int | None = None, max_bytes: int | None = None, allow_partial: bool = False
 ) -> Scene:

@@ -294,11 +294,7 @@ def _added(slices: list[_Slice]) -> list[StreamReport]:
     """Sums over the slices by section; the positions come first."""
     found: dict[str, StreamReport] = {}
     for row in (row for part in slices for row in part.streams):
-        so_far = found.get(row.name, StreamReport(row.name, 0, 0.0, 0))
-        found[row.name] = StreamReport(
-            row.name,
-            so_far.payload_bits + row.payload_bits,
-            so_far.rate_bits + row.rate_bits,
-            so_far.symbols + row.symbols,
-        )
+        other = found.get(row.name, StreamReport(row.name, 0, 0.0, 0))
+        bits, rate = other.payload_bits + row.payload_bits, other.rate_bits + row.rate_bits
+        found[row.name] = StreamReport(row.name, bits, rate, other.symbols + row.symbols)
     return list(found.values())

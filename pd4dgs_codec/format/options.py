@@ -37,13 +37,13 @@ class EncodeOptions:
     """Options of the encoder. Raises EncodeError for an invalid value.
 
     mode: "ans", or "lzma" for the same symbols under LZMA2. priors: "best", or "gauss", the model of R(a). layers:
-    "auto" leaves out every head that is zero after quantisation or below the bounds of `heads`, and every layer without
-    a head; 0, 1 or 2 keeps the layers up to that number and drops only heads that are exactly zero. effort: 1 (fast) ..
-    9 (small). omit: "bounded" leaves out heads below those bounds and parts that change no picture, "lossless" the
-    latter alone, "nothing" only heads that are exactly zero and anchors below the mask threshold. step_scale: factor on
-    every quantisation step. slices: most bytes of a slice, where planes and networks allow it, the header counted with
-    the first slice; 0 for one slice per layer. verify: decode the result, compare every symbol, and check every value
-    against the error bound in the header.
+    "auto" leaves out every head that is zero after quantisation or below the bounds of `plan.head_bounds`, and every
+    layer without a head; 0, 1 or 2 keeps the layers up to that number and drops only heads that are exactly zero.
+    effort: 1 (fast) .. 9 (small). omit: "bounded" leaves out heads below those bounds and parts that change no picture,
+    "lossless" the latter alone, "nothing" only heads that are exactly zero and anchors below the mask threshold.
+    step_scale: factor on every quantisation step. slices: most bytes of a slice, where planes and networks allow it,
+    the header counted with the first slice; 0 for one slice per layer. verify: decode the result, compare every symbol,
+    and check every value against the error bound in the header.
     """
 
     mode: str = "ans"

@@ -206,7 +206,7 @@ def _write_lzma(
     channels = [*masks, *graded, *symbols.attributes, *rest]
     if not any(channel.size for channel in channels):
         return {}
-    data = encode_channels_lzma(channels, effort=options.effort).payload
+    data = encode_channels_lzma(channels, effort=options.effort)
     counted = [*by_class(symbols.attributes, symbols.classes), *rest]
     rate_bits = sum(histogram(channel).rate_bits for channel in counted if channel.size)
     return {Section.SYMBOLS: (data, rate_bits + entropy_bits(symbols.classes))}

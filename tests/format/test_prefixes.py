@@ -11,7 +11,7 @@ from strategies import LAYER_SETS, assert_same_scene, scenes, small_file
 from pd4dgs_codec import decode, encode, open_stream
 from pd4dgs_codec.errors import BadSignature, ChecksumMismatch, DecodeError, Malformed, Truncated
 from pd4dgs_codec.format.container import write_chunk, write_preamble
-from pd4dgs_codec.format.decoder import decode_layers, decode_partial
+from pd4dgs_codec.format.decoder import decode_partial, read_layers
 from pd4dgs_codec.format.header import pack_header, scene_id_of
 from pd4dgs_codec.format.info import hashes, info
 from pd4dgs_codec.format.options import EncodeOptions
@@ -111,7 +111,7 @@ def faults_by_every_door(data):
         streamed,
         lambda: decode(data),
         lambda: decode(data, allow_partial=True),
-        lambda: decode_layers(data),
+        lambda: read_layers(data),
         lambda: hashes(data),
     )
     for door in doors:
@@ -124,7 +124,8 @@ def faults_by_every_door(data):
 @pytest.mark.parametrize("first", ["value", "mask code", "voxel"])
 def test_of_two_faults_every_door_names_that_of_the_earlier_layer(first, later):
     """Values that are not finite, sums of masks and voxels taken twice, which a payload alone does not show."""
-    header, layers, _ = decode_layers(small_file())
+    reader, _ = read_layers(small_file())
+    header, layers = reader.header, reader.layers
     payloads = [write_layer(layer, EncodeOptions(effort=1))[0] for layer in layers]
     steps, which = header.grid.steps, 1
     if first == "value":

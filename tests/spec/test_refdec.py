@@ -109,7 +109,7 @@ def test_every_prior_family():
     assert refdec.decode_channels(coded.payload, counts) == [c.tolist() for c in channels]
     wide = encode_channels(channels[4:5], priors="gauss").payload
     assert wide[0] >> 1 == 4 and refdec.decode_channels(wide, [400]) == [channels[4].tolist()]
-    assert refdec.decode_lzma_symbols(encode_channels_lzma(channels).payload, counts) == [c.tolist() for c in channels]
+    assert refdec.decode_lzma_symbols(encode_channels_lzma(channels), counts) == [c.tolist() for c in channels]
 
 
 @pytest.mark.parametrize("depth", [7, 13, 21])
