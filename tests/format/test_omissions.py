@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 from strategies import assert_same_scene, make_scene
 
-from pd4dgs_codec.errors import EncodeError
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode, encode_with_report
 from pd4dgs_codec.format.options import EncodeOptions
@@ -157,8 +156,3 @@ def test_a_filled_plane_keeps_what_is_given_and_costs_less():
     assert any(zeros)
     assert np.array_equal(fill_plane(plane, np.ones_like(given))[0], plane)
     assert not fill_plane(plane, np.zeros_like(given))[0].any()
-
-
-def test_an_unknown_wish_is_refused():
-    with pytest.raises(EncodeError, match="omit 'much', expected one of"):
-        encode(lively_scene(), omit="much")
