@@ -14,6 +14,7 @@ import torch
 
 from pd4dgs_codec import encode
 from pd4dgs_codec.__main__ import MODULES
+from pd4dgs_codec.model import checkpoint
 
 #: Exit code, command line, and a part of the message. SCENE, MODEL and DATA are a .pd4, a checkpoint and a dataset;
 #: others are files of `folder`.
@@ -127,10 +128,9 @@ def bad_files(tmp_path_factory, model_pt, scene_pd4, scene):
     (folder / "flipped.pd4").write_bytes(_flip(data, 400))
     (folder / "blind.pd4").write_bytes(encode(replace(scene, info=replace(scene.info, camera=None)), effort=1))
     for name, value in (("nan", float("nan")), ("inf", float("inf")), ("huge", 1e20)):
-        content = torch.load(model_pt, weights_only=True)
-        del content["digest"]  # as in a checkpoint of an older release
-        content["state"]["feature"][3, 2] = value
-        torch.save(content, folder / f"{name}.pt")
+        model, _ = checkpoint.load(model_pt)
+        model.feature.data[3, 2] = value
+        checkpoint.save(folder / f"{name}.pt", model)
     torch.save({"format": "pd4dgs-checkpoint", "version": 1, "state": _Payload(folder / "ran")}, folder / "evil.pt")
     (folder / "cut.pt").write_bytes(model_pt.read_bytes()[:-200])
     for name in ("kept.npz", "kept.gif", "notes"):
