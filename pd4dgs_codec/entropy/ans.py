@@ -24,6 +24,7 @@ from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
 
 MAX_COUNT = 1 << 26  #: symbols in one channel; decoding allocates four bytes for each
 _U32 = np.dtype("<u4")
+_INVALID = f"a frequency table does not ascend from 0 to {TOTAL}"
 
 
 #: A table as constriction has it. Passed less one, its own rounding has scale exactly 1 and reproduces the integers.
@@ -32,7 +33,10 @@ Model: TypeAlias = constriction.stream.model.Categorical
 
 def model_of(cum: np.ndarray) -> Model | None:
     """The model of a table int64 [n + 1]; None for a table of one symbol. Raises Malformed for an invalid table."""
-    return models_of_each(cum, np.array([len(cum) - 1]))[0]
+    frequencies = cum[1:] - cum[:-1]  # beside `models_of_each`, which takes twice as long for one table
+    if not len(frequencies) or cum[0] or cum[-1] != TOTAL or frequencies[frequencies.argmin()] < 1:
+        raise Malformed(_INVALID)
+    return Model((frequencies - 1).astype(np.float64), perfect=False) if len(frequencies) > 1 else None
 
 
 def models_of_each(cums: np.ndarray, sizes: np.ndarray) -> list[Model | None]:
@@ -44,7 +48,7 @@ def models_of_each(cums: np.ndarray, sizes: np.ndarray) -> list[Model | None]:
     frequencies -= 1
     frequencies[ends - 1] = 0  # the difference between two tables
     if cums[firsts].any() or np.any(cums[ends - 1] != TOTAL) or frequencies.min(initial=0) < 0:
-        raise Malformed(f"a frequency table does not ascend from 0 to {TOTAL}")
+        raise Malformed(_INVALID)
     pairs = zip(firsts.tolist(), sizes.tolist(), strict=True)
     return [Model(frequencies[at : at + n], perfect=False) if n > 1 else None for at, n in pairs]
 

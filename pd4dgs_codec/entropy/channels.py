@@ -132,6 +132,9 @@ def _encode(
 
 
 def _split(array: np.ndarray, window: Window) -> tuple[np.ndarray, _Exceptions]:
+    if window.kmin <= int(array.min()) and int(array.max()) < window.end:  # nearly always
+        nothing = np.zeros(0, np.int64)
+        return array, _Exceptions(nothing, nothing)
     out = (array < window.kmin) | (array >= window.end)
     positions = np.flatnonzero(out)
     return array[~out], _Exceptions(positions, array[positions])
@@ -145,8 +148,9 @@ def _write_channel(out: bytearray, prior: Prior, exceptions: _Exceptions, define
     if back is None:
         write_prior(out, prior)
         defined.append(prior)
-    if len(exceptions.positions):
-        put_varint(out, len(exceptions.positions) - 1)
+    if not len(exceptions.positions):
+        return back is None
+    put_varint(out, len(exceptions.positions) - 1)
     kmin, end = prior.window.kmin, prior.window.end
     gaps = np.diff(exceptions.positions, prepend=-1) - 1
     for gap, value in zip(gaps.tolist(), exceptions.values.tolist(), strict=True):

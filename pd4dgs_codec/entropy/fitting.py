@@ -168,9 +168,13 @@ def _richer_priors(h: Histogram, found: Fitted, effort: int) -> list[Fitted]:
 
 def _dense(h: Histogram, window: Window) -> np.ndarray:
     """Counts per table entry, int64 [n]."""
-    inside = (h.values >= window.kmin) & (h.values < window.end)
-    entries = (h.values[inside] - window.kmin) >> window.shift
-    return np.bincount(entries, weights=h.counts[inside], minlength=window.n).astype(np.int64)
+    values, counts = h.values, h.counts
+    if values[0] < window.kmin or values[-1] >= window.end:
+        inside = (values >= window.kmin) & (values < window.end)
+        values, counts = values[inside], counts[inside]
+    dense = np.zeros(window.n, np.int64)
+    np.add.at(dense, (values - window.kmin) >> window.shift, counts)
+    return dense
 
 
 def _beside(h: Histogram, window: Window) -> int:
