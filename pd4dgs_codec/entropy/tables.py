@@ -12,7 +12,6 @@ import numpy as np
 
 PRECISION = 24
 TOTAL = 1 << PRECISION
-MAX_FLOOR_MASS = 1 << 23  #: n * floor may not pass it, so at least half of the mass follows the model
 SI_MIN, SI_MAX = -640, 1280  #: sigma = Q * 2 ** (si / 64)
 
 # The two constants of NormTable v1. Computing them in float64 is safe: no entry comes closer than 1e-4 to a rounding
@@ -65,7 +64,7 @@ def norm_table(n: int, mu8: int, si: int, floor: int) -> np.ndarray:
     """NormTable v1: cum int64 [n + 1] of a quantised Gaussian over symbols 0 .. n - 1.
 
     The first symbol carries the mass below the window, the last the mass above it. The caller has checked
-    n >= 1, SI_MIN <= si <= SI_MAX, |mu8| < 2**40 and n * floor <= MAX_FLOOR_MASS.
+    n >= 1, SI_MIN <= si <= SI_MAX, |mu8| < 2**40 and n <= 2**14 with floor <= 16 (clause 8.2 of the format).
     """
     sizes = np.array([n])
     return tables_of_each(norm_cdf28_of_each(sizes, np.array([mu8]), np.array([si])), sizes, np.array([floor]))

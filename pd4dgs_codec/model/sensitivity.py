@@ -16,7 +16,7 @@ from torch import Tensor
 
 from pd4dgs_codec.format.symbols import layer_symbols
 from pd4dgs_codec.model.convert import from_scene
-from pd4dgs_codec.model.model import Model
+from pd4dgs_codec.model.model import Gaussians, Model
 from pd4dgs_codec.model.networks import EXACT, Rounding
 from pd4dgs_codec.model.picture import draw, render_image
 from pd4dgs_codec.scene import ATTRIBUTES, Camera, Scene
@@ -63,13 +63,17 @@ def _gated(model: Model, level: int, t: float, camera: Camera, rounding: Roundin
     """(picture [H, W, 3], the gates of the anchors [N], all 1, bool [N] whether an anchor may reach it)."""
     with torch.no_grad():
         g = model.gaussians(level, t, camera, rounding)
-    n, device = len(model.anchor_q), g.means.device
-    met = torch.zeros(n, dtype=torch.bool, device=device)
-    met[g.anchors] = True
-    gate = torch.ones(n, device=device, requires_grad=True)
+    gate = torch.ones(len(model.anchor_q), device=g.means.device, requires_grad=True)
     shown = gate[torch.div(g.slots, model.widths.slots, rounding_mode="floor")]
     gated = replace(g, scales=g.scales * shown[:, None], opacities=g.opacities * shown)
-    return draw(model.info, gated, camera).image, gate, met
+    return draw(model.info, gated, camera).image, gate, _met(model, g)
+
+
+def _met(model: Model, gaussians: Gaussians) -> Tensor:
+    """bool [N]: whether each anchor was evaluated for these Gaussians, so that it may reach their picture."""
+    met = torch.zeros(len(model.anchor_q), dtype=torch.bool, device=gaussians.means.device)
+    met[gaussians.anchors] = True
+    return met
 
 
 def _squared(image: Tensor, gate: Tensor, generator: torch.Generator, weights: Tensor | None = None) -> Tensor:
@@ -124,12 +128,10 @@ def attribute_slopes(
     with torch.enable_grad():
         g = model.gaussians(level, t, camera, rounding)
         image = draw(model.info, g, camera).image
-        met = torch.zeros(len(model.anchor_q), dtype=torch.bool, device=image.device)
-        met[g.anchors] = True
         slopes = [torch.zeros_like(value) for value in values]
         if len(g.scales):
             slopes = list(torch.autograd.grad((image * _signs(image, generator, weights)).sum(), values))
-    return dict(zip(ATTRIBUTES, slopes, strict=True)), met, image.detach()
+    return dict(zip(ATTRIBUTES, slopes, strict=True)), _met(model, g), image.detach()
 
 
 def _signs(image: Tensor, generator: torch.Generator, weights: Tensor | None) -> Tensor:
