@@ -25,8 +25,13 @@ SCENES = """\
   synthetic:global   large objects move slowly
   synthetic:local    the same, and small parts move on their own
   synthetic:fast     quick motion
+  synthetic:flyby, synthetic:dart, synthetic:rods, synthetic:tunnel, synthetic:bend, synthetic:blink
+                     on white in D-NeRF's manner, from a camera that jumps and without points: a ball flies past a
+                     cube, a small ball flies fast, thin rods move, a ball goes through a tunnel, a column bends,
+                     things appear and vanish
   (synthetic:NAME?seed=n is another scene of that kind; &size=WxH and &frames=N set the size and number of its
-  images, by default 160x120 and 60)
+  images, by default 160x120 and 60, on white 100x100 and 150; &path=pass|sweeps|jump moves the camera once over its
+  arc, to and fro, or to a random place at each instant)
   teacher:PATH       images rendered from explicit Gaussians: a folder of .ply or .spz files, one per frame, one such
                      file, a .4dgs file, a gsplat checkpoint, or module:function (time -> Gaussians)
   (teacher:PATH?cameras=SOURCE takes the cameras, times and held-out images of another source;

@@ -79,7 +79,7 @@ FOLDERS = tuple(
 def load(source: str | Path, *, downscale: int = 1, holdout: int = 8) -> Dataset:
     """Read a dataset.
 
-    source: a folder that one of READERS recognises, or `synthetic:NAME[?seed=n&size=WxH&frames=N]`.
+    source: a folder that one of READERS recognises, or `synthetic:NAME[?key=value&...]` (see `synthetic`).
     downscale: images are averaged over downscale x downscale blocks (the remainder is cropped), intrinsics follow.
     holdout: without split files, frames with i % holdout == holdout // 2 are the test frames; 0 = none.
     Views whose masks hold no valid pixel are left out, see `Dataset.left_out`.

@@ -1,192 +1,111 @@
-"""`synthetic:static|global|local|fast[?seed=n&size=WxH&frames=N]`: ray-cast dynamic scenes, exact covisibility masks.
+"""`synthetic:NAME[?seed=n&size=WxH&frames=N&path=pass|sweeps|jump]`: ray-cast dynamic scenes; `bodies` has their names.
 
-One camera moves to and fro along an arc (60 training frames); two fixed cameras off that arc give the test views. The
-four scenes share their objects and differ in motion. Another size keeps the vertical field of view; more frames repeat
-the same motion more densely. The content depends on the source string alone.
+In a room one camera moves along an arc (60 training frames); two fixed cameras off that arc give the test views, with
+exact covisibility masks. On white the camera jumps on the upper hemisphere, as D-NeRF's does (150 frames without
+points); two cameras that stand still see all instants. Another size keeps the vertical field of view; more frames
+repeat the same motion more densely. The content depends on the source string alone.
 """
 
 from __future__ import annotations
 
 import re
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from typing import Any
 
 import numpy as np
 from numpy.typing import DTypeLike
 
+from pd4dgs_codec.data.bodies import MOTIONS, THINGS, bodies
 from pd4dgs_codec.data.cameras import Lens, world_to_camera
 from pd4dgs_codec.data.dataset import SYNTHETIC
 from pd4dgs_codec.data.files import check_downscale, shrink_image, shrink_mask, split_options
-from pd4dgs_codec.data.raycast import NO_BODY, Body, Eye, Paint, Pose, material, normal, place, shade
+from pd4dgs_codec.data.raycast import NO_BODY, Body, Eye, material, normal, place, shade
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DataError
 
-LENS = Lens(160, 120, 150.0, 150.0, 81.5, 58.75)  #: off centre on purpose: readers must honour cx, cy
 SUPERSAMPLING = 2
 SECONDS = 59 / 12
-#: Test views of each fixed camera, if there are enough frames.
-TEST_INSTANTS = 15
 #: Allowed values of the options.
 SIZES, FRAMES = range(8, 8193), range(3, 10_001)
-EXAMPLES = {"seed": "seed=1", "size": "size=960x540", "frames": "frames=300"}
-#: The camera sweeps its arc so many times. If it passed each place once, place and time would be the same, and a static
-#: scene with a view-dependent look would explain every motion.
-SWEEPS = 2.5
-SKY = (0.71, 0.80, 0.90)
-TARGET = np.array([0.0, 0.1, 0.5])
-BOX = np.array([[-2.7, -2.7, -0.1], [2.7, 2.5, 2.6]], np.float32)
+EXAMPLES = {"seed": "seed=1", "size": "size=960x540", "frames": "frames=300", "path": "path=pass, sweeps or jump"}
+#: How often the camera goes to and fro; None: it is at a random place at each instant. If it passes each place once,
+#: place and time are the same, and a static scene with a view-dependent look explains every motion.
+PATHS = {"pass": 0.5, "sweeps": 2.5, "jump": None}
 NEAR, FAR = 0.5, 12.0
 POINTS = 5000
 COVISIBLE_SHARE = 0.05  #: of the training frames that must see a test pixel's surface point
 
 
-@dataclass(frozen=True)
-class Motion:
-    """The motion of a scene over t = 0..1. Amplitudes in radians or shares, rates in turns (cycles) over that time."""
-
-    sway: float = 0.0  #: turning of the platform with all that stands on it
-    heave: float = 0.0  #: its rise, scene units
-    swing: float = 0.0  #: the arm on the column
-    swing_rate: float = 2.0
-    pulse: float = 0.0  #: stretching of the ball
-    tint: float = 0.0  #: colour change of the plank
-    spin: float = 0.0  #: turns of the crate
-    hops: float = 0.0  #: bounces of the two balls
-    orbit: float = 0.0  #: turns of the runner around the platform
+def _look(target: np.ndarray, azimuth: float, radius: float, height: float) -> np.ndarray:
+    """float64 [4, 4] viewmat of a camera at the azimuth (0 = along y) that looks at the target."""
+    center = target + np.array([radius * np.sin(azimuth), -radius * np.cos(azimuth), height])
+    z = (target - center) / np.linalg.norm(target - center)
+    x = np.cross(z, [0, 0, 1])
+    x /= np.linalg.norm(x)
+    return world_to_camera(np.stack([x, np.cross(z, x), z]), center)
 
 
-Size = Sequence[float]  #: of three axes
-#: Rotation [3, 3], shift [3] and stretch per axis [3] of a body at an instant, on top of its place.
-Local = tuple[np.ndarray, np.ndarray, np.ndarray]
-
-MOTIONS = {
-    "static": Motion(),
-    "global": Motion(sway=0.7, heave=0.08),
-    "local": Motion(sway=0.3, swing=0.6, pulse=0.16, tint=0.55),
-    "fast": Motion(swing=1.0, swing_rate=6.0, spin=2.5, hops=6.0, orbit=1.5),
-}
+ROOM_TARGET = np.array([0.0, 0.1, 0.5])
 
 
-def _turn(axis: int, angle: float) -> np.ndarray:
-    """Rotation about a coordinate axis."""
-    c, s = np.cos(angle), np.sin(angle)
-    i, j = (axis + 1) % 3, (axis + 2) % 3
-    r = np.eye(3)
-    r[i, i], r[i, j], r[j, i], r[j, j] = c, -s, s, c
-    return r
+def room_viewmat(phase: float, s: float) -> np.ndarray:
+    """The moving camera in the room after `phase` times to and fro; s 0..1 decides height and distance."""
+    azimuth = 40 * np.sin(2 * np.pi * phase - np.pi / 2)
+    return _look(ROOM_TARGET, np.radians(azimuth), 3.9 + 0.15 * np.cos(7 * s), 1.15 + 0.2 * np.sin(9 * s))
 
 
-class SceneBuilder:
-    """Builds the bodies of one scene."""
+def white_viewmat(phase: float, s: float) -> np.ndarray:
+    """The camera after `phase` turns around a scene on white, at D-NeRF's distance; s 0..1 is evenly spread over the
+    upper hemisphere without its pole."""
+    z = 0.05 + 0.9 * s
+    return _look(np.zeros(3), 2 * np.pi * phase, 4 * np.sqrt(1 - z * z), 4 * z)
 
-    def __init__(self, name: str, seed: int):
-        self.motion, self.rng = MOTIONS[name], np.random.default_rng(seed)
-        self.hue = self.rng.uniform()
 
-    def paint(
-        self, size: Size, hue: float, wave: float, axes: tuple[int, int] = (0, 2), strength: float = 0.45
-    ) -> Paint:
-        """Two shades of a hue in checks along two axes, `wave` radians per unit."""
-        rng = self.rng
-        angle = 2 * np.pi * (hue + self.hue + np.array([0, 1 / 3, 2 / 3]))
-        base = 0.56 + 0.34 * np.cos(angle)
-        waves, (a, b) = np.zeros((2, 4)), axes
-        waves[:, a], waves[0, b], waves[1, b], waves[:, 3] = wave, wave, -wave, rng.uniform(0, 6, 2)
-        direction = rng.normal(size=(4, 3))
-        direction *= rng.uniform(9, 26, (4, 1)) / np.linalg.norm(direction, axis=1, keepdims=True)
-        detail = np.concatenate([direction, rng.uniform(0, 6, (4, 1))], axis=1)
-        high = np.clip(base + 0.25, 0, 1)
-        return Paint(base * (1 - strength), high, waves, detail, np.asarray(size, float))
+@dataclass(frozen=True, eq=False)
+class Stage:
+    """What the scenes of one kind have in common.
 
-    def group(self, t: float) -> Pose:
-        """Rotation and position of the platform."""
-        m = self.motion
-        angle = m.sway * np.sin(2 * np.pi * 0.75 * t)
-        return _turn(2, angle), np.array([0, 0, m.heave * np.sin(np.pi * t) ** 2])
+    viewmat: of the moving camera, from the phase of its path and s 0..1. fixed: viewmats of the test cameras.
+    instants: about so many test views of each of them; 0 for all. capture: whether there are covisibility masks and
+    initial points.
+    """
 
-    def fixed(self, shape: str, size: Size, at: Size, *look: Any, casts: bool = False, **more: Any) -> Body:
-        """A body that never moves. look, more: of its paint. casts: False for floor and wall."""
-        pose = np.diag(np.asarray(size, float)), np.asarray(at, float)
-        return Body(shape, lambda t: pose, self.paint(size, *look, **more), casts)
+    lens: Lens
+    frames: int
+    path: str
+    background: tuple[float, float, float]
+    box: np.ndarray
+    viewmat: Callable[[float, float], np.ndarray]
+    fixed: tuple[np.ndarray, np.ndarray]
+    instants: int = 0
+    capture: bool = False
 
-    def riding(
-        self, shape: str, size: Size, at: Size, *look: Any, local: Callable[[float], Local] | None = None, **more: Any
-    ) -> Body:
-        """A body on the platform; `local` is its motion there."""
-        half = np.asarray(size, float)
-        yaw = _turn(2, self.rng.uniform(-0.4, 0.4))
-        place = np.asarray(at, float) + np.array([*self.rng.uniform(-0.05, 0.05, 2), 0])
 
-        def pose(t: float) -> Pose:
-            R, p = self.group(t)
-            turn, shift, stretch = local(t) if local else (np.eye(3), np.zeros(3), np.ones(3))
-            return R @ turn @ yaw @ np.diag(half * stretch), R @ (place + shift) + p
-
-        return Body(shape, pose, self.paint(size, *look, **more))
-
-    def arm(self) -> list[Body]:
-        """A rod that swings about the top of the column, with a bob at its end."""
-        m, pivot, reach = self.motion, np.array([0.15, 0.35, 1.17]), 0.36
-        rest = self.rng.uniform(0.4, 0.9)
-
-        def part(size: Size, along: float) -> Callable[[float], Pose]:
-            def pose(t: float) -> Pose:
-                R, p = self.group(t)
-                turn = R @ _turn(1, rest + m.swing * np.sin(2 * np.pi * m.swing_rate * t))
-                return turn @ np.diag(size), R @ pivot + p + turn @ np.array([along, -0.2, 0])
-
-            return pose
-
-        rod, bob = (reach, 0.05, 0.05), (0.15, 0.15, 0.15)
-        return [
-            Body("box", part(rod, 0.6 * reach), self.paint(rod, 0.1, 9.0)),
-            Body("sphere", part(bob, 1.7 * reach), self.paint(bob, 0.75, 14.0)),
-        ]
-
-    def bodies(self) -> list[Body]:
-        """All bodies, the still ones first."""
-        m = self.motion
-        one, still = np.ones(3), np.eye(3)
-
-        def hop(t: float, phase: float, height: float) -> np.ndarray:
-            bounce = height * abs(np.sin(np.pi * (m.hops * t + phase))) if m.hops else 0.0
-            return np.array([0, 0, bounce])
-
-        def ball(t: float) -> Local:
-            s = m.pulse * np.sin(2 * np.pi * 3 * t)
-            return still, hop(t, 0.0, 0.55) + [0, 0, 0.3 * s], np.array([1 - 0.5 * s, 1 - 0.5 * s, 1 + s])
-
-        def small(t: float) -> Local:
-            return still, hop(t, 0.4, 0.8), one
-
-        def crate(t: float) -> Local:
-            return _turn(2, 2 * np.pi * m.spin * t), np.zeros(3), one
-
-        def runner(t: float) -> Local:
-            angle = 2 * np.pi * m.orbit * t
-            return still, 1.5 * np.array([np.cos(angle) - 1, np.sin(angle), 0]), one
-
-        def tint(t: float) -> np.ndarray:
-            s = m.tint * np.sin(np.pi * 2 * t) ** 2
-            return np.array([1 - s, 1 - 0.4 * s, 1 + 0.6 * s])
-
-        plank = self.riding("box", (0.1, 0.38, 0.24), (-0.62, 0.42, 0.34), 0.55, 11.0, axes=(1, 2))
-        return [
-            self.fixed("box", (2.6, 2.4, 0.05), (0, -0.1, -0.05), 0.08, 5.5, axes=(0, 1), strength=0.3),
-            self.fixed("box", (2.6, 0.05, 1.2), (0, 2.3, 1.2), 0.6, 3.5, strength=0.18),
-            self.fixed("box", (0.22, 0.22, 0.75), (1.9, 1.5, 0.75), 0.3, 8.0, casts=True),
-            self.fixed("sphere", (0.42, 0.42, 0.42), (-1.8, 1.2, 0.42), 0.9, 7.0, casts=True),
-            self.riding("cylinder", (1.15, 1.15, 0.05), (0, 0, 0.05), 0.15, 6.0, axes=(0, 1)),
-            self.riding("cylinder", (0.12, 0.12, 0.55), (0.15, 0.42, 0.65), 0.45, 10.0),
-            replace(plank, paint=replace(plank.paint, tint=tint if m.tint else None)),
-            self.riding("box", (0.26, 0.26, 0.26), (-0.42, -0.3, 0.36), 0.0, 9.0, local=crate),
-            self.riding("sphere", (0.3, 0.3, 0.3), (0.5, -0.3, 0.4), 0.33, 9.0, local=ball),
-            self.riding("sphere", (0.16, 0.16, 0.16), (-0.42, -0.3, 0.78), 0.7, 12.0, local=small),
-            self.riding("sphere", (0.14, 0.14, 0.14), (1.5, 0, 0.14), 0.2, 14.0, local=runner),
-            *self.arm(),
-        ]
+#: The lens is off centre on purpose: readers must honour cx, cy. The test cameras are inside the arc in azimuth but off
+#: it in height and distance.
+ROOM = Stage(
+    lens=Lens(160, 120, 150.0, 150.0, 81.5, 58.75),
+    frames=60,
+    path="sweeps",
+    background=(0.71, 0.80, 0.90),
+    box=np.array([[-2.7, -2.7, -0.1], [2.7, 2.5, 2.6]], np.float32),
+    viewmat=room_viewmat,
+    fixed=(_look(ROOM_TARGET, np.radians(-19), 3.5, 0.75), _look(ROOM_TARGET, np.radians(23), 3.75, 1.75)),
+    instants=15,
+    capture=True,
+)
+#: D-NeRF's field of view and its box of initial points.
+WHITE = Stage(
+    lens=Lens(100, 100, 138.889, 138.889, 50.0, 50.0),
+    frames=150,
+    path="jump",
+    background=(1.0, 1.0, 1.0),
+    box=np.array([[-1.3] * 3, [1.3] * 3], np.float32),
+    viewmat=white_viewmat,
+    fixed=(white_viewmat(0.9, 0.3), white_viewmat(0.3, 0.6)),
+)
 
 
 # -- a dataset of a scene ----------------------------------------------------------------------------------------------
@@ -194,31 +113,51 @@ class SceneBuilder:
 
 @dataclass(frozen=True)
 class Take:
-    """A parsed source. size: (width, height) of the pictures; frames: of the moving camera."""
+    """A parsed source. size: (width, height) of the pictures; frames: of the moving camera; path: its name in PATHS."""
 
     name: str
+    stage: Stage = field(compare=False)  # the name decides it
+    size: tuple[int, int]
+    frames: int
+    path: str
     seed: int = 0
-    size: tuple[int, int] = (LENS.width, LENS.height)
-    frames: int = 60
 
     @property
     def lens(self) -> Lens:
-        """`LENS` for pictures of this size."""
-        (width, height), scale = self.size, self.size[1] / LENS.height
-        return Lens(width, height, LENS.fx * scale, LENS.fy * scale, LENS.cx * width / LENS.width, LENS.cy * scale)
+        """The stage's lens for pictures of this size."""
+        (width, height), lens = self.size, self.stage.lens
+        scale = height / lens.height
+        return Lens(width, height, lens.fx * scale, lens.fy * scale, lens.cx * width / lens.width, lens.cy * scale)
+
+    @property
+    def times(self) -> list[float]:
+        """The instants of the training frames."""
+        return [i / (self.frames - 1) for i in range(self.frames)]
+
+    def viewmats(self) -> list[np.ndarray]:
+        """Those of the training frames."""
+        turns = PATHS[self.path]
+        if turns is not None:
+            return [self.stage.viewmat(turns * t, t) for t in self.times]
+        places = np.random.default_rng([self.seed, 2]).uniform(size=(self.frames, 2))
+        return [self.stage.viewmat(phase, s) for phase, s in places.tolist()]
 
 
 def parse(source: str) -> Take:
     """Parses a `synthetic:` source. Raises DataError."""
     name, options = split_options(source.removeprefix(SYNTHETIC), source, _value, EXAMPLES)
-    if name not in MOTIONS:
-        expected = f"{SYNTHETIC}{'|'.join(MOTIONS)}[?seed=n&size=WxH&frames=N]"
+    if name not in MOTIONS and name not in THINGS:
+        expected = f"{SYNTHETIC}{'|'.join((*MOTIONS, *THINGS))}[?seed=n&size=WxH&frames=N&path={'|'.join(PATHS)}]"
         raise DataError(f"{source}: unknown synthetic scene, expected {expected}")
-    return Take(name, **options)
+    stage = ROOM if name in MOTIONS else WHITE
+    usual: dict[str, Any] = {"size": (stage.lens.width, stage.lens.height), "frames": stage.frames, "path": stage.path}
+    return Take(name, stage, **(usual | options))
 
 
 def _value(key: str, text: str) -> Any:
     """The value of an option. Raises ValueError for an invalid one."""
+    if key == "path" and text in PATHS:
+        return text
     if not re.fullmatch(r"\d{1,9}(x\d{1,9})?", text):
         raise ValueError(text)
     numbers = tuple(map(int, text.split("x")))
@@ -229,39 +168,19 @@ def _value(key: str, text: str) -> Any:
     raise ValueError(text)
 
 
-def _look(azimuth: float, radius: float, height: float) -> np.ndarray:
-    """float64 [4, 4] viewmat of a camera at the azimuth (0 = in front of the wall) that looks at TARGET."""
-    center = TARGET + np.array([radius * np.sin(azimuth), -radius * np.cos(azimuth), height])
-    z = (TARGET - center) / np.linalg.norm(TARGET - center)
-    x = np.cross(z, [0, 0, 1])
-    x /= np.linalg.norm(x)
-    return world_to_camera(np.stack([x, np.cross(z, x), z]), center)
-
-
-def train_viewmat(t: float) -> np.ndarray:
-    """The moving camera."""
-    azimuth = 40 * np.sin(2 * np.pi * SWEEPS * t - np.pi / 2)
-    return _look(np.radians(azimuth), 3.9 + 0.15 * np.cos(7 * t), 1.15 + 0.2 * np.sin(9 * t))
-
-
-def fixed_viewmats() -> tuple[np.ndarray, np.ndarray]:
-    """The two fixed cameras, inside the arc in azimuth but off it in height and distance."""
-    return _look(np.radians(-19), 3.5, 0.75), _look(np.radians(23), 3.75, 1.75)
-
-
 def _grid(lens: Lens, scale: int = 1, dtype: DTypeLike = np.float64) -> tuple[np.ndarray, np.ndarray]:
     """x [scale * W] and y [scale * H] at depth 1 of the pixel centres of an image `scale` times as fine."""
     x = ((np.arange(lens.width * scale) + 0.5) / scale - lens.cx) / lens.fx
     return x.astype(dtype), (((np.arange(lens.height * scale) + 0.5) / scale - lens.cy) / lens.fy).astype(dtype)
 
 
-def _render(bodies: list[Body], viewmat: np.ndarray, t: float, lens: Lens = LENS) -> np.ndarray:
+def _render(bodies: list[Body], viewmat: np.ndarray, t: float, lens: Lens, background: Sequence[float]) -> np.ndarray:
     """uint8 [H, W, 3]: the mean of SUPERSAMPLING² rays per pixel."""
     placed = place(bodies, t)
     eye = Eye(placed, viewmat)
     xs, ys = _grid(lens, SUPERSAMPLING, np.float32)
     depth, index = eye.first_hits(xs, ys)
-    color = np.tile(np.asarray(SKY, np.float32)[:, None, None], (1, *depth.shape))
+    color = np.tile(np.asarray(background, np.float32)[:, None, None], (1, *depth.shape))
     for i in range(len(placed)):
         row, col = np.nonzero(index == i)
         if len(row):
@@ -271,7 +190,7 @@ def _render(bodies: list[Body], viewmat: np.ndarray, t: float, lens: Lens = LENS
     return np.asarray(mean.transpose(1, 2, 0) * 255 + 0.5).astype(np.uint8)
 
 
-def _surface(bodies: list[Body], viewmat: np.ndarray, t: float, lens: Lens = LENS) -> tuple[np.ndarray, np.ndarray]:
+def _surface(bodies: list[Body], viewmat: np.ndarray, t: float, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     """Of the surface behind each pixel centre: body index [n], and material point [3, n], for the sky its direction."""
     eye, (xs, ys) = Eye(place(bodies, t), viewmat), _grid(lens)
     depth, index = (a.ravel() for a in eye.first_hits(xs, ys))
@@ -283,7 +202,7 @@ def _surface(bodies: list[Body], viewmat: np.ndarray, t: float, lens: Lens = LEN
     return index, point
 
 
-def _seen(eye: Eye, body: np.ndarray, point: np.ndarray, lens: Lens = LENS) -> np.ndarray:
+def _seen(eye: Eye, body: np.ndarray, point: np.ndarray, lens: Lens) -> np.ndarray:
     """bool [n]: at the time of `eye` the points (see _surface) are in its picture, face it and are not hidden."""
     rotation = eye.viewmat[:3, :3]
     camera, facing = rotation @ point, np.ones(len(body), bool)
@@ -320,7 +239,7 @@ def _covisible(bodies: list[Body], eyes: list[Eye], viewmat: np.ndarray, t: floa
 
 
 def _initial_points(
-    bodies: list[Body], viewmats: list[np.ndarray], lens: Lens, rng: np.random.Generator
+    bodies: list[Body], viewmats: list[np.ndarray], lens: Lens, box: np.ndarray, rng: np.random.Generator
 ) -> tuple[np.ndarray, np.ndarray]:
     """Points as structure from motion finds them at time 0: visible surface points with noise, 2 % of them stray."""
     placed = place(bodies, 0.0)
@@ -340,31 +259,32 @@ def _initial_points(
     chosen = rng.permutation(sum(map(len, points)))[:POINTS]
     xyz, rgb = np.concatenate(points)[chosen], np.concatenate(colors)[chosen]
     stray = rng.uniform(size=len(xyz)) < 0.02
-    xyz[stray] = rng.uniform(BOX[0], BOX[1], (int(stray.sum()), 3))
+    xyz[stray] = rng.uniform(box[0], box[1], (int(stray.sum()), 3))
     return xyz.astype(np.float32), (rgb * 255 + 0.5).astype(np.uint8)
 
 
 @lru_cache(maxsize=4)
 def _dataset(take: Take) -> Dataset:
-    bodies, lens = SceneBuilder(take.name, take.seed).bodies(), take.lens
-    times = [i / (take.frames - 1) for i in range(take.frames)]
-    viewmats = [train_viewmat(t) for t in times]
-    eyes = [Eye(place(bodies, t), v) for t, v in zip(times, viewmats, strict=True)]
+    stage, lens, times, viewmats = take.stage, take.lens, take.times, take.viewmats()
+    scene = bodies(take.name, take.seed)
+    eyes = [Eye(place(scene, t), v) for t, v in zip(times, viewmats, strict=True)]
 
     def view(viewmat: np.ndarray, camera: int, i: int) -> View:
-        image, matrices = _render(bodies, viewmat, times[i], lens), (viewmat.astype(np.float32), lens.matrix())
-        mask = _covisible(bodies, eyes, viewmat, times[i], lens) if camera else None
-        return View(*matrices, *take.size, times[i], image, mask, f"{camera}_{i:05d}", camera)
+        image, K = _render(scene, viewmat, times[i], lens, stage.background), lens.matrix()
+        mask = _covisible(scene, eyes, viewmat, times[i], lens) if camera and stage.capture else None
+        return View(viewmat.astype(np.float32), K, *take.size, times[i], image, mask, f"{camera}_{i:05d}", camera)
 
     train = tuple(view(v, 0, i) for i, v in enumerate(viewmats))
-    instants = range(2, take.frames, max(1, take.frames // TEST_INSTANTS))
-    test = tuple(view(v, camera, i) for camera, v in enumerate(fixed_viewmats(), start=1) for i in instants)
-    points, colors = _initial_points(bodies, viewmats, lens, np.random.default_rng([take.seed, 1]))
-    fields = SKY, (0.0, SECONDS), (0.0, 0.0, 1.0), 0.0, True
-    return Dataset(f"synthetic-{take.name}", train, test, points, colors, BOX, NEAR, FAR, *fields)
+    instants = range(2, take.frames, max(1, take.frames // stage.instants)) if stage.instants else range(take.frames)
+    test = tuple(view(v, camera, i) for camera, v in enumerate(stage.fixed, start=1) for i in instants)
+    points, colors = None, None
+    if stage.capture:
+        points, colors = _initial_points(scene, viewmats, lens, stage.box, np.random.default_rng([take.seed, 1]))
+    fields = stage.background, (0.0, SECONDS), (0.0, 0.0, 1.0), 0.0, stage.capture
+    return Dataset(f"synthetic-{take.name}", train, test, points, colors, stage.box, NEAR, FAR, *fields)
 
 
-def _shrink(view: View, k: int, lens: Lens = LENS) -> View:
+def _shrink(view: View, k: int, lens: Lens) -> View:
     image, mask = shrink_image(view.image, k), None if view.mask is None else shrink_mask(view.mask, k)
     return replace(view, K=lens.matrix(k), width=image.shape[1], height=image.shape[0], image=image, mask=mask)
 

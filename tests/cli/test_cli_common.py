@@ -29,10 +29,10 @@ def test_help_has_a_summary_an_example_and_exits_0(verb, capsys):
 
 @pytest.mark.parametrize("verb", ("train", "render", "eval"))
 def test_help_lists_every_synthetic_scene(verb):
-    from pd4dgs_codec.data.synthetic import MOTIONS
+    from pd4dgs_codec.data.bodies import MOTIONS, THINGS
 
     text = VERBS[verb].parser().format_help()
-    for name in MOTIONS:
+    for name in (*MOTIONS, *THINGS):
         assert f"synthetic:{name}" in text
 
 

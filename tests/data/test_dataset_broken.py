@@ -270,15 +270,15 @@ def test_bad_options(blender, refused, name, value):
 
 
 SYNTHETIC = {
-    "": "expected synthetic:static|global|local|fast[?seed=n&size=WxH&frames=N]",
+    "": "expected synthetic:static|global|local|fast|flyby|dart|rods|tunnel|bend|blink[?seed=n&size=WxH&frames=N&path=",
     "Static": "expected synthetic:static",
     "nothing?seed=1": "expected synthetic:static",
     **{
         f"static?{query}": f"{query.split('=')[0]} is {query.split('=')[1]!r}; expected for example"
-        for query in ("seed=-1", "seed=x", "size=160", "size=7x160", "size=9000x9000", "frames=2", "frames=")
+        for query in ("seed=-1", "seed=x", "size=160", "size=7x160", "size=9000x90", "frames=2", "frames=", "path=1")
     },
     **{
-        f"static?{query}": "expected each of seed, size, frames once at most, as key=value"
+        f"static?{query}": "expected each of seed, size, frames, path once at most, as key=value"
         for query in ("", "a", "seed=1&a", "seed=1&seed=1", "seed=1&")
     },
 }

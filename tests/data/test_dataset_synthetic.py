@@ -7,9 +7,11 @@ import numpy as np
 import pytest
 
 from pd4dgs_codec.data import synthetic as syn
+from pd4dgs_codec.data.bodies import MOTIONS, THINGS, bodies
 from pd4dgs_codec.data.dataset import load
 from pd4dgs_codec.data.raycast import NO_BODY, Eye, enter, place
-from pd4dgs_codec.data.synthetic import MOTIONS, SceneBuilder
+
+LENS, SWEEPS = syn.ROOM.lens, syn.PATHS["sweeps"]
 
 INSIDE = {
     "sphere": lambda m: (m**2).sum(axis=0) <= 1,
@@ -46,34 +48,34 @@ def marched_hidden(placed, origin, target, own):
 
 def test_visibility_agrees_with_marching():
     """_seen, on surface points that moved with their bodies, against sampling the segment to the camera."""
-    bodies = SceneBuilder("fast", 0).bodies()
-    body, point = syn._surface(bodies, syn.fixed_viewmats()[1], 0.6)
+    scene = bodies("fast", 0)
+    body, point = syn._surface(scene, syn.ROOM.fixed[1], 0.6, LENS)
     rng = np.random.default_rng(1)
     chosen = rng.choice(np.flatnonzero(body > 1), 60, replace=False)  # not floor and wall: mostly visible
     body, point = body[chosen], point[:, chosen]
     verdicts = []
     for t in (0.0, 0.37, 0.9):
-        placed = place(bodies, t)
-        eye = Eye(placed, syn.train_viewmat(t))
-        for k, seen in enumerate(syn._seen(eye, body, point)):
+        placed = place(scene, t)
+        eye = Eye(placed, syn.room_viewmat(SWEEPS * t, t))
+        for k, seen in enumerate(syn._seen(eye, body, point, LENS)):
             at = placed[body[k]]
             world = at.A @ point[:, k] + at.c
             x, y, z = eye.viewmat[:3, :3] @ (world - eye.center)
-            u, v = syn.LENS.fx * x / z + syn.LENS.cx, syn.LENS.fy * y / z + syn.LENS.cy
+            u, v = LENS.fx * x / z + LENS.cx, LENS.fy * y / z + LENS.cy
             # A back is hidden by its own body: look a little before the surface.
             near = world + 1e-3 * (eye.center - world)
             back = INSIDE[at.body.shape]((at.inverse @ (near - at.c))[:, None])[0]
             free = not back and not marched_hidden(placed, eye.center, world, body[k])
-            verdicts.append((seen, free and 0 <= u <= syn.LENS.width and 0 <= v <= syn.LENS.height))
+            verdicts.append((seen, free and 0 <= u <= LENS.width and 0 <= v <= LENS.height))
     seen, expected = np.array(verdicts).T
     assert (seen != expected).mean() <= 0.02  # grazing cases of the sampled segment
     assert 0.1 < seen.mean() < 0.95
 
 
 def test_first_hit_is_the_nearest_of_all_bodies():
-    placed = place(SceneBuilder("static", 3).bodies(), 0.0)
-    eye = Eye(placed, syn.fixed_viewmats()[0])
-    xs, ys = syn._grid(syn.LENS)
+    placed = place(bodies("static", 3), 0.0)
+    eye = Eye(placed, syn.ROOM.fixed[0])
+    xs, ys = syn._grid(LENS)
     depth, index = eye.first_hits(xs, ys)
     full = np.stack([eye.enter(b, xs[None, :], ys[:, None]) for b in placed])
     np.testing.assert_array_equal(depth, full.min(axis=0))
@@ -93,28 +95,37 @@ def test_shapes_and_split(local):
     assert ((local.points >= local.box[0] - 0.1) & (local.points <= local.box[1] + 0.1)).all()
 
 
+def centers(views):
+    """float32 [n, 3]: the cameras' places."""
+    return np.stack([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in views])
+
+
+def azimuths(places):
+    """Degrees in the room."""
+    return np.degrees(np.arctan2(places[:, 0] - syn.ROOM_TARGET[0], syn.ROOM_TARGET[1] - places[:, 1]))
+
+
 def test_camera_goes_back_and_forth_on_an_arc(local):
-    centers = np.stack([-v.viewmat[:3, :3].T @ v.viewmat[:3, 3] for v in local.train])
-    azimuth = np.degrees(np.arctan2(centers[:, 0] - syn.TARGET[0], syn.TARGET[1] - centers[:, 1]))
+    places = centers(local.train)
+    azimuth = azimuths(places)
     assert 60 <= np.ptp(azimuth) <= 90
     turns = np.flatnonzero(np.diff(np.sign(np.diff(azimuth))))
-    assert len(turns) == 2 * syn.SWEEPS - 1  # each place is passed at several instants, far apart
+    assert len(turns) == 2 * SWEEPS - 1  # each place is passed at several instants, far apart
     crossings = np.flatnonzero(np.diff(np.sign(azimuth)))
-    assert len(crossings) == 2 * syn.SWEEPS and np.diff(crossings).min() >= 8
+    assert len(crossings) == 2 * SWEEPS and np.diff(crossings).min() >= 8
     for v in (local.test[0], local.test[-1]):
-        c = -v.viewmat[:3, :3].T @ v.viewmat[:3, 3]
-        assert np.linalg.norm(centers - c, axis=1).min() > 0.2
+        assert np.linalg.norm(places - centers([v]), axis=1).min() > 0.2
 
 
 def test_points_lie_on_visible_surfaces(local):
     """Points project onto pixels of their own colour in the first frame, where nothing hides them."""
     v = local.train[0]
-    placed = place(SceneBuilder("local", 0).bodies(), 0.0)
+    placed = place(bodies("local", 0), 0.0)
     eye = Eye(placed, v.viewmat.astype(np.float64))
     c = v.viewmat[:3, :3] @ local.points.T + v.viewmat[:3, 3:]
-    u, w = c[0] / c[2] * syn.LENS.fx + syn.LENS.cx, c[1] / c[2] * syn.LENS.fy + syn.LENS.cy
+    u, w = c[0] / c[2] * LENS.fx + LENS.cx, c[1] / c[2] * LENS.fy + LENS.cy
     ok = (c[2] > 0) & (u > 1) & (w > 1) & (u < 159) & (w < 119)
-    depth, _ = eye.first_hits(*syn._grid(syn.LENS))
+    depth, _ = eye.first_hits(*syn._grid(LENS))
     ok[ok] = np.abs(depth[w[ok].astype(int), u[ok].astype(int)] - c[2][ok]) < 0.08
     assert ok.sum() > 1500
     error = np.abs(v.image[w[ok].astype(int), u[ok].astype(int)].astype(float) - local.point_colors[ok])
@@ -151,9 +162,13 @@ def test_size_and_frames_options(local):
     assert np.abs(middle.reshape(24, 2, 32, 2, 3).mean((1, 3)) - blocks).mean() < 6  # the axis is .3 pixels off
 
 
+def shoot(scene, viewmat, t):
+    return syn._render(scene, viewmat, t, LENS, syn.ROOM.background)
+
+
 def test_seed_and_name_change_the_picture():
     scenes = [("static", 0), ("static", 1), ("global", 0), ("local", 0), ("fast", 0)]
-    pictures = [syn._render(SceneBuilder(*scene).bodies(), syn.train_viewmat(0.5), 0.5) for scene in scenes]
+    pictures = [shoot(bodies(*scene), syn.room_viewmat(0.25, 0.5), 0.5) for scene in scenes]
     for a, b in combinations(pictures, 2):
         assert (a != b).any(axis=2).mean() > 0.01
 
@@ -161,9 +176,9 @@ def test_seed_and_name_change_the_picture():
 @pytest.mark.parametrize("name", MOTIONS)
 def test_motion_of_each_scene(name):
     """From a fixed camera: static never changes; the others do, fast more per frame than global."""
-    bodies = SceneBuilder(name, 0).bodies()
-    camera = syn.fixed_viewmats()[0]
-    a, b = (syn._render(bodies, camera, t).astype(float) for t in (0.30, 0.30 + 1 / 59))
+    scene = bodies(name, 0)
+    camera = syn.ROOM.fixed[0]
+    a, b = (shoot(scene, camera, t).astype(float) for t in (0.30, 0.30 + 1 / 59))
     change = np.abs(a - b).mean()
     assert change == 0 if name == "static" else change > (1.0 if name == "fast" else 0.05)
 
@@ -177,3 +192,32 @@ def test_downscale_matches_the_full_picture(local):
     np.testing.assert_allclose(v.K[:2], w.K[:2] / 2, rtol=1e-6)
     m, n = half.test[0].mask, local.test[0].mask
     np.testing.assert_array_equal(m, n.reshape(60, 2, 80, 2).all(axis=(1, 3)))
+
+
+def test_a_camera_passes_once_or_jumps():
+    places = {path: syn.parse(f"synthetic:static?path={path}").viewmats() for path in syn.PATHS}
+    turned = {path: azimuths(np.stack([-m[:3, :3].T @ m[:3, 3] for m in found])) for path, found in places.items()}
+    assert (np.diff(turned["pass"]) > 0).all() and all(70 < np.ptp(found) <= 80 for found in turned.values())
+    assert np.abs(np.diff(turned["jump"])).mean() > 15 > 8 > np.abs(np.diff(turned["sweeps"])).mean()
+    assert syn.parse("synthetic:static?path=jump&seed=1").viewmats()[0].tolist() != places["jump"][0].tolist()
+
+
+@pytest.mark.parametrize("name", THINGS)
+def test_scenes_on_white(name):
+    """In D-NeRF's manner: no points, a camera that jumps on the hemisphere, whole things inside box and pictures; two
+    cameras that stand still, away from all others, see each instant, and something moves there."""
+    d = load(f"synthetic:{name}?size=48x48&frames=20")
+    assert len(d.train) == 20 and len(d.test) == 40 and d.points is None and not d.masked
+    assert d.background == (1, 1, 1) and all(v.mask is None for v in (*d.train, *d.test))
+    places = centers(d.train)
+    np.testing.assert_allclose(np.linalg.norm(places, axis=1), 4, rtol=1e-5)
+    assert (places[:, 2] > 0).all() and np.linalg.norm(np.diff(places, axis=0), axis=1).mean() > 3
+    for camera in (1, 2):
+        views = [v for v in d.test if v.camera_id == camera]
+        assert [v.time for v in views] == [v.time for v in d.train]
+        assert np.linalg.norm(places - centers(views[:1]), axis=1).min() > 0.1
+        truth = np.stack([v.image for v in views]).astype(int)
+        assert 0.01 < (np.ptp(truth, axis=0).max(axis=2) > 16).mean() < 0.5
+    for v in d.train:
+        border = np.concatenate([v.image[0], v.image[-1], v.image[:, 0], v.image[:, -1]])
+        assert (border == 255).all() and (v.image < 200).any()
