@@ -61,5 +61,12 @@ def morton_codes(cells: np.ndarray) -> np.ndarray:
 
 
 def morton_order(cells: np.ndarray) -> np.ndarray:
-    """The permutation int64 [N] that sorts cells int [N, 3] by Morton code; equal cells keep their order."""
-    return np.argsort(morton_codes(cells), kind="stable").astype(np.int64)
+    """The permutation int64 [N] that sorts cells int [N, 3], all within ±MAX_VOXEL, by Morton code; equal cells keep
+    their order. From MAX_VOXEL down to its negative an axis takes one bit more than a code has."""
+    offsets = cells.astype(np.int64) - cells.min(axis=0, initial=MAX_VOXEL)
+    upper = offsets >> AXIS_BITS
+    lower = [spread_bits(offsets[:, axis] & ((1 << AXIS_BITS) - 1)) << axis for axis in range(3)]
+    codes = lower[0] | lower[1] | lower[2]
+    if not upper.any():
+        return np.argsort(codes, kind="stable").astype(np.int64)
+    return np.lexsort((codes, upper @ (1, 2, 4))).astype(np.int64)

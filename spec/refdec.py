@@ -1319,8 +1319,9 @@ def add_slice(layer, part):
 
 
 # 10.1 Payload: "bit 3i of the code is bit i of x, 3i + 1 of y, 3i + 2 of z"
+# 12.2 Prefixes: "Sorted, the codes of slices that lie far apart may take 66 bits."
 def morton_code(offset):
-    return sum((v >> i & 1) << 3 * i + axis for axis, v in enumerate(offset) for i in range(21))
+    return sum((v >> i & 1) << 3 * i + axis for axis, v in enumerate(offset) for i in range(22))
 
 
 # 12.1 Order: "For each layer chunk, before the next chunk is looked at: parameters and their limits, sections, the

@@ -1,8 +1,7 @@
 """Canonical msgpack (clause 4), in which a value has one byte string, and checked access to its maps and lists.
 
 Values are bool, int, float (a finite binary32), str, bytes, list, and dict with non-negative integer keys. Keys ascend,
-every form is the shortest, and nesting is at most MAX_DEPTH. The reader encodes the value again and compares, so that
-no second form of a value passes.
+every form is the shortest, and nesting is at most MAX_DEPTH.
 """
 
 from __future__ import annotations
@@ -35,19 +34,98 @@ def pack(obj: Any) -> bytes:
 def unpack(data: bytes | memoryview, *, offset: int = 0) -> Any:
     """The value of canonical bytes. Raises Malformed for any other bytes, cut and trailing ones included.
 
-    offset: where `data` begins in the file, for messages. msgpack bounds every declared size by len(data).
+    offset: where `data` begins in the file, for messages. Memory is linear in the bytes, whatever they declare.
     """
-    data = bytes(data)
-    try:
-        obj = msgpack.unpackb(data, raw=False, use_list=True, strict_map_key=False)
-        again = msgpack.packb(_canonical(obj), use_single_float=True)
-    except (ValueError, TypeError, RecursionError, msgpack.UnpackException) as error:
-        reason = str(error) or type(error).__name__
-        raise Malformed(f"{len(data)} bytes are not canonical msgpack: {reason}", offset=offset) from None
-    if again != data:
-        at = next((i for i, (a, b) in enumerate(zip(again, data, strict=False)) if a != b), min(len(again), len(data)))
-        raise Malformed(f"{len(data)} bytes of msgpack leave the canonical form at byte {at}", offset=offset + at)
-    return obj
+    reader = _Reader(bytes(data), offset)
+    value = reader.value(0)
+    if reader.at != len(reader.data):
+        raise reader.fault(f"{len(reader.data) - reader.at} bytes follow the value")
+    return value
+
+
+#: By first byte, of each kind the first one: kind, least numbers that need each of its forms, of 1, 2, .. bytes.
+_SIZED = {
+    0xC4: ("bytes", (0, 1 << 8, 1 << 16), "BHI"),
+    0xCC: ("int", (1 << 7, 1 << 8, 1 << 16, 1 << 32), "BHIQ"),
+    0xD0: ("negative", (1 << 5, 1 << 7, 1 << 15, 1 << 31), "bhiq"),  # of an integer n, the number is -1 - n
+    0xD9: ("str", (1 << 5, 1 << 8, 1 << 16), "BHI"),
+    0xDC: ("list", (1 << 4, 1 << 16), "HI"),
+    0xDE: ("map", (1 << 4, 1 << 16), "HI"),
+}
+_HEADS = {
+    first + i: (kind, least, struct.Struct(">" + form))
+    for first, (kind, sizes, forms) in _SIZED.items()
+    for i, (least, form) in enumerate(zip(sizes, forms, strict=True))
+}
+_REAL = struct.Struct(">f")
+
+
+class _Reader:
+    """Reads values front to back. The library's own reader believes the declared size of every nested list."""
+
+    def __init__(self, data: bytes, offset: int):
+        self.data, self.offset, self.at = data, offset, 0
+
+    def fault(self, reason: str) -> Malformed:
+        found = f"{len(self.data)} bytes are not canonical msgpack"
+        return Malformed(f"{found}: {reason} at byte {self.at}", offset=self.offset + self.at)
+
+    def value(self, depth: int) -> Any:
+        """The next value, with `depth` lists and maps around it."""
+        kind, n = self._head()
+        if kind in ("int", "real"):
+            return n
+        if kind in ("bytes", "str"):
+            return self._bytes(kind, n)
+        if depth == MAX_DEPTH:
+            raise self.fault(f"nested deeper than {MAX_DEPTH}")
+        if kind == "list":
+            return [self.value(depth + 1) for _ in range(n)]
+        entries: dict[int, Any] = {}
+        last = -1
+        for _ in range(n):
+            key = self.value(depth + 1)
+            if type(key) is not int or not last < key < 1 << 32:
+                raise self.fault(f"map key {key!r}, expected integers that ascend, in 0..2**32 - 1")
+            entries[key], last = self.value(depth + 1), key
+        return entries
+
+    def _head(self) -> tuple[str, Any]:
+        """(kind of the next value, its number or how many bytes or entries follow)."""
+        (first,) = self._take(1)
+        if first < 0x80 or first >= 0xE0:
+            return "int", first if first < 0x80 else first - 256
+        if first < 0xC0:
+            short = first & 15
+            return ("map", short) if first < 0x90 else ("list", short) if first < 0xA0 else ("str", first & 31)
+        if first in (0xC2, 0xC3):
+            return "int", first == 0xC3
+        if first == 0xCA:
+            (real,) = _REAL.unpack(self._take(4))
+            if not math.isfinite(real):
+                raise self.fault(f"{real!r}, expected a finite binary32")
+            return "real", real
+        if first not in _HEADS:
+            raise self.fault(f"a value of type {first:#x}")
+        kind, least, form = _HEADS[first]
+        (n,) = form.unpack(self._take(form.size))
+        if (-1 - n if kind == "negative" else n) < least:
+            raise self.fault(f"{n} is not in its shortest form")
+        return ("int" if kind == "negative" else kind), n
+
+    def _bytes(self, kind: str, size: int) -> bytes | str:
+        data = self._take(size)
+        try:
+            return data if kind == "bytes" else data.decode()
+        except UnicodeDecodeError:
+            raise self.fault("a string that is not UTF-8") from None
+
+    def _take(self, size: int) -> bytes:
+        part = self.data[self.at : self.at + size]
+        if len(part) < size:
+            raise self.fault(f"cut: {size} bytes expected, {len(part)} left")
+        self.at += size
+        return part
 
 
 def _canonical(obj: Any, depth: int = 0) -> Any:

@@ -31,6 +31,16 @@ def sphere(count, radius):
     return np.rint(radius * points / np.linalg.norm(points, axis=1, keepdims=True)).astype(int)
 
 
+def test_the_order_of_cells_takes_66_bits():
+    """Slices may lie at both ends of an axis, 2^21 voxels apart; a code of one slice has 63 bits."""
+    ends = (-MAX_VOXEL, -1, 0, MAX_VOXEL)
+    cells = np.array([(x, y, z) for x in ends for y in ends for z in ends], np.int32)[::-1]
+    codes = [sum((int(v) + MAX_VOXEL >> i & 1) << 3 * i + a for a, v in enumerate(c) for i in range(22)) for c in cells]
+    assert max(codes).bit_length() == 66
+    assert morton_order(cells).tolist() == sorted(range(64), key=lambda row: codes[row])
+    assert morton_order(cells[:0]).tolist() == []
+
+
 def test_morton_codes_interleave_the_bits():
     cells = np.array([[5, 5, 5], [6, 5, 5], [5, 6, 5], [5, 5, 6], [5 + (1 << 20), 5, 5], [8, 8, 8]])
     assert morton_codes(cells).tolist() == [0, 1, 2, 4, 1 << 60, 0b111111]

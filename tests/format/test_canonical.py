@@ -1,5 +1,7 @@
 """Canonical msgpack: one value, one byte string, and nothing else is accepted."""
 
+import tracemalloc
+
 import msgpack
 import numpy as np
 import pytest
@@ -89,6 +91,19 @@ def test_very_deep_data_is_refused():
     for depth in (5, 600, 100_000):
         with pytest.raises(Malformed):
             unpack(b"\x91" * depth + b"\1")
+
+
+@pytest.mark.parametrize("head", ["dc3fff", "dd0003ffff", "de3fff", "df0003ffff", "c63fffffff", "db3fffffff"])
+def test_declared_sizes_take_no_memory(head):
+    """Lists of lists that each declare as many entries as there are bytes once took 78 MiB of a header's 16 kB, and
+    2 GiB of a metadata chunk of a few bytes."""
+    data = bytes.fromhex(head) * 1000 + bytes(1 << 18)
+    tracemalloc.start()
+    with pytest.raises(Malformed):
+        unpack(data)
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert peak < 1 << 20
 
 
 @settings(max_examples=400)

@@ -71,7 +71,7 @@ FAULTY = {
     "no declared size": (stream(canonical.pack({1: "a"})), Malformed, "declares no size"),
     "a bomb": (frame(bytes((1 << 18) + 1)), LimitExceeded, "262145 bytes declared"),
     "too long": (bytes((1 << 18) + 1), LimitExceeded, "262145 bytes compressed"),
-    "not canonical": (frame(b"\xda\x00\x01a"), Malformed, "canonical form"),
+    "not canonical": (frame(b"\xda\x00\x01a"), Malformed, "shortest form"),
     "a list": (frame(canonical.pack([1])), Malformed, "list, expected a map"),
     "an unknown key": (frame(canonical.pack({9: 1})), UnsupportedFeature, "unknown key 9"),
     "a title of bytes": (frame(canonical.pack({1: b"a"})), Malformed, "title, expected one line"),
