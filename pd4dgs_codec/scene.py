@@ -164,14 +164,25 @@ class SceneInfo:
 
 @dataclass(frozen=True, eq=False)
 class Deformation:
-    """A HexPlane and its residual MLP.
+    """A HexPlane and its residual MLP F(x, t).
 
     planes: float32, sampled bilinearly (align corners, border clamp), multiplied within a scale, concatenated over
-    scales. networks: "trunk" and the heads that are present.
+    scales. networks: "trunk" and the heads that are present. key: the code of the key instant t* (see `instant`) if the
+    residuals are F(x, t) - F(x, t*), so that layer 1 changes nothing at t*; None if they are F(x, t).
     """
 
     planes: Planes
     networks: dict[str, Network]
+    key: int | None = None
+
+
+#: Normalised times that a file holds are multiples of 1 / INSTANTS.
+INSTANTS = 65535
+
+
+def instant(code: int) -> float:
+    """The normalised time, a binary32 value, that a code 0..INSTANTS stands for."""
+    return float(np.float32(code) / np.float32(INSTANTS))
 
 
 def plane_sides(planes: dict[str, np.ndarray]) -> tuple[int, int, int, int]:

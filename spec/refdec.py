@@ -408,12 +408,16 @@ def read_layer(payload, number, later, before, header, past):
 
 
 # 6.2 Layer parameters: "In its first slice, layer 0 has keys 3 and 5 and not 4. Layers 1 and 2 have keys 3, 4 and 5 if
-# the layer has a deformation, else none of them. No later slice has any of the three."
+# the layer has a deformation, else none of them. Only a deformation of layer 1 may have key 6. No later slice has any
+# of the four."
 def read_parameters(layer, value):
-    parameters = fields(value, range(1, 6), (1, 2), "layer parameters")
+    parameters = fields(value, range(1, 7), (1, 2), "layer parameters")
     layer.rows = limited(parameters[1], (1 << 24) - layer.rows_before, "own rows")
     sections = fields(parameters[2], range(6), (), "sections")
     layer.sections = {s: limited(sections[s], (1 << 31) - 1, "a section", 1) for s in sections if s < 64}
+    if 6 in parameters:
+        need(layer.number == 1 and 5 in parameters and not layer.later, f"layer {layer.number} with a key instant")
+        limited(parameters[6], 65535, "the key instant")
     found = {3, 4, 5} & set(parameters)
     wanted = [set()] if layer.later else [{3, 4, 5}, set()] if layer.number else [{3, 5}]
     need(found in wanted, f"layer {layer.number} with keys {found}")

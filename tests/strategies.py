@@ -17,6 +17,7 @@ from pd4dgs_codec import encode
 from pd4dgs_codec.format.quantise import NO_CLASSES, Grid, attribute_rows, dequantise
 from pd4dgs_codec.scene import (
     DEFAULT_WIDTHS,
+    INSTANTS,
     LOCAL_HEADS,
     MAX_CLASS,
     PLANES,
@@ -65,6 +66,7 @@ def deformation(
     scales: int = 1,
     width: int = 3,
     kind: str = "small",
+    key: int | None = None,
 ) -> Deformation:
     """A Deformation with the steps (planes, weights); the sides x, y, z double from scale to scale."""
     planes = []
@@ -78,7 +80,7 @@ def deformation(
         layers = network(rng, (width, outputs), steps[1], kind)
         layers[-1][1][0] = np.float32(steps[1])  # not all zero: such a head is not sent
         networks[name] = layers
-    return Deformation(tuple(planes), networks)
+    return Deformation(tuple(planes), networks, key)
 
 
 def info(rng: np.random.Generator, with_camera: bool = True) -> SceneInfo:
@@ -103,6 +105,7 @@ def make_scene(
     with_camera: bool = True,
     extent: int = 8,
     hidden: tuple[int, ...] = (4,),
+    key: int | None = None,
     **deformation_options,
 ) -> Scene:
     """An unplanned scene: every anchor in every layer's prefix, in random order, some of them inactive.
@@ -145,7 +148,7 @@ def make_scene(
             for name, outputs in widths.networks.items()
         },
         global_deformation=deformation(
-            rng, heads[0], (steps.planes_global, steps.weights_global), kind=kind, **deformation_options
+            rng, heads[0], (steps.planes_global, steps.weights_global), kind=kind, key=key, **deformation_options
         )
         if 1 in layers and heads[0]
         else None,
@@ -183,6 +186,7 @@ def scenes(draw: st.DrawFn) -> Scene:
         anchors=draw(st.sampled_from((0, 1) if kind == "huge" else (0, 1, 2, 5, 40))),
         kind=kind,
         heads=(draw(_subset(widths.global_heads)), draw(_subset(LOCAL_HEADS))),
+        key=draw(st.none() | st.integers(0, INSTANTS)),
         widths=widths,
         with_camera=draw(st.booleans()),
         extent=draw(st.sampled_from((1, 30, 1 << 19))),

@@ -112,7 +112,7 @@ def trained_like_scene() -> Scene:
         offset=rng.normal(0, 0.5, (n, 10, 3)).astype(np.float32),
         mask=tuple(np.full(r, 200, np.uint8) for r in rows),
         networks={name: _network(rng, 35, 16, width) for name, width in Widths().networks.items()},
-        global_deformation=_deformation(rng, Widths().global_heads),
+        global_deformation=_deformation(rng, Widths().global_heads, key=40_000),
         local_deformation=_deformation(rng, LOCAL_HEADS),
     )
 
@@ -124,13 +124,14 @@ def _network(rng: np.random.Generator, *widths: int, scale: float = 0.3) -> Netw
     )
 
 
-def _deformation(rng: np.random.Generator, heads: dict[str, int]) -> Deformation:
+def _deformation(rng: np.random.Generator, heads: dict[str, int], key: int | None = None) -> Deformation:
     reso = (3, 4, 5, 6)
     planes = tuple(
         {name: rng.normal(1, 0.3, (2, reso[b], reso[a])).astype(np.float32) for name, a, b in PLANES} for _ in range(2)
     )
     networks = {"trunk": _network(rng, 4, 8, 8)}
-    return Deformation(planes, networks | {name: _network(rng, 8, width, scale=0.05) for name, width in heads.items()})
+    networks |= {name: _network(rng, 8, width, scale=0.05) for name, width in heads.items()}
+    return Deformation(planes, networks, key)
 
 
 def checkpoint_of(scene: Scene, path: Path) -> Path:

@@ -13,7 +13,16 @@ from pd4dgs_codec.draw import hexplane
 from pd4dgs_codec.draw.hexplane import PlaneLayout
 from pd4dgs_codec.draw.layers import Layers
 from pd4dgs_codec.draw.simd import LANES
-from pd4dgs_codec.scene import LENGTH_HEADS, PLANES, TRUNK, Deformation, Network, deformation_unit, plane_sides
+from pd4dgs_codec.scene import (
+    LENGTH_HEADS,
+    PLANES,
+    TRUNK,
+    Deformation,
+    Network,
+    deformation_unit,
+    instant,
+    plane_sides,
+)
 
 
 class Field:
@@ -31,6 +40,7 @@ class Field:
                 views[name][:, :, :channels] = scale[name].transpose(1, 2, 0)
         self._rows: tuple[float, np.ndarray] | None = None
         trunk = _with_padded_inputs(deformation.networks[TRUNK], channels, self._channels)
+        self._key = deformation.key
         unit, networks = deformation_unit(box), deformation.networks
         heads = {n: _scaled(networks[n], unit if n in LENGTH_HEADS else np.float32(1)) for n in widths if n in networks}
         self._trunk: Layers | None = None
@@ -41,8 +51,18 @@ class Field:
             ends = dict(zip(widths, accumulate(widths.values()), strict=True))
             self._heads = [(slice(ends[n] - widths[n], ends[n]), Layers(network)) for n, network in heads.items()]
 
+    def rest(self, values: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """The rows to which `move` adds, in place of `values`, its arguments: without F(x, t*) if there is a key
+        instant, which does not depend on the time."""
+        if self._key is None:
+            return values
+        still = np.zeros_like(values)
+        self.move(still, points, instant(self._key))
+        moved: np.ndarray = values - still
+        return moved
+
     def move(self, values: np.ndarray, points: np.ndarray, t: float) -> None:
-        """Adds the residuals at points float32 [n, 3] and normalised time t to values float32 [n, sum of widths],
+        """Adds F(x, t) at points x float32 [n, 3] and normalised time t to values float32 [n, sum of widths],
         C-contiguous; lengths in scene units."""
         layout = self._layout
         tables = layout.reso, layout.start, layout.rows

@@ -58,7 +58,9 @@ class Player:
         self._global, self._local = (None if field is None else Field(field, box, heads) for field, heads in fields)
         self._decoders = Decoders([scene.networks[name] for name in SCAFFOLD_NETWORKS])
         self._time: float | None = None
-        self._moved = self._table if self._global is None else np.empty_like(self._table)  # at self._time
+        self._moved = self._table  # at self._time
+        if self._global is not None:
+            self._table, self._moved = self._global.rest(self._table, self._anchor), np.empty_like(self._table)
         self._known = np.full(len(codes), self._global is None)  # the rows of _moved that are there
 
     @property

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import accumulate
 from typing import Any
 
@@ -27,6 +27,7 @@ from pd4dgs_codec.format.planes import sample_planes as sample_planes
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, dequantise, expect, expect_array, is_step, magnitude, quantise
 from pd4dgs_codec.format.registry import LayerKind, Section
 from pd4dgs_codec.scene import (
+    INSTANTS,
     LENGTH_HEADS,
     PLANES,
     TRUNK,
@@ -35,11 +36,12 @@ from pd4dgs_codec.scene import (
     Steps,
     Widths,
     deformation_unit,
+    instant,
     plane_sides,
 )
 
 # Keys of the layer parameters.
-STEPS, SCALES, NETWORKS = 3, 4, 5
+STEPS, SCALES, NETWORKS, KEY = 3, 4, 5, 6
 
 # Limits (clause 14).
 MAX_PLANE_SIDE = 4096  #: cells; eight times the paper's finest plane
@@ -69,13 +71,13 @@ def arrays_of(tensors: Deformation, kind: LayerKind) -> Iterator[tuple[str, str,
 def with_arrays(tensors: Deformation, kind: LayerKind, arrays: Iterable[np.ndarray]) -> Deformation:
     """A deformation of the structure of `tensors` with these arrays, in the order of `arrays_of`."""
     depths = {name: len(tensors.networks[name]) for name in kind.network_ids if name in tensors.networks}
-    return _assembled(len(tensors.planes), depths, iter(arrays))
+    return _assembled(len(tensors.planes), depths, tensors.key, iter(arrays))
 
 
-def _assembled(scales: int, depths: dict[str, int], arrays: Iterator[np.ndarray]) -> Deformation:
+def _assembled(scales: int, depths: dict[str, int], key: int | None, arrays: Iterator[np.ndarray]) -> Deformation:
     planes = tuple({name: next(arrays) for name, _, _ in PLANES} for _ in range(scales))
     networks = {name: tuple((next(arrays), next(arrays)) for _ in range(depth)) for name, depth in depths.items()}
-    return Deformation(planes, networks)
+    return Deformation(planes, networks, key)
 
 
 def quantise_tensors(tensors: Deformation, kind: LayerKind, steps: Steps) -> Deformation:
@@ -108,6 +110,9 @@ def check_tensors(tensors: Deformation, kind: LayerKind, widths: Widths) -> None
         channels, first = len(planes["xy"]), len(tensors.planes[0]["xy"])
         expect(channels == first, f"{own} scale {s}: {channels} channels, expected {first} as in scale 0")
         expect(min(channels, *plane_sides(planes)) >= 1, f"{own} scale {s}: an empty plane")
+    key = tensors.key
+    valid = key is None or (kind.layer == 1 and type(key) is int and 0 <= key <= INSTANTS)
+    expect(valid, f"{own}: key instant {key!r}, expected none, or in layer 1 an integer 0..{INSTANTS}")
     for name, network in tensors.networks.items():
         expect(len(network) > 0, f"{own} network {name}: no layers")
     shape = Shape.of(tensors, kind, widths)
@@ -128,7 +133,7 @@ def heads_of(tensors: Deformation) -> list[str]:
 
 def with_heads(tensors: Deformation, heads: Iterable[str]) -> Deformation:
     """The deformation with these of its heads alone."""
-    return Deformation(tensors.planes, {k: v for k, v in tensors.networks.items() if k == TRUNK or k in [*heads]})
+    return replace(tensors, networks={k: v for k, v in tensors.networks.items() if k == TRUNK or k in [*heads]})
 
 
 def head_alone(tensors: Deformation, head: str) -> Deformation:
@@ -137,8 +142,9 @@ def head_alone(tensors: Deformation, head: str) -> Deformation:
 
 
 def is_zero(tensors: Deformation, head: str) -> bool:
-    """Whether a head's residuals are 0 everywhere, by its last weights."""
-    return not any(array.any() for array in tensors.networks[head][-1])
+    """Whether a head's residuals are 0 everywhere, by its last weights; a key instant cancels the last bias."""
+    weight, bias = tensors.networks[head][-1]
+    return not weight.any() and (tensors.key is not None or not bias.any())
 
 
 def time_rows(tensors: Deformation) -> int:
@@ -149,10 +155,17 @@ def time_rows(tensors: Deformation) -> int:
 def residuals(deformation: Deformation, box: np.ndarray, points: np.ndarray, t: float) -> dict[str, np.ndarray]:
     """head -> float32 [n, width] residuals at `points` [n, 3] (scene units) and normalised time t; lengths in scene
     units. The function of the trained model, in numpy; it is not normative."""
-    hidden = np.maximum(_run(deformation.networks[TRUNK], sample_planes(deformation.planes, box, points, t)), 0)
-    outputs = {name: _run(deformation.networks[name], hidden) for name in heads_of(deformation)}
+    outputs = _outputs(deformation, box, points, t)
+    if deformation.key is not None:
+        still = _outputs(deformation, box, points, instant(deformation.key))
+        outputs = {name: out - still[name] for name, out in outputs.items()}
     unit = deformation_unit(box)
     return {name: out * unit if name in LENGTH_HEADS else out for name, out in outputs.items()}
+
+
+def _outputs(deformation: Deformation, box: np.ndarray, points: np.ndarray, t: float) -> dict[str, np.ndarray]:
+    hidden = np.maximum(_run(deformation.networks[TRUNK], sample_planes(deformation.planes, box, points, t)), 0)
+    return {name: _run(deformation.networks[name], hidden) for name in heads_of(deformation)}
 
 
 def _run(network: Network, x: np.ndarray) -> np.ndarray:
@@ -176,11 +189,13 @@ class Scale:
 @dataclass(frozen=True)
 class Shape:
     """Sizes of a layer's planes and networks. networks: by name the outputs of its linear layers. inputs: input width
-    of the networks of layer 0, 0 for a deformation, whose widths follow from the scales and the trunk."""
+    of the networks of layer 0, 0 for a deformation, whose widths follow from the scales and the trunk. key: as in
+    Deformation."""
 
     scales: tuple[Scale, ...] = ()
     networks: dict[str, tuple[int, ...]] | None = None
     inputs: int = 0
+    key: int | None = None
 
     @staticmethod
     def of(tensors: Deformation, kind: LayerKind, widths: Widths) -> Shape:
@@ -188,7 +203,7 @@ class Shape:
         scales = tuple(Scale(len(scale["xy"]), plane_sides(scale), ()) for scale in tensors.planes)
         names = [name for name in kind.network_ids if name in tensors.networks]
         networks = {name: tuple(len(bias) for _, bias in tensors.networks[name]) for name in names}
-        return Shape(scales, networks, 0 if kind.layer else widths.inputs)
+        return Shape(scales, networks, 0 if kind.layer else widths.inputs, tensors.key)
 
     @property
     def planes(self) -> list[PlaneShape]:
@@ -209,9 +224,10 @@ class Shape:
         return shapes
 
     def json(self) -> dict[str, Any]:
-        """planes: [C, x, y, z, t] per scale. networks: output widths by name."""
+        """planes: [C, x, y, z, t] per scale. networks: output widths by name. key_instant: normalised time, if any."""
         networks = {name: list(widths) for name, widths in (self.networks or {}).items()}
-        return {"planes": [[scale.channels, *scale.sides] for scale in self.scales], "networks": networks}
+        found = {"planes": [[scale.channels, *scale.sides] for scale in self.scales], "networks": networks}
+        return found if self.key is None else found | {"key_instant": instant(self.key)}
 
     @property
     def symbols(self) -> int:
@@ -233,6 +249,8 @@ def pack_parameters(
         ]
     networks = tensors.networks.items()
     fields[NETWORKS] = [[kind.network_ids[name], *(len(bias) for _, bias in network)] for name, network in networks]
+    if tensors.key is not None:
+        fields[KEY] = tensors.key
     return fields
 
 
@@ -247,11 +265,19 @@ def unpack_parameters(
         if (key in fields) != expected:
             found, wanted = ("missing", "it") if expected else ("there", "no such key")
             raise Malformed(f"{where}: key {key} is {found}, expected {wanted}")
-    shape = Shape(scales, networks, 0 if kind.layer else widths.inputs)
+    shape = Shape(scales, networks, 0 if kind.layer else widths.inputs, _unpack_key(fields, kind, networks, where))
     cells = sum(map(math.prod, shape.planes))
     if cells > MAX_PLANE_CELLS:
         raise LimitExceeded(f"{where}: planes of {cells} cells, limit {MAX_PLANE_CELLS}")
     return shape, _unpack_steps(fields, kind, where) if networks else {}
+
+
+def _unpack_key(fields: Fields, kind: LayerKind, networks: dict[str, tuple[int, ...]], where: str) -> int | None:
+    if KEY not in fields:
+        return None
+    if kind.layer != 1 or not networks:
+        raise Malformed(f"{where}: key {KEY} is there, expected it in a deformation of layer 1 alone")
+    return fields.integer(KEY, INSTANTS)
 
 
 def _unpack_steps(fields: Fields, kind: LayerKind, where: str) -> dict[str, float]:
@@ -375,4 +401,4 @@ def _restored(shape: Shape, residuals: Sequence[np.ndarray], weights: Sequence[n
     samples = restore(list(zip(predictors, residuals, strict=True)))
     reshaped = [weight.reshape(one) for weight, one in zip(weights, shape.weights, strict=True)]
     depths = {name: len(widths) for name, widths in (shape.networks or {}).items()}
-    return _assembled(len(shape.scales), depths, iter([*samples, *reshaped]))
+    return _assembled(len(shape.scales), depths, shape.key, iter([*samples, *reshaped]))

@@ -88,7 +88,7 @@ def read_parameters(
         raise LimitExceeded(f"{where}: parameters of {length} bytes, limit {MAX_PARAMETERS}")
     if length > len(payload) - 4:
         raise Malformed(f"{where}: parameters of {length} bytes in a payload of {len(payload)}")
-    fields = Fields(canonical.unpack(payload[4 : 4 + length]), where, set(range(ROWS, deformation.NETWORKS + 1)))
+    fields = Fields(canonical.unpack(payload[4 : 4 + length]), where, set(range(ROWS, deformation.KEY + 1)))
     known = {int(section) for section in Section}
     sections = Fields(fields.get(SECTIONS), f"{where} sections", known)
     shape, steps = deformation.unpack_parameters(fields, kind, widths, later, where)

@@ -28,18 +28,26 @@ from pd4dgs_codec.model.rate import gaussian_bits
 
 
 class DeformationField(nn.Module):
-    """Residuals at points and a time. The heads start at zero, so a fresh field changes nothing."""
+    """Residuals at points and a time. The heads start at zero, so a fresh field changes nothing.
 
-    def __init__(self, planes: HexPlane, trunk: MLP, heads: Mapping[str, MLP]):
+    key: as in `scene.Deformation`.
+    """
+
+    def __init__(self, planes: HexPlane, trunk: MLP, heads: Mapping[str, MLP], key: int | None = None):
         super().__init__()
-        self.planes, self.trunk, self.heads = planes, trunk, nn.ModuleDict(heads)
+        self.planes, self.trunk, self.heads, self.key = planes, trunk, nn.ModuleDict(heads), key
         self.unit = float(scene.deformation_unit(planes.box.numpy()))  #: of heads that are lengths, scene units
 
     # -- start values and arrays ---------------------------------------------------------------------------------------
 
     @staticmethod
     def fresh(
-        config: DeformationConfig, box: np.ndarray, head_widths: dict[str, int], spacing: int | None, step: float
+        config: DeformationConfig,
+        box: np.ndarray,
+        head_widths: dict[str, int],
+        spacing: int | None,
+        step: float,
+        key: int | None = None,
     ) -> DeformationField:
         """A new field with the heads that `config` names. head_widths: the output width of each; spacing and the
         quantisation step of the planes: see `HexPlane.start`."""
@@ -48,41 +56,42 @@ class DeformationField(nn.Module):
         planes.start(spacing, step)
         trunk = MLP((config.channels * len(scales), config.width, config.width))
         heads = {name: MLP((config.width, head_widths[name]), zero_last=True) for name in config.heads}
-        return DeformationField(planes, trunk, heads)
+        return DeformationField(planes, trunk, heads, key)
 
     @staticmethod
     def from_arrays(deformation: scene.Deformation, box: np.ndarray) -> DeformationField:
         """The field of a decoded scene."""
         networks = {name: MLP.from_arrays(net) for name, net in deformation.networks.items()}
         trunk = networks.pop(scene.TRUNK)
-        return DeformationField(HexPlane.from_arrays(box, deformation.planes), trunk, networks)
+        return DeformationField(HexPlane.from_arrays(box, deformation.planes), trunk, networks, deformation.key)
 
     def arrays(self) -> scene.Deformation:
         """The inverse of `from_arrays`."""
         networks = {scene.TRUNK: self.trunk.arrays()} | {name: head.arrays() for name, head in self._named_heads()}
-        return scene.Deformation(self.planes.arrays(), networks)
+        return scene.Deformation(self.planes.arrays(), networks, self.key)
 
-    def shape(self) -> list[list[int]]:
+    def shape(self) -> dict[str, Any]:
         """What a checkpoint needs beside the state to rebuild the field: see `arrays_of_state`."""
-        resolutions: list[list[int]] = self.planes.layout.reso.tolist()
-        return resolutions
+        return {"resolutions": self.planes.layout.reso.tolist(), "key": self.key}
 
     @staticmethod
-    def arrays_of_state(shape: list[list[int]], state: Mapping[str, np.ndarray]) -> scene.Deformation:
+    def arrays_of_state(shape: dict[str, Any], state: Mapping[str, np.ndarray]) -> scene.Deformation:
         """Arrays of a field's shapes, from its `shape` and state dictionary; the planes are 0. ValueError if the two do
         not fit."""
         n_cells, channels = state["planes.grid"].shape
-        needed = sum(r[a] * r[b] for r in shape for _, a, b in scene.PLANES)
+        resolutions = shape["resolutions"]
+        needed = sum(r[a] * r[b] for r in resolutions for _, a, b in scene.PLANES)
         if needed != n_cells:  # before anything of that size is made
-            raise ValueError(f"planes of {n_cells} cells, expected {needed} for the resolutions {shape}")
+            raise ValueError(f"planes of {n_cells} cells, expected {needed} for the resolutions {resolutions}")
         planes = tuple(
-            {plane: np.zeros((channels, r[b], r[a]), np.float32) for plane, a, b in scene.PLANES} for r in shape
+            {plane: np.zeros((channels, r[b], r[a]), np.float32) for plane, a, b in scene.PLANES} for r in resolutions
         )
         # the registry's order, not the dictionary's: optimiser states are matched to parameters by order
         present = {key.split(".")[1] for key in state if key.startswith("heads.")}
         heads = [head for head in (*scene.GLOBAL_HEADS, *scene.LOCAL_HEADS) if head in present]
         names = {scene.TRUNK: scene.TRUNK} | {head: f"heads.{head}" for head in heads}
-        return scene.Deformation(planes, {name: MLP.arrays_of_state(state, key) for name, key in names.items()})
+        networks = {name: MLP.arrays_of_state(state, key) for name, key in names.items()}
+        return scene.Deformation(planes, networks, shape["key"])
 
     # -- parameters, regularisers and rate -----------------------------------------------------------------------------
 
@@ -127,6 +136,16 @@ class DeformationField(nn.Module):
         and weights are rounded to multiples of them, straight through."""
         if not self.heads:
             return {}
+        found = self._outputs(points, t, plane_step, weight_step)
+        if self.key is not None:
+            still = self._outputs(points, scene.instant(self.key), plane_step, weight_step)
+            found = {name: value - still[name] for name, value in found.items()}
+        return found
+
+    def _outputs(
+        self, points: Tensor, t: float, plane_step: float | None, weight_step: float | None
+    ) -> dict[str, Tensor]:
+        """F(x, t) per head."""
         hidden = F.relu(self.trunk(self.planes(points, t, plane_step), weight_step))
         return {name: head(hidden, weight_step) * self._unit_of(name) for name, head in self._named_heads()}
 
@@ -157,16 +176,16 @@ class DeformationField(nn.Module):
         if not self.heads:
             return rows
         points = rows[:, :3] if follows else rows[:, :3].detach()
-        features = self.planes(points, t, plane_step)
         ends = dict(zip(widths, accumulate(widths.values()), strict=True))
-        columns = [
-            (slice(ends[name] - widths[name], ends[name]), self._unit_of(name)) for name, _ in self._named_heads()
-        ]
+        own = [(slice(ends[name] - widths[name], ends[name]), self._unit_of(name)) for name, _ in self._named_heads()]
         networks = [self.trunk, *(head for _, head in self._named_heads())]
         parameters = [p for network in networks for layer in network.layers for p in (layer.weight, layer.bias)]
-        settings = (columns, 2 * len(self.trunk.layers), weight_step)
-        out: Tensor = _AddNetworks.apply(rows, features, settings, *parameters)  # type: ignore[no-untyped-call]
-        return out
+        signed = [(t, 1.0)] if self.key is None else [(t, 1.0), (scene.instant(self.key), -1.0)]
+        for time, sign in signed:
+            features = self.planes(points, time, plane_step)
+            settings = ([(columns, sign * unit) for columns, unit in own], 2 * len(self.trunk.layers), weight_step)
+            rows = _AddNetworks.apply(rows, features, settings, *parameters)  # type: ignore[no-untyped-call]
+        return rows
 
     def _named_heads(self) -> list[tuple[str, MLP]]:
         """The heads present, in the registry's order."""

@@ -30,5 +30,7 @@ export const MAX_CHANNELS = 256;
 export const MAX_SIDE = 4096;
 export const MAX_LINEAR_LAYERS = 16;
 export const MAX_WIDTH = 4096;
+/** Normalised times are multiples of 1 / INSTANTS. */
+export const INSTANTS = 65535;
 /** The format's is 2^28, the least 2^25. */
 export const MAX_PLANE_CELLS = 2 ** 26;

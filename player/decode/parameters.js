@@ -5,6 +5,7 @@ import { Fields, asInteger, asList, asRegistered, checkStep } from "./fields.js"
 import { channelCount } from "./header.js";
 import { LOCAL_HEADS, globalHeads } from "./heads.js";
 import {
+  INSTANTS,
   MAX_CHANNELS,
   MAX_FIELDS,
   MAX_LINEAR_LAYERS,
@@ -45,7 +46,7 @@ export function layerKind(layer, { widths, centres }) {
 /** Sections of mode ans by number (6.4). */
 const SECTIONS = /** @type {const} */ (["positions", "masks", "attributes", "planes", "weights", "symbols"]);
 /** The keys of a layer's parameters (6.1). */
-const KEYS = [1, 2, 3, 4, 5];
+const KEYS = [1, 2, 3, 4, 5, 6];
 
 /** One plane of a scale. @typedef {{channels: number, height: number, width: number, predictor: number}} PlaneShape */
 /** Layers from the input side. @typedef {{name: string, layers: {inputs: number, outputs: number}[]}} NetworkShape */
@@ -56,6 +57,7 @@ const KEYS = [1, 2, 3, 4, 5];
  * @property {number[]} steps of the weights in layer 0, else of planes and weights; empty without a deformation
  * @property {PlaneShape[]} planes six per scale
  * @property {NetworkShape[]} networks
+ * @property {number | null} key instant of layer 1, normalised time, if there is one
  * @property {Partial<Record<(typeof SECTIONS)[number], Uint8Array>>} sections
  * @property {Declared} declared by the slices so far, this one included
  */
@@ -82,10 +84,11 @@ export function readParameters(payload, kind, before, later) {
   const fields = new Fields(unpack(payload.subarray(4, 4 + length), where).value, where, KEYS);
   const rows = asInteger(fields.get(1), 0, MAX_ROWS - before.rows, `${where}: own rows`);
   const lengths = new Fields(fields.get(2), `${where}: sections`, [...SECTIONS.keys()]);
-  if (later) for (const key of [3, 4, 5]) if (fields.has(key)) throw malformed(`${where}: key ${key} in a later slice`);
+  if (later) for (const key of [3, 4, 5, 6]) if (fields.has(key)) throw malformed(`${where}: key ${key} in a later slice`);
   const scales = readScales(fields, kind, where);
   const networks = later ? [] : readNetworks(fields, kind, where, scales);
   const steps = readSteps(fields, kind, where, networks.length > 0);
+  const key = readKey(fields, kind, where, networks.length > 0);
   const planes = scales.flat();
   const sections = cutSections(payload, 4 + length, lengths, where);
   const cells = planes.reduce((sum, { channels, height, width }) => sum + channels * height * width, 0);
@@ -109,7 +112,7 @@ export function readParameters(payload, kind, before, later) {
       throw malformed(`${where}: section ${name} is ${found}, with ${counts[i]} symbols to code`);
     }
   });
-  return { rows, steps, planes, networks, sections, declared };
+  return { rows, steps, planes, networks, key, sections, declared };
 }
 
 /** Clause 6.5. @param {string} where @param {string} what @param {number} count @param {number} free
@@ -138,6 +141,13 @@ function readSteps(fields, kind, where, expected) {
   if (fields.has(3) !== expected) throw malformed(`${where}: steps ${expected ? "missing" : "without networks"}`);
   if (!expected) return [];
   return fields.reals(3, kind.classes.length, "steps").map((step) => checkStep(step, `${where}: step`));
+}
+
+/** Key 6. @param {Fields} fields @param {LayerKind} kind @param {string} where @param {boolean} deformed */
+function readKey(fields, kind, where, deformed) {
+  if (!fields.has(6)) return null;
+  if (kind.layer !== 1 || !deformed) throw malformed(`${where}: a key instant, expected none`);
+  return Math.fround(asInteger(fields.get(6), 0, INSTANTS, `${where}: key instant`) / INSTANTS);
 }
 
 /** Key 4: the planes of each scale. @param {Fields} fields @param {LayerKind} kind @param {string} where */

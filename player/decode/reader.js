@@ -149,7 +149,7 @@ export class LayerReader {
    * @param {LayerSymbols} symbols @param {Continuation} continuation @param {boolean} later @returns {LayerTensors} */
   _accept(symbols, continuation, later) {
     const { kind, parameters, voxels, rises } = symbols;
-    const { steps, planes, networks } = parameters;
+    const { steps, planes, networks, key } = parameters;
     const header = /** @type {Header} */ (this.header);
     const where = `layer ${kind.layer}`;
     const latest = this._layers[this._layers.length - 1];
@@ -173,7 +173,7 @@ export class LayerReader {
     this._loose.push(voxels);
     if (!later) {
       const none = { slices: 0, parts: [] };
-      this._layers.push({ layer: kind.layer, ...none, steps, planes, networks, tensors, earlier, continuation });
+      this._layers.push({ layer: kind.layer, ...none, steps, planes, networks, key, tensors, earlier, continuation });
     }
     const layer = this._layers[this._layers.length - 1];
     layer.slices++;
@@ -206,7 +206,7 @@ export class LayerReader {
     for (const layer of later) {
       const [ofPlanes, ofWeights] = layer.steps;
       if (ofPlanes === undefined) continue;
-      deformations[layer.layer - 1] = { planes: planesOf(layer), networks: networksOf(layer) };
+      deformations[layer.layer - 1] = { planes: planesOf(layer), networks: networksOf(layer), key: layer.key };
       if (layer.layer === 1) Object.assign(steps, { planesGlobal: ofPlanes, weightsGlobal: ofWeights });
       else Object.assign(steps, { planesLocal: ofPlanes, weightsLocal: ofWeights });
     }
@@ -255,6 +255,7 @@ const COLUMNS = /** @type {const} */ (["voxels", "codes", "anchor", "feature", "
  * @property {number[]} steps
  * @property {PlaneShape[]} planes
  * @property {NetworkShape[]} networks
+ * @property {number | null} key
  * @property {Pick<LayerTensors, "planes" | "weights">} tensors
  * @property {Uint8Array} earlier mask codes of earlier rows
  * @property {Own[]} parts that make up its rows

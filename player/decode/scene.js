@@ -18,7 +18,9 @@
  * planes: per scale its six planes. networks: `trunk` and the heads that are there, in the order of their ids: of the
  * global deformation position, feature, offset, scaling, of the local one mean, scale, quat, opacity, color.
  *
- * @typedef {{planes: Record<PlaneName, Plane>[], networks: Record<string, Network>}} Deformation
+ * key: the key instant t* in normalised time if the residuals are those at t minus those at t* (13.4), else null.
+ *
+ * @typedef {{planes: Record<PlaneName, Plane>[], networks: Record<string, Network>, key: number | null}} Deformation
  */
 
 /**

@@ -18,8 +18,9 @@ from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.picture import render_image
-from pd4dgs_codec.scene import Camera, Deformation, Scene, Widths
+from pd4dgs_codec.scene import Camera, Deformation, Scene, Widths, instant
 
+KEYED = {"key": 40_000}
 ROOT = Path(__file__).parents[2]
 K = np.array([[40, 0, 24], [0, 40, 18], [0, 0, 1]], np.float32)
 
@@ -43,8 +44,8 @@ def _scene(**changes: object) -> Scene:
 
 @pytest.mark.parametrize(
     "changes",
-    [{}, {"hidden": (16, 8)}, {"channels": 5, "width": 7}, {"widths": Widths(16, 4)}, {"widths": Widths(3, 13)}],
-    ids=["usual", "deep", "odd", "narrow", "odd widths"],
+    [{}, {"hidden": (16, 8)}, {"channels": 5, "width": 7}, {"widths": Widths(16, 4)}, {"widths": Widths(3, 13)}, KEYED],
+    ids=["usual", "deep", "odd", "narrow", "odd widths", "key instant"],
 )
 def test_pictures_are_those_of_the_torch_model(changes):
     scene = _scene(**changes)
@@ -58,9 +59,19 @@ def test_pictures_are_those_of_the_torch_model(changes):
             got = player.picture(camera, t)
             assert got.dtype == np.float32 and got.shape == expected.shape
             # sums in another order; a Gaussian next to the threshold of opacity may come or go at 1/255
-            assert np.abs(got - expected).max() < 5e-3 and np.abs(got - expected).mean() < 1e-5
+            assert np.abs(got - expected).max() < 5e-3 and np.abs(got - expected).mean() < 5e-5
             seen += float(np.ptp(got))
     assert seen > 2, "the pictures show something"
+
+
+def test_layer_1_changes_nothing_at_its_key_instant():
+    scene = _scene(**KEYED)
+    rows = (len(scene.anchor_q),) * 3  # all anchors in every layer
+    scene = replace(scene, rows=rows, mask=tuple(np.full(n, 255, np.uint8) for n in rows))
+    still, moving = Player(scene.prefix(0)), Player(scene.prefix(1))
+    at = instant(KEYED["key"])
+    np.testing.assert_allclose(moving.picture(_camera(1), at), still.picture(_camera(1), at), atol=1e-5)
+    assert np.abs(moving.picture(_camera(1), 0.0) - still.picture(_camera(1), 0.0)).max() > 0.05
 
 
 @pytest.mark.parametrize("t", [float("nan"), float("inf")])
