@@ -145,10 +145,10 @@ def command(name: str, *arguments: object) -> Row:
 
 def levels(scene: Scene, file: Path) -> list[Row]:
     """Held-out quality of each level of a file or a checkpoint: level, bytes, mpsnr, mssim, anchors, decode_seconds,
-    render_ms."""
-    keys = ("level", "mpsnr", "mssim", "anchors", "decode_seconds", "render_ms")
+    render_ms, and moving_mpsnr where test cameras stand still."""
+    keys = ("level", "mpsnr", "moving_mpsnr", "mssim", "anchors", "decode_seconds", "render_ms")
     found = command("eval", file, *scene.reading)["levels"]
-    return [{"bytes": row["cumulative_bytes"]} | {key: row[key] for key in keys} for row in found]
+    return [{"bytes": row["cumulative_bytes"]} | {key: row[key] for key in keys if key in row} for row in found]
 
 
 def present(names: Sequence[str]) -> Iterator[Scene]:

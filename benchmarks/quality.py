@@ -81,7 +81,7 @@ def text(rows: Sequence[Row]) -> str:
     groups: dict[tuple[str, Any], list[Row]] = {}
     for row in rows:
         groups.setdefault((row["scene"], row["level"]), []).append(row)
-    cells = []
+    cells, moves = [], any("moving_mpsnr" in row for row in rows)
     for (scene, level), found in groups.items():
         size = median(row["bytes"] for row in found)
         cells.append(
@@ -91,13 +91,16 @@ def text(rows: Sequence[Row]) -> str:
                 spread([row["bytes"] for row in found], 0),
                 seconds_at(size),
                 spread([row["mpsnr"] for row in found], 2),
+                *([spread([row["moving_mpsnr"] for row in found if "moving_mpsnr" in row], 2)] if moves else []),
                 number(median(row["mssim"] for row in found), 4),
                 number(found[0]["anchors"], 0),
                 number(found[0]["steps"], 0),
                 number(found[0]["minutes"], 1),
             )
         )
-    head = ("scene", "level", "bytes so far", "s at 2 Mbps", "mPSNR dB", "mSSIM", "anchors", "steps", "training min")
+    head = ["scene", "level", "bytes so far", "s at 2 Mbps", "mPSNR dB", "mSSIM", "anchors", "steps", "training min"]
+    if moves:
+        head.insert(5, "moving dB")
     seeds = 1 + max(row["seed"] for row in rows)
     told = f" Medians of {seeds} seeds, with the least and the most." if seeds > 1 else ""
     return (
@@ -107,7 +110,9 @@ def text(rows: Sequence[Row]) -> str:
 
 
 def spread(values: Sequence[float], digits: int) -> str:
-    """The median and, of several values, the least and the most."""
+    """The median and, of several values, the least and the most; a dash without values."""
+    if not values:
+        return "-"
     middle = number(median(values), digits)
     return f"{middle} ({number(min(values), digits)} to {number(max(values), digits)})" if len(values) > 1 else middle
 

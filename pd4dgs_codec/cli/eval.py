@@ -12,8 +12,9 @@ from pd4dgs_codec.cli.progress import progress_bar
 DETAILS = f"""\
 Each level of a .pd4 file is decoded from its own prefix and compared with the held-out views.
 mPSNR in dB and mSSIM follow the DyCheck protocol: 8-bit images, masked if the dataset has covisibility masks.
---perceptual adds LPIPS, ST-LPIPS and FLIP, as far as they are installed, masked too, and their temporal variants
-(t-LPIPS, ...): the mean distance between successive frames of a fixed camera. docs/evaluation.md defines them.
+Where test cameras stand still, the moving region is measured too: pixels whose true colour changes by more than 16 of
+255 over time. --perceptual adds LPIPS, ST-LPIPS and FLIP, as far as they are installed, masked too, and their temporal
+variants (t-LPIPS, ...): the mean distance between successive frames of a fixed camera. docs/evaluation.md has more.
 
 {options.SOURCES}
 
@@ -74,10 +75,15 @@ def _text(result: dict[str, Any]) -> str:
     lines = [
         f"{result['source']}: {result['views']} {what} views, {result['width']}x{result['height']}, {masked}",
         table(head, rows),
+        *_moving_lines(result["moving_share"]),
         *_distance_lines(result.get("perceptual")),
         f"baseline, the mean training image: {number(result['baseline_mean_image_psnr'])} dB",
     ]
     return "\n".join(lines)
+
+
+def _moving_lines(share: float | None) -> list[str]:
+    return [f"moving: the {100 * share:.1f} % of pixels that change where cameras stand still"] if share else []
 
 
 def _distance_lines(perceptual: dict[str, Any] | None) -> list[str]:

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.data.view import Dataset, View
-from pd4dgs_codec.quality.image import Metric, mean_image_baseline, mean_scores, mpsnr, mssim, to_uint8
+from pd4dgs_codec.quality.image import Metric, mean_image_baseline, mean_scores, moving_regions, mpsnr, mssim, to_uint8
 from pd4dgs_codec.quality.levels import Level, load_levels
 from pd4dgs_codec.quality.perceptual import Distance, Perceptual
 from pd4dgs_codec.scene import Camera
@@ -19,6 +19,7 @@ from pd4dgs_codec.scene import Camera
 #: Pictures of the fixed camera over t = 0..1 that the temporal distances compare.
 TEMPORAL_FRAMES = 30
 NO_DISTANCES: Mapping[str, Distance] = MappingProxyType({})
+NOTHING_MOVES: Mapping[View, np.ndarray] = MappingProxyType({})
 
 
 def evaluate_file(
@@ -37,7 +38,7 @@ def evaluate_file(
     after each picture of each level. Raises DecodeError, DataError.
     """
     views, split = (dataset.test, "test") if dataset.test else (dataset.train, "train")
-    levels = load_levels(path_or_bytes, max_layer, device)
+    levels, moving = load_levels(path_or_bytes, max_layer, device), moving_regions(views)
     distances = perceptual.distances if perceptual else NO_DISTANCES
     result: dict[str, Any] = {
         "source": dataset.name,
@@ -47,7 +48,8 @@ def evaluate_file(
         "height": views[0].height,
         "masked": dataset.masked and split == "test",
         "baseline_mean_image_psnr": mean_image_baseline(dataset.train, views),
-        "levels": [evaluate_level(level, views, distances, step) for level in levels],
+        "moving_share": float(np.mean([region.mean() for region in moving.values()])) if moving else None,
+        "levels": [evaluate_level(level, views, distances, step, moving) for level in levels],
     }
     if perceptual:
         result["perceptual"] = {
@@ -64,6 +66,7 @@ def metric_columns(result: dict[str, Any]) -> list[tuple[str, str, int]]:
     titles = {name: d["title"] for name, d in result.get("perceptual", {"distances": {}})["distances"].items()}
     return [
         ("mPSNR dB", "mpsnr", 2),
+        *([("moving dB", "moving_mpsnr", 2)] if result["moving_share"] else []),
         ("mSSIM", "mssim", 4),
         *((f"m{title}", f"m{name}", 4) for name, title in titles.items()),
         *((f"t-{title}", f"t_{name}", 5) for name, title in titles.items()),
@@ -75,24 +78,29 @@ def evaluate_level(
     views: tuple[View, ...],
     distances: Mapping[str, Distance] = NO_DISTANCES,
     step: Callable[[], None] = lambda: None,
+    moving: Mapping[View, np.ndarray] = NOTHING_MOVES,
 ) -> dict[str, Any]:
     """The row of one level. render_ms: median milliseconds per picture, the networks included.
 
     distances: name -> distance; adds m<name>, the mean over the views, and t_<name>, the mean between successive
-    pictures of the first view's camera at TEMPORAL_FRAMES equidistant times from 0 to 1.
+    pictures of the first view's camera at TEMPORAL_FRAMES equidistant times from 0 to 1. moving: masks of views, see
+    `moving_regions`; adds moving_mpsnr, the mean over these views of the mPSNR there.
     """
     metrics: dict[str, Metric] = {"mpsnr": mpsnr, "mssim": mssim, **{f"m{name}": d for name, d in distances.items()}}
-    milliseconds = []
+    milliseconds, where_moving = [], []
 
     def draw(view: View) -> np.ndarray:
         image, took = level.timed_picture(view.camera, view.time)
         milliseconds.append(took)
+        if view in moving:
+            where_moving.append(mpsnr(image, view.image, moving[view]))
         return image
 
     level.picture(views[0].camera, views[0].time)  # warms up, so that render_ms counts no compilation
     return {
         "level": level.level,
         **mean_scores(draw, views, metrics, step),
+        **({"moving_mpsnr": float(np.mean(where_moving))} if moving else {}),
         **_temporal(level, views[0].camera, distances, step),
         "cumulative_bytes": level.cumulative_bytes,
         "anchors": level.anchors,

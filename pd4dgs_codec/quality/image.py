@@ -19,6 +19,8 @@ if TYPE_CHECKING:
 TAPS, SIGMA = 11, 1.5
 C1, C2 = 0.01**2, 0.03**2
 LEAST_WEIGHT = 1e-6
+#: A pixel moves if its true colour changes by more than this, of 255: video noise stays below, moving things do not.
+MOVING = 16
 
 
 def to_uint8(image: np.ndarray) -> np.ndarray:
@@ -106,6 +108,33 @@ def mean_image_baseline(train: Sequence[View], test: Sequence[View]) -> float | 
         return None
     mean = np.asarray(sum(view.image.astype(np.float64) for view in train)) / (255.0 * len(train))
     return float(np.mean([mpsnr(mean, view.image, view.mask) for view in test]))
+
+
+def moving_regions(views: Sequence[View]) -> dict[View, np.ndarray]:
+    """bool [H, W] of each view whose camera stands still: the valid pixels that change over time there.
+
+    Cameras stand still that took views at two times or more. A pixel changes if a channel of the true image does so by
+    more than MOVING between any two times at which it is valid. Views without such a pixel are left out.
+    """
+    cameras: dict[tuple[object, ...], list[View]] = {}
+    for view in views:
+        pose = view.viewmat.tobytes(), view.K.tobytes(), view.width, view.height
+        cameras.setdefault(pose, []).append(view)
+    regions = {}
+    for taken in cameras.values():
+        if len({view.time for view in taken}) < 2:
+            continue
+        low, high = np.full_like(taken[0].image, 255), np.zeros_like(taken[0].image)
+        for view in taken:
+            valid = True if view.mask is None else view.mask[..., None]
+            np.minimum(low, view.image, out=low, where=valid)
+            np.maximum(high, view.image, out=high, where=valid)
+        changes = (high.astype(np.int16) - low > MOVING).any(axis=2)
+        for view in taken:
+            region = changes if view.mask is None else changes & view.mask
+            if region.any():
+                regions[view] = region
+    return regions
 
 
 #: (picture, true image, mask) -> score

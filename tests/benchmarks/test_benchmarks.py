@@ -129,6 +129,9 @@ def test_several_seeds_are_shown_with_their_spread():
         for i, (n, db) in enumerate([(1000, 20.0), (1200, 21.0), (900, 23.0)])
     ]
     cells = [cell.strip() for cell in quality.text(rows).splitlines()[-1].strip("|").split("|")]
+    assert "moving dB" not in quality.text(rows)
+    rows += [row | {"scene": "cube", "seed": 0, "bytes": 9, "mpsnr": 30.0, "moving_mpsnr": 21.5}]
+    assert [line.split(" | ")[5] for line in quality.text(rows).splitlines()[-4:]] == ["moving dB", "-", "-", "21.50"]
     assert cells[:5] == ["discs", "0", "1,000 (900 to 1,200)", "0.00", "21.00 (20.00 to 23.00)"]
 
 

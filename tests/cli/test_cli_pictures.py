@@ -50,6 +50,27 @@ def test_eval_of_checkpoint_and_pipe(cli, model_pt, scene_pd4, shared_dataset):
     assert piped[1]["mpsnr"] == pytest.approx(levels[1]["mpsnr"], abs=0.5)
 
 
+def test_eval_measures_what_moves_where_cameras_stand_still(cli, scene_pd4):
+    """Against the region found from the truth at hand, with the pictures that render writes."""
+    from pd4dgs_codec.data.dataset import load
+    from pd4dgs_codec.quality.image import mpsnr
+    from pd4dgs_codec.quality.levels import load_levels
+
+    source = "synthetic:flyby?size=32x32&frames=4"
+    report = cli("eval", scene_pd4, source, "--json", "--max-layer", 1).json
+    views, (*_, level) = load(source).test, load_levels(scene_pd4, 1)
+    scores, shares = [], []
+    for view in views:
+        truth = np.stack([v.image for v in views if v.camera_id == view.camera_id]).astype(int)
+        region = (np.ptp(truth, axis=0) > 16).any(axis=2)
+        scores.append(mpsnr(level.picture(view.camera, view.time), view.image, region))
+        shares.append(region.mean())
+    assert report["levels"][1]["moving_mpsnr"] == pytest.approx(np.mean(scores))
+    assert 0 < report["moving_share"] == pytest.approx(np.mean(shares))
+    shown = cli("eval", scene_pd4, source, "--max-layer", 0).out.decode()
+    assert "moving dB" in shown and f"moving: the {100 * np.mean(shares):.1f} % of pixels" in shown
+
+
 def test_eval_without_held_out_views_says_so(cli, scene_pd4, shared_dataset):
     result = cli("eval", scene_pd4, shared_dataset, "--holdout", 0, "--max-layer", 0)
     assert result.code == 0 and "training views" in result.err and b"6 training views" in result.out

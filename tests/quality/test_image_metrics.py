@@ -5,8 +5,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from pd4dgs_codec.data.view import View
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.quality.image import level_psnr, mean_image_baseline, mean_scores, mpsnr, mssim, to_uint8
+from pd4dgs_codec.quality.image import (
+    level_psnr,
+    mean_image_baseline,
+    mean_scores,
+    moving_regions,
+    mpsnr,
+    mssim,
+    to_uint8,
+)
 
 
 def random_pair(h=15, w=17, seed=0):
@@ -183,3 +192,28 @@ def test_psnr_per_level_keeps_the_levels_and_honours_masks():
         return picture
 
     assert level_psnr(draw, (0, 2), VIEWS) == pytest.approx({0: 20 * np.log10(255), 2: 20 * np.log10(255 / 3)})
+
+
+def still(time, image, mask=None, x=0.0):
+    """A view of a camera at x."""
+    viewmat = np.eye(4, dtype=np.float32)
+    viewmat[0, 3] = x
+    return View(viewmat, np.eye(3, dtype=np.float32), 4, 3, time, image, mask, "", 1)
+
+
+def test_what_moves_where_a_camera_stands_still():
+    """A change of 17 in one channel counts, one of 16 does not, nor what is not valid at that time."""
+    first, later = np.full((3, 4, 3), 100, np.uint8), np.full((3, 4, 3), 116, np.uint8)
+    later[1, 2, 0], later[0, 1], later[2, 3, 2] = 117, 0, 83
+    mask = np.ones((3, 4), bool)
+    mask[0, 1] = False
+    views = [still(0.0, first), still(1.0, later, mask), still(0.0, first, x=1.0), still(0.5, later, x=2.0)]
+    views += [still(0.5, later, x=2.0)]  # a pose at one time, twice
+    regions = moving_regions(views)
+    assert list(regions) == views[:2]
+    for view in views[:2]:
+        np.testing.assert_array_equal(np.argwhere(regions[view]), [(1, 2), (2, 3)])
+    mask[1, 2] = False
+    gone = moving_regions([still(0.0, first), still(1.0, later, mask)])
+    assert [int(region.sum()) for region in gone.values()] == [1, 1]
+    assert moving_regions([still(0.0, first), still(1.0, first)]) == {}
