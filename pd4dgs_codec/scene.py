@@ -15,6 +15,8 @@ from typing import Any
 import numpy as np
 
 SCALING_DIM = 6
+#: Inputs of a network that are the view direction, a unit vector, behind the feature.
+VIEW_DIM = 3
 
 #: Limits of `Widths`: the feature may be twice as wide as in Scaffold-GS.
 MAX_FEATURE, MAX_SLOTS = 64, 16
@@ -45,11 +47,13 @@ SCAFFOLD_NETWORKS = ("opacity", "covariance", "color")
 @dataclass(frozen=True)
 class Widths:
     """Sizes of an anchor: `feature` numbers D for the networks, and `slots` G, the Gaussians that it spawns. All other
-    widths of anchors and networks follow from these two. graded: whether each anchor has a step class."""
+    widths of anchors and networks follow from these two. graded: whether each anchor has a step class. viewing: the
+    scaffold's networks that take the view direction as well, in their order."""
 
     feature: int = 32
     slots: int = 10
     graded: bool = False
+    viewing: tuple[str, ...] = SCAFFOLD_NETWORKS
 
     @property
     def attributes(self) -> dict[str, tuple[int, ...]]:
@@ -67,9 +71,9 @@ class Widths:
         return self.predicted + 3 * self.slots
 
     @property
-    def inputs(self) -> int:
-        """Input width of the scaffold's decoders: the feature and the view direction."""
-        return self.feature + 3
+    def inputs(self) -> dict[str, int]:
+        """Input width of each of the scaffold's decoders: the feature, and 3 of the view direction if it takes it."""
+        return {name: self.feature + VIEW_DIM * (name in self.viewing) for name in SCAFFOLD_NETWORKS}
 
     @property
     def networks(self) -> dict[str, int]:
@@ -268,8 +272,10 @@ class Scene:
 
     @property
     def widths(self) -> Widths:
-        """D and G, read off the arrays."""
-        return Widths(self.feature.shape[1], self.offset.shape[1], self.grading is not None)
+        """Read off the arrays; a network of more inputs than the feature takes the view direction."""
+        inputs = {name: network[0][0].shape[1:] for name, network in self.networks.items() if network}
+        viewing = tuple(name for name in SCAFFOLD_NETWORKS if inputs.get(name) != self.feature.shape[1:])
+        return Widths(self.feature.shape[1], self.offset.shape[1], self.grading is not None, viewing)
 
     @property
     def level(self) -> int:

@@ -262,8 +262,8 @@ def read_header(data):
         read_camera(header[12])
     read_error_bounds(header[13])
     need(type(header[14]) is bytes and len(header[14]) == 16, "the digest of the layers is not 16 bytes")
-    for value, most in zip(a_list(header[15], "the widths", 2), (64, 16)):
-        limited(value, most, "a width", 1)
+    for value, least, most in zip(a_list(header[15], "the widths", 3), (1, 1, 0), (64, 16, 7)):
+        limited(value, most, "a width", least)
     for centre in a_list(header[16], "the centres", channel_count(header)) if 16 in header else ():
         limited(centre, MAX_SYMBOL, "a centre", -MAX_SYMBOL)
     read_chunk_list(header[1])
@@ -273,11 +273,11 @@ def read_header(data):
     return header
 
 
-# 5.1 Header map: "feature width D, 1..64, and slots G, 1..16"
+# 5.1 Header map: "feature width D, 1..64, slots G, 1..16, and V, 0..7"
 # 11.2 Attributes: "The D + 6 + 3·G channels are the scalars of an anchor: feature 0 .. D − 1, scaling_log 0..5,
 # offset 0 .. 3·G − 1."
 def attribute_channels(header):
-    feature, slots = header[15]
+    feature, slots, _ = header[15]
     return {"feature": feature, "scaling_log": 6, "offset": 3 * slots}
 
 
@@ -287,7 +287,7 @@ def channel_count(header):
 
 # 6.3 Planes and networks: the outputs by id, None for any
 def network_outputs(number, header):
-    feature, slots = header[15]
+    feature, slots, _ = header[15]
     return (
         {0: slots, 1: 7 * slots, 2: 3 * slots},
         {0: None, 1: 3, 2: feature, 3: 3 * slots, 4: 6},
@@ -482,11 +482,11 @@ def plane_shapes(layer):
 
 
 # 6.3 Planes and networks: "Linear layer i is a weight [o_i, o_{i−1}] and a bias [o_i]; o_0 is the network's input
-# width."
+# width." "The input width is D in layer 0, but D + 3 (feature D, view direction 3) for network i if bit i of V is set"
 def weight_shapes(layer):
-    shapes, feature = [], layer.header[15][0]
+    shapes, (feature, _, viewing) = [], layer.header[15]
     for key, widths in layer.networks.items():
-        width = sum(s[0] for s in layer.scales) if layer.number else feature + 3
+        width = sum(s[0] for s in layer.scales) if layer.number else feature + 3 * (viewing >> key & 1)
         if layer.number and key:
             width = layer.networks[0][-1]
         for i, outputs in enumerate(widths):
@@ -533,7 +533,7 @@ def read_sections(layer, parts):
         for section, sizes in counts.items():
             data = part(section, sum(sizes))
             if section == ATTRIBUTE_SECTION and sum(sizes):
-                channels[section] = decode_attributes(data, *layer.header[15], layer.rows, past, 16 in layer.header)
+                channels[section] = decode_attributes(data, *layer.header[15][:2], layer.rows, past, 16 in layer.header)
             elif section == PLANE_SECTION and sizes:
                 channels[section] = decode_planes(data, [shape for _, _, shape in planes])
             else:

@@ -21,6 +21,7 @@ from pd4dgs_codec.scene import (
     LOCAL_HEADS,
     MAX_CLASS,
     PLANES,
+    SCAFFOLD_NETWORKS,
     Camera,
     Deformation,
     Grading,
@@ -144,7 +145,7 @@ def make_scene(
         grading=grading,
         mask=tuple(codes.T.copy()),
         networks={
-            name: network(rng, (widths.inputs, *hidden, outputs), steps.weights_scaffold, kind)
+            name: network(rng, (widths.inputs[name], *hidden, outputs), steps.weights_scaffold, kind)
             for name, outputs in widths.networks.items()
         },
         global_deformation=deformation(
@@ -179,7 +180,9 @@ def scenes(draw: st.DrawFn) -> Scene:
     """
     kind = draw(st.sampled_from(RANGES))
     graded = draw(st.booleans())
-    widths = replace(draw(st.sampled_from((Widths(), Widths(1, 1), Widths(5, 2), Widths(64, 16)))), graded=graded)
+    viewing = tuple(name for name in SCAFFOLD_NETWORKS if draw(st.booleans()))
+    widths = draw(st.sampled_from((Widths(), Widths(1, 1), Widths(5, 2), Widths(64, 16))))
+    widths = replace(widths, graded=graded, viewing=viewing)
     return make_scene(
         draw(st.integers(0, 2**32 - 1)),
         layers=draw(st.sampled_from(LAYER_SETS)),
@@ -200,7 +203,7 @@ def scenes(draw: st.DrawFn) -> Scene:
 
 def assert_same_scene(a: Scene, b: Scene) -> None:
     """Every array of two scenes is equal, bit for bit."""
-    assert (a.layers, a.rows) == (b.layers, b.rows)
+    assert (a.layers, a.rows, a.widths) == (b.layers, b.rows, b.widths)
     for name in ("anchor_q", "feature", "scaling_log", "offset"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name), err_msg=name)
         assert getattr(a, name).dtype == getattr(b, name).dtype

@@ -41,7 +41,7 @@ from pd4dgs_codec.draw.simd import (
     wide_splat,
 )
 from pd4dgs_codec.errors import RenderError
-from pd4dgs_codec.scene import SCALING_DIM, Camera, Network, SceneInfo
+from pd4dgs_codec.scene import SCALING_DIM, VIEW_DIM, Camera, Network, SceneInfo
 from pd4dgs_codec.threads import kernel_threads
 
 #: A Gaussian fainter than the rasteriser's threshold never reaches a pixel, so its networks are not evaluated.
@@ -137,53 +137,50 @@ def fusible(networks: Sequence[Sequence[tuple[Any, Any]]]) -> bool:
 
 
 class Decoders:
-    """The scaffold's networks, opacity, covariance and colour, packed for the kernels."""
+    """The scaffold's networks, opacity, covariance and colour, packed for the kernels; or the first two alone, for
+    Gaussians whose colours are 0. A network that does not take the direction has weights of 0 for it here."""
 
-    def __init__(self, networks: Sequence[Network | Sequence[Layer]], functions: Functions = NUMPY):
+    def __init__(self, given: Sequence[Network | Sequence[Layer]], features: int, functions: Functions = NUMPY):
+        """features: D, numbers of an anchor's feature."""
+        networks = [_viewing(network, features) for network in given]
         self.slots = len(networks[0][-1][1])  #: Gaussians of an anchor
-        self._functions = functions
-        self._last = [network[-1] for network in networks[1:]]
-        self._by_slot = [by_slot(*layer, self.slots) for layer in self._last]
+        self._features, self._functions = features, functions
+        self._inputs = [network[0][0].shape[1] for network in given]
+        self._heads = [SlotHead(network, self.slots) for network in networks[1:]]
         self._fused = fusible(networks)
         if self._fused:
-            self._widths = [len(network[0][1]) for network in networks]
+            self._ends = np.cumsum([len(network[0][1]) for network in networks])[:-1]
             first = tuple(np.concatenate(parts) for parts in zip(*(network[0] for network in networks), strict=True))
-            self._opacity, self._hidden = Layers([(first[0], first[1]), networks[0][1]]), []
+            self._opacity = Layers([(first[0], first[1]), networks[0][1]])
         else:
             self._opacity = Layers(networks[0])
-            self._hidden = [Layers(n[:-1], relu_last=True) if len(n) > 1 else None for n in networks[1:]]
 
     def look(self, anchors: Array, eye: Array) -> Look:
         """The anchors as an eye at [3], world, sees them."""
-        n, features = len(anchors), anchors.shape[1] - 3 - 3 * self.slots - SCALING_DIM
-        x, distance = np.empty((n, features + 3), anchors.dtype), np.empty(n, anchors.dtype)
-        inputs(x, distance, anchors, eye)
-        opacity = np.zeros((n, self.slots), anchors.dtype)
+        x, distance = _seen_from(anchors, eye, self._features)
+        opacity = np.zeros((len(anchors), self.slots), anchors.dtype)
         hidden = self._opacity.add(opacity, x, keep=self._fused)
         if self._fused:
-            parts = [(hidden, self._widths[0]), (hidden, self._widths[0] + self._widths[1])]
+            parts = [(hidden, int(column)) for column in self._ends]
         else:
-            parts = [
-                (_padded(x, before, table), 0) for before, (table, _) in zip(self._hidden, self._by_slot, strict=True)
-            ]
+            parts = [(head.hidden(x), 0) for head in self._heads]
         return Look(x, distance, self._functions.tanh(opacity), tuple(parts))
 
     def make(self, anchors: Array, mask: Array, look: Look, keep: Array) -> Made:
         """The Gaussians of the kept slots of anchors under mask [n]."""
-        shape, color = (np.empty((len(keep), len(bias) // self.slots), anchors.dtype) for _, bias in self._last)
-        for out, (hidden, column), (weight, bias) in zip((shape, color), look.hidden, self._by_slot, strict=True):
-            linear(out, keep, hidden, column, weight, bias)
+        shape, *colors = (head(keep, *hidden) for head, hidden in zip(self._heads, look.hidden, strict=True))
         _, sigmoid, exp = self._functions
         relative, extent = sigmoid(shape), exp(np.ascontiguousarray(anchors[:, SCALING]))
+        color = sigmoid(colors[0]) if colors else np.zeros((len(keep), 3), anchors.dtype)
         gaussians, gates = np.empty((len(keep), GAUSSIAN_WIDTH), anchors.dtype), np.empty(len(keep), anchors.dtype)
-        assemble(gaussians, gates, keep, anchors, extent, look.opacity, mask, shape, relative, sigmoid(color))
+        assemble(gaussians, gates, keep, anchors, extent, look.opacity, mask, shape, relative, color)
         return Made(gaussians, gates, shape, relative, extent)
 
     def backward(
         self, anchors: Array, look: Look, keep: Array, made: Made, g: Array, g_gates: Array
     ) -> tuple[Array, Array, list[Layer]]:
         """The gradients by anchors, by mask [n] and by each layer of each network, from those by the Gaussians and
-        their gates. Of fused networks alone."""
+        their gates. Of three fused networks alone."""
         parts = kernel_threads()
         g_anchors, g_opacity, g_mask = np.zeros_like(anchors), np.zeros_like(look.opacity), np.zeros_like(look.distance)
         g_shape, g_color = np.empty_like(made.shape), np.empty((len(g), 3), g.dtype)
@@ -193,25 +190,65 @@ class Decoders:
         )  # fmt: skip
         ((hidden, _), _), last = look.hidden, []
         g_hidden = np.zeros_like(hidden)
-        for slope, (_, column), (weight, bias) in zip((g_shape, g_color), look.hidden, self._last, strict=True):
+        for slope, (_, column), head in zip((g_shape, g_color), look.hidden, self._heads, strict=True):
+            weight, bias = head.last
             g_weight, g_bias = np.zeros((parts, *weight.shape), g.dtype), np.zeros((parts, len(bias)), g.dtype)
             padded = np.pad(weight, ((0, 0), (0, -weight.shape[1] % WIDE)))
             linear_backward(g_hidden, g_weight, g_bias, keep, slope, hidden, column, padded)
             last.append((g_weight.sum(0), g_bias.sum(0)))
         g_inputs, (first, opacity) = self._opacity.backward(g_opacity, look.inputs, hidden, g_hidden)
         inputs_backward(g_anchors, g_inputs, look.inputs, look.distance)
-        ends = np.cumsum(self._widths[:-1])
-        firsts = zip(*(np.split(part, ends) for part in first), strict=True)
+        cut = zip(*(np.split(part, self._ends) for part in first), self._inputs, strict=True)
+        firsts = [(weight[:, :inputs], bias) for weight, bias, inputs in cut]
         return g_anchors, g_mask, [layer for pair in zip(firsts, [opacity, *last], strict=True) for layer in pair]
 
 
-def _padded(x: Array, before: Layers | None, table: Array) -> Array:
-    """The inputs of a network's last layer in as many columns as its table of `by_slot` has rows; the padding is 0."""
-    if before is not None:
-        return before(x, table.shape[1])
-    out = np.zeros((len(x), table.shape[1]), x.dtype)
-    out[:, : x.shape[1]] = x
-    return out
+class SlotHead:
+    """A network of G w outputs, w LANES at most, of which those of the kept slots alone are evaluated."""
+
+    def __init__(self, network: Sequence[Layer], slots: int):
+        self.last, self._before, self._slots = network[-1], network[:-1], slots
+        self._table = by_slot(*self.last, slots)
+
+    def hidden(self, x: Array) -> Array:
+        """The inputs of the last layer for x [n, inputs], in as many columns as `linear` takes; the padding is 0."""
+        width = self._table[0].shape[1]
+        if self._before:
+            return Layers(self._before, relu_last=True)(x, width)
+        out = np.zeros((len(x), width), x.dtype)
+        out[:, : x.shape[1]] = x
+        return out
+
+    def __call__(self, keep: Array, hidden: Array, column: int = 0) -> Array:
+        """[K, w]: the outputs."""
+        out = np.empty((len(keep), len(self.last[1]) // self._slots), hidden.dtype)
+        linear(out, keep, hidden, column, *self._table)
+        return out
+
+
+class Colors:
+    """The network of colours, for Gaussians of which nothing else depends on the eye."""
+
+    def __init__(self, network: Network, slots: int, features: int):
+        self._features, self._head = features, SlotHead(_viewing(network, features), slots)
+
+    def __call__(self, anchors: Array, eye: Array, keep: Array) -> Array:
+        """[K, 3] of the kept slots of anchors, as an eye at [3], world, sees them."""
+        x, _ = _seen_from(anchors, eye, self._features)
+        return NUMPY.sigmoid(self._head(keep, self._head.hidden(x)))
+
+
+def _viewing(network: Sequence[Layer], features: int) -> list[Layer]:
+    """The network with weights of 0 for the view direction if it does not take it."""
+    (weight, bias), *rest = network
+    return [(np.pad(weight, ((0, 0), (0, features + VIEW_DIM - weight.shape[1]))), bias), *rest]
+
+
+def _seen_from(anchors: Array, eye: Array, features: int) -> tuple[Array, Array]:
+    """(x, distance) of `inputs`."""
+    x, distance = np.empty((len(anchors), features + VIEW_DIM), anchors.dtype), np.empty(len(anchors), anchors.dtype)
+    inputs(x, distance, anchors, eye)
+    return x, distance
 
 
 def seen(opacity: Array, mask: Array, faintest: float) -> Array:

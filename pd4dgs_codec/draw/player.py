@@ -56,7 +56,7 @@ class Player:
         box = scene.info.box
         fields = (scene.global_deformation, scene.widths.global_heads), (scene.local_deformation, LOCAL_HEADS)
         self._global, self._local = (None if field is None else Field(field, box, heads) for field, heads in fields)
-        self._decoders = Decoders([scene.networks[name] for name in SCAFFOLD_NETWORKS])
+        self._decoders = Decoders([scene.networks[name] for name in SCAFFOLD_NETWORKS], scene.widths.feature)
         self._time: float | None = None
         self._moved = self._table  # at self._time
         if self._global is not None:
@@ -165,7 +165,7 @@ def _one_anchor(side: int = 16) -> Scene:
         scaling_log=np.full((1, *widths.attributes["scaling_log"]), -2, np.float32),
         offset=np.zeros((1, widths.slots, 3), np.float32),
         mask=(np.full(1, 255, np.uint8),) * 3,
-        networks={name: constant_network(widths.inputs, n, 0.5) for name, n in widths.networks.items()},
+        networks={name: constant_network(widths.inputs[name], n, 0.5) for name, n in widths.networks.items()},
         global_deformation=still("position", 3),
         local_deformation=still("mean", 3),
     )

@@ -188,13 +188,13 @@ class Scale:
 
 @dataclass(frozen=True)
 class Shape:
-    """Sizes of a layer's planes and networks. networks: by name the outputs of its linear layers. inputs: input width
-    of the networks of layer 0, 0 for a deformation, whose widths follow from the scales and the trunk. key: as in
+    """Sizes of a layer's planes and networks. networks: by name the outputs of its linear layers. inputs: by name the
+    input width of networks of layer 0; those of a deformation follow from the scales and the trunk. key: as in
     Deformation."""
 
     scales: tuple[Scale, ...] = ()
     networks: dict[str, tuple[int, ...]] | None = None
-    inputs: int = 0
+    inputs: dict[str, int] | None = None
     key: int | None = None
 
     @staticmethod
@@ -203,7 +203,7 @@ class Shape:
         scales = tuple(Scale(len(scale["xy"]), plane_sides(scale), ()) for scale in tensors.planes)
         names = [name for name in kind.network_ids if name in tensors.networks]
         networks = {name: tuple(len(bias) for _, bias in tensors.networks[name]) for name in names}
-        return Shape(scales, networks, 0 if kind.layer else widths.inputs, tensors.key)
+        return Shape(scales, networks, None if kind.layer else widths.inputs, tensors.key)
 
     @property
     def planes(self) -> list[PlaneShape]:
@@ -217,7 +217,7 @@ class Shape:
         networks = self.networks or {}
         for name, widths in networks.items():
             features = sum(scale.channels for scale in self.scales)
-            width = self.inputs or (features if name == TRUNK else networks[TRUNK][-1])
+            width = self.inputs[name] if self.inputs else features if name == TRUNK else networks[TRUNK][-1]
             for outputs in widths:
                 shapes += [(outputs, width), (outputs,)]
                 width = outputs
@@ -265,7 +265,7 @@ def unpack_parameters(
         if (key in fields) != expected:
             found, wanted = ("missing", "it") if expected else ("there", "no such key")
             raise Malformed(f"{where}: key {key} is {found}, expected {wanted}")
-    shape = Shape(scales, networks, 0 if kind.layer else widths.inputs, _unpack_key(fields, kind, networks, where))
+    shape = Shape(scales, networks, None if kind.layer else widths.inputs, _unpack_key(fields, kind, networks, where))
     cells = sum(map(math.prod, shape.planes))
     if cells > MAX_PLANE_CELLS:
         raise LimitExceeded(f"{where}: planes of {cells} cells, limit {MAX_PLANE_CELLS}")

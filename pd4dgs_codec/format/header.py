@@ -17,7 +17,7 @@ from pd4dgs_codec.format.container import SCENE_ID_SIZE
 from pd4dgs_codec.format.options import MODES
 from pd4dgs_codec.format.quantise import MAX_SYMBOL, Grid, is_step
 from pd4dgs_codec.format.registry import BY_CHUNK_TYPE, LAYER_KINDS, MAX_CHUNKS, MAX_PAYLOAD
-from pd4dgs_codec.scene import ATTRIBUTES, MAX_FEATURE, MAX_SLOTS, Camera, SceneInfo, Widths
+from pd4dgs_codec.scene import ATTRIBUTES, MAX_FEATURE, MAX_SLOTS, SCAFFOLD_NETWORKS, Camera, SceneInfo, Widths
 
 # Keys of the header map.
 CHUNKS, MODE = 1, 2
@@ -91,7 +91,7 @@ def pack_header(header: Header) -> bytes:
         }
     bounds = header.error_bounds
     fields[ERROR_BOUNDS] = {number: bounds[name] for name, number in TENSOR_CLASSES.items() if name in bounds}
-    fields |= {DIGEST: header.digest, WIDTHS: [grid.widths.feature, grid.widths.slots]}
+    fields |= {DIGEST: header.digest, WIDTHS: _pack_widths(grid.widths)}
     if grid.widths.graded:
         fields[CENTRE] = grid.centre.tolist()
     return canonical.pack(fields)
@@ -199,10 +199,17 @@ def layers_of(chunks: Iterable[tuple[int, int]]) -> list[int]:
     return [kind for kind, _ in chunks if kind in BY_CHUNK_TYPE]
 
 
+def _pack_widths(widths: Widths) -> list[int]:
+    return [widths.feature, widths.slots, sum(1 << SCAFFOLD_NETWORKS.index(name) for name in widths.viewing)]
+
+
 def _unpack_widths(header: Fields) -> Widths:
-    feature, slots = header.sequence(WIDTHS, 2)
+    feature, slots, bits = header.sequence(WIDTHS, 3)
     as_integer(feature, MAX_FEATURE, "header: feature width", low=1)
-    return Widths(feature, as_integer(slots, MAX_SLOTS, "header: slots", low=1), CENTRE in header)
+    as_integer(slots, MAX_SLOTS, "header: slots", low=1)
+    as_integer(bits, (1 << len(SCAFFOLD_NETWORKS)) - 1, "header: networks that take the view direction")
+    viewing = tuple(name for i, name in enumerate(SCAFFOLD_NETWORKS) if bits >> i & 1)
+    return Widths(feature, slots, CENTRE in header, viewing)
 
 
 def _unpack_centre(header: Fields, widths: Widths) -> np.ndarray:

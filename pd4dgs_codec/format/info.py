@@ -73,6 +73,7 @@ def info(data: bytes) -> dict[str, Any]:
         "voxel_size": header.info.voxel_size,
         "feature_width": header.grid.widths.feature,
         "slots": header.grid.widths.slots,
+        "view_dependent": list(header.grid.widths.viewing),
         "graded": header.grid.widths.graded,
         "steps": header.grid.steps,
         "error_bounds": header.error_bounds,

@@ -14,7 +14,7 @@ import numpy as np
 from pd4dgs_codec.entropy.bits import entropy_bits
 from pd4dgs_codec.format.planes import cells_read, fill_plane
 from pd4dgs_codec.format.registry import LAYER_KINDS
-from pd4dgs_codec.scene import PLANES, TRUNK, Deformation
+from pd4dgs_codec.scene import PLANES, TRUNK, VIEW_DIM, Deformation
 
 #: Nothing is left out of networks whose values may exceed this: 0 times infinity is not 0. Binary32 ends at 3.4e38.
 LARGEST = 1e30
@@ -65,8 +65,9 @@ class Omissions:
             found = {name: self._largest(layer, name, hidden) for name in self.tensors[layer].networks if name != TRUNK}
             moved |= found if layer == 1 else {}
             sizes += found.values()
-        inputs = np.concatenate([self.anchors.largest + moved.get("feature", 0.0), np.ones(3)])
-        sizes += [self._largest(0, name, inputs) for name in self.tensors[0].networks]
+        inputs = np.concatenate([self.anchors.largest + moved.get("feature", 0.0), np.ones(VIEW_DIM)])
+        networks = self.tensors[0].networks.items()
+        sizes += [self._largest(0, name, inputs[: network[0][0].shape[1]]) for name, network in networks]
         return all((size < LARGEST).all() for size in sizes)
 
     def _largest(self, layer: int, name: str, inputs: np.ndarray) -> np.ndarray:
@@ -111,10 +112,11 @@ class Omissions:
             self.unread |= stale
         if (unread & moved).any():
             self._zero_weights(1, "feature", -1, "rows", unread)
-        idle = np.concatenate([~self.anchors.nonzero & ~moved, np.zeros(3, bool)])
+        idle = np.concatenate([~self.anchors.nonzero & ~moved, np.zeros(VIEW_DIM, bool)])
         for name, network in scaffold.items():
-            if network[0][0][:, idle].any():
-                self._zero_weights(0, name, 0, "columns", idle)
+            own = idle[: network[0][0].shape[1]]
+            if network[0][0][:, own].any():
+                self._zero_weights(0, name, 0, "columns", own)
 
     def _zero_unread_channels(self, layer: int) -> None:
         """Zero plane channels that the trunk does not read, and weights of those whose product is 0."""

@@ -226,7 +226,7 @@ def _network(
         raise DataError(f"{path}: found {shapes}; expected two layers with {outputs} outputs")
     if not all(np.isfinite(part).all() for part in (b1, w1, b2, w2)):
         raise DataError(f"{path}: holds a NaN or an infinity; expected finite numbers")
-    inputs, usual = w1.shape[1], widths.inputs
+    inputs, usual = w1.shape[1], widths.inputs[name]
     taken = 0 if embedding is None or name != "color" else embedding.shape[1]
     if inputs != usual + taken:
         found = f"{inputs} inputs" if inputs != usual + taken + 1 else f"the distance as well ({inputs} inputs)"

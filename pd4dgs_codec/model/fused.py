@@ -21,6 +21,7 @@ from torch.autograd.function import once_differentiable
 from pd4dgs_codec.draw import gaussians as kernels
 from pd4dgs_codec.draw.gaussians import MIN_OPACITY, Decoders, Functions
 from pd4dgs_codec.model.networks import MLP
+from pd4dgs_codec.scene import SCALING_DIM
 
 TORCH = Functions(
     lambda x: torch.from_numpy(x).tanh().numpy(),
@@ -119,7 +120,8 @@ class _Grow(torch.autograd.Function):
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         used = [p if step is None else torch.div(p, step).round_().mul_(step) for p in parameters]
         layers = [(w.numpy(), b.numpy()) for w, b in zip(used[::2], used[1::2], strict=True)]
-        decoders = Decoders([layers[:2], layers[2:4], layers[4:]], TORCH)
+        features = anchors.shape[1] - 3 - 3 * len(layers[1][1]) - SCALING_DIM
+        decoders = Decoders([layers[:2], layers[2:4], layers[4:]], features, TORCH)
         look = decoders.look(anchors.numpy(), eye.numpy())
         keep = kernels.seen(look.opacity, mask.numpy(), MIN_OPACITY)
         made = decoders.make(anchors.numpy(), mask.numpy(), look, keep)

@@ -96,8 +96,10 @@ class Model(nn.Module):
 
     @property
     def widths(self) -> Widths:
-        """Feature width and slots, as its tensors have them."""
-        return Widths(self.feature.shape[1], self.offset.shape[1])
+        """Feature width, slots and what its networks take, as its tensors have them."""
+        features = self.feature.shape[1]
+        viewing = tuple(n for n in SCAFFOLD_NETWORKS if self.network(n).layers[0].in_features > features)
+        return Widths(features, self.offset.shape[1], viewing=viewing)
 
     @property
     def spacing(self) -> Tensor:
@@ -236,8 +238,8 @@ class Model(nn.Module):
 
 
 def fresh_networks(widths: Widths, hidden: int) -> dict[str, MLP]:
-    """The scaffold's decoders, untrained: input [feature, view direction 3]."""
-    networks = {name: MLP((widths.inputs, hidden, outputs)) for name, outputs in widths.networks.items()}
+    """The scaffold's decoders, untrained."""
+    networks = {name: MLP((widths.inputs[name], hidden, outputs)) for name, outputs in widths.networks.items()}
     with torch.no_grad():  # else chance decides what is ever seen
         networks["opacity"].layers[-1].bias.copy_(torch.linspace(*START_OPACITY, widths.slots))
     return networks

@@ -179,7 +179,7 @@ def grow(
         anchors, [3, anchors.shape[1] - 3 - 3 * slots - SCALING_DIM, 3 * slots, SCALING_DIM], dim=1
     )
     inputs = torch.cat([feature, F.normalize(position - eye, dim=1)], dim=1)
-    opacity, shape, color = (network(inputs, step) for network in networks)
+    opacity, shape, color = (network(inputs[:, : network.layers[0].in_features], step) for network in networks)
     opacity = torch.tanh(opacity)
     keep = (opacity.detach() * mask.detach()[:, None] >= MIN_OPACITY).flatten().nonzero()[:, 0]
     shape, color = (values.reshape(-1, values.shape[1] // slots).index_select(0, keep) for values in (shape, color))

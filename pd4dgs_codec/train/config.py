@@ -22,6 +22,9 @@ DEFAULT_ITERATIONS = {"tiny": 3_000, "small": 10_000, "paper": 15_000}
 #: times the cost.
 ROLLOUTS = ("adaptive", "uniform", "fixed", "top", "all")
 
+#: Which of the scaffold's networks take the view direction.
+VIEW_DEPENDENT = ("color", "covariance+color", "opacity+color", "opacity+covariance+color")
+
 #: Parts of the method that `--without` turns off, as the fields of `TrainConfig` that do so.
 ABLATIONS: dict[str, dict[str, Any]] = {
     "rate": {"rate_scale": 0.0, "plane_rate": 0.0},
@@ -120,6 +123,9 @@ class TrainConfig:
         32, help=f"numbers of an anchor's feature, 1 to {MAX_FEATURE}", metavar="N", least=1, most=MAX_FEATURE
     )
     slots: int = option(10, help=f"Gaussians of an anchor, 1 to {MAX_SLOTS}", metavar="N", least=1, most=MAX_SLOTS)
+    view_dependent: str = option(
+        "opacity+covariance+color", help="the networks of anchors that take the view direction", choices=VIEW_DEPENDENT
+    )
     downscale: int = option(1)
     holdout: int = option(8)
     #: None: the preset's default, or by the clock if there is a time limit
@@ -197,7 +203,7 @@ class TrainConfig:
     @property
     def widths(self) -> Widths:
         """Of a fresh model's anchors."""
-        return Widths(self.feature_width, self.slots)
+        return Widths(self.feature_width, self.slots, viewing=tuple(self.view_dependent.split("+")))
 
     def model_steps(self, steps: Steps) -> Steps:
         """The steps of a fresh model whose preset has the given ones."""

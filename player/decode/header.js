@@ -9,7 +9,8 @@ import { unpack } from "./msgpack.js";
 
 /** @typedef {{type: number, length: number}} ListedChunk */
 
-/** D, scalars of a feature, and G, Gaussians of an anchor. @typedef {{feature: number, slots: number}} Widths */
+/** D, scalars of a feature, G, Gaussians of an anchor, and V, bit i: network i of layer 0 takes the view direction.
+ * @typedef {{feature: number, slots: number, views: number}} Widths */
 
 /**
  * @typedef {object} Header
@@ -23,7 +24,7 @@ import { unpack } from "./msgpack.js";
  * @property {string} sceneId hexadecimal (3.3)
  */
 
-/** The channels of an anchor (11.2). @param {Widths} widths */
+/** The channels of an anchor (11.2). @param {Pick<Widths, "feature" | "slots">} widths */
 export const channelCount = ({ feature, slots }) => feature + 6 + 3 * slots;
 
 /** How many layer types there are: 0, 1 and 2. */
@@ -37,6 +38,7 @@ const CLASSES = [0, 1, 2, 3, 4, 5, 6, 7];
 const REQUIRED_CLASSES = 4;
 const DIGEST_SIZE = 16;
 const MAX_CAMERA_SIDE = 65535;
+const MAX_VIEWS = 7;
 
 /**
  * @param {Uint8Array} bytes
@@ -65,10 +67,11 @@ export function readHeader(bytes) {
   const camera = fields.has(12) ? readCamera(fields.get(12)) : null;
   const bounds = readBounds(fields.get(13));
   asBytes(fields.get(14), DIGEST_SIZE, "header: digest"); // of all layers, so that a decoder of some cannot check it
-  const [width, count] = asList(fields.get(15), "header: widths", 2);
+  const [width, count, views] = asList(fields.get(15), "header: widths", 3);
   const widths = {
     feature: asInteger(width, 1, MAX_FEATURE, "header: feature width"),
     slots: asInteger(count, 1, MAX_SLOTS, "header: slots"),
+    views: asInteger(views, 0, MAX_VIEWS, "header: networks that take the view direction"),
   };
   const centres = fields.has(16) ? readCentres(fields.get(16), channelCount(widths)) : null;
   const layers = chunks.filter(({ type }) => type < LAYER_TYPES).map(({ type }) => type);

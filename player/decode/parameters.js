@@ -26,7 +26,7 @@ import { PLANES } from "./scene.js";
  * @typedef {object} LayerKind
  * @property {number} layer
  * @property {[string, number | null][]} networks name and outputs by id; null: any number of outputs
- * @property {number} inputs of layer 0's networks: feature and view direction
+ * @property {number[]} inputs by id, of layer 0's networks
  * @property {number[]} classes of the error bounds of its steps, in their order (5.4)
  * @property {import("./header.js").Widths} widths
  * @property {boolean} stepClasses whether anchors have step classes (11.2)
@@ -34,13 +34,14 @@ import { PLANES } from "./scene.js";
 
 /** @param {number} layer @param {import("./header.js").Header} header @returns {LayerKind} */
 export function layerKind(layer, { widths, centres }) {
-  const { feature: D, slots: G } = widths;
+  const { feature: D, slots: G, views } = widths;
   /** @type {[string, number | null][]} */
   const networks = [["trunk", null]];
   if (layer === 0) networks.splice(0, 1, ["opacity", G], ["covariance", 7 * G], ["color", 3 * G]);
   else for (const { name, outputs } of layer === 1 ? globalHeads(widths) : LOCAL_HEADS) networks.push([name, outputs]);
   const classes = layer ? [2 + 2 * layer, 3 + 2 * layer] : [3];
-  return { layer, networks, inputs: D + 3, classes, widths, stepClasses: centres !== null };
+  const inputs = [0, 1, 2].map((id) => D + (views & (1 << id) ? 3 : 0));
+  return { layer, networks, inputs, classes, widths, stepClasses: centres !== null };
 }
 
 /** Sections of mode ans by number (6.4). */
@@ -185,7 +186,7 @@ function readNetworks(fields, kind, where, scales) {
   const rows = asList(fields.get(5), `${where}: networks`);
   if (!rows.length) throw malformed(`${where}: an empty list of networks`);
   if (deformation && !scales.length) throw malformed(`${where}: a deformation without planes`);
-  let inputs = deformation ? scales.reduce((sum, planes) => sum + planes[0].channels, 0) : kind.inputs;
+  let inputs = scales.reduce((sum, planes) => sum + planes[0].channels, 0);
   let last = -1;
   const networks = rows.map((row) => {
     const [id, ...widths] = asList(row, `${where}: a network`);
@@ -195,7 +196,7 @@ function readNetworks(fields, kind, where, scales) {
     if (deformation && last < 0 && number > 0) throw malformed(`${where}: no trunk, expected one`);
     last = number;
     asInteger(widths.length, 1, MAX_LINEAR_LAYERS, `${where}: linear layers of ${name}`);
-    let width = inputs;
+    let width = deformation ? inputs : kind.inputs[number];
     const layers = widths.map((value) => {
       const layer = { inputs: width, outputs: asInteger(value, 1, MAX_WIDTH, `${where}: width of ${name}`) };
       width = layer.outputs;

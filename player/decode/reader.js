@@ -215,6 +215,7 @@ export class LayerReader {
     const { voxels, anchor, ...attributes } = gathered(owns);
     return {
       info: header.info,
+      widths: header.widths,
       steps,
       layers: layers.map(({ layer }) => layer),
       rows: layers.map(({ earlier }, i) => earlier.length + owns[i].codes.length),

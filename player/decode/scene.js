@@ -64,6 +64,7 @@
  *
  * @typedef {object} Scene
  * @property {Info} info
+ * @property {import("./header.js").Widths} widths
  * @property {Steps} steps
  * @property {number[]} layers numbers of the layers that are there, ascending, 0 first
  * @property {number[]} rows rows[i]: number of anchors in the prefix that ends with layers[i]
@@ -73,7 +74,8 @@
  * @property {Float32Array} scalingLog [N, 6]
  * @property {Float32Array} offset [N, G, 3]
  * @property {Uint8Array[]} mask per layer the codes of its rows[i] rows: the gate times 255; 0 is inactive
- * @property {{opacity: Network, covariance: Network, color: Network}} networks
+ * @property {{opacity: Network, covariance: Network, color: Network}} networks of D inputs, the feature, or of D + 3, the
+ * view direction behind it
  * @property {Deformation | null} globalDeformation of layer 1; null where it has none or is not there
  * @property {Deformation | null} localDeformation of layer 2, likewise
  */

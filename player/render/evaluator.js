@@ -48,10 +48,12 @@ class Scaffold {
     this.features = columns(first, 0, features);
     this.firstBlock = firstBlock;
     this.blocks = blocksOf(first.outputs);
-    const direction = columns(first, features, 3);
+    /** Inputs that are the view direction: 3 or 0. */
+    this.views = first.inputs - features;
+    const { weight } = columns(first, features, this.views);
     const data = new Float32Array(12 * this.blocks);
     for (let o = 0; o < first.outputs; o++) {
-      for (let k = 0; k < 3; k++) data[((o >> 2) * 3 + k) * 4 + (o & 3)] = direction.weight[3 * o + k];
+      for (let k = 0; k < this.views; k++) data[((o >> 2) * 3 + k) * 4 + (o & 3)] = weight[3 * o + k];
     }
     this._gl = gpu.gl;
     this._direction = gpu.uniforms(data);
@@ -69,16 +71,15 @@ class Scaffold {
 
   /** Source that declares the weights of the direction. @param {number} index of the uniform block */
   declare(index) {
-    return `layout(std140) uniform U${index} { vec4 v${index}[${3 * this.blocks}]; };\n`;
+    return this.views ? `layout(std140) uniform U${index} { vec4 v${index}[${3 * this.blocks}]; };\n` : "";
   }
 
   /** Source of the hidden activations at anchor p, seen in direction d. @param {number} index @param {string} to */
   compute(index, to) {
-    return repeat(
-      this.blocks,
-      (k) => `vec4 ${to}${k} = max(texelFetch(before, ivec3(p, ${this.firstBlock + k}), 0)
-  + v${index}[${3 * k}] * d.x + v${index}[${3 * k + 1}] * d.y + v${index}[${3 * k + 2}] * d.z, 0.);`,
-    );
+    return repeat(this.blocks, (k) => {
+      const terms = [..."xyz"].slice(0, this.views).map((axis, i) => ` + v${index}[${3 * k + i}] * d.${axis}`);
+      return `vec4 ${to}${k} = max(texelFetch(before, ivec3(p, ${this.firstBlock + k}), 0)${terms.join("")}, 0.);`;
+    });
   }
 }
 

@@ -28,14 +28,7 @@ export function levelOf(scene, level) {
 }
 
 /** The widths of a scene's arrays. @param {Scene} scene */
-export function widthsOf(scene) {
-  const anchors = scene.anchor.length / 3;
-  return {
-    anchors,
-    feature: scene.networks.opacity[0].inputs - 3,
-    slots: scene.networks.opacity[scene.networks.opacity.length - 1].outputs,
-  };
-}
+export const widthsOf = ({ anchor, widths }) => ({ anchors: anchor.length / 3, ...widths });
 
 /**
  * The unit of the heads position, mean and scale: a quarter of the longest side of the box, scene units.

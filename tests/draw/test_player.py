@@ -44,8 +44,17 @@ def _scene(**changes: object) -> Scene:
 
 @pytest.mark.parametrize(
     "changes",
-    [{}, {"hidden": (16, 8)}, {"channels": 5, "width": 7}, {"widths": Widths(16, 4)}, {"widths": Widths(3, 13)}, KEYED],
-    ids=["usual", "deep", "odd", "narrow", "odd widths", "key instant"],
+    [
+        {},
+        {"hidden": (16, 8)},
+        {"channels": 5, "width": 7},
+        {"widths": Widths(16, 4)},
+        {"widths": Widths(3, 13)},
+        {"widths": Widths(viewing=("color",))},
+        {"widths": Widths(viewing=("covariance",)), "hidden": (16,)},
+        KEYED,
+    ],
+    ids=["usual", "deep", "odd", "narrow", "odd widths", "views of color", "views of covariance", "key instant"],
 )
 def test_pictures_are_those_of_the_torch_model(changes):
     scene = _scene(**changes)

@@ -66,9 +66,9 @@ def dead_scene(widths: Widths = DEFAULT_WIDTHS) -> Scene:
     )
 
 
-@pytest.mark.parametrize("graded", [False, True])
-def test_the_planned_scene_is_rounded_to_the_planned_symbols(graded):
-    planned = make_plan(dead_scene(replace(DEFAULT_WIDTHS, graded=graded)), EncodeOptions(layers=2))
+@pytest.mark.parametrize("widths", [Widths(), Widths(graded=True), Widths(viewing=("color",))])
+def test_the_planned_scene_is_rounded_to_the_planned_symbols(widths):
+    planned = make_plan(dead_scene(widths), EncodeOptions(layers=2))
     assert len(planned.left_out) > 8
     assert_same_scene(planned.symbols.scene(), rounded(planned.scene))
 

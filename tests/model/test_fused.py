@@ -74,7 +74,10 @@ def test_it_is_so_with_step_classes(rounding):
     check(stir(model, 0.3), 2, rounding)
 
 
-@pytest.mark.parametrize("widths", [Widths(16, 4), Widths(1, 1), Widths(5, 13)])
+BLIND = Widths(viewing=("color",))
+
+
+@pytest.mark.parametrize("widths", [Widths(16, 4), Widths(1, 1), Widths(5, 13), BLIND])
 def test_it_is_so_at_other_widths(widths):
     gaussians = check(stir(small_model(widths=widths, anchors=300, opacity=0.0), 0.3), 2)
     assert 0 < len(gaussians.slots) < widths.slots * len(gaussians.anchors)

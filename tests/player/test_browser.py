@@ -130,7 +130,8 @@ def lively_scene(
         offset=rng.normal(0, 0.6, (anchors, widths.slots, 3)).astype(np.float32),
         mask=tuple(codes.T[list(layers)].copy()),
         networks={
-            name: _network(rng, widths.inputs, *hidden, width, scale=0.4) for name, width in widths.networks.items()
+            name: _network(rng, widths.inputs[name], *hidden, width, scale=0.4)
+            for name, width in widths.networks.items()
         },
         global_deformation=fields[0] if 1 in layers else None,
         local_deformation=fields[1] if 2 in layers else None,
@@ -240,6 +241,8 @@ SHAPES: dict[str, dict[str, Any]] = {
     "16 and 4": dict(widths=Widths(16, 4)),
     "most": dict(widths=Widths(64, 16), hidden=(7,)),
     "least": dict(widths=Widths(1, 1), anchors=700, seed=6),
+    "views of color": dict(widths=Widths(viewing=("color",))),
+    "views of opacity": dict(widths=Widths(5, 4, viewing=("opacity",))),
 }
 
 

@@ -31,7 +31,7 @@ from vectors.blocks import (
 from pd4dgs_codec.entropy.priors import Const, Hist, Mixture, Normal, Prior, Window
 from pd4dgs_codec.errors import DecodeError
 from pd4dgs_codec.format.info import hashes
-from pd4dgs_codec.scene import Widths
+from pd4dgs_codec.scene import SCAFFOLD_NETWORKS, Widths
 
 VECTORS = Path(__file__).resolve().parents[2] / "spec" / "vectors"
 LARGEST_SEED = 6000  #: bytes of a vector: larger ones decode slowly
@@ -66,7 +66,8 @@ def decodes(data: bytes) -> bool:
 
 def legal(rng: random.Random) -> File:
     """A file of random layers, slices, widths, forms and priors."""
-    widths = Widths(rng.choice((1, 2, 7, 32)), rng.choice((1, 2, 10)))
+    viewing = tuple(name for name in SCAFFOLD_NETWORKS if rng.random() < 0.5)
+    widths = Widths(rng.choice((1, 2, 7, 32)), rng.choice((1, 2, 10)), viewing=viewing)
     graded, layers, before = rng.random() < 0.4, list[Layer](), 0
     for number in sorted({0, *rng.sample((1, 2), rng.randrange(3))}):
         own = list(_layer(rng, number, before, widths, graded))

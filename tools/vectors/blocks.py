@@ -54,7 +54,7 @@ HEADER: dict[int, Any] = {
     11: 1.5,
     # of all classes: a file may declare bounds for tensors that it does not have
     13: dict(enumerate([0.03125, 0.015625, 0.0625, 2.0**-8, 0.25, 2.0**-9, 0.5, 2.0**-10])),
-    15: [32, 10],
+    15: [32, 10, 7],
 }
 CAMERA: dict[int, Any] = {
     1: [1.0, 0.0, 0.0, 0.25, 0.0, 0.0, -1.0, 0.5, 0.0, 1.0, 0.0, 4.0],
@@ -444,11 +444,11 @@ def constant(value: int) -> Callable[[str, tuple[int, ...]], np.ndarray]:
     return lambda name, shape: np.full(shape, value, np.int32)
 
 
-def constant_networks(widths: Mapping[int, Sequence[int]], inputs: int, of_trunk: bool) -> dict[int, list[np.ndarray]]:
-    """id -> weight, bias, weight, ..; each of one symbol of its own. widths: id -> outputs."""
+def constant_networks(widths: Mapping[int, Sequence[int]], inputs: Mapping[int, int]) -> dict[int, list[np.ndarray]]:
+    """id -> weight, bias, weight, ..; each of one symbol of its own. widths: id -> outputs. inputs: id -> inputs."""
     networks, symbol = {}, 2
     for number, outputs in widths.items():
-        wide, layers = widths[0][-1] if of_trunk and number else inputs, list[np.ndarray]()
+        wide, layers = inputs[number], list[np.ndarray]()
         for out in outputs:
             layers += [np.full((out, wide), symbol, np.int32), np.full(out, symbol - 5, np.int32)]
             wide, symbol = out, symbol + 1
@@ -492,8 +492,10 @@ def make_layer(
         least = {0: (widths.slots,), 1: (7 * widths.slots,), 2: (3 * widths.slots,)} if number == 0 else {}
         networks = {0: (3,), 1: (3,)} if scales else least
     if not any(isinstance(x, np.ndarray) for own in networks.values() for x in own):
-        inputs = widths.feature + 3 if number == 0 else sum(s.channels for s in scales)
-        networks = constant_networks(networks, inputs, number > 0)  # type: ignore[arg-type]
+        inputs = dict(enumerate(widths.inputs.values()))
+        if number:
+            inputs = {i: networks[0][-1] if i else sum(s.channels for s in scales) for i in networks}  # type: ignore[misc]
+        networks = constant_networks(networks, inputs)  # type: ignore[arg-type]
     planes = [plane for scale in scales for plane in scale.planes()]
     predictors = [p for s in scales for p in s.predictors]
     meta: dict[int, Any] = {1: n}
@@ -680,8 +682,9 @@ def make_file(*layers: Layer, header: Mapping[int, Any] | None = None) -> File:
         flags = [i << 6 | 2 * (i + 1 < len(own)) for i in range(len(own))]
         chunks += [Chunk(number, x.payload(), f, x) for f, x in zip(flags, own, strict=True)]
     widths = layers[0].widths
+    views = sum(1 << i for i, inputs in enumerate(widths.inputs.values()) if inputs > widths.feature)
     centres = {16: [i % 5 - 2 for i in range(widths.channels)]} if widths.graded else {}
-    return File(tuple(chunks)).with_header({15: [widths.feature, widths.slots], **centres, **(header or {})})
+    return File(tuple(chunks)).with_header({15: [widths.feature, widths.slots, views], **centres, **(header or {})})
 
 
 def _hashes(slices: list[Layer], header: Mapping[int, Any]) -> dict[str, Any]:
