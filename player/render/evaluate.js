@@ -147,12 +147,14 @@ class Field {
   }
 
   /**
-   * Adds the residuals to records, whose first three columns are their points.
+   * Adds F(x, t) to records.
    *
    * @param {Float32Array} records @param {number} first @param {number} rows at most BATCH @param {number} stride
+   * @param {Float32Array} [points] x, [rows, 3]; default: the first three columns of the records
    */
-  deform(records, first, rows, stride) {
-    this._sample(records, first * stride, rows, stride);
+  deform(records, first, rows, stride, points) {
+    if (points) this._sample(points, 0, rows, 3);
+    else this._sample(records, first * stride, rows, stride);
     this._trunk.run(rows, this._features, this._width);
     const { floats } = this._arena;
     for (const { chain, columns, unit, head } of this._heads) {
@@ -166,15 +168,15 @@ class Field {
     }
   }
 
-  /** @param {Float32Array} records @param {number} at @param {number} rows @param {number} stride */
-  _sample(records, at, rows, stride) {
+  /** @param {Float32Array} points @param {number} at @param {number} rows @param {number} stride */
+  _sample(points, at, rows, stride) {
     const { floats } = this._arena;
     const C = this._channels;
     const u = new Float64Array(3);
     const [low, high] = this._box;
     for (let r = 0, to = this._features; r < rows; r++, at += stride) {
       for (let k = 0; k < 3; k++) {
-        const x = records[at + k];
+        const x = points[at + k];
         u[k] = !(x > low[k]) ? 0 : x >= high[k] ? 1 : (x - low[k]) / (high[k] - low[k]);
       }
       for (let s = 0; s < this._spatial.length; s++) {
@@ -227,6 +229,9 @@ class Evaluator {
     this._inputs = arena.take(BATCH * this._stride);
     this._anchorStride = anchorColumns(this._widths);
     this._anchors = new Float32Array(BATCH * this._anchorStride);
+    this._points = new Float32Array(BATCH * 3);
+    /** The scene with what the global deformation adds to. @type {Scene | null} */
+    this._rest = null;
     this._offsetAt = this._anchorStride - 4 * this._widths.slots;
   }
 
@@ -234,13 +239,14 @@ class Evaluator {
   evaluate(level, t, eye) {
     const { rows, codes, global, local } = levelOf(this.scene, level);
     const moved = global && this._global;
+    const source = moved ? (this._rest ??= this._withoutStill(moved)) : this.scene;
     moved?.setTime(t);
     const kept = new Records(rows);
     const anchors = new Uint32Array(BATCH);
     for (let a = 0; a < rows; ) {
       let count = 0;
       for (; a < rows && count < BATCH; a++) if (codes[a]) anchors[count++] = a;
-      this._keep(moved, anchors.subarray(0, count), codes, eye, kept);
+      this._keep(source, moved, anchors.subarray(0, count), codes, eye, kept);
     }
     if (local && this._local) {
       this._local.setTime(t);
@@ -251,24 +257,51 @@ class Evaluator {
     return kept.gated(codes, this._widths.slots);
   }
 
+  /** The scene; with a key instant t*, its attributes without F(x, t*). @param {Field} field @returns {Scene} */
+  _withoutStill(field) {
+    const { scene, _anchors: records, _anchorStride: wide } = this;
+    const key = scene.globalDeformation?.key ?? null;
+    if (key === null) return scene;
+    const attributes = [scene.anchor, scene.feature, scene.offset, scene.scalingLog];
+    const [anchor, feature, offset, scalingLog] = attributes.map((values) => values.slice());
+    const rest = { ...scene, anchor, feature, offset, scalingLog };
+    field.setTime(key);
+    for (let first = 0; 3 * first < anchor.length; first += BATCH) {
+      const points = scene.anchor.subarray(3 * first, 3 * (first + BATCH));
+      records.fill(0);
+      field.deform(records, 0, points.length / 3, wide, points);
+      eachAttribute(rest, (values, width, columns) => {
+        for (let r = 0; 3 * r < points.length; r++) {
+          const to = width * (first + r);
+          for (let k = 0; k < width; k++) values[to + k] -= records[r * wide + columns[k]];
+        }
+      });
+    }
+    return rest;
+  }
+
   /**
    * Steps 1 to 4 for at most BATCH anchors: their visible Gaussians.
    *
-   * @param {Field | null} moved the global deformation, at its time @param {Uint32Array} anchors
-   * @param {Uint8Array} codes @param {number[]} eye @param {Records} kept takes them
+   * @param {Scene} source of the attributes @param {Field | null} moved the global deformation, at its time
+   * @param {Uint32Array} anchors @param {Uint8Array} codes @param {number[]} eye @param {Records} kept takes them
    */
-  _keep(moved, anchors, codes, eye, kept) {
+  _keep(source, moved, anchors, codes, eye, kept) {
     const { floats } = this.arena;
     const { feature: F, slots: S } = this._widths;
-    const { _anchors: records, _anchorStride: wide, _inputs: inputs, _stride: stride } = this;
+    const { _anchors: records, _anchorStride: wide, _points: points, _inputs: inputs, _stride: stride } = this;
     const count = anchors.length;
-    eachAttribute(this.scene, (values, width, columns) => {
+    eachAttribute(source, (values, width, columns) => {
       for (let r = 0; r < count; r++) {
         const from = width * anchors[r];
         for (let k = 0; k < width; k++) records[r * wide + columns[k]] = values[from + k];
       }
     });
-    moved?.deform(records, 0, count, wide);
+    if (moved) {
+      const { anchor } = this.scene; // the field is sampled at stored positions, which `records` may not have
+      for (let r = 0; r < count; r++) for (let k = 0; k < 3; k++) points[3 * r + k] = anchor[3 * anchors[r] + k];
+      moved.deform(records, 0, count, wide, points);
+    }
     for (let r = 0; r < count; r++) {
       const from = r * wide;
       const at = inputs + r * stride;

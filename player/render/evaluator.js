@@ -140,7 +140,9 @@ export class GpuEvaluator {
     this._scaffolds = [this._opacity, this._covariance, this._color];
     this._first = new Linear(gpu, stack(this._scaffolds.map((scaffold) => scaffold.features)));
     if (this._first.paddedBlocks > gpu.maxLayers) throw new TooLarge("the networks' first layers");
-    const blocks = this._blocks * (scene.globalDeformation ? 2 : 1) + this._first.paddedBlocks + blocksOf(slots);
+    const key = scene.globalDeformation?.key ?? null;
+    const tables = scene.globalDeformation ? (key === null ? 2 : 3) : 1;
+    const blocks = this._blocks * tables + this._first.paddedBlocks + blocksOf(slots);
     if (16 * this._width * this._height * blocks > MAX_BYTES) throw new TooLarge(`${anchors} anchors`);
     this._anchors = gpu.field(this._width, this._height, this._blocks, this._attributes());
     this._before = gpu.field(this._width, this._height, this._first.paddedBlocks);
@@ -151,6 +153,8 @@ export class GpuEvaluator {
     const { global, local } = levelOf(scene, 2);
     this._global = global && new FieldPass(gpu, global, scene, globalHeads(widths), 4 * this._blocks);
     this._residual = this._global && gpu.field(this._width, this._height, this._global.outputBlocks);
+    /** Records to which residuals are added. @type {Field} */
+    this._rest = this._residual && key !== null ? this._withoutStill(key, this._residual) : this._anchors;
     this._local = local && new FieldPass(gpu, local, scene, LOCAL_HEADS, GAUSSIAN_COLUMNS);
 
     /** @type {WebGLTexture | null} */
@@ -184,6 +188,25 @@ export class GpuEvaluator {
       });
     });
     return out;
+  }
+
+  /** The anchors' records without F(x, t*). @param {number} key t* @param {Field} residual */
+  _withoutStill(key, residual) {
+    const gpu = this._gpu;
+    const rest = gpu.field(this._width, this._height, this._blocks);
+    this._global?.run(key, this._anchors, this._height, residual);
+    const program = gpu.program(`${targets(1)}uniform sampler2DArray anchors, residual;
+uniform int block;
+void main() {
+  ivec3 p = ivec3(gl_FragCoord.xy, block);
+  out0 = texelFetch(anchors, p, 0) - texelFetch(residual, p, 0);
+}`);
+    gpu.use(program, { anchors: this._anchors, residual });
+    for (let block = 0; block < this._blocks; block++) {
+      gpu.gl.uniform1i(program.uniform("block"), block);
+      gpu.cover(rest, block, 1, 0, this._height);
+    }
+    return rest;
   }
 
   /** Last layers of shape and colour, one chunk per slot: (v 0..2, 0), v 3..6, (w, 0). */
@@ -283,7 +306,7 @@ ${repeat(linear.chunkBlocks, (i) => `out${i} = y${i};`)}}`,
 
   /** @param {Field | null} residual @returns {Record<string, Field>} */
   _anchorTextures(residual) {
-    return residual ? { anchors: this._anchors, residual } : { anchors: this._anchors };
+    return residual ? { anchors: this._rest, residual } : { anchors: this._anchors };
   }
 
   /** @param {Field | null} residual @param {number[]} eye @param {number} lines */
@@ -443,7 +466,7 @@ ${changes ? localSource() : ""}
 
   free() {
     this._gpu.free(this._anchors, this._before, this._opacities, this._residual, this._codes);
-    this._gpu.free(this._list, this._means, this._changes);
+    this._gpu.free(this._list, this._means, this._changes, this._rest);
     for (const scaffold of this._scaffolds) scaffold.free();
     this._gpu.gl.deleteBuffer(this._shapes.buffer);
     this._global?.free();

@@ -71,6 +71,24 @@ test("both evaluate a scene alike, at every level", () => {
   }
 });
 
+for (const [name, key] of /** @type {[string, number][]} */ ([["least", 0], ["largest", 1]])) {
+  test(`layer 1 changes nothing at its key instant, the ${name}`, () => {
+    const file = decode(readFileSync(new URL(`../../spec/vectors/uncommon/key-instant-${name}.pd4`, import.meta.url)));
+    const rows = file.rows.map(() => file.anchor.length / 3); // the levels have the same anchors
+    const scene = { ...file, rows, mask: rows.map((count) => new Uint8Array(count).fill(255)) };
+    for (const { data } of scene.globalDeformation?.planes.flatMap((planes) => Object.values(planes)) ?? []) {
+      data.set(numbers(data.length).map((v) => 1 + v)); // and layer 1 moves them
+    }
+    scene.globalDeformation?.networks.trunk[0].bias.fill(1);
+    const [still, same, other] = [[0, 0.4], [1, key], [1, 0.4]].map(([level, t]) => {
+      return evaluate(scene, level, t, [0, 0, -3]).records;
+    });
+    assert.ok(still.length > 0);
+    assert.ok(farthest(same, still) < 1e-6);
+    assert.ok(farthest(other, still) > 1e-3);
+  });
+}
+
 test("Gaussians are sorted back to front; of equal depths the later ones come first", () => {
   const means = numbers(2000).map((v, i) => (i % 4 === 2 ? Math.round(10 * v) / 10 : v));
   const order = [...new DepthSort().sort(means, [0, 0, 1, 0.5], 0.1)];

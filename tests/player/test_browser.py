@@ -69,7 +69,7 @@ def _network(rng: np.random.Generator, *widths: int, scale: float) -> Network:
 
 
 def _deformation(
-    rng: np.random.Generator, heads: dict[str, int], channels: int, scales: int, trunk: tuple[int, ...]
+    rng: np.random.Generator, heads: dict[str, int], channels: int, scales: int, trunk: tuple[int, ...], key: int | None
 ) -> Deformation | None:
     if not heads:
         return None
@@ -83,7 +83,7 @@ def _deformation(
     )
     networks = {"trunk": _network(rng, scales * channels, *trunk, scale=0.3)}
     networks |= {name: _network(rng, trunk[-1], width, scale=0.05) for name, width in heads.items()}
-    return Deformation(planes, networks)
+    return Deformation(planes, networks, key)
 
 
 def lively_scene(
@@ -97,6 +97,7 @@ def lively_scene(
     heads: tuple[dict[str, int], dict[str, int]] | None = None,
     layers: tuple[int, ...] = (0, 1, 2),
     widths: Widths = scene_module.DEFAULT_WIDTHS,
+    key: int | None = None,
 ) -> Scene:
     """Layers that differ, some thousand Gaussians of all shapes in front of the scene's camera."""
     rng = np.random.default_rng(seed)
@@ -108,7 +109,8 @@ def lively_scene(
     codes = np.sort(rng.choice(np.array([0, 60, 180, 255], np.uint8), (anchors, 3)), axis=1)
     codes[: anchors // 2] = [140, 200, 255]
     named = heads or (widths.global_heads, scene_module.LOCAL_HEADS)
-    fields = [_deformation(rng, names, channels, scales, trunk) for names in named]
+    keys = (key, None)
+    fields = [_deformation(rng, names, channels, scales, trunk, k) for names, k in zip(named, keys, strict=True)]
     return Scene(
         info=SceneInfo(
             voxel_size=float(np.float32(1 / 40)),
@@ -239,6 +241,7 @@ SHAPES: dict[str, dict[str, Any]] = {
     "global only": dict(hidden=(4,), channels=3, heads=({"feature": 32}, {})),
     "no layer 1": dict(layers=(0, 2), heads=({}, {"quat": 4, "color": 3})),
     "16 and 4": dict(widths=Widths(16, 4)),
+    "key instant": dict(key=26_214),
     "most": dict(widths=Widths(64, 16), hidden=(7,)),
     "least": dict(widths=Widths(1, 1), anchors=700, seed=6),
     "views of color": dict(widths=Widths(viewing=("color",))),
@@ -262,8 +265,8 @@ def test_both_evaluators_agree(harness, folder, server, options):
 
 @pytest.fixture(scope="module")
 def narrow() -> bytes:
-    """Features of 16 numbers, and four Gaussians an anchor."""
-    return encode(lively_scene(700, widths=Widths(16, 4)), layers=2, effort=1)
+    """Features of 16 numbers, four Gaussians an anchor, and a key instant."""
+    return encode(lively_scene(700, widths=Widths(16, 4), key=20_000), layers=2, effort=1)
 
 
 @pytest.mark.parametrize("evaluator", ["gpu", "cpu"])
