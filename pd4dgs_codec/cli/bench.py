@@ -54,7 +54,7 @@ def _frames(args: argparse.Namespace, info: SceneInfo) -> list[Frame]:
 
     if args.data is None:
         return own_frames(info, args.views, downscale=args.downscale)
-    dataset = common.read_dataset(args.data, args)
+    dataset = common.read_dataset(args.data, args, info)
     views = dataset.test or dataset.train
     count = min(args.views, len(views))
     return dataset_frames([views[(2 * i + 1) * len(views) // (2 * count)] for i in range(count)])

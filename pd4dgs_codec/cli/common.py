@@ -22,7 +22,7 @@ from pd4dgs_codec.threads import configure
 
 if TYPE_CHECKING:
     from pd4dgs_codec.data.view import Dataset
-    from pd4dgs_codec.scene import Scene
+    from pd4dgs_codec.scene import Scene, SceneInfo
 
 #: A last garbage collection at exit took a quarter of the time of a cold start's first picture.
 atexit.register(gc.freeze)
@@ -159,11 +159,11 @@ def write_checkpoint(path: str, scene: Scene, overwrite: bool) -> None:
     checkpoint.save(path, model)
 
 
-def read_dataset(source: str, args: argparse.Namespace) -> Dataset:
-    """The dataset `source`, read with the options of `add_reading`."""
+def read_dataset(source: str, args: argparse.Namespace, info: SceneInfo) -> Dataset:
+    """The dataset `source`, read with the options of `add_reading`, to compare with a scene over its background."""
     from pd4dgs_codec.interchange.teacher import load_source
 
-    return load_source(source, downscale=args.downscale, holdout=args.holdout)
+    return load_source(source, downscale=args.downscale, holdout=args.holdout, background=info.background)
 
 
 def check_output(path: str, overwrite: bool) -> None:

@@ -16,7 +16,7 @@ from pd4dgs_codec.quality import ENCODE_MIN_DB_PER_MEGABYTE
 if TYPE_CHECKING:
     from pd4dgs_codec.format.metadata import Metadata
     from pd4dgs_codec.quality.packing import Packed, Views
-    from pd4dgs_codec.scene import Scene
+    from pd4dgs_codec.scene import Scene, SceneInfo
 
 DETAILS = f"""\
 A .pd4 file holds layer 0 (static scene), layer 1 (global motion) and layer 2 (local motion) in this order; every prefix
@@ -98,7 +98,7 @@ def _encode(args: argparse.Namespace, console: Console) -> int:
         scene,
         chosen,
         target_sizes=args.target_size,
-        views=_views(args, console),
+        views=_views(args, scene.info, console),
         min_gain=ENCODE_MIN_DB_PER_MEGABYTE if args.min_gain is None else args.min_gain,
         downscale=args.downscale,
         metadata=metadata,
@@ -142,12 +142,12 @@ def _metadata(args: argparse.Namespace, had: Metadata | None) -> Metadata | None
     return replace(had or Metadata(), **given)
 
 
-def _views(args: argparse.Namespace, console: Console) -> Views | None:
+def _views(args: argparse.Namespace, info: SceneInfo, console: Console) -> Views | None:
     if args.data is None:
         return None
     from pd4dgs_codec.quality.packing import Views
 
-    dataset = common.read_dataset(args.data, args)
+    dataset = common.read_dataset(args.data, args, info)
     views = Views.of(dataset, args.data, args.views)
     console.detail(f"{args.data}: {len(views.fitting)} training views, {len(views.held_out)} held out")
     if not dataset.test:

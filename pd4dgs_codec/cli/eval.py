@@ -31,17 +31,21 @@ def parser() -> options.Parser:
     p.add_argument("source", metavar="SOURCE", help="dataset to compare with, see below")
     options.add_max_layer(p, "leave out the layers above this one")
     options.add_reading(p)
+    p.add_argument("--max-bytes", type=options.size, metavar="SIZE", help="measure the first SIZE bytes, such as 50k")
+    options.add_background(p, "the file's")
     p.add_argument("--perceptual", action="store_true", help="add perceptual distances, which take longer")
     p.add_common()
     return p
 
 
 def _evaluate(args: argparse.Namespace, console: Console) -> int:
-    from pd4dgs_codec.quality.evaluate import evaluate_file
+    from pd4dgs_codec.quality.evaluate import evaluate
+    from pd4dgs_codec.quality.levels import load_levels
     from pd4dgs_codec.quality.perceptual import load_perceptual
 
     file = named_input(args.input)
-    dataset = read_dataset(args.source, args)
+    levels = load_levels(file, args.max_layer, max_bytes=args.max_bytes, background=args.background)
+    dataset = read_dataset(args.source, args, levels[-1].model.info)
     console.detail(f"{args.source}: {len(dataset.train)} training views, {len(dataset.test)} held out")
     if not dataset.test:
         console.message("no views are held out: measuring on the training views")
@@ -49,7 +53,7 @@ def _evaluate(args: argparse.Namespace, console: Console) -> int:
     for name, why in (perceptual.absent if perceptual else {}).items():
         console.message(f"no {name}: {why}")
     with progress_bar(None, "pictures", "evaluating") as step:
-        result = evaluate_file(file, dataset, args.max_layer, perceptual=perceptual, step=step)
+        result = evaluate(levels, dataset, perceptual=perceptual, step=step)
     result = {"input": args.input, "downscale": args.downscale, "holdout": args.holdout, **result}
     console.result(result, _text(result), on_stdout=True)
     return OK

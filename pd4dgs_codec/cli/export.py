@@ -134,7 +134,7 @@ def _eyes(args: argparse.Namespace, player: Player) -> Eyes:
 
     if args.data is None:
         return eyes_of_scene(player)
-    return eyes_of_cameras([view.camera for view in common.read_dataset(args.data, args).train])
+    return eyes_of_cameras([view.camera for view in common.read_dataset(args.data, args, player.info).train])
 
 
 def _write_still(args: argparse.Namespace, export: Export, console: Console) -> dict[str, Any]:
@@ -218,7 +218,7 @@ def _write_folder(args: argparse.Namespace, count: int, frames: Iterator[bytes])
 def _cost(args: argparse.Namespace, export: Export) -> dict[str, Any]:
     from pd4dgs_codec.interchange.export import cost
 
-    views = common.read_dataset(args.compare, args).test
+    views = common.read_dataset(args.compare, args, export.player.info).test
     if not views:
         raise DataError(f"{args.compare}: has no held-out views; expected another --holdout")
     with progress_bar(len(views), "views", "comparing") as step:

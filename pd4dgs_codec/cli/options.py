@@ -92,6 +92,12 @@ def add_reading(options: argparse._ActionsContainer, *, defaults: bool = True) -
     add("--holdout", type=count, default=holdout, metavar="K", help=what)
 
 
+def add_background(options: argparse._ActionsContainer, default: str) -> None:
+    """--background; default: what it is otherwise, in words."""
+    what = f"black, white or R,G,B in 0..1 behind the scene and behind pictures with alpha (default: {default})"
+    options.add_argument("--background", type=background, metavar="COLOR", help=what)
+
+
 def add_max_layer(options: argparse._ActionsContainer, what: str) -> None:
     """--max-layer, whose help is `what`."""
     options.add_argument("--max-layer", type=int, choices=(0, 1, 2), help=what)
@@ -140,6 +146,15 @@ finite_float = checked(float, math.isfinite, "a number")
 def listed(kind: Callable[[str], T]) -> Callable[[str], tuple[T, ...]]:
     """The type of comma-separated values of a kind: without repetitions, in the order given."""
     return lambda text: tuple(dict.fromkeys(kind(part) for part in text.split(",")))
+
+
+def background(text: str) -> tuple[float, float, float]:
+    """A colour as RGB in 0..1, see `dataset.color`."""
+    from pd4dgs_codec.data.dataset import color
+
+    with contextlib.suppress(ValueError):
+        return color(text)
+    raise argparse.ArgumentTypeError(f"found {text!r}, expected black, white or R,G,B in 0..1")
 
 
 def one_of(*names: str) -> Callable[[str], str]:

@@ -45,6 +45,7 @@ def parser() -> options.Parser:
     options.add_max_layer(p, "render the layers up to this one")
     what = "render the slices within the first SIZE bytes, such as 50k"
     p.add_argument("--max-bytes", type=options.size, metavar="SIZE", help=what)
+    options.add_background(p, "the file's")
     p.add_argument("--data", metavar="SOURCE", help="take cameras, times and ground-truth images from a dataset")
     p.add_argument("--split", choices=("test", "train"), default="test", help="views of the dataset (default: test)")
     options.add_reading(p)
@@ -72,7 +73,11 @@ def _render(args: argparse.Namespace, console: Console) -> int:
 
         check_mp4()
     levels = load_levels(
-        named_input(args.input), args.max_layer, max_bytes=args.max_bytes, last_only=not args.side_by_side
+        named_input(args.input),
+        args.max_layer,
+        max_bytes=args.max_bytes,
+        last_only=not args.side_by_side,
+        background=args.background,
     )
     console.detail(f"{args.input}: levels " + ", ".join(f"{row.level} ({row.anchors} anchors)" for row in levels))
     frames = _frames(args, levels[-1])
@@ -115,7 +120,7 @@ def _frames(args: argparse.Namespace, level: Level) -> list[Frame]:
 
     if args.data is None:
         return own_frames(level.model.info, args.frames or 60, args.orbit, args.downscale)
-    dataset = read_dataset(args.data, args)
+    dataset = read_dataset(args.data, args, level.model.info)
     views = dataset.test if args.split == "test" else dataset.train
     if not views:
         raise DataError(f"{args.data}: has no held-out views; expected --split train or another --holdout")

@@ -55,6 +55,7 @@ def parser() -> options.Parser:
     add("source", metavar="SOURCE", help="dataset to train on, see below")
     add("-o", "--output", required=True, metavar="FILE.pt", help="checkpoint to write")
     options.add_reading(p, defaults=False)
+    options.add_background(p, "that of the data, white behind pictures with alpha")
     what = "0 (small files) to 100 (high quality), see below (default: 50)"
     add("--quality", type=options.checked(float, lambda q: 0 <= q <= 100, "0 to 100"), metavar="Q", help=what)
     _add_fields(p)
@@ -100,7 +101,8 @@ def _train(args: argparse.Namespace, console: Console) -> int:
     config = _stored_config(args) if args.resume else _fresh_config(args)
     workers.start(device, config.views_per_step)
     first = workers.rank() == 0
-    trainer = Trainer(config, load_source(args.source, downscale=config.downscale, holdout=config.holdout), device)
+    dataset = load_source(args.source, downscale=config.downscale, holdout=config.holdout, background=config.background)
+    trainer = Trainer(config, dataset, device)
     if args.resume:
         trainer.resume(Path(args.resume))
         _check_time_left(trainer, args.resume)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pd4dgs_codec.data.files import check_downscale, read_image, shrink_image, shrink_mask
+from pd4dgs_codec.data.files import Color, check_downscale, read_image, shrink_image, shrink_mask
 from pd4dgs_codec.data.view import View
 from pd4dgs_codec.errors import DataError
 
@@ -180,15 +180,15 @@ def rectify(image: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     return np.where(seen[..., None], top * (1 - b) + bottom * b + 0.5, 0).astype(np.uint8), seen
 
 
-def read_view(frame: UnreadView, time: float, downscale: int, *, composite: bool) -> View:
-    """The frame with its pixels, undistorted and downscaled. time: normalised."""
+def read_view(frame: UnreadView, time: float, downscale: int, under: Color | None) -> View:
+    """The frame with its pixels, undistorted and downscaled. time: normalised. under: as in `read_image`."""
     lens, size = frame.lens, (frame.lens.width, frame.lens.height)
     mask = None
     if lens.is_pinhole:
-        image = read_image(frame.image, size, downscale=downscale, composite=composite)
+        image = read_image(frame.image, size, downscale=downscale, under=under)
     else:
         check_downscale(size, downscale, str(frame.image))
-        image, seen = rectify(read_image(frame.image, size, composite=composite), lens)
+        image, seen = rectify(read_image(frame.image, size, under=under), lens)
         image, mask = shrink_image(image, downscale), shrink_mask(seen, downscale)
     height, width = image.shape[:2]
     viewmat = frame.viewmat.astype(np.float32)

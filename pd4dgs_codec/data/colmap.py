@@ -19,7 +19,7 @@ import numpy as np
 
 from pd4dgs_codec.data.cameras import Lens, UnreadView, checked_rotation, world_to_camera
 from pd4dgs_codec.data.dataset import COLMAP
-from pd4dgs_codec.data.files import LARGEST, number, read_file
+from pd4dgs_codec.data.files import LARGEST, Color, number, read_file
 from pd4dgs_codec.data.posed import LARGEST_TIME, held_out, posed_dataset
 from pd4dgs_codec.data.videos import synchronised_dataset, video_size
 from pd4dgs_codec.data.view import Dataset
@@ -42,7 +42,7 @@ VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".MP4", ".MOV")
 Image = tuple[str, int, list[float]]
 
 
-def read_colmap(folder: Path, downscale: int, holdout: int) -> Dataset:
+def read_colmap(folder: Path, downscale: int, holdout: int, background: Color | None) -> Dataset:
     """Reads a folder with a COLMAP model (see `dataset.load`). Of videos the first camera is held out."""
     places = ((folder / place, kind) for place in COLMAP for kind in (".bin", ".txt"))
     model, kind = next((p, k) for p, k in places if all((p / f"{n}{k}").exists() for n in ("cameras", "images")))
@@ -61,7 +61,7 @@ def read_colmap(folder: Path, downscale: int, holdout: int) -> Dataset:
         if pictures.resolve() not in path.resolve().parents or not path.is_file():
             raise DataError(f"{model / f'images{kind}'}: {camera.name}: there is no such picture in {pictures}")
         frames.append(replace(camera, name=camera.image.stem, time=time, image=path))
-    return posed_dataset(folder, *held_out(frames, holdout), points, colors, downscale)
+    return posed_dataset(folder, *held_out(frames, holdout), points, colors, downscale, background=background)
 
 
 def _videos(folder: Path) -> dict[str, Path]:

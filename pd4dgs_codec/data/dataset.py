@@ -1,8 +1,8 @@
 """The table of dataset readers, and `load`, which picks one by the files in a folder.
 
-A new reader is a function `read_NAME(folder, downscale, holdout) -> Dataset` in a module of this package and a row of
-READERS. The help of the commands, `pd4dgs-batch scan` and the error for unknown folders follow from the row. This
-module imports the standard library alone, so that `--help` loads neither numpy nor a reader.
+A new reader is a function `read_NAME(folder, downscale, holdout, background) -> Dataset` in a module of this package
+and a row of READERS. The help of the commands, `pd4dgs-batch scan` and the error for unknown folders follow from the
+row. This module imports the standard library alone, so that `--help` loads neither numpy nor a reader.
 """
 
 from __future__ import annotations
@@ -16,9 +16,11 @@ from typing import TYPE_CHECKING
 from pd4dgs_codec.errors import DataError
 
 if TYPE_CHECKING:
+    from pd4dgs_codec.data.files import Color
     from pd4dgs_codec.data.view import Dataset, View
 
 SYNTHETIC = "synthetic:"
+COLORS = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
 @dataclass(frozen=True)
@@ -40,9 +42,9 @@ class Reader:
         return any(all(any(folder.glob(mark)) for mark in marks) for marks in self.marks)
 
     @property
-    def read(self) -> Callable[[Path, int, int], Dataset]:
-        """The function, called with folder, downscale and holdout (see `load`)."""
-        function: Callable[[Path, int, int], Dataset] = resolve_name(f"pd4dgs_codec.data.{self.function}")
+    def read(self) -> Callable[[Path, int, int, Color | None], Dataset]:
+        """The function, called with folder, downscale, holdout and background (see `load`)."""
+        function: Callable[[Path, int, int, Color | None], Dataset] = resolve_name(f"pd4dgs_codec.data.{self.function}")
         return function
 
 
@@ -76,16 +78,27 @@ FOLDERS = tuple(
 )
 
 
-def load(source: str | Path, *, downscale: int = 1, holdout: int = 8) -> Dataset:
+def load(source: str | Path, *, downscale: int = 1, holdout: int = 8, background: Color | None = None) -> Dataset:
     """Read a dataset.
 
     source: a folder that one of READERS recognises, or `synthetic:NAME[?key=value&...]` (see `synthetic`).
     downscale: images are averaged over downscale x downscale blocks (the remainder is cropped), intrinsics follow.
     holdout: without split files, frames with i % holdout == holdout // 2 are the test frames; 0 = none.
+    background: RGB 0..1 on which pictures with alpha are laid, None for white; other pictures stay as they are.
     Views whose masks hold no valid pixel are left out, see `Dataset.left_out`.
     Raises DataError, one line, for anything missing or broken.
     """
-    return _without_blind_views(_read(source, downscale, holdout), source)
+    return _without_blind_views(_read(source, downscale, holdout, background), source)
+
+
+def color(text: str) -> Color:
+    """The RGB of black, white or R,G,B in 0..1. Raises ValueError for other texts."""
+    if text in COLORS:
+        return COLORS[text]
+    r, g, b = map(float, text.split(","))
+    if not all(0 <= v <= 1 for v in (r, g, b)):
+        raise ValueError(text)
+    return r, g, b
 
 
 def dataset_folders(names: Iterable[str]) -> list[str]:
@@ -103,7 +116,7 @@ def dataset_folders(names: Iterable[str]) -> list[str]:
     return sorted(str(folder) for folder in found if found.isdisjoint(folder.parents))
 
 
-def _read(source: str | Path, downscale: int, holdout: int) -> Dataset:
+def _read(source: str | Path, downscale: int, holdout: int, background: Color | None) -> Dataset:
     if isinstance(downscale, bool) or not isinstance(downscale, int) or downscale < 1:
         raise DataError(f"{source}: downscale is {downscale}, expected an integer >= 1")
     if isinstance(holdout, bool) or not isinstance(holdout, int) or holdout < 0 or holdout == 1:
@@ -117,7 +130,7 @@ def _read(source: str | Path, downscale: int, holdout: int) -> Dataset:
         raise DataError(f"{folder}: found {found}, expected a dataset folder or {SYNTHETIC}NAME")
     for reader in READERS:
         if reader.recognises(folder):
-            return reader.read(folder, downscale, holdout)
+            return reader.read(folder, downscale, holdout, background)
     found = "other files" if any(folder.iterdir()) else "an empty folder"
     expected = ", ".join(f"{reader.contents} ({reader.name})" for reader in READERS)
     raise DataError(f"{folder}: found {found}, expected {expected}")

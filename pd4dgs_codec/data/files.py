@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 #: Largest length in scene units or pixels: products and squares of such numbers stay finite in binary32.
 LARGEST = 1e9
+Color = tuple[float, float, float]  #: RGB 0..1
+WHITE = (1.0, 1.0, 1.0)
 IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 #: Pillow's pixel modes with one obvious conversion to RGB; others (CMYK, LAB, floats) are refused.
 GREY16_MODES = {"I;16", "I;16L", "I;16B"}
@@ -195,29 +197,30 @@ def _srgb(image: Picture, where: str) -> Picture:
     return converted
 
 
-def _rgb(image: Picture, where: str, *, composite: bool) -> Picture:
-    """The picture in mode RGB and in sRGB: alpha composited on white, or dropped."""
+def _rgb(image: Picture, where: str, under: Color | None) -> Picture:
+    """The picture in mode RGB and in sRGB; under as in `read_image`."""
     from PIL import Image
 
     _check_readable(image, where)
     if image.mode in GREY16_MODES:  # Pillow itself would clip to 255
         image = Image.fromarray(((np.asarray(image).astype(np.uint32) * 255 + 32_767) // 65_535).astype(np.uint8))
     image = _srgb(image, where)
-    if composite and _has_alpha(image):
+    if under is not None and _has_alpha(image):
         image = image.convert("RGBA")
-        image = Image.alpha_composite(Image.new("RGBA", image.size, (255,) * 4), image)
+        r, g, b = (round(255 * v) for v in under)
+        image = Image.alpha_composite(Image.new("RGBA", image.size, (r, g, b, 255)), image)
     return image.convert("RGB")
 
 
-def read_image(path: Path, size: tuple[int, int], *, downscale: int = 1, composite: bool = True) -> np.ndarray:
+def read_image(path: Path, size: tuple[int, int], *, downscale: int = 1, under: Color | None = WHITE) -> np.ndarray:
     """uint8 [H // downscale, W // downscale, 3], the mean of each block; the file must measure `size` = (W, H).
 
-    composite: blend a transparent image with white; otherwise its alpha is dropped (photographs).
+    under: RGB 0..1 on which a transparent image is laid; None drops its alpha (photographs).
     """
     with _open(path, "image", size) as image:
         check_downscale(size, downscale, str(path))
         try:
-            rgb = _rgb(image, str(path), composite=composite)
+            rgb = _rgb(image, str(path), under)
         except (OSError, SyntaxError, ValueError) as e:
             raise DataError(f"{path}: image data is broken: {e}") from None
         if downscale > 1:

@@ -22,6 +22,7 @@ from pd4dgs_codec.data.cameras import (
 )
 from pd4dgs_codec.data.files import (
     LARGEST,
+    Color,
     array,
     find_image,
     number,
@@ -147,7 +148,7 @@ def read_cameras(folder: str | Path) -> CameraFiles:
     return CameraFiles(train, test, factor, scene, extra, _points(folder, center, scale))
 
 
-def read_iphone(folder: Path, downscale: int, holdout: int) -> Dataset:
+def read_iphone(folder: Path, downscale: int, holdout: int, background: Color | None) -> Dataset:
     """Reads rgb/{factor}x (see `dataset.load`). The split files decide, whatever `holdout` is."""
     files = read_cameras(folder)
     frames = [*files.train, *files.test]
@@ -209,7 +210,7 @@ META, PICTURES = ("metadata", "metadata.json"), ("rgbd", "rgb")
 MAX_FRAMES = 1_000_000
 
 
-def read_record3d(folder: Path, downscale: int, holdout: int) -> Dataset:
+def read_record3d(folder: Path, downscale: int, holdout: int, background: Color | None) -> Dataset:
     """Reads an unpacked recording (see `dataset.load`).
 
     `K` holds nine numbers by columns; `perFrameIntrinsicCoeffs`, if present, fx fy cx cy of each picture. `poses` are
@@ -230,7 +231,7 @@ def read_record3d(folder: Path, downscale: int, holdout: int) -> Dataset:
         rotation = checked_rotation(pose[[3, 0, 1, 2]], f"{path}: pose {i}")
         viewmat = world_to_camera(OPENGL_TO_OPENCV @ rotation.T, pose[4:])
         frames.append(UnreadView(str(i), 0, time, viewmat, lens, find_image(pictures, str(i))))
-    return posed_dataset(folder, *held_out(frames, holdout), None, None, downscale)
+    return posed_dataset(folder, *held_out(frames, holdout), None, None, downscale, background=background)
 
 
 def _record3d_lenses(meta: dict[str, object], size: tuple[int, int], count: int, path: Path) -> list[Lens]:

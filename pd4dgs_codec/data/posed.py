@@ -9,6 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from pd4dgs_codec.data.cameras import UnreadView, read_view
+from pd4dgs_codec.data.files import WHITE, Color, image_info
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DataError
 
@@ -45,24 +46,28 @@ def posed_dataset(
     colors: np.ndarray | None,
     downscale: int,
     depth: tuple[float, float] | None = None,
-    background: tuple[float, float, float] | None = None,
+    background: Color | None = None,
     box: np.ndarray | None = None,
     *,
     composite: bool = True,
 ) -> Dataset:
     """The dataset of these frames.
 
-    points: float32 [M, 3] and colors uint8 [M, 3], or None. depth: near and far, if known. background: None for the
-    colour of the images' border. box: float32 [2, 3], if known. composite: as in `read_image`.
+    points: float32 [M, 3] and colors uint8 [M, 3], or None. depth: near and far, box: float32 [2, 3], if known.
+    background: what lies behind pictures with alpha, None for white; without alpha it is the colour of the images'
+    border. composite: False drops alpha (photographs), and `background` is the scene's, None for the border's colour.
     """
-    frames = [*train, *test]
+    frames, under = [*train, *test], (background or WHITE) if composite else None
+    behind = background
+    if composite:
+        behind = under if image_info(train[0].image)[2] else None
     times, start, stop = normalised_times([f.time for f in frames], str(folder))
-    views = [read_view(f, t, downscale, composite=composite) for f, t in zip(frames, times, strict=True)]
+    views = [read_view(f, t, downscale, under) for f, t in zip(frames, times, strict=True)]
     return Dataset(
         name=folder.resolve().name,
         train=tuple(views[: len(train)]),
         test=tuple(views[len(train) :]),
-        background=background or border_color(views[: len(train)]),
+        background=behind or border_color(views[: len(train)]),
         time_range=seconds_range(start, stop),
         **geometry(frames, points, colors, depth, box),
     )

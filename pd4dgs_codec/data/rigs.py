@@ -11,6 +11,7 @@ import numpy as np
 from pd4dgs_codec.data.cameras import Lens, UnreadView, check_rotation, world_to_camera
 from pd4dgs_codec.data.files import (
     LARGEST,
+    Color,
     array,
     find_image,
     read_file,
@@ -31,7 +32,7 @@ POSES, MAX_CAMERAS = "poses_bounds.npy", 10_000
 ASPECT_TOLERANCE = 0.01
 
 
-def read_neu3d(folder: Path, downscale: int, holdout: int) -> Dataset:
+def read_neu3d(folder: Path, downscale: int, holdout: int, background: Color | None) -> Dataset:
     """Reads LLFF's poses_bounds.npy with a synchronised video `cam*.mp4` per camera (see `dataset.load`).
 
     Row i belongs to the i-th video by name: three rows of [R | t | (height, width, focal)], the columns of R pointing
@@ -79,7 +80,7 @@ FPS = 30.0
 MAX_POINTS_BYTES = 560_000_000
 
 
-def read_panoptic(folder: Path, downscale: int, holdout: int) -> Dataset:
+def read_panoptic(folder: Path, downscale: int, holdout: int, background: Color | None) -> Dataset:
     """Reads Panoptic Studio in the layout of Dynamic 3D Gaussians (see `dataset.load`).
 
     The meta files hold `w` and `h` and, by instant and camera, `k` (3x3), `w2c` (4x4, OpenCV axes), `fn` (a picture in
@@ -91,7 +92,7 @@ def read_panoptic(folder: Path, downscale: int, holdout: int) -> Dataset:
         test = _panoptic_frames(folder, folder / TEST_META)
     else:
         train, test = without_first_camera(folder, train, holdout)
-    return posed_dataset(folder, train, test, *_panoptic_points(folder / POINTS), downscale)
+    return posed_dataset(folder, train, test, *_panoptic_points(folder / POINTS), downscale, background=background)
 
 
 def _panoptic_frames(folder: Path, path: Path) -> list[UnreadView]:

@@ -17,6 +17,7 @@ from pd4dgs_codec.data.cameras import (
     world_to_camera,
 )
 from pd4dgs_codec.data.files import (
+    Color,
     array,
     find_image,
     image_info,
@@ -133,12 +134,11 @@ def _stored_depth(folder: Path, file: dict[str, Any]) -> tuple[float, float] | N
     return near, far
 
 
-def read_transforms(folder: Path, downscale: int, holdout: int) -> Dataset:
+def read_transforms(folder: Path, downscale: int, holdout: int, background: Color | None) -> Dataset:
     """Reads a folder with transforms*.json (see `dataset.load`); a test or val file decides before `holdout`."""
     train_file, test_file = _choose(folder)
     frames, file = _frames(folder, train_file)
     train, test = held_out(frames, holdout) if test_file is None else (frames, _frames(folder, test_file)[0])
     named = file.get("ply_file_path")
     points, colors = read_ply(folder / named) if isinstance(named, str) else read_only_ply(folder)
-    background = (1.0, 1.0, 1.0) if image_info(train[0].image)[2] else None
     return posed_dataset(folder, train, test, points, colors, downscale, _stored_depth(folder, file), background)

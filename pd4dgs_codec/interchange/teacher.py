@@ -26,7 +26,7 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.data.dataset import load
+from pd4dgs_codec.data.dataset import color, load
 from pd4dgs_codec.data.files import read_file, split_options
 from pd4dgs_codec.data.posed import depth_range, held_out, points_box
 from pd4dgs_codec.data.view import Dataset, View
@@ -60,7 +60,6 @@ EXAMPLES = {
     "cameras": "cameras=FOLDER", "views": "views=200", "size": "size=400x400", "fps": "fps=30", "up": "up=0,-1,0",
     "background": "background=white or background=0.5,0.5,0.5",
 }  # fmt: skip
-NAMED = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 Triple = tuple[float, float, float]
 
 
@@ -76,14 +75,15 @@ class Options:
     up: Triple = (0.0, -1.0, 0.0)
 
 
-def load_source(source: str, *, downscale: int = 1, holdout: int = 8) -> Dataset:
+def load_source(source: str, *, downscale: int = 1, holdout: int = 8, background: Triple | None = None) -> Dataset:
     """`data.dataset.load` for every source, including `teacher:`. Raises DataError."""
     if not source.startswith(PREFIX):
-        return load(source, downscale=downscale, holdout=holdout)
+        return load(source, downscale=downscale, holdout=holdout, background=background)
     place, options = _parsed(source)
     teacher = read_model(place, options.fps)
     if options.cameras:
-        return _like(source, teacher, load(options.cameras, downscale=downscale, holdout=holdout))
+        like = load(options.cameras, downscale=downscale, holdout=holdout, background=background)
+        return _like(source, teacher, like)
     return _around(source, Path(place), teacher, options, downscale, holdout)
 
 
@@ -175,11 +175,9 @@ def _value(key: str, text: str) -> Any:
         return int(text)
     if key == "fps" and 0 < float(text) < math.inf:
         return float(text)
-    if key == "background" and text in NAMED:
-        return NAMED[text]
+    if key == "background":
+        return color(text)
     numbers = tuple(map(float, re.split("[x,]", text)))
-    if key == "background" and len(numbers) == 3 and all(0 <= v <= 1 for v in numbers):
-        return numbers
     if key == "up" and len(numbers) == 3 and 0 < math.hypot(*numbers) < math.inf:
         return numbers
     if key == "size" and len(numbers) == 2 and all(v == int(v) and 8 <= v <= 8192 for v in numbers):

@@ -1,10 +1,9 @@
-"""Quality and bytes per level of a file, on a dataset's held-out views."""
+"""Quality and bytes of the levels of a file, on a dataset's held-out views."""
 
 from __future__ import annotations
 
 import statistics
-from collections.abc import Callable, Mapping
-from pathlib import Path
+from collections.abc import Callable, Mapping, Sequence
 from types import MappingProxyType
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.quality.image import Metric, mean_image_baseline, mean_scores, moving_regions, mpsnr, mssim, to_uint8
-from pd4dgs_codec.quality.levels import Level, load_levels
+from pd4dgs_codec.quality.levels import Level
 from pd4dgs_codec.quality.perceptual import Distance, Perceptual
 from pd4dgs_codec.scene import Camera
 
@@ -22,12 +21,10 @@ NO_DISTANCES: Mapping[str, Distance] = MappingProxyType({})
 NOTHING_MOVES: Mapping[View, np.ndarray] = MappingProxyType({})
 
 
-def evaluate_file(
-    path_or_bytes: str | Path | bytes,
+def evaluate(
+    levels: Sequence[Level],
     dataset: Dataset,
-    max_layer: int | None = None,
     *,
-    device: str = "cpu",
     perceptual: Perceptual | None = None,
     step: Callable[[], None] = lambda: None,
 ) -> dict[str, Any]:
@@ -35,10 +32,10 @@ def evaluate_file(
 
     Without held-out views the training views are used and "split" is "train". mpsnr in dB, infinite for equal pictures.
     perceptual: distances to add, see `evaluate_level`; the result describes them under "perceptual". step is called
-    after each picture of each level. Raises DecodeError, DataError.
+    after each picture of each level.
     """
     views, split = (dataset.test, "test") if dataset.test else (dataset.train, "train")
-    levels, moving = load_levels(path_or_bytes, max_layer, device), moving_regions(views)
+    moving = moving_regions(views)
     distances = perceptual.distances if perceptual else NO_DISTANCES
     result: dict[str, Any] = {
         "source": dataset.name,

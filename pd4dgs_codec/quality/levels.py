@@ -66,15 +66,28 @@ def load_levels(
     *,
     max_bytes: int | None = None,
     last_only: bool = False,
+    background: tuple[float, float, float] | None = None,
 ) -> list[Level]:
     """The levels of a `.pd4` file (or its bytes) or of a checkpoint, ascending, up to max_layer; with last_only the
-    last one. max_bytes: of a `.pd4`, decode only the slices within so many bytes.
+    last one. max_bytes: of a `.pd4`, decode only the slices within so many bytes. background: RGB to draw in place of
+    the scene's.
 
     Each level of a `.pd4` is decoded from its own prefix, so nothing of a later layer can leak into it. Raises
     DataError for a file that cannot be read, DecodeError.
     """
     if isinstance(file, bytes):
-        return _of_bytes(file, max_layer, device, max_bytes, last_only)
+        levels = _of_bytes(file, max_layer, device, max_bytes, last_only)
+    else:
+        levels = _of_file(file, max_layer, device, max_bytes, last_only)
+    if background is not None:
+        for level in levels:
+            level.model.info = replace(level.model.info, background=background)
+    return levels
+
+
+def _of_file(
+    file: str | Path, max_layer: int | None, device: str, max_bytes: int | None, last_only: bool
+) -> list[Level]:
     try:
         data = Path(file).read_bytes()
     except OSError as error:

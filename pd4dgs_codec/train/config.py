@@ -76,8 +76,10 @@ class Option:
         if not allowed:
             raise TrainError(f"{name} must be {self.range}, found {value}")
 
-    def contains(self, value: float) -> bool:
-        """Whether a number is finite and within the range."""
+    def contains(self, value: float | tuple[float, ...]) -> bool:
+        """Whether a number, or each of several, is finite and within the range."""
+        if isinstance(value, tuple):
+            return all(map(self.contains, value))
         return self.least <= value <= self.most and value > self.above and math.isfinite(value)
 
 
@@ -128,6 +130,8 @@ class TrainConfig:
     )
     downscale: int = option(1)
     holdout: int = option(8)
+    #: RGB behind pictures with alpha; None: white
+    background: tuple[float, float, float] | None = option(None, least=0, most=1)
     #: None: the preset's default, or by the clock if there is a time limit
     iterations: int | None = option(
         None, help="training steps (default: by preset, unless --max-seconds is given)", metavar="N", least=1

@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pd4dgs_codec import decode
+
 WIDTH, HEIGHT = 32, 24  # of the scene's camera and of the dataset's pictures
 
 
@@ -28,12 +30,13 @@ def test_eval_averages_the_views_of_each_levels_own_prefix(scene_pd4, shared_dat
     from pd4dgs_codec.format.info import info
     from pd4dgs_codec.model.convert import from_scene
     from pd4dgs_codec.model.picture import render_image
-    from pd4dgs_codec.quality.evaluate import evaluate_file
+    from pd4dgs_codec.quality.evaluate import evaluate
     from pd4dgs_codec.quality.image import mpsnr
+    from pd4dgs_codec.quality.levels import load_levels
 
     data, dataset = scene_pd4.read_bytes(), load(str(shared_dataset), holdout=2)
     end = info(data)["layers"][1]["end"]
-    rows = evaluate_file(data[:end], dataset, 1)["levels"]
+    rows = evaluate(load_levels(data[:end], 1), dataset)["levels"]
     model = from_scene(decode(data, max_layer=1))
     images = [render_image(model, 1, v.time, v.camera) for v in dataset.test]
     expected = np.mean([mpsnr(image, v.image, v.mask) for image, v in zip(images, dataset.test, strict=True)])
@@ -69,6 +72,62 @@ def test_eval_measures_what_moves_where_cameras_stand_still(cli, scene_pd4):
     assert 0 < report["moving_share"] == pytest.approx(np.mean(shares))
     shown = cli("eval", scene_pd4, source, "--max-layer", 0).out.decode()
     assert "moving dB" in shown and f"moving: the {100 * np.mean(shares):.1f} % of pixels" in shown
+
+
+@pytest.mark.parametrize("given", [None, "0,0.6,1"])
+def test_truth_and_scene_have_the_background_of_the_file_or_the_option(cli, scene, tmp_path, given):
+    """The pictures are transparent: what they show is the background alone."""
+    from dataclasses import replace
+
+    from tiny import write_views
+
+    from pd4dgs_codec.data.dataset import load
+    from pd4dgs_codec.format.encoder import encode
+    from pd4dgs_codec.quality.image import mpsnr
+    from pd4dgs_codec.quality.levels import load_levels
+
+    folder, file = write_views(tmp_path / "set"), tmp_path / "green.pd4"
+    for picture in folder.glob("*.png"):
+        Image.fromarray(np.zeros((HEIGHT, WIDTH, 4), np.uint8)).save(picture)
+    file.write_bytes(encode(replace(scene, info=replace(scene.info, background=(0.0, 1.0, 0.0))), effort=1))
+    behind, options = (0.0, 1.0, 0.0), ["--max-layer", 0, "--json"]
+    if given:
+        behind, options = (0.0, 0.6, 1.0), [*options, "--background", given]
+    (view,), level = load(str(folder)).test, load_levels(file, 0)[-1]
+    level.model.info = replace(level.model.info, background=behind)
+    truth = np.broadcast_to(np.float32(behind), (HEIGHT, WIDTH, 3))
+    expected = mpsnr(level.picture(view.camera, view.time), truth)
+    assert cli("eval", file, folder, *options).json["levels"][0]["mpsnr"] == pytest.approx(expected)
+    done = cli("render", file, "-o", tmp_path / "a.png", "--data", folder, "--side-by-side", *options)
+    assert done.code == 0
+    sheet = np.asarray(Image.open(tmp_path / "a.png"))[-HEIGHT:]
+    assert (sheet[:, -WIDTH:] == np.rint(255 * truth)).all()
+    np.testing.assert_array_equal(sheet[:, :WIDTH], np.rint(255 * level.picture(view.camera, view.time)))
+
+
+def test_a_model_keeps_the_background_that_it_is_trained_on(cli, tmp_path, monkeypatch):
+    from tiny import TINY, write_views
+
+    from pd4dgs_codec.model import checkpoint
+    from pd4dgs_codec.model.config import PRESETS
+
+    monkeypatch.setitem(PRESETS, "tiny", TINY)
+    folder = write_views(tmp_path / "set")
+    for picture in folder.glob("*.png"):
+        Image.fromarray(np.zeros((HEIGHT, WIDTH, 4), np.uint8)).save(picture)
+    options = ("--preset", "tiny", "--iterations", 1, "--background", "0,0.5,1")
+    assert cli("train", folder, "-o", tmp_path / "m.pt", *options).code == 0
+    assert checkpoint.load(tmp_path / "m.pt")[0].info.background == (0, 0.5, 1)
+    assert cli("encode", tmp_path / "m.pt", "-o", tmp_path / "m.pd4").code == 0
+    assert decode((tmp_path / "m.pd4").read_bytes()).info.background == (0, 0.5, 1)
+    assert cli("eval", tmp_path / "m.pd4", folder, "--background", "red").code == 2
+
+
+def test_eval_of_the_first_bytes(cli, scene_pd4, shared_dataset):
+    end = cli("info", scene_pd4, "--json").json["layers"][1]["end"]
+    levels = cli("eval", scene_pd4, shared_dataset, "--json", "--max-bytes", end + 5).json["levels"]
+    assert levels[-1]["cumulative_bytes"] == end and [row["level"] for row in levels] == [0, 1]
+    assert cli("eval", scene_pd4, shared_dataset, "--max-bytes", 100).code == 1
 
 
 def test_eval_without_held_out_views_says_so(cli, scene_pd4, shared_dataset):

@@ -115,6 +115,7 @@ def test_resume_refuses_what_contradicts_the_checkpoint(cli, train, tmp_path, sh
         "--preset": ("--preset", "small"),
         "--without noise": ("--without", "noise"),
         "--max-layer": ("--max-layer", 1),
+        "--background": ("--background", "white"),
         "--feature-width": ("--feature-width", 16),
     }
     for what, options in contradictions.items():

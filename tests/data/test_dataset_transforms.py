@@ -67,18 +67,19 @@ def test_split_files_decide(blender):
     assert d.test[0].time == pytest.approx(3 / 8)
 
 
-def test_alpha_goes_on_white(blender):
+@pytest.mark.parametrize("color", [None, (0.0, 0.0, 0.0), (0.2, 1.0, 0.6)])
+def test_alpha_goes_on_the_background(blender, color):
     folder = blender(n=2)
     rgba = np.zeros((8, 12, 4), np.uint8)
     rgba[:, :6] = 200, 100, 0, 255
     rgba[:, 6:9] = 200, 100, 0, 51
     for i in range(2):
         Image.fromarray(rgba).save(folder / f"r_{i:03d}.png")
-    d = load(folder, holdout=0)
-    assert d.background == (1, 1, 1)
+    d, behind = load(folder, holdout=0, background=color), color or (1, 1, 1)
+    assert d.background == behind
     image = d.train[0].image
-    assert image[0, 0].tolist() == [200, 100, 0] and image[0, 11].tolist() == [255] * 3
-    assert np.abs(image[0, 7].astype(int) - [244, 224, 204]).max() <= 1
+    assert image[0, 0].tolist() == [200, 100, 0] and image[0, 11].tolist() == [255 * v for v in behind]
+    assert np.abs(image[0, 7] - (0.8 * 255 * np.array(behind) + 0.2 * np.array([200, 100, 0]))).max() <= 1
 
 
 @pytest.mark.parametrize("color", [(255, 255, 255), (10, 200, 30)])
@@ -88,7 +89,9 @@ def test_uniform_border_is_the_background(blender, color):
         image = np.full((8, 12, 3), color, np.uint8)
         image[3:5, 3:9] = 77
         Image.fromarray(image).save(folder / f"r_{i:03d}.png")
-    assert load(folder).background == pytest.approx([c / 255 for c in color])
+    for asked in (None, (0.5, 0.5, 0.5)):  # there is no alpha to see it through
+        d = load(folder, background=asked)
+        assert d.background == pytest.approx([c / 255 for c in color]) and d.train[0].image[0, 0].tolist() == [*color]
 
 
 def test_busy_border_means_black(blender):
