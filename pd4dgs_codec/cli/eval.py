@@ -12,6 +12,8 @@ from pd4dgs_codec.cli.progress import progress_bar
 DETAILS = f"""\
 Each level of a .pd4 file is decoded from its own prefix and compared with the held-out views.
 mPSNR in dB and mSSIM follow the DyCheck protocol: 8-bit images, masked if the dataset has covisibility masks.
+--protocol 3dgs shows what papers on Gaussian splatting report, without masks: PSNR, SSIM as the code of 3D Gaussian
+Splatting computes it, and LPIPS-VGG where the package lpips and its weights are installed.
 Where test cameras stand still, the moving region is measured too: pixels whose true colour changes by more than 16 of
 255 over time. --perceptual adds LPIPS, ST-LPIPS and FLIP, as far as they are installed, masked too, and their temporal
 variants (t-LPIPS, ...): the mean distance between successive frames of a fixed camera. docs/evaluation.md has more.
@@ -21,6 +23,7 @@ variants (t-LPIPS, ...): the mean distance between successive frames of a fixed 
 examples:
   pd4dgs-eval scene.pd4 synthetic:local
   pd4dgs-eval scene.pd4 synthetic:local --perceptual
+  pd4dgs-eval mutant.pd4 recordings/mutant --protocol 3dgs
   pd4dgs-eval model.pt recordings/kitchen --downscale 2 --json"""
 
 
@@ -31,6 +34,8 @@ def parser() -> options.Parser:
     p.add_argument("source", metavar="SOURCE", help="dataset to compare with, see below")
     options.add_max_layer(p, "leave out the layers above this one")
     options.add_reading(p)
+    what = "dycheck: masked metrics; 3dgs: those of 3D Gaussian Splatting, see above (default: dycheck)"
+    p.add_argument("--protocol", choices=("dycheck", "3dgs"), default="dycheck", help=what)
     p.add_argument("--max-bytes", type=options.size, metavar="SIZE", help="measure the first SIZE bytes, such as 50k")
     options.add_background(p, "the file's")
     p.add_argument("--perceptual", action="store_true", help="add perceptual distances, which take longer")
@@ -41,7 +46,7 @@ def parser() -> options.Parser:
 def _evaluate(args: argparse.Namespace, console: Console) -> int:
     from pd4dgs_codec.quality.evaluate import evaluate
     from pd4dgs_codec.quality.levels import load_levels
-    from pd4dgs_codec.quality.perceptual import load_perceptual
+    from pd4dgs_codec.quality.perceptual import PERCEPTUAL, VGG, load_perceptual
 
     file = named_input(args.input)
     levels = load_levels(file, args.max_layer, max_bytes=args.max_bytes, background=args.background)
@@ -49,11 +54,12 @@ def _evaluate(args: argparse.Namespace, console: Console) -> int:
     console.detail(f"{args.source}: {len(dataset.train)} training views, {len(dataset.test)} held out")
     if not dataset.test:
         console.message("no views are held out: measuring on the training views")
-    perceptual = load_perceptual() if args.perceptual else None
+    distances = (*(PERCEPTUAL if args.perceptual else ()), *([VGG] if args.protocol == "3dgs" else []))
+    perceptual = load_perceptual(distances) if distances else None
     for name, why in (perceptual.absent if perceptual else {}).items():
         console.message(f"no {name}: {why}")
     with progress_bar(None, "pictures", "evaluating") as step:
-        result = evaluate(levels, dataset, perceptual=perceptual, step=step)
+        result = evaluate(levels, dataset, protocol=args.protocol, perceptual=perceptual, step=step)
     result = {"input": args.input, "downscale": args.downscale, "holdout": args.holdout, **result}
     console.result(result, _text(result), on_stdout=True)
     return OK
@@ -76,6 +82,7 @@ def _text(result: dict[str, Any]) -> str:
     rows = [(row["level"], *(number(row[key], digits) for _, key, digits in columns)) for row in result["levels"]]
     what = "held-out" if result["split"] == "test" else "training"
     masked = "covisibility masks" if result["masked"] else "no covisibility masks"
+    masked = masked if result["protocol"] == "dycheck" else "protocol 3dgs"
     lines = [
         f"{result['source']}: {result['views']} {what} views, {result['width']}x{result['height']}, {masked}",
         table(head, rows),
@@ -94,5 +101,7 @@ def _distance_lines(perceptual: dict[str, Any] | None) -> list[str]:
     if not perceptual or not perceptual["distances"]:
         return []
     sources = "; ".join(f"{d['title']}: {d['source']}" for d in perceptual["distances"].values())
+    if "temporal_frames" not in perceptual:
+        return [sources]
     camera, frames = perceptual["temporal_camera"], perceptual["temporal_frames"]
     return [sources, f"t-: between successive frames, {frames} from the camera of view {camera}"]

@@ -10,13 +10,24 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.data.view import Dataset, View
-from pd4dgs_codec.quality.image import Metric, mean_image_baseline, mean_scores, moving_regions, mpsnr, mssim, to_uint8
+from pd4dgs_codec.quality.image import (
+    Metric,
+    mean_image_baseline,
+    mean_scores,
+    moving_regions,
+    mpsnr,
+    mssim,
+    ssim,
+    to_uint8,
+)
 from pd4dgs_codec.quality.levels import Level
-from pd4dgs_codec.quality.perceptual import Distance, Perceptual
+from pd4dgs_codec.quality.perceptual import VGG, Distance, Perceptual
 from pd4dgs_codec.scene import Camera
 
 #: Pictures of the fixed camera over t = 0..1 that the temporal distances compare.
 TEMPORAL_FRAMES = 30
+#: mpsnr and mssim are those of DyCheck. 3dgs adds psnr, ssim and, if it is there, lpips_vgg, all without masks.
+PROTOCOLS = ("dycheck", "3dgs")
 NO_DISTANCES: Mapping[str, Distance] = MappingProxyType({})
 NOTHING_MOVES: Mapping[View, np.ndarray] = MappingProxyType({})
 
@@ -25,20 +36,27 @@ def evaluate(
     levels: Sequence[Level],
     dataset: Dataset,
     *,
+    protocol: str = PROTOCOLS[0],
     perceptual: Perceptual | None = None,
     step: Callable[[], None] = lambda: None,
 ) -> dict[str, Any]:
     """The result of `pd4dgs-eval --json`: metrics are means over the views.
 
     Without held-out views the training views are used and "split" is "train". mpsnr in dB, infinite for equal pictures.
-    perceptual: distances to add, see `evaluate_level`; the result describes them under "perceptual". step is called
-    after each picture of each level.
+    protocol: of PROTOCOLS. perceptual: distances to add, see `evaluate_level`; the result describes them under
+    "perceptual". step is called after each picture of each level.
     """
     views, split = (dataset.test, "test") if dataset.test else (dataset.train, "train")
     moving = moving_regions(views)
     distances = perceptual.distances if perceptual else NO_DISTANCES
+    masked = {name: distance for name, distance in distances.items() if name != VGG}
+    metrics: dict[str, Metric] = {"mpsnr": mpsnr, "mssim": mssim, **{f"m{name}": d for name, d in masked.items()}}
+    if protocol == "3dgs":
+        metrics |= {"psnr": _unmasked(mpsnr), "ssim": _unmasked(ssim)}
+        metrics |= {name: _unmasked(distances[name]) for name in {VGG} & distances.keys()}
     result: dict[str, Any] = {
         "source": dataset.name,
+        "protocol": protocol,
         "split": split,
         "views": len(views),
         "width": views[0].width,
@@ -46,14 +64,13 @@ def evaluate(
         "masked": dataset.masked and split == "test",
         "baseline_mean_image_psnr": mean_image_baseline(dataset.train, views),
         "moving_share": float(np.mean([region.mean() for region in moving.values()])) if moving else None,
-        "levels": [evaluate_level(level, views, distances, step, moving) for level in levels],
+        "levels": [evaluate_level(level, views, metrics, masked, step, moving) for level in levels],
     }
     if perceptual:
         result["perceptual"] = {
             "distances": {name: {"title": d.title, "source": d.source} for name, d in distances.items()},
             "absent": perceptual.absent,
-            "temporal_frames": TEMPORAL_FRAMES,
-            "temporal_camera": views[0].name,
+            **({"temporal_frames": TEMPORAL_FRAMES, "temporal_camera": views[0].name} if masked else {}),
         }
     return result
 
@@ -61,10 +78,13 @@ def evaluate(
 def metric_columns(result: dict[str, Any]) -> list[tuple[str, str, int]]:
     """(heading, key of a level's row, decimals) of each metric of an evaluation."""
     titles = {name: d["title"] for name, d in result.get("perceptual", {"distances": {}})["distances"].items()}
+    vgg = titles.pop(VGG, None)
+    m = "m" if result["protocol"] == "dycheck" else ""
     return [
-        ("mPSNR dB", "mpsnr", 2),
+        (f"{m}PSNR dB", f"{m}psnr", 2),
         *([("moving dB", "moving_mpsnr", 2)] if result["moving_share"] else []),
-        ("mSSIM", "mssim", 4),
+        (f"{m}SSIM", f"{m}ssim", 4),
+        *([(vgg, VGG, 4)] if vgg else []),
         *((f"m{title}", f"m{name}", 4) for name, title in titles.items()),
         *((f"t-{title}", f"t_{name}", 5) for name, title in titles.items()),
     ]
@@ -73,17 +93,17 @@ def metric_columns(result: dict[str, Any]) -> list[tuple[str, str, int]]:
 def evaluate_level(
     level: Level,
     views: tuple[View, ...],
+    metrics: Mapping[str, Metric],
     distances: Mapping[str, Distance] = NO_DISTANCES,
     step: Callable[[], None] = lambda: None,
     moving: Mapping[View, np.ndarray] = NOTHING_MOVES,
 ) -> dict[str, Any]:
     """The row of one level. render_ms: median milliseconds per picture, the networks included.
 
-    distances: name -> distance; adds m<name>, the mean over the views, and t_<name>, the mean between successive
-    pictures of the first view's camera at TEMPORAL_FRAMES equidistant times from 0 to 1. moving: masks of views, see
-    `moving_regions`; adds moving_mpsnr, the mean over these views of the mPSNR there.
+    metrics: key -> metric, whose mean over the views is taken. distances: name -> distance; adds t_<name>, the mean
+    between successive pictures of the first view's camera at TEMPORAL_FRAMES equidistant times from 0 to 1. moving:
+    masks of views, see `moving_regions`; adds moving_mpsnr, the mean over these views of the mPSNR there.
     """
-    metrics: dict[str, Metric] = {"mpsnr": mpsnr, "mssim": mssim, **{f"m{name}": d for name, d in distances.items()}}
     milliseconds, where_moving = [], []
 
     def draw(view: View) -> np.ndarray:
@@ -104,6 +124,10 @@ def evaluate_level(
         "decode_seconds": level.decode_seconds,
         "render_ms": statistics.median(milliseconds),
     }
+
+
+def _unmasked(metric: Callable[[np.ndarray, np.ndarray], float]) -> Metric:
+    return lambda picture, truth, mask: metric(picture, truth)
 
 
 def _temporal(

@@ -1,4 +1,4 @@
-"""Masked PSNR and masked SSIM of the DyCheck protocol, in float64 numpy, and their means over views and levels.
+"""Masked PSNR and SSIM of the DyCheck protocol, SSIM of 3D Gaussian Splatting, in float64 numpy, and means over views.
 
 Images are rounded to 8 bits first, as a written picture would be. Masks are bool [H, W], True = counts.
 """
@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from pd4dgs_codec.data.view import View
 
 TAPS, SIGMA = 11, 1.5
+GAUSSIAN: np.ndarray = np.exp(-0.5 * ((np.arange(TAPS) - TAPS // 2) / SIGMA) ** 2)
+GAUSSIAN /= GAUSSIAN.sum()
 C1, C2 = 0.01**2, 0.03**2
 LEAST_WEIGHT = 1e-6
 #: A pixel moves if its true colour changes by more than this, of 255: video noise stays below, moving things do not.
@@ -72,11 +74,9 @@ def _blur(z: np.ndarray, m: np.ndarray) -> np.ndarray:
 
     Each pass is conv(z m, f) * taps / conv(m, 1), or 0 where no pixel counts; the mask becomes (count != 0).
     """
-    f: np.ndarray = np.exp(-0.5 * ((np.arange(TAPS) - TAPS // 2) / SIGMA) ** 2)
-    f /= f.sum()
     for axis in (1, 0):
         count = _slide(m, np.ones(TAPS), axis)
-        z = np.where(count != 0, _slide(z * m, f, axis) * TAPS / np.maximum(count, 1.0), 0.0)
+        z = np.where(count != 0, _slide(z * m, GAUSSIAN, axis) * TAPS / np.maximum(count, 1.0), 0.0)
         m = (count != 0).astype(np.float64)
     return z
 
@@ -95,8 +95,21 @@ def mssim(pred: np.ndarray, target: np.ndarray, mask: np.ndarray | None = None) 
     var0, var1 = np.maximum(aa - mu0 * mu0, 0.0), np.maximum(bb - mu1 * mu1, 0.0)
     cov = ab - mu0 * mu1
     cov = np.sign(cov) * np.minimum(np.sqrt(var0 * var1), np.abs(cov))
+    return _mean_ssim(mu0, mu1, var0 + var1, cov)
+
+
+def ssim(pred: np.ndarray, target: np.ndarray) -> float:
+    """SSIM as 3D Gaussian Splatting's code computes it: 11x11 Gaussian, sigma 1.5, zeros around the picture, per
+    channel; mean of the map. pred, target: [H, W, 3] uint8 or floats in 0..1."""
+    a, b, _ = prepare(pred, target, None)
+    z = np.pad(np.concatenate([a, b, a * a, b * b, a * b], axis=2), [(TAPS // 2, TAPS // 2)] * 2 + [(0, 0)])
+    mu0, mu1, aa, bb, ab = np.split(_slide(_slide(z, GAUSSIAN, 1), GAUSSIAN, 0), 5, axis=2)
+    return _mean_ssim(mu0, mu1, aa - mu0 * mu0 + bb - mu1 * mu1, ab - mu0 * mu1)
+
+
+def _mean_ssim(mu0: np.ndarray, mu1: np.ndarray, variances: np.ndarray, cov: np.ndarray) -> float:
     numerator = (2 * mu0 * mu1 + C1) * (2 * cov + C2)
-    return float((numerator / ((mu0 * mu0 + mu1 * mu1 + C1) * (var0 + var1 + C2))).mean())
+    return float((numerator / ((mu0 * mu0 + mu1 * mu1 + C1) * (variances + C2))).mean())
 
 
 def mean_image_baseline(train: Sequence[View], test: Sequence[View]) -> float | None:

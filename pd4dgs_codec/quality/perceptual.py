@@ -1,4 +1,4 @@
-"""LPIPS, ST-LPIPS and FLIP, masked, each if its package and weights are installed; and their temporal forms.
+"""LPIPS, ST-LPIPS and FLIP, each if its package and weights are installed; masked, and between successive pictures.
 
 Nothing is downloaded. docs/evaluation.md gives the definitions and says where each package comes from.
 """
@@ -26,8 +26,10 @@ VIEWING = (0.7, 3840, 0.7)
 #: Smallest side, pixels, for which the networks' strides and paddings leave an output.
 LPIPS_LEAST, STLPIPS_LEAST = 31, 21
 
-#: float32 [H, W] error per pixel, of two float32 [H, W, 3] in 0..1
+#: float32 [H, W] error per pixel, or one number for the whole, of two float32 [H, W, 3] in 0..1
 ErrorMap = Callable[[np.ndarray, np.ndarray], np.ndarray]
+#: The distances of `--perceptual`, and that of the protocol 3dgs.
+PERCEPTUAL, VGG = ("lpips", "stlpips", "flip"), "lpips_vgg"
 
 
 @dataclass(frozen=True)
@@ -75,12 +77,13 @@ class _Absent(Exception):
     """Why a distance cannot be computed here."""
 
 
-def load_perceptual() -> Perceptual:
-    """Loads the installed distances; takes a second or two."""
+def load_perceptual(names: Iterable[str] = PERCEPTUAL) -> Perceptual:
+    """Loads those of these distances that are installed; takes a second or two."""
+    loaders = {"lpips": _lpips, "stlpips": _stlpips, "flip": _flip, VGG: _lpips_vgg}
     distances, absent = {}, {}
-    for name, loader in (("lpips", _lpips), ("stlpips", _stlpips), ("flip", _flip)):
+    for name in names:
         try:
-            distances[name] = loader()
+            distances[name] = loaders[name]()
         except _Absent as error:
             absent[name] = str(error)
         except ModuleNotFoundError as error:
@@ -91,19 +94,34 @@ def load_perceptual() -> Perceptual:
 
 
 def _lpips() -> Distance:
-    import torch
     from torchvision.models import AlexNet_Weights
 
-    # lpips makes torchvision download ImageNet's weights if they are not in this folder
-    weights = Path(torch.hub.get_dir()) / "checkpoints" / Path(AlexNet_Weights.IMAGENET1K_V1.url).name
+    source, network = _lpips_network("alex", AlexNet_Weights.IMAGENET1K_V1.url, spatial=True)
+    return Distance("LPIPS", source, _of_network(network), LPIPS_LEAST)
+
+
+def _lpips_vgg() -> Distance:
+    """As 3D Gaussian Splatting's code calls it: one number, and pictures in 0..1 where the network expects -1..1."""
+    from torchvision.models import VGG16_Weights
+
+    source, network = _lpips_network("vgg", VGG16_Weights.IMAGENET1K_V1.url, spatial=False)
+    return Distance("LPIPS-VGG", source, _of_network(network, low=0.0), LPIPS_LEAST)
+
+
+def _lpips_network(net: str, url: str, *, spatial: bool) -> tuple[str, Any]:
+    """Source and module of LPIPS with a network whose ImageNet weights torchvision has from `url`."""
+    import torch
+
+    # lpips makes torchvision download the weights if they are not in this folder
+    weights = Path(torch.hub.get_dir()) / "checkpoints" / Path(url).name
     if not weights.is_file():
-        raise _Absent(f"its AlexNet weights are not in {weights}")
+        raise _Absent(f"its weights of ImageNet are not in {weights}")
     import lpips
 
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # a deprecation of torchvision
-        network = lpips.LPIPS(net="alex", spatial=True, verbose=False)
-    return Distance("LPIPS", f"lpips {metadata.version('lpips')}, alex", _of_network(network), LPIPS_LEAST)
+        network = lpips.LPIPS(net=net, spatial=spatial, verbose=False)
+    return f"lpips {metadata.version('lpips')}, {net}", network
 
 
 def _stlpips() -> Distance:
@@ -120,13 +138,13 @@ def _stlpips() -> Distance:
     return Distance("ST-LPIPS", source, _of_network(network), STLPIPS_LEAST)
 
 
-def _of_network(network: Any) -> ErrorMap:
-    """The spatial map of an LPIPS-like module, which takes [1, 3, H, W] in -1..1."""
+def _of_network(network: Any, low: float = -1.0) -> ErrorMap:
+    """The error of an LPIPS-like module, which is given [1, 3, H, W] in low..1."""
     import torch
 
     @torch.inference_mode()
     def error_map(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        x, y = (torch.from_numpy(z).permute(2, 0, 1)[None] * 2 - 1 for z in (a, b))
+        x, y = (torch.from_numpy(z).permute(2, 0, 1)[None] * (1 - low) + low for z in (a, b))
         distances: np.ndarray = network(x, y)[0, 0].numpy()
         return distances
 

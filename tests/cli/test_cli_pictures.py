@@ -123,6 +123,31 @@ def test_a_model_keeps_the_background_that_it_is_trained_on(cli, tmp_path, monke
     assert cli("eval", tmp_path / "m.pd4", folder, "--background", "red").code == 2
 
 
+def test_eval_by_the_protocol_of_3dgs(cli, scene_pd4, monkeypatch):
+    """No masks, one LPIPS-VGG a picture; the masked metrics stay in the JSON."""
+    from pd4dgs_codec.data.dataset import load
+    from pd4dgs_codec.quality import perceptual
+    from pd4dgs_codec.quality.image import mpsnr, ssim
+    from pd4dgs_codec.quality.levels import load_levels
+
+    def vgg():
+        return perceptual.Distance("LPIPS-VGG", "by hand", lambda a, b: np.abs(a - b).max())
+
+    source = "synthetic:local?size=32x24&frames=4"
+    options = ("--protocol", "3dgs", "--max-layer", 0)
+    monkeypatch.setattr(perceptual, "_lpips_vgg", vgg)
+    report, plain = (cli("eval", scene_pd4, source, *o, "--json").json for o in (options, options[2:]))
+    (row,), (usual,), level = report["levels"], plain["levels"], load_levels(scene_pd4, 0)[0]
+    pairs = [(level.picture(v.camera, v.time), v.image) for v in load(source).test]
+    assert row["psnr"] == pytest.approx(np.mean([mpsnr(*pair) for pair in pairs])) != row["mpsnr"]
+    assert row["ssim"] == pytest.approx(np.mean([ssim(*pair) for pair in pairs]))
+    assert row["lpips_vgg"] == pytest.approx(np.mean([vgg()(*pair) for pair in pairs]))
+    assert set(row) - set(usual) == {"psnr", "ssim", "lpips_vgg"} and row["mssim"] == usual["mssim"]
+    text = cli("eval", scene_pd4, source, *options).out.decode()
+    assert "protocol 3dgs" in text and text.splitlines()[1].split()[1:6] == ["PSNR", "dB", "moving", "dB", "SSIM"]
+    assert "LPIPS-VGG: by hand" in text and "t-:" not in text
+
+
 def test_eval_of_the_first_bytes(cli, scene_pd4, shared_dataset):
     end = cli("info", scene_pd4, "--json").json["layers"][1]["end"]
     levels = cli("eval", scene_pd4, shared_dataset, "--json", "--max-bytes", end + 5).json["levels"]
@@ -143,7 +168,7 @@ def test_eval_adds_perceptual_distances_and_names_the_absent(cli, scene_pd4, sha
 
     distance = Distance("MAE", "by hand", lambda a, b: np.abs(a - b).mean(axis=2))
     loaded = Perceptual({"mae": distance}, {"lpips": "it is not here"})
-    monkeypatch.setattr("pd4dgs_codec.quality.perceptual.load_perceptual", lambda: loaded)
+    monkeypatch.setattr("pd4dgs_codec.quality.perceptual.load_perceptual", lambda names: loaded)
     command = ("eval", scene_pd4, shared_dataset, "--max-layer", 1)
     result = cli(*command, "--perceptual", "--json")
     assert result.error_lines == ["no lpips: it is not here"]

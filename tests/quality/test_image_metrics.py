@@ -4,6 +4,7 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+import torch
 
 from pd4dgs_codec.data.view import View
 from pd4dgs_codec.errors import DataError
@@ -14,6 +15,7 @@ from pd4dgs_codec.quality.image import (
     moving_regions,
     mpsnr,
     mssim,
+    ssim,
     to_uint8,
 )
 
@@ -192,6 +194,26 @@ def test_psnr_per_level_keeps_the_levels_and_honours_masks():
         return picture
 
     assert level_psnr(draw, (0, 2), VIEWS) == pytest.approx({0: 20 * np.log10(255), 2: 20 * np.log10(255 / 3)})
+
+
+def reference_ssim(a, b):
+    """What utils/loss_utils.py of 3D Gaussian Splatting computes, in float64."""
+    x, y = (torch.from_numpy(z / 255.0).permute(2, 0, 1)[None] for z in (a, b))
+    taps = torch.exp(-((torch.arange(11) - 5.0).double() ** 2) / (2 * 1.5**2))
+    window = (torch.outer(taps, taps) / taps.sum() ** 2).expand(3, 1, 11, 11)
+
+    def blur(z):
+        return torch.nn.functional.conv2d(z, window, padding=5, groups=3)
+
+    mx, my = blur(x), blur(y)
+    vx, vy, cov = blur(x * x) - mx**2, blur(y * y) - my**2, blur(x * y) - mx * my
+    return (((2 * mx * my + 1e-4) * (2 * cov + 9e-4)) / ((mx**2 + my**2 + 1e-4) * (vx + vy + 9e-4))).mean().item()
+
+
+@pytest.mark.parametrize("size", [(15, 17), (7, 40)])
+def test_ssim_is_that_of_3dgs(size):
+    a, b = random_pair(*size)
+    assert ssim(a, b) == pytest.approx(reference_ssim(a, b), abs=1e-12) and ssim(a, a) == pytest.approx(1)
 
 
 def still(time, image, mask=None, x=0.0):

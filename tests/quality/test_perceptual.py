@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.quality.perceptual import Distance, load_perceptual
+from pd4dgs_codec.quality.perceptual import VGG, Distance, load_perceptual
 
 MEAN_DIFFERENCE = Distance("mean difference", "by hand", lambda a, b: np.abs(a - b).mean(axis=2), least=2)
 
@@ -169,6 +169,28 @@ def test_lpips_without_weights_fetches_nothing(monkeypatch, tmp_path):
     monkeypatch.setitem(sys.modules, "lpips", None)  # not even loaded
     monkeypatch.setenv("TORCH_HOME", str(tmp_path))
     assert load_perceptual().absent["lpips"].endswith(str(tmp_path / "hub" / "checkpoints" / "alexnet-x.pth"))
+
+
+def test_vgg_is_called_as_3d_gaussian_splatting_calls_it(monkeypatch, tmp_path):
+    """One number for a picture in 0..1, whatever the mask; only with weights where torchvision keeps them."""
+    given, weights = [], tmp_path / "hub" / "checkpoints" / "vgg16-x.pth"
+    models, lpips = ModuleType("torchvision.models"), ModuleType("lpips")
+    models.VGG16_Weights = SimpleNamespace(IMAGENET1K_V1=SimpleNamespace(url=f"https://example.org/{weights.name}"))
+    lpips.LPIPS = lambda net, spatial, verbose: (
+        lambda *z: given.extend((net, spatial, *z)) or torch.full((1,) * 4, 0.25)
+    )
+    for module in (ModuleType("torchvision"), models, lpips):
+        monkeypatch.setitem(sys.modules, module.__name__, module)
+    monkeypatch.setattr("importlib.metadata.version", lambda name: "0.1.4")
+    monkeypatch.setenv("TORCH_HOME", str(tmp_path))
+    assert load_perceptual([VGG]).absent == {VGG: f"its weights of ImageNet are not in {weights}"}
+    weights.parent.mkdir(parents=True)
+    weights.touch()
+    a, b, _ = pair()
+    distance = load_perceptual([VGG]).distances[VGG]
+    assert distance(a, b) == 0.25 and given[:2] == ["vgg", False] and distance.source == "lpips 0.1.4, vgg"
+    for found, picture in zip(given[2:], (a, b), strict=True):
+        np.testing.assert_allclose(found[0].permute(1, 2, 0), picture / 255, atol=1e-6)
 
 
 def test_stand_ins_do_not_stay(distance):
