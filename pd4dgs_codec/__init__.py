@@ -10,9 +10,7 @@ Importing the package loads none of its modules; each name below loads what it n
 
 from __future__ import annotations
 
-from importlib import import_module
-from typing import TYPE_CHECKING
-
+TYPE_CHECKING = False  # `typing` takes milliseconds, in which an interrupt of a command would print a traceback
 if TYPE_CHECKING:
     from pd4dgs_codec.format.decoder import decode, open_stream
     from pd4dgs_codec.format.encoder import encode
@@ -34,6 +32,8 @@ _HOMES = {
 def __getattr__(name: str) -> object:
     if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    from importlib import import_module
+
     return getattr(import_module(_HOMES[name]), name)
 
 

@@ -8,9 +8,20 @@ from __future__ import annotations
 LONGEST = 400  #: characters of a message; beyond, its middle is left out
 
 
+def printable(text: str, kept: str = "\n") -> str:
+    """What somebody else may have written, fit for terminals, pages and logs. Characters that are not printable, such
+    as those that move the cursor, turn the direction of writing or are halves of pairs, become \\x1b and the like.
+
+    kept: those that stay.
+    """
+    if text.isprintable():
+        return text
+    return "".join(c if c.isprintable() or c in kept else c.encode("unicode_escape").decode() for c in text)
+
+
 def one_line(text: str, longest: int = LONGEST) -> str:
-    """What somebody else may have written, fit for one line on a terminal: printable, and at most so long."""
-    line = " ".join("".join(c if c.isprintable() else " " for c in text).split())
+    """`printable` in one line, of at most so many characters."""
+    line = printable(" ".join(text.split()))
     return line if len(line) <= longest else f"{line[: longest * 2 // 3]} … {line[-longest // 3 + 3 :]}"
 
 

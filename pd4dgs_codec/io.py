@@ -1,7 +1,8 @@
 """Output files that appear whole or not at all, and values that JSON can hold.
 
-A writer gets a path in a temporary folder beside its target. When it is done the file is flushed to the disk and
-renamed to the target in one step. The folder is removed after any failure; a killed process may leave it behind.
+A writer gets a path in a temporary folder beside its target. When it is done the file is flushed to the disk, gets the
+mode of the file that it replaces, and is renamed to the target in one step. The folder is removed after any failure or
+signal; a process that is killed by SIGKILL may leave it behind.
 """
 
 from __future__ import annotations
@@ -18,8 +19,11 @@ from pathlib import Path
 from typing import Any
 
 from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.signals import held
 
 PREFIX = ".pd4dgs-"
+#: Temporary folders that there are.
+_FOLDERS: set[Path] = set()
 
 
 def check_output(path: str | Path, overwrite: bool) -> None:
@@ -56,6 +60,7 @@ def whole_file(path: str | Path, overwrite: bool) -> Iterator[Path]:
     target = Path(os.path.realpath(path))
     with _temporary_folder(target.parent, path) as folder:
         yield folder / target.name
+        _flush(folder / target.name)
         check_output(path, overwrite)  # it may have appeared meanwhile
         _move(folder / target.name, target)
 
@@ -76,9 +81,12 @@ def whole_files(pattern: str, names: Sequence[str], overwrite: bool) -> Iterator
     with _temporary_folder(existing, pattern) as folder:
         temporaries = [folder / Path(name).name for name in names]
         yield temporaries
-        parent.mkdir(parents=True, exist_ok=True)
-        for temporary, name in zip(temporaries, names, strict=True):
-            _move(temporary, Path(name))
+        for temporary in temporaries:
+            _flush(temporary)
+        with held():  # all or none of them
+            parent.mkdir(parents=True, exist_ok=True)
+            for temporary, name in zip(temporaries, names, strict=True):
+                _move(temporary, Path(name))
 
 
 def remove_leftovers(path: str | Path) -> None:
@@ -112,16 +120,33 @@ def _temporary_folder(parent: Path, path: str | Path) -> Iterator[Path]:
     """A folder on the same disk as the output, so that the rename is one step. Errors name the output, not a folder."""
     folder = None
     try:
-        folder = tempfile.mkdtemp(dir=parent, prefix=PREFIX)
-        yield Path(folder)
+        with held():
+            folder = Path(tempfile.mkdtemp(dir=parent, prefix=PREFIX))
+            _FOLDERS.add(folder)
+        yield folder
     except OSError as error:
         raise OSError(error.errno or errno.EIO, error.strerror or str(error), str(path)) from None
     finally:
         if folder is not None:
             shutil.rmtree(folder, ignore_errors=True)
+            _FOLDERS.discard(folder)
+
+
+def remove_temporaries() -> None:
+    """Removes the temporary folders of this process that a signal cut the removal of."""
+    while _FOLDERS:
+        shutil.rmtree(_FOLDERS.pop(), ignore_errors=True)
+
+
+def _flush(temporary: Path) -> None:
+    with temporary.open("r+b") as stream:
+        os.fsync(stream.fileno())  # otherwise a power failure may keep the rename and lose the bytes
 
 
 def _move(temporary: Path, target: Path) -> None:
-    with temporary.open("r+b") as stream:
-        os.fsync(stream.fileno())  # otherwise a power failure may keep the rename and lose the bytes
+    with contextlib.suppress(FileNotFoundError):  # a new file has the mode of new files
+        before = target.stat()
+        with contextlib.suppress(PermissionError):  # only root may give files away
+            os.chown(temporary, before.st_uid, before.st_gid)
+        os.chmod(temporary, stat.S_IMODE(before.st_mode))
     os.replace(temporary, target)

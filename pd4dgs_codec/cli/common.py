@@ -9,15 +9,17 @@ from __future__ import annotations
 import argparse
 import atexit
 import contextlib
+import errno
 import gc
 import io
 import os
 import sys
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from pd4dgs_codec.errors import DecodeError, EncodeError, Pd4Error
+from pd4dgs_codec.errors import DecodeError, EncodeError, Pd4Error, one_line, printable
+from pd4dgs_codec.signals import ignore_more, interruptible
 from pd4dgs_codec.threads import configure
 
 if TYPE_CHECKING:
@@ -28,6 +30,7 @@ if TYPE_CHECKING:
 atexit.register(gc.freeze)
 
 OK, FAILED, USAGE, PARTIAL = 0, 1, 2, 3
+FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  #: a disk has no room
 STDIO = "-"
 
 
@@ -60,17 +63,31 @@ class Console:
 
             from pd4dgs_codec.io import finite
 
-            print(json.dumps(finite(data)), flush=True)
+            show(json.dumps(finite(data)))
         elif on_stdout:
-            print(text, flush=True)
+            show(text)
         else:
             self.message(text)
+
+
+def show(text: str) -> None:
+    """Prints `text` on stdout. Raises OSError that names stdout."""
+    with _naming_stdout():
+        print(printable(text), flush=True)
+
+
+@contextlib.contextmanager
+def _naming_stdout() -> Iterator[None]:
+    try:
+        yield
+    except OSError as error:
+        raise OSError(error.errno, error.strerror or str(error), "stdout") from None
 
 
 def say(text: str) -> None:
     """A line on stderr. If stderr is full or closed, the line is lost and the work goes on."""
     try:
-        print(text, file=sys.stderr, flush=True)
+        print(printable(text), file=sys.stderr, flush=True)
     except OSError:
         _point_at_nothing(sys.stderr)
 
@@ -78,7 +95,7 @@ def say(text: str) -> None:
 def tell(prog: str, text: str) -> int:
     """Prints `text` on stdout as a program's whole output; returns the exit code."""
     try:
-        print(text, flush=True)
+        show(text)
     except OSError as error:
         if not isinstance(error, BrokenPipeError):
             say(f"{prog}: error: stdout: {error.strerror}")
@@ -181,8 +198,9 @@ def write_bytes(path: str, data: bytes, overwrite: bool) -> None:
 
         write_bytes(path, data, overwrite)
         return
-    sys.stdout.buffer.write(data)
-    sys.stdout.buffer.flush()
+    with _naming_stdout():
+        sys.stdout.buffer.write(data)
+        sys.stdout.buffer.flush()
 
 
 # -- running -----------------------------------------------------------------------------------------------------------
@@ -191,9 +209,25 @@ Action = Callable[[argparse.Namespace, Console], int]
 
 
 def run(parser: argparse.ArgumentParser, action: Action, argv: Sequence[str] | None) -> int:
-    """Parses the arguments and runs `action`; every failure becomes one line on stderr and an exit code."""
+    """Parses the arguments and runs `action`; every failure becomes one line on stderr and an exit code.
+
+    ENDING signals end it as a failure. One that comes while a command runs another ends both.
+    """
     open_streams()
     arguments = list(sys.argv[1:] if argv is None else argv)
+    with interruptible() as outermost:
+        try:
+            return _run(parser, action, arguments)
+        except KeyboardInterrupt as error:
+            if not outermost:
+                raise
+            ignore_more()
+            if writing := sys.modules.get("pd4dgs_codec.io"):
+                writing.remove_temporaries()
+            return _fail(parser.prog, error, "interrupted; nothing was written", "--json" in arguments)
+
+
+def _run(parser: argparse.ArgumentParser, action: Action, arguments: list[str]) -> int:
     as_json, verbose = "--json" in arguments, not {"-v", "--verbose"}.isdisjoint(arguments)
     name = ""
     try:
@@ -201,18 +235,21 @@ def run(parser: argparse.ArgumentParser, action: Action, argv: Sequence[str] | N
         name = getattr(args, "input", "")
         configure(getattr(args, "threads", None))  # before numpy, torch and numba are imported
         code = action(args, Console(args))
-        sys.stdout.flush()
+        with _naming_stdout():
+            sys.stdout.flush()
         return code
     except UsageError as error:
         return _fail(parser.prog, error, f"{error}; see {parser.prog} --help", as_json, USAGE)
     except BrokenPipeError:  # the reader closed the pipe, as `| head` does
         _point_at_nothing(sys.stdout)
         return FAILED
-    except (Exception, KeyboardInterrupt) as error:
+    except Exception as error:
         message = _explain(error, shown_name(name))
         if message is None:
             if verbose:
-                raise
+                import traceback
+
+                say(traceback.format_exc().rstrip())
             message = f"internal error, please report it: {type(error).__name__}: {error} (-v shows where)"
         return _fail(parser.prog, error, message, as_json)
 
@@ -233,19 +270,18 @@ def _explain(error: BaseException, name: str) -> str | None:
     if isinstance(error, Pd4Error):
         return str(error)
     if isinstance(error, OSError):
-        where = error.filename or ("stdout" if error.errno else "")  # only writes to a stream carry no name
+        # a library's cache or temporary file has no name
+        where = error.filename or ("a cache or a temporary file" if error.errno in FULL else "")
         return f"{where}: {error.strerror or error}".lstrip(": ")
     if isinstance(error, ModuleNotFoundError) and error.name and not error.name.startswith("pd4dgs_codec"):
         return f"needs the module {error.name}, which is not installed: pip install 'pd4dgs-codec[train]'"
     if isinstance(error, MemoryError):
         return "out of memory"
-    if isinstance(error, KeyboardInterrupt):
-        return "interrupted; nothing was written"
     return None
 
 
 def _fail(prog: str, error: BaseException, message: str, as_json: bool, code: int = FAILED) -> int:
-    line = " ".join(message.split())
+    line = one_line(message)
     say(f"{prog}: error: {line}")
     if as_json:
         import json
@@ -277,6 +313,9 @@ def open_streams() -> None:
         sys.stdout = open(1, "w", encoding="utf-8", closefd=False)  # noqa: SIM115 - it lives as long as the process
     if sys.stderr is None:
         sys.stderr = open(2, "w", encoding="utf-8", closefd=False)  # noqa: SIM115 - likewise
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):  # a terminal may lack the letters of a title
+            stream.reconfigure(errors="backslashreplace")
 
 
 def _point_at_nothing(stream: TextIO) -> None:

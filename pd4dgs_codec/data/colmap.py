@@ -10,8 +10,11 @@ from __future__ import annotations
 
 import re
 import struct
+from collections import Counter
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import replace
+from itertools import dropwhile, islice
 from pathlib import Path
 from typing import Any
 
@@ -19,7 +22,7 @@ import numpy as np
 
 from pd4dgs_codec.data.cameras import Lens, UnreadView, checked_rotation, world_to_camera
 from pd4dgs_codec.data.dataset import COLMAP
-from pd4dgs_codec.data.files import LARGEST, Color, number, read_file
+from pd4dgs_codec.data.files import LARGEST, Color, inside, number, read_file, whole_number
 from pd4dgs_codec.data.posed import LARGEST_TIME, held_out, posed_dataset
 from pd4dgs_codec.data.videos import synchronised_dataset, video_size
 from pd4dgs_codec.data.view import Dataset
@@ -34,7 +37,7 @@ MODELS = {
     "OPENCV": ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2"),
     "OPENCV_FISHEYE": ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4"),
 }
-MAX_SIDE = 65535
+MAX_SIDE, MAX_NUMBER = 65535, 1 << 32
 VIDEOS = (".mp4", ".mov", ".mkv", ".avi", ".webm", ".MP4", ".MOV")
 
 
@@ -48,19 +51,22 @@ def read_colmap(folder: Path, downscale: int, holdout: int, background: Color | 
     model, kind = next((p, k) for p, k in places if all((p / f"{n}{k}").exists() for n in ("cameras", "images")))
     cameras, points, colors = _registered(model, kind)
     if videos := _videos(folder):
-        rig = [_with_video(model, camera, videos, i) for i, camera in enumerate(cameras)]
-        twice = next((c.name for i, c in enumerate(rig) if any(c.image == d.image for d in rig[:i])), None)
-        if twice is not None:
-            raise DataError(f"{model}: two pictures are of the video {twice}, expected one per camera")
+        files = [_video_of(model, camera, videos) for camera in cameras]
+        twice = [video.stem for video, count in Counter(files).items() if count > 1]
+        if twice:
+            raise DataError(f"{model}: two pictures are of the video {twice[0]}, expected one per camera")
+        rig = [_with_video(model, *pair, i) for i, pair in enumerate(zip(cameras, files, strict=True))]
         return synchronised_dataset(folder, rig, points, colors, downscale, holdout)
     pictures = folder / "images" if (folder / "images").is_dir() else folder
     times = _times(folder, [camera.name for camera in cameras])
     frames = []
     for camera, time in zip(cameras, times, strict=True):
-        path = pictures / camera.image
-        if pictures.resolve() not in path.resolve().parents or not path.is_file():
-            raise DataError(f"{model / f'images{kind}'}: {camera.name}: there is no such picture in {pictures}")
-        frames.append(replace(camera, name=camera.image.stem, time=time, image=path))
+        path = inside(pictures, camera.name)
+        with suppress(OSError):  # a name too long for the system
+            if path.is_file():
+                frames.append(replace(camera, name=camera.image.stem, time=time, image=path))
+                continue
+        raise DataError(f"{model / f'images{kind}'}: {camera.name}: there is no such picture in {pictures}")
     return posed_dataset(folder, *held_out(frames, holdout), points, colors, downscale, background=background)
 
 
@@ -74,11 +80,15 @@ def _videos(folder: Path) -> dict[str, Path]:
     return {file.stem: file for file in sorted(place.iterdir()) if file.suffix in VIDEOS}
 
 
-def _with_video(model: Path, camera: UnreadView, videos: dict[str, Path], i: int) -> UnreadView:
+def _video_of(model: Path, camera: UnreadView, videos: dict[str, Path]) -> Path:
     video = videos.get(camera.image.stem) or videos.get(camera.image.parts[0])
     if video is None:
         where = f"{model}: {camera.name}"
         raise DataError(f"{where}: there is no video of this name among {len(videos)}, expected one per picture")
+    return video
+
+
+def _with_video(model: Path, camera: UnreadView, video: Path, i: int) -> UnreadView:
     size, lens = video_size(video), camera.lens
     if size != (lens.width, lens.height):
         found = f"is {size[0]}x{size[1]}, and its camera in {model} {lens.width}x{lens.height}"
@@ -208,25 +218,26 @@ class _Text:
                 if model not in MODELS:
                     raise DataError(f"{where}: camera model {model}, expected one of {', '.join(MODELS)}")
                 width, height, *values = self._values(i, words, 2)
-                yield int(self._values(i, [key], 1)[0]), _lens(model, int(width), int(height), values, where)
+                number, width, height = (self._whole(i, v) for v in (*self._values(i, [key], 1), width, height))
+                yield number, _lens(model, width, height, values, where)
 
     def images(self) -> Iterator[Image]:
         """The registered pictures: two lines each, the second with the matched features."""
-        lines = self.lines
-        while lines and not lines[0][1]:
-            lines = lines[1:]
-        for i, line in lines[::2]:
+        for i, line in islice(dropwhile(lambda line: not line[1], self.lines), 0, None, 2):
             words = line.split(maxsplit=9)
             if not words:
                 continue
             values = self._values(i, words[:9], 9)
             if len(words) < 10:
                 raise DataError(f"{self.path}: line {i} names no picture")
-            yield words[9], int(values[8]), values[1:8]
+            yield words[9], self._whole(i, values[8]), values[1:8]
 
     def points(self) -> Iterator[tuple[float, ...]]:
         """Rows x y z r g b."""
         return (tuple(self._values(i, line.split()[1:7], 6)) for i, line in self.lines if line)
+
+    def _whole(self, i: int, value: float) -> int:
+        return whole_number(value, f"{self.path}: line {i}", low=-MAX_NUMBER, largest=MAX_NUMBER)
 
     def _values(self, i: int, words: list[str], count: int) -> list[float]:
         try:

@@ -13,7 +13,7 @@ from pathlib import Path, PurePosixPath
 from pkgutil import resolve_name
 from typing import TYPE_CHECKING
 
-from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.errors import DataError, one_line
 
 if TYPE_CHECKING:
     from pd4dgs_codec.data.files import Color
@@ -130,7 +130,13 @@ def _read(source: str | Path, downscale: int, holdout: int, background: Color | 
         raise DataError(f"{folder}: found {found}, expected a dataset folder or {SYNTHETIC}NAME")
     for reader in READERS:
         if reader.recognises(folder):
-            return reader.read(folder, downscale, holdout, background)
+            try:
+                return reader.read(folder, downscale, holdout, background)
+            except (DataError, ImportError, MemoryError):
+                raise
+            except Exception as error:  # what no check foresaw in somebody else's files
+                found = f"{type(error).__name__}: {error}"
+                raise DataError(f"{folder}: cannot be read as {reader.name}: {one_line(found, 160)}") from error
     found = "other files" if any(folder.iterdir()) else "an empty folder"
     expected = ", ".join(f"{reader.contents} ({reader.name})" for reader in READERS)
     raise DataError(f"{folder}: found {found}, expected {expected}")

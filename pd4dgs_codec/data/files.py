@@ -5,7 +5,8 @@ from __future__ import annotations
 import contextlib
 import io
 import json
-from collections.abc import Callable, Mapping
+import warnings
+from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -21,6 +22,9 @@ LARGEST = 1e9
 Color = tuple[float, float, float]  #: RGB 0..1
 WHITE = (1.0, 1.0, 1.0)
 IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
+FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")  #: of pictures; one of Pillow's others runs programs
+#: Pixels that pictures of any size may have, and more for each byte of theirs: blank ones of 4K are read.
+FREE_PIXELS, PIXELS_PER_BYTE = 1 << 24, 256
 #: Pillow's pixel modes with one obvious conversion to RGB; others (CMYK, LAB, floats) are refused.
 GREY16_MODES = {"I;16", "I;16L", "I;16B"}
 READABLE_MODES = {"1", "L", "LA", "P", "PA", "RGB", "RGBA", "RGBX"} | GREY16_MODES
@@ -73,9 +77,9 @@ def number(value: Any, where: str, *, positive: bool = False, largest: float = L
     return float(value)
 
 
-def whole_number(value: Any, where: str, low: int = 0) -> int:
+def whole_number(value: Any, where: str, low: int = 0, largest: float = LARGEST) -> int:
     """`value` as an integer >= low; 2.0 is one."""
-    result = number(value, where)
+    result = number(value, where, largest=largest)
     if result != int(result) or result < low:
         raise DataError(f"{where} is {result:g}, expected a whole number >= {low}")
     return int(result)
@@ -121,14 +125,34 @@ def split_options(
 # -- images and masks --------------------------------------------------------------------------------------------------
 
 
+def inside(folder: Path, name: str) -> Path:
+    """The path of `name`, as a file of a dataset gives it, in `folder`. Raises DataError if it leads out of it, also by
+    a link; it need not exist."""
+    path = folder / name
+    with contextlib.suppress(OSError, ValueError, RuntimeError):  # a NUL, a circle of links, a name that is too long
+        if folder.resolve() in path.resolve().parents:
+            return path
+    raise DataError(f"{folder}: {one_line(repr(name), 120)} is not the name of a file in this folder")
+
+
 def find_image(folder: Path, name: str) -> Path:
     """The image file of a `file_path` written with or without its extension."""
     for suffix in IMAGE_SUFFIXES:
-        path = folder / (name + suffix)
+        path = inside(folder, name + suffix)
         with contextlib.suppress(OSError):  # a name too long for the system
             if path.is_file():
                 return path
     raise DataError(f"{folder / name}: image is missing (tried as it is, .png, .jpg and .jpeg)")
+
+
+def check_pixels(count: int, files: Iterable[Path], where: str) -> None:
+    """Raises DataError for pictures of more pixels than files of this size hold: a few kB can unpack to gigabytes."""
+    try:
+        held = FREE_PIXELS + PIXELS_PER_BYTE * sum(file.stat().st_size for file in files)
+    except OSError:
+        return  # whoever reads the file says why it cannot be read
+    if count > held:
+        raise DataError(f"{where}: {count:,} pixels, expected {held:,} at most in pictures of so few bytes")
 
 
 def _open(path: Path, what: str = "image", size: tuple[int, int] | None = None) -> Picture:
@@ -136,11 +160,14 @@ def _open(path: Path, what: str = "image", size: tuple[int, int] | None = None) 
     from PIL import Image  # of the extra `train`
 
     try:
-        picture = Image.open(path)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # of Pillow, about sizes
+            picture = Image.open(path, formats=FORMATS)
     except FileNotFoundError:
         raise DataError(f"{path}: image is missing") from None
-    except (OSError, ValueError, SyntaxError, Image.DecompressionBombError):
-        raise DataError(f"{path}: not an image that can be read") from None
+    except Exception:  # Pillow raises many kinds
+        raise DataError(f"{path}: not an image that can be read, expected {', '.join(FORMATS)}") from None
+    check_pixels(picture.width * picture.height, [path], str(path))
     if size is not None and picture.size != tuple(size):
         picture.close()
         raise DataError(f"{path}: {what} is {picture.width}x{picture.height}, expected {size[0]}x{size[1]}")
@@ -221,7 +248,9 @@ def read_image(path: Path, size: tuple[int, int], *, downscale: int = 1, under: 
         check_downscale(size, downscale, str(path))
         try:
             rgb = _rgb(image, str(path), under)
-        except (OSError, SyntaxError, ValueError) as e:
+        except DataError:
+            raise
+        except Exception as e:
             raise DataError(f"{path}: image data is broken: {e}") from None
         if downscale > 1:
             w, h = size[0] // downscale, size[1] // downscale
@@ -234,7 +263,7 @@ def read_mask(path: Path, size: tuple[int, int], *, downscale: int = 1) -> np.nd
     with _open(path, "mask", size) as image:
         try:
             return shrink_mask(np.array(image.convert("L")) > 0, downscale)
-        except (OSError, SyntaxError, ValueError) as e:
+        except Exception as e:
             raise DataError(f"{path}: mask data is broken: {e}") from None
 
 

@@ -25,6 +25,7 @@ from pd4dgs_codec.data.files import (
     Color,
     array,
     find_image,
+    inside,
     number,
     read_file,
     read_json,
@@ -86,6 +87,8 @@ def _camera(path: Path, factor: int) -> tuple[Lens, np.ndarray, np.ndarray]:
 def _strings(value: Any, where: str) -> list[str]:
     if not isinstance(value, list) or not all(isinstance(v, str) for v in value):
         raise DataError(f"{where} is not a list of frame names")
+    if len(set(value)) < len(value):
+        raise DataError(f"{where} names a frame twice")
     return value
 
 
@@ -137,10 +140,10 @@ def read_cameras(folder: str | Path) -> CameraFiles:
         if not isinstance(entry, dict):
             raise DataError(f"{path}: no entry for frame {name!r}, which the split lists")
         time = number(entry.get("warp_id", entry.get("time_id")), f"{path}: {name}: warp_id", largest=LARGEST_TIME)
-        lens, rotation, position = _camera(folder / "camera" / f"{name}.json", factor)
+        lens, rotation, position = _camera(inside(folder / "camera", f"{name}.json"), factor)
         viewmat = world_to_camera(rotation, (position - center) * scale)
         camera_id = whole_number(entry.get("camera_id", 0), f"{path}: {name}: camera_id")
-        return UnreadView(name, camera_id, time, viewmat, lens, folder / "rgb" / f"{factor}x" / f"{name}.png")
+        return UnreadView(name, camera_id, time, viewmat, lens, inside(folder / "rgb" / f"{factor}x", f"{name}.png"))
 
     train, test = (tuple(frame(name) for name in names) for names in _split_names(folder))
     if not train:
@@ -197,7 +200,7 @@ def _box_and_depth(
 
 def _covisible(view: View, frame: UnreadView, folder: Path, downscale: int) -> View:
     """The view with its covisibility mask."""
-    path = folder / f"{frame.name}.png"
+    path = inside(folder, f"{frame.name}.png")
     if not path.is_file():
         raise DataError(f"{path}: covisibility mask is missing, though others of its folder are there")
     mask = read_mask(path, (frame.lens.width, frame.lens.height), downscale=downscale)

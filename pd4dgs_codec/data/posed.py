@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from pd4dgs_codec.data.cameras import UnreadView, read_view
-from pd4dgs_codec.data.files import WHITE, Color, image_info
+from pd4dgs_codec.data.files import WHITE, Color, check_pixels, image_info
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DataError
 
@@ -19,6 +19,7 @@ LARGEST_TIME, SPAN_TOLERANCE = float(np.finfo(np.float32).max), 1e-3
 BOX_OVER_DISTANCE = 1.3 / 4.0
 #: A border is one colour if this share of it lies within this many 8-bit levels of its median.
 BORDER_SHARE, BORDER_LEVELS = 0.99, 3
+USES = 4  #: of a picture, such as for training and for testing
 T = TypeVar("T")
 Posed = TypeVar("Posed", UnreadView, View)
 
@@ -58,6 +59,10 @@ def posed_dataset(
     border. composite: False drops alpha (photographs), and `background` is the scene's, None for the border's colour.
     """
     frames, under = [*train, *test], (background or WHITE) if composite else None
+    files = {frame.image for frame in frames}
+    if len(frames) > USES * len(files):
+        raise DataError(f"{folder}: {len(frames)} frames are of {len(files)} pictures, expected {USES} of one at most")
+    check_pixels(sum(frame.lens.width * frame.lens.height for frame in frames), files, str(folder))
     behind = background
     if composite:
         behind = under if image_info(train[0].image)[2] else None

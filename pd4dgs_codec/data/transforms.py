@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cache, partial
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +22,7 @@ from pd4dgs_codec.data.files import (
     array,
     find_image,
     image_info,
+    inside,
     number,
     read_json,
     read_only_ply,
@@ -29,7 +31,7 @@ from pd4dgs_codec.data.files import (
 )
 from pd4dgs_codec.data.posed import LARGEST_TIME, held_out, posed_dataset
 from pd4dgs_codec.data.view import Dataset
-from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.errors import DataError, one_line
 
 PINHOLE_MODELS = {"PINHOLE", "SIMPLE_PINHOLE", "OPENCV", "SIMPLE_RADIAL", "RADIAL", "PERSPECTIVE"}
 FISHEYE_MODEL = "OPENCV_FISHEYE"
@@ -62,8 +64,8 @@ def _focal(get: Callable[[str], Any], axis: str, size: int, where: str) -> float
     return number(float(0.5 * size / np.tan(0.5 * angle)), f"{where}: focal length", positive=True)
 
 
-def _lens(file: dict[str, Any], frame: dict[str, Any], image: Path, where: str) -> Lens:
-    """Intrinsics of one frame; its own keys go before the file's."""
+def _lens(file: dict[str, Any], frame: dict[str, Any], size: Callable[[], tuple[int, int]], where: str) -> Lens:
+    """Intrinsics of one frame; its own keys go before the file's. size: of its image, as (width, height)."""
 
     def get(key: str) -> Any:
         return frame.get(key, file.get(key))
@@ -72,10 +74,12 @@ def _lens(file: dict[str, Any], frame: dict[str, Any], image: Path, where: str) 
         return default if get(key) is None else number(get(key), f"{where}: {key}")
 
     if get("w") is None or get("h") is None:
-        width, height, _ = image_info(image)
+        width, height = size()
     else:
         width, height = (whole_number(get(k), f"{where}: {k}", low=1) for k in ("w", "h"))
     model = get("camera_model")
+    if model is not None and not isinstance(model, str):
+        raise DataError(f"{where}: camera_model is {one_line(repr(model), 60)}, expected a name")
     fisheye = model == FISHEYE_MODEL
     if (model is not None and model not in PINHOLE_MODELS and not fisheye) or (value("k4") and not fisheye):
         expected = f"a pinhole or {FISHEYE_MODEL}"
@@ -109,6 +113,7 @@ def _frames(folder: Path, path: Path) -> tuple[list[UnreadView], dict[str, Any]]
     if not isinstance(listed, list) or not listed:
         raise DataError(f"{path}: found no frames, expected a list of at least 1")
     frames = []
+    size = cache(lambda image: image_info(image)[:2])  # each image is opened once
     for i, frame in enumerate(listed):
         where = f"{path}: frame {i}"
         if not isinstance(frame, dict) or not isinstance(frame.get("file_path"), str):
@@ -118,7 +123,8 @@ def _frames(folder: Path, path: Path) -> tuple[list[UnreadView], dict[str, Any]]
         time = i / max(len(listed) - 1, 1)
         if frame.get("time") is not None:
             time = number(frame["time"], f"{where}: time", largest=LARGEST_TIME)
-        frames.append(UnreadView(image.stem, 0, time, viewmat, _lens(file, frame, image, where), image))
+        lens = _lens(file, frame, partial(size, image), where)
+        frames.append(UnreadView(image.stem, 0, time, viewmat, lens, image))
     return frames, file
 
 
@@ -140,5 +146,5 @@ def read_transforms(folder: Path, downscale: int, holdout: int, background: Colo
     frames, file = _frames(folder, train_file)
     train, test = held_out(frames, holdout) if test_file is None else (frames, _frames(folder, test_file)[0])
     named = file.get("ply_file_path")
-    points, colors = read_ply(folder / named) if isinstance(named, str) else read_only_ply(folder)
+    points, colors = read_ply(inside(folder, named)) if isinstance(named, str) else read_only_ply(folder)
     return posed_dataset(folder, train, test, points, colors, downscale, _stored_depth(folder, file), background)

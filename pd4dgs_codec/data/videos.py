@@ -10,25 +10,31 @@ from __future__ import annotations
 import errno
 import hashlib
 import json
+import math
 import os
+import subprocess
 import tempfile
-from collections.abc import Callable, Generator, Iterator, Sequence
-from contextlib import contextmanager
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
 from pd4dgs_codec.data.cameras import Lens, UnreadView, rectify
-from pd4dgs_codec.data.files import check_downscale, shrink_image, shrink_mask
+from pd4dgs_codec.data.files import check_downscale, check_pixels, shrink_image, shrink_mask
 from pd4dgs_codec.data.posed import geometry, without_first_camera
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DataError, one_line
 
 #: Largest width or height, and frames per second: beyond them the header is wrong.
 MAX_SIDE, MAX_FPS = 16_384, 10_000.0
+#: A damaged video is short if it lacks this share of the frames that its header speaks of, and one more.
+SHORT = 0.01
+LAST_BYTES = 4096  #: of ffmpeg's errors that are read
 FOLDER, SIZE, DEFAULT_GIB = "PD4DGS_CACHE", "PD4DGS_CACHE_GIB", 20.0
 #: Of the layout of cache files: frames, the index as JSON, and the length of the index in LENGTH bytes.
 VERSION, LENGTH = 2, 8
@@ -51,57 +57,88 @@ class Video:
     path: Path
     size: tuple[int, int]
     fps: float
-    pictures: Generator[np.ndarray, None, None]
+    pictures: Iterator[np.ndarray]
 
 
 def open_video(path: Path, *, grey: bool = False, output: Sequence[str] = ()) -> Video:
     """Opens a video without decoding a frame. output: further options of ffmpeg, such as a filter.
 
-    Raises DataError of one line if it cannot be opened, and so do the pictures if they cannot be decoded.
+    Raises DataError of one line if it cannot be opened, and so do the pictures if they cannot be decoded, or end before
+    the frames that the header speaks of. Other damage is a warning.
     """
     if not path.is_file():
         raise DataError(f"{path}: found {'no file' if not path.exists() else 'no regular file'}, expected a video")
     from imageio_ffmpeg import read_frames  # of the extra `train`
 
-    pixels: dict[str, Any] = {"pix_fmt": "gray", "bits_per_pixel": 8} if grey else {}
-    reader = read_frames(str(path), output_params=list(output), **pixels)
-    with _failures(path):
+    reader = read_frames(str(path), output_params=list(output))
+    with _failures(path), closing(reader):
         meta: dict[str, Any] = next(reader, {})
-        (width, height), fps = meta["size"], float(meta["fps"])
+        (width, height), fps, seconds = meta["size"], float(meta["fps"]), float(meta["duration"])
     if not (1 <= min(width, height) <= max(width, height) <= MAX_SIDE and 0 < fps < MAX_FPS):
-        reader.close()
         found = f"{width}x{height} at {fps:g} frames per second"
         raise DataError(f"{path}: {found}, expected at most {MAX_SIDE} a side and {MAX_FPS:g}")
+    check_pixels(width * height, [path], str(path))
     shape = (height, width) if grey else (height, width, 3)
-    return Video(path, (width, height), fps, _pictures(reader, path, shape))
+    return Video(path, (width, height), fps, _pictures(path, shape, output, seconds * fps))
 
 
 def video_size(path: Path) -> tuple[int, int]:
     """(width, height) of a video as displayed."""
-    video = open_video(path)
-    video.pictures.close()
-    return video.size
+    return open_video(path).size
 
 
-def _pictures(reader: Any, path: Path, shape: tuple[int, ...]) -> Generator[np.ndarray, None, None]:
-    try:
-        while True:
-            with _failures(path):
-                data = next(reader, None)
-                picture = None if data is None else np.frombuffer(data, np.uint8).reshape(shape)
-            if picture is None:
-                return
-            yield picture
-    finally:
-        reader.close()
+def _pictures(path: Path, shape: tuple[int, ...], output: Sequence[str], promised: float) -> Iterator[np.ndarray]:
+    """promised: the frames that the header speaks of, about; 0 if it does not say."""
+    pixels, size, count = "gray" if len(shape) == 2 else "rgb24", math.prod(shape), 0
+    arguments = ["-i", str(path), "-pix_fmt", pixels, *output, "-f", "rawvideo", "-"]
+    with ffmpeg(arguments, stdout=subprocess.PIPE) as run:
+        assert run.process.stdout is not None
+        while len(data := run.process.stdout.read(size)) == size:
+            yield np.frombuffer(data, np.uint8).reshape(shape)
+            count += 1
+        code, said = run.end()
+    found = f"{count} of {promised:.0f} frames, ffmpeg says {said or code}"
+    if code or data or (said and count < promised * (1 - SHORT) - 1):
+        raise DataError(f"{path}: is damaged: found {found}; expected a whole video")
+    if said:
+        warnings.warn(f"{path}: is damaged: found {found}", stacklevel=2)
+
+
+@dataclass(frozen=True)
+class Ffmpeg:
+    """A running ffmpeg, and the file to which it writes its errors."""
+
+    process: subprocess.Popen[Any]
+    errors: IO[bytes]
+
+    def end(self) -> tuple[int, str]:
+        """Waits for its end: (its exit code, the last error that it wrote, if any)."""
+        code = self.process.wait()
+        self.errors.seek(max(0, self.errors.seek(0, os.SEEK_END) - LAST_BYTES))
+        lines = self.errors.read().decode("utf-8", "replace").strip().splitlines()
+        return code, one_line(lines[-1], 160) if lines else ""
+
+
+@contextmanager
+def ffmpeg(arguments: Sequence[str], **pipes: Any) -> Iterator[Ffmpeg]:
+    """Runs ffmpeg, which does not see the terminal's Ctrl-C, and kills it at the end of the block."""
+    import imageio_ffmpeg
+
+    command = [imageio_ffmpeg.get_ffmpeg_exe(), "-v", "error", *arguments]
+    given: dict[str, Any] = {"stdin": subprocess.DEVNULL, "start_new_session": True} | pipes
+    with tempfile.TemporaryFile() as errors, subprocess.Popen(command, stderr=errors, **given) as process:
+        try:
+            yield Ffmpeg(process, errors)
+        finally:
+            process.kill()
 
 
 @contextmanager
 def _failures(path: Path) -> Iterator[None]:
-    """Turns the exceptions of imageio-ffmpeg into a DataError that names the video."""
+    """Turns the exceptions of imageio-ffmpeg, which reads what ffmpeg prints of a header, into a DataError."""
     try:
         yield
-    except (OSError, RuntimeError, ValueError, KeyError) as error:
+    except Exception as error:  # of many kinds
         # imageio-ffmpeg appends all output of ffmpeg, whose last line names the cause
         said = str(error).strip().rpartition("\n")[2]
         raise DataError(f"{path}: cannot be decoded: {one_line(said, 120)}") from None
@@ -133,6 +170,7 @@ class StoredFrames:
                 data = zstandard.ZstdDecompressor().decompress(stream.read(stop - start), int(np.prod(self.shape)))
             steps = np.frombuffer(data, np.uint8).reshape(self.shape)
         except (OSError, ValueError, zstandard.ZstdError):
+            self.path.unlink(missing_ok=True)
             raise DataError(f"{self.path}: a cached frame is missing or broken; start again to decode anew") from None
         return np.add.accumulate(steps, axis=1, dtype=np.uint8)
 
@@ -176,10 +214,12 @@ def _stored(target: Path) -> StoredFrames | None:
         with target.open("rb") as stream:
             end = stream.seek(-LENGTH, os.SEEK_END)
             stream.seek(end - int.from_bytes(stream.read(LENGTH), "little"))
-            index = json.loads(stream.read()[:-LENGTH])
+            start, index = stream.tell(), json.loads(stream.read()[:-LENGTH])
+        if index["offsets"][-1] != start:
+            return None
         os.utime(target)  # now the most recently used
         return StoredFrames(target, index["offsets"], tuple(index["shape"]), index["fps"])
-    except (OSError, ValueError, KeyError):
+    except (OSError, ValueError, KeyError, TypeError, IndexError):  # a cut or damaged file
         return None
 
 
@@ -193,8 +233,6 @@ def _store(video: Video, target: Path, treat: Callable[[np.ndarray], np.ndarray]
     except OSError as error:
         what = "the disk is full" if error.errno == errno.ENOSPC else error.strerror or str(error)
         raise DataError(f"{target.parent}: cannot keep the frames of {video.path.name}: {what}") from None
-    finally:
-        video.pictures.close()
     return StoredFrames(target, frames.offsets, frames.shape, frames.fps)
 
 

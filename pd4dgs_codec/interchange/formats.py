@@ -21,10 +21,10 @@ from typing import Any
 
 import numpy as np
 
+from pd4dgs_codec.archives import read_tensors
 from pd4dgs_codec.data.files import LARGEST, read_file, read_vertices
 from pd4dgs_codec.errors import DataError, one_line
 from pd4dgs_codec.interchange.splats import MAX_DEGREE, SH_C0, Splats, unit
-from pd4dgs_codec.interchange.tensors import read_tensors
 
 #: Coefficients of the harmonics without the constant, by degree.
 REST = {(degree + 1) ** 2 - 1: degree for degree in range(MAX_DEGREE + 1)}
@@ -174,7 +174,7 @@ def _check_spz(path: Path, data: bytes) -> None:
 
 def read_gsplat(path: Path) -> Splats:
     """A checkpoint of gsplat's trainers: {"splats": state dict}."""
-    content = read_tensors(path)
+    content = read_tensors(read_file(path), str(path))
     state = content.get("splats") if isinstance(content, dict) else None
     wanted = ("means", "quats", "scales", "opacities", "sh0", "shN")
     missing = [name for name in wanted if not isinstance(state, dict) or not isinstance(state.get(name), np.ndarray)]

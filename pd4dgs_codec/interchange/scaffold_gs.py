@@ -18,11 +18,11 @@ from typing import Any
 
 import numpy as np
 
+from pd4dgs_codec.archives import Module, read_tensors
 from pd4dgs_codec.data.cameras import ROTATION_TOLERANCE, world_to_camera
 from pd4dgs_codec.data.files import LARGEST, read_file, read_vertices
 from pd4dgs_codec.data.posed import points_box
 from pd4dgs_codec.errors import DataError
-from pd4dgs_codec.interchange.tensors import Module, read_tensors
 from pd4dgs_codec.morton import MAX_VOXEL
 from pd4dgs_codec.scene import (
     MAX_FEATURE,
@@ -46,6 +46,7 @@ NEAR, FAR = 0.2, 100.0
 UP = (0.0, -1.0, 0.0)  #: of a run without cameras.json
 #: Tolerance of anchors off the grid: this share of a voxel, plus units in the last place of the coordinate.
 OFF_GRID, ULPS = 1e-3, 8
+DEPTH = 4  #: of modules in modules
 #: The layers of each decoder, as TorchScript names them.
 LAYERS = {
     name: ("Linear", "ReLU", "Linear", *end)
@@ -169,16 +170,16 @@ def _decoders(place: Path) -> tuple[dict[str, Any], np.ndarray | None]:
     """(the content of each decoder's file or key, the appearance embedding [pictures, A] or None)."""
     united = place / "checkpoints.pth"
     if united.is_file():
-        content = read_tensors(united)
+        content = _tensors(united)
         if not isinstance(content, dict):
             raise DataError(f"{united}: holds a {type(content).__name__}, expected a dict of state dicts")
         bank, embedding = next((key for key in BANKS if key in content), None), content.get("appearance")
         found, where = {name: content.get(key) for name, key in DECODERS.items()}, united
     else:
         bank = next((name for name in BANKS if (place / name).exists()), None)
-        found = {name: read_tensors(place / f"{key}.pt") for name, key in DECODERS.items()}
+        found = {name: _tensors(place / f"{key}.pt") for name, key in DECODERS.items()}
         where = place / EMBEDDING
-        embedding = read_tensors(where) if where.exists() else None
+        embedding = _tensors(where) if where.exists() else None
     if bank:
         raise DataError(f"{place}: has a bank of features ({bank}), expected a model without one")
     if missing := [DECODERS[name] for name, decoder in found.items() if decoder is None]:
@@ -191,17 +192,20 @@ def _decoders(place: Path) -> tuple[dict[str, Any], np.ndarray | None]:
     return found, tables[0].astype(np.float64)
 
 
+def _tensors(path: Path) -> Any:
+    return read_tensors(read_file(path), str(path))
+
+
 def _flat(content: Any, prefix: str = "") -> dict[str, Any]:
-    """Members of nested modules and dicts under dotted names, as in a state dict; each is entered once."""
+    """Members of nested modules and dicts under dotted names, as in a state dict, down to DEPTH."""
     flat: dict[str, Any] = {}
-    waiting, entered = [(prefix, content)], set()
+    waiting = [(prefix, content)]
     while waiting:
         name, value = waiting.pop()
-        members = vars(value) if isinstance(value, Module) else value
+        members = value.members if isinstance(value, Module) else value
         if not isinstance(members, dict):
             flat[name] = value
-        elif id(value) not in entered:
-            entered.add(id(value))
+        elif name.count(".") < DEPTH:
             waiting += [(f"{name}.{key}" if name else str(key), part) for key, part in members.items()]
     return flat
 
@@ -211,8 +215,8 @@ def _network(
 ) -> Network:
     """Two linear layers with a ReLU between them, and the embedding of the chosen picture in the first bias."""
     if isinstance(decoder, Module):  # state dicts do not name the kinds of layers
-        parts = [part for key, part in vars(decoder).items() if key.isdigit() and isinstance(part, Module)]
-        kinds, usual_kinds = ", ".join(type(part).__name__ for part in parts), ", ".join(LAYERS[name])
+        parts = [part for key, part in decoder.members.items() if key.isdigit() and isinstance(part, Module)]
+        kinds, usual_kinds = ", ".join(part.kind for part in parts), ", ".join(LAYERS[name])
         if kinds != usual_kinds:
             raise DataError(f"{path}: layers are {kinds[:120]}; expected {usual_kinds}")
     tensors = {key: value for key, value in _flat(decoder).items() if isinstance(value, np.ndarray)}
@@ -281,7 +285,7 @@ def read_cameras(path: Path) -> tuple[list[Camera], tuple[float, float, float]]:
         good = good and bool((np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)) <= ROTATION_TOLERANCE).all())
         good = good and bool((np.abs(places) <= LARGEST).all() and (lenses > 0).all() and (lenses <= LARGEST).all())
         good = good and bool((lenses[:, 2:] == np.round(lenses[:, 2:])).all() and lenses[:, 2:].max() <= 65535)
-    except (ValueError, TypeError, KeyError, IndexError, RecursionError, OSError):
+    except (ValueError, TypeError, KeyError, IndexError, OverflowError, RecursionError):
         good = False
     if not good:
         raise DataError(f"{path}: expected a list of cameras with position, rotation, fx, fy, width and height")

@@ -1,4 +1,4 @@
-"""Checkpoints: versioned, self-describing, and loaded with `weights_only=True`, so that a file cannot run code.
+"""Checkpoints: versioned, self-describing, and read by `archives` as data, so that a file cannot run code.
 
 A checkpoint is a dict {"format", "version", "digest", "info", "steps", "deformations", "state": tensors, "training"}.
 Shapes come from the tensors; loading does not need the configuration that made the model. "training" is the state for
@@ -10,8 +10,6 @@ from __future__ import annotations
 import hashlib
 import io
 import os
-import pickle
-from contextlib import nullcontext
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -19,7 +17,8 @@ from typing import Any, BinaryIO
 import numpy as np
 import torch
 
-from pd4dgs_codec.errors import DataError, Pd4Error
+from pd4dgs_codec.archives import read_tensors
+from pd4dgs_codec.errors import DataError, one_line
 from pd4dgs_codec.format.check import check_scene
 from pd4dgs_codec.io import write_bytes
 from pd4dgs_codec.model.convert import from_scene
@@ -67,38 +66,27 @@ def target(path: str | Path) -> Path:
 def load(path: str | Path | BinaryIO) -> tuple[Model, dict[str, Any]]:
     """(model, training) of a checkpoint. DataError, of one line, for any other or damaged file."""
     try:
-        content = torch.load(path, map_location="cpu", weights_only=True)
+        raw = Path(path).read_bytes() if isinstance(path, (str, Path)) else path.read()
     except FileNotFoundError:
         raise DataError(f"{path}: no such checkpoint") from None
-    except (IsADirectoryError, PermissionError) as error:
-        raise DataError(f"{path}: cannot be read: {error.strerror}") from None
-    except Exception as error:  # torch raises many kinds for a broken zip archive
-        if isinstance(error, pickle.UnpicklingError) and _begins_as_torch_files(path):
-            found = "refused, it holds pickled code or objects"
-            raise DataError(f"{path}: {found}; expected a {FORMAT} of tensors") from None
-        raise DataError(f"{path}: not a readable checkpoint; expected a {FORMAT} file") from None
+    except (OSError, ValueError) as error:  # ValueError: a NUL in the name
+        raise DataError(f"{path}: cannot be read: {getattr(error, 'strerror', error)}") from None
+    content = read_tensors(raw, str(path), lambda array: torch.from_numpy(np.array(array)))
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise DataError(f"{path}: not a {FORMAT}; found {_describe(content)}")
     version = content.get("version")
     if type(version) is not int or version != VERSION:  # True is an int too, and equal to 1
         raise DataError(f"{path}: {FORMAT} version {version!r}, expected {VERSION}")
-    if content.get("digest") != _digest(content):
-        raise DataError(f"{path}: damaged: its digest does not match its content")
     try:
+        if content.get("digest") != _digest(content):
+            raise DataError(f"{path}: damaged: its digest does not match its content")
         _refuse_not_finite(content["state"])
         return _build(content), dict(content["training"])
-    except (
-        KeyError, TypeError, ValueError, IndexError, RuntimeError, AttributeError, MemoryError, Pd4Error
-    ) as error:  # fmt: skip
-        reason = " ".join(str(error).split())  # torch's messages have several lines
+    except Exception as error:  # of many kinds, for a file that lies about its content
+        reason = one_line(str(error))  # torch's messages have several lines
+        if isinstance(error, DataError) and reason.startswith(f"{path}: damaged"):
+            raise
         raise DataError(f"{path}: a {FORMAT} with missing or misshapen content: {reason}") from None
-
-
-def _begins_as_torch_files(path: str | Path | BinaryIO) -> bool:
-    """Whether it is a zip archive or a binary pickle: torch refuses pickled objects and any text by the same error."""
-    with open(path, "rb") if isinstance(path, (str, Path)) else nullcontext(path) as stream:
-        stream.seek(0)
-        return stream.read(2).startswith((b"PK", b"\x80"))
 
 
 def _digest(content: dict[str, Any]) -> str:

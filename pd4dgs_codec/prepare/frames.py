@@ -59,7 +59,6 @@ class VideoFile:
 
     def __init__(self, path: Path):
         video = open_video(path)
-        video.pictures.close()
         self.path, self.size, self.fps = path, video.size, video.fps
 
     def looks(self) -> Iterator[np.ndarray]:

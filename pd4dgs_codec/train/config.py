@@ -223,7 +223,7 @@ class TrainConfig:
         try:
             config: TrainConfig = _rebuilt(json.loads(text), TrainConfig())
             return config
-        except (ValueError, TypeError, AttributeError) as error:
+        except (ValueError, TypeError, AttributeError, RecursionError) as error:
             raise TrainError(f"{path}: its stored configuration cannot be read: {error}") from None
 
 
@@ -244,7 +244,13 @@ def at_quality(quality: float) -> dict[str, float]:
 
 
 def _rebuilt(plain: Any, like: Any) -> Any:
-    """JSON data as a value of the same type as `like`: nested dataclasses, and tuples for lists."""
+    """JSON data as a value of the same type as `like`: nested dataclasses, and tuples for lists. Raises ValueError,
+    TypeError or AttributeError."""
     if is_dataclass(like) and not isinstance(like, type):
         return type(like)(**{name: _rebuilt(value, getattr(like, name)) for name, value in plain.items()})
-    return tuple(plain) if isinstance(plain, list) else plain
+    if isinstance(like, tuple):
+        return tuple(_rebuilt(value, like[0]) for value in plain)
+    kind = (int, float) if isinstance(like, float) else type(like)
+    if like is not None and not isinstance(plain, kind) or isinstance(plain, (list, dict)):
+        raise ValueError(f"{plain!r} where {like!r} is usual")
+    return plain

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import json
+import math
 import signal
 import threading
 import time
@@ -199,8 +200,10 @@ class Trainer:
             raise TrainError(f"{path}: holds no training state (it was decoded or stripped); cannot resume from it")
         try:
             self.learner.restore(model, training)
-            self.seconds, self.curve = float(training["seconds"]), list(json.loads(training["curve"]))
-        except (KeyError, TypeError, ValueError, RuntimeError, AttributeError) as error:
+            self.seconds, self.curve = float(training["seconds"]), _curve(training["curve"])
+            if not 0 <= self.seconds < math.inf:
+                raise ValueError(f"seconds are {self.seconds}")
+        except Exception as error:  # of many kinds
             reason = " ".join(f"{type(error).__name__}: {error}".split())  # torch's messages have several lines
             raise DataError(f"{path}: its training state cannot be read: {reason}") from None
         order, count = self.learner.order, len(self.dataset.train)
@@ -208,6 +211,14 @@ class Trainer:
             raise DataError(
                 f"{path}: its next views are {order[:8]}, found {count} training views; expected the same data"
             )
+
+
+def _curve(text: str) -> list[dict[str, Any]]:
+    """The curve in a checkpoint. Raises ValueError, KeyError or TypeError."""
+    rows = list(json.loads(text))
+    if not all(math.isfinite(v) for row in rows for v in (row["iteration"], row["seconds"], *row["psnr"])):
+        raise ValueError("a curve that is not finite")
+    return rows
 
 
 class RecordLog:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections import OrderedDict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -26,6 +27,7 @@ from pd4dgs_codec.train.ssim import pixel_weights
 
 #: Bytes of images on the device, weights included, beyond which the least recently used are dropped.
 KEPT_BYTES = 1 << 30
+MOST_STEPS = 1 << 31  #: of a run that is resumed
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,10 +203,21 @@ class TrainState:
 
     def restore(self, model: Model, state: dict[str, Any]) -> None:
         """Continues with `model` from a `state`. A broken state raises its first fault's own exception."""
+        if model.widths != self.model.widths:
+            raise ValueError(f"a model of {model.widths}, where its configuration has {self.model.widths}")
+        fresh = fresh_statistics(len(model.anchor_q), self.config.slots)
+        for name, value in fresh.items():
+            if state["densifier"][name].shape != value.shape:
+                raise ValueError(f"{name} of shape {tuple(state['densifier'][name].shape)}, not {tuple(value.shape)}")
+        for name, most in (("iteration", MOST_STEPS), ("skipped", MOST_STEPS), ("total", MOST_STEPS), ("share", 1)):
+            if not 0 <= state[name] <= most:
+                raise ValueError(f"{name} is {state[name]!r}, not from 0 to {most}")
+        if not math.isfinite(state["rho"]):
+            raise ValueError(f"rho is {state['rho']!r}")
         self.model = model.to(self.device)
         self.optimiser = Optimiser(self.model, self.config.rates, self.config.cooldown)
         self.optimiser.load_state(state["optimiser"])
-        self.statistics = {name: state["densifier"][name] for name in self.statistics}
+        self.statistics = {name: state["densifier"][name].float() for name in fresh}
         self.generator.set_state(state["generator"])
         self.noise.generator.set_state(state["noise"])
         self.iteration, self.skipped = int(state["iteration"]), int(state["skipped"])

@@ -164,7 +164,7 @@ CASES: list[tuple[str, str, Any, str]] = [
     ("record3d", "rgbd/3.png", None, "image is missing"),
     ("panoptic", "train_meta.json", lambda m: m | {"k": m["k"][:1]}, "lists of as many instants"),
     ("panoptic", "train_meta.json", lambda m: m | {"fn": [row[:1] for row in m["fn"]]}, "instant 0: expected k, w2c"),
-    ("panoptic", "train_meta.json", {"fn": [["../x.png"] * CAMERAS] * INSTANTS}, "is not the name of a picture"),
+    ("panoptic", "train_meta.json", {"fn": [["../x.png"] * CAMERAS] * INSTANTS}, "../x.png' is not the name"),
     ("panoptic", "train_meta.json", {"fn": [["9/a.png"] * CAMERAS] * INSTANTS}, "image is missing"),
     (
         "panoptic", "train_meta.json", {"w2c": [[(2 * np.eye(4)).tolist()] * CAMERAS] * INSTANTS},
@@ -173,7 +173,7 @@ CASES: list[tuple[str, str, Any, str]] = [
     ("panoptic", "train_meta.json", {"k": [[np.zeros((3, 3)).tolist()] * CAMERAS] * INSTANTS}, "with fx, fy > 0"),
     ("panoptic", "train_meta.json", {"w": 7}, "expected 7x"),
     ("panoptic", "train_meta.json", {"h": 0}, "h is 0"),
-    ("panoptic", "init_pt_cld.npz", bomb(), "unpacks to more than 1,000,000 bytes"),
+    ("panoptic", "init_pt_cld.npz", bomb(), "data unpacks to more than 1,"),
     ("panoptic", "init_pt_cld.npz", npy(np.array([{}]), archive=True), "data: not a .npy file"),
     ("panoptic", "init_pt_cld.npz", npy(np.zeros((4, 2)), archive=True), "expected numbers [M, 6]"),
     ("panoptic", "init_pt_cld.npz", b"no archive", "not an archive of numpy"),
@@ -194,7 +194,7 @@ CASES: list[tuple[str, str, Any, str]] = [
         "colmap", MODEL + "cameras.bin", lambda data: data.replace(struct.pack("<ii", 7, 1), struct.pack("<ii", 7, 9)),
         "camera model number 9, expected one of",
     ),
-    ("colmap", MODEL + "images.bin", lambda data: data.replace(b"cam/frame_0002", b"../frame_00002"), "no such pic"),
+    ("colmap", MODEL + "images.bin", lambda data: data.replace(b"cam/frame_0002", b"../frame_00002"), "is not the n"),
     ("colmap", MODEL + "images.bin", bytes(8), "no picture is registered"),
     ("colmap", "times.txt", b"cam/frame_0000.png 1\n", "has no line for cam/frame_0002.png"),
     ("colmap", "times.txt", b"cam/frame soon\n", "line 1 is 'cam/frame soon', expected NAME SECONDS"),
@@ -229,10 +229,9 @@ def changed(path: Path, change: Any) -> None:
 
 
 @pytest.mark.parametrize("layout", LAYOUTS)
-def test_broken_folders(layout, scene, tmp_path, monkeypatch, refused):
+def test_broken_folders(layout, scene, tmp_path, refused):
     if layout in ("neu3d", "videos"):
         pytest.importorskip("imageio_ffmpeg")
-    monkeypatch.setattr("pd4dgs_codec.data.rigs.MAX_POINTS_BYTES", 1_000_000)
     folder = LAYOUTS[layout](scene, tmp_path / "set")
     for name, change, text in [case[1:] for case in CASES if case[0] == layout]:
         path = folder / name

@@ -31,7 +31,7 @@ def test_frames_are_decoded_once(folder, monkeypatch, cache):
 
     monkeypatch.setattr(cached, "_store", never)
     np.testing.assert_array_equal(first.train[3].image, load(folder).train[3].image)
-    with pytest.raises(AssertionError, match="decoded twice"):
+    with pytest.raises(DataError, match="decoded twice"):
         load(folder, downscale=2)
 
 

@@ -11,11 +11,11 @@ import pytest
 import torch
 from test_formats import make_splats
 
+from pd4dgs_codec.archives import read_tensors
 from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.formats import ply_bytes, read_splats
 from pd4dgs_codec.interchange.scaffold_gs import read_cameras
 from pd4dgs_codec.interchange.teacher import read_model
-from pd4dgs_codec.interchange.tensors import read_tensors
 
 CASES = 150
 
@@ -63,7 +63,7 @@ def _cameras(path: Path) -> None:
     "name, make, read",
     [
         ("ckpt.pt", _gsplat, lambda path: read_model(str(path), 30).splats(0)),
-        ("mlp.pt", _script, read_tensors),
+        ("mlp.pt", _script, lambda path: read_tensors(path.read_bytes(), str(path))),
         ("a.ply", _ply, read_splats),
         ("cameras.json", _cameras, read_cameras),
     ],

@@ -1,0 +1,209 @@
+"""Tensors from the files of torch and of TorchScript, read as data: nothing in a file is called.
+
+Both are zip archives with a pickle `data.pkl` and one member per storage. The machine below knows the operations and
+the names that such pickles need and refuses all others. What it makes takes memory and time in proportion to the file:
+members that it reads are not compressed, tensors hold no more bytes than the file, lists, dicts and tensors have one
+place each, and keys are short texts or numbers. `torch.load(weights_only=True)` has none of these
+bounds, and refuses TorchScript.
+"""
+
+from __future__ import annotations
+
+import io
+import math
+import pickletools
+import zipfile
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from pd4dgs_codec.errors import DataError, one_line
+
+#: Torch's names of storages and what they hold.
+STORAGES = dict(
+    FloatStorage="<f4", DoubleStorage="<f8", HalfStorage="<f2", LongStorage="<i8", IntStorage="<i4", ShortStorage="<i2",
+    CharStorage="i1", ByteStorage="u1", BoolStorage="?",
+)  # fmt: skip
+MAX_PICKLE = 1 << 21  #: bytes of data.pkl
+SHORT, FEW = 256, 4  #: most characters of a key, and of a text that a pickle refers to again; values of such a tuple
+VALUES = {"BININT", "BININT1", "BININT2", "LONG1", "BINFLOAT", "BINUNICODE", "SHORT_BINUNICODE"}
+CONSTANTS = {"NONE": None, "NEWTRUE": True, "NEWFALSE": False, "EMPTY_TUPLE": ()}
+TUPLES = {"TUPLE1": 1, "TUPLE2": 2, "TUPLE3": 3}
+
+
+class Name(NamedTuple):
+    """A name in a pickle, such as that of a class."""
+
+    module: str
+    name: str
+
+
+class Module:
+    """A module of a TorchScript file. kind: the name of its class. members: by name."""
+
+    def __init__(self, kind: str):
+        self.kind, self.members = kind, dict[str, Any]()
+
+
+class Refused(Exception):
+    """A file holds something else than tensors, or more than its bytes."""
+
+
+ORDERED = Name("collections", "OrderedDict")
+TENSOR, PARAMETER = Name("torch._utils", "_rebuild_tensor_v2"), Name("torch._utils", "_rebuild_parameter")
+
+
+def read_tensors(raw: bytes, where: str, made: Callable[[np.ndarray], Any] = lambda array: array) -> Any:
+    """The content of a file: dicts, lists, tuples, scalars, modules, and tensors as `made` of a read-only array.
+
+    Raises DataError, which begins with `where`, for anything else.
+    """
+    try:
+        with zipfile.ZipFile(io.BytesIO(raw)) as archive:
+            return _Machine(archive, len(raw), made).result
+    except Refused as error:
+        raise DataError(f"{where}: refused: {error}; expected tensors alone") from None
+    except Exception as error:  # zipfile, pickletools and a broken pickle raise many kinds
+        reason = one_line(f"{type(error).__name__}: {error}", 120)
+        raise DataError(f"{where}: not a zip archive of tensors as torch writes it ({reason})") from None
+
+
+class _Machine:
+    """Runs the pickle of an archive of so many bytes; `result` is what it makes."""
+
+    def __init__(self, archive: zipfile.ZipFile, size: int, made: Callable[[np.ndarray], Any]):
+        members = archive.infolist()
+        if sum(member.compress_size for member in members) > size:
+            raise Refused("members overlap")
+        pickles = [member for member in members if member.filename.split("/")[1:] == ["data.pkl"]]
+        if len(pickles) != 1 or pickles[0].file_size > MAX_PICKLE:
+            raise Refused(f"{len(pickles)} members NAME/data.pkl, expected one of {MAX_PICKLE:,} bytes at most")
+        self.archive, self.left, self.made = archive, size, made
+        self.prefix = pickles[0].filename.removesuffix("data.pkl")
+        if f"{self.prefix}byteorder" in archive.NameToInfo and self._read("byteorder") != b"little":
+            raise Refused("numbers that are not little-endian")
+        self.stack: list[Any] = []
+        self.marks: list[int] = []
+        self.memo: dict[int, Any] = {}
+        self.storages: dict[str, bytes] = {}
+        for operation, argument, _ in pickletools.genops(self._read("data.pkl")):
+            self._step(operation.name, argument)
+        (self.result,) = self.stack
+
+    def _read(self, name: str) -> bytes:
+        """The bytes of a member. torch compresses none of these."""
+        member = self.archive.getinfo(f"{self.prefix}{name}")
+        if member.compress_type != zipfile.ZIP_STORED or member.file_size != member.compress_size:
+            raise Refused(f"member {name!r} is compressed")
+        return self.archive.read(member)
+
+    def _step(self, name: str, argument: Any) -> None:
+        stack = self.stack
+        if name in VALUES:
+            stack.append(argument)
+        elif name in CONSTANTS:
+            stack.append(CONSTANTS[name])
+        elif name in ("BINPUT", "LONG_BINPUT", "MEMOIZE"):
+            self.memo[len(self.memo) if name == "MEMOIZE" else argument] = stack[-1]
+        elif name in ("BINGET", "LONG_BINGET"):
+            stack.append(_again(self.memo[argument]))
+        elif name == "MARK":
+            self.marks.append(len(stack))
+        elif name in ("EMPTY_DICT", "EMPTY_LIST"):
+            stack.append({} if name == "EMPTY_DICT" else [])
+        elif name == "TUPLE" or name in TUPLES:
+            stack.append(tuple(self._taken(TUPLES.get(name))))
+        elif name in ("SETITEM", "SETITEMS"):
+            _set(self._taken(2 if name == "SETITEM" else None), stack[-1])
+        elif name in ("APPEND", "APPENDS"):
+            items = self._taken(1 if name == "APPEND" else None)
+            list.extend(stack[-1], items)
+        elif name in ("GLOBAL", "STACK_GLOBAL"):
+            stack.append(_known(*(argument.split(" ", 1) if name == "GLOBAL" else self._taken(2))))
+        elif name == "BINPERSID":
+            stack.append(self._storage(*stack.pop()))
+        elif name in ("REDUCE", "NEWOBJ"):
+            stack.append(self._call(*self._taken(2)))
+        elif name == "BUILD":
+            self._build(*self._taken(1))
+        elif name not in ("PROTO", "FRAME", "STOP"):
+            raise Refused(f"the pickle has the operation {name}")
+
+    def _taken(self, count: int | None) -> list[Any]:
+        """The last `count` values of the stack, or those since the last mark, which leave it."""
+        start = self.marks.pop() if count is None else len(self.stack) - count
+        if start < 0:
+            raise Refused("a pickle that ends in its middle")
+        values = self.stack[start:]
+        del self.stack[start:]
+        return values
+
+    def _storage(self, kind: Any, dtype: Any, key: Any, _: Any, count: Any) -> np.ndarray:
+        """A storage as a 1-D array."""
+        if kind != "storage" or not isinstance(dtype, np.dtype) or not str(key).isdigit():
+            raise Refused("a storage of an unknown kind")
+        if key not in self.storages:
+            self.storages[key] = self._read(f"data/{key}")
+        values = np.frombuffer(self.storages[key], dtype)
+        if len(values) != count:
+            raise Refused(f"a storage of {len(values)} numbers that should hold {one_line(str(count), 24)}")
+        return values
+
+    def _call(self, what: Any, values: Any) -> Any:
+        if what == ORDERED and values == ():
+            return {}
+        if what == TENSOR:
+            return self._tensor(*values)
+        if what == PARAMETER:
+            return values[0]
+        if isinstance(what, Name) and what.module.startswith("__torch__."):
+            return Module(what.name)
+        raise Refused("the pickle makes something of what is no class")
+
+    def _build(self, state: Any) -> None:
+        """Members of a module; those of an OrderedDict are torch's own notes."""
+        if isinstance(self.stack[-1], Module):
+            self.stack[-1].members.update(state)
+        elif not isinstance(self.stack[-1], dict):
+            raise Refused("the pickle gives members to what is no module")
+
+    def _tensor(self, storage: np.ndarray, offset: int, size: tuple[int, ...], stride: tuple[int, ...], *_: Any) -> Any:
+        """A tensor, a view of its storage."""
+        whole = all(type(v) is int and v >= 0 for v in (offset, *size, *stride)) and len(size) == len(stride)
+        count = math.prod(size) if whole else -1
+        last = offset + sum((n - 1) * step for n, step in zip(size, stride, strict=True)) if whole and count else offset
+        if not whole or count > len(storage) or (count and last >= len(storage)):
+            raise Refused("a tensor that reaches beyond its storage")
+        self.left -= count * storage.itemsize
+        if self.left < 0:
+            raise Refused("tensors of more bytes than the file")
+        strides = tuple(step * storage.itemsize for step in stride)
+        return self.made(np.lib.stride_tricks.as_strided(storage[offset:], tuple(size), strides, writeable=False))
+
+
+def _known(module: str, name: str) -> Any:
+    """A name that files of tensors need."""
+    if module == "torch" and name in STORAGES:
+        return np.dtype(STORAGES[name])
+    found = Name(module, name)
+    if found not in (ORDERED, TENSOR, PARAMETER) and not module.startswith("__torch__."):
+        raise Refused(f"the pickle asks for {one_line(f'{module}.{name}', 80)}")
+    return found
+
+
+def _again(value: Any) -> Any:
+    """What a pickle refers to again: names, short texts and tuples of few; else few bytes would stand for gigabytes."""
+    parts = value if isinstance(value, tuple) and len(value) <= FEW else (value,)
+    if not all(isinstance(v, (int, float, np.dtype)) or isinstance(v, str) and len(v) <= SHORT for v in parts):
+        raise Refused("a part that has two places")
+    return value
+
+
+def _set(items: list[Any], target: Any) -> None:
+    if not isinstance(target, dict) or len(items) % 2:
+        raise Refused("a pickle that sets items of what is no dict")
+    for key in items[::2]:
+        if not (isinstance(key, str) and len(key) <= SHORT or isinstance(key, int)):
+            raise Refused(f"a key that is no short text: {one_line(repr(key), 60)}")
+    target.update(zip(items[::2], items[1::2], strict=True))
