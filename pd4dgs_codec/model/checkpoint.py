@@ -71,6 +71,8 @@ def load(path: str | Path | BinaryIO) -> tuple[Model, dict[str, Any]]:
         raise DataError(f"{path}: no such checkpoint") from None
     except (OSError, ValueError) as error:  # ValueError: a NUL in the name
         raise DataError(f"{path}: cannot be read: {getattr(error, 'strerror', error)}") from None
+    if not raw.startswith(b"PK"):  # a zip archive, as torch writes it
+        raise DataError(f"{path}: not a readable checkpoint; expected a {FORMAT} file")
     content = read_tensors(raw, str(path), lambda array: torch.from_numpy(np.array(array)))
     if not isinstance(content, dict) or content.get("format") != FORMAT:
         raise DataError(f"{path}: not a {FORMAT}; found {_describe(content)}")

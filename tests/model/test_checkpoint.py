@@ -91,7 +91,7 @@ def test_a_pickle_that_wants_to_run_code_is_refused_unrun(path, tmp_path, zipped
     content = torch.load(path, weights_only=True)
     content["training"] = Trap(target)
     torch.save(content, path, _use_new_zipfile_serialization=zipped)
-    message = refusal(path, "refused" if zipped else "not a zip archive")
+    message = refusal(path, "refused" if zipped else "not a readable checkpoint")
     assert not target.exists() and "\n" not in message
     torch.load(path, weights_only=False)  # the trap works
     assert target.exists()
@@ -249,7 +249,7 @@ def test_a_link_stays_one_and_a_pipe_is_refused(path, tmp_path):
 
 def test_text_is_not_called_pickled_code(tmp_path):
     (tmp_path / "m.pt").write_text("hello")
-    assert "pickled" not in refusal(tmp_path / "m.pt", "not a zip archive")
+    assert "pickled" not in refusal(tmp_path / "m.pt", "not a readable checkpoint")
 
 
 def test_a_folder_that_is_not_there(tmp_path):
