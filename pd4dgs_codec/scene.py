@@ -76,6 +76,11 @@ class Widths:
         return {name: self.feature + VIEW_DIM * (name in self.viewing) for name in SCAFFOLD_NETWORKS}
 
     @property
+    def shapes_are_blind(self) -> bool:
+        """Whether nothing of an anchor's Gaussians but their colours depends on the eye."""
+        return not {"opacity", "covariance"} & {*self.viewing}
+
+    @property
     def networks(self) -> dict[str, int]:
         """Output width of each of the scaffold's decoders."""
         return dict(zip(SCAFFOLD_NETWORKS, (self.slots, 7 * self.slots, 3 * self.slots), strict=True))

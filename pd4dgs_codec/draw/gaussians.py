@@ -137,8 +137,8 @@ def fusible(networks: Sequence[Sequence[tuple[Any, Any]]]) -> bool:
 
 
 class Decoders:
-    """The scaffold's networks, opacity, covariance and colour, packed for the kernels; or the first two alone, for
-    Gaussians whose colours are 0. A network that does not take the direction has weights of 0 for it here."""
+    """The scaffold's networks, opacity, covariance and colour, packed for the kernels. One that does not take the
+    direction has weights of 0 for it here."""
 
     def __init__(self, given: Sequence[Network | Sequence[Layer]], features: int, functions: Functions = NUMPY):
         """features: D, numbers of an anchor's feature."""
@@ -168,19 +168,18 @@ class Decoders:
 
     def make(self, anchors: Array, mask: Array, look: Look, keep: Array) -> Made:
         """The Gaussians of the kept slots of anchors under mask [n]."""
-        shape, *colors = (head(keep, *hidden) for head, hidden in zip(self._heads, look.hidden, strict=True))
+        shape, color = (head(keep, *hidden) for head, hidden in zip(self._heads, look.hidden, strict=True))
         _, sigmoid, exp = self._functions
         relative, extent = sigmoid(shape), exp(np.ascontiguousarray(anchors[:, SCALING]))
-        color = sigmoid(colors[0]) if colors else np.zeros((len(keep), 3), anchors.dtype)
         gaussians, gates = np.empty((len(keep), GAUSSIAN_WIDTH), anchors.dtype), np.empty(len(keep), anchors.dtype)
-        assemble(gaussians, gates, keep, anchors, extent, look.opacity, mask, shape, relative, color)
+        assemble(gaussians, gates, keep, anchors, extent, look.opacity, mask, shape, relative, sigmoid(color))
         return Made(gaussians, gates, shape, relative, extent)
 
     def backward(
         self, anchors: Array, look: Look, keep: Array, made: Made, g: Array, g_gates: Array
     ) -> tuple[Array, Array, list[Layer]]:
         """The gradients by anchors, by mask [n] and by each layer of each network, from those by the Gaussians and
-        their gates. Of three fused networks alone."""
+        their gates. Of fused networks alone."""
         parts = kernel_threads()
         g_anchors, g_opacity, g_mask = np.zeros_like(anchors), np.zeros_like(look.opacity), np.zeros_like(look.distance)
         g_shape, g_color = np.empty_like(made.shape), np.empty((len(g), 3), g.dtype)

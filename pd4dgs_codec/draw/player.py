@@ -5,13 +5,18 @@ The two agree to rounding: activations differ in the last bit.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from pd4dgs_codec.draw.deformation import Field, constant_network, still
 from pd4dgs_codec.draw.gaussians import (
+    COLOR,
+    GAUSSIAN_WIDTH,
     MIN_OPACITY,
     OFFSET_REACH,
     SIGMA_REACH,
+    Colors,
     Decoders,
     Gaussians,
     check_time,
@@ -37,8 +42,9 @@ from pd4dgs_codec.scene import (
 class Player:
     """Draws the highest level of a decoded scene.
 
-    The anchors' residuals at one time are kept: a second view at that time evaluates only anchors that the first did
-    not. Not for several threads at once.
+    What does not depend on the eye is kept at one time: the anchors' residuals and, where opacity and covariance do not
+    take the view direction, from the second view on their Gaussians without the colours. Further views at that time
+    evaluate only anchors that were not met, and colours. Not for several threads at once.
     """
 
     def __init__(self, scene: Scene):
@@ -56,12 +62,17 @@ class Player:
         box = scene.info.box
         fields = (scene.global_deformation, scene.widths.global_heads), (scene.local_deformation, LOCAL_HEADS)
         self._global, self._local = (None if field is None else Field(field, box, heads) for field, heads in fields)
-        self._decoders = Decoders([scene.networks[name] for name in SCAFFOLD_NETWORKS], scene.widths.feature)
+        networks, widths = [scene.networks[name] for name in SCAFFOLD_NETWORKS], scene.widths
+        self._decoders = Decoders(networks, widths.feature)
+        self._colors = Colors(networks[-1], self.slots, widths.feature) if widths.shapes_are_blind else None
         self._time: float | None = None
         self._moved = self._table  # at self._time
         if self._global is not None:
             self._table, self._moved = self._global.rest(self._table, self._anchor), np.empty_like(self._table)
         self._known = np.full(len(codes), self._global is None)  # the rows of _moved that are there
+        self._count = np.full(len(codes), -1)  # of an anchor's Gaussians in _grown; -1: not evaluated
+        self._first = np.zeros(len(codes), np.int64)  # the first of them
+        self._slots, self._grown = np.zeros(0, np.int64), np.zeros((0, GAUSSIAN_WIDTH), np.float32)  # with colours of 0
 
     @property
     def active(self) -> np.ndarray:
@@ -102,6 +113,12 @@ class Player:
             return self._of_eyes(rows, t, list(eyes))
 
     def _of_eyes(self, rows: np.ndarray, t: float, eyes: list[np.ndarray]) -> Gaussians:
+        again = t == self._time
+        if not again:
+            self._time, self._known[:], self._count[:] = t, self._global is None, -1
+            self._slots, self._grown = self._slots[:0], self._grown[:0]
+        if self._colors is not None and (again or len(eyes) > 1):
+            return self._of_colors(rows, t, eyes, self._colors)
         mask, anchors = self._mask[rows], self._anchors(rows, t)
         looks = [self._decoders.look(anchors, eye) for eye in eyes]
         shown = [seen(look.opacity, mask, MIN_OPACITY) for look in looks]
@@ -120,14 +137,43 @@ class Player:
             if len(own) < len(keep):
                 opacities[~np.isin(keep, own, assume_unique=True)] = 0
             found.append((means, quats, scales, opacities, colors, slots))
-        return Gaussians(*(found[0] if len(eyes) == 1 else map(np.concatenate, zip(*found, strict=True))))
+        return _joined(found)
+
+    def _of_colors(self, rows: np.ndarray, t: float, eyes: list[np.ndarray], colors: Colors) -> Gaussians:
+        """`_of_eyes` where nothing but colours depends on the eye."""
+        anchors = self._anchors(rows, t)
+        self._grow(rows, anchors, t)
+        count = self._count[rows]
+        before = np.cumsum(count) - count
+        places = np.repeat(self._first[rows] - before, count) + np.arange(count.sum())
+        slots, gates = self._slots.take(places), np.repeat(self._mask[rows], count)
+        keep, found = slots + np.repeat((np.arange(len(rows)) - rows) * self.slots, count), []
+        for eye in eyes:
+            gaussians = self._grown.take(places, axis=0)
+            gaussians[:, COLOR:] += colors(anchors, eye, keep)
+            found.append((*finished(gaussians, gates, self._local is not None), slots))
+        return _joined(found)
+
+    def _grow(self, rows: np.ndarray, anchors: np.ndarray, t: float) -> None:
+        """Appends the Gaussians of `rows` that are not in _grown."""
+        missing = self._count[rows] < 0
+        own, anchors, slots = rows[missing], anchors[missing], self.slots
+        if not own.size:
+            return
+        mask, look = self._mask[own], self._decoders.look(anchors, np.zeros(3, np.float32))
+        keep = seen(look.opacity, mask, MIN_OPACITY)
+        gaussians = self._decoders.make(anchors, mask, look, keep).gaussians
+        gaussians[:, COLOR:] = 0
+        if self._local is not None:
+            self._local.move(gaussians, np.ascontiguousarray(gaussians[:, :3]), t)
+        count = np.bincount(keep // slots, minlength=len(own))
+        self._count[own], self._first[own] = count, len(self._slots) + np.cumsum(count) - count
+        self._slots = np.concatenate([self._slots, own[keep // slots] * slots + keep % slots])
+        self._grown = np.concatenate([self._grown, gaussians])
 
     def _anchors(self, rows: np.ndarray, t: float) -> np.ndarray:
         """float32 [n, 9 + D + 3 G]: the anchors `rows` as the global deformation moves them."""
         if self._global is not None:
-            if self._time != t:
-                self._time = t
-                self._known[:] = False
             missing = rows[~self._known[rows]]
             if missing.size:
                 moved = self._table.take(missing, axis=0)
@@ -136,6 +182,11 @@ class Player:
                 self._known[missing] = True
         found: np.ndarray = self._moved.take(rows, axis=0)
         return found
+
+
+def _joined(eyes: Sequence[tuple[np.ndarray, ...]]) -> Gaussians:
+    """The Gaussians of all eyes, one behind the other."""
+    return Gaussians(*(eyes[0] if len(eyes) == 1 else map(np.concatenate, zip(*eyes, strict=True))))
 
 
 # -- warming up --------------------------------------------------------------------------------------------------------

@@ -18,7 +18,7 @@ from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.encoder import encode
 from pd4dgs_codec.model.convert import from_scene
 from pd4dgs_codec.model.picture import render_image
-from pd4dgs_codec.scene import Camera, Deformation, Scene, Widths, instant
+from pd4dgs_codec.scene import SCAFFOLD_NETWORKS, Camera, Deformation, Scene, Widths, instant
 
 KEYED = {"key": 40_000}
 ROOT = Path(__file__).parents[2]
@@ -89,14 +89,37 @@ def test_a_time_that_is_no_number_is_refused(t):
         Player(_scene()).picture(_camera(0), t)
 
 
-def test_what_depends_on_time_alone_is_kept_and_changes_nothing():
-    player = Player(_scene())
+@pytest.mark.parametrize("viewing", [SCAFFOLD_NETWORKS, ("color",), ()])
+def test_what_depends_on_time_alone_is_kept_and_changes_nothing(viewing):
+    scene = _scene(widths=Widths(viewing=viewing))
+    player = Player(scene)
     one, other = _camera(0), _camera(1)
-    expected = [Player(_scene()).picture(camera, 0.4) for camera in (one, other)]
+    expected = [Player(scene).picture(camera, 0.4) for camera in (one, other)]
     np.testing.assert_array_equal(player.picture(one, 0.4), expected[0])
-    np.testing.assert_array_equal(player.picture(other, 0.4), expected[1])
+    for _ in range(2):
+        np.testing.assert_array_equal(player.picture(other, 0.4), expected[1])
     assert player._known.any()
-    np.testing.assert_array_equal(player.picture(one, 0.9), Player(_scene()).picture(one, 0.9))
+    np.testing.assert_array_equal(player.picture(one, 0.9), Player(scene).picture(one, 0.9))
+
+
+class Untouchable:
+    """Stands for what nothing may ask."""
+
+
+def test_where_shapes_do_not_take_the_direction_another_eye_evaluates_colours_alone():
+    scene = _scene(widths=Widths(viewing=("color",)), heads=(None, {"mean": 3, "opacity": 1}))
+    mild = tuple((weight / 64, bias / 64) for weight, bias in scene.networks["color"])  # no sigmoid is at its end
+    scene = replace(scene, networks={**scene.networks, "color": mild})
+    player, eyes = Player(scene), np.array([[0, 0, -4], [3, 1, 2]], np.float32)
+    for _ in range(2):  # from the second view on
+        first = player.gaussians_of_eyes(player.active, 0.4, eyes[:1])
+    player._decoders = player._global = player._local = Untouchable()
+    second = player.gaussians_of_eyes(player.active, 0.4, eyes[1:])
+    both = Player(scene).gaussians_of_eyes(player.active, 0.4, eyes)
+    for name, values in vars(both).items():
+        np.testing.assert_array_equal(values, np.concatenate([getattr(first, name), getattr(second, name)]))
+    assert (first.colors != second.colors).any()
+    assert (first.opacities == second.opacities).all() and len(first.slots) > 50
 
 
 def test_scenes_without_gaussians_in_view_show_the_background():
