@@ -3,7 +3,7 @@
 // Per anchor, when time changes: global deformation; the features' share of the scaffold's first layers. Per anchor,
 // when the camera's centre changes: opacities. They tell which Gaussians are visible, about a fifth of all, and only
 // these are evaluated further. Per Gaussian, when time changes: mean and local deformation. Per Gaussian, when the
-// camera's centre changes: shape and colour.
+// camera's centre changes: shape and colour. Opacities and shapes that do not take the view direction change with time.
 
 import { GAUSSIAN_COLUMNS, LOCAL_HEADS, anchorColumns, globalHeads } from "../decode/heads.js";
 import { FieldPass } from "./field.js";
@@ -14,9 +14,9 @@ import { eachAttribute, levelOf, widthsOf } from "./level.js";
 
 /**
  * Visible Gaussians for the renderer: the records of heads.js, in texels of four blocks. A texel without a Gaussian has
- * opacity −1.
+ * opacity −1. shapes: stands for the time and the list of which they have the opacities and shapes.
  *
- * @typedef {{field: Field, texels: number}} Splats
+ * @typedef {{field: Field, texels: number, shapes?: object}} Splats
  */
 
 /**
@@ -27,6 +27,8 @@ import { eachAttribute, levelOf, widthsOf } from "./level.js";
 
 /** Block of an anchor's record where its features begin. */
 const FEATURE_BLOCK = 3;
+/** Block of a Gaussian's record that is its colour. */
+const COLOR_BLOCK = 3;
 /** Blocks of a Gaussian's record. */
 export const SPLAT_BLOCKS = GAUSSIAN_COLUMNS / 4;
 /** Limit of the textures of all anchors, bytes: beyond it devices fail in ways that cannot be distinguished. */
@@ -175,6 +177,8 @@ export class GpuEvaluator {
     this._eye = null;
     /** Whether the listed Gaussians' means and changes are those of the time. */
     this._current = false;
+    /** Stands for their time and list. */
+    this._shape = {};
   }
 
   /** The anchors' records, [blocks, height, width, 4]. */
@@ -260,7 +264,7 @@ void main() {
       this._runFirst(residual, lines);
     }
     if (timeMoved) this._current = false;
-    if (anchorsMoved || eyeMoved) {
+    if (anchorsMoved || (eyeMoved && this._opacity.views)) {
       this._runOpacities(residual, eye, lines);
       const opacities = await gpu.read(this._opacities, 0, blocksOf(this._slots), lines);
       const previous = timeMoved ? null : this._listed;
@@ -272,6 +276,7 @@ void main() {
       this._runMeans(residual);
       if (local && this._changes && this._means) this._local?.run(t, this._means, this._listed.rows, this._changes);
       this._current = true;
+      this._shape = {};
     }
     const splats = this._runShapes(residual, local ? this._changes : null, eye, into);
     this._level = number;
@@ -389,58 +394,12 @@ ${repeat(linear.chunkBlocks, (i) => `out${i} = y${i} * vec4(greaterThanEqual(y${
       gpu.free(field);
       field = gpu.field(width, height, SPLAT_BLOCKS);
     }
-    const splats = { field, texels: rows * width };
+    const blind = !this._opacity.views && !this._covariance.views;
+    const kept = blind && into?.field === field && into.shapes === this._shape;
+    const splats = { field, texels: rows * width, shapes: this._shape };
     if (!rows || !this._means || !this._list || !this._codes) return splats;
     const shapes = this._shapes;
-    const K = this._covariance.blocks;
-    const L = this._color.blocks;
-    const program = gpu.program(
-      targets(SPLAT_BLOCKS) +
-        anchorSource(residual) +
-        entrySource(this._width) +
-        this._covariance.declare(1) +
-        this._color.declare(2) +
-        `layout(std140) uniform U3 { vec4 b3[2]; mat4 w3[${2 * K}]; };
-layout(std140) uniform U4 { vec4 b4; mat4 w4[${L}]; };
-uniform sampler2DArray before;
-uniform sampler2DArray means, opacities${changes ? ", changes" : ""};
-uniform sampler2D codes;
-uniform vec3 eye;
-vec4 unit(vec4 q) {
-  float n = length(q);
-  return n > 0. ? q / n : vec4(1, 0, 0, 0);
-}
-void main() {
-  ivec2 g = ivec2(gl_FragCoord.xy);
-  uint entry = texelFetch(list, g, 0).r;
-  out0 = vec4(0, 0, 0, -1);
-  out1 = out2 = out3 = vec4(0);
-  if (entry == ${NO_ENTRY}u) return;
-  ivec2 p = anchorOf(entry);
-  int slot = int(entry >> ${ANCHOR_BITS});
-  float opacity = texelFetch(opacities, ivec3(p, slot >> 2), 0)[slot & 3];
-  vec3 mean = texelFetch(means, ivec3(g, 0), 0).xyz;
-  out0 = vec4(mean, 0);
-  if (!(opacity > 0.)) return;
-  vec3 d = anchorBlock(p, 0).xyz - eye;
-  d /= max(length(d), 1e-30);
-${this._covariance.compute(1, "x")}
-  vec4 v = b3[0], q = b3[1], w = b4;
-${repeat(K, (k) => `v += w3[${k}] * x${k}; q += w3[${K + k}] * x${k};`)}
-${this._color.compute(2, "c")}
-${repeat(L, (k) => `w += w4[${k}] * c${k};`)}
-  vec4 g0 = vec4(mean, opacity);
-  vec4 g1 = vec4(exp(anchorBlock(p, 2).xyz) / (1. + exp(-v.xyz)), 0);
-  vec4 g2 = unit(q);
-  vec4 g3 = vec4(1. / (1. + exp(-w.xyz)), 0);
-${changes ? localSource() : ""}
-  float gate = texelFetch(codes, p, 0).r;
-  out0 = vec4(g0.xyz, g0.w * gate);
-  out1 = vec4(g1.xyz * gate, 0);
-  out2 = g2;
-  out3 = g3;
-}`,
-    );
+    const program = gpu.program(kept ? this._colorSource(residual, changes) : this._shapeSource(residual, changes));
     /** @type {Record<string, Field | WebGLTexture>} */
     const textures = {
       ...this._anchorTextures(residual),
@@ -459,9 +418,85 @@ ${changes ? localSource() : ""}
       if (starts[i + 1] === starts[i]) continue;
       gl.bindBufferRange(gl.UNIFORM_BUFFER, 3, shapes.buffer, shapes.stride * i, shapes.shapeBytes);
       gl.bindBufferRange(gl.UNIFORM_BUFFER, 4, shapes.buffer, shapes.stride * i + shapes.colorAt, shapes.colorBytes);
-      gpu.cover(field, 0, SPLAT_BLOCKS, starts[i], starts[i + 1] - starts[i]);
+      const [first, count] = kept ? [COLOR_BLOCK, 1] : [0, SPLAT_BLOCKS];
+      gpu.cover(field, first, count, starts[i], starts[i + 1] - starts[i]);
     }
     return splats;
+  }
+
+  /** Shapes and colours of listed Gaussians. @param {Field | null} residual @param {Field | null} changes */
+  _shapeSource(residual, changes) {
+    const K = this._covariance.blocks;
+    return `${targets(SPLAT_BLOCKS) + this._listedSource(residual, changes) + this._covariance.declare(1)}
+layout(std140) uniform U3 { vec4 b3[2]; mat4 w3[${2 * K}]; };
+uniform sampler2DArray means, opacities;
+uniform sampler2D codes;
+void main() {
+  ivec2 g = ivec2(gl_FragCoord.xy);
+  uint entry = texelFetch(list, g, 0).r;
+  out0 = vec4(0, 0, 0, -1);
+  out1 = out2 = out3 = vec4(0);
+  if (entry == ${NO_ENTRY}u) return;
+  ivec2 p = anchorOf(entry);
+  int slot = int(entry >> ${ANCHOR_BITS});
+  float opacity = texelFetch(opacities, ivec3(p, slot >> 2), 0)[slot & 3];
+  vec3 mean = texelFetch(means, ivec3(g, 0), 0).xyz;
+  out0 = vec4(mean, 0);
+  if (!(opacity > 0.)) return;
+  vec3 d = directionTo(p);
+${this._covariance.compute(1, "x")}
+  vec4 v = b3[0], q = b3[1];
+${repeat(K, (k) => `v += w3[${k}] * x${k}; q += w3[${K + k}] * x${k};`)}
+  vec4 g0 = vec4(mean, opacity);
+  vec4 g1 = vec4(exp(anchorBlock(p, 2).xyz) / (1. + exp(-v.xyz)), 0);
+  vec4 g2 = unit(q);
+  vec4 g3 = colorOf(p, d);
+${changes ? localSource([0, 1, 2, 3]) : ""}
+  float gate = texelFetch(codes, p, 0).r;
+  out0 = vec4(g0.xyz, g0.w * gate);
+  out1 = vec4(g1.xyz * gate, 0);
+  out2 = g2;
+  out3 = g3;
+}`;
+  }
+
+  /** Colours alone. @param {Field | null} residual @param {Field | null} changes */
+  _colorSource(residual, changes) {
+    return `${targets(1) + this._listedSource(residual, changes)}
+void main() {
+  ivec2 g = ivec2(gl_FragCoord.xy);
+  uint entry = texelFetch(list, g, 0).r;
+  out0 = vec4(0);
+  if (entry == ${NO_ENTRY}u) return;
+  ivec2 p = anchorOf(entry);
+  vec4 g3 = colorOf(p, directionTo(p));
+${changes ? localSource([COLOR_BLOCK]) : ""}
+  out0 = g3;
+}`;
+  }
+
+  /** What both take. @param {Field | null} residual @param {Field | null} changes */
+  _listedSource(residual, changes) {
+    const L = this._color.blocks;
+    return `${anchorSource(residual) + entrySource(this._width) + this._color.declare(2)}
+layout(std140) uniform U4 { vec4 b4; mat4 w4[${L}]; };
+uniform sampler2DArray before${changes ? ", changes" : ""};
+uniform vec3 eye;
+vec4 unit(vec4 q) {
+  float n = length(q);
+  return n > 0. ? q / n : vec4(1, 0, 0, 0);
+}
+vec3 directionTo(ivec2 p) {
+  vec3 d = anchorBlock(p, 0).xyz - eye;
+  return d / max(length(d), 1e-30);
+}
+vec4 colorOf(ivec2 p, vec3 d) {
+${this._color.compute(2, "c")}
+  vec4 w = b4;
+${repeat(L, (k) => `w += w4[${k}] * c${k};`)}
+  return vec4(1. / (1. + exp(-w.xyz)), 0);
+}
+`;
   }
 
   free() {
@@ -486,10 +521,11 @@ function rowsOf({ weight, bias, inputs }, first, count) {
   };
 }
 
-/** Source that adds the changes of the local deformation to a Gaussian's record, and brings each sum into its range. */
-function localSource() {
-  const blocks = repeat(SPLAT_BLOCKS, (b) => `g${b} += texelFetch(changes, ivec3(g, ${b}), 0);`);
-  const ranges = LOCAL_HEADS.map(({ at, outputs, then }) => {
+/** Source that adds the changes of the local deformation to blocks of a Gaussian's record, and brings each sum into its
+ * range. @param {number[]} of the blocks */
+function localSource(of) {
+  const blocks = of.map((b) => `g${b} += texelFetch(changes, ivec3(g, ${b}), 0);\n`).join("");
+  const ranges = LOCAL_HEADS.filter(({ at }) => of.includes(at >> 2)).map(({ at, outputs, then }) => {
     const part = `g${at >> 2}.${"xyzw".slice(at & 3, (at & 3) + outputs)}`;
     if (then === "unit") return `${part} = unit(${part});`;
     if (then === "positive") return `${part} = max(${part}, 0.);`;

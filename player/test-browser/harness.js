@@ -18,7 +18,7 @@ const QUANTITIES = { mean: [0, 1, 2], opacity: [3], scale: [4, 5, 6], quaternion
 /**
  * Both evaluators at some levels, times and cameras' centres, in this order on one GPU evaluator. worst: the largest
  * difference of each quantity, relative to its largest magnitude. lonely: how many Gaussians only one of them has
- * although their opacity is clear of the threshold.
+ * although their opacity is clear of the threshold. moved: whether means or the list changed.
  *
  * @param {string} url @param {{level: number, t: number, eye: number[]}[]} cases @param {number} bandPoints
  */
@@ -33,7 +33,8 @@ async function compare(url, cases, bandPoints) {
   const out = [];
   let splats = null;
   for (const { level, t, eye } of cases) {
-    ({ splats } = await evaluator.evaluate(level, t, eye, splats, lister));
+    const evaluated = await evaluator.evaluate(level, t, eye, splats, lister);
+    ({ splats } = evaluated);
     const n = splats.texels;
     const texels = n ? await gpu.read(splats.field, 0, 4, n / splats.field.width) : new Float32Array(0);
     const { count, slot: slots, records } = evaluate(scene, level, t, eye);
@@ -58,7 +59,7 @@ async function compare(url, cases, bandPoints) {
     let lonely = 0;
     slots.forEach((slot, i) => (lonely += Number(records[16 * i + 3] > clear && !at.has(slot))));
     for (const [slot, g] of at) lonely += Number(texels[4 * g + 3] > clear && !known.has(slot));
-    out.push({ worst: Object.fromEntries(worst), lonely, count });
+    out.push({ worst: Object.fromEntries(worst), lonely, count, moved: evaluated.means !== null });
   }
   const error = gl.getError();
   evaluator.free();
