@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from pathlib import Path
 
-from common import REAL, Benchmark, Row, Run, Scene, number, seconds_at, table
+from common import ONE, REAL, Benchmark, Row, Run, Scene, number, seconds_at, table
 from quality import monolith, packed_levels
 
 from pd4dgs_codec.bench.report import drawing
@@ -78,7 +78,7 @@ def text(rows: Sequence[Row]) -> str:
     parts = []
     for row in rows:
         if row["table"] == "parts":
-            psnr, size = PUBLISHED.get(row["model"], (None, None))
+            psnr, size = PUBLISHED.get(row["model"], (None, None)) if row["scene"] in ONE else (None, None)
             parts.append(
                 (row["scene"], row["model"], number(row["mpsnr"]), number(row["bytes"], 0), number(row["layer0"], 0))
                 + (number(psnr), number(size))

@@ -15,12 +15,29 @@ from pd4dgs_codec.bench.report import drawing
 #: A model that is trained as a whole: the highest level in every step, nothing spent on bytes, levels or quantisation.
 MONOLITH = ("--rollout", "top", "--prune", "0", "--grading", "0")
 MONOLITH += tuple(word for part in ("rate", "tmc", "noise", "whitening", "judge") for word in ("--without", part))
+#: What papers report, see OFFICIAL_TEXT: method, PSNR, SSIM, MB.
+PUBLISHED: dict[str, tuple[tuple[str, float, float | None, float | None], ...]] = {
+    "mutant": (
+        ("P-4DGS", 41.12, 0.993, 0.93),
+        ("Deformable-3DGS, black", 42.63, 0.995, 44.44),
+        ("4DGaussians, white", 37.71, 0.988, 22.45),
+        ("4DGS", 36.62, 0.982, 301.0),
+        ("4DGS-1K-PP", 37.02, 0.988, 3.56),
+    ),
+    "basketball": (("GIFStream, mean with boxes", 29.5, None, None),),
+}
+OFFICIAL_TEXT = (
+    "Scenes of D-NeRF (mutant: official split, 20 test views; on white, mutant-black on black) and Panoptic Sports "
+    "(basketball: 4 test cameras, 150 instants), by `pd4dgs-eval --protocol 3dgs`: metrics without masks, means over "
+    "pictures. Rows that name a method are published (arXiv 2510.10030, supplement, table 1, where its authors ran "
+    "them again; 4DGS-1K-PP: arXiv 2503.16422, table 6; GIFStream: arXiv 2505.07539); their backgrounds differ."
+)
 #: Bytes of a picture in git.
 LARGEST_PICTURE = 300_000
 
 
 def measure(run: Run, scene: Scene) -> list[Row]:
-    """A row per level of each seed's file, and one of the monolith."""
+    """A row per level of each seed's file, and one of the monolith where nobody has published any."""
     rows: list[Row] = []
     for seed in range(run.seeds):
         model, training = run.trained(scene, seed=seed)
@@ -30,7 +47,7 @@ def measure(run: Run, scene: Scene) -> list[Row]:
         if seed == 0:
             rows[0]["curve"] = curve(model)
             draw_levels(scene, file, run.images / f"{scene.name}.jpg")
-    return [*rows, monolith(run, scene)]
+    return rows if scene.protocol == "3dgs" else [*rows, monolith(run, scene)]
 
 
 def packed_levels(scene: Scene, model: Path, file: Path) -> list[Row]:
@@ -77,7 +94,24 @@ def draw_levels(scene: Scene, file: Path, picture: Path) -> None:
 
 
 def text(rows: Sequence[Row]) -> str:
-    """A row per scene and level: medians over the seeds and, of several, the least and the most."""
+    """A row per scene and level: medians over the seeds and, of several, the least and the most. Scenes that papers
+    report on have a table of their own, with what they report."""
+    ours, official = ([row for row in rows if ("psnr" in row) == by] for by in (False, True))
+    seeds = 1 + max(row["seed"] for row in rows)
+    told = f" Medians of {seeds} seeds, with the least and the most." if seeds > 1 else ""
+    parts = [
+        "Quality is measured on held-out views, from the prefix of the file whose size is in the same row. *monolith*: "
+        "the same scene trained for the highest level alone, without a rate term, stored as float32 under LZMA." + told
+    ]
+    if ours:
+        parts.append(levels_table(ours, "m"))
+    if official:
+        parts += [OFFICIAL_TEXT, levels_table(official, "")]
+    return "\n\n".join(parts)
+
+
+def levels_table(rows: Sequence[Row], m: str) -> str:
+    """The rows as a table, of mpsnr and mssim (m is "m") or of psnr and ssim, and published ones below their scene."""
     groups: dict[tuple[str, Any], list[Row]] = {}
     for row in rows:
         groups.setdefault((row["scene"], row["level"]), []).append(row)
@@ -90,23 +124,24 @@ def text(rows: Sequence[Row]) -> str:
                 level,
                 spread([row["bytes"] for row in found], 0),
                 seconds_at(size),
-                spread([row["mpsnr"] for row in found], 2),
+                spread([row[f"{m}psnr"] for row in found], 2),
                 *([spread([row["moving_mpsnr"] for row in found if "moving_mpsnr" in row], 2)] if moves else []),
-                number(median(row["mssim"] for row in found), 4),
+                number(median(row[f"{m}ssim"] for row in found), 4),
                 number(found[0]["anchors"], 0),
                 number(found[0]["steps"], 0),
                 number(found[0]["minutes"], 1),
             )
         )
-    head = ["scene", "level", "bytes so far", "s at 2 Mbps", "mPSNR dB", "mSSIM", "anchors", "steps", "training min"]
+    scenes = list(dict.fromkeys(scene for scene, _ in groups))
+    for scene in scenes:
+        for method, psnr, ssim, size in PUBLISHED.get(scene, ()):
+            told = ("-", "-") if size is None else (number(1e6 * size, 0), seconds_at(1e6 * size))
+            cells.append((scene, method, *told, number(psnr), *["-"] * moves, number(ssim, 3), "-", "-", "-"))
+    cells.sort(key=lambda row: scenes.index(row[0]))
+    head = ["scene", "level", "bytes so far", "s at 2 Mbps", f"{m}PSNR dB", f"{m}SSIM", "anchors", "steps"]
     if moves:
         head.insert(5, "moving dB")
-    seeds = 1 + max(row["seed"] for row in rows)
-    told = f" Medians of {seeds} seeds, with the least and the most." if seeds > 1 else ""
-    return (
-        "Quality is measured on held-out views, from the prefix of the file whose size is in the same row. *monolith*: "
-        "the same scene trained for the highest level alone, without a rate term, stored as float32 under LZMA." + told
-    ) + f"\n\n{table(head, cells)}"
+    return table([*head, "training min"], cells)
 
 
 def spread(values: Sequence[float], digits: int) -> str:

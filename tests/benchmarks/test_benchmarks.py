@@ -135,6 +135,21 @@ def test_several_seeds_are_shown_with_their_spread():
     assert cells[:5] == ["discs", "0", "1,000 (900 to 1,200)", "0.00", "21.00 (20.00 to 23.00)"]
 
 
+def test_official_scenes_stand_beside_what_is_published():
+    """In a table of their own, by its protocol: unmasked metrics, the published rows below those of their scene."""
+    row = {"level": 1, "seed": 0, "bytes": 9e5, "mpsnr": 30.0, "mssim": 0.9, "anchors": 7, "steps": 9, "minutes": 1.0}
+    official = row | {"psnr": 40.0, "ssim": 0.99}
+    rows = [official | {"scene": "mutant"}, official | {"scene": "basketball", "moving_mpsnr": 20.0}]
+    _, ours, told, theirs = quality.text([row | {"scene": "shelf-hand"}, *rows]).split("\n\n")
+    assert "mPSNR dB" in ours and len(ours.splitlines()) == 3 and "--protocol 3dgs" in told
+    head, _, *cells = (line.strip("| ").split(" | ") for line in theirs.splitlines())
+    assert head[4:7] == ["PSNR dB", "moving dB", "SSIM"] and {len(line) for line in cells} == {len(head)}
+    assert [line[0] for line in cells] == ["mutant"] * 6 + ["basketball"] * 2
+    assert cells[0][2:7] == ["900,000", "3.60", "40.00", "-", "0.9900"] and cells[6][5] == "20.00"
+    assert cells[1][1:7] == ["P-4DGS", "930,000", "3.72", "41.12", "-", "0.993"]
+    assert all(common.SCENES[name].protocol == "3dgs" for name in quality.PUBLISHED)
+
+
 def test_other_coders_take_about_the_entropy_of_their_symbols():
     rng = np.random.default_rng(0)
     channel = rng.normal(0, 5, 50_000).round().astype(np.int32)

@@ -11,19 +11,30 @@ from pd4dgs_codec.data.view import Dataset
 from pd4dgs_codec.errors import DataError
 
 SHARED = Path(os.environ.get("PD4DGS_SHARED", Path(__file__).resolve().parents[2] / ".." / "shared" / "data"))
+OFFICIAL = Path(os.environ.get("PD4DGS_OFFICIAL", Path(__file__).resolve().parents[2] / ".." / "official"))
+
+
+def _found(folder: Path, variable: str) -> Callable[[str], Path]:
+    """Path of a dataset in the folder; skips if it is not there."""
+
+    def find(name: str) -> Path:
+        if not (folder / name).is_dir():
+            pytest.skip(f"{name} is not in {folder} (set {variable})")
+        return folder / name
+
+    return find
 
 
 @pytest.fixture
 def shared():
-    """Path of a shared dataset; skips if it is not there."""
+    """Path of a shared dataset."""
+    return _found(SHARED, "PD4DGS_SHARED")
 
-    def find(name: str) -> Path:
-        path = SHARED / name
-        if not path.is_dir():
-            pytest.skip(f"{name} is not in {SHARED} (set PD4DGS_SHARED)")
-        return path
 
-    return find
+@pytest.fixture
+def official():
+    """Path of a scene that papers report on."""
+    return _found(OFFICIAL, "PD4DGS_OFFICIAL")
 
 
 @pytest.fixture(scope="session")

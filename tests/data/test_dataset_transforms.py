@@ -208,3 +208,18 @@ def test_pictures_are_resampled_by_the_formulas_of_opencv(tmp_path, name):
     seen = np.ones(u.shape, bool) if view.mask is None else view.mask
     assert (view.mask is None) == (name == "pinhole") and seen.mean() > 0.8
     assert np.abs(view.image - _levels(fx * xd + cx, fy * yd + cy))[seen].max() < 2
+
+
+@pytest.mark.slow
+def test_mutant(official):
+    """D-NeRF's split: the test file goes before the validation file, and the camera's box is D-NeRF's."""
+    d = load(official("mutant"), downscale=8, background=(0.0, 0.0, 0.0))
+    assert (len(d.train), len(d.test)) == (150, 20) and d.background == (0, 0, 0) and d.points is None
+    assert all((view.image[0] == 0).all() and view.image.max() > 100 for view in d.test)
+    np.testing.assert_allclose(d.box, [[-1.3] * 3, [1.3] * 3], atol=0.1)
+
+
+@pytest.mark.slow
+def test_basketball(official):
+    d = load(official("basketball"), downscale=8)
+    assert (len(d.train), len(d.test)) == (27 * 150, 4 * 150) and len({view.camera_id for view in d.test}) == 4
