@@ -180,6 +180,16 @@ def rectify(image: np.ndarray, lens: Lens) -> tuple[np.ndarray, np.ndarray]:
     return np.where(seen[..., None], top * (1 - b) + bottom * b + 0.5, 0).astype(np.uint8), seen
 
 
+def shrunk_view(view: View, k: int) -> View:
+    """The view at 1/k of its size: the mean of each block of k x k pixels, valid where the whole block is; the
+    remainder is cropped."""
+    if k == 1:
+        return view
+    image, mask = shrink_image(view.image, k), None if view.mask is None else shrink_mask(view.mask, k)
+    size = image.shape[1], image.shape[0]
+    return View(view.viewmat, downscaled_matrix(view.K, k), *size, view.time, image, mask, view.name, view.camera_id)
+
+
 def read_view(frame: UnreadView, time: float, downscale: int, under: Color | None) -> View:
     """The frame with its pixels, undistorted and downscaled. time: normalised. under: as in `read_image`."""
     lens, size = frame.lens, (frame.lens.width, frame.lens.height)

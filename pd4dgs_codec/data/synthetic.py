@@ -18,9 +18,9 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from pd4dgs_codec.data.bodies import MOTIONS, THINGS, bodies
-from pd4dgs_codec.data.cameras import Lens, world_to_camera
+from pd4dgs_codec.data.cameras import Lens, shrunk_view, world_to_camera
 from pd4dgs_codec.data.dataset import SYNTHETIC
-from pd4dgs_codec.data.files import check_downscale, shrink_image, shrink_mask, split_options
+from pd4dgs_codec.data.files import check_downscale, split_options
 from pd4dgs_codec.data.raycast import NO_BODY, Body, Eye, material, normal, place, shade
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.errors import DataError
@@ -285,8 +285,7 @@ def _dataset(take: Take) -> Dataset:
 
 
 def _shrink(view: View, k: int, lens: Lens) -> View:
-    image, mask = shrink_image(view.image, k), None if view.mask is None else shrink_mask(view.mask, k)
-    return replace(view, K=lens.matrix(k), width=image.shape[1], height=image.shape[0], image=image, mask=mask)
+    return replace(shrunk_view(view, k), K=lens.matrix(k))
 
 
 def read_synthetic(source: str, downscale: int = 1) -> Dataset:

@@ -209,6 +209,13 @@ def composite(
     flat_geom, flat_colors = geom.reshape(-1), colors.reshape(-1)
     for tile in range(tasks[0], tasks[1]):
         left, top = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
+        if starts[tile] == starts[tile + 1]:
+            for y in range(top, min(top + TILE_HEIGHT, height)):
+                for x in range(left, min(left + TILE_WIDTH, width)):
+                    transmittance[y, x] = 1.0
+                    for c in range(_COLORS):
+                        picture[y, x, c] = background[c]
+            continue
         state = aligned(_BLOCKS * _STATE * LANES, _F)
         _composite_tile(items, starts[tile], starts[tile + 1], flat_geom, flat_colors, left, top, width, height, state)
         for y in range(top, min(top + TILE_HEIGHT, height)):
@@ -314,6 +321,8 @@ def composite_backward(
     columns = -(-width // TILE_WIDTH)
     flat_geom, flat_colors, flat_slots = geom.reshape(-1), colors.reshape(-1), slots.reshape(-1)
     for tile in range(tasks[0], tasks[1]):
+        if starts[tile] == starts[tile + 1]:
+            continue
         left, top = tile % columns * TILE_WIDTH, tile // columns * TILE_HEIGHT
         state = aligned(_BLOCKS * _STATE * LANES, _F)
         for y in range(top, min(top + TILE_HEIGHT, height)):

@@ -157,6 +157,14 @@ class TrainConfig:
     views_per_step: int = option(
         1, help="views of each level per step; torchrun's workers share them", metavar="V", least=1
     )
+    #: a step on a smaller picture costs less, and what is coarse has to be learnt first
+    small_pictures: float = option(
+        0.0,
+        help="share of the run, at its start, that trains on pictures of a quarter, then of half their size, if these "
+        "have 100 pixels a side; 0 trains on whole ones alone",
+        least=0,
+        most=1,
+    )
     rollout: str = option("adaptive", help="which level each step trains", choices=ROLLOUTS)
     #: 0 is a static scaffold, 1 a scaffold with its global deformation
     max_layer: int = option(2, help="train without the layers above this one", choices=(0, 1, 2))

@@ -199,11 +199,12 @@ class Learner(TrainState):
 
         only: bool [N], the anchors to render, if not all. Raises NotFinite where the model has diverged.
         """
-        config, shown = self.config, self.views[index]
+        config, shown = self.config, self.picture(index)
         picture = render(self.model, level, shown.view.time, shown.view.camera, self.rounding(), only)
         if picture.meta["means2d"].requires_grad:
             picture.meta["means2d"].retain_grad()
-        l1, dissimilarity = image_loss(picture.image, shown.image, shown.weights)
+        part = shown.content(picture.alpha)
+        l1, dissimilarity = image_loss(picture.image[part], shown.pixels[part].float() / 255, shown.weights[part])
         terms = {"l1": l1, "dssim": dissimilarity}
         loss = (1 - config.ssim) * l1 + config.ssim * dissimilarity
         if config.volume and len(picture.gaussians.scales):

@@ -78,6 +78,11 @@ class Schedule:
         return [name for name, start in starts.items() if iteration <= start]
 
 
+def reduction(progress: float, share: float) -> int:
+    """1/size of the training pictures at progress 0..1, where a `share` of the run has smaller ones: 4, 2, then 1."""
+    return 4 if progress < share / 2 else 2 if progress < share else 1
+
+
 def learning_rate(bounds: tuple[float, float], progress: float, cooldown: float = 0.0) -> float:
     """Log-linear between the bounds at progress 0..1; times a factor that falls from 1 to 0 over the last `cooldown`
     of it."""

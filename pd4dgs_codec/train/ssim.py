@@ -81,6 +81,16 @@ def image_loss_reference(image: Tensor, target: Tensor, weights: Tensor) -> tupl
     return ((image - target).abs() * weights[..., None]).sum(), dissimilarity.sum()
 
 
+def within_reach(differs: Tensor) -> slice:
+    """The rows (or columns) of two pictures that `image_loss` and its gradient depend on: outside of them both are
+    zero. differs: bool [n], whether the pictures may differ in a row.
+
+    A difference changes the SSIM of windows up to REACH away, whose other pixels lie up to REACH further.
+    """
+    found = differs.nonzero()[:, 0].tolist() or [0]
+    return slice(max(0, found[0] - 2 * REACH), found[-1] + 1 + 2 * REACH)
+
+
 def lanes(width: int) -> int:
     """3 * width rounded up to whole vectors."""
     return -(-3 * width // LANES) * LANES

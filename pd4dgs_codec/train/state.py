@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from pd4dgs_codec.data.cameras import shrunk_view
 from pd4dgs_codec.data.view import Dataset, View
 from pd4dgs_codec.model.config import PRESETS, ModelConfig
 from pd4dgs_codec.model.model import Model
@@ -22,35 +23,55 @@ from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.initialise import fresh_model
 from pd4dgs_codec.train.optimiser import PER_ANCHOR, Optimiser
-from pd4dgs_codec.train.schedule import Schedule
-from pd4dgs_codec.train.ssim import pixel_weights
+from pd4dgs_codec.train.schedule import Schedule, reduction
+from pd4dgs_codec.train.ssim import pixel_weights, within_reach
 
 #: Bytes of images on the device, weights included, beyond which the least recently used are dropped.
 KEPT_BYTES = 1 << 30
+#: Pixels of the shorter side that reduced pictures keep.
+LEAST_SIDE = 100
 MOST_STEPS = 1 << 31  #: of a run that is resumed
 
 
 @dataclass(frozen=True, eq=False)
 class TrainingView:
-    """A view of the dataset on the device. image: float32 [H, W, 3], 0..1; weights: [H, W], see `pixel_weights`."""
+    """A view of the dataset on the device.
+
+    pixels: uint8 [H, W, 3]. weights: float32 [H, W], see `pixel_weights`. rows, columns: bool [H] and [W], which of
+    them show something before the background.
+    """
 
     view: View
-    image: Tensor
+    pixels: Tensor
     weights: Tensor
+    rows: Tensor
+    columns: Tensor
 
     @staticmethod
-    def of(view: View, device: torch.device) -> TrainingView:
+    def of(view: View, background: Sequence[float], device: torch.device) -> TrainingView:
         """Copies the image to the device."""
-        image = torch.as_tensor(view.image, device=device).float() / 255
-        mask = image.new_ones(image.shape[:2])
+        pixels = torch.as_tensor(view.image, device=device)
+        mask = torch.ones(pixels.shape[:2], device=device)
         if view.mask is not None:
             mask = torch.as_tensor(view.mask, device=device).float()
-        return TrainingView(view, image, pixel_weights(mask))
+        shown = (pixels != torch.tensor(background, device=device) * 255).any(2)
+        return TrainingView(view, pixels, pixel_weights(mask), shown.any(1), shown.any(0))
 
     @property
     def nbytes(self) -> int:
         """Bytes on the device."""
-        return self.image.nbytes + self.weights.nbytes
+        return self.pixels.nbytes + self.weights.nbytes
+
+    @property
+    def image(self) -> Tensor:
+        """float32 [H, W, 3], 0..1."""
+        return self.pixels.float() / 255
+
+    def content(self, alpha: Tensor) -> tuple[slice, slice]:
+        """The rows and columns that the loss of a picture with `alpha` [H, W] depends on: elsewhere the picture and the
+        image are the background."""
+        rows, columns = (alpha.detach().amax(axis).bool() for axis in (1, 0))
+        return within_reach(self.rows | rows), within_reach(self.columns | columns)
 
     def squared_error(self, image: Tensor) -> float:
         """Of a picture [H, W, 3] of this view, summed over colours and weighted pixels."""
@@ -60,9 +81,9 @@ class TrainingView:
 class TrainingViews:
     """A dataset's training views, copied to the device on demand; KEPT_BYTES of them stay there."""
 
-    def __init__(self, views: Sequence[View], device: torch.device):
-        self.views, self.device = views, device
-        self._kept: OrderedDict[int, TrainingView] = OrderedDict()
+    def __init__(self, views: Sequence[View], background: Sequence[float], device: torch.device):
+        self.views, self.background, self.device = views, background, device
+        self._kept: OrderedDict[tuple[int, int], TrainingView] = OrderedDict()
         self._bytes = 0
 
     def __len__(self) -> int:
@@ -73,11 +94,18 @@ class TrainingViews:
         return [self[i] for i in range(0, len(self), -(-len(self) // most))]
 
     def __getitem__(self, index: int) -> TrainingView:
-        found = self._kept.pop(index, None)
+        return self.reduced(index, 1)
+
+    def reduced(self, index: int, most: int) -> TrainingView:
+        """View `index` at 1/most of its size, or the next larger power of two that leaves LEAST_SIDE pixels."""
+        view = self.views[index]
+        while most > 1 and min(view.width, view.height) // most < LEAST_SIDE:
+            most //= 2
+        found = self._kept.pop((index, most), None)
         if found is None:
-            found = TrainingView.of(self.views[index], self.device)
+            found = TrainingView.of(shrunk_view(view, most), self.background, self.device)
             self._bytes += found.nbytes
-        self._kept[index] = found
+        self._kept[index, most] = found
         while self._bytes > KEPT_BYTES and len(self._kept) > 1:
             self._bytes -= self._kept.popitem(last=False)[1].nbytes
         return found
@@ -114,7 +142,7 @@ class TrainState:
         self.optimiser = Optimiser(self.model, config.rates, config.cooldown)
         self.generator = torch.Generator().manual_seed(config.seed)
         self.noise = Noise(config.seed + 1, device)
-        self.views = TrainingViews(dataset.train, device)
+        self.views = TrainingViews(dataset.train, model.info.background, device)
         self.statistics = fresh_statistics(len(model.anchor_q), config.slots)
         self.iteration = self.skipped = 0
         self.share: float | None = None
@@ -141,6 +169,11 @@ class TrainState:
         noise = noisy and self.position >= self.schedule.coarse_end and not exact
         weights = self.position >= self.schedule.rounding
         return Rounding(self.noise if noise else None, attributes=exact, weights=weights)
+
+    def picture(self, index: int) -> TrainingView:
+        """Training view `index` as the steps at this position see it: at first smaller."""
+        progress = self.schedule.progress(self.position)
+        return self.views.reduced(index, reduction(progress, self.config.small_pictures))
 
     def trained_levels(self) -> range:
         """The levels that the run trains."""

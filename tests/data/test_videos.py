@@ -85,11 +85,11 @@ def test_training_views_are_kept_within_a_budget(scene, monkeypatch):
     import torch
 
     views = scene.train[:6]
-    whole = TrainingViews(views, torch.device("cpu"))
-    size = whole[0].image.nbytes + whole[0].weights.nbytes
+    whole = TrainingViews(views, scene.background, torch.device("cpu"))
+    size = whole[0].nbytes
     monkeypatch.setattr("pd4dgs_codec.train.state.KEPT_BYTES", 2 * size)
-    few = TrainingViews(views, torch.device("cpu"))
+    few = TrainingViews(views, scene.background, torch.device("cpu"))
     for index in (0, 1, 0, 5, 0, 2):
         assert torch.equal(few[index].image, whole[index].image)
-    assert set(few._kept) == {0, 2} and few._bytes == 2 * size
+    assert set(few._kept) == {(0, 1), (2, 1)} and few._bytes == 2 * size
     assert few[0] is few[0] and len(few) == 6

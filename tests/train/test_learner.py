@@ -1,15 +1,19 @@
 """The step on a scene of a few tiny pictures: levels, terms, what it skips, what it leaves as it is."""
 
 import math
+from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 
 from pd4dgs_codec.errors import NotFinite, RenderError
+from pd4dgs_codec.train import state
 from pd4dgs_codec.train.config import ABLATIONS, TrainConfig
 from pd4dgs_codec.train.learner import Learner
 from pd4dgs_codec.train.optimiser import PER_ANCHOR
 from pd4dgs_codec.train.schedule import Schedule
+from pd4dgs_codec.train.state import TrainingView
 
 
 def learner(dataset, iterations: int | None = 30, **config) -> Learner:
@@ -162,3 +166,37 @@ def test_only_what_is_not_finite_is_skipped(dataset, monkeypatch):
     refuse(RenderError("no gsplat"))
     with pytest.raises(RenderError, match="no gsplat"):
         steps.step()
+
+
+# -- the pixels of a step ----------------------------------------------------------------------------------------------
+
+
+def test_large_pictures_are_small_at_first(dataset, monkeypatch):
+    """A quarter, then half of the size, by the mean of blocks, with the camera; never below LEAST_SIDE pixels."""
+    monkeypatch.setattr(state, "LEAST_SIDE", 6)
+    steps = learner(dataset, 40, small_pictures=0.5)
+    sizes = {}
+    for steps.iteration in range(40):
+        sizes[steps.iteration] = steps.picture(0).view.width
+    assert [sizes[i] for i in (0, 9, 10, 19, 20, 39)] == [8, 8, 16, 16, 32, 32]
+    steps.iteration = 0
+    small, whole = steps.picture(0), steps.views[0]
+    blocks = whole.pixels.float().view(6, 4, 8, 4, 3).mean((1, 3))
+    assert (small.pixels - blocks).abs().max() <= 0.5 and small.view.camera.height == 6
+    assert np.array_equal(small.view.K[:2], whole.view.K[:2] / 4) and small.weights.sum() == pytest.approx(1 / 3)
+    monkeypatch.setattr(state, "LEAST_SIDE", 7)
+    assert steps.picture(0).view.width == 16
+    assert learner(dataset, 40, small_pictures=0.0).picture(0).view.width == 32
+
+
+def test_the_loss_looks_at_what_is_drawn_or_shown(dataset):
+    """All that differs from the background, in the image or in the picture, and what a window on a window reaches."""
+    image = np.full((90, 80, 3), 90, np.uint8)
+    image[30:32, 40, 1] += 1
+    view = replace(dataset.train[0], image=image, width=80, height=90)
+    shown, alpha = TrainingView.of(view, (90 / 255,) * 3, torch.device("cpu")), torch.zeros(90, 80)
+    assert shown.content(alpha) == (slice(20, 42), slice(30, 51))
+    alpha[2, 60] = 0.004
+    assert shown.content(alpha) == (slice(0, 42), slice(30, 71))
+    other = TrainingView.of(view, (0.0, 0.0, 0.0), torch.device("cpu"))
+    assert other.image[other.content(alpha)].shape == (90, 80, 3)

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from pd4dgs_codec import threads
-from pd4dgs_codec.train.ssim import image_loss, image_loss_reference, pixel_weights
+from pd4dgs_codec.train.ssim import image_loss, image_loss_reference, pixel_weights, within_reach
 
 
 def pair(height, width, dtype=torch.float32, masked=False, seed=0):
@@ -76,6 +76,25 @@ def test_masked_pixels_out_of_reach_do_not_matter():
     after = terms_and_gradient(image_loss(changed, target, weights), changed)
     torch.testing.assert_close(after[:2], before[:2], rtol=0, atol=1e-6)
     assert after[2][:, 25:].eq(0).all() and not torch.equal(after[2][:, 20:25], torch.zeros(16, 5, 3))
+
+
+@pytest.mark.parametrize("masked", [False, True])
+@pytest.mark.parametrize("differing", [(slice(30, 41), slice(20, 23)), (slice(0, 3), slice(90, 100)), None])
+def test_nothing_within_reach_is_cropped(differing, masked):
+    """Cropped to what a difference reaches, value and gradient are those of the whole pictures."""
+    image, target, weights = pair(70, 100, masked=masked)
+    differs = torch.zeros(70, 100, dtype=torch.bool)
+    if differing:
+        differs[differing] = True
+    with torch.no_grad():
+        image[~differs] = target[~differs] = torch.tensor([0.2, 1.0, 0.0])
+    part = within_reach(differs.any(1)), within_reach(differs.any(0))
+    assert image[part].numel() < image.numel() / 2
+    whole = terms_and_gradient(image_loss(image, target, weights), image)
+    cropped = terms_and_gradient(image_loss(image[part], target[part], weights[part]), image)
+    for found, expected, tolerance in zip(cropped, whole, (1e-7, 1e-7, 1e-8), strict=True):
+        assert (found - expected).abs().max() <= tolerance
+    assert bool(cropped[0] > 0) == bool(differing)
 
 
 @pytest.mark.skipif(threads.available() < 2, reason="needs two CPUs")
