@@ -47,6 +47,7 @@ class Option:
 
     help, metavar: of the command-line option of the same name; no help where the command has none.
     least, most: the range of numbers, both ends included; above: a lower end that is not included.
+    count: how many numbers the value holds, as a tuple if more than one.
     choices: the values allowed, if they are few.
     dial: the value at quality 0 over the default, which is the value at quality 50; None if the dial leaves it alone.
     fixed: a resumed run takes the value from its checkpoint, and the command line may not contradict it.
@@ -57,6 +58,7 @@ class Option:
     least: float = -math.inf
     most: float = math.inf
     above: float = -math.inf
+    count: int = 1
     choices: tuple[Any, ...] = ()
     dial: float | None = None
     fixed: bool = True
@@ -76,10 +78,11 @@ class Option:
         if not allowed:
             raise TrainError(f"{name} must be {self.range}, found {value}")
 
-    def contains(self, value: float | tuple[float, ...]) -> bool:
+    def contains(self, value: Any) -> bool:
         """Whether a number, or each of several, is finite and within the range."""
-        if isinstance(value, tuple):
-            return all(map(self.contains, value))
+        if self.count > 1:
+            one = replace(self, count=1)
+            return isinstance(value, tuple) and len(value) == self.count and all(map(one.contains, value))
         return self.least <= value <= self.most and value > self.above and math.isfinite(value)
 
 
@@ -131,7 +134,7 @@ class TrainConfig:
     downscale: int = option(1)
     holdout: int = option(8)
     #: RGB behind pictures with alpha; None: white
-    background: tuple[float, float, float] | None = option(None, least=0, most=1)
+    background: tuple[float, float, float] | None = option(None, least=0, most=1, count=3)
     #: None: the preset's default, or by the clock if there is a time limit
     iterations: int | None = option(
         None, help="training steps (default: by preset, unless --max-seconds is given)", metavar="N", least=1
@@ -256,6 +259,8 @@ def _rebuilt(plain: Any, like: Any) -> Any:
     TypeError or AttributeError."""
     if is_dataclass(like) and not isinstance(like, type):
         return type(like)(**{name: _rebuilt(value, getattr(like, name)) for name, value in plain.items()})
+    if like is None and isinstance(plain, list):
+        return tuple(plain)
     if isinstance(like, tuple):
         return tuple(_rebuilt(value, like[0]) for value in plain)
     kind = (int, float) if isinstance(like, float) else type(like)

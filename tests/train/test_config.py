@@ -1,6 +1,5 @@
 """Options of training, the schedule that follows from them, and configurations as checkpoints store them."""
 
-import json
 import math
 
 import pytest
@@ -24,6 +23,7 @@ from pd4dgs_codec.train.schedule import Schedule, learning_rate, rollout_probabi
         ({"prune": 1.5}, "prune must be from 0 to 1, found 1.5"),
         ({"rate_scale": math.inf}, "rate_scale must be at least 0, found inf"),
         ({"background": (0.0, 2.0, 0.0)}, "background must be from 0 to 1, found"),
+        ({"background": (0.0, 1.0)}, "background must be from 0 to 1, found"),
         ({"grading": math.nan}, "grading must be from 0 to 1, found nan"),
     ],
 )
@@ -35,7 +35,7 @@ def test_options_out_of_range_are_refused(bad, message):
 def test_a_stored_configuration_comes_back():
     config = TrainConfig(iterations=7, background=(0.0, 0.5, 1.0), **ABLATIONS["tmc"])
     assert TrainConfig.from_json(config.to_json(), "m.pt") == config
-    for broken in ("[", "[]", json.dumps({"colour": 1})):
+    for broken in ("[", "[]", '{"colour": 1}', '{"iterations": [5]}', '{"background": [0, "a", 1]}'):
         with pytest.raises(TrainError, match="m.pt: its stored configuration"):
             TrainConfig.from_json(broken, "m.pt")
 
