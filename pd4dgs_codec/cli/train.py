@@ -27,9 +27,11 @@ it stops the run early. Ctrl-C or SIGTERM ends the run after the current step wi
 --quality sets the weights of the bit rates, pruning and quantisation steps together; --rate-scale, --prune and
 --grading replace single ones.
 
---rollout: adaptive samples levels, higher ones more often the more the layers differ; uniform samples all levels alike;
-fixed samples them with probabilities .15, .30, .55; top trains only the highest level; all trains every level in every
-step, at about three times the cost. The first tenth of a run trains level 0 in any case.
+--rollout: key makes level 0 the scene at --key-instant, from which layer 1 moves it, and trains mostly the highest
+level. The others are the paper's, whose level 0 is the mean over time: adaptive samples levels, higher ones more often
+the more the layers differ; uniform samples all levels alike; fixed samples them with probabilities .15, .30, .55; top
+trains only the highest level; all trains every level in every step, at about three times the cost. The first tenth of a
+run trains level 0 in any case.
 --without: rate, the bit-rate terms; planes, the bit-rate term of the planes; binary and smooth, the two mask terms;
 tmc, both of them; noise, the simulated quantisation; whitening, the transform of the feature channels; judge, the
 removal of levels that gain too little on held-back training views.

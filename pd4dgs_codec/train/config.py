@@ -17,10 +17,10 @@ from pd4dgs_codec.scene import MAX_FEATURE, MAX_SLOTS, Steps, Widths
 #: Iterations per preset when neither a count nor a time limit is given.
 DEFAULT_ITERATIONS = {"tiny": 3_000, "small": 10_000, "paper": 15_000}
 
-#: Which levels a step trains after the coarse phase: one drawn from pi(rho), from the uniform or from the paper's fixed
-#: distribution; the highest alone, as a monolithic model is trained; or each of them, with a view of its own, at three
-#: times the cost.
-ROLLOUTS = ("adaptive", "uniform", "fixed", "top", "all")
+#: Which levels a step trains after the coarse phase: mostly the highest, with a key instant for level 0, see `rollout`;
+#: one drawn from pi(rho), from the uniform or from the paper's fixed distribution; the highest alone, as a monolithic
+#: model is trained; or each of them, with a view of its own, at three times the cost.
+ROLLOUTS = ("key", "adaptive", "uniform", "fixed", "top", "all")
 
 #: Which of the scaffold's networks take the view direction.
 VIEW_DEPENDENT = ("color", "covariance+color", "opacity+color", "opacity+covariance+color")
@@ -91,11 +91,16 @@ def option(default: Any, **about: Any) -> Any:
     return field(default=default, metadata={"option": Option(**about)})
 
 
+#: Steps of a run whose deformation has the rates of `LearningRates` as they are.
+SHORT_RUN = 1500
+
+
 @dataclass(frozen=True)
 class LearningRates:
     """(start, end) of a log-linear schedule over the run, which `TrainConfig.cooldown` multiplies; Adam, eps 1e-15.
 
-    Final rates stay high: the cooldown anneals them to 0.
+    Final rates stay high: the cooldown anneals them to 0. planes and deformation are those of a run of up to
+    SHORT_RUN steps; see `of_run` for longer ones.
     """
 
     feature: tuple[float, float] = (7.5e-3, 1.2e-2)
@@ -107,6 +112,13 @@ class LearningRates:
     color: tuple[float, float] = (8e-3, 1.6e-3)
     planes: tuple[float, float] = (3e-2, 8e-3)
     deformation: tuple[float, float] = (1.5e-3, 5.6e-4)
+
+    def of_run(self, iterations: int | None) -> LearningRates:
+        """The rates of a run of so many steps: the deformation's end as the reciprocal of the number, its planes start
+        as that of its square root. At rates of a short run a long one would move what it has learnt to the end."""
+        share = min(SHORT_RUN / iterations, 1.0) if iterations else 1.0
+        planes = self.planes[0] * math.sqrt(share), self.planes[1] * share
+        return replace(self, planes=planes, deformation=(self.deformation[0], self.deformation[1] * share))
 
 
 @dataclass(frozen=True)
@@ -168,7 +180,10 @@ class TrainConfig:
         least=0,
         most=1,
     )
-    rollout: str = option("adaptive", help="which level each step trains", choices=ROLLOUTS)
+    rollout: str = option("key", help="which level each step trains, see below", choices=ROLLOUTS)
+    key_instant: float = option(
+        0.5, help="normalised time of the scene that level 0 shows, with --rollout key", metavar="T", least=0, most=1
+    )
     #: 0 is a static scaffold, 1 a scaffold with its global deformation
     max_layer: int = option(2, help="train without the layers above this one", choices=(0, 1, 2))
     #: leave out levels that gain too little on held-back training views, see `phases.levels`
@@ -263,6 +278,8 @@ def _rebuilt(plain: Any, like: Any) -> Any:
         return tuple(plain)
     if isinstance(like, tuple):
         return tuple(_rebuilt(value, like[0]) for value in plain)
+    if like is None and isinstance(plain, list):
+        return tuple(_rebuilt(value, 0.0) for value in plain)
     kind = (int, float) if isinstance(like, float) else type(like)
     if like is not None and not isinstance(plain, kind) or isinstance(plain, (list, dict)):
         raise ValueError(f"{plain!r} where {like!r} is usual")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -13,7 +14,7 @@ from pd4dgs_codec.draw.simd import Tasks, parallel
 from pd4dgs_codec.model.config import ModelConfig
 from pd4dgs_codec.model.deformation import DeformationField
 from pd4dgs_codec.model.model import Model, fresh_networks
-from pd4dgs_codec.scene import LOCAL_HEADS, SceneInfo, Steps, Widths
+from pd4dgs_codec.scene import INSTANTS, LOCAL_HEADS, SceneInfo, Steps, Widths
 
 #: Voxels along the longest side of the scene's box.
 GRID = 1024
@@ -32,13 +33,22 @@ PATH_STEPS, PATH_ANCHORS, PATH_RATES = 400, 4096, (0.02, 0.002)
 
 
 def fresh_model(
-    config: ModelConfig, dataset: Dataset, widths: Widths, steps: Steps, seed: int, max_layer: int = 2
+    config: ModelConfig,
+    dataset: Dataset,
+    widths: Widths,
+    steps: Steps,
+    seed: int,
+    max_layer: int = 2,
+    key: float | None = None,
 ) -> Model:
-    """An untrained model without the deformations of the layers above max_layer.
+    """An untrained model without the deformations of the layers above max_layer. key: its key instant, normalised time.
 
     Anchors start on the dataset's points (with more of them near by if there are few), or all over its box, and move
     along the points' paths if the dataset has them. The start of a layer does not depend on max_layer.
     """
+    if key is not None and dataset.paths is not None:  # the anchors are what stands there at the key instant
+        nearest = min(range(len(dataset.path_times)), key=lambda k: abs(dataset.path_times[k] - key))
+        dataset = replace(dataset, points=dataset.paths[nearest])
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)  # nn.Linear and HexPlane draw their start values from the global generator
     info = scene_info(dataset)
@@ -46,10 +56,10 @@ def fresh_model(
     n = len(anchor_q)
     spacing = nearest_distances((anchor_q.double() * info.voxel_size).float()).clamp(min=info.voxel_size)
     fields: list[DeformationField | None] = [
-        None if field is None else DeformationField.fresh(field, info.box, heads, start_spacing, step)
-        for field, heads, start_spacing, step in (
-            (config.global_deformation, widths.global_heads, GLOBAL_SPACING, steps.planes_global),
-            (config.local_deformation, LOCAL_HEADS, None, steps.planes_local),
+        None if field is None else DeformationField.fresh(field, info.box, heads, start_spacing, step, code)
+        for field, heads, start_spacing, step, code in (
+            (config.global_deformation, widths.global_heads, GLOBAL_SPACING, steps.planes_global, instant_code(key)),
+            (config.local_deformation, LOCAL_HEADS, None, steps.planes_local, None),
         )
     ]
     model = Model(
@@ -70,6 +80,11 @@ def fresh_model(
     elif dataset.paths is not None:
         learn_paths(model, dataset, generator)
     return model
+
+
+def instant_code(key: float | None) -> int | None:
+    """The code of the instant nearest to a normalised time, see `scene.instant`."""
+    return None if key is None else round(INSTANTS * key)
 
 
 def learn_paths(model: Model, dataset: Dataset, generator: torch.Generator) -> None:

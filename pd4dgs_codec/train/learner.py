@@ -20,24 +20,14 @@ from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.losses import ModelLoss
 from pd4dgs_codec.train.phases import Phase
 from pd4dgs_codec.train.phases.grow import Grow
-from pd4dgs_codec.train.phases.levels import SelectLevels, held_back_views
+from pd4dgs_codec.train.phases.levels import SelectLevels
 from pd4dgs_codec.train.phases.prefixes import Prefixes
 from pd4dgs_codec.train.phases.prune import Prune
 from pd4dgs_codec.train.phases.quantisation import FitQuantisation
-from pd4dgs_codec.train.schedule import (
-    CAPACITY_WEIGHTED,
-    LOWEST,
-    PRUNING_ROUNDS,
-    TOP,
-    UNIFORM,
-    Schedule,
-    rollout_probabilities,
-    updated_rho,
-)
+from pd4dgs_codec.train.rollout import as_taught, draw_levels, next_view
+from pd4dgs_codec.train.schedule import LOWEST, PRUNING_ROUNDS, Schedule, updated_rho
 from pd4dgs_codec.train.ssim import image_loss
 from pd4dgs_codec.train.state import TrainState
-
-Probabilities = tuple[float, float, float]  #: of levels 0, 1, 2
 
 
 class Learner(TrainState):
@@ -70,11 +60,11 @@ class Learner(TrainState):
         self._apply(self.before_step, record)
         only = self.prefixes.draw(self)
         if only is None:
-            levels, record["pi"] = self._draw_levels()
+            levels, record["pi"] = draw_levels(self)
         else:
             levels, record["pi"], record["prefix"] = (0,), LOWEST, int(only.sum())
         record["level"] = levels[-1]
-        drawn = [(self._next_view(), level) for level in levels for _ in range(self.config.views_per_step)]
+        drawn = [(next_view(self, level), level) for level in levels for _ in range(self.config.views_per_step)]
         if not self._learn(drawn, record, only):
             self.skipped += 1
             record["skipped"] = self.skipped
@@ -89,32 +79,6 @@ class Learner(TrainState):
                     phase.apply(self, record)
                 except NotFinite:  # passed over like a step that diverged
                     pass
-
-    # -- draws -----------------------------------------------------------------------------------------------------
-
-    def _draw_levels(self) -> tuple[tuple[int, ...], Probabilities]:
-        """The levels of this step, ascending, and the probabilities that they were drawn with."""
-        rollout = self.config.rollout
-        if self.position < self.schedule.coarse_end:
-            return (0,), LOWEST
-        if rollout == "all":
-            return tuple(range(self.model.level + 1)), (1.0, 1.0, 1.0)
-        if rollout == "top":
-            probabilities = TOP
-        elif rollout == "uniform" or self.position < self.schedule.progressive:
-            probabilities = UNIFORM
-        else:
-            probabilities = CAPACITY_WEIGHTED if rollout == "fixed" else rollout_probabilities(self.rho)
-        draw = float(torch.rand((), generator=self.generator))
-        level = int(draw >= probabilities[0]) + int(draw >= probabilities[0] + probabilities[1])
-        return (min(level, self.model.level),), probabilities
-
-    def _next_view(self) -> int:
-        if not self.order:
-            held_back = held_back_views(self) if self.position < self.schedule.rounding else set()
-            drawn = torch.randperm(len(self.views), generator=self.generator).tolist()
-            self.order = [index for index in drawn if index not in held_back]
-        return self.order.pop()
 
     # -- loss and update -------------------------------------------------------------------------------------------
 
@@ -131,7 +95,7 @@ class Learner(TrainState):
         if not math.isfinite(norm):
             return False
         self.grow.observe(self, pictures)
-        self.optimiser.step(self.schedule.progress(self.position))
+        self.optimiser.step(self.schedule.progress(self.position), self.schedule.iterations)
         self._apply([self.grow], record)
         return True
 
@@ -199,7 +163,7 @@ class Learner(TrainState):
 
         only: bool [N], the anchors to render, if not all. Raises NotFinite where the model has diverged.
         """
-        config, shown = self.config, self.picture(index)
+        config, shown = self.config, as_taught(self, self.picture(index), level)
         picture = render(self.model, level, shown.view.time, shown.view.camera, self.rounding(), only)
         if picture.meta["means2d"].requires_grad:
             picture.meta["means2d"].retain_grad()

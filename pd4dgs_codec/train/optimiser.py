@@ -45,10 +45,11 @@ class Optimiser:
         return [p for params in self.groups.values() for p in params]
 
     @torch.no_grad()
-    def step(self, progress: float) -> None:
-        """One update at progress 0..1 of the schedule."""
+    def step(self, progress: float, iterations: int | None) -> None:
+        """One update at progress 0..1 of a schedule of so many steps."""
+        rates = self.rates.of_run(iterations)
         for name, params in self.groups.items():
-            rate = learning_rate(getattr(self.rates, name), progress, self.cooldown)
+            rate = learning_rate(getattr(rates, name), progress, self.cooldown)
             moved: list[Tensor] = [p for p in params if p.grad is not None]
             for p in moved:
                 if p not in self.moments:

@@ -5,10 +5,13 @@ from __future__ import annotations
 import math
 from typing import Any
 
+Probabilities = tuple[float, float, float]  #: of levels 0, 1, 2
+
 #: Probabilities of the levels 0, 1, 2.
-UNIFORM = (1 / 3, 1 / 3, 1 / 3)
-CAPACITY_WEIGHTED = (0.15, 0.30, 0.55)
-TOP, LOWEST = (0.0, 0.0, 1.0), (1.0, 0.0, 0.0)
+UNIFORM: Probabilities = (1 / 3, 1 / 3, 1 / 3)
+CAPACITY_WEIGHTED: Probabilities = (0.15, 0.30, 0.55)
+TOP: Probabilities = (0.0, 0.0, 1.0)
+LOWEST: Probabilities = (1.0, 0.0, 0.0)
 #: Weight of the past in the moving average rho.
 RHO_DECAY = 0.95
 #: Share of a run in which level 0 alone is trained.
@@ -24,6 +27,8 @@ class Schedule:
     every later phase begins at infinity, and nothing is grown or pruned.
     coarse_end: before it only level 0 is trained; from it on, quantisation noise is added.
     progressive: the rate term, TMC and the average rho start here (T_progressive; T_warm is within the coarse phase).
+        Before it no transparent anchor is pruned: what moves may not have been seen where it is.
+    local: with a key instant level 2 is trained from here on.
     rho_every: iterations between updates of rho (K).
     rounding: planes and weights are rounded straight-through from here on.
     exact_rounding: the anchors' attributes are rounded straight-through from here on, where noise simulated it before.
@@ -37,6 +42,7 @@ class Schedule:
 
         self.iterations = iterations
         self.coarse_end, self.progressive, self.rho_every = at(COARSE_SHARE), at(1 / 3), max(1, at(1 / 150))
+        self.local = at(1 / 2)
         self.rounding, self.exact_rounding = at(2 / 3), at(9 / 10)
         self.grow = self.prune = range(0)
         if iterations is not None:

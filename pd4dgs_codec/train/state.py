@@ -19,7 +19,7 @@ from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.model.networks import EXACT, Noise, Rounding
 from pd4dgs_codec.model.picture import render_image
 from pd4dgs_codec.quality.image import level_psnr
-from pd4dgs_codec.scene import MASK_THRESHOLD
+from pd4dgs_codec.scene import MASK_THRESHOLD, instant
 from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.initialise import fresh_model
 from pd4dgs_codec.train.optimiser import PER_ANCHOR, Optimiser
@@ -137,7 +137,8 @@ class TrainState:
         self.config, self.dataset, self.schedule, self.device = config, dataset, schedule, device
         self.size = size or PRESETS[config.preset]
         steps = config.model_steps(self.size.steps)
-        model = fresh_model(self.size, dataset, config.widths, steps, config.seed, config.max_layer)
+        key = config.key_instant if config.rollout == "key" else None
+        model = fresh_model(self.size, dataset, config.widths, steps, config.seed, config.max_layer, key)
         self.model = model.to(device)
         self.optimiser = Optimiser(self.model, config.rates, config.cooldown)
         self.generator = torch.Generator().manual_seed(config.seed)
@@ -156,6 +157,12 @@ class TrainState:
     def position(self) -> int:
         """Of the next step in the schedule, 0..N: the steps done, or in a timed run the share of N."""
         return self.iteration if self.share is None else int(self.share * (self.schedule.iterations or 0))
+
+    @property
+    def key(self) -> float | None:
+        """The key instant, normalised time; None without one, or without layer 1."""
+        field = self.model.global_deformation
+        return None if field is None or field.key is None else instant(field.key)
 
     def reached(self, start: float) -> bool:
         """Whether this step is the first at or past position `start`."""

@@ -1,13 +1,23 @@
 """Options of training, the schedule that follows from them, and configurations as checkpoints store them."""
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
 
 from pd4dgs_codec.errors import TrainError
 from pd4dgs_codec.scene import Steps
-from pd4dgs_codec.train.config import ABLATIONS, COARSENED, DEFAULT_QUALITY, DIAL, TrainConfig, at_quality
+from pd4dgs_codec.train.config import (
+    ABLATIONS,
+    COARSENED,
+    DEFAULT_QUALITY,
+    DIAL,
+    SHORT_RUN,
+    LearningRates,
+    TrainConfig,
+    at_quality,
+)
 from pd4dgs_codec.train.schedule import Schedule, learning_rate, rollout_probabilities, updated_rho
 
 
@@ -17,7 +27,7 @@ from pd4dgs_codec.train.schedule import Schedule, learning_rate, rollout_probabi
         ({"preset": "huge"}, "preset must be one of tiny, small, paper, found huge"),
         ({"iterations": 0}, "iterations must be at least 1, found 0"),
         ({"max_seconds": 0.0}, "max_seconds must be more than 0, found 0.0"),
-        ({"rollout": "greedy"}, "rollout must be one of adaptive"),
+        ({"rollout": "greedy"}, "rollout must be one of key"),
         ({"seed": -1}, "seed must be from 0"),
         ({"max_layer": 3}, "max_layer must be one of 0, 1, 2, found 3"),
         ({"prune": 1.5}, "prune must be from 0 to 1, found 1.5"),
@@ -86,6 +96,15 @@ def test_learning_rates_are_log_linear():
     assert learning_rate((1e-2, 1e-4), 0.5) == pytest.approx(1e-3)
     assert learning_rate((1e-2, 1e-4), 0.5, 0.1) == pytest.approx(1e-3)
     assert learning_rate((1e-2, 1e-2), 0.95, 0.1) == pytest.approx(5e-3) and learning_rate((1, 1), 1.0, 0.1) == 0
+
+
+def test_the_deformation_of_a_long_run_ends_at_lower_rates():
+    rates = LearningRates()
+    assert rates.of_run(None) == rates.of_run(800) == rates
+    long = rates.of_run(4 * SHORT_RUN)
+    assert long.planes == pytest.approx((rates.planes[0] / 2, rates.planes[1] / 4))
+    assert long.deformation == pytest.approx((rates.deformation[0], rates.deformation[1] / 4))
+    assert replace(long, planes=rates.planes, deformation=rates.deformation) == rates
 
 
 def test_rollout_probabilities():

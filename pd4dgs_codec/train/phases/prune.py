@@ -8,7 +8,7 @@ over the scene, can be pruned, and the rest is measured again.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
@@ -21,6 +21,7 @@ from pd4dgs_codec.scene import MASK_THRESHOLD
 from pd4dgs_codec.train import workers
 from pd4dgs_codec.train.phases import Phase, long_enough
 from pd4dgs_codec.train.phases.levels import held_back_views
+from pd4dgs_codec.train.rollout import taught_views
 from pd4dgs_codec.train.schedule import PRUNING_ROUNDS
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
@@ -28,6 +29,10 @@ from pd4dgs_codec.train.state import TrainingView, TrainState
 VIEWS = 24
 #: Mask of an anchor at a level that it has left: below the threshold, so that it is neither drawn there nor coded.
 ABSENT = 1e-3
+
+#: Mean squared error, that of 30 dB, beyond which the error of a view pays for no saving: what has not been learnt yet
+#: would pay for all of it, and with it what few views show.
+LEARNT = 1e-3
 
 #: `omission_error` or one of the same arguments: (errors, bool [N] whether an anchor may reach the picture, picture).
 ErrorOf = Callable[..., tuple[Tensor, Tensor, Tensor]]
@@ -56,7 +61,8 @@ class Prune(Phase):
         order = [i for i in range(len(state.views)) if i not in held_back]
         stride = -(-len(order) // VIEWS)
         views = [state.views[i] for i in order[self.turn % stride :: stride]]
-        errors = added_error(model, levels, views, state.rounding(noisy=False), omission_error).to(state.device)
+        taught = taught_views(state, views)
+        errors = added_error(model, taught, state.rounding(noisy=False), omission_error).to(state.device)
         errors[:, round_of(model.anchor_q) != self.turn] = torch.inf
         redundant = least(errors.amax(0), share)
         keep = (~redundant | redundant.all()).nonzero()[:, 0]
@@ -72,13 +78,13 @@ class Prune(Phase):
 
 
 def added_error(
-    model: Model, levels: Sequence[int], views: Sequence[TrainingView], rounding: Rounding, error_of: ErrorOf
+    model: Model, views: Mapping[int, Sequence[TrainingView]], rounding: Rounding, error_of: ErrorOf
 ) -> Tensor:
-    """float64 [levels, N], on the CPU and alike in all workers: the squared error over `views` that `error_of` says
-    each anchor adds at each level, relative to the present error. Infinite where no view shows the anchor."""
+    """float64 [levels, N], on the CPU and alike in all workers: the squared error over `views`, by level, that
+    `error_of` says each anchor adds there, relative to the present error. Infinite where no view shows the anchor."""
 
     def measure() -> Tensor:
-        found = [relative_error(model, level, views, rounding, error_of) for level in levels]
+        found = [relative_error(model, level, views[level], rounding, error_of) for level in views]
         return torch.stack([torch.where(met, error, torch.inf).cpu() for error, met in found])
 
     return workers.alike(measure)
@@ -88,14 +94,14 @@ def relative_error(
     model: Model, level: int, views: Sequence[TrainingView], rounding: Rounding, error_of: ErrorOf
 ) -> tuple[Tensor, Tensor]:
     """(the sum over `views` of the float64 errors that `error_of` finds at `level`, relative to the present squared
-    error; bool [N]: whether a view shows the anchor)."""
+    error, of a view at most LEARNT; bool [N]: whether a view shows the anchor)."""
     generator = torch.Generator().manual_seed(0)
     total, met, error = torch.zeros((), dtype=torch.float64), torch.zeros((), dtype=torch.bool), 0.0
     for view in views:
         place = (level, view.view.time, view.view.camera)
         added, near, image = error_of(model, *place, generator, weights=view.weights, rounding=rounding)
         total, met = total + added, met | near
-        error += view.squared_error(image)
+        error += min(view.squared_error(image), LEARNT)
     return total / max(error, 1e-12), met
 
 

@@ -13,7 +13,7 @@ error follow: the next class doubles the steps, which quadruples the squared err
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
@@ -26,6 +26,7 @@ from pd4dgs_codec.scene import MASK_THRESHOLD, MAX_CLASS, SCAFFOLD_NETWORKS
 from pd4dgs_codec.train import phases, workers
 from pd4dgs_codec.train.optimiser import Optimiser
 from pd4dgs_codec.train.phases.prune import added_error, relative_error
+from pd4dgs_codec.train.rollout import taught_views
 from pd4dgs_codec.train.state import TrainingView, TrainState
 
 #: Training views in which the error of a step is measured.
@@ -45,15 +46,15 @@ class FitQuantisation(phases.Phase):
 
     def apply(self, state: TrainState, record: dict[str, Any]) -> None:
         """Logs how many anchors each step class has."""
-        model, config, levels = state.model, state.config, state.trained_levels()
-        views, rounding = state.views.spread(VIEWS), state.rounding(noisy=False)
+        model, config, rounding = state.model, state.config, state.rounding(noisy=False)
+        views = taught_views(state, state.views.spread(VIEWS))
         found: list[int] = []
         if config.grading:
-            found = grade(model, views, levels, config.grading, rounding)
+            found = grade(model, views, config.grading, rounding)
         if config.whitening:
-            whiten(model, state.optimiser, views, levels, rounding)
+            whiten(model, state.optimiser, views, rounding)
             if config.grading:  # the features' steps have changed
-                found = grade(model, views, levels, config.grading, rounding)
+                found = grade(model, views, config.grading, rounding)
         if found:
             record["step_classes"] = found
 
@@ -61,12 +62,10 @@ class FitQuantisation(phases.Phase):
 # -- step classes ------------------------------------------------------------------------------------------------------
 
 
-def grade(
-    model: Model, views: Sequence[TrainingView], levels: Sequence[int], share: float, rounding: Rounding
-) -> list[int]:
-    """Gives every anchor the class at which quantisation adds at most `share` to the squared error of each of `levels`
-    beyond what it adds at class 0, and the attributes their centres. Returns how many anchors each class has."""
-    errors = added_error(model, levels, views, rounding, rounding_error)
+def grade(model: Model, views: Mapping[int, Sequence[TrainingView]], share: float, rounding: Rounding) -> list[int]:
+    """Gives every anchor the class at which quantisation adds at most `share` to the squared error of `views`, by
+    level, beyond what it adds at class 0, and the attributes their centres. Returns how many anchors each class has."""
+    errors = added_error(model, views, rounding, rounding_error)
     met = errors.isfinite()
     worst = torch.where(met, errors, 0.0).amax(0)  # a level of large error must not set the budget of the others
     classes = classes_within(torch.where(met.any(0), worst, torch.inf), share)
@@ -110,19 +109,17 @@ def centre(model: Model) -> Tensor:
 # -- whitening ---------------------------------------------------------------------------------------------------------
 
 
-def whiten(
-    model: Model, optimiser: Optimiser, views: Sequence[TrainingView], levels: Sequence[int], rounding: Rounding
-) -> None:
+def whiten(model: Model, optimiser: Optimiser, views: Mapping[int, Sequence[TrainingView]], rounding: Rounding) -> None:
     """Transforms the features' channels in the anchors and in all that reads or moves them: pictures stay, to rounding.
     The error of a step, summed over the channels, stays the same too."""
-    transform = workers.alike(lambda: _measured(model, views, levels, rounding))
+    transform = workers.alike(lambda: _measured(model, views, rounding))
     if transform is not None:
         _apply(model, optimiser, transform.to(model.feature.device))
 
 
-def _measured(model: Model, views: Sequence[TrainingView], levels: Sequence[int], rounding: Rounding) -> Tensor | None:
+def _measured(model: Model, views: Mapping[int, Sequence[TrainingView]], rounding: Rounding) -> Tensor | None:
     """float64 [D, D]: the transform for the model; None where no picture shows a feature."""
-    errors = torch.stack([relative_error(model, i, views, rounding, _feature_error)[0] for i in levels]).sum(0)
+    errors = torch.stack([relative_error(model, i, views[i], rounding, _feature_error)[0] for i in views]).sum(0)
     active = model.masks(2).detach() > MASK_THRESHOLD
     if not errors.trace() > 0 or int(active.sum()) < 2:
         return None

@@ -1,0 +1,90 @@
+"""Which levels and views a step trains, and which pixels of a view teach a level.
+
+With a key instant t*, level 0 is the scene at t*, and level 1 adds F(x, t) - F(x, t*). The levels then agree: most
+steps train the highest level, from all views. The first steps, in which the deformation is still, see views near t*
+alone: in views of all times what moves would fade. Later a share of the steps trains level 0: near t*, and from all
+views in the pixels that layer 1 leaves as they are, so that what stands still is complete without it.
+
+The rollouts of the paper have no key instant: they teach level 0 the mean over time.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import torch
+
+from pd4dgs_codec.model.picture import render
+from pd4dgs_codec.train.phases.levels import held_back_views
+from pd4dgs_codec.train.schedule import CAPACITY_WEIGHTED, LOWEST, TOP, UNIFORM, Probabilities, rollout_probabilities
+from pd4dgs_codec.train.state import TrainingView, TrainState
+
+#: Share of the steps that train level 0 once the deformation moves, and of these the share near the key instant.
+STILL_ODDS, NEAR_ODDS = 0.15, 1 / 3
+#: The views near the key instant: this share of all, but at least so many.
+NEAR_SHARE, NEAR_VIEWS = 1 / 12, 4
+#: The largest difference of a colour between levels 0 and 1 in pixels that layer 1 leaves as they are.
+STILL_CONTRAST = 0.15
+#: Odds of level 2 from `Schedule.local` on.
+LOCAL_ODDS = 1 / 3
+
+
+def draw_levels(state: TrainState) -> tuple[tuple[int, ...], Probabilities]:
+    """The levels of this step, ascending, and the probabilities of levels 0, 1, 2 that they were drawn with."""
+    rollout, top = state.config.rollout, state.model.level
+    if state.position < state.schedule.coarse_end:
+        return (0,), LOWEST
+    if rollout == "all":
+        return tuple(range(top + 1)), (1.0, 1.0, 1.0)
+    if rollout == "top":
+        probabilities = TOP
+    elif rollout == "key":
+        local = LOCAL_ODDS if state.position >= state.schedule.local else 0.0
+        probabilities = STILL_ODDS, 1 - STILL_ODDS - local, local
+    elif rollout == "uniform" or state.position < state.schedule.progressive:
+        probabilities = UNIFORM
+    else:
+        probabilities = CAPACITY_WEIGHTED if rollout == "fixed" else rollout_probabilities(state.rho)
+    draw = float(torch.rand((), generator=state.generator))
+    level = int(draw >= probabilities[0]) + int(draw >= probabilities[0] + probabilities[1])
+    return (min(level, top),), probabilities
+
+
+def next_view(state: TrainState, level: int) -> int:
+    """The training view of the next picture at `level`: each in turn, in random order; views near the key instant at
+    random."""
+    held_back = held_back_views(state) if state.position < state.schedule.rounding else set()
+    if level == 0 and state.key is not None:
+        still = state.position < state.schedule.coarse_end
+        if still or float(torch.rand((), generator=state.generator)) < NEAR_ODDS:
+            near = near_key(state, [index for index in range(len(state.views)) if index not in held_back])
+            return near[int(torch.randint(len(near), (), generator=state.generator))]
+    if not state.order:
+        drawn = torch.randperm(len(state.views), generator=state.generator).tolist()
+        state.order = [index for index in drawn if index not in held_back]
+    return state.order.pop()
+
+
+def near_key(state: TrainState, among: list[int]) -> list[int]:
+    """Those of the training views `among` that are nearest to the key instant."""
+    key, views = state.key or 0.0, state.views.views
+    nearest = sorted(among, key=lambda index: abs(views[index].time - key))
+    return nearest[: max(NEAR_VIEWS, round(len(among) * NEAR_SHARE))]
+
+
+def taught_views(state: TrainState, views: Sequence[TrainingView]) -> dict[int, list[TrainingView]]:
+    """The views as they teach each of the trained levels."""
+    return {level: [as_taught(state, view, level) for view in views] for level in state.trained_levels()}
+
+
+def as_taught(state: TrainState, shown: TrainingView, level: int) -> TrainingView:
+    """The view with the weights of the pixels that teach `level`: at level 0 of a scene with a key instant none where
+    layer 1 changes the picture."""
+    if level > 0 or state.key is None or state.position < state.schedule.coarse_end:
+        return shown
+    with torch.no_grad():
+        place = shown.view.time, shown.view.camera, state.rounding(noisy=False)
+        still, moved = (render(state.model, drawn, *place).image for drawn in (0, 1))
+    same = (still - moved).abs().amax(-1) < STILL_CONTRAST
+    return replace(shown, weights=shown.weights * same)

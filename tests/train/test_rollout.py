@@ -1,0 +1,72 @@
+"""Levels, views and pixels of steps with a key instant."""
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from pd4dgs_codec.model.picture import render
+from pd4dgs_codec.scene import instant
+from pd4dgs_codec.train import rollout
+from pd4dgs_codec.train.config import TrainConfig
+from pd4dgs_codec.train.initialise import TIED
+from pd4dgs_codec.train.learner import Learner
+from pd4dgs_codec.train.rollout import as_taught, draw_levels, near_key, next_view
+from pd4dgs_codec.train.schedule import LOWEST, Schedule
+
+
+def learner(dataset, key: float = 0.5, **config) -> Learner:
+    views = replace(dataset, train=dataset.train * 6)
+    config = TrainConfig(preset="tiny", key_instant=key, **config)
+    return Learner(config, views, Schedule(1000), torch.device("cpu"))
+
+
+def times(state: Learner, indices: list[int]) -> set[float]:
+    return {state.views.views[index].time for index in indices}
+
+
+def test_the_still_start_sees_views_near_the_key_instant_alone(dataset):
+    state = learner(dataset, key=0.0)
+    near = near_key(state, list(range(len(state.views))))
+    assert max(times(state, near)) < min(view.time for view in state.views.views if view.time not in times(state, near))
+    assert draw_levels(state) == ((0,), LOWEST)
+    assert {next_view(state, 0) for _ in range(60)} <= set(near)
+    assert len({next_view(state, 1) for _ in range(len(state.views))}) > len(near), "level 1 takes every view in turn"
+
+
+@pytest.mark.parametrize("share, odds", [(0.2, (0.15, 0.85, 0.0)), (0.6, (0.15, 0.517, 0.333))])
+def test_most_steps_train_what_moves(dataset, share, odds):
+    state = learner(dataset)
+    state.iteration = round(1000 * share)
+    drawn = [draw_levels(state) for _ in range(300)]
+    assert drawn[0][1] == pytest.approx(odds, abs=1e-3)
+    counts = [sum(levels == (level,) for levels, _ in drawn) / 300 for level in range(3)]
+    assert counts == pytest.approx(odds, abs=0.1)
+
+
+@torch.no_grad()
+def test_level_0_learns_nothing_where_layer_1_changes_the_picture(dataset, monkeypatch):
+    monkeypatch.setattr(rollout, "STILL_CONTRAST", 0.01)  # a fresh model is faint
+    state = learner(dataset)
+    state.iteration = 500
+    state.model.mask_logits[:, 1:] = TIED  # the levels have the same anchors
+    field = state.model.global_deformation
+    field.planes.grid.mul_(torch.rand(len(field.planes.grid), 1) + 0.5)
+    for head in field.heads.values():
+        head.layers[-1].weight.uniform_(-1, 1)
+    view = state.views[0]
+    place = view.view.time, view.view.camera
+    still, moved = (render(state.model, level, *place).image for level in (0, 1))
+    differs = (still - moved).abs().amax(-1) >= rollout.STILL_CONTRAST
+    assert differs.any() and not differs.all()
+    taught = as_taught(state, view, 0).weights
+    assert torch.equal(taught == 0, differs | (view.weights == 0))
+    assert as_taught(state, view, 1) is view
+    at_key = replace(view, view=replace(view.view, time=instant(field.key)))
+    assert torch.equal(as_taught(state, at_key, 0).weights, view.weights), "at t* level 0 is all that there is"
+
+
+def test_other_rollouts_have_no_key_instant(dataset):
+    state = learner(dataset, rollout="adaptive")
+    assert state.key is None and state.model.global_deformation.key is None
+    assert as_taught(state, state.views[0], 0) is state.views[0]
