@@ -274,13 +274,9 @@ def _rebuilt(plain: Any, like: Any) -> Any:
     TypeError or AttributeError."""
     if is_dataclass(like) and not isinstance(like, type):
         return type(like)(**{name: _rebuilt(value, getattr(like, name)) for name, value in plain.items()})
-    if like is None and isinstance(plain, list):
-        return tuple(plain)
-    if isinstance(like, tuple):
-        return tuple(_rebuilt(value, like[0]) for value in plain)
-    if like is None and isinstance(plain, list):
-        return tuple(_rebuilt(value, 0.0) for value in plain)
+    if isinstance(plain, list):
+        return tuple(_rebuilt(value, like[0] if isinstance(like, tuple) else 0.0) for value in plain)
     kind = (int, float) if isinstance(like, float) else type(like)
-    if like is not None and not isinstance(plain, kind) or isinstance(plain, (list, dict)):
+    if like is not None and not isinstance(plain, kind) or isinstance(plain, dict):
         raise ValueError(f"{plain!r} where {like!r} is usual")
     return plain
