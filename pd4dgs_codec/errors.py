@@ -32,6 +32,10 @@ class Pd4Error(Exception):
         super().__init__(one_line(message))
 
 
+class DamageWarning(UserWarning):
+    """Somebody's file is damaged and could be read in part."""
+
+
 class DataError(Pd4Error):
     """A dataset, an image, a camera or a checkpoint is missing, broken or not ours."""
 

@@ -18,6 +18,8 @@ from pd4dgs_codec.batch import store
 from pd4dgs_codec.batch.manifest import OPS, Line, arguments
 from pd4dgs_codec.data.dataset import SYNTHETIC
 from pd4dgs_codec.errors import DataError, Pd4Error, one_line
+from pd4dgs_codec.io import remove_temporaries
+from pd4dgs_codec.signals import ignore_more, interruptible
 
 LOG_BYTES = 1 << 16  #: kept of a command's log
 DONE, ALREADY, FAILED = "done", "already", "failed"
@@ -64,21 +66,34 @@ class CommandFailed(Exception):
 
 
 def run_job(job: Job, command: Command) -> Outcome:
-    """Does a job unless its output is finished. Raises nothing: every failure is an outcome."""
+    """Does a job unless its output is finished. Every failure is an outcome, and so is a signal, but in the process
+    that runs the batch, which a signal ends."""
     cpu = time.process_time()
-    try:
-        outcome = _done_once(job, command)
-    except CommandFailed as error:
-        outcome = error.outcome
-    except Pd4Error as error:
-        outcome = Outcome(FAILED, str(error), final=True)
-    except OSError as error:
-        message = f"{error.filename}: {error.strerror}" if error.filename else str(error)
-        outcome = Outcome(FAILED, message, final=isinstance(error, store.FINAL))
-    except Exception as error:  # a fault in the package or a library must not end the batch
-        outcome = Outcome(FAILED, f"{type(error).__name__}: {error}")
+    with interruptible() as outermost:
+        try:
+            outcome = _outcome(job, command)
+        except KeyboardInterrupt:
+            if not outermost:
+                raise
+            ignore_more()
+            remove_temporaries()
+            outcome = Outcome(FAILED, "was interrupted")
     peak = 1024 * resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
     return replace(outcome, message=one_line(outcome.message), cpu=time.process_time() - cpu, peak=peak)
+
+
+def _outcome(job: Job, command: Command) -> Outcome:
+    try:
+        return _done_once(job, command)
+    except CommandFailed as error:
+        return error.outcome
+    except Pd4Error as error:
+        return Outcome(FAILED, str(error), final=True)
+    except OSError as error:
+        message = f"{error.filename}: {error.strerror}" if error.filename else str(error)
+        return Outcome(FAILED, message, final=isinstance(error, store.FINAL))
+    except Exception as error:  # a fault in the package or a library must not end the batch
+        return Outcome(FAILED, f"{type(error).__name__}: {error}")
 
 
 def _done_once(job: Job, command: Command) -> Outcome:

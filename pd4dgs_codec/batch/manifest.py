@@ -14,7 +14,7 @@ from typing import Any
 
 from pd4dgs_codec.batch import store
 from pd4dgs_codec.data.dataset import SYNTHETIC, dataset_folders
-from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.errors import DataError, one_line
 
 
 @dataclass(frozen=True)
@@ -83,6 +83,8 @@ class Manifest:
                     self.lines.append(line)
                 except DataError as error:
                     self.faults.append(Fault(number, str(error)))
+                except Exception as error:  # what no check foresaw is this line's alone
+                    self.faults.append(Fault(number, one_line(f"{type(error).__name__}: {error}")))
         if not (self.lines or self.faults):
             raise DataError(f"{place}: holds no lines, expected a JSON object for each scene")
 
@@ -98,7 +100,7 @@ def _line(number: int, raw: bytes, op: Op, check: Callable[[dict[str, Any]], Non
         found = ", ".join(map(str, content)) if isinstance(content, dict) else type(content).__name__
         raise DataError(f"found {found}; expected an object of {', '.join(KEYS)}")
     source, options = content.get("source"), content.get("options", {})
-    if not isinstance(source, str) or not source:
+    if not isinstance(source, str):
         raise DataError(f"source is {source!r}, expected a path or a URI")
     if not isinstance(options, dict):
         raise DataError(f"options are {options!r}, expected an object")
@@ -111,7 +113,9 @@ def _line(number: int, raw: bytes, op: Op, check: Callable[[dict[str, Any]], Non
     return Line(number, _absolute(source), output, options | inputs)
 
 
-def _absolute(place: str) -> str:
+def _absolute(place: Any) -> str:
+    if not isinstance(place, str) or not place:
+        raise DataError(f"found {place!r}, expected a path or a URI")
     return place if place.startswith(SYNTHETIC) else store.absolute(place)
 
 

@@ -27,6 +27,7 @@ from pd4dgs_codec.batch.job import ALREADY, DONE, FAILED, Command, Job, Outcome,
 from pd4dgs_codec.errors import DataError
 
 Work = Callable[[Job], Outcome]
+GRACE_SECONDS = 5.0  #: that a process has to clear up before it is killed
 POLL_SECONDS = 1.0  #: between looks at Slurm's results
 MAX_ARRAY = 1000  #: jobs of a Slurm array; the usual limit (MaxArraySize) is 1001
 
@@ -178,17 +179,24 @@ class Local(Engine):
         return future
 
     def kill(self, future: Future[Outcome]) -> None:
-        """Kills the process."""
-        executor, pid = pool = self.busy.pop(future)
-        self.pools.remove(pool)
-        with contextlib.suppress(BrokenProcessPool, ProcessLookupError):
-            os.kill(pid.result(), signal.SIGKILL)
-        executor.shutdown(wait=False, cancel_futures=True)
+        """Ends the process."""
+        self._end([future])
+
+    def _end(self, futures: list[Future[Outcome]]) -> None:
+        """By SIGTERM, so that it removes what it was writing; by SIGKILL if it is still there after GRACE_SECONDS."""
+        pools = {future: self.busy.pop(future) for future in futures}
+        for number, patience in ((signal.SIGTERM, GRACE_SECONDS), (signal.SIGKILL, 0.0)):
+            for future in (future for future in futures if not future.done()):
+                with contextlib.suppress(BrokenProcessPool, ProcessLookupError):
+                    os.kill(pools[future][1].result(), number)
+            wait(futures, patience)
+        for pool in pools.values():
+            self.pools.remove(pool)
+            pool[0].shutdown(wait=False, cancel_futures=True)
 
     def close(self) -> None:
-        """Kills the processes at work and dismisses the others."""
-        for future in [future for future in self.busy if not future.done()]:
-            self.kill(future)
+        """Ends the processes at work and dismisses the others."""
+        self._end([future for future in self.busy if not future.done()])
         for executor, _ in self.pools:
             executor.shutdown(wait=False)
 

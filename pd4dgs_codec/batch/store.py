@@ -13,6 +13,7 @@ import os
 import posixpath
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
+from importlib.util import find_spec
 from pathlib import Path
 from typing import IO, Any
 
@@ -28,21 +29,35 @@ FINAL = (FileNotFoundError, FileExistsError, PermissionError, IsADirectoryError,
 
 
 def absolute(place: str) -> str:
-    """An absolute path, for workers in other folders; URIs stay. Raises DataError for an unknown scheme."""
-    _, path, local = _system(place)
-    return path if local else place
+    """An absolute path, for workers in other folders; URIs stay, and nothing is asked of their store. Raises DataError
+    for an unknown scheme."""
+    _need_fsspec()
+    from fsspec import available_protocols
+    from fsspec.core import split_protocol
+
+    first, chained, _ = place.partition("::")
+    scheme = split_protocol(first)[0] or (first if chained else "file")
+    if scheme in ("file", "local"):
+        return _system(place)[1]
+    if scheme not in available_protocols():
+        raise DataError(f"{place}: Protocol not known: {scheme}")
+    return place
+
+
+def _need_fsspec() -> None:
+    if find_spec("fsspec") is None:
+        raise DataError("batches need the package fsspec: pip install 'pd4dgs-codec[cluster]'")
 
 
 def _system(place: str) -> tuple[Any, str, bool]:
     """(file system, path in it, whether it is this machine's)."""
-    try:
-        from fsspec.core import url_to_fs
-        from fsspec.implementations.local import LocalFileSystem
-    except ImportError:
-        raise DataError("batches need the package fsspec: pip install 'pd4dgs-codec[cluster]'") from None
+    _need_fsspec()
+    from fsspec.core import url_to_fs
+    from fsspec.implementations.local import LocalFileSystem
+
     try:
         system, path = url_to_fs(place)
-    except (ImportError, ValueError) as error:
+    except Exception as error:  # each store has its own
         raise DataError(f"{place}: {one_line(str(error))}") from None
     return system, str(path), isinstance(system, LocalFileSystem)
 

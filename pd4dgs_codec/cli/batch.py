@@ -16,7 +16,7 @@ from pd4dgs_codec.batch.manifest import OPS, arguments
 from pd4dgs_codec.cli import options
 from pd4dgs_codec.cli.common import FAILED, OK, STDIO, Console, UsageError, check_output, run, say, write_bytes
 from pd4dgs_codec.cli.progress import progress_bar
-from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.errors import DataError, printable
 from pd4dgs_codec.threads import available
 
 if TYPE_CHECKING:
@@ -180,9 +180,9 @@ class _Failures:
         log = None
         if outcome.log:
             path = self.folder / f"{job.line.output}.log"
-            with contextlib.suppress(OSError):  # the batch matters more than its logs
+            with contextlib.suppress(OSError, ValueError):  # the batch matters more than its logs
                 path.parent.mkdir(parents=True, exist_ok=True)
-                path.write_text(outcome.log)
+                path.write_text(printable(outcome.log), encoding="utf-8")
                 log = str(path)
         again = f", tried {tries} times" if tries > 1 else ""
         self._add(job.line.number, job.line.output, outcome.message + again, log)

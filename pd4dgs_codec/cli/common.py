@@ -14,11 +14,12 @@ import gc
 import io
 import os
 import sys
+import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
 
-from pd4dgs_codec.errors import DecodeError, EncodeError, Pd4Error, one_line, printable
+from pd4dgs_codec.errors import DamageWarning, DecodeError, EncodeError, Pd4Error, one_line, printable
 from pd4dgs_codec.signals import ignore_more, interruptible
 from pd4dgs_codec.threads import configure
 
@@ -215,7 +216,7 @@ def run(parser: argparse.ArgumentParser, action: Action, argv: Sequence[str] | N
     """
     open_streams()
     arguments = list(sys.argv[1:] if argv is None else argv)
-    with interruptible() as outermost:
+    with interruptible() as outermost, _told_warnings(parser.prog):
         try:
             return _run(parser, action, arguments)
         except KeyboardInterrupt as error:
@@ -225,6 +226,24 @@ def run(parser: argparse.ArgumentParser, action: Action, argv: Sequence[str] | N
             if writing := sys.modules.get("pd4dgs_codec.io"):
                 writing.remove_temporaries()
             return _fail(parser.prog, error, "interrupted; nothing was written", "--json" in arguments)
+
+
+@contextlib.contextmanager
+def _told_warnings(prog: str) -> Iterator[None]:
+    """Tells of damage in files as messages are told, and escapes all other warnings."""
+    before = warnings.showwarning
+
+    def tell_of(message: Warning | str, category: type[Warning], *where: Any, **more: Any) -> None:
+        if issubclass(category, DamageWarning):
+            say(f"{prog}: warning: {one_line(str(message))}")
+        else:
+            before(one_line(str(message)), category, *where, **more)
+
+    warnings.showwarning = tell_of
+    try:
+        yield
+    finally:
+        warnings.showwarning = before
 
 
 def _run(parser: argparse.ArgumentParser, action: Action, arguments: list[str]) -> int:

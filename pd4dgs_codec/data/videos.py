@@ -28,7 +28,7 @@ from pd4dgs_codec.data.cameras import Lens, UnreadView, rectify
 from pd4dgs_codec.data.files import check_downscale, check_pixels, shrink_image, shrink_mask
 from pd4dgs_codec.data.posed import geometry, without_first_camera
 from pd4dgs_codec.data.view import Dataset, View
-from pd4dgs_codec.errors import DataError, one_line
+from pd4dgs_codec.errors import DamageWarning, DataError, one_line
 
 #: Largest width or height, and frames per second: beyond them the header is wrong.
 MAX_SIDE, MAX_FPS = 16_384, 10_000.0
@@ -101,7 +101,7 @@ def _pictures(path: Path, shape: tuple[int, ...], output: Sequence[str], promise
     if code or data or (said and count < promised * (1 - SHORT) - 1):
         raise DataError(f"{path}: is damaged: found {found}; expected a whole video")
     if said:
-        warnings.warn(f"{path}: is damaged: found {found}", stacklevel=2)
+        warnings.warn(DamageWarning(f"{path}: is damaged: found {found}"), stacklevel=2)
 
 
 @dataclass(frozen=True)

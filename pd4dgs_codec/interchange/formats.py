@@ -40,6 +40,8 @@ JSON, BINARY = 0x4E4F534A, 0x004E4942  #: types of chunks
 SPZ_STEP, SPZ_REACH = 1 / 4096, 2048.0
 #: SPZ's first bytes; the most Gaussians, and unpacked bytes of each: 65 with all harmonics, the rest for extensions.
 SPZ_MAGIC, SPZ_MOST, SPZ_BYTES = b"NGSP", 10_000_000, 128
+#: Bytes that any SPZ file may unpack to, and more for each byte of its own.
+FREE_BYTES, INFLATES = 1 << 20, 16
 #: 4dgs files store harmonics but the constant as bytes, from -SH_SPAN to SH_SPAN.
 SH_SPAN = 4.0
 
@@ -157,7 +159,7 @@ def _check_spz(path: Path, data: bytes) -> None:
         count = int.from_bytes(head[8:12], "little")
         if count > SPZ_MOST:
             raise DataError(f"{path}: says it has {count:,} Gaussians, expected {SPZ_MOST:,} at most")
-        size, most = len(head), len(head) + SPZ_BYTES * count
+        size, most = len(head), min(len(head) + SPZ_BYTES * count, FREE_BYTES + INFLATES * len(data))
         while zipped and not unpacker.eof and size <= most:
             part = unpacker.decompress(unpacker.unconsumed_tail, 1 << 20)
             if not part:
@@ -169,7 +171,7 @@ def _check_spz(path: Path, data: bytes) -> None:
         table = data[int.from_bytes(head[16:20], "little") :][: 16 * head[15]]
         size = sum(int.from_bytes(table[i + 8 : i + 16], "little") for i in range(0, len(table), 16))
     if size > most:
-        raise DataError(f"{path}: unpacks to more than its {count:,} Gaussians take")
+        raise DataError(f"{path}: unpacks to more than {most:,} bytes, for {count:,} Gaussians in {len(data):,} bytes")
 
 
 def read_gsplat(path: Path) -> Splats:

@@ -113,6 +113,19 @@ def reconstruct(database: Path, images: Path, folder: Path, threads: int, advanc
     return max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()), default=None)
 
 
+def write(model: Any, folder: Path) -> None:
+    """Writes a model into a folder. Raises DataError unless it can be read again: COLMAP does not say when a disk is
+    full."""
+    folder.mkdir(parents=True, exist_ok=True)
+    model.write(folder)
+    try:
+        found = colmap().Reconstruction(folder).num_points3D()
+    except Exception:  # of pycolmap's own kinds
+        found = -1
+    if found != model.num_points3D():
+        raise DataError(f"{folder}: the model could not be written whole; expected room on the disk")
+
+
 def upright(model: Any) -> None:
     """Rotates the mean up direction of the model to -y and moves its median point to 0: boxes and planes along the axes
     fit better, and numbers stay small."""

@@ -9,6 +9,7 @@ from __future__ import annotations
 import json
 import os
 import shutil
+import stat
 from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -16,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.errors import DataError, one_line
 from pd4dgs_codec.io import finite, write_bytes
 from pd4dgs_codec.prepare import poses
 from pd4dgs_codec.prepare.frames import (
@@ -31,6 +32,7 @@ from pd4dgs_codec.prepare.frames import (
     write_frames,
 )
 from pd4dgs_codec.prepare.poses import Verdicts
+from pd4dgs_codec.signals import held
 
 STATE, REPORT = "prepare.json", "report.json"
 #: Thresholds of advice: share of frames, pixels of a picture 1000 wide, points a picture, degrees, share of features.
@@ -67,13 +69,18 @@ def prepare(
         looks, choice, times = _frames(work, recording, choices, progress)
         findings = _poses(work, times, choices, progress)
         result = _finish(work, findings, looks, choice, times, source)
-    except DataError:
+    except (DataError, OSError):
         shutil.rmtree(work, ignore_errors=True)
         raise
+    except (RuntimeError, ValueError) as error:  # of pycolmap and SQLite, on a full disk for example
+        shutil.rmtree(work, ignore_errors=True)
+        raise DataError(f"{source}: COLMAP gives up: {one_line(str(error), 160)}") from None
     check_folder(output, overwrite)  # it may have appeared meanwhile
-    if output.exists():
-        shutil.rmtree(output)
-    os.replace(work, output)
+    with held():
+        if output.exists():
+            os.chmod(work, stat.S_IMODE(output.stat().st_mode))
+            shutil.rmtree(output)
+        os.replace(work, output)
     return result
 
 
@@ -156,9 +163,7 @@ def _poses(work: Path, times: dict[str, float], choices: Choices, progress: Prog
         if second is not None and second.num_reg_images() >= first.num_reg_images():
             model = second
     poses.upright(model)
-    target = work / "sparse" / "0"
-    target.mkdir(parents=True, exist_ok=True)
-    model.write(target)
+    poses.write(model, work / "sparse" / "0")
     return Findings(model, verdicts, moving)
 
 

@@ -9,12 +9,13 @@ from __future__ import annotations
 import hashlib
 import html
 import json
+import os
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from pd4dgs_codec.errors import DeliveryError
+from pd4dgs_codec.errors import DeliveryError, printable
 from pd4dgs_codec.format.decoder import decode
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.scene import Scene
@@ -112,8 +113,7 @@ def _json(content: dict[str, Any]) -> bytes:
 # -- the library -------------------------------------------------------------------------------------------------------
 
 LIBRARY = "library.json"
-#: Keys of a package's index that the library repeats.
-FIELDS = ("bytes", "sha256", "format_version", "seconds", "first_frame_seconds")
+LARGEST, LONGEST = 2**53, 200  #: number and text in the index of a package that a library repeats
 STYLE = (
     "body{font:16px system-ui;margin:2rem;background:#111;color:#eee}"
     "main{display:grid;grid-template-columns:repeat(auto-fill,minmax(220px,1fr));gap:1rem}"
@@ -136,19 +136,41 @@ def library(folder: Path) -> dict[str, bytes]:
 
 def _scenes(folder: Path) -> Iterator[dict[str, Any]]:
     for path in sorted(folder.rglob(INDEX)):
-        if path.parent == folder:
+        if path.parent == folder or not path.is_file():
             continue
-        name = path.parent.relative_to(folder).as_posix()
-        base = quote(name)
         try:
-            about = json.loads(path.read_bytes())
-            scene: dict[str, Any] = {"name": name, "page": f"{base}/{PAGE}", "file": f"{base}/{about['file']}"}
-            scene["poster"] = f"{base}/{about['poster']}" if about["poster"] else None
-            scene |= {field: about[field] for field in FIELDS}
-            scene["layers"] = [{"layer": part["layer"], "end": part["range"][1]} for part in about["layers"]]
-        except (ValueError, KeyError, TypeError) as error:
+            yield _listed(path.parent.relative_to(folder).as_posix(), json.loads(path.read_bytes()))
+        except (ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
             raise DeliveryError(f"{path}: invalid index of a package ({type(error).__name__}: {error})") from None
-        yield scene
+
+
+def _listed(name: str, about: Any) -> dict[str, Any]:
+    """What the library says of a package by its index, in which somebody else may have written anything."""
+    base = quote(os.fsencode(name))
+    layers = [{"layer": _number(part["layer"]), "end": _number(part["range"][1])} for part in about["layers"]]
+    return {
+        "name": printable(name, ""),
+        "page": f"{base}/{PAGE}",
+        "file": f"{base}/{quote(_text(about['file']), safe='')}",
+        "poster": f"{base}/{quote(_text(about['poster']), safe='')}" if about["poster"] else None,
+        "bytes": int(_number(about["bytes"])),
+        **{field: _text(about[field]) for field in ("sha256", "format_version")},
+        "seconds": _number(about["seconds"]),
+        "first_frame_seconds": {_text(rate): _number(s) for rate, s in about["first_frame_seconds"].items()},
+        "layers": layers,
+    }
+
+
+def _number(value: Any) -> Any:
+    if isinstance(value, bool) or not isinstance(value, (int, float)) or not 0 <= value <= LARGEST:
+        raise TypeError(f"found {str(value)[:60]}, expected a number from 0")
+    return value
+
+
+def _text(value: Any) -> str:
+    if not isinstance(value, str) or not value.isprintable() or not 0 < len(value) <= LONGEST:
+        raise TypeError(f"found {str(value)[:60]!r}, expected a text of at most {LONGEST} characters")
+    return value
 
 
 def _library_page(scenes: list[dict[str, Any]]) -> str:
@@ -156,7 +178,7 @@ def _library_page(scenes: list[dict[str, Any]]) -> str:
     for scene in scenes:
         poster = f'<img loading="lazy" alt="" src="{html.escape(scene["poster"])}">' if scene["poster"] else None
         first = ", ".join(f"{seconds:.1f} s at {rate}bps" for rate, seconds in scene["first_frame_seconds"].items())
-        about = f"{scene['bytes'] / 1e6:.2f} MB; first picture after {first}"
+        about = html.escape(f"{scene['bytes'] / 1e6:.2f} MB; first picture after {first}")
         link = f'<a href="{html.escape(scene["page"])}">{poster or "<div class=none></div>"}'
         cards.append(f"{link}<br>{html.escape(scene['name'])}<br><small>{about}</small></a>")
     head = f'<!doctype html><meta charset="utf-8"><title>{len(scenes)} scenes</title><style>{STYLE}</style>'
