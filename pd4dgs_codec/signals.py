@@ -32,6 +32,11 @@ def _received(number: int, frame: FrameType | None) -> None:
         raise KeyboardInterrupt
 
 
+def _raise_again() -> None:
+    """In the main thread, whichever this one is: it may wait for the system."""
+    signal.pthread_kill(threading.main_thread().ident or 0, signal.SIGINT)
+
+
 @contextmanager
 def held() -> Iterator[None]:
     """Lets signals wait until the block ends, if `interruptible` handles them. For moments, not for work."""
@@ -42,7 +47,7 @@ def held() -> Iterator[None]:
         _State.held -= 1
         if _State.waiting and not _State.held:
             _State.waiting = False
-            signal.raise_signal(signal.SIGINT)  # for the main thread, whichever this one is
+            _raise_again()
 
 
 def ignore_more() -> None:
@@ -62,7 +67,7 @@ def interruptible() -> Iterator[bool]:
     def lost(event: Any) -> None:
         """Python prints what a callback of its own raises, also where a signal came, and goes on."""
         if issubclass(event.exc_type, KeyboardInterrupt):
-            threading.Timer(AGAIN_SECONDS, signal.raise_signal, [signal.SIGINT]).start()
+            threading.Timer(AGAIN_SECONDS, _raise_again).start()
         else:
             hook(event)
 

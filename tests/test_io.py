@@ -54,6 +54,20 @@ def test_a_link_stays_one_and_a_device_is_written_to(tmp_path):
     assert not os.path.isfile("/dev/null")
 
 
+@pytest.mark.skipif(os.name != "posix", reason="modes")
+@pytest.mark.parametrize("mode", [0o600, 0o640, 0o755])
+def test_an_output_keeps_its_mode(tmp_path, mode):
+    names = [str(tmp_path / "a"), str(tmp_path / "b")]
+    for name in names:
+        open(name, "w").close()
+        os.chmod(name, mode)
+    io.write_bytes(names[0], b"new", overwrite=True)
+    with io.whole_files(names[0], names, True) as temporaries:
+        for temporary in temporaries:
+            temporary.write_bytes(b"new")
+    assert [os.stat(name).st_mode & 0o777 for name in names] == [mode] * 2
+
+
 def test_leftovers_of_a_killed_process_are_found_by_the_file_they_hold(tmp_path):
     mine = tmp_path / ".pd4dgs-ab_3xyz9" / "m.pt"
     others = [tmp_path / name for name in ("m.pt", ".pd4dgs-cd_3xyz9/other.pt", "folder/m.pt")]

@@ -100,7 +100,7 @@ def _line(number: int, raw: bytes, op: Op, check: Callable[[dict[str, Any]], Non
         found = ", ".join(map(str, content)) if isinstance(content, dict) else type(content).__name__
         raise DataError(f"found {found}; expected an object of {', '.join(KEYS)}")
     source, options = content.get("source"), content.get("options", {})
-    if not isinstance(source, str):
+    if not isinstance(source, str) or not source:
         raise DataError(f"source is {source!r}, expected a path or a URI")
     if not isinstance(options, dict):
         raise DataError(f"options are {options!r}, expected an object")

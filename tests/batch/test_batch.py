@@ -99,6 +99,15 @@ LINES = [
     ('{"source": "a.pt", "output": "/x.pd4"}', "/x.pd4"),
     ('{"source": "a.pt", "output": "x.done.json"}', "x.done.json"),
     ('{"source": "nowhere://a.pt"}', "nowhere"),
+    ('{"source": "a.pt", "options": {"data": 5}}', "found 5, expected a path"),
+    ('{"source": "a.pt", "options": {"data": [["x"]]}}', "expected a path"),
+    ('{"source": "a.pt", "options": {"data": ""}}', "expected a path"),
+    ("[" * 100_000, "not JSON"),
+    ('{"source": 1' + "0" * 5000 + "}", "not JSON"),
+    ('{"source": "a.pt", "output": "\x1b[2J"}', "not JSON"),
+    ('{"source": "a.pt", "output": "\\u001b[2J"}', "output is"),
+    ('{"source": "a.pt", "output": "\\ud800"}', "output is"),
+    ('{"source": "ssh2://a.pt"}', "ssh2"),
 ]
 
 
@@ -109,6 +118,22 @@ def test_a_broken_line_is_named_and_the_others_go_on(library, line, what):
     (fault,) = library.manifest().faults
     assert fault.number == 1 and what in fault.message
     assert library.run().done == 1
+
+
+STORES = ("dir:///", "reference://", "zip://none.zip", "sftp://127.0.0.1:9/x", "simplecache::none", "\0", "a\ud800b")
+
+
+@pytest.mark.parametrize("place", [*STORES, "file://" + "x" * 5000])
+@pytest.mark.parametrize("key", ["source", "data"])
+def test_a_place_that_no_store_has_is_a_failure_of_its_line_alone(library, place, key):
+    library.add("a.pt", "first", options={"data": place} if key == "data" else {})
+    if key == "source":
+        library.lines[0] = json.dumps({"source": place, "output": "a.pd4"})
+    library.add("b.pt", "fine")
+    faults = library.manifest().faults
+    assert library.run(retries=0).done == 1 and (library.out / "b.pd4").read_text() == "FINE"
+    said = faults[0].message if faults else library.outcomes["a.pd4"][0].message
+    assert said.isprintable() and said
 
 
 def test_two_lines_with_one_output_are_named(library):

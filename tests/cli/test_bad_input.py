@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import errno
+import io
 import json
 import os
 import shlex
+import shutil
+import warnings
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,6 +17,8 @@ import torch
 
 from pd4dgs_codec import encode
 from pd4dgs_codec.__main__ import MODULES
+from pd4dgs_codec.cli import common
+from pd4dgs_codec.errors import DamageWarning, DataError
 from pd4dgs_codec.model import checkpoint
 
 #: Exit code, command line, and a part of the message. SCENE, MODEL and DATA are a .pd4, a checkpoint and a dataset;
@@ -259,3 +264,56 @@ def test_missing_torch_and_faults_of_ours_are_one_line(cli, model_pt, scene_pd4,
 def test_usage_errors_as_json(cli):
     result = cli("info", "--json", "--nothing")
     assert result.code == 2 and json.loads(result.out)["error"]["type"] == "UsageError"
+
+
+EVIL = "\x1b]0;title\x07\x9b2J\u202e"
+
+
+def test_names_of_files_and_titles_cannot_move_the_cursor(cli, scene_pd4, tmp_path):
+    for path in (tmp_path / EVIL, tmp_path / (EVIL * 30), tmp_path / f"{EVIL}\udcff.pd4"):
+        result = cli("info", path)
+        assert result.code == 1 and result.err.rstrip("\n").isprintable() and "x1b]0;title" in result.err
+    shutil.copy(scene_pd4, tmp_path / f"{EVIL}.pd4")
+    assert "\x1b" not in cli("info", tmp_path / f"{EVIL}.pd4").out.decode()
+
+
+def test_a_terminal_without_the_letters_of_a_text_gets_escapes(monkeypatch):
+    stream = io.TextIOWrapper(io.BytesIO(), encoding="ascii")
+    monkeypatch.setattr("sys.stdout", stream)
+    common.open_streams()
+    common.show("Ein Flügel \udcff\x1b[2J")
+    assert stream.buffer.getvalue() == b"Ein Fl\\xfcgel \\udcff\\x1b[2J\n"
+
+
+def test_warnings_are_one_line(cli, scene_pd4, monkeypatch):
+    def info(data):
+        warnings.simplefilter("always")
+        warnings.warn(DamageWarning(f"x.mp4: is damaged:\n{EVIL}"), stacklevel=1)
+        raise DataError("no")
+
+    monkeypatch.setattr("pd4dgs_codec.format.info.info", info)
+    first, second = cli("info", scene_pd4).error_lines
+    assert first.startswith("pd4dgs-info: warning: x.mp4: is damaged: \\x1b") and second == "pd4dgs-info: error: no"
+
+
+def test_a_full_disk_behind_a_library_is_not_called_stdout(cli, scene_pd4, monkeypatch):
+    def full(data):
+        raise OSError(errno.EFBIG, os.strerror(errno.EFBIG))
+
+    monkeypatch.setattr("pd4dgs_codec.format.info.info", full)
+    _check(cli("info", scene_pd4), "info", 1, "a cache or a temporary file: File too large")
+
+
+def test_a_film_on_a_full_disk_is_one_line_and_no_file(cli, scene_pd4, tmp_path):
+    resource = pytest.importorskip("resource")
+    arguments = (scene_pd4, "-o", tmp_path / "x.mp4", "--frames", 8)
+    limits = resource.getrlimit(resource.RLIMIT_FSIZE)
+    assert cli("render", *arguments).code == 0
+    (tmp_path / "x.mp4").unlink()
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1000, limits[1]))
+    try:
+        result = cli("render", *arguments)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, limits)
+    _check(result, "render", 1, "x.mp4: ffmpeg cannot write it: ")
+    assert not list(tmp_path.iterdir())

@@ -14,8 +14,10 @@ import folders
 import numpy as np
 import pytest
 from folders import CAMERAS, COUNT, INSTANTS, pose, save
+from PIL import Image
 
 NAN = float("nan")
+FRAMES = [{"file_path": f"r_{i}", "time": i / 10, "transform_matrix": pose(0.2 * i)} for i in range(3)]
 XYZ = "property float x\nproperty float y\nproperty float z\n"
 
 
@@ -26,12 +28,13 @@ def ply(form: str, body: bytes = b"", properties: str = XYZ) -> bytes:
 
 def write_blender(_: object, folder: Path) -> Path:
     """Three frames, points, depths and a distorting lens."""
-    frames = [{"file_path": f"r_{i}", "time": i / 10, "transform_matrix": pose(0.2 * i)} for i in range(3)]
-    file = {"camera_angle_x": 0.8, "w": 12, "h": 8, "k1": 0.01, "near_far_per_frame": [[1, 9]] * 3, "frames": frames}
+    file = {"camera_angle_x": 0.8, "w": 12, "h": 8, "k1": 0.01, "near_far_per_frame": [[1, 9]] * 3, "frames": FRAMES}
     save(folder / "transforms.json", file | {"ply_file_path": "points.ply"})
     save(folder / "points.ply", ply("ascii", b"0 0 0\n1 1 1\n"))
     for i in range(3):
         save(folder / f"r_{i}.png", folders.gradient(12, 8, i))
+    save(folder.parent / "outside" / "r_0.png", folders.gradient(12, 8))
+    (folder / "out").symlink_to(folder.parent / "outside")
     return folder
 
 
@@ -82,10 +85,32 @@ def npy(array: np.ndarray, **archive: bool) -> bytes:
     return stream.getvalue()
 
 
-def bomb() -> bytes:
+#: Of the header of a .npy file, up to its shape.
+DESCRIBED = "{{'descr': '<f8', 'fortran_order': False, 'shape': {}}}"
+
+
+def header(text: str) -> bytes:
+    """A .npy file of this header and a few bytes."""
+    return b"\x93NUMPY\x01\x00" + len(text).to_bytes(2, "little") + text.encode() + bytes(80)
+
+
+def blank() -> bytes:
+    """A black PNG of 4 kB and 33 megapixels."""
+    stream = io.BytesIO()
+    Image.new("1", (8192, 4096)).save(stream, "png")
+    return stream.getvalue()
+
+
+def renamed(file: dict[str, Any], name: str) -> dict[str, Any]:
+    """The transforms with another name for the first frame's image."""
+    first, *others = file["frames"]
+    return file | {"frames": [first | {"file_path": name}, *others]}
+
+
+def bomb(method: int = zipfile.ZIP_DEFLATED) -> bytes:
     """An archive of 50 kB that unpacks to 50 MB."""
     stream = io.BytesIO()
-    with zipfile.ZipFile(stream, "w", zipfile.ZIP_DEFLATED) as archive:
+    with zipfile.ZipFile(stream, "w", method) as archive:
         archive.writestr("data.npy", bytes(50_000_000))
     return stream.getvalue()
 
@@ -154,6 +179,23 @@ CASES: list[tuple[str, str, Any, str]] = [
     ("iphone", "points.npy", b"junk", "points.npy: not a .npy file"),
     ("iphone", "points.npy", npy(np.zeros((3, 2))), "found float64 (3, 2), expected floats [M, 3]"),
     ("iphone", "points.npy", npy(np.array([{}], dtype=object)), "points.npy: not a .npy file"),
+    ("blender", "transforms.json", {"camera_model": ["PINHOLE"]}, "camera_model is ['PINHOLE'], expected a name"),
+    ("blender", "transforms.json", {"camera_model": {}}, "camera_model is {}, expected a name"),
+    ("blender", "transforms.json", {"ply_file_path": "../points.ply"}, "'../points.ply' is not the name of a file in"),
+    ("blender", "transforms.json", {"ply_file_path": "/etc/passwd"}, "'/etc/passwd' is not the name of a file in"),
+    ("blender", "transforms.json", {"ply_file_path": "p\0.ply"}, "is not the name of a file in"),
+    *(
+        ("blender", "transforms.json", lambda file, name=name: renamed(file, name), "is not the name of a file in")
+        for name in ("../r_0", "/r_0", "a/../../r_0", "out/r_0", "r\0", "", ".")
+    ),
+    ("blender", "transforms.json", lambda file: renamed(file, "x" * 300), "image is missing"),
+    ("blender", "transforms.json", lambda file: renamed(file, "\x1b]0;x\x07" * 40), "image is missing"),
+    ("blender", "transforms.json", {"frames": FRAMES * 5, "near_far_per_frame": None}, "15 frames are of 3 pictures"),
+    ("blender", "r_0.png", lambda _: blank(), "33,554,432 pixels, expected"),
+    ("blender", "r_0.png", b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 12 8\n", "not an image that can be read"),
+    ("iphone", "splits/train.json", {"frame_names": ["../camera/0_00000"]}, "no entry for frame"),
+    ("iphone", "splits/train.json", {"frame_names": ["0_00000"] * 2}, "names a frame twice"),
+    ("iphone", "metadata.json", {"0_00000": {"warp_id": [1]}}, "warp_id is [1]"),
     ("record3d", "metadata", {"poses": []}, "found no poses"),
     ("record3d", "metadata", lambda m: m | {"poses": [row[:6] for row in m["poses"]]}, "expected (12, 7)"),
     ("record3d", "metadata", {"poses": [[0, 0, 0, 2, 0, 0, 0]] * COUNT}, "pose 0: quaternion of length 2, expected 1"),
@@ -176,6 +218,9 @@ CASES: list[tuple[str, str, Any, str]] = [
     ("panoptic", "init_pt_cld.npz", bomb(), "data unpacks to more than 1,"),
     ("panoptic", "init_pt_cld.npz", npy(np.array([{}]), archive=True), "data: not a .npy file"),
     ("panoptic", "init_pt_cld.npz", npy(np.zeros((4, 2)), archive=True), "expected numbers [M, 6]"),
+    ("panoptic", "init_pt_cld.npz", bomb(zipfile.ZIP_BZIP2), "data is compressed by method 12, expected deflate"),
+    ("panoptic", "init_pt_cld.npz", bomb(zipfile.ZIP_LZMA), "data is compressed by method 14, expected deflate"),
+    ("panoptic", "init_pt_cld.npz", bomb()[:-30], "not an archive of numpy"),
     ("panoptic", "init_pt_cld.npz", b"no archive", "not an archive of numpy"),
     ("neu3d", "poses_bounds.npy", lambda poses: poses[:2], "2 poses in poses_bounds.npy and 3 videos"),
     ("neu3d", "poses_bounds.npy", lambda poses: poses[:, :16], "rows of 17"),
@@ -184,6 +229,14 @@ CASES: list[tuple[str, str, Any, str]] = [
     ("neu3d", "poses_bounds.npy", times(np.where(COLUMN == 4, 2, 1)), "expected the same shape"),
     ("neu3d", "poses_bounds.npy", times(np.where(COLUMN == 15, 20, 1)), "0 < nearest < farthest"),
     ("neu3d", "poses_bounds.npy", npy(np.array([{}])), "not a .npy file"),
+    ("neu3d", "poses_bounds.npy", header("{'descr': '<f8', 'shape': " + "(" * 3000), "not a .npy file of numbers"),
+    ("neu3d", "poses_bounds.npy", header("{'descr': '<f8', 'shape': \'\'\'"), "not a .npy file of numbers"),
+    ("neu3d", "poses_bounds.npy", header(DESCRIBED.format("(" + "9" * 40 + ",)")), "not a .npy file of numbers"),
+    ("neu3d", "poses_bounds.npy", header(DESCRIBED.format("(-3, 17)")), "not a .npy file of numbers"),
+    ("neu3d", "poses_bounds.npy", header(DESCRIBED.format("(1 << 40, 17)")), "not a .npy file of numbers"),
+    ("neu3d", "poses_bounds.npy", header(DESCRIBED.format("(1000000000, 17)")), "not a .npy file of numbers"),
+    ("neu3d", "poses_bounds.npy", header("{'descr': [('a', 'f8')], 'fortran_order': False, 'shape': ()}"), "expected"),
+    ("neu3d", "poses_bounds.npy", b"PK\x03\x04", "not a .npy file of numbers"),
     ("neu3d", "cam1.mp4", b"no video", "cam1.mp4: cannot be decoded"),
     ("neu3d", "cam1.mp4", None, "3 poses in poses_bounds.npy and 2 videos"),
     ("colmap", MODEL + "cameras.bin", lambda data: data[:4], "cameras.bin: ends at byte 4"),
@@ -206,6 +259,15 @@ CASES: list[tuple[str, str, Any, str]] = [
     ("text", MODEL + "cameras.txt", b"7 PINHOLE 40 1e9 1 1 1 1", "expected 1..65535 a side"),
     ("text", MODEL + "cameras.txt", b"8 PINHOLE 40 30 30 30 20 15", "taken by camera 7, which cameras.txt does not h"),
     ("text", MODEL + "cameras.txt", b"7 PINHOLE 41 30 30 30 20 15", "image is 40x30, expected 41x30"),
+    ("text", MODEL + "cameras.txt", b"inf PINHOLE 40 30 30 30 20 15", "line 1 is inf, expected a number"),
+    ("text", MODEL + "cameras.txt", b"7 PINHOLE nan 30 30 30 20 15", "line 1 is nan, expected a number"),
+    ("text", MODEL + "cameras.txt", b"7 PINHOLE 1e400 30 30 30 20 15", "line 1 is inf, expected a number"),
+    ("text", MODEL + "images.txt", b"1 1 0 0 0 0 0 0 nan a.png\n\n", "line 1 is nan, expected a number"),
+    ("text", MODEL + "images.txt", b"1 nan 0 0 0 0 0 0 7 a.png\n\n", "pose is nan"),
+    ("text", MODEL + "images.txt", b"\n" * 300_000, "no picture is registered"),
+    ("text", MODEL + "images.txt", b"1 1 0 0 0 0 0 0 7 " + b"\x1b[2J" * 80 + b"\n\n", "there is no such picture"),
+    ("text", MODEL + "images.txt", b"1 1 0 0 0 0 0 0 7 a\0b\n\n", "is not the name of a file"),
+    ("colmap", MODEL + "images.bin", lambda data: data.replace(b"cam/frame_0002", b"\x1b]0;\x9b2J\xff\xfe/x1"), "no"),
     ("videos", "videos/cam1.mp4", b"no video", "cam1.mp4: cannot be decoded"),
     ("videos", "videos/cam1.mp4", None, "cam1.png: there is no video of this name among 2"),
     ("videos", MODEL + "cameras.txt", b"1 PINHOLE 42 30 30 30 20 15", "expected the same size"),

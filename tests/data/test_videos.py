@@ -11,7 +11,7 @@ from videos import write_video
 
 from pd4dgs_codec.data import videos as cached
 from pd4dgs_codec.data.dataset import load
-from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.errors import DamageWarning, DataError
 from pd4dgs_codec.train.state import TrainingViews
 
 pytest.importorskip("imageio_ffmpeg")
@@ -93,3 +93,46 @@ def test_training_views_are_kept_within_a_budget(scene, monkeypatch):
         assert torch.equal(few[index].image, whole[index].image)
     assert set(few._kept) == {(0, 1), (2, 1)} and few._bytes == 2 * size
     assert few[0] is few[0] and len(few) == 6
+
+
+@pytest.fixture
+def film(tmp_path):
+    """A video of 60 frames that begins with its header, so that it plays while it arrives."""
+    from pd4dgs_codec.quality.movie import write_mp4
+
+    pictures = np.random.default_rng(0).integers(0, 255, (60, 48, 64, 3), np.uint8)
+    plain, path = tmp_path / "plain.mp4", tmp_path / "film.mp4"
+    write_mp4(iter(pictures), plain, 30)
+    arguments = ["-i", str(plain), "-c", "copy", "-movflags", "+faststart", str(path)]
+    with cached.ffmpeg(arguments) as run:
+        assert run.end() == (0, "")
+    return path
+
+
+@pytest.mark.parametrize("share", [0.3, 0.6, 0.97])
+def test_a_video_that_is_cut_is_refused(film, share):
+    whole = film.read_bytes()
+    assert sum(1 for _ in cached.open_video(film).pictures) == 60
+    film.write_bytes(whole[: int(share * len(whole))])
+    with pytest.raises(DataError, match=r"film.mp4: is damaged: found \d+ of 60 frames"):
+        list(cached.open_video(film).pictures)
+
+
+def test_damage_inside_a_video_is_told(film):
+    data = bytearray(film.read_bytes())
+    middle = len(data) // 2
+    data[middle : middle + 4000] = b"\x55" * 4000
+    film.write_bytes(data)
+    try:
+        with pytest.warns(DamageWarning, match="film.mp4: is damaged: found"):
+            list(cached.open_video(film).pictures)
+    except DataError as error:  # a decoder may give up
+        assert "is damaged" in str(error)
+
+
+def test_a_cut_or_foreign_cache_file_is_made_anew(folder, cache):
+    expected = load(folder).train[0].image
+    for damage in (lambda data: data[: len(data) // 2], lambda data: data[100:], lambda _: b"[]" + b"\2" + bytes(7)):
+        for file in cache.glob("*.frames"):
+            file.write_bytes(damage(file.read_bytes()))
+        np.testing.assert_array_equal(load(folder).train[0].image, expected)

@@ -249,8 +249,16 @@ BROKEN_STATES = {
     "generator": torch.zeros(3),
     "optimiser": {"state": {0: {"step": torch.zeros(()), "exp_avg": torch.zeros(3), "exp_avg_sq": torch.zeros(3)}}},
     "densifier": None,
-    "iteration": "many",
-    "curve": "{",
+    "iteration": -3,
+    "total": 10**30,
+    "skipped": "many",
+    "share": math.nan,
+    "rho": math.inf,
+    "seconds": -math.inf,
+    "noise": torch.zeros(3),
+    "rank": torch.zeros(5, 5),
+    "left_out": "[" * 5000,
+    "curve": '[{"iteration": 1, "seconds": 1, "psnr": [null]}]',
 }
 
 

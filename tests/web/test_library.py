@@ -99,3 +99,53 @@ def test_the_command_writes_a_library_beside_its_packages(cli, shelf):
 def test_other_names_may_change(name):
     assert cache_control(name) == CHANGES
     assert cache_control(addressed(name, b"x")) == IMMUTABLE
+
+
+def rewritten(folder, **changes):
+    """Changes keys of a package's index."""
+    path = folder / "c" / "index.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | changes))
+
+
+EVIL = "<img src=x onerror=alert(1)>"
+
+
+def test_nothing_that_a_package_says_becomes_part_of_the_page(shelf):
+    rewritten(
+        shelf, file=f'"{EVIL}', poster=f'"{EVIL}', sha256=EVIL, format_version=EVIL, first_frame_seconds={EVIL: 1}
+    )
+    (shelf / "c").rename(shelf / f"{EVIL.replace('/', '')}\x1b[2J")
+    files = library(shelf)
+    page = files["index.html"].decode()
+    assert "<img src=x" not in page and "alert(1)&gt;" in page and "\x1b" not in page
+    assert json.loads(files["library.json"])["scenes"]
+
+
+WRONG = {
+    "bytes": [None, "1", -1, True, 1.5e308, [1]],
+    "seconds": [None, "<b>", float("nan"), float("inf"), -1],
+    "first_frame_seconds": [None, [1, 2], {"2M": "<b>"}, {"x" * 300: 1}, {"a\nb": 1}, {"\x1b": 1}, 5],
+    "file": [None, 5, "", "\x1b[2J", "x" * 300, "\ud800"],
+    "poster": [5, "\x07", ["x"]],
+    "sha256": [5, None, {}],
+    "format_version": [3.0, None],
+    "layers": [None, {}, 5, [{}], [{"layer": 0, "range": [1]}], [{"layer": "<b>", "range": [0, 1]}], "ab"],
+}
+
+
+@pytest.mark.parametrize("key, value", [(key, value) for key, values in WRONG.items() for value in values])
+def test_an_index_that_says_something_else_is_named(shelf, key, value):
+    rewritten(shelf, **{key: value})
+    if key == "layers" and value == {}:
+        assert library(shelf)
+        return
+    with pytest.raises(DeliveryError, match="c/index.json: invalid index of a package") as caught:
+        library(shelf)
+    assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize("text", ["[]", "5", "[" * 100_000, '{"bytes": 1' + "0" * 5000 + "}", "\x00"])
+def test_an_index_that_is_none_is_named(shelf, text):
+    (shelf / "c" / "index.json").write_text(text)
+    with pytest.raises(DeliveryError, match="c/index.json: invalid index of a package"):
+        library(shelf)

@@ -60,6 +60,8 @@ class Prefixes(Phase):
     def restore(self, stored: Mapping[str, Any]) -> None:
         """The inverse of `stored`."""
         self.rank = stored["rank"] if len(stored["rank"]) else None
+        if self.rank is not None and self.rank.shape != stored["densifier"]["opacity"].shape:
+            raise ValueError(f"a rank of shape {tuple(self.rank.shape)}, not one number for each anchor")
 
 
 def rank_anchors(model: Model, views: Sequence[View]) -> Tensor:

@@ -1,0 +1,119 @@
+"""Files of torch that stand for more than their bytes, or for anything but tensors, are refused before they unpack."""
+
+from __future__ import annotations
+
+import io
+import pickle
+import tracemalloc
+import zipfile
+from collections.abc import Callable
+
+import numpy as np
+import pytest
+
+from pd4dgs_codec.archives import MAX_PICKLE, read_tensors
+from pd4dgs_codec.errors import DataError
+
+PROTO, STOP = b"\x80\x02", b"."
+
+
+def text(value: str) -> bytes:
+    return b"X" + len(value).to_bytes(4, "little") + value.encode()
+
+
+def number(value: int) -> bytes:
+    return b"\x8a\x08" + value.to_bytes(8, "little")
+
+
+def tensor(size: int, stride: int, count: int = 4) -> bytes:
+    """The pickle of a 1-D tensor in a storage of `count` float32."""
+    stored = b"(" + text("storage") + b"ctorch\nFloatStorage\n" + text("0") + text("cpu") + number(count) + b"tQ"
+    hooks = b"ccollections\nOrderedDict\n)R"
+    shape = number(size) + b"\x85" + number(stride) + b"\x85"
+    return b"ctorch._utils\n_rebuild_tensor_v2\n(" + stored + b"K\x00" + shape + b"\x89" + hooks + b"tR"
+
+
+def archive(data: bytes, method: int = zipfile.ZIP_STORED, storage: bytes = bytes(16)) -> bytes:
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", method) as made:
+        made.writestr("a/data.pkl", PROTO + data + STOP)
+        made.writestr("a/data/0", storage)
+    return stream.getvalue()
+
+
+def overlapping() -> bytes:
+    """Members of a central directory that all point to the same bytes."""
+    raw = archive(b"}")
+    at = raw.index(b"PK\x01\x02")
+    end = raw.index(b"PK\x05\x06")
+    entries, tail = raw[at:end], bytearray(raw[end:])
+    tail[8:10] = tail[10:12] = (2 * 400).to_bytes(2, "little")
+    tail[12:16] = (len(entries) * 400).to_bytes(4, "little")
+    big = raw[:at].replace(bytes(16), bytes(1 << 12))
+    return big + entries * 400 + bytes(tail)
+
+
+def doubled(depth: int = 60) -> bytes:
+    return b"]q\x00" + b"".join(b"](h%ch%ceq%c" % (i, i, i + 1) for i in range(depth))
+
+
+REFUSED: dict[str, tuple[Callable[[], bytes], str]] = {
+    "a tensor of 2^30 numbers and one": (lambda: archive(tensor(1 << 30, 0)), "beyond its storage"),
+    "a tensor of 2^45 numbers": (lambda: archive(tensor(1 << 45, 0)), "beyond its storage"),
+    "many tensors of one storage": (
+        lambda: archive(b"](" + tensor(1 << 12, 1, 1 << 12) * 200 + b"e", storage=bytes(1 << 14)), "more bytes than"
+    ),
+    "a storage that lies about its size": (lambda: archive(tensor(4, 1, 1 << 40)), "that should hold 1099511627776"),
+    "a deflated storage": (
+        lambda: archive(tensor(1 << 20, 1, 1 << 20), zipfile.ZIP_DEFLATED, bytes(1 << 22)), "is compressed"
+    ),
+    "a deflated pickle": (lambda: archive(b"]" * 1000, zipfile.ZIP_DEFLATED), "is compressed"),
+    "a pickle of 2 MiB and one": (lambda: archive(b"}" * MAX_PICKLE), f"expected one of {MAX_PICKLE:,} bytes"),
+    "lists that are one": (doubled, "two places"),
+    "a list in itself": (lambda: b"]q\x00h\x00a", "two places"),
+    "a text that stands for gigabytes": (lambda: b"](" + text("x" * 9999) + b"q\x00" + b"h\x00" * 999 + b"e", "places"),
+    "a tuple for a key": (lambda: b"}" + b"J\xff\xff\xff\xff" * 2 + b"\x86Ns", "a key that is no short text"),
+    "keys that make long names": (lambda: b"}" + text("x" * 999) + b"Ns", "a key that is no short text"),
+    "an operation that none needs": (lambda: b"(" + text("a") + b"l", "the operation LIST"),
+    "a memo of 2^31 places": (lambda: b"]r\xff\xff\xff\x7f" * 3, "not a zip archive of tensors"),
+    "code": (lambda: b"cos\nsystem\n" + text("true") + b"\x85R", "the pickle asks for os.system"),
+    "a class of code": (lambda: b"cbuiltins\neval\n)\x81", "the pickle asks for builtins.eval"),
+    "an end in the middle": (lambda: b"t", "not a zip archive of tensors"),
+    "nothing": (lambda: b"", "not a zip archive of tensors"),
+    "an endless number": (lambda: b"\x8b" + (1 << 16).to_bytes(4, "little") + b"\x7f" * (1 << 16), "operation LONG4"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_what_costs_more_than_it_weighs_is_refused(name):
+    make, says = REFUSED[name]
+    raw = make()
+    raw = raw if raw.startswith(b"PK") else archive(raw)
+    tracemalloc.start()
+    with pytest.raises(DataError, match=says) as caught:
+        read_tensors(raw, "m.pt")
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    assert str(caught.value).startswith("m.pt: ") and str(caught.value).isprintable()
+    assert peak < 8 * len(raw) + (1 << 21)
+
+
+def test_overlapping_members_are_refused():
+    with pytest.raises(DataError, match="m.pt: "):
+        read_tensors(overlapping(), "m.pt")
+
+
+def test_deep_and_wide_content_is_read_in_one_pass():
+    found = read_tensors(archive(b"](" * 3000 + b"e" * 2999 + b"e"), "m.pt")
+    depth = 0
+    while found:
+        found, depth = found[0], depth + 1
+    assert depth == 2999
+    wide = {f"key {i}": (i, 1.5, None, True, [i]) for i in range(3000)}
+    assert read_tensors(archive(pickle.dumps(wide, 2)[2:-1]), "m.pt") == wide
+
+
+def test_tensors_are_views_of_the_file():
+    found = read_tensors(archive(tensor(2, 2), storage=np.arange(4, dtype="<f4").tobytes()), "m.pt")
+    np.testing.assert_array_equal(found, [0.0, 2.0])
+    assert not found.flags.writeable
