@@ -83,7 +83,12 @@ class DecodeError(Pd4Error):
 
 
 class Truncated(DecodeError):
-    """The bytes end too early. Streaming waits on it; `allow_partial` turns it into the longest valid prefix."""
+    """The bytes end too early. Streaming waits on it; `allow_partial` turns it into the longest valid prefix.
+
+    needs: so many bytes of the file the step takes that found too few, 0 if unknown.
+    """
+
+    needs: int = 0
 
 
 class BadSignature(DecodeError):

@@ -1,14 +1,15 @@
-"""Mutates legal files and holds the decoders to their promises.
+"""Makes legal files and mutates them, and holds the decoders to their promises.
 
     python tools/fuzz.py                                        # 20,000 inputs of run 0
     python tools/fuzz.py --inputs 1000000 --decoders python     # the package alone
     python tools/fuzz.py --inputs 5000 --seed 7 scene.pd4       # files beside the built-in ones
     python tools/fuzz.py --seed 7 --input 4711                  # one input again, with its recipe
 
-Three of five inputs have their fields, sections, tokens or bytes changed and then right lengths, CRC-32 and scene id;
-the others keep the CRCs of before. Input i of a run over the same files is the same on every machine. A crash, an
-exception that is no DecodeError, too much time or memory, damage that decodes, and a decoder that accepts what another
-refuses or yields other hashes are findings; they are saved in --out, and the exit code is 1.
+One of five inputs is a legal file of random choices near the limits, which every decoder must accept with the hashes
+that its writer says. Of the others, three of five have their fields, sections, tokens or bytes changed and then right
+lengths, CRC-32 and scene id, and two keep the CRCs of before. Input i of a run over the same files is the same on every
+machine. A crash, an exception that is no DecodeError, too much time or memory, damage that decodes, and a decoder that
+accepts what another refuses or yields other hashes are findings; they are saved in --out, and the exit code is 1.
 """
 
 from __future__ import annotations
@@ -42,7 +43,7 @@ from fuzzing.legal import Seed, seeds  # noqa: E402
 from fuzzing.mutate import make_case  # noqa: E402
 
 DECODERS = ("python", "refdec", "javascript")
-COMPARED = {"refdec": 10, "javascript": 2}  #: every so many inputs
+COMPARED = {"refdec": 10, "javascript": 2}  #: every so many inputs, and every legal one
 MEASURED = 25  #: every so many inputs the peak memory is traced, which takes twice the time
 STUCK_SECONDS = 30.0  #: of wall time on one input; then the process is ended
 
@@ -52,6 +53,7 @@ class Figures:
     """Counts. findings: {input, kind, message, recipe}. differences: faults that two decoders name differently."""
 
     inputs: int = 0
+    legal: int = 0
     sealed: int = 0
     outcomes: Counter[str] = field(default_factory=Counter)
     compared: Counter[str] = field(default_factory=Counter)
@@ -62,6 +64,7 @@ class Figures:
     def add(self, other: Figures) -> None:
         """Count another part of the run as well."""
         self.inputs += other.inputs
+        self.legal += other.legal
         self.sealed += other.sealed
         self.outcomes += other.outcomes
         self.compared += other.compared
@@ -71,7 +74,8 @@ class Figures:
 
     def text(self) -> str:
         """A table."""
-        rows: list[tuple[str, Any]] = [("inputs", self.inputs), ("right CRCs after the mutation", self.sealed)]
+        rows: list[tuple[str, Any]] = [("inputs", self.inputs), ("legal files", self.legal)]
+        rows += [("right CRCs after the mutation", self.sealed)]
         rows += [(f"ends in {name}", count) for name, count in self.outcomes.most_common()]
         rows += [(f"compared with {name}", count) for name, count in self.compared.items()]
         rows += [("another name for a fault", self.differences.total()), ("memory, of its bound", f"{self.memory:.0%}")]
@@ -95,13 +99,16 @@ def run_inputs(
         if place is not None:
             place.value = index
         case = make_case(files, run, index)
+        legal = case.meaning is not None
         figures.inputs += 1
-        figures.sealed += case.sealed
-        asked = {n: d for n, d in decoders.items() if len(inputs) == 1 or index % COMPARED.get(n, 1) == 0}
+        figures.legal += legal
+        figures.sealed += case.sealed and not legal
+        every = legal or len(inputs) == 1
+        asked = {n: d for n, d in decoders.items() if every or index % COMPARED.get(n, 1) == 0}
         try:
             figures.outcomes[check_package(case, random.Random(~index))] += 1
             figures.compared.update(set(asked) - {"python"})
-            if difference := compare(case.data, asked):
+            if difference := compare(case.data, asked, case.meaning):
                 figures.differences[difference] += 1
             if index % MEASURED == 0:
                 figures.memory = max(figures.memory, check_memory(case.data))

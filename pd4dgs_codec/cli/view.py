@@ -61,7 +61,8 @@ def _view(args: argparse.Namespace, console: Console) -> int:
             (folder / SCENE).write_bytes(_packed(source, console))
             source = SCENE
         log = console.message if console.verbose else None
-        with Server(folder, port=args.port, link=Link(args.rate), latency=args.latency, log=log) as server:
+        link = Link(args.rate)
+        with Server(folder, port=args.port, private=True, link=link, latency=args.latency, log=log) as server:
             stop = set_by_signals()
             with server.running():
                 url = f"{server.url}{PAGE}?src={quote(source, safe='')}"

@@ -96,21 +96,23 @@ def read_preamble(data: Buffer) -> Preamble:
 
     Raises BadSignature, Truncated, UnsupportedVersion (the major version), LimitExceeded or ChecksumMismatch.
     """
-    view = memoryview(data)
-    start = bytes(view[: len(SIGNATURE)])
-    if not SIGNATURE.startswith(start):
-        raise BadSignature(f"not a .pd4 file: it begins with {start.hex(' ')}, expected {SIGNATURE.hex(' ')}", offset=0)
-    _need(view, PREAMBLE_SIZE, "the preamble")
-    _, major, minor, length = _PREAMBLE.unpack_from(view)
-    if major != MAJOR:
-        raise UnsupportedVersion(f"format version {major}.{minor}, this decoder reads {MAJOR}.x", offset=8)
-    if length > MAX_HEADER:
-        raise LimitExceeded(f"a header of {length} bytes, limit {MAX_HEADER}", offset=12)
-    size = PREAMBLE_SIZE + length
-    _need(view, size, "the header")
-    header = bytes(view[PREAMBLE_SIZE:size])
-    _check_crc(view, _PREAMBLE.size, zlib.crc32(header, zlib.crc32(view[: _PREAMBLE.size])), "preamble and header")
-    return Preamble(major, minor, header, size)
+    with memoryview(data) as view:  # one that an error's traceback keeps would fix the size of a stream's buffer
+        start = bytes(view[: len(SIGNATURE)])
+        if not SIGNATURE.startswith(start):
+            raise BadSignature(
+                f"not a .pd4 file: it begins with {start.hex(' ')}, expected {SIGNATURE.hex(' ')}", offset=0
+            )
+        _need(view, PREAMBLE_SIZE, "the preamble")
+        _, major, minor, length = _PREAMBLE.unpack_from(view)
+        if major != MAJOR:
+            raise UnsupportedVersion(f"format version {major}.{minor}, this decoder reads {MAJOR}.x", offset=8)
+        if length > MAX_HEADER:
+            raise LimitExceeded(f"a header of {length} bytes, limit {MAX_HEADER}", offset=12)
+        size = PREAMBLE_SIZE + length
+        _need(view, size, "the header")
+        header = bytes(view[PREAMBLE_SIZE:size])
+        _check_crc(view, _PREAMBLE.size, zlib.crc32(header, zlib.crc32(view[: _PREAMBLE.size])), "preamble and header")
+        return Preamble(major, minor, header, size)
 
 
 def write_chunk(type: int, flags: int, scene_id: bytes, payload: bytes) -> bytes:
@@ -131,41 +133,48 @@ def read_chunk(
     length: int | None = None,
     scene_id: bytes | None = None,
     index: int | None = None,
+    start: int = 0,
 ) -> Chunk:
-    """The chunk at `offset`. type, length (of the payload) and scene_id are what the header or layer 0 announced.
+    """The chunk at `offset` of a file. type, length (of the payload) and scene_id are what the header announced.
 
-    index: the chunk's place in the file, for the error's text. Raises Truncated, LimitExceeded, ChecksumMismatch, or
-    Malformed where the chunk is not the one announced or sets a reserved flag.
+    index: the chunk's place in the file, for the error's text. start: where in the file `data` begins. Raises
+    Truncated, LimitExceeded, ChecksumMismatch, or Malformed where the chunk is not the one announced or sets a reserved
+    flag.
     """
-    view = memoryview(data)
-    _need(view, offset + CHUNK_HEAD_SIZE, "a chunk's head", index)
-    found_type, flags, found_length, found_id = _CHUNK.unpack_from(view, offset)
-    if found_length > MAX_PAYLOAD:
-        raise LimitExceeded(f"a payload of {found_length} bytes, limit {MAX_PAYLOAD}", offset=offset + 4, chunk=index)
-    if length is not None and found_length != length:
-        raise Malformed(f"payload length {found_length}, the header says {length}", offset=offset + 4, chunk=index)
-    body_end = offset + CHUNK_HEAD_SIZE + found_length
-    _need(view, body_end + _CRC.size, "a chunk", index)
-    _check_crc(view, body_end, zlib.crc32(view[offset:body_end]), "chunk", index)
-    if _reserved(flags):
-        raise Malformed(f"flags {flags:#06x}, reserved bits must be zero", offset=offset + 2, chunk=index)
-    if type is not None and found_type != type:
-        raise Malformed(f"chunk type {found_type}, the header says {type}", offset=offset, chunk=index)
-    if scene_id is not None and found_id != scene_id:
-        message = f"the chunk belongs to scene {found_id.hex()}, this file is {scene_id.hex()}"
-        raise Malformed(message, offset=offset + 8, chunk=index)
-    payload = bytes(view[offset + CHUNK_HEAD_SIZE : body_end])
-    return Chunk(found_type, flags, found_id, payload, body_end + _CRC.size)
+    with memoryview(data) as view:
+        at = offset - start
+        _need(view, at + CHUNK_HEAD_SIZE, "a chunk's head", index, start)
+        found_type, flags, found_length, found_id = _CHUNK.unpack_from(view, at)
+        if found_length > MAX_PAYLOAD:
+            raise LimitExceeded(
+                f"a payload of {found_length} bytes, limit {MAX_PAYLOAD}", offset=offset + 4, chunk=index
+            )
+        if length is not None and found_length != length:
+            raise Malformed(f"payload length {found_length}, the header says {length}", offset=offset + 4, chunk=index)
+        body_end = at + CHUNK_HEAD_SIZE + found_length
+        _need(view, body_end + _CRC.size, "a chunk", index, start)
+        _check_crc(view, body_end, zlib.crc32(view[at:body_end]), "chunk", index, start)
+        if _reserved(flags):
+            raise Malformed(f"flags {flags:#06x}, reserved bits must be zero", offset=offset + 2, chunk=index)
+        if type is not None and found_type != type:
+            raise Malformed(f"chunk type {found_type}, the header says {type}", offset=offset, chunk=index)
+        if scene_id is not None and found_id != scene_id:
+            message = f"the chunk belongs to scene {found_id.hex()}, this file is {scene_id.hex()}"
+            raise Malformed(message, offset=offset + 8, chunk=index)
+        payload = bytes(view[at + CHUNK_HEAD_SIZE : body_end])
+        return Chunk(found_type, flags, found_id, payload, start + body_end + _CRC.size)
 
 
-def _need(view: memoryview, size: int, what: str, index: int | None = None) -> None:
+def _need(view: memoryview, size: int, what: str, index: int | None = None, start: int = 0) -> None:
     if len(view) < size:
-        message = f"{len(view)} bytes end inside {what}, which needs {size}"
-        raise Truncated(message, offset=len(view), chunk=index)
+        end, needs = start + len(view), start + size
+        error = Truncated(f"{end} bytes end inside {what}, which needs {needs}", offset=end, chunk=index)
+        error.needs = needs
+        raise error
 
 
-def _check_crc(view: memoryview, at: int, computed: int, what: str, index: int | None = None) -> None:
+def _check_crc(view: memoryview, at: int, computed: int, what: str, index: int | None = None, start: int = 0) -> None:
     (stored,) = _CRC.unpack_from(view, at)
     if stored != computed:
         message = f"CRC-32 of the {what} is {computed:#010x}, stored {stored:#010x}"
-        raise ChecksumMismatch(message, offset=at, chunk=index)
+        raise ChecksumMismatch(message, offset=start + at, chunk=index)

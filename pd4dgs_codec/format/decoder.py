@@ -2,46 +2,51 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from copy import copy
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from itertools import accumulate
 
 from pd4dgs_codec.entropy.priors import Prior
 from pd4dgs_codec.errors import DecodeError, Malformed, Truncated, UnsupportedFeature
 from pd4dgs_codec.format.attributes import Past
 from pd4dgs_codec.format.container import CHUNK_OVERHEAD, PREAMBLE_SIZE, Chunk, read_chunk, read_preamble
-from pd4dgs_codec.format.header import Header, layers_of, scene_id_of, unpack_header
+from pd4dgs_codec.format.header import Header, scene_id_of, unpack_header
 from pd4dgs_codec.format.payload import Declared, read_layer
 from pd4dgs_codec.format.registry import BY_CHUNK_TYPE, LayerKind
-from pd4dgs_codec.format.symbols import LayerSymbols, SceneSymbols, TakenVoxels, check_slice, merged
+from pd4dgs_codec.format.symbols import (
+    GrowingScene,
+    LayerSymbols,
+    MaskCodes,
+    SceneSymbols,
+    TakenVoxels,
+    check_slice,
+    merged,
+)
 from pd4dgs_codec.scene import Scene
 
 
 class LayerReader:
-    """Reads a file's chunks in order. It holds no bytes: each call gets all that have arrived. Its lists are replaced
-    and never changed, so a copy keeps its state."""
+    """Reads a file's chunks in order. It holds neither bytes nor slices: a call gets the bytes from the next chunk on
+    and returns one slice. After a fault it stands where it stood before the slice.
 
-    def __init__(self) -> None:
+    growing: whether `scene` grows with each slice.
+    """
+
+    def __init__(self, growing: bool = True) -> None:
         self.header: Header | None = None
         self.offset = 0  #: of the next chunk
-        self.slices: list[list[LayerSymbols]] = []  #: by layer
-        self._merged: list[LayerSymbols | None] = []  # by layer, None until it is asked for
+        self.count = 0  #: slices read
+        self._growing = growing
+        self._scene: GrowingScene | None = None
+        self._layer, self._number = -1, -1  # of the latest slice
+        self._following: list[int | None] = []  # by chunk, the layer of the first slice behind those before it
+        self._share: list[float] = []  # by chunk, the part of all slices' bytes that has come with it
         self._index = 0
         self._scene_id = b""
         self._declared = Declared()
+        self._codes = MaskCodes()
         self._taken = TakenVoxels()
         self._past: Past[Prior] | None = None
-
-    @property
-    def layers(self) -> list[LayerSymbols]:
-        """The layers read so far; the last one may lack slices."""
-        layers = [layer or merged(parts) for layer, parts in zip(self._merged, self.slices, strict=True)]
-        self._merged = [*layers]
-        return layers
-
-    @property
-    def latest(self) -> LayerSymbols:
-        """The slice read last."""
-        return self.slices[-1][-1]
 
     @property
     def complete(self) -> bool:
@@ -49,114 +54,161 @@ class LayerReader:
         return self.header is not None and self._index == len(self.header.chunks)
 
     @property
-    def symbols(self) -> SceneSymbols:
-        """The symbols of the layers read so far, at least one."""
-        assert self.header is not None
-        return SceneSymbols(self.header.info, self.header.grid, self.layers)
+    def scene(self) -> GrowingScene:
+        """The scene of the slices read so far, at least one."""
+        assert self._scene is not None
+        return self._scene
 
-    def scene(self) -> Scene:
-        """The scene of the layers read so far, at least one."""
-        return self.symbols.scene()
+    @property
+    def whole(self) -> bool:
+        """Whether the layer of the latest slice has no further ones."""
+        return self._following[self._index] != self._layer
 
-    def next_slice(self, data: bytes | bytearray, max_layer: int | None = None, max_bytes: int | None = None) -> bool:
-        """Read one more slice of a layer <= max_layer that ends within the first max_bytes (clause 12); whether there
-        was one.
+    def next_slice(
+        self, data: bytes | bytearray, max_layer: int | None = None, max_bytes: int | None = None, start: int = 0
+    ) -> LayerSymbols | None:
+        """One more slice of a layer <= max_layer that ends within the first max_bytes (clause 12), None if there is
+        none. start: where in the file `data` begins, at most `offset`.
 
         Raises Truncated, with nothing consumed that a later call would miss, if `data` ends before its end. Raises
         Malformed if bytes follow the last chunk of a file that is read whole (without either limit).
         """
         if self.header is None:
             preamble = read_preamble(data)
-            self.header, self.offset = unpack_header(preamble.header, offset=PREAMBLE_SIZE), preamble.size
-            self._scene_id = scene_id_of(preamble.header)
+            self._begin(unpack_header(preamble.header, offset=PREAMBLE_SIZE))
+            self.offset, self._scene_id = preamble.size, scene_id_of(preamble.header)
+        assert self.header is not None
         chunks = self.header.chunks
         while self._index < len(chunks):
-            if max_layer is not None and all(layer > max_layer for layer in layers_of(chunks[self._index :])):
-                return False
+            layer = self._following[self._index]
+            if max_layer is not None and (layer is None or layer > max_layer):
+                return None
             if max_bytes is not None and self.offset + CHUNK_OVERHEAD + chunks[self._index][1] > max_bytes:
-                return False
-            if self._read_chunk(data):
-                return True
-        if max_layer is None and max_bytes is None and len(data) > self.offset:
-            raise Malformed(f"{len(data) - self.offset} bytes follow the last chunk, expected none", offset=self.offset)
-        return False
+                return None
+            if (part := self._read_chunk(data, start)) is not None:
+                return part
+        left = start + len(data) - self.offset
+        if max_layer is None and max_bytes is None and left:
+            raise Malformed(f"{left} bytes follow the last chunk, expected none", offset=self.offset)
+        return None
 
-    def _read_chunk(self, data: bytes | bytearray) -> bool:
-        """Read the next chunk; whether it is a slice, not an ancillary chunk."""
+    def _begin(self, header: Header) -> None:
+        following: list[int | None] = [None]
+        for kind, _ in reversed(header.chunks):
+            following.append(kind if kind in BY_CHUNK_TYPE else following[-1])
+        self.header, self._following = header, following[::-1]
+        come = [*accumulate(size if kind in BY_CHUNK_TYPE else 0 for kind, size in header.chunks)]
+        self._share = [part / max(1, come[-1]) for part in come]
+        self._scene = GrowingScene(header.info, header.grid) if self._growing else None
+
+    def _read_chunk(self, data: bytes | bytearray, start: int) -> LayerSymbols | None:
+        """Read the next chunk: a slice, or None for an ancillary chunk."""
         assert self.header is not None
-        expected_type, length = self.header.chunks[self._index]
-        chunk = read_chunk(
-            data, self.offset, type=expected_type, length=length, scene_id=self._scene_id, index=self._index
-        )
-        kind = BY_CHUNK_TYPE.get(chunk.type)
+        offset, (kind_of, length) = self.offset, self.header.chunks[self._index]
+        place = {"type": kind_of, "length": length, "index": self._index, "start": start}
+        chunk = read_chunk(data, offset, scene_id=self._scene_id, **place)
+        kind, part = BY_CHUNK_TYPE.get(chunk.type), None
         if kind is None and not chunk.ancillary:
             message = f"critical chunk of unknown type {chunk.type}"
-            raise UnsupportedFeature(message, offset=self.offset, chunk=self._index)
+            raise UnsupportedFeature(message, offset=offset, chunk=self._index)
         if kind is not None and chunk.ancillary:
             message = f"layer {kind.layer} is flagged ancillary, expected a critical chunk"
-            raise Malformed(message, offset=self.offset, chunk=self._index)
+            raise Malformed(message, offset=offset, chunk=self._index)
         if kind is not None:
             self._check_place(chunk, kind.layer)
             try:
-                self._read_slice(chunk, kind, self.header)
+                part = self._read_slice(chunk, kind, self.header)
             except DecodeError as error:
                 # A payload is whole, so a fault inside it is not Truncated.
                 of = Malformed if isinstance(error, Truncated) else type(error)
-                raise of(error.message, offset=self.offset, chunk=self._index) from None
+                raise of(error.message, offset=offset, chunk=self._index) from None
         self._index += 1
         self.offset = chunk.end
-        return kind is not None
-
-    def _goes_on(self, layer: int) -> bool:
-        """Whether a slice of `layer` was read before."""
-        return bool(self.slices) and self.slices[-1][0].kind.layer == layer
+        return part
 
     def _check_place(self, chunk: Chunk, layer: int) -> None:
         """Raise Malformed unless the slice's flags fit its place (clause 3.6)."""
-        assert self.header is not None
-        expected, message = len(self.slices[-1]) if self._goes_on(layer) else 0, ""
-        following = layers_of(self.header.chunks[self._index + 1 :])[:1]
+        expected, message = self._number + 1 if layer == self._layer else 0, ""
+        following = self._following[self._index + 1]
         if chunk.slice != expected:
             message = f"slice {chunk.slice} of layer {layer}, expected {expected}"
-        elif following and chunk.more != (following == [layer]):
+        elif following is not None and chunk.more != (following == layer):
             told = "announces a further slice" if chunk.more else "ends its layer"
-            message = f"slice {expected} of layer {layer} {told}, but layer {following[0]} follows"
+            message = f"slice {expected} of layer {layer} {told}, but layer {following} follows"
         if message:
             raise Malformed(message, offset=self.offset + 2, chunk=self._index)
 
-    def _read_slice(self, chunk: Chunk, kind: LayerKind, header: Header) -> None:
-        later = self._goes_on(kind.layer)
+    def _read_slice(self, chunk: Chunk, kind: LayerKind, header: Header) -> LayerSymbols:
+        later = kind.layer == self._layer
         past = self._past if later else Past[Prior]() if chunk.more else None
-        read, declared = read_layer(chunk.payload, kind, header.grid.widths, self._declared, header.mode, later, past)
-        before = self.layers if read.mask_increase.size else []
-        check_slice([*before, read], header.info.voxel_size, header.grid)
-        missing = [name for name in read.steps if name not in header.error_bounds]
-        if missing:
-            raise Malformed(f"layer {kind.layer}: no error bound of {missing[0]} in the header, expected one")
-        self._taken.take(read.anchor_q)
+        undo = past.mark() if past else None
+        try:
+            part, declared = read_layer(
+                chunk.payload, kind, header.grid.widths, self._declared, header.mode, later, past
+            )
+            check_slice(part, self._codes, header.info.voxel_size, header.grid)
+            missing = [name for name in part.steps if name not in header.error_bounds]
+            if missing:
+                raise Malformed(f"layer {kind.layer}: no error bound of {missing[0]} in the header, expected one")
+            self._taken.take(part.anchor_q)
+        except DecodeError:
+            if undo:
+                undo()
+            raise
+        self._codes.take(part, not later)
         self._declared, self._past = declared, past
-        at = -1 if later else len(self.slices)
-        self.slices = [*self.slices[:at], [*(self.slices[-1] if later else ()), read]]
-        self._merged = [*self._merged[:at], None]
+        self._layer, self._number, self.count = kind.layer, chunk.slice, self.count + 1
+        if self._scene is not None:
+            following, share = self._following[self._index + 1], self._share[self._index]
+            growth = 1.0 if following is None else max(1.5, 1.25 / share)
+            self._scene.add(part, not later, growth)
+            if following != kind.layer:
+                self._scene.sort(growth)
+        return part
 
 
-def read_layers(
-    data: bytes, *, max_layer: int | None = None, max_bytes: int | None = None, allow_partial: bool = False
-) -> tuple[LayerReader, bool]:
-    """(reader that holds the layers asked for, whether none of them is missing); arguments as in `decode`."""
+def _read(
+    reader: LayerReader,
+    data: bytes,
+    max_layer: int | None,
+    max_bytes: int | None = None,
+    allow_partial: bool = False,
+    take: Callable[[LayerSymbols], None] = lambda part: None,
+) -> bool:
+    """Whether no slice that was asked for is missing; arguments as in `decode`. take: is given each slice."""
     if max_layer is not None and max_layer < 0:
         raise ValueError(f"max_layer must be 0 or more, found {max_layer}")
-    reader = LayerReader()
     try:
-        while reader.next_slice(data, max_layer, max_bytes):
-            pass
-        if not reader.slices:
+        while (part := reader.next_slice(data, max_layer, max_bytes)) is not None:
+            take(part)
+        if not reader.count:
             raise Truncated(f"{max_bytes} bytes end before the first slice does", offset=max_bytes)
     except Truncated:
-        if not (allow_partial and reader.slices):
+        if not (allow_partial and reader.count):
             raise
-        return reader, False
-    return reader, True
+        return False
+    return True
+
+
+@dataclass(eq=False)
+class FileSymbols:
+    """What a file stores: its header, and the symbols of its layers."""
+
+    header: Header
+    layers: list[LayerSymbols]
+
+    @property
+    def symbols(self) -> SceneSymbols:
+        """The scene as integers."""
+        return SceneSymbols(self.header.info, self.header.grid, self.layers)
+
+
+def read_layers(data: bytes, *, max_layer: int | None = None) -> FileSymbols:
+    """The symbols of a file, or of its layers <= max_layer. Raises as `decode` does."""
+    reader, layers = LayerReader(growing=False), dict[int, list[LayerSymbols]]()
+    _read(reader, data, max_layer, take=lambda part: layers.setdefault(part.kind.layer, []).append(part))
+    assert reader.header is not None
+    return FileSymbols(reader.header, [merged(parts) for parts in layers.values()])
 
 
 def decode(
@@ -175,64 +227,93 @@ def decode_partial(
     data: bytes, *, max_layer: int | None = None, max_bytes: int | None = None, allow_partial: bool = True
 ) -> tuple[Scene, bool]:
     """(scene, complete): as `decode`, and whether every slice asked for was there."""
-    reader, complete = read_layers(data, max_layer=max_layer, max_bytes=max_bytes, allow_partial=allow_partial)
-    return reader.scene(), complete
+    reader = LayerReader()
+    complete = _read(reader, data, max_layer, max_bytes, allow_partial)
+    reader.scene.sort()
+    return reader.scene.scene(), complete
 
 
 # -- incremental decoding ----------------------------------------------------------------------------------------------
 
 
 class Stream:
-    """Decodes a file fed in pieces of any size. The scenes do not depend on where the pieces are cut."""
+    """Decodes a file fed in pieces of any size, which takes about as long as `decode` of them all. The scenes do not
+    depend on where the pieces are cut."""
 
     def __init__(self) -> None:
         self._reader = LayerReader()
-        self._buffer = bytearray()
+        self._buffer = bytearray()  # from byte `consumed` of the file on
+        self._needs = 0  # bytes of the file before which nothing is to be found out
         self._error: DecodeError | None = None
-        self.slices = 0  #: completed so far
 
     @property
     def complete(self) -> bool:
         """Whether every chunk in the header's list has arrived."""
         return self._reader.complete
 
+    @property
+    def consumed(self) -> int:
+        """Bytes of the file that are decoded and no longer held."""
+        return self._reader.offset
+
+    @property
+    def slices(self) -> int:
+        """How many are complete so far."""
+        return self._reader.count
+
     def feed(self, data: bytes) -> list[Scene]:
         """The newest scene of each layer that `data` completes a slice of, with all slices up to there.
 
-        Slices that arrive together give one scene: a small file may have a thousand slices, and each scene takes memory
-        and time for all of its rows. `every_prefix` has a scene for each slice.
+        The rows of a layer stand in the order in which its slices came until it is whole, and then in that of `decode`.
+        Scenes share their arrays, which are read-only. `every_prefix` has a scene for each slice.
 
         A fault raises its DecodeError now, or at the next call if this one completes a slice before it, and at every
-        later call. Scenes returned before stay valid.
+        later call until `rewind`. Scenes returned before stay valid.
         """
         if self._error is not None:
             raise self._error
         self._buffer += data
-        newest: dict[int, LayerReader] = {}
+        if self.consumed + len(self._buffer) < self._needs:
+            return []
+        scenes, pending = list[Scene](), False
         try:
-            while self._reader.next_slice(self._buffer):
-                self.slices += 1
-                newest[self._reader.latest.kind.layer] = copy(self._reader)
-        except Truncated:
-            pass
+            while self._next() is not None:
+                pending = not self._reader.whole  # a scene of each slice would keep arrays that are about to be copied
+                scenes += [] if pending else [self._scene()]
+        except Truncated as error:
+            self._needs = error.needs
         except DecodeError as error:
             self._error = error
-            if not newest:
+            if not (scenes or pending):
                 raise
-        return [reader.scene() for reader in newest.values()]
+        return [*scenes, self._scene()] if pending else scenes
+
+    def _scene(self) -> Scene:
+        return self._reader.scene.scene(writeable=False)
 
     def finish(self) -> None:
         """End the stream: raises the pending fault, or Truncated if a chunk is missing."""
         if self._error is not None:
             raise self._error
-        self._reader.next_slice(self._buffer)
+        self._next()
+
+    def rewind(self) -> None:
+        """Forget a fault, and the bytes that are not decoded: feed the file from byte `consumed` on next."""
+        self._buffer, self._needs, self._error = bytearray(), 0, None
+
+    def _next(self) -> LayerSymbols | None:
+        start = self.consumed
+        try:
+            return self._reader.next_slice(self._buffer, start=start)
+        finally:
+            del self._buffer[: self.consumed - start]
 
 
 def every_prefix(data: bytes) -> Iterator[Scene]:
-    """The scene after each slice of a whole file. Raises DecodeError."""
+    """The scene after each slice of a whole file, as a stream gives them. Raises DecodeError."""
     reader = LayerReader()
-    while reader.next_slice(data):
-        yield reader.scene()
+    while reader.next_slice(data) is not None:
+        yield reader.scene.scene(writeable=False)
 
 
 def open_stream() -> Stream:

@@ -248,18 +248,17 @@ def _check_file(data: bytes, fingerprints: list[bytes]) -> None:
         if not fingerprints:
             info(data)
             return
-        reader, _ = read_layers(data)
+        file = read_layers(data)
     except LimitExceeded as error:
         raise EncodeError(f"the scene is over a limit of the format: {error}") from None
     except DecodeError as error:
         raise EncodeError(f"verification: the file does not decode: {error}") from error
-    assert reader.header is not None
-    if pack_header(reader.header) != read_preamble(data).header:
+    if pack_header(file.header) != read_preamble(data).header:
         raise EncodeError("verification: the header decodes to other values")
-    found = [_fingerprint(layer) for layer in reader.layers]
+    found = [_fingerprint(layer) for layer in file.layers]
     if len(found) != len(fingerprints):
         raise EncodeError(f"verification: the file decodes to {len(found)} layers, expected {len(fingerprints)}")
-    for layer, own, meant in zip(reader.layers, found, fingerprints, strict=True):
+    for layer, own, meant in zip(file.layers, found, fingerprints, strict=True):
         if own != meant:
             raise EncodeError(f"verification: layer {layer.kind.layer} decodes to other symbols")
 

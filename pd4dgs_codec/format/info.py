@@ -112,7 +112,7 @@ def _about(payload: bytes) -> dict[str, Any]:
 def nearest_bounds(data: bytes) -> dict[str, float]:
     """By field of Steps the error bounds of an encoder that rounds to the nearest symbol, for a complete file, which is
     decoded. They can be compared with the declared bounds without the scene that was encoded."""
-    return rounding_bounds(read_layers(data)[0].symbols)
+    return rounding_bounds(read_layers(data).symbols)
 
 
 def hashes(data: bytes, max_layer: int | None = None) -> list[dict[str, Any]]:
@@ -125,12 +125,11 @@ def hashes(data: bytes, max_layer: int | None = None) -> list[dict[str, Any]]:
     tensors: float32 little-endian of anchor [n, 3], feature [n, D], scaling_log [n,
     6], offset [n, G, 3] of own rows, then planes and networks as above.
     """
-    reader, _ = read_layers(data, max_layer=max_layer)
-    scene = reader.scene()
-    rows = []
-    for index, layer in enumerate(reader.layers):
-        symbols, tensors = _digest(layer.arrays(), "<i4"), _digest(float_tensors(scene, index), "<f4")
-        rows.append({"layer": layer.kind.layer, "symbols": symbols, "tensors": tensors})
+    symbols = read_layers(data, max_layer=max_layer).symbols
+    scene, rows = symbols.scene(), []
+    for index, layer in enumerate(symbols.layers):
+        integers, tensors = _digest(layer.arrays(), "<i4"), _digest(float_tensors(scene, index), "<f4")
+        rows.append({"layer": layer.kind.layer, "symbols": integers, "tensors": tensors})
     return rows
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 
@@ -135,27 +134,11 @@ class SceneSymbols:
 
     def scene(self) -> Scene:
         """The dequantised scene (clause 11.5)."""
-        masks, steps, widths = _mask_codes(self.layers), self.steps, self.grid.widths
-        n = masks[-1].size
-        values: dict[str, Any] = {name: np.empty((n, *one), np.float32) for name, one in widths.attributes.items()}
-        for rows, _, block in self.blocks():
-            for name, x in block.items():
-                values[name][rows] = x
-        classes = np.concatenate([layer.classes for layer in self.layers]).astype(np.uint8)
-        tensors = {x.kind.layer: dequantise_tensors(x.tensors, x.kind, steps) for x in self.layers}
-        return Scene(
-            info=self.info,
-            steps=steps,
-            layers=tuple(layer.kind.layer for layer in self.layers),
-            rows=tuple(codes.size for codes in masks),
-            anchor_q=np.concatenate([layer.anchor_q for layer in self.layers]),
-            mask=tuple(codes.astype(np.uint8) for codes in masks),
-            networks=tensors[0].networks,
-            global_deformation=tensors[1] if 1 in tensors and tensors[1].networks else None,
-            local_deformation=tensors[2] if 2 in tensors and tensors[2].networks else None,
-            grading=Grading(classes, self.grid.centre_values) if widths.graded else None,
-            **values,
-        )
+        grown = GrowingScene(self.info, self.grid)
+        rows = [len(layer.anchor_q) for layer in self.layers]
+        for i, layer in enumerate(self.layers, start=1):
+            grown.add(layer, growth=sum(rows) / max(1, sum(rows[:i])))
+        return grown.scene()
 
 
 def rounded(scene: Scene) -> Scene:
@@ -171,28 +154,124 @@ def float_tensors(scene: Scene, index: int) -> list[np.ndarray]:
     return [scene.anchor_at(own), *attributes, *(x for *_, x in arrays_of(scene.tensors(kind.layer), kind))]
 
 
-def _mask_codes(layers: Sequence[LayerSymbols]) -> list[np.ndarray]:
-    """int32 codes of all rows so far, per layer: sums of the rises (clause 11.1)."""
-    masks: list[np.ndarray] = []
-    for layer in layers:
-        raised = masks[-1] + layer.mask_increase if masks else layer.mask_increase
-        masks.append(np.concatenate([raised, layer.mask_own]))
-    return masks
+# -- slices as they come -----------------------------------------------------------------------------------------------
+
+
+#: An array is allocated for so many times its rows at most, however many are to come.
+MOST_GROWTH = 4.0
+
+
+class _Column:
+    """An array [n, ...] that grows at its end. What was read from it before stays as it is."""
+
+    def __init__(self, dtype: type, *shape: int):
+        self._room: np.ndarray = np.empty((0, *shape), dtype)
+        self.size = 0
+
+    @property
+    def values(self) -> np.ndarray:
+        return self._room[: self.size]
+
+    def grow(self, n: int, growth: float) -> np.ndarray:
+        """n further rows, to be written. growth: about how many times as many there will be."""
+        end = self.size + n
+        if end > len(self._room):
+            room = np.empty((int(end * min(growth, MOST_GROWTH)), *self._room.shape[1:]), self._room.dtype)
+            room[: self.size] = self.values
+            self._room = room
+        first, self.size = self.size, end
+        return self._room[first:end]
+
+    def reorder(self, first: int, order: np.ndarray, growth: float) -> None:
+        """Sort the rows from `first` on, in a copy."""
+        room = np.empty((int(self.size * min(growth, MOST_GROWTH)), *self._room.shape[1:]), self._room.dtype)
+        room[:first], room[first : self.size] = self.values[:first], self.values[first:][order]
+        self._room = room
+
+
+class GrowingScene:
+    """The dequantised scene of the slices so far: each is added once, whatever was read before.
+
+    The rows of a layer stand in the order in which they came until it is whole, or `sort` is called; then in that of
+    clause 12.2.
+    """
+
+    def __init__(self, info: SceneInfo, grid: Grid):
+        self._info, self._grid = info, grid
+        shapes = {name: (np.float32, shape) for name, shape in grid.widths.attributes.items()}
+        columns = {"anchor_q": (np.int32, (3,)), **shapes, "classes": (np.uint8, ())}
+        self._columns = {name: _Column(dtype, *shape) for name, (dtype, shape) in columns.items()}
+        self._masks = list[_Column]()
+        self._tensors = dict[int, Deformation]()
+        self._steps = Steps(**grid.steps)
+        self._first = 0  # row of the layer in progress
+        self._sorted = True  # whether its rows are
+        self._centre = grid.centre_values
+
+    def add(self, part: LayerSymbols, first: bool = True, growth: float = 1.0) -> None:
+        """Add a slice. first: of its layer. growth: about how many times as many rows there will be in the end."""
+        n, layer = len(part.anchor_q), part.kind.layer
+        if first:
+            self.sort()
+            self._first, codes = self._columns["anchor_q"].size, _Column(np.uint8)
+            before = self._masks[-1].values if self._masks else np.zeros(0, np.uint8)
+            raised = codes.grow(len(before), growth * (len(before) + n) / max(1, len(before)))
+            np.add(before, part.mask_increase, out=raised, casting="unsafe")
+            self._masks.append(codes)
+            self._steps = replace(self._steps, **part.steps)
+            self._tensors[layer] = dequantise_tensors(part.tensors, part.kind, self._steps)
+        self._sorted = first or (self._sorted and not n)
+        self._masks[-1].grow(n, growth)[:] = part.mask_own
+        self._columns["anchor_q"].grow(n, growth)[:] = part.anchor_q
+        self._columns["classes"].grow(part.classes.size, growth)[:] = part.classes
+        rows = {name: self._columns[name].grow(n, growth) for name in self._grid.widths.attributes}
+        for at in row_blocks(n):
+            for name, x in self._grid.dequantise(part.attributes[:, at], part.classes[at]).items():
+                rows[name][at] = x
+
+    def sort(self, growth: float = 1.0) -> None:
+        """Put the rows of the layer in progress in order. growth: as in `add`."""
+        if self._sorted:
+            return
+        order = morton_order(self._columns["anchor_q"].values[self._first :])
+        for column in (*self._columns.values(), self._masks[-1]):
+            if column.size:
+                column.reorder(self._first, order, growth)
+        self._sorted = True
+
+    def scene(self, writeable: bool = True) -> Scene:
+        """The scene so far, at least one slice. Scenes share their arrays: let no two of them be written to."""
+        arrays = {name: column.values for name, column in self._columns.items()}
+        masks = tuple(column.values for column in self._masks)
+        for array in (*arrays.values(), *masks):
+            array.flags.writeable = writeable
+        classes, tensors = arrays.pop("classes"), self._tensors
+        return Scene(
+            info=self._info,
+            steps=self._steps,
+            layers=tuple(tensors),
+            rows=tuple(codes.size for codes in masks),
+            mask=masks,
+            networks=tensors[0].networks,
+            global_deformation=tensors[1] if 1 in tensors and tensors[1].networks else None,
+            local_deformation=tensors[2] if 2 in tensors and tensors[2].networks else None,
+            grading=Grading(classes, self._centre) if self._grid.widths.graded else None,
+            **arrays,
+        )
 
 
 # -- rules between slices ----------------------------------------------------------------------------------------------
 
 
-def check_slice(layers: Sequence[LayerSymbols], voxel_size: float, grid: Grid) -> None:
-    """Check a slice against the header and the layers before its own; `layers` ends with it.
+def check_slice(layer: LayerSymbols, before: MaskCodes, voxel_size: float, grid: Grid) -> None:
+    """Check a slice against the header and the codes before it.
 
     Raises Malformed if a mask code is above 255, an attribute lies too many steps from 0, or a dequantised value would
     not be finite.
     """
-    layer = layers[-1]
     where = f"layer {layer.kind.layer}"
     if layer.mask_increase.size:
-        highest = int((_mask_codes(layers[:-1])[-1] + layer.mask_increase).max())
+        highest = int((before.codes + layer.mask_increase).max())
         if highest > 255:
             raise Malformed(f"{where}: mask code {highest}, expected at most 255")
     farthest = grid.farthest(layer.attributes, layer.classes)
@@ -204,20 +283,46 @@ def check_slice(layers: Sequence[LayerSymbols], voxel_size: float, grid: Grid) -
         raise Malformed(f"{where}: a dequantised value is not finite")
 
 
+class MaskCodes:
+    """The mask codes of the slices so far."""
+
+    def __init__(self) -> None:
+        self._raised = np.zeros(0, np.int32)  # of the rows before the latest layer
+        self._cells, self._own = list[np.ndarray](), list[np.ndarray]()
+
+    @property
+    def codes(self) -> np.ndarray:
+        """int32 [rows so far], in the order of clause 12.2."""
+        if len(self._own) > 1:
+            cells = np.concatenate(self._cells)
+            order = morton_order(cells)
+            self._cells, self._own = [cells[order]], [np.concatenate(self._own)[order]]
+        return np.concatenate([self._raised, *self._own])
+
+    def take(self, part: LayerSymbols, first: bool) -> None:
+        """Add those of a slice. first: of its layer."""
+        if first:
+            self._raised, self._cells, self._own = self.codes + part.mask_increase, [], []
+        self._cells.append(part.anchor_q)
+        self._own.append(part.mask_own)
+
+
 class TakenVoxels:
     """The voxels of the slices so far."""
 
     def __init__(self) -> None:
-        self._keys = np.zeros(0, np.uint64)  # ascending
+        self._runs = list[np.ndarray]()  # ascending keys, each run more than twice as long as the next
 
     def take(self, anchor_q: np.ndarray) -> None:
         """Add voxels int32 [n, 3], which differ among themselves. Raises Malformed if one is taken."""
         keys = np.sort(_voxel_keys(anchor_q))
-        at = np.searchsorted(self._keys, keys)
-        taken = np.flatnonzero(self._keys[np.minimum(at, self._keys.size - 1)] == keys) if self._keys.size else at[:0]
-        if taken.size:
-            raise Malformed(f"voxel {_voxel_of(keys[taken[0]])} holds more than one anchor, expected one")
-        self._keys = np.insert(self._keys, at, keys)
+        for run in self._runs:
+            taken = np.flatnonzero(run[np.minimum(np.searchsorted(run, keys), run.size - 1)] == keys)
+            if taken.size:
+                raise Malformed(f"voxel {_voxel_of(keys[taken[0]])} holds more than one anchor, expected one")
+        while keys.size and self._runs and self._runs[-1].size <= 2 * keys.size:
+            keys = np.sort(np.concatenate([self._runs.pop(), keys]), kind="stable")
+        self._runs += [keys] if keys.size else []
 
 
 def first_duplicate(anchor_q: np.ndarray) -> list[int] | None:

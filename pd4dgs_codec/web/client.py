@@ -21,18 +21,35 @@ from dataclasses import dataclass
 from pd4dgs_codec.errors import BadSignature, DecodeError, UnsupportedVersion
 from pd4dgs_codec.format.decoder import open_stream
 from pd4dgs_codec.scene import Scene
-from pd4dgs_codec.web.transfer import HEADER_GUESS, LONGEST_HEADER, Changed, OutOfTime, Transfer, prefix_end, slice_ends
+from pd4dgs_codec.web.transfer import (
+    HEADER_GUESS,
+    LONGEST_HEADER,
+    MOST_BYTES,
+    Changed,
+    OutOfTime,
+    Transfer,
+    check_end,
+    prefix_end,
+    slice_ends,
+)
 
 RATE_SECONDS = 1.0
 
 
 @dataclass(frozen=True)
 class Budget:
-    """Limits of a download: highest layer, bytes counted from the first of the file, seconds counted from the call."""
+    """Limits of a download: highest layer, bytes counted from the first of the file, seconds counted from the call.
+
+    Without bytes nothing behind byte MOST_BYTES is fetched, and it is a fault if the first slice ends there.
+    """
 
     max_layer: int | None = None
     bytes: int | None = None
     seconds: float = math.inf
+
+    def end(self, slices: list[tuple[int, int]]) -> int:
+        """End of the last slice that it allows, 0 if there is none."""
+        return prefix_end(slices, self.max_layer, MOST_BYTES if self.bytes is None else self.bytes)
 
 
 def next_end(
@@ -42,7 +59,7 @@ def next_end(
 
     slices: (layer, end offset) in file order. have: bytes here. rate: recent bytes per second; None if unknown.
     """
-    limit = prefix_end(slices, budget.max_layer, budget.bytes)
+    limit = budget.end(slices)
     end = next((end for _, end in slices if have < end <= limit), None)
     if end is None or seconds_left <= 0:
         return None
@@ -103,8 +120,10 @@ class SceneClient:
             end: int | None = HEADER_GUESS if len(self.transfer.data) < HEADER_GUESS else LONGEST_HEADER
             reach = None
             if self._slices:
+                if budget.bytes is None:
+                    check_end(self._slices[0][1])
                 end = next_end(self._slices, len(self.transfer.data), budget, left, recent_rate(self._arrivals))
-                reach = prefix_end(self._slices, budget.max_layer, budget.bytes)
+                reach = budget.end(self._slices)
             if end is None:
                 break
             try:
@@ -121,7 +140,7 @@ class SceneClient:
         self.close()
 
     def _begin(self) -> None:
-        self._stream, self._fed, self._done = open_stream(), 0, 0
+        self._stream, self._fed = open_stream(), 0
         self._slices: list[tuple[int, int]] = []
         self._arrivals = self._now()
 
@@ -135,13 +154,12 @@ class SceneClient:
         except (BadSignature, UnsupportedVersion):
             raise  # not a transmission error
         except DecodeError:
-            good = self._slices[self._done - 1][1] if self._done else 0
+            good = self._stream.consumed
             if self._repaired_at == good:
                 raise
-            self._repaired_at = good
+            self._repaired_at = self._fed = good
             self.transfer.rewind(good)
-            self._begin()
-            self._feed(Budget())  # the valid slices, which were yielded before
+            self._stream.rewind()
             return []
 
     def _feed(self, budget: Budget) -> list[Scene]:
@@ -149,8 +167,6 @@ class SceneClient:
         if not self._slices:
             self._slices = slice_ends(data)
         if self._slices:  # the first bytes of a small file may hold more than the budget allows
-            end = min(end, prefix_end(self._slices, budget.max_layer, budget.bytes))
+            end = min(end, budget.end(self._slices))
         block, self._fed = bytes(data[self._fed : end]), max(self._fed, end)
-        scenes = self._stream.feed(block)
-        self._done = self._stream.slices
-        return scenes
+        return self._stream.feed(block)

@@ -48,6 +48,8 @@ CORS = {
     "Cross-Origin-Resource-Policy": "cross-origin",
     "Timing-Allow-Origin": "*",
 }
+#: For pages of this server alone.
+OWN = {"Cross-Origin-Resource-Policy": "same-origin"}
 PREFLIGHT = {
     "Access-Control-Allow-Methods": METHODS,
     "Access-Control-Allow-Headers": "Range, If-Range, If-None-Match, If-Modified-Since",
@@ -104,6 +106,7 @@ class Link:
 class Server(ThreadingTCPServer):
     """Serves `folder` on host:port (0: any free port) once serve_forever runs.
 
+    private: for pages of its own origin alone, asked for by an address of this machine; else for those of every site.
     link: carries all response bodies. latency: seconds of a round trip, for each new connection and each request.
     log: called with one line per request. Raises DeliveryError for an unusable folder or address.
     """
@@ -118,6 +121,7 @@ class Server(ThreadingTCPServer):
         host: str = "127.0.0.1",
         port: int = 0,
         *,
+        private: bool = False,
         link: Link | None = None,
         latency: float = 0.0,
         log: Callable[[str], None] | None = None,
@@ -125,21 +129,30 @@ class Server(ThreadingTCPServer):
         self.root = Path(folder).resolve()
         if not self.root.is_dir():
             raise DeliveryError(f"{folder}: is no folder, expected one to serve")
-        self.link, self.latency, self.log = link or Link(), latency, log
+        self.link, self.latency, self.log, self.private = link or Link(), latency, log, private
         #: Connections that owe a request, with the time.monotonic() of its deadline.
         self.waiting: dict[socket.socket, float] = {}
         self.address_family = socket.AF_INET6 if ":" in host else socket.AF_INET
         try:
             super().__init__((host, port), _Handler)
         except (OSError, OverflowError) as error:
-            raise DeliveryError(f"{host}:{port}: cannot listen here: {getattr(error, 'strerror', error)}") from None
+            raise DeliveryError(
+                f"{_authority(host, port)}: cannot listen here: {getattr(error, 'strerror', error)}"
+            ) from None
 
     @property
     def url(self) -> str:
         """Address of the folder, with a final slash."""
         host, port = self.server_address[:2]
-        name = str(host)
-        return f"http://{f'[{name}]' if ':' in name else name}:{port}/"
+        return f"http://{_authority(str(host), port)}/"
+
+    def is_own(self, host: str | None, origin: str | None) -> bool:
+        """Whether a request names this server, and comes from a page of it or from none. A site can give its own name
+        the address of this machine, and then asks with that name."""
+        own, port = str(self.server_address[0]), self.server_address[1]
+        names = {_authority(name, port) for name in {own, "localhost"}}
+        names |= {name.removesuffix(":80") for name in names}
+        return host is not None and host.lower() in names and origin in (None, f"http://{host.lower()}")
 
     def url_of(self, name: str) -> str:
         """Address of a file in the folder."""
@@ -169,6 +182,10 @@ class Server(ThreadingTCPServer):
         """Reports errors of this program; clients that disconnect are normal."""
         if not isinstance(sys.exc_info()[1], OSError):
             super().handle_error(request, client_address)  # type: ignore[arg-type]
+
+
+def _authority(host: str, port: int) -> str:
+    return f"[{host}]:{port}" if ":" in host else f"{host}:{port}"
 
 
 def _opened(root: Path, target: str) -> BinaryIO | None:
@@ -227,20 +244,34 @@ class _Handler(BaseHTTPRequestHandler):
     def parse_request(self) -> bool:
         complete = super().parse_request()
         self.server.waiting.pop(self.connection, None)
-        return complete
+        return complete and self._is_taken()
+
+    def _is_taken(self) -> bool:
+        """Whether the request is answered as what it says. No body is read, and none is taken for a request."""
+        head = self.headers
+        if "Content-Length" in head or "Transfer-Encoding" in head or self.command not in METHODS.split(", "):
+            self.close_connection = True
+        # what the parser could not read as header fields may announce a body, as may a line that goes on
+        if head.defects or head.get_payload() or any("\n" in value or "\r" in value for value in head.values()):
+            self.send_error(HTTPStatus.BAD_REQUEST)
+            return False
+        if len(head.get_all("Host", [])) > 1:
+            self.send_error(HTTPStatus.BAD_REQUEST)
+            return False
+        if self.server.private and not self.server.is_own(head.get("Host"), head.get("Origin")):
+            self.send_error(HTTPStatus.MISDIRECTED_REQUEST)
+            return False
+        return True
 
     def do_OPTIONS(self) -> None:
-        self._begin(HTTPStatus.NO_CONTENT, {"Allow": METHODS, **PREFLIGHT})
+        self._begin(HTTPStatus.NO_CONTENT, {"Allow": METHODS, **({} if self.server.private else PREFLIGHT)})
 
     def _refuse(self) -> None:
-        self.close_connection = True  # a request body, which nobody reads, may follow
         self._fail(HTTPStatus.METHOD_NOT_ALLOWED, {"Allow": METHODS})
 
     do_POST = do_PUT = do_PATCH = do_DELETE = _refuse
 
     def do_GET(self) -> None:
-        if "Content-Length" in self.headers or "Transfer-Encoding" in self.headers:
-            self.close_connection = True  # the request body must not be taken for the next request
         file = _opened(self.server.root, self.path)
         if file is None:
             self._fail(HTTPStatus.NOT_FOUND)
@@ -312,7 +343,8 @@ class _Handler(BaseHTTPRequestHandler):
     def _begin(self, status: HTTPStatus, headers: dict[str, str]) -> None:
         time.sleep(self.server.latency)
         self.send_response(status)
-        for name, value in {**headers, **CORS, "X-Content-Type-Options": "nosniff"}.items():
+        whose = OWN if self.server.private else CORS
+        for name, value in {**headers, **whose, "X-Content-Type-Options": "nosniff"}.items():
             self.send_header(name, value)
         if self.close_connection:
             self.send_header("Connection", "close")

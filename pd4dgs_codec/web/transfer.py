@@ -20,7 +20,7 @@ from http import HTTPStatus
 from typing import TypeVar
 from urllib.parse import SplitResult, quote, urljoin, urlsplit
 
-from pd4dgs_codec.errors import DeliveryError, Truncated, one_line
+from pd4dgs_codec.errors import DeliveryError, LimitExceeded, Truncated, one_line
 from pd4dgs_codec.format.container import PREAMBLE_SIZE, read_preamble
 from pd4dgs_codec.format.info import info
 from pd4dgs_codec.format.registry import MAX_HEADER
@@ -40,6 +40,8 @@ SHOWN = 80
 #: Most headers have some 300 bytes; a longer one costs a second request.
 HEADER_GUESS = 512
 LONGEST_HEADER = PREAMBLE_SIZE + MAX_HEADER
+#: Bytes of a file that are fetched where no budget is given: a header of a few bytes may promise terabytes.
+MOST_BYTES = 1 << 28
 
 T = TypeVar("T")
 
@@ -193,8 +195,10 @@ class Transfer:
         """The response with its headers. The time limit covers name resolution, connection, TLS and all headers."""
         seconds = self._patience(until)
         if self._connection is None:
-            kind = http.client.HTTPSConnection if self._place.scheme == "https" else http.client.HTTPConnection
-            self._connection = kind(str(self._place.hostname), self._place.port, timeout=seconds)
+            secure = self._place.scheme == "https"
+            kind = http.client.HTTPSConnection if secure else http.client.HTTPConnection
+            port = self._place.port or kind.default_port  # without one it is looked for in an IPv6 address
+            self._connection = kind(str(self._place.hostname), port, timeout=seconds)
         connection, target = self._connection, _target(self._place)
         self.requests += 1
 
@@ -319,6 +323,12 @@ def prefix_end(slices: list[tuple[int, int]], max_layer: int | None = None, max_
     return max((end for layer, end in slices if layer <= layer_limit and end <= limit), default=0)
 
 
+def check_end(end: int) -> None:
+    """Raise LimitExceeded if a file, or the prefix of it that is asked for, ends too far behind."""
+    if end > MOST_BYTES + 1:
+        raise LimitExceeded(f"ends at byte {end:,}, limit {MOST_BYTES:,} without a budget of bytes")
+
+
 def fetch_header(transfer: Transfer) -> bytes:
     """Preamble and header; fewer bytes if the remote file ends within them. Raises as `fetch` does."""
     return fetch(transfer, max_bytes=0)
@@ -329,7 +339,8 @@ def fetch(transfer: Transfer, max_layer: int | None = None, max_bytes: int | Non
     ends early.
 
     A prefix takes two requests for exactly its bytes, the whole file one. One byte after the last chunk is fetched, so
-    that the decoder sees trailing data. Raises as Transfer.read does, and DecodeError for an invalid header.
+    that the decoder sees trailing data. Raises as Transfer.read does, and DecodeError for an invalid header, and for a
+    prefix that ends behind byte MOST_BYTES without max_bytes.
     """
     whole = max_layer is None and max_bytes is None
 
@@ -345,6 +356,8 @@ def fetch(transfer: Transfer, max_layer: int | None = None, max_bytes: int | Non
                 return bytes(transfer.data)
             header = bytes(transfer.data[:size])
             end = info(header)["bytes"] + 1 if whole else prefix_end(slice_ends(header), max_layer, max_bytes)
+            if max_bytes is None:
+                check_end(end)
             return fill(max(end, size))
 
 

@@ -213,9 +213,8 @@ def test_verification_notices_another_header_and_a_lost_layer(monkeypatch):
     read = encoder.read_layers
 
     def another_header(data):
-        reader, complete = read(data)
-        reader.header = replace(reader.header, mode="lzma")
-        return reader, complete
+        file = read(data)
+        return replace(file, header=replace(file.header, mode="lzma"))
 
     for message, function in (
         ("the header decodes to other values", another_header),

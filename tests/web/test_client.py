@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import http.client
 import math
 import random
 import shutil
 import ssl
+import struct
 import subprocess
 import threading
 import time
@@ -13,18 +15,31 @@ from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from types import SimpleNamespace
+from urllib.parse import urlsplit
 
 import pytest
 from faulty import Fault, FaultyServer
-from strategies import assert_same_scene
+from fuzzing.mutate import take_apart
+from strategies import assert_same_scene, small_file
 
-from pd4dgs_codec import decode, encode
-from pd4dgs_codec.errors import BadSignature, ChecksumMismatch, DeliveryError, Pd4Error, Truncated
+from pd4dgs_codec import decode, encode, open_stream
+from pd4dgs_codec.errors import (
+    BadSignature,
+    ChecksumMismatch,
+    DeliveryError,
+    LimitExceeded,
+    Malformed,
+    Pd4Error,
+    Truncated,
+)
+from pd4dgs_codec.format import canonical
+from pd4dgs_codec.format.container import read_preamble, write_preamble
+from pd4dgs_codec.format.header import scene_id_of
 from pd4dgs_codec.scene import Scene
 from pd4dgs_codec.web import client as client_module
 from pd4dgs_codec.web.client import Budget, SceneClient, next_end, recent_rate
 from pd4dgs_codec.web.server import Link, Server
-from pd4dgs_codec.web.transfer import MAX_CHANGES, Transfer, slice_ends
+from pd4dgs_codec.web.transfer import MAX_CHANGES, Transfer, fetch, slice_ends
 
 SAME = {"ETag": '"same"'}
 
@@ -345,6 +360,58 @@ def test_random_cuts_give_the_same_scenes(file, cuts):
 
 
 @pytest.mark.parametrize("clients", [4, pytest.param(64, marks=pytest.mark.slow)])
+def promising(*sizes: int) -> bytes:
+    """The header of a file of such chunks, and the head of the first of them."""
+    parts = take_apart(small_file())
+    header = canonical.pack({**parts.header, 1: [[0 if i == 0 else 9, size] for i, size in enumerate(sizes)]})
+    return write_preamble(header) + struct.pack("<HHI8s", 0, 0, sizes[0], scene_id_of(header))
+
+
+@pytest.mark.parametrize("sizes", [[(1 << 31) - 1] * 1001, [1 << 28], [(1 << 28) - 100]])
+def test_a_header_that_promises_much_is_refused_before_its_bytes_arrive(monkeypatch, sizes):
+    """1,001 chunks of 2 GiB and an endless body once held 3.9 GB after 20 seconds."""
+    transfer = Transfer("http://nowhere.example/x.pd4")
+    body = promising(*sizes) + bytes(1 << 20)
+
+    def read(end=None, **_):
+        block = body[len(transfer.data) : end][: 1 << 14]
+        transfer.data += block
+        assert len(transfer.data) < len(body)
+        return block
+
+    monkeypatch.setattr(transfer, "read", read)
+    with pytest.raises(LimitExceeded, match="limit 268,435,456"):
+        fetch(transfer)
+    client = SceneClient("http://nowhere.example/x.pd4")
+    client.transfer = transfer
+    transfer.data.clear()
+    with pytest.raises(LimitExceeded, match="limit 268,435,456"):
+        list(client.scenes())
+
+
+def test_a_frame_that_differs_from_the_list_is_refused_as_soon_as_it_is_there(scene_bytes):
+    """Before the bytes of the chunk that it announces."""
+    start = read_preamble(scene_bytes).size
+    lying = scene_bytes[: start + 4] + struct.pack("<I", 5) + scene_bytes[start + 8 : start + 16]
+    stream = open_stream()
+    with pytest.raises(Malformed, match="payload length 5"):
+        stream.feed(lying)
+
+
+@pytest.mark.parametrize(
+    "address", ["http://[::1]/x", "https://[::1]/x", "http://[2001:db8::2]/x", "http://[::1]:81/x"]
+)
+def test_an_ipv6_address_needs_no_port(monkeypatch, address):
+    seen = []
+    monkeypatch.setattr(
+        http.client.HTTPConnection, "connect", lambda self: seen.append((self.host, self.port)) or 1 / 0
+    )
+    with pytest.raises(ZeroDivisionError):
+        Transfer(address).read(5)
+    parts = urlsplit(address)
+    assert seen == [(parts.hostname, parts.port or {"http": 80, "https": 443}[parts.scheme])]
+
+
 def test_many_clients_at_once_get_every_byte(folder, scene_bytes, clients):
     results: list[tuple[bytes, int]] = []
     with Server(folder, link=Link(200e6)) as server, server.running():

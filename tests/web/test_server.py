@@ -149,15 +149,59 @@ def test_a_connection_serves_several_requests(server):
     connection.close()
 
 
-def test_a_body_on_get_is_not_the_next_request(server):
+SMUGGLED = b"GET /scene.pd4 HTTP/1.1\r\nHost: x\r\n\r\n"
+
+
+@pytest.mark.parametrize("method", ["GET", "HEAD", "OPTIONS", "POST", "TRACE"])
+@pytest.mark.parametrize(
+    "field",
+    ["Content-Length: {}", "content-length:{}", "Content-Length : {}", "Content-Length\t: {}", ": {}",
+     "Transfer-Encoding: chunked", "Transfer-Encoding : chunked", "Transfer-Encoding: identity",
+     "Accept: a\r\n Content-Length: {}", "X\rContent-Length: {}", "no field at all\r\nContent-Length: {}",
+     "\x0bContent-Length: {}", "Host: y\r\nContent-Length: 0"],
+)  # fmt: skip
+def test_a_body_is_not_the_next_request(server, method, field):
+    """However it is announced: the server reads no body, so it ends the connection."""
     with socket.create_connection(server.server_address[:2], timeout=10) as raw:
-        smuggled = b"GET /scene.pd4 HTTP/1.1\r\nHost: x\r\n\r\n"
-        head = f"GET /bytes.bin HTTP/1.1\r\nHost: x\r\nContent-Length: {len(smuggled)}\r\n\r\n".encode()
-        raw.sendall(head + smuggled)
+        head = f"{method} /bytes.bin HTTP/1.1\r\nHost: x\r\n{field.format(len(SMUGGLED))}\r\n\r\n"
+        raw.sendall(head.encode("latin-1") + SMUGGLED)
         received = b""
-        while block := raw.recv(65536):
-            received += block
-    assert received.count(b"HTTP/1.1 ") == 1 and received.endswith(CONTENT)
+        with contextlib.suppress(ConnectionResetError):  # what nobody reads may reset it
+            while block := raw.recv(65536):
+                received += block
+    assert received.count(b"HTTP/1.1 ") <= 1 and b"scene" not in received
+
+
+@pytest.fixture
+def private(folder):
+    with Server(folder, private=True) as served, served.running():
+        yield served
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1:{}", "localhost:{}", "LOCALHOST:{}"])
+def test_a_private_server_answers_its_own_pages(private, host):
+    own = host.format(private.server_address[1])
+    for origin in ({}, {"Origin": f"http://{own.lower()}"}):
+        answer = ask(private, "/bytes.bin", Host=own, **origin)
+        assert answer.status == 200 and answer.body == CONTENT
+        assert answer.headers["Access-Control-Allow-Origin"] is None
+        assert answer.headers["Cross-Origin-Resource-Policy"] == "same-origin"
+    assert "Access-Control-Allow-Headers" not in ask(private, "/bytes.bin", "OPTIONS", Host=own).headers
+
+
+@pytest.mark.parametrize(
+    "headers",
+    [{"Host": "evil.example:{}"}, {"Host": "127.0.0.1"}, {"Host": "127.0.0.1:1"}, {"Host": ""},
+     {"Host": "127.0.0.1.evil.example:{}"}, {"Origin": "http://evil.example"}, {"Origin": "null"},
+     {"Origin": "http://127.0.0.1:1"}, {"Origin": "https://127.0.0.1:{}"}],
+)  # fmt: skip
+@pytest.mark.parametrize("method", ["GET", "HEAD", "OPTIONS"])
+def test_a_private_server_answers_no_other_site(private, method, headers):
+    """Not under a name that a site gives this machine, and not to a page of another origin."""
+    given = {name: value.format(private.server_address[1]) for name, value in headers.items()}
+    answer = ask(private, "/bytes.bin", method, **given)
+    assert answer.status == 421 and CONTENT[:9] not in answer.body
+    assert answer.headers["Access-Control-Allow-Origin"] is None
 
 
 def test_a_file_that_shrinks_while_it_is_sent_cuts_the_answer(folder, monkeypatch):

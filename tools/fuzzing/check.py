@@ -200,10 +200,12 @@ class JavaScript:
 Decoder = Callable[[bytes], tuple[str, Any] | None]
 
 
-def compare(data: bytes, decoders: dict[str, Decoder]) -> str | None:
+def compare(data: bytes, decoders: dict[str, Decoder], meaning: list[dict[str, Any]] | None = None) -> str | None:
     """None if all decoders agree, or the two names that differ: a file with several faults may be refused for any of
-    them. Finding if one accepts a file that another refuses, for other hashes, or for a crash."""
-    answers = {name: answer for name, decoder in decoders.items() if (answer := decoder(data)) is not None}
+    them. Finding if one accepts a file that another refuses, for other hashes, or for a crash. meaning: the hashes of a
+    legal file."""
+    answers = {} if meaning is None else {"the writer": (DECODED, meaning)}
+    answers |= {name: answer for name, decoder in decoders.items() if (answer := decoder(data)) is not None}
     (first, (expected, given)), *others = answers.items() or [("", ("", None))]
     for name, (found, result) in others:
         if found.startswith("crash"):

@@ -1,4 +1,5 @@
-"""Mutations of `.pd4` files, of bytes and of parts. Lengths, the chunk list, scene ids and CRCs are then made right.
+"""The inputs: legal files of random choices, and mutations of files, of bytes and of parts, after which lengths, the
+chunk list, scene ids and CRCs are made right.
 
 Everything is drawn from the given random.Random, so an input is named by its run and its number.
 """
@@ -20,7 +21,7 @@ from pd4dgs_codec.format import canonical
 from pd4dgs_codec.format.container import read_chunk, read_preamble, write_chunk, write_preamble
 from pd4dgs_codec.format.header import scene_id_of
 
-from .legal import Seed
+from .legal import Seed, legal
 
 ATTRIBUTES, PLANES = 2, 3  # sections in stages
 SECTIONS = 2  # key of the layer parameters
@@ -29,18 +30,20 @@ _POWERS = (7, 8, 12, 14, 15, 16, 20, 21, 22, 23, 24, 26, 28, 31, 32)
 INTEGERS = (0, 1, 2, 3, 4, 5, 10, 30, 68, 70, *(v for p in _POWERS for v in ((1 << p) - 1, 1 << p, (1 << p) + 1)))
 REALS = (0.0, -0.0, 1.0, -1.0, 0.5, 2.0**-149, 2.0**-126, 2.0**-20, 2.0**20, 2.0**127, -(2.0**127))
 LONGEST_BURST = 64
-SEALED_SHARE = 0.6  #: of the inputs
+LEGAL_SHARE = 0.2  #: of the inputs
+SEALED_SHARE = 0.6  #: of the others
 
 
 @dataclass(frozen=True)
 class Case:
     """One input. sealed: whether lengths, ids and CRCs were made right after the mutation. recipe: what was done.
-    origins: the files that it was made from."""
+    origins: the files that it was made from. meaning: the hashes that a legal file must have; None for any other."""
 
     data: bytes
     sealed: bool
     recipe: str
     origins: tuple[bytes, ...] = ()
+    meaning: list[dict[str, Any]] | None = None
 
 
 # -- bytes -------------------------------------------------------------------------------------------------------------
@@ -376,6 +379,9 @@ def change_header_bytes(rng: random.Random, data: bytes, other: bytes, names: li
 def make_case(seeds: Sequence[Seed], run: int, index: int) -> Case:
     """Input number `index` of a run over these files."""
     rng = random.Random(run << 40 | index)
+    if rng.random() < LEGAL_SHARE:
+        file = legal(rng)
+        return Case(file.data(), True, "a legal file", meaning=file.hashes())
     chosen, donor = rng.choice(seeds), rng.choice(seeds)
     names: list[str] = []
     act = rng.random()

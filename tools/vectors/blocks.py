@@ -255,6 +255,11 @@ def staged_planes(
     priors: StagePriors | None = None,
 ) -> bytes:
     """Section PLANES of residuals int32 [C, H, W], form 1 (clause 8.8). counts: classes of the stages from 1 on."""
+    return b"\1" + varint(*counts) + staged(plane_stages(planes, counts), lengths, tail, priors)
+
+
+def plane_stages(planes: Sequence[np.ndarray], counts: Sequence[int]) -> list[list[np.ndarray]]:
+    """The channels of the stages of clause 8.8."""
     stages = []
     for stage in range(max(1, (len(planes[0]) - 1).bit_length())):
         first, end, channels = (1 << stage if stage else 0), 2 << stage, list[np.ndarray]()
@@ -264,7 +269,7 @@ def staged_planes(
             for channel in e[first:end]:
                 channels += _split(channel.ravel(), classes, count)
         stages.append(channels)
-    return b"\1" + varint(*counts) + staged(stages, lengths, tail, priors)
+    return stages
 
 
 @dataclass(frozen=True)

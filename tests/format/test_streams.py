@@ -1,0 +1,110 @@
+"""A stream costs what decoding costs, however the bytes are split."""
+
+import time
+import tracemalloc
+from collections import deque
+from functools import cache
+from itertools import chain
+
+import numpy as np
+import pytest
+from strategies import assert_same_scene
+from vectors.blocks import later, line, make_file, make_layer, pattern
+
+from pd4dgs_codec import decode, open_stream
+from pd4dgs_codec.errors import ChecksumMismatch
+from pd4dgs_codec.format.info import info
+
+SLICES, ROWS = 60, 64
+
+
+@cache
+def many_slices():
+    """Layer 0 in many slices, and layer 1, whose rises are in the order of all of them."""
+    k = np.resize(pattern(68, 7), (68, ROWS))
+    first = make_layer(0, line(ROWS, z=900), attributes=k)
+    rest = [later(0, line(ROWS, z=(7 * i) % SLICES), attributes=k) for i in range(1, SLICES)]
+    anchors = SLICES * ROWS
+    rises = (np.arange(anchors) % 50).tolist()
+    return make_file(first, *rest, make_layer(1, line(3, z=-5), before=anchors, rises=rises)).data()
+
+
+@cache
+def ends():
+    return [part["end"] for layer in info(many_slices())["layers"] for part in layer["slices"]]
+
+
+def streamed(cuts, keep=None):
+    """The scenes of a stream that is fed these pieces, or the last ones alone."""
+    data, stream, scenes = many_slices(), open_stream(), deque(maxlen=keep)
+    for a, b in zip(chain([0], cuts), chain(cuts, [len(data)]), strict=True):
+        scenes += stream.feed(data[a:b])
+    stream.finish()
+    return scenes
+
+
+def cost(work):
+    """(least seconds of processor time of two runs, peak bytes)."""
+    seconds = []
+    for _ in range(2):
+        start = time.process_time()
+        work()
+        seconds.append(time.process_time() - start)
+    tracemalloc.start()
+    work()
+    peak = tracemalloc.get_traced_memory()[1]
+    tracemalloc.stop()
+    return min(seconds), peak
+
+
+SPLITS = {
+    "whole": lambda: (),
+    "slices": lambda: ends()[:-1],
+    "within slices": lambda: [end - 7 for end in ends()],
+    "runs of bytes": lambda: range(50, len(many_slices()), 50),
+}
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_any_split_takes_the_time_and_memory_of_decoding(split):
+    """Making a scene of all rows for each slice took the square of their number."""
+    cuts = SPLITS[split]()
+    decode(many_slices())
+    seconds, peak = cost(lambda: decode(many_slices()))
+    found_seconds, found_peak = cost(lambda: streamed(cuts, keep=1))
+    assert found_seconds <= 3 * seconds
+    assert found_peak <= 1.5 * peak
+
+
+@pytest.mark.parametrize("split", SPLITS)
+def test_any_split_ends_in_the_scene_of_decoding(split):
+    scenes = streamed(SPLITS[split]())
+    assert_same_scene(scenes[-1], decode(many_slices()))
+    assert_same_scene(scenes[-2], decode(many_slices(), max_layer=0))
+
+
+def test_scenes_stay_as_they_were():
+    scenes = streamed(SPLITS["slices"]())
+    assert len(scenes) == len(ends())
+    for scene, end in list(zip(scenes, ends(), strict=True))[::11]:
+        expected = decode(many_slices(), max_bytes=end)
+        order, other = (np.lexsort(s.anchor_q.T) for s in (scene, expected))
+        for name in ("anchor_q", "feature", "scaling_log", "offset"):
+            np.testing.assert_array_equal(getattr(scene, name)[order], getattr(expected, name)[other])
+        np.testing.assert_array_equal(scene.mask[0][order], expected.mask[0][other])
+        with pytest.raises(ValueError, match="read-only"):
+            scene.feature[:] = 0
+
+
+def test_a_stream_goes_on_after_a_damaged_slice_is_fed_again():
+    data, at = many_slices(), ends()[4]
+    damaged = bytearray(data)
+    damaged[at + 40] ^= 1
+    stream = open_stream()
+    assert len(stream.feed(damaged)) == 1 and stream.consumed == at and stream.slices == 5
+    for _ in range(2):
+        with pytest.raises(ChecksumMismatch):
+            stream.feed(b"")
+    stream.rewind()
+    assert_same_scene(stream.feed(data[at:])[-1], decode(data))
+    stream.finish()
