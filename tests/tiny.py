@@ -117,6 +117,15 @@ def trained_like_scene() -> Scene:
     )
 
 
+def sighted(scene: Scene, *viewing: str) -> Scene:
+    """The scene without the weights for the view direction in networks other than `viewing`."""
+    networks = {
+        name: network if name in viewing else ((network[0][0][:, : scene.widths.feature], network[0][1]), *network[1:])
+        for name, network in scene.networks.items()
+    }
+    return replace(scene, networks=networks)
+
+
 def _network(rng: np.random.Generator, *widths: int, scale: float = 0.3) -> Network:
     pairs = zip(widths, widths[1:], strict=False)
     return tuple(

@@ -25,7 +25,8 @@ if TYPE_CHECKING:
 
 DETAILS = f"""\
 View-dependent colours become spherical harmonics, view-dependent opacities and sizes become means over many viewpoints;
-both are then refined against renderings of the scene. The viewpoints are the training cameras of --data, or else lie
+both are then refined against renderings of the scene. If colours alone are view-dependent (pd4dgs-info --json), all but
+the harmonics is exact, and refinement is off by default. The viewpoints are the training cameras of --data, or else lie
 around the point that the file's camera looks at. --compare measures the loss of quality.
 
   ply       one PLY file in the layout of 3D Gaussian splatting
@@ -61,8 +62,8 @@ def parser() -> options.Parser:
     p.add_argument("--level", type=int, choices=(0, 1, 2), help="level to write (default: the file's highest)")
     what = "degree of the spherical harmonics (default: 3)"
     p.add_argument("--sh", type=int, choices=(0, 1, 2, 3), default=3, help=what)
-    what = f"optimisation steps of the refinement, a quarter for later frames (default: {STEPS}; 0: none)"
-    p.add_argument("--refine", type=options.count, default=STEPS, metavar="N", help=what)
+    what = f"optimisation steps of the refinement, a quarter for later frames (default: {STEPS} or 0, see below)"
+    p.add_argument("--refine", type=options.count, metavar="N", help=what)
     what = "multiply all lengths, so that small scenes suit SPZ's fixed-point numbers (default: 1)"
     p.add_argument("--scale", type=options.positive_float, default=1.0, metavar="X", help=what)
     p.add_argument("--data", metavar="SOURCE", help="use the training cameras of a dataset as viewpoints")
@@ -87,9 +88,12 @@ def _export(args: argparse.Namespace, console: Console) -> int:
     if args.to == "4dgs":
         library("fourdgs", ".4dgs files")
     player = _player(args)
+    if args.refine is None:
+        args.refine = 0 if player.shapes_are_blind else STEPS
     export = Export(player, _eyes(args, player), args.sh, args.refine)
     start = time.perf_counter()
     result = {"input": args.input, "output": args.output, "to": args.to, "level": player.level, "sh": args.sh}
+    result["refine"] = args.refine
     result |= _write_sequence(args, export) if args.to in SEQUENCES else _write_still(args, export, console)
     result["seconds"] = time.perf_counter() - start
     if args.compare:

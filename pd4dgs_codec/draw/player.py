@@ -64,7 +64,8 @@ class Player:
         self._global, self._local = (None if field is None else Field(field, box, heads) for field, heads in fields)
         networks, widths = [scene.networks[name] for name in SCAFFOLD_NETWORKS], scene.widths
         self._decoders = Decoders(networks, widths.feature)
-        self._colors = Colors(networks[-1], self.slots, widths.feature) if widths.shapes_are_blind else None
+        self.shapes_are_blind = widths.shapes_are_blind  #: whether of the Gaussians colours alone depend on the eye
+        self._colors = Colors(networks[-1], self.slots, widths.feature) if self.shapes_are_blind else None
         self._time: float | None = None
         self._moved = self._table  # at self._time
         if self._global is not None:

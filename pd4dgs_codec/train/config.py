@@ -141,7 +141,7 @@ class TrainConfig:
     )
     slots: int = option(10, help=f"Gaussians of an anchor, 1 to {MAX_SLOTS}", metavar="N", least=1, most=MAX_SLOTS)
     view_dependent: str = option(
-        "opacity+covariance+color", help="the networks of anchors that take the view direction", choices=VIEW_DEPENDENT
+        "color", help="the networks of anchors that take the view direction", choices=VIEW_DEPENDENT
     )
     downscale: int = option(1)
     holdout: int = option(8)

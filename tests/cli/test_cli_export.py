@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import pytest
+from tiny import sighted
 
 from pd4dgs_codec.interchange.formats import properties
 
@@ -25,6 +26,16 @@ def test_one_instant_as_ply(cli, scene_pd4, tmp_path):
     assert again.code == 1 and "exists already; --overwrite replaces it" in again.err and out.read_bytes() == middle
     assert cli(*command, "--time", 0, "-f").code == 0 and out.read_bytes() != middle
     assert cli(*command, "--time", 0, "-f", "--level", 0, "-v").json["level"] == 0
+
+
+def test_gaussians_whose_colours_alone_depend_on_the_view_are_not_refined(cli, scene, tmp_path):
+    from pd4dgs_codec.format.encoder import encode
+
+    file = tmp_path / "scene.pd4"
+    file.write_bytes(encode(sighted(scene, "color"), effort=1))
+    assert cli("info", file, "--json").json["view_dependent"] == ["color"]
+    result = cli("export", file, "-o", tmp_path / "scene.ply", "--to", "ply", "--json")
+    assert result.json["refine"] == 0 and result.json["gaussians"] > 20
 
 
 def test_the_whole_time_as_a_folder_of_plys(cli, scene_pd4, tmp_path):

@@ -2,10 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
-from tiny import trained_like_scene
+from tiny import sighted, trained_like_scene
 
 from pd4dgs_codec.draw.player import Player
 from pd4dgs_codec.format.decoder import decode
@@ -26,9 +24,4 @@ def player(scene) -> Player:
 @pytest.fixture
 def blind_player(scene) -> Player:
     """Its Gaussians are the same from everywhere."""
-    networks = {}
-    for name, ((weight, bias), *rest) in scene.networks.items():
-        weight = weight.copy()
-        weight[:, -3:] = 0
-        networks[name] = ((weight, bias), *rest)
-    return Player(replace(scene, networks=networks))
+    return Player(sighted(scene))

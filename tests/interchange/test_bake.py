@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from tiny import camera_ahead
+from tiny import camera_ahead, sighted
 
 from pd4dgs_codec.draw.player import Player
 from pd4dgs_codec.interchange.export import (
@@ -96,6 +96,14 @@ def test_gaussians_of_eyes_equal_those_of_cameras(player):
             inside = np.isin(slots // player.slots, direct.slots // player.slots)
             unseen = np.setdiff1d(np.flatnonzero(inside), here)
             np.testing.assert_array_equal(opacities[unseen], 0)
+
+
+def test_a_bake_is_exact_where_colours_alone_depend_on_the_view(scene):
+    cameras, player = _cameras(), Player(sighted(scene, "color"))
+    splats, _ = bake(player, 0.5, eyes_of_cameras(cameras), 3)
+    for camera in cameras[::4]:
+        difference = picture(splats, camera, player.info.background) - player.picture(camera, 0.5)
+        assert np.square(difference).mean() < 1e-5
 
 
 def test_refinement_comes_closer_to_the_scenes_own_pictures(player):
