@@ -174,9 +174,9 @@ class TrainConfig:
     )
     #: a step on a smaller picture costs less, and what is coarse has to be learnt first
     small_pictures: float = option(
-        0.0,
-        help="share of the run, at its start, that trains on pictures of a quarter, then of half their size, if these "
-        "have 100 pixels a side; 0 trains on whole ones alone",
+        0.4,
+        help="share of the run, at its start, that sees pictures of 400 pixels a side or more at a quarter, then at "
+        "half their size; 0: always whole",
         least=0,
         most=1,
     )

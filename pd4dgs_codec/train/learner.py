@@ -168,7 +168,7 @@ class Learner(TrainState):
         if picture.meta["means2d"].requires_grad:
             picture.meta["means2d"].retain_grad()
         part = shown.content(picture.alpha)
-        l1, dissimilarity = image_loss(picture.image[part], shown.pixels[part].float() / 255, shown.weights[part])
+        l1, dissimilarity = image_loss(picture.image, shown.pixels[part].float() / 255, shown.weights[part], part)
         terms = {"l1": l1, "dssim": dissimilarity}
         loss = (1 - config.ssim) * l1 + config.ssim * dissimilarity
         if config.volume and len(picture.gaussians.scales):

@@ -28,6 +28,8 @@ EXACT_TAPS /= EXACT_TAPS.sum()
 TAPS = EXACT_TAPS.astype(np.float32)
 REACH = 5
 SIDE = 3 * REACH
+Part = tuple[slice, slice]  #: rows and columns
+WHOLE = slice(None), slice(None)
 
 
 def pixel_weights(mask: Tensor) -> Tensor:
@@ -38,30 +40,32 @@ def pixel_weights(mask: Tensor) -> Tensor:
 
 class _ImageLoss(torch.autograd.Function):
     @staticmethod
-    def forward(ctx: Any, image: Tensor, target: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
-        x, y, w = pad(image.numpy()), pad(target.numpy()), weights.numpy()
+    def forward(ctx: Any, image: Tensor, target: Tensor, weights: Tensor, part: Part) -> tuple[Tensor, Tensor]:
+        x, y, w = pad(image[part].numpy()), pad(target.numpy()), weights.contiguous().numpy()
         slopes, sums = np.zeros((3, *x.shape), x.dtype), np.empty((len(w), 2))
         loss(slopes, sums, x, y, w, TAPS)
-        ctx.saved = x, y, w, slopes
+        ctx.saved, ctx.shape, ctx.part = (x, y, w, slopes), image.shape, part
         l1, dissimilarity = sums.sum(0)
         return image.new_tensor(l1), image.new_tensor(dissimilarity)
 
     @staticmethod
     @once_differentiable
-    def backward(ctx: Any, g_l1: Tensor, g_dissimilarity: Tensor) -> tuple[Tensor, None, None]:
+    def backward(ctx: Any, g_l1: Tensor, g_dissimilarity: Tensor) -> tuple[Tensor, None, None, None]:
         x, y, weights, slopes = ctx.saved
         grad = np.empty((*weights.shape, 3), x.dtype)
         factors = np.array([g_l1.item(), g_dissimilarity.item()], x.dtype)
         loss_backward(grad, x, y, weights, slopes, factors, TAPS)
-        return torch.from_numpy(grad), None, None
+        whole = torch.zeros(ctx.shape)
+        whole[ctx.part] = torch.from_numpy(grad)
+        return whole, None, None, None
 
 
-def image_loss(image: Tensor, target: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
+def image_loss(image: Tensor, target: Tensor, weights: Tensor, part: Part = WHOLE) -> tuple[Tensor, Tensor]:
     """(weighted mean of |image - target|, weighted mean of 1 - SSIM), scalars. image, target: float32 [H, W, 3], linear
-    0..1. weights: [H, W], from `pixel_weights`."""
+    0..1. weights: [H, W], from `pixel_weights`. part: of the image, that `target` and `weights` are cropped to."""
     if image.device.type != "cpu":
-        return image_loss_reference(image, target, weights)
-    l1, dissimilarity = _ImageLoss.apply(image.contiguous(), target, weights)  # type: ignore[no-untyped-call]
+        return image_loss_reference(image[part], target, weights)
+    l1, dissimilarity = _ImageLoss.apply(image, target, weights, part)  # type: ignore[no-untyped-call]
     return l1, dissimilarity
 
 

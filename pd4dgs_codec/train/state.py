@@ -24,12 +24,12 @@ from pd4dgs_codec.train.config import TrainConfig
 from pd4dgs_codec.train.initialise import fresh_model
 from pd4dgs_codec.train.optimiser import PER_ANCHOR, Optimiser
 from pd4dgs_codec.train.schedule import Schedule, reduction
-from pd4dgs_codec.train.ssim import pixel_weights, within_reach
+from pd4dgs_codec.train.ssim import Part, pixel_weights, within_reach
 
 #: Bytes of images on the device, weights included, beyond which the least recently used are dropped.
 KEPT_BYTES = 1 << 30
-#: Pixels of the shorter side that reduced pictures keep.
-LEAST_SIDE = 100
+#: Pixels of the shorter side from which on pictures are reduced: a quarter keeps 100, with fewer little time is saved.
+LARGE = 400
 MOST_STEPS = 1 << 31  #: of a run that is resumed
 
 
@@ -67,7 +67,7 @@ class TrainingView:
         """float32 [H, W, 3], 0..1."""
         return self.pixels.float() / 255
 
-    def content(self, alpha: Tensor) -> tuple[slice, slice]:
+    def content(self, alpha: Tensor) -> Part:
         """The rows and columns that the loss of a picture with `alpha` [H, W] depends on: elsewhere the picture and the
         image are the background."""
         rows, columns = (alpha.detach().amax(axis).bool() for axis in (1, 0))
@@ -96,16 +96,15 @@ class TrainingViews:
     def __getitem__(self, index: int) -> TrainingView:
         return self.reduced(index, 1)
 
-    def reduced(self, index: int, most: int) -> TrainingView:
-        """View `index` at 1/most of its size, or the next larger power of two that leaves LEAST_SIDE pixels."""
+    def reduced(self, index: int, k: int) -> TrainingView:
+        """View `index` at 1/k of its size, if it is LARGE."""
         view = self.views[index]
-        while most > 1 and min(view.width, view.height) // most < LEAST_SIDE:
-            most //= 2
-        found = self._kept.pop((index, most), None)
+        k = k if min(view.width, view.height) >= LARGE else 1
+        found = self._kept.pop((index, k), None)
         if found is None:
-            found = TrainingView.of(shrunk_view(view, most), self.background, self.device)
+            found = TrainingView.of(shrunk_view(view, k), self.background, self.device)
             self._bytes += found.nbytes
-        self._kept[index, most] = found
+        self._kept[index, k] = found
         while self._bytes > KEPT_BYTES and len(self._kept) > 1:
             self._bytes -= self._kept.popitem(last=False)[1].nbytes
         return found
@@ -178,7 +177,7 @@ class TrainState:
         return Rounding(self.noise if noise else None, attributes=exact, weights=weights)
 
     def picture(self, index: int) -> TrainingView:
-        """Training view `index` as the steps at this position see it: at first smaller."""
+        """Training view `index` as the steps at this position see it: a large one smaller at first."""
         progress = self.schedule.progress(self.position)
         return self.views.reduced(index, reduction(progress, self.config.small_pictures))
 

@@ -172,21 +172,21 @@ def test_only_what_is_not_finite_is_skipped(dataset, monkeypatch):
 
 
 def test_large_pictures_are_small_at_first(dataset, monkeypatch):
-    """A quarter, then half of the size, by the mean of blocks, with the camera; never below LEAST_SIDE pixels."""
-    monkeypatch.setattr(state, "LEAST_SIDE", 6)
+    """A quarter, then half of the size, by the mean of blocks, with the camera; others stay whole."""
+    monkeypatch.setattr(state, "LARGE", 24)
     steps = learner(dataset, 40, small_pictures=0.5)
     sizes = {}
     for steps.iteration in range(40):
         sizes[steps.iteration] = steps.picture(0).view.width
     assert [sizes[i] for i in (0, 9, 10, 19, 20, 39)] == [8, 8, 16, 16, 32, 32]
+    assert learner(dataset, 40, small_pictures=0.0).picture(0).view.width == 32
     steps.iteration = 0
     small, whole = steps.picture(0), steps.views[0]
     blocks = whole.pixels.float().view(6, 4, 8, 4, 3).mean((1, 3))
     assert (small.pixels - blocks).abs().max() <= 0.5 and small.view.camera.height == 6
     assert np.array_equal(small.view.K[:2], whole.view.K[:2] / 4) and small.weights.sum() == pytest.approx(1 / 3)
-    monkeypatch.setattr(state, "LEAST_SIDE", 7)
-    assert steps.picture(0).view.width == 16
-    assert learner(dataset, 40, small_pictures=0.0).picture(0).view.width == 32
+    monkeypatch.setattr(state, "LARGE", 25)
+    assert steps.picture(0).view.width == 32
 
 
 def test_the_loss_looks_at_what_is_drawn_or_shown(dataset):

@@ -53,7 +53,7 @@ def records_of(trainer: Trainer, folder) -> list[dict]:
 @pytest.mark.usefixtures("short_runs_have_phases")
 def test_a_run_with_all_phases_resumes_bit_for_bit(dataset, tmp_path, monkeypatch):
     """Cut on quarter pictures before anchors grow, between two rounds of pruning, and while prefixes are trained."""
-    monkeypatch.setattr("pd4dgs_codec.train.state.LEAST_SIDE", 6)
+    monkeypatch.setattr("pd4dgs_codec.train.state.LARGE", 24)
     monkeypatch.setattr(prefixes, "utility", lambda scene, _: np.arange(len(scene.anchor_q)) % 7.0)  # is slow
     config = TrainConfig(preset="tiny", iterations=44, prune=0.05, grading=0.5, prefixes=0.5, small_pictures=0.6)
     trainer, schedule, whitenings = Trainer(config, dataset), Schedule(44), []

@@ -91,7 +91,7 @@ def test_nothing_within_reach_is_cropped(differing, masked):
     part = within_reach(differs.any(1)), within_reach(differs.any(0))
     assert image[part].numel() < image.numel() / 2
     whole = terms_and_gradient(image_loss(image, target, weights), image)
-    cropped = terms_and_gradient(image_loss(image[part], target[part], weights[part]), image)
+    cropped = terms_and_gradient(image_loss(image, target[part], weights[part], part), image)
     for found, expected, tolerance in zip(cropped, whole, (1e-7, 1e-7, 1e-8), strict=True):
         assert (found - expected).abs().max() <= tolerance
     assert bool(cropped[0] > 0) == bool(differing)
