@@ -106,7 +106,7 @@ class SceneClient:
         self.transfer.close()
 
     def scenes(self, budget: Budget = Budget()) -> Iterator[Scene]:
-        """A scene for each slice that arrives, with all slices so far, until the budget is spent.
+        """The newest scene as slices arrive, with all slices so far, until the budget is spent.
 
         A further call continues after the last slice yielded. Raises DeliveryError if the file is not available,
         DecodeError if it is invalid; scenes yielded before stay valid.

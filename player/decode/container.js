@@ -106,7 +106,7 @@ function need(bytes, size, what, offset, chunk) {
   if (bytes.length >= size) return;
   const end = offset + bytes.length;
   const message = `${end} bytes end inside ${what}, which needs ${offset + size}`;
-  throw new DecodeError("Truncated", message, { offset: end, chunk });
+  throw new DecodeError("Truncated", message, { offset: end, chunk, needs: offset + size });
 }
 
 /** @param {DataView} view @param {number} at @param {number} computed @param {number} offset

@@ -18,9 +18,10 @@ export class DecodeError extends Error {
   /**
    * @param {ErrorKind} kind
    * @param {string} reason what was found, what was expected
-   * @param {{offset?: number | null, chunk?: number | null}} [place]
+   * @param {{offset?: number | null, chunk?: number | null, needs?: number}} [place] needs: of Truncated, so many bytes
+   * of the file the step takes that found too few
    */
-  constructor(kind, reason, { offset = null, chunk = null } = {}) {
+  constructor(kind, reason, { offset = null, chunk = null, needs = 0 } = {}) {
     const where = [];
     if (chunk !== null) where.push(`chunk ${chunk}`);
     if (offset !== null) where.push(`offset ${offset}`);
@@ -30,6 +31,7 @@ export class DecodeError extends Error {
     this.reason = reason;
     this.offset = offset;
     this.chunk = chunk;
+    this.needs = needs;
   }
 }
 

@@ -57,7 +57,7 @@ const MOST_CHANGES = 4;
 class Cut extends Error {}
 
 /**
- * The scenes of one URL. `scenes()` yields one per slice; called again, with another budget, it continues after the
+ * The scenes of one URL. `scenes()` yields them as slices arrive; called again, with another budget, it continues after the
  * last one. A damaged slice is fetched once more and never yielded.
  */
 export class SceneSource {
@@ -92,6 +92,8 @@ export class SceneSource {
     this._requested = { at: 0, received: 0 };
     /** Where the file was fetched anew after damage. */
     this._repairedAt = -1;
+    /** How many slices end within the first `consumed` bytes. */
+    this._slices = { consumed: 0, next: 0 };
     /** Preamble of the file. */
     this._head = new Uint8Array(PREAMBLE_SIZE);
     signal?.addEventListener("abort", () => this._controller?.abort(signal.reason), { once: true });
@@ -104,7 +106,7 @@ export class SceneSource {
   }
 
   /**
-   * One scene per slice that completes, each with all slices so far, until the budget or the file ends.
+   * The newest scene whenever a slice completes, with all slices so far, until the budget or the file ends.
    *
    * Raises FetchError if the file is not available, DecodeError if it is invalid, and the signal's reason if it is
    * aborted; scenes yielded before stay valid. If the file changes, its scenes restart with layer 0. Without a budget
@@ -159,16 +161,20 @@ export class SceneSource {
       if (this.received < PREAMBLE_SIZE) return PREAMBLE_SIZE;
       return Math.min(PREAMBLE_SIZE + headerLength(this._head), LONGEST_HEADER);
     }
-    const wanted = ends.filter(({ layer, end }) => layer <= maxLayer && end <= (bytes ?? MOST_BYTES));
-    if (!wanted.length && bytes === undefined && maxLayer >= 0) {
+    const limit = bytes ?? MOST_BYTES;
+    if (ends[0].end > limit && bytes === undefined && maxLayer >= 0) {
       throw new DecodeError("LimitExceeded", `layer 0 ends at byte ${ends[0].end}, limit ${MOST_BYTES}`);
     }
-    const end = wanted.find((slice) => slice.end > consumed)?.end;
-    if (end === undefined) return null;
+    if (consumed < this._slices.consumed) this._slices = { consumed: 0, next: 0 }; // it changed
+    let { next } = this._slices; // slices and their layers ascend
+    while (next < ends.length && ends[next].end <= consumed) next++;
+    this._slices = { consumed, next };
+    if (next === ends.length || ends[next].layer > maxLayer || ends[next].end > limit) return null;
+    const { end } = ends[next];
     const { at, received } = this._requested;
     const rate = (this.received - received) / (now() - at);
     const late = until < Infinity && rate > 0 && end - this.received > rate * (until - now());
-    return late && end !== wanted[0].end ? null : end;
+    return late && next > 0 ? null : end;
   }
 
   /** The scenes that a block completes. After damage the download goes back to the last valid chunk, once.

@@ -34,11 +34,14 @@ export { Stream } from "./stream.js";
  */
 export function decode(bytes, { maxLayer = null, allowPartial = false } = {}) {
   const data = bytes instanceof Uint8Array ? bytes : new Uint8Array(bytes);
-  return readAll(data, checkMaxLayer(maxLayer), allowPartial).scene();
+  const reader = readAll(data, checkMaxLayer(maxLayer), allowPartial);
+  reader.sort();
+  return reader.scene();
 }
 
 /**
- * A decoder that takes a file in pieces: `feed(bytes)` gives one scene per slice that they complete.
+ * A decoder that takes a file in pieces: `feed(bytes)` gives the newest scene of each layer that they
+ * complete a slice of.
  *
  * @param {{maxLayer?: number | null}} [options]
  * @returns {Stream}

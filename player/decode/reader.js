@@ -1,12 +1,13 @@
 // Clause 12: a file's chunks in order, slice by slice, to scenes.
 
+import { Column } from "./columns.js";
 import { CHUNK_OVERHEAD, PREAMBLE_SIZE, readChunk, readPreamble } from "./container.js";
 import { DecodeError, limitExceeded, malformed, unsupported } from "./errors.js";
 import { LAYER_TYPES, readHeader } from "./header.js";
 import { MOST_CODE, decodeLayer, dequantise, transposed } from "./layer.js";
 import { layerKind } from "./parameters.js";
 import { PLANES } from "./scene.js";
-import { Continuation, joined, mortonOrder, reordered } from "./slices.js";
+import { Continuation, mortonOrder } from "./slices.js";
 import { VoxelTable } from "./voxels.js";
 /** @import { Header, ListedChunk } from "./header.js" */
 /** @import { LayerSymbols } from "./layer.js" */
@@ -46,7 +47,13 @@ export class LayerReader {
     this.offset = 0;
     /** What the layers read so far hold. @type {LayerParts[]} */
     this._layers = [];
+    /** What all rows hold. @type {Record<string, Column<any>>} */
+    this._columns = {};
     this._index = 0;
+    /** By chunk, the layer of the first slice behind those before it; null if there is none. @type {(number | null)[]} */
+    this._following = [];
+    /** By chunk, the part of all slices' bytes that has come with it. @type {number[]} */
+    this._share = [];
     /** How many slices have been read. */
     this.count = 0;
     /** By those slices. @type {Declared} */
@@ -72,7 +79,29 @@ export class LayerReader {
     const packed = readPreamble(bytes);
     this.header = readHeader(packed);
     this.offset = PREAMBLE_SIZE + packed.length;
+    this._begin(this.header);
     return this.header;
+  }
+
+  /** @param {Header} header */
+  _begin({ chunks, widths: { feature, slots } }) {
+    this._following = [null];
+    for (const { type } of [...chunks].reverse()) {
+      this._following.push(type < LAYER_TYPES ? type : this._following[this._following.length - 1]);
+    }
+    this._following.reverse();
+    let come = 0;
+    const sums = chunks.map(({ type, length }) => (come += type < LAYER_TYPES ? length : 0));
+    this._share = sums.map((sum) => sum / come);
+    const widths = { voxels: 3, anchor: 3, feature, scalingLog: 6, offset: 3 * slots };
+    for (const [name, width] of Object.entries(widths)) {
+      this._columns[name] = new Column(name === "voxels" ? Int32Array : Float32Array, width);
+    }
+  }
+
+  /** Whether the layer of the latest slice has no further ones. */
+  get whole() {
+    return this._following[this._index] !== this._layers[this._layers.length - 1].layer;
   }
 
   /**
@@ -89,9 +118,8 @@ export class LayerReader {
     const start = this.offset;
     const { chunks } = this.readHeader(bytes);
     while (this._index < chunks.length) {
-      if (maxLayer !== null && !chunks.slice(this._index).some(({ type }) => type < LAYER_TYPES && type <= maxLayer)) {
-        return null;
-      }
+      const following = this._following[this._index];
+      if (maxLayer !== null && (following === null || following > maxLayer)) return null;
       const slice = this._readChunk(bytes.subarray(this.offset - start), chunks[this._index]);
       if (slice) return slice;
     }
@@ -120,19 +148,21 @@ export class LayerReader {
       const later = latest?.layer === listed.type;
       const expected = later ? latest.slices : 0;
       if (chunk.number !== expected) throw located(malformed(`slice ${chunk.number}, expected ${expected}`), 2);
-      const next = header.chunks.slice(index + 1).find(({ type }) => type < LAYER_TYPES);
-      if (next && chunk.more !== (next.type === listed.type)) {
+      const next = this._following[index + 1];
+      if (next !== null && chunk.more !== (next === listed.type)) {
         const said = chunk.more ? "further slices" : "no further slice";
-        throw located(malformed(`layer ${listed.type} has ${said}, and layer ${next.type} follows`), 2);
+        throw located(malformed(`layer ${listed.type} has ${said}, and layer ${next} follows`), 2);
       }
       const continuation = later ? latest.continuation : new Continuation();
       const forget = continuation.mark();
+      const undo = this._mark();
       try {
         const symbols = decodeLayer(chunk.payload, layerKind(listed.type, header), this._declared, continuation, later);
         slice = { symbols, tensors: this._accept(symbols, continuation, later), later };
         this._declared = symbols.parameters.declared;
       } catch (error) {
         forget();
+        undo();
         // What an engine says where it cannot allocate an array.
         const full = error instanceof RangeError && /allocation|array length|buffer length/i.test(error.message);
         const fault = full ? limitExceeded(`layer ${listed.type} takes more memory than there is`) : error;
@@ -153,7 +183,7 @@ export class LayerReader {
     const header = /** @type {Header} */ (this.header);
     const where = `layer ${kind.layer}`;
     const latest = this._layers[this._layers.length - 1];
-    const before = rises.length ? joined([latest.earlier, ownOf(latest).codes]) : rises;
+    const before = rises.length ? latest.codes.values : rises; // of a whole layer, in order
     const earlier = Uint8Array.from(rises);
     for (let i = 0; i < rises.length; i++) {
       const code = before[i] + rises[i];
@@ -171,14 +201,44 @@ export class LayerReader {
       if (!header.bounds.has(number)) throw malformed(`${where}: the header has no error bound of class ${number}`);
     }
     this._loose.push(voxels);
+    const growth = this._following[this._index + 1] === null ? 1 : Math.max(1.5, 1.25 / this._share[this._index]);
     if (!later) {
-      const none = { slices: 0, parts: [] };
-      this._layers.push({ layer: kind.layer, ...none, steps, planes, networks, key, tensors, earlier, continuation });
+      const codes = new Column(Uint8Array, 1);
+      codes.append(earlier, (growth * (earlier.length + symbols.codes.length)) / Math.max(1, earlier.length));
+      const first = this._columns.voxels.rows;
+      const none = { slices: 0, first, sorted: true };
+      this._layers.push({ layer: kind.layer, ...none, steps, planes, networks, key, tensors, codes, continuation });
     }
     const layer = this._layers[this._layers.length - 1];
     layer.slices++;
-    layer.parts.push({ voxels, codes: Uint8Array.from(symbols.codes), anchor, ...attributes });
+    layer.codes.append(symbols.codes, growth);
+    const rows = { voxels, anchor, ...attributes };
+    for (const [name, values] of Object.entries(rows)) this._columns[name].append(values, growth);
+    layer.sorted = !later || (layer.sorted && !voxels.length);
+    if (this._following[this._index + 1] !== kind.layer) this.sort(growth);
     return { anchor, ...attributes, ...tensors };
+  }
+
+  /** Returns a function that undoes later additions of rows. */
+  _mark() {
+    const { length } = this._layers;
+    const columns = [...Object.values(this._columns), ...this._layers.map(({ codes }) => codes)];
+    const counts = columns.map(({ rows }) => rows);
+    const loose = [...this._loose];
+    return () => {
+      this._layers.length = length;
+      columns.forEach((column, i) => (column.rows = counts[i]));
+      this._loose = loose;
+    };
+  }
+
+  /** Puts the rows of the latest layer in the order of 12.2. @param {number} [growth] as in Column */
+  sort(growth = 1) {
+    const layer = this._layers[this._layers.length - 1];
+    if (!layer || layer.sorted) return;
+    const order = mortonOrder(this._columns.voxels.values.subarray(3 * layer.first));
+    for (const column of [...Object.values(this._columns), layer.codes]) column.reorder(layer.first, order, growth);
+    layer.sorted = true;
   }
 
   /** Malformed if an earlier slice has one of these voxels. @param {Int32Array} voxels of a slice, distinct */
@@ -192,7 +252,12 @@ export class LayerReader {
     }
   }
 
-  /** The scene of the layers read so far, at least one. @returns {Scene} */
+  /**
+   * The scene of the slices read so far, at least one. Its arrays are views of those of later scenes, which leave these
+   * rows as they are; those of a layer that is not whole stand as they came, unless `sort` was called.
+   *
+   * @returns {Scene}
+   */
   scene() {
     const header = this.header;
     if (!header || !this._layers.length) throw new TypeError("no layer has been read");
@@ -210,21 +275,20 @@ export class LayerReader {
       if (layer.layer === 1) Object.assign(steps, { planesGlobal: ofPlanes, weightsGlobal: ofWeights });
       else Object.assign(steps, { planesLocal: ofPlanes, weightsLocal: ofWeights });
     }
-    const layers = this._layers;
-    const owns = layers.map(ownOf);
-    const { voxels, anchor, ...attributes } = gathered(owns);
+    const { voxels, ...columns } = this._columns;
+    const masks = this._layers.map(({ codes }) => codes.values);
     return {
       info: header.info,
       widths: header.widths,
       steps,
-      layers: layers.map(({ layer }) => layer),
-      rows: layers.map(({ earlier }, i) => earlier.length + owns[i].codes.length),
-      anchorQ: voxels,
-      anchor,
-      feature: attributes.feature,
-      scalingLog: attributes.scalingLog,
-      offset: attributes.offset,
-      mask: layers.map(({ earlier }, i) => joined([earlier, owns[i].codes])),
+      layers: this._layers.map(({ layer }) => layer),
+      rows: masks.map(({ length }) => length),
+      anchorQ: voxels.values,
+      anchor: columns.anchor.values,
+      feature: columns.feature.values,
+      scalingLog: columns.scalingLog.values,
+      offset: columns.offset.values,
+      mask: masks,
       networks: { opacity: networks.opacity, covariance: networks.covariance, color: networks.color },
       globalDeformation: deformations[0],
       localDeformation: deformations[1],
@@ -232,11 +296,8 @@ export class LayerReader {
   }
 }
 
-/** The arrays of `Own`. */
-const COLUMNS = /** @type {const} */ (["voxels", "codes", "anchor", "feature", "scalingLog", "offset"]);
-
 /**
- * The rows that a slice adds, or a layer, then in the order of 12.2.
+ * The rows that a slice adds.
  *
  * @typedef {object} Own
  * @property {Int32Array} voxels
@@ -258,8 +319,9 @@ const COLUMNS = /** @type {const} */ (["voxels", "codes", "anchor", "feature", "
  * @property {NetworkShape[]} networks
  * @property {number | null} key
  * @property {Pick<LayerTensors, "planes" | "weights">} tensors
- * @property {Uint8Array} earlier mask codes of earlier rows
- * @property {Own[]} parts that make up its rows
+ * @property {number} first row of its own
+ * @property {boolean} sorted whether its rows are
+ * @property {Column<Uint8Array>} codes of the mask, of all rows up to its own
  * @property {Continuation} continuation
  */
 
@@ -273,23 +335,6 @@ function attributesOf({ kind, parameters: { rows }, stepClasses, attributes }, h
     return transposed(symbols, rows, width, header.steps[i], centres ? { centres, stepClasses } : null);
   });
   return { feature, scalingLog, offset };
-}
-
-/** The rows of a layer, put in order once. @param {LayerParts} layer @returns {Own} */
-function ownOf(layer) {
-  const { parts } = layer;
-  if (parts.length === 1) return parts[0];
-  const own = gathered(parts);
-  const order = mortonOrder(own.voxels);
-  for (const name of COLUMNS) Object.assign(own, { [name]: reordered(own[name], order) });
-  layer.parts = [own];
-  return own;
-}
-
-/** The rows of several parts, in their order. @param {Own[]} parts at least one @returns {Own} */
-function gathered(parts) {
-  const columns = COLUMNS.map((name) => [name, joined(parts.map((part) => part[name]))]);
-  return Object.fromEntries(columns);
 }
 
 /** @param {LayerParts} layer */

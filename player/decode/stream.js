@@ -1,4 +1,4 @@
-// Clause 12.3: bytes as they arrive, to one scene per completed slice.
+// Clause 12.3: bytes as they arrive, to scenes.
 
 import { CHUNK_OVERHEAD, PREAMBLE_SIZE } from "./container.js";
 import { DecodeError } from "./errors.js";
@@ -22,10 +22,16 @@ export class Stream {
     this._maxLayer = checkMaxLayer(maxLayer);
     this._reader = new LayerReader();
     this._buffer = new Uint8Array(0);
+    /** The bytes of the file from `consumed` on stand here in the buffer. */
+    this._start = 0;
     this._filled = 0;
+    /** Bytes of the file before which nothing is to be found out. */
+    this._needs = 0;
     /** @type {DecodeError | null} */
     this._error = null;
     this._done = false;
+    /** @type {{layer: number, end: number}[]} */
+    this._ends = [];
   }
 
   /** Whether every layer that was asked for has arrived. */
@@ -41,21 +47,22 @@ export class Stream {
   /** Each slice's layer with the end of its chunk in the file, in file order; empty until the header is there. */
   get layerEnds() {
     const header = this._reader.header;
-    if (!header) return [];
+    if (!header || this._ends.length) return this._ends;
     let end = PREAMBLE_SIZE + header.size;
     const ends = [];
     for (const { type, length } of header.chunks) {
       end += CHUNK_OVERHEAD + length;
       if (type < LAYER_TYPES) ends.push({ layer: type, end });
     }
-    return ends;
+    return (this._ends = ends);
   }
 
   /**
-   * One scene per slice that `bytes` complete, each with all slices so far. The bytes are copied.
+   * The newest scene of each layer that `bytes` complete a slice of, with all slices so far. The bytes are copied.
    *
-   * A fault raises its DecodeError now, or at the next call if this one completes a slice before it, and at every later
-   * call. Scenes given before stay valid.
+   * The rows of a layer stand in the order in which its slices came until it is whole. Scenes share their arrays, which
+   * nobody may write to. A fault raises its DecodeError now, or at the next call if this one completes a slice before
+   * it, and at every later call. Scenes given before stay valid.
    *
    * @param {Uint8Array} bytes
    * @returns {Scene[]}
@@ -64,17 +71,24 @@ export class Stream {
     if (this._error) throw this._error;
     if (this._done) return [];
     this._append(bytes);
+    if (this.consumed + this._filled - this._start < this._needs) return [];
     /** @type {Scene[]} */
     const scenes = [];
+    let pending = false;
     try {
-      while (this._next()) scenes.push(this._reader.scene());
+      while (this._next()) {
+        pending = !this._reader.whole;
+        if (!pending) scenes.push(this._reader.scene());
+      }
     } catch (error) {
       if (!(error instanceof DecodeError)) throw error;
+      this._needs = error.needs;
       if (error.kind !== "Truncated") {
         this._error = error;
-        if (!scenes.length) throw error;
+        if (!scenes.length && !pending) throw error;
       }
     }
+    if (pending) scenes.push(this._reader.scene());
     return scenes;
   }
 
@@ -87,7 +101,7 @@ export class Stream {
   /** Forgets a fault and the bytes that are not decoded: feed the file from byte `consumed` on next. */
   rewind() {
     this._error = null;
-    this._filled = 0;
+    this._start = this._filled = this._needs = 0;
     this._buffer = new Uint8Array(0);
   }
 
@@ -95,7 +109,7 @@ export class Stream {
   _next() {
     const before = this._reader.offset;
     try {
-      const layer = this._reader.next(this._buffer.subarray(0, this._filled), this._maxLayer);
+      const layer = this._reader.next(this._buffer.subarray(this._start, this._filled), this._maxLayer);
       this._done = layer === null && this._maxLayer !== null;
       return layer !== null;
     } finally {
@@ -105,22 +119,28 @@ export class Stream {
 
   /** @param {Uint8Array} bytes */
   _append(bytes) {
-    const size = this._filled + bytes.length;
-    if (size > this._buffer.length) {
+    const held = this._buffer.subarray(this._start, this._filled);
+    const size = held.length + bytes.length;
+    if (this._filled + bytes.length > this._buffer.length) {
       const doubled = Math.min(2 * this._buffer.length, size + (1 << 26));
-      const grown = new Uint8Array(Math.max(SMALLEST_BUFFER, size, doubled));
-      grown.set(this._buffer.subarray(0, this._filled));
-      this._buffer = grown;
+      // where half of the buffer is free already, what it holds moves to its front
+      const fits = size <= this._buffer.length / 2;
+      const target = fits ? this._buffer : new Uint8Array(Math.max(SMALLEST_BUFFER, size, doubled));
+      target.set(held);
+      this._buffer = target;
+      this._start = 0;
+      this._filled = held.length;
     }
     this._buffer.set(bytes, this._filled);
-    this._filled = size;
+    this._filled += bytes.length;
   }
 
   /** Forgets the first `count` bytes. @param {number} count */
   _drop(count) {
-    if (!count) return;
-    this._buffer.copyWithin(0, count, this._filled);
-    this._filled -= count;
-    if (!this._filled) this._buffer = new Uint8Array(0);
+    this._start += count;
+    if (this._start === this._filled) {
+      this._start = this._filled = 0;
+      this._buffer = new Uint8Array(0);
+    }
   }
 }

@@ -23,7 +23,7 @@ export class WorkerDecoder {
   }
 
   /**
-   * One scene per slice that `bytes` complete, as `Stream.feed` returns them. Rejects with its DecodeError.
+   * The scenes that `Stream.feed` returns, copied. Rejects with its DecodeError.
    *
    * @param {Uint8Array} bytes @param {{transfer?: boolean}} [options] transfer: transfers the buffer of `bytes`
    * @returns {Promise<Scene[]>}

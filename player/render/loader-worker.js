@@ -1,11 +1,14 @@
-// The worker that fetches and decodes: bytes in, one scene per completed slice out.
+// The worker that fetches and decodes: bytes in, scenes out as slices complete.
 
 import { SceneSource } from "../decode/fetch.js";
 import { serve, tell } from "../decode/remote.js";
 import { Stream } from "../decode/stream.js";
+/** @import { Scene } from "../decode/scene.js" */
 
 /** Between two messages about progress, milliseconds. */
 const PROGRESS_MS = 100;
+/** A scene is copied to the page, and prepared there. So after one of them the next waits for so many times as long. */
+const REST = 4;
 
 /**
  * A message while a scene loads. arrived and decoded: milliseconds since the epoch.
@@ -39,10 +42,44 @@ let told = 0;
 let arrived = 0;
 const epochNow = () => performance.timeOrigin + performance.now();
 
-/** @param {News["scene"]} [scene] */
-function report(scene) {
+/** The newest scene, until it is told. @type {{scene: Scene, arrived: number, decoded: number} | null} */
+let newest = null;
+/** When the next scene may be told, performance.now(), and what will tell it. */
+let free = 0;
+let timer = 0;
+
+/** Tells the scene now, or the newest one as soon as the last one is dealt with. @param {Scene} scene */
+function offer(scene) {
+  newest = { scene, arrived, decoded: epochNow() };
+  const wait = free - performance.now();
+  if (wait <= 0) flush();
+  else if (!timer) timer = setTimeout(flush, wait);
+}
+
+/** Tells the newest scene, if it is not told yet. */
+function flush() {
+  clearTimeout(timer);
+  timer = 0;
+  if (!newest) return;
+  const start = performance.now();
+  const { scene, ...times } = newest;
+  newest = null;
+  report(own(scene), times);
+  const now = performance.now();
+  free = now + REST * (now - start);
+}
+
+/** The scene with arrays of their own: messages copy the whole of the arrays that views belong to. @param {Scene} scene */
+function own(scene) {
+  const { anchorQ, anchor, feature, scalingLog, offset } = scene;
+  const columns = Object.entries({ anchorQ, anchor, feature, scalingLog, offset });
+  const copies = Object.fromEntries(columns.map(([name, values]) => [name, values.slice()]));
+  return { ...scene, ...copies, mask: scene.mask.map((codes) => codes.slice()) };
+}
+
+/** @param {Scene} [scene] @param {{arrived: number, decoded: number}} [times] */
+function report(scene, times = { arrived, decoded: epochNow() }) {
   const { received: bytes, total } = source;
-  const times = { arrived, decoded: epochNow() };
   tell({ told: { ...(scene && { scene }), bytes, total, ends: decoder.layerEnds, ...times } });
   told = performance.now();
 }
@@ -68,8 +105,9 @@ serve({
    */
   async load(budget) {
     try {
-      for await (const scene of source.scenes(budget)) report(scene);
+      for await (const scene of source.scenes(budget)) offer(scene);
     } finally {
+      flush();
       report();
     }
     const ends = decoder.layerEnds;

@@ -11,8 +11,10 @@ import shutil
 import subprocess
 from pathlib import Path
 
+import numpy as np
 import pytest
 from strategies import small_file
+from vectors.blocks import later, line, make_file, make_layer, pattern
 
 from pd4dgs_codec import decode, encode
 
@@ -49,6 +51,20 @@ def test_the_decoders_own_tests_pass():
     failed = [line for line in done.stdout.splitlines() if line.lstrip().startswith("not ok")]
     assert done.returncode == 0, "\n".join([*failed[:20], done.stderr[-2000:]])
     assert int(re.search(r"^# pass (\d+)$", done.stdout, flags=re.M)[1]) > 50
+
+
+def test_any_split_of_a_stream_costs_what_decoding_does(tmp_path):
+    """One scene per slice once took 1.6 GiB for 13 kB, and a source twelve seconds."""
+    rows, slices = 9, 500
+    k = np.resize(pattern(68, 7), (68, rows))
+    rest = [later(0, line(rows, z=7 * i % slices), attributes=k) for i in range(1, slices)]
+    path = tmp_path / "many.pd4"
+    path.write_bytes(make_file(make_layer(0, line(rows, z=slices), attributes=k), *rest).data())
+    for way, found in json.loads(run_node("testing/streams.mjs", path).stdout).items():
+        assert found["time"] <= 3, way
+        # all scenes together: decoding holds 2.25 times its scene, rows as they came, with room for more, and in order
+        assert found["memory"] <= 1.5 * 2.25, way
+        assert found["scenes"] == (1 if way == "whole" else slices)
 
 
 @pytest.mark.skipif(not TSC.exists(), reason="no typescript: npm install --no-package-lock in player/")

@@ -1,0 +1,56 @@
+// The rows of a scene as slices bring them (clause 12.2): arrays that grow at their end.
+
+/** An array is allocated for so many times its rows at most, however many are to come. */
+const MOST_GROWTH = 4;
+
+/** @typedef {Int32Array | Float32Array | Uint8Array} Values */
+
+/**
+ * An array [rows, width] that grows. What was read from it before stays as it is.
+ *
+ * @template {Values} A
+ */
+export class Column {
+  /** @param {new (length: number) => A} type @param {number} width */
+  constructor(type, width) {
+    this._type = type;
+    this._width = width;
+    this._room = new type(0);
+    this.rows = 0;
+  }
+
+  /** The rows so far. @returns {A} */
+  get values() {
+    return /** @type {A} */ (this._room.subarray(0, this.rows * this._width));
+  }
+
+  /** @param {ArrayLike<number>} values of whole rows @param {number} growth about how many times as many there will be */
+  append(values, growth) {
+    const start = this.rows * this._width;
+    const end = start + values.length;
+    this.rows = end / this._width;
+    if (end > this._room.length) {
+      const old = this._room.subarray(0, start);
+      this._room = this._allocated(growth);
+      this._room.set(old);
+    }
+    this._room.set(values, start);
+  }
+
+  /** Sorts the rows from `first` on, in a copy. @param {number} first @param {Uint32Array} order @param {number} growth */
+  reorder(first, order, growth) {
+    const { _width: width, values } = this;
+    this._room = this._allocated(growth);
+    this._room.set(values.subarray(0, first * width));
+    let at = first * width;
+    for (const row of order) {
+      const from = (first + row) * width;
+      for (let k = 0; k < width; k++) this._room[at++] = values[from + k];
+    }
+  }
+
+  /** @param {number} growth */
+  _allocated(growth) {
+    return new this._type(Math.floor(this.rows * Math.min(growth, MOST_GROWTH)) * this._width);
+  }
+}
