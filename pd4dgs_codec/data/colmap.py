@@ -206,8 +206,12 @@ class _Text:
 
     def __init__(self, path: Path):
         self.path = path
-        lines = read_file(path).decode("utf-8", "replace").splitlines()
-        self.lines = [(i, line.strip()) for i, line in enumerate(lines, 1) if not line.startswith("#")]
+        self.raw = read_file(path).decode("utf-8", "replace").splitlines()
+
+    @property
+    def lines(self) -> Iterator[tuple[int, str]]:
+        """Numbers of lines and what they hold, without comments."""
+        return ((i, line.strip()) for i, line in enumerate(self.raw, 1) if not line.startswith("#"))
 
     def cameras(self) -> Iterator[tuple[int, Lens]]:
         """Lenses with their numbers."""

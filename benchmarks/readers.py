@@ -1,0 +1,226 @@
+"""Time and memory of every reader of strangers' files on its worst input known, as a Markdown table.
+
+Each input is read in a process of its own; memory is the rise of its peak, after imports.
+
+    python benchmarks/readers.py            # all rows, a minute
+    python benchmarks/readers.py PNG        # those whose name holds a text
+"""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+import zipfile
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+
+MEGABYTE = 1 << 20
+
+
+def archive(pickled: bytes, method: int = zipfile.ZIP_STORED, storage: bytes = b"", members: int = 1) -> bytes:
+    """A file as torch writes it."""
+    stream = io.BytesIO()
+    with zipfile.ZipFile(stream, "w", method) as made:
+        made.writestr("a/data.pkl", b"\x80\x02" + pickled + b".")
+        for i in range(members):
+            made.writestr(f"a/data/{i}", storage)
+    return stream.getvalue()
+
+
+def text(value: str) -> bytes:
+    """A text in a pickle."""
+    return b"X" + len(value).to_bytes(4, "little") + value.encode()
+
+
+def checkpoint_with(training: bytes) -> bytes:
+    """A checkpoint with this value of "training", and a digest that is found wrong once all of it is walked."""
+    head = text("format") + text("pd4dgs-checkpoint") + text("version") + b"K\x01"
+    return archive(b"}(" + head + text("training") + training + b"u")
+
+
+def zipped_array(zeros: int) -> bytes:
+    """An .npz of zeros, deflated."""
+    stream = io.BytesIO()
+    np.savez_compressed(stream, data=np.zeros(zeros // 8))
+    return stream.getvalue()
+
+
+def blank_png(width: int, height: int) -> bytes:
+    """A picture of one colour."""
+    from PIL import Image
+
+    stream = io.BytesIO()
+    Image.new("1", (width, height)).save(stream, "png")
+    return stream.getvalue()
+
+
+def blank_film(side: int, frames: int) -> bytes:
+    """A video of one colour."""
+    from pd4dgs_codec.quality.movie import write_mp4
+
+    with tempfile.TemporaryDirectory() as folder:
+        write_mp4((np.zeros((side, side, 3), np.uint8) for _ in range(frames)), Path(folder) / "x.mp4", 30)
+        return (Path(folder) / "x.mp4").read_bytes()
+
+
+def spz(size: int) -> bytes:
+    """An SPZ file that says it has ten million Gaussians, all zero."""
+    return gzip.compress(b"NGSP" + (2).to_bytes(4, "little") + (10_000_000).to_bytes(4, "little") + bytes(size))
+
+
+def read_checkpoint(path: Path) -> None:
+    """As pd4dgs-encode reads it."""
+    from pd4dgs_codec.model import checkpoint
+
+    checkpoint.load(path)
+
+
+def read_import(path: Path) -> None:
+    """As pd4dgs-import reads a model."""
+    from pd4dgs_codec.archives import read_tensors
+
+    read_tensors(path.read_bytes(), str(path))
+
+
+def read_splats(path: Path) -> None:
+    """PLY and SPZ."""
+    from pd4dgs_codec.interchange import formats
+
+    formats.read_splats(path)
+
+
+def read_points(path: Path) -> None:
+    """Panoptic's points."""
+    from pd4dgs_codec.data.rigs import _panoptic_points
+
+    _panoptic_points(path)
+
+
+def read_frames(path: Path) -> None:
+    """A transforms.json."""
+    from pd4dgs_codec.data.dataset import load
+
+    load(path.parent)
+
+
+def read_model(path: Path) -> None:
+    """COLMAP's points and images as text."""
+    from pd4dgs_codec.data.colmap import _Text
+
+    reader = _Text(path)
+    list(reader.points() if "points" in path.name else reader.images())
+
+
+def read_picture(path: Path) -> None:
+    """A picture."""
+    from pd4dgs_codec.data.files import image_info, read_image
+
+    read_image(path, image_info(path)[:2])
+
+
+def read_film(path: Path) -> None:
+    """Every frame of a video, one at a time."""
+    from pd4dgs_codec.data.videos import open_video
+
+    for _ in open_video(path).pictures:
+        pass
+
+
+def read_library(path: Path) -> None:
+    """The index of a package."""
+    from pd4dgs_codec.web.package import library
+
+    library(path.parent.parent)
+
+
+def read_manifest(path: Path) -> None:
+    """A manifest of a batch."""
+    from pd4dgs_codec.batch.manifest import OPS, Manifest
+
+    Manifest(str(path), OPS["encode"], lambda options: None)
+
+
+#: Name of the row -> (name of the file, its content, its reader).
+CASES: dict[str, tuple[str, Callable[[], bytes], Callable[[Path], None]]] = {
+    "checkpoint: empty dicts": ("m.pt", lambda: checkpoint_with(b"](" + b"}" * MEGABYTE + b"e"), read_checkpoint),
+    "checkpoint: one tuple again and again": (
+        "m.pt", lambda: checkpoint_with(b"((K\1K\1K\1tq\0](" + b"h\0" * (MEGABYTE // 2) + b"et"), read_checkpoint
+    ),
+    "checkpoint: lists in lists": ("m.pt", lambda: checkpoint_with(b"](" * 400_000 + b"e" * 400_000), read_checkpoint),
+    "checkpoint: deflated": (
+        "m.pt", lambda: archive(b"}", zipfile.ZIP_DEFLATED, bytes(256 * MEGABYTE)), read_checkpoint
+    ),
+    "model to import: modules": (
+        "m.pt", lambda: archive(b"](c__torch__.a\nb\nq\0)\x81" + b"h\0)\x81" * (MEGABYTE // 4) + b"e"), read_import
+    ),
+    "model to import: members": ("m.pt", lambda: archive(b"}", members=20_000), read_import),
+    "points (.npz): zeros": ("x.npz", lambda: zipped_array(512 * MEGABYTE), read_points),
+    "points (.ply): as text": (
+        "x.ply",
+        lambda: b"ply\nformat ascii 1.0\nelement vertex 170000\n" + b"".join(b"property float %c\n" % c for c in b"xyz")
+        + b"end_header\n" + b"0 0 0\n" * 170_000,
+        read_splats,
+    ),
+    "Gaussians (.spz): zeros": ("x.spz", lambda: spz(256 * MEGABYTE), read_splats),
+    "transforms.json: empty lists": (
+        "transforms.json", lambda: b'{"frames": [' + b"[]," * (MEGABYTE // 3) + b"0]}", read_frames
+    ),
+    "COLMAP: blank lines": ("images.txt", lambda: b"\n" * MEGABYTE, read_model),
+    "COLMAP: points as text": ("points3D.txt", lambda: b"1 0 0 0 0 0 0 0\n" * (MEGABYTE // 16), read_model),
+    "picture: 16 megapixels (PNG)": ("x.png", lambda: blank_png(4096, 4096), read_picture),
+    "picture: 177 megapixels (PNG)": ("x.png", lambda: blank_png(16384, 10800), read_picture),
+    "video: 30 blank frames of 2048 x 2048": ("x.mp4", lambda: blank_film(2048, 30), read_film),
+    "library: lists in lists": ("a/index.json", lambda: b"[" * MEGABYTE, read_library),
+    "manifest: broken lines": ("m.jsonl", lambda: b"{}\n" * (MEGABYTE // 12), read_manifest),
+}  # fmt: skip
+
+
+def measure(name: str, path: Path) -> None:
+    """Prints seconds, bytes of memory and the answer of one reader, as JSON."""
+    import torch  # noqa: F401 - and all else that a reader imports, before the measurement
+
+    from pd4dgs_codec import batch, data, interchange, model, web  # noqa: F401
+    from pd4dgs_codec.data import colmap, rigs, transforms, videos  # noqa: F401
+    from pd4dgs_codec.errors import Pd4Error
+    from pd4dgs_codec.interchange import formats  # noqa: F401
+    from pd4dgs_codec.model import checkpoint  # noqa: F401
+
+    before, begin, answer = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.process_time(), "read"
+    try:
+        CASES[name][2](path)
+    except Pd4Error as error:
+        answer = str(error).replace(str(path.parent), "")
+    seconds = time.process_time() - begin + resource.getrusage(resource.RUSAGE_CHILDREN).ru_utime
+    memory = 1024 * (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before)
+    print(json.dumps([seconds, memory, answer]))
+
+
+def main() -> None:
+    """The table."""
+    if len(sys.argv) == 3:
+        measure(sys.argv[1], Path(sys.argv[2]))
+        return
+    print("| reader and input | bytes | s | µs per byte | MiB | answer |\n|---|---:|---:|---:|---:|---|")
+    for name, (file, make, _) in CASES.items():
+        if sys.argv[1:] and sys.argv[1] not in name:
+            continue
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / file
+            path.parent.mkdir(exist_ok=True)
+            size = path.write_bytes(make())
+            found = subprocess.run([sys.executable, __file__, name, str(path)], capture_output=True, check=True)
+        seconds, memory, answer = json.loads(found.stdout)
+        cost = f"{1e6 * seconds / size:.2f} | {memory / MEGABYTE:.0f}"
+        print(f"| {name} | {size:,} | {seconds:.2f} | {cost} | {answer[:90]} |", flush=True)
+
+
+if __name__ == "__main__":
+    main()
