@@ -54,7 +54,7 @@ class Grow(Phase):
         most = state.size.max_anchors
         visited = statistics["anchor_visits"] >= MIN_ANCHOR_VISITS
         keep = torch.arange(len(model.anchor_q))
-        if state.position >= state.schedule.progressive:
+        if state.position >= state.schedule.moving:
             keep = _opaque(model, statistics, visited)
         sizes = CELLS if len(model.anchor_q) < most else ()
         cells = _new_cells(model, statistics, sizes, state.config.grow_threshold, state.generator)
