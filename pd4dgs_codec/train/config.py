@@ -205,13 +205,6 @@ class TrainConfig:
         dial=3.0,
     )
     whitening: bool = True  #: transform the channels of the features, see `phases.quantisation`
-    prefixes: float = option(
-        0.0,
-        help="share of the steps of the last third that render only the most useful anchors of level 0, for pictures "
-        "from the first slices of pd4dgs-encode --slices; 0.3 is a high value",
-        least=0,
-        most=1,
-    )
     #: share of the run, at its end, over which all learning rates fall to 0: otherwise the last steps carry weights
     #: over the edges of their rounding intervals, and the PSNR jumps by tenths of a dB from one step to the next
     cooldown: float = option(0.4, least=0, most=1, fixed=False)
