@@ -51,7 +51,6 @@ class Dataset:
         time 0 and 1, (0, 1) if unknown. up: unit vector, world. unit: metres per scene unit, 0 if unknown.
     masked: True if the test masks are covisibility masks. left_out: names of views in neither split, as their masks
         hold no valid pixel.
-    paths: float32 [T, M, 3], the points at path_times, T normalised times; None if unknown.
     """
 
     name: str
@@ -68,8 +67,6 @@ class Dataset:
     unit: float
     masked: bool
     left_out: tuple[str, ...] = ()
-    paths: np.ndarray | None = None
-    path_times: tuple[float, ...] = ()
 
     @property
     def camera(self) -> Camera:

@@ -50,10 +50,6 @@ FIELD_OF_VIEW = math.radians(50)
 DISTANCE, LOWEST = 2.6, -0.35
 MIDDLE = 0.5  #: the time of the initial anchors
 BOX_TIMES = 5  #: times that the box covers
-PATH_TIMES = 17  #: most times of the Gaussians' paths
-#: Rows of two times are the same Gaussians if the median distance between them is below this share of the median
-#: distance between random rows.
-SAME = 0.25
 #: Times of cameras without any advance by this share, so that each stretch of cameras covers the whole time.
 GOLDEN = (5**0.5 - 1) / 2
 EXAMPLES = {
@@ -124,29 +120,11 @@ def _solid(source: str, teacher: Teacher, t: float) -> np.ndarray:
 
 
 def _points(teacher: Teacher, solid: np.ndarray) -> dict[str, Any]:
-    """The fields of a Dataset on its points: at most POINTS of these rows, with paths if rows stay the same
-    Gaussians."""
+    """The fields of a Dataset on its points: at most POINTS of these rows."""
     rows = solid if len(solid) <= POINTS else solid[np.random.default_rng(0).permutation(len(solid))[:POINTS]]
     splats = teacher.splats(teacher.nearest(MIDDLE))
     colors = np.clip(splats.sh[rows, 0] * np.float32(SH_C0) + np.float32(0.5), 0, 1)
-    points = {"points": splats.means[rows], "point_colors": np.rint(colors * 255).astype(np.uint8)}
-    return points | _paths(teacher, rows, len(splats.means))
-
-
-def _paths(teacher: Teacher, rows: np.ndarray, count: int) -> dict[str, Any]:
-    """The places of these rows of `count` over time; nothing if rows do not stay the same Gaussians."""
-    times = spread(teacher.times or tuple(np.linspace(0, 1, PATH_TIMES)), PATH_TIMES)
-    others, places = np.random.default_rng(0).permutation(len(rows)), list[np.ndarray]()
-    for t in times:
-        means = teacher.splats(t).means
-        if len(means) != count:
-            return {}
-        places.append(means[rows])
-        if len(places) > 1:
-            near, far = (np.median(np.linalg.norm(places[-1][k] - places[-2], axis=1)) for k in (slice(None), others))
-            if not near <= SAME * far:
-                return {}
-    return {"paths": np.stack(places), "path_times": times} if len(times) > 1 else {}
+    return {"points": splats.means[rows], "point_colors": np.rint(colors * 255).astype(np.uint8)}
 
 
 def _pictures(teacher: Teacher, poses: Sequence[tuple[Camera, float]], background: Triple, near: float) -> list[View]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import numpy as np
 import torch
@@ -28,8 +27,6 @@ CARVE_VIEWS = 40
 CARVE_CONTRAST = 8
 #: Spacing of the start values of global planes, in cells: few values, so that positions differ at the start.
 GLOBAL_SPACING = 4
-#: For a dataset with paths: steps that learn them, anchors in each, and learning rates of planes and networks.
-PATH_STEPS, PATH_ANCHORS, PATH_RATES = 400, 4096, (0.02, 0.002)
 
 
 def fresh_model(
@@ -43,22 +40,20 @@ def fresh_model(
 ) -> Model:
     """An untrained model without the deformations of the layers above max_layer. key: its key instant, normalised time.
 
-    Anchors start on the dataset's points (with more of them near by if there are few), or all over its box, and move
-    along the points' paths if the dataset has them. The start of a layer does not depend on max_layer.
+    Anchors start on the dataset's points (with more of them near by if there are few), or all over its box. The start
+    of a layer does not depend on max_layer.
     """
-    if key is not None and dataset.paths is not None:  # the anchors are what stands there at the key instant
-        nearest = min(range(len(dataset.path_times)), key=lambda k: abs(dataset.path_times[k] - key))
-        dataset = replace(dataset, points=dataset.paths[nearest])
     generator = torch.Generator().manual_seed(seed)
     torch.manual_seed(seed)  # nn.Linear and HexPlane draw their start values from the global generator
     info = scene_info(dataset)
     anchor_q = initial_cells(dataset, config.initial_anchors, info.voxel_size, generator)
     n = len(anchor_q)
     spacing = nearest_distances((anchor_q.double() * info.voxel_size).float()).clamp(min=info.voxel_size)
+    key_code = None if key is None else round(INSTANTS * key)  # see `scene.instant`
     fields: list[DeformationField | None] = [
         None if field is None else DeformationField.fresh(field, info.box, heads, start_spacing, step, code)
         for field, heads, start_spacing, step, code in (
-            (config.global_deformation, widths.global_heads, GLOBAL_SPACING, steps.planes_global, instant_code(key)),
+            (config.global_deformation, widths.global_heads, GLOBAL_SPACING, steps.planes_global, key_code),
             (config.local_deformation, LOCAL_HEADS, None, steps.planes_local, None),
         )
     ]
@@ -77,36 +72,7 @@ def fresh_model(
         model.local_deformation = None
     if max_layer < 1:
         model.global_deformation = None
-    elif dataset.paths is not None:
-        learn_paths(model, dataset, generator)
     return model
-
-
-def instant_code(key: float | None) -> int | None:
-    """The code of the instant nearest to a normalised time, see `scene.instant`."""
-    return None if key is None else round(INSTANTS * key)
-
-
-def learn_paths(model: Model, dataset: Dataset, generator: torch.Generator) -> None:
-    """Trains the global deformation to move each anchor like the dataset's point nearest to it."""
-    field = model.global_deformation
-    if field is None or field.head_layer("position") is None or dataset.points is None or dataset.paths is None:
-        return
-    anchors, points = model.anchor, torch.from_numpy(dataset.points)
-    blocks = torch.split(anchors, max(1, 8_000_000 // len(points)))
-    nearest = torch.cat([torch.cdist(block, points).argmin(1) for block in blocks])
-    moves = (torch.from_numpy(dataset.paths) - points)[:, nearest] / field.unit
-    if not moves.any():
-        return
-    groups = zip((field.features, field.weights), PATH_RATES, strict=True)
-    adam = torch.optim.Adam([{"params": params, "lr": rate} for params, rate in groups])
-    for _ in range(PATH_STEPS):
-        k = int(torch.randint(len(moves), (), generator=generator))
-        rows = torch.randperm(len(anchors), generator=generator)[:PATH_ANCHORS]
-        found = field(anchors[rows], dataset.path_times[k])["position"] / field.unit
-        torch.autograd.backward((found - moves[k, rows]).square().mean())
-        adam.step()
-        adam.zero_grad()
 
 
 def fresh_mask_logits(n: int, level: int) -> Tensor:

@@ -18,9 +18,6 @@ from pd4dgs_codec.errors import DataError
 from pd4dgs_codec.interchange.formats import fourdgs_bytes, ply_bytes, read_splats, spz_bytes
 from pd4dgs_codec.interchange.splats import Splats, camera_eye, picture
 from pd4dgs_codec.interchange.teacher import load_source, read_model
-from pd4dgs_codec.model.config import PRESETS
-from pd4dgs_codec.train.config import TrainConfig
-from pd4dgs_codec.train.initialise import fresh_model
 
 
 def _same(found: Splats, expected: Splats, **tolerance: float) -> None:
@@ -250,36 +247,6 @@ def test_bad_spz_files_are_refused_before_they_fill_memory(tmp_path, capfd, data
     with pytest.raises(DataError, match=message):
         read_splats(path)
     assert capfd.readouterr() == ("", "")  # the library has its own words on stdout and stderr
-
-
-def test_anchors_start_on_the_paths_of_gaussians_that_keep_their_rows(tmp_path, monkeypatch):
-    (tmp_path / "my_paths.py").write_text(
-        "from my_model import *\n"
-        "def mixed(t):\n"
-        "    found, order = ball(t), np.random.default_rng(int(99 * t)).permutation(300)\n"
-        "    return {name: value[order] for name, value in found.items()}\n"
-        "def fewer(t):\n"
-        "    return {name: value[int(t > 0.8) :] for name, value in ball(t).items()}\n"
-    )
-    (tmp_path / "my_model.py").write_text(FUNCTION)
-    monkeypatch.chdir(tmp_path)
-    for name in ("my_model", "my_paths"):
-        monkeypatch.delitem(sys.modules, name, raising=False)
-    for name in ("mixed", "fewer"):
-        assert load_source(f"teacher:my_paths:{name}?views=8&size=16x16").paths is None
-    data = load_source("teacher:my_model:ball?views=8&size=16x16")
-    assert data.paths is not None and data.paths.shape == (len(data.path_times), 300, 3)
-    np.testing.assert_allclose(data.paths[0][:, 0] + 0.5, data.points[:, 0], atol=1e-6)
-
-    size, config = PRESETS["tiny"], TrainConfig(source="", preset="tiny")
-    model = fresh_model(size, data, config.widths, config.model_steps(size.steps), 0)
-    assert model.global_deformation is not None
-    for t in (0.0, 0.25, 1.0):
-        with torch.no_grad():
-            residuals = model.global_deformation(model.anchor, t)
-        error = residuals.pop("position") - torch.tensor([t - 0.5, 0, 0])
-        assert error.norm(dim=1).median() < 0.1
-        assert all(not values.any() for values in residuals.values())
 
 
 def test_training_learns_from_a_teacher(tmp_path, cli):
