@@ -284,10 +284,6 @@ def _dataset(take: Take) -> Dataset:
     return Dataset(f"synthetic-{take.name}", train, test, points, colors, stage.box, NEAR, FAR, *fields)
 
 
-def _shrink(view: View, k: int, lens: Lens) -> View:
-    return replace(shrunk_view(view, k), K=lens.matrix(k))
-
-
 def read_synthetic(source: str, downscale: int = 1) -> Dataset:
     """The scene named by `source`; rendered once per process and kept in memory."""
     take = parse(source)
@@ -295,5 +291,6 @@ def read_synthetic(source: str, downscale: int = 1) -> Dataset:
     full = _dataset(take)
     if downscale == 1:
         return full
-    train, test = (tuple(_shrink(v, downscale, take.lens) for v in views) for views in (full.train, full.test))
+    K = take.lens.matrix(downscale)
+    train, test = (tuple(replace(shrunk_view(v, downscale), K=K) for v in views) for views in (full.train, full.test))
     return replace(full, train=train, test=test)

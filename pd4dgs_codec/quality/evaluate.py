@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import statistics
 from collections.abc import Callable, Mapping, Sequence
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -28,8 +27,6 @@ from pd4dgs_codec.scene import Camera
 TEMPORAL_FRAMES = 30
 #: mpsnr and mssim are those of DyCheck. 3dgs adds psnr, ssim and, if it is there, lpips_vgg, all without masks.
 PROTOCOLS = ("dycheck", "3dgs")
-NO_DISTANCES: Mapping[str, Distance] = MappingProxyType({})
-NOTHING_MOVES: Mapping[View, np.ndarray] = MappingProxyType({})
 
 
 def evaluate(
@@ -43,12 +40,12 @@ def evaluate(
     """The result of `pd4dgs-eval --json`: metrics are means over the views.
 
     Without held-out views the training views are used and "split" is "train". mpsnr in dB, infinite for equal pictures.
-    protocol: of PROTOCOLS. perceptual: distances to add, see `evaluate_level`; the result describes them under
+    protocol: of PROTOCOLS. perceptual: distances to add, see `_row`; the result describes them under
     "perceptual". step is called after each picture of each level.
     """
     views, split = (dataset.test, "test") if dataset.test else (dataset.train, "train")
     moving = moving_regions(views)
-    distances = perceptual.distances if perceptual else NO_DISTANCES
+    distances = perceptual.distances if perceptual else {}
     masked = {name: distance for name, distance in distances.items() if name != VGG}
     metrics: dict[str, Metric] = {"mpsnr": mpsnr, "mssim": mssim, **{f"m{name}": d for name, d in masked.items()}}
     if protocol == "3dgs":
@@ -64,7 +61,7 @@ def evaluate(
         "masked": dataset.masked and split == "test",
         "baseline_mean_image_psnr": mean_image_baseline(dataset.train, views),
         "moving_share": float(np.mean([region.mean() for region in moving.values()])) if moving else None,
-        "levels": [evaluate_level(level, views, metrics, masked, step, moving) for level in levels],
+        "levels": [_row(level, views, metrics, masked, moving, step) for level in levels],
     }
     if perceptual:
         result["perceptual"] = {
@@ -90,13 +87,13 @@ def metric_columns(result: dict[str, Any]) -> list[tuple[str, str, int]]:
     ]
 
 
-def evaluate_level(
+def _row(
     level: Level,
     views: tuple[View, ...],
     metrics: Mapping[str, Metric],
-    distances: Mapping[str, Distance] = NO_DISTANCES,
-    step: Callable[[], None] = lambda: None,
-    moving: Mapping[View, np.ndarray] = NOTHING_MOVES,
+    distances: Mapping[str, Distance],
+    moving: Mapping[View, np.ndarray],
+    step: Callable[[], None],
 ) -> dict[str, Any]:
     """The row of one level. render_ms: median milliseconds per picture, the networks included.
 

@@ -75,28 +75,24 @@ def load_levels(
     Each level of a `.pd4` is decoded from its own prefix, so nothing of a later layer can leak into it. Raises
     DataError for a file that cannot be read, DecodeError.
     """
-    if isinstance(file, bytes):
-        levels = _of_bytes(file, max_layer, device, max_bytes, last_only)
+    data = file if isinstance(file, bytes) else _read(file)
+    if isinstance(file, bytes) or data.startswith(SIGNATURE[:4]):
+        levels = _of_bytes(data, max_layer, device, max_bytes, last_only)
+    elif max_bytes is None:
+        levels = _of_checkpoint(file, max_layer, device)[-1 if last_only else 0 :]
     else:
-        levels = _of_file(file, max_layer, device, max_bytes, last_only)
+        raise DataError(f"{file}: a checkpoint has no slices; expected a .pd4 file")
     if background is not None:
         for level in levels:
             level.model.info = replace(level.model.info, background=background)
     return levels
 
 
-def _of_file(
-    file: str | Path, max_layer: int | None, device: str, max_bytes: int | None, last_only: bool
-) -> list[Level]:
+def _read(file: str | Path) -> bytes:
     try:
-        data = Path(file).read_bytes()
+        return Path(file).read_bytes()
     except OSError as error:
         raise DataError(f"{file}: cannot be read: {error.strerror}") from None
-    if data.startswith(SIGNATURE[:4]):
-        return _of_bytes(data, max_layer, device, max_bytes, last_only)
-    if max_bytes is not None:
-        raise DataError(f"{file}: a checkpoint has no slices; expected a .pd4 file")
-    return _of_checkpoint(file, max_layer, device)[-1 if last_only else 0 :]
 
 
 def _of_bytes(data: bytes, max_layer: int | None, device: str, max_bytes: int | None, last_only: bool) -> list[Level]:

@@ -252,10 +252,8 @@ class _Handler(BaseHTTPRequestHandler):
         if "Content-Length" in head or "Transfer-Encoding" in head or self.command not in METHODS.split(", "):
             self.close_connection = True
         # what the parser could not read as header fields may announce a body, as may a line that goes on
-        if head.defects or head.get_payload() or any("\n" in value or "\r" in value for value in head.values()):
-            self.send_error(HTTPStatus.BAD_REQUEST)
-            return False
-        if len(head.get_all("Host", [])) > 1:
+        broken = head.defects or head.get_payload() or any("\n" in value or "\r" in value for value in head.values())
+        if broken or len(head.get_all("Host", [])) > 1:
             self.send_error(HTTPStatus.BAD_REQUEST)
             return False
         if self.server.private and not self.server.is_own(head.get("Host"), head.get("Origin")):
