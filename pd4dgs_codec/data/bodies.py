@@ -243,8 +243,11 @@ THINGS: dict[str, tuple[Thing, ...]] = {
 }
 
 
-def things(name: str, seed: int) -> list[Body]:
-    """The bodies of a scene on white; the seed changes paints and the direction that it faces."""
+def bodies(name: str, seed: int) -> list[Body]:
+    """All bodies of a scene of MOTIONS or THINGS, the still ones of a room first. On white the seed changes paints and
+    the direction that the scene faces."""
+    if name in MOTIONS:
+        return RoomBuilder(name, seed).bodies()
     painter = Painter(seed)
     facing = _turn(2, painter.rng.uniform(0, 2 * pi))
 
@@ -257,8 +260,3 @@ def things(name: str, seed: int) -> list[Body]:
         Body(thing.shape, partial(pose, thing), painter.paint(thing.size, hues[thing.shape], 9.0))
         for thing in THINGS[name]
     ]
-
-
-def bodies(name: str, seed: int) -> list[Body]:
-    """All bodies of a scene of MOTIONS or THINGS, the still ones of a room first."""
-    return things(name, seed) if name in THINGS else RoomBuilder(name, seed).bodies()

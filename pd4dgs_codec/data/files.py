@@ -23,6 +23,8 @@ Color = tuple[float, float, float]  #: RGB 0..1
 WHITE = (1.0, 1.0, 1.0)
 IMAGE_SUFFIXES = ("", ".png", ".jpg", ".jpeg", ".PNG", ".JPG", ".JPEG")
 FORMATS = ("PNG", "JPEG", "WEBP", "BMP", "TIFF")  #: of pictures; one of Pillow's others runs programs
+#: Bytes that a compressed file of any size may unpack to, and more for each byte of its own.
+FREE_BYTES, INFLATES = 1 << 20, 16
 #: Pixels that pictures of any size may have, and more for each byte of theirs: blank ones of 4K are read.
 FREE_PIXELS, PIXELS_PER_BYTE = 1 << 24, 256
 #: Pillow's pixel modes with one obvious conversion to RGB; others (CMYK, LAB, floats) are refused.

@@ -11,6 +11,8 @@ import numpy as np
 
 from pd4dgs_codec.data.cameras import Lens, UnreadView, check_rotation, world_to_camera
 from pd4dgs_codec.data.files import (
+    FREE_BYTES,
+    INFLATES,
     LARGEST,
     Color,
     array,
@@ -77,8 +79,6 @@ def _neu3d_camera(row: np.ndarray, i: int, size: tuple[int, int], video: Path) -
 
 META, TEST_META, PICTURES, POINTS = "train_meta.json", "test_meta.json", "ims", "init_pt_cld.npz"
 FPS = 30.0
-#: Bytes that points of any file may unpack to, and more for each byte of theirs.
-FREE_BYTES, INFLATES = 1 << 20, 16
 
 
 def read_panoptic(folder: Path, downscale: int, holdout: int, background: Color | None) -> Dataset:

@@ -71,9 +71,13 @@ def open_video(path: Path, *, grey: bool = False, output: Sequence[str] = ()) ->
     from imageio_ffmpeg import read_frames  # of the extra `train`
 
     reader = read_frames(str(path), output_params=list(output))
-    with _failures(path), closing(reader):
-        meta: dict[str, Any] = next(reader, {})
+    try:
+        with closing(reader):
+            meta: dict[str, Any] = next(reader, {})
         (width, height), fps, seconds = meta["size"], float(meta["fps"]), float(meta["duration"])
+    except Exception as error:  # of many kinds, with all that ffmpeg prints of a header; its last line names the cause
+        said = str(error).strip().rpartition("\n")[2]
+        raise DataError(f"{path}: cannot be decoded: {one_line(said, 120)}") from None
     if not (1 <= min(width, height) <= max(width, height) <= MAX_SIDE and 0 < fps < MAX_FPS):
         found = f"{width}x{height} at {fps:g} frames per second"
         raise DataError(f"{path}: {found}, expected at most {MAX_SIDE} a side and {MAX_FPS:g}")
@@ -131,17 +135,6 @@ def ffmpeg(arguments: Sequence[str], **pipes: Any) -> Iterator[Ffmpeg]:
             yield Ffmpeg(process, errors)
         finally:
             process.kill()
-
-
-@contextmanager
-def _failures(path: Path) -> Iterator[None]:
-    """Turns the exceptions of imageio-ffmpeg, which reads what ffmpeg prints of a header, into a DataError."""
-    try:
-        yield
-    except Exception as error:  # of many kinds
-        # imageio-ffmpeg appends all output of ffmpeg, whose last line names the cause
-        said = str(error).strip().rpartition("\n")[2]
-        raise DataError(f"{path}: cannot be decoded: {one_line(said, 120)}") from None
 
 
 # -- the cache ---------------------------------------------------------------------------------------------------------

@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 
 from pd4dgs_codec.archives import read_tensors
-from pd4dgs_codec.data.files import LARGEST, read_file, read_vertices
+from pd4dgs_codec.data.files import FREE_BYTES, INFLATES, LARGEST, read_file, read_vertices
 from pd4dgs_codec.errors import DataError, one_line
 from pd4dgs_codec.interchange.splats import MAX_DEGREE, SH_C0, Splats, unit
 
@@ -40,8 +40,6 @@ JSON, BINARY = 0x4E4F534A, 0x004E4942  #: types of chunks
 SPZ_STEP, SPZ_REACH = 1 / 4096, 2048.0
 #: SPZ's first bytes; the most Gaussians, and unpacked bytes of each: 65 with all harmonics, the rest for extensions.
 SPZ_MAGIC, SPZ_MOST, SPZ_BYTES = b"NGSP", 10_000_000, 128
-#: Bytes that any SPZ file may unpack to, and more for each byte of its own.
-FREE_BYTES, INFLATES = 1 << 20, 16
 #: 4dgs files store harmonics but the constant as bytes, from -SH_SPAN to SH_SPAN.
 SH_SPAN = 4.0
 

@@ -18,7 +18,7 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.errors import DataError, one_line
 from pd4dgs_codec.quality.image import LEAST_WEIGHT, prepare
 
 #: FLIP's viewing conditions, its package's default: metres from the screen, its width in pixels and in metres.
@@ -89,7 +89,7 @@ def load_perceptual(names: Iterable[str] = PERCEPTUAL) -> Perceptual:
         except ModuleNotFoundError as error:
             absent[name] = f"the module {error.name} is not installed"
         except Exception as error:  # a broken package must not disable the other distances
-            absent[name] = " ".join(f"{type(error).__name__}: {error}".split())
+            absent[name] = one_line(f"{type(error).__name__}: {error}")
     return Perceptual(distances, absent)
 
 
