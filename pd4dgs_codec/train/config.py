@@ -252,7 +252,6 @@ OPTIONS: dict[str, Option] = {f.name: f.metadata["option"] for f in fields(Train
 FIXED = tuple(name for name, about in OPTIONS.items() if about.fixed)
 #: What the quality dial moves, as (value at 50, value at 0 over it).
 DIAL = {name: (getattr(TrainConfig, name), about.dial) for name, about in OPTIONS.items() if about.dial is not None}
-DEFAULT_QUALITY = 50.0
 
 
 def at_quality(quality: float) -> dict[str, float]:

@@ -21,11 +21,9 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from pd4dgs_codec.draw.simd import LANES, Tasks, fma, fnma, kernel, load, parallel, splat, store
+from pd4dgs_codec.quality.image import C1, C2, GAUSSIAN
 
-C1, C2 = 0.01**2, 0.03**2
-EXACT_TAPS = np.exp(-0.5 * (np.arange(-5, 6) / 1.5) ** 2)
-EXACT_TAPS /= EXACT_TAPS.sum()
-TAPS = EXACT_TAPS.astype(np.float32)
+TAPS = GAUSSIAN.astype(np.float32)
 REACH = 5
 SIDE = 3 * REACH
 Part = tuple[slice, slice]  #: rows and columns
@@ -71,7 +69,7 @@ def image_loss(image: Tensor, target: Tensor, weights: Tensor, part: Part = WHOL
 
 def image_loss_reference(image: Tensor, target: Tensor, weights: Tensor) -> tuple[Tensor, Tensor]:
     """The plain torch form of `image_loss`."""
-    taps = torch.from_numpy(EXACT_TAPS).to(image).view(1, 1, -1, 1)
+    taps = torch.from_numpy(GAUSSIAN).to(image).view(1, 1, -1, 1)
 
     def blur(channels: Tensor) -> Tensor:
         return F.conv2d(F.conv2d(channels, taps, padding=(5, 0)), taps.mT, padding=(0, 5))

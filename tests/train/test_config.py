@@ -11,7 +11,6 @@ from pd4dgs_codec.scene import Steps
 from pd4dgs_codec.train.config import (
     ABLATIONS,
     COARSENED,
-    DEFAULT_QUALITY,
     DIAL,
     SHORT_RUN,
     LearningRates,
@@ -52,7 +51,7 @@ def test_a_stored_configuration_comes_back():
 
 def test_the_dial_is_log_linear_and_stands_at_the_defaults():
     default = TrainConfig()
-    assert at_quality(DEFAULT_QUALITY) == {name: getattr(default, name) for name in DIAL}
+    assert at_quality(50) == {name: getattr(default, name) for name in DIAL}
     low, middle, high = (at_quality(q) for q in (20, 50, 80))
     for name in DIAL:
         assert low[name] > middle[name] > high[name] > 0
