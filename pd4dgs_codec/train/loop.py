@@ -8,6 +8,7 @@ import math
 import signal
 import threading
 import time
+from collections.abc import Iterator
 from pathlib import Path
 from statistics import median
 from types import FrameType
@@ -102,7 +103,7 @@ class Trainer:
         A second signal raises KeyboardInterrupt at once: `output` stays as last saved. save_every: seconds. Raises
         DataError if the checkpoint cannot be written, or the log, in which case the checkpoint is saved first.
         """
-        with StopRequest() as stop, one_torch_thread():
+        with stop_request() as stop, one_torch_thread():
             records = RecordLog(log)
             try:
                 self._steps(output, stop, records, progress, save_every)
@@ -113,12 +114,12 @@ class Trainer:
             if self.config.noise and self.finished:
                 self.model.round_to_steps()  # as the end of the run rendered it and the file will hold it
             self.save(output)
-        self.interrupted = stop.requested
+        self.interrupted = stop.is_set()
         if records.failure:
             raise records.failure
 
     def _steps(
-        self, output: Path, stop: StopRequest, records: RecordLog, progress: Progress | None, save_every: float
+        self, output: Path, stop: threading.Event, records: RecordLog, progress: Progress | None, save_every: float
     ) -> None:
         """Steps until the run ends; a record that cannot be logged ends it too."""
         saved = now = time.monotonic()
@@ -138,7 +139,7 @@ class Trainer:
             if time.monotonic() - saved > save_every:
                 self.save(output)
                 saved = time.monotonic()
-            if any(workers.largest(stop.requested or late or not logged)):
+            if any(workers.largest(stop.is_set() or late or not logged)):
                 break
 
     def _spend(self, seconds: float) -> bool:
@@ -256,31 +257,26 @@ class RecordLog:
         return DataError(f"{self.path}: the log cannot be written: {error.strerror or error}")
 
 
-class StopRequest:
-    """A context in which the first Ctrl-C or SIGTERM sets `requested` and every further one raises KeyboardInterrupt.
+@contextlib.contextmanager
+def stop_request() -> Iterator[threading.Event]:
+    """Gives what the first Ctrl-C or SIGTERM sets; every further one raises KeyboardInterrupt.
 
     Signals that the process ignores stay ignored. Outside the main thread, where Python allows no handlers, nothing
     changes.
     """
+    stop, main = threading.Event(), threading.current_thread() is threading.main_thread()
 
-    SIGNALS = (signal.SIGINT, signal.SIGTERM)
-
-    def __init__(self) -> None:
-        self.requested = False
-        self._before: dict[signal.Signals, Any] = {}
-
-    def __enter__(self) -> StopRequest:
-        if threading.current_thread() is threading.main_thread():
-            for number in self.SIGNALS:
-                if signal.getsignal(number) is not signal.SIG_IGN:
-                    self._before[number] = signal.signal(number, self._received)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for number, handler in self._before.items():
-            signal.signal(number, signal.SIG_DFL if handler is None else handler)
-
-    def _received(self, number: int, frame: FrameType | None) -> None:
-        if self.requested:
+    def received(number: int, frame: FrameType | None) -> None:
+        if stop.is_set():
             raise KeyboardInterrupt
-        self.requested = True
+        stop.set()
+
+    before = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM) if main}
+    before = {number: handler for number, handler in before.items() if handler is not signal.SIG_IGN}
+    try:
+        for number in before:
+            signal.signal(number, received)
+        yield stop
+    finally:
+        for number, handler in before.items():
+            signal.signal(number, signal.SIG_DFL if handler is None else handler)

@@ -140,10 +140,10 @@ def test_a_resumed_timed_run_spends_what_is_left(dataset, tmp_path, monkeypatch,
     first = timed(dataset, monkeypatch, clock, "quiet")
     update = first.learner.optimiser.step
 
-    def interrupted(progress):
+    def interrupted(*at):
         if first.seconds > 0.5 * LIMIT:
             signal.raise_signal(signal.SIGINT)
-        update(progress)
+        update(*at)
 
     monkeypatch.setattr(first.learner.optimiser, "step", interrupted)
     first.run(tmp_path / "m.pt")
@@ -199,10 +199,10 @@ def test_the_first_signal_ends_the_run_after_a_whole_step(dataset, tmp_path, mon
     trainer = Trainer(TrainConfig(preset="tiny", iterations=8), dataset)
     update, before = trainer.learner.optimiser.step, signal.getsignal(number)
 
-    def interrupted(progress):
+    def interrupted(*at):
         if trainer.iteration == 2:
             signal.raise_signal(number)  # in the middle of a step
-        update(progress)
+        update(*at)
 
     monkeypatch.setattr(trainer.learner.optimiser, "step", interrupted)
     trainer.run(tmp_path / "m.pt")
@@ -219,7 +219,7 @@ def test_the_first_signal_ends_the_run_after_a_whole_step(dataset, tmp_path, mon
 def test_a_second_signal_ends_it_at_once_and_saves_nothing(dataset, tmp_path, monkeypatch):
     trainer = Trainer(TrainConfig(preset="tiny", iterations=8), dataset)
     before = signal.getsignal(signal.SIGINT)
-    twice = lambda progress: [signal.raise_signal(signal.SIGINT) for _ in range(2)]  # noqa: E731
+    twice = lambda *_: [signal.raise_signal(signal.SIGINT) for _ in range(2)]  # noqa: E731
     monkeypatch.setattr(trainer.learner.optimiser, "step", twice)
     with pytest.raises(KeyboardInterrupt):
         trainer.run(tmp_path / "m.pt")
