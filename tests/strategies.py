@@ -14,6 +14,7 @@ import numpy as np
 from hypothesis import strategies as st
 
 from pd4dgs_codec import encode
+from pd4dgs_codec.entropy.tables import norm_cdf28_of_each, tables_of_each
 from pd4dgs_codec.format.quantise import NO_CLASSES, Grid, attribute_rows, dequantise
 from pd4dgs_codec.scene import (
     DEFAULT_WIDTHS,
@@ -232,3 +233,9 @@ def assert_same_networks(a: dict[str, Network], b: dict[str, Network]) -> None:
         for (wa, ba), (wb, bb) in zip(a[name], b[name], strict=True):
             np.testing.assert_array_equal(wa, wb, err_msg=name)
             np.testing.assert_array_equal(ba, bb, err_msg=name)
+
+
+def norm_table(n: int, mu8: int, si: int, floor: int) -> np.ndarray:
+    """NormTable v1 of one quantised Gaussian over symbols 0 .. n - 1: cum int64 [n + 1]."""
+    sizes, mu8s, sis, floors = (np.array([v]) for v in (n, mu8, si, floor))
+    return tables_of_each(norm_cdf28_of_each(sizes, mu8s, sis), sizes, floors)

@@ -44,8 +44,12 @@ def norm_cdf28_of_each(sizes: np.ndarray, mu8: np.ndarray, si: np.ndarray) -> np
 
 
 def tables_of_each(cdf: np.ndarray, sizes: np.ndarray, floor: np.ndarray) -> np.ndarray:
-    """The tables of `sizes` from a result of norm_cdf28_of_each, with a floor int64 [m] each; concatenated. Each symbol
-    gets the floor plus its share of the rest."""
+    """NormTable v1: the tables of `sizes` from a result of norm_cdf28_of_each, with a floor int64 [m] each, joined.
+
+    Each symbol gets the floor plus its share of the rest; the first one has the mass below the window, the last one
+    that above. The caller has checked the limits of clause 8.2: sizes 1 .. 2**14, si within SI_MIN .. SI_MAX, |mu8| <
+    2**40, floors up to 16.
+    """
     lengths = sizes + 1
     ends = np.cumsum(lengths)
     cum: np.ndarray = (cdf * np.repeat(TOTAL - sizes * floor, lengths)) >> 28
@@ -58,16 +62,6 @@ def _counted(lengths: np.ndarray) -> np.ndarray:
     """0 .. length - 1 of each of `lengths`, concatenated."""
     counted: np.ndarray = np.arange(int(lengths.sum())) - np.repeat(np.cumsum(lengths) - lengths, lengths)
     return counted
-
-
-def norm_table(n: int, mu8: int, si: int, floor: int) -> np.ndarray:
-    """NormTable v1: cum int64 [n + 1] of a quantised Gaussian over symbols 0 .. n - 1.
-
-    The first symbol carries the mass below the window, the last the mass above it. The caller has checked
-    n >= 1, SI_MIN <= si <= SI_MAX, |mu8| < 2**40 and n <= 2**14 with floor <= 16 (clause 8.2 of the format).
-    """
-    sizes = np.array([n])
-    return tables_of_each(norm_cdf28_of_each(sizes, np.array([mu8]), np.array([si])), sizes, np.array([floor]))
 
 
 def histogram_table(freqs: np.ndarray) -> np.ndarray:

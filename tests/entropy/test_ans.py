@@ -5,9 +5,10 @@ import pytest
 import refdec
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from strategies import norm_table
 
 from pd4dgs_codec.entropy.ans import MAX_COUNT, AnsDecoder, ans_encode, model_of, models_of_each
-from pd4dgs_codec.entropy.tables import histogram_table, norm_table, uniform_table
+from pd4dgs_codec.entropy.tables import histogram_table, uniform_table
 from pd4dgs_codec.errors import EncodeError, LimitExceeded, Malformed
 
 

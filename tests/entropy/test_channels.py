@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from strategies import norm_table
 
 from pd4dgs_codec.entropy import channels as coding
 from pd4dgs_codec.entropy import priors as registry
@@ -26,7 +27,7 @@ from pd4dgs_codec.entropy.priors import (
     Normal,
     Window,
 )
-from pd4dgs_codec.entropy.tables import norm_table, uniform_table
+from pd4dgs_codec.entropy.tables import uniform_table
 from pd4dgs_codec.entropy.varint import put_varint
 from pd4dgs_codec.errors import DecodeError, EncodeError, LimitExceeded, Malformed, UnsupportedFeature
 

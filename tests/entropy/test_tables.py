@@ -10,6 +10,7 @@ import pytest
 import refdec
 from hypothesis import given
 from hypothesis import strategies as st
+from strategies import norm_table
 
 from pd4dgs_codec.entropy.priors import (
     CLASS_STEPS,
@@ -32,7 +33,6 @@ from pd4dgs_codec.entropy.tables import (
     TOTAL,
     histogram_table,
     histogram_tables_of_each,
-    norm_table,
     uniform_table,
 )
 from pd4dgs_codec.errors import Malformed
