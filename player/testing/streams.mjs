@@ -9,12 +9,19 @@ import { decode, openStream } from "../decode/index.js";
 
 const bytes = new Uint8Array(readFileSync(process.argv[2]));
 
-/** @param {() => Scene[] | Promise<Scene[]>} work @returns {Promise<[number, Scene[]]>} */
+/** The least of three times, for a collection of garbage may fall into one, and the scenes.
+ * @param {() => Scene[] | Promise<Scene[]>} work @returns {Promise<[number, Scene[]]>} */
 async function timed(work) {
-  const start = process.cpuUsage();
-  const scenes = await work();
-  const { user, system } = process.cpuUsage(start);
-  return [user + system, scenes];
+  let least = Infinity;
+  /** @type {Scene[]} */
+  let scenes = [];
+  for (let i = 0; i < 3; i++) {
+    const start = process.cpuUsage();
+    scenes = await work();
+    const { user, system } = process.cpuUsage(start);
+    least = Math.min(least, user + system);
+  }
+  return [least, scenes];
 }
 
 /** @param {Scene[]} scenes */

@@ -359,7 +359,6 @@ def test_random_cuts_give_the_same_scenes(file, cuts):
         made += client.transfer.cuts
 
 
-@pytest.mark.parametrize("clients", [4, pytest.param(64, marks=pytest.mark.slow)])
 def promising(*sizes: int) -> bytes:
     """The header of a file of such chunks, and the head of the first of them."""
     parts = take_apart(small_file())
@@ -412,6 +411,7 @@ def test_an_ipv6_address_needs_no_port(monkeypatch, address):
     assert seen == [(parts.hostname, parts.port or {"http": 80, "https": 443}[parts.scheme])]
 
 
+@pytest.mark.parametrize("clients", [4, pytest.param(64, marks=pytest.mark.slow)])
 def test_many_clients_at_once_get_every_byte(folder, scene_bytes, clients):
     results: list[tuple[bytes, int]] = []
     with Server(folder, link=Link(200e6)) as server, server.running():
