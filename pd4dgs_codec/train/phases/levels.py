@@ -10,6 +10,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
+from torch.nn.functional import softplus
 
 from pd4dgs_codec.model.model import Model
 from pd4dgs_codec.quality import TRAIN_MIN_DB, TRAIN_MIN_DB_PER_MEGABYTE
@@ -81,11 +82,15 @@ def levels_without_gain(psnr: Sequence[float], sizes: Sequence[float]) -> list[t
 
 
 def drop_level(model: Model, optimiser: Optimiser, level: int) -> None:
-    """Removes the deformation of `level` from the model and its optimiser, and ties its masks to the level below."""
+    """Removes the deformation of `level` from the model and its optimiser, and ties its masks to the level below. Most
+    steps with a key instant have trained the masks of level 1, which then become those of level 0."""
     name = {1: "global_deformation", 2: "local_deformation"}[level]
     field = getattr(model, name)
+    keyed = field is not None and field.key is not None
     if field is not None:
         optimiser.forget(field)
         setattr(model, name, None)
     with torch.no_grad():
+        if keyed:
+            model.mask_logits[:, level - 1] += softplus(model.mask_logits[:, level])
         model.mask_logits[:, level] = TIED
