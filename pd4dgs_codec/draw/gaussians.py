@@ -16,6 +16,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -209,11 +210,16 @@ class SlotHead:
         self.last, self._before, self._slots = network[-1], network[:-1], slots
         self._table = by_slot(*self.last, slots)
 
+    @cached_property
+    def _packed(self) -> Layers:
+        """The layers before the last. Networks that are fused need none, and training makes heads anew at each step."""
+        return Layers(self._before, relu_last=True)
+
     def hidden(self, x: Array) -> Array:
         """The inputs of the last layer for x [n, inputs], in as many columns as `linear` takes; the padding is 0."""
         width = self._table[0].shape[1]
         if self._before:
-            return Layers(self._before, relu_last=True)(x, width)
+            return self._packed(x, width)
         out = np.zeros((len(x), width), x.dtype)
         out[:, : x.shape[1]] = x
         return out

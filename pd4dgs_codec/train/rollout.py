@@ -54,16 +54,22 @@ def draw_levels(state: TrainState) -> tuple[tuple[int, ...], Probabilities]:
 def next_view(state: TrainState, level: int) -> int:
     """The training view of the next picture at `level`: each in turn, in random order; views near the key instant at
     random."""
-    held_back = held_back_views(state) if state.position < state.schedule.rounding else set()
     if level == 0 and state.key is not None:
         still = state.position < state.schedule.coarse_end
         if still or float(torch.rand((), generator=state.generator)) < NEAR_ODDS:
+            held_back = _held_back(state)
             near = near_key(state, [index for index in range(len(state.views)) if index not in held_back])
             return near[int(torch.randint(len(near), (), generator=state.generator))]
     if not state.order:
+        held_back = _held_back(state)
         drawn = torch.randperm(len(state.views), generator=state.generator).tolist()
         state.order = [index for index in drawn if index not in held_back]
     return state.order.pop()
+
+
+def _held_back(state: TrainState) -> set[int]:
+    """The training views that wait for the selection of levels."""
+    return held_back_views(state) if state.position < state.schedule.rounding else set()
 
 
 def near_key(state: TrainState, among: list[int]) -> list[int]:
