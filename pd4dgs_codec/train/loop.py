@@ -17,7 +17,7 @@ from typing import Any, Protocol
 import torch
 
 from pd4dgs_codec.data.view import Dataset
-from pd4dgs_codec.errors import DataError, TrainError
+from pd4dgs_codec.errors import DataError, TrainError, one_line
 from pd4dgs_codec.io import finite
 from pd4dgs_codec.model import checkpoint
 from pd4dgs_codec.model.config import ModelConfig
@@ -205,7 +205,7 @@ class Trainer:
             if not 0 <= self.seconds < math.inf:
                 raise ValueError(f"seconds are {self.seconds}")
         except Exception as error:  # of many kinds
-            reason = " ".join(f"{type(error).__name__}: {error}".split())  # torch's messages have several lines
+            reason = one_line(f"{type(error).__name__}: {error}")  # torch's messages have several lines
             raise DataError(f"{path}: its training state cannot be read: {reason}") from None
         order, count = self.learner.order, len(self.dataset.train)
         if not all(0 <= index < count for index in order):
