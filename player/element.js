@@ -62,7 +62,7 @@ input::-webkit-slider-thumb { -webkit-appearance: none; width: 6px; height: 22px
 input::-moz-range-track { background: none; }
 input::-moz-range-thumb { width: 6px; height: 22px; border: 0; border-radius: 3px; background: #fff; }
 .clock, .status { font-variant-numeric: tabular-nums; }
-.status { position: absolute; inset: auto 10px 44px auto; opacity: .75; text-shadow: 0 0 4px #000, 0 0 2px #000;
+.status { position: absolute; inset: auto 10px 44px auto; text-align: right; opacity: .75; text-shadow: 0 0 4px #000, 0 0 2px #000;
   pointer-events: none; }
 @container (max-width: 420px) {
   .bar { flex-wrap: wrap; justify-content: flex-end; }
@@ -307,12 +307,13 @@ export class Pd4Player extends HTMLElement {
   _showStatus() {
     const player = this._player;
     if (!player || this._bar.hidden) return;
-    const { bytes, total, loading, ends, level, levels, fps, scale } = player.status;
+    const { bytes, total, loading, ends, level, levels, fps, scale, software } = player.status;
     const parts = [];
     if (level !== null) parts.push(`level ${level}${levels.length ? ` of ${levels[levels.length - 1]}` : ""}`);
     if (bytes) parts.push(`${size(bytes)}${loading && total ? ` of ${size(total)}` : ""}`);
     if (fps > 1) parts.push(`${fps} fps`);
     if (scale < 1) parts.push(`${Math.round(100 * scale)} %`);
+    if (software) parts.push("no GPU: the CPU draws, fewer pixels while the picture moves");
     setText(this._statusLine, parts.join(" · "));
 
     const whole = ends.filter(({ layer }, i) => layer !== ends[i + 1]?.layer); // of slices the last one

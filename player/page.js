@@ -19,7 +19,7 @@ if (query.has("bench")) {
     const value = query.get(name);
     if (value !== null) player.setAttribute(name, value);
   }
-  document.body.append(player);
+  document.querySelector("main")?.append(player);
   player.load(source);
   document.body.addEventListener("dragover", (event) => event.preventDefault());
   document.body.addEventListener("drop", (event) => {

@@ -181,5 +181,6 @@ def _library_page(scenes: list[dict[str, Any]]) -> str:
         about = html.escape(f"{scene['bytes'] / 1e6:.2f} MB; first picture after {first}")
         link = f'<a href="{html.escape(scene["page"])}">{poster or "<div class=none></div>"}'
         cards.append(f"{link}<br>{html.escape(scene['name'])}<br><small>{about}</small></a>")
-    head = f'<!doctype html><meta charset="utf-8"><title>{len(scenes)} scenes</title><style>{STYLE}</style>'
+    title, head = f"{len(scenes)} scenes", '<!doctype html><html lang="en"><meta charset="utf-8">'
+    head += f"<title>{title}</title><style>{STYLE}</style>\n<h1>{title}</h1>"
     return f"{head}\n<main>\n" + "\n".join(cards) + "\n</main>\n"

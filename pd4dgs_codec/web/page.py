@@ -110,9 +110,9 @@ globalThis.early?.begin(workers["{WORKERS[0]}"]);
     early = "" if isinstance(source, bytes) else f"<script>\n{packed(root / EARLY)}</script>"
     head = head.replace(f'<script src="./{EARLY}"></script>', early)
     if isinstance(source, str):
-        head, body = head.replace("<html ", f'<html data-src="{html.escape(source)}" ', 1), "<body>\n"
+        head, body = head.replace("<html ", f'<html data-src="{html.escape(source)}" ', 1), ""
     elif source is not None:
-        body = f'<body>\n<script type="text/plain" id="scene">{base64.b64encode(source).decode()}</script>\n'
+        body = f'<script type="text/plain" id="scene">{base64.b64encode(source).decode()}</script>\n'
     return f"{head}{body}{script}</html>\n"
 
 

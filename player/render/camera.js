@@ -71,7 +71,18 @@ export function defaultCamera({ camera, box: [low, high], up }) {
 }
 
 /**
- * The camera for a picture of another size: all of its picture is seen, as large as it fits, in the middle.
+ * How much larger than a camera's picture a window shows it. The window shows all of it, but upright ones (phones) fill
+ * up with it: above and below it was nothing captured, there are only floaters.
+ *
+ * @param {Pick<Camera, "width" | "height">} camera @param {number} width @param {number} height of the window, pixels
+ */
+export function magnification(camera, width, height) {
+  const sides = [width / camera.width, height / camera.height];
+  return height > width ? Math.max(...sides) : Math.min(...sides);
+}
+
+/**
+ * The camera for a picture of another size, its own in the middle.
  *
  * @param {Camera} camera @param {number} width @param {number} height pixels
  * @returns {Camera}
@@ -79,7 +90,7 @@ export function defaultCamera({ camera, box: [low, high], up }) {
 export function fitted(camera, width, height) {
   if (camera.width === width && camera.height === height) return camera;
   const { viewmat, K } = camera;
-  const scale = Math.min(width / camera.width, height / camera.height);
+  const scale = magnification(camera, width, height);
   return {
     viewmat,
     K: new Float32Array([

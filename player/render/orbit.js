@@ -1,6 +1,6 @@
 // Moving the camera: about a point of the scene, along the picture, towards it.
 
-import { centreOf, cross, downOf, dot, forwardOf, lookAlong, plus, turn, unit } from "./camera.js";
+import { centreOf, cross, downOf, dot, forwardOf, lookAlong, magnification, plus, turn, unit } from "./camera.js";
 /** @import { Vector } from "./camera.js" */
 /** @import { Player } from "./player.js" */
 
@@ -74,7 +74,7 @@ export class Orbit {
       const camera = this._player.camera;
       const { clientWidth, clientHeight } = this._surface;
       if (!camera || !clientWidth || !clientHeight) return null;
-      const scale = Math.min(clientWidth / camera.width, clientHeight / camera.height);
+      const scale = magnification(camera, clientWidth, clientHeight);
       const distance = Math.max(dot(plus(pivot, eye, -1), forward), 1e-9);
       const { viewmat } = camera;
       const right = [viewmat[0], viewmat[1], viewmat[2]];

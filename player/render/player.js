@@ -39,6 +39,7 @@ import { Emitter, startLoader } from "./loader.js";
  * @property {number} fps pictures drawn in the last second
  * @property {number} scale of the picture's sides
  * @property {number} gaussians drawn
+ * @property {boolean} software whether the CPU draws, for want of a GPU
  */
 
 /** After so many milliseconds without movement the picture is drawn at full quality. */
@@ -285,6 +286,7 @@ export class Player extends Emitter {
       fps: this._draws.length,
       scale: this._moving(now) ? this._scale() : 1,
       gaussians: this._painter?.count ?? 0,
+      software: this._gpu?.software ?? false,
     };
   }
 

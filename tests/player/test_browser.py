@@ -609,7 +609,9 @@ def test_every_control_has_a_name_and_is_reached_by_key(page, server):
         page.keyboard.press("Tab")
         names.append(page.evaluate(f"{ELEMENT}.shadowRoot.activeElement?.getAttribute('aria-label')"))
     assert names == ["Dynamic scene", "Play", "Time", "Highest level", "Reset the view", "Full screen"]
-    assert player.locator("[part=status]").inner_text().startswith("level 2 of 2 · ")
+    status = player.locator("[part=status]").inner_text()
+    assert status.startswith("level 2 of 2 · ")
+    assert status.endswith(" · no GPU: the CPU draws, fewer pixels while the picture moves")
 
 
 def test_attributes_and_removal(page, server):
@@ -698,6 +700,8 @@ def test_one_page_holds_player_and_scene(page, server, lively, place):
         page.goto((server.root / "alone.html").as_uri())
         frame = page
     wait_for_level(frame, 2)
+    assert frame.get_by_role("main").get_by_role("application").count() == 1
+    assert frame.get_by_role("heading", level=1).inner_text() == "Dynamic scene"
     assert asked[1:].count("http") + asked[1:].count("https") + asked[1:].count("file") == 0
 
 
@@ -707,6 +711,7 @@ def test_the_page_asks_nobody_else_and_measures_itself(page, server):
     page.goto(server.url_of("player/index.html"))
     wait_for_level(page, 2)
     assert not page.evaluate("document.querySelector('pd4-player').paused")
+    assert page.get_by_role("main").get_by_role("heading", level=1).count() == 1
     page.goto(server.url_of("player/index.html") + "?bench&src=scene.pd4&sizes=48x36")
     started = time.monotonic()
     page.wait_for_function("!!window.benchResult")
