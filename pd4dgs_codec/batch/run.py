@@ -9,9 +9,11 @@ from __future__ import annotations
 import contextlib
 import multiprocessing
 import os
+import shutil
 import signal
 import socket
 import sys
+import tempfile
 import threading
 import time
 from collections import Counter, deque
@@ -153,6 +155,7 @@ class Local(Engine):
     def __init__(self, work: Work, settings: Settings):
         self.work, self.inline, self.timeout = work, settings.workers == 0, settings.timeout
         self.room = settings.workers or 1
+        self.folder = tempfile.TemporaryDirectory(prefix="pd4dgs-batch-", ignore_cleanup_errors=True)
         self.pools: list[tuple[ProcessPoolExecutor, Future[int]]] = []
         self.busy: dict[Future[Outcome], tuple[ProcessPoolExecutor, Future[int]]] = {}
 
@@ -168,7 +171,7 @@ class Local(Engine):
             return future
         pool = next((pool for pool in self.pools if pool not in self.busy.values()), None)
         if pool is None:  # OpenMP forbids fork
-            executor = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _follow_parent)
+            executor = ProcessPoolExecutor(1, multiprocessing.get_context("spawn"), _follow_parent, (self.folder.name,))
             self.pools.append(pool := (executor, executor.submit(os.getpid)))
         try:
             future = pool[0].submit(self.work, job)
@@ -199,16 +202,20 @@ class Local(Engine):
         self._end([future for future in self.busy if not future.done()])
         for executor, _ in self.pools:
             executor.shutdown(wait=False)
+        self.folder.cleanup()
 
 
-def _follow_parent() -> None:
-    """Lets a process ignore Ctrl-C, which its parent handles, and end with its parent."""
+def _follow_parent(folder: str) -> None:
+    """Lets a process ignore Ctrl-C, which its parent handles, and end with its parent. Its temporary files are in
+    `folder`, so that its parent removes them if it is killed, and it removes them if its parent is."""
+    tempfile.tempdir = folder
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
     assert parent is not None
 
     def follow() -> None:
         parent.join()
+        shutil.rmtree(folder, ignore_errors=True)
         os._exit(1)
 
     threading.Thread(target=follow, daemon=True).start()

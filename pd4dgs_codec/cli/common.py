@@ -33,6 +33,7 @@ atexit.register(gc.freeze)
 OK, FAILED, USAGE, PARTIAL = 0, 1, 2, 3
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)  #: a disk has no room
 STDIO = "-"
+EXTRAS = {"ray": "cluster", "submitit": "cluster"}  #: of the modules that are not of the extra `train`
 
 
 class UsageError(Exception):
@@ -293,7 +294,8 @@ def _explain(error: BaseException, name: str) -> str | None:
         where = error.filename or ("a cache or a temporary file" if error.errno in FULL else "")
         return f"{where}: {error.strerror or error}".lstrip(": ")
     if isinstance(error, ModuleNotFoundError) and error.name and not error.name.startswith("pd4dgs_codec"):
-        return f"needs the module {error.name}, which is not installed: pip install 'pd4dgs-codec[train]'"
+        extra = EXTRAS.get(error.name.partition(".")[0], "train")
+        return f"needs the module {error.name}, which is not installed: pip install 'pd4dgs-codec[{extra}]'"
     if isinstance(error, MemoryError):
         return "out of memory"
     return None

@@ -31,13 +31,24 @@ def filled(library):
     return library
 
 
+@pytest.fixture
+def temporary(tmp_path, monkeypatch):
+    """The folder for temporary files, of which none stays."""
+    folder = tmp_path / "temporary"
+    folder.mkdir()
+    monkeypatch.setenv("TMPDIR", str(folder))
+    monkeypatch.setattr("tempfile.tempdir", None)
+    yield folder
+    assert list(folder.iterdir()) == []
+
+
 def test_a_pool_makes_what_one_process_makes(filled):
     assert filled.run(workers=2).done == 8
     assert _outputs(filled) == WANTED and filled.made() == sorted(TEXTS.values())
     assert filled.run(workers=2).already == 8 and len(filled.made()) == 8
 
 
-def test_a_job_whose_worker_dies_is_tried_again(filled):
+def test_a_job_whose_worker_dies_is_tried_again(filled, temporary):
     filled.add("z.pt", f"die {filled.folder}/flag")
     summary = filled.run(workers=2)
     assert (summary.done, summary.retried) == (9, 1)
@@ -51,7 +62,7 @@ def test_a_job_that_always_kills_its_worker_is_named(filled):
     assert outcome.state == "failed" and tries == 1 and "no-such-folder" in outcome.message
 
 
-def test_slow_job_is_ended_and_tried_again(filled):
+def test_slow_job_is_ended_and_tried_again(filled, temporary):
     filled.add("z.pt", f"dawdle {filled.folder}/flag")
     summary = filled.run(workers=2, timeout=5.0)
     assert summary.done == 9 and summary.retried >= 1
@@ -65,7 +76,7 @@ def test_timed_out_job_names_its_limit(library):
     assert "0.5 s" in library.outcomes["0.pd4"][0].message
 
 
-def test_workers_end_with_a_parent_that_was_killed(filled, tmp_path):
+def test_workers_end_with_a_parent_that_was_killed(filled, tmp_path, temporary):
     """A killed batch leaves no process behind, and the next one finishes what is left."""
     filled.add("a.pt", f"dawdle {filled.folder}/flag")
     program = (

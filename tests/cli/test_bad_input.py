@@ -8,6 +8,7 @@ import json
 import os
 import shlex
 import shutil
+import sys
 import warnings
 from dataclasses import replace
 from pathlib import Path
@@ -259,6 +260,15 @@ def test_missing_torch_and_faults_of_ours_are_one_line(cli, model_pt, scene_pd4,
     result = cli("info", scene_pd4)
     assert result.code == 1 and len(result.error_lines) == 1 and "internal error" in result.err
     assert "ZeroDivisionError" in cli("info", scene_pd4, "-v").error_lines[-2]
+
+
+@pytest.mark.parametrize("engine, module", [("ray", "ray"), ("slurm", "submitit")])
+def test_an_engine_that_is_not_installed_names_its_extra(cli, tmp_path, monkeypatch, engine, module):
+    monkeypatch.setitem(sys.modules, module, None)
+    (tmp_path / "m.jsonl").write_text('{"source": "synthetic:local"}\n')
+    result = cli("batch", tmp_path / "m.jsonl", "-o", tmp_path / "out", "--op", "train", "--on", engine)
+    line = f"needs the module {module}, which is not installed: pip install 'pd4dgs-codec[cluster]'"
+    _check(result, "batch", 1, line)
 
 
 def test_usage_errors_as_json(cli):

@@ -59,7 +59,8 @@ def _together(program: Path, output: str, *options: object) -> subprocess.Comple
     with socket.socket() as probe:
         probe.bind(("127.0.0.1", 0))
         port = probe.getsockname()[1]
-    launch = ["-m", "torch.distributed.run", "--nproc-per-node=2", f"--master-port={port}", "--", str(program)]
+    launch = ["-m", "torch.distributed.run", "--nproc-per-node=2", f"--master-port={port}"]
+    launch += [f"--log-dir={program.parent}", "--", str(program)]  # else a folder stays in the temporary one
     command = [sys.executable, *launch, *_arguments(program.parent, output, *options)]
     return subprocess.run(command, cwd=program.parent, capture_output=True, text=True, timeout=900)
 
