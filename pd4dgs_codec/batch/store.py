@@ -19,11 +19,14 @@ from typing import IO, Any
 
 from pd4dgs_codec.errors import DataError, one_line
 from pd4dgs_codec.io import write_bytes
+from pd4dgs_codec.web.headers import media_type
 
 RECORD = ".done.json"
 PROBE = ".pd4dgs-batch"
 #: Fields of a file's entry in a store that change with the file; the first one present is used.
 STAMPS = ("ETag", "etag", "md5Hash", "generation", "LastModified", "Last-Modified", "mtime")
+#: What the file systems of stores call a file's media type when they write one.
+TYPED = {"s3": "ContentType", "gs": "content_type"}
 #: Errors that another try would meet again.
 FINAL = (FileNotFoundError, FileExistsError, PermissionError, IsADirectoryError, NotADirectoryError)
 
@@ -129,6 +132,8 @@ class Root:
     def __init__(self, place: str):
         self.place = place.rstrip("/")
         self.system, self.path, self.local = _system(self.place)
+        schemes = self.system.protocol
+        self.schemes = (schemes,) if isinstance(schemes, str) else schemes
 
     def check(self) -> None:
         """Raises DataError, before any work, if the place takes no output."""
@@ -160,8 +165,8 @@ class Root:
         return all(found[name] and found[name]["size"] == file["bytes"] for name, file in record["files"].items())
 
     def publish(self, output: str, files: dict[str, Path], record: dict[str, Any], replace: bool) -> int:
-        """Writes the files of an output (name -> local path; "" is the output itself), then its record with their sizes
-        and digests. Returns the bytes of the files.
+        """Writes the files of an output (name -> local path; "" is the output itself), then its record with their
+        sizes, digests and media types. Returns the bytes of the files.
 
         replace: other content may be replaced. Raises DataError if there is any and it may not, OSError if the store
         fails.
@@ -174,7 +179,8 @@ class Root:
             if not replace and self._ask("cat_file", place) not in (None, content):
                 raise DataError(f"{self.place}/{place}: exists already, with no record of it; --overwrite replaces it")
             self._put(place, content)
-            entries[name] = {"bytes": len(content), "sha256": hashlib.sha256(content).hexdigest()}
+            digest = hashlib.sha256(content).hexdigest()
+            entries[name] = {"bytes": len(content), "sha256": digest, "type": media_type(place)}
         self._put(output + RECORD, (json.dumps(record | {"files": entries}, indent=1, sort_keys=True) + "\n").encode())
         return sum(entry["bytes"] for entry in entries.values())
 
@@ -191,7 +197,8 @@ class Root:
                 Path(where).parent.mkdir(parents=True, exist_ok=True)
                 write_bytes(where, content, overwrite=True)
             else:
-                self.system.pipe_file(where, content)
+                typed = [named for scheme, named in TYPED.items() if scheme in self.schemes]
+                self.system.pipe_file(where, content, **dict.fromkeys(typed, media_type(name)))
 
     def _at(self, name: str) -> str:
         return posixpath.join(self.path, name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import posixpath
 import re
 
 #: Positions of more digits belong to no file, and int() takes quadratic time for them.
@@ -12,6 +13,24 @@ _CONTENT_RANGE = re.compile(rf"bytes ({_DIGITS})-({_DIGITS})/({_DIGITS})", re.IG
 _ADDRESSED = re.compile(r"-[0-9a-f]{16}\.\w+$")
 #: Caches keep immutable files for a year, and revalidate all others on every use.
 IMMUTABLE, CHANGES = "public, max-age=31536000, immutable", "no-cache"
+#: Of files by their suffix. That of scenes is described in packaging/.
+MEDIA_TYPES = {
+    ".html": "text/html; charset=utf-8",
+    ".jpg": "image/jpeg",
+    ".js": "text/javascript; charset=utf-8",
+    ".json": "application/json",
+    ".m3u8": "application/vnd.apple.mpegurl",
+    ".mp4": "video/mp4",
+    ".mpd": "application/dash+xml",
+    ".pd4": "model/vnd.pd4dgs",
+    ".png": "image/png",
+    ".wasm": "application/wasm",
+}
+
+
+def media_type(name: str) -> str:
+    """The Content-Type of a file."""
+    return MEDIA_TYPES.get(posixpath.splitext(name)[1].lower(), "application/octet-stream")
 
 
 class Unsatisfiable(Exception):

@@ -10,9 +10,9 @@ from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 from pd4dgs_codec.errors import DeliveryError
+from pd4dgs_codec.web.headers import MEDIA_TYPES
 
 TIMESCALE = 1000  #: ticks per second of every track
-MIME_FORMAT = b"application/x-pd4"
 MAX_BOX = (1 << 32) - 1
 
 _IDENTITY = struct.pack(">9I", 1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30)
@@ -58,7 +58,7 @@ def _track(number: int, ticks: int) -> bytes:
     handler = _full(b"hdlr", 0, 0, struct.pack(">I4s12x", 0, b"meta"), f"layer {number - 1}\0".encode())
     here = _full(b"url ", 0, 1)
     data = box(b"dinf", _full(b"dref", 0, 0, struct.pack(">I", 1), here))
-    entry = box(b"mett", struct.pack(">6xH", 1), b"\0", MIME_FORMAT + b"\0")
+    entry = box(b"mett", struct.pack(">6xH", 1), b"\0", MEDIA_TYPES[".pd4"].encode() + b"\0")
     none = struct.pack(">I", 0)
     table = box(
         b"stbl",

@@ -25,20 +25,8 @@ from urllib.parse import quote, unquote, urlsplit
 
 from pd4dgs_codec.errors import DeliveryError
 from pd4dgs_codec.web import PAGE
-from pd4dgs_codec.web.headers import Unsatisfiable, cache_control, lists_etag, requested_range
+from pd4dgs_codec.web.headers import Unsatisfiable, cache_control, lists_etag, media_type, requested_range
 
-MEDIA_TYPES = {
-    ".html": "text/html; charset=utf-8",
-    ".jpg": "image/jpeg",
-    ".js": "text/javascript; charset=utf-8",
-    ".json": "application/json",
-    ".m3u8": "application/vnd.apple.mpegurl",
-    ".mp4": "video/mp4",
-    ".mpd": "application/dash+xml",
-    ".pd4": "application/octet-stream",
-    ".png": "image/png",
-    ".wasm": "application/wasm",
-}
 #: Files up to MAX_ZIPPED bytes with these suffixes are sent with gzip to clients that accept it.
 ZIPPED, MAX_ZIPPED = {".html", ".js", ".json"}, 1 << 20
 METHODS = "GET, HEAD, OPTIONS"
@@ -293,7 +281,7 @@ class _Handler(BaseHTTPRequestHandler):
         if lists_etag(self.headers.get("If-None-Match", ""), headers["ETag"]):
             self._begin(HTTPStatus.NOT_MODIFIED, headers)
             return
-        headers["Content-Type"] = MEDIA_TYPES.get(suffix, "application/octet-stream")
+        headers["Content-Type"] = media_type(path.name)
         if zipped:
             body = io.BytesIO(gzip.compress(file.read(MAX_ZIPPED), 9, mtime=0))
             size, headers["Content-Encoding"] = body.getbuffer().nbytes, "gzip"

@@ -198,6 +198,26 @@ def test_uris_of_fsspec_are_sources_and_outputs(library):
     assert library.made() == ["text"]
 
 
+@pytest.mark.parametrize("schemes, name", [(("s3", "s3a"), "ContentType"), (("gs", "gcs"), "content_type")])
+def test_stores_and_records_hold_media_types(library, monkeypatch, schemes, name):
+    from fsspec.implementations.memory import MemoryFileSystem
+
+    told = {}
+
+    def pipe_file(self, path, value, **options):
+        told[path.rpartition("/")[2]] = options
+        whole(self, path, value)
+
+    whole = MemoryFileSystem.pipe_file
+    monkeypatch.setattr(MemoryFileSystem, "pipe_file", pipe_file)
+    monkeypatch.setattr(MemoryFileSystem, "protocol", schemes)
+    library.add("a.pt", "text")
+    assert library.run(root=f"memory://typed-{name}").done == 1
+    assert told == {"a.pd4": {name: "model/vnd.pd4dgs"}, "a.pd4.done.json": {name: "application/json"}}
+    record = json.loads(MemoryFileSystem().cat_file(f"/typed-{name}/a.pd4.done.json"))
+    assert record["files"][""]["type"] == "model/vnd.pd4dgs"
+
+
 def test_read_only_store_is_named_before_any_work(tmp_path):
     (tmp_path / "file").touch()
     with pytest.raises(DataError, match="file: takes no output: File exists"):

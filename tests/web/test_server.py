@@ -25,7 +25,7 @@ def test_the_whole_file_with_its_validators(server):
     assert answer.status == 200 and answer.body == CONTENT
     assert answer.headers["Content-Length"] == "1000" and answer.headers["Accept-Ranges"] == "bytes"
     assert answer.headers["ETag"].startswith('"') and answer.headers["Last-Modified"].endswith("GMT")
-    assert ask(server, "/scene.pd4").headers["Content-Type"] == "application/octet-stream"
+    assert ask(server, "/scene.pd4").headers["Content-Type"] == "model/vnd.pd4dgs"
 
 
 @pytest.mark.parametrize(

@@ -90,7 +90,7 @@ def test_a_page_of_another_site_may_fetch_and_resume(port, folder, scene_bytes):
     (folder / "scene.mpd").write_text("<MPD/>")
     assert ask(port, target="/scene.mpd").headers["Content-Type"] == "application/dash+xml"
     whole = ask(port)
-    assert whole.read() == scene_bytes and whole.headers["Content-Type"] == "application/octet-stream"
+    assert whole.read() == scene_bytes and whole.headers["Content-Type"] == "model/vnd.pd4dgs"
     assert whole.headers["Access-Control-Allow-Origin"] == "*"
     assert whole.headers["Cache-Control"] == "no-cache"
     (folder / "scene-0123456789abcdef.pd4").write_bytes(scene_bytes)
