@@ -8,9 +8,7 @@
 Importing the package loads none of its modules; each name below loads what it needs at first use.
 """
 
-from __future__ import annotations
-
-TYPE_CHECKING = False  # `typing` takes milliseconds, in which an interrupt of a command would print a traceback
+TYPE_CHECKING = False  # nothing is imported here: until `cli` is, an interrupt of a command would print a traceback
 if TYPE_CHECKING:
     from pd4dgs_codec.format.decoder import decode, open_stream
     from pd4dgs_codec.format.encoder import encode

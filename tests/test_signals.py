@@ -7,10 +7,12 @@ import signal
 import subprocess
 import sys
 from itertools import count
+from pathlib import Path
 
 import pytest
 from test_io import _calls_of_the_system
 
+import pd4dgs_codec
 from pd4dgs_codec import io
 from pd4dgs_codec.signals import ENDING, held, ignore_more, interruptible
 
@@ -114,6 +116,30 @@ def test_no_traceback_from_the_first_import_to_the_last_line(when, number):
         assert done.returncode == 1 and done.stderr == "pd4dgs-info: error: interrupted; nothing was written\n"
     else:
         assert done.returncode == -number and done.stderr == ""
+
+
+#: Prints which modules a program looks for while a signal would still print a traceback.
+WATCHED = """
+import _signal, sys
+sys.argv = ["/bin/pd4dgs-info"]
+_signal.signal(_signal.SIGINT, _signal.default_int_handler)
+early = []
+def seen(event, args):
+    if event == "import" and _signal.getsignal(_signal.SIGINT) is not _signal.SIG_DFL:
+        early.append(args[0])
+sys.addaudithook(seen)
+from pd4dgs_codec.cli.MODULE import main
+print(*early)
+"""
+
+
+@pytest.mark.parametrize("module", ["info", "train"])
+def test_nothing_but_the_packages_is_loaded_before_the_first_handler(module):
+    script = [sys.executable, "-S", "-c", WATCHED.replace("MODULE", module)]  # no site: it may load modules before us
+    where = os.pathsep.join([str(Path(pd4dgs_codec.__file__).parents[1]), *filter(None, sys.path)])
+    done = subprocess.run(script, env={"PYTHONPATH": where}, capture_output=True, text=True, timeout=120)
+    names = {"pd4dgs_codec", "pd4dgs_codec.cli", f"pd4dgs_codec.cli.{module}"}
+    assert done.stdout and names.issuperset(done.stdout.split()), done.stdout + done.stderr
 
 
 def test_a_signal_inside_a_callback_is_not_lost():
