@@ -129,7 +129,6 @@ class SceneClient:
             try:
                 block = self.transfer.read(end, reach=reach, seconds=left)
             except Changed:
-                self._repaired_at = -1
                 self._begin()
                 continue
             except OutOfTime:

@@ -24,21 +24,8 @@ export class FetchError extends Error {
  */
 
 /**
- * A Stream, or a WorkerDecoder.
- *
- * @typedef {object} Decoder
- * @property {(bytes: Uint8Array) => Scene[] | Promise<Scene[]>} feed
- * @property {() => void | Promise<void>} rewind
- * @property {() => void | Promise<void>} finish
- * @property {LayerEnd[]} layerEnds
- * @property {number} consumed
- * @property {() => void} [close]
- */
-
-/**
  * @typedef {object} SourceOptions
  * @property {AbortSignal} [signal]
- * @property {() => Decoder} [makeDecoder] called once, and again if the file changes; without a limit of layers
  * @property {number} [stall] seconds without a byte after which a connection counts as cut
  * @property {number} [attempts] consecutive failures, without a byte between them, before giving up
  * @property {number} [pause] seconds before the second attempt, doubled for each further one
@@ -63,7 +50,7 @@ class Cut extends Error {}
 export class SceneSource {
   /** @param {string | URL} url @param {SourceOptions} [options] */
   constructor(url, options = {}) {
-    const { signal, makeDecoder = () => new Stream(), stall = 10, attempts = 5, pause = 0.2, progress } = options;
+    const { signal, stall = 10, attempts = 5, pause = 0.2, progress } = options;
     this.url = String(url);
     /** Connections that ended early, and changes of the file, so far. */
     this.cuts = 0;
@@ -73,9 +60,8 @@ export class SceneSource {
     /** @type {number | null} */
     this.total = null;
     this._signal = signal;
-    this._makeDecoder = makeDecoder;
-    /** @type {Decoder} */
-    this._decoder = makeDecoder();
+    /** What decodes the bytes; another one if the file changes. */
+    this.decoder = new Stream();
     this._stall = stall;
     this._attempts = attempts;
     this._pause = pause;
@@ -140,12 +126,12 @@ export class SceneSource {
           continue;
         }
         if (block === null) {
-          await this._decoder.finish(); // the file ends within this layer: Truncated
+          this.decoder.finish(); // the file ends within this layer: Truncated
           return;
         }
         if (!block.length) continue;
         failures = 0;
-        yield* await this._feed(block);
+        yield* this._feed(block);
       }
     } finally {
       this.close();
@@ -155,7 +141,7 @@ export class SceneSource {
   /** Where to stop next: behind preamble, header or a slice; null where the budget ends.
    * @param {number} maxLayer @param {number | undefined} bytes @param {number} until */
   _end(maxLayer, bytes, until) {
-    const { layerEnds: ends, consumed } = this._decoder;
+    const { layerEnds: ends, consumed } = this.decoder;
     if (!ends.length) {
       // nothing behind the header is decoded before the budget is checked
       if (this.received < PREAMBLE_SIZE) return PREAMBLE_SIZE;
@@ -178,18 +164,18 @@ export class SceneSource {
   }
 
   /** The scenes that a block completes. After damage the download goes back to the last valid chunk, once.
-   * @param {Uint8Array} block @returns {Promise<Scene[]>} */
-  async _feed(block) {
+   * @param {Uint8Array} block @returns {Scene[]} */
+  _feed(block) {
     try {
-      return await this._decoder.feed(block);
+      return this.decoder.feed(block);
     } catch (error) {
       const damaged = error instanceof DecodeError && !["BadSignature", "UnsupportedVersion"].includes(error.kind);
-      const good = this._decoder.consumed;
+      const good = this.decoder.consumed;
       if (!damaged || this._repairedAt === good) throw error;
       this._repairedAt = good;
       this.close();
       this.received = good;
-      await this._decoder.rewind();
+      this.decoder.rewind();
       return [];
     }
   }
@@ -286,9 +272,7 @@ export class SceneSource {
   _restart() {
     this.changes++;
     if (this.changes > MOST_CHANGES) throw new FetchError(`${this.url}: changed ${this.changes} times while it loaded`);
-    this._decoder.close?.();
-    this._decoder = this._makeDecoder();
-    this._repairedAt = -1;
+    this.decoder = new Stream();
     this.received = 0;
     this._requested.received = 0;
     this.total = null;

@@ -2,7 +2,7 @@
 // shaders do not take.
 
 import { SPLAT_BLOCKS } from "./evaluator.js";
-import { Remote } from "../decode/remote.js";
+import { Remote } from "./remote.js";
 /** @import { Gpu } from "./gl.js" */
 
 /** Gaussians in the layout of `Splats`. @typedef {{data: Float32Array, width: number, height: number}} Packed */

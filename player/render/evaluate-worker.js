@@ -1,7 +1,7 @@
 // The worker of the evaluator without a GPU.
 
 import { evaluate } from "./evaluate.js";
-import { serve } from "../decode/remote.js";
+import { serve } from "./remote.js";
 
 /** @type {import("../decode/scene.js").Scene} */
 let scene;

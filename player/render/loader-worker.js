@@ -1,8 +1,7 @@
 // The worker that fetches and decodes: bytes in, scenes out as slices complete.
 
 import { SceneSource } from "../decode/fetch.js";
-import { serve, tell } from "../decode/remote.js";
-import { Stream } from "../decode/stream.js";
+import { serve, tell } from "./remote.js";
 /** @import { Scene } from "../decode/scene.js" */
 
 /** Between two messages about progress, milliseconds. */
@@ -35,7 +34,6 @@ function ask(url, options) {
   return answer;
 }
 
-let decoder = new Stream();
 /** @type {SceneSource} */
 let source;
 let told = 0;
@@ -69,7 +67,8 @@ function flush() {
   free = now + REST * (now - start);
 }
 
-/** The scene with arrays of their own: messages copy the whole of the arrays that views belong to. @param {Scene} scene */
+/** The scene with arrays of its rows that are its own, where messages copy all that a view is a part of.
+ * @param {Scene} scene */
 function own(scene) {
   const { anchorQ, anchor, feature, scalingLog, offset } = scene;
   const columns = Object.entries({ anchorQ, anchor, feature, scalingLog, offset });
@@ -77,10 +76,12 @@ function own(scene) {
   return { ...scene, ...copies, mask: scene.mask.map((codes) => codes.slice()) };
 }
 
-/** @param {Scene} [scene] @param {{arrived: number, decoded: number}} [times] */
+/** @param {Scene} [scene] whose rows the page takes over @param {{arrived: number, decoded: number}} [times] */
 function report(scene, times = { arrived, decoded: epochNow() }) {
-  const { received: bytes, total } = source;
-  tell({ told: { ...(scene && { scene }), bytes, total, ends: decoder.layerEnds, ...times } });
+  const { received: bytes, total, decoder } = source;
+  const rows = scene ? [scene.anchorQ, scene.anchor, scene.feature, scene.scalingLog, scene.offset, ...scene.mask] : [];
+  const news = { ...(scene && { scene }), bytes, total, ends: decoder.layerEnds, ...times };
+  tell({ told: news }, rows.map(({ buffer }) => buffer));
   told = performance.now();
 }
 
@@ -89,7 +90,6 @@ serve({
   open(from) {
     source = new SceneSource(typeof from === "string" ? from : URL.createObjectURL(from), {
       fetch: ask,
-      makeDecoder: () => (decoder = new Stream()),
       progress: () => {
         arrived = epochNow();
         if (performance.now() - told > PROGRESS_MS) report();
@@ -110,7 +110,7 @@ serve({
       flush();
       report();
     }
-    const ends = decoder.layerEnds;
-    return { bytes: source.received, complete: ends.length > 0 && decoder.consumed >= ends[ends.length - 1].end };
+    const { layerEnds: ends, consumed } = source.decoder;
+    return { bytes: source.received, complete: ends.length > 0 && consumed >= ends[ends.length - 1].end };
   },
 });

@@ -1,6 +1,6 @@
 // What Player and Pd4Splats share: events, and the worker that fetches and decodes.
 
-import { Remote } from "../decode/remote.js";
+import { Remote } from "./remote.js";
 
 /**
  * What early.js began: a worker that requests `url`, null if it could not. begin: gives it the address of the loader's

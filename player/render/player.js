@@ -7,7 +7,7 @@ import { ContextLost, Gpu } from "./gl.js";
 import { levelOf, sameState, stateOf, timeAfter } from "./level.js";
 import { Pace } from "./pace.js";
 import { Painter } from "./painter.js";
-import { Remote } from "../decode/remote.js";
+import { Remote } from "./remote.js";
 import { Emitter, startLoader } from "./loader.js";
 /** @import { Camera, Scene } from "../decode/scene.js" */
 /** @import { Splats } from "./evaluator.js" */

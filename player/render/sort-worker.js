@@ -1,6 +1,6 @@
 // The worker that makes lists and orders.
 
-import { serve } from "../decode/remote.js";
+import { serve } from "./remote.js";
 import { DepthSort, listGaussians } from "./sort.js";
 
 const sorter = new DepthSort();

@@ -200,7 +200,7 @@ test("a file of another type is refused, a damaged one keeps its valid layers", 
   damaged[damaged.length - 20] ^= 4;
   const splats = await Pd4Splats.open(addressOf(damaged), modules);
   const { kind, message } = await detailOf(splats, "error");
-  assert.equal(kind, "FetchError"); // a damaged slice is asked for once more, and these addresses know no ranges
+  assert.equal(kind, "ChecksumMismatch");
   assert.ok(message && !message.includes("\n"));
   await settle(splats, cameraAt([0, 0, -4]));
   assert.deepEqual(splats.levels, [0, 1]);

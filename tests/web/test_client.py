@@ -169,6 +169,14 @@ CASES = {
         )
         for n in range(3)
     },
+    "layer 1 damaged in the file, no validator": Case(
+        shown=lambda f: f.levels()[:1] * 2,
+        content=lambda f: f.damaged(1),
+        server={"etag": False},
+        error=ChecksumMismatch,
+        changes=1,
+        requests=2,
+    ),
     **{
         f"Content-Range {value}": Case(
             lambda f, value=value: [Fault(600), Fault(headers={"Content-Range": value, "Connection": "close"})],
