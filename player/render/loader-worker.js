@@ -44,7 +44,7 @@ const epochNow = () => performance.timeOrigin + performance.now();
 let newest = null;
 /** When the next scene may be told, performance.now(), and what will tell it. */
 let free = 0;
-let timer = 0;
+let timer = /** @type {ReturnType<typeof setTimeout> | 0} */ (0);
 
 /** Tells the scene now, or the newest one as soon as the last one is dealt with. @param {Scene} scene */
 function offer(scene) {

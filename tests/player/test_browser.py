@@ -15,7 +15,8 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from urllib.parse import urlsplit
@@ -39,7 +40,7 @@ ROOT = Path(__file__).parents[2]
 WIDTH, HEIGHT = 96, 72
 #: Of pictures against the rasteriser. Eight bits alone leave 59.
 LEAST_DB = 45.0
-#: Of pictures that Spark draws, whose Gaussians are half floats and small integers.
+#: Of pictures that Spark and PlayCanvas draw, whose Gaussians are half floats and small integers.
 SPARK_DB = 40.0
 
 
@@ -291,24 +292,31 @@ def test_pictures_are_those_of_the_rasteriser(harness, server, folder, kind, eva
     assert decibels(seen[1], seen[2]) < 60 and decibels(seen[2], seen[5]) < 60  # levels and times differ
 
 
-#: What a page with Spark asks for, of the packages in player/node_modules.
+#: What the pages of other viewers ask for, of the packages in player/node_modules.
 SPARK_FILES = (
     "three/build/three.module.js",
     "three/build/three.core.js",
     "three/examples/jsm/postprocessing/Pass.js",
     "@sparkjsdev/spark/dist/spark.module.js",
 )
+PLAYCANVAS_FILES = ("playcanvas/build/playcanvas.mjs",)
+
+
+def viewer(page: Any, server: Server, folder: Path, name: str, files: Sequence[str]) -> None:
+    """Loads the harness of another viewer, whose `files` it imports, all as .js."""
+    for file in files:
+        if not (PLAYER / "node_modules" / file).is_file():
+            pytest.skip(f"no {file}: npm install --no-package-lock in player/")
+        target = folder / "packages" / file
+        target.parent.mkdir(parents=True, exist_ok=True)
+        shutil.copy(PLAYER / "node_modules" / file, target.with_suffix(".js"))
+    page.goto(server.url_of(f"player/test-browser/{name}.html"))
+    page.wait_for_function("!!window.harness")
 
 
 def test_pictures_through_spark_are_those_of_the_rasteriser(page, server, folder, lively):
     pytest.importorskip("numba")
-    for name in SPARK_FILES:
-        if not (PLAYER / "node_modules" / name).is_file():
-            pytest.skip("no Spark: npm install --no-package-lock in player/")
-        (folder / "packages" / name).parent.mkdir(parents=True, exist_ok=True)
-        shutil.copy(PLAYER / "node_modules" / name, folder / "packages" / name)
-    page.goto(server.url_of("player/test-browser/spark.html"))
-    page.wait_for_function("!!window.harness")
+    viewer(page, server, folder, "spark", SPARK_FILES)
     opened(page, server.url_of("scene.pd4"))
     scene = decode(lively)
     views = [resized(camera, WIDTH, HEIGHT) for camera in cameras(scene, [(0.3, 0.1)])]
@@ -319,6 +327,46 @@ def test_pictures_through_spark_are_those_of_the_rasteriser(page, server, folder
         assert np.abs(shot.expected - scene.info.background).max() > 0.2
         seen.append(shot.player)
     assert decibels(seen[0], seen[1]) < 60  # levels differ
+    call(page, "harness.close")
+
+
+def centred(camera: Camera) -> Camera:
+    """The view with square pixels and its axis in the middle of the picture, as PlayCanvas has them."""
+    K = np.array([[80, 0, WIDTH / 2], [0, 80, HEIGHT / 2], [0, 0, 1]], np.float32)
+    return replace(camera, K=K, width=WIDTH, height=HEIGHT)
+
+
+def test_pictures_through_playcanvas_are_those_of_the_rasteriser(page, server, folder, lively):
+    pytest.importorskip("numba")
+    viewer(page, server, folder, "playcanvas", PLAYCANVAS_FILES)
+    opened(page, server.url_of("scene.pd4"))
+    scene = decode(lively)
+    views = [centred(camera) for camera in cameras(scene, [(0.3, 0.1)])]
+    seen = []
+    # level 2 has Gaussians far larger than the picture, which the engine does not draw as large
+    for shot in (*shots(page, lively, views[:1], (0.0, 1.0), [0, 1]), *shots(page, lively, views[1:], (0.5,), [1])):
+        assert decibels(shot.player, shot.expected) > SPARK_DB, (shot.level, shot.t, shot.camera)
+        assert np.abs(shot.expected - scene.info.background).max() > 0.2
+        seen.append(shot.player)
+    assert decibels(seen[0], seen[1]) < 60 and decibels(seen[1], seen[3]) < 60  # levels and times differ
+    call(page, "harness.close")
+
+
+def test_the_playcanvas_script_plays_and_tells_what_fails(page, server, folder):
+    viewer(page, server, folder, "playcanvas", PLAYCANVAS_FILES)
+    opened(page, server.url_of("scene.pd4"))
+    page.evaluate("harness.script.speed = 10; harness.script.loop = false; harness.script.playback.play()")
+    page.wait_for_function("harness.script.playback.paused")
+    assert page.evaluate("harness.script.playback.time") == 3
+    page.evaluate("harness.script.once('error', (error) => (window.told = error.message))")
+    page.evaluate("(url) => harness.script.load(url)", server.url_of("absent.pd4"))
+    page.wait_for_function("!!window.told")
+    assert "404" in page.evaluate("told") and page.evaluate("harness.script.info") is None
+    assert page.evaluate("harness.script.entity.gsplat") is None
+    page.evaluate("(url) => harness.script.load(url)", server.url_of("scene.pd4"))
+    page.wait_for_function("harness.script.playback.settled && harness.script.entity.gsplat.resource.numSplats > 100")
+    page.evaluate("harness.script.entity.destroy()")
+    page.wait_for_function("!harness.script.playback")
     call(page, "harness.close")
 
 

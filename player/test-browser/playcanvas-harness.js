@@ -1,0 +1,92 @@
+// What the test of the PlayCanvas script calls: `window.harness`. The engine comes from the page's import map.
+
+import * as pc from "playcanvas";
+
+import { Pd4 } from "../playcanvas.js";
+
+/** @type {any} */
+let shown = null;
+
+/**
+ * A scene in PlayCanvas on a canvas of some size.
+ *
+ * @param {string} url @param {number} width @param {number} height
+ */
+async function open(url, width, height) {
+  close();
+  const canvas = document.createElement("canvas");
+  document.body.append(canvas);
+  const graphicsDevice = await pc.createGraphicsDevice(canvas, { deviceTypes: ["webgl2"], antialias: false });
+  graphicsDevice.maxPixelRatio = 1;
+  const options = new pc.AppOptions();
+  options.graphicsDevice = graphicsDevice;
+  options.componentSystems = [pc.CameraComponentSystem, pc.GSplatComponentSystem, pc.ScriptComponentSystem];
+  const app = new pc.AppBase(canvas);
+  app.init(options);
+  app.setCanvasFillMode(pc.FILLMODE_NONE, width, height);
+  app.setCanvasResolution(pc.RESOLUTION_FIXED, width, height);
+  app.start();
+  const camera = new pc.Entity("camera", app);
+  camera.addComponent("camera");
+  const entity = new pc.Entity("scene", app);
+  entity.setLocalPosition(1, 2, 3); // pictures do not depend on where the scene stands
+  entity.setLocalEulerAngles(0, 0, 180);
+  entity.setLocalScale(2, 2, 2);
+  app.root.addChild(camera);
+  app.root.addChild(entity);
+  entity.addComponent("script");
+  const script = /** @type {Pd4} */ (entity.script?.create(Pd4, { properties: { src: url, autoplay: false, exact: true } }));
+  shown = { app, camera, script, canvas, width, height };
+  await new Promise((resolve, reject) => {
+    script.on("loaded", resolve);
+    script.on("error", reject);
+  });
+}
+
+/**
+ * The picture as base64 of its RGBA bytes, once the engine has sorted the Gaussians of a state.
+ *
+ * @param {{level: number, seconds: number, viewmat: number[], K: number[], width: number, height: number}} state
+ */
+async function shoot({ level, seconds, viewmat, K, width, height }) {
+  const { app, camera, script, canvas } = shown;
+  script.maxLayer = level;
+  script.playback.time = seconds;
+  script.lookThrough(camera, { viewmat: new Float32Array(viewmat), K: new Float32Array(K), width, height });
+  const frame = () => new Promise((resolve) => app.once("frameend", resolve));
+  let sorted = false;
+  const handle = app.scene.on("gsplat:sorted", () => (sorted = true));
+  for (let still = 0; still < 5; still = sorted ? 0 : still + 1) {
+    sorted = !script.playback.settled;
+    await frame();
+  }
+  handle.off();
+  const picture = new OffscreenCanvas(width, height).getContext("2d");
+  if (!picture) throw new Error("no 2D context");
+  await new Promise((resolve) => app.once("frameend", () => resolve(picture.drawImage(canvas, 0, 0))));
+  const { data } = picture.getImageData(0, 0, width, height);
+  let text = "";
+  for (let i = 0; i < data.length; i += 8192) text += String.fromCharCode(...data.subarray(i, i + 8192));
+  return btoa(text);
+}
+
+function close() {
+  if (!shown) return;
+  shown.app.destroy();
+  shown.canvas.remove();
+  shown = null;
+}
+
+Object.assign(window, {
+  harness: {
+    open,
+    shoot,
+    close,
+    get script() {
+      return shown?.script;
+    },
+    get app() {
+      return shown?.app;
+    },
+  },
+});
