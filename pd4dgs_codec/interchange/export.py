@@ -26,6 +26,7 @@ from pd4dgs_codec.interchange.splats import (
     harmonics,
     looking,
     picture,
+    principal_axes,
     quaternions,
     sphere,
     spread,
@@ -159,7 +160,7 @@ def _bake(
     factor = rotation_matrix(g.quats) * g.scales[:, None, :]
     covariances = (factor @ factor.transpose(0, 2, 1)).reshape(count, -1, 3, 3)
     covariance = np.einsum("ek,ekij->kij", weights, covariances)
-    scales, axes = _principal_axes(turn @ covariance @ turn.T)
+    scales, axes = principal_axes(turn @ covariance @ turn.T)
     places = eyes.places.astype(np.float64)
     directions = unit(means[None].astype(np.float64) - places[:, None]) @ turn.T
     splats = Splats(
@@ -171,14 +172,6 @@ def _bake(
     )
     finite = np.isfinite(splats.means).all(axis=1) & np.isfinite(splats.scales).all(axis=1) & (opacity > 0)
     return splats.taken(finite), slots[finite]
-
-
-def _principal_axes(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """(standard deviations [n, 3], rotations [n, 3, 3] whose columns are their axes); NaN where there are none."""
-    finite = np.isfinite(covariances).all(axis=(1, 2))
-    values, axes = np.linalg.eigh(np.where(finite[:, None, None], covariances, np.eye(3)))
-    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
-    return np.where(finite[:, None], np.sqrt(np.maximum(values, 0)), np.nan), axes
 
 
 def _fitted(basis: np.ndarray, colors: np.ndarray, weights: np.ndarray) -> np.ndarray:

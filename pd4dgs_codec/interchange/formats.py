@@ -102,6 +102,11 @@ def quiet() -> Iterator[None]:
 
 def read_splats(path: Path) -> Splats:
     """The Gaussians of a PLY file of 3D Gaussian splatting, a compressed PLY or an SPZ file. Raises DataError."""
+    return checked(str(path), **activated(read_parameters(path)))
+
+
+def read_parameters(path: Path) -> dict[str, np.ndarray]:
+    """The numbers of such a file, float32: logarithms of scales, logits of opacities, any quaternions."""
     compressed = path.name.lower().endswith(".compressed.ply")
     if path.suffix.lower() == ".spz" or compressed:
         rows = read_vertices(path, _unpacked(path, "compressed.ply" if compressed else "spz"))
@@ -120,16 +125,20 @@ def read_splats(path: Path) -> Splats:
         raise DataError(f"{path}: has {rest} properties f_rest_*, expected {', '.join(str(3 * n) for n in REST)}")
     # channel by channel
     sh = [stack(f"f_dc_{c}", *(f"f_rest_{c * rest // 3 + i}" for i in range(rest // 3))) for c in range(3)]
-    quats, scales = stack("rot_0", "rot_1", "rot_2", "rot_3"), stack("scale_0", "scale_1", "scale_2")
-    return _activated(path, stack("x", "y", "z"), quats, scales, stack("opacity")[:, 0], np.stack(sh, axis=2))
+    return {
+        "means": stack("x", "y", "z"),
+        "quats": stack("rot_0", "rot_1", "rot_2", "rot_3"),
+        "scales": stack("scale_0", "scale_1", "scale_2"),
+        "opacities": stack("opacity")[:, 0],
+        "sh": np.stack(sh, axis=2),
+    }
 
 
-def _activated(
-    path: Path, means: np.ndarray, quats: np.ndarray, scales: np.ndarray, opacities: np.ndarray, sh: np.ndarray
-) -> Splats:
-    """`checked` of logarithms of scales and logits of opacities."""
+def activated(parameters: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """With scales and opacities instead of logarithms and logits."""
     with np.errstate(over="ignore"):
-        return checked(str(path), means, quats, np.exp(scales), 1 / (1 + np.exp(-opacities)), sh)
+        scales, opacities = np.exp(parameters["scales"]), 1 / (1 + np.exp(-parameters["opacities"]))
+    return parameters | {"scales": scales, "opacities": opacities}
 
 
 def _unpacked(path: Path, kind: str) -> bytes:
@@ -180,9 +189,9 @@ def read_gsplat(path: Path) -> Splats:
     missing = [name for name in wanted if not isinstance(state, dict) or not isinstance(state.get(name), np.ndarray)]
     if missing or not isinstance(state, dict):
         raise DataError(f"{path}: has no splats.{missing[0]}; expected a checkpoint of gsplat with spherical harmonics")
-    means, quats, scales, opacities, base, rest = (state[name].astype(np.float32) for name in wanted)
+    *_, base, rest = parts = [state[name].astype(np.float32) for name in wanted]
     sh = np.concatenate([base, rest], axis=1) if base.ndim == 3 else base
-    return _activated(path, means, quats, scales, opacities, sh)
+    return checked(str(path), sh=sh, **activated(dict(zip(wanted[:4], parts, strict=False))))
 
 
 # -- writing -----------------------------------------------------------------------------------------------------------

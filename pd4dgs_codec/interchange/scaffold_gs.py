@@ -9,7 +9,6 @@ give the voxel size, the background and the cameras; they are parsed as text.
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -18,17 +17,16 @@ from typing import Any
 
 import numpy as np
 
-from pd4dgs_codec.archives import Module, read_tensors
-from pd4dgs_codec.data.cameras import ROTATION_TOLERANCE, world_to_camera
-from pd4dgs_codec.data.files import LARGEST, read_file, read_vertices
+from pd4dgs_codec.archives import Module
+from pd4dgs_codec.data.files import LARGEST, read_vertices
 from pd4dgs_codec.data.posed import points_box
 from pd4dgs_codec.errors import DataError
+from pd4dgs_codec.interchange.runs import PLY, Config, State, iteration, network_of, read_cameras, read_torch, run_of
 from pd4dgs_codec.morton import MAX_VOXEL
 from pd4dgs_codec.scene import (
     MAX_FEATURE,
     MAX_SLOTS,
     SCALING_DIM,
-    Camera,
     Network,
     Scene,
     SceneInfo,
@@ -70,9 +68,9 @@ class Choices:
 def read_scaffold_gs(folder: Path, choices: Choices) -> Scene:
     """The scene, unquantised but for its anchors, which lie on the grid. Raises DataError for unsupported models."""
     place = _iteration(folder, choices.iteration)
-    run = place.parent.parent if place.parent.name == "point_cloud" else place
-    config = _config(run / "cfg_args")
-    ply = place / "point_cloud.ply"
+    run = run_of(place)
+    config = Config.of(run)
+    ply = place / PLY
     table = _columns(ply)
     decoders, embedding = _decoders(place)
     widths = Widths(table["feature"].shape[1], table["offset"].shape[1])
@@ -81,15 +79,14 @@ def read_scaffold_gs(folder: Path, choices: Choices) -> Scene:
         for name, decoder in decoders.items()
     }
     anchor = table["anchor"]
-    voxel = choices.voxel_size or config.get("voxel_size") or 0.0
+    voxel = choices.voxel_size or _voxel_size(config)
     voxel = float(np.float32(voxel if voxel > 0 else _grid(anchor, ply)))
     camera, up = None, UP
     if (run / "cameras.json").is_file():
         (camera, *_), up = read_cameras(run / "cameras.json")
-    background = (1.0, 1.0, 1.0) if config.get("white_background") else (0.0, 0.0, 0.0)
     depth = float(np.float32(NEAR)), FAR
     return Scene(
-        info=SceneInfo(voxel, points_box(anchor), (0.0, 1.0), background, *depth, up, 0.0, camera),
+        info=SceneInfo(voxel, points_box(anchor), (0.0, 1.0), config.background, *depth, up, 0.0, camera),
         steps=Steps().scaled(1.0),
         layers=(0,),
         rows=(len(anchor),),
@@ -103,35 +100,26 @@ def read_scaffold_gs(folder: Path, choices: Choices) -> Scene:
 
 
 def _iteration(folder: Path, number: int | None) -> Path:
-    """The folder with point_cloud.ply: `folder` itself, or an iteration below it."""
+    """The folder of the iteration."""
     if not folder.is_dir():
         raise DataError(f"{folder}: found {'a file' if folder.exists() else 'nothing'}, expected a folder")
-    if (folder / "point_cloud.ply").is_file():
-        return folder
-    base = folder / "point_cloud" if (folder / "point_cloud").is_dir() else folder
-    found = {
-        int(match[1]): path
-        for path in base.glob("iteration_*")
-        if (match := re.fullmatch(r"iteration_(\d{1,9})", path.name)) and (path / "point_cloud.ply").is_file()
-    }
-    if not found or number is not None and number not in found:
-        what = f"iteration_{number}" if number is not None else "point_cloud.ply, here or in point_cloud/iteration_N"
+    place = iteration(folder, number)
+    if place is None:
+        what = f"iteration_{number}" if number is not None else f"{PLY}, here or in point_cloud/iteration_N"
         raise DataError(f"{folder}: has no {what}; expected a checkpoint of Scaffold-GS")
-    return found[max(found) if number is None else number]
+    if network := network_of(place):
+        how = f"pd4dgs-train teacher:{folder} learns from it"
+        raise DataError(f"{folder}: its Gaussians move by {network.name}, expected a checkpoint of Scaffold-GS; {how}")
+    return place
 
 
-def _config(path: Path) -> dict[str, Any]:
-    """Voxel size and background from `Namespace(...)`, read as text."""
-    if not path.is_file():
-        return {}
-    text = read_file(path).decode("utf-8", "replace")
-    config: dict[str, Any] = {"white_background": re.search(r"\bwhite_background=True\b", text) is not None}
-    if voxel := re.search(r"\bvoxel_size=([-+0-9.eE]{1,32})[,)]", text):
-        try:
-            config["voxel_size"] = float(voxel[1])
-        except ValueError:
-            raise DataError(f"{path}: voxel_size is {voxel[1]!r}, expected a number") from None
-    return config
+def _voxel_size(config: Config) -> float:
+    """Scene units, 0 if unknown."""
+    found = config.get("voxel_size") or "0"
+    try:
+        return float(found)
+    except ValueError:
+        raise DataError(f"{config.path}: voxel_size is {found!r}, expected a number") from None
 
 
 def _columns(path: Path) -> dict[str, np.ndarray]:
@@ -170,16 +158,16 @@ def _decoders(place: Path) -> tuple[dict[str, Any], np.ndarray | None]:
     """(the content of each decoder's file or key, the appearance embedding [pictures, A] or None)."""
     united = place / "checkpoints.pth"
     if united.is_file():
-        content = _tensors(united)
+        content = read_torch(united)
         if not isinstance(content, dict):
             raise DataError(f"{united}: holds a {type(content).__name__}, expected a dict of state dicts")
         bank, embedding = next((key for key in BANKS if key in content), None), content.get("appearance")
         found, where = {name: content.get(key) for name, key in DECODERS.items()}, united
     else:
         bank = next((name for name in BANKS if (place / name).exists()), None)
-        found = {name: _tensors(place / f"{key}.pt") for name, key in DECODERS.items()}
+        found = {name: read_torch(place / f"{key}.pt") for name, key in DECODERS.items()}
         where = place / EMBEDDING
-        embedding = _tensors(where) if where.exists() else None
+        embedding = read_torch(where) if where.exists() else None
     if bank:
         raise DataError(f"{place}: has a bank of features ({bank}), expected a model without one")
     if missing := [DECODERS[name] for name, decoder in found.items() if decoder is None]:
@@ -190,10 +178,6 @@ def _decoders(place: Path) -> tuple[dict[str, Any], np.ndarray | None]:
     if len(tables) != 1 or tables[0].ndim != 2 or not len(tables[0]) or not np.isfinite(tables[0]).all():
         raise DataError(f"{where}: expected one embedding of finite numbers, pictures x dimensions")
     return found, tables[0].astype(np.float64)
-
-
-def _tensors(path: Path) -> Any:
-    return read_tensors(read_file(path), str(path))
 
 
 def _flat(content: Any, prefix: str = "") -> dict[str, Any]:
@@ -223,13 +207,9 @@ def _network(
     expected = ("0.bias", "0.weight", "2.bias", "2.weight")
     if tuple(sorted(tensors)) != expected:
         raise DataError(f"{path}: has tensors {', '.join(sorted(tensors))[:120]}, expected {', '.join(expected)}")
-    b1, w1, b2, w2 = (tensors[key].astype(np.float64) for key in expected)
-    outputs, hidden = widths.networks[name], len(b1) if b1.ndim else 0
-    if w1.ndim != 2 or [len(w1), b1.ndim, b2.shape, w2.shape] != [hidden, 1, (outputs,), (outputs, hidden)]:
-        shapes = ", ".join(f"{key} {tensors[key].shape}" for key in expected)
-        raise DataError(f"{path}: found {shapes}; expected two layers with {outputs} outputs")
-    if not all(np.isfinite(part).all() for part in (b1, w1, b2, w2)):
-        raise DataError(f"{path}: holds a NaN or an infinity; expected finite numbers")
+    outputs, state = widths.networks[name], State(path, tensors)
+    w1, b1 = (part.astype(np.float64) for part in state.linear("0"))
+    w2, b2 = state.linear("2", len(b1), outputs)
     inputs, usual = w1.shape[1], widths.inputs[name]
     taken = 0 if embedding is None or name != "color" else embedding.shape[1]
     if inputs != usual + taken:
@@ -241,7 +221,7 @@ def _network(
             how = f"choose the appearance of one of {len(embedding)} with --appearance 0..{len(embedding) - 1}"
             raise DataError(f"{path.parent}: colours depend on the picture; {how}")
         w1, b1 = w1[:, :usual], b1 + w1[:, usual:] @ embedding[choices.appearance]
-    return (w1.astype(np.float32), b1.astype(np.float32)), (w2.astype(np.float32), b2.astype(np.float32))
+    return (w1.astype(np.float32), b1.astype(np.float32)), (w2, b2)
 
 
 def _grid(anchor: np.ndarray, path: Path) -> float:
@@ -272,27 +252,3 @@ def _cells(anchor: np.ndarray, voxel: float, path: Path) -> np.ndarray:
         found = f"anchors lie up to {off.max():.3g} voxels off the grid of {voxel:g}"
         raise DataError(f"{path}: {found}, expected multiples of it; --voxel-size names another")
     return cells.astype(np.int32)
-
-
-def read_cameras(path: Path) -> tuple[list[Camera], tuple[float, float, float]]:
-    """(the cameras, their mean direction up) of a cameras.json as 3D Gaussian splatting writes it."""
-    try:
-        rows = json.loads(read_file(path))
-        turns = np.array([row["rotation"] for row in rows], np.float64)
-        places = np.array([row["position"] for row in rows], np.float64)
-        lenses = np.array([[row[key] for key in ("fx", "fy", "width", "height")] for row in rows], np.float64)
-        good = turns.shape == (len(rows), 3, 3) and places.shape == (len(rows), 3) and lenses.shape == (len(rows), 4)
-        good = good and bool((np.abs(turns @ turns.transpose(0, 2, 1) - np.eye(3)) <= ROTATION_TOLERANCE).all())
-        good = good and bool((np.abs(places) <= LARGEST).all() and (lenses > 0).all() and (lenses <= LARGEST).all())
-        good = good and bool((lenses[:, 2:] == np.round(lenses[:, 2:])).all() and lenses[:, 2:].max() <= 65535)
-    except (ValueError, TypeError, KeyError, IndexError, OverflowError, RecursionError):
-        good = False
-    if not good:
-        raise DataError(f"{path}: expected a list of cameras with position, rotation, fx, fy, width and height")
-    cameras = []
-    for turn, place, (fx, fy, width, height) in zip(turns, places, lenses, strict=True):
-        K = np.array([[fx, 0, width / 2], [0, fy, height / 2], [0, 0, 1]], np.float32)
-        cameras.append(Camera(world_to_camera(turn.T, place).astype(np.float32), K, int(width), int(height)))
-    up = -turns[:, :, 1].mean(axis=0)
-    x, y, z = (float(np.float32(v)) for v in up / max(float(np.linalg.norm(up)), 1e-12))
-    return cameras, (x, y, z)

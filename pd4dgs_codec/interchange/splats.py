@@ -134,3 +134,11 @@ def quaternions(matrices: np.ndarray) -> np.ndarray:
     ww, xx, yy, zz = squares.T
     products = np.array([[ww, a, b, c], [a, xx, d, e], [b, d, yy, f], [c, e, f, zz]])
     return unit(products[squares.argmax(axis=1), :, np.arange(len(m))])
+
+
+def principal_axes(covariances: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """(standard deviations [n, 3], rotations [n, 3, 3] whose columns are their axes); NaN where there are none."""
+    finite = np.isfinite(covariances).all(axis=(1, 2))
+    values, axes = np.linalg.eigh(np.where(finite[:, None, None], covariances, np.eye(3)))
+    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
+    return np.where(finite[:, None], np.sqrt(np.maximum(values, 0)), np.nan), axes
